@@ -93,7 +93,7 @@ def test_flat_forest_falls_into_the_leaves_of_scikit_learn() -> None:
     at_thresholds = np.repeat(flat.threshold[flat.left > 0][:500, None], 8, axis=1)
     x = np.concatenate([data.descriptors, at_thresholds, np.nextafter(at_thresholds, np.inf)])
 
-    words = flat.fall(x)
+    words = flat.apply(x)
 
     for tree, leaves in zip(words.T, forest.apply(x).T, strict=True):
         assert len(set(zip(tree, leaves, strict=True))) == len(set(leaves)) == len(set(tree))
@@ -130,24 +130,27 @@ def test_the_first_tree_makes_the_best_split() -> None:
     data = blobs(40, 3, ("cup", "can"))
     x, y = data.descriptors, (data.labels == "can").astype(int)
     model = BoostedDictionary(rounds=1, leaves=2, columns=1.0, rows=1.0, random_state=0).fit(x, y)
-    slope, bend = 0.5 - (y == 0), np.full(len(y), 0.5)  # both categories have half of the views
+    gradient, hessian = (
+        0.5 - (y == 0),
+        np.full(len(y), 0.5),
+    )  # both categories have half of the views
     gains = {}
     for feature in range(8):
         for cut in np.quantile(x[:, feature], np.linspace(0, 1, 65)[1:-1]).astype(np.float32):
             low = x[:, feature] <= cut
             gains[feature, cut] = sum(
-                slope[part].sum() ** 2 / (bend[part].sum() + 2) for part in (low, ~low)
+                gradient[part].sum() ** 2 / (hessian[part].sum() + 2) for part in (low, ~low)
             )
     feature, cut = max(gains, key=lambda key: gains[key])
     left = x[:, feature] <= cut
-    step = [-0.1 * slope[part].sum() / (bend[part].sum() + 2) for part in (left, ~left)]
+    step = [-0.1 * gradient[part].sum() / (hessian[part].sum() + 2) for part in (left, ~left)]
 
     assert (int(model.forest_.feature[0]), float(model.forest_.threshold[0])) == (feature, cut)
     np.testing.assert_allclose(model.votes_[:2, 0], step, rtol=2e-3)
 
 
 def test_rounds_lessen_the_training_loss() -> None:
-    """A sign or a factor wrong in slope or bend still learns a little, but overshoots or stalls."""
+    """A wrong sign or factor in a derivative still learns a little, but overshoots or stalls."""
     data = blobs(50, 1)
     codes = encode(data.labels, CATEGORIES)
     losses = []

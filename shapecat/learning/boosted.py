@@ -20,8 +20,8 @@ from shapecat.learning.tree_dictionary import TreeDictionary
 
 __all__ = ["BoostedDictionary"]
 
-_RIDGE = 2.0
-_LEAST = 1.0
+_L2 = 2.0
+_MIN_HESSIAN = 1.0
 _FEWEST_COLUMNS = 10
 _FEWEST_ROWS = 100
 
@@ -129,10 +129,10 @@ class BoostedDictionary(ClassifierMixin, TreeDictionary):  # type: ignore[misc] 
         columns = np.sort(rng.permutation(features)[:width])
         return columns, np.sort(rng.permutation(views)[:height]).astype(np.int32)
 
-    def _grow(self, bins: Bins, draw: tuple[I4, I4], slope: F4, bend: F4, score: F4) -> Tree:
+    def _grow(self, bins: Bins, draw: tuple[I4, I4], gradient: F4, hessian: F4, score: F4) -> Tree:
         columns, rows = draw
-        settings = TreeSettings(self.leaves, self.rate, _RIDGE, _LEAST)
-        return grow_tree(bins, columns, rows, slope, np.maximum(bend, 1e-6), settings, score)
+        settings = TreeSettings(self.leaves, self.rate, _L2, _MIN_HESSIAN)
+        return grow_tree(bins, columns, rows, gradient, np.maximum(hessian, 1e-6), settings, score)
 
 
 def _join(trees: Sequence[Tree], categories: int) -> tuple[FlatForest, F4]:

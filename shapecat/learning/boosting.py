@@ -26,14 +26,14 @@ class TreeSettings(NamedTuple):
     ----------
     leaves : maximum number of leaves.
     rate : learning rate, which multiplies every leaf value.
-    ridge : L2 regularisation, added to the second derivative of a leaf.
-    least : minimum second derivative of a leaf.
+    l2 : L2 regularisation, added to the second derivative of a leaf.
+    min_hessian : minimum second derivative of a leaf.
     """
 
     leaves: int
     rate: float
-    ridge: float
-    least: float
+    l2: float
+    min_hessian: float
 
 
 class Bins(NamedTuple):
@@ -76,7 +76,7 @@ def make_bins(features: F4) -> Bins:
 
 
 def grow_tree(
-    bins: Bins, columns: I4, rows: I4, slope: F4, bend: F4, settings: TreeSettings, score: F4
+    bins: Bins, columns: I4, rows: I4, gradient: F4, hessian: F4, settings: TreeSettings, score: F4
 ) -> Tree:
     """Grow one tree, best split first, and add its values to the ``score`` (n,) of all views.
 
@@ -84,15 +84,15 @@ def grow_tree(
     ----------
     columns : indices of the features to use.
     rows : int32 indices of the views to learn from; they are reordered in place.
-    slope, bend : (n,) first and second derivative of the loss with respect to the score.
+    gradient, hessian : (n,) first and second derivative of the loss with respect to the score.
     score : (n,) updated in place.
     """
     room = 2 * settings.leaves - 1
     feature, cut, left = (np.zeros(room, np.int64) for _ in range(3))
     value = np.zeros(room, np.float32)
     count = _grow(
-        bins.binned, columns, rows, slope, bend, settings.leaves, settings.rate, settings.ridge,
-        settings.least, feature, cut, left, value,
+        bins.binned, columns, rows, gradient, hessian, settings.leaves, settings.rate, settings.l2,
+        settings.min_hessian, feature, cut, left, value,
     )  # fmt: skip
     feature, cut, left, value = (feature[:count], cut[:count], left[:count], value[:count])
     _add_values(bins.binned, feature, cut, left, value, score)
@@ -104,12 +104,12 @@ def _grow(
     binned: U1,
     columns: I4,
     rows: I4,
-    slope: F4,
-    bend: F4,
+    gradient: F4,
+    hessian: F4,
     leaves: int,
     rate: float,
-    ridge: float,
-    least: float,
+    l2: float,
+    min_hessian: float,
     feature: I4,
     cut: I4,
     left: I4,
@@ -122,8 +122,8 @@ def _grow(
     sums = np.zeros((room, columns.size, BINS, 2), np.float32)
     spare = np.empty_like(rows)
     last[0] = rows.size
-    _collect(binned, columns, rows, slope, bend, sums[0])
-    value[0] = -rate * _best_cut(sums[0], ridge, least, best[0])
+    _collect(binned, columns, rows, gradient, hessian, sums[0])
+    value[0] = -rate * _best_cut(sums[0], l2, min_hessian, best[0])
     count = 1
     for _ in range(leaves - 1):
         # (1) Choose the leaf whose split gains most.
@@ -139,20 +139,20 @@ def _grow(
         # (3) Sum up the smaller child; the larger one is the parent minus this.
         small = count if middle - first[node] <= last[node] - middle else count + 1
         large = 2 * count + 1 - small
-        _collect(binned, columns, rows[first[small] : last[small]], slope, bend, sums[small])
+        _collect(binned, columns, rows[first[small] : last[small]], gradient, hessian, sums[small])
         sums[large] = sums[node] - sums[small]
         # (4) Find the best split of each child.
         for child in (count, count + 1):
-            value[child] = -rate * _best_cut(sums[child], ridge, least, best[child])
+            value[child] = -rate * _best_cut(sums[child], l2, min_hessian, best[child])
         best[node, 0] = 0.0
         count += 2
     return count
 
 
 @kernel(inner=True)
-def _collect(binned: U1, columns: I4, rows: I4, slope: F4, bend: F4, sums: F4) -> None:
-    """Add slope and bend of the views in ``rows`` to ``sums`` (columns, BINS, 2)."""
-    g, h = slope[rows], bend[rows]
+def _collect(binned: U1, columns: I4, rows: I4, gradient: F4, hessian: F4, sums: F4) -> None:
+    """Add gradient and hessian of the views in ``rows`` to ``sums`` (columns, BINS, 2)."""
+    g, h = gradient[rows], hessian[rows]
     for c in range(columns.size):
         bins, out = binned[columns[c]], sums[c]
         for i in range(rows.size):
@@ -162,32 +162,32 @@ def _collect(binned: U1, columns: I4, rows: I4, slope: F4, bend: F4, sums: F4) -
 
 
 @kernel(inner=True)
-def _best_cut(sums: F4, ridge: float, least: float, best: F8) -> float:
+def _best_cut(sums: F4, l2: float, min_hessian: float, best: F8) -> float:
     """Write gain, column and bin of a leaf's best split into ``best``; return its Newton step."""
-    slope = bend = 0.0
+    gradient = hessian = 0.0
     for k in range(BINS):
-        slope += sums[0, k, 0]
-        bend += sums[0, k, 1]
-    alone = slope * slope / (bend + ridge)
+        gradient += sums[0, k, 0]
+        hessian += sums[0, k, 1]
+    alone = gradient * gradient / (hessian + l2)
     best[0] = 0.0
     for c in range(sums.shape[0]):
-        low_slope = low_bend = 0.0
+        low_gradient = low_hessian = 0.0
         for k in range(BINS - 1):
-            low_slope += sums[c, k, 0]
-            low_bend += sums[c, k, 1]
-            if low_bend < least:
+            low_gradient += sums[c, k, 0]
+            low_hessian += sums[c, k, 1]
+            if low_hessian < min_hessian:
                 continue
-            if bend - low_bend < least:
+            if hessian - low_hessian < min_hessian:
                 break
-            high_slope, high_bend = slope - low_slope, bend - low_bend
+            high_gradient, high_hessian = gradient - low_gradient, hessian - low_hessian
             gain = (
-                low_slope * low_slope / (low_bend + ridge)
-                + high_slope * high_slope / (high_bend + ridge)
+                low_gradient * low_gradient / (low_hessian + l2)
+                + high_gradient * high_gradient / (high_hessian + l2)
                 - alone
             )
             if gain > best[0]:
                 best[0], best[1], best[2] = gain, c, k
-    return slope / (bend + ridge)
+    return gradient / (hessian + l2)
 
 
 @kernel(inline=True)

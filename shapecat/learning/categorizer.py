@@ -13,7 +13,7 @@ from shapecat.arrays import F4, F8, U1, Record, array
 from shapecat.errors import ModelError
 from shapecat.jit import kernel
 from shapecat.learning.features import FeatureBank, write_features
-from shapecat.learning.forest import FlatForest, fall
+from shapecat.learning.forest import FlatForest, apply
 
 __all__ = ["Categorizer", "Prediction", "parts_of"]
 
@@ -202,7 +202,7 @@ def _predict(
     logits = np.zeros(bias.size)
     for i in range(x.shape[0]):
         # (2) Dictionary: the leaf of each tree.
-        fall(features[i], trees, word, words)
+        apply(features[i], trees, word, words)
         # (3) Logits of the categories.
         for c in range(bias.size):
             logits[c] = bias[c]

@@ -62,11 +62,11 @@ class FlatForest(Record):
 
     @cached_property
     def parameters(self) -> tuple[Trees, I4]:
-        """The trees and words for `fall`; small types keep a large forest in the cache."""
+        """The trees and words for `apply`; small types keep a large forest in the cache."""
         left = self.left.astype(np.int32)
         return Trees(self.roots, self.feature, self.threshold, left), self.word
 
-    def fall(self, features: F4) -> I4:
+    def apply(self, features: F4) -> I4:
         """Return the words (n, t), one for each tree, of features (n, f).
 
         Raises
@@ -79,12 +79,12 @@ class FlatForest(Record):
             raise ValueError(msg)
         result = np.zeros((len(x), len(self.roots)), np.int64)
         for i, row in enumerate(x):
-            fall(row, *self.parameters, result[i])
+            apply(row, *self.parameters, result[i])
         return result
 
 
 @kernel
-def fall(x: F4, trees: Trees, word: I4, result: I4) -> None:
+def apply(x: F4, trees: Trees, word: I4, result: I4) -> None:
     """Write the word (number of the leaf) that one view reaches in each tree into ``result`` (t,).
 
     ``x`` (f,) are its features; ``word`` (n,) is from `FlatForest.word`.

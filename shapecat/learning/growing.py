@@ -109,7 +109,7 @@ def grow_on(
 def _logits(categorizer: Categorizer, features: F4) -> F4:
     """Return the logits (n, k) of features (n, f), computed a thousand views at a time."""
     found = [
-        categorizer.votes[categorizer.forest.fall(part)].sum(axis=1, dtype=np.float32)
+        categorizer.votes[categorizer.forest.apply(part)].sum(axis=1, dtype=np.float32)
         for part in np.array_split(features, len(features) // 1000 + 1)
     ]
     return np.asarray(np.concatenate(found) + categorizer.bias, np.float32)

@@ -90,7 +90,7 @@ def add_categories(
     order = _order(old_count, count, unknown=categorizer.knows_unknown)
     truth = np.concatenate([categorizer.known_category.astype(np.int64), order[codes]])
     features = _features_of_standardised(bank, z)
-    words = categorizer.forest.fall(features)
+    words = categorizer.forest.apply(features)
     inputs = _Inputs(features.astype(np.float64), bag_of_words(words, categorizer.forest.words))
     old = _old_logits(categorizer, inputs)
     cold = old / categorizer.temperature

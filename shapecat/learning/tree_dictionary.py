@@ -28,7 +28,7 @@ class TreeDictionary(TransformerMixin, BaseEstimator):  # type: ignore[misc]  # 
     def words(self, X: ArrayLike) -> I4:
         """Return the words (n, trees) of features X (n, f): the leaf reached in each tree."""
         check_is_fitted(self)
-        return self.forest_.fall(validate_data(self, X, dtype=np.float32, reset=False))
+        return self.forest_.apply(validate_data(self, X, dtype=np.float32, reset=False))
 
     def transform(self, X: ArrayLike) -> sparse.csr_array:
         """Return the sparse bags of words (n, words), zeros and ones, of features X (n, f)."""

@@ -13,7 +13,7 @@ from shapecat.trees import BoostedTrees, Trees
 
 __all__ = ["Growth", "grow", "growing_options"]
 
-_RIDGE, _LEAST, _ROWS = 1.0, 2.0, 0.7
+_L2, _MIN_HESSIAN, _ROWS = 1.0, 2.0, 0.7
 
 
 class Growth(NamedTuple):
@@ -60,13 +60,13 @@ def grow(features: F4, truth: Bool, growth: Growth, seed: int) -> BoostedTrees:
     share = truth.mean()
     grown = [_leaf(float(np.log(share / (1 - share))))]
     logit = np.full(n, grown[0].value[0], np.float32)
-    settings = TreeSettings(growth.leaves, growth.rate, _RIDGE, _LEAST)
+    settings = TreeSettings(growth.leaves, growth.rate, _L2, _MIN_HESSIAN)
     columns = np.arange(features.shape[1])
     for _ in range(growth.rounds):
         posterior = 1 / (1 + np.exp(-logit))
         rows = np.sort(rng.permutation(n)[: round(_ROWS * n)]).astype(np.int32)
-        slope, bend = posterior - truth, posterior * (1 - posterior)
-        grown.append(grow_tree(bins, columns, rows, slope, bend, settings, logit))
+        gradient, hessian = posterior - truth, posterior * (1 - posterior)
+        grown.append(grow_tree(bins, columns, rows, gradient, hessian, settings, logit))
     return _joined(grown)
 
 

@@ -35,7 +35,7 @@ SceneKind = Literal[
 
 
 @dataclass(frozen=True)
-class _Wish:
+class _SceneSpec:
     """Contents of a scene; if ``distractors`` is None, the kind of scene decides their number."""
 
     filming: Filming
@@ -45,7 +45,7 @@ class _Wish:
     def draw(self, rng: Generator, count: int, *, usual: int = 0) -> list[str]:
         """Return ``count`` categories, each once before any repeats, then the unknown objects.
 
-        ``usual`` is the number of unknown objects if the wish leaves it open.
+        ``usual`` is the number of unknown objects if the spec leaves it open.
         """
         first = [str(c) for c in rng.permutation(self.categories)]
         more = [str(c) for c in rng.choice(self.categories, max(0, count - len(first)))]
@@ -83,7 +83,7 @@ def make_scene(
     if kind not in SCENES:
         msg = f"no scene {kind!r}; known: {', '.join(SCENES)}"
         raise ValueError(msg)
-    return SCENES[kind](rng, _Wish(Filming(frames, rate_hz), tuple(categories), distractors))
+    return SCENES[kind](rng, _SceneSpec(Filming(frames, rate_hz), tuple(categories), distractors))
 
 
 def make_stage(pieces: Sequence[Piece], rng: Generator, *, views: int = 8) -> World:
@@ -106,26 +106,26 @@ def make_stage(pieces: Sequence[Piece], rng: Generator, *, views: int = 8) -> Wo
     return World("stage", (*room, table), tuple(layout.things), path, np.zeros(views))
 
 
-def _tabletop(rng: Generator, wish: _Wish) -> World:
+def _tabletop(rng: Generator, spec: _SceneSpec) -> World:
     """Place six to ten objects on a table with gaps, at least one of each category."""
     room, table = make_room(rng, wall_chance=0.3), make_table(rng)
     layout = Layout(rng, gap=rng.uniform(0.015, 0.05))
-    count = int(rng.integers(max(6, len(wish.categories)), 11))
-    for category in wish.draw(rng, count):
+    count = int(rng.integers(max(6, len(spec.categories)), 11))
+    for category in spec.draw(rng, count):
         layout.put(category, table, np.array([0.38, 0.27]), stack=0.06)
     target = np.array([0, 0, table.height + 0.05])
-    path = walk(rng, target, wish.filming, distance=(0.9, 1.4), elevation=(28, 52), sweep=(25, 60))
+    path = walk(rng, target, spec.filming, distance=(0.9, 1.4), elevation=(28, 52), sweep=(25, 60))
     return World(
-        "tabletop", (*room, table), tuple(layout.things), path, np.zeros(wish.filming.frames)
+        "tabletop", (*room, table), tuple(layout.things), path, np.zeros(spec.filming.frames)
     )
 
 
-def _clutter(rng: Generator, wish: _Wish) -> World:
+def _clutter(rng: Generator, spec: _SceneSpec) -> World:
     """Crowd objects on a table: nearly touching, stacked, occluding each other."""
     room, table = make_room(rng, wall_chance=0.2), make_table(rng)
     layout = Layout(rng, gap=0.01)
     half = rng.uniform([0.2, 0.16], [0.32, 0.24])
-    wanted = wish.draw(rng, int(rng.integers(7, 13)), usual=int(rng.integers(0, 3)))
+    wanted = spec.draw(rng, int(rng.integers(7, 13)), usual=int(rng.integers(0, 3)))
     wanted.sort(
         key=lambda category: category not in {"box", "can"}
     )  # objects that can carry others come first
@@ -133,64 +133,64 @@ def _clutter(rng: Generator, wish: _Wish) -> World:
         layout.gap = float(rng.choice([0.002, 0.008, 0.02]))
         layout.put(category, table, half, stack=0.3, attempts=4)
     target = np.array([0, 0, table.height + 0.06])
-    path = walk(rng, target, wish.filming, distance=(0.65, 1.3), elevation=(25, 58), sweep=(20, 50))
+    path = walk(rng, target, spec.filming, distance=(0.65, 1.3), elevation=(25, 58), sweep=(20, 50))
     return World(
-        "clutter", (*room, table), tuple(layout.things), path, np.zeros(wish.filming.frames)
+        "clutter", (*room, table), tuple(layout.things), path, np.zeros(spec.filming.frames)
     )
 
 
-def _shelf(rng: Generator, wish: _Wish) -> World:
+def _shelf(rng: Generator, spec: _SceneSpec) -> World:
     """Place twelve objects on three boards of a shelf, some stacked."""
     width, depth = rng.uniform(0.85, 1.15), rng.uniform(0.3, 0.42)
     low, step = rng.uniform(0.25, 0.4), rng.uniform(0.33, 0.42)
     boards, sides = make_shelf(width, depth, low, step)
     layout = Layout(rng, gap=0.015, headroom=step - 0.05, enclosed=True)
     half = np.array([width / 2 - 0.06, depth / 2 - 0.03])
-    for k, category in enumerate(wish.draw(rng, 12, usual=int(rng.integers(0, 2)))):
+    for k, category in enumerate(spec.draw(rng, 12, usual=int(rng.integers(0, 2)))):
         layout.put(category, boards[k % 3], half, stack=0.5 if k > 5 else 0.0, attempts=8)
     target = np.array([0, 0, low + 1.15 * step])
     path = walk(
-        rng, target, wish.filming, distance=(1.25, 1.55), elevation=(20, 30), sweep=(12, 28)
+        rng, target, spec.filming, distance=(1.25, 1.55), elevation=(20, 30), sweep=(12, 28)
     )
     supports = (*make_room(rng, wall_chance=0.0), *boards, *sides)
-    return World("shelf", supports, tuple(layout.things), path, np.zeros(wish.filming.frames))
+    return World("shelf", supports, tuple(layout.things), path, np.zeros(spec.filming.frames))
 
 
-def _turntable(rng: Generator, wish: _Wish) -> World:
+def _turntable(rng: Generator, spec: _SceneSpec) -> World:
     """Turn a round table in front of a still camera."""
     room = make_room(rng, wall_chance=0.3)
     table = round_table(rng.uniform(0.38, 0.48), rng.uniform(0.65, 0.85), 0.03)
     layout = Layout(rng, gap=0.03)
-    for category in wish.draw(rng, int(rng.integers(5, 9))):
+    for category in spec.draw(rng, int(rng.integers(5, 9))):
         layout.put(category, table, np.array([0.3, 0.3]), attempts=4)
     target = np.array([0, 0, table.height + 0.04])
     distance, elevation = rng.uniform(0.9, 1.2), rng.uniform(28, 48)
-    path = hold(rng, target, wish.filming.frames, distance=distance, elevation=elevation)
+    path = hold(rng, target, spec.filming.frames, distance=distance, elevation=elevation)
     speed = rng.choice([-1, 1]) * rng.uniform(0.25, 0.5)  # radians per second
-    turns = np.round(speed * wish.filming.times(), 9)
+    turns = np.round(speed * spec.filming.times(), 9)
     return World("turntable", (*room, table), tuple(layout.things), path, turns)
 
 
-def _empty(rng: Generator, wish: _Wish) -> World:
+def _empty(rng: Generator, spec: _SceneSpec) -> World:
     """Leave the table empty."""
     room, table = make_room(rng, wall_chance=0.5), make_table(rng)
     target = np.array([0, 0, table.height])
-    path = walk(rng, target, wish.filming, distance=(0.8, 1.5), elevation=(25, 60), sweep=(10, 50))
-    return World("empty", (*room, table), (), path, np.zeros(wish.filming.frames))
+    path = walk(rng, target, spec.filming, distance=(0.8, 1.5), elevation=(25, 60), sweep=(10, 50))
+    return World("empty", (*room, table), (), path, np.zeros(spec.filming.frames))
 
 
-SCENES: dict[str, Callable[[Generator, _Wish], World]] = {
+SCENES: dict[str, Callable[[Generator, _SceneSpec], World]] = {
     "tabletop": _tabletop,
     "shelf": _shelf,
     "clutter": _clutter,
-    "pile": lambda rng, wish: pile(rng, wish.poured(rng), wish.filming),
-    "bin": lambda rng, wish: bin_picking(rng, wish.poured(rng), wish.filming),
-    "shelf_bin": lambda rng, wish: shelf_bin(rng, wish.poured(rng), wish.filming),
-    "room": lambda rng, wish: room(rng, wish.draw(rng, 7), wish.filming),
+    "pile": lambda rng, spec: pile(rng, spec.poured(rng), spec.filming),
+    "bin": lambda rng, spec: bin_picking(rng, spec.poured(rng), spec.filming),
+    "shelf_bin": lambda rng, spec: shelf_bin(rng, spec.poured(rng), spec.filming),
+    "room": lambda rng, spec: room(rng, spec.draw(rng, 7), spec.filming),
     "turntable": _turntable,
-    "walking": lambda rng, wish: walking(rng, wish.draw(rng, 11), wish.filming),
-    "crossing": lambda rng, wish: crossing(rng, wish.draw(rng, 7), wish.filming),
-    "rearranged": lambda rng, wish: rearranged(rng, wish.draw(rng, 8), wish.filming),
+    "walking": lambda rng, spec: walking(rng, spec.draw(rng, 11), spec.filming),
+    "crossing": lambda rng, spec: crossing(rng, spec.draw(rng, 7), spec.filming),
+    "rearranged": lambda rng, spec: rearranged(rng, spec.draw(rng, 8), spec.filming),
     "empty": _empty,
 }
 """The function that makes each kind of scene."""
