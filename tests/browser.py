@@ -1,4 +1,4 @@
-"""A headless Chromium, where there is one, driven over the WebDriver protocol."""
+"""A headless Chromium, if installed, driven over the WebDriver protocol."""
 
 import json
 import shutil
@@ -97,7 +97,7 @@ class Browser:
         self._ask("POST", "/url", {"url": page.as_uri() if isinstance(page, Path) else page})
 
     def run(self, script: str) -> Any:
-        """Return what a script returns."""
+        """Run a script and return its result."""
         return self._ask("POST", "/execute/sync", {"script": script, "args": []})
 
     def _find(self, selector: str) -> str:
@@ -113,7 +113,7 @@ class Browser:
         self._ask("POST", f"/element/{self._find(selector)}/value", {"text": text})
 
     def press(self, *keys: str) -> None:
-        """Press keys one after the other, where the focus is; `Control+z` holds the first."""
+        """Press keys one after the other on the focused element; `Control+z` holds the first."""
         events = [event for key in keys for event in _strokes(key.split("+"))]
         source = {"type": "key", "id": "keyboard", "actions": events}
         self._ask("POST", "/actions", {"actions": [source]})
@@ -127,15 +127,15 @@ class Browser:
         return [str(handle) for handle in self._ask("GET", "/window/handles")]
 
     def turn_to(self, tab: str) -> None:
-        """Drive a tab from now on."""
+        """Drive another tab from now on."""
         self._ask("POST", "/window", {"handle": tab})
 
     def close_tab(self) -> None:
-        """Close the tab that is driven."""
+        """Close the current tab."""
         self._ask("DELETE", "/window")
 
     def renew(self) -> None:
-        """Leave all tabs for a new one, unasked, and forget their complaints."""
+        """Replace all tabs by a new one, without asking, and forget their console messages."""
         new, left = self.tab(), self.tabs()
         for tab in left:
             self.turn_to(tab)
@@ -146,7 +146,7 @@ class Browser:
         self.complaints()
 
     def _allow_downloads(self) -> None:
-        """Let the tab that is driven download; each asks anew."""
+        """Allow downloads in the current tab; each tab needs this."""
         where = {"behavior": "allow", "downloadPath": str(self.downloads)}
         self.cdp("Browser.setDownloadBehavior", where)
 
@@ -163,7 +163,7 @@ class Browser:
         return self._ask("POST", "/goog/cdp/execute", {"cmd": command, "params": parameters})
 
     def complaints(self) -> list[str]:
-        """Return warnings and errors of the console."""
+        """Return the warnings and errors in the console."""
         return [entry["message"] for entry in self._ask("POST", "/se/log", {"type": "browser"})]
 
     def downloaded(self) -> Path:

@@ -1,4 +1,4 @@
-"""What tests share: the command as installed, real data when present, a simulated recording."""
+"""Shared fixtures: the installed command, real data if present, a simulated recording."""
 
 import os
 import shutil
@@ -31,7 +31,7 @@ SHARED = Path(__file__).parents[2] / "shared" / "data"
 
 
 def pytest_configure() -> None:
-    """Heed interrupts, which a shell ignores for what it runs in the background.
+    """Obey interrupts, which a shell ignores for its background jobs.
 
     And do not wait for the disk: only `test_run_folder` and the faults look at that. Collecting
     garbage while all tests are imported would take a third of that time.
@@ -42,7 +42,7 @@ def pytest_configure() -> None:
 
 
 def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
-    """Begin with the files that take longest: at the end all workers but one would wait for them.
+    """Run the longest files first, so that no worker is left waiting for one at the end.
 
     A worker takes a whole file, for its fixtures.
     """
@@ -73,7 +73,7 @@ def shapecat() -> Callable[..., Result]:
 
 
 class Guesser:
-    """Stands in for a model where a test is not about one: guesses from the descriptor."""
+    """Replaces the model in tests of other parts: guesses from the descriptor."""
 
     categories = ("cup", "can", "box", "bottle", "bowl", "plate", "ball")
     model_id = "guesser"
@@ -129,7 +129,7 @@ def reported_run(guessed_run: Path, drawn: Any, tmp_path_factory: pytest.TempPat
 
 @pytest.fixture(scope="module")
 def undisturbed(recording: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """Process the recording of a file of tests without any trouble; return the folder above."""
+    """Process a test file's recording without any disturbance; return the parent folder."""
     from shapecat.pipeline import process  # noqa: PLC0415  the same
     from shapecat.runs.jobs import Job  # noqa: PLC0415  the same
 
@@ -158,7 +158,7 @@ def coloured_run(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 @pytest.fixture(scope="module")
 def few_trees() -> Iterator[None]:
-    """Grow a tenth of the trees of the forests beside the chain: their accuracy does not matter."""
+    """Grow a tenth of the trees of the baseline forests, whose accuracy does not matter here."""
     from sklearn.ensemble import RandomForestClassifier  # noqa: PLC0415  the same
 
     def grow(trees: int, **options: Any) -> Any:
@@ -171,7 +171,7 @@ def few_trees() -> Iterator[None]:
 
 @pytest.fixture(scope="session")
 def chromium(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Browser]:
-    """Start a headless Chromium; the test is left out where there is none."""
+    """Start a headless Chromium; skip the test if there is none."""
     opened = Browser(tmp_path_factory.mktemp("browser"))
     yield opened
     opened.close()

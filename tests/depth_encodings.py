@@ -1,4 +1,4 @@
-"""Depth images compressed as the transport of ROS writes them, coded apart from the readers."""
+"""Depth images compressed as the ROS transport does, by encoders independent of the readers."""
 
 import struct
 import zlib

@@ -1,4 +1,4 @@
-"""Make the recordings of the folder fixtures, and the tables expected of them.
+"""Make the recordings in the folder fixtures, and their expected tables.
 
     python -m tests.fixtures
 
@@ -53,7 +53,7 @@ PLANES = ("frame", "plane", "height_m", "area_m2", "normal", "offset")
 
 
 class Scene(NamedTuple):
-    """What a recording shows; its images are ``shrunk`` times smaller than a Kinect's."""
+    """The contents of a recording; its images are ``shrunk`` times smaller than a Kinect's."""
 
     kind: SceneKind
     container: Literal["mcap", "ros1", "ros2"]
@@ -110,13 +110,13 @@ def processed_tables(recording: Path, folder: Path) -> dict[str, list[Row]]:
 
 
 def expected_path(name: str, table: str) -> Path:
-    """Return where the table that is expected of a recording lies."""
+    """Return the path of a recording's expected table."""
     stem = Path("tabletop.mcap" if name == FOXGLOVE else name).stem
     return EXPECTED / f"{stem}.{table}.csv"
 
 
 def differences(found: Sequence[Row], wanted: Sequence[Row]) -> Iterator[str]:
-    """Tell what differs: words and whole numbers at all, other numbers by more than `TOLERANCE`."""
+    """Describe differences: in text and integers any, in other numbers those above `TOLERANCE`."""
     if len(found) != len(wanted):
         yield f"{len(found)} rows, expected {len(wanted)}"
     for number, (here, there) in enumerate(zip(found, wanted, strict=False)):
@@ -129,13 +129,13 @@ def differences(found: Sequence[Row], wanted: Sequence[Row]) -> Iterator[str]:
 
 
 def read_table(path: Path) -> list[Row]:
-    """Return the rows of a table of the folder expected."""
+    """Return the rows of an expected table."""
     with path.open(encoding="utf-8", newline="") as file:
         return list(csv.DictReader(file))
 
 
 def write_table(path: Path, rows: Sequence[Row]) -> None:
-    """Write a table of the folder expected."""
+    """Write an expected table."""
     with path.open("w", encoding="utf-8", newline="") as file:
         writer = csv.DictWriter(file, list(rows[0]), lineterminator="\n")
         writer.writeheader()
@@ -160,7 +160,7 @@ def _shrunk(sensor: Sensor, k: int) -> Sensor:
 
 
 def _forget_library(database: Path) -> None:
-    """Remove the version of SQLite from a database: bytes 96 to 99, which no reader heeds."""
+    """Clear the SQLite version number in a database: bytes 96 to 99, which readers ignore."""
     with database.open("r+b") as file:
         file.seek(96)
         file.write(bytes(4))
@@ -190,7 +190,7 @@ def _text(value: Any) -> str:
 
 
 def _as_foxglove(source: Path, target: Path) -> None:
-    """Write the depth images, their camera and the transforms of a recording as Foxglove's."""
+    """Write the depth images, camera and transforms of a recording as Foxglove messages."""
     types = MessageFactory(2).typestore
     with source.open("rb") as file, target.open("wb") as out:
         writer = Writer(out)
@@ -213,7 +213,7 @@ def _as_foxglove(source: Path, target: Path) -> None:
 
 
 def _foxglove(kind: str, ros: Any) -> Iterator[tuple[str, dict[str, Any]]]:
-    """Yield the Foxglove messages that say what a ROS message says."""
+    """Yield the Foxglove messages that correspond to a ROS message."""
     if kind.endswith("TFMessage"):
         for link in ros.transforms:
             yield "foxglove.FrameTransform", _transform(link)
@@ -248,7 +248,7 @@ def _transform(link: Any) -> dict[str, Any]:
 
 
 def main() -> None:
-    """Make the recordings anew, and renew the tables expected of them."""
+    """Make the recordings again, and renew their expected tables."""
     for path in FIXTURES.iterdir():
         if path.is_dir():
             shutil.rmtree(path)

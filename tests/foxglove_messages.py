@@ -1,4 +1,4 @@
-"""Foxglove's messages in JSON and Protocol Buffers, and recordings made of them."""
+"""Foxglove messages in JSON and Protocol Buffers, and recordings of them."""
 
 import base64
 import json

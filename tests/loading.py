@@ -1,4 +1,4 @@
-"""Which libraries a piece of code loads, in an interpreter of its own."""
+"""The libraries that a piece of code loads, measured in a separate interpreter."""
 
 import subprocess
 import sys
@@ -6,7 +6,7 @@ from collections.abc import Set as AbstractSet
 
 
 def loaded_by(code: str, libraries: AbstractSet[str]) -> set[str]:
-    """Return those of some modules that are loaded once ``code`` has run."""
+    """Return which of some modules are loaded after running ``code``."""
     names = ",".join(sorted(libraries))
     report = f"import sys; print(*set({names!r}.split(',')) & set(sys.modules))"
     done = subprocess.run(

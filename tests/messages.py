@@ -1,4 +1,4 @@
-"""Messages of depth cameras as drivers publish them, and recordings made of them."""
+"""Messages of depth cameras as drivers publish them, and recordings of such messages."""
 
 import struct
 from collections.abc import Iterable

@@ -1,10 +1,10 @@
-"""A batch in object storage, on Dask workers without a shared disk, with losses on the way.
+"""A batch in object storage, on Dask workers without a shared disk, with workers that die.
 
     python -m tests.object_batch --count 2000        by hand; some minutes
 
 The storage refuses a share of the requests. One worker is killed when a third of the recordings
-are done, the scheduler and all workers when two thirds are; both are started anew, as whoever runs
-a cluster would. `Report` says what came of it.
+are done, the scheduler and all workers when two thirds are; both are restarted, as a cluster
+administrator would do. `Report` holds the outcome.
 """
 
 import json
@@ -31,7 +31,7 @@ FRAMES = 3
 
 @dataclass(frozen=True)
 class Report:
-    """What came of a batch.
+    """The outcome of a batch.
 
     ``made`` counts how often each recording became a run; ``left`` names what lies in the bucket
     beside runs and manifest.
@@ -48,10 +48,10 @@ class Report:
 
 
 class DaskCluster:
-    """A scheduler and workers, each in a folder of its own: they share no disk."""
+    """A scheduler and workers, each in its own folder, so that they share no disk."""
 
     def __init__(self, address: str, folder: Path, workers: int = 2) -> None:
-        """Start them."""
+        """Start the scheduler and the workers."""
         host = ("--host", "127.0.0.1", "--dashboard-address", "127.0.0.1:0")
         port = address.rpartition(":")[2]
         self._processes = [self._start(folder, "scheduler", "--port", port, *host)]
@@ -77,14 +77,14 @@ class DaskCluster:
                 os.kill(child, signal.SIGKILL)
 
     def kill(self) -> None:
-        """Kill all of it."""
+        """Kill the scheduler and all workers."""
         for process in self._processes:
             os.killpg(process.pid, signal.SIGKILL)
             process.wait()
 
 
 def children(process: int) -> list[int]:
-    """Return the processes that one has started."""
+    """Return the child processes of a process."""
     threads = Path(f"/proc/{process}/task").glob("*/children")
     return [int(pid) for thread in threads for pid in thread.read_text().split()]
 
@@ -96,7 +96,7 @@ def free_address() -> str:
 
 
 def fill(count: int, folder: Path) -> None:
-    """Put so many recordings into the bucket: each is one of five."""
+    """Upload a number of recordings to the bucket, copies of five different ones."""
     import fsspec  # noqa: PLC0415  an extra
 
     system = fsspec.filesystem("s3")
@@ -107,7 +107,7 @@ def fill(count: int, folder: Path) -> None:
 
 
 def run(count: int, folder: Path, *, refused: float) -> Report:
-    """Process so many recordings; kill a worker, then the scheduler and all workers."""
+    """Process a number of recordings; kill a worker, then the scheduler and all workers."""
     with object_storage(folder / "log", refused=refused) as log:
         fill(count, folder)
         address = free_address()
@@ -139,7 +139,7 @@ def wait_until(condition: Callable[[], bool], process: subprocess.Popen[bytes]) 
 
 
 def made(log: Path) -> list[str]:
-    """Return the names of the recordings that became runs, in order, as often as they did."""
+    """Return the names of the recordings that became runs, in order, with repetitions."""
     return [path.split("/")[-2] for path in requests(log, "PUT", "/run.json")]
 
 
@@ -172,7 +172,7 @@ if __name__ == "__main__":
     @click.option("--count", default=2000)
     @click.option("--refused", default=0.05, help="Share of requests that the storage refuses.")
     def main(count: int, refused: float) -> None:
-        """Run the batch, print what came of it."""
+        """Run the batch and print its outcome."""
         with tempfile.TemporaryDirectory() as folder:
             report = run(count, Path(folder), refused=refused)
         twice = [name for name, times in report.made.items() if times != 1]

@@ -1,4 +1,4 @@
-"""Object storage on this machine: moto's S3, which can be made to refuse a share of requests.
+"""Object storage on this machine: moto's S3, which can refuse a fraction of the requests.
 
     python -m tests.object_storage SHARE LOG      prints its port, serves until it is killed
 
@@ -17,10 +17,10 @@ REFUSAL = b"<Error><Code>SlowDown</Code><Message>Please reduce your request rate
 
 
 class Throttled:
-    """A web application that refuses some requests, as S3 does under load, and notes all."""
+    """A web application that refuses some requests, as S3 does under load, and logs all."""
 
     def __init__(self, application: Any, share: float, log: Path) -> None:
-        """Refuse a share of the requests."""
+        """Refuse a fraction of the requests."""
         self._application, self._share = application, share
         self._log = log.open("a", encoding="utf-8", buffering=1)
         self._random = random.Random(0)  # noqa: S311  no secret
@@ -86,7 +86,7 @@ def object_storage(log: Path, *, refused: float = 0.0, bucket: str = "lab") -> I
 
 
 def requests(log: Path, method: str, ending: str) -> list[str]:
-    """Return the paths of the requests that were granted, by method and how the path ends."""
+    """Return the paths of the granted requests, by method and ending of the path."""
     lines = [line.split() for line in log.read_text("utf-8").splitlines()]
     return [
         path

@@ -1,4 +1,4 @@
-"""Processes odd recordings and prints what became of each: ``python -m tests.odd [FOLDER]...``."""
+"""Process odd recordings and print the outcome of each: ``python -m tests.odd [FOLDER]...``."""
 
 import json
 import sys
@@ -17,7 +17,7 @@ CODES = {0, 3, 4}
 
 
 class Verdict(NamedTuple):
-    """What became of one recording."""
+    """The outcome of one recording."""
 
     code: int
     frames: int

@@ -1,4 +1,4 @@
-"""Draw the rooms of the package and their imports: ``python -m tests.picture``.
+"""Draw the subpackages and their imports: ``python -m tests.picture``.
 
 A room is drawn in the layer that `tests.test_architecture` assigns to it. An arrow leads to what a
 room imports; those that follow from others are left out, and so are those to the two layers below,
@@ -31,7 +31,7 @@ _Place = tuple[float, float, float]
 
 
 def imports() -> dict[str, set[str]]:
-    """Return what each room imports."""
+    """Return the imports of each subpackage."""
     found: dict[str, set[str]] = {}
     for path in FILES:
         found.setdefault(room(path), set()).update(imported_rooms(path) - {room(path)})
@@ -49,12 +49,12 @@ def reduced(graph: Mapping[str, set[str]]) -> dict[str, set[str]]:
 
 
 def layer(name: str) -> float:
-    """Return the layer of a room; stages, which import nothing beside them, stand apart."""
+    """Return the layer of a subpackage; stages do not import each other and stand apart."""
     return FLOOR[name] + 0.5 * (name in STAGES)
 
 
 def places(rooms: set[str]) -> dict[str, _Place]:
-    """Return the left edge, top and width of the box of each room."""
+    """Return left edge, top and width of the box of each subpackage."""
     found: dict[str, _Place] = {}
     for row, level in enumerate(LAYERS):
         names = sorted(name for name in rooms if layer(name) == level)
@@ -73,7 +73,7 @@ _ARROW_HEAD = (
 
 
 def draw() -> str:
-    """Return the picture."""
+    """Return the picture as SVG."""
     graph = imports()
     boxes = places(set(graph) | {"schemas"})
     height = 16 + ROW * len(LAYERS)

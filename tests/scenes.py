@@ -21,7 +21,7 @@ PERIOD = SECOND // 30
 
 
 class View(NamedTuple):
-    """Depth (120, 160) in metres, as whole millimetres, and where it was taken from."""
+    """Depth (120, 160) in metres, rounded to millimetres, and the pose of the camera."""
 
     depth: F4
     camera: Camera
@@ -35,7 +35,7 @@ class View(NamedTuple):
 
 @cache
 def views(count: int = 4) -> tuple[View, ...]:
-    """Return what a camera sees that moves past the table."""
+    """Return the frames of a camera that moves past the table."""
     world = make_scene("tabletop", np.random.default_rng(7), frames=30)
     found = []
     for index in range(count):
@@ -51,7 +51,7 @@ def views(count: int = 4) -> tuple[View, ...]:
 
 
 def back_and_forth(frames: int) -> Iterator[View]:
-    """Return so many views, as a camera takes that moves to and fro."""
+    """Return a number of views from a camera that moves back and forth."""
     seen = views()
     cycle = [*seen, *seen[-2:0:-1]]
     for k in range(frames):

@@ -1,4 +1,4 @@
-"""annotated.mcap: nothing of the original is lost, and every tool reads what is added."""
+"""annotated.mcap keeps every original message, and every tool can read the added ones."""
 
 import hashlib
 import json
@@ -134,7 +134,7 @@ def test_every_original_message_stays_byte_for_byte(
 
 
 def test_other_readers_accept_the_file(tmp_path: Path) -> None:
-    """The summary, its offsets and its checksums are ours: others must agree with them."""
+    """We write summary, offsets and checksums ourselves, so other readers must accept them."""
     target = tmp_path / "out.mcap"
     annotate(write_mcap(tmp_path / "a.mcap"), target)
 
@@ -165,7 +165,7 @@ def test_other_readers_accept_the_file(tmp_path: Path) -> None:
 
 @pytest.mark.parametrize("markers", [False, True])
 def test_channels_of_the_original_keep_their_numbers(tmp_path: Path, *, markers: bool) -> None:
-    """Writers may leave out numbers; one that is given twice mixes the messages of two topics."""
+    """Numbers may have gaps; a number used twice would mix the messages of two topics."""
     source, target, text = tmp_path / "a.mcap", tmp_path / "out.mcap", b"string data"
     with source.open("wb") as file:
         writer = Writer(file)
@@ -242,7 +242,7 @@ def test_detections_say_what_and_where(tmp_path: Path) -> None:
 
 
 def test_scene_shows_updates_and_removes_tracks(tmp_path: Path) -> None:
-    """Boxes that stay when an object is gone are the commonest complaint about viewers."""
+    """Users complain most about boxes that stay when their object is gone."""
     target = tmp_path / "out.mcap"
     annotate(write_mcap(tmp_path / "a.mcap"), target)
 

@@ -1,4 +1,4 @@
-"""Annotations of a turned box with numbers that are all different, in every encoding."""
+"""Annotations of a rotated box without equal numbers, in every encoding."""
 
 import json
 from dataclasses import replace
@@ -38,7 +38,7 @@ ABOVE = CENTER + TURN.apply([0, 0, SIZE[2] / 2 + 0.03])
 
 
 def decode_ros(name: str, schema: bytes, data: bytes, *, ros1: bool) -> Any:
-    """Decode with the definition that is embedded, as a reader in the field has to."""
+    """Decode with the embedded definition, as an independent reader has to."""
     store = get_typestore(Stores.EMPTY)
     store.register(get_types_from_msg(schema.decode(), name.replace("/msg/", "/")))
     kind = name if "/msg/" in name else name.replace("/", "/msg/")
@@ -46,7 +46,7 @@ def decode_ros(name: str, schema: bytes, data: bytes, *, ros1: bool) -> Any:
 
 
 def plain(message: Any) -> Any:
-    """Return a message as attributes, whatever it was decoded by; times in nanoseconds."""
+    """Return a message as attributes, whatever decoded it; times in nanoseconds."""
     if isinstance(message, dict):
         message = SimpleNamespace(**message)
     if isinstance(message, list | tuple):
@@ -65,7 +65,7 @@ def plain(message: Any) -> Any:
 
 
 def messages(encoding: str) -> dict[str, Any]:
-    """Return the message of each topic, decoded by what its channel says of itself."""
+    """Return the message of each topic, decoded by its channel's own schema."""
     found = {}
     for channel, encode in encoder_for(encoding, markers=True):
         (data,) = encode([ANNOTATION])
@@ -86,7 +86,7 @@ def numbers(record: Any, names: str) -> list[float]:
 
 
 def same_turn(quaternion: Any) -> float:
-    """Return how far a quaternion (x, y, z, w) is from that of the box, radians."""
+    """Return the angle between a quaternion (x, y, z, w) and that of the box, radians."""
     return float((Rotation.from_quat(numbers(quaternion, "xyzw")) * TURN.inv()).magnitude())
 
 
@@ -97,7 +97,7 @@ def check_box(pose: Any, size: Any) -> None:
 
 
 def test_the_label_stands_above_the_top_of_the_box() -> None:
-    """By the transposed rotation it stands beside a box that is tilted."""
+    """With a transposed rotation it would be beside a tilted box."""
     assert_allclose(text_position(*BOX[3:]), ABOVE, atol=1e-12)
 
 
@@ -154,7 +154,7 @@ def test_detections_keep_every_number_in_its_place(encoding: str) -> None:
 
 @pytest.mark.parametrize("encoding", ["cdr", "ros1"])
 def test_markers_stand_where_the_boxes_do(encoding: str) -> None:
-    """RViz: a cube is type 1, a text that faces the viewer 9; action 2 removes one marker."""
+    """RViz: type 1 is a cube, type 9 a text that faces the viewer; action 2 deletes a marker."""
     markers = messages(encoding)["/shapecat/markers"].markers
     gone, (cube, text) = markers[:4], markers[4:]
 
@@ -182,7 +182,7 @@ def chunk_indexes(path: Path) -> list[ChunkIndex]:
 
 
 def index_end(data: bytes, at: int, count: int) -> int:
-    """Return where so many message index records (opcode 7) end that begin at a place."""
+    """Return the end of the message index records (opcode 7) that begin at an offset."""
     for _ in range(count):
         assert data[at] == 7
         at += 9 + int.from_bytes(data[at + 1 : at + 9], "little")
@@ -190,7 +190,7 @@ def index_end(data: bytes, at: int, count: int) -> int:
 
 
 def test_chunk_indexes_tell_where_their_message_indexes_end(tmp_path: Path) -> None:
-    """Readers that fetch a chunk with its index in one request go by this length."""
+    """Readers that fetch a chunk with its index in one request rely on this length."""
     frames = [replace(FRAME, index=k, log_time_ns=STAMP + k) for k in range(900)]
     target = tmp_path / "out.mcap"
     with open_recording(write_mcap(tmp_path / "a.mcap")) as recording:
@@ -206,7 +206,7 @@ def test_chunk_indexes_tell_where_their_message_indexes_end(tmp_path: Path) -> N
 
 
 def test_added_messages_are_found_by_time(tmp_path: Path) -> None:
-    """A seek reads only the chunks whose times say so."""
+    """A seek reads only the chunks whose time range contains the target."""
     frames = [replace(FRAME, index=k, log_time_ns=STAMP + k * SECOND) for k in range(400)]
     target = tmp_path / "out.mcap"
     with open_recording(write_mcap(tmp_path / "a.mcap")) as recording:
@@ -231,7 +231,7 @@ def test_added_messages_are_found_by_time(tmp_path: Path) -> None:
 
 
 def test_added_messages_are_found_though_they_are_not_in_order(tmp_path: Path) -> None:
-    """Two sensors are read by turns."""
+    """Messages of two sensors arrive interleaved."""
     offsets = (50, 20, 90, 70)
     frames = [replace(FRAME, index=k, log_time_ns=EPOCH + t) for k, t in enumerate(offsets)]
     target = tmp_path / "out.mcap"
@@ -246,7 +246,7 @@ def test_added_messages_are_found_though_they_are_not_in_order(tmp_path: Path) -
 
 
 def test_stamps_beyond_those_of_ros_are_its_last_second() -> None:
-    """Its seconds have 31 bits: a clock that counts otherwise must not end the writing."""
+    """ROS seconds have 31 bits: larger stamps must not stop the writer."""
     ros = RosMessages(ros1=False)
     for seconds, written in ((2**31 - 2, 2**31 - 2), (2**31, 2**31 - 1), (9 * 10**9, 2**31 - 1)):
         frame = replace(FRAME, stamp_ns=seconds * SECOND + 7, objects=())
@@ -262,7 +262,7 @@ def test_stamps_beyond_those_of_ros_are_its_last_second() -> None:
 def test_the_file_begins_and_ends_with_whichever_message_does(
     tmp_path: Path, offsets: tuple[int, ...], first: int, last: int
 ) -> None:
-    """A player takes its length from the statistics: what lies beyond is not played.
+    """Players take the length from the statistics and would not play messages beyond it.
 
     The messages of the original are at 0 to 8.
     """
@@ -280,7 +280,7 @@ def test_the_file_begins_and_ends_with_whichever_message_does(
 
 
 def test_what_another_sensor_still_sees_is_not_taken_away(tmp_path: Path) -> None:
-    """Tracks of two sensors share the scene: the last one that shows an object ends it."""
+    """Two sensors share the tracks of a scene: the last frame with an object ends it."""
 
     def seen(topic: str, k: int, *, there: bool) -> ShownFrame:
         boxes = (BOX,) if there else ()
@@ -307,7 +307,7 @@ IMAGE = ImageFrame(STAMP, STAMP + 3, "colour", (IMAGE_BOX,))
 
 
 def drawn(encoding: str) -> dict[str, Any]:
-    """Return what is drawn on an image, by topic, decoded by what its channel says of itself."""
+    """Return the drawings on an image, by topic, decoded by their channel's own schema."""
     found = {}
     for channel, encode in image_encoder_for(encoding):
         data = encode(IMAGE)
@@ -324,7 +324,7 @@ def drawn(encoding: str) -> dict[str, Any]:
 
 @pytest.mark.parametrize("encoding", ["cdr", "ros1", "json", "protobuf"])
 def test_image_annotations_say_the_same_in_every_encoding(encoding: str) -> None:
-    """Of a box 120 wide and 66 high at (31, 44), in the colour of its category."""
+    """A box 120 wide and 66 high at (31, 44), in the colour of its category."""
     message, colour = drawn(encoding)["/shapecat/image_annotations"], colour_of("bowl")
     (line,), (text,) = message.points, message.texts
     corners = [(p.x, p.y) for p in line.points]

@@ -1,4 +1,4 @@
-"""The door from Python: light to import, arrays of the stated shapes, every printed block works."""
+"""The Python interface: light to import, arrays of the stated shapes, working examples."""
 
 import re
 import runpy
@@ -42,7 +42,7 @@ def place(shapecat: Callable[..., Result], tmp_path_factory: pytest.TempPathFact
 def test_the_times_of_a_posterior_count_from_the_first_frame(
     guessed_run: Path, tmp_path: Path
 ) -> None:
-    """Tracks are born at other times: drawn over their own age they could not be compared."""
+    """Tracks start at different times; posteriors over their own age could not be compared."""
     run = shapecat.open_run(guessed_run)
     rows = run.tracks.arrow()
     pq.write_table(rows.filter(pc.greater_equal(rows["frame"], 3)), tmp_path / "late.parquet")
@@ -64,7 +64,7 @@ def test_every_block_of_the_page_works_as_printed(place: Path) -> None:
 
 
 def test_frames_have_the_points_and_masks_of_the_tables(place: Path) -> None:
-    """A mask of the wrong frame, or transposed, would have other pixels than the table says."""
+    """A mask of the wrong frame, or a transposed one, would contradict the table."""
     run = shapecat.open_run(place / "results" / "demo")
     rows = pq.read_table(run.folder / "detections.parquet").to_pylist()
     objects = 0
@@ -84,7 +84,7 @@ def test_frames_have_the_points_and_masks_of_the_tables(place: Path) -> None:
 
 
 def test_colour_masks_show_the_objects_that_are_there(place: Path) -> None:
-    """A mask of another object or frame, or shifted, shows something else in truth."""
+    """A mask of another object or frame, or a shifted one, would cover something else."""
     run = shapecat.open_run(place / "results" / "demo")
     with np.load(place / "demo.color_labels.npz") as file:
         truth = file["labels"]
@@ -124,7 +124,7 @@ def test_columns_are_arrays_with_nan_where_nothing_is(place: Path) -> None:
 
 
 def test_a_missing_list_is_a_row_of_nan(tmp_path: Path) -> None:
-    """Arrow keeps what lies behind a null, or nothing: rows must not move up."""
+    """Arrow may or may not store values behind a null; later rows must not shift."""
     import pyarrow as pa  # noqa: PLC0415  beside its only use
 
     from shapecat.outputs.opened_run import Table  # noqa: PLC0415  the same
@@ -152,7 +152,7 @@ def test_wrong_settings_and_folders_are_refused_in_one_line(place: Path, tmp_pat
 
 
 def test_import_loads_no_library() -> None:
-    """The commands import the package: what it loads, `--help` waits for."""
+    """Every command imports the package, so a heavy import would delay `--help`."""
     heavy = {"open3d", "rerun", "matplotlib", "sklearn", "pandas"}
 
     assert loaded_by("import shapecat", {"numpy"}) == set()
@@ -160,7 +160,7 @@ def test_import_loads_no_library() -> None:
 
 
 def test_several_cores_in_a_script_without_a_guard_are_refused_at_once(tmp_path: Path) -> None:
-    """Each process would run the script again, and print a traceback of its own."""
+    """Otherwise each process would run the script again and print its own traceback."""
     script = tmp_path / "script.py"
     script.write_text("import shapecat\nshapecat.process('none.mcap', 'out', cores=3)\n")
     done = subprocess.run(

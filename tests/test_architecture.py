@@ -1,4 +1,4 @@
-"""The layout is enforced: layers, import cost, no forbidden constructs."""
+"""The architecture is enforced: layers, cost of imports, forbidden constructs."""
 
 import ast
 import graphlib
@@ -72,7 +72,7 @@ def imported_rooms(path: Path) -> set[str]:
 
 
 def wrong_import(here: str, other: str) -> str:
-    """Return what is wrong with an import from one room into another, if anything."""
+    """Return the problem with an import from one subpackage into another, or an empty string."""
     if other not in FLOOR:
         return "has no floor: add it to the table above"
     if FLOOR[other] > FLOOR[here]:
@@ -97,7 +97,7 @@ def module_of(path: Path) -> str:
 
 
 def imported_modules(path: Path, modules: set[str]) -> set[str]:
-    """Return what the code of a file imports, also inside its functions."""
+    """Return the modules that a file imports, also inside its functions."""
     found = set()
     for node in nodes(path):
         if isinstance(node, ast.Import):
@@ -109,7 +109,7 @@ def imported_modules(path: Path, modules: set[str]) -> set[str]:
 
 
 def test_no_module_imports_itself_by_a_detour() -> None:
-    """Of two files that import each other, neither can be read, tested or moved alone."""
+    """Two files that import each other cannot be read, tested or moved alone."""
     modules = {module_of(path): path for path in FILES}
     graph = {name: imported_modules(path, set(modules)) for name, path in modules.items()}
     graph["shapecat"] = set()  # the door from Python, which loads its names when they are used
@@ -118,7 +118,7 @@ def test_no_module_imports_itself_by_a_detour() -> None:
 
 
 def is_forbidden(node: ast.AST) -> bool:
-    """Tell whether a node prints, evaluates text, or catches everything."""
+    """Return whether a node prints, evaluates text, or catches everything."""
     if isinstance(node, ast.Call) and isinstance(node.func, ast.Name):
         return node.func.id in {"print", "eval", "exec"}
     return isinstance(node, ast.ExceptHandler) and node.type is None
@@ -135,7 +135,7 @@ def test_no_print_eval_or_bare_except() -> None:
 
 
 def test_only_documented_parts_of_numba_are_used() -> None:
-    """Its compiler's own modules and methods change with any release."""
+    """Undocumented parts of its compiler change with any release."""
     documented = {"numba", "numba.extending"}
     for path in FILES:
         for node in nodes(path):
@@ -155,7 +155,7 @@ def test_help_loads_no_heavy_library() -> None:
 
 
 def test_processing_loads_no_library_too_soon() -> None:
-    """Neither what the first frame need not wait for, nor what draws on a display.
+    """Before the first frame, processing must load neither slow libraries nor display libraries.
 
     SciPy's images, data frames and Protocol Buffers take longer to load than all of ours. Open3D
     needs libEGL and libX11, which a server or a container does not have.
@@ -173,7 +173,7 @@ def test_processing_loads_no_library_too_soon() -> None:
 
 
 def test_commands_do_without_pandas() -> None:
-    """Arrow loads it with its first array, which takes half a second."""
+    """Arrow would load pandas with its first array, which takes half a second."""
     code = (
         "import types, pyarrow, shapecat.__main__ as entry;"
         "command = types.SimpleNamespace(main=lambda **_: pyarrow.array([1]));"
@@ -184,7 +184,7 @@ def test_commands_do_without_pandas() -> None:
 
 
 def test_root_of_the_package_holds_what_everybody_uses() -> None:
-    """A file of one room that lies in the root hides which room it is of."""
+    """A file of a single subpackage must not be in the root, which hides its owner."""
     assert len(list((ROOT / "shapecat").glob("*.py"))) <= 12
 
 
@@ -193,7 +193,7 @@ def test_architecture_page_is_short() -> None:
 
 
 def test_the_picture_is_drawn_from_the_code_as_it_is() -> None:
-    """`make picture` renews it."""
+    """`make picture` redraws it."""
     from tests.picture import PICTURE, draw  # noqa: PLC0415  it imports this file
 
     assert PICTURE.read_text("utf-8") == draw()
@@ -204,7 +204,7 @@ def test_a_library_that_is_loaded_is_seen() -> None:
 
 
 def test_an_inlined_kernel_has_one_caller_of_the_same_arithmetic() -> None:
-    """Each further call would be compiled anew, and other fast-math flags give other numbers."""
+    """A second caller would compile it again; other fast-math flags give other numbers."""
     flags, calls = kernels()
     inlined = {name: own for name, own in flags.items() if own.get("inline")}
     assert inlined
@@ -213,7 +213,7 @@ def test_an_inlined_kernel_has_one_caller_of_the_same_arithmetic() -> None:
 
 
 def test_an_inner_kernel_is_called_by_kernels_alone() -> None:
-    """Python would run it uncompiled, a hundred times slower, and nothing would tell."""
+    """Python would silently run it uncompiled, a hundred times slower."""
     flags, calls = kernels()
     inner = [name for name, own in flags.items() if own.get("inner")]
     assert inner
@@ -226,7 +226,7 @@ def test_an_inner_kernel_is_called_by_kernels_alone() -> None:
 def kernels() -> tuple[
     dict[tuple[str, str], dict[str, bool]], dict[tuple[str, str], list[tuple[bool, bool]]]
 ]:
-    """Return what each ``@kernel`` is given, and the uses of each function elsewhere.
+    """Return the arguments of each ``@kernel``, and the uses of each function elsewhere.
 
     Functions are named by their module and name. A use says whether it is in a kernel, and whether
     that is ``fast``.
@@ -260,7 +260,7 @@ def kernels() -> tuple[
 
 
 def _kernel_flags(part: ast.stmt) -> dict[str, bool] | None:
-    """Return what ``@kernel`` is given; None without it."""
+    """Return the arguments of ``@kernel``; None without it."""
     for decorator in part.decorator_list if isinstance(part, ast.FunctionDef) else ():
         words = decorator.keywords if isinstance(decorator, ast.Call) else []
         name = decorator.func if isinstance(decorator, ast.Call) else decorator

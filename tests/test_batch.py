@@ -1,4 +1,4 @@
-"""Many recordings: the same tables on every executor, and nothing lost, doubled or left behind."""
+"""Batches: the same tables on every executor; no recording lost, repeated or left over."""
 
 import json
 import os
@@ -34,7 +34,7 @@ QUIET: Any = {"stdout": subprocess.DEVNULL, "stderr": subprocess.DEVNULL}
 
 
 class Watcher:
-    """Remembers what it was told, and may do something about it."""
+    """Remembers the reports, and may react to them."""
 
     def __init__(self, act: Callable[[str, str], None] | None = None) -> None:
         self.heard: set[str] = set()
@@ -42,20 +42,20 @@ class Watcher:
         self._act = act
 
     def progress(self, folder: str, phase: str, done: int, total: int | None) -> None:
-        """Hear how far a recording is."""
+        """Receive the progress of a recording."""
         assert total is None or done <= total
         self.heard.add(folder)
         if self._act is not None:
             self._act(folder, phase)
 
     def ended(self, outcome: Outcome) -> None:
-        """Hear what became of one."""
+        """Receive the outcome of a recording."""
         self.outcomes.append(outcome)
 
 
 @pytest.fixture(scope="module")
 def recordings(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """Make a folder as a lab has it: three formats, a broken file, sidecars, old results."""
+    """Make a folder as found in a lab: three formats, a broken file, sidecars, old results."""
     folder = tmp_path_factory.mktemp("recordings")
     (folder / "monday").mkdir()
     record(folder / "monday" / "log.mcap", FRAMES)
@@ -155,7 +155,7 @@ def test_complete_recordings_are_not_opened_again(
 
 
 def test_changed_work_is_not_taken_for_done(recordings: Path, one_by_one: Path) -> None:
-    """Content, settings, a model, a missing output: each must be noticed without opening files."""
+    """Changed content, settings or model, or a missing output, must be noticed cheaply."""
 
     def status(job: Job) -> str:
         with plan_batch(job, [str(recordings)], str(one_by_one)) as batch:
@@ -202,7 +202,7 @@ def test_processes_that_share_frames_give_the_same_tables(
 def test_shards_give_the_same_tables(
     shapecat: Run, recordings: Path, one_by_one: Path, tmp_path: Path
 ) -> None:
-    """Together the shards do everything, and nothing twice."""
+    """Together, the shards process every recording exactly once."""
     codes = []
     for k in range(4):
         options = ("--out", tmp_path, "--shard", f"{k}/4", "--jobs", 1, "--no-rrd")
@@ -218,7 +218,7 @@ def test_shards_give_the_same_tables(
 
 
 def test_folders_are_searched_and_bags_are_not_taken_apart(tmp_path: Path) -> None:
-    """As the shell expands folder/** : folders, what is in them, and what belongs to others."""
+    """A shell expands folder/** to folders, their contents, and files of other programs."""
     bags = (
         "bag/bag_0.db3",
         "bag/metadata.yaml",
@@ -274,7 +274,7 @@ def test_killed_local_worker_is_replaced(
 
 
 class Fragile(Executor):
-    """Loses its worker with every job of one folder."""
+    """An executor that loses its worker with every job of one folder."""
 
     def __init__(self, folder: str) -> None:
         self.begun: list[str] = []
@@ -304,7 +304,7 @@ def test_recording_that_kills_its_workers_is_given_up(recordings: Path, tmp_path
 
 
 def test_recording_that_only_waited_is_not_blamed(recordings: Path, tmp_path: Path) -> None:
-    """A scheduler that restarts drops all that wait, again and again."""
+    """A scheduler that restarts drops all queued tasks, possibly many times."""
 
     class Forgetful(Fragile):
         def submit(self, fn: Any, /, *args: Any, **kwargs: Any) -> Future[Any]:
@@ -352,14 +352,14 @@ def test_full_disk_stops_the_large_and_not_the_small(shapecat: Run, tmp_path: Pa
 
 
 def heed_interrupts() -> None:
-    """Do not inherit that a shell lets its background jobs ignore them."""
+    """Obey interrupts even if the shell lets its background jobs ignore them."""
     signal.signal(signal.SIGINT, signal.SIG_DFL)
 
 
 def test_interrupted_batch_ends_at_once_and_goes_on(
     shapecat: Run, recordings: Path, one_by_one: Path, tmp_path: Path
 ) -> None:
-    """Ctrl-C: exit code 130, nothing goes on, and a second run completes the rest."""
+    """Ctrl-C: exit code 130, no process left, and a second run completes the rest."""
     words = ("process", str(recordings), "--out", str(tmp_path), "--no-rrd", "--jobs")
     running = subprocess.Popen(
         [sys.executable, "-m", "shapecat", *words, "2"],
@@ -408,7 +408,7 @@ def test_dask_gives_the_same_tables_though_a_worker_is_killed(
 def test_dask_goes_on_when_its_scheduler_is_restarted(
     recordings: Path, one_by_one: Path, tmp_path: Path
 ) -> None:
-    """What a scheduler knew is gone with it, and its workers end: both are started anew."""
+    """A dead scheduler takes its state and its workers along; both are started again."""
     pytest.importorskip("distributed")
     with socket.create_server(("127.0.0.1", 0)) as server:
         address = f"tcp://127.0.0.1:{server.getsockname()[1]}"
@@ -447,7 +447,7 @@ class DaskCluster:
         ]
 
     def kill(self) -> None:
-        """Kill all of it."""
+        """Kill the scheduler and the workers."""
         for process in self._processes:
             os.killpg(process.pid, signal.SIGKILL)
             process.wait()
@@ -464,7 +464,7 @@ def test_ray_gives_the_same_tables(
 
 
 def test_manifest_survives_what_a_crash_left(tmp_path: Path, one_by_one: Path) -> None:
-    """A line cut short, or of another program, must not hide or swallow its neighbours."""
+    """A truncated or foreign line must not hide or absorb its neighbours."""
     path = tmp_path / "manifest.jsonl"
     shutil.copy(one_by_one / "manifest.jsonl", path)
     before = Manifest(path).entries

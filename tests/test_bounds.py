@@ -40,7 +40,7 @@ for height, width in ((480, 640), (37, 51), (8, 900)):
 
 @pytest.mark.many
 def test_odd_frames_stay_within_bounds(tmp_path: Path) -> None:
-    """Machine code checks no index: one beyond an array corrupts memory far from the cause."""
+    """Compiled code checks no index: a wrong one corrupts memory far from its cause."""
     checked = {"NUMBA_BOUNDSCHECK": "1", "NUMBA_CACHE_DIR": str(tmp_path)}
     run = subprocess.run(
         [sys.executable, "-c", ODD_FRAMES],

@@ -1,4 +1,4 @@
-"""Calibrations and depth encodings with numbers that are all different, worked out by hand."""
+"""Calibrations and depth encodings on worked examples without equal numbers."""
 
 from pathlib import Path
 from types import SimpleNamespace
@@ -27,7 +27,7 @@ SIZE = (640, 480)
 
 
 def calibration(**changes: Any) -> Any:
-    """Return a CameraInfo in which K and P are of different cameras."""
+    """Return a CameraInfo whose K and P describe different cameras."""
     message = info(EPOCH, Camera(*SIZE, 1.0, 1.0, 0.0, 0.0))
     message.k, message.p = np.array(K), np.array(P)
     for name, value in changes.items():
@@ -63,7 +63,7 @@ def test_a_rectified_image_is_described_by_p_and_a_raw_one_by_k() -> None:
 def test_the_name_of_a_topic_tells_whether_its_images_are_rectified(
     topic: str, rectified: bool
 ) -> None:
-    """A transport adds a part to the name; the namespace says nothing."""
+    """A transport appends to the topic name; the namespace carries no information."""
     recording: Any = SimpleNamespace(topics=())
     stream = Stream(topic, IMAGE, "depth", "/info", 9, "optical", "16UC1")
 
@@ -77,7 +77,7 @@ def test_without_p_a_rectified_image_is_described_by_k() -> None:
 
 
 def test_a_region_of_interest_moves_the_principal_point_back() -> None:
-    """What was at (322.3, 243.9) is at (242.3, 213.9) once 80 columns and 30 rows are gone."""
+    """Cutting 80 columns and 30 rows moves it from (322.3, 243.9) to (242.3, 213.9)."""
     camera, _ = camera_of_info(calibration(roi=region(80, 30, 400, 300)), rectified=False)
 
     assert (camera.width, camera.height) == (400, 300)
@@ -111,7 +111,7 @@ def test_a_region_without_pixels_is_the_whole_image(width: int, height: int) -> 
 
 
 def fisheye_of_opencv(ray: Any, k: Any) -> Any:
-    """Project slopes as the documentation of cv::fisheye says, term by term."""
+    """Project slopes by the formula in the documentation of cv::fisheye."""
     a, b = ray
     r = np.sqrt(a**2 + b**2)
     theta = np.arctan(r)
@@ -129,7 +129,7 @@ def test_fisheye_follows_its_published_formula(model: str, ray: tuple[float, flo
 
 
 def rational_of_opencv(ray: Any, d: Any) -> Any:
-    """Project slopes as the documentation of cv::projectPoints says, term by term."""
+    """Project slopes by the formula in the documentation of cv::projectPoints."""
     x, y = ray
     k1, k2, p1, p2, k3, k4, k5, k6 = d
     r2 = x * x + y * y
@@ -170,7 +170,7 @@ def test_undistorted_rays_are_found_by_any_solver(model: str, d: Any, project: A
 
 
 def test_a_fisheye_depth_camera_gives_points_along_its_true_rays(tmp_path: Path) -> None:
-    """The whole way: message, calibration, points of the frame."""
+    """From message and calibration to the points of the frame."""
     message = info(EPOCH, d=FISHEYE)
     message.distortion_model = "equidistant"
     items = [
@@ -188,7 +188,7 @@ def test_a_fisheye_depth_camera_gives_points_along_its_true_rays(tmp_path: Path)
 
 @pytest.mark.parametrize("kind", ["16UC1", "32FC1"])
 def test_big_endian_depth_is_the_same_depth(kind: str) -> None:
-    """Drivers on other machines send it; read the wrong way round 1 m is 59 m."""
+    """Some machines send it; in the wrong byte order, 1 m becomes 59 m."""
     depth = wavy_depth()
     values = depth if kind == "16UC1" else (depth / 1000).astype(np.float32)
     little = image(EPOCH, values, kind)
@@ -210,7 +210,7 @@ def test_inverse_depth_is_a_over_stored_minus_b(pack: Any) -> None:
 
 
 def test_pixels_and_rays_agree_to_a_thousandth_of_a_pixel() -> None:
-    """A shift by half a pixel is a millimetre on a table, and no other test would see it."""
+    """A shift by half a pixel is a millimetre on a table; no other test would notice it."""
     camera = Camera(64, 48, 60.0, 61.0, 31.2, 23.7)
     depth = np.full((48, 64), 2.0, np.float32)
     points = Frame("", 0, 0, 0, "", depth=depth, camera=camera).xyz()

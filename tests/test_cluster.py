@@ -1,4 +1,4 @@
-"""Batches in object storage, on workers that share no disk: nothing lost, nothing done twice."""
+"""Batches in object storage, on workers without a shared disk: nothing lost or done twice."""
 
 import os
 import signal
@@ -23,7 +23,7 @@ pytestmark = pytest.mark.many
 
 @pytest.fixture
 def bucket(tmp_path: Path) -> Iterator[Path]:
-    """Serve a bucket that refuses some requests; give the log of all."""
+    """Serve a bucket that refuses some requests; provide the log of all requests."""
     with object_storage(tmp_path / "log", refused=0.03) as log:
         yield log
 
@@ -39,14 +39,14 @@ def assert_right(report: Report, count: int) -> None:
 
 
 def test_a_batch_on_dask_survives_a_worker_and_the_scheduler(tmp_path: Path) -> None:
-    """The storage is throttled, a worker is killed, later the scheduler and all workers are."""
+    """The storage is throttled; a worker is killed, later the scheduler and all workers."""
     report = run(18, tmp_path, refused=0.05)
 
     assert_right(report, 18)
 
 
 def ray_workers(driver: int) -> list[int]:
-    """Return the processes that Ray computes in, below the process that started it."""
+    """Return Ray's worker processes, below the process that started Ray."""
     found, below = [], [driver]
     while below:
         process = below.pop()
@@ -73,7 +73,7 @@ def test_a_batch_on_ray_survives_a_worker(bucket: Path, tmp_path: Path) -> None:
 
 
 def assert_same_tables(folder: Path) -> None:
-    """Compare what lies in the bucket with what one process makes of the same recordings."""
+    """Compare the results in the bucket with those of a single process."""
     from shapecat.pipeline import process  # noqa: PLC0415  only where it is needed
     from shapecat.runs.jobs import Job  # noqa: PLC0415  the same
 
@@ -90,7 +90,7 @@ def assert_same_tables(folder: Path) -> None:
 
 
 def test_a_killed_command_is_gone_on_with(bucket: Path, tmp_path: Path) -> None:
-    """Kill -9 at any moment; and then the same command twice at once."""
+    """Kill -9 at any moment, then start the same command twice at once."""
     fill(8, tmp_path)
     command = [*PROCESS, "--jobs", "2"]
     quiet: Any = {"stderr": subprocess.PIPE, "stdout": subprocess.DEVNULL, "text": True}

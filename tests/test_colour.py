@@ -1,4 +1,4 @@
-"""Masks on colour images: the right pixels, dense, and none that the camera does not see."""
+"""Masks on colour images: the right pixels, dense, and only pixels that the camera sees."""
 
 from collections import Counter
 from pathlib import Path
@@ -24,7 +24,7 @@ TURNED = Pose(rotation_from_quaternion((0.03, -0.05, 0.02, 1.0)), np.array([-0.0
 
 
 def test_a_worked_example_of_a_turned_camera_with_a_lens() -> None:
-    """A wrong order of turning, shifting and bending moves every mask; computed by hand."""
+    """A wrong order of rotation, translation and distortion would move every mask."""
     quarter = Pose(np.array([[0.0, 1, 0], [-1, 0, 0], [0, 0, 1]]), np.array([0.1, 0.2, 0.5]))
     lens = LensCamera(
         Camera(640, 480, 400.0, 300.0, 310.0, 250.0), "plumb_bob", (0.2, 0, 0.01, 0, 0)
@@ -41,7 +41,7 @@ def test_a_worked_example_of_a_turned_camera_with_a_lens() -> None:
 
 @pytest.mark.parametrize("model", ["plumb_bob", "rational_polynomial", "equidistant"])
 def test_lenses_bend_and_straighten_alike(model: str) -> None:
-    """One of the two directions is used by depth images, the other by masks."""
+    """Depth images use one of the two directions, masks the other."""
     coefficients = (0.1, -0.05, 0.001, -0.002, 0.01, 0.02, -0.01, 0.003)
     rays = undistorted_rays(LENS.pinhole, model, coefficients)
     assert rays is not None
@@ -52,7 +52,7 @@ def test_lenses_bend_and_straighten_alike(model: str) -> None:
 
 
 def test_what_a_lens_cannot_show_is_not_shown() -> None:
-    """A polynomial turns back far from the axis and would paint the walls onto the table."""
+    """Far from the axis, the polynomial turns back and would paint walls onto the table."""
     lens = LensCamera(LENS.pinhole, "plumb_bob", (-0.4, 0.0, 0.0, 0.0, 0.0))
     points = np.array([[0.2, 0, 1.0], [2.5, 0, 1.0], [0, 0, -1.0], [np.nan, 0, 1]])
     seen = project(points, lens, IDENTITY)
@@ -60,7 +60,7 @@ def test_what_a_lens_cannot_show_is_not_shown() -> None:
 
 
 def test_the_painted_image_agrees_with_projected_points() -> None:
-    """The kernel and the plain projection are one camera: every lone pixel lands in its place."""
+    """The kernel and the plain projection must place every single pixel equally."""
     depth = np.zeros((120, 160), np.float32)
     labels = np.zeros((120, 160), np.int32)
     rng = np.random.default_rng(3)
@@ -96,7 +96,7 @@ def two_boards() -> tuple[Frame, Any, Any]:
 
 
 def test_what_the_colour_camera_does_not_see_gets_no_mask() -> None:
-    """From 20 cm to the left the near board covers more of the far one: it must not be painted."""
+    """From 20 cm to the left, the near board hides more of the far one: no mask there."""
     frame, near, far = two_boards()
     lens = LensCamera(Camera(320, 240, 280.0, 282.0, 160.6, 117.8))
     shift = Pose(np.eye(3), np.array([0.2, 0.0, 0.0]))  # the colour camera is to the left
@@ -113,7 +113,7 @@ def test_what_the_colour_camera_does_not_see_gets_no_mask() -> None:
 
 
 def test_masks_have_no_holes_of_pixels_but_those_of_the_object() -> None:
-    """Finer images than the depth have gaps between its pixels; a handle's hole is none of them."""
+    """A colour image finer than the depth has gaps to close; a hole in a handle is not a gap."""
     depth = np.full((120, 160), 1.0, np.float32)
     ring = np.zeros(depth.shape, bool)
     ring[30:90, 40:110] = True
@@ -137,7 +137,7 @@ def test_masks_have_no_holes_of_pixels_but_those_of_the_object() -> None:
 
 
 def test_masks_of_two_objects_never_share_a_pixel_nor_swallow_the_table() -> None:
-    """Closing gaps must not join what stands side by side, nor what the table separates."""
+    """Closing gaps must not join neighbouring objects, nor objects across the table."""
     seen = np.zeros((20, 40), np.int32)
     seen[5:15, 5:15], seen[5:15, 17:27] = 1, 2
     seen[9, 10] = seen[10, 20] = 0  # a pixel each
@@ -148,7 +148,7 @@ def test_masks_of_two_objects_never_share_a_pixel_nor_swallow_the_table() -> Non
 
 
 def test_parts_of_an_object_are_united() -> None:
-    """A track that a person merged has one mask."""
+    """A merged track has a single mask."""
     seen = np.zeros((20, 40), np.int32)
     seen[2:6, 3:9], seen[10:13, 20:31] = 1, 2
     one, two = labelled_masks(seen, label_boxes(seen, 2))
@@ -160,7 +160,7 @@ def test_parts_of_an_object_are_united() -> None:
 
 
 def picture_of_a_box(colour: tuple[int, int, int]) -> tuple[Any, Any]:
-    """Return a grainy image of a box of a colour, rows 20 to 59 and columns 30 to 69, and which."""
+    """Return a grainy image of a coloured box, rows 20 to 59 and columns 30 to 69, and its mask."""
     rng = np.random.default_rng(1)
     inside = np.zeros((80, 100), bool)
     inside[20:60, 30:70] = True
@@ -170,7 +170,7 @@ def picture_of_a_box(colour: tuple[int, int, int]) -> tuple[Any, Any]:
 
 @pytest.mark.parametrize(("top", "left"), [(18, 32), (22, 28), (18, 27)])
 def test_outlines_move_to_the_edges_of_the_colours(top: int, left: int) -> None:
-    """A mask two or three pixels beside its object teaches a wrong outline."""
+    """A mask two or three pixels off its object teaches a wrong outline."""
     pixels, inside = picture_of_a_box((170, 90, 60))
     (mask,) = snapped([Mask(left, top, np.ones((40, 40), bool))], pixels)
     wrong = mask.full(80, 100) ^ inside
@@ -180,7 +180,7 @@ def test_outlines_move_to_the_edges_of_the_colours(top: int, left: int) -> None:
 
 
 def test_outlines_stay_where_both_sides_look_alike() -> None:
-    """Depth tells a white cup from a white table; colours must not move its outline at random."""
+    """Depth separates a white cup from a white table; colour noise must not move its outline."""
     pixels, _ = picture_of_a_box((120, 130, 140))
     before = Mask(28, 22, np.ones((40, 40), bool))
     (mask,) = snapped([before], pixels)
@@ -189,7 +189,7 @@ def test_outlines_stay_where_both_sides_look_alike() -> None:
 
 
 def test_masks_side_by_side_share_no_pixel_when_they_move() -> None:
-    """Each looks for its edge by itself: what one takes, the other must not."""
+    """Outlines move independently, so two masks could claim the same pixel."""
     pixels, inside = picture_of_a_box((170, 90, 60))
     left = Mask(30, 20, np.ones((40, 17), bool))
     right = Mask(47, 20, np.ones((40, 23), bool))
@@ -208,7 +208,7 @@ def test_masks_side_by_side_share_no_pixel_when_they_move() -> None:
 def test_masks_agree_with_what_the_simulated_colour_camera_sees(
     tmp_path: Path, sensor: Literal["kinect", "realsense"]
 ) -> None:
-    """The whole chain: lens, transform, occlusion, sensor faults; truth by the renderer."""
+    """End to end: lens, transform, occlusion and sensor errors, against the rendered truth."""
     from shapecat.simulation import simulate  # noqa: PLC0415  slow to load
 
     scores = []
@@ -221,7 +221,7 @@ def test_masks_agree_with_what_the_simulated_colour_camera_sees(
 
 
 def overlaps(path: Path) -> list[float]:
-    """Return the intersection over union of the mask of each object with what is true."""
+    """Return the intersection over union of the mask of each object with its true mask."""
     from shapecat.recordings import choose_streams, open_recording  # noqa: PLC0415  slow to load
     from shapecat.recordings.colour_frames import frames_with_colour  # noqa: PLC0415  the same
     from shapecat.recordings.colour_streams import choose_colour  # noqa: PLC0415  the same

@@ -1,4 +1,4 @@
-"""Colour in a run: its masks, the review, the annotated recording."""
+"""Colour in a run: its masks, the review, and the annotated recording."""
 
 import json
 import shutil
@@ -65,7 +65,7 @@ def recorded(path: Path, topic: str) -> list[tuple[int, Any]]:
 
 
 def test_masks_of_the_run_are_where_the_objects_are(run: Path) -> None:
-    """From recording to table: every clear object of the truth has its mask in every image."""
+    """From recording to table: every clearly visible object has its mask in every image."""
     source = run.parents[1] / "table.mcap"
     truth = np.load(source.with_suffix(".color_labels.npz"))["labels"]
     found = list(read_masks(run))
@@ -84,7 +84,7 @@ def test_masks_of_the_run_are_where_the_objects_are(run: Path) -> None:
 
 
 def test_boxes_of_the_table_are_those_of_its_masks(run: Path) -> None:
-    """Annotations use the boxes alone, exports the masks: they must not disagree."""
+    """Annotations use the boxes, exports the masks: the two must agree."""
     _, masks = next(iter(read_masks(run)))
     for number, box in masks.boxes.items():
         assert mask_of(masks, [number]).box == box
@@ -95,7 +95,7 @@ def test_boxes_of_the_table_are_those_of_its_masks(run: Path) -> None:
 
 
 def test_the_review_holds_images_as_they_came_and_boxes_of_the_tracks(run: Path) -> None:
-    """A second compression would blur what people look at; a wrong box misleads them.
+    """Compressing twice would blur the images; a wrong box misleads the reviewer.
 
     Every frame whose scene is drawn has its own image.
     """
@@ -126,7 +126,7 @@ def test_the_review_holds_images_as_they_came_and_boxes_of_the_tracks(run: Path)
 
 @pytest.mark.parametrize("wanted", [(1,), (0, 3), (2, 3), (0, 1, 2, 3)])
 def test_frames_that_are_read_alone_keep_their_own_image(run: Path, wanted: Sequence[int]) -> None:
-    """The images between frames are not read: none may take the place of another."""
+    """Images between the wanted frames are skipped; none may replace another."""
     finished = read_finished(run)
     of_frame = {frame: masks for (_, frame), masks in read_masks(run)}
     frames = (frame for frame in finished.frames() if frame.index in wanted)
@@ -147,7 +147,7 @@ def _rows(run: Path, entity: str) -> list[dict[str, Any]]:
 
 
 def test_annotations_on_images_have_the_stamp_and_frame_of_the_image(run: Path) -> None:
-    """Foxglove draws what has the very stamp of the image, and nothing else."""
+    """Foxglove draws only annotations with exactly the timestamp of the image."""
     images = recorded(run / "annotated.mcap", IMAGES)
     found = recorded(run / "annotated.mcap", "/shapecat/detections_2d")
     drawn = recorded(run / "annotated.mcap", "/shapecat/image_annotations")
@@ -190,7 +190,7 @@ def test_colours_of_a_loose_cloud_are_not_annotated_as_an_image(
 
 
 def test_corrections_reach_the_images(run: Path, tmp_path: Path) -> None:
-    """A deleted track must go from the images too, and the masks are not made again for it."""
+    """A deleted track must vanish from the images, although masks are not computed again."""
     folder = tmp_path / "table"
     shutil.copytree(run, folder)
     relabel(folder, {1: "delete", 2: "wine glass"})
@@ -207,7 +207,7 @@ def test_corrections_reach_the_images(run: Path, tmp_path: Path) -> None:
 def test_colour_can_be_left_out_and_a_wrong_topic_is_refused(
     run: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, shapecat: Callable[..., Result]
 ) -> None:
-    """Who names a topic that holds no images learns so before the work, not after."""
+    """A topic without images must be refused before the work begins, not after."""
     monkeypatch.setattr("shapecat.pipeline.load_model", lambda _path: Guesser())
     source = run.parents[1] / "table.mcap"
     process(Job(source=source, folder=tmp_path / "a", color="", rrd=False, end_s=0.04))
@@ -223,7 +223,7 @@ def test_colour_can_be_left_out_and_a_wrong_topic_is_refused(
 def test_masks_do_not_depend_on_processes_and_survive_an_interruption(
     run: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """Masks are found in any process, and wait in segments with the other tables."""
+    """Any process may compute masks, and segments store them with the other tables."""
     sent = []
 
     def elsewhere(*parts: Any) -> Callable[[Any], Any]:
@@ -299,7 +299,7 @@ def test_annotations_in_json_and_protobuf_say_the_same() -> None:
 
 
 def test_run_lengths_are_those_of_coco_and_come_back() -> None:
-    """Whoever trains reads column by column; a row-wise mask would be noise."""
+    """Training code reads masks column by column; a row-wise mask would be noise."""
     rng = np.random.default_rng(5)
     for height, width in ((7, 9), (1, 6), (6, 1), (40, 31)):
         for share in (0.0, 0.3, 0.8, 1.0):
@@ -325,7 +325,7 @@ def test_run_lengths_are_those_of_coco_and_come_back() -> None:
 
 
 def test_a_damaged_image_costs_the_review_only_itself(tmp_path: Path) -> None:
-    """The size of a file may be right and its content not: the frame is shown without colour."""
+    """A file may state the right size and be damaged: the frame is shown without colour."""
     whole = png(gradient())
     half, views = len(whole) // 2, []
     for k, data in enumerate((whole[:half] + bytes(20) + whole[half + 20 :], whole)):

@@ -1,4 +1,4 @@
-"""What the commands say, with numbers worked out by hand."""
+"""Outputs of the commands, with numbers worked out by hand."""
 
 import json
 import re
@@ -35,7 +35,7 @@ def ended(name: str, *, processed: bool | None, warnings: tuple[str, ...] = ()) 
 
 
 def test_time_left_is_that_of_the_bytes_that_are_left(monkeypatch: pytest.MonkeyPatch) -> None:
-    """What was complete before took no time; what failed was read all the same."""
+    """Recordings that were already complete took no time; failed ones were still read."""
     now = 100.0
     monkeypatch.setattr("shapecat.cli.progress.time.monotonic", lambda: now)
     tasks = [task("a", size=100), task("b", size=300), task("c", "complete", 7000), task("d")]
@@ -52,14 +52,14 @@ def test_time_left_is_that_of_the_bytes_that_are_left(monkeypatch: pytest.Monkey
 
 
 def test_time_left_is_read_as_hours_minutes_and_seconds() -> None:
-    """An hour and five minutes are not an hour and a half."""
+    """An hour and five minutes must not be shown as 1.5 hours."""
     words = [PROGRESS._duration(seconds) for seconds in (3903.4, 36_000, 125, 59.6, -2)]
 
     assert words == ["1:05:03", "10:00:00", "2:05", "1:00", "0:00"]
 
 
 def test_closing_table_is_in_the_order_of_the_plan(capsys: pytest.CaptureFixture[str]) -> None:
-    """Recordings end in any order; the table is compared with the list that was given."""
+    """Recordings finish in any order; users compare the table with their list."""
     tally = PROCESS._Tally(keep_all=False)
     for name, frames in (("b", 20), ("c", None), ("a", 3)):
         counts = {"frames": frames, "tracks": {"cup": 2}}
@@ -82,7 +82,7 @@ def test_closing_table_is_in_the_order_of_the_plan(capsys: pytest.CaptureFixture
 def test_closing_table_lists_a_hundred_recordings_or_none(
     capsys: pytest.CaptureFixture[str], count: int, listed: int
 ) -> None:
-    """A table that lacks some of them would be taken for all."""
+    """Users would take an incomplete table for a complete one."""
     names = [f"r{k}" for k in range(count)]
     tally = PROCESS._Tally(keep_all=False)
     for name in names:
@@ -103,7 +103,7 @@ def test_closing_table_lists_a_hundred_recordings_or_none(
 def test_nothing_that_a_simulation_writes_is_replaced_unasked(
     shapecat: Run, tmp_path: Path, name: str
 ) -> None:
-    """Also the truth beside a recording, which somebody may have moved elsewhere."""
+    """Nor the ground truth, even if the recording itself was moved elsewhere."""
     (tmp_path / name).write_text("mine")
     found = shapecat("simulate", tmp_path / "a.mcap", "--color", "--frames", 1)
 
@@ -125,7 +125,7 @@ def test_an_empty_time_range_is_refused(
 
 
 def test_one_recording_is_not_that_of_several_runs(shapecat: Run, tmp_path: Path) -> None:
-    """A folder of runs is several runs, too."""
+    """A folder of runs also counts as several runs."""
     for name in ("a", "b"):
         (tmp_path / "runs" / name).mkdir(parents=True)
         (tmp_path / "runs" / name / "run.json").write_text("{}")
@@ -158,7 +158,7 @@ def test_categories_are_counted_from_the_most_frequent() -> None:
 
 
 def test_info_tells_some_unreadable_recordings_from_all(shapecat: Run, tmp_path: Path) -> None:
-    """A script goes on at exit code 1, with those that it can read."""
+    """With exit code 1 a script continues with the readable recordings."""
     good = record(tmp_path / "good.mcap", 1)
     (tmp_path / "bad.mcap").write_bytes(b"no recording")
 
@@ -172,7 +172,7 @@ def test_info_tells_some_unreadable_recordings_from_all(shapecat: Run, tmp_path:
 
 
 def test_info_tells_what_is_in_a_recording(capsys: pytest.CaptureFixture[str]) -> None:
-    """A megabyte is a million bytes, as for `ls --si` and in the other outputs."""
+    """A megabyte is a million bytes, as in `ls --si` and the other outputs."""
     topics = [
         {"name": "/d", "type": "sensor_msgs/Image", "encoding": "cdr", "count": 61,
          "use": "depth stream"},
@@ -197,7 +197,7 @@ def test_info_tells_what_is_in_a_recording(capsys: pytest.CaptureFixture[str]) -
 def test_events_tell_zeros_and_leave_out_what_is_unknown(
     capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """A program that waits for ``exit_code`` would take a success for still running."""
+    """A program that waits for ``exit_code`` would miss a success."""
     now = 100.0
     monkeypatch.setattr("shapecat.cli.progress.time.monotonic", lambda: now)
     tasks = [task("a", size=700), task("b", "retry", 40), task("c", "complete", 3), task("d")]
@@ -239,7 +239,7 @@ def test_events_tell_zeros_and_leave_out_what_is_unknown(
 
 
 def test_a_few_warnings_about_new_results_are_printed(capsys: pytest.CaptureFixture[str]) -> None:
-    """A thousand damaged recordings may have ten each; those of earlier runs were printed then."""
+    """A thousand damaged recordings may have ten each; earlier runs printed theirs."""
     progress = PROGRESS.Progress([task("a"), task("b"), task("c")])
     progress.ended(ended("a", processed=True, warnings=tuple("stuvw")))
     progress.ended(ended("b", processed=False, warnings=("old",)))
@@ -254,7 +254,7 @@ def test_a_few_warnings_about_new_results_are_printed(capsys: pytest.CaptureFixt
 def test_lines_tell_what_is_done_running_and_left(
     capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """At most one line in five seconds. The time left is that of the bytes that are not read."""
+    """At most one line in five seconds; the time left follows from the unread bytes."""
     now = 100.0
     monkeypatch.setattr("shapecat.cli.progress.time.monotonic", lambda: now)
     progress = PROGRESS.PlainProgress([task("a", size=100), task("b", size=300), task("c")])
@@ -320,7 +320,7 @@ CALLS = {
 def test_options_reach_the_work_and_its_answer_the_reader(
     shapecat: Run, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, line: str
 ) -> None:
-    """An option that is lost on the way changes a result without a word."""
+    """A lost option silently changes a result."""
     work, words, options, answer, said = CALLS[line]
     calls = []
 
@@ -341,7 +341,7 @@ def test_options_reach_the_work_and_its_answer_the_reader(
 def test_annotate_tells_what_was_written_and_which_labels_were_not_transferred(
     shapecat: Run, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """Labels that silently stay behind would be taken for applied."""
+    """Users would believe that silently dropped labels were applied."""
     calls = []
     missed = [{"old_track": 17, "label": "tea pot", "reason": "no object there"}]
     answer = {"transferred": [{}] * 5, "not_transferred": missed, "by": TABLE_ALONE}
@@ -405,7 +405,7 @@ def test_process_tells_where_labels_are_that_were_not_transferred(
 def test_a_name_that_contradicts_the_format_is_told_the_right_one(
     shapecat: Run, tmp_path: Path, name: str, container: str, said: str
 ) -> None:
-    """Written all the same, no program would open it."""
+    """No program would open a file with the wrong suffix."""
     found = shapecat("simulate", tmp_path / name, "--format", container)
 
     assert found.exit_code == 2

@@ -1,4 +1,4 @@
-"""`shapecat compare` at the door: figures, the table, the page, plain refusals."""
+"""`shapecat compare` end to end: metrics, the table, the page, clear error messages."""
 
 import base64
 import io
@@ -74,7 +74,7 @@ FINAL = {1: "cup", 2: "can", 3: "box", 4: "cup"}
 
 
 def write_run(folder: Path, *, digest: str = "one", shift_ns: int = 0) -> Path:
-    """Write the tables of a run of three frames by hand; the recording is nowhere."""
+    """Write the tables of a run of three frames by hand; there is no recording."""
     folder.mkdir(parents=True)
     stamps = [START + shift_ns + STEP * k for k in range(3)]
     none: dict[str, Any] = dict.fromkeys(FRAMES.names)
@@ -118,7 +118,7 @@ def true_objects() -> list[dict[str, Any]]:
 
 
 def write_truth(folder: Path) -> Path:
-    """Write truth as the simulator does: a cup, a box of two parts, and a box in doubt."""
+    """Write truth as the simulator does: a cup, a box in two parts, and an ambiguous box."""
     image = np.full(SIDE * SIDE, 3, np.uint8)
     for label, pixels in ((7, CUP), (8, CAN[:8]), (9, CAN[8:]), (5, BOX)):
         image[pixels] = label
@@ -133,7 +133,7 @@ def write_truth(folder: Path) -> Path:
 
 
 def test_a_crowd_of_coco_is_no_object_to_be_named() -> None:
-    """Other tools mark with it what nobody could tell; it is found, and its category not asked."""
+    """Other tools mark ambiguous objects this way: they count as found, without a category."""
     square = [[1, 0, 3, 0, 3, 2, 1, 2]]
     annotations = [
         {"id": k, "image_id": 7, "category_id": 4, "segmentation": square, "iscrowd": k}
@@ -163,7 +163,7 @@ def truth(tmp_path: Path) -> Path:
 
 
 def test_figures_are_those_by_hand(run: Path, truth: Path) -> None:
-    """Cup 20 pixels, can 16 of which 12 are found, box 15; once missed; 2 labelled surplus."""
+    """Cup 20 pixels; can 16, of which 12 are found; box 15; one miss; 2 labelled surplus."""
     figures = compare(run, truth).figures
     shared, found, true = 3 * 20 + 3 * 12 + 2 * 15, 3 * 20 + 3 * 12 + 2 * 15 + 2, 3 * (20 + 16 + 15)
 
@@ -220,7 +220,7 @@ def test_the_table_tells_every_difference_once(shapecat: Run, run: Path, truth: 
 
 
 def test_an_identity_is_lost_once() -> None:
-    """From the frame after the switch on, the new track is the one that the object had before."""
+    """After the frame of the switch, the new track counts as the object's own."""
     tally, cup = _Tally(), Item(11, "cup")
     kinds = [_kind(tally, Item(track, "cup"), cup, 0.9) for track in (5, 5, 6, 6, 6, 5, 5)]
 
@@ -228,7 +228,7 @@ def test_an_identity_is_lost_once() -> None:
 
 
 def test_the_page_has_each_figure_in_its_place(run: Path, truth: Path) -> None:
-    """The figures are those by hand above; the table has tracks of the run, not of the truth."""
+    """The metrics are those above; the table has the tracks of the run, not of the truth."""
     found = compare(run, truth)
     values = {name.strip(): (value, meaning) for name, value, meaning in figure_rows(found)}
     rows = re.findall(r"<tr>(.*?)</tr>", format_page(found))
@@ -339,7 +339,7 @@ def test_a_page_without_differences_says_so_and_has_no_empty_table() -> None:
 
 
 def test_the_page_shows_each_number_once_and_in_its_place() -> None:
-    """All that a reader sees, in order: text, tables, and captions inside of the picture."""
+    """All visible content, in order: text, tables, and captions in the picture."""
     page = format_page(worked())
     figures, rows = (
         [re.findall(r"<t[hd]>(.*?)</t[hd]>", row) for row in re.findall(r"<tr>(.*?)</tr>", table)]
@@ -389,7 +389,7 @@ def test_the_page_shows_each_number_once_and_in_its_place() -> None:
 
 
 def test_the_table_has_each_number_in_its_column(tmp_path: Path) -> None:
-    """Read by another program, which knows the columns by their names."""
+    """Other programs read the table by its column names."""
     found = worked()
     write_comparison(tmp_path / "out", found)
     rows = pq.read_table(tmp_path / "out" / "objects.parquet").to_pylist()
@@ -412,7 +412,7 @@ def test_the_table_has_each_number_in_its_column(tmp_path: Path) -> None:
     ],
 )
 def test_an_image_is_of_the_frame_that_its_name_says(name: str, key: tuple[str, int]) -> None:
-    """Names begin with numbers of sessions and cameras; a stamp is told by its size."""
+    """Names may begin with session and camera numbers; a timestamp is recognised by its size."""
     images = [{"id": 1, "file_name": name, "width": 4, "height": 3}]
     labels = CocoLabels(Path("x.json"), {"categories": [], "annotations": [], "images": images})
 
@@ -421,7 +421,7 @@ def test_an_image_is_of_the_frame_that_its_name_says(name: str, key: tuple[str, 
 
 
 def test_truth_of_every_other_frame_is_that_of_the_same_image(tmp_path: Path) -> None:
-    """A run of every n-th frame skips label images, which are read forward."""
+    """A run of every n-th frame must skip label images, which are read sequentially."""
     images = np.zeros((6, 3, 4), np.uint8)
     for k in range(6):
         images[k].flat[k + 2] = 7
@@ -456,7 +456,7 @@ def test_the_picture_of_a_part_is_that_of_its_worst_frame() -> None:
 
 
 def half_spaces(box: Box) -> np.ndarray:
-    """Return the sides (6, 4) of a box as SciPy has them: a x + b y + c z + d <= 0."""
+    """Return the sides (6, 4) of a box in SciPy's form: a x + b y + c z + d <= 0."""
     axes = Rotation.from_quat(box.orientation).as_matrix().T
     normals = np.concatenate([axes, -axes])
     offsets = -normals @ box.center - np.tile(box.size / 2, 2)
@@ -464,7 +464,7 @@ def half_spaces(box: Box) -> np.ndarray:
 
 
 def test_overlap_of_turned_boxes_is_that_of_their_half_spaces() -> None:
-    """Boxes turned about any axis, of which some do not meet; SciPy is the oracle."""
+    """Boxes rotated about any axis, some of them disjoint, compared with SciPy."""
     rng, met = np.random.default_rng(5), 0
     for _ in range(60):
         a, b = (
@@ -542,7 +542,7 @@ def test_depth_behind_the_masks_is_bright_where_it_is_near_and_faces_the_camera(
 
 @pytest.mark.parametrize(("shift", "iou"), [(0.2, 1 / 3), (0.23, 17 / 63), (0.25, None)])
 def test_boxes_are_matched_from_a_quarter_of_overlap_on(shift: float, iou: float | None) -> None:
-    """Hidden sides are estimates, so that masks would need more. Without masks, pairs have no F."""
+    """Hidden sides are estimates, so the limit is lower than for masks. Boxes have no F."""
     size, still = np.array([0.4, 0.2, 0.3]), np.array([0, 0, 0, 1])
     found = [Item(5, "cup", box=Box(np.array([0.1 + shift, 0.2, 1]), size, still))]
     true = [Item(None, "can"), Item(1, "cup", box=Box(np.array([0.1, 0.2, 1]), size, still))]
@@ -556,7 +556,7 @@ def test_boxes_are_matched_from_a_quarter_of_overlap_on(shift: float, iou: float
 def test_frames_of_one_side_alone_are_told_with_that_side(
     shapecat: Run, run: Path, truth: Path
 ) -> None:
-    """Swapped, they would send the reader to look for the gap in the wrong place."""
+    """Swapped, they would send the user looking for the gap in the wrong run."""
     entries = json.loads(truth.read_text())
     later = [{**entries[0], "stamp_ns": START + STEP * k} for k in (5, 6, 7, 8)]
     truth.write_text(json.dumps([*entries[:2], *later]))
@@ -565,7 +565,7 @@ def test_frames_of_one_side_alone_are_told_with_that_side(
 
 
 def test_an_object_in_doubt_has_no_wrong_category(run: Path, truth: Path) -> None:
-    """Nobody could tell what it is from this side, so that no answer is a difference."""
+    """From this side the category is undecidable, so no answer counts as a difference."""
     table = run / "tracks.csv"
     table.write_text(table.read_text().replace("3,box,0.9,", "3,can,0.9,"))
 
@@ -574,7 +574,7 @@ def test_an_object_in_doubt_has_no_wrong_category(run: Path, truth: Path) -> Non
 
 @pytest.mark.parametrize("overlaps", [(0.2, 0.8), (0.8, 0.2)])
 def test_a_track_in_two_pieces_is_judged_by_the_better_one(overlaps: tuple[float, float]) -> None:
-    """Otherwise a splinter would cost the identity of an object that is found."""
+    """Otherwise a fragment would cost a found object its identity."""
     pieces = [Item(5, "cup"), Item(None, "cup"), Item(5, "cup")]
     similarity = np.array([[overlaps[0]], [0.9], [overlaps[1]]])
     seen = seen_together(pieces, [Item(1, "cup")], Matched({}, similarity, None, None))
@@ -692,7 +692,7 @@ def test_a_slanted_polygon_has_its_area() -> None:
 def test_kitti_boxes_come_back_from_a_tilted_camera(
     shapecat: Run, guessed_run: Path, tmp_path: Path
 ) -> None:
-    """What was exported is read back: a wrong axis or half a height would cost overlap."""
+    """Boxes survive export and re-reading: a wrong axis or half a height would cost overlap."""
     done = shapecat("export", guessed_run, "--format", "kitti", "--out", tmp_path / "kitti")
     assert done.exit_code == 0, done.stderr
     labels = next((tmp_path / "kitti").iterdir())
@@ -722,7 +722,7 @@ def test_types_of_kitti_are_the_categories_of_the_run(run: Path) -> None:
 
 
 def test_labels_of_two_topics_are_not_mixed(tmp_path: Path) -> None:
-    """Cameras that are triggered together give frames of the same stamps and numbers."""
+    """Cameras triggered together give frames with equal stamps and numbers."""
     topics = {"/left": "cup", "/right": "wine glass", "/top": None}
     images = [
         {"id": k, "topic": topic, "stamp_ns": START, "file_name": "x", "width": 4, "height": 3}
@@ -789,7 +789,7 @@ def test_refusals_say_what_was_found_and_what_to_try(
 
 
 def test_a_part_split_off_is_seen_in_the_picture() -> None:
-    """Drawn from unions of masks, an object in two halves looked as if all were right."""
+    """With unions of masks, an object in two halves would look correct."""
     true = Labelling((Item(1, "cup", np.arange(0, 60)),), None, (10, 10))
     halves = (Item(5, "can", np.arange(0, 40)), Item(6, "cup", np.arange(40, 70)))
     head = ("/d", 0, START)

@@ -1,4 +1,4 @@
-"""Whole boxes, from one side and from several, of cylinders, boxes and balls of known size."""
+"""Full boxes, from one view and several, of cylinders, boxes and balls of known size."""
 
 from pathlib import Path
 
@@ -32,7 +32,7 @@ def sure(category: str) -> np.ndarray:
 
 
 def estimate(surface: np.ndarray, normals: np.ndarray, category: str) -> FullBox:
-    """Complete what a camera sees of a convex surface (n, 3) that stands at `PLACE`."""
+    """Complete the visible part of a convex surface (n, 3) that stands at `PLACE`."""
     points = surface + PLACE
     seen = points[(normals * points).sum(axis=1) < 0] @ LEVEL
     return complete(seen.astype(np.float32), UP, PLACE[2], sure(category), CATEGORIES)
@@ -61,7 +61,7 @@ def cuboid(size: np.ndarray, yaw: float) -> tuple[np.ndarray, np.ndarray]:
 
 
 def test_the_hidden_half_of_a_can_is_its_seen_half() -> None:
-    """Its top shows all of its width, but a camera below the top must not halve it."""
+    """The top shows its whole width; a camera below the top must not halve it."""
     points, normals = cylinder(0.034, 0.12)
     side = normals[:, 2] == 0
     box = estimate(points[side], normals[side], "can")
@@ -93,7 +93,7 @@ def test_a_box_with_an_odd_yaw_keeps_its_lengths() -> None:
 
 
 def test_noise_of_a_flat_side_does_not_bring_a_box_nearer() -> None:
-    """The farthest of many noisy points lie before the side; the far edge has few of them."""
+    """The farthest of many noisy points lie in front of the side; the far edge has few."""
     size = np.array([0.16, 0.1, 0.2])
     points, normals = cuboid(size, np.pi / 2 - 0.24)
     rays = (points + PLACE) / np.linalg.norm(points + PLACE, axis=1)[:, None]
@@ -106,7 +106,7 @@ def test_noise_of_a_flat_side_does_not_bring_a_box_nearer() -> None:
 
 
 def test_a_ball_that_is_hidden_in_part_stays_round() -> None:
-    """What something before it leaves of a ball is no circle."""
+    """The visible part of an occluded ball is not a circle."""
     normals = RNG.normal(size=(8000, 3))
     normals /= np.linalg.norm(normals, axis=1)[:, None]
     shown = normals[:, 0] > -0.4
@@ -116,7 +116,7 @@ def test_a_ball_that_is_hidden_in_part_stays_round() -> None:
 
 
 def test_what_an_occluder_hides_below_is_part_of_the_box() -> None:
-    """Something that stands reaches down to its support, and is less sure to."""
+    """A standing object reaches down to its support, with a larger deviation."""
     points, normals = cylinder(0.04, 0.2)
     top = points[:, 2] > 0.12
     box, hidden = (
@@ -129,7 +129,7 @@ def test_what_an_occluder_hides_below_is_part_of_the_box() -> None:
 
 
 def test_a_bottle_that_lies_is_not_as_wide_as_long() -> None:
-    """A circle around its length would be four times its footprint."""
+    """A circle around its length would have four times its footprint."""
     points, normals = cylinder(0.035, 0.25)
     lying = points[:, [2, 0, 1]] + [-0.125, 0, 0.035]
     box = estimate(lying, normals[:, [2, 0, 1]], "bottle")
@@ -159,13 +159,13 @@ def about_z(yaw: float) -> np.ndarray:
 
 
 def rectangular(size: np.ndarray) -> np.ndarray:
-    """Return how far a rectangle reaches from its middle in each direction."""
+    """Return the extent of a rectangle from its centre in each direction."""
     angles = np.arange(DIRECTIONS) * (2 * np.pi / DIRECTIONS)
     return np.asarray(abs(np.cos(angles)) * size[0] / 2 + abs(np.sin(angles)) * size[1] / 2)
 
 
 def views_of(centers: np.ndarray, axes: np.ndarray, sizes: np.ndarray) -> BoxViews:
-    """Return views, from all around, of boxes whose outlines are seen."""
+    """Return views from all sides of boxes with visible outlines."""
     outlines = np.stack([rectangular(size) for size in sizes])
     around = np.linspace(0, 2 * np.pi, len(centers), endpoint=False)
     sensors = centers + np.stack([np.cos(around), np.sin(around), np.ones(len(centers))], axis=1)
@@ -199,7 +199,7 @@ def test_views_agree_on_one_size_whatever_their_quarter_turns() -> None:
 
 
 def test_views_of_a_part_cut_nothing_off_that_whole_views_show() -> None:
-    """Behind an occluder half of a box is seen, from a side that the other views do not face."""
+    """Behind an occluder, half of a box is seen from a side that no other view faces."""
     sizes = np.array([[0.2, 0.1, 0.3]] * 5 + [[0.16, 0.1, 0.3]] * 9)
     centers = np.array([[0.0, 0, 0]] * 5 + [[-0.02, 0, 0]] * 9)
     views = views_of(centers, np.tile(np.eye(3), (14, 1, 1)), sizes)
@@ -211,7 +211,7 @@ def test_views_of_a_part_cut_nothing_off_that_whole_views_show() -> None:
 
 
 def test_a_view_from_where_the_object_was_moved_to_keeps_its_place() -> None:
-    """And its yaw; its length and width are those of the others, whichever way around."""
+    """It also keeps its yaw; length and width are those of the other views."""
     centers, sizes = np.zeros((7, 3)), np.tile([0.2, 0.1, 0.3], (7, 1))
     centers[5:], axes = [0.4, 0.1, 0], np.tile(np.eye(3), (7, 1, 1))
     sizes[6], axes[6] = [0.1, 0.2, 0.3], about_z(0.5)
@@ -224,7 +224,7 @@ def test_a_view_from_where_the_object_was_moved_to_keeps_its_place() -> None:
 
 
 def test_the_sides_that_several_views_show_make_an_oval_whole() -> None:
-    """An oval bottle looks round from each side; only from around does it show its two widths."""
+    """An oval bottle looks round from each side; only all views show its two widths."""
     points, normals = cylinder(1.0, 0.25)
     wall = normals[:, 2] == 0
     oval = points[wall] * [0.045, 0.033, 1.0]
@@ -251,7 +251,7 @@ def test_the_sides_that_several_views_show_make_an_oval_whole() -> None:
 
 
 def test_the_handle_of_a_cup_is_in_its_box() -> None:
-    """It is seen beside the cup; an oval around the rest alone would cut it off."""
+    """It is seen beside the cup; an oval around the body alone would cut it off."""
     points, normals = cylinder(0.04, 0.1)
     wall = normals[:, 2] == 0
     tips = np.stack([np.full(60, -0.068), RNG.normal(0, 0.003, 60), RNG.uniform(0.03, 0.07, 60)], 1)
@@ -295,7 +295,7 @@ def test_a_track_has_one_full_size(guessed_run: Path) -> None:
 
 
 def test_a_quarter_turn_exchanges_length_and_width() -> None:
-    """Half of the views call the longer side the second one: the box stays the same box."""
+    """Half of the views swap the longer and shorter side: the box is the same."""
     size, yaw = np.array([0.06, 0.15, 0.2]), 0.3
     turns = [yaw + np.pi / 2 * (k % 2) for k in range(6)]
     sizes = np.array([size[[1, 0, 2]] if k % 2 else size for k in range(6)])
@@ -312,7 +312,7 @@ def test_a_quarter_turn_exchanges_length_and_width() -> None:
 
 
 def test_many_views_of_one_side_do_not_make_its_size_certain() -> None:
-    """They share what they cannot see, so that the deviation never falls to a few micrometres."""
+    """All views miss the same side, so the deviation must not fall to a few micrometres."""
     stds = []
     for count in (1, 400):
         sizes, axes = np.tile([0.2, 0.1, 0.3], (count, 1)), np.tile(np.eye(3), (count, 1, 1))
@@ -324,7 +324,7 @@ def test_many_views_of_one_side_do_not_make_its_size_certain() -> None:
 
 
 def test_the_views_that_tell_the_size_are_spread_over_the_track() -> None:
-    """An object that is walked around shows its other side in the end."""
+    """A camera that walks around an object sees its other side only at the end."""
     some = _spread(7000)
 
     assert (len(some), some[0], some[-1]) == (1000, 0, 6999)

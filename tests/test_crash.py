@@ -1,4 +1,4 @@
-"""A run that is killed at any moment leaves nothing or all of it, and the next run goes on."""
+"""A run killed at any moment leaves nothing or all of its results, and the next one resumes."""
 
 import os
 import resource
@@ -45,7 +45,7 @@ def assert_same_tables(a: Path, b: Path) -> None:
 
 
 def counts(folder: Path) -> dict[str, Any]:
-    """Return what a run counts, besides what an interrupted one had done."""
+    """Return a run's counts, excluding those that an interrupted run contributed."""
     return {name: n for name, n in read_run(folder)["counts"].items() if name != "resumed"}
 
 
@@ -59,7 +59,7 @@ def recording(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 def kill_after(arguments: list[str], begun: Path, seconds: float) -> bool:
-    """Kill a run so long after a file or folder has appeared; tell whether it was still alive."""
+    """Kill a run some time after a file or folder appears; return whether it was still alive."""
     running = subprocess.Popen(arguments, stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL)
     while running.poll() is None and not begun.exists():
         time.sleep(0.005)
@@ -73,7 +73,7 @@ def kill_after(arguments: list[str], begun: Path, seconds: float) -> bool:
 
 
 def survive_kills(recording: Path, out: Path, undisturbed: Path, moments: list[float]) -> int:
-    """Kill runs at some moments of their work; check the place after each; then finish."""
+    """Kill runs at some moments, check the folder after each kill, then finish."""
     killed = 0
     for moment in moments:
         killed += kill_after(command(recording, out), out / ".table.partial", moment)
@@ -88,7 +88,7 @@ def survive_kills(recording: Path, out: Path, undisturbed: Path, moments: list[f
 def test_killed_run_goes_on_where_it_stopped(
     recording: Path, undisturbed: Path, tmp_path: Path
 ) -> None:
-    """Killed once while it perceives: only frames of the unfinished segment are seen twice."""
+    """Killed while perceiving: only frames of the unfinished segment are perceived again."""
     segment = tmp_path / ".table.partial" / "segments" / "000000"
     assert kill_after(command(recording, tmp_path), segment, 0.0)
     assert not (tmp_path / "table").exists()
@@ -101,7 +101,7 @@ def test_killed_run_goes_on_where_it_stopped(
 
 
 def test_kills_at_random_moments(recording: Path, undisturbed: Path, tmp_path: Path) -> None:
-    """Soon after the work has begun, so that no kill comes too late to be one."""
+    """Early in the work, so that every kill interrupts something."""
     moments = np.random.default_rng(1).uniform(0, 0.3, 3).tolist()
 
     assert survive_kills(recording, tmp_path, undisturbed, moments) == len(moments)
@@ -142,7 +142,7 @@ def test_what_other_settings_left_is_discarded(
 def test_phases_that_are_done_are_not_repeated(
     recording: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, phase: str
 ) -> None:
-    """Interrupted by the keyboard in a later phase, the next run begins with that phase."""
+    """After an interrupt in a later phase, the next run begins with that phase."""
     job = Job(recording, tmp_path / "table", end_s=0.3, rrd=False)
     target = {
         "track": "shapecat.runs.tracks.track_run",
@@ -202,7 +202,7 @@ def test_two_runs_do_not_write_one_folder(recording: Path, tmp_path: Path) -> No
 def test_a_recording_that_is_still_written_to_has_no_results(
     recording: Path, tmp_path: Path
 ) -> None:
-    """Its first frames would be of one recording, and its outputs of another."""
+    """Its tables would describe an earlier state of the recording than its outputs."""
     source, out = tmp_path / "live.mcap", tmp_path / "out"
     shutil.copy(recording, source)
 
@@ -219,7 +219,7 @@ def test_a_recording_that_is_still_written_to_has_no_results(
 def test_unwritable_folder_is_one_line(
     shapecat: Callable[..., Result], recording: Path, tmp_path: Path
 ) -> None:
-    """Root may write anywhere, but not below a file."""
+    """Root may write anywhere, but not inside a file."""
     (tmp_path / "file").write_text("")
     result = shapecat("process", recording, "--out", tmp_path / "file")
 
@@ -232,7 +232,7 @@ def test_unwritable_folder_is_one_line(
 def test_full_disk_is_one_line_and_nothing_is_left(
     shapecat: Callable[..., Result], recording: Path, tmp_path: Path, limit: int
 ) -> None:
-    """A limit on the size of files stands for a disk that is full; it stops tables, or the MCAP."""
+    """A limit on the file size simulates a full disk, for tables or for the MCAP."""
     soft, hard = resource.getrlimit(resource.RLIMIT_FSIZE)
     resource.setrlimit(resource.RLIMIT_FSIZE, (limit, hard))
     try:

@@ -95,7 +95,7 @@ def describe_view(view: View, eye: F4 = EYE) -> F4:
 
 
 def test_names_and_blocks_cover_the_descriptor() -> None:
-    """A model stores names: each number has one, each block is its own run of them."""
+    """A model stores names, so each number needs one, and blocks must not overlap."""
     assert len(set(DESCRIPTOR_NAMES)) == len(DESCRIPTOR_NAMES) == len(describe_view(ball()))
     end = 0
     for block, part in BLOCKS.items():
@@ -106,7 +106,7 @@ def test_names_and_blocks_cover_the_descriptor() -> None:
 
 
 def scattered(seed: int) -> F4:
-    """Describe points and links thrown about: they reach the bins that plain shapes leave empty."""
+    """Describe random points and links: they reach bins that plain shapes leave empty."""
     rng = np.random.default_rng(seed)
     points = (rng.normal(size=(400, 3)) * np.power((1, 0.3, 0.6), seed)).astype(np.float32)
     edges = np.argwhere(np.triu(rng.random((30, 30)) < 0.12, 1))
@@ -114,7 +114,7 @@ def scattered(seed: int) -> F4:
 
 
 def test_every_number_can_change() -> None:
-    """A slot that nothing writes."""
+    """Guards against a component that is never written."""
     views = [
         *(make(seed) for make in SHAPES.values() for seed in range(2)),
         ball(hollow=True),
@@ -169,7 +169,7 @@ def test_the_order_of_points_does_not_matter() -> None:
 
 
 def test_noise_moves_the_descriptor_less_than_the_shape_does() -> None:
-    """A descriptor that tells more about the draw of the gas than about the object."""
+    """Guards against a descriptor that reflects random draws of the gas more than the object."""
     draws = {
         name: np.stack([describe_view(make(seed)) for seed in range(3)])[:, SCALE_FREE]
         for name, make in SHAPES.items()
@@ -292,7 +292,7 @@ def local_fit(view: View, radius: float) -> tuple[F4, F4]:
 
 
 def test_curvature_of_a_ball_and_of_the_inside_of_a_bowl() -> None:
-    """Sign and size: convex towards the eye is positive, whatever the normal's first guess."""
+    """Sign and size: convex towards the sensor is positive, whatever the normal's first sign."""
     normals, curvatures = local_fit(ball(), 0.025)
     assert np.median(curvatures) == pytest.approx(1 / 0.05, rel=0.15)
     out = ball().gas.neurons - [0, 0, 0.05]
@@ -309,7 +309,7 @@ def test_curvature_of_a_lying_can_is_along_one_direction() -> None:
 
 
 def test_the_axes_of_a_can_are_found_from_one_side() -> None:
-    """The middle of what is visible is not the middle of the object."""
+    """The centre of the visible part is not the centre of the object."""
     for lying in (False, True):
         view = can(lying=lying)
         x, y, z = (np.ascontiguousarray(axis) for axis in view.gas.neurons.T / 0.05)

@@ -76,7 +76,7 @@ def solid_numbers(cloud: F4, normals: F4) -> F4:
 
 @pytest.mark.parametrize("yaw", [-0.6, -0.3, 0.0])
 def test_a_box_fits_a_box_and_a_can_does_not(yaw: float) -> None:
-    """The pair that was mixed up most: their corners tell them apart even with noise."""
+    """These two were confused most often; corners distinguish them even with noise."""
     rng = np.random.default_rng(0)
     cloud, normals = seen_box(rng, yaw)
     box = solid_numbers(cloud + rng.normal(0, 0.01, cloud.shape).astype(np.float32), normals)
@@ -110,7 +110,7 @@ def outline_of(cloud: F8, eye: F4 = EYE) -> F4:
 
 
 def test_errors_along_the_line_of_sight_leave_the_outline() -> None:
-    """It is there because depth is noisy: it may not depend on it."""
+    """The outline exists because depth is noisy, so it must not depend on depth."""
     rng = np.random.default_rng(0)
     points, _ = half_cone(rng, slope=0.2)
     rays = points - EYE

@@ -1,4 +1,4 @@
-"""The documentation is held to the commands: each is explained, each printed line works."""
+"""The documentation matches the commands: each is explained, and each printed line works."""
 
 import ast
 import re

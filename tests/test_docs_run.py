@@ -62,7 +62,7 @@ def run_in_shell(lines: list[str], folder: Path) -> None:
 
 
 def run_here(line: str, shapecat: Callable[..., Result]) -> None:
-    """Run a line in this process, where libraries are loaded once; in a shell what needs one.
+    """Run a line in this process, where libraries load once; in a shell if it needs one.
 
     Recordings are processed here as well: `test_batch` and `test_executors` start processes.
     """

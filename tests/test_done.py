@@ -1,4 +1,4 @@
-"""What counts as done: only the same work on the same content, and never half a line."""
+"""Completed work is recognised: only the same work on the same content, never half a line."""
 
 import json
 import os
@@ -51,7 +51,7 @@ def planned(source: Path, **changes: Any) -> RunInfo:
 def test_a_file_that_cannot_be_read_is_not_passed_over(
     source: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """Among others without a suffix: who has no permission should hear of it when it is opened."""
+    """Among other files without a suffix, missing permissions must be reported on opening."""
     secret, note = source.with_name("secret"), source.with_name("note")
     secret.write_bytes(b"#ROSBAG V2.0\n")
     note.write_bytes(b"no recording")
@@ -95,7 +95,7 @@ CHANGES: Mapping[str, Mapping[str, Any]] = {
 
 @pytest.mark.parametrize("name", CHANGES)
 def test_other_options_are_other_work(source: Path, name: str) -> None:
-    """Results of other work under the same name would be taken for those asked for."""
+    """Results of other options under the same name would pass for the requested ones."""
     run, other = planned(source), planned(source, **CHANGES[name])
 
     assert same_options(run, planned(source))
@@ -120,7 +120,7 @@ def test_another_model_version_or_content_is_other_work(source: Path, key: str) 
 
 @pytest.mark.parametrize("name", ["color", "mcap", "rrd"])
 def test_outputs_do_not_change_what_the_tables_are_of(source: Path, name: str) -> None:
-    """So that labels of a run without a review fit one with it, which is yet another run."""
+    """Labels of a run without a review must also fit the same run with a review."""
     changed: Any = {"color": {"color": ""}, "mcap": {"mcap": False}, "rrd": {"rrd": False}}
     run, other = planned(source), planned(source, **changed[name])
 
@@ -129,7 +129,7 @@ def test_outputs_do_not_change_what_the_tables_are_of(source: Path, name: str) -
 
 
 def test_a_recording_that_was_written_to_has_changed_though_it_is_as_long(source: Path) -> None:
-    """New rights alone are no change, though they renew the time of the inode."""
+    """Changed permissions alone are no change, though they renew the inode time."""
     before = file_stats(source)
     source.chmod(0o600)
     assert unchanged(before, source)
@@ -143,7 +143,7 @@ def test_a_recording_that_was_written_to_has_changed_though_it_is_as_long(source
 
 
 def test_a_digest_that_nobody_needs_is_not_waited_for(source: Path) -> None:
-    """Left before it has begun, it is no error; left later, it does not go on in secret."""
+    """Stopped before it began, it is no error; stopped later, it must not continue."""
     with ContentDigest(source) as content:
         assert not content._thread.is_alive()
     with ContentDigest(source) as content:
@@ -194,7 +194,7 @@ def partial(folder: Path, run: RunInfo) -> None:
 
 
 def test_what_an_error_has_left_is_kept_if_it_is_work(source: Path, tmp_path: Path) -> None:
-    """A disk that is full after an hour must not cost the hour."""
+    """A full disk after an hour must not cost that hour."""
     run = planned(source)
     (tmp_path / "begun").mkdir()
     write_run(tmp_path / "begun", run)
@@ -217,7 +217,7 @@ def test_a_partial_run_of_the_same_work_goes_on(source: Path, tmp_path: Path) ->
 
 @pytest.mark.parametrize("what", ["model", "settings", "shapecat", "numpy", "content"])
 def test_a_partial_run_of_other_work_is_begun_anew(source: Path, tmp_path: Path, what: str) -> None:
-    """Half of the tables would be of another model or version."""
+    """Otherwise half of the tables would come from another model or version."""
     folder, run = tmp_path / "half", planned(source)
     if what == "model":
         run["model"] = {**run["model"], "id": "m2"}
@@ -243,7 +243,7 @@ def status_of(job: Job, source: Path, out: Path) -> str:
 def test_a_batch_takes_nothing_of_another_model_for_done(
     source: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """The plan goes by the manifest alone, without opening a file."""
+    """The plan relies on the manifest alone, without opening a file."""
     (source.parent / "other.mcap").write_bytes(b"another")
     out, job = tmp_path / "out", Job(Path(), Path(), mcap=False, rrd=False)
     (out / "lab").mkdir(parents=True)
@@ -285,7 +285,7 @@ def test_a_batch_takes_no_run_without_its_outputs_for_done(
     there: tuple[str, ...],
     status: str,
 ) -> None:
-    """The manifest knows nothing of what happened to a folder since."""
+    """A manifest does not notice later changes to a run folder."""
     (source.parent / "other.mcap").write_bytes(b"another")
     out, job, run = tmp_path / "out", Job(Path(), Path()), planned(source)
     (out / "lab").mkdir(parents=True)
@@ -306,7 +306,7 @@ def test_a_batch_takes_no_run_without_its_outputs_for_done(
 
 
 def test_a_full_disk_leaves_no_torn_line(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    """The half of a line that did fit is taken back; else the next line is glued to it."""
+    """The part of a line that fit is removed; else the next line would be appended to it."""
     path = tmp_path / "manifest.jsonl"
     Manifest(path).record([Entry("a", "a.mcap", "complete")])
     whole = path.read_bytes()
@@ -386,7 +386,7 @@ def test_a_manifest_at_a_url_ends_as_one_file(
 def test_a_recording_that_had_begun_is_blamed_for_what_is_lost(
     source: Path, monkeypatch: pytest.MonkeyPatch, error: BaseException, *, begun: bool, tries: int
 ) -> None:
-    """Blamed for nothing, one that kills its machine would be tried for ever."""
+    """Otherwise a recording that kills its machine would be tried for ever."""
     (source.parent / "other.mcap").write_bytes(b"another")
     monkeypatch.setattr("shapecat.batch.plans.load_model", lambda _path: MODEL)
     out = str(source.parent / "out")
@@ -410,7 +410,7 @@ def test_a_recording_that_had_begun_is_blamed_for_what_is_lost(
     [((0, 0), 0), ((0, 3), 1), ((3, 4), 3), ((4, 1), 4), ((1, 2), 2), ((1,), 1), ((), 0)],
 )
 def test_exit_codes_of_a_batch(codes: tuple[int, ...], expected: int) -> None:
-    """Documented in the reference: scripts go by them."""
+    """Scripts rely on the documented codes."""
     outcomes = [Outcome(Job(Path("a"), Path("b")), code=code) for code in codes]
 
     assert exit_code(outcomes) == expected
@@ -426,7 +426,7 @@ def test_shards_are_disjoint_in_whatever_order_the_recordings_are_found() -> Non
 
 
 class Noting(Executor):
-    """Notes what it is handed, and does nothing."""
+    """Records its input and does nothing else."""
 
     def __init__(self) -> None:
         self.names: list[str] = []
@@ -442,7 +442,7 @@ class Noting(Executor):
 def test_the_largest_recordings_begin_first(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """Begun last, a long one would keep a whole cluster waiting."""
+    """Started last, a long one would keep a whole cluster waiting."""
     monkeypatch.setattr(
         "shapecat.batch.plans.load_model", lambda _path: SimpleNamespace(model_id="m1")
     )
@@ -456,14 +456,14 @@ def test_the_largest_recordings_begin_first(
 
 
 def test_recordings_of_one_name_have_folders_of_their_own() -> None:
-    """Named by their parents, a person knows which is which; a number alone tells nothing."""
+    """The name of the parent folder distinguishes recordings; a number alone would not."""
     folders = name_folders(["x", "x", "x", "y"], ["a", "b", "a", "a"])
 
     assert folders == ["a_x", "b_x", "a_x_3", "y"]
 
 
 def test_a_name_that_a_number_makes_may_be_taken() -> None:
-    """Two recordings in one folder would each be taken for the other, and one be lost."""
+    """Two recordings in one folder would be confused, and one would be lost."""
     folders = name_folders(["a_x_3", "x", "x", "a_x_4", "x"], ["b", "a", "a", "b", "a"])
 
     assert folders == ["a_x_3", "a_x", "a_x_4", "a_x_4_4", "a_x_5"]

@@ -1,4 +1,4 @@
-"""What a new user meets at the door: plain refusals before work begins, nothing lost silently."""
+"""First contact: clear refusals before work begins, and nothing lost silently."""
 
 import json
 import logging
@@ -40,7 +40,7 @@ def runs(shapecat: Run, recording: Path, tmp_path_factory: pytest.TempPathFactor
 
 
 def test_info_looks_into_a_folder_as_process_does(shapecat: Run, tmp_path: Path) -> None:
-    """A bag beside an MCAP file is no part of a ROS 2 recording, nor to be passed over."""
+    """A bag beside an MCAP file is not part of a ROS 2 recording, and must not be skipped."""
     record(tmp_path / "one.mcap", 2)
     record(tmp_path / "two.bag", 2, container="ros1")
     found = json.loads(shapecat("info", tmp_path, "--json").stdout)
@@ -83,7 +83,7 @@ def test_an_impossible_range_is_wrong_usage(
 
 @contextmanager
 def new_logging() -> Iterator[None]:
-    """Let the command set up logging, which it does once in a process."""
+    """Allow the command to set up logging, which it does once per process."""
     ours = logging.getLogger("shapecat")
     before = ours.level
     with pytest.MonkeyPatch.context() as patch:
@@ -97,7 +97,7 @@ def new_logging() -> Iterator[None]:
 def test_verbose_tells_what_is_done(
     shapecat: Run, recording: Path, tmp_path: Path, place: str
 ) -> None:
-    """An option that is taken at one place only seems to do nothing at the other."""
+    """An option accepted only before or only after the command seems to do nothing."""
     before, after = (["-v"], []) if place == "before" else ([], ["-v"])
     options = ("--out", tmp_path, "--no-rrd", "--jobs", "1", "--progress", "none")
     with new_logging():
@@ -129,7 +129,7 @@ def test_verbose_is_off_by_default(
 def test_a_place_that_cannot_be_written_is_noticed_before_the_work(
     shapecat: Run, tmp_path: Path, command: tuple[str, ...]
 ) -> None:
-    """Root may write anywhere, but not below a file. The data set need not even exist."""
+    """Root may write anywhere, but not inside a file. The data set need not exist."""
     (tmp_path / "file").write_text("")
     names = {"DATA": str(tmp_path / "none"), "PLACE": str(tmp_path / "file")}
     words = [names.get(word, word.replace("PLACE", names["PLACE"])) for word in command]
@@ -201,7 +201,7 @@ def test_export_takes_folders_of_runs(shapecat: Run, runs: Path, tmp_path: Path)
 
 
 class Links(HTMLParser):
-    """Collects where the links of a page lead."""
+    """Collects the targets of the links of a page."""
 
     def __init__(self, page: Path) -> None:
         super().__init__()
@@ -209,7 +209,7 @@ class Links(HTMLParser):
         self.feed(page.read_text("utf-8"))
 
     def handle_starttag(self, _tag: str, attrs: list[tuple[str, str | None]]) -> None:
-        """Take down an href."""
+        """Collect an href."""
         self.found += [value for name, value in attrs if name == "href" and value]
 
 
@@ -297,7 +297,7 @@ def descendants(pid: int) -> list[int]:
 
 
 def test_the_web_viewer_serves_this_machine_alone(tmp_path: Path) -> None:
-    """Recordings of a lab are nobody else's business in the same network."""
+    """Other machines in the network must not be able to see the recordings."""
     import rerun as rr  # noqa: PLC0415  loads for a second
 
     stream = rr.RecordingStream("door")
@@ -328,7 +328,7 @@ def test_the_web_viewer_serves_this_machine_alone(tmp_path: Path) -> None:
 
 @pytest.mark.parametrize("kind", ["plain", "rich", "none", "bars"])
 def test_the_compile_notice_appears_once(capsys: pytest.CaptureFixture[str], kind: str) -> None:
-    """Each recording, and each worker, tells of the kernels it compiles."""
+    """Otherwise each recording and each worker would announce the compilation."""
     open_progress = import_module("shapecat.cli.progress").open_progress
     progress_bars = import_module("shapecat.cli.render").progress_bars
     if kind == "bars":

@@ -1,4 +1,4 @@
-"""Evaluation: the metrics against scikit-learn, and the way from a folder to a report."""
+"""Evaluation: metrics compared with scikit-learn, and reports from a data set folder."""
 
 import json
 import math
@@ -225,7 +225,7 @@ def test_own_categories_follow_the_usual_ones() -> None:
 
 
 def test_the_page_is_whole_and_escapes_names(trained: Path, tmp_path: Path) -> None:
-    """Folder names come from strangers; a page may not run what they contain."""
+    """Folder names are untrusted; a page must not run code that they contain."""
     dataset = write_dataset(tmp_path / "data", ("box", "ball"), instances=2)
     report = replace(evaluate_folder(dataset, trained), categories=("<script>", "ball"))
     write_page(tmp_path / "report.html", report, title="a & b")
@@ -250,7 +250,7 @@ def test_accuracies_over_ranges_are_those_by_hand() -> None:
 
 
 def test_the_drawn_confusion_has_true_categories_in_rows() -> None:
-    """Transposed, it would tell that cans are taken for cups."""
+    """A transposed matrix would claim that cans are taken for cups."""
     root = ET.fromstring(confusion_svg(("cup", "can"), [[4, 3], [0, 7]]))  # noqa: S314  we drew it
     texts = {e.text: e.attrib for e in root.iter() if e.tag.endswith("text")}
     heads = [e.attrib for e in root.iter() if e.text == "can"]  # of its row and its column
@@ -372,7 +372,7 @@ def test_the_page_and_its_markdown_have_each_number_in_its_place() -> None:
 
 
 def drawn(svg: str, kind: str, *names: str) -> list[tuple[str | None, ...]]:
-    """Return some attributes of all elements of a kind; ``text`` is what they contain."""
+    """Return some attributes of all elements of a kind; ``text`` is their content."""
     found = [e for e in ET.fromstring(svg).iter() if e.tag.endswith(kind)]  # noqa: S314  ours
     return [tuple(e.text if n == "text" else e.get(n) for n in names) for e in found]
 
@@ -499,7 +499,7 @@ def test_accuracy_is_told_by_the_pose_of_the_sensor(compared: Report) -> None:
 
 
 def test_views_of_an_object_are_fused() -> None:
-    """Leftovers and views of other objects may not mix in; two of three wrong can be right."""
+    """Leftover views and views of other objects must not be fused in; two of three may err."""
     truth = np.zeros(8, np.int64)
     posteriors = np.array([[0.9, 0.1], [0.45, 0.55], [0.45, 0.55]] * 2 + [[0, 1], [0, 1]], "f4")
     names = np.array(["a", "a", "a", "b", "b", "b", "c", "c"])

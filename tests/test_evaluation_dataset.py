@@ -1,4 +1,4 @@
-"""Point cloud files of data sets: every encoding, and what strangers may send."""
+"""Point cloud files of data sets: every encoding, and hostile input."""
 
 import struct
 from pathlib import Path

@@ -1,4 +1,4 @@
-"""Workers fail alone, end with their parent, and speak the interface of concurrent.futures."""
+"""Workers fail alone, end with their parent, and have the interface of concurrent.futures."""
 
 import gc
 import os
@@ -64,7 +64,7 @@ def wait_for(condition: Any, seconds: float = 20) -> None:
 
 
 class Unreadable:
-    """Can be pickled and not unpickled."""
+    """Can be pickled but not unpickled."""
 
     def __reduce__(self) -> tuple[Any, ...]:
         return raise_error, ()
@@ -80,7 +80,7 @@ def executor() -> Iterator[Executor]:
 
 
 def test_results_errors_and_deaths_reach_their_own_futures(executor: Executor) -> None:
-    """A worker that dies fails the one task it held; a broken pool would fail them all."""
+    """A dying worker fails only its own task; a broken pool would fail all."""
     dead = [executor.submit(kill_self) for _ in range(3)]
     powers = list(executor.map(pow, range(6), [2] * 6))
     wrong = executor.submit(raise_error)
@@ -112,7 +112,7 @@ def test_what_cannot_be_sent_fails_alone(executor: Executor) -> None:
 
 
 def test_a_busy_worker_is_sent_its_next_task() -> None:
-    """It would wait while 20 MB of frames come, and nobody works meanwhile."""
+    """Otherwise the worker would be idle while 20 MB of frames arrive."""
     one = LocalExecutor(1, ahead=1)
     held, sent, waiting = (one.submit(time.sleep, seconds) for seconds in (60, 0, 0))
     wait_for(sent.running)
@@ -133,7 +133,7 @@ def test_what_cannot_be_received_costs_its_worker_alone() -> None:
 
 
 def test_workers_use_the_threads_they_are_given() -> None:
-    """Two workers with two threads each on two cores take turns at being slow."""
+    """Two workers with two threads each would slow each other down on two cores."""
     before = os.environ.get("OMP_NUM_THREADS")
     with LocalExecutor(1, threads=3) as one:
         assert one.submit(os.getenv, "OMP_NUM_THREADS").result() == "3"
@@ -177,7 +177,7 @@ def test_workers_put_their_work_down_when_the_executor_stops(tmp_path: Path) -> 
 
 
 def test_workers_end_when_their_parent_is_killed(tmp_path: Path) -> None:
-    """Left behind, they would go on for hours, and the next run would find its folders locked."""
+    """Orphans would run for hours and keep the folders locked."""
     code = (
         "from tests.test_executors import write_and_sleep\n"
         "from shapecat.executors import LocalExecutor\n"
@@ -242,7 +242,7 @@ def frail(k: int) -> int:
 
 
 def test_processes_keep_the_order_and_hold_few_items() -> None:
-    """A recording does not fit into memory; its tables must not depend on who was faster."""
+    """A recording does not fit into memory, and its tables must not depend on timing."""
     used: list[tuple[int, int]] = []
     workers: set[int] = set()
     deadline = time.monotonic() + 60
@@ -285,7 +285,7 @@ def one_by_one() -> Iterator[tuple[int, float]]:
 
 
 def test_the_last_items_do_not_wait_for_a_slow_process() -> None:
-    """What was not sent to it yet is worked on here."""
+    """Items that were not sent yet are processed here."""
     with Processes(slow_elsewhere, 2) as processes:
         processes.start()
         wait_for(lambda: all(future.done() for future in processes._waking))
@@ -299,7 +299,7 @@ def process_and_ones(k: int) -> tuple[int, np.ndarray]:
 
 
 def test_results_are_freed_without_collecting_garbage() -> None:
-    """Garbage is seldom collected: results in cycles take memory in a long recording."""
+    """Garbage is collected rarely: results in cycles would fill the memory."""
     received: list[Any] = []
     deadline = time.monotonic() + 60
 
@@ -336,7 +336,7 @@ def test_errors_come_at_their_turn() -> None:
 
 
 class UnreadableError(Exception):
-    """Cannot be read again: that takes more than its message."""
+    """Cannot be unpickled, since its constructor needs more than a message."""
 
     def __init__(self, place: str, number: int) -> None:
         super().__init__(f"{place}, {number}")
@@ -348,7 +348,7 @@ def raise_unreadable() -> None:
 
 
 def test_an_error_that_cannot_be_read_fails_its_task_alone() -> None:
-    """The one who waits for it would wait for ever."""
+    """Otherwise the caller would wait for ever."""
     with LocalExecutor(1) as executor:
         unread, after = executor.submit(raise_unreadable), executor.submit(abs, -3)
         with pytest.raises(TypeError, match="number"):

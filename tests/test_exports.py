@@ -1,4 +1,4 @@
-"""Exports, read back by parsers that are written from the descriptions of their formats."""
+"""Exports, read back by parsers written from the specifications of their formats."""
 
 import csv
 import json
@@ -76,7 +76,7 @@ def boxes(folder: Path, which: str = "_full") -> dict[int, list[tuple[int, np.nd
 
 
 def farthest(a: np.ndarray, b: np.ndarray) -> float:
-    """Return how far corners (8, 3) are from the nearest of other corners."""
+    """Return the largest distance from corners (8, 3) to the nearest of other corners."""
     apart = np.linalg.norm(a[:, None] - b[None], axis=-1)
     return float(max(apart.min(axis=0).max(), apart.min(axis=1).max()))
 
@@ -168,7 +168,7 @@ def read_calibration(path: Path) -> dict[str, np.ndarray]:
 
 @pytest.mark.parametrize("which", ["", "_full"])
 def test_kitti_boxes_are_ours_within_a_millimetre(run: Path, tmp_path: Path, which: str) -> None:
-    """Whole objects are what detectors are trained on; the visible boxes are for the asking."""
+    """Detectors are trained on whole objects; visible boxes are optional."""
     export_run(run, "kitti", tmp_path, visible_boxes=not which)
     out = tmp_path / "table"
     camera = intrinsics(run)
@@ -232,7 +232,7 @@ def test_the_rectified_camera_is_level(up: tuple[float, ...]) -> None:
 
 
 def test_labelcloud_formats_say_the_same(run: Path, tmp_path: Path) -> None:
-    """Read as labelCloud 1.1 does: centroid and size, or what its loader takes from vertices."""
+    """Read as labelCloud 1.1 reads them: centroid and size, or the result of its vertex loader."""
     export_run(run, "labelcloud", tmp_path, every=3)
     out = tmp_path / "table"
     worst, count = 0.0, 0

@@ -1,4 +1,4 @@
-"""Data sets of images: what lands in them, read back as trainers read them."""
+"""Image data sets: their contents, read back as training code reads them."""
 
 import csv
 import io
@@ -99,7 +99,7 @@ def test_coco_holds_images_as_they_came_and_the_masks_of_the_tracks(
 
 
 def nearest(box: list[int], others: Iterable[tuple[int, int, int, int]]) -> int:
-    """Return by how much the sides of a box are off those of the most similar of others."""
+    """Return the difference of the sides of a box from those of the most similar other box."""
     sides = np.add(box, [0, 0, *box[:2]])
     return min(int(np.abs(np.add(o, [0, 0, *o[:2]]) - sides).max()) for o in others)
 
@@ -107,7 +107,7 @@ def nearest(box: list[int], others: Iterable[tuple[int, int, int, int]]) -> int:
 def test_masks_of_a_data_set_lie_on_the_edges_of_the_colours(
     coloured_run: Path, tmp_path: Path
 ) -> None:
-    """Who trains on masks learns their outlines; depth alone is off by a pixel or two."""
+    """Models learn the outlines of masks, and depth alone is off by a pixel or two."""
     export_dataset([coloured_run], "coco", tmp_path / "out", Selection())
     true = np.load(coloured_run.parents[1] / "table.color_labels.npz")["labels"]
     data = read_coco(tmp_path / "out")
@@ -292,7 +292,7 @@ def test_boxes_are_refused_by_formats_without_them(
 
 
 def test_kitti_boxes_project_onto_the_colour_image(run: Path, tmp_path: Path) -> None:
-    """P2, the 3D boxes and the image are three files that must tell of one camera."""
+    """P2, the 3D boxes and the image are three files that must describe the same camera."""
     export_run(run, "kitti", tmp_path)
     folder = tmp_path / "table"
     with (folder / "frames.csv").open() as file:

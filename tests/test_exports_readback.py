@@ -1,4 +1,4 @@
-"""Data sets of images as other people's code reads them, and every option at the door."""
+"""Image data sets read back by other libraries, and every option of the command."""
 
 import json
 import shutil

@@ -1,4 +1,4 @@
-"""Exports of one turned box that is worked out by hand, read as each format is described."""
+"""Exports of a rotated box, worked out by hand and read as each format is specified."""
 
 import json
 import re
@@ -158,7 +158,7 @@ def test_kitti_calibration_leads_to_the_pixels_of_a_colour_camera_beside_it(tmp_
 def test_the_box_of_kitti_ends_with_the_colour_image(
     tmp_path: Path, left: int, top: int, width: int, height: int, box: list[int]
 ) -> None:
-    """A colour camera often sees less than the depth sensor; pixels outside are no part of a box.
+    """A colour camera often sees less than the depth sensor; a box ends at the image border.
 
     It sees what the depth camera sees in a window that cuts the object.
     """
@@ -189,7 +189,7 @@ def corners_of(center: Sequence[float], size: Any, yaw: float) -> Any:
 
 
 def apart(a: Any, b: Any) -> float:
-    """Return how far two sets of corners are from each other, whatever their order."""
+    """Return the distance between two sets of corners, regardless of their order."""
     return float(np.linalg.norm(a[:, None] - b[None], axis=2).min(axis=1).max())
 
 
@@ -230,7 +230,7 @@ def test_identity_is_not_the_pose_of_this_example() -> None:
 
 
 def test_kitti_of_a_cloud_has_no_pixels(tmp_path: Path) -> None:
-    """Loose points have no image: the 2D box is -1 four times, as the readme says."""
+    """Loose points have no image: by the specification, the 2D box is -1 four times."""
     points = frame().xyz()
     cloud = Frame("/scan", 0, 5, 6, "laser", points=points)
     seen: Any = [(labelled(cut=False, hidden=False), cloud, None)]
@@ -319,7 +319,7 @@ def test_coco_keeps_every_number_in_its_place(tmp_path: Path) -> None:
 
 
 def test_yolo_leaves_out_what_is_not_sure(tmp_path: Path) -> None:
-    """Its format knows no crowds: an unsure label would be trained on."""
+    """The format has no flag for uncertain labels, so they would be trained on."""
     categories = ("cup", "can", "bowl")
     assert write_yolo(tmp_path, [("val", finished(), dataset_image())], categories) == 1
     (line,) = (tmp_path / "labels" / "val" / "a.txt").read_text().splitlines()

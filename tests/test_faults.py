@@ -1,4 +1,4 @@
-"""The command under faults, a few cases; and the checks themselves, which must notice harm."""
+"""The command under a few faults, and the checks themselves, which must detect damage."""
 
 import shutil
 from collections.abc import Callable
@@ -154,7 +154,7 @@ def test_bad_ends_are_noticed(ended: Ended, said: str) -> None:
 
 
 def test_silent_and_repeated_errors_are_noticed() -> None:
-    """An error is said, once."""
+    """An error must be reported exactly once."""
     silent, twice = Ended(1, 1.0), Ended(1, 1.0, [(0.5, "Error: full\n")] * 2)
 
     assert "no error line" in [*invariants.ended_well("eio", silent)]

@@ -1,4 +1,4 @@
-"""The recordings of the folder fixtures give the tables that are expected of them."""
+"""The recordings in the folder fixtures give their expected tables."""
 
 import io
 from collections.abc import Iterator
@@ -28,7 +28,7 @@ RENEW = "if that is meant, renew them with `make fixtures`"
 
 @pytest.mark.parametrize("name", RECORDINGS)
 def test_fixture_gives_the_expected_tables(name: str, tmp_path: Path) -> None:
-    """A change of results must be noticed, and be meant."""
+    """A change of results must be noticed and intended."""
     tables = processed_tables(FIXTURES / name, tmp_path / "run")
 
     wrong = [
@@ -40,7 +40,7 @@ def test_fixture_gives_the_expected_tables(name: str, tmp_path: Path) -> None:
 
 
 def test_differences_are_told_except_in_last_digits() -> None:
-    """A comparison that forgives too much would let everything pass."""
+    """A comparison that is too tolerant would let everything pass."""
     wanted = [{"category": "cup", "points": "512", "x": "0.4000", "on": ""}]
 
     assert not list(differences([wanted[0] | {"x": "0.4010"}], wanted))
@@ -51,7 +51,7 @@ def test_differences_are_told_except_in_last_digits() -> None:
 
 
 def test_fixtures_are_small_and_all_there() -> None:
-    """A clone must stay quick, and no table be left over from a recording that is gone."""
+    """Cloning must stay quick, and no table may remain of a deleted recording."""
     files = [path for path in FIXTURES.rglob("*") if path.is_file()]
     tables = {expected_path(n, t) for n in SCENES for t in ("tracks", "detections", "planes")}
 
@@ -61,7 +61,7 @@ def test_fixtures_are_small_and_all_there() -> None:
 
 @pytest.mark.many
 def test_fixtures_made_again_are_the_same(tmp_path: Path) -> None:
-    """A recording that cannot be made again cannot be mended either.
+    """A recording that cannot be reproduced cannot be repaired.
 
     All bytes are the same but those of colour images: processors round their pixels otherwise.
     """

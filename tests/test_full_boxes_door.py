@@ -1,4 +1,4 @@
-"""Which boxes leave the house: whole ones, or with `--boxes visible` those of what is seen."""
+"""Boxes in the outputs: full ones, or the visible ones with `--boxes visible`."""
 
 import json
 import shutil
@@ -48,7 +48,7 @@ def tables(folder: Path, *, full: bool) -> Sizes:
 def test_annotations_have_the_boxes_asked_for(
     guessed_run: Path, tmp_path: Path, shapecat: Callable[..., Result], options: tuple[str, ...]
 ) -> None:
-    """Who annotates again with the other boxes must not get those of before."""
+    """Annotating again with other boxes must not keep the earlier ones."""
     folder = tmp_path / "table"
     shutil.copytree(guessed_run, folder)
     result = shapecat("annotate", folder, *options)
@@ -69,7 +69,7 @@ def test_annotations_have_the_boxes_asked_for(
 def test_exports_have_the_boxes_asked_for(
     guessed_run: Path, tmp_path: Path, shapecat: Callable[..., Result], options: tuple[str, ...]
 ) -> None:
-    """What a model learns from visible boxes it will not say of whole objects."""
+    """A model trained on visible boxes would not predict whole objects."""
     command = ("export", guessed_run, "--format", "labelcloud", "--out", tmp_path, "--every", 8)
     assert shapecat(*command, *options).exit_code == 0
 

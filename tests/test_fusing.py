@@ -1,4 +1,4 @@
-"""Fusing consecutive depth images: what moves, jumps or is not known must not smear."""
+"""Fusing consecutive depth images: moving, jumping or unknown surfaces must not smear."""
 
 from collections.abc import Iterator, Sequence
 from dataclasses import replace
@@ -65,7 +65,7 @@ def noisy(depth: F4, rng: np.random.Generator, deviation: float = 0.0015) -> F4:
 
 
 def error(depth: F4, truth: F4) -> F4:
-    """Return the error of the inverse depth where there is a reading, and it is used."""
+    """Return the errors of the inverse depth at the readings in range."""
     used = (depth > 0) & (truth < RANGE_M - 0.1)
     return np.asarray(1 / depth[used] - 1 / truth[used])
 
@@ -85,7 +85,7 @@ def moved(pose: Pose, other: Pose) -> Pose:
 
 
 def home(*shift: float, gaze: tuple[float, ...] = (0.0, 0.0, 0.0), roll: float = 0.0) -> Pose:
-    """Return a pose of the camera, moved away from the usual place by metres."""
+    """Return a camera pose, displaced from the usual one by some metres."""
     return looking_at(np.add(EYE, shift), np.array(gaze), roll=roll)
 
 
@@ -93,7 +93,7 @@ HOME = home(0.0, 0.0, 0.0)
 
 
 def test_one_frame_is_the_frame_itself() -> None:
-    """The default must not change a bit."""
+    """The default must not change a single bit."""
     alone = frame(see(HOME))
     recent = RecentFrames(Settings().detection.fuse_frames)
     for stamp in (0, TICK):
@@ -124,7 +124,7 @@ turns = st.floats(-0.05, 0.05)
 def test_the_place_of_a_camera_that_moves_is_taken_into_account(
     x: float, y: float, z: float, right: float, up: float, roll: float
 ) -> None:
-    """A wrong direction or order of the transforms displaces every surface."""
+    """A wrong direction or order of the transforms would displace every surface."""
     other = home(x, y, z, gaze=(right, 0.0, up), roll=roll)
     now, before = see(HOME), see(other)
 
@@ -136,7 +136,7 @@ def test_the_place_of_a_camera_that_moves_is_taken_into_account(
 
 
 def test_noise_falls_also_while_the_camera_moves() -> None:
-    """Nothing wrong is easy where nothing is fused."""
+    """Not fusing at all would pass the other tests."""
     rng = np.random.default_rng(2)
     recent = RecentFrames(3)
     for k in range(3):
@@ -152,7 +152,7 @@ def test_noise_falls_also_while_the_camera_moves() -> None:
 
 
 def test_an_image_that_its_pose_does_not_explain_is_left_out() -> None:
-    """Without poses, or with wrong ones, a camera that moved would smear all there is."""
+    """Without poses, or with wrong ones, a moving camera would smear everything."""
     other = home(0.05, 0.0, -0.04)
     now = see(HOME)
 
@@ -168,7 +168,7 @@ def slid(x: float) -> Any:
 
 @pytest.mark.parametrize("box", [slid(0.03), slid(-0.06), slid(0.2), None])
 def test_what_has_moved_does_not_smear(box: Any) -> None:
-    """Neither at its new place nor at the one it left; also what has just come."""
+    """Neither at its new nor at its old position; nor may new objects smear."""
     now, before = see(HOME), see(HOME, box)
 
     for depth, others in ((now, before), (before, now)):
@@ -193,7 +193,7 @@ def test_holes_are_filled_with_what_was_seen_there() -> None:
 
 
 def test_a_thing_that_was_taken_away_does_not_fill_the_hole_it_left() -> None:
-    """Where it stood the sensor may see nothing for a moment; it must not come back there."""
+    """Where it stood the sensor may briefly see nothing; the object must not reappear."""
     empty = see(HOME, None)
     gone = np.abs(empty - see(HOME)) > 1e-6
     now = np.where(gone, 0, empty)
@@ -238,7 +238,7 @@ SMALL = Camera(80, 60, 65.0, 65.0, 39.5, 29.5)
     ids=["same stamp", "clock back", "gap", "frame", "resolution", "lens", "cloud"],
 )
 def test_a_break_begins_anew(change: Any) -> None:
-    """Frames before a jump of the clock or another camera show something else."""
+    """Frames before a clock jump or from another camera show something else."""
     *two, third = (frame(see(HOME), k * TICK) for k in range(3))
 
     assert lengths([(f, IDENTITY) for f in (*two, third)]) == [0, 1, 2]
@@ -296,7 +296,7 @@ def job(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Job:
 
 
 def test_tables_do_not_depend_on_processes_or_interruptions(job: Job) -> None:
-    """Frames are fused with those before them, also where another process or run had them."""
+    """Frames are fused with earlier ones, even if another process or run perceived those."""
 
     def stop(phase: str, done: int, _total: int | None) -> None:
         if (phase, done) == ("perceive", 36):

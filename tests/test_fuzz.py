@@ -1,4 +1,4 @@
-"""Damage anywhere in a recording: what is whole is read, what is not is said, nothing crashes."""
+"""Damage anywhere in a recording: intact parts are read, damage is reported, no crash."""
 
 import resource
 from collections import Counter
@@ -29,7 +29,7 @@ FRAMES = 12
 
 
 class Outcome(NamedTuple):
-    """Exit code, stamps of the frames read, their number, and what was said."""
+    """Exit code, stamps and number of the frames read, and the messages."""
 
     code: int
     stamps: frozenset[int]

@@ -102,7 +102,7 @@ def test_records_refuse_shapes_that_do_not_fit() -> None:
 
 
 def test_records_cannot_be_written_to() -> None:
-    """Shared arrays that change under a reader are the bugs nobody finds."""
+    """Shared arrays that change under a reader cause bugs that are hard to find."""
     made = Pose(np.eye(3), np.zeros(3))
 
     with pytest.raises(ValueError, match="read-only"):

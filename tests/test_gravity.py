@@ -1,4 +1,4 @@
-"""Where up is: from whom, and how sure."""
+"""The up direction: its sources and its reliability."""
 
 from pathlib import Path
 from typing import Any
@@ -63,7 +63,7 @@ def test_up_from_an_imu_is_smoothed_and_turned_into_the_sensor_frame(tmp_path: P
 
 
 def test_an_imu_without_stamps_is_read_at_its_log_times(tmp_path: Path) -> None:
-    """Depth images without stamps have those times, too."""
+    """Depth images without stamps also use their log times."""
     items = [
         ("/imu", EPOCH + k * SECOND, imu(0, a, "camera"))
         for k, a in ((0, [0, -9.8, 0]), (7, [9.8, 0, 0]))
@@ -76,7 +76,7 @@ def test_an_imu_without_stamps_is_read_at_its_log_times(tmp_path: Path) -> None:
 
 
 def test_an_imu_that_is_logged_late_is_read_at_its_stamps(tmp_path: Path) -> None:
-    """Drivers send packets of measurements: the robot had turned by the time they were logged."""
+    """Drivers send measurements in packets; the robot may have turned before they are logged."""
     items = [
         ("/imu", EPOCH + (k + 7) * SECOND, imu(EPOCH + k * SECOND, a, "camera"))
         for k, a in ((1, [0, -9.8, 0]), (8, [9.8, 0, 0]))
@@ -138,7 +138,7 @@ def test_run_says_how_far_the_planes_found_disagree(
 def test_an_up_is_dropped_only_if_no_plane_confirms_it(
     monkeypatch: pytest.MonkeyPatch, off_deg: tuple[float | None, ...], *, dropped: bool
 ) -> None:
-    """A cupboard in view at the start must not cost what the robot knows."""
+    """A cupboard in view at the start must not override a correct up direction."""
     upright: Any = Upright(TransformBuffer(), None, None, ("tf", "imu"))
     upright.preview = lambda _: ("tf", np.array([0.0, -1.0, 0.0]))
     angles = [None if off is None else np.radians(off) for off in off_deg]
@@ -173,7 +173,7 @@ def test_the_imu_stands_in_where_transforms_do_not_reach(tmp_path: Path) -> None
 
 
 def test_a_failed_look_up_is_counted_once(tmp_path: Path) -> None:
-    """Frames are looked at before they are used: the warning would count some of them twice."""
+    """Frames are previewed before use, so the warning could count some twice."""
     items = [("/tf", EPOCH, MAKE.transforms([("map", "elsewhere", IDENTITY)], EPOCH))]
     with open_recording(write(tmp_path / "a.mcap", items)) as recording:
         upright = Upright.of(recording, up="auto", fixed_frame=None)

@@ -1,4 +1,4 @@
-"""Hours of recording are tracked in parts that fit into the memory; none of them is seen."""
+"""Hours of recording are tracked in batches that fit into memory, with no visible seams."""
 
 from pathlib import Path
 
@@ -32,7 +32,7 @@ def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
 def test_the_length_of_the_parts_changes_nothing(
     folder: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """Parts that end within a frame, a track, or a row group; a track of several parts."""
+    """Batches may end within a frame, a track or a row group; a track may span several."""
     whole, lines = tracked(folder)
     sizes = {(tracks, "_BATCH"): 100, (full_boxes, "_BLOCK"): 7, (full_boxes, "_AT_ONCE"): 1}
     sizes |= {(hits, "_BLOCK"): 50, (fusion, "_BLOCK"): 33}
@@ -47,7 +47,7 @@ def test_the_length_of_the_parts_changes_nothing(
 
 
 def test_few_views_tell_the_box_of_all(folder: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    """As large as if all had told it, within the noise of the outlines; in every row seen."""
+    """A sample of views gives the same box, within the noise of the outlines, in every row."""
     whole, _ = tracked(folder)
     monkeypatch.setattr(full_boxes, "_TELLING", 60)
 

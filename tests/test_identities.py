@@ -1,4 +1,4 @@
-"""Tracking figures agree with motmetrics and with worked examples; boxes with volumes by hand."""
+"""Tracking metrics agree with motmetrics and worked examples; box overlaps with exact volumes."""
 
 import warnings
 from collections.abc import Iterator
@@ -47,7 +47,7 @@ def oracle(frames: list[SeenTogether], threshold: float) -> Any:
 
 @pytest.mark.parametrize("seed", range(8))
 def test_mota_and_idf1_are_those_of_motmetrics(seed: int) -> None:
-    """A tie broken otherwise, or a pair that does not go on, shifts the published figures."""
+    """Breaking a tie differently, or dropping a kept pair, would shift published figures."""
     frames = list(crowd(seed))
     expected, figures = oracle(frames, 0.5), judge_identities(frames)
 
@@ -59,7 +59,7 @@ def test_mota_and_idf1_are_those_of_motmetrics(seed: int) -> None:
 
 
 def test_hota_of_a_worked_example() -> None:
-    """One object, four frames, seen thrice at .72, first as track 1, then twice as track 2.
+    """One object, four frames, found three times at .72: once as track 1, then twice as track 2.
 
     Up to .7 (14 thresholds) there are 3 hits, 1 miss, 0 false positives: DetA 3/4. The hit of
     track 1 associates 1/(4+1-1), those of track 2 2/(4+2-2): AssA (1/4 + 1/2 + 1/2)/3 = 5/12.
@@ -101,7 +101,7 @@ def turned(x: float, y: float, z: float, w: float, still: Box) -> Box:
 
 
 def test_box_iou_of_turned_boxes_is_that_by_hand_and_by_sampling() -> None:
-    """Boxes are seen from a tilted camera: what holds for upright ones alone is wrong there."""
+    """A tilted camera sees rotated boxes, for which a formula for upright ones is wrong."""
     a = box([0.1, -0.2, 0.9], [0.3, 0.2, 0.5], [0, 0, 0, 1])
     b = box([0.2, -0.15, 1.0], [0.3, 0.2, 0.5], [0, 0, 0, 1])
     shared = 0.2 * 0.15 * 0.4
@@ -131,7 +131,7 @@ def test_boxes_that_only_touch_or_are_flat_share_nothing() -> None:
 
 
 def test_masks_are_matched_for_the_greatest_overlap_in_all() -> None:
-    """By hand: the first mask shares most with the first object, but both are served otherwise."""
+    """By hand: the first mask overlaps the first object most, but the best total differs."""
     true = [np.arange(0, 10), np.arange(10, 16)]
     found = [np.arange(4, 14), np.arange(0, 4), np.array([30, 31])]
     matches = match_masks(found, true)

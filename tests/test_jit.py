@@ -1,4 +1,4 @@
-"""Kernels on disk: code must not outlive what it was made of."""
+"""Cached kernels: compiled code must not outlive its sources."""
 
 import os
 import runpy
@@ -44,7 +44,7 @@ def stage(tmp_path: Path) -> Path:
 
 @pytest.fixture
 def run(stage: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]) -> Run:
-    """Run the script as a new process would, but where numba is loaded: it knows nothing yet."""
+    """Run the script as in a new process with numba loaded but nothing compiled."""
     monkeypatch.syspath_prepend(stage)
     monkeypatch.setattr(sys, "dont_write_bytecode", True)
     monkeypatch.setattr("numba.config.CACHE_DIR", "")
@@ -60,7 +60,7 @@ def run(stage: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixt
 
 @pytest.mark.parametrize("decorator", ["@kernel", "@kernel(inner=True)", "@kernel(inline=True)"])
 def test_an_edit_of_a_called_kernel_counts(stage: Path, run: Run, decorator: str) -> None:
-    """Numba's own cache would go on with the old code: the file of the caller is the same."""
+    """Numba's own cache would keep the old code, since the caller's file is unchanged."""
     callee = CALLEE.replace("@kernel", decorator)
     (stage / "callee.py").write_text(callee)
     assert run() == "7 0"
@@ -71,7 +71,7 @@ def test_an_edit_of_a_called_kernel_counts(stage: Path, run: Run, decorator: str
 
 
 def test_a_process_with_the_files_of_before_spoils_nothing(stage: Path, run: Run) -> None:
-    """It may compile and save what it was started with after the files have changed."""
+    """It may compile and save the code it started with after the files have changed."""
     (stage / "caller.py").write_text(CALLER.replace("print", "import sys; sys.stdin.read()\nprint"))
     command = [sys.executable, "-B", str(stage / "caller.py")]
     with subprocess.Popen(command, stdin=subprocess.PIPE, stdout=subprocess.PIPE) as late:
@@ -86,7 +86,7 @@ def test_a_process_with_the_files_of_before_spoils_nothing(stage: Path, run: Run
 def test_code_goes_where_it_can_be_written(
     stage: Path, run: Run, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """Packages of the system are read-only for their users; images name a folder of their own."""
+    """System packages are read-only for users; container images set their own folder."""
     stage.joinpath("__pycache__").write_text("a file, so that not even root can write in it")
     own, named = tmp_path / "own", tmp_path / "named"
     monkeypatch.setenv("XDG_CACHE_HOME", str(own))
@@ -111,7 +111,7 @@ def test_a_kernel_is_compiled_where_nothing_can_be_kept(
 
 
 def test_a_stage_is_one_with_its_sub_packages() -> None:
-    """Kernels call kernels of other sub-packages of their stage: an edit of any counts."""
+    """Kernels call kernels of other subpackages of their stage, so any edit counts."""
     here = Path(shapecat.__file__).parent
 
     assert _stage_of(here / "detection" / "planes" / "ransac.py") == here / "detection"

@@ -1,4 +1,4 @@
-"""Labels of another run: refused as they are, found again by place and time, never guessed."""
+"""Labels of another run: refused by number, transferred by place and time, never guessed."""
 
 import csv
 from collections import Counter
@@ -77,7 +77,7 @@ def make_run(
     size: float = 0.08,
     labels: Mapping[int, str] | None = None,
 ) -> Path:
-    """Write the tables of a run whose tracks are where they are said to be."""
+    """Write the tables of a run whose tracks are at the given positions."""
     folder.mkdir(parents=True)
     work = work or f"w{folder.name}"
     about = {"path": f"/recordings/{folder.name}.mcap", "digest": digest, "files": []}
@@ -173,7 +173,7 @@ def test_mixed_tables_are_refused(tmp_path: Path) -> None:
 
 
 def test_a_table_without_the_column_is_the_runs_own_or_refused(tmp_path: Path) -> None:
-    """Somebody deleted the column: the places tell; a table made by hand has none."""
+    """If a user deletes the column, the positions decide; a hand-made table has none."""
     mine = make_run(tmp_path / "mine", {1: still(CUP)})
     theirs = make_run(tmp_path / "theirs", {1: still(shifted(CUP, y=0.01))})
     for run, label in ((mine, "bowl"), (theirs, "can")):
@@ -305,7 +305,7 @@ def test_what_is_gone_is_told(tmp_path: Path) -> None:
 
 
 def test_a_neighbour_is_not_taken_for_what_is_not_seen(tmp_path: Path) -> None:
-    """The labelled object is missing in the target; what stands beside it is the nearest there."""
+    """The labelled object is missing in the target, and its neighbour is the nearest track."""
     source = make_run(tmp_path / "source", {1: still(CUP)}, labels={1: "mug"}, size=0.05)
     beside = {5: still(shifted(CUP, y=0.08))}
     target = make_run(tmp_path / "target", beside, size=0.05)
@@ -372,7 +372,7 @@ def test_a_label_that_was_carried_over_can_be_replaced(tmp_path: Path) -> None:
 
 
 def test_one_label_that_contradicts_does_not_cost_the_others(tmp_path: Path) -> None:
-    """A person has merged a track of the target with one that the source says to delete."""
+    """A user merged a track of the target that the source says to delete."""
     labels = {1: "delete", 3: "mug"}
     source = make_run(tmp_path / "source", {1: still(CUP), 3: still(BOWL)}, labels=labels)
     objects = {5: still(CUP), 6: still(CAN), 7: still(BOWL)}
@@ -448,7 +448,7 @@ def test_what_was_moved_is_told_not_guessed(tmp_path: Path) -> None:
 def test_a_large_object_may_scatter_more_than_a_small_one(
     tmp_path: Path, size: float, *, moved: bool
 ) -> None:
-    """Seen from another side, the middle of what is visible of a box is another one."""
+    """From another side, the centre of the visible part of a box is elsewhere."""
     path = [shifted(CUP, x=0.025 * k) for k in range(FRAMES_EACH)]  # half of it within 6 cm
     source = make_run(tmp_path / "source", {1: path}, labels={1: "mug"}, size=size)
     target = second(tmp_path / "target", {1: still(shifted(CUP, x=0.11))}, size=size)
@@ -545,7 +545,7 @@ def place_of(row: Mapping[str, str]) -> list[float]:
 
 
 def annotated(run: Path) -> set[str]:
-    """Return the classes that annotated.mcap tells."""
+    """Return the classes in annotated.mcap."""
     found = set()
     with (run / "annotated.mcap").open("rb") as file:
         reader = make_reader(file, decoder_factories=[DecoderFactory()])

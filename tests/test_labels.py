@@ -1,4 +1,4 @@
-"""Corrections of tracks.csv: what a person writes, and what spreadsheets make of it."""
+"""Corrections of tracks.csv, as users write them and as spreadsheets save them."""
 
 import json
 import shutil
@@ -127,7 +127,7 @@ def test_chains_of_merges_end_in_one_track(run: Path) -> None:
 
 
 def test_of_labels_that_contradict_each_other_the_merge_is_refused(run: Path) -> None:
-    """A track merged into one that is deleted would vanish without anybody having said so."""
+    """A track merged into a deleted one would vanish without having been deleted."""
     rows = read_track_table(run / "tracks.csv").rows
     first, second = sorted(row.track for row in rows)[:2]
     labels = {first: f"merge with {second}", second: "delete"}
@@ -169,7 +169,7 @@ def test_tracks_of_two_sensors_are_merged_where_both_have_a_place(run: Path) -> 
 
 
 def test_all_problems_are_named_at_once_and_nothing_is_written(run: Path) -> None:
-    """Fixing one line per attempt is how people stop correcting."""
+    """Nobody wants to fix one line per attempt."""
     corrected = run.parent / "mine.csv"
     corrected.write_text(
         labelled(t4="botle", t2="merge with 9", t1="bowl") + "77,0,cup,0.5,bowl,/depth\n"
@@ -218,7 +218,7 @@ def test_a_label_that_was_not_applied_yet_is_not_original(run: Path) -> None:
 
 
 def test_lines_left_out_keep_their_label(run: Path) -> None:
-    """A filtered spreadsheet saved as it is seen must not delete what was hidden."""
+    """A filtered spreadsheet must not delete the labels of hidden lines."""
     corrected = run.parent / "mine.csv"
     corrected.write_text(labelled(t4="bowl"))
     adopt_labels(corrected, run)
@@ -367,7 +367,7 @@ def test_a_track_of_two_sensors_ends_where_it_was_last_seen_in_time(tmp_path: Pa
 
 
 def replayed(path: Path) -> list[tuple[int, set[str]]]:
-    """Replay the scene of a recording; return what is shown after each message, and its time."""
+    """Replay the scene of a recording; return the entities after each message, and its time."""
     alive: dict[str, float] = {}
     shown = []
     with path.open("rb") as file:

@@ -1,4 +1,4 @@
-"""Learning: the fitted chain, its prediction without scikit-learn, novelty, new categories."""
+"""Learning: the fitted pipeline, prediction without scikit-learn, novelty, new categories."""
 
 import itertools
 from dataclasses import replace
@@ -101,7 +101,7 @@ def test_flat_forest_falls_into_the_leaves_of_scikit_learn() -> None:
 
 @pytest.mark.parametrize("kernels", [0, 20])
 def test_prediction_agrees_with_the_fitted_chain(kernels: int) -> None:
-    """The compiled walk is a second implementation: it may not say anything else.
+    """The compiled kernel is a second implementation and must give the same results.
 
     That its trees are walked as scikit-learn walks them, `test_flat_forest_falls…` checks.
     """
@@ -163,7 +163,7 @@ def test_rounds_lessen_the_training_loss() -> None:
 
 
 def test_same_seed_same_model_bit_for_bit() -> None:
-    """A model that cannot be made again cannot be trusted; threads may not change it."""
+    """A model must be reproducible, whatever the number of threads."""
     assert fit(seed=0).model_id == fit(replace(SMALL, jobs=2), seed=0).model_id
     assert fit(seed=0).model_id != fit(seed=1).model_id
 
@@ -328,7 +328,7 @@ def test_a_new_category_is_learned_on_the_fixed_dictionary(categorizer: Categori
 
 
 def test_adding_twice_is_possible(categorizer: Categorizer) -> None:
-    """The model must keep what the next addition needs."""
+    """The model must keep the data that the next addition needs."""
     rng = np.random.default_rng(0)
     cone = blobs(20, 7, ("cone",))
     once = add_categories(categorizer, cone.descriptors, ["cone"] * 20, rng=rng)

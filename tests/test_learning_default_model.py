@@ -1,4 +1,4 @@
-"""The model that is shipped, and the simulated views it is made from."""
+"""The default model, and the simulated views that it is trained on."""
 
 from importlib.resources import files
 from pathlib import Path

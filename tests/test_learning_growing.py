@@ -1,4 +1,4 @@
-"""More trees for a model: what it knew stays, what it gets wrong is learned."""
+"""More trees for a model: correct predictions stay, errors are corrected."""
 
 import numpy as np
 import pytest

@@ -1,4 +1,4 @@
-"""Model files are data from strangers: they may neither run code, crash, hang nor fill memory."""
+"""Model files are untrusted: they must not run code, crash, hang or fill the memory."""
 
 import io
 import json
@@ -85,7 +85,7 @@ def test_a_saved_model_comes_back_whole(saved: Path) -> None:
 
 
 def test_the_same_model_gives_the_same_bytes(saved: Path, tmp_path: Path) -> None:
-    """Otherwise `make model` changes the repository each time."""
+    """Otherwise `make model` would change the repository each time."""
     again = tmp_path / "again.npz"
     save_model(again, load_model(saved))
 
@@ -189,7 +189,7 @@ def test_hostile_models_are_refused(saved: Path, case: str) -> None:
 
 
 def test_a_claimed_size_is_not_believed(saved: Path) -> None:
-    """A header of 100 bytes may not make the reader allocate a terabyte."""
+    """A header of 100 bytes must not make the reader allocate a terabyte."""
     real = npy(np.zeros((4, 2)), "f2")
     rewrite(
         saved,

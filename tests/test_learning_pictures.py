@@ -1,4 +1,4 @@
-"""The worst mistakes on the model card: the surest first, one for each object."""
+"""The worst mistakes on the model card: the most confident first, one for each object."""
 
 from pathlib import Path
 
@@ -18,7 +18,7 @@ class Oracle:
     categories = ("cup", "box")
 
     def predict(self, descriptors: np.ndarray) -> Prediction:
-        """Return what the descriptors say."""
+        """Return the predictions that the descriptors encode."""
         cup = descriptors[:, 0]
         return Prediction(np.stack([cup, 1 - cup], axis=1), descriptors[:, 1])
 

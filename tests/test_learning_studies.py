@@ -1,4 +1,4 @@
-"""What the studies of the model card compare: it has to be what their rows are called."""
+"""The ablation studies of the model card compare the methods that their rows name."""
 
 from typing import Any
 

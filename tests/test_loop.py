@@ -26,7 +26,7 @@ FRAMES = 8
 
 
 def table_with_glasses(seed: int) -> World:
-    """Put four wine glasses, which the model does not know, between one thing of each category."""
+    """Place four wine glasses, unknown to the model, between one object of each category."""
     rng = np.random.default_rng(seed)
     table = make_table(rng)
     layout = Layout(rng, gap=0.03)
@@ -59,7 +59,7 @@ def things_of(recording: Path, folder: Path) -> dict[int, tuple[int, str]]:
 
 
 def truth_of(recording: Path, folder: Path) -> dict[int, str]:
-    """Return what a person would say of each track."""
+    """Return the correct label of each track."""
     return {track: name for track, (_, name) in things_of(recording, folder).items()}
 
 
@@ -93,7 +93,7 @@ def command(shapecat: Run, *words: object) -> str:
 
 
 def test_a_new_category_is_learned_from_corrections(shapecat: Run, tmp_path: Path) -> None:
-    """Two wrong labels and a category the model does not know; nothing known gets worse."""
+    """Two wrong labels and a category unknown to the model; known categories must not suffer."""
     recording = record(table_with_glasses(3), tmp_path / "lab.mcap", seed=3, sensor=KINECT)
     command(shapecat, "process", recording, "--out", tmp_path / "first", "--no-rrd")
     first = tmp_path / "first" / "lab"

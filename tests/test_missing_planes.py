@@ -1,4 +1,4 @@
-"""A run without planes finds nothing: the user is told why, in run.json and on the screen."""
+"""A run without planes finds nothing: the user learns the reason, in run.json and on screen."""
 
 import subprocess
 import sys

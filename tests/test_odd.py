@@ -1,4 +1,4 @@
-"""Every odd recording ends as documented, and whatever is missing is said."""
+"""Every odd recording ends as documented, and everything missing is reported."""
 
 from pathlib import Path
 

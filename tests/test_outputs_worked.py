@@ -1,4 +1,4 @@
-"""What leaves a run, on examples worked out by hand: no two numbers are alike."""
+"""The outputs of a run, on worked examples without equal numbers."""
 
 import csv
 import io
@@ -91,7 +91,7 @@ def shown(topic: str, stamp: int, *tracks: int, ended: tuple[int, ...] = ()) -> 
 
 
 def test_annotations_outlive_their_period_and_are_deleted_once() -> None:
-    """The period is that to the next frame of the topic, else that from the one before."""
+    """The period is the time to the next frame of the topic, else from the previous one."""
     frames = [
         shown("/a", 100, 1, 2),
         shown("/a", 140, 2),
@@ -119,7 +119,7 @@ def test_annotations_outlive_their_period_and_are_deleted_once() -> None:
 def test_images_of_two_cameras_with_the_same_stamp_are_both_annotated(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
-    """Cameras are triggered together. An image beside two depth images is annotated once."""
+    """Cameras are triggered together. An image of two depth streams is annotated once."""
     seen = [("/l", 5, 30), ("/r", 5, 30)] * 2 + [("/r", 9, 30), ("/cloud", 11, 1)]
     masks = [
         (("/d", k), ImageMasks(topic, stamp, stamp + 1, "c", 40, height, {0: (3, 4, 7, 9)}, {}))
@@ -139,7 +139,7 @@ def test_images_of_two_cameras_with_the_same_stamp_are_both_annotated(
 def test_a_merged_track_has_one_box_around_all_its_parts_on_an_image(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
-    """A box around one part alone teaches a detector half an object; a part may be out of sight."""
+    """A box around one part would teach half an object; a part may be out of view."""
     boxes = {0: (3, 4, 7, 9), 1: (20, 1, 2, 3), 2: (5, 11, 12, 6)}
     masks = ImageMasks("/l", 5, 6, "c", 40, 30, boxes, {})
     whole, other = TrackLabel(6, "cup", 0.8), TrackLabel(9, "can", 0.7)
@@ -161,7 +161,7 @@ def test_a_merged_track_has_one_box_around_all_its_parts_on_an_image(
 def test_a_frame_has_a_colour_image_only_together_with_its_masks(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
-    """A run of an older version has no masks: exports then go without colours, not to ruin."""
+    """Runs of older versions have no masks: exports then omit colour instead of failing."""
     masks = ImageMasks("/color", 5, 6, "c", 40, 30, {}, {})
     labelled = [replace(labelled_frame(k), masks=masks if k % 2 else None) for k in range(4)]
     read: Any = [(SimpleNamespace(topic="/depth", index=k), "view" if k < 2 else None)
@@ -181,7 +181,7 @@ def test_a_frame_has_a_colour_image_only_together_with_its_masks(
 def test_a_camera_that_passes_by_moves_nothing_in_the_fixed_frame(
     monkeypatch: pytest.MonkeyPatch, fixed_frame: str | None, drawn: list[int]
 ) -> None:
-    """Drawn anew for every step of a robot, the review of a resting table is ten times as long."""
+    """Redrawn at every step of the robot, the review of a still table would be ten times longer."""
     turn = Rotation.from_euler("zyx", [0.7, -0.4, 0.3]).as_matrix()
     place = np.array([1.31, -0.24, 0.87])
     frames = []
@@ -204,7 +204,7 @@ def test_a_camera_that_passes_by_moves_nothing_in_the_fixed_frame(
 
 
 def test_a_scene_is_drawn_if_a_whole_object_moves_or_the_clock_goes_back() -> None:
-    """What is seen of an object that rests changes from frame to frame."""
+    """The visible part of an object at rest varies from frame to frame."""
     rests = box_at((0.31, -0.24, 1.17), (0.12, 0.07, 0.19))
     seen = [(0, 0.0, 0.0), (100, 0.03, 0.0), (200, 0.03, 0.02), (150, 0.03, 0.02), (220, 0.0, 0.02)]
     frames = []
@@ -225,7 +225,7 @@ def test_a_scene_is_drawn_if_a_whole_object_moves_or_the_clock_goes_back() -> No
 
 
 def test_a_long_path_is_forgotten_from_its_beginning() -> None:
-    """The newest five hundred positions stay; steps of no more than 15 mm are none."""
+    """The newest 500 positions are kept; steps of at most 15 mm are ignored."""
     drawn: list[Any] = []
     columns: Any = SimpleNamespace(add=lambda _entity, _at, ways, _draw, **_: drawn.append(ways))
     paths = Paths(columns)
@@ -315,7 +315,7 @@ def test_a_view_is_a_direction_a_distance_a_size_and_a_shape() -> None:
 
 
 def test_images_without_an_object_to_train_on_are_left_out(monkeypatch: pytest.MonkeyPatch) -> None:
-    """To a detector, an image with nothing in it but doubtful objects says that none is there."""
+    """A detector would learn that an image with only uncertain objects is empty."""
     images = [
         None,
         *(SimpleNamespace(sure=sure) for sure in ((False, True), (False,), (), (True,))),
@@ -340,7 +340,7 @@ def test_images_without_an_object_to_train_on_are_left_out(monkeypatch: pytest.M
 
 
 def test_depth_images_are_in_millimetres_and_end_where_16_bits_do() -> None:
-    """What is farther away would come near again."""
+    """Larger depths would wrap around and appear near."""
     depth = np.array([[0.0, 1.2346, 65.535], [65.6, 70.0, 0.0005]], np.float32)
     frame = Frame("/depth", 0, 0, 0, "cam", depth=depth, camera=Camera(3, 2, 5.0, 6.0, 1.0, 0.5))
     found = _depth_file(labelled_frame(0), frame)
@@ -364,7 +364,7 @@ def runs(count: int, same: int = 0) -> Any:
     [(1, 0.9, 0), (10, 0.2, 2), (10, 0.26, 3), (3, 0.99, 2), (5, 0, 0)],
 )
 def test_a_share_of_the_recordings_is_for_validation(count: int, val: float, expected: int) -> None:
-    """One is always left to train on; runs of one recording are never on both sides."""
+    """At least one is left for training; runs of one recording are never split."""
     assert split_runs(runs(count), val).count("val") == expected
     assert len(set(split_runs(runs(10, same=6), 0.4)[:7])) == 1
     for wrong in (-0.1, 1.0):
@@ -462,7 +462,7 @@ def test_the_legend_of_point_labels_knows_red_from_blue(tmp_path: Path) -> None:
 
 
 def test_a_crop_stands_on_its_support() -> None:
-    """Height above the support where it is known, else half of the box."""
+    """It uses the height above the support if known, else half of the box."""
     item = labelled_object(1, [0, 2], height_m=0.31)
     middle = float(UP @ item.box.center)
     assert support_offset(item, UP) == pytest.approx(middle - 0.31)
@@ -489,7 +489,7 @@ def row(**changes: Any) -> dict[str, Any]:
 
 
 def test_the_support_of_a_detection_is_above_its_plane() -> None:
-    """Height of the centre over the plane, less that over what it stands on."""
+    """Its height is that of the centre above the plane minus that above the support."""
     normal = np.array([0.6, 0.0, 0.8])
     plane = Plane(normal, 0.4, np.zeros((3, 3)), 0.5, 0.7)
     over = 0.6 * 0.3 + 0.8 * 1.1 - 0.4
@@ -528,7 +528,7 @@ def test_a_node_is_described_by_its_track_its_size_and_what_is_missing() -> None
 
 
 def test_a_missing_frame_is_answered_with_the_ones_that_are_there(tmp_path: Path) -> None:
-    """Frames of a part of a recording, or of every n-th message, do not count from 0 to the end."""
+    """With a time range or every n-th message, frames are not numbered from 0 to the end."""
     rows = pa.table({"topic": ["/a", "/b", "/a", "/b", "/a"], "frame": [3, 0, 6, 2, 9]})
     pq.write_table(rows, tmp_path / "frames.parquet")
 
@@ -550,7 +550,7 @@ def test_the_corners_of_an_image_box_are_the_borders_of_its_pixels() -> None:
 
 
 def damerau(a: str, b: str) -> int:
-    """Count slips by trying all of them, one after the other."""
+    """Count edits by trying all of them, one after the other."""
     if not a or not b:
         return len(a) + len(b)
     ways = [

@@ -1,4 +1,4 @@
-"""What is another's is not touched, and what has changed is done again."""
+"""Files of others are not touched, and changed input is processed again."""
 
 from collections.abc import Callable
 from pathlib import Path
@@ -23,7 +23,7 @@ def recording(tmp_path_factory: pytest.TempPathFactory) -> Path:
 def test_a_strangers_folder_is_refused(
     shapecat: Run, recording: Path, tmp_path: Path, option: str, name: str
 ) -> None:
-    """Also with --overwrite, and also if it looks like a run."""
+    """Even with --overwrite, and even if it resembles a run."""
     (tmp_path / "lab").mkdir()
     (tmp_path / "lab" / name).write_text("{}")
     done = shapecat("process", recording, "--out", tmp_path, *OPTIONS, option)
@@ -49,7 +49,7 @@ def test_files_beside_the_results_survive(shapecat: Run, recording: Path, tmp_pa
 
 
 def test_four_kilobytes_in_the_middle_make_another_recording(shapecat: Run, tmp_path: Path) -> None:
-    """A run over what a disk has lost since must not pass for complete."""
+    """Damage to a recording after its run must not go unnoticed."""
     lab = record(tmp_path / "lab.bag", 12, container="ros1")  # not compressed: depth, not chunks
     content = bytearray(lab.read_bytes())
     command = ("process", lab, "--out", tmp_path / "out", *OPTIONS)
@@ -81,7 +81,7 @@ def test_a_copy_with_other_times_is_the_same_recording(
 
 
 def test_each_failure_is_told_once(shapecat: Run, recording: Path, tmp_path: Path) -> None:
-    """On stderr when it happens, not again in a column of the closing table."""
+    """On stderr when it happens, and not again in the closing table."""
     (tmp_path / "lab.mcap").write_bytes(recording.read_bytes())
     for k in range(3):
         (tmp_path / f"bad{k}.mcap").write_text("no recording")

@@ -1,4 +1,4 @@
-"""The package as users get it: a wheel, in an environment with the runtime dependencies alone."""
+"""The package as users install it: a wheel, with the runtime dependencies alone."""
 
 import hashlib
 import os
@@ -25,7 +25,7 @@ def run(*command: object, **options: object) -> subprocess.CompletedProcess[str]
 
 @pytest.fixture(scope="module")
 def wheel(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """Build the wheel from a copy of what is under version control, or of the folders it needs."""
+    """Build the wheel from a copy of the files under version control, or of the needed folders."""
     out = tmp_path_factory.mktemp("wheel")
     source = out / "source"
     source.mkdir()
@@ -88,7 +88,7 @@ def _take_machine_code(package: Path) -> None:
 
 
 def _numba_name(sources: Path) -> str:
-    """Return what numba calls the folder for the kernels of a folder of sources."""
+    """Return numba's name for the cache folder of a folder of sources."""
     return (
         f"{sources.name}_{hashlib.sha1(str(sources).encode(), usedforsecurity=False).hexdigest()}"
     )

@@ -1,4 +1,4 @@
-"""The main job from end to end, on recordings made here and on real data when present."""
+"""The whole pipeline, on recordings made here and on real data if present."""
 
 import json
 from collections import Counter
@@ -82,7 +82,7 @@ def test_originals_are_kept_and_annotations_decode(recording: Path, run_folder: 
 
 
 def test_objects_are_found_named_and_followed(recording: Path, run_folder: Path) -> None:
-    """Against the truth beside the recording: found in 9 of 10 frames, one track, right name."""
+    """Against the truth: found in 9 of 10 frames, one track each, correct category."""
     truth = json.loads(recording.with_suffix(".truth.json").read_text())
     labels = np.load(recording.with_suffix(".labels.npz"))["labels"]
     track_of = {
@@ -123,7 +123,7 @@ def final_labels(folder: Path) -> dict[int, str]:
 
 
 def test_the_camera_s_own_motion_is_taken_out(run_folder: Path) -> None:
-    """With transforms, a thing that stands still has one place."""
+    """With transforms, an object at rest has a constant position."""
     run = json.loads((run_folder / "run.json").read_text())
     assert run["fixed_frame"] == "map"
     assert run["up"]["source"].startswith("transforms")
@@ -251,7 +251,7 @@ def test_a_recording_without_clouds(shapecat: Run, tmp_path: Path, recording: Pa
 
 
 def test_a_warning_that_comes_again_is_told_once(tmp_path: Path) -> None:
-    """The recording is opened again by every command that writes its outputs."""
+    """Every command that writes outputs opens the recording again."""
     recording: Any = SimpleNamespace(warnings=["no index", "skipped 3"])
     run: Any = {
         "settings": {"outputs": {}},
@@ -280,7 +280,7 @@ def test_one_bad_recording_does_not_stop_the_others(
 
 
 def test_a_recording_in_which_nothing_is_found(shapecat: Run, tmp_path: Path) -> None:
-    """Tables without a row have been shaped as if they had one."""
+    """Guards against empty tables shaped as if they had a row."""
     path = simulate(tmp_path / "bare.mcap", scene="empty", frames=3, seed=2)
     result = shapecat("process", path, "--out", tmp_path)
     assert result.exit_code == 0, result.output

@@ -1,4 +1,4 @@
-"""Containers: what was recorded is what is read, and damage is said, never raised."""
+"""Containers: recorded messages are read back; damage is reported, never raised."""
 
 import os
 import struct
@@ -135,7 +135,7 @@ def test_unfinished_mcap_is_recovered(tmp_path: Path) -> None:
 
 @pytest.mark.parametrize("rest", [b"", b"\x05" + struct.pack("<Q", 1000) + b"abc"])
 def test_it_is_said_how_much_of_an_unfinished_mcap_is_lost(tmp_path: Path, rest: bytes) -> None:
-    """A user wants to know whether a power cut has cost anything: twelve bytes, or nothing."""
+    """The user must learn whether a power cut cost twelve bytes or nothing."""
     path = write_mcap(tmp_path / "a.mcap", list(range(20)), unfinished=True)
     path.write_bytes(path.read_bytes() + rest)
     with open_recording(path) as recording:
@@ -147,7 +147,7 @@ def test_it_is_said_how_much_of_an_unfinished_mcap_is_lost(tmp_path: Path, rest:
 
 
 def test_a_chunk_without_messages_has_no_time(tmp_path: Path) -> None:
-    """Its times are 0, as the format says: a recording of today would begin in 1970.
+    """By the format its times are 0: a recording of today would begin in 1970.
 
     `--end 5` would then read nothing. Some writers begin with a chunk of schemas and channels.
     """
@@ -183,7 +183,7 @@ def test_every_truncation_ends_sensibly(tmp_path: Path) -> None:
 
 
 def test_every_flipped_byte_ends_sensibly(tmp_path: Path) -> None:
-    """Length fields that lie must not allocate, loop, or leave a traceback."""
+    """Wrong length fields must not cause allocations, endless loops or tracebacks."""
     whole = write_mcap(tmp_path / "a.mcap", list(range(6)), compression=CompressionType.LZ4)
     data = whole.read_bytes()
     path = tmp_path / "flipped.mcap"
@@ -203,7 +203,7 @@ def test_every_flipped_byte_ends_sensibly(tmp_path: Path) -> None:
 def test_small_messages_are_read_without_the_images_behind_them(
     tmp_path: Path, compression: CompressionType
 ) -> None:
-    """To look for transforms was to decompress all of the recording once more."""
+    """Otherwise reading transforms would decompress the whole recording once more."""
     path = tmp_path / "a.mcap"
     noise = np.random.default_rng(0).integers(0, 256, 100_000, np.uint8).tobytes()
     with path.open("wb") as file:
@@ -254,7 +254,7 @@ def test_damaged_chunk_is_left_out(tmp_path: Path) -> None:
 
 @pytest.mark.parametrize("size", [10**9, 2**62])
 def test_chunk_that_claims_to_be_huge_is_refused(tmp_path: Path, size: int) -> None:
-    """Memory follows what the file holds, not what it says."""
+    """Memory must depend on the content of the file, not on its claims."""
     path = write_mcap(tmp_path / "a.mcap", [1, 2], compression=CompressionType.ZSTD)
     data = bytearray(path.read_bytes())
     chunk = data.index(b"\x06", 8 + 9 + 16)
@@ -316,7 +316,7 @@ def test_bag_with_two_types_on_a_topic(tmp_path: Path, compression: Any) -> None
 
 
 def test_bag_cut_anywhere_gives_what_is_there(tmp_path: Path) -> None:
-    """Also one whose recorder was killed: it has no index."""
+    """Including one whose recorder was killed, which has no index."""
     whole = write_bag(tmp_path / "a.bag")
     data = whole.read_bytes()
     path = tmp_path / "cut.bag"
@@ -392,7 +392,7 @@ def test_ros2_folder(
 
 
 def test_a_file_that_is_no_part_of_a_bag_is_not_read(tmp_path: Path) -> None:
-    """A recording put beside the parts, or a damaged part that was repaired, is none of them."""
+    """Guards against a foreign recording, or a repaired copy of a part, beside the parts."""
     path = write_folder(tmp_path / "bag", StoragePlugin.MCAP)
     write_mcap(path / "another.mcap", [7, 8])
     plain = (path / "metadata.yaml").read_text()
@@ -410,7 +410,7 @@ def test_a_file_that_is_no_part_of_a_bag_is_not_read(tmp_path: Path) -> None:
     [("string", 5000, True), ("uint8", 5000, False), ("string", 9, False)],
 )
 def test_long_arrays_of_texts_are_not_unrolled(kind: str, length: int, *, refused: bool) -> None:
-    """The library writes code for each element: a definition of a line would fill the memory."""
+    """The library generates code per element: one line of definition could fill the memory."""
     name, definition = "lab/msg/Long", f"{kind}[{length}] data".encode()
     channel = Channel("/a", name, "cdr", name, "ros2msg", definition)
     expected = pytest.raises(ValueError, match=f"an array of {length} is too long")
@@ -495,7 +495,7 @@ def two_publishers(path: Path, container: str) -> Path:
 
 @pytest.mark.parametrize("container", ["mcap", "ros1", "MCAP", "SQLITE3"])
 def test_messages_of_all_publishers_of_a_topic_are_counted(tmp_path: Path, container: str) -> None:
-    """The topic with most messages may be chosen, and the count is that of the progress."""
+    """The count decides which topic is chosen, and is the total of the progress."""
     suffix = {"mcap": ".mcap", "ros1": ".bag"}.get(container, "")
     with open_recording(two_publishers(tmp_path / f"lab{suffix}", container)) as recording:
         assert [(topic.name, topic.count) for topic in recording.topics] == [("/a", 7), ("/b", 2)]
@@ -504,7 +504,7 @@ def test_messages_of_all_publishers_of_a_topic_are_counted(tmp_path: Path, conta
 
 
 def test_a_split_that_lasts_longest_tells_the_end_whichever_began_last(tmp_path: Path) -> None:
-    """Of two recorders started one after the other, the first may have been stopped last."""
+    """Of two recorders, the one started first may have been stopped last."""
     write_mcap(tmp_path / "b_0.mcap", [11, 40, 97])
     write_mcap(tmp_path / "b_1.mcap", [23, 58])
 

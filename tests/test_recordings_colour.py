@@ -1,4 +1,4 @@
-"""Colour streams: found, decoded, paired in time, placed beside the depth camera."""
+"""Colour streams: found, decoded, paired in time, and registered to the depth camera."""
 
 from collections import Counter
 from pathlib import Path
@@ -99,7 +99,7 @@ def test_raw_images_of_every_channel_order_give_the_same_pixels(encoding: str, d
 
 
 def test_mosaics_and_brightness_with_chroma_become_colours() -> None:
-    """Blocks of one colour come back as that colour, whatever the sensor's layout."""
+    """Blocks of one colour survive, whatever the sensor's pixel layout."""
     red, green, blue = 200, 120, 40
     mosaic = np.zeros((6, 8), np.uint8)
     mosaic[::2, 1::2], mosaic[1::2, ::2] = red, blue  # grbg
@@ -148,7 +148,7 @@ def test_brightness_comes_where_the_encoding_says(encoding: str) -> None:
 
 
 def test_packed_colours_of_points_are_read_by_their_own_offset() -> None:
-    """The float of PCL holds 0x00RRGGBB; reading it as a number gives black objects."""
+    """PCL's float holds 0x00RRGGBB; read as a number it gives black objects."""
     points = organized_points(wavy_depth())
     data = np.zeros((48, 64), np.dtype([("xyz", "<f4", 3), ("pad", "<f4"), ("rgb", "<u4")]))
     data["xyz"] = points
@@ -167,7 +167,7 @@ def test_packed_colours_of_points_are_read_by_their_own_offset() -> None:
 
 
 def test_a_cloud_brings_its_own_colours(tmp_path: Path) -> None:
-    """Colours that are in the points need no second topic, and fit pixel by pixel."""
+    """Colours in the points need no second topic, and fit pixel by pixel."""
     points = organized_points(wavy_depth())
     data = np.zeros((48, 64), np.dtype([("xyz", "<f4", 3), ("rgb", "<u4")]))
     data["xyz"], data["rgb"] = points, 0x0A141E
@@ -200,7 +200,7 @@ def test_compressed_images_are_kept_as_they_came(tmp_path: Path, encode: Any, cl
 
 
 def test_compressed_comes_before_raw_and_colour_before_infrared(tmp_path: Path) -> None:
-    """The wrong one of five streams of a camera must not be taken."""
+    """The wrong one of five streams of a camera must not be chosen."""
     items = depth_items(EPOCH)
     for topic in ("/cam/infra1/image", "/cam/color/image_raw", "/other/color/image_raw"):
         encoding = "mono8" if "infra" in topic else "rgb8"
@@ -231,7 +231,7 @@ def test_compressed_comes_before_raw_and_colour_before_infrared(tmp_path: Path) 
 
 
 def test_frames_pair_with_the_nearest_image_up_to_half_a_period(tmp_path: Path) -> None:
-    """An image of another moment paints the table onto what has moved."""
+    """An image from another time would paint the table onto a moved object."""
     shades = {k: gradient(seed=k) for k in range(4)}
     colours = [
         ("/cam/color/image_raw", EPOCH + t * MS, raw(EPOCH + t * MS, shades[k], "rgb8"))
@@ -247,7 +247,7 @@ def test_frames_pair_with_the_nearest_image_up_to_half_a_period(tmp_path: Path) 
 
 
 def test_an_image_that_is_logged_late_is_waited_for(tmp_path: Path) -> None:
-    """Compression takes its time: the right image is often logged behind the next frame."""
+    """Compression takes time: the right image is often logged after the next frame."""
     stamps = [EPOCH + t * MS for t in (0, 33, 66)]
     colours = [
         ("/cam/color/image_raw", s + 50 * MS, raw(s, gradient(seed=k), "rgb8"))
@@ -259,7 +259,7 @@ def test_an_image_that_is_logged_late_is_waited_for(tmp_path: Path) -> None:
 
 
 def test_damaged_images_are_left_out_and_counted(tmp_path: Path) -> None:
-    """One bad image must not cost a run, nor be passed over in silence."""
+    """A damaged image must neither end a run nor go unreported."""
     body = jpeg(gradient())
     bodies = [body[:-200], b"\xff\xd8\xff", b"", b"no image", body]
     stamps = [EPOCH + 100 * k * MS for k in range(5)]
@@ -276,7 +276,7 @@ def test_damaged_images_are_left_out_and_counted(tmp_path: Path) -> None:
 
 
 def test_damage_inside_an_image_is_a_message_error() -> None:
-    """The header of a file may promise what its content does not keep."""
+    """The header of a file may claim more than its content holds."""
     for body in (jpeg(gradient()), png(gradient())):
         kind = "png" if body.startswith(b"\x89") else "jpeg"
         damaged = body[: len(body) // 2] + body[-12:]
@@ -292,7 +292,7 @@ def test_damage_inside_an_image_is_a_message_error() -> None:
 
 
 def test_another_camera_is_placed_by_the_transforms(tmp_path: Path) -> None:
-    """A turned pose: the inverse, or the wrong order of frames, would be far off."""
+    """With a rotated pose, an inverse or a wrong order of frames is far off."""
     turn = (0.1, -0.2, 0.05, 0.97)
     tf = ("/tf_static", EPOCH, static("camera", "color_optical", (0.05, 0.01, -0.02), turn))
     ((_, view),), _ = read(beside(tmp_path / "a.mcap", tf))
@@ -317,7 +317,7 @@ def test_without_a_transform_there_is_no_colour(tmp_path: Path) -> None:
 
 
 def test_images_of_the_same_frame_but_another_size_are_projected(tmp_path: Path) -> None:
-    """The same frame id says where the camera is, not that the pixels are the same."""
+    """An equal frame id means an equal camera position, not equal pixels."""
     ((_, view),), _ = read(beside(tmp_path / "a.mcap", frame_id="camera"))
 
     assert view is not None
@@ -326,7 +326,7 @@ def test_images_of_the_same_frame_but_another_size_are_projected(tmp_path: Path)
 
 
 def test_extrinsics_of_the_realsense_driver(tmp_path: Path) -> None:
-    """Rotations are stored by columns there; by rows a turned camera looks the other way."""
+    """It stores rotations column by column; read by rows, a rotated camera faces the other way."""
     ros1 = get_typestore(Stores.ROS1_NOETIC)
     text = "std_msgs/Header header\nfloat64[9] rotation\nfloat64[3] translation\n"
     kind = "realsense2_camera/msg/Extrinsics"

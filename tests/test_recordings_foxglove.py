@@ -1,4 +1,4 @@
-"""Recordings made for Foxglove: JSON and Protocol Buffers instead of ROS messages."""
+"""Recordings for Foxglove: JSON and Protocol Buffers instead of ROS messages."""
 
 from collections import Counter
 from pathlib import Path

@@ -1,4 +1,4 @@
-"""Frames: every layout of a cloud or depth image gives the same, right, coordinates."""
+"""Frames: every layout of a cloud or depth image gives the same, correct coordinates."""
 
 from collections import Counter
 from pathlib import Path
@@ -55,7 +55,7 @@ def read(path: Path, *topics: str, **options: Any) -> tuple[list[Frame], Counter
 
 
 def test_needed_frames_are_the_same_as_if_all_were_read(tmp_path: Path) -> None:
-    """Those between them are left out where the file has an index, and still counted."""
+    """In an indexed file the others are skipped, but still counted."""
     items = []
     for k in range(12):
         stamp = EPOCH + k * SECOND
@@ -99,7 +99,7 @@ def test_depth_image_and_organized_cloud_give_the_same_frame(tmp_path: Path) -> 
 
 
 def test_intrinsics_stay_while_they_fit_and_follow_a_change(tmp_path: Path) -> None:
-    """Noise must not make the camera wander; another camera must not keep the old one."""
+    """Noise must not shift the camera; another camera must replace it."""
     rng = np.random.default_rng(0)
     clean = organized_points(wavy_depth())
     noisy = [clean + rng.normal(0, 1e-5, clean.shape) for _ in range(4)]
@@ -244,7 +244,7 @@ def test_definition_without_the_fields_of_its_type(tmp_path: Path) -> None:
 
 
 def test_stamps_and_log_times_that_no_clock_gives_are_counted(tmp_path: Path) -> None:
-    """Tables hold 63 bits."""
+    """Tables hold only 63 bits."""
     points = np.ones((1, 3, 3), np.float32)
     late, negative = cloud(EPOCH, points), cloud(EPOCH, points)
     negative.header.stamp.sec = -5
@@ -286,7 +286,7 @@ def test_missing_readings_of_a_depth_image_are_zero(tmp_path: Path) -> None:
 
 
 def test_each_image_gets_the_calibration_of_its_own_time(tmp_path: Path) -> None:
-    """Zoom and dynamic reconfiguration change it; it may be recorded before or after."""
+    """Zoom and dynamic reconfiguration change it; it may be recorded before or after the image."""
     other, last = (Camera(64, 48, f, f, 30.0, 20.0) for f in (99.0, 77.0))
     depth = wavy_depth()
     items = [
@@ -410,7 +410,7 @@ def test_streams_of_one_sensor_give_one_choice(tmp_path: Path) -> None:
 
 
 def test_of_two_like_streams_the_one_with_more_messages_is_chosen(tmp_path: Path) -> None:
-    """A driver may publish one image on a topic before another takes over."""
+    """A driver may publish one image on a topic before another topic takes over."""
     items = [("/cam/depth/camera_info", 0, info(EPOCH))]
     for number, topic in enumerate(["/cam/depth/a", "/cam/depth/b", "/cam/depth/b"]):
         items.append((topic, number, image(EPOCH + number, wavy_depth())))
@@ -486,7 +486,7 @@ def test_damaged_compressed_depth_is_a_message_error(data: bytes, pack: Any, at:
 
 
 def test_realsense_viewer_bag(tmp_path: Path) -> None:
-    """It has its own topic names, its depth is mono16, and it states the unit of each sensor."""
+    """It has its own topic names, mono16 depth, and a depth unit for each sensor."""
     depth = wavy_depth()
     sensor = "/device_0/sensor_1"
     unit, other = (make("std_msgs/msg/Float32", metres) for metres in (0.00025, 0.001))
@@ -527,7 +527,7 @@ def test_recorded_clouds_match_the_depth_images(name: str) -> None:
 
 
 def test_an_image_waits_no_longer_than_for_its_own_calibration(tmp_path: Path) -> None:
-    """With several streams, one that came a frame late would be out of order."""
+    """With several streams, an image one frame late would be out of order."""
     items = [
         ("/depth/image", 0, image(EPOCH, wavy_depth())),
         ("/depth/camera_info", 1, info(EPOCH)),

@@ -1,4 +1,4 @@
-"""Choices, clocks, cuts and windows of recordings, each at its very limit."""
+"""Choices, clocks, cuts and time windows of recordings, each at its exact limit."""
 
 import struct
 from collections import Counter
@@ -45,7 +45,7 @@ OTHER = Camera(80, 60, 69.5, 73.5, 39.1, 30.3)
 
 
 def colour(topic: str, frame_id: str = "far", count: int = 1) -> list[tuple[str, int, Any]]:
-    """Return images of a topic, compressed if its name says so."""
+    """Return images of a topic, compressed if the topic name says so."""
     stamps = [EPOCH + k * MS for k in range(count)]
     if topic.endswith("compressed"):
         return [(topic, s, packed(s, jpeg(gradient()), frame_id=frame_id)) for s in stamps]
@@ -103,7 +103,7 @@ def test_of_several_strange_cameras_none_belongs_to_the_depth_camera(tmp_path: P
 def test_the_only_colour_camera_belongs_to_no_depth_camera_if_there_are_two(
     tmp_path: Path, topic: str, frame_id: str, found: str | None
 ) -> None:
-    """The masks of one of the two would be drawn on what the other sees."""
+    """Masks of one depth camera would be drawn on the view of the other."""
     second = (topic, EPOCH, image(EPOCH, wavy_depth(), frame_id=frame_id))
     items = [*depth_items(EPOCH), second, *colour("/one/image")]
     with open_recording(record(tmp_path / "a.mcap", in_order(items))) as recording:
@@ -310,7 +310,7 @@ def test_the_end_of_a_compressed_file_is_looked_for_at_its_end() -> None:
 
 
 def test_odd_rows_and_columns_have_no_colour() -> None:
-    """Two by two pixels share a colour: what is left over stays black, and nothing moves."""
+    """Blocks of 2 by 2 pixels share a colour: a remainder stays black, and nothing shifts."""
     mosaic = np.full((5, 7), 90, np.uint8)
     found = pixels_of(ColourImage("", 0, 0, "", "bayer_rggb8", 7, 5, 7, mosaic.tobytes()))
     assert (found[:4, :6] == 90).all()
@@ -543,7 +543,7 @@ def test_every_window_gives_the_messages_of_its_times(tmp_path: Path, container:
 
 
 def test_a_recording_is_described_whole(tmp_path: Path) -> None:
-    """What `shapecat info` says: times, sizes, and the use of each topic."""
+    """The contents of `shapecat info`: times, sizes, and the use of each topic."""
     items = depth_items(EPOCH, EPOCH + 250 * MS)
     items.append(("/cam/color/camera_info", EPOCH, info(EPOCH, WIDE)))
     items.append(("/cam/color/image_raw", EPOCH, raw(EPOCH, gradient(60, 80), "rgb8", "color")))

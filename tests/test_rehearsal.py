@@ -1,4 +1,4 @@
-"""Compiling ahead: what is rehearsed must be the whole way, done once, and leave nobody behind."""
+"""Compiling ahead of time: every kernel, only once, with no process left behind."""
 
 import multiprocessing
 import subprocess
@@ -13,7 +13,7 @@ from shapecat.rehearsal import compile_all, find_ball, recognize_ball
 
 
 def test_the_rehearsals_go_all_the_way() -> None:
-    """Where nothing is found, most kernels are not called and stay uncompiled."""
+    """If nothing is detected, most kernels are not called and stay uncompiled."""
     assert find_ball() == 1
     assert recognize_ball() == "ball"
 
@@ -33,7 +33,7 @@ def trace(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
 
 
 def test_compiling_is_done_once(trace: Path) -> None:
-    """A run tells of it and waits for it: the next must not."""
+    """A run announces the compilation and waits for it; the next run must not."""
     told: list[str] = []
 
     assert compile_all(lambda: told.append("begin")) > 0
@@ -45,7 +45,7 @@ def test_compiling_is_done_once(trace: Path) -> None:
 def test_kernels_are_kept_where_another_version_removed_their_folder(
     trace: Path, monkeypatch: pytest.MonkeyPatch, tmp_path: Path
 ) -> None:
-    """An update while a batch runs must not fail the recordings that are still to come."""
+    """An update during a batch must not fail the remaining recordings."""
     monkeypatch.setattr(rehearsal, "_notes", lambda: tmp_path / "removed" / "complete")
 
     assert compile_all() > 0
@@ -54,7 +54,7 @@ def test_kernels_are_kept_where_another_version_removed_their_folder(
 
 
 def test_an_interrupted_one_is_done_again(trace: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    """Half of the kernels are not all of them."""
+    """Half of the kernels are not enough."""
 
     def interrupt(_cores: int) -> None:
         raise KeyboardInterrupt
@@ -69,7 +69,7 @@ def test_an_interrupted_one_is_done_again(trace: Path, monkeypatch: pytest.Monke
 def test_whoever_waits_is_told(
     trace: Path, monkeypatch: pytest.MonkeyPatch, capfd: pytest.CaptureFixture[str]
 ) -> None:
-    """Minutes of silence look like a hang; kernels that are there already are no news."""
+    """Minutes of silence look like a hang; compiled kernels need no announcement."""
     counted = threading.Event()
 
     def count() -> int:
@@ -94,7 +94,7 @@ def test_whoever_waits_is_told(
 def test_whoever_asks_for_help_need_not_wait(
     trace: Path, capsys: pytest.CaptureFixture[str], word: str, code: int
 ) -> None:
-    """The module took no notice of its arguments, and compiled for a minute."""
+    """`--help` must not compile for a minute."""
     with pytest.raises(SystemExit) as ended:
         rehearsal.main([word])
 
@@ -126,7 +126,7 @@ print("processed")
 
 @pytest.mark.parametrize("says", ["", "# no __main__"])
 def test_a_script_without_a_guard_does_not_wait_for_itself(tmp_path: Path, says: str) -> None:
-    """A process that compiles would run the script again, and wait for its parent's lock."""
+    """A compiling process would run the script again and wait for its parent's lock."""
     script = tmp_path / "script.py"
     script.write_text(UNGUARDED.format(says=says, notes=str(tmp_path / "complete")))
     ended = subprocess.run(

@@ -1,4 +1,4 @@
-"""Recordings and results at URLs: nothing half-done is seen, nothing is left in scratch."""
+"""Recordings and results at URLs: no partial results are visible, no scratch files remain."""
 
 import csv
 import errno
@@ -37,7 +37,7 @@ OPTIONS = ("--no-rrd", "--jobs", 1)
 
 
 class Quiet(http.server.SimpleHTTPRequestHandler):
-    """Serves files without telling."""
+    """Serves files without logging."""
 
     def log_message(self, *_: Any) -> None:
         """Say nothing."""
@@ -63,14 +63,14 @@ def address(served: Path) -> Iterator[str]:
 
 @pytest.fixture(scope="module")
 def bucket(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Path]:
-    """Serve a bucket named lab; give the log of its requests."""
+    """Serve a bucket named lab; provide the log of its requests."""
     with object_storage(tmp_path_factory.mktemp("storage") / "log") as log:
         yield log
 
 
 @pytest.fixture(autouse=True)
 def own_scratch(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[Path]:
-    """Whatever a test does, nothing stays in scratch."""
+    """Whatever a test does, nothing may remain in scratch space."""
     folder = tmp_path / "scratch"
     folder.mkdir()
     monkeypatch.setattr(tempfile, "tempdir", str(folder))
@@ -80,7 +80,7 @@ def own_scratch(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[Pat
 
 @pytest.fixture(autouse=True)
 def impatient(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Do not wait long for what does not pass."""
+    """Shorten all waits for the storage and for claims."""
     monkeypatch.setattr(storage, "_WAITS_S", (0.01, 0.02))
     monkeypatch.setattr(claims, "_BEAT_S", 0.2)
     monkeypatch.setattr(claims, "_LOOK_S", 0.1)
@@ -101,7 +101,7 @@ def results(url: str) -> set[str]:
 def test_from_a_server_to_a_folder(
     shapecat: Run, address: str, served: Path, tmp_path: Path
 ) -> None:
-    """A signed URL has a query, which is no part of a name."""
+    """A signed URL has a query, which is not part of a name."""
     names = ("a.mcap", "b.bag?signature=4/2.mcap", "broken.mcap", "missing.mcap")
     urls = [f"{address}/{name}" for name in names]
     done = shapecat("process", *urls, "--out", tmp_path / "out", *OPTIONS)
@@ -145,7 +145,7 @@ def test_from_a_folder_to_a_storage_and_on(
 def test_results_are_not_made_again_without_a_manifest(
     shapecat: Run, served: Path, bucket: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """A killed command has not sent its last lines: the run folders themselves must be enough."""
+    """A killed command has not sent its last lines; the run folders must suffice."""
     for name in ("a.mcap", "b.bag"):
         (Location("s3://lab/again") / name).upload(served / name)
     command = ("process", "s3://lab/again/", "--out", "s3://lab/again/out", *OPTIONS)
@@ -176,7 +176,7 @@ def test_patterns_and_folders_of_a_storage(served: Path) -> None:
 
 @pytest.mark.parametrize("place", ["memory://lab/mixed", "s3://lab/mixed"])
 def test_a_storage_is_searched_as_a_folder_is(bucket: Path, place: str) -> None:
-    """Results of earlier runs are no recordings; a ROS 2 bag is a folder, and one recording."""
+    """Results of earlier runs are not recordings; a ROS 2 bag is a folder, and one recording."""
     here = Location(place)
     for name in (
         *("x.mcap", "d/y.bag", "bag/bag_0.db3", "bag/bag_1.db3", "bag/metadata.yaml"),
@@ -229,7 +229,7 @@ def answer(status: int) -> Exception:
     ids=str,
 )
 def test_what_may_pass_is_tried_again(error: Exception, *, passes: bool) -> None:
-    """A busy server ends no batch, and a wrong key does not delay one."""
+    """A busy server must not end a batch, and a wrong key must not delay one."""
     assert storage._may_pass(error) is passes
 
 
@@ -261,7 +261,7 @@ PLACES = ["memory://half/run", "s3://lab/half/run"]
 def test_upload_shows_nothing_before_it_is_whole(
     made: Path, bucket: Path, monkeypatch: pytest.MonkeyPatch, url: str
 ) -> None:
-    """Wherever it is cut, there is either no run.json, or all that it stands for."""
+    """Wherever it is interrupted, either there is no run.json, or all its files are there."""
     names = {path.name for path in made.iterdir()}
     sent = Location.upload
     for cut in range(len(names)):
@@ -292,7 +292,7 @@ def test_upload_shows_nothing_before_it_is_whole(
 def test_labels_survive_a_replacement_that_was_killed(
     shapecat: Run, served: Path, bucket: Path, monkeypatch: pytest.MonkeyPatch, url: str
 ) -> None:
-    """The old run is gone, the new one is not there: corrections must not be lost."""
+    """With the old run gone and no new one yet, corrections must survive."""
     out, place = url.removesuffix("/run"), Location(url)
     shutil.copy(served / "a.mcap", served / "run.mcap")
     command = ("process", served / "run.mcap", "--out", out, *OPTIONS)
@@ -330,7 +330,7 @@ def fail(*_: object, **__: object) -> None:
 
 
 def test_what_a_run_no_longer_makes_goes_with_the_run_it_replaces(made: Path) -> None:
-    """Masks or a report beside tables of other settings would show what they do not hold."""
+    """Masks or a report of earlier settings would contradict the new tables."""
     url, names = "memory://renewed/run", {path.name for path in made.iterdir()}
     assert "review.rrd" not in names
     for name in RUN_FILES:
@@ -364,7 +364,7 @@ def test_one_process_at_a_time_works_on_a_folder(bucket: Path, url: str) -> None
 
 
 def test_a_dead_process_is_followed_and_a_late_one_ends(made: Path, bucket: Path) -> None:
-    """A worker that was held to be dead wakes up: its results must not mix with the new ones."""
+    """A worker presumed dead may wake up: its results must not mix with the new ones."""
     url = "s3://lab/late/run"
     first = claims.Claim(url, "one")  # whose heart does not beat
     system: Any = fsspec.filesystem("s3")
@@ -397,7 +397,7 @@ def entry(name: str, state: Any) -> Entry:
 
 
 def test_a_manifest_in_a_bucket_has_all_writers(bucket: Path) -> None:
-    """Two commands at once, one of them killed: no line that was sent is lost."""
+    """With two commands at once, one of them killed, no sent line may be lost."""
     url = "s3://lab/manifests"
     killed = RemoteManifest(url)
     killed.record([entry("a", "complete"), entry("b", "running")])
@@ -418,7 +418,7 @@ def test_a_manifest_in_a_bucket_has_all_writers(bucket: Path) -> None:
 
 
 def test_parts_of_a_manifest_stay_small(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Sent anew with each line, the manifest of a large batch would outweigh its results."""
+    """Sent whole with each line, the manifest of a large batch would outweigh its results."""
     monkeypatch.setattr("shapecat.batch.manifest._PART_BYTES", 2000)
     written = RemoteManifest("memory://parts")
     for k in range(100):
@@ -464,7 +464,7 @@ def test_a_bucket_that_is_not_there_is_one_line(
 
 
 def test_results_do_not_make_a_bucket(shapecat: Run, bucket: Path, served: Path) -> None:
-    """Its name may be misspelt. It is known before a frame is read."""
+    """A misspelt bucket must be reported before a frame is read."""
     for recordings in ([served], [served / "a.mcap"]):
         done = shapecat("process", *recordings, "--out", "s3://none/out", *OPTIONS)
         assert done.exit_code == 1
@@ -498,7 +498,7 @@ def peak_mb() -> float:
 def test_large_files_are_streamed(
     bucket: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """An hour's review.rrd does not fit into memory; it goes and comes in parts."""
+    """The review.rrd of an hour does not fit into memory, so it is transferred in parts."""
     monkeypatch.setattr(storage, "_PART_BYTES", 5 * 2**20)
     large = tmp_path / "large"
     block = os.urandom(2**20)

@@ -1,4 +1,4 @@
-"""The report: what is on the page, and in a browser where there is one."""
+"""The report: the content of the page, and its behaviour in a browser if there is one."""
 
 import base64
 import io
@@ -391,7 +391,7 @@ def many_tracks(folder: Path, count: int) -> str:
 def test_corrections_clicked_in_a_browser_are_adopted(
     browser: Browser, shapecat: Run, run: Path, drawn: RunReport
 ) -> None:
-    """From click to annotated.mcap: what the page writes is what `annotate` reads."""
+    """From click to annotated.mcap: `annotate` reads the table that the page writes."""
     (page,) = Reports([replace(drawn, folder=run)]).write()
     rows = read_track_table(run / "tracks.csv").rows
     a, b, c, d, e = (row.track for row in rows[:5])

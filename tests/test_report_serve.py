@@ -1,4 +1,4 @@
-"""The served report: what is corrected is on disk, and nobody else can correct it."""
+"""The served report: corrections are on disk at once, and nobody else can make any."""
 
 import csv
 import http.client
@@ -191,7 +191,7 @@ TROUBLE = {
 def test_corrections_bear_what_happens_to_the_one_before(
     browser: Browser, run: Path, drawn: RunReport, trouble: str
 ) -> None:
-    """A late answer knows nothing of later labels; what is lost is sent again."""
+    """A late answer must not undo later labels; a lost request is sent again."""
     with serving(run, drawn) as (address, _):
         browser.open(address)
         browser.press("Right", "Left")
@@ -411,7 +411,7 @@ def test_two_tabs_do_not_overwrite_one_another(
 def test_an_interrupt_ends_it_with_the_corrections_in_the_page(
     served: Callable[..., Server], run: Path
 ) -> None:
-    """The page that is mailed afterwards shows what was corrected."""
+    """A page that is mailed afterwards must show the corrections."""
     server = served(without_recording(run).parent)
     assert urlsplit(server.address).path.endswith("/index.html")
     page = server.address.replace("index.html", "table/report.html")

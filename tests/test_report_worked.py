@@ -68,7 +68,7 @@ def test_a_card_shows_views_times_and_the_posterior_of_all_of_them() -> None:
 
 
 def text_of(html: str) -> list[str]:
-    """Return what a reader sees of HTML, in order."""
+    """Return the visible text of HTML, in order."""
     return [part.strip() for part in re.split(r"<[^>]*>", html) if part.strip()]
 
 
@@ -238,7 +238,7 @@ def test_time_lines_end_with_the_last_track(run: Path) -> None:
 
 
 def test_a_long_time_line_is_drawn_to_its_ends() -> None:
-    """What a track was taken for last is what counts."""
+    """The last posterior of a track is the one that counts."""
     assert _few(80).tolist() == list(range(80))
     assert _few(3).tolist() == [0, 1, 2]
     some = _few(1001)
@@ -412,7 +412,7 @@ def test_a_card_shows_the_best_of_its_views() -> None:
 
 
 def test_drawings_are_from_the_sensor_the_side_and_above() -> None:
-    """Right is to the right of who looks, and what is nearer is lower."""
+    """Right is to the viewer's right, and nearer is lower."""
     ends = [[0.1, 0, 0], [-0.1, 0, 0], [0, 0.07, 0], [0, 0, 0.12]]
     gas = NeuralGas(np.array(ends), np.array([[0, 1]]))
     shot = Snapshot(np.zeros((0, 3), np.float32), gas, np.array([2.0, 0.0, 1.5]))

@@ -1,4 +1,4 @@
-"""What is repeated from an earlier frame, and above all what is not."""
+"""Reuse of earlier descriptions: the views that qualify, and above all those that do not."""
 
 from collections.abc import Sequence
 from dataclasses import replace
@@ -35,7 +35,7 @@ def still_world(frames: int = FRAMES, **changes: Any) -> World:
 
 
 def shifted(track: int, shifts: Sequence[Any]) -> Motion:
-    """Return a motion by so much (3,) in each frame; None where the thing is not there."""
+    """Return a motion by a step (3,) per frame; None where the object is absent."""
     return Motion(track, np.array([(np.nan,) * 3 if s is None else s for s in shifts]))
 
 
@@ -47,7 +47,7 @@ def alone(world: World) -> int:
 
 
 def perceive(world: World, **settings: Any) -> list[Perception]:
-    """Perceive the frames of a world as one block, with noise of its own in each."""
+    """Perceive the frames of a world as one block, each with its own noise."""
     views = []
     for k in range(len(world)):
         frame, _ = render_frame(world, k, rng=np.random.default_rng(k), sensor=KINECT)
@@ -84,7 +84,7 @@ def test_a_still_scene_is_perceived_once() -> None:
 
 
 def test_only_readings_of_the_frame_itself_are_pixels_of_an_object() -> None:
-    """A repeated mask on a hole would paint, and export, points that do not exist."""
+    """A repeated mask over a hole would paint and export points that do not exist."""
     world = still_world(2)
     perceptions = perceive(world)
     frame, _ = render_frame(world, 1, rng=np.random.default_rng(1), sensor=KINECT)
@@ -112,7 +112,7 @@ def test_what_moves_is_described_anew_and_nothing_else() -> None:
 
 
 def test_another_object_at_the_same_place_is_described_anew() -> None:
-    """The label of what stood there before would stick to it."""
+    """Otherwise it would inherit the label of the object that stood there before."""
     world = still_world()
     names = [thing.category for thing in world.things]
     track, other = alone(world), names.index("plate" if names[alone(world)] != "plate" else "can")
@@ -152,7 +152,7 @@ def test_what_is_partly_hidden_is_described_anew() -> None:
 
 
 def test_a_slow_drift_is_not_repeated_for_ever() -> None:
-    """Each step alone is within the noise: what counts is the way since the description."""
+    """Each step is within the noise; the motion since the description must count."""
     frames, step = 16, 0.003
     world = still_world(frames)
     track = alone(world)
@@ -171,7 +171,7 @@ def test_a_slow_drift_is_not_repeated_for_ever() -> None:
 
 
 def test_a_walking_camera_takes_surfaces_along() -> None:
-    """In the fixed frame, what is repeated stays exactly where it was."""
+    """In the fixed frame, a reused surface must stay exactly in place."""
     world = make_scene("tabletop", np.random.default_rng(11), frames=FRAMES, rate_hz=30.0)
     perceptions = perceive(world)
     assert all(p.reused_from is None for p in perceptions)
@@ -193,7 +193,7 @@ def test_a_walking_camera_takes_surfaces_along() -> None:
 
 
 def test_a_wrong_pose_repeats_nothing() -> None:
-    """A camera that is said to rest, but moves, shows other points."""
+    """A camera that moves, but is said to rest, sees other points."""
     world = make_scene("tabletop", np.random.default_rng(11), frames=12, rate_hz=3.0)
     still = replace(world, path=(world.path[0],) * 12)
     guesser: Any = Guesser()
@@ -218,7 +218,7 @@ def blank(index: int = 0) -> Frame:
 
 
 def test_something_as_small_as_the_smallest_object_is_a_change() -> None:
-    """60 points are an object: what is so small must not vanish in a scene that is repeated."""
+    """60 points are an object: in a repeated scene, it must not vanish."""
     frame = blank()
     assert frame.depth is not None
     for row, column in ((240, 320), (241, 323), (101, 77)):
@@ -261,7 +261,7 @@ def test_a_camera_that_has_moved_shows_another_scene(
 def test_the_tables_tell_what_is_repeated_within_each_block(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """Blocks begin where they always do: so any worker, and any resumed run, repeats the same."""
+    """Blocks have fixed starts, so that any worker and any resumed run repeats the same."""
     monkeypatch.setattr(shapecat.pipeline, "load_model", lambda _path: Guesser())
     source = record(still_world(10), tmp_path / "still.mcap", seed=1, sensor=KINECT)
     out = tmp_path / "out"

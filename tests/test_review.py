@@ -225,7 +225,7 @@ def drawn(scenes: Iterable[tuple[LabelledFrame, Frame]], *, fixed: bool) -> list
 
 
 def walked(places: Iterable[float]) -> list[tuple[LabelledFrame, Frame]]:
-    """Return what a camera sees that walks along x, of an object at places x in the fixed frame."""
+    """Return views by a camera that moves along x of an object at given x in the fixed frame."""
     poses = [Pose(np.eye(3), np.array([0.1 * k, 0, 0])) for k in range(9)]
     return [
         scene(k, [labelled_object(1, x=x - 0.1 * k)], pose=pose)
@@ -234,7 +234,7 @@ def walked(places: Iterable[float]) -> list[tuple[LabelledFrame, Frame]]:
 
 
 def test_a_caption_names_a_confidence_that_is_low() -> None:
-    """What is nearly certain need not be said, and long captions cover the scene."""
+    """High confidences are not worth mentioning, and long captions cover the scene."""
     item = labelled_object(7)
     low, high, strange = (
         short_label(dataclasses.replace(item, confidence=confidence, category=category))
@@ -320,7 +320,7 @@ def test_a_failure_leaves_no_file_behind(tmp_path: Path) -> None:
 
 
 def test_a_disk_that_fails_under_way_ends_the_writing(tmp_path: Path) -> None:
-    """Rerun's own writer ends with the first error, and the next one who logs waits for ever."""
+    """Rerun's own writer ends at the first error, and later logging blocks forever."""
     before = resource.getrlimit(resource.RLIMIT_FSIZE)
     resource.setrlimit(resource.RLIMIT_FSIZE, (60_000, before[1]))
     try:
@@ -371,7 +371,7 @@ _ANSWERS = "import socket, time; s = socket.create_server(('127.0.0.1', PORT)); 
 def test_a_viewer_without_graphics_names_the_package(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, begins: str, says: str
 ) -> None:
-    """A container has no graphics card: the message must say what to install."""
+    """A container has no graphics card: the message must name the package to install."""
     fake = tmp_path / "rerun"
     answer = (
         f'{sys.executable} -c "{_ANSWERS}"'.replace("PORT", "$4") if begins == "answers" else ""
@@ -384,7 +384,7 @@ def test_a_viewer_without_graphics_names_the_package(
 
 
 def test_no_viewer_is_left_behind(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    """The program `rerun` is a script; killed alone it would leave what it has started."""
+    """The program `rerun` is a script; killing it alone would leave its child process."""
     fake = tmp_path / "rerun"
     fake.write_text(f"#!/bin/sh\nsleep 60 &\necho $! > {tmp_path / 'pid'}\nwait\n")
     fake.chmod(0o755)
@@ -421,7 +421,7 @@ def test_a_screenshot_shows_the_scene(
 
 
 def test_the_eye_steps_back_until_all_is_in_view_but_not_out_of_the_house() -> None:
-    """A walking camera leaves what it saw first; a robot that drives about sees too much."""
+    """A walking camera leaves early objects behind, but a driving robot sees too many."""
     eye = Eye(np.array([0.0, -1.0, 1.0]), np.zeros(3), np.array([0.0, 0.0, 1.0]))
     low, high = np.array([-1.0, -0.2, 0.0]), np.array([1.0, 0.2, 0.2])
 

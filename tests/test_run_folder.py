@@ -31,7 +31,7 @@ def test_nothing_is_left_after_an_error(tmp_path: Path) -> None:
 
 
 def test_a_place_that_cannot_be_written_is_one_line_in_words(tmp_path: Path) -> None:
-    """A number, and the path a second time, tell a user nothing."""
+    """An error number, and the path a second time, do not help a user."""
     (tmp_path / "file").write_text("")
     below, missing = tmp_path / "file" / "model.npz", tmp_path / "none"
 

@@ -1,4 +1,4 @@
-"""What the whole recording tells of up is used in frames that are disturbed."""
+"""The up direction of the whole recording is used in frames that are disturbed."""
 
 import csv
 from collections.abc import Iterator
@@ -57,7 +57,7 @@ def views(moving: bool) -> tuple[tuple[Any, Any, Camera, Pose], ...]:
 
 
 def disturb(depth: Any, labels: Any) -> Any:
-    """Wipe the depth of all furniture, and hold a slanted board behind the top of the image."""
+    """Erase the depth of all furniture, and add a slanted board behind the top of the image."""
     spoilt = np.where(labels < 20, 0, depth).astype(np.float32)
     i, j = np.mgrid[:120, :160]
     board = (i < 60) & (labels < 20)
@@ -114,7 +114,7 @@ def revised(out: Path) -> list[int]:
 
 
 def share_found(out: Path, plain: Path) -> float:
-    """Return how many objects of the frames that are disturbed are where they are without that."""
+    """Return the fraction of objects in disturbed frames that are where they are otherwise."""
     centers: dict[tuple[int, Path], list[Any]] = {}
     for folder in (out, plain):
         for row in rows(folder, "detections", "frame", "center"):
@@ -156,7 +156,7 @@ def walk(tmp_path_factory: pytest.TempPathFactory) -> Path:
 def test_a_recording_of_which_a_tenth_is_disturbed_loses_no_track(
     walk: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, *, moving: bool
 ) -> None:
-    """A camera without transforms that stands, and one with them that walks."""
+    """Both a still camera without transforms and a walking one with them."""
     still = tmp_path / "plain.mcap"
     plain = walk if moving else run(still, items(moving=False, poses=False))
     spoilt = items(moving=moving, poses=moving, disturbed=DISTURBED)
@@ -175,7 +175,7 @@ def test_a_recording_of_which_a_tenth_is_disturbed_loses_no_track(
 def test_disturbed_frames_in_a_row_end_no_track(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """Nor is what is there in these alone lost; without the second look all tracks end."""
+    """Nor are their own objects lost; without the second look all tracks end."""
 
     def recording(disturbed: tuple[int, ...]) -> Iterator[Any]:
         return items(moving=False, poses=False, brief=True, disturbed=disturbed)
@@ -196,7 +196,7 @@ def test_disturbed_frames_in_a_row_end_no_track(
 
 
 def test_a_fixed_frame_whose_z_is_not_up_is_dropped(walk: Path, tmp_path: Path) -> None:
-    """Its poses are true all the same: up in it is what the planes agree on."""
+    """Its poses are still correct, and the planes agree on an up direction in it."""
     leaning = items(moving=True, fixed=LEANING, disturbed=DISTURBED)
     out = run(tmp_path / "leaning.mcap", leaning)
     told = read_run(out)
@@ -210,7 +210,7 @@ def test_a_fixed_frame_whose_z_is_not_up_is_dropped(walk: Path, tmp_path: Path) 
 
 @pytest.mark.parametrize("up", ["0,0.28,-0.96", "tf"])
 def test_an_up_that_the_user_asks_for_is_kept(tmp_path: Path, up: str) -> None:
-    """Whoever gives it by hand may know better than the planes; a warning is all."""
+    """An explicit direction may be better than the planes; a warning is enough."""
     leaning = items(moving=False, fixed=LEANING, disturbed=DISTURBED)
     out = run(tmp_path / "leaning.mcap", leaning, up=up)
     told = read_run(out)
@@ -265,7 +265,7 @@ def test_an_interrupted_second_look_goes_on_where_it_stopped(spoilt: Path, tmp_p
 def test_a_kill_between_the_new_tables_leaves_nothing_that_lasts(
     spoilt: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """Some tables are of the second look then, others are not."""
+    """Some tables would be from the second look, others not."""
     job = Job(spoilt / "table.mcap", tmp_path / "table", mcap=False, rrd=False, settings=BLOCKS)
 
     def die(*_args: object) -> int:
@@ -309,7 +309,7 @@ def tables(
 
 
 def leaning(degrees: Any) -> Any:
-    """Return up (n, 3) of cameras that look down by so much."""
+    """Return up (n, 3) of cameras with these angles below the horizontal."""
     angle = np.radians(degrees)
     return np.stack([0 * angle, -np.cos(angle), -np.sin(angle)], axis=1)
 
@@ -327,7 +327,7 @@ def test_a_still_camera_knows_up_from_its_neighbours() -> None:
 
 
 def test_no_frame_is_its_own_witness() -> None:
-    """Those within three seconds are heard, thirty at most to either side, and not itself."""
+    """Frames within three seconds count, at most thirty on either side, but not itself."""
     stream = _streams(tables(leaning(np.full(90, 35.0))))["/d"]
     apart = stream._replace(stamps_ns=np.arange(90) * 1_000_000_000)
 
@@ -337,7 +337,7 @@ def test_no_frame_is_its_own_witness() -> None:
 
 
 def test_a_camera_that_moves_unknown_to_all_is_no_neighbour() -> None:
-    """What held a moment before says nothing of where up is now."""
+    """If the camera moved in between, earlier frames do not constrain up."""
     up, offsets = leaning(np.linspace(10, 70, 20)), np.full(20, -0.9)
     offsets[8] = np.nan
 
@@ -345,7 +345,7 @@ def test_a_camera_that_moves_unknown_to_all_is_no_neighbour() -> None:
 
 
 def test_poses_carry_up_through_any_motion() -> None:
-    """The fixed frame's z is not up here, and only the planes know."""
+    """The fixed frame's z is not up here; only the planes give it."""
     tilts = np.linspace(10, 70, 20)
     truth, fixed_up = leaning(tilts), np.array([0.6, 0.0, 0.8])
     rotation = [rotation_between(v, fixed_up) for v in truth]
@@ -367,7 +367,7 @@ def rotation_between(a: Any, b: Any) -> Any:
 
 
 def test_a_frame_that_was_told_the_same_is_not_looked_at_again() -> None:
-    """It would be seen the same; a reading of an IMU that was shaken is another matter."""
+    """With an equal up direction the result is the same; a shaken IMU is another matter."""
     given, offsets = leaning(np.full(20, 35.0)), np.full(20, -0.9)
     offsets[[5, 12]] = np.nan
     given[12] = leaning([65.0])[0]

@@ -1,4 +1,4 @@
-"""The yardstick of whole sequences: what it asks for, what it spares, what it counts."""
+"""The benchmark of whole sequences: required, ignored and counted objects."""
 
 import json
 from pathlib import Path

@@ -1,4 +1,4 @@
-"""Several sensors in one run share one table, and tracks where they share a fixed frame."""
+"""Several sensors in one run share a table, and tracks if they share a fixed frame."""
 
 import json
 from collections.abc import Callable

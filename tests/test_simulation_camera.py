@@ -1,4 +1,4 @@
-"""The rasterizer against geometry and rays; the sensor models against what real ones do."""
+"""The rasterizer against geometry and ray casting; the sensor models against real sensors."""
 
 import dataclasses
 
@@ -58,7 +58,7 @@ def test_sphere_is_where_it_should_be() -> None:
 
 
 def test_shared_edges_leave_no_gap() -> None:
-    """A wall of many small triangles must hide what is behind it, at every pixel."""
+    """A wall of many small triangles must hide everything behind it, at every pixel."""
     rng = np.random.default_rng(0)
     n = 60
     grid = np.stack(np.meshgrid(np.linspace(-1, 1, n), np.linspace(-1, 1, n)), -1).reshape(-1, 2)

@@ -1,4 +1,4 @@
-"""Scenes that physics makes: what is hollow stays hollow, and truth tells what bears what."""
+"""Scenes by physics: hollow objects stay hollow, and the truth names the supports."""
 
 import json
 from functools import cache
@@ -27,7 +27,7 @@ QUARTER = rotation_from_quaternion([0, 0, np.sin(0.3), np.cos(0.3)])
 
 @cache
 def settled(kind: SceneKind, seed: int) -> World:
-    """Make a scene once for all tests that look at it; two frames."""
+    """Make a scene of two frames once for all tests that use it."""
     return make_scene(kind, np.random.default_rng(seed), frames=2)
 
 
@@ -39,7 +39,7 @@ def table(height: float = 0.7) -> Mesh:
 
 @pytest.mark.parametrize("category", ["cup", "bowl", "plate"])
 def test_open_shapes_are_cut_into_parts_and_closed_ones_are_not(category: str) -> None:
-    """As its convex hull a cup would be full, and nothing could lie in it."""
+    """As its convex hull a cup would be solid, and nothing could lie in it."""
     for seed in range(3):
         rng = np.random.default_rng(seed)
         assert hollowness(make_object(category, rng)) > 0.25
@@ -49,12 +49,12 @@ def test_open_shapes_are_cut_into_parts_and_closed_ones_are_not(category: str) -
 
 
 def test_parts_cover_the_surface_and_leave_the_inside_open() -> None:
-    """A hole in a wall lets things fall out; a filled corner holds them up."""
+    """Objects would fall through a hole in a wall, or rest on a filled corner."""
     cup = lathe([[0, 0], [0.05, 0], [0.05, 0.12], [0.046, 0.12], [0.046, 0.005], [0, 0.005]])
     hulls = [ConvexHull(part).equations for part in convex_parts(cup)]
 
     def depth(points: np.ndarray) -> np.ndarray:
-        """Return how deep points (n, 3) lie in the parts, metres; negative outside."""
+        """Return the depth of points (n, 3) inside the parts, metres; negative outside."""
         return np.asarray(
             np.max([-(points @ h[:, :3].T + h[:, 3]).max(axis=1) for h in hulls], axis=0)
         )
@@ -65,7 +65,7 @@ def test_parts_cover_the_surface_and_leave_the_inside_open() -> None:
 
 
 def test_ball_that_is_dropped_into_a_cup_lies_in_it() -> None:
-    """The cup bears it, not the table."""
+    """The cup supports it, not the table."""
     cup = lathe([[0, 0], [0.05, 0], [0.05, 0.1], [0.046, 0.1], [0.046, 0.005], [0, 0.005]])
     ball = make_ball(np.random.default_rng(1))
     ball = Mesh(ball.vertices * (0.05 / ball.extents.max()), ball.triangles)
@@ -78,7 +78,7 @@ def test_ball_that_is_dropped_into_a_cup_lies_in_it() -> None:
 
 
 def test_box_on_a_box_is_borne_by_it() -> None:
-    """Relations of objects are judged by this."""
+    """Benchmarks of support relations rely on this."""
     low, high = rounded_box([0.12, 0.09, 0.07]), rounded_box([0.05, 0.06, 0.04])
     place = np.array([-0.2, 0.13])
     first, second = settle([table()], [Drop(low, QUARTER, place), Drop(high, QUARTER, place)])
@@ -99,7 +99,7 @@ def test_what_misses_the_table_falls() -> None:
     ["pile", *(pytest.param(k, marks=pytest.mark.many) for k in ("bin", "shelf_bin", "room"))],
 )
 def test_settled_scenes_are_the_same_again(kind: SceneKind) -> None:
-    """Training and judging name their scenes by seeds."""
+    """Training and evaluation identify scenes by their seeds."""
     one, other = settled(kind, 1), make_scene(kind, np.random.default_rng(1), frames=2)
     assert len(one.things) == len(other.things) > 2
     for a, b in zip(one.things, other.things, strict=True):
@@ -140,7 +140,7 @@ def world_support(kind: str) -> str:
 
 
 def test_tilted_things_are_told_from_straight_ones() -> None:
-    """Categories of tilted things are judged apart."""
+    """The category accuracy of tilted objects is reported separately."""
     tilted = straight = 0
     for seed in (1, 4):
         for thing in settled("pile", seed).things:
@@ -153,7 +153,7 @@ def test_tilted_things_are_told_from_straight_ones() -> None:
 
 
 def test_truth_of_a_pile_is_written(tmp_path: Path) -> None:
-    """It is JSON, and its relations name tracks that are listed."""
+    """It is JSON, and its relations refer to listed tracks."""
     path = record(settled("pile", 4), tmp_path / "pile.mcap", seed=4, sensor=KINECT)
     first, _ = json.loads(path.with_suffix(".truth.json").read_text("utf-8"))
     things = {o["track"]: o for o in [*first["objects"], *first["hidden"]]}

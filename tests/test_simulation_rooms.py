@@ -1,4 +1,4 @@
-"""Rooms: what is no object is labelled so, and the benchmark counts what is detected on it."""
+"""Rooms: background is labelled as such, and the benchmark counts detections on it."""
 
 import numpy as np
 import pytest
@@ -36,7 +36,7 @@ def test_detections_on_no_object_and_pieces_are_surplus() -> None:
 
 @pytest.mark.parametrize("kind", PROCEDURAL)
 def test_families_make_things_of_the_size_of_a_hand(kind: str) -> None:
-    """What is learned as unknown fits on a table, and no two are alike."""
+    """Objects that train *unknown* must fit on a table, and no two may be alike."""
     found = [make_distractor(np.random.default_rng(seed), kind)[1] for seed in range(30)]
     for mesh in found:
         assert 0.02 < mesh.extents.max() < 0.6

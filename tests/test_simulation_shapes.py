@@ -1,4 +1,4 @@
-"""Simulated shapes: the borders between categories, watertight sizes, how things rest."""
+"""Simulated shapes: limits of the categories, watertight meshes, sizes, resting poses."""
 
 import numpy as np
 import pytest

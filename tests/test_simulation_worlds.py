@@ -1,4 +1,4 @@
-"""Scenes: nothing floats or interpenetrates, truth agrees with depth, recordings read back."""
+"""Scenes: nothing floats or intersects, truth agrees with depth, recordings read back."""
 
 import hashlib
 import json

@@ -1,4 +1,4 @@
-"""A person or a scheduler interrupts: the frames in work are kept, the exit code says so."""
+"""Interrupts by a user or a scheduler: current frames are kept, the exit code tells."""
 
 import json
 import os
@@ -27,13 +27,13 @@ def recording(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 def heed_interrupts_slowly() -> None:
-    """Let whoever interrupts run first, or a busy machine ends the command before the signal."""
+    """Yield to the interrupter; a busy machine would otherwise end the command first."""
     heed_interrupts()
     os.nice(10)
 
 
 class Command:
-    """The real command, in a process group of its own as a shell starts it."""
+    """The real command, in its own process group, as a shell starts it."""
 
     def __init__(self, recording: Path, out: Path, *options: str) -> None:
         arguments = ["process", str(recording), "--out", str(out), "--no-rrd", *options]
@@ -47,7 +47,7 @@ class Command:
         )
 
     def wait_for_frames(self, count: int) -> None:
-        """Read progress until so many frames are perceived."""
+        """Read the progress until a number of frames are perceived."""
         assert self.running.stderr is not None
         for line in self.running.stderr:
             event = json.loads(line)
@@ -56,11 +56,11 @@ class Command:
         pytest.fail("ended before it could be interrupted")
 
     def signal_group(self, signum: int) -> None:
-        """Signal as a terminal does: the command and its workers."""
+        """Send a signal as a terminal does: to the command and its workers."""
         os.killpg(self.running.pid, signum)
 
     def end(self) -> tuple[int, str]:
-        """Return the exit code, and what is said after the signal."""
+        """Return the exit code, and the output after the signal."""
         _, errors = self.running.communicate(timeout=60)
         return self.running.returncode, errors
 
@@ -77,7 +77,7 @@ class Command:
 def test_a_signal_keeps_what_is_done(
     recording: Path, undisturbed: Path, tmp_path: Path, signum: int, code: int, jobs: str
 ) -> None:
-    """It reaches the workers too, which must neither die of it nor show a traceback."""
+    """It reaches the workers too, which must neither die of it nor print a traceback."""
     command = Command(recording, tmp_path, "--jobs", jobs)
     command.wait_for_frames(40)
     command.signal_group(signum)
@@ -151,7 +151,7 @@ def test_a_signal_while_libraries_load_ends_the_command() -> None:
 
 @pytest.fixture
 def asked() -> Iterator[Callable[[], None]]:
-    """Stand for a signal that has arrived, and forget it after."""
+    """Pretend that a signal has arrived, and reset that afterwards."""
     with stopping.heeding_signals():
         yield stopping.request
 
@@ -159,7 +159,7 @@ def asked() -> Iterator[Callable[[], None]]:
 def test_frames_in_work_are_finished(
     recording: Path, tmp_path: Path, asked: Callable[[], None]
 ) -> None:
-    """Results that other processes hold when the signal comes are not thrown away."""
+    """Results that other processes hold when the signal arrives are kept."""
 
     def stop(phase: str, done: int, _total: int | None) -> None:
         if (phase, done) == ("perceive", 20):
@@ -173,7 +173,7 @@ def test_frames_in_work_are_finished(
 
 
 def test_a_recording_that_is_written_to_meanwhile_gives_no_results(tmp_path: Path) -> None:
-    """Otherwise half of the tables are of another recording."""
+    """Otherwise half of the tables would be from another recording."""
     moving = record(tmp_path / "table.mcap", 30)
     process(Job(moving, tmp_path / "before" / "table", rrd=False))
 

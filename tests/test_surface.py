@@ -59,7 +59,7 @@ def gas_of(points: F4, method: Method = "fritzke", seed: int = 0) -> NeuralGas:
 def test_voxels_average_their_points(
     points: list[tuple[float, float, float]], voxel_m: float
 ) -> None:
-    """A centroid that mixes voxels, or a voxel that is lost."""
+    """Guards against a centroid that mixes voxels, and against a lost voxel."""
     cloud = np.array(points, np.float32).reshape(-1, 3)
     cells: dict[tuple[int, ...], list[F4]] = {}
     for point in cloud:
@@ -73,7 +73,7 @@ def test_voxels_average_their_points(
 
 
 def test_voxels_do_not_depend_on_the_order_of_points() -> None:
-    """Results that differ between workers or readers."""
+    """Guards against results that differ between workers or readers."""
     cloud = half_sphere(3000)
     shuffled = cloud[rng().permutation(len(cloud))]
     np.testing.assert_array_equal(voxelize(cloud, voxel_m=0.005), voxelize(shuffled, voxel_m=0.005))
@@ -113,7 +113,7 @@ def test_voxels_refuse_what_they_cannot_count(points: list[list[float]], voxel_m
 def test_every_graph_is_connected_and_within_the_points(
     method: Method, count: int, stretch: tuple[float, float, float], seed: int
 ) -> None:
-    """Isolated neurons, separate parts, edges twice or reversed, neurons beside the object."""
+    """Guards against isolated neurons, separate parts, repeated edges, and stray neurons."""
     points = (rng(seed).uniform(-1, 1, (count, 3)) * stretch).astype(np.float32)
     gas = reconstruct(points, settings=surface(method), rng=rng(seed))
     if gas is None:
@@ -142,7 +142,7 @@ def test_same_seed_same_graph(method: Method) -> None:
 @pytest.mark.parametrize("method", METHODS)
 @pytest.mark.parametrize("scale", [1e-3, 1e3])
 def test_thresholds_follow_the_scale_of_the_object(method: Method, scale: float) -> None:
-    """Thresholds in metres: a big object would get more neurons than a small one."""
+    """With thresholds in metres, a big object would get more neurons than a small one."""
     points = half_sphere()
     gas = gas_of(points, method)
     scaled = gas_of((points * scale).astype(np.float32), method)
@@ -162,7 +162,7 @@ def test_neurons_lie_on_the_surface_evenly(method: Method) -> None:
 
 
 def test_noise_moves_neurons_less_than_points() -> None:
-    """The reason for a gas at all: it averages."""
+    """Averaging noise is the reason for using a neural gas."""
     clean = half_sphere(1000)
     noisy = (clean * (1 + 0.04 * rng(5).normal(size=(1000, 1)))).astype(np.float32)
     off_points = np.std(np.linalg.norm(noisy, axis=1))
@@ -218,7 +218,7 @@ def _search(x: F4, y: F4, z: F4, sx: float, sy: float, sz: float) -> Any:
 
 @pytest.mark.parametrize("size", [16, 80, 528])
 def test_vector_search_finds_the_nearest(size: int) -> None:
-    """A lane or a remainder left out; a winner that is listed twice."""
+    """Guards against a skipped lane or remainder, and a winner listed twice."""
     places = rng(size).uniform(-1, 1, (3, size)).astype(np.float32)
     for signal in rng(1).uniform(-1, 1, (200, 3)).astype(np.float32):
         two, three = _search(*places, *signal)
@@ -312,7 +312,7 @@ def test_the_kernel_is_the_published_algorithm() -> None:
 
 
 def test_a_third_neighbour_far_away_is_not_linked() -> None:
-    """Two neurons apart from a row of others: their points' third nearest is across the gap."""
+    """Two neurons are apart from a row of others: the third nearest is across the gap."""
     row = np.stack([np.arange(8.0), np.zeros(8), np.zeros(8)], axis=1) / 10
     pair = np.array([[0.0, 0.9, 0.0], [0.1, 0.9, 0.0]])
     neurons = np.concatenate([row, pair]).astype(np.float32)

@@ -1,4 +1,4 @@
-"""Moving least squares: noise goes, shape stays."""
+"""Moving least squares removes noise and keeps the shape."""
 
 import numpy as np
 import pytest

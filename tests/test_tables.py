@@ -133,7 +133,7 @@ def test_frames_are_stored_when_many_or_old(
 def test_a_second_look_replaces_a_frame_only_where_it_sees_more_than_nothing(
     tmp_path: Path,
 ) -> None:
-    """With another up a scene may be lost: what was seen first is better than that."""
+    """Another up direction may lose a scene; the first result is then better."""
     write_run_tables(tmp_path, [2, 1, 0, 2])
     nothing = replace(perception(3, 0), scene=Scene(np.array([0, -1, 0]), (), ()))
     again = PerceptionTables(tmp_path, categories=CATEGORIES, model_id="m1", again=True)
@@ -182,7 +182,7 @@ def test_labelled_frames_join_tracks_and_labels(tmp_path: Path) -> None:
 
 
 def test_what_has_ended_is_told_in_the_next_frame_of_the_same_sensor(tmp_path: Path) -> None:
-    """In a frame of another sensor nobody would look for it."""
+    """A viewer would not look for it in a frame of another sensor."""
     names = ("/a", "/b", "/b", "/a", "/b")
     with PerceptionTables(tmp_path, categories=CATEGORIES, model_id="m1") as tables:
         for k, name in enumerate(names):

@@ -1,4 +1,4 @@
-"""The tables of a processed recording, against its points and the simulator's truth."""
+"""The tables of a processed recording, compared with its points and the simulator's truth."""
 
 import json
 import shutil
@@ -75,7 +75,7 @@ def test_corrected_labels_reach_every_output(coloured_run: Path, tmp_path: Path)
 
 
 def plain_mcap(path: Path) -> bytes:
-    """Return all messages of what was added to a recording."""
+    """Return all added messages of a recording."""
     from mcap.reader import make_reader  # noqa: PLC0415  beside its only use
 
     with path.open("rb") as file:

@@ -1,4 +1,4 @@
-"""The tables of a sensor that is turned and moved, every number another: checked by SciPy."""
+"""The tables of a rotated and moved sensor, without equal numbers, checked by SciPy."""
 
 import csv
 from dataclasses import replace
@@ -82,7 +82,7 @@ def seen(frame: int, item: int) -> Detection:
 
 @pytest.fixture(scope="module")
 def run(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """Write the tables of three objects that a moving, turned sensor sees."""
+    """Write the tables of three objects seen by a moving, rotated sensor."""
     folder = tmp_path_factory.mktemp("turned")
     with PerceptionTables(folder, categories=CATEGORIES, model_id="m") as tables:
         for k in range(FRAMES):
@@ -109,7 +109,7 @@ def lines(folder: Path) -> list[dict[str, str]]:
 
 
 def test_the_pose_of_the_sensor_is_written_row_by_row(run: Path) -> None:
-    """Transposed, it is a rotation too: only other numbers tell."""
+    """A transposed rotation is also valid; only unequal numbers reveal it."""
     for row in rows(run, "frames"):
         k = row["frame"]
         assert_allclose(np.reshape(row["fixed_rotation"], (3, 3)), TURNS[k].as_matrix())
@@ -164,7 +164,7 @@ def test_lists_of_detections_are_row_by_row(run: Path) -> None:
 
 
 def test_the_tracker_sees_boxes_in_the_fixed_frame(run: Path) -> None:
-    """By the inverse of the pose boxes that stand still would turn."""
+    """With the inverse pose, boxes at rest would rotate."""
     found = list(_read_frames(run, len(CATEGORIES), {"/depth"}))
 
     assert [frame.frame for frame in found] == list(range(FRAMES))
@@ -178,7 +178,7 @@ def test_the_tracker_sees_boxes_in_the_fixed_frame(run: Path) -> None:
 
 
 def test_the_tracker_knows_which_views_repeat_an_earlier_one(tmp_path: Path) -> None:
-    """A view that is repeated while nothing moves would count as many."""
+    """A view repeated in a still scene would count as many views."""
     origins = [None, 0, 0, None]
     scene = Scene(UP, (Plane(UP, -0.5, OUTLINE, 0.7, 0.0),), ())
     with PerceptionTables(tmp_path, categories=CATEGORIES, model_id="m") as tables:
@@ -232,7 +232,7 @@ def test_frames_of_two_sensors_with_the_same_numbers_are_not_exchanged(tmp_path:
 
 
 def test_a_cut_view_says_little_of_the_whole_box(tmp_path: Path) -> None:
-    """Four views in which the image cuts an object weigh as much as one of the two whole ones."""
+    """Four partial views weigh as much as one of the two whole ones."""
     cut = (True, False, True, True, False, True)
     heights = [0.11 if one else 0.21 for one in cut]
     with PerceptionTables(tmp_path, categories=CATEGORIES, model_id="m") as tables:
@@ -262,7 +262,7 @@ def test_a_cut_view_says_little_of_the_whole_box(tmp_path: Path) -> None:
 def test_a_pose_that_is_missing_in_half_of_the_frames_is_not_used(
     tmp_path: Path, posed: int
 ) -> None:
-    """Detections without a pose would be lost; with few of them, they are."""
+    """Detections without a pose would be lost; if they are few, they are."""
     own = np.array([0.31, -0.12, 0.94])
     with PerceptionTables(tmp_path, categories=CATEGORIES, model_id="m") as tables:
         for k in range(FRAMES):
@@ -284,7 +284,7 @@ def test_a_pose_that_is_missing_in_half_of_the_frames_is_not_used(
 
 
 def test_causal_posteriors_know_their_own_view_and_none_after_it(run: Path) -> None:
-    """Row k is the geometric mean of views 0 to k; of those that are cut a quarter counts."""
+    """Row k is the geometric mean of views 0 to k, with a quarter weight for partial views."""
     for item in range(3):
         weights = np.where(PARTIAL, 0.25, 1.0) if item == 0 else np.ones(FRAMES)
         views = np.log([POSTERIORS[k % 2, item] for k in range(FRAMES)])
@@ -295,7 +295,7 @@ def test_causal_posteriors_know_their_own_view_and_none_after_it(run: Path) -> N
 
 
 def test_tracks_csv_begins_with_what_deserves_a_look(run: Path) -> None:
-    """A person reads from the top: unknown ones first, then the least sure."""
+    """Users read from the top: unknown objects first, then the least certain."""
     table = lines(run)
 
     assert table[0]["category"] == "unknown"
@@ -307,7 +307,7 @@ def test_tracks_csv_begins_with_what_deserves_a_look(run: Path) -> None:
 
 
 def test_tracks_csv_says_where_and_when(run: Path) -> None:
-    """Columns in another order are no error to any reader, only wrong."""
+    """Swapped columns would not be an error for any reader, only wrong."""
     by_place = {round(float(row["x"]), 1): row for row in lines(run)}
 
     assert sorted(by_place) == [2.6, 3.1, 3.5]
@@ -325,7 +325,7 @@ def test_tracks_csv_says_where_and_when(run: Path) -> None:
 
 @pytest.mark.parametrize("merged", [False, True])
 def test_labelled_frames_and_annotations_show_the_same_boxes(run: Path, *, merged: bool) -> None:
-    """Two ways lead from the tables to what is shown; up is another one in every frame."""
+    """Two code paths read the tables; the up direction differs in every frame."""
     labels = read_labels(run / "tracks.csv", CATEGORIES)
     if merged:
         labels[3] = labels[1]
@@ -374,7 +374,7 @@ def test_parts_of_a_merged_track_are_one_object(run: Path) -> None:
 
 
 def test_the_place_of_a_track_is_the_usual_one() -> None:
-    """A single stray view must not move the place that a person looks for."""
+    """A single outlier must not move the position that the user sees."""
     centers = np.array([[0.3, 1.1, 0.7], [0.31, 1.12, 0.72], [0.32, 1.13, 0.73], [1.5, 2.6, 0.1]])
     track = Track(
         id=3,

@@ -1,4 +1,4 @@
-"""The tracker and the fusion, piece by piece."""
+"""Unit tests of the tracker and the fusion."""
 
 from dataclasses import replace
 from typing import Any
@@ -42,7 +42,7 @@ def frame(
     posterior: F8 = CUP,
     topic: str = "/depth",
 ) -> FrameDetections:
-    """Return a frame (ten per second by default) of like objects at some places."""
+    """Return a frame (ten per second by default) of equal objects at given positions."""
     points = np.reshape(np.asarray(centers, float), (-1, 3))
     n = len(points)
     return FrameDetections(
@@ -98,7 +98,7 @@ def test_a_fragment_beside_the_object_does_not_steal_its_identity() -> None:
 
 
 def test_a_new_object_next_to_a_missed_one_is_not_forced_into_its_track() -> None:
-    """A plain assignment would use up the free row at any price."""
+    """A plain assignment would use the free row at any cost."""
     tracker = Tracker(SETTINGS)
     for k in range(5):
         step(tracker, k, [[0, 0, 0], [1, 0, 0]])
@@ -124,7 +124,7 @@ def test_an_unseen_track_ends_and_ended_tracks_cost_nothing() -> None:
 
 
 def test_a_late_frame_does_not_end_a_track() -> None:
-    """Time-lapse recordings have frames farther apart than any patience."""
+    """Time-lapse recordings have longer frame intervals than any timeout."""
     tracker = Tracker(SETTINGS)
     assert [step(tracker, k, [0, 0, 0], stamp_ns=k * 60 * SECOND) for k in range(4)] == [[1]] * 4
 
@@ -159,7 +159,7 @@ def test_hungarian_takes_the_best_whole_and_greedy_the_best_pair() -> None:
 
 
 def test_a_recording_of_single_pictures_keeps_every_detection() -> None:
-    """Stamps a second apart, other objects at the same places in every frame."""
+    """Stamps are a second apart, and each frame has other objects at the same places."""
     random = np.random.default_rng(4)
     frames = [
         FrameDetections(
@@ -195,7 +195,7 @@ def test_a_false_detection_gets_no_track() -> None:
 
 
 def test_one_odd_frame_is_no_cut() -> None:
-    """All objects missed and two invented in one frame must not break the tracks."""
+    """One frame with all objects missed and two false ones must not break the tracks."""
     seen = [[0, 0, 0], [0.3, 0, 0]]
     frames = [frame(k, [[0.1, 0.1, 0], [0.2, 0.1, 0]] if k == 9 else seen) for k in range(20)]
     assert not scene_cuts(Hits.of(frames), SETTINGS).any()
@@ -212,7 +212,7 @@ def test_a_gap_is_filled_by_rows_on_the_line_and_a_long_one_is_left_out() -> Non
 
 
 def test_an_object_that_comes_back_to_its_place_keeps_its_track() -> None:
-    """It left the view for longer than any patience: only hindsight knows."""
+    """It is out of view longer than any timeout, so only hindsight can join its tracks."""
     frames = [frame(k, [0, 0, 0] if k < 20 or k >= 200 else [2, 0, 0]) for k in range(220)]
     tracks = tuple(track_recording(frames, SETTINGS))
     assert [track.hits for track in tracks] == [40, 180]
@@ -276,7 +276,7 @@ def test_fragments_are_joined_only_when_nothing_speaks_against_it(
 
 
 def test_one_wrong_view_does_not_keep_what_comes_back_apart() -> None:
-    """What comes into view is cut at first, and may be found in two pieces when it is whole."""
+    """Objects enter the view partly visible, and may be split once they are whole."""
     cup, other = np.array([0.999, 0.001]), np.array([0.05, 0.95])
     before = [frame(k, [0, 0, 0], posterior=cup) for k in range(20)]
     away = [frame(k, []) for k in range(20, 100)]
@@ -294,7 +294,7 @@ def test_streams_are_tracked_apart_and_numbered_together() -> None:
 
 
 def test_long_recordings_keep_their_tracks_whole() -> None:
-    """A thousand frames; how long they take, the benchmarks say."""
+    """A thousand frames; the benchmarks measure their duration."""
     random = np.random.default_rng(0)
     places = np.column_stack([np.arange(6) * 0.2, np.zeros((6, 2))])
     frames = [frame(k, places + random.normal(0, 0.01, (6, 3))) for k in range(1000)]
@@ -318,7 +318,7 @@ def test_fusion_is_a_distribution_and_every_prefix_is_a_fusion(views: F8, method
 
 @pytest.mark.parametrize("method", ["mean", "product", "vote"])
 def test_more_views_of_the_same_kind_do_not_sharpen(method: str) -> None:
-    """Views of one placement share their error: thirty equal ones are worth one."""
+    """Views of one placement share their errors: thirty equal ones count as one."""
     one = fuse([[0.6, 0.4]], method)  # type: ignore[arg-type]  # one of the three
     assert np.allclose(fuse([[0.6, 0.4]] * 30, method), one)  # type: ignore[arg-type]  # the same
 
@@ -333,7 +333,7 @@ def test_fusion_weighs_and_no_view_has_a_veto() -> None:
 
 
 def test_many_views_reject_less_and_a_cut_view_counts_less() -> None:
-    """Known objects whose novelty strays about the limit must not become unknown by their mean."""
+    """Known objects whose novelty scatters around the limit must not become unknown."""
     assert fuse_novelty([1.05], [1.0]) == pytest.approx(1.05)
     assert fuse_novelty([1.05] * 9, [1.0] * 9) < 1 < fuse_novelty([1.1] * 9, [1.0] * 9)
     assert fuse_novelty([0.5, 2.0], view_weights(np.array([False, True]))) < 1
@@ -359,7 +359,7 @@ def test_pieces_of_an_object_that_is_split_now_and_then_are_no_tracks() -> None:
 
 
 def test_a_burst_of_splits_is_no_track() -> None:
-    """Nothing is missed in its life: what was there before and after it tells."""
+    """It is never missed while it lasts; only the frames before and after reveal it."""
     whole, split = [(0.0, 0.2)], [(0.0, 0.12), (0.12, 0.2)]
     tracks = tuple(track_recording(boxed([whole] * 20 + [split] * 6 + [whole] * 20), SETTINGS))
     assert [track.hits for track in tracks] == [46]
@@ -391,7 +391,7 @@ def test_what_is_put_into_a_bowl_is_not_a_piece_of_the_bowl() -> None:
 
 
 def test_an_object_that_comes_into_view_in_pieces_is_one_track() -> None:
-    """Before it was ever whole, nothing but its later size tells that they are pieces."""
+    """Before it is whole, only its later size shows that they are pieces."""
     whole, split = [(0.0, 0.2)], [(0.0, 0.08), (0.08, 0.2)]
     tracks = tuple(track_recording(boxed([split] * 12 + [whole] * 30), SETTINGS))
     assert [track.hits for track in tracks] == [42]
@@ -399,7 +399,7 @@ def test_an_object_that_comes_into_view_in_pieces_is_one_track() -> None:
 
 @pytest.mark.parametrize("partial", [True, False])
 def test_what_passes_behind_a_narrow_thing_is_one_track(partial: bool) -> None:
-    """For some frames both of its sides are seen, and never its whole depth."""
+    """For some frames both of its sides are visible, but never its whole width."""
     left, right = (0.0, 0.0, 0.0), (0.15, 0.0, 0.0)
     sides = [[left]] * 20 + [[left, right]] * 4 + [[right]] * 20
     frames = [
@@ -415,7 +415,7 @@ def test_what_passes_behind_a_narrow_thing_is_one_track(partial: bool) -> None:
 
 @pytest.mark.parametrize("in_one", [True, False])
 def test_what_is_seen_in_one_between_its_two_sides_is_one_track(in_one: bool) -> None:
-    """Nothing else shows its whole length: two things may come and go like its two sides."""
+    """Nothing else shows its whole length: two objects could look like its two sides."""
     left, right = (0.0, 0.05), (0.1, 0.15)
     split, whole = [left, right], [(0.0, 0.15)]
     change = [split, whole if in_one else split, split, split, split, split]
@@ -424,7 +424,7 @@ def test_what_is_seen_in_one_between_its_two_sides_is_one_track(in_one: bool) ->
 
 
 def test_what_is_there_after_a_while_unseen_need_not_be_the_same() -> None:
-    """Unseen for 0.8 s, a track waits on; whether it came back is judged by all of its views."""
+    """A track survives 0.8 s unseen; all of its views decide whether it came back."""
     before = [frame(k, [0, 0, 0], posterior=CUP) for k in range(20)]
     after = [frame(k, [0.02, 0, 0], posterior=BOX, size=(0.14, 0.14, 0.1)) for k in range(28, 50)]
     tracks = tuple(
@@ -434,7 +434,7 @@ def test_what_is_there_after_a_while_unseen_need_not_be_the_same() -> None:
 
 
 def turning(*, speed: float, hidden: range, frames: int = 80) -> list[FrameDetections]:
-    """Return a table that turns by ``speed`` radians a second; of one thing nothing is seen."""
+    """Return a table that rotates at ``speed`` rad/s; one object has no reading."""
     random = np.random.default_rng(1)
     angle, radius = np.array([0.0, 1.3, 2.4, 3.9, 5.2]), np.array([0.3, 0.2, 0.35, 0.25, 0.3])
     found = []
@@ -448,7 +448,7 @@ def turning(*, speed: float, hidden: range, frames: int = 80) -> list[FrameDetec
 
 
 def test_an_object_hidden_on_a_turning_table_is_known_where_it_comes_back() -> None:
-    """The others tell how far the table has turned: by 1.2 radians, 35 cm of its way."""
+    """The other objects show the rotation of the table: 1.2 rad, or 35 cm of its path."""
     frames = turning(speed=0.4, hidden=range(25, 55))
     tracks = tuple(track_recording(frames, SETTINGS))
     assert sorted(track.hits for track in tracks) == [50, 80, 80, 80, 80]
@@ -487,7 +487,7 @@ def test_a_clock_that_jumps_back_is_a_cut() -> None:
 
 
 def test_a_cut_view_moves_its_track_less_and_teaches_it_less() -> None:
-    """What the border or an occluder cuts is seen beside its middle, and smaller than it is."""
+    """A partial view is off-centre and too small."""
 
     def after(*, partial: bool) -> Any:
         tracker = Tracker(SETTINGS)
@@ -546,7 +546,7 @@ def test_only_a_long_gap_of_several_frames_splits_a_track(
 
 @pytest.mark.parametrize(("hits", "alive"), [(2, 1), (3, 0)])
 def test_a_track_that_has_proved_itself_ends_by_time_alone(hits: int, alive: int) -> None:
-    """After ``min_hits`` detections no missed frame is forgiven that comes too late."""
+    """After ``min_hits`` detections, only the elapsed time ends a track."""
     tracker = Tracker(replace(SETTINGS, min_hits=3))
     for k in range(hits):
         step(tracker, k, [[0.0, 0, 0]], stamp_ns=2 * k * SECOND)
@@ -584,7 +584,7 @@ def test_a_short_track_inside_a_longer_one_is_its_shadow(
 
 
 def test_only_one_fragment_goes_on_where_two_ended() -> None:
-    """A track with two detections in one frame would give its number to two boxes."""
+    """A track with two detections in one frame would number two boxes alike."""
     columns: dict[str, Any] = {
         "first_ns": [0, 0, 20 * SECOND],
         "last_ns": [2 * SECOND, 2 * SECOND, 30 * SECOND],

@@ -1,4 +1,4 @@
-"""Simulated recordings with known identities: what the tracker must not lose, swap or invent."""
+"""Simulated detections with known identities that the tracker must not lose, swap or invent."""
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
@@ -22,7 +22,7 @@ HIDDEN = 0.8
 
 @dataclass(frozen=True)
 class Thing:
-    """An object: where it is at a time (3,), or None where there is none."""
+    """An object: its position (3,) at a time, or None while it is absent."""
 
     category: int
     size: F8
@@ -31,7 +31,7 @@ class Thing:
 
 @dataclass(frozen=True)
 class Sensor:
-    """Where the camera is, how far it sees (a square around ``looks_at``), and its faults."""
+    """The position of the camera, its view (a square around ``looks_at``), and its faults."""
 
     eye: Callable[[float], F8]
     looks_at: Callable[[float], F8]
@@ -73,7 +73,7 @@ def truth_at(things: Sequence[Thing], sensor: Sensor, t: float) -> dict[int, F8]
 
 
 def hidden_share(k: int, places: dict[int, F8], things: Sequence[Thing], eye: F8) -> float:
-    """Return how much of an object's outline the nearer ones hide from the camera."""
+    """Return the fraction of an object that nearer ones hide from the camera."""
     ray = places[k] - eye
     reach = np.linalg.norm(ray[:2])
     share = 0.0
@@ -93,7 +93,7 @@ def hidden_share(k: int, places: dict[int, F8], things: Sequence[Thing], eye: F8
 def detections_at(
     things: Sequence[Thing], sensor: Sensor, t: float, random: np.random.Generator
 ) -> tuple[list[tuple[int, F8, F8, F8]], Truth]:
-    """Return (category, centre, size, posterior) of what a detector reports, and the truth."""
+    """Return (category, centre, size, posterior) of the detections, and the truth."""
     found = []
     places, eye = truth_at(things, sensor, t), sensor.eye(t)
     shares = {k: hidden_share(k, places, things, eye) for k in places}

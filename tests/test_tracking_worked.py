@@ -1,4 +1,4 @@
-"""The steps of the tracking against worked examples and other libraries, no two numbers alike."""
+"""The steps of tracking against worked examples and other libraries, without equal numbers."""
 
 from dataclasses import replace
 from typing import Any
@@ -113,7 +113,7 @@ def test_the_correction_is_kalmans_and_the_means_run() -> None:
 
 
 def test_the_cost_of_a_pair_is_the_sum_of_what_speaks_against_it() -> None:
-    """Distance over the gate squared, sizes, posteriors, and that a track is young."""
+    """Squared distance over the gate, sizes, posteriors, and a penalty for young tracks."""
     found = tracker._seed(
         np.array([[0.13, -0.40, 0.86], [0.34, -0.15, 0.60]]),
         np.log([[0.21, 0.10, 0.05], [0.31, 0.12, 0.05]]),
@@ -135,7 +135,7 @@ def test_the_cost_of_a_pair_is_the_sum_of_what_speaks_against_it() -> None:
 
 
 def test_a_box_that_flips_by_a_quarter_turn_keeps_its_size() -> None:
-    """Its two sides change places; the height does not, though it is between them."""
+    """Its two sides swap; the height does not, though it is between them."""
     expected = np.log([0.20, 0.06, 0.13])  # each a centimetre longer
 
     assert_allclose(size_key(np.array([[0.05, 0.19, 0.12], [0.19, 0.05, 0.12]])), [expected] * 2)
@@ -170,7 +170,7 @@ def test_a_track_is_waited_for_as_long_as_it_was_there(
 
 
 def test_the_line_through_detections_is_the_one_of_ridge_regression() -> None:
-    """Least squares with a row that says: it stands still."""
+    """Least squares with an additional row for zero velocity."""
     rng = np.random.default_rng(3)
     stamps = np.array([5.0, 5.1, 5.3, 5.32, 5.8])
     centers = rng.normal(size=(5, 3))
@@ -242,7 +242,7 @@ def fragments(**changes: Any) -> Fragments:
 
 
 def test_the_way_from_one_fragment_to_the_next_is_the_shortest_of_five() -> None:
-    """From its end or its rest to their start or rest, or halfway on along both motions."""
+    """From its end or rest to their start or rest, or halfway along both motions."""
     found = _distances(fragments(), 0, np.array([1, 2]), SETTINGS)
 
     # Halfway through the second between them: (.45, .17, .08) and (.44, .17, .09).
@@ -293,7 +293,7 @@ def test_frames_of_two_sensors_are_put_in_the_order_of_time() -> None:
 
 
 def test_tracks_are_numbered_by_birth_whichever_sensor_sees_them() -> None:
-    """What people call #1 is what appeared first."""
+    """Users expect #1 to be the first object that appears."""
     late = [frame(k, [0.3, 0.1, 1.0], topic="/a") for k in range(5, 15)]
     early = [frame(k, [0.6, 0.2, 1.1], topic="/b") for k in range(10)]
     found = list(track_recording([*late, *early], SETTINGS))
@@ -306,7 +306,7 @@ def test_tracks_are_numbered_by_birth_whichever_sensor_sees_them() -> None:
 
 
 def turned_hits() -> Hits:
-    """Return two detections in one frame whose boxes are turned otherwise."""
+    """Return two detections in one frame whose boxes have different yaws."""
     other = Rotation.from_euler("z", 0.5).as_matrix() @ TURNED
     places = [[0.31, -0.12, 0.83], [0.42, -0.05, 0.79]]
     sizes, axes = np.array([[0.12, 0.05, 0.2], [0.07, 0.16, 0.09]]), np.stack([TURNED, other])
@@ -399,7 +399,7 @@ def test_the_level_frame_stands_up_and_is_right_handed() -> None:
 
 
 def test_a_turn_in_the_plane_is_one_about_up_in_space() -> None:
-    """It moves points as the plane says, and leaves their heights."""
+    """It must move points in the plane and keep their heights."""
     level = _level(TURNED[None])
     turn, shift = np.exp(1j * np.array([0.4, -1.1])), np.array([0.3 - 0.2j, 0.05 + 0.7j])
     motion = _in_space(level, turn, shift)
@@ -419,7 +419,7 @@ def test_a_turn_in_the_plane_is_one_about_up_in_space() -> None:
 
 
 def test_turn_and_shift_of_each_frame_are_found_alone() -> None:
-    """A frame with a single point keeps what it had; a point that weighs nothing says nothing."""
+    """A frame with a single point keeps its transform; points of weight zero have no effect."""
     turn, shift = np.exp(0.6j), 0.2 - 0.5j
     seen = np.array([0.1 + 0.2j, -0.3 + 0.1j, 0.4 - 0.6j, 2.0 + 1.0j, 0.7 + 0.7j])
     still = turn * seen + shift

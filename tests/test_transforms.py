@@ -1,4 +1,4 @@
-"""Transforms: the right pose, or an error that says what is missing."""
+"""Transforms: the correct pose, or an error that names the missing link."""
 
 import tracemalloc
 from bisect import bisect_right
@@ -63,7 +63,7 @@ def test_chain_over_time_agrees_with_pytransform3d(seed: int, share: float) -> N
 
 
 def test_order_of_arrival_and_repeated_poses_do_not_matter() -> None:
-    """Bags hold transforms out of order, and a standing robot says the same for hours."""
+    """Bags hold transforms out of order, and a robot at rest repeats them for hours."""
     buffer = TransformBuffer()
     for stamp, x in ((40, 4.0), (0, 1.0), (10, 1.0), (20, 1.0), (30, 1.0), (50, 4.0), (60, 4.0)):
         buffer.add("map", "base", stamp, moved(x), static=False)
@@ -236,7 +236,7 @@ def test_transforms_of_a_ros2_recording(tmp_path: Path) -> None:
 
 
 def test_transforms_of_an_old_ros1_recording(tmp_path: Path) -> None:
-    """tf/tfMessage is what ROS 1 recorded before tf2."""
+    """ROS 1 recorded tf/tfMessage before tf2."""
     store, kind = get_typestore(Stores.ROS1_NOETIC), "tf/msg/tfMessage"
     store.register(get_types_from_msg("geometry_msgs/TransformStamped[] transforms", kind))
     path = tmp_path / "a.bag"

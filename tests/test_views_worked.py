@@ -1,4 +1,4 @@
-"""Surfaces and descriptors of shapes whose numbers can be worked out."""
+"""Surfaces and descriptors of shapes with known values."""
 
 from typing import Any
 
@@ -30,7 +30,7 @@ def facing(points: F8, normals: F8, eye: F8) -> F8:
 
 
 def ball(middle: F8, radius: float, eye: F8) -> F8:
-    """Return what is seen of a ball, evenly (Fibonacci's sphere)."""
+    """Return the visible points of a ball, evenly spread (Fibonacci sphere)."""
     k = np.arange(2 * COUNT) + 0.5
     z, angle = 1 - k / COUNT, k * np.pi * (1 + 5**0.5)
     r = np.sqrt(1 - z * z)
@@ -65,7 +65,7 @@ def test_shares_of_a_ball_that_is_seen_from_the_side() -> None:
 
 @pytest.mark.parametrize("height", [0.9, -0.6])
 def test_from_below_more_of_a_ball_looks_down(height: float) -> None:
-    """From the side as much of it looks up as down: that tells no sign."""
+    """From the side, equal parts face up and down, which reveals no sign error."""
     middle, eye = np.array([0, 0, 0.2]), np.array([0.8, 0.3, height])
     points = ball(middle, 0.06, eye)
     normals = (points - middle) / 0.06
@@ -76,7 +76,7 @@ def test_from_below_more_of_a_ball_looks_down(height: float) -> None:
 
 
 def test_where_an_object_begins_and_how_it_is_seen() -> None:
-    """It hangs 0.14 m above its support; the sensor looks down on it by the arc sine of 0.6."""
+    """It is 0.14 m above its support; the sensor looks down at an angle of asin(0.6)."""
     middle = np.array([0.0, 0.0, 0.2])
     eye = middle + np.array([0.8, 0.0, 0.6])
     value = described(ball(middle, 0.06, eye), eye)
@@ -100,7 +100,7 @@ def walls() -> F8:
 
 
 def test_no_edge_leads_through_the_air() -> None:
-    """Along such an edge the inside of a cup would be as near as its rim."""
+    """Otherwise the inside of a cup would be as near as its rim."""
     points = walls()
     gas = gas_of(points)
     tree = cKDTree(points)
@@ -127,7 +127,7 @@ def test_parts_are_joined_once_and_where_they_are_nearest() -> None:
 
 
 def test_stacked_objects_are_described_from_what_they_stand_on() -> None:
-    """Described from the table up, a box on a box would begin at the height of the lower one.
+    """Measured from the table, a box on a box would begin at the height of the lower one.
 
     Completed from the table up, it would reach through it.
     """
@@ -153,7 +153,7 @@ def scene_of(frame: Frame, up: F8 | None) -> F8:
 
 
 def test_a_turned_cloud_with_its_up_has_the_same_objects() -> None:
-    """What a caller says of up is in the frame of the points, however these are turned."""
+    """A given up direction is in the frame of the points, whatever their rotation."""
     rng = np.random.default_rng(11)
     image, _ = render_frame(make_scene("tabletop", rng, frames=1), 0, rng=rng, sensor=IDEAL)
     points = image.xyz()
@@ -170,7 +170,7 @@ def test_a_turned_cloud_with_its_up_has_the_same_objects() -> None:
 
 
 def test_cells_of_an_image_see_where_their_pixels_do() -> None:
-    """Inverse depth of a plane is linear in the rays: shifted by half a pixel it is another."""
+    """The inverse depth of a plane is linear in the rays, so half a pixel would change it."""
     camera = Camera(320, 240, 260.3, 255.1, 158.7, 121.2)
     normal, offset = np.array([0.21, -0.83, -0.35]), -0.9
     v, u = np.mgrid[:240, :320]

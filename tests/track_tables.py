@@ -1,4 +1,4 @@
-"""Tables of tracks for runs that are made up."""
+"""Track tables of synthetic runs."""
 
 from collections.abc import Sequence
 from pathlib import Path

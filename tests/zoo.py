@@ -1,4 +1,4 @@
-"""A zoo of recordings: each way in which robots write, break and misuse the formats."""
+"""A zoo of recordings: the ways in which robots write, break and misuse the formats."""
 
 import json
 import shutil
@@ -29,7 +29,7 @@ FACTORY, FACTORY1 = MessageFactory(2), MessageFactory(1)
 
 
 class Exhibit(NamedTuple):
-    """How to write it, the exit code and frames expected, and what must be said about it."""
+    """A recording: its writer, the expected exit code and frames, and the expected messages."""
 
     write: Callable[[Path], Path]
     code: int = 0
@@ -99,7 +99,7 @@ def bag(path: Path, compression: Any = None, *, threshold: int = 60_000) -> Path
 
 
 def active_bag(path: Path) -> Path:
-    """Write what rosbag leaves when it is killed: no index, the header says so."""
+    """Write the file that a killed rosbag leaves: no index, and a header that says so."""
     found = bag(path)
     data = found.read_bytes().replace(b"index_pos=", b"index_pos=\0\0\0\0\0\0\0\0*", 1)
     at = data.index(b"index_pos=") + 10
@@ -294,7 +294,7 @@ def distorted(path: Path, *, strong: bool) -> Path:
 
 
 def foreign(path: Path) -> Path:
-    """Channels of other programs: a service event, encodings and schemas nobody knows."""
+    """Channels of other programs: a service event, and unknown encodings and schemas."""
     found = path / "a.mcap"
     with found.open("wb") as file:
         writer = Writer(file)
@@ -350,7 +350,7 @@ def hostile_chunk(path: Path) -> Path:
 
 
 def bad_frames(path: Path) -> Path:
-    """Every image is shorter than it says."""
+    """Every image has less data than its header claims."""
 
     def change(topic: str, message: Any) -> Any:
         if topic.endswith("image_raw"):

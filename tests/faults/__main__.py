@@ -1,4 +1,4 @@
-"""Disturbs the command at random and prints what held: ``python -m tests.faults --count 50``."""
+"""Disturb the command at random and print the outcomes: ``python -m tests.faults --count 50``."""
 
 import argparse
 import sys

@@ -16,12 +16,12 @@ _FIRST_S = 900.0
 
 
 class SkippedError(Exception):
-    """A fault that cannot be made here."""
+    """A fault that cannot be injected here."""
 
 
 @dataclass(frozen=True)
 class Verdict:
-    """What became of a case."""
+    """The outcome of a case."""
 
     kind: str
     seed: int
@@ -75,7 +75,7 @@ class Laboratory:
         return rng.choice(fitting)
 
     def judge(self, kind: str, seed: int) -> Verdict:
-        """Make a case, check it, run the same command again, check it again."""
+        """Run a case, check it, run the same command again, and check that."""
         rng = random.Random(f"{kind} {seed}")  # noqa: S311  draws moments, no secrets
         scenario = self.draw(kind, rng)
         case = self.store / "cases" / f"{kind}-{seed}-{time.monotonic_ns()}"

@@ -1,4 +1,4 @@
-"""How a command is disturbed: signals, dead workers, failing calls, a full disk, other input."""
+"""Disturbances of the command: signals, dead workers, failing calls, a full disk, changed input."""
 
 import contextlib
 import json
@@ -31,7 +31,7 @@ _LINGER_S = 8.0
 
 @dataclass
 class Ended:
-    """What is known of a command that has ended."""
+    """The outcome of a command that has ended."""
 
     code: int
     seconds: float
@@ -46,7 +46,7 @@ class Ended:
         return "".join(line for _, line in self.lines)
 
     def events(self) -> list[tuple[float, dict[str, object]]]:
-        """Return the lines of progress with their moments."""
+        """Return the progress lines with their times."""
         found = []
         for moment, line in self.lines:
             with contextlib.suppress(ValueError):
@@ -57,12 +57,12 @@ class Ended:
 
 
 def _heed_interrupts() -> None:
-    """Do not inherit that a shell lets its background jobs ignore them."""
+    """Obey interrupts even if the shell lets its background jobs ignore them."""
     signal.signal(signal.SIGINT, signal.SIG_DFL)
 
 
 class Running:
-    """A command in a session of its own whose stderr is read as it comes."""
+    """A command in a session of its own, whose stderr is read as it is written."""
 
     def __init__(self, command: list[str], environment: Mapping[str, str] | None = None) -> None:
         self.begun = time.monotonic()
@@ -87,7 +87,7 @@ class Running:
                 self.lines.append((time.monotonic() - self.begun, line))
 
     def wait_until(self, moment: float) -> bool:
-        """Wait for a moment after the start; tell whether the command still runs then."""
+        """Wait until a time after the start; return whether the command is still running."""
         try:
             self.process.wait(max(0.0, self.begun + moment - time.monotonic()))
         except subprocess.TimeoutExpired:
@@ -116,7 +116,7 @@ class Running:
 
 
 def session(leader: int) -> list[int]:
-    """Return the processes that live in the session of a leader, but for itself and zombies."""
+    """Return the processes in the session of a leader, except the leader and zombies."""
     found = []
     for entry in Path("/proc").iterdir():
         if entry.name.isdigit() and int(entry.name) != leader:
@@ -128,7 +128,7 @@ def session(leader: int) -> list[int]:
 
 
 def disturb(kind: str, rng: random.Random, command: list[str], seconds: float) -> Ended:
-    """Run a command and signal it, or kill a worker, at a random moment of ``seconds``."""
+    """Run a command, and signal it or kill a worker at a random time within ``seconds``."""
     running = Running(command)
     moment = rng.uniform(0.3, max(0.4, seconds))
     group = rng.random() < 0.5
@@ -188,7 +188,7 @@ def build_shim(folder: Path) -> Path | None:
 
 
 def shimmed(library: Path, kind: str, nth: int, case: Path) -> dict[str, str]:
-    """Return the environment in which the ``nth`` call below a case is the first to fail."""
+    """Return the environment in which the ``nth`` call in a case folder is the first to fail."""
     counts = case.with_name(f"{case.name}.counts")
     counts.write_bytes(bytes(24))
     return {
@@ -201,7 +201,7 @@ def shimmed(library: Path, kind: str, nth: int, case: Path) -> dict[str, str]:
 
 
 def mount(folder: Path, megabytes: int) -> bool:
-    """Put a small disk at a folder; False where that is not permitted."""
+    """Mount a small disk at a folder; return False if that is not permitted."""
     folder.mkdir(parents=True, exist_ok=True)
     words = ["mount", "-t", "tmpfs", "-o", f"size={megabytes}m", "shapecat-faults", str(folder)]
     try:
@@ -211,10 +211,10 @@ def mount(folder: Path, megabytes: int) -> bool:
 
 
 def enlarge(folder: Path) -> None:
-    """Give the small disk room."""
+    """Enlarge the small disk."""
     subprocess.run(["mount", "-o", "remount,size=300m", str(folder)], check=True)
 
 
 def unmount(folder: Path) -> None:
-    """Take the small disk away."""
+    """Unmount the small disk."""
     subprocess.run(["umount", str(folder)], check=False, capture_output=True)

@@ -1,4 +1,4 @@
-"""What must hold after a fault. Each check yields what is wrong, in words."""
+"""Invariants after a fault. Each check yields the violations as text."""
 
 import json
 import re
@@ -42,7 +42,7 @@ _CRASH = re.compile(
 
 
 def ended_well(kind: str, ended: Ended) -> Iterator[str]:
-    """Check the exit code and what was said."""
+    """Check the exit code and the messages."""
     if ended.hung:
         yield "hung"
     elif ended.code not in CODES[kind]:
@@ -59,7 +59,7 @@ def ended_well(kind: str, ended: Ended) -> Iterator[str]:
 
 
 def whole_places(scenario: Scenario, out: Path) -> Iterator[str]:
-    """Check that whatever has a final name is complete."""
+    """Check that everything under a final name is complete."""
     for item in sorted(out.iterdir()) if out.is_dir() else []:
         if item.name.startswith("."):
             continue
@@ -72,7 +72,7 @@ def whole_places(scenario: Scenario, out: Path) -> Iterator[str]:
 
 
 def whole_run(run: Path) -> Iterator[str]:
-    """Check that a run folder holds every file, and each of them whole."""
+    """Check that a run folder holds every file, each of them complete."""
     for name in (*FILES, *OUTPUTS):
         if not (run / name).is_file():
             yield f"{run.name}: no {name}"
@@ -111,7 +111,7 @@ def _read_mcap(path: Path) -> None:
 
 
 def _read_rrd_footer(path: Path) -> None:
-    """Check the last 32 bytes: begin and size of the footer, a checksum, a mark."""
+    """Check the last 32 bytes: start and size of the footer, a checksum, a magic number."""
     content = path.read_bytes()
     begin, size = struct.unpack("<QQ", content[-32:-16])
     if (
@@ -124,7 +124,7 @@ def _read_rrd_footer(path: Path) -> None:
 
 
 def whole_lines(manifest: Path) -> Iterator[str]:
-    """Check that no line of a manifest is torn."""
+    """Check that no line of a manifest is truncated."""
     content = manifest.read_bytes()
     if content and not content.endswith(b"\n"):
         yield "manifest: last line is torn"
@@ -145,7 +145,7 @@ def nothing_lost(scenario: Scenario, ended: Ended, out: Path) -> Iterator[str]:
 
 
 def reported(ended: Ended, until: float) -> dict[str, int]:
-    """Return how many frames of each recording were perceived by a moment."""
+    """Return the number of frames of each recording that were perceived before a given time."""
     done: dict[str, int] = {}
     for moment, event in ended.events():
         if event.get("event") == "progress" and event.get("phase") == "perceive":
@@ -156,7 +156,7 @@ def reported(ended: Ended, until: float) -> dict[str, int]:
 
 
 def kept_frames(out: Path, run: str) -> int:
-    """Return the frames in a run folder, or in the hidden folder of one that goes on."""
+    """Return the frames in a run folder, or in the hidden folder of an unfinished run."""
     for folder in (out / run, out / f".{run}.partial"):
         if (folder / "frames.parquet").is_file():
             try:
@@ -177,7 +177,7 @@ def _rows(path: Path) -> int:
 
 
 def nothing_hidden(out: Path) -> Iterator[str]:
-    """Check that a completed command leaves no hidden half-made thing."""
+    """Check that a completed command leaves no hidden partial results."""
     for path in sorted(out.rglob(".*")):
         if path.name.endswith((".partial", ".old")):
             yield f"left over: {path.relative_to(out)}"
@@ -211,7 +211,7 @@ def tracks(run: Path) -> list[list[str]]:
 
 
 def same_files(folder: Path, reference: Path, *, all_there: bool) -> Iterator[str]:
-    """Check that files have the content of the undisturbed command's, and which there are."""
+    """Check that the same files exist as after the undisturbed command, with equal content."""
     found, expected = files(folder), files(reference)
     for name in sorted(found.keys() & expected.keys()):
         if found[name] != expected[name]:

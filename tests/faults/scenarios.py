@@ -1,4 +1,4 @@
-"""What is disturbed: small simulated recordings, and commands that work on them."""
+"""The commands to disturb, and the small simulated recordings that they process."""
 
 import os
 import shutil
@@ -20,7 +20,7 @@ class Scenario:
     verb: str = "process"
 
     def prepare(self, store: Path, case: Path) -> None:
-        """Link the recordings into a fresh case; copy the finished run that others need."""
+        """Link the recordings into a new case; copy the finished run that other commands need."""
         (case / "in").mkdir(parents=True)
         for name in self.recordings:
             os.link(store / name, case / "in" / name)
@@ -69,7 +69,7 @@ _RECORDINGS = {
 
 
 def relabel(table: Path) -> None:
-    """Fill the label of the first track, as a person does."""
+    """Fill in the label of the first track, as a user does."""
     head, first, *rest = table.read_text("utf-8").splitlines()
     column = head.split(",").index("label")
     cells = first.split(",")

@@ -1,1 +1,1 @@
-"""Operators that are flipped on purpose, to see whether a test notices."""
+"""Mutation testing: flip an operator and check that a test fails."""

@@ -1,4 +1,4 @@
-"""Flip operators of the modules without kernels, one at a time, and run the tests that know them.
+"""Flip operators in modules without kernels, one at a time, and run the tests of the module.
 
     python -m tests.mutations --only quick --count 60 --least 0.6
 
@@ -156,7 +156,7 @@ def tests_of(mutant: Mutant) -> list[Path]:
 
 
 def judge(mutant: Mutant, reached: Mapping[Path, Reached | None]) -> tuple[Mutant, str]:
-    """Run the tests that reach a mutant, then the others of their files; tell what became of it."""
+    """Run the tests that reach a mutant, then the others of their files; return the outcome."""
     known = {file: reached[file] for file in tests_of(mutant)}
     found = {file: result for file, result in known.items() if result and result.by(mutant)}
     if not found:
@@ -167,7 +167,7 @@ def judge(mutant: Mutant, reached: Mapping[Path, Reached | None]) -> tuple[Mutan
 
 
 def main() -> int:
-    """Print what became of each mutant, and the share that was killed."""
+    """Print the outcome of each mutant, and the fraction that was killed."""
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("--count", type=int, help="mutants, all if absent")
     parser.add_argument("--seed", type=int, default=1)

@@ -1,4 +1,4 @@
-"""The tests of a module in a forked process, with a mutant of that module or without."""
+"""The tests of a module in a forked process, with or without a mutant of that module."""
 
 import ast
 import importlib.abc
@@ -39,7 +39,7 @@ class Mutant(NamedTuple):
 
 
 class Reached(NamedTuple):
-    """The tests of a file that reach a line, by module and line, and how long the file takes.
+    """The tests of a file that reach each line, by module and line, and the duration of the file.
 
     An empty name stands for what runs before the first test, when modules are imported.
     """
@@ -68,7 +68,7 @@ def reach(test: Path) -> Reached | None:
 
 
 def attempt(mutant: Mutant, tests: Sequence[Path], first: Sequence[str], seconds: float) -> str:
-    """Run test files with a mutant, some tests first; tell whether it survived or what killed it.
+    """Run test files with a mutant, some tests first; return whether it survived, or its killer.
 
     ``failed``: a test failed; ``broken``: a test file could not be imported; ``late``: the tests
     took longer than allowed.
@@ -117,7 +117,7 @@ def _tested(tests: Sequence[Path], *plugins: object) -> int:
 
 
 class _Contexts:
-    """Tells the tracer which test runs."""
+    """Tells the tracer which test is running."""
 
     def __init__(self, coverage: Coverage) -> None:
         self.coverage = coverage
@@ -127,7 +127,7 @@ class _Contexts:
 
 
 class _Order:
-    """Puts some tests at the front."""
+    """Runs some tests first."""
 
     def __init__(self, first: set[str]) -> None:
         self.first = first
@@ -138,19 +138,19 @@ class _Order:
 
 
 class _Mutated(importlib.abc.MetaPathFinder, importlib.abc.Loader):
-    """Gives one module another code."""
+    """Replaces the code of one module."""
 
     def __init__(self, name: str, file: Path, code: CodeType) -> None:
         self.name, self.file, self.code = name, file, code
 
     def pytest_sessionstart(self) -> None:
-        """Stand before pytest's own finder, which loads a module whose examples are run."""
+        """Register before pytest's own finder, which loads modules with examples."""
         sys.meta_path.insert(0, self)
 
     def find_spec(
         self, name: str, _path: object, _target: object = None
     ) -> importlib.machinery.ModuleSpec | None:
-        """Know that module alone."""
+        """Find only the mutated module."""
         if name != self.name:
             return None
         return importlib.util.spec_from_file_location(name, self.file, loader=self)
@@ -159,5 +159,5 @@ class _Mutated(importlib.abc.MetaPathFinder, importlib.abc.Loader):
         """Leave it to Python."""
 
     def exec_module(self, module: Any) -> None:
-        """Run the other code."""
+        """Run the mutated code."""
         exec(self.code, module.__dict__)  # noqa: S102  our own code but for an operator

@@ -1,4 +1,4 @@
-"""Where an operator of a module can be flipped, and the module with one that is."""
+"""The operators of a module that can be flipped, and the module with one of them flipped."""
 
 import ast
 import copy
@@ -34,7 +34,7 @@ _UNARY = (ast.Not, ast.USub)
 
 
 class Flip(NamedTuple):
-    """An operator: its place among the nodes of the module, its line, and what becomes of it."""
+    """An operator: its index among the nodes of the module, its line, and its replacement."""
 
     place: int
     line: int
@@ -59,14 +59,14 @@ def flipped(source: str, flip: Flip) -> ast.Module:
 
 
 def _code_nodes(tree: ast.Module) -> Iterator[ast.AST]:
-    """Yield the nodes that are run: no annotations, and no types that are unions by ``|``."""
+    """Yield the nodes that are executed, without annotations and unions of types by ``|``."""
     for node in ast.walk(tree):
         if not isinstance(node, ast.BinOp) or not isinstance(node.op, ast.BitOr | ast.BitAnd):
             yield node
 
 
 def _flip(node: ast.AST) -> str:
-    """Flip an operator in place; return what was done, empty if there is none."""
+    """Flip an operator in place; return a description of the change, empty if there was none."""
     if isinstance(node, ast.Compare) and type(node.ops[0]) in _COMPARISONS:
         old = type(node.ops[0])
         node.ops[0] = _COMPARISONS[old]()
@@ -90,7 +90,7 @@ def _flip(node: ast.AST) -> str:
 
 
 def _is_text(node: ast.BinOp) -> bool:
-    """Tell whether an operand is a text: its formatting is no arithmetic."""
+    """Return whether an operand is a string: formatting is not arithmetic."""
     parts = (node.left, node.right)
     return any(
         isinstance(part, ast.JoinedStr)
