@@ -1,4 +1,4 @@
-"""Segments: parts of the tables that survive a kill, for the first and the second look.
+"""Segments: finished parts of the tables, which survive a kill of the run.
 
 Segments are folders that appear when complete and never change. The tables can be joined from
 them again and again, so a kill while they are joined does no harm.
