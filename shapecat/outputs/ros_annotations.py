@@ -52,7 +52,7 @@ class RosMessages:
         return _definition(self.ros1, name)
 
     def make(self, kind: str, *values: Any) -> Any:
-        """Make a message of the type ``kind`` (short name) from its fields, or a Header from a frame."""
+        """Make a message of the type ``kind`` from its fields, or a Header from a frame."""
         if kind == "Header":
             return self._header(*values)
         return self._types[kind](*values)
