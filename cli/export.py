@@ -5,6 +5,7 @@ from pathlib import Path
 from typing import Any
 
 import click
+from click.core import ParameterSource
 
 from shapecat.outputs.counts import plural
 
@@ -65,7 +66,10 @@ _FORMATS = (*_DATASETS, "crops", *_WITH_BOXES, "point-labels")
 )
 @boxes_option("kitti, labelcloud: {}; full by default.")
 @recording_option
+@click.pass_context
 def export(
+    ctx: click.Context,
+    /,
     *,
     folders: tuple[Path, ...],
     kind: str,
@@ -108,7 +112,7 @@ def export(
     if kind in _DATASETS:
         _export_dataset(runs, kind, out, recording, {"every": every, **chosen})
         return
-    given = [name for name, value in chosen.items() if value and name != "val"]
+    given = [name for name in chosen if ctx.get_parameter_source(name) != ParameterSource.DEFAULT]
     if given:
         msg = f"--{given[0].replace('_', '-')} is for --format coco and yolo, not {kind}"
         raise click.UsageError(msg)

@@ -271,12 +271,25 @@ def test_only_an_earlier_export_is_replaced(run: Path, tmp_path: Path) -> None:
         export_dataset([run], "coco", run, Selection())
 
 
+@pytest.mark.parametrize(
+    ("option", "value"),
+    [
+        ("--per-track", "3"),
+        ("--min-confidence", "0.5"),
+        ("--corrected-only", ""),
+        ("--depth", ""),
+        ("--val", "0.2"),
+    ],
+)
 def test_options_of_data_sets_are_refused_elsewhere(
-    run: Path, tmp_path: Path, shapecat: Run
+    run: Path, tmp_path: Path, shapecat: Run, option: str, value: str
 ) -> None:
-    result = shapecat("export", run, "--format", "kitti", "--out", tmp_path, "--corrected-only")
+    """An option that is ignored without a word leaves a person with another export than asked."""
+    out = tmp_path / "out"
+    result = shapecat("export", run, "--format", "kitti", "--out", out, option, *value.split())
     assert result.exit_code == 2
-    assert "--corrected-only is for --format coco and yolo, not kitti" in result.stderr
+    assert f"{option} is for --format coco and yolo, not kitti" in result.stderr
+    assert not out.exists()
 
 
 @pytest.mark.parametrize("kind", ["coco", "yolo", "crops", "point-labels"])
