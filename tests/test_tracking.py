@@ -211,6 +211,18 @@ def test_a_gap_is_filled_by_rows_on_the_line_and_a_long_one_is_left_out() -> Non
     assert track.hits == 20
 
 
+def test_a_track_in_a_gap_does_not_know_the_view_after_it() -> None:
+    """A posterior that is causal only where there is a detection tells the future in the gap."""
+    views = {0: CUP, 1: CUP, 2: CUP, 6: BOX, 7: BOX}
+    frames = [
+        frame(k, [[0, 0, 0]] if k in views else [], posterior=views.get(k, CUP)) for k in range(8)
+    ]
+    (track,) = track_recording(frames, SETTINGS)
+    assert track.detections[3:6].tolist() == [-1, -1, -1]
+    assert np.allclose(track.causal[2:6], CUP)
+    assert track.causal[6, 0] < 0.9
+
+
 def test_an_object_that_comes_back_to_its_place_keeps_its_track() -> None:
     """It is out of view longer than any timeout, so only hindsight can join its tracks."""
     frames = [frame(k, [0, 0, 0] if k < 20 or k >= 200 else [2, 0, 0]) for k in range(220)]
@@ -560,6 +572,8 @@ def test_a_track_that_has_proved_itself_ends_by_time_alone(hits: int, alive: int
     [
         (10, 0.01, False),  # inside the host, while it is seen
         (10, 0.2, True),  # beside it
+        (25, 0.01, False),  # and when it outlasts the host by a frame
+        (2, 0.01, False),  # or comes a frame before it
         (27, 0.01, True),  # at its place, after it has gone
         (0, 0.01, True),  # and before it came
     ],
