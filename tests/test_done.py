@@ -17,7 +17,7 @@ from shapecat.batch.plans import Shard, name_folders, plan_batch
 from shapecat.batch.remote import Ticket
 from shapecat.batch.runs import exit_code, process_on
 from shapecat.batch.storage import Location
-from shapecat.config import Settings
+from shapecat.config import Settings, with_overrides
 from shapecat.errors import OutputError
 from shapecat.executors import WorkerLostError
 from shapecat.runs.folder import read_run, write_run
@@ -28,7 +28,14 @@ from shapecat.runs.identity import (
     unchanged,
     work_id,
 )
-from shapecat.runs.jobs import Job, describe_run, has_work, resume, same_options
+from shapecat.runs.jobs import (
+    Job,
+    describe_run,
+    has_work,
+    require_unchanged,
+    resume,
+    same_options,
+)
 from shapecat.runs.run_info import RunInfo
 from shapecat.system.files import partial_path
 
@@ -118,10 +125,11 @@ def test_another_model_version_or_content_is_other_work(source: Path, key: str) 
     assert work_id(run) != work_id(other)
 
 
-@pytest.mark.parametrize("name", ["color", "mcap", "rrd"])
+@pytest.mark.parametrize("name", ["color", "mcap", "rrd", "boxes"])
 def test_outputs_do_not_change_what_the_tables_are_of(source: Path, name: str) -> None:
     """Labels of a run without a review must also fit the same run with a review."""
     changed: Any = {"color": {"color": ""}, "mcap": {"mcap": False}, "rrd": {"rrd": False}}
+    changed["boxes"] = {"settings": with_overrides(Settings(), ["outputs.boxes=visible"])}
     run, other = planned(source), planned(source, **changed[name])
 
     assert work_id(run) == work_id(other)
@@ -213,6 +221,19 @@ def test_a_partial_run_of_the_same_work_goes_on(source: Path, tmp_path: Path) ->
 
     assert resume(folder, planned(source), source, lambda: "")["id"] == run["id"]
     assert (folder / "segments" / "000000").exists()
+
+
+def test_a_partial_run_goes_on_with_a_copy_of_its_recording(source: Path, tmp_path: Path) -> None:
+    """Times of the old file would make the finished run look changed, and delete its work."""
+    folder, run = tmp_path / "half", planned(source)
+    partial(folder, run)
+    os.utime(source, (1, 1))
+
+    going_on = resume(folder, planned(source), source, lambda: run["input"]["digest"])
+
+    assert going_on["id"] == run["id"]
+    require_unchanged(folder, going_on, source)
+    assert has_work(folder)
 
 
 @pytest.mark.parametrize("what", ["model", "settings", "shapecat", "numpy", "content"])

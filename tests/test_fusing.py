@@ -299,7 +299,7 @@ def test_tables_do_not_depend_on_processes_or_interruptions(job: Job) -> None:
     """Frames are fused with earlier ones, even if another process or run perceived those."""
 
     def stop(phase: str, done: int, _total: int | None) -> None:
-        if (phase, done) == ("perceive", 36):
+        if (phase, done) == ("perceive", 20):
             raise KeyboardInterrupt
 
     other = replace(job, folder=job.folder.with_name("other"))
@@ -308,7 +308,7 @@ def test_tables_do_not_depend_on_processes_or_interruptions(job: Job) -> None:
         process(other, stop)
     process(other, cores=2)
 
-    assert read_run(other.folder)["counts"]["resumed"] >= 32
+    assert 20 <= read_run(other.folder)["counts"]["resumed"] < 40  # or nothing was left to fuse
     assert_same_tables(job.folder, other.folder)
     process(replace(job, folder=job.folder.with_name("single"), settings=Settings()))
     with pytest.raises(AssertionError, match="frames"):  # or nothing was fused
