@@ -13,6 +13,7 @@ from scipy.spatial.transform import Rotation
 
 from shapecat.completion import DIRECTIONS
 from shapecat.config import TrackingSettings
+from shapecat.outputs.report.tracks import read_timelines
 from shapecat.runs.corrections import read_labels
 from shapecat.runs.labels import _join, read_labelled_frames
 from shapecat.runs.perceived import FrameRow, PerceptionTables
@@ -344,6 +345,25 @@ def test_labelled_frames_and_annotations_show_the_same_boxes(run: Path, *, merge
             assert_allclose(item.center, same.full.center, atol=1e-6)
             assert_allclose(item.size, same.full.size, atol=1e-6)
             assert_allclose(item.orientation, same.full.orientation, atol=1e-6)
+
+
+def test_times_count_from_the_earliest_frame_though_another_came_first(tmp_path: Path) -> None:
+    """Beside a camera whose frames arrive late, a track would begin before the recording."""
+    with PerceptionTables(tmp_path, categories=CATEGORIES, model_id="m") as tables:
+        for k in range(FRAMES):
+            for topic, delay in (("/soon", SECOND // 20), ("/late", 0)):
+                scene = Scene(UP, (Plane(UP, -0.5, OUTLINE, 0.7, 0.0),), ())
+                stamp = EPOCH + k * SECOND // 10 + delay
+                perception = Perception(topic, k, stamp, "cam", scene, (seen(0, 1),), {})
+                tables.write([perception], [FrameRow(stamp, None, UP)])
+    track_run(tmp_path, TrackingSettings(), CATEGORIES)
+
+    table, timelines = lines(tmp_path), read_timelines(tmp_path)
+    begins = {row["topic"]: (row["first_s"], row["last_s"]) for row in table}
+    assert begins == {"/late": ("0.000", "0.500"), "/soon": ("0.050", "0.550")}
+    for row in table:
+        shown = timelines[int(row["track"])].seconds
+        assert_allclose(shown[[0, -1]], [float(row["first_s"]), float(row["last_s"])], atol=1e-3)
 
 
 def test_confidence_and_guess_are_those_of_all_views(run: Path) -> None:

@@ -16,7 +16,7 @@ from shapecat.outputs.colouring import Coloured, with_colour
 from shapecat.outputs.rereading import FinishedRun, open_source, read_finished
 from shapecat.recordings.colour_image import pixels_of
 from shapecat.runs.run_info import RunInfo
-from shapecat.runs.tables import numbers
+from shapecat.runs.tables import first_stamp, numbers
 from shapecat.types import Frame, LabelledFrame, LabelledObject
 
 __all__ = ["Run", "RunFrame", "Table"]
@@ -192,8 +192,7 @@ class Run:
         rows = np.flatnonzero(self.tracks.numpy("track") == track)
         if not len(rows):
             raise KeyError(track)
-        start = self.frame_table.numpy("stamp_ns").min()
-        seconds = (self.tracks.numpy("stamp_ns")[rows] - start) * 1e-9
+        seconds = (self.tracks.numpy("stamp_ns")[rows] - first_stamp(self.folder)) * 1e-9
         return seconds, self.tracks.numpy("posterior")[rows]
 
     def labelled_frames(self) -> Iterator[LabelledFrame]:

@@ -29,6 +29,7 @@ __all__ = [
     "Key",
     "arrow_table",
     "count_rows",
+    "first_stamp",
     "frame_rows",
     "numbers",
     "open_writer",
@@ -153,6 +154,15 @@ def count_rows(folder: Path, table: str) -> int:
     """
     with opened(folder / f"{table}.parquet") as file:
         return int(file.metadata.num_rows)
+
+
+def first_stamp(folder: Path) -> int:
+    """Return the earliest stamp of the frames of a run, ns; 0 without frames.
+
+    It need not be that of the first row: frames are in the order in which they were recorded.
+    """
+    groups = read_row_groups(folder / "frames.parquet", ["stamp_ns"])
+    return min((int(numbers(group["stamp_ns"]).min()) for group in groups if len(group)), default=0)
 
 
 def write_table(path: Path, columns: dict[str, Any], schema: pa.Schema) -> None:

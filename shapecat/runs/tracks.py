@@ -18,6 +18,7 @@ from shapecat.runs.full_boxes import FullBoxes, full_columns
 from shapecat.runs.tables import (
     TRACKS,
     arrow_table,
+    first_stamp,
     frame_rows,
     numbers,
     open_writer,
@@ -80,7 +81,7 @@ def track_run(
             some.clear()  # the next batch may be as long
             release_memory()
     with replacing(folder / "tracks.csv") as path:
-        _write_csv(path, lines, _start_ns(folder), work)
+        _write_csv(path, lines, first_stamp(folder), work)
     return dict(Counter(line.category for line in lines))
 
 
@@ -282,8 +283,3 @@ def _write_csv(path: Path, lines: Sequence[_Line], start_ns: int, work: str) -> 
                     work,
                 )
             )
-
-
-def _start_ns(folder: Path) -> int:
-    first = next(read_row_groups(folder / "frames.parquet", ["stamp_ns"]))
-    return int(first["stamp_ns"][0].as_py())

@@ -1,6 +1,5 @@
 """The timeline of each track: when it was detected, and its posterior so far."""
 
-from collections.abc import Iterator
 from pathlib import Path
 
 import numpy as np
@@ -9,7 +8,7 @@ import pyarrow.compute
 import pyarrow.parquet as pq
 
 from shapecat.arrays import F4, F8, Bool, Record, array
-from shapecat.runs.tables import read_row_groups
+from shapecat.runs.tables import first_stamp, read_row_groups
 
 __all__ = ["Detected", "Timeline", "read_stage_seconds", "read_timelines"]
 
@@ -36,7 +35,7 @@ class Timeline(Record):
 
 def read_timelines(folder: Path) -> dict[int, Timeline]:
     """Read the timeline of every track of a run."""
-    start = min(_first_stamps(folder), default=0)
+    start = first_stamp(folder)
     table = pq.read_table(folder / "tracks.parquet")
     width = len(table["posterior"][0]) if table.num_rows else 0
     tracks = table["track"].to_numpy()
@@ -51,12 +50,6 @@ def read_timelines(folder: Path) -> dict[int, Timeline]:
         keys = tuple((topics[k], frames[k], int(detections[k])) for k in rows.tolist())
         timelines[track] = Timeline(seconds[rows], detections[rows] >= 0, causal[rows], keys)
     return timelines
-
-
-def _first_stamps(folder: Path) -> Iterator[int]:
-    for group in read_row_groups(folder / "frames.parquet", ["stamp_ns"]):
-        if group.num_rows:
-            yield int(pa.compute.min(group["stamp_ns"]).as_py())
 
 
 def read_stage_seconds(folder: Path) -> dict[str, F8]:
