@@ -30,7 +30,7 @@ _LARGEST_BLOCK = 64
 class DetectionSettings:
     """Planes and object candidates (thesis ch. 4). Lengths in metres, angles in degrees."""
 
-    max_range_m: float = 2.0
+    max_range_m: float = 3.0
     """Points farther from the sensor than this are ignored (thesis 4.2)."""
     fuse_frames: int = 1
     """Number of consecutive depth images that are fused before detection, including the current one

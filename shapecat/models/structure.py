@@ -125,7 +125,7 @@ _SERIES = (
 )
 """The merging trees were not grown on these seeds. The scaled scenes add large objects, which are
 too rare otherwise; rooms add arms and furniture, floors objects where furniture usually is."""
-_DISTANCE_M, _ELEVATION_DEG, _SWEEP_DEG = (0.35, 1.9), (12.0, 84.0), (20.0, 150.0)
+_DISTANCE_M, _ELEVATION_DEG, _SWEEP_DEG = (0.35, 2.6), (12.0, 84.0), (20.0, 150.0)
 """Ranges of the position of a camera ``anywhere``, relative to its target."""
 _VIEWS = {"path": 2, "anywhere": 6, "floor": 6}
 """Views of each scene, with one sensor after the other; on the path, from a single place."""
