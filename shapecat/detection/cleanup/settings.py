@@ -11,6 +11,11 @@ class CleanupSettings(NamedTuple):
     least_logit: float = -1.0
     """Minimum logit of an object, for a probability of 0.27: a missed object is lost, a false one
     can still be rejected over time."""
+    far_m: float = 2.0
+    """Depth beyond which most segments are background, metres."""
+    least_far_logit: float = 1.0
+    """Minimum logit of an object that is far. In 160 simulated rooms, it rejects 60 of the 73 false
+    objects that a range of 3 m adds to one of 2 m, and 2 of the 57 true ones."""
     certain_logit: float = 5.0
     """Partial logit beyond which evaluation stops, on either side of 0: the remaining trees can
     hardly change the verdict."""

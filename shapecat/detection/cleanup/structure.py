@@ -75,9 +75,11 @@ def find_background(
     context = add_context(features[roots], alone, weights)[again]
     logits = alone.copy()
     logits[again] = logits_of(as_rows(context), grown.in_context)
-    rejected[roots] = logits < CLEANUP.least_logit
     segment, cells = features["segment"], features["visibility"]["cells"]
-    enough = [smallest_object_at(grid, z) for z in features["visibility"]["depth_m"][roots]]
+    depths = features["visibility"]["depth_m"][roots]
+    far = depths > CLEANUP.far_m
+    rejected[roots] = logits < np.where(far, CLEANUP.least_far_logit, CLEANUP.least_logit)
+    enough = [smallest_object_at(grid, z) for z in depths]
     rejected[roots] |= cells[roots] < CLEANUP.tiny_share * np.array(enough)
     rejected |= segment["width_m"] > settings.max_size_m
     rejected |= segment["top_m"] > settings.max_height_m - CLEANUP.cut_off_m
