@@ -701,7 +701,7 @@ def test_kitti_boxes_come_back_from_a_tilted_camera(
     assert found["kind"] == "KITTI labels"
     assert (found["overlap"], found["tracking"]) == (None, None)
     assert found["box_iou"]["n"] == found["objects"]["true"] == found["objects"]["found"] > 5
-    assert found["box_iou"]["mean"] > 0.999
+    assert found["box_iou"]["mean"] > 0.995
 
 
 def test_types_of_kitti_are_the_categories_of_the_run(run: Path) -> None:

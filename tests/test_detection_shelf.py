@@ -77,12 +77,7 @@ def test_sliver_beside_the_side_of_a_shelf_is_no_object(seed: int) -> None:
     assert all(np.median(part) >= FIRST_THING for part in seen("shelf", seed)[1])
 
 
-LOST = pytest.mark.xfail(strict=True, reason="its board is seen 8 cm less far than it reaches")
-
-
-@pytest.mark.parametrize(
-    ("seed", "label"), [(430, 31), (434, 28), pytest.param(651, 22, marks=LOST)]
-)
+@pytest.mark.parametrize(("seed", "label"), [(430, 31), (434, 28), (651, 22)])
 def test_plate_at_the_level_of_the_camera_is_found(seed: int, label: int) -> None:
     """Its far side stands out against the wall behind, not against its board."""
     labels, parts = seen("shelf", seed)

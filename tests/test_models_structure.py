@@ -64,7 +64,7 @@ def test_a_camera_anywhere_looks_at_the_objects_from_where_its_sensor_can_read()
         assert isinstance(pose, Pose)
         away = place - pose.translation
         distance = float(np.linalg.norm(away))
-        assert KINECT.nearest_m < distance < 2.1
+        assert KINECT.nearest_m < distance < 2.8
         assert pose.rotation[:, 2] @ away > 0.98 * distance
         assert -away[2] / distance > 0.13
 
