@@ -54,7 +54,7 @@ class SurfaceSettings:
     """Growing Neural Gas (thesis ch. 5)."""
 
     method: Literal["fritzke", "thesis"] = "fritzke"
-    """When a neuron is inserted: `fritzke` at a fixed interval of signals (thesis, Algorithm 3),
+    """Insertion of neurons: `fritzke` at a fixed interval of signals (thesis, Algorithm 3),
     `thesis` where the accumulated error is large (Algorithm 4)."""
     neurons: int = 80
     """Number of neurons at the end of growth; fewer on small clouds."""
@@ -75,7 +75,7 @@ class TrackingSettings:
     """Nearest-centroid tracker and fusion (thesis 7.5.2)."""
 
     association: Literal["hungarian", "greedy"] = "hungarian"
-    """How detections are assigned to tracks: `hungarian` minimises the total distance, `greedy`
+    """Assignment of detections to tracks: `hungarian` minimises the total distance, `greedy`
     takes the nearest pair first."""
     gate_m: float = 0.12
     """Largest distance between a track and the centroid of its next detection; smaller for
@@ -87,7 +87,7 @@ class TrackingSettings:
     """A track ends after this time without a detection, a recently started one sooner. An object
     that later reappears in the same place gets its old track."""
     fusion: Literal["mean", "product", "vote"] = "product"
-    """How the posteriors of all views are fused: `product`, `mean` or `vote`. The product is
+    """Fusion of the posteriors of all views: `product`, `mean` or `vote`. The product is
     tempered by the number of views, so that more views alone do not raise the confidence."""
 
 
@@ -222,7 +222,7 @@ def _checked(name: str, value: Any, kind: Any) -> Any:
     if kind is float and isinstance(value, int) and not isinstance(value, bool):
         value = float(value)
     if type(value) is not kind:
-        msg = f"{name} must be {kind.__name__}, got {value!r}"
+        msg = f"{name} must be of type {kind.__name__}, got {value!r}"
         raise ConfigError(msg)
     if isinstance(value, float) and not abs(value) < float("inf"):
         msg = f"{name} must be finite, got {value!r}"

@@ -25,10 +25,10 @@ def test_file_then_overrides(tmp_path: Path) -> None:
     [
         ("tracking.gat_m=1", "did you mean tracking.gate_m"),
         ("nonsense=1", "known: seed"),
-        ("tracking.gate_m=wide", "must be float"),
+        ("tracking.gate_m=wide", "must be of type float"),
         ("tracking.gate_m=-1", "must not be negative"),
         ("tracking.gate_m=NaN", "must be finite"),
-        ("tracking.gate_m=true", "must be float"),
+        ("tracking.gate_m=true", "must be of type float"),
         ("tracking.fusion=median", "must be one of mean"),
         ("tracking=1", "group of settings"),
         ("tracking.gate_m", "expected name=value"),

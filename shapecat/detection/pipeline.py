@@ -237,7 +237,7 @@ def merge_segments(
 ) -> Bool:
     """Merge the segments of each object, in place.
 
-    Returns which segments are known to be low-profile objects: (segments,) bool.
+    Return the mask (segments,) of those known to be low-profile objects.
     """
     graph, labels, segments = oversegmentation
     known: Bool = merge_low_profile(segments, model.low_profile, labels, graph.spans)

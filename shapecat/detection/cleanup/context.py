@@ -1,4 +1,4 @@
-"""Context: how the segments beside a segment have been judged.
+"""Context: the verdicts on the segments beside a segment.
 
 A finger of a gripper looks like an object, but it is connected to an arm. So trees that judge each
 segment by itself are followed by others, which also see the verdicts on its neighbours.
@@ -27,7 +27,7 @@ CONTEXT_FEATURES = np.dtype(
 
 
 def measure_borders(segments: Segments) -> tuple[I4, F4]:
-    """Return the merged segments (r,), and how long each borders on each other one.
+    """Return the merged segments (r,), and the lengths of the borders between them.
 
     The lengths (4, r, r), in cells, are of the borders where the two are connected, where the
     second is behind and in front of the first, and where both are near without being connected.

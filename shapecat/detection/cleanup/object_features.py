@@ -1,7 +1,7 @@
 """Object features: named features that distinguish objects from structure and noise.
 
-They describe how a segment looks, where it ends, and where its surface continues: walls of bins are
-at the outline of their floor, walls of rooms continue beyond all planes, and furniture is cut off
+They describe a segment's shape, its ends, and the continuation of its surface: walls of bins are at
+the outline of their floor, walls of rooms continue beyond all planes, and furniture is cut off
 by the image border.
 """
 
@@ -57,7 +57,7 @@ _VISIBILITY = np.dtype(
         ("ragged", "f4"),  # squared boundary over cells: 16 for a square
     ]
 )
-"""How well a segment is visible."""
+"""The visibility of a segment."""
 OBJECT_FEATURES = np.dtype(
     [("segment", SEGMENT_FEATURES), ("surroundings", _SURROUNDINGS), ("visibility", _VISIBILITY)]
 )
@@ -201,7 +201,7 @@ def _measure(grid: DepthGrid, planes: F8, segments: Segments, down: float, out: 
 
 @kernel(inline=True)
 def _measure_outside(grid: DepthGrid, plane: F8, samples: I4, out: Row) -> None:
-    """Write how far samples are outside the outline of a plane; negative inside.
+    """Write the distance of samples outside the outline of a plane; negative inside.
 
     ``plane`` is a row of `pack_planes`.
     """

@@ -6,7 +6,7 @@ __all__ = ["CLEANUP", "CleanupSettings"]
 
 
 class CleanupSettings(NamedTuple):
-    """How structure is rejected and labels are completed."""
+    """Constants of the rejection of structure and the completion of labels."""
 
     least_logit: float = -1.0
     """Minimum logit of an object, for a probability of 0.27: a missed object is lost, a false one

@@ -6,7 +6,7 @@ __all__ = ["LOW", "OUTLINES", "OVERHANG", "WALLS"]
 
 
 class LowProfileSettings(NamedTuple):
-    """How low-profile objects are distinguished from low-frequency depth error."""
+    """Constants that distinguish low-profile objects from low-frequency depth error."""
 
     levels: tuple[float, ...] = (3.0, 2.0, 1.3, 0.9, 0.6, 0.4)
     """Thresholds above the mean whose outlines are tested, as multiples of the minimum rise: one
@@ -76,7 +76,7 @@ class OutlineSettings(NamedTuple):
 
 
 class WallSettings(NamedTuple):
-    """How walls are found."""
+    """Constants of the search for walls."""
 
     most: int = 5
     """Maximum number of planes that are tested, which bounds the time."""
@@ -106,7 +106,7 @@ class WallSettings(NamedTuple):
 
 
 class OverhangSettings(NamedTuple):
-    """How far objects extend beyond the outline of their plane."""
+    """Constants of the overhang: objects that extend beyond the outline of their plane."""
 
     reach_m: float = 0.15
     """Greatest distance of an object's cell from the outline, metres."""

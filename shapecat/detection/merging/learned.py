@@ -45,7 +45,7 @@ def load_trees() -> BoostedTrees:
 class Scratch(NamedTuple):
     """Memory for the features of one pair, which the trees read.
 
-    ``pair`` (1,) is a record of `PAIR_FEATURES`; ``features`` (features,) are the same numbers.
+    ``pair`` (1,) is a record of `PAIR_FEATURES`; ``features`` (features,) is a view of its fields.
     """
 
     pair: Records

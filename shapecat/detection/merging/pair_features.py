@@ -63,7 +63,7 @@ _RELATION = np.dtype(
         ("bottom_over_top_m", "f4"),
         ("other_bottom_over_top_m", "f4"),
         ("bottom_over_bottom_m", "f4"),
-        ("most_beyond_m", "f4"),  # how far the first extends beyond the sides of the second
+        ("most_beyond_m", "f4"),  # extent of the first beyond the sides of the second
         ("least_beyond_m", "f4"),
         ("lateral_curvature", "f4"),  # of both together
         ("normal_position_correlation", "f4"),

@@ -6,7 +6,7 @@ __all__ = ["MERGING", "MergingSettings"]
 
 
 class MergingSettings(NamedTuple):
-    """How segments are measured, compared and merged."""
+    """Constants of the measuring, comparing and merging of segments."""
 
     few: int = 3
     """Minimum number of links between two segments that are a contact, not noise."""

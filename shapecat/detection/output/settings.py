@@ -6,7 +6,7 @@ __all__ = ["OUTPUT", "OutputSettings"]
 
 
 class OutputSettings(NamedTuple):
-    """How objects are measured and labelled."""
+    """Constants of the measuring and labelling of objects."""
 
     occluded_share: float = 0.12
     """Minimum fraction of the boundary of an occluded object that is behind a nearer surface."""

@@ -41,8 +41,8 @@ class SupportingPlane(NamedTuple):
     a, b, c : the inverse depth at column j and row i of the grid is ``a * j + b * i + c``, 1/m.
     up : (3,) unit normal, sensor frame.
     offset : metres, ``up @ p`` for the points p of the plane.
-    extent : (DIRECTIONS,) metres, the support function of the outline: how far it extends from the
-        sensor in evenly spaced directions of the level frame (`gravity_rotation`).
+    extent : (DIRECTIONS,) metres, the support function of the outline: its extent from the sensor
+        in evenly spaced directions of the level frame (`gravity_rotation`).
     area_m2 : visible area.
     """
 

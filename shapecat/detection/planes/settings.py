@@ -7,7 +7,7 @@ __all__ = ["PLANES", "STRIPS", "UP", "PlaneSettings", "StripSettings", "UpSettin
 
 
 class UpSettings(NamedTuple):
-    """How the up direction is estimated."""
+    """Constants of the estimation of the up direction."""
 
     facing_cos: float = math.cos(math.radians(20))
     """Minimum cosine between a direction and the normal of surface that faces it, for 20 degrees:
@@ -40,7 +40,7 @@ class UpSettings(NamedTuple):
 
 
 class PlaneSettings(NamedTuple):
-    """How planes are found, and distinguished from the tops of objects."""
+    """Constants of the search for planes, and of their distinction from the tops of objects."""
 
     tolerance: float = 0.01
     """Distance of an inlier from a plane in inverse depth, 1/m: three steps of a Kinect."""
@@ -84,7 +84,7 @@ class PlaneSettings(NamedTuple):
 
 
 class StripSettings(NamedTuple):
-    """How planes with only narrow visible strips are found."""
+    """Constants of the search for planes of which only narrow strips are visible."""
 
     bin_m: float = 0.005
     """Height of a bin, metres: the noise of strips at 1 m."""

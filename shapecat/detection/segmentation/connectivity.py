@@ -243,7 +243,7 @@ def _raise_concavity(
     b0 = np.uint64(3 * (i + di) * columns + first + dj)
     row = np.uint64(columns)
     a1, a2, b1, b2 = a0 + row, a0 + row + row, b0 + row, b0 + row + row
-    # (1) how far both planes are from the cell
+    # (1) the distances of both planes from the cell
     for k in range(n):
         v1, v2, v = plane[a0 + k], plane[b0 + k], inv_depth[here + k]
         gap1 = abs(v1 + plane[a1 + k] * x + plane[a2 + k] * y - v)

@@ -6,7 +6,7 @@ __all__ = ["SEGMENTATION", "SegmentationSettings"]
 
 
 class SegmentationSettings(NamedTuple):
-    """How surfaces are fitted, linked and split."""
+    """Constants of the fitting, linking and splitting of surfaces."""
 
     gate: float = 0.008
     """Largest difference in inverse depth between a sample of a local plane and its centre, 1/m:
