@@ -14,6 +14,8 @@ from shapecat.detection.planes.settings import PLANES, UP
 
 __all__ = ["assume_plane", "unexplained"]
 
+NEAR_M = 2.0
+"""Objects hide their support only near the camera; farther away, background has none."""
 UNEXPLAINED = 0.2
 """Share of unexplained samples above which a plane is assumed; plain tables have at most 0.06."""
 FEW = 0.01
@@ -21,11 +23,11 @@ FEW = 0.01
 
 
 def unexplained(grid: DepthGrid, plane_id: I4, walls: U1) -> Bool | None:
-    """Return the samples that are neither on a plane, nor above one, nor on a wall.
+    """Return the near samples that are neither on a plane, nor above one, nor on a wall.
 
     The result is (rows, columns) bool; None if there are few.
     """
-    seen = grid.inverse_depth > 0
+    seen = grid.inverse_depth > np.float32(1 / NEAR_M)
     rest: Bool = ((plane_id.view(np.uint8) | walls) == 0) & seen
     few = np.count_nonzero(rest) <= UNEXPLAINED * np.count_nonzero(seen)
     return None if few else rest
