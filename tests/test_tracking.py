@@ -230,6 +230,12 @@ def test_an_object_that_comes_back_to_its_place_keeps_its_track() -> None:
     assert [track.hits for track in tracks] == [40, 180]
 
 
+def test_an_object_that_is_hidden_again_and_again_stays_one_track() -> None:
+    """Four parts are joined through the parts between them, which two of them do not touch."""
+    frames = [frame(k, [] if k // 50 % 2 else [0, 0, 0]) for k in range(350)]
+    assert [track.hits for track in track_recording(frames, SETTINGS)] == [200]
+
+
 @pytest.mark.parametrize(
     ("options", "joined"),
     [
@@ -326,6 +332,15 @@ def test_fusion_is_a_distribution_and_every_prefix_is_a_fusion(views: F8, method
     assert np.allclose(running.sum(axis=1), 1)
     for k in range(len(views)):
         assert np.allclose(running[k], fuse(views[: k + 1], method))  # type: ignore[arg-type]  # the same
+
+
+def test_a_track_of_many_blocks_is_fused_as_a_whole(monkeypatch: pytest.MonkeyPatch) -> None:
+    """From the third block on, about an hour, early views could count twice."""
+    views = np.random.default_rng(0).dirichlet(np.full(4, 0.3), 7)
+    whole = causal(views)
+    monkeypatch.setattr("shapecat.tracking.fusion._BLOCK", 2)
+
+    assert np.allclose(causal(views), whole)
 
 
 @pytest.mark.parametrize("method", ["mean", "product", "vote"])
