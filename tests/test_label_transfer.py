@@ -254,6 +254,17 @@ def test_time_tells_apart_what_changed_places(tmp_path: Path) -> None:
     assert labels_of(target) == {5: "tin", 6: "mug"}
 
 
+def test_frames_that_the_other_run_skipped_do_not_vote(tmp_path: Path) -> None:
+    """Half of the frames were processed before: no label would find a majority of all of them."""
+    every_2nd = range(0, FRAMES_EACH, 2)
+    source = make_run(tmp_path / "source", {1: still(CUP, frames=every_2nd)}, labels={1: "mug"})
+    target = make_run(tmp_path / "target", {5: still(CUP)})
+
+    transfer_labels(source, target)
+
+    assert labels_of(target) == {5: "mug"}
+
+
 def test_a_track_that_came_in_two_pieces_is_labelled_whole(tmp_path: Path) -> None:
     source = make_run(tmp_path / "source", {1: still(CUP)}, labels={1: "mug"})
     pieces = {4: still(CUP, frames=range(4)), 5: still(CUP, frames=range(4, 10))}
@@ -276,11 +287,13 @@ def test_two_labels_for_one_track_are_told_not_guessed(tmp_path: Path) -> None:
     assert all("9" in item.reason for item in transfer.missed)
 
 
-def test_merged_tracks_that_are_one_now_need_no_merge(tmp_path: Path) -> None:
+@pytest.mark.parametrize("digest", ["xxh3-128:one", "xxh3-128:two"])
+def test_merged_tracks_that_are_one_now_need_no_merge(tmp_path: Path, digest: str) -> None:
+    """By place, one part could be another candidate for the place of the other."""
     objects = {1: still(CUP, frames=range(7)), 2: still(CUP, frames=range(7, 10))}
     labels = {1: "mug", 2: "merge with 1"}
     source = make_run(tmp_path / "source", objects, labels=labels)
-    target = make_run(tmp_path / "target", {9: still(CUP, frames=range(8))})
+    target = make_run(tmp_path / "target", {9: still(CUP, frames=range(8))}, digest=digest)
 
     transfer = transfer_labels(source, target)
 
