@@ -30,6 +30,7 @@ from shapecat.executors import (
     share_cores,
     usable_cores,
 )
+from shapecat.executors.dask import _DaskExecutor
 from shapecat.executors.order import Processes
 from shapecat.system import stopping
 
@@ -228,6 +229,16 @@ def test_executors_that_are_not_there_are_named(monkeypatch: pytest.MonkeyPatch)
         open_executor("local", workers=1, address="tcp://127.0.0.1:1")
     with pytest.raises(ValueError, match="at least 1"):
         LocalExecutor(0)
+
+
+def test_dask_does_not_answer_a_second_attempt_with_the_result_of_the_first() -> None:
+    """A recording whose worker died would be given up untried: its retry is the same call."""
+    distributed = pytest.importorskip("distributed")
+    client = distributed.Client(processes=False, n_workers=1, dashboard_address=None)
+    with _DaskExecutor(client, None) as executor:
+        first, second = [executor.submit(os.urandom, 8) for _ in range(2)]
+
+        assert first.result() != second.result()
 
 
 def slow_at_times(k: int) -> tuple[int, int]:

@@ -368,11 +368,14 @@ def test_a_dead_process_is_followed_and_a_late_one_ends(made: Path, bucket: Path
     url = "s3://lab/late/run"
     first = claims.Claim(url, "one")  # whose heart does not beat
     system: Any = fsspec.filesystem("s3")
-    system.call_s3("create_multipart_upload", Bucket="lab", Key="late/run/annotated.mcap")
+    for name in ("run", "run10"):  # one of them belongs to a process that is alive
+        key = f"late/{name}/annotated.mcap"
+        system.call_s3("create_multipart_upload", Bucket="lab", Key=key)
     with claimed(url, "two") as second:
         assert second.inherited
         upload(made, url, second)
-        assert system.list_multipart_uploads("lab") == []
+        (left,) = system.list_multipart_uploads("lab")
+        assert left["Key"] == "late/run10/annotated.mcap"
         assert not first.beat()
         with pytest.raises(OutputError, match="taken over"):
             upload(made, url, first)
