@@ -299,12 +299,25 @@ def test_merged_tracks_are_one_object_of_the_index(run: Path) -> None:
 
 
 def test_the_first_detection_of_a_frame_is_a_view(run: Path) -> None:
-    """It has number 0."""
-    rows = pq.read_table(run / "tracks.parquet").to_pylist()
+    """It has number 0, and a row without a number is no view."""
+    table = pq.read_table(run / "tracks.parquet")
+    rows = table.to_pylist()
+    rows[3]["detection"] = None
+    pq.write_table(pa.Table.from_pylist(rows, table.schema), run / "tracks.parquet")
     assert any(row["detection"] == 0 for row in rows)
     for track, line in read_timelines(run).items():
         found = [row["detection"] is not None for row in rows if row["track"] == track]
         assert sorted(line.seen.tolist()) == sorted(found)
+
+
+def test_the_strip_is_in_the_order_of_time_and_not_of_the_table(run: Path) -> None:
+    """Frames of several sensors are not logged by their stamps: some would be at -0.1 s."""
+    timelines = read_timelines(run)
+    strip = list(choose_frames(run, timelines).strip.items())
+    table = pq.read_table(run / "frames.parquet")
+    pq.write_table(table.take(list(range(table.num_rows))[::-1]), run / "frames.parquet")
+
+    assert list(choose_frames(run, timelines).strip.items()) == strip
 
 
 def test_a_whole_view_is_chosen_before_a_larger_one_that_is_cut_off(run: Path) -> None:

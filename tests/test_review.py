@@ -233,6 +233,16 @@ def walked(places: Iterable[float]) -> list[tuple[LabelledFrame, Frame]]:
     ]
 
 
+def test_a_camera_that_is_calibrated_anew_is_drawn_anew(tmp_path: Path) -> None:
+    """After a zoom, the frustum of the first frame would stay."""
+    (first, seen), (second, zoomed) = scene(0), scene(1, [labelled_object(1)])
+    zoomed = dataclasses.replace(zoomed, camera=dataclasses.replace(CAMERA, fx=80.0))
+    path = write(tmp_path / "review.rrd", [(first, seen), (second, zoomed)])
+
+    drawn = rows(path, f"/world/{TOPIC}/camera")
+    assert [row["Pinhole:image_from_camera"][0][0] for row in drawn] == [60.0, 80.0]
+
+
 def test_a_caption_names_a_confidence_that_is_low() -> None:
     """High confidences are not worth mentioning, and long captions cover the scene."""
     item = labelled_object(7)
