@@ -70,10 +70,10 @@ def cloud(stamp: int, points: Any, **changes: Any) -> Any:
     return message
 
 
-def write(path: Path, items: Iterable[tuple[str, int, Any]]) -> Path:
+def write(path: Path, items: Iterable[tuple[str, int, Any]], *, chunk_size: int = 1 << 20) -> Path:
     """Write messages given as topic, log time, message or bytes."""
     with path.open("wb") as file:
-        writer = Writer(file)
+        writer = Writer(file, chunk_size=chunk_size)
         writer.start("ros2", "test")
         channels: dict[tuple[str, str], int] = {}
         for topic, time, item in items:

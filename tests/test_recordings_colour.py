@@ -22,6 +22,7 @@ from shapecat.types import Camera, Frame
 from tests.colour_messages import gradient, jpeg, packed, png, raw
 from tests.messages import (
     EPOCH,
+    SECOND,
     STORE,
     cloud,
     header,
@@ -59,13 +60,13 @@ def in_order(items: list[tuple[str, int, Any]]) -> list[tuple[str, int, Any]]:
     return sorted(items, key=lambda item: item[1])
 
 
-def static(parent: str, child: str, translation: Any, quaternion: Any) -> Any:
+def static(parent: str, child: str, translation: Any, quaternion: Any, stamp: int = EPOCH) -> Any:
     transform = make(
         "geometry_msgs/msg/Transform",
         make("geometry_msgs/msg/Vector3", *translation),
         make("geometry_msgs/msg/Quaternion", *quaternion),
     )
-    stamped = make("geometry_msgs/msg/TransformStamped", header(EPOCH, parent), child, transform)
+    stamped = make("geometry_msgs/msg/TransformStamped", header(stamp, parent), child, transform)
     return make("tf2_msgs/msg/TFMessage", [stamped])
 
 
@@ -306,6 +307,22 @@ def test_another_camera_is_placed_by_the_transforms(tmp_path: Path) -> None:
     ahead = rotation_from_quaternion(turn) @ [0, 0, 1] + [0.05, 0.01, -0.02]
     pose = view.colour_from_depth
     np.testing.assert_allclose(pose.rotation @ ahead + pose.translation, [0, 0, 1], atol=1e-9)
+
+
+def test_a_camera_that_moves_beside_the_sensor_is_placed_anew_in_each_frame(tmp_path: Path) -> None:
+    """Only a static transform may be kept: the first pose would colour all later frames."""
+    items = [
+        *depth_items(EPOCH, EPOCH + SECOND),
+        ("/cam/color/camera_info", EPOCH, info(EPOCH, WIDE)),
+    ]
+    for stamp, x in ((EPOCH, 0.05), (EPOCH + SECOND, 0.09)):
+        moved = static("camera", "color_optical", (x, 0.0, 0.0), (0.0, 0.0, 0.0, 1.0), stamp)
+        colours = raw(stamp, gradient(60, 80), "rgb8", "color_optical")
+        items += [("/tf", stamp, moved), ("/cam/color/image_raw", stamp + 1, colours)]
+    pairs, _ = read(write(tmp_path / "a.mcap", in_order(items)))
+
+    poses = [view.colour_from_depth for _, view in pairs if view is not None]
+    assert [pose.translation[0] for pose in poses if pose is not None] == [-0.05, -0.09]
 
 
 def test_without_a_transform_there_is_no_colour(tmp_path: Path) -> None:

@@ -42,10 +42,21 @@ both = pytest.mark.parametrize("encoding", ["json", "protobuf"])
 
 
 @both
-def test_point_cloud_with_a_pose(tmp_path: Path, encoding: str) -> None:
+@pytest.mark.parametrize(
+    ("angles", "place"),
+    [
+        ([0.7, -0.4, 2.3], [10.0, -3.0, 0.5]),
+        ([0.0, 0.0, 0.0], [10.0, -3.0, 0.5]),
+        ([0.7, -0.4, 2.3], [0.0, 0.0, 0.0]),
+    ],
+)
+def test_point_cloud_with_a_pose(
+    tmp_path: Path, encoding: str, angles: list[float], place: list[float]
+) -> None:
+    """A pose that only shifts or only turns is no identity."""
     points = np.arange(12, dtype="<f4").reshape(4, 3) + 1
     fields = [{"name": name, "offset": 4 * k, "type": 7} for k, name in enumerate("xyz")]
-    turn, place = Rotation.from_euler("zyx", [0.7, -0.4, 2.3]), [10.0, -3.0, 0.5]
+    turn = Rotation.from_euler("zyx", angles)
     pose = {
         "position": dict(zip("xyz", place, strict=True)),
         "orientation": dict(zip("xyzw", turn.as_quat().tolist(), strict=True)),

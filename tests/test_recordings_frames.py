@@ -54,7 +54,8 @@ def read(path: Path, *topics: str, **options: Any) -> tuple[list[Frame], Counter
         return result, skipped, recording.warnings
 
 
-def test_needed_frames_are_the_same_as_if_all_were_read(tmp_path: Path) -> None:
+@pytest.mark.parametrize("chunk_size", [1 << 20, 25_000])  # one chunk, or one for each 5 images
+def test_needed_frames_are_the_same_as_if_all_were_read(tmp_path: Path, chunk_size: int) -> None:
     """In an indexed file the others are skipped, but still counted."""
     items = []
     for k in range(12):
@@ -63,7 +64,7 @@ def test_needed_frames_are_the_same_as_if_all_were_read(tmp_path: Path) -> None:
             ("/depth/camera_info", stamp, info(stamp)),
             ("/depth/image_rect", stamp + 1, image(stamp, wavy_depth() + np.float32(0.1 * k))),
         ]
-    path = write(tmp_path / "a.mcap", items)
+    path = write(tmp_path / "a.mcap", items, chunk_size=chunk_size)
     every, _, _ = read(path)
     times = {every[k].log_time_ns for k in (0, 5, 6, 11)}
 
@@ -350,6 +351,23 @@ def test_slight_distortion_is_absorbed_and_strong_distortion_gives_true_rays(
     u = (x * radial + 2 * p1 * x * y + p2 * (r + 2 * x * x)) * CAMERA.fx + CAMERA.cx
     v = (y * radial + p1 * (r + 2 * y * y) + 2 * p2 * x * y) * CAMERA.fy + CAMERA.cy
     assert (u, v) == pytest.approx((7, 5), abs=0.01)
+
+
+def test_a_lens_that_is_calibrated_anew_bends_other_rays(tmp_path: Path) -> None:
+    """The rays of the first calibration would be kept for the whole recording."""
+    depth = np.full((48, 64), 1000, np.uint16)
+    old, new = [
+        [
+            ("/depth/camera_info", k, info(EPOCH + k, d=(bend, 0.1, 0.0, 0.0, 0.0))),
+            ("/depth/image", k, image(EPOCH + k, depth)),
+        ]
+        for k, bend in enumerate((-0.3, -0.4))
+    ]
+
+    (_, second), _, _ = read(write(tmp_path / "a.mcap", old + new))
+    (alone,), _, _ = read(write(tmp_path / "b.mcap", new))
+
+    np.testing.assert_array_equal(second.points, alone.points)
 
 
 def test_window_and_thinning(tmp_path: Path) -> None:
