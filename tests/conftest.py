@@ -4,6 +4,7 @@ import os
 import shutil
 import signal
 from collections.abc import Callable, Iterator
+from concurrent.futures import wait
 from dataclasses import replace
 from importlib import import_module
 from pathlib import Path
@@ -14,6 +15,7 @@ import numpy as np
 import pytest
 from click.testing import CliRunner, Result
 
+from shapecat.executors.order import Processes
 from shapecat.system.files import FSYNC
 from shapecat.system.garbage import collect_seldom
 from tests.browser import Browser
@@ -60,16 +62,37 @@ def real_data() -> Path:
 
 @pytest.fixture(scope="session")
 def shapecat() -> Callable[..., Result]:
-    """Run the command as a user would, in this process."""
+    """Run the command as a user would, in this process, and as if it had one core.
+
+    Other processes would start with each short recording, and end before they had loaded anything.
+    """
     command: Any = import_module("shapecat.cli.main").main
 
     def run(*arguments: object) -> Result:
-        result = CliRunner().invoke(command, list(map(str, arguments)))
+        with pytest.MonkeyPatch.context() as patch:
+            patch.setattr("shapecat.executors.cores.usable_cores", lambda: 1)
+            result = CliRunner().invoke(command, list(map(str, arguments)))
         if result.exception is not None and not isinstance(result.exception, SystemExit):
             raise result.exception
         return result
 
     return run
+
+
+@pytest.fixture
+def all_awake(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Let all processes of a job start before its first frame, and share its frames from there on.
+
+    Otherwise the first would perceive a short recording before another one has loaded anything.
+    """
+    begin = Processes.start
+
+    def begin_and_wait(self: Processes[Any, Any]) -> None:
+        begin(self)
+        wait(self._waking)
+
+    monkeypatch.setattr("shapecat.executors.order._ALONE", 0)
+    monkeypatch.setattr(Processes, "start", begin_and_wait)
 
 
 class Guesser:
@@ -152,7 +175,7 @@ def coloured_run(tmp_path_factory: pytest.TempPathFactory) -> Path:
     source = simulate(folder / "table.mcap", frames=4, seed=7, color=True)
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(shapecat.pipeline, "load_model", lambda _path: Guesser())
-        shapecat.pipeline.process(Job(source=source, folder=folder / "out" / "table"), cores=2)
+        shapecat.pipeline.process(Job(source=source, folder=folder / "out" / "table"))
     return folder / "out" / "table"
 
 

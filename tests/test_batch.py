@@ -20,10 +20,12 @@ from click.testing import Result
 from shapecat.batch import Batch, Outcome, exit_code, plan_batch, process_on
 from shapecat.batch.finding import find_recordings
 from shapecat.batch.manifest import Manifest
+from shapecat.config import Settings
 from shapecat.errors import RecordingError
 from shapecat.executors import LocalExecutor, WorkerLostError, open_executor
 from shapecat.runs.jobs import Job
 from tests.scenes import record
+from tests.test_crash import assert_same_tables
 from tests.test_executors import alive, wait_for
 
 Run = Callable[..., Result]
@@ -187,16 +189,16 @@ def test_two_processes_give_the_same_tables(
     assert states(tmp_path) == ALL_DONE
 
 
-def test_processes_that_share_frames_give_the_same_tables(
-    recordings: Path, one_by_one: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+@pytest.mark.usefixtures("all_awake")
+def test_processes_that_share_frames_give_the_same_tables(recordings: Path, tmp_path: Path) -> None:
+    """They share blocks of frames, so there must be several."""
     from shapecat.pipeline import process  # noqa: PLC0415  beside its only use
 
-    monkeypatch.setattr("shapecat.executors.order._ALONE", 0)
-    process(Job(recordings / "monday/log.mcap", tmp_path / "log", rrd=False), cores=3)
-    (tmp_path / "manifest.jsonl").touch()
+    source, settings = recordings / "monday/log.mcap", Settings(reuse_frames=2)
+    for name, cores in (("alone", 1), ("shared", 2)):
+        process(Job(source, tmp_path / name, settings=settings, rrd=False), cores=cores)
 
-    assert_same(one_by_one, tmp_path, ["log"])
+    assert_same_tables(tmp_path / "alone", tmp_path / "shared")
 
 
 def test_shards_give_the_same_tables(

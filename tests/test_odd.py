@@ -12,7 +12,7 @@ from tests.zoo import FRAMES, ZOO
 def test_zoo(name: str, tmp_path: Path) -> None:
     exhibit = ZOO[name]
 
-    verdict = odd.examine(exhibit.write(tmp_path), tmp_path / "out")
+    verdict = odd.examine(exhibit.write(tmp_path), tmp_path / "out", "--jobs", "1")
 
     assert (verdict.code, verdict.frames) == (exhibit.code, exhibit.frames), verdict.message
     assert exhibit.said in verdict.message
