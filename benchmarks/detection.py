@@ -12,13 +12,15 @@ import numpy as np
 
 from benchmarks.measure import cpu_ms, markdown, summary
 from benchmarks.scenes import real_tables, simulated_clutter
-from shapecat.config import Settings
+from shapecat.config import DetectionSettings
 from shapecat.detection import detect
 from shapecat.types import Frame
 
 ROUNDS = 8
 """Number of rounds; methods alternate, as the speed of a machine changes within seconds."""
 PCL = ("segmentation", "features", "filters", "sample_consensus", "search", "kdtree", "common")
+RANGE_M = 2.0
+"""Range of all methods, metres."""
 
 
 def run(count: int) -> tuple[str, dict[str, Any]]:
@@ -46,7 +48,7 @@ def run(count: int) -> tuple[str, dict[str, Any]]:
 
 def _time_all(frames: list[Frame], program: Path | None) -> dict[str, dict[str, float]]:
     """Time every method on every frame in rounds; summarise each frame's best time."""
-    settings = Settings().detection
+    settings = DetectionSettings(max_range_m=RANGE_M)
     ups = [detect(f, settings=settings, rng=np.random.default_rng(0)).up for f in frames]
     loose = [_unorganized(frame) for frame in frames]
     clouds = None if program is None else _write_clouds(program.with_name("clouds"), frames, ups)
@@ -81,7 +83,7 @@ def _time_open3d(frames: list[Frame], ups: list[Any]) -> list[float]:
         return []
 
     def work(points: Any, up: Any) -> int:
-        cloud = o3d.geometry.PointCloud(o3d.utility.Vector3dVector(points[points[:, 2] < 2]))
+        cloud = o3d.geometry.PointCloud(o3d.utility.Vector3dVector(points[points[:, 2] < RANGE_M]))
         cloud = cloud.voxel_down_sample(0.01)
         cloud.estimate_normals(o3d.geometry.KDTreeSearchParamKNN(20))
         o3d.utility.random.seed(0)
