@@ -151,7 +151,7 @@ class Samples(NamedTuple):
 @click.command()
 @growing_options(Path(structure.__file__).parent)
 def main(*, seed: int, jobs: int, out: Path) -> None:
-    """Simulate scenes, detect merged segments, and grow and write the trees."""
+    """Train the trees that reject background, on simulated scenes."""
     samples = collect(_SERIES, jobs)
     for (name, features), grown in zip(
         FILES.items(), grow_rejection_trees(samples, seed), strict=True

@@ -15,7 +15,8 @@ from shapecat.detection.planes.settings import PLANES, UP
 __all__ = ["assume_plane", "unexplained"]
 
 NEAR_M = 2.0
-"""Objects hide their support only near the camera; farther away, background has none."""
+"""Depth up to which samples above no plane may be objects that hide their support, metres; farther
+away they are background."""
 UNEXPLAINED = 0.2
 """Share of unexplained samples above which a plane is assumed; plain tables have at most 0.06."""
 FEW = 0.01
