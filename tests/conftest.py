@@ -4,7 +4,8 @@ import os
 import shutil
 import signal
 from collections.abc import Callable, Iterator
-from concurrent.futures import wait
+from concurrent.futures import Executor, Future, wait
+from copy import deepcopy
 from dataclasses import replace
 from importlib import import_module
 from pathlib import Path
@@ -93,6 +94,47 @@ def all_awake(monkeypatch: pytest.MonkeyPatch) -> None:
 
     monkeypatch.setattr("shapecat.executors.order._ALONE", 0)
     monkeypatch.setattr(Processes, "start", begin_and_wait)
+
+
+class LateAnswer(Future[Any]):
+    """An answer of another process that arrives when it is waited for, and not before."""
+
+    def __init__(self, function: Callable[..., Any], *arguments: Any) -> None:
+        super().__init__()
+        self._call = deepcopy((function, arguments))  # as if it was pickled
+        self.set_running_or_notify_cancel()
+
+    def exception(self, timeout: float | None = None) -> BaseException | None:
+        """Work."""
+        if not self.done():
+            function, arguments = self._call
+            self.set_result(function(*arguments))
+        return super().exception(timeout)
+
+
+class LateExecutor(Executor):
+    """Replaces other processes, which are awake at once and know only what they are sent."""
+
+    def __init__(self, _workers: int, **_options: int) -> None:
+        self._awake = False
+
+    def submit(self, fn: Callable[..., Any], /, *args: Any, **_options: Any) -> Future[Any]:
+        """Send a call; the first one wakes the process."""
+        answer = LateAnswer(fn, *args)
+        if not self._awake:
+            answer.set_result(None)
+        self._awake = True
+        return answer
+
+    def terminate(self) -> None:
+        """Lose what was not waited for, as killed processes do."""
+
+
+@pytest.fixture
+def late_answers(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Let another process have frames from the first one on, always as many as it may hold."""
+    monkeypatch.setattr("shapecat.executors.order._ALONE", 0)
+    monkeypatch.setattr("shapecat.executors.order.LocalExecutor", LateExecutor)
 
 
 class Guesser:

@@ -287,14 +287,14 @@ def test_indices_are_those_of_the_frames_own_readings() -> None:
 
 
 @pytest.fixture
-def job(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Job:
-    """Return a job that fuses three frames, in other processes from the first one on."""
-    monkeypatch.setattr("shapecat.executors.order._ALONE", 0)
-    settings = with_overrides(Settings(), ["detection.fuse_frames=3"])
+def job(tmp_path: Path) -> Job:
+    """Return a job that fuses three frames, and has another setting to pass on."""
+    settings = with_overrides(Settings(), ["detection.fuse_frames=3", "surface.neurons=30"])
     source = record(tmp_path / "table.mcap", 40)
     return Job(source, tmp_path / "one", settings=settings, mcap=False, rrd=False)
 
 
+@pytest.mark.usefixtures("late_answers")
 def test_tables_do_not_depend_on_processes_or_interruptions(job: Job) -> None:
     """Frames are fused with earlier ones, even if another process or run perceived those."""
 
@@ -310,7 +310,8 @@ def test_tables_do_not_depend_on_processes_or_interruptions(job: Job) -> None:
 
     assert 20 <= read_run(other.folder)["counts"]["resumed"] < 40  # or nothing was left to fuse
     assert_same_tables(job.folder, other.folder)
-    process(replace(job, folder=job.folder.with_name("single"), settings=Settings()))
+    single = with_overrides(job.settings, ["detection.fuse_frames=1"])
+    process(replace(job, folder=job.folder.with_name("single"), settings=single))
     with pytest.raises(AssertionError, match="frames"):  # or nothing was fused
         assert_same_tables(job.folder, job.folder.with_name("single"))
 

@@ -10,9 +10,12 @@ from pathlib import Path
 
 import pytest
 
+from shapecat.config import Settings
+from shapecat.executors.order import _HELD
 from shapecat.pipeline import process
 from shapecat.runs.folder import read_run
 from shapecat.runs.jobs import Job
+from shapecat.runs.segments import list_segments, read_segment
 from shapecat.system import stopping
 from tests.scenes import record
 from tests.test_batch import heed_interrupts
@@ -156,20 +159,23 @@ def asked() -> Iterator[Callable[[], None]]:
         yield stopping.request
 
 
+@pytest.mark.usefixtures("late_answers")
 def test_frames_in_work_are_finished(
     recording: Path, tmp_path: Path, asked: Callable[[], None]
 ) -> None:
     """Results that other processes hold when the signal arrives are kept."""
 
     def stop(phase: str, done: int, _total: int | None) -> None:
-        if (phase, done) == ("perceive", 20):
+        if (phase, done) == ("perceive", 3):
             asked()
 
+    one_by_one = Settings(reuse_frames=1)
     with pytest.raises(stopping.Stopped):
-        process(Job(recording, tmp_path / "table", rrd=False), stop, cores=2)
+        process(Job(recording, tmp_path / "table", settings=one_by_one), stop, cores=2)
 
     partial = tmp_path / ".table.partial" / "segments"
-    assert len(list(partial.glob("[0-9]*"))) == 1
+    kept = [read_segment(segment, "frames").num_rows for segment in list_segments(partial)]
+    assert sum(kept) == 3 + _HELD
 
 
 def test_a_recording_that_is_written_to_meanwhile_gives_no_results(tmp_path: Path) -> None:
