@@ -302,6 +302,26 @@ def test_recovered_recording_is_written_anew(tmp_path: Path) -> None:
     assert len(decoded(target, "/shapecat/scene")) == 3
 
 
+def test_two_definitions_of_one_type_are_both_kept(tmp_path: Path) -> None:
+    """Recordings of two robots, merged and cut: each topic keeps its own definition."""
+    texts = {"/a": b"uint32 a", "/b": b"uint32 a\nuint32 b"}
+    source, target = tmp_path / "a.mcap", tmp_path / "out.mcap"
+    with source.open("wb") as file:
+        writer = Writer(file)
+        writer.start("ros2", "test")
+        for topic, text in texts.items():
+            schema = writer.register_schema("lab/msg/Own", "ros2msg", text)
+            channel = writer.register_channel(topic, "cdr", schema)
+            writer.add_message(channel, EPOCH, b"\0\1\0\0\7\0\0\0", EPOCH)
+        writer.flush()
+
+    annotate(source, target)
+
+    with target.open("rb") as file:
+        read = {c.topic: s.data for s, c, _ in make_reader(file).iter_messages(list(texts)) if s}
+    assert read == texts
+
+
 def test_what_lies_beside_the_messages_of_any_part_is_kept(tmp_path: Path) -> None:
     source, target = tmp_path / "bag", tmp_path / "out.mcap"
     source.mkdir()
@@ -397,6 +417,8 @@ def test_message_that_cannot_be_converted_is_wrapped_whole(tmp_path: Path) -> No
         connection = writer.add_connection("/text", STRING, typestore=STORE1)
         writer.write(connection, EPOCH, STORE1.serialize_ros1(STORE1.types[STRING]("fine"), STRING))
         writer.write(connection, EPOCH + 1, b"\xff\xff\xff\x7fcut")
+        other = writer.add_connection("/more", STRING, typestore=STORE1)
+        writer.write(other, EPOCH + 2, b"\xff\xff\xff\x7f")
 
     annotate(source, target)
 
@@ -404,6 +426,8 @@ def test_message_that_cannot_be_converted_is_wrapped_whole(tmp_path: Path) -> No
         fine, wrapped = (m for m in recording.messages() if m.topic == "/text")
         assert recording.decode(fine).data == "fine"
         raw = recording.decode(wrapped)
+        (more,) = (m for m in recording.messages() if m.topic == "/more")
+        assert bytes(recording.decode(more).data) == b"\xff\xff\xff\x7f"
     assert (raw.type, raw.encoding, bytes(raw.data)) == (STRING, "ros1", b"\xff\xff\xff\x7fcut")
 
 

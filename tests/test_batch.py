@@ -10,6 +10,7 @@ import subprocess
 import sys
 from collections.abc import Callable, Sequence
 from concurrent.futures import Executor, Future
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -166,6 +167,7 @@ def test_changed_work_is_not_taken_for_done(recordings: Path, one_by_one: Path) 
     same = Job(Path(), Path(), rrd=False)
     assert status(same) == "complete"
     assert status(Job(Path(), Path(), rrd=False, every=2)) == "check"
+    assert status(replace(same, settings=Settings(seed=7))) == "check"
     assert status(Job(Path(), Path(), rrd=False, overwrite=True)) == "new"
     log = recordings / "monday" / "log.mcap"
     stamp = log.stat()

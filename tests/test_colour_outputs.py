@@ -35,7 +35,7 @@ from shapecat.outputs.rereading import open_source, read_finished
 from shapecat.outputs.review import write_review
 from shapecat.outputs.review_scenes import ReviewFrame
 from shapecat.perception import Perceiver
-from shapecat.pipeline import process
+from shapecat.pipeline import annotate_again, process
 from shapecat.recordings.protobuf import message_decoder
 from shapecat.runs.corrections import read_labels
 from shapecat.runs.jobs import Job
@@ -352,3 +352,16 @@ def test_a_damaged_image_costs_the_review_only_itself(tmp_path: Path) -> None:
     texts = [row["TextLog:text"][0] for row in rows(path, "/log")]
     assert any(text.startswith("/color: png image is damaged") for text in texts)
     assert rows(path, f"/world/{TOPIC}/scene")
+
+
+def test_an_output_of_each_kind_is_written_again(
+    coloured_run: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Otherwise a review or an annotated recording would keep the labels of before."""
+    folder, written = tmp_path / "table", []
+    shutil.copytree(coloured_run, folder)
+    for name in ("annotated_mcap.write_annotated", "review.write_review"):
+        monkeypatch.setattr(f"shapecat.outputs.{name}", lambda *_, n=name, **__: written.append(n))
+    annotate_again(folder, None)
+
+    assert sorted(written) == ["annotated_mcap.write_annotated", "review.write_review"]

@@ -10,13 +10,13 @@ from typing import Any, get_args
 
 import pytest
 
-from shapecat.batch.finding import Source, find_recordings
+from shapecat.batch.finding import Source, _key_of_all, find_recordings
 from shapecat.batch.ledger import Ledger, Outcome
 from shapecat.batch.manifest import Entry, Manifest, RemoteManifest, State
 from shapecat.batch.plans import Shard, name_folders, plan_batch
 from shapecat.batch.remote import Ticket
 from shapecat.batch.runs import exit_code, process_on
-from shapecat.batch.storage import Location
+from shapecat.batch.storage import Location, content_key
 from shapecat.config import Settings, with_overrides
 from shapecat.errors import OutputError
 from shapecat.executors import WorkerLostError
@@ -25,11 +25,13 @@ from shapecat.runs.identity import (
     ContentDigest,
     content_digest,
     file_stats,
+    same_content,
     unchanged,
     work_id,
 )
 from shapecat.runs.jobs import (
     Job,
+    Summary,
     describe_run,
     has_work,
     require_unchanged,
@@ -146,8 +148,22 @@ def test_a_recording_that_was_written_to_has_changed_though_it_is_as_long(source
     os.utime(source, ns=(3, before[0][2] + 1))
 
     assert not unchanged(before, source)
+    source.write_bytes(b"longer recording")
+    os.utime(source, ns=(3, before[0][2]))
+    assert not unchanged(before, source)
     source.unlink()
     assert not unchanged(before, source)
+
+
+def test_content_is_compared_where_only_the_times_of_a_file_differ(source: Path) -> None:
+    """Labels would be drawn on another recording of the same name and length."""
+    known = planned(source)["input"]
+    known["digest"] = content_digest(source)
+    os.utime(source, ns=(3, 4))
+    assert same_content(known, source, lambda: content_digest(source))
+
+    source.write_bytes(b"recordinG")
+    assert not same_content(known, source, lambda: content_digest(source))
 
 
 def test_a_digest_that_nobody_needs_is_not_waited_for(source: Path) -> None:
@@ -393,6 +409,77 @@ def test_a_manifest_at_a_url_ends_as_one_file(
     assert len(lines.splitlines()) == 2
     assert {n: e.state for n, e in RemoteManifest(place).entries.items()} == found
     assert (Location(f"{place}-none") / "manifest.jsonl").read() is None
+
+
+def test_a_part_of_a_manifest_is_read_again_when_it_has_grown() -> None:
+    """Two shards end at the same time: the last one to end writes what both have done."""
+    place = "memory://grown"
+    with RemoteManifest(place) as one, RemoteManifest(place) as other:
+        one.record([Entry("a", "a.mcap", "running")])
+        one.send()
+        other._read_parts()
+        one.record([Entry("a", "a.mcap", "complete")])
+        one.send()
+        other.record([Entry("b", "b.mcap", "complete")])
+        other.__exit__()
+        lines = (Location(place) / "manifest.jsonl").read() or b""
+
+    found = {known["folder"]: known["state"] for known in map(json.loads, lines.splitlines())}
+    assert found == {"a": "complete", "b": "complete"}
+
+
+def test_entries_of_other_work_are_replaced(source: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Else the manifest of new settings would hold the keys of the old, and do all work again."""
+    (source.parent / "other.mcap").write_bytes(b"another")
+    monkeypatch.setattr("shapecat.batch.plans.load_model", lambda _path: MODEL)
+    out = str(source.parent / "out")
+    with plan_batch(Job(Path(), Path()), [str(source.parent)], out) as batch:
+        (task,) = (task for task in batch.tasks if task.name == "lab")
+        manifest = batch.manifest
+        assert manifest is not None
+        ledger = Ledger(manifest)
+        manifest.record([Entry("lab", "lab.mcap", "planned", task.input, "old work")])
+        ledger.plan([task])
+        assert manifest.entries["lab"].work == task.work
+        manifest.record([Entry("lab", "lab.mcap", "complete", "old input", task.work)])
+        ledger.begin(task)
+        counts = {"frames": 3, "tracks": {"cup": 2}}
+        ledger.ended(task, Outcome(task.job, Summary("lab.mcap", Path("lab"), counts, 1.5, ())))
+
+    assert manifest.entries["lab"].input == task.input
+    assert manifest.entries["lab"].state == "complete"
+
+
+INFO: Mapping[str, Any] = {"size": 7, "ETag": "e1", "mtime": 1.5}
+
+
+@pytest.mark.parametrize(
+    ("changes", "other"),
+    [
+        ({"size": 8}, True),
+        ({"ETag": "e2"}, True),
+        ({"mtime": 2.5}, False),  # a copy of the same content
+        ({"ETag": None, "mtime": 2.5}, True),
+        ({"ETag": None, "size": 8}, True),
+    ],
+)
+def test_a_key_follows_the_content_at_a_url(changes: Mapping[str, Any], *, other: bool) -> None:
+    """Storages that give no digest are asked for the time of writing."""
+    first = {**INFO, "ETag": None} if "ETag" in changes and changes["ETag"] is None else INFO
+    infos = (
+        {k: v for k, v in info.items() if v is not None} for info in (first, {**INFO, **changes})
+    )
+    before, after = map(content_key, infos)
+
+    assert (before != after) is other
+
+
+def test_the_key_of_a_bag_at_a_url_is_that_of_all_its_files() -> None:
+    """In whatever order a storage lists them."""
+    keys = [_key_of_all(keys) for keys in ("ab", "ac", "db", "ba")]
+
+    assert len(set(keys)) == 3
+    assert keys[3] == keys[0]
 
 
 @pytest.mark.parametrize(

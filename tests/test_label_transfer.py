@@ -516,11 +516,16 @@ def test_places_in_other_frames_are_not_compared(tmp_path: Path, frame: str | No
         match_labels(source, target)
 
 
-def test_a_table_alone_is_matched_by_its_places(tmp_path: Path) -> None:
-    write_csv(tmp_path / "table.csv", {4: still(CUP), 5: still(CAN)}, "wfar", {4: "mug"})
+@pytest.mark.parametrize("place", ["downloads", "other"])
+def test_a_table_alone_is_matched_by_its_places(tmp_path: Path, place: str) -> None:
+    """Also if it was saved beside the tables of another run, whose tracks are other objects."""
+    (tmp_path / "downloads").mkdir()
+    make_run(tmp_path / "other", {4: still(CAN), 5: still(CUP)})
+    table = tmp_path / place / "table.csv"
+    write_csv(table, {4: still(CUP), 5: still(CAN)}, "wfar", {4: "mug"})
     target = second(tmp_path / "target", {1: still(CAN), 2: still(shifted(CUP, z=0.01))})
 
-    transfer = transfer_labels(tmp_path / "table.csv", target)
+    transfer = transfer_labels(table, target)
 
     assert labels_of(target) == {1: "", 2: "mug"}
     assert transfer.by == TABLE_ALONE

@@ -369,7 +369,8 @@ def test_clocks_are_counted_for_what_is_wrong_with_them() -> None:
         (EPOCH + 1, EPOCH + 6 + jump),  # the delay changes by just ten seconds
         (EPOCH + 2, EPOCH + 8 + 2 * jump),  # and by one nanosecond more
         (EPOCH + 2, EPOCH + 8 + 2 * jump),  # twice the same time is not backwards
-        (EPOCH + 1, EPOCH + 7 + 2 * jump),  # backwards
+        (EPOCH, EPOCH + 6 + 2 * jump),  # backwards
+        (EPOCH + 1, EPOCH + 7 + 2 * jump),  # and on from there
         (0, 77),  # none
         (year2000 - 1, year2000),
         (year2000 - 2, year2000 - 1),  # neither clock knows the year

@@ -32,7 +32,7 @@ from shapecat.outputs.report.tracks import Timeline, read_timelines
 from shapecat.outputs.report.writing import Reports, RunReport
 from shapecat.outputs.rereading import FinishedRun, read_finished
 from shapecat.outputs.wording import caption, confidence_text, time_span
-from shapecat.runs.corrections import read_labels
+from shapecat.runs.corrections import read_labels, relabel
 from shapecat.runs.track_table import TrackRow, TrackTable, read_track_table
 from shapecat.types import Box, Camera, Frame, LabelledFrame, LabelledObject, NeuralGas
 from tests.browser import Browser
@@ -95,6 +95,18 @@ def test_what_is_not_certain_is_nowhere_shown_as_certain(run: Path, drawn: RunRe
     cards = dict(re.findall(r'id="track-(\d+)".*?<span class="sure">(.*?)</span>', page, re.DOTALL))
     assert {track: cards[track] for track in shown} == shown
     assert "100 %" not in page
+
+
+def test_a_page_shows_the_labels_of_now(run: Path, drawn: RunReport) -> None:
+    """A server answers for hours from the same report, while tracks.csv is edited elsewhere."""
+    report = replace(drawn, folder=run)
+    before = report.page(), report.listed("").categories
+    track = read_track_table(run / "tracks.csv").rows[0].track
+    relabel(run, {track: "teapot"})
+    after = report.page(), report.listed("").categories
+
+    assert ["teapot" in page for page, _ in (before, after)] == [False, True]
+    assert [counts["teapot"] for _, counts in (before, after)] == [0, 1]
 
 
 def test_a_confidence_looks_the_same_as_its_rounding_in_the_table() -> None:

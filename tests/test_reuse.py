@@ -217,6 +217,32 @@ def blank(index: int = 0) -> Frame:
     return replace(frame, index=index)
 
 
+@pytest.mark.parametrize(
+    "change", [{"frame_id": "other"}, {"camera": replace(KINECT.camera, fx=9)}]
+)
+def test_a_frame_of_another_camera_shows_something_else(change: Any) -> None:
+    frame = blank()
+
+    assert shows_the_same(frame, None, frame, None, range_m=2.0)
+    assert not shows_the_same(replace(frame, **change), None, frame, None, range_m=2.0)
+
+
+def test_topics_and_up_directions_repeat_nothing_of_each_other() -> None:
+    """Two sensors may begin with equal images; heights depend on the up direction."""
+    frame = replace(blank(), topic="/left")
+    up = np.asarray(still_world(1).path[0].rotation[2], np.float32)
+    tilted = up + np.float32(0.04) * np.array([1, 0, 0], np.float32)
+    tilted /= np.linalg.norm(tilted)
+    ups = {"/left": (up, tilted, None), "/right": (up,)}
+    views = [View(replace(frame, topic=topic), up) for topic, some in ups.items() for up in some]
+    guesser: Any = Guesser()
+    perceptions = Perceiver(guesser, Settings(), None)(views)
+
+    assert [seen.topic for seen in perceptions] == [*["/left"] * 3, "/right"]
+    assert all(seen.reused_from is None for seen in perceptions)
+    assert {d.reused_from for d in perceptions[3].detections} == {None}
+
+
 def test_something_as_small_as_the_smallest_object_is_a_change() -> None:
     """60 points are an object: in a repeated scene, it must not vanish."""
     frame = blank()

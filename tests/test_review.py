@@ -11,11 +11,14 @@ from typing import Any
 
 import numpy as np
 import pytest
+import rerun as rr
 
 from shapecat.errors import OutputError
-from shapecat.outputs import review, review_viewer
+from shapecat.outputs import review, review_layout, review_viewer
 from shapecat.outputs.colours import colour_of
 from shapecat.outputs.review_cloud import paint
+from shapecat.outputs.review_columns import Columns
+from shapecat.outputs.review_images import Images, Picture
 from shapecat.outputs.review_layout import Eye, TrackView, _track_tabs, stepped_back
 from shapecat.outputs.review_scenes import ReviewFrame, choose_scenes
 from shapecat.outputs.review_shapes import _fan, markdown, short_label
@@ -111,6 +114,18 @@ def rows(path: Path, entity: str) -> list[dict[str, Any]]:
         if "frame" in row
     ]
     return sorted(found, key=lambda row: row["frame"])
+
+
+def styled(path: Path) -> set[str]:
+    """Return the entities with values that hold in all frames."""
+    from rerun.chunk import RrdReader  # noqa: PLC0415  heavy
+
+    chunks = RrdReader(str(path)).stream().to_chunks()
+    return {
+        str(chunk.entity_path).replace("\\", "")
+        for chunk in chunks
+        if "frame" not in chunk.to_record_batch().schema.names
+    }
 
 
 def scalars(path: Path, entity: str) -> list[list[float]]:
@@ -241,6 +256,48 @@ def test_a_camera_that_is_calibrated_anew_is_drawn_anew(tmp_path: Path) -> None:
 
     drawn = rows(path, f"/world/{TOPIC}/camera")
     assert [row["Pinhole:image_from_camera"][0][0] for row in drawn] == [60.0, 80.0]
+
+
+def test_two_sensors_are_drawn_apart(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Two cameras of one kind, whose frames alternate; both begin without an object."""
+    views: list[tuple[str, str, Eye]] = []
+
+    def lay_out(scenes: Any, *more: Any) -> Any:
+        views.extend(scenes)
+        return review_layout.lay_out(scenes, *more)
+
+    monkeypatch.setattr(review, "lay_out", lay_out)
+    scenes = []
+    for k in range(4):
+        for side, (topic, track) in enumerate((("/left", 1), ("/right", 2))):
+            objects = [labelled_object(track, x=0.1 * k + side)] if 0 < k < 3 else ()
+            labelled, frame = scene(k, objects, ended=(track,) if k == 3 else ())
+            late = dataclasses.replace(labelled, topic=topic, stamp_ns=stamp(k) + side * 40_000_000)
+            scenes.append((late, dataclasses.replace(frame, topic=topic)))
+    due = [due for _, due in choose_scenes((labelled for labelled, _ in scenes), fixed=False)]
+    path = write(tmp_path / "review.rrd", scenes)
+
+    left, right = ({e.replace(t, "") for e in styled(path) if t in e} for t in ("/left", "/right"))
+    assert left == right
+    assert len(left) > 3
+    assert due == [True] * 8
+    for side, topic in enumerate(("/left", "/right")):
+        (drawn,) = rows(path, f"/world/{topic}/camera")
+        assert drawn["Pinhole:image_from_camera"][0][0] == 60
+        ways = [row["LineStrips3D:strips"] for row in rows(path, f"/world/{topic}/paths/{topic}")]
+        assert np.allclose(ways[0], [[[0.1 + side, 0.1, 1], [0.2 + side, 0.1, 1]]])
+        assert ways[1:] == [[]]  # it has ended
+        assert np.allclose(views[side][2].target, [0.1 + side, 0.1, 1])
+
+
+def test_two_sensors_may_share_their_colour_camera() -> None:
+    stream = rr.RecordingStream("test")
+    images = Images(stream, Columns(stream))
+    for topic in ("/left", "/right"):
+        nothing = np.zeros((0, 4), np.float32)
+        images.add(topic, (0, 0), Picture("/colour", b"", "image/png", b"", nothing, []))
+
+    assert list(images.entities.values()) == ["/colour", "/colour"]
 
 
 def test_a_caption_names_a_confidence_that_is_low() -> None:

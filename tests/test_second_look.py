@@ -4,6 +4,7 @@ import csv
 from collections.abc import Iterator
 from functools import cache
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
@@ -14,6 +15,7 @@ import pytest
 from shapecat.config import Settings
 from shapecat.geometry import IDENTITY
 from shapecat.pipeline import process
+from shapecat.runs import perceiving
 from shapecat.runs.folder import read_run
 from shapecat.runs.jobs import Job
 from shapecat.runs.second_look import _around, _streams, frames_to_revise
@@ -22,7 +24,7 @@ from shapecat.simulation import IDEAL, make_scene, render_frame
 from shapecat.simulation.messages import MessageFactory
 from shapecat.simulation.truth import LINK_FROM_OPTICAL, robot_links
 from shapecat.system import stopping
-from shapecat.types import Camera, Pose
+from shapecat.types import Camera, Frame, Pose
 from tests.messages import EPOCH, write
 from tests.scenes import OPTICAL, PERIOD, STEP
 from tests.test_crash import assert_same_tables
@@ -325,6 +327,45 @@ def test_a_still_camera_knows_up_from_its_neighbours() -> None:
     for revision in chosen.values():
         np.testing.assert_allclose(revision.up, leaning([35.0])[0], atol=1e-6)
         assert revision.up_given is None
+
+
+def test_cameras_are_compared_with_their_own_frames_alone() -> None:
+    """Two cameras that lean differently would revise each other's frames."""
+    one, other = (leaning(np.full(20, degrees)) for degrees in (35.0, 10.0))
+    one[6], other[3] = leaning([80.0])[0], leaning([60.0])[0]
+    both = [
+        tuple(
+            pa.concat_tables([a, b.set_column(0, "topic", pa.array(["/e"] * len(b)))])
+            for a, b in zip(*parts, strict=True)
+        )
+        for parts in zip(tables(one), tables(other), strict=True)
+    ]
+
+    assert list(frames_to_revise(both)) == [("/d", 6), ("/e", 3)]
+
+
+def test_each_camera_is_asked_whether_its_planes_confirm_up(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    """Only the one whose mounting is wrong is doubted, after three of its frames."""
+    level, tilted = leaning([0.0, 40.0])
+    planes = {"/good": level, "/bad": tilted, "/blind": None}
+    monkeypatch.setattr(perceiving, "find_up", lambda frame, _: planes[frame.topic])
+    doubted: list[tuple[str, str, int]] = []
+    upright: Any = SimpleNamespace(
+        preview=lambda frame: (f"tf of {frame.topic}", level),
+        contradict=lambda topic, source, angles: doubted.append((topic, source, len(angles))),
+    )
+    names = [*["/blind"] * 4, "/good", "/bad"] * 4
+    frames = [
+        Frame(name, k, k, k, "camera", points=np.zeros((1, 3))) for k, name in enumerate(names)
+    ]
+    trial = perceiving._UpTrial(upright, Settings())
+
+    seen = list(trial.before((frame, None) for frame in frames))
+
+    assert [frame.index for frame, _ in seen] == list(range(len(frames)))
+    assert doubted == [("/bad", "tf of /bad", 3)]
 
 
 def test_no_frame_is_its_own_witness() -> None:
