@@ -4,6 +4,7 @@ import json
 import os
 from collections.abc import Mapping
 from concurrent.futures import CancelledError, Executor, Future
+from dataclasses import replace
 from pathlib import Path
 from types import SimpleNamespace
 from typing import Any, get_args
@@ -340,6 +341,7 @@ def test_a_batch_takes_no_run_without_its_outputs_for_done(
         )
 
     assert status_of(job, source, out) == status
+    assert status_of(replace(job, overwrite=True), source, out) == "resume"
 
 
 def test_a_full_disk_leaves_no_torn_line(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -380,6 +382,15 @@ def test_the_last_line_of_a_recording_holds(tmp_path: Path) -> None:
         Manifest(path).record([Entry("a", "a.mcap", state)])
 
     assert Manifest(path).entries["a"].state == get_args(State)[-1]
+
+
+def test_an_entry_without_tracks_is_not_one_whose_tracks_are_unknown(tmp_path: Path) -> None:
+    """Nothing was found, which need not be looked up in the run again."""
+    path = tmp_path / "manifest.jsonl"
+    Manifest(path).record([Entry("a", "a.mcap", "complete", seconds=0.0, frames=3, tracks={})])
+    read = Manifest(path).entries["a"]
+
+    assert (read.seconds, read.frames, read.tracks) == (0, 3, {})
 
 
 @pytest.mark.parametrize("part_bytes", [1, 10**6])

@@ -74,7 +74,7 @@ def make_run(
     work: str = "",
     digest: str = "xxh3-128:one",
     fixed_frame: str | None = "map",
-    size: float = 0.08,
+    size: float | tuple[float, float, float] = 0.08,
     labels: Mapping[int, str] | None = None,
 ) -> Path:
     """Write the tables of a run whose tracks are at the given positions."""
@@ -110,7 +110,8 @@ def make_run(
     order = sorted(range(len(rows)), key=lambda k: (rows[k][1], detections[k]))
     found = {name: [columns[name][k] for k in order] for name in ("topic", "frame", "stamp_ns")}
     empty = {field.name: [None] * len(rows) for field in DETECTIONS}
-    found = {**empty, **found, "size": [[size, size, 1.3 * size]] * len(rows)}
+    sides = size if isinstance(size, tuple) else (size, size, 1.3 * size)
+    found = {**empty, **found, "size": [list(sides)] * len(rows)}
     write_table(folder / "detections.parquet", found, DETECTIONS)
     write_table(folder / "frames.parquet", {f.name: [] for f in FRAMES}, FRAMES)
     write_csv(folder / "tracks.csv", objects, work, labels or {})
@@ -457,9 +458,12 @@ def test_what_was_moved_is_told_not_guessed(tmp_path: Path) -> None:
     assert labels_of(target) == {1: ""}
 
 
-@pytest.mark.parametrize(("size", "moved"), [(0.08, True), (0.31, False)])
+@pytest.mark.parametrize(
+    ("size", "moved"),
+    [(0.08, True), (0.31, False), ((0.31, 0.08, 0.1), False), ((0.08, 0.31, 0.1), False)],
+)
 def test_a_large_object_may_scatter_more_than_a_small_one(
-    tmp_path: Path, size: float, *, moved: bool
+    tmp_path: Path, size: float | tuple[float, float, float], *, moved: bool
 ) -> None:
     """From another side, the centre of the visible part of a box is elsewhere."""
     path = [shifted(CUP, x=0.025 * k) for k in range(FRAMES_EACH)]  # half of it within 6 cm

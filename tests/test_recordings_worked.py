@@ -498,9 +498,10 @@ def mcap_of(path: Path) -> Path:
 
 
 def bag_of(path: Path) -> Path:
+    """Write two messages in most chunks, as `mcap_of` does."""
     store = get_typestore(Stores.ROS1_NOETIC)
     writer = BagWriter(path)
-    writer.chunk_threshold = 1
+    writer.chunk_threshold = 60
     with writer as bag:
         kind = "std_msgs/msg/UInt8"
         links = [bag.add_connection(topic, kind, typestore=store) for topic in TEXTS]

@@ -497,6 +497,16 @@ def peak_mb() -> float:
     return resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1024
 
 
+@pytest.mark.usefixtures("bucket")
+@pytest.mark.parametrize("size", [0, 1, 9000 * 2**24, 9000 * 2**24 + 1, 5 * 2**40])
+def test_no_file_has_more_parts_than_a_storage_takes(size: int) -> None:
+    """Nor parts smaller than others, which are as many requests."""
+    part = Location("s3://lab/large")._in_parts(size)["chunksize"]
+
+    assert part >= 16 * 2**20
+    assert -(-size // part) <= 9000
+
+
 @pytest.mark.slow
 def test_large_files_are_streamed(
     bucket: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch

@@ -180,6 +180,12 @@ def test_a_plane_is_filled_to_its_last_corner() -> None:
     assert _fan(5).tolist() == [[0, 1, 2], [0, 2, 3], [0, 3, 4]]
 
 
+def test_the_outline_of_a_plane_is_closed(recording: Path) -> None:
+    """Without its last edge, a table would look open on one side."""
+    (strip,) = rows(recording, f"/world/{TOPIC}/planes")[0]["LineStrips3D:strips"]
+    assert np.allclose(strip, [*OUTLINE, OUTLINE[0]])
+
+
 def test_posterior_counts_and_times_are_plotted_for_every_frame(recording: Path) -> None:
     assert np.allclose(scalars(recording, "/tracks/1/posterior"), [[0.8, 0.2], [0.8, 0.2]])
     assert scalars(recording, "/plots/objects/cup") == [[1], [1], [0]]
