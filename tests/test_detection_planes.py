@@ -170,17 +170,15 @@ def test_no_plane_is_assumed_for_a_few_samples_or_above_the_camera() -> None:
     grid = DepthGrid(np.ones((60, 80), np.float32), PinholeIntrinsics(75, 75, 39.5, 29.5), 8, 0.01)
     few = np.zeros((60, 80), np.int8)
     few[6:] = -1  # a tenth is above no plane
-    none = np.zeros((60, 80), np.uint8)
     up = np.array([0.0, 0.0, -1.0])
-    assert unexplained(grid, few, none) is None
-    assert unexplained(grid, ~few, (few < 0).astype(np.uint8)) is None
-    rest = unexplained(grid, ~few, none)
+    assert unexplained(grid, few) is None
+    rest = unexplained(grid, ~few)
     assert rest is not None
     np.testing.assert_array_equal(rest, few == -1)
     assert assume_plane(grid, rest, -up, tallest_m=0.5) is None
     assert assume_plane(grid, rest, up, tallest_m=0.5) is not None
     far = grid._replace(inverse_depth=np.where(few < 0, np.float32(0.4), grid.inverse_depth))
-    assert unexplained(far, ~few, none) is None  # background, 2.5 m away
+    assert unexplained(far, ~few) is None  # background, 2.5 m away
 
 
 @pytest.mark.parametrize("first", [3002, pytest.param(3005, marks=pytest.mark.many)])

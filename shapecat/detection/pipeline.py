@@ -45,7 +45,7 @@ from shapecat.detection.output.settings import OUTPUT
 from shapecat.detection.planes import NO_HINT, find_supporting_planes
 from shapecat.detection.planes.assumed import assume_plane, unexplained
 from shapecat.detection.planes.extent import SupportingPlane
-from shapecat.detection.planes.height_map import measure_heights, pack_planes
+from shapecat.detection.planes.height_map import HeightMap, measure_heights, pack_planes
 from shapecat.detection.planes.ransac import draw_trials
 from shapecat.detection.records import OverSegmentation, PlaneModel, Segmentation
 from shapecat.detection.segmentation.connectivity import connect_surfaces
@@ -195,29 +195,34 @@ def _find_planes(
         up = hint
     elif not up.any():
         up = np.array(DEFAULT_UP)
-    model = _separate(grid, supports, up, trials, task)
-    rest = unexplained(grid, model.heights.plane_id, model.walls)
-    assumed = None if rest is None else assume_plane(grid, rest, up, tallest_m)
+    planes = pack_planes(supports)
+    heights = measure_heights(grid, planes, tallest_m)
+    assumed = _assumed(grid, heights, up, trials, task.settings)
     if assumed is not None:
         supports = sorted([*supports, assumed], key=lambda support: support.offset)
-        model = _separate(grid, supports, up, trials, task)
+        planes = pack_planes(supports)
+        heights = measure_heights(grid, planes, tallest_m)
     if not supports:
         return None
-    extend_overhang(grid, model.heights, model.planes, model.walls, tallest_m)
-    return model
-
-
-def _separate(
-    grid: DepthGrid, supports: list[SupportingPlane], up: F8, trials: F8, task: Task
-) -> PlaneModel:
-    """Measure the heights above the planes, and find low-profile objects and walls."""
-    planes, largest_m = pack_planes(supports), task.settings.max_size_m
-    heights = measure_heights(grid, planes, task.settings.max_height_m)
+    largest_m = task.settings.max_size_m
     low_profile = np.zeros(grid.inverse_depth.shape, np.int16)
     if task.steps.low_profile:
         find_low_profile(grid, heights, planes, low_profile, largest_m)
     walls = remove_walls(grid, heights.plane_id, up, largest_m, trials)
+    extend_overhang(grid, heights, planes, walls, tallest_m)
     return PlaneModel(up, supports, planes, heights, low_profile, walls)
+
+
+def _assumed(
+    grid: DepthGrid, heights: HeightMap, up: F8, trials: F8, settings: DetectionSettings
+) -> SupportingPlane | None:
+    """Assume a plane below samples that neither planes nor walls explain; None if they are few."""
+    plane_id = heights.plane_id.copy()
+    rest = unexplained(grid, plane_id)
+    if rest is not None:
+        walls = remove_walls(grid, plane_id, up, settings.max_size_m, trials)
+        rest = unexplained(grid, plane_id.view(np.uint8) | walls)
+    return None if rest is None else assume_plane(grid, rest, up, settings.max_height_m)
 
 
 def _oversegment(grid: DepthGrid, model: PlaneModel, steps: Steps) -> OverSegmentation:

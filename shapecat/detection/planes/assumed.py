@@ -19,17 +19,19 @@ NEAR_M = 2.0
 away they are background."""
 UNEXPLAINED = 0.2
 """Share of unexplained samples above which a plane is assumed; plain tables have at most 0.06."""
+APART = 2
+"""Step between the rows and columns of the samples used."""
 FEW = 0.01
 """Share of the unexplained samples that may lie below the plane, as noise."""
 
 
-def unexplained(grid: DepthGrid, plane_id: I4, walls: U1) -> Bool | None:
-    """Return the near samples that are neither on a plane, nor above one, nor on a wall.
+def unexplained(grid: DepthGrid, explained: I4 | U1) -> Bool | None:
+    """Return the near samples where ``explained`` is 0, (rows, columns); None if they are few.
 
-    The result is (rows, columns) bool; None if there are few.
+    ``explained`` (rows, columns) is not 0 on a plane, above one, or on a wall.
     """
     seen = grid.inverse_depth > np.float32(1 / NEAR_M)
-    rest: Bool = ((plane_id.view(np.uint8) | walls) == 0) & seen
+    rest: Bool = (explained == 0) & seen
     few = np.count_nonzero(rest) <= UNEXPLAINED * np.count_nonzero(seen)
     return None if few else rest
 
@@ -46,8 +48,10 @@ def assume_plane(grid: DepthGrid, rest: Bool, up: F8, tallest_m: float) -> Suppo
     up : (3,) unit normal of the plane, sensor frame.
     tallest_m : height of the tallest object, metres.
     """
-    across, along, height = level_coordinates(grid, rest, up)
-    z = 1 / grid.inverse_depth[rest].astype(np.float64)
+    some = np.zeros(rest.shape, np.bool_)
+    some[::APART, ::APART] = rest[::APART, ::APART]
+    across, along, height = level_coordinates(grid, some, up)
+    z = 1 / grid.inverse_depth[some].astype(np.float64)
     offset = _fullest(height, 1 / (1 + (z / UP.half_m) ** 2), tallest_m)
     if offset >= 0:  # its upper side is not visible
         return None

@@ -27,6 +27,8 @@ __all__ = ["add_strip_planes", "may_have_strips"]
 
 APART = 2
 """Step between the columns of the samples used."""
+SPARSE = 4
+"""One of so many samples measures the area above a plane."""
 ARM = 2
 """Distance, in cells, to the neighbours that show whether a sample is on level surface."""
 BINS = 600
@@ -132,14 +134,16 @@ def _covered(seen: PlaneCandidate, strips: F4, intrinsics: PinholeIntrinsics) ->
 
 def _area_over(strips: F4, intrinsics: PinholeIntrinsics, plane: SupportingPlane) -> float:
     """Return the area of level surface just above the outline of a plane, m²."""
-    j, i, inv_depth, _ = strips.astype(np.float64)
+    some = strips[:, ::SPARSE]
+    above = some[3] - plane.offset
+    near = some[:, (above > STRIPS.same_m) & (above < STRIPS.tallest_m)]
+    j, i, inv_depth, _ = near.astype(np.float64)
     x, y = (j - intrinsics.cx) / intrinsics.fx, (i - intrinsics.cy) / intrinsics.fy
     level = gravity_rotation(plane.up) @ (np.stack([x, y, np.ones(j.size)]) / inv_depth)
-    above = level[2] - plane.offset
-    over = (above > STRIPS.same_m) & (above < STRIPS.tallest_m)
-    over &= (COS[:, None] * level[0] + SIN[:, None] * level[1] < plane.extent[:, None]).all(axis=0)
+    over = (COS[:, None] * level[0] + SIN[:, None] * level[1] < plane.extent[:, None]).all(axis=0)
     facing = np.maximum(-level[2] * inv_depth, STRIPS.least_rise)
-    return float((APART / (intrinsics.fx * intrinsics.fy * facing * inv_depth**2))[over].sum())
+    share = SPARSE * APART / (intrinsics.fx * intrinsics.fy)
+    return float((share / (facing * inv_depth**2))[over].sum())
 
 
 @kernel
