@@ -33,8 +33,8 @@ def measure_borders(segments: Segments) -> tuple[I4, F4]:
     second is behind and in front of the first, and where both are near without being connected.
     """
     roots = np.flatnonzero(segments.parent == np.arange(segments.parent.size))[1:]
-    pairs = segments.pairs[np.ix_(roots, roots)]
-    contact, in_front, near = pairs["contact"], pairs["in_front"], pairs["near"]
+    both = np.ix_(roots, roots)
+    contact, in_front, near = (segments.pairs[n][both] for n in ("contact", "in_front", "near"))
     weights = np.stack([contact + contact.T, in_front, in_front.T, near + near.T])
     weights[:, np.arange(len(roots)), np.arange(len(roots))] = 0
     return roots, weights

@@ -8,7 +8,7 @@ __all__ = ["LOW", "OUTLINES", "OVERHANG", "WALLS"]
 class LowProfileSettings(NamedTuple):
     """Constants that distinguish low-profile objects from low-frequency depth error."""
 
-    levels: tuple[float, ...] = (3.0, 2.0, 1.3, 0.9, 0.6, 0.4)
+    levels: tuple[float, ...] = (3.0, 2.0, 1.3, 0.9, 0.6)
     """Thresholds above the mean whose outlines are tested, as multiples of the minimum rise: one
     of them separates an object from the depth error beside it."""
     fine: float = 0.006
