@@ -138,7 +138,7 @@ def test_context_decides_on_doubtful_segments_only(
 
 def test_verdicts_stop_where_they_are_certain() -> None:
     """The features of a context have the same range in training and in use."""
-    for value, expected in ((9.0, 5.0), (-9.0, -5.0), (1.5, 1.5)):
+    for value, expected in ((9.0, 4.0), (-9.0, -4.0), (1.5, 1.5)):
         trees = _LEAF._replace(value=np.array([value], np.float32))
         assert logits_of(np.zeros((1, 1), np.float32), trees).tolist() == [expected]
 
