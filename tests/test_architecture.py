@@ -165,7 +165,8 @@ def test_processing_loads_no_library_too_soon() -> None:
     never = {"open3d", "matplotlib", "sklearn"}
     code = (
         "import sys, shapecat.batch, shapecat.recordings.decoding;"
-        f"print(*{late} & set(sys.modules));"
+        f"print(*{late} & set(sys.modules)); shapecat.open_run;"
+        f"print(*{never | {'rerun', 'pandas'}} & set(sys.modules));"
         "import shapecat.outputs.annotated_mcap, shapecat.outputs.review"
     )
 

@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 
 from shapecat.errors import ModelError
-from shapecat.learning import Categorizer, load_model, save_model
+from shapecat.learning import Categorizer, load_model, model_file, save_model
 from shapecat.learning.categorizer import parts_of
 from shapecat.learning.features import FeatureBank
 from shapecat.learning.forest import FlatForest
@@ -200,8 +200,11 @@ def test_a_claimed_size_is_not_believed(saved: Path) -> None:
         load_model(saved)
 
 
-def test_a_bomb_is_not_unpacked(saved: Path) -> None:
-    content = bytes(129 << 20)
+def test_a_bomb_is_not_unpacked(saved: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """The limit itself would take a second to pack."""
+    assert model_file._LARGEST_PART == 128 << 20
+    monkeypatch.setattr(model_file, "_LARGEST_PART", 8 << 20)
+    content = bytes(9 << 20)
     with zipfile.ZipFile(saved, "w", zipfile.ZIP_DEFLATED, compresslevel=1) as archive:
         archive.writestr("votes.npy", content)
 

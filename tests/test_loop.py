@@ -22,7 +22,7 @@ from shapecat.types import CATEGORIES, Pose
 
 Run = Callable[..., Result]
 NEW = "wine glass"
-FRAMES = 8
+FRAMES = 6
 
 
 def table_with_glasses(seed: int) -> World:

@@ -1,12 +1,12 @@
 """A run without planes finds nothing: the user learns the reason, in run.json and on screen."""
 
-import subprocess
-import sys
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pyarrow.parquet as pq
+from click.testing import Result
 
 from shapecat.config import DetectionSettings, Settings
 from shapecat.pipeline import process
@@ -80,14 +80,13 @@ def test_objects_on_a_plane_that_is_only_assumed_need_no_reason(tmp_path: Path) 
     assert pq.read_metadata(tmp_path / "heap" / "planes.parquet").num_rows == 0
 
 
-def test_the_reason_is_printed(tmp_path: Path) -> None:
+def test_the_reason_is_printed(shapecat: Callable[..., Result], tmp_path: Path) -> None:
     """Nobody opens run.json to learn why a table has no tracks."""
     path = record(tmp_path / "far.mcap", 2)
-    out = str(tmp_path / "out")
-    command = [sys.executable, "-m", "shapecat", "process", str(path), "--out", out]
-    command += ["--set", "detection.max_range_m=0.3", "--jobs", "1", "--no-rrd"]
+    options = ("--set", "detection.max_range_m=0.3", "--jobs", "1", "--no-rrd")
 
-    done = subprocess.run(command, capture_output=True, text=True, check=True)
+    done = shapecat("process", path, "--out", tmp_path / "out", *options)
 
+    assert done.exit_code == 0
     assert "Warning: far: no supporting plane in 2 of 2 frames: 100%" in done.stderr
     assert "none" in done.stdout

@@ -112,24 +112,22 @@ def other_than(category: str, number: int) -> int:
     return digit if NAMES[digit - 1] != category else 1 + digit % len(NAMES)
 
 
-def test_corrections_by_keyboard_outlive_the_server(
-    browser: Browser, served: Callable[..., Server], long_run: Path
-) -> None:
-    server = served(long_run)
-    browser.open(server.address)
+def test_corrections_by_keyboard_outlive_the_server(browser: Browser, long_run: Path) -> None:
+    """They are on disk when the page says so, before the server ends."""
     categories = {row.track: row.category for row in read_track_table(long_run / "tracks.csv").rows}
     wanted, keys = {}, []
-    for number, track in enumerate(order_of(browser)):
-        digit = other_than(categories[track], number)
-        keys += [str(digit), "Right"]
-        wanted[track] = NAMES[digit - 1]
-    browser.press(*keys)
-    browser.wait(SAVED)
-    os.kill(server.pid, signal.SIGKILL)
-    server.wait()
+    with serving(long_run) as (address, _):
+        browser.open(address)
+        for number, track in enumerate(order_of(browser)):
+            digit = other_than(categories[track], number)
+            keys += [str(digit), "Right"]
+            wanted[track] = NAMES[digit - 1]
+        browser.press(*keys)
+        browser.wait(SAVED)
+        on_disk = labels_on_disk(long_run)
 
     assert len(wanted) == TRACKS
-    assert labels_on_disk(long_run) == wanted
+    assert on_disk == wanted
     assert browser.complaints() == []
 
     script = (

@@ -234,7 +234,7 @@ def spoilt(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return folder
 
 
-@pytest.mark.usefixtures("all_awake")
+@pytest.mark.usefixtures("late_answers")
 def test_the_second_look_does_not_depend_on_the_number_of_workers(
     spoilt: Path, tmp_path: Path
 ) -> None:
