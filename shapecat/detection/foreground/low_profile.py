@@ -46,6 +46,7 @@ class Scratch(NamedTuple):
     stack: I4
 
 
+@kernel
 def find_low_profile(
     grid: DepthGrid, heights: HeightMap, planes: F8, low_profile: I4, largest_m: float
 ) -> None:
@@ -59,14 +60,16 @@ def find_low_profile(
     low_profile : (rows, columns) zeros; set to 1, 2, ... on low-profile objects.
     largest_m : maximum width of a low-profile object, metres.
     """
-    inv_depth, plane_id, height = grid.inverse_depth, heights.plane_id, heights.height
+    inv_depth, (plane_id, height) = grid.inverse_depth, heights
+    shape, size = inv_depth.shape, inv_depth.size
     widest = largest_m * grid.intrinsics.fx
-    images = unset((2, *inv_depth.shape), np.float32)
+    residuals, high_passes = unset(shape, np.float32), unset(shape, np.float32)
+    drops = unset(size, np.float32)
     scratch = Scratch(
-        np.zeros(inv_depth.shape, np.int32),
-        np.zeros(inv_depth.shape, np.int32),
-        unset(inv_depth.size, np.int32),
-        unset(inv_depth.size, np.int32),
+        np.zeros(shape, np.int32),
+        np.zeros(shape, np.int32),
+        unset(size, np.int32),
+        unset(size, np.int32),
     )
     objects = parts = 0
     for k in range(len(planes)):
@@ -75,37 +78,23 @@ def find_low_profile(
         if start == end:
             continue
         plane[2] += start * plane[1]  # rows count from ``start`` from here on
-        rows = slice(start, end)
-        values, plane_ids, above, marks = (
-            inv_depth[rows],
-            plane_id[rows],
-            height[rows],
-            low_profile[rows],
-        )
-        residual, high_pass = images[0, rows], images[1, rows]
+        values, plane_ids = inv_depth[start:end], plane_id[start:end]
+        above, marks = height[start:end], low_profile[start:end]
+        residual, high_pass = residuals[start:end], high_passes[start:end]
         if measure_residual(values, plane_ids, above, plane, number, residual) < LOW.least_cells:
             continue
-        clear_contact(
-            values,
-            plane_ids,
-            above,
-            number,
-            residual,
-            scratch.seeds,
-            scratch.stack.view(np.float32),
-        )
+        clear_contact(values, plane_ids, above, number, residual, scratch.seeds, drops)
         filter_high_pass(residual, high_pass)
         clear = max(LOW.step, LOW.steady * measure_noise(high_pass, plane_ids, number))
         step = max(clear, LOW.slip * math.hypot(plane[0], plane[1]))
-        least = np.float32(min(clear, LOW.fine))
-        bounds = (step, least, widest)
+        bounds = (step, np.float32(min(clear, LOW.fine)), widest)
         objects, parts = _raise(
             values, high_pass, plane_ids, number, bounds, marks, objects, parts, scratch
         )
         parts = _lower(values, residual, plane_ids, number, step, marks, parts, scratch)
 
 
-@kernel
+@kernel(inline=True)
 def _rows_of(plane_id: I4, number: int) -> tuple[int, int]:
     """Return the first row of the cells of a plane, and one after the last, with a margin.
 
@@ -126,7 +115,7 @@ def _rows_of(plane_id: I4, number: int) -> tuple[int, int]:
     return start - start % EVERY, min(end + LOW.apart, rows)  # noise is measured on the same rows
 
 
-@kernel
+@kernel(inner=True)
 def _raise(
     inv_depth: F4,
     high_pass: F4,
@@ -236,7 +225,7 @@ def _flood(residual: F4, level: float, start: int, n: int, part: I4, stack: I4) 
     return top
 
 
-@kernel
+@kernel(inner=True)
 def _lower(
     inv_depth: F4,
     residual: F4,
