@@ -70,17 +70,18 @@ def find_background(
     """
     rejected = np.zeros(len(features), np.bool_)
     roots, weights = measure_borders(segments)
-    alone = logits_of(as_rows(features[roots]), grown.alone)
+    merged = features[roots]
+    alone = logits_of(as_rows(merged), grown.alone)
     again = is_uncertain(alone)
-    context = add_context(features[roots], alone, weights)[again]
+    context = add_context(merged, alone, weights)[again]
     logits = alone.copy()
     logits[again] = logits_of(as_rows(context), grown.in_context)
     segment, cells = features["segment"], features["visibility"]["cells"]
-    depths = features["visibility"]["depth_m"][roots]
+    depths = merged["visibility"]["depth_m"]
     far = depths > CLEANUP.far_m
     rejected[roots] = logits < np.where(far, CLEANUP.least_far_logit, CLEANUP.least_logit)
-    enough = [smallest_object_at(grid, z) for z in depths]
-    rejected[roots] |= cells[roots] < CLEANUP.tiny_share * np.array(enough)
+    enough = np.array([smallest_object_at(grid, z) for z in depths.tolist()])
+    rejected[roots] |= cells[roots] < CLEANUP.tiny_share * enough
     rejected |= segment["width_m"] > settings.max_size_m
     rejected |= segment["top_m"] > settings.max_height_m - CLEANUP.cut_off_m
     # Large and mostly outside the image: furniture, which the trees were not shown.
