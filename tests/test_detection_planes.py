@@ -177,6 +177,8 @@ def test_no_plane_is_assumed_for_a_few_samples_or_above_the_camera() -> None:
     np.testing.assert_array_equal(rest, few == -1)
     assert assume_plane(grid, rest, -up, tallest_m=0.5) is None
     assert assume_plane(grid, rest, up, tallest_m=0.5) is not None
+    one = np.arange(few.size).reshape(few.shape) == 3001
+    assert assume_plane(grid, one, up, tallest_m=0.5) is not None
     far = grid._replace(inverse_depth=np.where(few < 0, np.float32(0.4), grid.inverse_depth))
     assert unexplained(far, ~few) is None  # background, 2.5 m away
 

@@ -19,8 +19,8 @@ NEAR_M = 2.0
 away they are background."""
 UNEXPLAINED = 0.2
 """Share of unexplained samples above which a plane is assumed; plain tables have at most 0.06."""
-APART = 2
-"""Step between the rows and columns of the samples used."""
+EVERY = 4
+"""One of so many unexplained samples places the plane."""
 FEW = 0.01
 """Share of the unexplained samples that may lie below the plane, as noise."""
 
@@ -49,7 +49,7 @@ def assume_plane(grid: DepthGrid, rest: Bool, up: F8, tallest_m: float) -> Suppo
     tallest_m : height of the tallest object, metres.
     """
     some = np.zeros(rest.shape, np.bool_)
-    some[::APART, ::APART] = rest[::APART, ::APART]
+    some.flat[np.flatnonzero(rest)[::EVERY]] = True
     across, along, height = level_coordinates(grid, some, up)
     z = 1 / grid.inverse_depth[some].astype(np.float64)
     offset = _fullest(height, 1 / (1 + (z / UP.half_m) ** 2), tallest_m)
