@@ -2,7 +2,6 @@
 
 import gc
 import os
-import signal
 import subprocess
 import sys
 import time
@@ -10,12 +9,10 @@ import weakref
 from collections.abc import Iterator
 from concurrent.futures import Executor
 from itertools import count
-from multiprocessing import parent_process
 from pathlib import Path
 from queue import SimpleQueue
 from typing import Any
 
-import numpy as np
 import pytest
 
 from shapecat.errors import ConfigError
@@ -33,20 +30,20 @@ from shapecat.executors import (
 from shapecat.executors.dask import _DaskExecutor
 from shapecat.executors.order import Processes
 from shapecat.system import stopping
-
-
-def kill_self(_: object = None) -> None:
-    os.kill(os.getpid(), signal.SIGKILL)
-
-
-def raise_error() -> None:
-    msg = "as told"
-    raise ValueError(msg)
-
-
-def write_and_sleep(path: str) -> None:
-    Path(path).write_text(str(os.getpid()), "utf-8")
-    time.sleep(60)
+from tests.tasks import (
+    Unreadable,
+    frail,
+    inverse_of_rest,
+    kill_self,
+    loads_pandas,
+    process_and_ones,
+    raise_error,
+    raise_unreadable,
+    slow_at_times,
+    slow_elsewhere,
+    work_until_asked,
+    write_and_sleep,
+)
 
 
 def alive(process: int) -> bool:
@@ -62,16 +59,6 @@ def wait_for(condition: Any, seconds: float = 20) -> None:
     while not condition():
         assert time.monotonic() < deadline, "waited in vain"
         time.sleep(0.02)
-
-
-class Unreadable:
-    """Can be pickled but not unpickled."""
-
-    def __reduce__(self) -> tuple[Any, ...]:
-        return raise_error, ()
-
-    def method(self) -> None:
-        """Do nothing."""
 
 
 @pytest.fixture(scope="module")
@@ -93,13 +80,6 @@ def test_results_errors_and_deaths_reach_their_own_futures(executor: Executor) -
         assert isinstance(error, WorkerLostError)
         assert is_lost(error)
         assert "SIGKILL" in str(error)
-
-
-def loads_pandas() -> bool:
-    import pyarrow as pa  # noqa: PLC0415  in a worker
-
-    pa.array([1])
-    return "pandas" in sys.modules
 
 
 def test_workers_do_without_pandas(executor: Executor) -> None:
@@ -158,12 +138,6 @@ def test_terminate_kills_running_tasks(tmp_path: Path) -> None:
         one.submit(abs, -1)
 
 
-def work_until_asked(path: str) -> None:
-    Path(path).write_text("begun")
-    while True:
-        stopping.check()
-
-
 def test_workers_put_their_work_down_when_the_executor_stops(tmp_path: Path) -> None:
     executor = LocalExecutor(1)
     running = executor.submit(work_until_asked, str(tmp_path / "begun"))
@@ -180,7 +154,7 @@ def test_workers_put_their_work_down_when_the_executor_stops(tmp_path: Path) -> 
 def test_workers_end_when_their_parent_is_killed(tmp_path: Path) -> None:
     """Orphans would run for hours and keep the folders locked."""
     code = (
-        "from tests.test_executors import write_and_sleep\n"
+        "from tests.tasks import write_and_sleep\n"
         "from shapecat.executors import LocalExecutor\n"
         "if __name__ == '__main__':\n"
         f"    LocalExecutor(1).submit(write_and_sleep, {str(tmp_path / 'pid')!r}).result()\n"
@@ -241,17 +215,6 @@ def test_dask_does_not_answer_a_second_attempt_with_the_result_of_the_first() ->
         assert first.result() != second.result()
 
 
-def slow_at_times(k: int) -> tuple[int, int]:
-    time.sleep(0.02 * (k % 7 == 0))
-    return -k, os.getpid()
-
-
-def frail(k: int) -> int:
-    if parent_process() is not None and k % 50 == 20:
-        os.kill(os.getpid(), signal.SIGKILL)
-    return slow_at_times(k)[0]
-
-
 def test_processes_keep_the_order_and_hold_few_items() -> None:
     """A recording does not fit into memory, and its tables must not depend on timing."""
     used: list[tuple[int, int]] = []
@@ -283,12 +246,6 @@ def test_a_killed_process_loses_no_item() -> None:
     assert results == [(k, -k) for k in range(200)]
 
 
-def slow_elsewhere(seconds: float) -> int:
-    if parent_process() is not None:
-        time.sleep(seconds)
-    return os.getpid()
-
-
 def one_by_one() -> Iterator[tuple[int, float]]:
     for k in range(3):
         time.sleep(0.1)
@@ -303,10 +260,6 @@ def test_the_last_items_do_not_wait_for_a_slow_process() -> None:
         workers = [worker for _, worker in processes.in_order(one_by_one())]
     assert workers[0] == workers[1] != os.getpid()
     assert workers[2] == os.getpid()
-
-
-def process_and_ones(k: int) -> tuple[int, np.ndarray]:
-    return os.getpid(), np.ones(k)
 
 
 def test_results_are_freed_without_collecting_garbage() -> None:
@@ -334,28 +287,12 @@ def test_results_are_freed_without_collecting_garbage() -> None:
         gc.enable()
 
 
-def inverse_of_rest(k: int) -> int:
-    return 1 // (12 - k)
-
-
 def test_errors_come_at_their_turn() -> None:
     with Processes(inverse_of_rest, 2) as processes:
         results = processes.in_order((k, k) for k in range(20))
         assert [next(results)[1] for _ in range(12)] == [0] * 11 + [1]
         with pytest.raises(ZeroDivisionError):
             next(results)
-
-
-class UnreadableError(Exception):
-    """Cannot be unpickled, since its constructor needs more than a message."""
-
-    def __init__(self, place: str, number: int) -> None:
-        super().__init__(f"{place}, {number}")
-
-
-def raise_unreadable() -> None:
-    place = "here"
-    raise UnreadableError(place, 1)
 
 
 def test_an_error_that_cannot_be_read_fails_its_task_alone() -> None:
