@@ -243,6 +243,8 @@ def test_views_of_two_sensors_count_both() -> None:
     (hits,) = gather(found, together=BODIES)
 
     assert (hits.weights(np.arange(4)) > 0).all()
+    mine = np.flatnonzero(hits.topics[hits.rows] == 0)  # a track that one sensor saw
+    assert hits.seen_with(mine, np.arange(4)).tolist() == mine.tolist()
 
 
 def test_each_topic_has_its_own_poses(tmp_path: Path) -> None:

@@ -130,7 +130,11 @@ def test_exporting_again_leaves_no_view_under_an_earlier_label(run: Path, tmp_pa
     own = tmp_path / "crops" / "cup" / "mine"
     own.mkdir(parents=True)
     (own / "view.pcd").write_text("of another data set")
-    export_run(folder, "crops", tmp_path / "crops", every=4)
+    told: list[tuple[str, int, int | None]] = []
+    export_run(
+        folder, "crops", tmp_path / "crops", every=4, observe=lambda *what: told.append(what)
+    )
+    assert told[-1][1:] == (len(told), len(told))  # the progress ends at its total
     relabel(folder, {2: "vase", 3: "delete"})
     export_run(folder, "crops", tmp_path / "crops", every=4)
 

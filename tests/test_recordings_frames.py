@@ -23,6 +23,7 @@ from shapecat.recordings.compressed_depth import depth_of_compressed
 from shapecat.recordings.pinhole import fit_pinhole, still_fits
 from shapecat.recordings.pointcloud2 import cloud_points
 from shapecat.recordings.sources import DepthSource
+from shapecat.runs.selection import count_frames
 from shapecat.types import Camera, Frame
 from tests.depth_encodings import png, rvl
 from tests.messages import (
@@ -159,6 +160,25 @@ def test_organized_points_without_a_camera_stay_points(points: Any, tmp_path: Pa
 
     assert frame.points is not None
     np.testing.assert_array_equal(frame.points, points.reshape(-1, 3))
+
+
+def test_images_without_a_row_length_and_the_number_of_frames(tmp_path: Path) -> None:
+    """A step of 0 means that rows follow each other; a window has no known number of frames."""
+    depth = np.arange(500, 500 + 5 * 7, dtype=np.uint16).reshape(5, 7)
+    packed = image(EPOCH, depth)
+    packed.step = 0
+    items = [("/camera/camera_info", EPOCH, info(EPOCH, Camera(7, 5, 9, 9, 3, 2)))]
+    items += [("/camera/image_raw", EPOCH + k, packed) for k in range(5)]
+    path = write(tmp_path / "a.mcap", items)
+
+    (first, *_), _, _ = read(path)
+
+    np.testing.assert_allclose(first.depth, depth / np.float32(1000))
+    options = {"topics": ["/camera/image_raw"], "every": 2, "start_s": None, "end_s": None}
+    with open_recording(path) as recording:
+        assert count_frames(recording, options) == 3
+        assert count_frames(recording, options | {"start_s": 1.0}) is None
+        assert count_frames(recording, options | {"end_s": 1.0}) is None
 
 
 FORMATS = {1: "i1", 2: "u1", 3: "i2", 4: "u2", 5: "i4", 6: "u4", 7: "f4", 8: "f8"}
