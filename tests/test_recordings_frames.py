@@ -173,8 +173,9 @@ def test_images_without_a_row_length_and_the_number_of_frames(tmp_path: Path) ->
 
     (first, *_), _, _ = read(path)
 
-    np.testing.assert_allclose(first.depth, depth / np.float32(1000))
-    options = {"topics": ["/camera/image_raw"], "every": 2, "start_s": None, "end_s": None}
+    assert first.depth is not None
+    np.testing.assert_allclose(first.depth, depth.astype(np.float32) / 1000)
+    options: Any = {"topics": ["/camera/image_raw"], "every": 2, "start_s": None, "end_s": None}
     with open_recording(path) as recording:
         assert count_frames(recording, options) == 3
         assert count_frames(recording, options | {"start_s": 1.0}) is None
