@@ -10,19 +10,12 @@ from shapecat.arrays import F8, I4, U1, Bool
 from shapecat.detection.depth_grid import DepthGrid
 from shapecat.detection.planes.extent import COS, SIN, SupportingPlane, level_coordinates
 from shapecat.detection.planes.ransac import horizontal_plane
-from shapecat.detection.planes.settings import PLANES, UP
+from shapecat.detection.planes.settings import ASSUMED, PLANES, UP
 
 __all__ = ["assume_plane", "unexplained"]
 
-NEAR_M = 2.0
-"""Depth up to which samples above no plane may be objects that hide their support, metres; farther
-away they are background."""
-UNEXPLAINED = 0.2
-"""Share of unexplained samples above which a plane is assumed; plain tables have at most 0.06."""
 EVERY = 4
-"""One of so many unexplained samples places the plane."""
-FEW = 0.01
-"""Share of the unexplained samples that may lie below the plane, as noise."""
+"""Step between the unexplained samples that place the plane."""
 
 
 def unexplained(grid: DepthGrid, explained: I4 | U1) -> Bool | None:
@@ -30,9 +23,9 @@ def unexplained(grid: DepthGrid, explained: I4 | U1) -> Bool | None:
 
     ``explained`` (rows, columns) is not 0 on a plane, above one, or on a wall.
     """
-    seen = grid.inverse_depth > np.float32(1 / NEAR_M)
+    seen = grid.inverse_depth > np.float32(1 / ASSUMED.near_m)
     rest: Bool = (explained == 0) & seen
-    few = np.count_nonzero(rest) <= UNEXPLAINED * np.count_nonzero(seen)
+    few = np.count_nonzero(rest) <= ASSUMED.unexplained * np.count_nonzero(seen)
     return None if few else rest
 
 
@@ -70,5 +63,5 @@ def _fullest(height: F8, weight: F8, tallest_m: float) -> float:
     inside = total[window:] - total[:-window]
     start = int(np.argmax(inside))
     above = np.cumsum(count[start:])
-    start += int(np.argmax(above > FEW * inside[start]))
+    start += int(np.argmax(above > ASSUMED.few * inside[start]))
     return low + start * PLANES.bin_m - PLANES.margin_m

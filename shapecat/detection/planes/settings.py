@@ -3,7 +3,7 @@
 import math
 from typing import NamedTuple
 
-__all__ = ["PLANES", "STRIPS", "UP", "PlaneSettings", "StripSettings", "UpSettings"]
+__all__ = ["ASSUMED", "PLANES", "STRIPS", "UP"]
 
 
 class UpSettings(NamedTuple):
@@ -120,4 +120,18 @@ class StripSettings(NamedTuple):
     """Largest visible share of the outline of a covered plane; a lid is fully visible."""
 
 
+class AssumedSettings(NamedTuple):
+    """Constants of the plane that is assumed below samples above no visible plane."""
+
+    near_m: float = 2.0
+    """Depth up to which such samples may be objects that hide their support, metres; farther away
+    they are background."""
+    unexplained: float = 0.2
+    """Share of unexplained samples above which a plane is assumed; plain tables have at most 0.06.
+    """
+    few: float = 0.01
+    """Share of the unexplained samples that may lie below the plane, as noise."""
+
+
 UP, PLANES, STRIPS = UpSettings(), PlaneSettings(), StripSettings()
+ASSUMED = AssumedSettings()

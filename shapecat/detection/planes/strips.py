@@ -28,7 +28,7 @@ __all__ = ["add_strip_planes", "may_have_strips"]
 APART = 2
 """Step between the columns of the samples used."""
 SPARSE = 4
-"""One of so many samples measures the area above a plane."""
+"""Step between the samples that measure the area above a plane."""
 ARM = 2
 """Distance, in cells, to the neighbours that show whether a sample is on level surface."""
 BINS = 600
