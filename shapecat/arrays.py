@@ -21,7 +21,7 @@ Bool: TypeAlias = NDArray[Any]
 def freeze(
     value: ArrayLike, shape: str, dtype: DTypeLike, sizes: dict[str, int] | None = None
 ) -> NDArray[Any]:
-    """Return ``value`` as a read-only array of the stated shape and type.
+    """Return ``value`` as a read-only array of the stated shape and type, in C order.
 
     Parameters
     ----------
@@ -33,7 +33,8 @@ def freeze(
 
     Returns
     -------
-    A read-only view if the type already fits, otherwise a read-only copy.
+    A read-only view if type and order already fit, otherwise a read-only copy. Kernels are compiled
+    anew for arrays of another order, and for writable ones.
 
     Raises
     ------
@@ -62,7 +63,7 @@ def _freeze(
     value: ArrayLike, axes: Axes, dtype: np.dtype[Any], sizes: dict[str, int]
 ) -> NDArray[Any]:
     """Do the work of `freeze` with parsed arguments, for speed."""
-    result = np.asarray(value, dtype)
+    result = np.asarray(value, dtype, order="C")
     # A shape without named axes is compared at once.
     if result.shape != axes and not _agree(axes, result.shape, sizes):
         known = f" with {sizes}" if sizes else ""
@@ -124,3 +125,10 @@ class Record:
                 raise ValueError(msg) from None
             if frozen is not value:
                 object.__setattr__(self, name, frozen)
+
+    def __setstate__(self, state: dict[str, Any]) -> None:
+        """Restore a record in another process, where its arrays would be writable."""
+        self.__dict__.update(state)
+        for name, *_ in self._arrays:
+            if (value := state.get(name)) is not None:
+                value.setflags(write=False)

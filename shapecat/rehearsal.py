@@ -21,44 +21,69 @@ from pathlib import Path
 import numba
 import numpy as np
 
+from shapecat.arrays import F4
 from shapecat.completion import complete
 from shapecat.config import Settings
 from shapecat.description import describe
 from shapecat.detection import detect
 from shapecat.executors.local import LocalExecutor
 from shapecat.executors.worker import WorkerLostError
+from shapecat.geometry import level_from_sensor
 from shapecat.jit import code_folder
 from shapecat.learning import load_model
 from shapecat.reuse import KeyView, find_repeats, shows_the_same, sight_of
 from shapecat.surface import reconstruct, thin
+from shapecat.surface.triangles import triangles_of
 from shapecat.system import stopping
 from shapecat.system.files import lock
 from shapecat.system.scripts import runs_again
-from shapecat.types import Camera, Candidate, Detection, Frame, NeuralGas
+from shapecat.types import Camera, Candidate, Detection, Frame, NeuralGas, Scene
 
 __all__ = ["compile_all", "find_ball", "main", "recognize_ball", "rehearse"]
 
-_RADIUS_M = 0.05
+_RADIUS_M, _TOP_M = 0.05, 0.11
+"""Radii of the ball, and of the plate and the top of the block."""
+_TABLE_M, _BOARD_M = 0.4, 0.05
+"""Half the widths of the table and of a board."""
 
 
 def find_ball() -> int:
-    """Detect a synthetic ball on a table; return the number of repeated objects."""
+    """Detect a synthetic ball, a plate and a block; return the number of repeated objects."""
     v, u = np.mgrid[:480, :640]
     rays = np.stack([(u - 320) / 525, (v - 240) / 525, np.ones(u.shape)], axis=-1)
     up = np.array([0, -np.sqrt(0.5), -np.sqrt(0.5)])
-    table = -0.7 / np.minimum(rays @ up, -0.1)  # 0.7 m below the camera
-    ball = np.array([0, 0, 0.7 * np.sqrt(2)]) + _RADIUS_M * up
+    down = np.minimum(rays @ up, -0.1)
+    middle = np.array([0, 0, 0.7 * np.sqrt(2)])
+    ball = middle + _RADIUS_M * up
+    table = -0.7 / down
+    seen = np.where(
+        abs(rays[..., 0] * table) < _TABLE_M, table, -1.2 / down
+    )  # beside it, the floor
+    for height, x in ((0.015, 0.2), (0.1, -0.25)):
+        top = (height - 0.7) / down
+        centre = middle + height * up + [x, 0, 0]
+        near = np.linalg.norm(rays * top[..., None] - centre, axis=-1) < _TOP_M
+        seen = np.where(near, top, seen)
     a, b, c = (rays**2).sum(axis=-1), rays @ ball, ball @ ball - _RADIUS_M**2
     root = b**2 - a * c
-    depth = np.where(root > 0, (b - np.sqrt(np.maximum(root, 0))) / a, table).astype(np.float32)
-    frame = Frame(
-        "ball", 0, 0, 0, "camera", depth=depth, camera=Camera(640, 480, 525, 525, 320, 240)
-    )
-    scene = detect(frame, settings=Settings().detection, rng=np.random.default_rng(0))
+    depth = np.where(root > 0, (b - np.sqrt(np.maximum(root, 0))) / a, seen)
+    frame = _frame_of(depth)
+    scene = _found(frame)
+    board = 0.05 / np.maximum(rays[..., 1], 0.03)  # seen at a grazing angle
+    _found(_frame_of(np.where(abs(rays[..., 0] * board) < _BOARD_M, board, 2.5)))
     same = shows_the_same(frame, None, frame, None, range_m=2.0)
     sights = [sight_of(frame, None, ball, scene.up, _RADIUS_M) for ball in scene.candidates]
     keys = [KeyView(sight, _undescribed(sight.candidate)) for sight in sights]
     return sum(repeat is not None for repeat in find_repeats(sights, keys)) if same else 0
+
+
+def _frame_of(depth: F4) -> Frame:
+    camera = Camera(640, 480, 525, 525, 320, 240)
+    return Frame("ball", 0, 0, 0, "camera", depth=depth.astype(np.float32), camera=camera)
+
+
+def _found(frame: Frame) -> Scene:
+    return detect(frame, settings=Settings().detection, rng=np.random.default_rng(0))
 
 
 def _undescribed(candidate: Candidate) -> Detection:
@@ -78,6 +103,8 @@ def recognize_ball() -> str:
     gas = reconstruct(cloud, settings=settings.surface, rng=rng)
     if gas is None:
         return "unknown"
+    triangles_of(gas.edges, len(gas.neurons))
+    level_from_sensor((0, 0, 1), 0.0, cloud)
     complete(np.add(cloud, 1), (0, 0, 1), 0.0, np.ones(1), ("ball",))
     descriptor = describe(cloud, gas, eye=eye)
     return model.categories[int(model.predict(descriptor[None]).posteriors[0].argmax())]

@@ -8,11 +8,13 @@ import time
 import weakref
 from collections.abc import Iterator
 from concurrent.futures import Executor
+from copy import deepcopy
 from itertools import count
 from pathlib import Path
 from queue import SimpleQueue
 from typing import Any
 
+import numpy as np
 import pytest
 
 from shapecat.errors import ConfigError
@@ -30,6 +32,7 @@ from shapecat.executors import (
 from shapecat.executors.dask import _DaskExecutor
 from shapecat.executors.order import Processes
 from shapecat.system import stopping
+from shapecat.types import Camera, Frame, Pose
 from tests.tasks import (
     Unreadable,
     frail,
@@ -302,3 +305,16 @@ def test_an_error_that_cannot_be_read_fails_its_task_alone() -> None:
         with pytest.raises(TypeError, match="number"):
             unread.result(timeout=60)
         assert after.result(timeout=60) == 3
+
+
+def test_records_are_read_only_and_in_c_order_in_every_process() -> None:
+    """A result could change its input, and kernels would be compiled again for such arrays."""
+    turned = Pose(np.eye(3)[[1, 2, 0]].T, np.zeros(3))
+    sent = Frame(
+        "a", 0, 0, 0, "c", depth=np.ones((4, 5), np.float32), camera=Camera(5, 4, 3, 3, 2, 2)
+    )
+
+    assert turned.rotation.flags.c_contiguous
+    for record in (sent, deepcopy(sent)):  # restored in the same way as in another process
+        assert record.depth is not None
+        assert not record.depth.flags.writeable
