@@ -21,7 +21,7 @@ Bool: TypeAlias = NDArray[Any]
 def freeze(
     value: ArrayLike, shape: str, dtype: DTypeLike, sizes: dict[str, int] | None = None
 ) -> NDArray[Any]:
-    """Return ``value`` as a read-only array of the stated shape and type, in C order.
+    """Return ``value`` as a read-only array of the stated shape and type.
 
     Parameters
     ----------
@@ -33,8 +33,7 @@ def freeze(
 
     Returns
     -------
-    A read-only view if type and order already fit, otherwise a read-only copy. Kernels are compiled
-    anew for arrays of another order, and for writable ones.
+    A read-only view if the type already fits, otherwise a read-only copy.
 
     Raises
     ------
@@ -63,7 +62,7 @@ def _freeze(
     value: ArrayLike, axes: Axes, dtype: np.dtype[Any], sizes: dict[str, int]
 ) -> NDArray[Any]:
     """Do the work of `freeze` with parsed arguments, for speed."""
-    result = np.asarray(value, dtype, order="C")
+    result = np.asarray(value, dtype)
     # A shape without named axes is compared at once.
     if result.shape != axes and not _agree(axes, result.shape, sizes):
         known = f" with {sizes}" if sizes else ""

@@ -37,7 +37,7 @@ from shapecat.surface.triangles import triangles_of
 from shapecat.system import stopping
 from shapecat.system.files import lock
 from shapecat.system.scripts import runs_again
-from shapecat.types import Camera, Candidate, Detection, Frame, NeuralGas, Scene
+from shapecat.types import Camera, Candidate, Detection, Frame, NeuralGas, Pose, Scene
 
 __all__ = ["compile_all", "find_ball", "main", "recognize_ball", "rehearse"]
 
@@ -55,10 +55,8 @@ def find_ball() -> int:
     down = np.minimum(rays @ up, -0.1)
     middle = np.array([0, 0, 0.7 * np.sqrt(2)])
     ball = middle + _RADIUS_M * up
-    table = -0.7 / down
-    seen = np.where(
-        abs(rays[..., 0] * table) < _TABLE_M, table, -1.2 / down
-    )  # beside it, the floor
+    table, floor = -0.7 / down, -1.2 / down
+    seen = np.where(abs(rays[..., 0] * table) < _TABLE_M, table, floor)
     for height, x in ((0.015, 0.2), (0.1, -0.25)):
         top = (height - 0.7) / down
         centre = middle + height * up + [x, 0, 0]
@@ -72,9 +70,13 @@ def find_ball() -> int:
     board = 0.05 / np.maximum(rays[..., 1], 0.03)  # seen at a grazing angle
     _found(_frame_of(np.where(abs(rays[..., 0] * board) < _BOARD_M, board, 2.5)))
     same = shows_the_same(frame, None, frame, None, range_m=2.0)
-    sights = [sight_of(frame, None, ball, scene.up, _RADIUS_M) for ball in scene.candidates]
-    keys = [KeyView(sight, _undescribed(sight.candidate)) for sight in sights]
-    return sum(repeat is not None for repeat in find_repeats(sights, keys)) if same else 0
+    # A moving sensor: the inverse of its pose is in another order, for another version of a kernel.
+    now, before = (
+        [sight_of(frame, pose, ball, scene.up, _RADIUS_M) for ball in scene.candidates]
+        for pose in (Pose(np.eye(3), np.zeros(3)), Pose(np.eye(3), np.full(3, 1e-4)))
+    )
+    keys = [KeyView(sight, _undescribed(sight.candidate)) for sight in before]
+    return sum(repeat is not None for repeat in find_repeats(now, keys)) if same else 0
 
 
 def _frame_of(depth: F4) -> Frame:

@@ -32,7 +32,7 @@ from shapecat.executors import (
 from shapecat.executors.dask import _DaskExecutor
 from shapecat.executors.order import Processes
 from shapecat.system import stopping
-from shapecat.types import Camera, Frame, Pose
+from shapecat.types import Camera, Frame
 from tests.tasks import (
     Unreadable,
     frail,
@@ -307,14 +307,12 @@ def test_an_error_that_cannot_be_read_fails_its_task_alone() -> None:
         assert after.result(timeout=60) == 3
 
 
-def test_records_are_read_only_and_in_c_order_in_every_process() -> None:
+def test_records_are_read_only_in_every_process() -> None:
     """A result could change its input, and kernels would be compiled again for such arrays."""
-    turned = Pose(np.eye(3)[[1, 2, 0]].T, np.zeros(3))
     sent = Frame(
         "a", 0, 0, 0, "c", depth=np.ones((4, 5), np.float32), camera=Camera(5, 4, 3, 3, 2, 2)
     )
 
-    assert turned.rotation.flags.c_contiguous
     for record in (sent, deepcopy(sent)):  # restored in the same way as in another process
         assert record.depth is not None
         assert not record.depth.flags.writeable

@@ -15,6 +15,7 @@ from shapecat.detection.planes.strips import _level_strips
 from shapecat.detection.planes.supporting import _is_enclosed, _look_below
 from shapecat.geometry import _mean
 from shapecat.rehearsal import compile_all, find_ball, recognize_ball
+from shapecat.reuse.agreement import _compare
 
 
 def test_the_rehearsals_go_all_the_way() -> None:
@@ -23,6 +24,7 @@ def test_the_rehearsals_go_all_the_way() -> None:
     assert recognize_ball() == "ball"
     for called in (_count_overlap, _is_enclosed, _level_strips, _look_below, _mean, _turn):
         assert called.signatures
+    assert len(_compare.signatures) == 2  # for a pose and for an inverse
 
 
 def mark(path: Path) -> None:
