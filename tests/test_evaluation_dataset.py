@@ -109,6 +109,7 @@ def test_damaged_clouds_are_errors_or_clouds(
     [
         (b"POINTS 3", b"POINTS 4000000000"),
         (b"POINTS 3", b"POINTS -1"),
+        (b"TYPE U", b"TYPE a"),
         (b"COUNT 1 1 1 1 4", b"COUNT 1 1 1 1 99999999999"),
         (b"FIELDS rgb x y z _", b"FIELDS rgb x y w _"),
         (b"DATA binary", b"DATA zipped"),

@@ -122,6 +122,9 @@ def _pcd_header(content: bytes) -> tuple[dict[str, list[str]], _Layout]:
         else (name, f"<{kind.lower()}{size}")
         for name, kind, size, count in zip(names, header["TYPE"], sizes, counts, strict=True)
     ]
+    if not {*header["TYPE"]} <= {*"IUFiuf"}:
+        msg = f"its types are {' '.join(header['TYPE'])}, not I, U or F"
+        raise ValueError(msg)
     points = header.get("POINTS") or [str(int(header["WIDTH"][0]) * int(header["HEIGHT"][0]))]
     layout = _Layout(np.dtype(fields), int(points[0]), found[1].decode(), found.end())
     return header, layout
