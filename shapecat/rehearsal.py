@@ -66,9 +66,9 @@ def find_ball() -> int:
     root = b**2 - a * c
     depth = np.where(root > 0, (b - np.sqrt(np.maximum(root, 0))) / a, seen)
     frame = _frame_of(depth)
-    scene = _found(frame)
+    scene = _detect(frame)
     board = 0.05 / np.maximum(rays[..., 1], 0.03)  # seen at a grazing angle
-    _found(_frame_of(np.where(abs(rays[..., 0] * board) < _BOARD_M, board, 2.5)))
+    _detect(_frame_of(np.where(abs(rays[..., 0] * board) < _BOARD_M, board, 2.5)))
     same = shows_the_same(frame, None, frame, None, range_m=2.0)
     # A moving sensor: the inverse of its pose is in another order, for another version of a kernel.
     now, before = (
@@ -84,7 +84,7 @@ def _frame_of(depth: F4) -> Frame:
     return Frame("ball", 0, 0, 0, "camera", depth=depth.astype(np.float32), camera=camera)
 
 
-def _found(frame: Frame) -> Scene:
+def _detect(frame: Frame) -> Scene:
     return detect(frame, settings=Settings().detection, rng=np.random.default_rng(0))
 
 

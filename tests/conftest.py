@@ -105,7 +105,7 @@ class LateAnswer(Future[Any]):
         self.set_running_or_notify_cancel()
 
     def exception(self, timeout: float | None = None) -> BaseException | None:
-        """Work."""
+        """Do the work, unless it is done."""
         if not self.done():
             function, arguments = self._call
             self.set_result(function(*arguments))

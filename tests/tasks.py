@@ -1,4 +1,4 @@
-"""What tests let other processes do: a module of its own, which they load in no time."""
+"""Functions that tests run in other processes, which load this module quickly."""
 
 import os
 import signal

@@ -4,27 +4,50 @@ import multiprocessing
 import subprocess
 import sys
 import threading
+from collections.abc import Callable
 from pathlib import Path
+from types import ModuleType
+from typing import Any
 
 import pytest
 
-from shapecat import rehearsal
-from shapecat.detection.merging.low_profile import _count_overlap
-from shapecat.detection.planes.horizontal import _turn
-from shapecat.detection.planes.strips import _level_strips
-from shapecat.detection.planes.supporting import _is_enclosed, _look_below
-from shapecat.geometry import _mean
+from shapecat import geometry, rehearsal
+from shapecat.detection.merging import low_profile
+from shapecat.detection.planes import horizontal, strips, supporting
 from shapecat.rehearsal import compile_all, find_ball, recognize_ball
-from shapecat.reuse.agreement import _compare
+from shapecat.reuse import agreement
+
+KERNELS = [
+    (geometry, "_mean"),
+    (horizontal, "_turn"),
+    (low_profile, "_count_overlap"),
+    (strips, "_level_strips"),
+    (supporting, "_is_enclosed"),
+    (supporting, "_look_below"),
+]
 
 
-def test_the_rehearsals_go_all_the_way() -> None:
+def test_the_rehearsals_go_all_the_way(monkeypatch: pytest.MonkeyPatch) -> None:
     """A kernel that they do not call is compiled in the first run, or in each in a container."""
+    called, in_c_order = set(), set()
+
+    def watch(module: ModuleType, name: str, see: Callable[..., object]) -> None:
+        kernel = getattr(module, name)
+
+        def call(*arguments: Any) -> Any:
+            see(*arguments)
+            return kernel(*arguments)
+
+        monkeypatch.setattr(module, name, call)
+
+    for module, name in KERNELS:
+        watch(module, name, lambda *_, name=name: called.add(name))
+    watch(agreement, "_compare", lambda *given: in_c_order.add(given[5].flags.c_contiguous))
+
     assert find_ball() == 2
     assert recognize_ball() == "ball"
-    for called in (_count_overlap, _is_enclosed, _level_strips, _look_below, _mean, _turn):
-        assert called.signatures
-    assert len(_compare.signatures) == 2  # for a pose and for an inverse
+    assert called == {name for _, name in KERNELS}
+    assert in_c_order == {True, False}  # the rotations of a pose and of an inverse
 
 
 def mark(path: Path) -> None:

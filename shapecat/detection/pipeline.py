@@ -197,7 +197,7 @@ def _find_planes(
         up = np.array(DEFAULT_UP)
     planes = pack_planes(supports)
     heights = measure_heights(grid, planes, tallest_m)
-    assumed = _assumed(grid, heights, up, trials, task.settings)
+    assumed = _find_assumed_plane(grid, heights, up, trials, task.settings)
     if assumed is not None:
         supports = sorted([*supports, assumed], key=lambda support: support.offset)
         planes = pack_planes(supports)
@@ -213,13 +213,13 @@ def _find_planes(
     return PlaneModel(up, supports, planes, heights, low_profile, walls)
 
 
-def _assumed(
+def _find_assumed_plane(
     grid: DepthGrid, heights: HeightMap, up: F8, trials: F8, settings: DetectionSettings
 ) -> SupportingPlane | None:
     """Assume a plane below samples that neither planes nor walls explain; None if they are few."""
-    plane_id = heights.plane_id.copy()
-    rest = unexplained(grid, plane_id)
+    rest = unexplained(grid, heights.plane_id)
     if rest is not None:
+        plane_id = heights.plane_id.copy()  # low-profile objects are found before the final walls
         walls = remove_walls(grid, plane_id, up, settings.max_size_m, trials)
         rest = unexplained(grid, plane_id.view(np.uint8) | walls)
     return None if rest is None else assume_plane(grid, rest, up, settings.max_height_m)
