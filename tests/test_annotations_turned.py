@@ -68,7 +68,7 @@ def messages(encoding: str) -> dict[str, Any]:
     """Return the message of each topic, decoded by its channel's own schema."""
     found = {}
     for channel, encode in encoder_for(encoding, markers=True):
-        (data,) = encode([ANNOTATION])
+        data = encode(ANNOTATION)
         if encoding == "json":
             message = json.loads(data)
         elif encoding == "protobuf":
@@ -98,7 +98,7 @@ def check_box(pose: Any, size: Any) -> None:
 
 def test_the_label_stands_above_the_top_of_the_box() -> None:
     """With a transposed rotation it would be beside a tilted box."""
-    assert_allclose(text_position(*BOX[3:]), ABOVE, atol=1e-12)
+    assert_allclose(text_position(BOX), ABOVE, atol=1e-12)
 
 
 def test_the_caption_of_the_review_stands_there_as_well() -> None:
@@ -250,9 +250,9 @@ def test_stamps_beyond_those_of_ros_are_its_last_second() -> None:
     ros = RosMessages(ros1=False)
     for seconds, written in ((2**31 - 2, 2**31 - 2), (2**31, 2**31 - 1), (9 * 10**9, 2**31 - 1)):
         frame = replace(FRAME, stamp_ns=seconds * SECOND + 7, objects=())
-        made = ros.detections.make(Annotation(frame, SECOND, ()))
+        made = ros.detections(Annotation(frame, SECOND, ()))
         assert (made.header.stamp.sec, made.header.stamp.nanosec) == (written, 7)
-        assert ros.serialize(made, ros.detections.name)
+        assert ros.serialize(made, "vision_msgs/msg/Detection3DArray")
 
 
 @pytest.mark.parametrize(

@@ -7,17 +7,17 @@ MCAP. Annotations use the encoding of the source.
 import gc
 import json
 from collections import Counter
-from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import contextmanager
 from heapq import merge
-from itertools import chain, islice, pairwise
+from itertools import chain, pairwise
 from operator import attrgetter
 from pathlib import Path
-from typing import BinaryIO
+from typing import BinaryIO, TypeVar
 
-from shapecat.outputs.annotation import Annotation, AnnotationChannel, Item
-from shapecat.outputs.annotations import ENCODERS, Encode, encoder_for
+from shapecat.outputs.annotation import Annotation, AnnotationChannel, Encoders, Item
+from shapecat.outputs.annotations import ENCODERS, encoder_for
 from shapecat.outputs.image_annotations import ImageFrame, image_encoder_for
 from shapecat.outputs.mcap_append import Appender, copy_bytes
 from shapecat.recordings import Recording
@@ -32,10 +32,9 @@ _LIFETIME = 1.5
 """Lifetime of scene entities, as a multiple of the frame period."""
 _BUFFER = 4 << 20
 """Two threads that write to the same file wait for each other, so each writes much at a time."""
-_AT_ONCE = 256
-"""Frames encoded together."""
 _PERIOD_NS = 1_000_000_000
 """Frame period assumed for a stream with a single frame."""
+_F = TypeVar("_F", Annotation, ImageFrame)
 
 
 def write_annotated(
@@ -114,33 +113,21 @@ def _encoded(
     first = next(annotations, None)
     encoding = _encoding(recording, first)
     kinds = encoder_for(encoding, markers=markers)
-    items = _items(chain([first] if first else [], annotations), [encode for _, encode in kinds])
+    items = _items(chain([first] if first else [], annotations), kinds, 0)
     channels = [channel for channel, _ in kinds]
     if images is None:
         return channels, items
     drawn = image_encoder_for(encoding)
-    more = _image_items(images, [encode for _, encode in drawn], len(channels))
+    more = _items(images, drawn, len(channels))
     channels += [channel for channel, _ in drawn]
     return channels, merge(items, more, key=attrgetter("log_time_ns"))
 
 
-def _image_items(
-    images: Iterable[ImageFrame], encoders: Sequence[Callable[[ImageFrame], bytes]], first: int
-) -> Iterator[Item]:
-    """Encode image annotations; their channels are numbered from ``first``."""
-    for image in images:
-        for number, encode in enumerate(encoders, start=first):
-            yield Item(number, image.log_time_ns, encode(image))
-
-
-def _items(annotations: Iterable[Annotation], encoders: Sequence[Encode]) -> Iterator[Item]:
-    """Encode annotations, frame by frame."""
-    rest = iter(annotations)
-    while some := list(islice(rest, _AT_ONCE)):
-        encoded = zip(*(encode(some) for encode in encoders), strict=True)
-        for annotation, messages in zip(some, encoded, strict=True):
-            for number, data in enumerate(messages):
-                yield Item(number, annotation.frame.log_time_ns, data)
+def _items(frames: Iterable[_F], encoders: Encoders[_F], first: int) -> Iterator[Item]:
+    """Encode frames; their channels are numbered from ``first``."""
+    for frame in frames:
+        for number, (_, encode) in enumerate(encoders, start=first):
+            yield Item(number, frame.log_time_ns, encode(frame))
 
 
 def _append(

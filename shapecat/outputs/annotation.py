@@ -1,6 +1,7 @@
 """Content of annotations, independent of their encoding."""
 
-from typing import Any, NamedTuple
+from collections.abc import Callable
+from typing import NamedTuple, TypeVar
 
 from shapecat.outputs.wording import caption
 from shapecat.types import ShownBox, ShownFrame
@@ -8,12 +9,16 @@ from shapecat.types import ShownBox, ShownFrame
 __all__ = [
     "Annotation",
     "AnnotationChannel",
+    "Encoders",
     "Item",
     "entity_id",
     "properties",
     "text",
     "text_position",
 ]
+
+
+_T = TypeVar("_T")
 
 
 class AnnotationChannel(NamedTuple):
@@ -33,6 +38,15 @@ class Annotation(NamedTuple):
     frame: ShownFrame
     lifetime_ns: int
     gone: tuple[int, ...]
+
+    @property
+    def log_time_ns(self) -> int:
+        """The log time of the frame."""
+        return self.frame.log_time_ns
+
+
+Encoders = list[tuple[AnnotationChannel, Callable[[_T], bytes]]]
+"""Channels, each with the function that encodes a frame as its message."""
 
 
 class Item(NamedTuple):
@@ -62,14 +76,11 @@ def properties(box: ShownBox) -> dict[str, str]:
     }
 
 
-def text_position(center: Any, size: Any, orientation: Any) -> tuple[Any, Any, Any]:
-    """Return the position (x, y, z) of the text just above a box, metres, sensor frame.
-
-    The components of the arguments are numbers, or arrays (n,) for n boxes.
-    """
-    x, y, z = center
-    qx, qy, qz, qw = orientation
-    rise = size[2] / 2 + 0.03
+def text_position(box: ShownBox) -> tuple[float, float, float]:
+    """Return the position (x, y, z) of the text just above a box, metres, sensor frame."""
+    x, y, z = box.center
+    qx, qy, qz, qw = box.orientation
+    rise = box.size[2] / 2 + 0.03
     # The third column of the rotation.
     up = (2 * (qx * qz + qw * qy), 2 * (qy * qz - qw * qx), 1 - 2 * (qx * qx + qy * qy))
     return x + rise * up[0], y + rise * up[1], z + rise * up[2]

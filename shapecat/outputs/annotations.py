@@ -1,7 +1,7 @@
 """Annotation channels for each message encoding."""
 
 import json
-from collections.abc import Callable, Iterable, Iterator, Sequence
+from collections.abc import Callable, Sequence
 from functools import partial
 from importlib.resources import files
 from typing import Any
@@ -9,91 +9,57 @@ from typing import Any
 from shapecat.outputs.annotation import (
     Annotation,
     AnnotationChannel,
+    Encoders,
     entity_id,
     properties,
     text,
     text_position,
 )
 from shapecat.outputs.colours import colour_of
-from shapecat.outputs.ros_annotations import ArrayMessage, RosMessages
+from shapecat.outputs.ros_annotations import RosMessages
 from shapecat.outputs.scene_protobuf import descriptors_of, encode_foxglove
 from shapecat.types import ShownBox, ShownFrame
 
-__all__ = ["ENCODERS", "Encode", "encoder_for"]
+__all__ = ["ENCODERS", "encoder_for"]
 
 DETECTIONS = "/shapecat/detections"
 SCENE = "/shapecat/scene"
 MARKERS = "/shapecat/markers"
 
-Encode = Callable[[Sequence[Annotation]], Iterable[bytes]]
-"""Encodes the annotations of frames: one message per frame, in order."""
 
-
-def encoder_for(encoding: str, *, markers: bool) -> list[tuple[AnnotationChannel, Encode]]:
+def encoder_for(encoding: str, *, markers: bool) -> Encoders[Annotation]:
     """Return the annotation channels for an encoding, each with its encoder.
 
     An unknown encoding is replaced by JSON. ``markers`` adds a channel for RViz, for ROS only.
     """
-    return ENCODERS.get(encoding, _json)(markers)
+    found = ENCODERS.get(encoding, _json)()
+    return [(channel, encode) for channel, encode in found if markers or channel.topic != MARKERS]
 
 
-def _cdr(markers: bool) -> list[tuple[AnnotationChannel, Encode]]:  # noqa: FBT001  # one way to call
-    return _ros(RosMessages(ros1=False), "cdr", "ros2msg", markers)
-
-
-def _ros1(markers: bool) -> list[tuple[AnnotationChannel, Encode]]:  # noqa: FBT001  # the same
-    return _ros(RosMessages(ros1=True), "ros1", "ros1msg", markers)
-
-
-def _ros(
-    ros: RosMessages,
-    encoding: str,
-    schema_encoding: str,
-    markers: bool,  # noqa: FBT001  # the same
-) -> list[tuple[AnnotationChannel, Encode]]:
-    kinds = {DETECTIONS: ros.detections, SCENE: ros.scene}
-    if markers:
-        kinds[MARKERS] = ros.markers
+def _ros(*, ros1: bool) -> Encoders[Annotation]:
+    ros = RosMessages(ros1=ros1)
     return [
-        (
-            AnnotationChannel(
-                topic,
-                encoding,
-                message.name.replace("/msg/", "/") if ros.ros1 else message.name,
-                schema_encoding,
-                ros.definition(message.name),
-            ),
-            partial(_serialized, ros, message),
-        )
-        for topic, message in kinds.items()
+        ros.encoder(DETECTIONS, "vision_msgs/msg/Detection3DArray", ros.detections),
+        ros.encoder(SCENE, "foxglove_msgs/msg/SceneUpdate", ros.scene),
+        ros.encoder(MARKERS, "visualization_msgs/msg/MarkerArray", ros.markers),
     ]
 
 
-def _serialized(
-    ros: RosMessages, message: ArrayMessage, annotations: Iterable[Annotation]
-) -> Iterator[bytes]:
-    return (ros.serialize(message.make(one), message.name) for one in annotations)
-
-
-def _json(_markers: bool) -> list[tuple[AnnotationChannel, Encode]]:  # noqa: FBT001  # the same
+def _json() -> Encoders[Annotation]:
     schema = files("shapecat.schemas").joinpath("SceneUpdate.json").read_bytes()
     channel = AnnotationChannel(SCENE, "json", "foxglove.SceneUpdate", "jsonschema", schema)
-    return [
-        (channel, lambda some: (json.dumps(_plain_scene(a, _JSON)).encode() for a in some)),
-    ]
+    return [(channel, lambda one: json.dumps(_plain_scene(one, _JSON)).encode())]
 
 
-def _protobuf(_markers: bool) -> list[tuple[AnnotationChannel, Encode]]:  # noqa: FBT001  # the same
+def _protobuf() -> Encoders[Annotation]:
     name = "foxglove.SceneUpdate"
     channel = AnnotationChannel(SCENE, "protobuf", name, "protobuf", descriptors_of(name))
-    return [
-        (channel, lambda some: (encode_foxglove(_plain_scene(a, _PROTOBUF), name) for a in some)),
-    ]
+    return [(channel, lambda one: encode_foxglove(_plain_scene(one, _PROTOBUF), name))]
 
 
-ENCODERS: dict[str, Callable[[bool], list[tuple[AnnotationChannel, Encode]]]] = {
-    "cdr": _cdr,
-    "ros1": _ros1,
+ENCODERS: dict[str, Callable[[], Encoders[Annotation]]] = {
+    "cdr": partial(_ros, ros1=False),
+    "ros1": partial(_ros, ros1=True),
     "json": _json,
     "protobuf": _protobuf,
 }
@@ -126,7 +92,7 @@ def _plain_entity(box: ShownBox, frame: ShownFrame, time: Any, lifetime: Any) ->
         "orientation": _plain("xyzw", box.orientation),
     }
     text_pose = {
-        "position": _plain("xyz", text_position(*box[3:])),
+        "position": _plain("xyz", text_position(box)),
         "orientation": _plain("xyzw", (0.0, 0.0, 0.0, 1.0)),
     }
     colour = [part / 255 for part in colour_of(box.category)]

@@ -2,12 +2,13 @@
 
 import json
 from collections.abc import Callable, Iterator, Mapping
+from functools import partial
 from importlib.resources import files
 from pathlib import Path
 from typing import Any, NamedTuple
 
 from shapecat.colour.image_masks import box_of
-from shapecat.outputs.annotation import AnnotationChannel
+from shapecat.outputs.annotation import AnnotationChannel, Encoders
 from shapecat.outputs.colours import colour_of
 from shapecat.outputs.ros_annotations import RosMessages
 from shapecat.outputs.scene_protobuf import descriptors_of, encode_foxglove
@@ -78,10 +79,7 @@ def read_image_frames(folder: Path, labels: Mapping[int, TrackLabel]) -> Iterato
         yield ImageFrame(masks.stamp_ns, masks.log_time_ns, masks.frame_id, tuple(boxes))
 
 
-Encode = Callable[[ImageFrame], bytes]
-
-
-def image_encoder_for(encoding: str) -> list[tuple[AnnotationChannel, Encode]]:
+def image_encoder_for(encoding: str) -> Encoders[ImageFrame]:
     """Return the channels that annotate images in an encoding, each with its encoder.
 
     An unknown encoding is replaced by JSON.
@@ -89,45 +87,28 @@ def image_encoder_for(encoding: str) -> list[tuple[AnnotationChannel, Encode]]:
     return _ENCODERS.get(encoding, _json)()
 
 
-def _ros(encoding: str, schema_encoding: str) -> list[tuple[AnnotationChannel, Encode]]:
-    ros = RosMessages(ros1=encoding == "ros1")
-    kinds: dict[str, tuple[str, Callable[[RosMessages, ImageFrame], Any]]] = {
-        DETECTIONS_2D: ("vision_msgs/msg/Detection2DArray", _detections),
-        DRAWN: ("foxglove_msgs/msg/ImageAnnotations", _drawn),
-    }
-
-    def encoder(name: str, make: Callable[[RosMessages, ImageFrame], Any]) -> Encode:
-        return lambda frame: ros.serialize(make(ros, frame), name)
-
+def _ros(*, ros1: bool) -> Encoders[ImageFrame]:
+    ros = RosMessages(ros1=ros1)
     return [
-        (
-            AnnotationChannel(
-                topic,
-                encoding,
-                name.replace("/msg/", "/") if ros.ros1 else name,
-                schema_encoding,
-                ros.definition(name),
-            ),
-            encoder(name, make),
-        )
-        for topic, (name, make) in kinds.items()
+        ros.encoder(DETECTIONS_2D, "vision_msgs/msg/Detection2DArray", partial(_detections, ros)),
+        ros.encoder(DRAWN, "foxglove_msgs/msg/ImageAnnotations", partial(_drawn, ros)),
     ]
 
 
-def _json() -> list[tuple[AnnotationChannel, Encode]]:
+def _json() -> Encoders[ImageFrame]:
     schema = files("shapecat.schemas").joinpath("ImageAnnotations.json").read_bytes()
     channel = AnnotationChannel(DRAWN, "json", _NAME, "jsonschema", schema)
     return [(channel, lambda frame: json.dumps(_plain(frame, ("sec", "nsec"))).encode())]
 
 
-def _protobuf() -> list[tuple[AnnotationChannel, Encode]]:
+def _protobuf() -> Encoders[ImageFrame]:
     channel = AnnotationChannel(DRAWN, "protobuf", _NAME, "protobuf", descriptors_of(_NAME))
     return [(channel, lambda frame: encode_foxglove(_plain(frame, ("seconds", "nanos")), _NAME))]
 
 
-_ENCODERS: dict[str, Callable[[], list[tuple[AnnotationChannel, Encode]]]] = {
-    "cdr": lambda: _ros("cdr", "ros2msg"),
-    "ros1": lambda: _ros("ros1", "ros1msg"),
+_ENCODERS: dict[str, Callable[[], Encoders[ImageFrame]]] = {
+    "cdr": partial(_ros, ros1=False),
+    "ros1": partial(_ros, ros1=True),
     "json": _json,
     "protobuf": _protobuf,
 }

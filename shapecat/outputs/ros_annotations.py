@@ -3,7 +3,7 @@
 from collections.abc import Callable
 from functools import cache
 from importlib.resources import files
-from typing import Any, NamedTuple
+from typing import Any, TypeVar
 
 import numpy as np
 from rosbags.typesys import Stores, get_types_from_msg, get_typestore
@@ -11,6 +11,7 @@ from rosbags.typesys.store import Typestore
 
 from shapecat.outputs.annotation import (
     Annotation,
+    AnnotationChannel,
     entity_id,
     properties,
     text,
@@ -19,14 +20,9 @@ from shapecat.outputs.annotation import (
 from shapecat.outputs.colours import colour_of
 from shapecat.types import ShownBox
 
-__all__ = ["ArrayMessage", "RosMessages"]
+__all__ = ["RosMessages"]
 
-
-class ArrayMessage(NamedTuple):
-    """A message type: its name, and the function that makes a message from an annotation."""
-
-    name: str
-    make: Callable[[Annotation], Any]
+_T = TypeVar("_T")
 
 
 class RosMessages:
@@ -43,13 +39,15 @@ class RosMessages:
         self._nowhere = self._types["Pose"](self._types["Point"](0.0, 0.0, 0.0), self._upright)
         self.no_pose = self._types["PoseWithCovariance"](self._nowhere, self._no_covariance)
         self._colours: dict[tuple[str, str, float], Any] = {}
-        self.detections = ArrayMessage("vision_msgs/msg/Detection3DArray", self._detections)
-        self.scene = ArrayMessage("foxglove_msgs/msg/SceneUpdate", self._scene)
-        self.markers = ArrayMessage("visualization_msgs/msg/MarkerArray", self._markers)
 
-    def definition(self, name: str) -> bytes:
-        """Return the definition of a type, to store with its channel."""
-        return _definition(self.ros1, name)
+    def encoder(
+        self, topic: str, name: str, make: Callable[[_T], Any]
+    ) -> tuple[AnnotationChannel, Callable[[_T], bytes]]:
+        """Return a channel for messages of the type ``name``, and the encoder of those made."""
+        encoding, schema = ("ros1", "ros1msg") if self.ros1 else ("cdr", "ros2msg")
+        written = name.replace("/msg/", "/") if self.ros1 else name
+        channel = AnnotationChannel(topic, encoding, written, schema, _definition(self.ros1, name))
+        return channel, lambda frame: self.serialize(make(frame), name)
 
     def make(self, kind: str, *values: Any) -> Any:
         """Make a message of the type ``kind`` from its fields, or a Header from a frame."""
@@ -71,7 +69,8 @@ class RosMessages:
             return bytes(self._store.serialize_ros1(message, name))
         return bytes(self._store.serialize_cdr(message, name))
 
-    def _detections(self, annotation: Annotation) -> Any:
+    def detections(self, annotation: Annotation) -> Any:
+        """Make a vision_msgs/Detection3DArray."""
         found = [self._detection(annotation, box) for box in annotation.frame.objects]
         return self._types["Detection3DArray"](self._header(annotation.frame), found)
 
@@ -84,7 +83,8 @@ class RosMessages:
         bounds = t["BoundingBox3D"](pose, self._size(box))
         return t["Detection3D"](self._header(annotation.frame), [result], bounds, str(box.track))
 
-    def _scene(self, annotation: Annotation) -> Any:
+    def scene(self, annotation: Annotation) -> Any:
+        """Make a foxglove_msgs/SceneUpdate."""
         t, time = self._types, self._time(annotation.frame.stamp_ns)
         deletions = [
             t["SceneEntityDeletion"](time, 0, entity_id(track)) for track in annotation.gone
@@ -115,8 +115,8 @@ class RosMessages:
         pose, colour = self._text_pose(box), self.colour("Color", box.category, 1.0)
         return self._types["TextPrimitive"](pose, True, 0.03, False, colour, text(box))  # noqa: FBT003  # the order of the definition
 
-    def _markers(self, annotation: Annotation) -> Any:
-        """Make a MarkerArray: a cube and a text for each object."""
+    def markers(self, annotation: Annotation) -> Any:
+        """Make a visualization_msgs/MarkerArray: a cube and a text for each object."""
         gone = [
             self._marker(annotation, kind, track, action=2)
             for track in annotation.gone
@@ -181,7 +181,7 @@ class RosMessages:
         return t["Pose"](t["Point"](*box.center), t["Quaternion"](*box.orientation))
 
     def _text_pose(self, box: ShownBox) -> Any:
-        return self._types["Pose"](self._types["Point"](*text_position(*box[3:])), self._upright)
+        return self._types["Pose"](self._types["Point"](*text_position(box)), self._upright)
 
     def _size(self, box: ShownBox) -> Any:
         return self._types["Vector3"](*box.size)
