@@ -4,7 +4,7 @@
 """
 
 from collections import Counter
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Iterator, Sequence
 from pathlib import Path
 from typing import Any, Self
 
@@ -15,16 +15,11 @@ from shapecat.outputs.opened_run import Run, RunFrame, Table
 from shapecat.recordings import Recording, choose_streams, frames
 from shapecat.recordings import open_recording as _open_recording
 from shapecat.runs.jobs import Job
+from shapecat.system.progress import Observer, ignore
 from shapecat.system.scripts import runs_again
 from shapecat.types import Frame
 
 __all__ = ["OpenRecording", "Run", "RunFrame", "Table", "open_recording", "open_run", "process"]
-
-Observer = Callable[[str, int, int | None], None]
-
-
-def _ignore(_phase: str, _done: int, _total: int | None) -> None:
-    """Ignore the progress."""
 
 
 def open_run(folder: str | Path) -> Run:
@@ -155,5 +150,5 @@ def process(
         rrd=rrd,
         overwrite=overwrite,
     )
-    pipeline.process(job, observe or _ignore, cores=cores)
+    pipeline.process(job, observe or ignore, cores=cores)
     return Run(job.folder)

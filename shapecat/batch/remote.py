@@ -16,11 +16,12 @@ from pathlib import Path, PurePosixPath
 from shapecat.batch.claims import Claim, claimed
 from shapecat.batch.storage import Location
 from shapecat.errors import OutputError, ShapecatError
-from shapecat.pipeline import Observer, process
+from shapecat.pipeline import process
 from shapecat.runs.folder import OUTPUTS, RUN_FILES, read_run, require_ours, write_run
 from shapecat.runs.jobs import Job, Summary, summarize
 from shapecat.runs.run_info import OriginInfo, RunInfo
 from shapecat.system.files import lock
+from shapecat.system.progress import Observer
 
 __all__ = ["Ticket", "process_remote", "scratch", "upload"]
 

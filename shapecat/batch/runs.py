@@ -15,9 +15,10 @@ from shapecat.batch.plans import Task
 from shapecat.batch.remote import Ticket, process_remote
 from shapecat.errors import ShapecatError
 from shapecat.executors import Mailbox, is_lost, post
-from shapecat.pipeline import Observer, process
+from shapecat.pipeline import process
 from shapecat.runs.jobs import Job
 from shapecat.system import stopping
+from shapecat.system.progress import Observer
 
 __all__ = ["Outcome", "Watcher", "attempt", "exit_code", "process_here", "process_on"]
 

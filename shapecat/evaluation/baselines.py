@@ -12,7 +12,8 @@ from shapecat.errors import RecordingError
 from shapecat.evaluation import metrics
 from shapecat.evaluation.report import Compared
 from shapecat.evaluation.training import fit_views
-from shapecat.evaluation.views import DescribedViews, Observer, ignore
+from shapecat.evaluation.views import DescribedViews
+from shapecat.system.progress import Observer, ignore
 from shapecat.types import UNKNOWN
 
 __all__ = ["compare_learners"]

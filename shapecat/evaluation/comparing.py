@@ -1,7 +1,7 @@
 """Comparison of a run with ground truth, labels of other tools, or another run."""
 
 from collections import Counter
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from contextlib import ExitStack
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -26,17 +26,12 @@ from shapecat.evaluation.overlap import MATCHED_F, Overlap
 from shapecat.evaluation.references import OtherRun, open_reference, read_complete, run_labellings
 from shapecat.outputs.rereading import FinishedRun, clouds_again, open_source
 from shapecat.runs.tables import Key
+from shapecat.system.progress import Observer, ignore
 from shapecat.types import Frame
 
 __all__ = ["Comparison", "Difference", "compare"]
 
 _PICTURES = 12
-
-Observer = Callable[[str, int, int | None], None]
-
-
-def _ignore(_phase: str, _done: int, _total: int | None) -> None:
-    """Ignore progress."""
 
 
 class Difference(NamedTuple):
@@ -115,7 +110,7 @@ def compare(
     reference: Path,
     *,
     recording: Path | None = None,
-    observe: Observer = _ignore,
+    observe: Observer = ignore,
 ) -> Comparison:
     """Compare a finished run with a reference.
 

@@ -8,8 +8,9 @@ from shapecat.description import DESCRIPTOR_NAMES
 from shapecat.evaluation.baselines import compare_learners
 from shapecat.evaluation.dataset import Dataset, read_dataset
 from shapecat.evaluation.report import Report, evaluate, require_categories
-from shapecat.evaluation.views import DescribedViews, Observer, describe_views, ignore
+from shapecat.evaluation.views import DescribedViews, describe_views
 from shapecat.learning import load_model
+from shapecat.system.progress import Observer, ignore
 
 __all__ = ["evaluate_folder"]
 

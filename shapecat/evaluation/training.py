@@ -13,8 +13,9 @@ from shapecat.description import BLOCKS, DESCRIPTOR_NAMES
 from shapecat.errors import ModelError, RecordingError
 from shapecat.evaluation.dataset import read_dataset
 from shapecat.evaluation.report import evaluate
-from shapecat.evaluation.views import DescribedViews, Observer, describe_views, ignore
+from shapecat.evaluation.views import DescribedViews, describe_views
 from shapecat.learning import Categorizer, load_model, save_model
+from shapecat.system.progress import Observer, ignore
 from shapecat.types import CATEGORIES, UNKNOWN
 
 __all__ = [

@@ -2,7 +2,7 @@
 
 import math
 import time
-from collections.abc import Callable, Iterable
+from collections.abc import Iterable
 from typing import NamedTuple
 
 import numpy as np
@@ -13,17 +13,9 @@ from shapecat.description import DESCRIPTOR_NAMES, describe
 from shapecat.evaluation.dataset import View
 from shapecat.learning.shape_functions import shape_functions
 from shapecat.surface import reconstruct, thin
+from shapecat.system.progress import Observer, ignore
 
-__all__ = ["DescribedViews", "Observer", "describe_view", "describe_views", "ignore"]
-
-Observer = Callable[[str, int, int | None], None]
-"""Called with the name of the phase, the number of finished views, and the total, None if unknown.
-"""
-
-
-def ignore(_phase: str, _done: int, _total: int | None) -> None:
-    """Ignore progress."""
-
+__all__ = ["DescribedViews", "describe_view", "describe_views"]
 
 _NOT_ASKED = np.zeros(0)
 

@@ -18,13 +18,13 @@ from shapecat.outputs.exports_points import write_point_labels
 from shapecat.outputs.rereading import FinishedRun, open_source, read_finished
 from shapecat.runs.folder import clear, recover, staged
 from shapecat.system.files import flush, replacing
+from shapecat.system.progress import Observer, ignore
 from shapecat.types import Frame, LabelledFrame
 
 __all__ = ["FORMATS", "export_dataset", "export_run"]
 
 ExportedFrame = tuple[LabelledFrame, Frame, Coloured | None]
 Write = Callable[[Path, Iterable[ExportedFrame], FinishedRun], int]
-Observer = Callable[[str, int, int | None], None]
 
 
 def _clouds(shown: Iterable[ExportedFrame]) -> Iterator[tuple[LabelledFrame, Frame]]:
@@ -41,10 +41,6 @@ _WITH_BOXES = ("kitti", "labelcloud")
 _MARK = "export.json"
 
 
-def _ignore(_phase: str, _done: int, _total: int | None) -> None:
-    """Ignore the progress."""
-
-
 def export_run(
     folder: Path,
     format: str,  # noqa: A002  # the word users know
@@ -53,7 +49,7 @@ def export_run(
     every: int = 1,
     visible_boxes: bool = False,
     recording: Path | None = None,
-    observe: Observer = _ignore,
+    observe: Observer = ignore,
 ) -> int:
     """Export the labels of a finished run with their points.
 
@@ -105,7 +101,7 @@ def export_dataset(
     selection: Selection,
     *,
     recording: Path | None = None,
-    observe: Observer = _ignore,
+    observe: Observer = ignore,
 ) -> int:
     """Export the images of several runs with their labels as one data set.
 

@@ -5,7 +5,7 @@ planes in the first frames: a fixed frame whose z axis is not up would spoil all
 """
 
 from collections import Counter
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from dataclasses import replace
 from itertools import islice
 from pathlib import Path
@@ -32,12 +32,10 @@ from shapecat.runs.segments import read_segments
 from shapecat.runs.selection import count_frames, read_frames
 from shapecat.runs.tables import Key, count_rows, read_row_groups
 from shapecat.system import stopping
+from shapecat.system.progress import Observer, ignore
 from shapecat.types import Frame
 
 __all__ = ["Observer", "Work", "ignore", "perceive_all", "revise"]
-
-Observer = Callable[[str, int, int | None], None]
-"""Called with the phase, the number of frames done, and the total (None if unknown)."""
 
 _MANY = 100
 """With at least this many frames, other processes are started before anything is read."""
@@ -49,10 +47,6 @@ _DOUBTS, _LOOKS = 3, 10
 
 _Reading = tuple[Frame, ColourView | None]
 """A frame and its colour image; None if it has none."""
-
-
-def ignore(_phase: str, _done: int, _total: int | None) -> None:
-    """Ignore the progress."""
 
 
 class Work(NamedTuple):

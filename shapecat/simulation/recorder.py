@@ -3,7 +3,6 @@
 import json
 import tempfile
 import zipfile
-from collections.abc import Callable
 from contextlib import ExitStack
 from dataclasses import replace
 from pathlib import Path
@@ -21,6 +20,7 @@ from shapecat.simulation.truth import LINK_FROM_OPTICAL, frame_truth, robot_link
 from shapecat.simulation.views import render_frame
 from shapecat.simulation.worlds import World
 from shapecat.system.files import flush
+from shapecat.system.progress import Observer, ignore
 from shapecat.types import Camera, Frame
 
 __all__ = ["EPOCH_NS", "record", "simulate", "written_paths"]
@@ -31,10 +31,6 @@ EPOCH_NS = 1_700_200_000_000_000_000
 _LATENCY_NS = 12_000_000
 _OPTICAL = "camera_depth_optical_frame"
 _COLOUR_OPTICAL = "camera_color_optical_frame"
-
-
-def _ignore(phase: str, done: int, total: int | None) -> None:
-    """Ignore progress."""
 
 
 def simulate(
@@ -48,7 +44,7 @@ def simulate(
     clouds: bool = False,
     color: bool = False,
     rate_hz: float = 30.0,
-    observe: Callable[[str, int, int | None], None] = _ignore,
+    observe: Observer = ignore,
 ) -> Path:
     """Write a recording of a random scene.
 
@@ -103,7 +99,7 @@ def record(
     clouds: bool = False,
     color: bool = False,
     rate_hz: float = 30.0,
-    observe: Callable[[str, int, int | None], None] = _ignore,
+    observe: Observer = ignore,
 ) -> Path:
     """Write a recording of a world, as `simulate` does.
 

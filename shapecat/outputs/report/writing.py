@@ -2,7 +2,7 @@
 
 import os
 from collections import Counter
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
@@ -17,17 +17,12 @@ from shapecat.outputs.report.tracks import Timeline, read_stage_seconds, read_ti
 from shapecat.outputs.rereading import find_runs, read_finished
 from shapecat.runs.track_table import TrackTable, read_track_table
 from shapecat.system.files import replacing
+from shapecat.system.progress import Observer, ignore
 
 __all__ = ["INDEX", "PAGE", "Reports", "RunReport", "read_report", "read_reports"]
 
-Observer = Callable[[str, int, int | None], None]
-
 PAGE, INDEX = "report.html", "index.html"
 _FACES = 6
-
-
-def _ignore(_phase: str, _done: int, _total: int | None) -> None:
-    """Ignore the progress."""
 
 
 @dataclass(frozen=True)
@@ -136,7 +131,7 @@ class Reports:
         return list(pages)
 
 
-def read_reports(folders: Sequence[Path], observe: Observer = _ignore) -> Reports:
+def read_reports(folders: Sequence[Path], observe: Observer = ignore) -> Reports:
     """Read the content of the report page of each run, and of their index.
 
     Parameters
