@@ -98,7 +98,7 @@ def export(
     shapecat export results --format coco --out coco --per-track 20 --min-confidence 0.8
     """
     from shapecat.outputs.exports import export_run
-    from shapecat.outputs.rereading import find_runs
+    from shapecat.runs.finished import find_runs
 
     runs = find_runs(folders)
     if recording is not None and len(runs) > 1:

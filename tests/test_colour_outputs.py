@@ -31,13 +31,13 @@ from shapecat.outputs.image_annotations import (
     image_encoder_for,
     read_image_frames,
 )
-from shapecat.outputs.rereading import open_source, read_finished
 from shapecat.outputs.review import write_review
 from shapecat.outputs.review_scenes import ReviewFrame
 from shapecat.perception import Perceiver
 from shapecat.pipeline import annotate_again, process
 from shapecat.recordings.protobuf import message_decoder
 from shapecat.runs.corrections import read_labels
+from shapecat.runs.finished import open_source, read_finished
 from shapecat.runs.jobs import Job
 from shapecat.runs.masks import read_masks
 from shapecat.types import ImageMasks

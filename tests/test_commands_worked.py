@@ -331,7 +331,7 @@ def test_options_reach_the_work_and_its_answer_the_reader(
 
     monkeypatch.chdir(tmp_path)
     monkeypatch.setattr(work, stub)
-    monkeypatch.setattr("shapecat.outputs.rereading.find_runs", list)
+    monkeypatch.setattr("shapecat.runs.finished.find_runs", list)
     done = shapecat(*line.split())
 
     assert (done.exit_code, done.stdout) == (0, said), done.stderr

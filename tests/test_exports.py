@@ -3,6 +3,7 @@
 import csv
 import json
 import shutil
+from collections import Counter
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
@@ -19,9 +20,10 @@ from shapecat.geometry import rotation_from_quaternion
 from shapecat.outputs.exports import export_run
 from shapecat.outputs.exports_kitti import rectified_from_sensor
 from shapecat.outputs.exports_points import write_point_labels
-from shapecat.outputs.rereading import FinishedRun, read_finished
 from shapecat.runs.corrections import adopt_labels
+from shapecat.runs.finished import FinishedRun, open_source, read_finished
 from shapecat.runs.label_meaning import TrackLabel
+from shapecat.runs.selection import read_frames
 from shapecat.runs.track_table import read_track_table
 from shapecat.types import Box, Frame, LabelledFrame, LabelledObject, NeuralGas
 
@@ -217,11 +219,9 @@ def test_kitti_points_fall_on_their_pixels(run: Path, tmp_path: Path) -> None:
 
 
 def intrinsics(run: Path) -> np.ndarray:
-    from shapecat.outputs.rereading import clouds_again, open_source  # noqa: PLC0415  here alone
-
     finished = read_finished(run)
     with open_source(finished.run) as recording:
-        camera = next(iter(clouds_again(recording, finished.run))).camera
+        camera = next(read_frames(recording, finished.run["options"], skipped=Counter()))[0].camera
     assert camera is not None
     return np.array([[camera.fx, 0, camera.cx], [0, camera.fy, camera.cy], [0, 0, 1]])
 

@@ -19,8 +19,8 @@ from shapecat.colour.outline import joined, outlines
 from shapecat.errors import OutputError
 from shapecat.outputs.dataset_frames import Selection, split_runs
 from shapecat.outputs.exports import export_dataset, export_run
-from shapecat.outputs.rereading import FinishedRun, read_finished
 from shapecat.recordings.colour_image import pixels_of
+from shapecat.runs.finished import FinishedRun, read_finished
 from shapecat.runs.masks import read_masks
 from tests.test_colour_outputs import IMAGES, recorded
 from tests.test_exports import relabel

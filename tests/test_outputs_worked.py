@@ -36,9 +36,10 @@ from shapecat.outputs.dataset_frames import (
     split_runs,
 )
 from shapecat.outputs.exports import _made_by_export, _require_own, _thinned
-from shapecat.outputs.exports_files import png, support_offset, upright_cloud
 from shapecat.outputs.exports_points import write_point_labels
 from shapecat.outputs.image_annotations import ImageBox, read_image_frames
+from shapecat.outputs.level_clouds import support_offset, upright_cloud
+from shapecat.outputs.png import png
 from shapecat.outputs.review_paths import Paths
 from shapecat.outputs.review_scenes import choose_scenes, with_clouds
 from shapecat.outputs.scene_tree import _candidate, _described, _topic

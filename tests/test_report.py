@@ -30,9 +30,9 @@ from shapecat.outputs.report.pictures import TrackPictures
 from shapecat.outputs.report.surfaces import SIDE, Snapshot, draw
 from shapecat.outputs.report.tracks import Timeline, read_timelines
 from shapecat.outputs.report.writing import Reports, RunReport
-from shapecat.outputs.rereading import FinishedRun, read_finished
 from shapecat.outputs.wording import caption, confidence_text, time_span
 from shapecat.runs.corrections import read_labels, relabel
+from shapecat.runs.finished import FinishedRun, read_finished
 from shapecat.runs.track_table import TrackRow, TrackTable, read_track_table
 from shapecat.types import Box, Camera, Frame, LabelledFrame, LabelledObject, NeuralGas
 from tests.browser import Browser

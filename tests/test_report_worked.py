@@ -29,7 +29,7 @@ from shapecat.outputs.report.pictures import (
 from shapecat.outputs.report.surfaces import Snapshot, SurfaceDrawing, draw
 from shapecat.outputs.report.tracks import Timeline, read_timelines
 from shapecat.outputs.report.writing import RunReport, _faces
-from shapecat.outputs.rereading import FinishedRun, read_finished
+from shapecat.runs.finished import FinishedRun, read_finished
 from shapecat.runs.label_meaning import TrackLabel
 from shapecat.runs.track_table import TrackRow, TrackTable, read_track_table
 from shapecat.types import (

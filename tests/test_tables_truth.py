@@ -2,14 +2,16 @@
 
 import json
 import shutil
+from collections import Counter
 from pathlib import Path
 
 import numpy as np
 from scipy.spatial import cKDTree
 
-from shapecat.outputs.rereading import clouds_again, open_source
 from shapecat.pipeline import annotate_again
+from shapecat.runs.finished import open_source
 from shapecat.runs.folder import read_run
+from shapecat.runs.selection import read_frames
 from tests.test_tables_turned import lines, rows
 
 
@@ -19,7 +21,7 @@ def test_neurons_lie_among_the_points_of_their_object(guessed_run: Path) -> None
     found = rows(guessed_run, "detections")
     count = 0
     with open_source(run) as recording:
-        for frame in clouds_again(recording, run):
+        for frame, _ in read_frames(recording, run["options"], skipped=Counter()):
             for row in (row for row in found if row["frame"] == frame.index):
                 points = frame.xyz(np.array(row["indices"], np.uint32))
                 points = points[np.isfinite(points).all(axis=1)]

@@ -24,7 +24,9 @@ from shapecat.evaluation.identities import SeenTogether
 from shapecat.evaluation.labellings import Item, Labelling, Reference
 from shapecat.evaluation.overlap import MATCHED_F, Overlap
 from shapecat.evaluation.references import OtherRun, open_reference, read_complete, run_labellings
-from shapecat.outputs.rereading import FinishedRun, clouds_again, open_source
+from shapecat.runs.finished import FinishedRun, open_source
+from shapecat.runs.run_info import Options
+from shapecat.runs.selection import read_frames
 from shapecat.runs.tables import Key
 from shapecat.system.progress import Observer, ignore
 from shapecat.types import Frame
@@ -176,7 +178,8 @@ def _clouds(
     """Return the frames of the recording; if it is missing, no frames and a note."""
     try:
         source = stack.enter_context(open_source(finished.run, recording))
-        return clouds_again(source, finished.run), []
+        options: Options = {**finished.run["options"], "color": ""}
+        return (frame for frame, _ in read_frames(source, options, skipped=Counter())), []
     except (RecordingError, OutputError) as error:
         if recording is not None:
             raise

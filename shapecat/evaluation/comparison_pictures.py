@@ -8,7 +8,7 @@ import numpy as np
 
 from shapecat.arrays import U1
 from shapecat.evaluation.labellings import Item, Labelling
-from shapecat.outputs.exports_files import png
+from shapecat.outputs.png import png
 from shapecat.runs.tables import Key
 from shapecat.types import Frame
 

@@ -13,7 +13,7 @@ from shapecat.errors import OutputError, RecordingError
 from shapecat.evaluation.labellings import Item, Labelling, Reference
 from shapecat.evaluation.references_coco import CocoLabels
 from shapecat.evaluation.references_kitti import KittiLabels
-from shapecat.outputs.rereading import FinishedRun, read_finished
+from shapecat.runs.finished import FinishedRun, read_finished
 from shapecat.runs.labels import rows_by_frame
 from shapecat.runs.shown import ShownTracks
 from shapecat.runs.tables import Key, read_row_groups

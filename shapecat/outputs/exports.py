@@ -15,7 +15,7 @@ from shapecat.outputs.exports_crops import write_crops
 from shapecat.outputs.exports_kitti import write_kitti
 from shapecat.outputs.exports_labelcloud import write_labelcloud
 from shapecat.outputs.exports_points import write_point_labels
-from shapecat.outputs.rereading import FinishedRun, open_source, read_finished
+from shapecat.runs.finished import FinishedRun, open_source, read_finished
 from shapecat.runs.folder import clear, recover, staged
 from shapecat.system.files import flush, replacing
 from shapecat.system.progress import Observer, ignore

@@ -12,7 +12,7 @@ from typing import Any
 from shapecat.colour.outline import joined, outlines
 from shapecat.colour.rle import rle_counts, rle_text
 from shapecat.outputs.dataset_frames import DatasetImage
-from shapecat.outputs.rereading import FinishedRun
+from shapecat.runs.finished import FinishedRun
 
 __all__ = ["DATASETS", "write_coco", "write_yolo"]
 

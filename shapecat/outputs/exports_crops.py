@@ -10,8 +10,9 @@ from collections.abc import Iterable
 from pathlib import Path
 
 from shapecat.errors import OutputError
-from shapecat.outputs.exports_files import safe_name, upright_cloud, write_pcd
-from shapecat.outputs.rereading import FinishedRun
+from shapecat.outputs.level_clouds import upright_cloud, write_pcd
+from shapecat.outputs.wording import safe_name
+from shapecat.runs.finished import FinishedRun
 from shapecat.types import Frame, LabelledFrame
 
 __all__ = ["write_crops"]

@@ -14,8 +14,8 @@ import numpy as np
 from shapecat.arrays import F8
 from shapecat.geometry import box_corners, gravity_rotation, rotation_from_quaternion
 from shapecat.outputs.colours import colour_of
-from shapecat.outputs.exports_files import finite_points, upward, write_pcd
-from shapecat.outputs.rereading import FinishedRun
+from shapecat.outputs.level_clouds import finite_points, upward, write_pcd
+from shapecat.runs.finished import FinishedRun
 from shapecat.types import Frame, LabelledFrame, LabelledObject, Pose
 
 __all__ = ["write_labelcloud"]

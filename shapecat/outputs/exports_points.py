@@ -16,8 +16,8 @@ import numpy as np
 from shapecat.arrays import U4
 from shapecat.errors import OutputError
 from shapecat.outputs.colours import colour_of
-from shapecat.outputs.exports_files import png
-from shapecat.outputs.rereading import FinishedRun
+from shapecat.outputs.png import png
+from shapecat.runs.finished import FinishedRun
 from shapecat.types import Frame, LabelledFrame
 
 __all__ = ["write_point_labels"]

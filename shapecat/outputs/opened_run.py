@@ -13,8 +13,8 @@ import pyarrow.parquet as pq
 from shapecat.arrays import F4, I4, U1, Bool
 from shapecat.errors import OutputError
 from shapecat.outputs.colouring import Coloured, with_colour
-from shapecat.outputs.rereading import FinishedRun, open_source, read_finished
 from shapecat.recordings.colour_image import pixels_of
+from shapecat.runs.finished import FinishedRun, open_source, read_finished
 from shapecat.runs.run_info import RunInfo
 from shapecat.runs.tables import first_stamp, numbers
 from shapecat.types import Frame, LabelledFrame, LabelledObject

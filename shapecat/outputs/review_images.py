@@ -13,7 +13,7 @@ from shapecat.colour.masks import Mask
 from shapecat.jit import kernel
 from shapecat.outputs.colouring import Coloured
 from shapecat.outputs.colours import colour_of
-from shapecat.outputs.exports_files import png
+from shapecat.outputs.png import png
 from shapecat.outputs.review_columns import At, Columns
 from shapecat.outputs.review_shapes import short_label
 from shapecat.recordings.colour_image import pixels_of

@@ -9,7 +9,7 @@ import pyarrow as pa
 
 from shapecat.detection.scene_graph import Node, format_tree
 from shapecat.errors import OutputError
-from shapecat.outputs.rereading import FinishedRun, read_finished
+from shapecat.runs.finished import FinishedRun, read_finished
 from shapecat.runs.labels import read_labelled_frames
 from shapecat.runs.tables import read_row_groups
 from shapecat.types import Box, Candidate, Plane, Scene

@@ -1,8 +1,10 @@
-"""Format captions, confidences and times, the same in every output."""
+"""Format captions, confidences, times and names, the same in every output."""
+
+import re
 
 from shapecat.types import UNKNOWN
 
-__all__ = ["caption", "confidence_text", "time_span"]
+__all__ = ["caption", "confidence_text", "safe_name", "time_span"]
 
 
 def caption(track: int, category: str, confidence: float) -> str:
@@ -46,3 +48,14 @@ def time_span(first_s: float, last_s: float) -> str:
     """
     first, last = f"{first_s:.1f}", f"{last_s:.1f}"
     return f"{last} s" if first == last else f"{first}–{last} s"
+
+
+def safe_name(text: str) -> str:
+    """Return a text as the name of a file or folder, without separators and not hidden.
+
+    Examples
+    --------
+    >>> safe_name("../wine glass")
+    '_wine glass'
+    """
+    return re.sub(r"[^\w .+&'()-]", "_", text).strip(". ")[:120] or "_"

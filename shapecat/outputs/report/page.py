@@ -24,7 +24,7 @@ from shapecat.outputs.report.cards import (
     template,
 )
 from shapecat.outputs.report.pictures import StripFrame
-from shapecat.outputs.rereading import FinishedRun
+from shapecat.runs.finished import FinishedRun
 from shapecat.runs.track_table import TrackTable
 from shapecat.types import UNKNOWN
 

@@ -11,11 +11,11 @@ from shapecat.errors import RecordingError, ShapecatError
 from shapecat.geometry import level_from_sensor, transform
 from shapecat.outputs.colouring import Coloured, with_colour
 from shapecat.outputs.colours import colour_of
-from shapecat.outputs.exports_files import support_offset
+from shapecat.outputs.level_clouds import support_offset
 from shapecat.outputs.report.choosing import Choice
 from shapecat.outputs.report.images import Crop, SeenFrame, crop_of, encode, look, worth_of
 from shapecat.outputs.report.surfaces import MOST_POINTS, Snapshot, SurfaceDrawing, draw
-from shapecat.outputs.rereading import FinishedRun, open_source
+from shapecat.runs.finished import FinishedRun, open_source
 from shapecat.runs.label_meaning import TrackLabel
 from shapecat.runs.labels import read_labelled_frames
 from shapecat.runs.track_table import TrackRow

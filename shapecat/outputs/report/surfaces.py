@@ -6,7 +6,7 @@ from typing import NamedTuple
 import numpy as np
 
 from shapecat.arrays import F4, F8, U1, U2, Record, array
-from shapecat.outputs.exports_files import png
+from shapecat.outputs.png import png
 from shapecat.surface.triangles import triangles_of
 from shapecat.types import NeuralGas
 

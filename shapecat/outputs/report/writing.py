@@ -14,7 +14,7 @@ from shapecat.outputs.report.choosing import choose_frames
 from shapecat.outputs.report.page import Listed, index_page, run_page
 from shapecat.outputs.report.pictures import Pictures, take_pictures
 from shapecat.outputs.report.tracks import Timeline, read_stage_seconds, read_timelines
-from shapecat.outputs.rereading import find_runs, read_finished
+from shapecat.runs.finished import find_runs, read_finished
 from shapecat.runs.track_table import TrackTable, read_track_table
 from shapecat.system.files import replacing
 from shapecat.system.progress import Observer, ignore

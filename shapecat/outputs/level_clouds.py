@@ -1,0 +1,68 @@
+"""Clouds in the level frame, and PCD files of them."""
+
+from pathlib import Path
+
+import numpy as np
+
+from shapecat.arrays import F4
+from shapecat.geometry import IDENTITY, level_from_sensor, quaternion_from_rotation, transform
+from shapecat.types import Frame, LabelledFrame, LabelledObject, Pose
+
+__all__ = ["finite_points", "support_offset", "upright_cloud", "upward", "write_pcd"]
+
+
+def write_pcd(path: Path, points: F4, *, viewpoint: Pose = IDENTITY) -> None:
+    """Write points (n, 3), metres, as a binary PCD file, version 0.7.
+
+    ``viewpoint`` is the pose of the sensor in the frame of the points.
+    """
+    x, y, z, w = quaternion_from_rotation(viewpoint.rotation)
+    place = " ".join(f"{value:.6f}" for value in (*viewpoint.translation, w, x, y, z))
+    header = (
+        "# .PCD v0.7 - Point Cloud Data file format\nVERSION 0.7\nFIELDS x y z\nSIZE 4 4 4\n"
+        f"TYPE F F F\nCOUNT 1 1 1\nWIDTH {len(points)}\nHEIGHT 1\nVIEWPOINT {place}\n"
+        f"POINTS {len(points)}\nDATA binary\n"
+    )
+    path.write_bytes(header.encode("ascii") + np.ascontiguousarray(points, "<f4").tobytes())
+
+
+def finite_points(frame: Frame) -> F4:
+    """Return the points (n, 3) of a frame that have a reading, in order, metres, sensor frame."""
+    points = frame.xyz()
+    return np.asarray(points[np.isfinite(points).all(axis=1)])
+
+
+def support_offset(item: LabelledObject, up: F4) -> float:
+    """Return the offset of an object's support along ``up`` (3,) from the sensor, metres."""
+    middle = float(np.dot(np.asarray(up, np.float64), item.box.center))
+    half = float(item.box.size[2]) / 2
+    return middle - (item.height_m if np.isfinite(item.height_m) else half)
+
+
+def upward(labelled: LabelledFrame) -> F4:
+    """Return the up direction of a frame in the sensor frame, a unit vector (3,).
+
+    Raises
+    ------
+    ValueError : the up direction is unknown.
+    """
+    if labelled.up is None:
+        msg = f"frame {labelled.index} of {labelled.topic} has no up direction"
+        raise ValueError(msg)
+    return labelled.up
+
+
+def upright_cloud(
+    labelled: LabelledFrame, frame: Frame, item: LabelledObject
+) -> tuple[F4, Pose] | None:
+    """Return the points (n, 3) of an object in the level frame, and the sensor's pose in it.
+
+    The support is at z = 0; metres. None if no point has a reading.
+    """
+    points = frame.xyz(item.indices)
+    points = points[np.isfinite(points).all(axis=1)]
+    if not len(points):
+        return None
+    up = upward(labelled)
+    level = level_from_sensor(up, support_offset(item, up), points)
+    return transform(level, points).astype(np.float32), level

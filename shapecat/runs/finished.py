@@ -1,0 +1,109 @@
+"""Read a finished run, and open the recording from which it was made."""
+
+from collections.abc import Iterator, Mapping, Sequence
+from contextlib import contextmanager
+from dataclasses import dataclass, replace
+from pathlib import Path
+
+from shapecat.errors import OutputError, RecordingError
+from shapecat.recordings import Recording, open_recording
+from shapecat.runs.corrections import read_labels
+from shapecat.runs.folder import read_run
+from shapecat.runs.identity import content_digest, same_content
+from shapecat.runs.label_meaning import TrackLabel
+from shapecat.runs.labels import read_labelled_frames
+from shapecat.runs.run_info import RunInfo
+from shapecat.types import LabelledFrame
+
+__all__ = ["FinishedRun", "find_runs", "open_source", "read_finished"]
+
+
+@dataclass(frozen=True)
+class FinishedRun:
+    """A run folder, with run.json and the final label of each track."""
+
+    folder: Path
+    run: RunInfo
+    labels: Mapping[int, TrackLabel]
+
+    @property
+    def name(self) -> str:
+        """The name of the run folder."""
+        return self.folder.resolve().name
+
+    @property
+    def categories(self) -> tuple[str, ...]:
+        """The categories of the model, then categories that a person added."""
+        known = tuple(self.run["model"]["categories"])
+        added = {label.category for label in self.labels.values()} - {*known, "unknown"}
+        return (*known, *sorted(added))
+
+    def frames(self) -> Iterator[LabelledFrame]:
+        """Read the labelled frames."""
+        return read_labelled_frames(self.folder, self.labels)
+
+    def frames_with_full_boxes(self) -> Iterator[LabelledFrame]:
+        """Read the labelled frames; their boxes are full boxes where these are known."""
+        for frame in self.frames():
+            objects = (replace(item, box=item.full or item.box) for item in frame.objects)
+            yield replace(frame, objects=tuple(objects))
+
+
+def read_finished(folder: Path) -> FinishedRun:
+    """Read run.json and the labels of a run folder.
+
+    Raises
+    ------
+    OutputError : the folder is not a finished run, or its tracks.csv is invalid.
+    """
+    run = read_run(folder)
+    return FinishedRun(folder, run, read_labels(folder / "tracks.csv", run["model"]["categories"]))
+
+
+def find_runs(folders: Sequence[Path]) -> list[Path]:
+    """Return the run folders among ``folders`` and directly below them, each once.
+
+    The runs below a folder are sorted by name.
+
+    Raises
+    ------
+    OutputError : a folder is not a run and holds none.
+    """
+    runs = [run for folder in folders for run in _runs_in(folder)]
+    return list({run.resolve(): run for run in runs}.values())
+
+
+def _runs_in(folder: Path) -> list[Path]:
+    if (folder / "run.json").is_file():
+        return [folder]
+    runs = sorted(path.parent for path in folder.glob("*/run.json"))
+    runs = [run for run in runs if not run.name.startswith(".")]
+    if not runs:
+        msg = f"{folder}: no run.json there or one level below; expected runs of `process`"
+        raise OutputError(msg)
+    return runs
+
+
+@contextmanager
+def open_source(run: RunInfo, moved_to: Path | None = None) -> Iterator[Recording]:
+    """Open the recording from which a run was made.
+
+    Parameters
+    ----------
+    moved_to : path of the recording; by default where it was processed.
+
+    Raises
+    ------
+    RecordingError : the recording is missing or unreadable.
+    OutputError : the content of the recording differs from what was processed.
+    """
+    path = moved_to or Path(run["input"]["path"])
+    if moved_to is None and not path.exists():
+        msg = f"{path}: the recording is missing; if it was moved, give --recording PATH"
+        raise RecordingError(msg)
+    with open_recording(path) as recording:
+        if not same_content(run["input"], path, lambda: content_digest(path)):
+            hint = "is another recording" if moved_to else "has changed since it was processed"
+            msg = f"{path}: {hint}; process it again"
+            raise OutputError(msg)
+        yield recording
