@@ -26,13 +26,17 @@ from scipy.spatial.transform import Rotation
 from shapecat.evaluation import comparing
 from shapecat.evaluation.comparing import (
     Comparison,
-    Difference,
     _compare_frame,
     _kind,
     _Tally,
     compare,
 )
-from shapecat.evaluation.comparison_matching import Matched, match_objects, seen_together
+from shapecat.evaluation.comparison_matching import (
+    Difference,
+    Matched,
+    match_objects,
+    seen_together,
+)
 from shapecat.evaluation.comparison_page import figure_rows, format_page, write_comparison
 from shapecat.evaluation.comparison_pictures import (
     COLOURS,

@@ -3,9 +3,9 @@
 from collections import Counter
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import ExitStack
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any
 
 import numpy as np
 
@@ -14,6 +14,7 @@ from shapecat.evaluation.comparison_figures import Pairs, figures_of
 from shapecat.evaluation.comparison_matching import (
     SAME_BOX,
     SAME_MASK,
+    Difference,
     Matched,
     item_box_iou,
     match_objects,
@@ -31,36 +32,9 @@ from shapecat.runs.tables import Key
 from shapecat.system.progress import Observer, ignore
 from shapecat.types import Frame
 
-__all__ = ["Comparison", "Difference", "compare"]
+__all__ = ["Comparison", "compare"]
 
 _PICTURES = 12
-
-
-class Difference(NamedTuple):
-    """A row of the table: a true object and the detection matched to it, or one without the other.
-
-    Attributes
-    ----------
-    difference : ``missed``, ``surplus``, ``outline`` (``f`` below 0.75), ``category``, ``identity``
-        (another track than before), or None if both agree.
-    true_track, true_category : from the reference; None without a true object.
-    track, category, confidence : from the run; None without a detection.
-    f, iou : overlap of the masks; None without masks.
-    box_iou : overlap of the 3D boxes; None without boxes.
-    """
-
-    topic: str
-    frame: int
-    stamp_ns: int
-    difference: str | None
-    true_track: int | None = None
-    true_category: str | None = None
-    track: int | None = None
-    category: str | None = None
-    confidence: float | None = None
-    f: float | None = None
-    iou: float | None = None
-    box_iou: float | None = None
 
 
 @dataclass(frozen=True)
@@ -230,9 +204,7 @@ def _labelled_part(found: Labelling, true: Labelling, key: Key) -> Labelling:
     if true.known is None:
         return found
     items = (
-        item
-        if item.pixels is None
-        else Item(**{**vars(item), "pixels": item.pixels[true.known[item.pixels]]})
+        item if item.pixels is None else replace(item, pixels=item.pixels[true.known[item.pixels]])
         for item in found.items
     )
     return Labelling(tuple(items))

@@ -7,6 +7,7 @@ from typing import Any
 
 import numpy as np
 
+from shapecat.evaluation.comparison_matching import Difference, Matched
 from shapecat.evaluation.identities import SeenTogether, judge_identities
 from shapecat.evaluation.labellings import Item
 from shapecat.evaluation.metrics import expected_calibration_error
@@ -32,8 +33,8 @@ class Pairs:
     views: list[str] = field(default_factory=list)
     posteriors: list[Any] = field(default_factory=list)
 
-    def add(self, found: Sequence[Item], true: Sequence[Item], matched: Any) -> None:
-        """Add the matched pairs of a frame; ``matched`` is from `match_objects`."""
+    def add(self, found: Sequence[Item], true: Sequence[Item], matched: Matched) -> None:
+        """Add the matched pairs of a frame."""
         for i, j in matched.pairs.items():
             if true[j].decidable:
                 self.truth.append(true[j].category)
@@ -48,7 +49,7 @@ def figures_of(
     *,
     overlap: Overlap | None,
     seen: Sequence[SeenTogether] | None,
-    rows: Sequence[Any],
+    rows: Sequence[Difference],
     categories: Sequence[str],
     threshold: float,
 ) -> dict[str, Any]:
@@ -59,7 +60,7 @@ def figures_of(
     frames : numbers of frames, by name.
     overlap : overlap of the masks; None without masks.
     seen : identities of each frame; None without identities.
-    rows : the `Difference` rows of all frames.
+    rows : the differences of all frames.
     categories : categories of the model; metrics of categories ignore true objects of any other
         category.
     threshold : lowest similarity of a pair that counts as the same object in the tracking metrics.
@@ -75,7 +76,7 @@ def figures_of(
     }
 
 
-def _objects(rows: Sequence[Any], overlap: Overlap | None) -> dict[str, Any]:
+def _objects(rows: Sequence[Difference], overlap: Overlap | None) -> dict[str, Any]:
     """Count true and found objects, matched by masks, or by boxes if there are no masks."""
     true = sum(row.difference != "surplus" for row in rows)
     detections = sum(row.difference != "missed" for row in rows)

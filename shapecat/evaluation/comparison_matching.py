@@ -10,13 +10,48 @@ from shapecat.evaluation.identities import SeenTogether
 from shapecat.evaluation.labellings import Item
 from shapecat.evaluation.overlap import Overlap, box_iou, match_masks
 
-__all__ = ["SAME_BOX", "SAME_MASK", "Matched", "item_box_iou", "match_objects", "seen_together"]
+__all__ = [
+    "SAME_BOX",
+    "SAME_MASK",
+    "Difference",
+    "Matched",
+    "item_box_iou",
+    "match_objects",
+    "seen_together",
+]
 
 SAME_MASK = 0.5
 """Lowest IoU of two masks that count as the same object (PASCAL VOC)."""
 SAME_BOX = 0.25
 """Lowest IoU of two 3D boxes that count as the same object; less than for masks, as hidden sides
 are estimates (SUN RGB-D, Song 2015)."""
+
+
+class Difference(NamedTuple):
+    """A row of the table: a true object and the detection matched to it, or one without the other.
+
+    Attributes
+    ----------
+    difference : ``missed``, ``surplus``, ``outline`` (``f`` below 0.75), ``category``, ``identity``
+        (another track than before), or None if both agree.
+    true_track, true_category : from the reference; None without a true object.
+    track, category, confidence : from the run; None without a detection.
+    f, iou : overlap of the masks; None without masks.
+    box_iou : overlap of the 3D boxes; None without boxes.
+    """
+
+    topic: str
+    frame: int
+    stamp_ns: int
+    difference: str | None
+    true_track: int | None = None
+    true_category: str | None = None
+    track: int | None = None
+    category: str | None = None
+    confidence: float | None = None
+    f: float | None = None
+    iou: float | None = None
+    box_iou: float | None = None
 
 
 class Matched(NamedTuple):

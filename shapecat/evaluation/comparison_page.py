@@ -10,7 +10,8 @@ from typing import Any
 import pyarrow as pa
 
 from shapecat.errors import OutputError
-from shapecat.evaluation.comparing import Comparison, Difference
+from shapecat.evaluation.comparing import Comparison
+from shapecat.evaluation.comparison_matching import Difference
 from shapecat.evaluation.comparison_pictures import COLOURS, DifferenceImage, words_of
 from shapecat.outputs.counts import plural
 from shapecat.runs.tables import FRAME_COLUMNS, write_table

@@ -2,11 +2,12 @@
 
 import base64
 from collections.abc import Mapping, Sequence
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 
 from shapecat.arrays import U1
+from shapecat.evaluation.comparison_matching import Difference
 from shapecat.evaluation.labellings import Item, Labelling
 from shapecat.outputs.png import png
 from shapecat.runs.tables import Key
@@ -47,7 +48,7 @@ class DifferenceImage(NamedTuple):
     height: int
     captions: tuple[Caption, ...]
     severity: float
-    rows: tuple[Any, ...]
+    rows: tuple[Difference, ...]
 
 
 def draw_frame(
@@ -56,7 +57,7 @@ def draw_frame(
     found: Labelling,
     true: Labelling,
     pairs: Mapping[int, int],
-    rows: Sequence[Any],
+    rows: Sequence[Difference],
     severity: float,
 ) -> DifferenceImage | None:
     """Draw found and true masks over the depth image.
@@ -65,7 +66,7 @@ def draw_frame(
     ----------
     frame : the depth frame; None for a plain background.
     pairs : index of the true object for each matched found object.
-    rows : `Difference` rows of the frame; those of the found objects come first, in their order.
+    rows : differences of the frame; those of the found objects come first, in their order.
 
     Returns
     -------
@@ -88,7 +89,11 @@ def draw_frame(
 
 
 def _states(
-    found: Labelling, true: Labelling, pairs: Mapping[int, int], rows: Sequence[Any], size: int
+    found: Labelling,
+    true: Labelling,
+    pairs: Mapping[int, int],
+    rows: Sequence[Difference],
+    size: int,
 ) -> U1:
     """Return the colour number of each pixel, (n,), from 1; 0 without an object.
 
@@ -131,7 +136,7 @@ def _palette() -> U1:
 
 
 def _captions(
-    rows: Sequence[Any], found: Sequence[Item], true: Sequence[Item], width: int
+    rows: Sequence[Difference], found: Sequence[Item], true: Sequence[Item], width: int
 ) -> tuple[Caption, ...]:
     """Return a caption for each difference, at the position of its object."""
     captions = []
@@ -146,8 +151,8 @@ def _captions(
     return tuple(captions)
 
 
-def words_of(row: Any) -> str:
-    """Describe a `Difference` as a short phrase; its ``difference`` must not be None."""
+def words_of(row: Difference) -> str:
+    """Describe a difference as a short phrase; its ``difference`` must not be None."""
     track = "" if row.track is None else f" #{row.track}"
     return {
         "missed": f"missed {row.true_category}",
@@ -155,4 +160,4 @@ def words_of(row: Any) -> str:
         "category": f"{row.true_category} taken for {row.category}{track}",
         "identity": f"{row.true_category} now{track}",
         "outline": f"{row.category}{track}: outline differs",
-    }[row.difference]
+    }[str(row.difference)]

@@ -1,7 +1,8 @@
 """Overlap of found and true objects: masks, matched one to one, and boxes."""
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import astuple, dataclass
+from operator import add
 
 import numpy as np
 from scipy.optimize import linear_sum_assignment
@@ -44,7 +45,7 @@ class Overlap:
 
     def __add__(self, other: "Overlap") -> "Overlap":
         """Return the sum of both counts."""
-        return Overlap(*(a + b for a, b in zip(_counts(self), _counts(other), strict=True)))
+        return Overlap(*map(add, astuple(self), astuple(other)))
 
     @property
     def precision(self) -> float:
@@ -65,11 +66,6 @@ class Overlap:
     def share_found(self) -> float:
         """Fraction of the true objects that were found."""
         return self.hits / max(self.objects, 1)
-
-
-def _counts(overlap: Overlap) -> tuple[int, ...]:
-    names = ("shared", "found", "true", "hits", "objects", "detections")
-    return tuple(getattr(overlap, name) for name in names)
 
 
 @dataclass(frozen=True)
