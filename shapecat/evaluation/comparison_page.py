@@ -13,6 +13,7 @@ from shapecat.errors import OutputError
 from shapecat.evaluation.comparing import Comparison
 from shapecat.evaluation.comparison_matching import Difference
 from shapecat.evaluation.comparison_pictures import COLOURS, DifferenceImage, words_of
+from shapecat.evaluation.markup import figure_text, html_table
 from shapecat.outputs.counts import plural
 from shapecat.runs.tables import FRAME_COLUMNS, write_table
 from shapecat.system.files import complete_folder
@@ -130,22 +131,18 @@ def _tracking_rows(tracking: dict[str, Any]) -> list[_Row]:
     nouns = {"misses": "miss", "false_positives": "false positive", "switches": "identity switch"}
     errors = ", ".join(plural(tracking[name], noun) for name, noun in nouns.items())
     parts = (
-        f"detection {_text(tracking['detection_accuracy'])}, "
-        f"association {_text(tracking['association_accuracy'])}"
+        f"detection {figure_text(tracking['detection_accuracy'])}, "
+        f"association {figure_text(tracking['association_accuracy'])}"
     )
     return [
-        ("IDF1", _text(tracking["idf1"]), "consistency of identities over time"),
-        ("MOTA", _text(tracking["mota"]), errors),
-        ("HOTA", _text(tracking["hota"]), parts),
+        ("IDF1", figure_text(tracking["idf1"]), "consistency of identities over time"),
+        ("MOTA", figure_text(tracking["mota"]), errors),
+        ("HOTA", figure_text(tracking["hota"]), parts),
     ]
 
 
 def _percent(share: float | None) -> str:
     return "–" if share is None else f"{100 * share:.1f} %"
-
-
-def _text(value: float | None) -> str:
-    return "–" if value is None else f"{value:.3f}"
 
 
 def format_page(found: Comparison) -> str:
@@ -156,7 +153,7 @@ def format_page(found: Comparison) -> str:
         title=escape(f"{Path(found.run).name} compared with {Path(found.reference).name}"),
         subtitle=escape(f"{found.run} · {found.reference} ({found.kind})"),
         notes="".join(f'<p class="note">{escape(note)}</p>' for note in found.notes),
-        figures=_table((), figure_rows(found)),
+        figures=html_table((), figure_rows(found)),
         legend="".join(
             f'<span><i style="background:rgb{colour}"></i>{name}</span>'
             for name, colour in zip(
@@ -174,7 +171,7 @@ def format_page(found: Comparison) -> str:
         if not differing or found.pictures
         else "<p>No pictures: the frames are not images.</p>",
         count=_count(differing),
-        rows=_table(_HEAD, rows) if rows else "",
+        rows=html_table(_HEAD, rows) if rows else "",
     )
 
 
@@ -212,12 +209,6 @@ def _picture(picture: DifferenceImage) -> str:
         f'height="{picture.height}"/>{texts}</svg><figcaption><b>{escape(picture.topic)} '
         f"frame {picture.frame}</b>: {escape(listed)}</figcaption></figure>"
     )
-
-
-def _table(head: Sequence[str], rows: Sequence[Sequence[str]]) -> str:
-    lines = [f"<tr>{''.join(f'<th>{escape(c)}</th>' for c in head)}</tr>"] if head else []
-    lines += [f"<tr>{''.join(f'<td>{escape(c)}</td>' for c in row)}</tr>" for row in rows]
-    return f"<table>{''.join(lines)}</table>"
 
 
 _PAGE = Template(

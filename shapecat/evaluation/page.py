@@ -3,11 +3,17 @@
 from collections.abc import Mapping, Sequence
 from html import escape
 from pathlib import Path
-from typing import TypeAlias
 
 from shapecat.errors import OutputError
+from shapecat.evaluation.markup import figure_text, html_table
 from shapecat.evaluation.metrics import Bin
-from shapecat.evaluation.report import Report
+from shapecat.evaluation.report import (
+    Ranges,
+    Report,
+    Rows,
+    breakdown_table,
+    comparison_tables,
+)
 
 __all__ = [
     "accuracy_svg",
@@ -74,7 +80,7 @@ def format_page(report: Report, *, title: str) -> str:
     """Return an evaluation as an HTML page."""
     parts = [
         f"<h1>{escape(title)}</h1>",
-        _table(("", ""), _figures(report)),
+        html_table(("", ""), _figures(report)),
         "<h2>Confusion</h2><p>Rows: true category; columns: predicted category.</p>",
         confusion_svg(report.categories, report.confusion),
         f"<h2>Calibration</h2><p>{_CALIBRATION}</p>",
@@ -82,8 +88,11 @@ def format_page(report: Report, *, title: str) -> str:
     ]
     for name, rows in report.breakdowns:
         parts += [f"<h2>Accuracy by {name}</h2>", accuracy_svg(rows)]
-        parts.append(_table(*_breakdown(name, rows)))
-    parts += [f"<h2>{name}</h2>" + _table(head, rows) for name, head, rows in _comparisons(report)]
+        parts.append(html_table(*breakdown_table(name, rows)))
+    parts += [
+        f"<h2>{name}</h2>" + html_table(head, rows)
+        for name, head, rows in comparison_tables(report)
+    ]
     return (
         '<!DOCTYPE html><html lang="en"><meta charset="utf-8">'
         f"<title>{escape(title)}</title><style>{_STYLE}</style><body>"
@@ -104,62 +113,26 @@ def format_markdown(report: Report, *, title: str, pictures: Mapping[str, str]) 
     ]
     for name, rows in report.breakdowns:
         picture = f"![Accuracy by {name}]({pictures[name]})"
-        parts += [f"## Accuracy by {name}", picture, _markdown(*_breakdown(name, rows))]
-    parts += [f"## {name}\n\n" + _markdown(head, rows) for name, head, rows in _comparisons(report)]
+        parts += [f"## Accuracy by {name}", picture, _markdown(*breakdown_table(name, rows))]
+    parts += [
+        f"## {name}\n\n" + _markdown(head, rows) for name, head, rows in comparison_tables(report)
+    ]
     return "\n\n".join(parts) + "\n"
 
 
-_Rows: TypeAlias = list[tuple[str, ...]]
-
-
-def _figures(report: Report) -> _Rows:
+def _figures(report: Report) -> Rows:
     novelty = report.novelty or {}
     return [
         ("views", str(report.n)),
-        ("accuracy", _text(report.accuracy)),
-        ("balanced accuracy", _text(report.balanced_accuracy)),
-        ("calibration error", _text(report.ece)),
-        ("known shapes rejected", _text(report.rejected_known)),
-        ("unknown shapes rejected", _text(novelty.get("rejected"))),
-        ("novelty AUROC", _text(novelty.get("auroc"))),
+        ("accuracy", figure_text(report.accuracy)),
+        ("balanced accuracy", figure_text(report.balanced_accuracy)),
+        ("calibration error", figure_text(report.ece)),
+        ("known shapes rejected", figure_text(report.rejected_known)),
+        ("unknown shapes rejected", figure_text(novelty.get("rejected"))),
+        ("novelty AUROC", figure_text(novelty.get("auroc"))),
         ("model", report.model),
-        *((f"recall of {name}", _text(value)) for name, value in report.recall.items()),
+        *((f"recall of {name}", figure_text(value)) for name, value in report.recall.items()),
     ]
-
-
-_Ranges: TypeAlias = Sequence[tuple[str, int, float]]
-
-
-def _breakdown(name: str, ranges: _Ranges) -> tuple[tuple[str, ...], _Rows]:
-    """Return header and rows of a table of accuracies."""
-    rows = [(label, str(count), _text(value)) for label, count, value in ranges]
-    return (name, "views", "accuracy"), list(rows)
-
-
-def _comparisons(report: Report) -> list[tuple[str, tuple[str, ...], _Rows]]:
-    """Return title, header and rows of each table that has no picture."""
-    tables: list[tuple[str, tuple[str, ...], _Rows]] = []
-    if report.fused:
-        rows = [
-            (str(item.views), str(item.groups), _text(item.accuracy), _text(item.ece))
-            for item in report.fused
-        ]
-        head = ("views fused", "objects", "accuracy", "calibration error")
-        tables.append(("Several views of one object", head, list(rows)))
-    if report.baselines:
-        learners = [
-            (
-                item.learner,
-                str(item.learned),
-                _text(item.accuracy),
-                _text(item.balanced_accuracy),
-                _text(item.ece),
-            )
-            for item in report.baselines
-        ]
-        columns = ("classifier", "training views", "accuracy", "balanced", "calibration error")
-        tables.append(("Comparison with baselines", columns, list(learners)))
-    return tables
 
 
 def confusion_svg(categories: Sequence[str], table: Sequence[Sequence[int]]) -> str:
@@ -212,7 +185,7 @@ def calibration_svg(curve: Sequence[Bin], *, size: int = 280) -> str:
     return _svg(size, size, parts)
 
 
-def accuracy_svg(ranges: _Ranges, *, width: int = 480) -> str:
+def accuracy_svg(ranges: Ranges, *, width: int = 480) -> str:
     """Return accuracies as bars in SVG; a bar's thickness shows its number of views.
 
     ``ranges`` are (name, views, accuracy); ``width`` is in pixels.
@@ -253,14 +226,6 @@ def _shade(share: float) -> str:
     return "rgb" + str(tuple(round(255 + (ink - 255) * share) for ink in _INK))
 
 
-def _table(head: Sequence[str], rows: Sequence[Sequence[str]]) -> str:
-    lines = (
-        [f"<tr>{''.join(f'<th>{escape(cell)}</th>' for cell in head)}</tr>"] if any(head) else []
-    )
-    lines += [f"<tr>{''.join(f'<td>{escape(cell)}</td>' for cell in row)}</tr>" for row in rows]
-    return f"<table>{''.join(lines)}</table>"
-
-
 def _markdown(head: Sequence[str], rows: Sequence[Sequence[str]]) -> str:
     lines = [head, ["---"] * len(head), *rows]
     return "\n".join("| " + " | ".join(map(_plain, line)) + " |" for line in lines)
@@ -269,7 +234,3 @@ def _markdown(head: Sequence[str], rows: Sequence[Sequence[str]]) -> str:
 def _plain(text: str) -> str:
     """Return text with the markup characters of Markdown and HTML escaped."""
     return escape(text).replace("|", "\\|").replace("\n", " ")
-
-
-def _text(value: float | None) -> str:
-    return "–" if value is None else f"{value:.3f}"

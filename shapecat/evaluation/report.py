@@ -4,9 +4,10 @@ import io
 import itertools
 import math
 import time
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, field
-from typing import Any, NamedTuple
+from functools import partial
+from typing import Any, NamedTuple, TypeAlias
 
 import numpy as np
 from rich.console import Console
@@ -16,11 +17,27 @@ from shapecat.arrays import F4, I4
 from shapecat.errors import ModelError
 from shapecat.evaluation import metrics
 from shapecat.evaluation.fused import Fused, fuse_views
+from shapecat.evaluation.markup import figure_text
 from shapecat.evaluation.views import DescribedViews
 from shapecat.learning import Categorizer
 from shapecat.types import UNKNOWN
 
-__all__ = ["Compared", "Report", "evaluate", "format_report", "require_categories"]
+__all__ = [
+    "Compared",
+    "Ranges",
+    "Report",
+    "Rows",
+    "breakdown_table",
+    "comparison_tables",
+    "evaluate",
+    "format_report",
+    "require_categories",
+]
+
+Row: TypeAlias = tuple[str, ...]
+Rows: TypeAlias = list[Row]
+Ranges: TypeAlias = Sequence[tuple[str, int, float]]
+"""Range, number of views and accuracy."""
 
 _ELEVATIONS = (-math.inf, 15.0, 30.0, 45.0, 60.0, math.inf)
 _DISTANCES_M = (0.0, 0.8, 1.1, 1.4, 1.7, math.inf)
@@ -212,69 +229,70 @@ def format_report(report: Report) -> str:
     console = Console(file=stream, width=100, highlight=False)
     skipped = f"; skipped {report.skipped} without a surface" if report.skipped else ""
     console.print(f"{report.n} views, model {report.model}{skipped}\n")
-    console.print(_figures(report))
-    console.print(_confusion(report))
-    for title, rows in report.breakdowns:
-        console.print(_breakdown(title, rows))
-    if report.fused:
-        console.print(_fused(report))
-    if report.baselines:
-        console.print(_baselines(report))
+    console.print(_grid(None, ("", ""), _figures(report)))
+    head = ("", *report.categories, "recall")
+    title = "\nrows: true category; columns: predicted category"
+    console.print(_grid(title, head, _confusion(report)))
+    tables = [breakdown_table(name, ranges) for name, ranges in report.breakdowns]
+    tables += [(head, rows) for _, head, rows in comparison_tables(report, "-")]
+    for head, rows in tables:
+        console.print(_grid(None, [f"\n{name}" for name in head], rows))
     return "\n".join(line.rstrip() for line in stream.getvalue().splitlines())
 
 
-def _grid(title: str | None, *columns: str) -> Table:
+def _grid(title: str | None, head: Iterable[str], rows: Rows) -> Table:
     table = Table(title=title, title_justify="left", box=None, pad_edge=False, padding=(0, 2, 0, 0))
-    for k, name in enumerate(columns):
+    for k, name in enumerate(head):
         table.add_column(name, justify="left" if k == 0 else "right")
+    for row in rows:
+        table.add_row(*row)
     return table
 
 
-def _text(value: float | None) -> str:
-    return "-" if value is None else f"{value:.3f}"
-
-
-def _figures(report: Report) -> Table:
-    table = _grid(None, "", "")
-    table.add_row("accuracy", _text(report.accuracy))
-    table.add_row("balanced accuracy", _text(report.balanced_accuracy))
-    table.add_row("calibration error", _text(report.ece))
-    table.add_row("known shapes rejected", _text(report.rejected_known))
+def _figures(report: Report) -> Rows:
+    figures = {
+        "accuracy": report.accuracy,
+        "balanced accuracy": report.balanced_accuracy,
+        "calibration error": report.ece,
+        "known shapes rejected": report.rejected_known,
+    }
     if report.novelty is not None:
-        table.add_row("unknown shapes rejected", _text(report.novelty["rejected"]))
-        table.add_row("novelty AUROC", _text(report.novelty["auroc"]))
-    milliseconds = None if report.seconds_per_object is None else report.seconds_per_object * 1e3
-    table.add_row("ms per object", _text(milliseconds))
-    return table
+        figures["unknown shapes rejected"] = report.novelty["rejected"]
+        figures["novelty AUROC"] = report.novelty["auroc"]
+    seconds = report.seconds_per_object
+    figures["ms per object"] = None if seconds is None else seconds * 1e3
+    return [(name, figure_text(value, "-")) for name, value in figures.items()]
 
 
-def _confusion(report: Report) -> Table:
-    table = _grid(
-        "\nrows: true category; columns: predicted category", "", *report.categories, "recall"
-    )
-    for name, row in zip(report.categories, report.confusion, strict=True):
-        table.add_row(name, *(str(n) if n else "." for n in row), _text(report.recall[name]))
-    return table
+def _confusion(report: Report) -> Rows:
+    return [
+        (name, *(str(n) if n else "." for n in row), figure_text(report.recall[name], "-"))
+        for name, row in zip(report.categories, report.confusion, strict=True)
+    ]
 
 
-def _breakdown(title: str, rows: Sequence[tuple[str, int, float]]) -> Table:
-    table = _grid(None, f"\n{title}", "\nviews", "\naccuracy")
-    for name, count, value in rows:
-        table.add_row(name, str(count), _text(value))
-    return table
+def breakdown_table(name: str, ranges: Ranges) -> tuple[Row, Rows]:
+    """Return header and rows of a table of accuracies."""
+    rows = [(label, str(count), figure_text(value)) for label, count, value in ranges]
+    return (name, "views", "accuracy"), [*rows]
 
 
-def _fused(report: Report) -> Table:
-    table = _grid(None, "\nviews fused", "\nobjects", "\naccuracy", "\ncalibration error")
-    for item in report.fused:
-        table.add_row(str(item.views), str(item.groups), _text(item.accuracy), _text(item.ece))
-    return table
-
-
-def _baselines(report: Report) -> Table:
-    columns = ("classifier", "training views", "accuracy", "balanced", "calibration error")
-    table = _grid(None, *(f"\n{name}" for name in columns))
-    for item in report.baselines:
-        figures = (item.accuracy, item.balanced_accuracy, item.ece)
-        table.add_row(item.learner, str(item.learned), *map(_text, figures))
-    return table
+def comparison_tables(report: Report, missing: str = "–") -> list[tuple[str, Row, Rows]]:
+    """Return title, header and rows of each table that has no picture."""
+    text = partial(figure_text, missing=missing)
+    tables: list[tuple[str, Row, Rows]] = []
+    if report.fused:
+        head: Row = ("views fused", "objects", "accuracy", "calibration error")
+        rows: Rows = [
+            (str(one.views), str(one.groups), text(one.accuracy), text(one.ece))
+            for one in report.fused
+        ]
+        tables.append(("Several views of one object", head, rows))
+    if report.baselines:
+        head = ("classifier", "training views", "accuracy", "balanced", "calibration error")
+        rows = [
+            (learner, str(learned), *map(text, figures))
+            for learner, learned, *figures in report.baselines
+        ]
+        tables.append(("Comparison with baselines", head, rows))
+    return tables

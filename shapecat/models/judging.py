@@ -2,6 +2,7 @@
 
 from collections.abc import Iterable, Sequence
 from dataclasses import replace
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -12,6 +13,7 @@ from shapecat.config import Settings
 from shapecat.description import BLOCKS
 from shapecat.evaluation import Report, View, evaluate, format_report
 from shapecat.evaluation.fused import FUSED
+from shapecat.evaluation.markup import figure_text
 from shapecat.evaluation.views import describe_views
 from shapecat.learning import Categorizer
 from shapecat.models.arrangements import World
@@ -39,6 +41,7 @@ Differences of one point in accuracy are not significant at this size. The advan
 stability: random points are as accurate, but change nearly twice as much between frames."""
 _THESIS = ("the thesis's own figures, all objects of its data", "about 0.9", "", "< 2000")
 _HEAD = ("", "views", "accuracy", "balanced", "ECE", "known rejected", "unknown rejected", "AUROC")
+_text = partial(figure_text, missing="")
 
 
 def judge(
@@ -156,10 +159,6 @@ def _figures(name: str, report: Report) -> tuple[str, ...]:
         novelty.get("auroc"),
     )
     return (name, str(report.n), *map(_text, values))
-
-
-def _text(value: float | None) -> str:
-    return "" if value is None else f"{value:.3f}"
 
 
 def _counts(sets: dict[str, Simulated]) -> list[tuple[str, ...]]:
