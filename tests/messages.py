@@ -70,18 +70,30 @@ def cloud(stamp: int, points: Any, **changes: Any) -> Any:
     return message
 
 
-def write(path: Path, items: Iterable[tuple[str, int, Any]], *, chunk_size: int = 1 << 20) -> Path:
-    """Write messages given as topic, log time, message or bytes."""
+def write(
+    path: Path,
+    items: Iterable[tuple[str, int, Any]],
+    *,
+    chunk_size: int = 1 << 20,
+    empty: Iterable[tuple[str, str]] = (),
+) -> Path:
+    """Write messages given as topic, log time, message or bytes; ``empty`` topics have none."""
     with path.open("wb") as file:
         writer = Writer(file, chunk_size=chunk_size)
         writer.start("ros2", "test")
         channels: dict[tuple[str, str], int] = {}
+
+        def declare(topic: str, kind: str) -> None:
+            text = STORE.generate_msgdef(kind, ros_version=2)[0].encode()
+            schema = writer.register_schema(kind, "ros2msg", text)
+            channels[topic, kind] = writer.register_channel(topic, "cdr", schema)
+
+        for topic, kind in empty:
+            declare(topic, kind)
         for topic, time, item in items:
             kind = item[0] if isinstance(item, tuple) else item.__msgtype__
             if (topic, kind) not in channels:
-                text = STORE.generate_msgdef(kind, ros_version=2)[0].encode()
-                schema = writer.register_schema(kind, "ros2msg", text)
-                channels[topic, kind] = writer.register_channel(topic, "cdr", schema)
+                declare(topic, kind)
             raw = item[1] if isinstance(item, tuple) else bytes(STORE.serialize_cdr(item, kind))
             writer.add_message(channels[topic, kind], time, raw, time)
         writer.finish()

@@ -70,12 +70,15 @@ def static(parent: str, child: str, translation: Any, quaternion: Any, stamp: in
     return make("tf2_msgs/msg/TFMessage", [stamped])
 
 
-def beside(path: Path, *more: tuple[str, int, Any], frame_id: str = "color_optical") -> Path:
+def beside(
+    path: Path, *more: tuple[str, int, Any], frame_id: str = "color_optical", **written: Any
+) -> Path:
     """Write a depth image with a colour image of another camera."""
     items = depth_items(EPOCH)
     items += [("/cam/color/camera_info", EPOCH, info(EPOCH, WIDE, (0.1, -0.2, 0.001, 0.002, 0.0)))]
     colours = raw(EPOCH, gradient(60, 80), "rgb8", frame_id)
-    return write(path, in_order([*items, *more, ("/cam/color/image_raw", EPOCH + 1, colours)]))
+    items += [*more, ("/cam/color/image_raw", EPOCH + 1, colours)]
+    return write(path, in_order(items), **written)
 
 
 @pytest.mark.parametrize(
@@ -328,6 +331,15 @@ def test_a_camera_that_moves_beside_the_sensor_is_placed_anew_in_each_frame(tmp_
 def test_without_a_transform_there_is_no_colour(tmp_path: Path) -> None:
     """Colours in the wrong place are worse than none."""
     ((_, view),), warnings = read(beside(tmp_path / "a.mcap"))
+
+    assert view is None
+    assert any("no transform between camera and color_optical" in w for w in warnings)
+
+
+def test_an_extrinsics_topic_without_messages_is_absent(tmp_path: Path) -> None:
+    """It is latched: a recording that starts after the driver declares it and holds none."""
+    silent = [("/cam/extrinsics/depth_to_color", "std_msgs/msg/String")]
+    ((_, view),), warnings = read(beside(tmp_path / "a.mcap", empty=silent))
 
     assert view is None
     assert any("no transform between camera and color_optical" in w for w in warnings)

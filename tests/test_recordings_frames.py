@@ -20,6 +20,7 @@ from shapecat.recordings import (
     read_transforms,
 )
 from shapecat.recordings.compressed_depth import depth_of_compressed
+from shapecat.recordings.messages import Message
 from shapecat.recordings.pinhole import fit_pinhole, still_fits
 from shapecat.recordings.pointcloud2 import cloud_points
 from shapecat.recordings.sources import DepthSource
@@ -336,6 +337,31 @@ def test_a_calibration_recorded_once_serves_all(tmp_path: Path) -> None:
 
     assert len(read_frames) == 3
     assert not skipped
+
+
+def test_without_a_readable_calibration_it_is_searched_once(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Reading the topic again for each image would take hours for a recording of minutes."""
+    items: list[tuple[str, int, Any]] = []
+    for k in range(30):
+        items.append(("/depth/camera_info", EPOCH + k, (INFO, b"\0\1\0\0rubbish")))
+        items.append(("/depth/image", EPOCH + k, image(EPOCH + k, wavy_depth())))
+    decoded: Counter[str] = Counter()
+    with open_recording(write(tmp_path / "a.mcap", items)) as recording:
+        streams, skipped = choose_streams(recording), Counter[str]()
+        original = recording.decode
+
+        def decode(message: Message) -> Any:
+            decoded[message.topic] += 1
+            return original(message)
+
+        monkeypatch.setattr(recording, "decode", decode)
+        found = list(frames(recording, streams, skipped=skipped))
+
+    assert not found
+    assert skipped == {"depth image without camera info": 30}
+    assert decoded["/depth/camera_info"] < 30 + 10
 
 
 def test_mismatched_calibration_is_counted(tmp_path: Path) -> None:

@@ -165,7 +165,7 @@ def _probe(
     recording: Recording,
     infos: list[str],
 ) -> ColourStream | None:
-    first = first_message(recording, topic)
+    first = first_message(recording, topic.name, topic.type)
     try:
         encoding = _ENCODINGS[kind](first)
         if not encoding or (encoding == "mono8" and _is_other(topic.name)):

@@ -9,7 +9,7 @@ from shapecat.errors import RecordingError
 from shapecat.geometry import IDENTITY, compose, inverse, rotation_from_quaternion
 from shapecat.recordings.colour_streams import ColourStream
 from shapecat.recordings.recording import Recording
-from shapecat.recordings.streams import Stream
+from shapecat.recordings.streams import Stream, first_message
 from shapecat.recordings.transforms import (
     ExtrapolationError,
     TransformBuffer,
@@ -83,7 +83,7 @@ class Extrinsics:
         for topic in self._recording.topics:
             if topic.name.endswith("/extrinsics/depth_to_color"):
                 with suppress(*_MALFORMED):
-                    return _driver_pose(self._first(topic.name))
+                    return _driver_pose(first_message(self._recording, topic.name))
         depth, colour = (self._recorder_pose(s.topic) for s in (self._depth, self._colour))
         if depth is None or colour is None:
             return None
@@ -95,14 +95,11 @@ class Extrinsics:
         for topic in self._recording.topics:
             if topic.name.startswith(prefix) and len(prefix) > 4:
                 with suppress(*_MALFORMED):
-                    message = self._first(topic.name)
+                    message = first_message(self._recording, topic.name)
                     move, turn = message.translation, message.rotation
                     rotation = rotation_from_quaternion((turn.x, turn.y, turn.z, turn.w))
                     return Pose(rotation, np.array([move.x, move.y, move.z]))
         return None
-
-    def _first(self, topic: str) -> Any:
-        return self._recording.decode(next(self._recording.messages([topic])))
 
 
 def _driver_pose(message: Any) -> Pose | None:

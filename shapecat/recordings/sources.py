@@ -3,6 +3,7 @@
 from collections import Counter
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager, suppress
+from functools import cached_property
 from typing import Any
 
 import numpy as np
@@ -17,7 +18,7 @@ from shapecat.recordings.pinhole import PinholeFit, camera_of_info, fit_pinhole,
 from shapecat.recordings.pointcloud2 import cloud_points, organized, unorganized
 from shapecat.recordings.recording import Recording
 from shapecat.recordings.stamps import Clock, stamp_ns
-from shapecat.recordings.streams import COMPRESSED, Stream
+from shapecat.recordings.streams import COMPRESSED, Stream, first_message
 from shapecat.types import Camera, Frame, Pose
 
 __all__ = ["SOURCES", "DepthSource", "PointsSource", "Source"]
@@ -174,9 +175,14 @@ class DepthSource(Source):
         if frame is not None:
             yield frame
 
+    @cached_property
+    def _first_info(self) -> Any:
+        """The first calibration in the recording, for images before it; None if there is none."""
+        return first_message(self.recording, self.info_topic)
+
     def _content(self, image: Any) -> dict[str, Any]:
         if self._info is None:
-            self._info = _first(self.recording, self.info_topic)
+            self._info = self._first_info
         if self._info is None:
             msg = "depth image without camera info"
             raise MessageError(msg)
@@ -199,16 +205,8 @@ def _depth_units(recording: Recording, topic: str) -> float | None:
         name = other.name.replace(" ", "_")
         if name.startswith(f"{sensor}/") and name.endswith("/option/Depth_Units/value"):
             with suppress(*_MALFORMED):
-                metres = float(_first(recording, other.name).data)
+                metres = float(first_message(recording, other.name).data)
                 return 1 / metres if 1e-6 < metres < 1 else None
-    return None
-
-
-def _first(recording: Recording, topic: str) -> Any:
-    """Return the first decodable message of a topic in the recording; None if there is none."""
-    for message in recording.messages([topic]):
-        with suppress(MessageError):
-            return recording.decode(message)
     return None
 
 

@@ -74,7 +74,7 @@ def cloud_streams(recording: Recording) -> tuple[Stream, ...]:
     for topic in recording.topics:
         probe = _PROBES.get(ros_counterpart(topic.type))
         if probe is not None and topic.count != 0:
-            first = first_message(recording, topic)
+            first = first_message(recording, topic.name, topic.type)
             with suppress(AttributeError):  # a definition without the fields of its type
                 streams.append(probe(topic, first, infos))
     return tuple(stream for stream in streams if stream is not None)
@@ -174,9 +174,12 @@ def _rank(stream: Stream) -> tuple[int, int, int, str]:
     return (stream.kind != "depth", aligned, -(stream.count or 0), stream.topic)
 
 
-def first_message(recording: Recording, topic: Topic) -> Any:
-    """Return the first of a topic's first few messages that can be decoded; None if none can."""
-    same = (m for m in recording.messages([topic.name]) if m.type == topic.type)
+def first_message(recording: Recording, topic: str, kind: str | None = None) -> Any:
+    """Return the first of a topic's first few messages that can be decoded; None if none can.
+
+    With ``kind``, messages of other types are left out.
+    """
+    same = (m for m in recording.messages([topic]) if kind is None or m.type == kind)
     for message in islice(same, _PEEK):
         try:
             return recording.decode(message)
