@@ -16,6 +16,7 @@ from scipy.spatial.transform import Rotation
 from shapecat.cameras.colour import ColourImage, ColourView, LensCamera
 from shapecat.colour.masks import Mask
 from shapecat.evaluation.clouds import read_pcd
+from shapecat.evaluation.references_kitti import KittiLabels
 from shapecat.geometry import IDENTITY
 from shapecat.outputs.colouring import Coloured
 from shapecat.outputs.dataset_frames import DatasetImage
@@ -143,6 +144,16 @@ def test_kitti_calibration_leads_to_the_pixels_of_a_colour_camera_beside_it(tmp_
     low, high = ([f(at[of_object]) for at in (u, v)] for f in (np.min, np.max))
     assert box == np.rint([*low, *high]).tolist()
     assert (tmp_path / "image_2" / "000000.png").exists()
+
+    # The rotation between the cameras must not turn the boxes that are read back.
+    (tmp_path / "frames.csv").write_text("number,topic,frame,stamp_ns\n000000,/depth,0,5\n")
+    found = KittiLabels(tmp_path, ["bowl"]).at(("/depth", 0), 5)
+    assert found is not None
+    back, item = found.items[0].box, labelled(cut=False, hidden=False).objects[0]
+    assert back is not None
+    assert_allclose(back.center, item.box.center, atol=2e-5)
+    turn = Rotation.from_quat(back.orientation).inv() * Rotation.from_quat(item.box.orientation)
+    assert turn.magnitude() < 1e-4
 
 
 @pytest.mark.parametrize(

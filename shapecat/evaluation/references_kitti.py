@@ -5,7 +5,6 @@ from collections.abc import Sequence
 from pathlib import Path
 
 import numpy as np
-from scipy.linalg import rq
 
 from shapecat.arrays import F8
 from shapecat.errors import RecordingError
@@ -22,8 +21,9 @@ class KittiLabels(Reference):
     """Boxes of KITTI labels, without masks and identities.
 
     ``frames.csv`` gives the timestamp of each label file, and its topic where there are several;
-    without it, the file's number is the frame number. Boxes are in the rectified camera frame, and
-    the rotation in ``P2`` turns them into the sensor frame.
+    without it, the file's number is the frame number. Boxes are in the rectified camera frame;
+    the row ``Tr_rect_to_sensor`` of the calibration turns them into the sensor frame. Without it,
+    as in KITTI's own data, the frames are the same.
 
     A type cannot hold spaces. It stands for the first of ``categories`` that is written this way;
     in any other type, each ``_`` is a space.
@@ -90,13 +90,11 @@ def _stamps(path: Path) -> dict[tuple[str | None, int], str]:
 
 
 def _sensor_from_rectified(path: Path) -> F8:
-    """Return the rotation (3, 3) in ``P2`` of a calibration file; the identity if it is missing."""
-    if not path.is_file():
-        return np.eye(3)
-    lines = dict(line.split(":", 1) for line in path.read_text("utf-8").splitlines() if ":" in line)
-    projection = np.array(lines.get("P2", "1 0 0 0 0 1 0 0 0 0 1 0").split(), np.float64)
-    intrinsic, turn = rq(projection.reshape(3, 4)[:, :3])
-    return np.asarray(np.sign(np.diag(intrinsic))[:, None] * turn)
+    """Return the rotation (3, 3) from a calibration file; the identity if it has none."""
+    text = path.read_text("utf-8") if path.is_file() else ""
+    lines = dict(line.split(":", 1) for line in text.splitlines() if ":" in line)
+    transform = lines.get("Tr_rect_to_sensor", "1 0 0 0 0 1 0 0 0 0 1 0")
+    return np.array(transform.split(), np.float64).reshape(3, 4)[:, :3]
 
 
 def _box(words: list[str], turn: F8) -> Box:

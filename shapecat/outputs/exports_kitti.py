@@ -169,6 +169,7 @@ def _calibration(seen: _Seen, turn: F8) -> str:
         "R0_rect": np.eye(3),
         "Tr_velo_to_cam": np.concatenate([_VELO_FROM_RECTIFIED.T, still], axis=1),
         "Tr_imu_to_velo": np.concatenate([np.eye(3), still], axis=1),
+        "Tr_rect_to_sensor": np.concatenate([turn.T, still], axis=1),
     }
     return "".join(
         f"{name}: {' '.join(f'{value:.12e}' for value in matrix.ravel())}\n"
