@@ -104,7 +104,7 @@ def export(
     if recording is not None and len(runs) > 1:
         msg = f"--recording is for a single run, not for {len(runs)}"
         raise click.UsageError(msg)
-    if kind != "crops":
+    if kind not in ("crops", *_DATASETS):
         _require_own_names(runs)
     if boxes is not None and kind not in _WITH_BOXES:
         msg = f"--boxes is for --format {' and '.join(_WITH_BOXES)}, not {kind}"

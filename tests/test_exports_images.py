@@ -237,6 +237,21 @@ def test_several_runs_make_one_data_set_split_by_recording(
     assert both[0]["categories"] == both[1]["categories"]
 
 
+def test_runs_of_the_same_name_have_their_own_images(coloured_run: Path, tmp_path: Path) -> None:
+    """The images of one would replace those of the other, under both their masks."""
+    for day in ("monday", "tuesday"):
+        shutil.copytree(coloured_run, tmp_path / day / "lab 1")
+    runs = [tmp_path / day / "lab 1" for day in ("monday", "tuesday")]
+    export_dataset(runs, "coco", tmp_path / "out", Selection(val=0.0))
+
+    images = read_coco(tmp_path / "out")["images"]
+    names = [image["file_name"] for image in images]
+    assert len(set(names)) == len(names) == 2 * len([n for n in names if "lab 1_" in n])
+    assert all(list((tmp_path / "out").rglob(Path(name).name)) for name in names)
+    about = json.loads((tmp_path / "out" / "export.json").read_text())
+    assert list(about["runs"]) == ["lab 1", "lab 1-2"]
+
+
 def test_a_recording_is_never_in_both_splits() -> None:
     def finished(name: str, digest: str) -> FinishedRun:
         run: Any = {"input": {"digest": digest}}

@@ -337,12 +337,12 @@ def test_images_without_an_object_to_train_on_are_left_out(monkeypatch: pytest.M
         folder=Path(), run=run, name="lab", frames=lambda: iter(labelled)
     )
 
-    assert list(images_of(finished, Selection())) == [images[1], images[4]]
+    assert list(images_of(finished, Selection(), stem="lab")) == [images[1], images[4]]
 
 
 def test_depth_images_are_in_millimetres_and_end_where_16_bits_do() -> None:
-    """Larger depths would wrap around and appear near."""
-    depth = np.array([[0.0, 1.2346, 65.535], [65.6, 70.0, 0.0005]], np.float32)
+    """Larger depths would wrap around and appear near, or be read as 65.535 m."""
+    depth = np.array([[0.0, 1.2346, 65.535], [65.6, 70.0, 0.0004]], np.float32)
     frame = Frame("/depth", 0, 0, 0, "cam", depth=depth, camera=Camera(3, 2, 5.0, 6.0, 1.0, 0.5))
     found = _depth_file(labelled_frame(0), frame)
     assert found is not None
@@ -350,7 +350,7 @@ def test_depth_images_are_in_millimetres_and_end_where_16_bits_do() -> None:
 
     assert (suffix, size, masks) == (".png", (2, 3), ())
     image = np.asarray(Image.open(io.BytesIO(contents)))
-    assert image.tolist() == [[0, 1235, 65535], [65535, 65535, 0]]
+    assert image.tolist() == [[0, 1235, 65535], [0, 0, 0]]
 
 
 def runs(count: int, same: int = 0) -> Any:
@@ -376,26 +376,39 @@ def test_a_share_of_the_recordings_is_for_validation(count: int, val: float, exp
 # ---- exports: whose folder it is
 
 
+def test_the_export_of_another_recording_is_not_replaced(tmp_path: Path) -> None:
+    """Recordings of two days may have the same name; the first export would be gone."""
+    monday, tuesday = ({**KITTI, "input": {"digest": f"xxh3:{k}"}} for k in (3, 5))
+    (tmp_path / "export.json").write_text(json.dumps({**monday, "made": [], "objects": 3}))
+
+    _require_own(tmp_path, monday)
+    with pytest.raises(OutputError, match="of another recording; choose another --out"):
+        _require_own(tmp_path, tuesday)
+
+
+KITTI = {"format": "kitti"}
+
+
 def test_only_an_export_of_the_same_kind_that_nobody_changed_is_replaced(tmp_path: Path) -> None:
     out = tmp_path / "out"
-    _require_own(out, "kitti")
+    _require_own(out, KITTI)
     out.mkdir()
-    _require_own(out, "kitti")
+    _require_own(out, KITTI)
     (out / "notes.txt").write_text("mine")
     with pytest.raises(OutputError, match="holds something else"):
-        _require_own(out, "kitti")
+        _require_own(out, KITTI)
     mark = out / "export.json"
     mark.write_text(json.dumps({"format": "kitti", "made": ["notes.txt"], "objects": 3}))
-    _require_own(out, "kitti")
+    _require_own(out, KITTI)
     assert _made_by_export(out) == ["notes.txt", "export.json"]
     with pytest.raises(OutputError, match="holds kitti, not an earlier labelcloud"):
-        _require_own(out, "labelcloud")
+        _require_own(out, {"format": "labelcloud"})
     later = mark.stat().st_mtime_ns + 1000
     (out / "deep").mkdir()
     (out / "deep" / "label.txt").write_text("by hand")
     os.utime(out / "deep" / "label.txt", ns=(later, later))
     with pytest.raises(OutputError, match=r"label\.txt: was changed after the export"):
-        _require_own(out, "kitti")
+        _require_own(out, KITTI)
     mark.write_text(json.dumps({"format": "kitti", "made": ["../notes.txt"]}))  # killed in between
     assert sorted(_made_by_export(out) or ()) == ["deep", "export.json", "notes.txt"]
     mark.write_text(json.dumps({"made": "all"}))

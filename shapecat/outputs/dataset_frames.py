@@ -16,6 +16,7 @@ from shapecat.colour.snapping import snapped
 from shapecat.errors import OutputError
 from shapecat.outputs.colouring import Coloured, with_colour
 from shapecat.outputs.exports_files import png, safe_name
+from shapecat.outputs.exports_points import depth_in_mm
 from shapecat.outputs.rereading import FinishedRun, open_source
 from shapecat.recordings import MessageError
 from shapecat.recordings.colour_image import encoded, pixels_of
@@ -25,8 +26,6 @@ from shapecat.types import Frame, LabelledFrame, LabelledObject
 __all__ = ["DatasetImage", "Selection", "images_of", "snapped_masks", "split_runs"]
 
 _log = logging.getLogger(__name__)
-
-_DEPTH_UNITS = 1000  # per metre
 
 
 @dataclass(frozen=True)
@@ -90,7 +89,7 @@ def split_runs(runs: Sequence[FinishedRun], val: float) -> list[str]:
 
 
 def images_of(
-    finished: FinishedRun, selection: Selection, recording: Path | None = None
+    finished: FinishedRun, selection: Selection, recording: Path | None = None, *, stem: str
 ) -> Iterator[DatasetImage]:
     """Yield the images of a run with at least one object to train on; log damaged images.
 
@@ -99,6 +98,7 @@ def images_of(
     Parameters
     ----------
     recording : path of the recording; by default where it was processed.
+    stem : the names of the images begin with it.
 
     Raises
     ------
@@ -115,9 +115,8 @@ def images_of(
     with open_source(finished.run, recording) as source:
         frames = (f for f in finished.frames() if (f.topic, f.index) in chosen)
         for labelled, frame, coloured in with_colour(frames, source, finished.run):
-            stem = f"{safe_name(finished.name)}_"
-            stem += f"{safe_name(labelled.topic)}_" if several else ""
-            name = f"{stem}{labelled.index:06d}"
+            topic = f"{safe_name(labelled.topic)}_" if several else ""
+            name = f"{stem}_{topic}{labelled.index:06d}"
             try:
                 image = _image(name, labelled, frame, coloured, selection, corrected)
             except MessageError as error:
@@ -181,9 +180,8 @@ def _depth_file(labelled: LabelledFrame, frame: Frame) -> _File | None:
     """Return suffix, content, (height, width) and masks of a depth image (PNG), or None."""
     if frame.depth is None:
         return None
-    units = np.minimum(np.rint(frame.depth * _DEPTH_UNITS), 2**16 - 1).astype(np.uint16)
     masks = dense_masks(frame, [item.indices for item in labelled.objects])
-    return ".png", png(units, level=4), frame.depth.shape, masks
+    return ".png", png(depth_in_mm(frame.depth), level=4), frame.depth.shape, masks
 
 
 def snapped_masks(frame: Frame, coloured: Coloured, pixels: U1) -> tuple[Mask, ...]:

@@ -4,6 +4,7 @@ import json
 from collections import Counter
 from collections.abc import Callable, Collection, Iterable, Iterator, Mapping, Sequence
 from contextlib import suppress
+from itertools import chain, count
 from pathlib import Path
 from typing import Any
 
@@ -12,6 +13,7 @@ from shapecat.outputs.colouring import Coloured, with_colour
 from shapecat.outputs.dataset_frames import DatasetImage, Selection, images_of, split_runs
 from shapecat.outputs.exports_coco import DATASETS
 from shapecat.outputs.exports_crops import write_crops
+from shapecat.outputs.exports_files import safe_name
 from shapecat.outputs.exports_kitti import write_kitti
 from shapecat.outputs.exports_labelcloud import write_labelcloud
 from shapecat.outputs.exports_points import write_point_labels
@@ -89,9 +91,7 @@ def export_run(
             return FORMATS[format](out, pairs, finished)
         about = {"format": format, "run": finished.run["id"], "input": finished.run["input"]}
         write = FORMATS[format]
-        return _staged(
-            out / finished.name, format, about, lambda hidden: write(hidden, pairs, finished)
-        )
+        return _staged(out / finished.name, about, lambda hidden: write(hidden, pairs, finished))
 
 
 def export_dataset(
@@ -130,38 +130,46 @@ def export_dataset(
     runs = [read_finished(folder) for folder in folders]
     categories = list(dict.fromkeys(name for run in runs for name in run.categories))
     total = sum(int(run.run["counts"]["frames"]) for run in runs)
+    stems = _different_names([safe_name(run.name) for run in runs])
 
     def images() -> Iterator[tuple[str, FinishedRun, DatasetImage]]:
         done = 0
-        for split, run in zip(split_runs(runs, selection.val), runs, strict=True):
-            for image in images_of(run, selection, recording):
+        for split, stem, run in zip(split_runs(runs, selection.val), stems, runs, strict=True):
+            for image in images_of(run, selection, recording, stem=stem):
                 done += 1
                 observe("export", done, total)
                 yield split, run, image
 
-    about = {"format": format, "runs": {run.name: run.run["id"] for run in runs}}
-    return _staged(
-        out, format, about, lambda hidden: DATASETS[format](hidden, images(), categories)
-    )
+    ids = {stem: run.run["id"] for stem, run in zip(stems, runs, strict=True)}
+    about = {"format": format, "runs": ids}
+    return _staged(out, about, lambda hidden: DATASETS[format](hidden, images(), categories))
+
+
+def _different_names(names: Sequence[str]) -> list[str]:
+    """Return names with ``-2``, ``-3``, ... added to those that occur again."""
+    found: list[str] = []
+    for name in names:
+        numbered = (f"{name}-{k}" for k in count(2))
+        found.append(next(n for n in chain([name], numbered) if n not in found))
+    return found
 
 
 def _staged(
     target: Path,
-    format: str,  # noqa: A002  # the word users know
     about: Mapping[str, Any],
     write: Callable[[Path], int],
 ) -> int:
     """Let ``write`` fill a folder that appears when complete, with the marker of an export."""
     recover(target, _made_by_export)
-    _require_own(target, format)
+    _require_own(target, about)
     with staged(target, _made_by_export) as hidden:
         clear(hidden, _made_by_export(hidden) or ())
         _mark(hidden, about)
-        count = write(hidden)
+        objects = write(hidden)
         for file in hidden.rglob("*"):
             flush(file)
-        _mark(hidden, {**about, "objects": count})
-    return count
+        _mark(hidden, {**about, "objects": objects})
+    return objects
 
 
 def _mark(folder: Path, about: Mapping[str, Any]) -> None:
@@ -208,8 +216,8 @@ def _observed(
         observe("export", done, total)
 
 
-def _require_own(target: Path, format: str) -> None:  # noqa: A002  # the word users know
-    """Check that a folder is missing, empty, or an unchanged earlier export of this format.
+def _require_own(target: Path, about: Mapping[str, Any]) -> None:
+    """Check that a folder is missing, empty, or an unchanged earlier export of the same.
 
     Raises
     ------
@@ -217,15 +225,25 @@ def _require_own(target: Path, format: str) -> None:  # noqa: A002  # the word u
     """
     if not target.exists() or (target.is_dir() and not any(target.iterdir())):
         return
-    made = _read_mark(target).get("format", "something else")
-    if made != format:
+    earlier, format = _read_mark(target), about["format"]  # noqa: A001  # the word users know
+    if earlier.get("format") != format:
+        made = earlier.get("format", "something else")
         msg = f"{target}: holds {made}, not an earlier {format} export; choose another --out"
+        raise OutputError(msg)
+    if _recording_of(earlier) != _recording_of(about):
+        msg = f"{target}: holds the {format} export of another recording; choose another --out"
         raise OutputError(msg)
     exported = (target / _MARK).stat().st_mtime_ns
     changed = next((f for f in sorted(target.rglob("*")) if _is_later(f, exported)), None)
     if changed is not None:
         msg = f"{changed}: was changed after the export; choose another --out, or move it away"
         raise OutputError(msg)
+
+
+def _recording_of(about: Mapping[str, Any]) -> Any:
+    """Return the digest of the recording that was exported; None for data sets of several runs."""
+    source = about.get("input")
+    return source.get("digest") if isinstance(source, dict) else None
 
 
 def _is_later(file: Path, than_ns: int) -> bool:

@@ -13,7 +13,7 @@ from typing import Any
 
 import numpy as np
 
-from shapecat.arrays import U4
+from shapecat.arrays import F4, U2, U4
 from shapecat.errors import OutputError
 from shapecat.outputs.colours import colour_of
 from shapecat.outputs.png import png
@@ -81,15 +81,20 @@ def _labels(labelled: LabelledFrame, frame: Frame, classes: dict[str, int]) -> U
 
 def _write_masks(out: Path, name: str, frame: Frame, labels: U4) -> None:
     depth = np.zeros((0, 0), np.float32) if frame.depth is None else frame.depth
-    millimetres = np.round(depth.astype(np.float64) * 1000)
     images = {
-        "depth": np.where(millimetres <= _LARGEST, millimetres, 0),
+        "depth": depth_in_mm(depth),
         "semantic": (labels & 0xFFFF).reshape(depth.shape),
         "instance": (labels >> 16).reshape(depth.shape),
     }
     for folder, image in images.items():
         (out / folder).mkdir(exist_ok=True)
         (out / folder / f"{name}.png").write_bytes(png(image.astype(np.uint16), level=6))
+
+
+def depth_in_mm(depth: F4) -> U2:
+    """Return a depth image (h, w), metres, in millimetres; 0, no reading, beyond 65.535 m."""
+    millimetres = np.round(depth.astype(np.float64) * 1000)
+    return np.where(millimetres <= _LARGEST, millimetres, 0).astype(np.uint16)
 
 
 def _write_cloud(out: Path, name: str, frame: Frame, labels: U4) -> None:
