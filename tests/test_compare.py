@@ -53,6 +53,7 @@ from shapecat.evaluation.references_coco import CocoLabels, filled_polygon, rle_
 from shapecat.evaluation.references_kitti import KittiLabels
 from shapecat.runs.tables import DETECTIONS, FRAMES, TRACKS
 from shapecat.types import Box, Camera, Frame
+from tests.run_info import run_info
 
 Run = Callable[..., Result]
 SCORER = Path(__file__).parents[2] / "shared" / "tools" / "score_scenes.py"
@@ -102,13 +103,12 @@ def write_run(folder: Path, *, digest: str = "one", shift_ns: int = 0) -> Path:
         pq.write_table(pa.Table.from_pylist(content, schema), folder / f"{name}.parquet")
     lines = [f"{track},{category},0.9," for track, category in FINAL.items()]
     (folder / "tracks.csv").write_text("\n".join(["track,category,confidence,label", *lines]))
-    about = {
-        "id": "x",
-        "input": {"path": str(folder / "gone.mcap"), "digest": digest},
-        "model": {"categories": NAMES},
-        "counts": {"frames": 3},
-        "options": {"topics": ["/d"]},
-    }
+    about = run_info(
+        input={"path": str(folder / "gone.mcap"), "digest": digest},
+        model={"categories": NAMES},
+        counts={"frames": 3},
+        options={"topics": ["/d"]},
+    )
     (folder / "run.json").write_text(json.dumps(about))
     return folder
 

@@ -21,6 +21,7 @@ from shapecat.runs.label_transfer import TABLE_ALONE, match_labels, transfer_lab
 from shapecat.runs.same_objects import Match, _by_majority, _mutual_nearest
 from shapecat.runs.tables import DETECTIONS, FRAMES, TRACKS, write_table
 from shapecat.runs.track_table import read_track_table
+from tests.run_info import run_info
 from tests.scenes import record
 
 Run = Callable[..., Result]
@@ -82,8 +83,8 @@ def make_run(
     work = work or f"w{folder.name}"
     about = {"path": f"/recordings/{folder.name}.mcap", "digest": digest, "files": []}
     model = {"categories": ["cup", "can", "bowl"]}
-    run: Any = {"id": new_id(), "work": work, "input": about, "fixed_frame": fixed_frame}
-    write_run(folder, run | {"model": model})
+    run = run_info(id=new_id(), work=work, input=about, fixed_frame=fixed_frame, model=model)
+    write_run(folder, run)
     rows = [
         (track, frame, place)
         for track, path in objects.items()
@@ -411,7 +412,10 @@ def test_one_misspelt_label_does_not_cost_the_others(tmp_path: Path) -> None:
 
 @pytest.mark.parametrize(
     ("found", "broken", "told"),
-    [("\n2,", "\nx,", "line 3: expected numbers"), ("wsource\r\n2,", "wb\r\n2,", "several runs")],
+    [
+        ("\n2,", "\nx,", "line 3: expected a whole number"),
+        ("wsource\r\n2,", "wb\r\n2,", "several runs"),
+    ],
 )
 def test_lines_are_not_left_out_without_a_word(
     tmp_path: Path, found: str, broken: str, told: str

@@ -22,6 +22,7 @@ from shapecat.runs.perceived import FrameRow, PerceptionTables
 from shapecat.runs.shown import _ended
 from shapecat.runs.track_table import read_track_table
 from shapecat.types import Box, Candidate, Detection, NeuralGas, Perception, Plane, Scene
+from tests.run_info import run_info
 from tests.track_tables import write_tracks
 
 HEADER = "track,first_s,category,confidence,label,topic\n"
@@ -38,7 +39,7 @@ def run(tmp_path: Path) -> Path:
     folder.mkdir()
     (folder / "tracks.csv").write_text(ORIGINAL)
     (folder / "run.json").write_text(
-        json.dumps({"model": {"categories": ["cup", "can", "cactus"]}})
+        json.dumps(run_info(model={"categories": ["cup", "can", "cactus"]}))
     )
     return folder
 
@@ -108,6 +109,18 @@ def test_what_is_not_understood_is_named(run: Path, label: str, message: str) ->
     with pytest.raises(OutputError) as raised:
         read_labels(run / "tracks.csv", ["cactus"])
     assert message in str(raised.value)
+
+
+@pytest.mark.parametrize("confidence", ["nan", "inf", "-0.1", "1.01", "495"])
+def test_a_confidence_is_from_0_to_1(run: Path, confidence: str) -> None:
+    """A spreadsheet may turn 0.495 into 495; nothing after this expects such a number."""
+    header, first, *rest = ORIGINAL.splitlines()
+    cells = dict(zip(header.split(","), first.split(","), strict=True))
+    changed = ",".join({**cells, "confidence": confidence}.values())
+    (run / "tracks.csv").write_text("\n".join([header, changed, *rest]))
+
+    with pytest.raises(OutputError, match=f"one from 0 to 1, got .*'{confidence}'"):
+        read_labels(run / "tracks.csv")
 
 
 def test_chains_of_merges_end_in_one_track(run: Path) -> None:

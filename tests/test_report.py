@@ -530,6 +530,47 @@ def test_five_hundred_tracks_are_a_page_that_opens(browser: Browser, run: Path) 
     assert browser.run("return document.body.dataset.ready") == "yes"
 
 
+@pytest.mark.parametrize("table", ["tracks", "detections", "frames"])
+@pytest.mark.parametrize("words", [["report"], ["annotate"]])
+def test_a_damaged_table_is_named(
+    shapecat: Run, run: Path, tmp_path: Path, words: list[str], table: str
+) -> None:
+    """A disk error in one file must not end in a traceback."""
+    folder = tmp_path / "damaged"
+    shutil.copytree(run, folder)
+    content = (folder / f"{table}.parquet").read_bytes()
+    (folder / f"{table}.parquet").write_bytes(content[:-40] + bytes(40))
+    result = shapecat(*words, folder)
+
+    assert result.exit_code == 1
+    assert f"{table}.parquet: not a readable table of a run folder" in result.stderr
+
+
+@pytest.mark.parametrize(
+    "change",
+    [
+        lambda about: about.pop("counts"),
+        lambda about: about["input"].pop("digest"),
+        lambda about: about["model"].update(categories=None),
+        lambda about: about.update(options=[]),
+        lambda about: about.clear(),
+    ],
+)
+def test_a_run_json_that_lacks_entries_is_refused(
+    shapecat: Run, run: Path, tmp_path: Path, change: Callable[[dict[str, Any]], object]
+) -> None:
+    """Another program's run.json, or one edited by hand, must not end in a traceback."""
+    folder = tmp_path / "edited"
+    shutil.copytree(run, folder)
+    about = json.loads((folder / "run.json").read_text())
+    change(about)
+    (folder / "run.json").write_text(json.dumps(about))
+    result = shapecat("report", folder)
+
+    assert result.exit_code == 1
+    assert "run.json: not a description of a run" in result.stderr
+
+
 def test_a_run_without_tracks_has_a_page(run: Path) -> None:
     (run / "tracks.csv").write_text((run / "tracks.csv").read_text().splitlines()[0] + "\n")
     table = pq.read_table(run / "tracks.parquet")

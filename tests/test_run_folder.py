@@ -9,6 +9,7 @@ from shapecat.errors import OutputError
 from shapecat.runs.folder import previous_path, read_run, recover, staged, write_run
 from shapecat.runs.identity import content_digest, file_stats, new_id, same_content
 from shapecat.system.files import holding, partial_path, replacing, require_writable
+from tests.run_info import run_info
 
 
 def test_folder_appears_whole(tmp_path: Path) -> None:
@@ -49,7 +50,7 @@ def test_a_place_that_cannot_be_written_is_one_line_in_words(tmp_path: Path) -> 
 def own(folder: Path, **files: str) -> Path:
     """Make a run folder as an earlier run has left it."""
     folder.mkdir(parents=True)
-    run: Any = {"id": new_id()}
+    run = run_info(id=new_id())
     write_run(folder, run)
     for name, text in files.items():
         (folder / name.replace("_", ".")).write_text(text)
@@ -167,7 +168,7 @@ def test_replacing_keeps_the_old_file_on_error(tmp_path: Path) -> None:
 
 
 def test_run_json_round_trip_and_foreign_folder(tmp_path: Path) -> None:
-    run: Any = {"input": {"path": "ü"}}
+    run = run_info(input={"path": "ü"})
     write_run(tmp_path, run)
 
     assert read_run(tmp_path) == run

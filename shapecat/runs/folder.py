@@ -10,10 +10,9 @@ import shutil
 from collections.abc import Callable, Collection, Iterator
 from contextlib import contextmanager, suppress
 from pathlib import Path
-from typing import cast
 
 from shapecat.errors import OutputError
-from shapecat.runs.run_info import RunInfo
+from shapecat.runs.run_info import RunInfo, is_run_info
 from shapecat.system.files import flush, lock, partial_path, replacing
 
 __all__ = [
@@ -242,7 +241,7 @@ def read_run(folder: Path) -> RunInfo:
     except (OSError, UnicodeDecodeError, json.JSONDecodeError) as error:
         msg = f"{folder}: no run.json there; expected a folder made by `shapecat process`"
         raise OutputError(msg) from error
-    if not isinstance(run, dict):
+    if not is_run_info(run):
         msg = f"{folder / 'run.json'}: not a description of a run"
         raise OutputError(msg)
-    return cast("RunInfo", run)
+    return run

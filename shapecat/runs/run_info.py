@@ -1,6 +1,6 @@
 """The contents of run.json, which describes a run; `schemas/run.json` documents each entry."""
 
-from typing import Any, NotRequired, TypedDict
+from typing import Any, NotRequired, TypedDict, TypeGuard
 
 __all__ = [
     "Counts",
@@ -10,6 +10,7 @@ __all__ = [
     "OriginInfo",
     "RunInfo",
     "Window",
+    "is_run_info",
     "window_of",
 ]
 
@@ -37,7 +38,7 @@ class Options(Window):
     topics: list[str]
     up: str
     fixed_frame: str | None
-    color: str | None
+    color: NotRequired[str | None]
     mcap: bool
     rrd: bool
 
@@ -95,6 +96,24 @@ class RunInfo(TypedDict):
     boxes: NotRequired[str]
     origin: NotRequired[OriginInfo]
     corrections: NotRequired[dict[str, Any]]
+
+
+_PARTS: dict[str, Any] = {"input": InputInfo, "options": Options, "model": ModelInfo}
+
+
+def is_run_info(content: Any) -> TypeGuard[RunInfo]:
+    """Return whether the content of a file has the entries that every run.json has."""
+    return (
+        isinstance(content, dict)
+        and content.keys() >= RunInfo.__required_keys__
+        and all(isinstance(content[name], dict) for name in ("settings", "counts", "seconds"))
+        and all(
+            isinstance(content[name], dict) and content[name].keys() >= part.__required_keys__
+            for name, part in _PARTS.items()
+        )
+        and isinstance(content["model"]["categories"], list)
+        and all(isinstance(name, str) for name in content["model"]["categories"])
+    )
 
 
 def window_of(options: Options) -> Window:

@@ -12,12 +12,11 @@ from pathlib import Path
 from typing import NamedTuple
 
 import numpy as np
-import pyarrow.parquet as pq
 
 from shapecat.arrays import F4, F8, I4
 from shapecat.errors import OutputError
 from shapecat.runs.folder import read_run
-from shapecat.runs.tables import frame_rows, numbers, read_row_groups
+from shapecat.runs.tables import frame_rows, numbers, opened, read_row_groups
 from shapecat.runs.track_table import TrackRow
 
 __all__ = ["Group", "Match", "Matches", "match_in_place", "match_in_time"]
@@ -82,7 +81,7 @@ class _Tracks(NamedTuple):
 def _read_tracks(folder: Path) -> _Tracks:
     """Read the detections of the tracks of a run."""
     columns = ["track", "topic", "frame", "stamp_ns", "detection", "center_fixed"]
-    with pq.ParquetFile(folder / "tracks.parquet") as file:
+    with opened(folder / "tracks.parquet") as file:
         table = file.read(columns=columns)
     table = table.filter(table["detection"].is_valid())
     table = table.sort_by([("topic", "ascending"), ("stamp_ns", "ascending")])

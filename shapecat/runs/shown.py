@@ -19,6 +19,7 @@ from shapecat.runs.tables import (
     Key,
     frame_rows,
     numbers,
+    opened,
     read_row_groups,
     rows_of,
     topic_codes,
@@ -70,7 +71,7 @@ class ShownTracks:
         cls, folder: Path, labels: Mapping[int, TrackLabel], *, causal: bool = False
     ) -> "ShownTracks":
         """Read the tracks of a run; those missing from ``labels`` are not shown."""
-        with pq.ParquetFile(folder / "tracks.parquet", read_dictionary=["topic"]) as file:
+        with opened(folder / "tracks.parquet", read_dictionary=["topic"]) as file:
             table = file.read(columns=["track", "topic", "frame", "stamp_ns", "detection"])
             topics, codes = topic_codes(table)
             seen = pa.compute.indices_nonzero(table["detection"].is_valid())

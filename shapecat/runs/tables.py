@@ -233,15 +233,15 @@ def release_memory() -> None:
 
 
 @contextmanager
-def opened(path: Path) -> Iterator[pq.ParquetFile]:
-    """Open a table of a run folder.
+def opened(path: Path, *, read_dictionary: Sequence[str] = ()) -> Iterator[pq.ParquetFile]:
+    """Open a table of a run folder; the columns ``read_dictionary`` are read as dictionaries.
 
     Raises
     ------
     OutputError : the table is missing or unreadable.
     """
     try:
-        with pq.ParquetFile(path) as file:
+        with pq.ParquetFile(path, read_dictionary=list(read_dictionary)) as file:
             yield file
     except (OSError, pa.ArrowException) as error:
         msg = f"{path}: not a readable table of a run folder ({error}); process the recording again"

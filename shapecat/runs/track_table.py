@@ -64,7 +64,8 @@ def read_track_table(path: Path) -> TrackTable:
     ------
     OutputError : the file is unreadable, or lacks columns of tracks.csv.
     """
-    lines = csv.reader(io.StringIO(_text(path), newline=""), delimiter=_separator(path))
+    text = _text(path)
+    lines = csv.reader(io.StringIO(text, newline=""), delimiter=_separator(text))
     rows: dict[int, TrackRow] = {}
     problems: list[str] = []
     columns: tuple[str, ...] = ()
@@ -109,9 +110,9 @@ def _text(path: Path) -> str:
     raise OutputError(msg)
 
 
-def _separator(path: Path) -> str:
+def _separator(text: str) -> str:
     """Return the separator in the header line: a comma, a semicolon or a tab."""
-    lines = (line for line in _text(path).splitlines() if "track" in line.lower())
+    lines = (line for line in text.splitlines() if "track" in line.lower())
     header = next(lines, "")
     return max(",;\t", key=header.count)
 
@@ -130,11 +131,11 @@ def _row(line: int, cells: Mapping[str, str]) -> TrackRow | str:
     try:
         track = _number(cells["track"])
         confidence = _number(cells["confidence"])
-        if track != int(track):
-            raise ValueError  # noqa: TRY301  the same message for all that is not a number
+        if track != int(track) or not 0 <= confidence <= 1:
+            raise ValueError  # noqa: TRY301  the same message for all that is not such a number
     except (KeyError, ValueError, OverflowError):
         text = f"track {cells.get('track', '')!r}, confidence {cells.get('confidence', '')!r}"
-        return f"line {line}: expected numbers, got {text}"
+        return f"line {line}: expected a whole number and one from 0 to 1, got {text}"
     return TrackRow(
         line=line,
         track=int(track),

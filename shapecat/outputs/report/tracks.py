@@ -5,10 +5,9 @@ from pathlib import Path
 import numpy as np
 import pyarrow as pa
 import pyarrow.compute
-import pyarrow.parquet as pq
 
 from shapecat.arrays import F4, F8, Bool, Record, array
-from shapecat.runs.tables import first_stamp, read_row_groups
+from shapecat.runs.tables import first_stamp, opened, read_row_groups
 
 __all__ = ["Detected", "Timeline", "read_stage_seconds", "read_timelines"]
 
@@ -36,7 +35,8 @@ class Timeline(Record):
 def read_timelines(folder: Path) -> dict[int, Timeline]:
     """Read the timeline of every track of a run."""
     start = first_stamp(folder)
-    table = pq.read_table(folder / "tracks.parquet")
+    with opened(folder / "tracks.parquet") as file:
+        table = file.read()
     width = len(table["posterior"][0]) if table.num_rows else 0
     tracks = table["track"].to_numpy()
     seconds = (table["stamp_ns"].to_numpy() - start) * 1e-9

@@ -1,0 +1,36 @@
+"""The content of run.json of synthetic runs."""
+
+from typing import Any
+
+__all__ = ["run_info"]
+
+
+def run_info(**entries: Any) -> Any:
+    """Return a complete run.json; ``entries`` replace its own, or parts of them."""
+    complete: dict[str, Any] = {
+        "id": "0123456789abcdef",
+        "work": "",
+        "input": {"path": "/recordings/lab.mcap", "bytes": 0, "digest": "", "files": []},
+        "versions": {},
+        "settings": {},
+        "options": {
+            "topics": ["/depth"],
+            "up": "auto",
+            "fixed_frame": None,
+            "start_s": None,
+            "end_s": None,
+            "every": 1,
+            "mcap": True,
+            "rrd": True,
+        },
+        "model": {"id": "", "categories": []},
+        "fixed_frame": None,
+        "up": {},
+        "counts": {},
+        "seconds": {},
+        "warnings": [],
+    }
+    for name, value in entries.items():
+        known = complete.get(name)
+        complete[name] = known | value if isinstance(known, dict) else value
+    return complete
