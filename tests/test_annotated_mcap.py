@@ -1,5 +1,6 @@
 """annotated.mcap keeps every original message, and every tool can read the added ones."""
 
+import errno
 import hashlib
 import json
 import os
@@ -29,7 +30,7 @@ from rosbags.typesys import Stores, get_types_from_msg, get_typestore
 from shapecat.errors import OutputError
 from shapecat.outputs.annotated_mcap import write_annotated
 from shapecat.outputs.colours import CATEGORY_COLOURS, colour_of
-from shapecat.outputs.mcap_append import Appender
+from shapecat.outputs.mcap_append import Appender, copy_bytes
 from shapecat.recordings import open_recording
 from shapecat.recordings.mcap_records import ChunkError, read_chunk_index, write_chunk_index
 from shapecat.types import CATEGORIES, ShownBox, ShownFrame
@@ -41,6 +42,26 @@ STRING = "std_msgs/msg/String"
 SECOND = 10**9
 EPOCH = 1_700_000_000 * SECOND
 RUN = {"version": "1", "counts": {"frames": 3}}
+
+
+@pytest.mark.parametrize("in_kernel", [True, False])
+def test_a_recording_that_becomes_shorter_is_not_filled_with_zeros(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, *, in_kernel: bool
+) -> None:
+    """The space for the copy is reserved first, so that what is missing would read as zeros."""
+
+    def refuse(*_: object) -> int:
+        raise OSError(errno.EXDEV, "across file systems")
+
+    if not in_kernel:
+        monkeypatch.setattr(os, "copy_file_range", refuse)
+    source, target = tmp_path / "source", tmp_path / "target"
+    source.write_bytes(b"x" * 1000)
+    target.touch()
+    copy_bytes(source, target, 900)
+    assert target.read_bytes()[:900] == b"x" * 900
+    with pytest.raises(OSError, match="became shorter"):
+        copy_bytes(source, target, 4000)
 
 
 def shown(index: int, tracks: list[int], *, ended: tuple[int, ...] = ()) -> ShownFrame:

@@ -59,6 +59,10 @@ def copy_bytes(source: Path, target: Path, length: int) -> None:
     """Copy the first ``length`` bytes of a file over those of another, in the kernel if possible.
 
     Disk space is also reserved behind these bytes: truncate the target when everything is written.
+
+    Raises
+    ------
+    OSError : reading or writing failed, or the file has become shorter than ``length``.
     """
     with source.open("rb") as file, target.open("r+b") as copy:
         _reserve(copy, length)
@@ -74,6 +78,9 @@ def copy_bytes(source: Path, target: Path, length: int) -> None:
                 raise
         if done == 0:
             shutil.copyfileobj(_Limited(file, length), copy, 1 << 20)
+            done = copy.tell()
+        if done < length:  # what is missing would be zeros
+            raise OSError(errno.EIO, "the recording became shorter while it was copied")
 
 
 class _Limited:
