@@ -93,7 +93,8 @@ def process(job: Job, observe: Observer = ignore, *, cores: int = 1) -> Summary:
             run["color"] = {topic: colour.topic for topic, colour in colours.items()}
             compiling_s = compile_all(lambda: observe("compile", 0, None), cores=cores)
             content.start()
-            earlier = sum(run["seconds"].values())
+            # A kill after the last phase leaves a total.
+            earlier = run["seconds"].pop("total", None) or sum(run["seconds"].values())
             work = Work(recording, folder, run, job, categorizer, observe, cores)
             _once("perceive", folder, run, lambda: perceive_all(work))
             _once("revise", folder, run, lambda: _revise(work))

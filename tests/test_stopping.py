@@ -119,6 +119,27 @@ def test_frames_of_a_phase_that_was_done_count_as_resumed(
     assert 1000 < run["seconds"]["total"] < 2000  # also the time before the interruption
 
 
+def test_a_kill_after_the_last_phase_does_not_double_the_time(
+    recording: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """The total is written before the folder gets its name; it is no further phase."""
+
+    def fail(*_: object) -> None:
+        raise stopping.Stopped(signal.SIGTERM)
+
+    job = Job(recording, tmp_path / "table", rrd=False, end_s=0.3)
+    with monkeypatch.context() as broken, pytest.raises(stopping.Stopped):
+        broken.setattr("shapecat.pipeline.require_unchanged", fail)
+        process(job)
+    begun = tmp_path / ".table.partial" / "run.json"
+    about = json.loads(begun.read_text())
+    about["seconds"] |= {"perceive": 1000.0, "compile": 7.0, "total": 1100.0}
+    begun.write_text(json.dumps(about))
+    process(job)
+
+    assert 1100 < read_run(tmp_path / "table")["seconds"]["total"] < 1200
+
+
 def test_a_second_signal_leaves_at_once(recording: Path, undisturbed: Path, tmp_path: Path) -> None:
     command = Command(recording, tmp_path, "--jobs", "2")
     command.wait_for_frames(40)
