@@ -104,7 +104,9 @@ def process(
     config: str | Path | None = None,
     mcap: bool = True,
     rrd: bool = True,
+    color: str | None = None,
     overwrite: bool = False,
+    discard_labels: bool = False,
     cores: int = 1,
     observe: Observer | None = None,
     **settings: Any,
@@ -117,8 +119,9 @@ def process(
 
     Parameters
     ----------
-    topics, up, fixed_frame, start_s, end_s, every, model, config, overwrite : as the options of
-        the command.
+    topics, up, fixed_frame, start_s, end_s, every, model, config, overwrite, discard_labels : as
+        the options of the command.
+    color : topic of the colour images; None to choose one, empty to use none.
     mcap, rrd : whether to write annotated.mcap and review.rrd.
     cores : number of processes that perceive frames. If there are several, a script must have
         ``if __name__ == "__main__":``.
@@ -148,7 +151,9 @@ def process(
         model=None if model is None else Path(model),
         mcap=mcap,
         rrd=rrd,
+        color=color,
         overwrite=overwrite,
+        discard_labels=discard_labels,
     )
     pipeline.process(job, observe or ignore, cores=cores)
     return Run(job.folder)
