@@ -354,7 +354,10 @@ def test_a_tiny_turn_to_the_right_is_no_full_turn() -> None:
 
 
 def test_files_of_data_sets_tell_frames_runs_and_categories(tmp_path: Path) -> None:
-    """Two runs have a track 4: in the data set they are two. Ids count from 1, in each split."""
+    """Two runs have a track 4: in the data set they are two. Ids count from 1, in each split.
+
+    Ultralytics would resolve a relative "path" in data.yaml against the current directory.
+    """
     view = replace(labelled(cut=False, hidden=False), topic="/left", index=17, stamp_ns=12_345)
     second = replace(dataset_image(), name="b.jpg", labelled=view)
     other = SimpleNamespace(folder=Path("runs/hall"), name="hall")
@@ -391,7 +394,7 @@ def test_files_of_data_sets_tell_frames_runs_and_categories(tmp_path: Path) -> N
     runs = [(a["attributes"]["run"], a["attributes"]["track"]) for a in train["annotations"]]
     assert runs == [("lab", 4), ("lab", 9), ("hall", 4), ("hall", 9)]
     assert (tmp_path / "data.yaml").read_text().splitlines() == [
-        "path: .", "train: images/train", "val: images/val", "names:",
+        "train: images/train", "val: images/val", "names:",
         '  0: "cup"', '  1: "can"', '  2: "bowl"',
     ]  # fmt: skip
     assert sorted(str(p.relative_to(tmp_path)) for p in tmp_path.glob("*/*/*")) == [

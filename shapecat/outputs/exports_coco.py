@@ -105,7 +105,8 @@ def write_yolo(out: Path, images: Images, categories: Sequence[str]) -> int:
         count += len(lines)
     names = [f"  {k}: {json.dumps(name)}" for k, name in enumerate(categories)]
     val = "val" if "val" in splits else "train"
-    about = ["path: .", "train: images/train", f"val: images/{val}", "names:", *names]
+    # Without "path", the paths are relative to data.yaml, wherever training is started.
+    about = ["train: images/train", f"val: images/{val}", "names:", *names]
     (out / "data.yaml").write_text("\n".join(about) + "\n", "utf-8")
     return count
 
