@@ -228,15 +228,16 @@ def test_pixels_and_rays_agree_to_a_thousandth_of_a_pixel() -> None:
 def test_up_is_turned_from_the_fixed_frame_into_the_sensors() -> None:
     """Z of the fixed frame, seen by the sensor, is the last row of fixed_from_sensor."""
     from shapecat.recordings.gravity import Upright  # noqa: PLC0415  beside its only use
+    from shapecat.recordings.transform_window import TransformWindow  # noqa: PLC0415  the same
     from shapecat.recordings.transforms import TransformBuffer  # noqa: PLC0415  the same
 
     turn = Rotation.from_euler("xyz", [-2.1, 0.3, 0.8])
     transforms = TransformBuffer()
     transforms.add("map", "camera", 0, ((1.0, 2.0, 3.0), tuple(turn.as_quat())), static=True)
-    upright = Upright(transforms, "map", None, ("tf",))
+    upright = Upright(TransformWindow(transforms), "map", None, ("tf",))
     frame = Frame("/depth", 0, 5, 5, "camera", points=np.zeros((1, 3)))
 
-    up = upright.up(frame)
+    up = upright.orient(frame).up
     assert up is not None
     assert_allclose(up, turn.inv().apply([0, 0, 1]), atol=1e-6)
     pose = upright.fixed_from_sensor(frame)

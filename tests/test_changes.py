@@ -20,6 +20,7 @@ from shapecat.recordings.colour_streams import pair_colours
 from shapecat.recordings.decoding import decode
 from shapecat.recordings.gravity import Upright
 from shapecat.recordings.messages import Channel, Message
+from shapecat.recordings.transform_window import TransformWindow
 from shapecat.recordings.transforms import TransformBuffer
 from shapecat.reuse import KeyView, find_repeats, sight_of
 from shapecat.reuse.agreement import agreement
@@ -147,7 +148,7 @@ def test_topics_differ_in_what_is_known_of_their_pose() -> None:
     """One sensor may be in no transform, and planes may contradict the up direction of one."""
     transforms = TransformBuffer()
     transforms.add("map", "head", 0, ((1.0, 2.0, 3.0), STILL), static=True)
-    upright = Upright(transforms, None, None, ("tf", "imu"))
+    upright = Upright(TransformWindow(transforms), None, None, ("tf", "imu"))
     lost, head, hand = (
         Frame(f"/{name}", 0, 5, 5, frame_id, points=np.zeros((1, 3)))
         for name, frame_id in (("lost", "nowhere"), ("head", "head"), ("hand", "head"))
@@ -156,7 +157,8 @@ def test_topics_differ_in_what_is_known_of_their_pose() -> None:
 
     assert upright.fixed_from_sensor(lost) is None
     assert upright.fixed_from_sensor(head) is not None
-    assert [upright.up(frame) is None for frame in (lost, head, hand)] == [True, False, True]
+    ups = [upright.accept(frame.topic, upright.orient(frame)) for frame in (lost, head, hand)]
+    assert [up is None for up in ups] == [True, False, True]
 
 
 def test_a_static_transform_that_is_published_again_replaces_the_first() -> None:

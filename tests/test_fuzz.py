@@ -110,8 +110,7 @@ def read(path: Path) -> Outcome:
             upright = Upright.of(recording, up="auto", fixed_frame=None)
             stamps = []
             for frame in frames(recording, streams, skipped=skipped):
-                upright.up(frame)
-                upright.fixed_from_sensor(frame)
+                upright.accept(frame.topic, upright.orient(frame))
                 stamps.append(frame.stamp_ns)
             said = " ".join([*recording.warnings, *skipped])
             return Outcome(0 if stamps else 4, frozenset(stamps), len(stamps), said)

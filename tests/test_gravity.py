@@ -11,7 +11,8 @@ from shapecat.errors import ConfigError
 from shapecat.geometry import IDENTITY
 from shapecat.pipeline import process
 from shapecat.recordings import open_recording
-from shapecat.recordings.gravity import Upright
+from shapecat.recordings.gravity import Orientation, Upright
+from shapecat.recordings.transform_window import TransformWindow
 from shapecat.recordings.transforms import TransformBuffer
 from shapecat.runs import perceiving
 from shapecat.runs.folder import read_run
@@ -54,8 +55,8 @@ def test_up_from_an_imu_is_smoothed_and_turned_into_the_sensor_frame(tmp_path: P
         items.append(("/fake", stamp, imu(stamp, [9, 9, 9], absent=True)))
     with open_recording(write(tmp_path / "a.mcap", items)) as recording:
         upright = Upright.of(recording, up="imu", fixed_frame=None)
-        up = upright.up(frame(EPOCH + SECOND))
-        late = upright.up(frame(EPOCH + 60 * SECOND))
+        up = upright.orient(frame(EPOCH + SECOND)).up
+        late = upright.orient(frame(EPOCH + 60 * SECOND)).up
 
     assert up is not None
     assert np.degrees(np.arccos(up @ (TURN.T @ [0, 0, 1]))) < 3
@@ -70,7 +71,7 @@ def test_an_imu_without_stamps_is_read_at_its_log_times(tmp_path: Path) -> None:
     ]
     with open_recording(write(tmp_path / "a.mcap", items)) as recording:
         upright = Upright.of(recording, up="imu", fixed_frame=None)
-        found = [upright.up(frame(EPOCH + k * SECOND)) for k in (0, 3, 7)]
+        found = [upright.orient(frame(EPOCH + k * SECOND)).up for k in (0, 3, 7)]
 
     assert [None if up is None else up.tolist() for up in found] == [[0, -1, 0], None, [1, 0, 0]]
 
@@ -83,7 +84,7 @@ def test_an_imu_that_is_logged_late_is_read_at_its_stamps(tmp_path: Path) -> Non
     ]
     with open_recording(write(tmp_path / "a.mcap", items)) as recording:
         upright = Upright.of(recording, up="imu", fixed_frame=None)
-        found = [upright.up(frame(EPOCH + k * SECOND)) for k in (1, 8, 15)]
+        found = [upright.orient(frame(EPOCH + k * SECOND)).up for k in (1, 8, 15)]
 
     assert [None if up is None else up.tolist() for up in found] == [[0, -1, 0], [1, 0, 0], None]
 
@@ -139,17 +140,18 @@ def test_an_up_is_dropped_only_if_no_plane_confirms_it(
     monkeypatch: pytest.MonkeyPatch, off_deg: tuple[float | None, ...], *, dropped: bool
 ) -> None:
     """A cupboard in view at the start must not override a correct up direction."""
-    upright: Any = Upright(TransformBuffer(), None, None, ("tf", "imu"))
-    upright.preview = lambda _: ("tf", np.array([0.0, -1.0, 0.0]))
+    upright = Upright(TransformWindow(TransformBuffer()), None, None, ("tf", "imu"))
+    given = Orientation("tf", np.array([0.0, -1.0, 0.0]), None)
     angles = [None if off is None else np.radians(off) for off in off_deg]
     found = [None if a is None else np.array([0, -np.cos(a), -np.sin(a)]) for a in angles]
     planes = iter(found)
     monkeypatch.setattr(perceiving, "find_up", lambda *_: next(planes))
     frames = [frame(EPOCH + k) for k in range(len(off_deg))]
 
-    read = list(perceiving._UpTrial(upright, Settings()).before((one, None) for one in frames))
+    source = ((one, None, given) for one in frames)
+    read = list(perceiving._UpTrial(upright, Settings()).before(source))
 
-    assert [one for one, _ in read] == frames
+    assert [one for one, *_ in read] == frames
     assert upright.dropped == ({"/d": "tf"} if dropped else {})
 
 
@@ -166,20 +168,18 @@ def test_the_imu_stands_in_where_transforms_do_not_reach(tmp_path: Path) -> None
         ("/imu", EPOCH, imu(EPOCH, [0, -9.8, 0], "camera")),
     ]
     with open_recording(write(tmp_path / "a.mcap", items)) as recording:
-        up = Upright.of(recording, up="auto", fixed_frame=None).up(frame(EPOCH))
+        up = Upright.of(recording, up="auto", fixed_frame=None).orient(frame(EPOCH)).up
 
     assert up is not None
     np.testing.assert_allclose(up, [0, -1, 0], atol=1e-6)
 
 
-def test_a_failed_look_up_is_counted_once(tmp_path: Path) -> None:
-    """Frames are previewed before use, so the warning could count some twice."""
+def test_every_failed_look_up_is_counted(tmp_path: Path) -> None:
     items = [("/tf", EPOCH, MAKE.transforms([("map", "elsewhere", IDENTITY)], EPOCH))]
     with open_recording(write(tmp_path / "a.mcap", items)) as recording:
         upright = Upright.of(recording, up="auto", fixed_frame=None)
     for stamp in (EPOCH, EPOCH + 1):
-        upright.preview(frame(stamp))
-        assert upright.up(frame(stamp)) is None
+        assert upright.orient(frame(stamp)).up is None
     upright.report([])
 
     (warning,) = upright.warnings

@@ -214,7 +214,7 @@ def test_the_recorder_of_librealsense_tells_where_its_streams_are(tmp_path: Path
         (stream,) = choose_streams(recording)
         found = choose_colour(recording, stream)
         assert found is not None
-        pose = Extrinsics(recording, stream, found).colour_from_depth("0", "0", EPOCH)
+        pose = Extrinsics(recording, stream, found).colour_from_depth("0", "0", EPOCH, EPOCH)
 
     depth, seen = (Rotation.from_quat(turns[name]) for name in ("Depth_0", "Color_0"))
     assert pose is not None

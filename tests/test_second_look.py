@@ -15,6 +15,7 @@ import pytest
 from shapecat.config import Settings
 from shapecat.geometry import IDENTITY
 from shapecat.pipeline import process
+from shapecat.recordings.gravity import Orientation
 from shapecat.runs import perceiving
 from shapecat.runs.folder import read_run
 from shapecat.runs.jobs import Job
@@ -353,7 +354,6 @@ def test_each_camera_is_asked_whether_its_planes_confirm_up(
     monkeypatch.setattr(perceiving, "find_up", lambda frame, _: planes[frame.topic])
     doubted: list[tuple[str, str, int]] = []
     upright: Any = SimpleNamespace(
-        preview=lambda frame: (f"tf of {frame.topic}", level),
         contradict=lambda topic, source, angles: doubted.append((topic, source, len(angles))),
     )
     names = [*["/blind"] * 4, "/good", "/bad"] * 4
@@ -362,9 +362,10 @@ def test_each_camera_is_asked_whether_its_planes_confirm_up(
     ]
     trial = perceiving._UpTrial(upright, Settings())
 
-    seen = list(trial.before((frame, None) for frame in frames))
+    told = {name: Orientation(f"tf of {name}", level, None) for name in planes}
+    seen = list(trial.before((frame, None, told[frame.topic]) for frame in frames))
 
-    assert [frame.index for frame, _ in seen] == list(range(len(frames)))
+    assert [frame.index for frame, *_ in seen] == list(range(len(frames)))
     assert doubted == [("/bad", "tf of /bad", 3)]
 
 

@@ -199,7 +199,9 @@ class _Partner:
         if lens is None:
             msg = "colour images without a sensor_msgs/CameraInfo"
             raise MessageError(msg)
-        pose = self._extrinsics.colour_from_depth(frame.frame_id, image.frame_id, frame.stamp_ns)
+        pose = self._extrinsics.colour_from_depth(
+            frame.frame_id, image.frame_id, frame.log_time_ns, frame.stamp_ns
+        )
         if pose is not None:
             return ColourView(image, lens, pose)
         if same_shape and _alike(

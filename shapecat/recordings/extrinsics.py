@@ -1,6 +1,7 @@
 """The pose of the depth sensor in the frame of the colour camera."""
 
 from contextlib import suppress
+from functools import cached_property
 from typing import Any
 
 import numpy as np
@@ -10,6 +11,7 @@ from shapecat.geometry import IDENTITY, compose, inverse, rotation_from_quaterni
 from shapecat.recordings.colour_streams import ColourStream
 from shapecat.recordings.recording import Recording
 from shapecat.recordings.streams import Stream, first_message
+from shapecat.recordings.transform_window import TransformWindow
 from shapecat.recordings.transforms import (
     ExtrapolationError,
     TransformBuffer,
@@ -34,15 +36,28 @@ class Extrinsics:
         """Store the streams; transforms are read on first use."""
         self._recording = recording
         self._depth, self._colour = depth, colour
-        self._buffers: list[TransformBuffer | None] = [None, None]
         self._fixed: Pose | None = None
         self._looked = False
         self._static: dict[tuple[str, str], Pose] = {}
 
-    def colour_from_depth(self, depth_frame: str, colour_frame: str, stamp_ns: int) -> Pose | None:
+    @cached_property
+    def _still(self) -> TransformBuffer:
+        return read_transforms(self._recording, static_only=True)
+
+    @cached_property
+    def _moving(self) -> TransformWindow:
+        return TransformWindow.of(self._recording)
+
+    def colour_from_depth(
+        self, depth_frame: str, colour_frame: str, log_time_ns: int, stamp_ns: int
+    ) -> Pose | None:
         """Return ``colour_from_depth`` at a time, or None if the recording does not hold it.
 
-        ``depth_frame`` and ``colour_frame`` are the frame ids of the messages.
+        Parameters
+        ----------
+        depth_frame, colour_frame : frame ids of the messages.
+        log_time_ns, stamp_ns : those of the depth image, nanoseconds. Images come in the order of
+            the recording.
         """
         recorder = self._depth.topic.startswith("/device_")  # whose frame ids are numbers
         if depth_frame == colour_frame and not recorder:
@@ -50,24 +65,23 @@ class Extrinsics:
         frames = depth_frame, colour_frame
         if frames in self._static:
             return self._static[frames]
-        for number in (0, 1) if not recorder else ():
-            pose = self._lookup(number, depth_frame, colour_frame, stamp_ns)
+        if not recorder:
+            pose = self._lookup(self._still, depth_frame, colour_frame, stamp_ns)
             if pose is not None:
-                if number == 0:
-                    self._static[frames] = pose
+                self._static[frames] = pose
+                return pose
+            moving = self._moving.around(log_time_ns, stamp_ns)
+            pose = self._lookup(moving, depth_frame, colour_frame, stamp_ns)
+            if pose is not None:
                 return pose
         if not self._looked:
             self._looked, self._fixed = True, self._realsense()
         return self._fixed
 
     def _lookup(
-        self, number: int, depth_frame: str, colour_frame: str, stamp_ns: int
+        self, buffer: TransformBuffer, depth_frame: str, colour_frame: str, stamp_ns: int
     ) -> Pose | None:
-        """Look up a transform, static if ``number`` is 0, any if it is 1; None if missing."""
-        buffer = self._buffers[number]
-        if buffer is None:
-            buffer = read_transforms(self._recording, static_only=number == 0)
-            self._buffers[number] = buffer
+        """Look up a transform; None if it is missing."""
         with suppress(TransformError):
             try:
                 return buffer.lookup(colour_frame, depth_frame, stamp_ns)

@@ -2,24 +2,20 @@
 
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, field
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 import pyarrow as pa
 
 from shapecat.arrays import F4
 from shapecat.errors import ConfigError
-from shapecat.recordings.imu import Accelerometer, read_accelerometers
+from shapecat.recordings.imu import Accelerometers
 from shapecat.recordings.recording import Recording
-from shapecat.recordings.transforms import (
-    TransformBuffer,
-    TransformError,
-    fixed_frame,
-    read_transforms,
-)
+from shapecat.recordings.transform_window import TransformWindow
+from shapecat.recordings.transforms import TransformError, fixed_frame
 from shapecat.types import Frame, Pose
 
-__all__ = ["Upright"]
+__all__ = ["Orientation", "Upright"]
 
 _LEVEL_FRAMES = ("map", "odom", "world", "earth", "base_footprint", "base_link")
 """Frames whose z axis is up by convention (REP 105, REP 103)."""
@@ -27,9 +23,26 @@ _SOURCES = {"auto": ("tf", "imu"), "tf": ("tf",), "imu": ("imu",)}
 _DISAGREE_DEG = 10
 
 
+class Orientation(NamedTuple):
+    """What a recording tells about the sensor in a frame.
+
+    Attributes
+    ----------
+    source : source of ``up``; empty without one.
+    up : (3,) the up direction in the sensor frame, a unit vector; None if unknown.
+    fixed_from_sensor : the pose of the sensor in the fixed frame; None if unknown.
+    """
+
+    source: str
+    up: F4 | None
+    fixed_from_sensor: Pose | None
+
+
 @dataclass
 class Upright:
     """The up direction, and the pose of the sensor in the fixed frame, for each frame.
+
+    Frames are looked up in the order of the recording, since little is kept of what came before.
 
     Attributes
     ----------
@@ -40,11 +53,11 @@ class Upright:
     dropped : for each topic whose given up direction is ignored, the source of that direction.
     """
 
-    transforms: TransformBuffer
+    transforms: TransformWindow
     fixed_frame: str | None
     vector: F4 | None
     sources: tuple[str, ...]
-    accelerometers: tuple[Accelerometer, ...] = ()
+    accelerometers: Accelerometers | None = None
     warnings: list[str] = field(default_factory=list)
     dropped: dict[str, str] = field(default_factory=dict)
     _failed: int = 0
@@ -53,7 +66,7 @@ class Upright:
 
     @classmethod
     def of(cls, recording: Recording, *, up: str, fixed_frame: str | None) -> "Upright":
-        """Read the transforms and accelerometers of a recording.
+        """Read the first transforms and accelerations of a recording.
 
         Parameters
         ----------
@@ -67,43 +80,41 @@ class Upright:
         """
         sources = _SOURCES.get(up, ())
         vector = None if sources else _parse_vector(up)
-        transforms = read_transforms(recording)
-        if fixed_frame is not None and fixed_frame not in transforms.frames:
-            known = ", ".join(sorted(transforms.frames)) or "none, it has no transforms"
+        transforms = TransformWindow.of(recording)
+        known_frames = transforms.tree.frames
+        if fixed_frame is not None and fixed_frame not in known_frames:
+            known = ", ".join(known_frames) or "none, it has no transforms"
             msg = f"--fixed-frame {fixed_frame}: not in {recording.path}; its frames: {known}"
             raise ConfigError(msg)
-        if up == "tf" and not set(_LEVEL_FRAMES) & set(transforms.frames):
+        if up == "tf" and not set(_LEVEL_FRAMES) & set(known_frames):
             msg = (
                 f"--up tf: {recording.path} has no transforms to any of {', '.join(_LEVEL_FRAMES)}"
             )
             raise ConfigError(msg)
-        found = read_accelerometers(recording) if "imu" in sources else ()
-        if up == "imu" and not found:
+        found = Accelerometers(recording) if "imu" in sources else None
+        if up == "imu" and not (found and found.measure_anything()):
             msg = f"--up imu: {recording.path} has no sensor_msgs/Imu with accelerations"
             raise ConfigError(msg)
         return cls(transforms, fixed_frame, vector, sources, found)
 
+    def orient(self, frame: Frame) -> Orientation:
+        """Look up what the recording tells about the sensor in a frame."""
+        return Orientation(*self._find(frame), self.fixed_from_sensor(frame))
+
     def fixed_from_sensor(self, frame: Frame) -> Pose | None:
         """Return the pose of the sensor in the fixed frame, or None if it is unknown."""
         if self.fixed_frame is None:
-            self.fixed_frame = fixed_frame(self.transforms, frame.frame_id)
+            self.fixed_frame = fixed_frame(self.transforms.tree, frame.frame_id)
         if self.fixed_frame is None:
             return None
         return self._lookup(self.fixed_frame, frame)
 
-    def up(self, frame: Frame) -> F4 | None:
-        """Return the up direction in the sensor frame, a unit vector (3,); None if unknown."""
-        source, vector = ("", None) if frame.topic in self.dropped else self._find(frame)
-        source = "planes" if vector is None else source
+    def accept(self, topic: str, orientation: Orientation) -> F4 | None:
+        """Count where an up direction comes from, and return it; None if the topic's is dropped."""
+        up = None if topic in self.dropped else orientation.up
+        source = "planes" if up is None else orientation.source
         self._given[source] = self._given.get(source, 0) + 1
-        return vector
-
-    def preview(self, frame: Frame) -> tuple[str, F4 | None]:
-        """Return the source of a frame's up direction, and `up`; do not count the look-up."""
-        counted = self._failed, self._first_failure
-        answer = self._find(frame)
-        self._failed, self._first_failure = counted
-        return answer
+        return up
 
     def _find(self, frame: Frame) -> tuple[str, F4 | None]:
         if not self.sources:
@@ -120,7 +131,7 @@ class Upright:
 
         Parameters
         ----------
-        source : source of the up direction, as `preview` returns it.
+        source : source of the up direction, as in `Orientation`.
         angles_deg : angles between the up direction and that of the planes, one per frame.
         """
         off = f"differs by {np.median(angles_deg):.0f} degrees from the planes of {topic}"
@@ -134,14 +145,17 @@ class Upright:
             self.warnings.append(f"up ({source}) {off} and is ignored; give --up {name} to use it")
 
     def _from_transforms(self, frame: Frame) -> tuple[str, F4 | None]:
-        for level in (name for name in _LEVEL_FRAMES if name in self.transforms.frames):
+        frames = self.transforms.tree.frames
+        for level in (name for name in _LEVEL_FRAMES if name in frames):
             pose = self._lookup(level, frame)
             if pose is not None:
                 return f"transforms, z of {level}", np.asarray(pose.rotation[2], np.float32)
         return "", None
 
     def _from_accelerometer(self, frame: Frame) -> tuple[str, F4 | None]:
-        for sensor in self.accelerometers:
+        if self.accelerometers is None:
+            return "", None
+        for sensor in self.accelerometers.around(frame.log_time_ns, frame.stamp_ns):
             up = sensor.up(frame.stamp_ns)
             pose = None
             if sensor.frame_id != frame.frame_id:
@@ -152,8 +166,9 @@ class Upright:
         return "", None
 
     def _lookup(self, target: str, frame: Frame) -> Pose | None:
+        transforms = self.transforms.around(frame.log_time_ns, frame.stamp_ns)
         try:
-            return self.transforms.lookup(target, frame.frame_id, frame.stamp_ns)
+            return transforms.lookup(target, frame.frame_id, frame.stamp_ns)
         except TransformError as error:
             self._failed += 1
             self._first_failure = self._first_failure or str(error)

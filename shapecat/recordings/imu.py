@@ -1,15 +1,17 @@
 """Accelerometers: at rest they measure the reaction to gravity, which points up."""
 
 from dataclasses import dataclass, field
+from functools import cached_property
 
 import numpy as np
 
 from shapecat.arrays import F8
-from shapecat.recordings.messages import MessageError
+from shapecat.recordings.look_ahead import LookAhead
+from shapecat.recordings.messages import Message, MessageError
 from shapecat.recordings.recording import Recording
 from shapecat.recordings.stamps import stamp_ns
 
-__all__ = ["Accelerometer", "read_accelerometers"]
+__all__ = ["Accelerometer", "Accelerometers"]
 
 IMU = "sensor_msgs/msg/Imu"
 _BIN_NS = 50_000_000
@@ -30,6 +32,10 @@ class Accelerometer:
         at = stamp // _BIN_NS
         self._sums[at] = self._sums.get(at, 0) + acceleration
 
+    def forget(self, stamp: int) -> None:
+        """Remove the measurements before a time (ns)."""
+        self._sums = {at: total for at, total in self._sums.items() if at >= stamp // _BIN_NS}
+
     def up(self, stamp: int) -> F8 | None:
         """Return the up direction in the IMU's frame around a time (ns), a unit vector (3,).
 
@@ -42,29 +48,51 @@ class Accelerometer:
         return total / norm if norm > 1e-9 else None
 
 
-def read_accelerometers(recording: Recording) -> tuple[Accelerometer, ...]:
-    """Read the accelerations of all IMU topics in one pass, sorted by topic.
+class Accelerometers:
+    """The accelerometers of a recording, with their measurements around its frames.
 
     Messages without an acceleration are left out: their first covariance is -1 (sensor_msgs/Imu),
     or all values are zero, as from a gyroscope alone.
     """
-    topics = {topic.name for topic in recording.topics if topic.type == IMU and topic.count != 0}
-    found: dict[str, Accelerometer] = {}
-    for message in recording.messages(topics) if topics else ():
+
+    def __init__(self, recording: Recording) -> None:
+        """Prepare reading; nothing is read until it is needed."""
+        self._recording = recording
+        self._found: dict[str, Accelerometer] = {}
+
+    def measure_anything(self) -> bool:
+        """Return whether the recording holds any acceleration."""
+        if not self._ahead.whole and not self._found:
+            self._ahead.read_all()
+        return bool(self._found)
+
+    def around(self, log_time_ns: int, stamp_ns: int) -> list[Accelerometer]:
+        """Return the accelerometers, sorted by topic, for a frame with this log time and stamp."""
+        self._ahead.reach(log_time_ns, stamp_ns)
+        return [self._found[topic] for topic in sorted(self._found)]
+
+    @cached_property
+    def _ahead(self) -> LookAhead:
+        topics = {t.name for t in self._recording.topics if t.type == IMU and t.count != 0}
+        return LookAhead(self._recording, topics, self._take, self._forget)
+
+    def _take(self, message: Message) -> None:
         if message.type != IMU:
-            continue
+            return
         try:
-            imu = recording.decode(message)
+            imu = self._recording.decode(message)
             a, stamp = imu.linear_acceleration, stamp_ns(imu.header) or message.log_time_ns
             acceleration = np.array([a.x, a.y, a.z], np.float64)
             absent = float(imu.linear_acceleration_covariance[0]) == -1
         except (MessageError, AttributeError, LookupError, TypeError, ValueError) as error:
-            recording.warn(f"skipped an IMU message: {error}")
-            continue
+            self._recording.warn(f"skipped an IMU message: {error}")
+            return
         size = float(np.abs(acceleration).max())
         if not absent and 1e-3 < size < 1e4:
             name = str(imu.header.frame_id)
-            found.setdefault(message.topic, Accelerometer(message.topic, name)).add(
-                stamp, acceleration
-            )
-    return tuple(found[topic] for topic in sorted(found))
+            found = self._found.setdefault(message.topic, Accelerometer(message.topic, name))
+            found.add(stamp, acceleration)
+
+    def _forget(self, stamp: int) -> None:
+        for one in self._found.values():
+            one.forget(stamp)

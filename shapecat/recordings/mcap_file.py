@@ -51,7 +51,7 @@ class McapRecording(Recording):
 
     Attributes
     ----------
-    indexed : whether the file is finished and its index is complete.
+    indexed : the file is finished, and its index is complete.
     summary : schemas, channels and indexes.
     profile : ``ros2``, ``ros1`` or empty.
     """

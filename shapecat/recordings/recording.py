@@ -28,6 +28,7 @@ class Recording(ABC):
     path : the file or folder.
     topics : sorted by name; a topic with two types appears twice.
     start_ns, end_ns : log times of the first and last message; 0 if there is none.
+    indexed : whether messages are found by topic and time, without reading the rest.
     warnings : problems found in the recording, for the user.
     """
 
@@ -40,6 +41,7 @@ class Recording(ABC):
         self.topics: tuple[Topic, ...] = ()
         self.start_ns = 0
         self.end_ns = 0
+        self.indexed = True
         self.warnings: list[str] = []
         self._channels: dict[int, Channel] = {}
         self._decoders: dict[tuple[str, str, bytes], Callable[[bytes | memoryview], Any]] = {}

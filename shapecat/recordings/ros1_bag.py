@@ -68,6 +68,7 @@ class BagRecording(Recording):
             self._size = self._file.seek(0, 2)
             self._first = len(MAGIC)
             counts = self._read_index(self._read_header())
+            self.indexed = counts is not None
             if counts is None:
                 counts = self._scan()
         except BaseException:

@@ -66,6 +66,7 @@ class FolderRecording(Recording):
             self.end_ns = max(part.end_ns for part in filled)
         self._overlap = any(a.end_ns > b.start_ns for a, b in pairwise(filled))
         self.topics = _sum_topics(self._parts)
+        self.indexed = all(part.indexed for part in self._parts)
         self._note()
 
     def close(self) -> None:

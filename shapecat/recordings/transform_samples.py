@@ -45,6 +45,12 @@ class TransformTrack:
         else:
             self._set(slice(at, at), stamp, sample)
 
+    def forget(self, stamp: int) -> None:
+        """Remove the samples before the last one that is not later than a time."""
+        first = bisect_right(self.stamps, stamp) - 1
+        if first > 0:
+            del self.stamps[:first], self._parents[:first], self._numbers[: 7 * first]
+
     def _set(self, at: slice, stamp: int, sample: TransformSample) -> None:
         self.stamps[at] = array("q", [stamp])
         self._parents[at] = [sample.parent]

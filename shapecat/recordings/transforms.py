@@ -5,13 +5,14 @@ Stamps are integer nanoseconds: today's time as a float in seconds has a resolut
 
 import sys
 from bisect import bisect_right
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 
 from shapecat.errors import RecordingError, ShapecatError
 from shapecat.geometry import IDENTITY, compose, inverse
 from shapecat.recordings.foxglove import ros_counterpart
+from shapecat.recordings.messages import Message
 from shapecat.recordings.recording import Recording
 from shapecat.recordings.stamps import stamp_ns
 from shapecat.recordings.transform_samples import (
@@ -28,9 +29,12 @@ __all__ = [
     "TransformBuffer",
     "TransformError",
     "TransformLoopError",
+    "TransformReader",
+    "TransformTopics",
     "UnknownFrameError",
     "fixed_frame",
     "read_transforms",
+    "transform_topics",
 ]
 
 TF_TYPES = ("tf2_msgs/msg/TFMessage", "tf/msg/tfMessage")
@@ -73,6 +77,11 @@ class TransformBuffer:
         self._static: dict[str, TransformSample] = {}
         self._moving: dict[str, TransformTrack] = {}
         self._frames: set[str] = set()
+
+    def forget(self, stamp_ns: int) -> None:
+        """Remove the transforms before a time, except the last one of each frame before it."""
+        for track in self._moving.values():
+            track.forget(stamp_ns)
 
     @property
     def frames(self) -> tuple[str, ...]:
@@ -250,34 +259,64 @@ def read_transforms(
     tolerance_ns : as for `TransformBuffer`.
     static_only : read only static transforms, which are few: their topics end in ``tf_static``.
     """
-    buffer = TransformBuffer(tolerance_ns=tolerance_ns)
-    topics = {
-        topic.name
-        for topic in recording.topics
-        if ros_counterpart(topic.type) in TF_TYPES
-        and (topic.name.endswith("tf_static") or not static_only)
-    }
-    refused = 0
+    reader = TransformReader(recording, TransformBuffer(tolerance_ns=tolerance_ns))
+    static, moving = transform_topics(recording)
+    topics = static if static_only else static | moving
     for message in recording.messages(topics) if topics else ():
+        reader.take(message)
+    return reader.buffer
+
+
+class TransformTopics(NamedTuple):
+    """The topics with static transforms, and those with others."""
+
+    static: set[str]
+    moving: set[str]
+
+
+def transform_topics(recording: Recording) -> TransformTopics:
+    """Return the topics of a recording that hold transforms."""
+    topics = {t.name for t in recording.topics if ros_counterpart(t.type) in TF_TYPES}
+    static = {name for name in topics if name.endswith("tf_static")}
+    return TransformTopics(static, topics - static)
+
+
+class TransformReader:
+    """Adds the transforms in messages to a buffer.
+
+    Attributes
+    ----------
+    lag_ns : the largest difference between stamp and log time of a transform that is not static.
+    """
+
+    def __init__(self, recording: Recording, buffer: TransformBuffer) -> None:
+        """Read messages of ``recording`` into ``buffer``."""
+        self.buffer = buffer
+        self.lag_ns = 0
+        self._recording = recording
+
+    def take(self, message: Message) -> None:
+        """Add the transforms in a message; invalid ones cause a warning."""
         if ros_counterpart(message.type) not in TF_TYPES:
-            continue
+            return
+        static = message.topic.endswith("tf_static")
         try:
-            for transform in recording.decode(message).transforms:
-                refused += not _add(buffer, transform, static=message.topic.endswith("tf_static"))
+            for transform in self._recording.decode(message).transforms:
+                if not self._add(transform, static=static):
+                    self._recording.warn("skipped invalid transforms (NaN, no name)")
+                if not static:
+                    lag = abs(stamp_ns(transform.header) - message.log_time_ns)
+                    self.lag_ns = max(self.lag_ns, lag)
         except (AttributeError, TypeError, ValueError, RecordingError) as error:
-            recording.warn(f"skipped transforms: {error}")
-    if refused:
-        recording.warn(f"skipped invalid transforms (NaN, no name): {refused}")
-    return buffer
+            self._recording.warn(f"skipped transforms: {error}")
 
-
-def _add(buffer: TransformBuffer, transform: Any, *, static: bool) -> bool:
-    """Add a decoded geometry_msgs/TransformStamped; return False if it is invalid."""
-    move, turn = transform.transform.translation, transform.transform.rotation
-    return buffer.add(
-        transform.header.frame_id,
-        transform.child_frame_id,
-        stamp_ns(transform.header),
-        ((move.x, move.y, move.z), (turn.x, turn.y, turn.z, turn.w)),
-        static=static,
-    )
+    def _add(self, transform: Any, *, static: bool) -> bool:
+        """Add a decoded geometry_msgs/TransformStamped; return False if it is invalid."""
+        move, turn = transform.transform.translation, transform.transform.rotation
+        return self.buffer.add(
+            transform.header.frame_id,
+            transform.child_frame_id,
+            stamp_ns(transform.header),
+            ((move.x, move.y, move.z), (turn.x, turn.y, turn.z, turn.w)),
+            static=static,
+        )

@@ -22,7 +22,7 @@ from shapecat.executors.order import Processes
 from shapecat.learning import Categorizer
 from shapecat.perception import Perceiver, View, find_up
 from shapecat.recordings import Recording
-from shapecat.recordings.gravity import Upright
+from shapecat.recordings.gravity import Orientation, Upright
 from shapecat.rehearsal import rehearse
 from shapecat.runs.jobs import Job
 from shapecat.runs.perceived import FrameRow, PerceptionTables
@@ -47,6 +47,8 @@ _DOUBTS, _LOOKS = 3, 10
 
 _Reading = tuple[Frame, ColourView | None]
 """A frame and its colour image; None if it has none."""
+_Oriented = tuple[Frame, ColourView | None, Orientation]
+"""The same, and what the recording tells about the sensor."""
 
 
 class Work(NamedTuple):
@@ -81,13 +83,17 @@ def perceive_all(work: Work) -> None:
             processes.start()
         upright = Upright.of(recording, up=job.up, fixed_frame=job.fixed_frame)
 
-        def view(reading: _Reading) -> tuple[FrameRow, View]:
-            frame, colour = reading
-            up, pose = upright.up(frame), upright.fixed_from_sensor(frame)
+        def view(reading: _Oriented) -> tuple[FrameRow, View]:
+            frame, colour, orientation = reading
+            pose = orientation.fixed_from_sensor
+            up = upright.accept(frame.topic, orientation)
             row = FrameRow(frame.log_time_ns, pose, up)
             return row, View(frame, up, recent.before(frame, pose), pose, colour)
 
-        source = _readings(recording, run, job, skipped)
+        source = (
+            (frame, colour, upright.orient(frame))
+            for frame, colour in _readings(recording, run, job, skipped)
+        )
         views = map(view, _UpTrial(upright, job.settings).before(source))
         for count, _ in enumerate(stopping.until_asked(islice(views, tables.done)), start=1):
             observe("perceive", count, total)
@@ -172,14 +178,14 @@ class _UpTrial:
         self._looks: Counter[str] = Counter()
         self._decided: set[str] = set()
 
-    def before(self, source: Iterator[_Reading]) -> Iterator[_Reading]:
+    def before(self, source: Iterator[_Oriented]) -> Iterator[_Oriented]:
         """Yield all frames, but hold the first ones back until the up directions are decided."""
-        held: list[_Reading] = []
+        held: list[_Oriented] = []
         for reading in source:
-            frame, _ = reading
+            frame, _, orientation = reading
             held.append(reading)
             if frame.topic not in self._decided:
-                self._look(frame)
+                self._look(frame, orientation)
             if self._looks.keys() <= self._decided:
                 yield from held
                 held.clear()
@@ -187,14 +193,14 @@ class _UpTrial:
             self._decide(topic)
         yield from held
 
-    def _look(self, frame: Frame) -> None:
+    def _look(self, frame: Frame, orientation: Orientation) -> None:
         self._looks[frame.topic] += 1
         off = self._off_deg.setdefault(frame.topic, [])
-        source, given = self._upright.preview(frame)
+        given = orientation.up
         found = None if given is None else find_up(frame, self._settings)
         if given is not None and found is not None:
             off.append(float(np.degrees(np.arccos(np.clip(given @ found, -1, 1)))))
-            self._sources[frame.topic] = source
+            self._sources[frame.topic] = orientation.source
         enough = len(off) == _DOUBTS or self._looks[frame.topic] == _LOOKS
         if enough or min(off, default=np.inf) <= _CONFIRMS_DEG:
             self._decide(frame.topic)

@@ -1,0 +1,88 @@
+"""Read messages that frames look up by time shortly before they are needed.
+
+The transforms and accelerations of hours would fill the memory, and reading them all first would
+delay the first frame.
+"""
+
+from collections.abc import Callable, Collection, Iterator
+
+from shapecat.recordings.messages import Message
+from shapecat.recordings.recording import Recording
+
+__all__ = ["AROUND_NS", "LookAhead", "is_read_at_once"]
+
+AROUND_NS = 10_000_000_000
+"""Messages are known from this long before a frame to this long after it. Drivers log a message at
+most seconds after its stamp, and a transform is published more often than this."""
+
+
+def is_read_at_once(recording: Recording) -> bool:
+    """Return whether a recording is short, or has no index to read a part without the rest."""
+    return recording.end_ns - recording.start_ns <= 2 * AROUND_NS or not recording.indexed
+
+
+class LookAhead:
+    """Hands over the messages of some topics, from shortly before the frames to shortly after them.
+
+    Attributes
+    ----------
+    whole : whether all messages have been handed over: if `is_read_at_once`, or after `read_all`.
+    """
+
+    def __init__(
+        self,
+        recording: Recording,
+        topics: Collection[str],
+        take: Callable[[Message], None],
+        forget: Callable[[int], None],
+    ) -> None:
+        """Hand over the first messages.
+
+        Parameters
+        ----------
+        take : called with each message, in the order of the recording.
+        forget : called with a stamp (ns): earlier messages are no longer needed, except the last
+            one before it.
+        """
+        self._recording, self._topics = recording, topics
+        self._take, self._forget = take, forget
+        self._stamp_ns: int | None = None
+        self._forgotten_ns = 0
+        self.whole = is_read_at_once(recording)
+        self._read_from(recording.start_ns)
+
+    def read_all(self) -> None:
+        """Hand over all messages that are left, and forget none from now on."""
+        self.whole = True
+        self._read_until(None)
+
+    def reach(self, log_time_ns: int, stamp_ns: int) -> None:
+        """Hand over what a frame may look up, given its log time and stamp in nanoseconds."""
+        if self.whole:
+            return
+        if log_time_ns > self._reached_ns + AROUND_NS:  # the frames begin later, or have a gap
+            self._read_from(log_time_ns - AROUND_NS)
+        self._read_until(log_time_ns + AROUND_NS)
+        # The earlier of two stamps, since one may be wrong.
+        before = stamp_ns if self._stamp_ns is None else min(stamp_ns, self._stamp_ns)
+        before, self._stamp_ns = before - 2 * AROUND_NS, stamp_ns
+        if abs(before - self._forgotten_ns) > AROUND_NS:
+            self._forgotten_ns = before
+            self._forget(before)
+
+    def _read_from(self, log_time_ns: int) -> None:
+        start = None if self.whole else log_time_ns
+        self._messages: Iterator[Message] = (
+            self._recording.messages(self._topics, start_ns=start) if self._topics else iter(())
+        )
+        self._next = next(self._messages, None)
+        self._read_until(None if self.whole else log_time_ns + AROUND_NS)
+
+    def _read_until(self, log_time_ns: int | None) -> None:
+        """Hand over the messages up to a log time, all if it is None."""
+        while self._next is not None and (
+            log_time_ns is None or self._next.log_time_ns <= log_time_ns
+        ):
+            self._take(self._next)
+            self._next = next(self._messages, None)
+        self._reached_ns = log_time_ns or self._recording.end_ns

@@ -1,0 +1,60 @@
+"""The transforms of a recording around its frames, in constant memory."""
+
+from copy import deepcopy
+
+from shapecat.recordings.look_ahead import AROUND_NS, LookAhead, is_read_at_once
+from shapecat.recordings.recording import Recording
+from shapecat.recordings.transforms import (
+    TransformBuffer,
+    TransformReader,
+    read_transforms,
+    transform_topics,
+)
+
+__all__ = ["TransformWindow"]
+
+_LAG_NS = AROUND_NS // 2
+"""If transforms are logged farther from their stamps, all are read at once."""
+
+
+class TransformWindow:
+    """The transforms that are known when a frame looks one up.
+
+    Attributes
+    ----------
+    tree : the static transforms, and the others from the first and the last seconds of the
+        recording. They tell which frames there are, and their parents.
+    """
+
+    def __init__(
+        self,
+        known: TransformBuffer,
+        tree: TransformBuffer | None = None,
+        ahead: LookAhead | None = None,
+    ) -> None:
+        """Use ``known``, which ``ahead`` keeps filled; without it, these are all transforms."""
+        self.tree = known if tree is None else tree
+        self._known, self._ahead = known, ahead
+
+    @classmethod
+    def of(cls, recording: Recording) -> "TransformWindow":
+        """Read the static transforms of a recording, and the first and last of the others."""
+        topics = transform_topics(recording).moving
+        known = read_transforms(recording, static_only=not is_read_at_once(recording))
+        if is_read_at_once(recording) or not topics:
+            return cls(known)
+        reader = TransformReader(recording, known)
+        ahead = LookAhead(recording, topics, reader.take, known.forget)
+        end = TransformReader(recording, deepcopy(known))
+        for message in recording.messages(topics, start_ns=recording.end_ns - AROUND_NS):
+            end.take(message)
+        if max(reader.lag_ns, end.lag_ns) <= _LAG_NS:
+            return cls(known, end.buffer, ahead)
+        ahead.read_all()
+        return cls(known)
+
+    def around(self, log_time_ns: int, stamp_ns: int) -> TransformBuffer:
+        """Return the transforms for a frame, given its log time and stamp in nanoseconds."""
+        if self._ahead is not None:
+            self._ahead.reach(log_time_ns, stamp_ns)
+        return self._known
