@@ -31,9 +31,12 @@ def view(*, run: Path, web: bool, screenshot: Path | None) -> None:
     shapecat view results/lab --screenshot lab.png
     """
     from shapecat.outputs.review_viewer import open_viewer, take_screenshot
+    from shapecat.runs.folder import read_run
     from shapecat.system.files import require_writable
 
-    review = run / "review.rrd" if run.is_dir() else run
+    review = run if run.is_file() else run / "review.rrd"
+    if not review.is_file():
+        read_run(run)  # if there is no run, says that
     if screenshot is not None:
         require_writable(screenshot)
         take_screenshot(review, screenshot)

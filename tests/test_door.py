@@ -270,6 +270,20 @@ def test_view_without_a_display_says_what_to_do(
     assert result.stderr.count("\n") == 1
 
 
+def test_view_tells_a_missing_run_from_a_missing_review(
+    shapecat: Run, runs: Path, tmp_path: Path
+) -> None:
+    """A mistyped path, or a folder of runs, must not seem to call for processing again."""
+    for path in (tmp_path / "nothing", runs, runs / "a"):
+        result = shapecat("view", path)
+        assert result.exit_code == 1
+        assert f"{path}: no run.json there" in result.stderr
+
+    result = shapecat("view", runs / "a" / "lab")
+    assert result.exit_code == 1
+    assert "no review there; process the recording without --no-rrd" in result.stderr
+
+
 def listening(pid: int) -> set[str]:
     """Return the addresses on which a process and its children listen."""
     inodes = set()
