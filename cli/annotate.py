@@ -6,7 +6,7 @@ from typing import Any
 import click
 
 from .options import ANY_PATH, boxes_option, recording_option
-from .render import missed_words, progress_bars
+from .render import changed_labels, missed_words, progress_bars
 
 
 @click.command()
@@ -48,14 +48,28 @@ def annotate(
     if by_place and labels is None:
         msg = "--by-place needs --labels, the folder or the table of the other run"
         raise click.UsageError(msg)
+    before = _labels_of(run)
     with progress_bars() as bars:
         transfer = annotate_again(
             run, labels, bars, by_place=by_place, boxes=boxes, recording=recording
         )
     written = [name for name in OUTPUTS if (run / name).exists()]
     click.echo(f"{run}: wrote {' and '.join(written) or 'no file but its tables'}")
+    if changes := changed_labels(before, _labels_of(run)):
+        click.echo(f"{run}: {changes}")
     if transfer is not None:
         _show(transfer.as_dict(), labels)
+
+
+def _labels_of(run: Path) -> dict[int, str]:
+    """Return the label of each track of a run; none if it has no readable table."""
+    from shapecat.errors import OutputError
+    from shapecat.runs.track_table import read_track_table
+
+    try:
+        return {row.track: row.label for row in read_track_table(run / "tracks.csv").rows}
+    except OutputError:
+        return {}
 
 
 def _show(transfer: dict[str, Any], labels: Path | None) -> None:

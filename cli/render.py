@@ -7,6 +7,7 @@ from typing import Any
 
 import click
 
+from shapecat.outputs.counts import plural
 from shapecat.system import stopping
 
 PHASES = {
@@ -93,6 +94,16 @@ def print_table(
 def missed_words(missed: Mapping[str, Any]) -> str:
     """Describe a label that was not transferred, with the reason."""
     return f"  track {missed['old_track']}, {missed['label']}: {missed['reason']}"
+
+
+def changed_labels(before: Mapping[int, str], after: Mapping[int, str]) -> str:
+    """Describe how the labels of tracks changed: ``2 labels set, 1 cleared (#3 bowl)``."""
+    given = [k for k, label in after.items() if label and label != before.get(k)]
+    cleared = [f"#{k} {label}" for k, label in before.items() if label and not after.get(k)]
+    parts = [f"{plural(len(given), 'label')} set"] if given else []
+    if cleared:
+        parts.append(f"{plural(len(cleared), 'label')} cleared ({', '.join(cleared)})")
+    return ", ".join(parts)
 
 
 def count_words(counts: Mapping[str, int]) -> str:

@@ -98,6 +98,8 @@ def test_names_of_categories(run: Path, label: str, meant: str) -> None:
         ("7", "is not a category"),
         ("../../etc", "is not a category"),
         ("a/b", "is not a category"),
+        ("merge", "is not a category"),
+        ("del", "is not a category"),
         (".", "is not a category"),
         ("x" * 61, "is not a category"),
     ],
@@ -228,6 +230,40 @@ def test_a_label_that_was_not_applied_yet_is_not_original(run: Path) -> None:
     for folder in (run, other):
         assert (folder / "tracks.original.csv").read_text() == ORIGINAL
     assert read_labels(other / "tracks.csv")[4].category == "bowl"
+
+
+def test_a_page_that_is_out_of_date_undoes_nothing(run: Path) -> None:
+    """It holds the labels of all tracks as they were when it was made."""
+    corrected = run.parent / "mine.csv"
+    corrected.write_text(labelled(t4="bowl", t1="box"))
+    adopt_labels(corrected, run)
+    header, *lines = labelled(t2="plate", t1="can").splitlines()
+    corrected.write_text("\n".join([f"{header},label_seen", *(f"{line}," for line in lines)]))
+    adopt_labels(corrected, run)
+
+    labels = read_labels(run / "tracks.csv")
+    assert [labels[k].category for k in (4, 2, 1, 3)] == ["bowl", "plate", "can", "cup"]
+    assert "label_seen" not in (run / "tracks.csv").read_text()
+    assert (run / "tracks.previous.csv").read_text() == labelled(t4="bowl", t1="box")
+
+
+def test_labels_that_are_cleared_are_kept_in_a_copy_and_named(
+    shapecat: Callable[..., Result], guessed_run: Path, tmp_path: Path
+) -> None:
+    """Somebody may take an old table by mistake: hours of labels would be gone without a word."""
+    folder = tmp_path / "table"
+    shutil.copytree(guessed_run, folder)
+    unlabelled = tmp_path / "old.csv"
+    shutil.copy(folder / "tracks.csv", unlabelled)
+    first, second, *_ = sorted(row.track for row in read_track_table(unlabelled).rows)
+    relabel(folder, {first: "salad bowl", second: "delete"})
+    labelled_table = (folder / "tracks.csv").read_text()
+    done = shapecat("annotate", folder, "--labels", unlabelled)
+
+    assert done.exit_code == 0, done.output
+    cleared = f"{folder}: 2 labels cleared (#{first} salad bowl, #{second} delete)"
+    assert done.output.splitlines()[-1] == cleared
+    assert (folder / "tracks.previous.csv").read_text() == labelled_table
 
 
 def test_lines_left_out_keep_their_label(run: Path) -> None:

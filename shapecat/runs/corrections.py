@@ -65,8 +65,10 @@ def read_labels(path: Path, categories: Iterable[str] = ()) -> dict[int, TrackLa
 def adopt_labels(corrected: Path, folder: Path) -> None:
     """Apply the labels of a corrected table to a run.
 
-    Only the column ``label`` is read, and tracks that the table does not list keep their label.
-    The original table is kept as tracks.original.csv. ``corrected`` may be the run's own
+    Only the column ``label`` is read, and tracks that the table does not list keep their label. So
+    do tracks whose label equals that in a column ``label_seen``, which a report page writes: it
+    may be older than other corrections. The original table is kept as tracks.original.csv; if
+    labels are replaced, the last one as tracks.previous.csv. ``corrected`` may be the run's own
     tracks.csv.
 
     Raises
@@ -84,9 +86,11 @@ def _adopt(corrected: Path, folder: Path) -> None:
     in_place = current.exists() and corrected.exists() and corrected.samefile(current)
     _require_same_run(corrected, read_track_table(corrected), folder, known=in_place)
     base = read_track_table(original if original.exists() else current)
+    table = read_track_table(corrected)
+    rows = table.rows
     if not in_place:
         base = _relabelled(base, read_track_table(current).rows)
-    table = read_track_table(corrected)
+        rows = tuple(row for row in rows if row.cells.get("label_seen") != row.label)
     known = {row.track for row in base.rows}
     problems = [
         *table.problems,
@@ -96,11 +100,14 @@ def _adopt(corrected: Path, folder: Path) -> None:
             if row.track not in known
         ),
     ]
-    result = _relabelled(base, table.rows)
+    result = _relabelled(base, rows)
     known_categories = read_run(folder)["model"]["categories"]
     _, misread = resolve_labels(result.rows, known_categories, one_frame=_one_frame(folder))
     _refuse(corrected, problems + _lines(result.rows, misread))
     _keep_original(folder, base)
+    if any(a.label not in {"", b.label} for a, b in zip(base.rows, result.rows, strict=True)):
+        with replacing(folder / PREVIOUS) as path:
+            write_track_table(path, base)
     with replacing(current) as path:
         write_track_table(path, result)
 

@@ -148,7 +148,8 @@ def _understand(label: str, known: dict[str, str]) -> _Verdict:
         return merge
     new = _NEW.fullmatch(label)
     name = new[1] if new else label
-    if re.match(r"merged? ", label, re.IGNORECASE) or not _NAME.fullmatch(name):
+    command = re.match(r"(merged?( |$)|del$|remove$)", label, re.IGNORECASE)
+    if command or not _NAME.fullmatch(name):
         msg = f"{label!r} is not a category, `{DELETE}` or `merge with N`"
         raise ValueError(msg)
     near = _nearest(name.lower(), [*known, DELETE])

@@ -98,9 +98,10 @@ function confusion(checked) {
 
 function csv() {
   const quote = (cell) => (/[",\r\n]/.test(cell) ? `"${cell.replaceAll('"', '""')}"` : cell);
-  const lines = data.rows.map((row) => data.columns.map((name, k) =>
-    quote(name === "label" ? labels.get(row.track) : row.cells[k])).join(","));
-  return [data.columns.map(quote).join(","), ...lines, ""].join("\n");
+  // With the labels as this page was made, so that it does not undo labels given elsewhere since.
+  const lines = data.rows.map((row) => [...data.columns.map((name, k) =>
+    quote(name === "label" ? labels.get(row.track) : row.cells[k])), quote(row.label)].join(","));
+  return [[...data.columns, "label_seen"].map(quote).join(","), ...lines, ""].join("\n");
 }
 
 gallery.addEventListener("click", (event) => {
