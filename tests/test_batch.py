@@ -222,21 +222,29 @@ def test_shards_give_the_same_tables(
 
 
 def test_folders_are_searched_and_bags_are_not_taken_apart(tmp_path: Path) -> None:
-    """A shell expands folder/** to folders, their contents, and files of other programs."""
+    """A shell expands folder/** to folders, their contents, and files of other programs.
+
+    Two takes of a scene in one folder must not be mixed in one run.
+    """
     bags = (
         "bag/bag_0.db3",
         "bag/metadata.yaml",
-        "old/x_0.db3",
+        "old/old_0.db3",
         "two/a_0.mcap",
         "two/a_1.mcap.zstd",
+        "cut/cut_0.mcap",
+        "cut/cut_1.mcap",
     )
-    for name in ("x.mcap", "y.db3", "d/z.bag", "runs/run_1.mcap", "runs/run_2.mcap", *bags):
+    takes = {
+        *("runs/run_1.mcap", "runs/run_2.mcap", "takes/take_0.mcap", "takes/take_1.mcap"),
+        *("days/monday.db3", "days/tuesday.db3"),
+    }
+    for name in ("x.mcap", "y.db3", "d/z.bag", *takes, *bags):
         (tmp_path / name).parent.mkdir(exist_ok=True)
         (tmp_path / name).touch()
     for name in ("x.truth.json", "notes.txt", "d/.z.bag.partial"):
         (tmp_path / name).write_text("{}")
-    runs = {"runs/run_1.mcap", "runs/run_2.mcap"}
-    expected = {"x.mcap", "y.db3", "bag", "old", "two", "d/z.bag", *runs}
+    expected = {"x.mcap", "y.db3", "bag", "old", "two", "cut", "d/z.bag", *takes}
 
     for sources in ([tmp_path], sorted(tmp_path.rglob("[!.]*")), [tmp_path, *tmp_path.iterdir()]):
         found = find_recordings([str(path) for path in sources])

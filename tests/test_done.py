@@ -41,6 +41,7 @@ from shapecat.runs.jobs import (
 )
 from shapecat.runs.run_info import RunInfo
 from shapecat.system.files import partial_path
+from tests.run_info import run_info
 
 MODEL: Any = SimpleNamespace(model_id="m1", categories=("cup", "can"))
 
@@ -579,6 +580,22 @@ def test_recordings_of_one_name_have_folders_of_their_own() -> None:
     folders = name_folders(["x", "x", "x", "y"], ["a", "b", "a", "a"])
 
     assert folders == ["a_x", "b_x", "a_x_3", "y"]
+
+
+def test_a_run_keeps_its_folder_when_a_recording_of_its_name_is_added(
+    tmp_path: Path,
+) -> None:
+    """Otherwise it is processed again without its labels, and counted twice in each export."""
+    for day in ("monday", "tuesday"):
+        (tmp_path / day).mkdir()
+        (tmp_path / day / "lab.mcap").write_bytes(day.encode())
+    out = str(tmp_path / "out")
+    days = [str(tmp_path / day / "lab.mcap") for day in ("tuesday", "monday")]
+    (tmp_path / "out" / "lab").mkdir(parents=True)
+    write_run(tmp_path / "out" / "lab", run_info(input={"path": days[1]}))
+
+    with plan_batch(Job(Path(), Path()), days, out) as batch:
+        assert [task.name for task in batch.tasks] == ["tuesday_lab", "lab"]
 
 
 def test_a_name_that_a_number_makes_may_be_taken() -> None:

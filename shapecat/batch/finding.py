@@ -13,7 +13,6 @@ from shapecat.errors import RecordingError
 __all__ = ["Found", "Source", "find_recordings", "look_at"]
 
 SUFFIXES = {".mcap", ".bag", ".db3"}
-_OTHERS = (".mcap", ".bag")
 _MAGIC = (b"\x89MCAP", b"#ROSBAG", b"SQLite format 3")
 
 
@@ -158,21 +157,23 @@ def _searchable(path: Path) -> bool:
 
 
 def _is_bag(folder: Path) -> bool:
-    """Return whether a folder is a ROS 2 bag: it has metadata, or its files belong to one bag."""
+    """Return whether a folder is a ROS 2 bag: it has metadata, or its files are parts of one.
+
+    ROS 2 names the parts of a bag a/a_0.mcap, a/a_1.mcap, ... In a folder of another name, such
+    files may be different takes, unless one is compressed, as only parts are.
+    """
     if (folder / "metadata.yaml").exists():
         return True
     paths = list(folder.iterdir())
-    names = {path.name.removesuffix(".zstd") for path in paths if path.is_file()}
     if any(path.is_dir() for path in paths):
         return False
-    others = {name for name in names if name.endswith(_OTHERS)}
-    return _are_splits(others) or (any(n.endswith(".db3") for n in names) and not others)
-
-
-def _are_splits(names: set[str]) -> bool:
-    """Return whether the names are those of one split recording: a_0.mcap, a_1.mcap, ..."""
-    base = min(names, default="").rpartition("_")[0]
-    return len(names) > 1 and names == {f"{base}_{k}.mcap" for k in range(len(names))}
+    names = {path.name.removesuffix(".zstd") for path in paths if path.is_file()}
+    parts = {name for name in names if PurePosixPath(name).suffix in SUFFIXES}
+    first = PurePosixPath(min(parts, default=""))
+    base = first.stem.rpartition("_")[0]
+    compressed = any(path.suffix == ".zstd" for path in paths)
+    in_sequence = parts == {f"{base}_{k}{first.suffix}" for k in range(len(parts))}
+    return bool(parts) and in_sequence and (base == folder.name or compressed)
 
 
 def _search(folder: Path) -> Iterator[Path]:

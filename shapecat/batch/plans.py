@@ -4,12 +4,13 @@ import dataclasses
 import hashlib
 import json
 from collections import Counter
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import contextmanager, nullcontext, suppress
 from dataclasses import dataclass
 from itertools import chain, count
 from pathlib import Path
+from types import MappingProxyType
 from typing import Literal
 
 from shapecat.batch.claims import claim_name
@@ -143,20 +144,31 @@ class Batch:
     left_out: int
 
 
-def name_folders(names: Sequence[str], parents: Sequence[str]) -> list[str]:
+def name_folders(
+    names: Sequence[str], parents: Sequence[str], known: Mapping[int, str] = MappingProxyType({})
+) -> list[str]:
     """Return a unique run folder name for each recording: its own name without suffix.
 
     Recordings with the same name get the name of their parent folder in front, then a number.
+
+    Parameters
+    ----------
+    known : the names that some recordings, by index, already have.
 
     Examples
     --------
     >>> name_folders(["x", "x", "y"], ["a", "b", ""])
     ['a_x', 'b_x', 'y']
+    >>> name_folders(["x", "x", "y"], ["a", "b", ""], {0: "x"})
+    ['x', 'b_x', 'y']
     """
     counts = Counter(names)
-    taken: set[str] = set()
+    taken = set(known.values())
     folders = []
     for k, (name, parent) in enumerate(zip(names, parents, strict=True)):
+        if k in known:
+            folders.append(known[k])
+            continue
         unique = name if counts[name] == 1 else f"{parent}_{name}"
         numbered = (f"{unique}_{number}" for number in count(k + 1))
         free = next(folder for folder in chain([unique], numbered) if folder not in taken)
@@ -186,9 +198,10 @@ def plan_batch(
     """
     part = Shard.parse(shard) if shard is not None else None
     found = find_recordings(sources)
-    names = name_folders([s.stem for s in found.kept], [s.parent for s in found.kept])
-    named = list(zip(names, found.kept, strict=True))
     there = Location(out, OutputError).names() if is_url(out) else _names_in(Path(out))
+    known = {} if is_url(out) else _known_names(found.kept, Path(out), there)
+    names = name_folders([s.stem for s in found.kept], [s.parent for s in found.kept], known)
+    named = list(zip(names, found.kept, strict=True))
     with open_manifest(out, shard=shard) if len(named) > 1 else nullcontext() as manifest:
         planner = _Planner(job, out, there, manifest)
         chosen = part.of(named) if part is not None else named
@@ -230,6 +243,24 @@ class _Planner:
             done = same and entry is not None and entry.state == "complete" and _whole(task)
             return "complete" if done else "check"
         return "retry" if entry is not None and entry.state == "failed" else "new"
+
+
+def _known_names(sources: Sequence[Source], out: Path, there: set[str]) -> dict[int, str]:
+    """Return the names of the run folders that recordings with a common name have in ``out``.
+
+    A recording that comes to a batch later must not rename the run of another one.
+    """
+    counts = Counter(source.stem for source in sources)
+    common = {source.url or str(Path(source.path).resolve()): k for k, source in enumerate(sources)}
+    common = {path: k for path, k in common.items() if counts[sources[k].stem] > 1}
+    known: dict[int, str] = {}
+    for name in sorted(there) if common else ():
+        if any(sources[k].stem in name for k in common.values()):
+            with suppress(OutputError):
+                k = common.get(read_run(out / name)["input"]["path"])
+                if k is not None:
+                    known.setdefault(k, name)
+    return known
 
 
 def _names_in(folder: Path) -> set[str]:
