@@ -29,15 +29,16 @@ from shapecat.runs.folder import (
 )
 from shapecat.runs.identity import ContentDigest, file_stats, same_content
 from shapecat.runs.jobs import (
+    OUTPUT_OPTIONS,
     Job,
     Summary,
     describe_run,
+    differences,
     has_work,
     identify,
     keep_labels,
     require_unchanged,
     resume,
-    same_options,
     summarize,
 )
 from shapecat.runs.label_meaning import TrackLabel
@@ -61,8 +62,9 @@ _log = logging.getLogger(__name__)
 def process(job: Job, observe: Observer = ignore, *, cores: int = 1) -> Summary:
     """Process one recording into its run folder: perceive, track, annotate.
 
-    A complete folder made from the same input, settings and model is kept. A new folder gets its
-    final name only when it is complete; an interrupted run resumes where it stopped.
+    A complete folder made from the same input, settings and model is kept, and gets the outputs
+    that it lacks. A new folder gets its final name only when it is complete; an interrupted run
+    resumes where it stopped.
 
     Parameters
     ----------
@@ -140,17 +142,26 @@ def _finished(
     content: ContentDigest,
     observe: Observer,
 ) -> Summary:
-    """Return the summary of a complete folder, after finishing what a kill left unfinished.
+    """Return the summary of a complete folder, after writing the wanted outputs that it lacks.
 
     Raises
     ------
     OutputError : the folder holds the results of another input, model or settings.
     """
     run = read_run(job.folder)
-    if not (same_options(run, planned) and same_content(run["input"], job.source, content.result)):
+    for option, output in OUTPUT_OPTIONS.items() if not job.target else ():  # at a URL: no tables
+        there = (job.folder / output).exists()
+        planned["options"][option] |= there
+        run["options"][option] = planned["options"][option]
+        if not there:
+            run["seconds"].pop(output, None)
+    differing = differences(run, planned)
+    if not same_content(run["input"], job.source, content.result):
+        differing.append(f"input: {run['input']['path']} there")
+    if differing:
         msg = (
-            f"{job.folder}: has results of another input, model or settings; "
-            "choose another --out, or --overwrite it"
+            f"{job.folder}: has results of another input, model or settings "
+            f"({'; '.join(differing)}); choose another --out, or --overwrite it"
         )
         raise OutputError(msg)
     sweep(job.folder)

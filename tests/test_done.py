@@ -34,10 +34,10 @@ from shapecat.runs.jobs import (
     Job,
     Summary,
     describe_run,
+    differences,
     has_work,
     require_unchanged,
     resume,
-    same_options,
 )
 from shapecat.runs.run_info import RunInfo
 from shapecat.system.files import partial_path
@@ -109,8 +109,8 @@ def test_other_options_are_other_work(source: Path, name: str) -> None:
     """Results of other options under the same name would pass for the requested ones."""
     run, other = planned(source), planned(source, **CHANGES[name])
 
-    assert same_options(run, planned(source))
-    assert not same_options(run, other)
+    assert not differences(run, planned(source))
+    assert differences(run, other)
     assert work_id(run) != work_id(other)
 
 
@@ -119,7 +119,7 @@ def test_another_model_version_or_content_is_other_work(source: Path, key: str) 
     run, other = planned(source), planned(source)
     if key == "model":
         other["model"] = {**other["model"], "id": "m2"}
-        assert not same_options(run, other)
+        assert differences(run, other)
     elif key == "version":
         other["versions"] = {**other["versions"], "shapecat": "0.0.1"}
     else:
@@ -137,7 +137,7 @@ def test_outputs_do_not_change_what_the_tables_are_of(source: Path, name: str) -
     run, other = planned(source), planned(source, **changed[name])
 
     assert work_id(run) == work_id(other)
-    assert not same_options(run, other)  # a folder without colour is not taken for one with it
+    assert differences(run, other)  # a folder without colour is not taken for one with it
 
 
 def test_a_recording_that_was_written_to_has_changed_though_it_is_as_long(source: Path) -> None:
@@ -239,6 +239,16 @@ def test_a_partial_run_of_the_same_work_goes_on(source: Path, tmp_path: Path) ->
 
     assert resume(folder, planned(source), source, lambda: "")["id"] == run["id"]
     assert (folder / "segments" / "000000").exists()
+
+
+def test_a_partial_run_goes_on_with_other_outputs(source: Path, tmp_path: Path) -> None:
+    """Nothing is perceived again only because a review is wanted after all."""
+    folder, run = tmp_path / "half", planned(source, rrd=False)
+    partial(folder, run)
+
+    going_on = resume(folder, planned(source), source, lambda: "")
+
+    assert (going_on["id"], going_on["options"]["rrd"]) == (run["id"], True)
 
 
 def test_a_partial_run_goes_on_with_a_copy_of_its_recording(source: Path, tmp_path: Path) -> None:

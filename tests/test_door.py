@@ -3,6 +3,7 @@
 import json
 import logging
 import re
+import shutil
 import signal
 import socket
 import subprocess
@@ -282,6 +283,40 @@ def test_view_tells_a_missing_run_from_a_missing_review(
     result = shapecat("view", runs / "a" / "lab")
     assert result.exit_code == 1
     assert "no review there; process the recording without --no-rrd" in result.stderr
+
+
+def test_an_output_that_was_not_wanted_is_written_later(
+    shapecat: Run, recording: Path, runs: Path, tmp_path: Path
+) -> None:
+    """To get a review, nobody should have to process everything again, or overwrite results."""
+    shutil.copytree(runs / "a", tmp_path, dirs_exist_ok=True)
+    lab = tmp_path / "lab"
+    before = {path.name: path.stat().st_mtime_ns for path in lab.iterdir()}
+    command = ("process", recording, "--out", tmp_path, "--jobs", 1)
+
+    done = shapecat(*command)
+    assert done.exit_code == 0, done.stderr
+    after = {path.name: path.stat().st_mtime_ns for path in lab.iterdir()}
+    assert after.keys() - before.keys() == {"review.rrd"}
+    assert {name for name in before if after[name] != before[name]} == {"run.json"}
+    assert read_run(lab)["options"]["rrd"]
+
+    (lab / "annotated.mcap").unlink()
+    assert shapecat(*command, "--no-rrd").exit_code == 0
+    assert (lab / "annotated.mcap").is_file()
+    assert (lab / "review.rrd").stat().st_mtime_ns == after["review.rrd"]
+
+
+def test_refused_results_are_told_from_the_wanted_ones(
+    shapecat: Run, recording: Path, runs: Path
+) -> None:
+    """Without the option that differs, one can only guess which command made the results."""
+    options = ("--every", 2, "--no-color", "--set", "detection.min_points=7")
+    result = shapecat("process", recording, "--out", runs / "a", *options)
+
+    assert result.exit_code == 1
+    differing = "detection.min_points: 60 there, 7 wanted; every: 1 there, 2 wanted; "
+    assert f"({differing}color: default there, none wanted)" in result.stderr
 
 
 def listening(pid: int) -> set[str]:

@@ -7,7 +7,7 @@ from contextlib import suppress
 from dataclasses import dataclass, field
 from importlib.metadata import version
 from pathlib import Path
-from typing import Any
+from typing import Any, Literal
 
 from shapecat import __version__
 from shapecat.config import Settings
@@ -29,19 +29,25 @@ from shapecat.runs.segments import count_segments
 from shapecat.system.files import input_size, replacing
 
 __all__ = [
+    "OUTPUT_OPTIONS",
     "Job",
     "Summary",
     "describe_run",
+    "differences",
     "has_work",
     "identify",
     "keep_labels",
     "require_unchanged",
     "resume",
-    "same_options",
     "summarize",
 ]
 
 _LIBRARIES = ("numpy", "numba", "mcap", "rosbags", "rerun-sdk", "pyarrow")
+OUTPUT_OPTIONS: Mapping[Literal["mcap", "rrd"], str] = {
+    "mcap": "annotated.mcap",
+    "rrd": "review.rrd",
+}
+"""The options that ask for an output, with its file; the tables do not depend on them."""
 
 
 @dataclass(frozen=True)
@@ -154,13 +160,30 @@ def describe_run(job: Job, categorizer: Categorizer) -> RunInfo:
     }
 
 
-def same_options(run: RunInfo, planned: RunInfo) -> bool:
-    """Return whether two runs have the same settings, options and model."""
-    return (
-        run.get("settings") == planned["settings"]
-        and run.get("options") == planned["options"]
-        and run.get("model") == planned["model"]
-    )
+def differences(run: RunInfo, planned: RunInfo) -> list[str]:
+    """Return the settings, options and model in which two runs differ, with both values."""
+    here, wanted = (_entries(each) for each in (run, planned))
+    return [
+        f"{name}: {_words(here.get(name))} there, {_words(wanted.get(name))} wanted"
+        for name in dict.fromkeys((*here, *wanted))
+        if here.get(name) != wanted.get(name)
+    ]
+
+
+def _entries(run: RunInfo) -> dict[str, Any]:
+    """Return the settings, options and model of a run, each by its name."""
+    tree: dict[str, Any] = {**run["settings"], **run["options"], "model": run["model"]["id"]}
+    entries: dict[str, Any] = {}
+    for name, value in tree.items():
+        parts = value.items() if isinstance(value, dict) else ()
+        entries |= {f"{name}.{part}": each for part, each in parts} or {name: value}
+    return entries
+
+
+def _words(value: Any) -> str:
+    """Return the value of an entry as text."""
+    text = ", ".join(map(str, value)) if isinstance(value, list) else str(value)
+    return "default" if value is None else text or "none"
 
 
 def resume(folder: Path, planned: RunInfo, source: Path, digest: Callable[[], str]) -> RunInfo:
@@ -181,7 +204,9 @@ def resume(folder: Path, planned: RunInfo, source: Path, digest: Callable[[], st
     with suppress(OutputError):
         run = read_run(folder)
         known = run.get("input", {})
-        same = same_options(run, planned) and run.get("versions") == planned["versions"]
+        for name in OUTPUT_OPTIONS:
+            run["options"][name] = planned["options"][name]
+        same = not differences(run, planned) and run.get("versions") == planned["versions"]
         if same and (unchanged(known["files"], source) or same_content(known, source, digest)):
             if "perceive" in run["seconds"]:
                 run["counts"]["resumed"] = run["counts"]["frames"]
