@@ -4,6 +4,8 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+import pyarrow as pa
+import pyarrow.parquet as pq
 import pytest
 
 from shapecat.config import Settings
@@ -17,6 +19,8 @@ from shapecat.recordings.transforms import TransformBuffer
 from shapecat.runs import perceiving
 from shapecat.runs.folder import read_run
 from shapecat.runs.jobs import Job
+from shapecat.runs.tables import DETECTIONS, FRAMES, PLANES
+from shapecat.runs.up_report import report_up
 from shapecat.simulation.messages import MessageFactory
 from shapecat.types import Frame, Pose
 from tests.messages import CAMERA, EPOCH, SECOND, header, make, write
@@ -180,7 +184,26 @@ def test_every_failed_look_up_is_counted(tmp_path: Path) -> None:
         upright = Upright.of(recording, up="auto", fixed_frame=None)
     for stamp in (EPOCH, EPOCH + 1):
         assert upright.orient(frame(stamp)).up is None
-    upright.report([])
+    report_up(upright, tmp_path)
 
     (warning,) = upright.warnings
     assert warning.startswith("failed transform look-ups: 2, the first: ")
+
+
+def test_a_frame_with_objects_has_a_plane(tmp_path: Path) -> None:
+    """An assumed plane is in no table; the run would contradict its own warning."""
+    for name, schema, frames in (
+        ("frames", FRAMES, (0, 1, 2, 3)),
+        ("planes", PLANES, (0, 3)),
+        ("detections", DETECTIONS, (1,)),
+    ):
+        rows = [dict.fromkeys(schema.names) | {"topic": "/d", "frame": k} for k in frames]
+        for row in rows if name == "frames" else ():
+            given = None if row["frame"] == 3 else [0.0, -1.0, 0.0]
+            row |= {"up": [0.0, -np.cos(0.1), np.sin(0.1)], "up_given": given}
+        pq.write_table(pa.Table.from_pylist(rows, schema), tmp_path / f"{name}.parquet")
+    upright = Upright(TransformWindow(TransformBuffer()), None, None, ("tf",))
+    upright.given = {"transforms, z of map": 3, "planes": 1}
+
+    report = report_up(upright, tmp_path)
+    assert (report["planes_differ_deg"], report["frames_without_plane"]) == (5.7, 1)

@@ -1,11 +1,10 @@
 """The up direction and the sensor pose in each frame of a recording."""
 
-from collections.abc import Iterable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, field
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
-import pyarrow as pa
 
 from shapecat.arrays import F4
 from shapecat.errors import ConfigError
@@ -20,7 +19,6 @@ __all__ = ["Orientation", "Upright"]
 _LEVEL_FRAMES = ("map", "odom", "world", "earth", "base_footprint", "base_link")
 """Frames whose z axis is up by convention (REP 105, REP 103)."""
 _SOURCES = {"auto": ("tf", "imu"), "tf": ("tf",), "imu": ("imu",)}
-_DISAGREE_DEG = 10
 
 
 class Orientation(NamedTuple):
@@ -51,6 +49,8 @@ class Upright:
     sources : ``tf`` and ``imu``, in the order in which they are tried; empty with a vector.
     warnings : for the user.
     dropped : for each topic whose given up direction is ignored, the source of that direction.
+    failed, first_failure : the number of failed look-ups, and the error of the first.
+    given : the number of frames whose up direction is from each source.
     """
 
     transforms: TransformWindow
@@ -60,9 +60,9 @@ class Upright:
     accelerometers: Accelerometers | None = None
     warnings: list[str] = field(default_factory=list)
     dropped: dict[str, str] = field(default_factory=dict)
-    _failed: int = 0
-    _first_failure: str = ""
-    _given: dict[str, int] = field(default_factory=dict)
+    failed: int = 0
+    first_failure: str = ""
+    given: dict[str, int] = field(default_factory=dict)
 
     @classmethod
     def of(cls, recording: Recording, *, up: str, fixed_frame: str | None) -> "Upright":
@@ -113,7 +113,7 @@ class Upright:
         """Count where an up direction comes from, and return it; None if the topic's is dropped."""
         up = None if topic in self.dropped else orientation.up
         source = "planes" if up is None else orientation.source
-        self._given[source] = self._given.get(source, 0) + 1
+        self.given[source] = self.given.get(source, 0) + 1
         return up
 
     def _find(self, frame: Frame) -> tuple[str, F4 | None]:
@@ -170,63 +170,9 @@ class Upright:
         try:
             return transforms.lookup(target, frame.frame_id, frame.stamp_ns)
         except TransformError as error:
-            self._failed += 1
-            self._first_failure = self._first_failure or str(error)
+            self.failed += 1
+            self.first_failure = self.first_failure or str(error)
             return None
-
-    def report(self, perceived: Iterable[tuple[pa.Table, pa.Table]]) -> dict[str, Any]:
-        """Return the source of the up direction and its agreement with the planes, for run.json.
-
-        Failed look-ups and large differences are added to ``warnings``.
-
-        Parameters
-        ----------
-        perceived : the run's tables of frames and planes, one pair per row group.
-        """
-        if self._failed:
-            self.warnings.append(
-                f"failed transform look-ups: {self._failed}, the first: {self._first_failure}"
-            )
-        source = max(self._given, key=lambda name: self._given[name], default="planes")
-        report: dict[str, Any] = {"source": source}
-        if self.dropped:
-            report["dropped"] = dict(self.dropped)
-        if len(self._given) > 1:
-            report["frames"] = dict(self._given)
-        if set(self._given) - {"planes"}:
-            report |= self._agreement(perceived)
-        return report
-
-    def _agreement(self, perceived: Iterable[tuple[pa.Table, pa.Table]]) -> dict[str, Any]:
-        angles, bare = _angles_to_planes(perceived)
-        typical = round(float(np.median(angles)), 1) if angles else None
-        if typical is not None and typical > _DISAGREE_DEG:
-            self.warnings.append(f"up and the detected planes differ by {typical} degrees")
-        return {"planes_differ_deg": typical, "frames_without_plane": bare}
-
-
-def _angles_to_planes(
-    perceived: Iterable[tuple[pa.Table, pa.Table]],
-) -> tuple[list[float], int]:
-    """Compare the given up directions with the planes.
-
-    Returns
-    -------
-    The angle between the two in each frame, degrees; and the number of frames that have a given up
-    direction but no plane.
-    """
-    angles, bare = [], 0
-    for frames, planes in perceived:
-        level = {(row["topic"], row["frame"]) for row in planes.to_pylist()}
-        for row in frames.to_pylist():
-            if row["up_given"] is None:
-                continue
-            if (row["topic"], row["frame"]) in level:
-                cosine = np.clip(np.dot(row["up"], row["up_given"]), -1, 1)
-                angles.append(float(np.degrees(np.arccos(cosine))))
-            else:
-                bare += 1
-    return angles, bare
 
 
 def _parse_vector(text: str) -> F4:

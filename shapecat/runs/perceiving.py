@@ -12,7 +12,6 @@ from pathlib import Path
 from typing import NamedTuple
 
 import numpy as np
-import pyarrow as pa
 
 from shapecat.cameras.colour import ColourView
 from shapecat.config import Settings
@@ -31,6 +30,7 @@ from shapecat.runs.second_look import Revision, frames_to_revise
 from shapecat.runs.segments import read_segments
 from shapecat.runs.selection import count_frames, read_frames
 from shapecat.runs.tables import Key, count_rows, read_row_groups
+from shapecat.runs.up_report import report_up
 from shapecat.system import stopping
 from shapecat.system.progress import Observer, ignore
 from shapecat.types import Frame
@@ -113,7 +113,7 @@ def perceive_all(work: Work) -> None:
         run["counts"]["color"] = count_rows(folder, "masks")
     if tables.done:
         run["counts"]["resumed"] = tables.done
-    run["fixed_frame"], run["up"] = upright.fixed_frame, upright.report(_perceived(folder))
+    run["fixed_frame"], run["up"] = upright.fixed_frame, report_up(upright, folder)
     run["warnings"] = [*recording.warnings, *upright.warnings, *recent.warnings()]
 
 
@@ -241,9 +241,3 @@ def _readings(
 def _without_pixels(view: ColourView) -> ColourView:
     """Remove the pixels, which masks do not need, before the image is sent to other processes."""
     return replace(view, image=replace(view.image, data=b""))
-
-
-def _perceived(folder: Path) -> Iterator[tuple[pa.Table, pa.Table]]:
-    """Yield the tables of frames and planes, with the columns for `Upright.report`."""
-    frames = read_row_groups(folder / "frames.parquet", ["topic", "frame", "up", "up_given"])
-    return zip(frames, read_row_groups(folder / "planes.parquet", ["topic", "frame"]), strict=True)

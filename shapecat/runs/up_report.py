@@ -1,0 +1,70 @@
+"""Where the up direction of a run came from, and how well the planes confirm it."""
+
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from shapecat.recordings.gravity import Upright
+from shapecat.runs.tables import read_row_groups
+
+__all__ = ["report_up"]
+
+_DISAGREE_DEG = 10
+
+
+def report_up(upright: Upright, folder: Path) -> dict[str, Any]:
+    """Return the source of the up direction and its agreement with the planes, for run.json.
+
+    Failed look-ups and large differences are added to the warnings of ``upright``.
+
+    Parameters
+    ----------
+    folder : with the tables of frames, planes and detections.
+    """
+    if upright.failed:
+        upright.warnings.append(
+            f"failed transform look-ups: {upright.failed}, the first: {upright.first_failure}"
+        )
+    given = upright.given
+    report: dict[str, Any] = {"source": max(given, key=lambda name: given[name], default="planes")}
+    if upright.dropped:
+        report["dropped"] = dict(upright.dropped)
+    if len(given) > 1:
+        report["frames"] = dict(given)
+    if set(given) - {"planes"}:
+        angles, bare = _angles_to_planes(folder)
+        typical = round(float(np.median(angles)), 1) if angles else None
+        report |= {"planes_differ_deg": typical, "frames_without_plane": bare}
+        if typical is not None and typical > _DISAGREE_DEG:
+            upright.warnings.append(f"up and the detected planes differ by {typical} degrees")
+    return report
+
+
+def _angles_to_planes(folder: Path) -> tuple[list[float], int]:
+    """Compare the given up directions with the planes.
+
+    Returns
+    -------
+    The angle between the two in each frame, degrees; and the number of frames that have a given up
+    direction, but neither a plane nor an object, which implies one.
+    """
+    angles, bare = [], 0
+    rows = ["topic", "frame"]
+    tables = (
+        read_row_groups(folder / f"{name}.parquet", columns)
+        for name, columns in (
+            ("frames", [*rows, "up", "up_given"]), ("planes", rows), ("detections", rows)
+        )
+    )  # fmt: skip
+    for frames, *found in zip(*tables, strict=True):
+        planes, objects = ({(r["topic"], r["frame"]) for r in t.to_pylist()} for t in found)
+        for row in frames.to_pylist():
+            key = (row["topic"], row["frame"])
+            if row["up_given"] is None:
+                continue
+            if key in planes:
+                cosine = np.clip(np.dot(row["up"], row["up_given"]), -1, 1)
+                angles.append(float(np.degrees(np.arccos(cosine))))
+            bare += key not in planes and key not in objects
+    return angles, bare
