@@ -353,9 +353,14 @@ def test_what_lies_beside_the_messages_of_any_part_is_kept(tmp_path: Path) -> No
 
     with target.open("rb") as file:
         reader = make_reader(file)
-        names = [item.name for item in reader.iter_attachments()]
-        names += [item.name for item in reader.iter_metadata()]
-    assert sorted(names) == ["photo", "photo", "robot", "robot", "shapecat"]
+        attached = [
+            (item.create_time, item.log_time, item.name, item.media_type, item.data)
+            for item in reader.iter_attachments()
+        ]
+        names = [item.name for item in reader.iter_metadata()]
+    # Its two times are side by side in every call that passes them on.
+    assert attached == [(1, 2, "photo", "image/png", b"\x89PNG")] * 2
+    assert sorted(names) == ["robot", "robot", "shapecat"]
 
 
 @pytest.mark.parametrize("plugin", list(StoragePlugin))
