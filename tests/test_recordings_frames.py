@@ -118,6 +118,20 @@ def test_intrinsics_stay_while_they_fit_and_follow_a_change(tmp_path: Path) -> N
     assert abs(cameras[4].fx - 62.0) < 0.01
 
 
+def test_points_that_fit_no_camera_get_none_of_an_earlier_cloud(tmp_path: Path) -> None:
+    """Their depths in another cloud's camera would be points in wrong places."""
+    fitting = organized_points(wavy_depth())
+    other = np.random.default_rng(0).normal(0, 1, fitting.shape).astype(np.float32)
+    items = [("/points", k, cloud(EPOCH + k, p)) for k, p in enumerate((fitting, other, fitting))]
+
+    (first, odd, last), _, _ = read(write(tmp_path / "a.mcap", items))
+
+    assert odd.points is not None
+    np.testing.assert_array_equal(odd.points, other.reshape(-1, 3))
+    assert first.organized
+    assert last.camera == first.camera
+
+
 @given(
     fx=st.floats(20, 2000),
     ratio=st.floats(0.8, 1.25),
