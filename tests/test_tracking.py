@@ -211,6 +211,14 @@ def test_a_gap_is_filled_by_rows_on_the_line_and_a_long_one_is_left_out() -> Non
     assert track.hits == 20
 
 
+def test_a_track_moves_on_to_its_very_last_detection() -> None:
+    """The last position, and those in a gap before it, must not be that of an earlier detection."""
+    frames = [frame(k, [] if 12 <= k < 15 else [[0.01 * k, 0, 0]]) for k in range(16)]
+    (track,) = track_recording(frames, SETTINGS)
+    assert track.detections[11:].tolist() == [0, -1, -1, -1, 0]
+    assert track.centers[:, 0] == pytest.approx(0.01 * np.arange(16))
+
+
 def test_a_track_in_a_gap_does_not_know_the_view_after_it() -> None:
     """A posterior that is causal only where there is a detection tells the future in the gap."""
     views = {0: CUP, 1: CUP, 2: CUP, 6: BOX, 7: BOX}
