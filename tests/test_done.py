@@ -168,6 +168,17 @@ def test_content_is_compared_where_only_the_times_of_a_file_differ(source: Path)
     assert not same_content(known, source, lambda: content_digest(source))
 
 
+def test_content_is_compared_where_a_copy_has_kept_the_times(source: Path) -> None:
+    """`cp -p` and `rsync -t` put another recording there that only its inode time gives away."""
+    known, stat = planned(source)["input"], source.stat()
+    known["digest"] = content_digest(source)
+    while source.stat().st_ctime_ns == stat.st_ctime_ns:  # its clock ticks every few milliseconds
+        source.write_bytes(b"recordinG")
+        os.utime(source, ns=(stat.st_atime_ns, stat.st_mtime_ns))
+
+    assert not same_content(known, source, lambda: content_digest(source))
+
+
 def test_a_digest_that_nobody_needs_is_not_waited_for(source: Path) -> None:
     """Stopped before it began, it is no error; stopped later, it must not continue."""
     with ContentDigest(source) as content:
@@ -186,6 +197,8 @@ def test_a_digest_that_nobody_needs_is_not_waited_for(source: Path) -> None:
         (("in2", "w1"), ("in1", "w1"), False),
         (("in1", "w2"), ("in1", "w1"), False),
         (("", ""), ("", ""), False),  # what nothing is known of is not done
+        (("", "w1"), ("", "w1"), False),  # nor is what half is known of
+        (("in1", ""), ("in1", ""), False),
     ],
 )
 def test_results_at_a_url_are_those_of_the_same_input_and_work(
@@ -431,6 +444,27 @@ def test_a_manifest_at_a_url_ends_as_one_file(
     assert len(lines.splitlines()) == 2
     assert {n: e.state for n, e in RemoteManifest(place).entries.items()} == found
     assert (Location(f"{place}-none") / "manifest.jsonl").read() is None
+
+
+def test_lines_that_come_while_a_full_part_is_sent_go_into_the_next(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    """A megabyte takes a while to send, and recordings end meanwhile."""
+    monkeypatch.setattr("shapecat.batch.manifest._PART_BYTES", 1)
+    place, write = "memory://meanwhile", Location.write
+    manifest = RemoteManifest(place)
+    late = [Entry("b", "b.mcap", "complete")]
+
+    def write_slowly(self: Location, content: bytes) -> None:
+        write(self, content)
+        manifest.record([late.pop()] if late else [])
+
+    monkeypatch.setattr(Location, "write", write_slowly)
+    manifest.record([Entry("a", "a.mcap", "complete")])
+    manifest.send()
+    manifest.send()
+
+    assert RemoteManifest(place).entries.keys() == {"a", "b"}
 
 
 def test_a_part_of_a_manifest_is_read_again_when_it_has_grown() -> None:
