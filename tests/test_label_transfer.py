@@ -386,6 +386,19 @@ def test_a_label_that_was_carried_over_can_be_replaced(tmp_path: Path) -> None:
     assert labels_of(target) == {5: "teapot"}
 
 
+def test_a_label_that_was_carried_over_and_then_corrected_stays(tmp_path: Path) -> None:
+    """A second transfer knows what the first one wrote, and must not take it for that."""
+    source = make_run(tmp_path / "source", {1: still(CUP)}, labels={1: "mug"})
+    target = make_run(tmp_path / "target", {5: still(CUP)})
+    transfer_labels(source, target)
+    write_csv(target / "tracks.csv", {5: still(CUP)}, "wtarget", {5: "teapot"})
+
+    (missed,) = transfer_labels(source, target).missed
+
+    assert missed.reason == "track 5 already has the label teapot"
+    assert labels_of(target) == {5: "teapot"}
+
+
 def test_one_label_that_contradicts_does_not_cost_the_others(tmp_path: Path) -> None:
     """A user merged a track of the target that the source says to delete."""
     labels = {1: "delete", 3: "mug"}
