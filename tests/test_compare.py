@@ -627,6 +627,18 @@ def test_a_run_differs_from_itself_in_nothing_and_from_a_corrected_one_in_the_la
     assert changed["objects"] == {"true": 8, "detections": 9, "found": 8, "share_found": 1}
 
 
+def test_tracks_that_a_person_has_merged_are_one(run: Path, truth: Path) -> None:
+    """Whoever mended a broken track would still be told of the switch."""
+    text = (run / "tracks.csv").read_text()
+    (run / "tracks.csv").write_text(text.replace("4,cup,0.9,", "4,cup,0.9,merge with 1"))
+
+    found = compare(run, truth)
+
+    assert found.figures["tracking"]["switches"] == 0
+    assert {row.track for row in found.rows if row.true_track == 11} == {1}
+    assert "identity" not in {row.difference for row in found.rows}
+
+
 def test_coco_masks_in_all_forms_are_compared(shapecat: Run, run: Path) -> None:
     """A polygon, run lengths, and compressed run lengths of the same cup; stamps in the names."""
     mask = np.zeros(100, np.bool_)
