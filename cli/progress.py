@@ -26,6 +26,13 @@ WORDS = {
     "check": "to verify",
     "new": "new",
 }
+_SHARES = {
+    "perceive": (0.0, 0.7),
+    "revise": (0.7, 0.8),
+    "review": (0.8, 0.9),
+    "annotate": (0.9, 1.0),
+}
+"""Roughly where in the work on a recording each phase begins and ends."""
 
 
 def describe_plan(tasks: Sequence[Any], left_out: int, workers: int, cores: int) -> str:
@@ -95,11 +102,13 @@ class Progress:
             self.show_ended(outcome)
 
     def remaining_s(self) -> float | None:
-        """Return the estimated seconds left, from the bytes read so far; None before the first."""
-        if not self.read:
+        """Return the estimated seconds left, from the bytes done so far; None before the first."""
+        running = (self.tasks[name].bytes * _share(*state) for name, state in self.running.items())
+        done: float = self.read + sum(running)
+        if not done:
             return None
-        rate = self.read / (time.monotonic() - self.begun)
-        return (self.todo - self.read) / rate
+        elapsed = time.monotonic() - self.begun
+        return elapsed * (self.todo - done) / done
 
     def note(self, text: str) -> None:
         """Show a line."""
@@ -144,6 +153,12 @@ class PlainProgress(Progress):
         failed = f", {self.failed} failed" if self.failed else ""
         done = f"{self.complete + self.failed}/{len(self.tasks)} recordings{failed}{eta}"
         self.note(f"{done}; {running}")
+
+
+def _share(phase: str, done: int, total: int | None) -> float:
+    """Return how much of the work on a recording is done, from 0 to 1."""
+    begin, end = _SHARES.get(phase, (0.0, 0.0))
+    return begin + (end - begin) * min(done / total, 1.0) if total else begin
 
 
 def _words(name: str, phase: str, done: int, total: int | None) -> str:

@@ -51,6 +51,26 @@ def test_time_left_is_that_of_the_bytes_that_are_left(monkeypatch: pytest.Monkey
     assert (progress.complete, progress.failed) == (2, 1)
 
 
+def test_time_left_falls_while_a_recording_is_processed(monkeypatch: pytest.MonkeyPatch) -> None:
+    """With finished recordings alone, it would grow until the next one is finished."""
+    now = 0.0
+    monkeypatch.setattr("shapecat.cli.progress.time.monotonic", lambda: now)
+    progress = PROGRESS.Progress([task("a", size=100), task("b", size=300)])
+    now = 6.0
+    progress.progress("b", "perceive", 1, None)
+    assert progress.remaining_s() is None
+    progress.progress("b", "perceive", 2, 7)  # a fifth of the work, 60 bytes
+    assert progress.remaining_s() == pytest.approx(6 * 340 / 60)
+    now = 8.0
+    progress.ended(ended("a", processed=True))
+    assert progress.remaining_s() == pytest.approx(8 * 240 / 160)
+    now = 10.0
+    progress.progress("b", "review", 5, 10)  # 85 %, 255 bytes
+    assert progress.remaining_s() == pytest.approx(10 * 45 / 355)
+    progress.ended(ended("b", processed=True))
+    assert progress.remaining_s() == 0
+
+
 def test_time_left_is_read_as_hours_minutes_and_seconds() -> None:
     """An hour and five minutes must not be shown as 1.5 hours."""
     words = [PROGRESS._duration(seconds) for seconds in (3903.4, 36_000, 125, 59.6, -2)]
@@ -254,7 +274,7 @@ def test_a_few_warnings_about_new_results_are_printed(capsys: pytest.CaptureFixt
 def test_lines_tell_what_is_done_running_and_left(
     capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """At most one line in five seconds; the time left follows from the unread bytes."""
+    """At most one line in five seconds; the time left follows from the bytes and frames done."""
     now = 100.0
     monkeypatch.setattr("shapecat.cli.progress.time.monotonic", lambda: now)
     progress = PROGRESS.PlainProgress([task("a", size=100), task("b", size=300), task("c")])
@@ -265,12 +285,12 @@ def test_lines_tell_what_is_done_running_and_left(
     progress.progress("c", "annotate", 2, None)
     progress.progress("b", "perceive", 3, 61)
     now = 115.0
-    progress.progress("b", "perceive", 4, 61)
+    progress.progress("b", "perceive", 40, 61)
 
     done, busy = "1/3 recordings, 1 failed, about", "c: writing annotated.mcap 2"
     assert capsys.readouterr().err.splitlines() == [
         f"{done} 0:30 left; {busy}",
-        f"{done} 0:45 left; b: finding and categorizing objects 4/61, {busy}",
+        f"{done} 0:10 left; b: finding and categorizing objects 40/61, {busy}",
     ]
 
 
