@@ -56,15 +56,14 @@ def _serve(reports: "Reports", port: int) -> None:
     """Serve until a signal arrives, then write the pages again with the corrections."""
     from shapecat.outputs.report.serving import serve_reports
 
-    with serve_reports(reports, port=port) as address:
+    with serve_reports(reports, port=port) as address, stopping.noticing("stopping the server"):
         click.echo(address)
         click.echo(
             "corrections are written to tracks.csv as you make them; Ctrl+C stops the server",
             err=True,
         )
         try:
-            while True:
-                stopping.check()
+            while not stopping.asked():
                 time.sleep(0.1)
         finally:
             reports.write()

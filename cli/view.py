@@ -51,9 +51,9 @@ def _serve(review: Path) -> None:
     """Serve until the viewer ends or a signal arrives."""
     from shapecat.outputs.review_viewer import serve_viewer
 
-    with serve_viewer(review) as (address, viewer):
+    stops = stopping.noticing("stopping the viewer")
+    with serve_viewer(review) as (address, viewer), stops:
         click.echo(address)
-        while viewer.poll() is None:
-            stopping.check()
+        while viewer.poll() is None and not stopping.asked():
             with suppress(subprocess.TimeoutExpired):
                 viewer.wait(0.1)

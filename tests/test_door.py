@@ -370,8 +370,7 @@ def test_the_web_viewer_serves_this_machine_alone(tmp_path: Path) -> None:
         below = descendants(viewer.pid)
         viewer.send_signal(signal.SIGINT)
         _, errors = viewer.communicate(timeout=20)
-    assert viewer.returncode == 130
-    assert "Traceback" not in errors
+    assert (viewer.returncode, errors) == (0, "stopping the viewer\n")
     wait_for(lambda: not any(Path(f"/proc/{pid}").exists() for pid in below))
 
 

@@ -13,10 +13,20 @@ from contextlib import contextmanager, suppress
 from types import FrameType
 from typing import TypeVar
 
-__all__ = ["Stopped", "asked", "check", "heeding_signals", "leave", "request", "until_asked"]
+__all__ = [
+    "Stopped",
+    "asked",
+    "check",
+    "heeding_signals",
+    "leave",
+    "noticing",
+    "request",
+    "until_asked",
+]
 
 _SIGNALS = (signal.SIGINT, signal.SIGTERM)
-_NOTICE = b"stopping after the frames in work; interrupt again to leave at once\n"
+_notices = [b"stopping after the frames in work; interrupt again to leave at once\n"]
+"""The last one is printed at the first signal."""
 _SHOW_CURSOR = b"\x1b[?25h"
 
 _Item = TypeVar("_Item")
@@ -80,7 +90,17 @@ def _note(signum: int, frame: FrameType | None) -> None:
     if asked():
         leave(signum, frame)
     request(signum)
-    _say(_NOTICE)
+    _say(_notices[-1])
+
+
+@contextmanager
+def noticing(text: str) -> Iterator[None]:
+    """Print a text of the block's own at the first signal."""
+    _notices.append(f"{text}\n".encode())
+    try:
+        yield
+    finally:
+        _notices.pop()
 
 
 @contextmanager
