@@ -187,6 +187,22 @@ def test_figures_are_those_by_hand(run: Path, truth: Path) -> None:
     assert tracking["idf1"] == pytest.approx(2 * 7 / (9 + 8), abs=1e-4)
 
 
+def test_a_detection_of_an_object_too_small_to_be_listed_is_not_false(
+    run: Path, truth: Path
+) -> None:
+    """The simulator lists objects with few visible pixels apart; detection may find them."""
+    before = compare(run, truth).figures["objects"]
+    content = json.loads(truth.read_text())
+    for entry in content:
+        entry["hidden"] = [entry["objects"].pop(2)]
+    truth.write_text(json.dumps(content))
+    after = compare(run, truth).figures["objects"]
+
+    boxes = sum(track == 3 for found in FOUND for track, *_ in found)
+    assert before["detections"] - after["detections"] == boxes
+    assert before["true"] - after["true"] == 3
+
+
 def test_the_table_tells_every_difference_once(shapecat: Run, run: Path, truth: Path) -> None:
     out = run.parent / "out"
     result = shapecat("compare", run, truth, "--out", out)

@@ -9,6 +9,7 @@ from typing import Any
 
 import numpy as np
 
+from shapecat.arrays import Bool
 from shapecat.errors import OutputError, RecordingError
 from shapecat.evaluation.comparison_figures import Pairs, figures_of
 from shapecat.evaluation.comparison_matching import (
@@ -192,6 +193,8 @@ def _compare_frame(
 def _labelled_part(found: Labelling, true: Labelling, key: Key) -> Labelling:
     """Return the detections without the pixels that have no label in the truth.
 
+    Detections of which more than half is ignored in the truth are left out.
+
     Raises
     ------
     RecordingError : the label image and the depth image differ in size.
@@ -206,8 +209,15 @@ def _labelled_part(found: Labelling, true: Labelling, key: Key) -> Labelling:
     items = (
         item if item.pixels is None else replace(item, pixels=item.pixels[true.known[item.pixels]])
         for item in found.items
+        if not _is_ignored(item, true.ignored)
     )
     return Labelling(tuple(items))
+
+
+def _is_ignored(item: Item, ignored: Bool | None) -> bool:
+    if ignored is None or item.pixels is None or not item.pixels.size:
+        return False
+    return bool(ignored[item.pixels].mean() > 0.5)
 
 
 def _differences(

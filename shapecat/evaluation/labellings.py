@@ -46,11 +46,14 @@ class Labelling:
     ----------
     known : (n,) which pixels of the frame have a label; None if all have.
     shape : height and width of the image; None if unknown.
+    ignored : (n,) which pixels show objects that need not be found, nor are false if they are;
+        None if there are none.
     """
 
     items: tuple[Item, ...]
     known: Bool | None = None
     shape: tuple[int, int] | None = None
+    ignored: Bool | None = None
 
 
 class Reference(ABC):

@@ -60,7 +60,10 @@ def open_reference(path: Path, categories: Sequence[str] = ()) -> Reference:
 
 
 class SimulatedTruth(Reference):
-    """Ground truth of `shapecat simulate`: NAME.truth.json and NAME.labels.npz."""
+    """Ground truth of `shapecat simulate`: NAME.truth.json and NAME.labels.npz.
+
+    Objects of which too few pixels are visible are ignored.
+    """
 
     kind = "truth of every pixel"
 
@@ -89,7 +92,10 @@ class SimulatedTruth(Reference):
             )
             for item in entry["objects"]
         )
-        return Labelling(tuple(items), flat > 0, (image.shape[0], image.shape[1]))
+        small = [part for item in entry.get("hidden", ()) for part in item["parts"]]
+        ignored = np.isin(flat, small)
+        size = image.shape[0], image.shape[1]
+        return Labelling(tuple(items), (flat > 0) & ~ignored, size, ignored)
 
     def describe_frames(self) -> str:
         """Return the range of timestamps."""
