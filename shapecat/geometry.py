@@ -1,7 +1,7 @@
 """Geometry that the stages share: poses, quaternions, boxes, the level frame, depth limits."""
 
 import math
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from typing import TypeAlias
 
 import numpy as np
@@ -12,9 +12,11 @@ from shapecat.jit import kernel
 from shapecat.types import Box, Pose
 
 __all__ = [
+    "BOX_EDGES",
     "DISCONTINUITY",
     "IDENTITY",
     "NEAREST_M",
+    "box_around",
     "box_corners",
     "compose",
     "cross",
@@ -37,6 +39,12 @@ NEAREST_M = 0.05
 """Smallest depth considered, metres: no sensor measures nearer, and inverse depth stays bounded."""
 IDENTITY = Pose(np.eye(3), np.zeros(3))
 """The pose that changes nothing."""
+BOX_EDGES = np.array(
+    [(k, (k + 1) % 4) for k in range(4)]
+    + [(k + 4, (k + 1) % 4 + 4) for k in range(4)]
+    + [(k, k + 4) for k in range(4)]
+)
+"""The edges of a box (12, 2) as pairs of corners, in the order of `box_corners`."""
 
 
 def compose(a_from_b: Pose, b_from_c: Pose) -> Pose:
@@ -244,6 +252,12 @@ def box_corners(box: Box) -> F8:
     unit = np.array([[x, y, z] for z in (-1, 1) for x, y in signs.tolist()], np.float64)
     rotation = rotation_from_quaternion(box.orientation)
     return np.asarray(box.center + (unit * box.size / 2) @ rotation.T)
+
+
+def box_around(boxes: Iterable[Box], up: ArrayLike) -> Box:
+    """Return the `upright_box` around the corners of boxes."""
+    corners = np.concatenate([box_corners(box) for box in boxes])
+    return upright_box(corners.astype(np.float32), up)
 
 
 @kernel

@@ -9,19 +9,13 @@ from scipy.optimize import linear_sum_assignment
 from scipy.spatial import ConvexHull, QhullError
 
 from shapecat.arrays import F8, U4
-from shapecat.geometry import box_corners, rotation_from_quaternion
+from shapecat.geometry import BOX_EDGES, box_corners, rotation_from_quaternion
 from shapecat.types import Box
 
 __all__ = ["MATCHED_F", "MaskMatches", "Overlap", "box_iou", "match_masks"]
 
 MATCHED_F = 0.75
 """Lowest overlap F of an object that counts as found."""
-
-_EDGES = np.array(
-    [[k, (k + 1) % 4] for k in range(4)]
-    + [[4 + k, 4 + (k + 1) % 4] for k in range(4)]
-    + [[k, k + 4] for k in range(4)]
-)  # of the corners in the order of `box_corners`
 
 
 @dataclass(frozen=True)
@@ -146,7 +140,7 @@ def _inside(a: Box, b: Box) -> F8:
     turn = rotation_from_quaternion(b.orientation)
     corners = (box_corners(a) - b.center) @ turn
     half = b.size.astype(np.float64) / 2
-    start, step = corners[_EDGES[:, 0]], corners[_EDGES[:, 1]] - corners[_EDGES[:, 0]]
+    start, step = corners[BOX_EDGES[:, 0]], corners[BOX_EDGES[:, 1]] - corners[BOX_EDGES[:, 0]]
     still = np.abs(step) < 1e-12
     safe = np.where(still, 1.0, step)
     sides = np.stack([(-half - start) / safe, (half - start) / safe])

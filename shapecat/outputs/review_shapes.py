@@ -12,7 +12,12 @@ import pyarrow as pa
 import rerun as rr
 
 from shapecat.arrays import F4, F8, U4
-from shapecat.geometry import box_corners, quaternion_from_rotation, rotation_from_quaternion
+from shapecat.geometry import (
+    BOX_EDGES,
+    box_corners,
+    quaternion_from_rotation,
+    rotation_from_quaternion,
+)
 from shapecat.outputs.colours import colour_of
 from shapecat.outputs.review_cloud import PaintedCloud
 from shapecat.outputs.wording import caption
@@ -39,12 +44,6 @@ _CAPTION_M = 0.02  # from the top of a box to its caption
 _SURE = 0.9
 """A caption omits a confidence of at least this."""
 
-_EDGES = np.array(
-    [(k, (k + 1) % 4) for k in range(4)]
-    + [(k + 4, (k + 1) % 4 + 4) for k in range(4)]
-    + [(k, k + 4) for k in range(4)]
-)
-"""The edges of a box as pairs of corners, in the order of `box_corners`."""
 _DASHES = (np.arange(5)[:, None] + [0.0, 0.5])[..., None] / 4.5
 """Start and end (5, 2, 1) of the dashes of an edge, as shares of its length, from 0 to 1."""
 
@@ -158,9 +157,9 @@ def _dashes(scenes: Sequence[DrawnScene]) -> _Columns:
     known = [[o for o in m.objects if o.full is not None] for m in scenes]
     objects = list(chain.from_iterable(known))
     corners = np.reshape([box_corners(o.full) for o in objects if o.full is not None], (-1, 8, 3))
-    starts, ends = corners[:, _EDGES[:, 0]], corners[:, _EDGES[:, 1]]
+    starts, ends = corners[:, BOX_EDGES[:, 0]], corners[:, BOX_EDGES[:, 1]]
     pairs = starts[:, :, None, None] + _DASHES * (ends - starts)[:, :, None, None]
-    dashes = len(_EDGES) * len(_DASHES)
+    dashes = len(BOX_EDGES) * len(_DASHES)
     yield from rr.LineStrips3D.columns(
         strips=_segments(pairs.reshape(-1, 2, 3)),
         colors=np.repeat(_packed(objects, white=0.45), dashes),

@@ -4,13 +4,12 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
-import numpy as np
 import pyarrow as pa
 
 from shapecat.detection.scene_graph import Node, format_tree
 from shapecat.errors import OutputError
 from shapecat.runs.finished import FinishedRun, read_finished
-from shapecat.runs.labels import read_labelled_frames
+from shapecat.runs.labels import plane_of, read_labelled_frames
 from shapecat.runs.tables import read_row_groups
 from shapecat.types import Box, Candidate, Plane, Scene
 
@@ -40,16 +39,7 @@ def describe_scene(folder: Path, frame: int, *, topic: str | None = None) -> str
 def read_scene(folder: Path, topic: str, frame: int) -> Scene:
     """Return the planes and objects of a frame as detection found them."""
     up = _rows(folder, "frames", topic, frame, ["topic", "frame", "up"])[0]["up"]
-    planes = [
-        Plane(
-            normal=row["normal"],
-            offset=row["offset"],
-            outline=np.reshape(row["outline"], (-1, 3)),
-            area_m2=row["area_m2"],
-            height_m=row["height_m"],
-        )
-        for row in _rows(folder, "planes", topic, frame)
-    ]
+    planes = [plane_of(row) for row in _rows(folder, "planes", topic, frame)]
     rows = _rows(folder, "detections", topic, frame)
     objects = [_candidate(row, planes) for row in rows]
     return Scene(up, tuple(planes), tuple(objects))

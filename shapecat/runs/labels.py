@@ -10,7 +10,7 @@ import pyarrow as pa
 import pyarrow.compute
 
 from shapecat.arrays import F4
-from shapecat.geometry import box_corners, upright_box
+from shapecat.geometry import box_around
 from shapecat.runs.label_meaning import TrackLabel
 from shapecat.runs.masks import read_masks
 from shapecat.runs.shown import ShownTracks
@@ -25,7 +25,7 @@ from shapecat.types import (
     Pose,
 )
 
-__all__ = ["read_labelled_frames", "rows_by_frame"]
+__all__ = ["plane_of", "read_labelled_frames", "rows_by_frame"]
 
 
 _OBJECT = (
@@ -129,7 +129,7 @@ def _labelled_frame(
         log_time_ns=row["log_time_ns"],
         frame_id=row["frame_id"],
         fixed_from_sensor=pose,
-        planes=tuple(_plane(plane) for plane in planes),
+        planes=tuple(plane_of(plane) for plane in planes),
         objects=tuple(_join(seen, row["up"]) for seen in parts.values()),
         ended=shown.ended.get(key, ()),
         seconds=dict(zip(row["stages"], row["seconds"], strict=True)),
@@ -138,11 +138,12 @@ def _labelled_frame(
     )
 
 
-def _plane(row: Mapping[str, Any]) -> Plane:
+def plane_of(row: Mapping[str, Any]) -> Plane:
+    """Return the plane of a row of planes.parquet."""
     return Plane(
         normal=row["normal"],
         offset=row["offset"],
-        outline=row["outline"].reshape(-1, 3),
+        outline=np.reshape(row["outline"], (-1, 3)),
         area_m2=row["area_m2"],
         height_m=row["height_m"],
     )
@@ -172,8 +173,8 @@ def _join(parts: Sequence[LabelledObject], up: Sequence[float]) -> LabelledObjec
     """Join the parts of a merged track in one frame into one object."""
     if len(parts) == 1:
         return parts[0]
-    box = _around([part.box for part in parts], up)
-    full = _around([part.full or part.box for part in parts], up)
+    box = box_around([part.box for part in parts], up)
+    full = box_around([part.full or part.box for part in parts], up)
     bottoms = [float(np.dot(up, part.box.center)) - part.height_m for part in parts]
     starts = np.cumsum([0, *(len(part.gas.neurons) for part in parts)])
     edges = [part.gas.edges + start for part, start in zip(parts, starts[:-1], strict=True)]
@@ -190,8 +191,3 @@ def _join(parts: Sequence[LabelledObject], up: Sequence[float]) -> LabelledObjec
         detections=tuple(number for part in parts for number in part.detections),
         full=full if any(part.full for part in parts) else None,
     )
-
-
-def _around(boxes: Sequence[Box], up: Sequence[float]) -> Box:
-    corners = np.concatenate([box_corners(box) for box in boxes])
-    return upright_box(corners.astype(np.float32), up)

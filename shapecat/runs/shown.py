@@ -12,7 +12,7 @@ import pyarrow.compute
 import pyarrow.parquet as pq
 
 from shapecat.arrays import F4, F8, I4
-from shapecat.geometry import box_corners, upright_box
+from shapecat.geometry import box_around
 from shapecat.runs.full_boxes import FULL_WIDTHS, numbers_or_nan
 from shapecat.runs.label_meaning import TrackLabel
 from shapecat.runs.tables import (
@@ -207,8 +207,7 @@ def _join(parts: Sequence[ShownBox], up: F4) -> ShownBox:
     """Join the boxes of a merged track in one frame."""
     if len(parts) == 1:
         return parts[0]
-    corners = [box_corners(Box(*map(np.array, part[3:]))) for part in parts]
-    box = upright_box(np.concatenate(corners).astype(np.float32), up)
+    box = box_around((Box(*map(np.array, part[3:])) for part in parts), up)
     return parts[0]._replace(
         center=tuple(box.center.tolist()),
         size=tuple(box.size.tolist()),
