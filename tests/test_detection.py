@@ -246,7 +246,6 @@ def test_stacked_box_is_split_and_stands_on_the_lower() -> None:
     candidate = scene.candidates[upper]
     assert candidate.on_candidate == 1 - upper
     assert abs(candidate.support_m - 0.08) < 0.01
-    assert Hierarchy(scene).objects_on_objects() == ((1 - upper, upper),)
 
 
 def test_far_wall_of_a_bowl_is_not_split() -> None:
@@ -563,8 +562,8 @@ def test_any_cloud_gives_a_scene(n: int, seed: int, odd: float, spread: float) -
     assert np.isfinite(scene.up).all()
 
 
-def test_hierarchy_answers_the_queries() -> None:
-    """Highest, lowest, nearest, farthest, on objects, and counts (thesis 4.5)."""
+def test_hierarchy_tells_what_stands_on_what() -> None:
+    """An object on another is no child of the plane (thesis 4.5)."""
     shapes = [
         table(),
         box((-0.2, 0, 0), (0.15, 0.15, 0.08)),
@@ -580,13 +579,9 @@ def test_hierarchy_answers_the_queries() -> None:
     }
     assert len(scene.candidates) == len(name) == 4
     hierarchy = Hierarchy(scene)
-    assert hierarchy.highest(0) == name[2]
-    assert hierarchy.lowest(0) == name[4]
-    assert hierarchy.nearest(0) == name[4]
-    assert hierarchy.farthest(0) == name[3]
-    assert hierarchy.objects_on_objects() == ((name[1], name[2]),)
-    assert hierarchy.count(0) == 4
-    assert hierarchy.count(0, direct=True) == 3
+    on_plane = hierarchy.children(Node("plane", 0))
+    assert {node.index for node in on_plane} == {name[1], name[3], name[4]}
+    assert hierarchy.children(Node("object", name[1])) == (Node("object", name[2]),)
     assert hierarchy.roots == (Node("plane", 0),)
     assert len(set(hierarchy.nodes)) == 5
     tree = format_tree(scene).splitlines()
@@ -594,12 +589,11 @@ def test_hierarchy_answers_the_queries() -> None:
 
 
 def test_hierarchy_of_nothing() -> None:
-    """Queries on a plane without objects have no answer."""
+    """A plane without objects has no children."""
     depth, _ = render([table()])
     hierarchy = Hierarchy(found(frame_of(depth)))
-    assert hierarchy.highest(0) is None
-    assert hierarchy.nearest(0) is None
-    assert hierarchy.count(0) == 0
+    assert hierarchy.roots == hierarchy.nodes == (Node("plane", 0),)
+    assert hierarchy.children(Node("plane", 0)) == ()
 
 
 def test_can_on_a_microwave_oven() -> None:

@@ -504,7 +504,7 @@ def test_views_of_an_object_are_fused() -> None:
     posteriors = np.array([[0.9, 0.1], [0.45, 0.55], [0.45, 0.55]] * 2 + [[0, 1], [0, 1]], "f4")
     names = np.array(["a", "a", "a", "b", "b", "b", "c", "c"])
 
-    fused = fuse_views(truth, posteriors, names, counts=(3, 10))
+    fused = fuse_views(truth, posteriors, names)
 
     assert [item.views for item in fused] == [3]
     assert fused[0].groups == 2

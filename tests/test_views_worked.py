@@ -11,7 +11,7 @@ from scipy.spatial.transform import Rotation
 from shapecat.arrays import F8
 from shapecat.config import DetectionSettings, Settings, SurfaceSettings
 from shapecat.description import DESCRIPTOR_NAMES, describe
-from shapecat.detection import detect
+from shapecat.detection import depth_grid, detect
 from shapecat.detection.depth_grid import downsample
 from shapecat.detection.virtual_camera import virtual_image
 from shapecat.perception import perceive
@@ -169,7 +169,7 @@ def test_a_turned_cloud_with_its_up_has_the_same_objects() -> None:
     assert cKDTree(turn.apply(expected)).query(found)[0].max() < 0.01
 
 
-def test_cells_of_an_image_see_where_their_pixels_do() -> None:
+def test_cells_of_an_image_see_where_their_pixels_do(monkeypatch: pytest.MonkeyPatch) -> None:
     """The inverse depth of a plane is linear in the rays, so half a pixel would change it."""
     camera = Camera(320, 240, 260.3, 255.1, 158.7, 121.2)
     normal, offset = np.array([0.21, -0.83, -0.35]), -0.9
@@ -178,7 +178,8 @@ def test_cells_of_an_image_see_where_their_pixels_do() -> None:
     inverse = rays @ normal / offset
     depth = np.where(inverse > 0.4, 1 / np.maximum(inverse, 0.4), 0).astype(np.float32)
     for cell_m in (0.0125, 0.019):  # two pixels a cell, and three
-        grid = downsample(depth, camera, range_m=2.4, cell_m=cell_m)
+        monkeypatch.setattr(depth_grid, "CELL_M", cell_m)
+        grid = downsample(depth, camera, range_m=2.4)
         assert grid is not None
         i, j = np.nonzero(grid.inverse_depth)
         k = grid.intrinsics

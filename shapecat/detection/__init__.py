@@ -1,6 +1,6 @@
 """Detection: supporting planes, objects and the support graph of a scene (thesis ch. 4).
 
-`detect` turns a frame into a `shapecat.types.Scene`; `Hierarchy` answers queries about it.
+`detect` turns a frame into a `shapecat.types.Scene`; `Hierarchy` tells what stands on what.
 """
 
 from shapecat.detection.pipeline import detect

@@ -64,9 +64,7 @@ class DepthGrid(NamedTuple):
     size_m: float
 
 
-def downsample(
-    depth: F4, camera: Camera, *, range_m: float, cell_m: float = CELL_M
-) -> DepthGrid | None:
+def downsample(depth: F4, camera: Camera, *, range_m: float) -> DepthGrid | None:
     """Average, in each cell, the depths close to the nearest one; return the inverse means.
 
     Return None if no reading is within ``range_m``; in images larger than 50 pixels, only every
@@ -76,14 +74,13 @@ def downsample(
     ----------
     depth : (h, w) metres, 0 where there is no reading.
     range_m : readings farther away are ignored (thesis 4.2, pass-through filter).
-    cell_m : target width of a cell at the median depth.
     """
     sample = _sampled(depth, 5 if min(depth.shape) > 50 else 1, np.float32(range_m))
     if sample.size == 0:
         return None
     pixel_m = _median_of(sample) / max(abs(camera.fx), 1e-6)
     least = math.sqrt(depth.size / MOST_CELLS)
-    factor = round(min(max(cell_m / max(pixel_m, 1e-9), least, 1.0), LARGEST_FACTOR, *depth.shape))
+    factor = round(min(max(CELL_M / max(pixel_m, 1e-9), least, 1.0), LARGEST_FACTOR, *depth.shape))
     shift = (factor - 1) / 2
     intrinsics = PinholeIntrinsics(
         camera.fx / factor,

@@ -65,57 +65,10 @@ class Hierarchy:
         upper = {b for _, b in self.edges}
         return tuple(node for node in self.nodes if node not in upper)
 
-    def parents(self, node: Node) -> tuple[Node, ...]:
-        """Return the nodes that ``node`` stands on directly."""
-        return tuple(a for a, b in self.edges if b == node)
-
     def children(self, node: Node) -> tuple[Node, ...]:
         """Return the nodes directly on ``node``: planes in order of height, then objects."""
         upper = {b for a, b in self.edges if a == node}
         return tuple(n for n in self.nodes if n in upper)
-
-    def above(self, node: Node) -> tuple[Node, ...]:
-        """Return all nodes that ``node`` supports, directly or indirectly, each once."""
-        seen: set[Node] = set()
-        open_nodes = [node]
-        while open_nodes:
-            fresh = [n for n in self.children(open_nodes.pop()) if n not in seen]
-            seen.update(fresh)
-            open_nodes.extend(fresh)
-        return tuple(n for n in self.nodes if n in seen)
-
-    def objects_on(self, plane: int, *, direct: bool = False) -> tuple[int, ...]:
-        """Return the indices of the objects on a plane; if ``direct``, only those touching it."""
-        reach = self.children if direct else self.above
-        return tuple(n.index for n in reach(Node("plane", plane)) if n.kind == "object")
-
-    def count(self, plane: int, *, direct: bool = False) -> int:
-        """Return the number of objects on a plane."""
-        return len(self.objects_on(plane, direct=direct))
-
-    def highest(self, plane: int) -> int | None:
-        """Return the index of the object on a plane that has the highest top, or None."""
-        return max(self.objects_on(plane), key=lambda k: (self._top(k), -k), default=None)
-
-    def lowest(self, plane: int) -> int | None:
-        """Return the index of the object on a plane that has the lowest top, or None."""
-        return min(self.objects_on(plane), key=lambda k: (self._top(k), k), default=None)
-
-    def nearest(self, plane: int) -> int | None:
-        """Return the index of the object on a plane that is nearest to the sensor, or None."""
-        return min(self.objects_on(plane), key=lambda k: (self._range(k), k), default=None)
-
-    def farthest(self, plane: int) -> int | None:
-        """Return the index of the object on a plane that is farthest from the sensor, or None."""
-        return max(self.objects_on(plane), key=lambda k: (self._range(k), -k), default=None)
-
-    def objects_on_objects(self) -> tuple[tuple[int, int], ...]:
-        """Return pairs (lower, upper) of objects, by index; the upper stands on the lower."""
-        return tuple(
-            (c.on_candidate, k)
-            for k, c in enumerate(self.scene.candidates)
-            if c.on_candidate is not None
-        )
 
     def _parents_of_object(self, candidate: Candidate) -> Iterable[Node]:
         if candidate.on_candidate is not None:
@@ -146,9 +99,6 @@ class Hierarchy:
     def _top(self, k: int) -> float:
         box = self.scene.candidates[k].box
         return self._height(box.center) + float(box.size[2]) / 2
-
-    def _range(self, k: int) -> float:
-        return float(np.linalg.norm(self.scene.candidates[k].box.center))
 
 
 def _covers(plane: Plane, point: F8) -> bool:

@@ -121,8 +121,8 @@ def _valid_eye(eye: F8 | None) -> F8 | None:
     return eye
 
 
-def find_viewpoint(points: F4, *, distance_m: float = 1.0) -> F8:
-    """Estimate the position of the sensor from a partial view.
+def find_viewpoint(points: F4) -> F8:
+    """Estimate the position of the sensor from a partial view, 1 m from its centre.
 
     Seen from the sensor, no two points of a view have the same direction. Of 48 positions around
     the points, at 15 to 60 degrees of elevation, return the one from which the points cover the
@@ -131,7 +131,6 @@ def find_viewpoint(points: F4, *, distance_m: float = 1.0) -> F8:
     Parameters
     ----------
     points : (n, 3) metres, z up.
-    distance_m : distance of the position from the centre of the points.
 
     Returns
     -------
@@ -152,7 +151,7 @@ def find_viewpoint(points: F4, *, distance_m: float = 1.0) -> F8:
     local = points - centre
     cell = max(float(np.sqrt(np.ptp(local, axis=0).max() ** 2 / max(len(points), 1))), 1e-4)
     covered = [_covered_cells(local, direction, cell) for direction in directions]
-    return np.asarray(centre + distance_m * directions[int(np.argmax(covered))])
+    return np.asarray(centre + directions[int(np.argmax(covered))])
 
 
 def _covered_cells(points: F8, direction: F8, cell: float) -> int:

@@ -1,6 +1,5 @@
 """Accuracy of several fused views of one object (thesis 7.5.2)."""
 
-from collections.abc import Sequence
 from typing import NamedTuple
 
 import numpy as np
@@ -24,10 +23,10 @@ class Fused(NamedTuple):
     ece: float
 
 
-def fuse_views(
-    truth: I4, posteriors: F4, objects: np.ndarray, *, counts: Sequence[int] = FUSED
-) -> tuple[Fused, ...]:
+def fuse_views(truth: I4, posteriors: F4, objects: np.ndarray) -> tuple[Fused, ...]:
     """Fuse the views of each object in groups of consecutive views, and measure the accuracy.
+
+    Leftover views are not used.
 
     The errors of an object's views are correlated, so the product of their posteriors is tempered
     by their number, as in tracks. A plain product would be overconfident, a mean underconfident.
@@ -37,14 +36,13 @@ def fuse_views(
     truth : (n,) true column of each view.
     posteriors : (n, c).
     objects : (n,) name of each view's object.
-    counts : numbers of views per group; leftover views are not used.
 
     Returns
     -------
-    One result for each count for which at least one object has enough views.
+    One result for each number in `FUSED` for which at least one object has enough views.
     """
     result = []
-    for count in counts:
+    for count in FUSED:
         groups = [
             members[k : k + count]
             for members in (np.flatnonzero(objects == name) for name in np.unique(objects))

@@ -10,10 +10,7 @@ from shapecat.arrays import F8
 from shapecat.simulation.mesh import Mesh, join, standing
 from shapecat.simulation.primitives import lathe, smooth_path, tube
 
-__all__ = ["BOWL_BORDERS", "log_uniform", "make_bowl", "make_cup", "make_plate"]
-
-BOWL_BORDERS = (0.2, 0.65)
-"""Range of depth / diameter of bowls; plates are flatter, cups deeper."""
+__all__ = ["log_uniform", "make_bowl", "make_cup", "make_plate"]
 
 
 def log_uniform(rng: Generator, low: float, high: float) -> float:

@@ -13,7 +13,7 @@ from shapecat.simulation.placement import Rest, rests
 from shapecat.simulation.render import geometry, render
 from shapecat.types import Camera, Pose
 
-__all__ = ["fill_ratio", "load_mesh", "upright_poses", "uprighted"]
+__all__ = ["load_mesh", "upright_poses", "uprighted"]
 
 _AXES = np.array(
     [
@@ -88,12 +88,6 @@ def upright_poses(mesh: Mesh, category: str) -> tuple[Rest, ...]:
         raise ValueError(msg)
     order = {"upright": 0, "lying": 1, "upside_down": 2}
     return tuple(sorted(found, key=lambda rest: order[rest.manner]))
-
-
-def fill_ratio(mesh: Mesh) -> float:
-    """Return the volume of the convex hull divided by the volume of the bounding box."""
-    hull = ConvexHull(np.asarray(mesh.vertices, np.float64))
-    return float(hull.volume / np.prod(np.asarray(mesh.extents, np.float64)))
 
 
 def _roundness(points: F8) -> float:
