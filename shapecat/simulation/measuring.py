@@ -12,6 +12,9 @@ from shapecat.simulation.sensors import Sensor
 
 __all__ = ["measure"]
 
+_STEP = 0.03
+"""Step in inverse depth that separates two surfaces, 1/m."""
+
 
 def measure(image: Image, sensor: Sensor, rng: Generator) -> tuple[F4, I4]:
     """Measure a rendered image with the errors of a depth camera.
@@ -155,6 +158,7 @@ def _blended(inverse: F8, width: int) -> F8:
 
 @kernel
 def _read_out(inverse: F8, error: F4, lost: Bool, limits: F8, depth: F4, owners: I4) -> None:
+    """Write the depth of the readings, with their errors and in steps, within the limits."""
     step, nearest, farthest = limits
     for v in range(inverse.shape[0]):
         for u in range(inverse.shape[1]):
@@ -174,6 +178,7 @@ def _read_out(inverse: F8, error: F4, lost: Bool, limits: F8, depth: F4, owners:
 def _look_beside(
     inverse: F8, owners: I4, cosine: F4, across: F4, down: F4, out: F8, who: I4, angle: F4
 ) -> None:
+    """Write what pixels displaced by ``across`` and ``down`` see: ``out``, ``who``, ``angle``."""
     height, width = inverse.shape
     for v in range(height):
         for u in range(width):
@@ -181,7 +186,7 @@ def _look_beside(
             x, y = min(max(x, 0), width - 1), min(max(y, 0), height - 1)
             there, here = inverse[y, x], inverse[v, u]
             # Only outlines move; on a surface, the pixel keeps its own true depth.
-            if abs(there - here) < 0.03 and owners[y, x] == owners[v, u]:
+            if abs(there - here) < _STEP and owners[y, x] == owners[v, u]:
                 x, y = u, v
             out[v, u] = inverse[y, x]
             who[v, u] = owners[y, x]
@@ -235,7 +240,7 @@ def _cast_shadow(inverse: F8, shift: float, shadow: Bool) -> None:
             x = u - shift * w
             start = int(np.floor(x + 0.5))
             end = start
-            if u + 1 < width and abs(inverse[v, u + 1] - w) < 0.03:  # the same surface continues
+            if u + 1 < width and abs(inverse[v, u + 1] - w) < _STEP:  # the same surface continues
                 end = max(start, int(np.floor(u + 1 - shift * inverse[v, u + 1] + 0.5)) - 1)
             for cell in range(start, end + 1):
                 at = cell + margin
@@ -244,7 +249,7 @@ def _cast_shadow(inverse: F8, shift: float, shadow: Bool) -> None:
         for u in range(width):
             w = inverse[v, u]
             at = int(np.floor(u - shift * w + 0.5)) + margin
-            if 0 <= at < nearest.size and nearest[at] > w + 0.03:
+            if 0 <= at < nearest.size and nearest[at] > w + _STEP:
                 shadow[v, u] = True
 
 
@@ -289,8 +294,8 @@ def _blend(inverse: F8, reach: int, out: F8) -> None:
                 continue
             edge = False
             for k in range(1, reach + 1):
-                edge = edge or abs(inverse[v, u - k] - here) > 0.03
-                edge = edge or abs(inverse[v, u + k] - here) > 0.03
+                edge = edge or abs(inverse[v, u - k] - here) > _STEP
+                edge = edge or abs(inverse[v, u + k] - here) > _STEP
             if not edge:
                 continue
             total, count = 0.0, 0
@@ -313,7 +318,7 @@ def _smooth(inverse: F8, reach: int, out: F8) -> None:
                 last = inverse[v, u]
                 for k in range(1, reach + 1):
                     x = u + way * k
-                    if not 0 <= x < width or abs(inverse[v, x] - last) >= 0.03:
+                    if not 0 <= x < width or abs(inverse[v, x] - last) >= _STEP:
                         break
                     last = inverse[v, x]
                     total += last

@@ -7,6 +7,7 @@ noise is measured.
 import numpy as np
 
 from shapecat.arrays import F4, F8, I4
+from shapecat.detection.connected_components import SIDES
 from shapecat.detection.foreground.settings import LOW
 from shapecat.geometry import DISCONTINUITY
 from shapecat.jit import kernel
@@ -132,9 +133,8 @@ def clear_contact(
             continue
         for j in range(1, columns - 1):
             if edge[j]:
-                for d in range(4):
-                    y = i + (1 if d == 0 else -1 if d == 1 else 0)
-                    x = j + (1 if d == 2 else -1 if d == 3 else 0)
+                for di, dj in SIDES:
+                    y, x = i + di, j + dj
                     if (
                         residual[y, x] != 0
                         and abs(inv_depth[y, x] - inv_depth[i, j]) < DISCONTINUITY
@@ -147,9 +147,8 @@ def clear_contact(
         i, j = stack[done] // columns, stack[done] % columns
         here = drop[done]
         done += 1
-        for d in range(4):
-            y = i + (1 if d == 0 else -1 if d == 1 else 0)
-            x = j + (1 if d == 2 else -1 if d == 3 else 0)
+        for di, dj in SIDES:
+            y, x = i + di, j + dj
             if (
                 residual[y, x] != 0
                 and here - residual[y, x] > LOW.slope

@@ -96,9 +96,7 @@ def measure_outline(
         beside = (parts[p - 1] == me) & (parts[p + 1] == me)
         if beside & (parts[p - columns] == me) & (parts[p + columns] == me):
             continue
-        for d in range(4):
-            di = 1 if d == 0 else -1 if d == 1 else 0
-            dj = 1 if d == 2 else -1 if d == 3 else 0
+        for di, dj in ((1, 0), (-1, 0), (0, 1), (0, -1)):  # another order rounds sums differently
             if parts[p + di * columns + dj] == me:
                 continue
             i, j = row_and_column(p, columns)

@@ -123,9 +123,8 @@ def _extend(over: Overhang, i: int, j: int, stack: I4) -> None:
     while done < top:
         i, j = row_and_column(stack[done], columns)
         done += 1
-        for d in range(4):
-            y = i + (1 if d == 0 else -1 if d == 1 else 0)
-            x = j + (1 if d == 2 else -1 if d == 3 else 0)
+        for di, dj in SIDES:
+            y, x = i + di, j + dj
             if y < 0 or x < 0 or y >= rows or x >= columns or over.visited[y, x] == me:
                 continue
             mine = plane_id[y, x] == me

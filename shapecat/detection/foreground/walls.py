@@ -179,9 +179,8 @@ def _flood(
         facing = max(-(x * normal[0] + y * normal[1] + normal[2]), 0.1)
         area += 1 / (w * w * k.fx * k.fy * facing)
         off += (w - (plane[0] * j + plane[1] * i + plane[2])) ** 2
-        for d in range(4):
-            v = i + (1 if d == 0 else -1 if d == 1 else 0)
-            u = j + (1 if d == 2 else -1 if d == 3 else 0)
+        for di, dj in ((1, 0), (-1, 0), (0, 1), (0, -1)):  # another order rounds sums differently
+            v, u = i + di, j + dj
             if v < 0 or u < 0 or v >= rows or u >= columns or found[v, u] != UNSEEN:
                 continue
             stack[top], found[v, u] = v * columns + u, ON_WALL

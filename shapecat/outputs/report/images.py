@@ -12,6 +12,7 @@ from scipy import ndimage
 from shapecat.arrays import F4, F8, U1, U4, Bool, Record, array
 from shapecat.colour.masks import Mask, dense_masks
 from shapecat.colour.outline import outlines
+from shapecat.detection.output.settings import OUTPUT
 from shapecat.detection.virtual_camera import top_view, virtual_image
 from shapecat.geometry import gravity_rotation
 from shapecat.outputs.colouring import Coloured
@@ -35,8 +36,6 @@ _GOOD_DETAIL = 12.0
 """Standard deviation of the Laplacian at which sharpness is 0.5, grey levels."""
 _NEARER = 0.015
 """A pixel occludes its neighbour if it is nearer by this many metres plus this share."""
-_CROWDED = 0.08
-"""With a larger share of occluded points, a cloud counts as fused from several views."""
 _FAR_M = 6.0
 _SAME_SURFACE = 0.02
 """Neighbours whose inverse depths differ by less than this share are on the same surface."""
@@ -116,7 +115,7 @@ def _organized(labelled: LabelledFrame, frame: Frame) -> tuple[Frame, list[U4]] 
     turn = _upright(points, labelled.up)
     points = np.asarray(points @ turn.T, np.float32)
     view = virtual_image(points, range_m=_FAR_M)
-    if view is None or view.crowded > _CROWDED:
+    if view is None or view.crowded > OUTPUT.crowded:
         up, rng = np.array([0.0, -1.0, 0.0]), np.random.default_rng(0)
         view = top_view(points, up, range_m=_FAR_M, rng=rng) or view
     if view is None:
