@@ -24,7 +24,7 @@ import numpy as np
 from benchmarks.measure import markdown, save
 from shapecat.simulation import KINECT, make_scene, render_frame
 from shapecat.simulation.containers import CONTAINERS
-from shapecat.simulation.truth import LINK_FROM_OPTICAL, robot_links
+from shapecat.simulation.recorder import LINK_FROM_OPTICAL, robot_links
 from shapecat.simulation.worlds import World
 from shapecat.types import Frame, Pose
 

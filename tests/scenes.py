@@ -11,7 +11,7 @@ from shapecat.arrays import F4
 from shapecat.simulation import IDEAL, make_scene, render_frame
 from shapecat.simulation.containers import CONTAINERS
 from shapecat.simulation.messages import MessageFactory
-from shapecat.simulation.truth import LINK_FROM_OPTICAL, robot_links
+from shapecat.simulation.recorder import LINK_FROM_OPTICAL, robot_links
 from shapecat.types import Camera, Frame, Pose
 from tests.messages import EPOCH, SECOND
 

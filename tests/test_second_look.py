@@ -23,7 +23,7 @@ from shapecat.runs.second_look import _around, _streams, frames_to_revise
 from shapecat.runs.tables import FRAMES, PLANES
 from shapecat.simulation import IDEAL, make_scene, render_frame
 from shapecat.simulation.messages import MessageFactory
-from shapecat.simulation.truth import LINK_FROM_OPTICAL, robot_links
+from shapecat.simulation.recorder import LINK_FROM_OPTICAL, robot_links
 from shapecat.system import stopping
 from shapecat.types import Camera, Frame, Pose
 from tests.messages import EPOCH, write

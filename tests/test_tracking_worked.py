@@ -324,17 +324,18 @@ def test_the_common_box_of_two_pieces_holds_the_corners_of_both() -> None:
     for i, j in ((0, 1), (1, 0)):
         lengths = np.ptp(np.concatenate(corners) @ hits.axes[i], axis=0)
         expected = [*sorted(lengths[:2], reverse=True), lengths[2]]
-        assert_allclose(_joint(hits, np.array([[i, j]])), [expected], rtol=1e-6)
+        assert_allclose(_joint(hits, hits.axes, np.array([[i, j]])), [expected], rtol=1e-6)
 
 
 def test_pieces_fit_into_a_whole_that_neither_of_them_fills() -> None:
     hits = turned_hits()
-    assert hits.axes is not None
+    axes = hits.axes
+    assert axes is not None
     pair = np.array([[0, 1]])
-    both = np.minimum(_joint(hits, pair), _joint(hits, pair[:, ::-1]))[0]
+    both = np.minimum(*(_joint(hits, axes, each) for each in (pair, pair[:, ::-1])))[0]
 
     def fits(whole: F8, other: F8) -> bool:
-        return bool(fit_pieces(hits, pair, np.array([[whole, other]]))[0])
+        return bool(fit_pieces(hits, axes, pair, np.array([[whole, other]]))[0])
 
     none = np.zeros(3)
     assert fits(both, none)

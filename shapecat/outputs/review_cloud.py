@@ -4,7 +4,7 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from shapecat.arrays import F4, F8, I4, U1, U2, U4, Record, array
+from shapecat.arrays import F4, I4, U1, U2, U4, Record, array
 from shapecat.cameras.colour import ColourView
 from shapecat.jit import kernel
 from shapecat.outputs.colours import colour_of
@@ -183,7 +183,7 @@ def _colours(points: F4, light: F4, tones: U2, palette: U1, planes: F4, plane_to
 
 
 @kernel
-def _light(depth: F4, pixels: I4, fx: float, fy: float) -> F8:
+def _light(depth: F4, pixels: I4, fx: float, fy: float) -> F4:
     """Return the brightness (n,), 0.55 to 1.2, of pixels lit from above left of the camera.
 
     Parameters

@@ -12,21 +12,25 @@ import numpy as np
 
 from shapecat.arrays import U1
 from shapecat.errors import OutputError
+from shapecat.geometry import compose, inverse
 from shapecat.simulation.colour_camera import COLOUR, jpeg, render_colour
 from shapecat.simulation.containers import CONTAINERS, Container
 from shapecat.simulation.scenes import SceneKind, make_scene
 from shapecat.simulation.sensors import SENSORS, Sensor
-from shapecat.simulation.truth import LINK_FROM_OPTICAL, frame_truth, robot_links
+from shapecat.simulation.truth import frame_truth
 from shapecat.simulation.views import render_frame
 from shapecat.simulation.worlds import World
 from shapecat.system.files import flush
 from shapecat.system.progress import Observer, ignore
-from shapecat.types import Camera, Frame
+from shapecat.types import Camera, Frame, Pose
 
-__all__ = ["EPOCH_NS", "record", "simulate", "written_paths"]
+__all__ = ["EPOCH_NS", "LINK_FROM_OPTICAL", "record", "robot_links", "simulate", "written_paths"]
 
 EPOCH_NS = 1_700_200_000_000_000_000
 """Timestamp of the first frame."""
+
+LINK_FROM_OPTICAL = Pose(np.array([[0, 0, 1], [-1, 0, 0], [0, -1, 0]]), np.zeros(3))
+"""Pose of the optical frame (z forward, y down) in camera_link (x forward, z up, REP 103)."""
 
 _LATENCY_NS = 12_000_000
 _OPTICAL = "camera_depth_optical_frame"
@@ -248,3 +252,22 @@ def _move(made: Path, path: Path) -> None:
         path.rmdir()
     flush(made)
     made.replace(path)
+
+
+def robot_links(world_from_camera: Pose) -> list[tuple[str, str, Pose]]:
+    """Split the camera's pose into the links of a robot with its base on the floor.
+
+    Returns
+    -------
+    Links (parent, child, ``parent_from_child``): map to base_link, and base_link to camera_link.
+    """
+    world_from_link = compose(world_from_camera, inverse(LINK_FROM_OPTICAL))
+    heading = world_from_link.rotation[:2, 0]
+    c, s = heading / np.linalg.norm(heading)
+    turn = np.array([[c, -s, 0], [s, c, 0], [0, 0, 1]])
+    place = world_from_camera.translation * [1, 1, 0]
+    base = Pose(turn, place)
+    return [
+        ("map", "base_link", base),
+        ("base_link", "camera_link", compose(inverse(base), world_from_link)),
+    ]

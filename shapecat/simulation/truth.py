@@ -10,7 +10,6 @@ from shapecat.geometry import compose, inverse, transform, upright_box
 from shapecat.simulation.render import Geometry, alone_pixels
 from shapecat.simulation.sensors import Sensor
 from shapecat.simulation.worlds import Thing, World
-from shapecat.types import Pose
 
 __all__ = ["AMBIGUOUS_PIXELS", "AMBIGUOUS_SHARE", "LISTED_PIXELS", "Truth", "frame_truth"]
 
@@ -110,26 +109,3 @@ def _thing_truth(
 
 def _rounded(values: F8) -> list[float]:
     return [round(float(value), 5) for value in values]
-
-
-def robot_links(world_from_camera: Pose) -> list[tuple[str, str, Pose]]:
-    """Split the camera's pose into the links of a robot with its base on the floor.
-
-    Returns
-    -------
-    Links (parent, child, ``parent_from_child``): map to base_link, and base_link to camera_link.
-    """
-    world_from_link = compose(world_from_camera, inverse(LINK_FROM_OPTICAL))
-    heading = world_from_link.rotation[:2, 0]
-    c, s = heading / np.linalg.norm(heading)
-    turn = np.array([[c, -s, 0], [s, c, 0], [0, 0, 1]])
-    place = world_from_camera.translation * [1, 1, 0]
-    base = Pose(turn, place)
-    return [
-        ("map", "base_link", base),
-        ("base_link", "camera_link", compose(inverse(base), world_from_link)),
-    ]
-
-
-LINK_FROM_OPTICAL = Pose(np.array([[0, 0, 1], [-1, 0, 0], [0, -1, 0]]), np.zeros(3))
-"""Pose of the optical frame (z forward, y down) in camera_link (x forward, z up, REP 103)."""

@@ -4,7 +4,7 @@ from functools import cached_property
 
 import numpy as np
 
-from shapecat.arrays import F8, Record, array
+from shapecat.arrays import F8, U1, Record, array
 from shapecat.geometry import compose
 from shapecat.simulation.mesh import Mesh
 from shapecat.simulation.render import Geometry, geometry
@@ -137,7 +137,7 @@ class World(Record):
         return self._gather(frame) if self.motions or self.turns[frame] else self._still
 
     @cached_property
-    def labels(self) -> F8:
+    def labels(self) -> U1:
         """(n,) uint8 pixel label of each owner: the supports, then the objects."""
         found = [s.label for s in self.supports] + [t.label for t in self.things]
         return np.array(found, np.uint8)

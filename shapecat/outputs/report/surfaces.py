@@ -5,7 +5,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from shapecat.arrays import F4, F8, U1, U2, Record, array
+from shapecat.arrays import F4, F8, U1, U2, Bool, Record, array
 from shapecat.outputs.png import png
 from shapecat.surface.triangles import triangles_of
 from shapecat.types import NeuralGas
@@ -151,7 +151,7 @@ def _closed(near: F8, passes: int = 3) -> F8:
     return near
 
 
-def _smoothed(near: F8, bare: U1, passes: int = 3) -> F8:
+def _smoothed(near: F8, bare: Bool, passes: int = 3) -> F8:
     """Average each pixel (h, w), even if empty, with its neighbours on the object."""
     weight, value = (~bare).astype(np.float64), np.where(bare, 0.0, near)
     for _ in range(passes):
