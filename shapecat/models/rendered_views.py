@@ -64,7 +64,7 @@ def render_view(seen: Geometry, arrangement: Arrangement, rng: np.random.Generat
 
 
 def _draw_sensor(rng: np.random.Generator) -> tuple[str, Sensor]:
-    """Draw a preset, perhaps mixed with another, and vary its errors and resolution."""
+    """Draw a preset, mixed with another in half of the draws; vary its errors and resolution."""
     names = list(PRESETS)
     shares = np.array([_OFTEN.get(each, 1.0) for each in names])
     name, other = (str(each) for each in rng.choice(names, 2, p=shares / shares.sum()))

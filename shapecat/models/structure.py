@@ -54,13 +54,19 @@ _CHUNK = 10
 
 
 class Series(NamedTuple):
-    """Scenes of one kind: the first seed and their number; the sensors take turns.
+    """Scenes of one kind.
 
-    ``scale`` multiplies all sizes and distances. The camera is on the ``path`` of the scene, or
-    ``anywhere``: near or far, low or straight above. On the ``floor`` the table is taken away,
-    ``changed`` turns its bin into a tote or its shelf into a rack. Arms of the robot with the
-    camera, or of a person, are ``reaching`` for the objects or ``resting`` at the image border.
-    ``coarse`` images have a fraction of the sensor's resolution.
+    Attributes
+    ----------
+    first, scenes : the first seed and the number of scenes.
+    sensors : they take turns.
+    scale : factor of all sizes and distances.
+    view : the camera is on the ``path`` of the scene, or ``anywhere``: near or far, low or straight
+        above; for ``floor`` the table is taken away.
+    changed : turns a bin into a tote, or a shelf into a rack.
+    arms : of the robot with the camera, or of a person, ``reaching`` for the objects or ``resting``
+        at the image border.
+    coarse : whether images have a fraction of the sensor's resolution.
     """
 
     kind: SceneKind

@@ -159,7 +159,7 @@ def look(
 def _views_of(
     image: RenderedView, scene: Scene, k: int, actor: Actor, instance: str, rng: np.random.Generator
 ) -> list[WorldView]:
-    """Return a view of an object, segmented by truth or detection, and perhaps a partial view."""
+    """Return a view of an object, segmented by truth or detection; of some, a partial one too."""
     found = _cut_by_detection(image, scene, k)
     if found is not None and rng.random() < _DETECTED:
         (view, overlap), source = found, "detected"

@@ -150,7 +150,10 @@ def pair_features(
 def write_pair_features(
     segments: Segments, features: Records, p: int, q: int, view_geometry: ViewGeometry, out: Row
 ) -> None:
-    """Do the same as `pair_features`, given the `SEGMENT_FEATURES` (n + 1,) of all segments."""
+    """Write the features of segments ``p`` and ``q`` to ``out``.
+
+    ``features`` (n + 1,) are the segments' own.
+    """
     area_p, area_q = segments.statistics[p].area, segments.statistics[q].area
     if area_p > area_q or (area_p == area_q and p > q):
         p, q = q, p

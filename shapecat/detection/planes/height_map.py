@@ -99,8 +99,8 @@ def _assign(
 ) -> None:
     """Assign the free cells inside the outline of a plane to it; the loops over a row vectorise.
 
-    Not ``fast``: there is nothing to reorder, and the copy that is inlined into the caller would
-    round heights differently, so that the process that compiles would differ from later ones.
+    Compiled without ``fast``: with it, the inlined copy would round heights differently in the
+    process that compiles and in later ones.
     """
     rows, columns = inv_depth.shape
     a, scale, zero, one = np.float32(plane[0]), np.float32(plane[3]), np.float32(0), np.float32(1)
