@@ -9,7 +9,7 @@ from benchmarks.simulated import score
 from shapecat.config import DetectionSettings, Settings
 from shapecat.detection import detect
 from shapecat.detection.depth_grid import DepthGrid, PinholeIntrinsics, downsample
-from shapecat.detection.planes import NO_HINT, find_supporting_planes
+from shapecat.detection.planes import find_supporting_planes
 from shapecat.detection.planes.assumed import assume_plane, unexplained
 from shapecat.detection.planes.horizontal import find_horizontal_planes
 from shapecat.detection.planes.oriented_points import orient_points
@@ -65,9 +65,7 @@ def heights(meshes: list[Mesh]) -> tuple[list[float], list[float]]:
 def supports(meshes: list[Mesh]) -> list[float]:
     """Return the heights of the planes that objects may stand on."""
     trials = draw_trials(np.random.default_rng(0))
-    planes, up = find_supporting_planes(
-        grid_of(meshes), NO_HINT, trials, tallest_m=0.6, upright=True
-    )
+    planes, up = find_supporting_planes(grid_of(meshes), None, trials, tallest_m=0.6, upright=True)
     assert up @ UP > np.cos(np.radians(2))
     return [plane.offset + np.sqrt(0.5) for plane in planes]
 
@@ -125,7 +123,9 @@ def test_camera_upside_down_is_believed_where_nothing_speaks_against_it() -> Non
     grid = grid_of([block(0, 0, -0.03, (1.2, 1.0, 0.03))])
     turned = grid._replace(inverse_depth=np.ascontiguousarray(grid.inverse_depth[::-1, ::-1]))
     trials = draw_trials(np.random.default_rng(0))
-    up = estimate_up(orient_points(turned), turned.intrinsics, NO_HINT, trials, UP_SETTINGS.held)
+    up = estimate_up(
+        orient_points(turned), turned.intrinsics, np.zeros(3), trials, UP_SETTINGS.held
+    )
     assert up @ [0, -UP[1], UP[2]] > np.cos(np.radians(2))
 
 

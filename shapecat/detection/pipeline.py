@@ -42,7 +42,7 @@ from shapecat.detection.output.measurements import measure_objects
 from shapecat.detection.output.point_labels import label_points
 from shapecat.detection.output.scene import build_scene
 from shapecat.detection.output.settings import OUTPUT
-from shapecat.detection.planes import NO_HINT, find_supporting_planes
+from shapecat.detection.planes import find_supporting_planes
 from shapecat.detection.planes.assumed import assume_plane, unexplained
 from shapecat.detection.planes.extent import SupportingPlane
 from shapecat.detection.planes.height_map import HeightMap, measure_heights, pack_planes
@@ -182,13 +182,7 @@ def _find_planes(
 ) -> PlaneModel | None:
     """Find planes, heights, low-profile objects and walls; None without a supporting plane."""
     trials, tallest_m = draw_trials(task.rng), task.settings.max_height_m
-    supports, up = find_supporting_planes(
-        grid,
-        NO_HINT if hint is None else hint,
-        trials,
-        tallest_m=tallest_m,
-        upright=upright,
-    )
+    supports, up = find_supporting_planes(grid, hint, trials, tallest_m=tallest_m, upright=upright)
     if not supports and not upright:  # another view of the cloud may show a plane
         return None
     if not supports and hint is not None:

@@ -159,11 +159,8 @@ def _measure(
     plane_id, height = heights.plane_id, heights.height
     zero, one, far_off = np.float32(0), np.float32(1), np.float32(np.inf)
     per_x, per_y = np.float32(1 / intrinsics.fx), np.float32(1 / intrinsics.fy)
-    cx, cy, edge_on = (
-        np.float32(intrinsics.cx),
-        np.float32(intrinsics.cy),
-        np.float32(MERGING.edge_on_cos),
-    )
+    cx, cy = np.float32(intrinsics.cx), np.float32(intrinsics.cy)
+    edge_on = np.float32(MERGING.edge_on_cos)
     sx, sy, sz = np.float32(side[0]), np.float32(side[1]), np.float32(side[2])
     ux, uy, uz = np.float32(up[0]), np.float32(up[1]), np.float32(up[2])
     local_plane, normal, spans = graph.local_plane, graph.normal, graph.spans

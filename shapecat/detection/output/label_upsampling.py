@@ -284,13 +284,8 @@ def settle_labels(grid_labels: GridLabels, cells: I4, places: F8, n: int, marks:
     rows, columns = inv_depth.shape
     jump = np.float32(DISCONTINUITY)
     for m in range(n):
-        i, j, u, v, z = (
-            cells[0, m],
-            cells[1, m],
-            places[0, m],
-            places[1, m],
-            np.float32(places[2, m]),
-        )
+        i, j = cells[0, m], cells[1, m]
+        u, v, z = places[0, m], places[1, m], np.float32(places[2, m])
         marks[m] = 0
         if not abs(inv_depth[i, j] * z - np.float32(1)) < jump * z:
             # The neighbour whose depth fits best, if any is within two discontinuities.

@@ -46,11 +46,8 @@ def build_scene(
     """
     measured, seen = found.measured, found.plane_ids.size - 1
     numbers = _numbers_of_seen(found.model.supports)
-    plane_id, supported_by, hidden = (
-        [numbers[k] for k in found.plane_ids[1:].tolist()],
-        measured.supported_by.tolist(),
-        measured.hidden.tolist(),
-    )
+    plane_id = [numbers[k] for k in found.plane_ids[1:].tolist()]
+    supported_by, hidden = measured.supported_by.tolist(), measured.hidden.tolist()
     cut = _cut(grid, measured) if points is None else _cut_cloud(grid, found, sensor_from_view)
     cut |= measured.last
     kept = _kept(grid, measured, indices, settings.min_points, image=points is None)

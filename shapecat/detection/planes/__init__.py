@@ -12,14 +12,11 @@ from shapecat.detection.planes.strips import add_strip_planes, may_have_strips
 from shapecat.detection.planes.supporting import supporting_planes
 from shapecat.detection.planes.up_direction import estimate_up
 
-__all__ = ["NO_HINT", "find_supporting_planes"]
-
-NO_HINT = np.zeros(3)
-"""Placeholder for an unknown up direction."""
+__all__ = ["find_supporting_planes"]
 
 
 def find_supporting_planes(
-    grid: DepthGrid, hint: F8, trials: F8, *, tallest_m: float, upright: bool
+    grid: DepthGrid, hint: F8 | None, trials: F8, *, tallest_m: float, upright: bool
 ) -> tuple[list[SupportingPlane], F8]:
     """Find the horizontal planes that objects may stand on (thesis 4.3).
 
@@ -29,7 +26,7 @@ def find_supporting_planes(
 
     Parameters
     ----------
-    hint : (3,) unit vector away from gravity, sensor frame, or `NO_HINT`.
+    hint : (3,) unit vector away from gravity, sensor frame; None if unknown.
     trials : from `draw_trials`.
     tallest_m : height of the tallest object, metres.
     upright : whether the grid is from a real camera, which is rarely held on its side.
@@ -40,7 +37,8 @@ def find_supporting_planes(
     no level surface is found.
     """
     points = orient_points(grid)
-    up = estimate_up(points, grid.intrinsics, hint, trials, UP.held if upright else 0.0)
+    known = np.zeros(3) if hint is None else hint
+    up = estimate_up(points, grid.intrinsics, known, trials, UP.held if upright else 0.0)
     found = find_horizontal_planes(grid, points, up, trials)
     if not found:
         return [], up

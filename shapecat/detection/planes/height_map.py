@@ -70,10 +70,8 @@ def measure_heights(grid: DepthGrid, planes: F8, highest_m: float) -> HeightMap:
     planes : from `pack_planes`, lowest first.
     highest_m : greatest height above the plane, metres.
     """
-    plane_id, height = (
-        np.zeros(grid.inverse_depth.shape, np.int8),
-        np.zeros(grid.inverse_depth.shape, np.float32),
-    )
+    plane_id = np.zeros(grid.inverse_depth.shape, np.int8)
+    height = np.zeros(grid.inverse_depth.shape, np.float32)
     for number in range(len(planes), 0, -1):
         _assign(
             grid.inverse_depth,
@@ -135,10 +133,8 @@ def _assign(
         left, right, farthest, nearest = _bounds(line, inv_depth, i)
         for k in range(DIRECTIONS // 2):
             step, first = np.float32(sides[k, 0]), np.float32(sides[k, 1] * i + sides[k, 2])
-            far, near = (
-                np.float32(plane[OUTLINE + k]),
-                np.float32(plane[OUTLINE + k + DIRECTIONS // 2]),
-            )
+            far = np.float32(plane[OUTLINE + k])
+            near = np.float32(plane[OUTLINE + k + DIRECTIONS // 2])
             # Few rows reach beyond a side; bounds rule out most of the others.
             ends = step * left + first, step * right + first
             scratch = min(far * farthest, far * nearest), min(near * farthest, near * nearest)

@@ -134,10 +134,8 @@ def fit_horizontal_planes(
 def _heights(samples: DepthSamples, intrinsics: PinholeIntrinsics, up: F8) -> F4:
     heights = np.zeros(samples.inverse_depth.size, np.float32)
     for k in range(heights.size):
-        x, y = (
-            (samples.j[k] - intrinsics.cx) / intrinsics.fx,
-            (samples.i[k] - intrinsics.cy) / intrinsics.fy,
-        )
+        x = (samples.j[k] - intrinsics.cx) / intrinsics.fx
+        y = (samples.i[k] - intrinsics.cy) / intrinsics.fy
         heights[k] = (x * up[0] + y * up[1] + up[2]) / samples.inverse_depth[k]
     return heights
 
