@@ -42,7 +42,7 @@ def covered(rng: Generator) -> World:
         table = make_table(rng, tuple(rng.uniform([0.6, 0.45], [0.9, 0.65])))
         supports = (*make_room(rng, wall_chance=0.3), table)
         path = (_view(rng, table, rng.uniform(25, 65), rng.uniform(0.8, 1.2)),)
-        world = World("covered", supports, _flat_boxes(rng, table), path, np.zeros(1))
+        world = World("covered", supports, _flat_boxes(rng, table), path)
         if _shown(world)[0] > SEEN:
             return world
 

@@ -6,13 +6,15 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from shapecat.arrays import F8
+from shapecat.geometry import compose
 from shapecat.simulation.distractors import DISTRACTORS, make_distractor
 from shapecat.simulation.footprints import overlap
 from shapecat.simulation.mesh import Mesh, moved
-from shapecat.simulation.placement import choose_rest, rests, turn_about_z
+from shapecat.simulation.placement import choose_rest, rests
 from shapecat.simulation.primitives import lathe, rounded_box, tube
 from shapecat.simulation.render import geometry, render
 from shapecat.simulation.shapes import make_object
+from shapecat.simulation.worlds import turned_about_z
 from shapecat.types import CATEGORIES, Camera, Pose
 
 HERE = Pose(np.eye(3), np.zeros(3))
@@ -148,7 +150,8 @@ def test_what_lies_touches_the_ground_and_does_not_roll(
     rest = choose_rest(rests(mesh), "lying", rng)
     if rest is None:
         return
-    points = moved(mesh, turn_about_z(rest.pose, angle, np.array([0.3, -0.2, 0.7]))).vertices
+    pose = compose(turned_about_z(angle, [0.3, -0.2, 0.7]), rest.pose)
+    points = moved(mesh, pose).vertices
 
     assert float(points[:, 2].min()) == pytest.approx(0.7, abs=2e-5)
     contact = points[points[:, 2] < 0.7 + 2e-4, :2]

@@ -6,15 +6,15 @@ from typing import NamedTuple
 
 import numpy as np
 
-from shapecat.geometry import IDENTITY, rotation_from_quaternion
+from shapecat.geometry import rotation_from_quaternion
 from shapecat.simulation.distractors import make_distractor
 from shapecat.simulation.mesh import Mesh, moved, scaled, standing
 from shapecat.simulation.paths import Filming
 from shapecat.simulation.piles import bin_picking, pile, shelf_bin
-from shapecat.simulation.placement import choose_rest, rests, turn_about_z
+from shapecat.simulation.placement import choose_rest, rests
 from shapecat.simulation.primitives import rounded_box
 from shapecat.simulation.shapes import make_object
-from shapecat.simulation.worlds import Thing
+from shapecat.simulation.worlds import Thing, turned_about_z
 from shapecat.simulation.worlds import World as Scene
 from shapecat.types import CATEGORIES, UNKNOWN, Pose
 
@@ -190,7 +190,7 @@ def placed(
     actor: Actor, spot: tuple[float, float], support_m: float, rng: np.random.Generator
 ) -> Actor:
     """Turn an object randomly about z and place it at ``spot`` (x, y) and height, in metres."""
-    pose = turn_about_z(IDENTITY, rng.uniform(0, 2 * np.pi), np.array([*spot, support_m]))
+    pose = turned_about_z(rng.uniform(0, 2 * np.pi), [*spot, support_m])
     return actor._replace(mesh=moved(actor.mesh, pose), support_m=support_m)
 
 

@@ -8,7 +8,7 @@ from numpy.random import Generator
 from numpy.typing import ArrayLike
 
 from shapecat.arrays import F8
-from shapecat.simulation.mesh import Mesh, join, moved, scaled, standing
+from shapecat.simulation.mesh import Mesh, join, moved, standing
 from shapecat.simulation.parts import ellipsoid, placed, rod
 from shapecat.simulation.primitives import lathe, rounded_box, smooth_path, tube
 from shapecat.types import Camera, Pose
@@ -200,7 +200,7 @@ def make_chair(rng: Generator, place: ArrayLike, *, degrees: float) -> list[Mesh
         placed(rounded_box([wide, 0.04, back]), [0, wide / 2, high + rng.uniform(0.02, 0.2)]),
     ]
     if rng.random() < 0.4:
-        parts += [rod(high, 0.03), scaled(rod(0.06, wide / 2), [1, 1, 1])]
+        parts += [rod(high, 0.03), rod(0.06, wide / 2)]
     else:
         spots = [(x, y) for x in (-0.45, 0.45) for y in (-0.45, 0.45)]
         parts += [placed(rod(high, 0.016), [x * wide, y * wide, 0]) for x, y in spots]
@@ -251,7 +251,7 @@ def make_laptop(rng: Generator) -> Mesh:
     """Return an open laptop."""
     wide, deep = rng.uniform(0.28, 0.38), rng.uniform(0.2, 0.26)
     base = rounded_box([wide, deep, rng.uniform(0.012, 0.022)])
-    lid = placed(rounded_box([wide, 0.008, deep]), [0, 0, 0])
+    lid = rounded_box([wide, 0.008, deep])
     tilt = -rng.uniform(0, 30)
     return standing(join([base, placed(lid, [0, deep / 2, 0.012], about="x", degrees=tilt)]))
 

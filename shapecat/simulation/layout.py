@@ -10,9 +10,9 @@ from shapecat.geometry import IDENTITY, compose
 from shapecat.simulation.distractors import make_distractor
 from shapecat.simulation.footprints import Footprint, footprint, inside, overlap
 from shapecat.simulation.mesh import Mesh
-from shapecat.simulation.placement import Rest, choose_rest, rests, turn_about_z
+from shapecat.simulation.placement import Rest, choose_rest, rests
 from shapecat.simulation.shapes import make_object
-from shapecat.simulation.worlds import Support, Thing
+from shapecat.simulation.worlds import Support, Thing, turned_about_z
 from shapecat.types import Pose
 
 __all__ = ["Layout", "Piece", "make_piece"]
@@ -163,7 +163,7 @@ class Layout:
     def _drawn_turn(self, place: F8) -> Pose:
         """Return a random turn about z that moves the origin to ``place`` (3,)."""
         angle = self._rng.uniform(0, 2 * np.pi)
-        return turn_about_z(IDENTITY, angle, np.round(place, 6))
+        return turned_about_z(angle, np.round(place, 6))
 
     def _fits(self, here: Footprint, support: Support) -> bool:
         on_board = here.low < support.height + 1e-4

@@ -30,7 +30,7 @@ def walking(rng: Generator, categories: Sequence[str], filming: Filming) -> Worl
         )
     target = np.array([0, 0, counter.height + 0.05])
     path = stroll(rng, target, filming, distance=(0.95, 1.2), elevation=(30, 48), reach=(0.6, 0.75))
-    return World("walking", (*room, counter), tuple(layout.things), path, np.zeros(filming.frames))
+    return World("walking", (*room, counter), tuple(layout.things), path)
 
 
 def crossing(rng: Generator, categories: Sequence[str], filming: Filming) -> World:
@@ -56,7 +56,7 @@ def crossing(rng: Generator, categories: Sequence[str], filming: Filming) -> Wor
         layout.put(category, rows[k % 2], _ANYWHERE, attempts=20)
     path = _walk_past(rng, table, filming, elevation=(25, 40), sweep=8)
     things = tuple(layout.things)
-    return World("crossing", (*room, table), things, path, np.zeros(filming.frames), tuple(motions))
+    return World("crossing", (*room, table), things, path, motions=tuple(motions))
 
 
 def rearranged(rng: Generator, categories: Sequence[str], filming: Filming) -> World:
@@ -72,22 +72,21 @@ def rearranged(rng: Generator, categories: Sequence[str], filming: Filming) -> W
     for category in categories:
         layout.put(category, back, _ANYWHERE)
     duration, t = filming.frames / filming.rate_hz, filming.times()
-    begun = rng.uniform([0.15, 0.15, 0.5, 0.15], 0.5 + np.array([0, 0, 0.3, 0])) * duration
-    motions = [_pushed(0, layout.things[0].pose.translation, t - begun[0])]
+    starts = rng.uniform([0.15, 0.15, 0.5, 0.15], [0.5, 0.5, 0.8, 0.5])
+    pushed, carried, removed, added = starts * duration
+    motions = [_pushed(0, layout.things[0].pose.translation, t - pushed)]
     for k in range(1, len(layout.things)):
         goal = layout.room_for(k, back, _ANYWHERE)
         if goal is not None:
-            motions.append(_carried(k, goal - layout.things[k].pose.translation, t - begun[1]))
+            motions.append(_carried(k, goal - layout.things[k].pose.translation, t - carried))
             break
     others = [k for k in range(1, len(layout.things)) if k != motions[-1].track]
-    there = t[:, None] < begun[2], t[:, None] >= begun[3]  # one is removed, one is added
+    there = t[:, None] < removed, t[:, None] >= added
     for k, when in zip(others, there, strict=False):
         motions.append(Motion(k, np.where(when, np.zeros(3), np.nan)))
     path = _walk_past(rng, table, filming, elevation=(30, 48), sweep=12)
     things = tuple(layout.things)
-    return World(
-        "rearranged", (*room, table), things, path, np.zeros(filming.frames), tuple(motions)
-    )
+    return World("rearranged", (*room, table), things, path, motions=tuple(motions))
 
 
 def _walk_past(

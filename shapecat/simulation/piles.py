@@ -67,7 +67,7 @@ def pile(
         elevation=(18, 75),
         sweep=(20, 60),
     )
-    return World("pile", supports, things, path, np.zeros(filming.frames))
+    return World("pile", supports, things, path)
 
 
 def bin_picking(
@@ -86,7 +86,7 @@ def bin_picking(
     target = np.array([0, 0, bottom.height + 0.05])
     path = walk(rng, target, filming, distance=(0.6, 1.2), elevation=(60, 84), sweep=(10, 40))
     things = settled(items, drops, supports, bottom)
-    return World("bin", supports, things, path, np.zeros(filming.frames))
+    return World("bin", supports, things, path)
 
 
 def shelf_bin(
@@ -109,7 +109,7 @@ def shelf_bin(
     things = settled(items, drops, supports, board, highest_m=float(room_m))
     target = np.array([0, 0, board.height + room_m / 3])
     path = walk(rng, target, filming, distance=(0.5, 0.9), elevation=(5, 25), sweep=(5, 20))
-    return World("shelf_bin", (*supports, top), things, path, np.zeros(filming.frames))
+    return World("shelf_bin", (*supports, top), things, path)
 
 
 def make_item(category: str, rng: Generator, kinds: Sequence[str]) -> Item:

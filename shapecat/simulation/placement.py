@@ -9,7 +9,7 @@ from shapecat.geometry import gravity_rotation
 from shapecat.simulation.mesh import Mesh
 from shapecat.types import Pose
 
-__all__ = ["Rest", "choose_rest", "rests", "turn_about_z"]
+__all__ = ["Rest", "choose_rest", "rests"]
 
 
 class Rest(Record):
@@ -53,13 +53,6 @@ def rests(mesh: Mesh) -> tuple[Rest, ...]:
         manner = "upright" if tilt > 0.966 else "upside_down" if tilt < -0.966 else "lying"
         found.append(Rest(Pose(rotation, np.round(place, 9)), manner))
     return tuple(found)
-
-
-def turn_about_z(pose: Pose, angle: float, place: F8) -> Pose:
-    """Turn a pose about z by ``angle``, radians, then move it by ``place`` (3,), metres."""
-    c, s = np.round(np.cos(angle), 9), np.round(np.sin(angle), 9)
-    turn = np.array([[c, -s, 0], [s, c, 0], [0, 0, 1.0]])
-    return Pose(turn @ pose.rotation, turn @ pose.translation + place)
 
 
 def choose_rest(found: tuple[Rest, ...], manner: str, rng: Generator) -> Rest | None:

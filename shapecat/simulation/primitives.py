@@ -161,7 +161,7 @@ def rounded_box(size: ArrayLike, *, radius: float = 0.0, bulge: float = 0.0, fin
         outward = points - core
         points = core + radius * outward / np.linalg.norm(outward, axis=1, keepdims=True)
     if bulge:
-        dome = np.prod(np.cos(np.pi / 2 * np.clip(core / half, -1, 1))[:, [2]], axis=1)
+        dome = np.cos(np.pi / 2 * np.clip(core / half, -1, 1))[:, 2]
         for axis, other in ((0, 1), (1, 0)):
             face = np.abs(np.abs(points[:, axis]) - half[axis]) < 1e-9
             lift = dome * np.cos(np.pi / 2 * core[:, other] / half[other])

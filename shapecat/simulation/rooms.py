@@ -52,7 +52,7 @@ def room(
     path = walk(rng, target, filming, distance=(0.7, 2.2), elevation=(12, 60), sweep=(15, 60))
     rest = [s for s in supports if s is not table]
     everything = (*rest, *solid, *_named("room", around))
-    return World("room", everything, things, path, np.zeros(filming.frames))
+    return World("room", everything, things, path)
 
 
 def _named(name: str, meshes: Sequence[Mesh]) -> list[Support]:

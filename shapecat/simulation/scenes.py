@@ -103,7 +103,7 @@ def make_stage(pieces: Sequence[Piece], rng: Generator, *, views: int = 8) -> Wo
     for piece in pieces:
         layout.put_piece(piece, table, half)
     path = scattered(rng, np.array([0, 0, table.height + 0.04]), views)
-    return World("stage", (*room, table), tuple(layout.things), path, np.zeros(views))
+    return World("stage", (*room, table), tuple(layout.things), path)
 
 
 def _tabletop(rng: Generator, spec: _SceneSpec) -> World:
@@ -115,9 +115,7 @@ def _tabletop(rng: Generator, spec: _SceneSpec) -> World:
         layout.put(category, table, np.array([0.38, 0.27]), stack=0.06)
     target = np.array([0, 0, table.height + 0.05])
     path = walk(rng, target, spec.filming, distance=(0.9, 1.4), elevation=(28, 52), sweep=(25, 60))
-    return World(
-        "tabletop", (*room, table), tuple(layout.things), path, np.zeros(spec.filming.frames)
-    )
+    return World("tabletop", (*room, table), tuple(layout.things), path)
 
 
 def _clutter(rng: Generator, spec: _SceneSpec) -> World:
@@ -134,9 +132,7 @@ def _clutter(rng: Generator, spec: _SceneSpec) -> World:
         layout.put(category, table, half, stack=0.3, attempts=4)
     target = np.array([0, 0, table.height + 0.06])
     path = walk(rng, target, spec.filming, distance=(0.65, 1.3), elevation=(25, 58), sweep=(20, 50))
-    return World(
-        "clutter", (*room, table), tuple(layout.things), path, np.zeros(spec.filming.frames)
-    )
+    return World("clutter", (*room, table), tuple(layout.things), path)
 
 
 def _shelf(rng: Generator, spec: _SceneSpec) -> World:
@@ -153,7 +149,7 @@ def _shelf(rng: Generator, spec: _SceneSpec) -> World:
         rng, target, spec.filming, distance=(1.25, 1.55), elevation=(20, 30), sweep=(12, 28)
     )
     supports = (*make_room(rng, wall_chance=0.0), *boards, *sides)
-    return World("shelf", supports, tuple(layout.things), path, np.zeros(spec.filming.frames))
+    return World("shelf", supports, tuple(layout.things), path)
 
 
 def _turntable(rng: Generator, spec: _SceneSpec) -> World:
@@ -176,7 +172,7 @@ def _empty(rng: Generator, spec: _SceneSpec) -> World:
     room, table = make_room(rng, wall_chance=0.5), make_table(rng)
     target = np.array([0, 0, table.height])
     path = walk(rng, target, spec.filming, distance=(0.8, 1.5), elevation=(25, 60), sweep=(10, 50))
-    return World("empty", (*room, table), (), path, np.zeros(spec.filming.frames))
+    return World("empty", (*room, table), (), path)
 
 
 SCENES: dict[str, Callable[[Generator, _SceneSpec], World]] = {

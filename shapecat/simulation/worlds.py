@@ -3,6 +3,7 @@
 from functools import cached_property
 
 import numpy as np
+from numpy.typing import ArrayLike
 
 from shapecat.arrays import F8, U1, Record, array
 from shapecat.geometry import compose
@@ -103,7 +104,8 @@ class World(Record):
     ----------
     kind : name of the kind of scene.
     path : ``world_from_camera`` for each of the t images, with the camera's optical axes.
-    turns : (t,) rotation of all objects about the world's z axis in each frame, radians.
+    turns : (t,) rotation of all objects about the world's z axis in each frame, radians; None if
+        they stand still.
     motions : motions of objects that also move by themselves.
     """
 
@@ -111,7 +113,7 @@ class World(Record):
     supports: tuple[Support, ...]
     things: tuple[Thing, ...]
     path: tuple[Pose, ...]
-    turns: F8 = array("t", "f8")
+    turns: F8 | None = array("t", "f8", default=None)
     motions: tuple[Motion, ...] = ()
 
     def __len__(self) -> int:
@@ -124,7 +126,7 @@ class World(Record):
         pose = thing.pose
         if shift is not None and np.isfinite(shift[frame]).all():
             pose = Pose(pose.rotation, pose.translation + shift[frame])
-        turn = float(self.turns[frame])
+        turn = self._turn(frame)
         return compose(turned_about_z(turn), pose) if turn else pose
 
     def present(self, thing: Thing, frame: int) -> bool:
@@ -134,7 +136,7 @@ class World(Record):
 
     def geometry(self, frame: int) -> Geometry:
         """Return all triangles of a frame, in the world frame; owners index `labels`."""
-        return self._gather(frame) if self.motions or self.turns[frame] else self._still
+        return self._gather(frame) if self.motions or self._turn(frame) else self._still
 
     @cached_property
     def labels(self) -> U1:
@@ -150,6 +152,9 @@ class World(Record):
     def _still(self) -> Geometry:
         return self._gather(0)
 
+    def _turn(self, frame: int) -> float:
+        return 0.0 if self.turns is None else float(self.turns[frame])
+
     def _gather(self, frame: int) -> Geometry:
         here = Pose(np.eye(3), np.zeros(3))
         things = [
@@ -162,10 +167,10 @@ class World(Record):
 _NOTHING = Mesh(np.zeros((0, 3)), np.zeros((0, 3)))
 
 
-def turned_about_z(angle: float) -> Pose:
-    """Return a rotation about z by ``angle``, radians, as a pose; entries are rounded to 1e-9."""
+def turned_about_z(angle: float, place: ArrayLike = (0, 0, 0)) -> Pose:
+    """Return a turn about z by ``angle``, radians, rounded to 1e-9, then a shift to ``place``."""
     c, s = np.round(np.cos(angle), 9), np.round(np.sin(angle), 9)
-    return Pose(np.array([[c, -s, 0], [s, c, 0], [0, 0, 1]]), np.zeros(3))
+    return Pose(np.array([[c, -s, 0], [s, c, 0], [0, 0, 1]]), np.asarray(place))
 
 
 def _one_sided(mesh: Mesh) -> bool:
