@@ -527,14 +527,18 @@ def test_a_node_is_described_by_its_track_its_size_and_what_is_missing() -> None
         )
     ]
     scene = Scene(np.array([0, 0, 1.0]), (plane,), tuple(found))
-    told = [_described(scene, Node("object", k), {7: "cup #6"}) for k in range(4)]
+    shown: Any = SimpleNamespace(category="cup", track=6, full=None, box=found[0].box)
+    told = [_described(scene, Node("object", k), {7: shown}) for k in range(4)]
+    shown.full = replace(found[0].box, size=np.array([0.14, 0.08, 0.21]))
+    told.append(_described(scene, Node("object", 0), {7: shown}))
 
     assert _described(scene, Node("plane", 0), {}) == "plane 0: 0.73 m high, 0.57 m2"
     assert told == [
         "cup #6: 12 x 7 x 20 cm",
         "cup #6: 12 x 7 x 20 cm, cut by the border, occluded",
         "object in no track: 12 x 7 x 20 cm",
-        "object: 12 x 7 x 20 cm, occluded",
+        "object in no track: 12 x 7 x 20 cm, occluded",
+        "cup #6: 14 x 8 x 21 cm",  # of the whole object, where it is known
     ]
 
 

@@ -11,7 +11,7 @@ from shapecat.errors import OutputError
 from shapecat.runs.finished import FinishedRun, read_finished
 from shapecat.runs.labels import plane_of, read_labelled_frames
 from shapecat.runs.tables import read_row_groups
-from shapecat.types import Box, Candidate, Plane, Scene
+from shapecat.types import Box, Candidate, LabelledObject, Plane, Scene
 
 __all__ = ["describe_scene", "read_scene"]
 
@@ -30,9 +30,9 @@ def describe_scene(folder: Path, frame: int, *, topic: str | None = None) -> str
     """
     finished = read_finished(folder)
     topic = _topic(folder, frame, topic)
-    names = _names(finished, topic, frame)
+    objects = _objects(finished, topic, frame)
     return format_tree(
-        read_scene(folder, topic, frame), lambda scene, node: _described(scene, node, names)
+        read_scene(folder, topic, frame), lambda scene, node: _described(scene, node, objects)
     )
 
 
@@ -97,28 +97,26 @@ def _topic(folder: Path, frame: int, topic: str | None) -> str:
     raise OutputError(msg)
 
 
-def _names(finished: FinishedRun, topic: str, frame: int) -> dict[int, str]:
-    """Return category and track of each pixel or point that belongs to an object in a frame."""
+def _objects(finished: FinishedRun, topic: str, frame: int) -> dict[int, LabelledObject]:
+    """Return the object of each pixel or point that belongs to one in a frame."""
     frames = read_labelled_frames(finished.folder, finished.labels)
     shown = next(item for item in frames if (item.topic, item.index) == (topic, frame))
-    return {
-        int(index): f"{item.category} #{item.track}"
-        for item in shown.objects
-        for index in item.indices
-    }
+    return {int(index): item for item in shown.objects for index in item.indices}
 
 
-def _described(scene: Scene, node: Node, names: dict[int, str]) -> str:
+def _described(scene: Scene, node: Node, objects: dict[int, LabelledObject]) -> str:
     if node.kind == "plane":
         plane = scene.planes[node.index]
         return f"plane {node.index}: {plane.height_m:.2f} m high, {plane.area_m2:.2f} m2"
     item = scene.candidates[node.index]
-    name = names.get(int(item.indices[0]), "object in no track") if item.indices.size else "object"
+    shown = objects.get(int(item.indices[0])) if item.indices.size else None
+    name = "object in no track" if shown is None else f"{shown.category} #{shown.track}"
+    box = item.box if shown is None else shown.full or shown.box
     flags = [
         text
         for text, flag in (("cut by the border", item.touches_border), ("occluded", item.occluded))
         if flag
     ]
-    x, y, z = (100 * float(side) for side in item.box.size)
+    x, y, z = (100 * float(side) for side in box.size)
     note = f", {', '.join(flags)}" if flags else ""
     return f"{name}: {x:.0f} x {y:.0f} x {z:.0f} cm{note}"

@@ -28,7 +28,7 @@ _UPRIGHT = np.array([0.0, -1.0, 0.0], np.float32)
 
 
 class TrackPictures(NamedTuple):
-    """The best view of a track: crop, drawings of the surface, and box size in metres.
+    """The best view of a track: crop, drawings of the surface, and size of the full box in metres.
 
     ``crop`` is None if the recording or the object cannot be shown.
     """
@@ -104,7 +104,7 @@ class _Taken:
         """Draw the surfaces and return all pictures."""
         tracks = {}
         for track, (_, crop, shot, item) in self.best.items():
-            x, y, z = (float(side) for side in item.box.size)
+            x, y, z = (float(side) for side in (item.full or item.box).size)
             tracks[track] = TrackPictures(crop, draw(shot, colour_of(item.category)), (x, y, z))
         return Pictures(tracks, sorted(self.frames, key=lambda frame: frame.seconds), reason)
 
