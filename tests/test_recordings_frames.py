@@ -379,6 +379,7 @@ def test_without_a_readable_calibration_it_is_searched_once(
 
 
 def test_mismatched_calibration_is_counted(tmp_path: Path) -> None:
+    """Without its topic, nobody would guess that the calibration is that of another camera."""
     items = [
         ("/depth/camera_info", 0, info(EPOCH)),
         ("/depth/image", 1, image(EPOCH, np.ones((24, 32), np.uint16))),
@@ -386,7 +387,7 @@ def test_mismatched_calibration_is_counted(tmp_path: Path) -> None:
 
     _, skipped, _ = read(write(tmp_path / "a.mcap", items))
 
-    assert skipped == {"depth image of 32 x 24 with camera info for 64 x 48": 1}
+    assert skipped == {"with depth of 32 x 24 but camera info for 64 x 48 on /depth/camera_info": 1}
 
 
 def test_slight_distortion_is_absorbed_and_strong_distortion_gives_true_rays(

@@ -572,3 +572,12 @@ def test_a_recording_is_described_whole(tmp_path: Path) -> None:
     }
     alone = record(tmp_path / "b.mcap", [("/points", 1, cloud(EPOCH, points))])
     assert describe_recording(alone)["topics"][0]["use"] == "points stream"
+
+
+def test_depth_images_without_a_calibration_are_not_said_to_be_usable(tmp_path: Path) -> None:
+    """`process` refuses them, which `info` must foretell."""
+    images = [item for item in depth_items(EPOCH) if not item[0].endswith("camera_info")]
+    path = record(tmp_path / "a.mcap", images)
+
+    (topic,) = describe_recording(path)["topics"]
+    assert topic["use"] == "depth stream without CameraInfo"

@@ -48,7 +48,7 @@ def _uses(recording: Recording, streams: Mapping[str, Stream]) -> dict[str, str]
     """Return the use of each topic, in words; unused topics are absent."""
     uses = {stream.info_topic: "camera" for stream in streams.values() if stream.info_topic}
     for topic, stream in streams.items():
-        uses[topic] = f"{stream.kind} stream"
+        uses[topic] = f"{stream.kind} stream{'' if stream.usable else ' without CameraInfo'}"
         colour = choose_colour(recording, stream)
         if colour is None:
             continue

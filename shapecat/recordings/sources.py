@@ -191,7 +191,9 @@ class DepthSource(Source):
         depth = depth_of_compressed(image) if compressed else depth_of_image(image, self.units)
         if depth.shape != (camera.height, camera.width):
             shape = f"{depth.shape[1]} x {depth.shape[0]}"
-            msg = f"depth image of {shape} with camera info for {camera.width} x {camera.height}"
+            size = f"{camera.width} x {camera.height}"
+            # After a count, which may be 1.
+            msg = f"with depth of {shape} but camera info for {size} on {self.info_topic}"
             raise MessageError(msg)
         if distorted:
             return self.lens.content(self._info, camera, depth)
