@@ -572,6 +572,8 @@ def test_a_recording_is_described_whole(tmp_path: Path) -> None:
     }
     alone = record(tmp_path / "b.mcap", [("/points", 1, cloud(EPOCH, points))])
     assert describe_recording(alone)["topics"][0]["use"] == "points stream"
+    page = (Path(__file__).parents[1] / "docs/howto-bag.md").read_text("utf-8")
+    assert "calls a *depth stream* or a *points stream*" in page
 
 
 def test_depth_images_without_a_calibration_are_not_said_to_be_usable(tmp_path: Path) -> None:
