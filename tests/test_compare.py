@@ -46,7 +46,7 @@ from shapecat.evaluation.comparison_pictures import (
     _shades,
     draw_frame,
 )
-from shapecat.evaluation.labellings import Item, Labelling
+from shapecat.evaluation.labellings import LabelledItem, Labelling
 from shapecat.evaluation.overlap import Overlap, box_iou
 from shapecat.evaluation.references import open_reference
 from shapecat.evaluation.references_coco import CocoLabels, filled_polygon, rle_mask
@@ -241,8 +241,8 @@ def test_the_table_tells_every_difference_once(shapecat: Run, run: Path, truth: 
 
 def test_an_identity_is_lost_once() -> None:
     """After the frame of the switch, the new track counts as the object's own."""
-    tally, cup = _Tally(), Item(11, "cup")
-    kinds = [_kind(tally, Item(track, "cup"), cup, 0.9) for track in (5, 5, 6, 6, 6, 5, 5)]
+    tally, cup = _Tally(), LabelledItem(11, "cup")
+    kinds = [_kind(tally, LabelledItem(track, "cup"), cup, 0.9) for track in (5, 5, 6, 6, 6, 5, 5)]
 
     assert kinds == [None, None, "identity", None, None, "identity", None]
 
@@ -466,8 +466,8 @@ def test_the_picture_of_a_part_is_that_of_its_worst_frame() -> None:
     masks = np.arange(0, 20), np.arange(40, 90)
     tally = _Tally()
     for k, names in enumerate((("can", "cup"), ("can", "can"), ("cup", "can"))):
-        true = tuple(Item(j, "cup", mask) for j, mask in enumerate(masks))
-        found = tuple(Item(j, name, masks[j]) for j, name in enumerate(names))
+        true = tuple(LabelledItem(j, "cup", mask) for j, mask in enumerate(masks))
+        found = tuple(LabelledItem(j, name, masks[j]) for j, name in enumerate(names))
         both = Labelling(found), Labelling(true, None, (10, 10))
         _compare_frame(tally, ("/d", 7 + k), {"stamp_ns": k}, *both, iter(()), 5)
 
@@ -525,10 +525,10 @@ def test_each_part_of_the_run_has_one_picture(
 
 def test_captions_are_above_the_middle_of_their_objects() -> None:
     found = (
-        Item(4, "cup", np.array(block(2, 5, 3, 4))),
-        Item(5, "can", np.array(block(6, 7, 4, 2))),
+        LabelledItem(4, "cup", np.array(block(2, 5, 3, 4))),
+        LabelledItem(5, "can", np.array(block(6, 7, 4, 2))),
     )
-    true = (Item(11, "box", np.array(block(1, 3, 2, 2))),)
+    true = (LabelledItem(11, "box", np.array(block(1, 3, 2, 2))),)
     rows = [
         Difference("/d", 0, 0, "missed", true_track=11, true_category="box"),
         Difference("/d", 0, 0, "surplus", track=5, category="can"),
@@ -564,8 +564,11 @@ def test_depth_behind_the_masks_is_bright_where_it_is_near_and_faces_the_camera(
 def test_boxes_are_matched_from_a_quarter_of_overlap_on(shift: float, iou: float | None) -> None:
     """Hidden sides are estimates, so the limit is lower than for masks. Boxes have no F."""
     size, still = np.array([0.4, 0.2, 0.3]), np.array([0, 0, 0, 1])
-    found = [Item(5, "cup", box=Box(np.array([0.1 + shift, 0.2, 1]), size, still))]
-    true = [Item(None, "can"), Item(1, "cup", box=Box(np.array([0.1, 0.2, 1]), size, still))]
+    found = [LabelledItem(5, "cup", box=Box(np.array([0.1 + shift, 0.2, 1]), size, still))]
+    true = [
+        LabelledItem(None, "can"),
+        LabelledItem(1, "cup", box=Box(np.array([0.1, 0.2, 1]), size, still)),
+    ]
     matched = match_objects(found, true)
 
     assert matched.pairs == ({} if iou is None else {0: 1})
@@ -595,9 +598,9 @@ def test_an_object_in_doubt_has_no_wrong_category(run: Path, truth: Path) -> Non
 @pytest.mark.parametrize("overlaps", [(0.2, 0.8), (0.8, 0.2)])
 def test_a_track_in_two_pieces_is_judged_by_the_better_one(overlaps: tuple[float, float]) -> None:
     """Otherwise a fragment would cost a found object its identity."""
-    pieces = [Item(5, "cup"), Item(None, "cup"), Item(5, "cup")]
+    pieces = [LabelledItem(5, "cup"), LabelledItem(None, "cup"), LabelledItem(5, "cup")]
     similarity = np.array([[overlaps[0]], [0.9], [overlaps[1]]])
-    seen = seen_together(pieces, [Item(1, "cup")], Matched({}, similarity, None, None))
+    seen = seen_together(pieces, [LabelledItem(1, "cup")], Matched({}, similarity, None, None))
 
     assert (seen.true, seen.found, seen.similarity.tolist()) == ([1], [5], [[0.8]])
 
@@ -822,8 +825,8 @@ def test_refusals_say_what_was_found_and_what_to_try(
 
 def test_a_part_split_off_is_seen_in_the_picture() -> None:
     """With unions of masks, an object in two halves would look correct."""
-    true = Labelling((Item(1, "cup", np.arange(0, 60)),), None, (10, 10))
-    halves = (Item(5, "can", np.arange(0, 40)), Item(6, "cup", np.arange(40, 70)))
+    true = Labelling((LabelledItem(1, "cup", np.arange(0, 60)),), None, (10, 10))
+    halves = (LabelledItem(5, "can", np.arange(0, 40)), LabelledItem(6, "cup", np.arange(40, 70)))
     head = ("/d", 0, START)
     rows = [Difference(*head, "category", category="can"), Difference(*head, "surplus")]
     picture = draw_frame(("/d", 0), None, Labelling(halves), true, {0: 0}, rows, 2.0)
@@ -840,8 +843,12 @@ def test_a_part_split_off_is_seen_in_the_picture() -> None:
 
 def test_the_tint_of_an_object_is_that_of_its_own_difference() -> None:
     """Found and true objects come in different orders."""
-    true = Labelling((Item(1, "cup", np.arange(60, 90)), Item(2, "box", np.arange(0, 40))))
-    found = Labelling((Item(5, "can", np.arange(0, 40)), Item(6, "cup", np.arange(60, 90))))
+    true = Labelling(
+        (LabelledItem(1, "cup", np.arange(60, 90)), LabelledItem(2, "box", np.arange(0, 40)))
+    )
+    found = Labelling(
+        (LabelledItem(5, "can", np.arange(0, 40)), LabelledItem(6, "cup", np.arange(60, 90)))
+    )
     rows = [
         Difference("/d", 0, START, "category", category="can"),
         Difference("/d", 0, START, None),

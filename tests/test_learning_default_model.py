@@ -12,7 +12,7 @@ from shapecat.evaluation import View, evaluate
 from shapecat.evaluation.training import fit_views
 from shapecat.evaluation.views import describe_views
 from shapecat.learning import Categorizer, load_model, save_model
-from shapecat.models.arrangements import World
+from shapecat.models.arrangements import ArrangementOptions
 from shapecat.models.fragments import cut_fragment, cut_halo
 from shapecat.models.sets import Simulated, collect
 from shapecat.models.worlds import simulate_views, simulate_world
@@ -50,7 +50,9 @@ def test_the_default_model_is_read_once() -> None:
 def test_unseen_simulated_objects_are_recognised(model: Categorizer) -> None:
     """A few tables of a seed that nothing was made with; the card has the real figures."""
     kinds = ("pan", "hammer", "shoe", "chair")
-    seen = collect(view for k in range(6) for view in simulate_world(World(99, kinds), k))
+    seen = collect(
+        view for k in range(6) for view in simulate_world(ArrangementOptions(99, kinds), k)
+    )
     whole = (seen.source != "fragment") & (seen.visible > 0.7) & (seen.manner == "upright")
     report = evaluate(seen.views.where(whole & (seen.views.distances < _NEAR_M)), model)
 
@@ -62,7 +64,7 @@ def test_unseen_simulated_objects_are_recognised(model: Categorizer) -> None:
 @pytest.fixture(scope="module")
 def tables() -> tuple[Simulated, Simulated]:
     """Simulate the same tables with one process and with two."""
-    world = World(5, ("pan", "hammer"), cameras=1)
+    world = ArrangementOptions(5, ("pan", "hammer"), cameras=1)
     one, two = (collect(simulate_views(world, range(2), jobs=jobs)) for jobs in (1, 2))
     return one, two
 

@@ -11,7 +11,7 @@ from shapecat.evaluation import View
 from shapecat.evaluation.training import fit_views
 from shapecat.evaluation.views import DescribedViews
 from shapecat.learning.shape_functions import shape_functions
-from shapecat.models.arrangements import World
+from shapecat.models.arrangements import ArrangementOptions
 from shapecat.models.studies import compare_with_plain, next_frames, sampled, spread, subsample
 from shapecat.models.worlds import simulate_world
 
@@ -61,7 +61,9 @@ def test_the_next_frame_is_almost_the_same_and_not_the_same() -> None:
 
 def test_training_tables_hold_what_they_are_asked_for() -> None:
     """Shares that do not arrive leave the model as it was."""
-    world = World(7, ("pan",), unknown=0.0, lying=0.9, leaning=0.5, cameras=1, keep=True)
+    world = ArrangementOptions(
+        7, ("pan",), unknown=0.0, lying=0.9, leaning=0.5, cameras=1, keep=True
+    )
     views = [view for k in range(4) for view in simulate_world(world, k)]
     manners = [view.manner for view in views if view.label in {"cup", "can", "bottle"}]
 

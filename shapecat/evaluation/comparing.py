@@ -23,7 +23,7 @@ from shapecat.evaluation.comparison_matching import (
 )
 from shapecat.evaluation.comparison_pictures import DifferenceImage, draw_frame
 from shapecat.evaluation.identities import SeenTogether
-from shapecat.evaluation.labellings import Item, Labelling, Reference
+from shapecat.evaluation.labellings import LabelledItem, Labelling, Reference
 from shapecat.evaluation.overlap import MATCHED_F, Overlap
 from shapecat.evaluation.references import OtherRun, open_reference, read_complete, run_labellings
 from shapecat.runs.finished import FinishedRun, open_source
@@ -214,7 +214,7 @@ def _labelled_part(found: Labelling, true: Labelling, key: Key) -> Labelling:
     return Labelling(tuple(items))
 
 
-def _is_ignored(item: Item, ignored: Bool | None) -> bool:
+def _is_ignored(item: LabelledItem, ignored: Bool | None) -> bool:
     if ignored is None or item.pixels is None or not item.pixels.size:
         return False
     return bool(ignored[item.pixels].mean() > 0.5)
@@ -224,8 +224,8 @@ def _differences(
     tally: _Tally,
     key: Key,
     stamp_ns: int,
-    found: Sequence[Item],
-    true: Sequence[Item],
+    found: Sequence[LabelledItem],
+    true: Sequence[LabelledItem],
     matched: Matched,
 ) -> Iterator[Difference]:
     """Yield the rows of a frame: pairs, missed and surplus objects."""
@@ -257,7 +257,7 @@ def _differences(
             yield Difference(*head, "missed", true_track=b.track, true_category=b.category)
 
 
-def _kind(tally: _Tally, a: Item, b: Item, f: float | None) -> str | None:
+def _kind(tally: _Tally, a: LabelledItem, b: LabelledItem, f: float | None) -> str | None:
     """Return the most serious difference of a pair."""
     switched = False
     if a.track is not None and b.track is not None:

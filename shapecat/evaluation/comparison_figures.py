@@ -9,7 +9,7 @@ import numpy as np
 
 from shapecat.evaluation.comparison_matching import Difference, Matched
 from shapecat.evaluation.identities import SeenTogether, judge_identities
-from shapecat.evaluation.labellings import Item
+from shapecat.evaluation.labellings import LabelledItem
 from shapecat.evaluation.metrics import expected_calibration_error
 from shapecat.evaluation.overlap import Overlap
 
@@ -33,7 +33,9 @@ class Pairs:
     views: list[str] = field(default_factory=list)
     posteriors: list[Any] = field(default_factory=list)
 
-    def add(self, found: Sequence[Item], true: Sequence[Item], matched: Matched) -> None:
+    def add(
+        self, found: Sequence[LabelledItem], true: Sequence[LabelledItem], matched: Matched
+    ) -> None:
         """Add the matched pairs of a frame."""
         for i, j in matched.pairs.items():
             if true[j].decidable:

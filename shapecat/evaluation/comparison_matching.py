@@ -7,7 +7,7 @@ import numpy as np
 from scipy.optimize import linear_sum_assignment
 
 from shapecat.evaluation.identities import SeenTogether
-from shapecat.evaluation.labellings import Item
+from shapecat.evaluation.labellings import LabelledItem
 from shapecat.evaluation.overlap import Overlap, box_iou, match_masks
 
 __all__ = [
@@ -71,7 +71,7 @@ class Matched(NamedTuple):
     overlap: Overlap | None
 
 
-def match_objects(found: Sequence[Item], true: Sequence[Item]) -> Matched:
+def match_objects(found: Sequence[LabelledItem], true: Sequence[LabelledItem]) -> Matched:
     """Match the objects of a frame one to one.
 
     If all objects of both sides have masks, pairs maximise the sum of overlap F and need an IoU of
@@ -93,12 +93,14 @@ def _best(iou: Any) -> dict[int, int]:
     return {i: j for i, j in pairs if iou[i, j] >= SAME_BOX}
 
 
-def item_box_iou(a: Item, b: Item) -> float | None:
+def item_box_iou(a: LabelledItem, b: LabelledItem) -> float | None:
     """Return the IoU of two objects' 3D boxes; None if a box is missing."""
     return None if a.box is None or b.box is None else box_iou(a.box, b.box)
 
 
-def seen_together(found: Sequence[Item], true: Sequence[Item], matched: Matched) -> SeenTogether:
+def seen_together(
+    found: Sequence[LabelledItem], true: Sequence[LabelledItem], matched: Matched
+) -> SeenTogether:
     """Return the identities of a frame; a track with several detections keeps the most similar."""
     best: dict[int, int] = {}
     for i, item in enumerate(found):

@@ -8,7 +8,7 @@ import numpy as np
 
 from shapecat.arrays import U1
 from shapecat.evaluation.comparison_matching import Difference
-from shapecat.evaluation.labellings import Item, Labelling
+from shapecat.evaluation.labellings import LabelledItem, Labelling
 from shapecat.outputs.png import png
 from shapecat.runs.tables import Key
 from shapecat.types import Frame
@@ -136,7 +136,10 @@ def _palette() -> U1:
 
 
 def _captions(
-    rows: Sequence[Difference], found: Sequence[Item], true: Sequence[Item], width: int
+    rows: Sequence[Difference],
+    found: Sequence[LabelledItem],
+    true: Sequence[LabelledItem],
+    width: int,
 ) -> tuple[Caption, ...]:
     """Return a caption for each difference, at the position of its object."""
     captions = []

@@ -9,13 +9,13 @@ from shapecat.arrays import F4, U4, Bool
 from shapecat.runs.tables import Key
 from shapecat.types import Box
 
-__all__ = ["Item", "Labelling", "Reference", "find_frame"]
+__all__ = ["LabelledItem", "Labelling", "Reference", "find_frame"]
 
 _Frame = TypeVar("_Frame")
 
 
 @dataclass(frozen=True)
-class Item:
+class LabelledItem:
     """An object in a frame.
 
     Attributes
@@ -50,7 +50,7 @@ class Labelling:
         None if there are none.
     """
 
-    items: tuple[Item, ...]
+    items: tuple[LabelledItem, ...]
     known: Bool | None = None
     shape: tuple[int, int] | None = None
     ignored: Bool | None = None

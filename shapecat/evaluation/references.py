@@ -10,7 +10,7 @@ import numpy as np
 
 from shapecat.arrays import F8, U1
 from shapecat.errors import OutputError, RecordingError
-from shapecat.evaluation.labellings import Item, Labelling, Reference
+from shapecat.evaluation.labellings import LabelledItem, Labelling, Reference
 from shapecat.evaluation.references_coco import CocoLabels
 from shapecat.evaluation.references_kitti import KittiLabels
 from shapecat.runs.finished import FinishedRun, read_finished
@@ -83,7 +83,7 @@ class SimulatedTruth(Reference):
         image = self._labels.read(int(entry["frame"]))
         flat = image.reshape(-1)
         items = (
-            Item(
+            LabelledItem(
                 track=item.get("track"),
                 category=str(item["category"]),
                 pixels=np.flatnonzero(np.isin(flat, item["parts"])),
@@ -250,13 +250,13 @@ def _item(
     tracks: Mapping[tuple[str, int, int], int],
     finished: FinishedRun,
     full: Mapping[int, F8],
-) -> Item | None:
+) -> LabelledItem | None:
     """Return a detection with the final label of its track; None if a person has deleted it."""
     track = tracks.get((row["topic"], row["frame"], row["detection"]))
     label = None if track is None else finished.labels.get(track)
     if track is not None and label is None:
         return None
-    return Item(
+    return LabelledItem(
         track=None if label is None else label.track,
         category=row["category"] if label is None else label.category,
         pixels=cast("Any", row["indices"]).astype(np.int64),

@@ -10,7 +10,7 @@ import numpy as np
 
 from shapecat.arrays import I4, Bool
 from shapecat.errors import RecordingError
-from shapecat.evaluation.labellings import Item, Labelling, Reference, find_frame
+from shapecat.evaluation.labellings import LabelledItem, Labelling, Reference, find_frame
 from shapecat.runs.tables import Key
 
 __all__ = ["CocoLabels", "filled_polygon", "rle_mask"]
@@ -60,13 +60,13 @@ class CocoLabels(Reference):
         items = (self._item(item, height, width) for item in self._labels[image["id"]])
         return Labelling(tuple(items), None, (height, width))
 
-    def _item(self, item: Mapping[str, Any], height: int, width: int) -> Item:
+    def _item(self, item: Mapping[str, Any], height: int, width: int) -> LabelledItem:
         try:
             mask = _mask(item["segmentation"], height, width)
         except (KeyError, ValueError, TypeError, IndexError) as error:
             msg = f"{self._path}: annotation {item.get('id')} has no readable mask ({error!r})"
             raise RecordingError(msg) from error
-        return Item(
+        return LabelledItem(
             track=_track_of(item),
             category=item["name"],
             pixels=np.flatnonzero(mask),

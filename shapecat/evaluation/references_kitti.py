@@ -8,7 +8,7 @@ import numpy as np
 
 from shapecat.arrays import F8
 from shapecat.errors import RecordingError
-from shapecat.evaluation.labellings import Item, Labelling, Reference, find_frame
+from shapecat.evaluation.labellings import LabelledItem, Labelling, Reference, find_frame
 from shapecat.geometry import quaternion_from_rotation
 from shapecat.outputs.exports_kitti import kitti_type
 from shapecat.runs.tables import Key
@@ -64,9 +64,9 @@ class KittiLabels(Reference):
             raise RecordingError(msg) from error
         return Labelling(tuple(item for item in items if item.category != "DontCare"))
 
-    def _item(self, words: list[str], turn: F8) -> Item:
+    def _item(self, words: list[str], turn: F8) -> LabelledItem:
         category = self._categories.get(words[0], words[0].replace("_", " "))
-        return Item(track=None, category=category, box=_box(words, turn))
+        return LabelledItem(track=None, category=category, box=_box(words, turn))
 
     def describe_frames(self) -> str:
         """Return the range of timestamps or frame numbers."""

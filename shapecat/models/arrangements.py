@@ -14,11 +14,10 @@ from shapecat.simulation.piles import bin_picking, pile, shelf_bin
 from shapecat.simulation.placement import choose_rest, rests
 from shapecat.simulation.primitives import rounded_box
 from shapecat.simulation.shapes import make_object
-from shapecat.simulation.worlds import Thing, turned_about_z
-from shapecat.simulation.worlds import World as Scene
+from shapecat.simulation.worlds import Thing, World, turned_about_z
 from shapecat.types import CATEGORIES, UNKNOWN, Pose
 
-__all__ = ["ALONE", "Actor", "Arrangement", "World", "arrange", "placed"]
+__all__ = ["ALONE", "Actor", "Arrangement", "ArrangementOptions", "arrange", "placed"]
 
 _TABLE_M = (1.6, 1.2, 0.03)
 _MANNERS = {
@@ -37,7 +36,7 @@ _SIZES = (0.55, 1.5)
 
 
 @dataclass(frozen=True)
-class World:
+class ArrangementOptions:
     """Parameters of simulated arrangements.
 
     Attributes
@@ -94,7 +93,7 @@ class Arrangement(NamedTuple):
 
 ALONE = moved(rounded_box(_TABLE_M), Pose(np.eye(3), np.array([0.0, 0.0, -_TABLE_M[2]])))
 """A table without a room around it."""
-_SETTLED: tuple[tuple[Callable[..., Scene], float, Arrangement], ...] = (
+_SETTLED: tuple[tuple[Callable[..., World], float, Arrangement], ...] = (
     (pile, 0.7, Arrangement([], (), (8.0, 90.0))),
     (bin_picking, 0.15, Arrangement([], (), (50.0, 90.0))),
     (shelf_bin, 0.15, Arrangement([], (), (5.0, 35.0), (-120.0, -60.0))),
@@ -102,20 +101,20 @@ _SETTLED: tuple[tuple[Callable[..., Scene], float, Arrangement], ...] = (
 """Scenes made by physics, their probabilities, and the viewpoints for them."""
 
 
-def arrange(world: World, rng: np.random.Generator) -> Arrangement:
+def arrange(options: ArrangementOptions, rng: np.random.Generator) -> Arrangement:
     """Arrange random objects on a table, or let them settle by physics."""
-    if world.settled > 0 and rng.random() < world.settled:
-        return _settled(world, rng)
-    return Arrangement(_spread(world, rng), (ALONE,))
+    if options.settled > 0 and rng.random() < options.settled:
+        return _settled(options, rng)
+    return Arrangement(_spread(options, rng), (ALONE,))
 
 
-def _settled(world: World, rng: np.random.Generator) -> Arrangement:
+def _settled(options: ArrangementOptions, rng: np.random.Generator) -> Arrangement:
     """Let 4 to 18 objects settle in a pile, a bin, or a compartment of a shelf."""
     chosen = int(rng.choice(len(_SETTLED), p=[share for _, share, _ in _SETTLED]))
     make, _, seen_from = _SETTLED[chosen]
     names = rng.choice(CATEGORIES, int(rng.integers(4, 19)))
-    names = np.where(rng.random(names.size) < world.unknown, UNKNOWN, names)
-    scene = make(rng, names.tolist(), Filming(1, 30.0), kinds=world.kinds)
+    names = np.where(rng.random(names.size) < options.unknown, UNKNOWN, names)
+    scene = make(rng, names.tolist(), Filming(1, 30.0), kinds=options.kinds)
     supports = {support.name: support for support in scene.supports}
     bearing = next((t.on_support for t in scene.things if t.on_support is not None), "floor")
     down = Pose(np.eye(3), np.array([0.0, 0.0, -supports[bearing].height]))
@@ -132,15 +131,15 @@ def _actor(thing: Thing, down: Pose) -> Actor:
     return Actor(mesh, thing.category, manner, float(mesh.vertices[:, 2].min()))
 
 
-def _spread(world: World, rng: np.random.Generator) -> list[Actor]:
+def _spread(options: ArrangementOptions, rng: np.random.Generator) -> list[Actor]:
     """Place objects on the table: apart, close together, or one on another."""
     actors: list[Actor] = []
     spots: list[tuple[float, float, float]] = []
     gap = float(rng.choice([0.003, 0.02, 0.08]))
     size = float(np.exp(rng.uniform(*np.log(_SIZES)))) if rng.random() < _RESIZED else 1.0
     for _ in range(int(rng.integers(3, 10))):
-        actor = _make(world, rng, size)
-        if world.leaning > 0 and rng.random() < world.leaning:
+        actor = _make(options, rng, size)
+        if options.leaning > 0 and rng.random() < options.leaning:
             actor = _leant(actor, rng)
         radius = float(np.hypot(actor.mesh.vertices[:, 0], actor.mesh.vertices[:, 1]).max())
         spot = _free_spot(spots, radius + gap / 2, rng)
@@ -150,27 +149,27 @@ def _spread(world: World, rng: np.random.Generator) -> list[Actor]:
         actors.append(placed(actor, spot, 0.0, rng))
         top = actor.mesh.extents
         if actor.label == "box" and top[:2].min() > 0.05 and rng.random() < 0.3:
-            above = _make(world, rng, size)
+            above = _make(options, rng, size)
             if np.all(above.mesh.extents[:2] < 1.3 * top[:2].min()):
                 actors.append(placed(above, spot, float(top[2]), rng))
     return actors
 
 
-def _make(world: World, rng: np.random.Generator, size: float) -> Actor:
+def _make(options: ArrangementOptions, rng: np.random.Generator, size: float) -> Actor:
     """Make a random object or distractor, scaled by ``size``."""
-    if rng.random() < world.unknown:
-        _, mesh = make_distractor(rng, str(rng.choice(list(world.kinds))))
-        return _rested(scaled(mesh, size), UNKNOWN, world, rng)
+    if rng.random() < options.unknown:
+        _, mesh = make_distractor(rng, str(rng.choice(list(options.kinds))))
+        return _rested(scaled(mesh, size), UNKNOWN, options, rng)
     label = str(rng.choice(list(CATEGORIES)))
-    return _rested(scaled(make_object(label, rng), size), label, world, rng)
+    return _rested(scaled(make_object(label, rng), size), label, options, rng)
 
 
-def _rested(mesh: Mesh, label: str, world: World, rng: np.random.Generator) -> Actor:
+def _rested(mesh: Mesh, label: str, options: ArrangementOptions, rng: np.random.Generator) -> Actor:
     """Draw a resting pose from those usual for the label; upright if the mesh has none like it."""
     chances = dict(_MANNERS.get(label, {"upright": 1.0}))
-    if world.lying is not None and label in _ROUND:
-        chances["upright"] += chances["lying"] - world.lying
-        chances["lying"] = world.lying
+    if options.lying is not None and label in _ROUND:
+        chances["upright"] += chances["lying"] - options.lying
+        chances["lying"] = options.lying
     manner = str(rng.choice(list(chances), p=list(chances.values())))
     rest = choose_rest(rests(mesh), manner, rng) if manner != "upright" else None
     if rest is None:

@@ -16,12 +16,12 @@ from shapecat.evaluation.fused import FUSED
 from shapecat.evaluation.markup import figure_text
 from shapecat.evaluation.views import describe_views
 from shapecat.learning import Categorizer
-from shapecat.models.arrangements import World
+from shapecat.models.arrangements import ArrangementOptions
 from shapecat.models.card import PICTURE, Table, format_table, write_card
 from shapecat.models.meshes import mesh_views
 from shapecat.models.pictures import draw, worst_mistakes
 from shapecat.models.recorded import detected_views, labelled_views
-from shapecat.models.sets import CUT_WELL, MOSTLY, Simulated, clear_views, collect, world_of
+from shapecat.models.sets import CUT_WELL, MOSTLY, Simulated, clear_views, collect, options_of
 from shapecat.models.studies import add_two_categories, compare_surfaces, compare_with_plain
 from shapecat.models.worlds import WorldView, simulate_views, simulate_world
 from shapecat.simulation.distractors import DISTRACTORS
@@ -109,8 +109,8 @@ def judge(
 
 def _test_views() -> list[WorldView]:
     """Return clear views of a few tables of the test set, with their points."""
-    world = replace(world_of("test"), keep=True)
-    seen = [view for number in range(_DRAWN) for view in simulate_world(world, number)]
+    options = replace(options_of("test"), keep=True)
+    seen = [view for number in range(_DRAWN) for view in simulate_world(options, number)]
     return [view for view, clear in zip(seen, clear_views(collect(seen)), strict=True) if clear]
 
 
@@ -175,8 +175,10 @@ def _counts(sets: dict[str, Simulated]) -> list[tuple[str, ...]]:
 
 def _tracks(jobs: int) -> Iterable[WorldView]:
     """Simulate tables that are seen from many viewpoints."""
-    world = World(_TRACK_SEED, tuple(DISTRACTORS), unknown=0.0, cameras=max(FUSED) + 6)
-    return simulate_views(world, range(_TRACK_TABLES), jobs=jobs)
+    options = ArrangementOptions(
+        _TRACK_SEED, tuple(DISTRACTORS), unknown=0.0, cameras=max(FUSED) + 6
+    )
+    return simulate_views(options, range(_TRACK_TABLES), jobs=jobs)
 
 
 def _fused_table(tracks: dict[str, Simulated], model: Categorizer) -> Table:
@@ -241,7 +243,9 @@ def _studies(
 
 def _kept_views(seed: int, tables: int) -> list[View]:
     """Simulate tables and return the clear views of known categories."""
-    seen = simulate_views(World(seed, tuple(DISTRACTORS), unknown=0.0, keep=True), range(tables))
+    seen = simulate_views(
+        ArrangementOptions(seed, tuple(DISTRACTORS), unknown=0.0, keep=True), range(tables)
+    )
     return [
         item.view
         for item in seen

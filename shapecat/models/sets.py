@@ -12,7 +12,7 @@ import numpy as np
 
 from shapecat.arrays import Bool
 from shapecat.evaluation.views import DescribedViews
-from shapecat.models.arrangements import World
+from shapecat.models.arrangements import ArrangementOptions
 from shapecat.models.worlds import WorldView, simulate_views
 from shapecat.simulation.distractors import DISTRACTORS
 from shapecat.simulation.procedural import PROCEDURAL
@@ -24,9 +24,9 @@ __all__ = [
     "Simulated",
     "clear_views",
     "collect",
+    "options_of",
     "partial_views",
     "simulate",
-    "world_of",
 ]
 
 SETS = {"training": (1, 100_000), "calibration": (2, 160), "test": (100_003, 100)}
@@ -66,18 +66,18 @@ class Simulated(NamedTuple):
         )
 
 
-def world_of(name: str) -> World:
+def options_of(name: str) -> ArrangementOptions:
     """Return the parameters of the arrangements of a set, given by its name in `SETS`."""
     kinds = [kind for k, kind in enumerate(DISTRACTORS) if (k % 3 == 0) == (name == "test")]
     if name == "training":
         kinds += _TIMES * list(PROCEDURAL)
-    return World(SETS[name][0], tuple(kinds), **_SHARES[name])
+    return ArrangementOptions(SETS[name][0], tuple(kinds), **_SHARES[name])
 
 
 def simulate(name: str, worlds: int, jobs: int) -> Simulated:
     """Simulate up to ``worlds`` arrangements of a set, given by its name in `SETS`."""
     numbers = range(min(worlds, SETS[name][1]))
-    views = simulate_views(world_of(name), numbers, jobs=jobs)
+    views = simulate_views(options_of(name), numbers, jobs=jobs)
     click.echo(f"simulating {len(numbers)} tables of the {name} set", err=True)
     return collect(views)
 

@@ -22,7 +22,14 @@ from shapecat.geometry import (
     transform,
 )
 from shapecat.learning.shape_functions import shape_functions
-from shapecat.models.arrangements import ALONE, Actor, Arrangement, World, arrange, placed
+from shapecat.models.arrangements import (
+    ALONE,
+    Actor,
+    Arrangement,
+    ArrangementOptions,
+    arrange,
+    placed,
+)
 from shapecat.models.fragments import cut_fragment, cut_halo
 from shapecat.models.rendered_views import RenderedView, render_view
 from shapecat.simulation.mesh import Mesh, moved
@@ -86,12 +93,14 @@ class _Seen(NamedTuple):
     overlap: float
 
 
-def simulate_views(world: World, numbers: Sequence[int], *, jobs: int = 1) -> Iterator[WorldView]:
+def simulate_views(
+    options: ArrangementOptions, numbers: Sequence[int], *, jobs: int = 1
+) -> Iterator[WorldView]:
     """Yield the views of the arrangements with these numbers, in order.
 
     The number of jobs does not affect the result.
     """
-    one = partial(simulate_world, world)
+    one = partial(simulate_world, options)
     if jobs <= 1:
         for number in numbers:
             yield from one(number)
@@ -101,11 +110,11 @@ def simulate_views(world: World, numbers: Sequence[int], *, jobs: int = 1) -> It
             yield from views
 
 
-def simulate_world(world: World, number: int) -> list[WorldView]:
+def simulate_world(options: ArrangementOptions, number: int) -> list[WorldView]:
     """Simulate one arrangement and describe its objects from several viewpoints."""
-    rng = np.random.default_rng((world.seed, number))
-    arrangement, name = arrange(world, rng), f"{world.seed}/{number}"
-    return look(arrangement, name, cameras=world.cameras, rng=rng, keep=world.keep)
+    rng = np.random.default_rng((options.seed, number))
+    arrangement, name = arrange(options, rng), f"{options.seed}/{number}"
+    return look(arrangement, name, cameras=options.cameras, rng=rng, keep=options.keep)
 
 
 def simulate_mesh(

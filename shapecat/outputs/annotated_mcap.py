@@ -16,7 +16,7 @@ from operator import attrgetter
 from pathlib import Path
 from typing import BinaryIO, TypeVar
 
-from shapecat.outputs.annotation import Annotation, AnnotationChannel, Encoders, Item
+from shapecat.outputs.annotation import Annotation, AnnotationChannel, EncodedMessage, Encoders
 from shapecat.outputs.annotations import ENCODERS, encoder_for
 from shapecat.outputs.image_annotations import ImageFrame, image_encoder_for
 from shapecat.outputs.mcap_append import Appender, copy_bytes
@@ -107,7 +107,7 @@ def _encoded(
     images: Iterable[ImageFrame] | None,
     *,
     markers: bool,
-) -> tuple[list[AnnotationChannel], Iterator[Item]]:
+) -> tuple[list[AnnotationChannel], Iterator[EncodedMessage]]:
     """Return the annotation channels, and an iterator that encodes their messages by log time."""
     annotations = _annotations(frames)
     first = next(annotations, None)
@@ -123,18 +123,18 @@ def _encoded(
     return channels, merge(items, more, key=attrgetter("log_time_ns"))
 
 
-def _items(frames: Iterable[_F], encoders: Encoders[_F], first: int) -> Iterator[Item]:
+def _items(frames: Iterable[_F], encoders: Encoders[_F], first: int) -> Iterator[EncodedMessage]:
     """Encode frames; their channels are numbered from ``first``."""
     for frame in frames:
         for number, (_, encode) in enumerate(encoders, start=first):
-            yield Item(number, frame.log_time_ns, encode(frame))
+            yield EncodedMessage(number, frame.log_time_ns, encode(frame))
 
 
 def _append(
     summary: Summary,
     file: BinaryIO,
     channels: Iterable[AnnotationChannel],
-    items: Iterable[Item],
+    items: Iterable[EncodedMessage],
     metadata: Mapping[str, str],
 ) -> None:
     """Write the annotations after the end of the original data section."""

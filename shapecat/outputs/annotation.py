@@ -9,8 +9,8 @@ from shapecat.types import ShownBox, ShownFrame
 __all__ = [
     "Annotation",
     "AnnotationChannel",
+    "EncodedMessage",
     "Encoders",
-    "Item",
     "entity_id",
     "properties",
     "text",
@@ -49,7 +49,7 @@ Encoders = list[tuple[AnnotationChannel, Callable[[_T], bytes]]]
 """Channels, each with the function that encodes a frame as its message."""
 
 
-class Item(NamedTuple):
+class EncodedMessage(NamedTuple):
     """An encoded annotation: index of its channel, log time, and bytes."""
 
     channel: int

@@ -10,7 +10,7 @@ from mcap import records
 from mcap.opcode import Opcode
 from mcap.writer import CompressionType, Writer
 
-from shapecat.outputs.annotation import AnnotationChannel, Item
+from shapecat.outputs.annotation import AnnotationChannel, EncodedMessage
 from shapecat.outputs.ros1_conversion import convert_channel, raw_channel, wrap_raw
 from shapecat.recordings import Channel, Message, Recording
 from shapecat.recordings.decoding import LIBRARY_ERRORS, schema_of
@@ -24,7 +24,7 @@ def rewrite(
     recording: Recording,
     file: BinaryIO,
     channels: Sequence[AnnotationChannel],
-    items: Iterable[Item],
+    items: Iterable[EncodedMessage],
     metadata: Mapping[str, str],
 ) -> None:
     """Write the messages of a recording, its attachments and metadata, and the annotations.
@@ -39,7 +39,7 @@ def rewrite(
         source.number(channel)
     numbers = [_register(writer, channel) for channel in channels]
     sequences: Counter[int] = Counter()
-    streams: list[Iterable[Message | Item]] = [recording.messages(), items]
+    streams: list[Iterable[Message | EncodedMessage]] = [recording.messages(), items]
     for item in merge(*streams, key=attrgetter("log_time_ns")):
         if isinstance(item, Message):
             source.write(item)

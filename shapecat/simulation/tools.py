@@ -119,7 +119,7 @@ def _phone(rng: Generator) -> Mesh:
     return join([wedge, tube(smooth_path(bar, 12), [0.022, *[0.016] * 10, 0.022])])
 
 
-def _stool(rng: Generator) -> Mesh:
+def _spool(rng: Generator) -> Mesh:
     """Return a spool: two discs on an axle."""
     r, h = rng.uniform(0.04, 0.07), rng.uniform(0.05, 0.12)
     core, disc = r * rng.uniform(0.25, 0.5), 0.008
@@ -145,7 +145,7 @@ TOOLS: dict[str, Callable[[Generator], Mesh]] = {
     "dumbbell": _dumbbell,
     "mouse": _mouse,
     "phone": _phone,
-    "spool": _stool,
+    "spool": _spool,
     "shoe": _shoe,
 }
 """The function that makes each kind of object."""

@@ -57,20 +57,20 @@ class SeenFrame(Record):
     ----------
     masks : the mask of each object of the frame, in order.
     hidden : (n,) share of each object's outline along which something nearer occludes it.
-    depth : the frame as a depth image, for a cloud from a virtual camera.
+    image_frame : the frame as a depth image, for a cloud from a virtual camera.
     colour : (h, w, 3) red, green, blue; None if the depth image is shown.
     """
 
     masks: tuple[Mask, ...]
     hidden: F8 = array("n", "f8")
-    depth: Frame
+    image_frame: Frame
     colour: U1 | None = array("h w 3", "u1", default=None)
 
     @property
     def shape(self) -> tuple[int, int]:
         """Height and width of the picture."""
         height, width, *_ = np.asarray(
-            self.depth.depth if self.colour is None else self.colour
+            self.image_frame.depth if self.colour is None else self.colour
         ).shape
         return height, width
 
@@ -79,7 +79,7 @@ class SeenFrame(Record):
         left, top, right, bottom = window or (0, 0, *self.shape[::-1])
         if self.colour is not None:
             return np.ascontiguousarray(self.colour[top:bottom, left:right])
-        return _shaded(self.depth, (left, top, right, bottom))
+        return _shaded(self.image_frame, (left, top, right, bottom))
 
 
 class Crop(NamedTuple):
@@ -96,14 +96,14 @@ def look(labelled: LabelledFrame, frame: Frame, coloured: Coloured | None) -> Se
     found = _organized(labelled, frame)
     if found is None:
         return None
-    depth, objects = found
-    hidden = np.array([_hidden_share(depth.depth, pixels) for pixels in objects])
+    image_frame, objects = found
+    hidden = np.array([_hidden_share(image_frame.depth, pixels) for pixels in objects])
     if coloured is not None and frame.organized and coloured.view.image.height > 1:
         try:
-            return SeenFrame(coloured.masks, hidden, depth, pixels_of(coloured.view.image))
+            return SeenFrame(coloured.masks, hidden, image_frame, pixels_of(coloured.view.image))
         except MessageError:
             pass  # damaged image: show depth instead
-    return SeenFrame(dense_masks(depth, objects), hidden, depth)
+    return SeenFrame(dense_masks(image_frame, objects), hidden, image_frame)
 
 
 def _organized(labelled: LabelledFrame, frame: Frame) -> tuple[Frame, list[U4]] | None:
