@@ -139,8 +139,18 @@ def _export_dataset(
 
     with progress_bars() as bars:
         selection = Selection(**chosen)
-        count = export_dataset(runs, kind, out, selection, recording=recording, observe=bars)
-    click.echo(f"{plural(len(runs), 'run')}: {plural(count, 'labelled view')} in {out}")
+        found = export_dataset(runs, kind, out, selection, recording=recording, observe=bars)
+    click.echo(f"{plural(len(runs), 'run')}: {plural(found.objects, 'labelled view')} in {out}")
+    train, val = (found.images.get(split, 0) for split in ("train", "val"))
+    why = "one recording is" if len(runs) == 1 else "recordings are"
+    hint = "" if val or not selection.val else f": {why} never split"
+    click.echo(f"{plural(train, 'image')} in train, {val:,} in val{hint}")
+    if kind == "yolo" and found.uncertain:
+        click.echo(
+            f"Warning: {plural(found.uncertain, 'visible object')} without a certain label will be "
+            "background in training; coco can mark them to be ignored",
+            err=True,
+        )
 
 
 def _require_own_names(runs: Sequence[Path]) -> None:

@@ -12,6 +12,7 @@ import pytest
 from click.testing import Result
 
 from shapecat.outputs.dataset_frames import Selection
+from shapecat.outputs.exports import Exported
 from shapecat.runs.label_transfer import TABLE_ALONE
 from tests.scenes import record
 
@@ -322,8 +323,15 @@ CALLS = {
         "shapecat.outputs.exports.export_dataset",
         [[Path("a"), Path("b")], "coco", Path("o"), Selection(3, 7, 0.6, True, True, 0.4)],
         {"recording": None},
-        1075,
-        "2 runs: 1,075 labelled views in o\n",
+        Exported(1075, 3, {"train": 1400, "val": 20}),
+        "2 runs: 1,075 labelled views in o\n1,400 images in train, 20 in val\n",
+    ),
+    "export a b --format yolo --out o": (
+        "shapecat.outputs.exports.export_dataset",
+        [[Path("a"), Path("b")], "yolo", Path("o"), Selection()],
+        {"recording": None},
+        Exported(7, 0, {"train": 1}),
+        "2 runs: 7 labelled views in o\n1 image in train, 0 in val: recordings are never split\n",
     ),
     "export a --format kitti --out o --every 3 --boxes visible --recording r.bag": (
         "shapecat.outputs.exports.export_run",

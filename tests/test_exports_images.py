@@ -68,7 +68,7 @@ def test_coco_holds_images_as_they_came_and_the_masks_of_the_tracks(
     run: Path, tmp_path: Path
 ) -> None:
     """Every number in the file is one that a trainer relies on."""
-    count = export_dataset([run], "coco", tmp_path / "out", Selection())
+    count = export_dataset([run], "coco", tmp_path / "out", Selection()).objects
 
     data = read_coco(tmp_path / "out")
     names = {c["id"]: c["name"] for c in data["categories"]}
@@ -139,6 +139,24 @@ def test_unsure_labels_are_crowds_and_corrected_ones_always_go(run: Path, tmp_pa
     export_dataset([run], "coco", tmp_path / "out", Selection(min_confidence=1.0))
     data = read_coco(tmp_path / "out")
     assert {r["attributes"]["track"] for r in data["annotations"] if not r["iscrowd"]} == {2}
+
+
+@pytest.mark.parametrize("kind", ["coco", "yolo"])
+def test_export_tells_what_training_will_miss(
+    run: Path, tmp_path: Path, shapecat: Run, kind: str
+) -> None:
+    """A model without validation images, or one that learns to overlook objects, seems fine."""
+    export_dataset([run], "coco", tmp_path / "all", Selection(corrected_only=True))
+    data = read_coco(tmp_path / "all")
+    crowds = sum(row["iscrowd"] for row in data["annotations"])
+    options = ("--format", kind, "--out", tmp_path / "out")
+    done = shapecat("export", run, *options, "--corrected-only")
+
+    told = f"{len(data['images'])} images in train, 0 in val: one recording is never split"
+    assert done.stdout.splitlines()[1:] == [told]
+    warning = f"Warning: {crowds} visible objects without a certain label will be background"
+    assert (warning in done.stderr) == (kind == "yolo")
+    assert shapecat("export", run, *options).stderr == ""
 
 
 def test_yolo_polygons_cover_the_masks(run: Path, tmp_path: Path) -> None:
@@ -226,12 +244,14 @@ def test_several_runs_make_one_data_set_split_by_recording(
     about = json.loads((other / "run.json").read_text())
     about["input"]["digest"] = "xxh3-128:another"
     (other / "run.json").write_text(json.dumps(about))
-    count = export_dataset([run, other], "coco", tmp_path / "out", Selection(val=0.5))
+    found = export_dataset([run, other], "coco", tmp_path / "out", Selection(val=0.5))
 
     both = [read_coco(tmp_path / "out", split) for split in ("train", "val")]
     recordings = [{image["recording"] for image in part["images"]} for part in both]
     assert sorted(name for part in recordings for name in part) == ["other", "table"]
-    assert sum(len(part["annotations"]) for part in both) == count
+    assert sum(len(part["annotations"]) for part in both) == found.objects
+    sizes = [len(part["images"]) for part in both]
+    assert [found.images["train"], found.images["val"]] == sizes
     tracks = [{row["track_id"] for row in part["annotations"]} for part in both]
     assert not tracks[0] & tracks[1]
     assert both[0]["categories"] == both[1]["categories"]

@@ -4,6 +4,7 @@ import json
 from collections import Counter
 from collections.abc import Callable, Collection, Iterable, Iterator, Mapping, Sequence
 from contextlib import suppress
+from dataclasses import dataclass
 from itertools import chain, count
 from pathlib import Path
 from typing import Any
@@ -23,10 +24,26 @@ from shapecat.system.files import flush, replacing
 from shapecat.system.progress import Observer, ignore
 from shapecat.types import Frame, LabelledFrame
 
-__all__ = ["FORMATS", "export_dataset", "export_run"]
+__all__ = ["FORMATS", "Exported", "export_dataset", "export_run"]
 
 ExportedFrame = tuple[LabelledFrame, Frame, Coloured | None]
 Write = Callable[[Path, Iterable[ExportedFrame], FinishedRun], int]
+
+
+@dataclass(frozen=True)
+class Exported:
+    """What a data set of images holds.
+
+    Attributes
+    ----------
+    objects : number of objects labelled for training, summed over all images.
+    uncertain : number of visible objects without a certain label, summed in the same way.
+    images : number of images in each split.
+    """
+
+    objects: int
+    uncertain: int
+    images: Mapping[str, int]
 
 
 def _clouds(shown: Iterable[ExportedFrame]) -> Iterator[tuple[LabelledFrame, Frame]]:
@@ -102,7 +119,7 @@ def export_dataset(
     *,
     recording: Path | None = None,
     observe: Observer = ignore,
-) -> int:
+) -> Exported:
     """Export the images of several runs with their labels as one data set.
 
     ``out`` is replaced only if an earlier export wrote it. Damaged images are left out.
@@ -112,10 +129,6 @@ def export_dataset(
     format : ``coco`` or ``yolo``.
     recording : path of the recording of a single run; by default where it was processed.
     observe : called with the phase, the number of images done, and the number of frames.
-
-    Returns
-    -------
-    The number of objects labelled for training, summed over all images.
 
     Raises
     ------
@@ -132,17 +145,22 @@ def export_dataset(
     total = sum(int(run.run["counts"]["frames"]) for run in runs)
     stems = _different_names([safe_name(run.name) for run in runs])
 
+    counts: Counter[str] = Counter()
+    uncertain = 0
+
     def images() -> Iterator[tuple[str, FinishedRun, DatasetImage]]:
-        done = 0
+        nonlocal uncertain
         for split, stem, run in zip(split_runs(runs, selection.val), stems, runs, strict=True):
             for image in images_of(run, selection, recording, stem=stem):
-                done += 1
-                observe("export", done, total)
+                counts[split] += 1
+                uncertain += image.sure.count(False)
+                observe("export", counts.total(), total)
                 yield split, run, image
 
     ids = {stem: run.run["id"] for stem, run in zip(stems, runs, strict=True)}
     about = {"format": format, "runs": ids}
-    return _staged(out, about, lambda hidden: DATASETS[format](hidden, images(), categories))
+    objects = _staged(out, about, lambda hidden: DATASETS[format](hidden, images(), categories))
+    return Exported(objects, uncertain, counts)
 
 
 def _different_names(names: Sequence[str]) -> list[str]:
