@@ -14,8 +14,8 @@ from shapecat.recordings.colour_image import cloud_colours, compressed_size
 from shapecat.recordings.colour_streams import ColourStream
 from shapecat.recordings.extrinsics import Extrinsics
 from shapecat.recordings.frames import frames
-from shapecat.recordings.messages import Message, MessageError
-from shapecat.recordings.pinhole import camera_of_info
+from shapecat.recordings.messages import MALFORMED, Message, MessageError
+from shapecat.recordings.pinhole import camera_of_info, distortion_of, is_rectified
 from shapecat.recordings.recording import Recording
 from shapecat.recordings.stamps import stamp_ns
 from shapecat.recordings.streams import Stream
@@ -35,7 +35,6 @@ _USUAL_PERIOD_NS = 100_000_000
 """Image period assumed if neither stamps nor count and duration give one."""
 _NEAR, _EQUAL = 0.01, 1e-6
 """Intrinsics that differ by less than these fractions of the image width are similar, or equal."""
-_MALFORMED = (ArithmeticError, AttributeError, LookupError, TypeError, ValueError, RecordingError)
 
 
 def frames_with_colour(
@@ -129,7 +128,7 @@ class _Partner:
         try:
             image = self._recording.decode(message)
             stamp = stamp_ns(image.header) or message.log_time_ns
-        except _MALFORMED as error:
+        except (RecordingError, *MALFORMED) as error:
             self._left_out[_reason(error, self.stream.topic)] += 1
             return
         if self._newest is not None and stamp > self._newest:
@@ -147,7 +146,7 @@ class _Partner:
         try:
             self._lens = _lens_of(self._recording.decode(message), self.stream.topic)
             self._calibration = content
-        except _MALFORMED as error:
+        except (RecordingError, *MALFORMED) as error:
             self._left_out[f"calibration: {_reason(error, self.stream.topic)}"] += 1
 
     def reaches(self, frame: Frame) -> bool:
@@ -162,7 +161,7 @@ class _Partner:
             return None
         try:
             return self._view(frame, *nearest)
-        except _MALFORMED as error:
+        except (RecordingError, *MALFORMED) as error:
             self._left_out[_reason(error, self.stream.topic)] += 1
             return None
 
@@ -223,16 +222,14 @@ def _lens(camera: Camera | None) -> LensCamera | None:
 
 
 def _lens_of(info: Any, topic: str) -> LensCamera:
-    rectified = any("rect" in part for part in topic.split("/")[-2:])
-    camera, distorted = camera_of_info(info, rectified=rectified)
+    camera, distorted = camera_of_info(info, rectified=is_rectified(topic))
     if not distorted:
         return LensCamera(camera)
     model = str(info.distortion_model)
     if model not in LENS_MODELS:
         msg = f"unknown lens distortion {model!r}"
         raise MessageError(msg)
-    coefficients = tuple(float(c) for c in (info.d if hasattr(info, "d") else info.D))
-    return LensCamera(camera, model, coefficients)
+    return LensCamera(camera, model, distortion_of(info))
 
 
 def _alike(lens: LensCamera, camera: Camera | None, share: float) -> bool:

@@ -9,6 +9,7 @@ import numpy as np
 from shapecat.errors import RecordingError
 from shapecat.geometry import IDENTITY, compose, inverse, rotation_from_quaternion
 from shapecat.recordings.colour_streams import ColourStream
+from shapecat.recordings.messages import MALFORMED
 from shapecat.recordings.recording import Recording
 from shapecat.recordings.streams import Stream, first_message
 from shapecat.recordings.transform_window import TransformWindow
@@ -21,8 +22,6 @@ from shapecat.recordings.transforms import (
 from shapecat.types import Pose
 
 __all__ = ["Extrinsics"]
-
-_MALFORMED = (ArithmeticError, AttributeError, LookupError, TypeError, ValueError, RecordingError)
 
 
 class Extrinsics:
@@ -96,7 +95,7 @@ class Extrinsics:
         """Read librealsense's ``p_colour = rotation @ p_depth + translation``; None if absent."""
         for topic in self._recording.topics:
             if topic.name.endswith("/extrinsics/depth_to_color"):
-                with suppress(*_MALFORMED):
+                with suppress(RecordingError, *MALFORMED):
                     return _driver_pose(first_message(self._recording, topic.name))
         depth, colour = (self._recorder_pose(s.topic) for s in (self._depth, self._colour))
         if depth is None or colour is None:
@@ -108,7 +107,7 @@ class Extrinsics:
         prefix = f"{image.rpartition('/image')[0]}/tf/"
         for topic in self._recording.topics:
             if topic.name.startswith(prefix) and len(prefix) > 4:
-                with suppress(*_MALFORMED):
+                with suppress(RecordingError, *MALFORMED):
                     message = first_message(self._recording, topic.name)
                     move, turn = message.translation, message.rotation
                     rotation = rotation_from_quaternion((turn.x, turn.y, turn.z, turn.w))

@@ -6,7 +6,7 @@ import numpy as np
 
 from shapecat.arrays import F4, F8
 from shapecat.cameras.lenses import undistorted_rays
-from shapecat.recordings.pinhole import PinholeFit, fit_pinhole
+from shapecat.recordings.pinhole import PinholeFit, distortion_of, fit_pinhole
 from shapecat.recordings.pointcloud2 import unorganized
 from shapecat.recordings.recording import Recording
 from shapecat.types import Camera
@@ -34,8 +34,7 @@ class Lens:
         depth : (h, w) metres.
         """
         model = str(info.distortion_model)
-        coefficients = tuple(float(c) for c in (info.d if hasattr(info, "d") else info.D))
-        self._calibrate((camera, model, coefficients), depth)
+        self._calibrate((camera, model, distortion_of(info)), depth)
         if self._rays is None:
             self._warn(f"unknown lens distortion {model!r} is ignored")
             return {"depth": depth, "camera": camera}

@@ -34,7 +34,14 @@ from shapecat.recordings.mcap_records import (
     walk,
 )
 from shapecat.recordings.mcap_summary import Summary, read_summary
-from shapecat.recordings.messages import Channel, Message, Selection, Topic, ros_type
+from shapecat.recordings.messages import (
+    Channel,
+    Message,
+    Selection,
+    Topic,
+    ros_type,
+    sum_topics,
+)
 from shapecat.recordings.recording import Recording
 from shapecat.recordings.time_order import Timed, in_time_order
 
@@ -294,13 +301,11 @@ class McapRecording(Recording):
         )
 
     def _list_topics(self) -> tuple[Topic, ...]:
-        totals: dict[tuple[str, str, str], int] = {}
-        known = self._counts is not None
-        counts = self._counts or Counter[int]()
-        for number, channel in self._channels.items():
-            key = (channel.topic, channel.type, channel.encoding)
-            totals[key] = totals.get(key, 0) + counts[number]
-        return tuple(Topic(*key, totals[key] if known else None) for key in sorted(totals))
+        counts = self._counts
+        return sum_topics(
+            Topic(c.topic, c.type, c.encoding, None if counts is None else counts[number])
+            for number, c in self._channels.items()
+        )
 
 
 _NONE = ("", "", b"")

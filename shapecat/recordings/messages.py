@@ -1,12 +1,13 @@
 """Channels, messages and topics of a recording, and which messages to read."""
 
-from collections.abc import Callable, Collection
+from collections.abc import Callable, Collection, Iterable
 from dataclasses import dataclass
 from typing import NamedTuple, TypeAlias
 
 from shapecat.errors import RecordingError
 
 __all__ = [
+    "MALFORMED",
     "Channel",
     "Message",
     "MessageError",
@@ -16,6 +17,7 @@ __all__ = [
     "Topic",
     "Topics",
     "ros_type",
+    "sum_topics",
 ]
 
 Topics: TypeAlias = Collection[str] | None
@@ -24,6 +26,10 @@ Stamp: TypeAlias = int | None
 """A log time in nanoseconds; None means no limit."""
 Needed: TypeAlias = Callable[[str, int], bool] | None
 """Whether a message's data is needed, given its topic and log time (ns); None means always."""
+
+
+MALFORMED = (ArithmeticError, AttributeError, LookupError, TypeError, ValueError)
+"""Raised by the use of a decoded message whose definition lacks fields of its type."""
 
 
 class MessageError(RecordingError):
@@ -98,6 +104,16 @@ class Topic:
     type: str
     encoding: str
     count: int | None
+
+
+def sum_topics(topics: Iterable[Topic]) -> tuple[Topic, ...]:
+    """Return topics sorted, with equal ones as one; its count is None if one of theirs is."""
+    counts: dict[tuple[str, str, str], int | None] = {}
+    for topic in topics:
+        key = (topic.name, topic.type, topic.encoding)
+        before, more = counts.get(key, 0), topic.count
+        counts[key] = None if before is None or more is None else before + more
+    return tuple(Topic(*key, counts[key]) for key in sorted(counts))
 
 
 def ros_type(name: str) -> str:

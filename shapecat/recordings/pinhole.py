@@ -9,7 +9,15 @@ from shapecat.arrays import F4, F8
 from shapecat.recordings.messages import MessageError
 from shapecat.types import Camera
 
-__all__ = ["LARGEST_ERROR_PX", "PinholeFit", "camera_of_info", "fit_pinhole", "still_fits"]
+__all__ = [
+    "LARGEST_ERROR_PX",
+    "PinholeFit",
+    "camera_of_info",
+    "distortion_of",
+    "fit_pinhole",
+    "is_rectified",
+    "still_fits",
+]
 
 LARGEST_ERROR_PX = 0.6
 """A camera fits an organized cloud if 95 % of its points are reprojected within this distance."""
@@ -152,6 +160,16 @@ def camera_of_info(info: Any, *, rectified: bool) -> tuple[Camera, bool]:
         raise MessageError(msg)
     camera = Camera(width // bin_x, height // bin_y, *(float(value) for value in values))
     return camera, bool(not rectified and np.any(d != 0))
+
+
+def distortion_of(info: Any) -> tuple[float, ...]:
+    """Return the distortion coefficients of a decoded CameraInfo."""
+    return tuple(_field(info, "d").tolist())
+
+
+def is_rectified(topic: str) -> bool:
+    """Return whether the images of a topic are rectified, as in ``image_rect_raw``."""
+    return any("rect" in part for part in topic.split("/")[-2:])
 
 
 def _field(info: Any, name: str) -> F8:

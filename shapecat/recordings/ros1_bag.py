@@ -12,7 +12,14 @@ from pathlib import Path
 from typing import ClassVar, NamedTuple
 
 from shapecat.errors import RecordingError
-from shapecat.recordings.messages import Channel, Message, Selection, Topic, ros_type
+from shapecat.recordings.messages import (
+    Channel,
+    Message,
+    Selection,
+    Topic,
+    ros_type,
+    sum_topics,
+)
 from shapecat.recordings.recording import Recording
 from shapecat.recordings.ros1_records import (
     BAG_HEADER,
@@ -74,7 +81,10 @@ class BagRecording(Recording):
         except BaseException:
             self._file.close()
             raise
-        self.topics = _topics(self._channels, counts)
+        self.topics = sum_topics(
+            Topic(channel.topic, channel.type, channel.encoding, counts[number])
+            for number, channel in self._channels.items()
+        )
 
     def close(self) -> None:
         """Close the bag."""
@@ -276,10 +286,3 @@ def _channel(fields: dict[str, bytes], data: bytes | memoryview) -> Channel:
 
 def _text(value: bytes) -> str:
     return value.decode("utf-8", "replace")
-
-
-def _topics(channels: dict[int, Channel], counts: Counter[int]) -> tuple[Topic, ...]:
-    totals: Counter[tuple[str, str, str]] = Counter()
-    for number, channel in channels.items():
-        totals[channel.topic, channel.type, channel.encoding] += counts[number]
-    return tuple(Topic(*key, totals[key]) for key in sorted(totals))

@@ -12,7 +12,14 @@ from rosbags.rosbag2.metadata import dump_qos_v8
 
 from shapecat.errors import RecordingError
 from shapecat.recordings.decoding import LIBRARY_ERRORS
-from shapecat.recordings.messages import Channel, Message, Selection, Topic, ros_type
+from shapecat.recordings.messages import (
+    Channel,
+    Message,
+    Selection,
+    Topic,
+    ros_type,
+    sum_topics,
+)
 from shapecat.recordings.recording import Recording
 
 __all__ = ["DatabaseRecording"]
@@ -44,12 +51,11 @@ class DatabaseRecording(Recording):
         except (ReaderError, apsw.Error, *LIBRARY_ERRORS) as error:
             msg = f"not a readable ROS 2 bag: {str(error) or type(error).__name__}"
             raise RecordingError(msg) from error
-        counts: dict[tuple[str, str, str], int] = {}
-        for connection in self._reader.connections:
-            channel = self._channels[connection.id]
-            key = (channel.topic, channel.type, channel.encoding)
-            counts[key] = counts.get(key, 0) + connection.msgcount
-        self.topics = tuple(Topic(*key, counts[key]) for key in sorted(counts))
+        channels = ((self._channels[c.id], c.msgcount) for c in self._reader.connections)
+        self.topics = sum_topics(
+            Topic(channel.topic, channel.type, channel.encoding, count)
+            for channel, count in channels
+        )
         if self._reader.message_count:
             self.start_ns, self.end_ns = self._reader.start_time, self._reader.end_time - 1
         if any(c.encoding == "cdr" and not c.schema for c in self._channels.values()):

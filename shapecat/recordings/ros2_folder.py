@@ -16,7 +16,7 @@ import zstandard
 
 from shapecat.errors import RecordingError
 from shapecat.recordings.mcap_file import McapRecording
-from shapecat.recordings.messages import Channel, Message, Selection, Topic
+from shapecat.recordings.messages import Channel, Message, Selection, sum_topics
 from shapecat.recordings.recording import Recording
 from shapecat.recordings.ros2_database import DatabaseRecording
 from shapecat.system.files import lock
@@ -65,7 +65,7 @@ class FolderRecording(Recording):
             self.start_ns = min(part.start_ns for part in filled)
             self.end_ns = max(part.end_ns for part in filled)
         self._overlap = any(a.end_ns > b.start_ns for a, b in pairwise(filled))
-        self.topics = _sum_topics(self._parts)
+        self.topics = sum_topics(topic for part in self._parts for topic in part.topics)
         self.indexed = all(part.indexed for part in self._parts)
         self._note()
 
@@ -179,12 +179,3 @@ def _remove_abandoned() -> None:
 def _suffix(file: Path) -> str:
     """Return the suffix of a file, without ``.zstd``."""
     return Path(file.stem).suffix if file.suffix == ".zstd" else file.suffix
-
-
-def _sum_topics(parts: list[Recording]) -> tuple[Topic, ...]:
-    counts: dict[tuple[str, str, str], int | None] = {}
-    for topic in (topic for part in parts for topic in part.topics):
-        key = (topic.name, topic.type, topic.encoding)
-        before, more = counts.get(key, 0), topic.count
-        counts[key] = None if before is None or more is None else before + more
-    return tuple(Topic(*key, counts[key]) for key in sorted(counts))

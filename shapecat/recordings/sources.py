@@ -13,8 +13,14 @@ from shapecat.geometry import transform
 from shapecat.recordings.compressed_depth import depth_of_compressed
 from shapecat.recordings.depth_image import depth_of_image
 from shapecat.recordings.lens import Lens
-from shapecat.recordings.messages import Message, MessageError
-from shapecat.recordings.pinhole import PinholeFit, camera_of_info, fit_pinhole, still_fits
+from shapecat.recordings.messages import MALFORMED, Message, MessageError
+from shapecat.recordings.pinhole import (
+    PinholeFit,
+    camera_of_info,
+    fit_pinhole,
+    is_rectified,
+    still_fits,
+)
 from shapecat.recordings.pointcloud2 import cloud_points, organized, unorganized
 from shapecat.recordings.recording import Recording
 from shapecat.recordings.stamps import Clock, stamp_ns
@@ -22,9 +28,6 @@ from shapecat.recordings.streams import COMPRESSED, Stream, first_message
 from shapecat.types import Camera, Frame, Pose
 
 __all__ = ["SOURCES", "DepthSource", "PointsSource", "Source"]
-
-_MALFORMED = (ArithmeticError, AttributeError, LookupError, TypeError, ValueError)
-"""Raised if a message's definition lacks fields of its type."""
 
 
 @contextmanager
@@ -34,7 +37,7 @@ def _counting(skipped: Counter[str]) -> Iterator[None]:
         yield
     except MessageError as error:
         skipped[str(error).split(": ", 1)[-1][:160]] += 1
-    except _MALFORMED:
+    except MALFORMED:
         skipped["message does not match its type"] += 1
 
 
@@ -122,8 +125,7 @@ class DepthSource(Source):
         """Start without a calibration."""
         super().__init__(recording, stream)
         self.info_topic = stream.info_topic or ""
-        # "image_rect", "image_rect_raw", "image_rect/compressedDepth"
-        self.rectified = any("rect" in part for part in stream.topic.split("/")[-2:])
+        self.rectified = is_rectified(stream.topic)
         self.units = _depth_units(recording, stream.topic)
         self.lens = Lens(recording, stream.topic)
         self._waiting: tuple[Message, int, Any] | None = None
@@ -135,7 +137,7 @@ class DepthSource(Source):
         try:
             info = self.recording.decode(message)
             stamp = stamp_ns(info.header)
-        except (MessageError, *_MALFORMED) as error:
+        except (MessageError, *MALFORMED) as error:
             self.recording.warn(f"skipped a calibration: {error}")
             return
         if self._waiting is None:
@@ -206,7 +208,7 @@ def _depth_units(recording: Recording, topic: str) -> float | None:
     for other in recording.topics:
         name = other.name.replace(" ", "_")
         if name.startswith(f"{sensor}/") and name.endswith("/option/Depth_Units/value"):
-            with suppress(*_MALFORMED):
+            with suppress(*MALFORMED):
                 metres = float(first_message(recording, other.name).data)
                 return 1 / metres if 1e-6 < metres < 1 else None
     return None

@@ -114,13 +114,13 @@ def choose_streams(recording: Recording, wanted: Sequence[str] = ()) -> tuple[St
 def _wanted(
     recording: Recording, streams: tuple[Stream, ...], wanted: Sequence[str]
 ) -> tuple[Stream, ...]:
-    by_topic = {stream.topic: stream for stream in streams}
+    by_topic = {stream.topic.strip("/"): stream for stream in streams}
     chosen = []
     for name in dict.fromkeys(wanted):
-        stream = by_topic.get(name) or by_topic.get(f"/{name}")
+        stream = by_topic.get(name.strip("/"))
         if stream is None:
-            known = ", ".join(by_topic) or "none"
-            there = name in {topic.name for topic in recording.topics}
+            known = ", ".join(stream.topic for stream in streams) or "none"
+            there = name.strip("/") in {topic.name.strip("/") for topic in recording.topics}
             state = "holds no clouds or depth images" if there else "does not exist"
             msg = f"{recording.path}: topic {name} {state}; usable topics: {known}"
             raise NoStreamError(msg)

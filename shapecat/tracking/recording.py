@@ -152,7 +152,10 @@ def _describe(hits: Hits, fragments: Sequence[I4], scenes: I4) -> Fragments:
 
 
 def _fused(hits: Hits, member: I4) -> tuple[F8, float]:
-    """Return the fused posterior (c,) and novelty of hits of one object."""
+    """Return the fused posterior (c,) and novelty of hits of one object.
+
+    Fragments are compared by the product of their views, whatever the fusion of the settings.
+    """
     weights = hits.weights(member)
     posterior = fuse(hits.posteriors[member], weights=weights)
     return posterior, fuse_novelty(hits.novelties[member], weights)

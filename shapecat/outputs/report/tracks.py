@@ -44,9 +44,9 @@ def read_timelines(folder: Path) -> dict[int, Timeline]:
     detections = pa.compute.fill_null(table["detection"], -1).to_numpy()
     topics, frames = table["topic"].to_pylist(), table["frame"].to_pylist()
     timelines = {}
-    for track in np.unique(tracks).tolist():
-        rows = np.flatnonzero(tracks == track)
-        rows = rows[np.argsort(seconds[rows], kind="stable")]
+    order = np.lexsort((seconds, tracks))
+    names, starts = np.unique(tracks[order], return_index=True)
+    for track, rows in zip(names.tolist(), np.split(order, starts[1:]), strict=False):
         keys = tuple((topics[k], frames[k], int(detections[k])) for k in rows.tolist())
         timelines[track] = Timeline(seconds[rows], detections[rows] >= 0, causal[rows], keys)
     return timelines
