@@ -1,8 +1,10 @@
 """Growing boosted trees as binary classifiers for the detection."""
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterable, Sequence
+from concurrent.futures import ProcessPoolExecutor
+from multiprocessing import get_context
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any, NamedTuple, TypeVar
 
 import click
 import numpy as np
@@ -11,7 +13,9 @@ from shapecat.arrays import F4, Bool
 from shapecat.learning.boosting import Tree, TreeSettings, grow_tree, make_bins
 from shapecat.trees import BoostedTrees, Trees
 
-__all__ = ["Growth", "grow", "growing_options"]
+__all__ = ["Growth", "collect_chunks", "grow", "growing_options"]
+
+_T = TypeVar("_T")
 
 _L2, _MIN_HESSIAN, _ROWS = 1.0, 2.0, 0.7
 
@@ -40,6 +44,26 @@ def growing_options(out: Path) -> Callable[[Callable[..., Any]], Callable[..., A
         return command
 
     return add
+
+
+def collect_chunks(
+    collect: Callable[[Any], _T], series: Iterable[Any], size: int, jobs: int
+) -> list[_T]:
+    """Collect from series of scenes in spawned processes, and show the progress.
+
+    A series has a ``first`` seed and a number of ``scenes``; each call gets one of at most ``size``
+    scenes. The results are in order.
+    """
+    chunks = [
+        one._replace(first=one.first + k, scenes=min(size, one.scenes - k))
+        for one in series
+        for k in range(0, one.scenes, size)
+    ]
+    with (
+        ProcessPoolExecutor(jobs, mp_context=get_context("spawn")) as pool,
+        click.progressbar(pool.map(collect, chunks), length=len(chunks), label="scenes") as bar,
+    ):
+        return list(bar)
 
 
 def grow(features: F4, truth: Bool, growth: Growth, seed: int) -> BoostedTrees:

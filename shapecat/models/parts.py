@@ -6,9 +6,7 @@ partially merged segments.
 """
 
 from collections.abc import Iterator, Sequence
-from concurrent.futures import ProcessPoolExecutor
 from dataclasses import replace
-from multiprocessing import get_context
 from pathlib import Path
 from typing import NamedTuple
 
@@ -30,7 +28,7 @@ from shapecat.detection.merging.pair_features import (
 )
 from shapecat.detection.merging.segments import Segments, merge
 from shapecat.detection.pipeline import Task, oversegment
-from shapecat.models.growing import Growth, grow, growing_options
+from shapecat.models.growing import Growth, collect_chunks, grow, growing_options
 from shapecat.simulation import KINECT, REALSENSE, make_scene, render_frame
 from shapecat.simulation.scenes import SceneKind
 from shapecat.simulation.sensors import IDEAL, PRESETS, Sensor
@@ -118,23 +116,14 @@ def collect(scenes: Sequence[Series], share: float, jobs: int) -> Pairs:
 
     The number of jobs does not affect the result.
     """
-    chunks = [
-        (series, series.first + k, min(_CHUNK, count - k))
-        for series in scenes
-        for count in [round(series.scenes * share)]
-        for k in range(0, count, _CHUNK)
-    ]
-    with ProcessPoolExecutor(jobs, mp_context=get_context("spawn")) as pool:
-        found = pool.map(_collect, chunks)
-        with click.progressbar(found, length=len(chunks), label="scenes") as bar:
-            both = list(bar)
+    fewer = (series._replace(scenes=round(series.scenes * share)) for series in scenes)
+    both = collect_chunks(_collect, fewer, _CHUNK, jobs)
     return Pairs(np.concatenate([p.features for p in both]), np.concatenate([p.same for p in both]))
 
 
-def _collect(chunk: tuple[Series, int, int]) -> Pairs:
-    series, first, count = chunk
+def _collect(series: Series) -> Pairs:
     found: list[tuple[F4, bool]] = []
-    for seed in range(first, first + count):
+    for seed in range(series.first, series.first + series.scenes):
         rng = np.random.default_rng(seed)
         world = make_scene(series.kind, rng, frames=1, categories=series.categories)
         frame, owners = render_frame(world, 0, rng=rng, sensor=series.sensor)

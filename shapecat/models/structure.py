@@ -6,10 +6,8 @@ the segments.
 """
 
 from collections.abc import Callable, Iterator, Sequence
-from concurrent.futures import ProcessPoolExecutor
 from dataclasses import replace
 from itertools import chain
-from multiprocessing import get_context
 from pathlib import Path
 from typing import Literal, NamedTuple
 
@@ -31,7 +29,7 @@ from shapecat.detection.cleanup.structure import (
 from shapecat.detection.depth_grid import downsample
 from shapecat.detection.merging.segments import Records
 from shapecat.detection.pipeline import ALL_STEPS, Task, merge_segments, oversegment
-from shapecat.models.growing import Growth, grow, growing_options
+from shapecat.models.growing import Growth, collect_chunks, grow, growing_options
 from shapecat.models.parts import count_labels
 from shapecat.simulation import make_scene, render_frame
 from shapecat.simulation.equipment import make_own_arms, make_resting_arms
@@ -172,16 +170,7 @@ def collect(scenes: tuple[Series, ...], jobs: int) -> list[Samples]:
 
     Samples of the same scene are in the same part.
     """
-    chunks = [
-        s._replace(first=s.first + k, scenes=min(_CHUNK, s.scenes - k))
-        for s in scenes
-        for k in range(0, s.scenes, _CHUNK)
-    ]
-    with (
-        ProcessPoolExecutor(jobs, mp_context=get_context("spawn")) as pool,
-        click.progressbar(pool.map(_collect, chunks), length=len(chunks), label="scenes") as bar,
-    ):
-        return list(bar)
+    return collect_chunks(_collect, scenes, _CHUNK, jobs)
 
 
 def grow_rejection_trees(samples: Sequence[Samples], seed: int) -> RejectionTrees:

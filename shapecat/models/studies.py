@@ -39,9 +39,6 @@ _ROUNDS = 250
 _NEIGHBOURS = 6
 
 
-# --- learners ------------------------------------------------------------------------------------
-
-
 def compare_with_plain(
     train: DescribedViews,
     test: DescribedViews,
@@ -92,8 +89,6 @@ def _some(count: int, seed: int) -> I4:
 def _best(model: Categorizer, descriptors: F4) -> I4:
     return np.asarray(model.predict(descriptors).posteriors.argmax(axis=1))
 
-
-# --- surfaces ------------------------------------------------------------------------------------
 
 _Reconstruct = Callable[[F4, np.random.Generator], NeuralGas | None]
 
@@ -224,9 +219,6 @@ def sampled(
     first = np.repeat(np.arange(len(chosen)), near.shape[1])
     pairs = np.sort(np.stack([first, near.reshape(-1)], axis=1), axis=1)
     return NeuralGas(chosen, np.unique(pairs, axis=0))
-
-
-# --- new categories ------------------------------------------------------------------------------
 
 
 def add_two_categories(
