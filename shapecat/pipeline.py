@@ -12,7 +12,7 @@ from pathlib import Path
 from typing import TypeVar
 
 from shapecat.description import DESCRIPTOR_NAMES
-from shapecat.errors import OutputError
+from shapecat.errors import NoStreamError, OutputError
 from shapecat.learning import load_model
 from shapecat.recordings import Recording, choose_streams, open_recording
 from shapecat.recordings.colour_streams import pair_colours
@@ -81,6 +81,7 @@ def process(job: Job, observe: Observer = ignore, *, cores: int = 1) -> Summary:
         categorizer = load_model(job.model)
         categorizer.require_descriptor(DESCRIPTOR_NAMES)
         run = describe_run(job, categorizer)
+        _require_begun(job, recording)
         streams = choose_streams(recording, job.topics)
         run["options"]["topics"] = [stream.topic for stream in streams]
         colours = pair_colours(recording, streams, job.color)
@@ -111,6 +112,19 @@ def process(job: Job, observe: Observer = ignore, *, cores: int = 1) -> Summary:
             run["seconds"]["total"] = earlier + time.perf_counter() - begun
             write_run(folder, run)
     return summarize(job, run)
+
+
+def _require_begun(job: Job, recording: Recording) -> None:
+    """Check that the selected range begins within the recording.
+
+    Raises
+    ------
+    NoStreamError : it begins after the end.
+    """
+    seconds = (recording.end_ns - recording.start_ns) * 1e-9
+    if recording.end_ns and job.start_s is not None and job.start_s > seconds:
+        msg = f"{job.source}: --start {job.start_s:g} is after the end at {seconds:.1f} s"
+        raise NoStreamError(msg)
 
 
 def _revise(work: Work) -> None:

@@ -82,6 +82,17 @@ def test_an_impossible_range_is_wrong_usage(
     assert not (tmp_path / "out").exists()
 
 
+def test_a_range_after_the_end_tells_where_the_end_is(
+    shapecat: Run, recording: Path, tmp_path: Path
+) -> None:
+    result = shapecat("process", recording, "--out", tmp_path / "out", "--start", 100)
+    seconds = json.loads(shapecat("info", recording, "--json").stdout)[0]["seconds"]
+
+    assert result.exit_code == 4
+    assert f"--start 100 is after the end at {seconds:.1f} s" in result.stderr
+    assert not (tmp_path / "out").exists()
+
+
 @contextmanager
 def new_logging() -> Iterator[None]:
     """Allow the command to set up logging, which it does once per process."""

@@ -1,6 +1,6 @@
 """A run without planes finds nothing: the user learns the reason, in run.json and on screen."""
 
-from collections.abc import Callable
+from collections.abc import Callable, Iterable
 from pathlib import Path
 from typing import Any
 
@@ -20,8 +20,8 @@ from tests.test_detection import ball, frame_of, render
 MAKE = MessageFactory(2)
 
 
-def walls(path: Path, depths_m: list[float]) -> Path:
-    """Record a wall that the camera faces, at these depths; 0 is no reading."""
+def walls(path: Path, depths_m: Iterable[Any]) -> Path:
+    """Record a wall that the camera faces, at these depths (or images); 0 is no reading."""
     items: list[tuple[str, int, Any]] = []
     for k, depth_m in enumerate(depths_m):
         stamp = EPOCH + k * SECOND // 10
@@ -53,12 +53,19 @@ def test_a_table_beyond_the_range_is_named_as_the_reason(tmp_path: Path) -> None
 def test_frames_without_depth_and_frames_in_range_have_other_reasons(tmp_path: Path) -> None:
     """A covered lens is no matter of the range; nor is a wall at 1 m, where up may be wrong."""
     none = warnings_of(walls(tmp_path / "none.mcap", [0.0] * 3), tmp_path)
-    near = warnings_of(walls(tmp_path / "near.mcap", [1.0, 1.1, 1.2, 1.0]), tmp_path, up="0,-1,0")
+    wall = walls(tmp_path / "near.mcap", [1.0, 1.1, 1.2, 1.0])
+    near = warnings_of(wall, tmp_path, up="0,-1,0")
+    noise = np.random.default_rng(1).uniform(0.4, 1.9, (3, CAMERA.height, CAMERA.width))
+    nowhere = warnings_of(walls(tmp_path / "noise.mcap", noise), tmp_path)
 
     assert none == ["no supporting plane in 3 of 3 frames: they have no valid depth"]
     assert near[-1] == (
         "no supporting plane in 4 of 4 frames: "
         "is --up right? --up auto estimates up from the planes"
+    )
+    assert nowhere[-1] == (
+        "no supporting plane in 3 of 3 frames: "
+        "try --up X,Y,Z, or another range with --set detection.max_range_m=M"
     )
 
 

@@ -49,7 +49,9 @@ def explain_missing_planes(
     source = run["up"]["source"]
     if source == "option":
         return [f"{text}: is --up right? --up auto estimates up from the planes"]
-    return [text if source == "planes" else f"{text}: is up ({source}) right? Try another --up"]
+    if source == "planes":
+        return [f"{text}: try --up X,Y,Z, or another range with --set detection.max_range_m=M"]
+    return [f"{text}: is up ({source}) right? Try another --up"]
 
 
 def _count(folder: Path) -> tuple[int, int, set[Key]]:
