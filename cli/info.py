@@ -56,7 +56,10 @@ def _show(overview: dict[str, Any]) -> None:
         f"{overview['path']}: {overview['kind']}, {overview['bytes'] / 1e6:.1f} MB, "
         f"{overview['seconds']:.1f} s"
     )
-    rows = [(t["name"], t["type"], t["encoding"], t["count"], t["use"]) for t in overview["topics"]]
+    rows = [
+        (t["name"], t["type"], t["encoding"], "?" if t["count"] is None else t["count"], t["use"])
+        for t in overview["topics"]
+    ]
     print_table(("topic", "type", "encoding", "messages", "use"), rows)
     for warning in overview["warnings"]:
         click.echo(f"warning: {warning}")

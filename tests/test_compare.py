@@ -283,7 +283,7 @@ def worked() -> Comparison:
         Difference("/d", 9, START, "identity", 16, "ball", 27, "ball", 0.76, 0.95, 0.91, 0.88),
     )
     captions = (
-        Caption(20.0, 150.4, "left"), Caption(290.0, 9.0, "high"), Caption(144.0, 60.0, "in")
+        Caption(20.0, 150.4, "left"), Caption(290.0, 4.0, "high"), Caption(144.0, 60.0, "in")
     )  # fmt: skip
     picture = DifferenceImage(
         "/d", 9, "data:image/png;base64,AA", 300, 200, captions, 3.5, rows[5:]
@@ -398,10 +398,11 @@ def test_the_page_shows_each_number_once_and_in_its_place() -> None:
         (str(COLOURS["surplus"]), "surplus: only in the run, or on another object"),
         (str(COLOURS["category"]), "wrong category"),
     ]
-    assert '<svg viewBox="0 0 300 200"' in svg
+    # Letters of a fixed size would hide a small picture.
+    assert '<svg viewBox="0 0 300 200" style="font-size:7.0px"' in svg
     assert 'href="data:image/png;base64,AA" width="300" height="200"' in svg
     assert re.findall(r'<text x="(.*?)" y="(.*?)">(.*?)</text>', svg) == [
-        ("70", "150", "left"), ("230", "14", "high"), ("144", "60", "in"),
+        ("35", "150", "left"), ("265", "7", "high"), ("144", "60", "in"),
     ]  # fmt: skip
     assert page.count(
         "cup taken for can #25; surplus pot #26; missed a &amp; b; ball now #27"

@@ -262,6 +262,16 @@ def test_the_drawn_confusion_has_true_categories_in_rows() -> None:
     assert "0" not in texts
 
 
+def test_names_beside_the_confusion_neither_overlap_nor_end_at_the_edge() -> None:
+    """Users add categories of any length; a column is only 46 pixels wide."""
+    name = "a rather long category"
+    svg = confusion_svg((name, "can"), [[4, 3], [0, 7]])
+    (left, *_), heads = drawn(svg, "rect", "x")[0], drawn(svg, "text", "text", "transform")
+
+    assert float(str(left)) > 6 * len(name)
+    assert [turn.split()[0] for text, turn in heads if turn] == ["rotate(-90"] * 2
+
+
 def worked() -> Report:
     """Return a report in which no two numbers are equal."""
     return Report(
@@ -309,6 +319,7 @@ TABLES = [
 def test_the_printed_report_has_each_number_under_its_name() -> None:
     """A swapped pair of metrics is still a plausible report."""
     first, *lines = format_report(worked()).splitlines()
+    assert [line != "" for line in lines[:2]] == [False, True]
     cells = [re.split(r"\s{2,}", line.strip()) for line in lines if line.strip()]
     split = next(k for k, row in enumerate(cells) if row[0].startswith("rows:"))
 

@@ -163,7 +163,9 @@ def test_without_the_recording_surfaces_are_drawn_from_their_meshes(run: Path) -
     assert report.listed("x").faces
 
 
-def test_index_lists_runs_and_links_to_them(shapecat: Run, run: Path) -> None:
+def test_index_lists_runs_and_links_to_them(
+    shapecat: Run, run: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     other = run.with_name("ta ble#2")
     shutil.copytree(run, other)
     (run.parent / ".table.partial").mkdir()
@@ -173,9 +175,12 @@ def test_index_lists_runs_and_links_to_them(shapecat: Run, run: Path) -> None:
         about["input"]["path"] = str(run / "gone.mcap")  # its page needs fewer pictures
         (folder / "run.json").write_text(json.dumps(about))
 
-    result = shapecat("report", run.parent)
+    monkeypatch.chdir(run.parents[1])
+    result = shapecat("report", run.parent.name)
 
     assert result.exit_code == 0, result.output
+    names = ("ta ble#2/report.html", "table/report.html", "index.html")
+    assert result.stdout.splitlines() == [f"{run.parent.name}/{name}" for name in names]
     text = (run.parent / "index.html").read_text("utf-8")
     links = re.findall(r'class="run" href="([^"]+)"', text)
     assert links == ["ta%20ble%232/report.html", "table/report.html"]

@@ -21,6 +21,8 @@ from shapecat.system.files import complete_folder
 __all__ = ["OBJECTS", "figure_rows", "format_page", "require_new", "write_comparison"]
 
 _MOST_ROWS = 500
+_LETTERS = 43
+"""The height of letters goes so often into the width of a picture, however few pixels it has."""
 
 OBJECTS = pa.schema(
     [
@@ -197,16 +199,19 @@ def _cells(row: Difference) -> tuple[str, ...]:
 
 
 def _picture(picture: DifferenceImage) -> str:
+    letter = picture.width / _LETTERS
+    side = 5 * letter
     texts = "".join(
-        f'<text x="{min(max(c.x, 70), picture.width - 70):.0f}" y="{max(c.y, 14):.0f}">'
+        f'<text x="{min(max(c.x, side), picture.width - side):.0f}" y="{max(c.y, letter):.0f}">'
         f"{escape(c.text)}</text>"
         for c in picture.captions
     )
     listed = "; ".join(words_of(row) for row in picture.rows)
+    width, height = picture.width, picture.height
     return (
-        f'<figure><svg viewBox="0 0 {picture.width} {picture.height}" role="img" '
-        f'aria-label="{escape(listed)}"><image href="{picture.image}" width="{picture.width}" '
-        f'height="{picture.height}"/>{texts}</svg><figcaption><b>{escape(picture.topic)} '
+        f'<figure><svg viewBox="0 0 {width} {height}" style="font-size:{letter:.1f}px" role="img" '
+        f'aria-label="{escape(listed)}"><image href="{picture.image}" width="{width}" '
+        f'height="{height}"/>{texts}</svg><figcaption><b>{escape(picture.topic)} '
         f"frame {picture.frame}</b>: {escape(listed)}</figcaption></figure>"
     )
 
@@ -222,7 +227,7 @@ tr+tr{border-top:1px solid #ddd}td:nth-child(2){font-variant-numeric:tabular-num
 .pictures{display:grid;grid-template-columns:repeat(auto-fill,minmax(26em,1fr));gap:1.2em}
 figure{margin:0}figure svg{width:100%;border-radius:4px;display:block}
 figcaption{font-size:13px;color:#444}
-text{font:600 15px system-ui,sans-serif;fill:#fff;stroke:#000;stroke-width:3px;paint-order:stroke;
+text{font:600 1em system-ui,sans-serif;fill:#fff;stroke:#000;stroke-width:.2em;paint-order:stroke;
 text-anchor:middle}
 .legend span{margin-right:1.5em}.legend i{display:inline-block;width:.9em;height:.9em;
 border-radius:2px;margin-right:.4em;vertical-align:-1px}

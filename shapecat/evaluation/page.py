@@ -26,6 +26,7 @@ __all__ = [
 
 _CELL = 46
 _MARGIN = 74
+_LETTER = 7
 _INK = (31, 78, 121)
 _STYLE = (
     "body{font:15px/1.5 system-ui,sans-serif;max-width:52em;margin:2em auto;padding:0 1em}"
@@ -137,19 +138,21 @@ def _figures(report: Report) -> Rows:
 
 def confusion_svg(categories: Sequence[str], table: Sequence[Sequence[int]]) -> str:
     """Return a confusion matrix ``table`` (c, c) as SVG, shaded by the fraction of the row."""
-    size = _MARGIN + _CELL * len(categories)
+    margin = max(_MARGIN, 16 + _LETTER * max(map(len, categories), default=0))
+    size = margin + _CELL * len(categories)
     parts: list[str] = []
     for i, (name, row) in enumerate(zip(categories, table, strict=True)):
-        middle = _MARGIN + _CELL * (i + 0.5)
+        middle, end = margin + _CELL * (i + 0.5), margin - 8
+        turn = f'dy="4" transform="rotate(-90 {middle} {end})"'
         parts.extend(
             (
-                f'<text x="{_MARGIN - 8}" y="{middle + 4}" text-anchor="end">{escape(name)}</text>',
-                f'<text x="{middle}" y="{_MARGIN - 8}" text-anchor="middle">{escape(name)}</text>',
+                f'<text x="{end}" y="{middle + 4}" text-anchor="end">{escape(name)}</text>',
+                f'<text x="{middle}" y="{end}" {turn}>{escape(name)}</text>',
             )
         )
         total = max(sum(row), 1)
         for j, count in enumerate(row):
-            x, y, share = _MARGIN + _CELL * j, _MARGIN + _CELL * i, count / total
+            x, y, share = margin + _CELL * j, margin + _CELL * i, count / total
             ink = "white" if share > 0.5 else "black"
             parts.append(
                 f'<rect x="{x}" y="{y}" width="{_CELL}" height="{_CELL}" fill="{_shade(share)}"/>'

@@ -228,7 +228,7 @@ def format_report(report: Report) -> str:
     stream = io.StringIO()
     console = Console(file=stream, width=100, highlight=False)
     skipped = f"; skipped {report.skipped} without a surface" if report.skipped else ""
-    console.print(f"{report.n} views, model {report.model}{skipped}\n")
+    console.print(f"{report.n} views, model {report.model}{skipped}")
     console.print(_grid(None, ("", ""), _figures(report)))
     head = ("", *report.categories, "recall")
     title = "\nrows: true category; columns: predicted category"

@@ -103,8 +103,9 @@ class Reports:
 
     @cached_property
     def above(self) -> Path:
-        """The deepest folder that contains all runs."""
-        return _above([report.folder for report in self.runs])
+        """The deepest folder that contains all runs, relative if the first run is."""
+        above, first = _above([report.folder for report in self.runs]), self.runs[0].folder
+        return above if first.is_absolute() else Path(os.path.relpath(above))
 
     def link(self, report: RunReport) -> str:
         """Return the address of a page, relative to the common folder."""
@@ -113,7 +114,7 @@ class Reports:
     def index(self) -> str:
         """Return the page that lists the runs, with their current labels."""
         listed = [report.listed(self.link(report)) for report in self.runs]
-        return index_page(self.above.name, listed)
+        return index_page(self.above.resolve().name, listed)
 
     def write(self) -> list[Path]:
         """Write all pages, the index last, and return their paths.
