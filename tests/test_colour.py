@@ -7,8 +7,9 @@ from typing import Any, Literal
 import numpy as np
 import pytest
 
-from shapecat.cameras.colour import LensCamera
+from shapecat.cameras.colour import ColourImage, ColourView, LensCamera
 from shapecat.cameras.lenses import distort, undistorted_rays
+from shapecat.colour.image_masks import find_masks, mask_of
 from shapecat.colour.masks import NOTHING, Mask, dense_masks, label_boxes, labelled_masks, united
 from shapecat.colour.projection import project
 from shapecat.colour.snapping import snapped
@@ -57,6 +58,26 @@ def test_what_a_lens_cannot_show_is_not_shown() -> None:
     points = np.array([[0.2, 0, 1.0], [2.5, 0, 1.0], [0, 0, -1.0], [np.nan, 0, 1]])
     seen = project(points, lens, IDENTITY)
     assert np.isfinite(seen[:, 0]).tolist() == [True, False, False, False]
+
+
+@pytest.mark.parametrize(
+    ("model", "coefficients", "slope", "shown"),
+    [
+        # x - 0.4 x^3 turns back at x = sqrt(1 / 1.2) = 0.913.
+        ("plumb_bob", (-0.4, 0.0, 0.0, 0.0, 0.0), 0.90, True),
+        ("plumb_bob", (-0.4, 0.0, 0.0, 0.0, 0.0), 0.93, False),
+        ("equidistant", (0.0, 0.0, 0.0, 0.0), 2.9, True),  # 71 degrees off the axis
+        ("equidistant", (0.0, 0.0, 0.0, 0.0), 3.1, False),
+    ],
+)
+def test_a_lens_shows_all_up_to_where_it_turns_back(
+    model: str, coefficients: tuple[float, ...], slope: float, *, shown: bool
+) -> None:
+    """A limit on the slope is not one on its square."""
+    lens = LensCamera(LENS.pinhole, model, coefficients)
+    points = np.array([[slope, 0, 1], [0.6 * slope, -0.8 * slope, 1]])
+    seen = project(points, lens, IDENTITY)
+    assert np.isfinite(seen[:, 0]).tolist() == [shown, shown]
 
 
 def test_the_painted_image_agrees_with_projected_points() -> None:
@@ -110,6 +131,20 @@ def test_what_the_colour_camera_does_not_see_gets_no_mask() -> None:
     row = back.full(240, 320)[120]
     assert abs(np.flatnonzero(row)[0] - (2 * 59.5 + shift_near)) <= 1.5
     assert abs(np.flatnonzero(row)[-1] - (2 * 119.5 + shift_far)) <= 1.5
+
+
+def test_an_object_beside_the_colour_image_takes_no_mask_of_another() -> None:
+    """Masks are stored under the numbers of the detections, of which the first has none here."""
+    frame, near, far = two_boards()
+    lens = LensCamera(Camera(320, 240, 280.0, 282.0, 20.6, 117.8))
+    image = ColourImage("/color", 1, 2, "color", "rgb8", 320, 240, 0, b"")
+    masks = find_masks(frame, ColourView(image, lens, IDENTITY), (near, far))
+
+    assert masks.boxes.keys() == masks.counts.keys() == {1}
+    assert mask_of(masks, [0]).area == 0
+    whole = mask_of(masks, [1]).full(240, 320)
+    (_, far_mask) = dense_masks(frame, (near, far), lens, IDENTITY)
+    np.testing.assert_array_equal(whole, far_mask.full(240, 320))
 
 
 def test_masks_have_no_holes_of_pixels_but_those_of_the_object() -> None:
