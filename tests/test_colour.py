@@ -238,6 +238,22 @@ def test_masks_side_by_side_share_no_pixel_when_they_move() -> None:
     assert whole.area == 8000
 
 
+@pytest.mark.parametrize("border", [48, 52])
+def test_what_a_mask_gives_up_goes_to_the_mask_beside_it(border: int) -> None:
+    """Two objects touch at column 50; a gap between their masks would be taught as an outline.
+
+    Either of the masks may be the wider one: the order of the objects must not matter.
+    """
+    pixels, inside = picture_of_a_box((170, 90, 60))
+    pixels[20:60, 50:70] = np.where(inside[20:60, 50:70, None], (60, 90, 170), 0)
+    left = Mask(30, 20, np.ones((40, border - 30), bool))
+    right = Mask(border, 20, np.ones((40, 70 - border), bool))
+    one, two = (mask.full(80, 100) for mask in snapped([left, right], pixels))
+    assert (one ^ two)[23:57, 33:67].all()  # corners may be rounded
+    assert one[23:57, 33:50].all()
+    assert two[23:57, 50:67].all()
+
+
 @pytest.mark.slow
 @pytest.mark.parametrize("sensor", ["kinect", "realsense"])
 def test_masks_agree_with_what_the_simulated_colour_camera_sees(

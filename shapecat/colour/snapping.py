@@ -6,6 +6,7 @@ depth is already right to a pixel or two.
 """
 
 from collections.abc import Sequence
+from typing import NamedTuple
 
 import numpy as np
 from scipy import ndimage
@@ -54,33 +55,55 @@ def snapped(masks: Sequence[Mask], pixels: U1, scale: float = 1.0) -> tuple[Mask
         height, width = mask.pixels.shape
         part = owners[mask.top : mask.top + height, mask.left : mask.left + width]
         part[mask.pixels] = number
-    return tuple(
-        _snapped(mask, number, owners, pixels, scale) if mask.pixels.size else NOTHING
+    judged = [
+        _judged(mask, number, owners, pixels, scale) if mask.pixels.size else None
         for number, mask in enumerate(masks, start=1)
+    ]
+    # What all masks give up is free for any of them, whatever their order.
+    for number, one in enumerate(judged, start=1):
+        if one is not None:
+            part = owners[one.window]
+            part[(part == number) & ~one.wanted] = 0
+    return tuple(
+        NOTHING if one is None else _taken(one, number, owners)
+        for number, one in enumerate(judged, start=1)
     )
 
 
-def _snapped(mask: Mask, number: int, owners: I4, pixels: U1, scale: float) -> Mask:
-    """Return one mask with its new outline, and update ``owners`` (h, w), the mask numbers."""
-    band, window = max(2.0, _BAND_PX * scale), max(3, round(_WINDOW_PX * scale))
-    margin, (left, top, width, height) = int(band) + window, mask.box
-    top, bottom = max(0, top - margin), top + height + margin
-    left, right = max(0, left - margin), left + width + margin
-    part = owners[top:bottom, left:right]
-    inside = part == number
+class _Judged(NamedTuple):
+    """The window (rows and columns) around a mask, and the pixels in it that match it (h, w)."""
+
+    window: tuple[slice, slice]
+    wanted: Bool
+
+
+def _judged(mask: Mask, number: int, owners: I4, pixels: U1, scale: float) -> _Judged:
+    """Return the pixels that match a mask; ``owners`` (h, w) are the numbers of the masks."""
+    band, reach = max(2.0, _BAND_PX * scale), max(3, round(_WINDOW_PX * scale))
+    margin, (left, top, width, height) = int(band) + reach, mask.box
+    rows = slice(max(0, top - margin), top + height + margin)
+    columns = slice(max(0, left - margin), left + width + margin)
+    window = rows, columns
+    inside = owners[window] == number
     if inside.all() or not inside.any():
-        return mask
+        return _Judged(window, inside)
     # The distance of pixel centres from the outline, positive inside.
     within, without = (ndimage.distance_transform_edt(side) for side in (inside, ~inside))
     depth = np.where(inside, within - 0.5, 0.5 - without).astype(np.float32)
-    near = np.abs(depth) <= band
     likelier = np.zeros(depth.shape, np.float32)
-    colours = np.ascontiguousarray(pixels[top:bottom, left:right])
-    _compare(colours, depth, band, _CORE_PX * scale, window, likelier)
+    colours = np.ascontiguousarray(pixels[window])
+    _compare(colours, depth, band, _CORE_PX * scale, reach, likelier)
     score = ndimage.uniform_filter(likelier, 3) + depth / np.float32(_ERROR_PX * scale)
-    found = np.where(near, score > 0, inside) & (inside | (part == 0))
-    part[inside], part[found] = 0, number
-    return _cut_out(found, left, top)
+    return _Judged(window, np.where(np.abs(depth) <= band, score > 0, inside))
+
+
+def _taken(judged: _Judged, number: int, owners: I4) -> Mask:
+    """Return a mask of the pixels that match it and that no other mask has; mark them as taken."""
+    rows, columns = judged.window
+    part = owners[judged.window]
+    found = judged.wanted & ((part == number) | (part == 0))
+    part[found] = number
+    return _cut_out(found, columns.start, rows.start)
 
 
 def _cut_out(inside: Bool, left: int, top: int) -> Mask:
