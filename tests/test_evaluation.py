@@ -6,6 +6,7 @@ import re
 from dataclasses import replace
 from importlib import import_module
 from pathlib import Path
+from typing import Any
 from xml.etree import ElementTree as ET
 
 import numpy as np
@@ -30,11 +31,14 @@ from shapecat.evaluation.page import (
 )
 from shapecat.evaluation.report import Compared, _accuracy_over
 from shapecat.evaluation.training import (
+    fit_views,
     learn_on_folder,
     order_categories,
     split_instances,
     train_on_folder,
 )
+from shapecat.evaluation.views import DescribedViews
+from shapecat.learning import Categorizer, load_model
 
 
 def test_the_calibration_error_weighs_bins_by_their_views() -> None:
@@ -163,6 +167,27 @@ def test_the_same_folder_gives_the_same_model(tmp_path: Path) -> None:
 
     assert first["model"] == second["model"]
     assert (tmp_path / "a.npz").read_bytes() == (tmp_path / "b.npz").read_bytes()
+
+
+def test_a_model_is_calibrated_on_instances_it_had_not_seen(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """The written model has seen all, so it takes what was measured before it was trained."""
+    made: list[Categorizer] = []
+
+    def fit(*views: DescribedViews, **options: Any) -> Categorizer:
+        made.append(fit_views(*views, **options))
+        return made[-1]
+
+    monkeypatch.setattr("shapecat.evaluation.training.fit_views", fit)
+    dataset = write_dataset(tmp_path / "data", ("box", "ball", "unknown"), instances=2)
+    train_on_folder(dataset, tmp_path / "m.npz")
+
+    judged, whole = made
+    model = load_model(tmp_path / "m.npz")
+    assert (model.temperature, model.threshold) == (judged.temperature, judged.threshold)
+    assert judged.temperature != whole.temperature
+    assert judged.threshold != whole.threshold
 
 
 def test_a_category_is_added(trained: Path, tmp_path: Path) -> None:
