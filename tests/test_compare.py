@@ -402,7 +402,7 @@ def test_the_page_shows_each_number_once_and_in_its_place() -> None:
     assert '<svg viewBox="0 0 300 200" style="font-size:7.0px"' in svg
     assert 'href="data:image/png;base64,AA" width="300" height="200"' in svg
     assert re.findall(r'<text x="(.*?)" y="(.*?)">(.*?)</text>', svg) == [
-        ("35", "150", "left"), ("265", "7", "high"), ("144", "60", "in"),
+        ("42", "150", "left"), ("258", "7", "high"), ("144", "60", "in"),
     ]  # fmt: skip
     assert page.count(
         "cup taken for can #25; surplus pot #26; missed a &amp; b; ball now #27"

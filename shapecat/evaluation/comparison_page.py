@@ -200,7 +200,7 @@ def _cells(row: Difference) -> tuple[str, ...]:
 
 def _picture(picture: DifferenceImage) -> str:
     letter = picture.width / _LETTERS
-    side = 5 * letter
+    side = 6 * letter
     texts = "".join(
         f'<text x="{min(max(c.x, side), picture.width - side):.0f}" y="{max(c.y, letter):.0f}">'
         f"{escape(c.text)}</text>"
