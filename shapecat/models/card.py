@@ -33,6 +33,13 @@ views of known categories.
 - Cartons with a gable or a screw cap are between box and bottle.
 - Mostly hidden objects are categorized by their visible part.
 
+## Confidence
+
+On simulated objects the confidence is calibrated: of the objects with a confidence of 0.8, about
+80 % have the right category. In real clutter it is too high, mostly for shapes of no category: of
+46 detections of a known category on a listed object with a confidence of at least 0.9, 30 were
+right, and 13 of the 16 others were *unknown* shapes.
+
 ## The worst mistakes
 
 The views of the test set with the most confident wrong labels. Colour shows the distance.
