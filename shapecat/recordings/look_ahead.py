@@ -47,7 +47,7 @@ class LookAhead:
         self._recording, self._topics = recording, topics
         self._take, self._forget = take, forget
         self._stamp_ns: int | None = None
-        self._forgotten_ns = 0
+        self._forgotten_ns = self._reached_ns = 0
         self.whole = is_read_at_once(recording)
         self._read_from(recording.start_ns)
 
@@ -85,4 +85,5 @@ class LookAhead:
         ):
             self._take(self._next)
             self._next = next(self._messages, None)
-        self._reached_ns = log_time_ns or self._recording.end_ns
+        reached_ns = self._recording.end_ns if log_time_ns is None else log_time_ns
+        self._reached_ns = max(self._reached_ns, reached_ns)
