@@ -1,6 +1,7 @@
 """Progress of ``process`` on stderr: bars, plain lines, or JSON lines."""
 
 import json
+import os
 import sys
 import time
 from collections import Counter
@@ -112,7 +113,7 @@ class Progress:
 
     def note(self, text: str) -> None:
         """Show a line."""
-        click.echo(text, err=True)
+        _say(text)
 
     def show(self, folder: str) -> None:
         """Show the progress of a recording."""
@@ -216,7 +217,15 @@ class JsonProgress(Progress):
 
 def _event(event: str, **values: Any) -> None:
     known = {name: value for name, value in values.items() if value is not None}
-    click.echo(json.dumps({"event": event, **known}), err=True)
+    _say(json.dumps({"event": event, **known}))
+
+
+def _say(text: str) -> None:
+    """Write a line to stderr; if nobody reads it any more, the work goes on without."""
+    try:
+        click.echo(text, err=True)
+    except BrokenPipeError:
+        os.dup2(os.open(os.devnull, os.O_WRONLY), 2)
 
 
 class LiveProgress(Progress):

@@ -119,6 +119,23 @@ def test_frames_of_a_phase_that_was_done_count_as_resumed(
     assert 1000 < run["seconds"]["total"] < 2000  # also the time before the interruption
 
 
+def test_a_reader_of_the_progress_may_leave(recording: Path, tmp_path: Path) -> None:
+    """`--progress jsonl 2>&1 >table | head` would end a batch in the middle, without a word."""
+    words = [sys.executable, "-m", "shapecat", "process", str(recording), "--out", str(tmp_path)]
+    options = ["--progress", "jsonl", "--no-rrd", "--no-mcap", "--end", "0.5", "--jobs", "1"]
+    with subprocess.Popen(
+        [*words, *options], stderr=subprocess.PIPE, stdout=subprocess.PIPE
+    ) as run:
+        assert run.stderr is not None
+        assert b'"event": "plan"' in run.stderr.readline()
+        run.stderr.close()
+        run.stderr = None
+        run.communicate(timeout=300)
+
+    assert run.returncode == 0
+    assert (tmp_path / recording.stem / "tracks.csv").exists()
+
+
 def test_a_kill_after_the_last_phase_does_not_double_the_time(
     recording: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
