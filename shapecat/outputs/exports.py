@@ -14,10 +14,10 @@ from shapecat.outputs.colouring import Coloured, with_colour
 from shapecat.outputs.dataset_frames import DatasetImage, Selection, images_of, split_runs
 from shapecat.outputs.exports_coco import DATASETS
 from shapecat.outputs.exports_crops import write_crops
-from shapecat.outputs.exports_files import safe_name
 from shapecat.outputs.exports_kitti import write_kitti
 from shapecat.outputs.exports_labelcloud import write_labelcloud
 from shapecat.outputs.exports_points import write_point_labels
+from shapecat.outputs.wording import safe_name
 from shapecat.runs.finished import FinishedRun, open_source, read_finished
 from shapecat.runs.folder import clear, recover, staged
 from shapecat.system.files import flush, replacing
