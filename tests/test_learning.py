@@ -10,6 +10,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from scipy import sparse
 from sklearn.ensemble import RandomForestClassifier
+from sklearn.linear_model import LogisticRegression
 from sklearn.utils.estimator_checks import check_estimator
 
 from shapecat.arrays import F4
@@ -20,7 +21,7 @@ from shapecat.learning.calibration import fit_temperature, softmax
 from shapecat.learning.dictionary import ForestDictionary, WordLearner
 from shapecat.learning.features import FeatureBank
 from shapecat.learning.forest import FlatForest, flatten
-from shapecat.learning.incremental import _Inputs, _shift, add_categories
+from shapecat.learning.incremental import _STEPS, _fit_new, _Inputs, _shift, add_categories
 from shapecat.learning.pnn import ProbabilisticNeuralNetwork
 from shapecat.learning.shape_functions import shape_functions
 from shapecat.learning.training import (
@@ -44,7 +45,7 @@ SMALL = LearningSettings(rounds=20, leaves=6, known_views=200)
 def blobs(per_category: int, seed: int, categories: tuple[str, ...] = CATEGORIES) -> Examples:
     """Return views of 8 numbers around the centre of each category; unknown ones lie far out."""
     rng = np.random.default_rng(seed)
-    centres = {"cup": 0.0, "can": 2.0, "ball": 4.0, "cone": 6.0, UNKNOWN: -4.0}
+    centres = {"cup": 0.0, "can": 2.0, "ball": 4.0, "cone": 6.0, "spoon": 8.0, UNKNOWN: -4.0}
     labels = np.repeat(categories, per_category)
     offsets = np.array([centres[label] for label in labels])[:, None]
     signs = np.array([1, -1, 1, 1, -1, 1, -1, 1])
@@ -398,3 +399,43 @@ def test_new_categories_are_raised_by_views_that_are_right_and_not_learned_from(
 
     assert len(fitted_on) > 1
     assert shift == pytest.approx(float(np.quantile(margins[1::2], 0.006)))
+
+
+@pytest.mark.parametrize("ridge", [1e-1, 1e-2])
+def test_the_classifier_of_a_new_category_is_the_one_of_scikit_learn(ridge: float) -> None:
+    """Beside one old logit of zero. Too few iterations would leave it halfway."""
+    rng, count = np.random.default_rng(4), 300
+    truth = (np.arange(count) % 5 == 0).astype(np.int64)
+    features = rng.normal(truth[:, None] * [1, 0.5, 0.2, 0, -2], [1, 3, 0.1, 10, 1])
+    words = (rng.random((count, 10)) < 0.3).astype(np.float64)
+    start = np.zeros((features.shape[1] + words.shape[1] + 1, 1))
+    inputs = _Inputs(features, sparse.csr_array(words))
+    learned = _fit_new(inputs, np.zeros((count, 1)), truth, start, ridge, _STEPS)
+
+    exact = LogisticRegression(C=1 / ridge, tol=1e-10, max_iter=10_000).fit(
+        np.hstack([features, words]), truth, sample_weight=0.5 / np.bincount(truth)[truth]
+    )
+    weights = [*exact.coef_[0], *exact.intercept_]
+    assert np.max(np.abs(weights)) > 1
+    assert learned[:, 0] == pytest.approx(weights, abs=0.002)
+
+
+def test_the_constant_multiplies_the_odds_of_new_categories_alone(
+    categorizer: Categorizer, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Without it, a category learned from few views is seldom found; the rest must stay."""
+    new = blobs(30, 7, ("cone", "spoon"))
+    x = blobs(50, 8, (*CATEGORIES, "cone", "spoon")).descriptors
+    log_odds = []
+    for constant in (0.0, 1.25):
+        monkeypatch.setattr("shapecat.learning.incremental._shift", lambda *_, c=constant: c)
+        model = add_categories(
+            replace(categorizer, temperature=1.6),
+            new.descriptors,
+            new.labels.tolist(),
+            rng=np.random.default_rng(0),
+        )
+        log_odds.append(np.log(model.predict(x / 4).posteriors))
+    rise = log_odds[1] - log_odds[0]
+    assert rise[:, 3:] - rise[:, :1] == pytest.approx(1.25, abs=1e-3)
+    assert rise[:, :3] - rise[:, :1] == pytest.approx(0, abs=1e-3)
