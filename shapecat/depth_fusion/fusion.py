@@ -108,9 +108,10 @@ def _guide(depth: F4, range_m: float) -> F4:
     It is 0 beyond the range and without a neighbour.
     """
     rows, columns = depth.shape
-    guide = np.where(depth <= range_m, depth, np.float32(0))
+    guide = np.zeros((rows, columns), np.float32)
     for v in range(rows):
         for u in range(columns):
+            guide[v, u] = depth[v, u] if depth[v, u] <= range_m else np.float32(0)
             if depth[v, u] > 0:
                 continue
             for step in range(1, REACH + 1):

@@ -140,7 +140,10 @@ def _grow(
         small = count if middle - first[node] <= last[node] - middle else count + 1
         large = 2 * count + 1 - small
         _collect(binned, columns, rows[first[small] : last[small]], gradient, hessian, sums[small])
-        sums[large] = sums[node] - sums[small]
+        for c in range(columns.size):  # as one assignment, 2 s more to compile
+            for k in range(BINS):
+                for part in range(2):
+                    sums[large, c, k, part] = sums[node, c, k, part] - sums[small, c, k, part]
         # (4) Find the best split of each child.
         for child in (count, count + 1):
             value[child] = -rate * _best_cut(sums[child], l2, min_hessian, best[child])
@@ -204,7 +207,8 @@ def _divide(bins: U1, rows: I4, first: int, last: int, cut: int, spare: I4) -> i
         else:
             spare[high] = rows[i]
             high += 1
-    rows[low:last] = spare[:high]
+    for i in range(high):  # as one assignment, 2 s more to compile
+        rows[low + i] = spare[i]
     return low
 
 

@@ -4,6 +4,7 @@ import numpy as np
 
 from shapecat.arrays import F4, F8, I4
 from shapecat.config import SurfaceSettings
+from shapecat.geometry import cross
 from shapecat.jit import kernel
 from shapecat.surface.voxels import read_only, voxelize
 
@@ -80,15 +81,25 @@ def smooth(points: F4, *, radius_m: float) -> F4:
     if not cells < _MOST_CELLS:
         msg = f"points must be finite and within 2**20 times {radius_m} m of each other"
         raise ValueError(msg)
-    moved: F4 = _smooth(points, float(radius_m))
+    cells, size = _cells(points, radius_m)
+    moved: F4 = _smooth(points, float(radius_m), cells, size, np.argsort(cells, kind="stable"))
     return moved
 
 
+def _cells(points: F4, radius: float) -> tuple[I4, I4]:
+    """Return the cell (n,) of each point in a grid with the radius as spacing, and its size (3,).
+
+    Cells are numbered with z fastest. The grid has an empty border, so that the numbers before and
+    after a cell's are its neighbours in space.
+    """
+    place = ((points - points.min(axis=0).astype(np.float64)) / radius).astype(np.int64) + 1
+    size = place.max(axis=0) + 2
+    return (place[:, 0] * size[1] + place[:, 1]) * size[2] + place[:, 2], size
+
+
 @kernel
-def _smooth(points: F4, radius: float) -> F4:
+def _smooth(points: F4, radius: float, cells: I4, size: I4, order: I4) -> F4:
     count = points.shape[0]
-    cells, size = _cells(points, radius)
-    order = np.argsort(cells)
     keys = cells[order]
     moved = np.zeros((count, 3), np.float32)
     near = np.zeros((count, 4))  # neighbours from the point on, in radii, and their weights
@@ -107,25 +118,6 @@ def _smooth(points: F4, radius: float) -> F4:
             moved[kept, axis] = points[i, axis] + height * radius * normal[axis]
         kept += 1
     return moved[:kept].copy()
-
-
-@kernel(inline=True)
-def _cells(points: F4, radius: float) -> tuple[I4, I4]:
-    """Return the cell (n,) of each point in a grid with the radius as spacing, and its size (3,).
-
-    Cells are numbered with z fastest. The grid has an empty border, so that the numbers before and
-    after a cell's are its neighbours in space.
-    """
-    low, size = np.zeros(3), np.zeros(3, np.int64)
-    for axis in range(3):
-        low[axis] = points[:, axis].min()
-        size[axis] = np.int64((points[:, axis].max() - low[axis]) / radius) + 3
-    cells = np.zeros(points.shape[0], np.int64)
-    for i in range(points.shape[0]):
-        for axis in range(3):
-            place = np.int64((points[i, axis] - low[axis]) / radius) + 1
-            cells[i] = cells[i] * size[axis] + place
-    return cells, size
 
 
 @kernel(inline=True)
@@ -208,7 +200,7 @@ def _quadric(near: F8, found: int, normal: F8, height: float) -> float:
     first = -normal[small] * normal
     first[small] += 1.0
     first /= np.sqrt((first**2).sum())
-    second = np.cross(normal, first)
+    second = cross(normal, first)
     A, row = np.zeros((6, 7)), np.ones(7)
     total = 0.0
     for k in range(found):
