@@ -156,7 +156,7 @@ class Categorizer(Record):
         return (
             self.bank.parameters,
             self.forest.parameters,
-            self.votes.astype(np.float32),
+            np.ascontiguousarray(self.votes, np.float32),
             self.linear,
             bool(np.any(self.linear)),
             self.bias,

@@ -84,7 +84,7 @@ class FeatureBank(Record):
 
     def features(self, descriptors: F4) -> F4:
         """Return the features (n, width) of whole descriptors."""
-        x = np.ascontiguousarray(descriptors, np.float32)
+        x = np.require(descriptors, np.float32, ["C", "W"])  # one compiled version
         result = np.zeros((len(x), self.width), np.float32)
         write_features(x, *self.parameters, result)
         return result

@@ -73,7 +73,7 @@ class FlatForest(Record):
         ------
         ValueError : there are fewer features than the trees compare.
         """
-        x = np.ascontiguousarray(features, np.float32)
+        x = np.require(features, np.float32, ["C", "W"])  # one compiled version
         if x.shape[1] <= self.feature.max(initial=0):
             msg = f"the forest needs feature {self.feature.max()}, got {x.shape[1]} features"
             raise ValueError(msg)

@@ -143,10 +143,11 @@ def _punch_holes(sensor: Sensor, rng: Generator, lost: Bool) -> None:
 
 def _rounded(inverse: F8, width: int) -> F8:
     """Average the inverse depth over a window within each surface, which rounds its edges."""
-    across, both = np.zeros_like(inverse), np.zeros_like(inverse)
-    _smooth(inverse, width // 2, across)
-    _smooth(np.ascontiguousarray(across.T), width // 2, both.T)
-    return both
+    for _ in range(2):  # along the rows, then along the columns
+        along = np.zeros_like(inverse)
+        _smooth(inverse, width // 2, along)
+        inverse = np.ascontiguousarray(along.T)
+    return inverse
 
 
 def _blended(inverse: F8, width: int) -> F8:

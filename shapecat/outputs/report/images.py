@@ -9,7 +9,7 @@ import numpy as np
 from PIL import Image
 from scipy import ndimage
 
-from shapecat.arrays import F4, F8, U1, U4, Bool, Record, array
+from shapecat.arrays import F4, F8, U1, U4, Bool, Record, array, freeze
 from shapecat.colour.masks import Mask, dense_masks
 from shapecat.colour.outline import outlines
 from shapecat.detection.output.settings import OUTPUT
@@ -113,7 +113,7 @@ def _organized(labelled: LabelledFrame, frame: Frame) -> tuple[Frame, list[U4]] 
         return frame, indices
     points = frame.xyz()
     turn = _upright(points, labelled.up)
-    points = np.asarray(points @ turn.T, np.float32)
+    points = freeze(points @ turn.T, "n 3", "f4")  # read-only, as kernels know points
     view = virtual_image(points, range_m=_FAR_M)
     if view is None or view.crowded > OUTPUT.crowded:
         up, rng = np.array([0.0, -1.0, 0.0]), np.random.default_rng(0)
