@@ -7,6 +7,7 @@ from typing import Any, Literal
 import numpy as np
 import pytest
 
+from shapecat.arrays import freeze
 from shapecat.cameras.colour import ColourImage, ColourView, LensCamera
 from shapecat.cameras.lenses import distort, undistorted_rays
 from shapecat.colour.image_masks import find_masks, mask_of
@@ -90,7 +91,7 @@ def test_the_painted_image_agrees_with_projected_points() -> None:
     labels[rows, columns] = 1 + np.arange(rows.size).reshape(rows.shape)
     objects = [np.array([index], np.uint32) for index in (rows * 160 + columns).ravel()]
     frame = Frame("", 0, 0, 0, "", depth=depth, camera=DEPTH)
-    painted = splat_depth(depth, DEPTH, objects, LENS, TURNED)
+    painted = splat_depth(freeze(depth, "v u", "f4"), DEPTH, objects, LENS, TURNED)
 
     seen = project(frame.xyz(), LENS, TURNED)
     found = 0
@@ -110,7 +111,7 @@ def two_boards() -> tuple[Frame, Any, Any]:
     depth = np.full((120, 160), 2.0, np.float32)
     depth[30:90, 40:120] = 1.0  # far board
     depth[40:80, 20:60] = 0.6  # near board
-    pixels = np.arange(depth.size).reshape(depth.shape)
+    pixels = np.arange(depth.size, dtype=np.uint32).reshape(depth.shape)
     near = pixels[40:80, 20:60].ravel()
     far = np.setdiff1d(pixels[30:90, 40:120], near)
     return Frame("", 0, 0, 0, "", depth=depth, camera=DEPTH), near, far
@@ -289,7 +290,7 @@ def overlaps(path: Path) -> list[float]:
             assert view is not None
             own, other = labels[frame.index].ravel(), truth[frame.index]
             ids = [int(i) for i in np.unique(own) if i >= 20 and (own == i).sum() >= 100]
-            objects = [np.flatnonzero(own == i) for i in ids]
+            objects = [np.flatnonzero(own == i).astype(np.uint32) for i in ids]
             masks = dense_masks(frame, objects, view.lens, view.colour_from_depth)
             for i, mask in zip(ids, masks, strict=True):
                 full = mask.full(*other.shape)

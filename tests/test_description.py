@@ -109,7 +109,7 @@ def scattered(seed: int) -> F4:
     """Describe random points and links: they reach bins that plain shapes leave empty."""
     rng = np.random.default_rng(seed)
     points = (rng.normal(size=(400, 3)) * np.power((1, 0.3, 0.6), seed)).astype(np.float32)
-    edges = np.argwhere(np.triu(rng.random((30, 30)) < 0.12, 1))
+    edges = np.ascontiguousarray(np.argwhere(np.triu(rng.random((30, 30)) < 0.12, 1)))
     return describe(points, NeuralGas(points[:30], edges), rng.normal(size=3).astype(np.float32))
 
 
@@ -196,7 +196,7 @@ def flat(count: int) -> F4:
 LINE = np.linspace(0, 1, 50, dtype=np.float32)[:, None] * np.array([1, 2, 3], np.float32)
 ODD = {
     "level": flat(10),
-    "upright": flat(10)[:, [0, 2, 1]],
+    "upright": np.ascontiguousarray(flat(10)[:, [0, 2, 1]]),
     "line": LINE,
     "vertical line": LINE * np.array([0, 0, 1], np.float32),
     "one place": np.zeros((40, 3), np.float32),
@@ -231,7 +231,8 @@ def test_every_number_is_finite_for_scattered_points(
     points = (rng.normal(size=(count, 3)) * stretch).astype(np.float32)
     places = (rng.normal(size=(neurons, 3)) * stretch).astype(np.float32)
     edges = np.argwhere(np.triu(rng.random((neurons, neurons)) < 0.2, 1))
-    found = describe(points, NeuralGas(places, edges), rng.normal(size=3).astype(np.float32))
+    gas = NeuralGas(places, np.ascontiguousarray(edges))
+    found = describe(points, gas, rng.normal(size=3).astype(np.float32))
     assert np.isfinite(found).all()
 
 

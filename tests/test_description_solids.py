@@ -15,6 +15,11 @@ EYE = np.array([8.0, 0.0, 6.0], np.float32)
 BOX = {name: k for k, name in enumerate(SOLID_NAMES)}
 
 
+def rows_of(points: F8) -> F4:
+    """Return points (n, 3) as the kernels take them: (3, n)."""
+    return np.ascontiguousarray(points.T, np.float32)
+
+
 def tilted(angle: float) -> F8:
     c, s = np.cos(angle), np.sin(angle)
     return np.array([[1, 0, 0], [0, c, -s], [0, s, c]])
@@ -39,12 +44,12 @@ def test_the_axis_is_found_from_a_bad_guess(
     rng = np.random.default_rng(seed)
     points, normals = half_cone(rng, slope=slope)
     turn = tilted(tilt)
-    cloud = ((points + rng.normal(0, 0.01, points.shape)) @ turn.T).T.astype(np.float32)
+    cloud = rows_of((points + rng.normal(0, 0.01, points.shape)) @ turn.T)
     axis, point = turn @ [0.1, off, 1.0], turn @ [0.1, off, 0.0]
     axis /= np.linalg.norm(axis)
     weight = np.full(600, 1 / 600, np.float32)
 
-    fit_axis(cloud, weight, (normals @ turn.T).T.astype(np.float32), axis, point, 4)
+    fit_axis(cloud, weight, rows_of(normals @ turn.T), axis, point, 4)
 
     assert abs(axis @ turn[:, 2]) > (0.998 if slope == 0 else 0.995)  # steps in place of a cone
     assert np.linalg.norm(point - (point @ turn[:, 2]) * turn[:, 2]) < 0.05
@@ -62,7 +67,7 @@ def seen_box(rng: np.random.Generator, yaw: float) -> tuple[F4, F4]:
     c, s = np.cos(yaw), np.sin(yaw)
     turn = np.array([[c, -s, 0], [s, c, 0], [0, 0, 1]])
     cloud, directions = np.concatenate(points) @ turn.T, np.concatenate(normals) @ turn.T
-    return cloud.T.astype(np.float32), directions.T.astype(np.float32)
+    return rows_of(cloud), rows_of(directions)
 
 
 def solid_numbers(cloud: F4, normals: F4) -> F4:
@@ -81,7 +86,7 @@ def test_a_box_fits_a_box_and_a_can_does_not(yaw: float) -> None:
     cloud, normals = seen_box(rng, yaw)
     box = solid_numbers(cloud + rng.normal(0, 0.01, cloud.shape).astype(np.float32), normals)
     side, directions = half_cone(rng, slope=0.0)
-    can = solid_numbers(side.T.astype(np.float32), directions.T.astype(np.float32))
+    can = solid_numbers(rows_of(side), rows_of(directions))
 
     assert box[BOX["box_faces"]] < 0.03
     assert box[BOX["corner_upright"]] < 0.08 < can[BOX["corner_upright"]]
@@ -92,10 +97,8 @@ def test_a_ball_is_recognised_by_its_residual() -> None:
     rng = np.random.default_rng(0)
     normals = rng.normal(size=(900, 3))
     normals /= np.linalg.norm(normals, axis=1, keepdims=True)
-    normals = np.ascontiguousarray(normals[normals @ EYE > 0])
-    ball = solid_numbers(
-        (normals + np.array([0.0, 0.0, 1.0])).T.astype(np.float32), normals.T.astype(np.float32)
-    )
+    normals = normals[normals @ EYE > 0]
+    ball = solid_numbers(rows_of(normals + np.array([0.0, 0.0, 1.0])), rows_of(normals))
     cloud, directions = seen_box(rng, 0.0)
 
     assert ball[BOX["ball_residual"]] < 0.01
@@ -105,7 +108,7 @@ def test_a_ball_is_recognised_by_its_residual() -> None:
 
 def outline_of(cloud: F8, eye: F4 = EYE) -> F4:
     out = np.zeros(len(OUTLINE_NAMES), np.float32)
-    outline(np.ascontiguousarray(cloud.T, np.float32), eye, out)
+    outline(rows_of(cloud), eye, out)
     return out
 
 

@@ -28,7 +28,8 @@ from shapecat.detection.planes.height_map import OUTLINE, HeightMap
 from shapecat.trees import BoostedTrees, Trees
 from tests.test_detection import Array, Shape, box, frame_of, render, table
 
-_LEAF = BoostedTrees(Trees(*np.zeros((4, 1), np.int32)), np.ones(1, np.float32))
+_NODE = (np.zeros(1, dtype) for dtype in (np.int32, np.int16, np.float32, np.int32))
+_LEAF = BoostedTrees(Trees(*_NODE), np.ones(1, np.float32))
 ALWAYS = RejectionTrees(_LEAF, _LEAF)
 """Trees for which everything is an object."""
 INTRINSICS = PinholeIntrinsics(262.5, 262.5, 19.5, 19.5)

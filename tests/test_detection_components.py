@@ -57,6 +57,6 @@ def test_speckle_fits_into_memory() -> None:
 
 
 def test_spans() -> None:
-    assert span_of(np.array([0, -1, 3, 0, 2, 0])) == (2, 5)
+    assert span_of(np.array([0, -1, 3, 0, 2, 0], np.int16)) == (2, 5)
     assert span_of(np.zeros(4, np.int16)) == (0, 0)
-    assert spans_of(np.array([[0, 1], [0, 0]])).tolist() == [[1, 2], [0, 0]]
+    assert spans_of(np.array([[0, 1], [0, 0]], np.int16)).tolist() == [[1, 2], [0, 0]]

@@ -6,6 +6,7 @@ import pytest
 from benchmarks.piles import judge
 from benchmarks.planes import keeps_table, view_of
 from benchmarks.simulated import score
+from shapecat.arrays import freeze
 from shapecat.config import DetectionSettings, Settings
 from shapecat.detection import detect
 from shapecat.detection.depth_grid import DepthGrid, PinholeIntrinsics, downsample
@@ -42,7 +43,7 @@ def grid_of(meshes: list[Mesh]) -> DepthGrid:
     pose = looking_at(np.array([0, -np.sqrt(0.5), np.sqrt(0.5)]), np.zeros(3))
     here = Pose(np.eye(3), np.zeros(3))
     depth = render(geometry([(mesh, here) for mesh in meshes]), CAMERA, pose).depth
-    grid = downsample(depth.astype(np.float32), CAMERA, range_m=2.0)
+    grid = downsample(freeze(depth, "v u", "f4"), CAMERA, range_m=2.0)
     assert grid is not None
     return grid
 
@@ -139,7 +140,9 @@ def test_assumed_plane_lies_just_below_what_no_plane_explains() -> None:
     far = np.where(j > 150, 1.4, 0.0)
     height = blob + far
     inv_depth = np.where((height > 0) & (down > 0.2), down / np.maximum(height, 0.1), 0)
-    grid = DepthGrid(inv_depth.astype(np.float32), PinholeIntrinsics(150, 150, 70, 62), 4, 0.005)
+    grid = DepthGrid(
+        inv_depth.astype(np.float32), PinholeIntrinsics(150.0, 150.0, 70.0, 62.0), 4, 0.005
+    )
 
     plane = assume_plane(grid, inv_depth > 0, up, tallest_m=0.3)
 
@@ -167,7 +170,9 @@ def test_known_up_is_kept_where_nothing_is_level() -> None:
 
 
 def test_no_plane_is_assumed_for_a_few_samples_or_above_the_camera() -> None:
-    grid = DepthGrid(np.ones((60, 80), np.float32), PinholeIntrinsics(75, 75, 39.5, 29.5), 8, 0.01)
+    grid = DepthGrid(
+        np.ones((60, 80), np.float32), PinholeIntrinsics(75.0, 75.0, 39.5, 29.5), 8, 0.01
+    )
     few = np.zeros((60, 80), np.int8)
     few[6:] = -1  # a tenth is above no plane
     up = np.array([0.0, 0.0, -1.0])

@@ -5,6 +5,7 @@ from itertools import pairwise
 import numpy as np
 import pytest
 
+from shapecat.arrays import freeze
 from shapecat.detection.cleanup.holes import fill_holes
 from shapecat.detection.depth_grid import DepthGrid, downsample
 from shapecat.detection.foreground.convex_hull import fill_hull
@@ -144,7 +145,8 @@ def test_downsampling_keeps_the_nearer_side_of_an_edge() -> None:
     """A mean over both sides would make up a surface between them."""
     depth = np.full((480, 640), 0.9, np.float32)
     depth[:, 321:] = 0.7
-    grid = downsample(depth, Camera(640, 480, 525, 525, 319.5, 239.5), range_m=2.0)
+    camera = Camera(640, 480, 525, 525, 319.5, 239.5)
+    grid = downsample(freeze(depth, "v u", "f4"), camera, range_m=2.0)
     assert grid is not None
     assert grid.factor == 2
     np.testing.assert_allclose(np.unique(grid.inverse_depth), [1 / 0.9, 1 / 0.7], rtol=1e-6)

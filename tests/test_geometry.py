@@ -4,7 +4,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from numpy.testing import assert_allclose
 
-from shapecat.arrays import F8
+from shapecat.arrays import F8, freeze
 from shapecat.geometry import (
     compose,
     gravity_rotation,
@@ -120,6 +120,6 @@ def test_points_without_a_reading_are_nan() -> None:
 
 
 def test_triangles_of_a_graph() -> None:
-    edges = np.array([[0, 1], [0, 2], [1, 2], [2, 3]], np.uint16)
+    edges = freeze([[0, 1], [0, 2], [1, 2], [2, 3]], "n 2", "u2")
 
     assert triangles_of(edges, 4).tolist() == [[0, 1, 2]]

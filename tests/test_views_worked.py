@@ -8,7 +8,7 @@ from numpy.testing import assert_allclose
 from scipy.spatial import cKDTree
 from scipy.spatial.transform import Rotation
 
-from shapecat.arrays import F8
+from shapecat.arrays import F8, freeze
 from shapecat.config import DetectionSettings, Settings, SurfaceSettings
 from shapecat.description import DESCRIPTOR_NAMES, describe
 from shapecat.detection import depth_grid, detect
@@ -160,7 +160,7 @@ def test_a_turned_cloud_with_its_up_has_the_same_objects() -> None:
     up = detect(image, settings=DetectionSettings(), rng=np.random.default_rng(0)).up
     turn = Rotation.from_euler("xyz", [0.25, -0.4, 0.9])
     plain = Frame("/p", 0, 0, 0, "cam", points=points)
-    turned = Frame("/p", 0, 0, 0, "cam", points=turn.apply(points).astype(np.float32))
+    turned = Frame("/p", 0, 0, 0, "cam", points=np.array(turn.apply(points), np.float32, order="C"))
     expected = scene_of(plain, np.asarray(up, np.float64))
     found = scene_of(turned, turn.apply(up))
 
@@ -179,7 +179,7 @@ def test_cells_of_an_image_see_where_their_pixels_do(monkeypatch: pytest.MonkeyP
     depth = np.where(inverse > 0.4, 1 / np.maximum(inverse, 0.4), 0).astype(np.float32)
     for cell_m in (0.0125, 0.019):  # two pixels a cell, and three
         monkeypatch.setattr(depth_grid, "CELL_M", cell_m)
-        grid = downsample(depth, camera, range_m=2.4)
+        grid = downsample(freeze(depth, "v u", "f4"), camera, range_m=2.4)
         assert grid is not None
         i, j = np.nonzero(grid.inverse_depth)
         k = grid.intrinsics
@@ -192,7 +192,7 @@ def test_cells_of_an_image_see_where_their_pixels_do(monkeypatch: pytest.MonkeyP
 
 def test_cells_of_a_cloud_see_where_their_points_are() -> None:
     rng = np.random.default_rng(5)
-    points = rng.uniform([-0.4, -0.3, 1.0], [0.4, 0.3, 1.001], (60_000, 3)).astype(np.float32)
+    points = freeze(rng.uniform([-0.4, -0.3, 1.0], [0.4, 0.3, 1.001], (60_000, 3)), "n 3", "f4")
     view = virtual_image(points, range_m=2.0)
     assert view is not None
     used = view.cell >= 0
