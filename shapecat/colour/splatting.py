@@ -64,7 +64,7 @@ def splat_depth(
     """
     target = lens.pinhole
     scale = max(target.fx / camera.fx, target.fy / camera.fy)
-    pixels = np.concatenate([np.zeros(0, np.uint32), *objects])
+    pixels = np.concatenate([[], *objects], dtype=np.uint32, casting="unsafe")
     labels = np.repeat(np.arange(1, len(objects) + 1, dtype=np.int32), list(map(len, objects)))
     rays, size = _rays(camera, colour_from_depth), (target.width, target.height)
     parallax = max(camera.fx, camera.fy) * float(np.linalg.norm(colour_from_depth.translation))
