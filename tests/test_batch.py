@@ -25,6 +25,7 @@ from shapecat.config import Settings
 from shapecat.errors import RecordingError
 from shapecat.executors import LocalExecutor, WorkerLostError, open_executor
 from shapecat.runs.jobs import Job
+from tests.messages import EPOCH, SECOND, make, write
 from tests.scenes import record
 from tests.test_crash import assert_same_tables
 from tests.test_executors import alive, wait_for
@@ -221,15 +222,23 @@ def test_shards_give_the_same_tables(
     assert wrong.exit_code == 2
 
 
-def test_folders_are_searched_and_bags_are_not_taken_apart(tmp_path: Path) -> None:
-    """A shell expands folder/** to folders, their contents, and files of other programs.
+@pytest.mark.parametrize(("gap_s", "found"), [(-0.5, 2), (0.01, 1), (60, 2)])
+def test_takes_are_not_mixed_in_one_run(tmp_path: Path, gap_s: float, found: int) -> None:
+    """Only the parts of one bag follow each other, if its folder was renamed."""
+    (tmp_path / "lab").mkdir()
+    for k, begin in enumerate((0, SECOND + int(gap_s * SECOND))):
+        items = [("/x", EPOCH + begin + at, make("std_msgs/msg/String", "x")) for at in (0, SECOND)]
+        write(tmp_path / "lab" / f"take_{k}.mcap", items)
 
-    Two takes of a scene in one folder must not be mixed in one run.
-    """
+    assert len(find_recordings([str(tmp_path)]).kept) == found
+
+
+def test_folders_are_searched_and_bags_are_not_taken_apart(tmp_path: Path) -> None:
+    """A shell expands folder/** to folders, their contents, and files of other programs."""
     bags = (
         "bag/bag_0.db3",
         "bag/metadata.yaml",
-        "old/old_0.db3",
+        "old/x_0.db3",
         "two/a_0.mcap",
         "two/a_1.mcap.zstd",
         "cut/cut_0.mcap",

@@ -401,7 +401,8 @@ def text_only(path: Path) -> Path:
 def locked_part(path: Path) -> Path:
     """Write a folder of which one part is damaged."""
     found = folder(path, StoragePlugin.SQLITE3, metadata=False)
-    (found / "b.db3").write_bytes(b"SQLite format 3\0" + bytes(500))
+    (found / "a.db3").rename(found / "a_0.db3")
+    (found / "a_1.db3").write_bytes(b"SQLite format 3\0" + bytes(500))
     return found
 
 
@@ -459,7 +460,7 @@ ZOO: dict[str, Exhibit] = {
     "ros 2 message-compressed": Exhibit(lambda p: folder(p, _SQL, _PACKED.MESSAGE)),
     "ros 2 mcap file-compressed": Exhibit(lambda p: folder(p, _MCAP, _PACKED.FILE)),
     "ros 2 splits": Exhibit(splits, frames=2 * FRAMES, said="metadata"),
-    "ros 2 with a damaged part": Exhibit(locked_part, said="skipped b.db3"),
+    "ros 2 with a damaged part": Exhibit(locked_part, said="skipped a_1.db3"),
     "ros 2 beside other files": Exhibit(lambda p: copy_of(p, note="mine")),
     "db3": Exhibit(lambda p: database(p, definitions=True)),
     "db3 without definitions": Exhibit(lambda p: database(p, definitions=False), said="Humble"),

@@ -4,15 +4,19 @@ from collections.abc import Iterable, Iterator, Mapping, Sequence
 from contextlib import suppress
 from dataclasses import dataclass
 from hashlib import sha256
+from itertools import pairwise
 from pathlib import Path, PurePosixPath
 from typing import Any
 
 from shapecat.batch.storage import Location, content_key, is_url
 from shapecat.errors import RecordingError
+from shapecat.recordings import open_recording
 
 __all__ = ["Found", "Source", "find_recordings", "look_at"]
 
 SUFFIXES = {".mcap", ".bag", ".db3"}
+_GAP_NS = 10**10
+"""The longest time between the parts of a bag; takes are farther apart, or overlap."""
 _MAGIC = (b"\x89MCAP", b"#ROSBAG", b"SQLite format 3")
 
 
@@ -160,7 +164,7 @@ def _is_bag(folder: Path) -> bool:
     """Return whether a folder is a ROS 2 bag: it has metadata, or its files are parts of one.
 
     ROS 2 names the parts of a bag a/a_0.mcap, a/a_1.mcap, ... In a folder of another name, such
-    files may be different takes, unless one is compressed, as only parts are.
+    files may be different takes, unless they follow each other in time, or one is compressed.
     """
     if (folder / "metadata.yaml").exists():
         return True
@@ -170,10 +174,24 @@ def _is_bag(folder: Path) -> bool:
     names = {path.name.removesuffix(".zstd") for path in paths if path.is_file()}
     parts = {name for name in names if PurePosixPath(name).suffix in SUFFIXES}
     first = PurePosixPath(min(parts, default=""))
+    if len(parts) == 1 and first.suffix == ".db3":
+        return True
     base = first.stem.rpartition("_")[0]
+    in_sequence = [f"{base}_{k}{first.suffix}" for k in range(len(parts))]
+    if not parts or parts != set(in_sequence):
+        return False
     compressed = any(path.suffix == ".zstd" for path in paths)
-    in_sequence = parts == {f"{base}_{k}{first.suffix}" for k in range(len(parts))}
-    return bool(parts) and in_sequence and (base == folder.name or compressed)
+    return base == folder.name or compressed or _adjoin([folder / name for name in in_sequence])
+
+
+def _adjoin(paths: Sequence[Path]) -> bool:
+    """Return whether recordings follow each other in time without a gap."""
+    spans = []
+    for path in paths:
+        with suppress(RecordingError), open_recording(path) as recording:
+            if recording.end_ns:
+                spans.append((recording.start_ns, recording.end_ns))
+    return all(0 <= b - a <= _GAP_NS for (_, a), (b, _) in pairwise(spans)) and len(spans) > 1
 
 
 def _search(folder: Path) -> Iterator[Path]:
