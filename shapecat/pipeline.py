@@ -44,15 +44,16 @@ from shapecat.runs.jobs import (
 from shapecat.runs.label_meaning import TrackLabel
 from shapecat.runs.label_transfer import Transfer, transfer_labels
 from shapecat.runs.missing_planes import explain_missing_planes
-from shapecat.runs.perceiving import Observer, Work, ignore, perceive_all, revise
+from shapecat.runs.perceiving import Work, perceive_all, revise
 from shapecat.runs.run_info import RunInfo
 from shapecat.runs.segments import discard_segments
 from shapecat.runs.tables import release_memory
 from shapecat.system import stopping
 from shapecat.system.files import holding
+from shapecat.system.progress import Observer, ignore
 from shapecat.types import LabelledFrame, ShownFrame
 
-__all__ = ["Observer", "annotate", "annotate_again", "process", "track"]
+__all__ = ["annotate", "annotate_again", "process", "track"]
 
 _Shown = TypeVar("_Shown", LabelledFrame, ShownFrame)
 
@@ -280,7 +281,7 @@ def annotate_again(
         the recording differs from what was processed.
     RecordingError : the recording is missing or unreadable.
     """
-    from shapecat.outputs.rereading import open_source  # noqa: PLC0415  on first use
+    from shapecat.runs.finished import open_source  # noqa: PLC0415  on first use
 
     with open_source(read_run(folder), recording) as source:
         transfer = _adopt(labels, folder, by_place=by_place)

@@ -15,11 +15,12 @@ from shapecat.colour.masks import Mask, dense_masks
 from shapecat.colour.snapping import snapped
 from shapecat.errors import OutputError
 from shapecat.outputs.colouring import Coloured, with_colour
-from shapecat.outputs.exports_files import png, safe_name
 from shapecat.outputs.exports_points import depth_in_mm
-from shapecat.outputs.rereading import FinishedRun, open_source
+from shapecat.outputs.png import png
+from shapecat.outputs.wording import safe_name
 from shapecat.recordings import MessageError
 from shapecat.recordings.colour_image import encoded, pixels_of
+from shapecat.runs.finished import FinishedRun, open_source
 from shapecat.runs.track_table import read_track_table
 from shapecat.types import Frame, LabelledFrame, LabelledObject
 

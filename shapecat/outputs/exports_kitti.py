@@ -21,10 +21,10 @@ from shapecat.cameras.colour import LensCamera
 from shapecat.colour.projection import project, rectified
 from shapecat.geometry import IDENTITY, rotation_from_quaternion
 from shapecat.outputs.colouring import Coloured
-from shapecat.outputs.exports_files import finite_points, upward
-from shapecat.outputs.rereading import FinishedRun
+from shapecat.outputs.level_clouds import finite_points, upward
 from shapecat.recordings import MessageError
 from shapecat.recordings.colour_image import pixels_of
+from shapecat.runs.finished import FinishedRun
 from shapecat.types import Camera, Frame, LabelledFrame, LabelledObject, Pose
 
 __all__ = ["kitti_type", "rectified_from_sensor", "write_kitti"]

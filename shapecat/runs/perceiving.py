@@ -35,7 +35,7 @@ from shapecat.system import stopping
 from shapecat.system.progress import Observer, ignore
 from shapecat.types import Frame
 
-__all__ = ["Observer", "Work", "ignore", "perceive_all", "revise"]
+__all__ = ["Work", "perceive_all", "revise"]
 
 _MANY = 100
 """With at least this many frames, other processes are started before anything is read."""
