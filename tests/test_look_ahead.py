@@ -150,6 +150,13 @@ def test_a_frame_with_a_wrong_stamp_costs_only_itself(tmp_path: Path) -> None:
         assert found_at(window, 51.5) is not None
 
 
+def test_frames_of_two_sensors_may_come_out_of_order(tmp_path: Path) -> None:
+    """One driver sends its images later than the other; their transforms are still known."""
+    with open_recording(in_mcap(tmp_path)) as recording:
+        window = TransformWindow.of(recording)
+        assert all(found_at(window, second) is not None for second in (40, 55, 60, 46, 61, 48))
+
+
 def test_transforms_that_are_logged_far_from_their_stamps_are_all_read(tmp_path: Path) -> None:
     """A converter may write all transforms first; those of the last frame come with the first."""
     items = [(topic, EPOCH + k, message) for k, (topic, _, message) in enumerate(tagged())]
