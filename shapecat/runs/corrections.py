@@ -68,8 +68,8 @@ def adopt_labels(corrected: Path, folder: Path) -> None:
     Only the column ``label`` is read, and tracks that the table does not list keep their label. So
     do tracks whose label equals that in a column ``label_seen``, which a report page writes: it
     may be older than other corrections. The original table is kept as tracks.original.csv; if
-    labels are replaced, the last one as tracks.previous.csv. ``corrected`` may be the run's own
-    tracks.csv.
+    labels are replaced, the table before as tracks.previous.csv. ``corrected`` may be the run's
+    own tracks.csv.
 
     Raises
     ------
@@ -84,10 +84,9 @@ def adopt_labels(corrected: Path, folder: Path) -> None:
 def _adopt(corrected: Path, folder: Path) -> None:
     current, original = folder / "tracks.csv", folder / ORIGINAL
     in_place = current.exists() and corrected.exists() and corrected.samefile(current)
-    _require_same_run(corrected, read_track_table(corrected), folder, known=in_place)
-    base = read_track_table(original if original.exists() else current)
     table = read_track_table(corrected)
-    rows = table.rows
+    _require_same_run(corrected, table, folder, known=in_place)
+    base, rows = read_track_table(original if original.exists() else current), table.rows
     if not in_place:
         base = _relabelled(base, read_track_table(current).rows)
         rows = tuple(row for row in rows if row.cells.get("label_seen") != row.label)
