@@ -33,7 +33,7 @@ setup: .venv/ready ## make the virtual environment .venv from the lock file
 	@touch $@
 
 demo: setup ## simulate a recording, process it, and print where the results are
-	$(BIN)/shapecat simulate $(DEMO)/tabletop.mcap --scene tabletop --frames 60 --seed 3 --overwrite
+	$(BIN)/shapecat simulate $(DEMO)/tabletop.mcap --scene tabletop --frames 60 --seed 3 --color --overwrite
 	$(BIN)/shapecat process $(DEMO)/tabletop.mcap --out $(DEMO)/out --overwrite
 
 test: setup kernels ## run the quick tests
