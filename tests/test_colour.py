@@ -1,22 +1,24 @@
 """Masks on colour images: the right pixels, dense, and only pixels that the camera sees."""
 
+import itertools
 from collections import Counter
 from pathlib import Path
 from typing import Any, Literal
 
 import numpy as np
 import pytest
+from scipy import ndimage
 
 from shapecat.arrays import freeze
 from shapecat.cameras.colour import ColourImage, ColourView, LensCamera
 from shapecat.cameras.lenses import distort, undistorted_rays
-from shapecat.colour.image_masks import find_masks, mask_of
+from shapecat.colour.image_masks import box_of, find_masks, mask_of
 from shapecat.colour.masks import NOTHING, Mask, dense_masks, label_boxes, labelled_masks, united
-from shapecat.colour.projection import project
+from shapecat.colour.projection import project, rectified
 from shapecat.colour.snapping import snapped
 from shapecat.colour.splatting import splat_depth
 from shapecat.geometry import IDENTITY, rotation_from_quaternion
-from shapecat.types import Camera, Frame, Pose
+from shapecat.types import Camera, Frame, ImageMasks, Pose
 
 DEPTH = Camera(160, 120, 140.0, 141.0, 80.3, 58.9)
 LENS = LensCamera(
@@ -104,6 +106,108 @@ def test_the_painted_image_agrees_with_projected_points() -> None:
             assert abs(v.mean() + painted.top - seen[index, 1]) <= 0.51
             found += 1
     assert found > 40
+
+
+@pytest.mark.parametrize(
+    ("model", "coefficients"),
+    [
+        ("plumb_bob", (0.11, -0.24, 0.012, -0.021, 0.08)),
+        ("rational_polynomial", (0.21, -0.14, 0.012, -0.021, 0.08, 0.3, -0.05, 0.07)),
+        ("equidistant", (0.03, -0.02, 0.05, -0.04)),
+    ],
+)
+def test_points_land_where_the_lens_model_says(model: str, coefficients: tuple[float, ...]) -> None:
+    """Masks and images are straightened by different code; both must know all coefficients."""
+    lens = LensCamera(LENS.pinhole, model, coefficients)
+    points = np.random.default_rng(4).uniform((-0.4, -0.3, 0.8), (0.4, 0.3, 1.2), (50, 3))
+    moved = points @ TURNED.rotation.T + TURNED.translation
+    seen = distort(moved[:, :2] / moved[:, 2:], model, coefficients)
+    expected = np.column_stack([seen * (205.0, 207.0) + (121.4, 96.2), moved[:, 2]])
+
+    np.testing.assert_allclose(project(points, lens, TURNED), expected, rtol=1e-4)
+
+
+def test_an_image_is_straightened_to_the_colours_between_its_pixels() -> None:
+    """Compared with SciPy's bilinear interpolation: colours run differently in x and y."""
+    lens = LensCamera(Camera(24, 18, 20.0, 21.0, 11.3, 8.8), "plumb_bob", (-0.2, 0, 0.02, 0.01, 0))
+    pixels = np.random.default_rng(7).integers(0, 256, (18, 24, 3)).astype(np.uint8)
+    v, u = np.mgrid[:18, :24]
+    rays = np.stack([(u - 11.3) / 20, (v - 8.8) / 21], axis=-1)
+    x, y = np.moveaxis(distort(rays, lens.model, lens.coefficients), -1, 0)
+    place = [y * 21 + 8.8, x * 20 + 11.3]
+    seen = (place[0] >= 0) & (place[0] <= 17) & (place[1] >= 0) & (place[1] <= 23)
+    expected = [
+        ndimage.map_coordinates(one, place, order=1) for one in pixels.T.swapaxes(1, 2) * 1.0
+    ]
+
+    apart = rectified(pixels, lens) - np.where(seen, expected, 0).transpose(1, 2, 0)
+    assert seen.mean() > 0.8
+    assert np.abs(apart).max() <= 0.51
+
+
+@pytest.mark.parametrize("ahead", [-0.6, 0.7])
+def test_a_mask_is_dense_at_any_distance_of_the_colour_camera(ahead: float) -> None:
+    """A depth pixel covers more of the image the nearer the colour camera is to the object."""
+    depth = np.zeros((120, 160), np.float32)
+    depth[40:70, 50:95] = 1.0
+    frame = Frame("", 0, 0, 0, "", depth=depth, camera=DEPTH)
+    lens = LensCamera(Camera(800, 600, 280.0, 282.0, 400.0, 300.0))
+    (mask,) = dense_masks(
+        frame, [np.flatnonzero(depth)], lens, Pose(np.eye(3), np.array([0, 0, -ahead]))
+    )
+
+    # The border pixels end half a pixel beyond their centres.
+    wide, high = 280 * 45 / 140 / (1 - ahead), 282 * 30 / 141 / (1 - ahead)
+    left = 400 + (49.5 - 80.3) * 280 / 140 / (1 - ahead)
+    assert abs(mask.left - 0.5 - left) <= 1.5
+    assert np.abs(np.subtract(mask.box[2:], (wide, high))).max() <= 2
+    assert mask.area > 0.97 * mask.pixels.size
+
+
+def test_gaps_are_as_wide_as_they_were_in_the_depth_image() -> None:
+    """In a colour image three times as fine, a crack of 3 is closed and a gap of 10 is not."""
+    depth = np.zeros((120, 160), np.float32)
+    depth[40:80, 40:55] = depth[40:80, 58:80] = depth[40:80, 90:110] = 1.0
+    frame = Frame("", 0, 0, 0, "", depth=depth, camera=DEPTH)
+    fine = LensCamera(Camera(480, 360, 420.0, 423.0, 241.4, 177.2))
+    (mask,) = dense_masks(frame, [np.flatnonzero(depth)], fine, IDENTITY)
+
+    row = mask.full(360, 480)[180]
+    assert row[3 * 42 : 3 * 78].all()
+    assert not row[3 * 80 + 3 : 3 * 90 - 3].any()
+    assert row[3 * 92 : 3 * 108].all()
+
+
+def test_what_is_a_little_nearer_hides_an_object() -> None:
+    """A cloth 10 cm before a board hides from the colour camera what the depth camera sees."""
+    depth = np.full((120, 160), 1.0, np.float32)
+    depth[:, 30:70] = 0.9  # the cloth belongs to no object
+    frame = Frame("", 0, 0, 0, "", depth=depth, camera=DEPTH)
+    board = np.arange(depth.size).reshape(depth.shape)[40:90, 70:130].ravel()
+    lens = LensCamera(Camera(320, 240, 140.0, 141.0, 80.3, 58.9))
+    (mask,) = dense_masks(frame, [board], lens, Pose(np.eye(3), np.array([0.7, 0.0, 0.0])))
+
+    # The cloth ends at column 69.5 + 98 / 0.9, the board begins at 69.5 + 98.
+    row = mask.full(240, 320)[60]
+    assert abs(np.flatnonzero(row)[0] - (69.5 + 98 / 0.9)) <= 4  # a cell of 4 pixels
+    assert abs(np.flatnonzero(row)[-1] - (129.5 + 98)) <= 2
+
+
+@pytest.mark.parametrize(
+    "part", [np.s_[:, :30], np.s_[:, 120:], np.s_[:20, 30:90], np.s_[95:, 40:70], np.s_[:, :]]
+)
+def test_a_mask_goes_up_to_the_border_of_the_image(part: tuple[slice, slice]) -> None:
+    """Objects that are cut off by the border lost their rim, or the whole mask."""
+    inside = np.zeros((120, 160), bool)
+    inside[part] = True
+    depth = np.full((120, 160), 1.0, np.float32)
+    frame = Frame("", 0, 0, 0, "", depth=depth, camera=DEPTH)
+    (mask,) = dense_masks(frame, [np.flatnonzero(inside)])
+
+    wrong = mask.full(120, 160) ^ inside
+    assert wrong.sum() <= 12  # corners inside the image are rounded
+    assert not wrong[[0, -1]].any()
+    assert not wrong[:, [0, -1]].any()
 
 
 def two_boards() -> tuple[Frame, Any, Any]:
@@ -195,6 +299,29 @@ def test_parts_of_an_object_are_united() -> None:
     assert Mask(0, 0, np.zeros((0, 0), bool)).box == (0, 0, 0, 0)
 
 
+def test_the_union_of_masks_keeps_what_lies_in_the_boxes_of_others() -> None:
+    """The boxes of the parts of a chair overlap; a later part must not clear an earlier one."""
+    rng = np.random.default_rng(6)
+    masks = [
+        Mask(left, top, rng.random(size) < 0.4)
+        for left, top, size in ((3, 4, (9, 12)), (8, 2, (7, 5)), (5, 9, (6, 20)))
+    ]
+    expected = np.any([mask.full(20, 30) for mask in masks], axis=0)
+
+    for order in itertools.permutations(masks):
+        np.testing.assert_array_equal(united(order).full(20, 30), expected)
+
+
+def test_the_box_of_several_detections_is_around_all_of_them() -> None:
+    """Sizes, not corners: boxes drawn on images come from here."""
+    boxes = {0: (30, 4, 5, 6), 2: (7, 21, 9, 8), 3: (0, 0, 99, 99)}
+    masks = ImageMasks("/color", 1, 2, "color", 200, 100, boxes, {})
+
+    assert box_of(masks, [0, 1, 2]) == (7, 4, 28, 25)
+    assert box_of(masks, [2]) == (7, 21, 9, 8)
+    assert box_of(masks, [1]) is None
+
+
 def picture_of_a_box(colour: tuple[int, int, int]) -> tuple[Any, Any]:
     """Return a grainy image of a coloured box, rows 20 to 59 and columns 30 to 69, and its mask."""
     rng = np.random.default_rng(1)
@@ -213,6 +340,23 @@ def test_outlines_move_to_the_edges_of_the_colours(top: int, left: int) -> None:
     assert wrong.sum() <= 8  # of 160 and more; corners may be rounded
     (finer,) = snapped([Mask(left, top, np.ones((40, 40), bool))], pixels, 2.0)
     assert (finer.full(80, 100) ^ inside).sum() <= 16
+
+
+@pytest.mark.parametrize("turned", [False, True])
+def test_the_outline_of_a_long_object_moves_at_both_ends(*, turned: bool) -> None:
+    """The window around a mask must be as wide and as high as the mask."""
+    rng = np.random.default_rng(2)
+    inside = np.zeros((50, 180), bool)
+    inside[20:32, 20:160] = True
+    grain = rng.integers(-9, 10, (50, 180, 3))
+    pixels = (np.where(inside[..., None], (170, 90, 60), (120, 130, 140)) + grain).astype(np.uint8)
+    before = Mask(22, 20, np.ones((12, 140), bool))
+    if turned:
+        inside, pixels = inside.T, pixels.swapaxes(0, 1)
+        before = Mask(20, 22, before.pixels.T)
+    (mask,) = snapped([before], pixels)
+
+    assert (mask.full(*inside.shape) ^ inside).sum() <= 10  # of 48
 
 
 def test_outlines_stay_where_both_sides_look_alike() -> None:

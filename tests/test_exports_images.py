@@ -214,6 +214,22 @@ def test_parts_of_an_object_are_linked_into_one_polygon() -> None:
     assert (drawn & pixels).sum() / (drawn | pixels).sum() > 0.95
 
 
+def test_the_parts_come_largest_first_and_their_link_encloses_nothing() -> None:
+    """A picture of an object is framed by its first part; COCO tools compute areas of polygons."""
+    pixels = np.zeros((20, 40), bool)
+    pixels[1:3, 30:34], pixels[4:19, 2:14], pixels[9:15, 20:27] = True, True, True
+    parts = outlines(Mask(100, 70, pixels), 0.0)
+
+    def area(ring: Any) -> float:
+        (x, y), (next_x, next_y) = ring.T, np.roll(ring, -1, axis=0).T
+        return float(abs((x * next_y - next_x * y).sum()) / 2)
+
+    assert [area(part) for part in parts] == [15 * 12, 6 * 7, 2 * 4]
+    whole = joined(parts)
+    assert area(whole) == 15 * 12 + 6 * 7 + 2 * 4
+    assert len(whole) == 3 * 4 + 2 * 2  # the ends of both links occur twice
+
+
 def test_depth_images_are_millimetres_with_their_own_masks(run: Path, tmp_path: Path) -> None:
     """Recordings without colour give data sets too, and depth keeps its 16 bits."""
     export_dataset([run], "coco", tmp_path / "out", Selection(depth=True))
