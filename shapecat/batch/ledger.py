@@ -81,14 +81,22 @@ class Ledger:
             if entry is not None and entry.state != "running":
                 self._note(entry, state="running")
 
-    def lost(self, task: Task, error: BaseException) -> int:
-        """Record a lost worker; return the number of workers lost on this recording."""
+    def lost(self, task: Task, error: BaseException, *, most: int) -> bool:
+        """Record a lost worker; return whether the recording is to be tried again.
+
+        An attempt that had not begun when the scheduler was lost does not count.
+
+        Parameters
+        ----------
+        most : largest number of attempts.
+        """
         with self._lock:
             entry = self._open[task.name]
-            waited = entry.state != "running"
-            if not (is_dropped(error) and waited):
-                entry = self._note(entry, state="planned", tries=entry.tries + 1)
-            return entry.tries - 1
+            if is_dropped(error) and entry.state != "running":
+                return True
+            if entry.tries < most:
+                self._note(entry, state="planned", tries=entry.tries + 1)
+            return entry.tries < most
 
     def ended(self, task: Task, outcome: Outcome) -> None:
         """Record the outcome of a recording."""

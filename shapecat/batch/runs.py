@@ -134,7 +134,7 @@ def _outcomes(
             running += 1
         task, future = _next(ended)
         error = _error(future)
-        if error is not None and is_lost(error) and ledger.lost(task, error) < _TRIES:
+        if error is not None and is_lost(error) and ledger.lost(task, error, most=_TRIES):
             begin(task)
             continue
         running -= 1
