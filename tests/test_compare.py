@@ -525,19 +525,31 @@ def test_each_part_of_the_run_has_one_picture(
 
 
 def test_captions_are_above_the_middle_of_their_objects() -> None:
+    """Objects without a track are alike, so each is known by its place among the rows."""
     found = (
         LabelledItem(4, "cup", np.array(block(2, 5, 3, 4))),
-        LabelledItem(5, "can", np.array(block(6, 7, 4, 2))),
+        LabelledItem(None, "can", np.array(block(0, 0, 2, 1))),
+        LabelledItem(None, "can", np.array(block(6, 7, 4, 2))),
     )
-    true = (LabelledItem(11, "box", np.array(block(1, 3, 2, 2))),)
+    true = (
+        LabelledItem(None, "box", np.array(block(0, 0, 2, 1))),
+        LabelledItem(None, "box", np.array(block(1, 3, 2, 2))),
+        LabelledItem(None, "box", np.array(block(5, 9, 1, 1))),
+    )
+    head = ("/d", 0, 0)
     rows = [
-        Difference("/d", 0, 0, "missed", true_track=11, true_category="box"),
-        Difference("/d", 0, 0, "surplus", track=5, category="can"),
+        Difference(*head, "surplus", track=4, category="cup"),
+        Difference(*head, None, true_category="box", category="can"),
+        Difference(*head, "surplus", category="can"),
+        Difference(*head, "missed", true_category="box"),
+        Difference(*head, "missed", true_category="box"),
     ]
 
-    assert [tuple(caption) for caption in _captions(rows, found, true, SIDE)] == [
+    assert [tuple(caption) for caption in _captions(rows, found, true, {1: 0}, SIDE)] == [
+        (3, 1, "surplus cup #4"),
+        (7.5, 3, "surplus can"),
         (1.5, -1, "missed box"),
-        (7.5, 3, "surplus can #5"),
+        (5, 5, "missed box"),
     ]
 
 

@@ -66,7 +66,8 @@ def draw_frame(
     ----------
     frame : the depth frame; None for a plain background.
     pairs : index of the true object for each matched found object.
-    rows : differences of the frame; those of the found objects come first, in their order.
+    rows : differences of the frame: those of the found objects, then those of the missed ones, both
+        in their order.
 
     Returns
     -------
@@ -83,7 +84,7 @@ def draw_frame(
     )
     code = base64.b64encode(png(image.reshape(height, width).astype(np.uint8), _palette())).decode()
     differing = tuple(row for row in rows if row.difference)
-    captions = _captions(differing, found.items, true.items, width)
+    captions = _captions(rows, found.items, true.items, pairs, width)
     uri = f"data:image/png;base64,{code}"
     return DifferenceImage(*key, uri, width, height, captions, severity, differing)
 
@@ -139,16 +140,14 @@ def _captions(
     rows: Sequence[Difference],
     found: Sequence[LabelledItem],
     true: Sequence[LabelledItem],
+    pairs: Mapping[int, int],
     width: int,
 ) -> tuple[Caption, ...]:
     """Return a caption for each difference, at the position of its object."""
+    missed = [item for j, item in enumerate(true) if j not in pairs.values()]
     captions = []
-    for row in rows:
-        mine = row.difference != "missed"
-        wanted = (row.track, row.category) if mine else (row.true_track, row.true_category)
-        items = found if mine else true
-        item = next((i for i in items if (i.track, i.category) == wanted), None)
-        if item is not None and item.pixels is not None and item.pixels.size:
+    for row, item in zip(rows, [*found, *missed], strict=True):
+        if row.difference and item.pixels is not None and item.pixels.size:
             y, x = np.divmod(item.pixels, width)
             captions.append(Caption(float(x.mean()), float(y.min()) - 4, words_of(row)))
     return tuple(captions)
