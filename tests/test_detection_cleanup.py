@@ -98,7 +98,7 @@ def test_what_is_wider_than_an_object_is_none() -> None:
     segments = _blank(2)
     features = _seen(400)
     features["segment"]["width_m"] = 0.2
-    grid = DepthGrid(np.zeros((40, 40), np.float32), INTRINSICS, 1, 0.003)
+    grid = DepthGrid(np.zeros((40, 40), np.float32), INTRINSICS, 1)
     for widest, expected in ((0.1, True), (0.3, False)):
         settings = DetectionSettings(max_size_m=widest)
         assert find_background(segments, features, grid, settings, ALWAYS)[1] == expected
@@ -108,7 +108,7 @@ def test_what_is_wider_than_an_object_is_none() -> None:
 def test_what_is_large_and_cut_across_by_the_border_is_an_arm(cells: int, border: float) -> None:
     features = _seen(cells)
     features["surroundings"]["image_border"] = border
-    grid = DepthGrid(np.zeros((40, 40), np.float32), INTRINSICS, 1, 0.003)
+    grid = DepthGrid(np.zeros((40, 40), np.float32), INTRINSICS, 1)
     found = find_background(_blank(2), features, grid, DetectionSettings(), ALWAYS)[1]
     assert found == (cells > 100 and border > 0.4)
 
@@ -116,7 +116,7 @@ def test_what_is_large_and_cut_across_by_the_border_is_an_arm(cells: int, border
 @pytest.mark.parametrize(("cells", "rejected"), [(29, True), (31, False)])
 def test_what_is_far_too_small_goes_before_holes_are_filled(cells: int, rejected: bool) -> None:
     """Else it splits a hole in an object, and is dropped only after that."""
-    grid = DepthGrid(np.zeros((40, 40), np.float32), INTRINSICS, 1, 0.003)
+    grid = DepthGrid(np.zeros((40, 40), np.float32), INTRINSICS, 1)
     found = find_background(_blank(2), _seen(cells), grid, DetectionSettings(), ALWAYS)
     assert found[1] == rejected  # the smallest object covers 60 cells here
 
@@ -129,7 +129,7 @@ def test_context_decides_on_doubtful_segments_only(
     alone: float, in_context: float, rejected: bool
 ) -> None:
     features = _seen(400)
-    grid = DepthGrid(np.zeros((40, 40), np.float32), INTRINSICS, 1, 0.003)
+    grid = DepthGrid(np.zeros((40, 40), np.float32), INTRINSICS, 1)
     trees = RejectionTrees(
         *(_LEAF._replace(value=np.array([v], np.float32)) for v in (alone, in_context))
     )
@@ -169,7 +169,7 @@ def test_the_image_border_is_where_samples_begin() -> None:
     """A sensor may leave a strip empty; what is cut farther inside is no border."""
     inv_depth = np.zeros((100, 200), np.float32)
     inv_depth[3:60, 0:195] = 1
-    grid = DepthGrid(inv_depth, INTRINSICS, 1, 0.003)
+    grid = DepthGrid(inv_depth, INTRINSICS, 1)
     assert _border_lines(grid) == (3, -1, 0, 194)
     assert _border_lines(grid._replace(inverse_depth=np.zeros_like(inv_depth))) == (-1, -1, -1, -1)
 

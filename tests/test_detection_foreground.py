@@ -34,7 +34,7 @@ from tests.level_planes import ALONG, INTRINSICS, UP, I, J, level
 
 
 def grid_of(inv_depth: F4) -> DepthGrid:
-    return DepthGrid(np.ascontiguousarray(inv_depth, np.float32), INTRINSICS, 2, 0.0035)
+    return DepthGrid(np.ascontiguousarray(inv_depth, np.float32), INTRINSICS, 2)
 
 
 def plane_of(grid: DepthGrid, below_m: float) -> SupportingPlane:
@@ -133,7 +133,7 @@ def test_a_large_upright_face_is_a_wall_and_a_small_one_an_object() -> None:
 
     small = np.zeros((240, 320), np.int8)
     small[100:150, 140:190] = 1
-    only = DepthGrid(np.where(small > 0, grid.inverse_depth, 0), INTRINSICS, 2, 0.0035)
+    only = DepthGrid(np.where(small > 0, grid.inverse_depth, 0), INTRINSICS, 2)
     walls = remove_walls(only, small, up, 0.5, trials)
     assert not (walls == CLEARED).any()
     assert small.sum() == 2500

@@ -32,7 +32,7 @@ def measured(depth: Array, labels: Array) -> tuple[Segments, SurfaceGraph, Depth
     """Measure the labels of a depth image (150, 200), metres, 0 where there is nothing."""
     with np.errstate(divide="ignore"):
         inv_depth = np.where(depth > 0, 1 / depth, 0).astype(np.float32)
-    grid = DepthGrid(inv_depth, INTRINSICS, 1, 0.003)
+    grid = DepthGrid(inv_depth, INTRINSICS, 1)
     plane_id = (labels > 0).astype(np.int8)
     y = (np.arange(150)[:, None] - INTRINSICS.cy) / INTRINSICS.fy * depth
     heights = HeightMap(plane_id, np.where(labels > 0, 0.25 - y, 0).astype(np.float32))

@@ -140,9 +140,7 @@ def test_assumed_plane_lies_just_below_what_no_plane_explains() -> None:
     far = np.where(j > 150, 1.4, 0.0)
     height = blob + far
     inv_depth = np.where((height > 0) & (down > 0.2), down / np.maximum(height, 0.1), 0)
-    grid = DepthGrid(
-        inv_depth.astype(np.float32), PinholeIntrinsics(150.0, 150.0, 70.0, 62.0), 4, 0.005
-    )
+    grid = DepthGrid(inv_depth.astype(np.float32), PinholeIntrinsics(150.0, 150.0, 70.0, 62.0), 4)
 
     plane = assume_plane(grid, inv_depth > 0, up, tallest_m=0.3)
 
@@ -170,9 +168,7 @@ def test_known_up_is_kept_where_nothing_is_level() -> None:
 
 
 def test_no_plane_is_assumed_for_a_few_samples_or_above_the_camera() -> None:
-    grid = DepthGrid(
-        np.ones((60, 80), np.float32), PinholeIntrinsics(75.0, 75.0, 39.5, 29.5), 8, 0.01
-    )
+    grid = DepthGrid(np.ones((60, 80), np.float32), PinholeIntrinsics(75.0, 75.0, 39.5, 29.5), 8)
     few = np.zeros((60, 80), np.int8)
     few[6:] = -1  # a tenth is above no plane
     up = np.array([0.0, 0.0, -1.0])

@@ -63,11 +63,11 @@ def test_heights_of_a_board_with_an_edge() -> None:
     inv_depth[100:140, 80:120] = level(0.62)[100:140, 80:120]  # a box of 8 cm
     inv_depth[100:140, 280:300] = level(0.62)[100:140, 280:300]  # and one in the air beside
     trials = draw_trials(np.random.default_rng(0))
-    grid = DepthGrid(board, INTRINSICS, 2, 0.0035)
+    grid = DepthGrid(board, INTRINSICS, 2)
     found, _ = find_supporting_planes(grid, UP, trials, tallest_m=0.5, upright=True)
     planes = pack_planes(found)
     assert len(found) == 1
-    heights = measure_heights(DepthGrid(inv_depth, INTRINSICS, 2, 0.0035), planes, 0.6)
+    heights = measure_heights(DepthGrid(inv_depth, INTRINSICS, 2), planes, 0.6)
     assert (heights.plane_id[105:135, 85:115] == 1).all()
     np.testing.assert_allclose(heights.height[105:135, 85:115], 0.08, atol=1e-4)
     assert (heights.plane_id[100:140, 285:] == 0).all()
@@ -86,7 +86,7 @@ def test_two_faces_are_parted_where_they_meet_at_a_concave_edge(rise: float, seg
     inv_depth[90:150, 120:200] = (1 / z)[:, None].astype(np.float32)
     plane_id = (inv_depth > 0).astype(np.int8)
     heights = HeightMap(plane_id, np.where(plane_id, 0.1, 0).astype(np.float32))
-    graph = connect_surfaces(DepthGrid(inv_depth, INTRINSICS, 2, 0.0035), heights)
+    graph = connect_surfaces(DepthGrid(inv_depth, INTRINSICS, 2), heights)
 
     labels, n = watershed(heights, graph, concave=True)
 

@@ -55,13 +55,11 @@ class DepthGrid(NamedTuple):
     inverse_depth : (rows, columns) float32, 1/m; 0 where there is no reading.
     intrinsics : the camera in units of cells.
     factor : pixels along the edge of a cell.
-    size_m : width of a cell at the median depth, metres.
     """
 
     inverse_depth: F4
     intrinsics: PinholeIntrinsics
     factor: int
-    size_m: float
 
 
 def downsample(depth: F4, camera: Camera, *, range_m: float) -> DepthGrid | None:
@@ -91,7 +89,7 @@ def downsample(depth: F4, camera: Camera, *, range_m: float) -> DepthGrid | None
     rows, columns = depth.shape[0] // factor, depth.shape[1] // factor
     inv_depth = np.zeros((rows, columns), np.float32)
     _average(depth, factor, np.float32(range_m), np.float32(DISCONTINUITY), inv_depth)
-    return DepthGrid(inv_depth, intrinsics, factor, factor * pixel_m)
+    return DepthGrid(inv_depth, intrinsics, factor)
 
 
 def _median_of(values: F4) -> float:
@@ -147,9 +145,8 @@ def count_at_range_limit(inv_depth: F4, labels: I4, size: int, range_m: float) -
     for i in range(inv_depth.shape[0]):
         some = False
         for j in range(inv_depth.shape[1]):
-            some |= (labels[i, j] > 0) & (
-                inv_depth[i, j] < most
-            )  # most rows have none, and this vectorises
+            # Most rows have none, and this vectorises.
+            some |= (labels[i, j] > 0) & (inv_depth[i, j] < most)
         if not some:
             continue
         for j in range(inv_depth.shape[1]):

@@ -205,9 +205,7 @@ def _imaged(turned: F4, place: F4, bounds: F8, n: int, pose: Pose) -> VirtualIma
     cell = np.full(len(turned), -1, np.int32)
     behind = _project(turned, place, intrinsics, inv_depth, cell)
     _close_holes(inv_depth)
-    return VirtualImage(
-        DepthGrid(inv_depth, intrinsics, 1, pitch * depth), turned, cell, pose, behind / n
-    )
+    return VirtualImage(DepthGrid(inv_depth, intrinsics, 1), turned, cell, pose, behind / n)
 
 
 def _spacing(place: F4, bounds: F8, n: int) -> float:

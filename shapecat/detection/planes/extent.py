@@ -28,7 +28,6 @@ DIRECTIONS = 16
 """Sides of the convex outline of a plane."""
 ANGLES = np.arange(DIRECTIONS) * (2 * np.pi / DIRECTIONS)
 COS, SIN = np.cos(ANGLES), np.sin(ANGLES)
-NEXT = (np.arange(DIRECTIONS) + 1) % DIRECTIONS
 BESIDE = 3
 """Distance, in cells, from an inlier to the neighbours that may extend the plane."""
 
@@ -150,7 +149,7 @@ def level_coordinates(grid: DepthGrid, chosen: Bool, up: F8) -> F8:
 def outline_corners(plane: SupportingPlane) -> F8:
     """Return the corners (DIRECTIONS, 3) of the convex outline in order, metres, sensor frame."""
     # Neighbouring sides x cos + y sin = extent meet at a corner.
-    along = (plane.extent[NEXT] - plane.extent * COS[1]) / SIN[1]
+    along = (np.roll(plane.extent, -1) - plane.extent * COS[1]) / SIN[1]
     level = np.full((DIRECTIONS, 3), plane.offset)
     level[:, 0] = plane.extent * COS - along * SIN
     level[:, 1] = plane.extent * SIN + along * COS

@@ -91,7 +91,7 @@ class StripSettings(NamedTuple):
     grazing: float = 0.015
     """Change of inverse depth per row, 1/m, above which a plane is seen at a grazing angle: from
     one row to the next it exceeds the tolerance."""
-    least_depth_m: float = 0.03
+    least_slope: float = 0.03
     """Smallest downward slope of a ray (down / forward); flatter rays run along a surface."""
     least_rise: float = 0.05
     """Smallest downward slope that is used to compute the area a cell covers."""

@@ -229,7 +229,7 @@ def _find_level(inv_depth: F4, i: int, slope: tuple[float, float, float], level:
     start, across, down = slope
     steep = np.float32(0.5 * ARM) * np.sqrt(across * across + down * down)
     side, along = np.float32(ARM) * across, np.float32(ARM) * down
-    least, gate = np.float32(-STRIPS.least_depth_m), np.float32(-PLANES.tolerance / 2)
+    least, gate = np.float32(-STRIPS.least_slope), np.float32(-PLANES.tolerance / 2)
     deepest = np.float32((1 - BINS) * STRIPS.bin_m)
     here, above, below = inv_depth[i], inv_depth[i - ARM], inv_depth[i + ARM]
     for j in range(ARM, level.size - ARM):
