@@ -211,6 +211,16 @@ def test_the_space_between_two_boxes_is_no_hole() -> None:
     assert not filled.any()
 
 
+def test_the_background_of_a_large_image_is_no_hole() -> None:
+    """Its open sides, times the cells of the largest image, exceed 32 bits: six gaps of a rack."""
+    inv_depth = np.full((632, 632), 0.5, np.float32)
+    labels, filled = np.zeros((632, 632), np.int16), np.zeros((632, 632), np.uint8)
+    labels[[0, 3]] = labels[:, [0, -1]] = 1
+    labels[3, 100:601:100], labels[-1, 100:601:100] = 0, 1
+    fill_holes(inv_depth, labels, 1, filled)
+    assert not filled.any()
+
+
 def test_objects_that_are_left_are_numbered_in_the_order_of_their_segments() -> None:
     """Segments 2 and 4 are merged into 1 and 3, of which 3 is rejected; 5 stays alone."""
     parent = np.array([0, 1, 1, 3, 3, 5], np.int16)

@@ -75,7 +75,7 @@ def fill_holes(inv_depth: F4, labels: I4, count: int, filled: U1) -> None:
     component = unset(labels.shape, np.int32)
     links = np.full(labels.shape, RIGHT | DOWN, np.uint8)
     n = connected_components(inside, links, spans, component).size
-    sides, total = np.zeros((n, count + 1, 3), np.int32), np.zeros(n, np.int32)
+    sides, total = np.zeros((n, count + 1, 3), np.int32), np.zeros(n, np.int64)
     owner = np.zeros(n, np.int16)
     _count_sides(inv_depth, labels, inside, spans, component, sides, total)
     for p in range(1, n):
