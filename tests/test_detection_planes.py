@@ -168,6 +168,7 @@ def test_known_up_is_kept_where_nothing_is_level() -> None:
 
 
 def test_no_plane_is_assumed_for_a_few_samples_or_above_the_camera() -> None:
+    """Nor does it fail where `detection.max_height_m` leaves no object any height."""
     grid = DepthGrid(np.ones((60, 80), np.float32), PinholeIntrinsics(75.0, 75.0, 39.5, 29.5), 8)
     few = np.zeros((60, 80), np.int8)
     few[6:] = -1  # a tenth is above no plane
@@ -180,6 +181,8 @@ def test_no_plane_is_assumed_for_a_few_samples_or_above_the_camera() -> None:
     assert assume_plane(grid, rest, up, tallest_m=0.5) is not None
     one = np.arange(few.size).reshape(few.shape) == 3001
     assert assume_plane(grid, one, up, tallest_m=0.5) is not None
+    for low in (0.0, 0.001, 0.008):  # less than a bin of heights
+        assert assume_plane(grid, rest, up, tallest_m=low) is not None
     far = grid._replace(inverse_depth=np.where(few < 0, np.float32(0.4), grid.inverse_depth))
     assert unexplained(far, ~few) is None  # background, 2.5 m away
 

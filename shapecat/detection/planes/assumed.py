@@ -51,14 +51,15 @@ def assume_plane(grid: DepthGrid, rest: Bool, up: F8, tallest_m: float) -> Suppo
     held = (height > offset) & (height < offset + tallest_m)
     sides = COS[:, None] * across[held] + SIN[:, None] * along[held]
     a, b, c = horizontal_plane(grid.intrinsics, up, offset)
-    return SupportingPlane(a, b, c, up, offset, sides.max(axis=1) + PLANES.margin_m, 0.0)
+    extent = sides.max(axis=1, initial=-np.inf) + PLANES.margin_m
+    return SupportingPlane(a, b, c, up, offset, extent, 0.0)
 
 
 def _fullest(height: F8, weight: F8, tallest_m: float) -> float:
     """Return a height just below the interval of length ``tallest_m`` with the most weight."""
     low = float(height.min())
     count = np.bincount(((height - low) / PLANES.bin_m).astype(np.int64), weight)
-    window = round(tallest_m / PLANES.bin_m)
+    window = max(round(tallest_m / PLANES.bin_m), 1)
     total = np.cumsum(np.concatenate([[0.0], count, np.zeros(window)]))
     inside = total[window:] - total[:-window]
     start = int(np.argmax(inside))
