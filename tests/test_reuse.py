@@ -19,7 +19,7 @@ from shapecat.runs.jobs import Job
 from shapecat.simulation import KINECT, make_scene, render_frame
 from shapecat.simulation.recorder import record
 from shapecat.simulation.worlds import Motion, World
-from shapecat.tracking.hits import Hits
+from shapecat.tracking.hits import gather
 from shapecat.tracking.records import FrameDetections
 from shapecat.types import Detection, Frame, Perception, Pose
 from tests.conftest import Guesser
@@ -342,11 +342,11 @@ def test_a_repeated_view_is_no_new_evidence() -> None:
         )
         for k, origin in enumerate(described)
     ]
-    hits = Hits.of(frames)
+    hits = next(gather(frames))
     assert hits.weights(np.arange(8)).tolist() == [1, 0, 0, 0, 0, 1, 0.25, 1]
     # A track that begins with a repeat has nothing else to go by.
     assert hits.weights(np.arange(2, 8)).tolist() == [1, 0, 0, 1, 0.25, 1]
-    plain = Hits.of([replace(frame, described=None) for frame in frames])
+    plain = next(gather([replace(frame, described=None) for frame in frames]))
     assert plain.weights(np.arange(8)).tolist() == [1, 1, 1, 1, 1, 1, 0.25, 1]
 
 
@@ -366,4 +366,4 @@ def test_frames_of_two_topics_are_views_of_their_own() -> None:
         )
         for k, topic in enumerate(("/a", "/b"))
     ]
-    assert Hits.of(frames).weights(np.arange(2)).tolist() == [1, 1]
+    assert next(gather(frames, ("/a", "/b"))).weights(np.arange(2)).tolist() == [1, 1]

@@ -15,7 +15,7 @@ from shapecat.tracking import track_recording, tracker
 from shapecat.tracking.association import size_key
 from shapecat.tracking.common_motion import CommonMotion, _fit, _in_space, _level
 from shapecat.tracking.hindsight import Fragments, _contradiction, _distances
-from shapecat.tracking.hits import Hits
+from shapecat.tracking.hits import Hits, gather
 from shapecat.tracking.pieces import _changes, _joint, _largest
 from shapecat.tracking.pieces import _fit as fit_pieces
 from shapecat.tracking.recording import _describe, _line, _needed
@@ -174,8 +174,10 @@ def test_the_line_through_detections_is_the_one_of_ridge_regression() -> None:
     rng = np.random.default_rng(3)
     stamps = np.array([5.0, 5.1, 5.3, 5.32, 5.8])
     centers = rng.normal(size=(5, 3))
-    hits = Hits.of(
-        frame(k, places, stamp_ns=round(stamps[k] * 1e9)) for k, places in enumerate(centers)
+    hits = next(
+        gather(
+            frame(k, places, stamp_ns=round(stamps[k] * 1e9)) for k, places in enumerate(centers)
+        )
     )
     for at in (0, -1):
         t = stamps - stamps[at]
@@ -193,7 +195,7 @@ def test_a_track_needs_as_many_detections_as_frames_are_near() -> None:
     frames = [frame(k, [], stamp_ns=round(s * 1e9)) for k, s in enumerate(stamps)]
     scenes = np.array([0, 0, 0, 0, 1, 1, 1])
 
-    hits = Hits.of(frames)
+    hits = next(gather(frames))
     needed = [_needed(hits, scenes, row, 9) for row in range(len(frames))]
 
     assert needed == [3, 3, 4, 2, 2, 3, 2]
@@ -209,7 +211,7 @@ def test_a_fragment_is_summed_up_from_its_beginning_to_its_end() -> None:
         frame(k, place, partial=np.array([False, cut[k]]), sizes=np.full((2, 3), 0.1 + 0.01 * k))
         for k, place in enumerate(places)
     ]
-    hits = Hits.of(frames)
+    hits = next(gather(frames))
     found = _describe(hits, [np.array([1, 3, 5]), np.array([7])], np.array([4, 4, 4, 5]))
 
     assert_allclose([found.first_ns, found.last_ns], [[0, 3e8], [2e8, 3e8]])
@@ -283,7 +285,7 @@ def test_frames_of_two_sensors_are_put_in_the_order_of_time() -> None:
         ("/b", 4, [0.7]),
     ]
     frames = [frame(k, [[x, 0, 1] for x in xs], topic=name) for name, k, xs in order]
-    hits = Hits.of(frames)
+    hits = next(gather(frames, ("/a", "/b")))
 
     assert hits.frames.tolist() == [0, 1, 2, 3, 4]
     assert [hits.names[k] for k in hits.topics] == ["/a", "/b", "/b", "/a", "/b"]
@@ -310,7 +312,7 @@ def turned_hits() -> Hits:
     other = Rotation.from_euler("z", 0.5).as_matrix() @ TURNED
     places = [[0.31, -0.12, 0.83], [0.42, -0.05, 0.79]]
     sizes, axes = np.array([[0.12, 0.05, 0.2], [0.07, 0.16, 0.09]]), np.stack([TURNED, other])
-    return Hits.of([frame(0, places, sizes=sizes, axes=axes), frame(1, [])])
+    return next(gather([frame(0, places, sizes=sizes, axes=axes), frame(1, [])]))
 
 
 def test_the_common_box_of_two_pieces_holds_the_corners_of_both() -> None:
@@ -357,7 +359,7 @@ def test_of_two_pieces_the_larger_one_stays() -> None:
         frame(2, [[0.1, 0.2, 0.3]], sizes=[flat]),
     ]
 
-    assert _largest(Hits.of(frames), np.array([4, 0, 3, 1, 2])).tolist() == [1, 2, 4]
+    assert _largest(next(gather(frames)), np.array([4, 0, 3, 1, 2])).tolist() == [1, 2, 4]
 
 
 def test_one_track_ends_soon_after_the_other_began() -> None:
@@ -372,7 +374,7 @@ def test_one_track_ends_soon_after_the_other_began() -> None:
             members[m].append(at)
             at += 1
     duos = np.array([[0, 1], [0, 2]])
-    share = _changes(Hits.of(frames), [np.array(m) for m in members], duos)
+    share = _changes(next(gather(frames)), [np.array(m) for m in members], duos)
 
     assert share.tolist() == [0.2, np.inf]
 
@@ -413,7 +415,7 @@ def test_a_turn_in_the_plane_is_one_about_up_in_space() -> None:
         assert_allclose(still, expected, atol=1e-12)
         assert_allclose(motion.moved(np.full(7, k), still), points, atol=1e-12)
         alone = CommonMotion(motion.rotations[k : k + 1], motion.translations[k : k + 1])
-        back = alone.still(Hits.of([frame(0, points)]))
+        back = alone.still(next(gather([frame(0, points)])))
         assert_allclose(back.centers, expected, atol=1e-6)  # kept in single precision
         assert back.axes is not None
         assert_allclose(back.axes, np.broadcast_to(motion.rotations[k], (7, 3, 3)))

@@ -7,21 +7,24 @@ from scipy.optimize import linear_sum_assignment
 
 from shapecat.arrays import F4, F8, I4
 
-__all__ = ["assign", "posterior_difference", "size_difference", "size_key"]
+__all__ = ["assign", "posterior_difference", "size_difference", "size_key", "sorted_sides"]
 
 _SIZE_SLACK_M = 0.01
 """Added to every length before taking its logarithm, as a flat side may vary by a centimetre."""
 
 
-def size_key(sizes: F4) -> F8:
-    """Return the logarithms (n, 3) of sizes (n, 3), metres: longer side, shorter side, height.
+def sorted_sides(sizes: F4) -> F8:
+    """Return sizes (n, 3) as longer side, shorter side, height, in double precision.
 
-    The sides are sorted, as the yaw of a box may change by a quarter turn between frames.
+    The yaw of a box may change by a quarter turn between frames.
     """
-    sizes = np.asarray(sizes, np.float64)
-    sides = np.sort(sizes[:, :2], axis=1)[:, ::-1]
-    lengths = np.maximum(np.column_stack([sides, sizes[:, 2]]), 0.0)
-    return np.asarray(np.log(lengths + _SIZE_SLACK_M))
+    sides = np.sort(sizes[:, :2].astype(np.float64), axis=1)
+    return np.column_stack([sides[:, ::-1], sizes[:, 2]])
+
+
+def size_key(sizes: F4) -> F8:
+    """Return the logarithms (n, 3) of the `sorted_sides` of sizes (n, 3), metres."""
+    return np.asarray(np.log(np.maximum(sorted_sides(sizes), 0.0) + _SIZE_SLACK_M))
 
 
 def size_difference(keys_a: F8, keys_b: F8) -> F8:

@@ -127,7 +127,7 @@ def _successors(fragments: Fragments, limit: F8, settings: TrackingSettings) -> 
     trees = [cKDTree(places) for places in starts]
     order = np.argsort(fragments.first_ns, kind="stable")
     first = fragments.first_ns[order]
-    window = int(settings.max_missed_s * 1e9)
+    window = int(min(settings.max_missed_s * 1e9, 2**62))
     for i, end in enumerate(fragments.last_ns):
         # One by one, as all together would be lists of millions of numbers after some hours.
         places = [tree.query_ball_point(e[i], limit[i]) for tree in trees for e in ends]

@@ -14,6 +14,7 @@ from shapecat.tracking.records import FrameDetections
 __all__ = ["Hits", "gather"]
 
 _BLOCK = 2**16  # detections processed at once
+_SET_BACK_NS = 1_000_000_000  # a clock was set back by more than this; late messages differ by less
 
 _OF_FRAMES = {"topics": "i4", "frames": "i4", "stamps_ns": "i8"}
 _OF_HITS: dict[str, tuple[str, tuple[Any, ...]]] = {
@@ -59,14 +60,6 @@ class Hits:
     novelties: F4
     axes: F4 | None
     described: I4
-
-    @classmethod
-    def of(cls, frames: Iterable[FrameDetections]) -> Self:
-        """Collect the detections of one stream."""
-        stream = _Gathered()
-        for frame in frames:
-            stream.add(frame)
-        return cls(**stream.columns())
 
     def without_boxes(self) -> Self:
         """Return the hits without sizes and axes, which tracks do not need."""
@@ -118,18 +111,21 @@ class Hits:
         return np.arange(which.size) - (np.cumsum(stop - first) - stop)[which], which
 
     def places(self, member: I4, rows: I4) -> F8:
-        """Return the interpolated positions (k, 3) of a track in frames ``rows`` (k,), metres.
+        """Return the positions (k, 3) of a track in frames ``rows`` (k,), metres.
 
-        ``member`` are the hits of the track.
+        They are linear in time between its hits, ``member``.
         """
         if len(rows) == 0:
             return np.zeros((0, 3))
         # Use only hits near these frames, as long tracks are queried for many short spans.
         before, after = np.searchsorted(member, self.first[[rows.min() + 1, rows.max()]])
         near = member[max(before - 1, 0) : after + 1]
-        seen = self.rows[near]
-        lines = [np.interp(rows, seen, self.centers[near, axis]) for axis in range(3)]
-        return np.column_stack(lines)
+        last = np.maximum(np.searchsorted(self.rows[near], rows, side="right") - 1, 0)
+        a, b = near[last], near[np.minimum(last + 1, len(near) - 1)]
+        start, stop = self.stamps(a), self.stamps(b)
+        share = np.clip((self.stamps_ns[rows] - start) / np.maximum(stop - start, 1), 0, 1)
+        step = self.centers_of(b) - self.centers_of(a)
+        return np.asarray(self.centers_of(a) + share[:, None] * step)
 
     def life(self, member: I4, max_gap_s: float) -> tuple[I4, Bool]:
         """Return the frames (k,) of a track from its first to its last hit, and a mask of its hits.
@@ -221,6 +217,23 @@ def _column(frame: FrameDetections, name: str) -> Any:
 
 
 def _by_time(topics: I4, stamps_ns: I4) -> Any:
-    """Return the order of frames by time that keeps each topic's order of recording."""
-    streams = (np.flatnonzero(topics == topic).tolist() for topic in range(topics.max() + 1))
-    return np.fromiter(merge(*streams, key=stamps_ns.tolist().__getitem__), np.int64)
+    """Return the order of frames by time that keeps each topic's order of recording.
+
+    What any topic recorded before its clock was set back comes first.
+    """
+    streams = [np.flatnonzero(topics == topic) for topic in range(topics.max() + 1)]
+    stamps, time = np.unique(stamps_ns, return_inverse=True)
+    for stream in streams:
+        time[stream] += len(stamps) * _times_set_back(stamps_ns[stream])
+    key = time.tolist().__getitem__
+    return np.fromiter(merge(*(stream.tolist() for stream in streams), key=key), np.int64)
+
+
+def _times_set_back(stamps_ns: I4) -> I4:
+    """Return how often a clock had been set back at each frame (f,); an odd stamp is no such time.
+
+    So the two frames before are compared with two from there on.
+    """
+    stamps = np.pad(stamps_ns, 2, mode="edge")
+    before = np.minimum(stamps[:-4], stamps[1:-3])
+    return np.asarray((np.maximum(stamps[2:-2], stamps[3:-1]) < before - _SET_BACK_NS).cumsum())

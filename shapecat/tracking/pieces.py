@@ -8,6 +8,7 @@ import numpy as np
 from scipy.spatial import cKDTree
 
 from shapecat.arrays import F4, F8, I4, Bool
+from shapecat.tracking.association import sorted_sides
 from shapecat.tracking.hits import Hits
 
 __all__ = ["join_pieces"]
@@ -101,17 +102,11 @@ def _seen_in_one(hits: Hits, members: Sequence[I4], a: int, b: int) -> F8:
     stop = min(hits.rows[members[k][-1]] for k in (a, b))
     rows, at, counts = np.unique(hits.rows[both], return_index=True, return_counts=True)
     alone = both[at[(counts == 1) & (rows > start) & (rows < stop)]]
-    return np.asarray(_sorted_sides(hits.sizes[alone]).max(axis=0, initial=0))
+    return np.asarray(sorted_sides(hits.sizes[alone]).max(axis=0, initial=0))
 
 
 def _where(mask: Bool) -> list[int]:
     return [int(k) for k in np.flatnonzero(mask)]
-
-
-def _sorted_sides(sizes: F8) -> F8:
-    """Return sizes (n, 3) as longer side, shorter side, height."""
-    sides = np.sort(sizes[:, :2].astype(np.float64), axis=1)
-    return np.column_stack([sides[:, ::-1], sizes[:, 2]])
 
 
 def _wholes(hits: Hits, member: I4) -> F8:
@@ -126,7 +121,7 @@ def _wholes(hits: Hits, member: I4) -> F8:
 def _whole(hits: Hits, member: I4) -> F8:
     """Return the 75 % quantile (3,) of the lengths of whole views, or of all if none is whole."""
     uncut = member[~hits.partial[member]]
-    lengths = _sorted_sides(hits.sizes[member if len(uncut) == 0 else uncut])
+    lengths = sorted_sides(hits.sizes[member if len(uncut) == 0 else uncut])
     return np.asarray(np.quantile(lengths, 0.75, axis=0))
 
 
@@ -159,7 +154,7 @@ def _fit(hits: Hits, axes: F4, pairs: I4, wholes: F8) -> Bool:
     a bowl with an object in it would be.
     """
     joint = np.minimum(_joint(hits, axes, pairs), _joint(hits, axes, pairs[:, ::-1]))
-    lengths = _sorted_sides(hits.sizes[pairs.ravel()]).reshape(-1, 2, 3)
+    lengths = sorted_sides(hits.sizes[pairs.ravel()]).reshape(-1, 2, 3)
     room = wholes * _SLACK + _SLACK_M
     lacking = np.any(lengths.max(axis=1)[:, None] < _LACKING * wholes, axis=2)
     fitting = np.all(joint[:, None] <= room, axis=2)
@@ -174,7 +169,7 @@ def _joint(hits: Hits, axes: F4, pairs: I4) -> F8:
     turned = np.abs(np.einsum("pji,pjk->pik", own_axes, others))
     reach = 0.5 * np.einsum("pik,pk->pi", turned, hits.sizes[j])
     own = 0.5 * hits.sizes[i].astype(np.float64)
-    return _sorted_sides(np.maximum(own, offset + reach) - np.minimum(-own, offset - reach))
+    return sorted_sides(np.maximum(own, offset + reach) - np.minimum(-own, offset - reach))
 
 
 def _largest(hits: Hits, member: I4) -> I4:

@@ -82,11 +82,6 @@ class Tracker:
         self._clock_ns = 0
         self._active: _Active | None = None
 
-    @property
-    def active(self) -> int:
-        """Number of tracks that have not ended; only these take computing time."""
-        return 0 if self._active is None else len(self._active.ids)
-
     def reset(self) -> None:
         """End all tracks; their numbers are not reused."""
         self._active = None
@@ -138,7 +133,7 @@ class Tracker:
     def _advance(self, stamp_ns: int, found: _Active, partial: Bool) -> I4:
         elapsed_s = self._tick(stamp_ns)
         found.born_ns[:] = found.seen_ns[:] = self._clock_ns
-        if self._active is None or not self.active:
+        if self._active is None or not len(self._active.ids):
             self._active = found.rows(np.zeros(len(found.ids), bool))
         active = _predict(self._active, elapsed_s)
         pairs = assign(
