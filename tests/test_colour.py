@@ -383,6 +383,17 @@ def test_masks_side_by_side_share_no_pixel_when_they_move() -> None:
     assert whole.area == 8000
 
 
+def test_what_two_masks_may_both_grow_into_is_given_to_one() -> None:
+    """A body and its bar of the same colour, with a gap of 4 columns between their masks."""
+    pixels, _ = picture_of_a_box((170, 90, 60))
+    pixels[:36, 50:70] = pixels[44:, 50:70] = pixels[:36, :20].mean(axis=(0, 1))
+    body, bar = Mask(30, 20, np.ones((40, 18), bool)), Mask(52, 36, np.ones((8, 18), bool))
+    for order in ((body, bar), (bar, body)):
+        one, two = (mask.full(80, 100) for mask in snapped(order, pixels))
+        assert (one ^ two)[39:41, 33:67].all()
+        assert not (one & two).any()
+
+
 @pytest.mark.parametrize("border", [48, 52])
 def test_what_a_mask_gives_up_goes_to_the_mask_beside_it(border: int) -> None:
     """Two objects touch at column 50; a gap between their masks would be taught as an outline.
