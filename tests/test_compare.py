@@ -28,6 +28,7 @@ from shapecat.evaluation.comparing import (
     Comparison,
     _compare_frame,
     _kind,
+    _labelled_part,
     _Tally,
     compare,
 )
@@ -201,6 +202,22 @@ def test_a_detection_of_an_object_too_small_to_be_listed_is_not_false(
     boxes = sum(track == 3 for found in FOUND for track, *_ in found)
     assert before["detections"] - after["detections"] == boxes
     assert before["true"] - after["true"] == 3
+
+
+@pytest.mark.parametrize(("beside", "kept"), [(2, [10, 11, 12]), (3, None)])
+def test_a_detection_is_left_out_if_most_of_it_is_ignored(
+    beside: int, kept: list[int] | None
+) -> None:
+    """One that merely touches an object of a few pixels is judged by its other pixels."""
+    ignored = np.zeros(SIDE * SIDE, bool)
+    ignored[13 : 13 + beside] = True
+    true = Labelling((), ~ignored, (SIDE, SIDE), ignored)
+    item = LabelledItem(1, "cup", np.arange(13 + beside - 5, 13 + beside))
+    left = _labelled_part(Labelling((item,)), true, ("/d", 0)).items
+
+    assert [known.pixels.tolist() for known in left if known.pixels is not None] == (
+        [] if kept is None else [kept]
+    )
 
 
 def test_the_table_tells_every_difference_once(shapecat: Run, run: Path, truth: Path) -> None:
@@ -802,6 +819,23 @@ def test_labels_of_two_topics_are_not_mixed(tmp_path: Path) -> None:
     box = found.items[0].box
     assert box is not None
     np.testing.assert_allclose([box.center, box.size], [[1, 1.85, 4], [0.5, 0.1, 0.3]], rtol=1e-6)
+
+
+def test_labels_of_a_single_topic_fit_a_recording_that_names_it_otherwise(tmp_path: Path) -> None:
+    """The stamp is enough; a frame number that equals one of the other recording is not."""
+    (tmp_path / "label_2").mkdir()
+    for name in ("000003", "000004"):
+        (tmp_path / "label_2" / f"{name}.txt").write_text(
+            f"cup{name[-1]} 0 0 0 0 0 0 0 0.3 0.1 0.5 1 2 4 0.6\n"
+        )
+    rows = ["number,topic,frame,stamp_ns", f"000003,/a,7,{START}", f"000004,/a,8,{START + STEP}"]
+    (tmp_path / "frames.csv").write_text("\n".join(rows))
+    labels = KittiLabels(tmp_path)
+    found = labels.at(("/b", 3), START + STEP)
+
+    assert found is not None
+    assert [item.category for item in found.items] == ["cup4"]
+    assert labels.at(("/b", 7), START + 1) is None
 
 
 def refused(shapecat: Run, *words: object) -> tuple[int, str]:

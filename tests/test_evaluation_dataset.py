@@ -45,6 +45,27 @@ def test_every_encoding_of_pcd_is_read(tmp_path: Path, encoding: str) -> None:
     np.testing.assert_array_equal(cloud.viewpoint, [0.5, -0.25, 1.25])
 
 
+@pytest.mark.parametrize("encoding", ["ascii", "binary"])
+def test_a_field_of_several_values_moves_those_behind_it(tmp_path: Path, encoding: str) -> None:
+    """Files with normals or histograms before x."""
+    head = (
+        "FIELDS normal x i y z\nSIZE 4 4 2 4 4\nTYPE F F U F F\nCOUNT 3 1 2 1 1\n"
+        f"WIDTH 2\nHEIGHT 1\nPOINTS 2\nDATA {encoding}\n"
+    ).encode()
+    rows = [(0.1, 0.2, 0.3, 1.5, 7, 8, 2.5, 3.5), (0.4, 0.5, 0.6, 4.5, 9, 10, 5.5, 6.5)]
+    (tmp_path / "x.pcd").write_bytes(
+        head
+        + b"".join(
+            b"%g %g %g %g %d %d %g %g\n" % row
+            if encoding == "ascii"
+            else struct.pack("<4f2H2f", *row)
+            for row in rows
+        )
+    )
+
+    assert read_pcd(tmp_path / "x.pcd").points.tolist() == [[1.5, 2.5, 3.5], [4.5, 5.5, 6.5]]
+
+
 @pytest.mark.parametrize("kind", ["ascii", "binary_little_endian", "binary_big_endian"])
 def test_every_encoding_of_ply_is_read(tmp_path: Path, kind: str) -> None:
     """Faces may follow the vertices."""
