@@ -606,6 +606,16 @@ def test_boxes_are_matched_from_a_quarter_of_overlap_on(shift: float, iou: float
     assert iou is None or matched.similarity.tolist()[0] == pytest.approx([0, iou])
 
 
+def test_truth_of_another_recording_is_doubted(shapecat: Run, run: Path, truth: Path) -> None:
+    """Simulated recordings have the same stamps, so a mistaken file gives figures of nothing."""
+    assert "of the same recording?" not in shapecat("compare", run, truth).output
+
+    image = np.full(SIDE * SIDE, 3, np.uint8)
+    image[block(6, 4, 3, 2)] = 7  # where the run has nothing
+    np.savez(truth.with_name("lab.labels.npz"), labels=np.stack([image.reshape(10, 10)] * 3))
+    assert f"is {truth} of the same recording?" in shapecat("compare", run, truth).output
+
+
 def test_frames_of_one_side_alone_are_told_with_that_side(
     shapecat: Run, run: Path, truth: Path
 ) -> None:

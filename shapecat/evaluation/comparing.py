@@ -36,6 +36,8 @@ from shapecat.types import Frame
 __all__ = ["Comparison", "compare"]
 
 _PICTURES = 12
+_DOUBTFUL = 0.1
+"""With a smaller fraction of the objects matched, the reference may be of another recording."""
 
 
 @dataclass(frozen=True)
@@ -120,6 +122,8 @@ def compare(
             observe("compare", done, total)
     if not tally.compared:
         raise RecordingError(_nothing_in_common(finished, reference, other))
+    if _hardly_matches(tally.rows):
+        notes.append(f"Hardly any object matches: is {reference} of the same recording?")
     return Comparison(
         run=str(folder),
         reference=str(reference),
@@ -145,6 +149,13 @@ def _nothing_in_common(finished: FinishedRun, reference: Path, other: Reference)
         f"{reference}: no frame in common with {finished.folder}: it has "
         f"{other.describe_frames()}, the run {own}; is it of another recording?"
     )
+
+
+def _hardly_matches(rows: Sequence[Difference]) -> bool:
+    """Return whether both sides have objects, of which few match."""
+    found, true = (Counter(row.difference for row in rows)[kind] for kind in ("surplus", "missed"))
+    matched = len(rows) - found - true
+    return min(found, true) > 0 and matched < _DOUBTFUL * (matched + min(found, true))
 
 
 def _clouds(
