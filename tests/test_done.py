@@ -80,6 +80,25 @@ def test_a_file_that_cannot_be_read_is_not_passed_over(
     assert found.left_out == 1
 
 
+def test_a_folder_that_may_not_be_read_does_not_end_the_search(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
+) -> None:
+    """The root of a disk has a folder lost+found, which only an administrator may read."""
+    (tmp_path / "lost+found").mkdir()
+    (tmp_path / "z.mcap").write_bytes(b"\x89MCAP")
+    listed = Path.iterdir
+
+    def refuse(path: Path) -> Any:
+        if path.name == "lost+found":
+            raise PermissionError(13, "Permission denied", str(path))
+        return listed(path)
+
+    monkeypatch.setattr(Path, "iterdir", refuse)
+
+    assert [kept.stem for kept in find_recordings([str(tmp_path)]).kept] == ["z"]
+    assert caplog.messages == [f"{tmp_path / 'lost+found'}: skipped: Permission denied"]
+
+
 def test_files_of_a_bag_are_not_counted_as_skipped(tmp_path: Path) -> None:
     """A pattern names them beside the bag that they belong to."""
     bag, note = tmp_path / "bag", tmp_path / "note.txt"

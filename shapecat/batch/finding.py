@@ -1,5 +1,6 @@
 """Find the recordings that a user names: files, folders, URLs."""
 
+import logging
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from contextlib import suppress
 from dataclasses import dataclass
@@ -13,6 +14,8 @@ from shapecat.errors import RecordingError
 from shapecat.recordings import open_recording
 
 __all__ = ["Found", "Source", "find_recordings", "look_at"]
+
+_log = logging.getLogger(__name__)
 
 SUFFIXES = {".mcap", ".bag", ".db3"}
 _GAP_NS = 10**10
@@ -166,10 +169,13 @@ def _is_bag(folder: Path) -> bool:
     ROS 2 names the parts of a bag a/a_0.mcap, a/a_1.mcap, ... In a folder of another name, such
     files may be different takes, unless they follow each other in time, or one is compressed.
     """
-    if (folder / "metadata.yaml").exists():
-        return True
-    paths = list(folder.iterdir())
-    if any(path.is_dir() for path in paths):
+    try:
+        if (folder / "metadata.yaml").exists():
+            return True
+        paths = list(folder.iterdir())
+        if any(path.is_dir() for path in paths):
+            return False
+    except OSError:  # reported by the search
         return False
     names = {path.name.removesuffix(".zstd") for path in paths if path.is_file()}
     parts = {name for name in names if PurePosixPath(name).suffix in SUFFIXES}
@@ -195,15 +201,20 @@ def _adjoin(paths: Sequence[Path]) -> bool:
 
 
 def _search(folder: Path) -> Iterator[Path]:
-    """Yield the recordings below a folder, sorted by name in each folder."""
-    if (folder / "run.json").exists():
+    """Yield the recordings below a folder, sorted by name in each folder.
+
+    A folder that may not be read, such as ``lost+found``, is skipped, and reported.
+    """
+    try:
+        paths = [] if (folder / "run.json").exists() else sorted(folder.iterdir())
+        found = [(path, path.is_dir()) for path in paths if not path.name.startswith(".")]
+    except OSError as error:
+        _log.error("%s: skipped: %s", folder, error.strerror or error)
         return
-    for path in sorted(folder.iterdir()):
-        if path.name.startswith("."):
-            continue
-        if _searchable(path):
+    for path, is_folder in found:
+        if is_folder and not _is_bag(path):
             yield from _search(path)
-        elif path.is_dir() or path.suffix in SUFFIXES:
+        elif is_folder or path.suffix in SUFFIXES:
             yield path
 
 
