@@ -114,6 +114,7 @@ def test_the_painted_image_agrees_with_projected_points() -> None:
         ("plumb_bob", (0.11, -0.24, 0.012, -0.021, 0.08)),
         ("rational_polynomial", (0.21, -0.14, 0.012, -0.021, 0.08, 0.3, -0.05, 0.07)),
         ("equidistant", (0.03, -0.02, 0.05, -0.04)),
+        ("fisheye", (0.03, -0.02, 0.05, -0.04)),  # another name of the same model
     ],
 )
 def test_points_land_where_the_lens_model_says(model: str, coefficients: tuple[float, ...]) -> None:
@@ -191,6 +192,36 @@ def test_what_is_a_little_nearer_hides_an_object() -> None:
     row = mask.full(240, 320)[60]
     assert abs(np.flatnonzero(row)[0] - (69.5 + 98 / 0.9)) <= 4  # a cell of 4 pixels
     assert abs(np.flatnonzero(row)[-1] - (129.5 + 98)) <= 2
+
+
+def test_what_is_far_from_an_object_in_the_depth_image_may_hide_it() -> None:
+    """A post near the camera moves much farther between the two images than what it hides."""
+    depth = np.full((120, 160), 2.0, np.float32)
+    depth[:, 10:40] = 0.5
+    frame = Frame("", 0, 0, 0, "", depth=depth, camera=DEPTH)
+    board = np.arange(depth.size).reshape(depth.shape)[40:90, 100:131].ravel()
+    lens = LensCamera(Camera(320, 240, 140.0, 141.0, 80.3, 58.9))
+    (mask,) = dense_masks(frame, [board], lens, Pose(np.eye(3), np.array([0.4, 0.0, 0.0])))
+
+    # By 56 / 0.5 pixels, to columns 122 to 151; the board by 56 / 2, to columns 128 to 158.
+    assert np.abs(np.subtract((mask.left, mask.left + mask.box[2]), (152, 159))).max() <= 4
+
+
+def test_a_slit_is_open_if_something_is_seen_through_it() -> None:
+    """What has no depth between two parts is a gap to be closed; a wall between them is not."""
+    closed, opened = np.full((2, 120, 160), 1.0, np.float32)
+    inside = np.zeros((120, 160), bool)
+    inside[30:90, 40:110] = True
+    inside[:, 70:73] = False
+    closed[:, 70:73], opened[:, 70:73] = 0, 1.4
+    found = []
+    for depth in (closed, opened):
+        frame = Frame("", 0, 0, 0, "", depth=depth, camera=DEPTH)
+        (mask,) = dense_masks(frame, [np.flatnonzero(inside)])
+        found.append(mask.full(120, 160)[35:85, 70:73])
+
+    assert found[0].all()
+    assert not found[1].any()
 
 
 @pytest.mark.parametrize(
@@ -340,6 +371,16 @@ def test_outlines_move_to_the_edges_of_the_colours(top: int, left: int) -> None:
     assert wrong.sum() <= 8  # of 160 and more; corners may be rounded
     (finer,) = snapped([Mask(left, top, np.ones((40, 40), bool))], pixels, 2.0)
     assert (finer.full(80, 100) ^ inside).sum() <= 16
+
+
+def test_outlines_move_to_faint_edges_in_fine_images() -> None:
+    """Three times as fine as depth, 7 pixels are little; colours differ by one deviation."""
+    inside = np.zeros((110, 130), bool)
+    inside[25:85, 35:95] = True
+    pixels = np.where(inside[..., None], (128, 138, 148), (120, 130, 140)).astype(np.uint8)
+    (mask,) = snapped([Mask(28, 25, np.ones((60, 60), bool))], pixels, 3.0)
+
+    assert (mask.full(110, 130) ^ inside).sum() <= 160  # of 840
 
 
 @pytest.mark.parametrize("turned", [False, True])
