@@ -27,7 +27,6 @@ from shapecat.executors import (
     open_executor,
     post,
     share_cores,
-    usable_cores,
 )
 from shapecat.executors.dask import _DaskExecutor
 from shapecat.executors.order import Processes
@@ -118,12 +117,18 @@ def test_what_cannot_be_received_costs_its_worker_alone() -> None:
 
 def test_workers_use_the_threads_they_are_given() -> None:
     """Two workers with two threads each would slow each other down on two cores."""
-    before = os.environ.get("OMP_NUM_THREADS")
     with LocalExecutor(1, threads=3) as one:
         assert one.submit(os.getenv, "OMP_NUM_THREADS").result() == "3"
-    assert os.environ.get("OMP_NUM_THREADS") == before
+
+
+def test_this_process_has_its_own_threads_back(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Libraries that are loaded later would stay as slow as those of the workers."""
+    monkeypatch.setenv("OMP_NUM_THREADS", "7")
+    monkeypatch.delenv("MKL_NUM_THREADS", raising=False)
     with limited_threads(5):
-        assert os.environ["OMP_NUM_THREADS"] == "5"
+        assert (os.environ["OMP_NUM_THREADS"], os.environ["MKL_NUM_THREADS"]) == ("5", "5")
+
+    assert (os.environ["OMP_NUM_THREADS"], "MKL_NUM_THREADS" in os.environ) == ("7", False)
 
 
 def test_terminate_kills_running_tasks(tmp_path: Path) -> None:
@@ -184,15 +189,26 @@ def test_mailbox_hands_on_what_is_posted_and_never_waits(tmp_path: Path) -> None
     post(str(tmp_path / "no such place"), "nor here")
 
 
-def test_cores_are_shared_between_recordings_and_their_frames() -> None:
-    cores = usable_cores()
-    assert share_cores(1, 40) == (1, 1)
-    assert share_cores(cores, 1) == (1, cores)
-    assert share_cores(None, 0) == (1, cores)
-    for jobs in range(1, 2 * cores):
-        workers, threads = share_cores(jobs, 3)
-        assert workers * threads <= max(jobs, 1)
-        assert threads == 1 or workers * threads <= cores
+@pytest.mark.parametrize(
+    ("jobs", "recordings", "expected"),
+    [
+        (None, 0, (1, 8)),
+        (None, 1, (1, 8)),
+        (None, 3, (3, 2)),
+        (None, 40, (8, 1)),
+        (1, 40, (1, 1)),
+        (5, 2, (2, 2)),
+        (20, 3, (3, 2)),  # of the cores that there are, not of those that were asked for
+        (20, 40, (20, 1)),
+    ],
+)
+def test_cores_are_shared_between_recordings_and_their_frames(
+    monkeypatch: pytest.MonkeyPatch, jobs: int | None, recordings: int, expected: tuple[int, int]
+) -> None:
+    """With more processes than cores, all of them are slower."""
+    monkeypatch.setattr("shapecat.executors.cores.usable_cores", lambda: 8)
+
+    assert share_cores(jobs, recordings) == expected
 
 
 def test_executors_that_are_not_there_are_named(monkeypatch: pytest.MonkeyPatch) -> None:
