@@ -16,7 +16,7 @@ from shapecat.batch.ledger import Ledger, Outcome
 from shapecat.batch.manifest import Entry, Manifest, RemoteManifest, State
 from shapecat.batch.plans import Shard, name_folders, plan_batch
 from shapecat.batch.remote import Ticket
-from shapecat.batch.runs import exit_code, process_on
+from shapecat.batch.runs import exit_code, process_here, process_on
 from shapecat.batch.storage import Location, content_key
 from shapecat.config import Settings, with_overrides
 from shapecat.errors import OutputError
@@ -639,6 +639,29 @@ def test_the_largest_recordings_begin_first(
         list(process_on(executor, batch.tasks, watcher))
 
     assert executor.names == ["b", "c", "a"]
+
+
+def test_a_recording_is_noted_as_complete_before_its_outcome_is_told(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Whoever stops the batch at this moment must not have to repeat it."""
+    monkeypatch.setattr("shapecat.batch.plans.load_model", lambda _path: MODEL)
+    counts = {"frames": 3, "tracks": {"cup": 2}}
+
+    def attempt(job: Job, *_: object, **__: object) -> Outcome:
+        return Outcome(job, Summary(job.name, job.folder, counts, 1.5, ()))
+
+    monkeypatch.setattr("shapecat.batch.runs.attempt", attempt)
+    for name in ("a", "b"):
+        (tmp_path / f"{name}.mcap").write_bytes(b"\x89MCAP")
+    watcher, out = SimpleNamespace(ended=lambda _outcome: None), tmp_path / "out"
+    with plan_batch(Job(Path(), Path()), [str(tmp_path)], str(out)) as batch:
+        first = next(process_here(batch.tasks, watcher, manifest=batch.manifest))
+        noted = Manifest(out / "manifest.jsonl").entries
+
+    assert {name: entry.state for name, entry in noted.items()} == {
+        first.job.folder.name: "complete", "b": "planned"
+    }  # fmt: skip
 
 
 def test_recordings_of_one_name_have_folders_of_their_own() -> None:

@@ -384,6 +384,29 @@ def test_a_dead_process_is_followed_and_a_late_one_ends(made: Path, bucket: Path
     assert len(requests(bucket, "PUT", "/late/run/run.json")) == 1
 
 
+def test_a_run_that_is_taken_over_while_it_is_uploaded_is_not_completed(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Its run.json would make a whole run of files from two processes."""
+    url, sent = "memory://taken/run", Location.upload
+    made, followers = tmp_path / "run", list[claims.Claim]()
+    made.mkdir()
+    for name in ("frames.parquet", "run.json", "tracks.csv"):
+        (made / name).write_text(name)
+
+    def lose(self: Location, file: Path) -> None:
+        sent(self, file)
+        followers.append(claims.Claim(url, "one"))
+
+    monkeypatch.setattr(Location, "upload", lose)
+    first = claims.Claim(url, "one")
+    with pytest.raises(OutputError, match="taken over"):
+        upload(made, url, first)
+
+    assert files(url) == {"frames.parquet", "tracks.csv"}
+    followers[-1].require()
+
+
 def test_a_batch_follows_its_own_dead_at_once(bucket: Path) -> None:
     first = claims.Claim("s3://lab/same/run", "one")
     second = claims.Claim("s3://lab/same/run", "one")
