@@ -32,6 +32,7 @@ from shapecat.evaluation.comparing import (
     _Tally,
     compare,
 )
+from shapecat.evaluation.comparison_figures import Pairs, figures_of
 from shapecat.evaluation.comparison_matching import (
     Difference,
     Matched,
@@ -155,6 +156,21 @@ def test_a_crowd_of_coco_is_no_object_to_be_named() -> None:
     pixels = labels.items[0].pixels
     assert pixels is not None
     assert pixels.tolist() == [1, 2, 5, 6]
+
+
+@pytest.mark.parametrize("own", [{"track_id": 7}, {"attributes": {"track_id": 7, "x": 3}}])
+def test_tracks_of_coco_are_read_where_tools_write_them(own: dict[str, Any]) -> None:
+    """CVAT writes them as an attribute. If one object has none, identities are not judged."""
+    item = {"id": 1, "image_id": 2, "category_id": 4, "segmentation": [[1, 0, 3, 0, 3, 2, 1, 2]]}
+    images = [{"id": 2, "frame": 5, "width": 4, "height": 3}]
+    content = {"categories": [{"id": 4, "name": "cup"}], "images": images}
+    labels = CocoLabels(Path("x.json"), {**content, "annotations": [{**item, **own}]})
+    mixed = CocoLabels(Path("x.json"), {**content, "annotations": [{**item, **own}, item]})
+    found = labels.at(("/d", 5), 0)
+
+    assert found is not None
+    assert [known.track for known in found.items] == [7]
+    assert (labels.tracked, mixed.tracked) == (True, False)
 
 
 @pytest.fixture
@@ -616,6 +632,17 @@ def test_truth_of_another_recording_is_doubted(shapecat: Run, run: Path, truth: 
     assert f"is {truth} of the same recording?" in shapecat("compare", run, truth).output
 
 
+def test_an_object_with_a_wrong_category_is_found_nevertheless() -> None:
+    """Without masks, what is found is counted by the differences."""
+    kinds = [None, "category", "identity", "missed", "missed", "surplus", "missed", "surplus"]
+    rows = [Difference("/d", 0, START, kind) for kind in kinds]
+    figures = figures_of(
+        {}, Pairs(), overlap=None, seen=None, rows=rows, categories=NAMES, threshold=0.25
+    )
+
+    assert figures["objects"] == {"true": 6, "detections": 5, "found": 3, "share_found": 0.5}
+
+
 def test_frames_of_one_side_alone_are_told_with_that_side(
     shapecat: Run, run: Path, truth: Path
 ) -> None:
@@ -794,6 +821,20 @@ def test_types_of_kitti_are_the_categories_of_the_run(run: Path) -> None:
     assert found.figures["box_iou"] == {"n": 2, "mean": 1}
     assert [row.true_category for row in found.rows] == ["wine_glass", "tea pot"]
     assert found.as_dict()["differences"] == {}
+
+
+def test_regions_that_kitti_does_not_care_about_are_no_objects(tmp_path: Path) -> None:
+    """Lines as in KITTI's own data, which has neither frames.csv nor spaces in types."""
+    (tmp_path / "label_2").mkdir()
+    lines = (
+        "Car 0.00 0 -1.58 587.01 173.33 614.12 200.12 1.65 1.67 3.64 -0.65 1.71 46.70 -1.59",
+        "DontCare -1 -1 -10 503.89 169.71 590.61 190.13 -1 -1 -1 -1000 -1000 -1000 -10",
+    )
+    (tmp_path / "label_2" / "000012.txt").write_text("\n".join(lines))
+    found = KittiLabels(tmp_path).at(("/d", 12), START)
+
+    assert found is not None
+    assert [item.category for item in found.items] == ["Car"]
 
 
 def test_labels_of_two_topics_are_not_mixed(tmp_path: Path) -> None:

@@ -671,6 +671,13 @@ def test_recordings_of_one_name_have_folders_of_their_own() -> None:
     assert folders == ["a_x", "b_x", "a_x_3", "y"]
 
 
+def test_a_new_recording_does_not_get_the_folder_of_an_older_one() -> None:
+    """Both would be written to one folder, and one of them lost."""
+    folders = name_folders(["x", "x", "x"], ["a", "a", "b"], {1: "a_x"})
+
+    assert folders == ["a_x_1", "a_x", "b_x"]
+
+
 def test_a_run_keeps_its_folder_when_a_recording_of_its_name_is_added(
     tmp_path: Path,
 ) -> None:

@@ -189,7 +189,9 @@ def test_a_model_is_calibrated_on_instances_it_had_not_seen(
 
 
 def test_a_category_is_added(trained: Path, tmp_path: Path) -> None:
-    learn_on_folder(trained, write_dataset(tmp_path / "new", ("plate",)), tmp_path / "m.npz")
+    """Crops of unknown objects lie beside those of the new category, but are none."""
+    dataset = write_dataset(tmp_path / "new", ("plate", "unknown"))
+    learn_on_folder(trained, dataset, tmp_path / "m.npz")
     test = write_dataset(tmp_path / "test", ("box", "ball", "plate"), instances=3, seed=5)
 
     report = evaluate_folder(test, tmp_path / "m.npz")
