@@ -2,6 +2,7 @@
 
 import hashlib
 import json
+from dataclasses import replace
 from itertools import pairwise
 from pathlib import Path
 from typing import Any, Literal, get_args
@@ -123,6 +124,9 @@ def test_frames_of_a_turntable_turn_the_things_not_the_table() -> None:
     assert np.linalg.norm(first.translation - last.translation) > 0.005
     assert first.translation[2] == last.translation[2]
     assert np.array_equal(world.path[0].translation, world.path[29].translation)
+    assert world.turns is not None
+    back = replace(world, turns=world.turns[::-1])  # ends where the other begins
+    np.testing.assert_array_equal(back.geometry(29).vertices, world.geometry(0).vertices)
 
 
 def test_scene_does_not_depend_on_the_number_of_frames() -> None:

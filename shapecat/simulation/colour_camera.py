@@ -20,15 +20,10 @@ __all__ = ["COLOUR", "ColourCamera", "jpeg", "render_colour"]
 
 @dataclass(frozen=True)
 class ColourCamera:
-    """A colour camera mounted beside the depth camera.
-
-    ``depth_from_colour`` is its pose in the optical frame of the depth camera, ``quality`` the JPEG
-    quality of its images, 1 to 95.
-    """
+    """A colour camera beside the depth camera, at ``depth_from_colour`` in its optical frame."""
 
     lens: LensCamera
     depth_from_colour: Pose
-    quality: int = 85
 
 
 COLOUR = ColourCamera(
@@ -52,16 +47,16 @@ _FINE = 2
 """Oversampling of the rendered pinhole image, which the rays of the lens then sample."""
 
 
-def render_colour(world: World, frame: int, camera: ColourCamera = COLOUR) -> tuple[U1, U1]:
-    """Render a frame of a world as the colour camera beside the depth camera sees it.
+def render_colour(world: World, frame: int) -> tuple[U1, U1]:
+    """Render a frame of a world as the camera `COLOUR` beside the depth camera sees it.
 
     Returns
     -------
     The image (h, w, 3), uint8 red, green, blue; and its labels (h, w), uint8: those of
     ``world.labels``, 0 where nothing is seen.
     """
-    pose = compose(world.path[frame], camera.depth_from_colour)
-    fine, rows, columns = _lookup(camera.lens)
+    pose = compose(world.path[frame], COLOUR.depth_from_colour)
+    fine, rows, columns = _lookup(COLOUR.lens)
     image = render(world.geometry(frame), fine, pose)
     owners = image.owners[rows, columns]
     colours = _paint(world, frame, pose, fine, image, rows, columns)
@@ -166,10 +161,10 @@ def _colour_in(
                 colours[i, j, k] = min(max(np.floor(value + 0.5), 0.0), 255.0)
 
 
-def jpeg(colours: U1, quality: int = 85) -> bytes:
-    """Encode an image (h, w, 3), uint8, as JPEG; ``quality`` is from 1 to 95."""
+def jpeg(colours: U1) -> bytes:
+    """Encode an image (h, w, 3), uint8, as JPEG."""
     from PIL import Image as Picture  # noqa: PLC0415  # only for colour
 
     file = io.BytesIO()
-    Picture.fromarray(colours).save(file, "jpeg", quality=quality)
+    Picture.fromarray(colours).save(file, "jpeg", quality=85)
     return file.getvalue()

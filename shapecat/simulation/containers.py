@@ -1,8 +1,8 @@
 """The container formats of simulated recordings."""
 
-from abc import ABC, abstractmethod
+from collections.abc import Callable
 from pathlib import Path
-from typing import Any, ClassVar, Literal, Protocol, Self
+from typing import Any, Self, TypeAlias
 
 from mcap.writer import CompressionType
 from mcap.writer import Writer as McapFile
@@ -27,23 +27,8 @@ _QOS = """- history: {history}
 """
 
 
-class Container(Protocol):
-    """A recording being written; leaving the ``with`` block completes it."""
-
-    messages: MessageFactory
-
-    def __init__(self, path: Path) -> None: ...
-
-    def __enter__(self) -> Self: ...
-
-    def __exit__(self, *_: object) -> None: ...
-
-    def write(self, topic: str, message: Any, log_time_ns: int) -> None:
-        """Append a message made by `messages`; times are in nanoseconds."""
-
-
 class _Mcap:
-    """An MCAP file with ROS 2 messages, compressed with zstd."""
+    """An MCAP file with ROS 2 messages, compressed with zstd; leaving ``with`` completes it."""
 
     def __init__(self, path: Path) -> None:
         self.messages = MessageFactory(2)
@@ -75,23 +60,15 @@ class _Mcap:
         return int(self._file.register_channel(topic, "cdr", schema, {"offered_qos_profiles": qos}))
 
 
-class _Bag(ABC):
-    """A recording written by rosbags."""
+class _Bag:
+    """A recording written by rosbags; leaving the ``with`` block completes it."""
 
-    ros_version: ClassVar[Literal[1, 2]]
-
-    def __init__(self, path: Path) -> None:
-        self.messages = MessageFactory(self.ros_version)
-        self._file = self.open(path)
+    def __init__(
+        self, ros_version: int, writer: Any, quality: Callable[..., dict[str, Any]]
+    ) -> None:
+        self.messages = MessageFactory(ros_version)
+        self._file, self._quality = writer, quality
         self._connections: dict[str, Any] = {}
-
-    @abstractmethod
-    def open(self, path: Path) -> Any:
-        """Return the writer of a new recording."""
-
-    @abstractmethod
-    def quality(self, *, latched: bool) -> dict[str, Any]:
-        """Return the options of a topic; a latched one resends its last message to subscribers."""
 
     def __enter__(self) -> Self:
         self._file.open()
@@ -103,34 +80,21 @@ class _Bag(ABC):
     def write(self, topic: str, message: Any, log_time_ns: int) -> None:
         if topic not in self._connections:
             kind, store = message.__msgtype__, self.messages.typestore
-            quality = self.quality(latched=topic == _STATIC)
+            quality = self._quality(topic == _STATIC)
             added = self._file.add_connection(topic, kind, typestore=store, **quality)
             self._connections[topic] = added
         self._file.write(self._connections[topic], log_time_ns, self.messages.serialize(message))
 
 
-class _Ros1(_Bag):
-    """A ROS 1 bag."""
-
-    ros_version = 1
-
-    def open(self, path: Path) -> Any:
-        return Ros1File(path)
-
-    def quality(self, *, latched: bool) -> dict[str, Any]:
-        return {"latching": int(latched)}
+def _ros1(path: Path) -> _Bag:
+    """Return a ROS 1 bag."""
+    return _Bag(1, Ros1File(path), lambda latched: {"latching": int(latched)})
 
 
-class _Ros2(_Bag):
-    """A ROS 2 bag: a folder with an SQLite database."""
-
-    ros_version = 2
-
-    def open(self, path: Path) -> Any:
-        return Ros2Folder(path, version=8)
-
-    def quality(self, *, latched: bool) -> dict[str, Any]:
-        return {"offered_qos_profiles": [_qos(latched=latched)]}
+def _ros2(path: Path) -> _Bag:
+    """Return a ROS 2 bag: a folder with an SQLite database."""
+    file = Ros2Folder(path, version=8)
+    return _Bag(2, file, lambda latched: {"offered_qos_profiles": [_qos(latched=latched)]})
 
 
 def _qos(*, latched: bool) -> ros.Qos:
@@ -147,9 +111,12 @@ def _qos(*, latched: bool) -> ros.Qos:
     )
 
 
-CONTAINERS: dict[str, tuple[str, type[Container]]] = {
+Container: TypeAlias = _Mcap | _Bag
+"""A recording being written: its ``messages`` make what ``write`` appends, at a log time in ns."""
+
+CONTAINERS: dict[str, tuple[str, Callable[[Path], Container]]] = {
     "mcap": (".mcap", _Mcap),
-    "ros1": (".bag", _Ros1),
-    "ros2": ("", _Ros2),
+    "ros1": (".bag", _ros1),
+    "ros2": ("", _ros2),
 }
 """File suffix and writer of each recording format."""

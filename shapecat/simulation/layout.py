@@ -123,10 +123,10 @@ class Layout:
                 return True
         return False
 
-    def room_for(self, k: int, support: Support, half: F8, *, tries: int = 200) -> F8 | None:
+    def room_for(self, k: int, support: Support, half: F8) -> F8 | None:
         """Reserve a second position for object ``k``, which keeps its first one.
 
-        The other parameters are as for `put_piece`.
+        ``half`` (2,) is as for `put`.
 
         Returns
         -------
@@ -134,7 +134,7 @@ class Layout:
         """
         thing, middle = self.things[k], support.outline[:, :2].mean(axis=0)
         first = self._places[k]
-        for _ in range(tries):
+        for _ in range(200):
             spot = np.round(middle + self._rng.uniform(-half, half), 6)
             place = np.array([*spot, thing.pose.translation[2]])
             here = first.moved(Pose(np.eye(3), place - thing.pose.translation))
@@ -143,12 +143,12 @@ class Layout:
                 return place
         return None
 
-    def _put_on_thing(self, piece: Piece, tries: int = 8) -> bool:
+    def _put_on_thing(self, piece: Piece) -> bool:
         bearers = [k for k in range(len(self.things)) if self._can_bear(k)]
         if not bearers or piece.category == "ball":
             return False
         resting = footprint(piece.mesh, piece.rest.pose)
-        for _ in range(tries):
+        for _ in range(8):
             k = bearers[int(self._rng.integers(len(bearers)))]
             below = self._places[k]
             slack = 0.25 * np.ptp(below.top, axis=0)

@@ -142,27 +142,15 @@ def hold(
     return (looking_at(eye, target, roll=float(np.radians(rng.normal(0, 1.0)))),) * frames
 
 
-def scattered(
-    rng: Generator,
-    target: F8,
-    count: int,
-    *,
-    distance: tuple[float, float] = (0.5, 2.0),
-    elevation: tuple[float, float] = (15.0, 60.0),
-) -> tuple[Pose, ...]:
-    """Aim a camera at a target from random directions.
+def scattered(rng: Generator, target: F8, count: int) -> tuple[Pose, ...]:
+    """Aim a camera at a target from ``count`` random directions, 15 to 60 degrees above.
 
-    Parameters
-    ----------
-    target : (3,) metres, world frame.
-    count : number of poses.
-    distance : range of the distance to the target, metres.
-    elevation : range of the angle of the line of sight below the horizontal, degrees.
+    ``target`` (3,) is in metres, world frame; the distance to it is 0.5 to 2 m.
     """
     poses = []
     for _ in range(count):
-        up, side = np.radians(rng.uniform(*elevation)), rng.uniform(0, 2 * np.pi)
-        far = rng.uniform(*distance)
+        up, side = np.radians(rng.uniform(15.0, 60.0)), rng.uniform(0, 2 * np.pi)
+        far = rng.uniform(0.5, 2.0)
         direction = np.array([np.cos(up) * np.cos(side), np.cos(up) * np.sin(side), np.sin(up)])
         gaze = target + rng.uniform(-0.05, 0.05, 3) * far
         roll = float(np.radians(rng.normal(0, 2.0)))

@@ -78,10 +78,7 @@ def bin_picking(
     half = np.ptp(bottom.outline[:, :2], axis=0) / 2
     items = [make_item(category, rng, kinds) for category in categories]
     items = [item for item in items if item.mesh.extents.max() < 1.6 * half.min()]
-    drops = []
-    for item in items:
-        room = np.maximum(half - float(item.mesh.extents.max()) / 2 - 0.01, 0)
-        drops.append(Drop(item.mesh, _turned(rng), rng.uniform(-room, room)))
+    drops = _drops_within(rng, items, half)
     supports = (*make_room(rng, wall_chance=0.2), bottom, *sides)
     target = np.array([0, 0, bottom.height + 0.05])
     path = walk(rng, target, filming, distance=(0.6, 1.2), elevation=(60, 84), sweep=(10, 40))
@@ -101,10 +98,7 @@ def shelf_bin(
     room_m = top.mesh.vertices[:, 2].min() - board.height
     items = [make_item(category, rng, kinds) for category in categories]
     items = [i for i in items if (i.mesh.extents[:2] < 1.6 * half.min()).all()]
-    drops = []
-    for item in items:
-        room = np.maximum(half - float(item.mesh.extents.max()) / 2 - 0.01, 0)
-        drops.append(Drop(item.mesh, _turned(rng), rng.uniform(-room, room)))
+    drops = _drops_within(rng, items, half)
     supports = (*make_room(rng, wall_chance=0.0), board, *walls)
     things = settled(items, drops, supports, board, highest_m=float(room_m))
     target = np.array([0, 0, board.height + room_m / 3])
@@ -117,6 +111,15 @@ def make_item(category: str, rng: Generator, kinds: Sequence[str]) -> Item:
     if category == "unknown":
         return Item(category, *make_distractor(rng, str(rng.choice(list(kinds)))))
     return Item(category, category, make_object(category, rng))
+
+
+def _drops_within(rng: Generator, items: Sequence[Item], half: F8) -> list[Drop]:
+    """Return drops, in random rotations, onto an area of half size ``half`` (2,), metres."""
+    drops = []
+    for item in items:
+        room = np.maximum(half - float(item.mesh.extents.max()) / 2 - 0.01, 0)
+        drops.append(Drop(item.mesh, _turned(rng), rng.uniform(-room, room)))
+    return drops
 
 
 def _turned(rng: Generator) -> F8:

@@ -183,21 +183,18 @@ def _write_colour(writer: Container, world: World, frame: Frame) -> U1:
     lens, logged = COLOUR.lens, stamp + _LATENCY_NS + _LATENCY_NS // 2
     info = make.camera_info(lens.pinhole, stamp, _COLOUR_OPTICAL, lens.coefficients)
     writer.write("/camera/color/camera_info", info, logged)
-    image = make.compressed(jpeg(colours, COLOUR.quality), stamp, _COLOUR_OPTICAL)
+    image = make.compressed(jpeg(colours), stamp, _COLOUR_OPTICAL)
     writer.write("/camera/color/image_raw/compressed", image, logged)
     return labels
 
 
 def _truth(world: World, frame: Frame, labels: U1, sensor: Sensor, seed: int) -> dict[str, Any]:
-    truth = frame_truth(world, frame.index, labels, sensor)
     return {
         "frame": frame.index,
         "scene": f"sim{seed}",
         "kind": world.kind,
         "stamp_ns": frame.stamp_ns,
-        "objects": truth.objects,
-        "hidden": truth.hidden,
-        "planes": truth.planes,
+        **vars(frame_truth(world, frame.index, labels, sensor)),
     }
 
 

@@ -36,26 +36,21 @@ SceneKind = Literal[
 
 @dataclass(frozen=True)
 class _SceneSpec:
-    """Contents of a scene; if ``distractors`` is None, the kind of scene decides their number."""
+    """How a scene is filmed, and the categories of its objects."""
 
     filming: Filming
     categories: tuple[str, ...]
-    distractors: int | None
 
-    def draw(self, rng: Generator, count: int, *, usual: int = 0) -> list[str]:
-        """Return ``count`` categories, each once before any repeats, then the unknown objects.
-
-        ``usual`` is the number of unknown objects if the spec leaves it open.
-        """
+    def draw(self, rng: Generator, count: int, *, unknown: int = 0) -> list[str]:
+        """Return ``count`` categories, each once before any repeats, then the unknown objects."""
         first = [str(c) for c in rng.permutation(self.categories)]
         more = [str(c) for c in rng.choice(self.categories, max(0, count - len(first)))]
-        unknown = usual if self.distractors is None else self.distractors
         return [*(first + more)[:count], *["unknown"] * unknown]
 
     def poured(self, rng: Generator) -> list[str]:
         """Return the categories of 4 to 18 objects in random order, one in six unknown."""
         count = int(rng.integers(4, 19))
-        wanted = self.draw(rng, count - count // 6, usual=count // 6)
+        wanted = self.draw(rng, count - count // 6, unknown=count // 6)
         return [str(category) for category in rng.permutation(wanted)]
 
 
@@ -66,7 +61,6 @@ def make_scene(
     frames: int = 90,
     rate_hz: float = 30.0,
     categories: Sequence[str] = CATEGORIES,
-    distractors: int | None = None,
 ) -> World:
     """Make a random scene and a camera path through it.
 
@@ -74,7 +68,6 @@ def make_scene(
     ----------
     frames, rate_hz : number of frames, and frames per second; the objects do not depend on them.
     categories : categories to draw from; each appears at least once where there is room.
-    distractors : number of objects outside the categories; the kind of scene decides by default.
 
     Raises
     ------
@@ -83,7 +76,7 @@ def make_scene(
     if kind not in SCENES:
         msg = f"no scene {kind!r}; known: {', '.join(SCENES)}"
         raise ValueError(msg)
-    return SCENES[kind](rng, _SceneSpec(Filming(frames, rate_hz), tuple(categories), distractors))
+    return SCENES[kind](rng, _SceneSpec(Filming(frames, rate_hz), tuple(categories)))
 
 
 def make_stage(pieces: Sequence[Piece], rng: Generator, *, views: int = 8) -> World:
@@ -123,7 +116,7 @@ def _clutter(rng: Generator, spec: _SceneSpec) -> World:
     room, table = make_room(rng, wall_chance=0.2), make_table(rng)
     layout = Layout(rng, gap=0.01)
     half = rng.uniform([0.2, 0.16], [0.32, 0.24])
-    wanted = spec.draw(rng, int(rng.integers(7, 13)), usual=int(rng.integers(0, 3)))
+    wanted = spec.draw(rng, int(rng.integers(7, 13)), unknown=int(rng.integers(0, 3)))
     wanted.sort(
         key=lambda category: category not in {"box", "can"}
     )  # objects that can carry others come first
@@ -142,7 +135,7 @@ def _shelf(rng: Generator, spec: _SceneSpec) -> World:
     boards, sides = make_shelf(width, depth, low, step)
     layout = Layout(rng, gap=0.015, headroom=step - 0.05, enclosed=True)
     half = np.array([width / 2 - 0.06, depth / 2 - 0.03])
-    for k, category in enumerate(spec.draw(rng, 12, usual=int(rng.integers(0, 2)))):
+    for k, category in enumerate(spec.draw(rng, 12, unknown=int(rng.integers(0, 2)))):
         layout.put(category, boards[k % 3], half, stack=0.5 if k > 5 else 0.0, attempts=8)
     target = np.array([0, 0, low + 1.15 * step])
     path = walk(

@@ -21,7 +21,6 @@ def render_frame(
     sensor: Sensor = KINECT,
     rate_hz: float = 30.0,
     start_ns: int = 0,
-    topic: str = "/camera/depth/image_raw",
 ) -> tuple[Frame, U1]:
     """Render one depth image of a world.
 
@@ -42,6 +41,7 @@ def render_frame(
     depth, owners = measure(image, sensor, rng)
     labels = np.take(np.append(world.labels, np.uint8(0)), owners, mode="wrap")  # -1 is the last
     stamp = start_ns + round(index * 1e9 / rate_hz)
+    topic = "/camera/depth/image_raw"
     frame = Frame(
         topic, index, stamp, stamp, "camera_depth_optical_frame", depth=depth, camera=sensor.camera
     )

@@ -136,7 +136,8 @@ class World(Record):
 
     def geometry(self, frame: int) -> Geometry:
         """Return all triangles of a frame, in the world frame; owners index `labels`."""
-        return self._gather(frame) if self.motions or self._turn(frame) else self._still
+        moves = self.motions or self.turns is not None
+        return self._gather(frame) if moves else self._still
 
     @cached_property
     def labels(self) -> U1:
