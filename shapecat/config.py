@@ -22,9 +22,6 @@ __all__ = [
     "with_settings",
 ]
 
-_MOST_FUSED = 30
-_LARGEST_BLOCK = 64
-
 
 @dataclass(frozen=True)
 class DetectionSettings:
@@ -44,9 +41,7 @@ class DetectionSettings:
 
     def __post_init__(self) -> None:
         """Reject a ``fuse_frames`` that is out of range."""
-        if not 1 <= self.fuse_frames <= _MOST_FUSED:
-            msg = f"detection.fuse_frames must be from 1 to {_MOST_FUSED}, got {self.fuse_frames}"
-            raise ConfigError(msg)
+        _check_range("detection.fuse_frames", self.fuse_frames, 1, 30)
 
 
 @dataclass(frozen=True)
@@ -68,6 +63,14 @@ class SurfaceSettings:
     smooth_radius_m: float = 0.0
     """Radius of moving least squares smoothing, applied to the averages of the voxels, for example
     0.015 (thesis 4.2); 0 turns it off."""
+
+    def __post_init__(self) -> None:
+        """Reject numbers and lengths that are out of range."""
+        # When distances are compared, the index of a neuron replaces their 10 lowest bits.
+        _check_range("surface.neurons", self.neurons, 3, 512)
+        _check_range("surface.voxel_m", self.voxel_m, 0.0001, 1.0)
+        if self.smooth_radius_m != 0:
+            _check_range("surface.smooth_radius_m, if not 0,", self.smooth_radius_m, 0.0001, 1.0)
 
 
 @dataclass(frozen=True)
@@ -118,9 +121,7 @@ class Settings:
 
     def __post_init__(self) -> None:
         """Reject a ``reuse_frames`` that is out of range."""
-        if not 1 <= self.reuse_frames <= _LARGEST_BLOCK:
-            msg = f"reuse_frames must be from 1 to {_LARGEST_BLOCK}, got {self.reuse_frames}"
-            raise ConfigError(msg)
+        _check_range("reuse_frames", self.reuse_frames, 1, 64)
 
     def as_dict(self) -> dict[str, Any]:
         """Return the settings as nested dictionaries, as stored in the outputs."""
@@ -183,6 +184,12 @@ def with_overrides(settings: Settings, overrides: Sequence[str]) -> Settings:
             tree = {part: tree}
         settings = _build(settings, tree, "")
     return settings
+
+
+def _check_range(name: str, value: float, least: float, most: float) -> None:
+    if not least <= value <= most:
+        msg = f"{name} must be from {least} to {most}, got {value}"
+        raise ConfigError(msg)
 
 
 def _parse_value(text: str) -> Any:

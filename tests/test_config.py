@@ -31,6 +31,9 @@ def test_file_then_overrides(tmp_path: Path) -> None:
         ("tracking.gate_m=true", "must be of type float"),
         ("tracking.fusion=median", "must be one of mean"),
         ("tracking=1", "group of settings"),
+        ("surface.neurons=513", "surface.neurons must be from 3 to 512, got 513"),
+        ("surface.voxel_m=0", "surface.voxel_m must be from 0.0001 to 1.0, got 0.0"),
+        ("surface.smooth_radius_m=1e-9", "if not 0, must be from 0.0001"),
         ("tracking.gate_m", "expected name=value"),
     ],
 )

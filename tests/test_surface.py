@@ -12,7 +12,6 @@ from shapecat.arrays import F4, F8, I4
 from shapecat.config import SurfaceSettings
 from shapecat.jit import kernel
 from shapecat.surface import MIN_POINTS, reconstruct, voxelize
-from shapecat.surface.gas import MAX_NEURONS
 from shapecat.surface.graph import link
 from shapecat.surface.growth import Cloud, Rates, grow_fritzke
 from shapecat.surface.lanes import adapt, three_nearest, two_nearest
@@ -188,11 +187,9 @@ def test_a_point_that_is_not_finite_is_refused(method: Method, value: float) -> 
         reconstruct(points, settings=surface(method), rng=rng())
 
 
-def test_refuses_wrong_shapes_and_too_many_neurons() -> None:
+def test_refuses_wrong_shapes() -> None:
     with pytest.raises(ValueError, match="shape"):
         reconstruct(np.zeros((50, 2), np.float32), settings=SMALL, rng=rng())
-    with pytest.raises(ValueError, match="at most"):
-        reconstruct(half_sphere(), settings=SurfaceSettings(neurons=MAX_NEURONS + 1), rng=rng())
 
 
 def test_a_small_separate_part_is_dropped_and_a_large_one_joined() -> None:

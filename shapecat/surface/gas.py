@@ -12,13 +12,10 @@ from shapecat.surface.growth import Cloud, Rates, grow_fritzke, grow_thesis
 from shapecat.surface.neurons import FAR, Gas, connect, empty_gas
 from shapecat.types import NeuralGas
 
-__all__ = ["MAX_NEURONS", "MIN_POINTS", "reconstruct"]
+__all__ = ["MIN_POINTS", "reconstruct"]
 
 MIN_POINTS = 24
 """Minimum number of points from which a surface is learned."""
-MAX_NEURONS = 512
-"""Maximum number of neurons in the settings: the 10 lowest bits of a distance are replaced by the
-index of a neuron when distances are compared."""
 _MAX_POINTS = 1200
 """Maximum number of points used, every k-th of a larger cloud: more only make the gas slower."""
 _NEURONS_PER_POINT = 0.45
@@ -58,8 +55,7 @@ def reconstruct(
 
     Raises
     ------
-    ValueError : the points are not (m, 3) or not finite, or the settings ask for more than
-        `MAX_NEURONS` neurons.
+    ValueError : the points are not (m, 3) or not finite.
 
     Notes
     -----
@@ -70,9 +66,6 @@ def reconstruct(
     points = np.ascontiguousarray(points, np.float32).view()
     if points.ndim != 2 or points.shape[1] != 3:
         msg = f"expected points of shape (m, 3), got {points.shape}"
-        raise ValueError(msg)
-    if settings.neurons > MAX_NEURONS:
-        msg = f"at most {MAX_NEURONS} neurons, got {settings.neurons}"
         raise ValueError(msg)
     if len(points) < MIN_POINTS:
         return None
