@@ -1,6 +1,7 @@
 """Colour streams: found, decoded, paired in time, and registered to the depth camera."""
 
 from collections import Counter
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
@@ -71,11 +72,15 @@ def static(parent: str, child: str, translation: Any, quaternion: Any, stamp: in
 
 
 def beside(
-    path: Path, *more: tuple[str, int, Any], frame_id: str = "color_optical", **written: Any
+    path: Path,
+    *more: tuple[str, int, Any],
+    frame_id: str = "color_optical",
+    distortion: Sequence[float] = (0.1, -0.2, 0.001, 0.002, 0.0),
+    **written: Any,
 ) -> Path:
     """Write a depth image with a colour image of another camera."""
     items = depth_items(EPOCH)
-    items += [("/cam/color/camera_info", EPOCH, info(EPOCH, WIDE, (0.1, -0.2, 0.001, 0.002, 0.0)))]
+    items += [("/cam/color/camera_info", EPOCH, info(EPOCH, WIDE, distortion))]
     colours = raw(EPOCH, gradient(60, 80), "rgb8", frame_id)
     items += [*more, ("/cam/color/image_raw", EPOCH + 1, colours)]
     return write(path, in_order(items), **written)
@@ -293,6 +298,16 @@ def test_damage_inside_an_image_is_a_message_error() -> None:
     short = ColourImage("", 0, 0, "", "rgb8", 640, 480, 1920, bytes(1000))
     with pytest.raises(MessageError, match="needs 921600 bytes and has 1000"):
         pixels_of(short)
+
+
+@pytest.mark.parametrize("wrong", [np.nan, np.inf])
+def test_distortion_that_is_no_number_is_told(tmp_path: Path, wrong: float) -> None:
+    """Else all masks are empty, without a word."""
+    tf = ("/tf_static", EPOCH, static("camera", "color_optical", (0.05, 0, 0), (0, 0, 0, 1)))
+    ((_, view),), warnings = read(beside(tmp_path / "a.mcap", tf, distortion=(wrong, 0, 0, 0, 0)))
+
+    assert view is None
+    assert any("lens distortion that is not finite" in w for w in warnings)
 
 
 def test_another_camera_is_placed_by_the_transforms(tmp_path: Path) -> None:

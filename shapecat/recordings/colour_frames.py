@@ -229,7 +229,11 @@ def _lens_of(info: Any, topic: str) -> LensCamera:
     if model not in LENS_MODELS:
         msg = f"unknown lens distortion {model!r}"
         raise MessageError(msg)
-    return LensCamera(camera, model, distortion_of(info))
+    coefficients = distortion_of(info)
+    if not np.isfinite(coefficients).all():
+        msg = "lens distortion that is not finite"
+        raise MessageError(msg)
+    return LensCamera(camera, model, coefficients)
 
 
 def _alike(lens: LensCamera, camera: Camera | None, share: float) -> bool:
