@@ -6,8 +6,8 @@ from typing import NamedTuple
 import numpy as np
 
 from shapecat.arrays import F8
-from shapecat.completion.outline import DIRECTIONS
-from shapecat.completion.whole import COSINES, SINES, faced, footprint
+from shapecat.completion.outline import COSINES, DIRECTIONS, SINES
+from shapecat.completion.whole import faced, footprint
 
 __all__ = ["BoxViews", "FusedBox", "FusedBoxes", "fuse_boxes"]
 

@@ -11,10 +11,21 @@ import numpy as np
 from shapecat.arrays import F4, F8, I4
 from shapecat.jit import kernel
 
-__all__ = ["DIRECTIONS", "QUARTER", "fit_oval", "narrowest", "rectangle", "support_function"]
+__all__ = [
+    "COSINES",
+    "DIRECTIONS",
+    "QUARTER",
+    "SINES",
+    "fit_oval",
+    "narrowest",
+    "rectangle",
+    "support_function",
+]
 
 DIRECTIONS = 96
 """Directions of an outline, every 3.75 degrees; a quarter turn is a whole number of them."""
+_ANGLES = np.arange(DIRECTIONS) * (2 * np.pi / DIRECTIONS)
+COSINES, SINES = np.cos(_ANGLES), np.sin(_ANGLES)
 QUARTER, _HALF = DIRECTIONS // 4, DIRECTIONS // 2
 _ROUNDS = 5
 _OUTLIER = 0.03
@@ -81,9 +92,7 @@ def _replace_smallest(ascending: F4, first: int, value: float) -> None:
     ascending[at - 1] = value
 
 
-def fit_oval(
-    reached: F8, seen: F8, roundness: float, cosines: F8, sines: F8
-) -> tuple[F8, float, float]:
+def fit_oval(reached: F8, seen: F8, roundness: float) -> tuple[F8, float, float]:
     """Fit an oval to an outline that is seen from one side, by robust least squares.
 
     A direction that faces no sensor counts only if the outline reaches the oval there, as the far
@@ -91,19 +100,18 @@ def fit_oval(
 
     Parameters
     ----------
-    reached : (k,) metres, the support function of `support_function`.
-    seen : (k,) weight of each direction, 0 for those that face no sensor.
+    reached : (`DIRECTIONS`,) metres, from `support_function`.
+    seen : (`DIRECTIONS`,) weight of each direction, 0 for those that face no sensor.
     roundness : weight of the prior for a circle, as a number of directions.
-    cosines, sines : (k,) the directions.
 
     Returns
     -------
-    The support function (k,) of the oval, its mean radius, and the root mean square deviation of
-    the directions that face a sensor; metres.
+    The support function (`DIRECTIONS`,) of the oval, its mean radius, and the root mean square
+    deviation of the directions that face a sensor; metres.
     """
     rows = np.ones((5, reached.size))
-    rows[0], rows[1] = cosines, sines
-    rows[3], rows[4] = cosines**2 - sines**2, 2 * cosines * sines
+    rows[0], rows[1] = COSINES, SINES
+    rows[3], rows[4] = COSINES**2 - SINES**2, 2 * COSINES * SINES
     weights = seen.copy()
     oval: F8 = np.zeros(reached.size)
     x: F8 = np.zeros(5)

@@ -9,7 +9,8 @@ from numpy.typing import ArrayLike
 
 from shapecat.arrays import F4, F8, Bool
 from shapecat.completion.outline import (
-    DIRECTIONS,
+    COSINES,
+    SINES,
     fit_oval,
     narrowest,
     rectangle,
@@ -18,10 +19,8 @@ from shapecat.completion.outline import (
 from shapecat.geometry import levelled, quaternion_from_rotation
 from shapecat.types import FullBox
 
-__all__ = ["COSINES", "ENOUGH_POINTS", "SINES", "Footprint", "complete", "faced", "footprint"]
+__all__ = ["ENOUGH_POINTS", "Footprint", "complete", "faced", "footprint"]
 
-_ANGLES = np.arange(DIRECTIONS) * (2 * np.pi / DIRECTIONS)
-COSINES, SINES = np.cos(_ANGLES), np.sin(_ANGLES)
 ENOUGH_POINTS = 256
 """Maximum number of points used for the outline; more only cost time."""
 
@@ -148,7 +147,7 @@ def footprint(seen: F8, facing: F8, posterior: F8, categories: Sequence[str]) ->
     likely = dict(zip(categories, np.asarray(posterior).tolist(), strict=True))
     category, angular = max(likely, key=likely.__getitem__), likely.get(_ANGULAR, 0.0)
     prior = _PRIORS.get(category, _OutlinePrior())
-    oval, radius, deviation = fit_oval(seen, facing, prior.roundness, COSINES, SINES)
+    oval, radius, deviation = fit_oval(seen, facing, prior.roundness)
     if category == _HANDLED and (seen - oval)[facing > 0].max() > _HANDLE * radius:
         oval = np.maximum(oval, np.where(facing > 0, seen, oval))
     whole = oval if deviation < prior.fits * radius else seen

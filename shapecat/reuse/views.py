@@ -35,8 +35,6 @@ _AREA = 0.25
 _AGREE, _BIAS = 0.95, 0.002
 """Minimum fraction of the points of either view that must agree with the other view; largest mean
 difference of their inverse depths, 1/m: 2 mm at 1 m."""
-
-
 _TRIES = 3
 """Number of earlier views to compare point by point, the newest first: masks may flicker."""
 
@@ -125,7 +123,8 @@ def find_repeats(sights: Sequence[Sight], keys: Sequence[KeyView]) -> list[Repea
     """
     if not keys or not sights:
         return [None] * len(sights)
-    now, then = (np.array([each.numbers for each in some]) for some in (sights, _sights(keys)))
+    now = np.array([sight.numbers for sight in sights])
+    then = np.array([key.sight.numbers for key in keys])
     alike, moves = _alike(now[:, None], then[None]), dict[int, Move]()
     found: list[Repeat | None] = []
     for sight, row in zip(sights, alike, strict=True):
@@ -174,10 +173,6 @@ def _moved_box(move: Move, box: FullBox | None) -> FullBox | None:
     product = np.array([[w, -z, y, x], [z, w, -x, y], [-y, x, w, z], [-x, -y, -z, w]])
     turned = product @ box.orientation
     return replace(box, center=transform(move.pose, box.center), orientation=turned)
-
-
-def _sights(keys: Sequence[KeyView]) -> list[Sight]:
-    return [key.sight for key in keys]
 
 
 def _alike(now: F8, then: F8) -> Bool:
