@@ -156,7 +156,8 @@ def compile_all(begin: Callable[[], None] = lambda: None, *, cores: int = 2) -> 
     try:
         if not notes.exists():
             begin()
-            with suppress(WorkerLostError):  # the rest is compiled when it is called
+            # The rest is compiled when it is called; another version may remove the folder.
+            with suppress(WorkerLostError, FileNotFoundError):
                 _rehearse(cores)
                 notes.touch()
     finally:

@@ -1,6 +1,7 @@
 """Compiling ahead of time: every kernel, only once, with no process left behind."""
 
 import multiprocessing
+import shutil
 import subprocess
 import sys
 import threading
@@ -77,9 +78,12 @@ def test_compiling_is_done_once(trace: Path) -> None:
 def test_kernels_are_kept_where_another_version_removed_their_folder(
     trace: Path, monkeypatch: pytest.MonkeyPatch, tmp_path: Path
 ) -> None:
-    """An update during a batch must not fail the remaining recordings."""
+    """An update during a batch must not fail the remaining recordings, nor one that compiles."""
     monkeypatch.setattr(rehearsal, "_notes", lambda: tmp_path / "removed" / "complete")
 
+    with monkeypatch.context() as patch:
+        patch.setattr(rehearsal, "_rehearse", lambda _: shutil.rmtree(tmp_path / "removed"))
+        assert compile_all() > 0
     assert compile_all() > 0
     assert compile_all() == 0
     assert trace.read_text() == "x"
