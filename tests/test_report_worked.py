@@ -14,6 +14,7 @@ import pyarrow.parquet as pq
 import pytest
 
 from shapecat.colour.masks import Mask
+from shapecat.outputs.report import choosing
 from shapecat.outputs.report.cards import Card, _few, card_html
 from shapecat.outputs.report.choosing import Choice, _areas, choose_frames
 from shapecat.outputs.report.images import Crop, SeenFrame, _border_share, _hidden_share, encode
@@ -318,6 +319,16 @@ def test_the_strip_is_in_the_order_of_time_and_not_of_the_table(run: Path) -> No
     pq.write_table(table.take(list(range(table.num_rows))[::-1]), run / "frames.parquet")
 
     assert list(choose_frames(run, timelines).strip.items()) == strip
+
+
+def test_each_frame_of_the_strip_shows_what_no_earlier_one_does() -> None:
+    """Twelve parts of three frames: the newest tracks, else the most, else the middle."""
+    stamps = [(7_000_000_000 + 500_000_000 * k, ("/d", k)) for k in range(36)]
+    tracks = {0: {1}, 1: {1, 2}, 3: {1, 2}, 5: {3}, 6: {1}, 7: {2}, 8: {3}, 9: {1, 2, 3}, 10: {1}}
+    strip = choosing._strip(stamps, {("/d", k): seen for k, seen in tracks.items()})
+
+    frames = [1, 5, 7, 9, *range(13, 36, 3)]
+    assert strip == {("/d", k): pytest.approx(0.5 * k) for k in frames}
 
 
 def test_a_whole_view_is_chosen_before_a_larger_one_that_is_cut_off(run: Path) -> None:
