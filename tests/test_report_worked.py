@@ -32,6 +32,7 @@ from shapecat.outputs.report.tracks import Timeline, read_timelines
 from shapecat.outputs.report.writing import RunReport, _faces
 from shapecat.runs.finished import FinishedRun, read_finished
 from shapecat.runs.label_meaning import TrackLabel
+from shapecat.runs.tables import FRAMES, TRACKS
 from shapecat.runs.track_table import TrackRow, TrackTable, read_track_table
 from shapecat.types import (
     Box,
@@ -309,6 +310,28 @@ def test_the_first_detection_of_a_frame_is_a_view(run: Path) -> None:
     for track, line in read_timelines(run).items():
         found = [row["detection"] is not None for row in rows if row["track"] == track]
         assert sorted(line.seen.tolist()) == sorted(found)
+
+
+def test_times_of_a_track_count_from_the_first_frame_of_the_run(tmp_path: Path) -> None:
+    """Nothing is found in the first frame, and rows are not in the order of time."""
+    start, step = 7_000_000_000, 500_000_000
+    frames = [{"topic": "/d", "frame": k, "stamp_ns": start + step * k} for k in (1, 0, 3, 2)]
+    rows: list[dict[str, Any]] = [
+        {"track": 9, "frame": 2, "detection": 1, "posterior": [0.3, 0.7]},
+        {"track": 4, "frame": 3, "detection": None, "posterior": [0.8, 0.2]},
+        {"track": 4, "frame": 1, "detection": 0, "posterior": [0.6, 0.4]},
+    ]
+    tracks = [{"topic": "/d", "stamp_ns": start + step * row["frame"], **row} for row in rows]
+    for name, content, schema in (("frames", frames, FRAMES), ("tracks", tracks, TRACKS)):
+        whole = [dict.fromkeys(schema.names) | row for row in content]
+        pq.write_table(pa.Table.from_pylist(whole, schema), tmp_path / f"{name}.parquet")
+    lines = read_timelines(tmp_path)
+
+    assert lines.keys() == {4, 9}
+    assert (lines[4].seconds.tolist(), lines[9].seconds.tolist()) == ([0.5, 1.5], [1.0])
+    assert (lines[4].seen.tolist(), lines[9].seen.tolist()) == ([True, False], [True])
+    np.testing.assert_allclose(lines[4].causal, [[0.6, 0.4], [0.8, 0.2]])
+    assert lines[4].keys == (("/d", 1, 0), ("/d", 3, -1))
 
 
 def test_the_strip_is_in_the_order_of_time_and_not_of_the_table(run: Path) -> None:
