@@ -16,7 +16,7 @@ from shapecat.batch.ledger import Ledger, Outcome
 from shapecat.batch.manifest import Entry, Manifest, RemoteManifest, State
 from shapecat.batch.plans import Shard, name_folders, plan_batch
 from shapecat.batch.remote import Ticket
-from shapecat.batch.runs import exit_code, process_here, process_on
+from shapecat.batch.runs import _reporter, exit_code, process_here, process_on
 from shapecat.batch.storage import Location, content_key
 from shapecat.config import Settings, with_overrides
 from shapecat.errors import OutputError
@@ -662,6 +662,26 @@ def test_a_recording_is_noted_as_complete_before_its_outcome_is_told(
     assert {name: entry.state for name, entry in noted.items()} == {
         first.job.folder.name: "complete", "b": "planned"
     }  # fmt: skip
+
+
+def test_a_worker_tells_its_progress_now_and_then_and_at_the_end(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    """Without the last frame, a recording would look unfinished while its outputs are written."""
+    told, clock = list[Any](), [10.0]
+    monkeypatch.setattr("shapecat.batch.runs.post", lambda *words: told.append(words))
+    monkeypatch.setattr("shapecat.batch.runs.time", SimpleNamespace(monotonic=lambda: clock[0]))
+    observe = _reporter("lab", "here")
+    for clock[0], phase, done in (
+        (10.0, "perceive", 1), (10.1, "perceive", 2), (10.25, "perceive", 3),
+        (10.3, "perceive", 4), (10.35, "perceive", 5), (10.4, "track", 0),
+    ):  # fmt: skip
+        observe(phase, done, 5)
+
+    assert told == [
+        ("here", ("lab", phase, done, 5))
+        for phase, done in (("perceive", 1), ("perceive", 3), ("perceive", 5), ("track", 0))
+    ]
 
 
 def test_recordings_of_one_name_have_folders_of_their_own() -> None:

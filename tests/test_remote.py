@@ -28,7 +28,7 @@ from shapecat.batch.remote import Ticket, process_remote, scratch, upload
 from shapecat.batch.storage import Location
 from shapecat.errors import OutputError, RecordingError
 from shapecat.runs.folder import RUN_FILES
-from shapecat.runs.jobs import Job
+from shapecat.runs.jobs import Job, Summary
 from tests.object_storage import object_storage, requests
 from tests.scenes import record
 
@@ -340,6 +340,21 @@ def test_what_a_run_no_longer_makes_goes_with_the_run_it_replaces(made: Path) ->
         upload(made, url, claim)
 
     assert files("memory://renewed") == {f"run/{name}" for name in names}
+
+
+def test_the_summary_of_a_run_names_its_folder_and_not_scratch(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    """A scratch folder is gone when its name is read."""
+
+    def process(job: Job, *_: object, **__: object) -> Summary:
+        return Summary(job.name, job.folder, {"frames": 3, "tracks": {}}, 1.5, (), processed=False)
+
+    monkeypatch.setattr("shapecat.batch.remote.process", process)
+    job = Job(Path("a.mcap"), Path("lab"), target="memory://named/lab")
+    summary = process_remote(job, lambda *_: None, cores=1, ticket=Ticket("one"))
+
+    assert (summary.folder, summary.seconds) == (Path("lab"), 1.5)
 
 
 def test_a_strangers_place_is_not_touched(made: Path) -> None:
