@@ -10,9 +10,11 @@ import numpy as np
 from shapecat.arrays import F8
 from shapecat.types import Camera
 
-__all__ = ["LENS_MODELS", "distort", "undistorted_rays"]
+__all__ = ["FISHEYE_MODELS", "LENS_MODELS", "distort", "undistorted_rays"]
 
-LENS_MODELS = ("plumb_bob", "rational_polynomial", "equidistant", "fisheye")
+FISHEYE_MODELS = ("equidistant", "fisheye")
+"""Two names of Kannala and Brandt's model."""
+LENS_MODELS = ("plumb_bob", "rational_polynomial", *FISHEYE_MODELS)
 """The supported lens models of OpenCV's calibration."""
 
 _ROUNDS = 20
@@ -44,7 +46,7 @@ def distort(rays: F8, model: str, coefficients: Sequence[float]) -> F8:
         raise ValueError(msg)
     d = np.zeros(8)
     d[: min(8, len(coefficients))] = coefficients[:8]
-    bend = _fisheye if model in {"equidistant", "fisheye"} else _polynomial
+    bend = _fisheye if model in FISHEYE_MODELS else _polynomial
     return bend(np.asarray(rays, np.float64), d)
 
 

@@ -6,7 +6,7 @@ import numpy as np
 
 from shapecat.arrays import F4, F8, I4, U1, Bool
 from shapecat.cameras.colour import LensCamera
-from shapecat.cameras.lenses import LENS_MODELS, distort
+from shapecat.cameras.lenses import FISHEYE_MODELS, LENS_MODELS, distort
 from shapecat.jit import kernel
 from shapecat.types import Pose
 
@@ -17,7 +17,6 @@ _WIDEST = 3.0
 Lens = tuple[F4, int, F4, float]
 """A lens for kernels: fx, fy, cx, cy in pixels; the kind of distortion (0 none, 1 polynomial,
 2 fisheye); its 8 coefficients; and the square of the largest slope that the lens sees."""
-_FISHEYE = {"equidistant", "fisheye"}
 
 
 def project(points: F4, lens: LensCamera, colour_from_depth: Pose) -> F4:
@@ -66,7 +65,7 @@ def kernel_lens(lens: LensCamera) -> Lens:
         raise ValueError(msg)
     d = np.zeros(8, np.float32)
     d[: len(lens.coefficients[:8])] = lens.coefficients[:8]
-    kind = 0 if not lens.model else 2 if lens.model in _FISHEYE else 1
+    kind = 0 if not lens.model else 2 if lens.model in FISHEYE_MODELS else 1
     camera, reach = lens.pinhole, _monotonic_up_to(lens) ** 2 if kind else np.inf
     numbers = np.array((camera.fx, camera.fy, camera.cx, camera.cy), np.float32)
     return numbers, kind, d, reach

@@ -44,7 +44,7 @@ class Track(Record):
     """One object over the frames of its streams, from its first to its last detection.
 
     Between detections a track *coasts*: such a row has no detection, and its centre is interpolated
-    linearly. A gap longer than `TrackingSettings.max_missed_s` has no rows.
+    linearly in time. A gap longer than `TrackingSettings.max_missed_s` has no rows.
 
     Attributes
     ----------
