@@ -230,6 +230,23 @@ def test_results_at_a_url_are_those_of_the_same_input_and_work(
     assert Ticket("b", *asked).made(run) is made
 
 
+def test_links_that_form_loops_are_followed_once(tmp_path: Path) -> None:
+    """Two links to their own folder made the search endless, one gave paths of 40 links."""
+    (tmp_path / "z").mkdir()
+    for name in ("lab.mcap", "z/kitchen.mcap"):
+        (tmp_path / name).write_bytes(b"\x89MCAP")
+    for link, target in (("again", "."), ("first", "z"), ("self.mcap", "self.mcap")):
+        (tmp_path / link).symlink_to(target)
+
+    found = [source.path for source in find_recordings([str(tmp_path)]).kept]
+
+    assert [str(Path(path).relative_to(tmp_path)) for path in found] == [
+        "lab.mcap",
+        "z/kitchen.mcap",
+        "self.mcap",  # which is reported when it is opened
+    ]
+
+
 def test_a_recording_is_processed_once_by_whatever_names_it_is_found(tmp_path: Path) -> None:
     """Two run folders of one recording would be counted, and trained on, twice."""
     data, other = tmp_path / "data", tmp_path / "other"

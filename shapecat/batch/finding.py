@@ -1,6 +1,7 @@
 """Find the recordings that a user names: files, folders, URLs."""
 
 import logging
+import os
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from contextlib import suppress
 from dataclasses import dataclass
@@ -71,7 +72,7 @@ def find_recordings(sources: Sequence[str]) -> Found:
 
 
 def _of_path(path: Path) -> Source:
-    whole = path.resolve()
+    whole = _whole(path)
     return Source(str(path), "", whole.name if path.is_dir() else path.stem, whole.parent.name)
 
 
@@ -149,11 +150,11 @@ def _find_paths(sources: Sequence[Path]) -> tuple[list[Path], int]:
     found: dict[Path, Path] = {}
     left: set[Path] = set()
     for source in sources:
-        for path in _search(source) if _searchable(source) else [source]:
+        for path in _search(source, set()) if _searchable(source) else [source]:
             if path.is_file() and not _looks_like_one(path):
-                left.add(path.resolve())
+                left.add(_whole(path))
             else:
-                found.setdefault(path.resolve(), path)
+                found.setdefault(_whole(path), path)
     bags = {whole for whole, path in found.items() if path.is_dir()}
     kept = [path for whole, path in found.items() if whole.parent not in bags]
     return kept, sum(path.parent not in bags for path in left)
@@ -200,22 +201,33 @@ def _adjoin(paths: Sequence[Path]) -> bool:
     return all(0 <= b - a <= _GAP_NS for (_, a), (b, _) in pairwise(spans)) and len(spans) > 1
 
 
-def _search(folder: Path) -> Iterator[Path]:
-    """Yield the recordings below a folder, sorted by name in each folder.
+def _search(folder: Path, searched: set[Path]) -> Iterator[Path]:
+    """Yield the recordings below a folder, sorted by name in each folder, links last.
 
-    A folder that may not be read, such as ``lost+found``, is skipped, and reported.
+    No folder is searched twice, so links may form loops. A folder that may not be read, such as
+    ``lost+found``, is skipped, and reported.
     """
+    whole = _whole(folder)
+    if whole in searched:
+        return
+    searched.add(whole)
     try:
-        paths = [] if (folder / "run.json").exists() else sorted(folder.iterdir())
+        paths = [] if (folder / "run.json").exists() else list(folder.iterdir())
+        paths.sort(key=lambda path: (path.is_symlink(), path))
         found = [(path, path.is_dir()) for path in paths if not path.name.startswith(".")]
     except OSError as error:
         _log.error("%s: skipped: %s", folder, error.strerror or error)
         return
     for path, is_folder in found:
         if is_folder and not _is_bag(path):
-            yield from _search(path)
+            yield from _search(path, searched)
         elif is_folder or path.suffix in SUFFIXES:
             yield path
+
+
+def _whole(path: Path) -> Path:
+    """Return the absolute path without links; a link to itself, which `resolve` refuses, stays."""
+    return Path(os.path.realpath(path))
 
 
 def _looks_like_one(path: Path) -> bool:

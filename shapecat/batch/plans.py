@@ -3,6 +3,7 @@
 import dataclasses
 import hashlib
 import json
+import os
 from collections import Counter
 from collections.abc import Iterator, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
@@ -251,7 +252,7 @@ def _known_names(sources: Sequence[Source], out: Path, there: set[str]) -> dict[
     A recording that comes to a batch later must not rename the run of another one.
     """
     counts = Counter(source.stem for source in sources)
-    common = {source.url or str(Path(source.path).resolve()): k for k, source in enumerate(sources)}
+    common = {source.url or os.path.realpath(source.path): k for k, source in enumerate(sources)}
     common = {path: k for path, k in common.items() if counts[sources[k].stem] > 1}
     known: dict[int, str] = {}
     for name in sorted(there) if common else ():
