@@ -3,14 +3,16 @@
 ``import shapecat`` loads this module only when one of its names is used.
 """
 
+import difflib
 from collections import Counter
-from collections.abc import Iterator, Sequence
+from collections.abc import Collection, Iterator, Sequence
 from pathlib import Path
 from typing import Any, Self
 
 from shapecat import pipeline
-from shapecat.config import load_settings, with_settings
-from shapecat.errors import ConfigError
+from shapecat.batch.finding import find_recordings
+from shapecat.config import Settings, load_settings, with_settings
+from shapecat.errors import ConfigError, RecordingError
 from shapecat.outputs.opened_run import Run, RunFrame, Table
 from shapecat.recordings import Recording, choose_streams, frames
 from shapecat.recordings import open_recording as _open_recording
@@ -85,17 +87,17 @@ def open_recording(path: str | Path) -> OpenRecording:
 
     Raises
     ------
-    RecordingError : the path is not a readable recording.
+    RecordingError : the path is not a readable recording, or a folder of several.
     """
-    return OpenRecording(_open_recording(Path(path)))
+    return OpenRecording(_open_recording(_one_recording(Path(path))))
 
 
 def process(
     recording: str | Path,
     out: str | Path,
     *,
-    topics: Sequence[str] = (),
-    up: str = "auto",
+    topics: str | Sequence[str] = (),
+    up: str | Sequence[float] = "auto",
     fixed_frame: str | None = None,
     start_s: float | None = None,
     end_s: float | None = None,
@@ -120,7 +122,7 @@ def process(
     Parameters
     ----------
     topics, up, fixed_frame, start_s, end_s, every, model, config, overwrite, discard_labels : as
-        the options of the command.
+        the options of the command. ``topics`` is one topic or several; ``up`` may be three numbers.
     color : topic of the colour images; None to choose one, empty to use none.
     mcap, rrd : whether to write annotated.mcap and review.rrd.
     cores : number of processes that perceive frames. If there are several, a script must have
@@ -130,20 +132,25 @@ def process(
 
     Raises
     ------
-    ConfigError : a setting does not exist or has an invalid value, or several processes are wanted
-        and the script lacks the ``__main__`` line.
-    RecordingError, NoStreamError, ModelError, OutputError : as for the command, which prints them.
+    ConfigError : an option or setting does not exist or has an invalid value, or several processes
+        are wanted and the script lacks the ``__main__`` line.
+    RecordingError : the recording cannot be read, or is a folder of several.
+    NoStreamError, ModelError, OutputError : as for the command, which prints them.
     """
+    _require_known(settings, process.__annotations__)
+    if every < 1:
+        msg = f"every must be at least 1, got {every}"
+        raise ConfigError(msg)
     if cores > 1 and runs_again():
         msg = f'cores={cores} starts processes: a script needs `if __name__ == "__main__":`'
         raise ConfigError(msg)
-    source = Path(recording)
+    source = _one_recording(Path(recording))
     job = Job(
         source=source,
         folder=Path(out) / (source.resolve().name if source.is_dir() else source.stem),
         settings=with_settings(load_settings(None if config is None else Path(config)), settings),
-        topics=tuple(topics),
-        up=up,
+        topics=(topics,) if isinstance(topics, str) else tuple(topics),
+        up=up if isinstance(up, str) else ",".join(str(float(part)) for part in up),
         fixed_frame=fixed_frame,
         start_s=start_s,
         end_s=end_s,
@@ -157,3 +164,27 @@ def process(
     )
     pipeline.process(job, observe or ignore, cores=cores)
     return Run(job.folder)
+
+
+def _require_known(settings: Collection[str], options: Collection[str]) -> None:
+    """Reject a keyword that is neither an option nor a setting."""
+    options = set(options) - {"return", "settings"}
+    known = sorted({*options, *Settings.__annotations__})
+    for name in settings:
+        if name not in known:
+            near = difflib.get_close_matches(name, known, 1)
+            hint = f"; did you mean {near[0]}?" if near else f"; known: {', '.join(known)}"
+            msg = f"unknown option or setting {name}{hint}"
+            raise ConfigError(msg)
+
+
+def _one_recording(path: Path) -> Path:
+    """Return a path; refuse a folder of recordings, whose files would be read as parts of one."""
+    if path.is_dir():
+        found = [source.path for source in find_recordings([str(path)]).kept]
+        if len(found) > 1:
+            names = ", ".join(str(Path(name).relative_to(path)) for name in found[:3])
+            more = ", ..." if len(found) > 3 else ""
+            msg = f"{path}: a folder of {len(found)} recordings; name one of them: {names}{more}"
+            raise RecordingError(msg)
+    return path

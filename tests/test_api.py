@@ -6,6 +6,7 @@ import subprocess
 import sys
 from collections.abc import Callable
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pyarrow.compute as pc
@@ -14,7 +15,7 @@ import pytest
 from click.testing import Result
 
 import shapecat
-from shapecat.errors import ConfigError, OutputError
+from shapecat.errors import ConfigError, OutputError, RecordingError
 from shapecat.outputs.opened_run import Table
 from tests.loading import loaded_by
 from tests.test_docs_run import run_here
@@ -147,8 +148,39 @@ def test_wrong_settings_and_folders_are_refused_in_one_line(place: Path, tmp_pat
         shapecat.process(place / "demo.mcap", place / "results", rrd=False)
     with pytest.raises(OutputError, match=r"no run\.json there"):
         shapecat.open_run(tmp_path)
+    with pytest.raises(
+        ConfigError, match=r"unknown option or setting topic; did you mean topics\?"
+    ):
+        shapecat.process(place / "demo.mcap", tmp_path, topic="/camera/depth/image_raw")
+    with pytest.raises(ConfigError, match="every must be at least 1, got 0"):
+        shapecat.process(place / "demo.mcap", tmp_path, every=0)
     with pytest.raises(AttributeError, match="nothing"):
         _ = shapecat.nothing
+
+
+def test_a_topic_and_an_up_direction_need_no_special_form(place: Path, tmp_path: Path) -> None:
+    """A topic was taken for a list of letters, and a list of numbers ended in a traceback."""
+    plain: Any = {"every": 8, "mcap": False, "rrd": False}
+    topic, up = "/camera/depth/image_raw", (0, -0.75, -0.5)
+
+    run = shapecat.process(place / "demo.mcap", tmp_path, topics=topic, up=up, **plain)
+
+    assert (run.info["options"]["topics"], run.info["options"]["up"]) == ([topic], "0.0,-0.75,-0.5")
+    given = np.array(run.frame_table.numpy("up_given")[0])
+    np.testing.assert_allclose(given, np.array(up) / np.linalg.norm(up), atol=1e-6)
+
+
+def test_a_folder_of_recordings_is_not_read_as_one(place: Path, tmp_path: Path) -> None:
+    """Only the command searches folders; the files would become one run with mixed frames."""
+    for name in ("monday.mcap", "tuesday.mcap"):
+        (tmp_path / name).write_bytes((place / "demo.mcap").read_bytes())
+    refused = r"a folder of 2 recordings; name one of them: monday\.mcap, tuesday\.mcap"
+
+    with pytest.raises(RecordingError, match=refused):
+        shapecat.process(tmp_path, tmp_path / "out")
+    with pytest.raises(RecordingError, match=refused):
+        shapecat.open_recording(tmp_path)
+    assert not (tmp_path / "out").exists()
 
 
 def test_import_loads_no_library() -> None:
