@@ -37,7 +37,7 @@ def info(ctx: click.Context, /, *, recordings: tuple[Path, ...], as_json: bool) 
                 _show(overview)
     if as_json:
         print_json(overviews)
-    ctx.exit(0 if not any(codes) else 1 if not all(codes) else codes[0])
+    ctx.exit(codes[0] if len(set(codes)) == 1 else 1)
 
 
 def _describe(path: Path) -> tuple[dict[str, Any] | None, int]:

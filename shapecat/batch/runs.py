@@ -201,13 +201,6 @@ def attempt(job: Job, observe: Observer, *, cores: int = 1, ticket: Ticket) -> O
 
 
 def exit_code(outcomes: Sequence[Outcome]) -> int:
-    """Return 0 if all outcomes are complete, 1 if only some are.
-
-    If none is, return the first of the exit codes 3, 4 and 2 that occurs, else 1.
-    """
-    codes = {outcome.code for outcome in outcomes}
-    if codes <= {0}:
-        return 0
-    if 0 in codes:
-        return 1
-    return next((code for code in (3, 4, 2) if code in codes), 1)
+    """Return the code that all outcomes share, 0 for none, and 1 if they differ."""
+    codes = {outcome.code for outcome in outcomes} or {0}
+    return codes.pop() if len(codes) == 1 else 1
