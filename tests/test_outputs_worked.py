@@ -35,7 +35,7 @@ from shapecat.outputs.dataset_frames import (
     images_of,
     split_runs,
 )
-from shapecat.outputs.exports import _made_by_export, _require_own, _thinned
+from shapecat.outputs.exports import _made_by_export, _require_own, _staged, _thinned
 from shapecat.outputs.exports_points import write_point_labels
 from shapecat.outputs.image_annotations import ImageBox, read_image_frames
 from shapecat.outputs.level_clouds import support_offset, upright_cloud
@@ -384,6 +384,29 @@ def test_the_export_of_another_recording_is_not_replaced(tmp_path: Path) -> None
     _require_own(tmp_path, monday)
     with pytest.raises(OutputError, match="of another recording; choose another --out"):
         _require_own(tmp_path, tuesday)
+
+
+def test_what_an_interrupted_export_has_left_is_not_part_of_the_next(tmp_path: Path) -> None:
+    """Images of other options would have no labels, and be taken for background."""
+    out = tmp_path / "out"
+
+    def interrupted(hidden: Path) -> int:
+        (hidden / "images").mkdir()
+        (hidden / "images" / "old.png").write_bytes(b"old")
+        raise KeyboardInterrupt
+
+    def write(hidden: Path) -> int:
+        (hidden / "images").mkdir()
+        (hidden / "images" / "new.png").write_bytes(b"new")
+        return 7
+
+    with pytest.raises(KeyboardInterrupt):
+        _staged(out, KITTI, interrupted)
+    assert not out.exists()
+    assert _staged(out, KITTI, write) == 7
+    assert [path.name for path in tmp_path.rglob("*.png")] == ["new.png"]
+    mark = json.loads((out / "export.json").read_text())
+    assert mark == {"format": "kitti", "objects": 7, "made": ["images"]}
 
 
 KITTI = {"format": "kitti"}
