@@ -50,6 +50,17 @@ def test_a_table_beyond_the_range_is_named_as_the_reason(tmp_path: Path) -> None
     assert not warnings_of(path, tmp_path / "again", range_m=2.0)
 
 
+def test_depth_in_a_wrong_unit_is_not_taken_for_a_large_room(tmp_path: Path) -> None:
+    """Millimetres in a 32FC1 image read as kilometres; a larger range would only hide that."""
+    (warning,) = warnings_of(walls(tmp_path / "unit.mcap", [30.0, 40.0, 41.0]), tmp_path)
+
+    assert warning == (
+        "no supporting plane in 3 of 3 frames: 100% of their depth is beyond "
+        "detection.max_range_m, 2 m; the median is 40 m: is the unit right? "
+        "16UC1 is in millimetres, 32FC1 and clouds in metres"
+    )
+
+
 def test_frames_without_depth_and_frames_in_range_have_other_reasons(tmp_path: Path) -> None:
     """A covered lens is no matter of the range; nor is a wall at 1 m, where up may be wrong."""
     none = warnings_of(walls(tmp_path / "none.mcap", [0.0] * 3), tmp_path)

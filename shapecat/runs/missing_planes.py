@@ -17,6 +17,9 @@ from shapecat.types import Frame
 
 __all__ = ["explain_missing_planes"]
 
+_NO_ROOM_M = 10.0
+"""A median depth that no camera indoors measures; the unit is wrong rather than the range."""
+
 _FRAMES = 3
 """Number of frames without a plane whose readings are examined."""
 
@@ -37,15 +40,22 @@ def explain_missing_planes(
         return []
     text = f"no supporting plane in {bare} of {frames} frames"
     readings = far = 0
+    typical: list[float] = []
     for frame in islice(_frames(recording, run, first), len(first)):
         distance = _distances(frame)
         readings += distance.size
         far += int(np.count_nonzero(distance > range_m))
+        if distance.size:
+            typical.append(float(np.median(distance)))
     if not readings:
         return [f"{text}: they have no valid depth"]
     if 2 * far > readings:
         share, setting = far / readings, f"detection.max_range_m, {range_m:g} m"
-        return [f"{text}: {share:.0%} of their depth is beyond {setting}; try a larger one"]
+        hint = "try a larger one"
+        if (middle := float(np.median(typical))) > _NO_ROOM_M:
+            unit = "16UC1 is in millimetres, 32FC1 and clouds in metres"
+            hint = f"the median is {middle:.0f} m: is the unit right? {unit}"
+        return [f"{text}: {share:.0%} of their depth is beyond {setting}; {hint}"]
     source = run["up"]["source"]
     if source == "option":
         return [f"{text}: is --up right? --up auto estimates up from the planes"]
