@@ -97,7 +97,7 @@ def export(
     shapecat export results --format kitti --out kitti
     shapecat export results --format coco --out coco --per-track 20 --min-confidence 0.8
     """
-    from shapecat.outputs.exports import export_run
+    from shapecat.outputs.exports import common_categories, export_run
     from shapecat.runs.finished import find_runs
 
     runs = find_runs(folders)
@@ -116,6 +116,7 @@ def export(
     if given:
         msg = f"--{given[0].replace('_', '-')} is for --format coco and yolo, not {kind}"
         raise click.UsageError(msg)
+    categories = common_categories(runs)
     for run in runs:
         with progress_bars() as bars:
             count = export_run(
@@ -124,6 +125,7 @@ def export(
                 out,
                 every=every,
                 visible_boxes=boxes == "visible",
+                categories=categories,
                 recording=recording,
                 observe=bars,
             )

@@ -271,6 +271,31 @@ def test_labelcloud_formats_say_the_same(run: Path, tmp_path: Path) -> None:
     assert worst < 1e-5
 
 
+def test_runs_exported_together_number_their_categories_alike(
+    shapecat: Run, run: Path, tmp_path: Path
+) -> None:
+    """The first new category of each run had the same number: apples would be learned as zebras."""
+    image = pytest.importorskip("PIL.Image")
+    labels = {"a": "zebra", "b": "apple"}
+    for name, label in labels.items():
+        shutil.copytree(run, tmp_path / "runs" / name)
+        relabel(tmp_path / "runs" / name, {2: label})
+    legends: Any = []
+    for kind, file in (("labelcloud", "labels/_classes.json"), ("point-labels", "labels.json")):
+        options = ("--format", kind, "--out", tmp_path / kind, "--every", 6)
+        assert shapecat("export", tmp_path / "runs", *options).exit_code == 0
+        legends = [json.loads((tmp_path / kind / n / file).read_text())["classes"] for n in labels]
+        assert legends[0] == legends[1]
+
+    for name, label in labels.items():
+        instance, semantic = (
+            np.asarray(image.open(tmp_path / "point-labels" / name / kind / "000000.png"))
+            for kind in ("instance", "semantic")
+        )
+        (number,) = set(semantic[instance == 2].tolist())
+        assert legends[0][str(number)] == label
+
+
 def test_masks_label_the_pixels_of_each_object(run: Path, tmp_path: Path) -> None:
     image = pytest.importorskip("PIL.Image")
     export_run(run, "point-labels", tmp_path)

@@ -4,7 +4,7 @@ import json
 from collections import Counter
 from collections.abc import Callable, Collection, Iterable, Iterator, Mapping, Sequence
 from contextlib import suppress
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from itertools import chain, count
 from pathlib import Path
 from typing import Any
@@ -24,7 +24,7 @@ from shapecat.system.files import flush, replacing
 from shapecat.system.progress import Observer, ignore
 from shapecat.types import Frame, LabelledFrame
 
-__all__ = ["FORMATS", "Exported", "export_dataset", "export_run"]
+__all__ = ["FORMATS", "Exported", "common_categories", "export_dataset", "export_run"]
 
 ExportedFrame = tuple[LabelledFrame, Frame, Coloured | None]
 Write = Callable[[Path, Iterable[ExportedFrame], FinishedRun], int]
@@ -67,6 +67,7 @@ def export_run(
     *,
     every: int = 1,
     visible_boxes: bool = False,
+    categories: Sequence[str] = (),
     recording: Path | None = None,
     observe: Observer = ignore,
 ) -> int:
@@ -80,6 +81,7 @@ def export_run(
     format : a key of `FORMATS`.
     every : export every n-th frame of a stream.
     visible_boxes : whether boxes enclose only the visible part of objects, not the whole.
+    categories : those of all runs that are exported together, so that their numbers agree.
     recording : path of the recording; by default where it was processed.
     observe : called with the phase, the number of frames done, and the total.
 
@@ -97,7 +99,7 @@ def export_run(
     if format not in FORMATS:
         msg = f"no export format {format!r}; known: {', '.join(FORMATS)}"
         raise ValueError(msg)
-    finished = read_finished(folder)
+    finished = replace(read_finished(folder), common=tuple(categories))
     total = -(-int(finished.run["counts"]["frames"]) // every)
     with open_source(finished.run, recording) as source:
         full = format in _WITH_BOXES and not visible_boxes
@@ -141,7 +143,7 @@ def export_dataset(
         msg = f"no data set format {format!r}; known: {', '.join(DATASETS)}"
         raise ValueError(msg)
     runs = [read_finished(folder) for folder in folders]
-    categories = list(dict.fromkeys(name for run in runs for name in run.categories))
+    categories = _common(runs)
     total = sum(int(run.run["counts"]["frames"]) for run in runs)
     stems = _different_names([safe_name(run.name) for run in runs])
 
@@ -161,6 +163,20 @@ def export_dataset(
     about = {"format": format, "runs": ids}
     objects = _staged(out, about, lambda hidden: DATASETS[format](hidden, images(), categories))
     return Exported(objects, uncertain, counts)
+
+
+def common_categories(folders: Sequence[Path]) -> list[str]:
+    """Return the categories of several runs, each once.
+
+    Raises
+    ------
+    OutputError : a folder is not a finished run, or its tracks.csv is invalid.
+    """
+    return _common([read_finished(folder) for folder in folders])
+
+
+def _common(runs: Sequence[FinishedRun]) -> list[str]:
+    return list(dict.fromkeys(name for run in runs for name in run.categories))
 
 
 def _different_names(names: Sequence[str]) -> list[str]:

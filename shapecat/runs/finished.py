@@ -20,11 +20,16 @@ __all__ = ["FinishedRun", "find_runs", "open_source", "read_finished"]
 
 @dataclass(frozen=True)
 class FinishedRun:
-    """A run folder, with run.json and the final label of each track."""
+    """A run folder, with run.json and the final label of each track.
+
+    ``common`` holds the categories of all runs that are exported together, in the same order in
+    each of them; empty if a run is on its own.
+    """
 
     folder: Path
     run: RunInfo
     labels: Mapping[int, TrackLabel]
+    common: tuple[str, ...] = ()
 
     @property
     def name(self) -> str:
@@ -33,8 +38,8 @@ class FinishedRun:
 
     @property
     def categories(self) -> tuple[str, ...]:
-        """The categories of the model, then categories that a person added."""
-        known = tuple(self.run["model"]["categories"])
+        """The common categories; then those of the model, and those that a person added."""
+        known = dict.fromkeys((*self.common, *self.run["model"]["categories"]))
         added = {label.category for label in self.labels.values()} - {*known, "unknown"}
         return (*known, *sorted(added))
 
