@@ -29,7 +29,10 @@ SECONDS = _Seconds(min=0)
 
 json_option = click.option("--json", "as_json", is_flag=True, help="Print the result as JSON.")
 array_option = click.option(
-    "--json", "as_json", is_flag=True, help="Print a JSON array with one object per recording."
+    "--json",
+    "as_json",
+    is_flag=True,
+    help="Print a JSON array with one object per recording that did not fail.",
 )
 config_option = click.option("--config", type=ANY_PATH, help="TOML file with settings.")
 set_option = click.option(

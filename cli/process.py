@@ -2,7 +2,7 @@
 
 import os
 from collections.abc import Iterator, Sequence
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from pathlib import Path
 from typing import Any
 
@@ -174,7 +174,7 @@ def process(
         for outcome in _run(batch, watcher, jobs, executor, scheduler):
             tally.add(outcome)
     if as_json:
-        print_json([outcome.summary.as_dict() for outcome in tally.kept if outcome.summary])
+        print_json([_plain(outcome) for outcome in tally.kept])
     else:
         _print_closing(batch.tasks, tally)
     ctx.exit(exit_code(list(tally.of_each_code.values())))
@@ -254,6 +254,23 @@ def _print_closing(tasks: Sequence[Any], tally: _Tally) -> None:
             _print_corrections(outcome)
     if len(tasks) > 1:
         click.echo(f"{tally.complete} complete, {tally.failed} failed, {tally.frames:,} frames")
+
+
+def _plain(outcome: Any) -> dict[str, Any]:
+    """Return the summary of a complete recording as plain values.
+
+    The manifest, which tells what was complete before, has no warnings and not all counts.
+    """
+    from shapecat.errors import OutputError
+    from shapecat.runs.folder import read_run
+    from shapecat.runs.jobs import summarize
+
+    summary, job = outcome.summary, outcome.job
+    if not summary.processed and not job.target:
+        with suppress(OutputError):  # it was removed meanwhile
+            summary = summarize(job, read_run(job.folder), processed=False)
+    plain: dict[str, Any] = summary.as_dict()
+    return plain
 
 
 def _print_corrections(outcome: Any) -> None:

@@ -271,13 +271,15 @@ def test_one_bad_recording_does_not_stop_the_others(
 ) -> None:
     bad = tmp_path / "bad.mcap"
     bad.write_bytes(b"no")
-    options = ("--end", 0.1, "--json", "--jobs", 1)
-    result = shapecat("process", bad, recording, "--out", tmp_path / "out", *options)
+    options, out = ("--end", 0.1, "--json", "--jobs", 1), tmp_path / "out"
+    result = shapecat("process", bad, recording, "--out", out, *options)
 
     assert result.exit_code == 1
     (summary,) = json.loads(result.stdout)
     assert summary["counts"]["frames"] > 0
-    assert {path.name for path in (tmp_path / "out").iterdir()} == {"table", "manifest.jsonl"}
+    (again,) = json.loads(shapecat("process", bad, recording, "--out", out, *options).stdout)
+    assert again == {**summary, "processed": False}  # also what the manifest does not hold
+    assert {path.name for path in out.iterdir()} == {"table", "manifest.jsonl"}
 
 
 def test_a_recording_in_which_nothing_is_found(shapecat: Run, tmp_path: Path) -> None:
