@@ -16,6 +16,7 @@ from rosbags.typesys import Stores, get_typestore
 from scipy.spatial.transform import Rotation, Slerp
 
 from shapecat.cameras.colour import ColourImage
+from shapecat.errors import NoStreamError
 from shapecat.recordings import choose_streams, open_recording, time_order
 from shapecat.recordings.colour_image import cloud_colours, compressed_size, pixels_of
 from shapecat.recordings.colour_streams import choose_colour, pair_colours
@@ -39,6 +40,19 @@ from tests.test_recordings_colour import MS, WIDE, depth_items, in_order, read, 
 from tests.test_recordings_frames import read as read_depth
 
 OTHER = Camera(80, 60, 69.5, 73.5, 39.1, 30.3)
+
+
+def test_images_without_depth_are_told_what_depth_would_be(tmp_path: Path) -> None:
+    """Depth in another encoding, such as 64FC1, was refused as if its topic held no image."""
+    path = record(tmp_path / "a.mcap", colour("/cam/depth/image_raw"))
+
+    with open_recording(path) as recording, pytest.raises(NoStreamError) as found:
+        choose_streams(recording)
+
+    assert str(found.value) == (
+        f"{path}: no point clouds or depth images (16UC1, mono16, 32FC1); "
+        "topics found: /cam/depth/image_raw (sensor_msgs/msg/Image)"
+    )
 
 
 # ---- which of several colour cameras

@@ -137,8 +137,10 @@ def _why_none(recording: Recording, streams: tuple[Stream, ...]) -> str:
         return f"{recording.path}: depth images without a sensor_msgs/CameraInfo: {names}"
     found = [f"{t.name} ({t.type or t.encoding})" for t in recording.topics]
     shown = ", ".join(found[:12]) + (", …" if len(found) > 12 else "")
+    images = any(t.type.endswith("Image") for t in recording.topics)
+    kinds = f" ({', '.join(DEPTH_ENCODINGS)})" if images else ""
     return (
-        f"{recording.path}: no point clouds or depth images; "
+        f"{recording.path}: no point clouds or depth images{kinds}; "
         f"topics found: {shown or 'none, the recording is empty'}"
     )
 
