@@ -146,6 +146,18 @@ def test_an_image_is_straightened_to_the_colours_between_its_pixels() -> None:
     assert np.abs(apart).max() <= 0.51
 
 
+def test_a_straightened_image_ends_where_its_lens_turns_back() -> None:
+    """Farther out the polynomial leads back into the image, and would show it again."""
+    camera = Camera(41, 31, 15.0, 16.0, 20.0, 15.0)
+    white = np.full((31, 41, 3), 255, np.uint8)
+    shown = rectified(white, LensCamera(camera, "plumb_bob", (-0.4, 0.0, 0.0, 0.0, 0.0)))
+    v, u = np.mgrid[:31, :41]
+    slope = np.hypot((u - 20) / 15, (v - 15) / 16)
+
+    assert (shown[slope < 0.905] == 255).all()  # x - 0.4 x^3 turns back at x = 0.913
+    assert (shown[slope > 0.92] == 0).all()
+
+
 @pytest.mark.parametrize("ahead", [-0.6, 0.7])
 def test_a_mask_is_dense_at_any_distance_of_the_colour_camera(ahead: float) -> None:
     """A depth pixel covers more of the image the nearer the colour camera is to the object."""

@@ -48,7 +48,7 @@ from shapecat.evaluation.comparison_pictures import (
     _shades,
     draw_frame,
 )
-from shapecat.evaluation.labellings import LabelledItem, Labelling
+from shapecat.evaluation.labellings import LabelledItem, Labelling, find_frame
 from shapecat.evaluation.overlap import Overlap, box_iou
 from shapecat.evaluation.references import open_reference
 from shapecat.evaluation.references_coco import CocoLabels, filled_polygon, rle_mask
@@ -635,12 +635,24 @@ def test_truth_of_another_recording_is_doubted(shapecat: Run, run: Path, truth: 
 def test_an_object_with_a_wrong_category_is_found_nevertheless() -> None:
     """Without masks, what is found is counted by the differences."""
     kinds = [None, "category", "identity", "missed", "missed", "surplus", "missed", "surplus"]
-    rows = [Difference("/d", 0, START, kind) for kind in kinds]
+    ious = [0.5, 0.0, *[None] * 6]  # boxes beside each other count, too
+    rows = [
+        Difference("/d", 0, START, kind, box_iou=iou) for kind, iou in zip(kinds, ious, strict=True)
+    ]
     figures = figures_of(
         {}, Pairs(), overlap=None, seen=None, rows=rows, categories=NAMES, threshold=0.25
     )
 
     assert figures["objects"] == {"true": 6, "detections": 5, "found": 3, "share_found": 0.5}
+    assert figures["box_iou"] == {"n": 2, "mean": 0.25}
+
+
+def test_the_labels_of_a_frame_are_those_of_its_own_topic_and_stamp() -> None:
+    """Labels without a topic, or by frame number, serve where there are no better ones."""
+    frames = {(None, 5): "any", ("/d", 5): "own", ("/d", START): "stamp", (None, START): "old"}
+    asked = ((("/d", 5), START), (("/e", 5), START), (("/d", 5), 1), (("/e", 5), 1), (("/e", 6), 1))
+
+    assert [find_frame(frames, *place) for place in asked] == ["stamp", "old", "own", "any", None]
 
 
 def test_frames_of_one_side_alone_are_told_with_that_side(

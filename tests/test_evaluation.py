@@ -6,6 +6,7 @@ import re
 from dataclasses import replace
 from importlib import import_module
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any
 from xml.etree import ElementTree as ET
 
@@ -17,8 +18,11 @@ from hypothesis import strategies as st
 from sklearn import metrics as reference
 
 from shapecat.arrays import F4
+from shapecat.config import Settings
+from shapecat.description import DESCRIPTOR_NAMES
 from shapecat.errors import ModelError, RecordingError
 from shapecat.evaluation import Report, evaluate_folder, format_report, metrics, read_dataset
+from shapecat.evaluation.dataset import View
 from shapecat.evaluation.fused import Fused, fuse_views
 from shapecat.evaluation.metrics import Bin
 from shapecat.evaluation.page import (
@@ -29,7 +33,7 @@ from shapecat.evaluation.page import (
     format_page,
     write_page,
 )
-from shapecat.evaluation.report import Compared, _accuracy_over
+from shapecat.evaluation.report import Compared, _accuracy_over, evaluate
 from shapecat.evaluation.training import (
     fit_views,
     learn_on_folder,
@@ -37,7 +41,7 @@ from shapecat.evaluation.training import (
     split_instances,
     train_on_folder,
 )
-from shapecat.evaluation.views import DescribedViews
+from shapecat.evaluation.views import DescribedView, DescribedViews, describe_views
 from shapecat.learning import Categorizer, load_model
 
 
@@ -272,6 +276,63 @@ def test_accuracies_over_ranges_are_those_by_hand() -> None:
         ("2-3 m", 2, 1.0),
         ("5 m or more", 2, 0.5),
     )
+
+
+def test_the_figures_of_a_report_are_those_by_hand() -> None:
+    """Six known views of three objects, and two unknown shapes, which count for novelty alone."""
+    posteriors = [[0.9, 0.1], [0.01, 0.99], [0.8, 0.2], [0.4, 0.6], [0.3, 0.7], [0.6, 0.4]]
+    novelty = np.array([0.5, 1.5, 0.2, 0.1, 0.3, 2.0, 1.2, 0.8])
+    predicted = SimpleNamespace(
+        posteriors=np.array([*posteriors, [0.5, 0.5], [0.2, 0.8]]), novelty=novelty
+    )
+    categories = ("cup", "can")
+    model: Any = SimpleNamespace(model_id="m", categories=categories, predict=lambda _: predicted)
+    views = DescribedViews(
+        np.zeros((8, 1), np.float32),
+        np.array([*["cup"] * 4, "can", "can", "unknown", "unknown"]),
+        np.array([f"x/{name}" for name in "acaabbuv"]),
+        points=np.array([50, 60, 70, 130, 130, 130, 50, 50]),
+        distances=np.array([0.5, 0.9, 0.9, 1.0, 1.2, 2.5, 0.5, 0.5]),
+        seconds=np.full(8, 0.25),
+        skipped=3,
+    )
+    report = evaluate(views, model)
+
+    assert (report.n, report.skipped, report.accuracy) == (6, 3, 0.5)
+    assert report.recall == {"cup": 0.5, "can": 0.5}
+    assert report.confusion == ((2, 2), (1, 1))
+    assert report.rejected_known == pytest.approx(2 / 6)
+    assert report.novelty == {"n": 2, "auroc": pytest.approx(8 / 12), "rejected": 0.5}
+    # The views of a: 0.9 * 0.8 * 0.4 against 0.1 * 0.2 * 0.6. Those of c and a would be a can.
+    assert [(one.views, one.groups, one.accuracy) for one in report.fused] == [(3, 1, 1.0)]
+    assert [row[:2] for row in report.by_distance] == [
+        ("0-0.8 m", 1), ("0.8-1.1 m", 3), ("1.1-1.4 m", 1), ("1.7 m or more", 1)
+    ]  # fmt: skip
+    assert [row[:2] for row in report.by_points] == [("0-60", 1), ("60-120", 2), ("120-250", 3)]
+    assert report.by_elevation == ()
+
+
+def test_the_pose_of_a_sensor_is_told_from_the_middle_of_the_object(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    """Views without a surface are left out of all columns, and counted."""
+    eyes, middle = ([0.3, 0.4, 1.35], [9, 9, 9], [-0.5, 1.2, 0.15]), np.array([0.0, 0.0, 0.15])
+    points = (np.array([[0.01, 0.02, -0.03], [-0.01, -0.02, 0.03]]) + middle).astype(np.float32)
+    found = iter((0.1, None, 0.2))
+
+    def describe(*_: object, **__: object) -> DescribedView | None:
+        value = next(found)
+        row = np.full(len(DESCRIPTOR_NAMES), value, np.float32)
+        return None if value is None else DescribedView(row, 7, 0.5)
+
+    monkeypatch.setattr("shapecat.evaluation.views.describe_view", describe)
+    seen = [View(points, np.array(eye, float), "cup", f"mug{k}") for k, eye in enumerate(eyes)]
+    views = describe_views(seen, settings=Settings())
+
+    assert (views.skipped, views.instances.tolist()) == (1, ["cup/mug0", "cup/mug2"])
+    assert views.distances == pytest.approx([1.3, 1.3], abs=1e-6)
+    assert views.elevations == pytest.approx([math.degrees(math.atan2(1.2, 0.5)), 0], abs=1e-5)
+    assert views.descriptors[:, 0] == pytest.approx([0.1, 0.2])
 
 
 def test_the_drawn_confusion_has_true_categories_in_rows() -> None:

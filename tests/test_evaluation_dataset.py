@@ -152,6 +152,14 @@ def save(root: Path, points: F4, **more: F4) -> Path:
     return path
 
 
+def test_a_point_needs_all_of_its_coordinates(tmp_path: Path) -> None:
+    """One NaN would spread over the whole descriptor."""
+    rows = [[0.1, 0.2, 0.3], [np.nan, 0.2, 0.3], [0.4, 0.5, np.inf], [0.7, 0.8, 0.9]]
+    view = read_view(save(tmp_path, np.array(rows, np.float32)))
+
+    np.testing.assert_allclose(view.points, [rows[0], rows[3]], rtol=1e-6)
+
+
 def test_a_view_keeps_its_sensor_and_loses_nan(tmp_path: Path) -> None:
     view = read_view(save(tmp_path, POINTS, viewpoint=np.array([0.1, 0.2, 0.9])))
 
