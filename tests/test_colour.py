@@ -295,6 +295,15 @@ def test_an_object_beside_the_colour_image_takes_no_mask_of_another() -> None:
     np.testing.assert_array_equal(whole, far_mask.full(240, 320))
 
 
+def test_a_loose_cloud_beside_a_colour_image_has_no_masks() -> None:
+    """Its points have no pixels to be projected; the recording must be processed nevertheless."""
+    cloud = Frame("", 0, 0, 0, "", points=np.array([[0.1, 0.2, 1.0], [0.2, 0.1, 1.1]], np.float32))
+    image = ColourImage("/color", 1, 2, "color", "rgb8", 320, 240, 0, b"")
+    masks = find_masks(cloud, ColourView(image, LENS, TURNED), [np.array([1], np.uint32)])
+
+    assert (masks.boxes, masks.counts, masks.width, masks.height) == ({}, {}, 320, 240)
+
+
 def test_masks_have_no_holes_of_pixels_but_those_of_the_object() -> None:
     """A colour image finer than the depth has gaps to close; a hole in a handle is not a gap."""
     depth = np.full((120, 160), 1.0, np.float32)
