@@ -488,6 +488,8 @@ def test_faces_of_a_run_are_the_surest_of_each_category() -> None:
         cards.append(Card(TrackRow(k, k, category, confidence, "", "/d", {}), line, pictures))
 
     assert _faces(cards) == ("2", "5", "4", "3", "1", "0")
+    cards[2] = replace(cards[2], pictures=None)
+    assert _faces(cards) == ("3", "5", "4", "1", "0", "6")
 
 
 def test_boxes_of_the_strip_are_as_large_as_in_its_pictures() -> None:

@@ -180,9 +180,10 @@ def _link(start: Path, target: Path) -> str:
 
 def _faces(cards: Sequence[Card]) -> tuple[str, ...]:
     """Return pictures of the most certain track of each category, then of other tracks."""
-    sure = sorted(cards, key=lambda card: -card.row.confidence)
-    first: dict[str, Card] = {}
-    for card in sure:
-        first.setdefault(card.row.category, card)
-    chosen = [*first.values(), *(card for card in sure if card not in first.values())]
-    return tuple(card.pictures.surfaces[0].image for card in chosen[:_FACES] if card.pictures)
+    drawn = [(card.row, card.pictures.surfaces[0].image) for card in cards if card.pictures]
+    first: dict[str, str] = {}
+    rest = []
+    for row, image in sorted(drawn, key=lambda face: -face[0].confidence):
+        if first.setdefault(row.category, image) is not image:
+            rest.append(image)
+    return (*first.values(), *rest)[:_FACES]
