@@ -1,4 +1,4 @@
-"""Arrangements of objects for training: on a table, in a pile, in a bin, on a shelf."""
+"""Arrangements of objects for training: on a table, in a pile, a bin, a shelf or a room."""
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
@@ -13,6 +13,7 @@ from shapecat.simulation.paths import Filming
 from shapecat.simulation.piles import bin_picking, pile, shelf_bin
 from shapecat.simulation.placement import choose_rest, rests
 from shapecat.simulation.primitives import rounded_box
+from shapecat.simulation.rooms import room
 from shapecat.simulation.shapes import make_object
 from shapecat.simulation.worlds import Thing, World, turned_about_z
 from shapecat.types import CATEGORIES, UNKNOWN, Pose
@@ -47,8 +48,10 @@ class ArrangementOptions:
     lying : fraction of cups, cans and bottles that lie; None for the default. Lying objects are
         harder, so training uses more of them.
     leaning : fraction of the objects on tables that are tilted, as if they leant on something.
-    settled : fraction of the arrangements made by physics: piles, bins, crowded compartments.
+    settled : fraction of the arrangements made by physics: piles, bins, crowded compartments,
+        tables in rooms.
     cameras : number of images of each arrangement.
+    background : whether detections of furniture and noise are views of ``unknown``, too.
     keep : whether to keep the points of the views.
     """
 
@@ -59,6 +62,7 @@ class ArrangementOptions:
     leaning: float = 0.0
     settled: float = 0.0
     cameras: int = 4
+    background: bool = False
     keep: bool = False
 
 
@@ -94,9 +98,10 @@ class Arrangement(NamedTuple):
 ALONE = moved(rounded_box(_TABLE_M), Pose(np.eye(3), np.array([0.0, 0.0, -_TABLE_M[2]])))
 """A table without a room around it."""
 _SETTLED: tuple[tuple[Callable[..., World], float, Arrangement], ...] = (
-    (pile, 0.7, Arrangement([], (), (8.0, 90.0))),
+    (pile, 0.5, Arrangement([], (), (8.0, 90.0))),
     (bin_picking, 0.15, Arrangement([], (), (50.0, 90.0))),
     (shelf_bin, 0.15, Arrangement([], (), (5.0, 35.0), (-120.0, -60.0))),
+    (room, 0.2, Arrangement([], (), (8.0, 80.0))),
 )
 """Scenes made by physics, their probabilities, and the viewpoints for them."""
 
@@ -109,7 +114,7 @@ def arrange(options: ArrangementOptions, rng: np.random.Generator) -> Arrangemen
 
 
 def _settled(options: ArrangementOptions, rng: np.random.Generator) -> Arrangement:
-    """Let 4 to 18 objects settle in a pile, a bin, or a compartment of a shelf."""
+    """Let 4 to 18 objects settle in a pile, a bin, a compartment of a shelf, or a room."""
     chosen = int(rng.choice(len(_SETTLED), p=[share for _, share, _ in _SETTLED]))
     make, _, seen_from = _SETTLED[chosen]
     names = rng.choice(CATEGORIES, int(rng.integers(4, 19)))

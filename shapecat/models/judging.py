@@ -116,7 +116,8 @@ def _test_views() -> list[WorldView]:
 
 def _parts(views: Simulated, model: Categorizer) -> list[tuple[str, Report]]:
     """Return a report for each part of a set; the parts differ in difficulty."""
-    whole = views.source != "fragment"
+    background = views.source == "background"
+    whole = (views.source != "fragment") & ~background
     clear = clear_views(views)
     parts = {
         "whole, mostly visible, well segmented, not upside down": clear,
@@ -127,7 +128,8 @@ def _parts(views: Simulated, model: Categorizer) -> list[tuple[str, Report]]:
         **{f"of these, by {name}": clear & (views.sensor == name) for name in PRESETS},
         "upside down": whole & (views.manner == "upside_down"),
         "30 to 70 % visible": whole & (views.visible < MOSTLY),
-        "fragments": ~whole,
+        "fragments": views.source == "fragment",
+        "background": background,
         "badly segmented (IoU 0.5 to 0.75)": whole & (views.overlap < CUT_WELL),
         "as detected": clear & (views.source == "detected"),
         "all": np.ones_like(clear),

@@ -32,8 +32,8 @@ __all__ = [
 SETS = {"training": (1, 100_000), "calibration": (2, 160), "test": (100_003, 100)}
 """Seed and maximum number of tables of each set; seeds from 100000 on are for evaluation only."""
 _SHARES: dict[str, dict[str, Any]] = {
-    "training": {"unknown": 0.3, "lying": 0.35, "leaning": 0.05, "settled": 0.4, "cameras": 10},
-    "calibration": {"unknown": 0.17, "settled": 0.4},
+    "training": {"unknown": 0.3, "lying": 0.35, "leaning": 0.05, "settled": 0.5, "cameras": 10},
+    "calibration": {"unknown": 0.17, "settled": 0.5},
     "test": {"unknown": 0.3, "settled": 0.5},
 }
 CUT_WELL = 0.75
@@ -71,7 +71,7 @@ def options_of(name: str) -> ArrangementOptions:
     kinds = [kind for k, kind in enumerate(DISTRACTORS) if (k % 3 == 0) == (name == "test")]
     if name == "training":
         kinds += _TIMES * list(PROCEDURAL)
-    return ArrangementOptions(SETS[name][0], tuple(kinds), **_SHARES[name])
+    return ArrangementOptions(SETS[name][0], tuple(kinds), background=True, **_SHARES[name])
 
 
 def simulate(name: str, worlds: int, jobs: int) -> Simulated:
@@ -109,6 +109,6 @@ def clear_views(views: Simulated) -> Bool:
 
 
 def partial_views(views: Simulated) -> Bool:
-    """Return the mask (n,) of views that show only a part of an object, or more than the object."""
-    seen = (views.source != "fragment") & (views.visible >= MOSTLY)
-    return np.asarray(~seen | (views.overlap < CUT_WELL))
+    """Return the mask (n,) of views that show a part of an object, more than it, or background."""
+    parts = np.isin(views.source, ("fragment", "background"))
+    return np.asarray(parts | (views.visible < MOSTLY) | (views.overlap < CUT_WELL))

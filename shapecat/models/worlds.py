@@ -36,12 +36,14 @@ from shapecat.simulation.mesh import Mesh, moved
 from shapecat.simulation.placement import Rest
 from shapecat.simulation.render import geometry
 from shapecat.surface import voxelize
-from shapecat.types import Scene
+from shapecat.types import UNKNOWN, Candidate, Scene
 
 __all__ = ["WorldView", "simulate_mesh", "simulate_views", "simulate_world"]
 
 _LEAST_VISIBLE = 0.3
 _OVERLAP = 0.5
+_BACKGROUND = 0.1
+"""Largest fraction of the pixels of a detection of background that show objects."""
 _DETECTED = 0.75
 """Fraction of the detected objects whose view is segmented by the detection."""
 _FRAGMENTS = 0.3
@@ -61,7 +63,8 @@ class WorldView(NamedTuple):
     distance : mean distance from the sensor, metres.
     seconds : time from points to descriptor.
     manner : resting pose: ``upright``, ``lying``, ``upside_down``, ``leaning`` or ``tilted``.
-    source : how the view was segmented: ``truth``, ``detected`` or ``fragment``.
+    source : how the view was segmented: ``truth``, ``detected`` or ``fragment``; or ``background``,
+        a detection that shows no object of the arrangement, whose label is ``unknown``.
     visible : fraction of the object's unoccluded pixels that have readings.
     overlap : IoU of the view's points and the object's readings.
     sensor : name of the sensor.
@@ -87,7 +90,8 @@ class WorldView(NamedTuple):
 class _Seen(NamedTuple):
     """An object in an image, with the circumstances of its view as in `WorldView`."""
 
-    actor: Actor
+    label: str
+    manner: str
     sensor: str
     visible: float
     overlap: float
@@ -114,7 +118,14 @@ def simulate_world(options: ArrangementOptions, number: int) -> list[WorldView]:
     """Simulate one arrangement and describe its objects from several viewpoints."""
     rng = np.random.default_rng((options.seed, number))
     arrangement, name = arrange(options, rng), f"{options.seed}/{number}"
-    return look(arrangement, name, cameras=options.cameras, rng=rng, keep=options.keep)
+    return look(
+        arrangement,
+        name,
+        cameras=options.cameras,
+        rng=rng,
+        background=options.background,
+        keep=options.keep,
+    )
 
 
 def simulate_mesh(
@@ -140,6 +151,7 @@ def look(
     *,
     cameras: int,
     rng: np.random.Generator,
+    background: bool = False,
     keep: bool = False,
 ) -> list[WorldView]:
     """Describe the objects of an arrangement from several viewpoints.
@@ -148,6 +160,7 @@ def look(
     ----------
     name : prefix of the instance names.
     cameras : number of viewpoints, each with its own sensor.
+    background : whether to describe the detections of background, too.
     keep : whether to keep the points of the views.
     """
     actors = arrangement.actors
@@ -162,6 +175,8 @@ def look(
         for k, actor in enumerate(actors):
             if image.visible[k] >= _LEAST_VISIBLE:
                 views += _views_of(image, scene, k, actor, f"{name}/{k}", rng)
+        if background:
+            views += _background(image, scene, len(actors), f"{name}/background")
     return views if keep else [view._replace(view=None) for view in views]
 
 
@@ -176,13 +191,26 @@ def _views_of(
         view, overlap = cut_halo(_cut_by_truth(image, k, actor, rng), rng), 1.0
         source = "truth"
     view = View(view.points, view.eye, actor.label, instance)
-    seen = _Seen(actor, image.sensor, float(image.visible[k]), overlap)
+    seen = _Seen(actor.label, actor.manner, image.sensor, float(image.visible[k]), overlap)
     described = [_described(view, source, seen)]
     if rng.random() < _FRAGMENTS:
         piece = cut_fragment(view, rng)
         if piece is not None:
             described.append(_described(piece, "fragment", seen))
     return [item for item in described if item is not None]
+
+
+def _background(image: RenderedView, scene: Scene, objects: int, name: str) -> list[WorldView]:
+    """Return the detections that show none of the first ``objects`` meshes."""
+    owners = image.owners.reshape(-1)
+    views = []
+    for candidate in scene.candidates:
+        mine = owners[candidate.indices]
+        if np.mean((mine >= 0) & (mine < objects)) <= _BACKGROUND:
+            view = replace(_view_of(image, scene, candidate), category=UNKNOWN, instance=name)
+            seen = _Seen(UNKNOWN, "upright", image.sensor, visible=1.0, overlap=1.0)
+            views.append(_described(view, "background", seen))
+    return [view for view in views if view is not None]
 
 
 def _cut_by_detection(image: RenderedView, scene: Scene, k: int) -> tuple[View, float] | None:
@@ -194,11 +222,16 @@ def _cut_by_detection(image: RenderedView, scene: Scene, k: int) -> tuple[View, 
         hits = int(np.count_nonzero(owners[candidate.indices] == k))
         overlap = hits / (total + candidate.indices.size - hits)
         if overlap >= _OVERLAP:
-            points = image.frame.xyz(candidate.indices)
-            points = points[np.isfinite(points[:, 0])]
-            level = level_from_sensor(scene.up, scene.support_offset(candidate), points)
-            return View(transform(level, points), level.translation, "", ""), overlap
+            return _view_of(image, scene, candidate), overlap
     return None
+
+
+def _view_of(image: RenderedView, scene: Scene, candidate: Candidate) -> View:
+    """Return the points of a detection in its level frame, without label and instance."""
+    points = image.frame.xyz(candidate.indices)
+    points = points[np.isfinite(points[:, 0])]
+    level = level_from_sensor(scene.up, scene.support_offset(candidate), points)
+    return View(transform(level, points), level.translation, "", "")
 
 
 def _cut_by_truth(image: RenderedView, k: int, actor: Actor, rng: np.random.Generator) -> View:
@@ -229,12 +262,12 @@ def _described(view: View, source: str, seen: _Seen) -> WorldView | None:
         return None
     return WorldView(
         descriptor=described.descriptor,
-        label=seen.actor.label,
+        label=seen.label,
         instance=view.instance,
         points=described.points,
         distance=distance,
         seconds=described.seconds,
-        manner=seen.actor.manner,
+        manner=seen.manner,
         source=source,
         visible=seen.visible,
         overlap=seen.overlap,
