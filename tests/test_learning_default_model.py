@@ -14,12 +14,14 @@ from shapecat.evaluation import View, evaluate
 from shapecat.evaluation.training import fit_views
 from shapecat.evaluation.views import describe_views
 from shapecat.learning import Categorizer, load_model, save_model
-from shapecat.models.arrangements import ArrangementOptions
+from shapecat.models.arrangements import ALONE, Actor, Arrangement, ArrangementOptions
 from shapecat.models.card import write_card
 from shapecat.models.fragments import cut_fragment, cut_halo
-from shapecat.models.sets import Simulated, collect
-from shapecat.models.worlds import simulate_views, simulate_world
-from shapecat.types import CATEGORIES
+from shapecat.models.sets import Simulated, collect, partial_views
+from shapecat.models.worlds import look, simulate_views, simulate_world
+from shapecat.simulation.mesh import moved
+from shapecat.simulation.primitives import rounded_box
+from shapecat.types import CATEGORIES, Pose
 
 DATA = Path(__file__).parents[2] / "shared" / "data"
 _NEAR_M = 1.2
@@ -104,6 +106,25 @@ def test_two_trainings_give_the_same_file(
         save_model(tmp_path / f"{jobs}.npz", model)
 
     assert (tmp_path / "1.npz").read_bytes() == (tmp_path / "2.npz").read_bytes()
+
+
+def test_background_is_a_view_of_no_category() -> None:
+    """A model that never saw background gives it a category; an object must not count as it."""
+    can, block = (rounded_box((0.08, 0.06, 0.12)) for _ in range(2))
+    aside = Pose(np.eye(3), np.array([0.15, 0.0, 0.0]))
+    seen = Arrangement([Actor(can, "box", "upright", 0.0)], (ALONE, moved(block, aside)), (30, 50))
+
+    views, objects = (
+        look(seen, "a", cameras=4, rng=np.random.default_rng(2), background=with_it, keep=True)
+        for with_it in (True, False)
+    )
+    found = [view for view in views if view.source == "background"]
+    assert found
+    assert {(view.label, view.instance) for view in found} == {("unknown", "a/background")}
+    assert all(abs(np.ptp(view.view.points[:, 2]) - 0.12) < 0.03 for view in found if view.view)
+    assert {view.source for view in views} > {view.source for view in objects}
+    assert {view.label for view in objects} == {"box"}
+    assert partial_views(collect(found)).all()
 
 
 def half_ball() -> View:
