@@ -51,7 +51,7 @@ def test_the_shipped_card_says_what_the_next_one_will_say(tmp_path: Path) -> Non
     """A reservation that is only in the file is lost with the next training."""
     card = (files("shapecat.models") / "MODEL_CARD.md").read_text("utf-8")
     report: Any = SimpleNamespace(categories=CATEGORIES, confusion=np.zeros((7, 7), int).tolist())
-    write_card(tmp_path / "card.md", model=load_model().model_id, after=None, categories=CATEGORIES,
+    write_card(tmp_path / "card.md", model=load_model().model_id, categories=CATEGORIES,
                tables=(), confusion=report, settings={})  # fmt: skip
     text, end = (tmp_path / "card.md").read_text("utf-8"), "\n## Confusion on the test tables"
 

@@ -65,18 +65,14 @@ class BoostedDictionary(ClassifierMixin, TreeDictionary):  # type: ignore[misc] 
     jobs: int | None = None
     random_state: int | None = None
 
-    def fit(self, X: ArrayLike, y: ArrayLike, start: F4 | None = None) -> Self:
-        """Grow the trees on features X (n, f) and labels y (n,); unknown shapes are included.
-
-        ``start`` (n, k) are the logits that the trees add to; by default the log frequencies of the
-        labels.
-        """
+    def fit(self, X: ArrayLike, y: ArrayLike) -> Self:
+        """Grow the trees on features X (n, f) and labels y (n,); unknown shapes are included."""
         x, y = validate_data(self, X, y, dtype=np.float32)
         self.classes_, labels = known_labels(y, self.unknown)
         labels = np.where(labels < 0, len(self.classes_), labels)
         self.bias_ = np.log(np.bincount(labels) / labels.size)
-        scores = np.repeat(self.bias_[:, None], labels.size, axis=1) if start is None else start.T
-        trees = self._boost(make_bins(x), labels, np.array(scores, np.float32, order="C"))
+        scores = np.repeat(self.bias_[:, None], labels.size, axis=1).astype(np.float32)
+        trees = self._boost(make_bins(x), labels, scores)
         self.forest_, self.votes_ = _join(trees, self.bias_.size)
         return self
 

@@ -12,7 +12,7 @@ PICTURE = "worst_mistakes.png"
 """File name of the picture beside the card."""
 _HEAD = """# The default model
 
-Model `{model}`, made by {command}
+Model `{model}`, made by `make model` (`python -m shapecat.models.training`)
 from the simulator alone: no real data were used for training or calibration. Settings were chosen
 on simulated objects; the results on real data below were known during this choice, so they are
 slightly optimistic.
@@ -46,10 +46,6 @@ The views of the test set with the most confident wrong labels. Colour shows the
 
 ![Points of the worst mistakes, with their true and predicted labels]({picture})
 """
-_ANEW = "`make model` (`python -m shapecat.models.training`)"
-_AFTER = """`python -m shapecat.models.training --after`
-on top of model `{after}`, whose trees it keeps (the ablation
-studies used that model),"""
 
 
 @dataclass(frozen=True)
@@ -79,7 +75,6 @@ def write_card(
     path: Path,
     *,
     model: str,
-    after: str | None,
     categories: Sequence[str],
     tables: Sequence[Table],
     confusion: Report,
@@ -90,14 +85,12 @@ def write_card(
     Parameters
     ----------
     model : id of the model.
-    after : id of the model whose trees it keeps; None if it was trained from scratch.
     tables : results to print.
     confusion : report whose confusion matrix is printed.
     settings : settings of the training, by name.
     """
     head = _HEAD.format(
         model=model,
-        command=_ANEW if after is None else _AFTER.format(after=after),
         categories=", ".join(categories),
         picture=PICTURE,
     )

@@ -91,7 +91,6 @@ def judge(
     write_card(
         out / "MODEL_CARD.md",
         model=model.model_id,
-        after=model.notes.get("after"),
         categories=model.categories,
         tables=tables,
         confusion=clear,
@@ -99,7 +98,6 @@ def judge(
             "worlds": len({name.split("/")[1] for name in sets["training"].views.instances}),
             "seed": seed,
             **model.notes["learning"],
-            **model.notes.get("more", {}),
         },
     )
     draw(out / PICTURE, worst_mistakes(_test_views(), model))
