@@ -17,8 +17,6 @@ __all__ = [
     "Examples",
     "LearningSettings",
     "calibrate",
-    "choose_evenly",
-    "collapse",
     "encode",
     "fit_categorizer",
     "fit_threshold",
@@ -127,7 +125,7 @@ def fit_categorizer(
         raise ValueError(msg)
     chain = make_chain(blocks, settings, seed=seed)
     chain.fit(train.descriptors, encode(train.labels, categories))
-    categorizer = collapse(
+    categorizer = _collapse(
         chain,
         train,
         descriptor_names=descriptor_names,
@@ -144,7 +142,7 @@ def _notes_of(settings: LearningSettings) -> dict[str, Any]:
     return {name: value for name, value in asdict(settings).items() if name != "jobs"}
 
 
-def collapse(
+def _collapse(
     chain: Pipeline,
     train: Examples,
     *,
@@ -164,7 +162,7 @@ def collapse(
     columns = dictionary.bias_.size
     codes = encode(train.labels, categories)
     codes = np.where((codes < 0) & (columns > len(categories)), len(categories), codes)
-    chosen = choose_evenly(codes, settings.known_views, np.random.default_rng(seed))
+    chosen = _choose_evenly(codes, settings.known_views, np.random.default_rng(seed))
     return Categorizer(
         categories=tuple(categories),
         descriptor_names=tuple(descriptor_names),
@@ -181,7 +179,7 @@ def collapse(
     )
 
 
-def choose_evenly(codes: I4, count: int, rng: np.random.Generator) -> I4:
+def _choose_evenly(codes: I4, count: int, rng: np.random.Generator) -> I4:
     """Return up to ``count`` indices of views, ascending, drawn evenly from all categories.
 
     Parameters
