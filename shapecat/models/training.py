@@ -27,7 +27,7 @@ _TREES: dict[str, Any] = {"rounds": 320, "leaves": 40, "rate": 0.09}
 
 
 @click.command()
-@click.option("--worlds", default=5000, show_default=True, help="Number of training scenes.")
+@click.option("--worlds", default=8000, show_default=True, help="Number of training scenes.")
 @click.option("--seed", default=0, show_default=True, help="Seed of the random generator.")
 @click.option("--jobs", default=2, show_default=True, help="Number of processes.")
 @click.option("--out", default=_HERE, type=click.Path(path_type=Path), help="Folder to write to.")
