@@ -108,11 +108,13 @@ def test_two_trainings_give_the_same_file(
     assert (tmp_path / "1.npz").read_bytes() == (tmp_path / "2.npz").read_bytes()
 
 
-def test_background_is_a_view_of_no_category() -> None:
-    """A model that never saw background gives it a category; an object must not count as it."""
-    can, block = (rounded_box((0.08, 0.06, 0.12)) for _ in range(2))
-    aside = Pose(np.eye(3), np.array([0.15, 0.0, 0.0]))
-    seen = Arrangement([Actor(can, "box", "upright", 0.0)], (ALONE, moved(block, aside)), (30, 50))
+def test_thin_background_is_a_view_of_no_category() -> None:
+    """A model that never saw it takes it for plates; what is higher has the shape of a category."""
+    sizes = ((0.08, 0.06, 0.12), (0.1, 0.09, 0.022), (0.07, 0.06, 0.1))
+    box, board, block = (rounded_box(size) for size in sizes)
+    here, there = (Pose(np.eye(3), np.array([x, 0.05, 0.0])) for x in (-0.15, 0.15))
+    around = (ALONE, moved(board, here), moved(block, there))
+    seen = Arrangement([Actor(box, "box", "upright", 0.0)], around, (30, 50))
 
     views, objects = (
         look(seen, "a", cameras=4, rng=np.random.default_rng(2), background=with_it, keep=True)
@@ -121,8 +123,8 @@ def test_background_is_a_view_of_no_category() -> None:
     found = [view for view in views if view.source == "background"]
     assert found
     assert {(view.label, view.instance) for view in found} == {("unknown", "a/background")}
-    assert all(abs(np.ptp(view.view.points[:, 2]) - 0.12) < 0.03 for view in found if view.view)
-    assert {view.source for view in views} > {view.source for view in objects}
+    assert all(np.ptp(view.view.points[:, 2]) < 0.035 for view in found if view.view)
+    assert len(views) == len(found) + len(objects)
     assert {view.label for view in objects} == {"box"}
     assert partial_views(collect(found)).all()
 

@@ -51,7 +51,7 @@ class ArrangementOptions:
     settled : fraction of the arrangements made by physics: piles, bins, crowded compartments,
         tables in rooms.
     cameras : number of images of each arrangement.
-    background : whether detections of furniture and noise are views of ``unknown``, too.
+    background : whether thin detections of furniture and noise are views of ``unknown``, too.
     keep : whether to keep the points of the views.
     """
 

@@ -12,6 +12,7 @@ import numpy as np
 
 from shapecat.arrays import F4, F8
 from shapecat.config import Settings
+from shapecat.description import DESCRIPTOR_NAMES
 from shapecat.detection import detect
 from shapecat.evaluation import View
 from shapecat.evaluation.views import describe_view
@@ -44,6 +45,10 @@ _LEAST_VISIBLE = 0.3
 _OVERLAP = 0.5
 _BACKGROUND = 0.1
 """Largest fraction of the pixels of a detection of background that show objects."""
+_THIN_M = 0.03
+"""Height of background below which it is a view: what is higher may have the shape of a category,
+as a cupboard is a box."""
+_HEIGHT = DESCRIPTOR_NAMES.index("metric.height")
 _DETECTED = 0.75
 """Fraction of the detected objects whose view is segmented by the detection."""
 _FRAGMENTS = 0.3
@@ -64,7 +69,7 @@ class WorldView(NamedTuple):
     seconds : time from points to descriptor.
     manner : resting pose: ``upright``, ``lying``, ``upside_down``, ``leaning`` or ``tilted``.
     source : how the view was segmented: ``truth``, ``detected`` or ``fragment``; or ``background``,
-        a detection that shows no object of the arrangement, whose label is ``unknown``.
+        a thin detection that shows no object, whose label is ``unknown``.
     visible : fraction of the object's unoccluded pixels that have readings.
     overlap : IoU of the view's points and the object's readings.
     sensor : name of the sensor.
@@ -160,7 +165,7 @@ def look(
     ----------
     name : prefix of the instance names.
     cameras : number of viewpoints, each with its own sensor.
-    background : whether to describe the detections of background, too.
+    background : whether to describe thin detections of background, too.
     keep : whether to keep the points of the views.
     """
     actors = arrangement.actors
@@ -201,7 +206,7 @@ def _views_of(
 
 
 def _background(image: RenderedView, scene: Scene, objects: int, name: str) -> list[WorldView]:
-    """Return the detections that show none of the first ``objects`` meshes."""
+    """Return the thin detections that show none of the first ``objects`` meshes."""
     owners = image.owners.reshape(-1)
     views = []
     for candidate in scene.candidates:
@@ -210,7 +215,7 @@ def _background(image: RenderedView, scene: Scene, objects: int, name: str) -> l
             view = replace(_view_of(image, scene, candidate), category=UNKNOWN, instance=name)
             seen = _Seen(UNKNOWN, "upright", image.sensor, visible=1.0, overlap=1.0)
             views.append(_described(view, "background", seen))
-    return [view for view in views if view is not None]
+    return [view for view in views if view is not None and view.descriptor[_HEIGHT] < _THIN_M]
 
 
 def _cut_by_detection(image: RenderedView, scene: Scene, k: int) -> tuple[View, float] | None:
