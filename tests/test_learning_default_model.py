@@ -14,11 +14,20 @@ from shapecat.evaluation import View, evaluate
 from shapecat.evaluation.training import fit_views
 from shapecat.evaluation.views import describe_views
 from shapecat.learning import Categorizer, load_model, save_model
-from shapecat.models.arrangements import ALONE, Actor, Arrangement, ArrangementOptions
+from shapecat.models import arrangements
+from shapecat.models.arrangements import (
+    ALONE,
+    Actor,
+    Arrangement,
+    ArrangementOptions,
+    arrange,
+)
 from shapecat.models.card import write_card
 from shapecat.models.fragments import cut_fragment, cut_halo
 from shapecat.models.sets import Simulated, collect, partial_views
 from shapecat.models.worlds import look, simulate_views, simulate_world
+from shapecat.simulation import piles
+from shapecat.simulation.distractors import make_distractor
 from shapecat.simulation.mesh import moved
 from shapecat.simulation.primitives import rounded_box
 from shapecat.types import CATEGORIES, Pose
@@ -106,6 +115,23 @@ def test_two_trainings_give_the_same_file(
         save_model(tmp_path / f"{jobs}.npz", model)
 
     assert (tmp_path / "1.npz").read_bytes() == (tmp_path / "2.npz").read_bytes()
+
+
+@pytest.mark.parametrize("number", range(4))
+def test_distractors_of_training_are_of_the_given_kinds(
+    number: int, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """The kinds of the test set must be new to the model in every scene."""
+    made, only = [], arrangements._SETTLED[number][0]
+    monkeypatch.setattr(arrangements, "_SETTLED", ((only, 1.0, Arrangement([], ())),))
+    monkeypatch.setattr(
+        piles, "make_distractor", lambda rng, kind: made.append(kind) or make_distractor(rng, kind)
+    )
+    options = ArrangementOptions(3, ("pan", "hammer"), unknown=1.0, settled=1.0)
+    actors = arrange(options, np.random.default_rng(5)).actors
+
+    assert {actor.label for actor in actors} == {"unknown"}
+    assert set(made) == {"pan", "hammer"}
 
 
 def test_thin_background_is_a_view_of_no_category() -> None:

@@ -30,14 +30,16 @@ _DEVICES = {"laptop": make_laptop, "keyboard": make_keyboard, "plant": make_plan
 """Large objects on the table, outside the categories."""
 
 
-def room(rng: Generator, categories: Sequence[str], filming: Filming) -> World:
+def room(
+    rng: Generator, categories: Sequence[str], filming: Filming, *, kinds: Sequence[str] = KINDS
+) -> World:
     """Return objects on a table among background equipment; parameters as for `pile`."""
     supports = [*make_room(rng, wall_chance=0.7), make_table(rng)]
     table = supports[-1]
     supports += _walls(rng)
     standing = [*_arms(rng, table), *_screens(rng, table)]
     around = [*_around(rng), *_cables(rng, table)]
-    drops, items = [], [make_item(category, rng, KINDS) for category in categories]
+    drops, items = [], [make_item(category, rng, kinds) for category in categories]
     items += [Item("unknown", name, make(rng)) for name, make in _devices(rng)]
     half = np.ptp(table.outline[:, :2], axis=0) / 2
     for item in items:
