@@ -28,7 +28,7 @@ from shapecat.models.sets import Simulated, collect, partial_views
 from shapecat.models.worlds import look, simulate_views, simulate_world
 from shapecat.simulation import piles
 from shapecat.simulation.distractors import make_distractor
-from shapecat.simulation.mesh import moved
+from shapecat.simulation.mesh import Mesh, moved
 from shapecat.simulation.primitives import rounded_box
 from shapecat.types import CATEGORIES, Pose
 
@@ -122,11 +122,15 @@ def test_distractors_of_training_are_of_the_given_kinds(
     number: int, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """The kinds of the test set must be new to the model in every scene."""
-    made, only = [], arrangements._SETTLED[number][0]
+    made: list[str] = []
+
+    def make(rng: np.random.Generator, kind: str) -> tuple[str, Mesh]:
+        made.append(kind)
+        return make_distractor(rng, kind)
+
+    only = arrangements._SETTLED[number][0]
     monkeypatch.setattr(arrangements, "_SETTLED", ((only, 1.0, Arrangement([], ())),))
-    monkeypatch.setattr(
-        piles, "make_distractor", lambda rng, kind: made.append(kind) or make_distractor(rng, kind)
-    )
+    monkeypatch.setattr(piles, "make_distractor", make)
     options = ArrangementOptions(3, ("pan", "hammer"), unknown=1.0, settled=1.0)
     actors = arrange(options, np.random.default_rng(5)).actors
 

@@ -17,6 +17,7 @@ __all__ = [
     "Examples",
     "LearningSettings",
     "calibrate",
+    "choose_evenly",
     "encode",
     "fit_categorizer",
     "fit_threshold",
@@ -162,7 +163,7 @@ def _collapse(
     columns = dictionary.bias_.size
     codes = encode(train.labels, categories)
     codes = np.where((codes < 0) & (columns > len(categories)), len(categories), codes)
-    chosen = _choose_evenly(codes, settings.known_views, np.random.default_rng(seed))
+    chosen = choose_evenly(codes, settings.known_views, np.random.default_rng(seed))
     return Categorizer(
         categories=tuple(categories),
         descriptor_names=tuple(descriptor_names),
@@ -179,7 +180,7 @@ def _collapse(
     )
 
 
-def _choose_evenly(codes: I4, count: int, rng: np.random.Generator) -> I4:
+def choose_evenly(codes: I4, count: int, rng: np.random.Generator) -> I4:
     """Return up to ``count`` indices of views, ascending, drawn evenly from all categories.
 
     Parameters
