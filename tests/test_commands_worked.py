@@ -338,7 +338,7 @@ CALLS = {
     "export a --format kitti --out o --every 3 --boxes visible --recording r.bag": (
         "shapecat.outputs.exports.export_run",
         [Path("a"), "kitti", Path("o")],
-        {"every": 3, "visible_boxes": True, "recording": Path("r.bag")},
+        {"every": 3, "visible_boxes": True, "recording": Path("r.bag"), "categories": ["of a"]},
         1,
         "a: 1 labelled view in o\n",
     ),
@@ -362,6 +362,8 @@ def test_options_reach_the_work_and_its_answer_the_reader(
     monkeypatch.chdir(tmp_path)
     monkeypatch.setattr(work, stub)
     monkeypatch.setattr("shapecat.runs.finished.find_runs", list)
+    common = "shapecat.outputs.exports.common_categories"
+    monkeypatch.setattr(common, lambda runs: [f"of {run}" for run in runs])
     done = shapecat(*line.split())
 
     assert (done.exit_code, done.stdout) == (0, said), done.stderr
