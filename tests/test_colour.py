@@ -128,9 +128,13 @@ def test_points_land_where_the_lens_model_says(model: str, coefficients: tuple[f
     np.testing.assert_allclose(project(points, lens, TURNED), expected, rtol=1e-4)
 
 
-def test_an_image_is_straightened_to_the_colours_between_its_pixels() -> None:
-    """Compared with SciPy's bilinear interpolation: colours run differently in x and y."""
-    lens = LensCamera(Camera(24, 18, 20.0, 21.0, 11.3, 8.8), "plumb_bob", (-0.2, 0, 0.02, 0.01, 0))
+@pytest.mark.parametrize("bent", [-0.2, 0.2])
+def test_an_image_is_straightened_to_the_colours_between_its_pixels(bent: float) -> None:
+    """Compared with SciPy's bilinear interpolation: colours run differently in x and y.
+
+    A lens that bends outward asks for pixels beyond each border, where there are none.
+    """
+    lens = LensCamera(Camera(24, 18, 20.0, 21.0, 11.3, 8.8), "plumb_bob", (bent, 0, 0.02, 0.01, 0))
     pixels = np.random.default_rng(7).integers(0, 256, (18, 24, 3)).astype(np.uint8)
     v, u = np.mgrid[:18, :24]
     rays = np.stack([(u - 11.3) / 20, (v - 8.8) / 21], axis=-1)

@@ -366,6 +366,25 @@ def test_a_batch_takes_nothing_of_another_model_for_done(
     assert status_of(job, source, out) == "check"
 
 
+def test_a_batch_looks_again_at_a_recording_whose_copy_has_kept_the_times(
+    source: Path, tmp_path: Path
+) -> None:
+    """`rsync -t` puts another recording there that only its inode time gives away."""
+    (source.parent / "other.mcap").write_bytes(b"another")
+
+    def key() -> str:
+        with plan_batch(Job(Path(), Path()), [str(source.parent)], str(tmp_path / "out")) as batch:
+            return next(task.input for task in batch.tasks if task.path == str(source))
+
+    before, stat = key(), source.stat()
+    assert key() == before
+    while source.stat().st_ctime_ns == stat.st_ctime_ns:  # its clock ticks every few milliseconds
+        source.write_bytes(b"recordinG")
+        os.utime(source, ns=(stat.st_atime_ns, stat.st_mtime_ns))
+
+    assert key() != before
+
+
 @pytest.mark.parametrize(
     ("noted", "there", "status"),
     [

@@ -329,6 +329,17 @@ def test_coco_keeps_every_number_in_its_place(tmp_path: Path) -> None:
     assert len({a["id"] for a in (sure, unsure)}) == len({a["track_id"] for a in (sure, unsure)})
 
 
+def test_tracks_of_runs_of_the_same_name_are_different_objects(tmp_path: Path) -> None:
+    """Two batches may each have a run ``lab``; their tracks 4 must not be one object."""
+    runs = [SimpleNamespace(folder=Path(day, "lab"), name="lab") for day in ("monday", "tuesday")]
+    images: Any = [("train", run, dataset_image()) for run in runs]
+    write_coco(tmp_path, images, ("cup", "can", "bowl"))
+    data = json.loads((tmp_path / "annotations" / "instances_train.json").read_text())
+
+    assert [a["attributes"]["track"] for a in data["annotations"]] == [4, 9, 4, 9]
+    assert [a["track_id"] for a in data["annotations"]] == [1, 2, 3, 4]
+
+
 def test_yolo_leaves_out_what_is_not_sure(tmp_path: Path) -> None:
     """The format has no flag for uncertain labels, so they would be trained on."""
     categories = ("cup", "can", "bowl")

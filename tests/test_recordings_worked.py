@@ -31,7 +31,7 @@ from shapecat.recordings.stamps import Clock
 from shapecat.recordings.streams import info_topic_of
 from shapecat.recordings.time_order import Timed, in_time_order
 from shapecat.recordings.transform_samples import _slerp
-from shapecat.recordings.transforms import TransformBuffer
+from shapecat.recordings.transforms import ExtrapolationError, TransformBuffer
 from shapecat.types import Camera
 from tests.colour_messages import gradient, jpeg, packed, png, raw
 from tests.messages import EPOCH, SECOND, cloud, image, info, make, organized_points, wavy_depth
@@ -439,6 +439,18 @@ def test_a_transform_is_held_for_the_tolerance_and_no_longer() -> None:
     for stamp, said in ((89, "before the first"), (511, "after the last")):
         with pytest.raises(Exception, match=said):
             buffer.lookup("map", "cup", stamp)
+
+
+def test_of_forgotten_transforms_the_last_one_stays() -> None:
+    """Between two transforms that are far apart, a frame needs the one long before it."""
+    buffer = TransformBuffer(tolerance_ns=10)
+    for stamp in (100, 200, 900):
+        buffer.add("map", "cup", stamp, ((stamp, 0, 0), (0, 0, 0, 1)), static=False)
+    buffer.forget(500)
+
+    assert buffer.lookup("map", "cup", 550).translation[0] == pytest.approx(550)
+    with pytest.raises(ExtrapolationError, match="before the first"):
+        buffer.lookup("map", "cup", 150)
 
 
 def test_accelerations_are_averaged_over_half_a_second_on_each_side() -> None:

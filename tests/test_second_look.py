@@ -330,6 +330,18 @@ def test_a_still_camera_knows_up_from_its_neighbours() -> None:
         assert revision.up_given is None
 
 
+def test_a_floor_beside_the_usual_support_disturbs_no_frame() -> None:
+    """A gap between furniture shows the floor in one frame; the table is still where it was."""
+    (frames, planes), *others = tables(leaning(np.full(20, 35.0)))
+    offset = planes.schema.get_field_index("offset")
+    floor = planes[4:5].set_column(offset, planes.schema.field(offset), [[np.float32(-1.4)]])
+    both = pa.concat_tables([planes[:4], floor, planes[4:]])
+
+    assert frames_to_revise([(frames, both), *others]) == {}
+    alone = pa.concat_tables([planes[:4], floor, planes[5:]])
+    assert list(frames_to_revise([(frames, alone), *others])) == [("/d", 4)]
+
+
 def test_cameras_are_compared_with_their_own_frames_alone() -> None:
     """Two cameras that lean differently would revise each other's frames."""
     one, other = (leaning(np.full(20, degrees)) for degrees in (35.0, 10.0))

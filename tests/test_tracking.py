@@ -578,7 +578,10 @@ def test_a_cut_view_moves_its_track_less_and_teaches_it_less() -> None:
 
 
 def test_weights_of_views_reach_the_posterior_of_a_track() -> None:
-    """Three whole views say cup, three cut ones box: the cup must win by a quarter's weight."""
+    """Three whole views say cup, three cut ones box: the cup must win by a quarter's weight.
+
+    The table of tracks and the report show the posterior after each view.
+    """
     frames = [
         replace(
             frame(k, [[0.0, 0, 0]], posterior=BOX if k % 2 else CUP), partial=np.array([k % 2 == 1])
@@ -590,6 +593,9 @@ def test_weights_of_views_reach_the_posterior_of_a_track() -> None:
     share = (3 * np.log(CUP) + 0.75 * np.log(BOX)) / 3.75
     np.testing.assert_allclose(track.posterior, np.exp(share) / np.exp(share).sum(), atol=1e-9)
     assert track.posterior[0] > 0.75
+    after_two = CUP**0.8 * BOX**0.2
+    np.testing.assert_allclose(track.causal[1], after_two / after_two.sum(), atol=1e-6)
+    np.testing.assert_allclose(track.causal[-1], track.posterior, atol=1e-6)
 
 
 @pytest.mark.parametrize(
