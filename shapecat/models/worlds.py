@@ -93,7 +93,7 @@ class WorldView(NamedTuple):
 
 
 class _Seen(NamedTuple):
-    """An object in an image, with the circumstances of its view as in `WorldView`."""
+    """An object or background in an image: label and circumstances as in `WorldView`."""
 
     label: str
     manner: str
