@@ -34,17 +34,16 @@ from shapecat.runs.jobs import (
     Summary,
     describe_run,
     differences,
-    has_work,
     identify,
     keep_labels,
     require_unchanged,
-    resume,
     summarize,
 )
 from shapecat.runs.label_meaning import TrackLabel
 from shapecat.runs.label_transfer import Transfer, transfer_labels
 from shapecat.runs.missing_planes import explain_missing_planes
 from shapecat.runs.perceiving import Work, perceive_all, revise
+from shapecat.runs.resuming import has_work, resume, take_over_frames
 from shapecat.runs.run_info import RunInfo
 from shapecat.runs.segments import discard_segments
 from shapecat.runs.tables import release_memory
@@ -65,7 +64,8 @@ def process(job: Job, observe: Observer = ignore, *, cores: int = 1) -> Summary:
 
     A complete folder made from the same input, settings and model is kept, and gets the outputs
     that it lacks. A new folder gets its final name only when it is complete; an interrupted run
-    resumes where it stopped.
+    resumes where it stopped. If a run replaces one that differs only in settings of tracking or
+    outputs, it keeps the perceived frames.
 
     Parameters
     ----------
@@ -94,6 +94,8 @@ def process(job: Job, observe: Observer = ignore, *, cores: int = 1) -> Summary:
             return _finished(job, recording, run, content, observe)
         with staged(job.folder, worth_keeping=has_work) as folder:
             run = resume(folder, run, job.source, content.result)
+            if "perceive" not in run["seconds"]:
+                run = take_over_frames(job.folder, folder, run, job.source, content.result)
             run["color"] = {topic: colour.topic for topic, colour in colours.items()}
             compiling_s = compile_all(lambda: observe("compile", 0, None), cores=cores)
             content.start()

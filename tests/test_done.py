@@ -35,10 +35,9 @@ from shapecat.runs.jobs import (
     Summary,
     describe_run,
     differences,
-    has_work,
     require_unchanged,
-    resume,
 )
+from shapecat.runs.resuming import has_work, resume
 from shapecat.runs.run_info import RunInfo
 from shapecat.system.files import partial_path
 from tests.run_info import run_info

@@ -2,8 +2,7 @@
 
 import dataclasses
 import platform
-from collections.abc import Callable, Mapping
-from contextlib import suppress
+from collections.abc import Mapping
 from dataclasses import dataclass, field
 from importlib.metadata import version
 from pathlib import Path
@@ -14,18 +13,16 @@ from shapecat.config import Settings
 from shapecat.errors import OutputError, RecordingError
 from shapecat.learning import Categorizer
 from shapecat.runs.corrections import PREVIOUS, has_labels
-from shapecat.runs.folder import clear, read_run, write_run
+from shapecat.runs.folder import clear
 from shapecat.runs.identity import (
     ContentDigest,
     file_stats,
     new_id,
-    same_content,
     unchanged,
     work_id,
 )
 from shapecat.runs.label_transfer import lost_labels, transfer_labels
 from shapecat.runs.run_info import Options, RunInfo
-from shapecat.runs.segments import count_segments
 from shapecat.system.files import input_size, replacing
 
 __all__ = [
@@ -34,11 +31,9 @@ __all__ = [
     "Summary",
     "describe_run",
     "differences",
-    "has_work",
     "identify",
     "keep_labels",
     "require_unchanged",
-    "resume",
     "summarize",
 ]
 
@@ -184,43 +179,6 @@ def _words(value: Any) -> str:
     """Return the value of an entry as text."""
     text = ", ".join(map(str, value)) if isinstance(value, list) else str(value)
     return "default" if value is None else text or "none"
-
-
-def resume(folder: Path, planned: RunInfo, source: Path, digest: Callable[[], str]) -> RunInfo:
-    """Return the run.json of the interrupted run in a folder if ``planned`` can continue it.
-
-    That is possible if settings, options, model, versions and recording are the same. Otherwise
-    clear the folder, write ``planned`` as its run.json and return ``planned``.
-
-    Parameters
-    ----------
-    digest : returns the digest of the recording; called only if names, sizes or times of its files
-        differ.
-
-    Raises
-    ------
-    OutputError : the folder cannot be written.
-    """
-    with suppress(OutputError):
-        run = read_run(folder)
-        known = run.get("input", {})
-        for name in OUTPUT_OPTIONS:
-            run["options"][name] = planned["options"][name]
-        same = not differences(run, planned) and run.get("versions") == planned["versions"]
-        if same and (unchanged(known["files"], source) or same_content(known, source, digest)):
-            if "perceive" in run["seconds"]:
-                run["counts"]["resumed"] = run["counts"]["frames"]
-            return {**run, "input": planned["input"]}
-    clear(folder)
-    write_run(folder, planned)
-    return planned
-
-
-def has_work(folder: Path) -> bool:
-    """Return whether an interrupted run has anything to resume."""
-    with suppress(OutputError):
-        return count_segments(folder) > 0 or "perceive" in read_run(folder)["seconds"]
-    return False
 
 
 def identify(run: RunInfo, content: ContentDigest) -> None:

@@ -1,0 +1,146 @@
+"""A run that replaces another perceives frames again only if that can change them."""
+
+import shutil
+from collections.abc import Callable
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import pyarrow.parquet as pq
+import pytest
+
+from shapecat import pipeline
+from shapecat.config import Settings, with_overrides
+from shapecat.errors import OutputError
+from shapecat.runs.folder import read_run, write_run
+from shapecat.runs.jobs import Job
+from tests.conftest import Guesser
+
+TABLES = ("frames", "detections", "planes", "masks", "tracks")
+
+
+class PerceivedError(Exception):
+    """Frames were perceived."""
+
+
+@pytest.fixture
+def job(coloured_run: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Job:
+    """Return the job of a finished run with colour, whose folder may be replaced."""
+    monkeypatch.setattr(pipeline, "load_model", lambda _path: Guesser())
+    folder = tmp_path / "out" / "table"
+    shutil.copytree(coloured_run, folder)
+    source = Path(read_run(folder)["input"]["path"])
+    return Job(source=source, folder=folder, overwrite=True)
+
+
+@pytest.fixture
+def perceiving_fails(monkeypatch: pytest.MonkeyPatch) -> None:
+    def refuse(_work: Any) -> None:
+        raise PerceivedError
+
+    monkeypatch.setattr(pipeline, "perceive_all", refuse)
+
+
+def changed(*overrides: str) -> Settings:
+    return with_overrides(Settings(), overrides)
+
+
+def table(folder: Path, name: str) -> Any:
+    found = pq.read_table(folder / f"{name}.parquet")
+    return found.drop_columns([c for c in found.column_names if c == "seconds"])
+
+
+@pytest.mark.usefixtures("perceiving_fails")
+def test_other_settings_of_tracking_give_the_tables_of_a_new_run(
+    job: Job, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Trying another gate cost the hour of perceiving; a table left out would cost results."""
+    before = read_run(job.folder)
+    job = replace(job, settings=changed("tracking.gate_m=0.001", "outputs.boxes=visible"))
+    tracked = table(job.folder, "tracks")
+
+    pipeline.process(job)
+
+    run = read_run(job.folder)
+    monkeypatch.undo()
+    monkeypatch.setattr(pipeline, "load_model", lambda _path: Guesser())
+    pipeline.process(replace(job, folder=tmp_path / "new"))
+    for name in TABLES:
+        assert table(job.folder, name).equals(table(tmp_path / "new", name)), name
+    assert not table(job.folder, "tracks").equals(tracked)
+    new = read_run(tmp_path / "new")
+    assert new["counts"] | {"resumed": 4} == run["counts"]
+    assert run["id"] != before["id"]
+    for name in ("work", "input", "settings", "options", "fixed_frame", "up", "warnings", "color"):
+        assert run[name] == new[name], name  # type: ignore[literal-required]  # one of its keys
+
+
+@pytest.mark.usefixtures("perceiving_fails")
+@pytest.mark.parametrize(
+    "change",
+    [
+        {},
+        {"settings": changed("detection.min_points=61", "tracking.gate_m=0.1")},
+        {"settings": changed("seed=1")},
+        {"settings": changed("tracking.gate_m=0.1"), "every": 2},
+        {"settings": changed("tracking.gate_m=0.1"), "color": ""},
+        {"settings": changed("tracking.gate_m=0.1"), "up": "0,0,1"},
+    ],
+    ids=["nothing", "detection", "seed", "every", "color", "up"],
+)
+def test_what_can_change_frames_perceives_them_again(job: Job, change: dict[str, Any]) -> None:
+    """And with --overwrite and no change, the user wants everything anew."""
+    with pytest.raises(PerceivedError):
+        pipeline.process(replace(job, **change))
+
+
+def truncate(folder: Path) -> None:
+    path = folder / "detections.parquet"
+    path.write_bytes(path.read_bytes()[:-100])
+
+
+def lose_rows(folder: Path) -> None:
+    path = folder / "frames.parquet"
+    pq.write_table(pq.read_table(path)[:3], path)
+
+
+def lose_masks(folder: Path) -> None:
+    (folder / "masks.parquet").unlink()
+
+
+def other_version(folder: Path) -> None:
+    run = read_run(folder)
+    write_run(folder, {**run, "versions": {**run["versions"], "shapecat": "0.0.1"}})
+
+
+def other_content(folder: Path) -> None:
+    run = read_run(folder)
+    run["input"] |= {"files": [["table.mcap", 5, 1, 1]], "digest": "xxh3-128:0123"}
+    write_run(folder, run)
+
+
+@pytest.mark.usefixtures("perceiving_fails")
+@pytest.mark.parametrize("damage", [truncate, lose_rows, lose_masks, other_version, other_content])
+def test_tables_that_do_not_fit_are_not_taken_over(
+    job: Job, damage: Callable[[Path], None]
+) -> None:
+    """Half of the results would come from another version or recording, or be missing."""
+    damage(job.folder)
+    with pytest.raises(PerceivedError):
+        pipeline.process(replace(job, settings=changed("tracking.gate_m=0.1")))
+
+
+def test_the_replaced_run_stays_whole_if_the_new_one_fails(
+    job: Job, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Its tables are linked into the new folder, and must not be emptied from there."""
+    before = {name: table(job.folder, name) for name in TABLES}
+
+    def fail(*_args: Any, **_options: Any) -> None:
+        msg = "full disk"
+        raise OutputError(msg)
+
+    monkeypatch.setattr(pipeline, "annotate", fail)
+    with pytest.raises(OutputError, match="full disk"):
+        pipeline.process(replace(job, settings=changed("tracking.gate_m=0.1")))
+    assert all(table(job.folder, name).equals(before[name]) for name in TABLES)
