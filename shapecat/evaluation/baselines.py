@@ -117,7 +117,7 @@ def _compared(name: str, learned: int, truth: I4, posteriors: F8) -> Compared:
 def _learners(blocks: tuple[str, ...], seed: int, jobs: int | None) -> dict[str, _Learner]:
     from shapecat.learning.baselines import make_baselines  # noqa: PLC0415  scikit-learn
 
-    makers = make_baselines({name: BLOCKS[name] for name in blocks}, seed=seed, jobs=jobs)
+    makers = make_baselines([BLOCKS[name] for name in blocks], seed=seed, jobs=jobs)
     learners: dict[str, _Learner] = {"shapecat": _chain(blocks, seed, jobs)}
     learners |= {name: _plain(make, _descriptors) for name, make in makers.items()}
     learners["forest on D2"] = _plain(makers["forest"], _d2)
@@ -137,7 +137,7 @@ def _chain(blocks: tuple[str, ...], seed: int, jobs: int | None) -> _Learner:
 
 
 def _plain(make: Callable[[], Any], features: Callable[[DescribedViews], F4]) -> _Learner:
-    """Return a scikit-learn classifier on features of the views; unknown shapes are left out."""
+    """Return a plain classifier on features of the views; unknown shapes are left out."""
 
     def learn(train: DescribedViews, test: DescribedViews, categories: tuple[str, ...]) -> F8:
         known = train.where(train.labels != UNKNOWN)

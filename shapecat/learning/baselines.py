@@ -1,21 +1,25 @@
 """Baseline classifiers."""
 
-from collections.abc import Callable, Mapping
-from typing import Any
+from collections.abc import Callable, Sequence
+from typing import Any, Self
 
+import numpy as np
 from sklearn.ensemble import RandomForestClassifier
 from sklearn.linear_model import LogisticRegression
 from sklearn.pipeline import make_pipeline
-from sklearn.preprocessing import StandardScaler
+from sklearn.preprocessing import OneHotEncoder, StandardScaler
+from sklearn.utils import check_random_state
 
-from shapecat.learning.dictionary import ForestDictionary, WordLearner
-from shapecat.learning.pnn import ProbabilisticNeuralNetwork
+from shapecat.arrays import F4, F8
+from shapecat.learning.calibration import softmax
+from shapecat.learning.features import FeatureBank
+from shapecat.learning.pnn import fit_bank
 
 __all__ = ["make_baselines"]
 
 
 def make_baselines(
-    blocks: Mapping[str, slice], *, seed: int, jobs: int | None = None
+    blocks: Sequence[slice], *, seed: int, jobs: int | None = None
 ) -> dict[str, Callable[[], Any]]:
     """Return functions that make unfitted baselines, by name; all classify whole descriptors.
 
@@ -26,21 +30,71 @@ def make_baselines(
 
     Parameters
     ----------
-    blocks : range of each block in the descriptor, by name.
+    blocks : range of each block in the descriptor.
     jobs : number of trees grown at the same time.
     """
-    spans = {name: (part.start, part.stop) for name, part in blocks.items()}
     return {
-        "forest": lambda: RandomForestClassifier(
-            400, min_samples_leaf=2, class_weight="balanced", n_jobs=jobs, random_state=seed
-        ),
+        "forest": lambda: _forest(400, seed, jobs),
         "linear": lambda: make_pipeline(
             StandardScaler(), LogisticRegression(C=0.1, class_weight="balanced", max_iter=2000)
         ),
-        "pnn": lambda: ProbabilisticNeuralNetwork(spans, kernels=300, random_state=seed),
-        "forest words": lambda: make_pipeline(
-            ProbabilisticNeuralNetwork(spans, kernels=50, random_state=seed),
-            ForestDictionary(trees=100, jobs=jobs, random_state=seed),
-            WordLearner(strategy="one_vs_rest", C=0.03),
-        ),
+        "pnn": lambda: _DensityProduct(blocks, seed),
+        "forest words": lambda: _ForestWords(blocks, seed, jobs),
     }
+
+
+def _forest(trees: int, seed: int, jobs: int | None) -> RandomForestClassifier:
+    return RandomForestClassifier(
+        trees, min_samples_leaf=2, class_weight="balanced", n_jobs=jobs, random_state=seed
+    )
+
+
+def _fit_densities(
+    x: F4, y: np.ndarray, blocks: Sequence[slice], kernels: int, seed: int
+) -> FeatureBank:
+    codes = np.unique(y, return_inverse=True)[1]
+    rng = np.random.default_rng(check_random_state(seed).randint(2**31))
+    return fit_bank(x, codes, blocks, kernels=kernels, rng=rng)
+
+
+class _DensityProduct:
+    """A probabilistic neural network as a classifier: the product of the blocks' densities."""
+
+    def __init__(self, blocks: Sequence[slice], seed: int) -> None:
+        self._blocks, self._seed = blocks, seed
+
+    def fit(self, x: F4, y: np.ndarray) -> Self:
+        self.classes_ = np.unique(y)
+        self._bank = _fit_densities(x, y, self._blocks, 300, self._seed)
+        return self
+
+    def predict_proba(self, x: F4) -> F8:
+        bank = self._bank
+        densities = bank.features(x)[:, bank.mean.size :].reshape(
+            len(x), bank.categories, bank.bandwidth.size
+        )
+        return softmax(densities.astype(np.float64) @ bank.spread.astype(np.float64))
+
+
+class _ForestWords:
+    """Linear classifiers on the words of a view: the leaves it reaches in a forest (thesis 7.3)."""
+
+    def __init__(self, blocks: Sequence[slice], seed: int, jobs: int | None) -> None:
+        self._blocks, self._seed = blocks, seed
+        self._forest, self._encoder = _forest(100, seed, jobs), OneHotEncoder()
+
+    def fit(self, x: F4, y: np.ndarray) -> Self:
+        self.classes_ = np.unique(y)
+        self._bank = _fit_densities(x, y, self._blocks, 50, self._seed)
+        features = self._bank.features(x)
+        words = self._encoder.fit_transform(self._forest.fit(features, y).apply(features))
+        self._learners = [
+            LogisticRegression(C=0.03, class_weight="balanced", max_iter=1000).fit(words, y == name)
+            for name in self.classes_
+        ]
+        return self
+
+    def predict_proba(self, x: F4) -> F8:
+        words = self._encoder.transform(self._forest.apply(self._bank.features(x)))
+        logits = [learner.decision_function(words) for learner in self._learners]
+        return softmax(np.stack(logits, axis=1))

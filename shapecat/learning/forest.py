@@ -1,8 +1,6 @@
 """A forest as flat arrays; each leaf is a word of the dictionary (thesis 7.3)."""
 
-from collections.abc import Sequence
 from functools import cached_property
-from typing import Any
 
 import numpy as np
 
@@ -10,7 +8,7 @@ from shapecat.arrays import F4, I4, U2, U4, Record, array
 from shapecat.jit import kernel
 from shapecat.trees import LANES, Trees, find_leaves
 
-__all__ = ["FlatForest", "flatten"]
+__all__ = ["FlatForest", "apply"]
 
 
 class FlatForest(Record):
@@ -94,42 +92,3 @@ def apply(x: F4, trees: Trees, word: I4, result: I4) -> None:
         count = find_leaves(x, roots, feature, threshold, left, first, leaves)
         for lane in range(count):
             result[first + lane] = word[leaves[lane]]
-
-
-def flatten(trees: Sequence[Any]) -> FlatForest:
-    """Return fitted scikit-learn trees (the ``tree_`` of each) as a `FlatForest`.
-
-    Thresholds are rounded down to single precision: a single-precision value is <= the rounded
-    threshold exactly if it is <= the double-precision one.
-    """
-    roots, parts = [], []
-    base = 0
-    for tree in trees:
-        order, left = _siblings_together(tree.children_left, tree.children_right)
-        inner = tree.children_left[order] >= 0
-        roots.append(base)
-        parts.append(
-            (
-                np.where(inner, tree.feature[order], 0),
-                _round_down(np.where(inner, tree.threshold[order], 0.0)),
-                np.where(inner, left + base, 0),
-            )
-        )
-        base += order.size
-    feature, threshold, left = (np.concatenate(column) for column in zip(*parts, strict=True))
-    return FlatForest(np.array(roots), feature, threshold, left)
-
-
-def _siblings_together(left: I4, right: I4) -> tuple[I4, I4]:
-    """Return the nodes in breadth-first order, and the new index of each one's left child."""
-    order, place = [0], np.zeros(left.size, np.int64)
-    for k, node in enumerate(order):  # a queue: it grows during the iteration
-        if left[node] >= 0:
-            place[k] = len(order)
-            order += [int(left[node]), int(right[node])]
-    return np.array(order), place
-
-
-def _round_down(values: np.ndarray) -> F4:
-    single = values.astype(np.float32)
-    return np.where(single > values, np.nextafter(single, np.float32(-np.inf)), single)

@@ -5,13 +5,14 @@ from dataclasses import asdict, dataclass, replace
 from typing import Any, NamedTuple
 
 import numpy as np
-from sklearn.pipeline import Pipeline
+from sklearn.utils import check_random_state
 
 from shapecat.arrays import F4, I4
-from shapecat.learning.boosted import BoostedDictionary
+from shapecat.learning.boosted import Dictionary, grow_dictionary
 from shapecat.learning.calibration import fit_temperature
 from shapecat.learning.categorizer import Categorizer
-from shapecat.learning.pnn import ProbabilisticNeuralNetwork
+from shapecat.learning.features import FeatureBank
+from shapecat.learning.pnn import fit_bank
 
 __all__ = [
     "Examples",
@@ -20,8 +21,8 @@ __all__ = [
     "choose_evenly",
     "encode",
     "fit_categorizer",
+    "fit_chain",
     "fit_threshold",
-    "make_chain",
 ]
 
 
@@ -46,17 +47,6 @@ class LearningSettings:
     jobs: int | None = None
     """Number of trees grown at the same time."""
 
-    def dictionary(self, seed: int) -> BoostedDictionary:
-        """Return the unfitted dictionary; -1 is the label of unknown shapes."""
-        return BoostedDictionary(
-            rounds=self.rounds,
-            leaves=self.leaves,
-            rate=self.rate,
-            unknown=-1,
-            jobs=self.jobs,
-            random_state=seed,
-        )
-
 
 class Examples(NamedTuple):
     """Described views with their labels.
@@ -78,21 +68,6 @@ class Examples(NamedTuple):
         return Examples(*(values[chosen] for values in self))
 
 
-def make_chain(blocks: Mapping[str, slice], settings: LearningSettings, *, seed: int) -> Pipeline:
-    """Return the unfitted pipeline: features with densities, then the boosted dictionary.
-
-    It expects labels from `encode`, in which -1 is an unknown shape. ``blocks`` is the range of
-    each block in the descriptor, by name.
-    """
-    names = settings.blocks or tuple(blocks)
-    used = {name: (blocks[name].start, blocks[name].stop) for name in names}
-    densities = ProbabilisticNeuralNetwork(
-        used, kernels=settings.kernels, unknown=-1, random_state=seed
-    )
-    dictionary = settings.dictionary(seed)
-    return Pipeline([("densities", densities), ("dictionary", dictionary)])
-
-
 def fit_categorizer(
     train: Examples,
     held_out: Examples,
@@ -100,9 +75,8 @@ def fit_categorizer(
     descriptor_names: Sequence[str],
     blocks: Mapping[str, slice],
     categories: Sequence[str],
-    settings: LearningSettings | None = None,
+    settings: LearningSettings,
     seed: int = 0,
-    notes: Mapping[str, Any] | None = None,
 ) -> Categorizer:
     """Train and calibrate a model.
 
@@ -113,71 +87,79 @@ def fit_categorizer(
     descriptor_names : names of the components of the descriptor.
     blocks : range of each block in the descriptor, by name.
     categories : the categories in the order of the posterior.
-    notes : plain JSON values to store in the model.
 
     Raises
     ------
     ValueError : there are fewer than two categories, or one has no training views.
     """
-    settings = settings or LearningSettings()
     missing = sorted(set(categories) - set(train.labels.tolist()))
     if missing:
         msg = f"no training views of {', '.join(missing)}"
         raise ValueError(msg)
-    chain = make_chain(blocks, settings, seed=seed)
-    chain.fit(train.descriptors, encode(train.labels, categories))
-    categorizer = _collapse(
-        chain,
-        train,
-        descriptor_names=descriptor_names,
-        categories=categories,
-        settings=settings,
-        seed=seed,
-        notes={"seed": seed, "learning": _notes_of(settings), **(notes or {})},
+    if len(categories) < 2:
+        msg = f"a classifier needs at least 2 categories, got {len(categories)}"
+        raise ValueError(msg)
+    codes = encode(train.labels, categories)
+    bank, dictionary = fit_chain(train.descriptors, codes, blocks, settings, seed=seed)
+    codes[codes < 0] = len(categories)  # the column of the learner of unknown shapes
+    chosen = choose_evenly(codes, settings.known_views, np.random.default_rng(seed))
+    categorizer = Categorizer(
+        categories=tuple(categories),
+        descriptor_names=tuple(descriptor_names),
+        bank=bank,
+        forest=dictionary.forest,
+        votes=dictionary.votes,
+        linear=np.zeros((dictionary.bias.size, bank.width)),
+        bias=dictionary.bias,
+        temperature=1.0,
+        threshold=0.0,
+        known_descriptors=bank.standardise(train.descriptors[chosen]),
+        known_category=codes[chosen],
+        notes={"seed": seed, "learning": _notes_of(settings)},
     )
     return calibrate(categorizer, held_out, rejected=settings.rejected)
+
+
+def fit_chain(
+    descriptors: F4,
+    codes: I4,
+    blocks: Mapping[str, slice],
+    settings: LearningSettings,
+    *,
+    seed: int,
+) -> tuple[FeatureBank, Dictionary]:
+    """Fit the features with densities, then grow the boosted dictionary on them.
+
+    Parameters
+    ----------
+    descriptors : (n, d).
+    codes : (n,) from `encode`; the -1 of unknown shapes gets trees and a logit of its own, after
+        those of the categories.
+    blocks : range of each block in the descriptor, by name.
+    """
+    number = check_random_state(seed).randint(2**31)
+    bank = fit_bank(
+        descriptors,
+        codes,
+        [blocks[name] for name in settings.blocks or blocks],
+        kernels=settings.kernels,
+        rng=np.random.default_rng(number),
+    )
+    dictionary = grow_dictionary(
+        bank.features(descriptors),
+        np.where(codes < 0, codes.max() + 1, codes),
+        rounds=settings.rounds,
+        leaves=settings.leaves,
+        rate=settings.rate,
+        jobs=settings.jobs,
+        rng=np.random.default_rng(number),
+    )
+    return bank, dictionary
 
 
 def _notes_of(settings: LearningSettings) -> dict[str, Any]:
     """Return the settings that affect the model: all except the number of jobs."""
     return {name: value for name, value in asdict(settings).items() if name != "jobs"}
-
-
-def _collapse(
-    chain: Pipeline,
-    train: Examples,
-    *,
-    descriptor_names: Sequence[str],
-    categories: Sequence[str],
-    settings: LearningSettings,
-    seed: int,
-    notes: Mapping[str, Any],
-) -> Categorizer:
-    """Return a fitted pipeline from `make_chain` as a `Categorizer`, not yet calibrated.
-
-    Parameters
-    ----------
-    train : the training views, some of which are stored in the model.
-    """
-    bank, dictionary = chain["densities"].bank_, chain["dictionary"]
-    columns = dictionary.bias_.size
-    codes = encode(train.labels, categories)
-    codes = np.where((codes < 0) & (columns > len(categories)), len(categories), codes)
-    chosen = choose_evenly(codes, settings.known_views, np.random.default_rng(seed))
-    return Categorizer(
-        categories=tuple(categories),
-        descriptor_names=tuple(descriptor_names),
-        bank=bank,
-        forest=dictionary.forest_,
-        votes=dictionary.votes_,
-        linear=np.zeros((columns, bank.width)),
-        bias=dictionary.bias_,
-        temperature=1.0,
-        threshold=0.0,
-        known_descriptors=bank.standardise(train.descriptors[chosen]),
-        known_category=codes[chosen],
-        notes=notes,
-    )
 
 
 def choose_evenly(codes: I4, count: int, rng: np.random.Generator) -> I4:
