@@ -201,7 +201,7 @@ def _run(
         with watcher:
             yield from process_here(batch.tasks, watcher, cores=cores, manifest=batch.manifest)
         return
-    started = open_executor(name, workers=workers, threads=1, address=scheduler)
+    started = open_executor(name, workers=workers, address=scheduler)
     with _closing(started) as executor, watcher:
         yield from process_on(executor, batch.tasks, watcher, cores=cores, manifest=batch.manifest)
 

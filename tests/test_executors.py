@@ -23,10 +23,10 @@ from shapecat.executors import (
     Mailbox,
     WorkerLostError,
     is_lost,
-    limited_threads,
     open_executor,
     post,
     share_cores,
+    single_threaded,
 )
 from shapecat.executors.dask import _DaskExecutor
 from shapecat.executors.order import Processes
@@ -115,18 +115,19 @@ def test_what_cannot_be_received_costs_its_worker_alone() -> None:
         assert one.submit(abs, -1).result() == 1
 
 
-def test_workers_use_the_threads_they_are_given() -> None:
+def test_workers_have_one_thread_each(monkeypatch: pytest.MonkeyPatch) -> None:
     """Two workers with two threads each would slow each other down on two cores."""
-    with LocalExecutor(1, threads=3) as one:
-        assert one.submit(os.getenv, "OMP_NUM_THREADS").result() == "3"
+    monkeypatch.setenv("OMP_NUM_THREADS", "3")
+    with LocalExecutor(1) as one:
+        assert one.submit(os.getenv, "OMP_NUM_THREADS").result() == "1"
 
 
 def test_this_process_has_its_own_threads_back(monkeypatch: pytest.MonkeyPatch) -> None:
     """Libraries that are loaded later would stay as slow as those of the workers."""
     monkeypatch.setenv("OMP_NUM_THREADS", "7")
     monkeypatch.delenv("MKL_NUM_THREADS", raising=False)
-    with limited_threads(5):
-        assert (os.environ["OMP_NUM_THREADS"], os.environ["MKL_NUM_THREADS"]) == ("5", "5")
+    with single_threaded():
+        assert (os.environ["OMP_NUM_THREADS"], os.environ["MKL_NUM_THREADS"]) == ("1", "1")
 
     assert (os.environ["OMP_NUM_THREADS"], "MKL_NUM_THREADS" in os.environ) == ("7", False)
 

@@ -9,7 +9,7 @@ from concurrent.futures import Executor
 from typing import Literal, get_args
 
 from shapecat.errors import ConfigError
-from shapecat.executors.cores import limited_threads, share_cores, usable_cores
+from shapecat.executors.cores import share_cores, single_threaded, usable_cores
 from shapecat.executors.local import LocalExecutor
 from shapecat.executors.mailbox import Mailbox, post
 from shapecat.executors.worker import WorkerLostError
@@ -21,10 +21,10 @@ __all__ = [
     "WorkerLostError",
     "is_dropped",
     "is_lost",
-    "limited_threads",
     "open_executor",
     "post",
     "share_cores",
+    "single_threaded",
     "usable_cores",
 ]
 
@@ -40,16 +40,13 @@ _DROPPED = {"CancelledError", "FutureCancelledError", "CommClosedError"}
 """Errors by name, since neither Dask nor Ray need be installed."""
 
 
-def open_executor(
-    name: str, *, workers: int, threads: int = 1, address: str | None = None
-) -> Executor:
+def open_executor(name: str, *, workers: int, address: str | None = None) -> Executor:
     """Start worker processes, or connect to running ones.
 
     Parameters
     ----------
     name : ``local``, ``dask`` or ``ray``.
     workers : number of processes to start on this machine if no ``address`` is given.
-    threads : number of threads for the numeric libraries in each process.
     address : address of a running Dask scheduler or Ray cluster; not for ``local``.
 
     Raises
@@ -59,23 +56,23 @@ def open_executor(
     if name == "local" and address is not None:
         msg = "--scheduler needs --executor dask or ray"
         raise ConfigError(msg)
-    return _OPENERS[name](workers, threads, address)
+    return _OPENERS[name](workers, address)
 
 
-def _dask(workers: int, threads: int, address: str | None) -> Executor:
+def _dask(workers: int, address: str | None) -> Executor:
     from shapecat.executors.dask import open_dask  # noqa: PLC0415  an extra
 
-    return open_dask(workers, threads, address)
+    return open_dask(workers, address)
 
 
-def _ray(workers: int, threads: int, address: str | None) -> Executor:
+def _ray(workers: int, address: str | None) -> Executor:
     from shapecat.executors.ray import RayExecutor  # noqa: PLC0415  an extra
 
-    return RayExecutor(workers, threads, address)
+    return RayExecutor(workers, address)
 
 
-_OPENERS: dict[str, Callable[[int, int, str | None], Executor]] = {
-    "local": lambda workers, threads, _: LocalExecutor(workers, threads=threads),
+_OPENERS: dict[str, Callable[[int, str | None], Executor]] = {
+    "local": lambda workers, _: LocalExecutor(workers),
     "dask": _dask,
     "ray": _ray,
 }

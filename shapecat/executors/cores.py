@@ -4,7 +4,7 @@ import os
 from collections.abc import Iterator
 from contextlib import contextmanager
 
-__all__ = ["THREAD_LIMITS", "limited_threads", "share_cores", "usable_cores"]
+__all__ = ["THREAD_LIMITS", "share_cores", "single_threaded", "usable_cores"]
 
 THREAD_LIMITS = ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS", "NUMBA_NUM_THREADS")
 """Environment variables that numeric libraries read when they are loaded."""
@@ -32,10 +32,10 @@ def share_cores(jobs: int | None, recordings: int) -> tuple[int, int]:
 
 
 @contextmanager
-def limited_threads(threads: int) -> Iterator[None]:
-    """Limit the threads of numeric libraries in processes that are started during the block."""
+def single_threaded() -> Iterator[None]:
+    """Give numeric libraries one thread in processes that are started during the block."""
     before = {name: os.environ.get(name) for name in THREAD_LIMITS}
-    os.environ.update(dict.fromkeys(THREAD_LIMITS, str(threads)))
+    os.environ.update(dict.fromkeys(THREAD_LIMITS, "1"))
     try:
         yield
     finally:

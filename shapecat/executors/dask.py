@@ -5,7 +5,7 @@ from contextlib import suppress
 from typing import Any
 
 from shapecat.errors import ConfigError
-from shapecat.executors.cores import limited_threads
+from shapecat.executors.cores import single_threaded
 
 __all__ = ["open_dask"]
 
@@ -41,7 +41,7 @@ class _DaskExecutor(Executor):
                     each.close(timeout=timeout_s)
 
 
-def open_dask(workers: int, threads: int, address: str | None) -> Executor:
+def open_dask(workers: int, address: str | None) -> Executor:
     """Connect to a scheduler, or start one with processes on this machine.
 
     The parameters are as for `open_executor`.
@@ -56,7 +56,7 @@ def open_dask(workers: int, threads: int, address: str | None) -> Executor:
         msg = "--executor dask needs Dask: pip install 'shapecat[cluster]'"
         raise ConfigError(msg) from error
     if address is None:
-        with limited_threads(threads):
+        with single_threaded():
             cluster = LocalCluster(
                 n_workers=workers,
                 threads_per_worker=1,

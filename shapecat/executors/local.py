@@ -25,12 +25,11 @@ class LocalExecutor(Executor):
     not wait for tasks; signals reach only the parent, which decides what they mean.
     """
 
-    def __init__(self, workers: int, *, threads: int = 1, ahead: int = 0) -> None:
+    def __init__(self, workers: int, *, ahead: int = 0) -> None:
         """Prepare ``workers`` processes; each starts with its first task.
 
         Parameters
         ----------
-        threads : number of threads for the numeric libraries in each process.
         ahead : number of tasks sent to a busy worker in advance; they fail if it dies.
 
         Raises
@@ -41,7 +40,7 @@ class LocalExecutor(Executor):
             msg = f"workers must be at least 1, got {workers}"
             raise ValueError(msg)
         self._tasks: SimpleQueue[Task | None] = SimpleQueue()
-        self._threads, self._ahead = threads, ahead
+        self._ahead = ahead
         self._closed = False
         self._workers: dict[int, Worker] = {}
         self._lock = threading.Lock()
@@ -133,7 +132,7 @@ class LocalExecutor(Executor):
                     msg = "the worker process died before its task was sent"
                     raise WorkerLostError(msg)
                 try:
-                    self._workers[seat] = Worker(self._threads, room)
+                    self._workers[seat] = Worker(room)
                 except OSError as error:
                     msg = f"no worker process can be started: {error}"
                     raise WorkerLostError(msg) from error

@@ -15,7 +15,7 @@ _STORE_BYTES = 100 * 2**20
 class RayExecutor(Executor):
     """Runs each call as a Ray task on one core."""
 
-    def __init__(self, workers: int, threads: int, address: str | None) -> None:
+    def __init__(self, workers: int, address: str | None) -> None:
         """Connect to a cluster, or start one with ``workers`` cores on this machine.
 
         The parameters are as for `open_executor`.
@@ -30,7 +30,7 @@ class RayExecutor(Executor):
             msg = "--executor ray needs Ray: pip install 'shapecat[ray]'"
             raise ConfigError(msg) from error
         self._ray = ray
-        variables = dict.fromkeys(THREAD_LIMITS, str(threads))
+        variables = dict.fromkeys(THREAD_LIMITS, "1")
         alone = {
             "num_cpus": workers,
             "include_dashboard": False,

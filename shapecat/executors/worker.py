@@ -15,7 +15,7 @@ from multiprocessing.reduction import ForkingPickler
 from queue import SimpleQueue
 from typing import Any, NamedTuple
 
-from shapecat.executors.cores import limited_threads
+from shapecat.executors.cores import single_threaded
 from shapecat.system import stopping
 from shapecat.system.garbage import collect_seldom
 from shapecat.system.libraries import block_pandas
@@ -45,14 +45,14 @@ class Worker:
     lost : whether the process has died.
     """
 
-    def __init__(self, threads: int, room: threading.Semaphore) -> None:
-        """Start a process with ``threads`` for numeric libraries; each answer releases ``room``."""
+    def __init__(self, room: threading.Semaphore) -> None:
+        """Start a process; each answer releases ``room``."""
         self.lost = False
         self._socket, far = socket.socketpair()
         asked, self._ask = _SPAWN.Pipe(duplex=False)
         # Not daemonic, since those may not start processes; `_watch_parent` ends it instead.
         self.process = _SPAWN.Process(target=_serve, args=(far, asked), daemon=False)
-        with limited_threads(threads):
+        with single_threaded():
             self.process.start()
         far.close()
         asked.close()
