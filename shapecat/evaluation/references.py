@@ -16,7 +16,7 @@ from shapecat.evaluation.references_kitti import KittiLabels
 from shapecat.runs.finished import FinishedRun, read_finished
 from shapecat.runs.labels import rows_by_frame
 from shapecat.runs.shown import ShownTracks
-from shapecat.runs.tables import Key, read_row_groups
+from shapecat.runs.tables import Key, keys_of, read_row_groups, read_together
 from shapecat.types import Box
 
 __all__ = ["OtherRun", "SimulatedTruth", "open_reference", "read_complete", "run_labellings"]
@@ -162,8 +162,7 @@ class OtherRun(Reference):
     def __init__(self, folder: Path) -> None:
         self.finished = read_complete(folder)
         groups = read_row_groups(folder / "frames.parquet", ["topic", "frame"])
-        keys = [zip(*(g[n].to_pylist() for n in ("topic", "frame")), strict=True) for g in groups]
-        self._keys: set[Key] = {key for some in keys for key in some}
+        self._keys: set[Key] = {key for group in groups for key in keys_of(group)}
         self.frames = len(self._keys)
         self._rest = run_labellings(self.finished)
 
@@ -214,12 +213,8 @@ def run_labellings(finished: FinishedRun) -> Iterator[tuple[Key, Mapping[str, An
     wanted = ("topic", "frame", "detection", "center", "size", "orientation", "indices")
     columns = [*wanted, "posterior", "category", "confidence"]
     shown = ShownTracks.read(folder, finished.labels)
-    groups = zip(
-        read_row_groups(folder / "frames.parquet", ["topic", "frame", "stamp_ns", "up"]),
-        read_row_groups(folder / "detections.parquet", columns),
-        strict=True,
-    )
-    for frames, detections in groups:
+    tables = {"frames": ["topic", "frame", "stamp_ns", "up"], "detections": columns}
+    for frames, detections in read_together(folder, tables):
         found = rows_by_frame(detections)
         for row in frames.to_pylist():
             key = (row["topic"], row["frame"])

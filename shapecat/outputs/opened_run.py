@@ -16,7 +16,7 @@ from shapecat.outputs.colouring import Coloured, with_colour
 from shapecat.recordings.colour_image import pixels_of
 from shapecat.runs.finished import FinishedRun, open_source, read_finished
 from shapecat.runs.run_info import RunInfo
-from shapecat.runs.tables import first_stamp, numbers
+from shapecat.runs.tables import first_stamp, numbers, numbers_or_nan
 from shapecat.types import Frame, LabelledFrame, LabelledObject
 
 __all__ = ["Run", "RunFrame", "Table"]
@@ -61,9 +61,10 @@ class Table:
         Lists of different lengths become an object array of arrays. Null becomes NaN, or a row of
         NaN.
         """
-        values = self.arrow([column])[column].combine_chunks()
-        if pa.types.is_fixed_size_list(values.type):
-            return _rows(values, values.type.list_size)
+        chunks = self.arrow([column])[column]
+        if pa.types.is_fixed_size_list(chunks.type):
+            return numbers_or_nan(chunks)
+        values = chunks.combine_chunks()
         if not pa.types.is_list(values.type):
             return values.to_numpy(zero_copy_only=False)
         lengths = set(values.value_lengths().to_pylist())
@@ -72,14 +73,6 @@ class Table:
         ragged = np.zeros(len(values), object)
         ragged[:] = [np.asarray(row) for row in values.to_pylist()]
         return ragged
-
-
-def _rows(values: pa.FixedSizeListArray, width: int) -> Any:
-    """Return lists of fixed size as an array (n, width); null becomes NaN."""
-    valid = np.asarray(values.is_valid().to_numpy(zero_copy_only=False), np.bool_)
-    rows = np.full((len(values), width), np.nan, values.type.value_type.to_pandas_dtype())
-    rows[valid] = values.drop_null().flatten().to_numpy().reshape(-1, width)
-    return rows
 
 
 @dataclass(frozen=True)

@@ -10,7 +10,7 @@ from shapecat.detection.scene_graph import Node, format_tree
 from shapecat.errors import OutputError
 from shapecat.runs.finished import FinishedRun, read_finished
 from shapecat.runs.labels import plane_of, read_labelled_frames
-from shapecat.runs.tables import read_row_groups
+from shapecat.runs.tables import keys_of, read_row_groups
 from shapecat.types import Box, Candidate, LabelledObject, Plane, Scene
 
 __all__ = ["describe_scene", "read_scene"]
@@ -66,8 +66,7 @@ def _rows(
 ) -> list[dict[str, Any]]:
     found = []
     for group in read_row_groups(folder / f"{table}.parquet", columns):
-        numbers, topics = group["frame"].to_pylist(), group["topic"].to_pylist()
-        keys = enumerate(zip(topics, numbers, strict=True))
+        keys = enumerate(keys_of(group))
         chosen = pa.array([k for k, key in keys if key == (topic, frame)], pa.int64())
         found += group.take(chosen).to_pylist()
     return found
@@ -82,8 +81,8 @@ def _topic(folder: Path, frame: int, topic: str | None) -> str:
     """
     frames: dict[str, list[int]] = {}
     for group in read_row_groups(folder / "frames.parquet", ["topic", "frame"]):
-        for row in group.to_pylist():
-            frames.setdefault(row["topic"], []).append(row["frame"])
+        for name, number in keys_of(group):
+            frames.setdefault(name, []).append(number)
     if topic is not None:
         frames = {name: numbers for name, numbers in frames.items() if name == topic}
     having = [name for name, numbers in frames.items() if frame in numbers]

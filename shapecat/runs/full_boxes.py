@@ -1,6 +1,6 @@
 """Full boxes of tracks, fused from the full boxes of their detections."""
 
-from collections.abc import Collection, Iterator, Mapping, Sequence
+from collections.abc import Collection, Iterator, Sequence
 from dataclasses import dataclass
 from itertools import accumulate
 from pathlib import Path
@@ -14,18 +14,23 @@ from scipy.spatial.transform import Rotation
 from shapecat.arrays import F4, F8, I4, Bool
 from shapecat.completion import DIRECTIONS, BoxViews, FusedBox, fuse_boxes
 from shapecat.runs.placed_frames import PlacedFrames
-from shapecat.runs.tables import numbers, opened, read_row_groups
+from shapecat.runs.tables import (
+    BOX_WIDTH,
+    FULL_BOX,
+    FULL_WIDTHS,
+    full_boxes_of,
+    numbers,
+    opened,
+    read_together,
+)
 from shapecat.tracking import Track, view_weights
 
-__all__ = ["FULL_WIDTHS", "FullBoxes", "full_columns", "numbers_or_nan"]
+__all__ = ["FullBoxes", "full_columns"]
 
-FULL_WIDTHS = {"center_full": 3, "size_full": 3, "orientation_full": 4, "size_full_std": 3}
-"""Columns of full boxes, and the number of values in each."""
 _BLOCK = 2**16
 _WIDTH = sum(FULL_WIDTHS.values())
 
 
-_BOX = sum(FULL_WIDTHS.values()) - FULL_WIDTHS["size_full_std"]
 _TELLING = 1000
 """Largest number of views from which a track's box is fused, spread over its time span."""
 _AT_ONCE = 8  # row groups
@@ -59,21 +64,18 @@ class FullBoxes:
         frames, groups = PlacedFrames(placed), [0]
         rows, partial = bytearray(), bytearray()
         cut = ("touches_border", "occluded")
-        wanted = ["topic", "frame", *cut, *FULL_WIDTHS]
-        for seen, detections in zip(
-            read_row_groups(folder / "frames.parquet", PlacedFrames.COLUMNS),
-            read_row_groups(folder / "detections.parquet", wanted),
-            strict=True,
-        ):
+        wanted = ["topic", "frame", *cut, *FULL_BOX]
+        tables = {"frames": PlacedFrames.COLUMNS, "detections": wanted}
+        for seen, detections in read_together(folder, tables):
             frames.add(seen, detections, groups[-1])
-            rows += numbers_or_nan(detections)[:, :_BOX].tobytes()
+            rows += full_boxes_of(detections).tobytes()
             partial += np.logical_or(*(detections[name].to_numpy() for name in cut)).tobytes()
             groups.append(groups[-1] + detections.num_rows)
         return cls(
             folder / "detections.parquet",
             np.array(groups),
             frames,
-            np.frombuffer(rows, np.float32).reshape(-1, _BOX),
+            np.frombuffer(rows, np.float32).reshape(-1, BOX_WIDTH),
             np.frombuffer(partial, np.bool_),
         )
 
@@ -165,19 +167,6 @@ def _placed(boxes: F4, poses: F8) -> tuple[F8, F8]:
     turns, places = poses[:, :, :3], poses[:, :, 3]
     axes = turns @ Rotation.from_quat(boxes[:, 6:10]).as_matrix()
     return np.einsum("kij,kj->ki", turns, boxes[:, :3].astype(np.float64)) + places, axes
-
-
-def numbers_or_nan(table: pa.Table, widths: Mapping[str, int] = FULL_WIDTHS) -> F4:
-    """Return the columns of full boxes as one array (rows, sum of widths); null becomes NaN."""
-    return np.hstack([_filled(table[name], width) for name, width in widths.items()])
-
-
-def _filled(column: pa.ChunkedArray, width: int) -> F4:
-    result = np.full((len(column), width), np.nan, np.float32)
-    known = pa.compute.is_valid(column).to_numpy()
-    if known.any():
-        result[known] = numbers(column.drop_null()).reshape(-1, width)
-    return result
 
 
 def full_columns(rows: F4) -> dict[str, Any]:

@@ -14,7 +14,7 @@ from shapecat.geometry import box_around
 from shapecat.runs.label_meaning import TrackLabel
 from shapecat.runs.masks import read_masks
 from shapecat.runs.shown import ShownTracks
-from shapecat.runs.tables import Key, numbers, read_row_groups, release_memory
+from shapecat.runs.tables import Key, numbers, read_together, release_memory
 from shapecat.types import (
     Box,
     ImageMasks,
@@ -55,11 +55,8 @@ def read_labelled_frames(folder: Path, labels: Mapping[int, TrackLabel]) -> Iter
     shown = ShownTracks.read(folder, labels, causal=True)
     release_memory()  # of the table of tracks
     masks = _MasksByFrame(read_masks(folder))
-    groups = (
-        read_row_groups(folder / f"{name}.parquet", columns)
-        for name, columns in (("frames", None), ("detections", _OBJECT), ("planes", None))
-    )
-    for frames, detections, planes in zip(*groups, strict=True):
+    tables = {"frames": None, "detections": _OBJECT, "planes": None}
+    for frames, detections, planes in read_together(folder, tables):
         objects = rows_by_frame(detections)
         supports = rows_by_frame(planes)
         for row in frames.to_pylist():

@@ -6,13 +6,12 @@ from itertools import islice
 from pathlib import Path
 
 import numpy as np
-import pyarrow as pa
 
 from shapecat.arrays import F4
 from shapecat.recordings import Recording
 from shapecat.runs.run_info import RunInfo
 from shapecat.runs.selection import read_frames
-from shapecat.runs.tables import Key, read_row_groups
+from shapecat.runs.tables import Key, keys_of, read_together
 from shapecat.types import Frame
 
 __all__ = ["explain_missing_planes"]
@@ -70,20 +69,13 @@ def _count(folder: Path) -> tuple[int, int, set[Key]]:
     A frame with objects has a plane, even if it is only assumed and not in the table.
     """
     count, bare, first = 0, 0, list[Key]()
-    tables = (
-        read_row_groups(folder / f"{name}.parquet", ["topic", "frame"])
-        for name in ("frames", "planes", "detections")
-    )
-    for frames, planes, detections in zip(*tables, strict=True):
-        found = {*_keys(planes), *_keys(detections)}
-        without = [key for key in _keys(frames) if key not in found]
+    tables = dict.fromkeys(("frames", "planes", "detections"), ("topic", "frame"))
+    for frames, planes, detections in read_together(folder, tables):
+        found = {*keys_of(planes), *keys_of(detections)}
+        without = [key for key in keys_of(frames) if key not in found]
         count, bare = count + frames.num_rows, bare + len(without)
         first += without[: _FRAMES - len(first)]
     return count, bare, set(first)
-
-
-def _keys(rows: pa.Table) -> Iterator[Key]:
-    return zip(rows["topic"].to_pylist(), rows["frame"].to_pylist(), strict=True)
 
 
 def _frames(recording: Recording, run: RunInfo, wanted: set[Key]) -> Iterator[Frame]:

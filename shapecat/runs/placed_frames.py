@@ -8,7 +8,7 @@ import pyarrow as pa
 import pyarrow.compute
 
 from shapecat.arrays import F8, I4, Bool
-from shapecat.runs.tables import frame_rows, numbers, topic_codes
+from shapecat.runs.tables import frame_rows, keys_of, numbers, numbers_or_nan, topic_codes
 
 __all__ = ["PlacedFrames"]
 
@@ -30,8 +30,7 @@ class PlacedFrames:
         known = [self._codes.setdefault(topic, len(self._codes)) for topic in topics]
         keys = _keys(np.array(known, np.int64)[codes], numbers(frames["frame"]))
         starts = {key: count + rows.start for key, rows in frame_rows(detections).items()}
-        of_frames = zip(frames["topic"].to_pylist(), frames["frame"].to_pylist(), strict=True)
-        first = np.array([starts.get(key, -1) for key in of_frames], np.int64)
+        first = np.array([starts.get(key, -1) for key in keys_of(frames)], np.int64)
         self._keys += keys.tobytes()
         self._first += first.tobytes()
         self._poses += _poses(
@@ -66,11 +65,8 @@ def _keys(codes: I4, frames: I4) -> I4:
 
 def _poses(frames: pa.Table, placed: Bool) -> F8:
     result = np.tile(np.eye(3, 4), (frames.num_rows, 1, 1))
-    known = pa.compute.is_valid(frames["fixed_rotation"]).to_numpy()
-    turns, places = (
-        numbers(frames[name].filter(pa.array(known)))
-        for name in ("fixed_rotation", "fixed_translation")
-    )
-    result[known, :, :3], result[known, :, 3] = turns.reshape(-1, 3, 3), places.reshape(-1, 3)
-    result[~placed] = np.eye(3, 4)
+    turns = numbers_or_nan(frames["fixed_rotation"]).reshape(-1, 3, 3)
+    known = placed & ~np.isnan(turns[:, 0, 0])
+    result[known, :, :3] = turns[known]
+    result[known, :, 3] = numbers_or_nan(frames["fixed_translation"])[known]
     return result

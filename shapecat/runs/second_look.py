@@ -13,7 +13,7 @@ import numpy as np
 import pyarrow as pa
 
 from shapecat.arrays import F4, F8, I4, Bool
-from shapecat.runs.tables import Key, frame_rows, numbers, rows_of, topic_codes
+from shapecat.runs.tables import Key, frame_rows, numbers, numbers_or_nan, rows_of, topic_codes
 
 __all__ = ["COLUMNS", "Revision", "frames_to_revise"]
 
@@ -179,8 +179,11 @@ def _parts(frames: pa.Table, planes: pa.Table) -> Iterator[tuple[str, _Stream]]:
     index, stamps = numbers(frames["frame"]), numbers(frames["stamp_ns"])
     keys = list(rows_of(topics, codes, index))
     of_frame = [offsets[rows.get(key, slice(0, 0))] for key in keys]
-    up, given = _vectors(frames["up"], 3), _vectors(frames["up_given"], 3)
-    rotation = _vectors(frames["fixed_rotation"], 9).reshape(-1, 3, 3)
+    up, given, rotation = (
+        numbers_or_nan(frames[name]).astype(np.float64)
+        for name in ("up", "up_given", "fixed_rotation")
+    )
+    rotation = rotation.reshape(-1, 3, 3)
     for code, topic in enumerate(topics):
         of = np.flatnonzero(codes == code)
         chosen = [of_frame[k] for k in of]
@@ -191,12 +194,3 @@ def _joined(parts: list[_Stream]) -> _Stream:
     *arrays, offsets = zip(*parts, strict=True)
     frames, stamps, up, given, rotation = map(np.concatenate, arrays)
     return _Stream(frames, stamps, up, given, rotation, list(chain.from_iterable(offsets)))
-
-
-def _vectors(column: pa.ChunkedArray, width: int) -> F8:
-    """Return a column of vectors as (n, width); null becomes NaN."""
-    known = column.is_valid().to_numpy()
-    vectors = np.full((len(known), width), np.nan)
-    if known.any():
-        vectors[known] = numbers(column).reshape(-1, width)
-    return vectors

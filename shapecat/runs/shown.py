@@ -13,14 +13,18 @@ import pyarrow.parquet as pq
 
 from shapecat.arrays import F4, F8, I4
 from shapecat.geometry import box_around
-from shapecat.runs.full_boxes import FULL_WIDTHS, numbers_or_nan
 from shapecat.runs.label_meaning import TrackLabel
 from shapecat.runs.tables import (
+    BOX_WIDTH,
+    FULL_BOX,
     Key,
     frame_rows,
+    full_boxes_of,
+    keys_of,
     numbers,
     opened,
     read_row_groups,
+    read_together,
     rows_of,
     topic_codes,
 )
@@ -31,7 +35,6 @@ __all__ = ["ShownTracks", "read_shown_frames"]
 _AT_ONCE = 8  # row groups of boxes in memory
 _ROWS = 2**13  # rows of tracks.parquet in memory
 _NO_ROWS = slice(0, 0)
-_FULL = {name: FULL_WIDTHS[name] for name in ("center_full", "size_full", "orientation_full")}
 _NONE = np.zeros((0, 0), np.float32)
 
 
@@ -113,12 +116,8 @@ def read_shown_frames(
     wanted = ("topic", "frame", "stamp_ns", "log_time_ns", "frame_id", "up")
     found = ("topic", "frame", "center", "size", "orientation")
     merged = len({label.track for label in labels.values()}) < len(labels)
-    groups = zip(
-        read_row_groups(folder / "frames.parquet", wanted, at_once=_AT_ONCE),
-        read_row_groups(folder / "detections.parquet", found, at_once=_AT_ONCE),
-        strict=True,
-    )
-    for frames, detections in groups:
+    tables = {"frames": wanted, "detections": found}
+    for frames, detections in read_together(folder, tables, at_once=_AT_ONCE):
         plain = [frames[name].to_pylist() for name in wanted[:-1]]
         keys = list(zip(*plain[:2], strict=True))
         boxes = _boxes(keys, shown, detections, visible=visible)
@@ -164,11 +163,10 @@ def _causal(file: pq.ParquetFile, rows: I4) -> F4:
 
 def _full(file: pq.ParquetFile, rows: I4) -> F4:
     """Return the full boxes (n, 10) of some rows; NaN if unknown."""
-    width = sum(_FULL.values())
     if "center_full" not in file.schema_arrow.names:  # from an older version
-        return np.full((len(rows), width), np.nan, np.float32)
-    found = _gather(file, list(_FULL), rows, lambda table: numbers_or_nan(table, _FULL))
-    return found.reshape(-1, width)  # also without rows
+        return np.full((len(rows), BOX_WIDTH), np.nan, np.float32)
+    found = _gather(file, list(FULL_BOX), rows, full_boxes_of)
+    return found.reshape(-1, BOX_WIDTH)  # also without rows
 
 
 def _gather(
@@ -239,7 +237,7 @@ def _next_of_topic(folder: Path, wanted: Container[Key]) -> dict[Key, Key]:
     following: dict[Key, Key] = {}
     latest: dict[str, Key] = {}
     for group in read_row_groups(folder / "frames.parquet", ["topic", "frame"], at_once=64):
-        for key in zip(group["topic"].to_pylist(), group["frame"].to_pylist(), strict=True):
+        for key in keys_of(group):
             before = latest.get(key[0])
             if before is not None and before in wanted:
                 following[before] = key

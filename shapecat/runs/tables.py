@@ -7,7 +7,7 @@ meaning of one is not.
 """
 
 import ctypes
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager, suppress
 from pathlib import Path
 from typing import Any
@@ -20,9 +20,12 @@ from shapecat.arrays import F4, I4
 from shapecat.errors import OutputError
 
 __all__ = [
+    "BOX_WIDTH",
     "DETECTIONS",
     "FRAMES",
     "FRAME_COLUMNS",
+    "FULL_BOX",
+    "FULL_WIDTHS",
     "PLANES",
     "SCHEMA_VERSION",
     "TRACKS",
@@ -31,10 +34,14 @@ __all__ = [
     "count_rows",
     "first_stamp",
     "frame_rows",
+    "full_boxes_of",
+    "keys_of",
     "numbers",
+    "numbers_or_nan",
     "open_writer",
     "opened",
     "read_row_groups",
+    "read_together",
     "release_memory",
     "rows_as_lists",
     "rows_of",
@@ -57,6 +64,10 @@ _FULL = (
     ("size_full_std", _VEC3),
 )
 
+FULL_WIDTHS = {name: kind.list_size for name, kind in _FULL}
+"""Columns of full boxes, and the number of values in each."""
+FULL_BOX = ("center_full", "size_full", "orientation_full")
+BOX_WIDTH = sum(FULL_WIDTHS[name] for name in FULL_BOX)
 FRAME_COLUMNS = (("topic", pa.string()), ("frame", pa.int32()), ("stamp_ns", pa.int64()))
 """Columns that identify a frame: topic, number on that topic, and stamp."""
 
@@ -189,6 +200,29 @@ def read_row_groups(
             )
 
 
+def read_together(
+    folder: Path, columns: Mapping[str, Sequence[str] | None], *, at_once: int = 1
+) -> Iterator[tuple[pa.Table, ...]]:
+    """Yield the row groups of the same frames from several tables of a run folder.
+
+    ``columns`` are those to read of each table, by its name; None for all.
+
+    Raises
+    ------
+    OutputError : a table is missing or unreadable.
+    """
+    groups = (
+        read_row_groups(folder / f"{name}.parquet", wanted, at_once=at_once)
+        for name, wanted in columns.items()
+    )
+    return zip(*groups, strict=True)
+
+
+def keys_of(table: pa.Table) -> list[Key]:
+    """Return the topic and frame of each row."""
+    return list(zip(table["topic"].to_pylist(), table["frame"].to_pylist(), strict=True))
+
+
 def frame_rows(table: pa.Table) -> dict[Key, slice]:
     """Return the slice of rows of each frame of a table; the rows of a frame are consecutive."""
     return rows_of(*topic_codes(table), numbers(table["frame"]))
@@ -223,6 +257,21 @@ def numbers(column: pa.ChunkedArray) -> Any:
     """
     array = column.combine_chunks()
     return np.from_dlpack(array if pa.types.is_primitive(array.type) else array.flatten())
+
+
+def numbers_or_nan(column: pa.ChunkedArray) -> Any:
+    """Return a column of lists of fixed size as an array (rows, size); null becomes NaN."""
+    width, kind = column.type.list_size, column.type.value_type.to_pandas_dtype()
+    result = np.full((len(column), width), np.nan, kind)
+    known = pa.compute.is_valid(column).to_numpy()
+    if known.any():
+        result[known] = numbers(column.drop_null()).reshape(-1, width)
+    return result
+
+
+def full_boxes_of(table: pa.Table) -> F4:
+    """Return the columns `FULL_BOX` as one array (rows, `BOX_WIDTH`); NaN if unknown."""
+    return np.hstack([numbers_or_nan(table[name]) for name in FULL_BOX])
 
 
 def release_memory() -> None:

@@ -21,8 +21,10 @@ from shapecat.runs.tables import (
     first_stamp,
     frame_rows,
     numbers,
+    numbers_or_nan,
     open_writer,
     read_row_groups,
+    read_together,
     release_memory,
     rows_as_lists,
 )
@@ -124,14 +126,8 @@ def _read_frames(folder: Path, categories: int, fixed: set[str]) -> Iterator[Fra
 
     They are in the fixed frame for the topics in ``fixed``, else in the sensor frame.
     """
-    groups = zip(
-        read_row_groups(
-            folder / "frames.parquet", ["topic", "frame", "stamp_ns", "fixed_rotation"]
-        ),
-        read_row_groups(folder / "detections.parquet", _COLUMNS),
-        strict=True,
-    )
-    for frames, detections in groups:
+    wanted = ["topic", "frame", "stamp_ns", "fixed_rotation"]
+    for frames, detections in read_together(folder, {"frames": wanted, "detections": _COLUMNS}):
         rows, columns = frame_rows(detections), _columns_of(detections, categories)
         for frame in frames.to_pylist():
             of_frame = rows.get((frame["topic"], frame["frame"]), slice(0, 0))
@@ -165,9 +161,7 @@ def _columns_of(table: pa.Table, categories: int) -> dict[str, Any]:
     columns["axes"] = Rotation.from_quat(turns).as_matrix() if len(turns) else np.zeros((0, 3, 3))
     first = table["reused_from"].combine_chunks()
     columns["described"] = np.where(first.is_null(), table["frame"], first.fill_null(0))
-    known = pa.compute.is_valid(table["center_fixed"]).to_numpy()
-    columns["center_fixed"] = np.full((table.num_rows, 3), np.nan)
-    columns["center_fixed"][known] = numbers(table["center_fixed"]).reshape(-1, 3)
+    columns["center_fixed"] = numbers_or_nan(table["center_fixed"]).astype(np.float64)
     columns["partial"] = np.logical_or(
         *(table[n].to_numpy() for n in ("touches_border", "occluded"))
     )

@@ -6,7 +6,7 @@ from typing import Any
 import numpy as np
 
 from shapecat.recordings.gravity import Upright
-from shapecat.runs.tables import read_row_groups
+from shapecat.runs.tables import keys_of, read_together
 
 __all__ = ["report_up"]
 
@@ -51,14 +51,9 @@ def _angles_to_planes(folder: Path) -> tuple[list[float], int]:
     """
     angles, bare = [], 0
     rows = ["topic", "frame"]
-    tables = (
-        read_row_groups(folder / f"{name}.parquet", columns)
-        for name, columns in (
-            ("frames", [*rows, "up", "up_given"]), ("planes", rows), ("detections", rows)
-        )
-    )  # fmt: skip
-    for frames, *found in zip(*tables, strict=True):
-        planes, objects = ({(r["topic"], r["frame"]) for r in t.to_pylist()} for t in found)
+    wanted = {"frames": [*rows, "up", "up_given"], "planes": rows, "detections": rows}
+    for frames, *found in read_together(folder, wanted):
+        planes, objects = (set(keys_of(table)) for table in found)
         for row in frames.to_pylist():
             key = (row["topic"], row["frame"])
             if row["up_given"] is None:
