@@ -21,6 +21,8 @@ __all__ = [
     "recall",
 ]
 
+_BINS = 15
+
 
 class Bin(NamedTuple):
     """Views of similar confidence: their number, mean confidence and accuracy."""
@@ -68,29 +70,29 @@ def balanced_accuracy(table: I4) -> float:
     return float(np.nanmean(shares)) if np.any(table) else float("nan")
 
 
-def calibration_curve(truth: I4, posteriors: F4, *, bins: int = 15) -> tuple[Bin, ...]:
+def calibration_curve(truth: I4, posteriors: F4) -> tuple[Bin, ...]:
     """Return the calibration curve: bins of equal width in confidence, without the empty ones.
 
     ``truth`` (n,) are the true columns of ``posteriors`` (n, c).
     """
     confidence = np.asarray(posteriors, np.float64).max(axis=1, initial=0.0)
     right = np.asarray(posteriors).argmax(axis=1) == truth if len(truth) else np.zeros(0, bool)
-    place = np.minimum((confidence * bins).astype(np.int64), bins - 1)
+    place = np.minimum((confidence * _BINS).astype(np.int64), _BINS - 1)
     return tuple(
         Bin(int(mine.sum()), float(confidence[mine].mean()), float(right[mine].mean()))
-        for mine in (place == k for k in range(bins))
+        for mine in (place == k for k in range(_BINS))
         if mine.any()
     )
 
 
-def expected_calibration_error(truth: I4, posteriors: F4, *, bins: int = 15) -> float:
+def expected_calibration_error(truth: I4, posteriors: F4) -> float:
     """Return the mean absolute difference between confidence and accuracy over bins of confidence.
 
     ``truth`` (n,) are the true columns of ``posteriors`` (n, c). The result is NaN without views.
 
     Source: Naeini et al. 2015; Guo et al. 2017, eq. 3.
     """
-    curve = calibration_curve(truth, posteriors, bins=bins)
+    curve = calibration_curve(truth, posteriors)
     if not curve:
         return float("nan")
     counts = np.array([item.views for item in curve])

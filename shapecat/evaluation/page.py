@@ -165,11 +165,9 @@ def confusion_svg(categories: Sequence[str], table: Sequence[Sequence[int]]) -> 
     return _svg(size, size, parts)
 
 
-def calibration_svg(curve: Sequence[Bin], *, size: int = 280) -> str:
-    """Return a calibration curve as SVG, ``size`` pixels wide.
-
-    The area of a dot shows its number of views.
-    """
+def calibration_svg(curve: Sequence[Bin]) -> str:
+    """Return a calibration curve as SVG; the area of a dot shows its number of views."""
+    size = 280
     low, top, side = 34.0, 18.0, size - 56.0  # room for the largest dot in a corner
     high, bottom = low + side, top + side
     parts = [
@@ -188,12 +186,12 @@ def calibration_svg(curve: Sequence[Bin], *, size: int = 280) -> str:
     return _svg(size, size, parts)
 
 
-def accuracy_svg(ranges: Ranges, *, width: int = 480) -> str:
+def accuracy_svg(ranges: Ranges) -> str:
     """Return accuracies as bars in SVG; a bar's thickness shows its number of views.
 
-    ``ranges`` are (name, views, accuracy); ``width`` is in pixels.
+    ``ranges`` are (name, views, accuracy).
     """
-    low, step = 96, 34  # room for the longest label
+    width, low, step = 480, 96, 34  # room for the longest label
     side = width - low - 56
     most = max((count for _, count, _ in ranges), default=1)
     parts: list[str] = []

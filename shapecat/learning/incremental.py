@@ -19,6 +19,8 @@ __all__ = ["add_categories"]
 
 _KERNELS = 100
 """Parzen kernels of a new category."""
+_RIDGE = 1e-2
+"""Strength of the L2 regularisation, per view."""
 _FOLDS = 4
 _STEPS, _FEW_STEPS = 150, 40
 """Iterations of the minimiser: from zero, and from the solution for all folds."""
@@ -43,7 +45,6 @@ def add_categories(
     labels: Sequence[str],
     *,
     rng: np.random.Generator,
-    ridge: float = 1e-2,
 ) -> Categorizer:
     """Add new categories to a model from a few views of each.
 
@@ -57,7 +58,6 @@ def add_categories(
     descriptors : (n, d) views of the new categories; views of old categories are further negative
         examples.
     labels : (n,) category names.
-    ridge : strength of the L2 regularisation, per view.
 
     Returns
     -------
@@ -94,8 +94,8 @@ def add_categories(
     inputs = _Inputs(features.astype(np.float64), bag_of_words(words, categorizer.forest.words))
     old = _old_logits(categorizer, inputs)
     cold = old / categorizer.temperature
-    learned = _fit_new(inputs, cold, truth, np.zeros((_width(inputs), count)), ridge, _STEPS)
-    learned[-1] += _shift(inputs, cold, truth, learned, ridge, rng)
+    learned = _fit_new(inputs, cold, truth, np.zeros((_width(inputs), count)), _RIDGE, _STEPS)
+    learned[-1] += _shift(inputs, cold, truth, learned, _RIDGE, rng)
     learned *= categorizer.temperature
     linear = np.zeros((old.shape[1] + count, bank.width), np.float32)
     linear[: old.shape[1], : categorizer.linear.shape[1]] = categorizer.linear

@@ -9,8 +9,8 @@ __all__ = ["shape_functions"]
 _SAMPLES = 4096
 
 
-def shape_functions(points: F4, rng: np.random.Generator, *, bins: int = 32) -> F4:
-    """Return scale-invariant shape distributions (3 * bins,) of points (n, 3).
+def shape_functions(points: F4, rng: np.random.Generator) -> F4:
+    """Return scale-invariant shape distributions (96,) of points (n, 3).
 
     These are three histograms, each with sum 1: the distance between two random points (D2), the
     root of the area of a triangle of three points (D3), both up to 3 times their mean, and the
@@ -26,5 +26,5 @@ def shape_functions(points: F4, rng: np.random.Generator, *, bins: int = 32) -> 
     norm = np.maximum(distance * np.linalg.norm(ac, axis=1), 1e-12)
     angle = np.arccos(np.clip((ab * ac).sum(axis=1) / norm, -1, 1)) * (3 / np.pi)
     scaled = (distance / max(distance.mean(), 1e-9), area / max(area.mean(), 1e-9), angle)
-    counts = [np.histogram(values, bins, (0.0, 3.0))[0] for values in scaled]
+    counts = [np.histogram(values, 32, (0.0, 3.0))[0] for values in scaled]
     return (np.concatenate(counts) / _SAMPLES).astype(np.float32)

@@ -5,13 +5,13 @@ from pathlib import Path
 import numpy as np
 
 from shapecat.arrays import F4
-from shapecat.geometry import IDENTITY, level_from_sensor, quaternion_from_rotation, transform
+from shapecat.geometry import level_from_sensor, quaternion_from_rotation, transform
 from shapecat.types import Frame, LabelledFrame, LabelledObject, Pose
 
 __all__ = ["finite_points", "support_offset", "upright_cloud", "upward", "write_pcd"]
 
 
-def write_pcd(path: Path, points: F4, *, viewpoint: Pose = IDENTITY) -> None:
+def write_pcd(path: Path, points: F4, *, viewpoint: Pose) -> None:
     """Write points (n, 3), metres, as a binary PCD file, version 0.7.
 
     ``viewpoint`` is the pose of the sensor in the frame of the points.

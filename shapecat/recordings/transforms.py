@@ -127,20 +127,6 @@ class TransformBuffer:
             self._moving.setdefault(child, TransformTrack()).add(stamp_ns, sample)
         return True
 
-    def ancestors(self, frame_id: str) -> tuple[str, ...]:
-        """Return a frame and its ancestors, nearest first, according to the latest transforms.
-
-        Returns
-        -------
-        The frame ids; empty if the frame does not occur in any transform.
-
-        Raises
-        ------
-        TransformLoopError : the frame or an ancestor is its own ancestor.
-        """
-        name = frame_id.lstrip("/")
-        return tuple(self._ancestors(name)) if name in self._frames else ()
-
     def root_of(self, frame_id: str) -> str:
         """Return the root of a frame's tree, according to the latest transforms.
 
@@ -249,17 +235,14 @@ def fixed_frame(buffer: TransformBuffer, frame_id: str) -> str | None:
     return root if root != frame_id.lstrip("/") else None
 
 
-def read_transforms(
-    recording: Recording, *, tolerance_ns: int = 100_000_000, static_only: bool = False
-) -> TransformBuffer:
+def read_transforms(recording: Recording, *, static_only: bool = False) -> TransformBuffer:
     """Read all transforms of a recording in one pass.
 
     Parameters
     ----------
-    tolerance_ns : as for `TransformBuffer`.
     static_only : read only static transforms, which are few: their topics end in ``tf_static``.
     """
-    reader = TransformReader(recording, TransformBuffer(tolerance_ns=tolerance_ns))
+    reader = TransformReader(recording, TransformBuffer())
     static, moving = transform_topics(recording)
     topics = static if static_only else static | moving
     for message in recording.messages(topics) if topics else ():
