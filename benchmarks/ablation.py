@@ -6,20 +6,46 @@ The frames are simulated clutter and, if available, real tables.
 """
 
 from collections.abc import Iterator
+from contextlib import ExitStack, contextmanager
 from pathlib import Path
 from typing import Any
+from unittest.mock import patch
 
 import click
 import numpy as np
 
 from benchmarks.measure import markdown, save
-from benchmarks.overlap import Array, Finder, labelled_sets, score, with_steps
+from benchmarks.overlap import Array, Finder, labelled_sets, objects_in, score
 from shapecat.config import DetectionSettings
 from shapecat.detection import detect
-from shapecat.detection.pipeline import ALL_STEPS, Steps
+from shapecat.detection.segmentation.settings import SEGMENTATION
+from shapecat.detection.segmentation.watershed import NO_EDGE
 from shapecat.types import Frame
 
-NO_STEPS = Steps(*[False] * len(Steps._fields))
+
+def _nothing(*_: object) -> None:
+    """Do nothing."""
+
+
+STEPS: dict[str, tuple[str, Any]] = {
+    "low profile": ("pipeline.find_low_profile", _nothing),
+    "concavity": ("segmentation.watershed.SEGMENTATION", SEGMENTATION._replace(edge_deg=NO_EDGE)),
+    "width split": ("pipeline.split_at_width_changes", lambda *given: given[-1]),
+    "learned merging": ("pipeline.learned.merge_learned", _nothing),
+    "across occlusion": ("pipeline.merge_across_occluder", _nothing),
+    "contact boundary": ("pipeline.fill_contact_boundary", _nothing),
+    "hole filling": ("pipeline.fill_holes", _nothing),
+}
+"""Steps beyond the thesis, with what replaces each when it is left out."""
+
+
+@contextmanager
+def without(*steps: str) -> Iterator[None]:
+    """Leave some of the `STEPS` out during the block."""
+    with ExitStack() as stack:
+        for target, replacement in map(STEPS.__getitem__, steps):
+            stack.enter_context(patch(f"shapecat.detection.{target}", replacement))
+        yield
 
 
 def run(count: int, first_seed: int = 500) -> tuple[str, dict[str, Any]]:
@@ -27,27 +53,24 @@ def run(count: int, first_seed: int = 500) -> tuple[str, dict[str, Any]]:
     sets = labelled_sets(count, first_seed)
     figures: dict[str, Any] = {}
     rows = []
-    for method, finder in _methods():
-        scores = {name: score(frames, finder) for name, frames in sets.items()}
+    for method, finder, left_out in _methods():
+        with without(*left_out):
+            scores = {name: score(frames, finder) for name, frames in sets.items()}
         figures[method] = scores
         rows.append((method, *(v for s in scores.values() for v in (s["F"], s["obj75"]))))
     columns = ("steps", *(f"{name}, {what}" for name in sets for what in ("F", "obj75")))
     return markdown("Detection, overlap with the truth", columns, rows), figures
 
 
-def _methods() -> Iterator[tuple[str, Finder]]:
-    yield "voxels, plane, DBSCAN (Open3D)", _clusters
-    yield "plane, height, depth discontinuities", with_steps(NO_STEPS)
-    steps = NO_STEPS
-    for name in Steps._fields:
-        steps = steps._replace(**{name: True})
-        yield f"+ {_words(name)}", with_steps(steps)
-    for name in Steps._fields:
-        yield f"all but {_words(name)}", with_steps(ALL_STEPS._replace(**{name: False}))
-
-
-def _words(name: str) -> str:
-    return name.replace("_", " ")
+def _methods() -> Iterator[tuple[str, Finder, list[str]]]:
+    """Yield the name of each method, its finder, and the steps to leave out."""
+    yield "voxels, plane, DBSCAN (Open3D)", _clusters, []
+    names = list(STEPS)
+    yield "plane, height, depth discontinuities", objects_in, names
+    for k, name in enumerate(names, start=1):
+        yield f"+ {name}", objects_in, names[k:]
+    for name in names:
+        yield f"all but {name}", objects_in, [name]
 
 
 def _clusters(frame: Frame) -> list[Array]:

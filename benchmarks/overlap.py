@@ -9,7 +9,6 @@ from numpy.typing import NDArray
 from benchmarks.scenes import labelled_clutter, labelled_tables
 from shapecat.config import DetectionSettings
 from shapecat.detection import detect
-from shapecat.detection.pipeline import Steps
 from shapecat.evaluation.overlap import Overlap, match_masks
 from shapecat.types import Frame
 
@@ -35,15 +34,10 @@ def labelled_sets(count: int, first_seed: int) -> dict[str, list[Labelled]]:
     return {name: frames for name, frames in sets.items() if frames}
 
 
-def with_steps(steps: Steps) -> Finder:
-    """Return a finder that runs only some steps of the detection."""
-    settings = DetectionSettings()
-
-    def find(frame: Frame) -> list[Array]:
-        scene = detect(frame, settings=settings, rng=np.random.default_rng(0), steps=steps)
-        return [candidate.indices for candidate in scene.candidates]
-
-    return find
+def objects_in(frame: Frame) -> list[Array]:
+    """Find objects by the detection."""
+    scene = detect(frame, settings=DetectionSettings(), rng=np.random.default_rng(0))
+    return [candidate.indices for candidate in scene.candidates]
 
 
 def score(frames: Sequence[Labelled], finder: Finder) -> dict[str, float]:

@@ -10,10 +10,10 @@ from hypothesis import example, given, settings
 from hypothesis import strategies as st
 from numpy.typing import NDArray
 
+from benchmarks.ablation import STEPS, without
 from shapecat.config import DetectionSettings
 from shapecat.detection import Hierarchy, Node, detect, format_tree
 from shapecat.detection.depth_grid import row_and_column
-from shapecat.detection.pipeline import Steps
 from shapecat.detection.virtual_camera import _occupied
 from shapecat.types import Camera, Frame, Scene
 
@@ -509,8 +509,8 @@ def test_without_the_steps_beyond_the_thesis_touching_boxes_are_one() -> None:
     """The benchmark of single steps would else measure nothing."""
     depth, _ = render([table(), box((0, 0, 0), (0.22, 0.18, 0.08)),
                        box((0, 0.01, 0.08), (0.1, 0.08, 0.1))])  # fmt: skip
-    plain = Steps(*[False] * len(Steps._fields))
-    scene = detect(frame_of(depth), settings=DEFAULTS, rng=np.random.default_rng(0), steps=plain)
+    with without(*STEPS):
+        scene = found(frame_of(depth))
     assert len(scene.candidates) == 1
 
 

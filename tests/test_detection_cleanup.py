@@ -22,7 +22,7 @@ from shapecat.detection.cleanup.structure import (
 )
 from shapecat.detection.depth_grid import DepthGrid, PinholeIntrinsics, downsample
 from shapecat.detection.merging.segments import _blank
-from shapecat.detection.pipeline import ALL_STEPS, Task, merge_segments, oversegment
+from shapecat.detection.pipeline import Task, merge_segments, oversegment
 from shapecat.detection.planes.extent import DIRECTIONS
 from shapecat.detection.planes.height_map import OUTLINE, HeightMap
 from shapecat.trees import BoostedTrees, Trees
@@ -46,7 +46,7 @@ def features_of(shapes: list[Shape], tilt_deg: float) -> tuple[Array, Array]:
     found = oversegment(grid, Task(settings, np.random.default_rng(0)))
     assert found is not None
     model, oversegmentation = found
-    known = merge_segments(grid, model, oversegmentation, ALL_STEPS)
+    known = merge_segments(grid, model, oversegmentation)
     features = measure_object_features(grid, model, oversegmentation, known, settings.max_range_m)
     segments = oversegmentation.segments
     rejected = find_background(segments, features, grid, settings, load_trees())

@@ -6,9 +6,9 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
+from benchmarks.ablation import without
 from shapecat.config import DetectionSettings
 from shapecat.detection import detect
-from shapecat.detection.pipeline import ALL_STEPS
 from shapecat.simulation import KINECT, REALSENSE, make_scene, render_frame
 from shapecat.types import Camera, Frame, Scene
 from tests.test_detection import overlaps
@@ -41,9 +41,9 @@ def measured(depth: Array, seed: int = 0) -> Frame:
 
 def found(frame: Frame, *, low_profile: bool = True) -> Scene:
     """Return what is found with or without the step for low-profile objects."""
-    steps = ALL_STEPS._replace(low_profile=low_profile)
     rng = np.random.default_rng(0)
-    return detect(frame, settings=DetectionSettings(), rng=rng, steps=steps)
+    with without(*([] if low_profile else ["low profile"])):
+        return detect(frame, settings=DetectionSettings(), rng=rng)
 
 
 def bump(radius: float, edge: float) -> Array:

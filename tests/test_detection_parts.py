@@ -5,6 +5,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from benchmarks.ablation import without
 from shapecat.config import DetectionSettings
 from shapecat.detection import detect
 from shapecat.detection.cleanup import structure
@@ -19,7 +20,7 @@ from shapecat.detection.merging.pair_features import (
     find_adjacent,
     pair_features,
 )
-from shapecat.detection.pipeline import ALL_STEPS, Task, oversegment
+from shapecat.detection.pipeline import Task, oversegment
 from shapecat.models.growing import Growth, grow
 from shapecat.models.parts import Series, collect
 from shapecat.simulation import KINECT, REALSENSE, make_scene, render_frame
@@ -96,10 +97,10 @@ def test_without_the_trees_objects_stay_in_pieces(seed: int) -> None:
     frame, seen = render_frame(world, 0, rng=rng, sensor=KINECT)
     labels = [thing.label for thing in world.things if np.count_nonzero(seen == thing.label) > 400]
     found = []
-    for merging in (False, True):
-        steps = ALL_STEPS._replace(learned_merging=merging, across_occlusion=False)
+    for left_out in (["learned merging", "across occlusion"], ["across occlusion"]):
         rng = np.random.default_rng(0)
-        scene = detect(frame, settings=DetectionSettings(), rng=rng, steps=steps)
+        with without(*left_out):
+            scene = detect(frame, settings=DetectionSettings(), rng=rng)
         found.append(np.mean(np.array(overlaps(scene, seen, labels)) > 0.75))
     assert found[1] > found[0]
 

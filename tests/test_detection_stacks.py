@@ -8,9 +8,9 @@ from typing import Any
 import numpy as np
 import pytest
 
+from benchmarks.ablation import without
 from shapecat.config import DetectionSettings
 from shapecat.detection import detect
-from shapecat.detection.pipeline import ALL_STEPS, Steps
 from shapecat.simulation import KINECT, make_scene, render_frame
 from tests.test_detection import (
     Array,
@@ -118,12 +118,12 @@ def rendered(scenery: Scenery) -> list[tuple[np.random.Generator, Array, Any, li
     return scenes
 
 
-def share_found(scenery: Scenery, steps: Steps, least: float) -> float:
+def share_found(scenery: Scenery, least: float) -> float:
     """Return in which share of made-up scenes each thing on the table is found so well."""
     good = []
     for rng, depth, seen, things in rendered(scenery):
         chance = deepcopy(rng)
-        scene = detect(frame_of(depth), settings=DetectionSettings(), rng=chance, steps=steps)
+        scene = detect(frame_of(depth), settings=DetectionSettings(), rng=chance)
         good.append(min(overlaps(scene, seen, things)) > least)
     return sum(good) / len(good)
 
@@ -136,9 +136,9 @@ def can_before_a_box(rng: np.random.Generator) -> list[Shape]:
 
 def test_two_sides_of_a_box_are_one_object() -> None:
     """What is in front of its middle hides where they meet."""
-    apart = ALL_STEPS._replace(across_occlusion=False)
-    assert share_found(can_before_a_box, ALL_STEPS, 0.75) > 0.9
-    assert share_found(can_before_a_box, apart, 0.75) < 0.4
+    assert share_found(can_before_a_box, 0.75) > 0.9
+    with without("across occlusion"):
+        assert share_found(can_before_a_box, 0.75) < 0.4
 
 
 def test_two_cans_beside_a_third_are_no_sides_of_one() -> None:
@@ -171,9 +171,9 @@ def tower_of_cans(rng: np.random.Generator) -> list[Shape]:
 
 def test_towers_of_three_cans_of_two_widths() -> None:
     """What stands on another may bear a third."""
-    whole = ALL_STEPS._replace(concavity=False, width_split=False)
-    assert share_found(tower_of_cans, ALL_STEPS, 0.75) > 0.6
-    assert share_found(tower_of_cans, whole, 0.75) < 0.2
+    assert share_found(tower_of_cans, 0.75) > 0.6
+    with without("concavity", "width split"):
+        assert share_found(tower_of_cans, 0.75) < 0.2
 
 
 def flush_boxes(rng: np.random.Generator) -> list[Shape]:
@@ -186,9 +186,9 @@ def flush_boxes(rng: np.random.Generator) -> list[Shape]:
 
 def test_stacked_boxes_with_flush_fronts_stay_two() -> None:
     """Only their outline tells where one ends, and the merging must leave them apart."""
-    without = ALL_STEPS._replace(width_split=False)
-    assert share_found(flush_boxes, ALL_STEPS, 0.75) > 0.7
-    assert share_found(flush_boxes, without, 0.75) < 0.1
+    assert share_found(flush_boxes, 0.75) > 0.7
+    with without("width split"):
+        assert share_found(flush_boxes, 0.75) < 0.1
 
 
 def test_round_object_with_one_axis_stays_whole() -> None:
@@ -243,18 +243,16 @@ def test_ball_on_a_can_whose_foot_is_hidden() -> None:
     check([*shapes, box((0, -0.1, 0), (0.2, 0.03, 0.05))], [1, 2, 3], tilt_deg=20)
 
 
-UNMERGED = ALL_STEPS._replace(
-    learned_merging=False, across_occlusion=False, contact_boundary=False, hole_filling=False
-)
-"""The steps that part objects, without those that merge parts of one again."""
+MERGING = ("learned merging", "across occlusion", "contact boundary", "hole filling")
+"""The steps that merge parts of an object again."""
 
 
-def overlaps_by(shapes: list[Shape], steps: Steps) -> list[float]:
-    """Return how well all but the first shape are found with some of the steps."""
+def overlaps_without(shapes: list[Shape], *steps: str) -> list[float]:
+    """Return how well all but the first shape are found if some of the steps are left out."""
     depth, seen = render(shapes)
-    scene = detect(
-        frame_of(depth), settings=DetectionSettings(), rng=np.random.default_rng(0), steps=steps
-    )
+    with without(*steps):
+        rng = np.random.default_rng(0)
+        scene = detect(frame_of(depth), settings=DetectionSettings(), rng=rng)
     return overlaps(scene, seen, list(range(1, len(shapes))))
 
 
@@ -263,8 +261,8 @@ def test_boxes_with_flush_fronts_are_parted_where_the_outline_steps(upper: float
     """No edge parts them; what is wider above shows no top of the lower one either."""
     boxes = [box((0, 0, 0), (0.1, 0.06, 0.1)), box((0, 0, 0.1), (upper, 0.06, 0.08))]
     shapes = [table(), *boxes]
-    assert min(overlaps_by(shapes, UNMERGED)) > 0.85
-    assert min(overlaps_by(shapes, UNMERGED._replace(width_split=False))) < 0.8
+    assert min(overlaps_without(shapes, *MERGING)) > 0.85
+    assert min(overlaps_without(shapes, *MERGING, "width split")) < 0.8
 
 
 @pytest.mark.parametrize(("seed", "label"), [(1132, 20), (1187, 21), (1395, 22), again(1076, 20)])
@@ -280,7 +278,7 @@ def test_outline_that_something_nearer_cuts_off_is_no_step() -> None:
         box((0, 0.1, 0), (0.16, 0.06, 0.2)),
         box((-0.06, -0.05, 0), (0.1, 0.05, 0.07)),
     ]
-    assert min(overlaps_by(shapes, UNMERGED)) > 0.85
+    assert min(overlaps_without(shapes, *MERGING)) > 0.85
 
 
 def test_plate_that_juts_out_over_a_can_is_parted_from_it() -> None:
@@ -291,9 +289,8 @@ def test_plate_that_juts_out_over_a_can_is_parted_from_it() -> None:
     """
     shapes = [table(), can(0, 0, 0, 0.038, 0.06), can(0, 0, 0.06, 0.05, 0.012)]
     depth, seen = render(shapes, tilt_deg=40)
-    steps = ALL_STEPS._replace(learned_merging=False)
-    scene = detect(
-        frame_of(depth), settings=DetectionSettings(), rng=np.random.default_rng(0), steps=steps
-    )
+    with without("learned merging"):
+        rng = np.random.default_rng(0)
+        scene = detect(frame_of(depth), settings=DetectionSettings(), rng=rng)
     assert len(scene.candidates) == 2
     assert min(overlaps(scene, seen, [1, 2])) > 0.8

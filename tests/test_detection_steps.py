@@ -88,7 +88,7 @@ def test_two_faces_are_parted_where_they_meet_at_a_concave_edge(rise: float, seg
     heights = HeightMap(plane_id, np.where(plane_id, 0.1, 0).astype(np.float32))
     graph = connect_surfaces(DepthGrid(inv_depth, INTRINSICS, 2), heights)
 
-    labels, n = watershed(heights, graph, concave=True)
+    labels, n = watershed(heights, graph)
 
     assert n == segments
     assert (labels[90:150, 120:200] > 0).all()

@@ -51,23 +51,21 @@ from shapecat.detection.records import OverSegmentation, PlaneModel, Segmentatio
 from shapecat.detection.segmentation.connectivity import connect_surfaces
 from shapecat.detection.segmentation.watershed import watershed
 from shapecat.detection.segmentation.width_split import split_at_width_changes
-from shapecat.detection.steps import ALL_STEPS, Steps
 from shapecat.detection.virtual_camera import VirtualImage, top_view, virtual_image
 from shapecat.geometry import IDENTITY, inverse
 from shapecat.types import Camera, Frame, Scene
 
-__all__ = ["ALL_STEPS", "Steps", "Task", "detect", "label", "merge_segments", "oversegment"]
+__all__ = ["Task", "detect", "label", "merge_segments", "oversegment"]
 
 DEFAULT_UP = (0.0, -1.0, 0.0)
 """Up in the optical frame of an upright camera, used if nothing else is known."""
 
 
 class Task(NamedTuple):
-    """The inputs of all steps: the settings, the generator for RANSAC, and the steps to take."""
+    """The inputs of all steps: the settings, and the generator for RANSAC."""
 
     settings: DetectionSettings
     rng: np.random.Generator
-    steps: Steps = ALL_STEPS
 
 
 def detect(
@@ -76,7 +74,6 @@ def detect(
     up: ArrayLike | None = None,
     settings: DetectionSettings,
     rng: np.random.Generator,
-    steps: Steps = ALL_STEPS,
 ) -> Scene:
     """Find the supporting planes of a frame and the objects on them.
 
@@ -88,7 +85,6 @@ def detect(
         dominant plane.
     settings : see `DetectionSettings`.
     rng : source of the RANSAC samples; the same state gives the same scene.
-    steps : the optional steps to take, for ablation.
 
     Returns
     -------
@@ -106,7 +102,7 @@ def detect(
     cloud was not taken from its origin, the virtual camera looks down on its dominant plane; the
     points of a fused cloud that are hidden in that view join the objects they touch.
     """
-    hint, task = None if up is None else _unit(up), Task(settings, rng, steps)
+    hint, task = None if up is None else _unit(up), Task(settings, rng)
     if frame.depth is not None and frame.camera is not None:
         scene = _in_image(frame.depth, frame.camera, hint, task)
     else:
@@ -165,8 +161,8 @@ def label(
     model = _find_planes(grid, hint, task, upright=upright)
     if model is None:
         return None
-    oversegmentation = _oversegment(grid, model, task.steps)
-    known = merge_segments(grid, model, oversegmentation, task.steps)
+    oversegmentation = _oversegment(grid, model)
+    known = merge_segments(grid, model, oversegmentation)
     representatives = _clean_up(grid, model, oversegmentation, known, task.settings)
     return _fill(grid, model, oversegmentation, representatives, task)
 
@@ -174,7 +170,7 @@ def label(
 def oversegment(grid: DepthGrid, task: Task) -> tuple[PlaneModel, OverSegmentation] | None:
     """Find planes and the segments of objects; None if there is no supporting plane."""
     model = _find_planes(grid, None, task)
-    return None if model is None else (model, _oversegment(grid, model, task.steps))
+    return None if model is None else (model, _oversegment(grid, model))
 
 
 def _find_planes(
@@ -200,8 +196,7 @@ def _find_planes(
         return None
     largest_m = task.settings.max_size_m
     low_profile = np.zeros(grid.inverse_depth.shape, np.int16)
-    if task.steps.low_profile:
-        find_low_profile(grid, heights, planes, low_profile, largest_m)
+    find_low_profile(grid, heights, planes, low_profile, largest_m)
     walls = remove_walls(grid, heights.plane_id, up, largest_m, trials)
     extend_overhang(grid, heights, planes, walls, tallest_m)
     return PlaneModel(up, supports, planes, heights, low_profile, walls)
@@ -219,32 +214,27 @@ def _find_assumed_plane(
     return None if rest is None else assume_plane(grid, rest, up, settings.max_height_m)
 
 
-def _oversegment(grid: DepthGrid, model: PlaneModel, steps: Steps) -> OverSegmentation:
+def _oversegment(grid: DepthGrid, model: PlaneModel) -> OverSegmentation:
     """Split the samples above the planes wherever two objects may meet."""
     heights, up = model.heights, model.up
     graph = connect_surfaces(grid, heights)
-    labels, n = watershed(heights, graph, concave=steps.concavity)
-    if steps.width_split:
-        n = split_at_width_changes(grid, heights, graph, labels, up, n)
+    labels, n = watershed(heights, graph)
+    n = split_at_width_changes(grid, heights, graph, labels, up, n)
     segments = measure_segments(grid, heights, graph, labels, n, up)
     measure_adjacency(grid.inverse_depth, heights, graph, labels, up, segments)
     return OverSegmentation(graph, labels, segments)
 
 
-def merge_segments(
-    grid: DepthGrid, model: PlaneModel, oversegmentation: OverSegmentation, steps: Steps
-) -> Bool:
+def merge_segments(grid: DepthGrid, model: PlaneModel, oversegmentation: OverSegmentation) -> Bool:
     """Merge the segments of each object, in place.
 
     Return the mask (segments,) of those known to be low-profile objects.
     """
     graph, labels, segments = oversegmentation
     known: Bool = merge_low_profile(segments, model.low_profile, labels, graph.spans)
-    if steps.learned_merging:
-        view_geometry = ViewGeometry(grid.intrinsics.fx, model.up[2])
-        learned.merge_learned(segments, view_geometry, learned.load_trees())
-    if steps.across_occlusion:
-        merge_across_occluder(segments, grid.inverse_depth, grid.intrinsics, graph.normal, labels)
+    view_geometry = ViewGeometry(grid.intrinsics.fx, model.up[2])
+    learned.merge_learned(segments, view_geometry, learned.load_trees())
+    merge_across_occluder(segments, grid.inverse_depth, grid.intrinsics, graph.normal, labels)
     return known
 
 
@@ -273,11 +263,9 @@ def _fill(
 ) -> Segmentation:
     """Fill contact boundaries and holes in the labels, and measure the objects."""
     _, labels, segments = oversegmentation  # since `_clean_up`, the labels are those of objects
-    if task.steps.contact_boundary:
-        fill_contact_boundary(grid.inverse_depth, model.heights, labels)
+    fill_contact_boundary(grid.inverse_depth, model.heights, labels)
     filled = np.zeros(labels.shape, np.uint8)
-    if task.steps.hole_filling:
-        fill_holes(grid.inverse_depth, labels, representatives.size - 1, filled)
+    fill_holes(grid.inverse_depth, labels, representatives.size - 1, filled)
     if model.low_profile.max() > 0:  # it may lie at the level of its plane
         filled |= (model.low_profile > 0) & (labels > 0)
     plane_ids = segments.plane_id[representatives].astype(np.int64) - 1

@@ -28,7 +28,7 @@ from shapecat.detection.cleanup.structure import (
 )
 from shapecat.detection.depth_grid import downsample
 from shapecat.detection.merging.segments import Records
-from shapecat.detection.pipeline import ALL_STEPS, Task, merge_segments, oversegment
+from shapecat.detection.pipeline import Task, merge_segments, oversegment
 from shapecat.models.growing import Growth, collect_chunks, grow, growing_options
 from shapecat.models.parts import count_labels
 from shapecat.simulation import make_scene, render_frame
@@ -303,7 +303,7 @@ def label_objects(frame: Frame, owners: U1, things: I4) -> Iterator[Samples]:
     if grid is None or found is None:
         return
     model, oversegmentation = found
-    known = merge_segments(grid, model, oversegmentation, ALL_STEPS)
+    known = merge_segments(grid, model, oversegmentation)
     features = measure_object_features(grid, model, oversegmentation, known, settings.max_range_m)
     _, labels, segments = oversegmentation
     counts = count_labels(owners.reshape(frame.depth.shape), labels, grid)

@@ -18,23 +18,18 @@ LEFT, UP = 4, 8
 """Bits of links to the other two neighbours, in addition to `RIGHT` and `DOWN`."""
 
 
-def watershed(heights: HeightMap, graph: SurfaceGraph, *, concave: bool) -> tuple[I4, int]:
+def watershed(heights: HeightMap, graph: SurfaceGraph) -> tuple[I4, int]:
     """Split the object cells into segments at depth discontinuities and concave edges.
 
     Each connected component of flat cells is a seed. A flood from the seeds, flattest cells first,
     assigns the cells of concave edges to the segments beside them (Meyer 1991).
-
-    Parameters
-    ----------
-    concave : if False, only depth discontinuities separate segments.
 
     Returns
     -------
     (rows, columns) int16 labels 1..n, 0 elsewhere; and n.
     """
     labels = np.zeros(heights.plane_id.shape, np.int16)
-    edge_deg = SEGMENTATION.edge_deg if concave else NO_EDGE
-    n = _label_parts(heights.plane_id, graph, edge_deg, labels, 0)
+    n = _label_parts(heights.plane_id, graph, SEGMENTATION.edge_deg, labels, 0)
     _flood_labels(graph.links, graph.concavity, graph.spans, labels)
     return labels, _label_parts(heights.plane_id, graph, NO_EDGE, labels, n)
 
