@@ -4,9 +4,9 @@ from importlib import import_module
 from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
-    from shapecat.api import Run, open_recording, open_run, process
+    from shapecat.api import Run, open_recording, open_run, perceive, process
 
-__all__ = ["Run", "open_recording", "open_run", "process"]
+__all__ = ["Run", "open_recording", "open_run", "perceive", "process"]
 
 __version__ = "0.1.0"
 

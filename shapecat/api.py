@@ -1,4 +1,4 @@
-"""The Python interface: open a run, open a recording, process a recording.
+"""The Python interface: open a run or a recording, process a recording, perceive one image.
 
 ``import shapecat`` loads this module only when one of its names is used.
 """
@@ -9,19 +9,33 @@ from collections.abc import Collection, Iterator, Sequence
 from pathlib import Path
 from typing import Any, Self
 
+from numpy.typing import ArrayLike
+
 from shapecat import pipeline
 from shapecat.batch.finding import find_recordings
 from shapecat.config import Settings, load_settings, with_settings
 from shapecat.errors import ConfigError, RecordingError
+from shapecat.learning import load_model
+from shapecat.outputs.in_memory import frame_of, perceive_alone
 from shapecat.outputs.opened_run import Run, RunFrame, Table
 from shapecat.recordings import Recording, choose_streams, frames
 from shapecat.recordings import open_recording as _open_recording
+from shapecat.rehearsal import compile_all
 from shapecat.runs.jobs import Job
 from shapecat.system.progress import Observer, ignore
 from shapecat.system.scripts import runs_again
 from shapecat.types import Frame
 
-__all__ = ["OpenRecording", "Run", "RunFrame", "Table", "open_recording", "open_run", "process"]
+__all__ = [
+    "OpenRecording",
+    "Run",
+    "RunFrame",
+    "Table",
+    "open_recording",
+    "open_run",
+    "perceive",
+    "process",
+]
 
 
 def open_run(folder: str | Path) -> Run:
@@ -164,6 +178,47 @@ def process(
     )
     pipeline.process(job, observe or ignore, cores=cores)
     return Run(job.folder)
+
+
+def perceive(
+    reading: ArrayLike,
+    intrinsics: Sequence[float] | None = None,
+    *,
+    up: Sequence[float] | None = None,
+    model: str | Path | None = None,
+    config: str | Path | None = None,
+    **settings: Any,
+) -> RunFrame:
+    """Find and categorize the objects of one depth image or point cloud.
+
+    Nothing is tracked and nothing is written; the result depends only on the arguments. The first
+    call after an installation compiles for a minute.
+
+    Parameters
+    ----------
+    reading : a depth image (h, w) along the optical axis, floats in metres or integers in
+        millimetres; or points (n, 3) or (h, w, 3) in the sensor frame, metres. Zero, negative and
+        non-finite depth, and non-finite points, are missing.
+    intrinsics : fx, fy, cx, cy of the depth image, pixels.
+    up : (3,) up direction in the sensor frame; None to estimate it from planes.
+    model, config, settings : as for `process`.
+
+    Returns
+    -------
+    A frame like those of a run. In place of a track, each object has its number in the frame, from
+    1; its posterior and confidence are those of this view.
+
+    Raises
+    ------
+    ConfigError : an argument has the wrong shape or value, or a setting does not exist.
+    ModelError : the model cannot be read.
+    """
+    _require_known(settings, perceive.__annotations__)
+    chosen = with_settings(load_settings(None if config is None else Path(config)), settings)
+    categorizer = load_model(None if model is None else Path(model))
+    frame = frame_of(reading, intrinsics)
+    compile_all()
+    return perceive_alone(frame, up=up, categorizer=categorizer, settings=chosen)
 
 
 def _require_known(settings: Collection[str], options: Collection[str]) -> None:

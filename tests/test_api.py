@@ -6,6 +6,7 @@ import subprocess
 import sys
 from collections.abc import Callable
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
@@ -15,8 +16,10 @@ import pytest
 from click.testing import Result
 
 import shapecat
+from shapecat import api
 from shapecat.errors import ConfigError, OutputError, RecordingError
 from shapecat.outputs.opened_run import Table
+from tests.conftest import Guesser
 from tests.loading import loaded_by
 from tests.test_docs_run import run_here
 
@@ -105,6 +108,123 @@ def test_colour_masks_show_the_objects_that_are_there(place: Path) -> None:
     assert np.median(shares) > 0.9
     assert len({track for track, _ in owners}) == len(owners)  # one object a track
     assert len({label for _, label in owners}) == len(owners)  # and one track an object
+
+
+FIXTURE = Path(__file__).parents[1] / "fixtures" / "tabletop.mcap"
+
+
+@pytest.fixture(scope="module")
+def image() -> Any:
+    """Return the first frame of the fixture."""
+    with shapecat.open_recording(FIXTURE) as recording:
+        return next(recording.frames())
+
+
+def intrinsics(camera: Any) -> tuple[float, ...]:
+    return camera.fx, camera.fy, camera.cx, camera.cy
+
+
+def test_an_image_in_memory_has_the_objects_of_its_recording(image: Any, tmp_path: Path) -> None:
+    """Swapped intrinsics, a wrong unit or a wrong object's label would move or rename objects."""
+    run = shapecat.process(FIXTURE, tmp_path, end_s=0.2, mcap=False, rrd=False)
+    expected = [row for row in run.detections.arrow().to_pylist() if row["frame"] == 0]
+    assert len(expected) == 8
+    unread = np.where(image.depth > 0, image.depth, np.nan)
+    unread[0, :3] = -1, np.inf, np.nan
+    millimetres = (image.depth * 1000).round().astype(np.uint16)
+    for depth in (image.depth, unread, millimetres):
+        seen = shapecat.perceive(depth, intrinsics(image.camera))
+        assert [o.track for o in seen.objects] == list(range(1, len(expected) + 1))
+        for item, row in zip(seen.objects, expected, strict=True):
+            assert item.category == row["category"]
+            assert (
+                item.confidence == max(item.posterior) == pytest.approx(row["confidence"], abs=0.1)
+            )
+            np.testing.assert_allclose(item.box.center, row["center"], atol=0.003)
+            np.testing.assert_allclose(item.box.size, row["size"], atol=0.006)
+            assert item.full is not None
+            np.testing.assert_allclose(item.full.size, row["size_full"], atol=0.01)
+            assert item.height_m == pytest.approx(row["height_m"], abs=0.003)
+            shared = np.intersect1d(item.indices, row["indices"]).size
+            assert shared > 0.95 * max(item.indices.size, len(row["indices"]))
+            assert np.array_equal(
+                seen.labels.ravel()[item.indices], [item.track] * item.indices.size
+            )
+        assert (seen.labels > 0).sum() == sum(o.indices.size for o in seen.objects)
+
+
+def test_points_in_memory_have_the_same_objects(image: Any) -> None:
+    """Rows without a reading stay in place, so that masks fit the caller's points."""
+    seen = shapecat.perceive(image.xyz(), up=(0, -6.2, -7.8))
+    alike = shapecat.perceive(image.depth, intrinsics(image.camera))
+
+    assert seen.labels.shape == (image.camera.width * image.camera.height,)
+    assert [o.category for o in seen.objects] == [o.category for o in alike.objects]
+    for one, other in zip(seen.objects, alike.objects, strict=True):
+        np.testing.assert_allclose(one.box.center, other.box.center, atol=0.005)
+        assert np.isfinite(seen.points_of(one)).all()
+    assert seen.labelled.up is not None
+    assert seen.labelled.up @ [0, -0.622, -0.783] == pytest.approx(1, abs=0.001)
+
+
+def test_the_categories_in_memory_are_those_of_the_model(
+    image: Any, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Names in another order, or shapes unlike all categories, must not get a category's name."""
+
+    class Reversed(Guesser):
+        categories = Guesser.categories[::-1]
+        strange = False
+
+        def predict(self, descriptors: Any) -> Any:
+            found = super().predict(descriptors)
+            return SimpleNamespace(
+                posteriors=found.posteriors, novelty=found.novelty + self.strange
+            )
+
+    model = Reversed()
+    monkeypatch.setattr(api, "load_model", lambda _path: model)
+    seen = shapecat.perceive(image.depth, intrinsics(image.camera))
+    for item in seen.objects:
+        assert item.category == model.categories[int(item.posterior.argmax())]
+    model.strange = True
+    seen = shapecat.perceive(image.depth, intrinsics(image.camera))
+    assert {o.category for o in seen.objects} == {"unknown"}
+
+
+IMAGE = np.ones((4, 6), np.float32)
+
+
+@pytest.mark.parametrize(
+    ("reading", "options", "problem"),
+    [
+        (IMAGE, {}, r"points \(n, 3\), or a depth image with intrinsics"),
+        (IMAGE, {"intrinsics": (5, 5, 3)}, "fx, fy, cx, cy in pixels of an image 6 x 4"),
+        (IMAGE, {"intrinsics": (5, 5, 3, 20)}, "fx, fy, cx, cy in pixels of an image 6 x 4"),
+        (IMAGE, {"intrinsics": (0, 5, 3, 2)}, "fx, fy, cx, cy in pixels of an image 6 x 4"),
+        (IMAGE, {"intrinsics": (5, np.nan, 3, 2)}, "fx, fy, cx, cy in pixels of an image 6 x 4"),
+        (IMAGE * 900, {"intrinsics": (5, 5, 3, 2)}, "divide millimetres by 1000"),
+        (np.ones((4, 6, 3)), {"intrinsics": (5, 5, 3, 2)}, r"depth image \(h, w\)"),
+        (np.array([["a"]]), {"intrinsics": (5, 5, 3, 2)}, "depth image"),
+        (np.ones((9, 3)), {"up": (0, 0, 0)}, "up direction"),
+        (np.ones((9, 3)), {"up": (0, 1)}, "up direction"),
+        (np.ones((9, 3)), {"seeed": 1}, "did you mean seed"),
+    ],
+)
+def test_what_cannot_be_perceived_is_named(
+    reading: Any, options: dict[str, Any], problem: str
+) -> None:
+    """A wrong unit or another image's intrinsics would give garbage without a word."""
+    with pytest.raises(ConfigError, match=problem):
+        shapecat.perceive(reading, **options)
+
+
+@pytest.mark.parametrize("reading", [np.zeros((48, 64)), np.full((48, 64), np.nan)])
+def test_an_image_without_a_reading_has_no_objects(reading: Any) -> None:
+    seen = shapecat.perceive(reading, (60, 60, 32, 24))
+
+    assert seen.objects == ()
+    assert (seen.labels == -1).all()
 
 
 def test_columns_are_arrays_with_nan_where_nothing_is(place: Path) -> None:

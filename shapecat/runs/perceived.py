@@ -7,7 +7,6 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Self
 
-import numpy as np
 import pyarrow as pa
 
 from shapecat.arrays import F4
@@ -25,7 +24,7 @@ from shapecat.runs.segments import (
 )
 from shapecat.runs.tables import SCHEMA_VERSION, arrow_table, lists, open_writer
 from shapecat.system.files import complete_folder, replacing
-from shapecat.types import UNKNOWN, Perception, Pose
+from shapecat.types import Perception, Pose
 
 __all__ = ["FrameRow", "PerceptionTables"]
 
@@ -167,7 +166,6 @@ def _detection_columns(
     objects = [(p, row, k, d) for p, row in rows for k, d in enumerate(p.detections)]
     found = [d for _, _, _, d in objects]
     candidates = [d.candidate for d in found]
-    best = [int(np.argmax(d.posterior)) for d in found]
     return {
         "topic": [p.topic for p, *_ in objects],
         "frame": [p.index for p, *_ in objects],
@@ -194,10 +192,8 @@ def _detection_columns(
         "points": [c.indices.size for c in candidates],
         "indices": lists([c.indices for c in candidates], pa.uint32()),
         "posterior": lists([d.posterior for d in found], pa.float32()),
-        "category": [
-            UNKNOWN if d.novelty > 1 else categories[k] for d, k in zip(found, best, strict=True)
-        ],
-        "confidence": [float(d.posterior[k]) for d, k in zip(found, best, strict=True)],
+        "category": [d.category(categories) for d in found],
+        "confidence": [float(d.posterior.max()) for d in found],
         "novelty": [d.novelty for d in found],
         "reused_from": [d.reused_from for d in found],
         "descriptor": lists([d.descriptor for d in found], pa.float32()),

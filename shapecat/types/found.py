@@ -1,6 +1,6 @@
 """Records of the planes and objects found in one frame, before tracking."""
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 
 from shapecat.arrays import F4, U2, U4, Record, array
 
@@ -154,6 +154,10 @@ class Detection(Record):
     seconds: float
     full: FullBox | None = None
     reused_from: int | None = None
+
+    def category(self, categories: Sequence[str]) -> str:
+        """Return the most probable of the model's categories, or unknown if novelty is above 1."""
+        return UNKNOWN if self.novelty > 1 else categories[int(self.posterior.argmax())]
 
 
 class ImageMasks(Record):

@@ -1,0 +1,134 @@
+"""One depth image or point cloud in memory, perceived without a recording or a run."""
+
+import math
+from collections.abc import Sequence
+from functools import partial
+
+import numpy as np
+from numpy.typing import ArrayLike
+
+from shapecat.arrays import F4
+from shapecat.config import Settings
+from shapecat.errors import ConfigError
+from shapecat.learning import Categorizer
+from shapecat.outputs.opened_run import RunFrame
+from shapecat.perception import perceive
+from shapecat.types import Camera, Detection, Frame, LabelledFrame, LabelledObject, Scene
+
+__all__ = ["frame_of", "perceive_alone"]
+
+_FARTHEST_M = 100.0
+"""A depth image whose median is larger is not in metres."""
+
+
+def frame_of(reading: ArrayLike, intrinsics: Sequence[float] | None = None) -> Frame:
+    """Return a depth image or points as a frame, with stamp 0.
+
+    Parameters
+    ----------
+    reading, intrinsics : as for `shapecat.perceive`.
+
+    Raises
+    ------
+    ConfigError : the shape, the type or a number is wrong, or depth is not in metres.
+    """
+    values = np.asarray(reading)
+    frame = partial(Frame, topic="", index=0, stamp_ns=0, log_time_ns=0, frame_id="")
+    if intrinsics is None:
+        if values.dtype.kind not in "fiu" or values.ndim not in {2, 3} or values.shape[-1] != 3:
+            msg = f"expected points (n, 3), or a depth image with intrinsics, got {values.shape}"
+            raise ConfigError(msg)
+        points = values.reshape(-1, 3).astype(np.float32)
+        points[~np.isfinite(points).all(axis=1)] = np.nan
+        return frame(points=points)
+    if values.dtype.kind not in "fiu" or values.ndim != 2:
+        msg = f"expected a depth image (h, w) of numbers, got {values.dtype} {values.shape}"
+        raise ConfigError(msg)
+    depth = values.astype(np.float32) * (1.0 if values.dtype.kind == "f" else 0.001)
+    depth[~(np.isfinite(depth) & (depth > 0))] = 0
+    if depth.any() and np.median(depth[depth > 0]) > _FARTHEST_M:
+        msg = "expected depth in metres; divide millimetres by 1000, or pass integers"
+        raise ConfigError(msg)
+    return frame(depth=depth, camera=_camera(intrinsics, *depth.shape))
+
+
+def _camera(intrinsics: Sequence[float], height: int, width: int) -> Camera:
+    """Return the camera of an image, whose centre must be in the image."""
+    numbers = [float(value) for value in intrinsics]
+    if len(numbers) == 4 and all(map(math.isfinite, numbers)):
+        fx, fy, cx, cy = numbers
+        if min(fx, fy) > 0 and 0 < cx < width and 0 < cy < height:
+            return Camera(width, height, fx, fy, cx, cy)
+    msg = f"expected fx, fy, cx, cy in pixels of an image {width} x {height}, got {numbers}"
+    raise ConfigError(msg)
+
+
+def perceive_alone(
+    frame: Frame, *, up: Sequence[float] | None, categorizer: Categorizer, settings: Settings
+) -> RunFrame:
+    """Return the objects of one frame with the labels of this view.
+
+    Parameters
+    ----------
+    up : (3,) up direction in the sensor frame; None to estimate it from planes.
+
+    Raises
+    ------
+    ConfigError : ``up`` is not a direction.
+    """
+    seen = perceive(
+        frame,
+        up=None if up is None else _unit(up),
+        categorizer=categorizer,
+        settings=settings,
+    )
+    objects = tuple(
+        _labelled(number, detection, seen.scene, categorizer.categories)
+        for number, detection in enumerate(seen.detections, start=1)
+    )
+    labelled = LabelledFrame(
+        topic=frame.topic,
+        index=frame.index,
+        stamp_ns=frame.stamp_ns,
+        log_time_ns=frame.log_time_ns,
+        frame_id=frame.frame_id,
+        fixed_from_sensor=None,
+        planes=seen.scene.planes,
+        objects=objects,
+        ended=(),
+        seconds=seen.seconds,
+        up=seen.scene.up,
+    )
+    return RunFrame(labelled, frame)
+
+
+def _unit(up: Sequence[float]) -> F4:
+    """Return a direction (3,) as a unit vector."""
+    direction = np.asarray(up, np.float64)
+    length = float(np.linalg.norm(direction))
+    if direction.shape != (3,) or not 0 < length < math.inf:
+        msg = f"expected three numbers as the up direction, not all zero; got {up}"
+        raise ConfigError(msg)
+    return np.asarray(direction / length, np.float32)
+
+
+def _labelled(
+    number: int, detection: Detection, scene: Scene, categories: Sequence[str]
+) -> LabelledObject:
+    """Return a detection as an object with this number, whose label comes from this view."""
+    candidate = detection.candidate
+    return LabelledObject(
+        track=number,
+        category=detection.category(categories),
+        confidence=float(detection.posterior.max()),
+        box=candidate.box,
+        indices=candidate.indices,
+        gas=detection.gas,
+        posterior=detection.posterior,
+        causal=detection.posterior,
+        height_m=math.nan if candidate.plane is None else scene.height_of(candidate),
+        touches_border=candidate.touches_border,
+        occluded=candidate.occluded,
+        detections=(number - 1,),
+        full=detection.full,
+    )
