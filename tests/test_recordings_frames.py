@@ -1,6 +1,7 @@
 """Frames: every layout of a cloud or depth image gives the same, correct coordinates."""
 
 from collections import Counter
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -388,6 +389,29 @@ def test_mismatched_calibration_is_counted(tmp_path: Path) -> None:
     _, skipped, _ = read(write(tmp_path / "a.mcap", items))
 
     assert skipped == {"with depth of 32 x 24 but camera info for 64 x 48 on /depth/camera_info": 1}
+
+
+@pytest.mark.parametrize(
+    ("center", "cropped", "warned"),
+    [((16.0, 12.0), False, True), ((31.2, 31.0), False, True), ((34.0, 21.0), False, False),
+     ((40.0, 12.0), True, False)],
+)  # fmt: skip
+def test_intrinsics_of_another_resolution_are_doubted(
+    tmp_path: Path, center: tuple[float, float], cropped: bool, warned: bool
+) -> None:
+    """Objects would be sheared and of the wrong size; in a crop the centre may lie anywhere."""
+    calibration = info(EPOCH, replace(CAMERA, cx=center[0], cy=center[1]))
+    if cropped:
+        calibration.roi.width, calibration.roi.height = 64, 48
+    items = [
+        ("/depth/camera_info", 0, calibration),
+        ("/depth/image", 1, image(EPOCH, np.full((48, 64), 1000, np.uint16))),
+    ]
+
+    found, _, warnings = read(write(tmp_path / "a.mcap", items))
+
+    assert len(found) == 1
+    assert any("intrinsics of another resolution?" in text for text in warnings) == warned
 
 
 def test_slight_distortion_is_absorbed_and_strong_distortion_gives_true_rays(

@@ -19,6 +19,7 @@ from shapecat.recordings.pinhole import (
     camera_of_info,
     fit_pinhole,
     is_rectified,
+    off_center,
     still_fits,
 )
 from shapecat.recordings.pointcloud2 import cloud_points, organized, unorganized
@@ -197,6 +198,12 @@ class DepthSource(Source):
             # After a count, which may be 1.
             msg = f"with depth of {shape} but camera info for {size} on {self.info_topic}"
             raise MessageError(msg)
+        if off_center(camera) and not self._info.roi.width:
+            self.recording.warn(
+                f"{self.info_topic}: the principal point ({camera.cx:.0f}, {camera.cy:.0f}) is far "
+                f"from the center of images of {camera.width} x {camera.height}: are these the "
+                "intrinsics of another resolution?"
+            )
         if distorted:
             return self.lens.content(self._info, camera, depth)
         return {"depth": depth, "camera": camera}
