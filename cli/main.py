@@ -1,5 +1,6 @@
 """The entry point: the group of commands; it prints a known error as a single line."""
 
+import errno
 import logging
 import os
 import sys
@@ -41,6 +42,15 @@ class _Commands(click.Group):
             how = "finished work is kept; run the same command again to continue" if kept else ""
             click.echo("; ".join(filter(None, ("stopped", how))), err=True)
             ctx.exit(stopped.exit_code)
+
+    def main(self, *args: Any, **extra: Any) -> Any:
+        try:
+            return super().main(*args, **extra)
+        except OSError as error:  # of the output: others name a file, or are ShapecatErrors
+            if error.errno != errno.ENOSPC or error.filename is not None:
+                raise
+            click.echo(f"Error: cannot write the output: {error.strerror}", err=True)
+            sys.exit(1)
 
     def list_commands(self, ctx: click.Context) -> list[str]:  # noqa: ARG002  click's signature
         return list(self.commands)  # in the order of use, not of the alphabet

@@ -400,3 +400,23 @@ def test_the_compile_notice_appears_once(capsys: pytest.CaptureFixture[str], kin
                 progress.progress(name, "compile", 0, None)
 
     assert capsys.readouterr().err.count("compiling kernels") == 1
+
+
+FIXTURE = str(Path(__file__).parents[1] / "fixtures" / "tabletop.mcap")
+
+
+@pytest.mark.skipif(not Path("/dev/full").exists(), reason="needs a device that is always full")
+@pytest.mark.parametrize("words", [("info", FIXTURE), ("--help",)])
+def test_a_full_disk_behind_the_output_is_one_line(words: tuple[str, ...]) -> None:
+    """A script that collects tables got a traceback."""
+    with Path("/dev/full").open("w") as full:
+        done = subprocess.run(
+            [sys.executable, "-m", "shapecat", *words],
+            stdout=full,
+            stderr=subprocess.PIPE,
+            text=True,
+            check=False,
+        )
+
+    assert done.returncode == 1
+    assert done.stderr == "Error: cannot write the output: No space left on device\n"

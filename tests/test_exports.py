@@ -396,7 +396,7 @@ def test_a_recording_that_is_gone_or_changed_is_refused(run: Path, tmp_path: Pat
     copy.write_bytes(changed)
     with pytest.raises(OutputError, match="has changed"):
         export_run(folder, "crops", tmp_path / "crops")
-    assert not (tmp_path / "crops").exists() or not any((tmp_path / "crops").iterdir())
+    assert not (tmp_path / "crops").exists()
 
 
 def test_the_command_names_what_it_wrote(shapecat: Run, run: Path, tmp_path: Path) -> None:

@@ -7,6 +7,7 @@ pose of the sensor.
 import glob
 import shutil
 from collections.abc import Iterable
+from contextlib import suppress
 from pathlib import Path
 
 from shapecat.errors import OutputError
@@ -34,7 +35,7 @@ def write_crops(
     prefix = f"{safe_name(finished.name)}.{finished.run['input']['digest'].rpartition(':')[2][:8]}"
     hidden = out / f".{prefix}.partial"
     several = len(finished.run["options"]["topics"]) > 1
-    count = 0
+    count, new = 0, not out.exists()
     try:
         shutil.rmtree(hidden, ignore_errors=True)
         for labelled, frame in frames:
@@ -54,6 +55,9 @@ def write_crops(
         raise OutputError(msg) from error
     finally:
         shutil.rmtree(hidden, ignore_errors=True)
+        if new:
+            with suppress(OSError):  # not empty, unless writing has failed
+                out.rmdir()
     return count
 
 
