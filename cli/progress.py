@@ -66,6 +66,7 @@ class Progress:
         self.running: dict[str, tuple[str, int, int | None]] = {}
         self.complete = self.failed = 0
         self._told = False
+        self._first: tuple[float, float] | None = None  # time and bytes of the first progress
 
     def __enter__(self) -> Self:
         return self
@@ -86,6 +87,8 @@ class Progress:
                 return
             if folder in self.tasks:
                 self.running[folder] = (phase, done, total)
+                if self._first is None:
+                    self._first = time.monotonic(), self._bytes_done()
                 self.show(folder)
 
     def ended(self, outcome: Any) -> None:
@@ -103,13 +106,17 @@ class Progress:
             self.show_ended(outcome)
 
     def remaining_s(self) -> float | None:
-        """Return the estimated seconds left, from the bytes done so far; None before the first."""
+        """Return the estimated seconds left, from the bytes done so far; None before the first.
+
+        Loading and compiling, before the first frame, do not count.
+        """
+        begun, before = self._first or (self.begun, 0.0)
+        now, done = time.monotonic(), self._bytes_done()
+        return (now - begun) * (self.todo - done) / (done - before) if done > before else None
+
+    def _bytes_done(self) -> float:
         running = (self.tasks[name].bytes * _share(*state) for name, state in self.running.items())
-        done: float = self.read + sum(running)
-        if not done:
-            return None
-        elapsed = time.monotonic() - self.begun
-        return elapsed * (self.todo - done) / done
+        return self.read + sum(running)
 
     def note(self, text: str) -> None:
         """Show a line."""

@@ -53,21 +53,26 @@ def test_time_left_is_that_of_the_bytes_that_are_left(monkeypatch: pytest.Monkey
 
 
 def test_time_left_falls_while_a_recording_is_processed(monkeypatch: pytest.MonkeyPatch) -> None:
-    """With finished recordings alone, it would grow until the next one is finished."""
+    """With finished recordings alone, it would grow until the next one is finished.
+
+    Compiling, a minute before a recording of seconds, made it eight minutes.
+    """
     now = 0.0
     monkeypatch.setattr("shapecat.cli.progress.time.monotonic", lambda: now)
     progress = PROGRESS.Progress([task("a", size=100), task("b", size=300)])
-    now = 6.0
-    progress.progress("b", "perceive", 1, None)
+    now = 90.0
+    progress.progress("b", "compile", 0, None)
+    progress.progress("b", "perceive", 1, 7)  # a tenth of the work, 30 bytes
     assert progress.remaining_s() is None
-    progress.progress("b", "perceive", 2, 7)  # a fifth of the work, 60 bytes
-    assert progress.remaining_s() == pytest.approx(6 * 340 / 60)
-    now = 8.0
+    now = 96.0
+    progress.progress("b", "perceive", 2, 7)  # 60 bytes
+    assert progress.remaining_s() == pytest.approx(6 * 340 / 30)
+    now = 98.0
     progress.ended(ended("a", processed=True))
-    assert progress.remaining_s() == pytest.approx(8 * 240 / 160)
-    now = 10.0
+    assert progress.remaining_s() == pytest.approx(8 * 240 / 130)
+    now = 100.0
     progress.progress("b", "review", 5, 10)  # 85 %, 255 bytes
-    assert progress.remaining_s() == pytest.approx(10 * 45 / 355)
+    assert progress.remaining_s() == pytest.approx(10 * 45 / 325)
     progress.ended(ended("b", processed=True))
     assert progress.remaining_s() == 0
 
@@ -292,8 +297,8 @@ def test_lines_tell_what_is_done_running_and_left(
 
     done, busy = "1/3 recordings, 1 failed, about", "c: writing annotated.mcap 2"
     assert capsys.readouterr().err.splitlines() == [
-        f"{done} 0:30 left; {busy}",
-        f"{done} 0:10 left; b: finding and categorizing objects 40/61, {busy}",
+        f"{done} 0:17 left; {busy}",  # 5.1 s * 300 / 92.2 bytes
+        f"{done} 0:07 left; b: finding and categorizing objects 40/61, {busy}",
     ]
 
 
