@@ -116,7 +116,7 @@ class Progress:
 
     def _bytes_done(self) -> float:
         running = (self.tasks[name].bytes * _share(*state) for name, state in self.running.items())
-        return self.read + sum(running)
+        return float(self.read + sum(running))
 
     def note(self, text: str) -> None:
         """Show a line."""
