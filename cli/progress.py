@@ -14,7 +14,7 @@ import click
 
 from shapecat.outputs.counts import plural
 
-from .render import COMPILING, PHASES
+from .render import COMPILING, PHASES, rich_progress
 
 _LINE_S = 5.0
 _EVENT_S = 0.5
@@ -240,18 +240,9 @@ class LiveProgress(Progress):
 
     def __init__(self, tasks: Sequence[Any]) -> None:
         """Prepare the bars."""
-        from rich import progress as rich
-        from rich.console import Console
-
         super().__init__(tasks)
         self._bars: dict[str, Any] = {}
-        self._rich = rich.Progress(
-            rich.TextColumn("{task.description}"),
-            rich.BarColumn(),
-            rich.MofNCompleteColumn(),
-            rich.TimeRemainingColumn(),
-            console=Console(stderr=True),
-        )
+        self._rich = rich_progress()
         self._stack = ExitStack()
         self._whole = (
             self._rich.add_task("recordings", total=len(tasks)) if len(tasks) > 1 else None

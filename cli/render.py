@@ -46,27 +46,27 @@ class Bars:
             self._tasks[phase] = self._progress.add_task(name, total=total)
         self._progress.update(self._tasks[phase], completed=done, total=total)
 
-    def restart(self) -> None:
-        """Remove the bars before the next recording."""
-        for task in self._tasks.values():
-            self._progress.remove_task(task)
-        self._tasks.clear()
 
-
-@contextmanager
-def progress_bars() -> Iterator[Bars]:
-    """Show progress bars on stderr while the block runs."""
+def rich_progress() -> Any:
+    """Return progress bars for stderr, not yet started."""
     from rich import progress as rich
     from rich.console import Console
 
-    console = Console(stderr=True)
     columns = (
         rich.TextColumn("{task.description}"),
         rich.BarColumn(),
         rich.MofNCompleteColumn(),
         rich.TimeRemainingColumn(),
     )
-    with rich.Progress(*columns, console=console, disable=not console.is_terminal) as progress:
+    return rich.Progress(*columns, console=Console(stderr=True))
+
+
+@contextmanager
+def progress_bars() -> Iterator[Bars]:
+    """Show progress bars on stderr, if it is a terminal, while the block runs."""
+    progress = rich_progress()
+    progress.disable = not progress.console.is_terminal
+    with progress:
         yield Bars(progress)
 
 

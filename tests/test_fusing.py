@@ -13,9 +13,9 @@ from hypothesis import strategies as st
 from shapecat.arrays import F4
 from shapecat.config import Settings, with_overrides
 from shapecat.depth_fusion import Earlier, RecentFrames, fuse
-from shapecat.depth_fusion.fusion import AGREE, REACH
+from shapecat.depth_fusion.fusion import REACH
 from shapecat.errors import ConfigError
-from shapecat.geometry import IDENTITY
+from shapecat.geometry import AGREE, IDENTITY
 from shapecat.perception import perceive
 from shapecat.pipeline import process
 from shapecat.runs.folder import read_run

@@ -13,7 +13,7 @@ from rosbags.typesys import Stores, get_types_from_msg, get_typestore
 from scipy.spatial.transform import Rotation
 
 from shapecat.outputs.annotated_mcap import write_annotated
-from shapecat.outputs.scene_protobuf import descriptors_of, encode_foxglove
+from shapecat.outputs.foxglove_encoders import descriptors_of, encode_foxglove
 from shapecat.recordings import choose_streams, frames, open_recording, read_transforms
 from shapecat.recordings.decoding import LIBRARY_ERRORS
 from shapecat.recordings.protobuf import message_decoder

@@ -13,15 +13,12 @@ import numpy as np
 
 from shapecat.arrays import F4
 from shapecat.depth_fusion.recent import Earlier
-from shapecat.geometry import DISCONTINUITY, IDENTITY, NEAREST_M
+from shapecat.geometry import AGREE, DISCONTINUITY, IDENTITY, NEAREST_M
 from shapecat.jit import kernel
 from shapecat.types import Camera, Frame, Pose, Scene
 
 __all__ = ["fuse", "with_own_readings"]
 
-AGREE = 0.006
-"""Largest difference in inverse depth between two readings of one point, 1/m: two steps of a Kinect
-and twice its noise; 6 mm at 1 m, 24 mm at 2 m. A larger value would smear low objects that move."""
 LEAST_SHARE = 0.9
 """Minimum fraction of the compared readings that differ by less than a `DISCONTINUITY`; below it,
 the pose of the earlier image is considered wrong."""
@@ -36,8 +33,9 @@ def fuse(frame: Frame, earlier: Sequence[Earlier], *, range_m: float) -> Frame:
     """Average the readings of a depth image with those of earlier ones, and fill its holes.
 
     1. An earlier image counts if most of its readings agree with the current ones.
-    2. A reading becomes the mean of itself and the earlier readings that agree with it (`AGREE`).
-       Where they disagree, something has moved or was hidden, and the current reading stays.
+    2. A reading becomes the mean of itself and the earlier readings that agree with it (`AGREE`; a
+       larger limit would smear low objects that move). Where they disagree, something has moved or
+       was hidden, and the current reading stays.
     3. A hole gets the mean of the earlier readings that continue a surface beside it in the current
        image. Readings of an object that has since moved away are not used.
 

@@ -1,14 +1,11 @@
 """Annotation channels for each message encoding."""
 
-import json
 from collections.abc import Callable, Sequence
 from functools import partial
-from importlib.resources import files
 from typing import Any
 
 from shapecat.outputs.annotation import (
     Annotation,
-    AnnotationChannel,
     Encoders,
     entity_id,
     properties,
@@ -16,8 +13,8 @@ from shapecat.outputs.annotation import (
     text_position,
 )
 from shapecat.outputs.colours import colour_of
+from shapecat.outputs.foxglove_encoders import json_encoder, protobuf_encoder
 from shapecat.outputs.ros_annotations import RosMessages
-from shapecat.outputs.scene_protobuf import descriptors_of, encode_foxglove
 from shapecat.types import ShownBox, ShownFrame
 
 __all__ = ["ENCODERS", "encoder_for"]
@@ -32,7 +29,7 @@ def encoder_for(encoding: str, *, markers: bool) -> Encoders[Annotation]:
 
     An unknown encoding is replaced by JSON. ``markers`` adds a channel for RViz, for ROS only.
     """
-    found = ENCODERS.get(encoding, _json)()
+    found = ENCODERS.get(encoding, ENCODERS["json"])()
     return [(channel, encode) for channel, encode in found if markers or channel.topic != MARKERS]
 
 
@@ -43,32 +40,6 @@ def _ros(*, ros1: bool) -> Encoders[Annotation]:
         ros.encoder(SCENE, "foxglove_msgs/msg/SceneUpdate", ros.scene),
         ros.encoder(MARKERS, "visualization_msgs/msg/MarkerArray", ros.markers),
     ]
-
-
-def _json() -> Encoders[Annotation]:
-    schema = files("shapecat.schemas").joinpath("SceneUpdate.json").read_bytes()
-    channel = AnnotationChannel(SCENE, "json", "foxglove.SceneUpdate", "jsonschema", schema)
-    return [(channel, lambda one: json.dumps(_plain_scene(one, _JSON)).encode())]
-
-
-def _protobuf() -> Encoders[Annotation]:
-    name = "foxglove.SceneUpdate"
-    channel = AnnotationChannel(SCENE, "protobuf", name, "protobuf", descriptors_of(name))
-    return [(channel, lambda one: encode_foxglove(_plain_scene(one, _PROTOBUF), name))]
-
-
-ENCODERS: dict[str, Callable[[], Encoders[Annotation]]] = {
-    "cdr": partial(_ros, ros1=False),
-    "ros1": partial(_ros, ros1=True),
-    "json": _json,
-    "protobuf": _protobuf,
-}
-"""Annotation channels by the encoding of the source: files with mixed encodings break ROS tools."""
-
-
-_JSON = ("sec", "nsec")
-_PROTOBUF = ("seconds", "nanos")
-"""Names of the two fields of a time."""
 
 
 def _plain_scene(annotation: Annotation, parts: tuple[str, str]) -> dict[str, Any]:
@@ -131,3 +102,13 @@ def _plain_entity(box: ShownBox, frame: ShownFrame, time: Any, lifetime: Any) ->
 
 def _plain(names: str, values: Sequence[float]) -> dict[str, float]:
     return dict(zip(names, values, strict=True))
+
+
+_SCENE = (SCENE, "foxglove.SceneUpdate", _plain_scene)
+ENCODERS: dict[str, Callable[[], Encoders[Annotation]]] = {
+    "cdr": partial(_ros, ros1=False),
+    "ros1": partial(_ros, ros1=True),
+    "json": partial(json_encoder, *_SCENE),
+    "protobuf": partial(protobuf_encoder, *_SCENE),
+}
+"""Annotation channels by the encoding of the source: files with mixed encodings break ROS tools."""

@@ -1,17 +1,15 @@
 """Annotations of colour images, for each message encoding."""
 
-import json
 from collections.abc import Callable, Iterator, Mapping
 from functools import partial
-from importlib.resources import files
 from pathlib import Path
 from typing import Any, NamedTuple
 
 from shapecat.colour.image_masks import box_of
-from shapecat.outputs.annotation import AnnotationChannel, Encoders
+from shapecat.outputs.annotation import Encoders
 from shapecat.outputs.colours import colour_of
+from shapecat.outputs.foxglove_encoders import json_encoder, protobuf_encoder
 from shapecat.outputs.ros_annotations import RosMessages
-from shapecat.outputs.scene_protobuf import descriptors_of, encode_foxglove
 from shapecat.outputs.wording import caption
 from shapecat.runs.label_meaning import TrackLabel
 from shapecat.runs.masks import read_masks
@@ -21,7 +19,6 @@ __all__ = ["ImageBox", "ImageFrame", "image_encoder_for", "read_image_frames"]
 
 DETECTIONS_2D = "/shapecat/detections_2d"
 DRAWN = "/shapecat/image_annotations"
-_NAME = "foxglove.ImageAnnotations"
 _LINE_LOOP = 2
 
 
@@ -84,7 +81,7 @@ def image_encoder_for(encoding: str) -> Encoders[ImageFrame]:
 
     An unknown encoding is replaced by JSON.
     """
-    return _ENCODERS.get(encoding, _json)()
+    return _ENCODERS.get(encoding, _ENCODERS["json"])()
 
 
 def _ros(*, ros1: bool) -> Encoders[ImageFrame]:
@@ -93,25 +90,6 @@ def _ros(*, ros1: bool) -> Encoders[ImageFrame]:
         ros.encoder(DETECTIONS_2D, "vision_msgs/msg/Detection2DArray", partial(_detections, ros)),
         ros.encoder(DRAWN, "foxglove_msgs/msg/ImageAnnotations", partial(_drawn, ros)),
     ]
-
-
-def _json() -> Encoders[ImageFrame]:
-    schema = files("shapecat.schemas").joinpath("ImageAnnotations.json").read_bytes()
-    channel = AnnotationChannel(DRAWN, "json", _NAME, "jsonschema", schema)
-    return [(channel, lambda frame: json.dumps(_plain(frame, ("sec", "nsec"))).encode())]
-
-
-def _protobuf() -> Encoders[ImageFrame]:
-    channel = AnnotationChannel(DRAWN, "protobuf", _NAME, "protobuf", descriptors_of(_NAME))
-    return [(channel, lambda frame: encode_foxglove(_plain(frame, ("seconds", "nanos")), _NAME))]
-
-
-_ENCODERS: dict[str, Callable[[], Encoders[ImageFrame]]] = {
-    "cdr": partial(_ros, ros1=False),
-    "ros1": partial(_ros, ros1=True),
-    "json": _json,
-    "protobuf": _protobuf,
-}
 
 
 def _font_size(box: ImageBox) -> float:
@@ -177,3 +155,12 @@ def _drawn(ros: RosMessages, frame: ImageFrame) -> Any:
         written = (corners[0], box.text, _font_size(box), white, behind)
         texts.append(ros.make("TextAnnotation", time, *written))
     return ros.make("ImageAnnotations", [], points, texts)
+
+
+_IMAGES = (DRAWN, "foxglove.ImageAnnotations", _plain)
+_ENCODERS: dict[str, Callable[[], Encoders[ImageFrame]]] = {
+    "cdr": partial(_ros, ros1=False),
+    "ros1": partial(_ros, ros1=True),
+    "json": partial(json_encoder, *_IMAGES),
+    "protobuf": partial(protobuf_encoder, *_IMAGES),
+}

@@ -3,15 +3,12 @@
 import numpy as np
 
 from shapecat.arrays import F4, F8, U4
-from shapecat.geometry import NEAREST_M
+from shapecat.geometry import AGREE, NEAREST_M
 from shapecat.jit import kernel
 from shapecat.types import Camera, Pose
 
-__all__ = ["AGREE", "agreement"]
+__all__ = ["agreement"]
 
-AGREE = 0.006
-"""Largest difference in inverse depth between two readings of one point, 1/m: two steps of a
-Kinect and twice its noise; 6 mm at 1 m, 24 mm at 2 m."""
 _SAMPLES = 256
 """Approximate number of points to compare."""
 _KNOWN = 0.5

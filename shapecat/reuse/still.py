@@ -3,9 +3,8 @@
 import numpy as np
 
 from shapecat.arrays import F4, Bool
-from shapecat.geometry import compose, inverse
+from shapecat.geometry import AGREE, compose, inverse
 from shapecat.jit import kernel
-from shapecat.reuse.agreement import AGREE
 from shapecat.types import Frame, Pose
 
 __all__ = ["shows_the_same"]
