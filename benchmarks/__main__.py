@@ -1,4 +1,4 @@
-"""Measure the stages, print Markdown tables, write ``build/benchmarks.json`` and a plot."""
+"""Measure the stages, print Markdown tables and write ``build/benchmarks.json``."""
 
 import os
 
@@ -9,7 +9,7 @@ from collections.abc import Callable  # noqa: E402  the environment comes first
 from pathlib import Path  # noqa: E402
 from typing import Any  # noqa: E402
 
-from benchmarks import ablation, density, detection, fusing, neural_gas, stages  # noqa: E402
+from benchmarks import ablation, detection, stages  # noqa: E402
 from benchmarks.measure import machine, save  # noqa: E402
 
 
@@ -19,11 +19,8 @@ def main() -> None:
     results = {}
     works: dict[str, Callable[[], tuple[str, dict[str, Any]]]] = {
         "detection": lambda: detection.run(15),
-        "density": lambda: density.run(5, Path("build/density.png")),
         "ablation": lambda: ablation.run(30),
-        "fusing": lambda: fusing.run(15),
         "stages": lambda: stages.run(8),
-        "neural gas": lambda: neural_gas.run(3),
     }
     for name, work in works.items():
         table, figures = work()

@@ -19,11 +19,8 @@ SEEN_PIXELS = 250
 
 
 def simulated_clutter(count: int, first_seed: int = 500) -> Iterator[Frame]:
-    """Yield a Kinect frame of each of ``count`` cluttered tables."""
-    for seed in range(first_seed, first_seed + count):
-        rng = np.random.default_rng(seed)
-        world = make_scene("clutter", rng, frames=1)
-        yield render_frame(world, 0, rng=rng, sensor=KINECT)[0]
+    """Return a Kinect frame of each of ``count`` cluttered tables."""
+    return (frame for frame, _, _ in labelled_clutter(count, first_seed))
 
 
 def real_tables(every: int = 1) -> Iterator[Frame]:
