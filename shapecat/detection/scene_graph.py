@@ -110,28 +110,23 @@ def _covers(plane: Plane, point: F8) -> bool:
     return len(outline) > 2 and bool((turns >= 0).all() or (turns <= 0).all())
 
 
-def format_tree(scene: Scene, describe: Callable[[Scene, Node], str] | None = None) -> str:
+def format_tree(scene: Scene, describe: Callable[[Node], str]) -> str:
     """Return the hierarchy as indented text, one node per line.
 
     A node with several parents is printed under each, marked ``=`` after the first time.
 
-    Parameters
-    ----------
-    describe : returns the text for a node; by default its kind, index and size.
-
     Examples
     --------
-    >>> format_tree(Scene([0, -1, 0], (), ()))
+    >>> format_tree(Scene([0, -1, 0], (), ()), str)
     'no plane, no object'
     """
     hierarchy = Hierarchy(scene)
     lines: list[str] = []
     printed: set[Node] = set()
-    describe = describe or _described
 
     def add(node: Node, depth: int) -> None:
         again = "= " if node in printed else ""
-        lines.append("  " * depth + again + describe(scene, node))
+        lines.append("  " * depth + again + describe(node))
         if node not in printed:
             printed.add(node)
             for child in hierarchy.children(node):
@@ -140,20 +135,3 @@ def format_tree(scene: Scene, describe: Callable[[Scene, Node], str] | None = No
     for root in hierarchy.roots:
         add(root, 0)
     return "\n".join(lines) or "no plane, no object"
-
-
-def _described(scene: Scene, node: Node) -> str:
-    if node.kind == "plane":
-        plane = scene.planes[node.index]
-        return f"plane {node.index}: {plane.height_m:.2f} m high, {plane.area_m2:.2f} m2"
-    candidate = scene.candidates[node.index]
-    x, y, z = candidate.box.size
-    flags = [
-        text
-        for text, flag in (("cut", candidate.touches_border), ("occluded", candidate.occluded))
-        if flag
-    ]
-    note = f" ({', '.join(flags)})" if flags else ""
-    return (
-        f"object {node.index}: {x:.2f} x {y:.2f} x {z:.2f} m, {len(candidate.indices)} points{note}"
-    )

@@ -6,7 +6,6 @@ are thin adapters for libraries in the extras ``cluster`` and ``ray``.
 
 from collections.abc import Callable
 from concurrent.futures import Executor
-from typing import Literal, get_args
 
 from shapecat.errors import ConfigError
 from shapecat.executors.cores import share_cores, single_threaded, usable_cores
@@ -15,7 +14,6 @@ from shapecat.executors.mailbox import Mailbox, post
 from shapecat.executors.worker import WorkerLostError
 
 __all__ = [
-    "EXECUTORS",
     "LocalExecutor",
     "Mailbox",
     "WorkerLostError",
@@ -27,9 +25,6 @@ __all__ = [
     "single_threaded",
     "usable_cores",
 ]
-
-Name = Literal["local", "dask", "ray"]
-EXECUTORS: tuple[str, ...] = get_args(Name)
 
 _LOST = {
     *("WorkerLostError", "BrokenProcessPool"),

@@ -31,9 +31,8 @@ def describe_scene(folder: Path, frame: int, *, topic: str | None = None) -> str
     finished = read_finished(folder)
     topic = _topic(folder, frame, topic)
     objects = _objects(finished, topic, frame)
-    return format_tree(
-        read_scene(folder, topic, frame), lambda scene, node: _described(scene, node, objects)
-    )
+    scene = read_scene(folder, topic, frame)
+    return format_tree(scene, lambda node: _described(scene, node, objects))
 
 
 def read_scene(folder: Path, topic: str, frame: int) -> Scene:

@@ -9,9 +9,7 @@ __all__ = [
     "Options",
     "OriginInfo",
     "RunInfo",
-    "Window",
     "is_run_info",
-    "window_of",
 ]
 
 
@@ -24,20 +22,15 @@ class InputInfo(TypedDict):
     files: list[list[Any]]
 
 
-class Window(TypedDict):
-    """The part of a recording that is read: see `shapecat.recordings.frames`."""
-
-    start_s: float | None
-    end_s: float | None
-    every: int
-
-
-class Options(Window):
+class Options(TypedDict):
     """The options of `shapecat process` that affect the results."""
 
     topics: list[str]
     up: str
     fixed_frame: str | None
+    start_s: float | None
+    end_s: float | None
+    every: int
     color: NotRequired[str | None]
     mcap: bool
     rrd: bool
@@ -114,8 +107,3 @@ def is_run_info(content: Any) -> TypeGuard[RunInfo]:
         and isinstance(content["model"]["categories"], list)
         and all(isinstance(name, str) for name in content["model"]["categories"])
     )
-
-
-def window_of(options: Options) -> Window:
-    """Return the part of a recording that options select."""
-    return {"start_s": options["start_s"], "end_s": options["end_s"], "every": options["every"]}

@@ -15,13 +15,7 @@ import pyarrow as pa
 from shapecat.arrays import F4, F8, I4, Bool
 from shapecat.runs.tables import Key, frame_rows, numbers, numbers_or_nan, rows_of, topic_codes
 
-__all__ = ["COLUMNS", "Revision", "frames_to_revise"]
-
-COLUMNS = {
-    "frames": ("topic", "frame", "stamp_ns", "up", "up_given", "fixed_rotation"),
-    "planes": ("topic", "frame", "offset"),
-}
-"""Columns that are read from each table."""
+__all__ = ["Revision", "frames_to_revise"]
 
 _OFF_DEG = 10.0
 """A frame is revised if its up direction differs by more from the recording's."""
@@ -79,7 +73,7 @@ def frames_to_revise(tables: Iterable[tuple[pa.Table, pa.Table]]) -> dict[Key, R
 
     Parameters
     ----------
-    tables : pairs of frames and planes tables with `COLUMNS`, segment by segment.
+    tables : pairs of frames and planes tables, segment by segment.
 
     Returns
     -------

@@ -8,7 +8,7 @@ from shapecat.recordings import Recording, choose_streams
 from shapecat.recordings.colour_frames import frames_with_colour
 from shapecat.recordings.colour_streams import pair_colours
 from shapecat.recordings.messages import Needed
-from shapecat.runs.run_info import Options, window_of
+from shapecat.runs.run_info import Options
 from shapecat.types import Frame
 
 __all__ = ["count_frames", "read_frames"]
@@ -29,8 +29,16 @@ def read_frames(
     """
     streams = choose_streams(recording, options["topics"])
     colours = pair_colours(recording, streams, options.get("color"))
-    window = window_of(options)
-    return frames_with_colour(recording, streams, colours, skipped=skipped, needed=needed, **window)
+    return frames_with_colour(
+        recording,
+        streams,
+        colours,
+        start_s=options["start_s"],
+        end_s=options["end_s"],
+        every=options["every"],
+        skipped=skipped,
+        needed=needed,
+    )
 
 
 def count_frames(recording: Recording, options: Options) -> int | None:
