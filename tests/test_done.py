@@ -733,17 +733,25 @@ def test_a_new_recording_does_not_get_the_folder_of_an_older_one() -> None:
     assert folders == ["a_x_1", "a_x", "b_x"]
 
 
+@pytest.mark.parametrize("way", ["whole", "relative", "link"])
 def test_a_run_keeps_its_folder_when_a_recording_of_its_name_is_added(
-    tmp_path: Path,
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, way: str
 ) -> None:
-    """Otherwise it is processed again without its labels, and counted twice in each export."""
+    """Otherwise it is processed again without its labels, and counted twice in each export.
+
+    However the recording is named this time: run.json has its whole path, without links.
+    """
     for day in ("monday", "tuesday"):
         (tmp_path / day).mkdir()
         (tmp_path / day / "lab.mcap").write_bytes(day.encode())
     out = str(tmp_path / "out")
-    days = [str(tmp_path / day / "lab.mcap") for day in ("tuesday", "monday")]
+    path = str((tmp_path / "monday" / "lab.mcap").resolve())
     (tmp_path / "out" / "lab").mkdir(parents=True)
-    write_run(tmp_path / "out" / "lab", run_info(input={"path": days[1]}))
+    write_run(tmp_path / "out" / "lab", run_info(input={"path": path}))
+    (tmp_path / "linked").symlink_to(tmp_path)
+    monkeypatch.chdir(tmp_path)
+    place = {"whole": tmp_path, "relative": Path(), "link": tmp_path / "linked"}[way]
+    days = [str(place / day / "lab.mcap") for day in ("tuesday", "monday")]
 
     with plan_batch(Job(Path(), Path()), days, out) as batch:
         assert [task.name for task in batch.tasks] == ["tuesday_lab", "lab"]

@@ -56,6 +56,7 @@ def test_other_settings_of_tracking_give_the_tables_of_a_new_run(
 ) -> None:
     """Trying another gate cost the hour of perceiving; a table left out would cost results."""
     before = read_run(job.folder)
+    write_run(job.folder, {**before, "warnings": ["frames 2 and 3 are tilted"]})
     job = replace(job, settings=changed("tracking.gate_m=0.001", "outputs.boxes=visible"))
     tracked = table(job.folder, "tracks")
 
@@ -71,8 +72,9 @@ def test_other_settings_of_tracking_give_the_tables_of_a_new_run(
     new = read_run(tmp_path / "new")
     assert new["counts"] | {"resumed": 4} == run["counts"]
     assert run["id"] != before["id"]
-    for name in ("work", "input", "settings", "options", "fixed_frame", "up", "warnings", "color"):
+    for name in ("work", "input", "settings", "options", "fixed_frame", "up", "color"):
         assert run[name] == new[name], name  # type: ignore[literal-required]  # one of its keys
+    assert run["warnings"] == ["frames 2 and 3 are tilted", *new["warnings"]]
 
 
 @pytest.mark.usefixtures("perceiving_fails")
@@ -144,3 +146,19 @@ def test_the_replaced_run_stays_whole_if_the_new_one_fails(
     with pytest.raises(OutputError, match="full disk"):
         pipeline.process(replace(job, settings=changed("tracking.gate_m=0.1")))
     assert all(table(job.folder, name).equals(before[name]) for name in TABLES)
+
+
+@pytest.mark.usefixtures("perceiving_fails")
+def test_an_output_that_was_removed_is_written_again(job: Job) -> None:
+    """The run would count as complete without the recording that people open."""
+    mcap, tracks = job.folder / "annotated.mcap", job.folder / "tracks.csv"
+    mcap.unlink(missing_ok=True)
+    known = tracks.stat().st_mtime_ns
+    run = read_run(job.folder)
+    run["seconds"] |= {"annotated.mcap": 1.5, "review.rrd": 1.5}
+    write_run(job.folder, run)
+
+    pipeline.process(replace(job, overwrite=False, rrd=False))
+
+    assert mcap.read_bytes().endswith(b"\x89MCAP0\r\n")
+    assert tracks.stat().st_mtime_ns == known

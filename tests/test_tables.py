@@ -99,9 +99,10 @@ def test_pixel_indices_are_stored_as_differences(tmp_path: Path) -> None:
     assert "DELTA_BINARY_PACKED" in indices.encodings
 
 
-def test_row_groups_cover_the_same_frames(tmp_path: Path) -> None:
-    """They are read side by side; a frame without planes or detections must not shift them."""
-    counts = [k % 3 for k in range(150)]
+@pytest.mark.parametrize("empty", [0, 40, 150])
+def test_row_groups_cover_the_same_frames(tmp_path: Path, empty: int) -> None:
+    """They are read side by side; frames without detections must not shift them."""
+    counts = [0 if k < empty else k % 3 for k in range(150)]
     write_run_tables(tmp_path, counts)
     names = ("frames", "detections", "planes")
     groups = [list(read_row_groups(tmp_path / f"{name}.parquet")) for name in names]
@@ -111,6 +112,7 @@ def test_row_groups_cover_the_same_frames(tmp_path: Path) -> None:
         known = set(frames["frame"].to_pylist())
         assert set(detections["frame"].to_pylist()) <= known
         assert set(planes["frame"].to_pylist()) <= known
+    assert sum(detections.num_rows for detections in groups[1]) == sum(counts)
 
 
 def test_frames_are_stored_when_many_or_old(
