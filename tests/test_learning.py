@@ -278,7 +278,7 @@ def test_unused_blocks_have_no_influence() -> None:
 
 def test_baselines_learn() -> None:
     train, test = blobs(60, 1), blobs(40, 2)
-    for name, make in make_baselines(tuple(BLOCKS.values()), seed=0).items():
+    for name, make in make_baselines(tuple(BLOCKS.values())).items():
         fitted = make().fit(train.descriptors, train.labels)
         predicted = fitted.classes_[fitted.predict_proba(test.descriptors).argmax(axis=1)]
         assert np.mean(predicted == test.labels) > 0.9, name

@@ -102,8 +102,22 @@ def test_worlds_do_not_depend_on_the_number_of_jobs(tables: tuple[Simulated, Sim
     alone, shared = tables
     for name in ("manner", "source", "visible", "overlap"):
         assert np.array_equal(getattr(alone, name), getattr(shared, name))
-    for name in ("descriptors", "labels", "instances", "points", "distances", "functions"):
+    for name in ("descriptors", "labels", "instances", "points", "distances"):
         assert np.array_equal(getattr(alone.views, name), getattr(shared.views, name))
+
+
+def test_training_tables_hold_what_they_are_asked_for() -> None:
+    """Shares that do not arrive leave the model as it was."""
+    world = ArrangementOptions(
+        7, ("pan",), unknown=0.0, lying=0.9, leaning=0.5, cameras=1, keep=True
+    )
+    views = [view for k in range(4) for view in simulate_world(world, k)]
+    manners = [view.manner for view in views if view.label in {"cup", "can", "bottle"}]
+
+    assert {"lying", "leaning"} <= set(manners)
+    assert manners.count("upright") < len(manners) / 3
+    assert all(view.view is not None and len(view.view.points) == view.points for view in views)
+    assert all(0.5 <= view.overlap <= 1 for view in views)
 
 
 def test_two_trainings_give_the_same_file(

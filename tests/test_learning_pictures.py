@@ -28,8 +28,7 @@ def seen(label: str, instance: str, cup: float, novelty: float) -> WorldView:
     view = View(points, np.array([0.5, 0.0, 0.5]), label, instance)
     descriptor = np.array([cup, novelty], np.float32)
     return WorldView(
-        descriptor, label, instance, 200, 0.7, 0.0, "upright", "truth", 1.0, 1.0, "kinect",
-        np.zeros(3, np.float32), view,
+        descriptor, label, instance, 200, 0.7, 0.0, "upright", "truth", 1.0, 1.0, "kinect", view,
     )  # fmt: skip
 
 

@@ -1,6 +1,7 @@
 """Comparison of shapecat's classifier with baselines on the same views."""
 
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterator
+from operator import attrgetter
 from pathlib import Path
 from typing import Any
 
@@ -31,9 +32,6 @@ def compare_learners(
     *,
     categories: tuple[str, ...],
     root: Path,
-    blocks: Sequence[str] = tuple(BLOCKS),
-    seed: int = 0,
-    jobs: int | None = None,
     observe: Observer = ignore,
 ) -> tuple[Compared, ...]:
     """Train shapecat's classifier and the baselines on the same views, and test all on ``test``.
@@ -44,8 +42,6 @@ def compare_learners(
     train : training views. If None, use ``test`` in five-fold cross-validation by instance.
     categories : order of the posteriors; a category without training views counts as missed.
     root : folder of the data set, which error messages name.
-    blocks : names of the descriptor's blocks to use.
-    jobs : number of trees grown at the same time.
 
     Returns
     -------
@@ -57,11 +53,11 @@ def compare_learners(
     RecordingError : there are fewer than two categories, or, for cross-validation, a category with
         only one instance.
     """
-    splits = list(_folds(test, seed)) if train is None else [(train, test)]
+    splits = list(_folds(test)) if train is None else [(train, test)]
     if not splits or any(len(_known(part.labels)) < 2 for part, _ in splits):
         msg = f"{root}: training needs at least two categories with at least two objects each"
         raise RecordingError(msg)
-    learners = _learners(tuple(blocks), seed, jobs)
+    learners = _learners()
     rows = []
     for k, (name, learner) in enumerate(learners.items(), start=1):
         truth, posteriors = _judged(learner, splits, categories)
@@ -70,7 +66,7 @@ def compare_learners(
     return tuple(rows)
 
 
-def _folds(views: DescribedViews, seed: int) -> Iterator[tuple[DescribedViews, DescribedViews]]:
+def _folds(views: DescribedViews) -> Iterator[tuple[DescribedViews, DescribedViews]]:
     """Yield training and test views; all views of an instance are on one side."""
     from sklearn.model_selection import StratifiedGroupKFold  # noqa: PLC0415  only needed here
 
@@ -80,7 +76,7 @@ def _folds(views: DescribedViews, seed: int) -> Iterator[tuple[DescribedViews, D
     )
     if fewest < 2:
         return
-    folds = StratifiedGroupKFold(min(_FOLDS, fewest), shuffle=True, random_state=seed)
+    folds = StratifiedGroupKFold(min(_FOLDS, fewest), shuffle=True, random_state=0)
     for train, test in folds.split(views.descriptors, views.labels, views.instances):
         yield views.where(train), views.where(test)
 
@@ -114,26 +110,22 @@ def _compared(name: str, learned: int, truth: I4, posteriors: F8) -> Compared:
     return Compared(name, learned, *(None if np.isnan(value) else value for value in figures))
 
 
-def _learners(blocks: tuple[str, ...], seed: int, jobs: int | None) -> dict[str, _Learner]:
+def _learners() -> dict[str, _Learner]:
     from shapecat.learning.baselines import make_baselines  # noqa: PLC0415  scikit-learn
 
-    makers = make_baselines([BLOCKS[name] for name in blocks], seed=seed, jobs=jobs)
-    learners: dict[str, _Learner] = {"shapecat": _chain(blocks, seed, jobs)}
-    learners |= {name: _plain(make, _descriptors) for name, make in makers.items()}
+    makers = make_baselines(tuple(BLOCKS.values()))
+    descriptors, functions = attrgetter("descriptors"), attrgetter("functions")
+    learners: dict[str, _Learner] = {"shapecat": _chain}
+    learners |= {name: _plain(make, descriptors) for name, make in makers.items()}
     learners["forest on D2"] = _plain(makers["forest"], _d2)
-    learners["forest on D2, D3, A3 (ESF-like)"] = _plain(makers["forest"], _functions)
+    learners["forest on D2, D3, A3 (ESF-like)"] = _plain(makers["forest"], functions)
     return learners
 
 
-def _chain(blocks: tuple[str, ...], seed: int, jobs: int | None) -> _Learner:
-    """Return shapecat's classifier; like `shapecat train`, it also learns unknown shapes."""
-
-    def learn(train: DescribedViews, test: DescribedViews, categories: tuple[str, ...]) -> F8:
-        nothing = train.where(np.zeros(0, np.int64))
-        model = fit_views(train, nothing, seed=seed, blocks=blocks, jobs=jobs)
-        return _in_order(model.predict(test.descriptors).posteriors, model.categories, categories)
-
-    return learn
+def _chain(train: DescribedViews, test: DescribedViews, categories: tuple[str, ...]) -> F8:
+    """Run shapecat's classifier; like `shapecat train`, it also learns unknown shapes."""
+    model = fit_views(train, train.where(np.zeros(0, np.int64)), seed=0)
+    return _in_order(model.predict(test.descriptors).posteriors, model.categories, categories)
 
 
 def _plain(make: Callable[[], Any], features: Callable[[DescribedViews], F4]) -> _Learner:
@@ -155,14 +147,6 @@ def _in_order(posteriors: F4, found: Any, categories: tuple[str, ...]) -> F8:
         if name in names:
             result[:, column] = posteriors[:, names.index(name)]
     return result
-
-
-def _descriptors(views: DescribedViews) -> F4:
-    return views.descriptors
-
-
-def _functions(views: DescribedViews) -> F4:
-    return views.functions
 
 
 def _d2(views: DescribedViews) -> F4:

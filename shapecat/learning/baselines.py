@@ -18,9 +18,7 @@ from shapecat.learning.pnn import fit_bank
 __all__ = ["make_baselines"]
 
 
-def make_baselines(
-    blocks: Sequence[slice], *, seed: int, jobs: int | None = None
-) -> dict[str, Callable[[], Any]]:
+def make_baselines(blocks: Sequence[slice]) -> dict[str, Callable[[], Any]]:
     """Return functions that make unfitted baselines, by name; all classify whole descriptors.
 
     ``forest`` is a random forest; ``linear`` is logistic regression on the standardised descriptor;
@@ -28,44 +26,39 @@ def make_baselines(
     thesis: linear one-versus-rest classifiers on the leaves of a forest that is grown on the
     descriptor and its densities.
 
-    Parameters
-    ----------
-    blocks : range of each block in the descriptor.
-    jobs : number of trees grown at the same time.
+    ``blocks`` is the range of each block in the descriptor.
     """
     return {
-        "forest": lambda: _forest(400, seed, jobs),
+        "forest": lambda: _forest(400),
         "linear": lambda: make_pipeline(
             StandardScaler(), LogisticRegression(C=0.1, class_weight="balanced", max_iter=2000)
         ),
-        "pnn": lambda: _DensityProduct(blocks, seed),
-        "forest words": lambda: _ForestWords(blocks, seed, jobs),
+        "pnn": lambda: _DensityProduct(blocks),
+        "forest words": lambda: _ForestWords(blocks),
     }
 
 
-def _forest(trees: int, seed: int, jobs: int | None) -> RandomForestClassifier:
+def _forest(trees: int) -> RandomForestClassifier:
     return RandomForestClassifier(
-        trees, min_samples_leaf=2, class_weight="balanced", n_jobs=jobs, random_state=seed
+        trees, min_samples_leaf=2, class_weight="balanced", random_state=0
     )
 
 
-def _fit_densities(
-    x: F4, y: np.ndarray, blocks: Sequence[slice], kernels: int, seed: int
-) -> FeatureBank:
+def _fit_densities(x: F4, y: np.ndarray, blocks: Sequence[slice], kernels: int) -> FeatureBank:
     codes = np.unique(y, return_inverse=True)[1]
-    rng = np.random.default_rng(check_random_state(seed).randint(2**31))
+    rng = np.random.default_rng(check_random_state(0).randint(2**31))
     return fit_bank(x, codes, blocks, kernels=kernels, rng=rng)
 
 
 class _DensityProduct:
     """A probabilistic neural network as a classifier: the product of the blocks' densities."""
 
-    def __init__(self, blocks: Sequence[slice], seed: int) -> None:
-        self._blocks, self._seed = blocks, seed
+    def __init__(self, blocks: Sequence[slice]) -> None:
+        self._blocks = blocks
 
     def fit(self, x: F4, y: np.ndarray) -> Self:
         self.classes_ = np.unique(y)
-        self._bank = _fit_densities(x, y, self._blocks, 300, self._seed)
+        self._bank = _fit_densities(x, y, self._blocks, 300)
         return self
 
     def predict_proba(self, x: F4) -> F8:
@@ -79,13 +72,13 @@ class _DensityProduct:
 class _ForestWords:
     """Linear classifiers on the words of a view: the leaves it reaches in a forest (thesis 7.3)."""
 
-    def __init__(self, blocks: Sequence[slice], seed: int, jobs: int | None) -> None:
-        self._blocks, self._seed = blocks, seed
-        self._forest, self._encoder = _forest(100, seed, jobs), OneHotEncoder()
+    def __init__(self, blocks: Sequence[slice]) -> None:
+        self._blocks = blocks
+        self._forest, self._encoder = _forest(100), OneHotEncoder()
 
     def fit(self, x: F4, y: np.ndarray) -> Self:
         self.classes_ = np.unique(y)
-        self._bank = _fit_densities(x, y, self._blocks, 50, self._seed)
+        self._bank = _fit_densities(x, y, self._blocks, 50)
         features = self._bank.features(x)
         words = self._encoder.fit_transform(self._forest.fit(features, y).apply(features))
         self._learners = [

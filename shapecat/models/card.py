@@ -51,12 +51,11 @@ The views of the test set with the most confident wrong labels. Colour shows the
 
 @dataclass(frozen=True)
 class Table:
-    """A table of the card, with its title and a note below it."""
+    """A table of the card, with its title."""
 
     title: str
     head: tuple[str, ...]
     rows: tuple[tuple[str, ...], ...]
-    note: str = ""
 
 
 def format_table(table: Table) -> str:
@@ -67,7 +66,6 @@ def format_table(table: Table) -> str:
         "| " + " | ".join(table.head) + " |",
         "|---" * len(table.head) + "|",
         *("| " + " | ".join(row) + " |" for row in table.rows),
-        *(["", table.note] if table.note else []),
     ]
     return "\n".join(lines) + "\n"
 

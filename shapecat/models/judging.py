@@ -4,14 +4,12 @@ from collections.abc import Iterable, Sequence
 from dataclasses import replace
 from functools import partial
 from pathlib import Path
-from typing import Any
 
 import click
 import numpy as np
 
 from shapecat.config import Settings
-from shapecat.description import BLOCKS
-from shapecat.evaluation import Report, View, evaluate, format_report
+from shapecat.evaluation import Report, evaluate, format_report
 from shapecat.evaluation.fused import FUSED
 from shapecat.evaluation.markup import figure_text
 from shapecat.evaluation.views import describe_views
@@ -22,7 +20,6 @@ from shapecat.models.meshes import mesh_views
 from shapecat.models.pictures import draw, worst_mistakes
 from shapecat.models.recorded import detected_views, labelled_views
 from shapecat.models.sets import CUT_WELL, MOSTLY, Simulated, clear_views, collect, options_of
-from shapecat.models.studies import add_two_categories, compare_surfaces, compare_with_plain
 from shapecat.models.worlds import WorldView, simulate_views, simulate_world
 from shapecat.simulation.distractors import DISTRACTORS
 from shapecat.simulation.sensors import PRESETS
@@ -30,16 +27,10 @@ from shapecat.types import UNKNOWN
 
 __all__ = ["judge"]
 
-_SURFACE_SEEDS = (4, 5)
-_SURFACE_TABLES = (150, 60)
 _TRACK_SEED, _TRACK_TABLES = 100_006, 24
 _DRAWN = 20
 """Number of test tables from which the worst mistakes are drawn."""
 _MANNERS = ("upright", "lying")
-_STEADY = """\
-Differences of one point in accuracy are not significant at this size. The advantage of the gas is
-stability: random points are as accurate, but change nearly twice as much between frames."""
-_THESIS = ("the thesis's own figures, all objects of its data", "about 0.9", "", "< 2000")
 _HEAD = ("", "views", "accuracy", "balanced", "ECE", "known rejected", "unknown rejected", "AUROC")
 _text = partial(figure_text, missing="")
 
@@ -51,7 +42,6 @@ def judge(
     *,
     seed: int,
     jobs: int,
-    studies: bool,
     meshes: Path | None,
     recorded: Sequence[Path],
 ) -> None:
@@ -60,7 +50,6 @@ def judge(
     Parameters
     ----------
     sets : the sets named in `SETS`.
-    studies : whether to run the ablation studies.
     meshes : folder of meshes to evaluate on; None for none.
     recorded : folders of labelled recordings to evaluate on.
 
@@ -69,13 +58,11 @@ def judge(
     RecordingError : a mesh or a labelled recording is unreadable.
     ModelError : the model does not know a category of the meshes or recordings.
     """
-    judged = {"test": sets["test"]}
     rows = [_figures(name, report) for name, report in _parts(sets["test"], model)]
-    tracks = {"simulated": collect(_tracks(jobs))} if studies else {}
+    tracks = {"simulated": collect(_tracks(jobs))}
     if meshes is not None:
-        judged["meshes"] = collect(mesh_views(meshes, seed=seed))
-        rows += [_figures(f"meshes: {n}", report) for n, report in _parts(judged["meshes"], model)]
-    if meshes is not None and studies:
+        seen = collect(mesh_views(meshes, seed=seed))
+        rows += [_figures(f"meshes: {n}", report) for n, report in _parts(seen, model)]
         tracks["meshes"] = collect(
             mesh_views(meshes, seed=seed + 1, placements=1, cameras=max(FUSED))
         )
@@ -84,8 +71,7 @@ def judge(
     tables = [
         Table("Views", ("set", "views", "objects", "unknown"), tuple(_counts(sets))),
         Table("Accuracy on unseen objects, single views", _HEAD, tuple(rows)),
-        *((_fused_table(tracks, model),) if tracks else ()),
-        *(_studies(sets["training"], judged, model, seed, jobs) if studies else ()),
+        _fused_table(tracks, model),
     ]
     clear = evaluate(sets["test"].where(clear_views(sets["test"])).views, model)
     write_card(
@@ -206,48 +192,3 @@ def _fused_table(tracks: dict[str, Simulated], model: Categorizer) -> Table:
     return Table(
         "Several fused views of one placement of an object, fused as in tracks", head, tuple(rows)
     )
-
-
-def _studies(
-    train: Simulated, judged: dict[str, Simulated], model: Categorizer, seed: int, jobs: int
-) -> list[Table]:
-    """Return the tables of the ablation studies."""
-    known = {
-        name: s.where(clear_views(s) & (s.views.labels != UNKNOWN)) for name, s in judged.items()
-    }
-    learned = train.where(train.views.labels != UNKNOWN)
-    choices: dict[str, Any] = {"blocks": tuple(BLOCKS), "seed": seed, "jobs": jobs}
-    plain = compare_with_plain(learned.views, known["test"].views, model, **choices)
-    surfaces = compare_surfaces(*map(_kept_views, _SURFACE_SEEDS, _SURFACE_TABLES), **choices)
-    shown = {name: seen.views for name, seen in known.items()}
-    added = add_two_categories(learned.views, shown, blocks=tuple(BLOCKS), seed=seed)
-    return [
-        Table(
-            "Baseline classifiers on the test tables, without upside-down views",
-            ("classifier", "training views", "accuracy", "balanced"),
-            tuple(plain),
-        ),
-        Table(
-            "Methods of surface reconstruction, each with its own model on the same few tables",
-            ("surface", "accuracy", "instability between frames", "ms per object"),
-            (*surfaces, _THESIS),
-            _STEADY,
-        ),
-        Table(
-            "Two new categories added to the fixed dictionary, compared with training from scratch",
-            ("data", "views each", "method", "new", "old", "old lost", "seconds"),
-            tuple(added),
-        ),
-    ]
-
-
-def _kept_views(seed: int, tables: int) -> list[View]:
-    """Simulate tables and return the clear views of known categories."""
-    seen = simulate_views(
-        ArrangementOptions(seed, tuple(DISTRACTORS), unknown=0.0, keep=True), range(tables)
-    )
-    return [
-        item.view
-        for item in seen
-        if item.view and item.source != "fragment" and item.manner != "upside_down"
-    ]

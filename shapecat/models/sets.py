@@ -93,7 +93,6 @@ def collect(views: Iterable[WorldView]) -> Simulated:
         points=columns["points"],
         distances=columns["distance"],
         seconds=columns["seconds"],
-        functions=columns["functions"],
     )
     circumstances = {name: columns[name] for name in Simulated._fields[1:]}
     return Simulated(described, **circumstances)

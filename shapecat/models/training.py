@@ -31,7 +31,6 @@ _TREES: dict[str, Any] = {"rounds": 320, "leaves": 40, "rate": 0.09}
 @click.option("--seed", default=0, show_default=True, help="Seed of the random generator.")
 @click.option("--jobs", default=2, show_default=True, help="Number of processes.")
 @click.option("--out", default=_HERE, type=click.Path(path_type=Path), help="Folder to write to.")
-@click.option("--studies/--no-studies", default=True, help="Run the ablation studies.")
 @click.option("--meshes", type=click.Path(path_type=Path), help="Folder of meshes for evaluation.")
 @click.option(
     "--recorded",
@@ -45,7 +44,6 @@ def main(
     seed: int,
     jobs: int,
     out: Path,
-    studies: bool,
     meshes: Path | None,
     recorded: Sequence[Path],
 ) -> None:
@@ -54,7 +52,7 @@ def main(
     train, held_out = sets["training"], sets["calibration"]
     model = _fit(train, held_out, seed, jobs)
     save_model(out / "default.npz", model)
-    judge(out, model, sets, seed=seed, jobs=jobs, studies=studies, meshes=meshes, recorded=recorded)
+    judge(out, model, sets, seed=seed, jobs=jobs, meshes=meshes, recorded=recorded)
 
 
 def _fit(train: Simulated, held_out: Simulated, seed: int, jobs: int) -> Categorizer:

@@ -22,7 +22,6 @@ from shapecat.geometry import (
     level_from_sensor,
     transform,
 )
-from shapecat.learning.shape_functions import shape_functions
 from shapecat.models.arrangements import (
     ALONE,
     Actor,
@@ -73,7 +72,6 @@ class WorldView(NamedTuple):
     visible : fraction of the object's unoccluded pixels that have readings.
     overlap : IoU of the view's points and the object's readings.
     sensor : name of the sensor.
-    functions : shape distributions, from `shape_functions`.
     view : the voxels; None if not kept.
     """
 
@@ -88,7 +86,6 @@ class WorldView(NamedTuple):
     visible: float
     overlap: float
     sensor: str
-    functions: F4
     view: View | None
 
 
@@ -277,6 +274,5 @@ def _described(view: View, source: str, seen: _Seen) -> WorldView | None:
         visible=seen.visible,
         overlap=seen.overlap,
         sensor=seen.sensor,
-        functions=shape_functions(view.points, rng),
         view=view,
     )
