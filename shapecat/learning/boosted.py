@@ -7,7 +7,7 @@ from typing import NamedTuple
 import numpy as np
 
 from shapecat.arrays import F4, F8, I4
-from shapecat.learning.boosting import Bins, Tree, TreeSettings, grow_tree, make_bins
+from shapecat.learning.boosting import Bins, Tree, TreeSettings, grow_tree, joined, make_bins
 from shapecat.learning.forest import FlatForest
 
 __all__ = ["Dictionary", "grow_dictionary"]
@@ -112,19 +112,11 @@ def _draw(bins: Bins, rng: np.random.Generator) -> tuple[I4, I4]:
 
 def _join(trees: Sequence[Tree], categories: int) -> tuple[FlatForest, F4]:
     """Return the trees as one forest, and the values (words, categories) of its leaves."""
-    sizes = np.array([tree.left.size for tree in trees])
-    roots = np.cumsum(sizes) - sizes
-    base = np.repeat(roots, sizes)
-    left = np.concatenate([tree.left for tree in trees])
+    (roots, feature, threshold, left), value = joined(trees)
     leaf = left == 0
-    forest = FlatForest(
-        roots,
-        np.where(leaf, 0, np.concatenate([tree.feature for tree in trees])),
-        np.where(leaf, 0, np.concatenate([tree.threshold for tree in trees])),
-        np.where(leaf, 0, left + base),
-    )
+    forest = FlatForest(roots, feature, np.where(leaf, 0, threshold), left)
+    sizes = np.diff(roots, append=left.size)
     owner = np.repeat(np.arange(len(trees)) % categories, sizes)[leaf]
-    value = np.concatenate([tree.value for tree in trees])[leaf]
     votes = np.zeros((forest.words, categories), np.float16)
-    votes[np.arange(forest.words), owner] = value
+    votes[np.arange(forest.words), owner] = value[leaf]
     return forest, votes.astype(np.float32)

@@ -5,14 +5,16 @@ category's posterior); leaf values and gains from second derivatives: Chen and G
 and 7.
 """
 
+from collections.abc import Sequence
 from typing import NamedTuple
 
 import numpy as np
 
 from shapecat.arrays import F4, F8, I4, U1
 from shapecat.jit import kernel
+from shapecat.trees import BoostedTrees, Trees
 
-__all__ = ["BINS", "Bins", "Tree", "TreeSettings", "grow_tree", "make_bins"]
+__all__ = ["BINS", "Bins", "Tree", "TreeSettings", "grow_tree", "joined", "make_bins"]
 
 BINS = 64
 """Number of quantile bins of each feature."""
@@ -97,6 +99,19 @@ def grow_tree(
     feature, cut, left, value = (feature[:count], cut[:count], left[:count], value[:count])
     _add_values(bins.binned, feature, cut, left, value, score)
     return Tree(feature, bins.edges[feature, cut], left, value)
+
+
+def joined(grown: Sequence[Tree]) -> BoostedTrees:
+    """Concatenate the nodes of all trees."""
+    roots = np.cumsum([0, *(len(tree.left) for tree in grown)])
+    left = [np.where(t.left > 0, t.left + root, 0) for t, root in zip(grown, roots, strict=False)]
+    trees = Trees(
+        roots[:-1].astype(np.int32),
+        np.concatenate([tree.feature for tree in grown]).astype(np.int16),
+        np.concatenate([tree.threshold for tree in grown]).astype(np.float32),
+        np.concatenate(left).astype(np.int32),
+    )
+    return BoostedTrees(trees, np.concatenate([tree.value for tree in grown]).astype(np.float32))
 
 
 @kernel

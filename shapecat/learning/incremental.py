@@ -13,7 +13,6 @@ from shapecat.arrays import F4, F8, I4, Bool
 from shapecat.errors import ModelError
 from shapecat.learning.categorizer import Categorizer
 from shapecat.learning.features import FeatureBank
-from shapecat.learning.words import bag_of_words
 
 __all__ = ["add_categories"]
 
@@ -91,7 +90,7 @@ def add_categories(
     truth = np.concatenate([categorizer.known_category.astype(np.int64), order[codes]])
     features = _features_of_standardised(bank, z)
     words = categorizer.forest.apply(features)
-    inputs = _Inputs(features.astype(np.float64), bag_of_words(words, categorizer.forest.words))
+    inputs = _Inputs(features.astype(np.float64), _bag_of_words(words, categorizer.forest.words))
     old = _old_logits(categorizer, inputs)
     cold = old / categorizer.temperature
     learned = _fit_new(inputs, cold, truth, np.zeros((_width(inputs), count)), _RIDGE, _STEPS)
@@ -151,6 +150,14 @@ def _features_of_standardised(bank: FeatureBank, z: F4) -> F4:
         bank, columns=np.arange(width), mean=np.zeros(width), inverse_scale=np.ones(width)
     )
     return plain.features(z)
+
+
+def _bag_of_words(words: I4, vocabulary: int) -> sparse.csr_array:
+    """Return sparse rows (n, vocabulary), one per view: 1 at its words (n, t), 0 elsewhere."""
+    views, trees = words.shape
+    starts = np.arange(views + 1, dtype=np.int32) * trees
+    columns = words.reshape(-1).astype(np.int32)
+    return sparse.csr_array((np.ones(words.size), columns, starts), shape=(views, vocabulary))
 
 
 def _old_logits(categorizer: Categorizer, inputs: _Inputs) -> F8:

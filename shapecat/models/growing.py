@@ -1,6 +1,6 @@
 """Growing boosted trees as binary classifiers for the detection."""
 
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Callable, Iterable
 from concurrent.futures import ProcessPoolExecutor
 from multiprocessing import get_context
 from pathlib import Path
@@ -10,8 +10,8 @@ import click
 import numpy as np
 
 from shapecat.arrays import F4, Bool
-from shapecat.learning.boosting import Tree, TreeSettings, grow_tree, make_bins
-from shapecat.trees import BoostedTrees, Trees
+from shapecat.learning.boosting import Tree, TreeSettings, grow_tree, joined, make_bins
+from shapecat.trees import BoostedTrees
 
 __all__ = ["Growth", "collect_chunks", "grow", "growing_options"]
 
@@ -91,23 +91,10 @@ def grow(features: F4, truth: Bool, growth: Growth, seed: int) -> BoostedTrees:
         rows = np.sort(rng.permutation(n)[: round(_ROWS * n)]).astype(np.int32)
         gradient, hessian = posterior - truth, posterior * (1 - posterior)
         grown.append(grow_tree(bins, columns, rows, gradient, hessian, settings, logit))
-    return _joined(grown)
+    return joined(grown)
 
 
 def _leaf(value: float) -> Tree:
     """Return a tree of one leaf, which adds a constant."""
     none = np.zeros(1, np.int64)
     return Tree(none, np.zeros(1, np.float32), none, np.array([value], np.float32))
-
-
-def _joined(grown: Sequence[Tree]) -> BoostedTrees:
-    """Concatenate the nodes of all trees."""
-    roots = np.cumsum([0, *(len(tree.left) for tree in grown)])
-    left = [np.where(t.left > 0, t.left + root, 0) for t, root in zip(grown, roots, strict=False)]
-    trees = Trees(
-        roots[:-1].astype(np.int32),
-        np.concatenate([tree.feature for tree in grown]).astype(np.int16),
-        np.concatenate([tree.threshold for tree in grown]).astype(np.float32),
-        np.concatenate(left).astype(np.int32),
-    )
-    return BoostedTrees(trees, np.concatenate([tree.value for tree in grown]).astype(np.float32))
