@@ -1,5 +1,8 @@
 """Errors shown to the user. Each message names the problem, the place, and what to try."""
 
+from collections.abc import Iterator
+from contextlib import contextmanager
+
 __all__ = [
     "ConfigError",
     "ModelError",
@@ -7,6 +10,7 @@ __all__ = [
     "OutputError",
     "RecordingError",
     "ShapecatError",
+    "explained",
 ]
 
 
@@ -42,3 +46,13 @@ class ModelError(ShapecatError):
 
 class OutputError(ShapecatError):
     """A result cannot be written, or the folder of a run cannot be used."""
+
+
+@contextmanager
+def explained(what: str, kind: type[ShapecatError]) -> Iterator[None]:
+    """Raise an `OSError` of the block as an error of a kind: ``what`` failed, and the reason."""
+    try:
+        yield
+    except OSError as error:
+        msg = f"{what}: {error.strerror or error}"
+        raise kind(msg) from error

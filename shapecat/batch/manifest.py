@@ -20,7 +20,7 @@ from typing import Any, Literal, Self, get_args
 from uuid import uuid4
 
 from shapecat.batch.storage import Location, content_key, is_url
-from shapecat.errors import OutputError, ShapecatError
+from shapecat.errors import OutputError, ShapecatError, explained
 
 __all__ = ["MANIFEST", "Entry", "Manifest", "RemoteManifest", "State", "open_manifest"]
 
@@ -102,12 +102,9 @@ class Manifest:
             self._append(b"".join(map(_line, stamped)))
 
     def _append(self, lines: bytes) -> None:
-        try:
-            with _appending(self.path) as file:
-                _write(file, lines)
-        except OSError as error:
-            msg = f"{self.path}: cannot be written: {error.strerror or error}"
-            raise OutputError(msg) from error
+        failing = explained(f"{self.path}: cannot be written", OutputError)
+        with failing, _appending(self.path) as file:
+            _write(file, lines)
 
 
 class RemoteManifest(Manifest):

@@ -11,7 +11,7 @@ from typing import NamedTuple
 import numpy as np
 
 from shapecat.arrays import F8, U1
-from shapecat.errors import RecordingError
+from shapecat.errors import RecordingError, explained
 from shapecat.jit import kernel
 
 __all__ = ["CloudFile", "read_pcd", "read_ply"]
@@ -93,14 +93,11 @@ def read_ply(path: Path) -> CloudFile:
 
 
 def _content(path: Path) -> bytes:
-    try:
+    with explained(f"{path}: cannot be read", RecordingError):
         if path.stat().st_size > _LARGEST_FILE:
             msg = f"{path}: larger than {_LARGEST_FILE >> 30} GB, not a view of one object"
             raise RecordingError(msg)
         return path.read_bytes()
-    except OSError as error:
-        msg = f"{path}: cannot be read: {error.strerror or error}"
-        raise RecordingError(msg) from error
 
 
 def _pcd_header(content: bytes) -> tuple[dict[str, list[str]], _Layout]:

@@ -9,7 +9,7 @@ from typing import Any
 
 import pyarrow as pa
 
-from shapecat.errors import OutputError
+from shapecat.errors import OutputError, explained
 from shapecat.evaluation.comparing import Comparison
 from shapecat.evaluation.comparison_matching import Difference
 from shapecat.evaluation.comparison_pictures import COLOURS, DifferenceImage, words_of
@@ -48,12 +48,9 @@ def require_new(folder: Path) -> None:
     ------
     OutputError : the folder is not empty, or cannot be created.
     """
-    try:
+    with explained(f"{folder}: cannot be written", OutputError):
         taken = folder.exists() and (not folder.is_dir() or any(folder.iterdir()))
         folder.parent.mkdir(parents=True, exist_ok=True)
-    except OSError as error:
-        msg = f"{folder}: cannot be written: {error.strerror or error}"
-        raise OutputError(msg) from error
     if taken:
         msg = f"{folder}: exists already; choose another --out, or move it away"
         raise OutputError(msg)
@@ -69,15 +66,12 @@ def write_comparison(folder: Path, found: Comparison) -> None:
     require_new(folder)
     columns = zip(*found.rows, strict=True) if found.rows else ([] for _ in Difference._fields)
     table = dict(zip(Difference._fields, map(list, columns), strict=True))
-    try:
-        with complete_folder(folder) as hidden:
-            write_table(hidden / "objects.parquet", table, OBJECTS)
-            (hidden / "comparison.html").write_text(format_page(found), "utf-8")
-            text = json.dumps(found.as_dict(), indent=1, ensure_ascii=False)
-            (hidden / "comparison.json").write_text(text + "\n", "utf-8")
-    except OSError as error:
-        msg = f"{folder}: cannot be written: {error.strerror or error}"
-        raise OutputError(msg) from error
+    failing = explained(f"{folder}: cannot be written", OutputError)
+    with failing, complete_folder(folder) as hidden:
+        write_table(hidden / "objects.parquet", table, OBJECTS)
+        (hidden / "comparison.html").write_text(format_page(found), "utf-8")
+        text = json.dumps(found.as_dict(), indent=1, ensure_ascii=False)
+        (hidden / "comparison.json").write_text(text + "\n", "utf-8")
 
 
 _Row = tuple[str, str, str]

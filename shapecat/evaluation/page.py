@@ -4,7 +4,7 @@ from collections.abc import Mapping, Sequence
 from html import escape
 from pathlib import Path
 
-from shapecat.errors import OutputError
+from shapecat.errors import OutputError, explained
 from shapecat.evaluation.markup import figure_text, html_table
 from shapecat.evaluation.metrics import Bin
 from shapecat.evaluation.report import (
@@ -54,13 +54,10 @@ def write_page(path: Path, report: Report, *, title: str) -> None:
             path: format_markdown(report, title=title, pictures=pictures),
             **{path.with_name(pictures[name]): picture for name, picture in drawn.items()},
         }
-    try:
+    with explained(f"{path}: cannot write the report", OutputError):
         path.parent.mkdir(parents=True, exist_ok=True)
         for place, content in files.items():
             place.write_text(content, "utf-8")
-    except OSError as error:
-        msg = f"{path}: cannot write the report: {error.strerror or error}"
-        raise OutputError(msg) from error
 
 
 _CALIBRATION = (

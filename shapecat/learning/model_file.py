@@ -16,7 +16,7 @@ from typing import Any, get_type_hints
 import numpy as np
 
 from shapecat.arrays import Record
-from shapecat.errors import ModelError
+from shapecat.errors import ModelError, explained
 from shapecat.learning.categorizer import Categorizer, parts_of
 
 __all__ = ["load_model", "save_model"]
@@ -81,11 +81,8 @@ def _default_model() -> Categorizer:
 
 
 def _read(source: Traversable, name: str) -> Categorizer:
-    try:
+    with explained(f"{name}: cannot read the model", ModelError):
         content = source.read_bytes()
-    except OSError as error:
-        msg = f"{name}: cannot read the model: {error.strerror or error}"
-        raise ModelError(msg) from error
     try:
         return _parse(content)
     except (_NotAModelError, ValueError, TypeError, OverflowError, RecursionError) as error:

@@ -16,7 +16,7 @@ import numpy as np
 from shapecat.cameras.colour import ColourView
 from shapecat.config import Settings
 from shapecat.depth_fusion import RecentFrames
-from shapecat.errors import NoStreamError, RecordingError
+from shapecat.errors import NoStreamError, RecordingError, explained
 from shapecat.executors.order import Processes
 from shapecat.learning import Categorizer
 from shapecat.perception import Perceiver, View, find_up
@@ -230,12 +230,9 @@ def _readings(
     recording: Recording, run: RunInfo, job: Job, skipped: Counter[str]
 ) -> Iterator[_Reading]:
     """Yield the frames of a run; an OSError becomes a RecordingError."""
-    try:
+    with explained(f"{job.source}: cannot be read", RecordingError):
         for frame, colour in read_frames(recording, run["options"], skipped=skipped):
             yield frame, None if colour is None else _without_pixels(colour)
-    except OSError as error:
-        msg = f"{job.source}: cannot be read: {error.strerror or error}"
-        raise RecordingError(msg) from error
 
 
 def _without_pixels(view: ColourView) -> ColourView:

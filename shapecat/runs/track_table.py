@@ -9,7 +9,7 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 
-from shapecat.errors import OutputError
+from shapecat.errors import OutputError, explained
 
 __all__ = [
     "TrackRow",
@@ -92,14 +92,11 @@ def read_track_table(path: Path) -> TrackTable:
 
 def _text(path: Path) -> str:
     """Return the text of a table, in any of the encodings that spreadsheets use."""
-    try:
+    with explained(f"{path}: cannot be read", OutputError):
         if path.stat().st_size > _LARGEST_TABLE:
             msg = f"{path}: larger than {_LARGEST_TABLE >> 20} MB, too large for a tracks.csv"
             raise OutputError(msg)
         content = path.read_bytes()
-    except OSError as error:
-        msg = f"{path}: cannot be read: {error.strerror or error}"
-        raise OutputError(msg) from error
     wide = content.startswith((b"\xff\xfe", b"\xfe\xff"))
     for encoding in ("utf-16",) if wide else ("utf-8-sig", "cp1252"):
         try:

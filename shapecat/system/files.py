@@ -13,7 +13,7 @@ from collections.abc import Iterator
 from contextlib import contextmanager, suppress
 from pathlib import Path
 
-from shapecat.errors import OutputError
+from shapecat.errors import OutputError, explained
 
 __all__ = [
     "FSYNC",
@@ -46,17 +46,15 @@ def replacing(path: Path) -> Iterator[Path]:
     OutputError : the file cannot be written.
     """
     hidden = partial_path(path)
-    try:
-        yield hidden
-        flush(hidden)
-        hidden.replace(path)
-        flush(path.parent)
-    except OSError as error:
-        msg = f"{path}: cannot be written: {error.strerror or error}"
-        raise OutputError(msg) from error
-    finally:
-        with suppress(OSError):
-            hidden.unlink(missing_ok=True)
+    with explained(f"{path}: cannot be written", OutputError):
+        try:
+            yield hidden
+            flush(hidden)
+            hidden.replace(path)
+            flush(path.parent)
+        finally:
+            with suppress(OSError):
+                hidden.unlink(missing_ok=True)
 
 
 def require_writable(path: Path) -> None:
@@ -67,13 +65,10 @@ def require_writable(path: Path) -> None:
     OutputError : the file cannot be written.
     """
     hidden = partial_path(path)
-    try:
+    with explained(f"{path}: cannot be written", OutputError):
         path.parent.mkdir(parents=True, exist_ok=True)
         hidden.touch()
         hidden.unlink()
-    except OSError as error:
-        msg = f"{path}: cannot be written: {error.strerror or error}"
-        raise OutputError(msg) from error
     if path.is_dir():
         msg = f"{path}: cannot be written: is a folder"
         raise OutputError(msg)
@@ -142,11 +137,8 @@ def holding(folder: Path) -> Iterator[None]:
     ------
     OutputError : the folder does not exist or cannot be opened.
     """
-    try:
+    with explained(str(folder), OutputError):
         held = os.open(folder, os.O_RDONLY)
-    except OSError as error:
-        msg = f"{folder}: {error.strerror or error}"
-        raise OutputError(msg) from error
     try:
         with suppress(OSError):  # a file system without locks
             fcntl.flock(held, fcntl.LOCK_EX)

@@ -19,7 +19,7 @@ from socketserver import ThreadingTCPServer
 from typing import Any, NamedTuple
 from urllib.parse import unquote
 
-from shapecat.errors import ConfigError, OutputError
+from shapecat.errors import ConfigError, OutputError, explained
 from shapecat.outputs.report.writing import INDEX, PAGE, Reports, RunReport
 from shapecat.runs.corrections import correct_label
 from shapecat.runs.track_table import read_track_table
@@ -199,11 +199,8 @@ def serve_reports(reports: Reports, *, port: int = 0) -> Iterator[str]:
     ------
     ConfigError : the port is in use or not permitted.
     """
-    try:
+    with explained(f"--port {port}", ConfigError):
         server = _Server((_HOST, port), _Handler)
-    except OSError as error:
-        msg = f"--port {port}: {error.strerror or error}"
-        raise ConfigError(msg) from error
     server.site = _Site(reports)
     thread = threading.Thread(target=server.serve_forever, args=(_POLL_S,), daemon=True)
     thread.start()
