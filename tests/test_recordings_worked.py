@@ -3,6 +3,7 @@
 import struct
 from collections import Counter
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
@@ -23,7 +24,7 @@ from shapecat.recordings.colour_streams import choose_colour, pair_colours
 from shapecat.recordings.extrinsics import Extrinsics
 from shapecat.recordings.imu import Accelerometer
 from shapecat.recordings.mcap_records import Opcode, TruncatedError, walk
-from shapecat.recordings.messages import MessageError
+from shapecat.recordings.messages import MessageError, Topic
 from shapecat.recordings.overview import describe_recording
 from shapecat.recordings.pinhole import PinholeFit, still_fits
 from shapecat.recordings.ros1_records import BagError, split
@@ -262,6 +263,13 @@ def test_a_calibration_that_comes_too_late_serves_only_where_there_is_no_other(
     assert after.camera == late
 
 
+def with_topics(infos: list[str]) -> Any:
+    """Return what is asked of a recording with these calibrations, and one without messages."""
+    kind = "sensor_msgs/msg/CameraInfo"
+    counts = {**dict.fromkeys(infos, 3), "/cam/infra/camera_info": 0}
+    return SimpleNamespace(topics=[Topic(n, kind, "cdr", count) for n, count in counts.items()])
+
+
 @pytest.mark.parametrize(
     ("image_topic", "expected"),
     [
@@ -277,8 +285,8 @@ def test_the_calibration_that_shares_most_of_the_path_is_taken(
 ) -> None:
     infos = ["/cam/camera_info", "/cam/depth/camera_info", "/cam/color/camera_info",
              "/device_0/sensor_0/Depth_0/info/camera_info"]  # fmt: skip
-    assert info_topic_of(image_topic, infos) == expected
-    assert info_topic_of(image_topic, ["/far/camera_info"]) == "/far/camera_info"
+    assert info_topic_of(image_topic, with_topics(infos)) == expected
+    assert info_topic_of(image_topic, with_topics(["/far/camera_info"])) == "/far/camera_info"
 
 
 def test_a_camera_still_fits_points_as_exact_as_those_it_was_fitted_to() -> None:

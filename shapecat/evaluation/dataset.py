@@ -36,7 +36,6 @@ class View(Record):
 class Dataset:
     """The files of a data set; views are read on demand."""
 
-    root: Path
     files: tuple[Path, ...]
 
     def __len__(self) -> int:
@@ -67,7 +66,7 @@ def read_dataset(root: Path) -> Dataset:
             f"{root.name}/cup/red_mug/000.pcd (or .ply, .npz)"
         )
         raise RecordingError(msg)
-    return Dataset(root, files)
+    return Dataset(files)
 
 
 def read_view(path: Path) -> View:

@@ -14,7 +14,6 @@ from shapecat.recordings.streams import (
     CLOUD,
     COMPRESSED,
     IMAGE,
-    INFO,
     Stream,
     by_sensor,
     cloud_streams,
@@ -53,13 +52,8 @@ class ColourStream:
 
 def colour_streams(recording: Recording) -> tuple[ColourStream, ...]:
     """Find the colour images and coloured clouds of a recording, sorted by topic."""
-    infos = [
-        topic.name
-        for topic in recording.topics
-        if ros_counterpart(topic.type) == INFO and topic.count != 0
-    ]
     found = (
-        _probe(topic, kind, recording, infos)
+        _probe(topic, kind, recording)
         for topic in recording.topics
         if topic.count != 0 and (kind := _KINDS.get(ros_counterpart(topic.type)))
     )
@@ -163,7 +157,6 @@ def _probe(
     topic: Topic,
     kind: Literal["raw", "compressed", "cloud"],
     recording: Recording,
-    infos: list[str],
 ) -> ColourStream | None:
     first = first_message(recording, topic.name, topic.type)
     try:
@@ -173,7 +166,7 @@ def _probe(
         frame_id = str(first.header.frame_id)
     except (AttributeError, TypeError):  # a definition without the fields of its type
         return None
-    info = info_topic_of(topic.name, infos) if kind != "cloud" else None
+    info = info_topic_of(topic.name, recording) if kind != "cloud" else None
     return ColourStream(topic.name, topic.type, kind, info, topic.count, frame_id, encoding)
 
 

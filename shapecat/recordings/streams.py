@@ -65,18 +65,13 @@ def cloud_streams(recording: Recording) -> tuple[Stream, ...]:
     is paired with the calibration in its own namespace (``depth/image_raw`` with
     ``depth/camera_info``), or with the only calibration in the recording.
     """
-    infos = [
-        topic.name
-        for topic in recording.topics
-        if ros_counterpart(topic.type) == INFO and topic.count != 0
-    ]
     streams = []
     for topic in recording.topics:
         probe = _PROBES.get(ros_counterpart(topic.type))
         if probe is not None and topic.count != 0:
             first = first_message(recording, topic.name, topic.type)
             with suppress(AttributeError):  # a definition without the fields of its type
-                streams.append(probe(topic, first, infos))
+                streams.append(probe(topic, first, recording))
     return tuple(stream for stream in streams if stream is not None)
 
 
@@ -190,11 +185,11 @@ def first_message(recording: Recording, topic: str, kind: str | None = None) -> 
     return None
 
 
-def _probe_cloud(topic: Topic, first: Any, _infos: list[str]) -> Stream:
+def _probe_cloud(topic: Topic, first: Any, _recording: Recording) -> Stream:
     return Stream(topic.name, topic.type, "points", None, topic.count, first.header.frame_id, "")
 
 
-def _probe_image(topic: Topic, first: Any, infos: list[str]) -> Stream | None:
+def _probe_image(topic: Topic, first: Any, recording: Recording) -> Stream | None:
     name, encoding = topic.name.lower(), str(first.encoding)
     infrared = "infra" in name or "/ir/" in name
     # Cameras publish infrared, and grey images of 16 bits, with the same encodings.
@@ -204,25 +199,32 @@ def _probe_image(topic: Topic, first: Any, infos: list[str]) -> Stream | None:
         or (encoding == "mono16" and "depth" not in name)
     ):
         return None
-    return _depth_stream(topic, first, infos, encoding)
+    return _depth_stream(topic, first, recording, encoding)
 
 
-def _probe_compressed(topic: Topic, first: Any, infos: list[str]) -> Stream | None:
+def _probe_compressed(topic: Topic, first: Any, recording: Recording) -> Stream | None:
     encoding = str(first.format)
-    return _depth_stream(topic, first, infos, encoding) if "compressedDepth" in encoding else None
+    return (
+        _depth_stream(topic, first, recording, encoding) if "compressedDepth" in encoding else None
+    )
 
 
-def _depth_stream(topic: Topic, first: Any, infos: list[str], encoding: str) -> Stream:
-    info = info_topic_of(topic.name, infos)
+def _depth_stream(topic: Topic, first: Any, recording: Recording, encoding: str) -> Stream:
+    info = info_topic_of(topic.name, recording)
     frame_id = first.header.frame_id
     return Stream(topic.name, topic.type, "depth", info, topic.count, frame_id, encoding)
 
 
-def info_topic_of(image: str, infos: list[str]) -> str | None:
+def info_topic_of(image: str, recording: Recording) -> str | None:
     """Return the calibration topic that shares the longest namespace with an image topic.
 
     Without a common namespace it is the only calibration topic, or None if there are several.
     """
+    infos = [
+        topic.name
+        for topic in recording.topics
+        if ros_counterpart(topic.type) == INFO and topic.count != 0
+    ]
     parts = image.split("/")[:-1]
     for length in range(len(parts), 1, -1):
         for name in _INFO_NAMES:
