@@ -94,7 +94,7 @@ _MOST_ROWS = 100
     "--overwrite",
     is_flag=True,
     help="Replace earlier results. Corrected labels are transferred to the objects at the same "
-    "places.",
+    "places. If only settings of tracking or outputs differ, perceived frames are kept.",
 )
 @click.option("--discard-labels", is_flag=True, help="With --overwrite: drop corrected labels.")
 @click.option(

@@ -123,7 +123,7 @@ def test_what_is_far_too_small_goes_before_holes_are_filled(cells: int, rejected
 
 @pytest.mark.parametrize(
     ("alone", "in_context", "rejected"),
-    [(2.9, -1.1, True), (-2.9, -0.9, False), (3.1, -9.0, False), (-3.1, 9.0, True)],
+    [(2.9, -0.1, True), (-2.9, 0.1, False), (3.1, -9.0, False), (-3.1, 9.0, True)],
 )
 def test_context_decides_on_doubtful_segments_only(
     alone: float, in_context: float, rejected: bool

@@ -8,9 +8,9 @@ __all__ = ["CLEANUP", "CleanupSettings"]
 class CleanupSettings(NamedTuple):
     """Constants of the rejection of structure and the completion of labels."""
 
-    least_logit: float = -1.0
-    """Minimum logit of an object, for a probability of 0.27: a missed object is lost, a false one
-    can still be rejected over time."""
+    least_logit: float = 0.0
+    """Minimum logit of an object, which is then more likely than structure. In 440 simulated scenes
+    of six kinds, -1 would find 1 % more of the objects and have half as many false ones again."""
     far_m: float = 2.0
     """Depth beyond which most segments are background, metres."""
     least_far_logit: float = 1.0
