@@ -88,11 +88,7 @@ def write_card(
     confusion : report whose confusion matrix is printed.
     settings : settings of the training, by name.
     """
-    head = _HEAD.format(
-        model=model,
-        categories=", ".join(categories),
-        picture=PICTURE,
-    )
+    head = _HEAD.format(model=model, categories=", ".join(categories), picture=PICTURE)
     rows = tuple(
         (name, *map(str, row))
         for name, row in zip(confusion.categories, confusion.confusion, strict=True)

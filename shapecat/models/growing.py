@@ -29,7 +29,7 @@ class Growth(NamedTuple):
 
 
 def growing_options(out: Path) -> Callable[[Callable[..., Any]], Callable[..., Any]]:
-    """Add the options that commands for growing trees share; ``out`` is the default for --out."""
+    """Add the options that the commands for training share; ``out`` is the default for --out."""
     options = (
         click.option("--seed", default=0, show_default=True, help="Seed of the random generator."),
         click.option("--jobs", default=2, show_default=True, help="Number of processes."),

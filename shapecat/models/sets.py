@@ -56,14 +56,8 @@ class Simulated(NamedTuple):
 
     def where(self, chosen: Bool) -> "Simulated":
         """Return the views that a mask (n,) selects."""
-        return Simulated(
-            self.views.where(chosen),
-            self.manner[chosen],
-            self.source[chosen],
-            self.visible[chosen],
-            self.overlap[chosen],
-            self.sensor[chosen],
-        )
+        _, *circumstances = self
+        return Simulated(self.views.where(chosen), *(column[chosen] for column in circumstances))
 
 
 def options_of(name: str) -> ArrangementOptions:

@@ -13,12 +13,12 @@ from shapecat.description import BLOCKS
 from shapecat.evaluation.training import fit_views
 from shapecat.learning import Categorizer, save_model
 from shapecat.learning.training import Examples, fit_threshold
+from shapecat.models.growing import growing_options
 from shapecat.models.judging import judge
 from shapecat.models.sets import SETS, Simulated, partial_views, simulate
 
 __all__ = ["main"]
 
-_HERE = Path(__file__).parent
 _REJECTED = 0.14
 """Fraction of the partial views of known categories that the novelty threshold rejects. Real
 objects are often partly hidden, and a partial view is more novel than a whole one."""
@@ -28,9 +28,7 @@ _TREES: dict[str, Any] = {"rounds": 320, "leaves": 40, "rate": 0.09}
 
 @click.command()
 @click.option("--worlds", default=8000, show_default=True, help="Number of training scenes.")
-@click.option("--seed", default=0, show_default=True, help="Seed of the random generator.")
-@click.option("--jobs", default=2, show_default=True, help="Number of processes.")
-@click.option("--out", default=_HERE, type=click.Path(path_type=Path), help="Folder to write to.")
+@growing_options(Path(__file__).parent)
 @click.option("--meshes", type=click.Path(path_type=Path), help="Folder of meshes for evaluation.")
 @click.option(
     "--recorded",

@@ -264,15 +264,11 @@ def _described(view: View, source: str, seen: _Seen) -> WorldView | None:
         return None
     return WorldView(
         descriptor=described.descriptor,
-        label=seen.label,
         instance=view.instance,
         points=described.points,
         distance=distance,
         seconds=described.seconds,
-        manner=seen.manner,
         source=source,
-        visible=seen.visible,
-        overlap=seen.overlap,
-        sensor=seen.sensor,
         view=view,
+        **seen._asdict(),
     )
