@@ -3,6 +3,7 @@
 import os
 import re
 import shlex
+import socket
 import subprocess
 import sys
 from collections.abc import Callable
@@ -96,6 +97,9 @@ def test_page_works_as_printed(
 @pytest.mark.parametrize("page", ["tutorial.md", "howto-cluster.md"])
 def test_page_works_as_printed_in_a_shell(page: str, tmp_path: Path) -> None:
     """Starting processes, Dask and Ray takes a minute; `test_batch` runs on Dask."""
-    run_in_shell(commands(page), tmp_path)
+    with socket.socket() as probe:  # the page's port may be taken
+        probe.bind(("127.0.0.1", 0))
+        port = probe.getsockname()[1]
+    run_in_shell([line.replace("8786", str(port)) for line in commands(page)], tmp_path)
 
     assert [name for name in PAGES[page] if not (tmp_path / name).exists()] == []

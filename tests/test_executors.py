@@ -228,7 +228,7 @@ def test_executors_that_are_not_there_are_named(monkeypatch: pytest.MonkeyPatch)
 def test_dask_does_not_answer_a_second_attempt_with_the_result_of_the_first() -> None:
     """A recording whose worker died would be given up untried: its retry is the same call."""
     distributed = pytest.importorskip("distributed")
-    client = distributed.Client(processes=False, n_workers=1, dashboard_address=None)
+    client = distributed.Client(processes=False, n_workers=1, dashboard_address="127.0.0.1:0")
     with _DaskExecutor(client, None) as executor:
         first, second = [executor.submit(os.urandom, 8) for _ in range(2)]
 
