@@ -733,9 +733,11 @@ def test_a_new_recording_does_not_get_the_folder_of_an_older_one() -> None:
     assert folders == ["a_x_1", "a_x", "b_x"]
 
 
-@pytest.mark.parametrize("way", ["whole", "relative", "link"])
+@pytest.mark.parametrize(
+    ("way", "name"), [("whole", "lab"), ("relative", "lab_2"), ("link", "monday_lab_3")]
+)
 def test_a_run_keeps_its_folder_when_a_recording_of_its_name_is_added(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, way: str
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, way: str, name: str
 ) -> None:
     """Otherwise it is processed again without its labels, and counted twice in each export.
 
@@ -746,15 +748,15 @@ def test_a_run_keeps_its_folder_when_a_recording_of_its_name_is_added(
         (tmp_path / day / "lab.mcap").write_bytes(day.encode())
     out = str(tmp_path / "out")
     path = str((tmp_path / "monday" / "lab.mcap").resolve())
-    (tmp_path / "out" / "lab").mkdir(parents=True)
-    write_run(tmp_path / "out" / "lab", run_info(input={"path": path}))
+    (tmp_path / "out" / name).mkdir(parents=True)
+    write_run(tmp_path / "out" / name, run_info(input={"path": path}))
     (tmp_path / "linked").symlink_to(tmp_path)
     monkeypatch.chdir(tmp_path)
     place = {"whole": tmp_path, "relative": Path(), "link": tmp_path / "linked"}[way]
     days = [str(place / day / "lab.mcap") for day in ("tuesday", "monday")]
 
     with plan_batch(Job(Path(), Path()), days, out) as batch:
-        assert [task.name for task in batch.tasks] == ["tuesday_lab", "lab"]
+        assert [task.name for task in batch.tasks] == ["tuesday_lab", name]
 
 
 def test_a_name_that_a_number_makes_may_be_taken() -> None:
