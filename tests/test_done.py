@@ -36,6 +36,7 @@ from shapecat.runs.jobs import (
     describe_run,
     differences,
     require_unchanged,
+    summarize,
 )
 from shapecat.runs.resuming import has_work, resume
 from shapecat.runs.run_info import RunInfo
@@ -156,6 +157,16 @@ def test_outputs_do_not_change_what_the_tables_are_of(source: Path, name: str) -
 
     assert work_id(run) == work_id(other)
     assert differences(run, other)  # a folder without colour is not taken for one with it
+
+
+def test_a_summary_has_the_seconds_from_begin_to_end(source: Path) -> None:
+    """The sum of all entries would count each phase twice, as the total holds it as well."""
+    run = planned(source)
+    run["seconds"] = {"perceive": 3.5, "track": 1.25, "compile": 0.75, "total": 8.0}
+    run["warnings"] = ["tilted"]
+    found = summarize(Job(source, source.parent / "lab"), run, processed=False)
+
+    assert (found.seconds, found.warnings, found.processed) == (8.0, ("tilted",), False)
 
 
 def test_a_recording_that_was_written_to_has_changed_though_it_is_as_long(source: Path) -> None:
