@@ -137,6 +137,7 @@ def test_an_image_in_memory_has_the_objects_of_its_recording(image: Any, tmp_pat
         assert [o.track for o in seen.objects] == list(range(1, len(expected) + 1))
         for item, row in zip(seen.objects, expected, strict=True):
             assert item.category == row["category"]
+            assert item.detections == (row["detection"],)
             assert (
                 item.confidence == max(item.posterior) == pytest.approx(row["confidence"], abs=0.1)
             )

@@ -16,6 +16,7 @@ from mcap_ros2.decoder import DecoderFactory
 from shapecat.errors import OutputError
 from shapecat.pipeline import annotate_again
 from shapecat.runs.corrections import _given, adopt_labels, read_labels, relabel
+from shapecat.runs.finished import FinishedRun
 from shapecat.runs.label_meaning import TrackLabel
 from shapecat.runs.labels import read_labelled_frames
 from shapecat.runs.perceived import FrameRow, PerceptionTables
@@ -388,6 +389,19 @@ def test_merged_parts_of_one_frame_become_one_object(tmp_path: Path) -> None:
     assert item.height_m == pytest.approx(0.1, abs=1e-5)
     assert item.gas.edges.tolist() == [[0, 1], [1, 2], [3, 4], [4, 5]]
     assert item.touches_border
+
+
+def test_categories_that_a_person_added_come_last(tmp_path: Path) -> None:
+    """A new name before the others would renumber the classes of a data set."""
+    run = run_info(model={"categories": ["cup", "can"]})
+    names = ("vase", "can", "unknown", "amphora", "cup")
+    labels = {k: TrackLabel(k, name, 1.0) for k, name in enumerate(names, 1)}
+
+    alone = FinishedRun(tmp_path, run, labels)
+    beside = FinishedRun(tmp_path, run, labels, common=("can", "jug"))
+
+    assert alone.categories == ("cup", "can", "amphora", "vase")
+    assert beside.categories == ("can", "jug", "cup", "amphora", "vase")
 
 
 def test_a_deleted_track_ends_where_it_would_have_been_seen(tmp_path: Path) -> None:

@@ -545,6 +545,20 @@ def bag_of(path: Path) -> Path:
     return path
 
 
+def test_a_bag_without_an_index_has_the_times_of_its_messages(tmp_path: Path) -> None:
+    """They need not be in the order of the file: the first one is not the earliest."""
+    path = bag_of(tmp_path / "a.bag")
+    data = bytearray(path.read_bytes())
+    at = data.index(b"index_pos=") + len(b"index_pos=")
+    data[at : at + 8] = bytes(8)  # as while it was being recorded
+    path.write_bytes(data)
+
+    with open_recording(path) as recording:
+        assert (recording.start_ns, recording.end_ns) == (5, 60)
+        assert [(t.name, t.count) for t in recording.topics] == [("/a", 6), ("/b", 6)]
+        assert recording.warnings == ["no index, or a damaged one; messages recovered: 12"]
+
+
 @pytest.mark.parametrize("container", ["mcap", "bag"])
 def test_every_window_gives_the_messages_of_its_times(tmp_path: Path, container: str) -> None:
     """As the format's own library reads them; a window has its start and not its stop."""
