@@ -129,11 +129,24 @@ def test_context_decides_on_doubtful_segments_only(
     alone: float, in_context: float, rejected: bool
 ) -> None:
     features = _seen(400)
-    grid = DepthGrid(np.zeros((40, 40), np.float32), INTRINSICS, 1)
+    grid = DepthGrid(np.zeros((200, 200), np.float32), INTRINSICS, 1)
     trees = RejectionTrees(
         *(_LEAF._replace(value=np.array([v], np.float32)) for v in (alone, in_context))
     )
     found = find_background(_blank(2), features, grid, DetectionSettings(), trees)
+    assert found[1] == rejected
+
+
+@pytest.mark.parametrize(
+    ("cells", "logit", "rejected"),
+    [(780, -0.1, True), (820, -0.1, False), (820, -0.9, False), (820, -1.1, True)],
+)
+def test_large_objects_need_less_evidence(cells: int, logit: float, *, rejected: bool) -> None:
+    """A large object that is lost is the first thing to be noticed."""
+    grid = DepthGrid(np.zeros((200, 200), np.float32), INTRINSICS, 1)  # 2 % are 800 cells
+    leaf = _LEAF._replace(value=np.array([logit], np.float32))
+    trees = RejectionTrees(leaf, leaf)
+    found = find_background(_blank(2), _seen(cells), grid, DetectionSettings(), trees)
     assert found[1] == rejected
 
 

@@ -9,8 +9,10 @@ class CleanupSettings(NamedTuple):
     """Constants of the rejection of structure and the completion of labels."""
 
     least_logit: float = 0.0
-    """Minimum logit of an object, which is then more likely than structure. In 440 simulated scenes
-    of six kinds, -1 would find 1 % more of the objects and have half as many false ones again."""
+    """Minimum logit of an object, which is then more likely than structure. Of the segments between
+    -1 and 0 that cover less than `large_share` of the image, a fifth are objects."""
+    least_large_logit: float = -1.0
+    """Minimum logit of a larger object; between -1 and 0, two thirds of them are objects."""
     far_m: float = 2.0
     """Depth beyond which most segments are background, metres."""
     least_far_logit: float = 1.0
@@ -34,7 +36,8 @@ class CleanupSettings(NamedTuple):
     cut_off_m: float = 0.02
     """A segment that comes this near to the greatest height continues above it, metres."""
     large_share: float = 0.02
-    """Minimum fraction of the image covered by an arm, furniture or the bent end of a table."""
+    """Minimum fraction of the image covered by a large object, an arm, furniture or the bent end of
+    a table."""
     cut_share: float = 0.4
     """Minimum fraction of the perimeter of such structure, taken for a square, at the image
     border."""

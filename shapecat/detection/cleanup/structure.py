@@ -78,14 +78,17 @@ def find_background(
     logits[again] = logits_of(as_rows(context), grown.in_context)
     segment, cells = features["segment"], features["visibility"]["cells"]
     depths = merged["visibility"]["depth_m"]
-    far = depths > CLEANUP.far_m
-    rejected[roots] = logits < np.where(far, CLEANUP.least_far_logit, CLEANUP.least_logit)
+    large = cells > CLEANUP.large_share * grid.inverse_depth.size
+    rejected[roots] = logits < np.select(
+        [depths > CLEANUP.far_m, large[roots]],
+        [CLEANUP.least_far_logit, CLEANUP.least_large_logit],
+        CLEANUP.least_logit,
+    )
     enough = np.array([smallest_object_at(grid, z) for z in depths.tolist()])
     rejected[roots] |= cells[roots] < CLEANUP.tiny_share * enough
     rejected |= segment["width_m"] > settings.max_size_m
     rejected |= segment["top_m"] > settings.max_height_m - CLEANUP.cut_off_m
     # Large and mostly outside the image: furniture, which the trees were not shown.
-    large = cells > CLEANUP.large_share * grid.inverse_depth.size
     rejected |= large & (features["surroundings"]["image_border"] > CLEANUP.cut_share)
     return rejected
 
