@@ -14,6 +14,7 @@ from shapecat.config import Settings, with_overrides
 from shapecat.errors import OutputError
 from shapecat.runs.folder import read_run, write_run
 from shapecat.runs.jobs import Job
+from shapecat.system.files import partial_path
 from tests.conftest import Guesser
 
 TABLES = ("frames", "detections", "planes", "masks", "tracks")
@@ -162,3 +163,29 @@ def test_an_output_that_was_removed_is_written_again(job: Job) -> None:
 
     assert mcap.read_bytes().endswith(b"\x89MCAP0\r\n")
     assert tracks.stat().st_mtime_ns == known
+
+
+@pytest.mark.parametrize("total", [None, 950.0])
+def test_the_seconds_of_a_killed_run_count_once(
+    job: Job, total: float | None, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """A kill may come before or after the total is written; it already has those of the phases."""
+    job = replace(job, settings=changed("tracking.gate_m=0.1"))
+
+    def kill(*_args: Any) -> None:
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr(pipeline, "require_unchanged", kill)
+    with pytest.raises(KeyboardInterrupt):
+        pipeline.process(job)
+    hidden = partial_path(job.folder)
+    run = read_run(hidden)
+    run["seconds"] = dict.fromkeys(run["seconds"], 100.0) | ({"total": total} if total else {})
+    write_run(hidden, run)
+    monkeypatch.undo()
+    monkeypatch.setattr(pipeline, "load_model", lambda _path: Guesser())
+
+    pipeline.process(job)
+
+    before = total or 100 * len(run["seconds"])
+    assert before < read_run(job.folder)["seconds"]["total"] < before + 90
