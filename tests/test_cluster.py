@@ -105,7 +105,9 @@ def test_a_killed_command_is_gone_on_with(bucket: Path, tmp_path: Path) -> None:
 
     for text in errors:
         told = [line for line in text.splitlines() if line.startswith("Error")]
-        assert all("another run is writing there" in line for line in told), text
+        # Where the machine stalls for long, one may take over from the other.
+        known = ("another run is writing there", "another run has taken over")
+        assert all(any(words in line for words in known) for line in told), text
     assert last.returncode == 0, last.stderr
     assert sorted(made(bucket)) == [f"run_{k:04}" for k in range(8)]
     assert_same_tables(tmp_path)
