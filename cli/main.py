@@ -50,6 +50,7 @@ class _Commands(click.Group):
             if error.errno != errno.ENOSPC or error.filename is not None:
                 raise
             click.echo(f"Error: cannot write the output: {error.strerror}", err=True)
+            os.dup2(os.open(os.devnull, os.O_WRONLY), 1)  # for what is still in the buffer
             sys.exit(1)
 
     def list_commands(self, ctx: click.Context) -> list[str]:  # noqa: ARG002  click's signature

@@ -407,8 +407,12 @@ FIXTURE = str(Path(__file__).parents[1] / "fixtures" / "tabletop.mcap")
 
 @pytest.mark.skipif(not Path("/dev/full").exists(), reason="needs a device that is always full")
 @pytest.mark.parametrize("words", [("info", FIXTURE), ("--help",)])
-def test_a_full_disk_behind_the_output_is_one_line(words: tuple[str, ...]) -> None:
-    """A script that collects tables got a traceback."""
+@pytest.mark.parametrize("unbuffered", ["", "1"])
+def test_a_full_disk_behind_the_output_is_one_line(
+    words: tuple[str, ...], unbuffered: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """A script that collects tables got a traceback, or a second one at exit."""
+    monkeypatch.setenv("PYTHONUNBUFFERED", unbuffered)
     with Path("/dev/full").open("w") as full:
         done = subprocess.run(
             [sys.executable, "-m", "shapecat", *words],
