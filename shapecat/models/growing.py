@@ -30,12 +30,11 @@ class Growth(NamedTuple):
 
 def growing_options(out: Path) -> Callable[[Callable[..., Any]], Callable[..., Any]]:
     """Add the options that the commands for training share; ``out`` is the default for --out."""
+    where = f"{'File' if out.suffix else 'Folder'} to write to; by default that of shapecat."
     options = (
         click.option("--seed", default=0, show_default=True, help="Seed of the random generator."),
         click.option("--jobs", default=2, show_default=True, help="Number of processes."),
-        click.option(
-            "--out", default=out, type=click.Path(path_type=Path), help="Path to write to."
-        ),
+        click.option("--out", default=out, type=click.Path(path_type=Path), help=where),
     )
 
     def add(command: Callable[..., Any]) -> Callable[..., Any]:
