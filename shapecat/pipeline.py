@@ -46,9 +46,9 @@ from shapecat.runs.perceiving import Work, perceive_all, revise
 from shapecat.runs.resuming import has_work, resume, take_over_frames
 from shapecat.runs.run_info import RunInfo
 from shapecat.runs.segments import discard_segments
-from shapecat.runs.tables import release_memory
 from shapecat.system import stopping
 from shapecat.system.files import holding
+from shapecat.system.memory import release_memory
 from shapecat.system.progress import Observer, ignore
 from shapecat.types import LabelledFrame, ShownFrame
 

@@ -14,7 +14,8 @@ from shapecat.geometry import box_around
 from shapecat.runs.label_meaning import TrackLabel
 from shapecat.runs.masks import read_masks
 from shapecat.runs.shown import ShownTracks
-from shapecat.runs.tables import Key, numbers, read_together, release_memory
+from shapecat.runs.tables import Key, numbers, read_together
+from shapecat.system.memory import release_memory
 from shapecat.types import (
     Box,
     ImageMasks,

@@ -37,7 +37,9 @@ def resume(folder: Path, planned: RunInfo, source: Path, digest: Callable[[], st
     """
     with suppress(OutputError):
         run = _with_outputs(read_run(folder), planned)
-        if not differences(run, planned) and _same_source(run, planned, source, digest):
+        if not differences(run, planned) and _same_recording_and_versions(
+            run, planned, source, digest
+        ):
             if "perceive" in run["seconds"]:
                 run["counts"]["resumed"] = run["counts"]["frames"]
             return {**run, "input": planned["input"]}
@@ -71,7 +73,8 @@ def take_over_frames(
         run = _with_outputs(read_run(finished), planned)
         changed = differences(run, planned)
         later = bool(changed) and all(each.startswith(_LATER) for each in changed)
-        if not later or not _same_source(run, planned, source, digest) or not _whole(finished, run):
+        alike = later and _same_recording_and_versions(run, planned, source, digest)
+        if not (alike and _is_complete(finished, run)):
             return planned
     except OutputError:
         return planned
@@ -100,7 +103,9 @@ def _with_outputs(run: RunInfo, planned: RunInfo) -> RunInfo:
     return run
 
 
-def _same_source(run: RunInfo, planned: RunInfo, source: Path, digest: Callable[[], str]) -> bool:
+def _same_recording_and_versions(
+    run: RunInfo, planned: RunInfo, source: Path, digest: Callable[[], str]
+) -> bool:
     """Return whether a run was made by the same versions from the same recording."""
     if run.get("versions") != planned["versions"]:
         return False
@@ -108,7 +113,7 @@ def _same_source(run: RunInfo, planned: RunInfo, source: Path, digest: Callable[
     return unchanged(known["files"], source) or same_content(known, source, digest)
 
 
-def _whole(folder: Path, run: RunInfo) -> bool:
+def _is_complete(folder: Path, run: RunInfo) -> bool:
     """Return whether both phases are done and the tables have all rows of the counts."""
     counts = run["counts"]
     return (

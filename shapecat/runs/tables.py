@@ -6,9 +6,8 @@ side by side in constant memory. Adding a column is allowed within a schema vers
 meaning of one is not.
 """
 
-import ctypes
 from collections.abc import Iterator, Mapping, Sequence
-from contextlib import contextmanager, suppress
+from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
@@ -42,7 +41,6 @@ __all__ = [
     "opened",
     "read_row_groups",
     "read_together",
-    "release_memory",
     "rows_as_lists",
     "rows_of",
     "topic_codes",
@@ -67,6 +65,7 @@ _FULL = (
 FULL_WIDTHS = {name: kind.list_size for name, kind in _FULL}
 """Columns of full boxes, and the number of values in each."""
 FULL_BOX = ("center_full", "size_full", "orientation_full")
+"""Columns of the box itself: centre and size in metres, and a quaternion, in the sensor frame."""
 BOX_WIDTH = sum(FULL_WIDTHS[name] for name in FULL_BOX)
 FRAME_COLUMNS = (("topic", pa.string()), ("frame", pa.int32()), ("stamp_ns", pa.int64()))
 """Columns that identify a frame: topic, number on that topic, and stamp."""
@@ -272,13 +271,6 @@ def numbers_or_nan(column: pa.ChunkedArray) -> Any:
 def full_boxes_of(table: pa.Table) -> F4:
     """Return the columns `FULL_BOX` as one array (rows, `BOX_WIDTH`); NaN if unknown."""
     return np.hstack([numbers_or_nan(table[name]) for name in FULL_BOX])
-
-
-def release_memory() -> None:
-    """Return freed memory to the operating system."""
-    pa.default_memory_pool().release_unused()
-    with suppress(OSError, AttributeError):  # glibc keeps small freed blocks
-        ctypes.CDLL(None).malloc_trim(0)
 
 
 @contextmanager

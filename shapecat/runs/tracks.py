@@ -25,10 +25,10 @@ from shapecat.runs.tables import (
     open_writer,
     read_row_groups,
     read_together,
-    release_memory,
     rows_as_lists,
 )
 from shapecat.system.files import replacing
+from shapecat.system.memory import release_memory
 from shapecat.tracking import FrameDetections, Track, track_recording
 from shapecat.types import UNKNOWN
 
