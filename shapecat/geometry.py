@@ -31,6 +31,7 @@ __all__ = [
     "rotation_from_quaternion",
     "row_quaternion",
     "transform",
+    "unit_direction",
     "upright_box",
 ]
 
@@ -67,6 +68,21 @@ def inverse(a_from_b: Pose) -> Pose:
 def transform(a_from_b: Pose, points: ArrayLike) -> F8:
     """Transform points (n, 3) or one point (3,) from frame b to frame a."""
     return np.asarray(np.asarray(points, np.float64) @ a_from_b.rotation.T + a_from_b.translation)
+
+
+def unit_direction(vector: ArrayLike) -> F8:
+    """Return a vector (3,) scaled to length 1.
+
+    Raises
+    ------
+    ValueError : it is not three finite numbers, or they are all zero.
+    """
+    v = np.asarray(vector, np.float64)
+    norm = float(np.linalg.norm(v))
+    if v.shape != (3,) or not 1e-9 < norm < math.inf:
+        msg = f"expected a direction of three numbers, not all zero; got {v.tolist()}"
+        raise ValueError(msg)
+    return np.asarray(v / norm)
 
 
 def rotation_from_quaternion(quaternion: ArrayLike) -> F8:

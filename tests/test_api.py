@@ -207,8 +207,10 @@ IMAGE = np.ones((4, 6), np.float32)
         (IMAGE * 900, {"intrinsics": (5, 5, 3, 2)}, "divide millimetres by 1000"),
         (np.ones((4, 6, 3)), {"intrinsics": (5, 5, 3, 2)}, r"depth image \(h, w\)"),
         (np.array([["a"]]), {"intrinsics": (5, 5, 3, 2)}, "depth image"),
-        (np.ones((9, 3)), {"up": (0, 0, 0)}, "up direction"),
-        (np.ones((9, 3)), {"up": (0, 1)}, "up direction"),
+        (np.ones((9, 3)), {"up": (0, 0, 0)}, "up: expected a direction"),
+        (np.ones((9, 3)), {"up": (0, 1)}, "up: expected a direction"),
+        (np.ones((9, 3)), {"up": (0, np.inf, 1)}, "up: expected a direction"),
+        (np.ones((9, 3)), {"up": "imu"}, "up: could not convert"),
         (np.ones((9, 3)), {"seeed": 1}, "did you mean seed"),
     ],
 )

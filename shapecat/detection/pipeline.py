@@ -52,7 +52,7 @@ from shapecat.detection.segmentation.connectivity import connect_surfaces
 from shapecat.detection.segmentation.watershed import watershed
 from shapecat.detection.segmentation.width_split import split_at_width_changes
 from shapecat.detection.virtual_camera import VirtualImage, top_view, virtual_image
-from shapecat.geometry import IDENTITY, inverse
+from shapecat.geometry import IDENTITY, inverse, unit_direction
 from shapecat.types import Camera, Frame, Scene
 
 __all__ = ["Task", "detect", "label", "merge_segments", "oversegment"]
@@ -102,21 +102,12 @@ def detect(
     cloud was not taken from its origin, the virtual camera looks down on its dominant plane; the
     points of a fused cloud that are hidden in that view join the objects they touch.
     """
-    hint, task = None if up is None else _unit(up), Task(settings, rng)
+    hint, task = None if up is None else unit_direction(up), Task(settings, rng)
     if frame.depth is not None and frame.camera is not None:
         scene = _in_image(frame.depth, frame.camera, hint, task)
     else:
         scene = _in_cloud(frame.xyz(), hint, task)
     return scene or Scene(np.array(DEFAULT_UP) if hint is None else hint, (), ())
-
-
-def _unit(up: ArrayLike) -> F8:
-    vector = np.asarray(up, np.float64)
-    norm = float(np.linalg.norm(vector))
-    if vector.shape != (3,) or not (np.isfinite(norm) and norm > 1e-9):
-        msg = f"up must be a direction (3,), got {vector.tolist()}"
-        raise ValueError(msg)
-    return vector / norm
 
 
 def _in_image(depth: F4, camera: Camera, hint: F8 | None, task: Task) -> Scene | None:

@@ -7,9 +7,9 @@ from functools import partial
 import numpy as np
 from numpy.typing import ArrayLike
 
-from shapecat.arrays import F4
 from shapecat.config import Settings
 from shapecat.errors import ConfigError
+from shapecat.geometry import unit_direction
 from shapecat.learning import Categorizer
 from shapecat.outputs.opened_run import RunFrame
 from shapecat.perception import perceive
@@ -76,12 +76,12 @@ def perceive_alone(
     ------
     ConfigError : ``up`` is not a direction.
     """
-    seen = perceive(
-        frame,
-        up=None if up is None else _unit(up),
-        categorizer=categorizer,
-        settings=settings,
-    )
+    try:
+        hint = None if up is None else unit_direction(up).astype(np.float32)
+    except (TypeError, ValueError) as error:
+        msg = f"up: {error}"
+        raise ConfigError(msg) from None
+    seen = perceive(frame, up=hint, categorizer=categorizer, settings=settings)
     objects = tuple(
         _labelled(number, detection, seen.scene, categorizer.categories)
         for number, detection in enumerate(seen.detections, start=1)
@@ -100,16 +100,6 @@ def perceive_alone(
         up=seen.scene.up,
     )
     return RunFrame(labelled, frame)
-
-
-def _unit(up: Sequence[float]) -> F4:
-    """Return a direction (3,) as a unit vector."""
-    direction = np.asarray(up, np.float64)
-    length = float(np.linalg.norm(direction))
-    if direction.shape != (3,) or not 0 < length < math.inf:
-        msg = f"expected three numbers as the up direction, not all zero; got {up}"
-        raise ConfigError(msg)
-    return np.asarray(direction / length, np.float32)
 
 
 def _labelled(

@@ -8,6 +8,7 @@ import numpy as np
 
 from shapecat.arrays import F4
 from shapecat.errors import ConfigError
+from shapecat.geometry import unit_direction
 from shapecat.recordings.imu import Accelerometers
 from shapecat.recordings.recording import Recording
 from shapecat.recordings.transform_window import TransformWindow
@@ -177,11 +178,7 @@ class Upright:
 
 def _parse_vector(text: str) -> F4:
     try:
-        vector = np.array([float(part) for part in text.split(",")], np.float64)
+        return unit_direction([float(part) for part in text.split(",")]).astype(np.float32)
     except ValueError:
-        vector = np.zeros(0)
-    length = float(np.linalg.norm(vector))
-    if vector.shape != (3,) or not 1e-6 < length < np.inf:
         msg = f"--up {text}: expected auto, tf, imu, or a vector such as 0,-1,0"
-        raise ConfigError(msg)
-    return np.asarray(vector / length, np.float32)
+        raise ConfigError(msg) from None
