@@ -4,6 +4,7 @@ import dataclasses
 
 import numpy as np
 import pytest
+from scipy.ndimage import binary_dilation, find_objects, label, uniform_filter
 
 from shapecat.arrays import F8
 from shapecat.simulation.measuring import measure
@@ -12,7 +13,7 @@ from shapecat.simulation.paths import looking_at
 from shapecat.simulation.primitives import lathe, rounded_box
 from shapecat.simulation.render import Geometry, Image, alone_pixels, cropped, geometry, render
 from shapecat.simulation.scenes import make_scene
-from shapecat.simulation.sensors import IDEAL, KINECT, REALSENSE, Sensor
+from shapecat.simulation.sensors import IDEAL, KINECT, PRESETS, REALSENSE, Sensor, resized
 from shapecat.types import Camera, Pose
 
 HERE = Pose(np.eye(3), np.zeros(3))
@@ -220,6 +221,82 @@ def test_shadow_lies_beside_nearer_things(sensor: Sensor, right: float) -> None:
 
     assert 0.6 * full < left_run < full + 1
     assert abs(right_run - right) < 2.0
+
+
+@pytest.mark.parametrize("name", ["d415", "d435", "d455", "sr300"])
+def test_noise_comes_in_waves_as_wide_as_the_matching_windows(name: str) -> None:
+    """Finer noise vanishes in voxels, and surfaces would come out flatter than real ones.
+
+    Real cameras bend a plane in waves of 15 to 40 pixels, and hardly roughen it below 5.
+    """
+    sensor = PRESETS[name]
+    plain = dataclasses.replace(sensor, wave=0.0, holes=0.0, step=0.0, grazing=0.0)
+    depth, _ = measure(wall_image(plain, 1.0), plain, np.random.default_rng(0))
+    error = 1 / depth[20:460, 40:600].astype(np.float64) - 1.0
+    smooth = uniform_filter(error, 5)
+    waves = smooth - uniform_filter(smooth, 41)
+
+    assert error.std() == pytest.approx(sensor.noise, rel=0.12)
+    assert (error - smooth).std() < 0.35 * waves.std()
+    assert waves.std() > 0.65 * sensor.noise
+
+
+def test_stereo_matching_fails_around_nearer_surfaces() -> None:
+    """In real images, readings are missing on all sides of an object, not only in its shadow."""
+    plain = dataclasses.replace(IDEAL, edge_px=6)
+    box = rounded_box([0.2, 0.3, 0.1])
+    seen = [(big_quad(1.2), HERE), (box, Pose(np.eye(3), np.array([0.05, -0.02, 0.8])))]
+    image = render(geometry(seen), plain.camera, HERE)
+    depth, owners = measure(image, plain, np.random.default_rng(0))
+    near = image.owners == 1
+    margin = binary_dilation(near, np.ones((13, 13))) & ~near
+
+    assert margin.sum() > 4000
+    assert (depth[margin] == 0).all()
+    assert (owners[margin] == -1).all()
+    assert (depth[~margin] > 0).all()
+
+
+def test_a_table_seen_at_a_low_angle_has_no_margins() -> None:
+    """Its inverse depth changes within a few pixels as much as at an outline."""
+    pose = looking_at(np.array([0, 0, 0.35]), np.array([0, 1.0, 0.2]))
+    sensor = dataclasses.replace(PRESETS["d455"], holes=0.0, grazing=0.0, border_px=(0,) * 4)
+    image = render(geometry([(big_quad(0.0), HERE)]), sensor.camera, pose)
+    depth, _ = measure(image, sensor, np.random.default_rng(0))
+    near = (image.depth > 0.8) & (image.depth < 2.5)
+
+    assert near.sum() > 50_000
+    assert (depth[near] > 0).mean() > 0.99
+
+
+@pytest.mark.parametrize("z", [0.5, 2.0])
+def test_noise_of_time_of_flight_grows_with_the_distance(z: float) -> None:
+    """With the noise of 1 m at 0.4 m, near objects would be rougher than real ones."""
+    sensor = dataclasses.replace(PRESETS["l515"], wave=0.0, holes=0.0)
+    depth, _ = measure(wall_image(sensor, z), sensor, np.random.default_rng(0))
+
+    assert depth[depth > 0].std() == pytest.approx(sensor.noise_m * z, rel=0.1)
+
+
+def test_stereo_loses_patches_and_not_single_pixels() -> None:
+    """Filters close holes of three pixels; those of real cameras are as wide as their windows."""
+    sensor = dataclasses.replace(IDEAL, holes=0.01, hole_px=12)
+    depth, _ = measure(wall_image(sensor, 1.0), sensor, np.random.default_rng(0))
+    holes, count = label(depth == 0)
+    widths = np.array([part[1].stop - part[1].start for part in find_objects(holes)])
+
+    assert 0.006 < (depth == 0).mean() < 0.014
+    assert count > 30
+    assert np.median(widths) >= 5
+
+
+def test_a_smaller_image_has_the_same_errors_in_smaller_windows() -> None:
+    """Margins of 8 pixels in an image of half the width would swallow the objects."""
+    half = resized(PRESETS["d455"], 0.5)
+
+    assert (half.camera.width, half.edge_px, half.hole_px, half.rounded_px) == (640, 4, 6, 8)
+    assert half.grain == (8, 6)
+    assert resized(IDEAL, 0.5).edge_px == 0
 
 
 def test_what_is_out_of_range_has_no_reading() -> None:

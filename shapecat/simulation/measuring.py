@@ -14,6 +14,8 @@ __all__ = ["measure"]
 
 _STEP = 0.03
 """Step in inverse depth that separates two surfaces, 1/m."""
+_MARGIN = 0.07
+"""Step in inverse depth beside which stereo matching fails, 1/m."""
 
 
 def measure(image: Image, sensor: Sensor, rng: Generator) -> tuple[F4, I4]:
@@ -31,6 +33,8 @@ def measure(image: Image, sensor: Sensor, rng: Generator) -> tuple[F4, I4]:
     """
     inverse, owners, cosine = _displaced(image, sensor, rng)
     lost = np.zeros(image.inverse.shape, np.bool_)
+    if sensor.edge_px:
+        _lose_margins(inverse, sensor.edge_px, lost)
     for place in sensor.shadow_m:
         _cast_shadow(inverse, place * sensor.camera.fx, lost)
     if sensor.filled_px > 0:
@@ -61,37 +65,59 @@ def _displaced(image: Image, sensor: Sensor, rng: Generator) -> tuple[F8, I4, F4
     inverse = np.array(image.inverse)
     owners, cosine = np.array(image.owners), np.array(image.cosine)
     if sensor.ragged_px > 0:
-        across = _grain(inverse.shape, sensor.ragged_window, sensor.ragged_px, rng)
-        down = _grain(inverse.shape, sensor.ragged_window, sensor.ragged_px, rng)
+        shape, window, size = inverse.shape, sensor.ragged_window, sensor.ragged_px
+        across = _grain(shape, window, size, rng, smoothings=sensor.smoothings)
+        down = _grain(shape, window, size, rng, smoothings=sensor.smoothings)
         _look_beside(
             image.inverse, image.owners, image.cosine, across, down, inverse, owners, cosine
         )
     return inverse, owners, cosine
 
 
-def _grain(shape: tuple[int, int], window: tuple[int, int], deviation: float, rng: Generator) -> F4:
+def _grain(
+    shape: tuple[int, int],
+    window: tuple[int, int],
+    deviation: float,
+    rng: Generator,
+    *,
+    smoothings: int = 1,
+) -> F4:
     """Return nearly normal noise (h, w), correlated over a window (across, down) in pixels.
 
     Sums of random bytes are many times faster than normal numbers.
     """
     wide, tall = window
-    raw = rng.integers(0, 256, (shape[0] + tall - 1, shape[1] + wide - 1), np.uint8)
-    result = np.zeros(shape, np.float32)
-    _box_sum(raw, wide, tall, result)
+    height, width = (n + smoothings * (k - 1) for n, k in zip(shape, (tall, wide), strict=True))
+    result = rng.integers(0, 256, (height, width), np.uint8)
+    for k in range(smoothings - 1, -1, -1):
+        size = shape[0] + k * (tall - 1), shape[1] + k * (wide - 1)
+        raw, result = result, np.zeros(size, np.float32)
+        _box_sum(raw, wide, tall, result)
     byte = np.sqrt((256**2 - 1) / 12)
-    result -= np.float32(127.5 * wide * tall)
-    result *= np.float32(deviation / (byte * np.sqrt(wide * tall)))
+    gain = _gain(wide, smoothings) * _gain(tall, smoothings)
+    result -= np.float32(127.5 * (wide * tall) ** smoothings)
+    result *= np.float32(deviation / (byte * gain))
     return result
+
+
+def _gain(width: int, times: int) -> float:
+    """Return by how much summing over windows of this width, several times, raises a deviation."""
+    weights = np.ones(1)
+    for _ in range(times):
+        weights = np.convolve(weights, np.ones(width))
+    return float(np.linalg.norm(weights))
 
 
 def _error(inverse: F8, sensor: Sensor, rng: Generator) -> F4:
     """Return the error (h, w) of the inverse depth before quantization, 1/m."""
     error = np.zeros(inverse.shape, np.float32)
     if sensor.noise > 0:
-        error += _grain(inverse.shape, sensor.grain, sensor.noise, rng)
+        error += _grain(
+            inverse.shape, sensor.grain, sensor.noise, rng, smoothings=sensor.smoothings
+        )
     if sensor.noise_m > 0:
-        in_metres = _grain(inverse.shape, sensor.grain, sensor.noise_m, rng)
-        error += in_metres * (inverse * inverse).astype(np.float32)
+        relative = _grain(inverse.shape, sensor.grain, sensor.noise_m, rng)
+        error += relative * inverse.astype(np.float32)
     if sensor.wave > 0:
         error += _wave(inverse.shape, sensor.wave, sensor.wave_px, sensor.device)
     return error
@@ -119,7 +145,8 @@ def _returned(cosine: F4, owners: I4, sensor: Sensor) -> F4:
 def _lose_grazing(cosine: F4, sensor: Sensor, rng: Generator, lost: Bool) -> None:
     """Mark lost readings where the ray grazes the surface."""
     if sensor.grazing > 0:
-        luck = _grain(cosine.shape, (3, 3), 0.5 * sensor.grazing, rng)
+        window = (sensor.hole_px, sensor.hole_px)
+        luck = _grain(cosine.shape, window, 0.5 * sensor.grazing, rng)
         lost |= cosine < luck + np.float32(sensor.grazing)
 
 
@@ -132,11 +159,12 @@ def _lose_border(sensor: Sensor, lost: Bool) -> None:
 
 
 def _punch_holes(sensor: Sensor, rng: Generator, lost: Bool) -> None:
-    """Mark lost readings in small random holes."""
-    count = rng.poisson(sensor.holes * lost.size / 8) if sensor.holes > 0 else 0
+    """Mark lost readings in random holes."""
+    area = 0.32 * (sensor.hole_px + 2) ** 2
+    count = rng.poisson(sensor.holes * lost.size / area) if sensor.holes > 0 else 0
     rows = rng.integers(0, lost.shape[0], count)
     columns = rng.integers(0, lost.shape[1], count)
-    sizes = rng.integers(1, 5, (count, 2))
+    sizes = rng.integers(1, sensor.hole_px + 2, (count, 2))
     for v, u, (tall, wide) in zip(rows, columns, sizes, strict=True):
         lost[v : v + tall, u : u + wide] = True
 
@@ -195,7 +223,27 @@ def _look_beside(
 
 
 @kernel
-def _box_sum(raw: U1, wide: int, tall: int, out: F4) -> None:
+def _lose_margins(inverse: F8, width: int, lost: Bool) -> None:
+    """Mark the pixels that are near a nearer surface, up to ``width`` pixels to each side."""
+    height, columns = inverse.shape
+    nearest = np.zeros(inverse.shape)
+    for v in range(height):
+        for u in range(columns):
+            best = inverse[v, u]
+            for x in range(max(u - width, 0), min(u + width + 1, columns)):
+                best = max(best, inverse[v, x])
+            nearest[v, u] = best
+    for v in range(height):
+        first, last = max(v - width, 0), min(v + width + 1, height)
+        for u in range(columns):
+            for y in range(first, last):
+                if nearest[y, u] > inverse[v, u] + _MARGIN:
+                    lost[v, u] = True
+                    break
+
+
+@kernel
+def _box_sum(raw: U1 | F4, wide: int, tall: int, out: F4) -> None:
     height, width = out.shape
     column = np.zeros(raw.shape[1], np.float32)
     for v in range(height):

@@ -24,8 +24,10 @@ class Sensor:
     nearest_m, farthest_m : range of depth that is reported.
     step : quantization of the inverse depth, 1/m; 0 is none.
     noise : standard deviation of the inverse depth, 1/m, for cameras that triangulate.
-    noise_m : standard deviation of the depth, metres, for time-of-flight cameras.
+    noise_m : standard deviation of the depth at 1 m, metres, for time-of-flight cameras; it grows
+        with the depth.
     grain : (across, down) correlation window of the noise, pixels.
+    smoothings : how often the noise is averaged over this window; more give smoother waves.
     wave : standard deviation of a fixed error of the device in inverse depth, 1/m.
     wave_px : distance over which this error varies, pixels.
     device : seed of the fixed error and of the objects' reflectance.
@@ -37,7 +39,9 @@ class Sensor:
     grazing : cosine of the angle of incidence at which half of the readings fail.
     dark : standard deviation of the logarithm of the objects' reflectance; a dark object loses
         readings at smaller angles of incidence.
-    holes : approximate fraction of the pixels lost in small random holes.
+    edge_px : width of the margin around nearer surfaces in which stereo matching fails, pixels.
+    holes : approximate fraction of the pixels lost in random holes.
+    hole_px : approximate width of the largest holes, pixels.
     blend_px : window that mixes near and far at outlines (flying pixels), pixels; 0 is none.
     rounded_px : window that rounds edges and corners within a surface (multipath, smoothing
         windows), pixels; 0 is none.
@@ -51,6 +55,7 @@ class Sensor:
     noise: float = 0.0
     noise_m: float = 0.0
     grain: tuple[int, int] = (1, 1)
+    smoothings: int = 1
     wave: float = 0.0
     wave_px: int = 80
     device: int = 1
@@ -60,7 +65,9 @@ class Sensor:
     filled_px: float = 0.0
     grazing: float = 0.0
     dark: float = 0.0
+    edge_px: int = 0
     holes: float = 0.0
+    hole_px: int = 3
     blend_px: int = 0
     rounded_px: int = 0
     border_px: tuple[int, int, int, int] = (0, 0, 0, 0)
@@ -129,7 +136,7 @@ _KINECT_V2 = Sensor(
 _AZURE_KINECT = Sensor(
     _camera(640, 576, 504.0),
     nearest_m=0.45,
-    noise_m=0.0013,
+    noise_m=0.0011,
     grain=(3, 3),
     wave=0.0015,
     wave_px=120,
@@ -149,39 +156,41 @@ _D435 = Sensor(
     _camera(848, 480, 425.0),
     nearest_m=0.2,
     step=0.0015,
-    noise=0.0035,
-    grain=(11, 7),
-    wave=0.009,
+    noise=0.0032,
+    grain=(11, 9),
+    smoothings=2,
+    wave=0.006,
     wave_px=90,
-    ragged_px=1.3,
-    ragged_window=(7, 7),
+    ragged_px=2.0,
+    ragged_window=(11, 11),
     shadow_m=(0.05,),
     filled_px=2.0,
     grazing=0.15,
     dark=0.2,
-    holes=0.003,
-    blend_px=5,
-    rounded_px=7,
+    edge_px=6,
+    holes=0.004,
+    hole_px=8,
+    blend_px=3,
+    rounded_px=11,
     border_px=(12, 0, 0, 0),
 )
-"""Intel D435 without filters: disparity noise of 0.08 px at a focal length of 425 px and a baseline
-of 50 mm; Grunnet-Jepsen et al., Best-known methods for tuning D400 depth cameras, 2018."""
+"""Intel D435 without filters: noise of 0.07 px of disparity at a focal length of 425 px and a
+baseline of 50 mm, in waves as wide as the matching windows; Grunnet-Jepsen et al., Best-known
+methods for tuning D400 depth cameras, 2018."""
 
 _D415 = replace(
     _D435,
     camera=_camera(848, 480, 615.0),
     nearest_m=0.3,
     step=0.0009,
-    noise=0.0020,
-    grain=(13, 7),
-    wave=0.006,
+    noise=0.0023,
+    grain=(13, 11),
+    wave=0.004,
     wave_px=110,
-    ragged_px=1.2,
     shadow_m=(0.055,),
-    holes=0.002,
     border_px=(14, 0, 0, 0),
 )
-"""Intel D415: disparity noise of 0.06 px, focal length 615 px, baseline 55 mm; source as for the
+"""Intel D415: disparity noise of 0.08 px, focal length 615 px, baseline 55 mm; source as for the
 D435."""
 
 _D455 = replace(
@@ -189,20 +198,21 @@ _D455 = replace(
     camera=_camera(1280, 720, 640.0),
     nearest_m=0.4,
     step=0.0005,
-    noise=0.0013,
-    grain=(15, 9),
-    wave=0.004,
+    noise=0.0024,
+    grain=(17, 13),
+    wave=0.003,
     wave_px=130,
-    ragged_px=1.6,
-    ragged_window=(9, 9),
+    ragged_px=2.6,
+    ragged_window=(15, 15),
     shadow_m=(0.095,),
     filled_px=3.0,
-    holes=0.002,
-    blend_px=7,
-    rounded_px=9,
+    edge_px=8,
+    hole_px=12,
+    blend_px=5,
+    rounded_px=17,
     border_px=(30, 0, 0, 0),
 )
-"""Intel D455: disparity noise of 0.08 px, focal length 640 px, baseline 95 mm; source as for the
+"""Intel D455: disparity noise of 0.15 px, focal length 640 px, baseline 95 mm; source as for the
 D435."""
 
 _SR300 = Sensor(
@@ -210,8 +220,9 @@ _SR300 = Sensor(
     nearest_m=0.2,
     farthest_m=1.5,
     step=0.0005,
-    noise=0.003,
-    grain=(3, 3),
+    noise=0.0018,
+    grain=(9, 9),
+    smoothings=2,
     wave=0.005,
     wave_px=100,
     ragged_px=0.6,
@@ -220,6 +231,7 @@ _SR300 = Sensor(
     filled_px=1.0,
     grazing=0.3,
     dark=0.6,
+    edge_px=3,
     holes=0.002,
     blend_px=3,
     border_px=(4, 4, 0, 0),
@@ -312,6 +324,10 @@ def resized(sensor: Sensor, scale: float) -> Sensor:
         ragged_px=sensor.ragged_px * scale,
         wave_px=max(round(sensor.wave_px * scale), 2),
         filled_px=sensor.filled_px * scale,
+        edge_px=round(sensor.edge_px * scale),
+        hole_px=max(round(sensor.hole_px * scale), 3),
+        blend_px=round(sensor.blend_px * scale),
+        rounded_px=round(sensor.rounded_px * scale),
     )
 
 
