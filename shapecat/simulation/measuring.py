@@ -1,12 +1,11 @@
 """Error model of a depth camera: from rendered depth to measured depth."""
 
-from functools import lru_cache
-
 import numpy as np
 from numpy.random import Generator
 
-from shapecat.arrays import F4, F8, I4, U1, Bool
+from shapecat.arrays import F4, F8, I4, Bool
 from shapecat.jit import kernel
+from shapecat.simulation.noise import fixed_error, noise
 from shapecat.simulation.render import Image
 from shapecat.simulation.sensors import Sensor
 
@@ -66,71 +65,25 @@ def _displaced(image: Image, sensor: Sensor, rng: Generator) -> tuple[F8, I4, F4
     owners, cosine = np.array(image.owners), np.array(image.cosine)
     if sensor.ragged_px > 0:
         shape, window, size = inverse.shape, sensor.ragged_window, sensor.ragged_px
-        across = _grain(shape, window, size, rng, smoothings=sensor.smoothings)
-        down = _grain(shape, window, size, rng, smoothings=sensor.smoothings)
+        across = noise(shape, window, size, rng, smoothings=sensor.smoothings)
+        down = noise(shape, window, size, rng, smoothings=sensor.smoothings)
         _look_beside(
             image.inverse, image.owners, image.cosine, across, down, inverse, owners, cosine
         )
     return inverse, owners, cosine
 
 
-def _grain(
-    shape: tuple[int, int],
-    window: tuple[int, int],
-    deviation: float,
-    rng: Generator,
-    *,
-    smoothings: int = 1,
-) -> F4:
-    """Return nearly normal noise (h, w), correlated over a window (across, down) in pixels.
-
-    Sums of random bytes are many times faster than normal numbers.
-    """
-    wide, tall = window
-    height, width = (n + smoothings * (k - 1) for n, k in zip(shape, (tall, wide), strict=True))
-    result = rng.integers(0, 256, (height, width), np.uint8)
-    for k in range(smoothings - 1, -1, -1):
-        size = shape[0] + k * (tall - 1), shape[1] + k * (wide - 1)
-        raw, result = result, np.zeros(size, np.float32)
-        _box_sum(raw, wide, tall, result)
-    byte = np.sqrt((256**2 - 1) / 12)
-    gain = _gain(wide, smoothings) * _gain(tall, smoothings)
-    result -= np.float32(127.5 * (wide * tall) ** smoothings)
-    result *= np.float32(deviation / (byte * gain))
-    return result
-
-
-def _gain(width: int, times: int) -> float:
-    """Return by how much summing over windows of this width, several times, raises a deviation."""
-    weights = np.ones(1)
-    for _ in range(times):
-        weights = np.convolve(weights, np.ones(width))
-    return float(np.linalg.norm(weights))
-
-
 def _error(inverse: F8, sensor: Sensor, rng: Generator) -> F4:
     """Return the error (h, w) of the inverse depth before quantization, 1/m."""
     error = np.zeros(inverse.shape, np.float32)
     if sensor.noise > 0:
-        error += _grain(
-            inverse.shape, sensor.grain, sensor.noise, rng, smoothings=sensor.smoothings
-        )
+        error += noise(inverse.shape, sensor.grain, sensor.noise, rng, smoothings=sensor.smoothings)
     if sensor.noise_m > 0:
-        relative = _grain(inverse.shape, sensor.grain, sensor.noise_m, rng)
+        relative = noise(inverse.shape, sensor.grain, sensor.noise_m, rng)
         error += relative * inverse.astype(np.float32)
     if sensor.wave > 0:
-        error += _wave(inverse.shape, sensor.wave, sensor.wave_px, sensor.device)
+        error += fixed_error(inverse.shape, sensor.wave, sensor.wave_px, sensor.device)
     return error
-
-
-@lru_cache(maxsize=8)
-def _wave(shape: tuple[int, int], deviation: float, spacing: int, device: int) -> F4:
-    """Return the fixed error (h, w) of a device, 1/m: smooth, and the same in every image."""
-    knots = (shape[0] // spacing + 2, shape[1] // spacing + 2)
-    heights = np.random.default_rng(device).normal(0, 1.5 * deviation, knots)
-    result = np.zeros(shape, np.float32)
-    _interpolate(heights, spacing, result)
-    return result
 
 
 def _returned(cosine: F4, owners: I4, sensor: Sensor) -> F4:
@@ -146,7 +99,7 @@ def _lose_grazing(cosine: F4, sensor: Sensor, rng: Generator, lost: Bool) -> Non
     """Mark lost readings where the ray grazes the surface."""
     if sensor.grazing > 0:
         window = (sensor.hole_px, sensor.hole_px)
-        luck = _grain(cosine.shape, window, 0.5 * sensor.grazing, rng)
+        luck = noise(cosine.shape, window, 0.5 * sensor.grazing, rng)
         lost |= cosine < luck + np.float32(sensor.grazing)
 
 
@@ -160,7 +113,7 @@ def _lose_border(sensor: Sensor, lost: Bool) -> None:
 
 def _punch_holes(sensor: Sensor, rng: Generator, lost: Bool) -> None:
     """Mark lost readings in random holes."""
-    area = 0.32 * (sensor.hole_px + 2) ** 2
+    area = 0.32 * (sensor.hole_px + 2) ** 2  # about the mean of width times height
     count = rng.poisson(sensor.holes * lost.size / area) if sensor.holes > 0 else 0
     rows = rng.integers(0, lost.shape[0], count)
     columns = rng.integers(0, lost.shape[1], count)
@@ -224,7 +177,7 @@ def _look_beside(
 
 @kernel
 def _lose_margins(inverse: F8, width: int, lost: Bool) -> None:
-    """Mark the pixels that are near a nearer surface, up to ``width`` pixels to each side."""
+    """Mark the pixels up to ``width`` rows and columns beside a nearer surface."""
     height, columns = inverse.shape
     nearest = np.zeros(inverse.shape)
     for v in range(height):
@@ -240,37 +193,6 @@ def _lose_margins(inverse: F8, width: int, lost: Bool) -> None:
                 if nearest[y, u] > inverse[v, u] + _MARGIN:
                     lost[v, u] = True
                     break
-
-
-@kernel
-def _box_sum(raw: U1 | F4, wide: int, tall: int, out: F4) -> None:
-    height, width = out.shape
-    column = np.zeros(raw.shape[1], np.float32)
-    for v in range(height):
-        for u in range(column.size):
-            column[u] = raw[v, u]
-        for k in range(1, tall):
-            for u in range(column.size):
-                column[u] += raw[v + k, u]
-        for u in range(width):
-            out[v, u] = column[u]
-        for k in range(1, wide):
-            for u in range(width):
-                out[v, u] += column[u + k]
-
-
-@kernel
-def _interpolate(knots: F8, spacing: int, out: F4) -> None:
-    height, width = out.shape
-    for v in range(height):
-        i = v // spacing
-        t = (v - i * spacing) / spacing
-        for u in range(width):
-            j = u // spacing
-            s = (u - j * spacing) / spacing
-            low = knots[i, j] + s * (knots[i, j + 1] - knots[i, j])
-            high = knots[i + 1, j] + s * (knots[i + 1, j + 1] - knots[i + 1, j])
-            out[v, u] = low + t * (high - low)
 
 
 @kernel

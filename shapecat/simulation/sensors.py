@@ -1,7 +1,8 @@
 """Depth cameras: their intrinsics and error models.
 
 The parameters of the Kinect and the RealSense D435 are fitted to real images of tables with
-objects; the other cameras follow their data sheets and the cited measurements.
+objects. The other cameras follow their data sheets and the cited measurements, the waves, margins
+and rounding of the D4xx and the SR300 also real images.
 """
 
 from dataclasses import dataclass, fields, replace
@@ -24,10 +25,9 @@ class Sensor:
     nearest_m, farthest_m : range of depth that is reported.
     step : quantization of the inverse depth, 1/m; 0 is none.
     noise : standard deviation of the inverse depth, 1/m, for cameras that triangulate.
-    noise_m : standard deviation of the depth at 1 m, metres, for time-of-flight cameras; it grows
-        with the depth.
+    noise_m : standard deviation of the depth of time-of-flight cameras, metres per metre.
     grain : (across, down) correlation window of the noise, pixels.
-    smoothings : how often the noise is averaged over this window; more give smoother waves.
+    smoothings : how often the noise, and the displacement of outlines, is averaged over its window.
     wave : standard deviation of a fixed error of the device in inverse depth, 1/m.
     wave_px : distance over which this error varies, pixels.
     device : seed of the fixed error and of the objects' reflectance.
@@ -39,9 +39,9 @@ class Sensor:
     grazing : cosine of the angle of incidence at which half of the readings fail.
     dark : standard deviation of the logarithm of the objects' reflectance; a dark object loses
         readings at smaller angles of incidence.
-    edge_px : width of the margin around nearer surfaces in which stereo matching fails, pixels.
+    edge_px : width of the margins around nearer surfaces in which stereo matching fails, pixels.
     holes : approximate fraction of the pixels lost in random holes.
-    hole_px : approximate width of the largest holes, pixels.
+    hole_px : approximate width of the largest holes, also of those at grazing incidence, pixels.
     blend_px : window that mixes near and far at outlines (flying pixels), pixels; 0 is none.
     rounded_px : window that rounds edges and corners within a surface (multipath, smoothing
         windows), pixels; 0 is none.
@@ -190,8 +190,7 @@ _D415 = replace(
     shadow_m=(0.055,),
     border_px=(14, 0, 0, 0),
 )
-"""Intel D415: disparity noise of 0.08 px, focal length 615 px, baseline 55 mm; source as for the
-D435."""
+"""Intel D415: disparity noise of 0.08 px at 615 px and 55 mm; source as for the D435."""
 
 _D455 = replace(
     _D435,
@@ -212,8 +211,7 @@ _D455 = replace(
     rounded_px=17,
     border_px=(30, 0, 0, 0),
 )
-"""Intel D455: disparity noise of 0.15 px, focal length 640 px, baseline 95 mm; source as for the
-D435."""
+"""Intel D455: disparity noise of 0.15 px at 640 px and 95 mm; source as for the D435."""
 
 _SR300 = Sensor(
     _camera(640, 480, 475.0),
