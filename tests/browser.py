@@ -156,7 +156,7 @@ class Browser:
             if self.run(script) is True:
                 return
             time.sleep(0.05)
-        pytest.fail(f"still not so: {script}")
+        pytest.fail(f"never became true: {script}")
 
     def cdp(self, command: str, parameters: object) -> Any:
         """Send a command of the DevTools protocol."""
@@ -170,7 +170,7 @@ class Browser:
         """Wait for a download to be complete."""
         for _ in range(100):
             found = [file for file in self.downloads.iterdir() if file.stat().st_size]
-            if [file.suffix for file in found] == [".csv"]:  # not .crdownload, nor its place
+            if [file.suffix for file in found] == [".csv"]:  # not .crdownload, nor its placeholder
                 return found[0]
             time.sleep(0.05)
         pytest.fail("nothing was downloaded")

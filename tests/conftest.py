@@ -29,15 +29,15 @@ LONGEST = (
     *("test_door", "test_exports_images", "test_evaluation", "test_learning", "test_jit"),
     *("test_rehearsal", "test_detection_stacks", "test_exports_readback", "test_tracking_scenes"),
 )
-"""Files of tests by the seconds that they take, longest first."""
+"""Test files by duration, longest first."""
 SHARED = Path(__file__).parents[2] / "shared" / "data"
 
 
 def pytest_configure() -> None:
-    """Obey interrupts, which a shell ignores for its background jobs.
+    """Obey interrupts, which a shell ignores for background jobs, and skip fsync.
 
-    And do not wait for the disk: only `test_run_folder` and the faults look at that. Collecting
-    garbage while all tests are imported would take a third of that time.
+    Only `test_run_folder` and `tests.faults` need fsync. Collecting garbage would take a third of
+    the time of importing all tests.
     """
     collect_seldom()
     signal.signal(signal.SIGINT, signal.default_int_handler)
@@ -45,9 +45,9 @@ def pytest_configure() -> None:
 
 
 def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
-    """Run the longest files first, so that no worker is left waiting for one at the end.
+    """Run the longest files first, so that no worker is left with one at the end.
 
-    A worker takes a whole file, for its fixtures.
+    A worker takes a whole file, because of its fixtures.
     """
     rank = {name: k for k, name in enumerate(LONGEST)}
     items.sort(key=lambda item: rank.get(item.path.stem, len(rank)))
@@ -63,9 +63,9 @@ def real_data() -> Path:
 
 @pytest.fixture(scope="session")
 def shapecat() -> Callable[..., Result]:
-    """Run the command as a user would, in this process, and as if it had one core.
+    """Run the command as a user would, but in this process and as if the machine had one core.
 
-    Other processes would start with each short recording, and end before they had loaded anything.
+    Other processes would start for each short recording, and end before they had loaded.
     """
     command: Any = import_module("shapecat.cli.main").main
 
@@ -82,9 +82,9 @@ def shapecat() -> Callable[..., Result]:
 
 @pytest.fixture
 def all_awake(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Let all processes of a job start before its first frame, and share its frames from there on.
+    """Start all processes of a job before its first frame, so that they share its frames.
 
-    Otherwise the first would perceive a short recording before another one has loaded anything.
+    Otherwise the first would process a short recording before the others have loaded.
     """
     begin = Processes.start
 
@@ -97,7 +97,7 @@ def all_awake(monkeypatch: pytest.MonkeyPatch) -> None:
 
 
 class LateAnswer(Future[Any]):
-    """An answer of another process that arrives when it is waited for, and not before."""
+    """An answer of another process that arrives only when the caller waits for it."""
 
     def __init__(self, function: Callable[..., Any], *arguments: Any) -> None:
         super().__init__()
@@ -113,13 +113,13 @@ class LateAnswer(Future[Any]):
 
 
 class LateExecutor(Executor):
-    """Replaces other processes, which are awake at once and know only what they are sent."""
+    """Replaces other processes: starts at once, and knows only what it is sent."""
 
     def __init__(self, _workers: int, **_options: int) -> None:
         self._awake = False
 
     def submit(self, fn: Callable[..., Any], /, *args: Any, **_options: Any) -> Future[Any]:
-        """Send a call; the first one wakes the process."""
+        """Send a call; the first one starts the process."""
         answer = LateAnswer(fn, *args)
         if not self._awake:
             answer.set_result(None)
@@ -127,12 +127,12 @@ class LateExecutor(Executor):
         return answer
 
     def terminate(self) -> None:
-        """Lose what was not waited for, as killed processes do."""
+        """Discard unfinished calls, as killed processes do."""
 
 
 @pytest.fixture
 def late_answers(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Let another process have frames from the first one on, always as many as it may hold."""
+    """Send frames to another process from the first frame on, as many as it may hold."""
     monkeypatch.setattr("shapecat.executors.order._ALONE", 0)
     monkeypatch.setattr("shapecat.executors.order.LocalExecutor", LateExecutor)
 
@@ -147,7 +147,7 @@ class Guesser:
         """Accept any descriptor."""
 
     def predict(self, descriptors: Any) -> Any:
-        """Return posteriors that are always the same, and no novelty."""
+        """Return deterministic posteriors and constant novelty."""
         x = np.nan_to_num(np.asarray(descriptors, np.float64))
         logits = x @ np.random.default_rng(0).normal(0, 0.3, (x.shape[1], len(self.categories)))
         logits -= logits.max(axis=1, keepdims=True)
@@ -194,7 +194,7 @@ def reported_run(guessed_run: Path, drawn: Any, tmp_path_factory: pytest.TempPat
 
 @pytest.fixture(scope="module")
 def undisturbed(recording: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """Process a test file's recording without any disturbance; return the parent folder."""
+    """Process a test file's recording without interruption; return the parent folder."""
     from shapecat.pipeline import process  # noqa: PLC0415  the same
     from shapecat.runs.jobs import Job  # noqa: PLC0415  the same
 

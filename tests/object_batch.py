@@ -175,10 +175,10 @@ if __name__ == "__main__":
         """Run the batch and print its outcome."""
         with tempfile.TemporaryDirectory() as folder:
             report = run(count, Path(folder), refused=refused)
-        twice = [name for name, times in report.made.items() if times != 1]
+        repeated = [name for name, times in report.made.items() if times != 1]
         click.echo(
             f"exit code {report.code}, {report.seconds:.0f} s, {dict(report.states)}, tries"
-            f" {dict(report.tries)}, {len(report.made)} made, {len(twice)} not once, left:"
+            f" {dict(report.tries)}, {len(report.made)} made, {len(repeated)} not once, left:"
             f" {report.left}, {report.refused} requests refused\n{report.errors[-1000:]}"
         )
 

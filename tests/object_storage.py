@@ -1,6 +1,6 @@
 """Object storage on this machine: moto's S3, which can refuse a fraction of the requests.
 
-    python -m tests.object_storage SHARE LOG      prints its port, serves until it is killed
+    python -m tests.object_storage SHARE LOG   prints its port, serves until killed
 
 Each answered request is a line of LOG: method, path, status.
 """
@@ -28,16 +28,16 @@ class Throttled:
     def __call__(self, environ: Any, start: Callable[..., Any]) -> Iterable[bytes]:
         """Answer a request."""
 
-        def noted(status: str, *rest: Any) -> Any:
+        def start_and_log(status: str, *rest: Any) -> Any:
             method, path = environ["REQUEST_METHOD"], environ["PATH_INFO"]
             self._log.write(f"{method} {path}?{environ['QUERY_STRING']} {status[:3]}\n")
             return start(status, *rest)
 
         if self._random.random() < self._share:
-            noted("503 Slow Down", [("Content-Type", "application/xml")])
+            start_and_log("503 Slow Down", [("Content-Type", "application/xml")])
             return [REFUSAL]
 
-        answer: Iterable[bytes] = self._application(environ, noted)
+        answer: Iterable[bytes] = self._application(environ, start_and_log)
         return answer
 
 

@@ -1,4 +1,4 @@
-"""Functions that tests run in other processes, which load this module quickly."""
+"""Functions that tests run in other processes; quick to import."""
 
 import os
 import signal

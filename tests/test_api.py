@@ -1,4 +1,4 @@
-"""The Python interface: light to import, arrays of the stated shapes, working examples."""
+"""Tests of the Python interface: imports, shapes of arrays, and the examples of its page."""
 
 import re
 import runpy
@@ -31,7 +31,7 @@ def blocks(kind: str) -> list[str]:
 
 
 @pytest.fixture(scope="module")
-def place(shapecat: Callable[..., Result], tmp_path_factory: pytest.TempPathFactory) -> Path:
+def page_folder(shapecat: Callable[..., Result], tmp_path_factory: pytest.TempPathFactory) -> Path:
     """Run every block of the page, in order, in an empty folder, as one script."""
     folder = tmp_path_factory.mktemp("python")
     (folder / "page.py").write_text("\n".join(blocks("python")), "utf-8")
@@ -43,10 +43,8 @@ def place(shapecat: Callable[..., Result], tmp_path_factory: pytest.TempPathFact
     return folder
 
 
-def test_the_times_of_a_posterior_count_from_the_first_frame(
-    guessed_run: Path, tmp_path: Path
-) -> None:
-    """Tracks start at different times; posteriors over their own age could not be compared."""
+def test_posterior_times_start_at_first_frame(guessed_run: Path, tmp_path: Path) -> None:
+    """Tracks start at different times; times since their own start could not be compared."""
     run = shapecat.open_run(guessed_run)
     rows = run.tracks.arrow()
     pq.write_table(rows.filter(pc.greater_equal(rows["frame"], 3)), tmp_path / "late.parquet")
@@ -59,27 +57,27 @@ def test_the_times_of_a_posterior_count_from_the_first_frame(
     assert posteriors.shape == (len(stamps) - 3, len(run.categories))
 
 
-def test_every_block_of_the_page_works_as_printed(place: Path) -> None:
+def test_every_example_on_the_page_runs(page_folder: Path) -> None:
     text = PAGE.read_text("utf-8")
     assert len(blocks("python")) + len(blocks("sh")) == text.count("```") // 2
-    assert (place / "posterior.png").read_bytes().startswith(b"\x89PNG")
+    assert (page_folder / "posterior.png").read_bytes().startswith(b"\x89PNG")
     (plot,) = (block for block in blocks("python") if "savefig" in block)
     assert len([line for line in plot.splitlines() if line.strip()]) <= 10
 
 
-def test_frames_have_the_points_and_masks_of_the_tables(place: Path) -> None:
+def test_frame_points_and_masks_match_tables(page_folder: Path) -> None:
     """A mask of the wrong frame, or a transposed one, would contradict the table."""
-    run = shapecat.open_run(place / "results" / "demo")
+    run = shapecat.open_run(page_folder / "results" / "demo")
     rows = pq.read_table(run.folder / "detections.parquet").to_pylist()
     objects = 0
-    for frame in run.frames(recording=place / "demo.mcap"):
+    for frame in run.frames(recording=page_folder / "demo.mcap"):
         assert frame.labels.shape == frame.shape == (480, 640)
         for item in frame.objects:
             objects += 1
-            place_in_time = (frame.labelled.index, frame.stamp_ns, item.indices.tolist())
-            mine = [r for r in rows if (r["frame"], r["stamp_ns"], r["indices"]) == place_in_time]
-            assert len(mine) == 1
-            assert frame.mask(item).ravel().nonzero()[0].tolist() == mine[0]["indices"]
+            key = (frame.labelled.index, frame.stamp_ns, item.indices.tolist())
+            matches = [r for r in rows if (r["frame"], r["stamp_ns"], r["indices"]) == key]
+            assert len(matches) == 1
+            assert frame.mask(item).ravel().nonzero()[0].tolist() == matches[0]["indices"]
             assert (frame.labels[frame.mask(item)] == item.track).all()
             points = frame.points_of(item)
             assert np.nanmax(np.abs(points.mean(axis=0) - item.box.center)) < item.box.size.max()
@@ -87,13 +85,13 @@ def test_frames_have_the_points_and_masks_of_the_tables(place: Path) -> None:
     assert objects == run.tracks.arrow(["detection"])["detection"].drop_null().length() > 20
 
 
-def test_colour_masks_show_the_objects_that_are_there(place: Path) -> None:
-    """A mask of another object or frame, or a shifted one, would cover something else."""
-    run = shapecat.open_run(place / "results" / "demo")
-    with np.load(place / "demo.color_labels.npz") as file:
+def test_colour_masks_cover_their_objects(page_folder: Path) -> None:
+    """A shifted mask, or one of another object or frame, would cover something else."""
+    run = shapecat.open_run(page_folder / "results" / "demo")
+    with np.load(page_folder / "demo.color_labels.npz") as file:
         truth = file["labels"]
     shares, owners = [], set()
-    for frame in run.frames(recording=place / "demo.mcap"):
+    for frame in run.frames(recording=page_folder / "demo.mcap"):
         number = frame.labelled.index
         assert frame.color is not None
         assert frame.color.shape == (*truth[number].shape, 3)
@@ -106,8 +104,8 @@ def test_colour_masks_show_the_objects_that_are_there(place: Path) -> None:
                 shares.append(count.max() / count.sum())
     assert len(shares) > 20
     assert np.median(shares) > 0.9
-    assert len({track for track, _ in owners}) == len(owners)  # one object a track
-    assert len({label for _, label in owners}) == len(owners)  # and one track an object
+    assert len({track for track, _ in owners}) == len(owners)  # one object per track
+    assert len({label for _, label in owners}) == len(owners)  # and one track per object
 
 
 FIXTURE = Path(__file__).parents[1] / "fixtures" / "tabletop.mcap"
@@ -124,18 +122,18 @@ def intrinsics(camera: Any) -> tuple[float, ...]:
     return camera.fx, camera.fy, camera.cx, camera.cy
 
 
-def test_an_image_in_memory_has_the_objects_of_its_recording(image: Any, tmp_path: Path) -> None:
-    """Swapped intrinsics, a wrong unit or a wrong object's label would move or rename objects."""
+def test_perceive_finds_same_objects_as_processing_recording(image: Any, tmp_path: Path) -> None:
+    """Swapped intrinsics, a wrong unit or a wrong label would move or rename objects."""
     run = shapecat.process(FIXTURE, tmp_path, end_s=0.2, mcap=False, rrd=False)
     expected = [row for row in run.detections.arrow().to_pylist() if row["frame"] == 0]
     assert len(expected) == 8
-    unread = np.where(image.depth > 0, image.depth, np.nan)
-    unread[0, :3] = -1, np.inf, np.nan
+    with_gaps = np.where(image.depth > 0, image.depth, np.nan)
+    with_gaps[0, :3] = -1, np.inf, np.nan
     millimetres = (image.depth * 1000).round().astype(np.uint16)
-    for depth in (image.depth, unread, millimetres):
-        seen = shapecat.perceive(depth, intrinsics(image.camera))
-        assert [o.track for o in seen.objects] == list(range(1, len(expected) + 1))
-        for item, row in zip(seen.objects, expected, strict=True):
+    for depth in (image.depth, with_gaps, millimetres):
+        result = shapecat.perceive(depth, intrinsics(image.camera))
+        assert [o.track for o in result.objects] == list(range(1, len(expected) + 1))
+        for item, row in zip(result.objects, expected, strict=True):
             assert item.category == row["category"]
             assert item.detections == (row["detection"],)
             assert (
@@ -146,51 +144,47 @@ def test_an_image_in_memory_has_the_objects_of_its_recording(image: Any, tmp_pat
             assert item.full is not None
             np.testing.assert_allclose(item.full.size, row["size_full"], atol=0.01)
             assert item.height_m == pytest.approx(row["height_m"], abs=0.003)
-            shared = np.intersect1d(item.indices, row["indices"]).size
-            assert shared > 0.95 * max(item.indices.size, len(row["indices"]))
+            common = np.intersect1d(item.indices, row["indices"]).size
+            assert common > 0.95 * max(item.indices.size, len(row["indices"]))
             assert np.array_equal(
-                seen.labels.ravel()[item.indices], [item.track] * item.indices.size
+                result.labels.ravel()[item.indices], [item.track] * item.indices.size
             )
-        assert (seen.labels > 0).sum() == sum(o.indices.size for o in seen.objects)
+        assert (result.labels > 0).sum() == sum(o.indices.size for o in result.objects)
 
 
-def test_points_in_memory_have_the_same_objects(image: Any) -> None:
-    """Rows without a reading stay in place, so that masks fit the caller's points."""
-    seen = shapecat.perceive(image.xyz(), up=(0, -6.2, -7.8))
-    alike = shapecat.perceive(image.depth, intrinsics(image.camera))
+def test_perceiving_points_finds_same_objects_as_depth_image(image: Any) -> None:
+    """Invalid rows stay in place, so that masks fit the caller's points."""
+    from_points = shapecat.perceive(image.xyz(), up=(0, -6.2, -7.8))
+    from_depth = shapecat.perceive(image.depth, intrinsics(image.camera))
 
-    assert seen.labels.shape == (image.camera.width * image.camera.height,)
-    assert [o.category for o in seen.objects] == [o.category for o in alike.objects]
-    for one, other in zip(seen.objects, alike.objects, strict=True):
+    assert from_points.labels.shape == (image.camera.width * image.camera.height,)
+    assert [o.category for o in from_points.objects] == [o.category for o in from_depth.objects]
+    for one, other in zip(from_points.objects, from_depth.objects, strict=True):
         np.testing.assert_allclose(one.box.center, other.box.center, atol=0.005)
-        assert np.isfinite(seen.points_of(one)).all()
-    assert seen.labelled.up is not None
-    assert seen.labelled.up @ [0, -0.622, -0.783] == pytest.approx(1, abs=0.001)
+        assert np.isfinite(from_points.points_of(one)).all()
+    assert from_points.labelled.up is not None
+    assert from_points.labelled.up @ [0, -0.622, -0.783] == pytest.approx(1, abs=0.001)
 
 
-def test_the_categories_in_memory_are_those_of_the_model(
-    image: Any, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    """Names in another order, or shapes unlike all categories, must not get a category's name."""
+def test_perceive_uses_categories_of_model(image: Any, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Reordered names, or shapes unlike all categories, must not give a wrong category."""
 
     class Reversed(Guesser):
         categories = Guesser.categories[::-1]
-        strange = False
+        novel = False
 
         def predict(self, descriptors: Any) -> Any:
             found = super().predict(descriptors)
-            return SimpleNamespace(
-                posteriors=found.posteriors, novelty=found.novelty + self.strange
-            )
+            return SimpleNamespace(posteriors=found.posteriors, novelty=found.novelty + self.novel)
 
     model = Reversed()
     monkeypatch.setattr(api, "load_model", lambda _path: model)
-    seen = shapecat.perceive(image.depth, intrinsics(image.camera))
-    for item in seen.objects:
+    result = shapecat.perceive(image.depth, intrinsics(image.camera))
+    for item in result.objects:
         assert item.category == model.categories[int(item.posterior.argmax())]
-    model.strange = True
-    seen = shapecat.perceive(image.depth, intrinsics(image.camera))
-    assert {o.category for o in seen.objects} == {"unknown"}
+    model.novel = True
+    result = shapecat.perceive(image.depth, intrinsics(image.camera))
+    assert {o.category for o in result.objects} == {"unknown"}
 
 
 IMAGE = np.ones((4, 6), np.float32)
@@ -214,24 +208,24 @@ IMAGE = np.ones((4, 6), np.float32)
         (np.ones((9, 3)), {"seeed": 1}, "did you mean seed"),
     ],
 )
-def test_what_cannot_be_perceived_is_named(
+def test_perceive_rejects_invalid_input(
     reading: Any, options: dict[str, Any], problem: str
 ) -> None:
-    """A wrong unit or another image's intrinsics would give garbage without a word."""
+    """A wrong unit or another image's intrinsics would silently give garbage."""
     with pytest.raises(ConfigError, match=problem):
         shapecat.perceive(reading, **options)
 
 
 @pytest.mark.parametrize("reading", [np.zeros((48, 64)), np.full((48, 64), np.nan)])
-def test_an_image_without_a_reading_has_no_objects(reading: Any) -> None:
-    seen = shapecat.perceive(reading, (60, 60, 32, 24))
+def test_empty_depth_image_has_no_objects(reading: Any) -> None:
+    result = shapecat.perceive(reading, (60, 60, 32, 24))
 
-    assert seen.objects == ()
-    assert (seen.labels == -1).all()
+    assert result.objects == ()
+    assert (result.labels == -1).all()
 
 
-def test_columns_are_arrays_with_nan_where_nothing_is(place: Path) -> None:
-    run = shapecat.open_run(str(place / "results" / "demo"))
+def test_table_columns_become_arrays(page_folder: Path) -> None:
+    run = shapecat.open_run(str(page_folder / "results" / "demo"))
     n = run.info["counts"]["detections"]
 
     assert run.detections.numpy("center").shape == (n, 3)
@@ -247,7 +241,7 @@ def test_columns_are_arrays_with_nan_where_nothing_is(place: Path) -> None:
         run.posterior(999)
 
 
-def test_a_missing_list_is_a_row_of_nan(tmp_path: Path) -> None:
+def test_null_list_becomes_row_of_nan(tmp_path: Path) -> None:
     """Arrow may or may not store values behind a null; later rows must not shift."""
     import pyarrow as pa  # noqa: PLC0415  beside its only use
 
@@ -264,39 +258,39 @@ def test_a_missing_list_is_a_row_of_nan(tmp_path: Path) -> None:
     )
 
 
-def test_wrong_settings_and_folders_are_refused_in_one_line(place: Path, tmp_path: Path) -> None:
+def test_wrong_settings_and_folders_are_refused(page_folder: Path, tmp_path: Path) -> None:
     with pytest.raises(ConfigError, match=r"did you mean detection\.max_range_m"):
-        shapecat.process(place / "demo.mcap", tmp_path, detection={"max_range": 1.0})
+        shapecat.process(page_folder / "demo.mcap", tmp_path, detection={"max_range": 1.0})
     with pytest.raises(OutputError, match="another input, model or settings"):
-        shapecat.process(place / "demo.mcap", place / "results", rrd=False)
+        shapecat.process(page_folder / "demo.mcap", page_folder / "results", rrd=False)
     with pytest.raises(OutputError, match=r"no run\.json there"):
         shapecat.open_run(tmp_path)
     with pytest.raises(
         ConfigError, match=r"unknown option or setting topic; did you mean topics\?"
     ):
-        shapecat.process(place / "demo.mcap", tmp_path, topic="/camera/depth/image_raw")
+        shapecat.process(page_folder / "demo.mcap", tmp_path, topic="/camera/depth/image_raw")
     with pytest.raises(ConfigError, match="every must be at least 1, got 0"):
-        shapecat.process(place / "demo.mcap", tmp_path, every=0)
+        shapecat.process(page_folder / "demo.mcap", tmp_path, every=0)
     with pytest.raises(AttributeError, match="nothing"):
         _ = shapecat.nothing
 
 
-def test_a_topic_and_an_up_direction_need_no_special_form(place: Path, tmp_path: Path) -> None:
+def test_process_accepts_single_topic_and_up_vector(page_folder: Path, tmp_path: Path) -> None:
     """A topic was taken for a list of letters, and a list of numbers ended in a traceback."""
     plain: Any = {"every": 8, "mcap": False, "rrd": False}
     topic, up = "/camera/depth/image_raw", (0, -0.75, -0.5)
 
-    run = shapecat.process(place / "demo.mcap", tmp_path, topics=topic, up=up, **plain)
+    run = shapecat.process(page_folder / "demo.mcap", tmp_path, topics=topic, up=up, **plain)
 
     assert (run.info["options"]["topics"], run.info["options"]["up"]) == ([topic], "0.0,-0.75,-0.5")
     given = np.array(run.frame_table.numpy("up_given")[0])
     np.testing.assert_allclose(given, np.array(up) / np.linalg.norm(up), atol=1e-6)
 
 
-def test_a_folder_of_recordings_is_not_read_as_one(place: Path, tmp_path: Path) -> None:
+def test_folder_of_recordings_is_refused(page_folder: Path, tmp_path: Path) -> None:
     """Only the command searches folders; the files would become one run with mixed frames."""
     for name in ("monday.mcap", "tuesday.mcap"):
-        (tmp_path / name).write_bytes((place / "demo.mcap").read_bytes())
+        (tmp_path / name).write_bytes((page_folder / "demo.mcap").read_bytes())
     refused = r"a folder of 2 recordings; name one of them: monday\.mcap, tuesday\.mcap"
 
     with pytest.raises(RecordingError, match=refused):
@@ -306,12 +300,12 @@ def test_a_folder_of_recordings_is_not_read_as_one(place: Path, tmp_path: Path) 
     assert not (tmp_path / "out").exists()
 
 
-def test_import_loads_no_library() -> None:
+def test_import_does_not_load_numpy() -> None:
     """Every command imports the package, so a heavy import would delay `--help`."""
     assert loaded_by("import shapecat", {"numpy"}) == set()
 
 
-def test_several_cores_in_a_script_without_a_guard_are_refused_at_once(tmp_path: Path) -> None:
+def test_several_cores_require_main_guard_in_script(tmp_path: Path) -> None:
     """Otherwise each process would run the script again and print its own traceback."""
     script = tmp_path / "script.py"
     script.write_text("import shapecat\nshapecat.process('none.mcap', 'out', cores=3)\n")

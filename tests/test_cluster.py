@@ -1,4 +1,4 @@
-"""Batches in object storage, on workers without a shared disk: nothing lost or done twice."""
+"""Tests of batches in object storage, on workers without a shared disk."""
 
 import os
 import signal
@@ -28,7 +28,7 @@ def bucket(tmp_path: Path) -> Iterator[Path]:
         yield log
 
 
-def assert_right(report: Report, count: int) -> None:
+def assert_complete(report: Report, count: int) -> None:
     assert report.code == 0, report.errors
     assert report.states == {"complete": count}
     assert len(report.made) == count
@@ -38,11 +38,11 @@ def assert_right(report: Report, count: int) -> None:
     assert "bug" not in report.errors
 
 
-def test_a_batch_on_dask_survives_a_worker_and_the_scheduler(tmp_path: Path) -> None:
-    """The storage is throttled; a worker is killed, later the scheduler and all workers."""
+def test_dask_batch_survives_killed_worker_and_scheduler(tmp_path: Path) -> None:
+    """The storage is throttled; one worker is killed, then the scheduler and all workers."""
     report = run(18, tmp_path, refused=0.05)
 
-    assert_right(report, 18)
+    assert_complete(report, 18)
 
 
 def ray_workers(driver: int) -> list[int]:
@@ -57,7 +57,7 @@ def ray_workers(driver: int) -> list[int]:
     return found
 
 
-def test_a_batch_on_ray_survives_a_worker(bucket: Path, tmp_path: Path) -> None:
+def test_ray_batch_survives_killed_worker(bucket: Path, tmp_path: Path) -> None:
     fill(10, tmp_path)
     options = ("--executor", "ray", "--jobs", "2")
     with (tmp_path / "errors").open("wb") as errors:
@@ -89,8 +89,7 @@ def assert_same_tables(folder: Path) -> None:
             assert expected.drop_columns(timed).equals(there.drop_columns(timed)), name
 
 
-def test_a_killed_command_is_gone_on_with(bucket: Path, tmp_path: Path) -> None:
-    """Kill -9 at any moment, then start the same command twice at once."""
+def test_killed_batch_resumes_when_started_twice_at_once(bucket: Path, tmp_path: Path) -> None:
     fill(8, tmp_path)
     command = [*PROCESS, "--jobs", "2"]
     quiet: Any = {"stderr": subprocess.PIPE, "stdout": subprocess.DEVNULL, "text": True}
@@ -104,10 +103,10 @@ def test_a_killed_command_is_gone_on_with(bucket: Path, tmp_path: Path) -> None:
     last = subprocess.run(command, check=False, **quiet)
 
     for text in errors:
-        told = [line for line in text.splitlines() if line.startswith("Error")]
-        # Where the machine stalls for long, one may take over from the other.
+        reported = [line for line in text.splitlines() if line.startswith("Error")]
+        # If the machine stalls for long, one command may take over from the other.
         known = ("another run is writing there", "another run has taken over")
-        assert all(any(words in line for words in known) for line in told), text
+        assert all(any(words in line for words in known) for line in reported), text
     assert last.returncode == 0, last.stderr
     assert sorted(made(bucket)) == [f"run_{k:04}" for k in range(8)]
     assert_same_tables(tmp_path)

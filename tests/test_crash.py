@@ -1,4 +1,4 @@
-"""A run killed at any moment leaves nothing or all of its results, and the next one resumes."""
+"""Tests that a killed run leaves no partial results and can be resumed."""
 
 import os
 import resource
@@ -36,9 +36,9 @@ def command(recording: Path, out: Path, *options: str) -> list[str]:
 def assert_same_tables(a: Path, b: Path) -> None:
     for name in TABLES:
         one, other = (pq.read_table(folder / f"{name}.parquet") for folder in (a, b))
-        apart = [column for column in one.column_names if column in {"seconds", "height_m"}]
-        assert one.drop_columns(apart).equals(other.drop_columns(apart)), name
-        if "height_m" in apart:  # no number equals itself to Arrow where there is none
+        excluded = [column for column in one.column_names if column in {"seconds", "height_m"}]
+        assert one.drop_columns(excluded).equals(other.drop_columns(excluded)), name
+        if "height_m" in excluded:  # to Arrow, NaN differs from itself
             np.testing.assert_array_equal(one["height_m"], other["height_m"])
     assert (a / "tracks.csv").read_bytes() == (b / "tracks.csv").read_bytes()
     assert counts(a) == counts(b)
@@ -85,10 +85,8 @@ def survive_kills(recording: Path, out: Path, undisturbed: Path, moments: list[f
     return killed
 
 
-def test_killed_run_goes_on_where_it_stopped(
-    recording: Path, undisturbed: Path, tmp_path: Path
-) -> None:
-    """Killed while perceiving: only frames of the unfinished segment are perceived again."""
+def test_killed_run_resumes(recording: Path, undisturbed: Path, tmp_path: Path) -> None:
+    """Only frames of the unfinished segment are processed again."""
     segment = tmp_path / ".table.partial" / "segments" / "000000"
     assert kill_after(command(recording, tmp_path), segment, 0.0)
     assert not (tmp_path / "table").exists()
@@ -100,15 +98,17 @@ def test_killed_run_goes_on_where_it_stopped(
     assert read_run(tmp_path / "table")["counts"]["resumed"] > 0
 
 
-def test_kills_at_random_moments(recording: Path, undisturbed: Path, tmp_path: Path) -> None:
-    """Early in the work, so that every kill interrupts something."""
+def test_run_survives_kills_at_random_moments(
+    recording: Path, undisturbed: Path, tmp_path: Path
+) -> None:
+    """The moments are early, so that every kill interrupts work."""
     moments = np.random.default_rng(1).uniform(0, 0.3, 3).tolist()
 
     assert survive_kills(recording, tmp_path, undisturbed, moments) == len(moments)
 
 
 @pytest.mark.many
-def test_fifty_kills(recording: Path, undisturbed: Path, tmp_path: Path) -> None:
+def test_run_survives_fifty_kills(recording: Path, undisturbed: Path, tmp_path: Path) -> None:
     begun = time.perf_counter()
     kill_after(command(recording, tmp_path / "timed"), tmp_path / "timed/.table.partial", 600)
     whole = time.perf_counter() - begun
@@ -120,7 +120,7 @@ def test_fifty_kills(recording: Path, undisturbed: Path, tmp_path: Path) -> None
         killed += survive_kills(recording, tmp_path / str(rounds), undisturbed, moments)
 
 
-def test_what_other_settings_left_is_discarded(
+def test_work_under_other_settings_is_discarded(
     recording: Path, undisturbed: Path, tmp_path: Path
 ) -> None:
     def stop(_phase: str, done: int, _total: int | None) -> None:
@@ -139,10 +139,10 @@ def test_what_other_settings_left_is_discarded(
 
 
 @pytest.mark.parametrize("phase", ["track", "annotated.mcap"])
-def test_phases_that_are_done_are_not_repeated(
+def test_finished_phases_are_not_repeated(
     recording: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, phase: str
 ) -> None:
-    """After an interrupt in a later phase, the next run begins with that phase."""
+    """After an interrupt, the next run begins with the interrupted phase."""
     job = Job(recording, tmp_path / "table", end_s=0.3, rrd=False)
     target = {
         "track": "shapecat.runs.tracks.track_run",
@@ -164,7 +164,7 @@ def interrupt(*_args: object, **_options: object) -> None:
     raise KeyboardInterrupt
 
 
-def test_an_interrupted_correction_is_finished(
+def test_interrupted_annotation_is_finished(
     recording: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """Otherwise the outputs would show labels that the table no longer has."""
@@ -186,22 +186,20 @@ def test_an_interrupted_correction_is_finished(
     assert contents(folder) - {"tracks.original.csv"} == before
 
 
-def test_two_runs_do_not_write_one_folder(recording: Path, tmp_path: Path) -> None:
+def test_two_runs_cannot_write_same_folder(recording: Path, tmp_path: Path) -> None:
     job = Job(recording, tmp_path / "table", end_s=0.3, rrd=False)
 
-    def second(phase: str, done: int, _total: int | None) -> None:
+    def start_second_run(phase: str, done: int, _total: int | None) -> None:
         if (phase, done) == ("perceive", 1):
             with pytest.raises(OutputError, match="another run is writing"):
                 process(job)
 
-    process(job, second)
+    process(job, start_second_run)
 
     assert [path.name for path in tmp_path.iterdir()] == ["table"]
 
 
-def test_a_recording_that_is_still_written_to_has_no_results(
-    recording: Path, tmp_path: Path
-) -> None:
+def test_recording_still_being_written_gives_no_results(recording: Path, tmp_path: Path) -> None:
     """Its tables would describe an earlier state of the recording than its outputs."""
     source, out = tmp_path / "live.mcap", tmp_path / "out"
     shutil.copy(recording, source)
@@ -216,10 +214,10 @@ def test_a_recording_that_is_still_written_to_has_no_results(
     assert not out.exists()
 
 
-def test_unwritable_folder_is_one_line(
+def test_unwritable_folder_is_reported_in_one_line(
     shapecat: Callable[..., Result], recording: Path, tmp_path: Path
 ) -> None:
-    """Root may write anywhere, but not inside a file."""
+    """Even root cannot write inside a file."""
     (tmp_path / "file").write_text("")
     result = shapecat("process", recording, "--out", tmp_path / "file")
 
@@ -229,7 +227,7 @@ def test_unwritable_folder_is_one_line(
 
 
 @pytest.mark.parametrize("limit", [20_000, 400_000])
-def test_full_disk_is_one_line_and_nothing_is_left(
+def test_full_disk_is_reported_and_leaves_nothing(
     shapecat: Callable[..., Result], recording: Path, tmp_path: Path, limit: int
 ) -> None:
     """A limit on the file size simulates a full disk, for tables or for the MCAP."""

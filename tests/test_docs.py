@@ -1,4 +1,4 @@
-"""The documentation matches the commands: each is explained, and each printed line works."""
+"""Tests that the documentation matches commands, settings and links."""
 
 import ast
 import re
@@ -26,9 +26,7 @@ def commands() -> dict[str, click.Command]:
 
 
 @pytest.mark.parametrize("name", sorted(commands()))
-def test_every_command_explains_itself_with_an_example(
-    shapecat: Callable[..., Result], name: str
-) -> None:
+def test_help_of_every_command_has_an_example(shapecat: Callable[..., Result], name: str) -> None:
     result = shapecat(name, "--help")
 
     assert result.exit_code == 0
@@ -38,8 +36,8 @@ def test_every_command_explains_itself_with_an_example(
             assert parameter.help or parameter.name in {"seed", "scene", "sensor"}, parameter.name
 
 
-def test_the_root_page_cuts_no_description(shapecat: Callable[..., Result]) -> None:
-    """The library ends a description that is too long for a terminal with dots."""
+def test_root_help_truncates_no_description(shapecat: Callable[..., Result]) -> None:
+    """Click ends descriptions that are too long with dots."""
     assert "..." not in shapecat("--help").stdout.partition("Commands:")[2]
 
 
@@ -54,7 +52,7 @@ def test_help_explains_each_choice(
     assert [c for c in choice.choices if not any(x.startswith(f"  {c}  ") for x in lines)] == []
 
 
-def written_commands() -> list[tuple[str, str]]:
+def documented_commands() -> list[tuple[str, str]]:
     return [
         (page.name, line.split("#")[0].strip())
         for page in PAGES
@@ -64,9 +62,8 @@ def written_commands() -> list[tuple[str, str]]:
     ]
 
 
-@pytest.mark.parametrize(("page", "line"), written_commands())
-def test_commands_in_the_documentation_exist_with_their_options(page: str, line: str) -> None:
-    """A renamed option makes documentation lie."""
+@pytest.mark.parametrize(("page", "line"), documented_commands())
+def test_documented_commands_and_options_exist(page: str, line: str) -> None:
     words = [word for word in line.split() if word not in {"\\", "…", "..."}]
     command = commands()[words[1]]
     known = {name for parameter in command.params for name in parameter.opts}
@@ -95,23 +92,23 @@ def setting_rows() -> list[str]:
     return rows
 
 
-def test_the_reference_has_every_setting_with_its_default() -> None:
+def test_reference_lists_every_setting_with_default() -> None:
     reference = (ROOT / "docs" / "reference.md").read_text("utf-8").splitlines()
     expected = setting_rows()
-    named = 1 + sum(
+    count = 1 + sum(
         len(group) for group in Settings().as_dict().values() if isinstance(group, dict)
     )
-    assert len(expected) == named, "a setting without a docstring"
+    assert len(expected) == count, "a setting without a docstring"
     assert [row for row in expected if row not in reference] == []
 
 
-def test_links_between_pages_lead_somewhere() -> None:
+def test_links_between_pages_resolve() -> None:
     for page in [*PAGES, ROOT / "ARCHITECTURE.md", ROOT / "CONTRIBUTING.md"]:
         for target in re.findall(r"\]\((?!http)([^)#]+)\)", page.read_text("utf-8")):
             assert (page.parent / target).exists(), f"{page.name}: {target}"
 
 
-def test_make_targets_named_in_the_documentation_exist() -> None:
+def test_documented_make_targets_exist() -> None:
     targets = set(re.findall(r"^([a-z-]+):", (ROOT / "Makefile").read_text(), re.MULTILINE))
     for page in [*PAGES, ROOT / "CONTRIBUTING.md"]:
         for target in re.findall(r"`make ([a-z-]+)`", page.read_text("utf-8")):

@@ -1,4 +1,4 @@
-"""The commands of the pages work as printed, in order, in an empty folder."""
+"""Tests that the documented commands work, in order, in an empty folder."""
 
 import os
 import re
@@ -63,9 +63,9 @@ def run_in_shell(lines: list[str], folder: Path) -> None:
 
 
 def run_here(line: str, shapecat: Callable[..., Result]) -> None:
-    """Run a line in this process, where libraries load once; in a shell if it needs one.
+    """Run a line in this process, where libraries load once, or in a shell if it needs one.
 
-    Recordings are processed here as well: `test_batch` and `test_executors` start processes.
+    Recordings are processed in this process too: `test_batch` and `test_executors` start others.
     """
     line = re.sub(r"--jobs \d+", "--jobs 1", line)
     if not line.startswith("shapecat ") or set(line) & set("$|<>&;*?\\"):
@@ -77,13 +77,13 @@ def run_here(line: str, shapecat: Callable[..., Result]) -> None:
 
 @pytest.mark.slow
 @pytest.mark.parametrize("page", ["tutorial.md", "howto-labelling.md", "howto-bag.md"])
-def test_page_works_as_printed(
+def test_documented_commands_work(
     page: str,
     shapecat: Callable[..., Result],
     tmp_path: Path,
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
-    """`test_loop` learns as many steps as it takes; here, a bad model is as good as any."""
+    """Learn for a few steps only: the accuracy of the model does not matter here."""
     monkeypatch.setattr("shapecat.learning.incremental._STEPS", 2)
     monkeypatch.setattr("shapecat.learning.incremental._FEW_STEPS", 1)
     monkeypatch.chdir(tmp_path)
@@ -95,8 +95,8 @@ def test_page_works_as_printed(
 
 @pytest.mark.many
 @pytest.mark.parametrize("page", ["tutorial.md", "howto-cluster.md"])
-def test_page_works_as_printed_in_a_shell(page: str, tmp_path: Path) -> None:
-    """Starting processes, Dask and Ray takes a minute; `test_batch` runs on Dask."""
+def test_documented_commands_work_in_a_shell(page: str, tmp_path: Path) -> None:
+    """Starting processes, Dask and Ray takes a minute."""
     with socket.socket() as probe:  # the page's port may be taken
         probe.bind(("127.0.0.1", 0))
         port = probe.getsockname()[1]

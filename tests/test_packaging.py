@@ -1,4 +1,4 @@
-"""The package as users install it: a wheel, with the runtime dependencies alone."""
+"""Tests of the wheel in an environment with only the runtime dependencies."""
 
 import hashlib
 import os
@@ -25,7 +25,7 @@ def run(*command: object, **options: object) -> subprocess.CompletedProcess[str]
 
 @pytest.fixture(scope="module")
 def wheel(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """Build the wheel from a copy of the files under version control, or of the needed folders."""
+    """Build the wheel from a copy of the needed folders."""
     out = tmp_path_factory.mktemp("wheel")
     source = out / "source"
     source.mkdir()
@@ -36,7 +36,7 @@ def wheel(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return next(out.glob("*.whl"))
 
 
-def runtime_modules() -> set[str]:
+def runtime_distributions() -> set[str]:
     """Return the names of the distributions that shapecat needs, directly or not."""
     found: set[str] = set()
     queue = ["shapecat"]
@@ -49,18 +49,18 @@ def runtime_modules() -> set[str]:
             needed = requires(name) or []
         except ImportError:
             continue
-        # Extras are left out: what they bring is not there for users.
+        # Users need not install the extras.
         queue += [re.split(r"[\s;<>=!~\[(]", n)[0] for n in needed if "extra ==" not in n]
     return found
 
 
 @pytest.fixture(scope="module")
 def bare(wheel: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """Make an environment with the wheel, and links to the runtime dependencies alone."""
+    """Make an environment with the wheel and only the runtime dependencies."""
     env = tmp_path_factory.mktemp("bare") / "env"
     run(sys.executable, "-m", "venv", "--without-pip", env)
     site = next(env.glob("lib/python3*/site-packages"))
-    for name in runtime_modules() - {"shapecat"}:
+    for name in runtime_distributions() - {"shapecat"}:
         try:
             files = distribution(name).files or []
         except ImportError:
@@ -72,12 +72,12 @@ def bare(wheel: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
     pip = Path(str(distribution("pip").locate_file("pip")))  # as `pip --python` does, once
     options = ("-q", "--no-deps", "--no-compile", "--disable-pip-version-check")
     run(env / "bin" / "python", pip, "install", *options, wheel)
-    _take_machine_code(site / "shapecat")
+    _copy_compiled_kernels(site / "shapecat")
     return env
 
 
-def _take_machine_code(package: Path) -> None:
-    """Give the package the kernels compiled here: compiling them once more takes minutes."""
+def _copy_compiled_kernels(package: Path) -> None:
+    """Copy the kernels compiled here: compiling them again takes minutes."""
     for kept in (ROOT / "shapecat").rglob("__pycache__/kernels-*"):
         here = kept.parent.parent
         stage = package / here.relative_to(ROOT / "shapecat")
@@ -97,7 +97,7 @@ def _numba_name(sources: Path) -> str:
 
 
 def test_wheel_installs_one_top_level_package(wheel: Path) -> None:
-    """Folders cli and schemas must not shadow other people's packages."""
+    """Folders cli and schemas must not shadow other packages."""
     with zipfile.ZipFile(wheel) as archive:
         names = archive.namelist()
 
@@ -125,21 +125,21 @@ for words in ("simulate s.mcap --frames 2", "process s.mcap --out out --jobs 1")
 """Two commands in one process, since loading libraries takes longer than either."""
 
 
-def test_main_job_runs_from_the_wheel(bare: Path, tmp_path: Path) -> None:
-    """A development-only import in the package works for everyone but the users."""
+def test_wheel_simulates_and_processes_a_recording(bare: Path, tmp_path: Path) -> None:
+    """An import of a development dependency would fail only for users."""
     environment = {**os.environ, "PYTHONPATH": "", "PYTHONDONTWRITEBYTECODE": "1"}
     options = {"cwd": tmp_path, "env": environment}
-    said = run(bare / "bin" / "shapecat", "--version", **options).stdout
+    version = run(bare / "bin" / "shapecat", "--version", **options).stdout
     run(bare / "bin" / "python", "-c", JOB, **options)
 
-    assert "shapecat" in said
+    assert "shapecat" in version
 
     names = {path.name for path in (tmp_path / "out" / "s").iterdir()}
     assert {"run.json", "tracks.csv", "annotated.mcap", "review.rrd"} <= names
 
 
 def test_lock_file_covers_every_dependency() -> None:
-    """`make setup` installs the lock file alone."""
+    """`make setup` installs only the lock file."""
     locked = set(
         re.findall(r"^([a-z0-9-]+)==", (ROOT / "requirements.lock").read_text(), re.MULTILINE)
     )

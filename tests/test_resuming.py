@@ -1,4 +1,4 @@
-"""A run that replaces another perceives frames again only if that can change them."""
+"""Tests that replacing a run processes frames again only if they may change."""
 
 import shutil
 from collections.abc import Callable
@@ -52,10 +52,10 @@ def table(folder: Path, name: str) -> Any:
 
 
 @pytest.mark.usefixtures("perceiving_fails")
-def test_other_settings_of_tracking_give_the_tables_of_a_new_run(
+def test_changed_tracking_settings_give_tables_of_new_run(
     job: Job, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """Trying another gate cost the hour of perceiving; a table left out would cost results."""
+    """Frames are not processed again, but every table must be that of a new run."""
     before = read_run(job.folder)
     write_run(job.folder, {**before, "warnings": ["frames 2 and 3 are tilted"]})
     job = replace(job, settings=changed("tracking.gate_m=0.001", "outputs.boxes=visible"))
@@ -91,8 +91,8 @@ def test_other_settings_of_tracking_give_the_tables_of_a_new_run(
     ],
     ids=["nothing", "detection", "seed", "every", "color", "up"],
 )
-def test_what_can_change_frames_perceives_them_again(job: Job, change: dict[str, Any]) -> None:
-    """And with --overwrite and no change, the user wants everything anew."""
+def test_options_that_affect_frames_process_them_again(job: Job, change: dict[str, Any]) -> None:
+    """So does --overwrite without a change."""
     with pytest.raises(PerceivedError):
         pipeline.process(replace(job, **change))
 
@@ -124,19 +124,17 @@ def other_content(folder: Path) -> None:
 
 @pytest.mark.usefixtures("perceiving_fails")
 @pytest.mark.parametrize("damage", [truncate, lose_rows, lose_masks, other_version, other_content])
-def test_tables_that_do_not_fit_are_not_taken_over(
-    job: Job, damage: Callable[[Path], None]
-) -> None:
+def test_unusable_tables_are_not_reused(job: Job, damage: Callable[[Path], None]) -> None:
     """Half of the results would come from another version or recording, or be missing."""
     damage(job.folder)
     with pytest.raises(PerceivedError):
         pipeline.process(replace(job, settings=changed("tracking.gate_m=0.1")))
 
 
-def test_the_replaced_run_stays_whole_if_the_new_one_fails(
+def test_replaced_run_stays_complete_if_new_run_fails(
     job: Job, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """Its tables are linked into the new folder, and must not be emptied from there."""
+    """Its tables are hard links in the new folder, and must not be truncated there."""
     before = {name: table(job.folder, name) for name in TABLES}
 
     def fail(*_args: Any, **_options: Any) -> None:
@@ -150,8 +148,8 @@ def test_the_replaced_run_stays_whole_if_the_new_one_fails(
 
 
 @pytest.mark.usefixtures("perceiving_fails")
-def test_an_output_that_was_removed_is_written_again(job: Job) -> None:
-    """The run would count as complete without the recording that people open."""
+def test_removed_output_is_written_again(job: Job) -> None:
+    """The run would count as complete without its annotated recording."""
     mcap, tracks = job.folder / "annotated.mcap", job.folder / "tracks.csv"
     mcap.unlink(missing_ok=True)
     known = tracks.stat().st_mtime_ns
@@ -166,10 +164,10 @@ def test_an_output_that_was_removed_is_written_again(job: Job) -> None:
 
 
 @pytest.mark.parametrize("total", [None, 950.0])
-def test_the_seconds_of_a_killed_run_count_once(
+def test_seconds_of_killed_run_count_once(
     job: Job, total: float | None, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """A kill may come before or after the total is written; it already has those of the phases."""
+    """A kill may come before or after the total is written, which includes the phases."""
     job = replace(job, settings=changed("tracking.gate_m=0.1"))
 
     def kill(*_args: Any) -> None:

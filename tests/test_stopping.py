@@ -1,4 +1,4 @@
-"""Interrupts by a user or a scheduler: current frames are kept, the exit code tells."""
+"""Tests of stopping a command by a signal: finished frames are kept."""
 
 import json
 import os
@@ -29,8 +29,8 @@ def recording(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return record(tmp_path_factory.mktemp("stopping") / "table.mcap", FRAMES)
 
 
-def heed_interrupts_slowly() -> None:
-    """Yield to the interrupter; a busy machine would otherwise end the command first."""
+def heed_interrupts_at_low_priority() -> None:
+    """Yield to the sender of the signal: on a busy machine, the command might end first."""
     heed_interrupts()
     os.nice(10)
 
@@ -46,11 +46,11 @@ class Command:
             stderr=subprocess.PIPE,
             text=True,
             start_new_session=True,
-            preexec_fn=heed_interrupts_slowly,  # noqa: PLW1509  there is no other way
+            preexec_fn=heed_interrupts_at_low_priority,  # noqa: PLW1509  there is no other way
         )
 
     def wait_for_frames(self, count: int) -> None:
-        """Read the progress until a number of frames are perceived."""
+        """Read the progress until a number of frames are processed."""
         assert self.running.stderr is not None
         for line in self.running.stderr:
             event = json.loads(line)
@@ -77,10 +77,10 @@ class Command:
         pytest.param(signal.SIGTERM, 143, "2", marks=pytest.mark.many),
     ],
 )
-def test_a_signal_keeps_what_is_done(
+def test_signal_keeps_finished_frames(
     recording: Path, undisturbed: Path, tmp_path: Path, signum: int, code: int, jobs: str
 ) -> None:
-    """It reaches the workers too, which must neither die of it nor print a traceback."""
+    """It reaches the workers too: they must not die of it or print a traceback."""
     command = Command(recording, tmp_path, "--jobs", jobs)
     command.wait_for_frames(40)
     command.signal_group(signum)
@@ -102,11 +102,11 @@ def test_a_signal_keeps_what_is_done(
     ("stopped_in", "seconds", "least"),
     [
         ("track", {"perceive": 1000.0}, 1000),
-        # The total is written before the folder gets its name; it is no further phase.
+        # The total is written before the folder is renamed; it is not another phase.
         ("require_unchanged", {"perceive": 1000.0, "compile": 7.0, "total": 1100.0}, 1100),
     ],
 )
-def test_the_time_before_an_interruption_counts_once(
+def test_time_before_interruption_counts_once(
     recording: Path,
     tmp_path: Path,
     monkeypatch: pytest.MonkeyPatch,
@@ -114,7 +114,7 @@ def test_the_time_before_an_interruption_counts_once(
     seconds: dict[str, float],
     least: int,
 ) -> None:
-    """And the frames of a phase that was done count as resumed."""
+    """Frames of a finished phase count as resumed."""
 
     def fail(*_: object) -> None:
         raise stopping.Stopped(signal.SIGTERM)
@@ -123,10 +123,10 @@ def test_the_time_before_an_interruption_counts_once(
     with monkeypatch.context() as broken, pytest.raises(stopping.Stopped):
         broken.setattr(f"shapecat.pipeline.{stopped_in}", fail)
         process(job)
-    begun = tmp_path / ".table.partial" / "run.json"
-    about = json.loads(begun.read_text())
-    about["seconds"] |= seconds
-    begun.write_text(json.dumps(about))
+    info_file = tmp_path / ".table.partial" / "run.json"
+    info = json.loads(info_file.read_text())
+    info["seconds"] |= seconds
+    info_file.write_text(json.dumps(info))
     process(job)
 
     run = read_run(tmp_path / "table")
@@ -134,8 +134,8 @@ def test_the_time_before_an_interruption_counts_once(
     assert least < run["seconds"]["total"] < least + 100
 
 
-def test_a_reader_of_the_progress_may_leave(recording: Path, tmp_path: Path) -> None:
-    """`--progress jsonl 2>&1 >table | head` would end a batch in the middle, without a word."""
+def test_run_completes_if_progress_reader_leaves(recording: Path, tmp_path: Path) -> None:
+    """`--progress jsonl 2>&1 >table | head` would silently end a batch in the middle."""
     words = [sys.executable, "-m", "shapecat", "process", str(recording), "--out", str(tmp_path)]
     options = ["--progress", "jsonl", "--no-rrd", "--no-mcap", "--end", "0.5", "--jobs", "1"]
     with subprocess.Popen(
@@ -151,7 +151,7 @@ def test_a_reader_of_the_progress_may_leave(recording: Path, tmp_path: Path) -> 
     assert (tmp_path / recording.stem / "tracks.csv").exists()
 
 
-def test_a_second_signal_leaves_at_once(recording: Path, undisturbed: Path, tmp_path: Path) -> None:
+def test_second_signal_ends_command(recording: Path, undisturbed: Path, tmp_path: Path) -> None:
     command = Command(recording, tmp_path, "--jobs", "2")
     command.wait_for_frames(40)
     command.signal_group(signal.SIGINT)
@@ -166,8 +166,7 @@ def test_a_second_signal_leaves_at_once(recording: Path, undisturbed: Path, tmp_
     assert_same_tables(tmp_path / "table", undisturbed / "table")
 
 
-def test_a_signal_while_libraries_load_ends_the_command() -> None:
-    """Before anything listens, Python would show a traceback of its own imports."""
+def test_signal_during_imports_ends_command_without_traceback() -> None:
     code = (
         "import os, signal, sys, shapecat.__main__ as entry;"
         "sys.modules['shapecat.cli.main'] = None;"
@@ -185,21 +184,21 @@ def test_a_signal_while_libraries_load_ends_the_command() -> None:
 
 
 @pytest.fixture
-def asked() -> Iterator[Callable[[], None]]:
-    """Pretend that a signal has arrived, and reset that afterwards."""
+def request_stop() -> Iterator[Callable[[], None]]:
+    """Provide a function that pretends a signal has arrived; reset it afterwards."""
     with stopping.heeding_signals():
         yield stopping.request
 
 
 @pytest.mark.usefixtures("late_answers")
-def test_frames_in_work_are_finished(
-    recording: Path, tmp_path: Path, asked: Callable[[], None]
+def test_frames_in_progress_are_finished(
+    recording: Path, tmp_path: Path, request_stop: Callable[[], None]
 ) -> None:
     """Results that other processes hold when the signal arrives are kept."""
 
     def stop(phase: str, done: int, _total: int | None) -> None:
         if (phase, done) == ("perceive", 3):
-            asked()
+            request_stop()
 
     one_by_one = Settings(reuse_frames=1)
     with pytest.raises(stopping.Stopped):
@@ -210,18 +209,18 @@ def test_frames_in_work_are_finished(
     assert sum(kept) == 3 + _HELD
 
 
-def test_a_recording_that_is_written_to_meanwhile_gives_no_results(tmp_path: Path) -> None:
+def test_recording_changed_during_processing_gives_no_results(tmp_path: Path) -> None:
     """Otherwise half of the tables would be from another recording."""
-    moving = record(tmp_path / "table.mcap", 30)
-    process(Job(moving, tmp_path / "before" / "table", rrd=False))
+    source = record(tmp_path / "table.mcap", 30)
+    process(Job(source, tmp_path / "before" / "table", rrd=False))
 
     def write(phase: str, done: int, _total: int | None) -> None:
         if (phase, done) == ("perceive", 12):
-            moving.write_bytes(moving.read_bytes())
+            source.write_bytes(source.read_bytes())
 
     from shapecat.errors import RecordingError  # noqa: PLC0415  beside its only use
 
-    job = Job(moving, tmp_path / "out" / "table", rrd=False)
+    job = Job(source, tmp_path / "out" / "table", rrd=False)
     with pytest.raises(RecordingError, match="changed while"):
         process(job, write)
     assert not (tmp_path / "out").exists()
