@@ -1,4 +1,4 @@
-"""What changes within a recording, or differs between its topics, is not kept from before."""
+"""Tests of calibrations, poses and views that change in a recording or differ between topics."""
 
 from collections import Counter
 from dataclasses import replace
@@ -42,8 +42,8 @@ BODIES = ("/cam/depth/image_raw", "/cam/depth/other_raw")
 """Two streams of one depth camera, which share its calibration."""
 
 
-def test_the_frame_of_each_image_counts_not_that_of_the_first(tmp_path: Path) -> None:
-    """A driver that starts again may name its frames anew, on either side."""
+def test_frame_id_of_each_image_counts(tmp_path: Path) -> None:
+    """A restarted driver may rename the frame of either camera."""
     names = [("depth", "color"), ("depth", "color_b"), ("depth_b", "color"), ("depth_b", "color_b")]
     items: list[Any] = [("/cam/color/camera_info", EPOCH, info(EPOCH, WIDE))]
     for name, x in (("depth", 0.01), ("depth_b", 0.02), ("color", 0.1), ("color_b", 0.4)):
@@ -60,8 +60,8 @@ def test_the_frame_of_each_image_counts_not_that_of_the_first(tmp_path: Path) ->
     assert found == pytest.approx([-0.09, -0.39, -0.08, -0.38])
 
 
-def test_a_colour_image_in_another_frame_is_no_longer_registered(tmp_path: Path) -> None:
-    """Aligning colour to depth can be switched off while a recording runs."""
+def test_colour_image_in_another_frame_is_not_registered(tmp_path: Path) -> None:
+    """A user may switch off the alignment of colour to depth while recording."""
     items: list[Any] = [("/tf_static", EPOCH, static("camera", "color", (0.05, 0, 0), STILL))]
     for k, name in enumerate(("camera", "color")):
         stamp = EPOCH + 100 * k * MS
@@ -73,7 +73,7 @@ def test_a_colour_image_in_another_frame_is_no_longer_registered(tmp_path: Path)
     assert [view is not None and view.registered for _, view in pairs] == [True, False]
 
 
-def test_a_rectified_image_follows_the_rectification(tmp_path: Path) -> None:
+def test_rectified_image_uses_current_projection(tmp_path: Path) -> None:
     """The lens may stay while the image is rectified to another focal length."""
     items: list[Any] = [("/tf_static", EPOCH, static("camera", "color", (0.05, 0, 0), STILL))]
     for k, focal in enumerate((71.0, 90.0)):
@@ -88,8 +88,8 @@ def test_a_rectified_image_follows_the_rectification(tmp_path: Path) -> None:
     assert [view and view.lens and view.lens.pinhole.fx for _, view in pairs] == [71.0, 90.0]
 
 
-def test_the_period_of_colour_images_is_that_of_the_latest(tmp_path: Path) -> None:
-    """Exposure in the dark: images 40 ms from their frame are then the nearest there will be."""
+def test_colour_period_follows_latest_images(tmp_path: Path) -> None:
+    """Long exposures lower the rate: the nearest image may then be 40 ms away."""
     times = [*range(0, 100, 10), *range(190, 700, 100)]
     stamps = [EPOCH + t * MS for t in times]
     colours = [("/cam/color/image_raw", s, raw(s, gradient(), "rgb8")) for s in stamps]
@@ -106,7 +106,7 @@ def read_both(path: Path, wanted: str | None = None) -> Pairs:
         return list(frames_with_colour(recording, streams, colours, skipped=Counter()))
 
 
-def test_a_camera_that_two_streams_share_changes_for_both(tmp_path: Path) -> None:
+def test_new_calibration_applies_to_both_streams_of_camera(tmp_path: Path) -> None:
     """Raw and filtered depth images have one calibration, and one colour camera beside them."""
     items: list[Any] = [("/tf_static", EPOCH, static("camera", "color", (0.05, 0, 0), STILL))]
     for k, (depth, colour) in enumerate(((CAMERA, WIDE), (ZOOMED, replace(WIDE, fx=90.0)))):
@@ -124,12 +124,10 @@ def test_a_camera_that_two_streams_share_changes_for_both(tmp_path: Path) -> Non
 
 
 @pytest.mark.parametrize("bend", [(0.3, 0.1, 0.0, 0.0, 0.0), ()])
-def test_a_depth_camera_may_be_calibrated_anew_in_its_focal_lengths_alone(
-    tmp_path: Path, bend: Any
-) -> None:
-    """Its distortion may stay; then its rays would be those of the old calibration."""
+def test_rays_follow_new_focal_lengths(tmp_path: Path, bend: Any) -> None:
+    """If the distortion stays, rays of the old calibration must not be reused."""
 
-    def seen(*cameras: Camera) -> list[Frame]:
+    def read_frames(*cameras: Camera) -> list[Frame]:
         items = []
         for k, camera in enumerate(cameras):
             items.append(("/depth/camera_info", k, info(EPOCH + k, camera, bend)))
@@ -137,15 +135,15 @@ def test_a_depth_camera_may_be_calibrated_anew_in_its_focal_lengths_alone(
         with open_recording(write(tmp_path / f"{len(cameras)}.mcap", items)) as recording:
             return list(frames(recording, choose_streams(recording), skipped=Counter()))
 
-    _, second = seen(CAMERA, ZOOMED)
-    (alone,) = seen(ZOOMED)
+    _, second = read_frames(CAMERA, ZOOMED)
+    (alone,) = read_frames(ZOOMED)
 
     assert second.camera == alone.camera
     np.testing.assert_array_equal(second.xyz(), alone.xyz())
 
 
-def test_topics_differ_in_what_is_known_of_their_pose() -> None:
-    """One sensor may be in no transform, and planes may contradict the up direction of one."""
+def test_missing_pose_or_up_affects_only_its_topic() -> None:
+    """One sensor may lack transforms, and planes may contradict the up direction of another."""
     transforms = TransformBuffer()
     transforms.add("map", "head", 0, ((1.0, 2.0, 3.0), STILL), static=True)
     upright = Upright(TransformWindow(transforms), None, None, ("tf", "imu"))
@@ -161,8 +159,8 @@ def test_topics_differ_in_what_is_known_of_their_pose() -> None:
     assert [up is None for up in ups] == [True, False, True]
 
 
-def test_a_static_transform_that_is_published_again_replaces_the_first() -> None:
-    """After a new calibration of the robot, the old one is no longer true."""
+def test_republished_static_transform_replaces_the_first() -> None:
+    """The robot may have been calibrated again."""
     transforms = TransformBuffer()
     for x in (1.0, 2.5):
         transforms.add("base", "camera", 0, ((x, 0.0, 0.0), STILL), static=True)
@@ -170,8 +168,8 @@ def test_a_static_transform_that_is_published_again_replaces_the_first() -> None
     assert transforms.lookup("base", "camera", 7).translation[0] == 2.5
 
 
-def test_a_type_is_read_by_the_definition_of_its_own_channel() -> None:
-    """Two robots in one recording may have defined it differently, or send it encoded otherwise."""
+def test_messages_are_decoded_by_definition_of_their_channel() -> None:
+    """Two robots in one recording may define or encode a type differently."""
     known: dict[Any, Any] = {}
     bits = b"\0\1\0\0" + np.array([3, 8], "<u4").tobytes()
 
@@ -187,8 +185,8 @@ def test_a_type_is_read_by_the_definition_of_its_own_channel() -> None:
 BENT = LensCamera(WIDE, "plumb_bob", (-1.2, 0.0, 0.02, 0.01, 0.0))
 
 
-def test_an_image_is_straightened_by_its_own_lens() -> None:
-    """Also if another lens of this camera and model came before, which showed less."""
+def test_image_is_rectified_with_its_own_lens() -> None:
+    """Even after another lens of the same camera and model."""
     pixels = gradient(60, 80)
     straight = replace(BENT, coefficients=(0.0,) * 5)
 
@@ -196,7 +194,7 @@ def test_an_image_is_straightened_by_its_own_lens() -> None:
     assert np.array_equal(rectified(pixels, straight), pixels)
 
 
-def test_points_are_compared_through_the_camera_of_each_image() -> None:
+def test_depth_images_are_compared_with_their_own_cameras() -> None:
     """After a zoom, an object at rest is at other pixels."""
 
     def slope(camera: Camera) -> Any:
@@ -211,8 +209,8 @@ def test_points_are_compared_through_the_camera_of_each_image() -> None:
     assert abs(bias) < 0.002
 
 
-def test_objects_repeat_views_of_their_own_kind_alone() -> None:
-    """A hidden or cut object shows another part, and a pose that is lost is no longer compared."""
+def test_only_views_of_same_kind_are_reused() -> None:
+    """Occluded or cut objects show another part; a view without a pose cannot be compared."""
     depth = np.full((48, 64), 0.8, np.float32)
     frame = Frame("/depth", 0, 0, 0, "camera", depth=depth, camera=CAMERA)
     whole = detection(3, points=40).candidate
@@ -229,8 +227,8 @@ def test_objects_repeat_views_of_their_own_kind_alone() -> None:
     assert not repeats(touches_border=True)
 
 
-def test_views_of_two_sensors_count_both() -> None:
-    """Their frames have the same numbers, but none repeats the other."""
+def test_views_of_both_sensors_count() -> None:
+    """Their frames have equal numbers, but neither repeats the other."""
     found = [
         replace(
             FrameDetections(
@@ -257,10 +255,10 @@ def test_each_topic_has_its_own_poses(tmp_path: Path) -> None:
         for topic, k in order:
             pose = None if (topic, k) == ("/hand", 1) else moved
             tables.write([replace(perception(k, 1), topic=topic)], [FrameRow(k, pose)])
-    seen, found = (pq.read_table(tmp_path / f"{n}.parquet") for n in ("frames", "detections"))
+    frame_rows, found = (pq.read_table(tmp_path / f"{n}.parquet") for n in ("frames", "detections"))
     placed = PlacedFrames({"/head"})
     for part in (slice(0, 2), slice(2, 5)):
-        placed.add(seen[part], found[part], part.start)
+        placed.add(frame_rows[part], found[part], part.start)
 
     assert _streams_with_poses(tmp_path) == {"/head"}
     rows = placed.find([topic for topic, _ in order], np.array([k for _, k in order]))
@@ -268,11 +266,11 @@ def test_each_topic_has_its_own_poses(tmp_path: Path) -> None:
     assert placed.poses[rows, 0, 3].tolist() == [float(topic == "/head") for topic, _ in order]
 
 
-def test_a_category_has_one_colour_and_no_other_categorys() -> None:
+def test_ros_messages_use_colour_of_category() -> None:
     ros = RosMessages(ros1=False)
     for alpha in (0.5, 1.0):
         for category in ("cup", "can", "unknown"):
             colour = ros.colour("Color", category, alpha)
-            tone = [255 * part for part in (colour.r, colour.g, colour.b)]
-            assert tone == pytest.approx(colour_of(category))
+            rgb = [255 * part for part in (colour.r, colour.g, colour.b)]
+            assert rgb == pytest.approx(colour_of(category))
             assert colour.a == alpha

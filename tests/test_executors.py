@@ -1,4 +1,4 @@
-"""Workers fail alone, end with their parent, and have the interface of concurrent.futures."""
+"""Tests of executors: workers fail alone, end with their parent, and keep the order of items."""
 
 import gc
 import os
@@ -59,7 +59,7 @@ def alive(process: int) -> bool:
 def wait_for(condition: Any, seconds: float = 20) -> None:
     deadline = time.monotonic() + seconds
     while not condition():
-        assert time.monotonic() < deadline, "waited in vain"
+        assert time.monotonic() < deadline, "condition not met in time"
         time.sleep(0.02)
 
 
@@ -69,7 +69,7 @@ def executor() -> Iterator[Executor]:
         yield made
 
 
-def test_results_errors_and_deaths_reach_their_own_futures(executor: Executor) -> None:
+def test_results_errors_and_deaths_reach_their_futures(executor: Executor) -> None:
     """A dying worker fails only its own task; a broken pool would fail all."""
     dead = [executor.submit(kill_self) for _ in range(3)]
     powers = list(executor.map(pow, range(6), [2] * 6))
@@ -84,17 +84,17 @@ def test_results_errors_and_deaths_reach_their_own_futures(executor: Executor) -
         assert "SIGKILL" in str(error)
 
 
-def test_workers_do_without_pandas(executor: Executor) -> None:
+def test_workers_do_not_load_pandas(executor: Executor) -> None:
     """Arrow loads it with its first array, which takes half a second in each worker."""
     assert not executor.submit(loads_pandas).result()
 
 
-def test_what_cannot_be_sent_fails_alone(executor: Executor) -> None:
+def test_unpicklable_task_fails_alone(executor: Executor) -> None:
     assert executor.submit(lambda: 1).exception() is not None
     assert executor.submit(abs, -1).result() == 1
 
 
-def test_a_busy_worker_is_sent_its_next_task() -> None:
+def test_busy_worker_receives_next_task() -> None:
     """Otherwise the worker would be idle while 20 MB of frames arrive."""
     one = LocalExecutor(1, ahead=1)
     held, sent, waiting = (one.submit(time.sleep, seconds) for seconds in (60, 0, 0))
@@ -109,7 +109,7 @@ def test_a_busy_worker_is_sent_its_next_task() -> None:
     one.shutdown()
 
 
-def test_what_cannot_be_received_costs_its_worker_alone() -> None:
+def test_task_that_cannot_be_unpickled_loses_only_its_worker() -> None:
     with LocalExecutor(1) as one:
         assert isinstance(one.submit(Unreadable().method).exception(20), WorkerLostError)
         assert one.submit(abs, -1).result() == 1
@@ -122,7 +122,7 @@ def test_workers_have_one_thread_each(monkeypatch: pytest.MonkeyPatch) -> None:
         assert one.submit(os.getenv, "OMP_NUM_THREADS").result() == "1"
 
 
-def test_this_process_has_its_own_threads_back(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_thread_limits_are_restored(monkeypatch: pytest.MonkeyPatch) -> None:
     """Libraries that are loaded later would stay as slow as those of the workers."""
     monkeypatch.setenv("OMP_NUM_THREADS", "7")
     monkeypatch.delenv("MKL_NUM_THREADS", raising=False)
@@ -147,7 +147,7 @@ def test_terminate_kills_running_tasks(tmp_path: Path) -> None:
         one.submit(abs, -1)
 
 
-def test_workers_put_their_work_down_when_the_executor_stops(tmp_path: Path) -> None:
+def test_stopping_executor_interrupts_tasks(tmp_path: Path) -> None:
     executor = LocalExecutor(1)
     running = executor.submit(work_until_asked, str(tmp_path / "begun"))
     waiting = executor.submit(work_until_asked, str(tmp_path / "never"))
@@ -181,7 +181,7 @@ def test_workers_end_when_their_parent_is_killed(tmp_path: Path) -> None:
     wait_for(lambda: not alive(worker), 5)
 
 
-def test_mailbox_hands_on_what_is_posted_and_never_waits(tmp_path: Path) -> None:
+def test_mailbox_delivers_messages_and_ignores_missing_listeners(tmp_path: Path) -> None:
     received: SimpleQueue[Any] = SimpleQueue()
     with Mailbox(received.put) as mailbox:
         post(mailbox.address, ["kitchen", 3])
@@ -199,7 +199,7 @@ def test_mailbox_hands_on_what_is_posted_and_never_waits(tmp_path: Path) -> None
         (None, 40, (8, 1)),
         (1, 40, (1, 1)),
         (5, 2, (2, 2)),
-        (20, 3, (3, 2)),  # of the cores that there are, not of those that were asked for
+        (20, 3, (3, 2)),  # available cores count, not requested ones
         (20, 40, (20, 1)),
     ],
 )
@@ -212,7 +212,7 @@ def test_cores_are_shared_between_recordings_and_their_frames(
     assert share_cores(jobs, recordings) == expected
 
 
-def test_executors_that_are_not_there_are_named(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_missing_or_invalid_executors_are_refused(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setitem(sys.modules, "ray", None)
     monkeypatch.setitem(sys.modules, "distributed", None)
     with pytest.raises(ConfigError, match=r"shapecat\[ray\]"):
@@ -225,8 +225,8 @@ def test_executors_that_are_not_there_are_named(monkeypatch: pytest.MonkeyPatch)
         LocalExecutor(0)
 
 
-def test_dask_does_not_answer_a_second_attempt_with_the_result_of_the_first() -> None:
-    """A recording whose worker died would be given up untried: its retry is the same call."""
+def test_dask_runs_equal_calls_separately() -> None:
+    """The retry of a recording whose worker died is the same call; a cached result would end it."""
     distributed = pytest.importorskip("distributed")
     client = distributed.Client(processes=False, n_workers=1, dashboard_address="127.0.0.1:0")
     with _DaskExecutor(client, None) as executor:
@@ -235,7 +235,7 @@ def test_dask_does_not_answer_a_second_attempt_with_the_result_of_the_first() ->
         assert first.result() != second.result()
 
 
-def test_processes_keep_the_order_and_hold_few_items() -> None:
+def test_processes_keep_order_and_hold_few_items() -> None:
     """A recording does not fit into memory, and its tables must not depend on timing."""
     used: list[tuple[int, int]] = []
     workers: set[int] = set()
@@ -259,8 +259,8 @@ def test_processes_keep_the_order_and_hold_few_items() -> None:
     assert len(workers) == 3
 
 
-def test_a_killed_process_loses_no_item(caplog: pytest.LogCaptureFixture) -> None:
-    """The kernel kills the largest process when memory is short; its frame must not be missing."""
+def test_killed_process_loses_no_item(caplog: pytest.LogCaptureFixture) -> None:
+    """The kernel kills the largest process if memory is short; no frame may be missing then."""
     deadline = time.monotonic() + 60
 
     def killed() -> bool:
@@ -287,7 +287,7 @@ def one_by_one() -> Iterator[tuple[int, float]]:
         yield k, 0.4
 
 
-def test_the_last_items_do_not_wait_for_a_slow_process() -> None:
+def test_last_items_do_not_wait_for_slow_process() -> None:
     """Items that were not sent yet are processed here."""
     with Processes(slow_elsewhere, 2) as processes:
         processes.start()
@@ -297,7 +297,7 @@ def test_the_last_items_do_not_wait_for_a_slow_process() -> None:
     assert workers[2] == os.getpid()
 
 
-def test_results_are_freed_without_collecting_garbage() -> None:
+def test_results_are_freed_without_garbage_collection() -> None:
     """Garbage is collected rarely: results in cycles would fill the memory."""
     received: list[Any] = []
     deadline = time.monotonic() + 60
@@ -322,7 +322,7 @@ def test_results_are_freed_without_collecting_garbage() -> None:
         gc.enable()
 
 
-def test_errors_come_at_their_turn() -> None:
+def test_errors_are_raised_in_order() -> None:
     with Processes(inverse_of_rest, 2) as processes:
         results = processes.in_order((k, k) for k in range(20))
         assert [next(results)[1] for _ in range(12)] == [0] * 11 + [1]
@@ -330,16 +330,16 @@ def test_errors_come_at_their_turn() -> None:
             next(results)
 
 
-def test_an_error_that_cannot_be_read_fails_its_task_alone() -> None:
+def test_error_that_cannot_be_unpickled_fails_only_its_task() -> None:
     """Otherwise the caller would wait for ever."""
     with LocalExecutor(1) as executor:
-        unread, after = executor.submit(raise_unreadable), executor.submit(abs, -3)
+        failing, after = executor.submit(raise_unreadable), executor.submit(abs, -3)
         with pytest.raises(TypeError, match="number"):
-            unread.result(timeout=60)
+            failing.result(timeout=60)
         assert after.result(timeout=60) == 3
 
 
-def test_records_are_read_only_in_every_process() -> None:
+def test_records_are_read_only_after_transfer() -> None:
     """A result could change its input, and kernels would be compiled again for such arrays."""
     sent = Frame(
         "a", 0, 0, 0, "c", depth=np.ones((4, 5), np.float32), camera=Camera(5, 4, 3, 3, 2, 2)

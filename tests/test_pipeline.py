@@ -1,4 +1,4 @@
-"""The whole pipeline, on recordings made here and on real data if present."""
+"""Tests of the whole pipeline, on simulated recordings and on real data if present."""
 
 import json
 from collections import Counter
@@ -61,13 +61,12 @@ def rows(folder: Path, table: str, *columns: str) -> list[dict[str, Any]]:
     return found
 
 
-def test_every_file_of_the_contract_and_no_other(run_folder: Path) -> None:
+def test_run_folder_has_exactly_the_documented_files(run_folder: Path) -> None:
     assert {path.name for path in run_folder.iterdir()} == FILES
     assert [path.name for path in run_folder.parent.iterdir()] == ["table"]
 
 
 def test_originals_are_kept_and_annotations_decode(recording: Path, run_folder: Path) -> None:
-    """A tool that changes a recording is never used twice."""
     assert not messages(recording) - messages(run_folder / "annotated.mcap")
 
     topics = ["/shapecat/detections", "/shapecat/scene"]
@@ -81,8 +80,8 @@ def test_originals_are_kept_and_annotations_decode(recording: Path, run_folder: 
     assert sum(len(m.detections) for t, m in decoded if t == topics[0]) > 100
 
 
-def test_objects_are_found_named_and_followed(recording: Path, run_folder: Path) -> None:
-    """Against the truth: found in 9 of 10 frames, one track each, correct category."""
+def test_objects_are_detected_categorized_and_tracked(recording: Path, run_folder: Path) -> None:
+    """In 9 of 10 frames, with one track each, and 85 % in the correct category."""
     truth = json.loads(recording.with_suffix(".truth.json").read_text())
     labels = np.load(recording.with_suffix(".labels.npz"))["labels"]
     track_of = {
@@ -122,7 +121,7 @@ def final_labels(folder: Path) -> dict[int, str]:
     return {int(row["track"]): row["category"] for row in table}
 
 
-def test_the_camera_s_own_motion_is_taken_out(run_folder: Path) -> None:
+def test_camera_motion_is_compensated(run_folder: Path) -> None:
     """With transforms, an object at rest has a constant position."""
     run = json.loads((run_folder / "run.json").read_text())
     assert run["fixed_frame"] == "map"
@@ -136,7 +135,7 @@ def test_the_camera_s_own_motion_is_taken_out(run_folder: Path) -> None:
 
 
 @pytest.mark.parametrize(("container", "name"), [("ros1", "table.bag"), ("ros2", "table")])
-def test_other_containers_give_the_same(
+def test_other_containers_give_same_detections(
     shapecat: Run, tmp_path: Path, run_folder: Path, container: str, name: str
 ) -> None:
     path = tmp_path / name
@@ -145,10 +144,10 @@ def test_other_containers_give_the_same(
     out = ("--out", tmp_path / "out", "--end", 0.2, "--no-rrd")
     assert shapecat("process", path, *out).exit_code == 0
 
-    same_detections(run_folder, tmp_path / "out" / "table", atol=1e-6)
+    assert_same_detections(run_folder, tmp_path / "out" / "table", atol=1e-6)
 
 
-def test_clouds_give_the_same_as_depth_images(
+def test_clouds_give_same_detections_as_depth_images(
     shapecat: Run, tmp_path: Path, run_folder: Path
 ) -> None:
     path = tmp_path / "table.mcap"
@@ -156,10 +155,10 @@ def test_clouds_give_the_same_as_depth_images(
     result = shapecat("process", path, "--out", tmp_path / "out", "--end", 0.2, "--no-rrd")
     assert result.exit_code == 0, result.output
 
-    same_detections(run_folder, tmp_path / "out" / "table", atol=2e-3)
+    assert_same_detections(run_folder, tmp_path / "out" / "table", atol=2e-3)
 
 
-def same_detections(expected: Path, actual: Path, *, atol: float) -> None:
+def assert_same_detections(expected: Path, actual: Path, *, atol: float) -> None:
     columns = ("frame", "detection", "center", "category", "posterior", "novelty")
     want, have = (rows(folder, "detections", *columns) for folder in (expected, actual))
     have_frames = {row["frame"] for row in have}
@@ -174,7 +173,7 @@ def same_detections(expected: Path, actual: Path, *, atol: float) -> None:
     assert np.mean(same) >= 0.9
 
 
-def test_same_input_gives_the_same_tables(
+def test_same_input_gives_same_tables(
     shapecat: Run, recording: Path, run_folder: Path, tmp_path: Path
 ) -> None:
     assert shapecat("process", recording, "--out", tmp_path, "--no-rrd").exit_code == 0
@@ -186,7 +185,7 @@ def test_same_input_gives_the_same_tables(
     assert (run_folder / "tracks.csv").read_text() == (tmp_path / "table/tracks.csv").read_text()
 
 
-def test_complete_results_are_not_made_again(
+def test_complete_run_is_not_processed_again(
     shapecat: Run, recording: Path, run_folder: Path
 ) -> None:
     before = (run_folder / "run.json").stat().st_mtime_ns
@@ -200,7 +199,7 @@ def test_complete_results_are_not_made_again(
     assert "--overwrite" in other.stderr
 
 
-def test_a_corrected_label_goes_into_the_outputs(
+def test_corrected_label_appears_in_annotations(
     shapecat: Run, recording: Path, tmp_path: Path
 ) -> None:
     assert shapecat("process", recording, "--out", tmp_path, "--end", 0.1).exit_code == 0
@@ -225,10 +224,10 @@ def test_a_corrected_label_goes_into_the_outputs(
 @pytest.mark.parametrize(
     ("content", "code"), [(None, 3), (b"", 3), (b"hello, this is a text\n", 3)]
 )
-def test_what_is_not_a_recording(
+def test_invalid_recording_is_refused_in_one_line(
     shapecat: Run, tmp_path: Path, content: bytes | None, code: int
 ) -> None:
-    """One clear line, the documented exit code, and nothing left behind."""
+    """With the documented exit code, and without leaving files."""
     for name in ("x.mcap", "x.bag", "x.db3", "x.txt"):
         path = tmp_path / name
         if content is not None:
@@ -240,7 +239,7 @@ def test_what_is_not_a_recording(
         assert not (tmp_path / "out").exists()
 
 
-def test_a_recording_without_clouds(shapecat: Run, tmp_path: Path, recording: Path) -> None:
+def test_unknown_topic_or_late_start_fails(shapecat: Run, tmp_path: Path, recording: Path) -> None:
     result = shapecat("process", recording, "--out", tmp_path / "out", "--topic", "/none")
     assert result.exit_code == 4
     assert "/camera/depth/image_raw" in result.stderr
@@ -251,7 +250,7 @@ def test_a_recording_without_clouds(shapecat: Run, tmp_path: Path, recording: Pa
     assert not (tmp_path / "out").exists()
 
 
-def test_a_warning_that_comes_again_is_told_once(tmp_path: Path) -> None:
+def test_repeated_warning_is_stored_once(tmp_path: Path) -> None:
     """Every command that writes outputs opens the recording again."""
     recording: Any = SimpleNamespace(warnings=["no index", "skipped 3"])
     run: Any = {
@@ -266,7 +265,7 @@ def test_a_warning_that_comes_again_is_told_once(tmp_path: Path) -> None:
     assert run["warnings"] == ["skipped 3", "tilted", "no index"]
 
 
-def test_one_bad_recording_does_not_stop_the_others(
+def test_bad_recording_does_not_stop_the_others(
     shapecat: Run, recording: Path, tmp_path: Path
 ) -> None:
     bad = tmp_path / "bad.mcap"
@@ -278,12 +277,12 @@ def test_one_bad_recording_does_not_stop_the_others(
     (summary,) = json.loads(result.stdout)
     assert summary["counts"]["frames"] > 0
     (again,) = json.loads(shapecat("process", bad, recording, "--out", out, *options).stdout)
-    assert again == {**summary, "processed": False}  # also what the manifest does not hold
+    assert again == {**summary, "processed": False}  # including what the manifest lacks
     assert {path.name for path in out.iterdir()} == {"table", "manifest.jsonl"}
 
 
-def test_a_recording_in_which_nothing_is_found(shapecat: Run, tmp_path: Path) -> None:
-    """Guards against empty tables shaped as if they had a row."""
+def test_commands_accept_run_without_objects(shapecat: Run, tmp_path: Path) -> None:
+    """Empty tables must not be shaped as if they had a row."""
     path = simulate(tmp_path / "bare.mcap", scene="empty", frames=3, seed=2)
     result = shapecat("process", path, "--out", tmp_path)
     assert result.exit_code == 0, result.output
@@ -315,24 +314,24 @@ def centres(shapecat: Run, recording: Path, out: Path) -> dict[int, list[Any]]:
 
 
 @pytest.fixture(scope="module")
-def in_depth_images(
+def depth_image_centres(
     shapecat: Run, real_data: Path, tmp_path_factory: pytest.TempPathFactory
 ) -> dict[int, list[Any]]:
     return centres(shapecat, real_data / "osd_learn/depth.mcap", tmp_path_factory.mktemp("depth"))
 
 
 @pytest.mark.parametrize("name", ["clouds.mcap", "clouds.bag", "clouds_ros2"])
-def test_real_clouds_give_what_their_depth_images_give(
+def test_real_clouds_give_same_objects_as_depth_images(
     shapecat: Run,
     real_data: Path,
-    in_depth_images: dict[int, list[Any]],
+    depth_image_centres: dict[int, list[Any]],
     tmp_path: Path,
     name: str,
 ) -> None:
-    """Same objects, centres within 2 mm, in every wrapping of the same sensor data."""
+    """Centres agree within 2 mm, in every container."""
     have = centres(shapecat, real_data / "osd_learn" / name, tmp_path)
 
     assert have
-    assert set(have) <= set(in_depth_images)
+    assert set(have) <= set(depth_image_centres)
     for stamp, found in have.items():
-        assert_allclose(found, in_depth_images[stamp], atol=2e-3)
+        assert_allclose(found, depth_image_centres[stamp], atol=2e-3)

@@ -12,7 +12,7 @@ from shapecat.system.files import holding, partial_path, replacing, require_writ
 from tests.run_info import run_info
 
 
-def test_folder_appears_whole(tmp_path: Path) -> None:
+def test_staged_folder_appears_complete(tmp_path: Path) -> None:
     folder = tmp_path / "out" / "lab"
     with staged(folder) as hidden:
         (hidden / "a").write_text("1")
@@ -22,8 +22,8 @@ def test_folder_appears_whole(tmp_path: Path) -> None:
     assert [p.name for p in folder.parent.iterdir()] == ["lab"]
 
 
-def test_nothing_is_left_after_an_error(tmp_path: Path) -> None:
-    """Also not the output folder that had to be made."""
+def test_error_leaves_nothing(tmp_path: Path) -> None:
+    """New parent folders are removed too."""
     with pytest.raises(RuntimeError), staged(tmp_path / "out" / "deep" / "lab") as hidden:
         (hidden / "a").write_text("1")
         raise RuntimeError
@@ -31,8 +31,8 @@ def test_nothing_is_left_after_an_error(tmp_path: Path) -> None:
     assert list(tmp_path.iterdir()) == []
 
 
-def test_a_place_that_cannot_be_written_is_one_line_in_words(tmp_path: Path) -> None:
-    """An error number, and the path a second time, do not help a user."""
+def test_unwritable_path_is_reported_with_reason(tmp_path: Path) -> None:
+    """Users need neither an error number nor the path twice."""
     (tmp_path / "file").write_text("")
     below, missing = tmp_path / "file" / "model.npz", tmp_path / "none"
 
@@ -47,8 +47,8 @@ def test_a_place_that_cannot_be_written_is_one_line_in_words(tmp_path: Path) -> 
     assert str(error.value) == f"{missing}: No such file or directory"
 
 
-def own(folder: Path, **files: str) -> Path:
-    """Make a run folder as an earlier run has left it."""
+def make_run(folder: Path, **files: str) -> Path:
+    """Make a run folder as an earlier run left it."""
     folder.mkdir(parents=True)
     run = run_info(id=new_id())
     write_run(folder, run)
@@ -61,8 +61,8 @@ def contents(folder: Path) -> dict[str, str]:
     return {path.name: path.read_text() for path in folder.iterdir() if path.name != "run.json"}
 
 
-def test_old_results_stay_until_the_new_are_complete(tmp_path: Path) -> None:
-    folder = own(tmp_path / "lab", tracks_csv="old")
+def test_old_results_stay_until_new_ones_are_complete(tmp_path: Path) -> None:
+    folder = make_run(tmp_path / "lab", tracks_csv="old")
     with pytest.raises(RuntimeError), staged(folder) as hidden:
         (hidden / "tracks.csv").write_text("new")
         raise RuntimeError
@@ -78,8 +78,8 @@ def test_old_results_stay_until_the_new_are_complete(tmp_path: Path) -> None:
 
 @pytest.mark.parametrize("name", ["lab", ".lab.partial"])
 @pytest.mark.parametrize("file", ["thesis.txt", "run.json", "tracks.csv"])
-def test_a_strangers_folder_is_not_touched(tmp_path: Path, name: str, file: str) -> None:
-    """Also not one that looks like ours but has no id."""
+def test_foreign_folder_is_not_touched(tmp_path: Path, name: str, file: str) -> None:
+    """Nor is one that looks like a run folder but has no id."""
     (tmp_path / name).mkdir()
     (tmp_path / name / file).write_text("{}")
     with pytest.raises(OutputError, match="did not make this"), staged(tmp_path / "lab"):
@@ -89,9 +89,9 @@ def test_a_strangers_folder_is_not_touched(tmp_path: Path, name: str, file: str)
     assert [path.name for path in tmp_path.iterdir()] == [name]
 
 
-def test_a_file_or_link_in_the_way_is_not_touched(tmp_path: Path) -> None:
+def test_file_or_link_at_target_is_not_touched(tmp_path: Path) -> None:
     (tmp_path / "lab").write_text("mine")
-    (tmp_path / "link").symlink_to(own(tmp_path / "elsewhere"))
+    (tmp_path / "link").symlink_to(make_run(tmp_path / "elsewhere"))
     for name in ("lab", "link"):
         with pytest.raises(OutputError, match="did not make this"), staged(tmp_path / name):
             pytest.fail("must not begin")
@@ -100,8 +100,8 @@ def test_a_file_or_link_in_the_way_is_not_touched(tmp_path: Path) -> None:
     assert (tmp_path / "elsewhere" / "run.json").exists()
 
 
-def test_what_a_person_put_beside_the_results_moves_on(tmp_path: Path) -> None:
-    folder = own(tmp_path / "lab", tracks_csv="old", notes_txt="mine")
+def test_user_files_move_to_new_results(tmp_path: Path) -> None:
+    folder = make_run(tmp_path / "lab", tracks_csv="old", notes_txt="mine")
     (folder / "photos").mkdir()
     (folder / "photos" / "a.jpg").write_text("picture")
     with staged(folder) as hidden:
@@ -113,10 +113,10 @@ def test_what_a_person_put_beside_the_results_moves_on(tmp_path: Path) -> None:
     assert (folder / "tracks.csv").read_text() == "new"
 
 
-def test_a_kill_between_the_renames_loses_neither(tmp_path: Path) -> None:
-    """The old folder is put back, and the new one waits until its run goes on."""
-    folder = own(tmp_path / "lab", tracks_csv="old")
-    own(partial_path(folder), tracks_csv="new")
+def test_kill_between_renames_loses_neither_folder(tmp_path: Path) -> None:
+    """The old folder is restored; the new one stays until its run resumes."""
+    folder = make_run(tmp_path / "lab", tracks_csv="old")
+    make_run(partial_path(folder), tracks_csv="new")
     folder.rename(previous_path(folder))
 
     recover(folder)
@@ -125,9 +125,9 @@ def test_a_kill_between_the_renames_loses_neither(tmp_path: Path) -> None:
     assert contents(partial_path(folder)) == {"tracks.csv": "new"}
 
 
-def test_a_kill_after_the_renames_is_tidied_up(tmp_path: Path) -> None:
-    folder = own(tmp_path / "lab", tracks_csv="new")
-    own(previous_path(folder), tracks_csv="old", notes_txt="mine")
+def test_recovery_removes_old_folder_but_keeps_user_files(tmp_path: Path) -> None:
+    folder = make_run(tmp_path / "lab", tracks_csv="new")
+    make_run(previous_path(folder), tracks_csv="old", notes_txt="mine")
 
     recover(folder)
 
@@ -135,7 +135,7 @@ def test_a_kill_after_the_renames_is_tidied_up(tmp_path: Path) -> None:
     assert contents(folder) == {"tracks.csv": "new", "notes.txt": "mine"}
 
 
-def test_work_that_can_be_resumed_stays_after_an_error(tmp_path: Path) -> None:
+def test_resumable_work_stays_after_error(tmp_path: Path) -> None:
     folder = tmp_path / "out" / "lab"
     with (
         pytest.raises(OutputError, match=r"No space left.*is kept"),
@@ -147,7 +147,7 @@ def test_work_that_can_be_resumed_stays_after_an_error(tmp_path: Path) -> None:
     assert (partial_path(folder) / "work").read_text() == "hours"
 
 
-def test_an_unwritable_place_is_one_line(tmp_path: Path) -> None:
+def test_unwritable_output_folder_is_reported(tmp_path: Path) -> None:
     (tmp_path / "file").write_text("")
     with (
         pytest.raises(OutputError, match="cannot write the results"),
@@ -156,7 +156,7 @@ def test_an_unwritable_place_is_one_line(tmp_path: Path) -> None:
         pass
 
 
-def test_replacing_keeps_the_old_file_on_error(tmp_path: Path) -> None:
+def test_replacing_keeps_old_file_on_error(tmp_path: Path) -> None:
     path = tmp_path / "f"
     path.write_text("old")
     with pytest.raises(RuntimeError), replacing(path) as hidden:
@@ -167,7 +167,7 @@ def test_replacing_keeps_the_old_file_on_error(tmp_path: Path) -> None:
     assert list(tmp_path.iterdir()) == [path]
 
 
-def test_run_json_round_trip_and_foreign_folder(tmp_path: Path) -> None:
+def test_run_json_round_trips_and_is_validated(tmp_path: Path) -> None:
     run = run_info(input={"path": "ü"})
     write_run(tmp_path, run)
 
@@ -180,32 +180,32 @@ def test_run_json_round_trip_and_foreign_folder(tmp_path: Path) -> None:
         read_run(tmp_path / "nowhere")
 
 
-def test_digest_sees_every_byte(tmp_path: Path) -> None:
+def test_digest_covers_whole_file(tmp_path: Path) -> None:
     path = tmp_path / "f"
     middle = bytearray(b"a" * 3_000_000)
     middle[1_500_000:1_504_096] = bytes(4096)
-    seen = set()
+    digests = set()
     for content in (b"", b"a", b"a" * 3_000_000, bytes(middle), b"a" * 3_000_001):
         path.write_bytes(content)
-        seen.add(content_digest(path))
+        digests.add(content_digest(path))
 
-    assert len(seen) == 5
+    assert len(digests) == 5
 
 
-def test_digest_of_a_folder_sees_names_and_where_files_end(tmp_path: Path) -> None:
-    seen = set()
+def test_folder_digest_covers_names_and_file_boundaries(tmp_path: Path) -> None:
+    digests = set()
     for k, files in enumerate(
         ({"a": "xy", "b": "z"}, {"a": "x", "b": "yz"}, {"a": "xy", "c": "z"})
     ):
         (tmp_path / str(k)).mkdir()
         for name, text in files.items():
             (tmp_path / str(k) / name).write_text(text)
-        seen.add(content_digest(tmp_path / str(k)))
+        digests.add(content_digest(tmp_path / str(k)))
 
-    assert len(seen) == 3
+    assert len(digests) == 3
 
 
-def test_content_is_read_only_where_times_cannot_tell(tmp_path: Path) -> None:
+def test_content_is_read_only_if_file_times_differ(tmp_path: Path) -> None:
     path = tmp_path / "f"
     path.write_text("abc")
     known: Any = {"files": file_stats(path), "digest": content_digest(path)}
@@ -229,24 +229,24 @@ def test_content_is_read_only_where_times_cannot_tell(tmp_path: Path) -> None:
     assert not same_content(known, path, read)
 
 
-def test_flushed_before_and_after_it_takes_its_name(
+def test_file_is_flushed_before_and_after_renaming(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """Else a power cut leaves a complete name with incomplete content."""
-    path, seen = tmp_path / "f", []
+    """A power cut could leave an incomplete file under its final name."""
+    path, flushed = tmp_path / "f", []
 
     def fsync(number: int) -> None:
-        seen.append((str(Path(f"/proc/self/fd/{number}").readlink()), path.exists()))
+        flushed.append((str(Path(f"/proc/self/fd/{number}").readlink()), path.exists()))
 
     monkeypatch.setattr(os, "fsync", fsync)
     monkeypatch.delenv("SHAPECAT_FSYNC")
     with replacing(path) as hidden:
         hidden.write_text("all")
 
-    assert seen == [(str(partial_path(path)), False), (str(tmp_path), True)]
+    assert flushed == [(str(partial_path(path)), False), (str(tmp_path), True)]
 
     monkeypatch.setenv("SHAPECAT_FSYNC", "0")
     with replacing(path) as hidden:
         hidden.write_text("more")
 
-    assert len(seen) == 2
+    assert len(flushed) == 2

@@ -68,8 +68,8 @@ def write_run_tables(folder: Path, counts: list[int], pose: Pose | None = None) 
             tables.write([perception(index, count)], [FrameRow(2000 + index, pose)])
 
 
-def test_columns_are_those_of_the_contract(tmp_path: Path) -> None:
-    """People's programs read these files."""
+def test_tables_have_documented_columns(tmp_path: Path) -> None:
+    """Programs of users read these files."""
     write_run_tables(tmp_path, [3, 0, 2], Pose(np.eye(3), np.array([0, 0, 10])))
 
     table = pq.read_table(tmp_path / "detections.parquet")
@@ -89,7 +89,7 @@ def test_columns_are_those_of_the_contract(tmp_path: Path) -> None:
     assert pq.read_table(tmp_path / "frames.parquet")["frame"].to_pylist() == [0, 1, 2]
 
 
-def test_pixel_indices_are_stored_as_differences(tmp_path: Path) -> None:
+def test_pixel_indices_are_delta_encoded(tmp_path: Path) -> None:
     """They are most of a table: plain numbers would take ten times the space."""
     write_run_tables(tmp_path, [2])
     group = pq.read_metadata(tmp_path / "detections.parquet").row_group(0)
@@ -100,7 +100,7 @@ def test_pixel_indices_are_stored_as_differences(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize("empty", [0, 40, 150])
-def test_row_groups_cover_the_same_frames(tmp_path: Path, empty: int) -> None:
+def test_row_groups_of_all_tables_cover_same_frames(tmp_path: Path, empty: int) -> None:
     """They are read side by side; frames without detections must not shift them."""
     counts = [0 if k < empty else k % 3 for k in range(150)]
     write_run_tables(tmp_path, counts)
@@ -115,10 +115,10 @@ def test_row_groups_cover_the_same_frames(tmp_path: Path, empty: int) -> None:
     assert sum(detections.num_rows for detections in groups[1]) == sum(counts)
 
 
-def test_frames_are_stored_when_many_or_old(
+def test_segments_are_written_when_full_or_old(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """A kill may cost two seconds; and many quick frames would fill the memory before that."""
+    """A kill may cost two seconds of work; many quick frames would fill the memory sooner."""
     clock = [7.0]
     place = "shapecat.runs.perceived"
     monkeypatch.setattr(f"{place}.time", SimpleNamespace(monotonic=lambda: clock[0]))
@@ -132,7 +132,7 @@ def test_frames_are_stored_when_many_or_old(
     assert stored == [0] * (_SEGMENT_FRAMES - 1) + [1] * 3 + [2]
 
 
-def test_a_second_look_replaces_a_frame_only_where_it_sees_more_than_nothing(
+def test_second_look_without_result_does_not_replace_frame(
     tmp_path: Path,
 ) -> None:
     """Another up direction may lose a scene; the first result is then better."""
@@ -143,16 +143,16 @@ def test_a_second_look_replaces_a_frame_only_where_it_sees_more_than_nothing(
         rows = [FrameRow(2001, None, again=True), FrameRow(2003, None, again=True)]
         tables.write([perception(1, 3), nothing], rows)
 
-    seen = {n: pq.read_table(tmp_path / f"{n}.parquet") for n in ("frames", "detections", "planes")}
+    read = {n: pq.read_table(tmp_path / f"{n}.parquet") for n in ("frames", "detections", "planes")}
 
-    assert seen["frames"]["revised"].to_pylist() == [False, True, False, False]
-    assert seen["detections"]["frame"].to_pylist() == [0, 0, 1, 1, 1, 3, 3]
-    assert seen["planes"]["frame"].to_pylist() == [0, 0, 1, 1, 2, 2, 3, 3]
+    assert read["frames"]["revised"].to_pylist() == [False, True, False, False]
+    assert read["detections"]["frame"].to_pylist() == [0, 0, 1, 1, 1, 3, 3]
+    assert read["planes"]["frame"].to_pylist() == [0, 0, 1, 1, 2, 2, 3, 3]
 
 
 @pytest.mark.parametrize("count", [0, 2])
-def test_frames_without_tracks_are_shown_empty(tmp_path: Path, count: int) -> None:
-    """A bare table is a result too, and so are detections that no track confirms."""
+def test_frames_without_tracks_have_no_objects(tmp_path: Path, count: int) -> None:
+    """Empty tables and unconfirmed detections are valid results."""
     write_run_tables(tmp_path, [count, 0])
     write_tracks(tmp_path, [])
 
@@ -183,7 +183,7 @@ def test_labelled_frames_join_tracks_and_labels(tmp_path: Path) -> None:
     assert_allclose(frames[0].fixed_from_sensor.translation, [1, 2, 3])
 
 
-def test_what_has_ended_is_told_in_the_next_frame_of_the_same_sensor(tmp_path: Path) -> None:
+def test_ended_tracks_are_reported_in_next_frame_of_sensor(tmp_path: Path) -> None:
     """A viewer would not look for it in a frame of another sensor."""
     names = ("/a", "/b", "/b", "/a", "/b")
     with PerceptionTables(tmp_path, categories=CATEGORIES, model_id="m1") as tables:
@@ -194,10 +194,10 @@ def test_what_has_ended_is_told_in_the_next_frame_of_the_same_sensor(tmp_path: P
     assert _next_of_topic(tmp_path, wanted) == {("/a", 0): ("/a", 30), ("/b", 20): ("/b", 40)}
 
 
-def test_each_detection_keeps_its_track_when_rows_are_read_a_few_at_a_time(
+def test_detections_keep_tracks_when_rows_are_read_in_parts(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """Tracks are written one after the other and shown frame by frame; some boxes are unknown."""
+    """Rows are sorted by track but shown by frame; some boxes are missing."""
     monkeypatch.setattr(shown, "_ROWS", 2)
     write_run_tables(tmp_path, [2, 2, 1])
     rows = [(5, 0, 1), (5, 1, 0), (5, 2, None), (6, 0, 0), (6, 2, 0), (7, 1, 1)]
@@ -219,17 +219,17 @@ def test_each_detection_keeps_its_track_when_rows_are_read_a_few_at_a_time(
     assert_allclose(found.full[3], np.full(10, 4.5))
 
 
-def test_lists_of_nothing() -> None:
+def test_no_lists_give_empty_column() -> None:
     assert lists([], DETECTIONS.field("indices").type.value_type).to_pylist() == []
 
 
-def test_a_foreign_file_is_not_a_table(tmp_path: Path) -> None:
+def test_foreign_file_is_rejected_as_table(tmp_path: Path) -> None:
     (tmp_path / "frames.parquet").write_bytes(b"hello")
     with pytest.raises(OutputError, match="process the recording again"):
         list(read_row_groups(tmp_path / "frames.parquet"))
 
 
-def test_run_json_is_as_its_schema_says(guessed_run: Path, coloured_run: Path) -> None:
+def test_run_json_matches_its_schema(guessed_run: Path, coloured_run: Path) -> None:
     """The schema is the documentation: it has every entry, and no other."""
     jsonschema = pytest.importorskip("jsonschema")
     schema = json.loads(files("shapecat.schemas").joinpath("run.json").read_text("utf-8"))
@@ -242,7 +242,7 @@ def test_run_json_is_as_its_schema_says(guessed_run: Path, coloured_run: Path) -
         assert set(schema["properties"][name]["properties"]) == set(get_type_hints(kind))
 
 
-def test_the_schema_has_every_setting() -> None:
+def test_schema_has_every_setting() -> None:
     schema = json.loads(files("shapecat.schemas").joinpath("run.json").read_text("utf-8"))
     known = schema["$defs"]["settings"]["properties"]
     values = Settings().as_dict()

@@ -1,4 +1,4 @@
-"""Annotations of a rotated box without equal numbers, in every encoding."""
+"""Tests of annotations of a rotated box in every encoding; all numbers differ, so swaps show."""
 
 import json
 from dataclasses import replace
@@ -29,12 +29,12 @@ from tests.test_annotated_mcap import EPOCH, write_mcap
 
 SECOND = 10**9
 STAMP = 1_700_000_123 * SECOND + 456_789_012
-TURN = Rotation.from_euler("zyx", [0.9, -0.5, 2.4])
+ROTATION = Rotation.from_euler("zyx", [0.9, -0.5, 2.4])
 CENTER, SIZE = (0.31, -0.22, 1.17), (0.06, 0.11, 0.19)
-BOX = ShownBox(7, "bowl", 0.625, CENTER, SIZE, tuple(TURN.as_quat().tolist()))
+BOX = ShownBox(7, "bowl", 0.625, CENTER, SIZE, tuple(ROTATION.as_quat().tolist()))
 FRAME = ShownFrame("/points", 4, STAMP, STAMP + 11, "optical", (BOX,), (5, 6))
 ANNOTATION = Annotation(FRAME, 2 * SECOND + 250_000_000, (5, 6))
-ABOVE = CENTER + TURN.apply([0, 0, SIZE[2] / 2 + 0.03])
+ABOVE = CENTER + ROTATION.apply([0, 0, SIZE[2] / 2 + 0.03])
 
 
 def decode_ros(name: str, schema: bytes, data: bytes, *, ros1: bool) -> Any:
@@ -85,30 +85,30 @@ def numbers(record: Any, names: str) -> list[float]:
     return [getattr(record, name) for name in names]
 
 
-def same_turn(quaternion: Any) -> float:
+def rotation_error(quaternion: Any) -> float:
     """Return the angle between a quaternion (x, y, z, w) and that of the box, radians."""
-    return float((Rotation.from_quat(numbers(quaternion, "xyzw")) * TURN.inv()).magnitude())
+    return float((Rotation.from_quat(numbers(quaternion, "xyzw")) * ROTATION.inv()).magnitude())
 
 
 def check_box(pose: Any, size: Any) -> None:
     assert_allclose(numbers(pose.position, "xyz"), CENTER, atol=1e-6)
-    assert same_turn(pose.orientation) < 1e-6
+    assert rotation_error(pose.orientation) < 1e-6
     assert_allclose(numbers(size, "xyz"), SIZE, atol=1e-6)
 
 
-def test_the_label_stands_above_the_top_of_the_box() -> None:
+def test_label_is_above_top_of_box() -> None:
     """With a transposed rotation it would be beside a tilted box."""
     assert_allclose(text_position(BOX), ABOVE, atol=1e-12)
 
 
-def test_the_caption_of_the_review_stands_there_as_well() -> None:
-    box = Box(np.array(CENTER), np.array(SIZE), TURN.as_quat())
+def test_review_label_is_above_top_of_box() -> None:
+    box = Box(np.array(CENTER), np.array(SIZE), ROTATION.as_quat())
 
-    assert_allclose(_above(box), CENTER + TURN.apply([0, 0, SIZE[2] / 2 + 0.02]), atol=1e-6)
+    assert_allclose(_above(box), CENTER + ROTATION.apply([0, 0, SIZE[2] / 2 + 0.02]), atol=1e-6)
 
 
 @pytest.mark.parametrize("encoding", ["cdr", "ros1", "json", "protobuf"])
-def test_a_scene_says_the_same_in_every_encoding(encoding: str) -> None:
+def test_scene_is_equal_in_every_encoding(encoding: str) -> None:
     scene = messages(encoding)["/shapecat/scene"]
     (entity,), colour = scene.entities, np.array(colour_of("bowl")) / 255
 
@@ -123,12 +123,12 @@ def test_a_scene_says_the_same_in_every_encoding(encoding: str) -> None:
     assert_allclose(numbers(text.color, "rgba"), [*colour, 1.0], atol=1e-6)
     assert "7" in text.text
     assert "bowl" in text.text
-    said = {item.key: item.value for item in entity.metadata}
-    assert said == {"category": "bowl", "confidence": "0.6250", "track": "7"}
+    entries = {item.key: item.value for item in entity.metadata}
+    assert entries == {"category": "bowl", "confidence": "0.6250", "track": "7"}
 
 
 @pytest.mark.parametrize("encoding", ["cdr", "ros1", "json", "protobuf"])
-def test_a_deletion_removes_one_entity_and_not_the_scene(encoding: str) -> None:
+def test_deletions_remove_single_entities(encoding: str) -> None:
     """Type 1 of foxglove.SceneEntityDeletion removes all entities of the topic."""
     deletions = messages(encoding)["/shapecat/scene"].deletions
 
@@ -139,7 +139,7 @@ def test_a_deletion_removes_one_entity_and_not_the_scene(encoding: str) -> None:
 
 
 @pytest.mark.parametrize("encoding", ["cdr", "ros1"])
-def test_detections_keep_every_number_in_its_place(encoding: str) -> None:
+def test_detections_have_right_values(encoding: str) -> None:
     message = messages(encoding)["/shapecat/detections"]
     (item,) = message.detections
 
@@ -153,12 +153,12 @@ def test_detections_keep_every_number_in_its_place(encoding: str) -> None:
 
 
 @pytest.mark.parametrize("encoding", ["cdr", "ros1"])
-def test_markers_stand_where_the_boxes_do(encoding: str) -> None:
+def test_markers_match_boxes(encoding: str) -> None:
     """RViz: type 1 is a cube, type 9 a text that faces the viewer; action 2 deletes a marker."""
     markers = messages(encoding)["/shapecat/markers"].markers
-    gone, (cube, text) = markers[:4], markers[4:]
+    deletions, (cube, text) = markers[:4], markers[4:]
 
-    assert [(m.ns, m.id, m.action) for m in gone] == [
+    assert [(m.ns, m.id, m.action) for m in deletions] == [
         (f"shapecat/{kind}", track, 2) for track in (5, 6) for kind in ("box", "text")
     ]
     for marker in (cube, text):
@@ -189,7 +189,7 @@ def index_end(data: bytes, at: int, count: int) -> int:
     return at
 
 
-def test_chunk_indexes_tell_where_their_message_indexes_end(tmp_path: Path) -> None:
+def test_chunk_indexes_have_length_of_message_indexes(tmp_path: Path) -> None:
     """Readers that fetch a chunk with its index in one request rely on this length."""
     frames = [replace(FRAME, index=k, log_time_ns=STAMP + k) for k in range(900)]
     target = tmp_path / "out.mcap"
@@ -230,7 +230,7 @@ def test_added_messages_are_found_by_time(tmp_path: Path) -> None:
     assert counts == {"/points": 9, "/shapecat/detections": 400, "/shapecat/scene": 400}
 
 
-def test_added_messages_are_found_though_they_are_not_in_order(tmp_path: Path) -> None:
+def test_unordered_messages_are_found_by_time(tmp_path: Path) -> None:
     """Messages of two sensors arrive interleaved."""
     offsets = (50, 20, 90, 70)
     frames = [replace(FRAME, index=k, log_time_ns=EPOCH + t) for k, t in enumerate(offsets)]
@@ -245,7 +245,7 @@ def test_added_messages_are_found_though_they_are_not_in_order(tmp_path: Path) -
             assert [message.log_time - EPOCH for *_, message in found] == expected
 
 
-def test_stamps_beyond_those_of_ros_are_its_last_second() -> None:
+def test_stamps_beyond_ros_range_are_clamped() -> None:
     """ROS seconds have 31 bits: larger stamps must not stop the writer."""
     ros = RosMessages(ros1=False)
     for seconds, written in ((2**31 - 2, 2**31 - 2), (2**31, 2**31 - 1), (9 * 10**9, 2**31 - 1)):
@@ -259,7 +259,7 @@ def test_stamps_beyond_those_of_ros_are_its_last_second() -> None:
     ("offsets", "first", "last"),
     [((50, 20, 90, 70), 0, 90), ((5, 2, 7, 3), 0, 8), ((-4, 6), -4, 8)],
 )
-def test_the_file_begins_and_ends_with_whichever_message_does(
+def test_statistics_cover_times_of_all_messages(
     tmp_path: Path, offsets: tuple[int, ...], first: int, last: int
 ) -> None:
     """Players take the length from the statistics and would not play messages beyond it.
@@ -279,18 +279,18 @@ def test_the_file_begins_and_ends_with_whichever_message_does(
     assert summary.statistics.message_end_time == EPOCH + last
 
 
-def test_what_another_sensor_still_sees_is_not_taken_away(tmp_path: Path) -> None:
+def test_object_visible_to_another_sensor_is_not_deleted(tmp_path: Path) -> None:
     """Two sensors share the tracks of a scene: the last frame with an object ends it."""
 
-    def seen(topic: str, k: int, *, there: bool) -> ShownFrame:
-        boxes = (BOX,) if there else ()
+    def frame_of(topic: str, k: int, *, visible: bool) -> ShownFrame:
+        boxes = (BOX,) if visible else ()
         return ShownFrame(topic, k, STAMP + k, STAMP + k, "optical", boxes, ())
 
     frames = [
-        seen("/a", 0, there=True),
-        seen("/b", 1, there=True),
-        seen("/a", 2, there=False),
-        seen("/b", 3, there=False),
+        frame_of("/a", 0, visible=True),
+        frame_of("/b", 1, visible=True),
+        frame_of("/a", 2, visible=False),
+        frame_of("/b", 3, visible=False),
     ]
     target = tmp_path / "out.mcap"
     with open_recording(write_mcap(tmp_path / "a.mcap")) as recording:
@@ -306,8 +306,8 @@ IMAGE_BOX = ImageBox(7, "bowl", 0.625, (31, 44, 120, 66))
 IMAGE = ImageFrame(STAMP, STAMP + 3, "colour", (IMAGE_BOX,))
 
 
-def drawn(encoding: str) -> dict[str, Any]:
-    """Return the drawings on an image, by topic, decoded by their channel's own schema."""
+def image_messages(encoding: str) -> dict[str, Any]:
+    """Return the annotations of an image by topic, decoded with their channel's schema."""
     found = {}
     for channel, encode in image_encoder_for(encoding):
         data = encode(IMAGE)
@@ -323,9 +323,9 @@ def drawn(encoding: str) -> dict[str, Any]:
 
 
 @pytest.mark.parametrize("encoding", ["cdr", "ros1", "json", "protobuf"])
-def test_image_annotations_say_the_same_in_every_encoding(encoding: str) -> None:
+def test_image_annotations_are_equal_in_every_encoding(encoding: str) -> None:
     """A box 120 wide and 66 high at (31, 44), in the colour of its category."""
-    message, colour = drawn(encoding)["/shapecat/image_annotations"], colour_of("bowl")
+    message, colour = image_messages(encoding)["/shapecat/image_annotations"], colour_of("bowl")
     (line,), (text,) = message.points, message.texts
     corners = [(p.x, p.y) for p in line.points]
 
@@ -340,8 +340,8 @@ def test_image_annotations_say_the_same_in_every_encoding(encoding: str) -> None
 
 
 @pytest.mark.parametrize("encoding", ["cdr", "ros1"])
-def test_detections_on_images_keep_every_number_in_its_place(encoding: str) -> None:
-    message = drawn(encoding)["/shapecat/detections_2d"]
+def test_image_detections_have_right_values(encoding: str) -> None:
+    message = image_messages(encoding)["/shapecat/detections_2d"]
     (item,) = message.detections
 
     assert (message.header.stamp, message.header.frame_id) == (STAMP, "colour")

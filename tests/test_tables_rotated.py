@@ -1,4 +1,4 @@
-"""The tables of a rotated and moved sensor, without equal numbers, checked by SciPy."""
+"""Tests of the tables of a moving, rotated sensor; all numbers differ, so swaps are noticed."""
 
 import csv
 from dataclasses import replace
@@ -36,10 +36,12 @@ CATEGORIES = ("cup", "can", "bowl")
 SECOND = 10**9
 EPOCH = 1_700_000_000 * SECOND
 FRAMES = 6
-TURNS = Rotation.from_euler("xyz", [[0.4 + 0.02 * k, -0.7, 1.9 + 0.05 * k] for k in range(FRAMES)])
-PLACES = np.array([[1.3 + 0.01 * k, -2.1, 0.6 + 0.02 * k] for k in range(FRAMES)])
+ROTATIONS = Rotation.from_euler(
+    "xyz", [[0.4 + 0.02 * k, -0.7, 1.9 + 0.05 * k] for k in range(FRAMES)]
+)
+POSITIONS = np.array([[1.3 + 0.01 * k, -2.1, 0.6 + 0.02 * k] for k in range(FRAMES)])
 CENTERS = np.array([[3.1, 4.2, 0.7], [3.5, 4.9, 0.8], [2.6, 4.4, 0.9]])
-"""Of three objects that stand still in the fixed frame, metres."""
+"""Of three objects at rest in the fixed frame, metres."""
 UP = np.array([0.0, 0.0, 1.0])
 AXES = Rotation.from_euler("z", 0.6)
 POSTERIORS = np.array(
@@ -50,18 +52,18 @@ POSTERIORS = np.array(
 )
 """Of each object, in even and in odd frames."""
 PARTIAL = [False, True, False, False, True, False]
-"""In which frames the image cuts the first object."""
+"""Frames in which the image border cuts the first object."""
 NOVELTIES = np.array([[0.9 if cut else 0.4, 0.3, 1.2] for cut in PARTIAL])
-"""By frame and object: a cut view looks stranger than it is."""
+"""By frame and object; a cut view has a higher novelty."""
 SIZE = np.array([0.06, 0.11, 0.19])
 NEURONS = np.array([[0.1, 0.2, 0.3], [0.4, 0.5, 0.6], [0.7, 0.8, 0.9]])
 OUTLINE = np.array([[0.1, 0.2, 1.3], [1.4, 0.5, 1.6], [1.7, 1.8, 1.9], [0.2, 1.1, 1.2]])
 
 
-def seen(frame: int, item: int) -> Detection:
-    """Return an object as the sensor sees it in a frame."""
-    inverse = TURNS[frame].inv()
-    center = inverse.apply(CENTERS[item] - PLACES[frame])
+def detection_of(frame: int, item: int) -> Detection:
+    """Return the detection of an object in a frame, in sensor coordinates."""
+    inverse = ROTATIONS[frame].inv()
+    center = inverse.apply(CENTERS[item] - POSITIONS[frame])
     orientation = (inverse * AXES).as_quat()
     candidate = Candidate(
         indices=np.arange(10 * item, 10 * item + 5),
@@ -87,13 +89,13 @@ def run(tmp_path_factory: pytest.TempPathFactory) -> Path:
     folder = tmp_path_factory.mktemp("turned")
     with PerceptionTables(folder, categories=CATEGORIES, model_id="m") as tables:
         for k in range(FRAMES):
-            up = TURNS[k].inv().apply(UP)
+            up = ROTATIONS[k].inv().apply(UP)
             planes = (Plane(up, -0.5, OUTLINE, 0.7, 0.0), Plane(up, -0.2, OUTLINE + 1, 0.4, 0.3))
             scene = Scene(up, planes, ())
-            found = tuple(seen(k, item) for item in range(3))
+            found = tuple(detection_of(k, item) for item in range(3))
             stamp = EPOCH + k * SECOND // 10
             perception = Perception("/depth", k, stamp, "cam", scene, found, {"detect": 0.01})
-            pose = Pose(TURNS[k].as_matrix(), PLACES[k])
+            pose = Pose(ROTATIONS[k].as_matrix(), POSITIONS[k])
             tables.write([perception], [FrameRow(stamp + 5, pose, up)])
     track_run(folder, TrackingSettings(), CATEGORIES, work="w0123")
     return folder
@@ -109,46 +111,46 @@ def lines(folder: Path) -> list[dict[str, str]]:
         return list(csv.DictReader(file))
 
 
-def test_the_pose_of_the_sensor_is_written_row_by_row(run: Path) -> None:
+def test_sensor_pose_is_written_row_major(run: Path) -> None:
     """A transposed rotation is also valid; only unequal numbers reveal it."""
     for row in rows(run, "frames"):
         k = row["frame"]
-        assert_allclose(np.reshape(row["fixed_rotation"], (3, 3)), TURNS[k].as_matrix())
-        assert_allclose(row["fixed_translation"], PLACES[k])
-        assert_allclose(row["up_given"], TURNS[k].inv().apply(UP), atol=1e-6)
+        assert_allclose(np.reshape(row["fixed_rotation"], (3, 3)), ROTATIONS[k].as_matrix())
+        assert_allclose(row["fixed_translation"], POSITIONS[k])
+        assert_allclose(row["up_given"], ROTATIONS[k].inv().apply(UP), atol=1e-6)
         assert (row["stamp_ns"], row["log_time_ns"]) == (
             EPOCH + k * SECOND // 10,
             EPOCH + k * SECOND // 10 + 5,
         )
 
 
-def test_centres_are_in_the_sensor_frame_and_in_the_fixed_one(run: Path) -> None:
+def test_centres_are_in_sensor_and_fixed_frame(run: Path) -> None:
     for row in rows(run, "detections"):
         k, item = row["frame"], row["detection"]
-        own = TURNS[k].inv().apply(CENTERS[item] - PLACES[k])
+        own = ROTATIONS[k].inv().apply(CENTERS[item] - POSITIONS[k])
         assert_allclose(row["center"], own, atol=1e-5)
         assert_allclose(row["center_fixed"], CENTERS[item], atol=1e-5)
-        assert_allclose(row["height_m"], TURNS[k].inv().apply(UP) @ own + 0.5, atol=1e-5)
+        assert_allclose(row["height_m"], ROTATIONS[k].inv().apply(UP) @ own + 0.5, atol=1e-5)
         assert row["touches_border"] == (item == 0 and PARTIAL[k])
         assert row["category"] == ("cup", "can" if k % 2 else "cup", "unknown")[item] or k % 2
 
 
-def test_planes_keep_every_number_in_its_place(run: Path) -> None:
+def test_plane_columns_have_right_values(run: Path) -> None:
     found = rows(run, "planes")
 
     assert len(found) == 2 * FRAMES
     for row in found:
         k, number = row["frame"], row["plane"]
         assert (row["topic"], row["stamp_ns"]) == ("/depth", EPOCH + k * SECOND // 10)
-        assert_allclose(row["normal"], TURNS[k].inv().apply(UP), atol=1e-6)
+        assert_allclose(row["normal"], ROTATIONS[k].inv().apply(UP), atol=1e-6)
         assert_allclose(row["offset"], (-0.5, -0.2)[number], rtol=1e-6)
         assert_allclose(row["height_m"], (0.0, 0.3)[number], atol=1e-7)
         assert_allclose(row["area_m2"], (0.7, 0.4)[number], rtol=1e-6)
         assert_allclose(np.reshape(row["outline"], (-1, 3)), OUTLINE + number, rtol=1e-6)
 
 
-def test_lists_of_detections_are_row_by_row(run: Path) -> None:
-    """Neurons as x y z in turn, edges as pairs; and the columns that are plain numbers."""
+def test_detection_columns_have_right_values(run: Path) -> None:
+    """Neurons are x y z triples, and edges are pairs."""
     for row in rows(run, "detections"):
         item = row["detection"]
         assert_allclose(np.reshape(row["neurons"], (-1, 3)), NEURONS + item, rtol=1e-6)
@@ -164,7 +166,7 @@ def test_lists_of_detections_are_row_by_row(run: Path) -> None:
         assert row["confidence"] == pytest.approx(POSTERIORS[row["frame"] % 2, item, best])
 
 
-def test_the_tracker_sees_boxes_in_the_fixed_frame(run: Path) -> None:
+def test_tracker_reads_boxes_in_fixed_frame(run: Path) -> None:
     """With the inverse pose, boxes at rest would rotate."""
     found = list(_read_frames(run, len(CATEGORIES), {"/depth"}))
 
@@ -178,13 +180,13 @@ def test_the_tracker_sees_boxes_in_the_fixed_frame(run: Path) -> None:
         assert_allclose(frame.novelties, NOVELTIES[k], rtol=1e-6)
 
 
-def test_the_tracker_knows_which_views_repeat_an_earlier_one(tmp_path: Path) -> None:
+def test_tracker_reads_which_views_are_reused(tmp_path: Path) -> None:
     """A view repeated in a still scene would count as many views."""
     origins = [None, 0, 0, None]
     scene = Scene(UP, (Plane(UP, -0.5, OUTLINE, 0.7, 0.0),), ())
     with PerceptionTables(tmp_path, categories=CATEGORIES, model_id="m") as tables:
         for k, origin in enumerate(origins):
-            found = (replace(seen(k, 1), reused_from=origin),)
+            found = (replace(detection_of(k, 1), reused_from=origin),)
             perception = Perception("/depth", k, k, "cam", scene, found, {})
             tables.write([perception], [FrameRow(k, None)])
 
@@ -193,32 +195,32 @@ def test_the_tracker_knows_which_views_repeat_an_earlier_one(tmp_path: Path) -> 
     assert [np.array(frame.described).tolist() for frame in frames] == [[0], [0], [0], [3]]
 
 
-def test_tracks_stay_where_their_objects_stand(run: Path) -> None:
+def test_track_boxes_match_object_poses(run: Path) -> None:
     tracks = rows(run, "tracks")
 
     assert len(tracks) == 3 * FRAMES
     for row in tracks:
         k, item = row["frame"], row["detection"]
-        inverse = TURNS[k].inv()
+        inverse = ROTATIONS[k].inv()
         assert_allclose(row["center_fixed"], CENTERS[item], atol=1e-5)
-        assert_allclose(row["center_full"], inverse.apply(CENTERS[item] - PLACES[k]), atol=0.02)
-        turned = Rotation.from_quat(row["orientation_full"])
-        off = (turned.inv() * inverse * AXES).magnitude()
-        quarter = np.pi / 2  # as which a turned box is the same box
-        assert min(off % quarter, quarter - off % quarter) < np.radians(10)
+        assert_allclose(row["center_full"], inverse.apply(CENTERS[item] - POSITIONS[k]), atol=0.02)
+        rotation = Rotation.from_quat(row["orientation_full"])
+        difference = (rotation.inv() * inverse * AXES).magnitude()
+        quarter = np.pi / 2  # which gives the same box
+        assert min(difference % quarter, quarter - difference % quarter) < np.radians(10)
         assert_allclose(np.sort(row["size_full"]), SIZE + 0.01, atol=0.03)
 
 
-def test_frames_of_two_sensors_with_the_same_numbers_are_not_exchanged(tmp_path: Path) -> None:
+def test_equal_frame_numbers_of_two_sensors_are_not_confused(tmp_path: Path) -> None:
     """Each box is shown in the frame of the sensor that saw it."""
     with PerceptionTables(tmp_path, categories=CATEGORIES, model_id="m") as tables:
         for k in range(FRAMES):
-            up = TURNS[k].inv().apply(UP)
+            up = ROTATIONS[k].inv().apply(UP)
             scene = Scene(up, (Plane(up, -0.5, OUTLINE, 0.7, 0.0),), ())
-            found = tuple(seen(k, item) for item in range(3))
+            found = tuple(detection_of(k, item) for item in range(3))
             stamp, topic = EPOCH + k * SECOND // 10, "/right" if k % 2 else "/left"
             perception = Perception(topic, k // 2, stamp, topic, scene, found, {})
-            pose = Pose(TURNS[k].as_matrix(), PLACES[k])
+            pose = Pose(ROTATIONS[k].as_matrix(), POSITIONS[k])
             tables.write([perception], [FrameRow(stamp, pose, up)])
     track_run(tmp_path, TrackingSettings(), CATEGORIES)
 
@@ -228,18 +230,18 @@ def test_frames_of_two_sensors_with_the_same_numbers_are_not_exchanged(tmp_path:
         k, item = 2 * row["frame"] + (row["topic"] == "/right"), row["detection"]
         assert row["stamp_ns"] == EPOCH + k * SECOND // 10
         assert_allclose(row["center_fixed"], CENTERS[item], atol=1e-5)
-        own = TURNS[k].inv().apply(CENTERS[item] - PLACES[k])
+        own = ROTATIONS[k].inv().apply(CENTERS[item] - POSITIONS[k])
         assert_allclose(row["center_full"], own, atol=0.02)
 
 
-def test_a_cut_view_says_little_of_the_whole_box(tmp_path: Path) -> None:
-    """Four partial views weigh as much as one of the two whole ones."""
+def test_cut_views_have_less_weight_for_full_box(tmp_path: Path) -> None:
+    """Four cut views weigh as much as one of the two whole views."""
     cut = (True, False, True, True, False, True)
     heights = [0.11 if one else 0.21 for one in cut]
     with PerceptionTables(tmp_path, categories=CATEGORIES, model_id="m") as tables:
         for k in range(FRAMES):
-            up = TURNS[k].inv().apply(UP)
-            found = [seen(k, item) for item in range(3)]
+            up = ROTATIONS[k].inv().apply(UP)
+            found = [detection_of(k, item) for item in range(3)]
             first, whole = found[1].candidate, found[1].full
             assert whole is not None
             found[1] = replace(
@@ -250,7 +252,7 @@ def test_a_cut_view_says_little_of_the_whole_box(tmp_path: Path) -> None:
             scene = Scene(up, (Plane(up, -0.5, OUTLINE, 0.7, 0.0),), ())
             stamp = EPOCH + k * SECOND // 10
             perception = Perception("/depth", k, stamp, "cam", scene, tuple(found), {})
-            pose = Pose(TURNS[k].as_matrix(), PLACES[k])
+            pose = Pose(ROTATIONS[k].as_matrix(), POSITIONS[k])
             tables.write([perception], [FrameRow(stamp, pose, up)])
     track_run(tmp_path, TrackingSettings(), CATEGORIES)
 
@@ -260,31 +262,29 @@ def test_a_cut_view_says_little_of_the_whole_box(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize("posed", [3, 4])
-def test_a_pose_that_is_missing_in_half_of_the_frames_is_not_used(
-    tmp_path: Path, posed: int
-) -> None:
-    """Detections without a pose would be lost; if they are few, they are."""
+def test_pose_missing_in_half_of_frames_is_not_used(tmp_path: Path, posed: int) -> None:
+    """Detections without a pose would be lost; a few of them are."""
     own = np.array([0.31, -0.12, 0.94])
     with PerceptionTables(tmp_path, categories=CATEGORIES, model_id="m") as tables:
         for k in range(FRAMES):
-            one = seen(0, 1)
+            one = detection_of(0, 1)
             box = replace(one.candidate.box, center=own)
             one = replace(one, candidate=replace(one.candidate, box=box))
-            pose = Pose(TURNS[0].as_matrix(), PLACES[0]) if k < posed else None
+            pose = Pose(ROTATIONS[0].as_matrix(), POSITIONS[0]) if k < posed else None
             scene = Scene(UP, (Plane(UP, -0.5, OUTLINE, 0.7, 0.0),), ())
             stamp = EPOCH + k * SECOND // 10
             perception = Perception("/depth", k, stamp, "cam", scene, (one,), {})
             tables.write([perception], [FrameRow(stamp, pose, UP)])
     track_run(tmp_path, TrackingSettings(), CATEGORIES)
 
-    place, count = (TURNS[0].apply(own) + PLACES[0], 4) if posed == 4 else (own, FRAMES)
+    place, count = (ROTATIONS[0].apply(own) + POSITIONS[0], 4) if posed == 4 else (own, FRAMES)
     tracks = [row for row in rows(tmp_path, "tracks") if row["detection"] is not None]
     assert [row["frame"] for row in tracks] == list(range(count))
     assert_allclose([row["center_fixed"] for row in tracks], [place] * count, atol=1e-5)
     assert [row["frames"] for row in lines(tmp_path)] == [str(count)]
 
 
-def test_causal_posteriors_know_their_own_view_and_none_after_it(run: Path) -> None:
+def test_causal_posteriors_use_current_and_earlier_views(run: Path) -> None:
     """Row k is the geometric mean of views 0 to k, with a quarter weight for partial views."""
     for item in range(3):
         weights = np.where(PARTIAL, 0.25, 1.0) if item == 0 else np.ones(FRAMES)
@@ -295,8 +295,8 @@ def test_causal_posteriors_know_their_own_view_and_none_after_it(run: Path) -> N
         assert_allclose(causal, wanted, atol=1e-6)
 
 
-def test_tracks_csv_begins_with_what_deserves_a_look(run: Path) -> None:
-    """Users read from the top: unknown objects first, then the least certain."""
+def test_tracks_csv_starts_with_unknown_and_uncertain_tracks(run: Path) -> None:
+    """Users read from the top."""
     table = lines(run)
 
     assert table[0]["category"] == "unknown"
@@ -307,8 +307,8 @@ def test_tracks_csv_begins_with_what_deserves_a_look(run: Path) -> None:
     assert table[0]["guess"] != "unknown"
 
 
-def test_tracks_csv_says_where_and_when(run: Path) -> None:
-    """Swapped columns would not be an error for any reader, only wrong."""
+def test_tracks_csv_has_positions_and_times(run: Path) -> None:
+    """No reader would notice swapped columns."""
     by_place = {round(float(row["x"]), 1): row for row in lines(run)}
 
     assert sorted(by_place) == [2.6, 3.1, 3.5]
@@ -325,7 +325,7 @@ def test_tracks_csv_says_where_and_when(run: Path) -> None:
 
 
 @pytest.mark.parametrize("merged", [False, True])
-def test_labelled_frames_and_annotations_show_the_same_boxes(run: Path, *, merged: bool) -> None:
+def test_labelled_frames_and_annotations_have_same_boxes(run: Path, *, merged: bool) -> None:
     """Two code paths read the tables; the up direction differs in every frame."""
     labels = read_labels(run / "tracks.csv", CATEGORIES)
     if merged:
@@ -337,7 +337,7 @@ def test_labelled_frames_and_annotations_show_the_same_boxes(run: Path, *, merge
     for one, other in zip(shown, labelled, strict=True):
         assert one.stamp_ns == other.stamp_ns == EPOCH + one.index * SECOND // 10
         assert other.fixed_from_sensor is not None
-        assert_allclose(other.fixed_from_sensor.rotation, TURNS[one.index].as_matrix())
+        assert_allclose(other.fixed_from_sensor.rotation, ROTATIONS[one.index].as_matrix())
         assert len(one.objects) == 3 - merged
         for item, same in zip(one.objects, other.objects, strict=True):
             assert (item.track, item.category) == (same.track, same.category)
@@ -347,14 +347,14 @@ def test_labelled_frames_and_annotations_show_the_same_boxes(run: Path, *, merge
             assert_allclose(item.orientation, same.full.orientation, atol=1e-6)
 
 
-def test_times_count_from_the_earliest_frame_though_another_came_first(tmp_path: Path) -> None:
+def test_times_count_from_earliest_stamp_not_first_message(tmp_path: Path) -> None:
     """Beside a camera whose frames arrive late, a track would begin before the recording."""
     with PerceptionTables(tmp_path, categories=CATEGORIES, model_id="m") as tables:
         for k in range(FRAMES):
             for topic, delay in (("/soon", SECOND // 20), ("/late", 0)):
                 scene = Scene(UP, (Plane(UP, -0.5, OUTLINE, 0.7, 0.0),), ())
                 stamp = EPOCH + k * SECOND // 10 + delay
-                perception = Perception(topic, k, stamp, "cam", scene, (seen(0, 1),), {})
+                perception = Perception(topic, k, stamp, "cam", scene, (detection_of(0, 1),), {})
                 tables.write([perception], [FrameRow(stamp, None, UP)])
     track_run(tmp_path, TrackingSettings(), CATEGORIES)
 
@@ -366,7 +366,7 @@ def test_times_count_from_the_earliest_frame_though_another_came_first(tmp_path:
         assert_allclose(shown[[0, -1]], [float(row["first_s"]), float(row["last_s"])], atol=1e-3)
 
 
-def test_confidence_and_guess_are_those_of_all_views(run: Path) -> None:
+def test_confidence_and_guess_use_all_views(run: Path) -> None:
     """The last causal posterior of a track decides, not its first view."""
     last = {row["track"]: row["posterior"] for row in rows(run, "tracks")}
 
@@ -377,8 +377,8 @@ def test_confidence_and_guess_are_those_of_all_views(run: Path) -> None:
         assert row["category"] in {row["guess"], "unknown"}
 
 
-def test_parts_of_a_merged_track_are_one_object(run: Path) -> None:
-    """One part may lie on the other: the lower support is that of the whole."""
+def test_parts_of_merged_track_become_one_object(run: Path) -> None:
+    """One part may rest on the other: the lower support counts."""
     frame = next(read_labelled_frames(run, read_labels(run / "tracks.csv", CATEGORIES)))
     up = frame.up
     assert up is not None
@@ -393,7 +393,7 @@ def test_parts_of_a_merged_track_are_one_object(run: Path) -> None:
     assert len(set(whole.detections)) == 2
 
 
-def test_the_place_of_a_track_is_the_usual_one() -> None:
+def test_track_position_is_median() -> None:
     """A single outlier must not move the position that the user sees."""
     centers = np.array([[0.3, 1.1, 0.7], [0.31, 1.12, 0.72], [0.32, 1.13, 0.73], [1.5, 2.6, 0.1]])
     track = Track(
