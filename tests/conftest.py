@@ -26,7 +26,7 @@ LONGEST = (
     *("test_stopping", "test_odd", "test_packaging", "test_second_look", "test_executors"),
     *("test_crash", "test_simulation_worlds", "test_simulation_physics", "test_api", "test_loop"),
     *("test_architecture", "test_review", "test_learning_default_model", "test_pipeline"),
-    *("test_door", "test_exports_images", "test_evaluation", "test_learning", "test_jit"),
+    *("test_command_line", "test_exports_images", "test_evaluation", "test_learning", "test_jit"),
     *("test_rehearsal", "test_detection_stacks", "test_exports_readback", "test_tracking_scenes"),
 )
 """Test files by duration, longest first."""

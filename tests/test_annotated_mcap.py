@@ -1,4 +1,4 @@
-"""annotated.mcap keeps every original message, and every tool can read the added ones."""
+"""Tests that annotated.mcap keeps all original messages, and that other tools can read it."""
 
 import errno
 import hashlib
@@ -45,10 +45,10 @@ RUN = {"version": "1", "counts": {"frames": 3}}
 
 
 @pytest.mark.parametrize("in_kernel", [True, False])
-def test_a_recording_that_becomes_shorter_is_not_filled_with_zeros(
+def test_copying_a_shrinking_recording_fails(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, *, in_kernel: bool
 ) -> None:
-    """The space for the copy is reserved first, so that what is missing would read as zeros."""
+    """Space for the copy is reserved first: missing bytes would read as zeros."""
 
     def refuse(*_: object) -> int:
         raise OSError(errno.EXDEV, "across file systems")
@@ -64,7 +64,7 @@ def test_a_recording_that_becomes_shorter_is_not_filled_with_zeros(
         copy_bytes(source, target, 4000)
 
 
-def shown(index: int, tracks: list[int], *, ended: tuple[int, ...] = ()) -> ShownFrame:
+def shown_frame(index: int, tracks: list[int], *, ended: tuple[int, ...] = ()) -> ShownFrame:
     objects = tuple(
         ShownBox(
             track=track,
@@ -87,7 +87,7 @@ def shown(index: int, tracks: list[int], *, ended: tuple[int, ...] = ()) -> Show
     )
 
 
-FRAMES = [shown(0, [3, 4]), shown(1, [4]), shown(2, [], ended=(4,))]
+FRAMES = [shown_frame(0, [3, 4]), shown_frame(1, [4]), shown_frame(2, [], ended=(4,))]
 
 
 def string(value: str) -> bytes:
@@ -133,9 +133,7 @@ def decoded(path: Path, topic: str) -> list[Any]:
 
 
 @pytest.mark.parametrize("compression", list(CompressionType))
-def test_every_original_message_stays_byte_for_byte(
-    tmp_path: Path, compression: CompressionType
-) -> None:
+def test_original_messages_stay_byte_for_byte(tmp_path: Path, compression: CompressionType) -> None:
     source = write_mcap(tmp_path / "a.mcap", compression=compression)
     target = tmp_path / "out.mcap"
 
@@ -146,7 +144,7 @@ def test_every_original_message_stays_byte_for_byte(
     with target.open("rb") as file:
         summary = make_reader(file).get_summary()
     assert summary is not None
-    # Who recorded without zstd may have no reader for it.
+    # Users who record without zstd may be unable to read it.
     name = compression.name.lower().replace("none", "")
     assert {chunk.compression for chunk in summary.chunk_indexes} == {name}
     with open_recording(source) as recording:
@@ -155,7 +153,7 @@ def test_every_original_message_stays_byte_for_byte(
 
 
 def test_other_readers_accept_the_file(tmp_path: Path) -> None:
-    """We write summary, offsets and checksums ourselves, so other readers must accept them."""
+    """The writer makes summary, offsets and checksums without a library."""
     target = tmp_path / "out.mcap"
     annotate(write_mcap(tmp_path / "a.mcap"), target)
 
@@ -185,8 +183,8 @@ def test_other_readers_accept_the_file(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize("markers", [False, True])
-def test_channels_of_the_original_keep_their_numbers(tmp_path: Path, *, markers: bool) -> None:
-    """Numbers may have gaps; a number used twice would mix the messages of two topics."""
+def test_original_channels_keep_their_ids(tmp_path: Path, *, markers: bool) -> None:
+    """Ids may have gaps; a duplicate would mix the messages of two topics."""
     source, target, text = tmp_path / "a.mcap", tmp_path / "out.mcap", b"string data"
     with source.open("wb") as file:
         writer = Writer(file)
@@ -230,7 +228,7 @@ def test_channels_of_the_original_keep_their_numbers(tmp_path: Path, *, markers:
         ]
 
 
-def test_summary_checksum_is_right(tmp_path: Path) -> None:
+def test_summary_checksum_is_correct(tmp_path: Path) -> None:
     """Readers of other languages verify it; the Python library does not."""
     import zlib  # noqa: PLC0415  # only here
 
@@ -243,7 +241,7 @@ def test_summary_checksum_is_right(tmp_path: Path) -> None:
     assert int.from_bytes(data[-12:-8], "little") == zlib.crc32(data[start:-12])
 
 
-def test_detections_say_what_and_where(tmp_path: Path) -> None:
+def test_detections_have_categories_and_boxes(tmp_path: Path) -> None:
     target = tmp_path / "out.mcap"
     annotate(write_mcap(tmp_path / "a.mcap"), target)
 
@@ -262,8 +260,8 @@ def test_detections_say_what_and_where(tmp_path: Path) -> None:
     assert (len(second.detections), len(third.detections)) == (1, 0)
 
 
-def test_scene_shows_updates_and_removes_tracks(tmp_path: Path) -> None:
-    """Users complain most about boxes that stay when their object is gone."""
+def test_scene_adds_updates_and_removes_tracks(tmp_path: Path) -> None:
+    """Boxes must not stay after their object is gone."""
     target = tmp_path / "out.mcap"
     annotate(write_mcap(tmp_path / "a.mcap"), target)
 
@@ -290,7 +288,7 @@ def test_scene_shows_updates_and_removes_tracks(tmp_path: Path) -> None:
     }
 
 
-def test_markers_are_deleted_too(tmp_path: Path) -> None:
+def test_markers_of_ended_tracks_are_deleted(tmp_path: Path) -> None:
     target = tmp_path / "out.mcap"
     annotate(write_mcap(tmp_path / "a.mcap"), target, markers=True)
 
@@ -303,7 +301,7 @@ def test_markers_are_deleted_too(tmp_path: Path) -> None:
     ]
 
 
-def test_recovered_recording_is_written_anew(tmp_path: Path) -> None:
+def test_truncated_recording_is_rewritten(tmp_path: Path) -> None:
     source = write_mcap(tmp_path / "a.mcap", unfinished=True)
     source.write_bytes(source.read_bytes()[:-5])
     target = tmp_path / "out.mcap"
@@ -323,7 +321,7 @@ def test_recovered_recording_is_written_anew(tmp_path: Path) -> None:
     assert len(decoded(target, "/shapecat/scene")) == 3
 
 
-def test_two_definitions_of_one_type_are_both_kept(tmp_path: Path) -> None:
+def test_both_definitions_of_a_type_are_kept(tmp_path: Path) -> None:
     """Recordings of two robots, merged and cut: each topic keeps its own definition."""
     texts = {"/a": b"uint32 a", "/b": b"uint32 a\nuint32 b"}
     source, target = tmp_path / "a.mcap", tmp_path / "out.mcap"
@@ -343,7 +341,7 @@ def test_two_definitions_of_one_type_are_both_kept(tmp_path: Path) -> None:
     assert read == texts
 
 
-def test_what_lies_beside_the_messages_of_any_part_is_kept(tmp_path: Path) -> None:
+def test_attachments_and_metadata_of_all_parts_are_kept(tmp_path: Path) -> None:
     source, target = tmp_path / "bag", tmp_path / "out.mcap"
     source.mkdir()
     for k in range(2):
@@ -358,13 +356,13 @@ def test_what_lies_beside_the_messages_of_any_part_is_kept(tmp_path: Path) -> No
             for item in reader.iter_attachments()
         ]
         names = [item.name for item in reader.iter_metadata()]
-    # Its two times are side by side in every call that passes them on.
+    # The two times differ, so that swapping them is noticed.
     assert attached == [(1, 2, "photo", "image/png", b"\x89PNG")] * 2
     assert sorted(names) == ["robot", "robot", "shapecat"]
 
 
 @pytest.mark.parametrize("plugin", list(StoragePlugin))
-def test_ros2_folder_keeps_its_bytes(tmp_path: Path, plugin: StoragePlugin) -> None:
+def test_messages_of_ros2_folder_stay_byte_for_byte(tmp_path: Path, plugin: StoragePlugin) -> None:
     source, target = tmp_path / "bag", tmp_path / "out.mcap"
     with FolderWriter(source, version=9, storage_plugin=plugin) as writer:
         connection = writer.add_connection(
@@ -379,7 +377,7 @@ def test_ros2_folder_keeps_its_bytes(tmp_path: Path, plugin: StoragePlugin) -> N
         summary = make_reader(file).get_summary()
     assert summary is not None
     (channel,) = (one for one in summary.channels.values() if one.topic == "/points")
-    # Without it, who plays the file publishes what no subscriber gets.
+    # Without it, subscribers would not receive the played messages.
     assert parse_qos(channel.metadata["offered_qos_profiles"]) == [QOS]
     with AnyReader([target]) as reader:
         chosen = [c for c in reader.connections if c.topic == "/points"]
@@ -406,7 +404,7 @@ def ros1_messages() -> Iterator[tuple[str, str, Any]]:
     yield "/own", "lab/msg/Own", STORE1.types["lab/msg/Own"](header, ["a", "bc"], 3)
 
 
-def test_ros1_bag_becomes_ros2(tmp_path: Path) -> None:
+def test_ros1_bag_is_converted_to_ros2(tmp_path: Path) -> None:
     source, target = tmp_path / "a.bag", tmp_path / "out.mcap"
     with BagWriter(source) as writer:
         for k, (topic, kind, item) in enumerate(ros1_messages()):
@@ -436,7 +434,7 @@ def test_ros1_bag_becomes_ros2(tmp_path: Path) -> None:
         assert other.message_count == 4 + 6
 
 
-def test_message_that_cannot_be_converted_is_wrapped_whole(tmp_path: Path) -> None:
+def test_unconvertible_message_is_wrapped(tmp_path: Path) -> None:
     """Two encodings in one file would make it unreadable for ROS tools."""
     source, target = tmp_path / "a.bag", tmp_path / "out.mcap"
     with BagWriter(source) as writer:
@@ -464,7 +462,7 @@ def test_message_that_cannot_be_converted_is_wrapped_whole(tmp_path: Path) -> No
         ("", "json", ("foxglove.PointCloud", "jsonschema"), "json"),
     ],
 )
-def test_annotations_use_the_encoding_of_the_source(
+def test_annotations_use_encoding_of_source(
     tmp_path: Path, profile: str, encoding: str, schema: tuple[str, str], expected: str
 ) -> None:
     source, target = tmp_path / "a.mcap", tmp_path / "out.mcap"
@@ -486,7 +484,7 @@ def test_annotations_use_the_encoding_of_the_source(
     assert scenes[0].entities[0].cubes[0].size.z == pytest.approx(0.3)
 
 
-def test_json_scene_fits_its_schema(tmp_path: Path) -> None:
+def test_json_messages_match_their_schemas(tmp_path: Path) -> None:
     jsonschema = pytest.importorskip("jsonschema")
     source, target = tmp_path / "a.mcap", tmp_path / "out.mcap"
     with source.open("wb") as file:
@@ -502,7 +500,7 @@ def test_json_scene_fits_its_schema(tmp_path: Path) -> None:
             jsonschema.validate(json.loads(message.data), json.loads(schema.data))
 
 
-def test_nothing_is_left_behind_on_failure(tmp_path: Path) -> None:
+def test_failure_leaves_no_file(tmp_path: Path) -> None:
     source = write_mcap(tmp_path / "a.mcap")
     target = tmp_path / "out.mcap"
 
@@ -521,7 +519,7 @@ def test_nothing_is_left_behind_on_failure(tmp_path: Path) -> None:
         annotate(source, tmp_path / "no" / "out.mcap")
 
 
-def test_a_disk_that_fills_up_under_the_writing_thread_is_an_error(
+def test_full_disk_in_writing_thread_is_reported(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     source = write_mcap(tmp_path / "a.mcap")
@@ -535,7 +533,7 @@ def test_a_disk_that_fills_up_under_the_writing_thread_is_an_error(
     assert [path.name for path in tmp_path.iterdir()] == ["a.mcap"]
 
 
-def test_recording_without_frames_is_still_copied(tmp_path: Path) -> None:
+def test_recording_without_frames_is_copied(tmp_path: Path) -> None:
     source, target = write_mcap(tmp_path / "a.mcap"), tmp_path / "out.mcap"
 
     with open_recording(source) as recording:
@@ -544,7 +542,7 @@ def test_recording_without_frames_is_still_copied(tmp_path: Path) -> None:
     assert digest(target) == digest(source)
 
 
-def test_every_category_has_a_colour_of_its_own() -> None:
+def test_every_category_has_its_own_colour() -> None:
     assert {*CATEGORIES, "unknown"} <= CATEGORY_COLOURS.keys()
     assert len(set(CATEGORY_COLOURS.values())) == len(CATEGORY_COLOURS)
     assert colour_of("teapot") == colour_of("teapot") != colour_of("kettle")
@@ -559,10 +557,10 @@ _U64 = st.integers(0, 2**64 - 1)
     compression=st.sampled_from(["", "lz4", "zstd", "größer"]),
 )
 @settings(max_examples=40, deadline=None)
-def test_chunk_indexes_are_those_of_the_library(
+def test_chunk_indexes_match_mcap_library(
     numbers: list[int], offsets: dict[int, int], compression: str
 ) -> None:
-    """A reader that trusts a wrong offset finds no message."""
+    """Readers would find no messages at a wrong offset."""
     length, start, size, end, index_length, begin, plain = numbers
     index = records.ChunkIndex(
         length, start, compression, size, end, index_length, offsets, begin, plain

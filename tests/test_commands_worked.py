@@ -1,4 +1,4 @@
-"""Outputs of the commands, with numbers worked out by hand."""
+"""Tests of outputs of the commands, with numbers worked out by hand."""
 
 import json
 import re
@@ -35,7 +35,7 @@ def ended(name: str, *, processed: bool | None, warnings: tuple[str, ...] = ()) 
     return SimpleNamespace(job=job, summary=summary, message="")
 
 
-def test_time_left_is_that_of_the_bytes_that_are_left(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_time_left_follows_remaining_bytes(monkeypatch: pytest.MonkeyPatch) -> None:
     """Recordings that were already complete took no time; failed ones were still read."""
     now = 100.0
     monkeypatch.setattr("shapecat.cli.progress.time.monotonic", lambda: now)
@@ -52,11 +52,8 @@ def test_time_left_is_that_of_the_bytes_that_are_left(monkeypatch: pytest.Monkey
     assert (progress.complete, progress.failed) == (2, 1)
 
 
-def test_time_left_falls_while_a_recording_is_processed(monkeypatch: pytest.MonkeyPatch) -> None:
-    """With finished recordings alone, it would grow until the next one is finished.
-
-    Compiling, a minute before a recording of seconds, made it eight minutes.
-    """
+def test_time_left_falls_during_a_recording(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Finished recordings alone would let it grow; compiling must not count."""
     now = 0.0
     monkeypatch.setattr("shapecat.cli.progress.time.monotonic", lambda: now)
     progress = PROGRESS.Progress([task("a", size=100), task("b", size=300)])
@@ -77,14 +74,14 @@ def test_time_left_falls_while_a_recording_is_processed(monkeypatch: pytest.Monk
     assert progress.remaining_s() == 0
 
 
-def test_time_left_is_read_as_hours_minutes_and_seconds() -> None:
-    """An hour and five minutes must not be shown as 1.5 hours."""
+def test_time_left_has_hours_minutes_and_seconds() -> None:
+    """An hour and five minutes must not be printed as 1.5 hours."""
     words = [PROGRESS._duration(seconds) for seconds in (3903.4, 36_000, 125, 59.6, -2)]
 
     assert words == ["1:05:03", "10:00:00", "2:05", "1:00", "0:00"]
 
 
-def test_closing_table_is_in_the_order_of_the_plan(capsys: pytest.CaptureFixture[str]) -> None:
+def test_closing_table_follows_order_of_plan(capsys: pytest.CaptureFixture[str]) -> None:
     """Recordings finish in any order; users compare the table with their list."""
     tally = PROCESS._Tally(keep_all=False)
     for name, frames in (("b", 20), ("c", None), ("a", 3)):
@@ -126,7 +123,7 @@ def test_closing_table_lists_a_hundred_recordings_or_none(
 
 
 @pytest.mark.parametrize("name", ["a.mcap", "a.truth.json", "a.labels.npz", "a.color_labels.npz"])
-def test_nothing_that_a_simulation_writes_is_replaced_unasked(
+def test_simulate_replaces_no_file_without_overwrite(
     shapecat: Run, tmp_path: Path, name: str
 ) -> None:
     """Nor the ground truth, even if the recording itself was moved elsewhere."""
@@ -139,7 +136,7 @@ def test_nothing_that_a_simulation_writes_is_replaced_unasked(
 
 
 @pytest.mark.parametrize(("end", "refused"), [("2.4", True), ("2.5", True), ("2.6", False)])
-def test_an_empty_time_range_is_refused(
+def test_empty_time_range_is_refused(
     shapecat: Run, tmp_path: Path, end: str, *, refused: bool
 ) -> None:
     """It would be a run without frames, which looks like an empty scene."""
@@ -150,7 +147,7 @@ def test_an_empty_time_range_is_refused(
     assert ("is not after --start 2.5" in found.stderr) == refused
 
 
-def test_one_recording_is_not_that_of_several_runs(shapecat: Run, tmp_path: Path) -> None:
+def test_recording_option_is_refused_for_several_runs(shapecat: Run, tmp_path: Path) -> None:
     """A folder of runs also counts as several runs."""
     for name in ("a", "b"):
         (tmp_path / "runs" / name).mkdir(parents=True)
@@ -163,8 +160,8 @@ def test_one_recording_is_not_that_of_several_runs(shapecat: Run, tmp_path: Path
         assert "--recording is for a single run, not for 2" in found.stderr
 
 
-def test_plan_says_what_there_is_to_do() -> None:
-    """Its megabytes and processes are those of the recordings that are left."""
+def test_plan_describes_remaining_work() -> None:
+    """Its megabytes and processes count the remaining recordings."""
     tasks = [
         task("a", "complete", 9_000_000),
         task("b", "retry", 1_200_000),
@@ -177,13 +174,15 @@ def test_plan_says_what_there_is_to_do() -> None:
     assert PROGRESS.describe_plan(tasks[:1], 0, 2, 3) == "1 recording: 1 already complete"
 
 
-def test_categories_are_counted_from_the_most_frequent() -> None:
-    """A table shows the first few; those of equal number are in alphabetical order."""
+def test_category_counts_are_sorted_by_frequency() -> None:
+    """Equal counts are in alphabetical order."""
     assert RENDER.count_words({"can": 3, "plate": 12, "ball": 3}) == "plate 12, ball 3, can 3"
     assert RENDER.count_words({}) == "none"
 
 
-def test_info_tells_some_unreadable_recordings_from_all(shapecat: Run, tmp_path: Path) -> None:
+def test_info_exit_code_distinguishes_some_from_all_unreadable(
+    shapecat: Run, tmp_path: Path
+) -> None:
     """With exit code 1 a script continues with the readable recordings."""
     good = record(tmp_path / "good.mcap", 1)
     (tmp_path / "bad.mcap").write_bytes(b"no recording")
@@ -197,7 +196,7 @@ def test_info_tells_some_unreadable_recordings_from_all(shapecat: Run, tmp_path:
         assert "bad.mcap" in found.stderr
 
 
-def test_info_tells_what_is_in_a_recording(capsys: pytest.CaptureFixture[str]) -> None:
+def test_info_prints_content_of_recording(capsys: pytest.CaptureFixture[str]) -> None:
     """A megabyte is a million bytes, as in `ls --si` and the other outputs."""
     topics = [
         {"name": "/d", "type": "sensor_msgs/Image", "encoding": "cdr", "count": 61,
@@ -222,7 +221,7 @@ def test_info_tells_what_is_in_a_recording(capsys: pytest.CaptureFixture[str]) -
     assert last == "warning: the last chunk is cut"
 
 
-def test_events_tell_zeros_and_leave_out_what_is_unknown(
+def test_json_events_keep_zeros_and_omit_unknown_values(
     capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """A program that waits for ``exit_code`` would miss a success."""
@@ -234,7 +233,7 @@ def test_events_tell_zeros_and_leave_out_what_is_unknown(
     progress = PROGRESS.JsonProgress(tasks)
     progress.progress("a", "perceive", 0, None)
     now = 100.3
-    progress.progress("a", "perceive", 3, None)  # too early to tell
+    progress.progress("a", "perceive", 3, None)  # too early to report
     now = 100.6
     progress.progress("a", "perceive", 5, 61)
     progress.progress("a", "annotate", 0, 61)
@@ -266,7 +265,7 @@ def test_events_tell_zeros_and_leave_out_what_is_unknown(
     ]  # fmt: skip
 
 
-def test_a_few_warnings_about_new_results_are_printed(capsys: pytest.CaptureFixture[str]) -> None:
+def test_at_most_three_warnings_per_new_run_are_printed(capsys: pytest.CaptureFixture[str]) -> None:
     """A thousand damaged recordings may have ten each; earlier runs printed theirs."""
     progress = PROGRESS.Progress([task("a"), task("b"), task("c")])
     progress.ended(ended("a", processed=True, warnings=tuple("stuvw")))
@@ -279,7 +278,7 @@ def test_a_few_warnings_about_new_results_are_printed(capsys: pytest.CaptureFixt
     ]
 
 
-def test_lines_tell_what_is_done_running_and_left(
+def test_plain_progress_shows_done_running_and_remaining(
     capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """At most one line in five seconds; the time left follows from the bytes and frames done."""
@@ -348,15 +347,15 @@ CALLS = {
         "a: 1 labelled view in o\n",
     ),
 }  # fmt: skip
-"""By command line the function that works, its arguments, its answer, and what is printed."""
+"""By command line: the called function, its arguments, its result, and the printed text."""
 
 
 @pytest.mark.parametrize("line", CALLS)
-def test_options_reach_the_work_and_its_answer_the_reader(
+def test_options_are_passed_on_and_results_printed(
     shapecat: Run, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, line: str
 ) -> None:
     """A lost option silently changes a result."""
-    work, words, options, answer, said = CALLS[line]
+    target, words, options, answer, printed = CALLS[line]
     calls = []
 
     def stub(*arguments: Any, observe: Any, **named: Any) -> Any:
@@ -365,23 +364,23 @@ def test_options_reach_the_work_and_its_answer_the_reader(
         return answer
 
     monkeypatch.chdir(tmp_path)
-    monkeypatch.setattr(work, stub)
+    monkeypatch.setattr(target, stub)
     monkeypatch.setattr("shapecat.runs.finished.find_runs", list)
     common = "shapecat.outputs.exports.common_categories"
     monkeypatch.setattr(common, lambda runs: [f"of {run}" for run in runs])
     done = shapecat(*line.split())
 
-    assert (done.exit_code, done.stdout) == (0, said), done.stderr
+    assert (done.exit_code, done.stdout) == (0, printed), done.stderr
     assert calls == [(words, options)]
 
 
-def test_annotate_tells_what_was_written_and_which_labels_were_not_transferred(
+def test_annotate_reports_written_files_and_untransferred_labels(
     shapecat: Run, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """Users would believe that silently dropped labels were applied."""
     calls = []
-    missed = [{"old_track": 17, "label": "tea pot", "reason": "no object there"}]
-    answer = {"transferred": [{}] * 5, "not_transferred": missed, "by": TABLE_ALONE}
+    untransferred = [{"old_track": 17, "label": "tea pot", "reason": "no object there"}]
+    answer = {"transferred": [{}] * 5, "not_transferred": untransferred, "by": TABLE_ALONE}
 
     def stub(*arguments: Any, **named: Any) -> Any:
         calls.append(([*arguments[:2]], named))
@@ -392,14 +391,14 @@ def test_annotate_tells_what_was_written_and_which_labels_were_not_transferred(
     Path("lab").mkdir()
     options = ("--by-place", "--boxes", "visible", "--recording", "r.bag")
     words = ("annotate", "lab", "--labels", "t.csv", *options)
-    bare = shapecat(*words)
+    without_files = shapecat(*words)
     for name in ("review.rrd", "annotated.mcap"):
         Path("lab", name).touch()
     done = shapecat(*words)
 
     chosen = {"by_place": True, "boxes": "visible", "recording": Path("r.bag")}
     assert calls == [([Path("lab"), Path("t.csv")], chosen)] * 2
-    assert bare.stdout.splitlines()[0] == "lab: wrote no file but its tables"
+    assert without_files.stdout.splitlines()[0] == "lab: wrote no file but its tables"
     assert done.stdout.splitlines() == [
         "lab: wrote annotated.mcap and review.rrd", "5 of 6 labels transferred"
     ]  # fmt: skip
@@ -411,7 +410,7 @@ def test_annotate_tells_what_was_written_and_which_labels_were_not_transferred(
     assert reason == "  track 17, tea pot: no object there"
 
 
-def test_process_tells_where_labels_are_that_were_not_transferred(
+def test_process_reports_where_untransferred_labels_are(
     capsys: pytest.CaptureFixture[str],
 ) -> None:
     missed = [{"old_track": 17, "label": "tea pot", "reason": "no object there"}]
@@ -421,11 +420,11 @@ def test_process_tells_where_labels_are_that_were_not_transferred(
         job = SimpleNamespace(name="in/lab", target=target)
         PROCESS._print_corrections(SimpleNamespace(job=job, summary=summary))
 
-    told = "lab: transferred 5 of 6 corrected labels; the others are in"
+    message = "lab: transferred 5 of 6 corrected labels; the others are in"
     assert capsys.readouterr().err.splitlines() == [
-        f"{told} out/lab/tracks.previous.csv",
+        f"{message} out/lab/tracks.previous.csv",
         "  track 17, tea pot: no object there",
-        f"{told} s3://b/lab/tracks.previous.csv",
+        f"{message} s3://b/lab/tracks.previous.csv",
         "  track 17, tea pot: no object there",
         "lab: transferred 5 of 5 corrected labels",
     ]
@@ -439,7 +438,7 @@ def test_process_tells_where_labels_are_that_were_not_transferred(
         ("a.zip", "ros1", "a.zip: name it a.mcap, a.bag, or a for a ROS 2 folder"),
     ],
 )
-def test_a_name_that_contradicts_the_format_is_told_the_right_one(
+def test_simulate_suggests_name_that_fits_format(
     shapecat: Run, tmp_path: Path, name: str, container: str, said: str
 ) -> None:
     """No program would open a file with the wrong suffix."""

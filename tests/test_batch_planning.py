@@ -1,4 +1,4 @@
-"""Completed work is recognised: only the same work on the same content, never half a line."""
+"""Tests of finding recordings, recognising finished work, and the manifest of a batch."""
 
 import json
 import os
@@ -59,10 +59,8 @@ def planned(source: Path, **changes: Any) -> RunInfo:
     return run
 
 
-def test_a_file_that_cannot_be_read_is_not_passed_over(
-    source: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    """Among other files without a suffix, missing permissions must be reported on opening."""
+def test_unreadable_file_is_not_skipped(source: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Missing permissions must be reported when the file is opened."""
     secret, note = source.with_name("secret"), source.with_name("note")
     secret.write_bytes(b"#ROSBAG V2.0\n")
     note.write_bytes(b"no recording")
@@ -80,7 +78,7 @@ def test_a_file_that_cannot_be_read_is_not_passed_over(
     assert found.left_out == 1
 
 
-def test_a_folder_that_may_not_be_read_does_not_end_the_search(
+def test_unreadable_folder_does_not_end_search(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
 ) -> None:
     """The root of a disk has a folder lost+found, which only an administrator may read."""
@@ -100,7 +98,7 @@ def test_a_folder_that_may_not_be_read_does_not_end_the_search(
 
 
 def test_files_of_a_bag_are_not_counted_as_skipped(tmp_path: Path) -> None:
-    """A pattern names them beside the bag that they belong to."""
+    """A shell pattern may list them beside their bag."""
     bag, note = tmp_path / "bag", tmp_path / "note.txt"
     bag.mkdir()
     files = [bag / "bag_0.db3", bag / "metadata.yaml", note]
@@ -124,7 +122,7 @@ CHANGES: Mapping[str, Mapping[str, Any]] = {
 
 
 @pytest.mark.parametrize("name", CHANGES)
-def test_other_options_are_other_work(source: Path, name: str) -> None:
+def test_other_options_give_other_work_id(source: Path, name: str) -> None:
     """Results of other options under the same name would pass for the requested ones."""
     run, other = planned(source), planned(source, **CHANGES[name])
 
@@ -134,7 +132,7 @@ def test_other_options_are_other_work(source: Path, name: str) -> None:
 
 
 @pytest.mark.parametrize("key", ["model", "version", "content"])
-def test_another_model_version_or_content_is_other_work(source: Path, key: str) -> None:
+def test_other_model_version_or_content_gives_other_work_id(source: Path, key: str) -> None:
     run, other = planned(source), planned(source)
     if key == "model":
         other["model"] = {**other["model"], "id": "m2"}
@@ -149,18 +147,18 @@ def test_another_model_version_or_content_is_other_work(source: Path, key: str) 
 
 
 @pytest.mark.parametrize("name", ["color", "mcap", "rrd", "boxes"])
-def test_outputs_do_not_change_what_the_tables_are_of(source: Path, name: str) -> None:
+def test_output_options_keep_work_id(source: Path, name: str) -> None:
     """Labels of a run without a review must also fit the same run with a review."""
     changed: Any = {"color": {"color": ""}, "mcap": {"mcap": False}, "rrd": {"rrd": False}}
     changed["boxes"] = {"settings": with_overrides(Settings(), ["outputs.boxes=visible"])}
     run, other = planned(source), planned(source, **changed[name])
 
     assert work_id(run) == work_id(other)
-    assert differences(run, other)  # a folder without colour is not taken for one with it
+    assert differences(run, other)  # a run without colour does not count as one with it
 
 
-def test_a_summary_has_the_seconds_from_begin_to_end(source: Path) -> None:
-    """The sum of all entries would count each phase twice, as the total holds it as well."""
+def test_summary_has_total_seconds(source: Path) -> None:
+    """The sum of all entries would count each phase twice."""
     run = planned(source)
     run["seconds"] = {"perceive": 3.5, "track": 1.25, "compile": 0.75, "total": 8.0}
     run["warnings"] = ["tilted"]
@@ -169,8 +167,8 @@ def test_a_summary_has_the_seconds_from_begin_to_end(source: Path) -> None:
     assert (found.seconds, found.warnings, found.processed) == (8.0, ("tilted",), False)
 
 
-def test_a_recording_that_was_written_to_has_changed_though_it_is_as_long(source: Path) -> None:
-    """Changed permissions alone are no change, though they renew the inode time."""
+def test_rewritten_recording_counts_as_changed(source: Path) -> None:
+    """New permissions are no change, although they renew the inode time."""
     before = file_stats(source)
     source.chmod(0o600)
     assert unchanged(before, source)
@@ -186,7 +184,7 @@ def test_a_recording_that_was_written_to_has_changed_though_it_is_as_long(source
     assert not unchanged(before, source)
 
 
-def test_content_is_compared_where_only_the_times_of_a_file_differ(source: Path) -> None:
+def test_content_is_compared_if_only_times_differ(source: Path) -> None:
     """Labels would be drawn on another recording of the same name and length."""
     known = planned(source)["input"]
     known["digest"] = content_digest(source)
@@ -197,8 +195,8 @@ def test_content_is_compared_where_only_the_times_of_a_file_differ(source: Path)
     assert not same_content(known, source, lambda: content_digest(source))
 
 
-def test_content_is_compared_where_a_copy_has_kept_the_times(source: Path) -> None:
-    """`cp -p` and `rsync -t` put another recording there that only its inode time gives away."""
+def test_content_is_compared_if_copy_keeps_times(source: Path) -> None:
+    """After `cp -p` or `rsync -t`, only the inode time of another recording differs."""
     known, stat = planned(source)["input"], source.stat()
     known["digest"] = content_digest(source)
     while source.stat().st_ctime_ns == stat.st_ctime_ns:  # its clock ticks every few milliseconds
@@ -208,8 +206,8 @@ def test_content_is_compared_where_a_copy_has_kept_the_times(source: Path) -> No
     assert not same_content(known, source, lambda: content_digest(source))
 
 
-def test_a_digest_that_nobody_needs_is_not_waited_for(source: Path) -> None:
-    """Stopped before it began, it is no error; stopped later, it must not continue."""
+def test_unneeded_digest_is_stopped(source: Path) -> None:
+    """Stopping is no error before the thread starts, and ends it afterwards."""
     with ContentDigest(source) as content:
         assert not content._thread.is_alive()
     with ContentDigest(source) as content:
@@ -225,12 +223,12 @@ def test_a_digest_that_nobody_needs_is_not_waited_for(source: Path) -> None:
         (("in1", "w1"), ("in1", "w1"), True),
         (("in2", "w1"), ("in1", "w1"), False),
         (("in1", "w2"), ("in1", "w1"), False),
-        (("", ""), ("", ""), False),  # what nothing is known of is not done
-        (("", "w1"), ("", "w1"), False),  # nor is what half is known of
+        (("", ""), ("", ""), False),  # nothing is known
+        (("", "w1"), ("", "w1"), False),  # only half is known
         (("in1", ""), ("in1", ""), False),
     ],
 )
-def test_results_at_a_url_are_those_of_the_same_input_and_work(
+def test_results_at_url_must_match_input_and_work(
     source: Path, known: tuple[str, str], asked: tuple[str, str], *, made: bool
 ) -> None:
     run = planned(source)
@@ -240,7 +238,7 @@ def test_results_at_a_url_are_those_of_the_same_input_and_work(
     assert Ticket("b", *asked).made(run) is made
 
 
-def test_links_that_form_loops_are_followed_once(tmp_path: Path) -> None:
+def test_looping_links_are_followed_once(tmp_path: Path) -> None:
     """Two links to their own folder made the search endless, one gave paths of 40 links."""
     (tmp_path / "z").mkdir()
     for name in ("lab.mcap", "z/kitchen.mcap"):
@@ -257,7 +255,7 @@ def test_links_that_form_loops_are_followed_once(tmp_path: Path) -> None:
     ]
 
 
-def test_a_recording_is_processed_once_by_whatever_names_it_is_found(tmp_path: Path) -> None:
+def test_recording_found_under_several_names_is_processed_once(tmp_path: Path) -> None:
     """Two run folders of one recording would be counted, and trained on, twice."""
     data, other = tmp_path / "data", tmp_path / "other"
     for folder, name in ((data, "a.mcap"), (data, "b.mcap"), (other, "a.mcap")):
@@ -278,7 +276,7 @@ def partial(folder: Path, run: RunInfo) -> None:
     write_run(folder, run)
 
 
-def test_what_an_error_has_left_is_kept_if_it_is_work(source: Path, tmp_path: Path) -> None:
+def test_partial_results_count_as_work(source: Path, tmp_path: Path) -> None:
     """A full disk after an hour must not cost that hour."""
     run = planned(source)
     (tmp_path / "begun").mkdir()
@@ -292,7 +290,7 @@ def test_what_an_error_has_left_is_kept_if_it_is_work(source: Path, tmp_path: Pa
     assert [has_work(tmp_path / name) for name in names] == [False, False, True, True]
 
 
-def test_a_partial_run_of_the_same_work_goes_on(source: Path, tmp_path: Path) -> None:
+def test_partial_run_of_same_work_resumes(source: Path, tmp_path: Path) -> None:
     folder, run = tmp_path / "half", planned(source)
     partial(folder, run)
 
@@ -300,31 +298,31 @@ def test_a_partial_run_of_the_same_work_goes_on(source: Path, tmp_path: Path) ->
     assert (folder / "segments" / "000000").exists()
 
 
-def test_a_partial_run_goes_on_with_other_outputs(source: Path, tmp_path: Path) -> None:
-    """Nothing is perceived again only because a review is wanted after all."""
+def test_partial_run_resumes_with_other_outputs(source: Path, tmp_path: Path) -> None:
+    """Requesting a review must not process frames again."""
     folder, run = tmp_path / "half", planned(source, rrd=False)
     partial(folder, run)
 
-    going_on = resume(folder, planned(source), source, lambda: "")
+    resumed = resume(folder, planned(source), source, lambda: "")
 
-    assert (going_on["id"], going_on["options"]["rrd"]) == (run["id"], True)
+    assert (resumed["id"], resumed["options"]["rrd"]) == (run["id"], True)
 
 
-def test_a_partial_run_goes_on_with_a_copy_of_its_recording(source: Path, tmp_path: Path) -> None:
-    """Times of the old file would make the finished run look changed, and delete its work."""
+def test_partial_run_resumes_with_copy_of_its_recording(source: Path, tmp_path: Path) -> None:
+    """With the old file's times, the recording would seem changed and the work be discarded."""
     folder, run = tmp_path / "half", planned(source)
     partial(folder, run)
     os.utime(source, (1, 1))
 
-    going_on = resume(folder, planned(source), source, lambda: run["input"]["digest"])
+    resumed = resume(folder, planned(source), source, lambda: run["input"]["digest"])
 
-    assert going_on["id"] == run["id"]
-    require_unchanged(folder, going_on, source)
+    assert resumed["id"] == run["id"]
+    require_unchanged(folder, resumed, source)
     assert has_work(folder)
 
 
 @pytest.mark.parametrize("what", ["model", "settings", "shapecat", "numpy", "content"])
-def test_a_partial_run_of_other_work_is_begun_anew(source: Path, tmp_path: Path, what: str) -> None:
+def test_partial_run_of_other_work_is_discarded(source: Path, tmp_path: Path, what: str) -> None:
     """Otherwise half of the tables would come from another model or version."""
     folder, run = tmp_path / "half", planned(source)
     if what == "model":
@@ -348,7 +346,7 @@ def status_of(job: Job, source: Path, out: Path) -> str:
         return next(task.status for task in batch.tasks if task.job.folder.name == source.stem)
 
 
-def test_a_batch_takes_nothing_of_another_model_for_done(
+def test_batch_checks_results_of_other_model_settings_or_content(
     source: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """The plan relies on the manifest alone, without opening a file."""
@@ -376,10 +374,8 @@ def test_a_batch_takes_nothing_of_another_model_for_done(
     assert status_of(job, source, out) == "check"
 
 
-def test_a_batch_looks_again_at_a_recording_whose_copy_has_kept_the_times(
-    source: Path, tmp_path: Path
-) -> None:
-    """`rsync -t` puts another recording there that only its inode time gives away."""
+def test_batch_notices_replaced_recording_with_same_times(source: Path, tmp_path: Path) -> None:
+    """After `rsync -t`, only the inode time of another recording differs."""
     (source.parent / "other.mcap").write_bytes(b"another")
 
     def key() -> str:
@@ -399,12 +395,12 @@ def test_a_batch_looks_again_at_a_recording_whose_copy_has_kept_the_times(
     ("noted", "there", "status"),
     [
         (("annotated.mcap", "review.rrd"), ("annotated.mcap", "review.rrd"), "complete"),
-        (("annotated.mcap", "review.rrd"), ("annotated.mcap",), "check"),  # a person removed it
+        (("annotated.mcap", "review.rrd"), ("annotated.mcap",), "check"),  # a user removed it
         (("annotated.mcap",), ("annotated.mcap", "review.rrd"), "check"),  # `annotate` was killed
         ((), (), "check"),
     ],
 )
-def test_a_batch_takes_no_run_without_its_outputs_for_done(
+def test_batch_checks_run_without_its_outputs(
     source: Path,
     tmp_path: Path,
     monkeypatch: pytest.MonkeyPatch,
@@ -419,7 +415,7 @@ def test_a_batch_takes_no_run_without_its_outputs_for_done(
     write_run(out / "lab", {**run, "seconds": dict.fromkeys(noted, 1.5)})
     for name in there:
         (out / "lab" / name).write_bytes(b"something")
-    partial_path(out / "lab").mkdir()  # a kill may leave it, which is no reason to begin anew
+    partial_path(out / "lab").mkdir()  # may remain after a kill, and must not matter
     model = SimpleNamespace(model_id="m1")
     monkeypatch.setattr("shapecat.batch.plans.load_model", lambda _path: model)
     with plan_batch(job, [str(source.parent)], str(out)) as batch:
@@ -433,8 +429,8 @@ def test_a_batch_takes_no_run_without_its_outputs_for_done(
     assert status_of(replace(job, overwrite=True), source, out) == "resume"
 
 
-def test_a_full_disk_leaves_no_torn_line(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    """The part of a line that fit is removed; else the next line would be appended to it."""
+def test_full_disk_leaves_no_partial_line(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """The next line would be appended to the part that fit."""
     path = tmp_path / "manifest.jsonl"
     Manifest(path).record([Entry("a", "a.mcap", "complete")])
     whole = path.read_bytes()
@@ -455,7 +451,7 @@ def test_a_full_disk_leaves_no_torn_line(tmp_path: Path, monkeypatch: pytest.Mon
     assert [json.loads(line)["folder"] for line in path.read_text().splitlines()] == ["a", "c"]
 
 
-def test_a_torn_line_of_a_crash_swallows_nothing(tmp_path: Path) -> None:
+def test_partial_line_of_crash_does_not_lose_next_entry(tmp_path: Path) -> None:
     path = tmp_path / "manifest.jsonl"
     path.write_bytes(b'{"folder": "a", "recording": "a.mcap", "state": "comp')
     Manifest(path).record([Entry("b", "b.mcap", "failed", tries=2, exit_code=3, message="bad")])
@@ -465,7 +461,7 @@ def test_a_torn_line_of_a_crash_swallows_nothing(tmp_path: Path) -> None:
     assert list(Manifest(path).entries) == ["b"]
 
 
-def test_the_last_line_of_a_recording_holds(tmp_path: Path) -> None:
+def test_last_line_of_a_recording_counts(tmp_path: Path) -> None:
     path = tmp_path / "manifest.jsonl"
     for state in get_args(State):
         Manifest(path).record([Entry("a", "a.mcap", state)])
@@ -473,8 +469,8 @@ def test_the_last_line_of_a_recording_holds(tmp_path: Path) -> None:
     assert Manifest(path).entries["a"].state == get_args(State)[-1]
 
 
-def test_an_entry_without_tracks_is_not_one_whose_tracks_are_unknown(tmp_path: Path) -> None:
-    """Nothing was found, which need not be looked up in the run again."""
+def test_entry_with_zero_tracks_is_not_read_as_unknown(tmp_path: Path) -> None:
+    """Unknown tracks would be looked up in the run again."""
     path = tmp_path / "manifest.jsonl"
     Manifest(path).record([Entry("a", "a.mcap", "complete", seconds=0.0, frames=3, tracks={})])
     read = Manifest(path).entries["a"]
@@ -483,13 +479,8 @@ def test_an_entry_without_tracks_is_not_one_whose_tracks_are_unknown(tmp_path: P
 
 
 @pytest.mark.parametrize("part_bytes", [1, 10**6])
-def test_a_manifest_at_a_url_ends_as_one_file(
-    monkeypatch: pytest.MonkeyPatch, part_bytes: int
-) -> None:
-    """It holds the last line of each recording, whether its last part is full or not.
-
-    A short recording begins and ends in one millisecond: the last line holds then too.
-    """
+def test_manifest_at_url_ends_as_one_file(monkeypatch: pytest.MonkeyPatch, part_bytes: int) -> None:
+    """It holds the last line of each recording, also of two written in the same millisecond."""
     monkeypatch.setattr("shapecat.batch.manifest._PART_BYTES", part_bytes)
     place = f"memory://one-file-{part_bytes}"
     with RemoteManifest(place) as manifest:
@@ -511,7 +502,7 @@ def test_a_manifest_at_a_url_ends_as_one_file(
     assert (Location(f"{place}-none") / "manifest.jsonl").read() is None
 
 
-def test_lines_that_come_while_a_full_part_is_sent_go_into_the_next(
+def test_lines_recorded_while_sending_go_into_next_part(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
     """A megabyte takes a while to send, and recordings end meanwhile."""
@@ -532,8 +523,8 @@ def test_lines_that_come_while_a_full_part_is_sent_go_into_the_next(
     assert RemoteManifest(place).entries.keys() == {"a", "b"}
 
 
-def test_a_part_of_a_manifest_is_read_again_when_it_has_grown() -> None:
-    """Two shards end at the same time: the last one to end writes what both have done."""
+def test_grown_part_of_manifest_is_read_again() -> None:
+    """Of two shards that end at the same time, the last one writes the entries of both."""
     place = "memory://grown"
     with RemoteManifest(place) as one, RemoteManifest(place) as other:
         one.record([Entry("a", "a.mcap", "running")])
@@ -550,7 +541,7 @@ def test_a_part_of_a_manifest_is_read_again_when_it_has_grown() -> None:
 
 
 def test_entries_of_other_work_are_replaced(source: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    """Else the manifest of new settings would hold the keys of the old, and do all work again."""
+    """Otherwise the manifest would keep the keys of old settings, and all work be repeated."""
     (source.parent / "other.mcap").write_bytes(b"another")
     monkeypatch.setattr("shapecat.batch.plans.load_model", lambda _path: MODEL)
     out = str(source.parent / "out")
@@ -584,8 +575,10 @@ INFO: Mapping[str, Any] = {"size": 7, "ETag": "e1", "mtime": 1.5}
         ({"ETag": None, "size": 8}, True),
     ],
 )
-def test_a_key_follows_the_content_at_a_url(changes: Mapping[str, Any], *, other: bool) -> None:
-    """Storages that give no digest are asked for the time of writing."""
+def test_content_key_changes_with_content_at_url(
+    changes: Mapping[str, Any], *, other: bool
+) -> None:
+    """Without a digest from the storage, the time of writing counts."""
     first = {**INFO, "ETag": None} if "ETag" in changes and changes["ETag"] is None else INFO
     infos = (
         {k: v for k, v in info.items() if v is not None} for info in (first, {**INFO, **changes})
@@ -595,8 +588,8 @@ def test_a_key_follows_the_content_at_a_url(changes: Mapping[str, Any], *, other
     assert (before != after) is other
 
 
-def test_the_key_of_a_bag_at_a_url_is_that_of_all_its_files() -> None:
-    """In whatever order a storage lists them."""
+def test_key_of_bag_at_url_covers_all_its_files() -> None:
+    """The storage may list them in any order."""
     keys = [_key_of_all(keys) for keys in ("ab", "ac", "db", "ba")]
 
     assert len(set(keys)) == 3
@@ -606,13 +599,13 @@ def test_the_key_of_a_bag_at_a_url_is_that_of_all_its_files() -> None:
 @pytest.mark.parametrize(
     ("error", "begun", "tries"),
     [
-        (CancelledError(), False, 1),  # it has only waited for a scheduler that is gone
-        (CancelledError(), True, 2),  # it may have been what killed the machine
+        (CancelledError(), False, 1),  # it only waited for the lost scheduler
+        (CancelledError(), True, 2),  # it may have killed the machine
         (WorkerLostError(), False, 2),
         (WorkerLostError(), True, 2),
     ],
 )
-def test_a_recording_that_had_begun_is_blamed_for_what_is_lost(
+def test_lost_recording_counts_as_tried_if_it_had_started(
     source: Path, monkeypatch: pytest.MonkeyPatch, error: BaseException, *, begun: bool, tries: int
 ) -> None:
     """Otherwise a recording that kills its machine would be tried for ever."""
@@ -642,14 +635,14 @@ def test_a_recording_that_had_begun_is_blamed_for_what_is_lost(
     [((0, 0), 0), ((0, 3), 1), ((3, 3), 3), ((4, 1), 1), ((3, 4), 1), ((2,), 2), ((), 0)],
 )
 def test_exit_codes_of_a_batch(codes: tuple[int, ...], expected: int) -> None:
-    """Results in the way of other settings, and one recording without depth, gave 4: no depth."""
+    """Different failures give 1, not the code of one of them."""
     outcomes = [Outcome(Job(Path("a"), Path("b")), code=code) for code in codes]
 
     assert exit_code(outcomes) == expected
 
 
-def test_shards_are_disjoint_in_whatever_order_the_recordings_are_found() -> None:
-    """A machine may list a folder in another order than the next one."""
+def test_shards_are_disjoint_in_any_order_of_recordings() -> None:
+    """Machines may list a folder in different orders."""
     named = [(name, Source(f"{name}.mcap", "", name, "")) for name in "dbeac"]
     first, second = Shard(0, 2).of(named), Shard(1, 2).of(named[::-1])
 
@@ -657,8 +650,8 @@ def test_shards_are_disjoint_in_whatever_order_the_recordings_are_found() -> Non
     assert [name for name, _ in second] == ["b", "d"]
 
 
-class Noting(Executor):
-    """Records its input and does nothing else."""
+class NameCollector(Executor):
+    """Collects the names of submitted recordings."""
 
     def __init__(self) -> None:
         self.names: list[str] = []
@@ -671,26 +664,24 @@ class Noting(Executor):
         return future
 
 
-def test_the_largest_recordings_begin_first(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_largest_recordings_start_first(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """Started last, a long one would keep a whole cluster waiting."""
     monkeypatch.setattr(
         "shapecat.batch.plans.load_model", lambda _path: SimpleNamespace(model_id="m1")
     )
     for name, size in (("a", 20), ("b", 3000), ("c", 400)):
         (tmp_path / f"{name}.mcap").write_bytes(bytes(size))
-    executor, watcher = Noting(), SimpleNamespace(ended=lambda _outcome: None)
+    executor, watcher = NameCollector(), SimpleNamespace(ended=lambda _outcome: None)
     with plan_batch(Job(Path(), Path()), [str(tmp_path)], str(tmp_path / "out")) as batch:
         list(process_on(executor, batch.tasks, watcher))
 
     assert executor.names == ["b", "c", "a"]
 
 
-def test_a_recording_is_noted_as_complete_before_its_outcome_is_told(
+def test_recording_is_complete_in_manifest_before_outcome_is_returned(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """Whoever stops the batch at this moment must not have to repeat it."""
+    """A batch stopped at this moment must not repeat it."""
     monkeypatch.setattr("shapecat.batch.plans.load_model", lambda _path: MODEL)
     counts = {"frames": 3, "tracks": {"cup": 2}}
 
@@ -703,19 +694,19 @@ def test_a_recording_is_noted_as_complete_before_its_outcome_is_told(
     watcher, out = SimpleNamespace(ended=lambda _outcome: None), tmp_path / "out"
     with plan_batch(Job(Path(), Path()), [str(tmp_path)], str(out)) as batch:
         first = next(process_here(batch.tasks, watcher, manifest=batch.manifest))
-        noted = Manifest(out / "manifest.jsonl").entries
+        lines = Manifest(out / "manifest.jsonl").entries
 
-    assert {name: entry.state for name, entry in noted.items()} == {
+    assert {name: entry.state for name, entry in lines.items()} == {
         first.job.folder.name: "complete", "b": "planned"
     }  # fmt: skip
 
 
-def test_a_worker_tells_its_progress_now_and_then_and_at_the_end(
+def test_worker_reports_progress_at_intervals_and_at_end(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
     """Without the last frame, a recording would look unfinished while its outputs are written."""
-    told, clock = list[Any](), [10.0]
-    monkeypatch.setattr("shapecat.batch.runs.post", lambda *words: told.append(words))
+    sent, clock = list[Any](), [10.0]
+    monkeypatch.setattr("shapecat.batch.runs.post", lambda *words: sent.append(words))
     monkeypatch.setattr("shapecat.batch.runs.time", SimpleNamespace(monotonic=lambda: clock[0]))
     observe = _reporter("lab", "here")
     for clock[0], phase, done in (
@@ -724,21 +715,21 @@ def test_a_worker_tells_its_progress_now_and_then_and_at_the_end(
     ):  # fmt: skip
         observe(phase, done, 5)
 
-    assert told == [
+    assert sent == [
         ("here", ("lab", phase, done, 5))
         for phase, done in (("perceive", 1), ("perceive", 3), ("perceive", 5), ("track", 0))
     ]
 
 
-def test_recordings_of_one_name_have_folders_of_their_own() -> None:
+def test_recordings_with_equal_names_get_different_folders() -> None:
     """The name of the parent folder distinguishes recordings; a number alone would not."""
     folders = name_folders(["x", "x", "x", "y"], ["a", "b", "a", "a"])
 
     assert folders == ["a_x", "b_x", "a_x_3", "y"]
 
 
-def test_a_new_recording_does_not_get_the_folder_of_an_older_one() -> None:
-    """Both would be written to one folder, and one of them lost."""
+def test_new_recording_does_not_get_existing_folder() -> None:
+    """Two recordings would be written to one folder, and one of them lost."""
     folders = name_folders(["x", "x", "x"], ["a", "a", "b"], {1: "a_x"})
 
     assert folders == ["a_x_1", "a_x", "b_x"]
@@ -747,12 +738,12 @@ def test_a_new_recording_does_not_get_the_folder_of_an_older_one() -> None:
 @pytest.mark.parametrize(
     ("way", "name"), [("whole", "lab"), ("relative", "lab_2"), ("link", "monday_lab_3")]
 )
-def test_a_run_keeps_its_folder_when_a_recording_of_its_name_is_added(
+def test_run_keeps_folder_when_recording_of_same_name_is_added(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, way: str, name: str
 ) -> None:
-    """Otherwise it is processed again without its labels, and counted twice in each export.
+    """It would be processed again without its labels, and counted twice in each export.
 
-    However the recording is named this time: run.json has its whole path, without links.
+    run.json has the absolute path without links, however the user names the recording.
     """
     for day in ("monday", "tuesday"):
         (tmp_path / day).mkdir()
@@ -770,7 +761,7 @@ def test_a_run_keeps_its_folder_when_a_recording_of_its_name_is_added(
         assert [task.name for task in batch.tasks] == ["tuesday_lab", name]
 
 
-def test_a_name_that_a_number_makes_may_be_taken() -> None:
+def test_numbered_folder_name_may_already_be_taken() -> None:
     """Two recordings in one folder would be confused, and one would be lost."""
     folders = name_folders(["a_x_3", "x", "x", "a_x_4", "x"], ["b", "a", "a", "b", "a"])
 

@@ -1,4 +1,4 @@
-"""First contact: clear refusals before work begins, and nothing lost silently."""
+"""Tests of the command line: invalid input is refused before work begins, and nothing is lost."""
 
 import json
 import logging
@@ -40,7 +40,7 @@ def runs(shapecat: Run, recording: Path, tmp_path_factory: pytest.TempPathFactor
     return out
 
 
-def test_info_looks_into_a_folder_as_process_does(shapecat: Run, tmp_path: Path) -> None:
+def test_info_lists_all_recordings_in_folder(shapecat: Run, tmp_path: Path) -> None:
     """A bag beside an MCAP file is not part of a ROS 2 recording, and must not be skipped."""
     record(tmp_path / "one.mcap", 2)
     record(tmp_path / "two.bag", 2, container="ros1")
@@ -52,7 +52,7 @@ def test_info_looks_into_a_folder_as_process_does(shapecat: Run, tmp_path: Path)
     }
 
 
-def test_info_goes_on_after_a_recording_that_cannot_be_read(
+def test_info_continues_after_unreadable_recording(
     shapecat: Run, recording: Path, tmp_path: Path
 ) -> None:
     (tmp_path / "bad.mcap").write_text("no recording")
@@ -72,7 +72,7 @@ def test_info_goes_on_after_a_recording_that_cannot_be_read(
         (("--start", "-2"), "--start"),
     ],
 )
-def test_an_impossible_range_is_wrong_usage(
+def test_impossible_time_range_is_wrong_usage(
     shapecat: Run, recording: Path, tmp_path: Path, options: tuple[str, ...], words: str
 ) -> None:
     result = shapecat("process", recording, "--out", tmp_path / "out", *options)
@@ -82,9 +82,7 @@ def test_an_impossible_range_is_wrong_usage(
     assert not (tmp_path / "out").exists()
 
 
-def test_a_range_after_the_end_tells_where_the_end_is(
-    shapecat: Run, recording: Path, tmp_path: Path
-) -> None:
+def test_start_after_end_reports_the_end(shapecat: Run, recording: Path, tmp_path: Path) -> None:
     result = shapecat("process", recording, "--out", tmp_path / "out", "--start", 100)
     seconds = json.loads(shapecat("info", recording, "--json").stdout)[0]["seconds"]
 
@@ -96,17 +94,17 @@ def test_a_range_after_the_end_tells_where_the_end_is(
 @contextmanager
 def new_logging() -> Iterator[None]:
     """Allow the command to set up logging, which it does once per process."""
-    ours = logging.getLogger("shapecat")
-    before = ours.level
+    logger = logging.getLogger("shapecat")
+    before = logger.level
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(logging.root, "handlers", [])
-        ours.setLevel(logging.NOTSET)
+        logger.setLevel(logging.NOTSET)
         yield
-        ours.setLevel(before)
+        logger.setLevel(before)
 
 
 @pytest.mark.parametrize("place", ["before", "after"])
-def test_verbose_tells_what_is_done(
+def test_verbose_works_before_and_after_command(
     shapecat: Run, recording: Path, tmp_path: Path, place: str
 ) -> None:
     """An option accepted only before or only after the command seems to do nothing."""
@@ -138,10 +136,10 @@ def test_verbose_is_off_by_default(
         ("evaluate", "DATA", "--report", "PLACE/page.html"),
     ],
 )
-def test_a_place_that_cannot_be_written_is_noticed_before_the_work(
+def test_unwritable_output_is_refused_before_reading_data(
     shapecat: Run, tmp_path: Path, command: tuple[str, ...]
 ) -> None:
-    """Root may write anywhere, but not inside a file. The data set need not exist."""
+    """Even root cannot write inside a file. The data set does not exist."""
     (tmp_path / "file").write_text("")
     names = {"DATA": str(tmp_path / "none"), "PLACE": str(tmp_path / "file")}
     words = [names.get(word, word.replace("PLACE", names["PLACE"])) for word in command]
@@ -152,7 +150,7 @@ def test_a_place_that_cannot_be_written_is_noticed_before_the_work(
     assert result.stderr.count("\n") == 1
 
 
-def test_missing_folders_of_a_model_are_made(tmp_path: Path) -> None:
+def test_missing_parent_folders_are_created(tmp_path: Path) -> None:
     from shapecat.system.files import require_writable  # noqa: PLC0415  beside its only use
 
     require_writable(tmp_path / "new" / "deep" / "mine.npz")
@@ -169,7 +167,7 @@ def test_missing_folders_of_a_model_are_made(tmp_path: Path) -> None:
         ("x.bag", ("--format", "ros2"), "folder"),
     ],
 )
-def test_simulate_refuses_a_suffix_that_says_something_else(
+def test_simulate_refuses_suffix_of_another_format(
     shapecat: Run, tmp_path: Path, name: str, options: tuple[str, ...], words: str
 ) -> None:
     result = shapecat("simulate", tmp_path / name, "--frames", 1, *options)
@@ -180,7 +178,7 @@ def test_simulate_refuses_a_suffix_that_says_something_else(
 
 
 @pytest.mark.parametrize("there", ["x.mcap", "x.truth.json", "x.labels.npz"])
-def test_simulate_overwrites_nothing_unasked(shapecat: Run, tmp_path: Path, there: str) -> None:
+def test_simulate_requires_overwrite_option(shapecat: Run, tmp_path: Path, there: str) -> None:
     (tmp_path / there).write_text("mine")
     result = shapecat("simulate", tmp_path / "x.mcap", "--frames", 1)
 
@@ -192,7 +190,7 @@ def test_simulate_overwrites_nothing_unasked(shapecat: Run, tmp_path: Path, ther
     assert (tmp_path / "x.mcap").read_bytes().startswith(b"\x89MCAP")
 
 
-def test_simulate_never_removes_a_folder_of_other_things(shapecat: Run, tmp_path: Path) -> None:
+def test_simulate_never_removes_foreign_folder(shapecat: Run, tmp_path: Path) -> None:
     (tmp_path / "x").mkdir()
     (tmp_path / "x" / "thesis.txt").write_text("mine")
     result = shapecat("simulate", tmp_path / "x", "--frames", 1, "--overwrite")
@@ -201,7 +199,9 @@ def test_simulate_never_removes_a_folder_of_other_things(shapecat: Run, tmp_path
     assert (tmp_path / "x" / "thesis.txt").read_text() == "mine"
 
 
-def test_export_takes_folders_of_runs(shapecat: Run, runs: Path, tmp_path: Path) -> None:
+def test_export_accepts_folders_but_refuses_equal_run_names(
+    shapecat: Run, runs: Path, tmp_path: Path
+) -> None:
     result = shapecat("export", runs / "a", runs / "deep" / "c" / "lab", "--format", "kitti",
                       "--out", tmp_path / "kitti")  # fmt: skip
     assert result.exit_code == 1
@@ -225,7 +225,7 @@ class Links(HTMLParser):
         self.found += [value for name, value in attrs if name == "href" and value]
 
 
-def test_an_index_over_scattered_runs_leads_to_all_of_them(shapecat: Run, runs: Path) -> None:
+def test_index_of_scattered_runs_links_to_their_pages(shapecat: Run, runs: Path) -> None:
     folders = [runs / "a" / "lab", runs / "b", runs / "deep" / "c"]
     result = shapecat("report", *folders)
 
@@ -241,7 +241,7 @@ def test_an_index_over_scattered_runs_leads_to_all_of_them(shapecat: Run, runs: 
         assert [(page.parent / unquote(link)).resolve() for link in back] == [index.resolve()]
 
 
-def test_a_recording_that_was_moved_can_be_named(
+def test_path_of_moved_recording_can_be_given(
     shapecat: Run, recording: Path, tmp_path: Path
 ) -> None:
     lab = tmp_path / "lab.mcap"
@@ -262,14 +262,14 @@ def test_a_recording_that_was_moved_can_be_named(
     exported = shapecat("export", tmp_path / "lab", *crops, "--recording", lab)
     assert exported.exit_code == 0, exported.stderr
     assert shapecat("annotate", tmp_path / "lab", "--recording", lab).exit_code == 0
-    assert shapecat("annotate", tmp_path / "lab").exit_code == 0  # it remembers
+    assert shapecat("annotate", tmp_path / "lab").exit_code == 0  # the new path is stored
     known, stat = read_run(tmp_path / "lab")["input"], lab.stat()
     assert known["path"] == str(lab.resolve())
-    # A recording that is known by these is not read whole again by each command.
+    # With these, later commands need not read the whole recording again.
     assert known["files"] == [["renamed.mcap", stat.st_size, stat.st_mtime_ns, stat.st_ctime_ns]]
 
 
-def test_view_without_a_display_says_what_to_do(
+def test_view_without_display_suggests_web_viewer(
     shapecat: Run, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     (tmp_path / "review.rrd").write_bytes(b"RRF2")
@@ -282,10 +282,10 @@ def test_view_without_a_display_says_what_to_do(
     assert result.stderr.count("\n") == 1
 
 
-def test_view_tells_a_missing_run_from_a_missing_review(
+def test_view_distinguishes_missing_run_from_missing_review(
     shapecat: Run, runs: Path, tmp_path: Path
 ) -> None:
-    """A mistyped path, or a folder of runs, must not seem to call for processing again."""
+    """A mistyped path, or a folder of runs, must not suggest processing again."""
     for path in (tmp_path / "nothing", runs, runs / "a"):
         result = shapecat("view", path)
         assert result.exit_code == 1
@@ -296,10 +296,10 @@ def test_view_tells_a_missing_run_from_a_missing_review(
     assert "no review there; process the recording without --no-rrd" in result.stderr
 
 
-def test_an_output_that_was_not_wanted_is_written_later(
+def test_output_requested_later_is_added_to_run(
     shapecat: Run, recording: Path, runs: Path, tmp_path: Path
 ) -> None:
-    """To get a review, nobody should have to process everything again, or overwrite results."""
+    """A review must not require processing everything again, or overwriting results."""
     shutil.copytree(runs / "a", tmp_path, dirs_exist_ok=True)
     lab = tmp_path / "lab"
     before = {path.name: path.stat().st_mtime_ns for path in lab.iterdir()}
@@ -318,9 +318,7 @@ def test_an_output_that_was_not_wanted_is_written_later(
     assert (lab / "review.rrd").stat().st_mtime_ns == after["review.rrd"]
 
 
-def test_refused_results_are_told_from_the_wanted_ones(
-    shapecat: Run, recording: Path, runs: Path
-) -> None:
+def test_refusal_names_differing_options(shapecat: Run, recording: Path, runs: Path) -> None:
     """Without the option that differs, one can only guess which command made the results."""
     options = ("--every", 2, "--no-color", "--set", "detection.min_points=7")
     result = shapecat("process", recording, "--out", runs / "a", *options)
@@ -330,7 +328,7 @@ def test_refused_results_are_told_from_the_wanted_ones(
     assert f"({differing}color: default there, none wanted)" in result.stderr
 
 
-def listening(pid: int) -> set[str]:
+def listening_addresses(pid: int) -> set[str]:
     """Return the addresses on which a process and its children listen."""
     inodes = set()
     for process in [pid, *descendants(pid)]:
@@ -356,7 +354,7 @@ def descendants(pid: int) -> list[int]:
     return found
 
 
-def test_the_web_viewer_serves_this_machine_alone(tmp_path: Path) -> None:
+def test_web_viewer_listens_only_on_localhost(tmp_path: Path) -> None:
     """Other machines in the network must not be able to see the recordings."""
     import rerun as rr  # noqa: PLC0415  loads for a second
 
@@ -374,19 +372,19 @@ def test_the_web_viewer_serves_this_machine_alone(tmp_path: Path) -> None:
         port = int(re.search(r"http://127\.0\.0\.1:(\d+)", url)[1])  # type: ignore[index]
         with socket.create_connection(("127.0.0.1", port), timeout=10):
             pass
-        here = {"0100007F", "0000000000000000FFFF00000100007F", "0" * 24 + "01000000"}
-        assert listening(viewer.pid)
-        assert listening(viewer.pid) <= here
+        localhost = {"0100007F", "0000000000000000FFFF00000100007F", "0" * 24 + "01000000"}
+        assert listening_addresses(viewer.pid)
+        assert listening_addresses(viewer.pid) <= localhost
     finally:
-        below = descendants(viewer.pid)
+        processes = descendants(viewer.pid)
         viewer.send_signal(signal.SIGINT)
         _, errors = viewer.communicate(timeout=20)
     assert (viewer.returncode, errors) == (0, "stopping the viewer\n")
-    wait_for(lambda: not any(Path(f"/proc/{pid}").exists() for pid in below))
+    wait_for(lambda: not any(Path(f"/proc/{pid}").exists() for pid in processes))
 
 
 @pytest.mark.parametrize("kind", ["plain", "rich", "none", "bars"])
-def test_the_compile_notice_appears_once(capsys: pytest.CaptureFixture[str], kind: str) -> None:
+def test_compile_notice_appears_once(capsys: pytest.CaptureFixture[str], kind: str) -> None:
     """Otherwise each recording and each worker would announce the compilation."""
     open_progress = import_module("shapecat.cli.progress").open_progress
     progress_bars = import_module("shapecat.cli.render").progress_bars
@@ -408,10 +406,10 @@ FIXTURE = str(Path(__file__).parents[1] / "fixtures" / "tabletop.mcap")
 @pytest.mark.skipif(not Path("/dev/full").exists(), reason="needs a device that is always full")
 @pytest.mark.parametrize("words", [("info", FIXTURE), ("--help",)])
 @pytest.mark.parametrize("unbuffered", ["", "1"])
-def test_a_full_disk_behind_the_output_is_one_line(
+def test_full_disk_behind_stdout_is_reported_in_one_line(
     words: tuple[str, ...], unbuffered: str, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """A script that collects tables got a traceback, or a second one at exit."""
+    """Neither the write nor the flush at exit may print a traceback."""
     monkeypatch.setenv("PYTHONUNBUFFERED", unbuffered)
     with Path("/dev/full").open("w") as full:
         done = subprocess.run(
