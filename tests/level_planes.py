@@ -1,4 +1,4 @@
-"""A level plane before a camera that looks down on it at 45 degrees, on a downsampled grid."""
+"""A level plane on a downsampled grid, for a camera that looks down at 45 degrees."""
 
 import numpy as np
 
@@ -11,7 +11,7 @@ INTRINSICS = PinholeIntrinsics(262.5, 262.5, 159.5, 119.5)
 UP = np.array([0.0, -np.sqrt(0.5), -np.sqrt(0.5)])
 I, J = np.mgrid[:240, :320]
 ALONG = ((J - 159.5) * UP[0] + (I - 119.5) * UP[1]) / 262.5 + UP[2]
-"""Height of a ray a metre along the optical axis."""
+"""Height of each ray at a depth of one metre."""
 
 
 def level(below_m: float = 0.7) -> F4:

@@ -1,4 +1,4 @@
-"""A small table with objects, seen by a coarse camera: real perception at a tenth of the cost."""
+"""A small table with objects and a low-resolution camera: perception at a tenth of the cost."""
 
 from collections.abc import Iterable, Iterator
 from functools import cache
@@ -28,16 +28,16 @@ class View(NamedTuple):
     pose: Pose
 
     def points(self) -> F4:
-        """Return the organized cloud (120, 160, 3), NaN where there is no reading."""
+        """Return the organized cloud (120, 160, 3), NaN where depth is missing."""
         frame = Frame("", 0, 0, 0, "", depth=self.depth, camera=self.camera)
         return frame.xyz().reshape(*self.depth.shape, 3)
 
 
 @cache
 def views(count: int = 4) -> tuple[View, ...]:
-    """Return the frames of a camera that moves past the table."""
+    """Return the views of a camera that moves past the table."""
     world = make_scene("tabletop", np.random.default_rng(7), frames=30)
-    found = []
+    rendered = []
     for index in range(count):
         rng = np.random.default_rng(index)
         frame, _ = render_frame(world, index, rng=rng, sensor=IDEAL)
@@ -46,14 +46,14 @@ def views(count: int = 4) -> tuple[View, ...]:
         c = frame.camera
         small = Camera(160, 120, c.fx / STEP, c.fy / STEP, c.cx / STEP, c.cy / STEP)
         depth = np.round(frame.depth[::STEP, ::STEP] * 1000) / np.float32(1000)
-        found.append(View(depth.astype(np.float32), small, world.path[index]))
-    return tuple(found)
+        rendered.append(View(depth.astype(np.float32), small, world.path[index]))
+    return tuple(rendered)
 
 
 def back_and_forth(frames: int) -> Iterator[View]:
-    """Return a number of views from a camera that moves back and forth."""
-    seen = views()
-    cycle = [*seen, *seen[-2:0:-1]]
+    """Yield a number of views of a camera that moves back and forth."""
+    forward = views()
+    cycle = [*forward, *forward[-2:0:-1]]
     for k in range(frames):
         yield cycle[k % len(cycle)]
 
@@ -62,8 +62,8 @@ def stream(
     make: MessageFactory, frames: int, *, clouds: bool = False, camera: str = "/camera"
 ) -> Iterator[tuple[str, int, Any]]:
     """Yield topic, log time and message of a recording of the table."""
-    still = [("camera_link", OPTICAL, LINK_FROM_OPTICAL)]
-    yield "/tf_static", EPOCH, make.transforms(still, EPOCH)
+    static = [("camera_link", OPTICAL, LINK_FROM_OPTICAL)]
+    yield "/tf_static", EPOCH, make.transforms(static, EPOCH)
     for k, view in enumerate(back_and_forth(frames)):
         stamp = EPOCH + k * PERIOD
         yield "/tf", stamp, make.transforms(robot_links(view.pose), stamp)
@@ -87,6 +87,6 @@ def record(path: Path, frames: int, *, container: str = "mcap", clouds: bool = F
 def serialized(
     items: Iterable[tuple[str, int, Any]], make: MessageFactory
 ) -> Iterator[tuple[str, str, int, bytes]]:
-    """Yield topic, type, log time and bytes."""
+    """Yield topic, type, log time and bytes of each message."""
     for topic, time, message in items:
         yield topic, message.__msgtype__, time, make.serialize(message)

@@ -1,4 +1,4 @@
-"""Detection on scenes drawn by a small ray caster, each named by the hazard it holds."""
+"""Tests of detection on scenes drawn by a small ray caster."""
 
 from collections.abc import Callable
 from functools import lru_cache, reduce
@@ -25,14 +25,14 @@ DEFAULTS = DetectionSettings()
 
 
 def squared(vectors: Array) -> Array:
-    """Return the squared lengths of vectors (..., n); a sum along so short an axis is slow."""
+    """Return the squared lengths of vectors (..., n), faster than a sum along the short axis."""
     return reduce(np.add, np.moveaxis(vectors**2, -1, 0))
 
 
-def turned_by(turn: Array, rays: Array) -> list[Array]:
-    """Return each component of turned vectors (..., 3), which lie in memory one after the other."""
+def rotated(rotation: Array, rays: Array) -> list[Array]:
+    """Return the components of rotated vectors (..., 3), each contiguous in memory."""
     x, y, z = np.moveaxis(rays, -1, 0)
-    return [row[0] * x + row[1] * y + row[2] * z for row in turn]
+    return [row[0] * x + row[1] * y + row[2] * z for row in rotation]
 
 
 def table(x: float = 0.5, y: float = 0.4, z: float = 0.0) -> Shape:
@@ -53,13 +53,13 @@ def box(
 ) -> Shape:
     """Return a box; ``center`` is the middle of its base."""
     c, s = np.cos(yaw), np.sin(yaw)
-    turn = np.array([[c, s, 0], [-s, c, 0], [0, 0, 1.0]])
+    rotation = np.array([[c, s, 0], [-s, c, 0], [0, 0, 1.0]])
     half = np.array(size) / 2
 
     def hit(origin: Array, rays: Array) -> Array:
-        o = turn @ (origin - np.array(center) - [0, 0, half[2]])
+        o = rotation @ (origin - np.array(center) - [0, 0, half[2]])
         near, far = np.zeros(rays.shape[:-1]), np.full(rays.shape[:-1], np.inf)
-        for axis, d in enumerate(turned_by(turn, rays)):
+        for axis, d in enumerate(rotated(rotation, rays)):
             with np.errstate(divide="ignore", invalid="ignore"):
                 a, b = (-half[axis] - o[axis]) / d, (half[axis] - o[axis]) / d
             near, far = np.maximum(near, np.minimum(a, b)), np.minimum(far, np.maximum(a, b))
@@ -78,9 +78,9 @@ def shell(center: tuple[float, float, float], radius: float, rim: float | None) 
 
     def hit(origin: Array, rays: Array) -> Array:
         o = origin - np.array(center)
-        a, (b,), c = squared(rays), turned_by(2 * o[None], rays), o @ o - radius**2
+        a, (b,), c = squared(rays), rotated(2 * o[None], rays), o @ o - radius**2
         root = b * b - 4 * a * c
-        best, close = np.full(a.shape, np.inf), root > 0  # the others pass it by
+        best, close = np.full(a.shape, np.inf), root > 0  # other rays miss it
         d, a, b, root = rays[close], a[close], b[close], root[close]
         nearest = np.full(a.shape, np.inf)
         for sign in (-1, 1):
@@ -103,7 +103,7 @@ def can(x: float, y: float, z: float, radius: float, height: float) -> Shape:
         a = squared(rays[..., :2])
         b = 2 * (o[0] * rays[..., 0] + o[1] * rays[..., 1])
         root = b * b - 4 * a * (o[:2] @ o[:2] - radius**2)
-        close = root > 0  # the others pass it by
+        close = root > 0  # other rays miss it
         d, a, b, root = rays[close], a[close], b[close], root[close]
         with np.errstate(invalid="ignore", divide="ignore"):
             t = (-b - np.sqrt(root)) / (2 * a)
@@ -111,8 +111,8 @@ def can(x: float, y: float, z: float, radius: float, height: float) -> Shape:
             side = np.where((t > 0) & (h > 0) & (h < height), t, np.inf)
             u = (height - o[2]) / d[..., 2]
             p = o[:2] + u[..., None] * d[..., :2]
-            lid = np.where((u > 0) & (squared(p) < radius**2), u, np.inf)
-        best[close] = np.minimum(side, lid)
+            top = np.where((u > 0) & (squared(p) < radius**2), u, np.inf)
+        best[close] = np.minimum(side, top)
         return best
 
     return hit
@@ -127,15 +127,15 @@ def render(
     noise: float = 0.0015,
     seed: int = 0,
 ) -> tuple[Array, NDArray[np.int64]]:
-    """Return depth (h, w) of a camera looking at the world's origin, and which shape is seen."""
+    """Return depth (h, w) of a camera looking at the origin, and the shape at each pixel."""
     forward, rays = looking(tilt_deg, camera)
-    z, seen = np.full(rays.shape[:-1], np.inf), np.full(rays.shape[:-1], -1)
+    z, labels = np.full(rays.shape[:-1], np.inf), np.full(rays.shape[:-1], -1)
     for k, shape in enumerate(shapes):
         hits = shape(-distance * forward, rays)
-        seen[hits < z] = k
+        labels[hits < z] = k
         z = np.minimum(z, hits)
     w = 1 / z + np.random.default_rng(seed).normal(0, noise, z.shape)
-    return np.where(np.isfinite(z), 1 / np.maximum(w, 1e-3), 0), seen
+    return np.where(np.isfinite(z), 1 / np.maximum(w, 1e-3), 0), labels
 
 
 @lru_cache(maxsize=8)
@@ -147,7 +147,7 @@ def looking(tilt_deg: float, camera: Camera) -> tuple[Array, Array]:
     down = np.cross(forward, right)
     v, u = np.mgrid[: camera.height, : camera.width]
     x, y = (u - camera.cx) / camera.fx, (v - camera.cy) / camera.fy
-    # Each component lies in one piece of memory: sums along so short an axis are slow.
+    # Each component is contiguous in memory, as sums along short axes are slow.
     rays = np.stack([x * right[k] + y * down[k] + forward[k] for k in range(3)])
     return forward, np.moveaxis(rays, 0, -1)
 
@@ -160,11 +160,11 @@ def found(frame: Frame, up: tuple[float, float, float] | None = None) -> Scene:
     return detect(frame, up=up, settings=DEFAULTS, rng=np.random.default_rng(0))
 
 
-def overlaps(scene: Scene, seen: NDArray[np.int64], objects: list[int]) -> list[float]:
+def overlaps(scene: Scene, labels: NDArray[np.int64], objects: list[int]) -> list[float]:
     """Return the largest IoU of each true object with any candidate."""
     best = []
     for k in objects:
-        truth = seen.ravel() == k
+        truth = labels.ravel() == k
         ious = []
         for c in scene.candidates:
             shared = np.count_nonzero(truth[c.indices])
@@ -174,16 +174,16 @@ def overlaps(scene: Scene, seen: NDArray[np.int64], objects: list[int]) -> list[
 
 
 def check(shapes: list[Shape], objects: list[int], least: float = 0.85, **view: float) -> Scene:
-    """Every listed shape is one candidate, and there is no other candidate."""
-    depth, seen = render(shapes, **view)  # type: ignore[arg-type]  # floats only
+    """Check that every listed shape is one candidate, and that there are no others."""
+    depth, labels = render(shapes, **view)  # type: ignore[arg-type]  # floats only
     scene = found(frame_of(depth))
     assert len(scene.candidates) == len(objects)
-    assert min(overlaps(scene, seen, objects), default=1.0) > least
+    assert min(overlaps(scene, labels, objects), default=1.0) > least
     return scene
 
 
-def test_separate_objects_and_flat_height() -> None:
-    """The plain case: three shapes, one plane, sizes and centres in metres."""
+def test_separate_objects_on_plane_are_detected() -> None:
+    """The plain case, with height, up direction, size and flags."""
     scene = check(
         [table(), box((-0.2, 0, 0), (0.1, 0.06, 0.15)), can(0, 0.05, 0, 0.035, 0.12),
          ball((0.2, 0, 0.05), 0.05)],
@@ -199,21 +199,19 @@ def test_separate_objects_and_flat_height() -> None:
 
 
 @pytest.mark.parametrize("tilt_deg", [20, 60])
-def test_camera_tilt(tilt_deg: float) -> None:
-    """Shallow and steep views of the same table."""
+def test_objects_are_detected_at_shallow_and_steep_tilt(tilt_deg: float) -> None:
     shapes = [table(), box((-0.15, 0, 0), (0.1, 0.1, 0.1)), can(0.1, 0, 0, 0.04, 0.12)]
     check(shapes, [1, 2], tilt_deg=tilt_deg)
 
 
-def test_no_reading_at_all() -> None:
-    """An empty image is an empty scene that keeps the hint."""
+def test_empty_image_gives_empty_scene_with_given_up() -> None:
     scene = found(frame_of(np.zeros((480, 640))), (0, 0, 2))
     assert (scene.planes, scene.candidates) == ((), ())
     np.testing.assert_allclose(scene.up, [0, 0, 1])
 
 
-def test_one_plane_fills_the_view() -> None:
-    """A table alone has no objects on it, at any of several noises."""
+def test_bare_table_has_no_objects() -> None:
+    """It fills the image, and its noise must not be detected."""
     for seed in range(4):
         depth, _ = render([table(3, 3)], seed=seed, noise=0.003)
         scene = found(frame_of(depth))
@@ -221,8 +219,8 @@ def test_one_plane_fills_the_view() -> None:
         assert scene.candidates == ()
 
 
-def test_empty_table_over_a_floor() -> None:
-    """The edge of the table and the floor below are no objects."""
+def test_empty_table_above_floor_has_no_objects() -> None:
+    """Neither the edge of the table nor the floor is an object."""
     depth, _ = render([table(0.4, 0.25), table(3, 3, -0.7)], distance=0.8, tilt_deg=45)
     scene = found(frame_of(depth))
     assert scene.candidates == ()
@@ -230,14 +228,13 @@ def test_empty_table_over_a_floor() -> None:
     assert abs(scene.planes[1].height_m - 0.7) < 0.02
 
 
-def test_touching_boxes_are_two() -> None:
-    """Two boxes side by side at an angle meet in a concave edge."""
+def test_touching_boxes_are_separated() -> None:
+    """They stand at an angle and meet in a concave edge."""
     check([table(), box((-0.06, 0, 0), (0.12, 0.08, 0.12), 0.35),
            box((0.055, -0.03, 0), (0.1, 0.1, 0.08), -0.3)], [1, 2])  # fmt: skip
 
 
-def test_stacked_box_is_split_and_stands_on_the_lower() -> None:
-    """A box on a box is a second object whose support is the first."""
+def test_stacked_box_is_supported_by_lower_box() -> None:
     scene = check(
         [table(), box((0, 0, 0), (0.22, 0.18, 0.08)), box((0, 0.01, 0.08), (0.1, 0.08, 0.1))],
         [1, 2],
@@ -248,13 +245,13 @@ def test_stacked_box_is_split_and_stands_on_the_lower() -> None:
     assert abs(candidate.support_m - 0.08) < 0.01
 
 
-def test_far_wall_of_a_bowl_is_not_split() -> None:
-    """The inside of a bowl behind its rim belongs to the bowl."""
+def test_far_wall_belongs_to_bowl() -> None:
+    """There is a depth discontinuity at the near rim."""
     check([table(), shell((0, 0, 0.09), 0.09, 0.07)], [1], least=0.8)
 
 
-def test_parts_behind_an_occluder_are_joined() -> None:
-    """A long box behind a thin upright one is seen in two parts."""
+def test_box_is_merged_across_an_occluder() -> None:
+    """A narrow box divides a long one behind it into two segments."""
     scene = check(
         [table(), box((0, 0.08, 0), (0.3, 0.06, 0.12)), box((0, -0.1, 0), (0.06, 0.04, 0.2))],
         [1, 2],
@@ -263,7 +260,7 @@ def test_parts_behind_an_occluder_are_joined() -> None:
 
 
 def pot(x: float, y: float, radius: float, height: float, floor: float) -> Shape:
-    """Return an upright cylinder open above, with a level floor."""
+    """Return an upright cylinder with an open top and a level floor."""
 
     def hit(origin: Array, rays: Array) -> Array:
         o = origin - np.array([x, y, 0])
@@ -294,25 +291,25 @@ def pot(x: float, y: float, radius: float, height: float, floor: float) -> Shape
         (60, 0.12, 0.15, 0.015),
     ],
 )
-def test_a_pot_is_one_object(tilt_deg: float, radius: float, height: float, floor: float) -> None:
-    """The near and the far half of its wall touch nowhere, and its floor may be a low object."""
+def test_pot_is_one_object(tilt_deg: float, radius: float, height: float, floor: float) -> None:
+    """Its near and far wall do not touch, and its floor may look like a low-profile object."""
     check([table(1, 1), pot(0, -0.1, radius, height, floor)], [1], tilt_deg=tilt_deg)
 
 
 @pytest.mark.parametrize(("tilt_deg", "x", "y"), [(50, -0.12, 0.15), (60, 0.05, 0.15)])
-def test_the_floor_of_a_pot_does_not_go_on_behind_it(tilt_deg: float, x: float, y: float) -> None:
-    """A plate behind a pot may lie as high as its floor; the wall of the pot hides both."""
+def test_plate_behind_pot_is_not_merged_with_its_floor(tilt_deg: float, x: float, y: float) -> None:
+    """Both may have the same height; the wall of the pot hides the gap between them."""
     shapes = [table(1, 1), pot(0, -0.1, 0.12, 0.08, 0.015), can(x, y, 0, 0.09, 0.012)]
     check(shapes, [1, 2], tilt_deg=tilt_deg)
 
 
 def union(*shapes: Shape) -> Shape:
-    """Return what shows one body of several shapes."""
+    """Return a body that consists of several shapes."""
     return lambda origin, rays: np.min([shape(origin, rays) for shape in shapes], axis=0)
 
 
 def drawer(width: float, height: float, wall: float, floor: float, yaw: float) -> Shape:
-    """Return a square box open above about the origin, with thick upright walls."""
+    """Return a square box at the origin with an open top and thick walls."""
     c, s, off = np.cos(yaw), np.sin(yaw), (width - wall) / 2
     sides = [(off, 0.0, wall, width), (-off, 0.0, wall, width),
              (0.0, off, width, wall), (0.0, -off, width, wall)]  # fmt: skip
@@ -324,8 +321,8 @@ def drawer(width: float, height: float, wall: float, floor: float, yaw: float) -
     ("tilt_deg", "distance", "floor", "yaw"),
     [(25, 0.7, 0.006, 0.6), (60, 0.7, 0.006, 0.6), (60, 1.0, 0.008, 0)],
 )
-def test_a_drawer_is_one_object(tilt_deg: float, distance: float, floor: float, yaw: float) -> None:
-    """A floor a few millimetres high is ragged, and shadows hide a part of its outline."""
+def test_drawer_is_one_object(tilt_deg: float, distance: float, floor: float, yaw: float) -> None:
+    """A floor a few millimetres high has a ragged outline, partly occluded."""
     shapes = [table(1, 1), drawer(0.3, 0.08, 0.01, floor, yaw)]
     check(shapes, [1], tilt_deg=tilt_deg, distance=distance)
 
@@ -333,39 +330,38 @@ def test_a_drawer_is_one_object(tilt_deg: float, distance: float, floor: float, 
 @pytest.mark.parametrize(
     ("tilt_deg", "width"), [(25, 0.03), (40, 0.03), (60, 0.03), (25, 0.05), (40, 0.05)]
 )
-def test_a_spout_behind_its_pot_belongs_to_it(tilt_deg: float, width: float) -> None:
-    """What joins them is hidden, but the spout ends in the air, where nothing can stand."""
+def test_spout_behind_pot_is_merged_with_it(tilt_deg: float, width: float) -> None:
+    """The joint is occluded, but the spout ends in the air, where nothing can stand."""
     spout = box((0.07, 0.03, 0.04), (width, 0.02, 0.05))
     check([table(1, 1), union(can(0, 0, 0, 0.065, 0.12), spout)], [1], tilt_deg=tilt_deg)
 
 
 @pytest.mark.parametrize("quarters", [0, 1, 2, 3])
-def test_a_spout_hangs_however_the_image_is_turned(quarters: int) -> None:
-    """Its lower end is the one nearer to the ground, not the one lower in the image."""
+def test_spout_is_merged_in_rotated_images(quarters: int) -> None:
+    """Its lower end is the one nearer to the table, not the one lower in the image."""
     spout = box((0.07, 0.03, 0.04), (0.05, 0.02, 0.05))
     depth, _ = render([table(1, 1), union(can(0, 0, 0, 0.065, 0.12), spout)], tilt_deg=40)
-    turned = np.ascontiguousarray(np.rot90(depth, quarters))
-    h, w = turned.shape
-    scene = found(frame_of(turned, Camera(w, h, 525, 525, (w - 1) / 2, (h - 1) / 2)))
+    rotated_depth = np.ascontiguousarray(np.rot90(depth, quarters))
+    h, w = rotated_depth.shape
+    scene = found(frame_of(rotated_depth, Camera(w, h, 525, 525, (w - 1) / 2, (h - 1) / 2)))
     assert len(scene.candidates) == 1
 
 
 @pytest.mark.parametrize("tilt_deg", [25, 40])
-def test_a_box_behind_a_pot_stays_one(tilt_deg: float) -> None:
-    """It shows as little, but ends behind the pot and not in the air."""
+def test_box_behind_pot_is_not_merged_with_it(tilt_deg: float) -> None:
+    """As little of it is visible as of a spout, but it does not end in the air."""
     pair = [table(1, 1), can(0, 0, 0, 0.065, 0.12), box((0.06, 0.11, 0), (0.04, 0.04, 0.16))]
     check(pair, [1, 2], tilt_deg=tilt_deg)
 
 
-def test_two_boxes_behind_an_occluder_stay_two() -> None:
-    """Parts that do not continue each other are not joined across an occluder."""
+def test_two_boxes_behind_an_occluder_are_not_merged() -> None:
+    """Neither continues the other."""
     check([table(), box((-0.12, 0.08, 0), (0.14, 0.06, 0.12), 0.6),
            box((0.12, 0.1, 0), (0.14, 0.06, 0.1), -0.6),
            box((0, -0.1, 0), (0.08, 0.04, 0.2))], [1, 2, 3])  # fmt: skip
 
 
-def test_object_cut_by_the_border_is_flagged() -> None:
-    """An object that leaves the image says so."""
+def test_object_at_image_border_is_flagged() -> None:
     shapes = [table(1, 1), box((-0.56, 0, 0), (0.1, 0.1, 0.1)), box((0.1, 0, 0), (0.1, 0.1, 0.1))]
     scene = check(shapes, [1, 2])
     left, right = sorted(scene.candidates, key=lambda c: c.box.center[0])
@@ -373,27 +369,27 @@ def test_object_cut_by_the_border_is_flagged() -> None:
     assert not right.touches_border
 
 
-def test_furniture_that_the_image_border_cuts_is_no_object() -> None:
-    """What is large and mostly outside of the image is rejected; a box that looks in stays."""
+def test_furniture_cut_by_image_border_is_rejected() -> None:
+    """A small box that the border cuts is kept."""
     furniture = box((0.05, -0.45, 0.05), (0.4, 0.4, 0.09))
     small = box((-0.56, 0.05, 0), (0.08, 0.08, 0.06))
-    depth, seen = render([table(1, 1), furniture, small, can(0.2, 0.15, 0, 0.04, 0.12)])
-    assert (seen[-1] == 1).sum() > 100
-    assert (seen[:, 0] == 2).any()
+    depth, labels = render([table(1, 1), furniture, small, can(0.2, 0.15, 0, 0.04, 0.12)])
+    assert (labels[-1] == 1).sum() > 100
+    assert (labels[:, 0] == 2).any()
     scene = found(frame_of(depth))
-    least = np.array(overlaps(scene, seen, [1, 2, 3]))
+    least = np.array(overlaps(scene, labels, [1, 2, 3]))
     assert least[0] < 0.05
     assert (least[1:] > 0.85).all()
 
 
-def test_the_border_is_where_readings_begin() -> None:
-    """A registered Kinect is blind in a tenth of the image; the top of a bottle is no border."""
+def test_image_border_is_where_depth_begins() -> None:
+    """A registered Kinect image has an empty margin of 10 %; the top of a bottle is no border."""
     shapes = [table(1, 1), box((-0.63, 0, 0), (0.08, 0.08, 0.1)), can(0.1, 0.45, 0, 0.04, 0.4)]
-    depth, seen = render(shapes, distance=1.2, tilt_deg=20)
+    depth, labels = render(shapes, distance=1.2, tilt_deg=20)
     assert not any(candidate.touches_border for candidate in found(frame_of(depth)).candidates)
-    middle = int(np.flatnonzero((seen == 1).any(axis=0)).mean())
+    middle = int(np.flatnonzero((labels == 1).any(axis=0)).mean())
     top = np.flatnonzero((depth > 0).any(axis=1))[0]
-    assert seen[top].max() == 2
+    assert labels[top].max() == 2
     assert middle / 640 < 0.12
     assert 0.05 < top / 480 < 0.12
     depth[:, :middle] = 0
@@ -401,14 +397,14 @@ def test_the_border_is_where_readings_begin() -> None:
     assert sorted(flags) == [False, True]
 
 
-def test_shelf_boards_have_their_own_objects() -> None:
-    """Objects belong to the board they stand on, and boards are sorted by height."""
+def test_objects_belong_to_their_shelf_board() -> None:
+    """Planes are sorted by height."""
     shapes = [table(0.45, 0.2), table(0.45, 0.12, 0.35), box((-0.1, -0.1, 0), (0.1, 0.1, 0.12)),
               can(0.1, -0.02, 0.35, 0.04, 0.12)]  # fmt: skip
-    depth, seen = render(shapes, tilt_deg=35, distance=1.2)
+    depth, labels = render(shapes, tilt_deg=35, distance=1.2)
     scene = found(frame_of(depth))
     np.testing.assert_allclose([p.height_m for p in scene.planes], [0, 0.35], atol=0.015)
-    assert min(overlaps(scene, seen, [2, 3])) > 0.8
+    assert min(overlaps(scene, labels, [2, 3])) > 0.8
     assert [c.plane for c in sorted(scene.candidates, key=lambda c: c.box.center[0])] == [0, 1]
 
 
@@ -426,46 +422,49 @@ SCENE = [table(), box((-0.06, 0, 0), (0.12, 0.08, 0.12), 0.35), can(0.12, -0.05,
     ],
     ids=["mirrored", "upside down", "left", "right"],
 )
-def test_result_does_not_depend_on_the_roll(change: Callable[[Array], Array]) -> None:
-    """Mirroring and turning the image turns the answer with it."""
-    depth, seen = render(SCENE)
-    turned, truth = np.ascontiguousarray(change(depth)), np.ascontiguousarray(change(seen))
-    h, w = turned.shape
-    scene = found(frame_of(turned, Camera(w, h, 525, 525, (w - 1) / 2, (h - 1) / 2)))
+def test_detection_is_independent_of_camera_roll(change: Callable[[Array], Array]) -> None:
+    depth, labels = render(SCENE)
+    changed, truth = np.ascontiguousarray(change(depth)), np.ascontiguousarray(change(labels))
+    h, w = changed.shape
+    scene = found(frame_of(changed, Camera(w, h, 525, 525, (w - 1) / 2, (h - 1) / 2)))
     assert len(scene.candidates) == 4
     assert min(overlaps(scene, truth, [1, 2, 3, 4])) > 0.8
 
 
-def test_what_reaches_the_range_is_cut() -> None:
-    """Readings beyond it are left out: the size of what is there is not its own."""
-    depth, seen = render([table(), box((0.2, 0, 0), (0.08, 0.3, 0.1)), can(-0.2, 0, 0, 0.04, 0.14)])
+def test_object_cut_by_range_limit_is_flagged() -> None:
+    """Samples beyond the limit are dropped, so the visible size is too small."""
+    depth, labels = render(
+        [table(), box((0.2, 0, 0), (0.08, 0.3, 0.1)), can(-0.2, 0, 0, 0.04, 0.14)]
+    )
     whole = found(frame_of(depth))
     assert not any(candidate.touches_border for candidate in whole.candidates)
-    settings = DetectionSettings(max_range_m=float(np.median(depth[seen == 1])))
+    settings = DetectionSettings(max_range_m=float(np.median(depth[labels == 1])))
     rest = detect(frame_of(depth), settings=settings, rng=np.random.default_rng(0))
-    cut = [c for c in rest.candidates if (seen.reshape(-1)[c.indices] == 1).all()]
+    cut = [c for c in rest.candidates if (labels.reshape(-1)[c.indices] == 1).all()]
     assert [candidate.touches_border for candidate in cut] == [True]
 
 
-def test_upside_down_the_front_of_a_large_box_is_no_support() -> None:
-    """Which way the camera is held tells less than how much of the scene is level."""
-    depth, seen = render([table(), box((0, 0, 0), (0.44, 0.1, 0.26)), can(0.32, 0, 0, 0.04, 0.14)])
+def test_objects_are_detected_in_upside_down_image() -> None:
+    """The front of the large box must not be taken for the supporting plane."""
+    depth, labels = render(
+        [table(), box((0, 0, 0), (0.44, 0.1, 0.26)), can(0.32, 0, 0, 0.04, 0.14)]
+    )
     camera = Camera(640, 480, 525, 525, 319.5, 239.5)
     scene = found(frame_of(np.ascontiguousarray(depth[::-1, ::-1]), camera))
-    assert min(overlaps(scene, np.ascontiguousarray(seen[::-1, ::-1]), [1, 2])) > 0.8
+    assert min(overlaps(scene, np.ascontiguousarray(labels[::-1, ::-1]), [1, 2])) > 0.8
 
 
-def test_half_resolution_finds_the_same() -> None:
-    """Cells follow the size of things, not the size of pixels."""
-    depth, seen = render(SCENE)
+def test_half_resolution_gives_same_objects() -> None:
+    """Grid cells have a size in metres, not in pixels."""
+    depth, labels = render(SCENE)
     camera = Camera(320, 240, 262.5, 262.5, 159.5, 119.5)
     scene = found(frame_of(np.ascontiguousarray(depth[::2, ::2]), camera))
     assert len(scene.candidates) == 4
-    assert min(overlaps(scene, seen[::2, ::2], [1, 2, 3, 4])) > 0.8
+    assert min(overlaps(scene, labels[::2, ::2], [1, 2, 3, 4])) > 0.8
 
 
-def test_unorganized_cloud_agrees_with_the_image() -> None:
-    """The same readings as points, in any order and frame, give the same objects (F >= 0.97)."""
+def test_unorganized_cloud_gives_same_objects_as_image() -> None:
+    """Its points may have any order and any coordinate frame."""
     depth, _ = render(SCENE)
     frame = frame_of(depth)
     scene = found(frame)
@@ -489,15 +488,13 @@ def test_unorganized_cloud_agrees_with_the_image() -> None:
         np.testing.assert_array_equal(twin.indices, np.sort(twin.indices))
 
 
-def test_hint_excludes_other_planes() -> None:
-    """With the direction of gravity known, a wall is no support."""
+def test_given_up_direction_excludes_walls() -> None:
     depth, _ = render([table(2, 2)], tilt_deg=5)
     assert len(found(frame_of(depth), (0, -1, -0.1)).planes) == 1
     assert found(frame_of(depth), (0, 0, -1)).planes == ()
 
 
-def test_same_seed_same_scene() -> None:
-    """Nothing depends on anything but the input and the generator."""
+def test_detection_is_reproducible() -> None:
     depth, _ = render(SCENE)
     a, b = found(frame_of(depth)), found(frame_of(depth))
     for x, y in zip(a.candidates, b.candidates, strict=True):
@@ -505,8 +502,8 @@ def test_same_seed_same_scene() -> None:
         np.testing.assert_array_equal(x.box.orientation, y.box.orientation)
 
 
-def test_without_the_steps_beyond_the_thesis_touching_boxes_are_one() -> None:
-    """The benchmark of single steps would else measure nothing."""
+def test_stacked_boxes_are_one_without_steps_beyond_thesis() -> None:
+    """Otherwise the ablation benchmark would measure nothing."""
     depth, _ = render([table(), box((0, 0, 0), (0.22, 0.18, 0.08)),
                        box((0, 0.01, 0.08), (0.1, 0.08, 0.1))])  # fmt: skip
     with without(*STEPS):
@@ -515,8 +512,7 @@ def test_without_the_steps_beyond_the_thesis_touching_boxes_are_one() -> None:
 
 
 @pytest.mark.parametrize("up", [(0, 0, 0), (np.nan, 0, 1), (0, 1)])
-def test_hint_that_is_no_direction(up: tuple[float, ...]) -> None:
-    """A wrong hint is the caller's mistake."""
+def test_invalid_up_direction_raises(up: tuple[float, ...]) -> None:
     frame = frame_of(np.zeros((480, 640)))
     with pytest.raises(ValueError, match="direction"):
         detect(frame, up=up, settings=DEFAULTS, rng=np.random.default_rng(0))
@@ -528,10 +524,10 @@ def test_hint_that_is_no_direction(up: tuple[float, ...]) -> None:
     st.integers(0, 2**32 - 1),
     st.sampled_from([0.0, 1e-30, 0.3, 1.0, 1e5, 1e30, np.inf, np.nan]),
 )
-@example(1, 2, 1, 0.0)  # one reading, which no plane explains
+@example(1, 2, 1, 0.0)  # one sample, which fits no plane
 @settings(deadline=None, max_examples=60)
 def test_any_image_gives_a_scene(h: int, w: int, seed: int, odd: float) -> None:
-    """Tiny images, garbage and values that are no depth never crash."""
+    """Tiny images, garbage and invalid depths must not crash."""
     rng = np.random.default_rng(seed)
     depth = rng.uniform(0.2, 2, (h, w)) if seed % 2 else np.full((h, w), 1.0)
     depth[rng.random((h, w)) < 0.3] = odd
@@ -539,8 +535,8 @@ def test_any_image_gives_a_scene(h: int, w: int, seed: int, odd: float) -> None:
     assert np.isfinite(scene.up).all()
 
 
-def test_points_in_nearly_one_place_are_counted_within_the_grid() -> None:
-    """Rounded they may lie beyond their bounds: compiled code would write beside the grid."""
+def test_rounded_points_stay_within_occupancy_grid() -> None:
+    """Beyond their bounds, compiled code would write outside the array."""
     place = np.array([[0.3, 0.3], [0.3 + 2e-6, 0.3 - 1e-6]], np.float32)
 
     assert _occupied.py_func(place, 0.3, 0.3, 1024 / 1e-6 * 0.999, 1024) == 2
@@ -554,7 +550,7 @@ def test_points_in_nearly_one_place_are_counted_within_the_grid() -> None:
 )
 @settings(deadline=None, max_examples=60)
 def test_any_cloud_gives_a_scene(n: int, seed: int, odd: float, spread: float) -> None:
-    """Empty clouds, points in one place and values that are no position never crash."""
+    """Empty clouds, coincident points and invalid coordinates must not crash."""
     rng = np.random.default_rng(seed)
     points = rng.uniform(-1, 1, (n, 3)) * spread + [0, 0, 1]
     points[rng.random((n, 3)) < 0.05] = odd
@@ -562,8 +558,8 @@ def test_any_cloud_gives_a_scene(n: int, seed: int, odd: float, spread: float) -
     assert np.isfinite(scene.up).all()
 
 
-def test_hierarchy_tells_what_stands_on_what() -> None:
-    """An object on another is no child of the plane (thesis 4.5)."""
+def test_hierarchy_puts_stacked_object_below_its_support() -> None:
+    """An object on another one is no child of the plane (thesis 4.5)."""
     shapes = [
         table(),
         box((-0.2, 0, 0), (0.15, 0.15, 0.08)),
@@ -571,10 +567,10 @@ def test_hierarchy_tells_what_stands_on_what() -> None:
         can(0.15, 0.15, 0, 0.04, 0.14),
         box((0.1, -0.15, 0), (0.1, 0.08, 0.05)),
     ]
-    depth, seen = render(shapes)
+    depth, labels = render(shapes)
     scene = found(frame_of(depth))
     name = {
-        int(np.bincount(seen.ravel()[c.indices]).argmax()): k
+        int(np.bincount(labels.ravel()[c.indices]).argmax()): k
         for k, c in enumerate(scene.candidates)
     }
     assert len(scene.candidates) == len(name) == 4
@@ -588,16 +584,15 @@ def test_hierarchy_tells_what_stands_on_what() -> None:
     assert [line.count("  ") for line in tree].count(2) == 1
 
 
-def test_hierarchy_of_nothing() -> None:
-    """A plane without objects has no children."""
+def test_hierarchy_of_bare_table_has_only_its_plane() -> None:
     depth, _ = render([table()])
     hierarchy = Hierarchy(found(frame_of(depth)))
     assert hierarchy.roots == hierarchy.nodes == (Node("plane", 0),)
     assert hierarchy.children(Node("plane", 0)) == ()
 
 
-def test_can_on_a_microwave_oven() -> None:
-    """The top of a closed body is no furniture: the oven is an object that carries another."""
+def test_can_is_supported_by_microwave_oven() -> None:
+    """The top of a closed body is not a supporting plane."""
     shapes = [
         table(0.6, 0.5),
         box((0, 0.1, 0), (0.45, 0.32, 0.26)),
@@ -609,38 +604,38 @@ def test_can_on_a_microwave_oven() -> None:
     assert abs(scene.candidates[on_oven].support_m - 0.26) < 0.01
 
 
-def test_board_on_thin_legs_is_furniture() -> None:
-    """A small table has nothing under its edge; its legs are no objects."""
+def test_top_of_small_table_is_a_supporting_plane() -> None:
+    """Unlike a box, it is open below its edge."""
     legs = [box((x, y, -0.5), (0.03, 0.03, 0.49)) for x in (-0.2, 0.2) for y in (-0.12, 0.12)]
     shapes = [table(2, 2, -0.5), box((0, 0, -0.02), (0.44, 0.3, 0.02)), *legs,
               box((0.05, 0, 0), (0.08, 0.08, 0.1))]  # fmt: skip
-    depth, seen = render(shapes, distance=1.1)
+    depth, labels = render(shapes, distance=1.1)
     scene = found(frame_of(depth))
     assert len(scene.planes) == 2
-    assert overlaps(scene, seen, [6])[0] > 0.85
+    assert overlaps(scene, labels, [6])[0] > 0.85
     on_table = [c for c in scene.candidates if c.plane == 1]
     assert len(on_table) == 1
 
 
 def world_points(shapes: list[Shape], turn_deg: float, seed: int) -> Array:
-    """Return what a camera sees from one side, as points in the world frame."""
+    """Return the points that a camera sees from one side, in the world frame."""
     c, s = np.cos(np.radians(turn_deg)), np.sin(np.radians(turn_deg))
-    turn = np.array([[c, -s, 0], [s, c, 0], [0, 0, 1]])
+    rotation = np.array([[c, -s, 0], [s, c, 0], [0, 0, 1]])
 
-    def turned(shape: Shape) -> Shape:
-        return lambda origin, rays: shape(turn @ origin, rays @ turn.T)
+    def rotate(shape: Shape) -> Shape:
+        return lambda origin, rays: shape(rotation @ origin, rays @ rotation.T)
 
-    depth, _ = render([turned(shape) for shape in shapes], tilt_deg=45, seed=seed)
+    depth, _ = render([rotate(shape) for shape in shapes], tilt_deg=45, seed=seed)
     points = frame_of(depth).xyz()
     t = np.radians(45)
     forward = np.array([0, np.cos(t), -np.sin(t)])
     world_from_camera = np.stack([[1.0, 0, 0], np.cross(forward, [1.0, 0, 0]), forward], axis=1)
-    seen = points[np.isfinite(points[:, 0])] @ world_from_camera.T - 0.9 * forward
-    return np.asarray(seen @ turn.T)
+    visible = points[np.isfinite(points[:, 0])] @ world_from_camera.T - 0.9 * forward
+    return np.asarray(visible @ rotation.T)
 
 
-def test_cloud_fused_from_two_sides_in_the_frame_of_the_table() -> None:
-    """Its origin is no viewpoint, and half of its points are hidden from any one."""
+def test_objects_are_detected_in_fused_cloud_of_two_sides() -> None:
+    """Its origin is no viewpoint, and no viewpoint sees all of its points."""
     shapes = [table(), box((-0.12, 0, 0), (0.1, 0.1, 0.12)), can(0.12, 0.05, 0, 0.04, 0.14)]
     points = np.concatenate([world_points(shapes, 0, 0), world_points(shapes, 180, 1)])
     scene = found(Frame("cloud", 0, 0, 0, "table", points=points))
@@ -650,27 +645,27 @@ def test_cloud_fused_from_two_sides_in_the_frame_of_the_table() -> None:
     assert len(scene.candidates) == 2
     for x, candidate in zip((-0.12, 0.12), sorted(scene.candidates, key=lambda c: c.box.center[0]),
                             strict=True):  # fmt: skip
-        mine = points[candidate.indices]
-        assert (abs(mine[:, 0] - x) < 0.075).all()
-        assert mine[:, 1].max() - mine[:, 1].min() > 0.07  # both sides
+        own = points[candidate.indices]
+        assert (abs(own[:, 0] - x) < 0.075).all()
+        assert own[:, 1].max() - own[:, 1].min() > 0.07  # both sides
 
 
-def test_directly_overhead_camera() -> None:
-    """A camera that looks straight down has no horizontal viewing direction."""
+def test_objects_are_detected_from_directly_above() -> None:
+    """The view direction has no horizontal part."""
     check([table(), box((-0.1, 0, 0), (0.1, 0.1, 0.1)), can(0.12, 0, 0, 0.04, 0.1)], [1, 2],
           tilt_deg=89.9)  # fmt: skip
 
 
-def test_flush_stack_is_two_objects() -> None:
-    """The front of a can lies in the front of the box below: the ledge beside it parts them."""
+def test_can_flush_with_box_below_is_separated() -> None:
+    """Only the top face of the box beside the can separates them."""
     shapes = [table(), box((0, 0, 0), (0.2, 0.1, 0.1)), can(0, -0.005, 0.1, 0.045, 0.09)]
     scene = check(shapes, [1, 2], 0.8)
     on = [c.on_candidate for c in scene.candidates]
     assert sum(o is not None for o in on) == 1
 
 
-def test_bottle_with_a_wide_neck_is_one_object() -> None:
-    """A shoulder that slopes is no ledge to stand on."""
+def test_bottle_with_wide_neck_is_one_object() -> None:
+    """A sloping shoulder is no top face."""
 
     def cone(origin: Array, rays: Array) -> Array:
         best = np.full(rays.shape[:2], np.inf)
@@ -687,8 +682,8 @@ def test_bottle_with_a_wide_neck_is_one_object() -> None:
     check([table(), bottle], [1])
 
 
-def test_a_tilted_top_does_not_take_the_place_of_the_table() -> None:
-    """Continued to below the camera it is the lower one, and what is just above it is a top."""
+def test_tilted_top_face_does_not_replace_the_table() -> None:
+    """Extended to below the camera, its plane is the lower of the two."""
 
     def wedge(origin: Array, rays: Array) -> Array:
         """Rise by 4 degrees from 3 cm above the table."""
@@ -700,17 +695,17 @@ def test_a_tilted_top_does_not_take_the_place_of_the_table() -> None:
     assert [plane.area_m2 > 0.3 for plane in scene.planes] == [True]
 
 
-def test_posts_of_a_rack_are_no_objects() -> None:
-    """Posts go on through the level of a board; a tall box that stops below it does not."""
+def test_posts_of_rack_are_no_objects() -> None:
+    """Posts extend through the height of a board, unlike a tall box that ends below it."""
     rack = [table(0.4, 0.2), table(0.4, 0.2, 0.32)]
     posts = [box((x, -0.19, 0), (0.03, 0.03, 0.6)) for x in (-0.38, 0.38)]
     check([*rack, *posts, box((0, 0, 0.32), (0.1, 0.1, 0.1))], [4], tilt_deg=25, distance=1.3)
 
 
-def test_cut_objects_are_flagged_in_clouds_too() -> None:
-    """What the image border cuts is cut in the cloud of the same view; what it does not, is not."""
+def test_cut_objects_are_flagged_in_clouds() -> None:
+    """The cloud of an image has the same border."""
     shapes = [table(), box((0.43, 0, 0), (0.12, 0.1, 0.1)), box((-0.1, 0, 0), (0.1, 0.1, 0.1))]
-    depth, seen = render(shapes)
+    depth, labels = render(shapes)
     frame = frame_of(depth)
     points = frame.xyz()
     points = points[np.isfinite(points[:, 2]) & (points[:, 2] > 0)]
@@ -719,57 +714,57 @@ def test_cut_objects_are_flagged_in_clouds_too() -> None:
     assert sorted(flags.values()) == [False, True]
     assert flags[max(flags)]
     assert sum(c.touches_border for c in found(frame).candidates) == 1
-    assert seen.max() == 2
+    assert labels.max() == 2
 
 
 EDGE_ON = pytest.mark.xfail(reason="what is hardly above the border of its board looks like noise")
 
 
 @pytest.mark.parametrize("board", [0.42, 0.45, pytest.param(0.46, marks=EDGE_ON)])
-def test_board_at_a_grazing_angle(board: float) -> None:
-    """A board 5 to 9 cm below the camera is a few rows high; what stands on it counts."""
+def test_object_on_board_at_grazing_angle_is_found(board: float) -> None:
+    """A board 5 to 9 cm below the camera covers only a few image rows."""
     shapes = [table(0.45, 0.3), table(0.4, 0.2, board), box((0, -0.05, board), (0.1, 0.1, 0.08))]
-    depth, seen = render(shapes, tilt_deg=20, distance=1.5)
+    depth, labels = render(shapes, tilt_deg=20, distance=1.5)
     scene = found(frame_of(depth))
     np.testing.assert_allclose([p.height_m for p in scene.planes], [0, board], atol=0.02)
-    assert min(overlaps(scene, seen, [2])) > 0.8
+    assert min(overlaps(scene, labels, [2])) > 0.8
 
 
-def test_top_of_a_box_at_a_grazing_angle_is_no_board() -> None:
-    """It is as level and as near to the height of the camera, but small and closed below."""
+def test_box_top_at_grazing_angle_is_no_plane() -> None:
+    """Unlike a board at this height, it is small and closed below."""
     shapes = [table(0.6, 0.4), box((0, 0, 0), (0.3, 0.25, 0.46))]
     depth, _ = render(shapes, tilt_deg=20, distance=1.5)
     np.testing.assert_allclose([p.height_m for p in found(frame_of(depth)).planes], [0], atol=0.01)
 
 
-def test_what_rises_beyond_the_greatest_height_is_no_object() -> None:
-    """Of a tall post only the lower part is looked at, and it stands on the table; it is none."""
+def test_post_above_maximum_height_is_no_object() -> None:
+    """Its lower part, which is all that is segmented, stands on the table as an object does."""
     post, tall_box = box((-0.25, 0.1, 0), (0.04, 0.04, 0.9)), box((0.1, 0, 0), (0.1, 0.1, 0.45))
     check([table(0.6, 0.4), post, tall_box], [2], tilt_deg=25, distance=1.5)
 
 
-def test_box_over_the_edge_of_the_table() -> None:
-    """What sticks out over the near edge belongs to the object, down to the last reading."""
+def test_overhang_belongs_to_box_at_table_edge() -> None:
+    """The box extends beyond the near edge."""
     check([table(0.5, 0.3), box((0, -0.28, 0), (0.1, 0.12, 0.1))], [1], least=0.93)
 
 
-def test_a_row_of_boxes_is_no_wall() -> None:
-    """The fronts of boxes in line lie in one upright plane, 0.75 m wide."""
+def test_row_of_boxes_is_no_wall() -> None:
+    """Their fronts lie in one upright plane, 0.75 m wide."""
     row = [box((0.16 * k - 0.32, 0, 0), (0.11, 0.08, 0.16)) for k in range(5)]
     check([table(0.6, 0.4), *row], [1, 2, 3, 4, 5], tilt_deg=25, distance=1.2)
 
 
 @pytest.mark.parametrize("width", [0.4, 0.45])
 @pytest.mark.parametrize("y", [0.1, -0.2])
-def test_a_large_box_with_nothing_behind_is_no_wall(width: float, y: float) -> None:
-    """Its front is flat and large, and it is where the readings end, but not the image."""
+def test_large_box_before_empty_background_is_no_wall(width: float, y: float) -> None:
+    """Depth ends at its large flat front, although the image does not."""
     large = box((-0.28, y, 0), (width, 0.06, 0.3), 0.15)
     check([table(0.5, 0.35), large], [1], tilt_deg=25, distance=1.6)
 
 
 @pytest.mark.parametrize("columns", [1, 3, 213, 320, 641, 1999])
-def test_places_of_flat_cells_are_exact(columns: int) -> None:
-    """A product stands for a division: the first cell of a row must not fall into the one above."""
+def test_row_and_column_of_flat_index_are_exact(columns: int) -> None:
+    """A product replaces a division: rounding must not move a cell to the row above."""
     for i in (0, 1, 7, 199, 1999):
         assert row_and_column(i * columns, columns) == (i, 0)
         assert row_and_column(i * columns + columns - 1, columns) == (i, columns - 1)

@@ -1,4 +1,4 @@
-"""Connected components: the one flood fill, on small images whose parts can be counted."""
+"""Tests of connected components on small images."""
 
 import numpy as np
 import pytest
@@ -15,7 +15,7 @@ def whole(shape: tuple[int, int]) -> np.ndarray:
 
 
 @pytest.mark.parametrize("share", [0.0, 0.3, 0.55, 0.7, 1.0])
-def test_components_are_those_of_scipy(share: float) -> None:
+def test_components_match_scipy(share: float) -> None:
     rng = np.random.default_rng(7)
     inside = rng.random((40, 50)) < share
     component = np.full(inside.shape, -1, np.int32)
@@ -27,8 +27,8 @@ def test_components_are_those_of_scipy(share: float) -> None:
     assert sizes.size == count + 1
 
 
-def test_components_end_where_links_do() -> None:
-    """A U whose arms are joined at the bottom is one; without the links there it is two."""
+def test_missing_links_separate_components() -> None:
+    """The arms of a U are connected only at the bottom."""
     inside = np.ones((4, 3), bool)
     inside[:3, 1] = False
     component, links = np.zeros((4, 3), np.int32), np.full((4, 3), BOTH, np.uint8)
@@ -38,7 +38,7 @@ def test_components_end_where_links_do() -> None:
     assert component[3].tolist() == [1, 2, 2]
 
 
-def test_what_is_outside_the_spans_is_neither_read_nor_written() -> None:
+def test_cells_outside_spans_are_not_written() -> None:
     inside = np.zeros((3, 6), bool)
     inside[0, :2] = inside[1, 4:] = True
     component, links = np.full((3, 6), 77, np.int32), np.full((3, 6), BOTH, np.uint8)
@@ -47,16 +47,16 @@ def test_what_is_outside_the_spans_is_neither_read_nor_written() -> None:
     assert component[2].tolist() == [77] * 6
 
 
-def test_speckle_fits_into_memory() -> None:
-    """In noise no cell is linked with another; each begins a part of its own."""
+def test_speckle_stays_within_arrays() -> None:
+    """Without links, every cell is a component."""
     inside, links = np.ones((9, 8), bool), np.zeros((9, 8), np.uint8)
     component = np.zeros((9, 8), np.int32)
-    # Python checks what machine code does not: whether an index is within its array.
+    # Plain Python checks array bounds, which compiled code does not.
     sizes = connected_components.py_func(inside, links, whole((9, 8)), component)
     assert sizes.tolist() == [0] + [1] * 72
 
 
-def test_spans() -> None:
+def test_spans_enclose_positive_labels() -> None:
     assert span_of(np.array([0, -1, 3, 0, 2, 0], np.int16)) == (2, 5)
     assert span_of(np.zeros(4, np.int16)) == (0, 0)
     assert spans_of(np.array([[0, 1], [0, 0]], np.int16)).tolist() == [[1, 2], [0, 0]]

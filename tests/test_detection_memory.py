@@ -1,4 +1,4 @@
-"""Detection of one frame needs little memory beyond the frame."""
+"""Test of the memory that the detection in one frame needs."""
 
 import numpy as np
 import pytest
@@ -9,11 +9,11 @@ from shapecat.simulation import KINECT, make_scene, render_frame
 from shapecat.types import Frame
 
 CLOUDS = 8
-"""The peak may be so many times the size of the cloud."""
+"""Upper limit of the peak, in sizes of the cloud."""
 
 
 @pytest.mark.parametrize("organized", [True, False])
-def test_peak_allocation(*, organized: bool) -> None:
+def test_peak_memory_is_few_times_the_cloud(*, organized: bool) -> None:
     """A worker holds several frames at a time; temporary images must not multiply each of them."""
     tracemalloc = pytest.importorskip("tracemalloc")
     rng = np.random.default_rng(500)
@@ -23,7 +23,7 @@ def test_peak_allocation(*, organized: bool) -> None:
         points = points[np.isfinite(points[:, 2])]
         frame = Frame("t", 0, 0, 0, "c", points=points)
     settings = DetectionSettings()
-    assert detect(frame, settings=settings, rng=rng).candidates  # and kernels are compiled
+    assert detect(frame, settings=settings, rng=rng).candidates  # also compiles the kernels
 
     tracemalloc.start()
     try:

@@ -1,4 +1,4 @@
-"""Output: boxes, borders and labels at full resolution of made-up labels."""
+"""Tests of boxes, image borders and upsampled labels on made-up data."""
 
 import numpy as np
 import pytest
@@ -15,8 +15,8 @@ def test_runs_are_listed_by_label() -> None:
     assert [each.tolist() for each in lists] == [[7, 8], [3, 4, 11], []]
 
 
-def test_occluded_points_join_what_they_touch() -> None:
-    """A row of points goes on from a known one; another stands apart; each keeps its label."""
+def test_occluded_points_join_adjacent_object() -> None:
+    """A row of points continues from a labelled one; another row lies apart."""
     along = np.arange(10) * 0.008
     points = np.zeros((20, 3), np.float32)
     points[:10, 0], points[10:, 0], points[10:, 1] = along, along, 0.3
@@ -27,8 +27,8 @@ def test_occluded_points_join_what_they_touch() -> None:
 
 
 @pytest.mark.parametrize(("rows", "expected"), [(range(4, 40), [4, 19]), (range(20, 40), [-1, -1])])
-def test_where_samples_begin(rows: range, expected: list[int]) -> None:
-    """A strip may be blank; what begins in the middle is the top of an object."""
+def test_border_is_found_behind_blank_strip(rows: range, expected: list[int]) -> None:
+    """Samples that begin in the middle of the image are the top of an object."""
     inv_depth = np.zeros((40, 30), np.float32)
     inv_depth[list(rows), 5:25] = 1
     assert find_borders(inv_depth, 2).tolist()[0] == expected
@@ -36,7 +36,7 @@ def test_where_samples_begin(rows: range, expected: list[int]) -> None:
     assert find_borders(np.ascontiguousarray(inv_depth.T), 2).tolist()[2] == expected
 
 
-def test_the_samples_behind_a_blank_strip_tell_how_wide_the_border_is() -> None:
+def test_border_extent_covers_first_lines_with_samples() -> None:
     inv_depth = np.zeros((40, 30), np.float32)
     inv_depth[4:, 10:14] = 1
     inv_depth[6, 2] = 1
@@ -44,15 +44,15 @@ def test_the_samples_behind_a_blank_strip_tell_how_wide_the_border_is() -> None:
     assert find_borders(inv_depth, 3).tolist()[0] == [4, 11]
 
 
-def test_the_box_of_a_turned_box() -> None:
-    """Its corners, turned by 30 degrees about an up that is aslant, give its size back."""
+def test_upright_box_of_rotated_box_has_its_size() -> None:
+    """Its corners are rotated by 30 degrees about an oblique up direction."""
     size = np.array([0.2, 0.1, 0.05])
     corners = (np.array(np.meshgrid(*[(-0.5, 0.5)] * 3)).reshape(3, -1).T) * size
     c, s = np.cos(np.pi / 6), np.sin(np.pi / 6)
     up = np.array([0.0, -np.sqrt(0.5), -np.sqrt(0.5)])
-    turn = np.array([[c, -s, 0], [s, c, 0], [0, 0, 1]])
+    rotation = np.array([[c, -s, 0], [s, c, 0], [0, 0, 1]])
     axes = np.stack([[1, 0, 0], np.cross(up, [1, 0, 0]), up], 1)
-    box = upright_box((corners @ turn.T @ axes.T + [0, 0, 1]).astype(np.float32), up)
+    box = upright_box((corners @ rotation.T @ axes.T + [0, 0, 1]).astype(np.float32), up)
     np.testing.assert_allclose(np.sort(box.size[:2]), [0.1, 0.2], atol=2e-3)
     assert box.size[2] == pytest.approx(0.05, abs=1e-4)
     np.testing.assert_allclose(box.center, [0, 0, 1], atol=1e-4)
