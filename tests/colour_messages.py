@@ -1,4 +1,4 @@
-"""Colour images as drivers publish them."""
+"""Builders of colour image messages as drivers publish them."""
 
 import io
 from typing import Any
@@ -37,7 +37,7 @@ def packed(stamp: int, body: bytes, kind: str = "jpeg", frame_id: str = "camera"
 
 
 def gradient(height: int = 48, width: int = 64, seed: int = 0) -> Any:
-    """Make smooth colours, which JPEG preserves, all of them different."""
+    """Make a smooth image, which JPEG preserves, of distinct colours."""
     v, u = np.mgrid[:height, :width]
     red, green, blue = 255 * u / width, 255 * v / height, 40 + 10 * seed + 0 * u
     return np.stack([red, green, blue], axis=-1).astype(np.uint8)

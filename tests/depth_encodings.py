@@ -1,4 +1,4 @@
-"""Depth images compressed as the ROS transport does, by encoders independent of the readers."""
+"""Encoders of compressed depth images, independent of the decoders under test."""
 
 import struct
 import zlib
@@ -17,9 +17,9 @@ def png(values: Any) -> bytes:
     p = left + up - corner
     dl, du, dc = abs(p - left), abs(p - up), abs(p - corner)
     nearest = np.where((dl <= du) & (dl <= dc), left, np.where(du <= dc, up, corner))
-    guesses = [np.zeros_like(rows), left, up, (left + up) // 2, nearest]
+    predictions = [np.zeros_like(rows), left, up, (left + up) // 2, nearest]
     data = b"".join(
-        bytes([y % 5]) + ((rows[y] - guesses[y % 5][y]) % 256).astype(np.uint8).tobytes()
+        bytes([y % 5]) + ((rows[y] - predictions[y % 5][y]) % 256).astype(np.uint8).tobytes()
         for y in range(len(rows))
     )
     head = struct.pack(">IIBBBBB", values.shape[1], values.shape[0], 16, 0, 0, 0, 0)
@@ -31,7 +31,7 @@ def png(values: Any) -> bytes:
 
 
 def rvl(values: Any) -> bytes:
-    """Write RVL as its paper describes."""
+    """Write RVL as described in its paper."""
     nibbles: list[int] = []
 
     def put(number: int) -> None:

@@ -26,7 +26,7 @@ class Field(NamedTuple):
 
 
 def field(name: str, kind: int, message: str = "", *, repeated: bool = False) -> Field:
-    """Return a field, by default one that is not repeated."""
+    """Return a field, not repeated by default."""
     return Field(name, kind, message, repeated)
 
 

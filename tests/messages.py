@@ -1,4 +1,4 @@
-"""Messages of depth cameras as drivers publish them, and recordings of such messages."""
+"""Builders of depth camera messages as drivers publish them, and recordings of them."""
 
 import struct
 from collections.abc import Iterable
@@ -77,7 +77,7 @@ def write(
     chunk_size: int = 1 << 20,
     empty: Iterable[tuple[str, str]] = (),
 ) -> Path:
-    """Write messages given as topic, log time, message or bytes; ``empty`` topics have none."""
+    """Write messages given as topic, log time, message or bytes, and ``empty`` topics."""
     with path.open("wb") as file:
         writer = Writer(file, chunk_size=chunk_size)
         writer.start("ros2", "test")

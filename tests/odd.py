@@ -10,7 +10,7 @@ from typing import Any, NamedTuple
 
 from click.testing import CliRunner
 
-from tests.zoo import ZOO
+from tests.odd_recordings import CASES
 
 COLLECTION = Path(__file__).parents[2] / "shared" / "data" / "odd"
 CODES = {0, 3, 4}
@@ -26,7 +26,7 @@ class Verdict(NamedTuple):
 
 
 def examine(path: Path, out: Path, *options: str) -> Verdict:
-    """Process a recording as a user would; an unknown error is a bug and is raised."""
+    """Process a recording as a user would; raise unknown errors, which are bugs."""
     arguments = ["process", str(path), "--out", str(out), "--no-rrd", *options]
     command: Any = import_module("shapecat.cli.main").main
     result = CliRunner().invoke(command, arguments)
@@ -37,8 +37,11 @@ def examine(path: Path, out: Path, *options: str) -> Verdict:
     (folder,) = out.iterdir()
     run = json.loads((folder / "run.json").read_text())
     skipped = run["counts"]["skipped"]
-    said = [*run["warnings"], *(f"{count} frames: {reason}" for reason, count in skipped.items())]
-    return Verdict(0, run["counts"]["frames"], sum(skipped.values()), "; ".join(said))
+    messages = [
+        *run["warnings"],
+        *(f"{count} frames: {reason}" for reason, count in skipped.items()),
+    ]
+    return Verdict(0, run["counts"]["frames"], sum(skipped.values()), "; ".join(messages))
 
 
 def recordings(folder: Path) -> Iterator[Path]:
@@ -66,10 +69,10 @@ def main(folders: list[Path]) -> int:
 def _verdicts(folders: list[Path]) -> Iterator[tuple[str, Verdict]]:
     sys.stdout.write(f"{'file':40} code frames skipped  message\n")
     with tempfile.TemporaryDirectory() as scratch:
-        for number, (name, exhibit) in enumerate(ZOO.items()):
-            place = Path(scratch, str(number))
-            place.mkdir()
-            yield name, examine(exhibit.write(place), place / "out")
+        for number, (name, case) in enumerate(CASES.items()):
+            case_folder = Path(scratch, str(number))
+            case_folder.mkdir()
+            yield name, examine(case.write(case_folder), case_folder / "out")
         for folder in folders:
             for number, path in enumerate(recordings(folder)):
                 out = Path(scratch, f"{folder.name}-{number}")

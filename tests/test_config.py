@@ -1,3 +1,5 @@
+"""Tests of settings: files, overrides and errors."""
+
 import dataclasses
 from pathlib import Path
 
@@ -7,8 +9,7 @@ from shapecat.config import Settings, load_settings, with_overrides
 from shapecat.errors import ConfigError
 
 
-def test_file_then_overrides(tmp_path: Path) -> None:
-    """The command line wins over the file, the file over the defaults."""
+def test_command_line_overrides_file_and_file_overrides_defaults(tmp_path: Path) -> None:
     path = tmp_path / "s.toml"
     path.write_text("seed = 3\n[tracking]\ngate_m = 1\nfusion = 'vote'\n")
 
@@ -37,13 +38,13 @@ def test_file_then_overrides(tmp_path: Path) -> None:
         ("tracking.gate_m", "expected name=value"),
     ],
 )
-def test_a_wrong_setting_is_named(override: str, message: str) -> None:
+def test_error_names_invalid_setting(override: str, message: str) -> None:
     with pytest.raises(ConfigError, match=message):
         with_overrides(Settings(), [override])
 
 
 @pytest.mark.parametrize("content", [b"a = ", b"\xff\xfe", None])
-def test_unreadable_file_is_a_config_error(tmp_path: Path, content: bytes | None) -> None:
+def test_unreadable_file_is_config_error(tmp_path: Path, content: bytes | None) -> None:
     path = tmp_path / "s.toml"
     if content is not None:
         path.write_bytes(content)
@@ -52,7 +53,7 @@ def test_unreadable_file_is_a_config_error(tmp_path: Path, content: bytes | None
         load_settings(path)
 
 
-def test_as_dict_holds_every_setting() -> None:
+def test_as_dict_has_every_field() -> None:
     """The stored tree must be enough to repeat a run."""
     tree = Settings().as_dict()
 

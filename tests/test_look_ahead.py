@@ -21,9 +21,9 @@ from shapecat.simulation.messages import MessageFactory
 from shapecat.types import Frame, Pose
 from tests import messages as ros
 from tests.messages import EPOCH, SECOND
+from tests.odd_recordings import write_all
 from tests.scenes import serialized
 from tests.test_gravity import imu
-from tests.zoo import write_all
 
 TURN = np.array([[0.0, 0, 1], [1, 0, 0], [0, 1, 0]])
 SECONDS = 90

@@ -1,4 +1,4 @@
-"""Memory stays flat with the length of a recording."""
+"""Test that memory does not grow with the length of a recording."""
 
 from pathlib import Path
 
@@ -13,15 +13,15 @@ def resident_bytes() -> int:
     return int(Path("/proc/self/statm").read_text().split()[1]) * PAGE
 
 
-def test_memory_does_not_grow_with_the_frames(tmp_path: Path) -> None:
-    """A detection kept by mistake costs 20 kB: a thousand of them more than is allowed."""
+def test_memory_does_not_grow_with_number_of_frames(tmp_path: Path) -> None:
+    """A detection kept by mistake costs 20 kB; a thousand of them exceed the limit."""
     recording = record(tmp_path / "a.mcap", 260)
-    seen: dict[int, int] = {}
+    resident: dict[int, int] = {}
 
     def watch(phase: str, done: int, _total: int | None) -> None:
         if phase == "perceive" and done % 32 == 1:
-            seen[done] = resident_bytes()
+            resident[done] = resident_bytes()
 
     process(Job(recording, tmp_path / "out", rrd=False), watch)
 
-    assert seen[257] - seen[97] < 8 << 20
+    assert resident[257] - resident[97] < 8 << 20

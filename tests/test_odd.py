@@ -1,23 +1,23 @@
-"""Every odd recording ends as documented, and everything missing is reported."""
+"""Tests of processing damaged and unusual recordings: exit codes, frames and messages."""
 
 from pathlib import Path
 
 import pytest
 
 from tests import odd
-from tests.zoo import FRAMES, ZOO
+from tests.odd_recordings import CASES, FRAMES
 
 
-@pytest.mark.parametrize("name", ZOO)
-def test_zoo(name: str, tmp_path: Path) -> None:
-    exhibit = ZOO[name]
+@pytest.mark.parametrize("name", CASES)
+def test_odd_recording_has_expected_outcome(name: str, tmp_path: Path) -> None:
+    case = CASES[name]
 
-    verdict = odd.examine(exhibit.write(tmp_path), tmp_path / "out", "--jobs", "1")
+    verdict = odd.examine(case.write(tmp_path), tmp_path / "out", "--jobs", "1")
 
-    assert (verdict.code, verdict.frames) == (exhibit.code, exhibit.frames), verdict.message
-    assert exhibit.said in verdict.message
+    assert (verdict.code, verdict.frames) == (case.code, case.frames), verdict.message
+    assert case.reported in verdict.message
     assert "\n" not in verdict.message
-    assert (verdict.message == "") is (exhibit.said == "")
+    assert (verdict.message == "") is (case.reported == "")
     if verdict.code == 0 and "cloud of" in name:
         assert verdict.frames + verdict.skipped == FRAMES
     if verdict.code:
@@ -28,7 +28,7 @@ EXPECTED = {"watercan.bag": 0, "asci-file.txt": 3, "empty-file.bag": 3, "metadat
 
 
 @pytest.mark.skipif(not odd.COLLECTION.exists(), reason="needs the collection of odd recordings")
-def test_collection(tmp_path: Path) -> None:
+def test_collected_recording_has_expected_exit_code(tmp_path: Path) -> None:
     for number, path in enumerate(odd.recordings(odd.COLLECTION)):
         verdict = odd.examine(path, tmp_path / str(number))
 

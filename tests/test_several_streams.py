@@ -1,4 +1,4 @@
-"""Several sensors in one run share a table, and tracks if they share a fixed frame."""
+"""Tests of runs with several sensors: tables, and tracks shared in a fixed frame."""
 
 import json
 from collections.abc import Callable
@@ -26,7 +26,7 @@ def two_cameras(path: Path, frames: int = 6, *, transforms: bool = True) -> Path
     return write(path, [item for item in items if transforms or "tf" not in item[0]])
 
 
-def test_an_object_that_two_sensors_see_is_one_track(shapecat: Run, tmp_path: Path) -> None:
+def test_object_seen_by_two_sensors_is_one_track(shapecat: Run, tmp_path: Path) -> None:
     recording = two_cameras(tmp_path / "a.mcap")
     for out, names in {"both": [DEPTH, POINTS], "one": [DEPTH]}.items():
         options = [part for name in names for part in ("--topic", name)]
@@ -44,16 +44,14 @@ def test_an_object_that_two_sensors_see_is_one_track(shapecat: Run, tmp_path: Pa
         POINTS,
     }
     assert sum(both["counts"]["tracks"].values()) == sum(one["counts"]["tracks"].values()) > 3
-    assert all(seen == {DEPTH, POINTS} for seen in topics.values())
-    # Frames of both sensors have the same numbers: no view may take another one's file.
+    assert all(sensors == {DEPTH, POINTS} for sensors in topics.values())
+    # Frames of both sensors have equal numbers; their files must not collide.
     crops = export_run(tmp_path / "both" / "a", "crops", tmp_path / "crops")
     assert len(list((tmp_path / "crops").glob("*/*/*.pcd"))) == crops > 12
 
 
-def test_without_a_fixed_frame_each_sensor_has_its_own_tracks(
-    shapecat: Run, tmp_path: Path
-) -> None:
-    """Their coordinates have nothing to do with each other."""
+def test_without_fixed_frame_sensors_share_no_tracks(shapecat: Run, tmp_path: Path) -> None:
+    """Their coordinates are unrelated."""
     recording = two_cameras(tmp_path / "a.mcap", transforms=False)
     options = ("--topic", DEPTH, "--topic", POINTS, "--no-rrd")
     assert shapecat("process", recording, "--out", tmp_path, *options).exit_code == 0
@@ -61,5 +59,5 @@ def test_without_a_fixed_frame_each_sensor_has_its_own_tracks(
     for row in pq.read_table(tmp_path / "a" / "tracks.parquet").to_pylist():
         topics.setdefault(row["track"], set()).add(row["topic"])
 
-    assert {len(seen) for seen in topics.values()} == {1}
+    assert {len(sensors) for sensors in topics.values()} == {1}
     assert set().union(*topics.values()) == {DEPTH, POINTS}

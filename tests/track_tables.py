@@ -1,4 +1,4 @@
-"""Track tables of synthetic runs."""
+"""Builder of track tables for synthetic runs."""
 
 from collections.abc import Sequence
 from pathlib import Path

@@ -1,4 +1,4 @@
-"""Hours of recording are tracked in batches that fit into memory, with no visible seams."""
+"""Tests of tracking long recordings in batches that fit into memory."""
 
 from pathlib import Path
 
@@ -29,9 +29,7 @@ def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return folder
 
 
-def test_the_length_of_the_parts_changes_nothing(
-    folder: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_batch_sizes_do_not_change_tracks(folder: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """Batches may end within a frame, a track or a row group; a track may span several."""
     whole, lines = tracked(folder)
     sizes = {(tracks, "_BATCH"): 100, (full_boxes, "_BLOCK"): 7, (full_boxes, "_AT_ONCE"): 1}
@@ -39,15 +37,17 @@ def test_the_length_of_the_parts_changes_nothing(
     for (module, name), size in sizes.items():
         monkeypatch.setattr(module, name, size)
 
-    parts, others = tracked(folder)
+    batched, batched_lines = tracked(folder)
 
     assert whole.num_rows > 7 * FRAMES
-    assert parts.equals(whole)
-    assert others == lines
+    assert batched.equals(whole)
+    assert batched_lines == lines
 
 
-def test_few_views_tell_the_box_of_all(folder: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    """A sample of views gives the same box, within the noise of the outlines, in every row."""
+def test_full_box_from_sample_matches_all_views(
+    folder: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Boxes agree in every row, within the noise of the outlines."""
     whole, _ = tracked(folder)
     monkeypatch.setattr(full_boxes, "_TELLING", 60)
 
@@ -67,5 +67,5 @@ def test_few_views_tell_the_box_of_all(folder: Path, monkeypatch: pytest.MonkeyP
 @pytest.mark.parametrize(
     ("frames", "length"), [(0, 32), (3000, 32), (10_000, 32), (10**5, 128), (10**6, 480)]
 )
-def test_long_tables_have_long_row_groups(frames: int, length: int) -> None:
+def test_row_groups_grow_with_number_of_frames(frames: int, length: int) -> None:
     assert group_frames(frames) == length

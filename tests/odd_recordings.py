@@ -1,4 +1,4 @@
-"""A zoo of recordings: the ways in which robots write, break and misuse the formats."""
+"""Recordings of every format variant, damaged and unusual ones, with their expected outcomes."""
 
 import json
 import shutil
@@ -28,17 +28,17 @@ FRAMES = 4
 FACTORY, FACTORY1 = MessageFactory(2), MessageFactory(1)
 
 
-class Exhibit(NamedTuple):
-    """A recording: its writer, the expected exit code and frames, and the expected messages."""
+class Case(NamedTuple):
+    """A recording: its writer, and the expected exit code, number of frames, and messages."""
 
     write: Callable[[Path], Path]
     code: int = 0
     frames: int = FRAMES
-    said: str = ""
+    reported: str = ""
 
 
 class McapChannels:
-    """Writes serialized ROS messages to an MCAP file; a topic gets its channel when it is met."""
+    """Writes serialized ROS messages to an MCAP file; registers a channel for each new topic."""
 
     def __init__(self, writer: Writer, make: MessageFactory, version: int = 2) -> None:
         self._writer, self._make, self._version = writer, make, version
@@ -71,7 +71,7 @@ def write_all(writer: Any, items: Iterable[tuple[str, str, int, bytes]], types: 
 
 
 def mcap(path: Path, *, finish: bool = True, cut: int = 0, last: Any = (), **options: Any) -> Path:
-    """Write the table, and then some bytes that are cut off, with some options of the writer."""
+    """Write the table and ``last`` messages; remove ``cut`` bytes from the end."""
     path /= "a.mcap"
     with path.open("wb") as file:
         writer = Writer(file, **({"chunk_size": 60_000} | options))
@@ -99,18 +99,18 @@ def bag(path: Path, compression: Any = None, *, threshold: int = 60_000) -> Path
 
 
 def active_bag(path: Path) -> Path:
-    """Write the file that a killed rosbag leaves: no index, and a header that says so."""
+    """Write the file that a killed rosbag leaves, which has no index."""
     found = bag(path)
     data = found.read_bytes().replace(b"index_pos=", b"index_pos=\0\0\0\0\0\0\0\0*", 1)
     at = data.index(b"index_pos=") + 10
     data = data[: at + 8] + data[at + 17 :]
-    # The connections and chunk information after the last chunk are not there.
+    # The connections and chunk information after the last chunk are missing.
     found.write_bytes(data[: data.rindex(b"op=\x05") + 60_000])
     return found.rename(path / "a.bag.active")
 
 
 def unsorted_bag(path: Path) -> Path:
-    """Chunks in another order than their messages."""
+    """Write a bag whose chunks are not in order of time."""
     writer = BagWriter(path / "a.bag")
     writer.chunk_threshold = 1
     items = list(serialized(stream(FACTORY1, FRAMES), FACTORY1))
@@ -143,7 +143,7 @@ def database(path: Path, *, definitions: bool) -> Path:
 
 
 def splits(path: Path) -> Path:
-    """Two parts, the second one compressed, and no metadata."""
+    """Write two parts without metadata, the second one compressed."""
     (path / "a").mkdir()
     for name, begin in (("a_0.mcap", 0), ("a_1.mcap", FRAMES * PERIOD)):
         part = mcap(path)
@@ -156,7 +156,7 @@ def splits(path: Path) -> Path:
 
 
 def ros1_mcap(path: Path) -> Path:
-    """MCAP with ROS 1 messages, as `mcap convert` makes it from a bag."""
+    """Write ROS 1 messages to MCAP, as `mcap convert` does."""
     path /= "a.mcap"
     with path.open("wb") as file:
         writer = Writer(file)
@@ -224,9 +224,9 @@ def layout(kind: str) -> Callable[[Path], Path]:
         size = np.dtype(number).itemsize
         gap = 7 if kind == "row-padded" else 0
         rows = np.zeros((h, w * step + gap), np.uint8)
-        cells = rows[:, : w * step].reshape(h, w, step)
+        records = rows[:, : w * step].reshape(h, w, step)
         packed = np.ascontiguousarray(points, order + number).view(np.uint8)
-        cells[..., offset : offset + 3 * size] = packed.reshape(h, w, 3 * size)
+        records[..., offset : offset + 3 * size] = packed.reshape(h, w, 3 * size)
         field = "sensor_msgs/msg/PointField"
         message.fields = [
             ros.make(field, name, offset + size * k, code, 1) for k, name in enumerate("xyz")
@@ -243,7 +243,7 @@ def layout(kind: str) -> Callable[[Path], Path]:
 
 
 def hostile_cloud(path: Path) -> Path:
-    """Let the first claim 2^32 points; the others are fine."""
+    """Write clouds of which the first claims 2^32 points."""
 
     def change(topic: str, message: Any) -> Any:
         if topic.endswith("points") and message.header.stamp.nanosec == 0:
@@ -255,7 +255,7 @@ def hostile_cloud(path: Path) -> Path:
 
 
 def empty_cloud(path: Path) -> Path:
-    """Let the first cloud have no point."""
+    """Write clouds of which the first has no points."""
 
     def change(topic: str, message: Any) -> Any:
         if topic.endswith("points") and message.header.stamp.nanosec == 0:
@@ -267,7 +267,7 @@ def empty_cloud(path: Path) -> Path:
 
 
 def flat_cloud(path: Path) -> Path:
-    """Unorganized, without the points that have no reading."""
+    """Write unorganized clouds without invalid points."""
 
     def change(topic: str, message: Any) -> Any:
         if topic.endswith("points"):
@@ -294,7 +294,7 @@ def distorted(path: Path, *, strong: bool) -> Path:
 
 
 def foreign(path: Path) -> Path:
-    """Channels of other programs: a service event, and unknown encodings and schemas."""
+    """Add channels of other programs: a service event, and unknown encodings and schemas."""
     found = path / "a.mcap"
     with found.open("wb") as file:
         writer = Writer(file)
@@ -316,7 +316,7 @@ def foreign(path: Path) -> Path:
 
 
 def clocks(path: Path, kind: str) -> Path:
-    """Stamps that count from power-on, are missing, or jump."""
+    """Write stamps that count from power-on, are missing, or jump."""
 
     def stamps() -> Iterator[tuple[str, int, Any]]:
         for number, (topic, time, message) in enumerate(stream(FACTORY, FRAMES)):
@@ -332,7 +332,7 @@ def clocks(path: Path, kind: str) -> Path:
 
 
 def late_transforms(path: Path) -> Path:
-    """Write the static transforms last, and a loop of frames."""
+    """Write the static transforms last, and transforms that form a loop."""
     first, *others = stream(FACTORY, FRAMES)
     links = [(f"f{k}", f"f{(k + 1) % 300}", IDENTITY) for k in range(300)]
     loop = ("/tf", EPOCH, FACTORY.transforms(links, EPOCH))
@@ -350,7 +350,7 @@ def hostile_chunk(path: Path) -> Path:
 
 
 def bad_frames(path: Path) -> Path:
-    """Every image has less data than its header claims."""
+    """Write images with less data than their headers claim."""
 
     def change(topic: str, message: Any) -> Any:
         if topic.endswith("image_raw"):
@@ -398,7 +398,7 @@ def text_only(path: Path) -> Path:
     return plain(path, [("/log", EPOCH, ros.make("std_msgs/msg/String", "hello"))])
 
 
-def locked_part(path: Path) -> Path:
+def damaged_part(path: Path) -> Path:
     """Write a folder of which one part is damaged."""
     found = folder(path, StoragePlugin.SQLITE3, metadata=False)
     (found / "a.db3").rename(found / "a_0.db3")
@@ -406,7 +406,7 @@ def locked_part(path: Path) -> Path:
     return found
 
 
-def copy_of(path: Path, *, note: str) -> Path:
+def with_other_files(path: Path, *, note: str) -> Path:
     """Write a recording beside files that do not belong to it."""
     found = folder(path, StoragePlugin.MCAP)
     (found / "notes.txt").write_text(json.dumps(note))
@@ -415,81 +415,81 @@ def copy_of(path: Path, *, note: str) -> Path:
 
 
 _SQL, _MCAP = StoragePlugin.SQLITE3, StoragePlugin.MCAP
-_PACKED = CompressionMode
+_MODE = CompressionMode
 _CUT = "not finished; messages recovered"
 
-ZOO: dict[str, Exhibit] = {
-    **{f"mcap {c.name.lower()}": Exhibit(partial(mcap, compression=c)) for c in CompressionType},
-    "mcap without chunks": Exhibit(lambda p: mcap(p, use_chunking=False), said="no index"),
-    "mcap without index": Exhibit(lambda p: mcap(p, index_types=IndexType.NONE), said="no index"),
-    "mcap without message index": Exhibit(lambda p: mcap(p, index_types=IndexType.CHUNK)),
-    "mcap without channels in summary": Exhibit(
-        lambda p: mcap(p, repeat_channels=False, repeat_schemas=False), said="no index"
+CASES: dict[str, Case] = {
+    **{f"mcap {c.name.lower()}": Case(partial(mcap, compression=c)) for c in CompressionType},
+    "mcap without chunks": Case(lambda p: mcap(p, use_chunking=False), reported="no index"),
+    "mcap without index": Case(lambda p: mcap(p, index_types=IndexType.NONE), reported="no index"),
+    "mcap without message index": Case(lambda p: mcap(p, index_types=IndexType.CHUNK)),
+    "mcap without channels in summary": Case(
+        lambda p: mcap(p, repeat_channels=False, repeat_schemas=False), reported="no index"
     ),
-    "mcap without statistics": Exhibit(
+    "mcap without statistics": Case(
         lambda p: mcap(p, use_statistics=False, use_summary_offsets=False)
     ),
-    "mcap unfinished": Exhibit(lambda p: mcap(p, finish=False), said=_CUT),
-    "mcap cut": Exhibit(
+    "mcap unfinished": Case(lambda p: mcap(p, finish=False), reported=_CUT),
+    "mcap cut": Case(
         lambda p: mcap(p, compression=CompressionType.NONE, finish=False, cut=30_000),
         frames=FRAMES - 1,
-        said=_CUT,
+        reported=_CUT,
     ),
-    "mcap cut in its only chunk": Exhibit(
+    "mcap cut in its only chunk": Case(
         lambda p: mcap(
             p, compression=CompressionType.LZ4, chunk_size=1 << 30, finish=False, cut=1000
         ),
         frames=FRAMES - 1,
-        said="the rest of the chunk",
+        reported="the rest of the chunk",
     ),
-    "mcap of ros 1": Exhibit(ros1_mcap),
-    "mcap with a hostile chunk": Exhibit(hostile_chunk, said="claims to hold"),
-    "foxglove json": Exhibit(lambda p: fox(p, "json")),
-    "foxglove protobuf": Exhibit(lambda p: fox(p, "protobuf")),
-    "ros 1": Exhibit(bag),
+    "mcap of ros 1": Case(ros1_mcap),
+    "mcap with a hostile chunk": Case(hostile_chunk, reported="claims to hold"),
+    "foxglove json": Case(lambda p: fox(p, "json")),
+    "foxglove protobuf": Case(lambda p: fox(p, "protobuf")),
+    "ros 1": Case(bag),
     **{
-        f"ros 1 {c.name.lower()}": Exhibit(partial(bag, compression=c))
+        f"ros 1 {c.name.lower()}": Case(partial(bag, compression=c))
         for c in BagWriter.CompressionFormat
     },
-    "ros 1 unsorted": Exhibit(unsorted_bag),
-    "ros 1 active": Exhibit(active_bag, frames=FRAMES - 1, said="no index"),
-    "ros 2 sqlite": Exhibit(lambda p: folder(p, _SQL)),
-    "ros 2 mcap": Exhibit(lambda p: folder(p, _MCAP)),
-    "ros 2 without metadata": Exhibit(lambda p: folder(p, _SQL, metadata=False), said="metadata"),
-    "ros 2 file-compressed": Exhibit(lambda p: folder(p, _SQL, _PACKED.FILE)),
-    "ros 2 message-compressed": Exhibit(lambda p: folder(p, _SQL, _PACKED.MESSAGE)),
-    "ros 2 mcap file-compressed": Exhibit(lambda p: folder(p, _MCAP, _PACKED.FILE)),
-    "ros 2 splits": Exhibit(splits, frames=2 * FRAMES, said="metadata"),
-    "ros 2 with a damaged part": Exhibit(locked_part, said="skipped a_1.db3"),
-    "ros 2 beside other files": Exhibit(lambda p: copy_of(p, note="mine")),
-    "db3": Exhibit(lambda p: database(p, definitions=True)),
-    "db3 without definitions": Exhibit(lambda p: database(p, definitions=False), said="Humble"),
-    "compressed depth png": Exhibit(lambda p: compressed_depth(p, depth.png)),
-    "compressed depth rvl": Exhibit(lambda p: compressed_depth(p, depth.rvl)),
-    "realsense viewer": Exhibit(realsense),
-    "organized cloud": Exhibit(lambda p: record(p / "a.mcap", FRAMES, clouds=True)),
+    "ros 1 unsorted": Case(unsorted_bag),
+    "ros 1 active": Case(active_bag, frames=FRAMES - 1, reported="no index"),
+    "ros 2 sqlite": Case(lambda p: folder(p, _SQL)),
+    "ros 2 mcap": Case(lambda p: folder(p, _MCAP)),
+    "ros 2 without metadata": Case(lambda p: folder(p, _SQL, metadata=False), reported="metadata"),
+    "ros 2 file-compressed": Case(lambda p: folder(p, _SQL, _MODE.FILE)),
+    "ros 2 message-compressed": Case(lambda p: folder(p, _SQL, _MODE.MESSAGE)),
+    "ros 2 mcap file-compressed": Case(lambda p: folder(p, _MCAP, _MODE.FILE)),
+    "ros 2 splits": Case(splits, frames=2 * FRAMES, reported="metadata"),
+    "ros 2 with a damaged part": Case(damaged_part, reported="skipped a_1.db3"),
+    "ros 2 beside other files": Case(lambda p: with_other_files(p, note="mine")),
+    "db3": Case(lambda p: database(p, definitions=True)),
+    "db3 without definitions": Case(lambda p: database(p, definitions=False), reported="Humble"),
+    "compressed depth png": Case(lambda p: compressed_depth(p, depth.png)),
+    "compressed depth rvl": Case(lambda p: compressed_depth(p, depth.rvl)),
+    "realsense viewer": Case(realsense),
+    "organized cloud": Case(lambda p: record(p / "a.mcap", FRAMES, clouds=True)),
     **{
-        f"cloud {kind}": Exhibit(layout(kind))
+        f"cloud {kind}": Case(layout(kind))
         for kind in ("padded", "unaligned", "big-endian", "f8", "row-padded", "extra", "dense-lie")
     },
-    "cloud unorganized": Exhibit(flat_cloud),
-    "cloud of 2^32 points": Exhibit(hostile_cloud, frames=FRAMES - 1, said="needs"),
-    "cloud of no points": Exhibit(empty_cloud, frames=FRAMES - 1, said="empty cloud"),
-    "slight distortion": Exhibit(lambda p: distorted(p, strong=False)),
-    "strong distortion": Exhibit(lambda p: distorted(p, strong=True), said="undistorted rays"),
-    "foreign channels": Exhibit(foreign),
-    "clock from power-on": Exhibit(lambda p: clocks(p, "uptime"), said="does not count from 1970"),
-    "clock missing": Exhibit(lambda p: clocks(p, "zero"), said="stamp is 0"),
-    "clock jump": Exhibit(lambda p: clocks(p, "jump"), said="jumps"),
-    "static transforms last": Exhibit(late_transforms),
-    "every image too short": Exhibit(bad_frames, 4, 0, "no usable frame"),
-    "no clouds": Exhibit(text_only, 4, 0, "no point clouds"),
-    "empty file": Exhibit(lambda p: file(p, "a.bag", b""), 3, 0, "is empty"),
-    "text": Exhibit(lambda p: file(p, "a.mcap", b"hello world\n"), 3, 0, "not a recording"),
-    "magic alone": Exhibit(lambda p: file(p, "a.mcap", b"\x89MCAP0\r\n"), 4, 0, "empty"),
-    "zeros": Exhibit(lambda p: file(p, "a.db3", b"SQLite format 3\0" + bytes(999)), 3, 0, "not a"),
-    "old bag": Exhibit(lambda p: file(p, "a.bag", b"#ROSBAG V1.2\n"), 3, 0, "version 2.0"),
-    "empty folder": Exhibit(empty_folder, 3, 0, "no recording found"),
-    "missing": Exhibit(lambda p: p / "a.mcap", 3, 0, "does not exist"),
+    "cloud unorganized": Case(flat_cloud),
+    "cloud of 2^32 points": Case(hostile_cloud, frames=FRAMES - 1, reported="needs"),
+    "cloud of no points": Case(empty_cloud, frames=FRAMES - 1, reported="empty cloud"),
+    "slight distortion": Case(lambda p: distorted(p, strong=False)),
+    "strong distortion": Case(lambda p: distorted(p, strong=True), reported="undistorted rays"),
+    "foreign channels": Case(foreign),
+    "clock from power-on": Case(lambda p: clocks(p, "uptime"), reported="does not count from 1970"),
+    "clock missing": Case(lambda p: clocks(p, "zero"), reported="stamp is 0"),
+    "clock jump": Case(lambda p: clocks(p, "jump"), reported="jumps"),
+    "static transforms last": Case(late_transforms),
+    "every image too short": Case(bad_frames, 4, 0, "no usable frame"),
+    "no clouds": Case(text_only, 4, 0, "no point clouds"),
+    "empty file": Case(lambda p: file(p, "a.bag", b""), 3, 0, "is empty"),
+    "text": Case(lambda p: file(p, "a.mcap", b"hello world\n"), 3, 0, "not a recording"),
+    "magic alone": Case(lambda p: file(p, "a.mcap", b"\x89MCAP0\r\n"), 4, 0, "empty"),
+    "zeros": Case(lambda p: file(p, "a.db3", b"SQLite format 3\0" + bytes(999)), 3, 0, "not a"),
+    "old bag": Case(lambda p: file(p, "a.bag", b"#ROSBAG V1.2\n"), 3, 0, "version 2.0"),
+    "empty folder": Case(empty_folder, 3, 0, "no recording found"),
+    "missing": Case(lambda p: p / "a.mcap", 3, 0, "does not exist"),
 }
-"""By name. A recording that is not damaged is read in full; nothing else is said about it."""
+"""By name; ``reported`` is part of the messages, and empty if there are none."""

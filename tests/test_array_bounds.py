@@ -1,4 +1,4 @@
-"""No kernel reads or writes beyond its arrays, whatever the sensor sends."""
+"""Test that compiled kernels stay within their arrays, whatever the sensor sends."""
 
 import os
 import subprocess
@@ -39,8 +39,8 @@ for height, width in ((480, 640), (37, 51), (8, 900)):
 
 
 @pytest.mark.many
-def test_odd_frames_stay_within_bounds(tmp_path: Path) -> None:
-    """Compiled code checks no index: a wrong one corrupts memory far from its cause."""
+def test_kernels_stay_within_bounds_on_unusual_frames(tmp_path: Path) -> None:
+    """Compiled code checks no index; a wrong one corrupts memory far from its cause."""
     checked = {"NUMBA_BOUNDSCHECK": "1", "NUMBA_CACHE_DIR": str(tmp_path)}
     run = subprocess.run(
         [sys.executable, "-c", ODD_FRAMES],
