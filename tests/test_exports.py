@@ -1,4 +1,4 @@
-"""Exports, read back by parsers written from the specifications of their formats."""
+"""Tests of exports, read back by parsers written from the specifications of their formats."""
 
 import csv
 import json
@@ -63,13 +63,13 @@ def boxes(folder: Path, which: str = "_full") -> dict[int, list[tuple[int, np.nd
         for row in rows(folder, "tracks")
         if row["detection"] is not None
     }
-    shown = read_finished(folder).labels
+    kept = read_finished(folder).labels
     found: dict[int, list[tuple[int, np.ndarray]]] = {}
     for row in rows(folder, "detections"):
-        seen = owner.get((row["frame"], row["detection"]), {"track": 0})
-        track = seen["track"]
-        if track in shown:
-            box = {**row, **seen}
+        track_row = owner.get((row["frame"], row["detection"]), {"track": 0})
+        track = track_row["track"]
+        if track in kept:
+            box = {**row, **track_row}
             half = np.array(box[f"size{which}"]) / 2
             unit = np.array([[x, y, z] for x in (-1, 1) for y in (-1, 1) for z in (-1, 1)])
             corners = (unit * half) @ rotation_from_quaternion(box[f"orientation{which}"]).T
@@ -79,8 +79,8 @@ def boxes(folder: Path, which: str = "_full") -> dict[int, list[tuple[int, np.nd
 
 def farthest(a: np.ndarray, b: np.ndarray) -> float:
     """Return the largest distance from corners (8, 3) to the nearest of other corners."""
-    apart = np.linalg.norm(a[:, None] - b[None], axis=-1)
-    return float(max(apart.min(axis=0).max(), apart.min(axis=1).max()))
+    distances = np.linalg.norm(a[:, None] - b[None], axis=-1)
+    return float(max(distances.min(axis=0).max(), distances.min(axis=1).max()))
 
 
 def test_crops_are_a_data_set_with_corrected_labels(run: Path, tmp_path: Path) -> None:
@@ -100,8 +100,8 @@ def test_crops_are_a_data_set_with_corrected_labels(run: Path, tmp_path: Path) -
         assert {view.category for view in found} == {labels[track].category}
 
 
-def test_crops_stand_upright_on_zero_and_know_the_sensor(run: Path, tmp_path: Path) -> None:
-    """A view in another frame than the chain's own gives another descriptor."""
+def test_crops_are_upright_at_height_zero_with_viewpoint(run: Path, tmp_path: Path) -> None:
+    """In any other frame, the descriptors would differ."""
     export_run(run, "crops", tmp_path)
     truth = json.loads(
         (Path(read_finished(run).run["input"]["path"]).with_suffix(".truth.json")).read_text()
@@ -125,18 +125,18 @@ def test_crops_stand_upright_on_zero_and_know_the_sensor(run: Path, tmp_path: Pa
         assert_allclose(view.points[:, :2].mean(axis=0), 0, atol=1e-4)
 
 
-def test_exporting_again_leaves_no_view_under_an_earlier_label(run: Path, tmp_path: Path) -> None:
+def test_exporting_again_removes_views_with_earlier_labels(run: Path, tmp_path: Path) -> None:
     """A stale view teaches the model the mistake that was corrected."""
     folder = tmp_path / "table"
     shutil.copytree(run, folder)
     own = tmp_path / "crops" / "cup" / "mine"
     own.mkdir(parents=True)
     (own / "view.pcd").write_text("of another data set")
-    told: list[tuple[str, int, int | None]] = []
+    events: list[tuple[str, int, int | None]] = []
     export_run(
-        folder, "crops", tmp_path / "crops", every=4, observe=lambda *what: told.append(what)
+        folder, "crops", tmp_path / "crops", every=4, observe=lambda *what: events.append(what)
     )
-    assert told[-1][1:] == (len(told), len(told))  # the progress ends at its total
+    assert events[-1][1:] == (len(events), len(events))  # the progress ends at its total
     relabel(folder, {2: "vase", 3: "delete"})
     export_run(folder, "crops", tmp_path / "crops", every=4)
 
@@ -160,8 +160,8 @@ def read_kitti(path: Path) -> list[tuple[str, np.ndarray, np.ndarray]]:
         ys = np.array([0, 0, 0, 0, -h, -h, -h, -h])
         zs = np.array([w, -w, -w, w, w, -w, -w, w]) / 2
         c, s = np.cos(ry), np.sin(ry)
-        turn = np.array([[c, 0, s], [0, 1, 0], [-s, 0, c]])
-        found.append((kind, np.array(values[3:7]), (turn @ [xs, ys, zs]).T + np.array([x, y, z])))
+        R = np.array([[c, 0, s], [0, 1, 0], [-s, 0, c]])
+        found.append((kind, np.array(values[3:7]), (R @ [xs, ys, zs]).T + np.array([x, y, z])))
         assert -np.pi <= values[2] <= np.pi
     return found
 
@@ -173,7 +173,7 @@ def read_calibration(path: Path) -> dict[str, np.ndarray]:
 
 
 @pytest.mark.parametrize("which", ["", "_full"])
-def test_kitti_boxes_are_ours_within_a_millimetre(run: Path, tmp_path: Path, which: str) -> None:
+def test_kitti_boxes_match_tables_within_1_mm(run: Path, tmp_path: Path, which: str) -> None:
     """Detectors are trained on whole objects; visible boxes are optional."""
     export_run(run, "kitti", tmp_path, visible_boxes=not which)
     out = tmp_path / "table"
@@ -181,13 +181,13 @@ def test_kitti_boxes_are_ours_within_a_millimetre(run: Path, tmp_path: Path, whi
     worst = 0.0
     with (out / "frames.csv").open() as file:
         index = list(csv.DictReader(file))
-    ours = boxes(run, which)
+    table_boxes = boxes(run, which)
     for entry in index:
         calibration = read_calibration(out / "calib" / f"{entry['number']}.txt")
         sensor_from_rectified = np.linalg.inv(camera) @ calibration["P2"][:, :3]
         assert_allclose(sensor_from_rectified @ sensor_from_rectified.T, np.eye(3), atol=1e-6)
         labels = read_kitti(out / "label_2" / f"{entry['number']}.txt")
-        expected = ours[int(entry["frame"])]
+        expected = table_boxes[int(entry["frame"])]
         assert len(labels) == len(expected)
         for (_, _, corners), (_, meant) in zip(labels, expected, strict=True):
             worst = max(worst, farthest(corners @ sensor_from_rectified.T, meant))
@@ -197,8 +197,8 @@ def test_kitti_boxes_are_ours_within_a_millimetre(run: Path, tmp_path: Path, whi
     assert {"wine_glass", "unknown"} <= kinds
 
 
-def test_kitti_points_fall_on_their_pixels(run: Path, tmp_path: Path) -> None:
-    """Boxes, points and image are tied by calib alone."""
+def test_kitti_points_project_to_their_pixels(run: Path, tmp_path: Path) -> None:
+    """Only the calibration connects boxes, points and image."""
     export_run(run, "kitti", tmp_path, every=6)
     out = tmp_path / "table"
     for number in ("000000", "000001"):
@@ -214,8 +214,8 @@ def test_kitti_points_fall_on_their_pixels(run: Path, tmp_path: Path) -> None:
             low, high = corners.min(axis=0) - 1e-3, corners.max(axis=0) + 1e-3
             box = ((rectified > low) & (rectified < high)).all(axis=1)
             inside = pixels[box]
-            seen = (inside > [left - 1, top - 1]) & (inside < [right + 1, bottom + 1])
-            assert seen.all(axis=1).mean() > 0.5
+            visible = (inside > [left - 1, top - 1]) & (inside < [right + 1, bottom + 1])
+            assert visible.all(axis=1).mean() > 0.5
 
 
 def intrinsics(run: Path) -> np.ndarray:
@@ -227,15 +227,15 @@ def intrinsics(run: Path) -> np.ndarray:
 
 
 @pytest.mark.parametrize("up", [(0, -1, 0), (0, -0.8, -0.6), (0, -0.02, -1), (0.1, -0.7, 0.7)])
-def test_the_rectified_camera_is_level(up: tuple[float, ...]) -> None:
-    turn = rectified_from_sensor(np.array(up), optical=True)
+def test_rectified_camera_is_level(up: tuple[float, ...]) -> None:
+    rotation = rectified_from_sensor(np.array(up), optical=True)
 
-    assert_allclose(turn @ turn.T, np.eye(3), atol=1e-12)
-    assert np.linalg.det(turn) == pytest.approx(1)
-    assert_allclose(turn @ up / np.linalg.norm(up), [0, -1, 0], atol=1e-12)
+    assert_allclose(rotation @ rotation.T, np.eye(3), atol=1e-12)
+    assert np.linalg.det(rotation) == pytest.approx(1)
+    assert_allclose(rotation @ up / np.linalg.norm(up), [0, -1, 0], atol=1e-12)
 
 
-def test_labelcloud_formats_say_the_same(run: Path, tmp_path: Path) -> None:
+def test_labelcloud_formats_agree(run: Path, tmp_path: Path) -> None:
     """Read as labelCloud 1.1 reads them: centroid and size, or the result of its vertex loader."""
     export_run(run, "labelcloud", tmp_path, every=3)
     out = tmp_path / "table"
@@ -246,9 +246,9 @@ def test_labelcloud_formats_say_the_same(run: Path, tmp_path: Path) -> None:
             json.loads((out / folder / name).read_text())["objects"]
             for folder in ("labels", "labels_centroid_abs", "labels_vertices")
         ]
-        ours = boxes(run)[3 * int(cloud.stem)]
-        assert [len(kind) for kind in kinds] == [len(ours)] * 3
-        for relative, absolute, vertices, (_, meant) in zip(*kinds, ours, strict=True):
+        table_boxes = boxes(run)[3 * int(cloud.stem)]
+        assert [len(kind) for kind in kinds] == [len(table_boxes)] * 3
+        for relative, absolute, vertices, (_, meant) in zip(*kinds, table_boxes, strict=True):
             radians, degrees = relative["rotations"]["z"], absolute["rotations"]["z"]
             assert 0 <= degrees < 360
             assert_allclose(np.exp(1j * radians), np.exp(1j * np.radians(degrees)), atol=1e-6)
@@ -271,10 +271,10 @@ def test_labelcloud_formats_say_the_same(run: Path, tmp_path: Path) -> None:
     assert worst < 1e-5
 
 
-def test_runs_exported_together_number_their_categories_alike(
+def test_runs_exported_together_share_category_numbers(
     shapecat: Run, run: Path, tmp_path: Path
 ) -> None:
-    """The first new category of each run had the same number: apples would be learned as zebras."""
+    """Otherwise the first new category of each run would get the same number."""
     image = pytest.importorskip("PIL.Image")
     labels = {"a": "zebra", "b": "apple"}
     for name, label in labels.items():
@@ -296,7 +296,7 @@ def test_runs_exported_together_number_their_categories_alike(
         assert legends[0][str(number)] == label
 
 
-def test_masks_label_the_pixels_of_each_object(run: Path, tmp_path: Path) -> None:
+def test_point_labels_match_pixels_of_each_object(run: Path, tmp_path: Path) -> None:
     image = pytest.importorskip("PIL.Image")
     export_run(run, "point-labels", tmp_path)
     out = tmp_path / "table"
@@ -329,7 +329,7 @@ def test_masks_label_the_pixels_of_each_object(run: Path, tmp_path: Path) -> Non
         assert ((instance > 0) == (semantic > 0)).all()
 
 
-def test_loose_clouds_get_semantic_kitti_labels(tmp_path: Path) -> None:
+def test_unorganised_clouds_get_semantic_kitti_labels(tmp_path: Path) -> None:
     points = np.array([[1, 0, 0], [np.nan] * 3, [2, 0, 0], [3, 0, 0]], np.float32)
     item = LabelledObject(
         track=513,
@@ -361,8 +361,8 @@ def test_loose_clouds_get_semantic_kitti_labels(tmp_path: Path) -> None:
         write_point_labels(tmp_path, [], many)
 
 
-def test_a_run_is_never_replaced_by_its_export(run: Path) -> None:
-    """`--out results` names the folder in which the run itself lies."""
+def test_export_never_replaces_its_run(run: Path) -> None:
+    """`--out results` names the folder that contains the run."""
     before = sorted(path.name for path in run.iterdir())
 
     with pytest.raises(OutputError, match="choose another --out"):
@@ -371,7 +371,7 @@ def test_a_run_is_never_replaced_by_its_export(run: Path) -> None:
     assert sorted(path.name for path in run.iterdir()) == before
 
 
-def test_exports_of_one_format_replace_each_other(run: Path, tmp_path: Path) -> None:
+def test_export_replaces_only_export_of_same_format(run: Path, tmp_path: Path) -> None:
     for _ in range(2):
         export_run(run, "point-labels", tmp_path, every=6)
     assert len(list((tmp_path / "table" / "semantic").iterdir())) == 2
@@ -380,14 +380,14 @@ def test_exports_of_one_format_replace_each_other(run: Path, tmp_path: Path) -> 
         export_run(run, "kitti", tmp_path)
 
 
-def test_a_recording_that_is_gone_or_changed_is_refused(run: Path, tmp_path: Path) -> None:
+def test_missing_or_changed_recording_is_refused(run: Path, tmp_path: Path) -> None:
     folder = tmp_path / "table"
     shutil.copytree(run, folder)
-    about = json.loads((folder / "run.json").read_text())
-    source = Path(about["input"]["path"])
+    info = json.loads((folder / "run.json").read_text())
+    source = Path(info["input"]["path"])
     copy = tmp_path / "copy.mcap"
-    about["input"]["path"] = str(copy)
-    (folder / "run.json").write_text(json.dumps(about))
+    info["input"]["path"] = str(copy)
+    (folder / "run.json").write_text(json.dumps(info))
 
     with pytest.raises(RecordingError):
         export_run(folder, "crops", tmp_path / "crops")
@@ -399,7 +399,7 @@ def test_a_recording_that_is_gone_or_changed_is_refused(run: Path, tmp_path: Pat
     assert not (tmp_path / "crops").exists()
 
 
-def test_the_command_names_what_it_wrote(shapecat: Run, run: Path, tmp_path: Path) -> None:
+def test_export_command_reports_views_and_errors(shapecat: Run, run: Path, tmp_path: Path) -> None:
     result = shapecat("export", run, "--format", "crops", "--out", tmp_path / "c", "--every", 6)
 
     assert result.exit_code == 0
@@ -410,13 +410,13 @@ def test_the_command_names_what_it_wrote(shapecat: Run, run: Path, tmp_path: Pat
     assert "no run.json" in missing.output
 
 
-def test_scene_prints_what_stands_on_what(shapecat: Run, run: Path) -> None:
+def test_scene_prints_plane_and_known_tracks(shapecat: Run, run: Path) -> None:
     result = shapecat("scene", run, "--frame", 5)
 
     assert result.exit_code == 0, result.output
     assert result.stdout.startswith("plane 0")
     known = {str(row.track) for row in read_track_table(run / "tracks.csv").rows}
-    named = {line.split("#")[1].split(":")[0] for line in result.stdout.splitlines() if "#" in line}
-    assert len(named) > 4
-    assert named <= known - {"1"}
+    found = {line.split("#")[1].split(":")[0] for line in result.stdout.splitlines() if "#" in line}
+    assert len(found) > 4
+    assert found <= known - {"1"}
     assert shapecat("scene", run, "--frame", 99).exit_code == 1

@@ -1,4 +1,4 @@
-"""Image data sets: their contents, read back as training code reads them."""
+"""Tests of image data sets, read back as training code reads them."""
 
 import csv
 import io
@@ -27,7 +27,7 @@ from tests.test_exports import relabel
 
 Run = Callable[..., Result]
 BAND_PX = 6
-"""Outlines move by three pixels of the depth image, and smoothing may take a corner along."""
+"""Outlines may move by three pixels of the depth image, and corners a little more."""
 
 
 @pytest.fixture(scope="module")
@@ -64,10 +64,7 @@ def decoded(segmentation: dict[str, Any]) -> np.ndarray:
     return flat.reshape(width, height).T
 
 
-def test_coco_holds_images_as_they_came_and_the_masks_of_the_tracks(
-    run: Path, tmp_path: Path
-) -> None:
-    """Every number in the file is one that a trainer relies on."""
+def test_coco_has_original_images_and_masks_of_tracks(run: Path, tmp_path: Path) -> None:
     count = export_dataset([run], "coco", tmp_path / "out", Selection()).objects
 
     data = read_coco(tmp_path / "out")
@@ -104,36 +101,34 @@ def nearest(box: list[int], others: Iterable[tuple[int, int, int, int]]) -> int:
     return min(int(np.abs(np.add(o, [0, 0, *o[:2]]) - sides).max()) for o in others)
 
 
-def test_masks_of_a_data_set_lie_on_the_edges_of_the_colours(
-    coloured_run: Path, tmp_path: Path
-) -> None:
+def test_exported_masks_follow_colour_edges(coloured_run: Path, tmp_path: Path) -> None:
     """Models learn the outlines of masks, and depth alone is off by a pixel or two."""
     export_dataset([coloured_run], "coco", tmp_path / "out", Selection())
     true = np.load(coloured_run.parents[1] / "table.color_labels.npz")["labels"]
     data = read_coco(tmp_path / "out")
     frames = {image["id"]: image["frame"] for image in data["images"]}
-    of_depth = {frame: masks for (_, frame), masks in read_masks(coloured_run)}
+    depth_masks = {frame: masks for (_, frame), masks in read_masks(coloured_run)}
     overlaps = []
     for row in data["annotations"]:
         frame, mask = frames[row["image_id"]], decoded(row["segmentation"])
-        own = np.bincount(true[frame][mask])[20:].argmax() + 20 == true[frame]
-        depth = of_depth[frame]
+        true_mask = np.bincount(true[frame][mask])[20:].argmax() + 20 == true[frame]
+        depth = depth_masks[frame]
         pairs = [
             (nearest(row["bbox"], [box]), mask_of(depth, [n]).full(*mask.shape))
             for n, box in depth.boxes.items()
         ]
         before = min(pairs, key=lambda pair: pair[0])[1]
-        overlaps.append([(m & own).sum() / (m | own).sum() for m in (before, mask)])
+        overlaps.append([(m & true_mask).sum() / (m | true_mask).sum() for m in (before, mask)])
     before, after = np.mean(overlaps, axis=0)
     assert after > max(0.92, before + 0.015)
 
 
-def test_unsure_labels_are_crowds_and_corrected_ones_always_go(run: Path, tmp_path: Path) -> None:
-    """A wrong label teaches a wrong thing; an object that is merely left out teaches one too."""
+def test_uncertain_labels_are_crowds_but_corrected_ones_are_not(run: Path, tmp_path: Path) -> None:
+    """Training must neither learn a wrong label nor take the object for background."""
     export_dataset([run], "coco", tmp_path / "out", Selection(corrected_only=True))
     data = read_coco(tmp_path / "out")
-    sure = {row["attributes"]["track"] for row in data["annotations"] if not row["iscrowd"]}
-    assert sure == {2}
+    certain = {row["attributes"]["track"] for row in data["annotations"] if not row["iscrowd"]}
+    assert certain == {2}
     assert sum(row["iscrowd"] for row in data["annotations"]) > 5
 
     export_dataset([run], "coco", tmp_path / "out", Selection(min_confidence=1.0))
@@ -142,7 +137,7 @@ def test_unsure_labels_are_crowds_and_corrected_ones_always_go(run: Path, tmp_pa
 
 
 @pytest.mark.parametrize("kind", ["coco", "yolo"])
-def test_export_tells_what_training_will_miss(
+def test_export_warns_about_missing_validation_and_labels(
     run: Path, tmp_path: Path, shapecat: Run, kind: str
 ) -> None:
     """A model without validation images, or one that learns to overlook objects, seems fine."""
@@ -152,14 +147,14 @@ def test_export_tells_what_training_will_miss(
     options = ("--format", kind, "--out", tmp_path / "out")
     done = shapecat("export", run, *options, "--corrected-only")
 
-    told = f"{len(data['images'])} images in train, 0 in val: one recording is never split"
-    assert done.stdout.splitlines()[1:] == [told]
+    line = f"{len(data['images'])} images in train, 0 in val: one recording is never split"
+    assert done.stdout.splitlines()[1:] == [line]
     warning = f"Warning: {crowds} visible objects without a certain label will be background"
     assert (warning in done.stderr) == (kind == "yolo")
     assert shapecat("export", run, *options).stderr == ""
 
 
-def test_yolo_polygons_cover_the_masks(run: Path, tmp_path: Path) -> None:
+def test_yolo_polygons_cover_masks(run: Path, tmp_path: Path) -> None:
     """Classes count from 0 and corners are shares of the image: both are easily mistaken."""
     export_dataset([run], "yolo", tmp_path / "yolo", Selection())
     export_dataset([run], "coco", tmp_path / "coco", Selection())
@@ -168,7 +163,7 @@ def test_yolo_polygons_cover_the_masks(run: Path, tmp_path: Path) -> None:
     text = (tmp_path / "yolo/data.yaml").read_text()
     for number, name in names.items():
         assert f'  {number - 1}: "{name}"\n' in text
-    assert "val: images/train\n" in text  # which must name something
+    assert "val: images/train\n" in text  # the key is required
     for image in data["images"]:
         label = (tmp_path / "yolo/labels/train" / image["file_name"]).with_suffix(".txt")
         rows = [r for r in data["annotations"] if r["image_id"] == image["id"]]
@@ -189,8 +184,7 @@ def drawing(corners: Any, height: int, width: int) -> Any:
     return np.asarray(image.reduce(4)) > 8  # the number of filled sixteenths of each pixel
 
 
-def test_outlines_are_those_of_the_pixels() -> None:
-    """Without tolerance the area of the polygons is that of the parts, whatever their shape."""
+def test_outlines_enclose_all_pixels() -> None:
     rng = np.random.default_rng(2)
     for _ in range(20):
         pixels = np.pad(rng.random((12, 17)) < 0.4, 2)
@@ -201,11 +195,11 @@ def test_outlines_are_those_of_the_pixels() -> None:
             assert part.min(axis=0).tolist() >= [30, 50]
             image |= drawing(part, 70, 60)
         inside = image[50 : 50 + pixels.shape[0], 30 : 30 + pixels.shape[1]]
-        assert (inside | ~pixels).all()  # holes are filled, nothing is lost
+        assert (inside | ~pixels).all()  # holes are filled, no pixel is lost
         assert not np.delete(image, np.s_[50:66], axis=0).any()
 
 
-def test_parts_of_an_object_are_linked_into_one_polygon() -> None:
+def test_parts_of_object_are_joined_into_one_polygon() -> None:
     pixels = np.zeros((20, 40), bool)
     pixels[2:9, 3:14], pixels[10:18, 22:38] = True, True
     parts = outlines(Mask(0, 0, pixels))
@@ -214,8 +208,8 @@ def test_parts_of_an_object_are_linked_into_one_polygon() -> None:
     assert (drawn & pixels).sum() / (drawn | pixels).sum() > 0.95
 
 
-def test_the_parts_come_largest_first_and_their_link_encloses_nothing() -> None:
-    """A picture of an object is framed by its first part; COCO tools compute areas of polygons."""
+def test_outlines_are_sorted_by_area_and_links_add_none() -> None:
+    """The first part frames the crop of an object; COCO tools compute areas of polygons."""
     pixels = np.zeros((20, 40), bool)
     pixels[1:3, 30:34], pixels[4:19, 2:14], pixels[9:15, 20:27] = True, True, True
     parts = outlines(Mask(100, 70, pixels), 0.0)
@@ -242,7 +236,7 @@ def test_depth_images_are_millimetres_with_their_own_masks(run: Path, tmp_path: 
     assert all(row["segmentation"]["size"] == [480, 640] for row in data["annotations"])
 
 
-def test_a_run_without_colour_says_what_to_do(
+def test_run_without_colour_suggests_depth_option(
     guessed_run: Path, tmp_path: Path, shapecat: Run
 ) -> None:
     result = shapecat("export", guessed_run, "--format", "coco", "--out", tmp_path / "out")
@@ -257,9 +251,9 @@ def test_several_runs_make_one_data_set_split_by_recording(
     """Frames of one recording in both splits would make any model look good."""
     other = tmp_path / "other"
     shutil.copytree(coloured_run, other)
-    about = json.loads((other / "run.json").read_text())
-    about["input"]["digest"] = "xxh3-128:another"
-    (other / "run.json").write_text(json.dumps(about))
+    info = json.loads((other / "run.json").read_text())
+    info["input"]["digest"] = "xxh3-128:another"
+    (other / "run.json").write_text(json.dumps(info))
     found = export_dataset([run, other], "coco", tmp_path / "out", Selection(val=0.5))
 
     both = [read_coco(tmp_path / "out", split) for split in ("train", "val")]
@@ -273,8 +267,8 @@ def test_several_runs_make_one_data_set_split_by_recording(
     assert both[0]["categories"] == both[1]["categories"]
 
 
-def test_runs_of_the_same_name_have_their_own_images(coloured_run: Path, tmp_path: Path) -> None:
-    """The images of one would replace those of the other, under both their masks."""
+def test_runs_with_equal_names_keep_their_images(coloured_run: Path, tmp_path: Path) -> None:
+    """The images of one run would replace those of the other."""
     for day in ("monday", "tuesday"):
         shutil.copytree(coloured_run, tmp_path / day / "lab 1")
     runs = [tmp_path / day / "lab 1" for day in ("monday", "tuesday")]
@@ -284,11 +278,11 @@ def test_runs_of_the_same_name_have_their_own_images(coloured_run: Path, tmp_pat
     names = [image["file_name"] for image in images]
     assert len(set(names)) == len(names) == 2 * len([n for n in names if "lab 1_" in n])
     assert all(list((tmp_path / "out").rglob(Path(name).name)) for name in names)
-    about = json.loads((tmp_path / "out" / "export.json").read_text())
-    assert list(about["runs"]) == ["lab 1", "lab 1-2"]
+    info = json.loads((tmp_path / "out" / "export.json").read_text())
+    assert list(info["runs"]) == ["lab 1", "lab 1-2"]
 
 
-def test_a_recording_is_never_in_both_splits() -> None:
+def test_recording_is_never_in_both_splits() -> None:
     def finished(name: str, digest: str) -> FinishedRun:
         run: Any = {"input": {"digest": digest}}
         return FinishedRun(Path(name), run, {})
@@ -303,7 +297,7 @@ def test_a_recording_is_never_in_both_splits() -> None:
         split_runs(runs, 1.0)
 
 
-def test_frames_are_thinned_by_number_and_by_novelty_of_view(run: Path, tmp_path: Path) -> None:
+def test_frames_are_selected_by_interval_and_by_track(run: Path, tmp_path: Path) -> None:
     export_dataset([run], "coco", tmp_path / "every", Selection(every=2))
     assert [i["frame"] for i in read_coco(tmp_path / "every")["images"]] == [0, 2]
     export_dataset([run], "coco", tmp_path / "track", Selection(per_track=1, corrected_only=True))
@@ -311,7 +305,7 @@ def test_frames_are_thinned_by_number_and_by_novelty_of_view(run: Path, tmp_path
     assert image["frame"] in {frame for (_, frame), _ in read_masks(run)}
 
 
-def test_only_an_earlier_export_is_replaced(run: Path, tmp_path: Path) -> None:
+def test_only_earlier_export_is_replaced(run: Path, tmp_path: Path) -> None:
     out = tmp_path / "out"
     export_dataset([run], "coco", out, Selection())
     export_dataset([run], "coco", out, Selection(every=2))
@@ -332,10 +326,10 @@ def test_only_an_earlier_export_is_replaced(run: Path, tmp_path: Path) -> None:
         ("--val", "0.2"),
     ],
 )
-def test_options_of_data_sets_are_refused_elsewhere(
+def test_data_set_options_are_refused_by_other_formats(
     run: Path, tmp_path: Path, shapecat: Run, option: str, value: str
 ) -> None:
-    """An option that is ignored without a word leaves a person with another export than asked."""
+    """An ignored option would silently give another export than requested."""
     out = tmp_path / "out"
     result = shapecat("export", run, "--format", "kitti", "--out", out, option, *value.split())
     assert result.exit_code == 2
@@ -344,10 +338,9 @@ def test_options_of_data_sets_are_refused_elsewhere(
 
 
 @pytest.mark.parametrize("kind", ["coco", "yolo", "crops", "point-labels"])
-def test_boxes_are_refused_by_formats_without_them(
+def test_boxes_option_is_refused_by_formats_without_boxes(
     run: Path, tmp_path: Path, shapecat: Run, kind: str
 ) -> None:
-    """The option was ignored without a word."""
     out = tmp_path / "out"
     result = shapecat("export", run, "--format", kind, "--out", out, "--boxes", "visible")
     assert result.exit_code == 2
@@ -355,7 +348,7 @@ def test_boxes_are_refused_by_formats_without_them(
     assert not out.exists()
 
 
-def test_kitti_boxes_project_onto_the_colour_image(run: Path, tmp_path: Path) -> None:
+def test_kitti_boxes_project_onto_colour_image(run: Path, tmp_path: Path) -> None:
     """P2, the 3D boxes and the image are three files that must describe the same camera."""
     export_run(run, "kitti", tmp_path)
     folder = tmp_path / "table"
@@ -378,31 +371,31 @@ def test_kitti_boxes_project_onto_the_colour_image(run: Path, tmp_path: Path) ->
             corners = np.array([[i, j, m] for i in (-1, 1) for j in (0, -1) for m in (-1, 1)])
             local = corners * (half + np.array([0, h, 0]))
             c, s = np.cos(yaw), np.sin(yaw)
-            turned = local @ np.array([[c, 0, s], [0, 1, 0], [-s, 0, c]]).T + (x, y, z)
-            seen = np.column_stack([turned, np.ones(8)]) @ p2.T
-            u, v = (seen[:, :2] / seen[:, 2:]).T
+            placed = local @ np.array([[c, 0, s], [0, 1, 0], [-s, 0, c]]).T + (x, y, z)
+            projected = np.column_stack([placed, np.ones(8)]) @ p2.T
+            u, v = (projected[:, :2] / projected[:, 2:]).T
             if right < 955 and bottom < 715 and left > 5 and top > 5:
                 assert u.min() - 6 <= left <= right <= u.max() + 6
                 assert v.min() - 6 <= top <= bottom <= v.max() + 6
-                # The lens bends by a few pixels: the middle of a box is on something.
+                # The lens distorts by a few pixels: the middle of a box is still on an object.
                 middle = labels[k, int((top + bottom) / 2), int((left + right) / 2)]
                 checked += middle >= 20
     assert checked > 10
 
 
-def test_a_damaged_image_costs_only_itself(run: Path, tmp_path: Path, monkeypatch: Any) -> None:
+def test_damaged_image_is_skipped(run: Path, tmp_path: Path, monkeypatch: Any) -> None:
     """One bad frame among thousands must not end the export."""
     from shapecat.outputs import dataset_frames  # noqa: PLC0415  to be changed
     from shapecat.recordings import MessageError  # noqa: PLC0415  the same
 
     calls = iter(range(99))
-    whole = pixels_of
+    read = pixels_of
 
     def failing(image: Any) -> Any:
         if next(calls) == 1:
             msg = "jpeg image is damaged"
             raise MessageError(msg)
-        return whole(image)
+        return read(image)
 
     monkeypatch.setattr(dataset_frames, "pixels_of", failing)
     export_dataset([run], "coco", tmp_path / "out", Selection())

@@ -1,4 +1,4 @@
-"""Image data sets read back by other libraries, and every option of the command."""
+"""Tests of image data sets read back by other libraries, and of the export options."""
 
 import json
 import shutil
@@ -29,15 +29,15 @@ def runs(coloured_run: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
     for k in range(RUNS):
         shutil.copytree(coloured_run, folder / f"lab{k}")
         relabel(folder / f"lab{k}", {2: "wine glass"})
-        about = json.loads((folder / f"lab{k}/run.json").read_text())
-        about["input"]["digest"] = f"xxh3-128:{k}"
-        (folder / f"lab{k}/run.json").write_text(json.dumps(about))
+        info = json.loads((folder / f"lab{k}/run.json").read_text())
+        info["input"]["digest"] = f"xxh3-128:{k}"
+        (folder / f"lab{k}/run.json").write_text(json.dumps(info))
     return folder
 
 
 @pytest.fixture(scope="module")
 def coco(runs: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """Return a data set whose labels are sure and not sure."""
+    """Return a data set with certain and uncertain labels."""
     out = tmp_path_factory.mktemp("readback") / "coco"
     export_dataset([runs / "lab0"], "coco", out, Selection(corrected_only=True))
     return out
@@ -46,7 +46,7 @@ def coco(runs: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
 @pytest.fixture
 def supervision() -> Iterator[Any]:
     with warnings.catch_warnings():
-        warnings.simplefilter("ignore")  # it tells of itself on import
+        warnings.simplefilter("ignore")  # it warns on import
         yield import_module("supervision")
 
 
@@ -61,7 +61,7 @@ def rows(out: Path) -> list[dict[str, Any]]:
 
 
 @pytest.mark.filterwarnings("ignore::DeprecationWarning")  # of its compiled part
-def test_the_coco_api_reads_masks_boxes_ids_and_crowds(coco: Path) -> None:
+def test_coco_api_reads_masks_boxes_ids_and_crowds(coco: Path) -> None:
     read = import_module("pycocotools.coco").COCO(str(coco / "annotations/instances_train.json"))
     rle = import_module("pycocotools.mask")
     data = read_coco(coco)
@@ -80,8 +80,8 @@ def test_the_coco_api_reads_masks_boxes_ids_and_crowds(coco: Path) -> None:
 
 
 @pytest.mark.filterwarnings("ignore::DeprecationWarning")  # of its compiled part
-def test_labels_evaluated_against_themselves_are_perfect(coco: Path) -> None:
-    """The evaluation of the COCO challenge, which most training reports."""
+def test_labels_score_perfectly_against_themselves(coco: Path) -> None:
+    """In the evaluation of the COCO challenge, which most training code reports."""
     path = str(coco / "annotations/instances_train.json")
     truth = import_module("pycocotools.coco").COCO(path)
     found = truth.loadRes([row for row in truth.dataset["annotations"] if not row["iscrowd"]])
@@ -115,7 +115,7 @@ def test_supervision_reads_coco(coco: Path, supervision: Any) -> None:
 
 
 def test_supervision_reads_yolo(runs: Path, tmp_path: Path, supervision: Any) -> None:
-    """Polygons cover the masks that COCO has of the same objects."""
+    """YOLO polygons cover the COCO masks of the same objects."""
     export_dataset([runs / "lab0"], "yolo", tmp_path / "yolo", Selection())
     export_dataset([runs / "lab0"], "coco", tmp_path / "coco", Selection())
     data = read_coco(tmp_path / "coco")
@@ -138,8 +138,8 @@ def test_supervision_reads_yolo(runs: Path, tmp_path: Path, supervision: Any) ->
             assert (mask & true).sum() / (mask | true).sum() > 0.9
 
 
-def test_the_layout_is_the_one_that_cvat_imports(coco: Path) -> None:
-    """images/SUBSET and annotations/instances_SUBSET.json, as its format COCO 1.0 asks for."""
+def test_coco_layout_is_importable_by_cvat(coco: Path) -> None:
+    """CVAT's COCO 1.0 needs images/SUBSET and annotations/instances_SUBSET.json."""
     for path in (coco / "annotations").iterdir():
         subset = path.stem.removeprefix("instances_")
         data = json.loads(path.read_text())
@@ -155,7 +155,7 @@ def test_the_layout_is_the_one_that_cvat_imports(coco: Path) -> None:
             assert {"id", "category_id", "segmentation", "area", "bbox", "iscrowd"} <= row.keys()
 
 
-def test_a_folder_of_five_runs_is_one_data_set_split_by_recording(
+def test_folder_of_runs_becomes_data_set_split_by_recording(
     runs: Path, tmp_path: Path, shapecat: Run
 ) -> None:
     export(shapecat, runs, tmp_path / "out", "--format", "coco", "--val", "0.4")
@@ -172,10 +172,9 @@ def test_a_folder_of_five_runs_is_one_data_set_split_by_recording(
         assert len(files) == len(read_coco(tmp_path / "out", split)["images"])
 
 
-def test_options_choose_frames_and_labels_at_the_door(
+def test_command_options_select_frames_and_labels(
     runs: Path, tmp_path: Path, shapecat: Run
 ) -> None:
-    """Each option alone, from the command to the file."""
     for name in ("lab0", "lab1"):
         shutil.copytree(runs / name, tmp_path / "two" / name)
     found = {}
@@ -208,7 +207,7 @@ def test_options_choose_frames_and_labels_at_the_door(
         assert row["iscrowd"] == (row["attributes"]["track"] != 2)
 
 
-def test_depth_images_at_the_door_have_16_bits(runs: Path, tmp_path: Path, shapecat: Run) -> None:
+def test_exported_depth_images_have_16_bits(runs: Path, tmp_path: Path, shapecat: Run) -> None:
     export(shapecat, runs / "lab0", tmp_path / "out", "--format", "yolo", "--depth")
     files = sorted((tmp_path / "out/images/train").iterdir())
 

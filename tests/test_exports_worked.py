@@ -1,4 +1,4 @@
-"""Exports of a rotated box, worked out by hand and read as each format is specified."""
+"""Tests of exports of a rotated box, worked out by hand and read as specified."""
 
 import json
 import re
@@ -45,9 +45,9 @@ PIXELS = [(40, 70), (41, 70), (63, 92), (52, 81)]
 
 
 def labelled(*, cut: bool, hidden: bool) -> LabelledFrame:
-    turn = LEVEL_FROM_SENSOR.inv()
-    axes = turn.apply(AXES).T
-    box = Box(turn.apply(CENTER), SIZE, Rotation.from_matrix(axes).as_quat())
+    rotation = LEVEL_FROM_SENSOR.inv()
+    axes = rotation.apply(AXES).T
+    box = Box(rotation.apply(CENTER), SIZE, Rotation.from_matrix(axes).as_quat())
     indices = np.array(sorted(v * CAMERA.width + u for u, v in PIXELS), np.uint32)
     item = LabelledObject(
         4, "bowl", 0.9, box, indices, NeuralGas(np.zeros((0, 3)), np.zeros((0, 2))),
@@ -57,25 +57,21 @@ def labelled(*, cut: bool, hidden: bool) -> LabelledFrame:
 
 
 def frame() -> Frame:
-    """Return a depth image of a wall that is not parallel to it."""
+    """Return the depth image of a slanted wall."""
     v, u = np.mgrid[:120, :160]
     depth = (1.2 + 0.003 * u + 0.002 * v).astype(np.float32)
     return Frame("/depth", 0, 5, 6, "optical", depth, CAMERA)
 
 
 def kitti(folder: Path, *, cut: bool, hidden: bool) -> list[str]:
-    seen: Any = [(labelled(cut=cut, hidden=hidden), frame(), None)]
+    views: Any = [(labelled(cut=cut, hidden=hidden), frame(), None)]
     unused: Any = SimpleNamespace()
-    assert write_kitti(folder, seen, unused) == 1
+    assert write_kitti(folder, views, unused) == 1
     return (folder / "label_2" / "000000.txt").read_text().split()
 
 
-def test_kitti_line_is_the_one_worked_out_by_hand(tmp_path: Path) -> None:
-    """Every number in its place and with its sign.
-
-    The bottom lies half a height below the centre; alpha is the yaw less the bearing of the box,
-    which lies to the left: so it is larger than the yaw.
-    """
+def test_kitti_line_matches_hand_calculation(tmp_path: Path) -> None:
+    """The position is the bottom of the box; alpha is the yaw minus the bearing."""
     kind, truncated, occluded, *words = kitti(tmp_path, cut=True, hidden=False)
     alpha, *box = map(float, words[:5])
     height, width, length, x, y, z, yaw = map(float, words[5:])
@@ -89,12 +85,12 @@ def test_kitti_line_is_the_one_worked_out_by_hand(tmp_path: Path) -> None:
     assert box == [40, 70, 63, 92]
 
 
-def test_kitti_tells_cut_from_hidden(tmp_path: Path) -> None:
-    """Truncated is left to right cut by the image; occluded is hidden by something else."""
+def test_kitti_distinguishes_truncated_from_occluded(tmp_path: Path) -> None:
+    """Truncated is cut by the image border; occluded is hidden by another object."""
     assert kitti(tmp_path, cut=False, hidden=True)[1:3] == ["0.0", "1"]
 
 
-def test_kitti_calibration_leads_from_points_to_pixels(tmp_path: Path) -> None:
+def test_kitti_calibration_projects_points_to_pixels(tmp_path: Path) -> None:
     kitti(tmp_path, cut=False, hidden=False)
     lines = (tmp_path / "calib" / "000000.txt").read_text().splitlines()
     matrices = {
@@ -115,8 +111,8 @@ def test_kitti_calibration_leads_from_points_to_pixels(tmp_path: Path) -> None:
     assert (points[:, 3] == 0).all()
 
 
-def test_kitti_calibration_leads_to_the_pixels_of_a_colour_camera_beside_it(tmp_path: Path) -> None:
-    """Its pose is in P2, and its pixels are those of the 2D box."""
+def test_kitti_calibration_projects_points_into_colour_camera(tmp_path: Path) -> None:
+    """P2 contains the pose of the camera, and the 2D box is in its pixels."""
     camera = Camera(200, 150, 171.0, 166.0, 103.2, 71.5)
     pose = Pose(
         Rotation.from_euler("xyz", [0.05, -0.08, 0.03]).as_matrix(), np.array([0.06, -0.02, 0.01])
@@ -124,9 +120,9 @@ def test_kitti_calibration_leads_to_the_pixels_of_a_colour_camera_beside_it(tmp_
     data = np.zeros((150, 200, 3), np.uint8).tobytes()
     image = ColourImage("/color", 5, 6, "color", "rgb8", 200, 150, 600, data)
     view = ColourView(image, LensCamera(camera), pose)
-    seen: Any = [(labelled(cut=False, hidden=False), frame(), Coloured(view, ()))]
+    views: Any = [(labelled(cut=False, hidden=False), frame(), Coloured(view, ()))]
     unused: Any = SimpleNamespace()
-    assert write_kitti(tmp_path, seen, unused) == 1
+    assert write_kitti(tmp_path, views, unused) == 1
 
     x, y, z = (frame().xyz() @ pose.rotation.T + pose.translation).T
     u, v = 171.0 * x / z + 103.2, 166.0 * y / z + 71.5
@@ -145,15 +141,15 @@ def test_kitti_calibration_leads_to_the_pixels_of_a_colour_camera_beside_it(tmp_
     assert box == np.rint([*low, *high]).tolist()
     assert (tmp_path / "image_2" / "000000.png").exists()
 
-    # The rotation between the cameras must not turn the boxes that are read back.
+    # The rotation between the cameras must not rotate the boxes that are read back.
     (tmp_path / "frames.csv").write_text("number,topic,frame,stamp_ns\n000000,/depth,0,5\n")
     found = KittiLabels(tmp_path, ["bowl"]).at(("/depth", 0), 5)
     assert found is not None
     back, item = found.items[0].box, labelled(cut=False, hidden=False).objects[0]
     assert back is not None
     assert_allclose(back.center, item.box.center, atol=2e-5)
-    turn = Rotation.from_quat(back.orientation).inv() * Rotation.from_quat(item.box.orientation)
-    assert turn.magnitude() < 1e-4
+    error = Rotation.from_quat(back.orientation).inv() * Rotation.from_quat(item.box.orientation)
+    assert error.magnitude() < 1e-4
 
 
 @pytest.mark.parametrize(
@@ -166,21 +162,18 @@ def test_kitti_calibration_leads_to_the_pixels_of_a_colour_camera_beside_it(tmp_
     ],
     ids=["left", "top", "right", "bottom"],
 )
-def test_the_box_of_kitti_ends_with_the_colour_image(
+def test_kitti_2d_box_is_clipped_to_colour_image(
     tmp_path: Path, left: int, top: int, width: int, height: int, box: list[int]
 ) -> None:
-    """A colour camera often sees less than the depth sensor; a box ends at the image border.
-
-    It sees what the depth camera sees in a window that cuts the object.
-    """
+    """The colour camera sees a window of the depth image that cuts the object."""
     camera = replace(CAMERA, width=width, height=height, cx=CAMERA.cx - left, cy=CAMERA.cy - top)
     image = ColourImage(
         "/color", 5, 6, "color", "rgb8", width, height, 3 * width, bytes(3 * width * height)
     )
     coloured = Coloured(ColourView(image, LensCamera(camera), IDENTITY), ())
-    seen: Any = [(labelled(cut=False, hidden=False), frame(), coloured)]
+    views: Any = [(labelled(cut=False, hidden=False), frame(), coloured)]
     unused: Any = SimpleNamespace()
-    write_kitti(tmp_path, seen, unused)
+    write_kitti(tmp_path, views, unused)
     words = (tmp_path / "label_2" / "000000.txt").read_text().split()
 
     assert list(map(float, words[4:8])) == box
@@ -194,18 +187,17 @@ def labelcloud(folder: Path) -> None:
 
 
 def corners_of(center: Sequence[float], size: Any, yaw: float) -> Any:
-    turn = Rotation.from_euler("z", yaw)
+    rotation = Rotation.from_euler("z", yaw)
     unit = np.array([[a, b, c] for a in (-1, 1) for b in (-1, 1) for c in (-1, 1)]) / 2
-    return turn.apply(unit * size) + center
+    return rotation.apply(unit * size) + center
 
 
-def apart(a: Any, b: Any) -> float:
+def corner_distance(a: Any, b: Any) -> float:
     """Return the distance between two sets of corners, regardless of their order."""
     return float(np.linalg.norm(a[:, None] - b[None], axis=2).min(axis=1).max())
 
 
-def test_labelcloud_clouds_are_in_the_frame_of_their_boxes(tmp_path: Path) -> None:
-    """Opened with our reader of PCD and with the format's own words."""
+def test_labelcloud_boxes_and_clouds_share_a_frame(tmp_path: Path) -> None:
     labelcloud(tmp_path)
     (item,) = json.loads((tmp_path / "labels" / "000000.json").read_text())["objects"]
     center, size = item["centroid"], item["dimensions"]
@@ -221,32 +213,32 @@ def test_labelcloud_clouds_are_in_the_frame_of_their_boxes(tmp_path: Path) -> No
     points = np.frombuffer(path.read_bytes().split(b"DATA binary\n", 1)[1], "<f4").reshape(-1, 3)
 
     assert item["name"] == "bowl"
-    # The sensor is at the origin of both: from there box and points must look the same.
+    # The sensor is the origin of both frames, so box and points must agree.
     w, x, y, z = map(float, words["VIEWPOINT"][3:])
     level_from_sensor = Rotation.from_quat([x, y, z, w])
     assert_allclose(level_from_sensor.apply(frame().xyz()), points, atol=1e-5)
     assert_allclose(level_from_sensor.apply(UP), [0, 0, 1], atol=1e-5)
     source = labelled(cut=False, hidden=False).objects[0].box
-    turn = Rotation.from_quat(source.orientation)
+    rotation = Rotation.from_quat(source.orientation)
     unit = np.array([[a, b, c] for a in (-1, 1) for b in (-1, 1) for c in (-1, 1)]) / 2
-    meant = level_from_sensor.apply(turn.apply(unit * source.size) + source.center)
-    assert apart(meant, box) < 1e-4
-    assert apart(meant, np.array(vertices["vertices"])) < 1e-4
+    meant = level_from_sensor.apply(rotation.apply(unit * source.size) + source.center)
+    assert corner_distance(meant, box) < 1e-4
+    assert corner_distance(meant, np.array(vertices["vertices"])) < 1e-4
     assert len(read_pcd(path).points) == len(points)
 
 
-def test_identity_is_not_the_pose_of_this_example() -> None:
-    """A turn that changes nothing would let every mistake pass."""
+def test_example_pose_is_not_identity() -> None:
+    """An identity rotation would hide mistakes."""
     assert np.abs(LEVEL_FROM_SENSOR.as_matrix() - IDENTITY.rotation).max() > 0.3
 
 
-def test_kitti_of_a_cloud_has_no_pixels(tmp_path: Path) -> None:
-    """Loose points have no image: by the specification, the 2D box is -1 four times."""
+def test_kitti_2d_box_of_cloud_is_minus_one(tmp_path: Path) -> None:
+    """An unorganised cloud has no image; the specification asks for -1."""
     points = frame().xyz()
     cloud = Frame("/scan", 0, 5, 6, "laser", points=points)
-    seen: Any = [(labelled(cut=False, hidden=False), cloud, None)]
+    views: Any = [(labelled(cut=False, hidden=False), cloud, None)]
     unused: Any = SimpleNamespace()
-    write_kitti(tmp_path, seen, unused)
+    write_kitti(tmp_path, views, unused)
     words = (tmp_path / "label_2" / "000000.txt").read_text().split()
 
     assert list(map(float, words[4:8])) == [-1, -1, -1, -1]
@@ -254,25 +246,25 @@ def test_kitti_of_a_cloud_has_no_pixels(tmp_path: Path) -> None:
     assert len(rows) == len(points)
 
 
-def test_the_cloud_of_a_level_lidar_stays_as_it_is_in_kitti(tmp_path: Path) -> None:
-    """Taken for a camera that looks up, its points and boxes would be turned on their side."""
+def test_kitti_keeps_cloud_of_level_lidar(tmp_path: Path) -> None:
+    """Treated as a camera that looks up, its points would be rotated onto their side."""
     points = np.array([[4.0, 1.0, -0.5], [2.0, -3.0, 0.25]], np.float32)
     level = replace(labelled(cut=False, hidden=False), up=np.array([0.0, 0.0, 1.0]), objects=())
-    seen: Any = [(level, Frame("/scan", 0, 5, 6, "laser", points=points), None)]
+    views: Any = [(level, Frame("/scan", 0, 5, 6, "laser", points=points), None)]
     unused: Any = SimpleNamespace()
-    write_kitti(tmp_path, seen, unused)
+    write_kitti(tmp_path, views, unused)
 
     rows = np.fromfile(tmp_path / "velodyne" / "000000.bin", "<f4").reshape(-1, 4)
     assert_allclose(rows[:, :3], points, atol=1e-6)
 
 
 @pytest.mark.parametrize(("up", "forward"), [((0, 0, 1), (1, 0, 0)), ((0.3, 0, 0.95), (1, 0, 0))])
-def test_a_lidar_looks_along_its_x_axis(up: Any, forward: Any) -> None:
+def test_lidar_looks_along_its_x_axis(up: Any, forward: Any) -> None:
     """REP 103: x forward, y left, z up; a camera looks along z."""
-    turn = rectified_from_sensor(np.array(up), optical=False)
+    rotation = rectified_from_sensor(np.array(up), optical=False)
 
-    assert turn[2] @ np.array(forward) > 0.9  # the rectified z axis, in the sensor frame
-    assert turn[0] @ np.array([0, -1, 0]) > 0.9  # x is right
+    assert rotation[2] @ np.array(forward) > 0.9  # the rectified z axis, in the sensor frame
+    assert rotation[0] @ np.array([0, -1, 0]) > 0.9  # x is right
 
 
 def test_crops_of_two_cameras_do_not_replace_each_other(tmp_path: Path) -> None:
@@ -297,39 +289,39 @@ def test_crops_of_two_cameras_do_not_replace_each_other(tmp_path: Path) -> None:
 
 
 def dataset_image() -> DatasetImage:
-    """Return an image of 40 x 20 pixels with two objects; the second one is not sure."""
+    """Return an image of 40 x 20 pixels with two objects; the second label is uncertain."""
     first, second = labelled(cut=False, hidden=True).objects[0], labelled(cut=True, hidden=False)
     corner = np.zeros((6, 8), bool)
     corner[:2], corner[:, :3] = True, True  # 16 pixels above, and 12 of the foot below
     masks = (Mask(20, 5, corner), Mask(1, 2, np.ones((3, 4), bool)))
-    unsure = replace(second.objects[0], track=9, category="cup", confidence=0.4)
+    uncertain = replace(second.objects[0], track=9, category="cup", confidence=0.4)
     view = labelled(cut=False, hidden=False)
-    return DatasetImage("a.jpg", b"jpeg", 40, 20, view, (first, unsure), masks, (True, False))
+    return DatasetImage("a.jpg", b"jpeg", 40, 20, view, (first, uncertain), masks, (True, False))
 
 
 def finished() -> Any:
     return SimpleNamespace(folder=Path("runs/lab"), name="lab")
 
 
-def test_coco_keeps_every_number_in_its_place(tmp_path: Path) -> None:
+def test_coco_entries_have_right_values(tmp_path: Path) -> None:
     categories = ("cup", "can", "bowl")
     assert write_coco(tmp_path, [("train", finished(), dataset_image())], categories) == 1
     data = json.loads((tmp_path / "annotations" / "instances_train.json").read_text())
-    (image,), (sure, unsure) = data["images"], data["annotations"]
+    (image,), (first, second) = data["images"], data["annotations"]
     names = {entry["id"]: entry["name"] for entry in data["categories"]}
 
     assert (image["width"], image["height"], image["file_name"]) == (40, 20, "a.jpg")
-    assert [names[a["category_id"]] for a in (sure, unsure)] == ["bowl", "cup"]
-    assert [a["iscrowd"] for a in (sure, unsure)] == [0, 1]
-    assert [a["bbox"] for a in (sure, unsure)] == [[20, 5, 8, 6], [1, 2, 4, 3]]
-    assert [a["area"] for a in (sure, unsure)] == [28, 12]
-    assert sure["segmentation"]["size"] == [20, 40]
-    assert [a["score"] for a in (sure, unsure)] == [0.9, 0.4]
-    assert sure["attributes"] == {"run": "lab", "track": 4, "occluded": True}
-    assert len({a["id"] for a in (sure, unsure)}) == len({a["track_id"] for a in (sure, unsure)})
+    assert [names[a["category_id"]] for a in (first, second)] == ["bowl", "cup"]
+    assert [a["iscrowd"] for a in (first, second)] == [0, 1]
+    assert [a["bbox"] for a in (first, second)] == [[20, 5, 8, 6], [1, 2, 4, 3]]
+    assert [a["area"] for a in (first, second)] == [28, 12]
+    assert first["segmentation"]["size"] == [20, 40]
+    assert [a["score"] for a in (first, second)] == [0.9, 0.4]
+    assert first["attributes"] == {"run": "lab", "track": 4, "occluded": True}
+    assert len({a["id"] for a in (first, second)}) == len({a["track_id"] for a in (first, second)})
 
 
-def test_tracks_of_runs_of_the_same_name_are_different_objects(tmp_path: Path) -> None:
+def test_tracks_of_runs_with_equal_names_have_different_ids(tmp_path: Path) -> None:
     """Two batches may each have a run ``lab``; their tracks 4 must not be one object."""
     runs = [SimpleNamespace(folder=Path(day, "lab"), name="lab") for day in ("monday", "tuesday")]
     images: Any = [("train", run, dataset_image()) for run in runs]
@@ -340,7 +332,7 @@ def test_tracks_of_runs_of_the_same_name_are_different_objects(tmp_path: Path) -
     assert [a["track_id"] for a in data["annotations"]] == [1, 2, 3, 4]
 
 
-def test_yolo_leaves_out_what_is_not_sure(tmp_path: Path) -> None:
+def test_yolo_omits_uncertain_labels(tmp_path: Path) -> None:
     """The format has no flag for uncertain labels, so they would be trained on."""
     categories = ("cup", "can", "bowl")
     assert write_yolo(tmp_path, [("val", finished(), dataset_image())], categories) == 1
@@ -355,17 +347,17 @@ def test_yolo_leaves_out_what_is_not_sure(tmp_path: Path) -> None:
     assert area == pytest.approx(28, abs=14)
 
 
-def test_a_tiny_turn_to_the_right_is_no_full_turn() -> None:
+def test_tiny_negative_yaw_is_not_written_as_360_degrees() -> None:
     """The remainder of a negative rounding error is 360 itself, which labelCloud cannot show."""
     item = labelled(cut=False, hidden=False).objects[0]
     for yaw in (-1e-12, 0.0, 1e-12):
         half = np.array([0, 0, np.sin(yaw / 2), np.cos(yaw / 2)])
-        turned = replace(item, box=Box(np.zeros(3), SIZE, half))
-        assert _described(turned, np.eye(3), "centroid_abs")["rotations"]["z"] == 0
+        rotated = replace(item, box=Box(np.zeros(3), SIZE, half))
+        assert _described(rotated, np.eye(3), "centroid_abs")["rotations"]["z"] == 0
 
 
-def test_files_of_data_sets_tell_frames_runs_and_categories(tmp_path: Path) -> None:
-    """Two runs have a track 4: in the data set they are two. Ids count from 1, in each split.
+def test_data_set_files_have_frames_runs_and_categories(tmp_path: Path) -> None:
+    """Tracks 4 of two runs are different objects; ids of images count from 1 in each split.
 
     Ultralytics would resolve a relative "path" in data.yaml against the current directory.
     """
@@ -414,7 +406,7 @@ def test_files_of_data_sets_tell_frames_runs_and_categories(tmp_path: Path) -> N
     ]  # fmt: skip
 
 
-def test_labelcloud_forms_hold_the_same_box_each_in_its_units(tmp_path: Path) -> None:
+def test_labelcloud_formats_hold_same_box_in_their_units(tmp_path: Path) -> None:
     """Absolute angles are in degrees, from 0 to 360; relative ones in radians."""
     labelcloud(tmp_path)
     relative, absolute = (
@@ -422,16 +414,16 @@ def test_labelcloud_forms_hold_the_same_box_each_in_its_units(tmp_path: Path) ->
         for folder in ("labels", "labels_centroid_abs")
     )
     (a,), (b,) = relative.pop("objects"), absolute.pop("objects")
-    turn = a["rotations"].pop("z"), b["rotations"].pop("z")
+    angles = a["rotations"].pop("z"), b["rotations"].pop("z")
 
     assert a == b
     assert a["dimensions"] == pytest.approx({"length": 0.31, "width": 0.14, "height": 0.23})
     assert (a["rotations"], a["name"]) == ({"x": 0, "y": 0}, "bowl")
-    # The level frame differs from the level camera only by a turn about the vertical.
+    # The level frame differs from the level camera only by a rotation about the vertical.
     assert a["centroid"]["z"] == pytest.approx(-0.52)
     assert np.hypot(a["centroid"]["x"], a["centroid"]["y"]) == pytest.approx(np.hypot(0.37, 1.64))
-    assert turn[1] == pytest.approx(np.degrees(turn[0]) % 360)
-    assert 0.1 < abs(turn[0]) < np.pi
+    assert angles[1] == pytest.approx(np.degrees(angles[0]) % 360)
+    assert 0.1 < abs(angles[0]) < np.pi
     assert relative == absolute == {
         "folder": "pointclouds", "filename": "000000.pcd", "path": "pointclouds/000000.pcd"
     }  # fmt: skip
@@ -446,14 +438,14 @@ def test_labelcloud_forms_hold_the_same_box_each_in_its_units(tmp_path: Path) ->
         ]  # fmt: skip
 
 
-def test_frames_of_kitti_numbers_are_listed(tmp_path: Path) -> None:
-    """It is the only way back from a label to its moment."""
+def test_kitti_lists_frame_of_each_number(tmp_path: Path) -> None:
+    """Only this list leads from a label back to its frame."""
     view = labelled(cut=False, hidden=False)
     other = replace(view, topic="/left", index=17, stamp_ns=12_345, objects=())
-    seen: Any = [(view, frame(), None), (other, frame(), None)]
+    views: Any = [(view, frame(), None), (other, frame(), None)]
     unused: Any = SimpleNamespace()
 
-    assert write_kitti(tmp_path, seen, unused) == 1
+    assert write_kitti(tmp_path, views, unused) == 1
     assert (tmp_path / "frames.csv").read_text() == (
         "number,topic,frame,stamp_ns\n000000,/depth,0,5\n000001,/left,17,12345\n"
     )

@@ -1,4 +1,4 @@
-"""The report: the content of the page, and its behaviour in a browser if there is one."""
+"""Tests of the report: the content of the page, and its behaviour in a browser if there is one."""
 
 import base64
 import io
@@ -54,7 +54,7 @@ def data_of(page: str) -> dict[str, Any]:
     return content
 
 
-def test_every_track_has_a_card_with_its_pictures(reported_run: Path) -> None:
+def test_every_track_has_card_with_pictures(reported_run: Path) -> None:
     text = (reported_run / "report.html").read_text("utf-8")
     table = read_track_table(reported_run / "tracks.csv")
 
@@ -68,8 +68,8 @@ def test_every_track_has_a_card_with_its_pictures(reported_run: Path) -> None:
     assert "drawn from their meshes" not in text
 
 
-def test_page_needs_nothing_from_outside(reported_run: Path) -> None:
-    """It is opened from a stick on a robot without network."""
+def test_page_loads_no_external_files(reported_run: Path) -> None:
+    """It must open on a robot without a network."""
     text = (reported_run / "report.html").read_text("utf-8")
 
     assert not re.findall(r'(?:src|href)="(?!data:|#|\.\./)', text)
@@ -79,7 +79,7 @@ def test_page_needs_nothing_from_outside(reported_run: Path) -> None:
     assert "url(" not in text
 
 
-def test_what_is_not_certain_is_nowhere_shown_as_certain(run: Path, drawn: RunReport) -> None:
+def test_uncertain_labels_are_not_shown_as_certain(run: Path, drawn: RunReport) -> None:
     header, *lines = (run / "tracks.csv").read_text().splitlines()
     track, column = (header.split(",").index(name) for name in ("track", "confidence"))
     shown = {}
@@ -88,7 +88,7 @@ def test_what_is_not_certain_is_nowhere_shown_as_certain(run: Path, drawn: RunRe
         cells[column] = str(confidence)
         lines[k], shown[cells[track]] = ",".join(cells), text
         assert caption(3, "cup", confidence) == f"#3 cup {text}"
-    assert caption(4, "unknown", 0.97) == "#4 unknown"  # it is the confidence of something else
+    assert caption(4, "unknown", 0.97) == "#4 unknown"  # the confidence is that of another category
     (run / "tracks.csv").write_text("\n".join([header, *lines]) + "\n")
     page = replace(drawn, folder=run).page()
 
@@ -97,8 +97,8 @@ def test_what_is_not_certain_is_nowhere_shown_as_certain(run: Path, drawn: RunRe
     assert "100 %" not in page
 
 
-def test_a_page_shows_the_labels_of_now(run: Path, drawn: RunReport) -> None:
-    """A server answers for hours from the same report, while tracks.csv is edited elsewhere."""
+def test_page_shows_current_labels(run: Path, drawn: RunReport) -> None:
+    """A server uses the same report for hours, while other programs edit tracks.csv."""
     report = replace(drawn, folder=run)
     before = report.page(), report.listed("").categories
     track = read_track_table(run / "tracks.csv").rows[0].track
@@ -109,36 +109,36 @@ def test_a_page_shows_the_labels_of_now(run: Path, drawn: RunReport) -> None:
     assert [counts["teapot"] for _, counts in (before, after)] == [0, 1]
 
 
-def test_a_confidence_looks_the_same_as_its_rounding_in_the_table() -> None:
+def test_confidence_text_is_same_after_rounding_in_table() -> None:
     """Cards show it beside the posterior, which is not rounded."""
     for value in np.random.default_rng(0).uniform(0, 0.99, 2000).tolist():
         assert confidence_text(value) == confidence_text(float(f"{value:.3f}"))
         assert abs(float(confidence_text(value)) - value) < 0.0056
 
 
-def test_words_agree_with_their_numbers(reported_run: Path) -> None:
+def test_plurals_and_time_spans_are_correct(reported_run: Path) -> None:
     assert (plural(1, "view"), plural(0, "view")) == ("1 view", "0 views")
     assert (time_span(34.0, 34.04), time_span(0.5, 2)) == ("34.0 s", "0.5–2.0 s")
     text = (reported_run / "report.html").read_text("utf-8")
 
     assert "95th percentile" in text
-    gone = ("1 views", "of work", "looked at", "by first sight", "in all", "95 %", "#graphs")
-    assert [phrase for phrase in gone if phrase in text] == []
+    outdated = ("1 views", "of work", "looked at", "by first sight", "in all", "95 %", "#graphs")
+    assert [phrase for phrase in outdated if phrase in text] == []
 
 
-def test_names_cannot_break_the_page(run: Path) -> None:
-    """Names of topics and categories come from recordings and models of others."""
+def test_names_are_escaped_in_page(run: Path) -> None:
+    """Topics and categories may come from recordings and models of others."""
     evil = "</script><img src=x onerror=alert(1)>"
-    about = json.loads((run / "run.json").read_text())
-    about["warnings"] = [evil]
-    about["options"]["topics"] = [evil]
-    about["model"]["categories"][0] = evil
+    info = json.loads((run / "run.json").read_text())
+    info["warnings"] = [evil]
+    info["options"]["topics"] = [evil]
+    info["model"]["categories"][0] = evil
     table = (run / "tracks.csv").read_text().splitlines()
     table[1] = table[1].replace(table[1].split(",")[4], evil)
     (run / "tracks.csv").write_text("\n".join(table) + "\n")
     timelines = read_timelines(run)
     rows = read_track_table(run / "tracks.csv")
-    finished = FinishedRun(run, about, {})
+    finished = FinishedRun(run, info, {})
 
     text = run_page(finished, rows, [Card(r, timelines[r.track], None) for r in rows.rows], [], {})
 
@@ -147,10 +147,10 @@ def test_names_cannot_break_the_page(run: Path) -> None:
     assert data_of(text)["rows"][0]["category"] == evil
 
 
-def test_without_the_recording_surfaces_are_drawn_from_their_meshes(run: Path) -> None:
-    about = json.loads((run / "run.json").read_text())
-    about["input"]["path"] = str(run / "gone.mcap")
-    (run / "run.json").write_text(json.dumps(about))
+def test_surfaces_are_drawn_from_meshes_without_recording(run: Path) -> None:
+    info = json.loads((run / "run.json").read_text())
+    info["input"]["path"] = str(run / "gone.mcap")
+    (run / "run.json").write_text(json.dumps(info))
 
     (report,) = read_reports([run]).runs
     text = report.page()
@@ -171,9 +171,9 @@ def test_index_lists_runs_and_links_to_them(
     (run.parent / ".table.partial").mkdir()
     (run.parent / ".table.partial" / "run.json").write_text("{}")
     for folder in (run, other):
-        about = json.loads((folder / "run.json").read_text())
-        about["input"]["path"] = str(run / "gone.mcap")  # its page needs fewer pictures
-        (folder / "run.json").write_text(json.dumps(about))
+        info = json.loads((folder / "run.json").read_text())
+        info["input"]["path"] = str(run / "gone.mcap")  # its page needs fewer pictures
+        (folder / "run.json").write_text(json.dumps(info))
 
     monkeypatch.chdir(run.parents[1])
     result = shapecat("report", run.parent.name)
@@ -200,7 +200,7 @@ def ball(count: int = 4000) -> np.ndarray:
     return points
 
 
-def test_a_ball_is_drawn_round_and_lit_from_above() -> None:
+def test_ball_is_drawn_round_and_lit_from_above() -> None:
     gas = NeuralGas(ball(60), np.array([[0, 1], [2, 3]]))
     for picture in draw(Snapshot(ball(), gas, np.array([1.0, 0.3, 0.6])), (200, 60, 60)):
         image = decode(picture.image)
@@ -221,45 +221,45 @@ def test_a_ball_is_drawn_round_and_lit_from_above() -> None:
 
 
 @pytest.mark.parametrize("count", [0, 1, 2, 5])
-def test_drawing_takes_any_object(count: int) -> None:
+def test_objects_with_few_points_are_drawn(count: int) -> None:
     gas = NeuralGas(np.zeros((0, 3)), np.zeros((0, 2)))
 
     assert len(draw(Snapshot(ball(5)[:count], gas, np.ones(3)), (1, 2, 3))) == 3
 
 
-def a_frame(depth: np.ndarray) -> Frame:
+def depth_frame(depth: np.ndarray) -> Frame:
     height, width = depth.shape
     camera = Camera(width, height, 300, 300, width / 2, height / 2)
     return Frame("/d", 0, 0, 0, "camera", depth=depth, camera=camera)
 
 
-def seen(blur: float = 0, left: int = 60, top: int = 50, hidden: float = 0, side: int = 80) -> Any:
-    """Return a striped photograph with a square object."""
+def view(blur: float = 0, left: int = 60, top: int = 50, hidden: float = 0, side: int = 80) -> Any:
+    """Return a view of a square object in a striped photograph."""
     stripes = 127 + 100 * np.sign(np.sin(np.arange(240) / 3))
     photo = ndimage.gaussian_filter(np.tile(stripes, (180, 1)), blur)
     mask = Mask(left, top, np.ones((side, side), bool))
     colour = np.repeat(photo[..., None], 3, axis=2).astype(np.uint8)
-    return SeenFrame((mask,), np.array([hidden]), a_frame(np.ones((180, 240))), colour)
+    return SeenFrame((mask,), np.array([hidden]), depth_frame(np.ones((180, 240))), colour)
 
 
 @pytest.mark.parametrize(
     "worse", [{"blur": 3}, {"left": 0}, {"top": 0}, {"hidden": 0.3}, {"side": 30}]
 )
-def test_a_blurred_cut_hidden_or_small_view_is_worth_less(worse: dict[str, Any]) -> None:
-    assert worth_of(seen(**worse), 0) < 0.9 * worth_of(seen(), 0)
+def test_blurred_cut_occluded_or_small_views_score_lower(worse: dict[str, Any]) -> None:
+    assert worth_of(view(**worse), 0) < 0.9 * worth_of(view(), 0)
 
 
-def test_an_object_that_is_not_seen_is_worth_nothing() -> None:
-    nothing = Mask(0, 0, np.zeros((0, 0), bool))
-    assert worth_of(replace(seen(), masks=(nothing,)), 0) == 0
+def test_invisible_object_scores_zero() -> None:
+    empty = Mask(0, 0, np.zeros((0, 0), bool))
+    assert worth_of(replace(view(), masks=(empty,)), 0) == 0
 
 
 @pytest.mark.parametrize(("left", "top"), [(60, 50), (0, 0), (160, 100)])
-def test_a_crop_shows_the_object_and_its_outline(left: int, top: int) -> None:
-    """Also at the border of the image, beyond which there is nothing to show."""
+def test_crop_shows_object_and_outline(left: int, top: int) -> None:
+    """Also at the border of the image."""
     photo = np.zeros((180, 240, 3), np.uint8)
     photo[top : top + 80, left : left + 80] = (250, 40, 40)
-    crop = crop_of(replace(seen(left=left, top=top), colour=photo), 0)
+    crop = crop_of(replace(view(left=left, top=top), colour=photo), 0)
     image = decode(crop.image)
     red = image[..., 0] > 128
     corners = np.array(re.findall(r"(\d+) (\d+)", crop.outline), int)
@@ -283,25 +283,25 @@ def labelled(*indices: np.ndarray, up: Sequence[int] = (0, -1, 0)) -> LabelledFr
     )
 
 
-def test_what_is_nearer_hides_and_what_is_behind_does_not() -> None:
+def test_only_nearer_objects_occlude() -> None:
     depth = np.full((120, 160), 1.2, np.float32)
     depth[40:80, 40:80] = 1.0
     depth[40:80, 80:120] = 0.8  # in front of the right side of the first
     number = np.arange(depth.size).reshape(depth.shape)
     both = labelled(number[40:80, 40:80].ravel(), number[40:80, 80:120].ravel())
-    found = look(both, a_frame(depth), None)
+    found = look(both, depth_frame(depth), None)
 
     assert found is not None
     assert found.hidden == pytest.approx([0.25, 0])
     assert [mask.box for mask in found.masks] == [(40, 40, 40, 40), (80, 40, 40, 40)]
 
 
-def test_depth_is_shaded_as_a_relief() -> None:
-    """A step is dark below and light above; without reading it is dark."""
+def test_depth_is_drawn_as_shaded_relief() -> None:
+    """Opposite slopes differ in brightness; missing depth is dark."""
     v, u = np.mgrid[:120, :160]
     depth = 1 / (1 / 1.5 + 0.002 * np.hypot(u - 80, v - 60).clip(20, 40))
     depth[:, 150:] = 0
-    found = look(labelled(), a_frame(depth.astype(np.float32)), None)
+    found = look(labelled(), depth_frame(depth.astype(np.float32)), None)
 
     assert found is not None
     image = found.pixels()
@@ -316,10 +316,10 @@ def test_depth_is_shaded_as_a_relief() -> None:
     [((1, 0, 0), (0, 1, 0), (0, 0, 1)), ((0, -1, 0), (0, 0, -1), (1, 0, 0))],
     ids=["camera", "lidar"],
 )
-def test_a_loose_cloud_is_seen_upright(
+def test_unorganised_cloud_is_drawn_upright(
     right: Sequence[int], down: Sequence[int], away: Sequence[int]
 ) -> None:
-    """A lidar has another idea of axes than a camera; on the page, up is up."""
+    """The axes of a lidar differ from those of a camera."""
     x, y = np.random.default_rng(0).uniform(0, 1, (2, 60000))
     pole = abs(x - 0.5) < 0.05
     y[~pole] = 0.5 + 0.5 * y[~pole]  # a low wall with a pole
@@ -340,7 +340,7 @@ def test_a_loose_cloud_is_seen_upright(
 
 
 def recorded(run: Path, seconds: float) -> np.ndarray:
-    """Return the colour image of a run at a time, as the door from Python gives it."""
+    """Return the colour image of a run at a time, as the Python interface gives it."""
     frames = list(open_run(run).frames())
     times = [(frame.stamp_ns - frames[0].stamp_ns) * 1e-9 for frame in frames]
     colour = frames[int(np.argmin(np.abs(np.subtract(times, seconds))))].color
@@ -348,19 +348,19 @@ def recorded(run: Path, seconds: float) -> np.ndarray:
     return colour.astype(int)
 
 
-def test_colour_is_shown_where_it_was_recorded(coloured_run: Path, tmp_path: Path) -> None:
+def test_frames_and_crops_are_in_colour(coloured_run: Path, tmp_path: Path) -> None:
     run = tmp_path / "table"
     shutil.copytree(coloured_run, run)
     (report,) = read_reports([run]).runs
     pictures = report.pictures
     frame = pictures.frames[0]
     image = decode(frame.image)
-    colours = [decode(seen.crop.image)[..., :3] for seen in pictures.tracks.values() if seen.crop]
+    colours = [decode(item.crop.image)[..., :3] for item in pictures.tracks.values() if item.crop]
 
     assert len(pictures.frames) == 4
     assert image.shape[:2] == (frame.height, frame.width)
-    off = np.abs(recorded(run, frame.seconds) - image[..., :3])
-    assert np.quantile(off, 0.999) <= 30  # what WebP loses; the next frame is off by 77
+    difference = np.abs(recorded(run, frame.seconds) - image[..., :3])
+    assert np.quantile(difference, 0.999) <= 30  # loss of WebP; the next frame differs by 77
     assert len(colours) == len(pictures.tracks) > 3
     assert all(np.ptp(colour, axis=2).max() > 30 for colour in colours)
     shown = set().union(*(frame.boxes for frame in pictures.frames))
@@ -370,7 +370,7 @@ def test_colour_is_shown_where_it_was_recorded(coloured_run: Path, tmp_path: Pat
         assert 0 <= top < top + height <= frame.height
 
 
-def test_the_strip_is_spread_over_the_run_and_its_tracks(run: Path) -> None:
+def test_frame_strip_covers_run_and_its_tracks(run: Path) -> None:
     timelines = read_timelines(run)
     chosen = choose_frames(run, timelines)
     once = {key[:2]: key for line in timelines.values() for key in line.keys}
@@ -405,10 +405,10 @@ def many_tracks(folder: Path, count: int) -> str:
     return run_page(FinishedRun(folder, read_finished(folder).run, {}), table, cards, [], {})
 
 
-def test_corrections_clicked_in_a_browser_are_adopted(
+def test_corrections_made_in_browser_are_adopted(
     browser: Browser, shapecat: Run, run: Path, drawn: RunReport
 ) -> None:
-    """From click to annotated.mcap: `annotate` reads the table that the page writes."""
+    """`annotate` reads the table that the page writes."""
     (page,) = Reports([replace(drawn, folder=run)]).write()
     rows = read_track_table(run / "tracks.csv").rows
     a, b, c, d, e = (row.track for row in rows[:5])
@@ -448,7 +448,7 @@ def test_corrections_clicked_in_a_browser_are_adopted(
     assert browser.run("return document.querySelectorAll('.changed').length") == 4
 
 
-def test_filters_in_a_browser(browser: Browser, reported_run: Path) -> None:
+def test_filters_select_cards(browser: Browser, reported_run: Path) -> None:
     page = reported_run / "report.html"
     rows = read_track_table(reported_run / "tracks.csv").rows
     browser.open(page)
@@ -479,20 +479,20 @@ def test_filters_in_a_browser(browser: Browser, reported_run: Path) -> None:
         "const s = document.getElementById('state'); s.value = '%s';"
         "s.dispatchEvent(new Event('change'))"
     )
-    drawn = "return getComputedStyle(document.querySelector('.side svg')).display"
+    display = "return getComputedStyle(document.querySelector('.side svg')).display"
     browser.run(choose % "changed")
     assert browser.run(shown) == [rows[1].track]
     browser.run(choose % "open")
     assert rows[1].track not in browser.run(shown)
-    assert browser.run(drawn) == "block"
+    assert browser.run(display) == "block"
     browser.click("#meshes")
-    assert browser.run(drawn) == "none"
+    assert browser.run(display) == "none"
     assert browser.complaints() == []
 
 
 @pytest.mark.parametrize("theme", ["light", "dark"])
-def test_text_can_be_read_in_both_themes(browser: Browser, reported_run: Path, theme: str) -> None:
-    """Contrast of text on its background: at least 4.5, as WCAG AA asks."""
+def test_text_is_readable_in_both_themes(browser: Browser, reported_run: Path, theme: str) -> None:
+    """WCAG AA asks for a contrast of at least 4.5."""
     page = reported_run / "report.html"
     features = [{"name": "prefers-color-scheme", "value": theme}]
     browser.cdp("Emulation.setEmulatedMedia", {"features": features})
@@ -523,7 +523,7 @@ def luminance(colour: str) -> float:
     return float(linear @ [0.2126, 0.7152, 0.0722])
 
 
-def test_five_hundred_tracks_are_a_page_that_opens(browser: Browser, run: Path) -> None:
+def test_page_of_five_hundred_tracks_opens(browser: Browser, run: Path) -> None:
     """The docs promise at most 70 kB per object."""
     text = many_tracks(run, 500)
     page = run / "many.html"
@@ -537,7 +537,7 @@ def test_five_hundred_tracks_are_a_page_that_opens(browser: Browser, run: Path) 
 
 @pytest.mark.parametrize("table", ["tracks", "detections", "frames"])
 @pytest.mark.parametrize("words", [["report"], ["annotate"]])
-def test_a_damaged_table_is_named(
+def test_damaged_table_is_reported_by_name(
     shapecat: Run, run: Path, tmp_path: Path, words: list[str], table: str
 ) -> None:
     """A disk error in one file must not end in a traceback."""
@@ -554,29 +554,29 @@ def test_a_damaged_table_is_named(
 @pytest.mark.parametrize(
     "change",
     [
-        lambda about: about.pop("counts"),
-        lambda about: about["input"].pop("digest"),
-        lambda about: about["model"].update(categories=None),
-        lambda about: about.update(options=[]),
-        lambda about: about.clear(),
+        lambda info: info.pop("counts"),
+        lambda info: info["input"].pop("digest"),
+        lambda info: info["model"].update(categories=None),
+        lambda info: info.update(options=[]),
+        lambda info: info.clear(),
     ],
 )
-def test_a_run_json_that_lacks_entries_is_refused(
+def test_incomplete_run_json_is_refused(
     shapecat: Run, run: Path, tmp_path: Path, change: Callable[[dict[str, Any]], object]
 ) -> None:
     """Another program's run.json, or one edited by hand, must not end in a traceback."""
     folder = tmp_path / "edited"
     shutil.copytree(run, folder)
-    about = json.loads((folder / "run.json").read_text())
-    change(about)
-    (folder / "run.json").write_text(json.dumps(about))
+    info = json.loads((folder / "run.json").read_text())
+    change(info)
+    (folder / "run.json").write_text(json.dumps(info))
     result = shapecat("report", folder)
 
     assert result.exit_code == 1
     assert "run.json: not a description of a run" in result.stderr
 
 
-def test_a_run_without_tracks_has_a_page(run: Path) -> None:
+def test_run_without_tracks_has_a_page(run: Path) -> None:
     (run / "tracks.csv").write_text((run / "tracks.csv").read_text().splitlines()[0] + "\n")
     table = pq.read_table(run / "tracks.parquet")
     pq.write_table(table.slice(0, 0), run / "tracks.parquet")
@@ -584,4 +584,4 @@ def test_a_run_without_tracks_has_a_page(run: Path) -> None:
 
     assert report.listed("x").categories.total() == 0
     assert "<article" not in report.page()
-    assert report.page().count('class="frame"') == 8  # also where nothing was found
+    assert report.page().count('class="frame"') == 8  # even without objects
