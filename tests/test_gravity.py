@@ -1,4 +1,4 @@
-"""The up direction: its sources and its reliability."""
+"""Tests of the up direction: its sources and their reliability."""
 
 from pathlib import Path
 from typing import Any
@@ -34,12 +34,12 @@ def imu(stamp: int, acceleration: Any, frame_id: str = "imu", *, absent: bool = 
     covariance = np.zeros(9)
     covariance[0] = -1.0 if absent else 0.0
     vector = make("geometry_msgs/msg/Vector3", *map(float, acceleration))
-    still = make("geometry_msgs/msg/Vector3", 0.0, 0.0, 0.0)
+    angular_velocity = make("geometry_msgs/msg/Vector3", 0.0, 0.0, 0.0)
     return make(
         "sensor_msgs/msg/Imu",
         header(stamp, frame_id),
         make("geometry_msgs/msg/Quaternion", 0.0, 0.0, 0.0, 1.0),
-        *(np.zeros(9), still, np.zeros(9), vector, covariance),
+        *(np.zeros(9), angular_velocity, np.zeros(9), vector, covariance),
     )
 
 
@@ -48,10 +48,10 @@ def frame(stamp: int) -> Frame:
     return Frame("/d", 0, stamp, stamp, "camera", depth=depth, camera=CAMERA)
 
 
-def test_up_from_an_imu_is_smoothed_and_turned_into_the_sensor_frame(tmp_path: Path) -> None:
+def test_imu_up_is_smoothed_and_rotated_into_sensor_frame(tmp_path: Path) -> None:
     rng = np.random.default_rng(0)
-    still = [("imu", "camera", Pose(TURN, np.zeros(3)))]
-    items: list[tuple[str, int, Any]] = [("/tf_static", EPOCH, MAKE.transforms(still, EPOCH))]
+    mounting = [("imu", "camera", Pose(TURN, np.zeros(3)))]
+    items: list[tuple[str, int, Any]] = [("/tf_static", EPOCH, MAKE.transforms(mounting, EPOCH))]
     for k in range(400):
         stamp = EPOCH + k * SECOND // 200
         items.append(("/imu", stamp, imu(stamp, rng.normal((0, 0, 9.8), 2))))
@@ -67,7 +67,7 @@ def test_up_from_an_imu_is_smoothed_and_turned_into_the_sensor_frame(tmp_path: P
     assert late is None
 
 
-def test_an_imu_without_stamps_is_read_at_its_log_times(tmp_path: Path) -> None:
+def test_imu_without_stamps_uses_log_times(tmp_path: Path) -> None:
     """Depth images without stamps also use their log times."""
     items = [
         ("/imu", EPOCH + k * SECOND, imu(0, a, "camera"))
@@ -80,7 +80,7 @@ def test_an_imu_without_stamps_is_read_at_its_log_times(tmp_path: Path) -> None:
     assert [None if up is None else up.tolist() for up in found] == [[0, -1, 0], None, [1, 0, 0]]
 
 
-def test_an_imu_that_is_logged_late_is_read_at_its_stamps(tmp_path: Path) -> None:
+def test_imu_logged_late_uses_its_stamps(tmp_path: Path) -> None:
     """Drivers send measurements in packets; the robot may have turned before they are logged."""
     items = [
         ("/imu", EPOCH + (k + 7) * SECOND, imu(EPOCH + k * SECOND, a, "camera"))
@@ -93,18 +93,18 @@ def test_an_imu_that_is_logged_late_is_read_at_its_stamps(tmp_path: Path) -> Non
     assert [None if up is None else up.tolist() for up in found] == [[0, -1, 0], [1, 0, 0], None]
 
 
-@pytest.mark.parametrize(("up", "said"), [("imu", "no sensor_msgs/Imu"), ("tf", "no transforms")])
-def test_a_source_that_is_not_there_is_said(tmp_path: Path, up: str, said: str) -> None:
+@pytest.mark.parametrize(("up", "error"), [("imu", "no sensor_msgs/Imu"), ("tf", "no transforms")])
+def test_missing_up_source_is_an_error(tmp_path: Path, up: str, error: str) -> None:
     path = write(tmp_path / "a.mcap", [("/x", 1, make("std_msgs/msg/String", "x"))])
-    with open_recording(path) as recording, pytest.raises(ConfigError, match=said):
+    with open_recording(path) as recording, pytest.raises(ConfigError, match=error):
         Upright.of(recording, up=up, fixed_frame=None)
 
 
 @pytest.mark.parametrize(("tilt_deg", "warns"), [(0.0, False), (13.0, True), (50.0, True)])
-def test_run_says_how_far_the_planes_found_disagree(
+def test_run_reports_angle_between_given_up_and_planes(
     tmp_path: Path, tilt_deg: float, warns: bool
 ) -> None:
-    """A wrong mounting angle in the transforms silently spoils every height."""
+    """A wrong mounting angle in the transforms would silently spoil every height."""
     angle = np.radians(tilt_deg)
     c, s = np.cos(angle), np.sin(angle)
     tilt = Pose(np.array([[1, 0, 0], [0, c, -s], [0, s, c]]), np.zeros(3))
@@ -133,14 +133,14 @@ def test_run_says_how_far_the_planes_found_disagree(
     ("off_deg", "dropped"),
     [
         ((40, 30, 50), True),
-        ((40, 3), False),  # one frame confirms it: the other one saw a wall
+        ((40, 3), False),  # one frame confirms it; the other shows a wall
         ((3, 40), False),
-        ((None, 40), False),  # too few have had a say
+        ((None, 40), False),  # too few frames have planes
         ((40, None, None, 35, None, None, 45), True),
         ((40, None, 2), False),
     ],
 )
-def test_an_up_is_dropped_only_if_no_plane_confirms_it(
+def test_given_up_is_dropped_only_if_no_plane_confirms_it(
     monkeypatch: pytest.MonkeyPatch, off_deg: tuple[float | None, ...], *, dropped: bool
 ) -> None:
     """A cupboard in view at the start must not override a correct up direction."""
@@ -152,21 +152,21 @@ def test_an_up_is_dropped_only_if_no_plane_confirms_it(
     monkeypatch.setattr(perceiving, "find_up", lambda *_: next(planes))
     frames = [frame(EPOCH + k) for k in range(len(off_deg))]
 
-    source = ((one, None, given) for one in frames)
-    read = list(perceiving._UpTrial(upright, Settings()).before(source))
+    oriented = ((item, None, given) for item in frames)
+    returned = list(perceiving._UpTrial(upright, Settings()).before(oriented))
 
-    assert [one for one, *_ in read] == frames
+    assert [item for item, *_ in returned] == frames
     assert upright.dropped == ({"/d": "tf"} if dropped else {})
 
 
-def test_without_any_source_up_is_that_of_the_planes(tmp_path: Path) -> None:
+def test_up_without_other_source_comes_from_planes(tmp_path: Path) -> None:
     items = [item for item in stream(MAKE, 1) if "tf" not in item[0]]
     process(Job(write(tmp_path / "a.mcap", items), tmp_path / "out", mcap=False, rrd=False))
 
     assert read_run(tmp_path / "out")["up"] == {"source": "planes"}
 
 
-def test_the_imu_stands_in_where_transforms_do_not_reach(tmp_path: Path) -> None:
+def test_imu_is_used_if_transforms_lack_the_sensor(tmp_path: Path) -> None:
     items: list[tuple[str, int, Any]] = [
         ("/tf", EPOCH, MAKE.transforms([("map", "elsewhere", IDENTITY)], EPOCH)),
         ("/imu", EPOCH, imu(EPOCH, [0, -9.8, 0], "camera")),
@@ -178,7 +178,7 @@ def test_the_imu_stands_in_where_transforms_do_not_reach(tmp_path: Path) -> None
     np.testing.assert_allclose(up, [0, -1, 0], atol=1e-6)
 
 
-def test_every_failed_look_up_is_counted(tmp_path: Path) -> None:
+def test_failed_transform_look_ups_are_counted(tmp_path: Path) -> None:
     items = [("/tf", EPOCH, MAKE.transforms([("map", "elsewhere", IDENTITY)], EPOCH))]
     with open_recording(write(tmp_path / "a.mcap", items)) as recording:
         upright = Upright.of(recording, up="auto", fixed_frame=None)
@@ -190,8 +190,8 @@ def test_every_failed_look_up_is_counted(tmp_path: Path) -> None:
     assert warning.startswith("failed transform look-ups: 2, the first: ")
 
 
-def test_a_frame_with_objects_has_a_plane(tmp_path: Path) -> None:
-    """An assumed plane is in no table; the run would contradict its own warning."""
+def test_frame_with_objects_does_not_count_as_without_plane(tmp_path: Path) -> None:
+    """An assumed plane is in no table; the report would contradict the missing warning."""
     for name, schema, frames in (
         ("frames", FRAMES, (0, 1, 2, 3, 4)),
         ("planes", PLANES, (0, 3)),

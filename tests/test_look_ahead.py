@@ -1,4 +1,4 @@
-"""Transforms and accelerations around the frames: the same as if all had been read first."""
+"""Tests of reading transforms and accelerations near the frames instead of all at once."""
 
 from collections import Counter
 from collections.abc import Callable, Iterator
@@ -63,7 +63,7 @@ def in_database(path: Path) -> Path:
     return path / "a"
 
 
-def found_at(window: TransformWindow, second: float) -> Any:
+def lookup_at(window: TransformWindow, second: float) -> Any:
     stamp = EPOCH + int(second * SECOND)
     try:
         return window.around(stamp, stamp).lookup("map", "camera", stamp)
@@ -72,16 +72,16 @@ def found_at(window: TransformWindow, second: float) -> Any:
 
 
 @pytest.mark.parametrize("write", [in_mcap, in_bag, in_database])
-def test_a_long_recording_gives_the_transforms_of_all_at_once(
+def test_windowed_transforms_equal_those_of_full_read(
     tmp_path: Path, write: Callable[[Path], Path]
 ) -> None:
-    """Also between other reads of the same file, as the frames come from it too."""
+    """Also if other messages of the file are read in between, as frames are."""
     with open_recording(write(tmp_path)) as recording:
         whole = TransformWindow(read_transforms(recording))
         window = TransformWindow.of(recording)
         others = recording.messages()
         for second in np.arange(0, SECONDS, 1.1):
-            expected, found = found_at(whole, second), found_at(window, second)
+            expected, found = lookup_at(whole, second), lookup_at(window, second)
             next(others, None)
             assert (expected is None) == (found is None)
             if expected is not None:
@@ -90,8 +90,8 @@ def test_a_long_recording_gives_the_transforms_of_all_at_once(
         assert next(others, None) is not None
 
 
-def test_the_fixed_frame_may_appear_late(tmp_path: Path) -> None:
-    """Localisation starts after the recording does, and all tracks are in its frame."""
+def test_fixed_frame_may_appear_late(tmp_path: Path) -> None:
+    """Localisation may start after the recording, and all tracks are in its frame."""
     with open_recording(in_mcap(tmp_path)) as recording:
         window = TransformWindow.of(recording)
 
@@ -113,60 +113,60 @@ def decoded(monkeypatch: pytest.MonkeyPatch) -> Counter[str]:
     return counts
 
 
-def test_the_first_frame_waits_for_seconds_not_for_hours(
+def test_first_frame_reads_only_seconds_of_transforms(
     tmp_path: Path, decoded: Counter[str]
 ) -> None:
     """Also if the frames begin in the middle, as with --start."""
     around = AROUND_NS // SECOND
     with open_recording(in_mcap(tmp_path)) as recording:
         window = TransformWindow.of(recording)
-        found_at(window, 0)
+        lookup_at(window, 0)
         assert decoded["/tf"] <= 2 * around + 4
         decoded.clear()
-        assert found_at(window, 60) is not None
+        assert lookup_at(window, 60) is not None
         assert decoded["/tf"] <= 2 * around + 4
 
 
-def test_what_is_kept_does_not_grow_with_the_recording(tmp_path: Path) -> None:
+def test_kept_transforms_do_not_grow_with_recording(tmp_path: Path) -> None:
     """Thirty joints at 50 Hz are 400 MB an hour."""
     with open_recording(in_mcap(tmp_path)) as recording:
         window = TransformWindow.of(recording)
         kept = []
         for second in range(SECONDS):
-            found_at(window, second)
+            lookup_at(window, second)
             kept.append(len(window._known._moving["base"].stamps))
 
     assert max(kept) <= 5 * AROUND_NS // SECOND
     assert kept[-1] < SECONDS // 2
 
 
-def test_a_frame_with_a_wrong_stamp_costs_only_itself(tmp_path: Path) -> None:
-    """A driver may send one stamp of the far future: nothing may be forgotten for it."""
+def test_wrong_frame_stamp_discards_no_transforms(tmp_path: Path) -> None:
+    """A driver may send one stamp far in the future."""
     with open_recording(in_mcap(tmp_path)) as recording:
         window = TransformWindow.of(recording)
-        assert found_at(window, 50) is not None
+        assert lookup_at(window, 50) is not None
         stamp = EPOCH + 51 * SECOND
         window.around(stamp, stamp + 10**6 * SECOND)
-        assert found_at(window, 51.5) is not None
+        assert lookup_at(window, 51.5) is not None
 
 
-def test_frames_of_two_sensors_may_come_out_of_order(tmp_path: Path) -> None:
-    """One driver sends its images later than the other; their transforms are still known."""
+def test_frames_of_two_sensors_may_be_out_of_order(tmp_path: Path) -> None:
+    """One driver may send its images later than the other."""
     with open_recording(in_mcap(tmp_path)) as recording:
         window = TransformWindow.of(recording)
-        assert all(found_at(window, second) is not None for second in (40, 55, 60, 46, 61, 48))
+        assert all(lookup_at(window, second) is not None for second in (40, 55, 60, 46, 61, 48))
 
 
-def test_transforms_that_are_logged_far_from_their_stamps_are_all_read(tmp_path: Path) -> None:
+def test_transforms_logged_far_from_their_stamps_are_read(tmp_path: Path) -> None:
     """A converter may write all transforms first; those of the last frame come with the first."""
-    items = [(topic, EPOCH + k, message) for k, (topic, _, message) in enumerate(tagged())]
+    items = [(topic, EPOCH + k, message) for k, (topic, _, message) in enumerate(moving_items())]
     items.append(("/end", EPOCH + SECONDS * SECOND, ros.make("std_msgs/msg/String", "")))
     with open_recording(ros.write(tmp_path / "a.mcap", items)) as recording:
         window = TransformWindow.of(recording)
-        assert all(found_at(window, second) is not None for second in (40, 60, 80, 41))
+        assert all(lookup_at(window, second) is not None for second in (40, 60, 80, 41))
 
 
-def tagged() -> Iterator[tuple[str, int, Any]]:
+def moving_items() -> Iterator[tuple[str, int, Any]]:
     yield from moving(MessageFactory(2))
 
 
@@ -176,7 +176,7 @@ def frame(second: int) -> Frame:
 
 
 @pytest.mark.parametrize("first", [0, 40])
-def test_an_imu_is_read_along_with_the_frames(
+def test_imu_is_read_only_as_far_as_frames_need(
     tmp_path: Path, decoded: Counter[str], first: int
 ) -> None:
     """It may be switched on late; at 400 Hz, hours of it would delay the first frame."""
@@ -198,13 +198,13 @@ def test_an_imu_is_read_along_with_the_frames(
             else:
                 assert up is None
         assert upright.accelerometers is not None
-        (one,) = upright.accelerometers.around(*2 * [EPOCH + (SECONDS - 1) * SECOND])
-        assert len(one._sums) < SECONDS // 2
+        (accelerometer,) = upright.accelerometers.around(*2 * [EPOCH + (SECONDS - 1) * SECOND])
+        assert len(accelerometer._sums) < SECONDS // 2
         assert Upright.of(recording, up="imu", fixed_frame=None).orient(frame(60)).up is not None
 
 
-def test_an_imu_without_any_acceleration_is_refused(tmp_path: Path) -> None:
-    """A gyroscope alone knows no up direction, in a long recording neither."""
+def test_imu_without_accelerations_is_refused(tmp_path: Path) -> None:
+    """A gyroscope alone gives no up direction."""
     items = [
         ("/imu", EPOCH + k * SECOND, imu(EPOCH + k * SECOND, [0, 0, 0])) for k in range(SECONDS)
     ]

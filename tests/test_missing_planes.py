@@ -1,4 +1,4 @@
-"""A run without planes finds nothing: the user learns the reason, in run.json and on screen."""
+"""Tests of the warning about missing planes: its reason, in run.json and on screen."""
 
 from collections.abc import Callable, Iterable
 from pathlib import Path
@@ -21,7 +21,7 @@ MAKE = MessageFactory(2)
 
 
 def walls(path: Path, depths_m: Iterable[Any]) -> Path:
-    """Record a wall that the camera faces, at these depths (or images); 0 is no reading."""
+    """Record a wall facing the camera at these depths, or these images; 0 is invalid."""
     items: list[tuple[str, int, Any]] = []
     for k, depth_m in enumerate(depths_m):
         stamp = EPOCH + k * SECOND // 10
@@ -37,8 +37,8 @@ def warnings_of(path: Path, out: Path, *, up: str = "auto", range_m: float = 2.0
     return read_run(out / path.stem)["warnings"]
 
 
-def test_a_table_beyond_the_range_is_named_as_the_reason(tmp_path: Path) -> None:
-    """It would look like a table without objects; and the advice would be to change up."""
+def test_warning_names_range_if_table_is_beyond_it(tmp_path: Path) -> None:
+    """Otherwise it would resemble an empty table, and users would change the up direction."""
     path = record(tmp_path / "far.mcap", 3)
 
     (warning,) = warnings_of(path, tmp_path, range_m=0.3)
@@ -50,8 +50,8 @@ def test_a_table_beyond_the_range_is_named_as_the_reason(tmp_path: Path) -> None
     assert not warnings_of(path, tmp_path / "again", range_m=2.0)
 
 
-def test_depth_in_a_wrong_unit_is_not_taken_for_a_large_room(tmp_path: Path) -> None:
-    """Millimetres in a 32FC1 image read as kilometres; a larger range would only hide that."""
+def test_warning_asks_for_unit_if_depth_is_implausible(tmp_path: Path) -> None:
+    """Millimetres in a 32FC1 image read as metres; a larger range would only hide that."""
     (warning,) = warnings_of(walls(tmp_path / "unit.mcap", [30.0, 40.0, 41.0]), tmp_path)
 
     assert warning == (
@@ -61,29 +61,29 @@ def test_depth_in_a_wrong_unit_is_not_taken_for_a_large_room(tmp_path: Path) -> 
     )
 
 
-def test_frames_without_depth_and_frames_in_range_have_other_reasons(tmp_path: Path) -> None:
-    """A covered lens is no matter of the range; nor is a wall at 1 m, where up may be wrong."""
-    none = warnings_of(walls(tmp_path / "none.mcap", [0.0] * 3), tmp_path)
+def test_warning_distinguishes_missing_depth_wrong_up_and_noise(tmp_path: Path) -> None:
+    """None of them is a matter of range."""
+    without_depth = warnings_of(walls(tmp_path / "none.mcap", [0.0] * 3), tmp_path)
     wall = walls(tmp_path / "near.mcap", [1.0, 1.1, 1.2, 1.0])
-    near = warnings_of(wall, tmp_path, up="0,-1,0")
+    wall_in_range = warnings_of(wall, tmp_path, up="0,-1,0")
     noise = np.random.default_rng(1).uniform(0.4, 1.9, (3, CAMERA.height, CAMERA.width))
-    nowhere = warnings_of(walls(tmp_path / "noise.mcap", noise), tmp_path)
+    only_noise = warnings_of(walls(tmp_path / "noise.mcap", noise), tmp_path)
 
-    assert none == ["no supporting plane in 3 of 3 frames: they have no valid depth"]
-    assert near[-1] == (
+    assert without_depth == ["no supporting plane in 3 of 3 frames: they have no valid depth"]
+    assert wall_in_range[-1] == (
         "no supporting plane in 4 of 4 frames: "
         "is --up right? --up auto estimates up from the planes"
     )
-    assert nowhere[-1] == (
+    assert only_noise[-1] == (
         "no supporting plane in 3 of 3 frames: "
         "try --up X,Y,Z, or another range with --set detection.max_range_m=M"
     )
 
 
-def test_objects_on_a_plane_that_is_only_assumed_need_no_reason(tmp_path: Path) -> None:
-    """A heap of balls hides its table, so that no plane is in the tables."""
-    places = [(x / 10, y / 10, 0.03 * abs(x + y)) for x in range(-3, 4) for y in range(-2, 3)]
-    depth, _ = render([ball(place, 0.06) for place in places], tilt_deg=35, noise=0)
+def test_no_warning_if_objects_stand_on_assumed_plane(tmp_path: Path) -> None:
+    """A heap of balls hides its table, so the tables hold no plane."""
+    centers = [(x / 10, y / 10, 0.03 * abs(x + y)) for x in range(-3, 4) for y in range(-2, 3)]
+    depth, _ = render([ball(center, 0.06) for center in centers], tilt_deg=35, noise=0)
     camera = frame_of(depth).camera
     assert camera is not None
     info = MAKE.camera_info(camera, EPOCH, "camera")
@@ -98,13 +98,13 @@ def test_objects_on_a_plane_that_is_only_assumed_need_no_reason(tmp_path: Path) 
     assert pq.read_metadata(tmp_path / "heap" / "planes.parquet").num_rows == 0
 
 
-def test_the_reason_is_printed(shapecat: Callable[..., Result], tmp_path: Path) -> None:
-    """Nobody opens run.json to learn why a table has no tracks."""
+def test_warning_is_printed(shapecat: Callable[..., Result], tmp_path: Path) -> None:
+    """Users do not open run.json to learn why there are no tracks."""
     path = record(tmp_path / "far.mcap", 2)
     options = ("--set", "detection.max_range_m=0.3", "--jobs", "1", "--no-rrd")
 
-    done = shapecat("process", path, "--out", tmp_path / "out", *options)
+    result = shapecat("process", path, "--out", tmp_path / "out", *options)
 
-    assert done.exit_code == 0
-    assert "Warning: far: no supporting plane in 2 of 2 frames: 100%" in done.stderr
-    assert "none" in done.stdout
+    assert result.exit_code == 0
+    assert "Warning: far: no supporting plane in 2 of 2 frames: 100%" in result.stderr
+    assert "none" in result.stdout

@@ -1,4 +1,4 @@
-"""Files of others are not touched, and changed input is processed again."""
+"""Tests that files of others are not touched, and that changed input is noticed."""
 
 from collections.abc import Callable
 from pathlib import Path
@@ -20,27 +20,29 @@ def recording(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 @pytest.mark.parametrize("option", ["--overwrite", "--no-mcap"])
 @pytest.mark.parametrize("name", ["thesis.txt", "run.json", "tracks.csv"])
-def test_a_strangers_folder_is_refused(
+def test_folder_not_made_by_shapecat_is_refused(
     shapecat: Run, recording: Path, tmp_path: Path, option: str, name: str
 ) -> None:
     """Even with --overwrite, and even if it resembles a run."""
     (tmp_path / "lab").mkdir()
     (tmp_path / "lab" / name).write_text("{}")
-    done = shapecat("process", recording, "--out", tmp_path, *OPTIONS, option)
+    result = shapecat("process", recording, "--out", tmp_path, *OPTIONS, option)
 
-    assert done.exit_code == 1
-    assert f"{tmp_path / 'lab'}: shapecat did not make this" in done.stderr
+    assert result.exit_code == 1
+    assert f"{tmp_path / 'lab'}: shapecat did not make this" in result.stderr
     assert {path.name for path in tmp_path.rglob("*")} == {"lab", name}
     assert (tmp_path / "lab" / name).read_text() == "{}"
 
 
-def test_files_beside_the_results_survive(shapecat: Run, recording: Path, tmp_path: Path) -> None:
+def test_overwrite_keeps_other_files_in_run_folder(
+    shapecat: Run, recording: Path, tmp_path: Path
+) -> None:
     shapecat("process", recording, "--out", tmp_path, *OPTIONS)
     (tmp_path / "lab" / "notes.txt").write_text("mine")
     before = read_run(tmp_path / "lab")
-    done = shapecat("process", recording, "--out", tmp_path, *OPTIONS, "--overwrite")
+    result = shapecat("process", recording, "--out", tmp_path, *OPTIONS, "--overwrite")
 
-    assert done.exit_code == 0
+    assert result.exit_code == 0
     assert (tmp_path / "lab" / "notes.txt").read_text() == "mine"
     assert [path.name for path in tmp_path.iterdir()] == ["lab"]
     after = read_run(tmp_path / "lab")
@@ -48,8 +50,7 @@ def test_files_beside_the_results_survive(shapecat: Run, recording: Path, tmp_pa
     assert before["work"] == after["work"]
 
 
-def test_four_kilobytes_in_the_middle_make_another_recording(shapecat: Run, tmp_path: Path) -> None:
-    """Damage to a recording after its run must not go unnoticed."""
+def test_recording_damaged_after_its_run_is_noticed(shapecat: Run, tmp_path: Path) -> None:
     lab = record(tmp_path / "lab.bag", 12, container="ros1")  # not compressed: depth, not chunks
     content = bytearray(lab.read_bytes())
     command = ("process", lab, "--out", tmp_path / "out", *OPTIONS)
@@ -58,14 +59,14 @@ def test_four_kilobytes_in_the_middle_make_another_recording(shapecat: Run, tmp_
     content[middle : middle + 4096] = bytes(4096)
     lab.write_bytes(content)
 
-    done = shapecat(*command)
+    result = shapecat(*command)
 
-    assert done.exit_code == 1
-    assert "another input" in done.stderr
-    assert "already complete" not in done.stdout
+    assert result.exit_code == 1
+    assert "another input" in result.stderr
+    assert "already complete" not in result.stdout
 
 
-def test_a_copy_with_other_times_is_the_same_recording(
+def test_copy_with_other_file_times_is_same_recording(
     shapecat: Run, recording: Path, tmp_path: Path
 ) -> None:
     command = ("process", tmp_path / "lab.mcap", "--out", tmp_path / "out", *OPTIONS)
@@ -74,20 +75,20 @@ def test_a_copy_with_other_times_is_the_same_recording(
     (tmp_path / "lab.mcap").unlink()
     (tmp_path / "lab.mcap").write_bytes(recording.read_bytes())
 
-    done = shapecat(*command)
+    result = shapecat(*command)
 
-    assert done.exit_code == 0, done.stderr
-    assert "already complete" in done.stdout
+    assert result.exit_code == 0, result.stderr
+    assert "already complete" in result.stdout
 
 
-def test_each_failure_is_told_once(shapecat: Run, recording: Path, tmp_path: Path) -> None:
+def test_each_failure_is_printed_once(shapecat: Run, recording: Path, tmp_path: Path) -> None:
     """On stderr when it happens, and not again in the closing table."""
     (tmp_path / "lab.mcap").write_bytes(recording.read_bytes())
     for k in range(3):
         (tmp_path / f"bad{k}.mcap").write_text("no recording")
-    done = shapecat("process", tmp_path, "--out", tmp_path / "out", *OPTIONS)
+    result = shapecat("process", tmp_path, "--out", tmp_path / "out", *OPTIONS)
 
-    assert done.exit_code == 1
-    assert done.output.count("not a recording") == 3
-    assert "bad" not in done.stdout
-    assert "1 complete, 3 failed" in done.stdout
+    assert result.exit_code == 1
+    assert result.output.count("not a recording") == 3
+    assert "bad" not in result.stdout
+    assert "1 complete, 3 failed" in result.stdout

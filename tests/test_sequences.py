@@ -1,4 +1,4 @@
-"""The benchmark of whole sequences: required, ignored and counted objects."""
+"""Tests of the benchmark of whole sequences: required, ignored and counted objects."""
 
 import json
 from pathlib import Path
@@ -27,7 +27,7 @@ def item(track: int, x: float, *, visible: float = 1.0, size: float = 0.1) -> di
     }
 
 
-def judged(folder: Path, objects: list[dict[str, Any]], tracks: list[list[float]]) -> Any:
+def figures_of(folder: Path, objects: list[dict[str, Any]], tracks: list[list[float]]) -> Any:
     """Return the figures of ten equal frames; tracks are given by their x, row by row."""
     truth = [{"objects": objects, "hidden": []}] * 10
     (folder / "recording.truth.json").write_text(json.dumps(truth))
@@ -38,54 +38,54 @@ def judged(folder: Path, objects: list[dict[str, Any]], tracks: list[list[float]
     ]
     (folder / "run").mkdir()
     pq.write_table(pa.Table.from_pylist(rows), folder / "run" / "tracks.parquet")
-    places = [{"frame": k, "fixed_translation": [0.0, 0.0, 0.0]} for k in range(10)]
-    pq.write_table(pa.Table.from_pylist(places), folder / "run" / "frames.parquet")
-    seen = list(sequences.seen_together(folder, sequences.read_truth(folder)))
-    return sequences.identities({"a": seen})["a"]
+    poses = [{"frame": k, "fixed_translation": [0.0, 0.0, 0.0]} for k in range(10)]
+    pq.write_table(pa.Table.from_pylist(poses), folder / "run" / "frames.parquet")
+    pairs = list(sequences.seen_together(folder, sequences.read_truth(folder)))
+    return sequences.identities({"a": pairs})["a"]
 
 
-def test_all_found_is_one_and_an_invented_track_costs(tmp_path: Path) -> None:
+def test_false_track_lowers_mota_of_perfect_tracks(tmp_path: Path) -> None:
     objects = [item(0, 0.0), item(1, 0.5)]
     for name, tracks, mota in (("good", [[0.02, 0.5]], 1.0), ("more", [[0.0, 0.5, 0.9]], 0.5)):
         (tmp_path / name).mkdir()
-        assert judged(tmp_path / name, objects, tracks)["mota"] == mota
+        assert figures_of(tmp_path / name, objects, tracks)["mota"] == mota
 
 
-def test_hidden_objects_count_neither_for_nor_against(tmp_path: Path) -> None:
+def test_hidden_objects_are_ignored(tmp_path: Path) -> None:
     objects = [item(0, 0.0), item(1, 0.5, visible=0.2)]
     for name, tracks in (("kept", [[0.0, 0.5]]), ("left", [[0.0]])):
         (tmp_path / name).mkdir()
-        figures = judged(tmp_path / name, objects, tracks)
+        figures = figures_of(tmp_path / name, objects, tracks)
         assert (figures["mota"], figures["idf1"], figures["objects"]) == (1.0, 1.0, 10)
 
 
-def test_what_is_out_of_range_counts_neither_for_nor_against(tmp_path: Path) -> None:
+def test_objects_and_tracks_out_of_range_are_ignored(tmp_path: Path) -> None:
     objects = [item(0, 0.0), item(1, 2.5)]
     for name, tracks in (("found", [[0.0, 2.5]]), ("left", [[0.0]]), ("invented", [[0.0, 3.5]])):
         (tmp_path / name).mkdir()
-        assert judged(tmp_path / name, objects, tracks)["mota"] == 1.0
+        assert figures_of(tmp_path / name, objects, tracks)["mota"] == 1.0
 
 
-def test_a_large_object_may_be_met_at_its_rim(tmp_path: Path) -> None:
-    """Of a tray only the near part may be seen."""
+def test_large_object_matches_track_near_its_edge(tmp_path: Path) -> None:
+    """Only the near part of a tray may be visible."""
     for name, size, mota in (("tray", 0.4, 1.0), ("cup", 0.1, -1.0)):
         (tmp_path / name).mkdir()
-        assert judged(tmp_path / name, [item(0, 0.0, size=size)], [[0.18]])["mota"] == mota
+        assert figures_of(tmp_path / name, [item(0, 0.0, size=size)], [[0.18]])["mota"] == mota
 
 
-def test_exchanged_identities_are_switches(tmp_path: Path) -> None:
-    figures = judged(tmp_path, [item(0, 0.0), item(1, 0.5)], [[0.0, 0.5], [0.5, 0.0]])
+def test_swapped_identities_count_as_switches(tmp_path: Path) -> None:
+    figures = figures_of(tmp_path, [item(0, 0.0), item(1, 0.5)], [[0.0, 0.5], [0.5, 0.0]])
     assert figures["switches"] == 18
     assert figures["idf1"] == 0.5
 
 
-def test_a_short_sequence_is_judged_from_recording_to_figures(
+def test_short_sequence_is_evaluated_from_recording_to_figures(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr(sequences, "FRAMES", 8)
     monkeypatch.setattr(sequences, "KINDS", ("rearranged",))
 
-    figures = sequences.evaluate(tmp_path, [4])  # in which nothing is lost or taken for another
+    figures = sequences.evaluate(tmp_path, [4])  # no object is lost or confused
 
     assert figures["identities"]["rearranged"]["idf1"] > 0.95
     assert figures["labels"]["all"]["views"] > 40

@@ -1,4 +1,4 @@
-"""The tables of a processed recording, compared with its points and the simulator's truth."""
+"""Tests of the tables of a run against its points and the simulator's truth."""
 
 import json
 import shutil
@@ -15,8 +15,8 @@ from shapecat.runs.selection import read_frames
 from tests.test_tables_rotated import lines, rows
 
 
-def test_neurons_lie_among_the_points_of_their_object(guessed_run: Path) -> None:
-    """In any other frame than the sensor's they would float beside it."""
+def test_neurons_lie_on_points_of_their_object(guessed_run: Path) -> None:
+    """Neurons in another coordinate frame would lie beside the object."""
     run = read_run(guessed_run)
     found = rows(guessed_run, "detections")
     count = 0
@@ -37,22 +37,24 @@ def test_neurons_lie_among_the_points_of_their_object(guessed_run: Path) -> None
     assert count > 50
 
 
-def test_tracks_stand_where_the_simulator_put_them(guessed_run: Path) -> None:
-    """The last table against the truth: metres in the fixed frame, none of the axes exchanged."""
+def test_track_positions_match_simulated_truth(guessed_run: Path) -> None:
+    """Guards the unit, the fixed frame, and the order of the axes."""
     source = Path(read_run(guessed_run)["input"]["path"])
     truth = json.loads(source.with_suffix(".truth.json").read_text())
-    things = {item["track"]: item["center"] for frame in truth for item in frame["objects"]}
-    centers = np.array(list(things.values()))
-    placed = np.array([[float(row[axis]) for axis in "xyz"] for row in lines(guessed_run)])
-    off, which = cKDTree(centers).query(placed)
+    objects = {item["track"]: item["center"] for frame in truth for item in frame["objects"]}
+    centers = np.array(list(objects.values()))
+    positions = np.array([[float(row[axis]) for axis in "xyz"] for row in lines(guessed_run)])
+    distance, nearest = cKDTree(centers).query(positions)
 
-    assert len(placed) >= 0.8 * len(centers)
-    assert len(set(which.tolist())) >= 0.8 * len(placed)
-    assert np.median(off) < 0.03
+    assert len(positions) >= 0.8 * len(centers)
+    assert len(set(nearest.tolist())) >= 0.8 * len(positions)
+    assert np.median(distance) < 0.03
 
 
-def test_corrected_labels_reach_every_output(coloured_run: Path, tmp_path: Path) -> None:
-    """An output that keeps its old labels teaches the mistake that was corrected."""
+def test_corrected_label_reaches_annotated_mcap_and_review(
+    coloured_run: Path, tmp_path: Path
+) -> None:
+    """An output with old labels would teach the corrected mistake."""
     folder = tmp_path / "table"
     shutil.copytree(coloured_run, folder)
     number = int(lines(folder)[0]["track"])
@@ -64,7 +66,7 @@ def test_corrected_labels_reach_every_output(coloured_run: Path, tmp_path: Path)
     assert b"wine glass" in plain_mcap(folder / "annotated.mcap")
     from rerun.chunk import RrdReader  # noqa: PLC0415  heavy
 
-    shown = {
+    labels = {
         label
         for chunk in RrdReader(str(folder / "review.rrd")).stream().to_chunks()
         for name, column in zip(
@@ -74,7 +76,7 @@ def test_corrected_labels_reach_every_output(coloured_run: Path, tmp_path: Path)
         for group in column.to_pylist()
         for label in group or ()
     }
-    assert any("wine glass" in label for label in shown), shown
+    assert any("wine glass" in label for label in labels), labels
 
 
 def plain_mcap(path: Path) -> bytes:
