@@ -1,4 +1,4 @@
-"""Calibrations and depth encodings on worked examples without equal numbers."""
+"""Worked examples of calibrations and depth encodings; no two numbers are equal."""
 
 from pathlib import Path
 from types import SimpleNamespace
@@ -39,14 +39,14 @@ def region(x: int, y: int, width: int, height: int) -> Any:
     return make("sensor_msgs/msg/RegionOfInterest", x, y, height, width, False)
 
 
-def test_a_rectified_image_is_described_by_p_and_a_raw_one_by_k() -> None:
+def test_rectified_image_uses_p_and_raw_image_uses_k() -> None:
     """sensor_msgs/CameraInfo: P is the camera of the rectified image, K of the raw one."""
-    rectified, left = camera_of_info(calibration(), rectified=True)
+    rectified, distorted = camera_of_info(calibration(), rectified=True)
     assert rectified == Camera(*SIZE, 498.4, 503.2, 317.6, 239.3)
-    assert not left
-    raw, left = camera_of_info(calibration(d=np.array([0.1, 0, 0, 0, 0])), rectified=False)
+    assert not distorted
+    raw, distorted = camera_of_info(calibration(d=np.array([0.1, 0, 0, 0, 0])), rectified=False)
     assert raw == Camera(*SIZE, 531.7, 527.1, 322.3, 243.9)
-    assert left
+    assert distorted
 
 
 @pytest.mark.parametrize(
@@ -60,23 +60,21 @@ def test_a_rectified_image_is_described_by_p_and_a_raw_one_by_k() -> None:
         ("/rectified_camera/depth/image_raw", False),
     ],
 )
-def test_the_name_of_a_topic_tells_whether_its_images_are_rectified(
-    topic: str, rectified: bool
-) -> None:
-    """A transport appends to the topic name; the namespace carries no information."""
+def test_topic_name_decides_whether_image_is_rectified(topic: str, rectified: bool) -> None:
+    """A transport appends to the topic name; the namespace has no meaning."""
     recording: Any = SimpleNamespace(topics=())
     stream = Stream(topic, IMAGE, "depth", "/info", 9, "optical", "16UC1")
 
     assert DepthSource(recording, stream).rectified is rectified
 
 
-def test_without_p_a_rectified_image_is_described_by_k() -> None:
+def test_rectified_image_without_p_uses_k() -> None:
     camera, _ = camera_of_info(calibration(p=np.zeros(12)), rectified=True)
 
     assert (camera.fx, camera.cy) == (531.7, 243.9)
 
 
-def test_a_region_of_interest_moves_the_principal_point_back() -> None:
+def test_region_of_interest_shifts_principal_point() -> None:
     """Cutting 80 columns and 30 rows moves it from (322.3, 243.9) to (242.3, 213.9)."""
     camera, _ = camera_of_info(calibration(roi=region(80, 30, 400, 300)), rectified=False)
 
@@ -91,7 +89,7 @@ def test_binning_divides_focal_length_and_principal_point() -> None:
     assert_allclose([camera.fx, camera.fy, camera.cx, camera.cy], [265.85, 131.775, 161.15, 60.975])
 
 
-def test_a_region_is_given_in_pixels_before_binning() -> None:
+def test_region_of_interest_applies_before_binning() -> None:
     """sensor_msgs/CameraInfo: the ROI is in full resolution, binning comes after."""
     changes = {"roi": region(80, 30, 400, 300), "binning_x": 2, "binning_y": 3}
     camera, _ = camera_of_info(calibration(**changes), rectified=False)
@@ -101,8 +99,8 @@ def test_a_region_is_given_in_pixels_before_binning() -> None:
 
 
 @pytest.mark.parametrize(("width", "height"), [(0, 0), (400, 0), (0, 300)])
-def test_a_region_without_pixels_is_the_whole_image(width: int, height: int) -> None:
-    """Drivers that fill in only some of its fields mean no region."""
+def test_empty_region_of_interest_means_whole_image(width: int, height: int) -> None:
+    """Some drivers fill in only some of its fields."""
     plain, _ = camera_of_info(calibration(), rectified=False)
 
     assert (
@@ -124,7 +122,7 @@ FISHEYE = (-0.021, 0.0043, -0.0117, 0.0029)
 
 @pytest.mark.parametrize("model", ["equidistant", "fisheye"])
 @pytest.mark.parametrize("ray", [(0.31, -0.52), (1.2, 0.4), (-0.05, 0.02)])
-def test_fisheye_follows_its_published_formula(model: str, ray: tuple[float, float]) -> None:
+def test_fisheye_matches_published_formula(model: str, ray: tuple[float, float]) -> None:
     assert_allclose(distort(np.array(ray), model, FISHEYE), fisheye_of_opencv(ray, FISHEYE))
 
 
@@ -143,7 +141,7 @@ def rational_of_opencv(ray: Any, d: Any) -> Any:
 
 
 @pytest.mark.parametrize("ray", [(0.31, -0.52), (-0.4, 0.17)])
-def test_the_rational_polynomial_follows_its_published_formula(ray: tuple[float, float]) -> None:
+def test_rational_polynomial_matches_published_formula(ray: tuple[float, float]) -> None:
     d = (0.21, -0.13, 0.0031, -0.0017, 0.047, 0.19, -0.08, 0.023)
 
     assert_allclose(distort(np.array(ray), "rational_polynomial", d), rational_of_opencv(ray, d))
@@ -156,7 +154,7 @@ def test_the_rational_polynomial_follows_its_published_formula(ray: tuple[float,
         ("plumb_bob", (-0.28, 0.11, 0.0012, -0.0021, -0.02), None),
     ],
 )
-def test_undistorted_rays_are_found_by_any_solver(model: str, d: Any, project: Any) -> None:
+def test_undistorted_rays_match_numerical_inverse(model: str, d: Any, project: Any) -> None:
     """SciPy's least squares inverts the published formula at some pixels."""
     forward = project or (lambda ray, k: rational_of_opencv(ray, (*k, 0, 0, 0)))
     camera = Camera(80, 60, 61.3, 57.9, 37.2, 31.4)
@@ -164,13 +162,12 @@ def test_undistorted_rays_are_found_by_any_solver(model: str, d: Any, project: A
     assert rays is not None
 
     for u, v in [(3, 5), (70, 11), (41, 52)]:
-        seen = np.array([(u - 37.2) / 61.3, (v - 31.4) / 57.9])
-        found = least_squares(lambda ray, s=seen: forward(ray, d) - s, seen, xtol=1e-14)
+        distorted = np.array([(u - 37.2) / 61.3, (v - 31.4) / 57.9])
+        found = least_squares(lambda ray, s=distorted: forward(ray, d) - s, distorted, xtol=1e-14)
         assert_allclose(rays[v, u], found.x, atol=1e-4)
 
 
-def test_a_fisheye_depth_camera_gives_points_along_its_true_rays(tmp_path: Path) -> None:
-    """From message and calibration to the points of the frame."""
+def test_fisheye_depth_image_gives_points_along_true_rays(tmp_path: Path) -> None:
     message = info(EPOCH, d=FISHEYE)
     message.distortion_model = "equidistant"
     items = [
@@ -187,8 +184,8 @@ def test_a_fisheye_depth_camera_gives_points_along_its_true_rays(tmp_path: Path)
 
 
 @pytest.mark.parametrize("kind", ["16UC1", "32FC1"])
-def test_big_endian_depth_is_the_same_depth(kind: str) -> None:
-    """Some machines send it; in the wrong byte order, 1 m becomes 59 m."""
+def test_big_endian_depth_equals_little_endian_depth(kind: str) -> None:
+    """In the wrong byte order, 1 m becomes 59 m."""
     depth = wavy_depth()
     values = depth if kind == "16UC1" else (depth / 1000).astype(np.float32)
     little = image(EPOCH, values, kind)
@@ -200,7 +197,7 @@ def test_big_endian_depth_is_the_same_depth(kind: str) -> None:
 
 
 @pytest.mark.parametrize("pack", [png, rvl])
-def test_inverse_depth_is_a_over_stored_minus_b(pack: Any) -> None:
+def test_inverse_depth_follows_its_formula(pack: Any) -> None:
     """compressed_depth_image_transport: depth = A / (value - B), here A 9100 and B -350."""
     stored = np.array([[650, 4200, 0], [1470, 0, 12_650]], np.uint16)
     message = compressed(EPOCH, pack(stored), "32FC1", (9100.0, -350.0))
@@ -209,8 +206,8 @@ def test_inverse_depth_is_a_over_stored_minus_b(pack: Any) -> None:
     assert_allclose(depth_of_compressed(message), expected, rtol=1e-5)
 
 
-def test_pixels_and_rays_agree_to_a_thousandth_of_a_pixel() -> None:
-    """A shift by half a pixel is a millimetre on a table; no other test would notice it."""
+def test_rays_agree_with_pixels_to_a_thousandth_of_a_pixel() -> None:
+    """A shift by half a pixel moves a point on a table by a millimetre."""
     camera = Camera(64, 48, 60.0, 61.0, 31.2, 23.7)
     depth = np.full((48, 64), 2.0, np.float32)
     points = Frame("", 0, 0, 0, "", depth=depth, camera=camera).xyz()
@@ -225,7 +222,7 @@ def test_pixels_and_rays_agree_to_a_thousandth_of_a_pixel() -> None:
     assert_allclose(found, [60.0, 61.0, 31.2, 23.7], atol=1e-3)
 
 
-def test_up_is_turned_from_the_fixed_frame_into_the_sensors() -> None:
+def test_up_is_rotated_from_fixed_frame_into_sensor_frame() -> None:
     """Z of the fixed frame, seen by the sensor, is the last row of fixed_from_sensor."""
     from shapecat.recordings.gravity import Upright  # noqa: PLC0415  beside its only use
     from shapecat.recordings.transform_window import TransformWindow  # noqa: PLC0415  the same

@@ -1,4 +1,4 @@
-"""Containers: recorded messages are read back; damage is reported, never raised."""
+"""Tests of recording containers: messages are read, and damage is reported, never raised."""
 
 import os
 import struct
@@ -63,7 +63,9 @@ def times_read(path: Path, **options: Any) -> list[int]:
 
 
 @pytest.mark.parametrize("compression", list(CompressionType))
-def test_indexed_mcap_is_read_by_time(tmp_path: Path, compression: CompressionType) -> None:
+def test_indexed_mcap_is_read_in_order_of_time(
+    tmp_path: Path, compression: CompressionType
+) -> None:
     times = [30, 10, 50, 20, 40, 0] * 5
     path = write_mcap(tmp_path / "a.mcap", times, compression=compression)
 
@@ -83,7 +85,7 @@ def test_indexed_mcap_is_read_by_time(tmp_path: Path, compression: CompressionTy
         assert (first.publish_time_ns, first.sequence % 6) == (51, 2)
 
 
-def test_window_and_topics_are_selected(tmp_path: Path) -> None:
+def test_time_window_and_topics_are_selected(tmp_path: Path) -> None:
     path = write_mcap(tmp_path / "a.mcap", list(range(0, 100, 10)))
 
     assert times_read(path, start_ns=20, stop_ns=60) == [20, 30, 40, 50]
@@ -101,9 +103,7 @@ def test_window_and_topics_are_selected(tmp_path: Path) -> None:
         {"repeat_channels": False, "use_statistics": False, "use_summary_offsets": False},
     ],
 )
-def test_mcap_without_an_index_is_read_in_the_order_of_the_file(
-    tmp_path: Path, options: dict[str, Any]
-) -> None:
+def test_mcap_without_index_is_read_in_file_order(tmp_path: Path, options: dict[str, Any]) -> None:
     """The library would sort everything in memory, or raise a bare KeyError."""
     times = [30, 10, 20, 0]
     path = write_mcap(tmp_path / "a.mcap", times, **options)
@@ -134,20 +134,20 @@ def test_unfinished_mcap_is_recovered(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize("rest", [b"", b"\x05" + struct.pack("<Q", 1000) + b"abc"])
-def test_it_is_said_how_much_of_an_unfinished_mcap_is_lost(tmp_path: Path, rest: bytes) -> None:
+def test_warning_states_lost_bytes_of_unfinished_mcap(tmp_path: Path, rest: bytes) -> None:
     """The user must learn whether a power cut cost twelve bytes or nothing."""
     path = write_mcap(tmp_path / "a.mcap", list(range(20)), unfinished=True)
     path.write_bytes(path.read_bytes() + rest)
     with open_recording(path) as recording:
-        (said,) = recording.warnings
+        (warning,) = recording.warnings
 
     lost = ", and what was readable in the last 12 bytes" if rest else ""
-    assert said.startswith("the recording was not finished; messages recovered: ")
-    assert said.partition("recovered: ")[2].lstrip("0123456789") == lost
+    assert warning.startswith("the recording was not finished; messages recovered: ")
+    assert warning.partition("recovered: ")[2].lstrip("0123456789") == lost
 
 
-def test_a_chunk_without_messages_has_no_time(tmp_path: Path) -> None:
-    """By the format its times are 0: a recording of today would begin in 1970.
+def test_chunk_without_messages_does_not_set_start(tmp_path: Path) -> None:
+    """By the format its times are 0, and the recording would begin in 1970.
 
     `--end 5` would then read nothing. Some writers begin with a chunk of schemas and channels.
     """
@@ -168,7 +168,7 @@ def test_a_chunk_without_messages_has_no_time(tmp_path: Path) -> None:
         assert not recording.warnings
 
 
-def test_every_truncation_ends_sensibly(tmp_path: Path) -> None:
+def test_mcap_truncated_anywhere_gives_first_messages(tmp_path: Path) -> None:
     """A power cut can happen at any byte."""
     whole = write_mcap(tmp_path / "a.mcap", list(range(8))).read_bytes()
     for size in range(0, len(whole), 7):
@@ -182,7 +182,7 @@ def test_every_truncation_ends_sensibly(tmp_path: Path) -> None:
             assert read == list(range(len(read)))
 
 
-def test_every_flipped_byte_ends_sensibly(tmp_path: Path) -> None:
+def test_flipped_bytes_in_mcap_raise_only_message_errors(tmp_path: Path) -> None:
     """Wrong length fields must not cause allocations, endless loops or tracebacks."""
     whole = write_mcap(tmp_path / "a.mcap", list(range(6)), compression=CompressionType.LZ4)
     data = whole.read_bytes()
@@ -200,10 +200,10 @@ def test_every_flipped_byte_ends_sensibly(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize("compression", list(CompressionType))
-def test_small_messages_are_read_without_the_images_behind_them(
+def test_chunk_is_read_only_up_to_last_wanted_message(
     tmp_path: Path, compression: CompressionType
 ) -> None:
-    """Otherwise reading transforms would decompress the whole recording once more."""
+    """Otherwise reading transforms would decompress the whole recording again."""
     path = tmp_path / "a.mcap"
     noise = np.random.default_rng(0).integers(0, 256, 100_000, np.uint8).tobytes()
     with path.open("wb") as file:
@@ -228,7 +228,7 @@ def test_small_messages_are_read_without_the_images_behind_them(
         assert "skipped the chunk" in recording.warnings[0]
 
 
-def test_a_message_index_that_lacks_messages_is_not_believed(tmp_path: Path) -> None:
+def test_incomplete_message_index_is_ignored(tmp_path: Path) -> None:
     path = write_mcap(tmp_path / "a.mcap", [0, 1, 2], chunk_size=10_000)
     data = path.read_bytes()
     first = data.index(b"\x07" + struct.pack("<QH", 38, 1))  # the index of /a
@@ -237,7 +237,7 @@ def test_a_message_index_that_lacks_messages_is_not_believed(tmp_path: Path) -> 
     assert times_read(path, topics=["/a"]) == [0, 2]
 
 
-def test_damaged_chunk_is_left_out(tmp_path: Path) -> None:
+def test_damaged_chunk_is_skipped(tmp_path: Path) -> None:
     path = write_mcap(tmp_path / "a.mcap", list(range(20)))
     data = bytearray(path.read_bytes())
     at = data.index(b"message 9")
@@ -253,7 +253,7 @@ def test_damaged_chunk_is_left_out(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize("size", [10**9, 2**62])
-def test_chunk_that_claims_to_be_huge_is_refused(tmp_path: Path, size: int) -> None:
+def test_chunk_with_huge_claimed_size_is_skipped(tmp_path: Path, size: int) -> None:
     """Memory must depend on the content of the file, not on its claims."""
     path = write_mcap(tmp_path / "a.mcap", [1, 2], compression=CompressionType.ZSTD)
     data = bytearray(path.read_bytes())
@@ -266,7 +266,7 @@ def test_chunk_that_claims_to_be_huge_is_refused(tmp_path: Path, size: int) -> N
         assert "claims to hold" in recording.warnings[0]
 
 
-def test_memory_stays_flat(tmp_path: Path) -> None:
+def test_memory_does_not_grow_with_recording(tmp_path: Path) -> None:
     """Only the chunks that overlap in time are held."""
     tracemalloc = pytest.importorskip("tracemalloc")
     path = tmp_path / "a.mcap"
@@ -304,7 +304,7 @@ def write_bag(path: Path, compression: Any = None) -> Path:
 
 
 @pytest.mark.parametrize("compression", [None, *BagWriter.CompressionFormat])
-def test_bag_with_two_types_on_a_topic(tmp_path: Path, compression: Any) -> None:
+def test_bag_with_two_types_on_one_topic_is_read(tmp_path: Path, compression: Any) -> None:
     path = write_bag(tmp_path / "a.bag", compression)
 
     with open_recording(path) as recording:
@@ -315,8 +315,8 @@ def test_bag_with_two_types_on_a_topic(tmp_path: Path, compression: Any) -> None
         assert (string.data, header.seq, header.stamp.nanosec) == ("hello", 7, 2)
 
 
-def test_bag_cut_anywhere_gives_what_is_there(tmp_path: Path) -> None:
-    """Including one whose recorder was killed, which has no index."""
+def test_bag_truncated_anywhere_gives_first_messages(tmp_path: Path) -> None:
+    """Also without an index, as if the recorder was killed."""
     whole = write_bag(tmp_path / "a.bag")
     data = whole.read_bytes()
     path = tmp_path / "cut.bag"
@@ -332,13 +332,13 @@ def test_bag_cut_anywhere_gives_what_is_there(tmp_path: Path) -> None:
                 assert "recovered" in " ".join(recording.warnings)
                 counts.append(len(read))
         except RecordingError as error:
-            assert "cut.bag: not a" in str(error)  # noqa: PT017  others than this are allowed
+            assert "cut.bag: not a" in str(error)  # noqa: PT017  not every size is an error
     assert counts == sorted(counts)
     assert counts[-1] == 2
 
 
 @pytest.mark.parametrize("compression", list(BagWriter.CompressionFormat))
-def test_damaged_chunk_of_a_bag_does_not_stop_the_others(tmp_path: Path, compression: Any) -> None:
+def test_damaged_bag_chunk_does_not_stop_others(tmp_path: Path, compression: Any) -> None:
     path = tmp_path / "a.bag"
     writer = BagWriter(path)
     writer.chunk_threshold = 100
@@ -374,7 +374,7 @@ def write_folder(path: Path, plugin: StoragePlugin, mode: CompressionMode | None
 @pytest.mark.parametrize("plugin", list(StoragePlugin))
 @pytest.mark.parametrize("mode", [None, CompressionMode.FILE, CompressionMode.MESSAGE])
 @pytest.mark.parametrize("metadata", [True, False])
-def test_ros2_folder(
+def test_ros2_folder_is_read(
     tmp_path: Path, plugin: StoragePlugin, mode: CompressionMode | None, metadata: Any
 ) -> None:
     if plugin is StoragePlugin.MCAP and mode is CompressionMode.MESSAGE:
@@ -391,8 +391,8 @@ def test_ros2_folder(
         assert bool(recording.warnings) is not metadata
 
 
-def test_a_file_that_is_no_part_of_a_bag_is_not_read(tmp_path: Path) -> None:
-    """Guards against a foreign recording, or a repaired copy of a part, beside the parts."""
+def test_file_not_listed_in_metadata_is_not_read(tmp_path: Path) -> None:
+    """Guards against another recording, or a repaired copy of a part, beside the parts."""
     path = write_folder(tmp_path / "bag", StoragePlugin.MCAP)
     write_mcap(path / "another.mcap", [7, 8])
     plain = (path / "metadata.yaml").read_text()
@@ -409,8 +409,8 @@ def test_a_file_that_is_no_part_of_a_bag_is_not_read(tmp_path: Path) -> None:
     ("kind", "length", "refused"),
     [("string", 5000, True), ("uint8", 5000, False), ("string", 9, False)],
 )
-def test_long_arrays_of_texts_are_not_unrolled(kind: str, length: int, *, refused: bool) -> None:
-    """The library generates code per element: one line of definition could fill the memory."""
+def test_long_string_arrays_are_refused(kind: str, length: int, *, refused: bool) -> None:
+    """The library generates code per element; one line of definition could fill the memory."""
     name, definition = "lab/msg/Long", f"{kind}[{length}] data".encode()
     channel = Channel("/a", name, "cdr", name, "ros2msg", definition)
     expected = pytest.raises(ValueError, match=f"an array of {length} is too long")
@@ -419,29 +419,29 @@ def test_long_arrays_of_texts_are_not_unrolled(kind: str, length: int, *, refuse
         assert name in typestore_of(channel).types
 
 
-def test_parts_unpacked_by_a_killed_process_are_removed(
+def test_parts_unpacked_by_killed_process_are_removed(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     path = write_folder(tmp_path / "bag", StoragePlugin.SQLITE3, CompressionMode.FILE)
-    place = tmp_path / "tmp"
-    old, other = place / "shapecat-parts-old", place / "shapecat-parts-other"
+    temporary = tmp_path / "tmp"
+    old, other = temporary / "shapecat-parts-old", temporary / "shapecat-parts-other"
     for folder in (old, other):
         folder.mkdir(parents=True)
         os.utime(folder, (0, 0))
-    monkeypatch.setattr("tempfile.tempdir", str(place))
+    monkeypatch.setattr("tempfile.tempdir", str(temporary))
     held = lock(other)
     assert held is not None
 
     with open_recording(path) as recording:
         assert not old.exists()
-        assert len(list(place.iterdir())) == 2
+        assert len(list(temporary.iterdir())) == 2
         assert sum(1 for _ in recording.messages()) == 5
 
-    assert list(place.iterdir()) == [other]
+    assert list(temporary.iterdir()) == [other]
     os.close(held)
 
 
-def test_splits_that_overlap_are_merged(tmp_path: Path) -> None:
+def test_overlapping_splits_are_merged(tmp_path: Path) -> None:
     write_mcap(tmp_path / "b_0.mcap", [0, 20, 40, 60])
     write_mcap(tmp_path / "b_1.mcap", [30, 50, 70, 90])
 
@@ -461,30 +461,30 @@ QOS = Qos(
 
 
 def two_publishers(path: Path, container: str) -> Path:
-    """Write three and four messages on /a, which have a channel each, and two on /b."""
+    """Write three and four messages on /a, by two publishers, and two on /b."""
     published = [("/a", "one", 3), ("/a", "two", 4), ("/b", "one", 2)]
     if container == "mcap":
         with path.open("wb") as file:
             writer = Writer(file)
             writer.start("ros2", "test")
             schema = writer.register_schema(STRING, "ros2msg", b"string data")
-            for topic, who, count in published:
-                channel = writer.register_channel(topic, "cdr", schema, {"who": who})
+            for topic, publisher, count in published:
+                channel = writer.register_channel(topic, "cdr", schema, {"who": publisher})
                 for k in range(count):
                     writer.add_message(channel, 10 + k, text("hello"), 10 + k)
             writer.finish()
     elif container == "ros1":
         store = get_typestore(Stores.ROS1_NOETIC)
         with BagWriter(path) as bag:
-            for topic, who, count in published:
-                link = bag.add_connection(topic, STRING, typestore=store, callerid=f"/{who}")
+            for topic, publisher, count in published:
+                link = bag.add_connection(topic, STRING, typestore=store, callerid=f"/{publisher}")
                 hello = store.serialize_ros1(store.types[STRING]("hello"), STRING)
                 for k in range(count):
                     bag.write(link, 10 + k, hello)
     else:
         with FolderWriter(path, version=9, storage_plugin=StoragePlugin[container]) as folder:
-            for topic, who, count in published:
-                qos = [QOS] if who == "two" else []
+            for topic, publisher, count in published:
+                qos = [QOS] if publisher == "two" else []
                 end = folder.add_connection(
                     topic, STRING, typestore=STORE, offered_qos_profiles=qos
                 )
@@ -494,7 +494,7 @@ def two_publishers(path: Path, container: str) -> Path:
 
 
 @pytest.mark.parametrize("container", ["mcap", "ros1", "MCAP", "SQLITE3"])
-def test_messages_of_all_publishers_of_a_topic_are_counted(tmp_path: Path, container: str) -> None:
+def test_topic_count_includes_all_publishers(tmp_path: Path, container: str) -> None:
     """The count decides which topic is chosen, and is the total of the progress."""
     suffix = {"mcap": ".mcap", "ros1": ".bag"}.get(container, "")
     with open_recording(two_publishers(tmp_path / f"lab{suffix}", container)) as recording:
@@ -503,7 +503,7 @@ def test_messages_of_all_publishers_of_a_topic_are_counted(tmp_path: Path, conta
         assert (recording.start_ns, recording.end_ns) == (10, 13)
 
 
-def test_a_split_that_lasts_longest_tells_the_end_whichever_began_last(tmp_path: Path) -> None:
+def test_recording_ends_with_its_longest_split(tmp_path: Path) -> None:
     """Of two recorders, the one started first may have been stopped last."""
     write_mcap(tmp_path / "b_0.mcap", [11, 40, 97])
     write_mcap(tmp_path / "b_1.mcap", [23, 58])
@@ -514,7 +514,7 @@ def test_a_split_that_lasts_longest_tells_the_end_whichever_began_last(tmp_path:
     assert times_read(tmp_path) == [11, 23, 40, 58, 97]
 
 
-def test_missing_split_is_said(tmp_path: Path) -> None:
+def test_missing_split_is_reported(tmp_path: Path) -> None:
     path = write_folder(tmp_path / "bag", StoragePlugin.SQLITE3)
     file = path / "metadata.yaml"
     listed = file.read_text().replace("  - bag.db3\n", "  - bag.db3\n  - gone.db3\n")
@@ -526,7 +526,7 @@ def test_missing_split_is_said(tmp_path: Path) -> None:
 
 def test_database_without_definitions_uses_humble(tmp_path: Path) -> None:
     """Bags from before ROS 2 Iron do not hold the definitions of their messages."""
-    import sqlite3  # noqa: PLC0415  # only here
+    import sqlite3  # noqa: PLC0415  only used here
 
     path = write_folder(tmp_path / "bag", StoragePlugin.SQLITE3) / "bag.db3"
     base = sqlite3.connect(path)
@@ -541,7 +541,7 @@ def test_database_without_definitions_uses_humble(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize(
-    ("name", "content", "said"),
+    ("name", "content", "reason"),
     [
         ("none.mcap", None, "does not exist"),
         ("empty.bag", b"", "is empty"),
@@ -550,8 +550,8 @@ def test_database_without_definitions_uses_humble(tmp_path: Path) -> None:
         ("base.db3", b"SQLite format 3\0" + bytes(200), "not a readable ROS 2 bag"),
     ],
 )
-def test_what_is_no_recording_is_one_line(
-    tmp_path: Path, name: str, content: bytes | None, said: str
+def test_unreadable_file_gives_one_line_error(
+    tmp_path: Path, name: str, content: bytes | None, reason: str
 ) -> None:
     path = tmp_path / name
     if content is not None:
@@ -561,11 +561,11 @@ def test_what_is_no_recording_is_one_line(
         open_recording(path)
 
     assert str(path) in str(caught.value)
-    assert said in str(caught.value)
+    assert reason in str(caught.value)
     assert "\n" not in str(caught.value)
 
 
-def test_suffix_is_not_believed(tmp_path: Path) -> None:
+def test_format_is_detected_from_content_not_suffix(tmp_path: Path) -> None:
     path = write_mcap(tmp_path / "a.bag", [1])
 
     assert times_read(path) == [1]
@@ -581,7 +581,7 @@ def test_suffix_is_not_believed(tmp_path: Path) -> None:
         "uint8 class",
     ],
 )
-def test_hostile_definition_is_an_error_of_the_message(tmp_path: Path, definition: str) -> None:
+def test_hostile_definition_is_message_error(tmp_path: Path, definition: str) -> None:
     path = tmp_path / "a.mcap"
     with path.open("wb") as file:
         writer = Writer(file)

@@ -1,4 +1,4 @@
-"""Colour streams: found, decoded, paired in time, and registered to the depth camera."""
+"""Tests of colour streams: choice, decoding, pairing in time, and registration to the depth."""
 
 from collections import Counter
 from collections.abc import Sequence
@@ -76,14 +76,14 @@ def beside(
     *more: tuple[str, int, Any],
     frame_id: str = "color_optical",
     distortion: Sequence[float] = (0.1, -0.2, 0.001, 0.002, 0.0),
-    **written: Any,
+    **options: Any,
 ) -> Path:
     """Write a depth image with a colour image of another camera."""
     items = depth_items(EPOCH)
     items += [("/cam/color/camera_info", EPOCH, info(EPOCH, WIDE, distortion))]
     colours = raw(EPOCH, gradient(60, 80), "rgb8", frame_id)
     items += [*more, ("/cam/color/image_raw", EPOCH + 1, colours)]
-    return write(path, in_order(items), **written)
+    return write(path, in_order(items), **options)
 
 
 @pytest.mark.parametrize(
@@ -99,16 +99,15 @@ def beside(
         ("bgr16", gradient()[..., ::-1].astype("<u2") * 256 + 99),
     ],
 )
-def test_raw_images_of_every_channel_order_give_the_same_pixels(encoding: str, data: Any) -> None:
-    """A swapped channel makes a red cup blue, in every data set that is trained on."""
+def test_raw_encodings_give_same_pixels(encoding: str, data: Any) -> None:
+    """A swapped channel makes a red cup blue in every exported data set."""
     message = raw(EPOCH, data, encoding)
     found = ColourImage("", 0, 0, "", encoding, 64, 48, message.step, bytes(message.data))
 
     np.testing.assert_array_equal(pixels_of(found), gradient())
 
 
-def test_mosaics_and_brightness_with_chroma_become_colours() -> None:
-    """Blocks of one colour survive, whatever the sensor's pixel layout."""
+def test_bayer_and_yuv_images_are_decoded() -> None:
     red, green, blue = 200, 120, 40
     mosaic = np.zeros((6, 8), np.uint8)
     mosaic[::2, 1::2], mosaic[1::2, ::2] = red, blue  # grbg
@@ -132,7 +131,7 @@ def test_mosaics_and_brightness_with_chroma_become_colours() -> None:
         ("bayer_bggr8", (1, 1), (0, 0)),
     ],
 )
-def test_every_mosaic_has_red_where_its_name_says(
+def test_bayer_patterns_place_red_and_blue_correctly(
     encoding: str, red_at: tuple[int, int], blue_at: tuple[int, int]
 ) -> None:
     mosaic = np.full((6, 8), 120, np.uint8)
@@ -144,7 +143,7 @@ def test_every_mosaic_has_red_where_its_name_says(
 
 
 @pytest.mark.parametrize("encoding", ["yuv422", "uyvy", "yuv422_yuy2", "yuyv"])
-def test_brightness_comes_where_the_encoding_says(encoding: str) -> None:
+def test_yuv_encodings_order_luma_and_chroma_correctly(encoding: str) -> None:
     """UYVY is the order of yuv422, YUYV that of yuv422_yuy2."""
     red, green, blue = 200, 120, 40
     y = 0.299 * red + 0.587 * green + 0.114 * blue
@@ -156,7 +155,7 @@ def test_brightness_comes_where_the_encoding_says(encoding: str) -> None:
     assert np.abs(pixels_of(found).astype(int) - [red, green, blue]).max() <= 2
 
 
-def test_packed_colours_of_points_are_read_by_their_own_offset() -> None:
+def test_packed_point_colours_are_read_at_their_offset() -> None:
     """PCL's float holds 0x00RRGGBB; read as a number it gives black objects."""
     points = organized_points(wavy_depth())
     data = np.zeros((48, 64), np.dtype([("xyz", "<f4", 3), ("pad", "<f4"), ("rgb", "<u4")]))
@@ -175,8 +174,8 @@ def test_packed_colours_of_points_are_read_by_their_own_offset() -> None:
         cloud_colours(message)
 
 
-def test_a_cloud_brings_its_own_colours(tmp_path: Path) -> None:
-    """Colours in the points need no second topic, and fit pixel by pixel."""
+def test_cloud_colours_are_registered_to_its_points(tmp_path: Path) -> None:
+    """They need no second topic."""
     points = organized_points(wavy_depth())
     data = np.zeros((48, 64), np.dtype([("xyz", "<f4", 3), ("rgb", "<u4")]))
     data["xyz"], data["rgb"] = points, 0x0A141E
@@ -195,7 +194,7 @@ def test_a_cloud_brings_its_own_colours(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize(("encode", "close"), [(jpeg, 4), (png, 0)])
-def test_compressed_images_are_kept_as_they_came(tmp_path: Path, encode: Any, close: int) -> None:
+def test_compressed_images_are_kept_unchanged(tmp_path: Path, encode: Any, close: int) -> None:
     """A second compression would cost quality and time."""
     body = encode(gradient())
     items = [*depth_items(EPOCH), ("/cam/color/image_raw/compressed", EPOCH, packed(EPOCH, body))]
@@ -208,7 +207,7 @@ def test_compressed_images_are_kept_as_they_came(tmp_path: Path, encode: Any, cl
     assert not warnings
 
 
-def test_compressed_comes_before_raw_and_colour_before_infrared(tmp_path: Path) -> None:
+def test_compressed_colour_stream_is_preferred(tmp_path: Path) -> None:
     """The wrong one of five streams of a camera must not be chosen."""
     items = depth_items(EPOCH)
     for topic in ("/cam/infra1/image", "/cam/color/image_raw", "/other/color/image_raw"):
@@ -239,7 +238,7 @@ def test_compressed_comes_before_raw_and_colour_before_infrared(tmp_path: Path) 
     assert uses["/cam/color/image_raw/compressed"] == "colour of /cam/depth/image_raw"
 
 
-def test_frames_pair_with_the_nearest_image_up_to_half_a_period(tmp_path: Path) -> None:
+def test_frames_pair_with_nearest_image_within_half_a_period(tmp_path: Path) -> None:
     """An image from another time would paint the table onto a moved object."""
     shades = {k: gradient(seed=k) for k in range(4)}
     colours = [
@@ -255,7 +254,7 @@ def test_frames_pair_with_the_nearest_image_up_to_half_a_period(tmp_path: Path) 
     assert any("(1×): no colour image near the time of the frame" in w for w in warnings)
 
 
-def test_an_image_that_is_logged_late_is_waited_for(tmp_path: Path) -> None:
+def test_pairing_waits_for_image_logged_late(tmp_path: Path) -> None:
     """Compression takes time: the right image is often logged after the next frame."""
     stamps = [EPOCH + t * MS for t in (0, 33, 66)]
     colours = [
@@ -267,7 +266,7 @@ def test_an_image_that_is_logged_late_is_waited_for(tmp_path: Path) -> None:
     assert [v and v.image.stamp_ns for _, v in pairs] == stamps
 
 
-def test_damaged_images_are_left_out_and_counted(tmp_path: Path) -> None:
+def test_damaged_images_are_skipped_and_reported(tmp_path: Path) -> None:
     """A damaged image must neither end a run nor go unreported."""
     body = jpeg(gradient())
     bodies = [body[:-200], b"\xff\xd8\xff", b"", b"no image", body]
@@ -284,8 +283,8 @@ def test_damaged_images_are_left_out_and_counted(tmp_path: Path) -> None:
     assert any("neither JPEG nor PNG" in w for w in warnings)
 
 
-def test_damage_inside_an_image_is_a_message_error() -> None:
-    """The header of a file may claim more than its content holds."""
+def test_damaged_image_is_message_error() -> None:
+    """The header of an image may claim more than its content holds."""
     for body in (jpeg(gradient()), png(gradient())):
         kind = "png" if body.startswith(b"\x89") else "jpeg"
         damaged = body[: len(body) // 2] + body[-12:]
@@ -301,8 +300,8 @@ def test_damage_inside_an_image_is_a_message_error() -> None:
 
 
 @pytest.mark.parametrize("wrong", [np.nan, np.inf])
-def test_distortion_that_is_no_number_is_told(tmp_path: Path, wrong: float) -> None:
-    """Else all masks are empty, without a word."""
+def test_non_finite_distortion_is_reported(tmp_path: Path, wrong: float) -> None:
+    """Otherwise all masks would be empty without a reason."""
     tf = ("/tf_static", EPOCH, static("camera", "color_optical", (0.05, 0, 0), (0, 0, 0, 1)))
     ((_, view),), warnings = read(beside(tmp_path / "a.mcap", tf, distortion=(wrong, 0, 0, 0, 0)))
 
@@ -310,8 +309,8 @@ def test_distortion_that_is_no_number_is_told(tmp_path: Path, wrong: float) -> N
     assert any("lens distortion that is not finite" in w for w in warnings)
 
 
-def test_another_camera_is_placed_by_the_transforms(tmp_path: Path) -> None:
-    """With a rotated pose, an inverse or a wrong order of frames is far off."""
+def test_pose_of_colour_camera_comes_from_transforms(tmp_path: Path) -> None:
+    """A rotated pose reveals an inverse or a wrong order of frames."""
     turn = (0.1, -0.2, 0.05, 0.97)
     tf = ("/tf_static", EPOCH, static("camera", "color_optical", (0.05, 0.01, -0.02), turn))
     ((_, view),), _ = read(beside(tmp_path / "a.mcap", tf))
@@ -327,8 +326,8 @@ def test_another_camera_is_placed_by_the_transforms(tmp_path: Path) -> None:
     np.testing.assert_allclose(pose.rotation @ ahead + pose.translation, [0, 0, 1], atol=1e-9)
 
 
-def test_a_camera_that_moves_beside_the_sensor_is_placed_anew_in_each_frame(tmp_path: Path) -> None:
-    """Only a static transform may be kept: the first pose would colour all later frames."""
+def test_moving_colour_camera_has_new_pose_in_each_frame(tmp_path: Path) -> None:
+    """Only a static transform may be kept; the first pose would colour all later frames."""
     items = [
         *depth_items(EPOCH, EPOCH + SECOND),
         ("/cam/color/camera_info", EPOCH, info(EPOCH, WIDE)),
@@ -343,24 +342,24 @@ def test_a_camera_that_moves_beside_the_sensor_is_placed_anew_in_each_frame(tmp_
     assert [pose.translation[0] for pose in poses if pose is not None] == [-0.05, -0.09]
 
 
-def test_without_a_transform_there_is_no_colour(tmp_path: Path) -> None:
-    """Colours in the wrong place are worse than none."""
+def test_colour_without_transform_is_unused(tmp_path: Path) -> None:
+    """Misplaced colours are worse than no colours."""
     ((_, view),), warnings = read(beside(tmp_path / "a.mcap"))
 
     assert view is None
     assert any("no transform between camera and color_optical" in w for w in warnings)
 
 
-def test_an_extrinsics_topic_without_messages_is_absent(tmp_path: Path) -> None:
-    """It is latched: a recording that starts after the driver declares it and holds none."""
-    silent = [("/cam/extrinsics/depth_to_color", "std_msgs/msg/String")]
-    ((_, view),), warnings = read(beside(tmp_path / "a.mcap", empty=silent))
+def test_extrinsics_topic_without_messages_is_ignored(tmp_path: Path) -> None:
+    """A recording that starts after the driver lacks messages of this latched topic."""
+    declared = [("/cam/extrinsics/depth_to_color", "std_msgs/msg/String")]
+    ((_, view),), warnings = read(beside(tmp_path / "a.mcap", empty=declared))
 
     assert view is None
     assert any("no transform between camera and color_optical" in w for w in warnings)
 
 
-def test_images_of_the_same_frame_but_another_size_are_projected(tmp_path: Path) -> None:
+def test_image_of_same_frame_and_other_size_is_projected(tmp_path: Path) -> None:
     """An equal frame id means an equal camera position, not equal pixels."""
     ((_, view),), _ = read(beside(tmp_path / "a.mcap", frame_id="camera"))
 
@@ -369,8 +368,8 @@ def test_images_of_the_same_frame_but_another_size_are_projected(tmp_path: Path)
     np.testing.assert_array_equal(view.colour_from_depth.rotation, np.eye(3))  # type: ignore[union-attr]
 
 
-def test_extrinsics_of_the_realsense_driver(tmp_path: Path) -> None:
-    """It stores rotations column by column; read by rows, a rotated camera faces the other way."""
+def test_realsense_extrinsics_are_read_column_by_column(tmp_path: Path) -> None:
+    """Read by rows, a rotated camera would face the other way."""
     ros1 = get_typestore(Stores.ROS1_NOETIC)
     text = "std_msgs/Header header\nfloat64[9] rotation\nfloat64[3] translation\n"
     kind = "realsense2_camera/msg/Extrinsics"
@@ -402,8 +401,7 @@ def test_extrinsics_of_the_realsense_driver(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize("container", ["mcap", "ros1", "ros2"])
-def test_simulated_recordings_bring_their_colour_camera(tmp_path: Path, container: Any) -> None:
-    """Each container of a recording gives the same image in the same place."""
+def test_simulated_colour_camera_is_equal_in_all_containers(tmp_path: Path, container: Any) -> None:
     from shapecat.simulation import simulate  # noqa: PLC0415  slow to load
     from shapecat.simulation.colour_camera import COLOUR  # noqa: PLC0415  the same
 
@@ -415,7 +413,7 @@ def test_simulated_recordings_bring_their_colour_camera(tmp_path: Path, containe
         assert view is not None
         assert view.image.stamp_ns == frame.stamp_ns
         assert view.colour_from_depth is not None
-        place = -view.colour_from_depth.rotation.T @ view.colour_from_depth.translation
-        np.testing.assert_allclose(place, COLOUR.depth_from_colour.translation, atol=1e-8)
+        position = -view.colour_from_depth.rotation.T @ view.colour_from_depth.translation
+        np.testing.assert_allclose(position, COLOUR.depth_from_colour.translation, atol=1e-8)
         assert view.lens == COLOUR.lens
         assert pixels_of(view.image).shape == (720, 960, 3)

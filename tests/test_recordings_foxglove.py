@@ -1,4 +1,4 @@
-"""Recordings for Foxglove: JSON and Protocol Buffers instead of ROS messages."""
+"""Tests of recordings with Foxglove messages in JSON and Protocol Buffers."""
 
 from collections import Counter
 from pathlib import Path
@@ -38,27 +38,27 @@ def read(path: Path) -> list[Frame]:
     return result
 
 
-both = pytest.mark.parametrize("encoding", ["json", "protobuf"])
+both_encodings = pytest.mark.parametrize("encoding", ["json", "protobuf"])
 
 
-@both
+@both_encodings
 @pytest.mark.parametrize(
-    ("angles", "place"),
+    ("angles", "position"),
     [
         ([0.7, -0.4, 2.3], [10.0, -3.0, 0.5]),
         ([0.0, 0.0, 0.0], [10.0, -3.0, 0.5]),
         ([0.7, -0.4, 2.3], [0.0, 0.0, 0.0]),
     ],
 )
-def test_point_cloud_with_a_pose(
-    tmp_path: Path, encoding: str, angles: list[float], place: list[float]
+def test_pose_is_applied_to_point_cloud(
+    tmp_path: Path, encoding: str, angles: list[float], position: list[float]
 ) -> None:
-    """A pose that only shifts or only turns is no identity."""
+    """A pose that only shifts or only rotates is not the identity."""
     points = np.arange(12, dtype="<f4").reshape(4, 3) + 1
     fields = [{"name": name, "offset": 4 * k, "type": 7} for k, name in enumerate("xyz")]
     turn = Rotation.from_euler("zyx", angles)
     pose = {
-        "position": dict(zip("xyz", place, strict=True)),
+        "position": dict(zip("xyz", position, strict=True)),
         "orientation": dict(zip("xyzw", turn.as_quat().tolist(), strict=True)),
     }
     values = {"pose": pose, "point_stride": 12, "fields": fields}
@@ -68,20 +68,20 @@ def test_point_cloud_with_a_pose(
 
     assert (frame.stamp_ns, frame.frame_id) == (EPOCH, "camera")
     assert frame.points is not None
-    np.testing.assert_allclose(frame.points, turn.apply(points) + place, atol=1e-5)
+    np.testing.assert_allclose(frame.points, turn.apply(points) + position, atol=1e-5)
 
 
-@both
+@both_encodings
 @pytest.mark.parametrize(
     ("number", "kind"),
     list(enumerate(["<u1", "<i1", "<u2", "<i2", "<u4", "<i4", "<f4", "<f8"], start=1)),
 )
-def test_coordinates_of_every_numeric_type(
+def test_coordinates_may_have_any_numeric_type(
     tmp_path: Path, encoding: str, number: int, kind: str
 ) -> None:
-    """Foxglove numbers the types otherwise than ROS does: -7 would become a large number."""
-    odd = np.iinfo(kind).max - 2 if "u" in kind else -7
-    points = np.array([[odd, 5, 9], [2, odd, 7]]).astype(kind)
+    """Foxglove numbers the types unlike ROS: -7 would become a large number."""
+    extreme = np.iinfo(kind).max - 2 if "u" in kind else -7
+    points = np.array([[extreme, 5, 9], [2, extreme, 7]]).astype(kind)
     size = points.itemsize
     fields = [{"name": name, "offset": size * k, "type": number} for k, name in enumerate("xyz")]
     values = {"point_stride": 3 * size, "fields": fields}
@@ -92,8 +92,8 @@ def test_coordinates_of_every_numeric_type(
     np.testing.assert_array_equal(frame.points, points.astype(np.float32))
 
 
-def test_stamps_of_foxglove_messages_in_ros(tmp_path: Path) -> None:
-    """ROS names the second part of a time otherwise: all frames of a second would be at once."""
+def test_foxglove_messages_in_ros_keep_nanoseconds(tmp_path: Path) -> None:
+    """ROS names them differently; all frames of a second would have the same stamp."""
     kind, stamp = "foxglove_msgs/msg/PointCloud", EPOCH + 123_456_789
     store = get_typestore(Stores.ROS2_HUMBLE)
     store.register(get_types_from_msg(_CLOUD, kind))
@@ -133,8 +133,8 @@ uint8 type
 """
 
 
-@both
-def test_depth_image(tmp_path: Path, encoding: str) -> None:
+@both_encodings
+def test_depth_image_is_read(tmp_path: Path, encoding: str) -> None:
     depth = np.arange(12, dtype="<u2").reshape(3, 4) * 100
     k = [60.0, 0.0, 1.5, 0.0, 61.0, 1.0, 0.0, 0.0, 1.0]
     size = {"width": 4, "height": 3}
@@ -151,8 +151,8 @@ def test_depth_image(tmp_path: Path, encoding: str) -> None:
     np.testing.assert_array_equal(frame.depth, depth / np.float32(1000))
 
 
-@both
-def test_transforms(tmp_path: Path, encoding: str) -> None:
+@both_encodings
+def test_transforms_are_read(tmp_path: Path, encoding: str) -> None:
     values = {
         "parent_frame_id": "map",
         "child_frame_id": "camera",
@@ -167,8 +167,8 @@ def test_transforms(tmp_path: Path, encoding: str) -> None:
     np.testing.assert_array_equal(pose.translation, [1, 2, 3])
 
 
-def test_protobuf_scene_is_read_by_its_own_descriptors() -> None:
-    """A viewer has nothing else to go by."""
+def test_protobuf_scene_is_decoded_by_embedded_descriptors() -> None:
+    """A viewer knows no others."""
     scene = {
         "deletions": [{"timestamp": {"seconds": 5}, "type": 1, "id": "a"}],
         "entities": [{"id": "track-3", "frame_locked": True, "metadata": [{"key": "k"}]}],
@@ -207,7 +207,7 @@ def test_protobuf_source_gets_protobuf_annotations(tmp_path: Path) -> None:
     )
 )
 @settings(deadline=None, max_examples=50)
-def test_integers_survive(values: dict[str, int]) -> None:
+def test_protobuf_integers_are_decoded_exactly(values: dict[str, int]) -> None:
     name = "google.protobuf.Timestamp"
     data = encode(values, name)
 
@@ -216,7 +216,7 @@ def test_integers_survive(values: dict[str, int]) -> None:
 
 @given(data=st.binary(max_size=60))
 @settings(deadline=None, max_examples=100)
-def test_hostile_bytes_are_a_known_error(data: bytes) -> None:
+def test_random_bytes_raise_only_known_errors(data: bytes) -> None:
     decode = message_decoder(descriptors(), "foxglove.PointCloud")
     for run in (lambda: decode(data), lambda: message_decoder(data, "a.B")):
         try:

@@ -1,4 +1,4 @@
-"""Frames: every layout of a cloud or depth image gives the same, correct coordinates."""
+"""Tests of frames: every layout of a cloud or depth image gives the same, correct coordinates."""
 
 from collections import Counter
 from dataclasses import replace
@@ -58,7 +58,7 @@ def read(path: Path, *topics: str, **options: Any) -> tuple[list[Frame], Counter
 
 
 @pytest.mark.parametrize("chunk_size", [1 << 20, 25_000])  # one chunk, or one for each 5 images
-def test_needed_frames_are_the_same_as_if_all_were_read(tmp_path: Path, chunk_size: int) -> None:
+def test_needed_frames_equal_those_of_full_read(tmp_path: Path, chunk_size: int) -> None:
     """In an indexed file the others are skipped, but still counted."""
     items = []
     for k in range(12):
@@ -68,21 +68,21 @@ def test_needed_frames_are_the_same_as_if_all_were_read(tmp_path: Path, chunk_si
             ("/depth/image_rect", stamp + 1, image(stamp, wavy_depth() + np.float32(0.1 * k))),
         ]
     path = write(tmp_path / "a.mcap", items, chunk_size=chunk_size)
-    every, _, _ = read(path)
-    times = {every[k].log_time_ns for k in (0, 5, 6, 11)}
+    all_frames, _, _ = read(path)
+    times = {all_frames[k].log_time_ns for k in (0, 5, 6, 11)}
 
-    some, _, _ = read(path, needed=lambda _, log_time_ns: log_time_ns in times)
+    needed_frames, _, _ = read(path, needed=lambda _, log_time_ns: log_time_ns in times)
 
-    assert len(every) == 12
-    assert [frame.index for frame in some] == [0, 5, 6, 11]
-    for frame in some:
-        same = every[frame.index]
+    assert len(all_frames) == 12
+    assert [frame.index for frame in needed_frames] == [0, 5, 6, 11]
+    for frame in needed_frames:
+        same = all_frames[frame.index]
         assert (frame.stamp_ns, frame.camera) == (same.stamp_ns, same.camera)
         np.testing.assert_array_equal(frame.depth, same.depth)
 
 
-def test_depth_image_and_organized_cloud_give_the_same_frame(tmp_path: Path) -> None:
-    """Whatever a sensor's driver recorded, the objects must not change."""
+def test_depth_image_and_organized_cloud_give_same_frame(tmp_path: Path) -> None:
+    """The objects must not depend on what a driver recorded."""
     depth = wavy_depth()
     items = [
         ("/cam/depth/camera_info", 0, info(EPOCH)),
@@ -102,7 +102,7 @@ def test_depth_image_and_organized_cloud_give_the_same_frame(tmp_path: Path) -> 
         assert abs(getattr(second.camera, name) - getattr(CAMERA, name)) < 0.01
 
 
-def test_intrinsics_stay_while_they_fit_and_follow_a_change(tmp_path: Path) -> None:
+def test_fitted_intrinsics_change_only_with_camera(tmp_path: Path) -> None:
     """Noise must not shift the camera; another camera must replace it."""
     rng = np.random.default_rng(0)
     clean = organized_points(wavy_depth())
@@ -119,16 +119,16 @@ def test_intrinsics_stay_while_they_fit_and_follow_a_change(tmp_path: Path) -> N
     assert abs(cameras[4].fx - 62.0) < 0.01
 
 
-def test_points_that_fit_no_camera_get_none_of_an_earlier_cloud(tmp_path: Path) -> None:
-    """Their depths in another cloud's camera would be points in wrong places."""
+def test_earlier_camera_is_not_used_for_points_that_do_not_fit(tmp_path: Path) -> None:
+    """Their depth in another cloud's camera would give wrong points."""
     fitting = organized_points(wavy_depth())
     other = np.random.default_rng(0).normal(0, 1, fitting.shape).astype(np.float32)
     items = [("/points", k, cloud(EPOCH + k, p)) for k, p in enumerate((fitting, other, fitting))]
 
-    (first, odd, last), _, _ = read(write(tmp_path / "a.mcap", items))
+    (first, unfitting, last), _, _ = read(write(tmp_path / "a.mcap", items))
 
-    assert odd.points is not None
-    np.testing.assert_array_equal(odd.points, other.reshape(-1, 3))
+    assert unfitting.points is not None
+    np.testing.assert_array_equal(unfitting.points, other.reshape(-1, 3))
     assert first.organized
     assert last.camera == first.camera
 
@@ -142,7 +142,7 @@ def test_points_that_fit_no_camera_get_none_of_an_earlier_cloud(tmp_path: Path) 
     seed=st.integers(0, 99),
 )
 @settings(deadline=None, max_examples=25)
-def test_fit_finds_any_camera(
+def test_pinhole_fit_recovers_any_camera(
     fx: float, ratio: float, cx: float, cy: float, outliers: int, seed: int
 ) -> None:
     rng = np.random.default_rng(seed)
@@ -167,9 +167,9 @@ def test_fit_finds_any_camera(
         np.ones((48, 64, 3), np.float32),
         organized_points(wavy_depth()) * np.array([1, -1, -1], np.float32),  # y up, z backwards
     ],
-    ids=["nothing", "noise", "one point", "another convention"],
+    ids=["all invalid", "noise", "one point", "another convention"],
 )
-def test_organized_points_without_a_camera_stay_points(points: Any, tmp_path: Path) -> None:
+def test_organized_cloud_that_fits_no_camera_stays_points(points: Any, tmp_path: Path) -> None:
     path = write(tmp_path / "a.mcap", [("/points", 0, cloud(EPOCH, points))])
 
     (frame,), _, _ = read(path)
@@ -178,8 +178,8 @@ def test_organized_points_without_a_camera_stay_points(points: Any, tmp_path: Pa
     np.testing.assert_array_equal(frame.points, points.reshape(-1, 3))
 
 
-def test_images_without_a_row_length_and_the_number_of_frames(tmp_path: Path) -> None:
-    """A step of 0 means that rows follow each other; a window has no known number of frames."""
+def test_image_with_step_zero_is_read_and_frames_are_counted(tmp_path: Path) -> None:
+    """A step of 0 means contiguous rows; the number of frames in a window is unknown."""
     depth = np.arange(500, 500 + 5 * 7, dtype=np.uint16).reshape(5, 7)
     packed = image(EPOCH, depth)
     packed.step = 0
@@ -203,7 +203,7 @@ FORMATS = {1: "i1", 2: "u1", 3: "i2", 4: "u2", 5: "i4", 6: "u4", 7: "f4", 8: "f8
 
 @given(data=st.data())
 @settings(deadline=None, max_examples=60)
-def test_any_layout_of_a_cloud(data: st.DataObject) -> None:
+def test_cloud_layout_does_not_change_coordinates(data: st.DataObject) -> None:
     """Padding, unaligned fields, byte order and row padding are all legal."""
     h, w = data.draw(st.integers(1, 4)), data.draw(st.integers(1, 5))
     big = data.draw(st.booleans())
@@ -222,7 +222,7 @@ def test_any_layout_of_a_cloud(data: st.DataObject) -> None:
     for k, name in enumerate("xyz"):
         at, kind = layout[name]
         np.ndarray((h, w), kind, buffer, at, (row, step))[...] = expected[..., k]
-    message = make(CLOUD, header(1), h, w, fields, big, step, row, buffer, True)  # is_dense lies
+    message = make(CLOUD, header(1), h, w, fields, big, step, row, buffer, True)  # wrongly dense
 
     np.testing.assert_array_equal(cloud_points(message), expected)
     message.data = buffer[: (h - 1) * row]
@@ -239,14 +239,14 @@ def test_any_layout_of_a_cloud(data: st.DataObject) -> None:
         ({"fields": []}, "without a field x"),
     ],
 )
-def test_cloud_that_lies_is_refused_before_memory_is_taken(
+def test_inconsistent_cloud_is_refused_before_allocation(
     changes: dict[str, Any], reason: str
 ) -> None:
     with pytest.raises(MessageError, match=reason):
         cloud_points(cloud(0, np.zeros((2, 3, 3), np.float32), **changes))
 
 
-def test_bad_messages_are_counted_and_never_stop_the_stream(tmp_path: Path) -> None:
+def test_invalid_messages_are_skipped_and_counted(tmp_path: Path) -> None:
     good = np.random.default_rng(0).normal(1, 0.1, (1, 50, 3)).astype(np.float32)
     items = [
         ("/points", 0, cloud(EPOCH, good)),
@@ -263,8 +263,8 @@ def test_bad_messages_are_counted_and_never_stop_the_stream(tmp_path: Path) -> N
     assert skipped["empty cloud"] == 1
 
 
-def test_definition_without_the_fields_of_its_type(tmp_path: Path) -> None:
-    """Anyone may call anything sensor_msgs/msg/Image."""
+def test_definition_without_fields_of_its_type_is_skipped(tmp_path: Path) -> None:
+    """Any program may name its own type sensor_msgs/msg/Image."""
     path = tmp_path / "a.mcap"
     with path.open("wb") as file:
         writer = Writer(file)
@@ -281,7 +281,7 @@ def test_definition_without_the_fields_of_its_type(tmp_path: Path) -> None:
         assert "skipped transforms" in recording.warnings[0]
 
 
-def test_stamps_and_log_times_that_no_clock_gives_are_counted(tmp_path: Path) -> None:
+def test_impossible_stamps_and_log_times_are_counted(tmp_path: Path) -> None:
     """Tables hold only 63 bits."""
     points = np.ones((1, 3, 3), np.float32)
     late, negative = cloud(EPOCH, points), cloud(EPOCH, points)
@@ -298,7 +298,7 @@ def test_stamps_and_log_times_that_no_clock_gives_are_counted(tmp_path: Path) ->
     assert skipped.total() == 2
 
 
-def test_missing_readings_of_a_cloud_are_nan_rows(tmp_path: Path) -> None:
+def test_invalid_points_of_cloud_are_nan(tmp_path: Path) -> None:
     rows = [[1, 2, 3], [np.nan, 1, 1], [np.inf, 0, 1], [0, 0, 0], [0, 0, 1]]
     points = np.array([rows], np.float32)
 
@@ -309,7 +309,7 @@ def test_missing_readings_of_a_cloud_are_nan_rows(tmp_path: Path) -> None:
     assert np.isfinite(frame.points[[0, 4]]).all()
 
 
-def test_missing_readings_of_a_depth_image_are_zero(tmp_path: Path) -> None:
+def test_invalid_depth_is_zero(tmp_path: Path) -> None:
     depth = np.full((48, 64), 1.5, np.float32)
     depth[0, :5] = [np.nan, np.inf, -np.inf, -1, 0]
     items = [
@@ -323,8 +323,8 @@ def test_missing_readings_of_a_depth_image_are_zero(tmp_path: Path) -> None:
     np.testing.assert_array_equal(frame.depth[0, :6], [0, 0, 0, 0, 0, 1.5])
 
 
-def test_each_image_gets_the_calibration_of_its_own_time(tmp_path: Path) -> None:
-    """Zoom and dynamic reconfiguration change it; it may be recorded before or after the image."""
+def test_each_image_uses_calibration_of_its_time(tmp_path: Path) -> None:
+    """Zoom and reconfiguration change it; it may be recorded before or after the image."""
     other, last = (Camera(64, 48, f, f, 30.0, 20.0) for f in (99.0, 77.0))
     depth = wavy_depth()
     items = [
@@ -343,7 +343,7 @@ def test_each_image_gets_the_calibration_of_its_own_time(tmp_path: Path) -> None
     assert [frame.index for frame in read_frames] == [0, 1, 2, 3]
 
 
-def test_a_calibration_recorded_once_serves_all(tmp_path: Path) -> None:
+def test_calibration_recorded_once_is_used_for_all_images(tmp_path: Path) -> None:
     depth = wavy_depth()
     items: list[tuple[str, int, Any]] = [("/depth/camera_info", 0, info(EPOCH))]
     items += [("/depth/image", k, image(EPOCH + k, depth)) for k in range(1, 4)]
@@ -354,7 +354,7 @@ def test_a_calibration_recorded_once_serves_all(tmp_path: Path) -> None:
     assert not skipped
 
 
-def test_without_a_readable_calibration_it_is_searched_once(
+def test_unreadable_calibration_is_searched_once(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """Reading the topic again for each image would take hours for a recording of minutes."""
@@ -379,8 +379,8 @@ def test_without_a_readable_calibration_it_is_searched_once(
     assert decoded["/depth/camera_info"] < 30 + 10
 
 
-def test_mismatched_calibration_is_counted(tmp_path: Path) -> None:
-    """Without its topic, nobody would guess that the calibration is that of another camera."""
+def test_mismatched_calibration_is_counted_with_its_topic(tmp_path: Path) -> None:
+    """Without the topic, nobody would guess that the calibration is another camera's."""
     items = [
         ("/depth/camera_info", 0, info(EPOCH)),
         ("/depth/image", 1, image(EPOCH, np.ones((24, 32), np.uint16))),
@@ -396,7 +396,7 @@ def test_mismatched_calibration_is_counted(tmp_path: Path) -> None:
     [((16.0, 12.0), False, True), ((31.2, 31.0), False, True), ((34.0, 21.0), False, False),
      ((40.0, 12.0), True, False)],
 )  # fmt: skip
-def test_intrinsics_of_another_resolution_are_doubted(
+def test_intrinsics_of_another_resolution_cause_warning(
     tmp_path: Path, center: tuple[float, float], cropped: bool, warned: bool
 ) -> None:
     """Objects would be sheared and of the wrong size; in a crop the centre may lie anywhere."""
@@ -414,17 +414,17 @@ def test_intrinsics_of_another_resolution_are_doubted(
     assert any("intrinsics of another resolution?" in text for text in warnings) == warned
 
 
-def test_slight_distortion_is_absorbed_and_strong_distortion_gives_true_rays(
+def test_slight_distortion_is_ignored_and_strong_is_corrected(
     tmp_path: Path,
 ) -> None:
     """An unrectified image has no pinhole camera; its points must still be right."""
     depth = np.full((48, 64), 1000, np.uint16)
     slight = [("/depth/camera_info", 0, info(EPOCH, d=(1e-4, 0, 0, 0, 0)))]
     strong = [("/depth/camera_info", 0, info(EPOCH, d=(-0.3, 0.1, 0.001, -0.002, 0)))]
-    shot = [("/depth/image", 1, image(EPOCH, depth))]
+    images = [("/depth/image", 1, image(EPOCH, depth))]
 
-    (first,), _, _ = read(write(tmp_path / "a.mcap", slight + shot))
-    (second,), _, warnings = read(write(tmp_path / "b.mcap", strong + shot))
+    (first,), _, _ = read(write(tmp_path / "a.mcap", slight + images))
+    (second,), _, warnings = read(write(tmp_path / "b.mcap", strong + images))
 
     assert first.organized
     assert second.points is not None
@@ -439,15 +439,15 @@ def test_slight_distortion_is_absorbed_and_strong_distortion_gives_true_rays(
     assert (u, v) == pytest.approx((7, 5), abs=0.01)
 
 
-def test_a_lens_that_is_calibrated_anew_bends_other_rays(tmp_path: Path) -> None:
-    """The rays of the first calibration would be kept for the whole recording."""
+def test_new_distortion_changes_rays(tmp_path: Path) -> None:
+    """Otherwise the rays of the first calibration would be used for the whole recording."""
     depth = np.full((48, 64), 1000, np.uint16)
     old, new = [
         [
-            ("/depth/camera_info", k, info(EPOCH + k, d=(bend, 0.1, 0.0, 0.0, 0.0))),
+            ("/depth/camera_info", k, info(EPOCH + k, d=(k1, 0.1, 0.0, 0.0, 0.0))),
             ("/depth/image", k, image(EPOCH + k, depth)),
         ]
-        for k, bend in enumerate((-0.3, -0.4))
+        for k, k1 in enumerate((-0.3, -0.4))
     ]
 
     (_, second), _, _ = read(write(tmp_path / "a.mcap", old + new))
@@ -456,7 +456,7 @@ def test_a_lens_that_is_calibrated_anew_bends_other_rays(tmp_path: Path) -> None
     np.testing.assert_array_equal(second.points, alone.points)
 
 
-def test_window_and_thinning(tmp_path: Path) -> None:
+def test_time_window_and_every_select_frames(tmp_path: Path) -> None:
     points = np.random.default_rng(0).normal(1, 0.1, (1, 9, 3)).astype(np.float32)
     items = [("/points", k * SECOND, cloud(EPOCH + k, points)) for k in range(10)]
     path = write(tmp_path / "a.mcap", items)
@@ -468,7 +468,7 @@ def test_window_and_thinning(tmp_path: Path) -> None:
         read(path, every=0)
 
 
-def test_stamps_that_cannot_be_trusted_are_said(tmp_path: Path) -> None:
+def test_untrustworthy_stamps_are_reported(tmp_path: Path) -> None:
     points = np.random.default_rng(0).normal(1, 0.1, (1, 9, 3)).astype(np.float32)
     stamps = [0, 5 * SECOND, EPOCH, EPOCH - SECOND]
     items = [("/points", EPOCH + k, cloud(stamp, points)) for k, stamp in enumerate(stamps)]
@@ -481,7 +481,7 @@ def test_stamps_that_cannot_be_trusted_are_said(tmp_path: Path) -> None:
         assert any(word in warning for warning in warnings)
 
 
-def test_streams_of_one_sensor_give_one_choice(tmp_path: Path) -> None:
+def test_one_stream_of_a_sensor_is_chosen(tmp_path: Path) -> None:
     depth = wavy_depth()
     colour = np.zeros((48, 64), np.uint8)
     items = [
@@ -513,7 +513,7 @@ def test_streams_of_one_sensor_give_one_choice(tmp_path: Path) -> None:
     assert {stream.topic for stream in wanted} == {"/cam/depth/points"}
 
 
-def test_of_two_like_streams_the_one_with_more_messages_is_chosen(tmp_path: Path) -> None:
+def test_stream_with_more_messages_is_chosen(tmp_path: Path) -> None:
     """A driver may publish one image on a topic before another topic takes over."""
     items = [("/cam/depth/camera_info", 0, info(EPOCH))]
     for number, topic in enumerate(["/cam/depth/a", "/cam/depth/b", "/cam/depth/b"]):
@@ -526,7 +526,7 @@ def test_of_two_like_streams_the_one_with_more_messages_is_chosen(tmp_path: Path
     assert chosen.topic == "/cam/depth/b"
 
 
-def test_several_sensors_must_be_chosen_from(tmp_path: Path) -> None:
+def test_several_sensors_require_a_topic(tmp_path: Path) -> None:
     points = np.ones((1, 3, 3), np.float32)
     left, right = cloud(EPOCH, points), cloud(EPOCH, points)
     left.header.frame_id, right.header.frame_id = "left", "right"
@@ -540,7 +540,7 @@ def test_several_sensors_must_be_chosen_from(tmp_path: Path) -> None:
             choose_streams(recording, ["/front"])
 
 
-def test_no_stream_names_what_is_there(tmp_path: Path) -> None:
+def test_error_names_why_no_stream_is_usable(tmp_path: Path) -> None:
     path = write(tmp_path / "a.mcap", [("/depth/image", 0, image(EPOCH, wavy_depth()))])
     bare = write(tmp_path / "b.mcap", [("/depth/camera_info", 0, info(EPOCH))])
 
@@ -554,7 +554,7 @@ def test_no_stream_names_what_is_there(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize("pack", [png, rvl])
-def test_compressed_depth(tmp_path: Path, pack: Any) -> None:
+def test_compressed_depth_is_decoded(tmp_path: Path, pack: Any) -> None:
     depth = wavy_depth()
     inverse = np.where(depth > 0, 4000, 0).astype(np.uint16)
     items = [
@@ -578,7 +578,7 @@ def test_compressed_depth(tmp_path: Path, pack: Any) -> None:
 
 @given(data=st.binary(max_size=200), pack=st.sampled_from([png, rvl]), at=st.integers(0, 2000))
 @settings(deadline=None, max_examples=60)
-def test_damaged_compressed_depth_is_a_message_error(data: bytes, pack: Any, at: int) -> None:
+def test_damaged_compressed_depth_is_error_or_finite(data: bytes, pack: Any, at: int) -> None:
     body = bytearray(pack(wavy_depth()))
     body[at : at + len(data)] = data
     for damaged in (bytes(body), data):
@@ -589,8 +589,8 @@ def test_damaged_compressed_depth_is_a_message_error(data: bytes, pack: Any, at:
         assert np.isfinite(depth).all()
 
 
-def test_realsense_viewer_bag(tmp_path: Path) -> None:
-    """It has its own topic names, mono16 depth, and a depth unit for each sensor."""
+def test_realsense_viewer_recording_uses_its_depth_unit(tmp_path: Path) -> None:
+    """It has other topic names, mono16 depth, and a depth unit for each sensor."""
     depth = wavy_depth()
     sensor = "/device_0/sensor_1"
     unit, other = (make("std_msgs/msg/Float32", metres) for metres in (0.00025, 0.001))
@@ -612,7 +612,7 @@ def test_realsense_viewer_bag(tmp_path: Path) -> None:
 
 @pytest.mark.skipif(not DATA.exists(), reason="needs the recorded tabletop scenes")
 @pytest.mark.parametrize("name", ["clouds.mcap", "clouds.bag", "clouds_ros2"])
-def test_recorded_clouds_match_the_depth_images(name: str) -> None:
+def test_recorded_clouds_match_depth_images(name: str) -> None:
     images, _, _ = read(DATA / "osd_learn" / "depth.mcap")
     clouds, skipped, _ = read(DATA / "osd_learn" / name)
     by_stamp = {frame.stamp_ns: frame for frame in images}
@@ -630,8 +630,8 @@ def test_recorded_clouds_match_the_depth_images(name: str) -> None:
             assert abs(getattr(frame.camera, field) - getattr(same.camera, field)) < 0.05
 
 
-def test_an_image_waits_no_longer_than_for_its_own_calibration(tmp_path: Path) -> None:
-    """With several streams, an image one frame late would be out of order."""
+def test_image_is_returned_as_soon_as_its_calibration_arrives(tmp_path: Path) -> None:
+    """With several streams, an image that is a frame late would be out of order."""
     items = [
         ("/depth/image", 0, image(EPOCH, wavy_depth())),
         ("/depth/camera_info", 1, info(EPOCH)),
@@ -641,9 +641,9 @@ def test_an_image_waits_no_longer_than_for_its_own_calibration(tmp_path: Path) -
     with open_recording(write(tmp_path / "a.mcap", items)) as recording:
         (stream,) = choose_streams(recording)
         source, skipped = DepthSource(recording, stream), Counter[str]()
-        given = []
+        returned = []
         for message in recording.messages():
             take = source.calibrate if message.topic.endswith("info") else source.read
-            given.append([frame.stamp_ns for frame in take(message, skipped)])
+            returned.append([frame.stamp_ns for frame in take(message, skipped)])
 
-    assert given == [[], [EPOCH], [], [EPOCH + 5]]
+    assert returned == [[], [EPOCH], [], [EPOCH + 5]]

@@ -1,4 +1,4 @@
-"""Choices, clocks, cuts and time windows of recordings, each at its exact limit."""
+"""Worked examples of streams, clocks, records and time windows, each at its exact limit."""
 
 import struct
 from collections import Counter
@@ -43,7 +43,7 @@ from tests.test_recordings_frames import read as read_depth
 OTHER = Camera(80, 60, 69.5, 73.5, 39.1, 30.3)
 
 
-def test_images_without_depth_are_told_what_depth_would_be(tmp_path: Path) -> None:
+def test_error_lists_supported_depth_encodings(tmp_path: Path) -> None:
     """Depth in another encoding, such as 64FC1, was refused as if its topic held no image."""
     path = record(tmp_path / "a.mcap", colour("/cam/depth/image_raw"))
 
@@ -84,9 +84,7 @@ def colour(topic: str, frame_id: str = "far", count: int = 1) -> list[tuple[str,
         (colour("/cam/acolor/image"), colour("/cam/bcolor/image")),
     ],
 )
-def test_each_reason_for_a_colour_camera_outweighs_all_later_ones(
-    tmp_path: Path, better: Any, worse: Any
-) -> None:
+def test_criteria_for_colour_stream_apply_in_order(tmp_path: Path, better: Any, worse: Any) -> None:
     path = record(tmp_path / "a.mcap", in_order([*depth_items(EPOCH), *worse, *better]))
     with open_recording(path) as recording:
         (stream,) = choose_streams(recording)
@@ -96,8 +94,7 @@ def test_each_reason_for_a_colour_camera_outweighs_all_later_ones(
     assert chosen.topic == better[0][0]
 
 
-def test_of_several_strange_cameras_none_belongs_to_the_depth_camera(tmp_path: Path) -> None:
-    """The only one does; two of other names and frames do not."""
+def test_unrelated_colour_camera_is_used_only_if_single(tmp_path: Path) -> None:
     path = record(tmp_path / "a.mcap", in_order([*depth_items(EPOCH), *colour("/one/image")]))
     both = in_order([*depth_items(EPOCH), *colour("/one/image"), *colour("/two/image")])
     for file, wanted in ((path, "/one/image"), (record(tmp_path / "b.mcap", both), None)):
@@ -115,7 +112,7 @@ def test_of_several_strange_cameras_none_belongs_to_the_depth_camera(tmp_path: P
         ("/right/depth/image_raw", "camera", "/one/image"),  # the same, by its frame
     ],
 )
-def test_the_only_colour_camera_belongs_to_no_depth_camera_if_there_are_two(
+def test_single_colour_camera_is_not_used_for_two_sensors(
     tmp_path: Path, topic: str, frame_id: str, found: str | None
 ) -> None:
     """Masks of one depth camera would be drawn on the view of the other."""
@@ -132,8 +129,8 @@ def test_the_only_colour_camera_belongs_to_no_depth_camera_if_there_are_two(
     assert {colour.topic for colour in wanted.values()} == {"/one/image"}
 
 
-def test_a_colour_camera_that_is_calibrated_anew_has_another_lens(tmp_path: Path) -> None:
-    """Each image is seen through the last calibration before it; a repeated one changes nothing."""
+def test_new_colour_calibration_changes_lens(tmp_path: Path) -> None:
+    """Each image uses the last calibration before it; a repeated one changes nothing."""
     items = [*depth_items(EPOCH, EPOCH + 100 * MS, EPOCH + 200 * MS)]
     items.append(("/tf_static", EPOCH, static("camera", "color", (0.05, 0, 0), (0, 0, 0, 1))))
     for k, camera in enumerate((WIDE, WIDE, OTHER)):
@@ -146,7 +143,7 @@ def test_a_colour_camera_that_is_calibrated_anew_has_another_lens(tmp_path: Path
     assert lenses == [WIDE, WIDE, OTHER]
 
 
-def test_a_colour_camera_may_be_calibrated_anew_in_its_distortion_alone(tmp_path: Path) -> None:
+def test_new_colour_distortion_alone_changes_lens(tmp_path: Path) -> None:
     """The focal lengths of a new calibration may be those of the old one."""
     distortions = ((0.11, -0.07, 0.002, 0.001, 0.03), (0.05, 0.02, -0.001, 0.003, -0.04), ())
     stamps = [EPOCH + 100 * k * MS for k in range(len(distortions))]
@@ -171,15 +168,15 @@ DEPTH = Camera(64, 48, 60.0, 61.0, 31.2, 23.7)
         # One frame: nearly the same calibration is the same camera.
         (Camera(64, 48, 60.6, 61.0, 31.2, 23.7), "camera", True),
         (Camera(64, 48, 60.0, 61.0, 31.2, 24.4), "camera", False),
-        # Another frame without a transform: only the very same numbers are one camera.
+        # Another frame without a transform: only equal numbers are the same camera.
         (DEPTH, "color", True),
         (Camera(64, 48, 60.001, 61.0, 31.2, 23.7), "color", None),
     ],
 )
-def test_pixels_are_taken_for_those_of_the_depth_image_if_the_cameras_are_one(
+def test_colour_is_registered_only_if_cameras_are_equal(
     tmp_path: Path, camera: Camera, frame_id: str, registered: bool | None
 ) -> None:
-    """None stands for no colour at all."""
+    """``registered`` is None if there is no colour at all."""
     items = depth_items(EPOCH)
     items.append(("/cam/color/camera_info", EPOCH, info(EPOCH, camera)))
     items.append(("/cam/color/image_raw", EPOCH + 1, raw(EPOCH, gradient(), "rgb8", frame_id)))
@@ -191,7 +188,7 @@ def test_pixels_are_taken_for_those_of_the_depth_image_if_the_cameras_are_one(
         assert view.lens.pinhole == camera
 
 
-def test_an_image_of_another_size_than_its_calibration_is_no_colour(tmp_path: Path) -> None:
+def test_colour_image_of_other_size_than_calibration_is_unused(tmp_path: Path) -> None:
     items = depth_items(EPOCH)
     items.append(("/cam/color/camera_info", EPOCH, info(EPOCH, WIDE)))
     items.append(("/cam/color/image_raw", EPOCH, raw(EPOCH, gradient(61, 80), "rgb8")))
@@ -202,7 +199,7 @@ def test_an_image_of_another_size_than_its_calibration_is_no_colour(tmp_path: Pa
 
 
 @pytest.mark.parametrize(("gap_ms", "found"), [(49, True), (51, False)])
-def test_a_single_image_serves_frames_within_a_twentieth_of_a_second(
+def test_single_image_pairs_with_frames_within_50_ms(
     tmp_path: Path, gap_ms: int, found: bool
 ) -> None:
     items = [*depth_items(EPOCH + gap_ms * MS), *colour("/cam/color/image", "camera")]
@@ -211,8 +208,8 @@ def test_a_single_image_serves_frames_within_a_twentieth_of_a_second(
     assert (view is not None) == found
 
 
-def test_the_recorder_of_librealsense_tells_where_its_streams_are(tmp_path: Path) -> None:
-    """Each stream has its own transform from the reference; both have to be used."""
+def test_librealsense_recording_gives_colour_pose(tmp_path: Path) -> None:
+    """Each stream has its own transform from the reference; both are needed."""
     turns = {"Depth_0": (0.02, 0.3, -0.1, 0.94), "Color_0": (-0.1, 0.05, 0.2, 0.97)}
     moves = {"Depth_0": (0.01, -0.02, 0.03), "Color_0": (0.05, 0.07, -0.04)}
     items: list[tuple[str, int, Any]] = []
@@ -231,21 +228,20 @@ def test_the_recorder_of_librealsense_tells_where_its_streams_are(tmp_path: Path
         assert found is not None
         pose = Extrinsics(recording, stream, found).colour_from_depth("0", "0", EPOCH, EPOCH)
 
-    depth, seen = (Rotation.from_quat(turns[name]) for name in ("Depth_0", "Color_0"))
+    depth_turn, colour_turn = (Rotation.from_quat(turns[name]) for name in ("Depth_0", "Color_0"))
     assert pose is not None
     point = np.array([0.3, -0.2, 0.9])  # in the reference
-    in_depth = depth.apply(point) + moves["Depth_0"]
-    in_colour = seen.apply(point) + moves["Color_0"]
+    in_depth = depth_turn.apply(point) + moves["Depth_0"]
+    in_colour = colour_turn.apply(point) + moves["Color_0"]
     assert_allclose(pose.rotation @ in_depth + pose.translation, in_colour, atol=1e-12)
 
 
 # ---- calibrations of depth images
 
 
-def test_a_calibration_that_comes_too_late_serves_only_where_there_is_no_other(
+def test_late_calibration_is_used_only_without_an_earlier_one(
     tmp_path: Path,
 ) -> None:
-    """The image waits for it: it has it if it is the first, and the one before it otherwise."""
     depth = wavy_depth()
     late = Camera(64, 48, 99.0, 98.0, 30.0, 20.0)
     first = [("/d/image", 0, image(EPOCH, depth)), ("/d/camera_info", 1, info(EPOCH + 9, late))]
@@ -264,7 +260,7 @@ def test_a_calibration_that_comes_too_late_serves_only_where_there_is_no_other(
 
 
 def with_topics(infos: list[str]) -> Any:
-    """Return what is asked of a recording with these calibrations, and one without messages."""
+    """Return a stub of a recording with these calibration topics, and one without messages."""
     kind = "sensor_msgs/msg/CameraInfo"
     counts = {**dict.fromkeys(infos, 3), "/cam/infra/camera_info": 0}
     return SimpleNamespace(topics=[Topic(n, kind, "cdr", count) for n, count in counts.items()])
@@ -277,19 +273,17 @@ def with_topics(infos: list[str]) -> Any:
         ("/cam/depth/image/compressedDepth", "/cam/depth/camera_info"),
         ("/cam/infra/image_raw", "/cam/camera_info"),
         ("/device_0/sensor_0/Depth_0/image/data", "/device_0/sensor_0/Depth_0/info/camera_info"),
-        ("/other/image", None),  # several: none is near
+        ("/other/image", None),  # several, of which none is near
     ],
 )
-def test_the_calibration_that_shares_most_of_the_path_is_taken(
-    image_topic: str, expected: str | None
-) -> None:
+def test_calibration_sharing_most_of_path_is_chosen(image_topic: str, expected: str | None) -> None:
     infos = ["/cam/camera_info", "/cam/depth/camera_info", "/cam/color/camera_info",
              "/device_0/sensor_0/Depth_0/info/camera_info"]  # fmt: skip
     assert info_topic_of(image_topic, with_topics(infos)) == expected
     assert info_topic_of(image_topic, with_topics(["/far/camera_info"])) == "/far/camera_info"
 
 
-def test_a_camera_still_fits_points_as_exact_as_those_it_was_fitted_to() -> None:
+def test_camera_still_fits_points_within_its_fit_error() -> None:
     points = organized_points(wavy_depth())
     assert still_fits(PinholeFit(DEPTH, 0.0), points)
     for shift, error_px, fits in ((0.1, 0.0, False), (0.1, 0.05, True), (0.7, 9.0, False)):
@@ -304,10 +298,10 @@ def test_a_camera_still_fits_points_as_exact_as_those_it_was_fitted_to() -> None
 # ---- pixels
 
 
-def test_the_size_of_a_jpeg_is_found_behind_filling_and_segments() -> None:
-    """Markers of a restart have no length, 0xFF fills; the size stands in any frame header."""
+def test_jpeg_size_is_found_behind_padding_and_segments() -> None:
+    """Restart markers have no length, 0xFF is padding, and any frame header has the size."""
     begin, app = b"\xff\xd8", b"\xff\xe1\x00\x06abcd"
-    tables = b"\xff\xc4\x00\x05xyz"  # no frame, though it is among their numbers
+    tables = b"\xff\xc4\x00\x05xyz"  # not a frame, though its marker is among theirs
     for marker in (0xC0, 0xC2, 0xCF):
         frame = bytes([0xFF, marker]) + struct.pack(">HBHHB", 8, 8, 123, 457, 3)
         body = begin + app + b"\xff\x01\xff\xd0\xff\xff" + tables + frame + b"\xff\xd9"
@@ -321,8 +315,8 @@ def test_the_size_of_a_jpeg_is_found_behind_filling_and_segments() -> None:
         compressed_size(begin + huge + b"\xff\xd9")
 
 
-def test_the_end_of_a_compressed_file_is_looked_for_at_its_end() -> None:
-    """Padding behind the end is no damage; an end far before it is one of a preview."""
+def test_compressed_image_may_have_short_padding_at_end() -> None:
+    """An end marker far before the end is one of a preview."""
     for body in (jpeg(gradient()), png(gradient())):
         assert compressed_size(body + bytes(4000))[1:] == (64, 48)
         with pytest.raises(MessageError, match="truncated"):
@@ -331,8 +325,8 @@ def test_the_end_of_a_compressed_file_is_looked_for_at_its_end() -> None:
         compressed_size(png(gradient())[:23])
 
 
-def test_odd_rows_and_columns_have_no_colour() -> None:
-    """Blocks of 2 by 2 pixels share a colour: a remainder stays black, and nothing shifts."""
+def test_incomplete_blocks_of_pixels_are_black() -> None:
+    """Blocks of 2 by 2 pixels share a colour; a remainder shifts nothing."""
     mosaic = np.full((5, 7), 90, np.uint8)
     found = pixels_of(ColourImage("", 0, 0, "", "bayer_rggb8", 7, 5, 7, mosaic.tobytes()))
     assert (found[:4, :6] == 90).all()
@@ -344,8 +338,8 @@ def test_odd_rows_and_columns_have_no_colour() -> None:
     assert not found[:, 2:].any()
 
 
-def test_raw_pixels_may_end_with_the_last_pixel_and_not_before() -> None:
-    """Rows are padded, the last one need not be."""
+def test_raw_image_must_reach_its_last_pixel() -> None:
+    """Rows are padded, but the last one need not be."""
     data = np.arange(60, dtype=np.uint8).tobytes()
     for step, size in ((8, 8 * 2 + 6), (6, 18), (0, 18)):
         found = ColourImage("", 0, 0, "", "bgr8", 2, 3, step, data[:size])
@@ -360,7 +354,7 @@ def test_raw_pixels_may_end_with_the_last_pixel_and_not_before() -> None:
             pixels_of(ColourImage("", 0, 0, "", "bgr8", width, height, 6, data))
 
 
-def test_packed_colours_may_end_with_the_last_point_and_not_before() -> None:
+def test_packed_colours_must_reach_last_point() -> None:
     points = np.zeros((3, 2, 3), np.float32)
     field = [make("sensor_msgs/msg/PointField", "rgba", 5, 6, 1)]
     data = np.arange(80, dtype=np.uint8)
@@ -382,29 +376,29 @@ def test_packed_colours_may_end_with_the_last_point_and_not_before() -> None:
 # ---- time
 
 
-def test_clocks_are_counted_for_what_is_wrong_with_them() -> None:
+def test_clock_counts_each_kind_of_fault() -> None:
     year2000 = 946_684_800 * SECOND
     clock = Clock("/t")
     jump = 10 * SECOND
-    readings = [
+    times = [
         (EPOCH, EPOCH + 5),
         (EPOCH + 1, EPOCH + 6 + jump),  # the delay changes by just ten seconds
         (EPOCH + 2, EPOCH + 8 + 2 * jump),  # and by one nanosecond more
         (EPOCH + 2, EPOCH + 8 + 2 * jump),  # twice the same time is not backwards
         (EPOCH, EPOCH + 6 + 2 * jump),  # backwards
-        (EPOCH + 1, EPOCH + 7 + 2 * jump),  # and on from there
-        (0, 77),  # none
+        (EPOCH + 1, EPOCH + 7 + 2 * jump),  # continues from there
+        (0, 77),  # no stamp
         (year2000 - 1, year2000),
         (year2000 - 2, year2000 - 1),  # neither clock knows the year
     ]
-    found = [clock.check(stamp, log_time) for stamp, log_time in readings]
+    found = [clock.check(stamp, log_time) for stamp, log_time in times]
 
-    assert found == [stamp or 77 for stamp, _ in readings]
+    assert found == [stamp or 77 for stamp, _ in times]
     assert clock.counts == {"zero": 1, "epoch": 1, "back": 3, "jump": 2}
 
 
-def test_overlapping_chunks_are_merged_in_little_memory(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Ties in the order of the file; a chunk is opened when it is due and there is room."""
+def test_overlapping_chunks_are_merged_in_bounded_memory(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Ties keep the order of the file; a chunk is opened when it is due and there is room."""
     chunks = {0: [50, 60], 1: [20, 30, 40], 2: [10, 30, 50], 3: [15, 70]}
     opened: list[int] = []
 
@@ -424,7 +418,7 @@ def test_overlapping_chunks_are_merged_in_little_memory(monkeypatch: pytest.Monk
     assert [n for _, n in merged()] == [2, 2, 2, 3, 3, 1, 1, 1, 0, 0]
 
 
-def test_rotations_are_interpolated_as_scipy_does() -> None:
+def test_slerp_agrees_with_scipy() -> None:
     rng = np.random.default_rng(8)
     for spread in (1.0, 0.02, 1e-4):
         a = rng.normal(size=4)
@@ -436,21 +430,21 @@ def test_rotations_are_interpolated_as_scipy_does() -> None:
             assert (found.inv() * expected).magnitude()[0] < 1e-7
 
 
-def test_a_transform_is_held_for_the_tolerance_and_no_longer() -> None:
-    """Of equal samples the middle one is left out, which must not change an answer."""
+def test_transform_is_extrapolated_only_within_tolerance() -> None:
+    """Of equal samples the middle one is dropped, which must not change a result."""
     buffer = TransformBuffer(tolerance_ns=10)
     for stamp, x in ((100, 1.0), (200, 2.0), (300, 2.0), (400, 2.0), (500, 5.0)):
         assert buffer.add("map", "cup", stamp, ((x, 0, 0), (0, 0, 0, 1)), static=False)
-    places = {90: 1.0, 100: 1.0, 130: 1.3, 250: 2.0, 400: 2.0, 440: 3.2, 500: 5.0, 510: 5.0}
-    for stamp, x in places.items():
+    expected = {90: 1.0, 100: 1.0, 130: 1.3, 250: 2.0, 400: 2.0, 440: 3.2, 500: 5.0, 510: 5.0}
+    for stamp, x in expected.items():
         assert buffer.lookup("map", "cup", stamp).translation[0] == pytest.approx(x)
-    for stamp, said in ((89, "before the first"), (511, "after the last")):
-        with pytest.raises(Exception, match=said):
+    for stamp, message in ((89, "before the first"), (511, "after the last")):
+        with pytest.raises(Exception, match=message):
             buffer.lookup("map", "cup", stamp)
 
 
-def test_of_forgotten_transforms_the_last_one_stays() -> None:
-    """Between two transforms that are far apart, a frame needs the one long before it."""
+def test_last_transform_before_the_limit_is_not_forgotten() -> None:
+    """A frame between two distant transforms needs the one long before it."""
     buffer = TransformBuffer(tolerance_ns=10)
     for stamp in (100, 200, 900):
         buffer.add("map", "cup", stamp, ((stamp, 0, 0), (0, 0, 0, 1)), static=False)
@@ -461,7 +455,7 @@ def test_of_forgotten_transforms_the_last_one_stays() -> None:
         buffer.lookup("map", "cup", 150)
 
 
-def test_accelerations_are_averaged_over_half_a_second_on_each_side() -> None:
+def test_accelerations_are_averaged_over_half_a_second_each_way() -> None:
     bin_ns = 50_000_000
     sensor = Accelerometer("/imu", "imu")
     for number, value in ((20, (3.0, 0, 0)), (30, (0, 4.0, 0)), (41, (0, 0, 9.0))):
@@ -483,8 +477,8 @@ def test_accelerations_are_averaged_over_half_a_second_on_each_side() -> None:
 # ---- records and windows
 
 
-def test_a_record_may_end_with_its_chunk_and_not_behind_it() -> None:
-    """Of a ROS 1 bag: header and data, each after its length."""
+def test_bag_record_must_end_within_its_chunk() -> None:
+    """A record is a header and data, each after its length."""
     header = struct.pack("<I", 4) + b"op=\x02"
 
     def entry(data: bytes) -> bytes:
@@ -498,7 +492,7 @@ def test_a_record_may_end_with_its_chunk_and_not_behind_it() -> None:
             list(split(memoryview((first + second)[:-cut])))
 
 
-def test_an_mcap_record_may_end_with_the_file_and_not_behind_it(tmp_path: Path) -> None:
+def test_mcap_record_must_end_within_the_file(tmp_path: Path) -> None:
     content = struct.pack("<BQ", Opcode.HEADER, 5) + b"hello"
     more = struct.pack("<BQ", Opcode.METADATA, 3) + b"abc"
     path = tmp_path / "records"
@@ -519,7 +513,7 @@ TEXTS = {"/a": 0, "/b": 1}
 
 
 def mcap_of(path: Path) -> Path:
-    """Write two messages a chunk, in an order that is not that of time."""
+    """Write one message per chunk, not in order of time."""
     with path.open("wb") as file:
         writer = Writer(file, chunk_size=1, compression=CompressionType.NONE)
         writer.start("ros2", "test")
@@ -532,7 +526,7 @@ def mcap_of(path: Path) -> Path:
 
 
 def bag_of(path: Path) -> Path:
-    """Write two messages in most chunks, as `mcap_of` does."""
+    """Write the times of `mcap_of`, two messages in most chunks."""
     store = get_typestore(Stores.ROS1_NOETIC)
     writer = BagWriter(path)
     writer.chunk_threshold = 60
@@ -545,8 +539,8 @@ def bag_of(path: Path) -> Path:
     return path
 
 
-def test_a_bag_without_an_index_has_the_times_of_its_messages(tmp_path: Path) -> None:
-    """They need not be in the order of the file: the first one is not the earliest."""
+def test_bag_without_index_has_times_of_its_messages(tmp_path: Path) -> None:
+    """The first message in the file need not be the earliest."""
     path = bag_of(tmp_path / "a.bag")
     data = bytearray(path.read_bytes())
     at = data.index(b"index_pos=") + len(b"index_pos=")
@@ -560,8 +554,8 @@ def test_a_bag_without_an_index_has_the_times_of_its_messages(tmp_path: Path) ->
 
 
 @pytest.mark.parametrize("container", ["mcap", "bag"])
-def test_every_window_gives_the_messages_of_its_times(tmp_path: Path, container: str) -> None:
-    """As the format's own library reads them; a window has its start and not its stop."""
+def test_time_windows_agree_with_official_readers(tmp_path: Path, container: str) -> None:
+    """A window includes its start and excludes its stop."""
     if container == "mcap":
         path = mcap_of(tmp_path / "a.mcap")
         with path.open("rb") as file:
@@ -592,17 +586,17 @@ def test_every_window_gives_the_messages_of_its_times(tmp_path: Path, container:
                     assert [time for _, time, _ in got] == sorted(time for _, time, _ in got)
 
 
-def test_a_recording_is_described_whole(tmp_path: Path) -> None:
-    """The contents of `shapecat info`: times, sizes, and the use of each topic."""
+def test_description_has_times_sizes_and_uses_of_topics(tmp_path: Path) -> None:
+    """The description is what `shapecat info` prints."""
     items = depth_items(EPOCH, EPOCH + 250 * MS)
     items.append(("/cam/color/camera_info", EPOCH, info(EPOCH, WIDE)))
     items.append(("/cam/color/image_raw", EPOCH, raw(EPOCH, gradient(60, 80), "rgb8", "color")))
     items.append(("/tf_static", EPOCH, static("camera", "color", (0.05, 0, 0), (0, 0, 0, 1))))
     path = record(tmp_path / "a.mcap", in_order(items))
     points = organized_points(wavy_depth())
-    told = describe_recording(path)
+    description = describe_recording(path)
 
-    uses = {topic["name"]: (topic["use"], topic["count"]) for topic in told.pop("topics")}
+    uses = {topic["name"]: (topic["use"], topic["count"]) for topic in description.pop("topics")}
     assert uses == {
         "/cam/color/camera_info": ("camera", 1),
         "/cam/color/image_raw": ("colour of /cam/depth/image_raw", 1),
@@ -610,7 +604,7 @@ def test_a_recording_is_described_whole(tmp_path: Path) -> None:
         "/cam/depth/image_raw": ("depth stream", 2),
         "/tf_static": ("", 1),
     }
-    assert told == {
+    assert description == {
         "path": str(path),
         "kind": "mcap",
         "bytes": path.stat().st_size,
@@ -624,8 +618,8 @@ def test_a_recording_is_described_whole(tmp_path: Path) -> None:
     assert "calls a *depth stream* or a *points stream*" in page
 
 
-def test_depth_images_without_a_calibration_are_not_said_to_be_usable(tmp_path: Path) -> None:
-    """`process` refuses them, which `info` must foretell."""
+def test_description_marks_depth_stream_without_calibration(tmp_path: Path) -> None:
+    """`process` refuses it, which `info` must foretell."""
     images = [item for item in depth_items(EPOCH) if not item[0].endswith("camera_info")]
     path = record(tmp_path / "a.mcap", images)
 

@@ -1,4 +1,4 @@
-"""Transforms: the correct pose, or an error that names the missing link."""
+"""Tests of transforms: the correct pose, or an error that names the missing link."""
 
 import tracemalloc
 from bisect import bisect_right
@@ -73,7 +73,7 @@ def test_order_of_arrival_and_repeated_poses_do_not_matter() -> None:
     assert read == pytest.approx([1, 1, 1, 2.5, 4, 4, 4])
 
 
-def test_stamps_keep_their_nanoseconds() -> None:
+def test_lookup_resolves_nanoseconds() -> None:
     """Seconds in a double resolve 238 ns."""
     buffer = TransformBuffer()
     buffer.add("map", "base", EPOCH, moved(0.0), static=False)
@@ -82,7 +82,7 @@ def test_stamps_keep_their_nanoseconds() -> None:
     assert buffer.lookup("map", "base", EPOCH + 25).translation[0] == pytest.approx(0.25)
 
 
-def test_quaternions_of_opposite_sign_turn_the_short_way() -> None:
+def test_interpolation_takes_shorter_rotation() -> None:
     buffer = TransformBuffer()
     buffer.add("map", "base", 0, ((0, 0, 0), (0, 0, 0, 1)), static=False)
     buffer.add("map", "base", 10, ((0, 0, 0), (0, 0, -np.sin(0.2), -np.cos(0.2))), static=False)
@@ -92,14 +92,14 @@ def test_quaternions_of_opposite_sign_turn_the_short_way() -> None:
     np.testing.assert_allclose(half, [0, 0, np.sin(0.1), np.cos(0.1)], atol=1e-9)
 
 
-def test_static_transforms_hold_for_all_time() -> None:
+def test_static_transform_is_valid_at_all_times() -> None:
     buffer = TransformBuffer()
     buffer.add("base", "camera", EPOCH, moved(2.0), static=True)
 
     assert buffer.lookup("/base", "/camera", 0).translation[0] == 2.0
 
 
-def test_extrapolation_is_tolerated_a_little_and_then_named() -> None:
+def test_extrapolation_beyond_tolerance_is_an_error() -> None:
     buffer = TransformBuffer(tolerance_ns=10)
     buffer.add("map", "base", 100, moved(1.0), static=False)
     buffer.add("map", "base", 200, moved(2.0), static=False)
@@ -112,7 +112,7 @@ def test_extrapolation_is_tolerated_a_little_and_then_named() -> None:
         buffer.lookup("map", "base", 211)
 
 
-def test_what_is_missing_is_named() -> None:
+def test_lookup_errors_name_missing_link() -> None:
     buffer = TransformBuffer()
     buffer.add("a", "b", 0, IDENTITY, static=True)
     buffer.add("c", "d", 0, IDENTITY, static=True)
@@ -129,7 +129,7 @@ def test_what_is_missing_is_named() -> None:
     assert buffer.root_of("b") == "a"
 
 
-def test_a_frame_may_change_its_parent() -> None:
+def test_frame_may_change_its_parent() -> None:
     """An object that a robot picks up moves from the table to the gripper."""
     buffer = TransformBuffer()
     buffer.add("world", "gripper", 0, moved(5.0), static=True)
@@ -140,8 +140,8 @@ def test_a_frame_may_change_its_parent() -> None:
     assert buffer.lookup("world", "cup", 100).translation[0] == 5.5
 
 
-def test_hours_of_transforms_take_little_memory() -> None:
-    """A hundred a second for ten hours and ten joints are 36 million."""
+def test_each_transform_takes_little_memory() -> None:
+    """A hundred per second for ten hours and ten joints are 36 million."""
     buffer = TransformBuffer()
     tracemalloc.start()
     try:
@@ -160,7 +160,7 @@ def test_hours_of_transforms_take_little_memory() -> None:
     "bad",
     [((np.nan, 0, 0), (0, 0, 0, 1)), ((0, 0, 0), (0, 0, 0, 0)), ((0, 0, 0), (np.inf, 0, 0, 1))],
 )
-def test_what_is_no_transform_is_refused(bad: Any) -> None:
+def test_invalid_transform_is_refused(bad: Any) -> None:
     buffer = TransformBuffer()
 
     assert not buffer.add("a", "b", 0, bad, static=False)
@@ -181,7 +181,7 @@ def test_what_is_no_transform_is_refused(bad: Any) -> None:
         (["camera", "lens"], None),
     ],
 )
-def test_fixed_frame_follows_the_convention(chain: list[str], expected: str | None) -> None:
+def test_fixed_frame_follows_naming_convention(chain: list[str], expected: str | None) -> None:
     buffer = TransformBuffer()
     for parent, child in pairwise(chain):
         buffer.add(parent, child, 0, IDENTITY, static=True)
@@ -208,7 +208,7 @@ def transform(store: Any, parent: str, child: str, stamp: int, x: float) -> Any:
     )
 
 
-def test_transforms_of_a_ros2_recording(tmp_path: Path) -> None:
+def test_transforms_of_ros2_recording_are_read(tmp_path: Path) -> None:
     store, kind = get_typestore(Stores.ROS2_HUMBLE), "tf2_msgs/msg/TFMessage"
     path = tmp_path / "a.mcap"
     with path.open("wb") as file:
@@ -234,7 +234,7 @@ def test_transforms_of_a_ros2_recording(tmp_path: Path) -> None:
     assert buffer.lookup("odom", "camera", EPOCH + SECOND // 2).translation[0] == 10.5
 
 
-def test_transforms_of_an_old_ros1_recording(tmp_path: Path) -> None:
+def test_transforms_of_old_ros1_recording_are_read(tmp_path: Path) -> None:
     """ROS 1 recorded tf/tfMessage before tf2."""
     store, kind = get_typestore(Stores.ROS1_NOETIC), "tf/msg/tfMessage"
     store.register(get_types_from_msg("geometry_msgs/TransformStamped[] transforms", kind))
