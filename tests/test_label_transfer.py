@@ -1,4 +1,4 @@
-"""Labels of another run: refused by number, transferred by place and time, never guessed."""
+"""Tests of labels of another run: refused by number, and transferred by place and time."""
 
 import csv
 from collections import Counter
@@ -31,14 +31,14 @@ FRAMES_EACH = 10
 CUP, CAN, BOWL = (0.11, -0.42, 0.83), (0.34, -0.15, 0.79), (-0.27, 0.08, 0.86)
 
 
-def test_only_what_is_nearest_to_each_other_is_a_pair() -> None:
-    """Of two cups beside the place of one, a label goes to the nearer; to none out of reach."""
+def test_only_mutually_nearest_objects_are_paired() -> None:
+    """Of two cups near the old place, the nearer one is paired; none beyond the limit is."""
     one = np.array([[0.00, 0.5, 0.3], [0.05, 0.5, 0.3], [0.9, 0.1, 0.2]])
     other = np.array([[0.92, 0.1, 0.2], [0.04, 0.5, 0.3]])
-    reach = np.array([[0.1, 0.1], [0.1, 0.1], [0.019, 0.1]])
+    limit = np.array([[0.1, 0.1], [0.1, 0.1], [0.019, 0.1]])
 
-    pairs = [(k, j, round(apart, 6)) for k, j, apart in _mutual_nearest(one, other, reach)]
-    wider = [(k, j, round(apart, 6)) for k, j, apart in _mutual_nearest(one, other, reach + 0.002)]
+    pairs = [(k, j, round(dist, 6)) for k, j, dist in _mutual_nearest(one, other, limit)]
+    wider = [(k, j, round(dist, 6)) for k, j, dist in _mutual_nearest(one, other, limit + 0.002)]
 
     assert pairs == [(1, 1, 0.01)]
     assert wider == [(1, 1, 0.01), (2, 0, 0.02)]
@@ -52,19 +52,19 @@ def test_only_what_is_nearest_to_each_other_is_a_pair() -> None:
         (5, 2, {}),  # no majority
     ],
 )
-def test_a_track_is_the_object_it_is_nearest_to_unless_another_has_a_claim(
+def test_track_is_matched_by_majority_unless_another_competes(
     first: int, second: int, expected: dict[int, list[Match]]
 ) -> None:
-    """It would get the label of one of two objects between which it changes."""
+    """A track that switches between two objects must not get the label of one."""
     votes = {(1, 9): first, (2, 9): second}
-    apart = {(1, 9): 0.03 * first, (2, 9): 0.05 * second}
-    found = _by_majority(votes, apart, Counter({9: 10}), lambda track: track)
+    distances = {(1, 9): 0.03 * first, (2, 9): 0.05 * second}
+    found = _by_majority(votes, distances, Counter({9: 10}), lambda track: track)
 
     assert found.found == expected
     assert set(found.reasons) == (set() if expected else {1, 2} if second == 3 else {1})
 
 
-def still(place: Sequence[float], *, frames: range = range(FRAMES_EACH)) -> Path3:
+def static(place: Sequence[float], *, frames: range = range(FRAMES_EACH)) -> Path3:
     return [place if k in frames else None for k in range(FRAMES_EACH)]
 
 
@@ -81,9 +81,9 @@ def make_run(
     """Write the tables of a run whose tracks are at the given positions."""
     folder.mkdir(parents=True)
     work = work or f"w{folder.name}"
-    about = {"path": f"/recordings/{folder.name}.mcap", "digest": digest, "files": []}
+    source = {"path": f"/recordings/{folder.name}.mcap", "digest": digest, "files": []}
     model = {"categories": ["cup", "can", "bowl"]}
-    run = run_info(id=new_id(), work=work, input=about, fixed_frame=fixed_frame, model=model)
+    run = run_info(id=new_id(), work=work, input=source, fixed_frame=fixed_frame, model=model)
     write_run(folder, run)
     rows = [
         (track, frame, place)
@@ -92,11 +92,11 @@ def make_run(
         if place is not None
     ]
     stamps = [1_000 + 33 * frame for _, frame, _ in rows]
-    seen: dict[int, int] = {}
+    counts: dict[int, int] = {}
     detections = []
     for _, frame, _ in rows:
-        detections.append(seen.get(frame, 0))
-        seen[frame] = detections[-1] + 1
+        detections.append(counts.get(frame, 0))
+        counts[frame] = detections[-1] + 1
     columns: dict[str, Any] = {
         "track": [track for track, _, _ in rows],
         "topic": ["/depth"] * len(rows),
@@ -139,13 +139,13 @@ def shifted(place: Sequence[float], x: float = 0, y: float = 0, z: float = 0) ->
     return [place[0] + x, place[1] + y, place[2] + z]
 
 
-# ---- whose table it is
+# ---- the run that a table belongs to
 
 
-def test_the_table_of_another_run_is_refused_with_both_names(tmp_path: Path) -> None:
-    """Track numbers say nothing across runs: seven objects were mislabelled without a word."""
-    mine = make_run(tmp_path / "mine", {1: still(CUP)})
-    theirs = make_run(tmp_path / "theirs", {1: still(CAN)}, labels={1: "bowl"})
+def test_table_of_another_run_is_refused(tmp_path: Path) -> None:
+    """Equal track numbers of two runs mean different objects."""
+    mine = make_run(tmp_path / "mine", {1: static(CUP)})
+    theirs = make_run(tmp_path / "theirs", {1: static(CAN)}, labels={1: "bowl"})
     with pytest.raises(OutputError) as refused:
         adopt_labels(theirs / "tracks.csv", mine)
 
@@ -154,9 +154,9 @@ def test_the_table_of_another_run_is_refused_with_both_names(tmp_path: Path) -> 
     assert labels_of(mine) == {1: ""}
 
 
-def test_a_table_that_was_copied_over_the_runs_own_is_refused(tmp_path: Path) -> None:
-    mine = make_run(tmp_path / "mine", {1: still(CUP)})
-    write_csv(mine / "tracks.csv", {1: still(CAN)}, "wtheirs", {1: "bowl"})
+def test_table_copied_from_another_run_is_refused(tmp_path: Path) -> None:
+    mine = make_run(tmp_path / "mine", {1: static(CUP)})
+    write_csv(mine / "tracks.csv", {1: static(CAN)}, "wtheirs", {1: "bowl"})
 
     with pytest.raises(OutputError, match="wtheirs"):
         adopt_labels(mine / "tracks.csv", mine)
@@ -165,7 +165,7 @@ def test_a_table_that_was_copied_over_the_runs_own_is_refused(tmp_path: Path) ->
 
 
 def test_mixed_tables_are_refused(tmp_path: Path) -> None:
-    mine = make_run(tmp_path / "mine", {1: still(CUP), 2: still(CAN)})
+    mine = make_run(tmp_path / "mine", {1: static(CUP), 2: static(CAN)})
     text = (mine / "tracks.csv").read_text().splitlines()
     text[-1] = text[-1].replace("wmine", "wtheirs")
     (tmp_path / "mixed.csv").write_text("\n".join(text))
@@ -174,10 +174,10 @@ def test_mixed_tables_are_refused(tmp_path: Path) -> None:
         adopt_labels(tmp_path / "mixed.csv", mine)
 
 
-def test_a_table_without_the_column_is_the_runs_own_or_refused(tmp_path: Path) -> None:
+def test_table_without_run_column_is_checked_by_positions(tmp_path: Path) -> None:
     """If a user deletes the column, the positions decide; a hand-made table has none."""
-    mine = make_run(tmp_path / "mine", {1: still(CUP)})
-    theirs = make_run(tmp_path / "theirs", {1: still(shifted(CUP, y=0.01))})
+    mine = make_run(tmp_path / "mine", {1: static(CUP)})
+    theirs = make_run(tmp_path / "theirs", {1: static(shifted(CUP, y=0.01))})
     for run, label in ((mine, "bowl"), (theirs, "can")):
         lines = [line.rpartition(",")[0] for line in (run / "tracks.csv").read_text().splitlines()]
         (tmp_path / f"{run.name}.csv").write_text(
@@ -194,9 +194,9 @@ def test_a_table_without_the_column_is_the_runs_own_or_refused(tmp_path: Path) -
     assert labels_of(mine) == {1: "delete"}
 
 
-def test_the_name_survives_a_spreadsheet(tmp_path: Path) -> None:
+def test_run_column_survives_spreadsheet(tmp_path: Path) -> None:
     """Semicolons, a byte order mark, another order of columns, decimal commas."""
-    mine = make_run(tmp_path / "mine", {1: still(CUP)}, work="w12e4567890123456")
+    mine = make_run(tmp_path / "mine", {1: static(CUP)}, work="w12e4567890123456")
     text = "\ufeffrun;label;confidence;category;track\nw12e4567890123456;bowl;0,9;cup;1,0\n"
     (tmp_path / "saved.csv").write_text(text, "utf-8")
 
@@ -208,15 +208,15 @@ def test_the_name_survives_a_spreadsheet(tmp_path: Path) -> None:
 # ---- one recording, processed again
 
 
-def test_labels_find_the_tracks_that_were_in_the_same_places(tmp_path: Path) -> None:
-    """Other numbers, some centimetres of difference; no two coordinates may be exchanged."""
+def test_labels_are_transferred_to_tracks_at_same_positions(tmp_path: Path) -> None:
+    """Numbers differ, positions by some centimetres; no coordinates may be swapped."""
     labels = {1: "mug", 2: "delete", 3: "merge with 1"}
-    objects = {1: still(CUP), 2: still(CAN), 3: still(BOWL)}
+    objects = {1: static(CUP), 2: static(CAN), 3: static(BOWL)}
     source = make_run(tmp_path / "source", objects, labels=labels)
     moved = {
-        7: still(shifted(BOWL, z=0.02)),
-        8: still(shifted(CUP, x=0.02)),
-        9: still(shifted(CAN, y=-0.02)),
+        7: static(shifted(BOWL, z=0.02)),
+        8: static(shifted(CUP, x=0.02)),
+        9: static(shifted(CAN, y=-0.02)),
     }
     target = make_run(tmp_path / "target", moved)
 
@@ -231,19 +231,19 @@ def test_labels_find_the_tracks_that_were_in_the_same_places(tmp_path: Path) -> 
     assert read_track_table(target / "tracks.original.csv").rows[0].label == ""
 
 
-def test_frames_of_one_recording_are_not_compared_in_two_coordinate_frames(tmp_path: Path) -> None:
-    """A cup in the one frame may be where a bowl is in the other, at every moment."""
+def test_runs_in_different_fixed_frames_are_not_compared(tmp_path: Path) -> None:
+    """A cup in one frame may be where a bowl is in the other, at every moment."""
     source = make_run(
-        tmp_path / "source", {1: still(CUP), 2: still(CAN)}, labels={1: "mug"}, fixed_frame="odom"
+        tmp_path / "source", {1: static(CUP), 2: static(CAN)}, labels={1: "mug"}, fixed_frame="odom"
     )
-    target = make_run(tmp_path / "target", {1: still(CAN), 2: still(CUP)})
+    target = make_run(tmp_path / "target", {1: static(CAN), 2: static(CUP)})
 
     with pytest.raises(OutputError, match="fixed frames differ"):
         transfer_labels(source, target)
     assert set(labels_of(target).values()) == {""}
 
 
-def test_time_tells_apart_what_changed_places(tmp_path: Path) -> None:
+def test_objects_that_swap_places_are_distinguished_by_time(tmp_path: Path) -> None:
     """Two objects swap places halfway: their medians are the same, their times are not."""
     half = FRAMES_EACH // 2
     first = [CUP] * half + [CAN] * half
@@ -256,31 +256,31 @@ def test_time_tells_apart_what_changed_places(tmp_path: Path) -> None:
     assert labels_of(target) == {5: "tin", 6: "mug"}
 
 
-def test_frames_that_the_other_run_skipped_do_not_vote(tmp_path: Path) -> None:
-    """Half of the frames were processed before: no label would find a majority of all of them."""
+def test_skipped_frames_do_not_count_against_a_match(tmp_path: Path) -> None:
+    """The source has half of the frames: no label would have a majority of all frames."""
     every_2nd = range(0, FRAMES_EACH, 2)
-    source = make_run(tmp_path / "source", {1: still(CUP, frames=every_2nd)}, labels={1: "mug"})
-    target = make_run(tmp_path / "target", {5: still(CUP)})
+    source = make_run(tmp_path / "source", {1: static(CUP, frames=every_2nd)}, labels={1: "mug"})
+    target = make_run(tmp_path / "target", {5: static(CUP)})
 
     transfer_labels(source, target)
 
     assert labels_of(target) == {5: "mug"}
 
 
-def test_a_track_that_came_in_two_pieces_is_labelled_whole(tmp_path: Path) -> None:
-    source = make_run(tmp_path / "source", {1: still(CUP)}, labels={1: "mug"})
-    pieces = {4: still(CUP, frames=range(4)), 5: still(CUP, frames=range(4, 10))}
-    target = make_run(tmp_path / "target", pieces)
+def test_both_parts_of_split_track_are_labelled(tmp_path: Path) -> None:
+    source = make_run(tmp_path / "source", {1: static(CUP)}, labels={1: "mug"})
+    parts = {4: static(CUP, frames=range(4)), 5: static(CUP, frames=range(4, 10))}
+    target = make_run(tmp_path / "target", parts)
 
     transfer_labels(source, target)
 
     assert labels_of(target) == {4: "mug", 5: "mug"}
 
 
-def test_two_labels_for_one_track_are_told_not_guessed(tmp_path: Path) -> None:
-    objects = {1: still(CUP, frames=range(5)), 2: still(CUP, frames=range(5, 10))}
+def test_conflicting_labels_are_reported_not_applied(tmp_path: Path) -> None:
+    objects = {1: static(CUP, frames=range(5)), 2: static(CUP, frames=range(5, 10))}
     source = make_run(tmp_path / "source", objects, labels={1: "mug", 2: "tin"})
-    target = make_run(tmp_path / "target", {9: still(CUP)})
+    target = make_run(tmp_path / "target", {9: static(CUP)})
 
     transfer = transfer_labels(source, target)
 
@@ -290,12 +290,12 @@ def test_two_labels_for_one_track_are_told_not_guessed(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize("digest", ["xxh3-128:one", "xxh3-128:two"])
-def test_merged_tracks_that_are_one_now_need_no_merge(tmp_path: Path, digest: str) -> None:
+def test_merged_tracks_may_be_one_track_in_target(tmp_path: Path, digest: str) -> None:
     """By place, one part could be another candidate for the place of the other."""
-    objects = {1: still(CUP, frames=range(7)), 2: still(CUP, frames=range(7, 10))}
+    objects = {1: static(CUP, frames=range(7)), 2: static(CUP, frames=range(7, 10))}
     labels = {1: "mug", 2: "merge with 1"}
     source = make_run(tmp_path / "source", objects, labels=labels)
-    target = make_run(tmp_path / "target", {9: still(CUP, frames=range(8))}, digest=digest)
+    target = make_run(tmp_path / "target", {9: static(CUP, frames=range(8))}, digest=digest)
 
     transfer = transfer_labels(source, target)
 
@@ -303,12 +303,12 @@ def test_merged_tracks_that_are_one_now_need_no_merge(tmp_path: Path, digest: st
     assert not [item for item in transfer.missed if item.old_track == 1]
 
 
-def test_what_is_gone_is_told(tmp_path: Path) -> None:
-    """Also a merge whose partner is gone."""
-    objects = {1: still(CUP), 2: still(CAN), 3: still(BOWL)}
+def test_missing_objects_are_reported(tmp_path: Path) -> None:
+    """So are merges whose partner is missing."""
+    objects = {1: static(CUP), 2: static(CAN), 3: static(BOWL)}
     labels = {1: "mug", 2: "tin", 3: "merge with 2"}
     source = make_run(tmp_path / "source", objects, labels=labels)
-    target = make_run(tmp_path / "target", {1: still(BOWL), 2: still(CUP)})
+    target = make_run(tmp_path / "target", {1: static(BOWL), 2: static(CUP)})
 
     transfer = transfer_labels(source, target)
 
@@ -319,10 +319,10 @@ def test_what_is_gone_is_told(tmp_path: Path) -> None:
     }
 
 
-def test_a_neighbour_is_not_taken_for_what_is_not_seen(tmp_path: Path) -> None:
+def test_neighbour_does_not_get_label_of_missing_object(tmp_path: Path) -> None:
     """The labelled object is missing in the target, and its neighbour is the nearest track."""
-    source = make_run(tmp_path / "source", {1: still(CUP)}, labels={1: "mug"}, size=0.05)
-    beside = {5: still(shifted(CUP, y=0.08))}
+    source = make_run(tmp_path / "source", {1: static(CUP)}, labels={1: "mug"}, size=0.05)
+    beside = {5: static(shifted(CUP, y=0.08))}
     target = make_run(tmp_path / "target", beside, size=0.05)
 
     transfer = transfer_labels(source, target)
@@ -332,15 +332,15 @@ def test_a_neighbour_is_not_taken_for_what_is_not_seen(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize("part_first", [False, True])
-def test_parts_and_pieces_become_one_whole(tmp_path: Path, part_first: bool) -> None:
-    """The target has two pieces, in one of which the part is; the order of lines is no matter."""
+def test_merged_track_may_be_split_in_target(tmp_path: Path, part_first: bool) -> None:
+    """The order of lines must not matter."""
     whole = [None if 5 <= k < 8 else CUP for k in range(FRAMES_EACH)]
-    part = still(shifted(CUP, y=0.01), frames=range(5, 8))
+    part = static(shifted(CUP, y=0.01), frames=range(5, 8))
     objects = {2: part, 1: whole} if part_first else {1: whole, 2: part}
     labels = {1: "mug", 2: "merge with 1"}
     source = make_run(tmp_path / "source", objects, labels=labels)
-    pieces = {9: still(CUP, frames=range(5)), 10: still(CUP, frames=range(5, 10))}
-    target = make_run(tmp_path / "target", pieces)
+    parts = {9: static(CUP, frames=range(5)), 10: static(CUP, frames=range(5, 10))}
+    target = make_run(tmp_path / "target", parts)
 
     transfer = transfer_labels(source, target)
 
@@ -348,27 +348,26 @@ def test_parts_and_pieces_become_one_whole(tmp_path: Path, part_first: bool) -> 
     assert not transfer.missed
 
 
-def test_a_chain_of_merges_leads_to_the_whole(tmp_path: Path) -> None:
-    """Merges with one another would lead in a circle, and all labels would be lost."""
+def test_chain_of_merges_is_transferred(tmp_path: Path) -> None:
+    """Merges into each other would form a loop, and all labels would be lost."""
     third = range(3), range(3, 6), range(6, 10)
-    objects = {k: still(CUP, frames=frames) for k, frames in enumerate(third, start=1)}
+    objects = {k: static(CUP, frames=frames) for k, frames in enumerate(third, start=1)}
     labels = {1: "merge with 2", 2: "merge with 3"}
     source = make_run(tmp_path / "source", objects, labels=labels)
-    pieces = {k + 10: still(CUP, frames=frames) for k, frames in enumerate(third)}
-    target = make_run(tmp_path / "target", pieces)
+    parts = {k + 10: static(CUP, frames=frames) for k, frames in enumerate(third)}
+    target = make_run(tmp_path / "target", parts)
 
     transfer_labels(source, target)
 
     assert labels_of(target) == {10: "merge with 12", 11: "merge with 12", 12: ""}
 
 
-# ---- what is there already, and what cannot be read
+# ---- existing labels, and labels that cannot be read
 
 
-def test_what_a_person_wrote_in_the_target_stays(tmp_path: Path) -> None:
-    """It was replaced without a word."""
-    source = make_run(tmp_path / "source", {1: still(CUP)}, labels={1: "mug"})
-    target = make_run(tmp_path / "target", {5: still(CUP)}, labels={5: "teapot"})
+def test_existing_label_in_target_is_kept(tmp_path: Path) -> None:
+    source = make_run(tmp_path / "source", {1: static(CUP)}, labels={1: "mug"})
+    target = make_run(tmp_path / "target", {5: static(CUP)}, labels={5: "teapot"})
 
     (missed,) = transfer_labels(source, target).missed
 
@@ -376,22 +375,22 @@ def test_what_a_person_wrote_in_the_target_stays(tmp_path: Path) -> None:
     assert labels_of(target) == {5: "teapot"}
 
 
-def test_a_label_that_was_carried_over_can_be_replaced(tmp_path: Path) -> None:
-    source = make_run(tmp_path / "source", {1: still(CUP)}, labels={1: "mug"})
-    target = make_run(tmp_path / "target", {5: still(CUP)})
+def test_transferred_label_can_be_replaced(tmp_path: Path) -> None:
+    source = make_run(tmp_path / "source", {1: static(CUP)}, labels={1: "mug"})
+    target = make_run(tmp_path / "target", {5: static(CUP)})
     transfer_labels(source, target)
-    write_csv(source / "tracks.csv", {1: still(CUP)}, "wsource", {1: "teapot"})
+    write_csv(source / "tracks.csv", {1: static(CUP)}, "wsource", {1: "teapot"})
 
     assert not transfer_labels(source, target).missed
     assert labels_of(target) == {5: "teapot"}
 
 
-def test_a_label_that_was_carried_over_and_then_corrected_stays(tmp_path: Path) -> None:
-    """A second transfer knows what the first one wrote, and must not take it for that."""
-    source = make_run(tmp_path / "source", {1: still(CUP)}, labels={1: "mug"})
-    target = make_run(tmp_path / "target", {5: still(CUP)})
+def test_second_transfer_keeps_corrected_label(tmp_path: Path) -> None:
+    """Only labels that the first transfer wrote may be replaced."""
+    source = make_run(tmp_path / "source", {1: static(CUP)}, labels={1: "mug"})
+    target = make_run(tmp_path / "target", {5: static(CUP)})
     transfer_labels(source, target)
-    write_csv(target / "tracks.csv", {5: still(CUP)}, "wtarget", {5: "teapot"})
+    write_csv(target / "tracks.csv", {5: static(CUP)}, "wtarget", {5: "teapot"})
 
     (missed,) = transfer_labels(source, target).missed
 
@@ -399,11 +398,11 @@ def test_a_label_that_was_carried_over_and_then_corrected_stays(tmp_path: Path) 
     assert labels_of(target) == {5: "teapot"}
 
 
-def test_one_label_that_contradicts_does_not_cost_the_others(tmp_path: Path) -> None:
+def test_conflicting_label_does_not_block_the_others(tmp_path: Path) -> None:
     """A user merged a track of the target that the source says to delete."""
     labels = {1: "delete", 3: "mug"}
-    source = make_run(tmp_path / "source", {1: still(CUP), 3: still(BOWL)}, labels=labels)
-    objects = {5: still(CUP), 6: still(CAN), 7: still(BOWL)}
+    source = make_run(tmp_path / "source", {1: static(CUP), 3: static(BOWL)}, labels=labels)
+    objects = {5: static(CUP), 6: static(CAN), 7: static(BOWL)}
     target = make_run(tmp_path / "target", objects, labels={6: "merge with 5"})
 
     (missed,) = transfer_labels(source, target).missed
@@ -412,10 +411,10 @@ def test_one_label_that_contradicts_does_not_cost_the_others(tmp_path: Path) -> 
     assert labels_of(target) == {5: "", 6: "merge with 5", 7: "mug"}
 
 
-def test_one_misspelt_label_does_not_cost_the_others(tmp_path: Path) -> None:
+def test_misspelt_label_does_not_block_the_others(tmp_path: Path) -> None:
     labels = {1: "mug", 2: "bowll"}
-    source = make_run(tmp_path / "source", {1: still(CUP), 2: still(CAN)}, labels=labels)
-    target = make_run(tmp_path / "target", {5: still(CUP), 6: still(CAN)})
+    source = make_run(tmp_path / "source", {1: static(CUP), 2: static(CAN)}, labels=labels)
+    target = make_run(tmp_path / "target", {5: static(CUP), 6: static(CAN)})
 
     (missed,) = transfer_labels(source, target).missed
 
@@ -430,15 +429,15 @@ def test_one_misspelt_label_does_not_cost_the_others(tmp_path: Path) -> None:
         ("wsource\r\n2,", "wb\r\n2,", "several runs"),
     ],
 )
-def test_lines_are_not_left_out_without_a_word(
+def test_damaged_lines_are_not_silently_skipped(
     tmp_path: Path, found: str, broken: str, told: str
 ) -> None:
     labels = {1: "mug", 2: "tin"}
-    source = make_run(tmp_path / "source", {1: still(CUP), 2: still(CAN)}, labels=labels)
+    source = make_run(tmp_path / "source", {1: static(CUP), 2: static(CAN)}, labels=labels)
     table = (source / "tracks.csv").read_bytes().decode()
     assert found in table
     (source / "tracks.csv").write_bytes(table.replace(found, broken).encode())
-    target = make_run(tmp_path / "target", {5: still(CUP), 6: still(CAN)})
+    target = make_run(tmp_path / "target", {5: static(CUP), 6: static(CAN)})
 
     with pytest.raises(OutputError, match=told):
         transfer_labels(source, target)
@@ -452,22 +451,22 @@ def second(folder: Path, objects: Mapping[int, Path3], **options: Any) -> Path:
     return make_run(folder, objects, digest="xxh3-128:two", **options)
 
 
-def test_what_stands_still_is_found_in_another_recording(tmp_path: Path) -> None:
-    """The stamps are the same by chance: they say nothing across recordings."""
-    objects = {1: still(CUP), 2: still(CAN)}
+def test_static_objects_are_found_in_another_recording(tmp_path: Path) -> None:
+    """Equal stamps are a coincidence, and must not matter."""
+    objects = {1: static(CUP), 2: static(CAN)}
     source = make_run(tmp_path / "source", objects, labels={1: "mug", 2: "delete"})
-    there = {1: still(shifted(CAN, z=0.02)), 2: still(shifted(CUP, y=0.03))}
-    target = second(tmp_path / "target", there)
+    moved = {1: static(shifted(CAN, z=0.02)), 2: static(shifted(CUP, y=0.03))}
+    target = second(tmp_path / "target", moved)
 
     transfer_labels(source, target)
 
     assert labels_of(target) == {1: "delete", 2: "mug"}
 
 
-def test_what_was_moved_is_told_not_guessed(tmp_path: Path) -> None:
+def test_moved_object_is_reported_not_labelled(tmp_path: Path) -> None:
     path = [shifted(CUP, x=0.05 * k) for k in range(FRAMES_EACH)]
     source = make_run(tmp_path / "source", {1: path}, labels={1: "mug"})
-    target = second(tmp_path / "target", {1: still(shifted(CUP, x=0.22))})
+    target = second(tmp_path / "target", {1: static(shifted(CUP, x=0.22))})
 
     (missed,) = transfer_labels(source, target).missed
 
@@ -479,13 +478,13 @@ def test_what_was_moved_is_told_not_guessed(tmp_path: Path) -> None:
     ("size", "moved"),
     [(0.08, True), (0.31, False), ((0.31, 0.08, 0.1), False), ((0.08, 0.31, 0.1), False)],
 )
-def test_a_large_object_may_scatter_more_than_a_small_one(
+def test_positions_of_large_objects_may_scatter_more(
     tmp_path: Path, size: float | tuple[float, float, float], *, moved: bool
 ) -> None:
     """From another side, the centre of the visible part of a box is elsewhere."""
     path = [shifted(CUP, x=0.025 * k) for k in range(FRAMES_EACH)]  # half of it within 6 cm
     source = make_run(tmp_path / "source", {1: path}, labels={1: "mug"}, size=size)
-    target = second(tmp_path / "target", {1: still(shifted(CUP, x=0.11))}, size=size)
+    target = second(tmp_path / "target", {1: static(shifted(CUP, x=0.11))}, size=size)
 
     transfer = transfer_labels(source, target)
 
@@ -493,10 +492,10 @@ def test_a_large_object_may_scatter_more_than_a_small_one(
     assert ["moved" in one.reason for one in transfer.missed] == [True] * moved
 
 
-def test_two_candidates_are_told_not_guessed(tmp_path: Path) -> None:
-    """They stand around the old place, equally near."""
-    source = make_run(tmp_path / "source", {1: still(CUP)}, labels={1: "mug"})
-    around = {1: still(shifted(CUP, x=0.03)), 2: still(shifted(CUP, x=-0.035))}
+def test_two_candidates_are_reported_not_labelled(tmp_path: Path) -> None:
+    """Both are about equally near to the old place."""
+    source = make_run(tmp_path / "source", {1: static(CUP)}, labels={1: "mug"})
+    around = {1: static(shifted(CUP, x=0.03)), 2: static(shifted(CUP, x=-0.035))}
     target = second(tmp_path / "target", around)
 
     (missed,) = transfer_labels(source, target).missed
@@ -505,12 +504,12 @@ def test_two_candidates_are_told_not_guessed(tmp_path: Path) -> None:
     assert labels_of(target) == {1: "", 2: ""}
 
 
-def test_identical_cups_that_swap_are_told_not_guessed(tmp_path: Path) -> None:
-    """They stand side by side, and in the second recording each is nearly where the other was."""
+def test_identical_cups_that_swap_are_not_labelled(tmp_path: Path) -> None:
+    """In the second recording, each of them is nearly where the other was."""
     labels = {1: "mug", 2: "tin"}
     beside = shifted(CUP, y=0.06)
-    source = make_run(tmp_path / "source", {1: still(CUP), 2: still(beside)}, labels=labels)
-    swapped = {1: still(shifted(CUP, y=0.025)), 2: still(shifted(CUP, y=0.035))}
+    source = make_run(tmp_path / "source", {1: static(CUP), 2: static(beside)}, labels=labels)
+    swapped = {1: static(shifted(CUP, y=0.025)), 2: static(shifted(CUP, y=0.035))}
     target = second(tmp_path / "target", swapped)
 
     transfer = transfer_labels(source, target)
@@ -519,9 +518,9 @@ def test_identical_cups_that_swap_are_told_not_guessed(tmp_path: Path) -> None:
     assert {item.old_track for item in transfer.missed} == {1, 2}
 
 
-def test_something_of_another_size_is_another_thing(tmp_path: Path) -> None:
-    source = make_run(tmp_path / "source", {1: still(CUP)}, labels={1: "mug"})
-    target = second(tmp_path / "target", {1: still(CUP)}, size=0.2)
+def test_object_of_another_size_does_not_match(tmp_path: Path) -> None:
+    source = make_run(tmp_path / "source", {1: static(CUP)}, labels={1: "mug"})
+    target = second(tmp_path / "target", {1: static(CUP)}, size=0.2)
 
     (missed,) = transfer_labels(source, target).missed
 
@@ -529,22 +528,22 @@ def test_something_of_another_size_is_another_thing(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize("frame", [None, "odom"])
-def test_places_in_other_frames_are_not_compared(tmp_path: Path, frame: str | None) -> None:
-    source = make_run(tmp_path / "source", {1: still(CUP)}, labels={1: "mug"}, fixed_frame=frame)
-    target = second(tmp_path / "target", {1: still(CUP)})
+def test_positions_in_other_frames_are_not_compared(tmp_path: Path, frame: str | None) -> None:
+    source = make_run(tmp_path / "source", {1: static(CUP)}, labels={1: "mug"}, fixed_frame=frame)
+    target = second(tmp_path / "target", {1: static(CUP)})
 
     with pytest.raises(OutputError, match="fixed frame"):
         match_labels(source, target)
 
 
 @pytest.mark.parametrize("place", ["downloads", "other"])
-def test_a_table_alone_is_matched_by_its_places(tmp_path: Path, place: str) -> None:
+def test_table_alone_is_matched_by_positions(tmp_path: Path, place: str) -> None:
     """Also if it was saved beside the tables of another run, whose tracks are other objects."""
     (tmp_path / "downloads").mkdir()
-    make_run(tmp_path / "other", {4: still(CAN), 5: still(CUP)})
+    make_run(tmp_path / "other", {4: static(CAN), 5: static(CUP)})
     table = tmp_path / place / "table.csv"
-    write_csv(table, {4: still(CUP), 5: still(CAN)}, "wfar", {4: "mug"})
-    target = second(tmp_path / "target", {1: still(CAN), 2: still(shifted(CUP, z=0.01))})
+    write_csv(table, {4: static(CUP), 5: static(CAN)}, "wfar", {4: "mug"})
+    target = second(tmp_path / "target", {1: static(CAN), 2: static(shifted(CUP, z=0.01))})
 
     transfer = transfer_labels(table, target)
 
@@ -556,8 +555,8 @@ def test_a_table_alone_is_matched_by_its_places(tmp_path: Path, place: str) -> N
 
 
 @pytest.fixture(scope="module")
-def corrected(shapecat: Run, tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, Path]:
-    """Process a recording, and correct one track: by its own name, with a name of its own."""
+def processed(shapecat: Run, tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, Path]:
+    """Process a recording; return it and its run folder."""
     folder = tmp_path_factory.mktemp("corrected")
     recording = record(folder / "lab.mcap", 24)
     shapecat("process", recording, "--out", folder / "out", "--no-rrd", "--jobs", 1)
@@ -583,7 +582,7 @@ def place_of(row: Mapping[str, str]) -> list[float]:
     return [float(row[name]) for name in "xyz"]
 
 
-def annotated(run: Path) -> set[str]:
+def annotated_classes(run: Path) -> set[str]:
     """Return the classes in annotated.mcap."""
     found = set()
     with (run / "annotated.mcap").open("rb") as file:
@@ -593,9 +592,10 @@ def annotated(run: Path) -> set[str]:
     return found
 
 
-def test_overwriting_keeps_corrections(shapecat: Run, corrected: tuple[Path, Path]) -> None:
-    """They were dropped without a word, and the outputs showed the model's own labels."""
-    recording, run = corrected
+def test_overwriting_keeps_corrections_unless_discarded(
+    shapecat: Run, processed: tuple[Path, Path]
+) -> None:
+    recording, run = processed
     before = label_first(run, "teapot")
     again = ("process", recording, "--out", run.parent, "--no-rrd", "--jobs", 1, "--overwrite")
     done = shapecat(*again, "--every", 2)
@@ -607,17 +607,16 @@ def test_overwriting_keeps_corrections(shapecat: Run, corrected: tuple[Path, Pat
     assert np.allclose(place_of(row), place_of(before), atol=0.02)
     assert read_run(run)["corrections"]["transferred"][0]["label"] == "teapot"
     assert labels_in(run / "tracks.previous.csv") == {"teapot"}
-    assert "teapot" in annotated(run)
+    assert "teapot" in annotated_classes(run)
 
     done = shapecat(*again, "--discard-labels")
 
     assert "transferred" not in done.stderr
     assert labels_in(run / "tracks.csv") == set()
-    assert "teapot" not in annotated(run)
+    assert "teapot" not in annotated_classes(run)
 
 
-def test_labels_are_not_discarded_without_overwriting(shapecat: Run, tmp_path: Path) -> None:
-    """Without --overwrite the option has no effect, and was ignored without a word."""
+def test_discarding_labels_requires_overwriting(shapecat: Run, tmp_path: Path) -> None:
     done = shapecat("process", tmp_path / "lab.mcap", "--out", tmp_path, "--discard-labels")
 
     assert done.exit_code == 2
@@ -628,11 +627,11 @@ def labels_in(table: Path) -> set[str]:
     return {row.label for row in read_track_table(table).rows if row.label}
 
 
-def test_labels_that_find_nothing_are_named_and_kept(
-    shapecat: Run, corrected: tuple[Path, Path]
+def test_labels_without_match_are_reported_and_kept(
+    shapecat: Run, processed: tuple[Path, Path]
 ) -> None:
-    """Nothing is in reach of the sensor in the new run."""
-    recording, run = corrected
+    """In the new run, all objects are beyond the range of the sensor."""
+    recording, run = processed
     label_first(run, "teapot")
     done = shapecat(
         *("process", recording, "--out", run.parent, "--no-rrd", "--jobs", 1, "--overwrite"),
@@ -645,10 +644,10 @@ def test_labels_that_find_nothing_are_named_and_kept(
     assert labels_in(run / "tracks.previous.csv") == {"teapot"}
 
 
-def test_labels_of_another_run_go_by_place_when_asked(
-    shapecat: Run, corrected: tuple[Path, Path], tmp_path: Path
+def test_by_place_transfers_labels_of_another_run(
+    shapecat: Run, processed: tuple[Path, Path], tmp_path: Path
 ) -> None:
-    recording, _ = corrected
+    recording, _ = processed
     for name in ("one", "two"):
         shapecat("process", recording, "--out", tmp_path / name, "--no-rrd", "--jobs", 1,
                  *(("--every", 2) if name == "two" else ()))  # fmt: skip
@@ -662,4 +661,4 @@ def test_labels_of_another_run_go_by_place_when_asked(
     done = shapecat("annotate", two, "--labels", one / "tracks.csv", "--by-place")
     assert done.exit_code == 0, done.stderr
     assert "1 of 1 labels transferred" in done.stdout
-    assert "teapot" in annotated(two)
+    assert "teapot" in annotated_classes(two)

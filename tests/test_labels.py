@@ -1,4 +1,4 @@
-"""Corrections of tracks.csv, as users write them and as spreadsheets save them."""
+"""Tests of corrections of tracks.csv, as users write them and as spreadsheets save them."""
 
 import json
 import shutil
@@ -55,7 +55,7 @@ def labelled(**labels: str) -> str:
     return text
 
 
-def test_every_kind_of_label(run: Path) -> None:
+def test_every_kind_of_label_is_read(run: Path) -> None:
     (run / "tracks.csv").write_text(labelled(t4="teapot", t2="merge with 1", t3="delete"))
 
     assert read_labels(run / "tracks.csv") == {
@@ -78,7 +78,7 @@ def test_every_kind_of_label(run: Path) -> None:
         ("Öllampe", "Öllampe"),
     ],
 )
-def test_names_of_categories(run: Path, label: str, meant: str) -> None:
+def test_category_names_are_normalised(run: Path, label: str, meant: str) -> None:
     (run / "tracks.csv").write_text(labelled(t4=label))
 
     assert read_labels(run / "tracks.csv", ["cactus"])[4] == TrackLabel(4, meant, 1.0)
@@ -105,8 +105,8 @@ def test_names_of_categories(run: Path, label: str, meant: str) -> None:
         ("x" * 61, "is not a category"),
     ],
 )
-def test_what_is_not_understood_is_named(run: Path, label: str, message: str) -> None:
-    """Exports make folders of labels; a typo would become a category of its own."""
+def test_unknown_label_is_refused_with_suggestion(run: Path, label: str, message: str) -> None:
+    """A typo would become its own category, and a folder in exports."""
     (run / "tracks.csv").write_text(labelled(t4=label))
 
     with pytest.raises(OutputError) as raised:
@@ -115,8 +115,8 @@ def test_what_is_not_understood_is_named(run: Path, label: str, message: str) ->
 
 
 @pytest.mark.parametrize("confidence", ["nan", "inf", "-0.1", "1.01", "495"])
-def test_a_confidence_is_from_0_to_1(run: Path, confidence: str) -> None:
-    """A spreadsheet may turn 0.495 into 495; nothing after this expects such a number."""
+def test_confidence_outside_0_to_1_is_refused(run: Path, confidence: str) -> None:
+    """A spreadsheet may turn 0.495 into 495."""
     header, first, *rest = ORIGINAL.splitlines()
     cells = dict(zip(header.split(","), first.split(","), strict=True))
     changed = ",".join({**cells, "confidence": confidence}.values())
@@ -142,20 +142,20 @@ def test_chains_of_merges_end_in_one_track(run: Path) -> None:
             read_labels(run / "tracks.csv")
 
 
-def test_of_labels_that_contradict_each_other_the_merge_is_refused(run: Path) -> None:
-    """A track merged into a deleted one would vanish without having been deleted."""
+def test_merge_into_deleted_track_is_refused(run: Path) -> None:
+    """The merged track would vanish although nobody deleted it."""
     rows = read_track_table(run / "tracks.csv").rows
     first, second = sorted(row.track for row in rows)[:2]
     labels = {first: f"merge with {second}", second: "delete"}
     kept, refused = _given(rows, labels, (), one_frame=True)
 
-    told = {row.track: row.label for row in kept}
-    assert (told[first], told[second]) == ("", "delete")
+    label_of = {row.track: row.label for row in kept}
+    assert (label_of[first], label_of[second]) == ("", "delete")
     assert f"track {second} is deleted" in refused.pop(first)
     assert refused == {}
 
 
-def test_tracks_of_two_sensors_are_not_merged(run: Path) -> None:
+def test_tracks_of_different_topics_are_not_merged(run: Path) -> None:
     """One number on two topics would make one annotation delete the other."""
     text = labelled(t4="merge with 1").replace("merge with 1,/depth", "merge with 1,/other")
     (run / "tracks.csv").write_text(text)
@@ -164,14 +164,14 @@ def test_tracks_of_two_sensors_are_not_merged(run: Path) -> None:
         read_labels(run / "tracks.csv")
 
 
-def test_tracks_are_merged_that_a_sensor_has_both_seen(run: Path) -> None:
+def test_tracks_with_common_sensor_are_merged(run: Path) -> None:
     """Which of several sensors see an object changes while the robot moves."""
     text = labelled(t4="merge with 1").replace("merge with 1,/depth", "merge with 1,/depth /other")
     (run / "tracks.csv").write_text(text)
     assert read_labels(run / "tracks.csv")[4].track == 1
 
 
-def test_tracks_of_two_sensors_are_merged_where_both_have_a_place(run: Path) -> None:
+def test_tracks_of_two_sensors_merge_in_fixed_frame(run: Path) -> None:
     text = labelled(t4="merge with 1").replace("merge with 1,/depth", "merge with 1,/other")
     described = json.loads((run / "run.json").read_text()) | {"fixed_frame": "map"}
     (run / "run.json").write_text(json.dumps(described))
@@ -184,8 +184,8 @@ def test_tracks_of_two_sensors_are_merged_where_both_have_a_place(run: Path) -> 
     assert read_labels(run / "tracks.csv")[4] == TrackLabel(1, "cup", 0.5)
 
 
-def test_all_problems_are_named_at_once_and_nothing_is_written(run: Path) -> None:
-    """Nobody wants to fix one line per attempt."""
+def test_all_problems_are_reported_at_once(run: Path) -> None:
+    """And nothing is written."""
     corrected = run.parent / "mine.csv"
     corrected.write_text(
         labelled(t4="botle", t2="merge with 9", t1="bowl") + "77,0,cup,0.5,bowl,/depth\n"
@@ -201,7 +201,7 @@ def test_all_problems_are_named_at_once_and_nothing_is_written(run: Path) -> Non
     assert {path.name for path in run.iterdir()} == {"run.json", "tracks.csv"}
 
 
-def test_corrections_are_adopted_and_the_first_table_stays(run: Path) -> None:
+def test_adopting_corrections_keeps_original_table(run: Path) -> None:
     corrected = run.parent / "mine.csv"
     for label in ("bowl", "plate"):
         corrected.write_text(labelled(t4=label))
@@ -211,7 +211,7 @@ def test_corrections_are_adopted_and_the_first_table_stays(run: Path) -> None:
         assert (run / "tracks.original.csv").read_text() == ORIGINAL
 
 
-def test_a_table_corrected_in_place_keeps_its_original(run: Path) -> None:
+def test_table_edited_in_place_keeps_its_original(run: Path) -> None:
     (run / "tracks.csv").write_text(labelled(t4="bowl"))
     adopt_labels(run / "tracks.csv", run)
 
@@ -219,8 +219,8 @@ def test_a_table_corrected_in_place_keeps_its_original(run: Path) -> None:
     assert read_labels(run / "tracks.csv")[4].category == "bowl"
 
 
-def test_a_label_that_was_not_applied_yet_is_not_original(run: Path) -> None:
-    """A person writes some labels into tracks.csv, and takes others from elsewhere."""
+def test_original_table_excludes_labels_not_yet_applied(run: Path) -> None:
+    """A user may edit tracks.csv and adopt labels of another table as well."""
     (run / "tracks.csv").write_text(labelled(t4="bowl"))
     other = run.parent / "other"
     shutil.copytree(run, other)
@@ -233,7 +233,7 @@ def test_a_label_that_was_not_applied_yet_is_not_original(run: Path) -> None:
     assert read_labels(other / "tracks.csv")[4].category == "bowl"
 
 
-def test_a_page_that_is_out_of_date_undoes_nothing(run: Path) -> None:
+def test_outdated_page_undoes_no_labels(run: Path) -> None:
     """It holds the labels of all tracks as they were when it was made."""
     corrected = run.parent / "mine.csv"
     corrected.write_text(labelled(t4="bowl", t1="box"))
@@ -248,10 +248,10 @@ def test_a_page_that_is_out_of_date_undoes_nothing(run: Path) -> None:
     assert (run / "tracks.previous.csv").read_text() == labelled(t4="bowl", t1="box")
 
 
-def test_labels_that_are_cleared_are_kept_in_a_copy_and_named(
+def test_cleared_labels_are_reported_and_kept_in_copy(
     shapecat: Callable[..., Result], guessed_run: Path, tmp_path: Path
 ) -> None:
-    """Somebody may take an old table by mistake: hours of labels would be gone without a word."""
+    """An old table given by mistake would silently clear hours of labels."""
     folder = tmp_path / "table"
     shutil.copytree(guessed_run, folder)
     unlabelled = tmp_path / "old.csv"
@@ -267,7 +267,7 @@ def test_labels_that_are_cleared_are_kept_in_a_copy_and_named(
     assert (folder / "tracks.previous.csv").read_text() == labelled_table
 
 
-def test_lines_left_out_keep_their_label(run: Path) -> None:
+def test_missing_lines_keep_their_label(run: Path) -> None:
     """A filtered spreadsheet must not delete the labels of hidden lines."""
     corrected = run.parent / "mine.csv"
     corrected.write_text(labelled(t4="bowl"))
@@ -292,7 +292,7 @@ def test_lines_left_out_keep_their_label(run: Path) -> None:
     ],
     ids=["excel", "sep", "quoted", "numbers", "utf16", "cp1252", "mac"],
 )
-def test_spreadsheet_habits(tmp_path: Path, content: bytes) -> None:
+def test_tables_saved_by_spreadsheets_are_read(tmp_path: Path, content: bytes) -> None:
     path = tmp_path / "tracks.csv"
     path.write_bytes(content)
 
@@ -302,7 +302,7 @@ def test_spreadsheet_habits(tmp_path: Path, content: bytes) -> None:
 @pytest.mark.parametrize(
     "content", [b"", b"hello", b"id,label\n1,cup\n", b"\xff\xfe\x00", b"\x00" * 9]
 )
-def test_what_is_no_table_is_refused(tmp_path: Path, content: bytes) -> None:
+def test_invalid_table_is_refused(tmp_path: Path, content: bytes) -> None:
     path = tmp_path / "tracks.csv"
     path.write_bytes(content)
 
@@ -310,7 +310,7 @@ def test_what_is_no_table_is_refused(tmp_path: Path, content: bytes) -> None:
         read_labels(path)
 
 
-def test_a_missing_table_is_named(run: Path) -> None:
+def test_missing_table_is_reported(run: Path) -> None:
     with pytest.raises(OutputError, match=r"gone\.csv: cannot be read"):
         adopt_labels(run / "gone.csv", run)
 
@@ -331,7 +331,7 @@ def test_any_text_is_read_or_refused(tmp_path_factory: pytest.TempPathFactory, t
 
 
 def write_run(folder: Path) -> None:
-    """Write three frames with two objects side by side, tracks 1 and 2; track 3 takes over 2."""
+    """Write three frames with two objects side by side, tracks 1 and 2; track 3 continues 2."""
     plane = Plane(np.array([0, -1, 0]), -0.5, np.zeros((3, 3)), 1.0, 0.0)
     gas = NeuralGas(np.zeros((3, 3)), np.array([[0, 1], [1, 2]]))
     with PerceptionTables(folder, categories=("cup", "can"), model_id="m") as tables:
@@ -356,13 +356,13 @@ def write_run(folder: Path) -> None:
                 for k in range(2)
             )
             scene = Scene(np.array([0, -1, 0]), (plane,), ())
-            seen = Perception("/d", index, index, "cam", scene, found, {})
-            tables.write([seen], [FrameRow(0, None)])
+            perception = Perception("/d", index, index, "cam", scene, found, {})
+            tables.write([perception], [FrameRow(0, None)])
     rows = [(1, 0, 0), (1, 1, 0), (1, 2, 0), (2, 0, 1), (3, 1, 1), (3, 2, 1)]
     write_tracks(folder, rows, topic="/d", begin_ns=0)
 
 
-def test_merged_fragments_follow_each_other_as_one_track(tmp_path: Path) -> None:
+def test_merged_tracks_continue_as_one_track(tmp_path: Path) -> None:
     write_run(tmp_path)
     labels = {
         1: TrackLabel(1, "cup", 0.9),
@@ -377,7 +377,7 @@ def test_merged_fragments_follow_each_other_as_one_track(tmp_path: Path) -> None
 
 
 def test_merged_parts_of_one_frame_become_one_object(tmp_path: Path) -> None:
-    """Two entities of one number in one message would overwrite each other."""
+    """Two entities with one id in one message would overwrite each other."""
     write_run(tmp_path)
     labels = dict.fromkeys((1, 2, 3), TrackLabel(1, "box", 1.0))
 
@@ -391,7 +391,7 @@ def test_merged_parts_of_one_frame_become_one_object(tmp_path: Path) -> None:
     assert item.touches_border
 
 
-def test_categories_that_a_person_added_come_last(tmp_path: Path) -> None:
+def test_new_categories_come_last(tmp_path: Path) -> None:
     """A new name before the others would renumber the classes of a data set."""
     run = run_info(model={"categories": ["cup", "can"]})
     names = ("vase", "can", "unknown", "amphora", "cup")
@@ -404,7 +404,7 @@ def test_categories_that_a_person_added_come_last(tmp_path: Path) -> None:
     assert beside.categories == ("can", "jug", "cup", "amphora", "vase")
 
 
-def test_a_deleted_track_ends_where_it_would_have_been_seen(tmp_path: Path) -> None:
+def test_deleted_track_is_not_shown(tmp_path: Path) -> None:
     write_run(tmp_path)
     labels = {1: TrackLabel(1, "cup", 0.9), 2: TrackLabel(2, "can", 1.0)}
 
@@ -414,14 +414,14 @@ def test_a_deleted_track_ends_where_it_would_have_been_seen(tmp_path: Path) -> N
     assert [f.ended for f in frames] == [(), (2,), ()]
 
 
-def test_a_track_of_two_sensors_ends_where_it_was_last_seen_in_time(tmp_path: Path) -> None:
-    """Else its box is deleted on one topic, and stays on the other for ever."""
+def test_track_of_two_sensors_ends_after_its_latest_view(tmp_path: Path) -> None:
+    """Otherwise its box would stay on one topic for ever."""
     scene = Scene(np.array([0, -1, 0]), (), ())
     times = [("/a", 0, 0), ("/b", 0, 1), ("/b", 1, 2), ("/a", 1, 3), ("/a", 2, 4)]
     with PerceptionTables(tmp_path, categories=("cup", "can"), model_id="m") as tables:
         for topic, index, stamp in times:
-            seen = Perception(topic, index, stamp, "cam", scene, (), {})
-            tables.write([seen], [FrameRow(stamp, None)])
+            perception = Perception(topic, index, stamp, "cam", scene, (), {})
+            tables.write([perception], [FrameRow(stamp, None)])
     frames = {("/a", 0): slice(0, 1), ("/a", 1): slice(1, 2), ("/b", 0): slice(2, 3)}
 
     ended = _ended(tmp_path, frames, np.array([7, 7, 7]), np.array([0, 3, 1]))
@@ -450,7 +450,7 @@ def replayed(path: Path) -> list[tuple[int, set[str]]]:
     return shown
 
 
-def test_no_stale_box_is_shown_after_corrections(guessed_run: Path, tmp_path: Path) -> None:
+def test_no_stale_box_remains_after_corrections(guessed_run: Path, tmp_path: Path) -> None:
     """A box that was deleted or merged away, or outlives its object, misleads the viewer."""
     folder = tmp_path / "table"
     shutil.copytree(guessed_run, folder)
@@ -473,10 +473,10 @@ def test_no_stale_box_is_shown_after_corrections(guessed_run: Path, tmp_path: Pa
         assert not {str(a), str(b)} & wanted
 
 
-def test_annotate_names_what_it_wrote(
+def test_annotate_names_only_written_files(
     guessed_run: Path, tmp_path: Path, shapecat: Callable[..., Result]
 ) -> None:
-    """Without the review that `--no-rrd` left out, the line named a file that is not there."""
+    """The run has no review, because of `--no-rrd`."""
     folder = tmp_path / "table"
     shutil.copytree(guessed_run, folder)
     done = shapecat("annotate", folder)

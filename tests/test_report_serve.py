@@ -1,4 +1,4 @@
-"""The served report: corrections are on disk at once, and nobody else can make any."""
+"""Tests of the served report: labels are written at once, and only its owner can write them."""
 
 import csv
 import http.client
@@ -45,7 +45,7 @@ def run(guessed_run: Path, tmp_path: Path) -> Path:
 
 @pytest.fixture
 def long_run(run: Path) -> Path:
-    """Return a run of `TRACKS` tracks, copies of those that were found; its recording is gone."""
+    """Return a run with `TRACKS` tracks, copies of those found; its recording is missing."""
     with (run / "tracks.csv").open(newline="") as file:
         rows = list(csv.DictReader(file))
     tracks = pq.read_table(run / "tracks.parquet")
@@ -66,15 +66,15 @@ def long_run(run: Path) -> Path:
 
 
 def without_recording(run: Path) -> Path:
-    """Let a run forget its recording: a page is served sooner without pictures of it."""
-    about = json.loads((run / "run.json").read_text())
-    about["input"]["path"] = str(run / "gone.mcap")
-    (run / "run.json").write_text(json.dumps(about))
+    """Point a run to a missing recording: its page is served sooner without pictures."""
+    info = json.loads((run / "run.json").read_text())
+    info["input"]["path"] = str(run / "gone.mcap")
+    (run / "run.json").write_text(json.dumps(info))
     return run
 
 
 class Server(subprocess.Popen[str]):
-    """``shapecat report --serve`` as a process of its own, and the address it printed."""
+    """``shapecat report --serve`` in its own process, and the address it printed."""
 
     def __init__(self, *folders: Path) -> None:
         command = [sys.executable, "-m", "shapecat", "report", "--serve", *map(str, folders)]
@@ -112,7 +112,7 @@ def other_than(category: str, number: int) -> int:
     return digit if NAMES[digit - 1] != category else 1 + digit % len(NAMES)
 
 
-def test_corrections_by_keyboard_outlive_the_server(browser: Browser, long_run: Path) -> None:
+def test_keyboard_corrections_survive_restart_of_server(browser: Browser, long_run: Path) -> None:
     """They are on disk when the page says so, before the server ends."""
     categories = {row.track: row.category for row in read_track_table(long_run / "tracks.csv").rows}
     wanted, keys = {}, []
@@ -147,10 +147,10 @@ def test_corrections_by_keyboard_outlive_the_server(browser: Browser, long_run: 
 
 
 @pytest.mark.slow
-def test_a_page_tells_what_a_killed_server_has_not_written(
+def test_page_reports_corrections_lost_by_killed_server(
     browser: Browser, served: Callable[..., Server], long_run: Path
 ) -> None:
-    """Each correction is on disk, or the page says that it is not and offers it as a table."""
+    """Each correction is on disk, or the page reports it and offers it as a table."""
     server = served(long_run)
     browser.open(server.address)
     order = order_of(browser)
@@ -160,7 +160,7 @@ def test_a_page_tells_what_a_killed_server_has_not_written(
     browser.press(*["d", "Right"] * 4)
     browser.wait("return document.getElementById('saved').textContent.includes('does not answer')")
     browser.wait("return !document.getElementById('download').hidden")
-    said = browser.run("return document.getElementById('saved').textContent")
+    message = browser.run("return document.getElementById('saved').textContent")
     browser.click("#download")
     table = browser.downloaded()
     downloaded = {row.track: row.label for row in read_track_table(table).rows}
@@ -169,12 +169,12 @@ def test_a_page_tells_what_a_killed_server_has_not_written(
     on_disk = labels_on_disk(long_run)
     missing = [track for track in order[:13] if on_disk[track] != "delete"]
     assert set(order[9:13]) <= set(missing)
-    assert int(said.split()[0]) >= len(missing)
+    assert int(message.split()[0]) >= len(missing)
     assert [track for track, label in downloaded.items() if label] == sorted(order[:13])
 
 
-NEWS = "return performance.getEntriesByType('resource').some((got) => /labels$/.test(got.name))"
-"""A page asks for news when it is turned to."""
+LOADED = "return performance.getEntriesByType('resource').some((got) => /labels$/.test(got.name))"
+"""A page requests the labels when it gets the focus."""
 TROUBLE = {
     "its answer comes late": (
         "const answer = await real(...request);"
@@ -186,14 +186,14 @@ TROUBLE = {
 
 
 @pytest.mark.parametrize("trouble", TROUBLE)
-def test_corrections_bear_what_happens_to_the_one_before(
+def test_later_corrections_survive_late_or_lost_answer(
     browser: Browser, run: Path, drawn: RunReport, trouble: str
 ) -> None:
     """A late answer must not undo later labels; a lost request is sent again."""
     with serving(run, drawn) as (address, _):
         browser.open(address)
         browser.press("Right", "Left")
-        browser.wait(NEWS)
+        browser.wait(LOADED)
         browser.run(
             "const real = fetch; let sent = 0; window.answered = 0;"
             "window.fetch = async (...request) => {"
@@ -219,7 +219,7 @@ def ask(
     body: str | bytes | None = None,
     headers: dict[str, str] | None = None,
 ) -> tuple[int, str]:
-    """Send a request as no browser would stop it; return status and text."""
+    """Send a request without the checks of a browser; return status and text."""
     parts = urlsplit(address)
     connection = http.client.HTTPConnection(parts.hostname or "", parts.port or 0)
     connection.request(method, parts.path if path is None else path, body, headers or {})
@@ -248,7 +248,7 @@ def correction(track: int, label: str, seen: str = "") -> str:
 def site(
     guessed_run: Path, drawn: RunReport, tmp_path_factory: pytest.TempPathFactory
 ) -> Iterator[tuple[Path, str, str]]:
-    """Serve a run that no test of these changes: the run, its page, and its labels."""
+    """Serve a run that no test changes; return it and the addresses of page and labels."""
     run = tmp_path_factory.mktemp("site") / "ta ble#2"
     shutil.copytree(guessed_run, run)
     with serving(run, drawn) as (address, labels):
@@ -256,7 +256,7 @@ def site(
 
 
 KNOWN = "/{token}/{page}"
-STRANGERS = {
+FOREIGN_REQUESTS = {
     "no token": ("/{page}", {}),
     "another token": ("/AAAAAAAAAAAAAAAAAAAAAAAAAAAAAAAA/{page}", {}),
     "a part of the token": ("/{token:.9}/{page}", {}),
@@ -272,16 +272,16 @@ STRANGERS = {
 """The path of a request, and its headers."""
 
 
-@pytest.mark.parametrize("stranger", STRANGERS)
+@pytest.mark.parametrize("stranger", FOREIGN_REQUESTS)
 @pytest.mark.parametrize("method", ["GET", "POST"])
-def test_strangers_are_refused(site: tuple[Path, str, str], method: str, stranger: str) -> None:
-    """Any page in the browser can send requests to this machine, by a name of its own as well."""
+def test_outsiders_are_refused(site: tuple[Path, str, str], method: str, stranger: str) -> None:
+    """Any web page can send requests to this machine, also under its own host name."""
     run, address, labels = site
-    form, headers = STRANGERS[stranger]
-    place = labels if method == "POST" else urlsplit(address).path
-    _, token, page = place.split("/", 2)
+    template, headers = FOREIGN_REQUESTS[stranger]
+    target = labels if method == "POST" else urlsplit(address).path
+    _, token, page = target.split("/", 2)
     before = (run / "tracks.csv").read_bytes()
-    path = form.format(token=token, page=page)
+    path = template.format(token=token, page=page)
     status, text = ask(address, method, path, correction(1, "bowl"), headers)
 
     assert status == 403
@@ -290,7 +290,7 @@ def test_strangers_are_refused(site: tuple[Path, str, str], method: str, strange
     assert not (run / "tracks.original.csv").exists()
 
 
-def test_the_owner_is_served_by_either_name(site: tuple[Path, str, str]) -> None:
+def test_owner_is_served_under_both_host_names(site: tuple[Path, str, str]) -> None:
     _, address, labels = site
     port = urlsplit(address).port
     for host in (f"127.0.0.1:{port}", f"localhost:{port}", "localhost:9000"):  # through a tunnel
@@ -302,7 +302,7 @@ def test_the_owner_is_served_by_either_name(site: tuple[Path, str, str]) -> None
     assert ask(address, path=labels.replace("labels", "../../run.json"))[0] == 404
 
 
-def test_no_other_machine_can_connect(site: tuple[Path, str, str]) -> None:
+def test_server_listens_on_one_address_only(site: tuple[Path, str, str]) -> None:
     """A server on all addresses would answer on this one of the loopback network as well."""
     with socket.socket() as other, pytest.raises(ConnectionRefusedError):
         other.connect(("127.0.0.2", urlsplit(site[1]).port))
@@ -327,7 +327,7 @@ def test_no_other_machine_can_connect(site: tuple[Path, str, str]) -> None:
         (correction(1, "cup", seen="bowl"), 409),
     ],
 )
-def test_what_makes_no_sense_is_not_written(
+def test_invalid_correction_is_not_written(
     site: tuple[Path, str, str], body: str, status: int
 ) -> None:
     run, address, labels = site
@@ -339,7 +339,7 @@ def test_what_makes_no_sense_is_not_written(
     assert (run / "tracks.csv").read_bytes() == before
 
 
-def test_a_correction_is_on_disk_before_it_is_confirmed(run: Path, drawn: RunReport) -> None:
+def test_correction_is_on_disk_before_confirmation(run: Path, drawn: RunReport) -> None:
     first = (run / "tracks.csv").read_bytes()
     with serving(run, drawn) as (address, labels):
         for label, seen in (
@@ -354,7 +354,7 @@ def test_a_correction_is_on_disk_before_it_is_confirmed(run: Path, drawn: RunRep
     assert (run / "tracks.original.csv").read_bytes() == first
 
 
-def test_corrections_at_the_same_time_are_all_written(run: Path, drawn: RunReport) -> None:
+def test_simultaneous_corrections_are_all_written(run: Path, drawn: RunReport) -> None:
     """Each reads and writes the whole table: without a lock the last would undo the others."""
     tracks = list(labels_on_disk(run))
     with serving(run, drawn) as (address, labels), serving(run, drawn) as (again, others):
@@ -370,7 +370,7 @@ def test_corrections_at_the_same_time_are_all_written(run: Path, drawn: RunRepor
     assert labels_on_disk(run) == {t: NAMES[n % 7] for n, t in enumerate(tracks)}
 
 
-def test_two_tabs_do_not_overwrite_one_another(
+def test_two_tabs_do_not_overwrite_each_other(
     browser: Browser, run: Path, drawn: RunReport
 ) -> None:
     first, second, third = list(labels_on_disk(run))[:3]
@@ -380,7 +380,7 @@ def test_two_tabs_do_not_overwrite_one_another(
         browser.turn_to(two)
         browser.open(address)
         late = "addEventListener('focus', (event) => event.stopImmediatePropagation(), true)"
-        browser.run(late)  # or it would ask for news when it is turned to
+        browser.run(late)  # or it would request the labels on focus
         browser.turn_to(one)
         browser.click(f"#track-{first} [data-label='unknown']")
         browser.wait(SAVED)
@@ -393,20 +393,20 @@ def test_two_tabs_do_not_overwrite_one_another(
         assert browser.run(fix) in {"→ unknown", "✓"}
         assert "unknown" in browser.run("return document.querySelector('#said').textContent")
 
-        browser.click(f"#track-{first} [data-label='delete']")  # knowing what is there, it may
+        browser.click(f"#track-{first} [data-label='delete']")  # allowed, as it now shows the label
         browser.click(f"#track-{second} [data-label='unknown']")
         browser.wait(SAVED)
         browser.close_tab()
         browser.turn_to(one)
         browser.click(f"#track-{third} [data-label='unknown']")
         browser.wait(SAVED)
-        browser.wait(f"{fix} === '→ delete'")  # the answer told of the other tab's
+        browser.wait(f"{fix} === '→ delete'")  # the answer includes that of the other tab
     found = labels_on_disk(run)
     assert [found[track] for track in (first, second, third)] == ["delete", "unknown", "unknown"]
 
 
 @pytest.mark.slow
-def test_an_interrupt_ends_it_with_the_corrections_in_the_page(
+def test_interrupted_server_writes_corrections_into_page(
     served: Callable[..., Server], run: Path
 ) -> None:
     """A page that is mailed afterwards must show the corrections."""
@@ -420,14 +420,14 @@ def test_an_interrupt_ends_it_with_the_corrections_in_the_page(
     server.send_signal(signal.SIGINT)
     _, errors = server.communicate()
 
-    assert server.returncode == 0  # the command says that this is how to end it
+    assert server.returncode == 0  # the command asks users to end it this way
     assert errors.splitlines()[-1] == "stopping the server"
     assert "corrections are written to tracks.csv as you make them" in errors
     assert '"label":"teapot"' in (run / "report.html").read_text("utf-8")
     assert "1 checked" in (run.parent / "index.html").read_text("utf-8")
 
 
-def test_a_port_that_is_taken_is_one_line(shapecat: Run, long_run: Path) -> None:
+def test_taken_port_is_refused(shapecat: Run, long_run: Path) -> None:
     with socket.socket() as taken:
         taken.bind(("127.0.0.1", 0))
         taken.listen()
@@ -448,21 +448,21 @@ def test_keys_undo_move_and_open(browser: Browser, reported_run: Path) -> None:
     ring = "return getComputedStyle(document.activeElement).outlineWidth"
     assert browser.run(ring) == "3px"
 
-    def after(*keys: str, track: int, label: str, focus: int) -> None:
+    def press_and_wait(*keys: str, track: int, label: str, focus: int) -> None:
         """Press keys; wait until the label of a track and the focus are as they should be."""
         browser.press(*keys)
         shown = f"document.querySelector('#track-{track} .fix').textContent === '{label}'"
         browser.wait(f"return {shown} && document.activeElement.dataset.track === '{focus}'")
 
-    after("Right", "Down", "Up", "Left", "Right", "d", track=b, label="→ delete", focus=b)
-    after("Left", "Control+z", track=b, label="", focus=b)  # where something was undone
-    after("Enter", track=b, label="✓", focus=b)
-    after("m", *str(a), "Enter", track=b, label=f"→ merge with #{a}", focus=b)
-    after("Backspace", track=b, label="", focus=b)
-    after("n", *"mug", "Enter", track=b, label="→ mug", focus=b)
-    after("Right", "8", track=c, label="→ mug", focus=c)  # a new name gets a key
-    after("u", track=c, label="", focus=c)
-    after("u", track=b, label="", focus=b)
+    press_and_wait("Right", "Down", "Up", "Left", "Right", "d", track=b, label="→ delete", focus=b)
+    press_and_wait("Left", "Control+z", track=b, label="", focus=b)  # focuses the undone card
+    press_and_wait("Enter", track=b, label="✓", focus=b)
+    press_and_wait("m", *str(a), "Enter", track=b, label=f"→ merge with #{a}", focus=b)
+    press_and_wait("Backspace", track=b, label="", focus=b)
+    press_and_wait("n", *"mug", "Enter", track=b, label="→ mug", focus=b)
+    press_and_wait("Right", "8", track=c, label="→ mug", focus=c)  # a new name gets a key
+    press_and_wait("u", track=c, label="", focus=c)
+    press_and_wait("u", track=b, label="", focus=b)
 
     browser.press("f")
     browser.wait("return document.getElementById('large').open")

@@ -1,4 +1,4 @@
-"""The numbers on the pages of a report, worked out by hand."""
+"""Tests of the numbers on the pages of a report, worked out by hand."""
 
 import json
 import re
@@ -54,8 +54,8 @@ def run(guessed_run: Path, tmp_path: Path) -> Path:
     return folder
 
 
-def test_a_card_shows_views_times_and_the_posterior_of_all_of_them() -> None:
-    """Between two detections a track coasts: that is no view. The likeliest bar is the first."""
+def test_card_shows_views_times_and_sorted_posterior() -> None:
+    """Frames without a detection are not views."""
     seen = np.array([True, True, False, False, True, False])
     causal = np.tile([0.2, 0.5, 0.3], (6, 1))
     line = Timeline(np.array([1.0, 1.5, 2.0, 2.5, 3.2, 3.9]), seen, causal, ())
@@ -84,13 +84,13 @@ def worked_card() -> Card:
     return Card(TrackRow(2, 17, "can", 0.644, "", "/d", {"novelty": "0.31"}), line, pictures)
 
 
-def test_a_card_has_each_number_in_its_place() -> None:
-    """The bars are of all views: the last posterior, not the first. A track may coast at its end.
+def test_card_has_right_values() -> None:
+    """Bars show the last posterior, which is of all views. A track may coast at its end.
 
-    On the time line, 300 wide and 4 s long, probable is up: 0 is at 33 and 1 at 2.
+    On the timeline, 300 wide and 4 s long, probability 0 is at y = 33 and 1 at y = 2.
     """
     card = card_html(worked_card(), NAMES, ("unknown", *NAMES), 4.0)
-    about = re.search(r"<article [^>]*>", card)
+    article = re.search(r"<article [^>]*>", card)
     lines = re.findall(r'<polyline points="(.*?)" stroke="(.*?)"', card)
     bars = re.findall(r'data-label="(\w+)" style="--c:(#\w+);--w:([\d.]+%)"', card)
 
@@ -100,11 +100,11 @@ def test_a_card_has_each_number_in_its_place() -> None:
         "2", "can", "0.58", "3", "box", "0.26", "1", "cup", "0.16",
         "2 views · 1.0–2.5 s · 12 × 7 × 23 cm · novelty 0.31", "unknown", "delete",
     ]  # fmt: skip
-    assert about is not None
+    assert article is not None
     for name, value in (
         ("track", "17"), ("category", "can"), ("confidence", "0.644"), ("first", "1")
     ):  # fmt: skip
-        assert f'data-{name}="{value}"' in about[0]
+        assert f'data-{name}="{value}"' in article[0]
     assert bars == [
         ("can", "#46a758", "58.0%"), ("box", "#3e82f6", "26.0%"), ("cup", "#e5484d", "16.0%")
     ]  # fmt: skip
@@ -125,10 +125,10 @@ def test_a_card_has_each_number_in_its_place() -> None:
 
 
 @pytest.mark.parametrize("topics", [("/d", "/d"), ("/d", "/e")])
-def test_the_strip_has_each_box_in_its_place(topics: tuple[str, str]) -> None:
-    """Left and width are shares of the width, top and height of the height.
+def test_strip_boxes_have_right_positions(topics: tuple[str, str]) -> None:
+    """Left and width are fractions of the width, top and height of the height.
 
-    Topics are named where there are several of them.
+    Topics are named if there are several.
     """
     boxes = {17: (50, 30, 20, 15), 99: (1, 2, 3, 4)}
     few = StripFrame("data:few", 200, 100, 0.52, topics[0], boxes)
@@ -147,8 +147,8 @@ def test_the_strip_has_each_box_in_its_place(topics: tuple[str, str]) -> None:
 
 
 @pytest.mark.parametrize("served", [False, True])
-def test_the_page_of_a_run_has_each_number_under_its_name(*, served: bool) -> None:
-    about: Any = {
+def test_run_page_has_right_values(*, served: bool) -> None:
+    info: Any = {
         "input": {"path": "/data/lab.mcap", "bytes": 12_340_000, "digest": "xxh3-128:77"},
         "options": {"topics": ["/d", "/e"]},
         "counts": {"frames": 61, "detections": 143, "skipped": {"too few points": 5}},
@@ -160,7 +160,7 @@ def test_the_page_of_a_run_has_each_number_under_its_name(*, served: bool) -> No
         "color": {"/d": "/rgb", "/e": None},
         "versions": {"shapecat": "1.2", "python": "3.13"},
     }
-    lab = FinishedRun(Path("out/my lab"), about, {17: TrackLabel(17, "mug", 1.0)})
+    lab = FinishedRun(Path("out/my lab"), info, {17: TrackLabel(17, "mug", 1.0)})
     row = worked_card().row
     table = TrackTable(("track", "label"), (row,), ())
     stages = {"detect": np.array([0.0021, 0.0042, 0.1044]), "rest": np.array([])}
@@ -172,10 +172,10 @@ def test_the_page_of_a_run_has_each_number_under_its_name(*, served: bool) -> No
     cells = [
         re.findall(r"<t[hd]>(.*?)</t[hd]>", line) for line in re.findall(r"<tr>.*?</tr>", times)
     ]
-    (saying,) = re.findall(
+    (instruction,) = re.findall(
         r'</div>\s*<p class="muted">(.*?)</code>', text[text.index("confusion") :]
     )
-    what = "" if served else " --labels tracks.csv"
+    option = "" if served else " --labels tracks.csv"
 
     assert facts == {
         "frames": "61", "length": "3.2 s", "detections": "143", "tracks": "1", "uncertain": "1",
@@ -194,8 +194,8 @@ def test_the_page_of_a_run_has_each_number_under_its_name(*, served: bool) -> No
         ["perceive", "12.3", "", "s"],
         ["total", "15.7", "", "s"],
     ]
-    assert text_of(saying)[-1] == f"shapecat annotate &#x27;out/my lab&#x27;{what}"
-    assert ("already in tracks.csv" in saying) == served
+    assert text_of(instruction)[-1] == f"shapecat annotate &#x27;out/my lab&#x27;{option}"
+    assert ("already in tracks.csv" in instruction) == served
     assert ("connect-src 'self'" in text) == served
     assert re.findall(r'<option value="(unknown|cup|can|box|mug)">', text) == [
         "unknown", "cup", "can", "box", "mug"
@@ -207,7 +207,7 @@ def test_the_page_of_a_run_has_each_number_under_its_name(*, served: bool) -> No
     assert data["rows"] == [{"track": "17", "category": "can", "label": "", "cells": ["", ""]}]
 
 
-def test_durations_of_stages_are_in_milliseconds_and_of_phases_in_seconds(run: Path) -> None:
+def test_stages_are_in_milliseconds_and_phases_in_seconds(run: Path) -> None:
     finished = read_finished(run)
     finished.run["seconds"] = {"perceive": 12.34}
     table = read_track_table(run / "tracks.csv")
@@ -217,7 +217,7 @@ def test_durations_of_stages_are_in_milliseconds_and_of_phases_in_seconds(run: P
     assert "<td>perceive</td><td>12.3</td><td></td><td>s</td>" in text
 
 
-def test_time_lines_end_with_the_last_track(run: Path) -> None:
+def test_timelines_end_with_the_last_track(run: Path) -> None:
     """The scale is the same on all cards, and no line is drawn beyond its card."""
     ends = {4: [1.0, 2.5], 5: [0.5, 6.25], 6: [3.0]}
     cards = [
@@ -239,7 +239,7 @@ def test_time_lines_end_with_the_last_track(run: Path) -> None:
     assert [line.split()[-1].split(",")[0] for line in lines[::3]] == ["120", "300", "144"]
 
 
-def test_a_long_time_line_is_drawn_to_its_ends() -> None:
+def test_long_timeline_includes_both_ends() -> None:
     """The last posterior of a track is the one that counts."""
     assert _few(80).tolist() == list(range(80))
     assert _few(3).tolist() == [0, 1, 2]
@@ -248,12 +248,12 @@ def test_a_long_time_line_is_drawn_to_its_ends() -> None:
     assert set(np.diff(some)) == {12, 13}
 
 
-def test_the_index_adds_up_its_runs() -> None:
+def test_index_sums_its_runs() -> None:
     listed = []
     for k, (frames, unsure, checked) in enumerate([(7, 2, 5), (40, 1, 0)]):
         counts = Counter({"cup": 3 + k, "can": 6})
-        about = {"counts": {"frames": frames}, "seconds": {"total": 12.34}, "warnings": ["x"] * k}
-        listed.append(Listed(f"{k}.html", f"run {k}", about, counts, unsure, checked, ("data:p",)))
+        info = {"counts": {"frames": frames}, "seconds": {"total": 12.34}, "warnings": ["x"] * k}
+        listed.append(Listed(f"{k}.html", f"run {k}", info, counts, unsure, checked, ("data:p",)))
     text = index_page("runs", listed)
 
     tiles = dict(re.findall(r"<dt>(\w+)</dt><dd>(\d+)</dd>", text))
@@ -267,8 +267,8 @@ def test_the_index_adds_up_its_runs() -> None:
     assert "can 6, cup 4" in text
 
 
-def test_index_counts_what_is_left_to_check(run: Path) -> None:
-    """A track that a person has labelled is no longer uncertain, however it was before."""
+def test_index_counts_tracks_left_to_check(run: Path) -> None:
+    """A labelled track is no longer uncertain."""
     header, *lines = (run / "tracks.csv").read_text().splitlines()
     names = header.split(",")
     rows = [dict(zip(names, line.split(","), strict=True)) for line in lines]
@@ -283,8 +283,8 @@ def test_index_counts_what_is_left_to_check(run: Path) -> None:
     assert listed.categories == {"can": len(rows) - 2, "cup": 2}
 
 
-def test_merged_tracks_are_one_object_of_the_index(run: Path) -> None:
-    """A person has found that three tracks are one object, and a fourth none."""
+def test_merged_tracks_count_once_in_index(run: Path) -> None:
+    """Three tracks are merged, and a fourth is deleted."""
     rows = (run / "tracks.csv").read_text().splitlines()
     at = rows[0].split(",").index("label")
     names = [row.split(",")[0] for row in rows[1:]]
@@ -300,8 +300,8 @@ def test_merged_tracks_are_one_object_of_the_index(run: Path) -> None:
     assert listed.checked == 4
 
 
-def test_the_first_detection_of_a_frame_is_a_view(run: Path) -> None:
-    """It has number 0, and a row without a number is no view."""
+def test_detection_with_number_zero_is_a_view(run: Path) -> None:
+    """A row without a number is not."""
     table = pq.read_table(run / "tracks.parquet")
     rows = table.to_pylist()
     rows[3]["detection"] = None
@@ -312,7 +312,7 @@ def test_the_first_detection_of_a_frame_is_a_view(run: Path) -> None:
         assert sorted(line.seen.tolist()) == sorted(found)
 
 
-def test_times_of_a_track_count_from_the_first_frame_of_the_run(tmp_path: Path) -> None:
+def test_track_times_count_from_first_frame_of_run(tmp_path: Path) -> None:
     """Nothing is found in the first frame, and rows are not in the order of time."""
     start, step = 7_000_000_000, 500_000_000
     frames = [{"topic": "/d", "frame": k, "stamp_ns": start + step * k} for k in (1, 0, 3, 2)]
@@ -323,8 +323,8 @@ def test_times_of_a_track_count_from_the_first_frame_of_the_run(tmp_path: Path) 
     ]
     tracks = [{"topic": "/d", "stamp_ns": start + step * row["frame"], **row} for row in rows]
     for name, content, schema in (("frames", frames, FRAMES), ("tracks", tracks, TRACKS)):
-        whole = [dict.fromkeys(schema.names) | row for row in content]
-        pq.write_table(pa.Table.from_pylist(whole, schema), tmp_path / f"{name}.parquet")
+        complete = [dict.fromkeys(schema.names) | row for row in content]
+        pq.write_table(pa.Table.from_pylist(complete, schema), tmp_path / f"{name}.parquet")
     lines = read_timelines(tmp_path)
 
     assert lines.keys() == {4, 9}
@@ -334,8 +334,8 @@ def test_times_of_a_track_count_from_the_first_frame_of_the_run(tmp_path: Path) 
     assert lines[4].keys == (("/d", 1, 0), ("/d", 3, -1))
 
 
-def test_the_strip_is_in_the_order_of_time_and_not_of_the_table(run: Path) -> None:
-    """Frames of several sensors are not logged by their stamps: some would be at -0.1 s."""
+def test_strip_is_sorted_by_time(run: Path) -> None:
+    """Frames of several sensors are not logged in the order of their stamps."""
     timelines = read_timelines(run)
     strip = list(choose_frames(run, timelines).strip.items())
     table = pq.read_table(run / "frames.parquet")
@@ -344,8 +344,8 @@ def test_the_strip_is_in_the_order_of_time_and_not_of_the_table(run: Path) -> No
     assert list(choose_frames(run, timelines).strip.items()) == strip
 
 
-def test_each_frame_of_the_strip_shows_what_no_earlier_one_does() -> None:
-    """Twelve parts of three frames: the newest tracks, else the most, else the middle."""
+def test_strip_frames_show_new_tracks_first() -> None:
+    """Of three frames each: that with most new tracks, else with most tracks, else the middle."""
     stamps = [(7_000_000_000 + 500_000_000 * k, ("/d", k)) for k in range(36)]
     tracks = {0: {1}, 1: {1, 2}, 3: {1, 2}, 5: {3}, 6: {1}, 7: {2}, 8: {3}, 9: {1, 2, 3}, 10: {1}}
     strip = choosing._strip(stamps, {("/d", k): seen for k, seen in tracks.items()})
@@ -354,7 +354,7 @@ def test_each_frame_of_the_strip_shows_what_no_earlier_one_does() -> None:
     assert strip == {("/d", k): pytest.approx(0.5 * k) for k in frames}
 
 
-def test_a_whole_view_is_chosen_before_a_larger_one_that_is_cut_off(run: Path) -> None:
+def test_whole_views_are_preferred_to_larger_cut_ones(run: Path) -> None:
     """The crop of a card should show the whole object."""
     table = pq.read_table(run / "detections.parquet")
     (run / "masks.parquet").unlink(missing_ok=True)
@@ -367,11 +367,11 @@ def test_a_whole_view_is_chosen_before_a_larger_one_that_is_cut_off(run: Path) -
         row |= {"points": 3000 if cut else 1000, "touches_border": cut, "occluded": False}
     pq.write_table(pa.Table.from_pylist(rows, table.schema), run / "detections.parquet")
     chosen = choose_frames(run, timelines).candidates
-    mine = [k for (topic, frame, _), k in owned.items() if track in chosen.get((topic, frame), ())]
+    views = [k for (topic, frame, _), k in owned.items() if track in chosen.get((topic, frame), ())]
 
     assert len(line.keys) == 8
-    assert len(mine) == 4
-    assert all(k % 2 for k in mine)
+    assert len(views) == 4
+    assert all(k % 2 for k in views)
 
 
 @pytest.mark.parametrize(
@@ -384,17 +384,15 @@ def test_a_whole_view_is_chosen_before_a_larger_one_that_is_cut_off(run: Path) -
         ((1, 1, 38, 28), False),
     ],
 )
-def test_a_mask_is_cut_by_each_border_of_its_image(
-    box: tuple[int, int, int, int], cut: bool
-) -> None:
-    """The image has 40 by 30 pixels; the mask has as many pixels as its odd runs."""
+def test_mask_can_be_cut_by_each_image_border(box: tuple[int, int, int, int], cut: bool) -> None:
+    """The image has 40 by 30 pixels; the odd runs are the pixels of the mask."""
     counts = np.array([100, 4, 36, 5, 1055], np.uint32)
     masks = ImageMasks("/c", 1, 2, "camera", 40, 30, {3: box}, {3: counts})
 
     assert _areas(iter([(("/d", 8), masks)])) == {("/d", 8, 3): (9.0, cut)}
 
 
-def test_the_outline_on_the_border_is_that_of_the_side_that_is_there() -> None:
+def test_border_share_counts_sides_at_the_border() -> None:
     """The mask has 5, 6, 1 and 2 pixels on its left, upper, right and lower side."""
     pixels = np.array(
         [
@@ -410,18 +408,18 @@ def test_the_outline_on_the_border_is_that_of_the_side_that_is_there() -> None:
     padded = np.pad(pixels, 1).astype(int)
     outline = sum(int(np.abs(np.diff(padded, axis=axis)).sum()) for axis in (0, 1))
     places = {(0, 9): 5, (9, 0): 6, (33, 9): 1, (9, 24): 2, (33, 24): 3, (9, 9): 0}
-    for (left, top), there in places.items():
+    for (left, top), cut in places.items():
         share = _border_share(Mask(left, top, pixels), 30, 40)
-        assert share == pytest.approx(there / outline), (left, top)
+        assert share == pytest.approx(cut / outline), (left, top)
 
 
-def test_an_object_is_hidden_where_its_neighbours_are_clearly_nearer() -> None:
+def test_only_clearly_nearer_neighbours_occlude() -> None:
     """Of ten edges, the left ones are of the same surface, and the right ones of an occluder."""
     depth = np.full((8, 9), 2.0, np.float32)
     depth[2:5, 3:5] = 1.0
     depth[2:5, 2] = 0.98  # within 15 mm and 1.5 % it may be noise or a slope
     depth[2:5, 5] = 0.96
-    depth[1, 3] = 0.0  # no reading hides nothing
+    depth[1, 3] = 0.0  # missing depth occludes nothing
     pixels = np.flatnonzero(depth == 1.0)
 
     assert _hidden_share(depth, pixels) == pytest.approx(3 / 10)
@@ -431,8 +429,8 @@ def test_an_object_is_hidden_where_its_neighbours_are_clearly_nearer() -> None:
         assert found == pytest.approx(share)
 
 
-def test_only_pixels_with_a_reading_are_drawn() -> None:
-    """Masks are filled where single readings are missing."""
+def test_only_pixels_with_depth_are_drawn() -> None:
+    """Masks include pixels whose depth is missing."""
     camera = Camera(3, 2, 2.0, 2.0, 1.0, 0.5)
     depth = np.array([[1.5, 0, 1.5], [2.5, 2.5, 0]], np.float32)
     frame = Frame("/d", 0, 0, 0, "camera", depth=depth, camera=camera)
@@ -444,8 +442,7 @@ def test_only_pixels_with_a_reading_are_drawn() -> None:
     np.testing.assert_allclose(_points(frame, item), expected)
 
 
-def test_a_card_shows_the_best_of_its_views() -> None:
-    """Without the recording, that is the one of most points."""
+def test_card_without_recording_shows_view_with_most_points() -> None:
     gas = NeuralGas(np.zeros((0, 3)), np.zeros((0, 2)))
     box = Box(np.array([0, 0, 1]), np.full(3, 0.1), np.array([0, 0, 0, 1]))
     taken = _Taken(Choice({("/d", k): frozenset({5}) for k in range(4)}, {}))
@@ -458,7 +455,7 @@ def test_a_card_shows_the_best_of_its_views() -> None:
     assert {track: best.item.indices.size for track, best in taken.best.items()} == {5: 9}
 
 
-def test_drawings_are_from_the_sensor_the_side_and_above() -> None:
+def test_drawings_show_sensor_side_and_top_view() -> None:
     """Right is to the viewer's right, and nearer is lower."""
     ends = [[0.1, 0, 0], [-0.1, 0, 0], [0, 0.07, 0], [0, 0, 0.12]]
     gas = NeuralGas(np.array(ends), np.array([[0, 1]]))
@@ -477,8 +474,8 @@ def test_drawings_are_from_the_sensor_the_side_and_above() -> None:
     assert high[1] < middle[1] < low[1]
 
 
-def test_faces_of_a_run_are_the_surest_of_each_category() -> None:
-    """Then the surest of the others, up to six."""
+def test_thumbnails_are_most_confident_of_each_category() -> None:
+    """Then the most confident of the others, up to six."""
     found = [("cup", 0.6), ("can", 0.7), ("cup", 0.95), ("cup", 0.9), ("unknown", 0.3)]
     found += [("can", 0.8), ("cup", 0.5), ("cup", 0.4)]
     line = Timeline(np.zeros(0), np.zeros(0, bool), np.zeros((0, 3)), ())
@@ -492,8 +489,8 @@ def test_faces_of_a_run_are_the_surest_of_each_category() -> None:
     assert _faces(cards) == ("3", "5", "4", "1", "0", "6")
 
 
-def test_boxes_of_the_strip_are_as_large_as_in_its_pictures() -> None:
-    """A wide image is made smaller for the page, and its boxes with it."""
+def test_strip_boxes_scale_with_their_images() -> None:
+    """A wide image is reduced for the page, and its boxes with it."""
     camera = Camera(1200, 900, 800.0, 800.0, 600.0, 450.0)
     frame = Frame("/d", 0, 0, 0, "camera", depth=np.ones((900, 1200)), camera=camera)
     gas = NeuralGas(np.zeros((0, 3)), np.zeros((0, 2)))
@@ -501,8 +498,8 @@ def test_boxes_of_the_strip_are_as_large_as_in_its_pictures() -> None:
     item = LabelledObject(5, "cup", 0.9, box, np.arange(3), gas, np.ones(1), np.ones(1))
     labelled = LabelledFrame("/d", 0, 0, 0, "camera", None, (), (item,), (), {})
     photo = np.zeros((900, 1200, 3), np.uint8)
-    seen = SeenFrame((Mask(300, 90, np.ones((180, 240), bool)),), np.zeros(1), frame, photo)
-    picture = _strip_frame(labelled, seen, 0.0)
+    view = SeenFrame((Mask(300, 90, np.ones((180, 240), bool)),), np.zeros(1), frame, photo)
+    picture = _strip_frame(labelled, view, 0.0)
     _, width, height = encode(photo)
 
     assert (picture.width, picture.height) == (width, height)
@@ -511,10 +508,10 @@ def test_boxes_of_the_strip_are_as_large_as_in_its_pictures() -> None:
     np.testing.assert_allclose(shares, [0.25, 0.1, 0.2, 0.2], atol=0.002)
 
 
-def test_facts_of_a_run_are_those_of_run_json(drawn: RunReport) -> None:
-    about = json.loads((drawn.folder / "run.json").read_text())
+def test_facts_of_page_match_run_json(drawn: RunReport) -> None:
+    info = json.loads((drawn.folder / "run.json").read_text())
     text = drawn.page()
 
     for name in ("frames", "detections"):
-        assert f"<dt>{name}</dt><dd>{about['counts'][name]}</dd>" in text
+        assert f"<dt>{name}</dt><dd>{info['counts'][name]}</dd>" in text
     assert f"<dt>tracks</dt><dd>{len(drawn.timelines)}</dd>" in text
