@@ -1,4 +1,4 @@
-"""Cleanup: what tells objects from background, and labels that are completed."""
+"""Tests of cleanup: structure rejection, and completed labels."""
 
 import numpy as np
 import pytest
@@ -31,12 +31,12 @@ from tests.test_detection import Array, Shape, box, frame_of, render, table
 _NODE = (np.zeros(1, dtype) for dtype in (np.int32, np.int16, np.float32, np.int32))
 _LEAF = BoostedTrees(Trees(*_NODE), np.ones(1, np.float32))
 ALWAYS = RejectionTrees(_LEAF, _LEAF)
-"""Trees for which everything is an object."""
+"""Trees that accept everything as an object."""
 INTRINSICS = PinholeIntrinsics(262.5, 262.5, 19.5, 19.5)
 
 
 def features_of(shapes: list[Shape], tilt_deg: float) -> tuple[Array, Array]:
-    """Return the object features of what stands on a table, and what is taken for background."""
+    """Return the object features of segments on a table, and whether they are rejected."""
     depth, _ = render(shapes, tilt_deg=tilt_deg)
     frame, settings = frame_of(depth), DetectionSettings()
     assert frame.depth is not None
@@ -50,12 +50,12 @@ def features_of(shapes: list[Shape], tilt_deg: float) -> tuple[Array, Array]:
     features = measure_object_features(grid, model, oversegmentation, known, settings.max_range_m)
     segments = oversegmentation.segments
     rejected = find_background(segments, features, grid, settings, load_trees())
-    seen = features["visibility"]["cells"] > 0
-    return features[seen], rejected[seen]
+    used = features["visibility"]["cells"] > 0
+    return features[used], rejected[used]
 
 
-def test_a_box_in_the_middle_of_a_table() -> None:
-    """It ends where it ends, inside the outline, and is an object."""
+def test_box_inside_outline_of_table_is_kept() -> None:
+    """Its features must not say that a border, a wall or the range limit cuts it."""
     features, rejected = features_of([table(), box((0, 0, 0), (0.1, 0.08, 0.12))], tilt_deg=35)
     assert len(features) == 1
     around, segment = features["surroundings"][0], features["segment"][0]
@@ -68,11 +68,11 @@ def test_a_box_in_the_middle_of_a_table() -> None:
     assert not rejected.any()
 
 
-def test_how_rough_the_plane_is_around_a_segment() -> None:
-    """Four cells away: 1 mm below the plane on the left, 3 mm above it on the right."""
+def test_height_and_noise_of_plane_around_segment_are_measured() -> None:
+    """Four cells away, samples are 1 mm below the plane (left) and 3 mm above it (right)."""
     labels, plane_id = np.zeros((11, 11), np.int16), np.full((11, 11), -1, np.int8)
     labels[5, 5] = plane_id[5, 5] = 1
-    plane_id[:, 10] = plane_id[1] = plane_id[9] = 0  # none above and below, nor at the border
+    plane_id[:, 10] = plane_id[1] = plane_id[9] = 0  # no plane above and below, nor at the border
     height = np.full((11, 11), 0.9, np.float32)
     height[5, 1], height[5, 9] = -0.001, 0.003
     segments, rows = _blank(2), np.zeros(2, OBJECT_FEATURES)["surroundings"]
@@ -87,16 +87,16 @@ def test_how_rough_the_plane_is_around_a_segment() -> None:
     assert rows["plane_noise"][1] == pytest.approx(0.002 / least)
 
 
-def _seen(cells: int) -> Array:
-    """Return the features of a segment of so many cells, 1 m away; the rest are 0."""
+def _features(cells: int) -> Array:
+    """Return the features of a segment with some cells, 1 m away; all others are 0."""
     features = np.zeros(2, OBJECT_FEATURES)
     features["visibility"]["cells"], features["visibility"]["depth_m"] = cells, 1.0
     return features
 
 
-def test_what_is_wider_than_an_object_is_none() -> None:
+def test_segment_wider_than_objects_is_rejected() -> None:
     segments = _blank(2)
-    features = _seen(400)
+    features = _features(400)
     features["segment"]["width_m"] = 0.2
     grid = DepthGrid(np.zeros((40, 40), np.float32), INTRINSICS, 1)
     for widest, expected in ((0.1, True), (0.3, False)):
@@ -105,8 +105,8 @@ def test_what_is_wider_than_an_object_is_none() -> None:
 
 
 @pytest.mark.parametrize(("cells", "border"), [(400, 0.5), (31, 0.5), (400, 0.3)])
-def test_what_is_large_and_cut_across_by_the_border_is_an_arm(cells: int, border: float) -> None:
-    features = _seen(cells)
+def test_large_segment_cut_by_border_is_rejected_as_arm(cells: int, border: float) -> None:
+    features = _features(cells)
     features["surroundings"]["image_border"] = border
     grid = DepthGrid(np.zeros((40, 40), np.float32), INTRINSICS, 1)
     found = find_background(_blank(2), features, grid, DetectionSettings(), ALWAYS)[1]
@@ -114,10 +114,10 @@ def test_what_is_large_and_cut_across_by_the_border_is_an_arm(cells: int, border
 
 
 @pytest.mark.parametrize(("cells", "rejected"), [(29, True), (31, False)])
-def test_what_is_far_too_small_goes_before_holes_are_filled(cells: int, rejected: bool) -> None:
-    """Else it splits a hole in an object, and is dropped only after that."""
+def test_tiny_segment_is_rejected_before_holes_are_filled(cells: int, rejected: bool) -> None:
+    """Otherwise it would split a hole in an object."""
     grid = DepthGrid(np.zeros((40, 40), np.float32), INTRINSICS, 1)
-    found = find_background(_blank(2), _seen(cells), grid, DetectionSettings(), ALWAYS)
+    found = find_background(_blank(2), _features(cells), grid, DetectionSettings(), ALWAYS)
     assert found[1] == rejected  # the smallest object covers 60 cells here
 
 
@@ -125,10 +125,10 @@ def test_what_is_far_too_small_goes_before_holes_are_filled(cells: int, rejected
     ("alone", "in_context", "rejected"),
     [(2.9, -0.1, True), (-2.9, 0.1, False), (3.1, -9.0, False), (-3.1, 9.0, True)],
 )
-def test_context_decides_on_doubtful_segments_only(
+def test_context_decides_only_uncertain_segments(
     alone: float, in_context: float, rejected: bool
 ) -> None:
-    features = _seen(400)
+    features = _features(400)
     grid = DepthGrid(np.zeros((200, 200), np.float32), INTRINSICS, 1)
     trees = RejectionTrees(
         *(_LEAF._replace(value=np.array([v], np.float32)) for v in (alone, in_context))
@@ -142,27 +142,27 @@ def test_context_decides_on_doubtful_segments_only(
     [(780, -0.1, True), (820, -0.1, False), (820, -0.9, False), (820, -1.1, True)],
 )
 def test_large_objects_need_less_evidence(cells: int, logit: float, *, rejected: bool) -> None:
-    """A large object that is lost is the first thing to be noticed."""
+    """Users notice the loss of a large object first."""
     grid = DepthGrid(np.zeros((200, 200), np.float32), INTRINSICS, 1)  # 2 % are 800 cells
     leaf = _LEAF._replace(value=np.array([logit], np.float32))
     trees = RejectionTrees(leaf, leaf)
-    found = find_background(_blank(2), _seen(cells), grid, DetectionSettings(), trees)
+    found = find_background(_blank(2), _features(cells), grid, DetectionSettings(), trees)
     assert found[1] == rejected
 
 
-def test_verdicts_stop_where_they_are_certain() -> None:
-    """The features of a context have the same range in training and in use."""
+def test_logits_are_clipped() -> None:
+    """Context features then have the same range in training and in use."""
     for value, expected in ((9.0, 4.0), (-9.0, -4.0), (1.5, 1.5)):
         trees = _LEAF._replace(value=np.array([value], np.float32))
         assert logits_of(np.zeros((1, 1), np.float32), trees).tolist() == [expected]
 
 
-def test_the_verdicts_on_neighbours_count_by_the_length_of_the_border() -> None:
-    """Of four segments, one was merged; the background hides a part of the object beside it."""
+def test_context_weights_neighbours_by_border_length() -> None:
+    """Of four segments, two are merged; the background occludes part of an object."""
     segments = _blank(5)
     segments.parent[:] = [0, 1, 2, 2, 4]
     segments.pairs["contact"][1, 2], segments.pairs["contact"][2, 4] = 6, 2
-    segments.pairs["contact"][2, 2] = 9  # the seam within a merged segment
+    segments.pairs["contact"][2, 2] = 9  # within a merged segment
     segments.pairs["in_front"][4, 1], segments.pairs["near"][4, 2] = 3, 1
     roots, weights = measure_borders(segments)
     assert roots.tolist() == [1, 2, 4]
@@ -171,15 +171,15 @@ def test_the_verdicts_on_neighbours_count_by_the_length_of_the_border() -> None:
     found = add_context(features, np.array([8.0, -1.0, -4.0], np.float32), weights)
     assert found["object"]["segment"]["width_m"] == pytest.approx([0.1, 0.2, 0.3])
     assert found["logit"].tolist() == [8, -1, -4]
-    yes, doubt, no = np.tanh([2, -0.25, -1])
-    assert found["connected"] == pytest.approx([doubt, (6 * yes + 2 * no) / 8, doubt])
+    yes, uncertain, no = np.tanh([2, -0.25, -1])
+    assert found["connected"] == pytest.approx([uncertain, (6 * yes + 2 * no) / 8, uncertain])
     assert found["behind"] == pytest.approx([0, 0, yes])
     assert found["in_front"] == pytest.approx([no, 0, 0])
-    assert found["near"] == pytest.approx([0, no, doubt])
+    assert found["near"] == pytest.approx([0, no, uncertain])
 
 
-def test_the_image_border_is_where_samples_begin() -> None:
-    """A sensor may leave a strip empty; what is cut farther inside is no border."""
+def test_image_border_is_where_samples_begin() -> None:
+    """A sensor may leave a strip empty; a wider gap is no border."""
     inv_depth = np.zeros((100, 200), np.float32)
     inv_depth[3:60, 0:195] = 1
     grid = DepthGrid(inv_depth, INTRINSICS, 1)
@@ -187,8 +187,8 @@ def test_the_image_border_is_where_samples_begin() -> None:
     assert _border_lines(grid._replace(inverse_depth=np.zeros_like(inv_depth))) == (-1, -1, -1, -1)
 
 
-def test_a_contact_boundary_goes_to_the_object_beside_it() -> None:
-    """Only what rises a little, and only one cell far."""
+def test_contact_boundary_joins_adjacent_object() -> None:
+    """Only cells that rise a little join it, and only one cell far."""
     inv_depth = np.full((8, 8), 1.0, np.float32)
     labels, plane_id = np.zeros((8, 8), np.int16), np.full((8, 8), -1, np.int8)
     labels[:4], plane_id[:4] = 3, 1
@@ -200,8 +200,8 @@ def test_a_contact_boundary_goes_to_the_object_beside_it() -> None:
     assert (labels[5:] == 0).all()
 
 
-def test_a_hole_belongs_to_what_encloses_it() -> None:
-    """A can that stands before the ring hides some of its hole, and does not own it."""
+def test_hole_is_filled_with_enclosing_object() -> None:
+    """A can before the ring hides part of the hole, but does not get the rest."""
     inv_depth = np.full((40, 40), 1.25, np.float32)
     labels, filled = np.zeros((40, 40), np.int16), np.zeros((40, 40), np.uint8)
     labels[10:30, 10:30] = 1
@@ -213,8 +213,8 @@ def test_a_hole_belongs_to_what_encloses_it() -> None:
     assert filled.sum() == hole.sum()
 
 
-def test_the_space_between_two_boxes_is_no_hole() -> None:
-    """Each has half of its boundary."""
+def test_gap_between_two_boxes_is_no_hole() -> None:
+    """Each box has half of its boundary."""
     inv_depth = np.full((40, 40), 1.25, np.float32)
     labels, filled = np.zeros((40, 40), np.int16), np.zeros((40, 40), np.uint8)
     labels[10:30, 5:35] = 1
@@ -224,8 +224,8 @@ def test_the_space_between_two_boxes_is_no_hole() -> None:
     assert not filled.any()
 
 
-def test_the_background_of_a_large_image_is_no_hole() -> None:
-    """Its open sides, times the cells of the largest image, exceed 32 bits: six gaps of a rack."""
+def test_background_of_large_image_is_no_hole() -> None:
+    """Its open sides (six gaps of a rack) times the number of cells exceed 32 bits."""
     inv_depth = np.full((632, 632), 0.5, np.float32)
     labels, filled = np.zeros((632, 632), np.int16), np.zeros((632, 632), np.uint8)
     labels[[0, 3]] = labels[:, [0, -1]] = 1
@@ -234,8 +234,8 @@ def test_the_background_of_a_large_image_is_no_hole() -> None:
     assert not filled.any()
 
 
-def test_objects_that_are_left_are_numbered_in_the_order_of_their_segments() -> None:
-    """Segments 2 and 4 are merged into 1 and 3, of which 3 is rejected; 5 stays alone."""
+def test_remaining_objects_are_numbered_in_segment_order() -> None:
+    """Segments 2 and 4 are merged into 1 and 3, and 3 is rejected."""
     parent = np.array([0, 1, 1, 3, 3, 5], np.int16)
     rejected = np.array([False, False, False, True, False, False])
     labels = np.array([[0, 1, 2], [3, 4, 5]], np.int16)

@@ -1,4 +1,4 @@
-"""Foreground and planes on small made-up images whose answers are known."""
+"""Tests of foreground and planes on small made-up images."""
 
 import numpy as np
 import pytest
@@ -50,20 +50,20 @@ def heights_of(grid: DepthGrid, plane: SupportingPlane) -> tuple[HeightMap, NDAr
     return measure_heights(grid, planes, 0.5), planes
 
 
-def test_points_face_the_way_their_surface_does() -> None:
-    """Half of the image is a table; nothing is seen in the other."""
+def test_oriented_points_have_surface_normals() -> None:
+    """Half of the image is a table, the other half is empty."""
     inv_depth = level(0.7)
     inv_depth[:, 160:] = 0
     points = orient_points(grid_of(inv_depth))
-    seen = points.normals[2] != 0
-    assert np.count_nonzero(seen) == points.smooth
+    valid = points.normals[2] != 0
+    assert np.count_nonzero(valid) == points.smooth
     assert 0.9 < points.smooth / (80 * 53) < 1
-    np.testing.assert_allclose(UP @ points.normals[:, seen], 1, atol=1e-4)
-    np.testing.assert_allclose(UP @ points.positions[:, seen], -0.7, atol=1e-4)
+    np.testing.assert_allclose(UP @ points.normals[:, valid], 1, atol=1e-4)
+    np.testing.assert_allclose(UP @ points.positions[:, valid], -0.7, atol=1e-4)
 
 
-def test_levels_apart_are_two_planes_with_one_normal() -> None:
-    """A box of 12 cm on a table; noise tilts each alone."""
+def test_parallel_planes_have_one_normal() -> None:
+    """A box of 12 cm on a table; noise tilts planes that are fitted alone."""
     rng = np.random.default_rng(0)
     inv_depth = level(0.7)
     inv_depth[90:180, 110:220] = level(0.58)[90:180, 110:220]
@@ -75,7 +75,7 @@ def test_levels_apart_are_two_planes_with_one_normal() -> None:
     assert found[0].plane.up @ UP > np.cos(np.radians(0.5))
 
 
-def test_outline_and_area_are_those_of_a_rectangle() -> None:
+def test_rectangular_plane_has_true_outline_and_area() -> None:
     """A board of 40 by 30 cm, 70 cm below the camera."""
     z = -0.7 / ALONG
     x, y, depth = (J - 159.5) / 262.5 * z, (I - 119.5) / 262.5 * z, z
@@ -84,13 +84,13 @@ def test_outline_and_area_are_those_of_a_rectangle() -> None:
     board = (abs(across) < 0.2) & (abs(along - 0.7) < 0.15)
     plane = plane_of(grid_of(np.where(board, level(0.7), 0)), 0.7)
     corners = outline_corners(plane)
-    assert 0.75 * 0.12 < plane.area_m2 <= 0.12  # what is near an edge tells no normal
+    assert 0.75 * 0.12 < plane.area_m2 <= 0.12  # no normals near edges
     np.testing.assert_allclose(corners @ UP, -0.7, atol=1e-9)
     np.testing.assert_allclose(abs(corners[:, 0]).max(), 0.2, atol=0.02)
     np.testing.assert_allclose(np.ptp(corners @ forward), 0.3, atol=0.04)
 
 
-def test_a_point_is_inside_the_outline_or_just_beyond_it() -> None:
+def test_points_within_margin_of_outline_are_inside() -> None:
     plane = SupportingPlane(0, 0, 0, np.array([0.0, 0, -1]), -1.0, np.full(DIRECTIONS, 0.5), 1.0)
     row = pack_planes([plane])[0]
     assert is_inside_outline(row, 0.45, 0.0, 1.0, 0.0)
@@ -100,14 +100,14 @@ def test_a_point_is_inside_the_outline_or_just_beyond_it() -> None:
 
 
 @pytest.mark.parametrize(("closed", "kept"), [(True, 1), (False, 2)])
-def test_a_box_is_closed_below_its_edge_and_a_board_is_not(closed: bool, kept: int) -> None:
-    """Both are 15 cm above the floor and equally large."""
+def test_board_is_a_supporting_plane_unlike_box_top(closed: bool, kept: int) -> None:
+    """Both are 15 cm above the floor and equally large; the box is closed below its edge."""
     inv_depth = level(0.9)
     z = -0.75 / ALONG
     forward = np.array([0, -np.sqrt(0.5), np.sqrt(0.5)])
     along = forward[1] * (I - 119.5) / 262.5 * z + forward[2] * z
     top = (abs((J - 159.5) / 262.5 * z) < 0.2) & (abs(along - 0.8) < 0.15)
-    edge = 0.65  # how far ahead of the camera the front is: a wall down to the floor
+    edge = 0.65  # distance to the front of the box, which reaches down to the floor
     front = edge / ((I - 119.5) / 262.5 * forward[1] + forward[2])
     height = ALONG * front
     wall = (height < -0.75) & (height > -0.9) & (abs((J - 159.5) / 262.5 * front) < 0.2)
@@ -121,8 +121,8 @@ def test_a_box_is_closed_below_its_edge_and_a_board_is_not(closed: bool, kept: i
     assert len(supporting_planes(grid, found, tallest_m=0.5)) == kept
 
 
-def test_a_large_upright_face_is_a_wall_and_a_small_one_an_object() -> None:
-    """Both are a metre before the camera, which looks ahead; walls are above no plane."""
+def test_large_upright_face_is_a_wall_unlike_small_one() -> None:
+    """Both are a metre before the camera, which looks ahead."""
     up = np.array([0.0, -1.0, 0.0])
     trials = draw_trials(np.random.default_rng(0))
     grid = grid_of(np.ones((240, 320), np.float32))
@@ -141,11 +141,11 @@ def test_a_large_upright_face_is_a_wall_and_a_small_one_an_object() -> None:
 
 
 @pytest.mark.parametrize(("width", "taken"), [(20, True), (110, False)])
-def test_overhang_belongs_to_the_object_unless_it_is_many_times_larger(
+def test_overhang_joins_object_unless_many_times_larger(
     width: int,
     taken: bool,
 ) -> None:
-    """A face goes on beyond the edge of the plane: a handle, or a wall behind the table."""
+    """Beyond the edge of the plane, it may be a handle or a wall behind the table."""
     inv_depth = level(0.7)
     inv_depth[100:140, 150 : 170 + width] = level(0.6)[100:140, 150 : 170 + width]
     plane_id = np.full((240, 320), -1, np.int8)
@@ -160,14 +160,14 @@ def test_overhang_belongs_to_the_object_unless_it_is_many_times_larger(
     assert (plane_id[:, 290:] == 0).all()
 
 
-def test_a_flat_plate_in_noise_is_found_and_a_swell_is_not() -> None:
-    """Both rise by 6 mm: in a step, and over 40 cells."""
+def test_plate_in_noise_is_found_and_depth_error_is_not() -> None:
+    """Both rise by 6 mm: the plate in a step, the error over 40 cells."""
     rng = np.random.default_rng(1)
     table, noise = level(0.7), rng.normal(0, 0.0007, (240, 320))
     gap = level(0.694) - table
     inside = (J - 90) ** 2 + (I - 140) ** 2 < 26**2
-    swell = np.exp(-((J - 230) ** 2 + (I - 140) ** 2) / (2 * 40**2))
-    grid = grid_of(table + noise + gap * (inside + swell))
+    error = np.exp(-((J - 230) ** 2 + (I - 140) ** 2) / (2 * 40**2))
+    grid = grid_of(table + noise + gap * (inside + error))
     plane = plane_of(grid_of(table), 0.7)
     heights, planes = heights_of(grid, plane)
     low = np.zeros((240, 320), np.int16)
@@ -177,16 +177,16 @@ def test_a_flat_plate_in_noise_is_found_and_a_swell_is_not() -> None:
     assert (heights.plane_id[:, 170:] == 1).mean() < 0.05
 
 
-def test_outline_of_an_object_rises_everywhere_along_the_plane() -> None:
+def test_outline_of_object_rises_on_all_sides() -> None:
     round_ = Outline(sides=100, table=95, known=95, hidden=0, rise=150.0, steep=90)
     assert is_object(round_, 600)
-    assert not is_object(round_._replace(steep=50), 600)  # a swell rises here and there
+    assert not is_object(round_._replace(steep=50), 600)  # depth error rises only in places
     assert not is_object(round_._replace(table=30, known=40, rise=60.0), 600)
     assert not is_object(round_._replace(rise=90.0), 600)
 
 
-def test_high_pass_keeps_a_step_and_levels_a_slope() -> None:
-    """The mean in the window takes away what changes slowly."""
+def test_high_pass_keeps_step_and_removes_slope() -> None:
+    """It subtracts the mean in a window."""
     residual = np.asarray(0.001 + 1e-6 * (I + J), np.float32)
     residual[120:126, 160:166] += 0.005
     high_pass = np.zeros_like(residual)
@@ -197,7 +197,7 @@ def test_high_pass_keeps_a_step_and_levels_a_slope() -> None:
     assert np.median(abs(high_pass[inner])) < 1e-5
 
 
-def test_noise_is_the_median_rise_on_the_plane() -> None:
+def test_noise_is_median_rise_between_cells_of_plane() -> None:
     rng = np.random.default_rng(0)
     high_pass = rng.normal(0, 0.001, (240, 320)).astype(np.float32)
     plane_id = np.full((240, 320), -1, np.int8)

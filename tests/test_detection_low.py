@@ -1,4 +1,4 @@
-"""Low and flush things: plates thinner than the swells of a table, stacks, shoulders, posts."""
+"""Tests of low-profile objects, such as plates lower than the depth error of a table."""
 
 from typing import Any
 
@@ -22,7 +22,7 @@ DISTANCE = 0.9
 
 
 def rays() -> Array:
-    """Return the directions of the pixels, (480, 640, 3), optical frame."""
+    """Return the rays of the pixels (480, 640, 3), optical frame."""
     v, u = np.mgrid[:480, :640]
     return np.stack([(u - 319.5) / 525, (v - 239.5) / 525, np.ones(u.shape)], -1)
 
@@ -34,14 +34,14 @@ def depth_of(height: Array, distance: float = DISTANCE) -> Array:
 
 
 def measured(depth: Array, seed: int = 0) -> Frame:
-    """Return what a Kinect reads: noise and steps of inverse depth."""
-    w = 1 / depth + np.random.default_rng(seed).normal(0, 0.0015, depth.shape)
-    depth = 1 / (np.round(w / 0.0029) * 0.0029)
+    """Return a frame with the noise and the quantization of a Kinect."""
+    inverse = 1 / depth + np.random.default_rng(seed).normal(0, 0.0015, depth.shape)
+    depth = 1 / (np.round(inverse / 0.0029) * 0.0029)
     return Frame("t", 0, 0, 0, "c", depth=depth.astype(np.float32), camera=CAMERA)
 
 
 def found(frame: Frame, *, low_profile: bool = True) -> Scene:
-    """Return what is found with or without the step for low-profile objects."""
+    """Detect objects with or without the step for low-profile objects."""
     rng = np.random.default_rng(0)
     with without(*([] if low_profile else ["low profile"])):
         return detect(frame, settings=DetectionSettings(), rng=rng)
@@ -49,7 +49,7 @@ def found(frame: Frame, *, low_profile: bool = True) -> Scene:
 
 @pytest.fixture
 def unrejected(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Keep the segments that the trees take for background."""
+    """Keep the segments that structure rejection would remove."""
     lenient = CLEANUP._replace(least_logit=-9.0, least_far_logit=-9.0)
     monkeypatch.setattr("shapecat.detection.cleanup.structure.CLEANUP", lenient)
 
@@ -62,15 +62,17 @@ def bump(radius: float, edge: float) -> Array:
 
 
 @pytest.mark.usefixtures("unrejected")
-def test_a_swell_of_the_table_is_no_object() -> None:
-    """A wave of the sensor's error that is higher than the least height of an object."""
+def test_depth_error_of_table_is_no_object() -> None:
+    """It exceeds the minimum height of an object."""
     frame = measured(depth_of(0.016 * bump(80, 90)))
     assert len(found(frame).candidates) == 0
-    assert len(found(frame, low_profile=False).candidates) > 0, "the test shows nothing"
+    assert len(found(frame, low_profile=False).candidates) > 0, (
+        "the error is too low to test anything"
+    )
 
 
-def test_a_thin_plate_is_an_object() -> None:
-    """A disc of 5 mm is lower than the least height, but has an edge."""
+def test_thin_plate_is_an_object() -> None:
+    """A disc of 5 mm is below the minimum height, but has an edge."""
     disc = bump(60, 4)
     frame = measured(depth_of(0.005 * disc))
     (one,) = found(frame).candidates
@@ -79,8 +81,7 @@ def test_a_thin_plate_is_an_object() -> None:
     assert inside.sum() > 0.9 * np.count_nonzero(disc > 0.5)
 
 
-def test_a_swell_beside_a_plate_stays_out() -> None:
-    """The plate must not grow over a swell that touches it."""
+def test_plate_does_not_grow_over_adjacent_depth_error() -> None:
     v, u = np.mgrid[:480, :640]
     side = np.exp(-(((u - 400) / 45) ** 2) - ((v - 250) / 35) ** 2)
     disc = bump(60, 4)
@@ -90,8 +91,8 @@ def test_a_swell_beside_a_plate_stays_out() -> None:
 
 
 @pytest.mark.parametrize("sensor", [KINECT, REALSENSE])
-def test_empty_tables(sensor: Any) -> None:
-    """At most one object is found on a dozen empty tables, whatever the sensor's depth error."""
+def test_empty_tables_have_few_false_objects(sensor: Any) -> None:
+    """At most one on a dozen tables, whatever the sensor's depth error."""
     count = 0
     for seed in range(12):
         rng = np.random.default_rng(seed)
@@ -100,16 +101,16 @@ def test_empty_tables(sensor: Any) -> None:
     assert count <= 1
 
 
-def test_a_plate_with_a_floor_thinner_than_a_step_is_found_whole() -> None:
-    """Only its rim rises clearly; what it encloses belongs to it."""
+def test_plate_with_very_thin_floor_is_found_whole() -> None:
+    """Only its rim rises clearly; the floor is thinner than a step of the sensor."""
     disc = bump(60, 4)
     frame = measured(depth_of(0.01 * (disc - bump(50, 4)) + 0.002 * disc))
     (one,) = found(frame).candidates
     assert np.isin(np.flatnonzero(disc.reshape(-1) > 0.5), one.indices).mean() > 0.9
 
 
-def test_a_plate_upon_a_wave_is_found_whole() -> None:
-    """No height parts its rim from the crest of the wave that it crosses."""
+def test_plate_on_wave_of_depth_error_is_found_whole() -> None:
+    """No height threshold separates its rim from the crest of the wave."""
     disc, wave = bump(60, 4), np.cos(2 * np.pi * (np.mgrid[:480, :640][1] - 250) / 250)
     frame = measured(depth_of(0.0035 * wave + 0.006 * (disc - bump(50, 4)) + 0.001 * disc))
     inside = np.flatnonzero(disc.reshape(-1) > 0.5)
@@ -117,8 +118,8 @@ def test_a_plate_upon_a_wave_is_found_whole() -> None:
     assert best > 0.9
 
 
-def test_a_plate_against_a_box_is_not_its_foot() -> None:
-    """Low cells below something tall are its foot, unless they are level."""
+def test_plate_touching_a_box_is_kept() -> None:
+    """Low cells beside a tall object are its contact boundary, unless they are level."""
     v, u = np.mgrid[:480, :640]
     disc = bump(60, 4)
     box = (u > 379) & (u < 480) & (v > 150) & (v < 330)
@@ -130,8 +131,8 @@ def test_a_plate_against_a_box_is_not_its_foot() -> None:
     assert best > 0.8
 
 
-def test_a_plate_half_hidden_is_an_object() -> None:
-    """What something nearer hides of an outline says nothing about it."""
+def test_half_occluded_plate_is_an_object() -> None:
+    """The occluded part of an outline is no evidence against an object."""
     v, u = np.mgrid[:480, :640]
     disc, near = bump(45, 4), (u > 320) & (u < 410) & (v > 200)
     depth = np.where(near, 0.55, depth_of(0.005 * disc))
@@ -140,15 +141,15 @@ def test_a_plate_half_hidden_is_an_object() -> None:
     assert best > 0.9
 
 
-def test_a_plate_thinner_than_noise_further_away() -> None:
-    """Near the camera 3 mm are many steps of the sensor."""
+def test_very_thin_plate_is_found_near_the_camera() -> None:
+    """There, 3 mm are many steps of the sensor."""
     disc = bump(60, 4)
     (one,) = found(measured(depth_of(0.003 * disc, 0.55))).candidates
     assert np.isin(np.flatnonzero(disc.reshape(-1) > 0.5), one.indices).mean() > 0.9
 
 
-def test_a_plate_thinner_than_a_step_of_a_kinect_before_a_better_sensor() -> None:
-    """How much must rise depends on the noise that is there."""
+def test_very_thin_plate_is_found_with_low_noise() -> None:
+    """The minimum rise depends on the noise in the frame."""
     disc = bump(60, 4)
     inverse = 1 / depth_of(0.0025 * disc)
     inverse += np.random.default_rng(0).normal(0, 0.0005, inverse.shape)
@@ -157,16 +158,16 @@ def test_a_plate_thinner_than_a_step_of_a_kinect_before_a_better_sensor() -> Non
     assert np.isin(np.flatnonzero(disc.reshape(-1) > 0.5), one.indices).mean() > 0.9
 
 
-def test_a_large_plate_does_not_tilt_the_table() -> None:
-    """Least squares may stay at a plane between the plate and the table beyond it."""
+def test_large_plate_does_not_tilt_the_table_plane() -> None:
+    """Least squares may converge to a plane between the plate and the table."""
     v, u = np.mgrid[:480, :640]
     scene = found(measured(depth_of(0.008 * ((v > 300) & (u < 360)))))
     assert scene.up @ UP > np.cos(np.radians(0.1))
     assert abs(scene.planes[0].offset + DISTANCE * np.sin(TILT)) < 1e-3
 
 
-def test_a_small_ball_does_not_grow_over_the_swell_around_it() -> None:
-    """The swell is lower than any object, but not than a foot."""
+def test_small_ball_does_not_grow_over_depth_error() -> None:
+    """The error is lower than any object, but not lower than a contact boundary."""
     rng = np.random.default_rng(648)
-    frame, seen = render_frame(make_scene("clutter", rng, frames=1), 0, rng=rng, sensor=KINECT)
-    assert min(overlaps(found(frame), seen, [22])) > 0.6
+    frame, labels = render_frame(make_scene("clutter", rng, frames=1), 0, rng=rng, sensor=KINECT)
+    assert min(overlaps(found(frame), labels, [22])) > 0.6

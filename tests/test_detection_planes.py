@@ -1,4 +1,4 @@
-"""Supporting planes where little of them is seen, and nothing is known of the up direction."""
+"""Tests of supporting planes that are hardly visible, mostly without a given up direction."""
 
 import numpy as np
 import pytest
@@ -26,20 +26,20 @@ from shapecat.simulation.primitives import rounded_box
 from shapecat.simulation.render import geometry, render
 from shapecat.types import Camera, Pose
 from tests.test_detection import ball, frame_of
-from tests.test_detection import render as made_up
+from tests.test_detection import render as render_shapes
 
 CAMERA = Camera(640, 480, 525.0, 525.0, 319.5, 239.5)
 UP = np.array([0.0, -np.sqrt(0.5), -np.sqrt(0.5)])
-"""Of a camera that looks down by 45 degrees."""
+"""For a camera that looks down at 45 degrees."""
 
 
 def block(x: float, y: float, z: float, size: tuple[float, float, float]) -> Mesh:
-    """Return a box by the middle of its lower face."""
+    """Return a box; x, y and z are the middle of its base."""
     return moved(rounded_box(size, fine=1), Pose(np.eye(3), np.array([x, y, z])))
 
 
 def grid_of(meshes: list[Mesh]) -> DepthGrid:
-    """Look down at the origin by 45 degrees from a metre away, without noise."""
+    """Look down at the origin at 45 degrees from a metre away, without noise."""
     pose = looking_at(np.array([0, -np.sqrt(0.5), np.sqrt(0.5)]), np.zeros(3))
     here = Pose(np.eye(3), np.zeros(3))
     depth = render(geometry([(mesh, here) for mesh in meshes]), CAMERA, pose).depth
@@ -56,7 +56,7 @@ def tiles(step: float, size: float, height: float) -> list[Mesh]:
 
 
 def heights(meshes: list[Mesh]) -> tuple[list[float], list[float]]:
-    """Return the heights of the planes that are found, and what of each is covered."""
+    """Return the height and the covered area of each plane."""
     grid, trials = grid_of(meshes), draw_trials(np.random.default_rng(0))
     found = find_horizontal_planes(grid, orient_points(grid), UP, trials)
     planes = add_strip_planes(grid, found)
@@ -64,7 +64,7 @@ def heights(meshes: list[Mesh]) -> tuple[list[float], list[float]]:
 
 
 def supports(meshes: list[Mesh]) -> list[float]:
-    """Return the heights of the planes that objects may stand on."""
+    """Return the heights of the supporting planes."""
     trials = draw_trials(np.random.default_rng(0))
     planes, up = find_supporting_planes(grid_of(meshes), None, trials, tallest_m=0.6, upright=True)
     assert up @ UP > np.cos(np.radians(2))
@@ -79,15 +79,15 @@ def supports(meshes: list[Mesh]) -> list[float]:
         *(("8 to 85 degrees", seed) for seed in (1, 5)),
     ],
 )
-def test_table_is_found_without_a_hint(kind: str, seed: int) -> None:
-    """A frame that loses its table loses all objects: for strips, a wall, or a grazing view."""
+def test_table_is_found_without_given_up(kind: str, seed: int) -> None:
+    """A frame loses all objects if strips, a wall or a grazing view hide its table."""
     world, frame = view_of(kind, seed)
     found = detect(frame, settings=DetectionSettings(), rng=np.random.default_rng(0))
     assert keeps_table(world, found)
 
 
-def test_table_is_found_in_strips_of_three_centimetres() -> None:
-    """They are narrower than what tells a tilt; the tops of the boxes are the largest plane."""
+def test_table_is_found_in_narrow_strips() -> None:
+    """3 cm are too narrow for a normal, and the tops of the boxes are the largest plane."""
     found, covered_m2 = heights(tiles(0.16, 0.13, 0.04))
     np.testing.assert_allclose(found, [0, 0.04], atol=0.004)
     assert covered_m2[0] > 0.1
@@ -95,21 +95,21 @@ def test_table_is_found_in_strips_of_three_centimetres() -> None:
 
 
 @pytest.mark.parametrize("seed", [500006, 520022])
-def test_strips_at_the_end_of_the_range_are_no_plane(seed: int) -> None:
-    """Beyond it nothing is seen, which looks like a board with nothing below."""
+def test_strips_at_range_limit_are_no_plane(seed: int) -> None:
+    """Nothing is visible beyond the limit, as below the edge of a board."""
     assert score("empty", seed, 1)["scenes with all planes"] == 1
 
 
-def test_lid_under_a_box_is_not_covered() -> None:
-    """It has nothing below and a top above it as a table has, but it is seen whole."""
+def test_box_top_below_smaller_box_is_not_covered() -> None:
+    """A top face lies above it, as above a covered table, but all of it is visible."""
     boxes = [block(0, 0, 0, (0.3, 0.3, 0.2)), block(0.05, 0.05, 0.2, (0.2, 0.2, 0.05))]
     _, covered_m2 = heights([block(0, 0, -0.03, (1.2, 1.0, 0.03)), *boxes])
     assert covered_m2 == [0] * len(covered_m2)
     assert len(covered_m2) > 1
 
 
-def test_floor_of_a_raised_bin_is_a_plane_and_the_top_of_a_box_is_not() -> None:
-    """Both are too small for furniture, half a metre above the floor, and nothing is seen below."""
+def test_floor_of_raised_bin_is_a_plane_unlike_box_top() -> None:
+    """Both have the size and height of a large object; only the bin has sides."""
     ground, body = block(0, 0.3, -0.53, (2.4, 2.4, 0.03)), block(0, 0, -0.5, (0.34, 0.3, 0.5))
     sides = [
         *(block(x, 0, 0, (0.01, 0.3, 0.08)) for x in (-0.165, 0.165)),
@@ -119,19 +119,19 @@ def test_floor_of_a_raised_bin_is_a_plane_and_the_top_of_a_box_is_not() -> None:
     assert supports([ground, body, *sides]) == pytest.approx([-0.5, 0], abs=0.01)
 
 
-def test_camera_upside_down_is_believed_where_nothing_speaks_against_it() -> None:
-    """How cameras are held is no more than a prior: a table alone is level however it is seen."""
+def test_upside_down_camera_is_accepted_for_bare_table() -> None:
+    """The usual orientation of cameras is only a prior."""
     grid = grid_of([block(0, 0, -0.03, (1.2, 1.0, 0.03))])
-    turned = grid._replace(inverse_depth=np.ascontiguousarray(grid.inverse_depth[::-1, ::-1]))
+    flipped = grid._replace(inverse_depth=np.ascontiguousarray(grid.inverse_depth[::-1, ::-1]))
     trials = draw_trials(np.random.default_rng(0))
     up = estimate_up(
-        orient_points(turned), turned.intrinsics, np.zeros(3), trials, UP_SETTINGS.held
+        orient_points(flipped), flipped.intrinsics, np.zeros(3), trials, UP_SETTINGS.held
     )
     assert up @ [0, -UP[1], UP[2]] > np.cos(np.radians(2))
 
 
-def test_assumed_plane_lies_just_below_what_no_plane_explains() -> None:
-    """Blobs in the air, 0.9 to 0.7 m below a turned camera; far ones decide nothing."""
+def test_assumed_plane_lies_just_below_unexplained_samples() -> None:
+    """They are 0.9 to 0.7 m below a tilted camera; far ones do not count."""
     up = np.array([0.36, -0.48, -0.8])
     i, j = np.mgrid[:120, :160]
     rays = np.stack([(j - 70) / 150, (i - 62) / 150, np.ones(i.shape)])
@@ -154,10 +154,10 @@ def test_assumed_plane_lies_just_below_what_no_plane_explains() -> None:
     assert below.mean() < 0.02
 
 
-def test_known_up_is_kept_where_nothing_is_level() -> None:
-    """A heap of balls hides its table: the plane below it follows the given direction."""
+def test_given_up_is_kept_without_visible_plane() -> None:
+    """The plane assumed below a heap of balls follows the given direction."""
     places = [(x / 10, y / 10, 0.03 * abs(x + y)) for x in range(-3, 4) for y in range(-2, 3)]
-    depth, _ = made_up([ball(place, 0.06) for place in places], tilt_deg=35, noise=0)
+    depth, _ = render_shapes([ball(place, 0.06) for place in places], tilt_deg=35, noise=0)
     up = np.array([0.1, -0.8, -0.6]) / np.linalg.norm([0.1, -0.8, -0.6])
 
     rng = np.random.default_rng(0)
@@ -167,11 +167,11 @@ def test_known_up_is_kept_where_nothing_is_level() -> None:
     assert scene.candidates  # above the assumed plane
 
 
-def test_no_plane_is_assumed_for_a_few_samples_or_above_the_camera() -> None:
-    """Nor does it fail where `detection.max_height_m` leaves no object any height."""
+def test_no_plane_is_assumed_for_few_samples_or_above_camera() -> None:
+    """A `detection.max_height_m` of nearly 0 must not fail."""
     grid = DepthGrid(np.ones((60, 80), np.float32), PinholeIntrinsics(75.0, 75.0, 39.5, 29.5), 8)
     few = np.zeros((60, 80), np.int8)
-    few[6:] = -1  # a tenth is above no plane
+    few[6:] = -1  # a tenth of the cells is above no plane
     up = np.array([0.0, 0.0, -1.0])
     assert unexplained(grid, few) is None
     rest = unexplained(grid, ~few)
@@ -181,19 +181,19 @@ def test_no_plane_is_assumed_for_a_few_samples_or_above_the_camera() -> None:
     assert assume_plane(grid, rest, up, tallest_m=0.5) is not None
     one = np.arange(few.size).reshape(few.shape) == 3001
     assert assume_plane(grid, one, up, tallest_m=0.5) is not None
-    for low in (0.0, 0.001, 0.008):  # less than a bin of heights
+    for low in (0.0, 0.001, 0.008):  # less than a bin of the histogram
         assert assume_plane(grid, rest, up, tallest_m=low) is not None
     far = grid._replace(inverse_depth=np.where(few < 0, np.float32(0.4), grid.inverse_depth))
     assert unexplained(far, ~few) is None  # background, 2.5 m away
 
 
 @pytest.mark.parametrize("first", [3002, pytest.param(3005, marks=pytest.mark.many)])
-def test_objects_in_compartments_are_found_where_their_board_is_hardly_seen(first: int) -> None:
-    """Without a plane below them none of these objects was found."""
-    found = seen = 0
+def test_objects_are_found_on_hardly_visible_boards(first: int) -> None:
+    """Without a plane below them, all objects in these compartments are lost."""
+    found = total = 0
     for seed in range(first, first + 2):
         scores = judge("shelf bin", "kinect", seed, 1, load_model(None), Settings())
         found += sum(judged.overlap >= MATCHED_F for judged in scores.objects)
-        seen += len(scores.objects)
-    assert seen > 12
-    assert found > 0.55 * seen
+        total += len(scores.objects)
+    assert total > 12
+    assert found > 0.55 * total

@@ -1,4 +1,4 @@
-"""Shelves: pieces of furniture that are no objects, and objects that are not in pieces."""
+"""Tests of shelves: their structure is rejected, and their objects stay whole."""
 
 from functools import cache
 from typing import Any
@@ -14,13 +14,13 @@ from shapecat.simulation import KINECT, make_scene, render_frame
 from shapecat.simulation.scenes import SceneKind
 from shapecat.types import Camera, Frame
 
-FIRST_THING = 20
-"""Lower pixel labels are those of furniture."""
+FIRST_OBJECT = 20
+"""Smaller pixel labels belong to the background."""
 
 
 @cache
-def seen(kind: SceneKind, seed: int) -> tuple[NDArray[Any], list[NDArray[Any]]]:
-    """Return the pixel labels of a scene, and those of each object found."""
+def scene_labels(kind: SceneKind, seed: int) -> tuple[NDArray[Any], list[NDArray[Any]]]:
+    """Return the pixel labels of a scene, and those of each candidate."""
     rng = np.random.default_rng(seed)
     frame, labels = render_frame(make_scene(kind, rng, frames=1), 0, rng=rng, sensor=KINECT)
     scene = detect(frame, settings=DetectionSettings(), rng=np.random.default_rng(0))
@@ -30,58 +30,58 @@ def seen(kind: SceneKind, seed: int) -> tuple[NDArray[Any], list[NDArray[Any]]]:
 
 @pytest.mark.parametrize("seed", [377, 507])
 def test_wall_beyond_the_floor_is_no_object(seed: int) -> None:
-    """Of a wall at the end of the range only a corner is above what is seen of the floor."""
-    assert seen("empty", seed)[1] == []
+    """Only a corner of a wall at the range limit is above the visible floor."""
+    assert scene_labels("empty", seed)[1] == []
 
 
-def test_corner_of_a_wall_beside_the_table_is_no_object() -> None:
-    """Most of the wall is behind the table, higher above the floor than objects are looked for."""
-    assert seen("empty", 410029)[1] == []
+def test_corner_of_wall_beside_table_is_no_object() -> None:
+    """Most of the wall is behind the table, above the maximum height of objects."""
+    assert scene_labels("empty", 410029)[1] == []
 
 
 @pytest.mark.parametrize("seed", [370775, 380981])
-def test_wall_in_a_corner_of_the_image_is_no_object(seed: int) -> None:
-    """Little of it is seen, but the image cuts it off on two sides."""
-    assert seen("empty", seed)[1] == []
+def test_wall_in_image_corner_is_no_object(seed: int) -> None:
+    """Little of it is visible, but the image border cuts it on two sides."""
+    assert scene_labels("empty", seed)[1] == []
 
 
 @pytest.mark.parametrize("seed", [313, 336, 581])
-def test_side_of_a_shelf_seen_edge_on_is_no_object(seed: int) -> None:
-    """Too narrow in the image to be fitted as a wall, and cut off by a board or the border."""
-    assert all(np.median(part) >= FIRST_THING for part in seen("shelf", seed)[1])
+def test_edge_on_side_of_shelf_is_no_object(seed: int) -> None:
+    """It is too narrow in the image to fit a wall, and cut by a board or the border."""
+    assert all(np.median(candidate) >= FIRST_OBJECT for candidate in scene_labels("shelf", seed)[1])
 
 
 @pytest.mark.parametrize("seed", [556, 567])
-def test_front_of_the_side_of_a_shelf_is_no_object(seed: int) -> None:
-    """Cut off by the border of the image; the side that it goes on in is known as a wall."""
-    assert all(np.median(part) >= FIRST_THING for part in seen("shelf", seed)[1])
+def test_front_of_shelf_side_is_no_object(seed: int) -> None:
+    """The image border cuts it; the side behind it is detected as a wall."""
+    assert all(np.median(candidate) >= FIRST_OBJECT for candidate in scene_labels("shelf", seed)[1])
 
 
-def test_speckled_side_of_a_shelf_is_no_object() -> None:
-    """Where a surface is seen edge on many readings fail, and those left are not so steep."""
-    assert all(np.median(part) >= FIRST_THING for part in seen("shelf", 335)[1])
+def test_speckled_side_of_shelf_is_no_object() -> None:
+    """Many samples of an edge-on surface are missing, and the others are less steep."""
+    assert all(np.median(candidate) >= FIRST_OBJECT for candidate in scene_labels("shelf", 335)[1])
 
 
 @pytest.mark.parametrize(("seed", "label"), [(419, 20), (547, 23)])
-def test_patch_of_the_back_between_objects_is_no_part_of_them(seed: int, label: int) -> None:
-    """It is smaller than a part of a wall usually is, but lies in it exactly."""
-    labels, parts = seen("shelf", seed)
-    best = max(parts, key=lambda part: np.count_nonzero(part == label))
+def test_patch_of_shelf_back_is_not_merged_with_objects(seed: int, label: int) -> None:
+    """It is smaller than most parts of walls, but exactly coplanar."""
+    labels, candidates = scene_labels("shelf", seed)
+    best = max(candidates, key=lambda candidate: np.count_nonzero(candidate == label))
     assert np.mean(best == label) > 0.8
     assert np.count_nonzero(best == label) > 0.5 * np.count_nonzero(labels == label)
 
 
 @pytest.mark.parametrize("seed", [653, 683])
-def test_sliver_beside_the_side_of_a_shelf_is_no_object(seed: int) -> None:
-    """The noise of an upright side smears into its foot, which rises from the board."""
-    assert all(np.median(part) >= FIRST_THING for part in seen("shelf", seed)[1])
+def test_sliver_beside_shelf_side_is_no_object(seed: int) -> None:
+    """The noise of an upright side spreads to its base, which seems to rise from the board."""
+    assert all(np.median(candidate) >= FIRST_OBJECT for candidate in scene_labels("shelf", seed)[1])
 
 
 @pytest.mark.parametrize(("seed", "label"), [(430, 31), (434, 28), (651, 22)])
-def test_plate_at_the_level_of_the_camera_is_found(seed: int, label: int) -> None:
-    """Its far side stands out against the wall behind, not against its board."""
-    labels, parts = seen("shelf", seed)
-    best = max(parts, key=lambda part: np.count_nonzero(part == label))
+def test_plate_at_camera_height_is_found(seed: int, label: int) -> None:
+    """Its far edge contrasts with the wall behind, not with its board."""
+    labels, candidates = scene_labels("shelf", seed)
+    best = max(candidates, key=lambda candidate: np.count_nonzero(candidate == label))
     common = np.count_nonzero(best == label)
     assert common > 0.5 * (len(best) + np.count_nonzero(labels == label) - common)
 
@@ -101,10 +101,10 @@ def test_plate_at_the_level_of_the_camera_is_found(seed: int, label: int) -> Non
         pytest.param(29, 23, id="handle half hidden"),
     ],
 )
-def test_object_is_in_one_piece(seed: int, label: int) -> None:
-    """What hangs on an object or bears it, and what is seen of its other side, is part of it."""
-    labels, parts = seen("shelf", seed)
-    (one,) = (part for part in parts if np.median(part) == label)
+def test_object_is_not_split(seed: int, label: int) -> None:
+    """Handles, bases and the visible far side are parts of an object."""
+    labels, candidates = scene_labels("shelf", seed)
+    (one,) = (candidate for candidate in candidates if np.median(candidate) == label)
     assert np.count_nonzero(one == label) > 0.75 * np.count_nonzero(labels == label)
 
 
@@ -112,8 +112,10 @@ def test_object_is_in_one_piece(seed: int, label: int) -> None:
     ("kind", "seed", "quarters"),
     [("shelf", 9, 2), ("shelf", 35, 2), ("clutter", 111, 2), ("clutter", 624, 1)],
 )
-def test_wall_is_no_ground_in_a_turned_image(kind: SceneKind, seed: int, quarters: int) -> None:
-    """More of the back of a shelf is seen than of its boards; what hides a wall divides it."""
+def test_wall_is_no_supporting_plane_in_rotated_image(
+    kind: SceneKind, seed: int, quarters: int
+) -> None:
+    """More of the back of a shelf is visible than of its boards, and objects divide a wall."""
     rng = np.random.default_rng(seed)
     world = make_scene(kind, rng, frames=1)
     frame, _ = render_frame(world, 0, rng=rng, sensor=KINECT)
@@ -121,60 +123,60 @@ def test_wall_is_no_ground_in_a_turned_image(kind: SceneKind, seed: int, quarter
     depth = np.ascontiguousarray(np.rot90(frame.depth, quarters))
     h, w = depth.shape
     camera = Camera(w, h, 525.0, 525.0, (w - 1) / 2, (h - 1) / 2)
-    turned = Frame("t", 0, 0, 0, "c", depth=depth, camera=camera)
-    scene = detect(turned, settings=DetectionSettings(), rng=np.random.default_rng(0))
+    rotated = Frame("t", 0, 0, 0, "c", depth=depth, camera=camera)
+    scene = detect(rotated, settings=DetectionSettings(), rng=np.random.default_rng(0))
     x, y, z = inverse(world.path[0]).rotation[:, 2]
     up = np.array([y, -x, z]) if quarters == 1 else np.array([-x, -y, z])
     assert scene.up @ up > np.cos(np.radians(5))
 
 
 def overlap_in_shelf(seed: int, label: int) -> float:
-    """Return the IoU of a thing and of the candidate that holds most of it."""
-    labels, parts = seen("shelf", seed)
-    best = max(parts, key=lambda part: np.count_nonzero(part == label))
+    """Return the IoU of an object and the candidate that contains most of it."""
+    labels, candidates = scene_labels("shelf", seed)
+    best = max(candidates, key=lambda candidate: np.count_nonzero(candidate == label))
     common = np.count_nonzero(best == label)
     return common / (np.count_nonzero(labels == label) + best.size - common)
 
 
 @pytest.mark.parametrize(("seed", "label"), [(116, 29), (117, 20)])
-def test_halves_of_a_small_thing_are_no_objects(seed: int, label: int) -> None:
-    """A bottle that lies and a cup, far away: neither half is much smaller than the other."""
+def test_small_far_object_is_not_split(seed: int, label: int) -> None:
+    """The halves of a lying bottle and of a cup have similar sizes."""
     assert overlap_in_shelf(seed, label) > 0.8
 
 
 @pytest.mark.parametrize("label", [25, 28])
-def test_small_plate_on_a_small_box_is_no_half_of_it(label: int) -> None:
-    """They meet along much of their outlines; but the box stands, and the plate does not."""
+def test_small_plate_is_not_merged_with_small_box_below(label: int) -> None:
+    """They touch along much of their outlines, but only the box stands on the board."""
     assert overlap_in_shelf(53, label) > 0.7
 
 
 @pytest.mark.parametrize(("seed", "label"), [(280, 25), (290, 22)])
-def test_near_and_far_side_of_a_plate_are_one(seed: int, label: int) -> None:
-    """They hardly touch, and the floor is so near to the rim that it seems to be a lid."""
+def test_near_and_far_side_of_plate_are_merged(seed: int, label: int) -> None:
+    """They hardly touch, and the floor is so close to the rim that it looks like a top face."""
     assert overlap_in_shelf(seed, label) > 0.8
 
 
-def test_bottle_with_a_level_shoulder_is_no_can_under_its_neck() -> None:
-    """Much of a flat shoulder faces up; but things hardly ever stand axis on axis."""
+def test_bottle_with_flat_shoulder_is_not_split() -> None:
+    """Much of the shoulder faces up, but stacked objects hardly ever share an axis."""
     assert overlap_in_shelf(346, 21) > 0.95
 
 
-def test_lid_is_part_of_its_box() -> None:
-    """The seam around it shows as a ledge, along a third of the outlines of both and more."""
+def test_lid_is_merged_with_its_box() -> None:
+    """The seam looks like a top face, along a third or more of both outlines."""
     assert overlap_in_shelf(263, 30) > 0.8
 
 
 @pytest.mark.parametrize(("seed", "label"), [(739, 20), (786, 25)])
-def test_small_top_of_an_object_is_no_board(seed: int, label: int) -> None:
-    """It is as large as what is seen of some floors, but lies above another plane."""
-    labels, parts = seen("shelf", seed)
-    most = max(np.count_nonzero(part == label) for part in parts)
+def test_small_top_of_object_is_no_supporting_plane(seed: int, label: int) -> None:
+    """It is as large as the visible part of some floors, but lies above another plane."""
+    labels, candidates = scene_labels("shelf", seed)
+    most = max(np.count_nonzero(candidate == label) for candidate in candidates)
     assert most > 0.9 * np.count_nonzero(labels == label)
 
 
 @pytest.mark.parametrize("seed", [29, 121, 189])
-def test_strip_of_floor_beside_a_table_is_a_plane(seed: int) -> None:
-    """Less of it is seen than of most boards."""
+def test_floor_strip_beside_table_is_a_plane(seed: int) -> None:
+    """Less of it is visible than of most boards."""
     rng = np.random.default_rng(seed)
     world = make_scene("empty", rng, frames=1)
     frame, _ = render_frame(world, 0, rng=rng, sensor=KINECT)
@@ -187,10 +189,8 @@ def test_strip_of_floor_beside_a_table_is_a_plane(seed: int) -> None:
     ("kind", "seed", "quarters"),
     [("clutter", 25, 2), ("shelf", 135, 0), ("shelf", 1374, 2)],
 )
-def test_wall_is_no_table_however_the_camera_is_turned(
-    kind: SceneKind, seed: int, quarters: int
-) -> None:
-    """More is seen of the wall or of the back of the shelf than of what bears objects."""
+def test_wall_is_no_table_for_rotated_camera(kind: SceneKind, seed: int, quarters: int) -> None:
+    """More of the wall or of the shelf's back is visible than of the supporting planes."""
     rng = np.random.default_rng(seed)
     world = make_scene(kind, rng, frames=1)
     frame, _ = render_frame(world, 0, rng=rng, sensor=KINECT)
@@ -204,7 +204,7 @@ def test_wall_is_no_table_however_the_camera_is_turned(
             camera.cy, camera.width - 1 - camera.cx,
         )  # fmt: skip
         up = np.array([up[1], -up[0], up[2]])
-    turned = Frame("turned", 0, 0, 0, "c", depth=np.ascontiguousarray(depth), camera=camera)
-    scene = detect(turned, settings=DetectionSettings(), rng=np.random.default_rng(0))
+    rotated = Frame("turned", 0, 0, 0, "c", depth=np.ascontiguousarray(depth), camera=camera)
+    scene = detect(rotated, settings=DetectionSettings(), rng=np.random.default_rng(0))
 
     assert scene.planes[0].normal @ up > 0.99

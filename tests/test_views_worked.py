@@ -1,4 +1,4 @@
-"""Surfaces and descriptors of shapes with known values."""
+"""Tests of surfaces, descriptors and grids on shapes with known values."""
 
 from typing import Any
 
@@ -25,7 +25,7 @@ COUNT = 1200
 
 
 def facing(points: F8, normals: F8, eye: F8) -> F8:
-    """Return the points of a surface that a sensor sees."""
+    """Return the points of a surface that face the sensor."""
     return np.asarray(points[np.sum(normals * (eye - points), axis=1) > 0])
 
 
@@ -53,8 +53,8 @@ def described(points: F8, eye: F8) -> dict[str, float]:
     return dict(zip(DESCRIPTOR_NAMES, values.tolist(), strict=True))
 
 
-def test_shares_of_a_ball_that_is_seen_from_the_side() -> None:
-    """Of a half sphere the area is even over z: normals up, sideways and down are bands of it."""
+def test_ball_has_shares_of_normals_of_half_sphere() -> None:
+    """The area of a sphere is uniform over z: normals up, sideways and down are bands of it."""
     eye = np.array([3.0, 0.4, 0.2])
     value = described(ball(np.array([0, 0, 0.2]), 0.06, eye), eye)
 
@@ -64,8 +64,8 @@ def test_shares_of_a_ball_that_is_seen_from_the_side() -> None:
 
 
 @pytest.mark.parametrize("height", [0.9, -0.6])
-def test_from_below_more_of_a_ball_looks_down(height: float) -> None:
-    """From the side, equal parts face up and down, which reveals no sign error."""
+def test_share_of_downward_normals_depends_on_viewpoint(height: float) -> None:
+    """From the side, equal parts face up and down, which would hide a sign error."""
     middle, eye = np.array([0, 0, 0.2]), np.array([0.8, 0.3, height])
     points = ball(middle, 0.06, eye)
     normals = (points - middle) / 0.06
@@ -75,8 +75,8 @@ def test_from_below_more_of_a_ball_looks_down(height: float) -> None:
     assert share == pytest.approx(np.mean(normals[:, 2] < -0.25), abs=0.04)
 
 
-def test_where_an_object_begins_and_how_it_is_seen() -> None:
-    """It is 0.14 m above its support; the sensor looks down at an angle of asin(0.6)."""
+def test_descriptor_has_true_heights_elevation_and_distance() -> None:
+    """The ball is 0.14 m above its support; the sensor looks down at an angle of asin(0.6)."""
     middle = np.array([0.0, 0.0, 0.2])
     eye = middle + np.array([0.8, 0.0, 0.6])
     value = described(ball(middle, 0.06, eye), eye)
@@ -85,13 +85,13 @@ def test_where_an_object_begins_and_how_it_is_seen() -> None:
     assert value["view.elevation"] == pytest.approx(0.6, abs=0.03)
     assert below["view.elevation"] < -0.5
     assert value["view.distance"] == pytest.approx(1.0, abs=0.06)
-    low = 0.2 - 0.06 * 0.8  # the lowest point that is seen lies on the horizon of the eye
+    low = 0.2 - 0.06 * 0.8  # the lowest visible point is on the horizon as seen from the sensor
     assert value["metric.low"] == pytest.approx(low, abs=0.01)
     assert value["metric.height"] == pytest.approx(0.26 - low, abs=0.012)
 
 
 def walls() -> F8:
-    """Return two walls 5 cm apart on a floor, as of a mug cut open."""
+    """Return two walls 5 cm apart on a floor, like a mug cut open."""
     a, b = (axis.ravel() for axis in np.meshgrid(*[np.linspace(0, 0.08, 33)] * 2))
     zero = np.zeros(a.size)
     floor = np.stack([a * 0.05 / 0.08, b, zero], axis=1)
@@ -99,7 +99,7 @@ def walls() -> F8:
     return np.concatenate([left, floor, right])
 
 
-def test_no_edge_leads_through_the_air() -> None:
+def test_surface_edges_do_not_cross_gaps() -> None:
     """Otherwise the inside of a cup would be as near as its rim."""
     points = walls()
     gas = gas_of(points)
@@ -111,7 +111,7 @@ def test_no_edge_leads_through_the_air() -> None:
     assert tree.query((a + b) / 2)[0].max() < spacing
 
 
-def test_parts_are_joined_once_and_where_they_are_nearest() -> None:
+def test_separate_parts_are_linked_once_at_nearest_neurons() -> None:
     sheet = walls()[: 33 * 33]
     points = np.concatenate([sheet, sheet + np.array([0.2, 0.03, 0.01])])
     gas = gas_of(points)
@@ -126,19 +126,16 @@ def test_parts_are_joined_once_and_where_they_are_nearest() -> None:
     assert length == pytest.approx(float(nearest), rel=1e-5)
 
 
-def test_stacked_objects_are_described_from_what_they_stand_on() -> None:
-    """Measured from the table, a box on a box would begin at the height of the lower one.
-
-    Completed from the table up, it would reach through it.
-    """
+def test_stacked_object_is_described_relative_to_its_support() -> None:
+    """Relative to the table, it would begin too high, and its full box would include the other."""
     shapes = [table(), box((0, 0, 0), (0.22, 0.18, 0.08)), box((0, 0.01, 0.08), (0.1, 0.08, 0.1))]
     frame = frame_of(render(shapes)[0])
     guesser: Any = Guesser()
-    seen = perceive(frame, up=None, categorizer=guesser, settings=Settings())
-    upper = [d for d in seen.detections if d.candidate.on_candidate is not None]
+    perception = perceive(frame, up=None, categorizer=guesser, settings=Settings())
+    upper = [d for d in perception.detections if d.candidate.on_candidate is not None]
     low, high = (DESCRIPTOR_NAMES.index(f"metric.{name}") for name in ("low", "height"))
 
-    assert len(seen.detections) == 2
+    assert len(perception.detections) == 2
     (top,) = upper
     assert top.candidate.support_m == pytest.approx(0.08, abs=0.01)
     assert top.descriptor[low] < 0.02
@@ -147,37 +144,39 @@ def test_stacked_objects_are_described_from_what_they_stand_on() -> None:
     assert top.full.size[2] == pytest.approx(0.1, abs=0.02)
 
 
-def scene_of(frame: Frame, up: F8 | None) -> F8:
+def centers_of(frame: Frame, up: F8 | None) -> F8:
     scene = detect(frame, up=up, settings=DetectionSettings(), rng=np.random.default_rng(0))
     return np.array(sorted(c.box.center.tolist() for c in scene.candidates))
 
 
-def test_a_turned_cloud_with_its_up_has_the_same_objects() -> None:
+def test_rotated_cloud_with_rotated_up_has_same_objects() -> None:
     """A given up direction is in the frame of the points, whatever their rotation."""
     rng = np.random.default_rng(11)
     image, _ = render_frame(make_scene("tabletop", rng, frames=1), 0, rng=rng, sensor=IDEAL)
     points = image.xyz()
     up = detect(image, settings=DetectionSettings(), rng=np.random.default_rng(0)).up
-    turn = Rotation.from_euler("xyz", [0.25, -0.4, 0.9])
+    rotation = Rotation.from_euler("xyz", [0.25, -0.4, 0.9])
     plain = Frame("/p", 0, 0, 0, "cam", points=points)
-    turned = Frame("/p", 0, 0, 0, "cam", points=np.array(turn.apply(points), np.float32, order="C"))
-    expected = scene_of(plain, np.asarray(up, np.float64))
-    found = scene_of(turned, turn.apply(up))
+    rotated = Frame(
+        "/p", 0, 0, 0, "cam", points=np.array(rotation.apply(points), np.float32, order="C")
+    )
+    expected = centers_of(plain, np.asarray(up, np.float64))
+    found = centers_of(rotated, rotation.apply(up))
 
     assert len(expected) >= 3
     assert len(found) == len(expected)
-    assert cKDTree(turn.apply(expected)).query(found)[0].max() < 0.01
+    assert cKDTree(rotation.apply(expected)).query(found)[0].max() < 0.01
 
 
-def test_cells_of_an_image_see_where_their_pixels_do(monkeypatch: pytest.MonkeyPatch) -> None:
-    """The inverse depth of a plane is linear in the rays, so half a pixel would change it."""
+def test_grid_intrinsics_match_pixels(monkeypatch: pytest.MonkeyPatch) -> None:
+    """The inverse depth of a plane is linear in the rays, so an error of half a pixel shows."""
     camera = Camera(320, 240, 260.3, 255.1, 158.7, 121.2)
     normal, offset = np.array([0.21, -0.83, -0.35]), -0.9
     v, u = np.mgrid[:240, :320]
     rays = np.stack([(u - 158.7) / 260.3, (v - 121.2) / 255.1, np.ones(u.shape)], axis=-1)
     inverse = rays @ normal / offset
     depth = np.where(inverse > 0.4, 1 / np.maximum(inverse, 0.4), 0).astype(np.float32)
-    for cell_m in (0.0125, 0.019):  # two pixels a cell, and three
+    for cell_m in (0.0125, 0.019):  # two and three pixels per cell
         monkeypatch.setattr(depth_grid, "CELL_M", cell_m)
         grid = downsample(freeze(depth, "v u", "f4"), camera, range_m=2.4)
         assert grid is not None
@@ -190,7 +189,7 @@ def test_cells_of_an_image_see_where_their_pixels_do(monkeypatch: pytest.MonkeyP
         assert abs(np.median(off)) < 0.1 * step.min()
 
 
-def test_cells_of_a_cloud_see_where_their_points_are() -> None:
+def test_virtual_view_intrinsics_match_points() -> None:
     rng = np.random.default_rng(5)
     points = freeze(rng.uniform([-0.4, -0.3, 1.0], [0.4, 0.3, 1.001], (60_000, 3)), "n 3", "f4")
     view = virtual_image(points, range_m=2.0)
