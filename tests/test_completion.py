@@ -1,4 +1,4 @@
-"""Full boxes, from one view and several, of cylinders, boxes and balls of known size."""
+"""Tests of full boxes of cylinders, boxes and balls of known size, from one or several views."""
 
 from pathlib import Path
 
@@ -16,10 +16,10 @@ from shapecat.types import CATEGORIES, FullBox
 
 TILT = np.radians(37)
 UP = np.array([0, -np.cos(TILT), -np.sin(TILT)])
-"""Up for a camera that looks 37 degrees down."""
+"""For a camera that looks down at 37 degrees."""
 LEVEL = gravity_rotation(UP)
 PLACE = np.array([0.21, 1.03, -0.74])
-"""Where the object stands, in the level frame of the camera."""
+"""Position of the object in the level frame of the camera."""
 RNG = np.random.default_rng(5)
 
 
@@ -27,15 +27,15 @@ def above(height: float) -> np.ndarray:
     return np.asarray(PLACE + np.array([0, 0, height]))
 
 
-def sure(category: str) -> np.ndarray:
+def one_hot(category: str) -> np.ndarray:
     return np.asarray(np.eye(len(CATEGORIES))[CATEGORIES.index(category)])
 
 
 def estimate(surface: np.ndarray, normals: np.ndarray, category: str) -> FullBox:
     """Complete the visible part of a convex surface (n, 3) that stands at `PLACE`."""
     points = surface + PLACE
-    seen = points[(normals * points).sum(axis=1) < 0] @ LEVEL
-    return complete(seen.astype(np.float32), UP, PLACE[2], sure(category), CATEGORIES)
+    visible = points[(normals * points).sum(axis=1) < 0] @ LEVEL
+    return complete(visible.astype(np.float32), UP, PLACE[2], one_hot(category), CATEGORIES)
 
 
 def cylinder(radius: float, height: float, count: int = 6000) -> tuple[np.ndarray, np.ndarray]:
@@ -56,12 +56,12 @@ def cuboid(size: np.ndarray, yaw: float) -> tuple[np.ndarray, np.ndarray]:
             points.append(face * size + [0, 0, size[2] / 2])
             normals.append(np.tile(sign * np.eye(3)[axis], (3000, 1)))
     c, s = np.cos(yaw), np.sin(yaw)
-    turn = np.array([[c, -s, 0], [s, c, 0], [0, 0, 1]])
-    return np.concatenate(points) @ turn.T, np.concatenate(normals) @ turn.T
+    rotation = np.array([[c, -s, 0], [s, c, 0], [0, 0, 1]])
+    return np.concatenate(points) @ rotation.T, np.concatenate(normals) @ rotation.T
 
 
-def test_the_hidden_half_of_a_can_is_its_seen_half() -> None:
-    """The top shows its whole width; a camera below the top must not halve it."""
+def test_hidden_half_of_can_mirrors_visible_half() -> None:
+    """Without a visible top, only the near half of its depth is visible."""
     points, normals = cylinder(0.034, 0.12)
     side = normals[:, 2] == 0
     box = estimate(points[side], normals[side], "can")
@@ -71,7 +71,7 @@ def test_the_hidden_half_of_a_can_is_its_seen_half() -> None:
     assert_allclose(rotation_from_quaternion(box.orientation)[:, 2], UP, atol=1e-6)
 
 
-def test_a_ball_is_as_high_and_as_deep_as_wide() -> None:
+def test_full_box_of_ball_is_a_cube() -> None:
     normals = RNG.normal(size=(8000, 3))
     normals /= np.linalg.norm(normals, axis=1)[:, None]
     box = estimate(0.095 * normals + [0, 0, 0.095], normals, "ball")
@@ -80,7 +80,7 @@ def test_a_ball_is_as_high_and_as_deep_as_wide() -> None:
     assert_allclose(LEVEL @ box.center, above(0.095), atol=0.006)
 
 
-def test_a_box_with_an_odd_yaw_keeps_its_lengths() -> None:
+def test_rotated_box_keeps_its_size_and_yaw() -> None:
     size = np.array([0.23, 0.09, 0.14])
     points, normals = cuboid(size, 0.431)
     box = estimate(points, normals, "box")
@@ -92,8 +92,8 @@ def test_a_box_with_an_odd_yaw_keeps_its_lengths() -> None:
     assert abs(np.sin(2 * off)) < np.sin(2 * np.radians(3))
 
 
-def test_noise_of_a_flat_side_does_not_bring_a_box_nearer() -> None:
-    """The farthest of many noisy points lie in front of the side; the far edge has few."""
+def test_noise_of_flat_side_does_not_shift_box_to_sensor() -> None:
+    """The extremes of many noisy points lie before the side; the far edge has few points."""
     size = np.array([0.16, 0.1, 0.2])
     points, normals = cuboid(size, np.pi / 2 - 0.24)
     rays = (points + PLACE) / np.linalg.norm(points + PLACE, axis=1)[:, None]
@@ -101,11 +101,11 @@ def test_noise_of_a_flat_side_does_not_bring_a_box_nearer() -> None:
     box = estimate(noisy, normals, "box")
 
     axes, center = LEVEL @ rotation_from_quaternion(box.orientation), LEVEL @ box.center - PLACE
-    front = normals[0]  # of the side that is 8 cm before the middle
+    front = normals[0]  # of the side 8 cm before the centre
     assert center @ front + abs(front @ axes) @ box.size / 2 == pytest.approx(0.08, abs=0.0035)
 
 
-def test_a_ball_that_is_hidden_in_part_stays_round() -> None:
+def test_partly_hidden_ball_stays_round() -> None:
     """The visible part of an occluded ball is not a circle."""
     normals = RNG.normal(size=(8000, 3))
     normals /= np.linalg.norm(normals, axis=1)[:, None]
@@ -115,8 +115,8 @@ def test_a_ball_that_is_hidden_in_part_stays_round() -> None:
     assert box.size[0] == pytest.approx(box.size[1], rel=0.02)
 
 
-def test_what_an_occluder_hides_below_is_part_of_the_box() -> None:
-    """A standing object reaches down to its support, with a larger deviation."""
+def test_full_box_reaches_down_to_hidden_support() -> None:
+    """Its height then has a larger deviation."""
     points, normals = cylinder(0.04, 0.2)
     top = points[:, 2] > 0.12
     box, hidden = (
@@ -128,7 +128,7 @@ def test_what_an_occluder_hides_below_is_part_of_the_box() -> None:
     assert hidden.size_std[2] > 3 * box.size_std[2]
 
 
-def test_a_bottle_that_lies_is_not_as_wide_as_long() -> None:
+def test_lying_bottle_is_not_as_wide_as_long() -> None:
     """A circle around its length would have four times its footprint."""
     points, normals = cylinder(0.035, 0.25)
     lying = points[:, [2, 0, 1]] + [-0.125, 0, 0.035]
@@ -139,18 +139,18 @@ def test_a_bottle_that_lies_is_not_as_wide_as_long() -> None:
 
 
 @pytest.mark.parametrize("count", [1, 2, 3, 50])
-def test_few_points_in_one_place_give_a_finite_box(count: int) -> None:
+def test_coincident_points_give_a_finite_box(count: int) -> None:
     """Equal points make every fit singular."""
     points = np.tile(np.array([0.1, 0.2, 1.3], np.float32), (count, 1))
     for category in CATEGORIES:
-        box = complete(points, UP, float(UP @ points[0]), sure(category), CATEGORIES)
+        box = complete(points, UP, float(UP @ points[0]), one_hot(category), CATEGORIES)
         assert np.isfinite([*box.center, *box.size, *box.size_std]).all()
         assert (box.size >= 0).all()
 
 
-def test_no_point_is_refused() -> None:
+def test_empty_cloud_is_rejected() -> None:
     with pytest.raises(ValueError, match="at least one point"):
-        complete(np.zeros((0, 3), np.float32), UP, 0.0, sure("cup"), CATEGORIES)
+        complete(np.zeros((0, 3), np.float32), UP, 0.0, one_hot("cup"), CATEGORIES)
 
 
 def about_z(yaw: float) -> np.ndarray:
@@ -180,42 +180,42 @@ def fused_in(
     return box.in_views(views.centers, views.axes, views.sizes)
 
 
-def test_views_agree_on_one_size_whatever_their_quarter_turns() -> None:
-    """Length and width swap with the yaw a view happens to find."""
+def test_fused_size_is_independent_of_quarter_turns() -> None:
+    """Length and width swap with the yaw that a view happens to find."""
     size, yaw = np.array([0.21, 0.11, 0.3]), 0.37
     noise = RNG.normal(0, 0.004, (9, 3))
     quarters = np.array([0, 1, 0, 3, 2, 0, 1, 0, 1])
     sizes = np.where((quarters % 2 == 1)[:, None], size[[1, 0, 2]], size) + noise
     axes = np.stack([about_z(yaw + q * np.pi / 2) for q in quarters])
     centers = PLACE + RNG.normal(0, 0.003, (9, 3))
-    fused = fused_in(views_of(centers, axes, sizes), np.ones(9), sure("box"), CATEGORIES)
+    fused = fused_in(views_of(centers, axes, sizes), np.ones(9), one_hot("box"), CATEGORIES)
 
     assert (fused.sizes == fused.sizes[0]).all()
     for k in range(9):
         true = Upright(PLACE, size, yaw)
         heading = fused.axes[k][:, 0]
-        mine = Upright(fused.centers[k], fused.sizes[k], float(np.arctan2(heading[1], heading[0])))
-        assert overlap(true, mine) > 0.9
+        box = Upright(fused.centers[k], fused.sizes[k], float(np.arctan2(heading[1], heading[0])))
+        assert overlap(true, box) > 0.9
 
 
-def test_views_of_a_part_cut_nothing_off_that_whole_views_show() -> None:
-    """Behind an occluder, half of a box is seen from a side that no other view faces."""
+def test_partial_views_do_not_shrink_fused_box() -> None:
+    """Behind an occluder, part of a box is visible from a side that no other view faces."""
     sizes = np.array([[0.2, 0.1, 0.3]] * 5 + [[0.16, 0.1, 0.3]] * 9)
     centers = np.array([[0.0, 0, 0]] * 5 + [[-0.02, 0, 0]] * 9)
     views = views_of(centers, np.tile(np.eye(3), (14, 1, 1)), sizes)
     sensors = np.array([[-1.0, 0.2, 0]] * 5 + [[1.0, 0.2, 0]] * 9)
     weights = np.array([1.0] * 5 + [0.25] * 9)
-    fused = fused_in(views._replace(sensors=sensors), weights, sure("box"), CATEGORIES)
+    fused = fused_in(views._replace(sensors=sensors), weights, one_hot("box"), CATEGORIES)
     np.testing.assert_allclose(fused.sizes[0], [0.2, 0.1, 0.3], atol=0.005)
     np.testing.assert_allclose(fused.centers[0], 0, atol=0.005)
 
 
-def test_a_view_from_where_the_object_was_moved_to_keeps_its_place() -> None:
-    """It also keeps its yaw; length and width are those of the other views."""
+def test_view_of_moved_object_keeps_its_pose() -> None:
+    """Its size is that of the other views."""
     centers, sizes = np.zeros((7, 3)), np.tile([0.2, 0.1, 0.3], (7, 1))
     centers[5:], axes = [0.4, 0.1, 0], np.tile(np.eye(3), (7, 1, 1))
     sizes[6], axes[6] = [0.1, 0.2, 0.3], about_z(0.5)
-    fused = fused_in(views_of(centers, axes, sizes), np.ones(7), sure("box"), CATEGORIES)
+    fused = fused_in(views_of(centers, axes, sizes), np.ones(7), one_hot("box"), CATEGORIES)
 
     assert_allclose(fused.centers, centers, atol=1e-12)
     assert_allclose(fused.axes[5], np.eye(3), atol=1e-12)
@@ -223,26 +223,26 @@ def test_a_view_from_where_the_object_was_moved_to_keeps_its_place() -> None:
     assert_allclose(fused.sizes, np.tile([0.2, 0.1, 0.3], (7, 1)))
 
 
-def test_the_sides_that_several_views_show_make_an_oval_whole() -> None:
-    """An oval bottle looks round from each side; only all views show its two widths."""
+def test_fused_views_give_true_size_of_oval_bottle() -> None:
+    """It looks round from each side; only all views together show its two widths."""
     points, normals = cylinder(1.0, 0.25)
     wall = normals[:, 2] == 0
     oval = points[wall] * [0.045, 0.033, 1.0]
     outward = normals[wall] / [0.045, 0.033, 1.0]
     views = []
     for angle in np.radians([10, 40, 70, 100, 130]):
-        away = about_z(-angle - np.pi / 2)  # what a sensor in this direction sees ahead of it
+        away = about_z(-angle - np.pi / 2)  # into the frame of a sensor in this direction
         place = PLACE.copy()
-        seen = ((outward @ away.T) * (oval @ away.T + place)).sum(axis=1) < 0
+        visible = ((outward @ away.T) * (oval @ away.T + place)).sum(axis=1) < 0
         box = complete(
-            ((oval[seen] @ away.T + place) @ LEVEL).astype(np.float32),
-            UP, place[2], sure("bottle"), CATEGORIES,
+            ((oval[visible] @ away.T + place) @ LEVEL).astype(np.float32),
+            UP, place[2], one_hot("bottle"), CATEGORIES,
         )  # fmt: skip
         axes = away.T @ LEVEL @ rotation_from_quaternion(box.orientation)
         center = away.T @ (LEVEL @ box.center - place)
         views.append((center, axes, box.size, box.size_std, box.outline, away.T @ -place))
     stacked = BoxViews(*map(np.array, zip(*views, strict=True)))
-    fused = fused_in(stacked, np.ones(5), sure("bottle"), CATEGORIES)
+    fused = fused_in(stacked, np.ones(5), one_hot("bottle"), CATEGORIES)
 
     assert_allclose(np.sort(fused.sizes[0]), [0.066, 0.09, 0.25], atol=0.006)
     assert_allclose(fused.centers, np.tile([0, 0, 0.125], (5, 1)), atol=0.004)
@@ -250,23 +250,23 @@ def test_the_sides_that_several_views_show_make_an_oval_whole() -> None:
     assert abs(heading[0]) > np.cos(np.radians(8))
 
 
-def test_the_handle_of_a_cup_is_in_its_box() -> None:
-    """It is seen beside the cup; an oval around the body alone would cut it off."""
+def test_full_box_includes_handle_of_cup() -> None:
+    """An oval around the body alone would cut it off."""
     points, normals = cylinder(0.04, 0.1)
     wall = normals[:, 2] == 0
     tips = np.stack([np.full(60, -0.068), RNG.normal(0, 0.003, 60), RNG.uniform(0.03, 0.07, 60)], 1)
     outward = np.concatenate([normals[wall], -np.tile(PLACE, (60, 1))])
     box = estimate(np.concatenate([points[wall], tips]), outward, "cup")
-    turned = LEVEL @ rotation_from_quaternion(box.orientation)
-    inside = turned.T @ (above(0.05) + np.array([-0.065, 0, 0]) - LEVEL @ box.center)
+    axes = LEVEL @ rotation_from_quaternion(box.orientation)
+    inside = axes.T @ (above(0.05) + np.array([-0.065, 0, 0]) - LEVEL @ box.center)
 
     assert (abs(inside) < box.size / 2).all()
     assert (LEVEL @ box.center)[0] < PLACE[0] - 0.005
     assert box.size[:2].max() < 0.12
 
 
-def test_overlap_of_turned_boxes_is_exact() -> None:
-    """A square turned by 45 degrees in another of the same size leaves an octagon."""
+def test_overlap_of_rotated_boxes_is_exact() -> None:
+    """Two equal squares, one rotated by 45 degrees, have an octagon in common."""
     a = Upright(np.zeros(3), np.array([2.0, 2.0, 2.0]), 0.2)
     b = Upright(np.array([0, 0, 0.5]), np.array([2.0, 2.0, 2.0]), 0.2 + np.pi / 4)
     octagon = 8 * (np.sqrt(2) - 1)
@@ -277,7 +277,7 @@ def test_overlap_of_turned_boxes_is_exact() -> None:
     assert overlap(a, b._replace(center=np.array([0, 3.0, 0]))) == 0
 
 
-def test_a_track_has_one_full_size(guessed_run: Path) -> None:
+def test_track_has_one_full_size(guessed_run: Path) -> None:
     """People read the size of an object from any row of its track."""
     detections = pq.read_table(guessed_run / "detections.parquet").to_pylist()
     tracks = pq.read_table(guessed_run / "tracks.parquet").to_pylist()
@@ -294,40 +294,42 @@ def test_a_track_has_one_full_size(guessed_run: Path) -> None:
     assert all(min(row["size_full"]) > 0 for row in detections)
 
 
-def test_a_quarter_turn_exchanges_length_and_width() -> None:
-    """Half of the views swap the longer and shorter side: the box is the same."""
+def test_quarter_turn_swaps_length_and_width() -> None:
+    """If half of the views swap them, the box is still the same."""
     size, yaw = np.array([0.06, 0.15, 0.2]), 0.3
-    turns = [yaw + np.pi / 2 * (k % 2) for k in range(6)]
+    yaws = [yaw + np.pi / 2 * (k % 2) for k in range(6)]
     sizes = np.array([size[[1, 0, 2]] if k % 2 else size for k in range(6)])
-    axes = Rotation.from_euler("z", np.array(turns)[:, None]).as_matrix()
-    fused = fused_in(views_of(np.zeros((6, 3)), axes, sizes), np.ones(6), sure("box"), CATEGORIES)
+    axes = Rotation.from_euler("z", np.array(yaws)[:, None]).as_matrix()
+    fused = fused_in(
+        views_of(np.zeros((6, 3)), axes, sizes), np.ones(6), one_hot("box"), CATEGORIES
+    )
 
     along = np.array([np.cos(yaw), np.sin(yaw), 0.0])  # the shorter side lies along it
-    for lengths, turned in zip(fused.sizes, fused.axes, strict=True):
-        first = int(np.argmax(np.abs(along @ turned)))
-        assert abs(along @ turned[:, first]) == pytest.approx(1, abs=1e-6)
+    for lengths, rotation in zip(fused.sizes, fused.axes, strict=True):
+        first = int(np.argmax(np.abs(along @ rotation)))
+        assert abs(along @ rotation[:, first]) == pytest.approx(1, abs=1e-6)
         assert lengths[first] == pytest.approx(0.06, abs=0.002)
         assert lengths[1 - first] == pytest.approx(0.15, abs=0.002)
         assert lengths[2] == pytest.approx(0.2)
 
 
-def test_many_views_of_one_side_do_not_make_its_size_certain() -> None:
-    """All views miss the same side, so the deviation must not fall to a few micrometres."""
+def test_many_views_do_not_make_size_certain() -> None:
+    """All views may share an error, so the deviation must not fall to a few micrometres."""
     stds = []
     for count in (1, 400):
         sizes, axes = np.tile([0.2, 0.1, 0.3], (count, 1)), np.tile(np.eye(3), (count, 1, 1))
         views = views_of(np.zeros((count, 3)), axes, sizes)
-        stds.append(fused_in(views, np.ones(count), sure("box"), CATEGORIES).stds[0])
+        stds.append(fused_in(views, np.ones(count), one_hot("box"), CATEGORIES).stds[0])
 
     assert_allclose(stds[0], [0.006, 0.006, 0.01], atol=1e-4)
     assert_allclose(stds[1] / stds[0], np.sqrt(0.5), rtol=0.01)
 
 
-def test_the_views_that_tell_the_size_are_spread_over_the_track() -> None:
-    """A camera that walks around an object sees its other side only at the end."""
-    some = _spread(7000)
+def test_views_for_full_size_are_spread_over_track() -> None:
+    """A camera that moves around an object sees its far side only at the end."""
+    chosen = _spread(7000)
 
-    assert (len(some), some[0], some[-1]) == (1000, 0, 6999)
-    assert set(np.diff(some)) <= {7, 8}
+    assert (len(chosen), chosen[0], chosen[-1]) == (1000, 0, 6999)
+    assert set(np.diff(chosen)) <= {7, 8}
     assert _spread(4).tolist() == [0, 1, 2, 3]
     assert _spread(0).size == 0

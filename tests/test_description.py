@@ -1,3 +1,5 @@
+"""Tests of the descriptor: names, invariance, finite values and single blocks."""
+
 from collections.abc import Callable
 
 import numpy as np
@@ -23,7 +25,7 @@ SCALE_FREE = [i for i in range(len(DESCRIPTOR_NAMES)) if i not in METRIC]
 
 
 class View(Record):
-    """Points of one side of a shape, and their graph."""
+    """The visible points of a shape, and their graph."""
 
     points: F4 = array("n 3", "f4")
     gas: NeuralGas
@@ -32,9 +34,9 @@ class View(Record):
 def visible(points: F8, normals: F8, seed: int = 0, count: int = 900) -> View:
     """Return the points that face the eye, thinned to ``count``, with 0.5 mm noise."""
     rng = np.random.default_rng(seed)
-    seen = np.flatnonzero(np.sum(normals * (EYE - points), axis=1) > 0)
-    seen = rng.choice(seen, min(count, len(seen)), replace=False)
-    cloud = points[seen] + rng.normal(scale=0.0005, size=(len(seen), 3))
+    facing = np.flatnonzero(np.sum(normals * (EYE - points), axis=1) > 0)
+    facing = rng.choice(facing, min(count, len(facing)), replace=False)
+    cloud = points[facing] + rng.normal(scale=0.0005, size=(len(facing), 3))
     gas = reconstruct(
         cloud.astype(np.float32), settings=SurfaceSettings(neurons=60, signals=4000), rng=rng
     )
@@ -43,7 +45,7 @@ def visible(points: F8, normals: F8, seed: int = 0, count: int = 900) -> View:
 
 
 def grid(count: int, low: float, high: float) -> tuple[F8, F8]:
-    """Angles and steps of an even grid: two flat arrays."""
+    """Return the angles and heights of an even grid as two flat arrays."""
     angle, step = np.meshgrid(
         np.arange(count) * 2 * np.pi / count, np.linspace(low, high, count // 3)
     )
@@ -61,13 +63,13 @@ def can(seed: int = 0, radius: float = 0.035, height: float = 0.12, *, lying: bo
     angle, z = grid(120, 0.0, height)
     wall = np.stack([np.cos(angle), np.sin(angle), 0 * angle], axis=1)
     side = wall * radius + np.outer(z, [0, 0, 1])
-    lid = wall * (radius * np.sqrt(z / height))[:, None] + [0, 0, height]
+    top = wall * (radius * np.sqrt(z / height))[:, None] + [0, 0, height]
     keep = slice(None, None, 4)
-    points = np.concatenate([side, lid[keep]])
-    normals = np.concatenate([wall, np.tile([0.0, 0, 1], (len(lid[keep]), 1))])
+    points = np.concatenate([side, top[keep]])
+    normals = np.concatenate([wall, np.tile([0.0, 0, 1], (len(top[keep]), 1))])
     if lying:
-        turn = np.array([[0.8, 0, 0.6], [-0.6, 0, 0.8], [0, -1.0, 0]])
-        points, normals = points @ turn.T + [0, 0, radius], normals @ turn.T
+        rotation = np.array([[0.8, 0, 0.6], [-0.6, 0, 0.8], [0, -1.0, 0]])
+        points, normals = points @ rotation.T + [0, 0, radius], normals @ rotation.T
     return visible(points, normals, seed)
 
 
@@ -95,36 +97,36 @@ def describe_view(view: View, eye: F4 = EYE) -> F4:
 
 
 def test_names_and_blocks_cover_the_descriptor() -> None:
-    """A model stores names, so each number needs one, and blocks must not overlap."""
+    """A model stores names: each feature needs a unique one, and blocks must not overlap."""
     assert len(set(DESCRIPTOR_NAMES)) == len(DESCRIPTOR_NAMES) == len(describe_view(ball()))
     end = 0
-    for block, part in BLOCKS.items():
-        assert part.start == end
-        end = part.stop
-        assert all(name.startswith(f"{block}.") for name in DESCRIPTOR_NAMES[part])
+    for block, columns in BLOCKS.items():
+        assert columns.start == end
+        end = columns.stop
+        assert all(name.startswith(f"{block}.") for name in DESCRIPTOR_NAMES[columns])
     assert end == len(DESCRIPTOR_NAMES)
 
 
-def scattered(seed: int) -> F4:
-    """Describe random points and links: they reach bins that plain shapes leave empty."""
+def describe_random(seed: int) -> F4:
+    """Describe random points and edges, which reach bins that plain shapes leave empty."""
     rng = np.random.default_rng(seed)
     points = (rng.normal(size=(400, 3)) * np.power((1, 0.3, 0.6), seed)).astype(np.float32)
     edges = np.ascontiguousarray(np.argwhere(np.triu(rng.random((30, 30)) < 0.12, 1)))
     return describe(points, NeuralGas(points[:30], edges), rng.normal(size=3).astype(np.float32))
 
 
-def test_every_number_can_change() -> None:
+def test_every_feature_varies() -> None:
     """Guards against a component that is never written."""
     views = [
         *(make(seed) for make in SHAPES.values() for seed in range(2)),
         ball(hollow=True),
         can(lying=True),
     ]
-    table = np.stack([*map(describe_view, views), *map(scattered, range(3))])
-    same = {DESCRIPTOR_NAMES[k] for k in np.flatnonzero(np.ptp(table, axis=0) == 0)}
+    table = np.stack([*map(describe_view, views), *map(describe_random, range(3))])
+    constant = {DESCRIPTOR_NAMES[k] for k in np.flatnonzero(np.ptp(table, axis=0) == 0)}
 
-    # Nothing is bent as much as the last bin asks for.
-    assert {name for name in same if not name.endswith("curvedness_5")} == set()
+    # No shape here is curved enough for the last bin.
+    assert {name for name in constant if not name.endswith("curvedness_5")} == set()
 
 
 # invariance
@@ -133,15 +135,15 @@ def test_every_number_can_change() -> None:
 @pytest.mark.parametrize("shape", SHAPES)
 @given(yaw=st.floats(-np.pi, np.pi), shift=st.tuples(st.floats(-3, 3), st.floats(-3, 3)))
 @settings(deadline=None, max_examples=8)
-def test_turning_about_z_and_moving_aside_change_nothing(
+def test_descriptor_is_invariant_to_yaw_and_horizontal_shift(
     shape: str, yaw: float, shift: tuple[float, float]
 ) -> None:
     view = SHAPES[shape](0)
     c, s = np.cos(yaw), np.sin(yaw)
-    turn, move = np.array([[c, -s, 0], [s, c, 0], [0, 0, 1]]), np.array([*shift, 0])
+    rotation, offset = np.array([[c, -s, 0], [s, c, 0], [0, 0, 1]]), np.array([*shift, 0])
 
     def moved(points: F4) -> F4:
-        return np.asarray(points @ turn.T + move, np.float32)
+        return np.asarray(points @ rotation.T + offset, np.float32)
 
     gas = NeuralGas(moved(view.gas.neurons), view.gas.edges)
     found = describe(moved(view.points), gas, moved(EYE))
@@ -151,7 +153,7 @@ def test_turning_about_z_and_moving_aside_change_nothing(
 
 @pytest.mark.parametrize("shape", SHAPES)
 @pytest.mark.parametrize("scale", [0.01, 4.0, 1000.0])
-def test_growing_about_the_origin_changes_the_metric_blocks_alone(shape: str, scale: float) -> None:
+def test_scaling_changes_only_metric_blocks(shape: str, scale: float) -> None:
     view = SHAPES[shape](0)
     gas = NeuralGas(view.gas.neurons * np.float32(scale), view.gas.edges)
     found = describe(view.points * np.float32(scale), gas, EYE * np.float32(scale))
@@ -161,15 +163,15 @@ def test_growing_about_the_origin_changes_the_metric_blocks_alone(shape: str, sc
     np.testing.assert_allclose(found[metric], expected[metric] * scale, rtol=0.01)
 
 
-def test_the_order_of_points_does_not_matter() -> None:
+def test_descriptor_is_independent_of_point_order() -> None:
     view = box()
     order = np.random.default_rng(0).permutation(len(view.points))
     found = describe(view.points[order], view.gas, EYE)
     np.testing.assert_allclose(found, describe_view(view), atol=2e-3)
 
 
-def test_noise_moves_the_descriptor_less_than_the_shape_does() -> None:
-    """Guards against a descriptor that reflects random draws of the gas more than the object."""
+def test_descriptor_varies_less_with_noise_than_with_shape() -> None:
+    """Guards against a descriptor that reflects the randomness of the gas more than the object."""
     draws = {
         name: np.stack([describe_view(make(seed)) for seed in range(3)])[:, SCALE_FREE]
         for name, make in SHAPES.items()
@@ -185,7 +187,7 @@ def test_noise_moves_the_descriptor_less_than_the_shape_does() -> None:
     assert max(within) < min(between) / 2
 
 
-# any input gives finite numbers
+# finite values
 
 
 def flat(count: int) -> F4:
@@ -194,7 +196,7 @@ def flat(count: int) -> F4:
 
 
 LINE = np.linspace(0, 1, 50, dtype=np.float32)[:, None] * np.array([1, 2, 3], np.float32)
-ODD = {
+DEGENERATE = {
     "level": flat(10),
     "upright": np.ascontiguousarray(flat(10)[:, [0, 2, 1]]),
     "line": LINE,
@@ -208,10 +210,12 @@ ODD = {
 }
 
 
-@pytest.mark.parametrize("name", ODD)
+@pytest.mark.parametrize("name", DEGENERATE)
 @pytest.mark.parametrize("eye", [(0, 0, 0), (0, 0, 5), (1, 2, 3), (1e6, 0, 0)])
-def test_every_number_is_finite(name: str, eye: tuple[float, float, float]) -> None:
-    points = ODD[name]
+def test_features_of_degenerate_points_are_finite(
+    name: str, eye: tuple[float, float, float]
+) -> None:
+    points = DEGENERATE[name]
     chosen = points[:: max(1, len(points) // 12)]
     chosen = np.concatenate([chosen, chosen])[: max(2, len(chosen))]
     chain = np.array([[i, i + 1] for i in range(len(chosen) - 1)])
@@ -223,7 +227,7 @@ def test_every_number_is_finite(name: str, eye: tuple[float, float, float]) -> N
 
 @given(data=st.data(), count=st.integers(2, 40), neurons=st.integers(2, 20))
 @settings(deadline=None, max_examples=40)
-def test_every_number_is_finite_for_scattered_points(
+def test_features_of_random_points_are_finite(
     data: st.DataObject, count: int, neurons: int
 ) -> None:
     rng = np.random.default_rng(data.draw(st.integers(0, 1 << 30)))
@@ -236,8 +240,8 @@ def test_every_number_is_finite_for_scattered_points(
     assert np.isfinite(found).all()
 
 
-def test_points_the_graph_does_not_cover_are_left_out() -> None:
-    """A dropped part of the object must not stretch its extents."""
+def test_points_far_from_graph_are_ignored() -> None:
+    """A dropped part of the object must not increase its extents."""
     view = can()
     crumbs = view.points[:20] + np.array([1, 0, 0], np.float32)
     found = describe(np.concatenate([view.points, crumbs]), view.gas, EYE)
@@ -245,7 +249,7 @@ def test_points_the_graph_does_not_cover_are_left_out() -> None:
 
 
 @pytest.mark.parametrize("wrong", ["points", "eye", "gas", "shape", "few"])
-def test_refuses_what_it_cannot_describe(wrong: str) -> None:
+def test_invalid_input_is_rejected(wrong: str) -> None:
     view = box()
     points, neurons, eye = view.points.copy(), view.gas.neurons.copy(), EYE.copy()
     if wrong == "points":
@@ -263,24 +267,24 @@ def test_refuses_what_it_cannot_describe(wrong: str) -> None:
         describe(points, gas, eye)
 
 
-def test_edges_beyond_the_neurons_are_refused() -> None:
-    """A graph read from a file must not be followed out of the array."""
+def test_edges_beyond_neurons_are_rejected() -> None:
+    """A graph from a file must not lead to reads outside the arrays."""
     view = box()
     gas = NeuralGas(view.gas.neurons, np.array([[0, 9999]]))
     with pytest.raises(ValueError, match="edge"):
         describe(view.points, gas, EYE)
 
 
-# the pieces
+# the blocks
 
 
 def test_geodesics_are_shortest_paths() -> None:
     view = can()
-    straight = euclidean(*(np.ascontiguousarray(axis) for axis in view.gas.neurons.T))
+    distances = euclidean(*(np.ascontiguousarray(axis) for axis in view.gas.neurons.T))
     i, j = view.gas.edges.astype(int).T
-    graph = coo_array((straight[i, j], (i, j)), shape=straight.shape)
+    graph = coo_array((distances[i, j], (i, j)), shape=distances.shape)
     expected = shortest_path(graph.tocsr(), directed=False)
-    np.testing.assert_allclose(geodesic(straight, view.gas.edges), expected, atol=1e-6)
+    np.testing.assert_allclose(geodesic(distances, view.gas.edges), expected, atol=1e-6)
 
 
 def local_fit(view: View, radius: float) -> tuple[F4, F4]:
@@ -292,8 +296,8 @@ def local_fit(view: View, radius: float) -> tuple[F4, F4]:
     return normals, curvatures
 
 
-def test_curvature_of_a_ball_and_of_the_inside_of_a_bowl() -> None:
-    """Sign and size: convex towards the sensor is positive, whatever the normal's first sign."""
+def test_curvature_of_ball_and_bowl_has_true_sign_and_size() -> None:
+    """Convex towards the sensor is positive, whatever the initial sign of the normal."""
     normals, curvatures = local_fit(ball(), 0.025)
     assert np.median(curvatures) == pytest.approx(1 / 0.05, rel=0.15)
     out = ball().gas.neurons - [0, 0, 0.05]
@@ -303,13 +307,13 @@ def test_curvature_of_a_ball_and_of_the_inside_of_a_bowl() -> None:
     assert np.median(inside) == pytest.approx(-1 / 0.05, rel=0.15)
 
 
-def test_curvature_of_a_lying_can_is_along_one_direction() -> None:
+def test_lying_can_is_curved_in_one_direction() -> None:
     _, (most, least) = local_fit(can(lying=True), 0.02)
     assert np.median(most) == pytest.approx(1 / 0.035, rel=0.2)
     assert abs(np.median(least)) < 0.2 / 0.035
 
 
-def test_the_axes_of_a_can_are_found_from_one_side() -> None:
+def test_axis_of_can_is_found_from_one_side() -> None:
     """The centre of the visible part is not the centre of the object."""
     for lying in (False, True):
         view = can(lying=lying)
@@ -328,7 +332,7 @@ def test_the_axes_of_a_can_are_found_from_one_side() -> None:
             assert np.hypot(cx, cy) < 0.1
 
 
-def test_context_says_what_it_names() -> None:
+def test_context_features_match_their_names() -> None:
     value = dict(zip(DESCRIPTOR_NAMES, describe_view(box()).tolist(), strict=True))
     assert value["metric.height"] == pytest.approx(0.1, abs=0.006)
     assert value["context.height_to_across"] == pytest.approx(0.1 / (0.1 + 0.127), abs=0.04)

@@ -1,4 +1,4 @@
-"""The blocks of fitted solids and of the outline."""
+"""Tests of the descriptor blocks of fitted solids and of the outline."""
 
 import numpy as np
 import pytest
@@ -16,7 +16,7 @@ BOX = {name: k for k, name in enumerate(SOLID_NAMES)}
 
 
 def rows_of(points: F8) -> F4:
-    """Return points (n, 3) as the kernels take them: (3, n)."""
+    """Return points (n, 3) as an array (3, n) for the kernels."""
     return np.ascontiguousarray(points.T, np.float32)
 
 
@@ -26,7 +26,7 @@ def tilted(angle: float) -> F8:
 
 
 def half_cone(rng: np.random.Generator, *, slope: float) -> tuple[F8, F8]:
-    """Return points (600, 3) and normals of the side of a frustum that is seen from +x."""
+    """Return points (600, 3) and normals of the side of a frustum that is visible from +x."""
     height, angle = rng.uniform(-1, 1, 600), rng.uniform(-1.2, 1.2, 600)
     radius = 0.5 + slope * height
     outward = np.stack([np.cos(angle), np.sin(angle), np.full(600, -slope)], axis=1)
@@ -37,26 +37,24 @@ def half_cone(rng: np.random.Generator, *, slope: float) -> tuple[F8, F8]:
 @pytest.mark.parametrize("slope", [0.0, 0.2])
 @given(tilt=st.floats(-1.5, 1.5), off=st.floats(-0.2, 0.2), seed=st.integers(0, 100))
 @settings(deadline=None, max_examples=15)
-def test_the_axis_is_found_from_a_bad_guess(
-    slope: float, tilt: float, off: float, seed: int
-) -> None:
-    """Only a third of the surface is seen, with noise; a frustum must not bend the axis."""
+def test_axis_is_found_from_a_bad_guess(slope: float, tilt: float, off: float, seed: int) -> None:
+    """Only a third of the surface is visible, with noise; a frustum must not tilt the axis."""
     rng = np.random.default_rng(seed)
     points, normals = half_cone(rng, slope=slope)
-    turn = tilted(tilt)
-    cloud = rows_of((points + rng.normal(0, 0.01, points.shape)) @ turn.T)
-    axis, point = turn @ [0.1, off, 1.0], turn @ [0.1, off, 0.0]
+    rotation = tilted(tilt)
+    cloud = rows_of((points + rng.normal(0, 0.01, points.shape)) @ rotation.T)
+    axis, point = rotation @ [0.1, off, 1.0], rotation @ [0.1, off, 0.0]
     axis /= np.linalg.norm(axis)
     weight = np.full(600, 1 / 600, np.float32)
 
-    fit_axis(cloud, weight, rows_of(normals @ turn.T), axis, point, 4)
+    fit_axis(cloud, weight, rows_of(normals @ rotation.T), axis, point, 4)
 
-    assert abs(axis @ turn[:, 2]) > (0.998 if slope == 0 else 0.995)  # steps in place of a cone
-    assert np.linalg.norm(point - (point @ turn[:, 2]) * turn[:, 2]) < 0.05
+    assert abs(axis @ rotation[:, 2]) > (0.998 if slope == 0 else 0.995)  # slices are no cone
+    assert np.linalg.norm(point - (point @ rotation[:, 2]) * rotation[:, 2]) < 0.05
 
 
-def seen_box(rng: np.random.Generator, yaw: float) -> tuple[F4, F4]:
-    """Return points and normals (3, n) of the three faces of a box that are seen."""
+def visible_box(rng: np.random.Generator, yaw: float) -> tuple[F4, F4]:
+    """Return points and normals (3, n) of the three visible faces of a box."""
     half = np.array([0.6, 0.9, 0.7])
     points, normals = [], []
     for axis, sign in ((0, 1), (1, 1), (2, 1)):
@@ -65,45 +63,45 @@ def seen_box(rng: np.random.Generator, yaw: float) -> tuple[F4, F4]:
         points.append(face * half)
         normals.append(np.tile(np.eye(3)[axis] * sign, (300, 1)))
     c, s = np.cos(yaw), np.sin(yaw)
-    turn = np.array([[c, -s, 0], [s, c, 0], [0, 0, 1]])
-    cloud, directions = np.concatenate(points) @ turn.T, np.concatenate(normals) @ turn.T
+    rotation = np.array([[c, -s, 0], [s, c, 0], [0, 0, 1]])
+    cloud, directions = np.concatenate(points) @ rotation.T, np.concatenate(normals) @ rotation.T
     return rows_of(cloud), rows_of(directions)
 
 
-def solid_numbers(cloud: F4, normals: F4) -> F4:
+def solid_features(cloud: F4, normals: F4) -> F4:
     out = np.zeros(len(SOLID_NAMES), np.float32)
     low, high = float(cloud[2].min()), float(cloud[2].max())
-    turned = np.full(8, 0.1, np.float32)
+    revolution = np.full(8, 0.1, np.float32)
     owner = np.arange(cloud.shape[1])
-    solids(cloud, owner, cloud[0], cloud[1], normals, EYE, low, high, turned, out)
+    solids(cloud, owner, cloud[0], cloud[1], normals, EYE, low, high, revolution, out)
     return out
 
 
 @pytest.mark.parametrize("yaw", [-0.6, -0.3, 0.0])
-def test_a_box_fits_a_box_and_a_can_does_not(yaw: float) -> None:
-    """These two were confused most often; corners distinguish them even with noise."""
+def test_box_fits_a_box_and_can_does_not(yaw: float) -> None:
+    """These two were confused most often; corners must distinguish them despite noise."""
     rng = np.random.default_rng(0)
-    cloud, normals = seen_box(rng, yaw)
-    box = solid_numbers(cloud + rng.normal(0, 0.01, cloud.shape).astype(np.float32), normals)
+    cloud, normals = visible_box(rng, yaw)
+    box = solid_features(cloud + rng.normal(0, 0.01, cloud.shape).astype(np.float32), normals)
     side, directions = half_cone(rng, slope=0.0)
-    can = solid_numbers(rows_of(side), rows_of(directions))
+    can = solid_features(rows_of(side), rows_of(directions))
 
     assert box[BOX["box_faces"]] < 0.03
     assert box[BOX["corner_upright"]] < 0.08 < can[BOX["corner_upright"]]
     assert 2 * box[BOX["box_sides"]] < can[BOX["box_sides"]]
 
 
-def test_a_ball_is_recognised_by_its_residual() -> None:
+def test_ball_has_small_residual_unlike_box() -> None:
     rng = np.random.default_rng(0)
     normals = rng.normal(size=(900, 3))
     normals /= np.linalg.norm(normals, axis=1, keepdims=True)
     normals = normals[normals @ EYE > 0]
-    ball = solid_numbers(rows_of(normals + np.array([0.0, 0.0, 1.0])), rows_of(normals))
-    cloud, directions = seen_box(rng, 0.0)
+    ball = solid_features(rows_of(normals + np.array([0.0, 0.0, 1.0])), rows_of(normals))
+    cloud, directions = visible_box(rng, 0.0)
 
     assert ball[BOX["ball_residual"]] < 0.01
     assert ball[BOX["ball_height"]] == pytest.approx(1.0 / np.ptp(normals[:, 2]), abs=0.2)
-    assert solid_numbers(cloud, directions)[BOX["ball_residual"]] > 0.05
+    assert solid_features(cloud, directions)[BOX["ball_residual"]] > 0.05
 
 
 def outline_of(cloud: F8, eye: F4 = EYE) -> F4:
@@ -112,8 +110,8 @@ def outline_of(cloud: F8, eye: F4 = EYE) -> F4:
     return out
 
 
-def test_errors_along_the_line_of_sight_leave_the_outline() -> None:
-    """The outline exists because depth is noisy, so it must not depend on depth."""
+def test_outline_is_independent_of_depth_errors() -> None:
+    """The outline exists because depth is noisy."""
     rng = np.random.default_rng(0)
     points, _ = half_cone(rng, slope=0.2)
     rays = points - EYE
@@ -122,8 +120,8 @@ def test_errors_along_the_line_of_sight_leave_the_outline() -> None:
     np.testing.assert_allclose(outline_of(noisy), outline_of(points), atol=0.02)
 
 
-def test_the_long_outline_ends_at_the_narrow_end() -> None:
-    """A lying bottle pointing left or right is the same bottle."""
+def test_long_outline_ends_at_narrow_end() -> None:
+    """A lying bottle must have one outline whether it points left or right."""
     rng = np.random.default_rng(0)
     points, _ = half_cone(rng, slope=0.35)
     lying = points[:, [0, 2, 1]] * [1, 1.5, 1]

@@ -1,3 +1,5 @@
+"""Tests of surface reconstruction: voxels, Growing Neural Gas and its kernels."""
+
 from typing import Any, Literal, get_args
 
 import numpy as np
@@ -62,7 +64,7 @@ def test_voxels_average_their_points(
     cloud = np.array(points, np.float32).reshape(-1, 3)
     cells: dict[tuple[int, ...], list[F4]] = {}
     for point in cloud:
-        # the same arithmetic as the grid's: a point on a border may fall on either side
+        # the same arithmetic as in the grid, as a point on a border may fall on either side
         key = tuple(np.rint(np.float64(point) * (65536 / voxel_m)).astype(np.int64) >> 16)
         cells.setdefault(key, []).append(point)
     expected = [np.mean(cells[key], 0) for key in sorted(cells)]
@@ -71,14 +73,14 @@ def test_voxels_average_their_points(
     np.testing.assert_allclose(found, np.reshape(expected, (-1, 3)), atol=voxel_m * 1e-4)
 
 
-def test_voxels_do_not_depend_on_the_order_of_points() -> None:
+def test_voxels_are_independent_of_point_order() -> None:
     """Guards against results that differ between workers or readers."""
     cloud = half_sphere(3000)
     shuffled = cloud[rng().permutation(len(cloud))]
     np.testing.assert_array_equal(voxelize(cloud, voxel_m=0.005), voxelize(shuffled, voxel_m=0.005))
 
 
-def test_voxels_far_apart_need_no_memory_of_the_space_between() -> None:
+def test_distant_voxels_need_no_memory_between_them() -> None:
     cloud = np.array([[-2000, 0, 0], [2000, 2000, 2000]], np.float32)
     assert len(voxelize(cloud, voxel_m=0.005)) == 2
 
@@ -94,7 +96,7 @@ def test_voxels_far_apart_need_no_memory_of_the_space_between() -> None:
         ([[1.0, 0]], 0.01),
     ],
 )
-def test_voxels_refuse_what_they_cannot_count(points: list[list[float]], voxel_m: float) -> None:
+def test_voxelize_rejects_invalid_input(points: list[list[float]], voxel_m: float) -> None:
     with pytest.raises(ValueError, match=r"points|voxel_m"):
         voxelize(np.array(points, np.float32), voxel_m=voxel_m)
 
@@ -109,7 +111,7 @@ def test_voxels_refuse_what_they_cannot_count(points: list[list[float]], voxel_m
     seed=st.integers(0, 99),
 )
 @settings(deadline=None, max_examples=15)
-def test_every_graph_is_connected_and_within_the_points(
+def test_every_graph_is_connected_and_within_its_points(
     method: Method, count: int, stretch: tuple[float, float, float], seed: int
 ) -> None:
     """Guards against isolated neurons, separate parts, repeated edges, and stray neurons."""
@@ -130,18 +132,18 @@ def test_every_graph_is_connected_and_within_the_points(
 
 
 @pytest.mark.parametrize("method", METHODS)
-def test_same_seed_same_graph(method: Method) -> None:
+def test_graph_is_reproducible(method: Method) -> None:
     points = half_sphere()
-    first, again, other = (gas_of(points, method, seed) for seed in (1, 1, 2))
-    np.testing.assert_array_equal(first.neurons, again.neurons)
-    np.testing.assert_array_equal(first.edges, again.edges)
+    first, second, other = (gas_of(points, method, seed) for seed in (1, 1, 2))
+    np.testing.assert_array_equal(first.neurons, second.neurons)
+    np.testing.assert_array_equal(first.edges, second.edges)
     assert not np.array_equal(first.neurons, other.neurons)
 
 
 @pytest.mark.parametrize("method", METHODS)
 @pytest.mark.parametrize("scale", [1e-3, 1e3])
-def test_thresholds_follow_the_scale_of_the_object(method: Method, scale: float) -> None:
-    """With thresholds in metres, a big object would get more neurons than a small one."""
+def test_thresholds_scale_with_the_object(method: Method, scale: float) -> None:
+    """With thresholds in metres, a large object would get more neurons than a small one."""
     points = half_sphere()
     gas = gas_of(points, method)
     scaled = gas_of((points * scale).astype(np.float32), method)
@@ -151,7 +153,7 @@ def test_thresholds_follow_the_scale_of_the_object(method: Method, scale: float)
 
 
 @pytest.mark.parametrize("method", METHODS)
-def test_neurons_lie_on_the_surface_evenly(method: Method) -> None:
+def test_neurons_cover_the_surface_evenly(method: Method) -> None:
     gas = gas_of(half_sphere(1000), method)
     assert np.linalg.norm(gas.neurons, axis=1) == pytest.approx(0.05, rel=0.05)
     gaps = np.linalg.norm(gas.neurons[:, None] - gas.neurons, axis=2)
@@ -160,7 +162,7 @@ def test_neurons_lie_on_the_surface_evenly(method: Method) -> None:
     assert len(triangles_of(gas.edges, len(gas.neurons))) > len(gas.neurons) / 2
 
 
-def test_noise_moves_neurons_less_than_points() -> None:
+def test_neurons_are_less_noisy_than_points() -> None:
     """Averaging noise is the reason for using a neural gas."""
     clean = half_sphere(1000)
     noisy = (clean * (1 + 0.04 * rng(5).normal(size=(1000, 1)))).astype(np.float32)
@@ -169,7 +171,7 @@ def test_noise_moves_neurons_less_than_points() -> None:
     assert off_neurons < off_points / 2
 
 
-def test_no_surface_is_none() -> None:
+def test_degenerate_points_have_no_surface() -> None:
     few = half_sphere(MIN_POINTS - 1)
     same = np.full((100, 3), 0.3, np.float32)
     two = np.repeat(np.array([[0, 0, 0], [1, 0, 0]], np.float32), 50, axis=0)
@@ -179,21 +181,21 @@ def test_no_surface_is_none() -> None:
 
 @pytest.mark.parametrize("method", METHODS)
 @pytest.mark.parametrize("value", [np.nan, np.inf])
-def test_a_point_that_is_not_finite_is_refused(method: Method, value: float) -> None:
-    """Kernels that reorder sums must never meet NaN; also not at a point that would be skipped."""
+def test_non_finite_points_are_rejected(method: Method, value: float) -> None:
+    """Kernels that reorder sums must not get NaN, not even at a point that they skip."""
     points = half_sphere(3000)
     points[1, 2] = value
     with pytest.raises(ValueError, match="finite"):
         reconstruct(points, settings=surface(method), rng=rng())
 
 
-def test_refuses_wrong_shapes() -> None:
+def test_wrong_shapes_are_rejected() -> None:
     with pytest.raises(ValueError, match="shape"):
         reconstruct(np.zeros((50, 2), np.float32), settings=SMALL, rng=rng())
 
 
-def test_a_small_separate_part_is_dropped_and_a_large_one_joined() -> None:
-    """Points of a neighbour that slipped into the mask; an object cut in two by an occluder."""
+def test_small_separate_part_is_dropped_and_large_one_joined() -> None:
+    """Points of a neighbour in the mask, and an object divided by an occluder."""
     body = half_sphere(600)
     crumb = half_sphere(60, 0.01, seed=1) + np.float32(0.5)
     assert np.ptp(gas_of(np.concatenate([body, crumb])).neurons[:, 0]) < 0.2
@@ -214,7 +216,7 @@ def _search(x: F4, y: F4, z: F4, sx: float, sy: float, sz: float) -> Any:
 
 
 @pytest.mark.parametrize("size", [16, 80, 528])
-def test_vector_search_finds_the_nearest(size: int) -> None:
+def test_simd_search_finds_nearest_neurons(size: int) -> None:
     """Guards against a skipped lane or remainder, and a winner listed twice."""
     places = rng(size).uniform(-1, 1, (3, size)).astype(np.float32)
     for signal in rng(1).uniform(-1, 1, (200, 3)).astype(np.float32):
@@ -234,7 +236,7 @@ def _adapt(x: F4, y: F4, z: F4, born: I4, wins: I4, row: int, winner: int, rates
     )
 
 
-def test_vector_adaptation_moves_the_winner_and_its_neighbours_alone() -> None:
+def test_simd_adaptation_moves_only_winner_and_its_neighbours() -> None:
     places = rng().uniform(-1, 1, (3, 48)).astype(np.float32)
     born = np.full((2, 48), 1 << 29, np.int32)
     wins = np.arange(48, dtype=np.int32)
@@ -250,7 +252,7 @@ def test_vector_adaptation_moves_the_winner_and_its_neighbours_alone() -> None:
 
 
 def _fritzke(points: F4, state: int, target: int, signals: int, interval: int) -> NeuralGas:
-    """Thesis Algorithm 3 step by step, with the deviations the kernel states."""
+    """Run Algorithm 3 of the thesis step by step, with the deviations that the kernel states."""
     places = [np.float64(points[0]), np.float64(points[1])]
     error, age = [0.0, 0.0], {frozenset((0, 1)): 0}
     order: list[int] = list(range(len(points)))
@@ -290,8 +292,8 @@ def _fritzke(points: F4, state: int, target: int, signals: int, interval: int) -
     return NeuralGas(np.array(places), np.array(sorted(sorted(edge) for edge in age)))
 
 
-def test_the_kernel_is_the_published_algorithm() -> None:
-    """The clock of the edges, the errors that grow instead of decaying, and the row of rates."""
+def test_kernel_matches_published_algorithm() -> None:
+    """The kernel stores ages of edges, errors and rates in another form."""
     points = half_sphere(60, radius=1.0)
     gas = empty_gas(20)
     gas.x[:2], gas.y[:2], gas.z[:2] = points[:2].T
@@ -308,8 +310,8 @@ def test_the_kernel_is_the_published_algorithm() -> None:
     np.testing.assert_array_equal(np.argwhere(np.triu(linked)), expected.edges)
 
 
-def test_a_third_neighbour_far_away_is_not_linked() -> None:
-    """Two neurons are apart from a row of others: the third nearest is across the gap."""
+def test_distant_third_neighbour_is_not_linked() -> None:
+    """The third neighbour of two neurons that are apart from a row is across the gap."""
     row = np.stack([np.arange(8.0), np.zeros(8), np.zeros(8)], axis=1) / 10
     pair = np.array([[0.0, 0.9, 0.0], [0.1, 0.9, 0.0]])
     neurons = np.concatenate([row, pair]).astype(np.float32)

@@ -1,4 +1,4 @@
-"""Moving least squares removes noise and keeps the shape."""
+"""Tests of smoothing by moving least squares."""
 
 import numpy as np
 import pytest
@@ -12,7 +12,7 @@ from shapecat.surface import smooth, thin, voxelize
 
 
 def cap(count: int, noise: float, seed: int = 0) -> F4:
-    """Return noisy points of half a ball of 40 mm."""
+    """Return noisy points of a half sphere with a radius of 40 mm."""
     rng = np.random.default_rng(seed)
     points = rng.normal(size=(count, 3))
     points[:, 2] = np.abs(points[:, 2])
@@ -21,7 +21,7 @@ def cap(count: int, noise: float, seed: int = 0) -> F4:
     return found.astype(np.float32)
 
 
-def test_noise_goes_and_the_ball_keeps_its_size() -> None:
+def test_smoothing_removes_noise_and_keeps_size() -> None:
     """A mean or a plane alone would pull a curved surface inwards, by a millimetre here."""
     before = np.linalg.norm(cap(1500, 0.002), axis=1)
     after = np.linalg.norm(smooth(cap(1500, 0.002), radius_m=0.015), axis=1)
@@ -32,7 +32,7 @@ def test_noise_goes_and_the_ball_keeps_its_size() -> None:
 
 @settings(deadline=None, max_examples=20)
 @given(st.integers(0, 1000))
-def test_a_plane_stays_where_it_is(seed: int) -> None:
+def test_plane_is_unchanged(seed: int) -> None:
     rng = np.random.default_rng(seed)
     flat = np.c_[rng.uniform(-0.05, 0.05, (300, 2)), np.zeros(300)]
     points = (flat @ rotation_from_quaternion(rng.normal(size=4)).T + [0.3, -0.2, 1]).astype("f4")
@@ -42,8 +42,8 @@ def test_a_plane_stays_where_it_is(seed: int) -> None:
     assert np.abs(moved - points).max() < 1e-5
 
 
-def test_the_same_in_every_place_and_order() -> None:
-    """Cells are an index: a border that is not searched would show in a shifted grid."""
+def test_smoothing_is_independent_of_position_and_order() -> None:
+    """A neighbour cell that is not searched would show in a shifted grid."""
     points = cap(600, 0.002)
     moved = smooth(points, radius_m=0.02)
     shifted = smooth(points + np.float32(0.0137), radius_m=0.02)
@@ -53,8 +53,8 @@ def test_the_same_in_every_place_and_order() -> None:
     assert np.abs(smooth(points[order], radius_m=0.02) - moved[order]).max() < 1e-5
 
 
-def test_neighbours_are_all_within_the_radius() -> None:
-    """Against the sums over all pairs, where the surface is a plane and noise is small."""
+def test_points_with_few_neighbours_are_removed() -> None:
+    """The count must match the distances of all pairs."""
     rng = np.random.default_rng(3)
     points = np.c_[rng.uniform(0, 0.1, (200, 2)), rng.normal(0, 1e-3, 200)].astype("f4")
     apart = np.linalg.norm(points[:, None] - points[None], axis=2)
@@ -64,15 +64,15 @@ def test_neighbours_are_all_within_the_radius() -> None:
     assert len(smooth(points, radius_m=0.008)) == 200 - lonely.sum()
 
 
-def test_outliers_are_left_out() -> None:
+def test_outliers_are_removed() -> None:
     points = np.r_[cap(800, 0.001), [[0.2, 0.2, 0.2]]].astype(np.float32)
 
     assert np.abs(smooth(points, radius_m=0.015)).max() < 0.05
 
 
 @pytest.mark.parametrize("count", [0, 1, 3, 30])
-def test_points_in_one_place_or_on_a_line(count: int) -> None:
-    """No direction is the least: the answer is finite, and near the points, all the same."""
+def test_degenerate_points_give_finite_results(count: int) -> None:
+    """Points in one place or on a line have no normal."""
     same = np.full((count, 3), 0.5, np.float32)
     line = (same + np.linspace(0, 0.02, count)[:, None] * [1, 1, 0]).astype(np.float32)
     for points in (same, line):
@@ -85,16 +85,16 @@ def test_points_in_one_place_or_on_a_line(count: int) -> None:
     ("points", "radius"),
     [([[0, 0, np.nan]] * 5, 0.01), ([[0, 0, 0], [1, 0, 0]], 1e-7), ([[0, 0, 0]], 0), ([[0, 0]], 1)],
 )
-def test_what_cannot_be_smoothed_is_refused(points: list[list[float]], radius: float) -> None:
+def test_invalid_input_is_rejected(points: list[list[float]], radius: float) -> None:
     with pytest.raises(ValueError, match=r"points|radius"):
         smooth(np.array(points, np.float32), radius_m=radius)
 
 
-def test_it_is_off_unless_asked_for() -> None:
-    """The default model has learned from points that were only averaged."""
+def test_smoothing_is_off_by_default() -> None:
+    """The default model was trained on points that were only averaged."""
     points = cap(6000, 0.002)
     averaged = voxelize(points, voxel_m=0.005)
-    asked = SurfaceSettings(smooth_radius_m=0.015)
+    enabled = SurfaceSettings(smooth_radius_m=0.015)
 
     assert np.array_equal(thin(points, settings=SurfaceSettings()), averaged)
-    assert np.array_equal(thin(points, settings=asked), smooth(averaged, radius_m=0.015))
+    assert np.array_equal(thin(points, settings=enabled), smooth(averaged, radius_m=0.015))

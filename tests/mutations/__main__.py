@@ -38,7 +38,7 @@ KNOWN_BY: dict[str, Sequence[str]] = {
     "shapecat.batch.storage": ("test_remote",),
     "shapecat.cameras": ("test_cameras", "test_colour", "test_recordings_colour"),
     "shapecat.cli": ("test_commands_worked", "test_command_line", "test_pipeline",
-                     "test_exports_readback", "test_full_boxes_door"),
+                     "test_exports_readback", "test_boxes_in_outputs"),
     "shapecat.cli.compare": ("test_compare",),
     "shapecat.cli.evaluate": ("test_evaluation", "test_command_line"),
     "shapecat.cli.process": ("test_commands_worked", "test_command_line", "test_pipeline",

@@ -1,4 +1,4 @@
-"""Boxes in the outputs: full ones, or the visible ones with `--boxes visible`."""
+"""Tests of the boxes in the outputs: full ones, or visible ones with `--boxes visible`."""
 
 import json
 import shutil
@@ -16,7 +16,7 @@ Sizes = dict[tuple[int, str], list[float]]
 
 
 def annotated(folder: Path) -> Sizes:
-    """Return by stamp and track the sizes in annotated.mcap."""
+    """Return the sizes in annotated.mcap by stamp and track."""
     found = {}
     with (folder / "annotated.mcap").open("rb") as file:
         reader = make_reader(file, decoder_factories=[DecoderFactory()])
@@ -30,25 +30,25 @@ def annotated(folder: Path) -> Sizes:
 
 
 def tables(folder: Path, *, full: bool) -> Sizes:
-    """Return the same of the tables: full sizes of the tracks, or the sizes of the detections."""
-    seen = {
+    """Return the sizes in the tables: full sizes of tracks, or visible sizes of detections."""
+    visible = {
         (row["frame"], row["detection"]): row["size"]
         for row in pq.read_table(folder / "detections.parquet").to_pylist()
     }
     return {
         (row["stamp_ns"], str(row["track"])): row["size_full"]
         if full
-        else seen[row["frame"], row["detection"]]
+        else visible[row["frame"], row["detection"]]
         for row in pq.read_table(folder / "tracks.parquet").to_pylist()
         if row["detection"] is not None
     }
 
 
 @pytest.mark.parametrize("options", [(), ("--boxes", "visible"), ("--boxes", "full")])
-def test_annotations_have_the_boxes_asked_for(
+def test_annotations_have_requested_boxes(
     guessed_run: Path, tmp_path: Path, shapecat: Callable[..., Result], options: tuple[str, ...]
 ) -> None:
-    """Annotating again with other boxes must not keep the earlier ones."""
+    """Annotating with other boxes must replace the earlier ones."""
     folder = tmp_path / "table"
     shutil.copytree(guessed_run, folder)
     result = shapecat("annotate", folder, *options)
@@ -60,13 +60,13 @@ def test_annotations_have_the_boxes_asked_for(
     keys = sorted(found)
     assert np.allclose([found[k] for k in keys], [expected[k] for k in keys], atol=1e-6)
     assert not np.allclose([found[k] for k in keys], [other[k] for k in keys], atol=1e-3)
-    if options == ("--boxes", "visible"):  # once more, for the sake of a label: boxes stay
+    if options == ("--boxes", "visible"):  # annotating again without the option keeps them
         assert shapecat("annotate", folder).exit_code == 0
         assert annotated(folder) == found
 
 
 @pytest.mark.parametrize("options", [(), ("--boxes", "visible")])
-def test_exports_have_the_boxes_asked_for(
+def test_exports_have_requested_boxes(
     guessed_run: Path, tmp_path: Path, shapecat: Callable[..., Result], options: tuple[str, ...]
 ) -> None:
     """A model trained on visible boxes would not predict whole objects."""
@@ -86,7 +86,7 @@ def test_exports_have_the_boxes_asked_for(
     assert not np.allclose(found, others, atol=1e-3)
 
 
-def test_export_refuses_other_boxes_by_name(
+def test_export_rejects_unknown_kind_of_boxes(
     guessed_run: Path, tmp_path: Path, shapecat: Callable[..., Result]
 ) -> None:
     result = shapecat(
