@@ -1,4 +1,4 @@
-"""Batches: the same tables on every executor; no recording lost, repeated or left over."""
+"""Tests of batches: same tables on every executor, and no recording lost or repeated."""
 
 import json
 import os
@@ -38,17 +38,17 @@ QUIET: Any = {"stdout": subprocess.DEVNULL, "stderr": subprocess.DEVNULL}
 
 
 class Watcher:
-    """Remembers the reports, and may react to them."""
+    """Collects reports of progress, and may react to them."""
 
     def __init__(self, act: Callable[[str, str], None] | None = None) -> None:
-        self.heard: set[str] = set()
+        self.reported: set[str] = set()
         self.outcomes: list[Outcome] = []
         self._act = act
 
     def progress(self, folder: str, phase: str, done: int, total: int | None) -> None:
         """Receive the progress of a recording."""
         assert total is None or done <= total
-        self.heard.add(folder)
+        self.reported.add(folder)
         if self._act is not None:
             self._act(folder, phase)
 
@@ -105,9 +105,7 @@ def states(out: Path) -> dict[str, str]:
 ALL_DONE = {**dict.fromkeys(NAMES, "complete"), "broken": "failed"}
 
 
-def test_bad_recordings_are_named_and_the_others_complete(
-    recordings: Path, one_by_one: Path
-) -> None:
+def test_bad_recording_is_reported_and_others_complete(recordings: Path, one_by_one: Path) -> None:
     assert states(one_by_one) == ALL_DONE
     entries = Manifest(one_by_one / "manifest.jsonl").entries
     assert entries["broken"].exit_code == 3
@@ -116,7 +114,9 @@ def test_bad_recordings_are_named_and_the_others_complete(
     assert {path.name for path in one_by_one.iterdir()} == {*NAMES, "manifest.jsonl"}
 
 
-def test_plan_progress_and_closing_table(shapecat: Run, recordings: Path, tmp_path: Path) -> None:
+def test_plan_progress_and_closing_table_are_printed(
+    shapecat: Run, recordings: Path, tmp_path: Path
+) -> None:
     """Events come from two processes at once."""
     options = ("--out", tmp_path, "--end", 0.1, "--no-rrd")
     first = shapecat("process", recordings, *options, "--jobs", 2, "--progress", "jsonl")
@@ -158,7 +158,7 @@ def test_complete_recordings_are_not_opened_again(
     assert (one_by_one / "log" / "run.json").stat().st_mtime_ns == before
 
 
-def test_changed_work_is_not_taken_for_done(recordings: Path, one_by_one: Path) -> None:
+def test_changed_work_is_not_complete(recordings: Path, one_by_one: Path) -> None:
     """Changed content, settings or model, or a missing output, must be noticed cheaply."""
 
     def status(job: Job) -> str:
@@ -182,7 +182,7 @@ def test_changed_work_is_not_taken_for_done(recordings: Path, one_by_one: Path) 
 
 
 @pytest.mark.many
-def test_two_processes_give_the_same_tables(
+def test_two_processes_give_same_tables(
     shapecat: Run, recordings: Path, one_by_one: Path, tmp_path: Path
 ) -> None:
     done = shapecat("process", recordings, "--out", tmp_path, "--jobs", 2, "--no-rrd")
@@ -193,7 +193,7 @@ def test_two_processes_give_the_same_tables(
 
 
 @pytest.mark.usefixtures("all_awake")
-def test_processes_that_share_frames_give_the_same_tables(recordings: Path, tmp_path: Path) -> None:
+def test_processes_sharing_frames_give_same_tables(recordings: Path, tmp_path: Path) -> None:
     """They share blocks of frames, so there must be several."""
     from shapecat.pipeline import process  # noqa: PLC0415  beside its only use
 
@@ -204,7 +204,7 @@ def test_processes_that_share_frames_give_the_same_tables(recordings: Path, tmp_
     assert_same_tables(tmp_path / "alone", tmp_path / "shared")
 
 
-def test_shards_give_the_same_tables(
+def test_shards_give_same_tables(
     shapecat: Run, recordings: Path, one_by_one: Path, tmp_path: Path
 ) -> None:
     """Together, the shards process every recording exactly once."""
@@ -224,7 +224,7 @@ def test_shards_give_the_same_tables(
 
 @pytest.mark.parametrize(("gap_s", "found"), [(-0.5, 2), (0.01, 1), (60, 2)])
 def test_takes_are_not_mixed_in_one_run(tmp_path: Path, gap_s: float, found: int) -> None:
-    """Only the parts of one bag follow each other, if its folder was renamed."""
+    """Only files that follow each other at once are parts of one bag."""
     (tmp_path / "lab").mkdir()
     for k, begin in enumerate((0, SECOND + int(gap_s * SECOND))):
         items = [("/x", EPOCH + begin + at, make("std_msgs/msg/String", "x")) for at in (0, SECOND)]
@@ -233,7 +233,7 @@ def test_takes_are_not_mixed_in_one_run(tmp_path: Path, gap_s: float, found: int
     assert len(find_recordings([str(tmp_path)]).kept) == found
 
 
-def test_folders_are_searched_and_bags_are_not_taken_apart(tmp_path: Path) -> None:
+def test_folders_are_searched_and_bags_stay_whole(tmp_path: Path) -> None:
     """A shell expands folder/** to folders, their contents, and files of other programs."""
     bags = (
         "bag/bag_0.db3",
@@ -302,7 +302,7 @@ class Fragile(Executor):
         self._folder = folder
 
     def submit(self, fn: Any, /, *args: Any, **kwargs: Any) -> Future[Any]:
-        """Do it here and now."""
+        """Run the call at once."""
         future: Future[Any] = Future()
         name = args[0].folder.name
         self.begun.append(name)
@@ -324,7 +324,7 @@ def test_recording_that_kills_its_workers_is_given_up(recordings: Path, tmp_path
     assert states(tmp_path) == {**ALL_DONE, "bag": "failed"}
 
 
-def test_recording_that_only_waited_is_not_blamed(recordings: Path, tmp_path: Path) -> None:
+def test_recording_that_only_waited_has_one_try(recordings: Path, tmp_path: Path) -> None:
     """A scheduler that restarts drops all queued tasks, possibly many times."""
 
     class Forgetful(Fragile):
@@ -344,8 +344,8 @@ def test_recording_that_only_waited_is_not_blamed(recordings: Path, tmp_path: Pa
     assert Manifest(tmp_path / "manifest.jsonl").entries["bag"].tries == 1
 
 
-def test_full_disk_stops_the_large_and_not_the_small(shapecat: Run, tmp_path: Path) -> None:
-    """A limit on the size of files stands for the disk."""
+def test_full_disk_fails_only_large_recording(shapecat: Run, tmp_path: Path) -> None:
+    """A limit on the file size simulates a full disk."""
     (tmp_path / "in").mkdir()
     record(tmp_path / "in" / "long.mcap", FRAMES)
     record(tmp_path / "in" / "short.mcap", 4)
@@ -377,7 +377,7 @@ def heed_interrupts() -> None:
     signal.signal(signal.SIGINT, signal.SIG_DFL)
 
 
-def test_interrupted_batch_ends_at_once_and_goes_on(
+def test_interrupted_batch_ends_and_can_be_resumed(
     shapecat: Run, recordings: Path, one_by_one: Path, tmp_path: Path
 ) -> None:
     """Ctrl-C: exit code 130, no process left, and a second run completes the rest."""
@@ -403,7 +403,7 @@ def test_interrupted_batch_ends_at_once_and_goes_on(
     assert_same(one_by_one, tmp_path)
 
 
-def test_dask_gives_the_same_tables_though_a_worker_is_killed(
+def test_dask_gives_same_tables_after_killed_worker(
     recordings: Path, one_by_one: Path, tmp_path: Path
 ) -> None:
     pytest.importorskip("distributed")
@@ -426,10 +426,10 @@ def test_dask_gives_the_same_tables_though_a_worker_is_killed(
 
 
 @pytest.mark.many
-def test_dask_goes_on_when_its_scheduler_is_restarted(
+def test_dask_batch_survives_restart_of_scheduler(
     recordings: Path, one_by_one: Path, tmp_path: Path
 ) -> None:
-    """A dead scheduler takes its state and its workers along; both are started again."""
+    """A dead scheduler loses its state and its workers; both are started again."""
     pytest.importorskip("distributed")
     with socket.create_server(("127.0.0.1", 0)) as server:
         address = f"tcp://127.0.0.1:{server.getsockname()[1]}"
@@ -454,7 +454,7 @@ def test_dask_goes_on_when_its_scheduler_is_restarted(
 
 
 class DaskCluster:
-    """A scheduler and two workers, each of its own processes."""
+    """A scheduler and two workers, in their own processes."""
 
     def __init__(self, address: str) -> None:
         dask = (sys.executable, "-m", "dask")
@@ -475,7 +475,7 @@ class DaskCluster:
 
 
 @pytest.mark.many
-def test_ray_gives_the_same_tables(
+def test_ray_gives_same_tables(
     shapecat: Run, recordings: Path, one_by_one: Path, tmp_path: Path
 ) -> None:
     options = ("--out", tmp_path, "--executor", "ray", "--jobs", 2, "--no-rrd")
@@ -484,7 +484,7 @@ def test_ray_gives_the_same_tables(
     assert_same(one_by_one, tmp_path)
 
 
-def test_manifest_survives_what_a_crash_left(tmp_path: Path, one_by_one: Path) -> None:
+def test_manifest_survives_damaged_lines(tmp_path: Path, one_by_one: Path) -> None:
     """A truncated or foreign line must not hide or absorb its neighbours."""
     path = tmp_path / "manifest.jsonl"
     shutil.copy(one_by_one / "manifest.jsonl", path)
@@ -500,7 +500,7 @@ def test_manifest_survives_what_a_crash_left(tmp_path: Path, one_by_one: Path) -
     assert len(Manifest(path).entries) == len(before)
 
 
-def test_batch_goes_on_when_its_manifest_cannot_be_written(
+def test_batch_continues_if_manifest_cannot_be_written(
     shapecat: Run, recordings: Path, tmp_path: Path
 ) -> None:
     (tmp_path / "manifest.jsonl").mkdir()

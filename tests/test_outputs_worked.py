@@ -1,4 +1,4 @@
-"""The outputs of a run, on worked examples without equal numbers."""
+"""Tests of the outputs of a run, on worked examples whose numbers all differ."""
 
 import csv
 import io
@@ -83,10 +83,10 @@ def labelled_frame(index: int, *objects: LabelledObject, topic: str = "/depth") 
     return LabelledFrame(topic, index, index * MS, 0, "cam", None, (), objects, (), {}, UP)
 
 
-# ---- annotations: how long, and which are deleted
+# ---- annotations: lifetime and deletion
 
 
-def shown(topic: str, stamp: int, *tracks: int, ended: tuple[int, ...] = ()) -> ShownFrame:
+def shown_frame(topic: str, stamp: int, *tracks: int, ended: tuple[int, ...] = ()) -> ShownFrame:
     boxes = tuple(ShownBox(t, "cup", 0.9, (0, 0, 1), (1, 1, 1), UPRIGHT) for t in tracks)
     return ShownFrame(topic, stamp, stamp, stamp, "cam", boxes, ended)
 
@@ -94,14 +94,14 @@ def shown(topic: str, stamp: int, *tracks: int, ended: tuple[int, ...] = ()) -> 
 def test_annotations_outlive_their_period_and_are_deleted_once() -> None:
     """The period is the time to the next frame of the topic, else from the previous one."""
     frames = [
-        shown("/a", 100, 1, 2),
-        shown("/a", 140, 2),
-        shown("/b", 150, 2, 7),
-        shown("/a", 200, 3, ended=(9,)),
-        shown("/b", 250, ended=(7,)),
-        shown("/c", 260, 4),
-        shown("/c", 300, 4),
-        shown("/c", 400),
+        shown_frame("/a", 100, 1, 2),
+        shown_frame("/a", 140, 2),
+        shown_frame("/b", 150, 2, 7),
+        shown_frame("/a", 200, 3, ended=(9,)),
+        shown_frame("/b", 250, ended=(7,)),
+        shown_frame("/c", 260, 4),
+        shown_frame("/c", 300, 4),
+        shown_frame("/c", 400),
     ]
     found = [(a.lifetime_ns, a.gone) for a in _annotations(frames)]
 
@@ -109,7 +109,7 @@ def test_annotations_outlive_their_period_and_are_deleted_once() -> None:
         (60, ()),  # 40 to the next
         (60, (1,)),  # 40 from the one before, as another topic follows
         (1_500_000_000, ()),  # a topic's first frame: a second is assumed
-        (90, (9,)),  # 2 is still seen on /b
+        (90, (9,)),  # 2 is still visible on /b
         (150, (2, 7)),
         (60, ()),
         (150, ()),  # the next frame comes late
@@ -117,14 +117,14 @@ def test_annotations_outlive_their_period_and_are_deleted_once() -> None:
     ]
 
 
-def test_images_of_two_cameras_with_the_same_stamp_are_both_annotated(
+def test_simultaneous_images_of_two_cameras_are_annotated(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
-    """Cameras are triggered together. An image of two depth streams is annotated once."""
-    seen = [("/l", 5, 30), ("/r", 5, 30)] * 2 + [("/r", 9, 30), ("/cloud", 11, 1)]
+    """An image that belongs to two depth streams is annotated once."""
+    images = [("/l", 5, 30), ("/r", 5, 30)] * 2 + [("/r", 9, 30), ("/cloud", 11, 1)]
     masks = [
         (("/d", k), ImageMasks(topic, stamp, stamp + 1, "c", 40, height, {0: (3, 4, 7, 9)}, {}))
-        for k, (topic, stamp, height) in enumerate(seen)
+        for k, (topic, stamp, height) in enumerate(images)
     ]
     item = ShownDetection(0, TrackLabel(6, "cup", 0.8), 0)
     place = "shapecat.outputs.image_annotations"
@@ -137,10 +137,10 @@ def test_images_of_two_cameras_with_the_same_stamp_are_both_annotated(
     assert {frame.boxes for frame in frames} == {(ImageBox(6, "cup", 0.8, (3, 4, 7, 9)),)}
 
 
-def test_a_merged_track_has_one_box_around_all_its_parts_on_an_image(
+def test_merged_track_has_one_box_on_image(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
-    """A box around one part would teach half an object; a part may be out of view."""
+    """A model would learn half an object from a box around one part; a part may be out of view."""
     boxes = {0: (3, 4, 7, 9), 1: (20, 1, 2, 3), 2: (5, 11, 12, 6)}
     masks = ImageMasks("/l", 5, 6, "c", 40, 30, boxes, {})
     whole, other = TrackLabel(6, "cup", 0.8), TrackLabel(9, "can", 0.7)
@@ -159,7 +159,7 @@ def test_a_merged_track_has_one_box_around_all_its_parts_on_an_image(
     )
 
 
-def test_a_frame_has_a_colour_image_only_together_with_its_masks(
+def test_colour_image_requires_masks(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
     """Runs of older versions have no masks: exports then omit colour instead of failing."""
@@ -179,17 +179,17 @@ def test_a_frame_has_a_colour_image_only_together_with_its_masks(
 
 
 @pytest.mark.parametrize(("fixed_frame", "drawn"), [("map", [0, 3]), (None, [0, 1, 2, 3])])
-def test_a_camera_that_passes_by_moves_nothing_in_the_fixed_frame(
+def test_moving_camera_does_not_redraw_static_scene(
     monkeypatch: pytest.MonkeyPatch, fixed_frame: str | None, drawn: list[int]
 ) -> None:
-    """Redrawn at every step of the robot, the review of a still table would be ten times longer."""
-    turn = Rotation.from_euler("zyx", [0.7, -0.4, 0.3]).as_matrix()
-    place = np.array([1.31, -0.24, 0.87])
+    """Otherwise the review of a static table would be ten times larger."""
+    rotation = Rotation.from_euler("zyx", [0.7, -0.4, 0.3]).as_matrix()
+    center = np.array([1.31, -0.24, 0.87])
     frames = []
     for k in range(4):
-        pose = Pose(turn, np.array([0.12 * k, 0.05, -0.03]))
-        moved = np.array([0.02 if k == 3 else 0.0, 0.0, 0.0])  # a hand moves it in the end
-        box = box_at(turn.T @ (place + moved - pose.translation), (0.12, 0.07, 0.19))
+        pose = Pose(rotation, np.array([0.12 * k, 0.05, -0.03]))
+        shift = np.array([0.02 if k == 3 else 0.0, 0.0, 0.0])  # it moves in the last frame
+        box = box_at(rotation.T @ (center + shift - pose.translation), (0.12, 0.07, 0.19))
         one = labelled_frame(k, labelled_object(6, box=box))
         frames.append(replace(one, stamp_ns=100 * k * MS, fixed_from_sensor=pose))
     monkeypatch.setattr(
@@ -204,14 +204,14 @@ def test_a_camera_that_passes_by_moves_nothing_in_the_fixed_frame(
     assert [one.labelled.index for one in found if one.frame is not None] == drawn
 
 
-def test_a_scene_is_drawn_if_a_whole_object_moves_or_the_clock_goes_back() -> None:
+def test_scene_is_redrawn_if_object_moves_or_time_goes_back() -> None:
     """The visible part of an object at rest varies from frame to frame."""
-    rests = box_at((0.31, -0.24, 1.17), (0.12, 0.07, 0.19))
-    seen = [(0, 0.0, 0.0), (100, 0.03, 0.0), (200, 0.03, 0.02), (150, 0.03, 0.02), (220, 0.0, 0.02)]
+    resting = box_at((0.31, -0.24, 1.17), (0.12, 0.07, 0.19))
+    data = [(0, 0.0, 0.0), (100, 0.03, 0.0), (200, 0.03, 0.02), (150, 0.03, 0.02), (220, 0.0, 0.02)]
     frames = []
-    for k, (time, visible, whole) in enumerate(seen):
+    for k, (time, visible, whole) in enumerate(data):
         box, full = (
-            replace(rests, center=rests.center + np.array([x, 0, 0])) for x in (visible, whole)
+            replace(resting, center=resting.center + np.array([x, 0, 0])) for x in (visible, whole)
         )
         one = labelled_frame(k, labelled_object(6, box=box, full=full))
         frames.append(replace(one, stamp_ns=time * MS))
@@ -225,7 +225,7 @@ def test_a_scene_is_drawn_if_a_whole_object_moves_or_the_clock_goes_back() -> No
 # ---- the review: paths
 
 
-def test_a_long_path_is_forgotten_from_its_beginning() -> None:
+def test_long_path_keeps_newest_positions() -> None:
     """The newest 500 positions are kept; steps of at most 15 mm are ignored."""
     drawn: list[Any] = []
     columns: Any = SimpleNamespace(add=lambda _entity, _at, ways, _draw, **_: drawn.append(ways))
@@ -248,30 +248,30 @@ def test_a_long_path_is_forgotten_from_its_beginning() -> None:
     ("annotated", "kind", "expected"),
     [
         ("/depth", "mcap", "cdr"),  # its own, though most topics are JSON
-        ("/bytes", "mcap", "json"),  # of an encoding that nothing can be annotated in
+        ("/bytes", "mcap", "json"),  # an encoding that annotations do not support
         ("/depth", "ros1", "cdr"),
         (None, "mcap", "json"),
     ],
 )
-def test_annotations_are_encoded_as_the_topic_they_belong_to(
+def test_annotations_use_encoding_of_their_topic(
     annotated: str | None, kind: str, expected: str
 ) -> None:
     """Viewers of one encoding would see the sensor without its objects."""
     encodings = {"/a": "json", "/b": "json", "/depth": "cdr", "/bytes": "flatbuffer"}
     topics = tuple(Topic(name, "t", encoding, 9) for name, encoding in encodings.items())
     recording: Any = SimpleNamespace(kind=kind, topics=topics)
-    strange: Any = SimpleNamespace(kind="mcap", topics=topics[3:])
-    first = None if annotated is None else Annotation(shown(annotated, 5, 1), 7, ())
+    unsupported: Any = SimpleNamespace(kind="mcap", topics=topics[3:])
+    first = None if annotated is None else Annotation(shown_frame(annotated, 5, 1), 7, ())
 
     assert _encoding(recording, first) == expected
-    assert _encoding(strange, first) == "json"
+    assert _encoding(unsupported, first) == "json"
 
 
 def finished(frames: list[LabelledFrame]) -> Any:
     return SimpleNamespace(frames=lambda: iter(frames))
 
 
-def test_frames_are_thinned_topic_by_topic() -> None:
+def test_frames_are_thinned_per_topic() -> None:
     topics = ["/a", "/b", "/a", "/a", "/b", "/a", "/b"]
     frames = [labelled_frame(k, topic=topic) for k, topic in enumerate(topics)]
 
@@ -280,7 +280,7 @@ def test_frames_are_thinned_topic_by_topic() -> None:
     assert chosen == {("/a", 0), ("/b", 1), ("/a", 3), ("/b", 6)}
 
 
-def test_the_views_of_a_track_are_the_most_different_ones() -> None:
+def test_most_different_views_of_track_are_selected() -> None:
     """First the one with most pixels, then always the one least like those chosen."""
     columns = np.zeros((5, 8))
     columns[:, 0], columns[:, 4] = [0, 1.0, 5, 5.4, 9], [0.1, 0.3, 0.1, 0.1, 0.2]
@@ -293,29 +293,29 @@ def test_the_views_of_a_track_are_the_most_different_ones() -> None:
     ]
     chosen = _chosen(finished(frames), Selection(per_track=2), set())
     assert chosen == {("/depth", 1), ("/depth", 2)}
-    unsure = Selection(per_track=2, min_confidence=0.61)
-    assert _chosen(finished(frames), unsure, set()) == set()
-    assert _chosen(finished(frames), unsure, {1}) == chosen
+    above = Selection(per_track=2, min_confidence=0.61)
+    assert _chosen(finished(frames), above, set()) == set()
+    assert _chosen(finished(frames), above, {1}) == chosen
     exact = Selection(per_track=2, min_confidence=0.6)
     assert _chosen(finished(frames), exact, set()) == chosen
-    by_hand = Selection(per_track=2, corrected_only=True)
-    assert _chosen(finished(frames), by_hand, set()) == set()
+    corrected = Selection(per_track=2, corrected_only=True)
+    assert _chosen(finished(frames), corrected, set()) == set()
 
 
-def test_a_view_is_a_direction_a_distance_a_size_and_a_shape() -> None:
-    turn = Rotation.from_euler("zyx", [0.4, 1.1, -0.3])
-    way, size = np.array([-0.36, 0.48, -0.8]), np.array([0.12, 0.07, 0.24])
-    item = labelled_object(1, range(55), box=box_at(-1.7 * way, size))
-    frame = replace(labelled_frame(0, item), fixed_from_sensor=Pose(turn.as_matrix(), np.zeros(3)))
+def test_view_vector_has_direction_distance_size_and_shape() -> None:
+    R = Rotation.from_euler("zyx", [0.4, 1.1, -0.3])
+    direction, size = np.array([-0.36, 0.48, -0.8]), np.array([0.12, 0.07, 0.24])
+    item = labelled_object(1, range(55), box=box_at(-1.7 * direction, size))
+    frame = replace(labelled_frame(0, item), fixed_from_sensor=Pose(R.as_matrix(), np.zeros(3)))
     found = _view(frame, item)
 
-    assert_allclose(found[:3], turn.apply(way), atol=1e-6)
+    assert_allclose(found[:3], R.apply(direction), atol=1e-6)
     assert_allclose(found[3:5], [np.log(1.7), 0.3 * np.log(55)], atol=1e-6)
     assert_allclose(found[5:], [0.25, 0.07 / 0.48, 0.5], atol=1e-6)
-    assert_allclose(_view(labelled_frame(0, item), item)[:3], way, atol=1e-6)
+    assert_allclose(_view(labelled_frame(0, item), item)[:3], direction, atol=1e-6)
 
 
-def test_images_without_an_object_to_train_on_are_left_out(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_images_without_certain_objects_are_omitted(monkeypatch: pytest.MonkeyPatch) -> None:
     """A detector would learn that an image with only uncertain objects is empty."""
     images = [
         None,
@@ -323,15 +323,15 @@ def test_images_without_an_object_to_train_on_are_left_out(monkeypatch: pytest.M
     ]
     place = "shapecat.outputs.dataset_frames"
     labelled = [labelled_frame(k) for k in range(len(images))]
-    stand_ins: dict[str, Any] = {
+    stubs: dict[str, Any] = {
         "_corrected": lambda _folder: set(),
         "_chosen": lambda *_: {("/depth", k) for k in range(len(images))},
         "open_source": lambda *_: nullcontext(),
         "with_colour": lambda frames, *_: ((one, None, None) for one in frames),
         "_image": lambda _name, one, *_: images[one.index],
     }
-    for name, stand_in in stand_ins.items():
-        monkeypatch.setattr(f"{place}.{name}", stand_in)
+    for name, stub in stubs.items():
+        monkeypatch.setattr(f"{place}.{name}", stub)
     run: Any = {"options": {"topics": ["/depth"]}, "color": {"/depth": "/color"}}
     finished: Any = SimpleNamespace(
         folder=Path(), run=run, name="lab", frames=lambda: iter(labelled)
@@ -340,7 +340,7 @@ def test_images_without_an_object_to_train_on_are_left_out(monkeypatch: pytest.M
     assert list(images_of(finished, Selection(), stem="lab")) == [images[1], images[4]]
 
 
-def test_depth_images_are_in_millimetres_and_end_where_16_bits_do() -> None:
+def test_depth_images_are_millimetres_without_overflow() -> None:
     """Larger depths would wrap around and appear near, or be read as 65.535 m."""
     depth = np.array([[0.0, 1.2346, 65.535], [65.6, 70.0, 0.0004]], np.float32)
     frame = Frame("/depth", 0, 0, 0, "cam", depth=depth, camera=Camera(3, 2, 5.0, 6.0, 1.0, 0.5))
@@ -364,7 +364,7 @@ def runs(count: int, same: int = 0) -> Any:
     ("count", "val", "expected"),
     [(1, 0.9, 0), (10, 0.2, 2), (10, 0.26, 3), (3, 0.99, 2), (5, 0, 0)],
 )
-def test_a_share_of_the_recordings_is_for_validation(count: int, val: float, expected: int) -> None:
+def test_share_of_recordings_is_used_for_validation(count: int, val: float, expected: int) -> None:
     """At least one is left for training; runs of one recording are never split."""
     assert split_runs(runs(count), val).count("val") == expected
     assert len(set(split_runs(runs(10, same=6), 0.4)[:7])) == 1
@@ -373,10 +373,10 @@ def test_a_share_of_the_recordings_is_for_validation(count: int, val: float, exp
             split_runs(runs(count), wrong)
 
 
-# ---- exports: whose folder it is
+# ---- exports: replacing earlier ones
 
 
-def test_the_export_of_another_recording_is_not_replaced(tmp_path: Path) -> None:
+def test_export_of_another_recording_is_not_replaced(tmp_path: Path) -> None:
     """Recordings of two days may have the same name; the first export would be gone."""
     monday, tuesday = ({**KITTI, "input": {"digest": f"xxh3:{k}"}} for k in (3, 5))
     (tmp_path / "export.json").write_text(json.dumps({**monday, "made": [], "objects": 3}))
@@ -386,7 +386,7 @@ def test_the_export_of_another_recording_is_not_replaced(tmp_path: Path) -> None
         _require_own(tmp_path, tuesday)
 
 
-def test_what_an_interrupted_export_has_left_is_not_part_of_the_next(tmp_path: Path) -> None:
+def test_export_excludes_files_of_interrupted_export(tmp_path: Path) -> None:
     """Images of other options would have no labels, and be taken for background."""
     out = tmp_path / "out"
 
@@ -412,7 +412,7 @@ def test_what_an_interrupted_export_has_left_is_not_part_of_the_next(tmp_path: P
 KITTI = {"format": "kitti"}
 
 
-def test_only_an_export_of_the_same_kind_that_nobody_changed_is_replaced(tmp_path: Path) -> None:
+def test_only_unchanged_export_of_same_format_is_replaced(tmp_path: Path) -> None:
     out = tmp_path / "out"
     _require_own(out, KITTI)
     out.mkdir()
@@ -454,11 +454,11 @@ def point_labels(out: Path) -> int:
         (replace(scanned, stamp_ns=7), cloud),
     ]
     labels = {3: TrackLabel(3, "cup", 0.6), 300: TrackLabel(300, "box", 1.0)}
-    about: Any = SimpleNamespace(folder=out, labels=labels, categories=("cup", "can", "box"))
-    return write_point_labels(out, frames, about)
+    run: Any = SimpleNamespace(folder=out, labels=labels, categories=("cup", "can", "box"))
+    return write_point_labels(out, frames, run)
 
 
-def test_point_labels_are_class_and_instance_of_each_pixel_and_point(tmp_path: Path) -> None:
+def test_point_labels_have_class_and_instance_of_each_point(tmp_path: Path) -> None:
     assert point_labels(tmp_path) == 3
 
     def pixels(folder: str) -> list[list[int]]:
@@ -478,7 +478,7 @@ def test_point_labels_are_class_and_instance_of_each_pixel_and_point(tmp_path: P
     assert list(second.values()) == ["000001", "/scan", "9", "7", *[""] * 6]
 
 
-def test_the_legend_of_point_labels_knows_red_from_blue(tmp_path: Path) -> None:
+def test_point_label_legends_have_right_colours(tmp_path: Path) -> None:
     """The tools of SemanticKITTI read colours as blue, green, red."""
     point_labels(tmp_path)
     legend = json.loads((tmp_path / "labels.json").read_text())
@@ -498,7 +498,7 @@ def test_the_legend_of_point_labels_knows_red_from_blue(tmp_path: Path) -> None:
 # ---- crops
 
 
-def test_a_crop_stands_on_its_support() -> None:
+def test_crop_height_starts_at_its_support() -> None:
     """It uses the height above the support if known, else half of the box."""
     item = labelled_object(1, [0, 2], height_m=0.31)
     middle = float(UP @ item.box.center)
@@ -510,8 +510,8 @@ def test_a_crop_stands_on_its_support() -> None:
     found = upright_cloud(labelled_frame(0, one), frame, one)
     assert found is not None
     assert_allclose(found[0][:, 2], points[[0, 3]] @ UP - (middle - 0.31), atol=1e-6)
-    nothing = replace(item, indices=np.array([2]))
-    assert upright_cloud(labelled_frame(0, nothing), frame, nothing) is None
+    empty = replace(item, indices=np.array([2]))
+    assert upright_cloud(labelled_frame(0, empty), frame, empty) is None
 
 
 # ---- the hierarchy of a frame as text
@@ -525,20 +525,20 @@ def row(**changes: Any) -> dict[str, Any]:
     } | changes  # fmt: skip
 
 
-def test_the_support_of_a_detection_is_above_its_plane() -> None:
+def test_support_height_is_relative_to_plane() -> None:
     """Its height is that of the centre above the plane minus that above the support."""
     normal = np.array([0.6, 0.0, 0.8])
     plane = Plane(normal, 0.4, np.zeros((3, 3)), 0.5, 0.7)
-    over = 0.6 * 0.3 + 0.8 * 1.1 - 0.4
+    high = 0.6 * 0.3 + 0.8 * 1.1 - 0.4
     stacked = _candidate(row(height_m=0.25, on_detection=3), [plane])
-    assert stacked.support_m == pytest.approx(over - 0.25)
+    assert stacked.support_m == pytest.approx(high - 0.25)
     assert stacked.on_candidate == 3
-    assert _candidate(row(height_m=over + 9e-6), [plane]).support_m == 0
-    assert _candidate(row(height_m=over + 2e-5), [plane]).support_m == pytest.approx(-2e-5, rel=0.1)
+    assert _candidate(row(height_m=high + 9e-6), [plane]).support_m == 0
+    assert _candidate(row(height_m=high + 2e-5), [plane]).support_m == pytest.approx(-2e-5, rel=0.1)
     assert _candidate(row(plane=None), [plane]).support_m == 0
 
 
-def test_a_node_is_described_by_its_track_its_size_and_what_is_missing() -> None:
+def test_scene_node_text_has_track_size_and_flags() -> None:
     plane = Plane(np.array([0, 0, 1.0]), 0.4, np.zeros((3, 3)), 0.567, 0.734)
     found = [
         _candidate(row(**changes), [plane])
@@ -550,13 +550,13 @@ def test_a_node_is_described_by_its_track_its_size_and_what_is_missing() -> None
         )
     ]
     scene = Scene(np.array([0, 0, 1.0]), (plane,), tuple(found))
-    shown: Any = SimpleNamespace(category="cup", track=6, full=None, box=found[0].box)
-    told = [_described(scene, Node("object", k), {7: shown}) for k in range(4)]
-    shown.full = replace(found[0].box, size=np.array([0.14, 0.08, 0.21]))
-    told.append(_described(scene, Node("object", 0), {7: shown}))
+    item: Any = SimpleNamespace(category="cup", track=6, full=None, box=found[0].box)
+    texts = [_described(scene, Node("object", k), {7: item}) for k in range(4)]
+    item.full = replace(found[0].box, size=np.array([0.14, 0.08, 0.21]))
+    texts.append(_described(scene, Node("object", 0), {7: item}))
 
     assert _described(scene, Node("plane", 0), {}) == "plane 0: 0.73 m high, 0.57 m2"
-    assert told == [
+    assert texts == [
         "cup #6: 12 x 7 x 20 cm",
         "cup #6: 12 x 7 x 20 cm, cut by the border, occluded",
         "object in no track: 12 x 7 x 20 cm",
@@ -568,43 +568,43 @@ def test_a_node_is_described_by_its_track_its_size_and_what_is_missing() -> None
 # ---- image boxes and labels
 
 
-def test_a_missing_frame_is_answered_with_the_ones_that_are_there(tmp_path: Path) -> None:
+def test_missing_frame_error_lists_existing_frames(tmp_path: Path) -> None:
     """With a time range or every n-th message, frames are not numbered from 0 to the end."""
     rows = pa.table({"topic": ["/a", "/b", "/a", "/b", "/a"], "frame": [3, 0, 6, 2, 9]})
     pq.write_table(rows, tmp_path / "frames.parquet")
 
     assert _topic(tmp_path, 6, None) == "/a"
-    for frame, topic, said in (
+    for frame, topic, message in (
         (2, "/a", "no frame 2 on /a; there are /a: 3 to 9"),
         (4, None, "no frame 4; there are /a: 3 to 9; /b: 0 to 2"),
         (6, "/c", "no frame 6 on /c; there are none"),
     ):
         with pytest.raises(OutputError) as error:
             _topic(tmp_path, frame, topic)
-        assert str(error.value) == f"{tmp_path}: {said}"
+        assert str(error.value) == f"{tmp_path}: {message}"
 
 
-def test_the_corners_of_an_image_box_are_the_borders_of_its_pixels() -> None:
+def test_image_box_corners_enclose_its_pixels() -> None:
     box = ImageBox(6, "cup", 0.8, (11, 23, 40, 7))
     assert box.corners == [(11, 23), (51, 23), (51, 30), (11, 30)]
     assert box.text == "#6 cup 0.80"
 
 
 def damerau(a: str, b: str) -> int:
-    """Count edits by trying all of them, one after the other."""
+    """Count edits recursively, by trying all of them."""
     if not a or not b:
         return len(a) + len(b)
-    ways = [
+    counts = [
         damerau(a[:-1], b) + 1,
         damerau(a, b[:-1]) + 1,
         damerau(a[:-1], b[:-1]) + (a[-1] != b[-1]),
     ]
     if len(a) > 1 and len(b) > 1 and a[-1] == b[-2] and a[-2] == b[-1]:
-        ways.append(damerau(a[:-2], b[:-2]) + 1)
-    return min(ways)
+        counts.append(damerau(a[:-2], b[:-2]) + 1)
+    return min(counts)
 
 
-def test_slips_are_counted_as_by_trying_them() -> None:
+def test_slips_match_damerau_levenshtein_distance() -> None:
     rng = np.random.default_rng(2)
     for _ in range(200):
         a, b = ("".join(rng.choice(list("abc"), rng.integers(0, 6))) for _ in range(2))
@@ -612,8 +612,8 @@ def test_slips_are_counted_as_by_trying_them() -> None:
 
 
 @pytest.mark.parametrize("rows", [(0, 0), (0, 9), (3, 4), (0, 1), (8, 9)])
-def test_a_picture_of_masks_reads_back(rows: tuple[int, int]) -> None:
-    """Its blank rows are not compressed again, and a viewer compares the checksum of all."""
+def test_png_of_masks_reads_back(rows: tuple[int, int]) -> None:
+    """Blank rows are not compressed again, but the checksum covers all rows."""
     entries = np.zeros((9, 12), np.uint8)
     entries[slice(*rows)] = np.arange(12) % 5
     packed = entries[:, ::2] << 4 | entries[:, 1::2]

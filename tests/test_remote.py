@@ -1,4 +1,4 @@
-"""Recordings and results at URLs: no partial results are visible, no scratch files remain."""
+"""Tests of recordings and results at URLs: no partial results, and no scratch files left."""
 
 import csv
 import errno
@@ -40,7 +40,7 @@ class Quiet(http.server.SimpleHTTPRequestHandler):
     """Serves files without logging."""
 
     def log_message(self, *_: Any) -> None:
-        """Say nothing."""
+        """Log nothing."""
 
 
 @pytest.fixture(scope="module")
@@ -70,7 +70,7 @@ def bucket(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Path]:
 
 @pytest.fixture(autouse=True)
 def own_scratch(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[Path]:
-    """Whatever a test does, nothing may remain in scratch space."""
+    """Require that each test leaves scratch space empty."""
     folder = tmp_path / "scratch"
     folder.mkdir()
     monkeypatch.setattr(tempfile, "tempdir", str(folder))
@@ -98,7 +98,7 @@ def results(url: str) -> set[str]:
     return {name for name in files(url) if not name.startswith(".manifest/")}
 
 
-def test_from_a_server_to_a_folder(
+def test_recordings_of_server_are_processed_into_folder(
     shapecat: Run, address: str, served: Path, tmp_path: Path
 ) -> None:
     """A signed URL has a query, which is not part of a name."""
@@ -120,7 +120,7 @@ def test_from_a_server_to_a_folder(
 
 
 @pytest.mark.parametrize("out", ["memory://results/first", "s3://lab/results/first"])
-def test_from_a_folder_to_a_storage_and_on(
+def test_folder_is_processed_into_storage_once(
     shapecat: Run, served: Path, bucket: Path, out: str
 ) -> None:
     done = shapecat("process", served, "--out", out, *OPTIONS)
@@ -142,10 +142,10 @@ def test_from_a_folder_to_a_storage_and_on(
     assert bucket.exists()
 
 
-def test_results_are_not_made_again_without_a_manifest(
+def test_results_without_manifest_are_not_repeated(
     shapecat: Run, served: Path, bucket: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """A killed command has not sent its last lines; the run folders must suffice."""
+    """A killed command cannot send its last lines; the run folders must suffice."""
     for name in ("a.mcap", "b.bag"):
         (Location("s3://lab/again") / name).upload(served / name)
     command = ("process", "s3://lab/again/", "--out", "s3://lab/again/out", *OPTIONS)
@@ -163,7 +163,7 @@ def test_results_are_not_made_again_without_a_manifest(
         assert len(requests(bucket, "PUT", f"/lab/again/out/{name}/run.json")) == 1
 
 
-def test_patterns_and_folders_of_a_storage(served: Path) -> None:
+def test_patterns_and_folders_of_storage_are_expanded(served: Path) -> None:
     url = f"file://{served}"
     both = {f"{url}/a.mcap", f"{url}/broken.mcap"}
 
@@ -175,15 +175,15 @@ def test_patterns_and_folders_of_a_storage(served: Path) -> None:
 
 
 @pytest.mark.parametrize("place", ["memory://lab/mixed", "s3://lab/mixed"])
-def test_a_storage_is_searched_as_a_folder_is(bucket: Path, place: str) -> None:
+def test_storage_is_searched_like_a_folder(bucket: Path, place: str) -> None:
     """Results of earlier runs are not recordings; a ROS 2 bag is a folder, and one recording."""
-    here = Location(place)
+    root = Location(place)
     for name in (
         *("x.mcap", "d/y.bag", "bag/bag_0.db3", "bag/bag_1.db3", "bag/metadata.yaml"),
         *("out/x/annotated.mcap", "out/x/run.json", "half/x/annotated.mcap"),
         *("half/x/frames.parquet", "out/.x.old/annotated.mcap", "notes.txt"),
     ):
-        (here / name).write(name.encode())
+        (root / name).write(name.encode())
     kept = find_recordings([f"{place}/"]).kept
     found = {source.url.replace(":///", "://"): source for source in kept}
 
@@ -192,12 +192,12 @@ def test_a_storage_is_searched_as_a_folder_is(bucket: Path, place: str) -> None:
     assert found[f"{place}/bag"].bytes == len("bag/bag_0.db3") + len("bag/bag_1.db3")
     before = found[f"{place}/x.mcap"].key
     assert before == look_at(f"{place}/x.mcap")[0] or place.startswith("memory")
-    (here / "x.mcap").write(b"other content")
+    (root / "x.mcap").write(b"other content")
     assert find_recordings([f"{place}/*.mcap"]).kept[0].key != before
     assert bucket.exists()
 
 
-def test_a_bag_in_a_bucket(shapecat: Run, bucket: Path, tmp_path: Path) -> None:
+def test_bag_in_bucket_is_processed(shapecat: Run, bucket: Path, tmp_path: Path) -> None:
     bag = record(tmp_path / "bag", 4, container="ros2")
     for file in bag.iterdir():
         (Location("s3://lab/bags/kitchen") / file.name).upload(file)
@@ -228,16 +228,16 @@ def answer(status: int) -> Exception:
     ],
     ids=str,
 )
-def test_what_may_pass_is_tried_again(error: Exception, *, passes: bool) -> None:
+def test_only_temporary_errors_are_retried(error: Exception, *, passes: bool) -> None:
     """A busy server must not end a batch, and a wrong key must not delay one."""
     assert storage._may_pass(error) is passes
 
 
-def test_listings_come_in_pages(bucket: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_listings_are_read_in_pages(bucket: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(storage, "_PAGE", 3)
     for k in range(10):
         (Location("s3://lab/pages") / f"{k}" / "x.mcap").write(b"x")
-    (Location("s3://lab/pages-beside") / "x.mcap").write(b"x")  # no part of the folder
+    (Location("s3://lab/pages-beside") / "x.mcap").write(b"x")  # not in the folder
 
     assert Location("s3://lab/pages").names() == set("0123456789")
     assert len(find_recordings(["s3://lab/pages/"]).kept) == 10
@@ -258,10 +258,10 @@ PLACES = ["memory://half/run", "s3://lab/half/run"]
 
 
 @pytest.mark.parametrize("url", PLACES)
-def test_upload_shows_nothing_before_it_is_whole(
+def test_interrupted_upload_shows_no_run(
     made: Path, bucket: Path, monkeypatch: pytest.MonkeyPatch, url: str
 ) -> None:
-    """Wherever it is interrupted, either there is no run.json, or all its files are there."""
+    """run.json must appear after all other files."""
     names = {path.name for path in made.iterdir()}
     sent = Location.upload
     for cut in range(len(names)):
@@ -289,7 +289,7 @@ def test_upload_shows_nothing_before_it_is_whole(
 
 
 @pytest.mark.parametrize("url", ["memory://old/run", "s3://lab/old/run"])
-def test_labels_survive_a_replacement_that_was_killed(
+def test_labels_survive_killed_replacement(
     shapecat: Run, served: Path, bucket: Path, monkeypatch: pytest.MonkeyPatch, url: str
 ) -> None:
     """With the old run gone and no new one yet, corrections must survive."""
@@ -329,7 +329,7 @@ def fail(*_: object, **__: object) -> None:
     raise OutputError(msg)
 
 
-def test_what_a_run_no_longer_makes_goes_with_the_run_it_replaces(made: Path) -> None:
+def test_upload_removes_files_of_replaced_run(made: Path) -> None:
     """Masks or a report of earlier settings would contradict the new tables."""
     url, names = "memory://renewed/run", {path.name for path in made.iterdir()}
     assert "review.rrd" not in names
@@ -342,10 +342,10 @@ def test_what_a_run_no_longer_makes_goes_with_the_run_it_replaces(made: Path) ->
     assert files("memory://renewed") == {f"run/{name}" for name in names}
 
 
-def test_the_summary_of_a_run_names_its_folder_and_not_scratch(
+def test_summary_names_run_folder_not_scratch(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
-    """A scratch folder is gone when its name is read."""
+    """Scratch is removed before anyone reads the summary."""
 
     def process(job: Job, *_: object, **__: object) -> Summary:
         return Summary(job.name, job.folder, {"frames": 3, "tracks": {}}, 1.5, (), processed=False)
@@ -357,7 +357,7 @@ def test_the_summary_of_a_run_names_its_folder_and_not_scratch(
     assert (summary.folder, summary.seconds) == (Path("lab"), 1.5)
 
 
-def test_a_strangers_place_is_not_touched(made: Path) -> None:
+def test_foreign_folder_is_not_touched(made: Path) -> None:
     (Location("memory://theirs/run") / "thesis.txt").write(b"years of work")
     with (
         claimed("memory://theirs/run", "one") as claim,
@@ -369,7 +369,7 @@ def test_a_strangers_place_is_not_touched(made: Path) -> None:
 
 
 @pytest.mark.parametrize("url", ["memory://claims/run", "s3://lab/claims/run"])
-def test_one_process_at_a_time_works_on_a_folder(bucket: Path, url: str) -> None:
+def test_only_one_process_claims_a_folder(bucket: Path, url: str) -> None:
     with claimed(url, "one"), pytest.raises(OutputError, match="another run is writing there"):
         claims.Claim(url, "two")
     with claimed(url, "two") as claim:
@@ -378,12 +378,12 @@ def test_one_process_at_a_time_works_on_a_folder(bucket: Path, url: str) -> None
     assert bucket.exists()
 
 
-def test_a_dead_process_is_followed_and_a_late_one_ends(made: Path, bucket: Path) -> None:
+def test_claim_of_dead_process_is_taken_over(made: Path, bucket: Path) -> None:
     """A worker presumed dead may wake up: its results must not mix with the new ones."""
     url = "s3://lab/late/run"
-    first = claims.Claim(url, "one")  # whose heart does not beat
+    first = claims.Claim(url, "one")  # it sends no heartbeat
     system: Any = fsspec.filesystem("s3")
-    for name in ("run", "run10"):  # one of them belongs to a process that is alive
+    for name in ("run", "run10"):  # one of them belongs to a live process
         key = f"late/{name}/annotated.mcap"
         system.call_s3("create_multipart_upload", Bucket="lab", Key=key)
     with claimed(url, "two") as second:
@@ -399,10 +399,10 @@ def test_a_dead_process_is_followed_and_a_late_one_ends(made: Path, bucket: Path
     assert len(requests(bucket, "PUT", "/late/run/run.json")) == 1
 
 
-def test_a_run_that_is_taken_over_while_it_is_uploaded_is_not_completed(
+def test_upload_stops_when_claim_is_taken_over(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """Its run.json would make a whole run of files from two processes."""
+    """Its run.json would complete a run with files of two processes."""
     url, sent = "memory://taken/run", Location.upload
     made, followers = tmp_path / "run", list[claims.Claim]()
     made.mkdir()
@@ -422,7 +422,7 @@ def test_a_run_that_is_taken_over_while_it_is_uploaded_is_not_completed(
     followers[-1].require()
 
 
-def test_a_batch_follows_its_own_dead_at_once(bucket: Path) -> None:
+def test_batch_takes_over_its_own_claims_at_once(bucket: Path) -> None:
     first = claims.Claim("s3://lab/same/run", "one")
     second = claims.Claim("s3://lab/same/run", "one")
     assert (first.inherited, second.inherited) == (False, True)
@@ -437,7 +437,7 @@ def entry(name: str, state: Any) -> Entry:
     return Entry(name, f"{name}.mcap", state, "input", "work")
 
 
-def test_a_manifest_in_a_bucket_has_all_writers(bucket: Path) -> None:
+def test_manifest_in_bucket_has_lines_of_all_writers(bucket: Path) -> None:
     """With two commands at once, one of them killed, no sent line may be lost."""
     url = "s3://lab/manifests"
     killed = RemoteManifest(url)
@@ -452,13 +452,13 @@ def test_a_manifest_in_a_bucket_has_all_writers(bucket: Path) -> None:
     with RemoteManifest(url) as third:
         found = {name: known.state for name, known in third.entries.items()}
     assert found == dict.fromkeys("abc", "complete")
-    whole = (Location(url) / "manifest.jsonl").read() or b""
-    assert sorted(json.loads(line)["folder"] for line in whole.splitlines()) == ["a", "b", "c"]
+    merged = (Location(url) / "manifest.jsonl").read() or b""
+    assert sorted(json.loads(line)["folder"] for line in merged.splitlines()) == ["a", "b", "c"]
     assert RemoteManifest(url, "1-of-4").entries == {}
     assert bucket.exists()
 
 
-def test_parts_of_a_manifest_stay_small(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_manifest_parts_stay_small(monkeypatch: pytest.MonkeyPatch) -> None:
     """Sent whole with each line, the manifest of a large batch would outweigh its results."""
     monkeypatch.setattr("shapecat.batch.manifest._PART_BYTES", 2000)
     written = RemoteManifest("memory://parts")
@@ -481,12 +481,12 @@ def test_scratch_of_killed_processes_is_removed(own_scratch: Path) -> None:
         assert not (own_scratch / "shapecat-scratch-left").exists()
 
 
-def test_server_that_is_not_there_is_one_line(tmp_path: Path) -> None:
+def test_unreachable_server_is_reported(tmp_path: Path) -> None:
     with pytest.raises(RecordingError, match="cannot be downloaded"):
         Location("http://127.0.0.1:9/x.mcap").download(tmp_path / "x.mcap")
 
 
-def one_line(result: Result) -> str:
+def only_error(result: Result) -> str:
     errors = [line for line in result.stderr.splitlines() if line.startswith("Error: ")]
     assert len(errors) == 1, result.stderr
     assert "Traceback" not in result.output
@@ -495,27 +495,27 @@ def one_line(result: Result) -> str:
 
 
 @pytest.mark.parametrize("source", ["s3://none/", "s3://none/*.mcap", "s3://none/a.mcap"])
-def test_a_bucket_that_is_not_there_is_one_line(
+def test_missing_bucket_is_reported_in_one_line(
     shapecat: Run, bucket: Path, tmp_path: Path, source: str
 ) -> None:
     read = shapecat("process", source, "--out", tmp_path, *OPTIONS)
     assert read.exit_code == 3
-    assert source.rstrip("/") in one_line(read)
+    assert source.rstrip("/") in only_error(read)
     assert bucket.exists()
 
 
-def test_results_do_not_make_a_bucket(shapecat: Run, bucket: Path, served: Path) -> None:
+def test_missing_result_bucket_is_not_created(shapecat: Run, bucket: Path, served: Path) -> None:
     """A misspelt bucket must be reported before a frame is read."""
     for recordings in ([served], [served / "a.mcap"]):
         done = shapecat("process", *recordings, "--out", "s3://none/out", *OPTIONS)
         assert done.exit_code == 1
-        assert "s3://none/out: cannot be listed: The specified bucket does not exist" in one_line(
+        assert "s3://none/out: cannot be listed: The specified bucket does not exist" in only_error(
             done
         )
     assert not requests(bucket, "PUT", "/none")
 
 
-def test_missing_credentials_are_one_line(
+def test_missing_credentials_are_reported_in_one_line(
     shapecat: Run, bucket: Path, served: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     for name in ("AWS_ACCESS_KEY_ID", "AWS_SECRET_ACCESS_KEY"):
@@ -526,7 +526,7 @@ def test_missing_credentials_are_one_line(
         system.clear_instance_cache()
         done = shapecat("process", *sources, "--out", out, *OPTIONS)
         assert done.exit_code in {1, 3}
-        assert "credentials" in one_line(done)
+        assert "credentials" in only_error(done)
     system.clear_instance_cache()
     assert bucket.exists()
 
@@ -537,8 +537,8 @@ def peak_mb() -> float:
 
 @pytest.mark.usefixtures("bucket")
 @pytest.mark.parametrize("size", [0, 1, 9000 * 2**24, 9000 * 2**24 + 1, 5 * 2**40])
-def test_no_file_has_more_parts_than_a_storage_takes(size: int) -> None:
-    """Nor parts smaller than others, which are as many requests."""
+def test_number_of_upload_parts_is_limited(size: int) -> None:
+    """Small parts would need more requests."""
     part = Location("s3://lab/large")._in_parts(size)["chunksize"]
 
     assert part >= 16 * 2**20

@@ -1,4 +1,4 @@
-"""review.rrd, read back with Rerun's own reader."""
+"""Tests of review.rrd, read back with Rerun's own reader."""
 
 import dataclasses
 import resource
@@ -102,7 +102,7 @@ def as_rows(batch: Any) -> list[dict[str, Any]]:
 
 
 def rows(path: Path, entity: str) -> list[dict[str, Any]]:
-    """Return the rows of an entity of a recording, in the order of frames; no style."""
+    """Return the rows of an entity of a recording, in the order of frames, without static ones."""
     from rerun.chunk import RrdReader  # noqa: PLC0415  heavy
 
     chunks = RrdReader(str(path)).stream().to_chunks()
@@ -116,7 +116,7 @@ def rows(path: Path, entity: str) -> list[dict[str, Any]]:
     return sorted(found, key=lambda row: row["frame"])
 
 
-def styled(path: Path) -> set[str]:
+def static(path: Path) -> set[str]:
     """Return the entities with values that hold in all frames."""
     from rerun.chunk import RrdReader  # noqa: PLC0415  heavy
 
@@ -129,7 +129,7 @@ def styled(path: Path) -> set[str]:
 
 
 def scalars(path: Path, entity: str) -> list[list[float]]:
-    """Return the values of a curve; its style is a row without any."""
+    """Return the values of a curve, without the row of its style."""
     values = [row.get("Scalars:scalars") for row in rows(path, entity)]
     return [value for value in values if value]
 
@@ -146,7 +146,7 @@ def recording(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return write(path, scenes)
 
 
-def test_boxes_are_what_was_written_and_none_is_left_stale(recording: Path) -> None:
+def test_boxes_match_objects_of_each_frame(recording: Path) -> None:
     """A box must vanish in the frame where its object is gone."""
     boxes = rows(recording, f"/world/{TOPIC}/objects/boxes")
     assert [row["Boxes3D:labels"] for row in boxes] == [
@@ -159,7 +159,7 @@ def test_boxes_are_what_was_written_and_none_is_left_stale(recording: Path) -> N
     assert np.allclose(boxes[1]["Boxes3D:quaternions"], [[0, 0, 0, 1]])
 
 
-def test_times_are_those_of_the_sensor_to_the_nanosecond(recording: Path) -> None:
+def test_times_are_sensor_stamps_in_nanoseconds(recording: Path) -> None:
     """Wall-clock time would make two runs differ; seconds as floats would lose the nanoseconds."""
     boxes = rows(recording, f"/world/{TOPIC}/objects/boxes")
     assert [row["frame"] for row in boxes] == [0, 1, 2]
@@ -174,13 +174,13 @@ def test_graphs_have_their_edges_and_triangles(recording: Path) -> None:
     assert mesh["Mesh3D:triangle_indices"] == [[0, 1, 2], [4, 5, 6]]
 
 
-def test_a_plane_is_filled_to_its_last_corner() -> None:
-    """A triangle that is missing is a notch in the table."""
+def test_plane_is_filled_to_its_last_corner() -> None:
+    """A missing triangle would be a notch in the table."""
     assert _fan(3).tolist() == [[0, 1, 2]]
     assert _fan(5).tolist() == [[0, 1, 2], [0, 2, 3], [0, 3, 4]]
 
 
-def test_the_outline_of_a_plane_is_closed(recording: Path) -> None:
+def test_plane_outline_is_closed(recording: Path) -> None:
     """Without its last edge, a table would look open on one side."""
     (strip,) = rows(recording, f"/world/{TOPIC}/planes")[0]["LineStrips3D:strips"]
     assert np.allclose(strip, [*OUTLINE, OUTLINE[0]])
@@ -192,7 +192,7 @@ def test_posterior_counts_and_times_are_plotted_for_every_frame(recording: Path)
     assert scalars(recording, "/plots/seconds/detect") == [[0], [0.01], [0.02]]
 
 
-def test_events_tell_births_ends_and_warnings(recording: Path) -> None:
+def test_log_has_warnings_and_begin_and_end_of_tracks(recording: Path) -> None:
     texts = [row["TextLog:text"][0] for row in rows(recording, "/log")]
     assert texts == [
         "no transforms",
@@ -203,8 +203,8 @@ def test_events_tell_births_ends_and_warnings(recording: Path) -> None:
     ]
 
 
-def test_the_layout_is_embedded_and_the_footer_is_whole(recording: Path) -> None:
-    """A file without a footer opens slowly, one without a layout opens as a heap of views."""
+def test_layout_is_embedded_and_file_is_complete(recording: Path) -> None:
+    """Without a footer, a file opens slowly; without a layout, as unsorted views."""
     from rerun.chunk import RrdReader  # noqa: PLC0415  heavy
 
     assert len(RrdReader(str(recording)).blueprints()) == 1
@@ -212,41 +212,41 @@ def test_the_layout_is_embedded_and_the_footer_is_whole(recording: Path) -> None
     assert verified.returncode == 0, verified.stderr
 
 
-def test_the_same_run_gives_the_same_content(tmp_path: Path) -> None:
+def test_same_run_gives_same_content(tmp_path: Path) -> None:
     scenes = [scene(k, [labelled_object(1)]) for k in range(3)]
     one, two = write(tmp_path / "1.rrd", scenes), write(tmp_path / "2.rrd", scenes)
     compared = subprocess.run([RERUN, "rrd", "compare", one, two], check=False, capture_output=True)
     assert compared.returncode == 0, compared.stderr
 
 
-def test_a_fixed_frame_moves_the_sensor_and_holds_the_paths(tmp_path: Path) -> None:
+def test_fixed_frame_has_sensor_poses_and_track_paths(tmp_path: Path) -> None:
     poses = [Pose(np.eye(3), np.array([0.1 * k, 0, 0])) for k in range(3)]
     scenes = [scene(k, [labelled_object(1)], pose=pose) for k, pose in enumerate(poses)]
     path = write(tmp_path / "r.rrd", scenes, fixed_frame="map")
-    moved = [
+    translations = [
         row["Transform3D:translation"]
         for row in rows(path, f"/world/{TOPIC}")
         if row.get("Transform3D:translation")
     ]
-    assert np.allclose(np.array(moved)[:, 0, 0], [0, 0.1, 0.2])
-    way = rows(path, f"/world/paths/{TOPIC}")[-1]["LineStrips3D:strips"]
-    assert np.allclose(way, [[[0, 0.1, 1], [0.1, 0.1, 1], [0.2, 0.1, 1]]])
+    assert np.allclose(np.array(translations)[:, 0, 0], [0, 0.1, 0.2])
+    track_path = rows(path, f"/world/paths/{TOPIC}")[-1]["LineStrips3D:strips"]
+    assert np.allclose(track_path, [[[0, 0.1, 1], [0.1, 0.1, 1], [0.2, 0.1, 1]]])
 
 
-def test_a_frame_without_a_pose_does_not_end_the_review(tmp_path: Path) -> None:
+def test_frame_without_pose_is_reviewed(tmp_path: Path) -> None:
     """Transforms may be missing at either end of a recording."""
     scenes = [scene(k, [labelled_object(1)]) for k in range(2)]
     path = write(tmp_path / "r.rrd", scenes, fixed_frame="map")
     assert len(rows(path, f"/world/{TOPIC}/objects/boxes")) == 2
 
 
-def drawn(scenes: Iterable[tuple[LabelledFrame, Frame]], *, fixed: bool) -> list[int]:
+def drawn_frames(scenes: Iterable[tuple[LabelledFrame, Frame]], *, fixed: bool) -> list[int]:
     chosen = choose_scenes((labelled for labelled, _ in scenes), fixed=fixed)
     return [labelled.index for labelled, due in chosen if due]
 
 
-def walked(places: Iterable[float]) -> list[tuple[LabelledFrame, Frame]]:
-    """Return views by a camera that moves along x of an object at given x in the fixed frame."""
+def moving_camera(places: Iterable[float]) -> list[tuple[LabelledFrame, Frame]]:
+    """Return scenes of an object at given x in the fixed frame, by a camera that moves along x."""
     poses = [Pose(np.eye(3), np.array([0.1 * k, 0, 0])) for k in range(9)]
     return [
         scene(k, [labelled_object(1, x=x - 0.1 * k)], pose=pose)
@@ -254,17 +254,17 @@ def walked(places: Iterable[float]) -> list[tuple[LabelledFrame, Frame]]:
     ]
 
 
-def test_a_camera_that_is_calibrated_anew_is_drawn_anew(tmp_path: Path) -> None:
+def test_recalibrated_camera_is_drawn_again(tmp_path: Path) -> None:
     """After a zoom, the frustum of the first frame would stay."""
-    (first, seen), (second, zoomed) = scene(0), scene(1, [labelled_object(1)])
+    (first, frame), (second, zoomed) = scene(0), scene(1, [labelled_object(1)])
     zoomed = dataclasses.replace(zoomed, camera=dataclasses.replace(CAMERA, fx=80.0))
-    path = write(tmp_path / "review.rrd", [(first, seen), (second, zoomed)])
+    path = write(tmp_path / "review.rrd", [(first, frame), (second, zoomed)])
 
-    drawn = rows(path, f"/world/{TOPIC}/camera")
-    assert [row["Pinhole:image_from_camera"][0][0] for row in drawn] == [60.0, 80.0]
+    cameras = rows(path, f"/world/{TOPIC}/camera")
+    assert [row["Pinhole:image_from_camera"][0][0] for row in cameras] == [60.0, 80.0]
 
 
-def test_two_sensors_are_drawn_apart(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_two_sensors_are_drawn_separately(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """Two cameras of one kind, whose frames alternate; both begin without an object."""
     views: list[tuple[str, str, Eye]] = []
 
@@ -283,16 +283,16 @@ def test_two_sensors_are_drawn_apart(tmp_path: Path, monkeypatch: pytest.MonkeyP
     due = [due for _, due in choose_scenes((labelled for labelled, _ in scenes), fixed=False)]
     path = write(tmp_path / "review.rrd", scenes)
 
-    left, right = ({e.replace(t, "") for e in styled(path) if t in e} for t in ("/left", "/right"))
+    left, right = ({e.replace(t, "") for e in static(path) if t in e} for t in ("/left", "/right"))
     assert left == right
     assert len(left) > 3
     assert due == [True] * 8
     for side, topic in enumerate(("/left", "/right")):
-        (drawn,) = rows(path, f"/world/{topic}/camera")
-        assert drawn["Pinhole:image_from_camera"][0][0] == 60
-        ways = [row["LineStrips3D:strips"] for row in rows(path, f"/world/{topic}/paths/{topic}")]
-        assert np.allclose(ways[0], [[[0.1 + side, 0.1, 1], [0.2 + side, 0.1, 1]]])
-        assert ways[1:] == [[]]  # it has ended
+        (camera_row,) = rows(path, f"/world/{topic}/camera")
+        assert camera_row["Pinhole:image_from_camera"][0][0] == 60
+        paths = [row["LineStrips3D:strips"] for row in rows(path, f"/world/{topic}/paths/{topic}")]
+        assert np.allclose(paths[0], [[[0.1 + side, 0.1, 1], [0.2 + side, 0.1, 1]]])
+        assert paths[1:] == [[]]  # it has ended
         assert np.allclose(views[side][2].target, [0.1 + side, 0.1, 1])
 
 
@@ -300,24 +300,24 @@ def test_two_sensors_may_share_their_colour_camera() -> None:
     stream = rr.RecordingStream("test")
     images = Images(stream, Columns(stream))
     for topic in ("/left", "/right"):
-        nothing = np.zeros((0, 4), np.float32)
-        images.add(topic, (0, 0), Picture("/colour", b"", "image/png", b"", nothing, []))
+        empty = np.zeros((0, 4), np.float32)
+        images.add(topic, (0, 0), Picture("/colour", b"", "image/png", b"", empty, []))
 
     assert list(images.entities.values()) == ["/colour", "/colour"]
 
 
-def test_a_caption_names_a_confidence_that_is_low() -> None:
+def test_label_has_only_low_confidences() -> None:
     """High confidences are not worth mentioning, and long captions cover the scene."""
     item = labelled_object(7)
-    low, high, strange = (
+    low, high, unknown = (
         short_label(dataclasses.replace(item, confidence=confidence, category=category))
         for confidence, category in ((0.61, "cup"), (0.93, "cup"), (0.5, "unknown"))
     )
 
-    assert (low, high, strange) == ("#7 cup 0.61", "#7 cup", "#7 unknown")
+    assert (low, high, unknown) == ("#7 cup 0.61", "#7 cup", "#7 unknown")
 
 
-def test_tabs_are_those_of_the_longest_tracks() -> None:
+def test_tabs_show_longest_tracks() -> None:
     """Of hundreds of tracks most are short; tabs are in the order of their numbers."""
     frames = {k: 300 if k % 2 else k for k in range(1, 101)}
     tracks = [TrackView(f"/tracks/{k}", f"#{k}", "cup", n) for k, n in frames.items()]
@@ -328,57 +328,57 @@ def test_tabs_are_those_of_the_longest_tracks() -> None:
     assert few == ["#1", "#2", "#3"]
 
 
-def test_scenes_are_drawn_less_often_while_nothing_moves() -> None:
-    still = [0.5] * 9
-    assert drawn(walked(still), fixed=True) == [0, 3, 6]
-    assert drawn(walked(still), fixed=False) == list(range(9))
-    assert drawn(walked([0.5, 0.5, *[0.52] * 7]), fixed=True) == [0, 2, 5, 8]
+def test_static_scenes_are_drawn_less_often() -> None:
+    at_rest = [0.5] * 9
+    assert drawn_frames(moving_camera(at_rest), fixed=True) == [0, 3, 6]
+    assert drawn_frames(moving_camera(at_rest), fixed=False) == list(range(9))
+    assert drawn_frames(moving_camera([0.5, 0.5, *[0.52] * 7]), fixed=True) == [0, 2, 5, 8]
 
 
-def test_an_object_that_comes_or_goes_is_drawn_at_once() -> None:
+def test_appearing_or_disappearing_object_is_drawn_at_once() -> None:
     scenes = [scene(k, [labelled_object(1)] if k == 2 else []) for k in range(7)]
-    assert drawn(scenes, fixed=False) == [0, 2, 3, 6]
+    assert drawn_frames(scenes, fixed=False) == [0, 2, 3, 6]
 
 
-def test_a_frame_that_repeats_another_is_not_drawn() -> None:
+def test_repeated_frame_is_not_drawn() -> None:
     repeated = [dataclasses.replace(scene(k)[0], reused_from=0) for k in range(1, 9)]
     scenes = [scene(0), *((labelled, image(labelled.index)) for labelled in repeated)]
-    assert drawn(scenes, fixed=False) == [0]
+    assert drawn_frames(scenes, fixed=False) == [0]
 
 
-def test_a_run_without_frames_or_objects_is_still_a_review(tmp_path: Path) -> None:
+def test_run_without_frames_or_objects_gives_review(tmp_path: Path) -> None:
     assert write(tmp_path / "0.rrd", []).stat().st_size > 0
     assert rows(write(tmp_path / "1.rrd", [scene(0)]), f"/world/{TOPIC}/scene")
 
 
-def test_clouds_keep_to_the_limit_and_objects_to_their_colour() -> None:
+def test_clouds_have_limited_points_and_category_colours() -> None:
     labelled, frame = scene(0, [labelled_object(1), labelled_object(2, "can")])
-    rest, mine = paint(frame, labelled.planes, labelled.objects, limit=600)
+    rest, foreground = paint(frame, labelled.planes, labelled.objects, limit=600)
     assert 300 < len(rest.points) <= 600
     assert np.isfinite(rest.points).all()
     everything = [*paint(frame, labelled.planes, labelled.objects, limit=0)]
     assert sum(len(cloud.points) for cloud in everything) == 48 * 60
     assert len(everything[1].points) == 16
-    shades = {tuple(c) for c in mine.colours.view(np.uint8).reshape(-1, 4)[:, :0:-1].tolist()}
+    shades = {tuple(c) for c in foreground.colours.view(np.uint8).reshape(-1, 4)[:, :0:-1].tolist()}
     ratios = {tuple(np.round(np.array(shade) / max(shade), 1)) for shade in shades}
     expected = [np.array(colour_of(category)) for category in CATEGORIES]
     assert ratios == {tuple(np.round(c / c.max(), 1)) for c in expected}
 
 
-def test_unorganized_clouds_and_points_near_a_plane_are_painted() -> None:
+def test_unorganised_clouds_and_points_near_plane_are_painted() -> None:
     points = np.random.default_rng(0).uniform(-0.3, 0.3, (500, 3)) + np.array([0, 0, 1])
     points[:200, 1], points[200] = 0.4, np.nan
     frame = Frame("/lidar", 0, 0, 0, "lidar", points=points)
     item = dataclasses.replace(labelled_object(1), indices=np.arange(300, 310))
-    rest, mine = paint(frame, (FLOOR,), (item,), limit=0)
-    assert (len(rest.points), len(mine.points)) == (489, 10)
+    rest, foreground = paint(frame, (FLOOR,), (item,), limit=0)
+    assert (len(rest.points), len(foreground.points)) == (489, 10)
     on_floor = np.abs(rest.points[:, 1] - 0.4) < 0.01
     assert len(set(rest.colours[on_floor].tolist())) == 1
     assert not set(rest.colours[on_floor].tolist()) & set(rest.colours[~on_floor].tolist())
 
 
-def test_a_failure_leaves_no_file_behind(tmp_path: Path) -> None:
-    """Neither half a file under the final name nor a hidden one; an older review survives."""
+def test_failure_leaves_no_file_and_keeps_older_review(tmp_path: Path) -> None:
+    """Neither a partial file under the final name nor a hidden one."""
     (tmp_path / "r.rrd").write_bytes(b"old")
 
     def broken() -> Iterator[tuple[LabelledFrame, Frame]]:
@@ -392,8 +392,8 @@ def test_a_failure_leaves_no_file_behind(tmp_path: Path) -> None:
     assert (tmp_path / "r.rrd").read_bytes() == b"old"
 
 
-def test_a_disk_that_fails_under_way_ends_the_writing(tmp_path: Path) -> None:
-    """Rerun's own writer ends at the first error, and later logging blocks forever."""
+def test_full_disk_while_writing_raises_error(tmp_path: Path) -> None:
+    """Rerun's own writer stops at the first error, and later logging blocks forever."""
     before = resource.getrlimit(resource.RLIMIT_FSIZE)
     resource.setrlimit(resource.RLIMIT_FSIZE, (60_000, before[1]))
     try:
@@ -404,12 +404,12 @@ def test_a_disk_that_fails_under_way_ends_the_writing(tmp_path: Path) -> None:
     assert not list(tmp_path.iterdir())
 
 
-def test_a_missing_folder_is_an_output_error(tmp_path: Path) -> None:
+def test_missing_folder_is_output_error(tmp_path: Path) -> None:
     with pytest.raises(OutputError, match="cannot be written"):
         write(tmp_path / "nowhere" / "r.rrd", [scene(0)])
 
 
-def test_the_run_is_readable_as_text() -> None:
+def test_run_json_is_formatted_as_text() -> None:
     text = markdown({"version": "1", "counts": {"frames": 3}, "warnings": [], "seconds": 0.123456})
     assert text.splitlines() == [
         "- **version**: 1",
@@ -422,7 +422,7 @@ def test_the_run_is_readable_as_text() -> None:
     ]
 
 
-def test_a_missing_review_or_viewer_is_said_in_one_line(
+def test_missing_review_or_viewer_is_reported(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     with pytest.raises(OutputError, match="no review there"):
@@ -441,7 +441,7 @@ _ANSWERS = "import socket, time; s = socket.create_server(('127.0.0.1', PORT)); 
     [("exit", "No graphics adapter was found"), ("answers", "Failed to get render context")],
     ids=["no graphics", "OpenGL without Vulkan"],
 )
-def test_a_viewer_without_graphics_names_the_package(
+def test_viewer_without_graphics_names_missing_package(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, begins: str, says: str
 ) -> None:
     """A container has no graphics card: the message must name the package to install."""
@@ -456,7 +456,7 @@ def test_a_viewer_without_graphics_names_the_package(
         review.take_screenshot(fake, tmp_path / "r.png")
 
 
-def test_no_viewer_is_left_behind(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_screenshot_ends_viewer_process(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """The program `rerun` is a script; killing it alone would leave its child process."""
     fake = tmp_path / "rerun"
     fake.write_text(f"#!/bin/sh\nsleep 60 &\necho $! > {tmp_path / 'pid'}\nwait\n")
@@ -467,7 +467,7 @@ def test_no_viewer_is_left_behind(tmp_path: Path, monkeypatch: pytest.MonkeyPatc
     with pytest.raises(OutputError, match="no answer"):
         review.take_screenshot(fake, tmp_path / "r.png")
     pid = int((tmp_path / "pid").read_text())
-    deadline = time.monotonic() + 10  # it is dead at once, and gone when its new parent looks
+    deadline = time.monotonic() + 10  # killed at once, but a zombie until reaped
     while alive(pid) and time.monotonic() < deadline:
         time.sleep(0.05)
     assert not alive(pid)
@@ -477,32 +477,32 @@ def test_no_viewer_is_left_behind(tmp_path: Path, monkeypatch: pytest.MonkeyPatc
 @pytest.mark.skipif(
     not any(Path("/usr/share/vulkan").glob("icd.d/*.json")), reason="nothing to draw with"
 )
-def test_a_screenshot_shows_the_scene(
+def test_screenshot_shows_scene(
     recording: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """Views that fail to draw, or an eye that looks away, would give an empty picture."""
-    monkeypatch.setattr(review_viewer, "_SETTLE_S", 2.0)  # the greetings may still be there
+    monkeypatch.setattr(review_viewer, "_SETTLE_S", 2.0)  # welcome messages may still be visible
     png = tmp_path / "r.png"
     review.take_screenshot(recording, png, size=(640, 480), stamp_ns=stamp(0))
     image_module = pytest.importorskip("PIL.Image")
     with image_module.open(png) as picture:
         assert picture.size == (640, 480)
         pixels = np.asarray(picture.convert("RGB"), float)[:, :400].reshape(-1, 3)
-    green = np.array(colour_of("can"), float)  # nothing of the viewer's own is so green
-    alike = pixels @ green / np.linalg.norm(green) / np.linalg.norm(pixels + 1, axis=1)
-    assert np.count_nonzero((alike > 0.98) & (pixels.max(axis=1) > 90)) > 100
+    green = np.array(colour_of("can"), float)  # no part of the viewer itself is so green
+    similarity = pixels @ green / np.linalg.norm(green) / np.linalg.norm(pixels + 1, axis=1)
+    assert np.count_nonzero((similarity > 0.98) & (pixels.max(axis=1) > 90)) > 100
 
 
-def test_the_eye_steps_back_until_all_is_in_view_but_not_out_of_the_house() -> None:
-    """A walking camera leaves early objects behind, but a driving robot sees too many."""
+def test_eye_steps_back_to_show_all_objects_if_near() -> None:
+    """A moving camera leaves early objects behind, but a driving robot passes too many."""
     eye = Eye(np.array([0.0, -1.0, 1.0]), np.zeros(3), np.array([0.0, 0.0, 1.0]))
     low, high = np.array([-1.0, -0.2, 0.0]), np.array([1.0, 0.2, 0.2])
 
-    seen = stepped_back(eye, low, high)
+    farther = stepped_back(eye, low, high)
 
-    assert np.allclose(seen.target, (low + high) / 2)
-    away = seen.position - seen.target
+    assert np.allclose(farther.target, (low + high) / 2)
+    away = farther.position - farther.target
     assert np.allclose(np.cross(away, eye.position), 0, atol=1e-9)
     assert np.linalg.norm(away) > np.linalg.norm(high - low)
     assert stepped_back(eye, low * 10, high * 10) is eye
-    assert stepped_back(eye, np.full(3, np.inf), np.full(3, -np.inf)) is eye  # nothing was seen
+    assert stepped_back(eye, np.full(3, np.inf), np.full(3, -np.inf)) is eye  # without objects
