@@ -24,10 +24,11 @@ from tests.browser import Browser
 LONGEST = (
     *("test_docs_run", "test_report_serve", "test_batch", "test_report", "test_remote"),
     *("test_stopping", "test_odd", "test_packaging", "test_second_look", "test_executors"),
-    *("test_crash", "test_simulation_worlds", "test_simulation_physics", "test_api", "test_loop"),
-    *("test_architecture", "test_review", "test_learning_default_model", "test_pipeline"),
-    *("test_command_line", "test_exports_images", "test_evaluation", "test_learning", "test_jit"),
-    *("test_rehearsal", "test_detection_stacks", "test_exports_readback", "test_tracking_scenes"),
+    *("test_crash", "test_simulation_worlds", "test_simulation_physics", "test_api"),
+    *("test_labelling_loop", "test_architecture", "test_review", "test_learning_default_model"),
+    *("test_pipeline", "test_command_line", "test_exports_images", "test_evaluation"),
+    *("test_learning", "test_jit", "test_rehearsal", "test_detection_stacks"),
+    *("test_exports_readback", "test_tracking_scenes"),
 )
 """Test files by duration, longest first."""
 SHARED = Path(__file__).parents[2] / "shared" / "data"

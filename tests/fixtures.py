@@ -2,9 +2,9 @@
 
     python -m tests.fixtures
 
-Recordings come from the simulator and a seed: made again, they are the same bytes, except that
-processors round the pixels of colour images otherwise. Only their tables change with the detection
-and the model.
+Recordings come from the simulator and a seed, and can be reproduced byte for byte, except for the
+pixels of colour images, which processors round differently. Only the tables change with the
+detection and the model.
 """
 
 import csv
@@ -33,7 +33,7 @@ FIXTURES = Path(__file__).parents[1] / "fixtures"
 EXPECTED = FIXTURES / "expected"
 RATE_HZ = 10.0
 TOLERANCE = 0.002
-"""Machines add in another order: how far metres and probabilities may be apart."""
+"""Largest difference of metres and probabilities, as machines add in different orders."""
 DETECTIONS = (
     "frame",
     "detection",
@@ -70,7 +70,7 @@ SCENES = {
     "clutter": Scene("clutter", "ros2", 4, 4, 2),
 }
 FOXGLOVE = "foxglove.mcap"
-"""The depth images of tabletop.mcap as Foxglove's messages in Protocol Buffers: the same tables."""
+"""The depth images of tabletop.mcap as Foxglove messages; the tables are the same."""
 RECORDINGS = (*SCENES, FOXGLOVE)
 Row = dict[str, str]
 
@@ -91,7 +91,7 @@ def make_recordings(folder: Path) -> None:
             color=scene.color,
             rate_hz=RATE_HZ,
         )
-    _forget_library(folder / "clutter" / "clutter.db3")
+    _clear_library_version(folder / "clutter" / "clutter.db3")
     _as_foxglove(folder / "tabletop.mcap", folder / FOXGLOVE)
 
 
@@ -116,7 +116,7 @@ def expected_path(name: str, table: str) -> Path:
 
 
 def differences(found: Sequence[Row], wanted: Sequence[Row]) -> Iterator[str]:
-    """Describe differences: in text and integers any, in other numbers those above `TOLERANCE`."""
+    """Describe all differences of text and integers, and those of floats above `TOLERANCE`."""
     if len(found) != len(wanted):
         yield f"{len(found)} rows, expected {len(wanted)}"
     for number, (here, there) in enumerate(zip(found, wanted, strict=False)):
@@ -124,7 +124,7 @@ def differences(found: Sequence[Row], wanted: Sequence[Row]) -> Iterator[str]:
             yield f"columns {', '.join(here)}, expected {', '.join(there)}"
             return
         for name, value in here.items():
-            if not _alike(value, there[name]):
+            if not _agree(value, there[name]):
                 yield f"row {number}, {name}: {value}, expected {there[name]}"
 
 
@@ -142,7 +142,7 @@ def write_table(path: Path, rows: Sequence[Row]) -> None:
         writer.writerows(rows)
 
 
-def _alike(value: str, wanted: str) -> bool:
+def _agree(value: str, wanted: str) -> bool:
     if "." not in wanted:
         return value == wanted
     try:
@@ -159,7 +159,7 @@ def _shrunk(sensor: Sensor, k: int) -> Sensor:
     return replace(sensor, camera=camera, border_px=(left, right, top, bottom))
 
 
-def _forget_library(database: Path) -> None:
+def _clear_library_version(database: Path) -> None:
     """Clear the SQLite version number in a database: bytes 96 to 99, which readers ignore."""
     with database.open("r+b") as file:
         file.seek(96)

@@ -1,4 +1,4 @@
-"""Masks on colour images: the right pixels, dense, and only pixels that the camera sees."""
+"""Tests of masks on colour images: position, density, and visibility from the colour camera."""
 
 import itertools
 from collections import Counter
@@ -27,7 +27,7 @@ LENS = LensCamera(
 TURNED = Pose(rotation_from_quaternion((0.03, -0.05, 0.02, 1.0)), np.array([-0.05, 0.02, 0.01]))
 
 
-def test_a_worked_example_of_a_turned_camera_with_a_lens() -> None:
+def test_projection_matches_worked_example() -> None:
     """A wrong order of rotation, translation and distortion would move every mask."""
     quarter = Pose(np.array([[0.0, 1, 0], [-1, 0, 0], [0, 0, 1]]), np.array([0.1, 0.2, 0.5]))
     lens = LensCamera(
@@ -44,27 +44,27 @@ def test_a_worked_example_of_a_turned_camera_with_a_lens() -> None:
 
 
 @pytest.mark.parametrize("model", ["plumb_bob", "rational_polynomial", "equidistant"])
-def test_lenses_bend_and_straighten_alike(model: str) -> None:
+def test_distortion_inverts_undistortion(model: str) -> None:
     """Depth images use one of the two directions, masks the other."""
     coefficients = (0.1, -0.05, 0.001, -0.002, 0.01, 0.02, -0.01, 0.003)
     rays = undistorted_rays(LENS.pinhole, model, coefficients)
     assert rays is not None
-    seen = distort(rays, model, coefficients)
+    distorted = distort(rays, model, coefficients)
     v, u = np.mgrid[:200, :240]
-    pixels = seen * (205.0, 207.0) + (121.4, 96.2)
+    pixels = distorted * (205.0, 207.0) + (121.4, 96.2)
     np.testing.assert_allclose(pixels, np.stack([u, v], axis=-1), atol=1e-3)
 
 
-def test_what_a_lens_cannot_show_is_not_shown() -> None:
+def test_points_outside_lens_model_are_not_projected() -> None:
     """Far from the axis, the polynomial turns back and would paint walls onto the table."""
     lens = LensCamera(LENS.pinhole, "plumb_bob", (-0.4, 0.0, 0.0, 0.0, 0.0))
     points = np.array([[0.2, 0, 1.0], [2.5, 0, 1.0], [0, 0, -1.0], [np.nan, 0, 1]])
-    seen = project(points, lens, IDENTITY)
-    assert np.isfinite(seen[:, 0]).tolist() == [True, False, False, False]
+    projected = project(points, lens, IDENTITY)
+    assert np.isfinite(projected[:, 0]).tolist() == [True, False, False, False]
 
 
 @pytest.mark.parametrize(
-    ("model", "coefficients", "slope", "shown"),
+    ("model", "coefficients", "slope", "visible"),
     [
         # x - 0.4 x^3 turns back at x = sqrt(1 / 1.2) = 0.913.
         ("plumb_bob", (-0.4, 0.0, 0.0, 0.0, 0.0), 0.90, True),
@@ -73,18 +73,18 @@ def test_what_a_lens_cannot_show_is_not_shown() -> None:
         ("equidistant", (0.0, 0.0, 0.0, 0.0), 3.1, False),
     ],
 )
-def test_a_lens_shows_all_up_to_where_it_turns_back(
-    model: str, coefficients: tuple[float, ...], slope: float, *, shown: bool
+def test_points_are_projected_up_to_turning_point_of_lens(
+    model: str, coefficients: tuple[float, ...], slope: float, *, visible: bool
 ) -> None:
-    """A limit on the slope is not one on its square."""
+    """A limit on the slope is not a limit on its square."""
     lens = LensCamera(LENS.pinhole, model, coefficients)
     points = np.array([[slope, 0, 1], [0.6 * slope, -0.8 * slope, 1]])
-    seen = project(points, lens, IDENTITY)
-    assert np.isfinite(seen[:, 0]).tolist() == [shown, shown]
+    projected = project(points, lens, IDENTITY)
+    assert np.isfinite(projected[:, 0]).tolist() == [visible, visible]
 
 
-def test_the_painted_image_agrees_with_projected_points() -> None:
-    """The kernel and the plain projection must place every single pixel equally."""
+def test_splatted_labels_agree_with_projected_points() -> None:
+    """The kernel and the plain projection must place each pixel equally."""
     depth = np.zeros((120, 160), np.float32)
     labels = np.zeros((120, 160), np.int32)
     rng = np.random.default_rng(3)
@@ -93,17 +93,17 @@ def test_the_painted_image_agrees_with_projected_points() -> None:
     labels[rows, columns] = 1 + np.arange(rows.size).reshape(rows.shape)
     objects = [np.array([index], np.uint32) for index in (rows * 160 + columns).ravel()]
     frame = Frame("", 0, 0, 0, "", depth=depth, camera=DEPTH)
-    painted = splat_depth(freeze(depth, "v u", "f4"), DEPTH, objects, LENS, TURNED)
+    splatted = splat_depth(freeze(depth, "v u", "f4"), DEPTH, objects, LENS, TURNED)
 
-    seen = project(frame.xyz(), LENS, TURNED)
+    projected = project(frame.xyz(), LENS, TURNED)
     found = 0
     for label, index in zip(
         labels[rows, columns].ravel(), (rows * 160 + columns).ravel(), strict=True
     ):
-        v, u = np.nonzero(painted.labels == label)
-        if v.size and 3 < seen[index, 0] < 236 and 3 < seen[index, 1] < 196:
-            assert abs(u.mean() + painted.left - seen[index, 0]) <= 0.51
-            assert abs(v.mean() + painted.top - seen[index, 1]) <= 0.51
+        v, u = np.nonzero(splatted.labels == label)
+        if v.size and 3 < projected[index, 0] < 236 and 3 < projected[index, 1] < 196:
+            assert abs(u.mean() + splatted.left - projected[index, 0]) <= 0.51
+            assert abs(v.mean() + splatted.top - projected[index, 1]) <= 0.51
             found += 1
     assert found > 40
 
@@ -117,53 +117,53 @@ def test_the_painted_image_agrees_with_projected_points() -> None:
         ("fisheye", (0.03, -0.02, 0.05, -0.04)),  # another name of the same model
     ],
 )
-def test_points_land_where_the_lens_model_says(model: str, coefficients: tuple[float, ...]) -> None:
-    """Masks and images are straightened by different code; both must know all coefficients."""
+def test_projection_follows_lens_model(model: str, coefficients: tuple[float, ...]) -> None:
+    """Masks and images are rectified by different code; both must use all coefficients."""
     lens = LensCamera(LENS.pinhole, model, coefficients)
     points = np.random.default_rng(4).uniform((-0.4, -0.3, 0.8), (0.4, 0.3, 1.2), (50, 3))
     moved = points @ TURNED.rotation.T + TURNED.translation
-    seen = distort(moved[:, :2] / moved[:, 2:], model, coefficients)
-    expected = np.column_stack([seen * (205.0, 207.0) + (121.4, 96.2), moved[:, 2]])
+    distorted = distort(moved[:, :2] / moved[:, 2:], model, coefficients)
+    expected = np.column_stack([distorted * (205.0, 207.0) + (121.4, 96.2), moved[:, 2]])
 
     np.testing.assert_allclose(project(points, lens, TURNED), expected, rtol=1e-4)
 
 
-@pytest.mark.parametrize("bent", [-0.2, 0.2])
-def test_an_image_is_straightened_to_the_colours_between_its_pixels(bent: float) -> None:
-    """Compared with SciPy's bilinear interpolation: colours run differently in x and y.
+@pytest.mark.parametrize("k1", [-0.2, 0.2])
+def test_rectified_image_matches_bilinear_interpolation(k1: float) -> None:
+    """Colours run differently in x and y.
 
     A lens that bends outward asks for pixels beyond each border, where there are none.
     """
-    lens = LensCamera(Camera(24, 18, 20.0, 21.0, 11.3, 8.8), "plumb_bob", (bent, 0, 0.02, 0.01, 0))
+    lens = LensCamera(Camera(24, 18, 20.0, 21.0, 11.3, 8.8), "plumb_bob", (k1, 0, 0.02, 0.01, 0))
     pixels = np.random.default_rng(7).integers(0, 256, (18, 24, 3)).astype(np.uint8)
     v, u = np.mgrid[:18, :24]
     rays = np.stack([(u - 11.3) / 20, (v - 8.8) / 21], axis=-1)
     x, y = np.moveaxis(distort(rays, lens.model, lens.coefficients), -1, 0)
-    place = [y * 21 + 8.8, x * 20 + 11.3]
-    seen = (place[0] >= 0) & (place[0] <= 17) & (place[1] >= 0) & (place[1] <= 23)
+    source = [y * 21 + 8.8, x * 20 + 11.3]
+    inside = (source[0] >= 0) & (source[0] <= 17) & (source[1] >= 0) & (source[1] <= 23)
     expected = [
-        ndimage.map_coordinates(one, place, order=1) for one in pixels.T.swapaxes(1, 2) * 1.0
+        ndimage.map_coordinates(one, source, order=1) for one in pixels.T.swapaxes(1, 2) * 1.0
     ]
 
-    apart = rectified(pixels, lens) - np.where(seen, expected, 0).transpose(1, 2, 0)
-    assert seen.mean() > 0.8
-    assert np.abs(apart).max() <= 0.51
+    difference = rectified(pixels, lens) - np.where(inside, expected, 0).transpose(1, 2, 0)
+    assert inside.mean() > 0.8
+    assert np.abs(difference).max() <= 0.51
 
 
-def test_a_straightened_image_ends_where_its_lens_turns_back() -> None:
+def test_rectified_image_ends_at_turning_point_of_lens() -> None:
     """Farther out the polynomial leads back into the image, and would show it again."""
     camera = Camera(41, 31, 15.0, 16.0, 20.0, 15.0)
     white = np.full((31, 41, 3), 255, np.uint8)
-    shown = rectified(white, LensCamera(camera, "plumb_bob", (-0.4, 0.0, 0.0, 0.0, 0.0)))
+    rectified_white = rectified(white, LensCamera(camera, "plumb_bob", (-0.4, 0.0, 0.0, 0.0, 0.0)))
     v, u = np.mgrid[:31, :41]
     slope = np.hypot((u - 20) / 15, (v - 15) / 16)
 
-    assert (shown[slope < 0.905] == 255).all()  # x - 0.4 x^3 turns back at x = 0.913
-    assert (shown[slope > 0.92] == 0).all()
+    assert (rectified_white[slope < 0.905] == 255).all()  # x - 0.4 x^3 turns back at x = 0.913
+    assert (rectified_white[slope > 0.92] == 0).all()
 
 
 @pytest.mark.parametrize("ahead", [-0.6, 0.7])
-def test_a_mask_is_dense_at_any_distance_of_the_colour_camera(ahead: float) -> None:
+def test_mask_is_dense_at_any_distance_of_colour_camera(ahead: float) -> None:
     """A depth pixel covers more of the image the nearer the colour camera is to the object."""
     depth = np.zeros((120, 160), np.float32)
     depth[40:70, 50:95] = 1.0
@@ -174,14 +174,14 @@ def test_a_mask_is_dense_at_any_distance_of_the_colour_camera(ahead: float) -> N
     )
 
     # The border pixels end half a pixel beyond their centres.
-    wide, high = 280 * 45 / 140 / (1 - ahead), 282 * 30 / 141 / (1 - ahead)
+    width, height = 280 * 45 / 140 / (1 - ahead), 282 * 30 / 141 / (1 - ahead)
     left = 400 + (49.5 - 80.3) * 280 / 140 / (1 - ahead)
     assert abs(mask.left - 0.5 - left) <= 1.5
-    assert np.abs(np.subtract(mask.box[2:], (wide, high))).max() <= 2
+    assert np.abs(np.subtract(mask.box[2:], (width, height))).max() <= 2
     assert mask.area > 0.97 * mask.pixels.size
 
 
-def test_gaps_are_as_wide_as_they_were_in_the_depth_image() -> None:
+def test_closed_gaps_are_measured_in_depth_pixels() -> None:
     """In a colour image three times as fine, a crack of 3 is closed and a gap of 10 is not."""
     depth = np.zeros((120, 160), np.float32)
     depth[40:80, 40:55] = depth[40:80, 58:80] = depth[40:80, 90:110] = 1.0
@@ -195,7 +195,7 @@ def test_gaps_are_as_wide_as_they_were_in_the_depth_image() -> None:
     assert row[3 * 92 : 3 * 108].all()
 
 
-def test_what_is_a_little_nearer_hides_an_object() -> None:
+def test_slightly_nearer_surface_occludes_object() -> None:
     """A cloth 10 cm before a board hides from the colour camera what the depth camera sees."""
     depth = np.full((120, 160), 1.0, np.float32)
     depth[:, 30:70] = 0.9  # the cloth belongs to no object
@@ -210,7 +210,7 @@ def test_what_is_a_little_nearer_hides_an_object() -> None:
     assert abs(np.flatnonzero(row)[-1] - (129.5 + 98)) <= 2
 
 
-def test_what_is_far_from_an_object_in_the_depth_image_may_hide_it() -> None:
+def test_surface_far_away_in_depth_image_may_occlude_object() -> None:
     """A post near the camera moves much farther between the two images than what it hides."""
     depth = np.full((120, 160), 2.0, np.float32)
     depth[:, 10:40] = 0.5
@@ -223,8 +223,8 @@ def test_what_is_far_from_an_object_in_the_depth_image_may_hide_it() -> None:
     assert np.abs(np.subtract((mask.left, mask.left + mask.box[2]), (152, 159))).max() <= 4
 
 
-def test_a_slit_is_open_if_something_is_seen_through_it() -> None:
-    """What has no depth between two parts is a gap to be closed; a wall between them is not."""
+def test_slit_stays_open_if_background_is_visible() -> None:
+    """Missing depth between two parts is a gap to be closed; a wall between them is not."""
     closed, opened = np.full((2, 120, 160), 1.0, np.float32)
     inside = np.zeros((120, 160), bool)
     inside[30:90, 40:110] = True
@@ -243,8 +243,8 @@ def test_a_slit_is_open_if_something_is_seen_through_it() -> None:
 @pytest.mark.parametrize(
     "part", [np.s_[:, :30], np.s_[:, 120:], np.s_[:20, 30:90], np.s_[95:, 40:70], np.s_[:, :]]
 )
-def test_a_mask_goes_up_to_the_border_of_the_image(part: tuple[slice, slice]) -> None:
-    """Objects that are cut off by the border lost their rim, or the whole mask."""
+def test_mask_extends_to_image_border(part: tuple[slice, slice]) -> None:
+    """Objects cut off by the border lost their edge, or the whole mask."""
     inside = np.zeros((120, 160), bool)
     inside[part] = True
     depth = np.full((120, 160), 1.0, np.float32)
@@ -268,7 +268,7 @@ def two_boards() -> tuple[Frame, Any, Any]:
     return Frame("", 0, 0, 0, "", depth=depth, camera=DEPTH), near, far
 
 
-def test_what_the_colour_camera_does_not_see_gets_no_mask() -> None:
+def test_surface_hidden_from_colour_camera_has_no_mask() -> None:
     """From 20 cm to the left, the near board hides more of the far one: no mask there."""
     frame, near, far = two_boards()
     lens = LensCamera(Camera(320, 240, 280.0, 282.0, 160.6, 117.8))
@@ -285,8 +285,8 @@ def test_what_the_colour_camera_does_not_see_gets_no_mask() -> None:
     assert abs(np.flatnonzero(row)[-1] - (2 * 119.5 + shift_far)) <= 1.5
 
 
-def test_an_object_beside_the_colour_image_takes_no_mask_of_another() -> None:
-    """Masks are stored under the numbers of the detections, of which the first has none here."""
+def test_object_outside_colour_image_has_no_mask() -> None:
+    """Masks are stored by detection number, and here the first detection has none."""
     frame, near, far = two_boards()
     lens = LensCamera(Camera(320, 240, 280.0, 282.0, 20.6, 117.8))
     image = ColourImage("/color", 1, 2, "color", "rgb8", 320, 240, 0, b"")
@@ -299,8 +299,8 @@ def test_an_object_beside_the_colour_image_takes_no_mask_of_another() -> None:
     np.testing.assert_array_equal(whole, far_mask.full(240, 320))
 
 
-def test_a_loose_cloud_beside_a_colour_image_has_no_masks() -> None:
-    """Its points have no pixels to be projected; the recording must be processed nevertheless."""
+def test_unorganized_cloud_has_no_masks() -> None:
+    """Its points have no pixels to project; the recording must be processed nevertheless."""
     cloud = Frame("", 0, 0, 0, "", points=np.array([[0.1, 0.2, 1.0], [0.2, 0.1, 1.1]], np.float32))
     image = ColourImage("/color", 1, 2, "color", "rgb8", 320, 240, 0, b"")
     masks = find_masks(cloud, ColourView(image, LENS, TURNED), [np.array([1], np.uint32)])
@@ -308,7 +308,7 @@ def test_a_loose_cloud_beside_a_colour_image_has_no_masks() -> None:
     assert (masks.boxes, masks.counts, masks.width, masks.height) == ({}, {}, 320, 240)
 
 
-def test_masks_have_no_holes_of_pixels_but_those_of_the_object() -> None:
+def test_masks_keep_only_holes_of_the_object() -> None:
     """A colour image finer than the depth has gaps to close; a hole in a handle is not a gap."""
     depth = np.full((120, 160), 1.0, np.float32)
     ring = np.zeros(depth.shape, bool)
@@ -332,22 +332,21 @@ def test_masks_have_no_holes_of_pixels_but_those_of_the_object() -> None:
     assert not solid[55:65, 65:85].any()
 
 
-def test_masks_of_two_objects_never_share_a_pixel_nor_swallow_the_table() -> None:
+def test_masks_of_two_objects_do_not_overlap() -> None:
     """Closing gaps must not join neighbouring objects, nor objects across the table."""
-    seen = np.zeros((20, 40), np.int32)
-    seen[5:15, 5:15], seen[5:15, 17:27] = 1, 2
-    seen[9, 10] = seen[10, 20] = 0  # a pixel each
-    seen[:, 30:] = -1
-    one, two = labelled_masks(seen, label_boxes(seen, 2))
+    labels = np.zeros((20, 40), np.int32)
+    labels[5:15, 5:15], labels[5:15, 17:27] = 1, 2
+    labels[9, 10] = labels[10, 20] = 0  # a pixel each
+    labels[:, 30:] = -1
+    one, two = labelled_masks(labels, label_boxes(labels, 2))
     assert (one.box, two.box) == ((5, 5, 10, 10), (17, 5, 10, 10))
     assert one.area == two.area == 88  # of squares, whose corners are rounded
 
 
-def test_parts_of_an_object_are_united() -> None:
-    """A merged track has a single mask."""
-    seen = np.zeros((20, 40), np.int32)
-    seen[2:6, 3:9], seen[10:13, 20:31] = 1, 2
-    one, two = labelled_masks(seen, label_boxes(seen, 2))
+def test_masks_of_a_merged_track_are_united() -> None:
+    labels = np.zeros((20, 40), np.int32)
+    labels[2:6, 3:9], labels[10:13, 20:31] = 1, 2
+    one, two = labelled_masks(labels, label_boxes(labels, 2))
     both = united((one, NOTHING, two))
     np.testing.assert_array_equal(both.full(20, 40), one.full(20, 40) | two.full(20, 40))
     assert both.box == (4, 2, 25, 11)
@@ -355,7 +354,7 @@ def test_parts_of_an_object_are_united() -> None:
     assert Mask(0, 0, np.zeros((0, 0), bool)).box == (0, 0, 0, 0)
 
 
-def test_the_union_of_masks_keeps_what_lies_in_the_boxes_of_others() -> None:
+def test_union_of_masks_with_overlapping_boxes_keeps_all_pixels() -> None:
     """The boxes of the parts of a chair overlap; a later part must not clear an earlier one."""
     rng = np.random.default_rng(6)
     masks = [
@@ -368,8 +367,8 @@ def test_the_union_of_masks_keeps_what_lies_in_the_boxes_of_others() -> None:
         np.testing.assert_array_equal(united(order).full(20, 30), expected)
 
 
-def test_the_box_of_several_detections_is_around_all_of_them() -> None:
-    """Sizes, not corners: boxes drawn on images come from here."""
+def test_box_of_several_detections_encloses_all() -> None:
+    """Sizes are not corners; the boxes drawn on images come from here."""
     boxes = {0: (30, 4, 5, 6), 2: (7, 21, 9, 8), 3: (0, 0, 99, 99)}
     masks = ImageMasks("/color", 1, 2, "color", 200, 100, boxes, {})
 
@@ -378,7 +377,7 @@ def test_the_box_of_several_detections_is_around_all_of_them() -> None:
     assert box_of(masks, [1]) is None
 
 
-def picture_of_a_box(colour: tuple[int, int, int]) -> tuple[Any, Any]:
+def image_of_a_box(colour: tuple[int, int, int]) -> tuple[Any, Any]:
     """Return a grainy image of a coloured box, rows 20 to 59 and columns 30 to 69, and its mask."""
     rng = np.random.default_rng(1)
     inside = np.zeros((80, 100), bool)
@@ -388,9 +387,9 @@ def picture_of_a_box(colour: tuple[int, int, int]) -> tuple[Any, Any]:
 
 
 @pytest.mark.parametrize(("top", "left"), [(18, 32), (22, 28), (18, 27)])
-def test_outlines_move_to_the_edges_of_the_colours(top: int, left: int) -> None:
+def test_outlines_snap_to_colour_edges(top: int, left: int) -> None:
     """A mask two or three pixels off its object teaches a wrong outline."""
-    pixels, inside = picture_of_a_box((170, 90, 60))
+    pixels, inside = image_of_a_box((170, 90, 60))
     (mask,) = snapped([Mask(left, top, np.ones((40, 40), bool))], pixels)
     wrong = mask.full(80, 100) ^ inside
     assert wrong.sum() <= 8  # of 160 and more; corners may be rounded
@@ -398,8 +397,8 @@ def test_outlines_move_to_the_edges_of_the_colours(top: int, left: int) -> None:
     assert (finer.full(80, 100) ^ inside).sum() <= 16
 
 
-def test_outlines_move_to_faint_edges_in_fine_images() -> None:
-    """Three times as fine as depth, 7 pixels are little; colours differ by one deviation."""
+def test_outlines_snap_to_faint_edges_in_fine_images() -> None:
+    """At three times the resolution of the depth, 7 pixels are a small error."""
     inside = np.zeros((110, 130), bool)
     inside[25:85, 35:95] = True
     pixels = np.where(inside[..., None], (128, 138, 148), (120, 130, 140)).astype(np.uint8)
@@ -409,7 +408,7 @@ def test_outlines_move_to_faint_edges_in_fine_images() -> None:
 
 
 @pytest.mark.parametrize("turned", [False, True])
-def test_the_outline_of_a_long_object_moves_at_both_ends(*, turned: bool) -> None:
+def test_outline_of_long_object_snaps_at_both_ends(*, turned: bool) -> None:
     """The window around a mask must be as wide and as high as the mask."""
     rng = np.random.default_rng(2)
     inside = np.zeros((50, 180), bool)
@@ -425,18 +424,18 @@ def test_the_outline_of_a_long_object_moves_at_both_ends(*, turned: bool) -> Non
     assert (mask.full(*inside.shape) ^ inside).sum() <= 10  # of 48
 
 
-def test_outlines_stay_where_both_sides_look_alike() -> None:
+def test_outlines_stay_without_colour_edges() -> None:
     """Depth separates a white cup from a white table; colour noise must not move its outline."""
-    pixels, _ = picture_of_a_box((120, 130, 140))
+    pixels, _ = image_of_a_box((120, 130, 140))
     before = Mask(28, 22, np.ones((40, 40), bool))
     (mask,) = snapped([before], pixels)
     assert (mask.full(80, 100) ^ before.full(80, 100)).sum() <= 40  # a quarter of a pixel
     assert snapped([before], np.zeros((80, 100, 3), np.uint8))[0].box == before.box
 
 
-def test_masks_side_by_side_share_no_pixel_when_they_move() -> None:
+def test_snapped_neighbouring_masks_do_not_overlap() -> None:
     """Outlines move independently, so two masks could claim the same pixel."""
-    pixels, inside = picture_of_a_box((170, 90, 60))
+    pixels, inside = image_of_a_box((170, 90, 60))
     left = Mask(30, 20, np.ones((40, 17), bool))
     right = Mask(47, 20, np.ones((40, 23), bool))
     pixels[20:60, 50:70] = np.where(inside[20:60, 50:70, None], (60, 90, 170), 0)
@@ -449,9 +448,9 @@ def test_masks_side_by_side_share_no_pixel_when_they_move() -> None:
     assert whole.area == 8000
 
 
-def test_what_two_masks_may_both_grow_into_is_given_to_one() -> None:
+def test_pixels_between_snapped_masks_go_to_one_of_them() -> None:
     """A body and its bar of the same colour, with a gap of 4 columns between their masks."""
-    pixels, _ = picture_of_a_box((170, 90, 60))
+    pixels, _ = image_of_a_box((170, 90, 60))
     pixels[:36, 50:70] = pixels[44:, 50:70] = pixels[:36, :20].mean(axis=(0, 1))
     body, bar = Mask(30, 20, np.ones((40, 18), bool)), Mask(52, 36, np.ones((8, 18), bool))
     for order in ((body, bar), (bar, body)):
@@ -461,12 +460,12 @@ def test_what_two_masks_may_both_grow_into_is_given_to_one() -> None:
 
 
 @pytest.mark.parametrize("border", [48, 52])
-def test_what_a_mask_gives_up_goes_to_the_mask_beside_it(border: int) -> None:
-    """Two objects touch at column 50; a gap between their masks would be taught as an outline.
+def test_pixels_released_by_a_mask_go_to_its_neighbour(border: int) -> None:
+    """A gap between the masks of two objects that touch would be taught as an outline.
 
     Either of the masks may be the wider one: the order of the objects must not matter.
     """
-    pixels, inside = picture_of_a_box((170, 90, 60))
+    pixels, inside = image_of_a_box((170, 90, 60))
     pixels[20:60, 50:70] = np.where(inside[20:60, 50:70, None], (60, 90, 170), 0)
     left = Mask(30, 20, np.ones((40, border - 30), bool))
     right = Mask(border, 20, np.ones((40, 70 - border), bool))
@@ -478,10 +477,10 @@ def test_what_a_mask_gives_up_goes_to_the_mask_beside_it(border: int) -> None:
 
 @pytest.mark.slow
 @pytest.mark.parametrize("sensor", ["kinect", "realsense"])
-def test_masks_agree_with_what_the_simulated_colour_camera_sees(
+def test_masks_agree_with_simulated_colour_camera(
     tmp_path: Path, sensor: Literal["kinect", "realsense"]
 ) -> None:
-    """End to end: lens, transform, occlusion and sensor errors, against the rendered truth."""
+    """Lens, transform, occlusion and sensor errors together, against the rendered truth."""
     from shapecat.simulation import simulate  # noqa: PLC0415  slow to load
 
     scores = []

@@ -1,4 +1,4 @@
-"""Colour in a run: its masks, the review, and the annotated recording."""
+"""Tests of colour in a run: masks, review, and annotated recording."""
 
 import json
 import shutil
@@ -64,8 +64,8 @@ def recorded(path: Path, topic: str) -> list[tuple[int, Any]]:
         return [(message.log_time, decoded) for _, _, message, decoded in found]
 
 
-def test_masks_of_the_run_are_where_the_objects_are(run: Path) -> None:
-    """From recording to table: every clearly visible object has its mask in every image."""
+def test_masks_of_run_match_simulated_truth(run: Path) -> None:
+    """From recording to table; every object of more than 2000 pixels counts."""
     source = run.parents[1] / "table.mcap"
     truth = np.load(source.with_suffix(".color_labels.npz"))["labels"]
     found = list(read_masks(run))
@@ -76,14 +76,14 @@ def test_masks_of_the_run_are_where_the_objects_are(run: Path) -> None:
         assert (masks.height, masks.width) == labels.shape
         own = [mask_of(masks, [number]).full(*labels.shape) for number in masks.counts]
         for label in np.unique(labels[labels >= 20]):
-            seen = labels == label
-            if seen.sum() > 2000:
-                best.append(max(float((seen & m).sum() / (seen | m).sum()) for m in own))
+            visible = labels == label
+            if visible.sum() > 2000:
+                best.append(max(float((visible & m).sum() / (visible | m).sum()) for m in own))
     assert len(best) > 4 * FRAMES
     assert np.median(best) > 0.85
 
 
-def test_boxes_of_the_table_are_those_of_its_masks(run: Path) -> None:
+def test_stored_boxes_match_masks(run: Path) -> None:
     """Annotations use the boxes, exports the masks: the two must agree."""
     _, masks = next(iter(read_masks(run)))
     for number, box in masks.boxes.items():
@@ -94,7 +94,7 @@ def test_boxes_of_the_table_are_those_of_its_masks(run: Path) -> None:
     assert mask_of(masks, [999]).area == 0
 
 
-def test_the_review_holds_images_as_they_came_and_boxes_of_the_tracks(run: Path) -> None:
+def test_review_has_original_images_and_boxes_of_tracks(run: Path) -> None:
     """Compressing twice would blur the images; a wrong box misleads the reviewer.
 
     Every frame whose scene is drawn has its own image.
@@ -114,18 +114,18 @@ def test_the_review_holds_images_as_they_came_and_boxes_of_the_tracks(run: Path)
     for box, caption in zip(boxes, captions, strict=True):
         masks = of_frame[box["frame"]]
         assert len(box["Boxes2D:half_sizes"]) == len(caption["Points2D:labels"]) > 0
-        shown = {text.split()[0] for text in caption["Points2D:labels"]}
-        assert shown <= {f"#{label.track}" for label in labels.values()}
+        captioned = {text.split()[0] for text in caption["Points2D:labels"]}
+        assert captioned <= {f"#{label.track}" for label in labels.values()}
         left, top, width, height = next(iter(masks.boxes.values()))
         middles = np.array(box["Boxes2D:centers"])
-        wanted = [left + width / 2, top + height / 2]
-        assert np.abs(middles - wanted).max(axis=1).min() < 0.01
+        center = [left + width / 2, top + height / 2]
+        assert np.abs(middles - center).max(axis=1).min() < 0.01
     layers = _rows(run, f"{entity}/masks")
     assert all(bytes(bytearray(r["EncodedImage:blob"][0])).startswith(b"\x89PNG") for r in layers)
 
 
 @pytest.mark.parametrize("wanted", [(1,), (0, 3), (2, 3), (0, 1, 2, 3)])
-def test_frames_that_are_read_alone_keep_their_own_image(run: Path, wanted: Sequence[int]) -> None:
+def test_selected_frames_keep_their_own_image(run: Path, wanted: Sequence[int]) -> None:
     """Images between the wanted frames are skipped; none may replace another."""
     finished = read_finished(run)
     of_frame = {frame: masks for (_, frame), masks in read_masks(run)}
@@ -146,7 +146,7 @@ def _rows(run: Path, entity: str) -> list[dict[str, Any]]:
     return [row for row in rows(run / "review.rrd", entity) if len(row) > 2]
 
 
-def test_annotations_on_images_have_the_stamp_and_frame_of_the_image(run: Path) -> None:
+def test_image_annotations_have_stamp_and_frame_of_image(run: Path) -> None:
     """Foxglove draws only annotations with exactly the timestamp of the image."""
     images = recorded(run / "annotated.mcap", IMAGES)
     found = recorded(run / "annotated.mcap", "/shapecat/detections_2d")
@@ -174,10 +174,10 @@ def test_annotations_on_images_have_the_stamp_and_frame_of_the_image(run: Path) 
             assert text.text.split()[:2] == [f"#{one.id}", one.results[0].hypothesis.class_id]
 
 
-def test_colours_of_a_loose_cloud_are_not_annotated_as_an_image(
+def test_colours_of_unorganized_cloud_are_not_annotated(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
-    """They are a row of points, for which no viewer has a picture."""
+    """They are a row of points, which no viewer shows as an image."""
     masks = [
         (("/d", k), ImageMasks("/colour", 7 + k, 7, "camera", 64, height, {}, {}))
         for k, height in enumerate((1, 48))
@@ -189,7 +189,7 @@ def test_colours_of_a_loose_cloud_are_not_annotated_as_an_image(
     assert [frame.stamp_ns for frame in read_image_frames(Path(), {})] == [8]
 
 
-def test_corrections_reach_the_images(run: Path, tmp_path: Path) -> None:
+def test_corrections_change_image_annotations(run: Path, tmp_path: Path) -> None:
     """A deleted track must vanish from the images, although masks are not computed again."""
     folder = tmp_path / "table"
     shutil.copytree(run, folder)
@@ -204,7 +204,7 @@ def test_corrections_reach_the_images(run: Path, tmp_path: Path) -> None:
     assert (folder / "masks.parquet").stat().st_mtime_ns == before
 
 
-def test_colour_can_be_left_out_and_a_wrong_topic_is_refused(
+def test_colour_can_be_disabled_and_wrong_topic_is_refused(
     run: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, shapecat: Callable[..., Result]
 ) -> None:
     """A topic without images must be refused before the work begins, not after."""
@@ -220,15 +220,15 @@ def test_colour_can_be_left_out_and_a_wrong_topic_is_refused(
     assert "contradict" in result.stderr
 
 
-def test_masks_do_not_depend_on_processes_and_survive_an_interruption(
+def test_masks_do_not_depend_on_processes_or_interruptions(
     run: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """Any process may compute masks, and segments store them with the other tables."""
     sent = []
 
-    def elsewhere(*parts: Any) -> Callable[[Any], Any]:
+    def in_other_process(*parts: Any) -> Callable[[Any], Any]:
         def perceive(views: Any) -> Any:
-            perceiver, received = deepcopy((Perceiver(*parts), views))  # by what is sent
+            perceiver, received = deepcopy((Perceiver(*parts), views))  # only what is sent
             sent.append(received)
             return deepcopy(perceiver(received))
 
@@ -245,7 +245,7 @@ def test_masks_do_not_depend_on_processes_and_survive_an_interruption(
 
     process(job("one"))
     with monkeypatch.context() as patched:
-        patched.setattr("shapecat.runs.perceiving.Perceiver", elsewhere)
+        patched.setattr("shapecat.runs.perceiving.Perceiver", in_other_process)
         process(job("sent"))
     assert len(sent) == FRAMES
     with pytest.raises(KeyboardInterrupt):
@@ -258,7 +258,7 @@ def test_masks_do_not_depend_on_processes_and_survive_an_interruption(
     assert masks["one"].num_rows == FRAMES
 
 
-def test_run_json_names_the_colour_images(run: Path) -> None:
+def test_run_json_names_colour_topic(run: Path) -> None:
     about = json.loads((run / "run.json").read_text())
     assert about["color"] == {"/camera/depth/image_raw": IMAGES}
     assert about["counts"]["color"] == FRAMES
@@ -273,8 +273,8 @@ DRAWING = ImageFrame(
 )
 
 
-def test_annotations_in_json_and_protobuf_say_the_same() -> None:
-    """Read back by the schema that is embedded, as Foxglove does."""
+def test_annotations_in_json_and_protobuf_are_equal() -> None:
+    """Read back with the embedded schema, as Foxglove does."""
     ((as_json, encode),) = image_encoder_for("json")
     plain = json.loads(encode(DRAWING))
     validate: Any = import_module("jsonschema").validate
@@ -298,7 +298,7 @@ def test_annotations_in_json_and_protobuf_say_the_same() -> None:
     assert message.texts[0].text == plain["texts"][0]["text"] == "#6 cup 0.97"
 
 
-def test_run_lengths_are_those_of_coco_and_come_back() -> None:
+def test_run_lengths_match_coco_and_decode_to_mask() -> None:
     """Training code reads masks column by column; a row-wise mask would be noise."""
     rng = np.random.default_rng(5)
     for height, width in ((7, 9), (1, 6), (6, 1), (40, 31)):
@@ -324,8 +324,8 @@ def test_run_lengths_are_those_of_coco_and_come_back() -> None:
     assert rle_text(np.array([3, 2, 1, 1, 5])) == "321O4"
 
 
-def test_a_damaged_image_costs_the_review_only_itself(tmp_path: Path) -> None:
-    """A file may state the right size and be damaged: the frame is shown without colour."""
+def test_review_omits_only_damaged_image(tmp_path: Path) -> None:
+    """An image may state the right size and be damaged; its frame is shown without colour."""
     whole = png(gradient())
     half, views = len(whole) // 2, []
     for k, data in enumerate((whole[:half] + bytes(20) + whole[half + 20 :], whole)):
@@ -354,10 +354,10 @@ def test_a_damaged_image_costs_the_review_only_itself(tmp_path: Path) -> None:
     assert rows(path, f"/world/{TOPIC}/scene")
 
 
-def test_an_output_of_each_kind_is_written_again(
+def test_annotate_again_writes_both_outputs(
     coloured_run: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """Otherwise a review or an annotated recording would keep the labels of before."""
+    """Otherwise a review or an annotated recording would keep its old labels."""
     folder, written = tmp_path / "table", []
     shutil.copytree(coloured_run, folder)
     for name in ("annotated_mcap.write_annotated", "review.write_review"):

@@ -1,4 +1,4 @@
-"""The recordings in the folder fixtures give their expected tables."""
+"""Tests that the recordings in the folder fixtures give their expected tables."""
 
 import io
 from collections.abc import Iterator
@@ -27,7 +27,7 @@ RENEW = "if that is meant, renew them with `make fixtures`"
 
 
 @pytest.mark.parametrize("name", RECORDINGS)
-def test_fixture_gives_the_expected_tables(name: str, tmp_path: Path) -> None:
+def test_fixture_gives_expected_tables(name: str, tmp_path: Path) -> None:
     """A change of results must be noticed and intended."""
     tables = processed_tables(FIXTURES / name, tmp_path / "run")
 
@@ -39,7 +39,7 @@ def test_fixture_gives_the_expected_tables(name: str, tmp_path: Path) -> None:
     assert wrong == [], f"{name} gives other tables; {RENEW}"
 
 
-def test_differences_are_told_except_in_last_digits() -> None:
+def test_comparison_ignores_rounding_differences() -> None:
     """A comparison that is too tolerant would let everything pass."""
     wanted = [{"category": "cup", "points": "512", "x": "0.4000", "on": ""}]
 
@@ -50,7 +50,7 @@ def test_differences_are_told_except_in_last_digits() -> None:
     assert list(differences([{"category": "cup"}], wanted))
 
 
-def test_fixtures_are_small_and_all_there() -> None:
+def test_fixtures_are_small_and_complete() -> None:
     """Cloning must stay quick, and no table may remain of a deleted recording."""
     files = [path for path in FIXTURES.rglob("*") if path.is_file()]
     tables = {expected_path(n, t) for n in SCENES for t in ("tracks", "detections", "planes")}
@@ -60,10 +60,10 @@ def test_fixtures_are_small_and_all_there() -> None:
 
 
 @pytest.mark.many
-def test_fixtures_made_again_are_the_same(tmp_path: Path) -> None:
+def test_fixtures_can_be_reproduced(tmp_path: Path) -> None:
     """A recording that cannot be reproduced cannot be repaired.
 
-    All bytes are the same but those of colour images: processors round their pixels otherwise.
+    All bytes are equal except those of colour images, whose pixels processors round differently.
     """
     make_recordings(tmp_path)
 
@@ -78,9 +78,9 @@ def test_fixtures_made_again_are_the_same(tmp_path: Path) -> None:
         assert [m[:2] for m in new] == [m[:2] for m in old], RENEW
         for (topic, _, data), (_, _, before) in zip(new, old, strict=True):
             if topic.endswith("/compressed"):
-                off = np.abs(picture(data) - picture(before))
-                assert off.mean() < 1, f"{topic}: {RENEW}"
-                assert off.max() < 30, f"{topic}: {RENEW}"
+                difference = np.abs(decoded_jpeg(data) - decoded_jpeg(before))
+                assert difference.mean() < 1, f"{topic}: {RENEW}"
+                assert difference.max() < 30, f"{topic}: {RENEW}"
             else:
                 assert data == before, f"{topic}: {RENEW}"
 
@@ -92,7 +92,7 @@ def read_messages(path: Path) -> Iterator[tuple[str, int, bytes]]:
             yield channel.topic, message.log_time, bytes(message.data)
 
 
-def picture(data: bytes) -> NDArray[np.int64]:
+def decoded_jpeg(data: bytes) -> NDArray[np.int64]:
     """Return the pixels of the JPEG file in a message."""
     with Image.open(io.BytesIO(data[data.index(b"\xff\xd8\xff") :])) as image:
         return np.asarray(image).astype(np.int64)

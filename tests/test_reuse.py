@@ -1,4 +1,4 @@
-"""Reuse of earlier descriptions: the views that qualify, and above all those that do not."""
+"""Tests of reusing earlier descriptions: the views that qualify, and those that do not."""
 
 from collections.abc import Sequence
 from dataclasses import replace
@@ -29,18 +29,18 @@ FRAMES, CHANGE = 6, 3
 
 
 def still_world(frames: int = FRAMES, **changes: Any) -> World:
-    """Return a table with things on it and a camera at rest."""
+    """Return a table with objects and a camera at rest."""
     world = make_scene("tabletop", np.random.default_rng(11), frames=frames)
     return replace(world, path=(world.path[0],) * frames, turns=np.zeros(frames), **changes)
 
 
 def shifted(track: int, shifts: Sequence[Any]) -> Motion:
-    """Return a motion by a step (3,) per frame; None where the object is absent."""
+    """Return a motion by a shift (3,) per frame; None where the object is absent."""
     return Motion(track, np.array([(np.nan,) * 3 if s is None else s for s in shifts]))
 
 
 def alone(world: World) -> int:
-    """Return the thing that is farthest from all others."""
+    """Return the index of the object that is farthest from all others."""
     places = np.array([thing.pose.translation for thing in world.things])
     gaps = np.linalg.norm(places[:, None] - places[None], axis=2) + 9 * np.eye(len(places))
     return int(gaps.min(axis=1).argmax())
@@ -57,7 +57,7 @@ def perceive(world: World, **settings: Any) -> list[Perception]:
     return Perceiver(guesser, Settings(**settings), None)(views)
 
 
-def at(world: World, perceptions: Sequence[Perception], k: int, place: Any) -> Detection:
+def detection_at(world: World, perceptions: Sequence[Perception], k: int, place: Any) -> Detection:
     """Return the detection nearest to a place in the world."""
     found = perceptions[k].detections
     gaps = [np.linalg.norm(transform(world.path[k], d.candidate.box.center) - place) for d in found]
@@ -65,10 +65,10 @@ def at(world: World, perceptions: Sequence[Perception], k: int, place: Any) -> D
     return found[int(np.argmin(gaps))]
 
 
-def test_a_still_scene_is_perceived_once() -> None:
+def test_still_scene_is_described_once() -> None:
     first, *others = perceive(still_world())
     assert len(first.detections) >= 6
-    times = [(seen.index, seen.stamp_ns) for seen in (first, *others)]
+    times = [(perception.index, perception.stamp_ns) for perception in (first, *others)]
     assert times == [(k, 1000 + 70 * k) for k in range(FRAMES)]
     assert first.reused_from is None
     assert {d.reused_from for d in first.detections} == {None}
@@ -83,7 +83,7 @@ def test_a_still_scene_is_perceived_once() -> None:
             assert len(now.candidate.indices) > 0.9 * len(then.candidate.indices)
 
 
-def test_only_readings_of_the_frame_itself_are_pixels_of_an_object() -> None:
+def test_reused_masks_cover_only_depth_of_their_frame() -> None:
     """A repeated mask over a hole would paint and export points that do not exist."""
     world = still_world(2)
     perceptions = perceive(world)
@@ -93,7 +93,7 @@ def test_only_readings_of_the_frame_itself_are_pixels_of_an_object() -> None:
         assert (frame.depth.reshape(-1)[found.candidate.indices] > 0).all()
 
 
-def test_what_moves_is_described_anew_and_nothing_else() -> None:
+def test_only_moved_object_is_described_again() -> None:
     world = still_world()
     track = alone(world)
     place = world.things[track].pose.translation
@@ -103,15 +103,15 @@ def test_what_moves_is_described_anew_and_nothing_else() -> None:
 
     perceptions = perceive(world)
 
-    moved = at(world, perceptions, CHANGE, place + shift)
+    moved = detection_at(world, perceptions, CHANGE, place + shift)
     assert perceptions[CHANGE].reused_from is None
     assert moved.reused_from is None
-    assert at(world, perceptions, CHANGE + 1, place + shift).reused_from == CHANGE
+    assert detection_at(world, perceptions, CHANGE + 1, place + shift).reused_from == CHANGE
     others = [d.reused_from for d in perceptions[CHANGE].detections if d is not moved]
     assert others.count(0) >= len(others) - 1
 
 
-def test_another_object_at_the_same_place_is_described_anew() -> None:
+def test_another_object_at_same_place_is_described_again() -> None:
     """Otherwise it would inherit the label of the object that stood there before."""
     world = still_world()
     names = [thing.category for thing in world.things]
@@ -127,11 +127,11 @@ def test_another_object_at_the_same_place_is_described_anew() -> None:
 
     perceptions = perceive(replace(world, motions=motions))
 
-    assert at(world, perceptions, CHANGE - 1, place).reused_from == 0
-    assert at(world, perceptions, CHANGE, place).reused_from is None
+    assert detection_at(world, perceptions, CHANGE - 1, place).reused_from == 0
+    assert detection_at(world, perceptions, CHANGE, place).reused_from is None
 
 
-def test_what_is_partly_hidden_is_described_anew() -> None:
+def test_partly_hidden_object_is_described_again() -> None:
     world = still_world()
     track = alone(world)
     blocker = (track + 1) % len(world.things)
@@ -151,7 +151,7 @@ def test_what_is_partly_hidden_is_described_anew() -> None:
     assert near.count(None) == len(near)
 
 
-def test_a_slow_drift_is_not_repeated_for_ever() -> None:
+def test_slowly_moving_object_is_described_again() -> None:
     """Each step is within the noise; the motion since the description must count."""
     frames, step = 16, 0.003
     world = still_world(frames)
@@ -164,14 +164,14 @@ def test_a_slow_drift_is_not_repeated_for_ever() -> None:
 
     origins = []
     for k in range(frames):
-        found = at(world, perceptions, k, place + np.array([*(k * way), 0]))
+        found = detection_at(world, perceptions, k, place + np.array([*(k * way), 0]))
         origins.append(k if found.reused_from is None else found.reused_from)
     assert max(k - origin for k, origin in enumerate(origins)) * step <= 0.02
     assert len(set(origins)) >= 3
 
 
-def test_a_walking_camera_takes_surfaces_along() -> None:
-    """In the fixed frame, a reused surface must stay exactly in place."""
+def test_reused_surfaces_stay_in_place_while_camera_moves() -> None:
+    """They stay exactly in place in the fixed frame."""
     world = make_scene("tabletop", np.random.default_rng(11), frames=FRAMES, rate_hz=30.0)
     perceptions = perceive(world)
     assert all(p.reused_from is None for p in perceptions)
@@ -192,8 +192,8 @@ def test_a_walking_camera_takes_surfaces_along() -> None:
         assert np.allclose(now.full.size, then.full.size)
 
 
-def test_a_wrong_pose_repeats_nothing() -> None:
-    """A camera that moves, but is said to rest, sees other points."""
+def test_wrong_pose_prevents_reuse() -> None:
+    """A moving camera whose pose is constant sees other points."""
     world = make_scene("tabletop", np.random.default_rng(11), frames=12, rate_hz=3.0)
     still = replace(world, path=(world.path[0],) * 12)
     guesser: Any = Guesser()
@@ -220,31 +220,31 @@ def blank(index: int = 0) -> Frame:
 @pytest.mark.parametrize(
     "change", [{"frame_id": "other"}, {"camera": replace(KINECT.camera, fx=9)}]
 )
-def test_a_frame_of_another_camera_shows_something_else(change: Any) -> None:
+def test_frame_of_another_camera_is_not_the_same(change: Any) -> None:
     frame = blank()
 
     assert shows_the_same(frame, None, frame, None, range_m=2.0)
     assert not shows_the_same(replace(frame, **change), None, frame, None, range_m=2.0)
 
 
-def test_topics_and_up_directions_repeat_nothing_of_each_other() -> None:
+def test_nothing_is_reused_across_topics_or_up_directions() -> None:
     """Two sensors may begin with equal images; heights depend on the up direction."""
     frame = replace(blank(), topic="/left")
     up = np.asarray(still_world(1).path[0].rotation[2], np.float32)
     tilted = up + np.float32(0.04) * np.array([1, 0, 0], np.float32)
     tilted /= np.linalg.norm(tilted)
     ups = {"/left": (up, tilted, None), "/right": (up,)}
-    views = [View(replace(frame, topic=topic), up) for topic, some in ups.items() for up in some]
+    views = [View(replace(frame, topic=topic), up) for topic, given in ups.items() for up in given]
     guesser: Any = Guesser()
     perceptions = Perceiver(guesser, Settings(), None)(views)
 
-    assert [seen.topic for seen in perceptions] == [*["/left"] * 3, "/right"]
-    assert all(seen.reused_from is None for seen in perceptions)
+    assert [perception.topic for perception in perceptions] == [*["/left"] * 3, "/right"]
+    assert all(perception.reused_from is None for perception in perceptions)
     assert {d.reused_from for d in perceptions[3].detections} == {None}
 
 
-def test_something_as_small_as_the_smallest_object_is_a_change() -> None:
-    """60 points are an object: in a repeated scene, it must not vanish."""
+def test_change_of_smallest_object_size_is_noticed() -> None:
+    """60 points are an object, which must not vanish in a repeated scene."""
     frame = blank()
     assert frame.depth is not None
     for row, column in ((240, 320), (241, 323), (101, 77)):
@@ -255,7 +255,7 @@ def test_something_as_small_as_the_smallest_object_is_a_change() -> None:
         assert not shows_the_same(frame, None, other, None, range_m=2.0)
 
 
-def test_single_readings_and_what_is_out_of_range_are_no_change() -> None:
+def test_single_pixels_and_distant_surfaces_are_no_change() -> None:
     frame = blank()
     assert frame.depth is not None
     depth = frame.depth.copy()
@@ -278,16 +278,16 @@ def test_single_readings_and_what_is_out_of_range_are_no_change() -> None:
         (IDENTITY, None, False),
     ],
 )
-def test_a_camera_that_has_moved_shows_another_scene(
+def test_same_scene_requires_known_and_equal_poses(
     pose: Pose | None, then: Pose | None, same: bool
 ) -> None:
     assert shows_the_same(blank(), pose, blank(), then, range_m=2.0) is same
 
 
-def test_the_tables_tell_what_is_repeated_within_each_block(
+def test_tables_record_reuse_within_each_block(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """Blocks have fixed starts, so that any worker and any resumed run repeats the same."""
+    """Blocks have fixed starts, so that any worker and any resumed run reuses the same."""
     monkeypatch.setattr(shapecat.pipeline, "load_model", lambda _path: Guesser())
     source = record(still_world(10), tmp_path / "still.mcap", seed=1, sensor=KINECT)
     out = tmp_path / "out"
@@ -309,22 +309,22 @@ def test_the_tables_tell_what_is_repeated_within_each_block(
             assert row[name] == first[name]
 
 
-def test_blocks_of_one_frame_repeat_nothing() -> None:
+def test_blocks_of_one_frame_reuse_nothing() -> None:
     guesser: Any = Guesser()
     perceiver = Perceiver(guesser, Settings(), None)
     frame = blank()
     for k in range(2):
-        (seen,) = perceiver([View(replace(frame, index=k), None, (), IDENTITY)])
-        assert {d.reused_from for d in seen.detections} == {None}
+        (perception,) = perceiver([View(replace(frame, index=k), None, (), IDENTITY)])
+        assert {d.reused_from for d in perception.detections} == {None}
 
 
 @pytest.mark.parametrize("count", [0, 65])
-def test_blocks_have_bounds(count: int) -> None:
+def test_reuse_frames_out_of_bounds_is_refused(count: int) -> None:
     with pytest.raises(ConfigError, match="reuse_frames must be from 1 to 64"):
         Settings(reuse_frames=count)
 
 
-def test_a_repeated_view_is_no_new_evidence() -> None:
+def test_repeated_views_add_no_evidence() -> None:
     """Thirty repeats of one wrong view must not outvote three right ones."""
     described = [0, 0, 0, 0, 0, 5, 6, 7]
     frames = [
@@ -344,13 +344,13 @@ def test_a_repeated_view_is_no_new_evidence() -> None:
     ]
     hits = next(gather(frames))
     assert hits.weights(np.arange(8)).tolist() == [1, 0, 0, 0, 0, 1, 0.25, 1]
-    # A track that begins with a repeat has nothing else to go by.
+    # A track that begins with a repeat has no other view.
     assert hits.weights(np.arange(2, 8)).tolist() == [1, 0, 0, 1, 0.25, 1]
     plain = next(gather([replace(frame, described=None) for frame in frames]))
     assert plain.weights(np.arange(8)).tolist() == [1, 1, 1, 1, 1, 1, 0.25, 1]
 
 
-def test_frames_of_two_topics_are_views_of_their_own() -> None:
+def test_frames_of_two_topics_are_separate_views() -> None:
     frames = [
         FrameDetections(
             topic=topic,

@@ -1,4 +1,4 @@
-"""The up direction of the whole recording is used in frames that are disturbed."""
+"""Tests of perceiving disturbed frames again with the up direction of the whole recording."""
 
 import csv
 from collections.abc import Iterator
@@ -36,24 +36,24 @@ COUNT = 40
 DISTURBED = (7, 16, 17, 31)
 MANY = tuple(range(3, COUNT, 4))
 SHORTLY, BRIEF = 25, tuple(range(20, 24))
-"""The label of an object, and the only frames, a tenth of all, that show it where it is brief."""
+"""The label of an object, and the frames, a tenth of all, that alone show it if ``brief``."""
 BLOCKS = Settings(reuse_frames=4)
-"""Shorter ones than usual, so that there are several to look at again."""
+"""Shorter blocks than usual, so that several are perceived again."""
 LEANING = Pose(np.array([[1.0, 0, 0], [0, 0.28, -0.96], [0, 0.96, 0.28]]), np.zeros(3))
 """The fixed frame of a log whose z is far from up."""
 
 
 @cache
 def views(moving: bool) -> tuple[tuple[Any, Any, Camera, Pose], ...]:
-    """Return depth, labels, camera and pose of a camera that walks past a table, or stands."""
+    """Return depth, labels, camera and pose of a camera that moves past a table, or rests."""
     world = make_scene("tabletop", np.random.default_rng(23), frames=90)
     found = []
     for k in range(12 if moving else 1):
         frame, labels = render_frame(world, 2 * k, rng=np.random.default_rng(k), sensor=IDEAL)
         assert frame.depth is not None
         assert frame.camera is not None
-        c = frame.camera
-        small = Camera(160, 120, c.fx / STEP, c.fy / STEP, c.cx / STEP, c.cy / STEP)
+        own = frame.camera
+        small = Camera(160, 120, own.fx / STEP, own.fy / STEP, own.cx / STEP, own.cy / STEP)
         depth = np.round(frame.depth[::STEP, ::STEP] * 1000) / np.float32(1000)
         found.append((depth.astype(np.float32), labels[::STEP, ::STEP], small, world.path[2 * k]))
     return tuple(found)
@@ -78,12 +78,12 @@ def items(
 ) -> Iterator[tuple[str, int, Any]]:
     """Yield the messages of a recording; ``fixed`` turns the fixed frame.
 
-    With ``brief`` the depth of one object is there in the frames `BRIEF` alone.
+    With ``brief``, one object has depth only in the frames `BRIEF`.
     """
     yield "/tf_static", EPOCH, MAKE.transforms([("camera_link", OPTICAL, LINK_FROM_OPTICAL)], EPOCH)
-    seen = [*views(moving), *views(moving)[-2:0:-1]]
+    sequence = [*views(moving), *views(moving)[-2:0:-1]]
     for k in range(COUNT):
-        depth, labels, camera, pose = seen[k % len(seen)]
+        depth, labels, camera, pose = sequence[k % len(sequence)]
         stamp = EPOCH + k * PERIOD
         if brief and k not in BRIEF:
             depth = np.where(labels == SHORTLY, np.float32(0), depth)
@@ -117,7 +117,7 @@ def revised(out: Path) -> list[int]:
 
 
 def share_found(out: Path, plain: Path) -> float:
-    """Return the fraction of objects in disturbed frames that are where they are otherwise."""
+    """Return the fraction of the plain run's detections in disturbed frames that are found."""
     centers: dict[tuple[int, Path], list[Any]] = {}
     for folder in (out, plain):
         for row in rows(folder, "detections", "frame", "center"):
@@ -131,7 +131,7 @@ def share_found(out: Path, plain: Path) -> float:
 
 
 def assert_same_tracks(one: Path, other: Path, fixed: Pose = IDENTITY) -> None:
-    """Each object is one track in both, of one category, in one place, while it is undisturbed."""
+    """Check that each object is one track in both runs, with equal category and position."""
     tracks = tracks_of(one), tracks_of(other)
     assert len(tracks[0]) == len(tracks[1]) >= 5
     for a in tracks[0]:
@@ -151,22 +151,22 @@ def place(track: dict[str, str]) -> Any:
 
 @pytest.fixture(scope="module")
 def walk(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """Return the undisturbed run of a camera that walks, with transforms."""
+    """Return the undisturbed run of a moving camera, with transforms."""
     return run(tmp_path_factory.mktemp("walk") / "plain.mcap", items(moving=True))
 
 
 @pytest.mark.parametrize("moving", [False, True])
-def test_a_recording_of_which_a_tenth_is_disturbed_loses_no_track(
+def test_recording_with_tenth_of_frames_disturbed_loses_no_track(
     walk: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, *, moving: bool
 ) -> None:
-    """Both a still camera without transforms and a walking one with them."""
+    """Both with a still camera without transforms and with a moving one with them."""
     still = tmp_path / "plain.mcap"
     plain = walk if moving else run(still, items(moving=False, poses=False))
     spoilt = items(moving=moving, poses=moving, disturbed=DISTURBED)
     out = run(tmp_path / "spoilt.mcap", spoilt)
 
     assert revised(plain) == []
-    assert revised(out) == ([] if moving else [*DISTURBED])  # the transforms had told it already
+    assert revised(out) == ([] if moving else [*DISTURBED])  # transforms define up anyway
     assert "revised" not in read_run(plain)["counts"]
     assert_same_tracks(plain, out)
 
@@ -176,10 +176,10 @@ def test_a_recording_of_which_a_tenth_is_disturbed_loses_no_track(
     assert share_found(out, plain) > share_found(once, plain) + 0.1
 
 
-def test_disturbed_frames_in_a_row_end_no_track(
+def test_consecutive_disturbed_frames_end_no_track(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """Nor are their own objects lost; without the second look all tracks end."""
+    """Objects seen only in these frames stay, too; without the second look all tracks end."""
 
     def recording(disturbed: tuple[int, ...]) -> Iterator[Any]:
         return items(moving=False, poses=False, brief=True, disturbed=disturbed)
@@ -199,29 +199,29 @@ def test_disturbed_frames_in_a_row_end_no_track(
     assert len(tracks_of(once)) > len(lengths)
 
 
-def test_a_fixed_frame_whose_z_is_not_up_is_dropped(walk: Path, tmp_path: Path) -> None:
+def test_up_of_tilted_fixed_frame_is_dropped(walk: Path, tmp_path: Path) -> None:
     """Its poses are still correct, and the planes agree on an up direction in it."""
     leaning = items(moving=True, fixed=LEANING, disturbed=DISTURBED)
     out = run(tmp_path / "leaning.mcap", leaning)
-    told = read_run(out)
+    about = read_run(out)
 
-    assert told["up"] == {"source": "planes", "dropped": {TOPIC: "transforms, z of map"}}
-    assert any("differs by 74 degrees" in text for text in told["warnings"])
+    assert about["up"] == {"source": "planes", "dropped": {TOPIC: "transforms, z of map"}}
+    assert any("differs by 74 degrees" in text for text in about["warnings"])
     assert all(row["up_given"] is None for row in rows(out, "frames", "up_given"))
     assert set(revised(out)) >= set(DISTURBED)
     assert_same_tracks(walk, out, LEANING)
 
 
 @pytest.mark.parametrize("up", ["0,0.28,-0.96", "tf"])
-def test_an_up_that_the_user_asks_for_is_kept(tmp_path: Path, up: str) -> None:
+def test_up_requested_by_user_is_kept(tmp_path: Path, up: str) -> None:
     """An explicit direction may be better than the planes; a warning is enough."""
     leaning = items(moving=False, fixed=LEANING, disturbed=DISTURBED)
     out = run(tmp_path / "leaning.mcap", leaning, up=up)
-    told = read_run(out)
+    about = read_run(out)
 
-    assert "dropped" not in told["up"]
+    assert "dropped" not in about["up"]
     assert all(row["up_given"] is not None for row in rows(out, "frames", "up_given"))
-    assert any("--up" in text and "differs by" in text for text in told["warnings"])
+    assert any("--up" in text and "differs by" in text for text in about["warnings"])
     assert revised(out) == []
 
 
@@ -237,9 +237,7 @@ def spoilt(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 @pytest.mark.usefixtures("late_answers")
-def test_the_second_look_does_not_depend_on_the_number_of_workers(
-    spoilt: Path, tmp_path: Path
-) -> None:
+def test_second_look_does_not_depend_on_number_of_workers(spoilt: Path, tmp_path: Path) -> None:
     out = tmp_path / "table"
     process(Job(spoilt / "table.mcap", out, mcap=False, rrd=False, settings=BLOCKS), cores=2)
 
@@ -247,7 +245,7 @@ def test_the_second_look_does_not_depend_on_the_number_of_workers(
     assert_same_tables(out, spoilt / "table")
 
 
-def test_an_interrupted_second_look_goes_on_where_it_stopped(spoilt: Path, tmp_path: Path) -> None:
+def test_interrupted_second_look_resumes_where_it_stopped(spoilt: Path, tmp_path: Path) -> None:
     job = Job(spoilt / "table.mcap", tmp_path / "table", mcap=False, rrd=False, settings=BLOCKS)
 
     def stop(phase: str, done: int, _total: int | None) -> None:
@@ -258,19 +256,19 @@ def test_an_interrupted_second_look_goes_on_where_it_stopped(spoilt: Path, tmp_p
         process(job, stop)
     assert (tmp_path / ".table.partial" / "revisions" / "000000").exists()
 
-    seen: list[tuple[str, int]] = []
-    process(job, lambda phase, done, _total: seen.append((phase, done)))
+    progress: list[tuple[str, int]] = []
+    process(job, lambda phase, done, _total: progress.append((phase, done)))
 
-    assert [done for phase, done in seen if phase == "revise"] == list(range(9, len(MANY) + 1))
-    assert not [done for phase, done in seen if phase == "perceive"]
+    assert [done for phase, done in progress if phase == "revise"] == list(range(9, len(MANY) + 1))
+    assert not [done for phase, done in progress if phase == "perceive"]
     assert_same_tables(job.folder, spoilt / "table")
     assert {p.name for p in job.folder.iterdir()} == {p.name for p in (spoilt / "table").iterdir()}
 
 
-def test_a_kill_between_the_new_tables_leaves_nothing_that_lasts(
+def test_kill_between_revised_tables_is_repaired(
     spoilt: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """Some tables would be from the second look, others not."""
+    """Otherwise some tables would be revised and others not."""
     job = Job(spoilt / "table.mcap", tmp_path / "table", mcap=False, rrd=False, settings=BLOCKS)
 
     def die(*_args: object) -> int:
@@ -305,8 +303,8 @@ def tables(
     }
     frames = pa.table({k: pa.array(v, FRAMES.field(k).type) for k, v in columns.items()})
     level = np.flatnonzero(np.isfinite(offsets))
-    borne = {"topic": ["/d"] * len(level), "frame": level, "offset": offsets[level]}
-    planes = pa.table({k: pa.array(v, PLANES.field(k).type) for k, v in borne.items()})
+    data = {"topic": ["/d"] * len(level), "frame": level, "offset": offsets[level]}
+    planes = pa.table({k: pa.array(v, PLANES.field(k).type) for k, v in data.items()})
     return [
         (frames[:9], planes.filter(pa.array(level < 9))),
         (frames[9:], planes.filter(pa.array(level >= 9))),
@@ -319,7 +317,7 @@ def leaning(degrees: Any) -> Any:
     return np.stack([0 * angle, -np.cos(angle), -np.sin(angle)], axis=1)
 
 
-def test_a_still_camera_knows_up_from_its_neighbours() -> None:
+def test_still_camera_takes_up_from_nearby_frames() -> None:
     up, offsets = leaning(np.full(20, 35.0)), np.full(20, -0.9)
     up[6], up[13], offsets[13], offsets[17] = leaning([80.0])[0], (0, -1, 0), np.nan, -0.5
 
@@ -331,7 +329,7 @@ def test_a_still_camera_knows_up_from_its_neighbours() -> None:
         assert revision.up_given is None
 
 
-def test_a_floor_beside_the_usual_support_disturbs_no_frame() -> None:
+def test_frame_with_floor_beside_usual_plane_is_kept() -> None:
     """A gap between furniture shows the floor in one frame; the table is still where it was."""
     (frames, planes), *others = tables(leaning(np.full(20, 35.0)))
     offset = planes.schema.get_field_index("offset")
@@ -343,7 +341,7 @@ def test_a_floor_beside_the_usual_support_disturbs_no_frame() -> None:
     assert list(frames_to_revise([(frames, alone), *others])) == [("/d", 4)]
 
 
-def test_cameras_are_compared_with_their_own_frames_alone() -> None:
+def test_frames_are_compared_within_each_camera() -> None:
     """Two cameras that lean differently would revise each other's frames."""
     one, other = (leaning(np.full(20, degrees)) for degrees in (35.0, 10.0))
     one[6], other[3] = leaning([80.0])[0], leaning([60.0])[0]
@@ -358,10 +356,10 @@ def test_cameras_are_compared_with_their_own_frames_alone() -> None:
     assert list(frames_to_revise(both)) == [("/d", 6), ("/e", 3)]
 
 
-def test_each_camera_is_asked_whether_its_planes_confirm_up(
+def test_given_up_is_tested_for_each_camera(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
-    """Only the one whose mounting is wrong is doubted, after three of its frames."""
+    """Only the camera with wrong mounting is doubted, after three of its frames."""
     level, tilted = leaning([0.0, 40.0])
     planes = {"/good": level, "/bad": tilted, "/blind": None}
     monkeypatch.setattr(perceiving, "find_up", lambda frame, _: planes[frame.topic])
@@ -375,15 +373,15 @@ def test_each_camera_is_asked_whether_its_planes_confirm_up(
     ]
     trial = perceiving._UpTrial(upright, Settings())
 
-    told = {name: Orientation(f"tf of {name}", level, None) for name in planes}
-    seen = list(trial.before((frame, None, told[frame.topic]) for frame in frames))
+    given = {name: Orientation(f"tf of {name}", level, None) for name in planes}
+    returned = list(trial.before((frame, None, given[frame.topic]) for frame in frames))
 
-    assert [frame.index for frame, *_ in seen] == list(range(len(frames)))
+    assert [frame.index for frame, *_ in returned] == list(range(len(frames)))
     assert doubted == [("/bad", "tf of /bad", 3)]
 
 
-def test_no_frame_is_its_own_witness() -> None:
-    """Frames within three seconds count, at most thirty on either side, but not itself."""
+def test_nearby_frames_exclude_the_frame_itself() -> None:
+    """They are within three seconds, at most thirty on either side."""
     stream = _streams(tables(leaning(np.full(90, 35.0))))["/d"]
     apart = stream._replace(stamps_ns=np.arange(90) * 1_000_000_000)
 
@@ -392,16 +390,16 @@ def test_no_frame_is_its_own_witness() -> None:
     assert _around(apart, 40).tolist() == [37, 38, 39, 41, 42, 43]
 
 
-def test_a_camera_that_moves_unknown_to_all_is_no_neighbour() -> None:
-    """If the camera moved in between, earlier frames do not constrain up."""
+def test_frames_of_camera_moving_without_poses_are_kept() -> None:
+    """Nearby frames do not constrain up if the camera moves between them."""
     up, offsets = leaning(np.linspace(10, 70, 20)), np.full(20, -0.9)
     offsets[8] = np.nan
 
     assert frames_to_revise(tables(up, offsets=offsets)) == {}
 
 
-def test_poses_carry_up_through_any_motion() -> None:
-    """The fixed frame's z is not up here; only the planes give it."""
+def test_poses_relate_up_directions_of_moving_camera() -> None:
+    """The fixed frame's z is not up; only the planes define up in it."""
     tilts = np.linspace(10, 70, 20)
     truth, fixed_up = leaning(tilts), np.array([0.6, 0.0, 0.8])
     rotation = [rotation_between(v, fixed_up) for v in truth]
@@ -422,8 +420,8 @@ def rotation_between(a: Any, b: Any) -> Any:
     return turn.as_matrix()
 
 
-def test_a_frame_that_was_told_the_same_is_not_looked_at_again() -> None:
-    """With an equal up direction the result is the same; a shaken IMU is another matter."""
+def test_frame_with_same_given_up_is_not_revised() -> None:
+    """An equal up direction gives an equal result, but a shaken IMU gives another one."""
     given, offsets = leaning(np.full(20, 35.0)), np.full(20, -0.9)
     offsets[[5, 12]] = np.nan
     given[12] = leaning([65.0])[0]
@@ -431,6 +429,6 @@ def test_a_frame_that_was_told_the_same_is_not_looked_at_again() -> None:
     chosen = frames_to_revise(tables(leaning(np.full(20, 35.0)), given=given, offsets=offsets))
 
     assert [frame for _, frame in chosen] == [12]
-    told = chosen["/d", 12].up_given
-    assert told is not None
-    np.testing.assert_allclose(told, given[12], atol=1e-6)
+    before = chosen["/d", 12].up_given
+    assert before is not None
+    np.testing.assert_allclose(before, given[12], atol=1e-6)

@@ -1,4 +1,4 @@
-"""The labelling loop of docs/howto-labelling.md: process, correct, export, learn, process again."""
+"""Test of the loop of docs/howto-labelling.md: process, correct, export, learn, process again."""
 
 import csv
 import json
@@ -40,8 +40,8 @@ def table_with_glasses(seed: int) -> World:
     return World("tabletop", (table,), tuple(layout.things), path)
 
 
-def things_of(recording: Path, folder: Path) -> dict[int, tuple[int, str]]:
-    """Return of each track the thing most of its points are on, and its true category."""
+def track_objects(recording: Path, folder: Path) -> dict[int, tuple[int, str]]:
+    """Return for each track the label of the object with most of its points, and its category."""
     frames = json.loads(recording.with_suffix(".truth.json").read_text())
     names = {item["label"]: item["category"] for frame in frames for item in frame["objects"]}
     labels = np.load(recording.with_suffix(".labels.npz"))["labels"]
@@ -49,25 +49,25 @@ def things_of(recording: Path, folder: Path) -> dict[int, tuple[int, str]]:
         (row["frame"], row["detection"]): row["indices"]
         for row in pq.read_table(folder / "detections.parquet").to_pylist()
     }
-    votes: dict[int, Counter[int]] = {}
+    counts: dict[int, Counter[int]] = {}
     for row in pq.read_table(folder / "tracks.parquet").to_pylist():
         if row["detection"] is not None:
             pixels = labels[row["frame"]].ravel()[indices[row["frame"], row["detection"]]]
-            votes.setdefault(row["track"], Counter()).update(pixels.tolist())
-    owners = {track: count.most_common(1)[0][0] for track, count in votes.items()}
-    return {track: (thing, names.get(thing, "delete")) for track, thing in owners.items()}
+            counts.setdefault(row["track"], Counter()).update(pixels.tolist())
+    owners = {track: count.most_common(1)[0][0] for track, count in counts.items()}
+    return {track: (label, names.get(label, "delete")) for track, label in owners.items()}
 
 
-def truth_of(recording: Path, folder: Path) -> dict[int, str]:
-    """Return the correct label of each track."""
-    return {track: name for track, (_, name) in things_of(recording, folder).items()}
+def true_categories(recording: Path, folder: Path) -> dict[int, str]:
+    """Return the correct category of each track."""
+    return {track: name for track, (_, name) in track_objects(recording, folder).items()}
 
 
-def right_things(recording: Path, folder: Path) -> set[int]:
-    """Return the things of known categories all of whose tracks have the right name."""
-    said, things = categories(folder), things_of(recording, folder)
-    known = {thing for thing, name in things.values() if name in CATEGORIES}
-    return known - {thing for track, (thing, name) in things.items() if said[track] != name}
+def correct_objects(recording: Path, folder: Path) -> set[int]:
+    """Return the objects of known categories whose tracks all have the right category."""
+    predicted, objects = categories(folder), track_objects(recording, folder)
+    known = {label for label, name in objects.values() if name in CATEGORIES}
+    return known - {label for track, (label, name) in objects.items() if predicted[track] != name}
 
 
 def read_table(path: Path) -> list[dict[str, str]]:
@@ -92,8 +92,8 @@ def command(shapecat: Run, *words: object) -> str:
     return str(result.stdout)
 
 
-def test_a_new_category_is_learned_from_corrections(shapecat: Run, tmp_path: Path) -> None:
-    """Two wrong labels and a category unknown to the model; known categories must not suffer.
+def test_new_category_is_learned_from_corrections(shapecat: Run, tmp_path: Path) -> None:
+    """Two labels are wrong and one category is new; known categories must not suffer.
 
     Views that were learned from are easy: a model that fits badly, or is too careful, misses the
     glasses of another table, or takes its cup for one.
@@ -104,18 +104,18 @@ def test_a_new_category_is_learned_from_corrections(shapecat: Run, tmp_path: Pat
     )
     command(shapecat, "process", recording, "--out", tmp_path / "first", "--no-rrd")
     first = tmp_path / "first" / "lab"
-    truth = truth_of(recording, first)
+    truth = true_categories(recording, first)
     before = categories(first)
     glasses = [track for track, name in truth.items() if name == NEW]
     known = [track for track, name in truth.items() if name in CATEGORIES]
-    right = [track for track in known if before[track] == truth[track]]
-    right_at_first = right_things(recording, first)
+    correct = [track for track in known if before[track] == truth[track]]
+    correct_before = correct_objects(recording, first)
     assert len(glasses) >= 4
-    assert len(right) >= len(right_at_first) >= 5
+    assert len(correct) >= len(correct_before) >= 5
 
     rows = read_table(first / "tracks.csv")
-    for row in rows:  # a model that takes two of them for something else
-        if int(row["track"]) in right[:2]:
+    for row in rows:  # as if the model had confused two of them
+        if int(row["track"]) in correct[:2]:
             row["category"] = next(n for n in CATEGORIES if n != truth[int(row["track"])])
     write_table(first / "tracks.csv", rows)
     corrected = [
@@ -127,25 +127,25 @@ def test_a_new_category_is_learned_from_corrections(shapecat: Run, tmp_path: Pat
     write_table(tmp_path / "corrected.csv", corrected)
     command(shapecat, "annotate", first, "--labels", tmp_path / "corrected.csv")
     command(shapecat, "export", first, "--format", "crops", "--out", tmp_path / "crops")
-    said = command(shapecat, "learn", "default", tmp_path / "crops", "--out", tmp_path / "mine.npz")
-    assert f"learned {NEW} from" in said
+    text = command(shapecat, "learn", "default", tmp_path / "crops", "--out", tmp_path / "mine.npz")
+    assert f"learned {NEW} from" in text
 
     process = ("process", recording, other, "--model", tmp_path / "mine.npz", "--no-rrd")
     command(shapecat, *process, "--no-mcap", "--out", tmp_path / "second")
     second = tmp_path / "second" / "lab"
-    after, truth = categories(second), truth_of(recording, second)
+    after, truth = categories(second), true_categories(recording, second)
     learned = [after[track] == NEW for track, name in truth.items() if name == NEW]
     assert len(learned) >= 4
     assert np.mean(learned) >= 0.9
-    assert right_things(recording, second) >= right_at_first
+    assert correct_objects(recording, second) >= correct_before
     unseen = tmp_path / "second" / "kitchen"
-    after, truth = categories(unseen), truth_of(other, unseen)
-    called = Counter(truth[track] for track, name in after.items() if name == NEW)
-    assert called.keys() == {NEW}
-    assert called[NEW] >= 3
+    after, truth = categories(unseen), true_categories(other, unseen)
+    predicted_glasses = Counter(truth[track] for track, name in after.items() if name == NEW)
+    assert predicted_glasses.keys() == {NEW}
+    assert predicted_glasses[NEW] >= 3
 
 
-def test_a_dataset_without_a_new_category_is_refused(shapecat: Run, tmp_path: Path) -> None:
+def test_dataset_without_new_category_is_refused(shapecat: Run, tmp_path: Path) -> None:
     view = tmp_path / "crops" / "cup" / "mine" / "0.npz"
     view.parent.mkdir(parents=True)
     np.savez(view, points=np.random.default_rng(0).normal(0.1, 0.04, (500, 3)))
@@ -158,7 +158,7 @@ def test_a_dataset_without_a_new_category_is_refused(shapecat: Run, tmp_path: Pa
 
 
 @pytest.mark.parametrize("model", ["none.npz", "crops"])
-def test_a_model_that_is_none_is_refused(shapecat: Run, tmp_path: Path, model: str) -> None:
+def test_invalid_model_is_refused(shapecat: Run, tmp_path: Path, model: str) -> None:
     (tmp_path / "crops").mkdir()
 
     result = shapecat("learn", tmp_path / model, tmp_path / "crops", "--out", tmp_path / "m.npz")

@@ -1,4 +1,4 @@
-"""Fusing consecutive depth images: moving, jumping or unknown surfaces must not smear."""
+"""Tests of fusing consecutive depth images: moving surfaces must not smear."""
 
 from collections.abc import Iterator, Sequence
 from dataclasses import replace
@@ -36,18 +36,18 @@ RANGE_M = 2.0
 TICK = SECOND // 30
 
 
-def see(pose: Pose, box: Any = BOX) -> F4:
+def render_depth(pose: Pose, box: Any = BOX) -> F4:
     """Return the true depth (h w,) of a box on a floor, by the geometry of rays and slabs."""
     v, u = np.mgrid[: CAMERA.height, : CAMERA.width]
     rays = np.stack(
         [(u - CAMERA.cx) / CAMERA.fx, (v - CAMERA.cy) / CAMERA.fy, np.ones(u.shape)], axis=-1
     )
-    way, eye = rays @ pose.rotation.T, pose.translation
+    direction, eye = rays @ pose.rotation.T, pose.translation
     with np.errstate(divide="ignore"):
-        floor = np.where(way[..., 2] < 0, -eye[2] / way[..., 2], 0)
+        floor = np.where(direction[..., 2] < 0, -eye[2] / direction[..., 2], 0)
         if box is None:
             return floor.astype(np.float32)
-        limits = np.sort((np.array(box).T[:, None, None] - eye) / way, axis=0)
+        limits = np.sort((np.array(box).T[:, None, None] - eye) / direction, axis=0)
     near, far = limits[0].max(axis=-1), limits[1].min(axis=-1)
     return np.where((near < far) & (near > 0), near, floor).astype(np.float32)
 
@@ -58,14 +58,14 @@ def frame(depth: F4, stamp_ns: int = 0, **changes: Any) -> Frame:
 
 
 def noisy(depth: F4, rng: np.random.Generator, deviation: float = 0.0015) -> F4:
-    """Disturb the inverse depth as a depth camera does."""
+    """Add noise to the inverse depth, as a depth camera does."""
     with np.errstate(divide="ignore"):
         inverse = 1 / depth + rng.normal(0, deviation, depth.shape)
     return np.where(depth > 0, 1 / inverse, 0).astype(np.float32)
 
 
-def error(depth: F4, truth: F4) -> F4:
-    """Return the errors of the inverse depth at the readings in range."""
+def errors(depth: F4, truth: F4) -> F4:
+    """Return the errors of the inverse depth at valid pixels in range."""
     used = (depth > 0) & (truth < RANGE_M - 0.1)
     return np.asarray(1 / depth[used] - 1 / truth[used])
 
@@ -92,9 +92,9 @@ def home(*shift: float, gaze: tuple[float, ...] = (0.0, 0.0, 0.0), roll: float =
 HOME = home(0.0, 0.0, 0.0)
 
 
-def test_one_frame_is_the_frame_itself() -> None:
+def test_single_frame_is_unchanged() -> None:
     """The default must not change a single bit."""
-    alone = frame(see(HOME))
+    alone = frame(render_depth(HOME))
     recent = RecentFrames(Settings().detection.fuse_frames)
     for stamp in (0, TICK):
         assert recent.before(replace(alone, stamp_ns=stamp), IDENTITY) == ()
@@ -103,14 +103,14 @@ def test_one_frame_is_the_frame_itself() -> None:
 
 @pytest.mark.parametrize("pose", [IDENTITY, None])
 @pytest.mark.parametrize("count", [2, 4])
-def test_noise_falls_by_the_root_of_the_number(pose: Pose | None, count: int) -> None:
+def test_noise_falls_with_root_of_number_of_frames(pose: Pose | None, count: int) -> None:
     rng = np.random.default_rng(1)
-    truth = see(HOME)
+    truth = render_depth(HOME)
     now, *others = (noisy(truth, rng) for _ in range(count))
 
     result = fused(now, *((depth, pose) for depth in others))
 
-    ratio = error(result, truth).std() / error(now, truth).std()
+    ratio = errors(result, truth).std() / errors(now, truth).std()
     assert ratio == pytest.approx(1 / np.sqrt(count), rel=0.1)
     assert np.array_equal(result[now > RANGE_M], now[now > RANGE_M])
 
@@ -121,67 +121,67 @@ turns = st.floats(-0.05, 0.05)
 
 @settings(deadline=None, max_examples=20)
 @given(shifts, shifts, shifts, turns, turns, turns)
-def test_the_place_of_a_camera_that_moves_is_taken_into_account(
+def test_fusion_compensates_for_camera_motion(
     x: float, y: float, z: float, right: float, up: float, roll: float
 ) -> None:
     """A wrong direction or order of the transforms would displace every surface."""
     other = home(x, y, z, gaze=(right, 0.0, up), roll=roll)
-    now, before = see(HOME), see(other)
+    now, before = render_depth(HOME), render_depth(other)
 
     result = fused(now, (before, moved(HOME, other)))
 
     # Between pixels, the edge of the box may be taken for a slope of less than AGREE.
-    assert np.abs(error(result, now)).max() <= 0.55 * AGREE
-    assert np.percentile(np.abs(error(result, now)), 95) < 2e-4
+    assert np.abs(errors(result, now)).max() <= 0.55 * AGREE
+    assert np.percentile(np.abs(errors(result, now)), 95) < 2e-4
 
 
-def test_noise_falls_also_while_the_camera_moves() -> None:
-    """Not fusing at all would pass the other tests."""
+def test_noise_falls_while_camera_moves() -> None:
+    """Fusing nothing would pass the other tests."""
     rng = np.random.default_rng(2)
     recent = RecentFrames(3)
     for k in range(3):
         pose = home(0.02 * k, 0.01, -0.01 * k, roll=0.01 * k)
-        truth = see(pose)
+        truth = render_depth(pose)
         now = noisy(truth, rng)
         earlier = recent.before(frame(now, k * TICK), pose)
 
     result = fused(now, *((other.depth, p) for other, p in earlier if other.depth is not None))
 
     assert len(earlier) == 2
-    assert error(result, truth).std() < 0.67 * error(now, truth).std()
+    assert errors(result, truth).std() < 0.67 * errors(now, truth).std()
 
 
-def test_an_image_that_its_pose_does_not_explain_is_left_out() -> None:
+def test_image_that_contradicts_its_pose_is_not_fused() -> None:
     """Without poses, or with wrong ones, a moving camera would smear everything."""
     other = home(0.05, 0.0, -0.04)
-    now = see(HOME)
+    now = render_depth(HOME)
 
     for pose in (None, IDENTITY, moved(other, HOME)):
-        assert np.array_equal(fused(now, (see(other), pose)), now)
-    assert not np.array_equal(fused(now, (see(other), moved(HOME, other))), now)
+        assert np.array_equal(fused(now, (render_depth(other), pose)), now)
+    assert not np.array_equal(fused(now, (render_depth(other), moved(HOME, other))), now)
 
 
-def slid(x: float) -> Any:
+def shifted_box(x: float) -> Any:
     (left, right), *others = BOX
     return ((left + x, right + x), *others)
 
 
-@pytest.mark.parametrize("box", [slid(0.03), slid(-0.06), slid(0.2), None])
-def test_what_has_moved_does_not_smear(box: Any) -> None:
-    """Neither at its new nor at its old position; nor may new objects smear."""
-    now, before = see(HOME), see(HOME, box)
+@pytest.mark.parametrize("box", [shifted_box(0.03), shifted_box(-0.06), shifted_box(0.2), None])
+def test_moved_or_new_object_does_not_smear(box: Any) -> None:
+    """Neither at its new nor at its old position."""
+    now, before = render_depth(HOME), render_depth(HOME, box)
 
     for depth, others in ((now, before), (before, now)):
         result = fused(depth, (others, IDENTITY), (others, IDENTITY))
         same = np.abs(1 / now - 1 / before) < 1e-6
         assert np.allclose(result[same], depth[same], rtol=1e-6)
-        assert np.abs(error(result, depth)).max() <= AGREE
-        assert np.count_nonzero(np.abs(error(result, depth)) > 1e-6) < 0.005 * depth.size
+        assert np.abs(errors(result, depth)).max() <= AGREE
+        assert np.count_nonzero(np.abs(errors(result, depth)) > 1e-6) < 0.005 * depth.size
 
 
-def test_holes_are_filled_with_what_was_seen_there() -> None:
+def test_holes_are_filled_from_earlier_images() -> None:
     rng = np.random.default_rng(3)
-    truth = see(HOME)
+    truth = render_depth(HOME)
     now, *others = (np.where(rng.random(truth.shape) < 0.3, 0, truth) for _ in range(3))
 
     result = fused(now, *((depth, IDENTITY) for depth in others))
@@ -189,33 +189,33 @@ def test_holes_are_filled_with_what_was_seen_there() -> None:
     near = truth < RANGE_M
     assert np.mean(now[near] == 0) > 0.25
     assert np.mean(result[near] == 0) < 0.04
-    assert np.abs(error(result, truth)).max() < 1e-5
+    assert np.abs(errors(result, truth)).max() < 1e-5
 
 
-def test_a_thing_that_was_taken_away_does_not_fill_the_hole_it_left() -> None:
-    """Where it stood the sensor may briefly see nothing; the object must not reappear."""
-    empty = see(HOME, None)
-    gone = np.abs(empty - see(HOME)) > 1e-6
+def test_removed_object_does_not_fill_the_hole_it_left() -> None:
+    """Where it stood, the sensor may briefly measure nothing; the object must not reappear."""
+    empty = render_depth(HOME, None)
+    gone = np.abs(empty - render_depth(HOME)) > 1e-6
     now = np.where(gone, 0, empty)
 
-    result = fused(now, (see(HOME), IDENTITY), (see(HOME), IDENTITY))
+    result = fused(now, (render_depth(HOME), IDENTITY), (render_depth(HOME), IDENTITY))
 
     ghost = gone & (result > 0)
     edge = np.argwhere(~gone)
     far = [np.abs(edge - pixel).sum(axis=1).min() > REACH for pixel in np.argwhere(ghost)]
     assert not any(far)
     assert np.count_nonzero(ghost) < 0.1 * np.count_nonzero(gone)
-    assert np.abs(error(np.where(ghost, result, 0), empty)).max(initial=0) < 0.05
+    assert np.abs(errors(np.where(ghost, result, 0), empty)).max(initial=0) < 0.05
 
 
-def lengths(frames: Sequence[tuple[Frame, Pose | None]], count: int = 3) -> list[int]:
+def kept(frames: Sequence[tuple[Frame, Pose | None]], count: int = 3) -> list[int]:
     recent = RecentFrames(count)
     return [len(recent.before(*item)) for item in frames]
 
 
-def test_the_newest_frames_come_first_and_old_ones_are_let_go() -> None:
+def test_recent_frames_are_newest_first_and_limited() -> None:
     """Memory must not grow with the recording."""
-    recent, depth = RecentFrames(4), see(HOME)
+    recent, depth = RecentFrames(4), render_depth(HOME)
     for k in range(9):
         found = recent.before(frame(depth, k * TICK, index=k), IDENTITY)
         assert [f.index for f, _ in found] == list(range(k - 1, max(k - 3, 0) - 1, -1))
@@ -237,31 +237,31 @@ SMALL = Camera(80, 60, 65.0, 65.0, 39.5, 29.5)
     ],
     ids=["same stamp", "clock back", "gap", "frame", "resolution", "lens", "cloud"],
 )
-def test_a_break_begins_anew(change: Any) -> None:
+def test_discontinuity_drops_earlier_frames(change: Any) -> None:
     """Frames before a clock jump or from another camera show something else."""
-    *two, third = (frame(see(HOME), k * TICK) for k in range(3))
+    *two, third = (frame(render_depth(HOME), k * TICK) for k in range(3))
 
-    assert lengths([(f, IDENTITY) for f in (*two, third)]) == [0, 1, 2]
-    assert lengths([(f, IDENTITY) for f in (*two, replace(third, **change))]) == [0, 1, 0]
+    assert kept([(f, IDENTITY) for f in (*two, third)]) == [0, 1, 2]
+    assert kept([(f, IDENTITY) for f in (*two, replace(third, **change))]) == [0, 1, 0]
 
 
-def test_topics_are_kept_apart_and_a_lost_pose_is_a_break() -> None:
-    depth = see(HOME)
+def test_topics_are_separate_and_lost_pose_drops_frames() -> None:
+    depth = render_depth(HOME)
     ticks = [frame(depth, k * TICK) for k in range(4)]
     turns = [(replace(f, topic=t), IDENTITY) for f in ticks for t in ("left", "right")]
 
-    assert lengths(turns) == [0, 0, 1, 1, 2, 2, 2, 2]
-    assert lengths(list(zip(ticks, (IDENTITY, None, None, IDENTITY), strict=True))) == [0, 0, 1, 0]
+    assert kept(turns) == [0, 0, 1, 1, 2, 2, 2, 2]
+    assert kept(list(zip(ticks, (IDENTITY, None, None, IDENTITY), strict=True))) == [0, 0, 1, 0]
 
 
 @pytest.mark.parametrize("count", [0, 31])
-def test_a_senseless_number_is_refused(count: int) -> None:
+def test_fuse_frames_out_of_bounds_is_refused(count: int) -> None:
     with pytest.raises(ConfigError, match=r"detection\.fuse_frames must be from 1 to 30"):
         with_overrides(Settings(), [f"detection.fuse_frames={count}"])
 
 
-def dropped(count: int) -> Iterator[Frame]:
-    """Yield frames of a table of which a fifth of the readings fails."""
+def with_missing_depth(count: int) -> Iterator[Frame]:
+    """Yield frames of a table in which a fifth of the depth is missing."""
     world = make_scene("tabletop", np.random.default_rng(4), frames=1)
     for k in range(count):
         rng = np.random.default_rng(k)
@@ -271,16 +271,16 @@ def dropped(count: int) -> Iterator[Frame]:
             yield replace(full, depth=depth, stamp_ns=k * TICK)
 
 
-def test_indices_are_those_of_the_frames_own_readings() -> None:
+def test_indices_refer_to_depth_of_the_frame_itself() -> None:
     """Exports look them up in the recording, where a filled hole is still a hole."""
-    *others, now = dropped(3)
+    *others, now = with_missing_depth(3)
     earlier = [Earlier(other, IDENTITY) for other in others]
     guesser: Any = Guesser()
 
-    seen = perceive(now, up=None, categorizer=guesser, settings=Settings(), earlier=earlier)
+    perception = perceive(now, up=None, categorizer=guesser, settings=Settings(), earlier=earlier)
 
-    assert len(seen.detections) >= 5
-    for found, candidate in zip(seen.detections, seen.scene.candidates, strict=True):
+    assert len(perception.detections) >= 5
+    for found, candidate in zip(perception.detections, perception.scene.candidates, strict=True):
         assert found.candidate is candidate
         assert candidate.indices.size >= 60
         assert np.isfinite(now.xyz(candidate.indices)).all()
@@ -316,7 +316,7 @@ def test_tables_do_not_depend_on_processes_or_interruptions(job: Job) -> None:
         assert_same_tables(job.folder, job.folder.with_name("single"))
 
 
-def test_what_could_not_be_fused_is_said(job: Job, tmp_path: Path) -> None:
+def test_frames_that_cannot_be_fused_are_reported(job: Job, tmp_path: Path) -> None:
     make = MessageFactory(2)
     items = [item for item in stream(make, 4) if "tf" not in item[0]]
     source = write(tmp_path / "still.mcap", items)
