@@ -135,7 +135,7 @@ class Browser:
         self._ask("DELETE", "/window")
 
     def renew(self) -> None:
-        """Replace all tabs by a new one, without asking, and forget their console messages."""
+        """Replace all tabs by a new one and clear their console messages."""
         new, left = self.tab(), self.tabs()
         for tab in left:
             self.turn_to(tab)

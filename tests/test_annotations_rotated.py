@@ -324,7 +324,7 @@ def image_messages(encoding: str) -> dict[str, Any]:
 
 @pytest.mark.parametrize("encoding", ["cdr", "ros1", "json", "protobuf"])
 def test_image_annotations_are_equal_in_every_encoding(encoding: str) -> None:
-    """A box 120 wide and 66 high at (31, 44), in the colour of its category."""
+    """The box is 120 wide and 66 high at (31, 44), in the colour of its category."""
     message, colour = image_messages(encoding)["/shapecat/image_annotations"], colour_of("bowl")
     (line,), (text,) = message.points, message.texts
     corners = [(p.x, p.y) for p in line.points]

@@ -380,7 +380,7 @@ def heed_interrupts() -> None:
 def test_interrupted_batch_ends_and_can_be_resumed(
     shapecat: Run, recordings: Path, one_by_one: Path, tmp_path: Path
 ) -> None:
-    """Ctrl-C: exit code 130, no process left, and a second run completes the rest."""
+    """Ctrl-C gives exit code 130 and leaves no process; a second run completes the rest."""
     words = ("process", str(recordings), "--out", str(tmp_path), "--no-rrd", "--jobs")
     running = subprocess.Popen(
         [sys.executable, "-m", "shapecat", *words, "2"],

@@ -634,7 +634,7 @@ def test_lost_recording_counts_as_tried_if_it_had_started(
     ("codes", "expected"),
     [((0, 0), 0), ((0, 3), 1), ((3, 3), 3), ((4, 1), 1), ((3, 4), 1), ((2,), 2), ((), 0)],
 )
-def test_exit_codes_of_a_batch(codes: tuple[int, ...], expected: int) -> None:
+def test_batch_exit_code_combines_outcomes(codes: tuple[int, ...], expected: int) -> None:
     """Different failures give 1, not the code of one of them."""
     outcomes = [Outcome(Job(Path("a"), Path("b")), code=code) for code in codes]
 
@@ -741,7 +741,7 @@ def test_new_recording_does_not_get_existing_folder() -> None:
 def test_run_keeps_folder_when_recording_of_same_name_is_added(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, way: str, name: str
 ) -> None:
-    """It would be processed again without its labels, and counted twice in each export.
+    """Otherwise it is processed again without its labels, and counted twice in each export.
 
     run.json has the absolute path without links, however the user names the recording.
     """

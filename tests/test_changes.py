@@ -186,7 +186,7 @@ BENT = LensCamera(WIDE, "plumb_bob", (-1.2, 0.0, 0.02, 0.01, 0.0))
 
 
 def test_image_is_rectified_with_its_own_lens() -> None:
-    """Even after another lens of the same camera and model."""
+    """The map of another lens of the same camera and model must not be reused."""
     pixels = gradient(60, 80)
     straight = replace(BENT, coefficients=(0.0,) * 5)
 
@@ -243,8 +243,8 @@ def test_views_of_both_sensors_count() -> None:
     (hits,) = gather(found, together=BODIES)
 
     assert (hits.weights(np.arange(4)) > 0).all()
-    mine = np.flatnonzero(hits.topics[hits.rows] == 0)  # a track that one sensor saw
-    assert hits.seen_with(mine, np.arange(4)).tolist() == mine.tolist()
+    first = np.flatnonzero(hits.topics[hits.rows] == 0)  # a track that one sensor saw
+    assert hits.seen_with(first, np.arange(4)).tolist() == first.tolist()
 
 
 def test_each_topic_has_its_own_poses(tmp_path: Path) -> None:

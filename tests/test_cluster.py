@@ -73,7 +73,7 @@ def test_ray_batch_survives_killed_worker(bucket: Path, tmp_path: Path) -> None:
 
 
 def assert_same_tables(folder: Path) -> None:
-    """Compare the results in the bucket with those of a single process."""
+    """Compare the results in the bucket with those of one local process."""
     from shapecat.pipeline import process  # noqa: PLC0415  only where it is needed
     from shapecat.runs.jobs import Job  # noqa: PLC0415  the same
 

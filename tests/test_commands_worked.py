@@ -126,7 +126,7 @@ def test_closing_table_lists_a_hundred_recordings_or_none(
 def test_simulate_replaces_no_file_without_overwrite(
     shapecat: Run, tmp_path: Path, name: str
 ) -> None:
-    """Nor the ground truth, even if the recording itself was moved elsewhere."""
+    """The ground truth may remain where the recording itself was moved elsewhere."""
     (tmp_path / name).write_text("mine")
     found = shapecat("simulate", tmp_path / "a.mcap", "--color", "--frames", 1)
 

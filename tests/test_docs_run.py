@@ -83,7 +83,7 @@ def test_documented_commands_work(
     tmp_path: Path,
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
-    """Learn for a few steps only: the accuracy of the model does not matter here."""
+    """Learning takes a few steps only: the accuracy of the model does not matter here."""
     monkeypatch.setattr("shapecat.learning.incremental._STEPS", 2)
     monkeypatch.setattr("shapecat.learning.incremental._FEW_STEPS", 1)
     monkeypatch.chdir(tmp_path)

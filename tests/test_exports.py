@@ -189,8 +189,8 @@ def test_kitti_boxes_match_tables_within_1_mm(run: Path, tmp_path: Path, which: 
         labels = read_kitti(out / "label_2" / f"{entry['number']}.txt")
         expected = table_boxes[int(entry["frame"])]
         assert len(labels) == len(expected)
-        for (_, _, corners), (_, meant) in zip(labels, expected, strict=True):
-            worst = max(worst, farthest(corners @ sensor_from_rectified.T, meant))
+        for (_, _, corners), (_, wanted) in zip(labels, expected, strict=True):
+            worst = max(worst, farthest(corners @ sensor_from_rectified.T, wanted))
     assert len(index) == 8
     assert worst < 0.001
     kinds = {label[0] for path in (out / "label_2").iterdir() for label in read_kitti(path)}
@@ -236,7 +236,7 @@ def test_rectified_camera_is_level(up: tuple[float, ...]) -> None:
 
 
 def test_labelcloud_formats_agree(run: Path, tmp_path: Path) -> None:
-    """Read as labelCloud 1.1 reads them: centroid and size, or the result of its vertex loader."""
+    """Centroid and size are read, or computed from vertices, as in labelCloud 1.1."""
     export_run(run, "labelcloud", tmp_path, every=3)
     out = tmp_path / "table"
     worst, count = 0.0, 0
@@ -248,7 +248,7 @@ def test_labelcloud_formats_agree(run: Path, tmp_path: Path) -> None:
         ]
         table_boxes = boxes(run)[3 * int(cloud.stem)]
         assert [len(kind) for kind in kinds] == [len(table_boxes)] * 3
-        for relative, absolute, vertices, (_, meant) in zip(*kinds, table_boxes, strict=True):
+        for relative, absolute, vertices, (_, wanted) in zip(*kinds, table_boxes, strict=True):
             radians, degrees = relative["rotations"]["z"], absolute["rotations"]["z"]
             assert 0 <= degrees < 360
             assert_allclose(np.exp(1j * radians), np.exp(1j * np.radians(degrees)), atol=1e-6)
@@ -261,7 +261,7 @@ def test_labelcloud_formats_agree(run: Path, tmp_path: Path) -> None:
             x, y, _ = v[3] - v[0]
             assert_allclose(np.arctan2(y, x), radians, atol=1e-5)
             assert len(set(v[:4, 2])) == 1
-            edges = np.linalg.norm(meant[0] - meant[1:], axis=1).min()
+            edges = np.linalg.norm(wanted[0] - wanted[1:], axis=1).min()
             worst = max(worst, abs(edges - min(sizes)))
             count += 1
     classes = json.loads((out / "labels" / "_classes.json").read_text())

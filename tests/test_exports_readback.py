@@ -81,7 +81,7 @@ def test_coco_api_reads_masks_boxes_ids_and_crowds(coco: Path) -> None:
 
 @pytest.mark.filterwarnings("ignore::DeprecationWarning")  # of its compiled part
 def test_labels_score_perfectly_against_themselves(coco: Path) -> None:
-    """In the evaluation of the COCO challenge, which most training code reports."""
+    """Most training code reports the evaluation of the COCO challenge, used here."""
     path = str(coco / "annotations/instances_train.json")
     truth = import_module("pycocotools.coco").COCO(path)
     found = truth.loadRes([row for row in truth.dataset["annotations"] if not row["iscrowd"]])

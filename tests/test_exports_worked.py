@@ -221,9 +221,9 @@ def test_labelcloud_boxes_and_clouds_share_a_frame(tmp_path: Path) -> None:
     source = labelled(cut=False, hidden=False).objects[0].box
     rotation = Rotation.from_quat(source.orientation)
     unit = np.array([[a, b, c] for a in (-1, 1) for b in (-1, 1) for c in (-1, 1)]) / 2
-    meant = level_from_sensor.apply(rotation.apply(unit * source.size) + source.center)
-    assert corner_distance(meant, box) < 1e-4
-    assert corner_distance(meant, np.array(vertices["vertices"])) < 1e-4
+    wanted = level_from_sensor.apply(rotation.apply(unit * source.size) + source.center)
+    assert corner_distance(wanted, box) < 1e-4
+    assert corner_distance(wanted, np.array(vertices["vertices"])) < 1e-4
     assert len(read_pcd(path).points) == len(points)
 
 

@@ -195,7 +195,7 @@ def test_table_without_run_column_is_checked_by_positions(tmp_path: Path) -> Non
 
 
 def test_run_column_survives_spreadsheet(tmp_path: Path) -> None:
-    """Semicolons, a byte order mark, another order of columns, decimal commas."""
+    """Spreadsheets write semicolons, a byte order mark and decimal commas, and move columns."""
     mine = make_run(tmp_path / "mine", {1: static(CUP)}, work="w12e4567890123456")
     text = "\ufeffrun;label;confidence;category;track\nw12e4567890123456;bowl;0,9;cup;1,0\n"
     (tmp_path / "saved.csv").write_text(text, "utf-8")
@@ -209,7 +209,7 @@ def test_run_column_survives_spreadsheet(tmp_path: Path) -> None:
 
 
 def test_labels_are_transferred_to_tracks_at_same_positions(tmp_path: Path) -> None:
-    """Numbers differ, positions by some centimetres; no coordinates may be swapped."""
+    """Numbers differ, positions differ by 2 cm, and no coordinates may be swapped."""
     labels = {1: "mug", 2: "delete", 3: "merge with 1"}
     objects = {1: static(CUP), 2: static(CAN), 3: static(BOWL)}
     source = make_run(tmp_path / "source", objects, labels=labels)
@@ -291,7 +291,7 @@ def test_conflicting_labels_are_reported_not_applied(tmp_path: Path) -> None:
 
 @pytest.mark.parametrize("digest", ["xxh3-128:one", "xxh3-128:two"])
 def test_merged_tracks_may_be_one_track_in_target(tmp_path: Path, digest: str) -> None:
-    """By place, one part could be another candidate for the place of the other."""
+    """By position, one part could compete with the other."""
     objects = {1: static(CUP, frames=range(7)), 2: static(CUP, frames=range(7, 10))}
     labels = {1: "mug", 2: "merge with 1"}
     source = make_run(tmp_path / "source", objects, labels=labels)
@@ -538,7 +538,7 @@ def test_positions_in_other_frames_are_not_compared(tmp_path: Path, frame: str |
 
 @pytest.mark.parametrize("place", ["downloads", "other"])
 def test_table_alone_is_matched_by_positions(tmp_path: Path, place: str) -> None:
-    """Also if it was saved beside the tables of another run, whose tracks are other objects."""
+    """It may lie beside the tables of another run, whose tracks are other objects."""
     (tmp_path / "downloads").mkdir()
     make_run(tmp_path / "other", {4: static(CAN), 5: static(CUP)})
     table = tmp_path / place / "table.csv"

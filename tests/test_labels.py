@@ -185,7 +185,7 @@ def test_tracks_of_two_sensors_merge_in_fixed_frame(run: Path) -> None:
 
 
 def test_all_problems_are_reported_at_once(run: Path) -> None:
-    """And nothing is written."""
+    """No label is adopted if there is a problem."""
     corrected = run.parent / "mine.csv"
     corrected.write_text(
         labelled(t4="botle", t2="merge with 9", t1="bowl") + "77,0,cup,0.5,bowl,/depth\n"

@@ -281,7 +281,7 @@ def test_frames_are_thinned_per_topic() -> None:
 
 
 def test_most_different_views_of_track_are_selected() -> None:
-    """First the one with most pixels, then always the one least like those chosen."""
+    """The first has most pixels; each next one differs most from those chosen."""
     columns = np.zeros((5, 8))
     columns[:, 0], columns[:, 4] = [0, 1.0, 5, 5.4, 9], [0.1, 0.3, 0.1, 0.1, 0.2]
     assert _different(columns, 3) == [1, 4, 2]

@@ -81,7 +81,7 @@ def test_originals_are_kept_and_annotations_decode(recording: Path, run_folder: 
 
 
 def test_objects_are_detected_categorized_and_tracked(recording: Path, run_folder: Path) -> None:
-    """In 9 of 10 frames, with one track each, and 85 % in the correct category."""
+    """Objects are found in 9 of 10 frames, and 85 % of them get the correct category."""
     truth = json.loads(recording.with_suffix(".truth.json").read_text())
     labels = np.load(recording.with_suffix(".labels.npz"))["labels"]
     track_of = {
@@ -108,10 +108,10 @@ def test_objects_are_detected_categorized_and_tracked(recording: Path, run_folde
 
     assert set(names.values()) >= {"cup", "can", "box", "bottle", "bowl", "plate", "ball"}
     assert all(found[k] >= 0.9 * visible[k] for k in visible), (found, visible, names)
-    assert all(len(seen) == 1 for seen in tracks.values()), "identity switch"
+    assert all(len(ids) == 1 for ids in tracks.values()), "identity switch"
     final = final_labels(run_folder)
-    right = [final[next(iter(seen))] == names[k] for k, seen in tracks.items()]
-    assert np.mean(right) >= 0.85
+    correct = [final[next(iter(ids))] == names[k] for k, ids in tracks.items()]
+    assert np.mean(correct) >= 0.85
 
 
 def final_labels(folder: Path) -> dict[int, str]:
@@ -227,7 +227,7 @@ def test_corrected_label_appears_in_annotations(
 def test_invalid_recording_is_refused_in_one_line(
     shapecat: Run, tmp_path: Path, content: bytes | None, code: int
 ) -> None:
-    """With the documented exit code, and without leaving files."""
+    """The exit code is the documented one, and no file is left."""
     for name in ("x.mcap", "x.bag", "x.db3", "x.txt"):
         path = tmp_path / name
         if content is not None:

@@ -79,7 +79,7 @@ def own_scratch(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[Pat
 
 
 @pytest.fixture(autouse=True)
-def impatient(monkeypatch: pytest.MonkeyPatch) -> None:
+def short_waits(monkeypatch: pytest.MonkeyPatch) -> None:
     """Shorten all waits for the storage and for claims."""
     monkeypatch.setattr(storage, "_WAITS_S", (0.01, 0.02))
     monkeypatch.setattr(claims, "_BEAT_S", 0.2)

@@ -256,7 +256,7 @@ def test_invisible_object_scores_zero() -> None:
 
 @pytest.mark.parametrize(("left", "top"), [(60, 50), (0, 0), (160, 100)])
 def test_crop_shows_object_and_outline(left: int, top: int) -> None:
-    """Also at the border of the image."""
+    """The object may be at the border of the image."""
     photo = np.zeros((180, 240, 3), np.uint8)
     photo[top : top + 80, left : left + 80] = (250, 40, 40)
     crop = crop_of(replace(view(left=left, top=top), colour=photo), 0)

@@ -345,7 +345,7 @@ def test_strip_is_sorted_by_time(run: Path) -> None:
 
 
 def test_strip_frames_show_new_tracks_first() -> None:
-    """Of three frames each: that with most new tracks, else with most tracks, else the middle."""
+    """Of three frames, it shows that with most new tracks, else most tracks, else the middle."""
     stamps = [(7_000_000_000 + 500_000_000 * k, ("/d", k)) for k in range(36)]
     tracks = {0: {1}, 1: {1, 2}, 3: {1, 2}, 5: {3}, 6: {1}, 7: {2}, 8: {3}, 9: {1, 2, 3}, 10: {1}}
     strip = choosing._strip(stamps, {("/d", k): seen for k, seen in tracks.items()})
@@ -475,7 +475,7 @@ def test_drawings_show_sensor_side_and_top_view() -> None:
 
 
 def test_thumbnails_are_most_confident_of_each_category() -> None:
-    """Then the most confident of the others, up to six."""
+    """The most confident of the others follow, up to six."""
     found = [("cup", 0.6), ("can", 0.7), ("cup", 0.95), ("cup", 0.9), ("unknown", 0.3)]
     found += [("can", 0.8), ("cup", 0.5), ("cup", 0.4)]
     line = Timeline(np.zeros(0), np.zeros(0, bool), np.zeros((0, 3)), ())

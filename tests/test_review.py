@@ -136,7 +136,7 @@ def scalars(path: Path, entity: str) -> list[list[float]]:
 
 @pytest.fixture(scope="module")
 def recording(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """Three frames: two objects, one, none."""
+    """Write three frames with two objects, one object and none."""
     path = tmp_path_factory.mktemp("review") / "review.rrd"
     scenes = [
         scene(0, [labelled_object(1), labelled_object(2, "can", 0.3)]),
@@ -265,7 +265,7 @@ def test_recalibrated_camera_is_drawn_again(tmp_path: Path) -> None:
 
 
 def test_two_sensors_are_drawn_separately(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    """Two cameras of one kind, whose frames alternate; both begin without an object."""
+    """Frames of two cameras of one kind alternate; both begin without an object."""
     views: list[tuple[str, str, Eye]] = []
 
     def lay_out(scenes: Any, *more: Any) -> Any:
@@ -378,7 +378,7 @@ def test_unorganised_clouds_and_points_near_plane_are_painted() -> None:
 
 
 def test_failure_leaves_no_file_and_keeps_older_review(tmp_path: Path) -> None:
-    """Neither a partial file under the final name nor a hidden one."""
+    """No partial file may remain, neither under the final name nor hidden."""
     (tmp_path / "r.rrd").write_bytes(b"old")
 
     def broken() -> Iterator[tuple[LabelledFrame, Frame]]:

@@ -23,7 +23,7 @@ def test_staged_folder_appears_complete(tmp_path: Path) -> None:
 
 
 def test_error_leaves_nothing(tmp_path: Path) -> None:
-    """New parent folders are removed too."""
+    """Parent folders that were made for the run are removed too."""
     with pytest.raises(RuntimeError), staged(tmp_path / "out" / "deep" / "lab") as hidden:
         (hidden / "a").write_text("1")
         raise RuntimeError

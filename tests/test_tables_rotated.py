@@ -181,7 +181,7 @@ def test_tracker_reads_boxes_in_fixed_frame(run: Path) -> None:
 
 
 def test_tracker_reads_which_views_are_reused(tmp_path: Path) -> None:
-    """A view repeated in a still scene would count as many views."""
+    """A view reused in a static scene would count as many views."""
     origins = [None, 0, 0, None]
     scene = Scene(UP, (Plane(UP, -0.5, OUTLINE, 0.7, 0.0),), ())
     with PerceptionTables(tmp_path, categories=CATEGORIES, model_id="m") as tables:
