@@ -1,8 +1,8 @@
 """Draw the subpackages and their imports: ``python -m tests.picture``.
 
-A room is drawn in the layer that `tests.test_architecture` assigns to it. An arrow leads to what a
-room imports; those that follow from others are left out, and so are those to the two layers below,
-which everybody uses.
+A subpackage is drawn in the layer that `tests.test_architecture` assigns to it. Arrows lead to the
+imported subpackages, except for imports that follow from others, and for those of the two lowest
+layers, which all subpackages use.
 """
 
 from collections.abc import Iterator, Mapping
@@ -39,13 +39,13 @@ def imports() -> dict[str, set[str]]:
 
 
 def reduced(graph: Mapping[str, set[str]]) -> dict[str, set[str]]:
-    """Return a graph without the edges that follow from a detour (transitive reduction)."""
+    """Return a graph without the edges that follow from others (transitive reduction)."""
 
     def below(name: str) -> set[str]:
         return set().union(*(graph.get(o, set()) | below(o) for o in graph.get(name, set())))
 
-    reach = {name: below(name) for name in graph}
-    return {name: others - reach[name] for name, others in graph.items()}
+    reachable = {name: below(name) for name in graph}
+    return {name: others - reachable[name] for name, others in graph.items()}
 
 
 def layer(name: str) -> float:

@@ -1,4 +1,4 @@
-"""Worked examples of calibrations and depth encodings; no two numbers are equal."""
+"""Worked examples of calibrations and depth encodings, with distinct numbers."""
 
 from pathlib import Path
 from types import SimpleNamespace

@@ -1,4 +1,4 @@
-"""The command under a few faults, and the checks themselves, which must detect damage."""
+"""Tests of the command under a few faults, and of the checks, which must detect damage."""
 
 import shutil
 from collections.abc import Callable
@@ -33,7 +33,7 @@ def laboratory(tmp_path_factory: pytest.TempPathFactory) -> Laboratory:
 @pytest.mark.many
 @pytest.mark.parametrize(("kind", "seed"), CASES)
 def test_fault_does_no_harm(laboratory: Laboratory, kind: str, seed: int) -> None:
-    """A fault could leave half a result, lose work, or keep the command from going on.
+    """A fault could leave half a result, lose work, or prevent the command from resuming.
 
     Of the quick tests, `test_stopping` interrupts, `test_crash` kills and fills the disk.
     """
@@ -59,9 +59,9 @@ def out(whole: Path, tmp_path: Path) -> Path:
     return tmp_path / "out"
 
 
-def test_unharmed_run_passes(out: Path, whole: Path) -> None:
-    """Checks that always complain would be switched off soon."""
-    assert not [*invariants.whole_places(TABLE, out)]
+def test_undamaged_run_passes(out: Path, whole: Path) -> None:
+    """Checks that always fail would soon be disabled."""
+    assert not [*invariants.complete_outputs(TABLE, out)]
     assert not [*invariants.same_results(["table"], out, whole)]
     assert not [*invariants.nothing_hidden(out)]
 
@@ -76,7 +76,7 @@ def _flip(path: Path) -> None:
     path.write_bytes(content)
 
 
-HARMS: tuple[tuple[str, Callable[[Path], None]], ...] = (
+DAMAGE: tuple[tuple[str, Callable[[Path], None]], ...] = (
     ("annotated.mcap", _cut),
     ("annotated.mcap", _flip),
     ("review.rrd", _cut),
@@ -87,21 +87,21 @@ HARMS: tuple[tuple[str, Callable[[Path], None]], ...] = (
 )
 
 
-@pytest.mark.parametrize(("name", "harm"), HARMS)
-def test_harmed_file_is_noticed(out: Path, name: str, harm: Callable[[Path], None]) -> None:
+@pytest.mark.parametrize(("name", "damage"), DAMAGE)
+def test_damaged_file_is_noticed(out: Path, name: str, damage: Callable[[Path], None]) -> None:
     """A check that cannot fail would let half a file pass."""
-    harm(out / "table" / name)
+    damage(out / "table" / name)
 
-    assert any(name in text for text in invariants.whole_places(TABLE, out))
+    assert any(name in text for text in invariants.complete_outputs(TABLE, out))
 
 
-def test_stray_and_torn_are_noticed(out: Path) -> None:
-    """Half a manifest line, a file under a name of no run, a hidden folder after the end."""
+def test_stray_files_and_torn_lines_are_noticed(out: Path) -> None:
+    """Half a manifest line, a file that is no run, and a hidden folder after the end."""
     (out / "manifest.jsonl").write_text('{"folder": "table"}\n{"fold')
     (out / "table.partial").write_text("")
     (out / ".table.partial").mkdir()
 
-    found = " ".join(invariants.whole_places(TABLE, out))
+    found = " ".join(invariants.complete_outputs(TABLE, out))
 
     assert "last line is torn" in found
     assert "line 2 is torn" in found
@@ -139,7 +139,7 @@ def test_lost_frames_are_noticed(out: Path) -> None:
 
 
 @pytest.mark.parametrize(
-    ("ended", "said"),
+    ("ended", "message"),
     [
         (Ended(1, 1.0, [(0.5, "Error: full\n")]), "exit code 1"),
         (Ended(130, 1.0, [(0.5, "Traceback (most recent call last)\n")]), "Traceback"),
@@ -148,14 +148,14 @@ def test_lost_frames_are_noticed(out: Path) -> None:
         (Ended(-9, 1.0, hung=True), "hung"),
     ],
 )
-def test_bad_ends_are_noticed(ended: Ended, said: str) -> None:
+def test_bad_ends_are_noticed(ended: Ended, message: str) -> None:
     """Crashes, wrong codes and processes left behind."""
-    assert any(said in text for text in invariants.ended_well("interrupt", ended))
+    assert any(message in text for text in invariants.ended_well("interrupt", ended))
 
 
 def test_silent_and_repeated_errors_are_noticed() -> None:
     """An error must be reported exactly once."""
-    silent, twice = Ended(1, 1.0), Ended(1, 1.0, [(0.5, "Error: full\n")] * 2)
+    silent, repeated = Ended(1, 1.0), Ended(1, 1.0, [(0.5, "Error: full\n")] * 2)
 
     assert "no error line" in [*invariants.ended_well("eio", silent)]
-    assert any("twice" in text for text in invariants.ended_well("eio", twice))
+    assert any("twice" in text for text in invariants.ended_well("eio", repeated))

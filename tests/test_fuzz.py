@@ -1,4 +1,4 @@
-"""Damage anywhere in a recording: intact parts are read, damage is reported, no crash."""
+"""Tests of damage anywhere in a recording: intact parts are read, and damage is reported."""
 
 import resource
 from collections import Counter
@@ -34,7 +34,7 @@ class Outcome(NamedTuple):
     code: int
     stamps: frozenset[int]
     frames: int
-    said: str
+    messages: str
 
 
 def items(make: MessageFactory) -> Any:
@@ -46,8 +46,8 @@ def items(make: MessageFactory) -> Any:
         yield "/depth/image_raw", stamp, make.image(depth.astype(np.float32), stamp, "optical")
 
 
-def mcap(place: Path, **options: Any) -> Path:
-    make, path = MessageFactory(2), place / "a.mcap"
+def mcap(parent: Path, **options: Any) -> Path:
+    make, path = MessageFactory(2), parent / "a.mcap"
     with path.open("wb") as file:
         writer = Writer(file, **({"chunk_size": 4000} | options))
         writer.start("ros2", "test")
@@ -72,8 +72,8 @@ def write_all(writer: Any, make: MessageFactory) -> None:
         writer.write(known[topic], time, make.serialize(message))
 
 
-def bag(place: Path, compression: Any = None) -> Path:
-    make, path = MessageFactory(1), place / "a.bag"
+def bag(parent: Path, compression: Any = None) -> Path:
+    make, path = MessageFactory(1), parent / "a.bag"
     writer = BagWriter(path)
     writer.chunk_threshold = 4000
     if compression is not None:
@@ -83,8 +83,8 @@ def bag(place: Path, compression: Any = None) -> Path:
     return path
 
 
-def folder(place: Path, plugin: StoragePlugin) -> Path:
-    make, path = MessageFactory(2), place / "a"
+def folder(parent: Path, plugin: StoragePlugin) -> Path:
+    make, path = MessageFactory(2), parent / "a"
     with FolderWriter(path, version=9, storage_plugin=plugin) as writer:
         write_all(writer, make)
     (part,) = (file for file in path.iterdir() if file.suffix in {".db3", ".mcap"})
@@ -112,8 +112,8 @@ def read(path: Path) -> Outcome:
             for frame in frames(recording, streams, skipped=skipped):
                 upright.accept(frame.topic, upright.orient(frame))
                 stamps.append(frame.stamp_ns)
-            said = " ".join([*recording.warnings, *skipped])
-            return Outcome(0 if stamps else 4, frozenset(stamps), len(stamps), said)
+            messages = " ".join([*recording.warnings, *skipped])
+            return Outcome(0 if stamps else 4, frozenset(stamps), len(stamps), messages)
     except (RecordingError, NoStreamError) as error:
         return Outcome(error.exit_code, frozenset(), 0, str(error))
 
@@ -140,10 +140,10 @@ def chunk_ends(path: Path) -> list[tuple[int, int]]:
 
 def check(path: Path, outcome: Outcome, at: int, ends: list[tuple[int, int]]) -> None:
     assert outcome.code in {0, 3, 4}, outcome
-    sure = max((count for end, count in ends if end <= at), default=0)
-    stamps = {EPOCH + k * SECOND for k in range(sure)}
-    assert stamps <= outcome.stamps, (path, at, len(outcome.stamps), sure, outcome.said)
-    assert outcome.frames >= FRAMES or outcome.said, (path, at, outcome.frames)
+    intact = max((count for end, count in ends if end <= at), default=0)
+    stamps = {EPOCH + k * SECOND for k in range(intact)}
+    assert stamps <= outcome.stamps, (path, at, len(outcome.stamps), intact, outcome.messages)
+    assert outcome.frames >= FRAMES or outcome.messages, (path, at, outcome.frames)
 
 
 def damage(name: str, tmp_path: Path, *, cuts: int, flips: int) -> None:
@@ -167,11 +167,11 @@ def damage(name: str, tmp_path: Path, *, cuts: int, flips: int) -> None:
 
 
 @pytest.mark.parametrize("name", WRITERS)
-def test_damage(name: str, tmp_path: Path) -> None:
+def test_damaged_recording_gives_intact_frames(name: str, tmp_path: Path) -> None:
     damage(name, tmp_path, cuts=12, flips=30)
 
 
 @pytest.mark.many
 @pytest.mark.parametrize("name", WRITERS)
-def test_much_damage(name: str, tmp_path: Path) -> None:
+def test_many_damaged_recordings_give_intact_frames(name: str, tmp_path: Path) -> None:
     damage(name, tmp_path, cuts=200, flips=2000)

@@ -1,4 +1,4 @@
-"""Simulated detections with known identities that the tracker must not lose, swap or invent."""
+"""Tests that identities survive in simulated detections with known truth."""
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
@@ -21,7 +21,7 @@ HIDDEN = 0.8
 
 
 @dataclass(frozen=True)
-class Thing:
+class Object:
     """An object: its position (3,) at a time, or None while it is absent."""
 
     category: int
@@ -50,20 +50,20 @@ class Truth:
 
 
 def resting(place: F8, born: float = 0.0, dies: float = np.inf) -> Callable[[float], F8 | None]:
-    """Return the motion of an object that stands at a place for a while."""
+    """Return the motion of an object that rests at a place for a while."""
     return lambda t: place if born <= t < dies else None
 
 
-def place_of(thing: Thing) -> F8:
-    """Return where a thing is that never leaves."""
-    place = thing.place(0.0)
+def place_of(item: Object) -> F8:
+    """Return where an object is that never leaves."""
+    place = item.place(0.0)
     assert place is not None
     return place
 
 
-def truth_at(things: Sequence[Thing], sensor: Sensor, t: float) -> dict[int, F8]:
+def truth_at(objects: Sequence[Object], sensor: Sensor, t: float) -> dict[int, F8]:
     """Return the places of the objects in view."""
-    places = {k: thing.place(t) for k, thing in enumerate(things)}
+    places = {k: item.place(t) for k, item in enumerate(objects)}
     middle = sensor.looks_at(t)[:2]
     return {
         k: p
@@ -72,45 +72,45 @@ def truth_at(things: Sequence[Thing], sensor: Sensor, t: float) -> dict[int, F8]
     }
 
 
-def hidden_share(k: int, places: dict[int, F8], things: Sequence[Thing], eye: F8) -> float:
+def hidden_share(k: int, places: dict[int, F8], objects: Sequence[Object], eye: F8) -> float:
     """Return the fraction of an object that nearer ones hide from the camera."""
     ray = places[k] - eye
-    reach = np.linalg.norm(ray[:2])
+    distance = np.linalg.norm(ray[:2])
     share = 0.0
     for other, place in places.items():
         offset = place - eye
-        if other != k and np.linalg.norm(offset[:2]) < reach:
-            across = abs(offset[0] * ray[1] - offset[1] * ray[0]) / reach
-            width = 0.5 * (things[k].size[0] + things[other].size[0])
+        if other != k and np.linalg.norm(offset[:2]) < distance:
+            across = abs(offset[0] * ray[1] - offset[1] * ray[0]) / distance
+            width = 0.5 * (objects[k].size[0] + objects[other].size[0])
             # Height at which the ray over the nearer object's top meets the farther one.
-            top = place[2] + things[other].size[2] / 2
-            shadow = eye[2] - (eye[2] - top) * reach / np.linalg.norm(offset[:2])
-            low = places[k][2] - things[k].size[2] / 2
-            share = max(share, min(1 - across / width, (shadow - low) / things[k].size[2]))
+            top = place[2] + objects[other].size[2] / 2
+            shadow = eye[2] - (eye[2] - top) * distance / np.linalg.norm(offset[:2])
+            low = places[k][2] - objects[k].size[2] / 2
+            share = max(share, min(1 - across / width, (shadow - low) / objects[k].size[2]))
     return share
 
 
 def detections_at(
-    things: Sequence[Thing], sensor: Sensor, t: float, random: np.random.Generator
+    objects: Sequence[Object], sensor: Sensor, t: float, random: np.random.Generator
 ) -> tuple[list[tuple[int, F8, F8, F8]], Truth]:
     """Return (category, centre, size, posterior) of the detections, and the truth."""
     found = []
-    places, eye = truth_at(things, sensor, t), sensor.eye(t)
-    shares = {k: hidden_share(k, places, things, eye) for k in places}
+    places, eye = truth_at(objects, sensor, t), sensor.eye(t)
+    shares = {k: hidden_share(k, places, objects, eye) for k in places}
     for k, place in places.items():
         hidden = shares[k]
         if hidden > HIDDEN or random.random() < sensor.miss:
             continue
         toward = (eye - place) * [1, 1, 0]
         toward /= np.linalg.norm(toward)
-        size = things[k].size * random.normal(0.92, 0.05, 3) * [1 - 0.5 * hidden, 1, 1]
-        seen = place + 0.12 * things[k].size[0] * toward  # only the near side is seen
-        parts = [(seen, size)]
+        size = objects[k].size * random.normal(0.92, 0.05, 3) * [1 - 0.5 * hidden, 1, 1]
+        visible = place + 0.12 * objects[k].size[0] * toward  # only the near side is seen
+        parts = [(visible, size)]
         if random.random() < sensor.split:
             half = np.array([0.25 * size[0], 0, 0])
-            parts = [(seen - half, size * [0.5, 1, 1]), (seen + half, size * [0.5, 1, 1])]
+            parts = [(visible - half, size * [0.5, 1, 1]), (visible + half, size * [0.5, 1, 1])]
         for center, length in parts:
-            found.append((things[k].category, center, length))
+            found.append((objects[k].category, center, length))
     for _ in range(random.poisson(sensor.false)):
         place = random.uniform([-0.4, -0.4, 0.03], [0.4, 0.4, 0.1]) + sensor.looks_at(t) * [1, 1, 0]
         found.append((int(random.integers(CATEGORIES)), place, random.uniform(0.03, 0.15, 3)))
@@ -125,16 +125,16 @@ def view_of(category: int, random: np.random.Generator) -> F8:
 
 
 def record(
-    things: Sequence[Thing], sensor: Sensor, seed: int, frames: int = FRAMES
+    objects: Sequence[Object], sensor: Sensor, seed: int, frames: int = FRAMES
 ) -> tuple[list[FrameDetections], list[Truth]]:
     """Return the detections and the truth of a simulated recording."""
     random = np.random.default_rng(seed)
     rows, truth = [], []
     for k in range(frames):
         t = k * PERIOD_S
-        found, real = detections_at(things, sensor, t, random)
+        found, actual = detections_at(objects, sensor, t, random)
         rows.append(frame_of(k, int(t * 1e9), found))
-        truth.append(real)
+        truth.append(actual)
     return rows, truth
 
 
@@ -156,27 +156,27 @@ def frame_of(
     )
 
 
-def table(random: np.random.Generator, n: int, *, spread: float = 0.35) -> list[Thing]:
+def table(random: np.random.Generator, n: int, *, spread: float = 0.35) -> list[Object]:
     """Return objects at rest, at least a centimetre apart."""
-    things: list[Thing] = []
+    objects: list[Object] = []
     places: list[F8] = []
-    while len(things) < n:
+    while len(objects) < n:
         size = random.uniform([0.06, 0.06, 0.05], [0.14, 0.1, 0.22])
         place = np.array([*random.uniform(-spread, spread, 2), size[2] / 2])
         gaps = [
             np.linalg.norm(place[:2] - p[:2]) - 0.5 * (size[0] + o.size[0])
-            for p, o in zip(places, things, strict=True)
+            for p, o in zip(places, objects, strict=True)
         ]
         if min(gaps, default=1.0) > 0.02:
-            things.append(Thing(int(random.integers(CATEGORIES)), size, resting(place)))
+            objects.append(Object(int(random.integers(CATEGORIES)), size, resting(place)))
             places.append(place)
-    return things
+    return objects
 
 
 STILL = Sensor(lambda _: np.array([0.0, -1.2, 0.6]), lambda _: np.zeros(3))
 
 
-def turntable(seed: int) -> tuple[list[Thing], Sensor]:
+def turntable(seed: int) -> tuple[list[Object], Sensor]:
     """Six objects turning at a quarter radian per second."""
 
     def turning(place: F8) -> Callable[[float], F8]:
@@ -186,24 +186,24 @@ def turntable(seed: int) -> tuple[list[Thing], Sensor]:
 
         return at
 
-    things = table(np.random.default_rng(seed), 6)
-    return [replace(thing, place=turning(place_of(thing))) for thing in things], STILL
+    objects = table(np.random.default_rng(seed), 6)
+    return [replace(item, place=turning(place_of(item))) for item in objects], STILL
 
 
-def walking(seed: int) -> tuple[list[Thing], Sensor]:
+def walking(seed: int) -> tuple[list[Object], Sensor]:
     """Ten objects on a long table; the camera walks along it and back, and sees a part of it."""
     random = np.random.default_rng(seed)
-    things = [
-        replace(thing, place=resting(place_of(thing) + np.array([shift, 0, 0])))
+    objects = [
+        replace(item, place=resting(place_of(item) + np.array([shift, 0, 0])))
         for shift in (0.0, 0.8)
-        for thing in table(random, 5)
+        for item in table(random, 5)
     ]
 
     def along(t: float) -> F8:
         return np.array([0.4 - 0.7 * np.cos(0.3 * t), 0.0, 0.0])
 
     beside = np.array([0.1, -1.2, 0.6])
-    return things, Sensor(lambda t: along(t) + beside, along, half_width_m=0.6)
+    return objects, Sensor(lambda t: along(t) + beside, along, half_width_m=0.6)
 
 
 def rolling(y: float, speed: float, start: float) -> Callable[[float], F8]:
@@ -211,24 +211,24 @@ def rolling(y: float, speed: float, start: float) -> Callable[[float], F8]:
     return lambda t: np.array([0.5 * np.sin(speed / 0.5 * t + start), y, 0.04])
 
 
-def crossing(seed: int) -> tuple[list[Thing], Sensor]:
+def crossing(seed: int) -> tuple[list[Object], Sensor]:
     """Objects at rest, and two balls that roll to and fro in front of and between them."""
     random = np.random.default_rng(seed)
-    things = table(random, 4)
+    objects = table(random, 4)
     for y, speed in ((-0.45, 0.12), (-0.6, -0.15)):
         start = random.uniform(-0.3, 0.3)
-        things.append(Thing(6, np.full(3, 0.08), rolling(y, speed, start)))
-    return things, STILL
+        objects.append(Object(6, np.full(3, 0.08), rolling(y, speed, start)))
+    return objects, STILL
 
 
-def rearranged(seed: int) -> tuple[list[Thing], Sensor]:
+def rearranged(seed: int) -> tuple[list[Object], Sensor]:
     """Objects that are carried elsewhere, added and removed."""
     random = np.random.default_rng(seed)
-    things = table(random, 6)
+    objects = table(random, 6)
     last = FRAMES * PERIOD_S
     for k, (born, dies) in enumerate([(6.0, last), (0.0, 12.0)]):
-        things[k] = replace(things[k], place=resting(place_of(things[k]), born, dies))
-    carried = place_of(things[2])
+        objects[k] = replace(objects[k], place=resting(place_of(objects[k]), born, dies))
+    carried = place_of(objects[2])
     goal = np.array([0.5, 0.45, carried[2]])
 
     def at(t: float) -> F8:
@@ -236,11 +236,11 @@ def rearranged(seed: int) -> tuple[list[Thing], Sensor]:
         lift = np.array([0, 0, 0.5 * share * (1 - share)])
         return np.asarray(carried + share * (goal - carried) + lift)
 
-    things[2] = replace(things[2], place=at)
-    return things, STILL
+    objects[2] = replace(objects[2], place=at)
+    return objects, STILL
 
 
-def shown(tracks: Sequence[Track], frame: int) -> dict[int, F8]:
+def centers_in(tracks: Sequence[Track], frame: int) -> dict[int, F8]:
     """Return the centres of the tracks in a frame."""
     result = {}
     for track in tracks:
@@ -261,24 +261,24 @@ class Score:
 
 def score(tracks: Sequence[Track], truth: Sequence[Truth], near_m: float = 0.1) -> Score:
     """Match tracks and truth frame by frame (MOTA) and over the recording (IDF1)."""
-    together = np.zeros((64, 64 + len(tracks)))
+    matches = np.zeros((64, 64 + len(tracks)))
     last: dict[int, int] = {}
-    faults = switches = total = claimed = 0
-    for k, real in enumerate(truth):
-        mine = shown(tracks, k)
-        names = [name for name in real.places if name not in real.hidden]
-        spared = [real.places[name] for name in real.hidden]
+    errors = switches = total = claimed = 0
+    for k, actual in enumerate(truth):
+        found = centers_in(tracks, k)
+        names = [name for name in actual.places if name not in actual.hidden]
+        ignored = [actual.places[name] for name in actual.hidden]
         ids = [
             i
-            for i, at in mine.items()
-            if not any(np.linalg.norm(at - p) < near_m for p in spared)
-            or any(np.linalg.norm(at - real.places[n]) < near_m for n in names)
+            for i, at in found.items()
+            if not any(np.linalg.norm(at - p) < near_m for p in ignored)
+            or any(np.linalg.norm(at - actual.places[n]) < near_m for n in names)
         ]
         total, claimed = total + len(names), claimed + len(ids)
-        cost = np.array([[np.linalg.norm(real.places[a] - mine[b]) for b in ids] for a in names])
+        cost = np.array([[np.linalg.norm(actual.places[a] - found[b]) for b in ids] for a in names])
         cost = cost.reshape(len(names), len(ids))
         for a, b in zip(*np.nonzero(cost < near_m), strict=True):
-            together[names[a], ids[b]] += 1
+            matches[names[a], ids[b]] += 1
             if last.get(names[a]) == ids[b]:
                 cost[a, b] -= near_m  # a match is kept while it is possible
         rows, columns = linear_sum_assignment(np.minimum(cost - near_m, 0))
@@ -286,18 +286,18 @@ def score(tracks: Sequence[Track], truth: Sequence[Truth], near_m: float = 0.1) 
             (names[a], ids[b]) for a, b in zip(rows, columns, strict=True) if cost[a, b] < near_m
         ]
         switches += sum(last.get(a, b) != b for a, b in pairs)
-        faults += len(names) + len(ids) - 2 * len(pairs)
+        errors += len(names) + len(ids) - 2 * len(pairs)
         last.update(pairs)
-    rows, columns = linear_sum_assignment(-together)
-    idf1 = 2 * together[rows, columns].sum() / (total + claimed)
-    return Score(float(idf1), 1 - (faults + switches) / total, switches)
+    rows, columns = linear_sum_assignment(-matches)
+    idf1 = 2 * matches[rows, columns].sum() / (total + claimed)
+    return Score(float(idf1), 1 - (errors + switches) / total, switches)
 
 
 @cache
 def recorded(
-    scene: Callable[[int], tuple[list[Thing], Sensor]], seed: int
+    scene: Callable[[int], tuple[list[Object], Sensor]], seed: int
 ) -> tuple[list[FrameDetections], list[Truth]]:
-    """Make a recording once for all settings."""
+    """Return the recording of a scene, made once for all settings."""
     return record(*scene(seed), seed)
 
 
@@ -316,14 +316,14 @@ def recorded(
     ],
 )
 def test_identities_survive_noise_misses_splits_and_occlusions(
-    scene: Callable[[int], tuple[list[Thing], Sensor]],
+    scene: Callable[[int], tuple[list[Object], Sensor]],
     idf1: float,
     mota: float,
     switches: int,
     association: Literal["hungarian", "greedy"],
     count: int,
 ) -> None:
-    """Several recordings each, on seeds that were not used to choose the tracker's constants."""
+    """The seeds were not used to choose the tracker's constants."""
     settings = replace(SETTINGS, association=association)
     scores = []
     for seed in SEEDS[:count]:
@@ -334,8 +334,8 @@ def test_identities_survive_noise_misses_splits_and_occlusions(
     assert sum(s.switches for s in scores) <= switches * count / len(SEEDS)
 
 
-def test_score_agrees_with_a_published_library() -> None:
-    """Guard the yardstick itself: motmetrics counts the same, when it is installed."""
+def test_score_agrees_with_motmetrics() -> None:
+    """Guards the metrics themselves."""
     motmetrics = pytest.importorskip("motmetrics")
     rows, truth = record(*turntable(7), 7)
     tracks = tuple(track_recording(rows, SETTINGS))
@@ -343,17 +343,17 @@ def test_score_agrees_with_a_published_library() -> None:
         Truth({k: p for k, p in t.places.items() if k not in t.hidden}, set()) for t in truth
     ]
     accumulator = motmetrics.MOTAccumulator(auto_id=True)
-    for k, real in enumerate(visible):
-        mine = shown(tracks, k)
+    for k, actual in enumerate(visible):
+        found = centers_in(tracks, k)
         gaps = np.array(
-            [[np.linalg.norm(p - c) for c in mine.values()] for p in real.places.values()]
+            [[np.linalg.norm(p - c) for c in found.values()] for p in actual.places.values()]
         )
         gaps[gaps >= 0.1] = np.nan
-        accumulator.update(list(real.places), list(mine), gaps)
-    theirs = motmetrics.metrics.create().compute(
+        accumulator.update(list(actual.places), list(found), gaps)
+    reference = motmetrics.metrics.create().compute(
         accumulator, metrics=["idf1", "mota", "num_switches"], return_dataframe=False
     )
-    ours = score(tracks, visible)
-    assert ours.idf1 == pytest.approx(theirs["idf1"], abs=0.003)
-    assert ours.mota == pytest.approx(theirs["mota"], abs=0.003)
-    assert ours.switches == theirs["num_switches"]
+    own = score(tracks, visible)
+    assert own.idf1 == pytest.approx(reference["idf1"], abs=0.003)
+    assert own.mota == pytest.approx(reference["mota"], abs=0.003)
+    assert own.switches == reference["num_switches"]

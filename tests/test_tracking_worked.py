@@ -1,4 +1,4 @@
-"""The steps of tracking against worked examples and other libraries, without equal numbers."""
+"""Worked examples of tracking against textbook formulas and libraries, with distinct numbers."""
 
 from dataclasses import replace
 from typing import Any
@@ -63,7 +63,7 @@ def two_tracks(**changes: Any) -> tracker._Active:
 # ---- the tracker
 
 
-def test_the_prediction_is_the_exact_one_of_a_fading_velocity() -> None:
+def test_prediction_is_exact_for_decaying_velocity() -> None:
     """Van Loan's matrix exponential integrates the same stochastic equation."""
     elapsed, decay, speed = 0.37, 1 / tracker._SPEED_MEMORY_S, tracker._SPEED_M_S
     drift = np.array([[0.0, 1.0], [0.0, -decay]])
@@ -81,8 +81,8 @@ def test_the_prediction_is_the_exact_one_of_a_fading_velocity() -> None:
     assert_allclose([after.position, after.velocity], moved, rtol=1e-12)
 
 
-def test_the_correction_is_kalmans_and_the_means_run() -> None:
-    """Textbook form, with the noise of a view that is cut and of another size."""
+def test_correction_is_kalman_update_with_running_means() -> None:
+    """Textbook form, with the noise of a partial view of another size."""
     tracks, before = two_tracks(), two_tracks()
     found = tracker._seed(
         np.array([[0.0, 0.0, 0.5], [0.13, -0.40, 0.86]]),
@@ -90,19 +90,19 @@ def test_the_correction_is_kalmans_and_the_means_run() -> None:
         np.array([[0.5, 0.5], [0.4, 0.6]]),
     )
     found.seen_ns[:] = 5 * SECOND
-    odd = np.abs(before.size[0] - found.size[1]).mean()
+    size_difference = np.abs(before.size[0] - found.size[1]).mean()
     tracker._correct(tracks, found, np.array([[0, 1]]), np.array([False, True]))
 
     pp, pv, vv = before.variance[0]
     covariance = np.array([[pp, pv], [pv, vv]])
-    noise = tracker._NOISE_M**2 * (1 + 10 * odd + 3)
+    noise = tracker._NOISE_M**2 * (1 + 10 * size_difference + 3)
     gain = covariance[:, 0] / (pp + noise)
     surprise = found.position[1] - before.position[0]
     left = covariance - np.outer(gain, covariance[0])
     assert_allclose(tracks.position[0], before.position[0] + gain[0] * surprise)
     assert_allclose(tracks.velocity[0], before.velocity[0] + gain[1] * surprise)
     assert_allclose(tracks.variance[0], left[np.triu_indices(2)])
-    rate = 0.25 / 6  # of a view that is cut, the sixth of its track
+    rate = 0.25 / 6  # of a partial view, the sixth of its track
     size = before.size[0] + rate * (found.size[1] - before.size[0])
     assert_allclose(tracks.size[0], size)
     assert_allclose(tracks.posterior[0], [0.7 - rate * 0.3, 0.3 + rate * 0.3])
@@ -112,7 +112,7 @@ def test_the_correction_is_kalmans_and_the_means_run() -> None:
     assert_allclose(tracks.position[1], before.position[1])
 
 
-def test_the_cost_of_a_pair_is_the_sum_of_what_speaks_against_it() -> None:
+def test_cost_of_pair_is_sum_of_differences() -> None:
     """Squared distance over the gate, sizes, posteriors, and a penalty for young tracks."""
     found = tracker._seed(
         np.array([[0.13, -0.40, 0.86], [0.34, -0.15, 0.60]]),
@@ -121,21 +121,21 @@ def test_the_cost_of_a_pair_is_the_sum_of_what_speaks_against_it() -> None:
     )
     costs = tracker._costs(two_tracks(), found, 4 * SECOND + 100_000_000, SETTINGS)
 
-    gate = 0.03 + 0.5 * 0.14 + 0.3 * 0.1  # its width, and a tenth of a second unseen
+    gate = 0.03 + 0.5 * 0.14 + 0.3 * 0.1  # half the width, and a tenth of a second unseen
     away = np.sqrt(0.02**2 + 0.02**2 + 0.03**2)
     sizes = (np.log(0.21 / 0.14) + np.log(0.08 / 0.05)) / 3
-    assert gate > SETTINGS.gate_m  # which is the most that a gate is
+    assert gate > SETTINGS.gate_m  # the largest gate
     assert costs[0, 0] == pytest.approx((away / 0.12) ** 2 + 0.8 * sizes + 0.5 * 0.3)
     assert np.isinf(costs[0, 1])
     assert np.isinf(costs[1]).all()  # 0.19 m below, and on the other side
     near = replace(SETTINGS, gate_m=0.3)
     young = tracker._costs(two_tracks(), found, 4 * SECOND + 100_000_000, near)
-    reach = 0.03 + 0.5 * 0.31 + 0.3 * 0.03
-    assert young[1, 1] == pytest.approx(np.inf if reach < 0.19 else (0.19 / reach) ** 2 + 0.2)
+    limit = 0.03 + 0.5 * 0.31 + 0.3 * 0.03
+    assert young[1, 1] == pytest.approx(np.inf if limit < 0.19 else (0.19 / limit) ** 2 + 0.2)
 
 
-def test_a_box_that_flips_by_a_quarter_turn_keeps_its_size() -> None:
-    """Its two sides swap; the height does not, though it is between them."""
+def test_size_key_ignores_quarter_turn() -> None:
+    """The two sides swap; the height does not, though it is between them."""
     expected = np.log([0.20, 0.06, 0.13])  # each a centimetre longer
 
     assert_allclose(size_key(np.array([[0.05, 0.19, 0.12], [0.19, 0.05, 0.12]])), [expected] * 2)
@@ -144,20 +144,20 @@ def test_a_box_that_flips_by_a_quarter_turn_keeps_its_size() -> None:
 @pytest.mark.parametrize(
     ("changes", "clock_s", "alive"),
     [
-        # Proved, and there for 4 s: waited for so long. The other was there for 1.07 s.
+        # Confirmed and 4 s old: survives 4 s unseen. The other one is 1.07 s old.
         ({"missed": np.array([9, 9])}, 5.0, [4, 9]),
         ({"missed": np.array([9, 9])}, 5.2, [4]),
         ({"missed": np.array([9, 9])}, 7.9, [4]),
         ({"missed": np.array([9, 9])}, 8.1, []),
-        # A frame that comes late: missed once, or twice for one that has not proved itself.
+        # A late frame: missed once, or twice if it is not confirmed.
         ({"missed": np.array([0, 1])}, 60.0, [4, 9]),
         ({"missed": np.array([1, 2])}, 60.0, []),
-        # Born just now: half a second.
+        # Just born: half a second.
         ({"missed": np.array([9, 9]), "born_ns": np.array([4 * SECOND] * 2)}, 4.45, [4, 9]),
         ({"missed": np.array([9, 9]), "born_ns": np.array([4 * SECOND] * 2)}, 4.53, [9]),
     ],
 )
-def test_a_track_is_waited_for_as_long_as_it_was_there(
+def test_track_survives_unseen_as_long_as_it_was_seen(
     changes: dict[str, Any], clock_s: float, alive: list[int]
 ) -> None:
     following = Tracker(SETTINGS)
@@ -169,7 +169,7 @@ def test_a_track_is_waited_for_as_long_as_it_was_there(
 # ---- fragments
 
 
-def test_the_line_through_detections_is_the_one_of_ridge_regression() -> None:
+def test_line_through_detections_is_ridge_regression() -> None:
     """Least squares with an additional row for zero velocity."""
     rng = np.random.default_rng(3)
     stamps = np.array([5.0, 5.1, 5.3, 5.32, 5.8])
@@ -189,8 +189,8 @@ def test_the_line_through_detections_is_the_one_of_ridge_regression() -> None:
         assert_allclose(place, mean - t.mean() * slope, rtol=1e-6)
 
 
-def test_a_track_needs_as_many_detections_as_frames_are_near() -> None:
-    """Within half a second, on both sides, and in the same scene."""
+def test_needed_detections_depend_on_nearby_frames() -> None:
+    """Nearby means within half a second on both sides and in the same scene."""
     stamps = np.array([0.0, 0.3, 0.45, 0.9, 2.0, 2.4, 2.6])
     frames = [frame(k, [], stamp_ns=round(s * 1e9)) for k, s in enumerate(stamps)]
     scenes = np.array([0, 0, 0, 0, 1, 1, 1])
@@ -203,8 +203,8 @@ def test_a_track_needs_as_many_detections_as_frames_are_near() -> None:
     assert _needed(hits, scenes, 1, 2) == 2
 
 
-def test_a_fragment_is_summed_up_from_its_beginning_to_its_end() -> None:
-    """Of an object that enters the view cut off, moves on and stays whole."""
+def test_fragment_summarises_its_detections() -> None:
+    """The object enters the view cut off, moves on and stays whole."""
     places = [[[9.0, 9, 9], [0.1 * k, 0.02 * k, 0.7]] for k in range(4)]
     cut = [True, False, True, False]
     frames = [
@@ -224,7 +224,7 @@ def test_a_fragment_is_summed_up_from_its_beginning_to_its_end() -> None:
 
 
 def fragments(**changes: Any) -> Fragments:
-    """Return a fragment and two later ones: one that moves on, one that rests."""
+    """Return a fragment and two later ones: one that moves, one that rests."""
     columns: dict[str, Any] = {
         "first_ns": np.array([0, 3 * SECOND, 30 * SECOND]),
         "last_ns": np.array([2 * SECOND, 9 * SECOND, 40 * SECOND]),
@@ -243,15 +243,15 @@ def fragments(**changes: Any) -> Fragments:
     return Fragments(*(columns | changes).values())
 
 
-def test_the_way_from_one_fragment_to_the_next_is_the_shortest_of_five() -> None:
+def test_distance_of_fragments_is_shortest_of_five() -> None:
     """From its end or rest to their start or rest, or halfway along both motions."""
     found = _distances(fragments(), 0, np.array([1, 2]), SETTINGS)
 
     # Halfway through the second between them: (.45, .17, .08) and (.44, .17, .09).
     assert found[0] == pytest.approx(np.hypot(0.01, 0.01))
-    assert found[1] == pytest.approx(0.1)  # its rest is as near to where the first one ended
-    still = fragments(rest=np.full((3, 3), np.nan))
-    far = _distances(still, 0, np.array([2]), SETTINGS)  # 28 s later a motion says nothing
+    assert found[1] == pytest.approx(0.1)  # its rest is as near to the end of the first one
+    moving = fragments(rest=np.full((3, 3), np.nan))
+    far = _distances(moving, 0, np.array([2]), SETTINGS)  # after 28 s a velocity means nothing
     assert far == pytest.approx(np.linalg.norm([0.5, -0.4, 0.3]))
 
 
@@ -264,7 +264,7 @@ def test_the_way_from_one_fragment_to_the_next_is_the_shortest_of_five() -> None
         (False, False, 0.0),
     ],
 )
-def test_what_is_not_known_whole_may_be_larger(
+def test_partially_seen_object_may_be_larger(
     known: bool, others_known: bool, expected: float
 ) -> None:
     key, others = np.array([1.4, 1.0, 0.6]), np.array([[1.0, 1.3, 0.5]])
@@ -275,7 +275,7 @@ def test_what_is_not_known_whole_may_be_larger(
 # ---- several sensors
 
 
-def test_frames_of_two_sensors_are_put_in_the_order_of_time() -> None:
+def test_frames_of_two_sensors_are_sorted_by_time() -> None:
     """They are recorded one sensor after the other; each keeps its own order."""
     order = [
         ("/a", 0, [0.1, 0.2]),
@@ -294,7 +294,7 @@ def test_frames_of_two_sensors_are_put_in_the_order_of_time() -> None:
     assert hits.rows.tolist() == [0, 0, 1, 3, 4]
 
 
-def test_tracks_are_numbered_by_birth_whichever_sensor_sees_them() -> None:
+def test_tracks_of_all_sensors_are_numbered_by_birth() -> None:
     """Users expect #1 to be the first object that appears."""
     late = [frame(k, [0.3, 0.1, 1.0], topic="/a") for k in range(5, 15)]
     early = [frame(k, [0.6, 0.2, 1.1], topic="/b") for k in range(10)]
@@ -315,7 +315,7 @@ def turned_hits() -> Hits:
     return next(gather([frame(0, places, sizes=sizes, axes=axes), frame(1, [])]))
 
 
-def test_the_common_box_of_two_pieces_holds_the_corners_of_both() -> None:
+def test_joint_box_encloses_corners_of_both_pieces() -> None:
     """Along the axes of the first: longer side, shorter side, height."""
     hits = turned_hits()
     signs = np.array(np.meshgrid(*[[-0.5, 0.5]] * 3)).reshape(3, -1).T
@@ -329,7 +329,7 @@ def test_the_common_box_of_two_pieces_holds_the_corners_of_both() -> None:
         assert_allclose(_joint(hits, hits.axes, np.array([[i, j]])), [expected], rtol=1e-6)
 
 
-def test_pieces_fit_into_a_whole_that_neither_of_them_fills() -> None:
+def test_pieces_fit_into_whole_that_neither_fills() -> None:
     hits = turned_hits()
     axes = hits.axes
     assert axes is not None
@@ -339,19 +339,19 @@ def test_pieces_fit_into_a_whole_that_neither_of_them_fills() -> None:
     def fits(whole: F8, other: F8) -> bool:
         return bool(fit_pieces(hits, axes, pair, np.array([[whole, other]]))[0])
 
-    none = np.zeros(3)
-    assert fits(both, none)
-    assert fits(none, both)
-    assert fits((both - 0.0099) / 1.1, none)
-    assert not fits((both - 0.0101) / 1.1, none)
-    assert not fits(both * [1, 1, 0.85], none)
+    nothing = np.zeros(3)
+    assert fits(both, nothing)
+    assert fits(nothing, both)
+    assert fits((both - 0.0099) / 1.1, nothing)
+    assert not fits((both - 0.0101) / 1.1, nothing)
+    assert not fits(both * [1, 1, 0.85], nothing)
     # One of them is as long, as wide and as high as the whole: something lies in a bowl.
     largest = np.array([0.16, 0.07, 0.2])
-    assert not fits(np.maximum(largest, 0), none)
+    assert not fits(np.maximum(largest, 0), nothing)
 
 
-def test_of_two_pieces_the_larger_one_stays() -> None:
-    """By volume: the longer one, or the one that comes first, may be the smaller."""
+def test_larger_of_two_pieces_is_kept() -> None:
+    """By volume: the longer one, or the first one, may be the smaller."""
     flat, cube = (0.21, 0.04, 0.05), (0.09, 0.08, 0.07)
     frames = [
         frame(0, [[0.1, 0.2, 0.3]] * 2, sizes=[flat, cube]),
@@ -362,15 +362,15 @@ def test_of_two_pieces_the_larger_one_stays() -> None:
     assert _largest(next(gather(frames)), np.array([4, 0, 3, 1, 2])).tolist() == [1, 2, 4]
 
 
-def test_one_track_ends_soon_after_the_other_began() -> None:
-    """Rows 0 to 9 and 8 to 19: two frames of ten. One within the other is no change."""
+def test_change_of_tracks_is_their_overlap() -> None:
+    """Rows 0 to 9 and 8 to 19 share two frames of ten; one within the other is no change."""
     rows = [range(10), range(8, 20), range(3, 6)]
     members: list[list[int]] = [[], [], []]
     frames, at = [], 0
     for k in range(20):
-        there = [m for m, own in enumerate(rows) if k in own]
-        frames.append(frame(k, [[0.1 * m, 0, 0] for m in there]))
-        for m in there:
+        present = [m for m, own in enumerate(rows) if k in own]
+        frames.append(frame(k, [[0.1 * m, 0, 0] for m in present]))
+        for m in present:
             members[m].append(at)
             at += 1
     duos = np.array([[0, 1], [0, 2]])
@@ -379,7 +379,7 @@ def test_one_track_ends_soon_after_the_other_began() -> None:
     assert share.tolist() == [0.2, np.inf]
 
 
-def test_a_place_is_in_a_box_along_the_axes_of_the_box() -> None:
+def test_point_in_box_is_tested_along_axes_of_box() -> None:
     hits = turned_hits()
     assert hits.axes is not None
     offsets = np.array([0.0599, -0.0249, 0.0999]) * [1, -1, -1]
@@ -393,7 +393,7 @@ def test_a_place_is_in_a_box_along_the_axes_of_the_box() -> None:
 # ---- the common motion
 
 
-def test_the_level_frame_stands_up_and_is_right_handed() -> None:
+def test_level_frame_is_upright_and_right_handed() -> None:
     level = _level(np.stack([TURNED, Rotation.from_euler("x", 0.02).as_matrix() @ TURNED]))
 
     assert_allclose(level @ level.T, np.eye(3), atol=1e-12)
@@ -401,7 +401,7 @@ def test_the_level_frame_stands_up_and_is_right_handed() -> None:
     assert level[2] @ TURNED[:, 2] > 0.999
 
 
-def test_a_turn_in_the_plane_is_one_about_up_in_space() -> None:
+def test_rotation_in_plane_is_rotation_about_up() -> None:
     """It must move points in the plane and keep their heights."""
     level = _level(TURNED[None])
     turn, shift = np.exp(1j * np.array([0.4, -1.1])), np.array([0.3 - 0.2j, 0.05 + 0.7j])
@@ -421,7 +421,7 @@ def test_a_turn_in_the_plane_is_one_about_up_in_space() -> None:
         assert_allclose(back.axes, np.broadcast_to(motion.rotations[k], (7, 3, 3)))
 
 
-def test_turn_and_shift_of_each_frame_are_found_alone() -> None:
+def test_rotation_and_shift_are_fitted_per_frame() -> None:
     """A frame with a single point keeps its transform; points of weight zero have no effect."""
     turn, shift = np.exp(0.6j), 0.2 - 0.5j
     seen = np.array([0.1 + 0.2j, -0.3 + 0.1j, 0.4 - 0.6j, 2.0 + 1.0j, 0.7 + 0.7j])

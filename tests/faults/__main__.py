@@ -56,7 +56,7 @@ def _cases(options: argparse.Namespace) -> Iterator[tuple[str, int]]:
 
 
 def _judge(laboratory: Laboratory, case: tuple[str, int], until: float) -> Verdict | str:
-    """Judge a case; a skipped one is a reason."""
+    """Judge a case; return the reason if it is skipped."""
     if time.monotonic() > until:
         return "no time left"
     try:
@@ -64,15 +64,15 @@ def _judge(laboratory: Laboratory, case: tuple[str, int], until: float) -> Verdi
     except SkippedError as error:
         return f"{case[0]}: {error}"
     if verdict.wrong:
-        print(_words(verdict), flush=True)
+        print(_describe(verdict), flush=True)
     return verdict
 
 
-def _words(verdict: Verdict) -> str:
+def _describe(verdict: Verdict) -> str:
     moment = "" if verdict.struck is None else f" at {verdict.struck:.2f} s"
     head = f"{verdict.kind} --only {verdict.seed} ({verdict.scenario}){moment}: exit {verdict.code}"
-    said = [line for line in verdict.stderr.splitlines() if not line.startswith('{"event": "prog')]
-    return "\n    ".join([head, *verdict.wrong, "stderr:", *said[-6:]])
+    lines = [line for line in verdict.stderr.splitlines() if not line.startswith('{"event": "prog')]
+    return "\n    ".join([head, *verdict.wrong, "stderr:", *lines[-6:]])
 
 
 def _print(results: list[Verdict | str]) -> int:

@@ -16,7 +16,7 @@ _FIRST_S = 900.0
 
 
 class SkippedError(Exception):
-    """A fault that cannot be injected here."""
+    """A fault that cannot be injected on this machine."""
 
 
 @dataclass(frozen=True)
@@ -113,7 +113,7 @@ class Laboratory:
 
     def _after_fault(self, kind: str, scenario: Scenario, ended: Ended, case: Path) -> list[str]:
         wrong = [*invariants.ended_well(kind, ended)]
-        wrong += invariants.whole_places(scenario, case / "out")
+        wrong += invariants.complete_outputs(scenario, case / "out")
         if kind != "replace":
             wrong += invariants.nothing_lost(scenario, ended, case / "out")
         if scenario.verb == "export":
@@ -144,7 +144,7 @@ class Laboratory:
         options = ("--overwrite",) if kind == "replace" and ended.code == 0 else ()
         again = Running(scenario.command(case, *options)).end()
         wrong = [f"exit code {again.code}: {again.text[-300:]}"] if again.code else []
-        wrong += invariants.whole_places(scenario, case / "out")
+        wrong += invariants.complete_outputs(scenario, case / "out")
         wrong += invariants.nothing_hidden(case)
         wrong += self._compared(scenario, case)
         return [f"again: {text}" for text in wrong]

@@ -26,7 +26,7 @@ KINDS = (*SIGNALS, "worker", "replace", "tmpfs", *COUNTERS)
 LIMIT_S = 120.0
 """A command that takes longer hangs."""
 _LINGER_S = 8.0
-"""Processes of a command may outlive it so long."""
+"""Longest time that processes of a command may outlive it."""
 
 
 @dataclass
@@ -62,7 +62,7 @@ def _heed_interrupts() -> None:
 
 
 class Running:
-    """A command in a session of its own, whose stderr is read as it is written."""
+    """A command in its own session, whose stderr is read as it is written."""
 
     def __init__(self, command: list[str], environment: Mapping[str, str] | None = None) -> None:
         self.begun = time.monotonic()
@@ -164,7 +164,7 @@ def replace_input(
     content = path.read_bytes() if way == "cut" else other.read_bytes()
     own = path.with_suffix(".own")
     shutil.copyfile(path, own)
-    own.replace(path)  # the recording is linked: what is written in place must be this case's
+    own.replace(path)  # a copy, as other cases have hard links to the recording
     running = Running(command)
     if not running.wait_until(moment):
         return running.end()

@@ -19,7 +19,7 @@ TABLES = ("frames", "detections", "planes", "tracks")
 FILES = ("run.json", *(f"{name}.parquet" for name in TABLES), "tracks.csv")
 OUTPUTS = ("annotated.mcap", "review.rrd")
 RECENT_S = 3.0
-"""Work younger than this may be lost."""
+"""Work of this many seconds before the fault may be lost."""
 CODES = {
     "interrupt": {0, 130},
     "double": {0, 130},
@@ -51,27 +51,27 @@ def ended_well(kind: str, ended: Ended) -> Iterator[str]:
         yield f"stderr says {found[0]!r}"
     if ended.lingering:
         yield f"{ended.lingering} processes outlive the command"
-    said = [line for line in ended.text.splitlines() if line.startswith("Error: ")]
-    said += [str(event["message"]) for _, event in ended.events() if event.get("message")]
-    if 0 < ended.code < 5 and not said:
+    lines = [line for line in ended.text.splitlines() if line.startswith("Error: ")]
+    lines += [str(event["message"]) for _, event in ended.events() if event.get("message")]
+    if 0 < ended.code < 5 and not lines:
         yield "no error line"
-    yield from (f"said twice: {line}" for line in sorted({s for s in said if said.count(s) > 1}))
+    yield from (f"said twice: {line}" for line in sorted({s for s in lines if lines.count(s) > 1}))
 
 
-def whole_places(scenario: Scenario, out: Path) -> Iterator[str]:
+def complete_outputs(scenario: Scenario, out: Path) -> Iterator[str]:
     """Check that everything under a final name is complete."""
     for item in sorted(out.iterdir()) if out.is_dir() else []:
         if item.name.startswith("."):
             continue
         if item.name == "manifest.jsonl":
-            yield from whole_lines(item)
+            yield from complete_lines(item)
         elif item.name not in scenario.runs or not item.is_dir():
             yield f"stray {item.name}"
         else:
-            yield from whole_run(item)
+            yield from complete_run(item)
 
 
-def whole_run(run: Path) -> Iterator[str]:
+def complete_run(run: Path) -> Iterator[str]:
     """Check that a run folder holds every file, each of them complete."""
     for name in (*FILES, *OUTPUTS):
         if not (run / name).is_file():
@@ -80,10 +80,10 @@ def whole_run(run: Path) -> Iterator[str]:
         if path.name.endswith(".partial") and not path.name.startswith("."):
             yield f"{run.name}: stray {path.name}"
         elif not path.name.startswith("."):
-            yield from (f"{run.name}: {text}" for text in whole_file(path))
+            yield from (f"{run.name}: {text}" for text in complete_file(path))
 
 
-def whole_file(path: Path) -> Iterator[str]:
+def complete_file(path: Path) -> Iterator[str]:
     """Check one file by its kind."""
     try:
         if path.suffix == ".json":
@@ -123,7 +123,7 @@ def _read_rrd_footer(path: Path) -> None:
         raise ValueError(msg)
 
 
-def whole_lines(manifest: Path) -> Iterator[str]:
+def complete_lines(manifest: Path) -> Iterator[str]:
     """Check that no line of a manifest is truncated."""
     content = manifest.read_bytes()
     if content and not content.endswith(b"\n"):
@@ -162,7 +162,7 @@ def kept_frames(out: Path, run: str) -> int:
             try:
                 return int(pq.read_metadata(folder / "frames.parquet").num_rows)
             except (pa.ArrowException, OSError):
-                pass  # not joined yet: the segments count
+                pass  # not joined yet: count the segments
     hidden = out / f".{run}.partial" / "segments"
     return sum(_rows(path) for path in hidden.glob("[0-9]*/frames.arrow"))
 

@@ -2,12 +2,12 @@
 
     python -m tests.mutations --only quick --count 60 --least 0.6
 
-The seed draws the mutants from all that there are: the same ones on every machine, and a change of
-one module leaves those of the others. No file is touched: each mutant lives in a forked process
-alone, whose imports give it. A module is judged by the test files that `KNOWN_BY` names. They run
-without a mutant first, which tells which of their tests reach a line: those files judge its
-mutants. A mutant is killed if a test fails, or if the tests take far longer than without it; one
-that no test reaches has survived.
+The seed draws from all mutants, so that every machine gets the same ones, and a change of one
+module leaves those of the others. No file is changed: a mutant exists only in a forked process,
+which imports it. The test files in `KNOWN_BY` judge a module. They first run without a mutant to
+find the tests that reach each line, and files with such tests judge the mutants of a line. A mutant
+is killed if a test fails, or if the tests take far longer than without it; a mutant that no test
+reaches has survived.
 """
 
 import argparse
@@ -27,7 +27,7 @@ from tests.mutations.flips import flips_of
 LIBRARIES = ("numba", "scipy.spatial.transform", "pyarrow.parquet", "rosbags.typesys",
              "mcap.reader", "mcap_ros2.decoder", "click.testing", "scipy.optimize")  # fmt: skip
 """Loaded once, before processes are forked."""
-ROOMS = ("batch", "cameras", "cli", "colour", "evaluation", "executors", "outputs", "recordings",
+PACKAGES = ("batch", "cameras", "cli", "colour", "evaluation", "executors", "outputs", "recordings",
          "runs", "system", "tracking")  # fmt: skip
 KNOWN_BY: dict[str, Sequence[str]] = {
     "shapecat.batch": ("test_batch_planning",),
@@ -104,7 +104,7 @@ KNOWN_BY: dict[str, Sequence[str]] = {
                           "test_changes"),
     "shapecat.tracking.full_boxes": ("test_completion", "test_tables_rotated"),
 }  # fmt: skip
-"""Test files by the beginning of a module's name; the longest that fits counts."""
+"""Test files by prefix of a module's name; the longest prefix counts."""
 SLOW = (
     "shapecat.batch.claims",
     "shapecat.batch.ledger",
@@ -119,15 +119,15 @@ SLOW = (
     "shapecat.runs.perceiving",
     "shapecat.runs.second_look",
 )
-"""Judged by browsers, viewers, object storage, whole recordings or commands: not `quick`."""
+"""Judged by browsers, viewers, object storage, whole recordings or commands; not in `quick`."""
 
 
 def modules(only: str) -> dict[str, Path]:
     """Return the modules without kernels whose name contains a text, by name."""
-    folders = {room: ROOT / "shapecat" / room for room in ROOMS} | {"cli": ROOT / "cli"}
+    folders = {package: ROOT / "shapecat" / package for package in PACKAGES} | {"cli": ROOT / "cli"}
     named = {
-        ".".join(("shapecat", room, *file.relative_to(folder).with_suffix("").parts)): file
-        for room, folder in folders.items()
+        ".".join(("shapecat", package, *file.relative_to(folder).with_suffix("").parts)): file
+        for package, folder in folders.items()
         for file in folder.rglob("*.py")
     }
     return {
@@ -154,14 +154,14 @@ def _rank(seed: int, mutant: Mutant) -> bytes:
 
 
 def tests_of(mutant: Mutant) -> list[Path]:
-    """Return the test files that judge a mutant: also the examples in its module."""
+    """Return the test files that judge a mutant, and its module if it has examples."""
     fitting = max((name for name in KNOWN_BY if mutant.module.startswith(name)), key=len)
     files = [ROOT / "tests" / f"{name}.py" for name in KNOWN_BY[fitting]]
     return [mutant.file, *files] if "\n    >>> " in mutant.file.read_text("utf-8") else files
 
 
 def judge(mutant: Mutant, reached: Mapping[Path, Reached | None]) -> tuple[Mutant, str]:
-    """Run the tests that reach a mutant, then the others of their files; return the outcome."""
+    """Run the tests that reach a mutant, then the other tests of their files."""
     known = {file: reached[file] for file in tests_of(mutant)}
     found = {file: result for file, result in known.items() if result and result.by(mutant)}
     if not found:
@@ -212,7 +212,7 @@ def _traced(files: Sequence[Path], pool: Executor) -> dict[Path, Reached | None]
 
 
 def _reach(file: Path) -> Reached | None:
-    return reach(file) or reach(file)  # once more: a machine may be busy for a moment
+    return reach(file) or reach(file)  # again, as the machine may be busy
 
 
 if __name__ == "__main__":

@@ -156,7 +156,7 @@ class _Mutated(importlib.abc.MetaPathFinder, importlib.abc.Loader):
         return importlib.util.spec_from_file_location(name, self.file, loader=self)
 
     def create_module(self, _spec: object) -> None:
-        """Leave it to Python."""
+        """Use the default."""
 
     def exec_module(self, module: Any) -> None:
         """Run the mutated code."""
