@@ -1,4 +1,4 @@
-"""Learning: the fitted pipeline, prediction without scikit-learn, novelty, new categories."""
+"""Tests of learning: the fitted pipeline, prediction, novelty and new categories."""
 
 import itertools
 from dataclasses import replace
@@ -39,7 +39,7 @@ SMALL = LearningSettings(rounds=20, leaves=6, known_views=200)
 
 
 def blobs(per_category: int, seed: int, categories: tuple[str, ...] = CATEGORIES) -> Examples:
-    """Return views of 8 numbers around the centre of each category; unknown ones lie far out."""
+    """Return views of 8 numbers around the centre of each category; unknown ones are far away."""
     rng = np.random.default_rng(seed)
     centres = {"cup": 0.0, "can": 2.0, "ball": 4.0, "cone": 6.0, "spoon": 8.0, UNKNOWN: -4.0}
     labels = np.repeat(categories, per_category)
@@ -80,29 +80,29 @@ def logits_of(dictionary: Dictionary, x: F4) -> Any:
     return dictionary.votes[dictionary.forest.apply(x)].sum(axis=1) + dictionary.bias
 
 
-def test_trees_are_walked_to_the_leaf() -> None:
+def test_trees_are_evaluated_to_the_leaf() -> None:
     """Values exactly at a threshold, or just above it, must not change sides."""
     data = blobs(50, 3)
     flat = grow(data.descriptors, encode(data.labels, CATEGORIES), rounds=10).forest
     at_thresholds = np.repeat(flat.threshold[flat.left > 0][:500, None], 8, axis=1)
     x = np.concatenate([data.descriptors, at_thresholds, np.nextafter(at_thresholds, np.inf)])
 
-    words = flat.apply(x)
+    leaf_ids = flat.apply(x)
 
     leaves = np.flatnonzero(flat.left == 0)
-    for row, found in zip(x, words, strict=True):
-        for root, word in zip(flat.roots, found, strict=True):
+    for row, found in zip(x, leaf_ids, strict=True):
+        for root, leaf_id in zip(flat.roots, found, strict=True):
             node = int(root)
             while flat.left[node]:
                 node = int(flat.left[node]) + int(row[flat.feature[node]] > flat.threshold[node])
-            assert leaves[word] == node
+            assert leaves[leaf_id] == node
 
 
 @pytest.mark.parametrize("kernels", [0, 20])
-def test_prediction_agrees_with_the_fitted_chain(kernels: int) -> None:
+def test_prediction_matches_fitted_chain(kernels: int) -> None:
     """The compiled kernel is a second implementation and must give the same results.
 
-    That its trees are walked rightly, `test_trees_are_walked_to_the_leaf` checks.
+    Its trees are checked by `test_trees_are_evaluated_to_the_leaf`.
     """
     chosen = replace(SMALL, kernels=kernels)
     train, test = blobs(60, 1, (*CATEGORIES, UNKNOWN)), blobs(50, 9)
@@ -123,8 +123,8 @@ def test_prediction_agrees_with_the_fitted_chain(kernels: int) -> None:
     )
 
 
-def test_the_first_tree_makes_the_best_split(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Against every split of every feature, by the formula, written out."""
+def test_first_tree_makes_the_best_split(monkeypatch: pytest.MonkeyPatch) -> None:
+    """The formula is evaluated for every split of every feature."""
     data = blobs(40, 3, ("cup", "can"))
     x, y = data.descriptors, (data.labels == "can").astype(int)
     monkeypatch.setattr("shapecat.learning.boosted._COLUMNS", 1.0)
@@ -149,8 +149,8 @@ def test_the_first_tree_makes_the_best_split(monkeypatch: pytest.MonkeyPatch) ->
     np.testing.assert_allclose(model.votes[:2, 0], step, rtol=2e-3)
 
 
-def test_rounds_lessen_the_training_loss() -> None:
-    """A wrong sign or factor in a derivative still learns a little, but overshoots or stalls."""
+def test_more_rounds_reduce_the_training_loss() -> None:
+    """With a wrong derivative, training still learns a little, but overshoots or stalls."""
     data = blobs(50, 1)
     codes = encode(data.labels, CATEGORIES)
     losses = []
@@ -162,35 +162,34 @@ def test_rounds_lessen_the_training_loss() -> None:
     assert all(later < 0.8 * earlier for earlier, later in itertools.pairwise(losses))
 
 
-def test_same_seed_same_model_bit_for_bit() -> None:
-    """A model must be reproducible, whatever the number of threads."""
+def test_model_is_reproducible_for_any_number_of_jobs() -> None:
     assert fit(seed=0).model_id == fit(replace(SMALL, jobs=2), seed=0).model_id
     assert fit(seed=0).model_id != fit(seed=1).model_id
 
 
 @pytest.mark.parametrize("x", [np.zeros((2, 7)), np.full((1, 8), np.nan), np.zeros(8)])
-def test_impossible_descriptors_are_refused(categorizer: Categorizer, x: F4) -> None:
+def test_invalid_descriptors_are_rejected(categorizer: Categorizer, x: F4) -> None:
     with pytest.raises(ValueError, match="descriptors"):
         categorizer.predict(x)
 
 
-def test_no_object_gives_no_prediction(categorizer: Categorizer) -> None:
+def test_empty_input_gives_empty_prediction(categorizer: Categorizer) -> None:
     prediction = categorizer.predict(np.zeros((0, 8), np.float32))
 
     assert prediction.posteriors.shape == (0, 3)
     assert prediction.novelty.shape == (0,)
 
 
-def test_strange_shapes_are_more_novel_than_known_ones(categorizer: Categorizer) -> None:
+def test_unknown_shapes_are_more_novel_than_known_ones(categorizer: Categorizer) -> None:
     known = categorizer.predict(blobs(100, 6).descriptors).novelty
-    strange = categorizer.predict(blobs(100, 6, (UNKNOWN,)).descriptors).novelty
+    unknown = categorizer.predict(blobs(100, 6, (UNKNOWN,)).descriptors).novelty
 
     assert np.mean(known > 1) < 0.15  # 5 % on the held-out views by construction
-    assert np.mean(strange > 1) > 0.8
+    assert np.mean(unknown > 1) > 0.8
 
 
-def test_without_strange_examples_the_unsure_are_novel() -> None:
-    """A model of a data set without `unknown` has no learner to ask."""
+def test_uncertain_views_are_novel_without_unknown_examples() -> None:
+    """A data set without `unknown` gives a model that cannot predict it."""
     model = fit_categorizer(
         blobs(60, 1), blobs(40, 2), descriptor_names=NAMES, blocks=BLOCKS, categories=CATEGORIES,
         settings=SMALL,
@@ -203,8 +202,8 @@ def test_without_strange_examples_the_unsure_are_novel() -> None:
     assert np.all(np.diff(prediction.posteriors.max(axis=1)[order]) <= 1e-6)
 
 
-def test_plain_shape_functions_of_a_known_shape() -> None:
-    """Three blocks of sum 1, the same at any scale; on a line all triangles are flat."""
+def test_shape_functions_are_normalized_and_scale_invariant() -> None:
+    """On a line, all triangles are flat."""
     rng = np.random.default_rng(0)
     line = np.outer(rng.uniform(size=500), [1.0, 2.0, 0.0]).astype(np.float32)
     functions = shape_functions(line, np.random.default_rng(1))
@@ -226,9 +225,9 @@ def test_densities_match_their_formula() -> None:
     features = bank.features(new)
     z, kernels = bank.standardise(new).astype(float), bank.kernels.astype(float)
     for c in range(2):
-        mine = kernels[bank.starts[c] : bank.starts[c + 1]]
+        own = kernels[bank.starts[c] : bank.starts[c + 1]]
         for b, (first, last) in enumerate(bank.spans):
-            squared = ((z[:, None, first:last] - mine[:, first:last]) ** 2).sum(axis=2)
+            squared = ((z[:, None, first:last] - own[:, first:last]) ** 2).sum(axis=2)
             density = np.exp(-squared / (2 * float(bank.bandwidth[b]) ** 2)).mean(axis=1)
             expected = (np.log(density) - bank.level[b]) / bank.spread[b]
             np.testing.assert_allclose(
@@ -236,8 +235,8 @@ def test_densities_match_their_formula() -> None:
             )
 
 
-def test_a_training_view_does_not_testify_for_itself() -> None:
-    """Otherwise densities are far higher in training than they will ever be."""
+def test_density_of_training_view_leaves_out_the_view_itself() -> None:
+    """Otherwise densities would be much higher in training than in use."""
     data = blobs(60, 1)
     bank = densities(data.descriptors, data.labels, kernels=60)
     own, new = (bank.features(x)[:, 8:] for x in (data.descriptors, blobs(60, 2).descriptors))
@@ -245,8 +244,8 @@ def test_a_training_view_does_not_testify_for_itself() -> None:
     assert abs(own.max(axis=1).mean() - new.max(axis=1).mean()) < 0.3
 
 
-def test_constant_components_do_no_harm() -> None:
-    """A bin of a histogram that is always empty has no deviation to divide by."""
+def test_constant_features_become_zero() -> None:
+    """A bin of a histogram that is always empty has no deviation by which to divide."""
     data = blobs(30, 1)
     x = data.descriptors.copy()
     x[:, 2] = 7.0
@@ -258,7 +257,7 @@ def test_constant_components_do_no_harm() -> None:
 
 @settings(deadline=None, max_examples=20)
 @given(st.floats(0.2, 5.0), st.integers(0, 1000))
-def test_temperature_is_found_again(temperature: float, seed: int) -> None:
+def test_temperature_is_recovered(temperature: float, seed: int) -> None:
     rng = np.random.default_rng(seed)
     logits = rng.normal(size=(4000, 5)) * 2
     above = rng.random((4000, 1)) > np.cumsum(softmax(logits), axis=1)
@@ -293,7 +292,7 @@ def test_known_views_are_chosen_evenly() -> None:
     assert np.bincount(codes[chosen]).tolist() == [30, 10]
 
 
-def test_a_category_without_views_is_named() -> None:
+def test_category_without_views_raises() -> None:
     with pytest.raises(ValueError, match="no training views of ball"):
         fit_categorizer(
             blobs(20, 1, ("cup", "can")),
@@ -305,28 +304,28 @@ def test_a_category_without_views_is_named() -> None:
         )
 
 
-def test_a_new_category_is_learned_on_the_fixed_dictionary(categorizer: Categorizer) -> None:
-    """The old learners stay, bit for bit, and the old categories stay recognised."""
+def test_new_category_is_learned_on_fixed_trees(categorizer: Categorizer) -> None:
+    """The old leaf values stay, bit for bit, and the old categories are still recognised."""
     new = blobs(30, 7, ("cone",))
     extended = add_categories(
         categorizer, new.descriptors, new.labels.tolist(), rng=np.random.default_rng(0)
     )
     test = blobs(100, 8, (*CATEGORIES, "cone"))
     prediction = extended.predict(test.descriptors)
-    right = prediction.posteriors.argmax(axis=1) == encode(test.labels, extended.categories)
+    correct = prediction.posteriors.argmax(axis=1) == encode(test.labels, extended.categories)
 
     assert extended.categories == (*CATEGORIES, "cone")
     assert np.array_equal(extended.votes[:, [0, 1, 2, 4]], categorizer.votes)  # unknown stays last
     assert np.array_equal(extended.bias[[0, 1, 2, 4]], categorizer.bias)
     assert np.array_equal(extended.forest.threshold, categorizer.forest.threshold)
-    assert right[test.labels == "cone"].mean() > 0.9
-    assert right[test.labels != "cone"].mean() > 0.9
+    assert correct[test.labels == "cone"].mean() > 0.9
+    assert correct[test.labels != "cone"].mean() > 0.9
     assert np.mean(prediction.novelty[test.labels == "cone"] > 1) < 0.2
-    strange = extended.predict(blobs(100, 6, (UNKNOWN,)).descriptors).novelty
-    assert np.mean(strange > 1) > 0.8
+    unknown = extended.predict(blobs(100, 6, (UNKNOWN,)).descriptors).novelty
+    assert np.mean(unknown > 1) > 0.8
 
 
-def test_adding_twice_is_possible(categorizer: Categorizer) -> None:
+def test_categories_can_be_added_twice(categorizer: Categorizer) -> None:
     """The model must keep the data that the next addition needs."""
     rng = np.random.default_rng(0)
     cone = blobs(20, 7, ("cone",))
@@ -341,8 +340,8 @@ def test_adding_twice_is_possible(categorizer: Categorizer) -> None:
 
 
 @pytest.mark.parametrize("left", [[1, 1, 0], [1, 0], [2, 0, 0], [1, 2, 3, 0, 0]])
-def test_trees_that_would_not_end_are_refused(left: list[int]) -> None:
-    """Or that branch and meet again: their ways double with every level."""
+def test_cyclic_trees_are_rejected(left: list[int]) -> None:
+    """So are branches that meet again, whose paths double with every level."""
     nothing = np.zeros(len(left))
 
     with pytest.raises(ValueError, match="damaged"):
@@ -350,19 +349,19 @@ def test_trees_that_would_not_end_are_refused(left: list[int]) -> None:
 
 
 @pytest.mark.parametrize("rejected", [0.05, 0.2])
-def test_the_novelty_threshold_rejects_the_promised_share(rejected: float) -> None:
-    """Of the views it is chosen on, to the view; of fresh ones of the same kind, about as many."""
+def test_novelty_threshold_rejects_requested_share(rejected: float) -> None:
+    """The share is exact on the calibration views and approximate on new ones."""
     model = calibrate(fit(), blobs(400, 2), rejected=rejected)
-    seen, fresh = (model.predict(blobs(400, seed).descriptors).novelty > 1 for seed in (2, 3))
+    calibrated, fresh = (model.predict(blobs(400, seed).descriptors).novelty > 1 for seed in (2, 3))
 
-    assert np.mean(seen) == pytest.approx(rejected, abs=0.003)
+    assert np.mean(calibrated) == pytest.approx(rejected, abs=0.003)
     assert np.mean(fresh) == pytest.approx(rejected, abs=0.35 * rejected)
 
 
-def test_shapes_of_no_category_have_no_say_in_the_calibration(categorizer: Categorizer) -> None:
-    """They are to be rejected: counted among the known, they would loosen the threshold."""
+def test_unknown_shapes_do_not_affect_calibration(categorizer: Categorizer) -> None:
+    """Counted as known, they would loosen the threshold."""
     known = blobs(60, 2)
-    mixed = blobs(60, 2, (*CATEGORIES, UNKNOWN))  # the same views, and 60 strange ones
+    mixed = blobs(60, 2, (*CATEGORIES, UNKNOWN))  # the same views, and 60 unknown ones
     assert np.array_equal(mixed.descriptors[: len(known.labels)], known.descriptors)
     one, other = (calibrate(categorizer, views, rejected=0.05) for views in (known, mixed))
 
@@ -370,10 +369,10 @@ def test_shapes_of_no_category_have_no_say_in_the_calibration(categorizer: Categ
     assert one.temperature == other.temperature
 
 
-def test_new_categories_are_raised_by_views_that_are_right_and_not_learned_from(
+def test_shift_of_new_categories_uses_correct_held_out_views(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
-    """Views that are wrong already cannot be lost, and views learned from would be too kind."""
+    """Wrong views cannot be lost, and the views of the fit would be too optimistic."""
     count = 200
     rows = np.arange(count, dtype=np.float64)[:, None]
     inputs = _Inputs(rows, sparse.csr_array((count, 1)))
@@ -400,33 +399,33 @@ def test_new_categories_are_raised_by_views_that_are_right_and_not_learned_from(
 
 
 @pytest.mark.parametrize("ridge", [1e-1, 1e-2])
-def test_the_classifier_of_a_new_category_is_the_one_of_scikit_learn(ridge: float) -> None:
-    """Beside one old logit of zero. Too few iterations would leave it halfway."""
+def test_classifier_of_new_category_matches_scikit_learn(ridge: float) -> None:
+    """The logit of the old category is zero. Too few iterations would not converge."""
     rng, count = np.random.default_rng(4), 300
     truth = (np.arange(count) % 5 == 0).astype(np.int64)
     features = rng.normal(truth[:, None] * [1, 0.5, 0.2, 0, -2], [1, 3, 0.1, 10, 1])
-    words = (rng.random((count, 10)) < 0.3).astype(np.float64)
-    start = np.zeros((features.shape[1] + words.shape[1] + 1, 1))
-    inputs = _Inputs(features, sparse.csr_array(words))
+    leaves = (rng.random((count, 10)) < 0.3).astype(np.float64)
+    start = np.zeros((features.shape[1] + leaves.shape[1] + 1, 1))
+    inputs = _Inputs(features, sparse.csr_array(leaves))
     learned = _fit_new(inputs, np.zeros((count, 1)), truth, start, ridge, _STEPS)
 
     exact = LogisticRegression(C=1 / ridge, tol=1e-10, max_iter=10_000).fit(
-        np.hstack([features, words]), truth, sample_weight=0.5 / np.bincount(truth)[truth]
+        np.hstack([features, leaves]), truth, sample_weight=0.5 / np.bincount(truth)[truth]
     )
     weights = [*exact.coef_[0], *exact.intercept_]
     assert np.max(np.abs(weights)) > 1
     assert learned[:, 0] == pytest.approx(weights, abs=0.002)
 
 
-def test_the_constant_multiplies_the_odds_of_new_categories_alone(
+def test_shift_raises_only_odds_of_new_categories(
     categorizer: Categorizer, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """Without it, a category learned from few views is seldom found; the rest must stay."""
+    """Without it, a category that was learned from few views is seldom predicted."""
     new = blobs(30, 7, ("cone", "spoon"))
     x = blobs(50, 8, (*CATEGORIES, "cone", "spoon")).descriptors
     log_odds = []
-    for constant in (0.0, 1.25):
-        monkeypatch.setattr("shapecat.learning.incremental._shift", lambda *_, c=constant: c)
+    for shift in (0.0, 1.25):
+        monkeypatch.setattr("shapecat.learning.incremental._shift", lambda *_, c=shift: c)
         model = add_categories(
             replace(categorizer, temperature=1.6),
             new.descriptors,

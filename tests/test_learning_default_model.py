@@ -1,4 +1,4 @@
-"""The default model, and the simulated views that it is trained on."""
+"""Tests of the default model and of the simulated views that it is trained on."""
 
 from importlib.resources import files
 from pathlib import Path
@@ -34,7 +34,7 @@ from shapecat.types import CATEGORIES, Pose
 
 DATA = Path(__file__).parents[2] / "shared" / "data"
 _NEAR_M = 1.2
-"""Farther away the worst of the ten simulated sensors show too little of a cup."""
+"""Farther away, the worst of the ten simulated sensors show too little of a cup."""
 
 
 @pytest.fixture(scope="module")
@@ -42,22 +42,22 @@ def model() -> Categorizer:
     return load_model()
 
 
-def test_the_shipped_model_fits_this_version(model: Categorizer) -> None:
-    """A changed descriptor without a new model would categorize nonsense."""
+def test_default_model_fits_current_descriptor(model: Categorizer) -> None:
+    """With a changed descriptor, an old model would predict nonsense."""
     model.require_descriptor(DESCRIPTOR_NAMES)
 
     assert model.categories == CATEGORIES
 
 
-def test_the_shipped_model_is_small_and_has_its_card() -> None:
+def test_default_model_is_small_and_has_its_card() -> None:
     folder = files("shapecat.models")
 
     assert len((folder / "default.npz").read_bytes()) <= 5_000_000
     assert load_model().model_id in (folder / "MODEL_CARD.md").read_text("utf-8")
 
 
-def test_the_shipped_card_says_what_the_next_one_will_say(tmp_path: Path) -> None:
-    """A reservation that is only in the file is lost with the next training."""
+def test_model_card_matches_its_template(tmp_path: Path) -> None:
+    """A caveat that is only in the file is lost with the next training."""
     card = (files("shapecat.models") / "MODEL_CARD.md").read_text("utf-8")
     report: Any = SimpleNamespace(categories=CATEGORIES, confusion=np.zeros((7, 7), int).tolist())
     write_card(tmp_path / "card.md", model=load_model().model_id, categories=CATEGORIES,
@@ -70,23 +70,23 @@ def test_the_shipped_card_says_what_the_next_one_will_say(tmp_path: Path) -> Non
         assert "In real clutter it is too high" in " ".join(page.split())
 
 
-def test_the_default_model_is_read_once() -> None:
-    """A batch of short recordings would spend a tenth of its time on parsing it again."""
+def test_default_model_is_loaded_once() -> None:
+    """A batch of short recordings would spend a tenth of its time on loading it again."""
     assert load_model() is load_model()
 
 
-def test_unseen_simulated_objects_are_recognised(model: Categorizer) -> None:
-    """A few tables of a seed that nothing was made with; the card has the real figures."""
+def test_new_simulated_objects_are_recognised(model: Categorizer) -> None:
+    """A few tables of an unused seed; the card has the real figures."""
     kinds = ("pan", "hammer", "shoe", "chair")
-    seen = collect(
+    data = collect(
         view for k in range(6) for view in simulate_world(ArrangementOptions(99, kinds), k)
     )
-    whole = (seen.source != "fragment") & (seen.visible > 0.7) & (seen.manner == "upright")
-    report = evaluate(seen.views.where(whole & (seen.views.distances < _NEAR_M)), model)
+    whole = (data.source != "fragment") & (data.visible > 0.7) & (data.manner == "upright")
+    report = evaluate(data.views.where(whole & (data.views.distances < _NEAR_M)), model)
 
     assert report.n > 30
     assert report.accuracy is not None
-    assert report.accuracy > 0.92  # 0.969 when the sensors became ten
+    assert report.accuracy > 0.92  # 0.969 with ten sensors
 
 
 @pytest.fixture(scope="module")
@@ -97,7 +97,7 @@ def tables() -> tuple[Simulated, Simulated]:
     return one, two
 
 
-def test_worlds_do_not_depend_on_the_number_of_jobs(tables: tuple[Simulated, Simulated]) -> None:
+def test_worlds_are_independent_of_number_of_jobs(tables: tuple[Simulated, Simulated]) -> None:
     """The same seed must give the same model on any machine."""
     alone, shared = tables
     for name in ("manner", "source", "visible", "overlap"):
@@ -106,8 +106,8 @@ def test_worlds_do_not_depend_on_the_number_of_jobs(tables: tuple[Simulated, Sim
         assert np.array_equal(getattr(alone.views, name), getattr(shared.views, name))
 
 
-def test_training_tables_hold_what_they_are_asked_for() -> None:
-    """Shares that do not arrive leave the model as it was."""
+def test_training_tables_follow_their_options() -> None:
+    """An ignored option would leave the model unchanged without notice."""
     world = ArrangementOptions(
         7, ("pan",), unknown=0.0, lying=0.9, leaning=0.5, cameras=1, keep=True
     )
@@ -120,19 +120,17 @@ def test_training_tables_hold_what_they_are_asked_for() -> None:
     assert all(0.5 <= view.overlap <= 1 for view in views)
 
 
-def test_two_trainings_give_the_same_file(
-    tables: tuple[Simulated, Simulated], tmp_path: Path
-) -> None:
-    """A model that cannot be made again, bit for bit, cannot be trusted."""
-    for jobs, seen in enumerate(tables, start=1):
-        model = fit_views(seen.views, seen.views, seed=3, rounds=4, jobs=jobs)
+def test_training_is_reproducible(tables: tuple[Simulated, Simulated], tmp_path: Path) -> None:
+    """A model that cannot be reproduced bit for bit cannot be trusted."""
+    for jobs, simulated in enumerate(tables, start=1):
+        model = fit_views(simulated.views, simulated.views, seed=3, rounds=4, jobs=jobs)
         save_model(tmp_path / f"{jobs}.npz", model)
 
     assert (tmp_path / "1.npz").read_bytes() == (tmp_path / "2.npz").read_bytes()
 
 
 @pytest.mark.parametrize("number", range(4))
-def test_distractors_of_training_are_of_the_given_kinds(
+def test_training_uses_only_given_kinds_of_distractors(
     number: int, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """The kinds of the test set must be new to the model in every scene."""
@@ -152,17 +150,17 @@ def test_distractors_of_training_are_of_the_given_kinds(
     assert set(made) == {"pan", "hammer"}
 
 
-def test_thin_background_is_a_view_of_no_category() -> None:
-    """A model that never saw it takes it for plates; what is higher has the shape of a category."""
+def test_thin_background_gives_unknown_views() -> None:
+    """Otherwise a model takes it for plates. Higher background may have the shape of a category."""
     sizes = ((0.08, 0.06, 0.12), (0.1, 0.09, 0.022), (0.07, 0.06, 0.1))
     box, board, block = (rounded_box(size) for size in sizes)
     here, there = (Pose(np.eye(3), np.array([x, 0.05, 0.0])) for x in (-0.15, 0.15))
     around = (ALONE, moved(board, here), moved(block, there))
-    seen = Arrangement([Actor(box, "box", "upright", 0.0)], around, (30, 50))
+    scene = Arrangement([Actor(box, "box", "upright", 0.0)], around, (30, 50))
 
     views, objects = (
-        look(seen, "a", cameras=4, rng=np.random.default_rng(2), background=with_it, keep=True)
-        for with_it in (True, False)
+        look(scene, "a", cameras=4, rng=np.random.default_rng(2), background=wanted, keep=True)
+        for wanted in (True, False)
     )
     found = [view for view in views if view.source == "background"]
     assert found
@@ -181,25 +179,25 @@ def half_ball() -> View:
     return View(points, np.array([1.0, 0.0, 0.6]), "ball", "b")
 
 
-def test_fragments_are_true_pieces() -> None:
-    """30 to 85 % of the points, not floating above the support."""
+def test_fragments_are_parts_of_their_view() -> None:
+    """They have 30 to 85 % of its points and do not float above the support."""
     view = half_ball()
     for seed in range(20):
-        piece = cut_fragment(view, np.random.default_rng(seed))
-        assert piece is not None
-        assert 0.3 <= len(piece.points) / len(view.points) <= 0.85
-        assert piece.points[:, 2].min() < 0.03
-        assert np.all(np.isin(piece.points[:, 0], view.points[:, 0]))
+        fragment = cut_fragment(view, np.random.default_rng(seed))
+        assert fragment is not None
+        assert 0.3 <= len(fragment.points) / len(view.points) <= 0.85
+        assert fragment.points[:, 2].min() < 0.03
+        assert np.all(np.isin(fragment.points[:, 0], view.points[:, 0]))
 
 
-def test_a_view_too_small_has_no_fragment() -> None:
+def test_small_view_has_no_fragment() -> None:
     view = half_ball()
     few = View(view.points[:50], view.eye, "ball", "b")
 
     assert cut_fragment(few, np.random.default_rng(0)) is None
 
 
-def test_the_halo_is_cut_from_below_only() -> None:
+def test_halo_is_cut_only_from_below() -> None:
     view = half_ball()
     cut = cut_halo(view, np.random.default_rng(0))
 
@@ -209,7 +207,7 @@ def test_the_halo_is_cut_from_below_only() -> None:
 
 @pytest.mark.skipif(not (DATA / "osd_learn").exists(), reason="no shared data")
 def test_real_objects_are_recognised(model: Categorizer) -> None:
-    """Kinect and RealSense readings, which nothing was learned from or chosen by."""
+    """Neither training nor the choice of parameters used these Kinect and RealSense images."""
     from shapecat.models.recorded import detected_views, labelled_views  # noqa: PLC0415
 
     by_hand = describe_views(labelled_views(DATA / "osd_learn"), settings=Settings())

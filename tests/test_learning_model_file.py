@@ -1,4 +1,4 @@
-"""Model files are untrusted: they must not run code, crash, hang or fill the memory."""
+"""Tests of model files, which are untrusted: they must not run code, crash or hang."""
 
 import io
 import json
@@ -17,7 +17,7 @@ from shapecat.learning.forest import FlatForest
 
 
 def tiny() -> Categorizer:
-    """Return a model of two trees over three components, written by hand."""
+    """Return a small model of two trees and three features."""
     forest = FlatForest(
         np.array([0, 3]),
         np.array([1, 0, 0, 2, 0, 0]),
@@ -74,7 +74,7 @@ def npy(value: object, dtype: str) -> bytes:
     return stream.getvalue()
 
 
-def test_a_saved_model_comes_back_whole(saved: Path) -> None:
+def test_saved_model_is_loaded_unchanged(saved: Path) -> None:
     before, after = tiny(), load_model(saved)
 
     for name, value in parts_of(before).items():
@@ -84,21 +84,21 @@ def test_a_saved_model_comes_back_whole(saved: Path) -> None:
     assert np.array_equal(after.predict(x).posteriors, before.predict(x).posteriors)
 
 
-def test_the_same_model_gives_the_same_bytes(saved: Path, tmp_path: Path) -> None:
+def test_model_file_is_reproducible(saved: Path, tmp_path: Path) -> None:
     """Otherwise `make model` would change the repository each time."""
-    again = tmp_path / "again.npz"
-    save_model(again, load_model(saved))
+    second = tmp_path / "again.npz"
+    save_model(second, load_model(saved))
 
-    assert again.read_bytes() == saved.read_bytes()
+    assert second.read_bytes() == saved.read_bytes()
 
 
-def test_the_id_follows_the_content(saved: Path) -> None:
-    def warmer(members: dict[str, bytes]) -> None:
+def test_model_id_depends_on_content(saved: Path) -> None:
+    def raise_temperature(members: dict[str, bytes]) -> None:
         header = json.loads(members["header.json"])
         header["temperature"] = 0.8
         members["header.json"] = json.dumps(header).encode()
 
-    rewrite(saved, warmer)
+    rewrite(saved, raise_temperature)
 
     assert load_model(saved).model_id != tiny().model_id
 
@@ -111,7 +111,9 @@ def test_the_id_follows_the_content(saved: Path) -> None:
         (b"PK\x03\x04" + bytes(60), "not an intact"),
     ],
 )
-def test_other_files_are_named_as_such(tmp_path: Path, content: bytes, reason: str) -> None:
+def test_other_files_raise_with_path_and_reason(
+    tmp_path: Path, content: bytes, reason: str
+) -> None:
     path = tmp_path / "x.npz"
     path.write_bytes(content)
 
@@ -121,12 +123,12 @@ def test_other_files_are_named_as_such(tmp_path: Path, content: bytes, reason: s
     assert "\n" not in str(caught.value)
 
 
-def test_a_missing_file_is_one_line(tmp_path: Path) -> None:
+def test_missing_file_raises_model_error(tmp_path: Path) -> None:
     with pytest.raises(ModelError, match="cannot read the model: No such file"):
         load_model(tmp_path / "absent.npz")
 
 
-def test_another_npz_is_not_a_model(tmp_path: Path) -> None:
+def test_other_npz_file_is_rejected(tmp_path: Path) -> None:
     np.savez(tmp_path / "x.npz", points=np.zeros(3))
 
     with pytest.raises(ModelError, match=r"no header\.json"):
@@ -178,8 +180,8 @@ _HOSTILE = {
 
 
 @pytest.mark.parametrize("case", _HOSTILE)
-def test_hostile_models_are_refused(saved: Path, case: str) -> None:
-    """An index that is not checked here is a crash or an endless loop in the compiled walk."""
+def test_hostile_models_are_rejected(saved: Path, case: str) -> None:
+    """With an unchecked index, the compiled trees would crash or never end."""
     change, reason = _HOSTILE[case]
     rewrite(saved, change)
 
@@ -188,8 +190,8 @@ def test_hostile_models_are_refused(saved: Path, case: str) -> None:
     assert "\n" not in str(caught.value)
 
 
-def test_a_claimed_size_is_not_believed(saved: Path) -> None:
-    """A header of 100 bytes must not make the reader allocate a terabyte."""
+def test_claimed_array_size_is_not_allocated(saved: Path) -> None:
+    """A header of 100 bytes must not make the reader allocate gigabytes."""
     real = npy(np.zeros((4, 2)), "f2")
     rewrite(
         saved,
@@ -200,8 +202,8 @@ def test_a_claimed_size_is_not_believed(saved: Path) -> None:
         load_model(saved)
 
 
-def test_a_bomb_is_not_unpacked(saved: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    """The limit itself would take a second to pack."""
+def test_zip_bomb_is_not_unpacked(saved: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """The limit is lowered, as packing more than it would take a second."""
     assert model_file._LARGEST_PART == 128 << 20
     monkeypatch.setattr(model_file, "_LARGEST_PART", 8 << 20)
     content = bytes(9 << 20)
@@ -212,8 +214,8 @@ def test_a_bomb_is_not_unpacked(saved: Path, monkeypatch: pytest.MonkeyPatch) ->
         load_model(saved)
 
 
-def test_damage_anywhere_is_an_error_or_harmless(saved: Path) -> None:
-    """Flip bytes all over the file: a model error, or a model that still predicts."""
+def test_damaged_file_raises_or_still_predicts(saved: Path) -> None:
+    """Bytes are changed all over the file."""
     content = saved.read_bytes()
     rng = np.random.default_rng(0)
     x = np.zeros((1, 3), np.float32)
@@ -237,13 +239,13 @@ def test_pickles_are_never_loaded(saved: Path) -> None:
         load_model(saved)
 
 
-def test_a_descriptor_of_another_version_is_refused() -> None:
+def test_descriptor_of_other_version_is_rejected() -> None:
     with pytest.raises(ModelError, match="another descriptor"):
         tiny().require_descriptor(("a", "b", "d"))
     tiny().require_descriptor(("a", "b", "c"))
 
 
-def test_a_folder_that_cannot_be_written_is_one_line(tmp_path: Path) -> None:
+def test_unwritable_folder_raises_model_error(tmp_path: Path) -> None:
     (tmp_path / "file").write_text("")
 
     with pytest.raises(ModelError, match="cannot write the model"):

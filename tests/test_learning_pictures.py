@@ -1,4 +1,4 @@
-"""The worst mistakes on the model card: the most confident first, one for each object."""
+"""Tests of the pictures of the worst mistakes on the model card."""
 
 from pathlib import Path
 
@@ -32,10 +32,10 @@ def seen(label: str, instance: str, cup: float, novelty: float) -> WorldView:
     )  # fmt: skip
 
 
-def test_the_surest_mistakes_come_first_and_objects_once(tmp_path: Path) -> None:
+def test_worst_mistakes_are_most_confident_and_one_per_object(tmp_path: Path) -> None:
     views = [
         seen("box", "a", 0.7, 0.2),  # taken for a cup
-        seen("box", "a", 0.9, 0.2),  # the same, surer
+        seen("box", "a", 0.9, 0.2),  # the same object, more confident
         seen("cup", "b", 0.9, 1.96),  # called unknown
         seen("cup", "c", 0.9, 0.1),  # right
         seen("unknown", "d", 0.5, 1.5),  # right
@@ -50,7 +50,7 @@ def test_the_surest_mistakes_come_first_and_objects_once(tmp_path: Path) -> None
         assert np.asarray(picture.convert("L")).std() > 5
 
 
-def test_the_number_of_mistakes_is_bounded() -> None:
+def test_number_of_mistakes_is_limited() -> None:
     views = [seen("box", str(k), 0.9, 0.0) for k in range(9)]
     model: Categorizer = Oracle()  # type: ignore[assignment]
 

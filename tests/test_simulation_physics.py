@@ -1,4 +1,4 @@
-"""Scenes by physics: hollow objects stay hollow, and the truth names the supports."""
+"""Tests of scenes with physics: convex parts, settled objects and their supports."""
 
 import json
 from functools import cache
@@ -21,13 +21,13 @@ from shapecat.simulation.worlds import World
 from shapecat.types import Pose
 
 SETTLED: tuple[SceneKind, ...] = ("pile", "bin", "shelf_bin", "room")
-QUARTER = rotation_from_quaternion([0, 0, np.sin(0.3), np.cos(0.3)])
-"""A turn about the vertical that is no symmetry of a box."""
+YAWED = rotation_from_quaternion([0, 0, np.sin(0.3), np.cos(0.3)])
+"""A rotation about the vertical that is no symmetry of a box."""
 
 
 @cache
 def settled(kind: SceneKind, seed: int) -> World:
-    """Make a scene of two frames once for all tests that use it."""
+    """Return a scene of two frames, which all tests share."""
     return make_scene(kind, np.random.default_rng(seed), frames=2)
 
 
@@ -38,8 +38,8 @@ def table(height: float = 0.7) -> Mesh:
 
 
 @pytest.mark.parametrize("category", ["cup", "bowl", "plate"])
-def test_open_shapes_are_cut_into_parts_and_closed_ones_are_not(category: str) -> None:
-    """As its convex hull a cup would be solid, and nothing could lie in it."""
+def test_only_open_shapes_are_divided_into_convex_parts(category: str) -> None:
+    """The convex hull of a cup is solid, and nothing could lie in it."""
     for seed in range(3):
         rng = np.random.default_rng(seed)
         assert hollowness(make_object(category, rng)) > 0.25
@@ -48,7 +48,7 @@ def test_open_shapes_are_cut_into_parts_and_closed_ones_are_not(category: str) -
             assert len(convex_parts(make_object(closed, rng))) == 1
 
 
-def test_parts_cover_the_surface_and_leave_the_inside_open() -> None:
+def test_convex_parts_cover_surface_and_leave_inside_open() -> None:
     """Objects would fall through a hole in a wall, or rest on a filled corner."""
     cup = lathe([[0, 0], [0.05, 0], [0.05, 0.12], [0.046, 0.12], [0.046, 0.005], [0, 0.005]])
     hulls = [ConvexHull(part).equations for part in convex_parts(cup)]
@@ -64,31 +64,31 @@ def test_parts_cover_the_surface_and_leave_the_inside_open() -> None:
     assert depth(inside).max() < -0.005
 
 
-def test_ball_that_is_dropped_into_a_cup_lies_in_it() -> None:
+def test_ball_dropped_into_cup_lies_in_it() -> None:
     """The cup supports it, not the table."""
     cup = lathe([[0, 0], [0.05, 0], [0.05, 0.1], [0.046, 0.1], [0.046, 0.005], [0, 0.005]])
     ball = make_ball(np.random.default_rng(1))
     ball = Mesh(ball.vertices * (0.05 / ball.extents.max()), ball.triangles)
     place = np.array([0.11, -0.07])
-    first, second = settle([table()], [Drop(cup, QUARTER, place), Drop(ball, np.eye(3), place)])
+    first, second = settle([table()], [Drop(cup, YAWED, place), Drop(ball, np.eye(3), place)])
     middle = transform(second.pose, ball.vertices).mean(axis=0)
     assert (first.bearer, second.bearer) == (None, 0)
     assert np.hypot(*(middle[:2] - place)) < 0.03
     assert 0.7 < transform(second.pose, ball.vertices)[:, 2].min() < 0.72
 
 
-def test_box_on_a_box_is_borne_by_it() -> None:
+def test_box_dropped_on_box_is_supported_by_it() -> None:
     """Benchmarks of support relations rely on this."""
     low, high = rounded_box([0.12, 0.09, 0.07]), rounded_box([0.05, 0.06, 0.04])
     place = np.array([-0.2, 0.13])
-    first, second = settle([table()], [Drop(low, QUARTER, place), Drop(high, QUARTER, place)])
+    first, second = settle([table()], [Drop(low, YAWED, place), Drop(high, YAWED, place)])
     assert (first.bearer, second.bearer) == (None, 0)
     np.testing.assert_allclose(first.pose.translation, [-0.2, 0.13, 0.7], atol=2e-3)
     np.testing.assert_allclose(second.pose.translation, [-0.2, 0.13, 0.77], atol=3e-3)
-    np.testing.assert_allclose(second.pose.rotation, QUARTER, atol=0.02)
+    np.testing.assert_allclose(second.pose.rotation, YAWED, atol=0.02)
 
 
-def test_what_misses_the_table_falls() -> None:
+def test_object_beside_table_falls() -> None:
     box = make_box(np.random.default_rng(2))
     (rest,) = settle([table()], [Drop(box, np.eye(3), np.array([0.9, 0.0]))])
     assert transform(rest.pose, box.vertices)[:, 2].max() < 0.5
@@ -98,7 +98,7 @@ def test_what_misses_the_table_falls() -> None:
     "kind",
     ["pile", *(pytest.param(k, marks=pytest.mark.many) for k in ("bin", "shelf_bin", "room"))],
 )
-def test_settled_scenes_are_the_same_again(kind: SceneKind) -> None:
+def test_settled_scenes_are_reproducible(kind: SceneKind) -> None:
     """Training and evaluation identify scenes by their seeds."""
     one, other = settled(kind, 1), make_scene(kind, np.random.default_rng(1), frames=2)
     assert len(one.things) == len(other.things) > 2
@@ -111,7 +111,9 @@ def test_settled_scenes_are_the_same_again(kind: SceneKind) -> None:
 @pytest.mark.parametrize(
     "seed", [1, *(pytest.param(seed, marks=pytest.mark.many) for seed in (2, 3))]
 )
-def test_things_lie_on_their_support_and_not_in_each_other(kind: SceneKind, seed: int) -> None:
+def test_settled_objects_lie_on_support_without_interpenetration(
+    kind: SceneKind, seed: int
+) -> None:
     world = settled(kind, seed)
     solids = [
         (transform(thing.pose, thing.mesh.vertices), [moved_part(p, thing.pose) for p in parts])
@@ -139,8 +141,8 @@ def world_support(kind: str) -> str:
     return {"pile": "table", "bin": "bin", "shelf_bin": "board_1", "room": "table"}[kind]
 
 
-def test_tilted_things_are_told_from_straight_ones() -> None:
-    """The category accuracy of tilted objects is reported separately."""
+def test_tilted_objects_are_marked() -> None:
+    """Their category accuracy is reported separately."""
     tilted = straight = 0
     for seed in (1, 4):
         for thing in settled("pile", seed).things:
@@ -152,21 +154,21 @@ def test_tilted_things_are_told_from_straight_ones() -> None:
     assert straight > 5
 
 
-def test_truth_of_a_pile_is_written(tmp_path: Path) -> None:
-    """It is JSON, and its relations refer to listed tracks."""
+def test_truth_of_pile_has_support_relations(tmp_path: Path) -> None:
+    """They refer to listed tracks."""
     path = record(settled("pile", 4), tmp_path / "pile.mcap", seed=4, sensor=KINECT)
     first, _ = json.loads(path.with_suffix(".truth.json").read_text("utf-8"))
-    things = {o["track"]: o for o in [*first["objects"], *first["hidden"]]}
-    assert len(things) > 3
-    for thing in things.values():
-        assert (thing["on_support"] is None) != (thing["on_track"] is None)
-        assert thing["on_track"] is None or thing["on_track"] in things
-        assert isinstance(thing["tilted"], bool)
+    objects = {o["track"]: o for o in [*first["objects"], *first["hidden"]]}
+    assert len(objects) > 3
+    for entry in objects.values():
+        assert (entry["on_support"] is None) != (entry["on_track"] is None)
+        assert entry["on_track"] is None or entry["on_track"] in objects
+        assert isinstance(entry["tilted"], bool)
 
 
 @pytest.mark.parametrize("kind", SETTLED)
-def test_the_camera_sees_what_was_dropped(kind: SceneKind) -> None:
+def test_most_dropped_objects_are_visible(kind: SceneKind) -> None:
     world = settled(kind, 1)
     _, labels = render_frame(world, 1, rng=np.random.default_rng(0))
-    seen = set(np.unique(labels).tolist())
-    assert sum(thing.label in seen for thing in world.things) > 0.5 * len(world.things)
+    visible = set(np.unique(labels).tolist())
+    assert sum(thing.label in visible for thing in world.things) > 0.5 * len(world.things)

@@ -1,4 +1,4 @@
-"""Rooms: background is labelled as such, and the benchmark counts detections on it."""
+"""Tests of rooms, and of the benchmark that counts detections on their background."""
 
 import numpy as np
 import pytest
@@ -9,10 +9,10 @@ from shapecat.simulation.distractors import make_distractor
 from shapecat.simulation.procedural import PROCEDURAL
 from shapecat.simulation.worlds import FIRST_THING_LABEL
 
-THING = FIRST_THING_LABEL
+FIRST = FIRST_THING_LABEL
 
 
-def test_rooms_hold_objects_and_much_else() -> None:
+def test_rooms_contain_objects_and_background() -> None:
     """Otherwise the benchmark counts nothing."""
     rooms = [make_scene("room", np.random.default_rng(seed), frames=1) for seed in range(4)]
     assert sum(any(s.name.startswith("robot") for s in room.supports) for room in rooms) > 2
@@ -23,8 +23,8 @@ def test_rooms_hold_objects_and_much_else() -> None:
         assert all(1 <= s.label <= 9 for s in room.supports)
 
 
-def test_detections_on_no_object_and_pieces_are_surplus() -> None:
-    labels = np.repeat([2, 6, THING, THING + 1], 1000)
+def test_detections_on_background_and_fragments_are_counted() -> None:
+    labels = np.repeat([2, 6, FIRST, FIRST + 1], 1000)
     arm, most, rest = np.arange(1200, 1700), np.arange(2000, 2800), np.arange(2800, 3000)
     blend = np.concatenate([np.arange(3000, 3400), np.arange(0, 700)])  # mostly table
     counts = count([arm, most, rest, blend], labels)
@@ -35,8 +35,8 @@ def test_detections_on_no_object_and_pieces_are_surplus() -> None:
 
 
 @pytest.mark.parametrize("kind", PROCEDURAL)
-def test_families_make_things_of_the_size_of_a_hand(kind: str) -> None:
-    """Objects that train *unknown* must fit on a table, and no two may be alike."""
+def test_procedural_families_give_distinct_objects_of_table_size(kind: str) -> None:
+    """They train *unknown*, so they must fit on a table, and no two may be equal."""
     found = [make_distractor(np.random.default_rng(seed), kind)[1] for seed in range(30)]
     for mesh in found:
         assert 0.02 < mesh.extents.max() < 0.6

@@ -1,4 +1,4 @@
-"""Simulated shapes: limits of the categories, watertight meshes, sizes, resting poses."""
+"""Tests of simulated shapes: limits of the categories, meshes, sizes and resting poses."""
 
 import numpy as np
 import pytest
@@ -21,12 +21,12 @@ HERE = Pose(np.eye(3), np.zeros(3))
 MANY = 40
 
 
-def made(category: str) -> list[Mesh]:
+def meshes_of(category: str) -> list[Mesh]:
     return [make_object(category, np.random.default_rng((3, seed))) for seed in range(MANY)]
 
 
 def width_at(mesh: Mesh, low: float, high: float) -> float:
-    """Return the greatest width between two heights, given as shares of the whole."""
+    """Return the greatest width between two heights, given as fractions of the total."""
     z = mesh.vertices[:, 2] / mesh.extents[2]
     flat = mesh.vertices[(z >= low) & (z <= high), :2]
     angle = np.arange(24) * (np.pi / 24)
@@ -34,7 +34,7 @@ def width_at(mesh: Mesh, low: float, high: float) -> float:
 
 
 def openness(mesh: Mesh) -> tuple[float, float]:
-    """Return depth and diameter of an open thing: seen from above, and measured at its rim."""
+    """Return the depth of an open object, rendered from above, and the diameter of its rim."""
     top = float(mesh.vertices[:, 2].max())
     rim = mesh.vertices[mesh.vertices[:, 2] > top - 0.01 * mesh.extents[2] - 1e-4, :2]
     far = 20.0
@@ -47,8 +47,8 @@ def openness(mesh: Mesh) -> tuple[float, float]:
 
 
 @pytest.mark.parametrize("category", CATEGORIES)
-def test_things_are_of_human_size_and_stand_on_the_ground(category: str) -> None:
-    for mesh in made(category):
+def test_objects_have_household_size_and_stand_on_ground(category: str) -> None:
+    for mesh in meshes_of(category):
         assert abs(float(mesh.vertices[:, 2].min())) < 1e-6
         assert mesh.extents.min() > 0.005
         assert mesh.extents.max() < 0.4
@@ -59,43 +59,43 @@ def test_things_are_of_human_size_and_stand_on_the_ground(category: str) -> None
 @pytest.mark.parametrize(
     ("category", "least", "most"), [("cup", 0.65, 2.6), ("bowl", 0.2, 0.65), ("plate", 0.02, 0.2)]
 )
-def test_open_categories_keep_to_their_depth(category: str, least: float, most: float) -> None:
-    """A generator that blurs the definitional borders teaches the model to guess."""
+def test_open_categories_stay_within_depth_limits(category: str, least: float, most: float) -> None:
+    """A generator that blurs the limits of categories teaches the model to guess."""
     ratios = []
-    for mesh in made(category):
+    for mesh in meshes_of(category):
         depth, diameter = openness(mesh)
         ratios.append(depth / diameter)
 
     assert min(ratios) > least
     assert max(ratios) < most
-    assert max(ratios) > 1.3 * min(ratios)  # and they differ among themselves
+    assert max(ratios) > 1.3 * min(ratios)  # they vary
 
 
-def test_bottles_are_clearly_narrower_at_the_top() -> None:
-    shares = [width_at(mesh, 0.93, 1.0) / width_at(mesh, 0.0, 1.0) for mesh in made("bottle")]
+def test_bottles_are_narrower_at_the_top() -> None:
+    shares = [width_at(mesh, 0.93, 1.0) / width_at(mesh, 0.0, 1.0) for mesh in meshes_of("bottle")]
 
-    # Pumps and triggers have a beak at the top; by far most are plain.
+    # Pumps and triggers are wide at the top, but most bottles have none.
     assert np.mean(np.array(shares) < 0.72) > 0.85
 
 
-def test_cans_are_not() -> None:
-    assert min(width_at(m, 0.93, 1.0) / width_at(m, 0.0, 1.0) for m in made("can")) > 0.75
+def test_cans_are_not_narrower_at_the_top() -> None:
+    assert min(width_at(m, 0.93, 1.0) / width_at(m, 0.0, 1.0) for m in meshes_of("can")) > 0.75
 
 
 def test_balls_are_round() -> None:
-    for mesh in made("ball"):
+    for mesh in meshes_of("ball"):
         assert mesh.extents.min() / mesh.extents.max() > 0.9
 
 
 @pytest.mark.parametrize("category", CATEGORIES)
-def test_no_two_things_are_alike(category: str) -> None:
-    extents = np.array([np.sort(mesh.extents) for mesh in made(category)])
+def test_objects_of_a_category_differ(category: str) -> None:
+    extents = np.array([np.sort(mesh.extents) for mesh in meshes_of(category)])
 
     assert len(np.unique(np.round(extents, 4), axis=0)) == MANY
     assert extents[:, 2].max() > 1.8 * extents[:, 2].min()
 
 
-def test_an_unknown_category_is_named() -> None:
+def test_unknown_category_raises() -> None:
     with pytest.raises(ValueError, match="spoon"):
         make_object("spoon", np.random.default_rng(0))
     with pytest.raises(ValueError, match="spoon"):
@@ -103,7 +103,7 @@ def test_an_unknown_category_is_named() -> None:
 
 
 @pytest.mark.parametrize("kind", DISTRACTORS)
-def test_every_distractor_can_be_made(kind: str) -> None:
+def test_every_distractor_is_generated(kind: str) -> None:
     name, mesh = make_distractor(np.random.default_rng(1), kind)
 
     assert name == kind
@@ -115,14 +115,14 @@ def test_there_are_many_kinds_of_distractors() -> None:
     assert len(DISTRACTORS) >= 24
 
 
-def test_box_is_as_large_as_asked() -> None:
+def test_rounded_box_has_requested_size() -> None:
     """Rounding the edges must not shrink the faces."""
     mesh = rounded_box([0.1, 0.2, 0.05], radius=0.006)
 
     np.testing.assert_allclose(mesh.extents, [0.1, 0.2, 0.05], atol=2e-6)
 
 
-def test_ring_has_no_seam() -> None:
+def test_closed_tube_has_surface_area_of_torus() -> None:
     angle = np.arange(24) * (2 * np.pi / 24)
     path = np.stack([np.cos(angle), np.sin(angle), 0 * angle], -1)
     mesh = tube(path, 0.2, closed=True)
@@ -132,7 +132,7 @@ def test_ring_has_no_seam() -> None:
     assert np.linalg.norm(normal, axis=1).sum() / 2 == pytest.approx(4 * np.pi**2 * 0.2, rel=0.05)
 
 
-def test_standing_cylinder_rests_on_its_ends_and_side() -> None:
+def test_cylinder_rests_on_its_ends_and_side() -> None:
     found = rests(lathe([[0, 0], [0.03, 0], [0.03, 0.1], [0, 0.1]], segments=24))
 
     assert [rest.manner for rest in found].count("upright") == 1
@@ -142,7 +142,7 @@ def test_standing_cylinder_rests_on_its_ends_and_side() -> None:
 
 @settings(max_examples=15, deadline=None)
 @given(st.sampled_from(["cup", "can", "box", "bottle"]), st.integers(0, 999), st.floats(0, 6.28))
-def test_what_lies_touches_the_ground_and_does_not_roll(
+def test_lying_object_touches_ground_and_does_not_roll(
     category: str, seed: int, angle: float
 ) -> None:
     rng = np.random.default_rng(seed)
@@ -162,7 +162,7 @@ def test_what_lies_touches_the_ground_and_does_not_roll(
 
 @given(st.floats(-0.3, 0.3), st.floats(-0.3, 0.3))
 @settings(deadline=None)
-def test_footprints_overlap_as_rectangles_do(x: float, y: float) -> None:
+def test_overlap_of_square_footprints_is_exact(x: float, y: float) -> None:
     square: F8 = np.array([[0, 0], [0.1, 0], [0.1, 0.1], [0, 0.1]], np.float64)
     apart = max(abs(x), abs(y)) >= 0.1
 
