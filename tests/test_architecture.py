@@ -1,4 +1,4 @@
-"""The architecture is enforced: layers, cost of imports, forbidden constructs."""
+"""Tests that enforce the architecture: layers, cost of imports, forbidden constructs."""
 
 import ast
 import graphlib
@@ -38,7 +38,7 @@ FLOOR = {
     "pipeline": 5,
     "batch": 6,
     "api": 7,
-    "__init__": 7,  # names the door from Python, and loads it when it is used
+    "__init__": 7,  # loads the Python interface when it is used
     "cli": 7,
     "__main__": 7,
 }
@@ -108,13 +108,13 @@ def imported_modules(path: Path, modules: set[str]) -> set[str]:
     return found & modules - {module_of(path)}
 
 
-def test_no_module_imports_itself_by_a_detour() -> None:
+def test_imports_have_no_cycles() -> None:
     """Two files that import each other cannot be read, tested or moved alone."""
     modules = {module_of(path): path for path in FILES}
     graph = {name: imported_modules(path, set(modules)) for name, path in modules.items()}
-    graph["shapecat"] = set()  # the door from Python, which loads its names when they are used
+    graph["shapecat"] = set()  # the Python interface, which loads its names when they are used
 
-    graphlib.TopologicalSorter(graph).prepare()  # CycleError tells the way around
+    graphlib.TopologicalSorter(graph).prepare()  # CycleError lists the cycle
 
 
 def is_forbidden(node: ast.AST) -> bool:
@@ -148,13 +148,13 @@ def test_only_documented_parts_of_numba_are_used() -> None:
 
 
 def test_help_loads_no_heavy_library() -> None:
-    """A command that takes a second to explain itself makes people avoid it."""
+    """People avoid commands whose help takes a second to appear."""
     heavy = {"numba", "rerun", "open3d", "sklearn", "scipy", "pyarrow", "numpy", "rich"}
 
     assert loaded_by("import shapecat.cli.main", heavy) == set()
 
 
-def test_processing_loads_no_library_too_soon() -> None:
+def test_processing_loads_no_library_too_early() -> None:
     """Before the first frame, processing must load neither slow libraries nor display libraries.
 
     SciPy's images, data frames and Protocol Buffers take longer to load than all of ours. Open3D
@@ -173,7 +173,7 @@ def test_processing_loads_no_library_too_soon() -> None:
     assert loaded_by(code, never) == set()
 
 
-def test_commands_do_without_pandas() -> None:
+def test_commands_do_not_load_pandas() -> None:
     """Arrow would load pandas with its first array, which takes half a second."""
     code = (
         "import types, pyarrow, shapecat.__main__ as entry;"
@@ -184,8 +184,8 @@ def test_commands_do_without_pandas() -> None:
     assert loaded_by(code, {"pandas"}) == set()
 
 
-def test_root_of_the_package_holds_what_everybody_uses() -> None:
-    """A file of a single subpackage must not be in the root, which hides its owner."""
+def test_root_of_package_has_few_files() -> None:
+    """A file that only one subpackage uses must not be in the root, which hides its owner."""
     assert len(list((ROOT / "shapecat").glob("*.py"))) <= 12
 
 
@@ -193,18 +193,18 @@ def test_architecture_page_is_short() -> None:
     assert (ROOT / "ARCHITECTURE.md").read_text("utf-8").count("\n") <= 150
 
 
-def test_the_picture_is_drawn_from_the_code_as_it_is() -> None:
+def test_architecture_picture_is_up_to_date() -> None:
     """`make picture` redraws it."""
     from tests.picture import PICTURE, draw  # noqa: PLC0415  it imports this file
 
     assert PICTURE.read_text("utf-8") == draw()
 
 
-def test_a_library_that_is_loaded_is_seen() -> None:
+def test_loaded_libraries_are_detected() -> None:
     assert loaded_by("import json.decoder", {"json", "numpy"}) == {"json"}
 
 
-def test_an_inlined_kernel_has_one_caller_of_the_same_arithmetic() -> None:
+def test_inlined_kernel_has_one_caller_with_same_arithmetic() -> None:
     """A second caller would compile it again; other fast-math flags give other numbers."""
     flags, calls = kernels()
     inlined = {name: own for name, own in flags.items() if own.get("inline")}
@@ -213,7 +213,7 @@ def test_an_inlined_kernel_has_one_caller_of_the_same_arithmetic() -> None:
         assert calls[name] == [(True, own.get("fast", False))], name
 
 
-def test_an_inner_kernel_is_called_by_kernels_alone() -> None:
+def test_inner_kernel_is_called_only_by_kernels() -> None:
     """Python would silently run it uncompiled, a hundred times slower."""
     flags, calls = kernels()
     inner = [name for name, own in flags.items() if own.get("inner")]
@@ -243,12 +243,12 @@ def kernels() -> tuple[
             if isinstance(node, ast.ImportFrom)
             for alias in node.names
         }
-        for part in tree.body:
-            name = getattr(part, "name", "")
-            own = _kernel_flags(part)
+        for statement in tree.body:
+            name = getattr(statement, "name", "")
+            own = _kernel_flags(statement)
             if own is not None:
                 flags[module, name] = own
-            for node in ast.walk(part):
+            for node in ast.walk(statement):
                 if isinstance(node, ast.Name) and node.id != name:
                     used = origins.get(node.id, module), node.id
                 elif isinstance(node, ast.Attribute) and isinstance(node.value, ast.Name):
@@ -260,11 +260,13 @@ def kernels() -> tuple[
     return flags, calls
 
 
-def _kernel_flags(part: ast.stmt) -> dict[str, bool] | None:
+def _kernel_flags(statement: ast.stmt) -> dict[str, bool] | None:
     """Return the arguments of ``@kernel``; None without it."""
-    for decorator in part.decorator_list if isinstance(part, ast.FunctionDef) else ():
-        words = decorator.keywords if isinstance(decorator, ast.Call) else []
+    for decorator in statement.decorator_list if isinstance(statement, ast.FunctionDef) else ():
+        arguments = decorator.keywords if isinstance(decorator, ast.Call) else []
         name = decorator.func if isinstance(decorator, ast.Call) else decorator
         if isinstance(name, ast.Name) and name.id == "kernel":
-            return {str(word.arg): bool(ast.literal_eval(word.value)) for word in words}
+            return {
+                str(argument.arg): bool(ast.literal_eval(argument.value)) for argument in arguments
+            }
     return None

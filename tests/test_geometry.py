@@ -1,3 +1,5 @@
+"""Tests of rotations, poses, upright boxes and records."""
+
 import numpy as np
 import pytest
 from hypothesis import given, settings
@@ -29,7 +31,7 @@ def pose(q: list[float], t: list[float]) -> Pose:
 
 @settings(deadline=None)
 @given(quaternion)
-def test_quaternion_round_trip_also_near_half_turns(q: list[float]) -> None:
+def test_quaternion_survives_a_round_trip(q: list[float]) -> None:
     rotation = rotation_from_quaternion(q)
 
     assert_allclose(rotation @ rotation.T, np.eye(3), atol=1e-12)
@@ -40,7 +42,7 @@ def test_quaternion_round_trip_also_near_half_turns(q: list[float]) -> None:
 
 @settings(deadline=None)
 @given(quaternion, vector, vector)
-def test_inverse_undoes(q: list[float], t: list[float], p: list[float]) -> None:
+def test_inverse_undoes_a_transform(q: list[float], t: list[float], p: list[float]) -> None:
     a_from_b = pose(q, t)
 
     assert_allclose(transform(inverse(a_from_b), transform(a_from_b, p)), p, atol=1e-9)
@@ -48,15 +50,15 @@ def test_inverse_undoes(q: list[float], t: list[float], p: list[float]) -> None:
 
 
 @pytest.mark.parametrize("bad", [[0, 0, 0, 0], [np.nan, 0, 0, 1]])
-def test_a_zero_quaternion_is_refused(bad: list[float]) -> None:
-    """TF messages of broken drivers hold them."""
+def test_invalid_quaternion_is_rejected(bad: list[float]) -> None:
+    """Faulty drivers publish them in transforms."""
     with pytest.raises(ValueError, match="not a rotation"):
         rotation_from_quaternion(bad)
 
 
 @settings(deadline=None)
 @given(direction)
-def test_gravity_rotation_turns_up_to_z(up: list[float]) -> None:
+def test_gravity_rotation_maps_up_to_z(up: list[float]) -> None:
     rotation = gravity_rotation(up)
     length = float(np.linalg.norm(up))
 
@@ -66,13 +68,13 @@ def test_gravity_rotation_turns_up_to_z(up: list[float]) -> None:
 
 @settings(deadline=None, max_examples=30)
 @given(direction, st.floats(0, 3), st.integers(0, 100))
-def test_box_of_a_turned_box_is_that_box(up: list[float], yaw: float, seed: int) -> None:
+def test_upright_box_of_rotated_box_is_that_box(up: list[float], yaw: float, seed: int) -> None:
     size = np.array([0.3, 0.12, 0.2])
     corners = np.array(np.meshgrid(*[[-0.5, 0.5]] * 3)).reshape(3, -1).T * size
     inside = np.random.default_rng(seed).uniform(-0.5, 0.5, (300, 3)) * size
     c, s = np.cos(yaw), np.sin(yaw)
-    turned = np.vstack([corners, inside]) @ np.array([[c, s, 0], [-s, c, 0], [0, 0, 1]])
-    points: F8 = turned @ gravity_rotation(up) + [1, 2, 3]
+    rotated = np.vstack([corners, inside]) @ np.array([[c, s, 0], [-s, c, 0], [0, 0, 1]])
+    points: F8 = rotated @ gravity_rotation(up) + [1, 2, 3]
 
     box = upright_box(points.astype(np.float32), up)
 
@@ -82,7 +84,7 @@ def test_box_of_a_turned_box_is_that_box(up: list[float], yaw: float, seed: int)
     assert np.all(np.abs(local) <= box.size / 2 + 1e-5)
 
 
-def test_box_of_one_point_and_of_none() -> None:
+def test_upright_box_needs_only_one_point() -> None:
     """Open3D's boxes raise on flat input."""
     box = upright_box(np.array([[1, 2, 3]], np.float32), [0, 0, 1])
 
@@ -92,7 +94,7 @@ def test_box_of_one_point_and_of_none() -> None:
         upright_box(np.zeros((0, 3), np.float32), [0, 0, 1])
 
 
-def test_records_refuse_shapes_that_do_not_fit() -> None:
+def test_records_reject_wrong_shapes() -> None:
     with pytest.raises(ValueError, match="translation"):
         Pose(np.eye(3), np.zeros(2))
     with pytest.raises(ValueError, match="either depth or points"):
@@ -101,7 +103,7 @@ def test_records_refuse_shapes_that_do_not_fit() -> None:
         Frame("t", 0, 0, 0, "f", depth=np.zeros((2, 2)), camera=Camera(3, 2, 1, 1, 1, 1))
 
 
-def test_records_cannot_be_written_to() -> None:
+def test_records_are_read_only() -> None:
     """Shared arrays that change under a reader cause bugs that are hard to find."""
     made = Pose(np.eye(3), np.zeros(3))
 
@@ -109,7 +111,7 @@ def test_records_cannot_be_written_to() -> None:
         made.translation[0] = 1
 
 
-def test_points_without_a_reading_are_nan() -> None:
+def test_points_without_depth_are_nan() -> None:
     camera = Camera(2, 1, 100.0, 100.0, 0.5, 0.0)
     frame = Frame("t", 0, 0, 0, "f", depth=np.array([[0, 2]]), camera=camera)
 
@@ -119,7 +121,7 @@ def test_points_without_a_reading_are_nan() -> None:
     assert_allclose(points[1], [0.01, 0, 2])
 
 
-def test_triangles_of_a_graph() -> None:
+def test_triangles_are_cycles_of_three_edges() -> None:
     edges = freeze([[0, 1], [0, 2], [1, 2], [2, 3]], "n 2", "u2")
 
     assert triangles_of(edges, 4).tolist() == [[0, 1, 2]]

@@ -1,4 +1,4 @@
-"""Tracking metrics agree with motmetrics and worked examples; box overlaps with exact volumes."""
+"""Tests of tracking metrics against motmetrics, and of box overlaps against exact volumes."""
 
 import warnings
 from collections.abc import Iterator
@@ -25,10 +25,10 @@ def crowd(seed: int, frames: int = 40) -> Iterator[SeenTogether]:
         if k % 13 == 12:
             names[int(rng.integers(5))] = 200 + k
         true = [i for i in range(5) if rng.random() < 0.8]
-        seen = [i for i in true if rng.random() < 0.85]
-        found = [names[i] for i in seen] + ([900 + k] if rng.random() < 0.3 else [])
+        detected = [i for i in true if rng.random() < 0.85]
+        found = [names[i] for i in detected] + ([900 + k] if rng.random() < 0.3 else [])
         similarity = rng.uniform(0, 0.65, (len(true), len(found)))
-        for j, i in enumerate(seen):
+        for j, i in enumerate(detected):
             similarity[true.index(i), j] = rng.uniform(0.4, 1)
         yield SeenTogether(true, found, np.where(similarity < 0.1, 0, similarity))
 
@@ -39,15 +39,15 @@ def oracle(frames: list[SeenTogether], threshold: float) -> Any:
         gaps = np.where(similarity >= threshold, 1 - similarity, np.nan)
         accumulator.update(true, found, gaps)
     names = ["idf1", "mota", "num_switches", "num_misses", "num_false_positives"]
-    with warnings.catch_warnings():  # of pandas, about its own future
+    with warnings.catch_warnings():  # deprecations in pandas
         warnings.simplefilter("ignore")
         table = motmetrics.metrics.create().compute(accumulator, metrics=names)
     return table.iloc[0]
 
 
 @pytest.mark.parametrize(("seed", "threshold"), [*enumerate([0.5, 0.3] * 4)])
-def test_mota_and_idf1_are_those_of_motmetrics(seed: int, threshold: float) -> None:
-    """Breaking a tie differently, or dropping a kept pair, would shift published figures."""
+def test_mota_and_idf1_match_motmetrics(seed: int, threshold: float) -> None:
+    """Another choice in a tie, or a dropped pair, would shift published figures."""
     frames = list(crowd(seed))
     expected, figures = oracle(frames, threshold), judge_identities(frames, threshold=threshold)
 
@@ -58,12 +58,12 @@ def test_mota_and_idf1_are_those_of_motmetrics(seed: int, threshold: float) -> N
     assert figures.idf1 == pytest.approx(expected["idf1"])
 
 
-def test_hota_of_a_worked_example() -> None:
-    """One object, four frames, found three times at .72: once as track 1, then twice as track 2.
+def test_hota_matches_a_worked_example() -> None:
+    """One object is found in 3 of 4 frames, at .72: once as track 1, then twice as track 2.
 
     Up to .7 (14 thresholds) there are 3 hits, 1 miss, 0 false positives: DetA 3/4. The hit of
     track 1 associates 1/(4+1-1), those of track 2 2/(4+2-2): AssA (1/4 + 1/2 + 1/2)/3 = 5/12.
-    Above it nothing is a hit. 19 thresholds in all.
+    Above .7, there are no hits. There are 19 thresholds.
     """
     none = np.zeros((1, 0))
     hit = np.array([[0.72]])
@@ -82,25 +82,25 @@ def test_hota_of_a_worked_example() -> None:
     assert figures.idf1 == pytest.approx(2 * 2 / (4 + 3))
 
 
-def test_frames_without_anything_have_no_figures_but_nan() -> None:
+def test_metrics_of_empty_frames_are_nan() -> None:
     empty = judge_identities([SeenTogether([], [], np.zeros((0, 0)))])
 
     assert np.isnan([empty.mota, empty.idf1, empty.hota]).all()
 
 
 def box(center: list[float], size: list[float], orientation: list[float]) -> Box:
-    """Return a box of plain numbers."""
+    """Return a box from plain numbers."""
     return Box(*(np.array(values, np.float64) for values in (center, size, orientation)))
 
 
-def turned(x: float, y: float, z: float, w: float, still: Box) -> Box:
-    """Turn a box about the origin."""
-    turn = rotation_from_quaternion([x, y, z, w])
-    own = rotation_from_quaternion(still.orientation)
-    return Box(turn @ still.center, still.size, quaternion_from_rotation(turn @ own))
+def rotated(x: float, y: float, z: float, w: float, original: Box) -> Box:
+    """Rotate a box about the origin."""
+    rotation = rotation_from_quaternion([x, y, z, w])
+    own = rotation_from_quaternion(original.orientation)
+    return Box(rotation @ original.center, original.size, quaternion_from_rotation(rotation @ own))
 
 
-def test_box_iou_of_turned_boxes_is_that_by_hand_and_by_sampling() -> None:
+def test_iou_of_rotated_boxes_matches_hand_calculation_and_sampling() -> None:
     """A tilted camera sees rotated boxes, for which a formula for upright ones is wrong."""
     a = box([0.1, -0.2, 0.9], [0.3, 0.2, 0.5], [0, 0, 0, 1])
     b = box([0.2, -0.15, 1.0], [0.3, 0.2, 0.5], [0, 0, 0, 1])
@@ -108,7 +108,7 @@ def test_box_iou_of_turned_boxes_is_that_by_hand_and_by_sampling() -> None:
     by_hand = shared / (2 * 0.3 * 0.2 * 0.5 - shared)
     assert box_iou(a, b) == pytest.approx(by_hand, rel=1e-5)
     tilt = (0.3, -0.5, 0.2, 0.7)
-    assert box_iou(turned(*tilt, a), turned(*tilt, b)) == pytest.approx(by_hand, rel=1e-4)
+    assert box_iou(rotated(*tilt, a), rotated(*tilt, b)) == pytest.approx(by_hand, rel=1e-4)
 
     c = box([0.15, -0.1, 0.95], [0.25, 0.35, 0.3], [0.1, 0.25, -0.4, 0.8])
     points = np.random.default_rng(0).uniform(-0.5, 1.5, (400_000, 3))
@@ -123,15 +123,15 @@ def test_box_iou_of_turned_boxes_is_that_by_hand_and_by_sampling() -> None:
     assert box_iou(a, a) == pytest.approx(1)
 
 
-def test_boxes_that_only_touch_or_are_flat_share_nothing() -> None:
+def test_touching_and_flat_boxes_have_no_overlap() -> None:
     a = box([0, 0, 0], [1, 2, 3], [0, 0, 0, 1])
     assert box_iou(a, box([1, 0, 0], [1, 2, 3], [0, 0, 0, 1])) == 0
     assert box_iou(a, box([9, 0, 0], [1, 2, 3], [0, 0, 0, 1])) == 0
     assert box_iou(a, box([0, 0, 0], [1, 2, 0], [0, 0, 0, 1])) == 0
 
 
-def test_masks_are_matched_for_the_greatest_overlap_in_all() -> None:
-    """By hand: the first mask overlaps the first object most, but the best total differs."""
+def test_mask_matching_maximizes_total_overlap() -> None:
+    """The first mask overlaps the first object most, but the best total needs other pairs."""
     true = [np.arange(0, 10), np.arange(10, 16)]
     found = [np.arange(4, 14), np.arange(0, 4), np.array([30, 31])]
     matches = match_masks(found, true)

@@ -1,4 +1,4 @@
-"""Cached kernels: compiled code must not outlive its sources."""
+"""Tests of the cache of kernels: compiled code must not outlive its sources."""
 
 import os
 import runpy
@@ -44,7 +44,7 @@ def stage(tmp_path: Path) -> Path:
 
 @pytest.fixture
 def run(stage: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]) -> Run:
-    """Run the script as in a new process with numba loaded but nothing compiled."""
+    """Run the script as in a new process, with Numba loaded but nothing compiled."""
     monkeypatch.syspath_prepend(stage)
     monkeypatch.setattr(sys, "dont_write_bytecode", True)
     monkeypatch.setattr("numba.config.CACHE_DIR", "")
@@ -59,18 +59,18 @@ def run(stage: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixt
 
 
 @pytest.mark.parametrize("decorator", ["@kernel", "@kernel(inner=True)", "@kernel(inline=True)"])
-def test_an_edit_of_a_called_kernel_counts(stage: Path, run: Run, decorator: str) -> None:
+def test_edit_of_callee_recompiles_the_caller(stage: Path, run: Run, decorator: str) -> None:
     """Numba's own cache would keep the old code, since the caller's file is unchanged."""
     callee = CALLEE.replace("@kernel", decorator)
     (stage / "callee.py").write_text(callee)
     assert run() == "7 0"
-    assert run() == "7 1", "nothing was kept"
+    assert run() == "7 1", "nothing was cached"
     (stage / "callee.py").write_text(callee.replace("2 * x", "20 * x"))
     assert run() == "61 0"
     assert len([*stage.glob("__pycache__/kernels-*")]) == 1, "code of earlier files is left"
 
 
-def test_a_process_with_the_files_of_before_spoils_nothing(stage: Path, run: Run) -> None:
+def test_process_with_older_sources_does_not_spoil_the_cache(stage: Path, run: Run) -> None:
     """It may compile and save the code it started with after the files have changed."""
     (stage / "caller.py").write_text(CALLER.replace("print", "import sys; sys.stdin.read()\nprint"))
     command = [sys.executable, "-B", str(stage / "caller.py")]
@@ -83,12 +83,12 @@ def test_a_process_with_the_files_of_before_spoils_nothing(stage: Path, run: Run
     assert run() == "61 0"
 
 
-def test_code_goes_where_it_can_be_written(
+def test_cache_folder_is_writable_or_configured(
     stage: Path, run: Run, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """System packages are read-only for users; container images set their own folder."""
     stage.joinpath("__pycache__").write_text("a file, so that not even root can write in it")
-    own, named = tmp_path / "own", tmp_path / "named"
+    own, configured = tmp_path / "own", tmp_path / "named"
     monkeypatch.setenv("XDG_CACHE_HOME", str(own))
 
     assert run() == "7 0"
@@ -96,12 +96,12 @@ def test_code_goes_where_it_can_be_written(
     assert [*own.glob("shapecat/stage-*/kernels-*")]
 
     command = [sys.executable, str(stage / "caller.py")]
-    environment = {**os.environ, "NUMBA_CACHE_DIR": str(named)}  # numba reads it as it loads
+    environment = {**os.environ, "NUMBA_CACHE_DIR": str(configured)}  # numba reads it as it loads
     assert subprocess.check_output(command, env=environment) == b"7 0\n"
-    assert [*named.glob("stage-*/kernels-*/**/*.nbc")]
+    assert [*configured.glob("stage-*/kernels-*/**/*.nbc")]
 
 
-def test_a_kernel_is_compiled_where_nothing_can_be_kept(
+def test_kernel_is_compiled_without_any_cache_folder(
     stage: Path, run: Run, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """Slow is better than an error."""
@@ -110,7 +110,7 @@ def test_a_kernel_is_compiled_where_nothing_can_be_kept(
     assert run() == "7 0"
 
 
-def test_a_stage_is_one_with_its_sub_packages() -> None:
+def test_stage_includes_its_subpackages() -> None:
     """Kernels call kernels of other subpackages of their stage, so any edit counts."""
     here = Path(shapecat.__file__).parent
 

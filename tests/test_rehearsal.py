@@ -1,4 +1,4 @@
-"""Compiling ahead of time: every kernel, only once, with no process left behind."""
+"""Tests of compiling ahead of time: all kernels, only once, without leftover processes."""
 
 import multiprocessing
 import shutil
@@ -28,8 +28,8 @@ KERNELS = [
 ]
 
 
-def test_the_rehearsals_go_all_the_way(monkeypatch: pytest.MonkeyPatch) -> None:
-    """A kernel that they do not call is compiled in the first run, or in each in a container."""
+def test_rehearsals_call_rarely_used_kernels(monkeypatch: pytest.MonkeyPatch) -> None:
+    """A kernel that they miss is compiled in the first run, or in every run in a container."""
     called, in_c_order = set(), set()
 
     def watch(module: ModuleType, name: str, see: Callable[..., object]) -> None:
@@ -52,7 +52,7 @@ def test_the_rehearsals_go_all_the_way(monkeypatch: pytest.MonkeyPatch) -> None:
 
 
 def mark(path: Path) -> None:
-    """Do no work, but leave a trace of it."""
+    """Record a call in a file."""
     with path.open("a") as file:
         file.write("x")
 
@@ -65,20 +65,20 @@ def trace(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
     return path
 
 
-def test_compiling_is_done_once(trace: Path) -> None:
+def test_kernels_are_compiled_only_once(trace: Path) -> None:
     """A run announces the compilation and waits for it; the next run must not."""
-    told: list[str] = []
+    announced: list[str] = []
 
-    assert compile_all(lambda: told.append("begin")) > 0
-    assert compile_all(lambda: told.append("begin")) == 0
-    assert told == ["begin"]
+    assert compile_all(lambda: announced.append("begin")) > 0
+    assert compile_all(lambda: announced.append("begin")) == 0
+    assert announced == ["begin"]
     assert trace.read_text() == "x"
 
 
-def test_kernels_are_kept_where_another_version_removed_their_folder(
+def test_compiling_survives_removal_of_its_folder(
     trace: Path, monkeypatch: pytest.MonkeyPatch, tmp_path: Path
 ) -> None:
-    """An update during a batch must not fail the remaining recordings, nor one that compiles."""
+    """An update during a batch must not fail the remaining recordings."""
     monkeypatch.setattr(rehearsal, "_notes", lambda: tmp_path / "removed" / "complete")
 
     with monkeypatch.context() as patch:
@@ -89,8 +89,7 @@ def test_kernels_are_kept_where_another_version_removed_their_folder(
     assert trace.read_text() == "x"
 
 
-def test_an_interrupted_one_is_done_again(trace: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    """Half of the kernels are not enough."""
+def test_interrupted_compiling_is_repeated(trace: Path, monkeypatch: pytest.MonkeyPatch) -> None:
 
     def interrupt(_cores: int) -> None:
         raise KeyboardInterrupt
@@ -102,7 +101,7 @@ def test_an_interrupted_one_is_done_again(trace: Path, monkeypatch: pytest.Monke
     assert trace.read_text() == "x"
 
 
-def test_whoever_waits_is_told(
+def test_compiling_reports_its_progress(
     trace: Path, monkeypatch: pytest.MonkeyPatch, capfd: pytest.CaptureFixture[str]
 ) -> None:
     """Minutes of silence look like a hang; compiled kernels need no announcement."""
@@ -127,20 +126,19 @@ def test_whoever_waits_is_told(
 
 
 @pytest.mark.parametrize(("word", "code"), [("--help", 0), ("now", 2)])
-def test_whoever_asks_for_help_need_not_wait(
+def test_help_and_wrong_usage_do_not_compile(
     trace: Path, capsys: pytest.CaptureFixture[str], word: str, code: int
 ) -> None:
-    """`--help` must not compile for a minute."""
     with pytest.raises(SystemExit) as ended:
         rehearsal.main([word])
 
     assert ended.value.code == code
-    said = capsys.readouterr()
-    assert "python -m shapecat.rehearsal [-h]" in said.out + said.err
+    output = capsys.readouterr()
+    assert "python -m shapecat.rehearsal [-h]" in output.out + output.err
     assert not trace.exists()
 
 
-def test_the_other_processes_end(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_compiling_processes_end(monkeypatch: pytest.MonkeyPatch) -> None:
     before = set(multiprocessing.active_children())
     monkeypatch.setattr(rehearsal, "_REHEARSALS", (multiprocessing.active_children,) * 2)
     rehearsal._rehearse(1)
@@ -161,7 +159,7 @@ print("processed")
 
 
 @pytest.mark.parametrize("says", ["", "# no __main__"])
-def test_a_script_without_a_guard_does_not_wait_for_itself(tmp_path: Path, says: str) -> None:
+def test_script_without_main_guard_does_not_deadlock(tmp_path: Path, says: str) -> None:
     """A compiling process would run the script again and wait for its parent's lock."""
     script = tmp_path / "script.py"
     script.write_text(UNGUARDED.format(says=says, notes=str(tmp_path / "complete")))

@@ -1,4 +1,4 @@
-"""The rasterizer against geometry and ray casting; the sensor models against real sensors."""
+"""Tests of the rasterizer against geometry and ray casting, and of the sensor models."""
 
 import dataclasses
 
@@ -31,8 +31,8 @@ def big_quad(z: float) -> Mesh:
     return Mesh(corners, np.array([[0, 1, 2], [0, 2, 3]]))
 
 
-def test_plane_is_exact_everywhere_even_behind_the_camera() -> None:
-    """A floor reaches behind the camera: nothing may be clipped wrongly."""
+def test_plane_that_extends_behind_the_camera_is_exact() -> None:
+    """A floor does, and must be clipped correctly."""
     pose = looking_at(np.array([0, 0, 1.3]), np.array([0.2, 1.0, 0.9]))
     image = render(geometry([(big_quad(0.0), HERE)]), CAMERA, pose)
     fall = (rays(CAMERA) @ pose.rotation.T)[..., 2]
@@ -43,7 +43,7 @@ def test_plane_is_exact_everywhere_even_behind_the_camera() -> None:
     assert np.array_equal(image.owners[near] == 0, expected[near] > 0)
 
 
-def test_sphere_is_where_it_should_be() -> None:
+def test_sphere_has_exact_depth_and_outline() -> None:
     t = np.linspace(-np.pi / 2, np.pi / 2, 200)
     ball = lathe(np.stack([0.2 * np.cos(t), 0.2 * np.sin(t)], -1), segments=300)
     image = render(geometry([(ball, Pose(np.eye(3), np.array([0.05, 0, 1.0])))]), CAMERA, HERE)
@@ -73,8 +73,8 @@ def test_shared_edges_leave_no_gap() -> None:
     assert (image.owners == 1).all()
 
 
-def test_both_sides_of_a_triangle_are_seen() -> None:
-    """Cups have thin walls: culling back faces would open them."""
+def test_both_sides_of_triangles_are_rendered() -> None:
+    """Cups have thin walls, which the culling of back faces would open."""
     quad = big_quad(1.0)
     back = Mesh(quad.vertices, quad.triangles[:, ::-1])
 
@@ -84,7 +84,7 @@ def test_both_sides_of_a_triangle_are_seen() -> None:
         assert float(image.cosine.max()) == pytest.approx(1.0, abs=1e-3)
 
 
-def test_the_nearer_thing_shows() -> None:
+def test_nearest_surface_is_visible() -> None:
     image = render(
         geometry([(big_quad(2.0), HERE), (big_quad(1.0), HERE), (big_quad(3.0), HERE)]),
         CAMERA,
@@ -94,24 +94,24 @@ def test_the_nearer_thing_shows() -> None:
     assert (image.owners == 1).all()
 
 
-def test_a_crop_is_a_part_of_the_image() -> None:
+def test_crop_equals_part_of_the_image() -> None:
     world = make_scene("clutter", np.random.default_rng(4), frames=1)
-    seen = world.geometry(0)
-    whole = render(seen, CAMERA, world.path[0])
-    part = render(seen, cropped(CAMERA, 50, 30, 60, 40), world.path[0])
+    solids = world.geometry(0)
+    whole = render(solids, CAMERA, world.path[0])
+    crop = render(solids, cropped(CAMERA, 50, 30, 60, 40), world.path[0])
 
-    np.testing.assert_allclose(part.inverse, whole.inverse[30:70, 50:110], rtol=1e-12)
-    assert (part.owners == whole.owners[30:70, 50:110]).mean() > 0.999
+    np.testing.assert_allclose(crop.inverse, whole.inverse[30:70, 50:110], rtol=1e-12)
+    assert (crop.owners == whole.owners[30:70, 50:110]).mean() > 0.999
 
 
-def test_agrees_with_open3d_rays() -> None:
+def test_depth_agrees_with_open3d_rays() -> None:
     o3d = pytest.importorskip("open3d")
     world = make_scene("shelf", np.random.default_rng(2), frames=1)
-    seen, pose = world.geometry(0), world.path[0]
-    image = render(seen, CAMERA, pose)
+    solids, pose = world.geometry(0), world.path[0]
+    image = render(solids, CAMERA, pose)
     scene = o3d.t.geometry.RaycastingScene()
     scene.add_triangles(
-        np.asarray(seen.vertices, np.float32), np.asarray(seen.triangles, np.uint32)
+        np.asarray(solids.vertices, np.float32), np.asarray(solids.triangles, np.uint32)
     )
     d = rays(CAMERA) @ pose.rotation.T
     cast = np.concatenate([np.broadcast_to(pose.translation, d.shape), d], -1).astype(np.float32)
@@ -122,19 +122,19 @@ def test_agrees_with_open3d_rays() -> None:
     assert (difference > 1e-3).mean() < 0.002
 
 
-def test_alone_pixels_counts_what_others_hide() -> None:
+def test_alone_pixels_include_occluded_ones() -> None:
     cube = rounded_box([0.2, 0.2, 0.2])
     behind = (cube, Pose(np.eye(3), np.array([0, 0, 1.5])))
     before = (cube, Pose(np.eye(3), np.array([0.1, 0, 1.0])))
-    seen = geometry([behind, before])
-    visible = int((render(seen, CAMERA, HERE).owners == 0).sum())
+    both = geometry([behind, before])
+    visible = int((render(both, CAMERA, HERE).owners == 0).sum())
     alone = int((render(geometry([behind]), CAMERA, HERE).owners == 0).sum())
 
-    assert alone_pixels(seen, 0, CAMERA, HERE) == alone
+    assert alone_pixels(both, 0, CAMERA, HERE) == alone
     assert 0 < visible < 0.7 * alone
 
 
-def test_nothing_to_draw() -> None:
+def test_empty_geometry_gives_empty_image() -> None:
     nothing = Geometry(np.zeros((0, 3)), np.zeros((0, 3)), np.zeros(0))
 
     assert (render(nothing, CAMERA, HERE).owners == -1).all()
@@ -149,8 +149,8 @@ def wall_image(sensor: Sensor, z: float) -> Image:
 
 def step_image(sensor: Sensor) -> Image:
     post = rounded_box([0.2, 0.2, 2.0])
-    things = [(big_quad(1.2), HERE), (post, Pose(np.eye(3)[[0, 2, 1]], np.array([0, -1.0, 0.8])))]
-    return render(geometry(things), sensor.camera, HERE)
+    solids = [(big_quad(1.2), HERE), (post, Pose(np.eye(3)[[0, 2, 1]], np.array([0, -1.0, 0.8])))]
+    return render(geometry(solids), sensor.camera, HERE)
 
 
 def test_ideal_sensor_changes_nothing() -> None:
@@ -162,18 +162,18 @@ def test_ideal_sensor_changes_nothing() -> None:
 
 
 @pytest.mark.parametrize("sensor", [KINECT, REALSENSE], ids=["kinect", "realsense"])
-def test_same_seed_same_noise(sensor: Sensor) -> None:
+def test_sensor_noise_is_reproducible(sensor: Sensor) -> None:
     image = step_image(sensor)
     first = measure(image, sensor, np.random.default_rng(5))
-    again = measure(image, sensor, np.random.default_rng(5))
+    second = measure(image, sensor, np.random.default_rng(5))
     other = measure(image, sensor, np.random.default_rng(6))
 
-    assert np.array_equal(first[0], again[0])
-    assert np.array_equal(first[1], again[1])
+    assert np.array_equal(first[0], second[0])
+    assert np.array_equal(first[1], second[1])
     assert not np.array_equal(first[0], other[0])
 
 
-def test_kinect_disparity_comes_in_steps() -> None:
+def test_kinect_disparity_is_quantized() -> None:
     depth, _ = measure(wall_image(KINECT, 1.0), KINECT, np.random.default_rng(0))
     levels = np.unique(1 / depth[depth > 0].astype(np.float64))
 
@@ -181,8 +181,8 @@ def test_kinect_disparity_comes_in_steps() -> None:
 
 
 @pytest.mark.parametrize("distance", [0.8, 1.6])
-def test_kinect_noise_grows_with_the_square_of_the_distance(distance: float) -> None:
-    """Real frames have 0.0020 1/m in a window of 40 pixels, at every distance."""
+def test_kinect_depth_noise_grows_with_squared_distance(distance: float) -> None:
+    """Its inverse depth has 0.0020 1/m in real frames (window of 40 pixels) at any distance."""
     sensor = dataclasses.replace(KINECT, wave=0.0)
     depth, _ = measure(wall_image(sensor, distance), sensor, np.random.default_rng(0))
     inverse = 1 / depth[depth > 0].astype(np.float64)
@@ -191,8 +191,8 @@ def test_kinect_noise_grows_with_the_square_of_the_distance(distance: float) -> 
     assert inverse.mean() == pytest.approx(1 / distance, abs=0.0005)
 
 
-def test_kinect_noise_is_alike_among_neighbours() -> None:
-    """Independent pixels would be averaged away by any smoothing: too easy to be real."""
+def test_kinect_noise_is_correlated_between_neighbours() -> None:
+    """Any smoothing would average out independent noise, unlike that of real sensors."""
     sensor = dataclasses.replace(KINECT, wave=0.0, holes=0.0)
     depth, _ = measure(wall_image(sensor, 1.0), sensor, np.random.default_rng(0))
     error = 1 / depth[20:460, 20:580].astype(np.float64) - 1.0
@@ -205,8 +205,8 @@ def test_kinect_noise_is_alike_among_neighbours() -> None:
 
 
 @pytest.mark.parametrize(("sensor", "right"), [(KINECT, 6.0), (REALSENSE, 0.0)])
-def test_shadow_lies_beside_nearer_things(sensor: Sensor, right: float) -> None:
-    """The projector stands to the right of the camera: the shadow falls to the left."""
+def test_shadow_is_left_of_near_objects(sensor: Sensor, right: float) -> None:
+    """The projector is to the right of the camera."""
     sensor = dataclasses.replace(sensor, holes=0.0, grazing=0.0)
     image = step_image(sensor)
     depth, owners = measure(image, sensor, np.random.default_rng(0))
@@ -224,8 +224,8 @@ def test_shadow_lies_beside_nearer_things(sensor: Sensor, right: float) -> None:
 
 
 @pytest.mark.parametrize("name", ["d415", "d435", "d455", "sr300"])
-def test_noise_comes_in_waves_as_wide_as_the_matching_windows(name: str) -> None:
-    """Finer noise vanishes in voxels, and surfaces would come out flatter than real ones.
+def test_stereo_noise_has_waves_as_wide_as_matching_windows(name: str) -> None:
+    """Voxels average finer noise, and surfaces would be flatter than real ones.
 
     Real cameras bend a plane in waves of 15 to 40 pixels, and hardly roughen it below 5.
     """
@@ -241,12 +241,12 @@ def test_noise_comes_in_waves_as_wide_as_the_matching_windows(name: str) -> None
     assert waves.std() > 0.65 * sensor.noise
 
 
-def test_stereo_matching_fails_around_nearer_surfaces() -> None:
-    """In real images, readings are missing on all sides of an object, not only in its shadow."""
+def test_stereo_depth_is_missing_around_near_surfaces() -> None:
+    """In real images, depth is missing on all sides of an object, not only in its shadow."""
     plain = dataclasses.replace(IDEAL, edge_px=6)
     box = rounded_box([0.2, 0.3, 0.1])
-    seen = [(big_quad(1.2), HERE), (box, Pose(np.eye(3), np.array([0.05, -0.02, 0.8])))]
-    image = render(geometry(seen), plain.camera, HERE)
+    solids = [(big_quad(1.2), HERE), (box, Pose(np.eye(3), np.array([0.05, -0.02, 0.8])))]
+    image = render(geometry(solids), plain.camera, HERE)
     depth, owners = measure(image, plain, np.random.default_rng(0))
     near = image.owners == 1
     margin = binary_dilation(near, np.ones((13, 13))) & ~near
@@ -257,8 +257,8 @@ def test_stereo_matching_fails_around_nearer_surfaces() -> None:
     assert (depth[~margin] > 0).all()
 
 
-def test_a_table_seen_at_a_low_angle_has_no_margins() -> None:
-    """Its inverse depth changes within a few pixels as much as at an outline."""
+def test_table_at_low_angle_has_no_missing_margins() -> None:
+    """Its inverse depth changes as much within a few pixels as at an outline."""
     pose = looking_at(np.array([0, 0, 0.35]), np.array([0, 1.0, 0.2]))
     sensor = dataclasses.replace(PRESETS["d455"], holes=0.0, grazing=0.0, border_px=(0,) * 4)
     image = render(geometry([(big_quad(0.0), HERE)]), sensor.camera, pose)
@@ -270,7 +270,7 @@ def test_a_table_seen_at_a_low_angle_has_no_margins() -> None:
 
 
 @pytest.mark.parametrize("z", [0.5, 2.0])
-def test_noise_of_time_of_flight_grows_with_the_distance(z: float) -> None:
+def test_time_of_flight_noise_grows_with_distance(z: float) -> None:
     """With the noise of 1 m at 0.4 m, near objects would be rougher than real ones."""
     sensor = dataclasses.replace(PRESETS["l515"], wave=0.0, holes=0.0)
     depth, _ = measure(wall_image(sensor, z), sensor, np.random.default_rng(0))
@@ -278,20 +278,20 @@ def test_noise_of_time_of_flight_grows_with_the_distance(z: float) -> None:
     assert depth[depth > 0].std() == pytest.approx(sensor.noise_m * z, rel=0.1)
 
 
-def test_stereo_loses_patches_and_not_single_pixels() -> None:
+def test_stereo_holes_are_patches() -> None:
     """Filters close holes of three pixels; those of real cameras are as wide as their windows."""
     sensor = dataclasses.replace(IDEAL, holes=0.01, hole_px=12)
     depth, _ = measure(wall_image(sensor, 1.0), sensor, np.random.default_rng(0))
     holes, count = label(depth == 0)
-    widths = np.array([part[1].stop - part[1].start for part in find_objects(holes)])
+    widths = np.array([hole[1].stop - hole[1].start for hole in find_objects(holes)])
 
     assert 0.006 < (depth == 0).mean() < 0.014
     assert count > 30
     assert np.median(widths) >= 5
 
 
-def test_a_smaller_image_has_the_same_errors_in_smaller_windows() -> None:
-    """Margins of 8 pixels in an image of half the width would swallow the objects."""
+def test_resized_sensor_has_windows_of_same_angle() -> None:
+    """Margins of 8 pixels in an image of half the width would hide the objects."""
     half = resized(PRESETS["d455"], 0.5)
 
     assert (half.camera.width, half.edge_px, half.hole_px, half.rounded_px) == (640, 4, 6, 8)
@@ -299,7 +299,7 @@ def test_a_smaller_image_has_the_same_errors_in_smaller_windows() -> None:
     assert resized(IDEAL, 0.5).edge_px == 0
 
 
-def test_what_is_out_of_range_has_no_reading() -> None:
+def test_surface_out_of_range_has_no_depth() -> None:
     for z in (0.3, 5.0):
         depth, owners = measure(wall_image(KINECT, z), KINECT, np.random.default_rng(0))
         assert (depth == 0).all()

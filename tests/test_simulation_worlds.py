@@ -1,4 +1,4 @@
-"""Scenes: nothing floats or intersects, truth agrees with depth, recordings read back."""
+"""Tests of simulated scenes, their truth and their recordings, and of scanned meshes."""
 
 import hashlib
 import json
@@ -26,7 +26,7 @@ from shapecat.simulation.scenes import SceneKind
 from shapecat.simulation.sensors import IDEAL, KINECT
 from shapecat.types import CATEGORIES, Camera, Pose
 
-SETTLED = {"pile", "bin", "shelf_bin", "room"}  # by physics: things touch, and lie in each other
+SETTLED = {"pile", "bin", "shelf_bin", "room"}  # with physics: objects touch and lie in each other
 KINDS: tuple[SceneKind, ...] = tuple(k for k in get_args(SceneKind) if k not in SETTLED)
 
 
@@ -42,21 +42,21 @@ def world(request: pytest.FixtureRequest) -> World:
     return make_scene(kind, np.random.default_rng(seed), frames=40)
 
 
-def seen_from_above(mesh: Mesh, pose: Pose) -> Bool:
-    """Return which millimetres of a place a thing covers, drawn from far above."""
+def top_view(mesh: Mesh, pose: Pose) -> Bool:
+    """Return the cells of 3 mm that an object covers, rendered from far above."""
     far = 500.0
     camera = Camera(500, 500, far / 0.003, far / 0.003, 249.5, 249.5)
     above = Pose(np.diag([1.0, -1.0, -1.0]), np.array([0, 0, far]))
     return np.asarray(render(geometry([(mesh, pose)]), camera, above).owners >= 0)
 
 
-def test_things_do_not_interpenetrate(world: World) -> None:
-    """Where two things are at the same height, no vertical line meets both."""
+def test_objects_do_not_interpenetrate(world: World) -> None:
+    """Where two of them are at the same height, no vertical line meets both."""
     here = Pose(np.eye(3), np.zeros(3))
     solids = [(thing.mesh, thing.pose) for thing in world.things]
     solids += [(s.mesh, here) for s in world.supports if s.name != "floor"]
     heights = [transform(pose, mesh.vertices)[:, 2] for mesh, pose in solids]
-    covers = [seen_from_above(*solid) for solid in solids]
+    covers = [top_view(*solid) for solid in solids]
     for i in range(len(world.things)):
         for j in range(i + 1, len(solids)):
             apart = min(heights[i].max(), heights[j].max()) - max(
@@ -66,7 +66,7 @@ def test_things_do_not_interpenetrate(world: World) -> None:
                 assert not np.any(covers[i] & covers[j]), (world.kind, i, j)
 
 
-def test_things_stand_on_what_the_truth_says(world: World) -> None:
+def test_objects_stand_on_their_true_supports(world: World) -> None:
     boards = {support.name: support for support in world.supports}
     for thing in world.things:
         points = transform(thing.pose, thing.mesh.vertices)
@@ -81,25 +81,25 @@ def test_things_stand_on_what_the_truth_says(world: World) -> None:
             assert bottom == pytest.approx(top, abs=3e-5)
 
 
-def test_the_camera_sees_most_things(world: World) -> None:
+def test_most_objects_are_visible(world: World) -> None:
     rng = np.random.default_rng(0)
     for index in (0, 20, 39):
         _, labels = render_frame(world, index, rng=rng, sensor=KINECT)
-        seen = {thing.track for thing in world.things if (labels == thing.label).sum() > 60}
+        visible = {thing.track for thing in world.things if (labels == thing.label).sum() > 60}
         share = 0.3 if world.kind == "walking" else 0.6  # that counter is longer than the view
-        assert len(seen) >= share * len(world.things)
+        assert len(visible) >= share * len(world.things)
 
 
-def test_the_camera_moves_smoothly(world: World) -> None:
+def test_camera_moves_smoothly(world: World) -> None:
     places = np.array([pose.translation for pose in world.path])
     step = np.linalg.norm(np.diff(places, axis=0), axis=1)
 
     assert step.max() < 0.04  # 1.2 m/s
-    turned = [(a.rotation.T @ b.rotation).trace() for a, b in pairwise(world.path)]
-    assert min(turned) > 1 + 2 * np.cos(np.radians(3))
+    traces = [(a.rotation.T @ b.rotation).trace() for a, b in pairwise(world.path)]
+    assert min(traces) > 1 + 2 * np.cos(np.radians(3))
 
 
-def test_tabletop_shows_all_categories() -> None:
+def test_tabletop_contains_all_categories() -> None:
     for seed in range(5):
         world = make_scene("tabletop", np.random.default_rng(seed), frames=2)
         assert {thing.category for thing in world.things} == set(CATEGORIES)
@@ -116,7 +116,7 @@ def test_stacks_occur_in_clutter_and_on_shelves() -> None:
     assert sum(stacked) >= 5
 
 
-def test_frames_of_a_turntable_turn_the_things_not_the_table() -> None:
+def test_turntable_moves_objects_and_not_the_camera() -> None:
     world = make_scene("turntable", np.random.default_rng(0), frames=30)
     thing = world.things[0]
     first, last = world.pose_of(thing, 0), world.pose_of(thing, 29)
@@ -129,7 +129,7 @@ def test_frames_of_a_turntable_turn_the_things_not_the_table() -> None:
     np.testing.assert_array_equal(back.geometry(29).vertices, world.geometry(0).vertices)
 
 
-def test_scene_does_not_depend_on_the_number_of_frames() -> None:
+def test_scene_is_independent_of_number_of_frames() -> None:
     """A longer demo of the same seed must show the same table."""
     short = make_scene("tabletop", np.random.default_rng(5), frames=3)
     long = make_scene("tabletop", np.random.default_rng(5), frames=50)
@@ -139,7 +139,7 @@ def test_scene_does_not_depend_on_the_number_of_frames() -> None:
         assert np.array_equal(a.translation, b.translation)
 
 
-def test_a_stage_shows_its_thing_from_all_sides() -> None:
+def test_stage_shows_its_object_from_all_sides() -> None:
     rng = np.random.default_rng(3)
     world = make_stage([make_piece("cup", rng, manner="lying")], rng, views=6)
     (thing,) = world.things
@@ -153,28 +153,28 @@ def test_a_stage_shows_its_thing_from_all_sides() -> None:
 
 
 @pytest.mark.parametrize("seed", [3, pytest.param(4, marks=pytest.mark.many)])
-def test_what_moves_stays_on_the_table_and_touches_nothing(seed: int) -> None:
-    """Truth would lie about objects that pass through each other or through the table."""
+def test_moving_objects_stay_on_table_and_do_not_collide(seed: int) -> None:
+    """Objects that pass through each other or through the table would make truth wrong."""
     kinds: tuple[SceneKind, ...] = ("crossing", "rearranged")
     for kind in kinds:
         moving = make_scene(kind, np.random.default_rng(seed), frames=24, rate_hz=4)
         assert moving.motions
         table = next(s for s in moving.supports if s.name == "table")
         for k in range(24):
-            there = [thing for thing in moving.things if moving.present(thing, k)]
-            solids = [(thing.mesh, moving.pose_of(thing, k)) for thing in there]
+            current = [thing for thing in moving.things if moving.present(thing, k)]
+            solids = [(thing.mesh, moving.pose_of(thing, k)) for thing in current]
             z = [transform(pose, mesh.vertices)[:, 2] for mesh, pose in solids]
-            covers = [seen_from_above(*solid) for solid in solids]
+            covers = [top_view(*solid) for solid in solids]
             assert min(low.min() for low in z) > table.height - 1e-4
             for i in range(len(solids)):
                 for j in range(i):
                     apart = min(z[i].max(), z[j].max()) - max(z[i].min(), z[j].min())
-                    # What is carried may pass over others, 15 cm high, or brush past them.
+                    # Carried objects may pass over others, 15 cm high, or close to them.
                     lifted = max(z[i].min(), z[j].min()) > table.height + 0.001
                     assert apart < 1e-4 or lifted or not np.any(covers[i] & covers[j])
 
 
-def test_truth_lists_only_what_is_there(tmp_path: Path) -> None:
+def test_truth_lists_only_present_objects(tmp_path: Path) -> None:
     path = simulate(tmp_path / "a.mcap", scene="rearranged", frames=12, rate_hz=2, seed=5)
     truth = json.loads(path.with_name("a.truth.json").read_text())
     labels = np.load(path.with_name("a.labels.npz"))["labels"]
@@ -183,39 +183,39 @@ def test_truth_lists_only_what_is_there(tmp_path: Path) -> None:
     for k, frame in enumerate(truth):
         listed = {o["track"]: o["pixels"] for o in frame["objects"] + frame["hidden"]}
         assert set(listed) == {t.track for t in world.things if world.present(t, k)}
-        gone = {t.label for t in world.things} - {20 + track for track in listed}
-        assert not np.isin(labels[k], list(gone)).any()
+        absent = {t.label for t in world.things} - {20 + track for track in listed}
+        assert not np.isin(labels[k], list(absent)).any()
         counts.append(len(listed))
     assert min(counts) < max(counts) <= len(world.things)
 
 
-def test_unknown_scene_is_named() -> None:
+def test_unknown_scene_raises() -> None:
     with pytest.raises(ValueError, match="kitchen"):
         make_scene("kitchen", np.random.default_rng(0))  # type: ignore[arg-type]  # the mistake
 
 
-def test_labels_are_where_the_depth_is(world: World) -> None:
+def test_labels_exist_exactly_where_depth_does(world: World) -> None:
     frame, labels = render_frame(world, 0, rng=np.random.default_rng(0))
     assert frame.depth is not None
 
     assert np.array_equal(labels == 0, frame.depth == 0)
 
 
-def test_labelled_points_lie_on_their_thing(world: World) -> None:
-    """Truth and depth must not slip: every labelled point is on that thing's mesh."""
+def test_labelled_points_lie_within_their_object(world: World) -> None:
+    """Labels must not be shifted against depth."""
     frame, labels = render_frame(world, 7, rng=np.random.default_rng(0), sensor=IDEAL)
     points = transform(world.path[7], frame.xyz())
     for thing in world.things:
-        mine = points[labels.reshape(-1) == thing.label]
-        if len(mine) == 0:
+        own = points[labels.reshape(-1) == thing.label]
+        if len(own) == 0:
             continue
-        local = transform(inverse(world.pose_of(thing, 7)), mine)
+        local = transform(inverse(world.pose_of(thing, 7)), own)
         low, high = thing.mesh.vertices.min(axis=0), thing.mesh.vertices.max(axis=0)
         assert np.all(local > low - 1e-4)
         assert np.all(local < high + 1e-4)
 
 
-def test_robot_links_chain_to_the_camera(world: World) -> None:
+def test_robot_links_compose_to_the_camera_pose(world: World) -> None:
     optical = Pose(np.array([[0, 0, 1], [-1, 0, 0], [0, -1, 0]]), np.zeros(3))
     for pose in world.path[::13]:
         (_, _, base), (_, _, mast) = robot_links(pose)
@@ -246,7 +246,7 @@ def read(path: Path) -> dict[str, list[Any]]:
     return found
 
 
-def test_recordings_are_what_was_rendered(recording: Path) -> None:
+def test_recordings_contain_the_rendered_frames(recording: Path) -> None:
     found = read(recording)
     world = make_scene("tabletop", np.random.default_rng(11), frames=3)
 
@@ -262,14 +262,14 @@ def test_recordings_are_what_was_rendered(recording: Path) -> None:
         assert k[0] == 525.0
 
 
-def test_stamps_are_those_of_the_epoch(recording: Path) -> None:
+def test_stamps_begin_at_the_epoch(recording: Path) -> None:
     images = read(recording)["/camera/depth/image_raw"]
     stamps = [m.header.stamp.sec * 1_000_000_000 + m.header.stamp.nanosec for m in images]
 
     assert stamps == [EPOCH_NS, EPOCH_NS + 33_333_333, EPOCH_NS + 66_666_667]
 
 
-def test_transforms_lead_from_map_to_the_camera(recording: Path) -> None:
+def test_transforms_connect_map_and_camera(recording: Path) -> None:
     found = read(recording)
     world = make_scene("tabletop", np.random.default_rng(11), frames=3)
     links = [found["/tf"][2].transforms[0], found["/tf"][2].transforms[1]]
@@ -286,7 +286,7 @@ def test_transforms_lead_from_map_to_the_camera(recording: Path) -> None:
     np.testing.assert_allclose(pose.rotation, world.path[2].rotation, atol=1e-7)
 
 
-def test_truth_counts_the_labelled_pixels(recording: Path) -> None:
+def test_truth_has_pixel_counts_of_labels(recording: Path) -> None:
     truth = json.loads(recording.with_name("demo.truth.json").read_text("utf-8"))
     labels = np.load(recording.with_name("demo.labels.npz"))["labels"]
 
@@ -300,14 +300,14 @@ def test_truth_counts_the_labelled_pixels(recording: Path) -> None:
         assert all(0 < o["visible"] <= 1 for o in frame["objects"])
 
 
-def test_true_boxes_hold_the_points_of_their_object(recording: Path) -> None:
+def test_true_boxes_contain_points_of_their_object(recording: Path) -> None:
     truth = json.loads(recording.with_name("demo.truth.json").read_text("utf-8"))[1]
     world = make_scene("tabletop", np.random.default_rng(11), frames=3)
     frame, labels = render_frame(world, 1, rng=np.random.default_rng(0), sensor=IDEAL)
     for entry in truth["objects"]:
         box = entry["box"]
-        mine = frame.xyz()[labels.reshape(-1) == entry["label"]] - box["center"]
-        local = mine @ rotation_from_quaternion(box["orientation"])
+        own = frame.xyz()[labels.reshape(-1) == entry["label"]] - box["center"]
+        local = own @ rotation_from_quaternion(box["orientation"])
         assert np.all(np.abs(local) < np.array(box["size"]) / 2 + 1e-3)
         center = transform(world.path[1], np.array(box["center"]))
         np.testing.assert_allclose(center, entry["center"], atol=1e-4)
@@ -322,21 +322,21 @@ def digest(path: Path) -> str:
     return total.hexdigest()
 
 
-def test_same_seed_same_messages(tmp_path: Path) -> None:
-    """Fixtures are made anew on every machine: they must not drift."""
+def test_recordings_are_reproducible(tmp_path: Path) -> None:
+    """Every machine generates the fixtures itself: they must be equal."""
     paths = [
         simulate(tmp_path / name, scene="clutter", frames=2, seed=seed)
         for name, seed in (("a", 3), ("b", 3), ("c", 4))
     ]
-    first, again, other = (digest(path) for path in paths)
+    first, second, other = (digest(path) for path in paths)
 
-    assert first == again
+    assert first == second
     assert first != other
     labels = [path.with_name(f"{path.stem}.labels.npz").read_bytes() for path in paths]
     assert labels[0] == labels[1]
 
 
-def test_clouds_are_the_depth_image_in_space(tmp_path: Path) -> None:
+def test_clouds_match_the_depth_image(tmp_path: Path) -> None:
     image = simulate(tmp_path / "d", frames=1, seed=1)
     cloud = simulate(tmp_path / "c", frames=1, seed=1, clouds=True)
     depth = np.frombuffer(read(image)["/camera/depth/image_raw"][0].data, "<u2") / 1000
@@ -348,7 +348,7 @@ def test_clouds_are_the_depth_image_in_space(tmp_path: Path) -> None:
     np.testing.assert_allclose(np.nan_to_num(points[:, 2]), depth, atol=0.00051)
 
 
-def test_an_older_recording_is_replaced(tmp_path: Path) -> None:
+def test_older_recording_is_replaced(tmp_path: Path) -> None:
     for seed in (1, 2):
         simulate(tmp_path / "bag", format="ros2", scene="empty", frames=1, seed=seed)
 
@@ -357,7 +357,7 @@ def test_an_older_recording_is_replaced(tmp_path: Path) -> None:
     assert not [p for p in tmp_path.iterdir() if p.name.startswith(".")]
 
 
-def test_a_place_that_cannot_be_written_is_one_line(tmp_path: Path) -> None:
+def test_unwritable_path_raises_output_error(tmp_path: Path) -> None:
     (tmp_path / "file").write_text("")
 
     with pytest.raises(OutputError, match="cannot write"):
@@ -367,8 +367,8 @@ def test_a_place_that_cannot_be_written_is_one_line(tmp_path: Path) -> None:
 # --- scanned meshes ------------------------------------------------------------------------------
 
 
-def test_real_meshes_stand_upright(real_data: Path) -> None:
-    """Wrongly stood meshes look like a weakness of the model."""
+def test_scanned_meshes_are_placed_upright(real_data: Path) -> None:
+    """Wrong poses would look like a weakness of the model."""
     pytest.importorskip("open3d")
     folder = real_data / "meshes"
     for entry in json.loads((folder / "catalogue.json").read_text("utf-8")):
