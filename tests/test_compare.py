@@ -1,4 +1,4 @@
-"""`shapecat compare` end to end: metrics, the table, the page, clear error messages."""
+"""Tests of `shapecat compare`: metrics, table, page, references and error messages."""
 
 import base64
 import io
@@ -76,7 +76,7 @@ FOUND: list[list[tuple[int | None, list[int], str]]] = [
     [(1, CUP, "cup"), (2, LESS, "can"), (3, BOX, "box")],
     [(4, CUP, "can"), (2, LESS, "can"), (3, BOX, "box"), (None, block(8, 8, 2, 2), "cup")],
 ]
-"""By frame the track, the pixels and the category of the single view of each detection."""
+"""For each frame, the track, the pixels and the single-view category of each detection."""
 FINAL = {1: "cup", 2: "can", 3: "box", 4: "cup"}
 
 
@@ -93,9 +93,9 @@ def write_run(folder: Path, *, digest: str = "one", shift_ns: int = 0) -> Path:
     for k, found in enumerate(FOUND):
         for n, (track, pixels, category) in enumerate(found):
             head = {"topic": "/d", "frame": k, "stamp_ns": stamps[k], "detection": n}
-            sure = [0.8 if name == category else 0.1 for name in NAMES]
+            scores = [0.8 if name == category else 0.1 for name in NAMES]
             box = {"center": [0.1 * n, 0, 1], "size": [0.1, 0.2, 0.3], "orientation": [0, 0, 0, 1]}
-            own = {"indices": pixels, "posterior": sure, "category": category, "confidence": 0.8}
+            own = {"indices": pixels, "posterior": scores, "category": category, "confidence": 0.8}
             rows.append(dict.fromkeys(DETECTIONS.names) | head | box | own)
             if track is not None:
                 tracks.append(dict.fromkeys(TRACKS.names) | head | {"track": track})
@@ -138,7 +138,7 @@ def write_truth(folder: Path) -> Path:
     return folder / "lab.truth.json"
 
 
-def test_a_crowd_of_coco_is_no_object_to_be_named() -> None:
+def test_coco_crowd_has_undecidable_category() -> None:
     """Other tools mark ambiguous objects this way: they count as found, without a category."""
     square = [[1, 0, 3, 0, 3, 2, 1, 2]]
     annotations = [
@@ -159,7 +159,7 @@ def test_a_crowd_of_coco_is_no_object_to_be_named() -> None:
 
 
 @pytest.mark.parametrize("own", [{"track_id": 7}, {"attributes": {"track_id": 7, "x": 3}}])
-def test_tracks_of_coco_are_read_where_tools_write_them(own: dict[str, Any]) -> None:
+def test_coco_tracks_are_read_from_field_or_attribute(own: dict[str, Any]) -> None:
     """CVAT writes them as an attribute. If one object has none, identities are not judged."""
     item = {"id": 1, "image_id": 2, "category_id": 4, "segmentation": [[1, 0, 3, 0, 3, 2, 1, 2]]}
     images = [{"id": 2, "frame": 5, "width": 4, "height": 3}]
@@ -183,7 +183,7 @@ def truth(tmp_path: Path) -> Path:
     return write_truth(tmp_path)
 
 
-def test_figures_are_those_by_hand(run: Path, truth: Path) -> None:
+def test_metrics_match_hand_calculation(run: Path, truth: Path) -> None:
     """Cup 20 pixels; can 16, of which 12 are found; box 15; one miss; 2 labelled surplus."""
     figures = compare(run, truth).figures
     shared, found, true = 3 * 20 + 3 * 12 + 2 * 15, 3 * 20 + 3 * 12 + 2 * 15 + 2, 3 * (20 + 16 + 15)
@@ -192,7 +192,7 @@ def test_figures_are_those_by_hand(run: Path, truth: Path) -> None:
     assert figures["overlap"]["precision"] == pytest.approx(shared / found, abs=1e-4)
     assert figures["objects"] == {"true": 9, "detections": 9, "found": 8, "share_found": 0.8889}
     category = figures["category"]
-    assert category["n"] == 6  # the box in doubt is not asked for
+    assert category["n"] == 6  # the ambiguous box does not count
     assert category["accuracy"] == 0.5  # cups right, the box always a can
     assert category["view_accuracy"] == pytest.approx(2 / 6, abs=1e-4)
     assert (category["balanced"], category["view_balanced"]) == (0.5, 0.3333)
@@ -204,10 +204,8 @@ def test_figures_are_those_by_hand(run: Path, truth: Path) -> None:
     assert tracking["idf1"] == pytest.approx(2 * 7 / (9 + 8), abs=1e-4)
 
 
-def test_a_detection_of_an_object_too_small_to_be_listed_is_not_false(
-    run: Path, truth: Path
-) -> None:
-    """The simulator lists objects with few visible pixels apart; detection may find them."""
+def test_detection_of_hidden_object_is_not_false(run: Path, truth: Path) -> None:
+    """The simulator lists objects with few visible pixels as hidden; detection may find them."""
     before = compare(run, truth).figures["objects"]
     content = json.loads(truth.read_text())
     for entry in content:
@@ -221,33 +219,31 @@ def test_a_detection_of_an_object_too_small_to_be_listed_is_not_false(
 
 
 @pytest.mark.parametrize(("beside", "kept"), [(2, [10, 11, 12]), (3, None)])
-def test_a_detection_is_left_out_if_most_of_it_is_ignored(
-    beside: int, kept: list[int] | None
-) -> None:
-    """One that merely touches an object of a few pixels is judged by its other pixels."""
+def test_detection_is_left_out_if_mostly_ignored(beside: int, kept: list[int] | None) -> None:
+    """One that merely touches an ignored object is compared by its other pixels."""
     ignored = np.zeros(SIDE * SIDE, bool)
     ignored[13 : 13 + beside] = True
     true = Labelling((), ~ignored, (SIDE, SIDE), ignored)
     item = LabelledItem(1, "cup", np.arange(13 + beside - 5, 13 + beside))
-    left = _labelled_part(Labelling((item,)), true, ("/d", 0)).items
+    rest = _labelled_part(Labelling((item,)), true, ("/d", 0)).items
 
-    assert [known.pixels.tolist() for known in left if known.pixels is not None] == (
+    assert [known.pixels.tolist() for known in rest if known.pixels is not None] == (
         [] if kept is None else [kept]
     )
 
 
-def test_the_table_tells_every_difference_once(shapecat: Run, run: Path, truth: Path) -> None:
+def test_table_lists_every_difference_once(shapecat: Run, run: Path, truth: Path) -> None:
     out = run.parent / "out"
     result = shapecat("compare", run, truth, "--out", out)
 
     assert result.exit_code == 0, result.stderr
     rows = pq.read_table(out / "objects.parquet").to_pylist()
-    told = [
+    listed = [
         (r["frame"], r["difference"], r["true_category"], r["category"], r["track"])
         for r in rows
         if r["difference"]
     ]
-    assert sorted(told, key=str) == sorted(
+    assert sorted(listed, key=str) == sorted(
         [
             (0, "category", "box", "can", 2),
             (0, "missed", "box", None, None),
@@ -272,7 +268,7 @@ def test_the_table_tells_every_difference_once(shapecat: Run, run: Path, truth: 
     assert "the recording is missing" in result.stderr
 
 
-def test_an_identity_is_lost_once() -> None:
+def test_identity_switch_is_counted_once() -> None:
     """After the frame of the switch, the new track counts as the object's own."""
     tally, cup = _Tally(), LabelledItem(11, "cup")
     kinds = [_kind(tally, LabelledItem(track, "cup"), cup, 0.9) for track in (5, 5, 6, 6, 6, 5, 5)]
@@ -280,13 +276,13 @@ def test_an_identity_is_lost_once() -> None:
     assert kinds == [None, None, "identity", None, None, "identity", None]
 
 
-def test_the_page_has_each_figure_in_its_place(run: Path, truth: Path) -> None:
+def test_page_has_each_metric_in_its_place(run: Path, truth: Path) -> None:
     """The metrics are those above; the table has the tracks of the run, not of the truth."""
     found = compare(run, truth)
     values = {name.strip(): (value, meaning) for name, value, meaning in figure_rows(found)}
     rows = re.findall(r"<tr>(.*?)</tr>", format_page(found))
     cells = [re.findall(r"<td>(.*?)</td>", row) for row in rows]
-    told = {(row[0], row[1]): row[2:] for row in cells if len(row) == 8}
+    listed = {(row[0], row[1]): row[2:] for row in cells if len(row) == 8}
 
     assert values["frames"] == ("3", "the same in both")
     assert values["objects found"] == ("88.9 %", "8 of 9; 9 detections")
@@ -296,9 +292,9 @@ def test_the_page_has_each_figure_in_its_place(run: Path, truth: Path) -> None:
     assert values["calibration error"][0] == "0.467"
     assert values["MOTA"] == ("0.778", "1 miss, 0 false positives, 1 identity switch")
     assert values["IDF1"][0] == "0.824"
-    assert told["0", "missed box"] == ["box", "", "", "", "", ""]
-    assert told["2", "cup now #4"] == ["cup", "cup", "#4", "0.90", "1.00", ""]
-    assert told["1", "box taken for can #2"] == ["box", "can", "#2", "0.90", "0.86", ""]
+    assert listed["0", "missed box"] == ["box", "", "", "", "", ""]
+    assert listed["2", "cup now #4"] == ["cup", "cup", "#4", "0.90", "1.00", ""]
+    assert listed["1", "box taken for can #2"] == ["box", "can", "#2", "0.90", "0.86", ""]
 
 
 def worked() -> Comparison:
@@ -366,10 +362,10 @@ FIGURES = [
 ]  # fmt: skip
 
 
-def test_the_command_prints_each_figure_under_its_name(
+def test_command_prints_each_metric_under_its_name(
     capsys: pytest.CaptureFixture[str],
 ) -> None:
-    """A swapped pair of numbers or words is still a plausible table."""
+    """A table with swapped numbers or words would look plausible."""
     found = worked()
     import_module("shapecat.cli.compare")._print(found, figure_rows(found))
     printed = capsys.readouterr()
@@ -382,7 +378,7 @@ def test_the_command_prints_each_figure_under_its_name(
     assert printed.err == "The pictures lack depth: it <is> gone\n"
 
 
-def test_a_page_without_differences_says_so_and_has_no_empty_table() -> None:
+def test_page_without_differences_has_no_empty_table() -> None:
     same = tuple(row for row in worked().rows if not row.difference)
     page = format_page(replace(worked(), rows=same, pictures=()))
 
@@ -391,8 +387,8 @@ def test_a_page_without_differences_says_so_and_has_no_empty_table() -> None:
     assert page.count("<table>") == 1
 
 
-def test_the_page_shows_each_number_once_and_in_its_place() -> None:
-    """All visible content, in order: text, tables, and captions in the picture."""
+def test_page_shows_all_content_in_its_place() -> None:
+    """The content is text, tables, and captions in the picture."""
     page = format_page(worked())
     figures, rows = (
         [re.findall(r"<t[hd]>(.*?)</t[hd]>", row) for row in re.findall(r"<tr>(.*?)</tr>", table)]
@@ -431,7 +427,7 @@ def test_the_page_shows_each_number_once_and_in_its_place() -> None:
         (str(COLOURS["surplus"]), "surplus: only in the run, or on another object"),
         (str(COLOURS["category"]), "wrong category"),
     ]
-    # Letters of a fixed size would hide a small picture.
+    # Text of a fixed size would hide a small picture.
     assert '<svg viewBox="0 0 300 200" style="font-size:7.0px"' in svg
     assert 'href="data:image/png;base64,AA" width="300" height="200"' in svg
     assert re.findall(r'<text x="(.*?)" y="(.*?)">(.*?)</text>', svg) == [
@@ -442,19 +438,19 @@ def test_the_page_shows_each_number_once_and_in_its_place() -> None:
     ) == 2  # fmt: skip
 
 
-def test_the_table_has_each_number_in_its_column(tmp_path: Path) -> None:
+def test_table_has_each_number_in_its_column(tmp_path: Path) -> None:
     """Other programs read the table by its column names."""
     found = worked()
     write_comparison(tmp_path / "out", found)
     rows = pq.read_table(tmp_path / "out" / "objects.parquet").to_pylist()
-    told = json.loads((tmp_path / "out" / "comparison.json").read_text("utf-8"))
+    content = json.loads((tmp_path / "out" / "comparison.json").read_text("utf-8"))
 
     assert rows == [pytest.approx(row._asdict()) for row in found.rows]
-    assert list(told) == [
+    assert list(content) == [
         "run", "reference", "kind", *found.figures, "differences", "notes"
     ]  # fmt: skip
-    assert told["tracking"] == found.figures["tracking"]
-    assert told["notes"] == list(found.notes)
+    assert content["tracking"] == found.figures["tracking"]
+    assert content["notes"] == list(found.notes)
 
 
 @pytest.mark.parametrize(
@@ -465,7 +461,7 @@ def test_the_table_has_each_number_in_its_column(tmp_path: Path) -> None:
         (f"12_{START}_5.png", ("/d", 99)),
     ],
 )
-def test_an_image_is_of_the_frame_that_its_name_says(name: str, key: tuple[str, int]) -> None:
+def test_frame_of_image_is_read_from_its_name(name: str, key: tuple[str, int]) -> None:
     """Names may begin with session and camera numbers; a timestamp is recognised by its size."""
     images = [{"id": 1, "file_name": name, "width": 4, "height": 3}]
     labels = CocoLabels(Path("x.json"), {"categories": [], "annotations": [], "images": images})
@@ -474,7 +470,7 @@ def test_an_image_is_of_the_frame_that_its_name_says(name: str, key: tuple[str, 
     assert [labels.at(("/d", k), 0) is None for k in (1, 2, 5, 7)] == [True] * 4
 
 
-def test_truth_of_every_other_frame_is_that_of_the_same_image(tmp_path: Path) -> None:
+def test_truth_skips_label_images_of_missing_frames(tmp_path: Path) -> None:
     """A run of every n-th frame must skip label images, which are read sequentially."""
     images = np.zeros((6, 3, 4), np.uint8)
     for k in range(6):
@@ -495,7 +491,7 @@ def test_truth_of_every_other_frame_is_that_of_the_same_image(tmp_path: Path) ->
         ]
 
 
-def test_the_picture_of_a_part_is_that_of_its_worst_frame() -> None:
+def test_picture_of_each_part_shows_its_worst_frame() -> None:
     """Of the frames in a twelfth of the run, the one with most differences is shown."""
     masks = np.arange(0, 20), np.arange(40, 90)
     tally = _Tally()
@@ -517,13 +513,13 @@ def half_spaces(box: Box) -> np.ndarray:
     return np.column_stack([normals, offsets])
 
 
-def test_overlap_of_turned_boxes_is_that_of_their_half_spaces() -> None:
+def test_iou_of_rotated_boxes_matches_half_space_intersection() -> None:
     """Boxes rotated about any axis, some of them disjoint, compared with SciPy."""
     rng, met = np.random.default_rng(5), 0
     for _ in range(60):
         a, b = (
-            Box(rng.uniform(-0.2, 0.2, 3), rng.uniform(0.1, 0.6, 3), turn)
-            for turn in Rotation.random(2, random_state=rng).as_quat()
+            Box(rng.uniform(-0.2, 0.2, 3), rng.uniform(0.1, 0.6, 3), quaternion)
+            for quaternion in Rotation.random(2, random_state=rng).as_quat()
         )
         sides = np.concatenate([half_spaces(a), half_spaces(b)])
         wide = np.column_stack([sides[:, :3], np.ones(12)])
@@ -539,7 +535,7 @@ def test_overlap_of_turned_boxes_is_that_of_their_half_spaces() -> None:
     assert 30 < met < 60
 
 
-def test_shares_of_an_overlap_are_of_their_own_counts() -> None:
+def test_overlap_fractions_use_their_own_counts() -> None:
     overlap = Overlap(30, 50, 40, 2, 5, 7) + Overlap(12, 13, 60, 1, 3, 2)
 
     assert overlap == Overlap(42, 63, 100, 3, 8, 9)
@@ -557,8 +553,8 @@ def test_each_part_of_the_run_has_one_picture(
     assert [picture.frame for picture in compare(run, truth).pictures] == [0, 2]
 
 
-def test_captions_are_above_the_middle_of_their_objects() -> None:
-    """Objects without a track are alike, so each is known by its place among the rows."""
+def test_captions_are_centred_above_their_objects() -> None:
+    """Objects without a track are identified by the order of the rows."""
     found = (
         LabelledItem(4, "cup", np.array(block(2, 5, 3, 4))),
         LabelledItem(None, "can", np.array(block(0, 0, 2, 1))),
@@ -586,8 +582,8 @@ def test_captions_are_above_the_middle_of_their_objects() -> None:
     ]
 
 
-def test_depth_behind_the_masks_is_bright_where_it_is_near_and_faces_the_camera() -> None:
-    """Half of the image is at 1 m, half at 2 m; without a reading it is nearly black."""
+def test_near_surfaces_that_face_the_camera_are_bright() -> None:
+    """Half of the image is at 1 m, half at 2 m; missing depth is nearly black."""
     depth = np.full((6, 40), 1.0, np.float32)
     depth[:, 20:], depth[:, 38:] = 2.0, 0.0
     frame = Frame("/d", 0, 0, 0, "c", depth=depth, camera=Camera(40, 6, 300, 300, 20, 3))
@@ -607,13 +603,13 @@ def test_depth_behind_the_masks_is_bright_where_it_is_near_and_faces_the_camera(
 
 
 @pytest.mark.parametrize(("shift", "iou"), [(0.2, 1 / 3), (0.23, 17 / 63), (0.25, None)])
-def test_boxes_are_matched_from_a_quarter_of_overlap_on(shift: float, iou: float | None) -> None:
+def test_boxes_are_matched_from_iou_of_a_quarter(shift: float, iou: float | None) -> None:
     """Hidden sides are estimates, so the limit is lower than for masks. Boxes have no F."""
-    size, still = np.array([0.4, 0.2, 0.3]), np.array([0, 0, 0, 1])
-    found = [LabelledItem(5, "cup", box=Box(np.array([0.1 + shift, 0.2, 1]), size, still))]
+    size, level = np.array([0.4, 0.2, 0.3]), np.array([0, 0, 0, 1])
+    found = [LabelledItem(5, "cup", box=Box(np.array([0.1 + shift, 0.2, 1]), size, level))]
     true = [
         LabelledItem(None, "can"),
-        LabelledItem(1, "cup", box=Box(np.array([0.1, 0.2, 1]), size, still)),
+        LabelledItem(1, "cup", box=Box(np.array([0.1, 0.2, 1]), size, level)),
     ]
     matched = match_objects(found, true)
 
@@ -622,18 +618,20 @@ def test_boxes_are_matched_from_a_quarter_of_overlap_on(shift: float, iou: float
     assert iou is None or matched.similarity.tolist()[0] == pytest.approx([0, iou])
 
 
-def test_truth_of_another_recording_is_doubted(shapecat: Run, run: Path, truth: Path) -> None:
-    """Simulated recordings have the same stamps, so a mistaken file gives figures of nothing."""
+def test_truth_that_matches_no_detection_gives_a_warning(
+    shapecat: Run, run: Path, truth: Path
+) -> None:
+    """Simulated recordings have equal stamps, so a wrong file would give meaningless metrics."""
     assert "of the same recording?" not in shapecat("compare", run, truth).output
 
     image = np.full(SIDE * SIDE, 3, np.uint8)
-    image[block(6, 4, 3, 2)] = 7  # where the run has nothing
+    image[block(6, 4, 3, 2)] = 7  # where the run has no detection
     np.savez(truth.with_name("lab.labels.npz"), labels=np.stack([image.reshape(10, 10)] * 3))
     assert f"is {truth} of the same recording?" in shapecat("compare", run, truth).output
 
 
-def test_an_object_with_a_wrong_category_is_found_nevertheless() -> None:
-    """Without masks, what is found is counted by the differences."""
+def test_object_with_wrong_category_counts_as_found() -> None:
+    """Without masks, the differences determine what is found."""
     kinds = [None, "category", "identity", "missed", "missed", "surplus", "missed", "surplus"]
     ious = [0.5, 0.0, *[None] * 6]  # boxes beside each other count, too
     rows = [
@@ -647,18 +645,16 @@ def test_an_object_with_a_wrong_category_is_found_nevertheless() -> None:
     assert figures["box_iou"] == {"n": 2, "mean": 0.25}
 
 
-def test_the_labels_of_a_frame_are_those_of_its_own_topic_and_stamp() -> None:
-    """Labels without a topic, or by frame number, serve where there are no better ones."""
+def test_labels_of_frame_match_its_topic_and_stamp() -> None:
+    """Labels without a topic, or by frame number, count only if there are no better ones."""
     frames = {(None, 5): "any", ("/d", 5): "own", ("/d", START): "stamp", (None, START): "old"}
     asked = ((("/d", 5), START), (("/e", 5), START), (("/d", 5), 1), (("/e", 5), 1), (("/e", 6), 1))
 
     assert [find_frame(frames, *place) for place in asked] == ["stamp", "old", "own", "any", None]
 
 
-def test_frames_of_one_side_alone_are_told_with_that_side(
-    shapecat: Run, run: Path, truth: Path
-) -> None:
-    """Swapped, they would send the user looking for the gap in the wrong run."""
+def test_unmatched_frames_are_reported_by_side(shapecat: Run, run: Path, truth: Path) -> None:
+    """Swapped, they would make the user search for the gap in the wrong run."""
     entries = json.loads(truth.read_text())
     later = [{**entries[0], "stamp_ns": START + STEP * k} for k in (5, 6, 7, 8)]
     truth.write_text(json.dumps([*entries[:2], *later]))
@@ -666,25 +662,25 @@ def test_frames_of_one_side_alone_are_told_with_that_side(
     assert "1 only in the run, 4 only in the reference" in shapecat("compare", run, truth).stdout
 
 
-def test_an_object_in_doubt_has_no_wrong_category(run: Path, truth: Path) -> None:
+def test_ambiguous_object_has_no_wrong_category(run: Path, truth: Path) -> None:
     """From this side the category is undecidable, so no answer counts as a difference."""
     table = run / "tracks.csv"
     table.write_text(table.read_text().replace("3,box,0.9,", "3,can,0.9,"))
 
-    assert compare(run, truth).as_dict()["differences"]["category"] == 3  # those of the sure box
+    assert compare(run, truth).as_dict()["differences"]["category"] == 3  # those of the other box
 
 
 @pytest.mark.parametrize("overlaps", [(0.2, 0.8), (0.8, 0.2)])
-def test_a_track_in_two_pieces_is_judged_by_the_better_one(overlaps: tuple[float, float]) -> None:
-    """Otherwise a fragment would cost a found object its identity."""
-    pieces = [LabelledItem(5, "cup"), LabelledItem(None, "cup"), LabelledItem(5, "cup")]
+def test_track_with_two_detections_uses_the_better_one(overlaps: tuple[float, float]) -> None:
+    """Otherwise a fragment could change the identity of a found object."""
+    detections = [LabelledItem(5, "cup"), LabelledItem(None, "cup"), LabelledItem(5, "cup")]
     similarity = np.array([[overlaps[0]], [0.9], [overlaps[1]]])
-    seen = seen_together(pieces, [LabelledItem(1, "cup")], Matched({}, similarity, None, None))
+    frame = seen_together(detections, [LabelledItem(1, "cup")], Matched({}, similarity, None, None))
 
-    assert (seen.true, seen.found, seen.similarity.tolist()) == ([1], [5], [[0.8]])
+    assert (frame.true, frame.found, frame.similarity.tolist()) == ([1], [5], [[0.8]])
 
 
-def test_nothing_is_replaced(shapecat: Run, run: Path, truth: Path) -> None:
+def test_existing_output_folder_is_not_replaced(shapecat: Run, run: Path, truth: Path) -> None:
     (run.parent / "out").mkdir()
     (run.parent / "out" / "mine.txt").write_text("mine")
     result = shapecat("compare", run, truth, "--out", run.parent / "out")
@@ -694,7 +690,7 @@ def test_nothing_is_replaced(shapecat: Run, run: Path, truth: Path) -> None:
 
 
 @pytest.mark.skipif(not SCORER.exists(), reason="the other scorer is not on this machine")
-def test_figures_are_those_of_another_scorer(run: Path, truth: Path) -> None:
+def test_metrics_match_another_scorer(run: Path, truth: Path) -> None:
     labels = truth.with_name("lab.labels.npz")
     command = [sys.executable, SCORER, run / "detections.parquet", labels, truth, "--json"]
     done = subprocess.run(list(map(str, command)), check=True, capture_output=True, text=True)
@@ -709,9 +705,7 @@ def test_figures_are_those_of_another_scorer(run: Path, truth: Path) -> None:
     assert ours["category"]["view_balanced"] == pytest.approx(theirs["category"]["balanced"], 1e-3)
 
 
-def test_a_run_differs_from_itself_in_nothing_and_from_a_corrected_one_in_the_labels(
-    shapecat: Run, run: Path
-) -> None:
+def test_run_differs_from_corrected_run_only_in_labels(shapecat: Run, run: Path) -> None:
     same = json.loads(shapecat("compare", run, run, "--json").stdout)
     assert (same["overlap"]["f"], same["differences"]) == (1, {})
     assert same["box_iou"] == {"n": 9, "mean": 1}
@@ -721,12 +715,12 @@ def test_a_run_differs_from_itself_in_nothing_and_from_a_corrected_one_in_the_la
     (other / "tracks.csv").write_text(text.replace("2,can,0.9,", "2,can,0.9,box") + "delete")
     changed = json.loads(shapecat("compare", run, other, "--json").stdout)
     assert changed["differences"] == {"category": 3, "surplus": 1}
-    # What is found is a share of the true objects, not of the detections.
+    # The fraction found is of the true objects, not of the detections.
     assert changed["objects"] == {"true": 8, "detections": 9, "found": 8, "share_found": 1}
 
 
-def test_tracks_that_a_person_has_merged_are_one(run: Path, truth: Path) -> None:
-    """Whoever mended a broken track would still be told of the switch."""
+def test_merged_tracks_have_one_identity(run: Path, truth: Path) -> None:
+    """The switch of a track that the user has repaired must not be reported."""
     text = (run / "tracks.csv").read_text()
     (run / "tracks.csv").write_text(text.replace("4,cup,0.9,", "4,cup,0.9,merge with 1"))
 
@@ -737,7 +731,7 @@ def test_tracks_that_a_person_has_merged_are_one(run: Path, truth: Path) -> None
     assert "identity" not in {row.difference for row in found.rows}
 
 
-def test_coco_masks_in_all_forms_are_compared(shapecat: Run, run: Path) -> None:
+def test_coco_masks_are_read_in_all_forms(shapecat: Run, run: Path) -> None:
     """A polygon, run lengths, and compressed run lengths of the same cup; stamps in the names."""
     mask = np.zeros(100, np.bool_)
     mask[CUP] = True
@@ -771,7 +765,7 @@ def test_coco_masks_in_all_forms_are_compared(shapecat: Run, run: Path) -> None:
 
 
 def compressed(counts: list[int]) -> str:
-    """Write run lengths as pycocotools does (rleToString in maskApi.c)."""
+    """Return run lengths in the format of pycocotools (rleToString in maskApi.c)."""
     text = ""
     for k, count in enumerate(counts):
         value = count - (counts[k - 2] if k > 2 else 0)
@@ -784,7 +778,7 @@ def compressed(counts: list[int]) -> str:
     return text
 
 
-def test_run_lengths_survive_the_compressed_form() -> None:
+def test_compressed_run_lengths_are_decoded() -> None:
     """Long, short and falling run lengths: differences of both signs, several letters."""
     counts = [3, 40, 1000, 5, 7, 900, 2, 1, 42]
     expected = rle_mask(counts, 40, 50)
@@ -795,7 +789,7 @@ def test_run_lengths_survive_the_compressed_form() -> None:
         rle_mask([1999], 40, 50)
 
 
-def test_a_slanted_polygon_has_its_area() -> None:
+def test_filled_polygon_has_its_area() -> None:
     mask = filled_polygon(np.array([[3.0, 2.0], [40.0, 10.0], [12.0, 35.0]]), 50, 60)
 
     assert mask.sum() == pytest.approx(abs(37 * 33 - 9 * 8) / 2, rel=0.02)
@@ -803,10 +797,10 @@ def test_a_slanted_polygon_has_its_area() -> None:
     assert not mask[30, 30]
 
 
-def test_kitti_boxes_come_back_from_a_tilted_camera(
+def test_kitti_boxes_of_tilted_camera_survive_export_and_reading(
     shapecat: Run, guessed_run: Path, tmp_path: Path
 ) -> None:
-    """Boxes survive export and re-reading: a wrong axis or half a height would cost overlap."""
+    """A wrong axis or half a height would reduce the overlap."""
     done = shapecat("export", guessed_run, "--format", "kitti", "--out", tmp_path / "kitti")
     assert done.exit_code == 0, done.stderr
     labels = next((tmp_path / "kitti").iterdir())
@@ -818,8 +812,8 @@ def test_kitti_boxes_come_back_from_a_tilted_camera(
     assert found["box_iou"]["mean"] > 0.995
 
 
-def test_types_of_kitti_are_the_categories_of_the_run(run: Path) -> None:
-    """A type cannot hold spaces, so an underscore may be either."""
+def test_kitti_types_match_categories_of_run(run: Path) -> None:
+    """A type cannot contain spaces, so an underscore may stand for one."""
     table = run / "tracks.csv"
     text = table.read_text().replace("1,cup,0.9,", "1,cup,0.9,wine_glass")
     table.write_text(text.replace("2,can,0.9,", "2,can,0.9,tea pot"))
@@ -835,7 +829,7 @@ def test_types_of_kitti_are_the_categories_of_the_run(run: Path) -> None:
     assert found.as_dict()["differences"] == {}
 
 
-def test_regions_that_kitti_does_not_care_about_are_no_objects(tmp_path: Path) -> None:
+def test_kitti_dont_care_regions_are_no_objects(tmp_path: Path) -> None:
     """Lines as in KITTI's own data, which has neither frames.csv nor spaces in types."""
     (tmp_path / "label_2").mkdir()
     lines = (
@@ -884,8 +878,8 @@ def test_labels_of_two_topics_are_not_mixed(tmp_path: Path) -> None:
     np.testing.assert_allclose([box.center, box.size], [[1, 1.85, 4], [0.5, 0.1, 0.3]], rtol=1e-6)
 
 
-def test_labels_of_a_single_topic_fit_a_recording_that_names_it_otherwise(tmp_path: Path) -> None:
-    """The stamp is enough; a frame number that equals one of the other recording is not."""
+def test_labels_of_single_topic_fit_a_renamed_topic(tmp_path: Path) -> None:
+    """An equal stamp is enough, an equal frame number is not."""
     (tmp_path / "label_2").mkdir()
     for name in ("000003", "000004"):
         (tmp_path / "label_2" / f"{name}.txt").write_text(
@@ -908,7 +902,7 @@ def refused(shapecat: Run, *words: object) -> tuple[int, str]:
     return result.exit_code, result.stderr
 
 
-def test_refusals_say_what_was_found_and_what_to_try(
+def test_errors_are_one_line_with_reason_and_exit_code(
     shapecat: Run, run: Path, truth: Path, tmp_path: Path
 ) -> None:
     half = shutil.copytree(run, tmp_path / "half")
@@ -933,7 +927,7 @@ def test_refusals_say_what_was_found_and_what_to_try(
         assert text in refused(shapecat, *words)[1]
 
 
-def test_a_part_split_off_is_seen_in_the_picture() -> None:
+def test_split_object_is_visible_in_the_picture() -> None:
     """With unions of masks, an object in two halves would look correct."""
     true = Labelling((LabelledItem(1, "cup", np.arange(0, 60)),), None, (10, 10))
     halves = (LabelledItem(5, "can", np.arange(0, 40)), LabelledItem(6, "cup", np.arange(40, 70)))
@@ -951,8 +945,8 @@ def test_a_part_split_off_is_seen_in_the_picture() -> None:
     assert len(np.unique(pixels, axis=0)) == 3
 
 
-def test_the_tint_of_an_object_is_that_of_its_own_difference() -> None:
-    """Found and true objects come in different orders."""
+def test_tint_of_object_shows_its_own_difference() -> None:
+    """Found and true objects may be in different order."""
     true = Labelling(
         (LabelledItem(1, "cup", np.arange(60, 90)), LabelledItem(2, "box", np.arange(0, 40)))
     )

@@ -1,4 +1,4 @@
-"""Evaluation: metrics compared with scikit-learn, and reports from a data set folder."""
+"""Tests of evaluation: metrics, training and reports on a data set folder, and pages."""
 
 import json
 import math
@@ -45,8 +45,8 @@ from shapecat.evaluation.views import DescribedView, DescribedViews, describe_vi
 from shapecat.learning import Categorizer, load_model
 
 
-def test_the_calibration_error_weighs_bins_by_their_views() -> None:
-    """Three views of which two are right at 0.9, one that is wrong at 0.6."""
+def test_calibration_error_weights_bins_by_views() -> None:
+    """Two of three views are right at 0.9; one view is wrong at 0.6."""
     posteriors = np.array([[0.9, 0.1], [0.1, 0.9], [0.9, 0.1], [0.6, 0.4]])
     truth = np.array([0, 1, 1, 1])
 
@@ -78,16 +78,16 @@ def test_metrics_agree_with_scikit_learn(n: int, categories: int, seed: int) -> 
 
 def test_calibration_error_of_known_cases() -> None:
     """Over- and under-confidence count alike, and confidence 1 belongs to the last bin."""
-    sure = np.array([[1.0, 0.0]] * 10)
-    assert metrics.expected_calibration_error(np.zeros(10, int), sure) == 0
-    assert metrics.expected_calibration_error(np.ones(10, int), sure) == 1
-    unsure = np.array([[0.6, 0.4]] * 10)
-    assert metrics.expected_calibration_error(np.zeros(10, int), unsure) == pytest.approx(0.4)
+    certain = np.array([[1.0, 0.0]] * 10)
+    assert metrics.expected_calibration_error(np.zeros(10, int), certain) == 0
+    assert metrics.expected_calibration_error(np.ones(10, int), certain) == 1
+    uncertain = np.array([[0.6, 0.4]] * 10)
+    assert metrics.expected_calibration_error(np.zeros(10, int), uncertain) == pytest.approx(0.4)
     half = np.repeat([0, 1], [6, 4])
-    assert metrics.expected_calibration_error(half, unsure) == pytest.approx(0)
+    assert metrics.expected_calibration_error(half, uncertain) == pytest.approx(0)
 
 
-def test_metrics_of_nothing_are_undefined_not_errors() -> None:
+def test_metrics_of_empty_input_are_nan() -> None:
     nothing = np.zeros(0, np.int64)
 
     assert np.isnan(metrics.accuracy(nothing, nothing))
@@ -96,7 +96,7 @@ def test_metrics_of_nothing_are_undefined_not_errors() -> None:
     assert np.isnan(metrics.auroc(np.zeros(0), np.ones(2)))
 
 
-def test_a_category_without_views_does_not_count() -> None:
+def test_balanced_accuracy_ignores_categories_without_views() -> None:
     """A mean over categories with 0 of 0 right would be NaN."""
     table = np.array([[3, 1, 0], [0, 2, 0], [0, 0, 0]])
 
@@ -107,7 +107,7 @@ def test_a_category_without_views_does_not_count() -> None:
 
 
 def half_of(shape: str, size: float, rng: np.random.Generator) -> F4:
-    """Return points on the side of a ball or box that is seen from +x, +y and above."""
+    """Return points on the side of a ball or box that is visible from +x, +y and above."""
     points = rng.normal(size=(12_000, 3))
     if shape == "ball":
         points /= np.linalg.norm(points, axis=1, keepdims=True)
@@ -115,8 +115,8 @@ def half_of(shape: str, size: float, rng: np.random.Generator) -> F4:
         points /= np.abs(points).max(axis=1, keepdims=True)
         points[:, 2] *= {"box": 1.0, "plate": 0.1, "post": 2.5}[shape]
     points = points * size + [0, 0, np.abs(points[:, 2]).max() * size]
-    seen = (points - points.mean(axis=0)) @ np.array([1, 1, 1.2]) > 0
-    noisy: F4 = points[seen] + rng.normal(size=(int(seen.sum()), 3)) * 5e-4
+    visible = (points - points.mean(axis=0)) @ np.array([1, 1, 1.2]) > 0
+    noisy: F4 = points[visible] + rng.normal(size=(int(visible.sum()), 3)) * 5e-4
     return noisy.astype(np.float32)
 
 
@@ -144,8 +144,8 @@ def trained(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return folder / "model.npz"
 
 
-def test_a_folder_is_learned_and_judged(trained: Path, tmp_path: Path) -> None:
-    """The loop a user closes with corrected crops, on instances never seen."""
+def test_model_is_trained_and_evaluated_on_folders(trained: Path, tmp_path: Path) -> None:
+    """Users do this with corrected crops; the instances of the evaluation are new."""
     dataset = write_dataset(tmp_path / "data", ("box", "ball", "unknown"), instances=3, seed=9)
     report = evaluate_folder(dataset, trained)
     values = json.loads(json.dumps(report.as_dict()))
@@ -164,17 +164,17 @@ def test_a_folder_is_learned_and_judged(trained: Path, tmp_path: Path) -> None:
     assert max(map(len, text.splitlines())) <= 100
 
 
-def test_the_same_folder_gives_the_same_model(trained: Path, tmp_path: Path) -> None:
-    again = train_on_folder(trained.parent / "data", tmp_path / "again.npz", seed=1)
+def test_training_on_folder_is_reproducible(trained: Path, tmp_path: Path) -> None:
+    second = train_on_folder(trained.parent / "data", tmp_path / "again.npz", seed=1)
 
-    assert again["model"] == load_model(trained).model_id
+    assert second["model"] == load_model(trained).model_id
     assert (tmp_path / "again.npz").read_bytes() == trained.read_bytes()
 
 
-def test_a_model_is_calibrated_on_instances_it_had_not_seen(
+def test_model_is_calibrated_on_held_out_instances(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """The written model has seen all, so it takes what was measured before it was trained."""
+    """The saved model is trained on all, so it has the calibration of an earlier model."""
     made: list[Categorizer] = []
 
     def fit(*views: DescribedViews, **options: Any) -> Categorizer:
@@ -185,15 +185,15 @@ def test_a_model_is_calibrated_on_instances_it_had_not_seen(
     dataset = write_dataset(tmp_path / "data", ("box", "ball", "unknown"), instances=2)
     train_on_folder(dataset, tmp_path / "m.npz")
 
-    judged, whole = made
+    partial, whole = made
     model = load_model(tmp_path / "m.npz")
-    assert (model.temperature, model.threshold) == (judged.temperature, judged.threshold)
-    assert judged.temperature != whole.temperature
-    assert judged.threshold != whole.threshold
+    assert (model.temperature, model.threshold) == (partial.temperature, partial.threshold)
+    assert partial.temperature != whole.temperature
+    assert partial.threshold != whole.threshold
 
 
-def test_a_category_is_added(trained: Path, tmp_path: Path) -> None:
-    """Crops of unknown objects lie beside those of the new category, but are none."""
+def test_new_category_is_learned_from_folder(trained: Path, tmp_path: Path) -> None:
+    """Crops of unknown objects beside those of the new category are no category."""
     dataset = write_dataset(tmp_path / "new", ("plate", "unknown"))
     learn_on_folder(trained, dataset, tmp_path / "m.npz")
     test = write_dataset(tmp_path / "test", ("box", "ball", "plate"), instances=3, seed=5)
@@ -205,35 +205,35 @@ def test_a_category_is_added(trained: Path, tmp_path: Path) -> None:
     assert report.accuracy > 0.9
 
 
-def test_nothing_new_is_said(trained: Path, tmp_path: Path) -> None:
+def test_learning_without_new_category_raises(trained: Path, tmp_path: Path) -> None:
     dataset = write_dataset(tmp_path / "data", ("box",), instances=1)
 
     with pytest.raises(ModelError, match="already knows all its categories"):
         learn_on_folder(trained, dataset, tmp_path / "m.npz")
 
 
-def test_a_strange_category_is_named(trained: Path, tmp_path: Path) -> None:
-    """Counted as wrong, it would spoil the figures in silence."""
+def test_evaluation_on_untrained_category_raises(trained: Path, tmp_path: Path) -> None:
+    """Counted as wrong, it would distort the metrics without notice."""
     dataset = write_dataset(tmp_path / "data", ("plate",), instances=1)
 
     with pytest.raises(ModelError, match="does not know plate"):
         evaluate_folder(dataset, trained)
 
 
-def test_one_category_is_no_model(tmp_path: Path) -> None:
+def test_training_needs_two_categories(tmp_path: Path) -> None:
     dataset = write_dataset(tmp_path / "data", ("box", "unknown"), instances=1)
 
     with pytest.raises(RecordingError, match=r"at least two categories .* found: box"):
         train_on_folder(dataset, tmp_path / "m.npz")
 
 
-def test_an_empty_folder_shows_the_layout(tmp_path: Path) -> None:
+def test_error_of_empty_folder_shows_the_layout(tmp_path: Path) -> None:
     with pytest.raises(RecordingError, match=r"cup/red_mug/000\.pcd"):
         read_dataset(tmp_path)
 
 
-def test_instances_never_straddle() -> None:
-    """Views of one object in training and test make any model look good."""
+def test_instances_are_not_split_between_training_and_test() -> None:
+    """Views of one object in both would make any model look good."""
     instances = np.array([f"{k // 3}" for k in range(60)])
     labels = np.where(np.arange(60) < 45, "cup", "can")
     labels[-3:] = "rare"
@@ -244,7 +244,7 @@ def test_instances_never_straddle() -> None:
         assert np.sum(held_out & (labels == label)) == count
 
 
-def test_own_categories_follow_the_usual_ones() -> None:
+def test_added_categories_follow_the_default_ones() -> None:
     assert order_categories(["spoon", "can", "cup", "unknown", "fork"]) == (
         "cup",
         "can",
@@ -253,7 +253,7 @@ def test_own_categories_follow_the_usual_ones() -> None:
     )
 
 
-def test_the_page_is_whole_and_escapes_names(trained: Path, tmp_path: Path) -> None:
+def test_page_is_complete_and_escapes_names(trained: Path, tmp_path: Path) -> None:
     """Folder names are untrusted; a page must not run code that they contain."""
     dataset = write_dataset(tmp_path / "data", ("box", "ball"), instances=2)
     report = replace(evaluate_folder(dataset, trained), categories=("<script>", "ball"))
@@ -267,7 +267,7 @@ def test_the_page_is_whole_and_escapes_names(trained: Path, tmp_path: Path) -> N
     assert page.count("<svg") == 2 + len(report.breakdowns) == 5
 
 
-def test_accuracies_over_ranges_are_those_by_hand() -> None:
+def test_accuracies_over_ranges_match_hand_calculation() -> None:
     """A view at a limit is in the upper range; a range without views is left out."""
     values, right = np.array([2.0, 1.0, 5.5, 1.5, 2.9, 5.0]), np.array([1, 1, 1, 0, 1, 0], bool)
 
@@ -278,8 +278,8 @@ def test_accuracies_over_ranges_are_those_by_hand() -> None:
     )
 
 
-def test_the_figures_of_a_report_are_those_by_hand() -> None:
-    """Six known views of three objects, and two unknown shapes, which count for novelty alone."""
+def test_report_metrics_match_hand_calculation() -> None:
+    """Six known views of three objects, and two unknown shapes, which count only for novelty."""
     posteriors = [[0.9, 0.1], [0.01, 0.99], [0.8, 0.2], [0.4, 0.6], [0.3, 0.7], [0.6, 0.4]]
     novelty = np.array([0.5, 1.5, 0.2, 0.1, 0.3, 2.0, 1.2, 0.8])
     predicted = SimpleNamespace(
@@ -312,12 +312,12 @@ def test_the_figures_of_a_report_are_those_by_hand() -> None:
     assert report.by_elevation == ()
 
 
-def test_the_pose_of_a_sensor_is_told_from_the_middle_of_the_object(
+def test_sensor_pose_is_relative_to_centre_of_object(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
     """Views without a surface are left out of all columns, and counted."""
-    eyes, middle = ([0.3, 0.4, 1.35], [9, 9, 9], [-0.5, 1.2, 0.15]), np.array([0.0, 0.0, 0.15])
-    points = (np.array([[0.01, 0.02, -0.03], [-0.01, -0.02, 0.03]]) + middle).astype(np.float32)
+    eyes, centre = ([0.3, 0.4, 1.35], [9, 9, 9], [-0.5, 1.2, 0.15]), np.array([0.0, 0.0, 0.15])
+    points = (np.array([[0.01, 0.02, -0.03], [-0.01, -0.02, 0.03]]) + centre).astype(np.float32)
     found = iter((0.1, None, 0.2))
 
     def describe(*_: object, **__: object) -> DescribedView | None:
@@ -326,8 +326,8 @@ def test_the_pose_of_a_sensor_is_told_from_the_middle_of_the_object(
         return None if value is None else DescribedView(row, 7, 0.5)
 
     monkeypatch.setattr("shapecat.evaluation.views.describe_view", describe)
-    seen = [View(points, np.array(eye, float), "cup", f"mug{k}") for k, eye in enumerate(eyes)]
-    views = describe_views(seen, settings=Settings())
+    dataset = [View(points, np.array(eye, float), "cup", f"mug{k}") for k, eye in enumerate(eyes)]
+    views = describe_views(dataset, settings=Settings())
 
     assert (views.skipped, views.instances.tolist()) == (1, ["cup/mug0", "cup/mug2"])
     assert views.distances == pytest.approx([1.3, 1.3], abs=1e-6)
@@ -335,7 +335,7 @@ def test_the_pose_of_a_sensor_is_told_from_the_middle_of_the_object(
     assert views.descriptors[:, 0] == pytest.approx([0.1, 0.2])
 
 
-def test_the_drawn_confusion_has_true_categories_in_rows() -> None:
+def test_confusion_picture_has_true_categories_in_rows() -> None:
     """A transposed matrix would claim that cans are taken for cups."""
     root = ET.fromstring(confusion_svg(("cup", "can"), [[4, 3], [0, 7]]))  # noqa: S314  we drew it
     texts = {e.text: e.attrib for e in root.iter() if e.tag.endswith("text")}
@@ -348,14 +348,14 @@ def test_the_drawn_confusion_has_true_categories_in_rows() -> None:
     assert "0" not in texts
 
 
-def test_names_beside_the_confusion_neither_overlap_nor_end_at_the_edge() -> None:
+def test_long_names_fit_into_confusion_picture() -> None:
     """Users add categories of any length; a column is only 46 pixels wide."""
     name = "a rather long category"
     svg = confusion_svg((name, "can"), [[4, 3], [0, 7]])
     (left, *_), heads = drawn(svg, "rect", "x")[0], drawn(svg, "text", "text", "transform")
 
     assert float(str(left)) > 6 * len(name)
-    assert [turn.split()[0] for text, turn in heads if turn] == ["rotate(-90"] * 2
+    assert [rotation.split()[0] for text, rotation in heads if rotation] == ["rotate(-90"] * 2
 
 
 def worked() -> Report:
@@ -402,8 +402,8 @@ TABLES = [
 ]  # fmt: skip
 
 
-def test_the_printed_report_has_each_number_under_its_name() -> None:
-    """A swapped pair of metrics is still a plausible report."""
+def test_printed_report_has_each_number_under_its_name() -> None:
+    """A report with swapped metrics would look plausible."""
     first, *lines = format_report(worked()).splitlines()
     assert [line != "" for line in lines[:2]] == [False, True]
     cells = [re.split(r"\s{2,}", line.strip()) for line in lines if line.strip()]
@@ -412,20 +412,20 @@ def test_the_printed_report_has_each_number_under_its_name() -> None:
     assert first == "57 views, model m-7; skipped 4 without a surface"
     assert cells[:split] == [*map(list, FIGURES.items()), ["ms per object", "34.500"]]
     head = next(k for k, row in enumerate(cells) if row[-1] == "recall")
-    said = " ".join(word for row in cells[split:head] for word in row)
-    assert said == "rows: true category; columns: predicted category"
+    text = " ".join(word for row in cells[split:head] for word in row)
+    assert text == "rows: true category; columns: predicted category"
     assert cells[head : head + 4] == [
         ["cup", "can", "box", "recall"],
         ["cup", "12", "5", "1", "0.667"],
         ["can", "3", "28", "8", "0.778"],
         ["box", ".", ".", ".", "-"],
     ]
-    told = [row for table in TABLES for row in table]
-    told[-1] = [*told[-1], "-"]
-    assert cells[head + 4 :] == told
+    expected = [row for table in TABLES for row in table]
+    expected[-1] = [*expected[-1], "-"]
+    assert cells[head + 4 :] == expected
 
 
-def test_the_page_and_its_markdown_have_each_number_in_its_place() -> None:
+def test_html_and_markdown_have_each_number_in_its_place() -> None:
     report = worked()
     page = format_page(report, title="a|b & c")
     names = {name: f"{name}.svg" for name in ("confusion", "calibration", "distance", "points")}
@@ -458,9 +458,9 @@ def test_the_page_and_its_markdown_have_each_number_in_its_place() -> None:
     assert written == [[[""], *tables[0]], *tables[1:]]  # its head is empty
     assert [b[0].removeprefix("## ") for b in blocks if b[0].startswith("##")] == heads
     assert blocks[0] == ["# a\\|b &amp; c"]
-    for said in (page, text):
-        assert "Rows: true category; columns: predicted category." in said
-        assert "On the diagonal, 80 % of the views with a confidence of 0.8 are right." in said
+    for content in (page, text):
+        assert "Rows: true category; columns: predicted category." in content
+        assert "On the diagonal, 80 % of the views with a confidence of 0.8 are right." in content
     assert re.findall(r"!\[(.*?)\]\((.*?)\)", text) == [
         ("Confusion", "confusion.svg"), ("Calibration", "calibration.svg"),
         ("Accuracy by distance", "distance.svg"), ("Accuracy by elevation", "elevation.svg"),
@@ -474,8 +474,8 @@ def drawn(svg: str, kind: str, *names: str) -> list[tuple[str | None, ...]]:
     return [tuple(e.text if n == "text" else e.get(n) for n in names) for e in found]
 
 
-def test_pictures_of_a_report_are_drawn_to_scale() -> None:
-    """Shades are shares of the row, areas of dots and thicknesses of bars numbers of views."""
+def test_report_pictures_are_drawn_to_scale() -> None:
+    """Shades show fractions of a row, areas of dots and thicknesses of bars numbers of views."""
     report = worked()
     cells = drawn(confusion_svg(report.categories, report.confusion), "rect", "x", "y", "fill")
     ink = np.array([31, 78, 121])
@@ -514,12 +514,12 @@ def test_pictures_of_a_report_are_drawn_to_scale() -> None:
     ]  # fmt: skip
 
 
-def test_the_markdown_page_has_its_pictures_beside_it(trained: Path, tmp_path: Path) -> None:
+def test_markdown_page_has_its_pictures_beside_it(trained: Path, tmp_path: Path) -> None:
     """A name with a bar would break the table, a missing file the picture."""
     dataset = write_dataset(tmp_path / "data", ("box", "ball"), instances=2)
     report = evaluate_folder(dataset, trained)
-    strange = replace(report, recall={"a|b": 1.0}, fused=(Fused(3, 4, 1.0, 0.25),))
-    write_page(tmp_path / "out" / "all.md", strange, title="all")
+    changed = replace(report, recall={"a|b": 1.0}, fused=(Fused(3, 4, 1.0, 0.25),))
+    write_page(tmp_path / "out" / "all.md", changed, title="all")
     page = (tmp_path / "out" / "all.md").read_text("utf-8")
 
     pictures = re.findall(r"!\[[\w ]+\]\((.*?)\)", page)
@@ -530,8 +530,7 @@ def test_the_markdown_page_has_its_pictures_beside_it(trained: Path, tmp_path: P
     assert "| 3 | 4 | 1.000 | 0.250 |" in page
 
 
-def test_the_command_writes_the_page(trained: Path, tmp_path: Path) -> None:
-    """A page that no command calls is of no use."""
+def test_command_writes_the_page(trained: Path, tmp_path: Path) -> None:
     dataset = write_dataset(tmp_path / "data", ("box", "ball"), instances=2)
     page = tmp_path / "page.html"
     command = import_module("shapecat.cli.evaluate").evaluate
@@ -554,8 +553,8 @@ def compared(
     return evaluate_folder(dataset, trained, baselines=dataset)
 
 
-def test_plain_learners_are_judged_beside_the_chain(compared: Report, tmp_path: Path) -> None:
-    """All see the same views: a chain that a plain learner beats has to show it."""
+def test_baselines_are_compared_with_shapecat(compared: Report, tmp_path: Path) -> None:
+    """All have the same views, so the report shows whether a baseline is better."""
     names = [item.learner for item in compared.baselines]
 
     assert names[:4] == ["shapecat", "forest", "linear", "pnn"]
@@ -570,8 +569,8 @@ def test_plain_learners_are_judged_beside_the_chain(compared: Report, tmp_path: 
 
 
 @pytest.mark.usefixtures("few_trees")
-def test_learners_may_have_a_training_set_of_their_own(trained: Path, tmp_path: Path) -> None:
-    """It may hold other categories in another order: each learner's columns are its own."""
+def test_baselines_may_have_their_own_training_set(trained: Path, tmp_path: Path) -> None:
+    """It may have other categories in another order: each baseline has its own columns."""
     train = write_dataset(tmp_path / "train", ("ball", "box", "plate"), instances=3, seed=3)
     test = write_dataset(tmp_path / "test", ("box", "ball"), instances=2, seed=4)
     report = evaluate_folder(test, trained, baselines=train)
@@ -580,23 +579,23 @@ def test_learners_may_have_a_training_set_of_their_own(trained: Path, tmp_path: 
     assert {item.learned for item in report.baselines} == {18}
 
 
-def test_a_category_of_one_object_has_no_folds(trained: Path, tmp_path: Path) -> None:
-    """Its views would be in training and test alike."""
+def test_baselines_need_two_objects_of_each_category(trained: Path, tmp_path: Path) -> None:
+    """Views of a single object would be in training and test."""
     dataset = write_dataset(tmp_path / "data", ("box", "ball"), instances=1)
 
     with pytest.raises(RecordingError, match="two objects each"):
         evaluate_folder(dataset, trained, baselines=dataset)
 
 
-def test_accuracy_is_told_by_the_pose_of_the_sensor(compared: Report) -> None:
-    """From above a can is a plate: one figure for all poses hides it."""
+def test_accuracy_is_broken_down_by_sensor_pose(compared: Report) -> None:
+    """From above, a can looks like a plate, which one figure for all poses hides."""
     assert [name for name, _ in compared.breakdowns] == ["distance", "elevation", "points"]
     assert sum(count for _, count, _ in compared.by_elevation) == compared.n
     assert compared.by_elevation[0][0] == "30-45°"
 
 
-def test_views_of_an_object_are_fused() -> None:
-    """Leftover views and views of other objects must not be fused in; two of three may err."""
+def test_only_views_of_one_object_are_fused() -> None:
+    """Leftover views must not be fused either; two of three views are wrong, but uncertain."""
     truth = np.zeros(8, np.int64)
     posteriors = np.array([[0.9, 0.1], [0.45, 0.55], [0.45, 0.55]] * 2 + [[0, 1], [0, 1]], "f4")
     names = np.array(["a", "a", "a", "b", "b", "b", "c", "c"])

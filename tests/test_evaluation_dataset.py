@@ -1,4 +1,4 @@
-"""Point cloud files of data sets: every encoding, and hostile input."""
+"""Tests of point cloud files of data sets: every encoding, and hostile input."""
 
 import struct
 from pathlib import Path
@@ -21,7 +21,7 @@ HEADER = (
 
 
 def pcd(encoding: str) -> bytes:
-    """Write POINTS with a colour before and padding behind them."""
+    """Return POINTS as a PCD file, with a colour before and padding after the coordinates."""
     head = f"{HEADER}{encoding}\n".encode()
     if encoding == "ascii":
         return head + b"".join(b"7 %g %g %g 0 0 0 0\n" % tuple(row) for row in POINTS)
@@ -46,8 +46,8 @@ def test_every_encoding_of_pcd_is_read(tmp_path: Path, encoding: str) -> None:
 
 
 @pytest.mark.parametrize("encoding", ["ascii", "binary"])
-def test_a_field_of_several_values_moves_those_behind_it(tmp_path: Path, encoding: str) -> None:
-    """Files with normals or histograms before x."""
+def test_fields_of_several_values_shift_later_fields(tmp_path: Path, encoding: str) -> None:
+    """Some files have normals or histograms before x."""
     head = (
         "FIELDS normal x i y z\nSIZE 4 4 2 4 4\nTYPE F F U F F\nCOUNT 3 1 2 1 1\n"
         f"WIDTH 2\nHEIGHT 1\nPOINTS 2\nDATA {encoding}\n"
@@ -88,8 +88,7 @@ def test_every_encoding_of_ply_is_read(tmp_path: Path, kind: str) -> None:
     np.testing.assert_array_equal(cloud.viewpoint, [0.5, -0.25, 1.25])
 
 
-def test_open3d_agrees(tmp_path: Path) -> None:
-    """Files as others write them: the library of the field is the judge."""
+def test_files_of_open3d_are_read(tmp_path: Path) -> None:
     open3d = pytest.importorskip("open3d", exc_type=ImportError)
     points = np.random.default_rng(0).normal(size=(500, 3)).astype(np.float32)
     points[100:300] = points[0]  # something to compress
@@ -109,10 +108,10 @@ def test_open3d_agrees(tmp_path: Path) -> None:
 
 @settings(deadline=None, max_examples=60)
 @given(st.data())
-def test_damaged_clouds_are_errors_or_clouds(
+def test_damaged_cloud_raises_or_is_read(
     tmp_path_factory: pytest.TempPathFactory, data: st.DataObject
 ) -> None:
-    """Neither a crash nor an allocation that the file cannot fill."""
+    """It must not crash or allocate more than the file can fill."""
     encoding = data.draw(st.sampled_from(["ascii", "binary", "binary_compressed"]))
     content = bytearray(pcd(encoding))
     for _ in range(data.draw(st.integers(1, 4))):
@@ -137,7 +136,7 @@ def test_damaged_clouds_are_errors_or_clouds(
         (b"SIZE 4 4", b"SIZE 3 4"),
     ],
 )
-def test_impossible_headers_are_refused(tmp_path: Path, old: bytes, new: bytes) -> None:
+def test_invalid_headers_are_rejected(tmp_path: Path, old: bytes, new: bytes) -> None:
     path = tmp_path / "x.pcd"
     for encoding in ("binary", "binary_compressed"):
         path.write_bytes(pcd(encoding).replace(old, new))
@@ -152,7 +151,7 @@ def save(root: Path, points: F4, **more: F4) -> Path:
     return path
 
 
-def test_a_point_needs_all_of_its_coordinates(tmp_path: Path) -> None:
+def test_points_without_all_coordinates_are_dropped(tmp_path: Path) -> None:
     """One NaN would spread over the whole descriptor."""
     rows = [[0.1, 0.2, 0.3], [np.nan, 0.2, 0.3], [0.4, 0.5, np.inf], [0.7, 0.8, 0.9]]
     view = read_view(save(tmp_path, np.array(rows, np.float32)))
@@ -160,7 +159,7 @@ def test_a_point_needs_all_of_its_coordinates(tmp_path: Path) -> None:
     np.testing.assert_allclose(view.points, [rows[0], rows[3]], rtol=1e-6)
 
 
-def test_a_view_keeps_its_sensor_and_loses_nan(tmp_path: Path) -> None:
+def test_view_keeps_viewpoint_and_drops_nan(tmp_path: Path) -> None:
     view = read_view(save(tmp_path, POINTS, viewpoint=np.array([0.1, 0.2, 0.9])))
 
     assert view.points.shape == (2, 3)
@@ -168,7 +167,7 @@ def test_a_view_keeps_its_sensor_and_loses_nan(tmp_path: Path) -> None:
     assert (view.category, view.instance) == ("cup", "mug")
 
 
-def test_views_come_in_the_order_of_their_paths(tmp_path: Path) -> None:
+def test_views_are_sorted_by_path(tmp_path: Path) -> None:
     """Models made from the same folder must not depend on the file system."""
     for name in ("b/2/1.pcd", "a/9/3.PCD", "a/10/0.pcd"):
         (tmp_path / name).parent.mkdir(parents=True)
@@ -191,7 +190,7 @@ def test_views_come_in_the_order_of_their_paths(tmp_path: Path) -> None:
         (np.zeros(5), "shape"),
     ],
 )
-def test_views_that_are_none_are_named(tmp_path: Path, points: F4, reason: str) -> None:
+def test_invalid_views_raise_with_path(tmp_path: Path, points: F4, reason: str) -> None:
     path = save(tmp_path, points)
 
     with pytest.raises(RecordingError, match=reason) as caught:
@@ -209,7 +208,7 @@ def test_pickled_points_are_not_loaded(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize("azimuth_deg", [0, 45, 130, 250])
-def test_a_lost_sensor_is_found_again(azimuth_deg: float) -> None:
+def test_missing_viewpoint_is_estimated(azimuth_deg: float) -> None:
     """A cloud without VIEWPOINT would otherwise be described inside out."""
     azimuth = np.radians(azimuth_deg)
     eye = np.array([0.8 * np.cos(azimuth), 0.8 * np.sin(azimuth), 0.6])
