@@ -27,7 +27,7 @@ LAYERS = {
     0.0: "base",
 }
 HIDDEN = {"__init__", "__main__", "py"}
-_Place = tuple[float, float, float]
+_Position = tuple[float, float, float]
 
 
 def imports() -> dict[str, set[str]]:
@@ -53,9 +53,9 @@ def layer(name: str) -> float:
     return FLOOR[name] + 0.5 * (name in STAGES)
 
 
-def places(rooms: set[str]) -> dict[str, _Place]:
+def box_positions(rooms: set[str]) -> dict[str, _Position]:
     """Return left edge, top and width of the box of each subpackage."""
-    found: dict[str, _Place] = {}
+    found: dict[str, _Position] = {}
     for row, level in enumerate(LAYERS):
         names = sorted(name for name in rooms if layer(name) == level)
         widths = [9.0 * len(name) + 16 for name in names]
@@ -75,7 +75,7 @@ _ARROW_HEAD = (
 def draw() -> str:
     """Return the picture as SVG."""
     graph = imports()
-    boxes = places(set(graph) | {"schemas"})
+    boxes = box_positions(set(graph) | {"schemas"})
     height = 16 + ROW * len(LAYERS)
     size = f'viewBox="0 0 {WIDTH} {height}" font-family="sans-serif" font-size="15"'
     parts = [
@@ -98,7 +98,7 @@ def _bands() -> Iterator[str]:
         yield f'<text x="18" y="{top + ROW / 2}" font-size="13" fill="#567">{escape(name)}</text>'
 
 
-def _arrows(graph: Mapping[str, set[str]], boxes: Mapping[str, _Place]) -> Iterator[str]:
+def _arrows(graph: Mapping[str, set[str]], boxes: Mapping[str, _Position]) -> Iterator[str]:
     for name, other in sorted((n, o) for n, others in graph.items() for o in others):
         if FLOOR[other] < 2 or layer(other) == layer(name):
             continue
@@ -112,7 +112,7 @@ def _arrows(graph: Mapping[str, set[str]], boxes: Mapping[str, _Place]) -> Itera
         )
 
 
-def _boxes(boxes: Mapping[str, _Place]) -> Iterator[str]:
+def _boxes(boxes: Mapping[str, _Position]) -> Iterator[str]:
     for name, (x, y, width) in sorted(boxes.items()):
         yield (
             f'<rect x="{x:.0f}" y="{y:.0f}" width="{width:.0f}" height="{BOX_H}" rx="6" '

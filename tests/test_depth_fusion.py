@@ -195,16 +195,16 @@ def test_holes_are_filled_from_earlier_images() -> None:
 def test_removed_object_does_not_fill_the_hole_it_left() -> None:
     """Where it stood, the sensor may briefly measure nothing; the object must not reappear."""
     empty = render_depth(HOME, None)
-    gone = np.abs(empty - render_depth(HOME)) > 1e-6
-    now = np.where(gone, 0, empty)
+    removed = np.abs(empty - render_depth(HOME)) > 1e-6
+    now = np.where(removed, 0, empty)
 
     result = fused(now, (render_depth(HOME), IDENTITY), (render_depth(HOME), IDENTITY))
 
-    ghost = gone & (result > 0)
-    edge = np.argwhere(~gone)
+    ghost = removed & (result > 0)
+    edge = np.argwhere(~removed)
     far = [np.abs(edge - pixel).sum(axis=1).min() > REACH for pixel in np.argwhere(ghost)]
     assert not any(far)
-    assert np.count_nonzero(ghost) < 0.1 * np.count_nonzero(gone)
+    assert np.count_nonzero(ghost) < 0.1 * np.count_nonzero(removed)
     assert np.abs(errors(np.where(ghost, result, 0), empty)).max(initial=0) < 0.05
 
 

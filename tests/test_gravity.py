@@ -191,7 +191,7 @@ def test_failed_transform_look_ups_are_counted(tmp_path: Path) -> None:
 
 
 def test_frame_with_objects_does_not_count_as_without_plane(tmp_path: Path) -> None:
-    """An assumed plane is in no table; the report would contradict the missing warning."""
+    """An assumed plane is in no table; the run would contradict its own warning."""
     for name, schema, frames in (
         ("frames", FRAMES, (0, 1, 2, 3, 4)),
         ("planes", PLANES, (0, 3)),

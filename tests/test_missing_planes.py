@@ -62,7 +62,7 @@ def test_warning_asks_for_unit_if_depth_is_implausible(tmp_path: Path) -> None:
 
 
 def test_warning_distinguishes_missing_depth_wrong_up_and_noise(tmp_path: Path) -> None:
-    """None of them is a matter of range."""
+    """A covered lens and a wall at 1 m are not out of range."""
     without_depth = warnings_of(walls(tmp_path / "none.mcap", [0.0] * 3), tmp_path)
     wall = walls(tmp_path / "near.mcap", [1.0, 1.1, 1.2, 1.0])
     wall_in_range = warnings_of(wall, tmp_path, up="0,-1,0")

@@ -503,7 +503,7 @@ def test_topic_count_includes_all_publishers(tmp_path: Path, container: str) -> 
         assert (recording.start_ns, recording.end_ns) == (10, 13)
 
 
-def test_recording_ends_with_its_longest_split(tmp_path: Path) -> None:
+def test_recording_ends_with_split_that_ends_last(tmp_path: Path) -> None:
     """Of two recorders, the one started first may have been stopped last."""
     write_mcap(tmp_path / "b_0.mcap", [11, 40, 97])
     write_mcap(tmp_path / "b_1.mcap", [23, 58])

@@ -71,7 +71,7 @@ def static(parent: str, child: str, translation: Any, quaternion: Any, stamp: in
     return make("tf2_msgs/msg/TFMessage", [stamped])
 
 
-def beside(
+def paired(
     path: Path,
     *more: tuple[str, int, Any],
     frame_id: str = "color_optical",
@@ -303,7 +303,7 @@ def test_damaged_image_is_message_error() -> None:
 def test_non_finite_distortion_is_reported(tmp_path: Path, wrong: float) -> None:
     """Otherwise all masks would be empty without a reason."""
     tf = ("/tf_static", EPOCH, static("camera", "color_optical", (0.05, 0, 0), (0, 0, 0, 1)))
-    ((_, view),), warnings = read(beside(tmp_path / "a.mcap", tf, distortion=(wrong, 0, 0, 0, 0)))
+    ((_, view),), warnings = read(paired(tmp_path / "a.mcap", tf, distortion=(wrong, 0, 0, 0, 0)))
 
     assert view is None
     assert any("lens distortion that is not finite" in w for w in warnings)
@@ -313,7 +313,7 @@ def test_pose_of_colour_camera_comes_from_transforms(tmp_path: Path) -> None:
     """A rotated pose reveals an inverse or a wrong order of frames."""
     turn = (0.1, -0.2, 0.05, 0.97)
     tf = ("/tf_static", EPOCH, static("camera", "color_optical", (0.05, 0.01, -0.02), turn))
-    ((_, view),), _ = read(beside(tmp_path / "a.mcap", tf))
+    ((_, view),), _ = read(paired(tmp_path / "a.mcap", tf))
 
     assert view is not None
     assert view.lens is not None
@@ -344,7 +344,7 @@ def test_moving_colour_camera_has_new_pose_in_each_frame(tmp_path: Path) -> None
 
 def test_colour_without_transform_is_unused(tmp_path: Path) -> None:
     """Misplaced colours are worse than no colours."""
-    ((_, view),), warnings = read(beside(tmp_path / "a.mcap"))
+    ((_, view),), warnings = read(paired(tmp_path / "a.mcap"))
 
     assert view is None
     assert any("no transform between camera and color_optical" in w for w in warnings)
@@ -353,7 +353,7 @@ def test_colour_without_transform_is_unused(tmp_path: Path) -> None:
 def test_extrinsics_topic_without_messages_is_ignored(tmp_path: Path) -> None:
     """A recording that starts after the driver lacks messages of this latched topic."""
     declared = [("/cam/extrinsics/depth_to_color", "std_msgs/msg/String")]
-    ((_, view),), warnings = read(beside(tmp_path / "a.mcap", empty=declared))
+    ((_, view),), warnings = read(paired(tmp_path / "a.mcap", empty=declared))
 
     assert view is None
     assert any("no transform between camera and color_optical" in w for w in warnings)
@@ -361,7 +361,7 @@ def test_extrinsics_topic_without_messages_is_ignored(tmp_path: Path) -> None:
 
 def test_image_of_same_frame_and_other_size_is_projected(tmp_path: Path) -> None:
     """An equal frame id means an equal camera position, not equal pixels."""
-    ((_, view),), _ = read(beside(tmp_path / "a.mcap", frame_id="camera"))
+    ((_, view),), _ = read(paired(tmp_path / "a.mcap", frame_id="camera"))
 
     assert view is not None
     assert not view.registered

@@ -61,11 +61,11 @@ def views(moving: bool) -> tuple[tuple[Any, Any, Camera, Pose], ...]:
 
 def disturb(depth: Any, labels: Any) -> Any:
     """Erase the depth of all furniture, and add a slanted board behind the top of the image."""
-    spoilt = np.where(labels < 20, 0, depth).astype(np.float32)
+    result = np.where(labels < 20, 0, depth).astype(np.float32)
     i, j = np.mgrid[:120, :160]
-    board = (i < 60) & (labels < 20)
-    spoilt[board] = (0.25 + 0.003 * j)[board]
-    return spoilt
+    slanted = (i < 60) & (labels < 20)
+    result[slanted] = (0.25 + 0.003 * j)[slanted]
+    return result
 
 
 def items(
@@ -162,8 +162,8 @@ def test_recording_with_tenth_of_frames_disturbed_loses_no_track(
     """Both with a still camera without transforms and with a moving one with them."""
     still = tmp_path / "plain.mcap"
     plain = walk if moving else run(still, items(moving=False, poses=False))
-    spoilt = items(moving=moving, poses=moving, disturbed=DISTURBED)
-    out = run(tmp_path / "spoilt.mcap", spoilt)
+    messages = items(moving=moving, poses=moving, disturbed=DISTURBED)
+    out = run(tmp_path / "spoilt.mcap", messages)
 
     assert revised(plain) == []
     assert revised(out) == ([] if moving else [*DISTURBED])  # transforms define up anyway
@@ -226,7 +226,7 @@ def test_up_requested_by_user_is_kept(tmp_path: Path, up: str) -> None:
 
 
 @pytest.fixture(scope="module")
-def spoilt(tmp_path_factory: pytest.TempPathFactory) -> Path:
+def source(tmp_path_factory: pytest.TempPathFactory) -> Path:
     folder = tmp_path_factory.mktemp("spoilt")
     run(
         folder / "table.mcap",
@@ -237,16 +237,16 @@ def spoilt(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 @pytest.mark.usefixtures("late_answers")
-def test_second_look_does_not_depend_on_number_of_workers(spoilt: Path, tmp_path: Path) -> None:
+def test_second_look_does_not_depend_on_number_of_workers(source: Path, tmp_path: Path) -> None:
     out = tmp_path / "table"
-    process(Job(spoilt / "table.mcap", out, mcap=False, rrd=False, settings=BLOCKS), cores=2)
+    process(Job(source / "table.mcap", out, mcap=False, rrd=False, settings=BLOCKS), cores=2)
 
     assert revised(out) == [*MANY]
-    assert_same_tables(out, spoilt / "table")
+    assert_same_tables(out, source / "table")
 
 
-def test_interrupted_second_look_resumes_where_it_stopped(spoilt: Path, tmp_path: Path) -> None:
-    job = Job(spoilt / "table.mcap", tmp_path / "table", mcap=False, rrd=False, settings=BLOCKS)
+def test_interrupted_second_look_resumes_where_it_stopped(source: Path, tmp_path: Path) -> None:
+    job = Job(source / "table.mcap", tmp_path / "table", mcap=False, rrd=False, settings=BLOCKS)
 
     def stop(phase: str, done: int, _total: int | None) -> None:
         if (phase, done) == ("revise", 5):
@@ -261,15 +261,15 @@ def test_interrupted_second_look_resumes_where_it_stopped(spoilt: Path, tmp_path
 
     assert [done for phase, done in progress if phase == "revise"] == list(range(9, len(MANY) + 1))
     assert not [done for phase, done in progress if phase == "perceive"]
-    assert_same_tables(job.folder, spoilt / "table")
-    assert {p.name for p in job.folder.iterdir()} == {p.name for p in (spoilt / "table").iterdir()}
+    assert_same_tables(job.folder, source / "table")
+    assert {p.name for p in job.folder.iterdir()} == {p.name for p in (source / "table").iterdir()}
 
 
 def test_kill_between_revised_tables_is_repaired(
-    spoilt: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+    source: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """Otherwise some tables would be revised and others not."""
-    job = Job(spoilt / "table.mcap", tmp_path / "table", mcap=False, rrd=False, settings=BLOCKS)
+    job = Job(source / "table.mcap", tmp_path / "table", mcap=False, rrd=False, settings=BLOCKS)
 
     def die(*_args: object) -> int:
         (tmp_path / ".table.partial" / "planes.parquet").write_bytes(b"half")
@@ -284,7 +284,7 @@ def test_kill_between_revised_tables_is_repaired(
     monkeypatch.undo()
     process(job)
 
-    assert_same_tables(job.folder, spoilt / "table")
+    assert_same_tables(job.folder, source / "table")
 
 
 def tables(
@@ -329,7 +329,7 @@ def test_still_camera_takes_up_from_nearby_frames() -> None:
         assert revision.up_given is None
 
 
-def test_frame_with_floor_beside_usual_plane_is_kept() -> None:
+def test_floor_beside_usual_plane_causes_no_revision() -> None:
     """A gap between furniture shows the floor in one frame; the table is still where it was."""
     (frames, planes), *others = tables(leaning(np.full(20, 35.0)))
     offset = planes.schema.get_field_index("offset")
@@ -390,7 +390,7 @@ def test_nearby_frames_exclude_the_frame_itself() -> None:
     assert _around(apart, 40).tolist() == [37, 38, 39, 41, 42, 43]
 
 
-def test_frames_of_camera_moving_without_poses_are_kept() -> None:
+def test_frames_of_camera_moving_without_poses_are_not_revised() -> None:
     """Nearby frames do not constrain up if the camera moves between them."""
     up, offsets = leaning(np.linspace(10, 70, 20)), np.full(20, -0.9)
     offsets[8] = np.nan

@@ -37,8 +37,8 @@ class Scenario:
         if self.verb == "export":
             return [*SHAPECAT, "export", run, "--format", "crops", "--out", str(case / "crops")]
         paths = [str(case / "in" / name) for name in self.recordings]
-        places = ["--out", str(case / "out"), "--jobs", str(self.jobs), "--progress", "jsonl"]
-        return [*SHAPECAT, "process", *paths, *places, *options]
+        outputs = ["--out", str(case / "out"), "--jobs", str(self.jobs), "--progress", "jsonl"]
+        return [*SHAPECAT, "process", *paths, *outputs, *options]
 
     @property
     def runs(self) -> tuple[str, ...]:
