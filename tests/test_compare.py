@@ -160,7 +160,7 @@ def test_coco_crowd_has_undecidable_category() -> None:
 
 @pytest.mark.parametrize("own", [{"track_id": 7}, {"attributes": {"track_id": 7, "x": 3}}])
 def test_coco_tracks_are_read_from_field_or_attribute(own: dict[str, Any]) -> None:
-    """CVAT writes them as an attribute. If one object has none, identities are not judged."""
+    """CVAT writes them as an attribute. If one object has none, identities are not compared."""
     item = {"id": 1, "image_id": 2, "category_id": 4, "segmentation": [[1, 0, 3, 0, 3, 2, 1, 2]]}
     images = [{"id": 2, "frame": 5, "width": 4, "height": 3}]
     content = {"categories": [{"id": 4, "name": "cup"}], "images": images}

@@ -49,7 +49,7 @@ def test_axis_is_found_from_a_bad_guess(slope: float, tilt: float, off: float, s
 
     fit_axis(cloud, weight, rows_of(normals @ rotation.T), axis, point, 4)
 
-    assert abs(axis @ rotation[:, 2]) > (0.998 if slope == 0 else 0.995)  # slices are no cone
+    assert abs(axis @ rotation[:, 2]) > (0.998 if slope == 0 else 0.995)  # slices assume a cylinder
     assert np.linalg.norm(point - (point @ rotation[:, 2]) * rotation[:, 2]) < 0.05
 
 

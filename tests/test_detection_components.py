@@ -10,7 +10,7 @@ BOTH = 3
 """Links to the right and down."""
 
 
-def whole(shape: tuple[int, int]) -> np.ndarray:
+def full_spans(shape: tuple[int, int]) -> np.ndarray:
     return np.tile(np.array([[0, shape[1]]], np.int32), (shape[0], 1))
 
 
@@ -20,7 +20,7 @@ def test_components_match_scipy(share: float) -> None:
     inside = rng.random((40, 50)) < share
     component = np.full(inside.shape, -1, np.int32)
     links = np.full(inside.shape, BOTH, np.uint8)
-    sizes = connected_components(inside, links, whole(inside.shape), component)
+    sizes = connected_components(inside, links, full_spans(inside.shape), component)
     expected, count = ndimage.label(inside)
     np.testing.assert_array_equal(component, expected)
     np.testing.assert_array_equal(sizes[1:], np.bincount(expected.ravel())[1:])
@@ -32,9 +32,9 @@ def test_missing_links_separate_components() -> None:
     inside = np.ones((4, 3), bool)
     inside[:3, 1] = False
     component, links = np.zeros((4, 3), np.int32), np.full((4, 3), BOTH, np.uint8)
-    assert connected_components(inside, links, whole((4, 3)), component).tolist() == [0, 9]
+    assert connected_components(inside, links, full_spans((4, 3)), component).tolist() == [0, 9]
     links[3, 0] = 0
-    assert connected_components(inside, links, whole((4, 3)), component).tolist() == [0, 4, 5]
+    assert connected_components(inside, links, full_spans((4, 3)), component).tolist() == [0, 4, 5]
     assert component[3].tolist() == [1, 2, 2]
 
 
@@ -52,7 +52,7 @@ def test_speckle_stays_within_arrays() -> None:
     inside, links = np.ones((9, 8), bool), np.zeros((9, 8), np.uint8)
     component = np.zeros((9, 8), np.int32)
     # Plain Python checks array bounds, which compiled code does not.
-    sizes = connected_components.py_func(inside, links, whole((9, 8)), component)
+    sizes = connected_components.py_func(inside, links, full_spans((9, 8)), component)
     assert sizes.tolist() == [0] + [1] * 72
 
 

@@ -507,7 +507,7 @@ def test_report_pictures_are_drawn_to_scale() -> None:
     ]
     confusion = confusion_svg(report.categories, report.confusion)
     for picture, width, height in ((confusion, 212, 212), (curve, 280, 280), (bars, 480, 68)):
-        whole = drawn(picture, "svg", "width", "height", "viewBox")  # else they are cut off
+        whole = drawn(picture, "svg", "width", "height", "viewBox")  # otherwise they are cut off
         assert whole == [(str(width), str(height), f"0 0 {width} {height}")]
     assert drawn(bars, "text", "text", "y") == [
         ("0-0.8 m", "21.0"), ("0.500", "21.0"), ("0.8-1.1 m", "55.0"), ("0.875", "55.0")

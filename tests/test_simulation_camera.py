@@ -51,10 +51,10 @@ def test_sphere_has_exact_depth_and_outline() -> None:
     a, b = (d * d).sum(-1), d @ [0.05, 0, 1.0]
     inside = b * b - a * (1.0025 - 0.04)
     depth = (b - np.sqrt(np.maximum(inside, 0))) / a
-    sure = inside > 0.01
+    clear = inside > 0.01
 
-    assert (image.owners[sure] == 0).all()
-    np.testing.assert_allclose(image.depth[sure], depth[sure], atol=2e-4)
+    assert (image.owners[clear] == 0).all()
+    np.testing.assert_allclose(image.depth[clear], depth[clear], atol=2e-4)
     assert (image.owners[inside < -1e-4] == -1).all()
 
 

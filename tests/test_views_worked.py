@@ -85,7 +85,7 @@ def test_descriptor_has_true_heights_elevation_and_distance() -> None:
     assert value["view.elevation"] == pytest.approx(0.6, abs=0.03)
     assert below["view.elevation"] < -0.5
     assert value["view.distance"] == pytest.approx(1.0, abs=0.06)
-    low = 0.2 - 0.06 * 0.8  # the lowest visible point is on the horizon as seen from the sensor
+    low = 0.2 - 0.06 * 0.8  # the lowest visible point, on the horizon of the sensor
     assert value["metric.low"] == pytest.approx(low, abs=0.01)
     assert value["metric.height"] == pytest.approx(0.26 - low, abs=0.012)
 
