@@ -57,12 +57,12 @@ class Judged(NamedTuple):
     """The IoU of three boxes of an object in one frame.
 
     ``overlaps`` (3,) belong to the visible box, the full box of the view, and the full box of the
-    track (NaN without a track); ``thing`` is the seed of the scene and the object's number.
+    track (NaN without a track); ``object_id`` is the seed of the scene and the object's number.
     """
 
     group: str
     category: str
-    thing: tuple[int, int]
+    object_id: tuple[int, int]
     overlaps: Array
 
 
@@ -91,7 +91,7 @@ def _rows(found: Sequence[Judged], group: str) -> Iterator[list[Any]]:
 def _row(name: str, some: Sequence[Judged]) -> list[Any]:
     overlaps = np.reshape([item.overlaps for item in some], (-1, 3))
     means = [round(float(np.nanmean(column)), 3) if len(some) else None for column in overlaps.T]
-    return [name, len({item.thing for item in some}), len(some), *means]
+    return [name, len({item.object_id for item in some}), len(some), *means]
 
 
 def _judge_kind(kind: SceneKind, first: int, count: int) -> Iterator[Judged]:
@@ -121,7 +121,7 @@ def _judge_run(folder: Path, seed: int) -> Iterator[Judged]:
     for frame in truth:
         number = frame["frame"]
         level = gravity_rotation(ups[number])
-        for thing, row in matches(frame["objects"], detections.get(number, []), labels[number]):
+        for item, row in matches(frame["objects"], detections.get(number, []), labels[number]):
             track = tracked.get((number, row["detection"]))
             boxes = (
                 _upright(row, "", level),
@@ -129,10 +129,10 @@ def _judge_run(folder: Path, seed: int) -> Iterator[Judged]:
                 _upright(track, "_full", level) if track else None,
             )
             yield Judged(
-                "tilted" if thing["tilted"] or thing["lying"] else "",
-                thing["category"],
-                (seed, thing["track"]),
-                np.array([_overlap(thing, box, level) for box in boxes]),
+                "tilted" if item["tilted"] or item["lying"] else "",
+                item["category"],
+                (seed, item["track"]),
+                np.array([_overlap(item, box, level) for box in boxes]),
             )
 
 
@@ -145,21 +145,21 @@ def by_frame(path: Path) -> dict[int, list[dict[str, Any]]]:
 
 
 def matches(
-    things: Sequence[dict[str, Any]], rows: Sequence[dict[str, Any]], labels: Array
+    objects: Sequence[dict[str, Any]], rows: Sequence[dict[str, Any]], labels: Array
 ) -> Iterator[tuple[dict[str, Any], dict[str, Any]]]:
     """Match true and found objects one to one by their pixels; yield the pairs.
 
     ``labels`` (h, w) are the true pixel labels of the frame.
     """
     inside = [np.bincount(labels.reshape(-1)[r["indices"]], minlength=256) for r in rows]
-    iou = np.zeros((len(things), len(rows)))
-    for i, thing in enumerate(things):
+    iou = np.zeros((len(objects), len(rows)))
+    for i, item in enumerate(objects):
         for j, row in enumerate(rows):
-            common = inside[j][thing["label"]]
-            iou[i, j] = common / (thing["pixels"] + len(row["indices"]) - common)
+            common = inside[j][item["label"]]
+            iou[i, j] = common / (item["pixels"] + len(row["indices"]) - common)
     for i, j in zip(*linear_sum_assignment(-iou), strict=True):
-        if iou[i, j] >= SAME and things[i]["pixels"] >= SEEN_PIXELS:
-            yield things[i], rows[j]
+        if iou[i, j] >= SAME and objects[i]["pixels"] >= SEEN_PIXELS:
+            yield objects[i], rows[j]
 
 
 def _upright(row: dict[str, Any], which: str, level: Array) -> Upright:
@@ -171,12 +171,12 @@ def _upright(row: dict[str, Any], which: str, level: Array) -> Upright:
     )
 
 
-def _overlap(thing: dict[str, Any], box: Upright | None, level: Array) -> float:
+def _overlap(item: dict[str, Any], box: Upright | None, level: Array) -> float:
     if box is None:
         return float("nan")
-    true = _upright(thing["box"], "", level)
+    true = _upright(item["box"], "", level)
     square = abs(true.size[0] - true.size[1]) < ALIKE * true.size[:2].max()
-    if thing["category"] in ROUND and square and not (thing["tilted"] or thing["lying"]):
+    if item["category"] in ROUND and square and not (item["tilted"] or item["lying"]):
         across = float(true.size[:2].mean())
         true = Upright(true.center, np.array([across, across, true.size[2]]), box.yaw)
     return overlap(true, box)

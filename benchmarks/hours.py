@@ -69,10 +69,10 @@ def _frames(numbers: Any) -> dict[str, Any]:
 
 
 def _detections(numbers: Any, places: Any, beliefs: Any, rng: Any) -> dict[str, Any]:
-    rows, things = _shown(numbers, rng)
+    rows, object_ids = _shown(numbers, rng)
     n = len(rows)
     first = np.searchsorted(rows, rows)
-    where = places[things] + rng.normal(0, NOISE_M, (n, 3))
+    where = places[object_ids] + rng.normal(0, NOISE_M, (n, 3))
     size, turn = list(np.full((n, 3), 0.1)), list(np.tile([0.0, 0.0, 0.0, 1.0], (n, 1)))
     return {
         "topic": ["/depth"] * n,
@@ -82,7 +82,7 @@ def _detections(numbers: Any, places: Any, beliefs: Any, rng: Any) -> dict[str, 
         "touches_border": np.zeros(n, bool),
         "occluded": np.zeros(n, bool),
         "novelty": np.full(n, 0.5),
-        "posterior": list(beliefs[things]),
+        "posterior": list(beliefs[object_ids]),
         **{name: list(where) for name in ("center", "center_fixed", "center_full")},
         **dict.fromkeys(("size", "size_full", "size_full_std"), size),
         **dict.fromkeys(("orientation", "orientation_full"), turn),
@@ -98,8 +98,8 @@ def _shown(numbers: Any, rng: Any) -> tuple[Any, Any]:
     begun = rng.random((len(numbers), PLACES_OF_FALSE)) < FALSE / PLACES_OF_FALSE
     before = np.cumsum(np.pad(begun, ((FALSE_FRAMES, 0), (0, 0))), axis=0)
     shown[:, OBJECTS:] = before[FALSE_FRAMES:] > before[:-FALSE_FRAMES]
-    rows, things = np.nonzero(shown)
-    return rows, things
+    rows, object_ids = np.nonzero(shown)
+    return rows, object_ids
 
 
 def _filled(columns: dict[str, Any], schema: pa.Schema) -> dict[str, Any]:

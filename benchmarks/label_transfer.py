@@ -31,7 +31,7 @@ from shapecat.runs.track_table import read_track_table
 from shapecat.simulation import KINECT, make_scene
 from shapecat.simulation.paths import Filming, walk
 from shapecat.simulation.recorder import record
-from shapecat.simulation.worlds import FIRST_THING_LABEL, World
+from shapecat.simulation.worlds import FIRST_OBJECT_LABEL, World
 
 SCENES = ("tabletop", "clutter", "walking", "rearranged")
 OTHER = Settings(
@@ -91,24 +91,24 @@ def objects_of(run: Path, recording: Path) -> dict[int, int]:
 
 
 def _owner(count: Counter[int]) -> int:
-    things = Counter({label: n for label, n in count.items() if label >= FIRST_THING_LABEL})
-    if 3 * things.total() < count.total():
+    objects = Counter({label: n for label, n in count.items() if label >= FIRST_OBJECT_LABEL})
+    if 3 * objects.total() < count.total():
         return -1
-    return things.most_common(1)[0][0] - FIRST_THING_LABEL
+    return objects.most_common(1)[0][0] - FIRST_OBJECT_LABEL
 
 
 def correct(run: Path, objects: dict[int, int]) -> None:
     """Label all tracks of a run: by object, as merged with its first track, or as deleted."""
     first: dict[int, int] = {}
     labels = {}
-    for track, thing in sorted(objects.items()):
-        if thing < 0:
+    for track, number in sorted(objects.items()):
+        if number < 0:
             labels[track] = "delete"
-        elif thing in first:
-            labels[track] = f"merge with {first[thing]}"
+        elif number in first:
+            labels[track] = f"merge with {first[number]}"
         else:
-            first[thing] = track
-            labels[track] = name_of(thing)
+            first[number] = track
+            labels[track] = name_of(number)
     relabel(run, labels)
 
 

@@ -90,13 +90,13 @@ def _judge_run(folder: Path) -> Iterator[tuple[bool, tuple[float, float]]]:
     on_image = np.load(folder / "recording.color_labels.npz")["labels"]
     rows = by_frame(folder / "run" / "detections.parquet")
     for number, masks in _masks(folder):
-        seen, things = on_image[number], truth[number]
-        pairs = matches(things, rows.get(number, []), on_depth[number])
-        found = {thing["label"]: row["detection"] for thing, row in pairs}
-        for thing in things:
-            mask = seen == thing["label"]
-            if thing["pixels"] >= SEEN_PIXELS and np.count_nonzero(mask) >= SEEN_ON_IMAGE:
-                own = masks.get(found.get(thing["label"], -1))
+        seen, objects = on_image[number], truth[number]
+        pairs = matches(objects, rows.get(number, []), on_depth[number])
+        found = {item["label"]: row["detection"] for item, row in pairs}
+        for item in objects:
+            mask = seen == item["label"]
+            if item["pixels"] >= SEEN_PIXELS and np.count_nonzero(mask) >= SEEN_ON_IMAGE:
+                own = masks.get(found.get(item["label"], -1))
                 yield own is not None, _overlaps(own, mask) if own else (0.0, 0.0)
 
 

@@ -43,8 +43,8 @@ def objects_in(frame: Frame) -> list[Array]:
 def score(frames: Sequence[Labelled], finder: Finder) -> dict[str, float]:
     """Match found and true objects one to one; return overlap F and the fraction found."""
     total = Overlap()
-    for frame, labels, things in frames:
-        masks = [np.flatnonzero(np.isin(labels, parts)) for parts in things]
+    for frame, labels, objects in frames:
+        masks = [np.flatnonzero(np.isin(labels, parts)) for parts in objects]
         total += match_masks([index[labels[index] > 0] for index in finder(frame)], masks).overlap
     return {
         "F": round(total.f, 4),

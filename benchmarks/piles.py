@@ -21,7 +21,7 @@ from shapecat.evaluation.metrics import auroc, expected_calibration_error
 from shapecat.evaluation.overlap import MATCHED_F, match_masks
 from shapecat.learning import Categorizer, load_model
 from shapecat.perception import perceive
-from shapecat.simulation import Thing, render_frame
+from shapecat.simulation import PlacedObject, render_frame
 from shapecat.simulation.paths import Filming
 from shapecat.simulation.piles import bin_picking, pile, shelf_bin
 from shapecat.simulation.sensors import PRESETS
@@ -39,7 +39,7 @@ class Judged(NamedTuple):
     ``shared`` is the number of their common pixels, ``overlap`` their overlap F.
     """
 
-    thing: Thing
+    placed: PlacedObject
     shared: int
     overlap: float
     detection: Detection | None
@@ -70,46 +70,46 @@ def judge(
         frame, labels = render_frame(world, 0, rng=rng, sensor=PRESETS[sensor])
         seen = perceive(frame, up=None, categorizer=model, settings=settings).detections
         flat = labels.reshape(-1)
-        objects += _matched(world.things, flat, seen)
+        objects += _matched(world.objects, flat, seen)
         found += sum(int(np.count_nonzero(flat[d.candidate.indices] > 0)) for d in seen)
-        shown = [t.label for t in world.things if np.count_nonzero(flat == t.label) >= SEEN_PIXELS]
+        shown = [t.label for t in world.objects if np.count_nonzero(flat == t.label) >= SEEN_PIXELS]
         true += int(np.isin(flat, shown).sum())
         detections += len(seen)
     return Scores(objects, found, true, detections)
 
 
 def _matched(
-    things: tuple[Thing, ...], labels: Array, seen: tuple[Detection, ...]
+    objects: tuple[PlacedObject, ...], labels: Array, seen: tuple[Detection, ...]
 ) -> Iterator[Judged]:
     """Match objects and detections one to one by overlap F."""
-    masks = {t.track: np.flatnonzero(labels == t.label) for t in things}
-    things = tuple(t for t in things if len(masks[t.track]) >= SEEN_PIXELS)
+    masks = {t.track: np.flatnonzero(labels == t.label) for t in objects}
+    objects = tuple(t for t in objects if len(masks[t.track]) >= SEEN_PIXELS)
     lists = [d.candidate.indices[labels[d.candidate.indices] > 0] for d in seen]
-    matches = match_masks(lists, [masks[t.track] for t in things])
+    matches = match_masks(lists, [masks[t.track] for t in objects])
     pairs = {column: row for row, column in matches.pairs}
-    for k, thing in enumerate(things):
+    for k, item in enumerate(objects):
         row = pairs.get(k)
         if row is None:
-            yield Judged(thing, 0, 0.0, None)
+            yield Judged(item, 0, 0.0, None)
         else:
-            shared = np.intersect1d(lists[row], masks[thing.track]).size
-            yield Judged(thing, shared, float(matches.f[row, k]), seen[row])
+            shared = np.intersect1d(lists[row], masks[item.track]).size
+            yield Judged(item, shared, float(matches.f[row, k]), seen[row])
 
 
 def figures(scores: Scores, model: Categorizer) -> dict[str, float]:
     """Return F, the fraction of objects found, and metrics of their categories."""
     objects = scores.objects
     well = [o for o in objects if o.overlap >= MATCHED_F and o.detection is not None]
-    known = [o for o in well if o.thing.category != "unknown" and not o.thing.indistinct]
-    strange = [o for o in well if o.thing.category == "unknown"]
-    tilted = [o for o in known if o.thing.tilted]
+    known = [o for o in well if o.placed.category != "unknown" and not o.placed.indistinct]
+    strange = [o for o in well if o.placed.category == "unknown"]
+    tilted = [o for o in known if o.placed.tilted]
     return {
         "objects": len(objects),
         "F": 2 * sum(o.shared for o in objects) / max(scores.found + scores.true, 1),
         "found": len(well) / max(len(objects), 1),
         "detections": scores.detections,
         "category": _right(known, model),
-        "upright or lying": _right([o for o in known if not o.thing.tilted], model),
+        "upright or lying": _right([o for o in known if not o.placed.tilted], model),
         "tilted": _right(tilted, model),
         "tilted objects": len(tilted),
         "AUROC": auroc(_novelty(strange), _novelty(known)) if strange and known else float("nan"),
@@ -119,7 +119,7 @@ def figures(scores: Scores, model: Categorizer) -> dict[str, float]:
 
 def _right(objects: list[Judged], model: Categorizer) -> float:
     """Return the fraction of objects with the right category; *unknown* counts as wrong."""
-    right = [_category(o, model) == o.thing.category for o in objects]
+    right = [_category(o, model) == o.placed.category for o in objects]
     return float(np.mean(right)) if right else float("nan")
 
 
@@ -135,7 +135,7 @@ def _novelty(objects: list[Judged]) -> Array:
 
 
 def _calibration(objects: list[Judged], model: Categorizer) -> float:
-    truth = np.array([model.categories.index(o.thing.category) for o in objects], np.int64)
+    truth = np.array([model.categories.index(o.placed.category) for o in objects], np.int64)
     posteriors = np.array([o.detection.posterior for o in objects if o.detection], np.float32)
     return expected_calibration_error(truth, posteriors) if len(objects) else float("nan")
 

@@ -20,7 +20,7 @@ from benchmarks.measure import markdown
 from shapecat.config import DetectionSettings
 from shapecat.detection import detect
 from shapecat.geometry import inverse
-from shapecat.simulation import KINECT, Support, Thing, World, make_scene, render_frame
+from shapecat.simulation import KINECT, PlacedObject, Support, World, make_scene, render_frame
 from shapecat.simulation.furniture import make_room, make_table
 from shapecat.simulation.paths import looking_at
 from shapecat.simulation.primitives import rounded_box
@@ -47,11 +47,11 @@ def covered(rng: Generator) -> World:
             return world
 
 
-def _flat_boxes(rng: Generator, table: Support) -> tuple[Thing, ...]:
+def _flat_boxes(rng: Generator, table: Support) -> tuple[PlacedObject, ...]:
     half = np.abs(table.outline[:, :2]).max(axis=0)
     fill = rng.uniform(np.sqrt(COVERED), 0.97)  # side of a box relative to its tile
     tiles = list(_tiles(rng, -half, half, int(rng.integers(14, 28))))
-    things: list[Thing] = []
+    objects: list[PlacedObject] = []
     left = COVERED * np.prod(2 * half)
     for k in rng.permutation(len(tiles)):
         low, high = tiles[k]
@@ -59,11 +59,11 @@ def _flat_boxes(rng: Generator, table: Support) -> tuple[Thing, ...]:
         middle = (low + high) / 2 + rng.uniform(-0.5, 0.5, 2) * (1 - fill) * (high - low)
         pose = Pose(np.eye(3), np.round([*middle, table.height], 6))
         mesh = rounded_box([*size, rng.uniform(0.02, 0.06)], fine=1)
-        things.append(Thing(len(things), "box", "box", mesh, pose, table.name, None))
+        objects.append(PlacedObject(len(objects), "box", "box", mesh, pose, table.name, None))
         left -= np.prod(size)
         if left < 0:
             break
-    return tuple(things)
+    return tuple(objects)
 
 
 def _tiles(rng: Generator, low: Array, high: Array, count: int) -> Iterator[tuple[Array, Array]]:

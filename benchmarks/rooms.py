@@ -22,7 +22,7 @@ from shapecat.learning import Categorizer, load_model
 from shapecat.perception import perceive
 from shapecat.simulation import make_scene, render_frame
 from shapecat.simulation.sensors import PRESETS
-from shapecat.simulation.worlds import FIRST_THING_LABEL
+from shapecat.simulation.worlds import FIRST_OBJECT_LABEL
 
 Array = NDArray[Any]
 HEAD = ("sensor", "frames", "detections", "surplus", "of these pieces", "found", "surplus a frame")
@@ -68,15 +68,15 @@ def judge(sensor: str, seed: int, model: Categorizer, settings: Settings) -> Cou
 
 def count(detections: list[Array], labels: Array) -> Counts:
     """Count detections, given by their pixels, by the true labels (h * w,) of these pixels."""
-    on_things = [float(np.mean(labels[d] >= FIRST_THING_LABEL)) > 0.5 for d in detections]
+    on_objects = [float(np.mean(labels[d] >= FIRST_OBJECT_LABEL)) > 0.5 for d in detections]
     masks = [np.flatnonzero(labels == label) for label in np.unique(labels)]
-    seen = [m for m in masks if labels[m[0]] >= FIRST_THING_LABEL]
+    seen = [m for m in masks if labels[m[0]] >= FIRST_OBJECT_LABEL]
     matches = match_masks(detections, seen)
-    kept = {row for row, _ in matches.pairs if on_things[row]}
+    kept = {row for row, _ in matches.pairs if on_objects[row]}
     listed = [k for k, mask in enumerate(seen) if len(mask) >= SEEN_PIXELS]
     found = [k for row, k in matches.pairs if k in listed and matches.f[row, k] >= MATCHED_F]
-    pieces = sum(on_things) - len(kept)
-    elsewhere = len(detections) - sum(on_things)
+    pieces = sum(on_objects) - len(kept)
+    elsewhere = len(detections) - sum(on_objects)
     return Counts(1, len(detections), elsewhere, pieces, len(listed), len(found))
 
 

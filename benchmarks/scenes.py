@@ -41,8 +41,8 @@ def labelled_clutter(
         world = make_scene("clutter", rng, frames=1)
         frame, labels = render_frame(world, 0, rng=rng, sensor=KINECT)
         seen = np.bincount(labels.reshape(-1), minlength=256)
-        things = [[t.label] for t in world.things if seen[t.label] >= SEEN_PIXELS]
-        yield frame, labels.reshape(-1), things
+        objects = [[t.label] for t in world.objects if seen[t.label] >= SEEN_PIXELS]
+        yield frame, labels.reshape(-1), objects
 
 
 def labelled_tables() -> list[tuple[Frame, NDArray[Any], list[list[int]]]]:

@@ -166,14 +166,14 @@ def read_views(folder: Path, kind: str, seed: int) -> list[View]:
     table = pq.read_table(folder / "run" / "detections.parquet", columns=[*columns, "occluded"])
     for row in table.to_pylist():
         track = track_of.get((row["frame"], row["detection"]))
-        thing = _seen(row["indices"], labels[row["frame"]], frames[row["frame"]]["objects"])
-        if track is None or thing is None:
+        true_object = _seen(row["indices"], labels[row["frame"]], frames[row["frame"]]["objects"])
+        if track is None or true_object is None:
             continue
         found.append(
             View(
                 (kind, seed, track),
-                thing["category"],
-                _object(thing, listed=True).undecidable,
+                true_object["category"],
+                _object(true_object, listed=True).undecidable,
                 row["touches_border"] or row["occluded"],
                 np.array(row["posterior"]),
                 row["category"],
@@ -190,8 +190,8 @@ def _seen(
     own = np.bincount(labels.reshape(-1)[indices], minlength=256)
     label = int(own.argmax())
     union = len(indices) + int((labels == label).sum()) - own[label]
-    thing = next((item for item in objects if item["label"] == label), None)
-    return thing if own[label] >= SAME * union else None
+    best = next((item for item in objects if item["label"] == label), None)
+    return best if own[label] >= SAME * union else None
 
 
 def identities(seen: dict[str, list[SeenTogether]]) -> dict[str, dict[str, float]]:

@@ -23,7 +23,7 @@ from shapecat.detection import detect
 from shapecat.geometry import inverse
 from shapecat.simulation import KINECT, make_scene, render_frame
 from shapecat.simulation.scenes import SceneKind
-from shapecat.simulation.worlds import Thing, World
+from shapecat.simulation.worlds import PlacedObject, World
 from shapecat.types import Frame, Scene
 
 Array = NDArray[Any]
@@ -71,7 +71,7 @@ def score(kind: SceneKind, first: int, count: int) -> Counter[str]:
         _judge_planes(view, total)
         _judge_relations(view, matches, total)
         total["scenes"] += 1
-        total["empty scenes with objects"] += not view.world.things and bool(view.found.candidates)
+        total["empty scenes with objects"] += not view.world.objects and bool(view.found.candidates)
     return total
 
 
@@ -97,21 +97,21 @@ def _matches(view: View, total: Counter[str]) -> dict[int, int]:
     """Match candidates and objects one to one; return the candidate of each hit by label."""
     labels, candidates = view.labels, view.found.candidates
     seen = np.bincount(labels, minlength=256)
-    things = [t.label for t in view.world.things if seen[t.label] >= SEEN_PIXELS]
-    small = [t.label for t in view.world.things if 0 < seen[t.label] < SEEN_PIXELS]
+    listed = [t.label for t in view.world.objects if seen[t.label] >= SEEN_PIXELS]
+    small = [t.label for t in view.world.objects if 0 < seen[t.label] < SEEN_PIXELS]
     # Pixels without a label mix two surfaces.
     inside = np.array([np.bincount(labels[c.indices], minlength=256) for c in candidates])
     inside = inside.reshape(-1, 256)
     inside[:, 0] = 0
-    common, sizes = inside[:, things], inside.sum(axis=1)
-    iou = common / np.maximum(sizes[:, None] + seen[things] - common, 1)
+    common, sizes = inside[:, listed], inside.sum(axis=1)
+    iou = common / np.maximum(sizes[:, None] + seen[listed] - common, 1)
     rows, columns = linear_sum_assignment(-iou)
     matches = {
-        things[k]: int(c) for c, k in zip(rows, columns, strict=True) if iou[c, k] >= HIT_IOU
+        listed[k]: int(c) for c, k in zip(rows, columns, strict=True) if iou[c, k] >= HIT_IOU
     }
     ignored = inside[:, small].max(axis=1, initial=0) > sizes / 2
     ignored[list(matches.values())] = False
-    total["objects"] += len(things)
+    total["objects"] += len(listed)
     total["hits"] += len(matches)
     total["detections"] += int(np.count_nonzero(~ignored))
     return matches
@@ -143,19 +143,19 @@ def _judge_planes(view: View, total: Counter[str]) -> None:
 
 def _judge_relations(view: View, matches: dict[int, int], total: Counter[str]) -> None:
     """Count the objects with the right support, if object and support were found."""
-    by_track = {t.track: t for t in view.world.things}
+    by_track = {t.track: t for t in view.world.objects}
     heights = {s.name: s.height for s in view.world.supports if s.level}
     found = _heights(view)
-    for thing in view.world.things:
-        if thing.label not in matches:
+    for item in view.world.objects:
+        if item.label not in matches:
             continue
-        candidate = view.found.candidates[matches[thing.label]]
-        if thing.on_support is not None:
+        candidate = view.found.candidates[matches[item.label]]
+        if item.on_support is not None:
             height = np.inf if candidate.plane is None else found[candidate.plane]
-            apart = abs(height - heights[thing.on_support])
+            apart = abs(height - heights[item.on_support])
             right = candidate.on_candidate is None and bool(apart < SAME_HEIGHT_M)
         else:
-            below = _label_of(by_track, thing)
+            below = _label_of(by_track, item)
             if below not in matches:
                 continue
             right = candidate.on_candidate == matches[below]
@@ -163,8 +163,8 @@ def _judge_relations(view: View, matches: dict[int, int], total: Counter[str]) -
         total["right relations"] += right
 
 
-def _label_of(by_track: dict[int, Thing], thing: Thing) -> int:
-    return by_track[thing.on_track].label if thing.on_track is not None else 0
+def _label_of(by_track: dict[int, PlacedObject], item: PlacedObject) -> int:
+    return by_track[item.on_track].label if item.on_track is not None else 0
 
 
 if __name__ == "__main__":

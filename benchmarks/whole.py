@@ -47,7 +47,7 @@ def find_world(frames: int, objects: int) -> World:
     """Return the first simulated table with this number of objects."""
     for seed in range(SEED, SEED + 100):
         world = make_scene("tabletop", np.random.default_rng(seed), frames=frames)
-        if len(world.things) == objects:
+        if len(world.objects) == objects:
             break
     return world
 
@@ -58,7 +58,7 @@ def tabletop(frames: int, *, objects: int = 8) -> tuple[list[View], int]:
     for k in range(frames):
         frame, _ = render_frame(world, k, rng=np.random.default_rng(k), sensor=KINECT)
         views.append(View(frame, world.path[k]))
-    return views, len(world.things)
+    return views, len(world.objects)
 
 
 def standing(frames: int, *, objects: int = 8) -> list[View]:

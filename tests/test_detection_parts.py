@@ -95,7 +95,7 @@ def test_without_the_trees_objects_stay_in_pieces(seed: int) -> None:
     rng = np.random.default_rng(seed)
     world = make_scene("clutter", rng, frames=1)
     frame, seen = render_frame(world, 0, rng=rng, sensor=KINECT)
-    labels = [thing.label for thing in world.things if np.count_nonzero(seen == thing.label) > 400]
+    labels = [item.label for item in world.objects if np.count_nonzero(seen == item.label) > 400]
     found = []
     for left_out in (["learned merging", "across occlusion"], ["across occlusion"]):
         rng = np.random.default_rng(0)

@@ -37,7 +37,7 @@ def table_with_glasses(seed: int) -> World:
         layout.put_piece(piece, table, np.array([0.36, 0.26]), tries=400)
     target = np.array([0, 0, table.height + 0.05])
     path = walk(rng, target, Filming(FRAMES, 30.0), distance=1.0, elevation=38, sweep=45)
-    return World("tabletop", (table,), tuple(layout.things), path)
+    return World("tabletop", (table,), tuple(layout.objects), path)
 
 
 def track_objects(recording: Path, folder: Path) -> dict[int, tuple[int, str]]:

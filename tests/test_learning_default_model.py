@@ -17,7 +17,7 @@ from shapecat.learning import Categorizer, load_model, save_model
 from shapecat.models import arrangements
 from shapecat.models.arrangements import (
     ALONE,
-    Actor,
+    ArrangedObject,
     Arrangement,
     ArrangementOptions,
     arrange,
@@ -25,7 +25,7 @@ from shapecat.models.arrangements import (
 from shapecat.models.card import write_card
 from shapecat.models.fragments import cut_fragment, cut_halo
 from shapecat.models.sets import Simulated, collect, partial_views
-from shapecat.models.worlds import look, simulate_views, simulate_world
+from shapecat.models.worlds import describe_arrangement, simulate_views, simulate_world
 from shapecat.simulation import piles
 from shapecat.simulation.distractors import make_distractor
 from shapecat.simulation.mesh import Mesh, moved
@@ -144,9 +144,9 @@ def test_training_uses_only_given_kinds_of_distractors(
     monkeypatch.setattr(arrangements, "_SETTLED", ((only, 1.0, Arrangement([], ())),))
     monkeypatch.setattr(piles, "make_distractor", make)
     options = ArrangementOptions(3, ("pan", "hammer"), unknown=1.0, settled=1.0)
-    actors = arrange(options, np.random.default_rng(5)).actors
+    objects = arrange(options, np.random.default_rng(5)).objects
 
-    assert {actor.label for actor in actors} == {"unknown"}
+    assert {item.label for item in objects} == {"unknown"}
     assert set(made) == {"pan", "hammer"}
 
 
@@ -156,10 +156,12 @@ def test_thin_background_gives_unknown_views() -> None:
     box, board, block = (rounded_box(size) for size in sizes)
     here, there = (Pose(np.eye(3), np.array([x, 0.05, 0.0])) for x in (-0.15, 0.15))
     around = (ALONE, moved(board, here), moved(block, there))
-    scene = Arrangement([Actor(box, "box", "upright", 0.0)], around, (30, 50))
+    scene = Arrangement([ArrangedObject(box, "box", "upright", 0.0)], around, (30, 50))
 
     views, objects = (
-        look(scene, "a", cameras=4, rng=np.random.default_rng(2), background=wanted, keep=True)
+        describe_arrangement(
+            scene, "a", cameras=4, rng=np.random.default_rng(2), background=wanted, keep=True
+        )
         for wanted in (True, False)
     )
     found = [view for view in views if view.source == "background"]

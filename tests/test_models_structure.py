@@ -32,13 +32,13 @@ SERIES = (Series("bin", 2000, 2, ("kinect",)), Series("clutter", 2000, 1, ("kine
 def test_objects_are_told_from_the_walls_of_their_bin() -> None:
     rng = np.random.default_rng(2000)
     world = make_scene("bin", rng, frames=1)
-    frame, owners = render_frame(world, 0, rng=rng, sensor=KINECT)
-    things = np.array([thing.label for thing in world.things])
-    (told,) = label_objects(frame, owners, things)
+    frame, pixel_labels = render_frame(world, 0, rng=rng, sensor=KINECT)
+    object_labels = np.array([item.label for item in world.objects])
+    (told,) = label_objects(frame, pixel_labels, object_labels)
     assert set(told.objects.tolist()) == {True, False}
     assert np.isfinite(as_rows(told.features)).all()
     assert told.weights[0].shape == (4, len(told.objects), len(told.objects))
-    (none,) = label_objects(frame, owners, things[:0])
+    (none,) = label_objects(frame, pixel_labels, object_labels[:0])
     assert none.objects.tolist() == [False] * len(told.objects)
 
 
@@ -47,9 +47,9 @@ def test_objects_lie_on_the_floor_where_the_table_was() -> None:
     below = _on_floor(world)
     assert "table" not in {support.name for support in below.supports}
     lowest = [
-        transform(thing.pose, thing.mesh.vertices)[:, 2].min()
-        for thing in below.things
-        if thing.on_support
+        transform(item.pose, item.mesh.vertices)[:, 2].min()
+        for item in below.objects
+        if item.on_support
     ]
     assert len(lowest) > 0
     assert np.abs(lowest).max() < 0.01
@@ -57,8 +57,8 @@ def test_objects_lie_on_the_floor_where_the_table_was() -> None:
 
 def test_a_camera_anywhere_looks_at_the_objects_from_where_its_sensor_can_read() -> None:
     world = make_scene("pile", np.random.default_rng(2001), frames=1)
-    world = replace(world, things=world.things[:1])
-    place = world.things[0].pose.translation
+    world = replace(world, objects=world.objects[:1])
+    place = world.objects[0].pose.translation
     for seed in range(20):
         pose = _viewpoint(world, KINECT, np.random.default_rng(seed))
         assert isinstance(pose, Pose)
@@ -143,9 +143,11 @@ def test_resting_arms_lie_on_the_support_and_are_cut_off_by_the_image_border() -
     for rng, pose, armed, points in _armed(world, "resting"):
         lowest = float(points[:, 2].min()) - table
         assert lowest > -0.1  # joints are thicker than the links
-        owners = render_frame(armed, pose, rng=rng, sensor=IDEAL)[1].reshape(480, 640)
-        rim = np.concatenate([owners[0], owners[-1], owners[:, 0], owners[:, -1]])
-        within = (owners[40:-40, 40:-40] == EQUIPMENT).any()
+        pixel_labels = render_frame(armed, pose, rng=rng, sensor=IDEAL)[1].reshape(480, 640)
+        rim = np.concatenate(
+            [pixel_labels[0], pixel_labels[-1], pixel_labels[:, 0], pixel_labels[:, -1]]
+        )
+        within = (pixel_labels[40:-40, 40:-40] == EQUIPMENT).any()
         cut += bool(lowest < 0.06 and within and (rim == EQUIPMENT).any())
     assert cut >= 5
 

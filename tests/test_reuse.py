@@ -41,7 +41,7 @@ def shifted(track: int, shifts: Sequence[Any]) -> Motion:
 
 def alone(world: World) -> int:
     """Return the index of the object that is farthest from all others."""
-    places = np.array([thing.pose.translation for thing in world.things])
+    places = np.array([item.pose.translation for item in world.objects])
     gaps = np.linalg.norm(places[:, None] - places[None], axis=2) + 9 * np.eye(len(places))
     return int(gaps.min(axis=1).argmax())
 
@@ -96,7 +96,7 @@ def test_reused_masks_cover_only_depth_of_their_frame() -> None:
 def test_only_moved_object_is_described_again() -> None:
     world = still_world()
     track = alone(world)
-    place = world.things[track].pose.translation
+    place = world.objects[track].pose.translation
     shift = np.array([*(0.05 * place[:2] / np.linalg.norm(place[:2])), 0])
     motion = shifted(track, [(0, 0, 0)] * CHANGE + [shift] * (FRAMES - CHANGE))
     world = replace(world, motions=(motion,))
@@ -114,11 +114,11 @@ def test_only_moved_object_is_described_again() -> None:
 def test_another_object_at_same_place_is_described_again() -> None:
     """Otherwise it would inherit the label of the object that stood there before."""
     world = still_world()
-    names = [thing.category for thing in world.things]
+    names = [item.category for item in world.objects]
     track, other = alone(world), names.index("plate" if names[alone(world)] != "plate" else "can")
-    place = world.things[track].pose.translation
-    bottom = [thing.mesh.vertices[:, 2].min() for thing in world.things]
-    across = place - world.things[other].pose.translation
+    place = world.objects[track].pose.translation
+    bottom = [item.mesh.vertices[:, 2].min() for item in world.objects]
+    across = place - world.objects[other].pose.translation
     across[2] += bottom[track] - bottom[other]
     motions = (
         shifted(track, [(0, 0, 0)] * CHANGE + [None] * (FRAMES - CHANGE)),
@@ -134,10 +134,10 @@ def test_another_object_at_same_place_is_described_again() -> None:
 def test_partly_hidden_object_is_described_again() -> None:
     world = still_world()
     track = alone(world)
-    blocker = (track + 1) % len(world.things)
-    place, eye = world.things[track].pose.translation, world.path[0].translation
+    blocker = (track + 1) % len(world.objects)
+    place, eye = world.objects[track].pose.translation, world.path[0].translation
     between = place + 0.12 * (eye - place) / np.linalg.norm(eye - place)
-    shift = between - world.things[blocker].pose.translation
+    shift = between - world.objects[blocker].pose.translation
     motion = shifted(blocker, [None] * CHANGE + [shift] * (FRAMES - CHANGE))
 
     perceptions = perceive(replace(world, motions=(motion,)))
@@ -156,7 +156,7 @@ def test_slowly_moving_object_is_described_again() -> None:
     frames, step = 16, 0.003
     world = still_world(frames)
     track = alone(world)
-    place = world.things[track].pose.translation
+    place = world.objects[track].pose.translation
     way = step * place[:2] / np.linalg.norm(place[:2])
     motion = shifted(track, [(*(k * way), 0) for k in range(frames)])
 

@@ -101,8 +101,8 @@ def test_object_beside_table_falls() -> None:
 def test_settled_scenes_are_reproducible(kind: SceneKind) -> None:
     """Training and evaluation identify scenes by their seeds."""
     one, other = settled(kind, 1), make_scene(kind, np.random.default_rng(1), frames=2)
-    assert len(one.things) == len(other.things) > 2
-    for a, b in zip(one.things, other.things, strict=True):
+    assert len(one.objects) == len(other.objects) > 2
+    for a, b in zip(one.objects, other.objects, strict=True):
         assert np.array_equal(a.pose.translation, b.pose.translation)
         assert np.array_equal(a.pose.rotation, b.pose.rotation)
 
@@ -116,9 +116,9 @@ def test_settled_objects_lie_on_support_without_interpenetration(
 ) -> None:
     world = settled(kind, seed)
     solids = [
-        (transform(thing.pose, thing.mesh.vertices), [moved_part(p, thing.pose) for p in parts])
-        for thing in world.things
-        for parts in [convex_parts(thing.mesh)]
+        (transform(item.pose, item.mesh.vertices), [moved_part(p, item.pose) for p in parts])
+        for item in world.objects
+        for parts in [convex_parts(item.mesh)]
     ]
     support = next(s for s in world.supports if s.name == world_support(world.kind))
     for points, _ in solids:
@@ -145,11 +145,11 @@ def test_tilted_objects_are_marked() -> None:
     """Their category accuracy is reported separately."""
     tilted = straight = 0
     for seed in (1, 4):
-        for thing in settled("pile", seed).things:
-            upright = np.degrees(np.arccos(np.clip(np.abs(thing.pose.rotation[2]).max(), 0, 1)))
-            assert thing.tilted == (upright > 15)
-            tilted += thing.tilted
-            straight += not thing.tilted
+        for item in settled("pile", seed).objects:
+            upright = np.degrees(np.arccos(np.clip(np.abs(item.pose.rotation[2]).max(), 0, 1)))
+            assert item.tilted == (upright > 15)
+            tilted += item.tilted
+            straight += not item.tilted
     assert tilted > 1
     assert straight > 5
 
@@ -171,4 +171,4 @@ def test_most_dropped_objects_are_visible(kind: SceneKind) -> None:
     world = settled(kind, 1)
     _, labels = render_frame(world, 1, rng=np.random.default_rng(0))
     visible = set(np.unique(labels).tolist())
-    assert sum(thing.label in visible for thing in world.things) > 0.5 * len(world.things)
+    assert sum(item.label in visible for item in world.objects) > 0.5 * len(world.objects)

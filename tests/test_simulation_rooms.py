@@ -7,9 +7,9 @@ from benchmarks.rooms import count
 from shapecat.simulation import make_scene
 from shapecat.simulation.distractors import make_distractor
 from shapecat.simulation.procedural import PROCEDURAL
-from shapecat.simulation.worlds import FIRST_THING_LABEL
+from shapecat.simulation.worlds import FIRST_OBJECT_LABEL
 
-FIRST = FIRST_THING_LABEL
+FIRST = FIRST_OBJECT_LABEL
 
 
 def test_rooms_contain_objects_and_background() -> None:
@@ -18,7 +18,7 @@ def test_rooms_contain_objects_and_background() -> None:
     assert sum(any(s.name.startswith("robot") for s in room.supports) for room in rooms) > 2
     assert sum(any(s.name.startswith("room_") for s in room.supports) for room in rooms) > 2
     for room in rooms:
-        assert len(room.things) >= 3
+        assert len(room.objects) >= 3
         assert len({s.name for s in room.supports}) == len(room.supports)
         assert all(1 <= s.label <= 9 for s in room.supports)
 

@@ -53,11 +53,11 @@ def top_view(mesh: Mesh, pose: Pose) -> Bool:
 def test_objects_do_not_interpenetrate(world: World) -> None:
     """Where two of them are at the same height, no vertical line meets both."""
     here = Pose(np.eye(3), np.zeros(3))
-    solids = [(thing.mesh, thing.pose) for thing in world.things]
+    solids = [(item.mesh, item.pose) for item in world.objects]
     solids += [(s.mesh, here) for s in world.supports if s.name != "floor"]
     heights = [transform(pose, mesh.vertices)[:, 2] for mesh, pose in solids]
     covers = [top_view(*solid) for solid in solids]
-    for i in range(len(world.things)):
+    for i in range(len(world.objects)):
         for j in range(i + 1, len(solids)):
             apart = min(heights[i].max(), heights[j].max()) - max(
                 heights[i].min(), heights[j].min()
@@ -68,15 +68,15 @@ def test_objects_do_not_interpenetrate(world: World) -> None:
 
 def test_objects_stand_on_their_true_supports(world: World) -> None:
     boards = {support.name: support for support in world.supports}
-    for thing in world.things:
-        points = transform(thing.pose, thing.mesh.vertices)
+    for item in world.objects:
+        points = transform(item.pose, item.mesh.vertices)
         bottom = float(points[:, 2].min())
-        if thing.on_support is not None:
-            assert thing.on_track is None
-            assert bottom == pytest.approx(boards[thing.on_support].height, abs=3e-5)
+        if item.on_support is not None:
+            assert item.on_track is None
+            assert bottom == pytest.approx(boards[item.on_support].height, abs=3e-5)
         else:
-            assert thing.on_track is not None
-            below = world.things[thing.on_track]
+            assert item.on_track is not None
+            below = world.objects[item.on_track]
             top = float(transform(below.pose, below.mesh.vertices)[:, 2].max())
             assert bottom == pytest.approx(top, abs=3e-5)
 
@@ -85,9 +85,9 @@ def test_most_objects_are_visible(world: World) -> None:
     rng = np.random.default_rng(0)
     for index in (0, 20, 39):
         _, labels = render_frame(world, index, rng=rng, sensor=KINECT)
-        visible = {thing.track for thing in world.things if (labels == thing.label).sum() > 60}
+        visible = {item.track for item in world.objects if (labels == item.label).sum() > 60}
         share = 0.3 if world.kind == "walking" else 0.6  # that counter is longer than the view
-        assert len(visible) >= share * len(world.things)
+        assert len(visible) >= share * len(world.objects)
 
 
 def test_camera_moves_smoothly(world: World) -> None:
@@ -102,13 +102,13 @@ def test_camera_moves_smoothly(world: World) -> None:
 def test_tabletop_contains_all_categories() -> None:
     for seed in range(5):
         world = make_scene("tabletop", np.random.default_rng(seed), frames=2)
-        assert {thing.category for thing in world.things} == set(CATEGORIES)
-        assert 6 <= len(world.things) <= 10
+        assert {item.category for item in world.objects} == set(CATEGORIES)
+        assert 6 <= len(world.objects) <= 10
 
 
 def test_stacks_occur_in_clutter_and_on_shelves() -> None:
     stacked = [
-        sum(t.on_track is not None for t in make_scene(kind, np.random.default_rng(s)).things)
+        sum(t.on_track is not None for t in make_scene(kind, np.random.default_rng(s)).objects)
         for kind in ("clutter", "shelf")
         for s in range(3)
     ]
@@ -118,8 +118,8 @@ def test_stacks_occur_in_clutter_and_on_shelves() -> None:
 
 def test_turntable_moves_objects_and_not_the_camera() -> None:
     world = make_scene("turntable", np.random.default_rng(0), frames=30)
-    thing = world.things[0]
-    first, last = world.pose_of(thing, 0), world.pose_of(thing, 29)
+    item = world.objects[0]
+    first, last = world.pose_of(item, 0), world.pose_of(item, 29)
 
     assert np.linalg.norm(first.translation - last.translation) > 0.005
     assert first.translation[2] == last.translation[2]
@@ -134,7 +134,7 @@ def test_scene_is_independent_of_number_of_frames() -> None:
     short = make_scene("tabletop", np.random.default_rng(5), frames=3)
     long = make_scene("tabletop", np.random.default_rng(5), frames=50)
 
-    assert len(short.things) == len(long.things)
+    assert len(short.objects) == len(long.objects)
     for a, b in zip(short.path, long.path, strict=False):
         assert np.array_equal(a.translation, b.translation)
 
@@ -142,14 +142,14 @@ def test_scene_is_independent_of_number_of_frames() -> None:
 def test_stage_shows_its_object_from_all_sides() -> None:
     rng = np.random.default_rng(3)
     world = make_stage([make_piece("cup", rng, manner="lying")], rng, views=6)
-    (thing,) = world.things
+    (item,) = world.objects
     sides = {round(np.arctan2(*pose.translation[1::-1])) for pose in world.path}
 
-    assert thing.lying
+    assert item.lying
     assert len(sides) >= 3
     for view in range(6):
         _, labels = render_frame(world, view, rng=rng)
-        assert (labels == thing.label).sum() > 100
+        assert (labels == item.label).sum() > 100
 
 
 @pytest.mark.parametrize("seed", [3, pytest.param(4, marks=pytest.mark.many)])
@@ -161,8 +161,8 @@ def test_moving_objects_stay_on_table_and_do_not_collide(seed: int) -> None:
         assert moving.motions
         table = next(s for s in moving.supports if s.name == "table")
         for k in range(24):
-            current = [thing for thing in moving.things if moving.present(thing, k)]
-            solids = [(thing.mesh, moving.pose_of(thing, k)) for thing in current]
+            current = [item for item in moving.objects if moving.present(item, k)]
+            solids = [(item.mesh, moving.pose_of(item, k)) for item in current]
             z = [transform(pose, mesh.vertices)[:, 2] for mesh, pose in solids]
             covers = [top_view(*solid) for solid in solids]
             assert min(low.min() for low in z) > table.height - 1e-4
@@ -182,11 +182,11 @@ def test_truth_lists_only_present_objects(tmp_path: Path) -> None:
     counts = []
     for k, frame in enumerate(truth):
         listed = {o["track"]: o["pixels"] for o in frame["objects"] + frame["hidden"]}
-        assert set(listed) == {t.track for t in world.things if world.present(t, k)}
-        absent = {t.label for t in world.things} - {20 + track for track in listed}
+        assert set(listed) == {t.track for t in world.objects if world.present(t, k)}
+        absent = {t.label for t in world.objects} - {20 + track for track in listed}
         assert not np.isin(labels[k], list(absent)).any()
         counts.append(len(listed))
-    assert min(counts) < max(counts) <= len(world.things)
+    assert min(counts) < max(counts) <= len(world.objects)
 
 
 def test_unknown_scene_raises() -> None:
@@ -205,12 +205,12 @@ def test_labelled_points_lie_within_their_object(world: World) -> None:
     """Labels must not be shifted against depth."""
     frame, labels = render_frame(world, 7, rng=np.random.default_rng(0), sensor=IDEAL)
     points = transform(world.path[7], frame.xyz())
-    for thing in world.things:
-        own = points[labels.reshape(-1) == thing.label]
+    for item in world.objects:
+        own = points[labels.reshape(-1) == item.label]
         if len(own) == 0:
             continue
-        local = transform(inverse(world.pose_of(thing, 7)), own)
-        low, high = thing.mesh.vertices.min(axis=0), thing.mesh.vertices.max(axis=0)
+        local = transform(inverse(world.pose_of(item, 7)), own)
+        low, high = item.mesh.vertices.min(axis=0), item.mesh.vertices.max(axis=0)
         assert np.all(local > low - 1e-4)
         assert np.all(local < high + 1e-4)
 

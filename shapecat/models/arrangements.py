@@ -15,10 +15,10 @@ from shapecat.simulation.placement import choose_rest, rests
 from shapecat.simulation.primitives import rounded_box
 from shapecat.simulation.rooms import room
 from shapecat.simulation.shapes import make_object
-from shapecat.simulation.worlds import Thing, World, turned_about_z
+from shapecat.simulation.worlds import PlacedObject, World, turned_about_z
 from shapecat.types import CATEGORIES, UNKNOWN, Pose
 
-__all__ = ["ALONE", "Actor", "Arrangement", "ArrangementOptions", "arrange", "placed"]
+__all__ = ["ALONE", "ArrangedObject", "Arrangement", "ArrangementOptions", "arrange", "placed"]
 
 _TABLE_M = (1.6, 1.2, 0.03)
 _MANNERS = {
@@ -66,7 +66,7 @@ class ArrangementOptions:
     keep: bool = False
 
 
-class Actor(NamedTuple):
+class ArrangedObject(NamedTuple):
     """An object of an arrangement.
 
     Attributes
@@ -89,7 +89,7 @@ class Arrangement(NamedTuple):
     ``elevation`` and ``azimuth`` are ranges in degrees; the open side of a shelf is at azimuth -90.
     """
 
-    actors: list[Actor]
+    objects: list[ArrangedObject]
     furniture: tuple[Mesh, ...]
     elevation: tuple[float, float] = (8.0, 80.0)
     azimuth: tuple[float, float] = (-180.0, 180.0)
@@ -121,46 +121,46 @@ def _settled(options: ArrangementOptions, rng: np.random.Generator) -> Arrangeme
     names = np.where(rng.random(names.size) < options.unknown, UNKNOWN, names)
     scene = make(rng, names.tolist(), Filming(1, 30.0), kinds=options.kinds)
     supports = {support.name: support for support in scene.supports}
-    bearing = next((t.on_support for t in scene.things if t.on_support is not None), "floor")
+    bearing = next((t.on_support for t in scene.objects if t.on_support is not None), "floor")
     down = Pose(np.eye(3), np.array([0.0, 0.0, -supports[bearing].height]))
     furniture = tuple(moved(support.mesh, down) for support in scene.supports)
     return seen_from._replace(
-        actors=[_actor(thing, down) for thing in scene.things], furniture=furniture
+        objects=[_arranged_object(item, down) for item in scene.objects], furniture=furniture
     )
 
 
-def _actor(thing: Thing, down: Pose) -> Actor:
-    mesh = moved(moved(thing.mesh, thing.pose), down)
-    manners = (("upside_down", thing.upside_down), ("lying", thing.lying), ("tilted", thing.tilted))
+def _arranged_object(item: PlacedObject, down: Pose) -> ArrangedObject:
+    mesh = moved(moved(item.mesh, item.pose), down)
+    manners = (("upside_down", item.upside_down), ("lying", item.lying), ("tilted", item.tilted))
     manner = next((name for name, so in manners if so), "upright")
-    return Actor(mesh, thing.category, manner, float(mesh.vertices[:, 2].min()))
+    return ArrangedObject(mesh, item.category, manner, float(mesh.vertices[:, 2].min()))
 
 
-def _spread(options: ArrangementOptions, rng: np.random.Generator) -> list[Actor]:
+def _spread(options: ArrangementOptions, rng: np.random.Generator) -> list[ArrangedObject]:
     """Place objects on the table: apart, close together, or one on another."""
-    actors: list[Actor] = []
+    objects: list[ArrangedObject] = []
     spots: list[tuple[float, float, float]] = []
     gap = float(rng.choice([0.003, 0.02, 0.08]))
     size = float(np.exp(rng.uniform(*np.log(_SIZES)))) if rng.random() < _RESIZED else 1.0
     for _ in range(int(rng.integers(3, 10))):
-        actor = _make(options, rng, size)
+        item = _make(options, rng, size)
         if options.leaning > 0 and rng.random() < options.leaning:
-            actor = _leant(actor, rng)
-        radius = float(np.hypot(actor.mesh.vertices[:, 0], actor.mesh.vertices[:, 1]).max())
+            item = _leant(item, rng)
+        radius = float(np.hypot(item.mesh.vertices[:, 0], item.mesh.vertices[:, 1]).max())
         spot = _free_spot(spots, radius + gap / 2, rng)
         if spot is None:
             continue
         spots.append((*spot, radius + gap / 2))
-        actors.append(placed(actor, spot, 0.0, rng))
-        top = actor.mesh.extents
-        if actor.label == "box" and top[:2].min() > 0.05 and rng.random() < 0.3:
+        objects.append(placed(item, spot, 0.0, rng))
+        top = item.mesh.extents
+        if item.label == "box" and top[:2].min() > 0.05 and rng.random() < 0.3:
             above = _make(options, rng, size)
             if np.all(above.mesh.extents[:2] < 1.3 * top[:2].min()):
-                actors.append(placed(above, spot, float(top[2]), rng))
-    return actors
+                objects.append(placed(above, spot, float(top[2]), rng))
+    return objects
 
 
-def _make(options: ArrangementOptions, rng: np.random.Generator, size: float) -> Actor:
+def _make(options: ArrangementOptions, rng: np.random.Generator, size: float) -> ArrangedObject:
     """Make a random object or distractor, scaled by ``size``."""
     if rng.random() < options.unknown:
         _, mesh = make_distractor(rng, str(rng.choice(list(options.kinds))))
@@ -169,7 +169,9 @@ def _make(options: ArrangementOptions, rng: np.random.Generator, size: float) ->
     return _rested(scaled(make_object(label, rng), size), label, options, rng)
 
 
-def _rested(mesh: Mesh, label: str, options: ArrangementOptions, rng: np.random.Generator) -> Actor:
+def _rested(
+    mesh: Mesh, label: str, options: ArrangementOptions, rng: np.random.Generator
+) -> ArrangedObject:
     """Draw a resting pose from those usual for the label; upright if the mesh has none like it."""
     chances = dict(_MANNERS.get(label, {"upright": 1.0}))
     if options.lying is not None and label in _ROUND:
@@ -178,24 +180,24 @@ def _rested(mesh: Mesh, label: str, options: ArrangementOptions, rng: np.random.
     manner = str(rng.choice(list(chances), p=list(chances.values())))
     rest = choose_rest(rests(mesh), manner, rng) if manner != "upright" else None
     if rest is None:
-        return Actor(standing(mesh), label, "upright", 0.0)
-    return Actor(moved(mesh, rest.pose), label, manner, 0.0)
+        return ArrangedObject(standing(mesh), label, "upright", 0.0)
+    return ArrangedObject(moved(mesh, rest.pose), label, manner, 0.0)
 
 
-def _leant(actor: Actor, rng: np.random.Generator) -> Actor:
+def _leant(item: ArrangedObject, rng: np.random.Generator) -> ArrangedObject:
     """Tilt an object by 5 to 25 degrees, as if it leant on something."""
     azimuth, half = rng.uniform(0, 2 * np.pi), np.radians(rng.uniform(5, 25)) / 2
     axis = np.sin(half) * np.array([np.cos(azimuth), np.sin(azimuth), 0.0])
     turn = Pose(rotation_from_quaternion(np.round([*axis, np.cos(half)], 9)), np.zeros(3))
-    return actor._replace(mesh=standing(moved(actor.mesh, turn)), manner="leaning")
+    return item._replace(mesh=standing(moved(item.mesh, turn)), manner="leaning")
 
 
 def placed(
-    actor: Actor, spot: tuple[float, float], support_m: float, rng: np.random.Generator
-) -> Actor:
+    item: ArrangedObject, spot: tuple[float, float], support_m: float, rng: np.random.Generator
+) -> ArrangedObject:
     """Turn an object randomly about z and place it at ``spot`` (x, y) and height, in metres."""
     pose = turned_about_z(rng.uniform(0, 2 * np.pi), [*spot, support_m])
-    return actor._replace(mesh=moved(actor.mesh, pose), support_m=support_m)
+    return item._replace(mesh=moved(item.mesh, pose), support_m=support_m)
 
 
 def _free_spot(

@@ -126,24 +126,24 @@ def _collect(series: Series) -> Pairs:
     for seed in range(series.first, series.first + series.scenes):
         rng = np.random.default_rng(seed)
         world = make_scene(series.kind, rng, frames=1, categories=series.categories)
-        frame, owners = render_frame(world, 0, rng=rng, sensor=series.sensor)
-        things = np.array([thing.label for thing in world.things])
+        frame, pixel_labels = render_frame(world, 0, rng=rng, sensor=series.sensor)
+        object_labels = np.array([item.label for item in world.objects])
         if frame.depth is not None and frame.camera is not None:
-            found += _pairs(frame.depth, frame.camera, owners, things, rng)
+            found += _pairs(frame.depth, frame.camera, pixel_labels, object_labels, rng)
     features = np.array([features for features, _ in found], np.float32).reshape(-1, FEATURES)
     return Pairs(features, np.array([same for _, same in found], bool))
 
 
 def _pairs(
-    depth: F4, camera: Camera, owners: U1, things: I4, rng: np.random.Generator
+    depth: F4, camera: Camera, pixel_labels: U1, object_labels: I4, rng: np.random.Generator
 ) -> Iterator[tuple[F4, bool]]:
     """Yield the features of pairs of segments, single or merged, and whether they are one object.
 
     Parameters
     ----------
     depth : (h, w) metres, 0 where there is no reading.
-    owners : (h, w) pixel labels of the scene.
-    things : (k,) labels of objects.
+    pixel_labels : (h, w) pixel labels of the scene.
+    object_labels : (k,) labels of objects.
     """
     settings = DetectionSettings()
     grid = downsample(depth, camera, range_m=settings.max_range_m)
@@ -155,13 +155,13 @@ def _pairs(
     ground, (graph, labels, segments) = found
     merge_low_profile(segments, ground.low_profile, labels, graph.spans)
     merge_across_occluder(segments, grid.inverse_depth, grid.intrinsics, graph.normal, labels)
-    counts = count_labels(owners.reshape(depth.shape), labels, grid)
+    counts = count_labels(pixel_labels.reshape(depth.shape), labels, grid)
     view_geometry, seen = ViewGeometry(grid.intrinsics.fx, float(ground.up[2])), set()
     while True:
-        rows, whose = _whose(segments, counts, things)
+        rows, object_of = _segment_objects(segments, counts, object_labels)
         todo = []
-        for p, q in _meeting(segments, whose):
-            same = bool(whose[p] == whose[q] and whose[p] > 0)
+        for p, q in _adjacent_pairs(segments, object_of):
+            same = bool(object_of[p] == object_of[q] and object_of[p] > 0)
             if same:
                 todo.append((p, q))
             if (p, q, rows[p], rows[q]) not in seen:
@@ -174,22 +174,22 @@ def _pairs(
         merge(segments, *todo[rng.integers(len(todo))])
 
 
-def count_labels(owners: U1, labels: I4, grid: DepthGrid) -> I4:
+def count_labels(pixel_labels: U1, labels: I4, grid: DepthGrid) -> I4:
     """Return the number of cells of each segment with each label, (segments, labels).
 
     Parameters
     ----------
-    owners : (h, w) pixel labels at full resolution.
+    pixel_labels : (h, w) pixel labels at full resolution.
     labels : (rows, columns) segment of each cell of the grid.
     """
     middle, (rows, columns) = grid.factor // 2, labels.shape
-    seen = owners[middle :: grid.factor, middle :: grid.factor][:rows, :columns]
-    counts = np.zeros((labels.max() + 1, owners.max() + 1), np.int64)
+    seen = pixel_labels[middle :: grid.factor, middle :: grid.factor][:rows, :columns]
+    counts = np.zeros((labels.max() + 1, pixel_labels.max() + 1), np.int64)
     np.add.at(counts, (labels.ravel(), seen.ravel()), 1)
     return counts
 
 
-def _whose(segments: Segments, counts: I4, things: I4) -> tuple[I4, I4]:
+def _segment_objects(segments: Segments, counts: I4, object_labels: I4) -> tuple[I4, I4]:
     """Return the number of cells (n,) and the owner (n,) of each merged segment.
 
     The owner is the label of an object, 0 for background, or -1 for a mixed segment.
@@ -199,16 +199,16 @@ def _whose(segments: Segments, counts: I4, things: I4) -> tuple[I4, I4]:
     sizes = joined.sum(axis=1)
     best = joined.argmax(axis=1)
     pure = joined[np.arange(len(best)), best] > _PURE * sizes
-    return sizes, np.where(pure, np.where(np.isin(best, things), best, 0), -1)
+    return sizes, np.where(pure, np.where(np.isin(best, object_labels), best, 0), -1)
 
 
-def _meeting(segments: Segments, whose: I4) -> Iterator[tuple[int, int]]:
+def _adjacent_pairs(segments: Segments, object_of: I4) -> Iterator[tuple[int, int]]:
     """Yield adjacent pairs of unmixed segments, of which at least one belongs to an object."""
     n = segments.parent.size
     for p in range(1, n):
         adjacent = find_adjacent(segments, p)
         for q in range(p + 1, n):
-            known = min(whose[p], whose[q]) >= 0 and max(whose[p], whose[q]) > 0
+            known = min(object_of[p], object_of[q]) >= 0 and max(object_of[p], object_of[q]) > 0
             if known and adjacent[q]:
                 yield p, q
 

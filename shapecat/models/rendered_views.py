@@ -48,17 +48,19 @@ class RenderedView(NamedTuple):
     sensor: str
 
 
-def render_view(seen: Geometry, arrangement: Arrangement, rng: np.random.Generator) -> RenderedView:
+def render_view(
+    geometry: Geometry, arrangement: Arrangement, rng: np.random.Generator
+) -> RenderedView:
     """Take an image of an arrangement with a random sensor from a random viewpoint.
 
-    ``seen`` holds the meshes of the arrangement, metres, table frame: first its objects,
+    ``geometry`` holds the meshes of the arrangement, metres, table frame: first its objects,
     then its furniture.
     """
     name, sensor = _draw_sensor(rng)
     camera, pose = sensor.camera, _viewpoint(arrangement, sensor, rng)
-    image = render(seen, camera, pose)
+    image = render(geometry, camera, pose)
     depth, owners = measure(image, sensor, rng)
-    visible = _visible_fractions(seen, owners, camera, pose, len(arrangement.actors))
+    visible = _visible_fractions(geometry, owners, camera, pose, len(arrangement.objects))
     frame = Frame("/camera", 0, 0, 0, "camera", depth=depth, camera=camera)
     return RenderedView(frame, owners, visible, pose, name)
 
@@ -89,7 +91,7 @@ def _draw_sensor(rng: np.random.Generator) -> tuple[str, Sensor]:
 
 def _viewpoint(arrangement: Arrangement, sensor: Sensor, rng: np.random.Generator) -> Pose:
     """Return ``table_from_camera``: 0.25 to 3 m away, in the elevations of the arrangement."""
-    points = np.concatenate([actor.mesh.vertices for actor in arrangement.actors])
+    points = np.concatenate([item.mesh.vertices for item in arrangement.objects])
     target = points.mean(axis=0) + rng.normal(0, 0.04, 3)
     nearest, farthest = _DISTANCES_M
     nearest = max(nearest, sensor.nearest_m + _CLOSER_M)
@@ -107,7 +109,9 @@ def _viewpoint(arrangement: Arrangement, sensor: Sensor, rng: np.random.Generato
     return looking_at(target + distance * back, target, roll=rng.normal(0, 0.05))
 
 
-def _visible_fractions(seen: Geometry, owners: I4, camera: Camera, pose: Pose, count: int) -> F8:
+def _visible_fractions(
+    geometry: Geometry, owners: I4, camera: Camera, pose: Pose, count: int
+) -> F8:
     """Return the visible fraction of each object, (count,).
 
     It is the number of readings divided by the pixels that the object would have alone in an image
@@ -125,8 +129,8 @@ def _visible_fractions(seen: Geometry, owners: I4, camera: Camera, pose: Pose, c
     )
     result = np.zeros(count)
     for k in range(count):
-        mine = seen.owners == k
-        alone = Geometry(seen.vertices, seen.triangles[mine], seen.owners[mine])
+        mine = geometry.owners == k
+        alone = Geometry(geometry.vertices, geometry.triangles[mine], geometry.owners[mine])
         total = int((render(alone, wide, pose).owners >= 0).sum()) * _COARSE**2
         if seen_pixels[k] >= _FEWEST_PIXELS:
             result[k] = min(1.0, seen_pixels[k] / max(total, 1))

@@ -225,27 +225,27 @@ def _views(series: Series, seed: int) -> Iterator[Samples]:
     world = _on_floor(world) if series.view == "floor" else world
     if series.changed is not None:
         world = replace(world, supports=tuple(series.changed(rng, world.supports)))
-    things = np.array([thing.label for thing in world.things], np.int64)
+    object_labels = np.array([item.label for item in world.objects], np.int64)
     for k in range(_VIEWS[series.view]):
         sensor = PRESETS[series.sensors[(seed + k) % len(series.sensors)]]
         view = 0 if series.view == "path" else _viewpoint(world, sensor, rng)
         sensor = resized(sensor, 1 / rng.integers(2, 5)) if series.coarse else sensor
-        seen = _with_arms(world, view, sensor.camera, series.arms, rng)
-        frame, owners = render_frame(seen, view, rng=rng, sensor=sensor)
+        with_arms = _with_arms(world, view, sensor.camera, series.arms, rng)
+        frame, pixel_labels = render_frame(with_arms, view, rng=rng, sensor=sensor)
         depth = None if frame.depth is None else frame.depth * np.float32(series.scale)
-        yield from label_objects(replace(frame, depth=depth), owners, things)
+        yield from label_objects(replace(frame, depth=depth), pixel_labels, object_labels)
 
 
 def _on_floor(world: World) -> World:
     """Remove the table and everything on it except the objects, and put these on the floor."""
     table = next(support for support in world.supports if support.name == "table")
     down = np.array([0.0, 0.0, -table.height])
-    things = (
-        replace(thing, pose=Pose(thing.pose.rotation, thing.pose.translation + down))
-        for thing in world.things
+    objects = (
+        replace(item, pose=Pose(item.pose.rotation, item.pose.translation + down))
+        for item in world.objects
     )
     rest = (s for s in world.supports if s is not table and not s.name.startswith("robot"))
-    return replace(world, supports=tuple(rest), things=tuple(things))
+    return replace(world, supports=tuple(rest), objects=tuple(objects))
 
 
 def _with_arms(
@@ -263,13 +263,15 @@ def _with_arms(
         meshes = make_own_arms(rng, pose, height)
     else:
         meshes = make_resting_arms(rng, pose, intrinsics, height)
-    seen = (Support(f"arm_{k}", EQUIPMENT, mesh, np.zeros((0, 3))) for k, mesh in enumerate(meshes))
-    return replace(world, supports=(*world.supports, *seen))
+    added = (
+        Support(f"arm_{k}", EQUIPMENT, mesh, np.zeros((0, 3))) for k, mesh in enumerate(meshes)
+    )
+    return replace(world, supports=(*world.supports, *added))
 
 
 def _viewpoint(world: World, sensor: Sensor, rng: np.random.Generator) -> Pose | int:
     """Return a random ``world_from_camera`` facing the objects; the path's if there are none."""
-    places = [thing.pose.translation for thing in world.things]
+    places = [item.pose.translation for item in world.objects]
     if not places:
         return 0
     target = (np.mean(places, axis=0) + places[rng.integers(len(places))]) / 2
@@ -286,13 +288,13 @@ def _viewpoint(world: World, sensor: Sensor, rng: np.random.Generator) -> Pose |
     return pose
 
 
-def label_objects(frame: Frame, owners: U1, things: I4) -> Iterator[Samples]:
+def label_objects(frame: Frame, pixel_labels: U1, object_labels: I4) -> Iterator[Samples]:
     """Yield the merged segments of a frame, if it shows a supporting plane.
 
     Parameters
     ----------
-    owners : (h, w) pixel labels of the scene, 0 where unknown.
-    things : (k,) labels of objects, in ascending order.
+    pixel_labels : (h, w) pixel labels of the scene, 0 where unknown.
+    object_labels : (k,) labels of objects, in ascending order.
     """
     settings = DetectionSettings()
     if frame.depth is None or frame.camera is None:
@@ -306,11 +308,13 @@ def label_objects(frame: Frame, owners: U1, things: I4) -> Iterator[Samples]:
     known = merge_segments(grid, model, oversegmentation)
     features = measure_object_features(grid, model, oversegmentation, known, settings.max_range_m)
     _, labels, segments = oversegmentation
-    counts = count_labels(owners.reshape(frame.depth.shape), labels, grid)
+    counts = count_labels(pixel_labels.reshape(frame.depth.shape), labels, grid)
     merged = np.zeros_like(counts)
     np.add.at(merged, segments.parent, counts)
     known_cells = merged[:, 1:].sum(axis=1)
-    shares = merged[:, things[things < merged.shape[1]]].sum(axis=1) / np.maximum(known_cells, 1)
+    shares = merged[:, object_labels[object_labels < merged.shape[1]]].sum(axis=1) / np.maximum(
+        known_cells, 1
+    )
     roots, weights = measure_borders(segments)
     yield Samples(features[roots], shares[roots] > _OBJECT, (weights,))
 

@@ -24,7 +24,7 @@ from shapecat.geometry import (
 )
 from shapecat.models.arrangements import (
     ALONE,
-    Actor,
+    ArrangedObject,
     Arrangement,
     ArrangementOptions,
     arrange,
@@ -120,7 +120,7 @@ def simulate_world(options: ArrangementOptions, number: int) -> list[WorldView]:
     """Simulate one arrangement and describe its objects from several viewpoints."""
     rng = np.random.default_rng((options.seed, number))
     arrangement, name = arrange(options, rng), f"{options.seed}/{number}"
-    return look(
+    return describe_arrangement(
         arrangement,
         name,
         cameras=options.cameras,
@@ -142,12 +142,12 @@ def simulate_mesh(
     rest : its resting pose.
     cameras : number of viewpoints, each with its own sensor.
     """
-    actor = Actor(moved(mesh, rest.pose), label, rest.manner, 0.0)
-    alone = Arrangement([placed(actor, (0.0, 0.0), 0.0, rng)], (ALONE,))
-    return look(alone, name, cameras=cameras, rng=rng)
+    item = ArrangedObject(moved(mesh, rest.pose), label, rest.manner, 0.0)
+    alone = Arrangement([placed(item, (0.0, 0.0), 0.0, rng)], (ALONE,))
+    return describe_arrangement(alone, name, cameras=cameras, rng=rng)
 
 
-def look(
+def describe_arrangement(
     arrangement: Arrangement,
     name: str,
     *,
@@ -165,41 +165,46 @@ def look(
     background : whether to describe thin detections of background, too.
     keep : whether to keep the points of the views.
     """
-    actors = arrangement.actors
-    if not actors:
+    objects = arrangement.objects
+    if not objects:
         return []
-    meshes = (*(actor.mesh for actor in actors), *arrangement.furniture)
-    seen = geometry([(mesh, IDENTITY) for mesh in meshes])
+    meshes = (*(item.mesh for item in objects), *arrangement.furniture)
+    scene_geometry = geometry([(mesh, IDENTITY) for mesh in meshes])
     views: list[WorldView] = []
     for _ in range(cameras):
-        image = render_view(seen, arrangement, rng)
+        image = render_view(scene_geometry, arrangement, rng)
         scene = detect(image.frame, up=None, settings=_SETTINGS.detection, rng=rng)
-        for k, actor in enumerate(actors):
+        for k, item in enumerate(objects):
             if image.visible[k] >= _LEAST_VISIBLE:
-                views += _views_of(image, scene, k, actor, f"{name}/{k}", rng)
+                views += _views_of(image, scene, k, item, f"{name}/{k}", rng)
         if background:
-            views += _background(image, scene, len(actors), f"{name}/background")
+            views += _background(image, scene, len(objects), f"{name}/background")
     return views if keep else [view._replace(view=None) for view in views]
 
 
 def _views_of(
-    image: RenderedView, scene: Scene, k: int, actor: Actor, instance: str, rng: np.random.Generator
+    image: RenderedView,
+    scene: Scene,
+    k: int,
+    item: ArrangedObject,
+    instance: str,
+    rng: np.random.Generator,
 ) -> list[WorldView]:
     """Return a view of an object, segmented by truth or detection; of some, a partial one too."""
     found = _cut_by_detection(image, scene, k)
     if found is not None and rng.random() < _DETECTED:
         (view, overlap), source = found, "detected"
     else:
-        view, overlap = cut_halo(_cut_by_truth(image, k, actor, rng), rng), 1.0
+        view, overlap = cut_halo(_cut_by_truth(image, k, item, rng), rng), 1.0
         source = "truth"
-    view = View(view.points, view.eye, actor.label, instance)
-    seen = _Seen(actor.label, actor.manner, image.sensor, float(image.visible[k]), overlap)
+    view = View(view.points, view.eye, item.label, instance)
+    seen = _Seen(item.label, item.manner, image.sensor, float(image.visible[k]), overlap)
     described = [_described(view, source, seen)]
     if rng.random() < _FRAGMENTS:
         piece = cut_fragment(view, rng)
         if piece is not None:
             described.append(_described(piece, "fragment", seen))
-    return [item for item in described if item is not None]
+    return [each for each in described if each is not None]
 
 
 def _background(image: RenderedView, scene: Scene, objects: int, name: str) -> list[WorldView]:
@@ -236,21 +241,23 @@ def _view_of(image: RenderedView, scene: Scene, candidate: Candidate) -> View:
     return View(transform(level, points), level.translation, "", "")
 
 
-def _cut_by_truth(image: RenderedView, k: int, actor: Actor, rng: np.random.Generator) -> View:
+def _cut_by_truth(
+    image: RenderedView, k: int, item: ArrangedObject, rng: np.random.Generator
+) -> View:
     """Return the object's true pixels in a level frame with errors of half a degree and 2 mm."""
     indices = np.flatnonzero((image.owners == k) & (np.asarray(image.frame.depth) > 0))
     points = image.frame.xyz(indices)
     camera_from_table = inverse(image.table_from_camera)
     up = camera_from_table.rotation[:, 2] + rng.normal(0, 0.008, 3)
     up /= np.linalg.norm(up)
-    foot = np.array([*_centre(actor), actor.support_m])
+    foot = np.array([*_centre(item), item.support_m])
     offset = float(up @ transform(camera_from_table, foot)) + rng.normal(0, 0.002)
     level = level_from_sensor(up, offset, points)
     return View(transform(level, points), level.translation, "", "")
 
 
-def _centre(actor: Actor) -> F8:
-    points = actor.mesh.vertices[:, :2]
+def _centre(item: ArrangedObject) -> F8:
+    points = item.mesh.vertices[:, :2]
     return np.asarray((points.min(axis=0) + points.max(axis=0)) / 2)
 
 

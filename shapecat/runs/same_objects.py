@@ -210,28 +210,28 @@ def match_in_place(
         reasons = dict.fromkeys(gone, "it was moved, so it cannot be found by its place")
     found: dict[int, list[Match]] = {}
     taken: dict[int, int] = {}
-    for thing in old:
-        others = [other for other in old if group(other.track) != group(thing.track)]
-        match, reason = _nearest_there(thing, others, new)
+    for item in old:
+        others = [other for other in old if group(other.track) != group(item.track)]
+        match, reason = _nearest_there(item, others, new)
         if match is None:
-            reasons[thing.track] = reason
-        elif group(taken.get(match.track, thing.track)) != group(thing.track):
-            reasons[thing.track] = f"track {match.track} could also be track {taken[match.track]}"
+            reasons[item.track] = reason
+        elif group(taken.get(match.track, item.track)) != group(item.track):
+            reasons[item.track] = f"track {match.track} could also be track {taken[match.track]}"
         else:
-            taken[match.track] = thing.track
-            found[thing.track] = [match]
+            taken[match.track] = item.track
+            found[item.track] = [match]
     return Matches(found, reasons)
 
 
 def _nearest_there(
-    thing: _Standing, old: Sequence[_Standing], new: Sequence[_Standing]
+    item: _Standing, old: Sequence[_Standing], new: Sequence[_Standing]
 ) -> tuple[Match | None, str]:
-    """Return the only object at the place of ``thing``, or the reason why there is none.
+    """Return the only object at the place of ``item``, or the reason why there is none.
 
     ``old`` are the other objects of the source, ``new`` the objects of the target.
     """
-    near = sorted((_apart(thing, other), k) for k, other in enumerate(new))
-    reached = [(d, k) for d, k in near if d <= _match_radius(thing, new[k])]
+    near = sorted((_apart(item, other), k) for k, other in enumerate(new))
+    reached = [(d, k) for d, k in near if d <= _match_radius(item, new[k])]
     if not reached:
         return None, "nothing was found there"
     (distance, first), *others = reached
@@ -241,7 +241,7 @@ def _nearest_there(
     rivals = [other.track for other in old if _apart(other, here) < distance + _CLEAR_M]
     if rivals:
         return None, f"track {here.track} could also be track {rivals[0]}"
-    ratio = max(thing.extent_m, here.extent_m) / min(thing.extent_m, here.extent_m)
+    ratio = max(item.extent_m, here.extent_m) / min(item.extent_m, here.extent_m)
     if ratio > _SIZE_RATIO:
         return None, f"track {here.track} is there, but has another size"
     return Match(here.track, round(distance, 4)), ""

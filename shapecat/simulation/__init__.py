@@ -9,16 +9,16 @@ from shapecat.simulation.recorder import record, simulate
 from shapecat.simulation.scenes import make_scene, make_stage
 from shapecat.simulation.sensors import IDEAL, KINECT, REALSENSE, Sensor
 from shapecat.simulation.views import render_frame
-from shapecat.simulation.worlds import Support, Thing, World
+from shapecat.simulation.worlds import PlacedObject, Support, World
 
 __all__ = [
     "IDEAL",
     "KINECT",
     "REALSENSE",
     "Piece",
+    "PlacedObject",
     "Sensor",
     "Support",
-    "Thing",
     "World",
     "make_piece",
     "make_scene",

@@ -87,7 +87,7 @@ def _paint(
     """Return the shaded colours (h, w, 3) uint8; the texture moves with each object."""
     supports = len(world.supports)
     places = [pose] * supports
-    places += [compose(inverse(world.pose_of(thing, frame)), pose) for thing in world.things]
+    places += [compose(inverse(world.pose_of(item, frame)), pose) for item in world.objects]
     textures = np.array([_texture(k, plain=k < supports) for k in range(len(places))])
     turns = np.array([place.rotation for place in places])
     shifts = np.array([place.translation for place in places])

@@ -12,7 +12,7 @@ from shapecat.simulation.footprints import Footprint, footprint, inside, overlap
 from shapecat.simulation.mesh import Mesh
 from shapecat.simulation.placement import Rest, choose_rest, rests
 from shapecat.simulation.shapes import make_object
-from shapecat.simulation.worlds import Support, Thing, turned_about_z
+from shapecat.simulation.worlds import PlacedObject, Support, turned_about_z
 from shapecat.types import Pose
 
 __all__ = ["Layout", "Piece", "make_piece"]
@@ -77,7 +77,7 @@ class Layout:
     def __init__(
         self, rng: Generator, *, gap: float, headroom: float = 1.0, enclosed: bool = False
     ) -> None:
-        self.things: list[Thing] = []
+        self.objects: list[PlacedObject] = []
         self.gap = gap
         self._rng = rng
         self._headroom = headroom
@@ -101,7 +101,7 @@ class Layout:
             size = footprint(piece.mesh, piece.rest.pose)
             if size.high > self._headroom or np.ptp(size.outline, axis=0).max() > _WIDEST_M:
                 continue
-            if self._rng.random() < stack and self._put_on_thing(piece):
+            if self._rng.random() < stack and self._put_on_object(piece):
                 return True
             if self.put_piece(piece, support, half):
                 return True
@@ -132,19 +132,19 @@ class Layout:
         -------
         The translation (3,) of its pose there, metres, or None if there is no room.
         """
-        thing, middle = self.things[k], support.outline[:, :2].mean(axis=0)
+        item, middle = self.objects[k], support.outline[:, :2].mean(axis=0)
         first = self._places[k]
         for _ in range(200):
             spot = np.round(middle + self._rng.uniform(-half, half), 6)
-            place = np.array([*spot, thing.pose.translation[2]])
-            here = first.moved(Pose(np.eye(3), place - thing.pose.translation))
+            place = np.array([*spot, item.pose.translation[2]])
+            here = first.moved(Pose(np.eye(3), place - item.pose.translation))
             if self._fits(here, support):
                 self._places.append(here)
                 return place
         return None
 
-    def _put_on_thing(self, piece: Piece) -> bool:
-        bearers = [k for k in range(len(self.things)) if self._can_bear(k)]
+    def _put_on_object(self, piece: Piece) -> bool:
+        bearers = [k for k in range(len(self.objects)) if self._can_bear(k)]
         if not bearers or piece.category == "ball":
             return False
         resting = footprint(piece.mesh, piece.rest.pose)
@@ -156,7 +156,7 @@ class Layout:
             turn = self._drawn_turn(np.array(spot))
             here = resting.moved(turn)
             if _bears(below, here) and self._fits(here, self._roots[k]):
-                self._add(piece, turn, here, self._roots[k], self.things[k].track)
+                self._add(piece, turn, here, self._roots[k], self.objects[k].track)
                 return True
         return False
 
@@ -180,14 +180,14 @@ class Layout:
     def _can_bear(self, k: int) -> bool:
         top = self._places[k].top
         flat = len(top) > 2 and float(np.ptp(top, axis=0).min()) > _SMALLEST_TOP_M
-        return flat and self.things[k].category in _BEARERS
+        return flat and self.objects[k].category in _BEARERS
 
     def _add(
         self, piece: Piece, turn: Pose, here: Footprint, support: Support, bearer: int | None
     ) -> None:
         manner = "upright" if piece.category == "box" else piece.rest.manner  # a box has no upright
-        thing = Thing(
-            len(self.things),
+        item = PlacedObject(
+            len(self.objects),
             piece.category,
             piece.kind,
             piece.mesh,
@@ -197,7 +197,7 @@ class Layout:
             lying=manner == "lying",
             upside_down=manner == "upside_down",
         )
-        self.things.append(thing)
+        self.objects.append(item)
         self._places.append(here)
         self._roots.append(support)
 

@@ -30,7 +30,7 @@ def walking(rng: Generator, categories: Sequence[str], filming: Filming) -> Worl
         )
     target = np.array([0, 0, counter.height + 0.05])
     path = stroll(rng, target, filming, distance=(0.95, 1.2), elevation=(30, 48), reach=(0.6, 0.75))
-    return World("walking", (*room, counter), tuple(layout.things), path)
+    return World("walking", (*room, counter), tuple(layout.objects), path)
 
 
 def crossing(rng: Generator, categories: Sequence[str], filming: Filming) -> World:
@@ -46,17 +46,17 @@ def crossing(rng: Generator, categories: Sequence[str], filming: Filming) -> Wor
         lane = _strip(table, (-0.45, 0.45), (low, low + 0.12))
         if not layout.put(str(rng.choice(_MOVERS)), lane, _ANYWHERE, attempts=40):
             continue
-        x = float(layout.things[-1].pose.translation[0])
+        x = float(layout.objects[-1].pose.translation[0])
         reach, speed = rng.uniform(0.3, 0.4), side * rng.uniform(0.14, 0.25)
         phase = np.arcsin(np.clip(x / reach, -1, 1))
         along = reach * np.sin(speed / reach * t + phase) - reach * np.sin(phase)
-        motions.append(_shifted(len(layout.things) - 1, along))
+        motions.append(_shifted(len(layout.objects) - 1, along))
     rows = [_strip(table, (-0.5, 0.5), y) for y in ((-0.32, -0.15), (0.15, 0.37))]
     for k, category in enumerate(categories):
         layout.put(category, rows[k % 2], _ANYWHERE, attempts=20)
     path = _walk_past(rng, table, filming, elevation=(25, 40), sweep=8)
-    things = tuple(layout.things)
-    return World("crossing", (*room, table), things, path, motions=tuple(motions))
+    objects = tuple(layout.objects)
+    return World("crossing", (*room, table), objects, path, motions=tuple(motions))
 
 
 def rearranged(rng: Generator, categories: Sequence[str], filming: Filming) -> World:
@@ -74,19 +74,19 @@ def rearranged(rng: Generator, categories: Sequence[str], filming: Filming) -> W
     duration, t = filming.frames / filming.rate_hz, filming.times()
     starts = rng.uniform([0.15, 0.15, 0.5, 0.15], [0.5, 0.5, 0.8, 0.5])
     pushed, carried, removed, added = starts * duration
-    motions = [_pushed(0, layout.things[0].pose.translation, t - pushed)]
-    for k in range(1, len(layout.things)):
+    motions = [_pushed(0, layout.objects[0].pose.translation, t - pushed)]
+    for k in range(1, len(layout.objects)):
         goal = layout.room_for(k, back, _ANYWHERE)
         if goal is not None:
-            motions.append(_carried(k, goal - layout.things[k].pose.translation, t - carried))
+            motions.append(_carried(k, goal - layout.objects[k].pose.translation, t - carried))
             break
-    others = [k for k in range(1, len(layout.things)) if k != motions[-1].track]
+    others = [k for k in range(1, len(layout.objects)) if k != motions[-1].track]
     there = t[:, None] < removed, t[:, None] >= added
     for k, when in zip(others, there, strict=False):
         motions.append(Motion(k, np.where(when, np.zeros(3), np.nan)))
     path = _walk_past(rng, table, filming, elevation=(30, 48), sweep=12)
-    things = tuple(layout.things)
-    return World("rearranged", (*room, table), things, path, motions=tuple(motions))
+    objects = tuple(layout.objects)
+    return World("rearranged", (*room, table), objects, path, motions=tuple(motions))
 
 
 def _walk_past(

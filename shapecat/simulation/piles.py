@@ -14,7 +14,7 @@ from shapecat.simulation.mesh import Mesh
 from shapecat.simulation.paths import Filming, walk
 from shapecat.simulation.physics import Drop, Rest, settle
 from shapecat.simulation.shapes import make_object
-from shapecat.simulation.worlds import Support, Thing, World
+from shapecat.simulation.worlds import PlacedObject, Support, World
 
 __all__ = ["KINDS", "Item", "bin_picking", "make_item", "pile", "settled", "shelf_bin"]
 
@@ -57,7 +57,7 @@ def pile(
     for item in items:
         place = np.clip(rng.normal(0, spread, 2), -0.4, 0.4)
         drops.append(Drop(item.mesh, _turned(rng), place))
-    things = settled(items, drops, supports, table)
+    objects = settled(items, drops, supports, table)
     target = np.array([0, 0, table.height + 0.05])
     path = walk(
         rng,
@@ -67,7 +67,7 @@ def pile(
         elevation=(18, 75),
         sweep=(20, 60),
     )
-    return World("pile", supports, things, path)
+    return World("pile", supports, objects, path)
 
 
 def bin_picking(
@@ -82,8 +82,8 @@ def bin_picking(
     supports = (*make_room(rng, wall_chance=0.2), bottom, *sides)
     target = np.array([0, 0, bottom.height + 0.05])
     path = walk(rng, target, filming, distance=(0.6, 1.2), elevation=(60, 84), sweep=(10, 40))
-    things = settled(items, drops, supports, bottom)
-    return World("bin", supports, things, path)
+    objects = settled(items, drops, supports, bottom)
+    return World("bin", supports, objects, path)
 
 
 def shelf_bin(
@@ -100,10 +100,10 @@ def shelf_bin(
     items = [i for i in items if (i.mesh.extents[:2] < 1.6 * half.min()).all()]
     drops = _drops_within(rng, items, half)
     supports = (*make_room(rng, wall_chance=0.0), board, *walls)
-    things = settled(items, drops, supports, board, highest_m=float(room_m))
+    objects = settled(items, drops, supports, board, highest_m=float(room_m))
     target = np.array([0, 0, board.height + room_m / 3])
     path = walk(rng, target, filming, distance=(0.5, 0.9), elevation=(5, 25), sweep=(5, 20))
-    return World("shelf_bin", (*supports, top), things, path)
+    return World("shelf_bin", (*supports, top), objects, path)
 
 
 def make_item(category: str, rng: Generator, kinds: Sequence[str]) -> Item:
@@ -139,7 +139,7 @@ def settled(
     below: Support,
     *,
     highest_m: float = np.inf,
-) -> tuple[Thing, ...]:
+) -> tuple[PlacedObject, ...]:
     """Drop items onto supports; return the objects that come to rest on the support ``below``.
 
     They are numbered from 0 in the order of ``items``. Objects that rise ``highest_m`` metres or
@@ -148,13 +148,13 @@ def settled(
     rests = settle([support.mesh for support in supports], drops)
     stays = [_stays(k.mesh, rest, below, highest_m) for k, rest in zip(items, rests, strict=True)]
     tracks = np.cumsum(stays) - 1
-    things = []
+    objects = []
     for k, (item, rest) in enumerate(zip(items, rests, strict=True)):
         if not stays[k]:
             continue
         bearer = rest.bearer if rest.bearer is not None and stays[rest.bearer] else None
-        things.append(_thing(int(tracks[k]), item, rest, below, tracks, bearer))
-    return tuple(things)
+        objects.append(_placed_object(int(tracks[k]), item, rest, below, tracks, bearer))
+    return tuple(objects)
 
 
 def _stays(mesh: Mesh, rest: Rest, below: Support, highest_m: float) -> bool:
@@ -166,11 +166,11 @@ def _stays(mesh: Mesh, rest: Rest, below: Support, highest_m: float) -> bool:
     return bool(held and low[2] > below.height - _SUNK_M and high[2] < below.height + highest_m)
 
 
-def _thing(
+def _placed_object(
     track: int, item: Item, rest: Rest, below: Support, tracks: F8, bearer: int | None
-) -> Thing:
+) -> PlacedObject:
     axes = rest.pose.rotation[2]  # world z of the object's own axes
-    return Thing(
+    return PlacedObject(
         track,
         item.category,
         item.kind,

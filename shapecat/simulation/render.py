@@ -53,19 +53,19 @@ class Image(Record):
             return np.where(self.inverse > 0, 1.0 / self.inverse, 0.0)
 
 
-def geometry(things: list[tuple[Mesh, Pose]]) -> Geometry:
+def geometry(meshes: list[tuple[Mesh, Pose]]) -> Geometry:
     """Merge meshes, each with its pose ``frame_from_mesh``, into one frame."""
-    starts = np.cumsum([0, *(len(mesh.vertices) for mesh, _ in things)])
+    starts = np.cumsum([0, *(len(mesh.vertices) for mesh, _ in meshes)])
     vertices = np.zeros((int(starts[-1]), 3))
-    for (mesh, pose), start in zip(things, starts[:-1], strict=True):
+    for (mesh, pose), start in zip(meshes, starts[:-1], strict=True):
         _place(mesh.vertices, pose.rotation, pose.translation, vertices[start:])
-    parts = [m.triangles + s for (m, _), s in zip(things, starts[:-1], strict=True)]
-    counts = [len(mesh.triangles) for mesh, _ in things]
+    parts = [m.triangles + s for (m, _), s in zip(meshes, starts[:-1], strict=True)]
+    counts = [len(mesh.triangles) for mesh, _ in meshes]
     triangles = np.concatenate(parts) if parts else np.zeros((0, 3), np.int32)
-    return Geometry(vertices, triangles, np.repeat(np.arange(len(things)), counts))
+    return Geometry(vertices, triangles, np.repeat(np.arange(len(meshes)), counts))
 
 
-def render(seen: Geometry, camera: Camera, frame_from_camera: Pose) -> Image:
+def render(scene: Geometry, camera: Camera, frame_from_camera: Pose) -> Image:
     """Render triangles, visible from both sides, with a z-buffer.
 
     The inverse depth of a plane is linear in the image. A ray hits a triangle if it is on the same
@@ -74,7 +74,7 @@ def render(seen: Geometry, camera: Camera, frame_from_camera: Pose) -> Image:
 
     Parameters
     ----------
-    seen : triangles in any frame.
+    scene : triangles in any frame.
     frame_from_camera : pose of the optical frame in this frame.
 
     Notes
@@ -84,16 +84,16 @@ def render(seen: Geometry, camera: Camera, frame_from_camera: Pose) -> Image:
     Source: Olano and Greer 1997.
     """
     shape = (camera.height, camera.width)
-    local = np.zeros_like(seen.vertices)
+    local = np.zeros_like(scene.vertices)
     camera_from_frame = inverse(frame_from_camera)
     rotation = np.ascontiguousarray(camera_from_frame.rotation)
-    _place(seen.vertices, rotation, camera_from_frame.translation, local)
+    _place(scene.vertices, rotation, camera_from_frame.translation, local)
     intrinsics = np.array([camera.fx, camera.fy, camera.cx, camera.cy])
     nearest, hits = np.zeros(shape), np.full(shape, -1, np.int32)
-    normals = np.zeros((len(seen.triangles), 3))
-    _draw(local, seen.triangles, intrinsics, nearest, hits, normals)
+    normals = np.zeros((len(scene.triangles), 3))
+    _draw(local, scene.triangles, intrinsics, nearest, hits, normals)
     owners, cosine = np.zeros(shape, np.int16), np.zeros(shape, np.float32)
-    _shade(hits, normals, seen.owners, intrinsics, owners, cosine)
+    _shade(hits, normals, scene.owners, intrinsics, owners, cosine)
     return Image(nearest, owners, cosine)
 
 
@@ -102,17 +102,17 @@ def cropped(camera: Camera, left: int, top: int, width: int, height: int) -> Cam
     return Camera(width, height, camera.fx, camera.fy, camera.cx - left, camera.cy - top)
 
 
-def alone_pixels(seen: Geometry, owner: int, camera: Camera, frame_from_camera: Pose) -> int:
+def alone_pixels(scene: Geometry, owner: int, camera: Camera, frame_from_camera: Pose) -> int:
     """Count the pixels of one owner, unoccluded, in an image three times as wide and high.
 
-    The count is 0 if a vertex is behind the camera or nearer than `NEAR_M`. ``seen`` and
+    The count is 0 if a vertex is behind the camera or nearer than `NEAR_M`. ``scene`` and
     ``frame_from_camera`` are as for `render`.
     """
-    mine = seen.triangles[seen.owners == owner]
+    mine = scene.triangles[scene.owners == owner]
     if len(mine) == 0:
         return 0
     used, corners = np.unique(mine, return_inverse=True)
-    alone = Geometry(seen.vertices[used], corners.reshape(-1, 3), np.zeros(len(mine), np.int32))
+    alone = Geometry(scene.vertices[used], corners.reshape(-1, 3), np.zeros(len(mine), np.int32))
     r, t = frame_from_camera.rotation, frame_from_camera.translation
     local = (alone.vertices - t) @ r
     if local[:, 2].min() <= NEAR_M:

@@ -47,12 +47,12 @@ def room(
         place = rng.uniform(-1, 1, 2) * np.clip(half - margin, 0.02, (0.45, 0.3))
         drops.append(Drop(item.mesh, turned_about_z(rng.uniform(-0.6, 0.6)).rotation, place))
     solid = (table, *_named("robot", standing))
-    things = settled(items, drops, solid, table)
+    objects = settled(items, drops, solid, table)
     target = np.array([0, 0, table.height + rng.uniform(0.0, 0.2)])
     path = walk(rng, target, filming, distance=(0.7, 2.2), elevation=(12, 60), sweep=(15, 60))
     rest = [s for s in supports if s is not table]
     everything = (*rest, *solid, *_named("room", around))
-    return World("room", everything, things, path)
+    return World("room", everything, objects, path)
 
 
 def _named(name: str, meshes: Sequence[Mesh]) -> list[Support]:

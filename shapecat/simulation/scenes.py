@@ -96,7 +96,7 @@ def make_stage(pieces: Sequence[Piece], rng: Generator, *, views: int = 8) -> Wo
     for piece in pieces:
         layout.put_piece(piece, table, half)
     path = scattered(rng, np.array([0, 0, table.height + 0.04]), views)
-    return World("stage", (*room, table), tuple(layout.things), path)
+    return World("stage", (*room, table), tuple(layout.objects), path)
 
 
 def _tabletop(rng: Generator, spec: _SceneSpec) -> World:
@@ -108,7 +108,7 @@ def _tabletop(rng: Generator, spec: _SceneSpec) -> World:
         layout.put(category, table, np.array([0.38, 0.27]), stack=0.06)
     target = np.array([0, 0, table.height + 0.05])
     path = walk(rng, target, spec.filming, distance=(0.9, 1.4), elevation=(28, 52), sweep=(25, 60))
-    return World("tabletop", (*room, table), tuple(layout.things), path)
+    return World("tabletop", (*room, table), tuple(layout.objects), path)
 
 
 def _clutter(rng: Generator, spec: _SceneSpec) -> World:
@@ -125,7 +125,7 @@ def _clutter(rng: Generator, spec: _SceneSpec) -> World:
         layout.put(category, table, half, stack=0.3, attempts=4)
     target = np.array([0, 0, table.height + 0.06])
     path = walk(rng, target, spec.filming, distance=(0.65, 1.3), elevation=(25, 58), sweep=(20, 50))
-    return World("clutter", (*room, table), tuple(layout.things), path)
+    return World("clutter", (*room, table), tuple(layout.objects), path)
 
 
 def _shelf(rng: Generator, spec: _SceneSpec) -> World:
@@ -142,7 +142,7 @@ def _shelf(rng: Generator, spec: _SceneSpec) -> World:
         rng, target, spec.filming, distance=(1.25, 1.55), elevation=(20, 30), sweep=(12, 28)
     )
     supports = (*make_room(rng, wall_chance=0.0), *boards, *sides)
-    return World("shelf", supports, tuple(layout.things), path)
+    return World("shelf", supports, tuple(layout.objects), path)
 
 
 def _turntable(rng: Generator, spec: _SceneSpec) -> World:
@@ -157,7 +157,7 @@ def _turntable(rng: Generator, spec: _SceneSpec) -> World:
     path = hold(rng, target, spec.filming.frames, distance=distance, elevation=elevation)
     speed = rng.choice([-1, 1]) * rng.uniform(0.25, 0.5)  # radians per second
     turns = np.round(speed * spec.filming.times(), 9)
-    return World("turntable", (*room, table), tuple(layout.things), path, turns)
+    return World("turntable", (*room, table), tuple(layout.objects), path, turns)
 
 
 def _empty(rng: Generator, spec: _SceneSpec) -> World:

@@ -9,7 +9,7 @@ from shapecat.arrays import F8, U1
 from shapecat.geometry import compose, inverse, transform, upright_box
 from shapecat.simulation.render import Geometry, alone_pixels
 from shapecat.simulation.sensors import Sensor
-from shapecat.simulation.worlds import Thing, World
+from shapecat.simulation.worlds import PlacedObject, World
 
 __all__ = ["AMBIGUOUS_PIXELS", "AMBIGUOUS_SHARE", "LISTED_PIXELS", "Truth", "frame_truth"]
 
@@ -38,16 +38,16 @@ def frame_truth(world: World, frame: int, labels: U1, sensor: Sensor) -> Truth:
     ----------
     labels : (h, w) uint8 pixel labels of the frame, from `render_frame`.
     """
-    seen = world.geometry(frame)
+    geometry = world.geometry(frame)
     pose = world.path[frame]
     counts = np.bincount(labels.reshape(-1), minlength=256)
     objects: list[dict[str, Any]] = []
     hidden: list[dict[str, Any]] = []
-    for owner, thing in enumerate(world.things, start=len(world.supports)):
-        if not world.present(thing, frame):
+    for owner, item in enumerate(world.objects, start=len(world.supports)):
+        if not world.present(item, frame):
             continue
-        pixels = int(counts[thing.label])
-        entry = _thing_truth(world, frame, thing, pixels, seen, owner, sensor)
+        pixels = int(counts[item.label])
+        entry = _object_truth(world, frame, item, pixels, geometry, owner, sensor)
         (objects if pixels >= LISTED_PIXELS else hidden).append(entry)
     camera_from_world = inverse(pose)
     planes = []
@@ -68,41 +68,41 @@ def frame_truth(world: World, frame: int, labels: U1, sensor: Sensor) -> Truth:
     return Truth(objects, hidden, planes)
 
 
-def _thing_truth(
+def _object_truth(
     world: World,
     frame: int,
-    thing: Thing,
+    item: PlacedObject,
     pixels: int,
-    seen: Geometry,
+    geometry: Geometry,
     owner: int,
     sensor: Sensor,
 ) -> dict[str, Any]:
     camera_from_world = inverse(world.path[frame])
-    camera_from_mesh = compose(camera_from_world, world.pose_of(thing, frame))
-    points = transform(camera_from_mesh, thing.mesh.vertices).astype(np.float32)
+    camera_from_mesh = compose(camera_from_world, world.pose_of(item, frame))
+    points = transform(camera_from_mesh, item.mesh.vertices).astype(np.float32)
     box = upright_box(points, camera_from_world.rotation[:, 2])
-    total = alone_pixels(seen, owner, sensor.camera, world.path[frame])
+    total = alone_pixels(geometry, owner, sensor.camera, world.path[frame])
     share = min(1.0, pixels / total) if total else 0.0
     few = pixels < AMBIGUOUS_PIXELS or share < AMBIGUOUS_SHARE
     return {
-        "label": thing.label,
-        "parts": [thing.label],
-        "category": thing.category,
-        "ambiguous": bool(few or thing.indistinct),
+        "label": item.label,
+        "parts": [item.label],
+        "category": item.category,
+        "ambiguous": bool(few or item.indistinct),
         "pixels": pixels,
-        "track": thing.track,
-        "kind": thing.kind,
+        "track": item.track,
+        "kind": item.kind,
         "center": _rounded(transform(world.path[frame], box.center)),
         "box": {
             "center": _rounded(box.center),
             "size": _rounded(box.size),
             "orientation": _rounded(box.orientation),
         },
-        "lying": thing.lying,
-        "upside_down": thing.upside_down,
-        "tilted": thing.tilted,
-        "on_support": thing.on_support,
-        "on_track": thing.on_track,
+        "lying": item.lying,
+        "upside_down": item.upside_down,
+        "tilted": item.tilted,
+        "on_support": item.on_support,
+        "on_track": item.on_track,
         "visible": round(share, 4),
     }
 

@@ -33,7 +33,7 @@ def render_frame(
     Returns
     -------
     The frame, and pixel labels (h, w), uint8: 0 if there is no reading, 1 to 9 on supports, and
-    `Thing.label` on objects.
+    `PlacedObject.label` on objects.
     """
     index = view if isinstance(view, int) else 0
     pose = world.path[view] if isinstance(view, int) else view

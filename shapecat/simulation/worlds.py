@@ -11,9 +11,9 @@ from shapecat.simulation.mesh import Mesh
 from shapecat.simulation.render import Geometry, geometry
 from shapecat.types import Pose
 
-__all__ = ["FIRST_THING_LABEL", "Motion", "Support", "Thing", "World", "turned_about_z"]
+__all__ = ["FIRST_OBJECT_LABEL", "Motion", "PlacedObject", "Support", "World", "turned_about_z"]
 
-FIRST_THING_LABEL = 20
+FIRST_OBJECT_LABEL = 20
 """Pixel label of the object with track 0; supports have 1 to 9, pixels without reading 0."""
 
 
@@ -45,12 +45,12 @@ class Support(Record):
         return float(self.outline[0, 2])
 
 
-class Thing(Record):
+class PlacedObject(Record):
     """An object in a world.
 
     Attributes
     ----------
-    track : number of the object, from 0; its pixel label is `FIRST_THING_LABEL` + track.
+    track : number of the object, from 0; its pixel label is `FIRST_OBJECT_LABEL` + track.
     category : one of the shape categories, or ``unknown``.
     kind : the category, or the kind of distractor.
     mesh : metres, z up, standing on z = 0.
@@ -75,7 +75,7 @@ class Thing(Record):
     @property
     def label(self) -> int:
         """Its pixel label."""
-        return FIRST_THING_LABEL + self.track
+        return FIRST_OBJECT_LABEL + self.track
 
     @property
     def indistinct(self) -> bool:
@@ -111,7 +111,7 @@ class World(Record):
 
     kind: str
     supports: tuple[Support, ...]
-    things: tuple[Thing, ...]
+    objects: tuple[PlacedObject, ...]
     path: tuple[Pose, ...]
     turns: F8 | None = array("t", "f8", default=None)
     motions: tuple[Motion, ...] = ()
@@ -120,18 +120,18 @@ class World(Record):
         """Return the number of frames."""
         return len(self.path)
 
-    def pose_of(self, thing: Thing, frame: int) -> Pose:
+    def pose_of(self, item: PlacedObject, frame: int) -> Pose:
         """Return ``world_from_mesh`` of an object in a frame; its start pose if it is absent."""
-        shift = self._shifts.get(thing.track)
-        pose = thing.pose
+        shift = self._shifts.get(item.track)
+        pose = item.pose
         if shift is not None and np.isfinite(shift[frame]).all():
             pose = Pose(pose.rotation, pose.translation + shift[frame])
         turn = self._turn(frame)
         return compose(turned_about_z(turn), pose) if turn else pose
 
-    def present(self, thing: Thing, frame: int) -> bool:
+    def present(self, item: PlacedObject, frame: int) -> bool:
         """Return whether an object is present in a frame."""
-        shift = self._shifts.get(thing.track)
+        shift = self._shifts.get(item.track)
         return shift is None or bool(np.isfinite(shift[frame]).all())
 
     def geometry(self, frame: int) -> Geometry:
@@ -142,7 +142,7 @@ class World(Record):
     @cached_property
     def labels(self) -> U1:
         """(n,) uint8 pixel label of each owner: the supports, then the objects."""
-        found = [s.label for s in self.supports] + [t.label for t in self.things]
+        found = [s.label for s in self.supports] + [t.label for t in self.objects]
         return np.array(found, np.uint8)
 
     @cached_property
@@ -158,11 +158,11 @@ class World(Record):
 
     def _gather(self, frame: int) -> Geometry:
         here = Pose(np.eye(3), np.zeros(3))
-        things = [
-            (thing.mesh if self.present(thing, frame) else _NOTHING, self.pose_of(thing, frame))
-            for thing in self.things
+        objects = [
+            (item.mesh if self.present(item, frame) else _NOTHING, self.pose_of(item, frame))
+            for item in self.objects
         ]
-        return geometry([(support.mesh, here) for support in self.supports] + things)
+        return geometry([(support.mesh, here) for support in self.supports] + objects)
 
 
 _NOTHING = Mesh(np.zeros((0, 3)), np.zeros((0, 3)))
