@@ -16,7 +16,7 @@ from shapecat.simulation.distractors import make_distractor
 from shapecat.simulation.furniture import make_table
 from shapecat.simulation.layout import Layout, Piece, make_piece
 from shapecat.simulation.paths import Filming, walk
-from shapecat.simulation.placement import Rest
+from shapecat.simulation.placement import StablePose
 from shapecat.simulation.sensors import KINECT
 from shapecat.types import CATEGORIES, Pose
 
@@ -30,9 +30,9 @@ def table_with_glasses(seed: int) -> World:
     rng = np.random.default_rng(seed)
     table = make_table(rng)
     layout = Layout(rng, gap=0.03)
-    upright = Rest(Pose(np.eye(3), np.zeros(3)), "upright")
+    upright = StablePose(Pose(np.eye(3), np.zeros(3)), "upright")
     pieces = [Piece(NEW, *make_distractor(rng, "wine_glass"), upright) for _ in range(4)]
-    pieces += [make_piece(category, rng, manner="upright") for category in CATEGORIES]
+    pieces += [make_piece(category, rng, resting_pose="upright") for category in CATEGORIES]
     for piece in pieces:
         layout.put_piece(piece, table, np.array([0.36, 0.26]), tries=400)
     target = np.array([0, 0, table.height + 0.05])

@@ -81,7 +81,7 @@ def test_new_simulated_objects_are_recognised(model: Categorizer) -> None:
     data = collect(
         view for k in range(6) for view in simulate_world(ArrangementOptions(99, kinds), k)
     )
-    whole = (data.source != "fragment") & (data.visible > 0.7) & (data.manner == "upright")
+    whole = (data.source != "fragment") & (data.visible > 0.7) & (data.resting_pose == "upright")
     report = evaluate(data.views.where(whole & (data.views.distances < _NEAR_M)), model)
 
     assert report.n > 30
@@ -100,7 +100,7 @@ def tables() -> tuple[Simulated, Simulated]:
 def test_worlds_are_independent_of_number_of_jobs(tables: tuple[Simulated, Simulated]) -> None:
     """The same seed must give the same model on any machine."""
     alone, shared = tables
-    for name in ("manner", "source", "visible", "overlap"):
+    for name in ("resting_pose", "source", "visible", "overlap"):
         assert np.array_equal(getattr(alone, name), getattr(shared, name))
     for name in ("descriptors", "labels", "instances", "points", "distances"):
         assert np.array_equal(getattr(alone.views, name), getattr(shared.views, name))
@@ -112,10 +112,10 @@ def test_training_tables_follow_their_options() -> None:
         7, ("pan",), unknown=0.0, lying=0.9, leaning=0.5, cameras=1, keep=True
     )
     views = [view for k in range(4) for view in simulate_world(world, k)]
-    manners = [view.manner for view in views if view.label in {"cup", "can", "bottle"}]
+    resting_poses = [view.resting_pose for view in views if view.label in {"cup", "can", "bottle"}]
 
-    assert {"lying", "leaning"} <= set(manners)
-    assert manners.count("upright") < len(manners) / 3
+    assert {"lying", "leaning"} <= set(resting_poses)
+    assert resting_poses.count("upright") < len(resting_poses) / 3
     assert all(view.view is not None and len(view.view.points) == view.points for view in views)
     assert all(0.5 <= view.overlap <= 1 for view in views)
 

@@ -72,7 +72,7 @@ def test_ball_dropped_into_cup_lies_in_it() -> None:
     place = np.array([0.11, -0.07])
     first, second = settle([table()], [Drop(cup, YAWED, place), Drop(ball, np.eye(3), place)])
     middle = transform(second.pose, ball.vertices).mean(axis=0)
-    assert (first.bearer, second.bearer) == (None, 0)
+    assert (first.supported_by, second.supported_by) == (None, 0)
     assert np.hypot(*(middle[:2] - place)) < 0.03
     assert 0.7 < transform(second.pose, ball.vertices)[:, 2].min() < 0.72
 
@@ -82,7 +82,7 @@ def test_box_dropped_on_box_is_supported_by_it() -> None:
     low, high = rounded_box([0.12, 0.09, 0.07]), rounded_box([0.05, 0.06, 0.04])
     place = np.array([-0.2, 0.13])
     first, second = settle([table()], [Drop(low, YAWED, place), Drop(high, YAWED, place)])
-    assert (first.bearer, second.bearer) == (None, 0)
+    assert (first.supported_by, second.supported_by) == (None, 0)
     np.testing.assert_allclose(first.pose.translation, [-0.2, 0.13, 0.7], atol=2e-3)
     np.testing.assert_allclose(second.pose.translation, [-0.2, 0.13, 0.77], atol=3e-3)
     np.testing.assert_allclose(second.pose.rotation, YAWED, atol=0.02)
@@ -90,8 +90,8 @@ def test_box_dropped_on_box_is_supported_by_it() -> None:
 
 def test_object_beside_table_falls() -> None:
     box = make_box(np.random.default_rng(2))
-    (rest,) = settle([table()], [Drop(box, np.eye(3), np.array([0.9, 0.0]))])
-    assert transform(rest.pose, box.vertices)[:, 2].max() < 0.5
+    (settled_pose,) = settle([table()], [Drop(box, np.eye(3), np.array([0.9, 0.0]))])
+    assert transform(settled_pose.pose, box.vertices)[:, 2].max() < 0.5
 
 
 @pytest.mark.parametrize(

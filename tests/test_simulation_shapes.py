@@ -10,7 +10,7 @@ from shapecat.geometry import compose
 from shapecat.simulation.distractors import DISTRACTORS, make_distractor
 from shapecat.simulation.footprints import overlap
 from shapecat.simulation.mesh import Mesh, moved
-from shapecat.simulation.placement import choose_rest, rests
+from shapecat.simulation.placement import choose_stable_pose, stable_poses
 from shapecat.simulation.primitives import lathe, rounded_box, tube
 from shapecat.simulation.render import geometry, render
 from shapecat.simulation.shapes import make_object
@@ -133,11 +133,11 @@ def test_closed_tube_has_surface_area_of_torus() -> None:
 
 
 def test_cylinder_rests_on_its_ends_and_side() -> None:
-    found = rests(lathe([[0, 0], [0.03, 0], [0.03, 0.1], [0, 0.1]], segments=24))
+    found = stable_poses(lathe([[0, 0], [0.03, 0], [0.03, 0.1], [0, 0.1]], segments=24))
 
-    assert [rest.manner for rest in found].count("upright") == 1
-    assert [rest.manner for rest in found].count("upside_down") == 1
-    assert [rest.manner for rest in found].count("lying") == 24
+    assert [stable.name for stable in found].count("upright") == 1
+    assert [stable.name for stable in found].count("upside_down") == 1
+    assert [stable.name for stable in found].count("lying") == 24
 
 
 @settings(max_examples=15, deadline=None)
@@ -147,10 +147,10 @@ def test_lying_object_touches_ground_and_does_not_roll(
 ) -> None:
     rng = np.random.default_rng(seed)
     mesh = make_object(category, rng)
-    rest = choose_rest(rests(mesh), "lying", rng)
-    if rest is None:
+    stable_pose = choose_stable_pose(stable_poses(mesh), "lying", rng)
+    if stable_pose is None:
         return
-    pose = compose(turned_about_z(angle, [0.3, -0.2, 0.7]), rest.pose)
+    pose = compose(turned_about_z(angle, [0.3, -0.2, 0.7]), stable_pose.pose)
     points = moved(mesh, pose).vertices
 
     assert float(points[:, 2].min()) == pytest.approx(0.7, abs=2e-5)

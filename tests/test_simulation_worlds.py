@@ -141,7 +141,7 @@ def test_scene_is_independent_of_number_of_frames() -> None:
 
 def test_stage_shows_its_object_from_all_sides() -> None:
     rng = np.random.default_rng(3)
-    world = make_stage([make_piece("cup", rng, manner="lying")], rng, views=6)
+    world = make_stage([make_piece("cup", rng, resting_pose="lying")], rng, views=6)
     (item,) = world.objects
     sides = {round(np.arctan2(*pose.translation[1::-1])) for pose in world.path}
 
@@ -377,7 +377,7 @@ def test_scanned_meshes_are_placed_upright(real_data: Path) -> None:
         x, y, z = (float(e) for e in mesh.extents)
         fill = ConvexHull(mesh.vertices).volume / (x * y * z)
         where = entry["file"]
-        assert upright_poses(mesh, category)[0].manner == "upright", where
+        assert upright_poses(mesh, category)[0].name == "upright", where
         if category == "plate":
             assert z < 0.25 * min(x, y), where
         if category == "bowl":

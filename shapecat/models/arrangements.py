@@ -11,7 +11,7 @@ from shapecat.simulation.distractors import make_distractor
 from shapecat.simulation.mesh import Mesh, moved, scaled, standing
 from shapecat.simulation.paths import Filming
 from shapecat.simulation.piles import bin_picking, pile, shelf_bin
-from shapecat.simulation.placement import choose_rest, rests
+from shapecat.simulation.placement import choose_stable_pose, stable_poses
 from shapecat.simulation.primitives import rounded_box
 from shapecat.simulation.rooms import room
 from shapecat.simulation.shapes import make_object
@@ -21,7 +21,7 @@ from shapecat.types import CATEGORIES, UNKNOWN, Pose
 __all__ = ["ALONE", "ArrangedObject", "Arrangement", "ArrangementOptions", "arrange", "placed"]
 
 _TABLE_M = (1.6, 1.2, 0.03)
-_MANNERS = {
+_RESTING_POSES = {
     "cup": {"upright": 0.78, "lying": 0.12, "upside_down": 0.1},
     "can": {"upright": 0.8, "lying": 0.2},
     "bottle": {"upright": 0.8, "lying": 0.2},
@@ -73,13 +73,13 @@ class ArrangedObject(NamedTuple):
     ----------
     mesh : metres, in the frame of the arrangement.
     label : category, or ``unknown``.
-    manner : resting pose: ``upright``, ``upside_down``, ``lying``, ``leaning`` or ``tilted``.
+    resting_pose : ``upright``, ``upside_down``, ``lying``, ``leaning`` or ``tilted``.
     support_m : height of the surface that it stands on; in piles, of its lowest vertex.
     """
 
     mesh: Mesh
     label: str
-    manner: str
+    resting_pose: str
     support_m: float
 
 
@@ -121,8 +121,8 @@ def _settled(options: ArrangementOptions, rng: np.random.Generator) -> Arrangeme
     names = np.where(rng.random(names.size) < options.unknown, UNKNOWN, names)
     scene = make(rng, names.tolist(), Filming(1, 30.0), kinds=options.kinds)
     supports = {support.name: support for support in scene.supports}
-    bearing = next((t.on_support for t in scene.objects if t.on_support is not None), "floor")
-    down = Pose(np.eye(3), np.array([0.0, 0.0, -supports[bearing].height]))
+    support_name = next((t.on_support for t in scene.objects if t.on_support is not None), "floor")
+    down = Pose(np.eye(3), np.array([0.0, 0.0, -supports[support_name].height]))
     furniture = tuple(moved(support.mesh, down) for support in scene.supports)
     return seen_from._replace(
         objects=[_arranged_object(item, down) for item in scene.objects], furniture=furniture
@@ -131,9 +131,9 @@ def _settled(options: ArrangementOptions, rng: np.random.Generator) -> Arrangeme
 
 def _arranged_object(item: PlacedObject, down: Pose) -> ArrangedObject:
     mesh = moved(moved(item.mesh, item.pose), down)
-    manners = (("upside_down", item.upside_down), ("lying", item.lying), ("tilted", item.tilted))
-    manner = next((name for name, so in manners if so), "upright")
-    return ArrangedObject(mesh, item.category, manner, float(mesh.vertices[:, 2].min()))
+    names = ("upside_down", "lying", "tilted")
+    resting_pose = next((name for name in names if getattr(item, name)), "upright")
+    return ArrangedObject(mesh, item.category, resting_pose, float(mesh.vertices[:, 2].min()))
 
 
 def _spread(options: ArrangementOptions, rng: np.random.Generator) -> list[ArrangedObject]:
@@ -145,7 +145,7 @@ def _spread(options: ArrangementOptions, rng: np.random.Generator) -> list[Arran
     for _ in range(int(rng.integers(3, 10))):
         item = _make(options, rng, size)
         if options.leaning > 0 and rng.random() < options.leaning:
-            item = _leant(item, rng)
+            item = _tilted(item, rng)
         radius = float(np.hypot(item.mesh.vertices[:, 0], item.mesh.vertices[:, 1]).max())
         spot = _free_spot(spots, radius + gap / 2, rng)
         if spot is None:
@@ -164,32 +164,34 @@ def _make(options: ArrangementOptions, rng: np.random.Generator, size: float) ->
     """Make a random object or distractor, scaled by ``size``."""
     if rng.random() < options.unknown:
         _, mesh = make_distractor(rng, str(rng.choice(list(options.kinds))))
-        return _rested(scaled(mesh, size), UNKNOWN, options, rng)
+        return _at_rest(scaled(mesh, size), UNKNOWN, options, rng)
     label = str(rng.choice(list(CATEGORIES)))
-    return _rested(scaled(make_object(label, rng), size), label, options, rng)
+    return _at_rest(scaled(make_object(label, rng), size), label, options, rng)
 
 
-def _rested(
+def _at_rest(
     mesh: Mesh, label: str, options: ArrangementOptions, rng: np.random.Generator
 ) -> ArrangedObject:
     """Draw a resting pose from those usual for the label; upright if the mesh has none like it."""
-    chances = dict(_MANNERS.get(label, {"upright": 1.0}))
+    chances = dict(_RESTING_POSES.get(label, {"upright": 1.0}))
     if options.lying is not None and label in _ROUND:
         chances["upright"] += chances["lying"] - options.lying
         chances["lying"] = options.lying
-    manner = str(rng.choice(list(chances), p=list(chances.values())))
-    rest = choose_rest(rests(mesh), manner, rng) if manner != "upright" else None
-    if rest is None:
+    resting_pose = str(rng.choice(list(chances), p=list(chances.values())))
+    stable = None
+    if resting_pose != "upright":
+        stable = choose_stable_pose(stable_poses(mesh), resting_pose, rng)
+    if stable is None:
         return ArrangedObject(standing(mesh), label, "upright", 0.0)
-    return ArrangedObject(moved(mesh, rest.pose), label, manner, 0.0)
+    return ArrangedObject(moved(mesh, stable.pose), label, resting_pose, 0.0)
 
 
-def _leant(item: ArrangedObject, rng: np.random.Generator) -> ArrangedObject:
+def _tilted(item: ArrangedObject, rng: np.random.Generator) -> ArrangedObject:
     """Tilt an object by 5 to 25 degrees, as if it leant on something."""
     azimuth, half = rng.uniform(0, 2 * np.pi), np.radians(rng.uniform(5, 25)) / 2
     axis = np.sin(half) * np.array([np.cos(azimuth), np.sin(azimuth), 0.0])
     turn = Pose(rotation_from_quaternion(np.round([*axis, np.cos(half)], 9)), np.zeros(3))
-    return item._replace(mesh=standing(moved(item.mesh, turn)), manner="leaning")
+    return item._replace(mesh=standing(moved(item.mesh, turn)), resting_pose="leaning")
 
 
 def placed(

@@ -30,7 +30,7 @@ __all__ = ["judge"]
 _TRACK_SEED, _TRACK_TABLES = 100_006, 24
 _DRAWN = 20
 """Number of test tables from which the worst mistakes are drawn."""
-_MANNERS = ("upright", "lying")
+_RESTING_POSES = ("upright", "lying")
 _HEAD = ("", "views", "accuracy", "balanced", "ECE", "known rejected", "unknown rejected", "AUROC")
 _text = partial(figure_text, missing="")
 
@@ -105,12 +105,12 @@ def _parts(views: Simulated, model: Categorizer) -> list[tuple[str, Report]]:
     clear = clear_views(views)
     parts = {
         "whole, mostly visible, well segmented, not upside down": clear,
-        "of these, upright": clear & (views.manner == "upright"),
-        "of these, lying": clear & (views.manner == "lying"),
-        "of these, tilted in piles": clear & (views.manner == "tilted"),
+        "of these, upright": clear & (views.resting_pose == "upright"),
+        "of these, lying": clear & (views.resting_pose == "lying"),
+        "of these, tilted in piles": clear & (views.resting_pose == "tilted"),
         "of these, nearer than 1.4 m": clear & (views.views.distances < 1.4),
         **{f"of these, by {name}": clear & (views.sensor == name) for name in PRESETS},
-        "upside down": whole & (views.manner == "upside_down"),
+        "upside down": whole & (views.resting_pose == "upside_down"),
         "30 to 70 % visible": whole & (views.visible < MOSTLY),
         "fragments": views.source == "fragment",
         "background": background,
@@ -172,15 +172,15 @@ def _fused_table(tracks: dict[str, Simulated], model: Categorizer) -> Table:
     rows = []
     for name, seen in tracks.items():
         clear = seen.where(clear_views(seen))
-        for manner in ("any but upside down", "upright", "lying"):
-            mine = clear.where((clear.manner == manner) | (manner not in _MANNERS))
+        for which in ("any but upside down", "upright", "lying"):
+            mine = clear.where((clear.resting_pose == which) | (which not in _RESTING_POSES))
             report = evaluate(mine.views, model)
-            singles = (name, manner, "1", str(report.n), _text(report.accuracy), _text(report.ece))
+            singles = (name, which, "1", str(report.n), _text(report.accuracy), _text(report.ece))
             rows.append(singles)
             rows += [
                 (
                     name,
-                    manner,
+                    which,
                     str(item.views),
                     str(item.groups),
                     _text(item.accuracy),

@@ -11,7 +11,7 @@ from shapecat.simulation.scans import load_mesh, upright_poses, uprighted
 __all__ = ["mesh_views"]
 
 _PLACEMENTS = {"upright": 3, "lying": 2}
-"""Number of placements in each resting manner, per round (see `mesh_views`)."""
+"""Number of placements in each resting pose, per round (see `mesh_views`)."""
 _NEVER_LIE = {"ball", "bowl", "plate"}
 
 
@@ -36,10 +36,10 @@ def mesh_views(
         rng = np.random.default_rng((seed, number))
         mesh = uprighted(load_mesh(path), label)
         found = upright_poses(mesh, label)
-        for manner, share in _PLACEMENTS.items():
-            wanted = "upright" if label in _NEVER_LIE else manner
-            fitting = [rest for rest in found if rest.manner == wanted] or list(found)
+        for resting_pose, share in _PLACEMENTS.items():
+            wanted = "upright" if label in _NEVER_LIE else resting_pose
+            fitting = [stable for stable in found if stable.name == wanted] or list(found)
             for k in range(share * placements):
-                rest = fitting[int(rng.integers(len(fitting)))]
-                name = f"{label}/{path.stem}/{manner}_{k}"
-                yield from simulate_mesh(mesh, label, name, rest, cameras=cameras, rng=rng)
+                stable = fitting[int(rng.integers(len(fitting)))]
+                name = f"{label}/{path.stem}/{resting_pose}_{k}"
+                yield from simulate_mesh(mesh, label, name, stable, cameras=cameras, rng=rng)

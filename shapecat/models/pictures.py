@@ -70,7 +70,7 @@ def _draw_one(axis: Any, mistake: Mistake) -> None:
     axis.set_aspect("equal")
     where = f"{seen.sensor}, {seen.distance:.1f} m, {seen.points} voxels"
     axis.set_title(
-        f"{seen.label}, {seen.manner}\nas {mistake.said} ({mistake.confidence:.2f})\n{where}",
+        f"{seen.label}, {seen.resting_pose}\nas {mistake.said} ({mistake.confidence:.2f})\n{where}",
         fontsize=7,
     )
 

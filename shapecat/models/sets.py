@@ -48,7 +48,7 @@ class Simulated(NamedTuple):
     """Simulated views with the circumstances of each, (n,), as in `WorldView`."""
 
     views: DescribedViews
-    manner: np.ndarray
+    resting_pose: np.ndarray
     source: np.ndarray
     visible: np.ndarray
     overlap: np.ndarray
@@ -98,7 +98,7 @@ def clear_views(views: Simulated) -> Bool:
     If detection merges an object with others, no category is right. The evaluation of the detection
     covers this case; the model card gives badly segmented views a row of their own.
     """
-    return np.asarray(~partial_views(views) & (views.manner != "upside_down"))
+    return np.asarray(~partial_views(views) & (views.resting_pose != "upside_down"))
 
 
 def partial_views(views: Simulated) -> Bool:

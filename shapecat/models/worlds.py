@@ -33,7 +33,7 @@ from shapecat.models.arrangements import (
 from shapecat.models.fragments import cut_fragment, cut_halo
 from shapecat.models.rendered_views import RenderedView, render_view
 from shapecat.simulation.mesh import Mesh, moved
-from shapecat.simulation.placement import Rest
+from shapecat.simulation.placement import StablePose
 from shapecat.simulation.render import geometry
 from shapecat.surface import voxelize
 from shapecat.types import UNKNOWN, Candidate, Scene
@@ -66,7 +66,7 @@ class WorldView(NamedTuple):
     points : number of voxels.
     distance : mean distance from the sensor, metres.
     seconds : time from points to descriptor.
-    manner : resting pose: ``upright``, ``lying``, ``upside_down``, ``leaning`` or ``tilted``.
+    resting_pose : ``upright``, ``lying``, ``upside_down``, ``leaning`` or ``tilted``.
     source : how the view was segmented: ``truth``, ``detected`` or ``fragment``; or ``background``,
         a thin detection that shows no object, whose label is ``unknown``.
     visible : fraction of the object's unoccluded pixels that have readings.
@@ -81,7 +81,7 @@ class WorldView(NamedTuple):
     points: int
     distance: float
     seconds: float
-    manner: str
+    resting_pose: str
     source: str
     visible: float
     overlap: float
@@ -93,7 +93,7 @@ class _Seen(NamedTuple):
     """An object or background in an image: label and circumstances as in `WorldView`."""
 
     label: str
-    manner: str
+    resting_pose: str
     sensor: str
     visible: float
     overlap: float
@@ -131,7 +131,13 @@ def simulate_world(options: ArrangementOptions, number: int) -> list[WorldView]:
 
 
 def simulate_mesh(
-    mesh: Mesh, label: str, name: str, rest: Rest, *, cameras: int, rng: np.random.Generator
+    mesh: Mesh,
+    label: str,
+    name: str,
+    stable_pose: StablePose,
+    *,
+    cameras: int,
+    rng: np.random.Generator,
 ) -> list[WorldView]:
     """Describe one given object, alone on the table, from several viewpoints.
 
@@ -139,10 +145,10 @@ def simulate_mesh(
     ----------
     label : true category of the object.
     name : prefix of its instance name.
-    rest : its resting pose.
+    stable_pose : pose in which the mesh rests on the table.
     cameras : number of viewpoints, each with its own sensor.
     """
-    item = ArrangedObject(moved(mesh, rest.pose), label, rest.manner, 0.0)
+    item = ArrangedObject(moved(mesh, stable_pose.pose), label, stable_pose.name, 0.0)
     alone = Arrangement([placed(item, (0.0, 0.0), 0.0, rng)], (ALONE,))
     return describe_arrangement(alone, name, cameras=cameras, rng=rng)
 
@@ -198,7 +204,7 @@ def _views_of(
         view, overlap = cut_halo(_cut_by_truth(image, k, item, rng), rng), 1.0
         source = "truth"
     view = View(view.points, view.eye, item.label, instance)
-    seen = _Seen(item.label, item.manner, image.sensor, float(image.visible[k]), overlap)
+    seen = _Seen(item.label, item.resting_pose, image.sensor, float(image.visible[k]), overlap)
     described = [_described(view, source, seen)]
     if rng.random() < _FRAGMENTS:
         piece = cut_fragment(view, rng)

@@ -10,7 +10,7 @@ from shapecat.geometry import IDENTITY, compose
 from shapecat.simulation.distractors import make_distractor
 from shapecat.simulation.footprints import Footprint, footprint, inside, overlap
 from shapecat.simulation.mesh import Mesh
-from shapecat.simulation.placement import Rest, choose_rest, rests
+from shapecat.simulation.placement import StablePose, choose_stable_pose, stable_poses
 from shapecat.simulation.shapes import make_object
 from shapecat.simulation.worlds import PlacedObject, Support, turned_about_z
 from shapecat.types import Pose
@@ -22,41 +22,44 @@ _LYING = {"can": 0.2, "bottle": 0.22, "cup": 0.12, "box": 0.7}
 _UPSIDE_DOWN = {"cup": 0.06, "bowl": 0.06, "plate": 0.03}
 """Probability that an open object stands on its rim."""
 _WIDEST_M = 0.42
-_BEARERS = {"box", "can"}
+_SUPPORTING = {"box", "can"}
+"""Categories that other objects are stacked on."""
 _SMALLEST_TOP_M = 0.035
+"""Minimum width of a top face that supports another object."""
 _EDGE_M = 0.01
+"""Minimum distance of the contact area from the edge of the support."""
 
 
 class Piece(NamedTuple):
-    """An object to be placed, with its resting pose."""
+    """An object to be placed, with its stable pose."""
 
     category: str
     kind: str
     mesh: Mesh
-    rest: Rest
+    stable_pose: StablePose
 
 
-def make_piece(category: str, rng: Generator, *, manner: str | None = None) -> Piece:
+def make_piece(category: str, rng: Generator, *, resting_pose: str | None = None) -> Piece:
     """Make a random object and choose its resting pose.
 
     Parameters
     ----------
     category : one of the shape categories, or ``unknown`` for a distractor, which stays upright.
-    manner : ``upright``, ``lying`` or ``upside_down``; random by default. An object that cannot
-        rest in this manner stands upright.
+    resting_pose : ``upright``, ``lying`` or ``upside_down``; random by default. An object without
+        such a stable pose stands upright.
     """
     if category == "unknown":
         kind, mesh = make_distractor(rng)
     else:
         kind, mesh = category, make_object(category, rng)
-    wanted = manner or _draw_manner(category, rng)
-    rest = Rest(IDENTITY, "upright")
+    wanted = resting_pose or _draw_resting_pose(category, rng)
+    stable_pose = StablePose(IDENTITY, "upright")
     if wanted != "upright" and category not in {"ball", "unknown"}:
-        rest = choose_rest(rests(mesh), wanted, rng) or rest
-    return Piece(category, kind, mesh, rest)
+        stable_pose = choose_stable_pose(stable_poses(mesh), wanted, rng) or stable_pose
+    return Piece(category, kind, mesh, stable_pose)
 
 
-def _draw_manner(category: str, rng: Generator) -> str:
+def _draw_resting_pose(category: str, rng: Generator) -> str:
     luck = rng.random()
     over = _UPSIDE_DOWN.get(category, 0.0)
     if luck < over:
@@ -83,7 +86,7 @@ class Layout:
         self._headroom = headroom
         self._enclosed = enclosed
         self._places: list[Footprint] = []
-        self._roots: list[Support] = []
+        self._base_supports: list[Support] = []
 
     def put(
         self, category: str, support: Support, half: F8, *, stack: float = 0.0, attempts: int = 6
@@ -98,7 +101,7 @@ class Layout:
         """
         for _ in range(attempts):
             piece = make_piece(category, self._rng)
-            size = footprint(piece.mesh, piece.rest.pose)
+            size = footprint(piece.mesh, piece.stable_pose.pose)
             if size.high > self._headroom or np.ptp(size.outline, axis=0).max() > _WIDEST_M:
                 continue
             if self._rng.random() < stack and self._put_on_object(piece):
@@ -113,7 +116,7 @@ class Layout:
         ``half`` (2,) is as for `put`; ``tries`` is the number of random positions to try.
         """
         middle = support.outline[:, :2].mean(axis=0)
-        resting = footprint(piece.mesh, piece.rest.pose)
+        resting = footprint(piece.mesh, piece.stable_pose.pose)
         for _ in range(tries):
             spot = middle + self._rng.uniform(-half, half)
             turn = self._drawn_turn(np.array([*spot, support.height]))
@@ -123,7 +126,7 @@ class Layout:
                 return True
         return False
 
-    def room_for(self, k: int, support: Support, half: F8) -> F8 | None:
+    def reserve_position(self, k: int, support: Support, half: F8) -> F8 | None:
         """Reserve a second position for object ``k``, which keeps its first one.
 
         ``half`` (2,) is as for `put`.
@@ -144,19 +147,19 @@ class Layout:
         return None
 
     def _put_on_object(self, piece: Piece) -> bool:
-        bearers = [k for k in range(len(self.objects)) if self._can_bear(k)]
-        if not bearers or piece.category == "ball":
+        candidates = [k for k in range(len(self.objects)) if self._can_support(k)]
+        if not candidates or piece.category == "ball":
             return False
-        resting = footprint(piece.mesh, piece.rest.pose)
+        resting = footprint(piece.mesh, piece.stable_pose.pose)
         for _ in range(8):
-            k = bearers[int(self._rng.integers(len(bearers)))]
+            k = candidates[int(self._rng.integers(len(candidates)))]
             below = self._places[k]
             slack = 0.25 * np.ptp(below.top, axis=0)
             spot = [*below.top.mean(axis=0) + self._rng.uniform(-slack, slack), below.high]
             turn = self._drawn_turn(np.array(spot))
             here = resting.moved(turn)
-            if _bears(below, here) and self._fits(here, self._roots[k]):
-                self._add(piece, turn, here, self._roots[k], self.objects[k].track)
+            if _supports(below, here) and self._fits(here, self._base_supports[k]):
+                self._add(piece, turn, here, self._base_supports[k], self.objects[k].track)
                 return True
         return False
 
@@ -177,32 +180,33 @@ class Layout:
         beside = [p for p in self._places if p.low < here.high and p.high > here.low + 1e-6]
         return not any(overlap(here.outline, p.outline, self.gap) for p in beside)
 
-    def _can_bear(self, k: int) -> bool:
+    def _can_support(self, k: int) -> bool:
         top = self._places[k].top
         flat = len(top) > 2 and float(np.ptp(top, axis=0).min()) > _SMALLEST_TOP_M
-        return flat and self.objects[k].category in _BEARERS
+        return flat and self.objects[k].category in _SUPPORTING
 
     def _add(
-        self, piece: Piece, turn: Pose, here: Footprint, support: Support, bearer: int | None
+        self, piece: Piece, turn: Pose, here: Footprint, support: Support, on_track: int | None
     ) -> None:
-        manner = "upright" if piece.category == "box" else piece.rest.manner  # a box has no upright
+        # No pose of a box is its upright one.
+        resting_pose = "upright" if piece.category == "box" else piece.stable_pose.name
         item = PlacedObject(
             len(self.objects),
             piece.category,
             piece.kind,
             piece.mesh,
-            compose(turn, piece.rest.pose),
-            support.name if bearer is None else None,
-            bearer,
-            lying=manner == "lying",
-            upside_down=manner == "upside_down",
+            compose(turn, piece.stable_pose.pose),
+            support.name if on_track is None else None,
+            on_track,
+            lying=resting_pose == "lying",
+            upside_down=resting_pose == "upside_down",
         )
         self.objects.append(item)
         self._places.append(here)
-        self._roots.append(support)
+        self._base_supports.append(support)
 
 
-def _bears(below: Footprint, above: Footprint) -> bool:
+def _supports(below: Footprint, above: Footprint) -> bool:
     """Return whether the central 60 % of the upper object's contact lies on the lower one's top."""
     middle = above.contact.mean(axis=0)
     return inside(middle + 0.6 * (above.contact - middle), below.top, 0.002)

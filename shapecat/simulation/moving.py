@@ -76,7 +76,7 @@ def rearranged(rng: Generator, categories: Sequence[str], filming: Filming) -> W
     pushed, carried, removed, added = starts * duration
     motions = [_pushed(0, layout.objects[0].pose.translation, t - pushed)]
     for k in range(1, len(layout.objects)):
-        goal = layout.room_for(k, back, _ANYWHERE)
+        goal = layout.reserve_position(k, back, _ANYWHERE)
         if goal is not None:
             motions.append(_carried(k, goal - layout.objects[k].pose.translation, t - carried))
             break

@@ -12,7 +12,7 @@ from shapecat.simulation.convex_parts import convex_parts
 from shapecat.simulation.mesh import Mesh
 from shapecat.types import Pose
 
-__all__ = ["Drop", "Rest", "settle"]
+__all__ = ["Drop", "SettledPose", "settle"]
 
 _STEP_S = 0.004
 _DENSITY = 400.0
@@ -45,20 +45,20 @@ class Drop(NamedTuple):
     place: F8
 
 
-class Rest(NamedTuple):
+class SettledPose(NamedTuple):
     """Resting pose of a dropped object.
 
     Attributes
     ----------
     pose : ``world_from_mesh``, rounded to 1 um.
-    bearer : index of the object that carries most of its weight; None if an obstacle does.
+    supported_by : index of the object that carries most of its weight; None if an obstacle does.
     """
 
     pose: Pose
-    bearer: int | None
+    supported_by: int | None
 
 
-def settle(obstacles: Sequence[Mesh], drops: Sequence[Drop]) -> list[Rest]:
+def settle(obstacles: Sequence[Mesh], drops: Sequence[Drop]) -> list[SettledPose]:
     """Drop objects one after the other, each from just above the others, until all are at rest.
 
     Parameters
@@ -87,7 +87,7 @@ def settle(obstacles: Sequence[Mesh], drops: Sequence[Drop]) -> list[Rest]:
             break
         for _ in range(_LOOK_STEPS):
             mujoco.mj_step(model, data)
-    return _rests(mujoco, model, data, len(drops))
+    return _settled_poses(mujoco, model, data, len(drops))
 
 
 def _say_nothing(_: str) -> None:
@@ -156,11 +156,11 @@ def _pose(data: Any, k: int) -> Pose:
     return Pose(rotation_from_quaternion([x, y, z, w]), np.round(place, 6))
 
 
-def _rests(mujoco: Any, model: Any, data: Any, count: int) -> list[Rest]:
+def _settled_poses(mujoco: Any, model: Any, data: Any, count: int) -> list[SettledPose]:
     """Return the resting pose of each object, and the body with the greatest upward force on it."""
     model.opt.enableflags = 0  # sleeping bodies have no contacts
     mujoco.mj_forward(model, data)
-    lift = np.zeros((count, count + 1))  # the last column: obstacles
+    upward_force = np.zeros((count, count + 1))  # the last column: obstacles
     force = np.zeros(6)
     for k in range(data.ncon):
         contact = data.contact[k]
@@ -169,8 +169,9 @@ def _rests(mujoco: Any, model: Any, data: Any, count: int) -> list[Rest]:
         one, two = (int(model.geom_bodyid[geom]) - 1 for geom in contact.geom)
         for body, other, up in ((two, one, upward), (one, two, -upward)):
             if body >= 0:
-                lift[body, other] += up
-    bearers = lift.argmax(axis=1)
+                upward_force[body, other] += up
+    supporting = upward_force.argmax(axis=1)
     return [
-        Rest(_pose(data, k), None if bearers[k] == count else int(bearers[k])) for k in range(count)
+        SettledPose(_pose(data, k), None if supporting[k] == count else int(supporting[k]))
+        for k in range(count)
     ]

@@ -12,7 +12,7 @@ from shapecat.simulation.distractors import DISTRACTORS, make_distractor
 from shapecat.simulation.furniture import make_bin, make_compartment, make_room, make_table
 from shapecat.simulation.mesh import Mesh
 from shapecat.simulation.paths import Filming, walk
-from shapecat.simulation.physics import Drop, Rest, settle
+from shapecat.simulation.physics import Drop, SettledPose, settle
 from shapecat.simulation.shapes import make_object
 from shapecat.simulation.worlds import PlacedObject, Support, World
 
@@ -145,20 +145,24 @@ def settled(
     They are numbered from 0 in the order of ``items``. Objects that rise ``highest_m`` metres or
     more above the surface of ``below`` are left out too.
     """
-    rests = settle([support.mesh for support in supports], drops)
-    stays = [_stays(k.mesh, rest, below, highest_m) for k, rest in zip(items, rests, strict=True)]
+    settled_poses = settle([support.mesh for support in supports], drops)
+    stays = [
+        _stays(k.mesh, landed, below, highest_m)
+        for k, landed in zip(items, settled_poses, strict=True)
+    ]
     tracks = np.cumsum(stays) - 1
     objects = []
-    for k, (item, rest) in enumerate(zip(items, rests, strict=True)):
+    for k, (item, landed) in enumerate(zip(items, settled_poses, strict=True)):
         if not stays[k]:
             continue
-        bearer = rest.bearer if rest.bearer is not None and stays[rest.bearer] else None
-        objects.append(_placed_object(int(tracks[k]), item, rest, below, tracks, bearer))
+        below_it = landed.supported_by
+        supported_by = below_it if below_it is not None and stays[below_it] else None
+        objects.append(_placed_object(int(tracks[k]), item, landed, below, tracks, supported_by))
     return tuple(objects)
 
 
-def _stays(mesh: Mesh, rest: Rest, below: Support, highest_m: float) -> bool:
-    points = transform(rest.pose, mesh.vertices)
+def _stays(mesh: Mesh, landed: SettledPose, below: Support, highest_m: float) -> bool:
+    points = transform(landed.pose, mesh.vertices)
     low, high = points.min(axis=0), points.max(axis=0)
     edge = below.outline[:, :2]
     middle = (low + high)[:2] / 2
@@ -167,17 +171,22 @@ def _stays(mesh: Mesh, rest: Rest, below: Support, highest_m: float) -> bool:
 
 
 def _placed_object(
-    track: int, item: Item, rest: Rest, below: Support, tracks: F8, bearer: int | None
+    track: int,
+    item: Item,
+    landed: SettledPose,
+    below: Support,
+    tracks: F8,
+    supported_by: int | None,
 ) -> PlacedObject:
-    axes = rest.pose.rotation[2]  # world z of the object's own axes
+    axes = landed.pose.rotation[2]  # world z of the object's own axes
     return PlacedObject(
         track,
         item.category,
         item.kind,
         item.mesh,
-        rest.pose,
-        below.name if bearer is None else None,
-        None if bearer is None else int(tracks[bearer]),
+        landed.pose,
+        below.name if supported_by is None else None,
+        None if supported_by is None else int(tracks[supported_by]),
         lying=bool(item.category != "box" and abs(axes[2]) < _LYING_COS),
         upside_down=bool(axes[2] < -_UPRIGHT_COS),
         tilted=bool(np.abs(axes).max() < _UPRIGHT_COS),

@@ -1,4 +1,4 @@
-"""Stable resting poses of a mesh on a horizontal surface."""
+"""Stable poses of a mesh on a horizontal surface."""
 
 import numpy as np
 from numpy.random import Generator
@@ -9,24 +9,24 @@ from shapecat.geometry import gravity_rotation
 from shapecat.simulation.mesh import Mesh
 from shapecat.types import Pose
 
-__all__ = ["Rest", "choose_rest", "rests"]
+__all__ = ["StablePose", "choose_stable_pose", "stable_poses"]
 
 
-class Rest(Record):
-    """A stable resting pose on a horizontal surface.
+class StablePose(Record):
+    """A stable pose of a mesh on a horizontal surface.
 
     Attributes
     ----------
     pose : ``level_from_mesh``: the lowest point at z = 0, the centre of mass over the origin.
-    manner : ``upright``, ``upside_down`` or ``lying``.
+    name : ``upright``, ``upside_down`` or ``lying``.
     """
 
     pose: Pose
-    manner: str
+    name: str
 
 
-def rests(mesh: Mesh) -> tuple[Rest, ...]:
-    """Return the stable resting poses of a mesh.
+def stable_poses(mesh: Mesh) -> tuple[StablePose, ...]:
+    """Return the stable poses of a mesh on a horizontal surface.
 
     A mesh rests on a face of its convex hull if the hull's centre of mass lies above this face. It
     is upright or upside down if its z axis is within 15 degrees of the vertical.
@@ -50,14 +50,16 @@ def rests(mesh: Mesh) -> tuple[Rest, ...]:
         z = points @ rotation[2]
         place = np.array([*-(rotation[:2] @ middle), -z.min()])
         tilt = rotation[2, 2]
-        manner = "upright" if tilt > 0.966 else "upside_down" if tilt < -0.966 else "lying"
-        found.append(Rest(Pose(rotation, np.round(place, 9)), manner))
+        name = "upright" if tilt > 0.966 else "upside_down" if tilt < -0.966 else "lying"
+        found.append(StablePose(Pose(rotation, np.round(place, 9)), name))
     return tuple(found)
 
 
-def choose_rest(found: tuple[Rest, ...], manner: str, rng: Generator) -> Rest | None:
-    """Draw a random resting pose of the given manner; None if there is none."""
-    fitting = [rest for rest in found if rest.manner == manner]
+def choose_stable_pose(
+    found: tuple[StablePose, ...], name: str, rng: Generator
+) -> StablePose | None:
+    """Draw a random stable pose with this name; None if there is none."""
+    fitting = [stable for stable in found if stable.name == name]
     return fitting[int(rng.integers(len(fitting)))] if fitting else None
 
 

@@ -9,7 +9,7 @@ from scipy.spatial import ConvexHull
 from shapecat.arrays import F8, I4
 from shapecat.errors import ConfigError, RecordingError
 from shapecat.simulation.mesh import Mesh, moved, standing
-from shapecat.simulation.placement import Rest, rests
+from shapecat.simulation.placement import StablePose, stable_poses
 from shapecat.simulation.render import geometry, render
 from shapecat.types import Camera, Pose
 
@@ -75,19 +75,19 @@ def uprighted(mesh: Mesh, category: str) -> Mesh:
     return standing(moved(mesh, Pose(_AXES[best], np.zeros(3))))
 
 
-def upright_poses(mesh: Mesh, category: str) -> tuple[Rest, ...]:
+def upright_poses(mesh: Mesh, category: str) -> tuple[StablePose, ...]:
     """Return the resting poses of a mesh that `uprighted` has turned, upright ones first.
 
     Raises
     ------
     ValueError : no face of the convex hull is stable.
     """
-    found = rests(uprighted(mesh, category))
+    found = stable_poses(uprighted(mesh, category))
     if not found:
         msg = f"a {category} that cannot stand or lie"
         raise ValueError(msg)
     order = {"upright": 0, "lying": 1, "upside_down": 2}
-    return tuple(sorted(found, key=lambda rest: order[rest.manner]))
+    return tuple(sorted(found, key=lambda stable: order[stable.name]))
 
 
 def _roundness(points: F8) -> float:
