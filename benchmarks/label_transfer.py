@@ -29,7 +29,7 @@ from shapecat.runs.label_transfer import match_labels
 from shapecat.runs.tables import read_row_groups
 from shapecat.runs.track_table import read_track_table
 from shapecat.simulation import KINECT, make_scene
-from shapecat.simulation.paths import Filming, walk
+from shapecat.simulation.paths import Filming, arc_orbit
 from shapecat.simulation.recorder import record
 from shapecat.simulation.worlds import FIRST_OBJECT_LABEL, World
 
@@ -143,7 +143,7 @@ def second_pass(world: World, seed: int, frames: int) -> World:
     rng = np.random.default_rng((seed, 2))
     height = next(s.height for s in world.supports if s.level and s.name != "floor")
     target = np.array([0, 0, height + 0.05])
-    elsewhere = walk(
+    elsewhere = arc_orbit(
         rng, target, Filming(frames, 30.0), distance=(0.8, 1.3), elevation=(28, 52), sweep=(25, 60)
     )
     return replace(world, path=elsewhere)

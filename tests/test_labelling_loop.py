@@ -15,7 +15,7 @@ from shapecat.simulation import World, record
 from shapecat.simulation.distractors import make_distractor
 from shapecat.simulation.furniture import make_table
 from shapecat.simulation.layout import Layout, Piece, make_piece
-from shapecat.simulation.paths import Filming, walk
+from shapecat.simulation.paths import Filming, arc_orbit
 from shapecat.simulation.placement import StablePose
 from shapecat.simulation.sensors import KINECT
 from shapecat.types import CATEGORIES, Pose
@@ -36,7 +36,7 @@ def table_with_glasses(seed: int) -> World:
     for piece in pieces:
         layout.put_piece(piece, table, np.array([0.36, 0.26]), tries=400)
     target = np.array([0, 0, table.height + 0.05])
-    path = walk(rng, target, Filming(FRAMES, 30.0), distance=1.0, elevation=38, sweep=45)
+    path = arc_orbit(rng, target, Filming(FRAMES, 30.0), distance=1.0, elevation=38, sweep=45)
     return World("tabletop", (table,), tuple(layout.objects), path)
 
 

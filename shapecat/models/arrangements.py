@@ -209,8 +209,8 @@ def _free_spot(
 
     ``spots`` are the (x, y, radius) of the objects so far; metres.
     """
-    for reach in np.repeat([0.08, 0.16, 0.26, 0.36], 4):
-        x, y = rng.uniform(-reach, reach, 2)
+    for half_width in np.repeat([0.08, 0.16, 0.26, 0.36], 4):
+        x, y = rng.uniform(-half_width, half_width, 2)
         if all(np.hypot(x - u, y - v) > radius + other for u, v, other in spots):
             return float(x), float(y)
     return None

@@ -128,5 +128,5 @@ def _by_place(scene: Scene, item: dict[str, Any]) -> int | None:
     """Return the index of the candidate nearest to an object; None if it is too far."""
     place = np.array(item["centroid_m"])
     gaps = [float(np.linalg.norm(c.box.center - place)) for c in scene.candidates]
-    reach = 0.5 * max(item["extent_m"])
-    return int(np.argmin(gaps)) if gaps and min(gaps) < reach else None
+    max_distance = 0.5 * max(item["extent_m"])
+    return int(np.argmin(gaps)) if gaps and min(gaps) < max_distance else None

@@ -34,7 +34,7 @@ from shapecat.models.parts import count_labels
 from shapecat.simulation import make_scene, render_frame
 from shapecat.simulation.equipment import make_own_arms, make_resting_arms
 from shapecat.simulation.furniture import EQUIPMENT, make_rack, make_tote
-from shapecat.simulation.paths import Filming, walk
+from shapecat.simulation.paths import Filming, arc_orbit
 from shapecat.simulation.scenes import SceneKind
 from shapecat.simulation.sensors import PRESETS, Sensor, resized
 from shapecat.simulation.worlds import Support, World
@@ -277,7 +277,7 @@ def _viewpoint(world: World, sensor: Sensor, rng: np.random.Generator) -> Pose |
     target = (np.mean(places, axis=0) + places[rng.integers(len(places))]) / 2
     nearest = max(_DISTANCE_M[0], sensor.nearest_m + _CLOSER_M)
     distance = float(np.exp(rng.uniform(np.log(nearest), np.log(_DISTANCE_M[1]))))
-    (pose,) = walk(
+    (pose,) = arc_orbit(
         rng,
         np.asarray(target),
         Filming(1, 30.0),

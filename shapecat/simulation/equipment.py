@@ -28,21 +28,21 @@ __all__ = [
 ]
 
 
-def make_arm(rng: Generator, base: F8, reach: F8) -> list[Mesh]:
+def make_arm(rng: Generator, base: F8, tip: F8) -> list[Mesh]:
     """Return the links of a robot arm from its base to its gripper.
 
     Parameters
     ----------
     base : (3,) position of the base, metres, world frame.
-    reach : (3,) position of the gripper's finger tips.
+    tip : (3,) position of the gripper's fingertips.
     """
     thick = rng.uniform(0.035, 0.06)
-    wrist = _above(reach, rng.uniform(0.16, 0.24))
+    wrist = _above(tip, rng.uniform(0.16, 0.24))
     shoulder = _above(base, rng.uniform(0.2, 0.4))
     elbow = _above((shoulder + wrist) / 2, rng.uniform(0.1, 0.35))
     foot = placed(rod(0.04, 2 * thick), base)
     links = [foot, *_links([base, shoulder, elbow, wrist], [thick, 0.9 * thick, 0.75 * thick])]
-    return [*links, *_gripper(rng, wrist, reach)]
+    return [*links, *_gripper(rng, wrist, tip)]
 
 
 def make_own_arms(rng: Generator, camera: Pose, height: float) -> list[Mesh]:
@@ -62,8 +62,8 @@ def make_own_arms(rng: Generator, camera: Pose, height: float) -> list[Mesh]:
         base = [side * rng.uniform(0.1, 0.55), below * rng.uniform(0.2, 0.6), rng.uniform(0, 0.4)]
         depth = far * rng.uniform(0.55, 0.95)
         aside = side * depth * rng.uniform(-0.05, 0.45)
-        reach = [aside, below * depth * rng.uniform(-0.1, 0.4), depth]
-        start, tip = (camera.rotation @ p + camera.translation for p in (base, reach))
+        tip_in_camera = [aside, below * depth * rng.uniform(-0.1, 0.4), depth]
+        start, tip = (camera.rotation @ p + camera.translation for p in (base, tip_in_camera))
         tip[2] = max(tip[2], height + rng.uniform(0.03, 0.12))
         wrist = _above(tip, rng.uniform(0.1, 0.24))
         elbow = _above((start + wrist) / 2, rng.uniform(-0.05, 0.25))
@@ -142,31 +142,31 @@ def _links(joints: Sequence[F8], radii: Sequence[float]) -> list[Mesh]:
     return parts
 
 
-def _gripper(rng: Generator, hand: F8, reach: F8) -> list[Mesh]:
-    """Return a palm at ``hand`` (3,) and two fingers that point down to ``reach`` (3,)."""
+def _gripper(rng: Generator, hand: F8, tip: F8) -> list[Mesh]:
+    """Return a palm at ``hand`` (3,) and two fingers that point down to ``tip`` (3,)."""
     turn, wide = rng.uniform(0, 180), rng.uniform(0.03, 0.09)
-    tall = float(hand[2] - reach[2])
+    tall = float(hand[2] - tip[2])
     palm = placed(rounded_box([wide + 0.05, 0.05, 0.5 * tall]), [0, 0, 0.45 * tall])
     finger = rounded_box([0.012, 0.022, 0.5 * tall], fine=2)
     fingers = [placed(finger, [side * wide / 2, 0, 0]) for side in (-1, 1)]
     return [
-        placed(placed(part, [0, 0, 0], about="z", degrees=turn), [*hand[:2], reach[2]])
+        placed(placed(part, [0, 0, 0], about="z", degrees=turn), [*hand[:2], tip[2]])
         for part in (palm, *fingers)
     ]
 
 
-def make_forearm(rng: Generator, reach: F8, start: F8) -> list[Mesh]:
-    """Return a person's arm from ``start`` (3,) to the hand at ``reach`` (3,); metres."""
-    over = _above((start + reach) / 2, rng.uniform(0.02, 0.12))
-    path = smooth_path(np.stack([start, over, reach]), 10)
+def make_forearm(rng: Generator, tip: F8, start: F8) -> list[Mesh]:
+    """Return a person's arm from ``start`` (3,) to the hand at ``tip`` (3,); metres."""
+    over = _above((start + tip) / 2, rng.uniform(0.02, 0.12))
+    path = smooth_path(np.stack([start, over, tip]), 10)
     arm = tube(path, np.linspace(rng.uniform(0.045, 0.06), 0.03, 10), segments=12)
-    palm = placed(ellipsoid([0.05, 0.045, 0.022]), reach)
-    ahead = (reach - start) / np.linalg.norm(reach - start)
+    palm = placed(ellipsoid([0.05, 0.045, 0.022]), tip)
+    ahead = (tip - start) / np.linalg.norm(tip - start)
     side = np.array([-ahead[1], ahead[0], 0.0])
     fingers = [
         tube(
             smooth_path(
-                reach
+                tip
                 + np.outer([0.02, rng.uniform(0.06, 0.1)], ahead)
                 + np.outer([1.0, 1.2], spread * side)
                 - np.array([[0, 0, 0], [0, 0, 0.03]]),

@@ -37,10 +37,10 @@ def _cloth(rng: Generator) -> Mesh:
         waves = np.sin(u[..., None] * across + v[..., None] * along + rng.uniform(0, 6, 3))
         height += (waves**2).sum(axis=-1) * rng.uniform(0.03, 0.12) / scale
     angle = np.arctan2(v, u)
-    reach = 0.5 * (1 + 0.25 * np.sin(angle * rng.integers(2, 6) + rng.uniform(0, 6)))
-    edge = np.clip(1.3 - np.hypot(u, v) / reach, 0, 1) ** 0.5
+    radius = 0.5 * (1 + 0.25 * np.sin(angle * rng.integers(2, 6) + rng.uniform(0, 6)))
+    edge = np.clip(1.3 - np.hypot(u, v) / radius, 0, 1) ** 0.5
     heap = rng.uniform(0, 0.5) * np.exp(-8 * (u**2 + v**2))
-    flat = np.minimum(1.0, reach / np.maximum(np.hypot(u, v), 1e-6))
+    flat = np.minimum(1.0, radius / np.maximum(np.hypot(u, v), 1e-6))
     top = np.stack([u * flat, v * flat, (height + heap) * edge], -1) * side
     under = top * [1, 1, 0]
     row = np.arange(count - 1)[:, None] * count + np.arange(count - 1)[None]

@@ -9,7 +9,7 @@ from numpy.random import Generator
 from shapecat.arrays import F8
 from shapecat.simulation.furniture import make_counter, make_room, make_table
 from shapecat.simulation.layout import Layout
-from shapecat.simulation.paths import Filming, stroll, walk
+from shapecat.simulation.paths import Filming, arc_orbit, lateral_pass
 from shapecat.simulation.worlds import Motion, Support, World
 from shapecat.types import Pose
 
@@ -17,7 +17,7 @@ __all__ = ["crossing", "rearranged", "walking"]
 
 
 def walking(rng: Generator, categories: Sequence[str], filming: Filming) -> World:
-    """Return a counter with objects of these categories; the camera walks along it and back.
+    """Return a counter with objects of these categories; the camera moves along it and back.
 
     Objects leave the view and come back.
     """
@@ -29,7 +29,9 @@ def walking(rng: Generator, categories: Sequence[str], filming: Filming) -> Worl
             category, _strip(counter, (middle - 0.3, middle + 0.3), (-0.22, 0.22)), _ANYWHERE
         )
     target = np.array([0, 0, counter.height + 0.05])
-    path = stroll(rng, target, filming, distance=(0.95, 1.2), elevation=(30, 48), reach=(0.6, 0.75))
+    path = lateral_pass(
+        rng, target, filming, distance=(0.95, 1.2), elevation=(30, 48), amplitude=(0.6, 0.75)
+    )
     return World("walking", (*room, counter), tuple(layout.objects), path)
 
 
@@ -47,14 +49,14 @@ def crossing(rng: Generator, categories: Sequence[str], filming: Filming) -> Wor
         if not layout.put(str(rng.choice(_MOVERS)), lane, _ANYWHERE, attempts=40):
             continue
         x = float(layout.objects[-1].pose.translation[0])
-        reach, speed = rng.uniform(0.3, 0.4), side * rng.uniform(0.14, 0.25)
-        phase = np.arcsin(np.clip(x / reach, -1, 1))
-        along = reach * np.sin(speed / reach * t + phase) - reach * np.sin(phase)
+        amplitude, speed = rng.uniform(0.3, 0.4), side * rng.uniform(0.14, 0.25)
+        phase = np.arcsin(np.clip(x / amplitude, -1, 1))
+        along = amplitude * np.sin(speed / amplitude * t + phase) - amplitude * np.sin(phase)
         motions.append(_shifted(len(layout.objects) - 1, along))
     rows = [_strip(table, (-0.5, 0.5), y) for y in ((-0.32, -0.15), (0.15, 0.37))]
     for k, category in enumerate(categories):
         layout.put(category, rows[k % 2], _ANYWHERE, attempts=20)
-    path = _walk_past(rng, table, filming, elevation=(25, 40), sweep=8)
+    path = _orbit_table(rng, table, filming, elevation=(25, 40), sweep=8)
     objects = tuple(layout.objects)
     return World("crossing", (*room, table), objects, path, motions=tuple(motions))
 
@@ -84,12 +86,12 @@ def rearranged(rng: Generator, categories: Sequence[str], filming: Filming) -> W
     there = t[:, None] < removed, t[:, None] >= added
     for k, when in zip(others, there, strict=False):
         motions.append(Motion(k, np.where(when, np.zeros(3), np.nan)))
-    path = _walk_past(rng, table, filming, elevation=(30, 48), sweep=12)
+    path = _orbit_table(rng, table, filming, elevation=(30, 48), sweep=12)
     objects = tuple(layout.objects)
     return World("rearranged", (*room, table), objects, path, motions=tuple(motions))
 
 
-def _walk_past(
+def _orbit_table(
     rng: Generator,
     table: Support,
     filming: Filming,
@@ -99,10 +101,10 @@ def _walk_past(
 ) -> tuple[Pose, ...]:
     """Return a camera path on an arc in front of a table.
 
-    ``elevation`` is a range and ``sweep`` half the arc, both in degrees, as for `walk`.
+    ``elevation`` is a range and ``sweep`` half the arc, both in degrees, as for `arc_orbit`.
     """
     middle = np.array([0, 0, table.height + 0.05])
-    return walk(rng, middle, filming, distance=(1.0, 1.3), elevation=elevation, sweep=sweep)
+    return arc_orbit(rng, middle, filming, distance=(1.0, 1.3), elevation=elevation, sweep=sweep)
 
 
 _ANYWHERE = np.array([0.6, 0.3])

@@ -9,7 +9,7 @@ from shapecat.arrays import F8
 from shapecat.geometry import quaternion_from_rotation, rotation_from_quaternion
 from shapecat.types import Pose
 
-__all__ = ["Filming", "hold", "looking_at", "scattered", "stroll", "walk"]
+__all__ = ["Filming", "arc_orbit", "lateral_pass", "looking_at", "random_views", "static_view"]
 
 
 class Filming(NamedTuple):
@@ -43,7 +43,7 @@ def looking_at(eye: F8, target: F8, *, roll: float = 0.0) -> Pose:
     return Pose(rotation_from_quaternion(quaternion), np.round(eye, 7))
 
 
-def walk(
+def arc_orbit(
     rng: Generator,
     target: F8,
     filming: Filming,
@@ -52,7 +52,7 @@ def walk(
     elevation: Range,
     sweep: Range,
 ) -> tuple[Pose, ...]:
-    """Carry a camera back and forth on an arc in front of a target, with the sway of a walk.
+    """Move a camera back and forth on an arc in front of a target, as if a person carried it.
 
     Parameters
     ----------
@@ -82,53 +82,55 @@ def walk(
         ],
         -1,
     )
-    gaze = target + 0.03 * np.stack(
+    aim = target + 0.03 * np.stack(
         [np.sin(slow[2] * t + shift[3]), np.cos(slow[0] * t + shift[4]), np.sin(slow[1] * t)], -1
     )
     roll = np.radians(rng.normal(0, 1.0) + 0.6 * np.sin(0.5 * step * t + shift[5]))
-    return tuple(looking_at(e, g, roll=float(r)) for e, g, r in zip(eye, gaze, roll, strict=True))
+    return tuple(looking_at(e, g, roll=float(r)) for e, g, r in zip(eye, aim, roll, strict=True))
 
 
-def stroll(
+def lateral_pass(
     rng: Generator,
     target: F8,
     filming: Filming,
     *,
     distance: Range,
     elevation: Range,
-    reach: Range,
+    amplitude: Range,
 ) -> tuple[Pose, ...]:
-    """Carry a camera back and forth along a counter that it faces, with the sway of a walk.
+    """Move a camera back and forth along a counter that it faces, as if a person carried it.
 
     Parameters
     ----------
     target : (3,) middle of the counter, metres; the camera is on the side of negative y.
     distance : distance to the counter, metres.
     elevation : angle of the line of sight below the horizontal, degrees.
-    reach : distance from the middle of the counter to the turning points, metres.
+    amplitude : distance from the middle of the counter to the turning points, metres.
     """
-    distance, elevation, reach = (_drawn(rng, value) for value in (distance, elevation, reach))
+    distance, elevation, amplitude = (
+        _drawn(rng, value) for value in (distance, elevation, amplitude)
+    )
     t = filming.times()
     speed = rng.uniform(0.4, 0.55)
-    side = reach * np.sin(speed / reach * t + rng.uniform(-np.pi, np.pi))
+    side = amplitude * np.sin(speed / amplitude * t + rng.uniform(-np.pi, np.pi))
     up, shift = np.radians(elevation), rng.uniform(0, 2 * np.pi, 4)
     bob = 0.006 * np.sin(2 * np.pi * 1.8 * t + shift[0])
-    sway = 0.02 * np.sin(2 * np.pi * 0.4 * t + shift[1])
-    gaze = target + np.column_stack([side + 0.03 * np.sin(t + shift[2]), sway, 0 * t])
+    jitter = 0.02 * np.sin(2 * np.pi * 0.4 * t + shift[1])
+    aim = target + np.column_stack([side + 0.03 * np.sin(t + shift[2]), jitter, 0 * t])
     eye = target + distance * np.array([0, -np.cos(up), np.sin(up)])
-    eye = eye + np.column_stack([side, sway, bob])
+    eye = eye + np.column_stack([side, jitter, bob])
     roll = np.radians(0.6 * np.sin(np.pi * 1.8 * t + shift[3]))
-    return tuple(looking_at(e, g, roll=float(r)) for e, g, r in zip(eye, gaze, roll, strict=True))
+    return tuple(looking_at(e, g, roll=float(r)) for e, g, r in zip(eye, aim, roll, strict=True))
 
 
 def _drawn(rng: Generator, value: Range) -> float:
     return float(rng.uniform(*value) if isinstance(value, tuple) else value)
 
 
-def hold(
+def static_view(
     rng: Generator, target: F8, frames: int, *, distance: float, elevation: float
 ) -> tuple[Pose, ...]:
-    """Keep a camera still, aimed at a target.
+    """Return the same pose in all frames: a static camera, aimed at a target.
 
     Parameters
     ----------
@@ -142,17 +144,17 @@ def hold(
     return (looking_at(eye, target, roll=float(np.radians(rng.normal(0, 1.0)))),) * frames
 
 
-def scattered(rng: Generator, target: F8, count: int) -> tuple[Pose, ...]:
-    """Aim a camera at a target from ``count`` random directions, 15 to 60 degrees above.
+def random_views(rng: Generator, target: F8, count: int) -> tuple[Pose, ...]:
+    """Return ``count`` random views of a target, from 15 to 60 degrees above.
 
-    ``target`` (3,) is in metres, world frame; the distance to it is 0.5 to 2 m.
+    ``target`` (3,) is in metres, world frame; the camera is 0.5 to 2 m away.
     """
     poses = []
     for _ in range(count):
         up, side = np.radians(rng.uniform(15.0, 60.0)), rng.uniform(0, 2 * np.pi)
         far = rng.uniform(0.5, 2.0)
         direction = np.array([np.cos(up) * np.cos(side), np.cos(up) * np.sin(side), np.sin(up)])
-        gaze = target + rng.uniform(-0.05, 0.05, 3) * far
+        aim = target + rng.uniform(-0.05, 0.05, 3) * far
         roll = float(np.radians(rng.normal(0, 2.0)))
-        poses.append(looking_at(target + far * direction, gaze, roll=roll))
+        poses.append(looking_at(target + far * direction, aim, roll=roll))
     return tuple(poses)

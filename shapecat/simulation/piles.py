@@ -11,7 +11,7 @@ from shapecat.geometry import rotation_from_quaternion, transform
 from shapecat.simulation.distractors import DISTRACTORS, make_distractor
 from shapecat.simulation.furniture import make_bin, make_compartment, make_room, make_table
 from shapecat.simulation.mesh import Mesh
-from shapecat.simulation.paths import Filming, walk
+from shapecat.simulation.paths import Filming, arc_orbit
 from shapecat.simulation.physics import Drop, SettledPose, settle
 from shapecat.simulation.shapes import make_object
 from shapecat.simulation.worlds import PlacedObject, Support, World
@@ -22,7 +22,7 @@ KINDS = tuple(DISTRACTORS)
 """Kinds of objects outside the categories."""
 _UPRIGHT = 0.45
 """Fraction of the objects dropped nearly upright; the others have any rotation."""
-_SWAY_DEG = 8.0
+_TILT_DEG = 8.0
 _UPRIGHT_COS, _LYING_COS = np.cos(np.radians(15)), np.sin(np.radians(15))
 _SUNK_M = 0.02
 """An object this far below the surface of its support has fallen off."""
@@ -59,7 +59,7 @@ def pile(
         drops.append(Drop(item.mesh, _turned(rng), place))
     objects = settled(items, drops, supports, table)
     target = np.array([0, 0, table.height + 0.05])
-    path = walk(
+    path = arc_orbit(
         rng,
         target,
         filming,
@@ -81,7 +81,7 @@ def bin_picking(
     drops = _drops_within(rng, items, half)
     supports = (*make_room(rng, wall_chance=0.2), bottom, *sides)
     target = np.array([0, 0, bottom.height + 0.05])
-    path = walk(rng, target, filming, distance=(0.6, 1.2), elevation=(60, 84), sweep=(10, 40))
+    path = arc_orbit(rng, target, filming, distance=(0.6, 1.2), elevation=(60, 84), sweep=(10, 40))
     objects = settled(items, drops, supports, bottom)
     return World("bin", supports, objects, path)
 
@@ -102,7 +102,7 @@ def shelf_bin(
     supports = (*make_room(rng, wall_chance=0.0), board, *walls)
     objects = settled(items, drops, supports, board, highest_m=float(room_m))
     target = np.array([0, 0, board.height + room_m / 3])
-    path = walk(rng, target, filming, distance=(0.5, 0.9), elevation=(5, 25), sweep=(5, 20))
+    path = arc_orbit(rng, target, filming, distance=(0.5, 0.9), elevation=(5, 25), sweep=(5, 20))
     return World("shelf_bin", (*supports, top), objects, path)
 
 
@@ -127,8 +127,8 @@ def _turned(rng: Generator) -> F8:
     if rng.random() >= _UPRIGHT:
         axis = rng.normal(size=4)
         return rotation_from_quaternion(axis / np.linalg.norm(axis))
-    sway, turn = rng.normal(0, np.radians(_SWAY_DEG) / 2, 2), rng.uniform(0, np.pi)
-    axis = np.array([*sway, np.sin(turn), np.cos(turn)])
+    tilt, turn = rng.normal(0, np.radians(_TILT_DEG) / 2, 2), rng.uniform(0, np.pi)
+    axis = np.array([*tilt, np.sin(turn), np.cos(turn)])
     return rotation_from_quaternion(axis / np.linalg.norm(axis))
 
 

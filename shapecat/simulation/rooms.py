@@ -19,7 +19,7 @@ from shapecat.simulation.equipment import (
 )
 from shapecat.simulation.furniture import EQUIPMENT, make_room, make_table, make_wall
 from shapecat.simulation.mesh import Mesh
-from shapecat.simulation.paths import Filming, walk
+from shapecat.simulation.paths import Filming, arc_orbit
 from shapecat.simulation.physics import Drop
 from shapecat.simulation.piles import KINDS, Item, make_item, settled
 from shapecat.simulation.worlds import Support, World, turned_about_z
@@ -49,7 +49,7 @@ def room(
     solid = (table, *_named("robot", standing))
     objects = settled(items, drops, solid, table)
     target = np.array([0, 0, table.height + rng.uniform(0.0, 0.2)])
-    path = walk(rng, target, filming, distance=(0.7, 2.2), elevation=(12, 60), sweep=(15, 60))
+    path = arc_orbit(rng, target, filming, distance=(0.7, 2.2), elevation=(12, 60), sweep=(15, 60))
     rest = [s for s in supports if s is not table]
     everything = (*rest, *solid, *_named("room", around))
     return World("room", everything, objects, path)
@@ -84,13 +84,13 @@ def _arms(rng: Generator, table: Support) -> Iterator[Mesh]:
     if rng.random() < 0.75:
         beside = rng.choice([-1, 1]) * rng.uniform(0.35, 0.6)
         base = np.array([beside, rng.uniform(-0.2, 0.4), top])
-        reach = np.array([*rng.uniform(-0.2, 0.2, 2), top + rng.uniform(0.08, 0.35)])
-        yield from make_arm(rng, base, reach)
+        tip = np.array([*rng.uniform(-0.2, 0.2, 2), top + rng.uniform(0.08, 0.35)])
+        yield from make_arm(rng, base, tip)
     if rng.random() < 0.3:
-        reach = np.array([*rng.uniform(-0.25, 0.25, 2), top + rng.uniform(0.06, 0.25)])
+        tip = np.array([*rng.uniform(-0.25, 0.25, 2), top + rng.uniform(0.06, 0.25)])
         beside = rng.choice([-1, 1]) * rng.uniform(0.6, 0.9)
         start = np.array([beside, -0.3, top + rng.uniform(0.1, 0.3)])
-        yield from make_forearm(rng, reach, start)
+        yield from make_forearm(rng, tip, start)
 
 
 def _screens(rng: Generator, table: Support) -> Iterator[Mesh]:

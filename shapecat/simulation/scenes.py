@@ -10,7 +10,7 @@ from numpy.random import Generator
 from shapecat.simulation.furniture import make_room, make_shelf, make_table, round_table
 from shapecat.simulation.layout import Layout, Piece
 from shapecat.simulation.moving import crossing, rearranged, walking
-from shapecat.simulation.paths import Filming, hold, scattered, walk
+from shapecat.simulation.paths import Filming, arc_orbit, random_views, static_view
 from shapecat.simulation.piles import bin_picking, pile, shelf_bin
 from shapecat.simulation.rooms import room
 from shapecat.simulation.worlds import World
@@ -47,7 +47,7 @@ class _SceneSpec:
         more = [str(c) for c in rng.choice(self.categories, max(0, count - len(first)))]
         return [*(first + more)[:count], *["unknown"] * unknown]
 
-    def poured(self, rng: Generator) -> list[str]:
+    def draw_shuffled(self, rng: Generator) -> list[str]:
         """Return the categories of 4 to 18 objects in random order, one in six unknown."""
         count = int(rng.integers(4, 19))
         wanted = self.draw(rng, count - count // 6, unknown=count // 6)
@@ -95,7 +95,7 @@ def make_stage(pieces: Sequence[Piece], rng: Generator, *, views: int = 8) -> Wo
     half = np.array([0.3, 0.25]) if len(pieces) > 1 else np.zeros(2)
     for piece in pieces:
         layout.put_piece(piece, table, half)
-    path = scattered(rng, np.array([0, 0, table.height + 0.04]), views)
+    path = random_views(rng, np.array([0, 0, table.height + 0.04]), views)
     return World("stage", (*room, table), tuple(layout.objects), path)
 
 
@@ -107,7 +107,9 @@ def _tabletop(rng: Generator, spec: _SceneSpec) -> World:
     for category in spec.draw(rng, count):
         layout.put(category, table, np.array([0.38, 0.27]), stack=0.06)
     target = np.array([0, 0, table.height + 0.05])
-    path = walk(rng, target, spec.filming, distance=(0.9, 1.4), elevation=(28, 52), sweep=(25, 60))
+    path = arc_orbit(
+        rng, target, spec.filming, distance=(0.9, 1.4), elevation=(28, 52), sweep=(25, 60)
+    )
     return World("tabletop", (*room, table), tuple(layout.objects), path)
 
 
@@ -124,7 +126,9 @@ def _clutter(rng: Generator, spec: _SceneSpec) -> World:
         layout.gap = float(rng.choice([0.002, 0.008, 0.02]))
         layout.put(category, table, half, stack=0.3, attempts=4)
     target = np.array([0, 0, table.height + 0.06])
-    path = walk(rng, target, spec.filming, distance=(0.65, 1.3), elevation=(25, 58), sweep=(20, 50))
+    path = arc_orbit(
+        rng, target, spec.filming, distance=(0.65, 1.3), elevation=(25, 58), sweep=(20, 50)
+    )
     return World("clutter", (*room, table), tuple(layout.objects), path)
 
 
@@ -138,7 +142,7 @@ def _shelf(rng: Generator, spec: _SceneSpec) -> World:
     for k, category in enumerate(spec.draw(rng, 12, unknown=int(rng.integers(0, 2)))):
         layout.put(category, boards[k % 3], half, stack=0.5 if k > 5 else 0.0, attempts=8)
     target = np.array([0, 0, low + 1.15 * step])
-    path = walk(
+    path = arc_orbit(
         rng, target, spec.filming, distance=(1.25, 1.55), elevation=(20, 30), sweep=(12, 28)
     )
     supports = (*make_room(rng, wall_chance=0.0), *boards, *sides)
@@ -154,7 +158,7 @@ def _turntable(rng: Generator, spec: _SceneSpec) -> World:
         layout.put(category, table, np.array([0.3, 0.3]), attempts=4)
     target = np.array([0, 0, table.height + 0.04])
     distance, elevation = rng.uniform(0.9, 1.2), rng.uniform(28, 48)
-    path = hold(rng, target, spec.filming.frames, distance=distance, elevation=elevation)
+    path = static_view(rng, target, spec.filming.frames, distance=distance, elevation=elevation)
     speed = rng.choice([-1, 1]) * rng.uniform(0.25, 0.5)  # radians per second
     turns = np.round(speed * spec.filming.times(), 9)
     return World("turntable", (*room, table), tuple(layout.objects), path, turns)
@@ -164,7 +168,9 @@ def _empty(rng: Generator, spec: _SceneSpec) -> World:
     """Leave the table empty."""
     room, table = make_room(rng, wall_chance=0.5), make_table(rng)
     target = np.array([0, 0, table.height])
-    path = walk(rng, target, spec.filming, distance=(0.8, 1.5), elevation=(25, 60), sweep=(10, 50))
+    path = arc_orbit(
+        rng, target, spec.filming, distance=(0.8, 1.5), elevation=(25, 60), sweep=(10, 50)
+    )
     return World("empty", (*room, table), (), path)
 
 
@@ -172,9 +178,9 @@ SCENES: dict[str, Callable[[Generator, _SceneSpec], World]] = {
     "tabletop": _tabletop,
     "shelf": _shelf,
     "clutter": _clutter,
-    "pile": lambda rng, spec: pile(rng, spec.poured(rng), spec.filming),
-    "bin": lambda rng, spec: bin_picking(rng, spec.poured(rng), spec.filming),
-    "shelf_bin": lambda rng, spec: shelf_bin(rng, spec.poured(rng), spec.filming),
+    "pile": lambda rng, spec: pile(rng, spec.draw_shuffled(rng), spec.filming),
+    "bin": lambda rng, spec: bin_picking(rng, spec.draw_shuffled(rng), spec.filming),
+    "shelf_bin": lambda rng, spec: shelf_bin(rng, spec.draw_shuffled(rng), spec.filming),
     "room": lambda rng, spec: room(rng, spec.draw(rng, 7), spec.filming),
     "turntable": _turntable,
     "walking": lambda rng, spec: walking(rng, spec.draw(rng, 11), spec.filming),

@@ -179,9 +179,9 @@ def _one_sided(mesh: Mesh) -> bool:
     points = np.asarray(mesh.vertices, np.float64)
     rim = points[points[:, 2] > points[:, 2].max() - 0.002, :2]
     angle = np.arange(64) * (2 * np.pi / 64)
-    reach = (points[:, :2] - (rim.min(axis=0) + rim.max(axis=0)) / 2) @ [
+    radius = (points[:, :2] - (rim.min(axis=0) + rim.max(axis=0)) / 2) @ [
         np.cos(angle),
         np.sin(angle),
     ]
-    reach = reach.max(axis=0)
-    return bool(np.abs(reach - np.roll(reach, 32)).max() > 0.25 * reach.mean())
+    radius = radius.max(axis=0)
+    return bool(np.abs(radius - np.roll(radius, 32)).max() > 0.25 * radius.mean())
