@@ -141,7 +141,7 @@ def judge(source: Path, objects: dict[int, int], target: Path, there: dict[int, 
 def second_pass(world: World, seed: int, frames: int) -> World:
     """Return the same objects with another camera path."""
     rng = np.random.default_rng((seed, 2))
-    height = next(s.height for s in world.supports if s.level and s.name != "floor")
+    height = next(s.height for s in world.supports if s.holds_objects and s.name != "floor")
     target = np.array([0, 0, height + 0.05])
     elsewhere = arc_orbit(
         rng, target, Filming(frames, 30.0), distance=(0.8, 1.3), elevation=(28, 52), sweep=(25, 60)

@@ -98,9 +98,9 @@ def cut(rng: Generator) -> World:
 def _shown(world: World) -> tuple[float, float]:
     """Return the fractions of the image with readings of the table and of the objects on it."""
     seen = render(world.geometry(0), PREVIEW, world.path[0])
-    owners = np.where(seen.depth > KINECT.nearest_m, seen.owners, -1)
-    table = owners == world.supports.index(_table(world))
-    return float(table.mean()), float((owners >= len(world.supports)).mean())
+    mesh_ids = np.where(seen.depth > KINECT.nearest_m, seen.mesh_ids, -1)
+    table = mesh_ids == world.supports.index(_table(world))
+    return float(table.mean()), float((mesh_ids >= len(world.supports)).mean())
 
 
 def tilted(rng: Generator) -> World:

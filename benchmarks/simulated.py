@@ -130,13 +130,13 @@ def _judge_planes(view: View, total: Counter[str]) -> None:
     height = points @ up + view.world.path[0].translation[2]
     near = points[:, 2] <= DetectionSettings().max_range_m
     found = _heights(view)
-    level = [s for s in view.world.supports if s.level]
-    for support in level:
+    horizontal = [s for s in view.world.supports if s.holds_objects]
+    for support in horizontal:
         face = near & (view.labels == support.label) & (abs(height - support.height) < FACE_M)
         missed = not (abs(found - support.height) < SAME_HEIGHT_M).any()
         if missed and np.count_nonzero(face) >= SEEN_PLANE_PIXELS:
             return
-    true = np.array([s.height for s in level])
+    true = np.array([s.height for s in horizontal])
     if all((abs(true - h) < SAME_HEIGHT_M).any() for h in found):
         total["scenes with all planes"] += 1
 
@@ -144,7 +144,7 @@ def _judge_planes(view: View, total: Counter[str]) -> None:
 def _judge_relations(view: View, matches: dict[int, int], total: Counter[str]) -> None:
     """Count the objects with the right support, if object and support were found."""
     by_track = {t.track: t for t in view.world.objects}
-    heights = {s.name: s.height for s in view.world.supports if s.level}
+    heights = {s.name: s.height for s in view.world.supports if s.holds_objects}
     found = _heights(view)
     for item in view.world.objects:
         if item.label not in matches:

@@ -181,7 +181,7 @@ def test_floor_strip_beside_table_is_a_plane(seed: int) -> None:
     world = make_scene("empty", rng, frames=1)
     frame, _ = render_frame(world, 0, rng=rng, sensor=KINECT)
     planes = detect(frame, settings=DetectionSettings(), rng=np.random.default_rng(0)).planes
-    table = max(support.height for support in world.supports if support.level)
+    table = max(support.height for support in world.supports if support.holds_objects)
     np.testing.assert_allclose([p.height_m for p in planes], [0, table], atol=0.02)
 
 

@@ -126,7 +126,7 @@ def _armed(world: World, arms: str) -> Iterator[tuple[np.random.Generator, Pose,
 def test_the_arms_of_a_robot_come_from_beside_its_camera() -> None:
     """They end above the support, and hide something in most images."""
     world = make_scene("clutter", np.random.default_rng(2003), frames=1)
-    table = max(support.height for support in world.supports if support.level)
+    table = max(support.height for support in world.supports if support.holds_objects)
     seen = 0
     for rng, pose, armed, points in _armed(world, "reaching"):
         assert points[:, 2].min() > table
@@ -138,7 +138,7 @@ def test_the_arms_of_a_robot_come_from_beside_its_camera() -> None:
 def test_resting_arms_lie_on_the_support_and_are_cut_off_by_the_image_border() -> None:
     """Else they would be objects like others, or arms in the air, which are easier to tell."""
     world = make_scene("clutter", np.random.default_rng(2003), frames=1)
-    table = max(support.height for support in world.supports if support.level)
+    table = max(support.height for support in world.supports if support.holds_objects)
     cut = 0
     for rng, pose, armed, points in _armed(world, "resting"):
         lowest = float(points[:, 2].min()) - table

@@ -40,7 +40,7 @@ def test_plane_that_extends_behind_the_camera_is_exact() -> None:
     near = expected < 60
 
     np.testing.assert_allclose(image.depth[near], expected[near], rtol=1e-9)
-    assert np.array_equal(image.owners[near] == 0, expected[near] > 0)
+    assert np.array_equal(image.mesh_ids[near] == 0, expected[near] > 0)
 
 
 def test_sphere_has_exact_depth_and_outline() -> None:
@@ -53,9 +53,9 @@ def test_sphere_has_exact_depth_and_outline() -> None:
     depth = (b - np.sqrt(np.maximum(inside, 0))) / a
     clear = inside > 0.01
 
-    assert (image.owners[clear] == 0).all()
+    assert (image.mesh_ids[clear] == 0).all()
     np.testing.assert_allclose(image.depth[clear], depth[clear], atol=2e-4)
-    assert (image.owners[inside < -1e-4] == -1).all()
+    assert (image.mesh_ids[inside < -1e-4] == -1).all()
 
 
 def test_shared_edges_leave_no_gap() -> None:
@@ -70,7 +70,7 @@ def test_shared_edges_leave_no_gap() -> None:
     )
     image = render(geometry([(big_quad(5.0), HERE), (Mesh(wall, triangles), HERE)]), CAMERA, HERE)
 
-    assert (image.owners == 1).all()
+    assert (image.mesh_ids == 1).all()
 
 
 def test_both_sides_of_triangles_are_rendered() -> None:
@@ -80,7 +80,7 @@ def test_both_sides_of_triangles_are_rendered() -> None:
 
     for mesh in (quad, back):
         image = render(geometry([(mesh, HERE)]), CAMERA, HERE)
-        assert (image.owners == 0).all()
+        assert (image.mesh_ids == 0).all()
         assert float(image.cosine.max()) == pytest.approx(1.0, abs=1e-3)
 
 
@@ -91,7 +91,7 @@ def test_nearest_surface_is_visible() -> None:
         HERE,
     )
 
-    assert (image.owners == 1).all()
+    assert (image.mesh_ids == 1).all()
 
 
 def test_crop_equals_part_of_the_image() -> None:
@@ -101,7 +101,7 @@ def test_crop_equals_part_of_the_image() -> None:
     crop = render(solids, cropped(CAMERA, 50, 30, 60, 40), world.path[0])
 
     np.testing.assert_allclose(crop.inverse, whole.inverse[30:70, 50:110], rtol=1e-12)
-    assert (crop.owners == whole.owners[30:70, 50:110]).mean() > 0.999
+    assert (crop.mesh_ids == whole.mesh_ids[30:70, 50:110]).mean() > 0.999
 
 
 def test_depth_agrees_with_open3d_rays() -> None:
@@ -127,8 +127,8 @@ def test_alone_pixels_include_occluded_ones() -> None:
     behind = (cube, Pose(np.eye(3), np.array([0, 0, 1.5])))
     before = (cube, Pose(np.eye(3), np.array([0.1, 0, 1.0])))
     both = geometry([behind, before])
-    visible = int((render(both, CAMERA, HERE).owners == 0).sum())
-    alone = int((render(geometry([behind]), CAMERA, HERE).owners == 0).sum())
+    visible = int((render(both, CAMERA, HERE).mesh_ids == 0).sum())
+    alone = int((render(geometry([behind]), CAMERA, HERE).mesh_ids == 0).sum())
 
     assert alone_pixels(both, 0, CAMERA, HERE) == alone
     assert 0 < visible < 0.7 * alone
@@ -137,7 +137,7 @@ def test_alone_pixels_include_occluded_ones() -> None:
 def test_empty_geometry_gives_empty_image() -> None:
     nothing = Geometry(np.zeros((0, 3)), np.zeros((0, 3)), np.zeros(0))
 
-    assert (render(nothing, CAMERA, HERE).owners == -1).all()
+    assert (render(nothing, CAMERA, HERE).mesh_ids == -1).all()
 
 
 # --- sensors -----------------------------------------------------------------------------------
@@ -155,10 +155,10 @@ def step_image(sensor: Sensor) -> Image:
 
 def test_ideal_sensor_changes_nothing() -> None:
     image = step_image(IDEAL)
-    depth, owners = measure(image, IDEAL, np.random.default_rng(0))
+    depth, mesh_ids = measure(image, IDEAL, np.random.default_rng(0))
 
     np.testing.assert_allclose(depth, image.depth, rtol=1e-6)
-    assert np.array_equal(owners, image.owners)
+    assert np.array_equal(mesh_ids, image.mesh_ids)
 
 
 @pytest.mark.parametrize("sensor", [KINECT, REALSENSE], ids=["kinect", "realsense"])
@@ -183,7 +183,7 @@ def test_kinect_disparity_is_quantized() -> None:
 @pytest.mark.parametrize("distance", [0.8, 1.6])
 def test_kinect_depth_noise_grows_with_squared_distance(distance: float) -> None:
     """Its inverse depth has 0.0020 1/m in real frames (window of 40 pixels) at any distance."""
-    sensor = dataclasses.replace(KINECT, wave=0.0)
+    sensor = dataclasses.replace(KINECT, fixed_error=0.0)
     depth, _ = measure(wall_image(sensor, distance), sensor, np.random.default_rng(0))
     inverse = 1 / depth[depth > 0].astype(np.float64)
 
@@ -193,7 +193,7 @@ def test_kinect_depth_noise_grows_with_squared_distance(distance: float) -> None
 
 def test_kinect_noise_is_correlated_between_neighbours() -> None:
     """Any smoothing would average out independent noise, unlike that of real sensors."""
-    sensor = dataclasses.replace(KINECT, wave=0.0, holes=0.0)
+    sensor = dataclasses.replace(KINECT, fixed_error=0.0, holes=0.0)
     depth, _ = measure(wall_image(sensor, 1.0), sensor, np.random.default_rng(0))
     error = 1 / depth[20:460, 20:580].astype(np.float64) - 1.0
     error -= error.mean()
@@ -207,12 +207,12 @@ def test_kinect_noise_is_correlated_between_neighbours() -> None:
 @pytest.mark.parametrize(("sensor", "right"), [(KINECT, 6.0), (REALSENSE, 0.0)])
 def test_shadow_is_left_of_near_objects(sensor: Sensor, right: float) -> None:
     """The projector is to the right of the camera."""
-    sensor = dataclasses.replace(sensor, holes=0.0, grazing=0.0)
+    sensor = dataclasses.replace(sensor, holes=0.0, grazing_cosine=0.0)
     image = step_image(sensor)
-    depth, owners = measure(image, sensor, np.random.default_rng(0))
+    depth, mesh_ids = measure(image, sensor, np.random.default_rng(0))
     row_runs = []
     for v in range(100, 380, 4):
-        post = np.flatnonzero(owners[v] == 1)
+        post = np.flatnonzero(mesh_ids[v] == 1)
         left = np.flatnonzero(depth[v, : post[0]] > 0)[-1]
         after = post[-1] + 1 + np.flatnonzero(depth[v, post[-1] + 1 :] > 0)[0]
         row_runs.append((post[0] - left - 1, after - post[-1] - 1))
@@ -230,7 +230,7 @@ def test_stereo_noise_has_waves_as_wide_as_matching_windows(name: str) -> None:
     Real cameras bend a plane in waves of 15 to 40 pixels, and hardly roughen it below 5.
     """
     sensor = PRESETS[name]
-    plain = dataclasses.replace(sensor, wave=0.0, holes=0.0, step=0.0, grazing=0.0)
+    plain = dataclasses.replace(sensor, fixed_error=0.0, holes=0.0, step=0.0, grazing_cosine=0.0)
     depth, _ = measure(wall_image(plain, 1.0), plain, np.random.default_rng(0))
     error = 1 / depth[20:460, 40:600].astype(np.float64) - 1.0
     smooth = uniform_filter(error, 5)
@@ -243,24 +243,24 @@ def test_stereo_noise_has_waves_as_wide_as_matching_windows(name: str) -> None:
 
 def test_stereo_depth_is_missing_around_near_surfaces() -> None:
     """In real images, depth is missing on all sides of an object, not only in its shadow."""
-    plain = dataclasses.replace(IDEAL, edge_px=6)
+    plain = dataclasses.replace(IDEAL, stereo_margin_px=6)
     box = rounded_box([0.2, 0.3, 0.1])
     solids = [(big_quad(1.2), HERE), (box, Pose(np.eye(3), np.array([0.05, -0.02, 0.8])))]
     image = render(geometry(solids), plain.camera, HERE)
-    depth, owners = measure(image, plain, np.random.default_rng(0))
-    near = image.owners == 1
+    depth, mesh_ids = measure(image, plain, np.random.default_rng(0))
+    near = image.mesh_ids == 1
     margin = binary_dilation(near, np.ones((13, 13))) & ~near
 
     assert margin.sum() > 4000
     assert (depth[margin] == 0).all()
-    assert (owners[margin] == -1).all()
+    assert (mesh_ids[margin] == -1).all()
     assert (depth[~margin] > 0).all()
 
 
 def test_table_at_low_angle_has_no_missing_margins() -> None:
     """Its inverse depth changes as much within a few pixels as at an outline."""
     pose = looking_at(np.array([0, 0, 0.35]), np.array([0, 1.0, 0.2]))
-    sensor = dataclasses.replace(PRESETS["d455"], holes=0.0, grazing=0.0, border_px=(0,) * 4)
+    sensor = dataclasses.replace(PRESETS["d455"], holes=0.0, grazing_cosine=0.0, border_px=(0,) * 4)
     image = render(geometry([(big_quad(0.0), HERE)]), sensor.camera, pose)
     depth, _ = measure(image, sensor, np.random.default_rng(0))
     near = (image.depth > 0.8) & (image.depth < 2.5)
@@ -272,7 +272,7 @@ def test_table_at_low_angle_has_no_missing_margins() -> None:
 @pytest.mark.parametrize("z", [0.5, 2.0])
 def test_time_of_flight_noise_grows_with_distance(z: float) -> None:
     """With the noise of 1 m at 0.4 m, near objects would be rougher than real ones."""
-    sensor = dataclasses.replace(PRESETS["l515"], wave=0.0, holes=0.0)
+    sensor = dataclasses.replace(PRESETS["l515"], fixed_error=0.0, holes=0.0)
     depth, _ = measure(wall_image(sensor, z), sensor, np.random.default_rng(0))
 
     assert depth[depth > 0].std() == pytest.approx(sensor.noise_m * z, rel=0.1)
@@ -294,13 +294,14 @@ def test_resized_sensor_has_windows_of_same_angle() -> None:
     """Margins of 8 pixels in an image of half the width would hide the objects."""
     half = resized(PRESETS["d455"], 0.5)
 
-    assert (half.camera.width, half.edge_px, half.hole_px, half.rounded_px) == (640, 4, 6, 8)
-    assert half.grain == (8, 6)
-    assert resized(IDEAL, 0.5).edge_px == 0
+    assert half.camera.width == 640
+    assert (half.stereo_margin_px, half.hole_px, half.smoothing_px) == (4, 6, 8)
+    assert half.noise_window == (8, 6)
+    assert resized(IDEAL, 0.5).stereo_margin_px == 0
 
 
 def test_surface_out_of_range_has_no_depth() -> None:
     for z in (0.3, 5.0):
-        depth, owners = measure(wall_image(KINECT, z), KINECT, np.random.default_rng(0))
+        depth, mesh_ids = measure(wall_image(KINECT, z), KINECT, np.random.default_rng(0))
         assert (depth == 0).all()
-        assert (owners == -1).all()
+        assert (mesh_ids == -1).all()

@@ -47,7 +47,7 @@ def top_view(mesh: Mesh, pose: Pose) -> Bool:
     far = 500.0
     camera = Camera(500, 500, far / 0.003, far / 0.003, 249.5, 249.5)
     above = Pose(np.diag([1.0, -1.0, -1.0]), np.array([0, 0, far]))
-    return np.asarray(render(geometry([(mesh, pose)]), camera, above).owners >= 0)
+    return np.asarray(render(geometry([(mesh, pose)]), camera, above).mesh_ids >= 0)
 
 
 def test_objects_do_not_interpenetrate(world: World) -> None:

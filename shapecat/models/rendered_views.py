@@ -10,7 +10,7 @@ from shapecat.models.arrangements import Arrangement
 from shapecat.simulation.measuring import measure
 from shapecat.simulation.paths import looking_at
 from shapecat.simulation.render import Geometry, render
-from shapecat.simulation.sensors import PRESETS, Sensor, between, resized
+from shapecat.simulation.sensors import PRESETS, Sensor, interpolated, resized
 from shapecat.types import Camera, Frame, Pose
 
 __all__ = ["RenderedView", "render_view"]
@@ -35,14 +35,14 @@ class RenderedView(NamedTuple):
     Attributes
     ----------
     frame : the depth image.
-    owners : (h, w) index of the object or furniture that each pixel shows, -1 without a reading.
+    mesh_ids : (h, w) index of the object or furniture that each pixel shows, -1 without depth.
     visible : (k,) visible fraction of each object.
     table_from_camera : pose of the optical frame.
     sensor : name of the sensor.
     """
 
     frame: Frame
-    owners: I4
+    mesh_ids: I4
     visible: F8
     table_from_camera: Pose
     sensor: str
@@ -59,31 +59,31 @@ def render_view(
     name, sensor = _draw_sensor(rng)
     camera, pose = sensor.camera, _viewpoint(arrangement, sensor, rng)
     image = render(geometry, camera, pose)
-    depth, owners = measure(image, sensor, rng)
-    visible = _visible_fractions(geometry, owners, camera, pose, len(arrangement.objects))
+    depth, mesh_ids = measure(image, sensor, rng)
+    visible = _visible_fractions(geometry, mesh_ids, camera, pose, len(arrangement.objects))
     frame = Frame("/camera", 0, 0, 0, "camera", depth=depth, camera=camera)
-    return RenderedView(frame, owners, visible, pose, name)
+    return RenderedView(frame, mesh_ids, visible, pose, name)
 
 
 def _draw_sensor(rng: np.random.Generator) -> tuple[str, Sensor]:
-    """Draw a preset, mixed with another in half of the draws; vary its errors and resolution."""
+    """Draw a preset, half of the time mixed with another; vary its errors and resolution."""
     names = list(PRESETS)
     shares = np.array([_OFTEN.get(each, 1.0) for each in names])
     name, other = (str(each) for each in rng.choice(names, 2, p=shares / shares.sum()))
     share = float(rng.uniform(0, 0.6)) if rng.random() < 0.5 else 0.0
-    sensor = between(PRESETS[name], PRESETS[other], share)
+    sensor = interpolated(PRESETS[name], PRESETS[other], share)
     least, most = np.log([0.4, 0.4, 0.5, 0.5, 0.7]), np.log([2.0, 2.5, 1.5, 8.0, 2.0])
-    noise, wave, ragged, holes, dark = np.exp(rng.uniform(least, most))
+    noise, fixed_error, edge_jitter, holes, darkness = np.exp(rng.uniform(least, most))
     sensor = replace(
         sensor,
         noise=float(sensor.noise * noise),
         noise_m=float(sensor.noise_m * noise),
-        wave=float(sensor.wave * wave),
+        fixed_error=float(sensor.fixed_error * fixed_error),
         device=int(rng.integers(1_000_000)),
-        ragged_px=float(sensor.ragged_px * ragged),
+        edge_jitter_px=float(sensor.edge_jitter_px * edge_jitter),
         holes=float(sensor.holes * holes),
-        grazing=float(sensor.grazing * dark),
-        dark=float(sensor.dark * dark),
+        grazing_cosine=float(sensor.grazing_cosine * darkness),
+        log_reflectance_std=float(sensor.log_reflectance_std * darkness),
     )
     scale = np.clip(rng.choice(_SCALES), *(np.array(_WIDTHS) / sensor.camera.width))
     return name, resized(sensor, float(scale))
@@ -110,14 +110,14 @@ def _viewpoint(arrangement: Arrangement, sensor: Sensor, rng: np.random.Generato
 
 
 def _visible_fractions(
-    geometry: Geometry, owners: I4, camera: Camera, pose: Pose, count: int
+    geometry: Geometry, mesh_ids: I4, camera: Camera, pose: Pose, count: int
 ) -> F8:
     """Return the visible fraction of each object, (count,).
 
     It is the number of readings divided by the pixels that the object would have alone in an image
     twice as wide and high; 0 with fewer than `_FEWEST_PIXELS` readings.
     """
-    seen_pixels = np.bincount(owners[owners >= 0], minlength=count + 1)
+    seen_pixels = np.bincount(mesh_ids[mesh_ids >= 0], minlength=count + 1)
     width, height = camera.width // _COARSE, camera.height // _COARSE
     wide = Camera(
         2 * width,
@@ -129,9 +129,9 @@ def _visible_fractions(
     )
     result = np.zeros(count)
     for k in range(count):
-        mine = geometry.owners == k
-        alone = Geometry(geometry.vertices, geometry.triangles[mine], geometry.owners[mine])
-        total = int((render(alone, wide, pose).owners >= 0).sum()) * _COARSE**2
+        mine = geometry.mesh_ids == k
+        alone = Geometry(geometry.vertices, geometry.triangles[mine], geometry.mesh_ids[mine])
+        total = int((render(alone, wide, pose).mesh_ids >= 0).sum()) * _COARSE**2
         if seen_pixels[k] >= _FEWEST_PIXELS:
             result[k] = min(1.0, seen_pixels[k] / max(total, 1))
     return result

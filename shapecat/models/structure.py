@@ -258,7 +258,7 @@ def _with_arms(
     if arms == "none":
         return world
     pose = view if isinstance(view, Pose) else world.path[view]
-    height = max(support.height for support in world.supports if support.level)
+    height = max(support.height for support in world.supports if support.holds_objects)
     if arms == "reaching":
         meshes = make_own_arms(rng, pose, height)
     else:

@@ -215,10 +215,10 @@ def _views_of(
 
 def _background(image: RenderedView, scene: Scene, objects: int, name: str) -> list[WorldView]:
     """Return the thin detections that show none of the first ``objects`` meshes."""
-    owners = image.owners.reshape(-1)
+    mesh_ids = image.mesh_ids.reshape(-1)
     views = []
     for candidate in scene.candidates:
-        mine = owners[candidate.indices]
+        mine = mesh_ids[candidate.indices]
         if np.mean((mine >= 0) & (mine < objects)) <= _BACKGROUND:
             view = replace(_view_of(image, scene, candidate), category=UNKNOWN, instance=name)
             seen = _Seen(UNKNOWN, "upright", image.sensor, visible=1.0, overlap=1.0)
@@ -228,11 +228,11 @@ def _background(image: RenderedView, scene: Scene, objects: int, name: str) -> l
 
 def _cut_by_detection(image: RenderedView, scene: Scene, k: int) -> tuple[View, float] | None:
     """Return the object as detection segments it, with the IoU; None if it was not found."""
-    owners = image.owners.reshape(-1)
+    mesh_ids = image.mesh_ids.reshape(-1)
     valid = np.asarray(image.frame.depth).reshape(-1) > 0
-    total = int(np.count_nonzero((owners == k) & valid))
+    total = int(np.count_nonzero((mesh_ids == k) & valid))
     for candidate in scene.candidates:
-        hits = int(np.count_nonzero(owners[candidate.indices] == k))
+        hits = int(np.count_nonzero(mesh_ids[candidate.indices] == k))
         overlap = hits / (total + candidate.indices.size - hits)
         if overlap >= _OVERLAP:
             return _view_of(image, scene, candidate), overlap
@@ -251,7 +251,7 @@ def _cut_by_truth(
     image: RenderedView, k: int, item: ArrangedObject, rng: np.random.Generator
 ) -> View:
     """Return the object's true pixels in a level frame with errors of half a degree and 2 mm."""
-    indices = np.flatnonzero((image.owners == k) & (np.asarray(image.frame.depth) > 0))
+    indices = np.flatnonzero((image.mesh_ids == k) & (np.asarray(image.frame.depth) > 0))
     points = image.frame.xyz(indices)
     camera_from_table = inverse(image.table_from_camera)
     up = camera_from_table.rotation[:, 2] + rng.normal(0, 0.008, 3)

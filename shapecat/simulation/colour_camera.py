@@ -58,9 +58,9 @@ def render_colour(world: World, frame: int) -> tuple[U1, U1]:
     pose = compose(world.path[frame], COLOUR.depth_from_colour)
     fine, rows, columns = _lookup(COLOUR.lens)
     image = render(world.geometry(frame), fine, pose)
-    owners = image.owners[rows, columns]
+    mesh_ids = image.mesh_ids[rows, columns]
     colours = _paint(world, frame, pose, fine, image, rows, columns)
-    return colours, np.take(np.append(world.labels, np.uint8(0)), owners, mode="wrap")
+    return colours, np.take(np.append(world.labels, np.uint8(0)), mesh_ids, mode="wrap")
 
 
 @lru_cache(maxsize=4)  # a recording has one lens
@@ -94,7 +94,7 @@ def _paint(
     intrinsics = np.array([camera.fx, camera.fy, camera.cx, camera.cy])
     colours = np.full((*rows.shape, 3), _NOTHING, np.uint8)
     _colour_in(
-        *(image.inverse, image.owners, image.cosine, rows, columns),
+        *(image.inverse, image.mesh_ids, image.cosine, rows, columns),
         *(intrinsics, turns, shifts, textures, colours),
     )
     return colours
@@ -115,7 +115,7 @@ def _texture(number: int, *, plain: bool) -> F8:
 @kernel
 def _colour_in(
     near: F8,
-    owners: I4,
+    mesh_ids: I4,
     cosine: F4,
     rows: I4,
     columns: I4,
@@ -131,8 +131,8 @@ def _colour_in(
 
     Parameters
     ----------
-    near, owners, cosine : the rendered image: inverse depth (1/m), number of the object, -1 for
-        none, and cosine of the angle of incidence.
+    near, mesh_ids, cosine : the rendered image: inverse depth (1/m), index of the visible mesh, -1
+        without surface, and cosine of the angle of incidence.
     rows, columns : (h, w) the pixel of that image to show in each pixel of ``colours``.
     intrinsics : fx, fy, cx, cy of the rendered image, pixels.
     turns, shifts : (k, 3, 3) and (k, 3) from the camera to the frame of each texture, metres.
@@ -143,12 +143,12 @@ def _colour_in(
     for i in range(rows.shape[0]):
         for j in range(rows.shape[1]):
             row, column = rows[i, j], columns[i, j]
-            owner = owners[row, column]
-            if owner < 0:
+            mesh_id = mesh_ids[row, column]
+            if mesh_id < 0:
                 continue
             z = 1.0 / near[row, column]
             x, y = (column - cx) / fx * z, (row - cy) / fy * z
-            turn, shift, texture = turns[owner], shifts[owner], textures[owner]
+            turn, shift, texture = turns[mesh_id], shifts[mesh_id], textures[mesh_id]
             cell, along = 0, 0.0
             for k in range(3):
                 point[k] = turn[k, 0] * x + turn[k, 1] * y + turn[k, 2] * z + shift[k]

@@ -53,9 +53,9 @@ def overlap(a: F8, b: F8, gap: float) -> bool:
     """
     for one, other in ((a, b), (b, a)):
         normals = _normals(one)
-        reach = (one @ normals.T).max(axis=0)
-        start = (other @ normals.T).min(axis=0)
-        if np.any(start - reach >= gap):
+        upper = (one @ normals.T).max(axis=0)
+        lower = (other @ normals.T).min(axis=0)
+        if np.any(lower - upper >= gap):
             return False
     return True
 
@@ -68,8 +68,8 @@ def inside(points: F8, outline: F8, margin: float) -> bool:
     if len(outline) < 3:
         return False
     normals = _normals(outline)
-    reach = (outline @ normals.T).max(axis=0)
-    return bool(np.all(points @ normals.T <= reach - margin))
+    upper = (outline @ normals.T).max(axis=0)
+    return bool(np.all(points @ normals.T <= upper - margin))
 
 
 def _normals(outline: F8) -> F8:

@@ -11,10 +11,10 @@ from shapecat.simulation.sensors import Sensor
 
 __all__ = ["measure"]
 
-_STEP = 0.03
-"""Step in inverse depth that separates two surfaces, 1/m."""
-_MARGIN = 0.07
-"""Step in inverse depth beside which stereo matching fails, 1/m."""
+_DISCONTINUITY = 0.03
+"""Discontinuity of the inverse depth that separates two surfaces, 1/m."""
+_MARGIN_DISCONTINUITY = 0.07
+"""Discontinuity of the inverse depth beside which stereo matching fails, 1/m."""
 
 
 def measure(image: Image, sensor: Sensor, rng: Generator) -> tuple[F4, I4]:
@@ -23,87 +23,93 @@ def measure(image: Image, sensor: Sensor, rng: Generator) -> tuple[F4, I4]:
     Parameters
     ----------
     image : rendered with the sensor's camera, or with a crop of it.
-    rng : generator of the noise and the lost readings.
+    rng : generator of the noise and of missing depth.
 
     Returns
     -------
-    depth : (h, w) float32 metres, 0 where there is no reading.
-    owners : (h, w) int16 owner of each reading, -1 where there is none.
+    depth : (h, w) float32 metres, 0 where it is missing.
+    mesh_ids : (h, w) int16 index of the measured mesh, -1 where there is no depth.
     """
-    inverse, owners, cosine = _displaced(image, sensor, rng)
+    inverse, mesh_ids, cosine = _jitter_edges(image, sensor, rng)
     lost = np.zeros(image.inverse.shape, np.bool_)
-    if sensor.edge_px:
-        _lose_margins(inverse, sensor.edge_px, lost)
+    if sensor.stereo_margin_px:
+        _drop_margins(inverse, sensor.stereo_margin_px, lost)
     for place in sensor.shadow_m:
         _cast_shadow(inverse, place * sensor.camera.fx, lost)
-    if sensor.filled_px > 0:
-        middle = round(sensor.filled_px)
-        eaten = rng.integers(middle - 1, middle + 2, (inverse.shape[0] // 3 + 1, 16), np.int8)
-        _fill_shadow(inverse, owners, lost, eaten)
-    _lose_grazing(_returned(cosine, owners, sensor), sensor, rng, lost)
-    _punch_holes(sensor, rng, lost)
-    _lose_border(sensor, lost)
-    if sensor.rounded_px:
-        inverse = _rounded(inverse, sensor.rounded_px)
+    if sensor.shadow_fill_px > 0:
+        middle = round(sensor.shadow_fill_px)
+        growth_px = rng.integers(middle - 1, middle + 2, (inverse.shape[0] // 3 + 1, 16), np.int8)
+        _fill_shadow(inverse, mesh_ids, lost, growth_px)
+    _drop_grazing(_scaled_by_reflectance(cosine, mesh_ids, sensor), sensor, rng, lost)
+    _drop_random_holes(sensor, rng, lost)
+    _drop_border(sensor, lost)
+    if sensor.smoothing_px:
+        inverse = _smoothed_surfaces(inverse, sensor.smoothing_px)
     if sensor.blend_px:
-        inverse = _blended(inverse, sensor.blend_px)
+        inverse = _blended_edges(inverse, sensor.blend_px)
     depth = np.zeros(inverse.shape, np.float32)
-    error = _error(inverse, sensor, rng)
+    error = _inverse_depth_error(inverse, sensor, rng)
     limits = np.array([sensor.step, sensor.nearest_m, sensor.farthest_m])
-    _read_out(inverse, error, lost, limits, depth, owners)
-    return depth, owners
+    _write_depth(inverse, error, lost, limits, depth, mesh_ids)
+    return depth, mesh_ids
 
 
-def _displaced(image: Image, sensor: Sensor, rng: Generator) -> tuple[F8, I4, F4]:
-    """Sample the true image at slightly displaced pixels, which makes outlines ragged.
+def _jitter_edges(image: Image, sensor: Sensor, rng: Generator) -> tuple[F8, I4, F4]:
+    """Sample the true image at randomly displaced pixels, which makes its edges ragged.
 
-    Returns the inverse depth (1/m), owners and cosines, all (h, w).
+    Returns the inverse depth (1/m), mesh ids and cosines, all (h, w).
 
     Source: Barron and Malik 2013.
     """
     inverse = np.array(image.inverse)
-    owners, cosine = np.array(image.owners), np.array(image.cosine)
-    if sensor.ragged_px > 0:
-        shape, window, size = inverse.shape, sensor.ragged_window, sensor.ragged_px
+    mesh_ids, cosine = np.array(image.mesh_ids), np.array(image.cosine)
+    if sensor.edge_jitter_px > 0:
+        shape, window, size = inverse.shape, sensor.edge_jitter_window, sensor.edge_jitter_px
         across = noise(shape, window, size, rng, smoothings=sensor.smoothings)
         down = noise(shape, window, size, rng, smoothings=sensor.smoothings)
-        _look_beside(
-            image.inverse, image.owners, image.cosine, across, down, inverse, owners, cosine
+        _sample_beside(
+            image.inverse, image.mesh_ids, image.cosine, across, down, inverse, mesh_ids, cosine
         )
-    return inverse, owners, cosine
+    return inverse, mesh_ids, cosine
 
 
-def _error(inverse: F8, sensor: Sensor, rng: Generator) -> F4:
+def _inverse_depth_error(inverse: F8, sensor: Sensor, rng: Generator) -> F4:
     """Return the error (h, w) of the inverse depth before quantization, 1/m."""
     error = np.zeros(inverse.shape, np.float32)
     if sensor.noise > 0:
-        error += noise(inverse.shape, sensor.grain, sensor.noise, rng, smoothings=sensor.smoothings)
+        error += noise(
+            inverse.shape, sensor.noise_window, sensor.noise, rng, smoothings=sensor.smoothings
+        )
     if sensor.noise_m > 0:
-        relative = noise(inverse.shape, sensor.grain, sensor.noise_m, rng)
+        relative = noise(inverse.shape, sensor.noise_window, sensor.noise_m, rng)
         error += relative * inverse.astype(np.float32)
-    if sensor.wave > 0:
-        error += fixed_error(inverse.shape, sensor.wave, sensor.wave_px, sensor.device)
+    if sensor.fixed_error > 0:
+        error += fixed_error(
+            inverse.shape, sensor.fixed_error, sensor.fixed_error_px, sensor.device
+        )
     return error
 
 
-def _returned(cosine: F4, owners: I4, sensor: Sensor) -> F4:
-    """Return the cosines (h, w) of incidence, scaled by the reflectance of each owner."""
-    if sensor.dark <= 0 or owners.max(initial=-1) < 0:
+def _scaled_by_reflectance(cosine: F4, mesh_ids: I4, sensor: Sensor) -> F4:
+    """Return the cosines (h, w) of incidence, scaled by the reflectance of each mesh."""
+    if sensor.log_reflectance_std <= 0 or mesh_ids.max(initial=-1) < 0:
         return cosine
-    draws = np.random.default_rng((sensor.device, 2)).normal(0, sensor.dark, owners.max() + 1)
-    light = np.append(np.exp(draws), 1.0).astype(np.float32)
-    return cosine * light[owners]
+    draws = np.random.default_rng((sensor.device, 2)).normal(
+        0, sensor.log_reflectance_std, mesh_ids.max() + 1
+    )
+    reflectance = np.append(np.exp(draws), 1.0).astype(np.float32)
+    return cosine * reflectance[mesh_ids]
 
 
-def _lose_grazing(cosine: F4, sensor: Sensor, rng: Generator, lost: Bool) -> None:
-    """Mark lost readings where the ray grazes the surface."""
-    if sensor.grazing > 0:
+def _drop_grazing(cosine: F4, sensor: Sensor, rng: Generator, lost: Bool) -> None:
+    """Mark missing depth on oblique surfaces."""
+    if sensor.grazing_cosine > 0:
         window = (sensor.hole_px, sensor.hole_px)
-        luck = noise(cosine.shape, window, 0.5 * sensor.grazing, rng)
-        lost |= cosine < luck + np.float32(sensor.grazing)
+        threshold_noise = noise(cosine.shape, window, 0.5 * sensor.grazing_cosine, rng)
+        lost |= cosine < threshold_noise + np.float32(sensor.grazing_cosine)
 
 
-def _lose_border(sensor: Sensor, lost: Bool) -> None:
+def _drop_border(sensor: Sensor, lost: Bool) -> None:
     left, right, top, bottom = sensor.border_px
     lost[:top] = True
     lost[len(lost) - bottom :] = True
@@ -111,8 +117,8 @@ def _lose_border(sensor: Sensor, lost: Bool) -> None:
     lost[:, lost.shape[1] - right :] = True
 
 
-def _punch_holes(sensor: Sensor, rng: Generator, lost: Bool) -> None:
-    """Mark lost readings in random holes."""
+def _drop_random_holes(sensor: Sensor, rng: Generator, lost: Bool) -> None:
+    """Mark missing depth in random holes."""
     area = 0.32 * (sensor.hole_px + 2) ** 2  # about the mean of width times height
     count = rng.poisson(sensor.holes * lost.size / area) if sensor.holes > 0 else 0
     rows = rng.integers(0, lost.shape[0], count)
@@ -122,7 +128,7 @@ def _punch_holes(sensor: Sensor, rng: Generator, lost: Bool) -> None:
         lost[v : v + tall, u : u + wide] = True
 
 
-def _rounded(inverse: F8, width: int) -> F8:
+def _smoothed_surfaces(inverse: F8, width: int) -> F8:
     """Average the inverse depth over a window within each surface, which rounds its edges."""
     for _ in range(2):  # along the rows, then along the columns
         along = np.zeros_like(inverse)
@@ -131,53 +137,53 @@ def _rounded(inverse: F8, width: int) -> F8:
     return inverse
 
 
-def _blended(inverse: F8, width: int) -> F8:
-    """Mix near and far inverse depth across outlines, like stereo windows and smoothing filters."""
+def _blended_edges(inverse: F8, width: int) -> F8:
+    """Mix near and far inverse depth at edges, as stereo windows and smoothing filters do."""
     result = np.zeros_like(inverse)
     _blend(inverse, width // 2, result)
     return result
 
 
 @kernel
-def _read_out(inverse: F8, error: F4, lost: Bool, limits: F8, depth: F4, owners: I4) -> None:
-    """Write the depth of the readings, with their errors and in steps, within the limits."""
+def _write_depth(inverse: F8, error: F4, lost: Bool, limits: F8, depth: F4, mesh_ids: I4) -> None:
+    """Write the depth with its error, quantized, where it is within the limits."""
     step, nearest, farthest = limits
     for v in range(inverse.shape[0]):
         for u in range(inverse.shape[1]):
             if not lost[v, u] and inverse[v, u] > 0:
-                w = inverse[v, u] + error[v, u]
+                inverse_depth = inverse[v, u] + error[v, u]
                 if step > 0:
-                    w = np.floor(w / step + 0.5) * step
-                if w > 0:
-                    z = 1.0 / w
+                    inverse_depth = np.floor(inverse_depth / step + 0.5) * step
+                if inverse_depth > 0:
+                    z = 1.0 / inverse_depth
                     if nearest <= z <= farthest:
                         depth[v, u] = z
             if depth[v, u] == 0:
-                owners[v, u] = -1
+                mesh_ids[v, u] = -1
 
 
 @kernel
-def _look_beside(
-    inverse: F8, owners: I4, cosine: F4, across: F4, down: F4, out: F8, who: I4, angle: F4
+def _sample_beside(
+    inverse: F8, mesh_ids: I4, cosine: F4, across: F4, down: F4, out: F8, ids_out: I4, angle: F4
 ) -> None:
-    """Write what pixels displaced by ``across`` and ``down`` see: ``out``, ``who``, ``angle``."""
+    """Sample at displaced pixels; fill ``out``, ``ids_out`` and ``angle``."""
     height, width = inverse.shape
     for v in range(height):
         for u in range(width):
             x, y = int(np.floor(u + across[v, u] + 0.5)), int(np.floor(v + down[v, u] + 0.5))
             x, y = min(max(x, 0), width - 1), min(max(y, 0), height - 1)
             there, here = inverse[y, x], inverse[v, u]
-            # Only outlines move; on a surface, the pixel keeps its own true depth.
-            if abs(there - here) < _STEP and owners[y, x] == owners[v, u]:
+            # Only edges move; on a surface, the pixel keeps its own true depth.
+            if abs(there - here) < _DISCONTINUITY and mesh_ids[y, x] == mesh_ids[v, u]:
                 x, y = u, v
             out[v, u] = inverse[y, x]
-            who[v, u] = owners[y, x]
+            ids_out[v, u] = mesh_ids[y, x]
             angle[v, u] = cosine[y, x]
 
 
 @kernel
-def _lose_margins(inverse: F8, width: int, lost: Bool) -> None:
-    """Mark the pixels up to ``width`` rows and columns beside a nearer surface."""
+def _drop_margins(inverse: F8, width: int, lost: Bool) -> None:
+    """Mark missing depth up to ``width`` rows and columns beside a nearer surface."""
     height, columns = inverse.shape
     nearest = np.zeros(inverse.shape)
     for v in range(height):
@@ -190,7 +196,7 @@ def _lose_margins(inverse: F8, width: int, lost: Bool) -> None:
         first, last = max(v - width, 0), min(v + width + 1, height)
         for u in range(columns):
             for y in range(first, last):
-                if nearest[y, u] > inverse[v, u] + _MARGIN:
+                if nearest[y, u] > inverse[v, u] + _MARGIN_DISCONTINUITY:
                     lost[v, u] = True
                     break
 
@@ -207,28 +213,29 @@ def _cast_shadow(inverse: F8, shift: float, shadow: Bool) -> None:
     for v in range(height):
         nearest[:] = 0.0
         for u in range(width):
-            w = inverse[v, u]
-            x = u - shift * w
+            inverse_depth = inverse[v, u]
+            x = u - shift * inverse_depth
             start = int(np.floor(x + 0.5))
             end = start
-            if u + 1 < width and abs(inverse[v, u + 1] - w) < _STEP:  # the same surface continues
+            # The same surface continues.
+            if u + 1 < width and abs(inverse[v, u + 1] - inverse_depth) < _DISCONTINUITY:
                 end = max(start, int(np.floor(u + 1 - shift * inverse[v, u + 1] + 0.5)) - 1)
             for cell in range(start, end + 1):
                 at = cell + margin
-                if 0 <= at < nearest.size and w > nearest[at]:
-                    nearest[at] = w
+                if 0 <= at < nearest.size and inverse_depth > nearest[at]:
+                    nearest[at] = inverse_depth
         for u in range(width):
-            w = inverse[v, u]
-            at = int(np.floor(u - shift * w + 0.5)) + margin
-            if 0 <= at < nearest.size and nearest[at] > w + _STEP:
+            inverse_depth = inverse[v, u]
+            at = int(np.floor(u - shift * inverse_depth + 0.5)) + margin
+            if 0 <= at < nearest.size and nearest[at] > inverse_depth + _DISCONTINUITY:
                 shadow[v, u] = True
 
 
 @kernel
-def _fill_shadow(inverse: F8, owners: I4, shadow: Bool, eaten: I4) -> None:
+def _fill_shadow(inverse: F8, mesh_ids: I4, shadow: Bool, growth_px: I4) -> None:
     """Grow the nearer side of each shadow into it, as the windows of stereo matching do.
 
-    ``eaten`` (h // 3 + 1, 16) holds the widths of this growth in pixels, which vary over the image.
+    ``growth_px`` (h // 3 + 1, 16) holds the widths of this growth, which vary over the image.
     """
     height, width = inverse.shape
     for v in range(height):
@@ -240,38 +247,38 @@ def _fill_shadow(inverse: F8, owners: I4, shadow: Bool, eaten: I4) -> None:
             end = u
             while end < width and shadow[v, end]:
                 end += 1
-            grow = eaten[v // 3, (u // 8) % eaten.shape[1]]
+            grow = growth_px[v // 3, (u // 8) % growth_px.shape[1]]
             before = inverse[v, u - 1] if u > 0 else 0.0
             after = inverse[v, end] if end < width else 0.0
             if before > after:
                 for k in range(u, min(u + grow, end)):
-                    inverse[v, k], owners[v, k] = before, owners[v, u - 1]
+                    inverse[v, k], mesh_ids[v, k] = before, mesh_ids[v, u - 1]
                     shadow[v, k] = False
             elif after > 0:
                 for k in range(max(end - grow, u), end):
-                    inverse[v, k], owners[v, k] = after, owners[v, end]
+                    inverse[v, k], mesh_ids[v, k] = after, mesh_ids[v, end]
                     shadow[v, k] = False
             u = end
 
 
 @kernel
-def _blend(inverse: F8, reach: int, out: F8) -> None:
+def _blend(inverse: F8, radius: int, out: F8) -> None:
     height, width = inverse.shape
     for v in range(height):
         for u in range(width):
             here = inverse[v, u]
             out[v, u] = here
-            if not (reach <= u < width - reach and reach <= v < height - reach) or here <= 0:
+            if not (radius <= u < width - radius and radius <= v < height - radius) or here <= 0:
                 continue
             edge = False
-            for k in range(1, reach + 1):
-                edge = edge or abs(inverse[v, u - k] - here) > _STEP
-                edge = edge or abs(inverse[v, u + k] - here) > _STEP
+            for k in range(1, radius + 1):
+                edge = edge or abs(inverse[v, u - k] - here) > _DISCONTINUITY
+                edge = edge or abs(inverse[v, u + k] - here) > _DISCONTINUITY
             if not edge:
                 continue
             total, count = 0.0, 0
-            for y in range(v - reach, v + reach + 1):
-                for x in range(u - reach, u + reach + 1):
+            for y in range(v - radius, v + radius + 1):
+                for x in range(u - radius, u + radius + 1):
                     if inverse[y, x] > 0:
                         total += inverse[y, x]
                         count += 1
@@ -279,17 +286,17 @@ def _blend(inverse: F8, reach: int, out: F8) -> None:
 
 
 @kernel
-def _smooth(inverse: F8, reach: int, out: F8) -> None:
-    """Average along rows, up to ``reach`` pixels to each side, without crossing a depth step."""
+def _smooth(inverse: F8, radius: int, out: F8) -> None:
+    """Average along rows, up to ``radius`` pixels to each side, within one surface."""
     height, width = inverse.shape
     for v in range(height):
         for u in range(width):
             total, count = inverse[v, u], 1
             for way in (-1, 1):
                 last = inverse[v, u]
-                for k in range(1, reach + 1):
+                for k in range(1, radius + 1):
                     x = u + way * k
-                    if not 0 <= x < width or abs(inverse[v, x] - last) >= _STEP:
+                    if not 0 <= x < width or abs(inverse[v, x] - last) >= _DISCONTINUITY:
                         break
                     last = inverse[v, x]
                     total += last

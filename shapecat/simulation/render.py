@@ -24,12 +24,12 @@ class Geometry(Record):
     ----------
     vertices : (n, 3) metres.
     triangles : (m, 3) indices into ``vertices``.
-    owners : (m,) index of the mesh that each triangle belongs to.
+    mesh_ids : (m,) index of the mesh that each triangle belongs to.
     """
 
     vertices: F8 = array("n 3", "f8")
     triangles: I4 = array("m 3", "i4")
-    owners: I4 = array("m", "i4")
+    mesh_ids: I4 = array("m", "i4")
 
 
 class Image(Record):
@@ -38,12 +38,12 @@ class Image(Record):
     Attributes
     ----------
     inverse : (h, w) inverse of the depth along the optical axis, 1/m; 0 without surface.
-    owners : (h, w) index of the mesh seen, -1 without surface.
+    mesh_ids : (h, w) index of the visible mesh, -1 without surface.
     cosine : (h, w) cosine of the angle between the ray and the surface normal; 0 without surface.
     """
 
     inverse: F8 = array("h w", "f8")
-    owners: I4 = array("h w", "i2")
+    mesh_ids: I4 = array("h w", "i2")
     cosine: F4 = array("h w", "f4")
 
     @property
@@ -89,12 +89,12 @@ def render(scene: Geometry, camera: Camera, frame_from_camera: Pose) -> Image:
     rotation = np.ascontiguousarray(camera_from_frame.rotation)
     _place(scene.vertices, rotation, camera_from_frame.translation, local)
     intrinsics = np.array([camera.fx, camera.fy, camera.cx, camera.cy])
-    nearest, hits = np.zeros(shape), np.full(shape, -1, np.int32)
+    nearest, triangle_ids = np.zeros(shape), np.full(shape, -1, np.int32)
     normals = np.zeros((len(scene.triangles), 3))
-    _draw(local, scene.triangles, intrinsics, nearest, hits, normals)
-    owners, cosine = np.zeros(shape, np.int16), np.zeros(shape, np.float32)
-    _shade(hits, normals, scene.owners, intrinsics, owners, cosine)
-    return Image(nearest, owners, cosine)
+    _rasterize(local, scene.triangles, intrinsics, nearest, triangle_ids, normals)
+    mesh_ids, cosine = np.zeros(shape, np.int16), np.zeros(shape, np.float32)
+    _shade(triangle_ids, normals, scene.mesh_ids, intrinsics, mesh_ids, cosine)
+    return Image(nearest, mesh_ids, cosine)
 
 
 def cropped(camera: Camera, left: int, top: int, width: int, height: int) -> Camera:
@@ -102,13 +102,13 @@ def cropped(camera: Camera, left: int, top: int, width: int, height: int) -> Cam
     return Camera(width, height, camera.fx, camera.fy, camera.cx - left, camera.cy - top)
 
 
-def alone_pixels(scene: Geometry, owner: int, camera: Camera, frame_from_camera: Pose) -> int:
-    """Count the pixels of one owner, unoccluded, in an image three times as wide and high.
+def alone_pixels(scene: Geometry, mesh_id: int, camera: Camera, frame_from_camera: Pose) -> int:
+    """Count the pixels of one mesh, unoccluded, in an image three times as wide and high.
 
     The count is 0 if a vertex is behind the camera or nearer than `NEAR_M`. ``scene`` and
     ``frame_from_camera`` are as for `render`.
     """
-    mine = scene.triangles[scene.owners == owner]
+    mine = scene.triangles[scene.mesh_ids == mesh_id]
     if len(mine) == 0:
         return 0
     used, corners = np.unique(mine, return_inverse=True)
@@ -125,7 +125,7 @@ def alone_pixels(scene: Geometry, owner: int, camera: Camera, frame_from_camera:
     if right <= left or bottom <= top:
         return 0
     part = cropped(camera, left, top, right - left, bottom - top)
-    return int((render(alone, part, frame_from_camera).owners >= 0).sum())
+    return int((render(alone, part, frame_from_camera).mesh_ids >= 0).sum())
 
 
 @kernel
@@ -138,18 +138,18 @@ def _place(points: F8, rotation: F8, translation: F8, out: F8) -> None:
 
 
 @kernel
-def _draw(
+def _rasterize(
     points: F8,
     triangles: I4,
     intrinsics: F8,
     nearest: F8,
-    hits: I4,
+    triangle_ids: I4,
     normals: F8,
 ) -> None:
-    """Find each pixel's greatest inverse depth (1/m) and the triangle with it.
+    """Find the nearest triangle of each pixel, and its inverse depth, 1/m.
 
     ``points`` (n, 3) are in the optical frame; ``intrinsics`` are fx, fy, cx, cy in pixels. Fills
-    ``nearest`` and ``hits`` (h, w), and ``normals`` (m, 3) of the triangles.
+    ``nearest`` (inverse depth) and ``triangle_ids`` (h, w), and the ``normals`` (m, 3).
     """
     height, width = nearest.shape
     fx, fy, cx, cy = intrinsics
@@ -210,22 +210,24 @@ def _draw(
                 continue
             rest = (ny * y + nz) * scale - per_pixel * cx
             for u in range(int(np.ceil(low)), int(np.floor(high)) + 1):
-                w = per_pixel * u + rest
-                if w > nearest[v, u]:
-                    nearest[v, u] = w
-                    hits[v, u] = m
+                inverse_depth = per_pixel * u + rest
+                if inverse_depth > nearest[v, u]:
+                    nearest[v, u] = inverse_depth
+                    triangle_ids[v, u] = m
 
 
 @kernel
-def _shade(hits: I4, normals: F8, ids: I4, intrinsics: F8, owners: I4, cosine: F4) -> None:
+def _shade(
+    triangle_ids: I4, normals: F8, ids: I4, intrinsics: F8, mesh_ids: I4, cosine: F4
+) -> None:
     fx, fy, cx, cy = intrinsics
-    for v in range(hits.shape[0]):
+    for v in range(triangle_ids.shape[0]):
         y = (v - cy) / fy
-        for u in range(hits.shape[1]):
-            m = hits[v, u]
-            owners[v, u] = -1
+        for u in range(triangle_ids.shape[1]):
+            m = triangle_ids[v, u]
+            mesh_ids[v, u] = -1
             if m >= 0:
                 x = (u - cx) / fx
                 facing = normals[m, 0] * x + normals[m, 1] * y + normals[m, 2]
                 cosine[v, u] = facing / np.sqrt(x * x + y * y + 1.0)
-                owners[v, u] = ids[m]
+                mesh_ids[v, u] = ids[m]

@@ -128,7 +128,7 @@ def _hollow(points: F8, mesh: Mesh) -> float:
     camera = Camera(64, 64, 31 * far / span, 31 * far / span, 31.5, 31.5)
     above = Pose(np.array([[1.0, 0, 0], [0, -1, 0], [0, 0, -1]]), np.array([0, 0, far]))
     image = render(geometry([(turned, Pose(np.eye(3), np.zeros(3)))]), camera, above)
-    seen = image.owners >= 0
+    seen = image.mesh_ids >= 0
     height = far - image.depth
     middle = np.zeros_like(seen)
     middle[20:44, 20:44] = True

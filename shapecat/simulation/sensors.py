@@ -1,8 +1,8 @@
 """Depth cameras: their intrinsics and error models.
 
 The parameters of the Kinect and the RealSense D435 are fitted to real images of tables with
-objects. The other cameras follow their data sheets and the cited measurements, the waves, margins
-and rounding of the D4xx and the SR300 also real images.
+objects. Those of the other cameras follow data sheets and the cited measurements. Real images also
+gave the low-frequency noise, margins and smoothing of the D4xx and the SR300.
 """
 
 from dataclasses import dataclass, fields, replace
@@ -12,7 +12,16 @@ import numpy as np
 
 from shapecat.types import Camera
 
-__all__ = ["IDEAL", "KINECT", "PRESETS", "REALSENSE", "SENSORS", "Sensor", "between", "resized"]
+__all__ = [
+    "IDEAL",
+    "KINECT",
+    "PRESETS",
+    "REALSENSE",
+    "SENSORS",
+    "Sensor",
+    "interpolated",
+    "resized",
+]
 
 
 @dataclass(frozen=True)
@@ -22,30 +31,32 @@ class Sensor:
     Attributes
     ----------
     camera : intrinsics.
-    nearest_m, farthest_m : range of depth that is reported.
+    nearest_m, farthest_m : depth range.
     step : quantization of the inverse depth, 1/m; 0 is none.
     noise : standard deviation of the inverse depth, 1/m, for cameras that triangulate.
     noise_m : standard deviation of the depth of time-of-flight cameras, metres per metre.
-    grain : (across, down) correlation window of the noise, pixels.
-    smoothings : how often the noise, and the displacement of outlines, is averaged over its window.
-    wave : standard deviation of a fixed error of the device in inverse depth, 1/m.
-    wave_px : distance over which this error varies, pixels.
+    noise_window : (across, down) correlation window of the noise, pixels.
+    smoothings : how often the noise and the edge jitter are averaged over their windows.
+    fixed_error : standard deviation of the low-frequency error of the device, which is the same in
+        all images, in inverse depth, 1/m.
+    fixed_error_px : distance over which this error varies, pixels.
     device : seed of the fixed error and of the objects' reflectance.
-    ragged_px : standard deviation by which the outlines of objects are displaced, pixels.
-    ragged_window : (across, down) correlation window of this displacement, pixels.
-    shadow_m : x positions of the light source and the other cameras, metres; a surface that one of
-        them does not see has no reading.
-    filled_px : mean width by which shadows are narrower than geometry predicts, pixels.
-    grazing : cosine of the angle of incidence at which half of the readings fail.
-    dark : standard deviation of the logarithm of the objects' reflectance; a dark object loses
-        readings at smaller angles of incidence.
-    edge_px : width of the margins around nearer surfaces in which stereo matching fails, pixels.
-    holes : approximate fraction of the pixels lost in random holes.
-    hole_px : approximate width of the largest holes, also of those at grazing incidence, pixels.
-    blend_px : window that mixes near and far at outlines (flying pixels), pixels; 0 is none.
-    rounded_px : window that rounds edges and corners within a surface (multipath, smoothing
+    edge_jitter_px : standard deviation of the displacement of depth edges, pixels.
+    edge_jitter_window : (across, down) correlation window of this displacement, pixels.
+    shadow_m : x positions of the light source and the other cameras, metres; depth is missing where
+        one of them is occluded.
+    shadow_fill_px : mean width by which shadows are narrower than geometry predicts, pixels.
+    grazing_cosine : cosine of the angle of incidence at which half of the depth is missing.
+    log_reflectance_std : standard deviation of the logarithm of the objects' reflectance; on dark
+        objects, depth is missing at smaller angles of incidence.
+    stereo_margin_px : width of the margins around nearer surfaces in which stereo matching fails,
+        pixels.
+    holes : approximate fraction of the pixels in random holes.
+    hole_px : approximate width of the largest holes, also of those on oblique surfaces, pixels.
+    blend_px : window that mixes near and far at depth edges (flying pixels), pixels; 0 is none.
+    smoothing_px : window that rounds edges and corners within a surface (multipath, smoothing
         windows), pixels; 0 is none.
-    border_px : (left, right, top, bottom) margins without readings, pixels.
+    border_px : (left, right, top, bottom) margins of the image without depth, pixels.
     """
 
     camera: Camera
@@ -54,22 +65,22 @@ class Sensor:
     step: float = 0.0
     noise: float = 0.0
     noise_m: float = 0.0
-    grain: tuple[int, int] = (1, 1)
+    noise_window: tuple[int, int] = (1, 1)
     smoothings: int = 1
-    wave: float = 0.0
-    wave_px: int = 80
+    fixed_error: float = 0.0
+    fixed_error_px: int = 80
     device: int = 1
-    ragged_px: float = 0.0
-    ragged_window: tuple[int, int] = (1, 1)
+    edge_jitter_px: float = 0.0
+    edge_jitter_window: tuple[int, int] = (1, 1)
     shadow_m: tuple[float, ...] = ()
-    filled_px: float = 0.0
-    grazing: float = 0.0
-    dark: float = 0.0
-    edge_px: int = 0
+    shadow_fill_px: float = 0.0
+    grazing_cosine: float = 0.0
+    log_reflectance_std: float = 0.0
+    stereo_margin_px: int = 0
     holes: float = 0.0
     hole_px: int = 3
     blend_px: int = 0
-    rounded_px: int = 0
+    smoothing_px: int = 0
     border_px: tuple[int, int, int, int] = (0, 0, 0, 0)
 
 
@@ -85,13 +96,13 @@ KINECT = Sensor(
     nearest_m=0.45,
     step=0.0029,  # 1/8 px of a 580 px infrared camera, 7.5 cm from its projector
     noise=0.0018,
-    grain=(8, 4),
-    wave=0.0024,
-    ragged_px=0.55,
-    ragged_window=(5, 4),
+    noise_window=(8, 4),
+    fixed_error=0.0024,
+    edge_jitter_px=0.55,
+    edge_jitter_window=(5, 4),
     shadow_m=(0.05, -0.025),  # projector and infrared camera, seen from the colour camera
-    filled_px=2.0,
-    grazing=0.06,
+    shadow_fill_px=2.0,
+    grazing_cosine=0.06,
     holes=0.0003,
     border_px=(4, 40, 4, 6),
 )
@@ -102,13 +113,13 @@ REALSENSE = Sensor(
     nearest_m=0.2,
     step=0.0005,
     noise=0.0023,
-    grain=(17, 7),
-    wave=0.0024,
-    ragged_px=0.7,
-    ragged_window=(7, 5),
+    noise_window=(17, 7),
+    fixed_error=0.0024,
+    edge_jitter_px=0.7,
+    edge_jitter_window=(7, 5),
     shadow_m=(0.05,),
-    filled_px=1.0,
-    grazing=0.12,
+    shadow_fill_px=1.0,
+    grazing_cosine=0.12,
     holes=0.0006,
     blend_px=3,
     border_px=(8, 0, 0, 0),
@@ -120,16 +131,16 @@ _KINECT_V2 = Sensor(
     nearest_m=0.5,
     farthest_m=4.5,
     noise_m=0.0018,
-    grain=(3, 3),
-    wave=0.002,
-    wave_px=100,
-    ragged_px=0.5,
-    ragged_window=(2, 2),
-    grazing=0.1,
-    dark=0.3,
+    noise_window=(3, 3),
+    fixed_error=0.002,
+    fixed_error_px=100,
+    edge_jitter_px=0.5,
+    edge_jitter_window=(2, 2),
+    grazing_cosine=0.1,
+    log_reflectance_std=0.3,
     holes=0.001,
     blend_px=3,
-    rounded_px=7,
+    smoothing_px=7,
 )
 """Kinect v2 (time of flight): Wasenmüller and Stricker, Comparison of Kinect v1 and v2, 2016."""
 
@@ -137,16 +148,16 @@ _AZURE_KINECT = Sensor(
     _camera(640, 576, 504.0),
     nearest_m=0.45,
     noise_m=0.0011,
-    grain=(3, 3),
-    wave=0.0015,
-    wave_px=120,
-    ragged_px=0.5,
-    ragged_window=(2, 2),
-    grazing=0.12,
-    dark=0.35,
+    noise_window=(3, 3),
+    fixed_error=0.0015,
+    fixed_error_px=120,
+    edge_jitter_px=0.5,
+    edge_jitter_window=(2, 2),
+    grazing_cosine=0.12,
+    log_reflectance_std=0.35,
     holes=0.001,
     blend_px=3,
-    rounded_px=5,
+    smoothing_px=5,
     border_px=(24, 24, 8, 8),
 )
 """Azure Kinect (time of flight, narrow field of view): Tölgyessy et al., Evaluation of the Azure
@@ -157,25 +168,25 @@ _D435 = Sensor(
     nearest_m=0.2,
     step=0.0015,
     noise=0.0032,
-    grain=(11, 9),
+    noise_window=(11, 9),
     smoothings=2,
-    wave=0.006,
-    wave_px=90,
-    ragged_px=2.0,
-    ragged_window=(11, 11),
+    fixed_error=0.006,
+    fixed_error_px=90,
+    edge_jitter_px=2.0,
+    edge_jitter_window=(11, 11),
     shadow_m=(0.05,),
-    filled_px=2.0,
-    grazing=0.15,
-    dark=0.2,
-    edge_px=6,
+    shadow_fill_px=2.0,
+    grazing_cosine=0.15,
+    log_reflectance_std=0.2,
+    stereo_margin_px=6,
     holes=0.004,
     hole_px=8,
     blend_px=3,
-    rounded_px=11,
+    smoothing_px=11,
     border_px=(12, 0, 0, 0),
 )
 """Intel D435 without filters: noise of 0.07 px of disparity at a focal length of 425 px and a
-baseline of 50 mm, in waves as wide as the matching windows; Grunnet-Jepsen et al., Best-known
+baseline of 50 mm, correlated over the matching windows; Grunnet-Jepsen et al., Best-known
 methods for tuning D400 depth cameras, 2018."""
 
 _D415 = replace(
@@ -184,9 +195,9 @@ _D415 = replace(
     nearest_m=0.3,
     step=0.0009,
     noise=0.0023,
-    grain=(13, 11),
-    wave=0.004,
-    wave_px=110,
+    noise_window=(13, 11),
+    fixed_error=0.004,
+    fixed_error_px=110,
     shadow_m=(0.055,),
     border_px=(14, 0, 0, 0),
 )
@@ -198,17 +209,17 @@ _D455 = replace(
     nearest_m=0.4,
     step=0.0005,
     noise=0.0024,
-    grain=(17, 13),
-    wave=0.003,
-    wave_px=130,
-    ragged_px=2.6,
-    ragged_window=(15, 15),
+    noise_window=(17, 13),
+    fixed_error=0.003,
+    fixed_error_px=130,
+    edge_jitter_px=2.6,
+    edge_jitter_window=(15, 15),
     shadow_m=(0.095,),
-    filled_px=3.0,
-    edge_px=8,
+    shadow_fill_px=3.0,
+    stereo_margin_px=8,
     hole_px=12,
     blend_px=5,
-    rounded_px=17,
+    smoothing_px=17,
     border_px=(30, 0, 0, 0),
 )
 """Intel D455: disparity noise of 0.15 px at 640 px and 95 mm; source as for the D435."""
@@ -219,17 +230,17 @@ _SR300 = Sensor(
     farthest_m=1.5,
     step=0.0005,
     noise=0.0018,
-    grain=(9, 9),
+    noise_window=(9, 9),
     smoothings=2,
-    wave=0.005,
-    wave_px=100,
-    ragged_px=0.6,
-    ragged_window=(2, 2),
+    fixed_error=0.005,
+    fixed_error_px=100,
+    edge_jitter_px=0.6,
+    edge_jitter_window=(2, 2),
     shadow_m=(0.026,),
-    filled_px=1.0,
-    grazing=0.3,
-    dark=0.6,
-    edge_px=3,
+    shadow_fill_px=1.0,
+    grazing_cosine=0.3,
+    log_reflectance_std=0.6,
+    stereo_margin_px=3,
     holes=0.002,
     blend_px=3,
     border_px=(4, 4, 0, 0),
@@ -241,16 +252,16 @@ _L515 = Sensor(
     _camera(640, 480, 460.0),
     nearest_m=0.25,
     noise_m=0.0025,
-    grain=(2, 2),
-    wave=0.001,
-    wave_px=140,
-    ragged_px=0.4,
-    ragged_window=(2, 2),
-    grazing=0.12,
-    dark=0.5,
+    noise_window=(2, 2),
+    fixed_error=0.001,
+    fixed_error_px=140,
+    edge_jitter_px=0.4,
+    edge_jitter_window=(2, 2),
+    grazing_cosine=0.12,
+    log_reflectance_std=0.5,
     holes=0.001,
     blend_px=3,
-    rounded_px=3,
+    smoothing_px=3,
 )
 """Intel L515 (scanned laser, time of flight): Servi et al., Metrological characterization and
 comparison of D415, D455, L515, 2021."""
@@ -259,13 +270,13 @@ _PHONE = Sensor(
     _camera(256, 192, 212.0),
     nearest_m=0.25,
     noise_m=0.0025,
-    grain=(5, 5),
-    wave=0.004,
-    wave_px=50,
-    ragged_px=0.8,
-    ragged_window=(3, 3),
+    noise_window=(5, 5),
+    fixed_error=0.004,
+    fixed_error_px=50,
+    edge_jitter_px=0.8,
+    edge_jitter_window=(3, 3),
     blend_px=3,
-    rounded_px=5,
+    smoothing_px=5,
 )
 """Lidar of a phone, which the phone densifies with its colour image to 256 x 192, without holes:
 Luetzenburg et al., Evaluation of the Apple iPhone 12 Pro LiDAR, 2021."""
@@ -288,11 +299,11 @@ SENSORS = {"ideal": IDEAL, **PRESETS}
 """All sensors by name."""
 
 
-def between(first: Sensor, second: Sensor, share: float) -> Sensor:
-    """Return the first sensor with an error model interpolated towards the second sensor's.
+def interpolated(first: Sensor, second: Sensor, share: float) -> Sensor:
+    """Interpolate the error models of two sensors.
 
-    ``share`` is 0 for the first model and 1 for the second. The first sensor keeps its intrinsics,
-    device, shadows and borders.
+    ``share`` is 0 for the first model and 1 for the second. Intrinsics, device, shadows and borders
+    are those of the first sensor.
     """
     mixed = {
         field.name: _mixed(getattr(first, field.name), getattr(second, field.name), share)
@@ -317,15 +328,15 @@ def resized(sensor: Sensor, scale: float) -> Sensor:
     return replace(
         sensor,
         camera=Camera(round(camera.width * scale), round(camera.height * scale), *focal, *middle),
-        grain=_scaled(sensor.grain, scale),
-        ragged_window=_scaled(sensor.ragged_window, scale),
-        ragged_px=sensor.ragged_px * scale,
-        wave_px=max(round(sensor.wave_px * scale), 2),
-        filled_px=sensor.filled_px * scale,
-        edge_px=round(sensor.edge_px * scale),
+        noise_window=_scaled(sensor.noise_window, scale),
+        edge_jitter_window=_scaled(sensor.edge_jitter_window, scale),
+        edge_jitter_px=sensor.edge_jitter_px * scale,
+        fixed_error_px=max(round(sensor.fixed_error_px * scale), 2),
+        shadow_fill_px=sensor.shadow_fill_px * scale,
+        stereo_margin_px=round(sensor.stereo_margin_px * scale),
         hole_px=max(round(sensor.hole_px * scale), 3),
         blend_px=round(sensor.blend_px * scale),
-        rounded_px=round(sensor.rounded_px * scale),
+        smoothing_px=round(sensor.smoothing_px * scale),
     )
 
 

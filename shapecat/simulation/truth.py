@@ -43,16 +43,16 @@ def frame_truth(world: World, frame: int, labels: U1, sensor: Sensor) -> Truth:
     counts = np.bincount(labels.reshape(-1), minlength=256)
     objects: list[dict[str, Any]] = []
     hidden: list[dict[str, Any]] = []
-    for owner, item in enumerate(world.objects, start=len(world.supports)):
+    for mesh_id, item in enumerate(world.objects, start=len(world.supports)):
         if not world.present(item, frame):
             continue
         pixels = int(counts[item.label])
-        entry = _object_truth(world, frame, item, pixels, geometry, owner, sensor)
+        entry = _object_truth(world, frame, item, pixels, geometry, mesh_id, sensor)
         (objects if pixels >= LISTED_PIXELS else hidden).append(entry)
     camera_from_world = inverse(pose)
     planes = []
     for support in world.supports:
-        if support.level:
+        if support.holds_objects:
             normal = camera_from_world.rotation[:, 2]
             point = transform(camera_from_world, support.outline[0])
             planes.append(
@@ -74,14 +74,14 @@ def _object_truth(
     item: PlacedObject,
     pixels: int,
     geometry: Geometry,
-    owner: int,
+    mesh_id: int,
     sensor: Sensor,
 ) -> dict[str, Any]:
     camera_from_world = inverse(world.path[frame])
     camera_from_mesh = compose(camera_from_world, world.pose_of(item, frame))
     points = transform(camera_from_mesh, item.mesh.vertices).astype(np.float32)
     box = upright_box(points, camera_from_world.rotation[:, 2])
-    total = alone_pixels(geometry, owner, sensor.camera, world.path[frame])
+    total = alone_pixels(geometry, mesh_id, sensor.camera, world.path[frame])
     share = min(1.0, pixels / total) if total else 0.0
     few = pixels < AMBIGUOUS_PIXELS or share < AMBIGUOUS_SHARE
     return {

@@ -38,8 +38,8 @@ def render_frame(
     index = view if isinstance(view, int) else 0
     pose = world.path[view] if isinstance(view, int) else view
     image = render(world.geometry(index), sensor.camera, pose)
-    depth, owners = measure(image, sensor, rng)
-    labels = np.take(np.append(world.labels, np.uint8(0)), owners, mode="wrap")  # -1 is the last
+    depth, mesh_ids = measure(image, sensor, rng)
+    labels = np.take(np.append(world.labels, np.uint8(0)), mesh_ids, mode="wrap")  # -1 is the last
     stamp = start_ns + round(index * 1e9 / rate_hz)
     topic = "/camera/depth/image_raw"
     frame = Frame(

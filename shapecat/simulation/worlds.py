@@ -35,7 +35,7 @@ class Support(Record):
     outline: F8 = array("k 3", "f8")
 
     @property
-    def level(self) -> bool:
+    def holds_objects(self) -> bool:
         """Whether objects can stand on it."""
         return len(self.outline) > 0
 
@@ -135,13 +135,13 @@ class World(Record):
         return shift is None or bool(np.isfinite(shift[frame]).all())
 
     def geometry(self, frame: int) -> Geometry:
-        """Return all triangles of a frame, in the world frame; owners index `labels`."""
+        """Return all triangles of a frame, in the world frame; mesh ids index `labels`."""
         moves = self.motions or self.turns is not None
         return self._gather(frame) if moves else self._still
 
     @cached_property
     def labels(self) -> U1:
-        """(n,) uint8 pixel label of each owner: the supports, then the objects."""
+        """(n,) uint8 pixel label of each mesh: the supports, then the objects."""
         found = [s.label for s in self.supports] + [t.label for t in self.objects]
         return np.array(found, np.uint8)
 
