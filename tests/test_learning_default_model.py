@@ -16,15 +16,15 @@ from shapecat.evaluation.views import describe_views
 from shapecat.learning import Categorizer, load_model, save_model
 from shapecat.models import arrangements
 from shapecat.models.arrangements import (
-    ALONE,
+    BARE_TABLE,
     ArrangedObject,
     Arrangement,
     ArrangementOptions,
     arrange,
 )
 from shapecat.models.card import write_card
-from shapecat.models.fragments import cut_fragment, cut_halo
-from shapecat.models.sets import Simulated, collect, partial_views
+from shapecat.models.fragments import cut_fragment, remove_base
+from shapecat.models.sets import SimulatedViews, collect, partial_views
 from shapecat.models.worlds import describe_arrangement, simulate_views, simulate_world
 from shapecat.simulation import piles
 from shapecat.simulation.distractors import make_distractor
@@ -90,14 +90,16 @@ def test_new_simulated_objects_are_recognised(model: Categorizer) -> None:
 
 
 @pytest.fixture(scope="module")
-def tables() -> tuple[Simulated, Simulated]:
+def tables() -> tuple[SimulatedViews, SimulatedViews]:
     """Simulate the same tables with one process and with two."""
     world = ArrangementOptions(5, ("pan", "hammer"), cameras=1)
     one, two = (collect(simulate_views(world, range(2), jobs=jobs)) for jobs in (1, 2))
     return one, two
 
 
-def test_worlds_are_independent_of_number_of_jobs(tables: tuple[Simulated, Simulated]) -> None:
+def test_worlds_are_independent_of_number_of_jobs(
+    tables: tuple[SimulatedViews, SimulatedViews],
+) -> None:
     """The same seed must give the same model on any machine."""
     alone, shared = tables
     for name in ("resting_pose", "source", "visible", "overlap"):
@@ -120,7 +122,9 @@ def test_training_tables_follow_their_options() -> None:
     assert all(0.5 <= view.overlap <= 1 for view in views)
 
 
-def test_training_is_reproducible(tables: tuple[Simulated, Simulated], tmp_path: Path) -> None:
+def test_training_is_reproducible(
+    tables: tuple[SimulatedViews, SimulatedViews], tmp_path: Path
+) -> None:
     """A model that cannot be reproduced bit for bit cannot be trusted."""
     for jobs, simulated in enumerate(tables, start=1):
         model = fit_views(simulated.views, simulated.views, seed=3, rounds=4, jobs=jobs)
@@ -155,7 +159,7 @@ def test_thin_background_gives_unknown_views() -> None:
     sizes = ((0.08, 0.06, 0.12), (0.1, 0.09, 0.022), (0.07, 0.06, 0.1))
     box, board, block = (rounded_box(size) for size in sizes)
     here, there = (Pose(np.eye(3), np.array([x, 0.05, 0.0])) for x in (-0.15, 0.15))
-    around = (ALONE, moved(board, here), moved(block, there))
+    around = (BARE_TABLE, moved(board, here), moved(block, there))
     scene = Arrangement([ArrangedObject(box, "box", "upright", 0.0)], around, (30, 50))
 
     views, objects = (
@@ -201,7 +205,7 @@ def test_small_view_has_no_fragment() -> None:
 
 def test_halo_is_cut_only_from_below() -> None:
     view = half_ball()
-    cut = cut_halo(view, np.random.default_rng(0))
+    cut = remove_base(view, np.random.default_rng(0))
 
     assert 0.003 < cut.points[:, 2].min() < 0.012
     assert cut.points[:, 2].max() == view.points[:, 2].max()

@@ -43,7 +43,7 @@ def test_worst_mistakes_are_most_confident_and_one_per_object(tmp_path: Path) ->
     model: Categorizer = Oracle()  # type: ignore[assignment]
     found = worst_mistakes(views, model)
 
-    assert [(m.seen.instance, m.said) for m in found] == [("b", "unknown"), ("a", "cup")]
+    assert [(m.world_view.instance, m.predicted) for m in found] == [("b", "unknown"), ("a", "cup")]
     assert found[0].confidence > found[1].confidence > 0.8 * 0.9
     draw(tmp_path / "worst.png", found)
     with Image.open(tmp_path / "worst.png") as picture:

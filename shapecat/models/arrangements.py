@@ -18,7 +18,7 @@ from shapecat.simulation.shapes import make_object
 from shapecat.simulation.worlds import PlacedObject, World, turned_about_z
 from shapecat.types import CATEGORIES, UNKNOWN, Pose
 
-__all__ = ["ALONE", "ArrangedObject", "Arrangement", "ArrangementOptions", "arrange", "placed"]
+__all__ = ["BARE_TABLE", "ArrangedObject", "Arrangement", "ArrangementOptions", "arrange", "placed"]
 
 _TABLE_M = (1.6, 1.2, 0.03)
 _RESTING_POSES = {
@@ -95,7 +95,7 @@ class Arrangement(NamedTuple):
     azimuth: tuple[float, float] = (-180.0, 180.0)
 
 
-ALONE = moved(rounded_box(_TABLE_M), Pose(np.eye(3), np.array([0.0, 0.0, -_TABLE_M[2]])))
+BARE_TABLE = moved(rounded_box(_TABLE_M), Pose(np.eye(3), np.array([0.0, 0.0, -_TABLE_M[2]])))
 """A table without a room around it."""
 _SETTLED: tuple[tuple[Callable[..., World], float, Arrangement], ...] = (
     (pile, 0.5, Arrangement([], (), (8.0, 90.0))),
@@ -110,7 +110,7 @@ def arrange(options: ArrangementOptions, rng: np.random.Generator) -> Arrangemen
     """Arrange random objects on a table, or let them settle by physics."""
     if options.settled > 0 and rng.random() < options.settled:
         return _settled(options, rng)
-    return Arrangement(_spread(options, rng), (ALONE,))
+    return Arrangement(_spread(options, rng), (BARE_TABLE,))
 
 
 def _settled(options: ArrangementOptions, rng: np.random.Generator) -> Arrangement:

@@ -7,7 +7,7 @@ import numpy as np
 from shapecat.arrays import F8, Bool
 from shapecat.evaluation import View
 
-__all__ = ["cut_fragment", "cut_halo"]
+__all__ = ["cut_fragment", "remove_base"]
 
 _FEWEST_POINTS = 60
 _KEPT = (0.3, 0.85)
@@ -36,7 +36,7 @@ def cut_fragment(view: View, rng: np.random.Generator) -> View | None:
     return None
 
 
-def cut_halo(view: View, rng: np.random.Generator) -> View:
+def remove_base(view: View, rng: np.random.Generator) -> View:
     """Remove the lowest points, as plane removal does; more are removed at a larger distance.
 
     At 1 m, the lowest 4 to 9 mm are removed.

@@ -18,11 +18,11 @@ _COLUMNS = 6
 
 
 class Mistake(NamedTuple):
-    """A view with a wrong label: the predicted label ``said`` and its confidence."""
+    """A view with a wrong label, the ``predicted`` one, and its confidence."""
 
-    seen: WorldView
+    world_view: WorldView
     view: View
-    said: str
+    predicted: str
     confidence: float
 
 
@@ -30,19 +30,21 @@ def worst_mistakes(
     views: Sequence[WorldView], model: Categorizer, *, count: int = 12
 ) -> list[Mistake]:
     """Return up to ``count`` mistakes on different objects, the most confident ones first."""
-    answer = model.predict(np.array([seen.descriptor for seen in views]))
+    answer = model.predict(np.array([world_view.descriptor for world_view in views]))
     found = []
-    for seen, posterior, novelty in zip(views, answer.posteriors, answer.novelty, strict=True):
-        strange = novelty > 1
-        said = UNKNOWN if strange else model.categories[int(posterior.argmax())]
+    for world_view, posterior, novelty in zip(
+        views, answer.posteriors, answer.novelty, strict=True
+    ):
+        is_unknown = novelty > 1
+        predicted = UNKNOWN if is_unknown else model.categories[int(posterior.argmax())]
         known = 1 - float(novelty) / 2
-        sure = 1 - known if strange else known * float(posterior.max())
-        if said != seen.label and seen.view is not None:
-            found.append(Mistake(seen, seen.view, said, sure))
+        confidence = 1 - known if is_unknown else known * float(posterior.max())
+        if predicted != world_view.label and world_view.view is not None:
+            found.append(Mistake(world_view, world_view.view, predicted, confidence))
     found.sort(key=lambda mistake: -mistake.confidence)
     worst: dict[str, Mistake] = {}
     for mistake in found:
-        worst.setdefault(mistake.seen.instance, mistake)
+        worst.setdefault(mistake.world_view.instance, mistake)
     return list(worst.values())[:count]
 
 
@@ -64,13 +66,14 @@ def draw(path: Path, mistakes: Sequence[Mistake]) -> None:
 
 
 def _draw_one(axis: Any, mistake: Mistake) -> None:
-    seen = mistake.seen
+    world_view = mistake.world_view
     across, depth = _as_seen(mistake.view)
     axis.scatter(*across.T, c=depth, s=3, cmap="viridis_r", linewidths=0)
     axis.set_aspect("equal")
-    where = f"{seen.sensor}, {seen.distance:.1f} m, {seen.points} voxels"
+    where = f"{world_view.sensor}, {world_view.distance:.1f} m, {world_view.points} voxels"
+    wrong = f"as {mistake.predicted} ({mistake.confidence:.2f})"
     axis.set_title(
-        f"{seen.label}, {seen.resting_pose}\nas {mistake.said} ({mistake.confidence:.2f})\n{where}",
+        f"{world_view.label}, {world_view.resting_pose}\n{wrong}\n{where}",
         fontsize=7,
     )
 

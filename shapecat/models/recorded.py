@@ -40,7 +40,7 @@ def labelled_views(folder: Path) -> Iterator[View]:
         for item in truth["objects"]:
             if item["ambiguous"]:
                 continue
-            points = _readings(frame, np.flatnonzero(np.isin(image, item["parts"])))
+            points = _valid_points(frame, np.flatnonzero(np.isin(image, item["parts"])))
             lowest = float(np.quantile(points @ up - offset, 0.02))
             support = offset + (lowest if lowest > _STACKED_M else 0.0)
             name = f"{truth['scene']}_{item['label']}"
@@ -66,7 +66,7 @@ def detected_views(folder: Path) -> Iterator[View]:
             if found is None:
                 continue
             candidate = scene.candidates[found]
-            points = _readings(frame, candidate.indices)
+            points = _valid_points(frame, candidate.indices)
             support = scene.support_offset(candidate)
             name = f"{truth['scene']}_{item.get('label', 0)}"
             yield _view(points, scene.up, support, item["category"], name)
@@ -81,7 +81,7 @@ def _frames(folder: Path) -> Iterator[tuple[Frame, dict[str, Any]]]:
             yield frame, by_stamp[frame.stamp_ns]
 
 
-def _readings(frame: Frame, indices: np.ndarray) -> F4:
+def _valid_points(frame: Frame, indices: np.ndarray) -> F4:
     points = frame.xyz(indices)
     return points[np.isfinite(points[:, 0])]
 
@@ -97,7 +97,7 @@ def _table(frame: Frame, image: np.ndarray) -> tuple[F8, float]:
     Both are in the sensor frame. The plane is fitted by RANSAC, then by least squares.
     """
     counts = np.bincount(image[(image > 0) & (image < 10)], minlength=10)
-    points = _readings(frame, np.flatnonzero(image == counts.argmax())).astype(np.float64)
+    points = _valid_points(frame, np.flatnonzero(image == counts.argmax())).astype(np.float64)
     rng = np.random.default_rng(0)
     sample = points[rng.integers(0, len(points), 4000)]
     best, most = sample[:3], -1

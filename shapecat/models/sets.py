@@ -18,10 +18,10 @@ from shapecat.simulation.distractors import DISTRACTORS
 from shapecat.simulation.procedural import PROCEDURAL
 
 __all__ = [
-    "CUT_WELL",
-    "MOSTLY",
+    "MOSTLY_VISIBLE",
     "SETS",
-    "Simulated",
+    "WELL_SEGMENTED_IOU",
+    "SimulatedViews",
     "clear_views",
     "collect",
     "options_of",
@@ -36,15 +36,15 @@ _SHARES: dict[str, dict[str, Any]] = {
     "calibration": {"unknown": 0.17, "settled": 0.5},
     "test": {"unknown": 0.3, "settled": 0.5},
 }
-CUT_WELL = 0.75
+WELL_SEGMENTED_IOU = 0.75
 """Lowest IoU of a detection that counts as well segmented."""
-MOSTLY = 0.7
+MOSTLY_VISIBLE = 0.7
 """Lowest visible fraction of an object that counts as mostly visible."""
 _TIMES = 3
 """Frequency of a family of procedural objects, relative to that of a kind of distractor."""
 
 
-class Simulated(NamedTuple):
+class SimulatedViews(NamedTuple):
     """Simulated views with the circumstances of each, (n,), as in `WorldView`."""
 
     views: DescribedViews
@@ -54,10 +54,12 @@ class Simulated(NamedTuple):
     overlap: np.ndarray
     sensor: np.ndarray
 
-    def where(self, chosen: Bool) -> "Simulated":
+    def where(self, chosen: Bool) -> "SimulatedViews":
         """Return the views that a mask (n,) selects."""
         _, *circumstances = self
-        return Simulated(self.views.where(chosen), *(column[chosen] for column in circumstances))
+        return SimulatedViews(
+            self.views.where(chosen), *(column[chosen] for column in circumstances)
+        )
 
 
 def options_of(name: str) -> ArrangementOptions:
@@ -68,7 +70,7 @@ def options_of(name: str) -> ArrangementOptions:
     return ArrangementOptions(SETS[name][0], tuple(kinds), background=True, **_SHARES[name])
 
 
-def simulate(name: str, worlds: int, jobs: int) -> Simulated:
+def simulate(name: str, worlds: int, jobs: int) -> SimulatedViews:
     """Simulate up to ``worlds`` arrangements of a set, given by its name in `SETS`."""
     numbers = range(min(worlds, SETS[name][1]))
     views = simulate_views(options_of(name), numbers, jobs=jobs)
@@ -76,7 +78,7 @@ def simulate(name: str, worlds: int, jobs: int) -> Simulated:
     return collect(views)
 
 
-def collect(views: Iterable[WorldView]) -> Simulated:
+def collect(views: Iterable[WorldView]) -> SimulatedViews:
     """Collect views into one array (n, ...) for each field."""
     rows = list(views)
     columns = {name: np.array([getattr(r, name) for r in rows]) for name in WorldView._fields}
@@ -88,11 +90,11 @@ def collect(views: Iterable[WorldView]) -> Simulated:
         distances=columns["distance"],
         seconds=columns["seconds"],
     )
-    circumstances = {name: columns[name] for name in Simulated._fields[1:]}
-    return Simulated(described, **circumstances)
+    circumstances = {name: columns[name] for name in SimulatedViews._fields[1:]}
+    return SimulatedViews(described, **circumstances)
 
 
-def clear_views(views: Simulated) -> Bool:
+def clear_views(views: SimulatedViews) -> Bool:
     """Return the mask (n,) of whole, mostly visible, well segmented views that are not upside down.
 
     If detection merges an object with others, no category is right. The evaluation of the detection
@@ -101,7 +103,9 @@ def clear_views(views: Simulated) -> Bool:
     return np.asarray(~partial_views(views) & (views.resting_pose != "upside_down"))
 
 
-def partial_views(views: Simulated) -> Bool:
+def partial_views(views: SimulatedViews) -> Bool:
     """Return the mask (n,) of views that show a part of an object, more than it, or background."""
     parts = np.isin(views.source, ("fragment", "background"))
-    return np.asarray(parts | (views.visible < MOSTLY) | (views.overlap < CUT_WELL))
+    return np.asarray(
+        parts | (views.visible < MOSTLY_VISIBLE) | (views.overlap < WELL_SEGMENTED_IOU)
+    )

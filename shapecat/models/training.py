@@ -14,8 +14,8 @@ from shapecat.evaluation.training import fit_views
 from shapecat.learning import Categorizer, save_model
 from shapecat.learning.training import Examples, fit_threshold
 from shapecat.models.growing import growing_options
-from shapecat.models.judging import judge
-from shapecat.models.sets import SETS, Simulated, partial_views, simulate
+from shapecat.models.model_evaluation import evaluate_model
+from shapecat.models.sets import SETS, SimulatedViews, partial_views, simulate
 
 __all__ = ["main"]
 
@@ -50,10 +50,10 @@ def main(
     train, held_out = sets["training"], sets["calibration"]
     model = _fit(train, held_out, seed, jobs)
     save_model(out / "default.npz", model)
-    judge(out, model, sets, seed=seed, jobs=jobs, meshes=meshes, recorded=recorded)
+    evaluate_model(out, model, sets, seed=seed, jobs=jobs, meshes=meshes, recorded=recorded)
 
 
-def _fit(train: Simulated, held_out: Simulated, seed: int, jobs: int) -> Categorizer:
+def _fit(train: SimulatedViews, held_out: SimulatedViews, seed: int, jobs: int) -> Categorizer:
     """Train a model; fit its temperature on all held-out views, its threshold on partial ones."""
     choices = {"blocks": tuple(BLOCKS), "jobs": jobs, "rejected": _REJECTED, **_TREES}
     model = fit_views(train.views, held_out.views, seed=seed, **choices)

@@ -23,14 +23,14 @@ from shapecat.geometry import (
     transform,
 )
 from shapecat.models.arrangements import (
-    ALONE,
+    BARE_TABLE,
     ArrangedObject,
     Arrangement,
     ArrangementOptions,
     arrange,
     placed,
 )
-from shapecat.models.fragments import cut_fragment, cut_halo
+from shapecat.models.fragments import cut_fragment, remove_base
 from shapecat.models.rendered_views import RenderedView, render_view
 from shapecat.simulation.mesh import Mesh, moved
 from shapecat.simulation.placement import StablePose
@@ -89,7 +89,7 @@ class WorldView(NamedTuple):
     view: View | None
 
 
-class _Seen(NamedTuple):
+class _Conditions(NamedTuple):
     """An object or background in an image: label and circumstances as in `WorldView`."""
 
     label: str
@@ -149,7 +149,7 @@ def simulate_mesh(
     cameras : number of viewpoints, each with its own sensor.
     """
     item = ArrangedObject(moved(mesh, stable_pose.pose), label, stable_pose.name, 0.0)
-    alone = Arrangement([placed(item, (0.0, 0.0), 0.0, rng)], (ALONE,))
+    alone = Arrangement([placed(item, (0.0, 0.0), 0.0, rng)], (BARE_TABLE,))
     return describe_arrangement(alone, name, cameras=cameras, rng=rng)
 
 
@@ -197,19 +197,21 @@ def _views_of(
     rng: np.random.Generator,
 ) -> list[WorldView]:
     """Return a view of an object, segmented by truth or detection; of some, a partial one too."""
-    found = _cut_by_detection(image, scene, k)
+    found = _segment_by_detection(image, scene, k)
     if found is not None and rng.random() < _DETECTED:
         (view, overlap), source = found, "detected"
     else:
-        view, overlap = cut_halo(_cut_by_truth(image, k, item, rng), rng), 1.0
+        view, overlap = remove_base(_segment_by_truth(image, k, item, rng), rng), 1.0
         source = "truth"
     view = View(view.points, view.eye, item.label, instance)
-    seen = _Seen(item.label, item.resting_pose, image.sensor, float(image.visible[k]), overlap)
-    described = [_described(view, source, seen)]
+    conditions = _Conditions(
+        item.label, item.resting_pose, image.sensor, float(image.visible[k]), overlap
+    )
+    described = [_described(view, source, conditions)]
     if rng.random() < _FRAGMENTS:
         piece = cut_fragment(view, rng)
         if piece is not None:
-            described.append(_described(piece, "fragment", seen))
+            described.append(_described(piece, "fragment", conditions))
     return [each for each in described if each is not None]
 
 
@@ -221,12 +223,12 @@ def _background(image: RenderedView, scene: Scene, objects: int, name: str) -> l
         mine = mesh_ids[candidate.indices]
         if np.mean((mine >= 0) & (mine < objects)) <= _BACKGROUND:
             view = replace(_view_of(image, scene, candidate), category=UNKNOWN, instance=name)
-            seen = _Seen(UNKNOWN, "upright", image.sensor, visible=1.0, overlap=1.0)
-            views.append(_described(view, "background", seen))
+            conditions = _Conditions(UNKNOWN, "upright", image.sensor, visible=1.0, overlap=1.0)
+            views.append(_described(view, "background", conditions))
     return [view for view in views if view is not None and view.descriptor[_HEIGHT] < _THIN_M]
 
 
-def _cut_by_detection(image: RenderedView, scene: Scene, k: int) -> tuple[View, float] | None:
+def _segment_by_detection(image: RenderedView, scene: Scene, k: int) -> tuple[View, float] | None:
     """Return the object as detection segments it, with the IoU; None if it was not found."""
     mesh_ids = image.mesh_ids.reshape(-1)
     valid = np.asarray(image.frame.depth).reshape(-1) > 0
@@ -247,7 +249,7 @@ def _view_of(image: RenderedView, scene: Scene, candidate: Candidate) -> View:
     return View(transform(level, points), level.translation, "", "")
 
 
-def _cut_by_truth(
+def _segment_by_truth(
     image: RenderedView, k: int, item: ArrangedObject, rng: np.random.Generator
 ) -> View:
     """Return the object's true pixels in a level frame with errors of half a degree and 2 mm."""
@@ -267,7 +269,7 @@ def _centre(item: ArrangedObject) -> F8:
     return np.asarray((points.min(axis=0) + points.max(axis=0)) / 2)
 
 
-def _described(view: View, source: str, seen: _Seen) -> WorldView | None:
+def _described(view: View, source: str, conditions: _Conditions) -> WorldView | None:
     """Describe a view by its voxels, which also seed the random generator; None if too few."""
     distance = float(np.linalg.norm(view.points.mean(axis=0) - view.eye))
     view = replace(view, points=voxelize(view.points, voxel_m=_SETTINGS.surface.voxel_m))
@@ -283,5 +285,5 @@ def _described(view: View, source: str, seen: _Seen) -> WorldView | None:
         seconds=described.seconds,
         source=source,
         view=view,
-        **seen._asdict(),
+        **conditions._asdict(),
     )

@@ -19,13 +19,20 @@ from shapecat.models.card import PICTURE, Table, format_table, write_card
 from shapecat.models.meshes import mesh_views
 from shapecat.models.pictures import draw, worst_mistakes
 from shapecat.models.recorded import detected_views, labelled_views
-from shapecat.models.sets import CUT_WELL, MOSTLY, Simulated, clear_views, collect, options_of
+from shapecat.models.sets import (
+    MOSTLY_VISIBLE,
+    WELL_SEGMENTED_IOU,
+    SimulatedViews,
+    clear_views,
+    collect,
+    options_of,
+)
 from shapecat.models.worlds import WorldView, simulate_views, simulate_world
 from shapecat.simulation.distractors import DISTRACTORS
 from shapecat.simulation.sensors import PRESETS
 from shapecat.types import UNKNOWN
 
-__all__ = ["judge"]
+__all__ = ["evaluate_model"]
 
 _TRACK_SEED, _TRACK_TABLES = 100_006, 24
 _DRAWN = 20
@@ -35,10 +42,10 @@ _HEAD = ("", "views", "accuracy", "balanced", "ECE", "known rejected", "unknown 
 _text = partial(figure_text, missing="")
 
 
-def judge(
+def evaluate_model(
     out: Path,
     model: Categorizer,
-    sets: dict[str, Simulated],
+    sets: dict[str, SimulatedViews],
     *,
     seed: int,
     jobs: int,
@@ -61,8 +68,8 @@ def judge(
     rows = [_figures(name, report) for name, report in _parts(sets["test"], model)]
     tracks = {"simulated": collect(_tracks(jobs))}
     if meshes is not None:
-        seen = collect(mesh_views(meshes, seed=seed))
-        rows += [_figures(f"meshes: {n}", report) for n, report in _parts(seen, model)]
+        of_meshes = collect(mesh_views(meshes, seed=seed))
+        rows += [_figures(f"meshes: {n}", report) for n, report in _parts(of_meshes, model)]
         tracks["meshes"] = collect(
             mesh_views(meshes, seed=seed + 1, placements=1, cameras=max(FUSED))
         )
@@ -94,11 +101,11 @@ def judge(
 def _test_views() -> list[WorldView]:
     """Return clear views of a few tables of the test set, with their points."""
     options = replace(options_of("test"), keep=True)
-    seen = [view for number in range(_DRAWN) for view in simulate_world(options, number)]
-    return [view for view, clear in zip(seen, clear_views(collect(seen)), strict=True) if clear]
+    views = [view for number in range(_DRAWN) for view in simulate_world(options, number)]
+    return [view for view, clear in zip(views, clear_views(collect(views)), strict=True) if clear]
 
 
-def _parts(views: Simulated, model: Categorizer) -> list[tuple[str, Report]]:
+def _parts(views: SimulatedViews, model: Categorizer) -> list[tuple[str, Report]]:
     """Return a report for each part of a set; the parts differ in difficulty."""
     background = views.source == "background"
     whole = (views.source != "fragment") & ~background
@@ -111,10 +118,10 @@ def _parts(views: Simulated, model: Categorizer) -> list[tuple[str, Report]]:
         "of these, nearer than 1.4 m": clear & (views.views.distances < 1.4),
         **{f"of these, by {name}": clear & (views.sensor == name) for name in PRESETS},
         "upside down": whole & (views.resting_pose == "upside_down"),
-        "30 to 70 % visible": whole & (views.visible < MOSTLY),
+        "30 to 70 % visible": whole & (views.visible < MOSTLY_VISIBLE),
         "fragments": views.source == "fragment",
         "background": background,
-        "badly segmented (IoU 0.5 to 0.75)": whole & (views.overlap < CUT_WELL),
+        "badly segmented (IoU 0.5 to 0.75)": whole & (views.overlap < WELL_SEGMENTED_IOU),
         "as detected": clear & (views.source == "detected"),
         "all": np.ones_like(clear),
     }
@@ -147,7 +154,7 @@ def _figures(name: str, report: Report) -> tuple[str, ...]:
     return (name, str(report.n), *map(_text, values))
 
 
-def _counts(sets: dict[str, Simulated]) -> list[tuple[str, ...]]:
+def _counts(sets: dict[str, SimulatedViews]) -> list[tuple[str, ...]]:
     return [
         (
             name,
@@ -167,11 +174,11 @@ def _tracks(jobs: int) -> Iterable[WorldView]:
     return simulate_views(options, range(_TRACK_TABLES), jobs=jobs)
 
 
-def _fused_table(tracks: dict[str, Simulated], model: Categorizer) -> Table:
+def _fused_table(tracks: dict[str, SimulatedViews], model: Categorizer) -> Table:
     """Return a table of the accuracy after fusing several views of one placement of an object."""
     rows = []
-    for name, seen in tracks.items():
-        clear = seen.where(clear_views(seen))
+    for name, views in tracks.items():
+        clear = views.where(clear_views(views))
         for which in ("any but upside down", "upright", "lying"):
             mine = clear.where((clear.resting_pose == which) | (which not in _RESTING_POSES))
             report = evaluate(mine.views, model)
