@@ -14,7 +14,7 @@ from shapecat.simulation.placement import choose_stable_pose, stable_poses
 from shapecat.simulation.primitives import lathe, rounded_box, tube
 from shapecat.simulation.render import geometry, render
 from shapecat.simulation.shapes import make_object
-from shapecat.simulation.worlds import turned_about_z
+from shapecat.simulation.worlds import pose_from_yaw
 from shapecat.types import CATEGORIES, Camera, Pose
 
 HERE = Pose(np.eye(3), np.zeros(3))
@@ -150,7 +150,7 @@ def test_lying_object_touches_ground_and_does_not_roll(
     stable_pose = choose_stable_pose(stable_poses(mesh), "lying", rng)
     if stable_pose is None:
         return
-    pose = compose(turned_about_z(angle, [0.3, -0.2, 0.7]), stable_pose.pose)
+    pose = compose(pose_from_yaw(angle, [0.3, -0.2, 0.7]), stable_pose.pose)
     points = moved(mesh, pose).vertices
 
     assert float(points[:, 2].min()) == pytest.approx(0.7, abs=2e-5)

@@ -1,1 +1,1 @@
-"""The default model and the detection's decision trees, with the programs that make them."""
+"""The default model, the decision trees of the detection, and the programs that train them."""

@@ -15,7 +15,7 @@ from shapecat.simulation.placement import choose_stable_pose, stable_poses
 from shapecat.simulation.primitives import rounded_box
 from shapecat.simulation.rooms import room
 from shapecat.simulation.shapes import make_object
-from shapecat.simulation.worlds import PlacedObject, World, turned_about_z
+from shapecat.simulation.worlds import PlacedObject, World, pose_from_yaw
 from shapecat.types import CATEGORIES, UNKNOWN, Pose
 
 __all__ = ["BARE_TABLE", "ArrangedObject", "Arrangement", "ArrangementOptions", "arrange", "placed"]
@@ -32,7 +32,7 @@ _RESTING_POSES = {
 }
 _ROUND = {"cup", "can", "bottle"}
 _RESIZED = 0.3
-"""Fraction of the tables whose objects are all smaller or larger than usual, by `_SIZES`."""
+"""Fraction of the tables on which all objects are scaled by one factor in the range `_SIZES`."""
 _SIZES = (0.55, 1.5)
 
 
@@ -47,11 +47,11 @@ class ArrangementOptions:
     unknown : fraction of the objects that are distractors.
     lying : fraction of cups, cans and bottles that lie; None for the default. Lying objects are
         harder, so training uses more of them.
-    leaning : fraction of the objects on tables that are tilted, as if they leant on something.
+    leaning : fraction of the objects on tables that are tilted, as if they leaned on something.
     settled : fraction of the arrangements made by physics: piles, bins, crowded compartments,
         tables in rooms.
     cameras : number of images of each arrangement.
-    background : whether thin detections of furniture and noise are views of ``unknown``, too.
+    background : whether to add thin detections of furniture and noise as views of ``unknown``.
     keep : whether to keep the points of the views.
     """
 
@@ -74,7 +74,7 @@ class ArrangedObject(NamedTuple):
     mesh : metres, in the frame of the arrangement.
     label : category, or ``unknown``.
     resting_pose : ``upright``, ``upside_down``, ``lying``, ``leaning`` or ``tilted``.
-    support_m : height of the surface that it stands on; in piles, of its lowest vertex.
+    support_m : height of the supporting surface; in piles, of the lowest vertex.
     """
 
     mesh: Mesh
@@ -84,7 +84,7 @@ class ArrangedObject(NamedTuple):
 
 
 class Arrangement(NamedTuple):
-    """Objects and furniture, with the supporting surface at z = 0, and the range of viewpoints.
+    """Objects and furniture on a supporting surface at z = 0, and a range of viewpoints.
 
     ``elevation`` and ``azimuth`` are ranges in degrees; the open side of a shelf is at azimuth -90.
     """
@@ -96,25 +96,25 @@ class Arrangement(NamedTuple):
 
 
 BARE_TABLE = moved(rounded_box(_TABLE_M), Pose(np.eye(3), np.array([0.0, 0.0, -_TABLE_M[2]])))
-"""A table without a room around it."""
+"""A table outside any room."""
 _SETTLED: tuple[tuple[Callable[..., World], float, Arrangement], ...] = (
     (pile, 0.5, Arrangement([], (), (8.0, 90.0))),
     (bin_picking, 0.15, Arrangement([], (), (50.0, 90.0))),
     (shelf_bin, 0.15, Arrangement([], (), (5.0, 35.0), (-120.0, -60.0))),
     (room, 0.2, Arrangement([], (), (8.0, 80.0))),
 )
-"""Scenes made by physics, their probabilities, and the viewpoints for them."""
+"""Physics scenes with their probabilities and viewpoints."""
 
 
 def arrange(options: ArrangementOptions, rng: np.random.Generator) -> Arrangement:
-    """Arrange random objects on a table, or let them settle by physics."""
+    """Place random objects on a table, or drop them in a physics simulation."""
     if options.settled > 0 and rng.random() < options.settled:
-        return _settled(options, rng)
-    return Arrangement(_spread(options, rng), (BARE_TABLE,))
+        return _drop_objects(options, rng)
+    return Arrangement(_place_on_table(options, rng), (BARE_TABLE,))
 
 
-def _settled(options: ArrangementOptions, rng: np.random.Generator) -> Arrangement:
-    """Let 4 to 18 objects settle in a pile, a bin, a compartment of a shelf, or a room."""
+def _drop_objects(options: ArrangementOptions, rng: np.random.Generator) -> Arrangement:
+    """Drop 4 to 18 objects into a pile, a bin, a shelf compartment, or a room."""
     chosen = int(rng.choice(len(_SETTLED), p=[share for _, share, _ in _SETTLED]))
     make, _, seen_from = _SETTLED[chosen]
     names = rng.choice(CATEGORIES, int(rng.integers(4, 19)))
@@ -136,8 +136,8 @@ def _arranged_object(item: PlacedObject, down: Pose) -> ArrangedObject:
     return ArrangedObject(mesh, item.category, resting_pose, float(mesh.vertices[:, 2].min()))
 
 
-def _spread(options: ArrangementOptions, rng: np.random.Generator) -> list[ArrangedObject]:
-    """Place objects on the table: apart, close together, or one on another."""
+def _place_on_table(options: ArrangementOptions, rng: np.random.Generator) -> list[ArrangedObject]:
+    """Place objects on the table: apart, close together, or stacked."""
     objects: list[ArrangedObject] = []
     spots: list[tuple[float, float, float]] = []
     gap = float(rng.choice([0.003, 0.02, 0.08]))
@@ -172,7 +172,7 @@ def _make(options: ArrangementOptions, rng: np.random.Generator, size: float) ->
 def _at_rest(
     mesh: Mesh, label: str, options: ArrangementOptions, rng: np.random.Generator
 ) -> ArrangedObject:
-    """Draw a resting pose from those usual for the label; upright if the mesh has none like it."""
+    """Draw a usual resting pose of the label; upright if the mesh has no such stable pose."""
     chances = dict(_RESTING_POSES.get(label, {"upright": 1.0}))
     if options.lying is not None and label in _ROUND:
         chances["upright"] += chances["lying"] - options.lying
@@ -187,7 +187,7 @@ def _at_rest(
 
 
 def _tilted(item: ArrangedObject, rng: np.random.Generator) -> ArrangedObject:
-    """Tilt an object by 5 to 25 degrees, as if it leant on something."""
+    """Tilt an object by 5 to 25 degrees, as if it leaned on something."""
     azimuth, half = rng.uniform(0, 2 * np.pi), np.radians(rng.uniform(5, 25)) / 2
     axis = np.sin(half) * np.array([np.cos(azimuth), np.sin(azimuth), 0.0])
     turn = Pose(rotation_from_quaternion(np.round([*axis, np.cos(half)], 9)), np.zeros(3))
@@ -198,16 +198,16 @@ def placed(
     item: ArrangedObject, spot: tuple[float, float], support_m: float, rng: np.random.Generator
 ) -> ArrangedObject:
     """Turn an object randomly about z and place it at ``spot`` (x, y) and height, in metres."""
-    pose = turned_about_z(rng.uniform(0, 2 * np.pi), [*spot, support_m])
+    pose = pose_from_yaw(rng.uniform(0, 2 * np.pi), [*spot, support_m])
     return item._replace(mesh=moved(item.mesh, pose), support_m=support_m)
 
 
 def _free_spot(
     spots: Sequence[tuple[float, float, float]], radius: float, rng: np.random.Generator
 ) -> tuple[float, float] | None:
-    """Return a free position (x, y) near the middle of the table, None if there is no room.
+    """Return a free position (x, y) near the middle of the table; None if there is none.
 
-    ``spots`` are the (x, y, radius) of the objects so far; metres.
+    ``spots`` holds the (x, y, radius) of the objects placed so far, in metres.
     """
     for half_width in np.repeat([0.08, 0.16, 0.26, 0.36], 4):
         x, y = rng.uniform(-half_width, half_width, 2)

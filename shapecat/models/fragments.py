@@ -1,4 +1,4 @@
-"""Partial views of objects, as if occluded by a nearer object."""
+"""Partial views of objects, as behind an occluder."""
 
 from dataclasses import replace
 
@@ -12,7 +12,7 @@ __all__ = ["cut_fragment", "remove_base"]
 _FEWEST_POINTS = 60
 _KEPT = (0.3, 0.85)
 _LOW = 0.3
-"""A fragment must reach into this lowest fraction of the height, near the support."""
+"""A fragment contains points in this lowest fraction of the height, near the support."""
 _TRIES = 8
 
 
@@ -21,8 +21,8 @@ def cut_fragment(view: View, rng: np.random.Generator) -> View | None:
 
     Returns
     -------
-    A view with 30 to 85 % of the points, at least 60, some of them near the support; None if eight
-    tries found no such piece.
+    A view with 30 to 85 % of the points, at least 60, some of them near the support; None after
+    eight failed attempts.
     """
     across = _image_plane(view)
     height = view.points[:, 2]
@@ -37,9 +37,9 @@ def cut_fragment(view: View, rng: np.random.Generator) -> View | None:
 
 
 def remove_base(view: View, rng: np.random.Generator) -> View:
-    """Remove the lowest points, as plane removal does; more are removed at a larger distance.
+    """Remove the points near the support, as plane removal does.
 
-    At 1 m, the lowest 4 to 9 mm are removed.
+    The removed layer is 4 to 9 mm thick at 1 m, and thicker at larger distances.
     """
     distance = float(np.linalg.norm(view.eye - view.points.mean(axis=0)))
     cut = rng.uniform(0.003, 0.006) + 0.003 * distance**2 * rng.uniform(0.3, 1.0)

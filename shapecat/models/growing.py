@@ -1,4 +1,4 @@
-"""Growing boosted trees as binary classifiers for the detection."""
+"""Training of boosted trees as binary classifiers for the detection."""
 
 from collections.abc import Callable, Iterable
 from concurrent.futures import ProcessPoolExecutor
@@ -48,10 +48,10 @@ def growing_options(out: Path) -> Callable[[Callable[..., Any]], Callable[..., A
 def collect_chunks(
     collect: Callable[[Any], _T], series: Iterable[Any], size: int, jobs: int
 ) -> list[_T]:
-    """Collect from series of scenes in spawned processes, and show the progress.
+    """Collect samples from series of scenes in spawned processes, and show the progress.
 
-    A series has a ``first`` seed and a number of ``scenes``; each call gets one of at most ``size``
-    scenes. The results are in order.
+    A series has a ``first`` seed and a number of ``scenes``; each call gets a chunk of at most
+    ``size`` scenes. The results are in order.
     """
     chunks = [
         one._replace(first=one.first + k, scenes=min(size, one.scenes - k))

@@ -1,4 +1,4 @@
-"""Views of scanned and CAD meshes, to evaluate a model on shapes from outside the simulator."""
+"""Views of scanned and CAD meshes, for evaluation on shapes that the simulator does not make."""
 
 from collections.abc import Iterator
 from pathlib import Path
@@ -24,7 +24,7 @@ def mesh_views(
     ----------
     placements : number of rounds. In each, a mesh is placed 3 times upright and 2 times lying;
         balls, bowls and plates are always upright.
-    cameras : images of each placement, whose views share their instance name.
+    cameras : images of each placement; their views share an instance name.
 
     Raises
     ------

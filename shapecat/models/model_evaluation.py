@@ -1,4 +1,4 @@
-"""Evaluate a model on data that it has not seen, and write the results into its card."""
+"""Evaluate a model on held-out data, and write the results into its card."""
 
 from collections.abc import Iterable, Sequence
 from dataclasses import replace
@@ -36,7 +36,7 @@ __all__ = ["evaluate_model"]
 
 _TRACK_SEED, _TRACK_TABLES = 100_006, 24
 _DRAWN = 20
-"""Number of test tables from which the worst mistakes are drawn."""
+"""Number of test tables among which to find the worst mistakes."""
 _RESTING_POSES = ("upright", "lying")
 _HEAD = ("", "views", "accuracy", "balanced", "ECE", "known rejected", "unknown rejected", "AUROC")
 _text = partial(figure_text, missing="")
@@ -57,7 +57,7 @@ def evaluate_model(
     Parameters
     ----------
     sets : the sets named in `SETS`.
-    meshes : folder of meshes to evaluate on; None for none.
+    meshes : folder of meshes to evaluate on, if any.
     recorded : folders of labelled recordings to evaluate on.
 
     Raises
@@ -99,14 +99,14 @@ def evaluate_model(
 
 
 def _test_views() -> list[WorldView]:
-    """Return clear views of a few tables of the test set, with their points."""
+    """Return the clear views of a few test tables, with their points."""
     options = replace(options_of("test"), keep=True)
     views = [view for number in range(_DRAWN) for view in simulate_world(options, number)]
     return [view for view, clear in zip(views, clear_views(collect(views)), strict=True) if clear]
 
 
 def _parts(views: SimulatedViews, model: Categorizer) -> list[tuple[str, Report]]:
-    """Return a report for each part of a set; the parts differ in difficulty."""
+    """Return a report for each subset of the views; the subsets differ in difficulty."""
     background = views.source == "background"
     whole = (views.source != "fragment") & ~background
     clear = clear_views(views)
@@ -167,7 +167,7 @@ def _counts(sets: dict[str, SimulatedViews]) -> list[tuple[str, ...]]:
 
 
 def _tracks(jobs: int) -> Iterable[WorldView]:
-    """Simulate tables that are seen from many viewpoints."""
+    """Simulate tables, each from many viewpoints."""
     options = ArrangementOptions(
         _TRACK_SEED, tuple(DISTRACTORS), unknown=0.0, cameras=max(FUSED) + 6
     )
@@ -175,7 +175,7 @@ def _tracks(jobs: int) -> Iterable[WorldView]:
 
 
 def _fused_table(tracks: dict[str, SimulatedViews], model: Categorizer) -> Table:
-    """Return a table of the accuracy after fusing several views of one placement of an object."""
+    """Return a table of the accuracy of several fused views of one placement of an object."""
     rows = []
     for name, views in tracks.items():
         clear = views.where(clear_views(views))

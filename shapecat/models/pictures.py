@@ -29,7 +29,7 @@ class Mistake(NamedTuple):
 def worst_mistakes(
     views: Sequence[WorldView], model: Categorizer, *, count: int = 12
 ) -> list[Mistake]:
-    """Return up to ``count`` mistakes on different objects, the most confident ones first."""
+    """Return up to ``count`` mistakes on different objects, most confident first."""
     answer = model.predict(np.array([world_view.descriptor for world_view in views]))
     found = []
     for world_view, posterior, novelty in zip(
@@ -49,7 +49,7 @@ def worst_mistakes(
 
 
 def draw(path: Path, mistakes: Sequence[Mistake]) -> None:
-    """Draw the points of each mistaken view from the sensor's side, with the predicted label."""
+    """Draw the points of each view from the sensor's viewpoint, with the predicted label."""
     import matplotlib as mpl  # noqa: PLC0415  only for pictures
 
     mpl.use("agg")

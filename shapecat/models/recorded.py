@@ -1,4 +1,4 @@
-"""Views of real objects from recordings with hand-made labels, to evaluate a model.
+"""Views of real objects from hand-labelled recordings, for evaluation.
 
 A folder holds ``depth.mcap`` and ``truth.json``, with one entry per frame. Each of its ``objects``
 has a ``category`` and either its ``parts``, the numbers of its pixels in the label images of
@@ -25,13 +25,13 @@ from shapecat.types import Frame, Scene
 __all__ = ["detected_views", "labelled_views"]
 
 _OVERLAP = 0.5
-"""IoU of masks at which a detection matches an object."""
+"""Minimum IoU of the masks of a detection and its object."""
 _STACKED_M = 0.025
-"""An object whose lowest points are this far above the table stands on another object."""
+"""Height of an object's lowest points above the table from which it stands on another object."""
 
 
 def labelled_views(folder: Path) -> Iterator[View]:
-    """Yield the unambiguous objects of a folder with label images, segmented by these labels."""
+    """Yield the unambiguous objects of a folder, segmented by its label images."""
     labels = np.load(folder / "labels.npz", allow_pickle=False)
     images = labels[labels.files[0]]
     for number, (frame, truth) in enumerate(_frames(folder)):
@@ -50,7 +50,7 @@ def labelled_views(folder: Path) -> Iterator[View]:
 def detected_views(folder: Path) -> Iterator[View]:
     """Yield the unambiguous objects of a folder, segmented by shapecat's detection.
 
-    Objects that are missed, or merged with others, are left out.
+    Missed objects, and those merged with others, are left out.
     """
     path = folder / "labels.npz"
     labels = np.load(path, allow_pickle=False) if path.exists() else None
@@ -62,7 +62,7 @@ def detected_views(folder: Path) -> Iterator[View]:
         for item in truth["objects"]:
             if item.get("ambiguous", False):
                 continue
-            found = _by_label(scene, image, item) if image is not None else _by_place(scene, item)
+            found = _nearest(scene, item) if image is None else _best_overlap(scene, image, item)
             if found is None:
                 continue
             candidate = scene.candidates[found]
@@ -114,7 +114,7 @@ def _table(frame: Frame, image: np.ndarray) -> tuple[F8, float]:
     return normal, float(normal @ centre)
 
 
-def _by_label(scene: Scene, image: np.ndarray, item: dict[str, Any]) -> int | None:
+def _best_overlap(scene: Scene, image: np.ndarray, item: dict[str, Any]) -> int | None:
     """Return the index of the candidate with the best IoU; None if it is too small."""
     mine = np.isin(image, item["parts"])
     shares = [
@@ -124,7 +124,7 @@ def _by_label(scene: Scene, image: np.ndarray, item: dict[str, Any]) -> int | No
     return int(np.argmax(shares)) if shares and max(shares) >= _OVERLAP else None
 
 
-def _by_place(scene: Scene, item: dict[str, Any]) -> int | None:
+def _nearest(scene: Scene, item: dict[str, Any]) -> int | None:
     """Return the index of the candidate nearest to an object; None if it is too far."""
     place = np.array(item["centroid_m"])
     gaps = [float(np.linalg.norm(c.box.center - place)) for c in scene.candidates]

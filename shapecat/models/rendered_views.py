@@ -1,4 +1,4 @@
-"""Images of arrangements, as random depth cameras see them from random viewpoints."""
+"""Depth images of arrangements from random viewpoints, by random cameras."""
 
 from dataclasses import replace
 from typing import NamedTuple
@@ -17,16 +17,16 @@ __all__ = ["RenderedView", "render_view"]
 
 _FEWEST_PIXELS = 80
 _COARSE = 4
-"""Visible fractions are computed in images this many times smaller."""
+"""Downsampling factor of the images that give the visible fractions."""
 _SCALES = (0.5, 1.0, 1.0, 1.0, 1.5)
-"""Factors on the sensors' own resolutions."""
+"""Scale factors of the image sizes; each is drawn with equal probability."""
 _WIDTHS = (224, 1280)
 """Minimum and maximum image width, pixels."""
 _OFTEN = {"kinect": 3.0, "realsense": 2.0}
-"""Weights of sensors that most recordings come from; others have weight 1."""
+"""Weights of the most common sensors; others have weight 1."""
 _DISTANCES_M = (0.25, 3.0)
 _CLOSER_M = 0.03
-"""Minimum distance of the target beyond the sensor's near limit."""
+"""Minimum distance from the sensor's near limit to the target."""
 
 
 class RenderedView(NamedTuple):
@@ -90,7 +90,7 @@ def _draw_sensor(rng: np.random.Generator) -> tuple[str, Sensor]:
 
 
 def _viewpoint(arrangement: Arrangement, sensor: Sensor, rng: np.random.Generator) -> Pose:
-    """Return ``table_from_camera``: 0.25 to 3 m away, in the elevations of the arrangement."""
+    """Draw ``table_from_camera``, 0.25 to 3 m away, in the angles of the arrangement."""
     points = np.concatenate([item.mesh.vertices for item in arrangement.objects])
     target = points.mean(axis=0) + rng.normal(0, 0.04, 3)
     nearest, farthest = _DISTANCES_M
@@ -114,8 +114,8 @@ def _visible_fractions(
 ) -> F8:
     """Return the visible fraction of each object, (count,).
 
-    It is the number of readings divided by the pixels that the object would have alone in an image
-    twice as wide and high; 0 with fewer than `_FEWEST_PIXELS` readings.
+    The object's depth pixels are divided by its pixels in an unoccluded image twice as wide and
+    high; the fraction is 0 with fewer than `_FEWEST_PIXELS` depth pixels.
     """
     seen_pixels = np.bincount(mesh_ids[mesh_ids >= 0], minlength=count + 1)
     width, height = camera.width // _COARSE, camera.height // _COARSE

@@ -30,22 +30,22 @@ __all__ = [
 ]
 
 SETS = {"training": (1, 100_000), "calibration": (2, 160), "test": (100_003, 100)}
-"""Seed and maximum number of tables of each set; seeds from 100000 on are for evaluation only."""
+"""Seed and maximum number of tables of each set; seeds from 100000 up are for evaluation only."""
 _SHARES: dict[str, dict[str, Any]] = {
     "training": {"unknown": 0.3, "lying": 0.35, "leaning": 0.05, "settled": 0.5, "cameras": 10},
     "calibration": {"unknown": 0.17, "settled": 0.5},
     "test": {"unknown": 0.3, "settled": 0.5},
 }
 WELL_SEGMENTED_IOU = 0.75
-"""Lowest IoU of a detection that counts as well segmented."""
+"""Minimum IoU of a well segmented detection."""
 MOSTLY_VISIBLE = 0.7
-"""Lowest visible fraction of an object that counts as mostly visible."""
+"""Minimum visible fraction of a mostly visible object."""
 _TIMES = 3
-"""Frequency of a family of procedural objects, relative to that of a kind of distractor."""
+"""How much more often a procedural family is drawn than another kind of distractor."""
 
 
 class SimulatedViews(NamedTuple):
-    """Simulated views with the circumstances of each, (n,), as in `WorldView`."""
+    """Simulated views, and the conditions (n,) of each as in `WorldView`."""
 
     views: DescribedViews
     resting_pose: np.ndarray
@@ -56,14 +56,12 @@ class SimulatedViews(NamedTuple):
 
     def where(self, chosen: Bool) -> "SimulatedViews":
         """Return the views that a mask (n,) selects."""
-        _, *circumstances = self
-        return SimulatedViews(
-            self.views.where(chosen), *(column[chosen] for column in circumstances)
-        )
+        _, *conditions = self
+        return SimulatedViews(self.views.where(chosen), *(column[chosen] for column in conditions))
 
 
 def options_of(name: str) -> ArrangementOptions:
-    """Return the parameters of the arrangements of a set, given by its name in `SETS`."""
+    """Return the parameters of the arrangements of a set in `SETS`."""
     kinds = [kind for k, kind in enumerate(DISTRACTORS) if (k % 3 == 0) == (name == "test")]
     if name == "training":
         kinds += _TIMES * list(PROCEDURAL)
@@ -71,7 +69,7 @@ def options_of(name: str) -> ArrangementOptions:
 
 
 def simulate(name: str, worlds: int, jobs: int) -> SimulatedViews:
-    """Simulate up to ``worlds`` arrangements of a set, given by its name in `SETS`."""
+    """Simulate up to ``worlds`` arrangements of a set in `SETS`."""
     numbers = range(min(worlds, SETS[name][1]))
     views = simulate_views(options_of(name), numbers, jobs=jobs)
     click.echo(f"simulating {len(numbers)} tables of the {name} set", err=True)
@@ -90,15 +88,15 @@ def collect(views: Iterable[WorldView]) -> SimulatedViews:
         distances=columns["distance"],
         seconds=columns["seconds"],
     )
-    circumstances = {name: columns[name] for name in SimulatedViews._fields[1:]}
-    return SimulatedViews(described, **circumstances)
+    conditions = {name: columns[name] for name in SimulatedViews._fields[1:]}
+    return SimulatedViews(described, **conditions)
 
 
 def clear_views(views: SimulatedViews) -> Bool:
     """Return the mask (n,) of whole, mostly visible, well segmented views that are not upside down.
 
     If detection merges an object with others, no category is right. The evaluation of the detection
-    covers this case; the model card gives badly segmented views a row of their own.
+    covers this case; the model card lists badly segmented views in their own row.
     """
     return np.asarray(~partial_views(views) & (views.resting_pose != "upside_down"))
 

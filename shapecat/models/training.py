@@ -23,7 +23,8 @@ _REJECTED = 0.14
 """Fraction of the partial views of known categories that the novelty threshold rejects. Real
 objects are often partly hidden, and a partial view is more novel than a whole one."""
 _TREES: dict[str, Any] = {"rounds": 320, "leaves": 40, "rate": 0.09}
-"""The many views support trees larger than the default; fewer of them take the same time."""
+"""With so many views, the trees can be larger than the default; there are fewer of them, so that
+training takes the same time."""
 
 
 @click.command()

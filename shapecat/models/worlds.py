@@ -43,20 +43,20 @@ __all__ = ["WorldView", "simulate_mesh", "simulate_views", "simulate_world"]
 _LEAST_VISIBLE = 0.3
 _OVERLAP = 0.5
 _BACKGROUND = 0.1
-"""Largest fraction of the pixels of a detection of background that show objects."""
+"""Maximum fraction of object pixels in a detection of background."""
 _THIN_M = 0.03
-"""Height of background below which it is a view: what is higher may have the shape of a category,
-as a cupboard is a box."""
+"""Maximum height of background that counts as *unknown*: higher background may have the shape of a
+category, as a cupboard is a box."""
 _HEIGHT = DESCRIPTOR_NAMES.index("metric.height")
 _DETECTED = 0.75
-"""Fraction of the detected objects whose view is segmented by the detection."""
+"""Fraction of the detected objects that are segmented by detection; others, by the truth."""
 _FRAGMENTS = 0.3
-"""Fraction of the views that also give a partial view."""
+"""Fraction of the views of which a partial view is added."""
 _SETTINGS = Settings()
 
 
 class WorldView(NamedTuple):
-    """One described view and its circumstances.
+    """One described view and its conditions.
 
     Attributes
     ----------
@@ -65,12 +65,12 @@ class WorldView(NamedTuple):
     instance : name of the object.
     points : number of voxels.
     distance : mean distance from the sensor, metres.
-    seconds : time from points to descriptor.
+    seconds : time to compute the descriptor from the points.
     resting_pose : ``upright``, ``lying``, ``upside_down``, ``leaning`` or ``tilted``.
     source : how the view was segmented: ``truth``, ``detected`` or ``fragment``; or ``background``,
         a thin detection that shows no object, whose label is ``unknown``.
-    visible : fraction of the object's unoccluded pixels that have readings.
-    overlap : IoU of the view's points and the object's readings.
+    visible : fraction of the object's unoccluded pixels that have depth.
+    overlap : IoU of the view's points and the object's depth pixels.
     sensor : name of the sensor.
     view : the voxels; None if not kept.
     """
@@ -90,7 +90,7 @@ class WorldView(NamedTuple):
 
 
 class _Conditions(NamedTuple):
-    """An object or background in an image: label and circumstances as in `WorldView`."""
+    """Label and conditions of an object, or of background, in an image, as in `WorldView`."""
 
     label: str
     resting_pose: str
@@ -139,7 +139,7 @@ def simulate_mesh(
     cameras: int,
     rng: np.random.Generator,
 ) -> list[WorldView]:
-    """Describe one given object, alone on the table, from several viewpoints.
+    """Describe one object, alone on the table, from several viewpoints.
 
     Parameters
     ----------
@@ -168,7 +168,7 @@ def describe_arrangement(
     ----------
     name : prefix of the instance names.
     cameras : number of viewpoints, each with its own sensor.
-    background : whether to describe thin detections of background, too.
+    background : whether to describe thin detections of background as well.
     keep : whether to keep the points of the views.
     """
     objects = arrangement.objects
@@ -196,7 +196,7 @@ def _views_of(
     instance: str,
     rng: np.random.Generator,
 ) -> list[WorldView]:
-    """Return a view of an object, segmented by truth or detection; of some, a partial one too."""
+    """Return a view of an object, segmented by truth or detection, and sometimes a partial view."""
     found = _segment_by_detection(image, scene, k)
     if found is not None and rng.random() < _DETECTED:
         (view, overlap), source = found, "detected"
@@ -216,7 +216,7 @@ def _views_of(
 
 
 def _background(image: RenderedView, scene: Scene, objects: int, name: str) -> list[WorldView]:
-    """Return the thin detections that show none of the first ``objects`` meshes."""
+    """Return the thin detections that do not show any of the first ``objects`` meshes."""
     mesh_ids = image.mesh_ids.reshape(-1)
     views = []
     for candidate in scene.candidates:
@@ -229,7 +229,7 @@ def _background(image: RenderedView, scene: Scene, objects: int, name: str) -> l
 
 
 def _segment_by_detection(image: RenderedView, scene: Scene, k: int) -> tuple[View, float] | None:
-    """Return the object as detection segments it, with the IoU; None if it was not found."""
+    """Return the object as segmented by detection, and the IoU; None if it was missed."""
     mesh_ids = image.mesh_ids.reshape(-1)
     valid = np.asarray(image.frame.depth).reshape(-1) > 0
     total = int(np.count_nonzero((mesh_ids == k) & valid))
@@ -252,7 +252,7 @@ def _view_of(image: RenderedView, scene: Scene, candidate: Candidate) -> View:
 def _segment_by_truth(
     image: RenderedView, k: int, item: ArrangedObject, rng: np.random.Generator
 ) -> View:
-    """Return the object's true pixels in a level frame with errors of half a degree and 2 mm."""
+    """Return the object's true points in a level frame with errors of half a degree and 2 mm."""
     indices = np.flatnonzero((image.mesh_ids == k) & (np.asarray(image.frame.depth) > 0))
     points = image.frame.xyz(indices)
     camera_from_table = inverse(image.table_from_camera)
@@ -270,7 +270,7 @@ def _centre(item: ArrangedObject) -> F8:
 
 
 def _described(view: View, source: str, conditions: _Conditions) -> WorldView | None:
-    """Describe a view by its voxels, which also seed the random generator; None if too few."""
+    """Describe the voxels of a view, which also seed the random generator; None if too few."""
     distance = float(np.linalg.norm(view.points.mean(axis=0) - view.eye))
     view = replace(view, points=voxelize(view.points, voxel_m=_SETTINGS.surface.voxel_m))
     rng = np.random.default_rng(crc32(view.points.tobytes()))

@@ -152,7 +152,7 @@ def make_bottle(rng: Generator) -> Mesh:
         mesh = join([mesh, *_pump(rng, radius * neck, height)])
     if family == "trigger":
         mesh = join([mesh, *_trigger(rng, radius, height)])
-    return standing(_spun(mesh, rng))
+    return standing(_with_random_yaw(mesh, rng))
 
 
 def _bottle_side(rng: Generator, family: str, body: float) -> F8:
@@ -200,7 +200,7 @@ def _flattened(mesh: Mesh, stretch: float, low: float, high: float, neck: float)
 
 
 def _bent(mesh: Mesh, shift: float, low: float, high: float) -> Mesh:
-    """Move the neck to one side, as on bottles for pouring."""
+    """Shift the neck to one side, as on detergent bottles."""
     points = np.array(mesh.vertices, np.float64)
     t = np.clip((points[:, 2] - low) / (high - low), 0, 1)
     points[:, 0] += shift * t * t * (3 - 2 * t)
@@ -293,7 +293,7 @@ def make_ball(rng: Generator) -> Mesh:
     return standing(moved(mesh, Pose(rotation_from_quaternion(quaternion), np.zeros(3))))
 
 
-def _spun(mesh: Mesh, rng: Generator) -> Mesh:
+def _with_random_yaw(mesh: Mesh, rng: Generator) -> Mesh:
     angle = rng.uniform(0, np.pi)
     return moved(
         mesh, Pose(rotation_from_quaternion([0, 0, np.sin(angle), np.cos(angle)]), np.zeros(3))

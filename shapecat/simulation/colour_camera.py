@@ -34,26 +34,26 @@ COLOUR = ColourCamera(
     ),
     Pose(rotation_from_quaternion((0.004, -0.009, 0.006, 1.0)), np.array([0.05, 0.0015, -0.002])),
 )
-"""Like the colour camera of a RealSense: 5 cm to the right, turned by a degree, a wider image."""
+"""Like the colour camera of a RealSense: 5 cm to the right, rotated by a degree, wider."""
 
 _NOTHING = 18
-"""Red, green and blue where nothing is seen."""
+"""Value of red, green and blue where no surface is visible."""
 _GRAIN_M = 0.005
 _SPREAD = (73856093, 19349663, 83492791)
-"""Factors that spread the cells of the grain over its levels."""
+"""Hash factors that give each cell of the grain one of its levels."""
 _BAND = 0.6
-"""Share of a band that has the first of its two colours."""
+"""Fraction of a band that has the first of its two colours."""
 _FINE = 2
-"""Oversampling of the rendered pinhole image, which the rays of the lens then sample."""
+"""Oversampling of the pinhole image from which the distorted image is sampled."""
 
 
 def render_colour(world: World, frame: int) -> tuple[U1, U1]:
-    """Render a frame of a world as the camera `COLOUR` beside the depth camera sees it.
+    """Render a frame of a world with the camera `COLOUR` beside the depth camera.
 
     Returns
     -------
     The image (h, w, 3), uint8 red, green, blue; and its labels (h, w), uint8: those of
-    ``world.labels``, 0 where nothing is seen.
+    ``world.labels``, 0 without surface.
     """
     pose = compose(world.path[frame], COLOUR.depth_from_colour)
     fine, rows, columns = _lookup(COLOUR.lens)
@@ -125,7 +125,7 @@ def _colour_in(
     textures: F8,
     colours: U1,
 ) -> None:
-    """Write the colours (h, w, 3) of the pixels that rays hit: two-tone bands and fine grain.
+    """Paint the pixels (h, w, 3) that show a surface: two-tone bands and fine grain.
 
     The texture uses only basic arithmetic, no sines, so that images are equal on every machine.
 

@@ -41,24 +41,24 @@ def hollowness(mesh: Mesh) -> float:
     top = np.full((_COLUMNS, _COLUMNS), low[2])
     np.maximum.at(top, (column[:, 0], column[:, 1]), points[:, 2])
     step = size[:2] / _COLUMNS
-    spots = low[:2] + (np.indices((_COLUMNS, _COLUMNS)).reshape(2, -1).T + 0.5) * step
-    lid, base = _span(hull, spots)
-    covered = lid > base
-    open_m = np.clip(lid - np.maximum(top.reshape(-1), base), 0, None)[covered]
-    return float(open_m.sum() / max((lid - base)[covered].sum(), 1e-12))
+    positions = low[:2] + (np.indices((_COLUMNS, _COLUMNS)).reshape(2, -1).T + 0.5) * step
+    upper, lower = _span(hull, positions)
+    covered = upper > lower
+    open_m = np.clip(upper - np.maximum(top.reshape(-1), lower), 0, None)[covered]
+    return float(open_m.sum() / max((upper - lower)[covered].sum(), 1e-12))
 
 
-def _span(hull: ConvexHull, spots: F8) -> tuple[F8, F8]:
+def _span(hull: ConvexHull, positions: F8) -> tuple[F8, F8]:
     """Return the largest and the smallest z of a hull at horizontal positions (n, 2)."""
     upward = hull.equations[:, 2]
-    flat = np.column_stack([spots, np.ones(len(spots))])
+    flat = np.column_stack([positions, np.ones(len(positions))])
     across = flat @ hull.equations[:, [0, 1, 3]].T
     level = np.abs(upward) < 1e-9
     limit = -across / np.where(level, 1.0, upward)
-    lid = np.where(upward > 0, limit, np.inf).min(axis=1, where=~level, initial=np.inf)
-    base = np.where(upward < 0, limit, -np.inf).max(axis=1, where=~level, initial=-np.inf)
-    lid[(across[:, level] > 0).any(axis=1)] = -np.inf
-    return lid, base
+    upper = np.where(upward > 0, limit, np.inf).min(axis=1, where=~level, initial=np.inf)
+    lower = np.where(upward < 0, limit, -np.inf).max(axis=1, where=~level, initial=-np.inf)
+    upper[(across[:, level] > 0).any(axis=1)] = -np.inf
+    return upper, lower
 
 
 def _samples(mesh: Mesh) -> F8:

@@ -76,7 +76,7 @@ def make_own_arms(rng: Generator, camera: Pose, height: float) -> list[Mesh]:
 def make_resting_arms(
     rng: Generator, camera: Pose, intrinsics: Camera, height: float
 ) -> list[Mesh]:
-    """Return arms that lie on a support, or just above, and that the image border cuts off.
+    """Return arms that lie on a support or just above it, cut off by the image border.
 
     Parameters
     ----------
@@ -98,9 +98,9 @@ def make_resting_arms(
 
 
 def _on_support(uv: ArrayLike, camera: Pose, intrinsics: Camera, height: float) -> F8:
-    """Return the point (3,) at the height of a support that a pixel shows, at most 2 m away.
+    """Return the point (3,) of a support that a pixel shows, at most 2 m away.
 
-    ``uv`` is column and row of the pixel, as fractions of the image size.
+    ``uv`` is the column and row of the pixel, as fractions of the image size.
     """
     u, v = np.asarray(uv, float) * [intrinsics.width, intrinsics.height]
     ray = [(u - intrinsics.cx) / intrinsics.fx, (v - intrinsics.cy) / intrinsics.fy, 1.0]

@@ -40,7 +40,7 @@ def make_room(rng: Generator, *, wall_chance: float) -> list[Support]:
 
 
 def make_counter(rng: Generator) -> Support:
-    """Return a counter top 2.4 m long, longer than the camera sees at once."""
+    """Return a counter top 2.4 m long, longer than the field of view."""
     height, depth = rng.uniform(0.75, 0.95), rng.uniform(0.55, 0.65)
     return _slab("table", TABLE, (2.4, depth, 0.04), (0, 0, height))
 
@@ -73,7 +73,7 @@ def make_shelf(
 ) -> tuple[list[Support], list[Support]]:
     """Return three shelf boards, ``width`` by ``depth``, and the two sides and the back.
 
-    The lowest board is at z = ``low``, and each of the others ``step`` higher.
+    The lowest board is at z = ``low``; the spacing of the boards is ``step``.
     """
     thick = 0.02
     top = low + 3 * step
@@ -130,7 +130,7 @@ def make_bin(rng: Generator) -> tuple[Support, list[Support]]:
 
 
 def make_tote(rng: Generator, supports: Sequence[Support]) -> list[Support]:
-    """Return bin ``supports`` whose sides lean outwards; with probability 1/2, they have a rim."""
+    """Return bin ``supports`` with sides that lean outwards and, with probability 1/2, a rim."""
     bottom = next(support for support in supports if support.name == "bin")
     sides = [support for support in supports if support.name in _SIDES]
     points = np.concatenate([side.mesh.vertices for side in sides])

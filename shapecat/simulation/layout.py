@@ -12,13 +12,13 @@ from shapecat.simulation.footprints import Footprint, footprint, inside, overlap
 from shapecat.simulation.mesh import Mesh
 from shapecat.simulation.placement import StablePose, choose_stable_pose, stable_poses
 from shapecat.simulation.shapes import make_object
-from shapecat.simulation.worlds import PlacedObject, Support, turned_about_z
+from shapecat.simulation.worlds import PlacedObject, Support, pose_from_yaw
 from shapecat.types import Pose
 
 __all__ = ["Layout", "Piece", "make_piece"]
 
 _LYING = {"can": 0.2, "bottle": 0.22, "cup": 0.12, "box": 0.7}
-"""Probability that an object of a category lies; a box lies on any of its faces."""
+"""Probability that an object of a category lies; a box lies on any face."""
 _UPSIDE_DOWN = {"cup": 0.06, "bowl": 0.06, "plate": 0.03}
 """Probability that an open object stands on its rim."""
 _WIDEST_M = 0.42
@@ -60,11 +60,11 @@ def make_piece(category: str, rng: Generator, *, resting_pose: str | None = None
 
 
 def _draw_resting_pose(category: str, rng: Generator) -> str:
-    luck = rng.random()
-    over = _UPSIDE_DOWN.get(category, 0.0)
-    if luck < over:
+    draw = rng.random()
+    upside_down = _UPSIDE_DOWN.get(category, 0.0)
+    if draw < upside_down:
         return "upside_down"
-    return "lying" if luck < over + _LYING.get(category, 0.0) else "upright"
+    return "lying" if draw < upside_down + _LYING.get(category, 0.0) else "upright"
 
 
 class Layout:
@@ -119,7 +119,7 @@ class Layout:
         resting = footprint(piece.mesh, piece.stable_pose.pose)
         for _ in range(tries):
             spot = middle + self._rng.uniform(-half, half)
-            turn = self._drawn_turn(np.array([*spot, support.height]))
+            turn = self._random_yaw_pose(np.array([*spot, support.height]))
             here = resting.moved(turn)
             if self._fits(here, support):
                 self._add(piece, turn, here, support, None)
@@ -156,17 +156,17 @@ class Layout:
             below = self._places[k]
             slack = 0.25 * np.ptp(below.top, axis=0)
             spot = [*below.top.mean(axis=0) + self._rng.uniform(-slack, slack), below.high]
-            turn = self._drawn_turn(np.array(spot))
+            turn = self._random_yaw_pose(np.array(spot))
             here = resting.moved(turn)
             if _supports(below, here) and self._fits(here, self._base_supports[k]):
                 self._add(piece, turn, here, self._base_supports[k], self.objects[k].track)
                 return True
         return False
 
-    def _drawn_turn(self, place: F8) -> Pose:
+    def _random_yaw_pose(self, place: F8) -> Pose:
         """Return a random turn about z that moves the origin to ``place`` (3,)."""
         angle = self._rng.uniform(0, 2 * np.pi)
-        return turned_about_z(angle, np.round(place, 6))
+        return pose_from_yaw(angle, np.round(place, 6))
 
     def _fits(self, here: Footprint, support: Support) -> bool:
         on_board = here.low < support.height + 1e-4

@@ -124,12 +124,12 @@ def _shifted(track: int, along: F8) -> Motion:
 
 def _pushed(track: int, start: F8, t: F8) -> Motion:
     """Return the motion of an object pushed 0.4 m along its lane, at 0.2 m/s, from t = 0."""
-    way = -np.sign(start[0] or 1.0) * 0.4
-    return _shifted(track, way * np.clip(t * 0.2 / abs(way), 0, 1))
+    distance = -np.sign(start[0] or 1.0) * 0.4
+    return _shifted(track, distance * np.clip(t * 0.2 / abs(distance), 0, 1))
 
 
-def _carried(track: int, way: F8, t: F8) -> Motion:
-    """Return the motion of an object lifted by 15 cm and carried by ``way`` (3,), at 0.5 m/s."""
-    share = np.clip(t * 0.5 / max(float(np.linalg.norm(way)), 0.1), 0, 1)
+def _carried(track: int, displacement: F8, t: F8) -> Motion:
+    """Return the motion of an object carried by ``displacement`` (3,), 15 cm high, at 0.5 m/s."""
+    share = np.clip(t * 0.5 / max(float(np.linalg.norm(displacement)), 0.1), 0, 1)
     height = 0.6 * share * (1 - share)
-    return Motion(track, np.round(np.outer(share, way) + np.outer(height, [0, 0, 1.0]), 6))
+    return Motion(track, np.round(np.outer(share, displacement) + np.outer(height, [0, 0, 1.0]), 6))

@@ -1,4 +1,4 @@
-"""Random errors that are correlated over the image."""
+"""Random errors with spatial correlation."""
 
 from functools import lru_cache
 
@@ -21,7 +21,7 @@ def noise(
 ) -> F4:
     """Return nearly normal noise (h, w), correlated over a window (across, down) in pixels.
 
-    Sums of random bytes are many times faster than normal numbers.
+    It is a sum of random bytes, which is many times faster than normal numbers.
 
     Parameters
     ----------
@@ -43,7 +43,7 @@ def noise(
 
 
 def _gain(width: int, times: int) -> float:
-    """Return by how much summing over windows of this width, several times, raises a deviation."""
+    """Return the factor by which repeated sums over a window raise a standard deviation."""
     weights = np.ones(1)
     for _ in range(times):
         weights = np.convolve(weights, np.ones(width))
@@ -56,8 +56,8 @@ def fixed_error(shape: tuple[int, int], deviation: float, spacing: int, device: 
 
     Parameters
     ----------
-    deviation : its standard deviation, 1/m.
-    spacing : distance over which it varies, pixels.
+    deviation : standard deviation, 1/m.
+    spacing : distance over which the error varies, pixels.
     device : seed.
     """
     knots = (shape[0] // spacing + 2, shape[1] // spacing + 2)

@@ -55,7 +55,7 @@ def make_cup(rng: Generator) -> Mesh:
         sides = [0.0, np.pi] if rng.random() < 0.04 else [0.0]
         shape = _handle_shape(rng, diameter, height)
         body = join([body, *(_handle(outer, shape, wall, side) for side in sides)])
-    return _turned(body, rng)
+    return _with_random_yaw(body, rng)
 
 
 def make_bowl(rng: Generator) -> Mesh:
@@ -87,7 +87,9 @@ def make_bowl(rng: Generator) -> Mesh:
     outer = _wall([base, middle, 1.0], diameter / 2, height, power=1.0)
     rim = rng.random() < 0.15 and ratio < 0.4
     profile = _hollow(outer, wall, floor=bottom, foot=foot, lip=diameter * 0.06 if rim else 0.0)
-    return _turned(lathe(profile, **_section(rng, oval=0.06, square=0.07, facets=0.03)), rng)
+    return _with_random_yaw(
+        lathe(profile, **_section(rng, oval=0.06, square=0.07, facets=0.03)), rng
+    )
 
 
 def make_plate(rng: Generator) -> Mesh:
@@ -120,7 +122,7 @@ def make_plate(rng: Generator) -> Mesh:
         under = np.concatenate([under[: at + 1], foot, under[at + 1 :]])
     profile = np.concatenate([under, top[::-1]])
     section = _section(rng, oval=0.08, square=0.13, facets=0.02)
-    return _turned(standing(lathe(profile, **section)), rng)
+    return _with_random_yaw(standing(lathe(profile, **section)), rng)
 
 
 def _wall(shares: ArrayLike, radius: float, height: float, *, power: float) -> F8:
@@ -217,7 +219,7 @@ def _handle(outer: F8, shape: tuple[F8, float, float], wall: float, side: float)
     return tube(points, radius, segments=8, flatness=flatness)
 
 
-def _turned(mesh: Mesh, rng: Generator) -> Mesh:
+def _with_random_yaw(mesh: Mesh, rng: Generator) -> Mesh:
     """Turn a mesh by a random angle about z and place it on the origin."""
     angle = rng.uniform(0, 2 * np.pi)
     c, s = np.cos(angle), np.sin(angle)

@@ -1,4 +1,4 @@
-"""Dropping objects until they come to rest, with the physics engine MuJoCo."""
+"""Simulation of falling objects until they are at rest, with the physics engine MuJoCo."""
 
 from collections.abc import Sequence
 from typing import Any, NamedTuple
@@ -23,15 +23,15 @@ _START_SPEED = 0.1
 """Downward speed at the start of a drop, m/s."""
 _FRICTION = (0.7, 0.005, 0.002)
 """Sliding, torsional and rolling friction."""
-_CLEAR_M = 0.02
+_CLEARANCE_M = 0.02
 """Height of a dropped object above the highest object below it."""
 _FALL_STEPS = 75
 """Simulation steps between two drops."""
-_MOST_STEPS = 750
+_MAX_STEPS = 750
 """Simulation steps after the last drop, at most."""
 _STILL = 0.02
 """Speed, in m/s and rad/s, below which an object is at rest."""
-_LOOK_STEPS = 12
+_CHECK_STEPS = 12
 """Simulation steps between two checks whether everything is at rest."""
 _WAITING_M = 5.0
 """Distance from the scene at which objects wait to be dropped."""
@@ -46,7 +46,7 @@ class Drop(NamedTuple):
 
 
 class SettledPose(NamedTuple):
-    """Resting pose of a dropped object.
+    """Final pose of a dropped object.
 
     Attributes
     ----------
@@ -59,7 +59,7 @@ class SettledPose(NamedTuple):
 
 
 def settle(obstacles: Sequence[Mesh], drops: Sequence[Drop]) -> list[SettledPose]:
-    """Drop objects one after the other, each from just above the others, until all are at rest.
+    """Drop objects one by one from just above the others, and simulate until all are at rest.
 
     Parameters
     ----------
@@ -67,31 +67,32 @@ def settle(obstacles: Sequence[Mesh], drops: Sequence[Drop]) -> list[SettledPose
 
     Returns
     -------
-    One resting pose for each drop, including objects that fell off.
+    One settled pose for each drop, including objects that fell off.
     """
     import mujoco  # type: ignore[import-untyped]  # noqa: PLC0415  slow; most scenes need no physics
 
-    mujoco.set_mju_user_warning(_say_nothing)  # else it writes a log file into the working folder
+    # Otherwise, MuJoCo writes a log file into the working folder.
+    mujoco.set_mju_user_warning(_ignore_warning)
     model = _model(mujoco, obstacles, drops)
     data = mujoco.MjData(model)
     shapes = [_extreme_points(drop.mesh) for drop in drops]
     fixed = [np.asarray(obstacle.vertices, np.float64) for obstacle in obstacles]
     for k, drop in enumerate(drops):
-        there = fixed + [transform(_pose(data, j), shapes[j]) for j in range(k)]
-        start = _start(drop, shapes[k], there)
+        placed_points = fixed + [transform(_pose(data, j), shapes[j]) for j in range(k)]
+        start = _start(drop, shapes[k], placed_points)
         _release(model, data, k, start)
         for _ in range(_FALL_STEPS):
             mujoco.mj_step(model, data)
-    for _ in range(_MOST_STEPS // _LOOK_STEPS):
+    for _ in range(_MAX_STEPS // _CHECK_STEPS):
         if float(np.abs(data.qvel).max()) < _STILL:
             break
-        for _ in range(_LOOK_STEPS):
+        for _ in range(_CHECK_STEPS):
             mujoco.mj_step(model, data)
     return _settled_poses(mujoco, model, data, len(drops))
 
 
-def _say_nothing(_: str) -> None:
-    """Ignore warnings of an unstable simulation: objects that fly off end up on no support."""
+def _ignore_warning(_: str) -> None:
+    """Ignore warnings of an unstable simulation; objects that fly off are not on the support."""
 
 
 def _model(mujoco: Any, obstacles: Sequence[Mesh], drops: Sequence[Drop]) -> Any:
@@ -124,11 +125,11 @@ def _extreme_points(mesh: Mesh) -> F8:
     return np.asarray(points[ConvexHull(points).vertices])
 
 
-def _start(drop: Drop, points: F8, there: Sequence[F8]) -> Pose:
+def _start(drop: Drop, points: F8, placed_points: Sequence[F8]) -> Pose:
     """Return the pose of a dropped object, slightly above everything at its position.
 
-    ``points`` (n, 3) are its extreme vertices; ``there`` are the vertices of the other meshes, in
-    the world frame.
+    ``points`` (n, 3) are its extreme vertices; ``placed_points`` are the vertices of the
+    other meshes, in the world frame.
     """
     turned = points @ drop.rotation.T
     middle = (turned.min(axis=0) + turned.max(axis=0)) / 2
@@ -136,11 +137,11 @@ def _start(drop: Drop, points: F8, there: Sequence[F8]) -> Pose:
     low, high = turned.min(axis=0)[:2] + shift[:2], turned.max(axis=0)[:2] + shift[:2]
     below = [
         float(other[:, 2].max())
-        for other in there
+        for other in placed_points
         if (other[:, :2].min(axis=0) < high).all() and (other[:, :2].max(axis=0) > low).all()
     ]
     top = max(below, default=0.0)
-    return Pose(drop.rotation, shift + np.array([0, 0, top + _CLEAR_M]))
+    return Pose(drop.rotation, shift + np.array([0, 0, top + _CLEARANCE_M]))
 
 
 def _release(model: Any, data: Any, k: int, start: Pose) -> None:
@@ -157,7 +158,7 @@ def _pose(data: Any, k: int) -> Pose:
 
 
 def _settled_poses(mujoco: Any, model: Any, data: Any, count: int) -> list[SettledPose]:
-    """Return the resting pose of each object, and the body with the greatest upward force on it."""
+    """Return the settled pose of each object; the greatest upward force tells what supports it."""
     model.opt.enableflags = 0  # sleeping bodies have no contacts
     mujoco.mj_forward(model, data)
     upward_force = np.zeros((count, count + 1))  # the last column: obstacles

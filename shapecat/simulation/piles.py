@@ -24,8 +24,8 @@ _UPRIGHT = 0.45
 """Fraction of the objects dropped nearly upright; the others have any rotation."""
 _TILT_DEG = 8.0
 _UPRIGHT_COS, _LYING_COS = np.cos(np.radians(15)), np.sin(np.radians(15))
-_SUNK_M = 0.02
-"""An object this far below the surface of its support has fallen off."""
+_FALLEN_M = 0.02
+"""Objects this far below the surface of their support have fallen off."""
 
 
 class Item(NamedTuple):
@@ -42,7 +42,7 @@ class Item(NamedTuple):
 def pile(
     rng: Generator, categories: Sequence[str], filming: Filming, *, kinds: Sequence[str] = KINDS
 ) -> World:
-    """Return a heap of objects dropped on a table; they lean on, lie across and lie in each other.
+    """Return a heap of objects dropped on a table, which lean on, lie across and lie in each other.
 
     Parameters
     ----------
@@ -56,7 +56,7 @@ def pile(
     drops, items = [], [make_item(category, rng, kinds) for category in categories]
     for item in items:
         place = np.clip(rng.normal(0, spread, 2), -0.4, 0.4)
-        drops.append(Drop(item.mesh, _turned(rng), place))
+        drops.append(Drop(item.mesh, _random_rotation(rng), place))
     objects = settled(items, drops, supports, table)
     target = np.array([0, 0, table.height + 0.05])
     path = arc_orbit(
@@ -118,11 +118,11 @@ def _drops_within(rng: Generator, items: Sequence[Item], half: F8) -> list[Drop]
     drops = []
     for item in items:
         room = np.maximum(half - float(item.mesh.extents.max()) / 2 - 0.01, 0)
-        drops.append(Drop(item.mesh, _turned(rng), rng.uniform(-room, room)))
+        drops.append(Drop(item.mesh, _random_rotation(rng), rng.uniform(-room, room)))
     return drops
 
 
-def _turned(rng: Generator) -> F8:
+def _random_rotation(rng: Generator) -> F8:
     """Return a random rotation (3, 3): nearly upright with probability `_UPRIGHT`, else any."""
     if rng.random() >= _UPRIGHT:
         axis = rng.normal(size=4)
@@ -147,7 +147,7 @@ def settled(
     """
     settled_poses = settle([support.mesh for support in supports], drops)
     stays = [
-        _stays(k.mesh, landed, below, highest_m)
+        _rests_on(k.mesh, landed, below, highest_m)
         for k, landed in zip(items, settled_poses, strict=True)
     ]
     tracks = np.cumsum(stays) - 1
@@ -161,13 +161,13 @@ def settled(
     return tuple(objects)
 
 
-def _stays(mesh: Mesh, landed: SettledPose, below: Support, highest_m: float) -> bool:
+def _rests_on(mesh: Mesh, landed: SettledPose, below: Support, highest_m: float) -> bool:
     points = transform(landed.pose, mesh.vertices)
     low, high = points.min(axis=0), points.max(axis=0)
     edge = below.outline[:, :2]
     middle = (low + high)[:2] / 2
     held = ((edge.min(axis=0) < middle) & (middle < edge.max(axis=0))).all()
-    return bool(held and low[2] > below.height - _SUNK_M and high[2] < below.height + highest_m)
+    return bool(held and low[2] > below.height - _FALLEN_M and high[2] < below.height + highest_m)
 
 
 def _placed_object(

@@ -1,4 +1,4 @@
-"""Procedural objects outside the categories: their variety widens what *unknown* covers."""
+"""Procedural objects outside the categories, for a wide variety of *unknown* shapes."""
 
 from collections.abc import Callable
 
@@ -23,7 +23,7 @@ def _assembly(rng: Generator) -> Mesh:
     parts, place = [], np.zeros(3)
     for _ in range(int(rng.integers(3, 6))):
         body = _body(rng, size * rng.uniform(0.35, 1.0))
-        parts.append(moved(body, Pose(_anyhow(rng), place)))
+        parts.append(moved(body, Pose(_random_rotation(rng), place)))
         points = np.asarray(parts[-1].vertices, np.float64)
         place = points[int(rng.integers(len(points)))] * rng.uniform(0.6, 1.0)
     return join(parts)
@@ -42,7 +42,7 @@ def _body(rng: Generator, size: float) -> Mesh:
     )
 
 
-def _anyhow(rng: Generator) -> F8:
+def _random_rotation(rng: Generator) -> F8:
     axis = rng.normal(size=4)
     return rotation_from_quaternion(axis / np.linalg.norm(axis))
 

@@ -14,7 +14,7 @@ from shapecat.types import Camera, Pose
 __all__ = ["Geometry", "Image", "alone_pixels", "cropped", "geometry", "render"]
 
 NEAR_M = 0.02
-"""A triangle with a corner nearer than this, in metres, is tested in every pixel of the image."""
+"""Triangles with a corner nearer than this, in metres, are tested in every pixel of the image."""
 
 
 class Geometry(Record):
@@ -54,7 +54,7 @@ class Image(Record):
 
 
 def geometry(meshes: list[tuple[Mesh, Pose]]) -> Geometry:
-    """Merge meshes, each with its pose ``frame_from_mesh``, into one frame."""
+    """Transform meshes into one frame, each by its pose ``frame_from_mesh``, and merge them."""
     starts = np.cumsum([0, *(len(mesh.vertices) for mesh, _ in meshes)])
     vertices = np.zeros((int(starts[-1]), 3))
     for (mesh, pose), start in zip(meshes, starts[:-1], strict=True):
@@ -70,7 +70,7 @@ def render(scene: Geometry, camera: Camera, frame_from_camera: Pose) -> Image:
 
     The inverse depth of a plane is linear in the image. A ray hits a triangle if it is on the same
     side of the three planes through the camera and the triangle's edges. Triangles need no
-    clipping, and neighbours leave no gap.
+    clipping, and neighbours have no gap.
 
     Parameters
     ----------
@@ -180,7 +180,7 @@ def _rasterize(
         edge[2, 0], edge[2, 1], edge[2, 2] = ay * bz - az * by, az * bx - ax * bz, ax * by - ay * bx
         det = ax * edge[0, 0] + ay * edge[0, 1] + az * edge[0, 2]
         if abs(det) < 1e-18:
-            continue  # seen from its edge
+            continue  # edge-on
         sign = 1.0 if det > 0 else -1.0
         for k in range(3):
             edge[k, 0] *= sign

@@ -22,7 +22,7 @@ from shapecat.simulation.mesh import Mesh
 from shapecat.simulation.paths import Filming, arc_orbit
 from shapecat.simulation.physics import Drop
 from shapecat.simulation.piles import KINDS, Item, make_item, settled
-from shapecat.simulation.worlds import Support, World, turned_about_z
+from shapecat.simulation.worlds import Support, World, pose_from_yaw
 
 __all__ = ["room"]
 
@@ -38,24 +38,24 @@ def room(
     table = supports[-1]
     supports += _walls(rng)
     standing = [*_arms(rng, table), *_screens(rng, table)]
-    around = [*_around(rng), *_cables(rng, table)]
+    around = [*_surroundings(rng), *_cables(rng, table)]
     drops, items = [], [make_item(category, rng, kinds) for category in categories]
     items += [Item("unknown", name, make(rng)) for name, make in _devices(rng)]
     half = np.ptp(table.outline[:, :2], axis=0) / 2
     for item in items:
         margin = float(item.mesh.extents[:2].max()) / 2
         place = rng.uniform(-1, 1, 2) * np.clip(half - margin, 0.02, (0.45, 0.3))
-        drops.append(Drop(item.mesh, turned_about_z(rng.uniform(-0.6, 0.6)).rotation, place))
-    solid = (table, *_named("robot", standing))
+        drops.append(Drop(item.mesh, pose_from_yaw(rng.uniform(-0.6, 0.6)).rotation, place))
+    solid = (table, *_as_supports("robot", standing))
     objects = settled(items, drops, solid, table)
     target = np.array([0, 0, table.height + rng.uniform(0.0, 0.2)])
     path = arc_orbit(rng, target, filming, distance=(0.7, 2.2), elevation=(12, 60), sweep=(15, 60))
     rest = [s for s in supports if s is not table]
-    everything = (*rest, *solid, *_named("room", around))
+    everything = (*rest, *solid, *_as_supports("room", around))
     return World("room", everything, objects, path)
 
 
-def _named(name: str, meshes: Sequence[Mesh]) -> list[Support]:
+def _as_supports(name: str, meshes: Sequence[Mesh]) -> list[Support]:
     nothing = np.zeros((0, 3))
     return [Support(f"{name}_{k}", EQUIPMENT, mesh, nothing) for k, mesh in enumerate(meshes)]
 
@@ -100,21 +100,21 @@ def _screens(rng: Generator, table: Support) -> Iterator[Mesh]:
         yield from make_monitor(rng, place, degrees=rng.normal(0, 12))
 
 
-def _around(rng: Generator) -> Iterator[Mesh]:
+def _surroundings(rng: Generator) -> Iterator[Mesh]:
     """Yield chairs, curtains and plants around the table."""
     for _ in range(int(rng.integers(0, 3))):
-        place = _beside(rng)
+        place = _position_beside_table(rng)
         yield from make_chair(rng, place, degrees=float(np.degrees(np.arctan2(*place[:2]))))
     if rng.random() < 0.35:
         hung = [rng.uniform(-0.5, 0.5), rng.uniform(0.8, 1.4), 0.1]
         yield make_curtain(rng, rng.uniform(0.6, 2.0), 2.2, hung)
     if rng.random() < 0.3:
         plant = make_plant(rng)
-        shift = _beside(rng).astype(np.float32)
+        shift = _position_beside_table(rng).astype(np.float32)
         yield Mesh(plant.vertices * np.float32(2.5) + shift, plant.triangles)
 
 
-def _beside(rng: Generator) -> F8:
+def _position_beside_table(rng: Generator) -> F8:
     """Return a position (3,) on the floor beside or behind the table."""
     angle = rng.uniform(0.0, np.pi)
     return rng.uniform(0.95, 1.5) * np.array([np.cos(angle), np.sin(angle), 0.0])

@@ -76,7 +76,7 @@ def uprighted(mesh: Mesh, category: str) -> Mesh:
 
 
 def upright_poses(mesh: Mesh, category: str) -> tuple[StablePose, ...]:
-    """Return the resting poses of a mesh that `uprighted` has turned, upright ones first.
+    """Return the stable poses of a mesh turned by `uprighted`, upright ones first.
 
     Raises
     ------
@@ -99,7 +99,7 @@ def _roundness(points: F8) -> float:
 
 
 def _narrow_end(points: F8, triangles: I4) -> float:
-    """Return a positive number if the upper half has smaller cross-sections than the lower half."""
+    """Return a positive number if the cross-sections of the upper half are the smaller ones."""
     low, high = points[:, 2].min(), points[:, 2].max()
     levels = np.linspace(low, high, 18)[1:-1]
     areas = [_slice_area(points[triangles], float(z)) for z in levels]

@@ -36,7 +36,7 @@ SceneKind = Literal[
 
 @dataclass(frozen=True)
 class _SceneSpec:
-    """How a scene is filmed, and the categories of its objects."""
+    """Frames and frame rate of a scene, and the categories to draw from."""
 
     filming: Filming
     categories: tuple[str, ...]
@@ -80,10 +80,10 @@ def make_scene(
 
 
 def make_stage(pieces: Sequence[Piece], rng: Generator, *, views: int = 8) -> World:
-    """Place given objects on a table and look at them from random directions.
+    """Place given objects on a table, seen from random directions.
 
-    Each frame is a view from any side, 0.5 to 2 m away and 15 to 60 degrees above. Objects without
-    room are left out; a single object stands in the middle.
+    Each frame is a view from any side, 0.5 to 2 m away and 15 to 60 degrees above. Objects that do
+    not fit are left out; a single object stands in the middle.
 
     Parameters
     ----------
@@ -114,7 +114,7 @@ def _tabletop(rng: Generator, spec: _SceneSpec) -> World:
 
 
 def _clutter(rng: Generator, spec: _SceneSpec) -> World:
-    """Crowd objects on a table: nearly touching, stacked, occluding each other."""
+    """Crowd objects on a table: nearly touching, stacked, and occluding each other."""
     room, table = make_room(rng, wall_chance=0.2), make_table(rng)
     layout = Layout(rng, gap=0.01)
     half = rng.uniform([0.2, 0.16], [0.32, 0.24])
@@ -150,7 +150,7 @@ def _shelf(rng: Generator, spec: _SceneSpec) -> World:
 
 
 def _turntable(rng: Generator, spec: _SceneSpec) -> World:
-    """Turn a round table in front of a still camera."""
+    """Rotate a round table in front of a static camera."""
     room = make_room(rng, wall_chance=0.3)
     table = round_table(rng.uniform(0.38, 0.48), rng.uniform(0.65, 0.85), 0.03)
     layout = Layout(rng, gap=0.03)
@@ -165,7 +165,7 @@ def _turntable(rng: Generator, spec: _SceneSpec) -> World:
 
 
 def _empty(rng: Generator, spec: _SceneSpec) -> World:
-    """Leave the table empty."""
+    """Show an empty table."""
     room, table = make_room(rng, wall_chance=0.5), make_table(rng)
     target = np.array([0, 0, table.height])
     path = arc_orbit(

@@ -32,7 +32,7 @@ def render_frame(
 
     Returns
     -------
-    The frame, and pixel labels (h, w), uint8: 0 if there is no reading, 1 to 9 on supports, and
+    The frame, and pixel labels (h, w), uint8: 0 without depth, 1 to 9 on supports, and
     `PlacedObject.label` on objects.
     """
     index = view if isinstance(view, int) else 0

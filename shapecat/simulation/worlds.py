@@ -11,10 +11,10 @@ from shapecat.simulation.mesh import Mesh
 from shapecat.simulation.render import Geometry, geometry
 from shapecat.types import Pose
 
-__all__ = ["FIRST_OBJECT_LABEL", "Motion", "PlacedObject", "Support", "World", "turned_about_z"]
+__all__ = ["FIRST_OBJECT_LABEL", "Motion", "PlacedObject", "Support", "World", "pose_from_yaw"]
 
 FIRST_OBJECT_LABEL = 20
-"""Pixel label of the object with track 0; supports have 1 to 9, pixels without reading 0."""
+"""Pixel label of the object with track 0; supports have 1 to 9, pixels without depth 0."""
 
 
 class Support(Record):
@@ -105,8 +105,8 @@ class World(Record):
     kind : name of the kind of scene.
     path : ``world_from_camera`` for each of the t images, with the camera's optical axes.
     turns : (t,) rotation of all objects about the world's z axis in each frame, radians; None if
-        they stand still.
-    motions : motions of objects that also move by themselves.
+        they do not rotate.
+    motions : motions of individual objects.
     """
 
     kind: str
@@ -127,7 +127,7 @@ class World(Record):
         if shift is not None and np.isfinite(shift[frame]).all():
             pose = Pose(pose.rotation, pose.translation + shift[frame])
         turn = self._turn(frame)
-        return compose(turned_about_z(turn), pose) if turn else pose
+        return compose(pose_from_yaw(turn), pose) if turn else pose
 
     def present(self, item: PlacedObject, frame: int) -> bool:
         """Return whether an object is present in a frame."""
@@ -168,8 +168,8 @@ class World(Record):
 _NOTHING = Mesh(np.zeros((0, 3)), np.zeros((0, 3)))
 
 
-def turned_about_z(angle: float, place: ArrayLike = (0, 0, 0)) -> Pose:
-    """Return a turn about z by ``angle``, radians, rounded to 1e-9, then a shift to ``place``."""
+def pose_from_yaw(angle: float, place: ArrayLike = (0, 0, 0)) -> Pose:
+    """Return the pose with this yaw, radians, rounded to 1e-9, and the translation ``place``."""
     c, s = np.round(np.cos(angle), 9), np.round(np.sin(angle), 9)
     return Pose(np.array([[c, -s, 0], [s, c, 0], [0, 0, 1]]), np.asarray(place))
 
