@@ -317,14 +317,16 @@ def drawer(width: float, height: float, wall: float, floor: float, yaw: float) -
     return union(box((0, 0, 0), (width, width, floor), yaw), *walls)
 
 
-@pytest.mark.parametrize(
-    ("tilt_deg", "distance", "floor", "yaw"),
-    [(25, 0.7, 0.006, 0.6), (60, 0.7, 0.006, 0.6), (60, 1.0, 0.008, 0)],
-)
-def test_drawer_is_one_object(tilt_deg: float, distance: float, floor: float, yaw: float) -> None:
+def test_most_drawers_are_one_object() -> None:
     """A floor a few millimetres high has a ragged outline, partly occluded."""
-    shapes = [table(1, 1), drawer(0.3, 0.08, 0.01, floor, yaw)]
-    check(shapes, [1], tilt_deg=tilt_deg, distance=distance)
+    rng, good = np.random.default_rng(5), 0
+    for _ in range(12):
+        width, height, floor = rng.uniform((0.2, 0.06, 0.005), (0.36, 0.1, 0.01))
+        shapes = [table(1, 1), drawer(width, height, 0.01, floor, rng.uniform(0, np.pi / 2))]
+        depth, labels = render(shapes, tilt_deg=rng.uniform(22, 60), distance=rng.uniform(0.7, 1))
+        scene = found(frame_of(depth))
+        good += len(scene.candidates) == 1 and overlaps(scene, labels, [1])[0] > 0.85
+    assert good >= 8
 
 
 @pytest.mark.parametrize(

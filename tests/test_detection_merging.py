@@ -1,4 +1,4 @@
-"""Segments and what they meet: two boxes that touch, a board behind a post, a plate."""
+"""Adjacency, pair features and merging of a few synthetic segments."""
 
 import numpy as np
 import pytest
@@ -44,14 +44,14 @@ def measured(depth: Array, labels: Array) -> tuple[Segments, SurfaceGraph, Depth
 
 
 def two_boxes(gap_m: float) -> tuple[Array, Array]:
-    """Return two fronts side by side, the right one farther away by ``gap_m``."""
+    """Return two front faces side by side, the right one farther away by ``gap_m``."""
     depth, labels = np.zeros((150, 200)), np.zeros((150, 200), np.int16)
     depth[50:100, 50:100], labels[50:100, 50:100] = 0.8, 1
     depth[40:100, 100:140], labels[40:100, 100:140] = 0.8 + gap_m, 2
     return depth, labels
 
 
-def test_two_boxes_that_touch() -> None:
+def test_touching_boxes_are_adjacent() -> None:
     segments, _, _ = measured(*two_boxes(0))
     first, second = segments.statistics[1], segments.statistics[2]
     assert first["count"] == 50 * 50
@@ -63,7 +63,7 @@ def test_two_boxes_that_touch() -> None:
     assert find_adjacent(segments, 1)[2]
 
 
-def test_a_box_before_another() -> None:
+def test_an_occluding_box_is_adjacent_to_the_box_behind_it() -> None:
     segments, _, _ = measured(*two_boxes(0.1))
     assert segments.pairs[1, 2]["contact"] == 0
     assert segments.pairs[1, 2]["in_front"] == 50
@@ -92,8 +92,8 @@ def test_features_of_two_boxes() -> None:
     assert share(1, 0) == 0
 
 
-def test_features_of_two_boards_that_meet_in_a_corner() -> None:
-    """Each leans at 45 degrees and ends in the other: a sign of two objects."""
+def test_features_of_two_planes_that_meet_in_a_corner() -> None:
+    """Two faces in a concave corner are usually two objects."""
     depth, labels = np.zeros((150, 200)), np.zeros((150, 200), np.int16)
     across = (np.arange(200) - INTRINSICS.cx) / INTRINSICS.fx
     depth[50:100, 50:150] = (1 / (1 + abs(across)))[50:150]
@@ -109,7 +109,7 @@ def test_features_of_two_boards_that_meet_in_a_corner() -> None:
     assert out["adjacency"]["concavity_deg"] == pytest.approx(90, abs=15)
 
 
-def test_what_is_merged_adds_up() -> None:
+def test_merging_adds_up_the_statistics() -> None:
     segments, _, _ = measured(*two_boxes(0))
     merge(segments, 1, 2)
     assert segments.parent.tolist() == [0, 1, 1]
@@ -120,7 +120,7 @@ def test_what_is_merged_adds_up() -> None:
 
 
 def behind_a_post(offset_m: float) -> tuple[Array, Array]:
-    """Return a board at 1 m whose middle a post hides; its right part ``offset_m`` farther."""
+    """Return a panel at 1 m behind a post; its right part is ``offset_m`` farther away."""
     depth, labels = np.zeros((150, 200)), np.zeros((150, 200), np.int16)
     depth[50:100, 40:90], labels[50:100, 40:90] = 1.0, 1
     depth[50:100, 100:150], labels[50:100, 100:150] = 1.0 + offset_m, 2
@@ -129,7 +129,7 @@ def behind_a_post(offset_m: float) -> tuple[Array, Array]:
 
 
 @pytest.mark.parametrize(("offset_m", "merged"), [(0.0, True), (0.05, False)])
-def test_a_board_goes_on_behind_a_post(offset_m: float, *, merged: bool) -> None:
+def test_coplanar_parts_behind_a_post_are_merged(offset_m: float, *, merged: bool) -> None:
     depth, labels = behind_a_post(offset_m)
     segments, graph, grid = measured(depth, labels)
     merge_across_occluder(segments, grid.inverse_depth, INTRINSICS, graph.normal, labels)
@@ -137,7 +137,7 @@ def test_a_board_goes_on_behind_a_post(offset_m: float, *, merged: bool) -> None
     assert segments.parent[3] == 3
 
 
-def test_without_the_post_two_boards_stay_two() -> None:
+def test_coplanar_parts_without_an_occluder_are_not_merged() -> None:
     depth, labels = behind_a_post(0)
     depth[labels == 3], labels[labels == 3] = 0, 0
     segments, graph, grid = measured(depth, labels)
@@ -145,8 +145,8 @@ def test_without_the_post_two_boards_stay_two() -> None:
     assert segments.parent.tolist() == [0, 1, 2]
 
 
-def test_the_segments_of_a_plate_are_one() -> None:
-    """Most of both is of one low-profile object; of a box beside it little is."""
+def test_segments_of_a_low_profile_object_are_merged() -> None:
+    """Both lie mostly within it; the box beside it does not."""
     depth, labels = two_boxes(0)
     labels[90:100, 50:140] = 3
     segments, graph, _ = measured(depth, labels)

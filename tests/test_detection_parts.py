@@ -1,4 +1,4 @@
-"""Parts of one object: told by trees that must be sound, and learned the same way each time."""
+"""The boosted trees of the detection: their files, their features and how they are grown."""
 
 from pathlib import Path
 
@@ -23,11 +23,11 @@ from shapecat.detection.merging.pair_features import (
 from shapecat.detection.pipeline import Task, oversegment
 from shapecat.models.growing import Growth, grow
 from shapecat.models.parts import Series, collect
-from shapecat.simulation import KINECT, REALSENSE, make_scene, render_frame
+from shapecat.simulation import KINECT, make_scene, render_frame
 from shapecat.trees import BoostedTrees, logit_of, read_trees, write_trees
 from tests.test_detection import overlaps
 
-SCENES = (Series("clutter", KINECT, 2000, 4), Series("pile", REALSENSE, 85_000, 2))
+SCENES = (Series("clutter", 2000, 1), Series("pile", 85_000, 1))
 GROWTH = Growth(100, 32, 0.1)
 
 
@@ -40,8 +40,8 @@ GROWTH = Growth(100, 32, 0.1)
     ],
     ids=["merging", "alone", "in context"],
 )
-def test_every_walk_through_the_trees_ends(grown: BoostedTrees, features: int) -> None:
-    """A child before its parent would be a walk without end."""
+def test_every_path_through_the_trees_ends(grown: BoostedTrees, features: int) -> None:
+    """A child stored before its parent could make an endless loop."""
     roots, feature, _, left = grown.trees
     inner = np.flatnonzero(left)
     assert np.all(left[inner] > inner)
@@ -51,8 +51,8 @@ def test_every_walk_through_the_trees_ends(grown: BoostedTrees, features: int) -
     assert np.isfinite(grown.value).all()
 
 
-def test_trees_know_which_features_they_were_grown_with(tmp_path: Path) -> None:
-    """A field that is inserted without growing them anew would shift all that follow."""
+def test_trees_grown_with_other_features_are_refused(tmp_path: Path) -> None:
+    """A new field shifts the index of every later feature."""
     inner = np.dtype([("width_m", "f4"), ("height_m", "f4")])
     features = np.dtype([("first", inner), ("second", inner), ("border_m", "f4")])
     grown = learned.load_trees()
@@ -65,7 +65,7 @@ def test_trees_know_which_features_they_were_grown_with(tmp_path: Path) -> None:
             read_trees(content, np.dtype(changed))
 
 
-def test_the_order_of_two_pieces_says_nothing() -> None:
+def test_pair_features_do_not_depend_on_the_order_of_the_pair() -> None:
     rng = np.random.default_rng(3)
     frame, _ = render_frame(make_scene("clutter", rng, frames=1), 0, rng=rng, sensor=KINECT)
     assert frame.depth is not None
@@ -91,7 +91,7 @@ def test_the_order_of_two_pieces_says_nothing() -> None:
 
 
 @pytest.mark.parametrize("seed", [1600, 1601])
-def test_without_the_trees_objects_stay_in_pieces(seed: int) -> None:
+def test_objects_are_oversegmented_without_learned_merging(seed: int) -> None:
     rng = np.random.default_rng(seed)
     world = make_scene("clutter", rng, frames=1)
     frame, seen = render_frame(world, 0, rng=rng, sensor=KINECT)
@@ -106,21 +106,19 @@ def test_without_the_trees_objects_stay_in_pieces(seed: int) -> None:
 
 
 @pytest.mark.many
-def test_pairs_do_not_depend_on_the_number_of_processes() -> None:
-    """Trees are grown on what several processes collect."""
+def test_training_pairs_do_not_depend_on_the_number_of_processes() -> None:
     one, two = (collect(SCENES, 1.0, jobs) for jobs in (1, 2))
     assert np.array_equal(one.features, two.features)
     assert np.array_equal(one.same, two.same)
     assert 0.05 < one.same.mean() < 0.95
 
 
-def test_grown_trees_tell_what_they_were_shown() -> None:
-    """And the same trees are grown each time."""
+def test_grown_trees_fit_their_training_data_and_are_reproducible() -> None:
     rng = np.random.default_rng(0)
     features = rng.normal(size=(2000, FEATURES)).astype(np.float32)
     same = (features[:, 4] > 0) ^ (features[:, 40] > 0.3)
     first, second = (grow(features, same, GROWTH, seed=1) for _ in range(2))
     assert all(np.array_equal(a, b) for a, b in zip(first.trees, second.trees, strict=True))
     assert np.array_equal(first.value, second.value)
-    told = np.array([logit_of(first, row, -np.inf, np.inf) > 0 for row in features])
-    assert np.mean(told == same) > 0.95
+    predicted = np.array([logit_of(first, row, -np.inf, np.inf) > 0 for row in features])
+    assert np.mean(predicted == same) > 0.95

@@ -1,4 +1,4 @@
-"""Steps of the detection on small made-up inputs whose answers are known."""
+"""Steps of the detection on small synthetic inputs with known results."""
 
 from itertools import pairwise
 
@@ -27,8 +27,8 @@ from shapecat.types import Camera
 from tests.level_planes import INTRINSICS, UP, level
 
 
-def test_a_plane_in_noise_is_found() -> None:
-    """Half of the samples are anywhere: least squares alone would lie between."""
+def test_ransac_finds_a_plane_among_outliers() -> None:
+    """Half of the samples are outliers, which would bias a least-squares fit."""
     rng = np.random.default_rng(0)
     inv_depth = level()
     lost = rng.random(inv_depth.shape) < 0.5
@@ -40,8 +40,7 @@ def test_a_plane_in_noise_is_found() -> None:
     assert 0.45 < count / samples.inverse_depth.size < 0.6
 
 
-def test_no_plane_among_two_samples() -> None:
-    """Three points span a plane, fewer must not make one up."""
+def test_two_samples_give_no_plane() -> None:
     inv_depth = np.zeros((240, 320), np.float32)
     inv_depth[:5, :5] = 1
     samples = sample_grid(inv_depth, inv_depth)
@@ -50,18 +49,18 @@ def test_no_plane_among_two_samples() -> None:
 
 
 @pytest.mark.parametrize("size", [1, 2, 7, 100])
-def test_the_median_is_that_of_a_sorted_list(size: int) -> None:
+def test_median_equals_that_of_the_sorted_values(size: int) -> None:
     values = np.random.default_rng(size).permutation(size).astype(np.float32)
     assert median_of(values) == size // 2
 
 
-def test_heights_of_a_board_with_an_edge() -> None:
-    """What is beside the board is not above it, however high."""
+def test_samples_beyond_the_edge_of_a_plane_have_no_height() -> None:
+    """An object beside a table is not on the table, however high it is."""
     inv_depth = level()
     inv_depth[:, 200:] = 0
     board = inv_depth.copy()
     inv_depth[100:140, 80:120] = level(0.62)[100:140, 80:120]  # a box of 8 cm
-    inv_depth[100:140, 280:300] = level(0.62)[100:140, 280:300]  # and one in the air beside
+    inv_depth[100:140, 280:300] = level(0.62)[100:140, 280:300]  # and one beyond the edge
     trials = draw_trials(np.random.default_rng(0))
     grid = DepthGrid(board, INTRINSICS, 2)
     found, _ = find_supporting_planes(grid, UP, trials, tallest_m=0.5, upright=True)
@@ -75,8 +74,8 @@ def test_heights_of_a_board_with_an_edge() -> None:
 
 
 @pytest.mark.parametrize(("rise", "segments"), [(0.0, 1), (1.0, 2)])
-def test_two_faces_are_parted_where_they_meet_at_a_concave_edge(rise: float, segments: int) -> None:
-    """A face that goes on straight is one segment; one that turns towards the camera is two."""
+def test_watershed_splits_faces_at_a_concave_edge(rise: float, segments: int) -> None:
+    """A flat face is one segment; a face that bends towards the camera is two."""
     inv_depth = np.zeros((240, 320), np.float32)
     y = (np.arange(90, 150) - INTRINSICS.cy) / INTRINSICS.fy
     edge = y[30]
@@ -95,8 +94,8 @@ def test_two_faces_are_parted_where_they_meet_at_a_concave_edge(rise: float, seg
     assert (labels[90, 120] != labels[149, 120]) == (segments == 2)
 
 
-def test_hull_of_an_l_is_filled() -> None:
-    """The cells between its arms belong to it, those beyond do not."""
+def test_convex_hull_of_an_l_is_filled() -> None:
+    """Cells between the arms are inside the hull, those beyond are not."""
     residual = np.ones((12, 12), np.float32)
     part, stack = np.zeros((12, 12), np.int32), np.zeros(144, np.int32)
     cells = [(i, 2) for i in range(2, 9)] + [(8, j) for j in range(3, 9)]
@@ -108,7 +107,7 @@ def test_hull_of_an_l_is_filled() -> None:
     assert count == np.count_nonzero(part == 7)
 
 
-def test_a_hole_within_one_object_is_filled_and_a_bay_is_not() -> None:
+def test_enclosed_holes_are_filled_and_open_ones_are_not() -> None:
     inv_depth = np.full((40, 40), 1.25, np.float32)
     labels = np.zeros((40, 40), np.int16)
     labels[10:30, 10:30] = 1
@@ -122,7 +121,7 @@ def test_a_hole_within_one_object_is_filled_and_a_bay_is_not() -> None:
 
 
 def test_statistics_of_two_segments_add_up() -> None:
-    """Ranges are joined, sums are added: a field forgotten here would be lost in every merge."""
+    """Ranges are joined and sums added; a forgotten field would be lost in every merge."""
     a, b = np.zeros(1, SEGMENT), np.zeros(1, SEGMENT)
     for k, name in enumerate(SEGMENT.names or ()):
         a[name], b[name] = k + 1, 100 + k
@@ -134,15 +133,15 @@ def test_statistics_of_two_segments_add_up() -> None:
         assert a[name][0] == expected, name
 
 
-def test_records_are_floats_without_gaps() -> None:
-    """The trees read the features of a pair as one row of numbers."""
+def test_feature_records_are_contiguous_floats() -> None:
+    """The trees read a record as one row of float32."""
     assert PAIR_FEATURES.itemsize == 4 * FEATURES == 4 * 70
     assert SEGMENT.itemsize == 4 * len(SEGMENT.names or ())
     assert PAIR.itemsize == 4 * len(PAIR.names or ())
 
 
 def test_downsampling_keeps_the_nearer_side_of_an_edge() -> None:
-    """A mean over both sides would make up a surface between them."""
+    """Averaging both sides would create a surface between them."""
     depth = np.full((480, 640), 0.9, np.float32)
     depth[:, 321:] = 0.7
     camera = Camera(640, 480, 525, 525, 319.5, 239.5)

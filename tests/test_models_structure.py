@@ -1,4 +1,4 @@
-"""What the trees that reject background learn from."""
+"""Training data of the trees that reject background."""
 
 from collections.abc import Iterator
 from dataclasses import replace
@@ -14,13 +14,12 @@ from shapecat.geometry import transform
 from shapecat.models.structure import (
     Samples,
     Series,
-    _on_floor,
-    _viewpoint,
     _with_arms,
     collect,
     grow_rejection_trees,
     label_objects,
 )
+from shapecat.models.viewpoints import move_to_floor, random_viewpoint
 from shapecat.simulation import IDEAL, KINECT, make_scene, render_frame
 from shapecat.simulation.furniture import EQUIPMENT, make_rack, make_tote
 from shapecat.simulation.worlds import World
@@ -29,22 +28,22 @@ from shapecat.types import Pose
 SERIES = (Series("bin", 2000, 2, ("kinect",)), Series("clutter", 2000, 1, ("kinect",), scale=1.5))
 
 
-def test_objects_are_told_from_the_walls_of_their_bin() -> None:
+def test_segments_of_objects_and_bin_walls_are_labelled() -> None:
     rng = np.random.default_rng(2000)
     world = make_scene("bin", rng, frames=1)
     frame, pixel_labels = render_frame(world, 0, rng=rng, sensor=KINECT)
     object_labels = np.array([item.label for item in world.objects])
-    (told,) = label_objects(frame, pixel_labels, object_labels)
-    assert set(told.objects.tolist()) == {True, False}
-    assert np.isfinite(as_rows(told.features)).all()
-    assert told.weights[0].shape == (4, len(told.objects), len(told.objects))
+    (samples,) = label_objects(frame, pixel_labels, object_labels)
+    assert set(samples.objects.tolist()) == {True, False}
+    assert np.isfinite(as_rows(samples.features)).all()
+    assert samples.weights[0].shape == (4, len(samples.objects), len(samples.objects))
     (none,) = label_objects(frame, pixel_labels, object_labels[:0])
-    assert none.objects.tolist() == [False] * len(told.objects)
+    assert none.objects.tolist() == [False] * len(samples.objects)
 
 
-def test_objects_lie_on_the_floor_where_the_table_was() -> None:
+def test_objects_move_to_the_floor_with_the_table_removed() -> None:
     world = make_scene("room", np.random.default_rng(2000), frames=1)
-    below = _on_floor(world)
+    below = move_to_floor(world)
     assert "table" not in {support.name for support in below.supports}
     lowest = [
         transform(item.pose, item.mesh.vertices)[:, 2].min()
@@ -55,12 +54,12 @@ def test_objects_lie_on_the_floor_where_the_table_was() -> None:
     assert np.abs(lowest).max() < 0.01
 
 
-def test_a_camera_anywhere_looks_at_the_objects_from_where_its_sensor_can_read() -> None:
+def test_random_viewpoint_faces_the_objects_within_the_range_of_the_sensor() -> None:
     world = make_scene("pile", np.random.default_rng(2001), frames=1)
     world = replace(world, objects=world.objects[:1])
     place = world.objects[0].pose.translation
     for seed in range(20):
-        pose = _viewpoint(world, KINECT, np.random.default_rng(seed))
+        pose = random_viewpoint(world, KINECT, np.random.default_rng(seed))
         assert isinstance(pose, Pose)
         away = place - pose.translation
         distance = float(np.linalg.norm(away))
@@ -69,8 +68,8 @@ def test_a_camera_anywhere_looks_at_the_objects_from_where_its_sensor_can_read()
         assert -away[2] / distance > 0.13
 
 
-def test_the_sides_of_a_tote_lean_outwards_from_its_bottom() -> None:
-    """All by the same angle, without a gap at the corners, and what is in it is not touched."""
+def test_sides_of_a_tote_lean_outwards() -> None:
+    """All sides lean by the same angle, meet at the corners and miss the content."""
     world = make_scene("bin", np.random.default_rng(2002), frames=1)
     upright = {support.name: support for support in world.supports}
     bottom = upright["bin"].height
@@ -94,8 +93,8 @@ def test_the_sides_of_a_tote_lean_outwards_from_its_bottom() -> None:
         assert tops[0][0] == pytest.approx(tops[1][0], abs=0.02)
 
 
-def test_a_rack_has_posts_at_the_corners_of_its_boards_and_no_sides() -> None:
-    """Posts go on above the highest board; what stands on the boards stays."""
+def test_a_rack_has_posts_instead_of_sides() -> None:
+    """Posts extend above the highest shelf; the objects on the shelves stay."""
     world = make_scene("shelf", np.random.default_rng(2004), frames=1)
     boards = [s for s in world.supports if s.name.startswith("board")]
     corner = np.abs(np.concatenate([board.mesh.vertices for board in boards])).max(axis=0)
@@ -115,7 +114,7 @@ def _armed(world: World, arms: str) -> Iterator[tuple[np.random.Generator, Pose,
     """Yield eight viewpoints, each with the world, arms added, and the arms' vertices (n, 3)."""
     for seed in range(8):
         rng = np.random.default_rng(seed)
-        pose = _viewpoint(world, KINECT, rng)
+        pose = random_viewpoint(world, KINECT, rng)
         assert isinstance(pose, Pose)
         armed = _with_arms(world, pose, KINECT.camera, arms, rng)
         added = armed.supports[len(world.supports) :]
@@ -123,7 +122,7 @@ def _armed(world: World, arms: str) -> Iterator[tuple[np.random.Generator, Pose,
         yield rng, pose, armed, np.concatenate([arm.mesh.vertices for arm in added])
 
 
-def test_the_arms_of_a_robot_come_from_beside_its_camera() -> None:
+def test_arms_of_the_robot_begin_beside_its_camera() -> None:
     """They end above the support, and hide something in most images."""
     world = make_scene("clutter", np.random.default_rng(2003), frames=1)
     table = max(support.height for support in world.supports if support.holds_objects)
@@ -135,8 +134,8 @@ def test_the_arms_of_a_robot_come_from_beside_its_camera() -> None:
     assert seen >= 6
 
 
-def test_resting_arms_lie_on_the_support_and_are_cut_off_by_the_image_border() -> None:
-    """Else they would be objects like others, or arms in the air, which are easier to tell."""
+def test_resting_arms_lie_on_the_support_and_reach_the_image_border() -> None:
+    """Otherwise they would look like objects, or like raised arms, which are easier to reject."""
     world = make_scene("clutter", np.random.default_rng(2003), frames=1)
     table = max(support.height for support in world.supports if support.holds_objects)
     cut = 0
@@ -152,13 +151,13 @@ def test_resting_arms_lie_on_the_support_and_are_cut_off_by_the_image_border() -
     assert cut >= 5
 
 
-def test_no_arms_leave_the_world_as_it_is() -> None:
+def test_world_without_arms_is_unchanged() -> None:
     world = make_scene("clutter", np.random.default_rng(2003), frames=1)
     assert _with_arms(world, 0, KINECT.camera, "none", np.random.default_rng(0)) is world
 
 
-def test_a_verdict_on_a_neighbour_is_learned_from() -> None:
-    """Two segments alike: one is an object, the other beside background that is easy to tell."""
+def test_trees_in_context_learn_from_the_logits_of_neighbours() -> None:
+    """Of two equal segments, one is an object and the other is beside obvious background."""
     rng = np.random.default_rng(5)
     samples = []
     for _ in range(60):
@@ -177,7 +176,7 @@ def test_a_verdict_on_a_neighbour_is_learned_from() -> None:
 
 
 @pytest.mark.many
-def test_what_is_learned_does_not_depend_on_the_number_of_processes() -> None:
+def test_samples_do_not_depend_on_the_number_of_processes() -> None:
     for one, two in zip(*(collect(SERIES, jobs) for jobs in (1, 2)), strict=True):
         assert np.array_equal(one.features, two.features)
         assert np.array_equal(one.objects, two.objects)

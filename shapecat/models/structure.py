@@ -31,12 +31,12 @@ from shapecat.detection.merging.segments import Records
 from shapecat.detection.pipeline import Task, merge_segments, oversegment
 from shapecat.models.growing import Growth, collect_chunks, grow, growing_options
 from shapecat.models.parts import count_labels
+from shapecat.models.viewpoints import move_to_floor, random_viewpoint
 from shapecat.simulation import make_scene, render_frame
 from shapecat.simulation.equipment import make_own_arms, make_resting_arms
 from shapecat.simulation.furniture import EQUIPMENT, make_rack, make_tote
-from shapecat.simulation.paths import Filming, arc_orbit
 from shapecat.simulation.scenes import SceneKind
-from shapecat.simulation.sensors import PRESETS, Sensor, resized
+from shapecat.simulation.sensors import PRESETS, resized
 from shapecat.simulation.worlds import Support, World
 from shapecat.trees import BoostedTrees, write_trees
 from shapecat.types import Camera, Frame, Pose
@@ -129,12 +129,8 @@ _SERIES = (
 )
 """The merging trees were not grown on these seeds. The scaled scenes add large objects, which are
 too rare otherwise; rooms add arms and furniture, floors objects where furniture usually is."""
-_DISTANCE_M, _ELEVATION_DEG, _SWEEP_DEG = (0.35, 2.6), (12.0, 84.0), (20.0, 150.0)
-"""Ranges of the position of a camera ``anywhere``, relative to its target."""
 _VIEWS = {"path": 2, "anywhere": 6, "floor": 6}
 """Views of each scene, with one sensor after the other; on the path, from a single place."""
-_CLOSER_M = 0.08
-"""Least distance of the target beyond the sensor's near limit."""
 
 
 class Samples(NamedTuple):
@@ -222,30 +218,18 @@ def _views(series: Series, seed: int) -> Iterator[Samples]:
     """Yield the segments of every view of one scene; a view costs a tenth of the scene."""
     rng = np.random.default_rng(seed)
     world = make_scene(series.kind, rng, frames=1)
-    world = _on_floor(world) if series.view == "floor" else world
+    world = move_to_floor(world) if series.view == "floor" else world
     if series.changed is not None:
         world = replace(world, supports=tuple(series.changed(rng, world.supports)))
     object_labels = np.array([item.label for item in world.objects], np.int64)
     for k in range(_VIEWS[series.view]):
         sensor = PRESETS[series.sensors[(seed + k) % len(series.sensors)]]
-        view = 0 if series.view == "path" else _viewpoint(world, sensor, rng)
+        view = 0 if series.view == "path" else random_viewpoint(world, sensor, rng)
         sensor = resized(sensor, 1 / rng.integers(2, 5)) if series.coarse else sensor
         with_arms = _with_arms(world, view, sensor.camera, series.arms, rng)
         frame, pixel_labels = render_frame(with_arms, view, rng=rng, sensor=sensor)
         depth = None if frame.depth is None else frame.depth * np.float32(series.scale)
         yield from label_objects(replace(frame, depth=depth), pixel_labels, object_labels)
-
-
-def _on_floor(world: World) -> World:
-    """Remove the table and everything on it except the objects, and put these on the floor."""
-    table = next(support for support in world.supports if support.name == "table")
-    down = np.array([0.0, 0.0, -table.height])
-    objects = (
-        replace(item, pose=Pose(item.pose.rotation, item.pose.translation + down))
-        for item in world.objects
-    )
-    rest = (s for s in world.supports if s is not table and not s.name.startswith("robot"))
-    return replace(world, supports=tuple(rest), objects=tuple(objects))
 
 
 def _with_arms(
@@ -267,25 +251,6 @@ def _with_arms(
         Support(f"arm_{k}", EQUIPMENT, mesh, np.zeros((0, 3))) for k, mesh in enumerate(meshes)
     )
     return replace(world, supports=(*world.supports, *added))
-
-
-def _viewpoint(world: World, sensor: Sensor, rng: np.random.Generator) -> Pose | int:
-    """Return a random ``world_from_camera`` facing the objects; the path's if there are none."""
-    places = [item.pose.translation for item in world.objects]
-    if not places:
-        return 0
-    target = (np.mean(places, axis=0) + places[rng.integers(len(places))]) / 2
-    nearest = max(_DISTANCE_M[0], sensor.nearest_m + _CLOSER_M)
-    distance = float(np.exp(rng.uniform(np.log(nearest), np.log(_DISTANCE_M[1]))))
-    (pose,) = arc_orbit(
-        rng,
-        np.asarray(target),
-        Filming(1, 30.0),
-        distance=distance,
-        elevation=_ELEVATION_DEG,
-        sweep=_SWEEP_DEG,
-    )
-    return pose
 
 
 def label_objects(frame: Frame, pixel_labels: U1, object_labels: I4) -> Iterator[Samples]:

@@ -150,7 +150,7 @@ def sample(seed: int, count: int | None, only: str) -> list[Mutant]:
 
 
 def _rank(seed: int, mutant: Mutant) -> bytes:
-    return hashlib.sha256(f"{seed} {mutant.module} {mutant.flip.index}".encode()).digest()
+    return hashlib.sha256(f"{seed} {mutant.module} {mutant.flip.position}".encode()).digest()
 
 
 def tests_of(mutant: Mutant) -> list[Path]:

@@ -34,9 +34,9 @@ _UNARY = (ast.Not, ast.USub)
 
 
 class Flip(NamedTuple):
-    """An operator: its index among the nodes of the module, its line, and its replacement."""
+    """An operator: its position among the nodes of the module, its line, and its replacement."""
 
-    index: int
+    position: int
     line: int
     what: str
 
@@ -45,8 +45,8 @@ def flips_of(source: str) -> list[Flip]:
     """Return the operators of a module that can be flipped, in the order of its nodes."""
     nodes = list(_code_nodes(ast.parse(source)))
     return [
-        Flip(index, getattr(node, "lineno", 0), what)
-        for index, node in enumerate(nodes)
+        Flip(position, getattr(node, "lineno", 0), what)
+        for position, node in enumerate(nodes)
         if (what := _flip(copy.deepcopy(node)))
     ]
 
@@ -54,7 +54,7 @@ def flips_of(source: str) -> list[Flip]:
 def flipped(source: str, flip: Flip) -> ast.Module:
     """Return a module in which one operator is flipped."""
     tree = ast.parse(source)
-    _flip(list(_code_nodes(tree))[flip.index])
+    _flip(list(_code_nodes(tree))[flip.position])
     return tree
 
 

@@ -1,0 +1,48 @@
+"""Viewpoints of the scenes that the trees of the detection are grown on."""
+
+from dataclasses import replace
+
+import numpy as np
+
+from shapecat.simulation.paths import Filming, arc_orbit
+from shapecat.simulation.sensors import Sensor
+from shapecat.simulation.worlds import World
+from shapecat.types import Pose
+
+__all__ = ["move_to_floor", "random_viewpoint"]
+
+_DISTANCE_M, _ELEVATION_DEG, _SWEEP_DEG = (0.35, 2.6), (12.0, 84.0), (20.0, 150.0)
+"""Ranges of the position of the camera, relative to its target."""
+_CLOSER_M = 0.08
+"""Least distance of the target beyond the sensor's near limit."""
+
+
+def random_viewpoint(world: World, sensor: Sensor, rng: np.random.Generator) -> Pose | int:
+    """Return a random ``world_from_camera`` facing the objects; the path's if there are none."""
+    places = [item.pose.translation for item in world.objects]
+    if not places:
+        return 0
+    target = (np.mean(places, axis=0) + places[rng.integers(len(places))]) / 2
+    nearest = max(_DISTANCE_M[0], sensor.nearest_m + _CLOSER_M)
+    distance = float(np.exp(rng.uniform(np.log(nearest), np.log(_DISTANCE_M[1]))))
+    (pose,) = arc_orbit(
+        rng,
+        np.asarray(target),
+        Filming(1, 30.0),
+        distance=distance,
+        elevation=_ELEVATION_DEG,
+        sweep=_SWEEP_DEG,
+    )
+    return pose
+
+
+def move_to_floor(world: World) -> World:
+    """Remove the table and everything on it except the objects, and put these on the floor."""
+    table = next(support for support in world.supports if support.name == "table")
+    down = np.array([0.0, 0.0, -table.height])
+    objects = (
+        replace(item, pose=Pose(item.pose.rotation, item.pose.translation + down))
+        for item in world.objects
+    )
+    rest = (s for s in world.supports if s is not table and not s.name.startswith("robot"))
+    return replace(world, supports=tuple(rest), objects=tuple(objects))
