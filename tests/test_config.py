@@ -2,10 +2,11 @@
 
 import dataclasses
 from pathlib import Path
+from typing import Any, Literal, get_args, get_origin, get_type_hints
 
 import pytest
 
-from shapecat.config import Settings, load_settings, with_overrides
+from shapecat.config import Settings, load_settings, with_overrides, with_settings
 from shapecat.errors import ConfigError
 
 
@@ -55,7 +56,22 @@ def test_unreadable_file_is_config_error(tmp_path: Path, content: bytes | None) 
 
 def test_as_dict_has_every_field() -> None:
     """The stored tree must be enough to repeat a run."""
-    tree = Settings().as_dict()
+    settings = changed(Settings())
 
-    assert set(tree) == {field.name for field in dataclasses.fields(Settings)}
-    assert tree["tracking"]["fusion"] == "product"
+    assert with_settings(Settings(), settings.as_dict()) == settings
+
+
+def changed(settings: Any) -> Any:
+    """Return settings of which each differs from the default."""
+    values: dict[str, Any] = {}
+    for name, kind in get_type_hints(type(settings)).items():
+        value = getattr(settings, name)
+        if dataclasses.is_dataclass(value):
+            values[name] = changed(value)
+        elif get_origin(kind) is Literal:
+            values[name] = next(choice for choice in get_args(kind) if choice != value)
+        elif kind is bool:
+            values[name] = not value
+        else:
+            values[name] = value + (1 if kind is int else 0.01)
+    return dataclasses.replace(settings, **values)

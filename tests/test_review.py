@@ -73,6 +73,17 @@ def scene(
 
 
 def write(path: Path, scenes: Iterable[tuple[LabelledFrame, Frame]], **options: Any) -> Path:
+    pairs = list(scenes)
+    fixed = options.get("fixed_frame") is not None
+    chosen = choose_scenes([labelled for labelled, _ in pairs], fixed=fixed)
+    frames = [
+        ReviewFrame(labelled, frame if due else None)
+        for (labelled, due), (_, frame) in zip(chosen, pairs, strict=True)
+    ]
+    return write_frames(path, frames, **options)
+
+
+def write_frames(path: Path, frames: Iterable[ReviewFrame], **options: Any) -> Path:
     settings: dict[str, Any] = {
         "name": "lab",
         "run": {"warnings": ["no transforms"], "counts": {"frames": 3}},
@@ -80,15 +91,7 @@ def write(path: Path, scenes: Iterable[tuple[LabelledFrame, Frame]], **options: 
         "cloud_points": 1000,
         "fixed_frame": None,
     }
-    settings |= options
-    fixed = settings["fixed_frame"] is not None
-    pairs = list(scenes)
-    chosen = choose_scenes([labelled for labelled, _ in pairs], fixed=fixed)
-    frames = [
-        ReviewFrame(labelled, frame if due else None)
-        for (labelled, due), (_, frame) in zip(chosen, pairs, strict=True)
-    ]
-    review.write_review(path, frames, **settings)
+    review.write_review(path, frames, **(settings | options))
     return path
 
 
@@ -381,13 +384,13 @@ def test_failure_leaves_no_file_and_keeps_older_review(tmp_path: Path) -> None:
     """No partial file may remain, neither under the final name nor hidden."""
     (tmp_path / "r.rrd").write_bytes(b"old")
 
-    def broken() -> Iterator[tuple[LabelledFrame, Frame]]:
-        yield scene(0, [labelled_object(1)])
+    def broken() -> Iterator[ReviewFrame]:
+        yield ReviewFrame(*scene(0, [labelled_object(1)]))
         msg = "the recording ends here"
         raise ValueError(msg)
 
     with pytest.raises(ValueError, match="ends here"):
-        write(tmp_path / "r.rrd", broken())
+        write_frames(tmp_path / "r.rrd", broken())
     assert [p.name for p in tmp_path.iterdir()] == ["r.rrd"]
     assert (tmp_path / "r.rrd").read_bytes() == b"old"
 

@@ -131,7 +131,7 @@ def test_cost_of_pair_is_sum_of_differences() -> None:
     near = replace(SETTINGS, gate_m=0.3)
     young = tracker._costs(two_tracks(), found, 4 * SECOND + 100_000_000, near)
     limit = 0.03 + 0.5 * 0.31 + 0.3 * 0.03
-    assert young[1, 1] == pytest.approx(np.inf if limit < 0.19 else (0.19 / limit) ** 2 + 0.2)
+    assert young[1, 1] == pytest.approx((0.19 / limit) ** 2 + 0.2)
 
 
 def test_size_key_ignores_quarter_turn() -> None:
