@@ -120,9 +120,8 @@ def test_recordings_of_server_are_processed_into_folder(
 
 
 @pytest.mark.parametrize("out", ["memory://results/first", "s3://lab/results/first"])
-def test_folder_is_processed_into_storage_once(
-    shapecat: Run, served: Path, bucket: Path, out: str
-) -> None:
+@pytest.mark.usefixtures("bucket")
+def test_folder_is_processed_into_storage_once(shapecat: Run, served: Path, out: str) -> None:
     done = shapecat("process", served, "--out", out, *OPTIONS)
 
     assert done.exit_code == 1, done.output
@@ -139,7 +138,6 @@ def test_folder_is_processed_into_storage_once(
     other = shapecat("process", served / "a.mcap", "--out", out, *OPTIONS, "--set", "seed=1")
     assert other.exit_code == 1
     assert "--overwrite" in other.stderr
-    assert bucket.exists()
 
 
 def test_results_without_manifest_are_not_repeated(
@@ -175,7 +173,8 @@ def test_patterns_and_folders_of_storage_are_expanded(served: Path) -> None:
 
 
 @pytest.mark.parametrize("place", ["memory://lab/mixed", "s3://lab/mixed"])
-def test_storage_is_searched_like_a_folder(bucket: Path, place: str) -> None:
+@pytest.mark.usefixtures("bucket")
+def test_storage_is_searched_like_a_folder(place: str) -> None:
     """Results of earlier runs are not recordings; a ROS 2 bag is a folder, and one recording."""
     root = Location(place)
     for name in (
@@ -191,10 +190,16 @@ def test_storage_is_searched_like_a_folder(bucket: Path, place: str) -> None:
     assert found[f"{place}/bag"].stem == "bag"
     assert found[f"{place}/bag"].bytes == len("bag/bag_0.db3") + len("bag/bag_1.db3")
     before = found[f"{place}/x.mcap"].key
-    assert before == look_at(f"{place}/x.mcap")[0] or place.startswith("memory")
+    assert before == only_key(f"{place}/*.mcap")
+    if place.startswith("s3"):  # fsspec's memory gives times of another type in listings
+        assert before == look_at(f"{place}/x.mcap")[0]
     (root / "x.mcap").write(b"other content")
-    assert find_recordings([f"{place}/*.mcap"]).kept[0].key != before
-    assert bucket.exists()
+    assert only_key(f"{place}/*.mcap") != before
+
+
+def only_key(pattern: str) -> str:
+    (source,) = find_recordings([pattern]).kept
+    return source.key
 
 
 def test_bag_in_bucket_is_processed(shapecat: Run, bucket: Path, tmp_path: Path) -> None:
@@ -258,8 +263,9 @@ PLACES = ["memory://half/run", "s3://lab/half/run"]
 
 
 @pytest.mark.parametrize("url", PLACES)
+@pytest.mark.usefixtures("bucket")
 def test_interrupted_upload_shows_no_run(
-    made: Path, bucket: Path, monkeypatch: pytest.MonkeyPatch, url: str
+    made: Path, monkeypatch: pytest.MonkeyPatch, url: str
 ) -> None:
     """run.json must appear after all other files."""
     names = {path.name for path in made.iterdir()}
@@ -279,18 +285,18 @@ def test_interrupted_upload_shows_no_run(
             with pytest.raises(OutputError, match="broke"):
                 upload(made, url, claim)
         assert "run.json" not in files(url)
-        assert len(files(url)) == cut or cut < 2
+        assert len(files(url)) == cut
 
     with claimed(url, "one") as claim:
         upload(made, url, claim)
     assert files(url) == names
     assert files(url.removesuffix("/run")) == {f"run/{name}" for name in names}
-    assert bucket.exists()
 
 
 @pytest.mark.parametrize("url", ["memory://old/run", "s3://lab/old/run"])
+@pytest.mark.usefixtures("bucket")
 def test_labels_survive_killed_replacement(
-    shapecat: Run, served: Path, bucket: Path, monkeypatch: pytest.MonkeyPatch, url: str
+    shapecat: Run, served: Path, monkeypatch: pytest.MonkeyPatch, url: str
 ) -> None:
     """With the old run gone and no new one yet, corrections must survive."""
     out, place = url.removesuffix("/run"), Location(url)
@@ -310,7 +316,6 @@ def test_labels_survive_killed_replacement(
     assert done.exit_code == 0, done.output
     assert "transferred 1 of 1" in done.stderr
     assert not [name for name in files(out) if name.startswith(".run.old")]
-    assert bucket.exists()
 
 
 def labelled(table: bytes, label: str) -> bytes:
@@ -369,13 +374,13 @@ def test_foreign_folder_is_not_touched(made: Path) -> None:
 
 
 @pytest.mark.parametrize("url", ["memory://claims/run", "s3://lab/claims/run"])
-def test_only_one_process_claims_a_folder(bucket: Path, url: str) -> None:
+@pytest.mark.usefixtures("bucket")
+def test_only_one_process_claims_a_folder(url: str) -> None:
     with claimed(url, "one"), pytest.raises(OutputError, match="another run is writing there"):
         claims.Claim(url, "two")
     with claimed(url, "two") as claim:
         assert not claim.inherited
     assert files(url.removesuffix("/run")) == set()
-    assert bucket.exists()
 
 
 def test_claim_of_dead_process_is_taken_over(made: Path, bucket: Path) -> None:
@@ -422,7 +427,8 @@ def test_upload_stops_when_claim_is_taken_over(
     followers[-1].require()
 
 
-def test_batch_takes_over_its_own_claims_at_once(bucket: Path) -> None:
+@pytest.mark.usefixtures("bucket")
+def test_batch_takes_over_its_own_claims_at_once() -> None:
     first = claims.Claim("s3://lab/same/run", "one")
     second = claims.Claim("s3://lab/same/run", "one")
     assert (first.inherited, second.inherited) == (False, True)
@@ -430,14 +436,14 @@ def test_batch_takes_over_its_own_claims_at_once(bucket: Path) -> None:
     second.require()
     second.release()
     assert files("s3://lab/same") == set()
-    assert bucket.exists()
 
 
 def entry(name: str, state: Any) -> Entry:
     return Entry(name, f"{name}.mcap", state, "input", "work")
 
 
-def test_manifest_in_bucket_has_lines_of_all_writers(bucket: Path) -> None:
+@pytest.mark.usefixtures("bucket")
+def test_manifest_in_bucket_has_lines_of_all_writers() -> None:
     """With two commands at once, one of them killed, no sent line may be lost."""
     url = "s3://lab/manifests"
     killed = RemoteManifest(url)
@@ -455,7 +461,6 @@ def test_manifest_in_bucket_has_lines_of_all_writers(bucket: Path) -> None:
     merged = (Location(url) / "manifest.jsonl").read() or b""
     assert sorted(json.loads(line)["folder"] for line in merged.splitlines()) == ["a", "b", "c"]
     assert RemoteManifest(url, "1-of-4").entries == {}
-    assert bucket.exists()
 
 
 def test_manifest_parts_stay_small(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -495,13 +500,11 @@ def only_error(result: Result) -> str:
 
 
 @pytest.mark.parametrize("source", ["s3://none/", "s3://none/*.mcap", "s3://none/a.mcap"])
-def test_missing_bucket_is_reported_in_one_line(
-    shapecat: Run, bucket: Path, tmp_path: Path, source: str
-) -> None:
+@pytest.mark.usefixtures("bucket")
+def test_missing_bucket_is_reported_in_one_line(shapecat: Run, tmp_path: Path, source: str) -> None:
     read = shapecat("process", source, "--out", tmp_path, *OPTIONS)
     assert read.exit_code == 3
     assert source.rstrip("/") in only_error(read)
-    assert bucket.exists()
 
 
 def test_missing_result_bucket_is_not_created(shapecat: Run, bucket: Path, served: Path) -> None:
@@ -515,8 +518,9 @@ def test_missing_result_bucket_is_not_created(shapecat: Run, bucket: Path, serve
     assert not requests(bucket, "PUT", "/none")
 
 
+@pytest.mark.usefixtures("bucket")
 def test_missing_credentials_are_reported_in_one_line(
-    shapecat: Run, bucket: Path, served: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+    shapecat: Run, served: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     for name in ("AWS_ACCESS_KEY_ID", "AWS_SECRET_ACCESS_KEY"):
         monkeypatch.delenv(name)
@@ -528,7 +532,6 @@ def test_missing_credentials_are_reported_in_one_line(
         assert done.exit_code in {1, 3}
         assert "credentials" in only_error(done)
     system.clear_instance_cache()
-    assert bucket.exists()
 
 
 def peak_mb() -> float:
