@@ -285,13 +285,15 @@ def test_damaged_images_are_skipped_and_reported(tmp_path: Path) -> None:
 
 def test_damaged_image_is_message_error() -> None:
     """The header of an image may claim more than its content holds."""
-    for body in (jpeg(gradient()), png(gradient())):
-        kind = "png" if body.startswith(b"\x89") else "jpeg"
-        damaged = body[: len(body) // 2] + body[-12:]
-        wrong = ColourImage("", 0, 0, "", kind, 64, 48, 0, damaged)
-        if kind == "png":
-            with pytest.raises(MessageError, match="damaged"):
-                pixels_of(wrong)
+    bodies = {"jpeg": jpeg(gradient()), "png": png(gradient())}
+    scan, half = bodies["jpeg"].index(b"\xff\xda"), len(bodies["png"]) // 2
+    damaged = {
+        "jpeg": bodies["jpeg"][:scan] + bodies["jpeg"][-2:],
+        "png": bodies["png"][:half] + bodies["png"][-12:],
+    }
+    for kind, body in bodies.items():
+        with pytest.raises(MessageError, match=f"{kind} image is damaged"):
+            pixels_of(ColourImage("", 0, 0, "", kind, 64, 48, 0, damaged[kind]))
         with pytest.raises(MessageError, match="instead of"):
             pixels_of(ColourImage("", 0, 0, "", kind, 640, 480, 0, body))
     short = ColourImage("", 0, 0, "", "rgb8", 640, 480, 1920, bytes(1000))
