@@ -2,6 +2,7 @@
 
 import io
 import json
+import tracemalloc
 import zipfile
 from collections.abc import Callable
 from pathlib import Path
@@ -197,9 +198,15 @@ def test_claimed_array_size_is_not_allocated(saved: Path) -> None:
         saved,
         lambda m: m.update({"votes.npy": real.replace(b"(4, 2), }    ", b"(400000000, 2), }")}),
     )
+    tracemalloc.start()
+    try:
+        with pytest.raises(ModelError, match="size of an array differs"):
+            load_model(saved)
+        peak = tracemalloc.get_traced_memory()[1]
+    finally:
+        tracemalloc.stop()
 
-    with pytest.raises(ModelError):
-        load_model(saved)
+    assert peak < 1e6
 
 
 def test_zip_bomb_is_not_unpacked(saved: Path, monkeypatch: pytest.MonkeyPatch) -> None:
