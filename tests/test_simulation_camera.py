@@ -290,6 +290,25 @@ def test_stereo_holes_are_patches() -> None:
     assert np.median(widths) >= 5
 
 
+@pytest.mark.parametrize(("hole_px", "correlation"), [(1, 0.0), (8, 1 / 3)])
+def test_depth_at_grazing_incidence_is_missing_in_patches(hole_px: int, correlation: float) -> None:
+    """Filters close single pixels: a table at a low angle would look intact.
+
+    At half the lag of the patches, the thresholds have a correlation of 1/2, their signs of 1/3.
+    """
+    pose = looking_at(np.array([0, 0, 0.35]), np.array([0, 1.0, 0.2]))
+    sensor = dataclasses.replace(IDEAL, grazing_cosine=0.2, hole_px=hole_px)
+    image = render(geometry([(big_quad(0.0), HERE)]), sensor.camera, pose)
+    depth, _ = measure(image, sensor, np.random.default_rng(0))
+    missing = (depth == 0) & (image.depth > 0)
+    share = missing.mean(axis=1, keepdims=True)
+    missing = (missing - share)[(share[:, 0] > 0.25) & (share[:, 0] < 0.75)]
+
+    assert (missing[:, 4:] * missing[:, :-4]).mean() / missing.var() == pytest.approx(
+        correlation, abs=0.05
+    )
+
+
 def test_resized_sensor_has_windows_of_same_angle() -> None:
     """Margins of 8 pixels in an image of half the width would hide the objects."""
     half = resized(PRESETS["d455"], 0.5)
