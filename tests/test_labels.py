@@ -413,6 +413,11 @@ def test_deleted_track_is_not_shown(tmp_path: Path) -> None:
     assert [[o.track for o in f.objects] for f in frames] == [[1, 2], [1], [1]]
     assert [f.ended for f in frames] == [(), (2,), ()]
 
+    frames = list(read_labelled_frames(tmp_path, {1: labels[1], 3: TrackLabel(3, "can", 1.0)}))
+
+    assert [[o.track for o in f.objects] for f in frames] == [[1], [1, 3], [1, 3]]
+    assert [f.ended for f in frames] == [(), (), ()]  # the deleted track 2 was never shown
+
 
 def test_track_of_two_sensors_ends_after_its_latest_view(tmp_path: Path) -> None:
     """Otherwise its box would stay on one topic for ever."""

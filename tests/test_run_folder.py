@@ -182,14 +182,18 @@ def test_run_json_round_trips_and_is_validated(tmp_path: Path) -> None:
 
 def test_digest_covers_whole_file(tmp_path: Path) -> None:
     path = tmp_path / "f"
-    middle = bytearray(b"a" * 3_000_000)
-    middle[1_500_000:1_504_096] = bytes(4096)
+    whole = b"a" * 3_000_000
+    contents = [b"", b"a", whole, whole + b"a"]
+    for at in (0, 1, *range(99_999, len(whole), 100_000)):
+        damaged = bytearray(whole)
+        damaged[at] = 0
+        contents.append(bytes(damaged))
     digests = set()
-    for content in (b"", b"a", b"a" * 3_000_000, bytes(middle), b"a" * 3_000_001):
+    for content in contents:
         path.write_bytes(content)
         digests.add(content_digest(path))
 
-    assert len(digests) == 5
+    assert len(digests) == len(contents)
 
 
 def test_folder_digest_covers_names_and_file_boundaries(tmp_path: Path) -> None:
