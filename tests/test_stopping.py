@@ -152,6 +152,7 @@ def test_run_completes_if_progress_reader_leaves(recording: Path, tmp_path: Path
 
 
 def test_second_signal_ends_command(recording: Path, undisturbed: Path, tmp_path: Path) -> None:
+    """At once: a command that finishes the frames in work says how to continue."""
     command = Command(recording, tmp_path, "--jobs", "2")
     command.wait_for_frames(40)
     command.signal_group(signal.SIGINT)
@@ -160,6 +161,7 @@ def test_second_signal_ends_command(recording: Path, undisturbed: Path, tmp_path
 
     assert returned in {130, 143}
     assert "Traceback" not in errors
+    assert "run the same command again" not in errors
 
     process(Job(recording, tmp_path / "table", rrd=False))
 
