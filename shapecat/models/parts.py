@@ -183,9 +183,9 @@ def count_labels(pixel_labels: U1, labels: I4, grid: DepthGrid) -> I4:
 
 
 def _segment_objects(segments: Segments, counts: I4, object_labels: I4) -> tuple[I4, I4]:
-    """Return the number of cells (n,) and the owner (n,) of each merged segment.
+    """Return the number of cells (n,) of each merged segment, and the object (n,) that it shows.
 
-    The owner is the label of an object, 0 for background, or -1 for a mixed segment.
+    The latter is the label of an object, 0 for background, or -1 for a mixed segment.
     """
     joined = np.zeros_like(counts)
     np.add.at(joined, segments.parent, counts)
