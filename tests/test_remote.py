@@ -24,11 +24,12 @@ from shapecat.batch import claims, storage
 from shapecat.batch.claims import claimed
 from shapecat.batch.finding import find_recordings, look_at
 from shapecat.batch.manifest import Entry, RemoteManifest
-from shapecat.batch.remote import Ticket, process_remote, scratch, upload
+from shapecat.batch.remote import Ticket, process_remote, upload
 from shapecat.batch.storage import Location
 from shapecat.errors import OutputError, RecordingError
 from shapecat.runs.folder import RUN_FILES
 from shapecat.runs.jobs import Job, Summary
+from shapecat.system.files import scratch_folder
 from tests.object_storage import object_storage, requests
 from tests.scenes import record
 
@@ -170,6 +171,33 @@ def test_patterns_and_folders_of_storage_are_expanded(served: Path) -> None:
     assert every == {*both, f"{url}/b.bag"}
     assert look_at(f"{url}/a.mcap")[1] == (served / "a.mcap").stat().st_size
     assert look_at(f"{url}/none.mcap") == ("", 0)
+
+
+@pytest.mark.parametrize("lab", ["memory://brackets", "s3://lab/brackets"])
+@pytest.mark.usefixtures("bucket")
+def test_names_with_brackets_are_not_patterns(
+    shapecat: Run, served: Path, tmp_path: Path, lab: str
+) -> None:
+    """Otherwise its run folder looks empty, and a stranger's file in it is overwritten."""
+    names = ("take[1].mcap", "bag[2]/one.mcap", "bag[2]/metadata.yaml")
+    for name in names[:2]:
+        (Location(lab) / name).upload(served / "a.mcap")
+    (Location(lab) / names[2]).write(b"relative_file_paths:\n  - one.mcap\n")
+    out = f"{lab}/out[3]"
+    command = ("process", f"{lab}/", "--out", out, *OPTIONS)
+
+    assert shapecat(*command).exit_code == 0
+    assert {"take[1]/run.json", "bag[2]/run.json"} <= files(out)
+    assert shapecat(*command).stdout.count("already complete") == 2
+    assert [source.url for source in find_recordings([f"{lab}/{names[0]}"]).kept]
+    Location(f"{lab}/bag[2]").download(tmp_path / "copy")
+    assert {path.name for path in (tmp_path / "copy").iterdir()} == {"one.mcap", "metadata.yaml"}
+
+    (Location(out) / "take[1]/run.json").remove()
+    (Location(out) / "take[1]/thesis.txt").write(b"years of work")
+    refused = shapecat(*command, "--overwrite")
+    assert refused.exit_code == 1
+    assert "shapecat did not make this" in refused.stderr
 
 
 @pytest.mark.parametrize("place", ["memory://lab/mixed", "s3://lab/mixed"])
@@ -478,12 +506,18 @@ def test_manifest_parts_stay_small(monkeypatch: pytest.MonkeyPatch) -> None:
 
 
 def test_scratch_of_killed_processes_is_removed(own_scratch: Path) -> None:
-    (own_scratch / "shapecat-scratch-left").mkdir()
-    with scratch() as mine:
-        with scratch() as other:
+    old, new = own_scratch / "shapecat-scratch-old", own_scratch / "shapecat-scratch-new"
+    for left in (old, new):
+        left.mkdir()
+    os.utime(old, (0, 0))
+    with scratch_folder("shapecat-scratch-") as mine:
+        os.utime(mine, (0, 0))
+        with scratch_folder("shapecat-scratch-") as other:
             assert mine.exists()
             assert other.exists()
-        assert not (own_scratch / "shapecat-scratch-left").exists()
+        assert not old.exists()
+        assert new.exists()  # its process may not have locked it yet
+        new.rmdir()
 
 
 def test_unreachable_server_is_reported(tmp_path: Path) -> None:

@@ -90,10 +90,11 @@ def _at(url: str) -> list[Source]:
     RecordingError : the storage cannot be reached.
     """
     location = Location(url)
-    if any(character in url for character in "*["):
-        found = [(name, content_key(info), _size(info)) for name, info in location.walk(deep=True)]
+    if any(character in url.partition("?")[0] for character in "*["):  # signed URLs have queries
+        found = [(name, content_key(info), _size(info)) for name, info in location.matches()]
         kept = [known for known in found if PurePosixPath(known[0]).suffix in SUFFIXES]
-        return [_of_url(*known) for known in sorted(kept)]
+        if kept or location.info() is None:  # otherwise a name with brackets
+            return [_of_url(*known) for known in sorted(kept)]
     if url.endswith("/"):
         return [_of_url(*known) for known in sorted(_search_remote(location))]
     return [_of_url(url, "", 0)]

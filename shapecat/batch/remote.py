@@ -5,11 +5,7 @@ uploaded last; without run.json, its files do not count as a run.
 """
 
 import dataclasses
-import os
-import shutil
-import tempfile
-from collections.abc import Iterator
-from contextlib import contextmanager, nullcontext, suppress
+from contextlib import nullcontext
 from dataclasses import dataclass
 from pathlib import Path, PurePosixPath
 
@@ -20,10 +16,10 @@ from shapecat.pipeline import process
 from shapecat.runs.folder import OUTPUTS, RUN_FILES, read_run, require_ours, write_run
 from shapecat.runs.jobs import Job, Summary, summarize
 from shapecat.runs.run_info import OriginInfo, RunInfo
-from shapecat.system.files import lock
+from shapecat.system.files import scratch_folder
 from shapecat.system.progress import Observer
 
-__all__ = ["Ticket", "process_remote", "scratch", "upload"]
+__all__ = ["Ticket", "process_remote", "upload"]
 
 _SCRATCH = "shapecat-scratch-"
 _PREVIOUS = tuple(name for name in RUN_FILES if name not in {*OUTPUTS, "report.html"})
@@ -70,7 +66,7 @@ def process_remote(job: Job, observe: Observer, *, cores: int, ticket: Ticket) -
     OutputError : the storage is not writable, or another process works on the run folder.
     """
     claim = claimed(job.target, ticket.batch) if job.target else nullcontext()
-    with scratch() as folder, claim as held:
+    with scratch_folder(_SCRATCH) as folder, claim as held:
         local = job
         if job.target:
             local, run = _fetch_run(
@@ -180,30 +176,3 @@ def upload(folder: Path, url: str, claim: Claim) -> None:
         (place / name).remove()
     for name in old.names():
         (old / name).remove()
-
-
-@contextmanager
-def scratch() -> Iterator[Path]:
-    """Provide a temporary folder for the block; remove the folders of killed processes."""
-    parent = Path(tempfile.gettempdir())
-    for left in parent.glob(f"{_SCRATCH}*"):
-        with suppress(OSError):
-            _remove_unless_used(left)
-    with tempfile.TemporaryDirectory(prefix=_SCRATCH, ignore_cleanup_errors=True) as folder:
-        held = lock(Path(folder))
-        try:
-            yield Path(folder)
-        finally:
-            _release(held)
-
-
-def _remove_unless_used(folder: Path) -> None:
-    held = lock(folder)
-    if held is not None:
-        shutil.rmtree(folder, ignore_errors=True)
-        _release(held)
-
-
-def _release(held: int | None) -> None:
-    if held is not None:
-        os.close(held)

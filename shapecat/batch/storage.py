@@ -161,14 +161,16 @@ class Location:
         ShapecatError : the file does not exist, or the transfer failed.
         """
 
-        def get() -> None:
-            if self._system.isdir(self._path):
-                self._system.get(self._path, str(target), recursive=True, **self._in_parts())
-            else:  # `get` would take a URL with a query for a pattern, and make a folder
-                self._system.get_file(self._path, str(target), **self._in_parts())
+        def get(source: str, file: Path) -> None:  # `get` would take some names for patterns
+            file.parent.mkdir(parents=True, exist_ok=True)
+            self._system.get_file(source, str(file), **self._in_parts())
 
         with suppress(FileNotFoundError):
-            self._tried("downloaded", get)
+            if not self._tried("downloaded", lambda: self._system.isdir(self._path)):
+                self._tried("downloaded", lambda: get(self._path, target))
+            for info in self._list(deep=True) if not target.exists() else ():
+                file = target / PurePosixPath(info["name"]).relative_to(self._path)
+                self._tried("downloaded", partial(get, info["name"], file))
         if not target.exists():
             msg = f"{self.url}: does not exist"
             raise self._error(msg)
@@ -187,23 +189,24 @@ class Location:
         return {PurePosixPath(url).name for url, _ in self.walk(deep=False)}
 
     def walk(self, *, deep: bool = True) -> Iterator[tuple[str, Mapping[str, Any]]]:
-        """Yield URL and info of the files in a folder, or of the files that match a pattern.
-
-        A folder that does not exist yields nothing.
+        """Yield URL and info of the files in a folder; none if it does not exist.
 
         Parameters
         ----------
-        deep : whether to yield the files in subfolders; if not, the subfolders are yielded. No
-            effect on a pattern.
+        deep : whether to yield the files in subfolders; if not, the subfolders are yielded.
         """
-        found = self._match() if _is_pattern(self._path) else self._list(deep=deep)
         with suppress(FileNotFoundError):
-            for info in found:
-                yield str(self._system.unstrip_protocol(info["name"].rstrip("/"))), info
+            for info in self._list(deep=deep):
+                yield self._url_of(info), info
 
-    def _match(self) -> Iterator[Mapping[str, Any]]:
-        system = self._system
-        yield from self._tried("listed", lambda: system.glob(self._path, detail=True)).values()
+    def matches(self) -> Iterator[tuple[str, Mapping[str, Any]]]:
+        """Yield URL and info of the files that match this URL, which is a pattern."""
+        found = self._tried("listed", lambda: self._system.glob(self._path, detail=True))
+        for info in found.values():
+            yield self._url_of(info), info
+
+    def _url_of(self, info: Mapping[str, Any]) -> str:
+        return str(self._system.unstrip_protocol(info["name"].rstrip("/")))
 
     def _list(self, *, deep: bool) -> Iterator[Mapping[str, Any]]:
         system, path = self._system, self._path
@@ -273,10 +276,6 @@ def _connect(url: str, error: type[ShapecatError]) -> tuple[Any, str]:
         msg = f"{url}: cannot be reached: {reason}"
         raise error(msg) from reason
     return system, str(path)
-
-
-def _is_pattern(path: str) -> bool:
-    return any(character in path for character in "*[")
 
 
 def _may_pass(error: Exception) -> bool:

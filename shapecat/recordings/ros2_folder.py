@@ -1,15 +1,12 @@
 """Read ROS 2 bags in a folder: one or more SQLite or MCAP files, possibly compressed."""
 
-import os
 import re
 import shutil
-import time
 from collections.abc import Callable, Iterator
-from contextlib import suppress
+from contextlib import ExitStack
 from heapq import merge
 from itertools import pairwise
 from pathlib import Path
-from tempfile import TemporaryDirectory, gettempdir
 from typing import ClassVar
 
 import zstandard
@@ -19,7 +16,7 @@ from shapecat.recordings.mcap_file import McapRecording
 from shapecat.recordings.messages import Channel, Message, Selection, sum_topics
 from shapecat.recordings.recording import Recording
 from shapecat.recordings.ros2_database import DatabaseRecording
-from shapecat.system.files import lock
+from shapecat.system.files import scratch_folder
 
 __all__ = ["FolderRecording"]
 
@@ -30,7 +27,6 @@ _PARTS: dict[str, Callable[[Path], Recording]] = {
 
 
 _SCRATCH = "shapecat-parts-"
-_NEW_S = 60
 
 
 class FolderRecording(Recording):
@@ -50,8 +46,8 @@ class FolderRecording(Recording):
         RecordingError : the folder holds no .mcap or .db3 file, or none of them can be read.
         """
         super().__init__(path)
-        self._scratch: TemporaryDirectory[str] | None = None
-        self._lock: int | None = None
+        self._scratch: Path | None = None
+        self._cleanup = ExitStack()
         self._parts: list[Recording] = []
         try:
             self._open_parts(self._list_files())
@@ -73,11 +69,7 @@ class FolderRecording(Recording):
         """Close all files and remove the decompressed copies."""
         for part in self._parts:
             part.close()
-        if self._scratch is not None:
-            self._scratch.cleanup()
-        if self._lock is not None:
-            os.close(self._lock)
-            self._lock = None
+        self._cleanup.close()
 
     def parts(self) -> list[Recording]:
         """Return one recording per file, sorted by start time."""
@@ -141,11 +133,9 @@ class FolderRecording(Recording):
     def _decompressed(self, file: Path) -> Path:
         """Decompress a file into a temporary folder, using at most half of the free space."""
         if self._scratch is None:
-            _remove_abandoned()
-            self._scratch = TemporaryDirectory(prefix=_SCRATCH)
-            self._lock = lock(Path(self._scratch.name))
-        plain = Path(self._scratch.name, file.stem)
-        room = shutil.disk_usage(self._scratch.name).free // 2
+            self._scratch = self._cleanup.enter_context(scratch_folder(_SCRATCH))
+        plain = self._scratch / file.stem
+        room = shutil.disk_usage(self._scratch).free // 2
         reader = zstandard.ZstdDecompressor()
         try:
             with file.open("rb") as source, plain.open("wb") as target:
@@ -163,17 +153,6 @@ class FolderRecording(Recording):
         for part in self._parts:
             for text in part.warnings:
                 self.warn(f"{part.path.name}: {text}")
-
-
-def _remove_abandoned() -> None:
-    """Remove the temporary folders of killed processes."""
-    for folder in Path(gettempdir()).glob(f"{_SCRATCH}*"):
-        with suppress(OSError):
-            # A new folder may not be locked yet.
-            if time.time() - folder.stat().st_mtime < _NEW_S or (held := lock(folder)) is None:
-                continue
-            shutil.rmtree(folder, ignore_errors=True)
-            os.close(held)
 
 
 def _suffix(file: Path) -> str:

@@ -9,9 +9,11 @@ import errno
 import fcntl
 import os
 import shutil
+import time
 from collections.abc import Iterator
 from contextlib import contextmanager, suppress
 from pathlib import Path
+from tempfile import TemporaryDirectory, gettempdir
 
 from shapecat.errors import OutputError, explained
 
@@ -26,10 +28,15 @@ __all__ = [
     "partial_path",
     "replacing",
     "require_writable",
+    "scratch_folder",
 ]
 
 FSYNC = "SHAPECAT_FSYNC"
 """The environment variable that disables flushing; worker processes inherit it."""
+
+
+_NEW_S = 60
+"""Age up to which a temporary folder may not be locked yet."""
 
 
 def partial_path(path: Path) -> Path:
@@ -145,6 +152,24 @@ def holding(folder: Path) -> Iterator[None]:
         yield
     finally:
         os.close(held)
+
+
+@contextmanager
+def scratch_folder(prefix: str) -> Iterator[Path]:
+    """Provide a temporary folder for the block; remove those of killed processes.
+
+    Parameters
+    ----------
+    prefix : beginning of the names of these folders.
+    """
+    for left in Path(gettempdir()).glob(f"{prefix}*"):
+        with suppress(OSError):
+            if time.time() - left.stat().st_mtime > _NEW_S and (held := lock(left)) is not None:
+                shutil.rmtree(left, ignore_errors=True)
+                os.close(held)
+    temporary = TemporaryDirectory(prefix=prefix, ignore_cleanup_errors=True)
+    with temporary as folder, holding(Path(folder)):
+        yield Path(folder)
 
 
 def input_files(path: Path) -> list[Path]:
