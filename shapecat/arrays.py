@@ -33,7 +33,8 @@ def freeze(
 
     Returns
     -------
-    A read-only view if the type already fits, otherwise a read-only copy.
+    ``value`` if it is read-only and of this type, a read-only view if only the type fits, otherwise
+    a read-only copy.
 
     Raises
     ------

@@ -19,6 +19,7 @@ from shapecat.recordings.colour_streams import pair_colours
 from shapecat.rehearsal import compile_all
 from shapecat.runs.corrections import adopt_labels, read_labels
 from shapecat.runs.folder import (
+    OUTPUT_OPTIONS,
     OUTPUTS,
     made_by_run,
     read_run,
@@ -29,7 +30,6 @@ from shapecat.runs.folder import (
 )
 from shapecat.runs.identity import ContentDigest, file_stats, same_content
 from shapecat.runs.jobs import (
-    OUTPUT_OPTIONS,
     Job,
     Summary,
     describe_run,

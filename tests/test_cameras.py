@@ -63,7 +63,7 @@ def test_rectified_image_uses_p_and_raw_image_uses_k() -> None:
 def test_topic_name_decides_whether_image_is_rectified(topic: str, rectified: bool) -> None:
     """A transport appends to the topic name; the namespace has no meaning."""
     recording: Any = SimpleNamespace(topics=())
-    stream = Stream(topic, IMAGE, "depth", "/info", 9, "optical", "16UC1")
+    stream = Stream(topic, IMAGE, "depth", "/info", 9, "optical")
 
     assert DepthSource(recording, stream).rectified is rectified
 

@@ -346,7 +346,7 @@ def test_unorganised_clouds_get_semantic_kitti_labels(tmp_path: Path) -> None:
     run: Any = {"model": {"categories": ["cup", "can"]}}
     finished = FinishedRun(tmp_path, run, {513: TrackLabel(513, "can", 1.0)})
 
-    assert write_point_labels(tmp_path, [(labelled, frame)], finished) == 1
+    assert write_point_labels(tmp_path, [(labelled, frame, None)], finished) == 1
 
     cloud = np.fromfile(tmp_path / "velodyne" / "000000.bin", "<f4").reshape(-1, 4)
     label = np.fromfile(tmp_path / "labels" / "000000.label", "<u4")

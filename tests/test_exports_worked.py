@@ -183,7 +183,10 @@ def labelcloud(folder: Path) -> None:
     finished: Any = SimpleNamespace(
         categories=("cup", "bowl"), run={"versions": {"shapecat": "0"}}, labels={}
     )
-    assert write_labelcloud(folder, [(labelled(cut=False, hidden=False), frame())], finished) == 1
+    assert (
+        write_labelcloud(folder, [(labelled(cut=False, hidden=False), frame(), None)], finished)
+        == 1
+    )
 
 
 def corners_of(center: Sequence[float], size: Any, yaw: float) -> Any:
@@ -276,15 +279,15 @@ def test_crops_of_two_cameras_do_not_replace_each_other(tmp_path: Path) -> None:
     }
     lab: Any = SimpleNamespace(name="lab", run=run)
     one = labelled(cut=False, hidden=False)
-    pairs = [(replace(one, topic=topic), replace(frame(), topic=topic)) for topic in topics]
+    frames = [(replace(one, topic=topic), replace(frame(), topic=topic), None) for topic in topics]
 
-    assert write_crops(tmp_path, pairs, lab) == 2
+    assert write_crops(tmp_path, frames, lab) == 2
     (instance,) = tmp_path.glob("*/*")
     assert instance.relative_to(tmp_path) == Path("bowl/lab.01234567.track-4")
     assert len(list(instance.iterdir())) == 2
 
     run["options"]["topics"] = topics[:1]
-    assert write_crops(tmp_path, pairs[:1], lab) == 1
+    assert write_crops(tmp_path, frames[:1], lab) == 1
     assert [path.name for path in tmp_path.glob("*/*/*")] == ["000000.pcd"]
 
 

@@ -450,8 +450,8 @@ def point_labels(out: Path) -> int:
     cup, box = labelled_object(3, [0, 5]), labelled_object(300, [2], category="box")
     scanned = labelled_frame(9, replace(box, indices=np.array([1, 2])), topic="/scan")
     frames = [
-        (replace(labelled_frame(4, cup, box), stamp_ns=5), image),
-        (replace(scanned, stamp_ns=7), cloud),
+        (replace(labelled_frame(4, cup, box), stamp_ns=5), image, None),
+        (replace(scanned, stamp_ns=7), cloud, None),
     ]
     labels = {3: TrackLabel(3, "cup", 0.6), 300: TrackLabel(300, "box", 1.0)}
     run: Any = SimpleNamespace(folder=out, labels=labels, categories=("cup", "can", "box"))

@@ -323,7 +323,7 @@ def test_label_has_only_low_confidences() -> None:
 def test_tabs_show_longest_tracks() -> None:
     """Of hundreds of tracks most are short; tabs are in the order of their numbers."""
     frames = {k: 300 if k % 2 else k for k in range(1, 101)}
-    tracks = [TrackView(f"/tracks/{k}", f"#{k}", "cup", n) for k, n in frames.items()]
+    tracks = [TrackView(f"/tracks/{k}", f"#{k}", n) for k, n in frames.items()]
     titles = [str(view.name) for view in _track_tabs(tracks).contents]
     few = [str(view.name) for view in _track_tabs(tracks[:3]).contents]
 

@@ -8,7 +8,7 @@ from itertools import islice
 from threading import Lock
 from typing import Any
 
-from shapecat.batch.manifest import Entry, Manifest
+from shapecat.batch.manifest import Entry, Manifest, State
 from shapecat.batch.plans import Task
 from shapecat.batch.storage import Location
 from shapecat.errors import OutputError
@@ -46,18 +46,22 @@ class Ledger:
     def plan(self, tasks: Iterable[Task]) -> None:
         """Record the recordings to process, unless the manifest has them already."""
         entries = (task.entry() for task in tasks if task.status != "complete")
-        new = (entry for entry in entries if not self._is_noted(entry))
+        new = (entry for entry in entries if not self._has(entry, "planned"))
         while some := list(islice(new, _LINES)):
             self._write(some)
 
-    def _is_noted(self, entry: Entry) -> bool:
-        known = self._manifest.entries.get(entry.folder) if self._manifest is not None else None
-        return known is not None and known.state == "planned" and known.same_work(entry)
+    def _last(self, folder: str) -> Entry | None:
+        return None if self._manifest is None else self._manifest.entries.get(folder)
+
+    def _has(self, entry: Entry, state: State) -> bool:
+        """Return whether the manifest has the same work in this state."""
+        known = self._last(entry.folder)
+        return known is not None and known.state == state and known.same_work(entry)
 
     def known(self, task: Task) -> Outcome:
         """Return the outcome of a task that was complete before."""
         job = task.job
-        entry = self._manifest.entries.get(task.name) if self._manifest is not None else None
+        entry = self._last(task.name)
         if entry is not None and entry.tracks is not None and entry.frames is not None:
             counts = {"frames": entry.frames, "tracks": entry.tracks}
             summary = Summary(
@@ -104,7 +108,7 @@ class Ledger:
             entry, summary = self._open[task.name], outcome.summary
             if summary is None:
                 self._note(entry, state="failed", exit_code=outcome.code, message=outcome.message)
-            elif not self._is_complete(entry):
+            elif not self._has(entry, "complete"):
                 self._note(
                     entry,
                     state="complete",
@@ -114,14 +118,9 @@ class Ledger:
                 )
             del self._open[task.name]
 
-    def _is_complete(self, entry: Entry) -> bool:
-        known = self._manifest.entries.get(entry.folder) if self._manifest is not None else None
-        return known is not None and known.state == "complete" and known.same_work(entry)
-
-    def _note(self, entry: Entry, **changes: Any) -> Entry:
+    def _note(self, entry: Entry, **changes: Any) -> None:
         new = self._open[entry.folder] = replace(entry, **changes)
         self._write([new])
-        return new
 
     def _write(self, entries: Sequence[Entry]) -> None:
         if self._manifest is None:

@@ -20,7 +20,8 @@ from shapecat.batch.manifest import Entry, Manifest, open_manifest
 from shapecat.batch.storage import Location, is_url
 from shapecat.errors import ConfigError, OutputError
 from shapecat.learning import load_model
-from shapecat.runs.folder import read_run
+from shapecat.runs.folder import OUTPUT_OPTIONS, read_run
+from shapecat.runs.identity import file_stats
 from shapecat.runs.jobs import Job
 from shapecat.system.files import partial_path
 
@@ -281,9 +282,7 @@ def _whole(task: Task) -> bool:
     job = task.job
     if job.target:
         return True  # complete if the manifest says so
-    outputs = [
-        name for name, made in (("annotated.mcap", job.mcap), ("review.rrd", job.rrd)) if made
-    ]
+    outputs = [name for option, name in OUTPUT_OPTIONS.items() if getattr(job, option)]
     try:
         run = read_run(job.folder)
     except OutputError:
@@ -294,11 +293,9 @@ def _whole(task: Task) -> bool:
 def _input_key(source: Path) -> tuple[str, int]:
     """Return a key of a recording's files, from names, sizes and times, and their total bytes."""
     try:
-        files = sorted(source.iterdir()) if source.is_dir() else [source]
-        stats = [(file.name, file.stat()) for file in files]
+        known = file_stats(source)
     except OSError:
         return "", 0
-    known = [(name, stat.st_size, stat.st_mtime_ns, stat.st_ctime_ns) for name, stat in stats]
     return _hash(known), sum(size for _, size, *_ in known)
 
 

@@ -22,7 +22,7 @@ __all__ = ["OBJECTS", "figure_rows", "format_page", "require_new", "write_compar
 
 _MOST_ROWS = 500
 _LETTERS = 43
-"""The height of letters goes so often into the width of a picture, however few pixels it has."""
+"""Width of a picture divided by the height of its letters, whatever its number of pixels."""
 
 OBJECTS = pa.schema(
     [

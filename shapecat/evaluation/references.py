@@ -14,6 +14,7 @@ from shapecat.evaluation.labellings import LabelledItem, Labelling, Reference
 from shapecat.evaluation.references_coco import CocoLabels
 from shapecat.evaluation.references_kitti import KittiLabels
 from shapecat.runs.finished import FinishedRun, read_finished
+from shapecat.runs.folder import read_run
 from shapecat.runs.labels import rows_by_frame
 from shapecat.runs.shown import ShownTracks
 from shapecat.runs.tables import Key, keys_of, read_row_groups, read_together
@@ -193,9 +194,7 @@ def read_complete(folder: Path) -> FinishedRun:
     ------
     OutputError : the folder is not a run, or the run is not complete.
     """
-    if not (folder / "run.json").is_file():
-        msg = f"{folder}: no run.json there; expected a folder made by `shapecat process`"
-        raise OutputError(msg)
+    read_run(folder)  # says if there is no run
     if not ((folder / "tracks.parquet").is_file() and (folder / "tracks.csv").is_file()):
         msg = f"{folder}: the run is not complete; run the same command again to resume"
         raise OutputError(msg)

@@ -24,10 +24,9 @@ _Result = TypeVar("_Result")
 _ALONE = 1
 """Items processed here before other processes are started: a short run needs none."""
 _AHEAD, _AWAY = 1, 3
-"""Items sent to a busy process in advance; and all items of a process, of which one waits here.
-
-The waiting item is sent when the process finishes another one, even while this process works.
-"""
+"""Items sent to a busy process in advance; and all that a process is given: the one it works on,
+one sent in advance, and one that waits here. A thread sends the waiting one as soon as the process
+finishes another, even while this process works."""
 _HELD = 8
 """At most this many items are in progress, or wait for the result of an earlier one."""
 _SWITCH_S = 5e-4

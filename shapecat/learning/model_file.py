@@ -11,7 +11,7 @@ from functools import cache
 from importlib.resources import files
 from importlib.resources.abc import Traversable
 from pathlib import Path
-from typing import Any, get_type_hints
+from typing import Any, TypeVar, get_type_hints
 
 import numpy as np
 
@@ -19,6 +19,7 @@ from shapecat.arrays import Record
 from shapecat.errors import ModelError, explained
 from shapecat.learning.categorizer import Categorizer, parts_of
 
+_Record = TypeVar("_Record", bound=Record)
 __all__ = ["load_model", "save_model"]
 
 _FORMAT = "shapecat-model"
@@ -46,12 +47,9 @@ def save_model(path: Path, categorizer: Categorizer) -> None:
             little = parts[name].astype(parts[name].dtype.newbyteorder("<"), copy=False)
             np.lib.format.write_array(content, np.ascontiguousarray(little), allow_pickle=False)
             _write_member(archive, f"{name}.npy", content.getvalue())
-    try:
+    with explained(f"{path}: cannot write the model", ModelError):
         path.parent.mkdir(parents=True, exist_ok=True)
         path.write_bytes(buffer.getvalue())
-    except OSError as error:
-        msg = f"{path}: cannot write the model: {error}"
-        raise ModelError(msg) from error
 
 
 def _write_member(archive: zipfile.ZipFile, name: str, content: bytes) -> None:
@@ -109,10 +107,7 @@ def _parse(content: bytes) -> Categorizer:
         msg = f"it has version {version}, this shapecat reads version {_VERSION}"
         raise _NotAModelError(msg)
     parts = {name.removesuffix(".npy"): _parse_array(data) for name, data in members.items()}
-    categorizer = _assemble(Categorizer, header | parts, "")
-    if not isinstance(categorizer, Categorizer):  # for the type checker
-        raise TypeError
-    return categorizer
+    return _assemble(Categorizer, header | parts, "")
 
 
 def _read_members(content: bytes) -> dict[str, bytes]:
@@ -159,7 +154,7 @@ def _parse_array(data: bytes) -> np.ndarray:
     return np.frombuffer(rest, dtype).reshape(shape)
 
 
-def _assemble(kind: type[Record], parts: Mapping[str, Any], prefix: str) -> Record:
+def _assemble(kind: type[_Record], parts: Mapping[str, Any], prefix: str) -> _Record:
     """Build nested records from fields by dotted name; the opposite of `parts_of`."""
     values: dict[str, Any] = {}
     hints = get_type_hints(kind)

@@ -14,7 +14,7 @@ from shapecat.runs.run_info import RunInfo
 from shapecat.runs.selection import read_frames
 from shapecat.types import Frame, LabelledFrame
 
-__all__ = ["Coloured", "with_colour"]
+__all__ = ["Coloured", "ExportedFrame", "with_colour"]
 
 _AHEAD = 4
 """Labelled frames that are known in advance."""
@@ -28,9 +28,13 @@ class Coloured:
     masks: tuple[Mask, ...]
 
 
+ExportedFrame = tuple[LabelledFrame, Frame, Coloured | None]
+"""A labelled frame with its depth, and its colour image if it has one."""
+
+
 def with_colour(
     labelled: Iterable[LabelledFrame], recording: Recording, run: RunInfo
-) -> Iterator[tuple[LabelledFrame, Frame, Coloured | None]]:
+) -> Iterator[ExportedFrame]:
     """Pair labelled frames with their frames and colour images from the recording.
 
     From an indexed file, only the wanted frames are read.
@@ -78,8 +82,8 @@ class _Awaited:
     def needs(self, topic: str, log_time_ns: int) -> bool:
         """Return whether a depth or colour message belongs, or may belong, to an awaited frame.
 
-        Only the next few awaited frames are known. A message that is not earlier than the last of
-        them, or its image, may belong to a later one. Messages of other topics are always needed.
+        Only the next few awaited frames are known, so a message that is not earlier than the last
+        of these may belong to a later one. Messages of other topics are always needed.
         """
         if topic not in self._topics | self._colours:
             return True

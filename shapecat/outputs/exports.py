@@ -10,7 +10,7 @@ from pathlib import Path
 from typing import Any
 
 from shapecat.errors import OutputError
-from shapecat.outputs.colouring import Coloured, with_colour
+from shapecat.outputs.colouring import ExportedFrame, with_colour
 from shapecat.outputs.dataset_frames import DatasetImage, Selection, images_of, split_runs
 from shapecat.outputs.exports_coco import DATASETS
 from shapecat.outputs.exports_crops import write_crops
@@ -22,11 +22,10 @@ from shapecat.runs.finished import FinishedRun, open_source, read_finished
 from shapecat.runs.folder import clear, recover, staged
 from shapecat.system.files import flush, replacing
 from shapecat.system.progress import Observer, ignore
-from shapecat.types import Frame, LabelledFrame
+from shapecat.types import LabelledFrame
 
 __all__ = ["FORMATS", "Exported", "common_categories", "export_dataset", "export_run"]
 
-ExportedFrame = tuple[LabelledFrame, Frame, Coloured | None]
 Write = Callable[[Path, Iterable[ExportedFrame], FinishedRun], int]
 
 
@@ -46,15 +45,11 @@ class Exported:
     images: Mapping[str, int]
 
 
-def _clouds(shown: Iterable[ExportedFrame]) -> Iterator[tuple[LabelledFrame, Frame]]:
-    return ((labelled, frame) for labelled, frame, _ in shown)
-
-
 FORMATS: dict[str, Write] = {
-    "crops": lambda out, shown, run: write_crops(out, _clouds(shown), run),
+    "crops": write_crops,
     "kitti": write_kitti,
-    "labelcloud": lambda out, shown, run: write_labelcloud(out, _clouds(shown), run),
-    "point-labels": lambda out, shown, run: write_point_labels(out, _clouds(shown), run),
+    "labelcloud": write_labelcloud,
+    "point-labels": write_point_labels,
 }
 _WITH_BOXES = ("kitti", "labelcloud")
 _MARK = "export.json"

@@ -10,18 +10,16 @@ from collections.abc import Iterable
 from contextlib import suppress
 from pathlib import Path
 
-from shapecat.errors import OutputError
+from shapecat.errors import OutputError, explained
+from shapecat.outputs.colouring import ExportedFrame
 from shapecat.outputs.level_clouds import upright_cloud, write_pcd
 from shapecat.outputs.wording import safe_name
 from shapecat.runs.finished import FinishedRun
-from shapecat.types import Frame, LabelledFrame
 
 __all__ = ["write_crops"]
 
 
-def write_crops(
-    out: Path, frames: Iterable[tuple[LabelledFrame, Frame]], finished: FinishedRun
-) -> int:
+def write_crops(out: Path, frames: Iterable[ExportedFrame], finished: FinishedRun) -> int:
     """Add the views of a run to a data set; return their number.
 
     Earlier views of the same recording are replaced, so that none keeps an outdated label. Deleted
@@ -37,22 +35,20 @@ def write_crops(
     several = len(finished.run["options"]["topics"]) > 1
     count, new = 0, not out.exists()
     try:
-        shutil.rmtree(hidden, ignore_errors=True)
-        for labelled, frame in frames:
-            for item in labelled.objects:
-                cloud = upright_cloud(labelled, frame, item)
-                if cloud is None:
-                    continue
-                instance = hidden / safe_name(item.category) / f"{prefix}.track-{item.track}"
-                instance.mkdir(parents=True, exist_ok=True)
-                stem = f"{safe_name(labelled.topic)}." if several else ""
-                view = instance / f"{stem}{labelled.index:06d}.pcd"
-                write_pcd(view, cloud[0], viewpoint=cloud[1])
-                count += 1
-        _replace(out, prefix, hidden)
-    except OSError as error:
-        msg = f"{out}: cannot be written: {error.strerror or error}"
-        raise OutputError(msg) from error
+        with explained(f"{out}: cannot be written", OutputError):
+            shutil.rmtree(hidden, ignore_errors=True)
+            for labelled, frame, _ in frames:
+                for item in labelled.objects:
+                    cloud = upright_cloud(labelled, frame, item)
+                    if cloud is None:
+                        continue
+                    instance = hidden / safe_name(item.category) / f"{prefix}.track-{item.track}"
+                    instance.mkdir(parents=True, exist_ok=True)
+                    stem = f"{safe_name(labelled.topic)}." if several else ""
+                    view = instance / f"{stem}{labelled.index:06d}.pcd"
+                    write_pcd(view, cloud[0], viewpoint=cloud[1])
+                    count += 1
+            _replace(out, prefix, hidden)
     finally:
         shutil.rmtree(hidden, ignore_errors=True)
         if new:

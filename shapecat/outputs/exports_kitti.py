@@ -20,7 +20,7 @@ from shapecat.arrays import F8
 from shapecat.cameras.colour import LensCamera
 from shapecat.colour.projection import project, rectified
 from shapecat.geometry import IDENTITY, rotation_from_quaternion
-from shapecat.outputs.colouring import Coloured
+from shapecat.outputs.colouring import Coloured, ExportedFrame
 from shapecat.outputs.level_clouds import finite_points, upward
 from shapecat.recordings import MessageError
 from shapecat.recordings.colour_image import pixels_of
@@ -34,11 +34,7 @@ _log = logging.getLogger(__name__)
 _VELO_FROM_RECTIFIED = np.array([[0.0, 0.0, 1.0], [-1.0, 0.0, 0.0], [0.0, -1.0, 0.0]])
 
 
-def write_kitti(
-    out: Path,
-    frames: Iterable[tuple[LabelledFrame, Frame, Coloured | None]],
-    _finished: FinishedRun,
-) -> int:
+def write_kitti(out: Path, frames: Iterable[ExportedFrame], _finished: FinishedRun) -> int:
     """Write label_2/, calib/ and velodyne/, with six-digit names; return the number of objects.
 
     Colour images are written to image_2/ as undistorted PNG. ``frames.csv`` lists the frame of

@@ -13,19 +13,18 @@ import numpy as np
 
 from shapecat.arrays import F8
 from shapecat.geometry import box_corners, gravity_rotation, rotation_from_quaternion
+from shapecat.outputs.colouring import ExportedFrame
 from shapecat.outputs.colours import colour_of
 from shapecat.outputs.level_clouds import finite_points, upward, write_pcd
 from shapecat.runs.finished import FinishedRun
-from shapecat.types import Frame, LabelledFrame, LabelledObject, Pose
+from shapecat.types import LabelledObject, Pose
 
 __all__ = ["write_labelcloud"]
 
 _FORMATS = ("centroid_rel", "centroid_abs", "vertices")
 
 
-def write_labelcloud(
-    out: Path, frames: Iterable[tuple[LabelledFrame, Frame]], finished: FinishedRun
-) -> int:
+def write_labelcloud(out: Path, frames: Iterable[ExportedFrame], finished: FinishedRun) -> int:
     """Write pointclouds/ and labels/ of a labelCloud project; return the number of objects.
 
     labels/ has the format ``centroid_rel``; labels_centroid_abs/ and labels_vertices/ hold the same
@@ -36,7 +35,7 @@ def write_labelcloud(
         _folder(out, kind).mkdir()
         (_folder(out, kind) / "_classes.json").write_text(_classes(finished, kind), "utf-8")
     count = 0
-    for number, (labelled, frame) in enumerate(frames):
+    for number, (labelled, frame, _) in enumerate(frames):
         level = gravity_rotation(upward(labelled))
         cloud = out / "pointclouds" / f"{number:06d}.pcd"
         points = finite_points(frame) @ level.T

@@ -15,6 +15,7 @@ import numpy as np
 
 from shapecat.arrays import F4, U2, U4
 from shapecat.errors import OutputError
+from shapecat.outputs.colouring import ExportedFrame
 from shapecat.outputs.colours import colour_of
 from shapecat.outputs.png import png
 from shapecat.runs.finished import FinishedRun
@@ -26,9 +27,7 @@ _LARGEST = 65535
 _INDEX = ("number", "topic", "frame", "stamp_ns", "width", "height", "fx", "fy", "cx", "cy")
 
 
-def write_point_labels(
-    out: Path, frames: Iterable[tuple[LabelledFrame, Frame]], finished: FinishedRun
-) -> int:
+def write_point_labels(out: Path, frames: Iterable[ExportedFrame], finished: FinishedRun) -> int:
     """Write the labels of all points; return the number of objects.
 
     For depth images it writes depth/ (millimetres), semantic/ and instance/ as 16-bit PNG; for
@@ -47,7 +46,7 @@ def write_point_labels(
     with (out / "frames.csv").open("w", newline="", encoding="utf-8") as file:
         index = csv.writer(file, lineterminator="\n")
         index.writerow(_INDEX)
-        for number, (labelled, frame) in enumerate(frames):
+        for number, (labelled, frame, _) in enumerate(frames):
             index.writerow((f"{number:06d}", *_about(labelled, frame)))
             write = _write_masks if frame.organized else _write_cloud
             write(out, f"{number:06d}", frame, _labels(labelled, frame, classes))

@@ -4,7 +4,7 @@ from pathlib import Path
 
 import numpy as np
 
-from shapecat.arrays import F4
+from shapecat.arrays import F4, U4
 from shapecat.geometry import level_from_sensor, quaternion_from_rotation, transform
 from shapecat.types import Frame, LabelledFrame, LabelledObject, Pose
 
@@ -26,9 +26,12 @@ def write_pcd(path: Path, points: F4, *, viewpoint: Pose) -> None:
     path.write_bytes(header.encode("ascii") + np.ascontiguousarray(points, "<f4").tobytes())
 
 
-def finite_points(frame: Frame) -> F4:
-    """Return the points (n, 3) of a frame that have a reading, in order, metres, sensor frame."""
-    points = frame.xyz()
+def finite_points(frame: Frame, indices: U4 | None = None) -> F4:
+    """Return the points (n, 3) of a frame that have a reading, in order, metres, sensor frame.
+
+    ``indices`` selects pixels or points; None selects all.
+    """
+    points = frame.xyz(indices)
     return np.asarray(points[np.isfinite(points).all(axis=1)])
 
 
@@ -59,8 +62,7 @@ def upright_cloud(
 
     The support is at z = 0; metres. None if no point has a reading.
     """
-    points = frame.xyz(item.indices)
-    points = points[np.isfinite(points).all(axis=1)]
+    points = finite_points(frame, item.indices)
     if not len(points):
         return None
     up = upward(labelled)

@@ -2,7 +2,6 @@
 
 import errno
 import os
-import shutil
 import struct
 import zlib
 from collections import Counter, defaultdict, deque
@@ -77,23 +76,10 @@ def copy_bytes(source: Path, target: Path, length: int) -> None:
             if done:
                 raise
         if done == 0:
-            shutil.copyfileobj(_Limited(file, length), copy, 1 << 20)
-            done = copy.tell()
+            while block := file.read(min(1 << 20, length - done)):
+                done += copy.write(block)
         if done < length:  # what is missing would be zeros
             raise OSError(errno.EIO, "the recording became shorter while it was copied")
-
-
-class _Limited:
-    """A reader of the first ``length`` bytes of a file."""
-
-    def __init__(self, file: BinaryIO, length: int) -> None:
-        self.file, self.left = file, length
-
-    def read(self, size: int = -1, /) -> bytes:
-        """Read up to ``size`` bytes."""
-        data = self.file.read(self.left if size < 0 else min(size, self.left))
-        self.left -= len(data)
-        return data
 
 
 @dataclass
@@ -208,20 +194,17 @@ class Appender:
         self._file.write(MAGIC)
 
     def _groups(self) -> list[tuple[Opcode, bytes]]:
+        original = [] if self._original is None else [self._original]
         return [
             (Opcode.SCHEMA, _encoded(self._schemas.values())),
             (Opcode.CHANNEL, _encoded(self._channels.values())),
-            (Opcode.STATISTICS, _encoded([self._statistics()] if self._original else [])),
+            (Opcode.STATISTICS, _encoded(map(self._statistics, original))),
             (Opcode.CHUNK_INDEX, b"".join(map(write_chunk_index, self._chunks))),
             (Opcode.ATTACHMENT_INDEX, _encoded(self._attachments)),
             (Opcode.METADATA_INDEX, _encoded(self._metadata)),
         ]
 
-    def _statistics(self) -> records.Statistics:
-        old = self._original
-        if old is None:
-            msg = "the original has no statistics to extend"
-            raise ValueError(msg)
+    def _statistics(self, old: records.Statistics) -> records.Statistics:
         times = [*self._times]
         if old.message_count:
             times += [old.message_start_time, old.message_end_time]

@@ -261,7 +261,7 @@ class _Review:
 
     def _add_track(self, item: LabelledObject) -> None:
         entity = f"/tracks/{item.track}"
-        self._tracks[item.track] = TrackView(entity, shapes.label(item), item.category)
+        self._tracks[item.track] = TrackView(entity, shapes.label(item))
         lines = rr.SeriesLines(
             names=list(self._categories),
             colors=[colour_of(category) for category in self._categories],

@@ -9,6 +9,7 @@ import rerun.blueprint as rrb
 
 from shapecat.arrays import F8
 from shapecat.geometry import IDENTITY, transform
+from shapecat.outputs.level_clouds import finite_points
 from shapecat.types import Frame, LabelledFrame, Pose
 
 __all__ = ["Eye", "TrackView", "choose_eye", "lay_out", "stepped_back"]
@@ -34,7 +35,6 @@ class TrackView:
 
     entity: str
     title: str
-    category: str
     frames: int = 0
 
 
@@ -87,8 +87,7 @@ def _subject(labelled: LabelledFrame, frame: Frame, pose: Pose) -> tuple[F8, flo
     elif labelled.planes:
         points = np.concatenate([plane.outline for plane in labelled.planes])
     else:
-        points = frame.xyz()
-        points = points[np.isfinite(points).all(axis=1)]
+        points = finite_points(frame)
     if len(points) == 0:
         points = np.zeros((1, 3))
     low, high = points.min(axis=0), points.max(axis=0)

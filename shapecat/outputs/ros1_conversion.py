@@ -1,6 +1,7 @@
 """Convert ROS 1 messages to ROS 2 messages: same fields, other encoding."""
 
 from collections.abc import Callable
+from functools import cache
 from importlib.resources import files
 from typing import Any
 
@@ -128,12 +129,8 @@ def wrap_raw(channel: Channel, data: bytes | memoryview) -> memoryview:
     return store.serialize_cdr(message, RAW_TYPE)
 
 
+@cache
 def _raw_store() -> Typestore:
-    if not _STORES:
-        store = get_typestore(Stores.EMPTY)
-        store.register(get_types_from_msg(raw_channel("").schema.decode(), RAW_TYPE))
-        _STORES.append(store)
-    return _STORES[0]
-
-
-_STORES: list[Typestore] = []
+    store = get_typestore(Stores.EMPTY)
+    store.register(get_types_from_msg(raw_channel("").schema.decode(), RAW_TYPE))
+    return store

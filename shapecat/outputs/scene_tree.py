@@ -9,7 +9,7 @@ import pyarrow as pa
 from shapecat.detection.scene_graph import Node, format_tree
 from shapecat.errors import OutputError
 from shapecat.runs.finished import FinishedRun, read_finished
-from shapecat.runs.labels import plane_of, read_labelled_frames
+from shapecat.runs.labels import plane_of
 from shapecat.runs.tables import keys_of, read_row_groups
 from shapecat.types import Box, Candidate, LabelledObject, Plane, Scene
 
@@ -97,8 +97,8 @@ def _topic(folder: Path, frame: int, topic: str | None) -> str:
 
 def _objects(finished: FinishedRun, topic: str, frame: int) -> dict[int, LabelledObject]:
     """Return the object of each pixel or point that belongs to one in a frame."""
-    frames = read_labelled_frames(finished.folder, finished.labels)
-    shown = next(item for item in frames if (item.topic, item.index) == (topic, frame))
+    labelled = finished.frames()
+    shown = next(item for item in labelled if (item.topic, item.index) == (topic, frame))
     return {int(index): item for item in shown.objects for index in item.indices}
 
 

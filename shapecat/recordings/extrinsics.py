@@ -35,8 +35,6 @@ class Extrinsics:
         """Store the streams; transforms are read on first use."""
         self._recording = recording
         self._depth, self._colour = depth, colour
-        self._fixed: Pose | None = None
-        self._looked = False
         self._static: dict[tuple[str, str], Pose] = {}
 
     @cached_property
@@ -73,9 +71,7 @@ class Extrinsics:
             pose = self._lookup(moving, depth_frame, colour_frame, stamp_ns)
             if pose is not None:
                 return pose
-        if not self._looked:
-            self._looked, self._fixed = True, self._realsense()
-        return self._fixed
+        return self._realsense
 
     def _lookup(
         self, buffer: TransformBuffer, depth_frame: str, colour_frame: str, stamp_ns: int
@@ -91,6 +87,7 @@ class Extrinsics:
                 )
         return None
 
+    @cached_property
     def _realsense(self) -> Pose | None:
         """Read librealsense's ``p_colour = rotation @ p_depth + translation``; None if absent."""
         for topic in self._recording.topics:

@@ -3,7 +3,7 @@
 from collections.abc import Callable
 from pathlib import Path
 
-from shapecat.errors import RecordingError
+from shapecat.errors import RecordingError, explained
 from shapecat.recordings.mcap_file import McapRecording
 from shapecat.recordings.recording import Recording
 
@@ -20,14 +20,12 @@ def open_recording(path: Path) -> Recording:
     RecordingError : the path does not exist or is not a readable recording.
     """
     path = Path(path)
-    try:
-        return _READERS[_sniff(path)](path)
-    except RecordingError as error:
-        msg = f"{path}: {error}"
-        raise RecordingError(msg) from error
-    except OSError as error:
-        msg = f"{path}: cannot be read: {error.strerror or error}"
-        raise RecordingError(msg) from error
+    with explained(f"{path}: cannot be read", RecordingError):
+        try:
+            return _READERS[_sniff(path)](path)
+        except RecordingError as error:
+            msg = f"{path}: {error}"
+            raise RecordingError(msg) from error
 
 
 def _bag(path: Path) -> Recording:

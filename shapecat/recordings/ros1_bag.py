@@ -67,7 +67,6 @@ class BagRecording(Recording):
         OSError : the file cannot be read.
         """
         super().__init__(path)
-        self._channels: dict[int, Channel] = {}
         self._chunks: list[_ChunkInfo] | None = None
         self._promised: dict[int, int] = {}
         self._file = path.open("rb")

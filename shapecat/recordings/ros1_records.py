@@ -71,7 +71,7 @@ class Record(NamedTuple):
     @property
     def op(self) -> int:
         """The opcode of the record; 0 if it has none."""
-        return self.fields.get("op", b"\0")[0] if self.fields.get("op") else 0
+        return (self.fields.get("op") or b"\0")[0]
 
 
 def fields_of(header: bytes | memoryview) -> dict[str, bytes]:

@@ -40,8 +40,7 @@ class Stream:
     """A topic of depth images or clouds.
 
     ``info_topic`` is the topic of a depth image's calibration, None if there is none; ``count`` is
-    the number of messages, None if unknown; ``frame_id`` and ``encoding`` (empty for clouds) are
-    from the first message.
+    the number of messages, None if unknown; ``frame_id`` is from the first message.
     """
 
     topic: str
@@ -50,7 +49,6 @@ class Stream:
     info_topic: str | None
     count: int | None
     frame_id: str
-    encoding: str
 
     @property
     def usable(self) -> bool:
@@ -186,7 +184,7 @@ def first_message(recording: Recording, topic: str, kind: str | None = None) -> 
 
 
 def _probe_cloud(topic: Topic, first: Any, _recording: Recording) -> Stream:
-    return Stream(topic.name, topic.type, "points", None, topic.count, first.header.frame_id, "")
+    return Stream(topic.name, topic.type, "points", None, topic.count, first.header.frame_id)
 
 
 def _probe_image(topic: Topic, first: Any, recording: Recording) -> Stream | None:
@@ -199,20 +197,18 @@ def _probe_image(topic: Topic, first: Any, recording: Recording) -> Stream | Non
         or (encoding == "mono16" and "depth" not in name)
     ):
         return None
-    return _depth_stream(topic, first, recording, encoding)
+    return _depth_stream(topic, first, recording)
 
 
 def _probe_compressed(topic: Topic, first: Any, recording: Recording) -> Stream | None:
     encoding = str(first.format)
-    return (
-        _depth_stream(topic, first, recording, encoding) if "compressedDepth" in encoding else None
-    )
+    return _depth_stream(topic, first, recording) if "compressedDepth" in encoding else None
 
 
-def _depth_stream(topic: Topic, first: Any, recording: Recording, encoding: str) -> Stream:
+def _depth_stream(topic: Topic, first: Any, recording: Recording) -> Stream:
     info = info_topic_of(topic.name, recording)
     frame_id = first.header.frame_id
-    return Stream(topic.name, topic.type, "depth", info, topic.count, frame_id, encoding)
+    return Stream(topic.name, topic.type, "depth", info, topic.count, frame_id)
 
 
 def info_topic_of(image: str, recording: Recording) -> str | None:

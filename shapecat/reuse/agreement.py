@@ -61,7 +61,13 @@ def _compare(
     turn: F8,
     shift: F8,
 ) -> tuple[int, int, float]:
-    """Return the numbers of points compared and in agreement, and the sum of their differences."""
+    """Return the numbers of points compared and in agreement, and the sum of their differences.
+
+    Parameters
+    ----------
+    camera, other_camera : fx, fy, cx, cy, pixels.
+    turn, shift : rotation (3, 3) and translation (3,), metres, of ``other_from_one``.
+    """
     fx, fy, cx, cy = camera
     gx, gy, ax, ay = other_camera
     width = depth.shape[1]

@@ -20,6 +20,7 @@ from shapecat.runs.label_meaning import (
 from shapecat.runs.track_table import (
     TrackRow,
     TrackTable,
+    parse_number,
     read_track_table,
     unlabelled,
     with_label,
@@ -246,9 +247,9 @@ def _places_agree(table: TrackTable, folder: Path) -> bool:
 
 
 def _number(cell: str | None) -> float | None:
-    """Return the number in a cell, which may have a decimal comma; None if it is not a number."""
-    with suppress(ValueError, AttributeError):
-        return float((cell or "").strip().replace(",", "."))
+    """Return the number in a cell; None if it is not a number."""
+    with suppress(ValueError):
+        return parse_number(cell or "")
     return None
 
 

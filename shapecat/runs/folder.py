@@ -7,16 +7,18 @@ A folder without a marker is neither removed nor replaced. Other files in a run 
 import json
 import os
 import shutil
-from collections.abc import Callable, Collection, Iterator
+from collections.abc import Callable, Collection, Iterator, Mapping
 from contextlib import contextmanager, suppress
 from pathlib import Path
+from typing import Literal
 
-from shapecat.errors import OutputError
+from shapecat.errors import OutputError, explained
 from shapecat.runs.run_info import RunInfo, is_run_info
 from shapecat.system.files import flush, lock, partial_path, replacing
 
 __all__ = [
     "OUTPUTS",
+    "OUTPUT_OPTIONS",
     "RUN_FILES",
     "Marker",
     "clear",
@@ -30,7 +32,12 @@ __all__ = [
     "write_run",
 ]
 
-OUTPUTS = ("annotated.mcap", "review.rrd")
+OUTPUT_OPTIONS: Mapping[Literal["mcap", "rrd"], str] = {
+    "mcap": "annotated.mcap",
+    "rrd": "review.rrd",
+}
+"""The options that ask for an output, with its file; the tables do not depend on them."""
+OUTPUTS = tuple(OUTPUT_OPTIONS.values())
 RUN_FILES = (
     *(f"{name}.parquet" for name in ("frames", "detections", "planes", "tracks", "masks")),
     *("tracks.csv", "tracks.original.csv", "tracks.previous.csv", "report.html"),
@@ -164,17 +171,15 @@ def recover(folder: Path, marker: Marker = made_by_run) -> None:
     previous, hidden = previous_path(folder), partial_path(folder)
     if not previous.is_dir():
         return
-    try:
-        with _locked(hidden if hidden.is_dir() else previous):
-            if not folder.exists() and marker(previous) is not None:
-                previous.rename(folder)
-            elif folder.exists() and marker(folder) is not None:
-                _retire(folder, marker)
-    except _BusyError:
-        return  # the other run does it
-    except OSError as error:
-        msg = f"{folder}: cannot be written: {error.strerror or error}"
-        raise OutputError(msg) from error
+    with (
+        suppress(_BusyError),  # the other run does it
+        explained(f"{folder}: cannot be written", OutputError),
+        _locked(hidden if hidden.is_dir() else previous),
+    ):
+        if not folder.exists() and marker(previous) is not None:
+            previous.rename(folder)
+        elif folder.exists() and marker(folder) is not None:
+            _retire(folder, marker)
 
 
 def clear(folder: Path, names: Collection[str] = _MADE) -> None:

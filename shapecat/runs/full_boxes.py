@@ -1,6 +1,6 @@
 """Full boxes of tracks, fused from the full boxes of their detections."""
 
-from collections.abc import Collection, Iterator, Sequence
+from collections.abc import Collection, Sequence
 from dataclasses import dataclass
 from itertools import accumulate
 from pathlib import Path
@@ -172,11 +172,12 @@ def _placed(boxes: F4, poses: F8) -> tuple[F8, F8]:
 def full_columns(rows: F4) -> dict[str, Any]:
     """Return full boxes (n, 13) as columns of a table; NaN rows become null."""
     missing = pa.array(np.isnan(rows[:, 0]))
-    return dict(_columns(rows, missing))
-
-
-def _columns(rows: F4, missing: pa.Array) -> Iterator[tuple[str, Any]]:
-    stop: I4 = np.cumsum(list(FULL_WIDTHS.values()))
-    for (name, width), end in zip(FULL_WIDTHS.items(), stop.tolist(), strict=True):
-        values = np.ascontiguousarray(rows[:, end - width : end], np.float32).ravel()
-        yield name, pa.FixedSizeListArray.from_arrays(values, width, mask=missing)
+    ends = np.cumsum(list(FULL_WIDTHS.values()))
+    return {
+        name: pa.FixedSizeListArray.from_arrays(
+            np.ascontiguousarray(rows[:, end - width : end], np.float32).ravel(),
+            width,
+            mask=missing,
+        )
+        for (name, width), end in zip(FULL_WIDTHS.items(), ends.tolist(), strict=True)
+    }

@@ -6,7 +6,7 @@ from collections.abc import Mapping
 from dataclasses import dataclass, field
 from importlib.metadata import version
 from pathlib import Path
-from typing import Any, Literal
+from typing import Any
 
 from shapecat import __version__
 from shapecat.config import Settings
@@ -26,7 +26,6 @@ from shapecat.runs.run_info import Options, RunInfo
 from shapecat.system.files import input_size, replacing
 
 __all__ = [
-    "OUTPUT_OPTIONS",
     "Job",
     "Summary",
     "describe_run",
@@ -38,11 +37,6 @@ __all__ = [
 ]
 
 _LIBRARIES = ("numpy", "numba", "mcap", "rosbags", "rerun-sdk", "pyarrow")
-OUTPUT_OPTIONS: Mapping[Literal["mcap", "rrd"], str] = {
-    "mcap": "annotated.mcap",
-    "rrd": "review.rrd",
-}
-"""The options that ask for an output, with its file; the tables do not depend on them."""
 
 
 @dataclass(frozen=True)

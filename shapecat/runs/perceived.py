@@ -10,6 +10,7 @@ from typing import Any, Self
 import pyarrow as pa
 
 from shapecat.arrays import F4
+from shapecat.geometry import transform
 from shapecat.runs.masks import mask_columns
 from shapecat.runs.segments import (
     GROUP_FRAMES,
@@ -36,7 +37,11 @@ _SEGMENT_FRAMES = 2 * GROUP_FRAMES
 
 @dataclass(frozen=True)
 class FrameRow:
-    """Values of the frames table that a `Perception` lacks; ``again`` marks a second pass."""
+    """Values of the frames table that a `Perception` lacks.
+
+    ``up_given`` is (3,), a unit vector in the sensor frame, None if planes tell it; ``again`` marks
+    a frame that is perceived for the second time.
+    """
 
     log_time_ns: int
     fixed_from_sensor: Pose | None
@@ -184,7 +189,10 @@ def _detection_columns(
         "orientation_full": [d.full and d.full.orientation for d in found],
         "size_full_std": [d.full and d.full.size_std for d in found],
         "outline_full": lists([d.full.outline if d.full else () for d in found], pa.float32()),
-        "center_fixed": [_center_fixed(row, d.candidate.box.center) for _, row, _, d in objects],
+        "center_fixed": [
+            row.fixed_from_sensor and transform(row.fixed_from_sensor, d.candidate.box.center)
+            for _, row, _, d in objects
+        ],
         "height_m": [
             _height(p, c.plane, c.support_m, c.box.center)
             for (p, *_), c in zip(objects, candidates, strict=True)
@@ -201,11 +209,6 @@ def _detection_columns(
         "edges": lists([d.gas.edges for d in found], pa.uint16()),
         "seconds": [d.seconds for d in found],
     }
-
-
-def _center_fixed(row: FrameRow, center: Any) -> Any:
-    pose = row.fixed_from_sensor
-    return None if pose is None else pose.rotation @ center + pose.translation
 
 
 def _height(perception: Perception, plane: int | None, support_m: float, center: Any) -> float:

@@ -44,7 +44,7 @@ class PlacedFrames:
 
     @cached_property
     def poses(self) -> F8:
-        """Return ``fixed_from_sensor`` (f, 3, 4), metres; the identity where it is not used."""
+        """Return ``fixed_from_sensor`` (f, 3, 4), metres; the identity if not known or not used."""
         return np.frombuffer(self._poses, np.float64).reshape(-1, 3, 4)
 
     @cached_property

@@ -7,9 +7,9 @@ from contextlib import suppress
 from pathlib import Path
 
 from shapecat.errors import OutputError
-from shapecat.runs.folder import clear, read_run, write_run
+from shapecat.runs.folder import OUTPUT_OPTIONS, clear, read_run, write_run
 from shapecat.runs.identity import same_content, unchanged
-from shapecat.runs.jobs import OUTPUT_OPTIONS, differences
+from shapecat.runs.jobs import differences
 from shapecat.runs.run_info import RunInfo
 from shapecat.runs.segments import PERCEIVED, count_segments
 from shapecat.runs.tables import count_rows

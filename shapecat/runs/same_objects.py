@@ -17,7 +17,7 @@ from shapecat.arrays import F4, F8, I4
 from shapecat.errors import OutputError
 from shapecat.runs.folder import read_run
 from shapecat.runs.tables import frame_rows, numbers, opened, read_row_groups
-from shapecat.runs.track_table import TrackRow
+from shapecat.runs.track_table import TrackRow, parse_number
 
 __all__ = ["Group", "Match", "Matches", "match_in_place", "match_in_time"]
 
@@ -285,7 +285,7 @@ def _place_of(row: TrackRow) -> F8:
     OutputError : the line has no position.
     """
     try:
-        place = [float(row.cells[name].strip().replace(",", ".")) for name in "xyz"]
+        place = [parse_number(row.cells[name]) for name in "xyz"]
     except (KeyError, ValueError) as error:
         msg = f"line {row.line}: no position x, y, z of track {row.track}"
         raise OutputError(msg) from error

@@ -32,7 +32,9 @@ __all__ = [
 ]
 
 GROUP_FRAMES = 32
+"""Minimum number of frames of a row group."""
 _BALANCE = 4096
+"""Number of frames above which row groups grow with its square root."""
 PERCEIVED = {"frames": FRAMES, "detections": DETECTIONS, "planes": PLANES, "masks": MASKS}
 """The tables of perceive; recordings without colour have no masks."""
 SEGMENTS, REVISIONS = "segments", "revisions"

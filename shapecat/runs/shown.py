@@ -39,7 +39,7 @@ _NONE = np.zeros((0, 0), np.float32)
 
 
 class ShownDetection(NamedTuple):
-    """A detection to show: its number in its frame, its label, its row in `ShownTracks.causal`."""
+    """A detection to show: its number in its frame, its label, and its row in `ShownTracks`."""
 
     detection: int
     label: TrackLabel

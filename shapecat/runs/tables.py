@@ -1,9 +1,9 @@
 """The Parquet tables between the phases: their columns, and how to read and write them.
 
-A run folder holds ``frames``, ``detections`` and ``planes`` (written by perceive), and ``tracks``
-(written by track). Row groups of the first three cover the same frames, so that they can be read
-side by side in constant memory. Adding a column is allowed within a schema version; changing the
-meaning of one is not.
+A run folder holds ``frames``, ``detections``, ``planes`` and, with colour images, ``masks``
+(written by perceive), and ``tracks`` (written by track). Row groups of all but ``tracks`` cover the
+same frames, so that they can be read side by side in constant memory. Adding a column is allowed
+within a schema version; changing the meaning of one is not.
 """
 
 from collections.abc import Iterator, Mapping, Sequence

@@ -14,6 +14,7 @@ from shapecat.errors import OutputError, explained
 __all__ = [
     "TrackRow",
     "TrackTable",
+    "parse_number",
     "read_track_table",
     "unlabelled",
     "with_label",
@@ -126,8 +127,8 @@ def _header(path: Path, cells: Sequence[str]) -> tuple[str, ...]:
 def _row(line: int, cells: Mapping[str, str]) -> TrackRow | str:
     """Return a row, or the problem of an invalid line."""
     try:
-        track = _number(cells["track"])
-        confidence = _number(cells["confidence"])
+        track = parse_number(cells["track"])
+        confidence = parse_number(cells["confidence"])
         if track != int(track) or not 0 <= confidence <= 1:
             raise ValueError  # noqa: TRY301  the same message for all that is not such a number
     except (KeyError, ValueError, OverflowError):
@@ -144,8 +145,14 @@ def _row(line: int, cells: Mapping[str, str]) -> TrackRow | str:
     )
 
 
-def _number(text: str) -> float:
-    return float(text.strip().replace(",", "."))
+def parse_number(cell: str) -> float:
+    """Return the number in a cell of a spreadsheet, which may have a decimal comma.
+
+    Raises
+    ------
+    ValueError : the cell holds no number.
+    """
+    return float(cell.strip().replace(",", "."))
 
 
 def unlabelled(table: TrackTable) -> TrackTable:

@@ -37,7 +37,7 @@ class Frame(Record):
     Attributes
     ----------
     topic : the stream of the recording.
-    index : number of the frame in its stream, from 0; skipped frames are counted too.
+    index : number of the frame in its stream, from 0 at the selected start, including skipped ones.
     stamp_ns : time of the measurement (``header.stamp``).
     log_time_ns : time of the recording.
     frame_id : name of the sensor frame.
