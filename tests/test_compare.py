@@ -23,6 +23,7 @@ from scipy.optimize import linprog
 from scipy.spatial import ConvexHull, HalfspaceIntersection
 from scipy.spatial.transform import Rotation
 
+from shapecat.errors import RecordingError
 from shapecat.evaluation import comparing
 from shapecat.evaluation.comparing import (
     Comparison,
@@ -225,7 +226,7 @@ def test_detection_is_left_out_if_mostly_ignored(beside: int, kept: list[int] | 
     ignored[13 : 13 + beside] = True
     true = Labelling((), ~ignored, (SIDE, SIDE), ignored)
     item = LabelledItem(1, "cup", np.arange(13 + beside - 5, 13 + beside))
-    rest = _labelled_part(Labelling((item,)), true, ("/d", 0)).items
+    rest = _labelled_part(Labelling((item,)), true).items
 
     assert [known.pixels.tolist() for known in rest if known.pixels is not None] == (
         [] if kept is None else [kept]
@@ -489,6 +490,19 @@ def test_truth_skips_label_images_of_missing_frames(tmp_path: Path) -> None:
         assert [list(map(int, item.pixels)) for item in found.items if item.pixels is not None] == [
             [k + 2]
         ]
+
+
+@pytest.mark.parametrize(("side", "depth"), [(30, True), (5, True), (5, False)])
+def test_labels_of_images_with_another_size_are_refused(side: int, depth: bool) -> None:
+    """A colour image has other pixels than the depth image: its labels would match nothing."""
+    camera = Camera(SIDE, SIDE, 20, 20, 5, 5)
+    frame = Frame("/d", 0, START, START, "cam", np.ones((SIDE, SIDE), np.float32), camera)
+    found = Labelling((LabelledItem(1, "cup", np.array(CUP)),))
+    true = Labelling((LabelledItem(2, "cup", np.arange(side)),), None, (side, side))
+    frames = iter([frame] if depth else [])
+
+    with pytest.raises(RecordingError, match=rf"{side} x {side} pixels.*--depth"):
+        _compare_frame(_Tally(), ("/d", 0), {"stamp_ns": START}, found, true, frames, 0)
 
 
 def test_picture_of_each_part_shows_its_worst_frame() -> None:

@@ -123,7 +123,10 @@ def compare(
     if not tally.compared:
         raise RecordingError(_nothing_in_common(finished, reference, other))
     if _hardly_matches(tally.rows):
-        notes.append(f"Hardly any object matches: is {reference} of the same recording?")
+        notes.append(
+            f"Hardly any object matches: is {reference} of the same recording? Labels of images "
+            "must be of its depth images (--format coco --depth)."
+        )
     return Comparison(
         run=str(folder),
         reference=str(reference),
@@ -183,7 +186,9 @@ def _compare_frame(
 ) -> None:
     """Match the objects of a frame and count agreements and differences."""
     tally.compared += 1
-    found = _labelled_part(found, true, key)
+    frame = next((f for f in clouds if (f.topic, f.index) == key), None)
+    _require_same_size(found, true, frame, key)
+    found = _labelled_part(found, true)
     matched = match_objects(found.items, true.items)
     tally.masks &= matched.overlap is not None
     tally.overlap += matched.overlap or Overlap()
@@ -194,27 +199,44 @@ def _compare_frame(
     differing = [item for item in rows if item.difference]
     severity = len(differing) + 1 - float(np.mean([item.iou or 0 for item in rows] or [1]))
     best = tally.pictures.get(part)
-    frame = next((f for f in clouds if (f.topic, f.index) == key), None)
     if differing and (best is None or severity > best.severity):
         picture = draw_frame(key, frame, found, true, matched.pairs, rows, severity)
         if picture is not None:
             tally.pictures[part] = picture
 
 
-def _labelled_part(found: Labelling, true: Labelling, key: Key) -> Labelling:
-    """Return the detections without the pixels that have no label in the truth.
+def _require_same_size(found: Labelling, true: Labelling, frame: Frame | None, key: Key) -> None:
+    """Check that the labels are of images with the size of the depth image.
 
-    Detections of which more than half is ignored in the truth are left out.
+    Without the recording (``frame`` is None), only too small images are noticed.
 
     Raises
     ------
-    RecordingError : the label image and the depth image differ in size.
+    RecordingError : the images differ in size.
     """
-    size = None if true.shape is None else true.shape[0] * true.shape[1]
+    if true.shape is None:
+        return
+    height, width = true.shape
+    size, depth = height * width, None if frame is None else frame.depth
     pixels = [item.pixels for item in found.items if item.pixels is not None and item.pixels.size]
-    if size is not None and any(int(some.max()) >= size for some in pixels):
-        msg = f"frame {key[1]} of {key[0]}: the labels have a different image size, {true.shape}"
-        raise RecordingError(msg)
+    if depth is not None and depth.shape != true.shape:
+        other = f"the depth image has {depth.shape[1]} x {depth.shape[0]}"
+    elif any(int(some.max()) >= size for some in pixels):
+        other = "the depth image is larger"
+    else:
+        return
+    msg = (
+        f"frame {key[1]} of {key[0]}: the labels are of an image of {width} x {height} pixels, but "
+        f"{other}; export labels of depth images (--format coco --depth)"
+    )
+    raise RecordingError(msg)
+
+
+def _labelled_part(found: Labelling, true: Labelling) -> Labelling:
+    """Return the detections without the pixels that have no label in the truth.
+
+    Detections of which more than half is ignored in the truth are left out.
+    """
     if true.known is None:
         return found
     items = (
