@@ -19,6 +19,7 @@ from shapecat.colour.outline import joined, outlines
 from shapecat.errors import OutputError
 from shapecat.outputs.dataset_frames import Selection, split_runs
 from shapecat.outputs.exports import export_dataset, export_run
+from shapecat.recordings import MessageError
 from shapecat.recordings.colour_image import pixels_of
 from shapecat.runs.finished import FinishedRun, read_finished
 from shapecat.runs.masks import read_masks
@@ -245,6 +246,37 @@ def test_run_without_colour_suggests_depth_option(
     assert not (tmp_path / "out").exists()
 
 
+@pytest.mark.parametrize(
+    ("options", "reason"),
+    [
+        ((), "damaged image (4×)"),
+        (("--depth", "--corrected-only"), "no object with a certain label (4×)"),
+        (("--depth", "--corrected-only", "--per-track", "1"), "no object with a certain label"),
+    ],
+)
+def test_export_without_images_says_why(
+    coloured_run: Path,
+    tmp_path: Path,
+    shapecat: Run,
+    monkeypatch: pytest.MonkeyPatch,
+    options: tuple[str, ...],
+    reason: str,
+) -> None:
+    """An empty data set that counts as a success is noticed only when training fails."""
+
+    def failing(_image: Any) -> Any:
+        msg = "jpeg image is damaged"
+        raise MessageError(msg)
+
+    monkeypatch.setattr("shapecat.outputs.dataset_frames.pixels_of", failing)
+    words = ("export", coloured_run, "--format", "coco", "--out", tmp_path / "out", *options)
+    result = shapecat(*words)
+
+    assert (result.exit_code, result.stdout) == (1, "")
+    assert f"Error: no image to export: {reason}\n" in result.stderr
+    assert not (tmp_path / "out").exists()
+
+
 def test_several_runs_make_one_data_set_split_by_recording(
     run: Path, coloured_run: Path, tmp_path: Path
 ) -> None:
@@ -392,7 +424,6 @@ def test_kitti_boxes_project_onto_colour_image(run: Path, tmp_path: Path) -> Non
 def test_damaged_image_is_skipped(run: Path, tmp_path: Path, monkeypatch: Any) -> None:
     """One bad frame among thousands must not end the export."""
     from shapecat.outputs import dataset_frames  # noqa: PLC0415  to be changed
-    from shapecat.recordings import MessageError  # noqa: PLC0415  the same
 
     calls = iter(range(99))
     read = pixels_of

@@ -5,6 +5,7 @@ import io
 import json
 import os
 import zlib
+from collections import Counter
 from contextlib import nullcontext
 from dataclasses import replace
 from pathlib import Path
@@ -337,7 +338,11 @@ def test_images_without_certain_objects_are_omitted(monkeypatch: pytest.MonkeyPa
         folder=Path(), run=run, name="lab", frames=lambda: iter(labelled)
     )
 
-    assert list(images_of(finished, Selection(), stem="lab")) == [images[1], images[4]]
+    left_out = Counter[str]()
+    found = images_of(finished, Selection(), stem="lab", left_out=left_out)
+
+    assert list(found) == [images[1], images[4]]
+    assert left_out == {"no image": 1, "no object with a certain label": 2}
 
 
 def test_depth_images_are_millimetres_without_overflow() -> None:

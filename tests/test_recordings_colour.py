@@ -283,6 +283,20 @@ def test_damaged_images_are_skipped_and_reported(tmp_path: Path) -> None:
     assert any("neither JPEG nor PNG" in w for w in warnings)
 
 
+def test_damaged_raw_images_are_skipped_and_reported(tmp_path: Path) -> None:
+    """They must not be counted as images of the run and fail when they are shown."""
+    stamps = [EPOCH + 100 * k * MS for k in range(4)]
+    images = [raw(stamp, gradient(), "rgb8") for stamp in stamps]
+    images[0].data = images[0].data[:100]
+    images[1].data = images[1].data[:0]
+    images[2].step = 3 * 64 - 1
+    colours = [("/cam/color/image_raw", s, m) for s, m in zip(stamps, images, strict=True)]
+    pairs, warnings = read(write(tmp_path / "a.mcap", in_order([*depth_items(*stamps), *colours])))
+
+    assert [view is not None for _, view in pairs] == [False, False, False, True]
+    assert any("(1×): image of 64 x 48 pixels needs" in w and "has 100" in w for w in warnings)
+
+
 def test_damaged_image_is_message_error() -> None:
     """The header of an image may claim more than its content holds."""
     bodies = {"jpeg": jpeg(gradient()), "png": png(gradient())}

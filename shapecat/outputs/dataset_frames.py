@@ -90,7 +90,12 @@ def split_runs(runs: Sequence[FinishedRun], val: float) -> list[str]:
 
 
 def images_of(
-    finished: FinishedRun, selection: Selection, recording: Path | None = None, *, stem: str
+    finished: FinishedRun,
+    selection: Selection,
+    recording: Path | None = None,
+    *,
+    stem: str,
+    left_out: Counter[str],
 ) -> Iterator[DatasetImage]:
     """Yield the images of a run with at least one object to train on; log damaged images.
 
@@ -100,6 +105,7 @@ def images_of(
     ----------
     recording : path of the recording; by default where it was processed.
     stem : the names of the images begin with it.
+    left_out : counts the other frames by reason.
 
     Raises
     ------
@@ -122,8 +128,13 @@ def images_of(
                 image = _image(name, labelled, frame, coloured, selection, corrected)
             except MessageError as error:
                 _log.warning("%s: skipped frame %d: %s", finished.name, labelled.index, error)
+                left_out["damaged image"] += 1
                 continue
-            if image is not None and any(image.sure):
+            if image is None:
+                left_out["no image"] += 1
+            elif not any(image.sure):
+                left_out["no object with a certain label"] += 1
+            else:
                 yield image
 
 

@@ -130,8 +130,8 @@ def export_dataset(
     Raises
     ------
     ValueError : the format is unknown.
-    OutputError : a folder is not a finished run, a run has no images, the content of a recording
-        has changed, or ``out`` is not writable or holds something else.
+    OutputError : a folder is not a finished run, a run has no images, no image can be exported, the
+        content of a recording has changed, or ``out`` is not writable or holds something else.
     RecordingError : a recording is missing or unreadable.
     """
     if format not in DATASETS:
@@ -142,17 +142,21 @@ def export_dataset(
     total = sum(int(run.run["counts"]["frames"]) for run in runs)
     stems = _different_names([safe_name(run.name) for run in runs])
 
-    counts: Counter[str] = Counter()
+    counts, left_out = Counter[str](), Counter[str]()
     uncertain = 0
 
     def images() -> Iterator[tuple[str, FinishedRun, DatasetImage]]:
         nonlocal uncertain
         for split, stem, run in zip(split_runs(runs, selection.val), stems, runs, strict=True):
-            for image in images_of(run, selection, recording, stem=stem):
+            for image in images_of(run, selection, recording, stem=stem, left_out=left_out):
                 counts[split] += 1
                 uncertain += image.sure.count(False)
                 observe("export", counts.total(), total)
                 yield split, run, image
+        if not counts:
+            reasons = ", ".join(f"{reason} ({count}×)" for reason, count in left_out.items())
+            msg = f"no image to export: {reasons or 'no object with a certain label'}"
+            raise OutputError(msg)
 
     ids = {stem: run.run["id"] for stem, run in zip(stems, runs, strict=True)}
     about = {"format": format, "runs": ids}

@@ -10,7 +10,7 @@ import numpy as np
 from shapecat.cameras.colour import ColourImage, ColourView, LensCamera
 from shapecat.cameras.lenses import LENS_MODELS
 from shapecat.errors import RecordingError
-from shapecat.recordings.colour_image import cloud_colours, compressed_size
+from shapecat.recordings.colour_image import bytes_per_row, cloud_colours, compressed_size
 from shapecat.recordings.colour_streams import ColourStream
 from shapecat.recordings.extrinsics import Extrinsics
 from shapecat.recordings.frames import frames
@@ -250,10 +250,12 @@ def _bytes(data: Any) -> memoryview:
 
 def _raw(topic: str, stamp: int, log_time_ns: int, decoded: Any) -> ColourImage:
     width, height, step = int(decoded.width), int(decoded.height), int(decoded.step)
-    return ColourImage(
+    image = ColourImage(
         topic, stamp, log_time_ns, str(decoded.header.frame_id), str(decoded.encoding),
         width, height, step, _bytes(decoded.data),
     )  # fmt: skip
+    bytes_per_row(image)  # raises if the image is truncated
+    return image
 
 
 def _compressed(topic: str, stamp: int, log_time_ns: int, decoded: Any) -> ColourImage:

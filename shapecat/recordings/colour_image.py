@@ -12,6 +12,7 @@ from shapecat.recordings.messages import MessageError
 
 __all__ = [
     "COLOUR_ENCODINGS",
+    "bytes_per_row",
     "cloud_colours",
     "compressed_kind",
     "compressed_size",
@@ -41,7 +42,13 @@ _BAYER = {"bayer_rggb8": 0, "bayer_grbg8": 1, "bayer_gbrg8": 2, "bayer_bggr8": 3
 _LUMA = {"yuv422": 1, "uyvy": 1, "yuv422_yuy2": 0, "yuyv": 0}
 """Index of the first luma byte in the four bytes of two pixels."""
 
-COLOUR_ENCODINGS = frozenset({*_CHANNELS, *_BAYER, *_LUMA})
+_PIXEL_BYTES = {
+    **{name: size * channels for name, (size, _, channels) in _CHANNELS.items()},
+    **dict.fromkeys(_BAYER, 1),
+    **dict.fromkeys(_LUMA, 2),
+}
+
+COLOUR_ENCODINGS = frozenset(_PIXEL_BYTES)
 """Encodings of sensor_msgs/Image that can be decoded to RGB; mono8 becomes grey."""
 
 _SOF = {*range(0xC0, 0xD0)} - {0xC4, 0xC8, 0xCC}
@@ -76,6 +83,27 @@ def compressed_size(data: bytes | memoryview) -> tuple[str, int, int]:
         msg = f"{kind} image is truncated"
         raise MessageError(msg)
     return kind, width, height
+
+
+def bytes_per_row(image: ColourImage) -> int:
+    """Return the bytes per row of a raw image, without decoding it.
+
+    Raises
+    ------
+    MessageError : the image is truncated or has too many pixels, its rows are too short, or its
+        encoding is unknown.
+    """
+    if image.encoding not in _PIXEL_BYTES:
+        msg = f"image encoding {image.encoding!r} is not colour"
+        raise MessageError(msg)
+    width, height, size = image.width, image.height, memoryview(image.data).nbytes
+    used = width * _PIXEL_BYTES[image.encoding]
+    row = image.step or used
+    need = (height - 1) * row + used
+    if not 0 < width * height <= _LARGEST or row < used or need > size:
+        msg = f"image of {width} x {height} pixels needs {need} bytes and has {size}"
+        raise MessageError(msg)
+    return row
 
 
 def _png_size(data: memoryview) -> tuple[int, int]:
@@ -160,29 +188,21 @@ def _decompressed(image: ColourImage, shrink: int) -> U1:
 
 
 def _raw_pixels(image: ColourImage) -> U1:
-    name = image.encoding
+    name, rows = image.encoding, _rows(image)
     if name in _LUMA:
-        return _from_yuv(_rows(image, 2), _LUMA[name])
+        return _from_yuv(rows, _LUMA[name])
     if name in _BAYER:
-        return _from_bayer(_rows(image, 1)[..., 0], _BAYER[name])
-    if name not in _CHANNELS:
-        msg = f"image encoding {name!r} is not colour"
-        raise MessageError(msg)
-    size, order, channels = _CHANNELS[name]
-    rows = _rows(image, size * channels)
+        return _from_bayer(rows[..., 0], _BAYER[name])
+    size, order, _ = _CHANNELS[name]
     # Take the high byte of 16-bit channels: the last one, assuming little-endian data.
     return np.ascontiguousarray(rows[..., [size * k + size - 1 for k in order]])
 
 
-def _rows(image: ColourImage, pixel: int) -> U1:
-    """Return the bytes of a raw image, (h, w, pixel), where `pixel` is the bytes per pixel."""
-    width, height, data = image.width, image.height, np.frombuffer(image.data, np.uint8)
-    row = image.step or width * pixel
-    need = (height - 1) * row + width * pixel
-    if not 0 < width * height <= _LARGEST or row < width * pixel or need > data.size:
-        msg = f"image of {width} x {height} pixels needs {need} bytes and has {data.size}"
-        raise MessageError(msg)
-    return np.ndarray((height, width, pixel), np.uint8, data, 0, (row, pixel, 1))
+def _rows(image: ColourImage) -> U1:
+    """Return the bytes of a raw image, (h, w, bytes per pixel)."""
+    row, pixel = bytes_per_row(image), _PIXEL_BYTES[image.encoding]
+    data = np.frombuffer(image.data, np.uint8)
+    return np.ndarray((image.height, image.width, pixel), np.uint8, data, 0, (row, pixel, 1))
 
 
 def _from_yuv(rows: U1, luma: int) -> U1:
