@@ -8,7 +8,18 @@ from typing import Any
 
 import click
 
-ANY_PATH = click.Path(path_type=Path)
+
+class _Path(click.Path):
+    """A path that is not empty: an unset variable of a shell must not mean the current folder."""
+
+    def convert(self, value: Any, param: click.Parameter | None, ctx: click.Context | None) -> Any:
+        if value == "":
+            self.fail("the path is empty", param, ctx)
+        return super().convert(value, param, ctx)
+
+
+ANY_PATH = _Path(path_type=Path)
+PATH_OR_URL = _Path(path_type=str, readable=False)
 
 
 class _Seconds(click.FloatRange):

@@ -11,6 +11,7 @@ import click
 from shapecat.system.stopping import Stopped
 
 from .options import (
+    PATH_OR_URL,
     SECONDS,
     array_option,
     boxes_option,
@@ -27,8 +28,10 @@ _MOST_ROWS = 100
 
 
 @click.command()
-@click.argument("recordings", nargs=-1, required=True, metavar="RECORDING...")
-@click.option("--out", required=True, metavar="OUT", help="Folder or URL for the results.")
+@click.argument("recordings", nargs=-1, required=True, type=PATH_OR_URL, metavar="RECORDING...")
+@click.option(
+    "--out", required=True, type=PATH_OR_URL, metavar="OUT", help="Folder or URL for the results."
+)
 @click.option(
     "--topic",
     "topics",

@@ -109,6 +109,9 @@ _SUFFIXES = {"mcap": ".mcap", "ros1": ".bag", "ros2": ""}
 
 def _format_of(out: Path, wanted: str | None) -> Any:
     """Return the format that the suffix or the option names; reject a contradiction."""
+    if out.name in {"", ".."}:
+        msg = f"{out} is a folder: name a recording in it, such as demo.mcap"
+        raise click.UsageError(msg)
     named = next((name for name, suffix in _SUFFIXES.items() if suffix == out.suffix), None)
     if named is None:
         stem = out.with_suffix("").name

@@ -177,6 +177,40 @@ def test_simulate_refuses_suffix_of_another_format(
     assert list(tmp_path.iterdir()) == []
 
 
+@pytest.mark.parametrize("folder", [".", "/", "..", "a/.."])
+def test_simulate_needs_name_of_recording(
+    shapecat: Run, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, folder: str
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    result = shapecat("simulate", folder, "--frames", 1)
+
+    assert result.exit_code == 2
+    assert f"Error: {folder} is a folder: name a recording in it" in result.stderr
+
+
+@pytest.mark.parametrize(
+    "words",
+    [
+        *(("info", ""), ("report", ""), ("view", ""), ("simulate", ""), ("annotate", "")),
+        *(("evaluate", ""), ("compare", "", "t.json"), ("compare", "a", ""), ("scene", "")),
+        *(("process", "", "--out", "q"), ("process", "a", "--out", "")),
+        *(("process", "a", "--out", "q", name, "") for name in ("--model", "--config")),
+        *(("export", "", "--format", "crops"), ("export", "a", "--recording", "")),
+        *(("learn", "default", ""), ("train", "")),
+    ],
+)  # fmt: skip
+def test_empty_path_is_wrong_usage(
+    shapecat: Run, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, words: tuple[str, ...]
+) -> None:
+    """An unset variable of a shell must not mean the current folder."""
+    monkeypatch.chdir(tmp_path)
+    result = shapecat(*words)
+
+    assert result.exit_code == 2
+    assert "the path is empty" in result.stderr
+    assert list(tmp_path.iterdir()) == []
+
+
 @pytest.mark.parametrize("there", ["x.mcap", "x.truth.json", "x.labels.npz"])
 def test_simulate_requires_overwrite_option(shapecat: Run, tmp_path: Path, there: str) -> None:
     (tmp_path / there).write_text("mine")
