@@ -28,10 +28,10 @@ def learn(*, model: Path, dataset: Path, out: Path, seed: int, as_json: bool) ->
     shapecat process lab.mcap --out again --model mine.npz
     """
     from shapecat.evaluation.training import learn_on_folder
-    from shapecat.system.files import require_writable
+    from shapecat.learning import require_model_path
 
     source = None if str(model) == "default" else model
-    require_writable(out)
+    require_model_path(out)
     with progress_bars() as bars:
         result = learn_on_folder(source, dataset, out, seed=seed, observe=bars)
     if as_json:

@@ -28,9 +28,9 @@ def train(*, dataset: Path, out: Path, seed: int, as_json: bool) -> None:
     shapecat process lab.mcap --out results --model mine.npz
     """
     from shapecat.evaluation.training import train_on_folder
-    from shapecat.system.files import require_writable
+    from shapecat.learning import require_model_path
 
-    require_writable(out)
+    require_model_path(out)
     with progress_bars() as bars:
         result = train_on_folder(dataset, out, seed=seed, observe=bars)
     if as_json:

@@ -117,7 +117,8 @@ def test_new_category_is_learned_from_corrections(shapecat: Run, tmp_path: Path)
     for row in rows:  # as if the model had confused two of them
         if int(row["track"]) in correct[:2]:
             row["category"] = next(n for n in CATEGORIES if n != truth[int(row["track"])])
-    write_table(first / "tracks.csv", rows)
+    for name in ("tracks.original.csv", "tracks.csv"):
+        write_table(first / name, rows)
     corrected = [
         {**row, "label": truth[int(row["track"])]}
         for row in rows

@@ -38,11 +38,17 @@ ORIGINAL = HEADER + "".join(
 def run(tmp_path: Path) -> Path:
     folder = tmp_path / "run"
     folder.mkdir()
-    (folder / "tracks.csv").write_text(ORIGINAL)
+    write_table(folder, ORIGINAL)
     (folder / "run.json").write_text(
         json.dumps(run_info(model={"categories": ["cup", "can", "cactus"]}))
     )
     return folder
+
+
+def write_table(folder: Path, text: str) -> None:
+    """Write the table of a run, and its original."""
+    for name in ("tracks.original.csv", "tracks.csv"):
+        (folder / name).write_text(text)
 
 
 def labelled(**labels: str) -> str:
@@ -158,7 +164,7 @@ def test_merge_into_deleted_track_is_refused(run: Path) -> None:
 def test_tracks_of_different_topics_are_not_merged(run: Path) -> None:
     """One number on two topics would make one annotation delete the other."""
     text = labelled(t4="merge with 1").replace("merge with 1,/depth", "merge with 1,/other")
-    (run / "tracks.csv").write_text(text)
+    write_table(run, text)
 
     with pytest.raises(OutputError, match="another topic"):
         read_labels(run / "tracks.csv")
@@ -167,7 +173,7 @@ def test_tracks_of_different_topics_are_not_merged(run: Path) -> None:
 def test_tracks_with_common_sensor_are_merged(run: Path) -> None:
     """Which of several sensors see an object changes while the robot moves."""
     text = labelled(t4="merge with 1").replace("merge with 1,/depth", "merge with 1,/depth /other")
-    (run / "tracks.csv").write_text(text)
+    write_table(run, text)
     assert read_labels(run / "tracks.csv")[4].track == 1
 
 
@@ -175,8 +181,8 @@ def test_tracks_of_two_sensors_merge_in_fixed_frame(run: Path) -> None:
     text = labelled(t4="merge with 1").replace("merge with 1,/depth", "merge with 1,/other")
     described = json.loads((run / "run.json").read_text()) | {"fixed_frame": "map"}
     (run / "run.json").write_text(json.dumps(described))
-    (run / "tracks.csv").write_text(
-        ORIGINAL.replace("4,0.000,unknown,0.500,,/depth", "4,0.000,unknown,0.500,,/other")
+    write_table(
+        run, ORIGINAL.replace("4,0.000,unknown,0.500,,/depth", "4,0.000,unknown,0.500,,/other")
     )
     corrected = run.parent / "mine.csv"
     corrected.write_text(text)
@@ -198,7 +204,8 @@ def test_all_problems_are_reported_at_once(run: Path) -> None:
     lines = [line.split(":")[0].strip() for line in str(raised.value).splitlines()[1:]]
     assert lines == ["line 2", "line 3", "line 6", "line 7", "line 8"]
     assert (run / "tracks.csv").read_text() == ORIGINAL
-    assert {path.name for path in run.iterdir()} == {"run.json", "tracks.csv"}
+    names = {"run.json", "tracks.csv", "tracks.original.csv"}
+    assert {path.name for path in run.iterdir()} == names
 
 
 def test_adopting_corrections_keeps_original_table(run: Path) -> None:
@@ -231,6 +238,62 @@ def test_original_table_excludes_labels_not_yet_applied(run: Path) -> None:
     for folder in (run, other):
         assert (folder / "tracks.original.csv").read_text() == ORIGINAL
     assert read_labels(other / "tracks.csv")[4].category == "bowl"
+
+
+def test_line_deleted_from_own_table_is_refused(run: Path) -> None:
+    """The object would silently leave all outputs, with its label."""
+    (run / "tracks.csv").write_text(labelled(t4="bowl"))
+    adopt_labels(run / "tracks.csv", run)
+    header, _, *others = labelled(t4="bowl", t2="box").splitlines(keepends=True)
+    (run / "tracks.csv").write_text(header + "".join(others))
+    (run.parent / "mine.csv").write_text(labelled(t2="plate"))
+
+    missing = r"line 2 of tracks\.original\.csv: track 4 is missing here"
+    with pytest.raises(OutputError, match=missing):
+        read_labels(run / "tracks.csv")
+    for corrected in (run / "tracks.csv", run.parent / "mine.csv"):
+        with pytest.raises(OutputError, match=missing):
+            adopt_labels(corrected, run)
+    with pytest.raises(OutputError, match=missing):
+        relabel(run, {2: "plate"})
+    assert (run / "tracks.csv").read_text() == header + "".join(others)
+
+
+@pytest.mark.parametrize("edited", ["cupp", "", "../../evil"])
+def test_edited_category_is_refused(run: Path, edited: str) -> None:
+    """It would become the name of a folder or of a class without any check."""
+    wrong = ORIGINAL.replace("2,0.000,can,", f"2,0.000,{edited},")
+    for path in (run / "tracks.csv", run.parent / "mine.csv"):
+        path.write_text(wrong)
+        with pytest.raises(OutputError, match="line 3: the category of track 2 is 'can', not"):
+            adopt_labels(path, run)
+    with pytest.raises(OutputError, match="write corrections into the column label"):
+        read_labels(run / "tracks.csv")
+
+
+def test_only_labels_and_additional_columns_can_be_edited(run: Path) -> None:
+    header, *lines = labelled(t4="bowl").replace(",0.500,", ",0.9,").splitlines()
+    table = "\n".join([f"note,{header}", *(f"dusty,{line}" for line in reversed(lines))])
+    (run / "tracks.csv").write_text(table)
+    adopt_labels(run / "tracks.csv", run)
+
+    assert read_labels(run / "tracks.csv")[2] == TrackLabel(2, "can", 0.5)
+    header, *lines = (run / "tracks.csv").read_text().splitlines()
+    assert (header, lines[0]) == (
+        f"{HEADER.strip()},note",
+        "4,0.000,unknown,0.500,bowl,/depth,dusty",
+    )
+    assert relabel(run, {2: "box"}) == {}
+    assert "2,0.000,can,0.500,box,/depth,dusty" in (run / "tracks.csv").read_text()
+
+
+@pytest.mark.parametrize("label", ["none", "new None", "DontCare"])
+def test_names_reserved_by_export_formats_are_refused(run: Path, label: str) -> None:
+    """KITTI readers ignore objects called DontCare; class 0 of point labels is called none."""
+    (run / "tracks.csv").write_text(labelled(t4=label))
+
+    with pytest.raises(OutputError, match="is not a category"):
+        read_labels(run / "tracks.csv")
 
 
 def test_outdated_page_undoes_no_labels(run: Path) -> None:

@@ -1,5 +1,6 @@
 """Tests of model files, which are untrusted: they must not run code, crash or hang."""
 
+import errno
 import io
 import json
 import tracemalloc
@@ -10,7 +11,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from shapecat.errors import ModelError
+from shapecat.errors import ModelError, OutputError
 from shapecat.learning import Categorizer, load_model, model_file, save_model
 from shapecat.learning.categorizer import parts_of
 from shapecat.learning.features import FeatureBank
@@ -252,8 +253,38 @@ def test_descriptor_of_other_version_is_rejected() -> None:
     tiny().require_descriptor(("a", "b", "c"))
 
 
-def test_unwritable_folder_raises_model_error(tmp_path: Path) -> None:
+def test_unwritable_folder_is_reported(tmp_path: Path) -> None:
     (tmp_path / "file").write_text("")
 
-    with pytest.raises(ModelError, match="cannot write the model"):
+    with pytest.raises(OutputError, match="cannot be written"):
         save_model(tmp_path / "file" / "model.npz", tiny())
+
+
+def test_only_models_are_replaced(saved: Path, tmp_path: Path) -> None:
+    """A mistyped --out must not destroy a recording, or a data set in another archive."""
+    recording, archive = tmp_path / "lab.mcap", tmp_path / "views.npz"
+    recording.write_bytes(b"years of work")
+    np.savez(archive, points=np.zeros(3))
+    for path in (recording, archive):
+        before = path.read_bytes()
+        with pytest.raises(OutputError, match="exists and is not a model"):
+            save_model(path, tiny())
+        assert path.read_bytes() == before
+    (tmp_path / "empty").touch()
+    for path in (saved, tmp_path / "empty"):
+        save_model(path, tiny())
+        assert load_model(path).model_id == tiny().model_id
+
+
+def test_failed_write_keeps_previous_model(saved: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    before = saved.read_bytes()
+    monkeypatch.setattr("shapecat.system.files.flush", full_disk)
+    with pytest.raises(OutputError, match="No space left"):
+        save_model(saved, tiny())
+
+    assert saved.read_bytes() == before
+    assert [path.name for path in saved.parent.iterdir()] == [saved.name]
+
+
+def full_disk(path: Path) -> None:
+    raise OSError(errno.ENOSPC, "No space left on device", path)

@@ -26,6 +26,7 @@ FILES = {
     "planes.parquet",
     "tracks.parquet",
     "tracks.csv",
+    "tracks.original.csv",
     "annotated.mcap",
     "review.rrd",
 }

@@ -89,7 +89,8 @@ def test_uncertain_labels_are_not_shown_as_certain(run: Path, drawn: RunReport) 
         lines[k], shown[cells[track]] = ",".join(cells), text
         assert caption(3, "cup", confidence) == f"#3 cup {text}"
     assert caption(4, "unknown", 0.97) == "#4 unknown"  # the confidence is that of another category
-    (run / "tracks.csv").write_text("\n".join([header, *lines]) + "\n")
+    for name in ("tracks.original.csv", "tracks.csv"):
+        (run / name).write_text("\n".join([header, *lines]) + "\n")
     page = replace(drawn, folder=run).page()
 
     cards = dict(re.findall(r'id="track-(\d+)".*?<span class="sure">(.*?)</span>', page, re.DOTALL))
@@ -577,7 +578,9 @@ def test_incomplete_run_json_is_refused(
 
 
 def test_run_without_tracks_has_a_page(run: Path) -> None:
-    (run / "tracks.csv").write_text((run / "tracks.csv").read_text().splitlines()[0] + "\n")
+    header = (run / "tracks.csv").read_text().splitlines()[0]
+    for name in ("tracks.original.csv", "tracks.csv"):
+        (run / name).write_text(header + "\n")
     table = pq.read_table(run / "tracks.parquet")
     pq.write_table(table.slice(0, 0), run / "tracks.parquet")
     (report,) = read_reports([run]).runs

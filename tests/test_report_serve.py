@@ -57,10 +57,11 @@ def long_run(run: Path) -> Path:
         column = pa.array([number] * copy.num_rows, pa.int32())
         tables.append(copy.set_column(0, tracks.schema.field("track"), column))
         many.append(row | {"track": str(number)})
-    with (run / "tracks.csv").open("w", newline="") as file:
-        writer = csv.DictWriter(file, list(many[0]), lineterminator="\n")
-        writer.writeheader()
-        writer.writerows(many)
+    for name in ("tracks.original.csv", "tracks.csv"):
+        with (run / name).open("w", newline="") as file:
+            writer = csv.DictWriter(file, list(many[0]), lineterminator="\n")
+            writer.writeheader()
+            writer.writerows(many)
     pq.write_table(pa.concat_tables(tables), run / "tracks.parquet")
     return without_recording(run)
 
@@ -287,7 +288,6 @@ def test_outsiders_are_refused(site: tuple[Path, str, str], method: str, strange
     assert status == 403
     assert "card" not in text
     assert (run / "tracks.csv").read_bytes() == before
-    assert not (run / "tracks.original.csv").exists()
 
 
 def test_owner_is_served_under_both_host_names(site: tuple[Path, str, str]) -> None:

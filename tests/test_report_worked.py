@@ -276,7 +276,8 @@ def test_index_counts_tracks_left_to_check(run: Path) -> None:
         row |= {"confidence": "0.5" if k < 3 else "0.9", "label": "cup" if k in {1, 4} else ""}
         row["category"] = "can"
     table = [header, *(",".join(row[name] for name in names) for row in rows)]
-    (run / "tracks.csv").write_text("\n".join(table) + "\n")
+    for file in ("tracks.original.csv", "tracks.csv"):
+        (run / file).write_text("\n".join(table) + "\n")
 
     listed = RunReport(run, read_timelines(run), Pictures({}, []), {}).listed("x")
     assert (listed.unsure, listed.checked) == (2, 2)

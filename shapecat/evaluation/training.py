@@ -47,7 +47,7 @@ def train_on_folder(
     Raises
     ------
     RecordingError : there are no views, one cannot be read, or there are fewer than two categories.
-    ModelError : the model cannot be written.
+    OutputError : the model cannot be written.
     """
     views = _describe_folder(root, seed, observe)
     categories = order_categories(views.labels)
@@ -86,7 +86,8 @@ def learn_on_folder(
     Raises
     ------
     RecordingError : there are no views, or one cannot be read.
-    ModelError : the model is unusable, there is no new category, or the result cannot be written.
+    ModelError : the model is unusable, or there is no new category.
+    OutputError : the result cannot be written.
     """
     # Only learning needs these parts of SciPy.
     from shapecat.learning.incremental import add_categories  # noqa: PLC0415

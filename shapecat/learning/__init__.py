@@ -7,6 +7,6 @@ posterior and a novelty. These modules predict and need no scikit-learn; `pnn`, 
 """
 
 from shapecat.learning.categorizer import Categorizer, Prediction
-from shapecat.learning.model_file import load_model, save_model
+from shapecat.learning.model_file import load_model, require_model_path, save_model
 
-__all__ = ["Categorizer", "Prediction", "load_model", "save_model"]
+__all__ = ["Categorizer", "Prediction", "load_model", "require_model_path", "save_model"]

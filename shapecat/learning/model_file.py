@@ -6,6 +6,7 @@ import math
 import zipfile
 import zlib
 from collections.abc import Mapping
+from contextlib import suppress
 from dataclasses import fields
 from functools import cache
 from importlib.resources import files
@@ -16,11 +17,12 @@ from typing import Any, TypeVar, get_type_hints
 import numpy as np
 
 from shapecat.arrays import Record
-from shapecat.errors import ModelError, explained
+from shapecat.errors import ModelError, OutputError, explained
 from shapecat.learning.categorizer import Categorizer, parts_of
+from shapecat.system.files import replacing, require_writable
 
 _Record = TypeVar("_Record", bound=Record)
-__all__ = ["load_model", "save_model"]
+__all__ = ["load_model", "require_model_path", "save_model"]
 
 _FORMAT = "shapecat-model"
 _VERSION = 2
@@ -34,8 +36,9 @@ def save_model(path: Path, categorizer: Categorizer) -> None:
 
     Raises
     ------
-    ModelError : the file cannot be written.
+    OutputError : the file cannot be written, or exists and is not a model.
     """
+    require_model_path(path)
     parts = parts_of(categorizer)
     header = {name: value for name, value in parts.items() if not isinstance(value, np.ndarray)}
     text = json.dumps({"format": _FORMAT, "version": _VERSION, **header}, sort_keys=True, indent=1)
@@ -47,9 +50,27 @@ def save_model(path: Path, categorizer: Categorizer) -> None:
             little = parts[name].astype(parts[name].dtype.newbyteorder("<"), copy=False)
             np.lib.format.write_array(content, np.ascontiguousarray(little), allow_pickle=False)
             _write_member(archive, f"{name}.npy", content.getvalue())
-    with explained(f"{path}: cannot write the model", ModelError):
-        path.parent.mkdir(parents=True, exist_ok=True)
-        path.write_bytes(buffer.getvalue())
+    with replacing(path) as hidden:
+        hidden.write_bytes(buffer.getvalue())
+
+
+def require_model_path(path: Path) -> None:
+    """Check that a model can be written to a path, and replaces nothing but a model.
+
+    Raises
+    ------
+    OutputError : it cannot be written, or the file exists and is not a model.
+    """
+    require_writable(path)
+    with explained(f"{path}: cannot be read", OutputError):
+        if not path.exists() or not path.stat().st_size:
+            return
+        if zipfile.is_zipfile(path):
+            with suppress(zipfile.BadZipFile), zipfile.ZipFile(path) as archive:
+                if _HEADER in archive.namelist():
+                    return
+    msg = f"{path}: exists and is not a model; choose another --out, or move it away"
+    raise OutputError(msg)
 
 
 def _write_member(archive: zipfile.ZipFile, name: str, content: bytes) -> None:

@@ -169,13 +169,20 @@ def common_categories(folders: Sequence[Path]) -> list[str]:
 
     Raises
     ------
-    OutputError : a folder is not a finished run, or its tracks.csv is invalid.
+    OutputError : a folder is not a finished run, its tracks.csv is invalid, or two runs spell a
+        category differently.
     """
     return _common([read_finished(folder) for folder in folders])
 
 
 def _common(runs: Sequence[FinishedRun]) -> list[str]:
-    return list(dict.fromkeys(name for run in runs for name in run.categories))
+    names = list(dict.fromkeys(name for run in runs for name in run.categories))
+    spelled: dict[str, str] = {}
+    for name in names:
+        if spelled.setdefault(name.lower(), name) != name:
+            msg = f"the runs spell a category {spelled[name.lower()]!r} and {name!r}; relabel one"
+            raise OutputError(msg)
+    return names
 
 
 def _different_names(names: Sequence[str]) -> list[str]:

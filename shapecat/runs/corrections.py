@@ -12,17 +12,18 @@ from pathlib import Path
 from shapecat.errors import OutputError
 from shapecat.runs.folder import read_run
 from shapecat.runs.label_meaning import (
+    DELETE,
     TrackLabel,
     find_misread,
     merged_with,
     resolve_labels,
 )
 from shapecat.runs.track_table import (
+    ORIGINAL,
     TrackRow,
     TrackTable,
     parse_number,
     read_track_table,
-    unlabelled,
     with_label,
     write_track_table,
 )
@@ -37,7 +38,6 @@ __all__ = [
     "relabel",
 ]
 
-ORIGINAL = "tracks.original.csv"
 PREVIOUS = "tracks.previous.csv"
 
 
@@ -56,64 +56,95 @@ def read_labels(path: Path, categories: Iterable[str] = ()) -> dict[int, TrackLa
     OutputError : the table is unreadable, belongs to another run, or has invalid lines, which the
         error message lists.
     """
+    table, problems = _read_own(path)
+    labels, misread = resolve_labels(table.rows, categories, one_frame=_one_frame(path.parent))
+    _refuse(path, [*problems, *_lines(table.rows, misread)])
+    return labels
+
+
+def _read_own(path: Path) -> tuple[TrackTable, list[str]]:
+    """Read the tracks.csv of a run; return it with the problems of its lines.
+
+    A person may edit the labels and add columns. Other cells are as in tracks.original.csv, which
+    tells when tracks are missing or a category was edited.
+    """
     table = read_track_table(path)
     _require_same_run(path, table, path.parent)
-    labels, misread = resolve_labels(table.rows, categories, one_frame=_one_frame(path.parent))
-    _refuse(path, [*table.problems, *_lines(table.rows, misread)])
-    return labels
+    if not path.with_name(ORIGINAL).exists():  # of a run by an earlier version
+        return table, list(table.problems)
+    own = read_track_table(path.with_name(ORIGINAL))
+    given = {row.track: row for row in table.rows}
+    missing = [
+        f"line {row.line} of {ORIGINAL}: track {row.track} is missing here; restore its line, or "
+        f"write `{DELETE}` in its column label to remove the object"
+        for row in own.rows
+        if row.track not in given
+    ]
+    rows = tuple(
+        replace(row, cells={**given[row.track].cells, **row.cells})
+        for row in own.rows
+        if row.track in given
+    )
+    columns = tuple(dict.fromkeys((*own.columns, *table.columns)))
+    restored = _relabelled(TrackTable(columns, rows, ()), table.rows)
+    return restored, [*table.problems, *_foreign(table, own), *missing]
+
+
+def _foreign(table: TrackTable, own: TrackTable) -> list[str]:
+    """Return the problems of lines that contradict a run's own table."""
+    known = {row.track: row.category for row in own.rows}
+    problems = []
+    for row in table.rows:
+        if row.track not in known:
+            problems.append(f"line {row.line}: there is no track {row.track}")
+        elif row.category.lower() != known[row.track].lower():
+            problems.append(
+                f"line {row.line}: the category of track {row.track} is {known[row.track]!r}, not "
+                f"{row.category!r}; write corrections into the column label"
+            )
+    return problems
 
 
 def adopt_labels(corrected: Path, folder: Path) -> None:
     """Apply the labels of a corrected table to a run.
 
-    Only the column ``label`` is read, and tracks that the table does not list keep their label. So
-    do tracks whose label equals that in a column ``label_seen``, which a report page writes: it
-    may be older than other corrections. The original table is kept as tracks.original.csv; if
-    labels are replaced, the table before as tracks.previous.csv. ``corrected`` may be the run's
-    own tracks.csv.
+    Only the column ``label`` is read. Tracks that a table elsewhere does not list keep their label,
+    and so do those whose label equals that in a column ``label_seen``, which a report page writes:
+    it may be older than other corrections. If labels are replaced, the table before is kept as
+    tracks.previous.csv. ``corrected`` may be the run's own tracks.csv, which must list all tracks.
 
     Raises
     ------
     OutputError : the table is unreadable, belongs to another run, names tracks that the run does
-        not have, or has invalid labels. The error message lists all these lines, and nothing is
-        written.
+        not have or other categories in the column ``category``, or has invalid labels. The error
+        message lists all these lines, and nothing is written.
     """
     with holding(folder):
         _adopt(corrected, folder)
 
 
 def _adopt(corrected: Path, folder: Path) -> None:
-    current, original = folder / "tracks.csv", folder / ORIGINAL
-    in_place = current.exists() and corrected.exists() and corrected.samefile(current)
-    table = read_track_table(corrected)
-    _require_same_run(corrected, table, folder, known=in_place)
-    base, rows = read_track_table(original if original.exists() else current), table.rows
-    if not in_place:
-        base = _relabelled(base, read_track_table(current).rows)
-        rows = tuple(row for row in rows if row.cells.get("label_seen") != row.label)
-    known = {row.track for row in base.rows}
-    problems = [
-        *table.problems,
-        *(
-            f"line {row.line}: there is no track {row.track}"
-            for row in table.rows
-            if row.track not in known
-        ),
-    ]
-    result = _relabelled(base, rows)
+    current = folder / "tracks.csv"
+    own, problems = _read_own(current)
+    result = own
+    if not (corrected.exists() and corrected.samefile(current)):
+        _refuse(current, problems)
+        table = read_track_table(corrected)
+        _require_same_run(corrected, table, folder, known=False)
+        given = (row for row in table.rows if row.cells.get("label_seen") != row.label)
+        result, problems = _relabelled(own, given), [*table.problems, *_foreign(table, own)]
     known_categories = read_run(folder)["model"]["categories"]
     _, misread = resolve_labels(result.rows, known_categories, one_frame=_one_frame(folder))
     _refuse(corrected, problems + _lines(result.rows, misread))
-    _keep_original(folder, base)
-    if any(a.label not in {"", b.label} for a, b in zip(base.rows, result.rows, strict=True)):
+    if any(a.label not in {"", b.label} for a, b in zip(own.rows, result.rows, strict=True)):
         with replacing(folder / PREVIOUS) as path:
-            write_track_table(path, base)
+            write_track_table(path, own)
     with replacing(current) as path:
         write_track_table(path, result)
 
 
 def relabel(folder: Path, labels: Mapping[int, str]) -> dict[int, str]:
-    """Set the labels of some tracks of a run; keep the other labels and the original table.
+    """Set the labels of some tracks of a run; keep the other labels.
 
     Returns
     -------
@@ -124,23 +155,14 @@ def relabel(folder: Path, labels: Mapping[int, str]) -> dict[int, str]:
     OutputError : the run's table is unreadable, invalid or another run's, or cannot be written.
     """
     current = folder / "tracks.csv"
-    base = read_track_table(current)
-    _require_same_run(current, base, folder)
+    base, problems = _read_own(current)
     categories, one_frame = read_run(folder)["model"]["categories"], _one_frame(folder)
     before = find_misread(base.rows, categories, one_frame=one_frame)
-    _refuse(current, [*base.problems, *_lines(base.rows, before)])
+    _refuse(current, [*problems, *_lines(base.rows, before)])
     rows, refused = _given(base.rows, labels, categories, one_frame=one_frame)
-    _keep_original(folder, base)
     with replacing(current) as path:
         write_track_table(path, replace(base, rows=rows))
     return refused
-
-
-def _keep_original(folder: Path, table: TrackTable) -> None:
-    """Write the table of a run without its labels to tracks.original.csv, unless it exists."""
-    if not (folder / ORIGINAL).exists():
-        with replacing(folder / ORIGINAL) as path:
-            write_track_table(path, unlabelled(table))
 
 
 def correct_label(folder: Path, track: int, label: str, *, seen: str) -> str:

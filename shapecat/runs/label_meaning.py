@@ -10,12 +10,14 @@ from typing import NamedTuple
 from shapecat.runs.track_table import TrackRow
 from shapecat.types import CATEGORIES, UNKNOWN
 
-__all__ = ["TrackLabel", "find_misread", "merged_with", "merging_with", "resolve_labels"]
+__all__ = ["DELETE", "TrackLabel", "find_misread", "merged_with", "merging_with", "resolve_labels"]
 
 DELETE = "delete"
 
 _MERGE = re.compile(r"merged? +(?:with|into) +#?(\d{1,9})(?:[.,]0*)?", re.IGNORECASE)
 _NEW = re.compile(r"new +(.+)", re.IGNORECASE)
+_RESERVED = ("none", "dontcare")
+"""Names that mean "no object" in exported formats."""
 _NAME = re.compile(r"[^\W\d_][\w .+&'()-]{0,58}[\w)]|[^\W\d_]")
 
 
@@ -149,7 +151,7 @@ def _understand(label: str, known: dict[str, str]) -> _Verdict:
     new = _NEW.fullmatch(label)
     name = new[1] if new else label
     command = re.match(r"(merged?( |$)|del$|remove$)", label, re.IGNORECASE)
-    if command or not _NAME.fullmatch(name):
+    if command or name.lower() in _RESERVED or not _NAME.fullmatch(name):
         msg = f"{label!r} is not a category, `{DELETE}` or `merge with N`"
         raise ValueError(msg)
     near = _nearest(name.lower(), [*known, DELETE])

@@ -12,15 +12,17 @@ from pathlib import Path
 from shapecat.errors import OutputError, explained
 
 __all__ = [
+    "ORIGINAL",
     "TrackRow",
     "TrackTable",
     "parse_number",
     "read_track_table",
-    "unlabelled",
     "with_label",
     "write_track_table",
 ]
 
+ORIGINAL = "tracks.original.csv"
+"""The table as the run wrote it, beside tracks.csv, which a person may edit."""
 _COLUMNS = ("track", "category", "confidence", "label")
 _LARGEST_TABLE = 64 << 20
 
@@ -153,11 +155,6 @@ def parse_number(cell: str) -> float:
     ValueError : the cell holds no number.
     """
     return float(cell.strip().replace(",", "."))
-
-
-def unlabelled(table: TrackTable) -> TrackTable:
-    """Return a copy of a table with all labels removed."""
-    return replace(table, rows=tuple(with_label(row, "") for row in table.rows))
 
 
 def with_label(row: TrackRow, label: str) -> TrackRow:

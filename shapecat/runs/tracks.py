@@ -27,6 +27,7 @@ from shapecat.runs.tables import (
     read_together,
     rows_as_lists,
 )
+from shapecat.runs.track_table import ORIGINAL
 from shapecat.system.files import replacing
 from shapecat.system.memory import release_memory
 from shapecat.tracking import FrameDetections, Track, track_recording
@@ -55,7 +56,7 @@ _COLUMNS = (
 def track_run(
     folder: Path, settings: TrackingSettings, categories: Sequence[str], *, work: str = ""
 ) -> dict[str, int]:
-    """Track the detections of a run; write tracks.parquet and tracks.csv.
+    """Track the detections of a run; write tracks.parquet, tracks.csv and its original.
 
     Parameters
     ----------
@@ -82,8 +83,9 @@ def track_run(
             lines += [_Line.of(track, categories) for track in some]
             some.clear()  # the next batch may be as long
             release_memory()
-    with replacing(folder / "tracks.csv") as path:
-        _write_csv(path, lines, first_stamp(folder), work)
+    for name in (ORIGINAL, "tracks.csv"):
+        with replacing(folder / name) as path:
+            _write_csv(path, lines, first_stamp(folder), work)
     return dict(Counter(line.category for line in lines))
 
 
