@@ -86,7 +86,11 @@ def detection_of(frame: int, item: int) -> Detection:
 @pytest.fixture(scope="module")
 def run(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """Write the tables of three objects seen by a moving, rotated sensor."""
-    folder = tmp_path_factory.mktemp("turned")
+    return write_run(tmp_path_factory.mktemp("turned"), np.zeros(3))
+
+
+def write_run(folder: Path, origin: Any) -> Path:
+    """Write the tables, with all objects and the sensor moved by ``origin``, metres."""
     with PerceptionTables(folder, categories=CATEGORIES, model_id="m") as tables:
         for k in range(FRAMES):
             up = ROTATIONS[k].inv().apply(UP)
@@ -95,7 +99,7 @@ def run(tmp_path_factory: pytest.TempPathFactory) -> Path:
             found = tuple(detection_of(k, item) for item in range(3))
             stamp = EPOCH + k * SECOND // 10
             perception = Perception("/depth", k, stamp, "cam", scene, found, {"detect": 0.01})
-            pose = Pose(ROTATIONS[k].as_matrix(), POSITIONS[k])
+            pose = Pose(ROTATIONS[k].as_matrix(), POSITIONS[k] + origin)
             tables.write([perception], [FrameRow(stamp + 5, pose, up)])
     track_run(folder, TrackingSettings(), CATEGORIES, work="w0123")
     return folder
@@ -210,6 +214,21 @@ def test_track_boxes_match_object_poses(run: Path) -> None:
         quarter = np.pi / 2  # which gives the same box
         assert min(difference % quarter, quarter - difference % quarter) < np.radians(10)
         assert_allclose(np.sort(row["size_full"]), SIZE + 0.01, atol=0.03)
+
+
+def test_positions_far_from_origin_are_exact(tmp_path: Path) -> None:
+    """Fixed frames of outdoor robots have coordinates of millions of metres (UTM)."""
+    origin = np.array([500_000.25, 5_400_000.125, 310.5])
+    folder = write_run(tmp_path, origin)
+
+    for table in ("detections", "tracks"):
+        found = rows(folder, table)
+        assert len(found) == 3 * FRAMES
+        for row in found:
+            assert_allclose(row["center_fixed"] - origin, CENTERS[row["detection"]], atol=1e-5)
+    places = [[float(line[axis]) for axis in "xyz"] for line in lines(folder)]
+    order = np.argsort([place[0] for place in places])
+    assert_allclose(np.array(places)[order] - origin, CENTERS[[2, 0, 1]], atol=6e-4)
 
 
 def test_equal_frame_numbers_of_two_sensors_are_not_confused(tmp_path: Path) -> None:

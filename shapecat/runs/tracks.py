@@ -198,7 +198,7 @@ def _columns(tracks: Sequence[Track], boxes: F4, categories: Sequence[str]) -> d
         "frame": column("frames", "i4"),
         "stamp_ns": column("stamps_ns", "i8"),
         "detection": pa.array(detections, mask=detections < 0),
-        "center_fixed": pa.FixedSizeListArray.from_arrays(column("centers", "f4", 3).ravel(), 3),
+        "center_fixed": pa.FixedSizeListArray.from_arrays(column("centers", "f8", 3).ravel(), 3),
         **full_columns(boxes),
         "posterior": rows_as_lists(column("causal", "f4", len(categories))),
     }

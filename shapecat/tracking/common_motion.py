@@ -37,12 +37,12 @@ class CommonMotion:
 
     def still(self, hits: Hits) -> Hits:
         """Return the detections transformed into the coordinate frame of the still objects."""
-        centers = np.zeros(hits.centers.shape, np.float32)
+        centers = np.zeros(hits.centers.shape)
         axes = None if hits.axes is None else np.zeros(hits.axes.shape, np.float32)
         for block in hits.blocks():
             turns = self.rotations[hits.rows[block]]
             shifts = self.translations[hits.rows[block]]
-            centers[block] = np.einsum("nij,nj->ni", turns, hits.centers_of(block)) + shifts
+            centers[block] = np.einsum("nij,nj->ni", turns, hits.centers[block]) + shifts
             if axes is not None and hits.axes is not None:
                 axes[block] = turns @ hits.axes[block]
         return replace(hits, centers=centers, axes=axes)
@@ -80,12 +80,12 @@ def find_common_motion(hits: Hits, members: Sequence[I4]) -> CommonMotion | None
     if hits.axes is None or len(long) < 3:
         return None
     lengths = [len(member) for member in long]
-    moved = [_extent(hits.centers_of(member)) > _MOVED_M for member in long]
+    moved = [_extent(hits.centers[member]) > _MOVED_M for member in long]
     if np.average(moved, weights=lengths) < _MOST:
         return None
     which, owner = np.concatenate(long), np.repeat(np.arange(len(long)), lengths)
     level = _level(hits.axes)
-    local = hits.centers_of(which) @ level.T
+    local = hits.centers[which] @ level.T
     plane = local[:, 0] + 1j * local[:, 1]
     rows, count = hits.rows[which], len(hits.stamps_ns)
     turn, shift = _between_neighbours(plane, rows, owner, count)

@@ -194,7 +194,7 @@ def _continues(hits: Hits, i: int, j: int, *, slow: bool, settings: TrackingSett
     show motion.
     """
     a, b = hits.of_frame(i), hits.of_frame(j)
-    distance = np.linalg.norm(hits.centers_of(a)[:, None] - hits.centers_of(b)[None], axis=2)
+    distance = np.linalg.norm(hits.centers[a][:, None] - hits.centers[b][None], axis=2)
     near = distance < _NEIGHBOURHOOD_M
     comparable = min(int(near.any(axis=1).sum()), int(near.any(axis=0).sum()))
     if comparable == 0:

@@ -19,7 +19,7 @@ _SET_BACK_NS = 1_000_000_000  # a clock was set back by more than this; late mes
 _OF_FRAMES = {"topics": "i4", "frames": "i4", "stamps_ns": "i8"}
 _OF_HITS: dict[str, tuple[str, tuple[Any, ...]]] = {
     "numbers": ("i4", ()),
-    "centers": ("f4", (3,)),
+    "centers": ("f8", (3,)),
     "sizes": ("f4", (3,)),
     "posteriors": ("f4", ("c",)),
     "partial": ("?", ()),
@@ -53,7 +53,7 @@ class Hits:
     first: I4
     rows: I4
     numbers: I4
-    centers: F4
+    centers: F8
     sizes: F4
     posteriors: F4
     partial: Bool
@@ -74,10 +74,6 @@ class Hits:
     def of_frame(self, row: int) -> slice:
         """Return the slice of a frame's hits."""
         return slice(int(self.first[row]), int(self.first[row + 1]))
-
-    def centers_of(self, some: I4 | slice) -> F8:
-        """Return the centres (k, 3) of some hits in double precision, metres."""
-        return np.asarray(self.centers[some], np.float64)
 
     def owners(self, members: Sequence[I4]) -> I4:
         """Return the track index of each hit, (n,), -1 if it has none.
@@ -124,8 +120,8 @@ class Hits:
         a, b = near[last], near[np.minimum(last + 1, len(near) - 1)]
         start, stop = self.stamps(a), self.stamps(b)
         share = np.clip((self.stamps_ns[rows] - start) / np.maximum(stop - start, 1), 0, 1)
-        step = self.centers_of(b) - self.centers_of(a)
-        return np.asarray(self.centers_of(a) + share[:, None] * step)
+        step = self.centers[b] - self.centers[a]
+        return np.asarray(self.centers[a] + share[:, None] * step)
 
     def life(self, member: I4, max_gap_s: float) -> tuple[I4, Bool]:
         """Return the frames (k,) of a track from its first to its last hit, and a mask of its hits.

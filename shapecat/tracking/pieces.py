@@ -165,7 +165,7 @@ def _joint(hits: Hits, axes: F4, pairs: I4) -> F8:
     """Return the lengths (p, 3) of the box around each pair, along the first box's axes, metres."""
     i, j = pairs.T
     own_axes, others = axes[i].astype(np.float64), axes[j].astype(np.float64)
-    offset = np.einsum("pji,pj->pi", own_axes, hits.centers_of(j) - hits.centers_of(i))
+    offset = np.einsum("pji,pj->pi", own_axes, hits.centers[j] - hits.centers[i])
     turned = np.abs(np.einsum("pji,pjk->pik", own_axes, others))
     reach = 0.5 * np.einsum("pik,pk->pi", turned, hits.sizes[j])
     own = 0.5 * hits.sizes[i].astype(np.float64)

@@ -105,7 +105,7 @@ def _associate(hits: Hits, cuts: Bool, settings: TrackingSettings) -> I4:
         here = hits.of_frame(row)
         ids[here] = tracker.step(
             stamp_ns,
-            hits.centers_of(here),
+            hits.centers[here],
             hits.sizes[here],
             hits.posteriors[here],
             partial=hits.partial[here],
@@ -171,7 +171,7 @@ def _extent(hits: Hits, member: I4) -> F8:
 
 def _rest(hits: Hits, member: I4) -> F8:
     """Return the median position (3,) of the whole views; NaN if they move or are too few."""
-    whole = hits.centers_of(member[~hits.partial[member]])
+    whole = hits.centers[member[~hits.partial[member]]]
     if (
         len(whole) < _LINE
         or np.ptp(np.quantile(whole, [0.1, 0.9], axis=0), axis=0).max() > _STILL_M
@@ -185,7 +185,7 @@ def _line(hits: Hits, some: I4, at: int) -> tuple[F8, F8]:
 
     A prior for standing still keeps the velocity of a few noisy points small.
     """
-    stamps, centers = hits.stamps(some), hits.centers_of(some)
+    stamps, centers = hits.stamps(some), hits.centers[some]
     t = (stamps - stamps[at]) * 1e-9
     middle, mean = t.mean(), centers.mean(axis=0)
     velocity = (t - middle) @ (centers - mean) / (((t - middle) ** 2).sum() + 0.1)

@@ -36,7 +36,7 @@ def without_shadows(hits: Hits, members: Sequence[I4]) -> list[I4]:
 
 def _inside(hits: Hits, member: I4, host: I4, radius: float) -> bool:
     place = hits.places(host, hits.rows[member])
-    distance = np.linalg.norm(hits.centers_of(member) - place, axis=1)
+    distance = np.linalg.norm(hits.centers[member] - place, axis=1)
     return bool(np.median(distance) <= radius)
 
 
@@ -82,7 +82,7 @@ def _covered_beside(hits: Hits, k: int, members: Sequence[I4], owner: I4) -> int
             host = hits.seen_with(member, members[owner[hit]])
             i = int(np.searchsorted(host, hit))
             then = host[max(i - most, 0) : i] if way < 0 else host[i + 1 : i + 1 + most]
-            place = hits.centers_of(member[end]) + hits.centers_of(then) - hits.centers_of(hit)
+            place = hits.centers[member[end]] + hits.centers[then] - hits.centers[hit]
             found.append(int(_in_box(hits, then, place).sum()))
         count += max(found)
     return count
@@ -91,5 +91,5 @@ def _covered_beside(hits: Hits, k: int, members: Sequence[I4], owner: I4) -> int
 def _in_box(hits: Hits, which: I4, places: F8) -> Bool:
     """Return whether each position (n, 3) lies in the box of the hit ``which`` (n,): (n,) bool."""
     axes = np.zeros((0, 3, 3)) if hits.axes is None else hits.axes
-    local = np.einsum("nji,nj->ni", axes[which], places - hits.centers_of(which))
+    local = np.einsum("nji,nj->ni", axes[which], places - hits.centers[which])
     return np.asarray((np.abs(local) <= 0.5 * hits.sizes[which]).all(axis=1))
