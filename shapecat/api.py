@@ -4,8 +4,10 @@
 """
 
 import difflib
+import math
 from collections import Counter
 from collections.abc import Collection, Iterator, Sequence
+from functools import lru_cache
 from pathlib import Path
 from typing import Any, Self
 
@@ -14,8 +16,8 @@ from numpy.typing import ArrayLike
 from shapecat import pipeline
 from shapecat.batch.finding import find_recordings
 from shapecat.config import Settings, load_settings, with_settings
-from shapecat.errors import ConfigError, RecordingError
-from shapecat.learning import load_model
+from shapecat.errors import ConfigError, ModelError, RecordingError, explained
+from shapecat.learning import Categorizer, load_model
 from shapecat.outputs.in_memory import frame_of, perceive_alone
 from shapecat.outputs.opened_run import Run, RunFrame, Table
 from shapecat.recordings import Recording, choose_streams, frames
@@ -83,15 +85,17 @@ class OpenRecording:
 
         Raises
         ------
+        ConfigError : ``start_s``, ``end_s`` or ``every`` is invalid.
         NoStreamError : a topic is missing or not usable, or none is given and none can be chosen.
         """
+        _require_selection(start_s, end_s, every)
         streams = choose_streams(self.recording, topics)
         return frames(
             self.recording,
             streams,
             start_s=start_s,
             end_s=end_s,
-            every=every,
+            every=int(every),
             skipped=Counter(),
         )
 
@@ -152,9 +156,7 @@ def process(
     NoStreamError, ModelError, OutputError : as for the command, which prints them.
     """
     _require_known(settings, process.__annotations__)
-    if every < 1:
-        msg = f"every must be at least 1, got {every}"
-        raise ConfigError(msg)
+    _require_selection(start_s, end_s, every)
     if cores > 1 and runs_again():
         msg = f'cores={cores} starts processes: a script needs `if __name__ == "__main__":`'
         raise ConfigError(msg)
@@ -168,7 +170,7 @@ def process(
         fixed_frame=fixed_frame,
         start_s=start_s,
         end_s=end_s,
-        every=every,
+        every=int(every),
         model=None if model is None else Path(model),
         mcap=mcap,
         rrd=rrd,
@@ -182,7 +184,7 @@ def process(
 
 def perceive(
     reading: ArrayLike,
-    intrinsics: Sequence[float] | None = None,
+    intrinsics: ArrayLike | None = None,
     *,
     up: Sequence[float] | None = None,
     model: str | Path | None = None,
@@ -199,7 +201,7 @@ def perceive(
     reading : a depth image (h, w) along the optical axis, floats in metres or integers in
         millimetres; or points (n, 3) or (h, w, 3) in the sensor frame, metres. Zero, negative and
         non-finite depth, and non-finite points, are missing.
-    intrinsics : fx, fy, cx, cy of the depth image, pixels.
+    intrinsics : fx, fy, cx, cy of the depth image, pixels, or its camera matrix (3, 3).
     up : (3,) up direction in the sensor frame; None to estimate it from planes.
     model, config, settings : as for `process`.
 
@@ -215,10 +217,36 @@ def perceive(
     """
     _require_known(settings, perceive.__annotations__)
     chosen = with_settings(load_settings(None if config is None else Path(config)), settings)
-    categorizer = load_model(None if model is None else Path(model))
+    categorizer = load_model(None) if model is None else _model_at(Path(model))
     frame = frame_of(reading, intrinsics)
     compile_all()
     return perceive_alone(frame, up=up, categorizer=categorizer, settings=chosen)
+
+
+def _model_at(path: Path) -> Categorizer:
+    """Read a model; keep the last one, for the next image."""
+    with explained(f"{path}: cannot read the model", ModelError):
+        file = path.stat()
+    return _unchanged_model(path.resolve(), file.st_size, file.st_mtime_ns)
+
+
+@lru_cache(maxsize=1)
+def _unchanged_model(path: Path, _size: int, _mtime_ns: int) -> Categorizer:
+    return load_model(path)
+
+
+def _require_selection(start_s: float | None, end_s: float | None, every: float) -> None:
+    """Refuse a time range or a step that the command refuses."""
+    if every < 1 or every % 1:
+        msg = f"every must be an integer of at least 1, got {every!r}"
+        raise ConfigError(msg)
+    for name, seconds in (("start_s", start_s), ("end_s", end_s)):
+        if seconds is not None and not 0 <= seconds < math.inf:
+            msg = f"{name} must be at least 0, got {seconds}"
+            raise ConfigError(msg)
+    if end_s is not None and end_s <= (start_s or 0):
+        msg = f"end_s {end_s:g} is not after start_s {start_s or 0:g}"
+        raise ConfigError(msg)
 
 
 def _require_known(settings: Collection[str], options: Collection[str]) -> None:

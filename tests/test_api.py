@@ -17,8 +17,9 @@ from click.testing import Result
 
 import shapecat
 from shapecat import api
-from shapecat.errors import ConfigError, OutputError, RecordingError
+from shapecat.errors import ConfigError, ModelError, OutputError, RecordingError
 from shapecat.outputs.opened_run import Table
+from shapecat.types import Camera
 from tests.conftest import Guesser
 from tests.loading import loaded_by
 from tests.test_docs_run import run_here
@@ -198,6 +199,18 @@ IMAGE = np.ones((4, 6), np.float32)
         (IMAGE, {"intrinsics": (5, 5, 3, 20)}, "fx, fy, cx, cy in pixels of an image 6 x 4"),
         (IMAGE, {"intrinsics": (0, 5, 3, 2)}, "fx, fy, cx, cy in pixels of an image 6 x 4"),
         (IMAGE, {"intrinsics": (5, np.nan, 3, 2)}, "fx, fy, cx, cy in pixels of an image 6 x 4"),
+        *(
+            (IMAGE, {"intrinsics": wrong}, r"image 6 x 4, or its camera matrix \(3, 3\), got")
+            for wrong in (
+                np.eye(3)[:2],
+                [[5, 0, 3], [0, 5], [0, 0, 1]],
+                [[5, 1, 3], [0, 5, 2], [0, 0, 1]],
+                [[5, 0, 3], [0, 5, 2], [0, 0, 5]],
+                [[5, 0, 0], [0, 5, 0], [3, 2, 1]],
+                "kinect",
+                5,
+            )
+        ),
         (IMAGE * 900, {"intrinsics": (5, 5, 3, 2)}, "divide millimetres by 1000"),
         (np.ones((4, 6, 3)), {"intrinsics": (5, 5, 3, 2)}, r"depth image \(h, w\)"),
         (np.array([["a"]]), {"intrinsics": (5, 5, 3, 2)}, "depth image"),
@@ -214,6 +227,38 @@ def test_perceive_rejects_invalid_input(
     """A wrong unit or another image's intrinsics would silently give garbage."""
     with pytest.raises(ConfigError, match=problem):
         shapecat.perceive(reading, **options)
+
+
+def test_camera_matrix_equals_four_numbers() -> None:
+    matrix = np.array([[61.0, 0, 33], [0, 62, 25], [0, 0, 1]])
+    for given in (matrix, matrix.tolist(), matrix[[0, 1, 0, 1], [0, 1, 2, 2]]):
+        camera = shapecat.perceive(np.zeros((48, 64)), given).reading.camera
+
+        assert camera == Camera(64, 48, 61, 62, 33, 25)
+
+
+def test_model_is_read_once_until_its_file_changes(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Reading takes longer than perceiving an image."""
+    read: list[Path] = []
+
+    def counted(path: Path) -> Guesser:
+        read.append(path)
+        return Guesser()
+
+    monkeypatch.setattr(api, "load_model", counted)
+    monkeypatch.chdir(tmp_path)
+    (tmp_path / "mine.npz").write_bytes(b"one")
+    for model in ("mine.npz", tmp_path / "mine.npz"):
+        shapecat.perceive(np.zeros((48, 64)), (60, 60, 32, 24), model=model)
+    assert read == [tmp_path / "mine.npz"]
+
+    (tmp_path / "mine.npz").write_bytes(b"two and more")
+    shapecat.perceive(np.zeros((48, 64)), (60, 60, 32, 24), model="mine.npz")
+    assert len(read) == 2
+    with pytest.raises(ModelError, match=r"none\.npz: cannot read the model: No such file"):
+        shapecat.perceive(np.zeros((48, 64)), (60, 60, 32, 24), model="none.npz")
 
 
 @pytest.mark.parametrize("reading", [np.zeros((48, 64)), np.full((48, 64), np.nan)])
@@ -237,7 +282,7 @@ def test_table_columns_become_arrays(page_folder: Path) -> None:
     assert run.frame_table.numpy("fixed_rotation").shape == (4, 9)
     with pytest.raises(OutputError, match=r"no column centre; known: .*center"):
         run.detections.numpy("centre")
-    with pytest.raises(KeyError):
+    with pytest.raises(OutputError, match=r"no track 999 among \d+ tracks"):
         run.posterior(999)
 
 
@@ -269,10 +314,30 @@ def test_wrong_settings_and_folders_are_refused(page_folder: Path, tmp_path: Pat
         ConfigError, match=r"unknown option or setting topic; did you mean topics\?"
     ):
         shapecat.process(page_folder / "demo.mcap", tmp_path, topic="/camera/depth/image_raw")
-    with pytest.raises(ConfigError, match="every must be at least 1, got 0"):
-        shapecat.process(page_folder / "demo.mcap", tmp_path, every=0)
     with pytest.raises(AttributeError, match="nothing"):
         _ = shapecat.nothing
+
+
+@pytest.mark.parametrize(
+    ("options", "problem"),
+    [
+        ({"every": 0}, "every must be an integer of at least 1, got 0"),
+        ({"every": 2.5}, r"every must be an integer of at least 1, got 2\.5"),
+        ({"start_s": -1}, "start_s must be at least 0, got -1"),
+        ({"start_s": float("nan")}, "start_s must be at least 0, got nan"),
+        ({"end_s": float("inf")}, "end_s must be at least 0, got inf"),
+        ({"start_s": 0.2, "end_s": 0.2}, r"end_s 0\.2 is not after start_s 0\.2"),
+    ],
+)
+def test_frames_that_the_command_refuses_are_refused(
+    tmp_path: Path, options: dict[str, Any], problem: str
+) -> None:
+    with pytest.raises(ConfigError, match=problem):
+        shapecat.process(FIXTURE, tmp_path, **options)
+    recording = shapecat.open_recording(FIXTURE)
+    with recording, pytest.raises(ConfigError, match=problem):
+        recording.frames(**options)
+    assert list(tmp_path.iterdir()) == []
 
 
 def test_process_accepts_single_topic_and_up_vector(page_folder: Path, tmp_path: Path) -> None:

@@ -2,6 +2,7 @@
 
 import math
 from collections.abc import Sequence
+from contextlib import suppress
 from functools import partial
 
 import numpy as np
@@ -19,9 +20,11 @@ __all__ = ["frame_of", "perceive_alone"]
 
 _FARTHEST_M = 100.0
 """A depth image whose median is larger is not in metres."""
+_FIXED = ([0, 1, 2, 2, 2], [1, 0, 0, 1, 2])
+"""The elements of a camera matrix that are the same for all cameras, without skew."""
 
 
-def frame_of(reading: ArrayLike, intrinsics: Sequence[float] | None = None) -> Frame:
+def frame_of(reading: ArrayLike, intrinsics: ArrayLike | None = None) -> Frame:
     """Return a depth image or points as a frame, with stamp 0.
 
     Parameters
@@ -52,14 +55,20 @@ def frame_of(reading: ArrayLike, intrinsics: Sequence[float] | None = None) -> F
     return frame(depth=depth, camera=_camera(intrinsics, *depth.shape))
 
 
-def _camera(intrinsics: Sequence[float], height: int, width: int) -> Camera:
+def _camera(intrinsics: ArrayLike, height: int, width: int) -> Camera:
     """Return the camera of an image, whose centre must be in the image."""
-    numbers = [float(value) for value in intrinsics]
-    if len(numbers) == 4 and all(map(math.isfinite, numbers)):
-        fx, fy, cx, cy = numbers
-        if min(fx, fy) > 0 and 0 < cx < width and 0 < cy < height:
-            return Camera(width, height, fx, fy, cx, cy)
-    msg = f"expected fx, fy, cx, cy in pixels of an image {width} x {height}, got {numbers}"
+    with suppress(TypeError, ValueError):  # not numbers, or rows of different lengths
+        given = np.asarray(intrinsics, np.float64)
+        if given.shape == (3, 3) and (given[_FIXED] == np.eye(3)[_FIXED]).all():
+            given = given[[0, 1, 0, 1], [0, 1, 2, 2]]
+        if given.shape == (4,) and np.isfinite(given).all():
+            fx, fy, cx, cy = given.tolist()
+            if min(fx, fy) > 0 and 0 < cx < width and 0 < cy < height:
+                return Camera(width, height, fx, fy, cx, cy)
+    msg = (
+        f"expected fx, fy, cx, cy in pixels of an image {width} x {height}, or its camera matrix "
+        f"(3, 3), got {' '.join(repr(intrinsics).split())}"
+    )
     raise ConfigError(msg)
 
 

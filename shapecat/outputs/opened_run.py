@@ -13,6 +13,7 @@ import pyarrow.parquet as pq
 from shapecat.arrays import F4, I4, U1, Bool
 from shapecat.errors import OutputError
 from shapecat.outputs.colouring import Coloured, with_colour
+from shapecat.outputs.counts import plural
 from shapecat.recordings.colour_image import pixels_of
 from shapecat.runs.finished import FinishedRun, open_source, read_finished
 from shapecat.runs.run_info import RunInfo
@@ -180,11 +181,13 @@ class Run:
 
         Raises
         ------
-        KeyError : there is no such track.
+        OutputError : there is no such track.
         """
-        rows = np.flatnonzero(self.tracks.numpy("track") == track)
+        tracks = self.tracks.numpy("track")
+        rows = np.flatnonzero(tracks == track)
         if not len(rows):
-            raise KeyError(track)
+            msg = f"{self.folder}: no track {track} among {plural(len(np.unique(tracks)), 'track')}"
+            raise OutputError(msg)
         seconds = (self.tracks.numpy("stamp_ns")[rows] - first_stamp(self.folder)) * 1e-9
         return seconds, self.tracks.numpy("posterior")[rows]
 
