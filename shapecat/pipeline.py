@@ -27,6 +27,7 @@ from shapecat.runs.folder import (
     staged,
     sweep,
     write_run,
+    writing_outputs,
 )
 from shapecat.runs.identity import ContentDigest, file_stats, same_content
 from shapecat.runs.jobs import (
@@ -181,8 +182,9 @@ def _finished(
             f"({'; '.join(differing)}); choose another --out, or --overwrite it"
         )
         raise OutputError(msg)
-    sweep(job.folder)
-    annotate(job.folder, recording, run, observe)
+    with writing_outputs(job.folder):
+        sweep(job.folder)
+        annotate(job.folder, recording, run, observe)
     return summarize(job, run, processed=False)
 
 
@@ -279,13 +281,13 @@ def annotate_again(
 
     Raises
     ------
-    OutputError : the folder is not a finished run, the table does not fit it, or the content of
-        the recording differs from what was processed.
+    OutputError : the folder is not a finished run, the table does not fit it, another process is
+        writing the outputs, or the content of the recording differs from what was processed.
     RecordingError : the recording is missing or unreadable.
     """
     from shapecat.runs.finished import open_source  # noqa: PLC0415  on first use
 
-    with open_source(read_run(folder), recording) as source:
+    with open_source(read_run(folder), recording) as source, writing_outputs(folder):
         transfer = _adopt(labels, folder, by_place=by_place)
         run = read_run(folder)
         run["input"] |= {"path": str(source.path.resolve()), "files": file_stats(source.path)}
@@ -294,7 +296,7 @@ def annotate_again(
             run["seconds"].pop(output, None)
         write_run(folder, run)  # after a kill, the next run writes what is missing
         annotate(folder, source, run, observe)
-    write_run(folder, run)
+        write_run(folder, run)
     return transfer
 
 

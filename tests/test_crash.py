@@ -7,6 +7,7 @@ import subprocess
 import sys
 import time
 from collections.abc import Callable
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -17,8 +18,8 @@ from click.testing import Result
 
 from shapecat.config import Settings
 from shapecat.errors import OutputError, RecordingError
-from shapecat.pipeline import process
-from shapecat.runs.folder import read_run
+from shapecat.pipeline import annotate_again, process
+from shapecat.runs.folder import read_run, writing_outputs
 from shapecat.runs.jobs import Job
 from tests.scenes import record
 
@@ -168,7 +169,6 @@ def test_interrupted_annotation_is_finished(
     recording: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """Otherwise the outputs would show labels that the table no longer has."""
-    from shapecat.pipeline import annotate_again  # noqa: PLC0415  # beside its only use
 
     folder = tmp_path / "table"
     job = Job(recording, folder, end_s=0.3, rrd=False)
@@ -184,6 +184,22 @@ def test_interrupted_annotation_is_finished(
     process(job)
 
     assert contents(folder) == before
+
+
+def test_two_commands_cannot_write_same_outputs(recording: Path, tmp_path: Path) -> None:
+    """They share hidden names: one would remove the file of the other, or undo its labels."""
+    job = Job(recording, tmp_path / "table", end_s=0.3, rrd=False)
+    process(job)
+    (job.folder / "annotated.mcap").unlink()
+    (job.folder / ".annotated.mcap.partial").write_bytes(b"half")
+    with writing_outputs(job.folder):
+        for command in (partial(annotate_again, job.folder, None), partial(process, job)):
+            with pytest.raises(OutputError, match="another command is writing its outputs"):
+                command()
+        assert (job.folder / ".annotated.mcap.partial").exists()
+
+    annotate_again(job.folder, None)
+    assert (job.folder / "annotated.mcap").exists()
 
 
 def test_two_runs_cannot_write_same_folder(recording: Path, tmp_path: Path) -> None:

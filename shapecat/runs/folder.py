@@ -30,6 +30,7 @@ __all__ = [
     "staged",
     "sweep",
     "write_run",
+    "writing_outputs",
 ]
 
 OUTPUT_OPTIONS: Mapping[Literal["mcap", "rrd"], str] = {
@@ -206,6 +207,26 @@ def _locked(folder: Path) -> Iterator[None]:
     held = lock(folder)
     if held is None:
         raise _BusyError
+    try:
+        yield
+    finally:
+        os.close(held)
+
+
+@contextmanager
+def writing_outputs(folder: Path) -> Iterator[None]:
+    """Let only this process write the outputs of a finished run during the block.
+
+    Raises
+    ------
+    OutputError : another process is writing them, or the folder is not a finished run.
+    """
+    with explained(str(folder), OutputError):
+        # Nothing replaces this file. The lock of the folder is for labels, which never wait long.
+        held = lock(folder / "tracks.parquet")
+    if held is None:
+        msg = f"{folder}: another command is writing its outputs; wait for it and run this again"
+        raise OutputError(msg)
     try:
         yield
     finally:
