@@ -1,5 +1,6 @@
 """Shape-checked, read-only arrays for the records."""
 
+import reprlib
 from dataclasses import dataclass, field, fields
 from typing import Any, ClassVar, TypeAlias, dataclass_transform
 
@@ -91,6 +92,21 @@ def array(shape: str, dtype: str, **options: Any) -> Any:
     return field(metadata={"shape": shape, "dtype": dtype}, **options)
 
 
+class _Short(reprlib.Repr):
+    """Text that fits a console: type and shape of arrays, the first elements of collections."""
+
+    def __init__(self) -> None:
+        super().__init__()
+        self.maxother = 200
+
+    def repr_ndarray(self, value: NDArray[Any], _level: int) -> str:
+        """Return type and shape, also of an array in a collection."""
+        return f"{value.dtype} {value.shape}"
+
+
+_short = _Short()
+
+
 @dataclass_transform(frozen_default=True, eq_default=False, field_specifiers=(array, field))
 class Record:
     """Base class of the records: a frozen dataclass that checks and freezes its array fields.
@@ -104,7 +120,7 @@ class Record:
 
     def __init_subclass__(cls) -> None:
         """Make the subclass a frozen dataclass."""
-        made = dataclass(frozen=True, eq=False)(cls)
+        made = dataclass(frozen=True, eq=False, repr=False)(cls)
         cls._arrays = tuple(
             (item.name, _axes(item.metadata["shape"]), np.dtype(item.metadata["dtype"]))
             for item in fields(made)  # type: ignore[arg-type]  # every subclass is a dataclass
@@ -125,6 +141,10 @@ class Record:
                 raise ValueError(msg) from None
             if frozen is not value:
                 object.__setattr__(self, name, frozen)
+
+    def __repr__(self) -> str:
+        values = (f"{name}={_short.repr(value)}" for name, value in vars(self).items())
+        return f"{type(self).__name__}({', '.join(values)})"
 
     def __setstate__(self, state: dict[str, Any]) -> None:
         """Restore a record in another process, where its arrays would be writable."""

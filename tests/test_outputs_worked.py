@@ -40,6 +40,7 @@ from shapecat.outputs.exports import _made_by_export, _require_own, _staged, _th
 from shapecat.outputs.exports_points import write_point_labels
 from shapecat.outputs.image_annotations import ImageBox, read_image_frames
 from shapecat.outputs.level_clouds import support_offset, upright_cloud
+from shapecat.outputs.opened_run import RunFrame
 from shapecat.outputs.png import png
 from shapecat.outputs.review_paths import Paths
 from shapecat.outputs.review_scenes import choose_scenes, with_clouds
@@ -82,6 +83,23 @@ def labelled_object(track: int, indices: Any = (), **changes: Any) -> LabelledOb
 
 def labelled_frame(index: int, *objects: LabelledObject, topic: str = "/depth") -> LabelledFrame:
     return LabelledFrame(topic, index, index * MS, 0, "cam", None, (), objects, (), {}, UP)
+
+
+def test_records_print_in_one_short_line() -> None:
+    """A console would print every element of the arrays, a hundred thousand characters."""
+    item = labelled_object(7, range(3000))
+    labelled = labelled_frame(12, item)
+    depth = Frame("/depth", 12, 0, 0, "cam", np.ones((4, 6)), Camera(6, 4, 5, 5, 3, 2))
+
+    assert repr(item) == "<LabelledObject #7: cup, confidence 0.60>"
+    assert repr(RunFrame(labelled, depth)) == "<RunFrame /depth 12: 1 object>"
+    assert repr(item.gas) == "NeuralGas(neurons=float32 (0, 3), edges=uint16 (0, 2))"
+    assert repr(depth).endswith(
+        "frame_id='cam', depth=float32 (4, 6), "
+        "camera=Camera(width=6, height=4, fx=5, fy=5, cx=3, cy=2), points=None)"
+    )
+    masks = ImageMasks("/color", 0, 0, "cam", 6, 4, {}, {3: np.arange(999, dtype=np.uint32)})
+    assert repr(masks).endswith("boxes={}, counts={3: uint32 (999,)})")
 
 
 # ---- annotations: lifetime and deletion

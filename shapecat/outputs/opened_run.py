@@ -84,6 +84,10 @@ class RunFrame:
     reading: Frame
     coloured: Coloured | None = None
 
+    def __repr__(self) -> str:
+        where = f"{self.labelled.topic} {self.labelled.index}"
+        return f"<RunFrame {where}: {plural(len(self.objects), 'object')}>"
+
     @property
     def objects(self) -> tuple[LabelledObject, ...]:
         """The objects with their final label, box, posterior and surface."""

@@ -40,6 +40,9 @@ class LabelledObject(Record):
     detections: tuple[int, ...] = ()
     full: Box | None = None
 
+    def __repr__(self) -> str:
+        return f"<LabelledObject #{self.track}: {self.category}, confidence {self.confidence:.2f}>"
+
 
 class LabelledFrame(Record):
     """One frame as the outputs show it, without its points.
