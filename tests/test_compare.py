@@ -40,7 +40,12 @@ from shapecat.evaluation.comparison_matching import (
     match_objects,
     seen_together,
 )
-from shapecat.evaluation.comparison_page import figure_rows, format_page, write_comparison
+from shapecat.evaluation.comparison_page import (
+    figure_rows,
+    format_page,
+    place_captions,
+    write_comparison,
+)
 from shapecat.evaluation.comparison_pictures import (
     COLOURS,
     Caption,
@@ -432,7 +437,7 @@ def test_page_shows_all_content_in_its_place() -> None:
     assert '<svg viewBox="0 0 300 200" style="font-size:7.0px"' in svg
     assert 'href="data:image/png;base64,AA" width="300" height="200"' in svg
     assert re.findall(r'<text x="(.*?)" y="(.*?)">(.*?)</text>', svg) == [
-        ("42", "150", "left"), ("258", "7", "high"), ("144", "60", "in"),
+        ("290", "7", "high"), ("144", "60", "in"), ("20", "150", "left"),
     ]  # fmt: skip
     assert page.count(
         "cup taken for can #25; surplus pot #26; missed a &amp; b; ball now #27"
@@ -565,6 +570,19 @@ def test_each_part_of_the_run_has_one_picture(
     monkeypatch.setattr(comparing, "_PICTURES", 2)
 
     assert [picture.frame for picture in compare(run, truth).pictures] == [0, 2]
+
+
+def test_captions_do_not_overlap() -> None:
+    """In a pile, several captions begin at the same place."""
+    texts = ("missed bowl", "surplus bowl #8", "missed plate", "surplus bowl #4")
+    places = ((200, 100), (210, 104), (205, 96), (40, 101))
+    captions = [Caption(*place, text) for place, text in zip(places, texts, strict=True)]
+    placed = {text: (x, y) for x, y, text in place_captions(captions, 10.0, 430)}
+
+    assert placed["missed plate"] == (205, 96)
+    assert placed["surplus bowl #4"] == (46.5, 101)  # moved into the picture, but not down
+    assert placed["missed bowl"] == (200, 107.5)
+    assert placed["surplus bowl #8"] == (210, 119)
 
 
 def test_captions_are_centred_above_their_objects() -> None:

@@ -169,7 +169,6 @@ def test_interrupted_annotation_is_finished(
     recording: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """Otherwise the outputs would show labels that the table no longer has."""
-
     folder = tmp_path / "table"
     job = Job(recording, folder, end_s=0.3, rrd=False)
     process(job)

@@ -1,7 +1,7 @@
 """Output of a comparison: metrics, a page with pictures, and a table of all objects."""
 
 import json
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from html import escape
 from pathlib import Path
 from string import Template
@@ -12,17 +12,26 @@ import pyarrow as pa
 from shapecat.errors import OutputError, explained
 from shapecat.evaluation.comparing import Comparison
 from shapecat.evaluation.comparison_matching import Difference
-from shapecat.evaluation.comparison_pictures import COLOURS, DifferenceImage, words_of
+from shapecat.evaluation.comparison_pictures import COLOURS, Caption, DifferenceImage, words_of
 from shapecat.evaluation.markup import figure_text, html_table
 from shapecat.outputs.counts import plural
 from shapecat.runs.tables import FRAME_COLUMNS, write_table
 from shapecat.system.files import complete_folder
 
-__all__ = ["OBJECTS", "figure_rows", "format_page", "require_new", "write_comparison"]
+__all__ = [
+    "OBJECTS",
+    "figure_rows",
+    "format_page",
+    "place_captions",
+    "require_new",
+    "write_comparison",
+]
 
 _MOST_ROWS = 500
 _LETTERS = 43
 """Width of a picture divided by the height of its letters, whatever its number of pixels."""
+_LETTER_WIDTH, _LINE = 0.62, 1.15
+"""Mean width of a letter, and distance of two lines, relative to the height of a letter."""
 
 OBJECTS = pa.schema(
     [
@@ -194,11 +203,9 @@ def _cells(row: Difference) -> tuple[str, ...]:
 
 def _picture(picture: DifferenceImage) -> str:
     letter = picture.width / _LETTERS
-    side = 6 * letter
     texts = "".join(
-        f'<text x="{min(max(c.x, side), picture.width - side):.0f}" y="{max(c.y, letter):.0f}">'
-        f"{escape(c.text)}</text>"
-        for c in picture.captions
+        f'<text x="{x:.0f}" y="{y:.0f}">{escape(text)}</text>'
+        for x, y, text in place_captions(picture.captions, letter, picture.width)
     )
     listed = "; ".join(words_of(row) for row in picture.rows)
     width, height = picture.width, picture.height
@@ -208,6 +215,28 @@ def _picture(picture: DifferenceImage) -> str:
         f'height="{height}"/>{texts}</svg><figcaption><b>{escape(picture.topic)} '
         f"frame {picture.frame}</b>: {escape(listed)}</figcaption></figure>"
     )
+
+
+def place_captions(
+    captions: Iterable[Caption], letter: float, width: int
+) -> list[tuple[float, float, str]]:
+    """Return middle, base line and text of each caption; move captions down that would overlap.
+
+    Parameters
+    ----------
+    letter : height of the letters, pixels.
+    width : of the picture, pixels.
+    """
+    placed: list[tuple[float, float, str]] = []
+    for caption in sorted(captions, key=lambda caption: caption.y):
+        side = _LETTER_WIDTH * letter * len(caption.text) / 2
+        x, y = min(max(caption.x, side), width - side), max(caption.y, letter)
+        for x1, y1, text in sorted(placed, key=lambda place: place[1]):
+            apart = _LETTER_WIDTH * letter * len(text) / 2 + side
+            if abs(x - x1) < apart and abs(y - y1) < _LINE * letter:
+                y = y1 + _LINE * letter
+        placed.append((x, y, caption.text))
+    return placed
 
 
 _PAGE = Template(
