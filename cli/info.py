@@ -54,7 +54,7 @@ def _describe(path: Path) -> tuple[dict[str, Any] | None, int]:
 def _show(overview: dict[str, Any]) -> None:
     click.echo(
         f"{overview['path']}: {overview['kind']}, {overview['bytes'] / 1e6:.1f} MB, "
-        f"{overview['seconds']:.1f} s"
+        f"{overview['seconds']:.1f} s long"
     )
     rows = [
         (t["name"], t["type"], t["encoding"], "?" if t["count"] is None else t["count"], t["use"])

@@ -37,6 +37,5 @@ def learn(*, model: Path, dataset: Path, out: Path, seed: int, as_json: bool) ->
     if as_json:
         print_json(result)
     else:
-        click.echo(
-            f"{out}: learned {', '.join(result['added'])} from {plural(result['views'], 'view')}"
-        )
+        views = plural(result["views"], "view")
+        click.echo(f"{out}: learned {', '.join(result['added'])} from a data set of {views}")

@@ -200,6 +200,8 @@ def _run(
     workers, cores = share_cores(jobs, sum(task.status != "complete" for task in batch.tasks))
     if len(batch.tasks) > 1:
         watcher.plan(describe_plan(batch.tasks, batch.left_out, workers, cores))
+    if not batch.tasks:
+        watcher.plan("no recordings in this shard")
     if name == "local" and scheduler is None and workers <= 1:
         with watcher:
             yield from process_here(batch.tasks, watcher, cores=cores, manifest=batch.manifest)

@@ -211,7 +211,7 @@ def test_info_prints_content_of_recording(capsys: pytest.CaptureFixture[str]) ->
     )  # fmt: skip
     first, *table, last = capsys.readouterr().out.splitlines()
 
-    assert first == "a/lab.mcap: MCAP, 98.8 MB, 12.3 s"
+    assert first == "a/lab.mcap: MCAP, 98.8 MB, 12.3 s long"
     assert [re.split(r"\s{2,}", line.strip()) for line in table] == [
         ["topic", "type", "encoding", "messages", "use"],
         ["/d", "sensor_msgs/Image", "cdr", "61", "depth stream"],
@@ -315,7 +315,7 @@ CALLS = {
         [None, Path("data"), Path("m.npz")],
         {"seed": 5},
         {"added": ["jar", "mug"], "views": 1075},
-        "m.npz: learned jar, mug from 1,075 views\n",
+        "m.npz: learned jar, mug from a data set of 1,075 views\n",
     ),
     "train data --out m.npz --seed 5": (
         "shapecat.evaluation.training.train_on_folder",

@@ -56,6 +56,30 @@ def test_error_lists_supported_depth_encodings(tmp_path: Path) -> None:
     )
 
 
+def test_error_about_a_truncated_recording_says_so(tmp_path: Path) -> None:
+    """It listed the topic of the depth images among the topics of a recording without any."""
+    topic = "/cam/depth/image_raw"
+    empty = [(topic, "sensor_msgs/msg/Image")]
+    path = record(tmp_path / "a.mcap", depth_items(EPOCH), chunk_size=1, empty=empty)
+    path.write_bytes(path.read_bytes()[:3000])
+
+    errors = []
+    for wanted in ([], [topic]):
+        with open_recording(path) as recording, pytest.raises(NoStreamError) as found:
+            choose_streams(recording, wanted)
+        errors.append(str(found.value))
+
+    warning = "the recording was not finished; messages recovered: 1, and what was readable in"
+    assert errors[0].startswith(
+        f"{path}: no point clouds or depth images (16UC1, mono16, 32FC1); topics found: "
+        "/cam/depth/camera_info (sensor_msgs/msg/CameraInfo), /cam/depth/image_raw "
+        f"(sensor_msgs/msg/Image, no readable messages); warnings: {warning}"
+    )
+    assert errors[1].startswith(
+        f"{path}: topic {topic} has no readable messages; usable topics: none; warnings: {warning}"
+    )
+
+
 # ---- which of several colour cameras
 
 

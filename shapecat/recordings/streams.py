@@ -33,6 +33,8 @@ INFO = "sensor_msgs/msg/CameraInfo"
 
 _PEEK = 5
 """Messages tried to find out what a topic holds: the first may be damaged."""
+_WARNINGS = 3
+"""Warnings about a recording that an error repeats."""
 
 
 @dataclass(frozen=True)
@@ -112,11 +114,7 @@ def _wanted(
     for name in dict.fromkeys(wanted):
         stream = by_topic.get(name.strip("/"))
         if stream is None:
-            known = ", ".join(stream.topic for stream in streams) or "none"
-            there = name.strip("/") in {topic.name.strip("/") for topic in recording.topics}
-            state = "holds no clouds or depth images" if there else "does not exist"
-            msg = f"{recording.path}: topic {name} {state}; usable topics: {known}"
-            raise NoStreamError(msg)
+            raise NoStreamError(_why_not(recording, streams, name))
         if not stream.usable:
             msg = f"{recording.path}: no sensor_msgs/CameraInfo for the depth images on {name}"
             raise NoStreamError(msg)
@@ -124,18 +122,46 @@ def _wanted(
     return tuple(chosen)
 
 
+def _why_not(recording: Recording, streams: tuple[Stream, ...], name: str) -> str:
+    known = ", ".join(stream.topic for stream in streams) or "none"
+    there = [t for t in recording.topics if t.name.strip("/") == name.strip("/")]
+    state = "holds no clouds or depth images" if there else "does not exist"
+    state = "has no readable messages" if any(_is_empty(recording, t) for t in there) else state
+    return f"{recording.path}: topic {name} {state}; usable topics: {known}{_warnings(recording)}"
+
+
 def _why_none(recording: Recording, streams: tuple[Stream, ...]) -> str:
     if streams:
         names = ", ".join(stream.topic for stream in streams)
-        return f"{recording.path}: depth images without a sensor_msgs/CameraInfo: {names}"
-    found = [f"{t.name} ({t.type or t.encoding})" for t in recording.topics]
+        what = f"depth images without a sensor_msgs/CameraInfo: {names}"
+        return f"{recording.path}: {what}{_warnings(recording)}"
+    found = [
+        f"{t.name} ({t.type or t.encoding}"
+        f"{', no readable messages' if _is_empty(recording, t) else ''})"
+        for t in recording.topics
+    ]
     shown = ", ".join(found[:12]) + (", …" if len(found) > 12 else "")
     images = any(t.type.endswith("Image") for t in recording.topics)
     kinds = f" ({', '.join(DEPTH_ENCODINGS)})" if images else ""
     return (
         f"{recording.path}: no point clouds or depth images{kinds}; "
-        f"topics found: {shown or 'none, the recording is empty'}"
+        f"topics found: {shown or 'none, the recording is empty'}{_warnings(recording)}"
     )
+
+
+def _is_empty(recording: Recording, topic: Topic) -> bool:
+    """Return whether a topic of clouds or images has no message that can be decoded."""
+    if ros_counterpart(topic.type) not in _PROBES:
+        return False
+    return topic.count == 0 or first_message(recording, topic.name, topic.type) is None
+
+
+def _warnings(recording: Recording) -> str:
+    """Return the first warnings about a recording, as the end of a message."""
+    texts = recording.warnings[:_WARNINGS]
+    if len(recording.warnings) > _WARNINGS:
+        texts.append("`shapecat info` lists all warnings")
+    return f"; warnings: {'; '.join(texts)}" if texts else ""
 
 
 def by_sensor(streams: Sequence[Stream]) -> list[list[Stream]]:
