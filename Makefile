@@ -54,7 +54,7 @@ coverage: setup kernels ## run the quick tests and print the lines and branches 
 screens: ## install the packages that browser and screenshot tests need
 	@{ command -v chromedriver && ls /usr/share/vulkan/icd.d/*; } >/dev/null 2>&1 || $(call apt,$(SCREENS))
 
-kernels: setup
+kernels: setup ## compile the kernels beforehand (about a minute)
 	@$(BIN)/python -m shapecat.rehearsal
 
 fixtures: setup kernels ## remake the recordings in fixtures/ and their expected tables

@@ -1,31 +1,46 @@
 """Draw the subpackages and their imports: ``python -m tests.picture``.
 
 A subpackage is drawn in the layer that `tests.test_architecture` assigns to it. Arrows lead to the
-imported subpackages, except for imports that follow from others, and for those of the two lowest
-layers, which all subpackages use.
+imported subpackages, except for imports that follow from others, those within a layer, and those of
+the two lowest layers, which all subpackages use.
 """
 
 from collections.abc import Iterator, Mapping
 from html import escape
 from pathlib import Path
 
-from tests.test_architecture import FILES, FLOOR, STAGES, imported_rooms, room
+from tests.test_architecture import FILES, FLOOR, imported_rooms, room
 
 __all__ = ["PICTURE", "draw"]
 
 PICTURE = Path(__file__).parents[1] / "docs" / "images" / "architecture.svg"
-WIDTH, ROW, BOX_H, GAP = 980, 70, 30, 14
+WIDTH, ROW, BOX_H, GAP = 1180, 70, 30, 8
 LAYERS = {
-    7.0: "doors",
-    6.0: "many recordings",
-    5.0: "the story",
-    4.0: "results",
-    3.0: "runs",
-    2.5: "stages",
-    2.0: "inputs",
-    1.0: "shared tools",
-    0.0: "base",
+    7: "interfaces",
+    6: "many recordings",
+    5: "pipeline",
+    4: "results",
+    3: "runs",
+    2: "stages, inputs",
+    1: "shared tools",
+    0: "base",
 }
+MIDDLES = {
+    "api": 660,
+    "batch": 740,
+    "cli": 1100,
+    "evaluation": 870,
+    "models": 1000,
+    "outputs": 740,
+    "perception": 400,
+    "pipeline": 740,
+    "rehearsal": 570,
+    "runs": 740,
+}
+"""Positions of boxes with which no arrow runs behind a box; other layers are filled evenly."""
+FIRST = ("schemas", "colour", "depth_fusion")
+LAST = ("tracking", "recordings", "simulation")
+"""Boxes at the left and right end of their layers; the others are in alphabetical order."""
 HIDDEN = {"__init__", "__main__", "py"}
 _Position = tuple[float, float, float]
 
@@ -48,22 +63,24 @@ def reduced(graph: Mapping[str, set[str]]) -> dict[str, set[str]]:
     return {name: others - reachable[name] for name, others in graph.items()}
 
 
-def layer(name: str) -> float:
-    """Return the layer of a subpackage; stages do not import each other and stand apart."""
-    return FLOOR[name] + 0.5 * (name in STAGES)
-
-
 def box_positions(rooms: set[str]) -> dict[str, _Position]:
     """Return left edge, top and width of the box of each subpackage."""
     found: dict[str, _Position] = {}
     for row, level in enumerate(LAYERS):
-        names = sorted(name for name in rooms if layer(name) == level)
-        widths = [9.0 * len(name) + 16 for name in names]
-        left = 130 + (WIDTH - 140 - sum(widths) - GAP * (len(names) - 1)) / 2
+        names = sorted((name for name in rooms if FLOOR[name] == level), key=_rank)
+        widths = [7.8 * len(name) + 12 for name in names]
+        left = 120 + (WIDTH - 134 - sum(widths) - GAP * (len(names) - 1)) / 2
         for name, width in zip(names, widths, strict=True):
-            found[name] = (left, 16 + row * ROW + (ROW - BOX_H) / 2 - 6, width)
+            middle = MIDDLES.get(name, left + width / 2)
+            found[name] = (middle - width / 2, 16 + row * ROW + (ROW - BOX_H) / 2 - 6, width)
             left += width + GAP
     return found
+
+
+def _rank(name: str) -> tuple[int, str]:
+    if name in FIRST:
+        return FIRST.index(name) - len(FIRST), name
+    return (LAST.index(name) + 1 if name in LAST else 0), name
 
 
 _ARROW_HEAD = (
@@ -77,7 +94,7 @@ def draw() -> str:
     graph = imports()
     boxes = box_positions(set(graph) | {"schemas"})
     height = 16 + ROW * len(LAYERS)
-    size = f'viewBox="0 0 {WIDTH} {height}" font-family="sans-serif" font-size="15"'
+    size = f'viewBox="0 0 {WIDTH} {height}" font-family="sans-serif" font-size="14"'
     parts = [
         f'<svg xmlns="http://www.w3.org/2000/svg" {size}>',
         _ARROW_HEAD,
@@ -100,7 +117,7 @@ def _bands() -> Iterator[str]:
 
 def _arrows(graph: Mapping[str, set[str]], boxes: Mapping[str, _Position]) -> Iterator[str]:
     for name, other in sorted((n, o) for n, others in graph.items() for o in others):
-        if FLOOR[other] < 2 or layer(other) == layer(name):
+        if FLOOR[other] < 2 or FLOOR[other] == FLOOR[name]:
             continue
         (x1, y1, w1), (x2, y2, w2) = boxes[name], boxes[other]
         start, end = (x1 + w1 / 2, y1 + BOX_H), (x2 + w2 / 2, y2)
