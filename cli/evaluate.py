@@ -41,8 +41,9 @@ def evaluate(
     linear        logistic regression on shapecat's descriptor
     pnn           probabilistic neural network on shapecat's descriptor
     forest words  method of the thesis: linear classifiers on the leaves of a forest
-    D2            random forest on the distribution of point distances
-    ESF-like      random forest on distributions of distances, areas and angles
+    forest on D2  random forest on the distribution of point distances
+    forest on D2, D3, A3 (ESF-like)
+                  random forest on distributions of distances, areas and angles
 
     \b
     shapecat evaluate crops --model mine.npz --report crops.html

@@ -24,10 +24,11 @@ if TYPE_CHECKING:
 def report(*, folders: tuple[Path, ...], serve: bool, port: int | None) -> None:
     """Make a page per run to review and correct tracks in a browser.
 
-    Each DIR is a run, or a folder of runs. The page of a run is RUN/report.html; several runs also
-    get an index.html in the folder that contains them all. A page needs no network and can be
-    mailed. Download the corrected tracks.csv from it and apply the file with `shapecat annotate`.
-    With --serve the page writes corrections to RUN/tracks.csv as you make them.
+    Each DIR is a run, or a folder of runs. The page of a run is RUN/report.html; several runs, and
+    a folder of runs, also get an index.html in the folder that contains them all. A page needs no
+    network and can be mailed. Download the corrected tracks.csv from it and apply the file with
+    `shapecat annotate`. With --serve the page writes corrections to RUN/tracks.csv as you make
+    them.
 
     \b
     shapecat report results

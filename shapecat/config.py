@@ -84,11 +84,11 @@ class TrackingSettings:
     """Largest distance between a track and the centroid of its next detection; smaller for
     small objects."""
     min_hits: int = 3
-    """Number of detections that confirm a track; fewer suffice if fewer frames lie within half a
-    second of its first detection."""
+    """Number of detections that confirm a track; fewer are enough if there are fewer frames within
+    half a second of its first detection."""
     max_missed_s: float = 5.0
-    """A track ends after this time without a detection, a recently started one sooner. An object
-    that later reappears in the same place gets its old track."""
+    """A track ends after this long without a detection; new tracks end sooner. An object that later
+    reappears in the same place gets its old track."""
     fusion: Literal["mean", "product", "vote"] = "product"
     """Fusion of the posteriors of all views: `product`, `mean` or `vote`. The product is
     tempered by the number of views, so that more views alone do not raise the confidence."""

@@ -264,7 +264,7 @@ def _connect(url: str, error: type[ShapecatError]) -> tuple[Any, str]:
     try:
         from fsspec.core import url_to_fs  # noqa: PLC0415  an extra
     except ImportError as missing:
-        msg = f"{url}: URLs need fsspec: pip install 'shapecat[remote]'"
+        msg = f"{url}: URLs need fsspec: in a clone of shapecat, pip install '.[remote]'"
         raise ConfigError(msg) from missing
     try:
         # Listings are not cached, since other workers change the storage.

@@ -53,7 +53,7 @@ def open_dask(workers: int, address: str | None) -> Executor:
     try:
         from distributed import Client, LocalCluster  # noqa: PLC0415  an extra
     except ImportError as error:
-        msg = "--executor dask needs Dask: pip install 'shapecat[cluster]'"
+        msg = "--executor dask needs Dask: in a clone of shapecat, pip install '.[cluster]'"
         raise ConfigError(msg) from error
     if address is None:
         with single_threaded():

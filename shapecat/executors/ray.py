@@ -27,7 +27,7 @@ class RayExecutor(Executor):
         try:
             import ray  # noqa: PLC0415  an extra
         except ImportError as error:
-            msg = "--executor ray needs Ray: pip install 'shapecat[ray]'"
+            msg = "--executor ray needs Ray: in a clone of shapecat, pip install '.[ray]'"
             raise ConfigError(msg) from error
         self._ray = ray
         variables = dict.fromkeys(THREAD_LIMITS, "1")

@@ -40,7 +40,8 @@ def load_mesh(path: Path) -> Mesh:
     try:
         import open3d  # noqa: PLC0415  # an extra
     except ImportError as error:
-        msg = f"{path}: reading meshes needs Open3D: pip install 'shapecat[meshes]' ({error})"
+        how = "in a clone of shapecat, pip install '.[meshes]'"
+        msg = f"{path}: reading meshes needs Open3D: {how} ({error})"
         raise ConfigError(msg) from error
     read: Any = open3d.io.read_triangle_mesh(path)
     if len(read.triangles) == 0:
