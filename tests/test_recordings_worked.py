@@ -639,7 +639,7 @@ def test_description_has_times_sizes_and_uses_of_topics(tmp_path: Path) -> None:
     alone = record(tmp_path / "b.mcap", [("/points", 1, cloud(EPOCH, points))])
     assert describe_recording(alone)["topics"][0]["use"] == "points stream"
     page = (Path(__file__).parents[1] / "docs/howto-bag.md").read_text("utf-8")
-    assert "calls a *depth stream* or a *points stream*" in page
+    assert "Look for *depth stream* or *points stream* in the column `use`" in page
 
 
 def test_description_marks_depth_stream_without_calibration(tmp_path: Path) -> None:
