@@ -154,7 +154,7 @@ def test_run_page_has_right_values(*, served: bool) -> None:
         "counts": {"frames": 61, "detections": 143, "skipped": {"too few points": 5}},
         "model": {"id": "m-7", "categories": list(NAMES)},
         "warnings": ["it <was> dark"],
-        "seconds": {"perceive": 12.34, "total": 15.67},
+        "seconds": {"total": 15.67, "perceive": 12.34},
         "fixed_frame": "map",
         "up": {"source": "imu"},
         "color": {"/d": "/rgb", "/e": None},

@@ -193,7 +193,8 @@ def _timings(phases: Mapping[str, float], stages: Mapping[str, F8]) -> str:
         middle, high = np.percentile(values, [50, 95]) * 1000 if len(values) else (0.0, 0.0)
         rows.append((name, f"{middle:.1f}", f"{high:.1f}", "ms"))
     rows.append(("phase", "total", "", ""))
-    rows += [(name, f"{seconds:.1f}", "", "s") for name, seconds in phases.items()]
+    last = sorted(phases.items(), key=lambda phase: phase[0] == "total")
+    rows += [(name, f"{seconds:.1f}", "", "s") for name, seconds in last]
     lines = []
     for cells in rows:
         kind = "th" if not cells[3] else "td"
