@@ -14,6 +14,8 @@ from .options import ANY_PATH
 def scene(*, run: Path, frame: int, topic: str | None) -> None:
     """Print which object stands on which in one frame of a run.
 
+    Merged tracks are one object; deleted ones are left out.
+
     \b
     shapecat scene results/lab --frame 12
     """

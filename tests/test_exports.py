@@ -420,3 +420,15 @@ def test_scene_prints_plane_and_known_tracks(shapecat: Run, run: Path) -> None:
     assert len(found) > 4
     assert found <= known - {"1"}
     assert shapecat("scene", run, "--frame", 99).exit_code == 1
+
+
+def test_scene_follows_corrections(shapecat: Run, run: Path, tmp_path: Path) -> None:
+    """Other outputs show merged tracks as one object, and no deleted ones."""
+    folder = shutil.copytree(run, tmp_path / "run")
+    before = shapecat("scene", folder, "--frame", 5).stdout.splitlines()
+    first, second, *rest = [line.split("#")[1].split(":")[0] for line in before if "#" in line]
+    relabel(folder, {int(first): "delete", int(second): f"merge with {rest[0]}"})
+    after = shapecat("scene", folder, "--frame", 5).stdout.splitlines()
+
+    assert len(after) == len(before) - 2
+    assert sorted(line.split("#")[1].split(":")[0] for line in after if "#" in line) == sorted(rest)

@@ -21,7 +21,7 @@ from numpy.typing import ArrayLike
 from PIL import Image
 from scipy.spatial.transform import Rotation
 
-from shapecat.detection.scene_graph import Node
+from shapecat.detection.scene_graph import Node, format_tree
 from shapecat.errors import OutputError
 from shapecat.outputs.annotated_mcap import _annotations, _encoding
 from shapecat.outputs.annotation import Annotation
@@ -44,13 +44,14 @@ from shapecat.outputs.opened_run import RunFrame
 from shapecat.outputs.png import png
 from shapecat.outputs.review_paths import Paths
 from shapecat.outputs.review_scenes import choose_scenes, with_clouds
-from shapecat.outputs.scene_tree import _candidate, _described, _topic
+from shapecat.outputs.scene_tree import _as_labelled, _candidate, _described, _topic
 from shapecat.recordings.messages import Topic
 from shapecat.runs.label_meaning import TrackLabel, _slips
 from shapecat.runs.shown import ShownDetection
 from shapecat.types import (
     Box,
     Camera,
+    Candidate,
     Frame,
     ImageMasks,
     LabelledFrame,
@@ -565,27 +566,52 @@ def test_scene_node_text_has_track_size_and_flags() -> None:
     plane = Plane(np.array([0, 0, 1.0]), 0.4, np.zeros((3, 3)), 0.567, 0.734)
     found = [
         _candidate(row(**changes), [plane])
-        for changes in (
-            {},
-            {"touches_border": True, "occluded": True},
-            {"indices": [1]},
-            {"indices": [], "occluded": True},
-        )
+        for changes in ({}, {"touches_border": True, "occluded": True}, {"occluded": True})
     ]
     scene = Scene(np.array([0, 0, 1.0]), (plane,), tuple(found))
     item: Any = SimpleNamespace(category="cup", track=6, full=None, box=found[0].box)
-    texts = [_described(scene, Node("object", k), {7: item}) for k in range(4)]
+    texts = [_described(scene, Node("object", k), {0: item, 1: item}) for k in range(3)]
     item.full = replace(found[0].box, size=np.array([0.14, 0.08, 0.21]))
-    texts.append(_described(scene, Node("object", 0), {7: item}))
+    texts.append(_described(scene, Node("object", 0), {0: item}))
 
     assert _described(scene, Node("plane", 0), {}) == "plane 0: 0.73 m high, 0.57 m2"
     assert texts == [
         "cup #6: 12 x 7 x 20 cm",
         "cup #6: 12 x 7 x 20 cm, cut by the border, occluded",
-        "object in no track: 12 x 7 x 20 cm",
         "object in no track: 12 x 7 x 20 cm, occluded",
         "cup #6: 14 x 8 x 21 cm",  # of the whole object, where it is known
     ]
+
+
+def test_scene_shows_merged_objects_once_and_no_deleted_ones() -> None:
+    """A mug found in three parts stands on a deleted plate, and a ball on the upper part."""
+    plane = Plane(np.array([0, 0, 1.0]), 0.0, np.zeros((3, 3)), 0.5, 0.7)
+    heights = {"rim": 0.12, "ball": 0.2, "plate": 0.01, "handle": 0.09, "body": 0.05, "can": 0.3}
+    number = {name: k for k, name in enumerate(heights)}
+    below = {"rim": "body", "ball": "rim", "handle": "body", "body": "plate", "can": "plate"}
+    candidates = [
+        Candidate(
+            np.array([k]), box_at((0, 0, height), (0.01, 0.01, 0.01)), 0,
+            number.get(below.get(name, "")), 0.1 if name in below else 0.0, False, name == "body",
+        )
+        for k, (name, height) in enumerate(heights.items())
+    ]  # fmt: skip
+    scene = Scene(np.array([0, 0, 1.0]), (plane,), tuple(candidates))
+    box = box_at((0, 0, 0.085), (0.08, 0.1, 0.14))
+    mug = labelled_object(8, [0, 3, 4], box=box, category="mug", detections=(0, 3, 4))
+    ball = labelled_object(1, [1], category="ball", detections=(1,))
+    mug = replace(mug, occluded=True)
+
+    changed, objects = _as_labelled(scene, [mug, ball], {number["plate"]})
+    lines = format_tree(changed, lambda node: _described(changed, node, objects)).splitlines()
+
+    assert [line.partition(":")[0] for line in lines] == [
+        "plane 0",
+        "  mug #8",
+        "    ball #1",
+        "  object in no track",
+    ]
+    assert lines[1].endswith(": 8 x 10 x 14 cm, occluded")
 
 
 # ---- image boxes and labels

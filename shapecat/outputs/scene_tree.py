@@ -1,6 +1,7 @@
 """The objects of a frame and what they stand on, as a text tree, from the tables of a run."""
 
-from collections.abc import Sequence
+from collections.abc import Collection, Mapping, Sequence
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -8,7 +9,7 @@ import pyarrow as pa
 
 from shapecat.detection.scene_graph import Node, format_tree
 from shapecat.errors import OutputError
-from shapecat.runs.finished import FinishedRun, read_finished
+from shapecat.runs.finished import read_finished
 from shapecat.runs.labels import plane_of
 from shapecat.runs.tables import keys_of, read_row_groups
 from shapecat.types import Box, Candidate, LabelledObject, Plane, Scene
@@ -18,6 +19,8 @@ __all__ = ["describe_scene", "read_scene"]
 
 def describe_scene(folder: Path, frame: int, *, topic: str | None = None) -> str:
     """Return the tree of planes and objects in a frame, indented, one per line.
+
+    Objects are those of the other outputs: merged tracks are one object, deleted ones are left out.
 
     Parameters
     ----------
@@ -30,8 +33,11 @@ def describe_scene(folder: Path, frame: int, *, topic: str | None = None) -> str
     """
     finished = read_finished(folder)
     topic = _topic(folder, frame, topic)
-    objects = _objects(finished, topic, frame)
+    labelled = next(f for f in finished.frames() if (f.topic, f.index) == (topic, frame))
+    rows = _rows(folder, "tracks", topic, frame, ["topic", "frame", "detection", "track"])
+    deleted = {row["detection"] for row in rows if row["track"] not in finished.labels}
     scene = read_scene(folder, topic, frame)
+    scene, objects = _as_labelled(scene, labelled.objects, deleted)
     return format_tree(scene, lambda node: _described(scene, node, objects))
 
 
@@ -95,19 +101,61 @@ def _topic(folder: Path, frame: int, topic: str | None) -> str:
     raise OutputError(msg)
 
 
-def _objects(finished: FinishedRun, topic: str, frame: int) -> dict[int, LabelledObject]:
-    """Return the object of each pixel or point that belongs to one in a frame."""
-    labelled = finished.frames()
-    shown = next(item for item in labelled if (item.topic, item.index) == (topic, frame))
-    return {int(index): item for item in shown.objects for index in item.indices}
+def _as_labelled(
+    scene: Scene, objects: Sequence[LabelledObject], deleted: Collection[int]
+) -> tuple[Scene, dict[int, LabelledObject]]:
+    """Join the parts of merged objects, and leave deleted candidates out.
+
+    What stood on a deleted object stands on the surface below it. A merged object stands where its
+    lowest part stands.
+
+    Parameters
+    ----------
+    deleted : indices of the candidates whose track was deleted.
+
+    Returns
+    -------
+    The changed scene, and the object of each of its candidates that belongs to one, by index.
+    """
+    owner = {part: item for item in objects for part in item.detections}
+    parts = {n: owner[n].detections if n in owner else (n,) for n in range(len(scene.candidates))}
+    kept = [n for n, own in parts.items() if n == own[0] and n not in deleted]
+    index = {part: k for k, n in enumerate(kept) for part in parts[n]}
+
+    def bottom(n: int) -> float:
+        box = scene.candidates[n].box
+        return float(scene.up @ box.center - box.size[2] / 2)
+
+    def changed(n: int) -> Candidate:
+        base = scene.candidates[min(parts[n], key=bottom)]
+        while (below := base.on_candidate) is not None and index.get(below, index[n]) == index[n]:
+            base = scene.candidates[below]
+        found = replace(
+            scene.candidates[n],
+            plane=base.plane,
+            on_candidate=None if below is None else index[below],
+            support_m=base.support_m,
+        )
+        item = owner.get(n)
+        if item is None:
+            return found
+        return replace(
+            found,
+            indices=item.indices,
+            box=item.box,
+            touches_border=item.touches_border,
+            occluded=item.occluded,
+        )
+
+    candidates = tuple(changed(n) for n in kept)
+    return replace(scene, candidates=candidates), {index[part]: owner[part] for part in owner}
 
 
-def _described(scene: Scene, node: Node, objects: dict[int, LabelledObject]) -> str:
+def _described(scene: Scene, node: Node, objects: Mapping[int, LabelledObject]) -> str:
     if node.kind == "plane":
         plane = scene.planes[node.index]
         return f"plane {node.index}: {plane.height_m:.2f} m high, {plane.area_m2:.2f} m2"
-    item = scene.candidates[node.index]
-    shown = objects.get(int(item.indices[0])) if item.indices.size else None
+    item, shown = scene.candidates[node.index], objects.get(node.index)
     name = "object in no track" if shown is None else f"{shown.category} #{shown.track}"
     box = item.box if shown is None else shown.full or shown.box
     flags = [
