@@ -62,6 +62,12 @@ LAYOUT = {
         5: field("step", FIXED),
         6: field("data", RAW),
     },
+    "foxglove.CompressedImage": {
+        1: TIME,
+        4: field("frame_id", STRING),
+        2: field("data", RAW),
+        3: field("format", STRING),
+    },
     "foxglove.CameraCalibration": {
         1: TIME,
         9: field("frame_id", STRING),

@@ -18,6 +18,7 @@ from shapecat.recordings import choose_streams, frames, open_recording, read_tra
 from shapecat.recordings.decoding import LIBRARY_ERRORS
 from shapecat.recordings.protobuf import message_decoder
 from shapecat.types import Camera, Frame, ShownFrame
+from tests.depth_encodings import png
 from tests.foxglove_messages import (
     EPOCH,
     SECOND,
@@ -134,16 +135,21 @@ uint8 type
 
 
 @both_encodings
-def test_depth_image_is_read(tmp_path: Path, encoding: str) -> None:
+@pytest.mark.parametrize("compressed", [False, True])
+def test_depth_image_is_read(tmp_path: Path, encoding: str, *, compressed: bool) -> None:
+    """Compressed depth was called a depth stream, and then none of its images was read."""
     depth = np.arange(12, dtype="<u2").reshape(3, 4) * 100
     k = [60.0, 0.0, 1.5, 0.0, 61.0, 1.0, 0.0, 0.0, 1.0]
     size = {"width": 4, "height": 3}
     info = {**size, "distortion_model": "", "D": [], "K": k, "R": [], "P": []}
     image = {**size, "encoding": "16UC1", "step": 8, "data": content(depth.tobytes(), encoding)}
+    packed = {"format": "16UC1; compressedDepth", "data": content(bytes(12) + png(depth), encoding)}
     items = [
         ("/depth/calibration", "foxglove.CameraCalibration", info),
         ("/depth/image", "foxglove.RawImage", image),
     ]
+    if compressed:
+        items[1] = ("/depth/image", "foxglove.CompressedImage", packed)
 
     (frame,) = read(write(tmp_path / "a.mcap", encoding, items))
 

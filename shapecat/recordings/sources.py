@@ -12,6 +12,7 @@ from shapecat.arrays import F4
 from shapecat.geometry import transform
 from shapecat.recordings.compressed_depth import depth_of_compressed
 from shapecat.recordings.depth_image import depth_of_image
+from shapecat.recordings.foxglove import ros_counterpart
 from shapecat.recordings.lens import Lens
 from shapecat.recordings.messages import MALFORMED, Message, MessageError
 from shapecat.recordings.pinhole import (
@@ -190,7 +191,7 @@ class DepthSource(Source):
             msg = "depth image without camera info"
             raise MessageError(msg)
         camera, distorted = camera_of_info(self._info, rectified=self.rectified)
-        compressed = self.stream.type == COMPRESSED
+        compressed = ros_counterpart(self.stream.type) == COMPRESSED
         depth = depth_of_compressed(image) if compressed else depth_of_image(image, self.units)
         if depth.shape != (camera.height, camera.width):
             shape = f"{depth.shape[1]} x {depth.shape[0]}"
