@@ -1,6 +1,7 @@
 """Tests of frames: every layout of a cloud or depth image gives the same, correct coordinates."""
 
 from collections import Counter
+from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -236,7 +237,7 @@ def test_cloud_layout_does_not_change_coordinates(data: st.DataObject) -> None:
         ({"width": 2**32 - 1, "height": 2**32 - 1}, "needs"),
         ({"point_step": 4}, "outside"),
         ({"row_step": 1}, "needs"),
-        ({"fields": []}, "without a field x"),
+        ({"fields": []}, "without fields x, y, z of a known type; fields: none"),
     ],
 )
 def test_inconsistent_cloud_is_refused_before_allocation(
@@ -244,6 +245,25 @@ def test_inconsistent_cloud_is_refused_before_allocation(
 ) -> None:
     with pytest.raises(MessageError, match=reason):
         cloud_points(cloud(0, np.zeros((2, 3, 3), np.float32), **changes))
+
+
+@pytest.mark.parametrize(
+    ("names", "missing"), [("XYZ", "x, y, z"), (("xyz", "y"), "x, z"), (("x", "y", "Z"), "z")]
+)
+def test_cloud_without_coordinates_names_missing_fields(
+    tmp_path: Path, names: Sequence[str], missing: str
+) -> None:
+    """The names of the other fields alone, "X, Y, Z", would look right."""
+    points = np.random.default_rng(0).normal(1, 0.1, (1, 50, 3)).astype(np.float32)
+    message = cloud(EPOCH, points)
+    for field, name in zip(message.fields, names, strict=False):
+        field.name = name
+    message.fields = message.fields[: len(names)]
+
+    _, skipped, _ = read(write(tmp_path / "a.mcap", [("/points", 0, message)]))
+
+    known = ", ".join(names)
+    assert skipped == {f"cloud without fields {missing} of a known type; fields: {known}": 1}
 
 
 def test_invalid_messages_are_skipped_and_counted(tmp_path: Path) -> None:
@@ -437,6 +457,31 @@ def test_slight_distortion_is_ignored_and_strong_is_corrected(
     u = (x * radial + 2 * p1 * x * y + p2 * (r + 2 * x * x)) * CAMERA.fx + CAMERA.cx
     v = (y * radial + p1 * (r + 2 * y * y) + 2 * p2 * x * y) * CAMERA.fy + CAMERA.cy
     assert (u, v) == pytest.approx((7, 5), abs=0.01)
+
+
+@pytest.mark.parametrize(
+    ("model", "coefficients", "problem"),
+    [
+        ("plumb_bob", (np.nan, 0, 0, 0, 0), "lens distortion that is not finite is ignored"),
+        (
+            "plumb_bob",
+            (-3.0, 0, 0, 0, 0),
+            "distortion 'plumb_bob' that cannot be inverted is ignored",
+        ),
+        ("mirror", (0.1, 0, 0, 0, 0), "unknown lens distortion 'mirror' is ignored"),
+    ],
+)
+def test_ignored_distortion_is_explained(
+    tmp_path: Path, model: str, coefficients: tuple[float, ...], problem: str
+) -> None:
+    calibration = info(EPOCH, d=coefficients)
+    calibration.distortion_model = model
+    depth = image(EPOCH, np.full((48, 64), 1000, np.uint16))
+    items = [("/depth/camera_info", 0, calibration), ("/depth/image", 1, depth)]
+
+    _, _, warnings = read(write(tmp_path / "a.mcap", items))
+
+    assert [problem in text for text in warnings] == [True]
 
 
 def test_new_distortion_changes_rays(tmp_path: Path) -> None:

@@ -1,11 +1,12 @@
 """Depth images from a lens with distortion."""
 
+from collections.abc import Sequence
 from typing import Any
 
 import numpy as np
 
 from shapecat.arrays import F4, F8
-from shapecat.cameras.lenses import undistorted_rays
+from shapecat.cameras.lenses import LENS_MODELS, undistorted_rays
 from shapecat.recordings.pinhole import PinholeFit, distortion_of, fit_pinhole
 from shapecat.recordings.pointcloud2 import unorganized
 from shapecat.recordings.recording import Recording
@@ -34,9 +35,10 @@ class Lens:
         depth : (h, w) metres.
         """
         model = str(info.distortion_model)
-        self._calibrate((camera, model, distortion_of(info)), depth)
+        coefficients = distortion_of(info)
+        self._calibrate((camera, model, coefficients), depth)
         if self._rays is None:
-            self._warn(f"unknown lens distortion {model!r} is ignored")
+            self._warn(f"{_problem(model, coefficients)} is ignored")
             return {"depth": depth, "camera": camera}
         if self._fit is not None:
             return {"depth": depth, "camera": self._fit.camera}
@@ -53,6 +55,15 @@ class Lens:
 
     def _warn(self, text: str) -> None:
         self._recording.warn(f"{self._topic}: {text}")
+
+
+def _problem(model: str, coefficients: Sequence[float]) -> str:
+    """Describe a lens for which `undistorted_rays` returns None."""
+    if model not in LENS_MODELS:
+        return f"unknown lens distortion {model!r}"
+    if not np.isfinite(coefficients).all():
+        return "lens distortion that is not finite"
+    return f"lens distortion {model!r} that cannot be inverted"
 
 
 def _points_along(rays: F8, depth: F4) -> F4:

@@ -51,13 +51,15 @@ def _axes(message: Any, step: int) -> list[tuple[int, str]]:
     """Return byte offset and NumPy type of x, y and z."""
     order = ">" if message.is_bigendian else "<"
     fields = {field.name: field for field in message.fields}
+    missing = [n for n in "xyz" if n not in fields or int(fields[n].datatype) not in _FORMATS]
+    if missing:
+        names = ", ".join(fields)[:80] or "none"
+        msg = f"cloud without fields {', '.join(missing)} of a known type; fields: {names}"
+        raise MessageError(msg)
     axes = []
     for name in "xyz":
-        field = fields.get(name)
-        kind = _FORMATS.get(int(field.datatype)) if field is not None else None
-        if field is None or kind is None:
-            msg = f"cloud without a field {name} of a known type; fields: {', '.join(fields)[:80]}"
-            raise MessageError(msg)
+        field = fields[name]
+        kind = _FORMATS[int(field.datatype)]
         if int(field.offset) + np.dtype(kind).itemsize > step:
             msg = f"field {name} at byte {field.offset} lies outside the point of {step} bytes"
             raise MessageError(msg)

@@ -33,12 +33,12 @@ __all__ = ["SOURCES", "DepthSource", "PointsSource", "Source"]
 
 
 @contextmanager
-def _counting(skipped: Counter[str]) -> Iterator[None]:
-    """Count unreadable messages by reason instead of raising."""
+def _counting(skipped: Counter[str], topic: str) -> Iterator[None]:
+    """Count unreadable messages of a topic by reason instead of raising."""
     try:
         yield
     except MessageError as error:
-        skipped[str(error).split(": ", 1)[-1][:160]] += 1
+        skipped[str(error).removeprefix(f"{topic}: ")[:160]] += 1
     except MALFORMED:
         skipped["message does not match its type"] += 1
 
@@ -92,7 +92,7 @@ class PointsSource(Source):
     def read(self, message: Message, skipped: Counter[str]) -> Iterator[Frame]:
         """Yield the frame of a cloud, or none if it is unreadable."""
         frame = None
-        with _counting(skipped):
+        with _counting(skipped, self.stream.topic):
             cloud = self.recording.decode(message)
             points = _placed(cloud_points(cloud), getattr(cloud, "pose", None))
             frame = self.frame(message, self.index - 1, cloud.header, self._content(points))
@@ -156,7 +156,7 @@ class DepthSource(Source):
     def read(self, message: Message, skipped: Counter[str]) -> Iterator[Frame]:
         """Hold an image back until its calibration arrives; yield the frame of the previous one."""
         yield from self.finish(skipped)
-        with _counting(skipped):
+        with _counting(skipped, self.stream.topic):
             image = self.recording.decode(message)
             stamp_ns(image.header)
             self._waiting = (message, self.index - 1, image)
@@ -174,7 +174,7 @@ class DepthSource(Source):
             return
         (message, index, image), self._waiting = self._waiting, None
         frame = None
-        with _counting(skipped):
+        with _counting(skipped, self.stream.topic):
             frame = self.frame(message, index, image.header, self._content(image))
         if frame is not None:
             yield frame
