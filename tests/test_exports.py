@@ -410,6 +410,17 @@ def test_export_command_reports_views_and_errors(shapecat: Run, run: Path, tmp_p
     assert "no run.json" in missing.output
 
 
+@pytest.mark.parametrize("kind", ["crops", "kitti", "labelcloud", "point-labels", "coco"])
+def test_nothing_is_exported_into_run(shapecat: Run, run: Path, kind: str) -> None:
+    """Categories would become folders among the tables of the run."""
+    before = sorted(path.name for path in run.iterdir())
+    result = shapecat("export", run, "--format", kind, "--out", run)
+
+    assert result.exit_code == 1
+    assert "choose another --out" in result.stderr
+    assert sorted(path.name for path in run.iterdir()) == before
+
+
 def test_scene_prints_plane_and_known_tracks(shapecat: Run, run: Path) -> None:
     result = shapecat("scene", run, "--frame", 5)
 

@@ -88,12 +88,15 @@ def export_run(
     ------
     ValueError : the format is unknown.
     OutputError : the folder is not a finished run, the content of the recording has changed, or
-        ``out`` is not writable or holds something else.
+        ``out`` is not writable, is a run, or holds something else.
     RecordingError : the recording is missing or unreadable.
     """
     if format not in FORMATS:
         msg = f"no export format {format!r}; known: {', '.join(FORMATS)}"
         raise ValueError(msg)
+    if (out / "run.json").exists():
+        msg = f"{out}: is a run; choose another --out"
+        raise OutputError(msg)
     finished = replace(read_finished(folder), common=tuple(categories))
     total = -(-int(finished.run["counts"]["frames"]) // every)
     with open_source(finished.run, recording) as source:
