@@ -21,7 +21,7 @@ import pyarrow.parquet as pq
 import pytest
 from click.testing import Result
 
-from shapecat.outputs.report.serving import serve_reports
+from shapecat.outputs.report.serving import _is_here, serve_reports
 from shapecat.outputs.report.writing import Reports, RunReport, read_report
 from shapecat.runs.corrections import adopt_labels, read_labels
 from shapecat.runs.track_table import read_track_table
@@ -293,13 +293,32 @@ def test_outsiders_are_refused(site: tuple[Path, str, str], method: str, strange
 def test_owner_is_served_under_both_host_names(site: tuple[Path, str, str]) -> None:
     _, address, labels = site
     port = urlsplit(address).port
-    for host in (f"127.0.0.1:{port}", f"localhost:{port}", "localhost:9000"):  # through a tunnel
+    for host in (
+        f"127.0.0.1:{port}",
+        f"localhost:{port}",
+        "localhost:9000",
+        "localhost",
+    ):  # tunnels
         for origin in ({}, {"Origin": f"http://{host}"}):
             assert ask(address, headers={"Host": host, **origin})[0] == 200
     assert json.loads(ask(address, path=labels)[1])["labels"]
     assert ask(address, path=labels + "x")[0] == 404
     assert ask(address, path=labels.replace("labels", "tracks.csv"))[0] == 404
     assert ask(address, path=labels.replace("labels", "../../run.json"))[0] == 404
+
+
+@pytest.mark.parametrize(
+    ("host", "here"),
+    [
+        *((host, True) for host in ("127.0.0.1", "127.0.0.1:80", "localhost", "localhost:8080")),
+        *((host, True) for host in ("[::1]", "[::1]:8080")),
+        *((host, False) for host in ("", ":80", "127.0.0.2", "localhost.evil.example", "[::2]:80")),
+        *((host, False) for host in ("::1", "evil.example", "evil.example:127.0.0.1")),
+    ],
+)
+def test_host_may_have_no_port(host: str, here: bool) -> None:
+    """Browsers omit port 80, and every page of a server on this port was refused."""
+    assert _is_here(host) == here
 
 
 def test_server_listens_on_one_address_only(site: tuple[Path, str, str]) -> None:

@@ -7,6 +7,7 @@ foreign domain name that resolves to this machine (DNS rebinding) fails the chec
 
 import json
 import logging
+import re
 import secrets
 import threading
 from collections.abc import Iterator
@@ -27,7 +28,7 @@ from shapecat.runs.track_table import read_track_table
 __all__ = ["serve_reports"]
 
 _HOST = "127.0.0.1"
-_NAMES = frozenset({_HOST, "localhost"})
+_NAMES = frozenset({_HOST, "[::1]", "localhost"})
 _LABELS = "labels"
 """Name of the resource beside a page that holds the labels of its run."""
 _LARGEST_BODY = 1 << 16
@@ -118,6 +119,11 @@ def _correction(body: bytes) -> tuple[int, str, str] | None:
     return (track, " ".join(label.split()), seen) if right else None
 
 
+def _is_here(host: str) -> bool:
+    """Return whether a host names this machine, with or without a port: browsers omit port 80."""
+    return re.sub(r":\d+$", "", host) in _NAMES
+
+
 class _Server(ThreadingTCPServer):
     """A server that, unlike `http.server.HTTPServer`, does not look up its own name."""
 
@@ -165,7 +171,7 @@ class _Handler(BaseHTTPRequestHandler):
     def _from_here(self) -> bool:
         """Return whether a request names this machine and does not come from a foreign page."""
         host, origin = self.headers.get("Host", ""), self.headers.get("Origin")
-        return host.rpartition(":")[0] in _NAMES and origin in {None, f"http://{host}"}
+        return _is_here(host) and origin in {None, f"http://{host}"}
 
     def _send(self, answer: _Answer) -> None:
         text = answer.content if isinstance(answer.content, str) else json.dumps(answer.content)
