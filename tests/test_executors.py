@@ -217,7 +217,7 @@ def test_missing_or_invalid_executors_are_refused(monkeypatch: pytest.MonkeyPatc
     monkeypatch.setitem(sys.modules, "distributed", None)
     with pytest.raises(ConfigError, match=r"\.\[ray\]"):
         open_executor("ray", workers=1)
-    with pytest.raises(ConfigError, match=r"shapecat\[cluster\]"):
+    with pytest.raises(ConfigError, match=r"\.\[cluster\]"):
         open_executor("dask", workers=1)
     with pytest.raises(ConfigError, match="--executor"):
         open_executor("local", workers=1, address="tcp://127.0.0.1:1")
