@@ -244,11 +244,11 @@ def test_line_deleted_from_own_table_is_refused(run: Path) -> None:
     """The object would silently leave all outputs, with its label."""
     (run / "tracks.csv").write_text(labelled(t4="bowl"))
     adopt_labels(run / "tracks.csv", run)
-    header, _, *others = labelled(t4="bowl", t2="box").splitlines(keepends=True)
+    header, _, _, *others = labelled(t4="bowl", t1="box").splitlines(keepends=True)
     (run / "tracks.csv").write_text(header + "".join(others))
     (run.parent / "mine.csv").write_text(labelled(t2="plate"))
 
-    missing = r"line 2 of tracks\.original\.csv: track 4 is missing here"
+    missing = r"  missing: #4, #2; restore the lines from tracks\.original\.csv"
     with pytest.raises(OutputError, match=missing):
         read_labels(run / "tracks.csv")
     for corrected in (run / "tracks.csv", run.parent / "mine.csv"):
@@ -257,6 +257,14 @@ def test_line_deleted_from_own_table_is_refused(run: Path) -> None:
     with pytest.raises(OutputError, match=missing):
         relabel(run, {2: "plate"})
     assert (run / "tracks.csv").read_text() == header + "".join(others)
+
+
+def test_error_lists_few_of_many_missing_tracks(run: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("shapecat.runs.corrections._LISTED", 2)
+    (run / "tracks.csv").write_text(HEADER)
+
+    with pytest.raises(OutputError, match="missing: #4, #2 and 2 more; restore"):
+        read_labels(run / "tracks.csv")
 
 
 @pytest.mark.parametrize("edited", ["cupp", "", "../../evil"])

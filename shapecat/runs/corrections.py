@@ -4,6 +4,7 @@ The table may have passed through a spreadsheet: separators, quotes, line ends, 
 columns and numbers such as ``1.0`` do not matter.
 """
 
+import re
 from collections.abc import Iterable, Mapping, Sequence
 from contextlib import suppress
 from dataclasses import replace
@@ -39,6 +40,8 @@ __all__ = [
 ]
 
 PREVIOUS = "tracks.previous.csv"
+_LISTED = 10
+"""Maximum number of missing tracks that an error lists."""
 
 
 def read_labels(path: Path, categories: Iterable[str] = ()) -> dict[int, TrackLabel]:
@@ -74,12 +77,14 @@ def _read_own(path: Path) -> tuple[TrackTable, list[str]]:
         return table, list(table.problems)
     own = read_track_table(path.with_name(ORIGINAL))
     given = {row.track: row for row in table.rows}
-    missing = [
-        f"line {row.line} of {ORIGINAL}: track {row.track} is missing here; restore its line, or "
-        f"write `{DELETE}` in its column label to remove the object"
-        for row in own.rows
-        if row.track not in given
-    ]
+    missing = [f"#{row.track}" for row in own.rows if row.track not in given]
+    problems = [*table.problems, *_foreign(table, own)]
+    if missing:
+        more = f" and {len(missing) - _LISTED} more" if len(missing) > _LISTED else ""
+        problems.append(
+            f"missing: {', '.join(missing[:_LISTED])}{more}; restore the lines from {ORIGINAL}, or "
+            f"write `{DELETE}` in the column label to remove objects"
+        )
     rows = tuple(
         replace(row, cells={**given[row.track].cells, **row.cells})
         for row in own.rows
@@ -87,7 +92,7 @@ def _read_own(path: Path) -> tuple[TrackTable, list[str]]:
     )
     columns = tuple(dict.fromkeys((*own.columns, *table.columns)))
     restored = _relabelled(TrackTable(columns, rows, ()), table.rows)
-    return restored, [*table.problems, *_foreign(table, own), *missing]
+    return restored, problems
 
 
 def _foreign(table: TrackTable, own: TrackTable) -> list[str]:
@@ -298,9 +303,15 @@ def _relabelled(base: TrackTable, rows: Iterable[TrackRow]) -> TrackTable:
 
 def _refuse(path: Path, problems: Sequence[str]) -> None:
     if problems:
-        listed = "\n  ".join(sorted(problems, key=lambda text: int(text.split()[1].rstrip(":"))))
+        listed = "\n  ".join(sorted(problems, key=_line_of))
         msg = f"{path}: nothing was written:\n  {listed}"
         raise OutputError(msg)
+
+
+def _line_of(problem: str) -> int:
+    """Return the number of the line that a problem names; 0 if it names none."""
+    line = re.match(r"line (\d+)", problem)
+    return int(line[1]) if line else 0
 
 
 def _one_frame(folder: Path) -> bool:
