@@ -9,7 +9,7 @@ from typing import Any
 import click
 
 
-class _Path(click.Path):
+class _NonEmptyPath(click.Path):
     """A path that is not empty: an unset variable of a shell must not mean the current folder."""
 
     def convert(self, value: Any, param: click.Parameter | None, ctx: click.Context | None) -> Any:
@@ -18,8 +18,8 @@ class _Path(click.Path):
         return super().convert(value, param, ctx)
 
 
-ANY_PATH = _Path(path_type=Path)
-PATH_OR_URL = _Path(path_type=str, readable=False)
+ANY_PATH = _NonEmptyPath(path_type=Path)
+PATH_OR_URL = _NonEmptyPath(path_type=str, readable=False)
 
 
 class _Seconds(click.FloatRange):

@@ -92,7 +92,7 @@ def array(shape: str, dtype: str, **options: Any) -> Any:
     return field(metadata={"shape": shape, "dtype": dtype}, **options)
 
 
-class _Short(reprlib.Repr):
+class _ShortRepr(reprlib.Repr):
     """Text that fits a console: type and shape of arrays, the first elements of collections."""
 
     def __init__(self) -> None:
@@ -104,7 +104,7 @@ class _Short(reprlib.Repr):
         return f"{value.dtype} {value.shape}"
 
 
-_short = _Short()
+_short_repr = _ShortRepr()
 
 
 @dataclass_transform(frozen_default=True, eq_default=False, field_specifiers=(array, field))
@@ -143,7 +143,7 @@ class Record:
                 object.__setattr__(self, name, frozen)
 
     def __repr__(self) -> str:
-        values = (f"{name}={_short.repr(value)}" for name, value in vars(self).items())
+        values = (f"{name}={_short_repr.repr(value)}" for name, value in vars(self).items())
         return f"{type(self).__name__}({', '.join(values)})"
 
     def __setstate__(self, state: dict[str, Any]) -> None:

@@ -44,7 +44,7 @@ from shapecat.outputs.opened_run import RunFrame
 from shapecat.outputs.png import png
 from shapecat.outputs.review_paths import Paths
 from shapecat.outputs.review_scenes import choose_scenes, with_clouds
-from shapecat.outputs.scene_tree import _as_labelled, _candidate, _described, _topic
+from shapecat.outputs.scene_tree import _apply_labels, _candidate, _described, _topic
 from shapecat.recordings.messages import Topic
 from shapecat.runs.label_meaning import TrackLabel, _slips
 from shapecat.runs.shown import ShownDetection
@@ -602,7 +602,7 @@ def test_scene_shows_merged_objects_once_and_no_deleted_ones() -> None:
     ball = labelled_object(1, [1], category="ball", detections=(1,))
     mug = replace(mug, occluded=True)
 
-    changed, objects = _as_labelled(scene, [mug, ball], {number["plate"]})
+    changed, objects = _apply_labels(scene, [mug, ball], {number["plate"]})
     lines = format_tree(changed, lambda node: _described(changed, node, objects)).splitlines()
 
     assert [line.partition(":")[0] for line in lines] == [

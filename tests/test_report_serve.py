@@ -21,7 +21,7 @@ import pyarrow.parquet as pq
 import pytest
 from click.testing import Result
 
-from shapecat.outputs.report.serving import _is_here, serve_reports
+from shapecat.outputs.report.serving import _names_this_machine, serve_reports
 from shapecat.outputs.report.writing import Reports, RunReport, read_report
 from shapecat.runs.corrections import adopt_labels, read_labels
 from shapecat.runs.track_table import read_track_table
@@ -318,7 +318,7 @@ def test_owner_is_served_under_both_host_names(site: tuple[Path, str, str]) -> N
 )
 def test_host_may_have_no_port(host: str, here: bool) -> None:
     """Browsers omit port 80, and every page of a server on this port was refused."""
-    assert _is_here(host) == here
+    assert _names_this_machine(host) == here
 
 
 def test_server_listens_on_one_address_only(site: tuple[Path, str, str]) -> None:

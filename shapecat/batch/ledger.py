@@ -50,18 +50,18 @@ class Ledger:
         while some := list(islice(new, _LINES)):
             self._write(some)
 
-    def _last(self, folder: str) -> Entry | None:
+    def _last_entry(self, folder: str) -> Entry | None:
         return None if self._manifest is None else self._manifest.entries.get(folder)
 
     def _has(self, entry: Entry, state: State) -> bool:
         """Return whether the manifest has the same work in this state."""
-        known = self._last(entry.folder)
+        known = self._last_entry(entry.folder)
         return known is not None and known.state == state and known.same_work(entry)
 
     def known(self, task: Task) -> Outcome:
         """Return the outcome of a task that was complete before."""
         job = task.job
-        entry = self._last(task.name)
+        entry = self._last_entry(task.name)
         if entry is not None and entry.tracks is not None and entry.frames is not None:
             counts = {"frames": entry.frames, "tracks": entry.tracks}
             summary = Summary(

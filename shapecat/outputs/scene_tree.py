@@ -37,7 +37,7 @@ def describe_scene(folder: Path, frame: int, *, topic: str | None = None) -> str
     rows = _rows(folder, "tracks", topic, frame, ["topic", "frame", "detection", "track"])
     deleted = {row["detection"] for row in rows if row["track"] not in finished.labels}
     scene = read_scene(folder, topic, frame)
-    scene, objects = _as_labelled(scene, labelled.objects, deleted)
+    scene, objects = _apply_labels(scene, labelled.objects, deleted)
     return format_tree(scene, lambda node: _described(scene, node, objects))
 
 
@@ -101,7 +101,7 @@ def _topic(folder: Path, frame: int, topic: str | None) -> str:
     raise OutputError(msg)
 
 
-def _as_labelled(
+def _apply_labels(
     scene: Scene, objects: Sequence[LabelledObject], deleted: Collection[int]
 ) -> tuple[Scene, dict[int, LabelledObject]]:
     """Join the parts of merged objects, and leave deleted candidates out.
@@ -123,10 +123,12 @@ def _as_labelled(
     index = {part: k for k, n in enumerate(kept) for part in parts[n]}
 
     def bottom(n: int) -> float:
+        """Return the height of the lower end of a candidate along up, metres."""
         box = scene.candidates[n].box
         return float(scene.up @ box.center - box.size[2] / 2)
 
     def changed(n: int) -> Candidate:
+        """Return a kept candidate with the extent of its object, on what lies below all parts."""
         base = scene.candidates[min(parts[n], key=bottom)]
         while (below := base.on_candidate) is not None and index.get(below, index[n]) == index[n]:
             base = scene.candidates[below]

@@ -38,7 +38,7 @@ class Lens:
         coefficients = distortion_of(info)
         self._calibrate((camera, model, coefficients), depth)
         if self._rays is None:
-            self._warn(f"{_problem(model, coefficients)} is ignored")
+            self._warn(f"{_describe_problem(model, coefficients)} is ignored")
             return {"depth": depth, "camera": camera}
         if self._fit is not None:
             return {"depth": depth, "camera": self._fit.camera}
@@ -57,7 +57,7 @@ class Lens:
         self._recording.warn(f"{self._topic}: {text}")
 
 
-def _problem(model: str, coefficients: Sequence[float]) -> str:
+def _describe_problem(model: str, coefficients: Sequence[float]) -> str:
     """Describe a lens for which `undistorted_rays` returns None."""
     if model not in LENS_MODELS:
         return f"unknown lens distortion {model!r}"

@@ -114,7 +114,7 @@ def _wanted(
     for name in dict.fromkeys(wanted):
         stream = by_topic.get(name.strip("/"))
         if stream is None:
-            raise NoStreamError(_why_not(recording, streams, name))
+            raise NoStreamError(_why_unusable(recording, streams, name))
         if not stream.usable:
             msg = f"{recording.path}: no sensor_msgs/CameraInfo for the depth images on {name}"
             raise NoStreamError(msg)
@@ -122,7 +122,8 @@ def _wanted(
     return tuple(chosen)
 
 
-def _why_not(recording: Recording, streams: tuple[Stream, ...], name: str) -> str:
+def _why_unusable(recording: Recording, streams: tuple[Stream, ...], name: str) -> str:
+    """Return the error for a wanted topic that is missing or holds no depth."""
     known = ", ".join(stream.topic for stream in streams) or "none"
     there = [t for t in recording.topics if t.name.strip("/") == name.strip("/")]
     state = "holds no clouds or depth images" if there else "does not exist"

@@ -78,7 +78,7 @@ def _read_own(path: Path) -> tuple[TrackTable, list[str]]:
     own = read_track_table(path.with_name(ORIGINAL))
     given = {row.track: row for row in table.rows}
     missing = [f"#{row.track}" for row in own.rows if row.track not in given]
-    problems = [*table.problems, *_foreign(table, own)]
+    problems = [*table.problems, *_contradictions(table, own)]
     if missing:
         more = f" and {len(missing) - _LISTED} more" if len(missing) > _LISTED else ""
         problems.append(
@@ -95,7 +95,7 @@ def _read_own(path: Path) -> tuple[TrackTable, list[str]]:
     return restored, problems
 
 
-def _foreign(table: TrackTable, own: TrackTable) -> list[str]:
+def _contradictions(table: TrackTable, own: TrackTable) -> list[str]:
     """Return the problems of lines that contradict a run's own table."""
     known = {row.track: row.category for row in own.rows}
     problems = []
@@ -137,7 +137,7 @@ def _adopt(corrected: Path, folder: Path) -> None:
         table = read_track_table(corrected)
         _require_same_run(corrected, table, folder, known=False)
         given = (row for row in table.rows if row.cells.get("label_seen") != row.label)
-        result, problems = _relabelled(own, given), [*table.problems, *_foreign(table, own)]
+        result, problems = _relabelled(own, given), [*table.problems, *_contradictions(table, own)]
     known_categories = read_run(folder)["model"]["categories"]
     _, misread = resolve_labels(result.rows, known_categories, one_frame=_one_frame(folder))
     _refuse(corrected, problems + _lines(result.rows, misread))

@@ -53,7 +53,7 @@ pa.set_memory_pool(pa.system_memory_pool())
 SCHEMA_VERSION = "1"
 
 _VEC3 = pa.list_(pa.float32(), 3)
-_PLACE = pa.list_(pa.float64(), 3)
+_POSITION = pa.list_(pa.float64(), 3)
 """A position in the fixed frame, whose origin may be thousands of kilometres away."""
 _QUATERNION = pa.list_(pa.float32(), 4)
 _FLOATS = pa.list_(pa.float32())
@@ -81,7 +81,7 @@ FRAMES = pa.schema(
         ("up_given", _VEC3),
         ("revised", pa.bool_()),
         ("reused_from", pa.int32()),
-        ("fixed_translation", _PLACE),
+        ("fixed_translation", _POSITION),
         ("fixed_rotation", pa.list_(pa.float64(), 9)),
         ("stages", pa.list_(pa.string())),
         ("seconds", _FLOATS),
@@ -105,7 +105,7 @@ DETECTIONS = pa.schema(
         ("center", _VEC3),
         ("size", _VEC3),
         ("orientation", _QUATERNION),
-        ("center_fixed", _PLACE),
+        ("center_fixed", _POSITION),
         *_FULL,
         ("outline_full", _FLOATS),
         ("height_m", pa.float32()),
@@ -144,7 +144,7 @@ TRACKS = pa.schema(
         ("track", pa.int32()),
         *FRAME_COLUMNS,
         ("detection", pa.int32()),
-        ("center_fixed", _PLACE),
+        ("center_fixed", _POSITION),
         *_FULL,
         ("posterior", _FLOATS),
     ]

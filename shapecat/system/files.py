@@ -33,8 +33,6 @@ __all__ = [
 
 FSYNC = "SHAPECAT_FSYNC"
 """The environment variable that disables flushing; worker processes inherit it."""
-
-
 _NEW_S = 60
 """Age up to which a temporary folder may not be locked yet."""
 

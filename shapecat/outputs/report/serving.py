@@ -119,7 +119,7 @@ def _correction(body: bytes) -> tuple[int, str, str] | None:
     return (track, " ".join(label.split()), seen) if right else None
 
 
-def _is_here(host: str) -> bool:
+def _names_this_machine(host: str) -> bool:
     """Return whether a host names this machine, with or without a port: browsers omit port 80."""
     return re.sub(r":\d+$", "", host) in _NAMES
 
@@ -171,7 +171,7 @@ class _Handler(BaseHTTPRequestHandler):
     def _from_here(self) -> bool:
         """Return whether a request names this machine and does not come from a foreign page."""
         host, origin = self.headers.get("Host", ""), self.headers.get("Origin")
-        return _is_here(host) and origin in {None, f"http://{host}"}
+        return _names_this_machine(host) and origin in {None, f"http://{host}"}
 
     def _send(self, answer: _Answer) -> None:
         text = answer.content if isinstance(answer.content, str) else json.dumps(answer.content)
