@@ -652,6 +652,13 @@ def test_objects_are_detected_in_fused_cloud_of_two_sides() -> None:
         assert own[:, 1].max() - own[:, 1].min() > 0.07  # both sides
 
 
+@pytest.mark.parametrize("distance", [0.28, 0.34, 0.42])
+def test_objects_close_to_the_camera_stay_whole(distance: float) -> None:
+    """A camera at the wrist of a robot: on slanted faces, inverse depth changes fast."""
+    shapes = [table(), box((-0.06, 0, 0), (0.06, 0.05, 0.05), yaw=0.6), ball((0.06, 0, 0.03), 0.03)]
+    check(shapes, [1, 2], distance=distance, tilt_deg=50)
+
+
 def test_objects_are_detected_from_directly_above() -> None:
     """The view direction has no horizontal part."""
     check([table(), box((-0.1, 0, 0), (0.1, 0.1, 0.1)), can(0.12, 0, 0, 0.04, 0.1)], [1, 2],

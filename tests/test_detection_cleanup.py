@@ -25,6 +25,7 @@ from shapecat.detection.merging.segments import _blank
 from shapecat.detection.pipeline import Task, merge_segments, oversegment
 from shapecat.detection.planes.extent import DIRECTIONS
 from shapecat.detection.planes.height_map import OUTLINE, HeightMap
+from shapecat.geometry import DISCONTINUITY
 from shapecat.trees import BoostedTrees, Trees
 from tests.test_detection import Array, Shape, box, frame_of, render, table
 
@@ -80,7 +81,8 @@ def test_height_and_noise_of_plane_around_segment_are_measured() -> None:
     inv_depth, owner = np.full((11, 11), 0.5, np.float32), np.arange(2, dtype=np.int16)
     walls, spans = np.zeros((11, 11), np.uint8), np.tile(np.array([0, 11], np.int32), (11, 1))
     planes = np.zeros((1, OUTLINE + DIRECTIONS))
-    field = LabelledGrid(inv_depth, planes, plane_id, height, walls, labels, spans, owner)
+    seen = inv_depth, DISCONTINUITY, planes, plane_id, height, walls
+    field = LabelledGrid(*seen, labels, spans, owner)
     _measure_plane(field, segments, rows)
     least = 0.004 + 0.0025 * 2.0**2
     assert rows["plane_height"][1] == pytest.approx(0.001 / least)
@@ -194,7 +196,7 @@ def test_contact_boundary_joins_adjacent_object() -> None:
     labels[:4], plane_id[:4] = 3, 1
     height = np.zeros((8, 8), np.float32)
     height[4:6, :5] = 0.005  # more than .6 of 6.5 mm
-    fill_contact_boundary(inv_depth, HeightMap(plane_id, height), labels)
+    fill_contact_boundary(DepthGrid(inv_depth, INTRINSICS, 1), HeightMap(plane_id, height), labels)
     assert (labels[4, :5] == 3).all()
     assert (labels[4, 5:] == 0).all()
     assert (labels[5:] == 0).all()
@@ -208,7 +210,7 @@ def test_hole_is_filled_with_enclosing_object() -> None:
     labels[15:25, 15:25] = 0
     labels[20:35, 18:21], inv_depth[20:35, 18:21] = 2, 1.4
     hole = labels[15:25, 15:25] == 0
-    fill_holes(inv_depth, labels, 2, filled)
+    fill_holes(DepthGrid(inv_depth, INTRINSICS, 1), labels, 2, filled)
     assert (labels[15:25, 15:25][hole] == 1).all()
     assert filled.sum() == hole.sum()
 
@@ -220,7 +222,7 @@ def test_gap_between_two_boxes_is_no_hole() -> None:
     labels[10:30, 5:35] = 1
     labels[20:30] *= 2
     labels[17:23, 15:25] = 0
-    fill_holes(inv_depth, labels, 2, filled)
+    fill_holes(DepthGrid(inv_depth, INTRINSICS, 1), labels, 2, filled)
     assert not filled.any()
 
 
@@ -230,7 +232,7 @@ def test_background_of_large_image_is_no_hole() -> None:
     labels, filled = np.zeros((632, 632), np.int16), np.zeros((632, 632), np.uint8)
     labels[[0, 3]] = labels[:, [0, -1]] = 1
     labels[3, 100:601:100], labels[-1, 100:601:100] = 0, 1
-    fill_holes(inv_depth, labels, 1, filled)
+    fill_holes(DepthGrid(inv_depth, INTRINSICS, 1), labels, 1, filled)
     assert not filled.any()
 
 

@@ -39,7 +39,7 @@ def measured(depth: Array, labels: Array) -> tuple[Segments, SurfaceGraph, Depth
     graph = connect_surfaces(grid, heights)
     labels = labels.astype(np.int16)
     segments = measure_segments(grid, heights, graph, labels, int(labels.max()), UP)
-    measure_adjacency(inv_depth, heights, graph, labels, UP, segments)
+    measure_adjacency(grid, heights, graph, labels, UP, segments)
     return segments, graph, grid
 
 
@@ -132,7 +132,7 @@ def behind_a_post(offset_m: float) -> tuple[Array, Array]:
 def test_coplanar_parts_behind_a_post_are_merged(offset_m: float, *, merged: bool) -> None:
     depth, labels = behind_a_post(offset_m)
     segments, graph, grid = measured(depth, labels)
-    merge_across_occluder(segments, grid.inverse_depth, INTRINSICS, graph.normal, labels)
+    merge_across_occluder(segments, grid, graph.normal, labels)
     assert (segments.parent[2] == 1) == merged
     assert segments.parent[3] == 3
 
@@ -141,7 +141,7 @@ def test_coplanar_parts_without_an_occluder_are_not_merged() -> None:
     depth, labels = behind_a_post(0)
     depth[labels == 3], labels[labels == 3] = 0, 0
     segments, graph, grid = measured(depth, labels)
-    merge_across_occluder(segments, grid.inverse_depth, INTRINSICS, graph.normal, labels)
+    merge_across_occluder(segments, grid, graph.normal, labels)
     assert segments.parent.tolist() == [0, 1, 2]
 
 

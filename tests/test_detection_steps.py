@@ -94,6 +94,21 @@ def test_watershed_splits_faces_at_a_concave_edge(rise: float, segments: int) ->
     assert (labels[90, 120] != labels[149, 120]) == (segments == 2)
 
 
+@pytest.mark.parametrize("distance", [0.3, 0.45, 0.9])
+def test_slanted_face_is_one_segment_at_any_distance(distance: float) -> None:
+    """Near the camera, its inverse depth changes by more than 0.012 1/m from cell to cell."""
+    camera = Camera(640, 480, 600.0, 600.0, 319.5, 239.5)
+    slope = 1.2 * (np.arange(480)[:, None] - camera.cy) / camera.fy
+    depth = np.broadcast_to(distance / (1 + slope), (480, 640)).astype(np.float32)
+    grid = downsample(depth[140:340].copy(), camera, range_m=3.0)
+    assert grid is not None
+    face = np.ones(grid.inverse_depth.shape, np.int8)
+    heights = HeightMap(face, np.full(face.shape, 0.1, np.float32))
+    labels, n = watershed(heights, connect_surfaces(grid, heights))
+    assert n == 1
+    assert (labels == 1).all()
+
+
 def test_convex_hull_of_an_l_is_filled() -> None:
     """Cells between the arms are inside the hull, those beyond are not."""
     residual = np.ones((12, 12), np.float32)
@@ -114,7 +129,7 @@ def test_enclosed_holes_are_filled_and_open_ones_are_not() -> None:
     labels[18:22, 18:22] = 0
     labels[14:16, 10:20] = 0  # open to the left
     filled = np.zeros((40, 40), np.uint8)
-    fill_holes(inv_depth, labels, 1, filled)
+    fill_holes(DepthGrid(inv_depth, INTRINSICS, 2), labels, 1, filled)
     assert (labels[18:22, 18:22] == 1).all()
     assert (filled[18:22, 18:22] == 1).all()
     assert (labels[14:16, 10:20] == 0).all()

@@ -19,6 +19,7 @@ __all__ = [
     "DepthGrid",
     "PinholeIntrinsics",
     "count_at_range_limit",
+    "discontinuity_at",
     "downsample",
     "find_borders",
     "row_and_column",
@@ -34,6 +35,9 @@ FEWEST_CELLS, ENOUGH_CELLS = 20.0, 60.0
 BORDER_SHARE = 0.12
 """Maximum fraction of the image in a blank border; a registered Kinect leaves a tenth."""
 LARGEST_FACTOR = 16
+STEP_M = 0.004
+"""Smallest step between two surfaces, metres. Near the camera, a slanted surface changes from cell
+to cell by more than a `DISCONTINUITY`."""
 MOST_CELLS = 100_000
 """Maximum number of cells, to bound the time per frame; cells become larger than `CELL_M`."""
 
@@ -55,11 +59,13 @@ class DepthGrid(NamedTuple):
     inverse_depth : (rows, columns) float32, 1/m; 0 where there is no reading.
     intrinsics : the camera in units of cells.
     factor : pixels along the edge of a cell.
+    discontinuity : step in inverse depth that separates two surfaces, 1/m.
     """
 
     inverse_depth: F4
     intrinsics: PinholeIntrinsics
     factor: int
+    discontinuity: float = DISCONTINUITY
 
 
 def downsample(depth: F4, camera: Camera, *, range_m: float) -> DepthGrid | None:
@@ -76,7 +82,8 @@ def downsample(depth: F4, camera: Camera, *, range_m: float) -> DepthGrid | None
     sample = _sampled(depth, 5 if min(depth.shape) > 50 else 1, np.float32(range_m))
     if sample.size == 0:
         return None
-    pixel_m = _median_of(sample) / max(abs(camera.fx), 1e-6)
+    depth_m = _median_of(sample)
+    pixel_m = depth_m / max(abs(camera.fx), 1e-6)
     least = math.sqrt(depth.size / MOST_CELLS)
     factor = round(min(max(CELL_M / max(pixel_m, 1e-9), least, 1.0), LARGEST_FACTOR, *depth.shape))
     shift = (factor - 1) / 2
@@ -88,8 +95,14 @@ def downsample(depth: F4, camera: Camera, *, range_m: float) -> DepthGrid | None
     )
     rows, columns = depth.shape[0] // factor, depth.shape[1] // factor
     inv_depth = np.zeros((rows, columns), np.float32)
-    _average(depth, factor, np.float32(range_m), np.float32(DISCONTINUITY), inv_depth)
-    return DepthGrid(inv_depth, intrinsics, factor)
+    step = discontinuity_at(depth_m)
+    _average(depth, factor, np.float32(range_m), np.float32(step), inv_depth)
+    return DepthGrid(inv_depth, intrinsics, factor, step)
+
+
+def discontinuity_at(depth_m: float) -> float:
+    """Return the step in inverse depth that separates two surfaces at a depth, 1/m."""
+    return max(DISCONTINUITY, STEP_M / depth_m**2)
 
 
 def _median_of(values: F4) -> float:

@@ -212,7 +212,7 @@ def _oversegment(grid: DepthGrid, model: PlaneModel) -> OverSegmentation:
     labels, n = watershed(heights, graph)
     n = split_at_width_changes(grid, heights, graph, labels, up, n)
     segments = measure_segments(grid, heights, graph, labels, n, up)
-    measure_adjacency(grid.inverse_depth, heights, graph, labels, up, segments)
+    measure_adjacency(grid, heights, graph, labels, up, segments)
     return OverSegmentation(graph, labels, segments)
 
 
@@ -225,7 +225,7 @@ def merge_segments(grid: DepthGrid, model: PlaneModel, oversegmentation: OverSeg
     known: Bool = merge_low_profile(segments, model.low_profile, labels, graph.spans)
     view_geometry = ViewGeometry(grid.intrinsics.fx, model.up[2])
     learned.merge_learned(segments, view_geometry, learned.load_trees())
-    merge_across_occluder(segments, grid.inverse_depth, grid.intrinsics, graph.normal, labels)
+    merge_across_occluder(segments, grid, graph.normal, labels)
     return known
 
 
@@ -254,9 +254,9 @@ def _fill(
 ) -> Segmentation:
     """Fill contact boundaries and holes in the labels, and measure the objects."""
     _, labels, segments = oversegmentation  # since `_clean_up`, the labels are those of objects
-    fill_contact_boundary(grid.inverse_depth, model.heights, labels)
+    fill_contact_boundary(grid, model.heights, labels)
     filled = np.zeros(labels.shape, np.uint8)
-    fill_holes(grid.inverse_depth, labels, representatives.size - 1, filled)
+    fill_holes(grid, labels, representatives.size - 1, filled)
     if model.low_profile.max() > 0:  # it may lie at the level of its plane
         filled |= (model.low_profile > 0) & (labels > 0)
     plane_ids = segments.plane_id[representatives].astype(np.int64) - 1

@@ -6,8 +6,8 @@ from typing import NamedTuple
 import numpy as np
 
 from shapecat.arrays import F4, F8, I4
-from shapecat.detection.depth_grid import CELL_M, DepthGrid, PinholeIntrinsics
-from shapecat.geometry import DISCONTINUITY, NEAREST_M, gravity_rotation
+from shapecat.detection.depth_grid import CELL_M, DepthGrid, PinholeIntrinsics, discontinuity_at
+from shapecat.geometry import NEAREST_M, gravity_rotation
 from shapecat.jit import kernel
 from shapecat.types import Pose
 
@@ -203,9 +203,11 @@ def _imaged(turned: F4, place: F4, bounds: F8, n: int, pose: Pose) -> VirtualIma
     intrinsics = PinholeIntrinsics(1 / pitch, 1 / pitch, -left / pitch, -top / pitch)
     inv_depth = np.zeros((int(height / pitch + 1.5), int(width / pitch + 1.5)), np.float32)
     cell = np.full(len(turned), -1, np.int32)
-    behind = _project(turned, place, intrinsics, inv_depth, cell)
-    _close_holes(inv_depth)
-    return VirtualImage(DepthGrid(inv_depth, intrinsics, 1), turned, cell, pose, behind / n)
+    jump = discontinuity_at(depth)
+    behind = _project(turned, place, intrinsics, jump, inv_depth, cell)
+    _close_holes(inv_depth, jump)
+    grid = DepthGrid(inv_depth, intrinsics, 1, jump)
+    return VirtualImage(grid, turned, cell, pose, behind / n)
 
 
 def _spacing(place: F4, bounds: F8, n: int) -> float:
@@ -238,7 +240,9 @@ def _occupied(place: F4, left: float, top: float, scale: float, side: int) -> in
 
 
 @kernel
-def _project(points: F4, place: F4, intrinsics: PinholeIntrinsics, inv_depth: F4, cell: I4) -> int:
+def _project(
+    points: F4, place: F4, intrinsics: PinholeIntrinsics, jump: float, inv_depth: F4, cell: I4
+) -> int:
     """Average the nearest points of each cell; return the number of points well behind them."""
     rows, columns = inv_depth.shape
     nearest = np.zeros(inv_depth.shape, np.float32)
@@ -258,10 +262,10 @@ def _project(points: F4, place: F4, intrinsics: PinholeIntrinsics, inv_depth: F4
             continue
         i, j = cell[k] // columns, cell[k] % columns
         v = np.float32(1) / points[k, 2]
-        if v > nearest[i, j] - DISCONTINUITY:
+        if v > nearest[i, j] - jump:
             inv_depth[i, j] += v
             count[i, j] += 1
-        elif v < nearest[i, j] - 3 * DISCONTINUITY:
+        elif v < nearest[i, j] - 3 * jump:
             behind += 1
     for i in range(rows):
         for j in range(columns):
@@ -271,7 +275,7 @@ def _project(points: F4, place: F4, intrinsics: PinholeIntrinsics, inv_depth: F4
 
 
 @kernel
-def _close_holes(inv_depth: F4) -> None:
+def _close_holes(inv_depth: F4, jump: float) -> None:
     """Fill empty cells between two neighbours on one surface with their mean."""
     rows, columns = inv_depth.shape
     source = inv_depth.copy()
@@ -281,11 +285,11 @@ def _close_holes(inv_depth: F4) -> None:
                 continue
             total, n = np.float32(0), 0
             a, b = source[i, j - 1], source[i, j + 1]
-            if (a > 0) & (b > 0) & (abs(a - b) < DISCONTINUITY):
+            if (a > 0) & (b > 0) & (abs(a - b) < jump):
                 total += a + b
                 n += 2
             a, b = source[i - 1, j], source[i + 1, j]
-            if (a > 0) & (b > 0) & (abs(a - b) < DISCONTINUITY):
+            if (a > 0) & (b > 0) & (abs(a - b) < jump):
                 total += a + b
                 n += 2
             if n > 0:

@@ -147,7 +147,7 @@ def _pairs(
         return
     ground, (graph, labels, segments) = found
     merge_low_profile(segments, ground.low_profile, labels, graph.spans)
-    merge_across_occluder(segments, grid.inverse_depth, grid.intrinsics, graph.normal, labels)
+    merge_across_occluder(segments, grid, graph.normal, labels)
     counts = count_labels(pixel_labels.reshape(depth.shape), labels, grid)
     view_geometry, seen = ViewGeometry(grid.intrinsics.fx, float(ground.up[2])), set()
     while True:

@@ -11,8 +11,8 @@ from shapecat.detection.connected_components import (
     connected_components,
     spans_of,
 )
+from shapecat.detection.depth_grid import DepthGrid
 from shapecat.detection.planes.height_map import HEIGHT_NOISE, MIN_HEIGHT_M, HeightMap
-from shapecat.geometry import DISCONTINUITY
 from shapecat.jit import kernel, unset
 
 __all__ = ["fill_contact_boundary", "fill_holes"]
@@ -23,15 +23,14 @@ the hole, and those where the surface continues."""
 
 
 @kernel
-def fill_contact_boundary(inv_depth: F4, heights: HeightMap, labels: I4) -> None:
+def fill_contact_boundary(grid: DepthGrid, heights: HeightMap, labels: I4) -> None:
     """Give the label of an object to adjacent cells that are slightly above its plane, in place.
 
     Parameters
     ----------
-    inv_depth : (rows, columns) 1/m; 0 where there is no reading.
     labels : (rows, columns) int16, the objects, 0 elsewhere.
     """
-    plane_id, height = heights
+    inv_depth, (plane_id, height) = grid.inverse_depth, heights
     rows, columns = labels.shape
     before, low = labels.copy(), np.zeros(columns, np.bool_)
     least, noise = (
@@ -52,13 +51,13 @@ def fill_contact_boundary(inv_depth: F4, heights: HeightMap, labels: I4) -> None
                 y, x = i + di, j + dj
                 if y < 0 or x < 0 or y >= rows or x >= columns or before[y, x] <= 0:
                     continue
-                near = abs(inv_depth[y, x] - inv_depth[i, j]) < DISCONTINUITY
+                near = abs(inv_depth[y, x] - inv_depth[i, j]) < grid.discontinuity
                 if near and abs(plane_id[y, x]) == -plane_id[i, j]:
                     labels[i, j] = before[y, x]
 
 
 @kernel
-def fill_holes(inv_depth: F4, labels: I4, count: int, filled: U1) -> None:
+def fill_holes(grid: DepthGrid, labels: I4, count: int, filled: U1) -> None:
     """Give enclosed cells the label of the object around them, in place.
 
     A hole is a connected component of unlabelled samples between labels. Most of its boundary has
@@ -66,18 +65,17 @@ def fill_holes(inv_depth: F4, labels: I4, count: int, filled: U1) -> None:
 
     Parameters
     ----------
-    inv_depth : (rows, columns) 1/m; 0 where there is no reading.
     labels : (rows, columns) objects 1..count, 0 elsewhere; changed in place.
     count : the number of objects.
     filled : (rows, columns) uint8, set to 1 in the filled cells.
     """
-    inside, spans = _between_labels(inv_depth, labels)
+    inside, spans = _between_labels(grid.inverse_depth, labels)
     component = unset(labels.shape, np.int32)
     links = np.full(labels.shape, RIGHT | DOWN, np.uint8)
     n = connected_components(inside, links, spans, component).size
     sides, total = np.zeros((n, count + 1, 3), np.int32), np.zeros(n, np.int64)
     owner = np.zeros(n, np.int16)
-    _count_sides(inv_depth, labels, inside, spans, component, sides, total)
+    _count_sides(grid, labels, inside, spans, component, sides, total)
     for p in range(1, n):
         owner[p] = _owner_of(sides[p], total[p])
     for i in range(len(spans)):
@@ -111,13 +109,14 @@ def _between_labels(inv_depth: F4, labels: I4) -> tuple[Bool, I4]:
 
 @kernel(inline=True)
 def _count_sides(
-    inv_depth: F4, labels: I4, inside: Bool, spans: I4, component: I4, sides: I4, total: I4
+    grid: DepthGrid, labels: I4, inside: Bool, spans: I4, component: I4, sides: I4, total: I4
 ) -> None:
     """Count the sides of holes by label, (n, labels, 3), and in ``total`` (n,).
 
     The total includes sides next to cells without a reading. If a hole is not enclosed, the total
     is so large that no label has a sufficient share.
     """
+    inv_depth, jump = grid.inverse_depth, grid.discontinuity
     for i in range(len(spans)):
         for j in range(spans[i, 0], spans[i, 1]):
             if not inside[i, j]:
@@ -127,8 +126,8 @@ def _count_sides(
                 label, there = labels[i + di, j + dj], inv_depth[i + di, j + dj]
                 if label > 0:
                     sides[p, label, BOUNDARY] += 1
-                    sides[p, label, IN_FRONT] += there > here + DISCONTINUITY
-                    sides[p, label, GOES_ON] += abs(there - here) < DISCONTINUITY
+                    sides[p, label, IN_FRONT] += there > here + jump
+                    sides[p, label, GOES_ON] += abs(there - here) < jump
                 if label > 0 or there <= 0:
                     total[p] += 1
                 elif not inside[i + di, j + dj]:

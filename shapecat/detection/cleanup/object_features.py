@@ -72,6 +72,7 @@ class LabelledGrid(NamedTuple):
     """
 
     inverse_depth: F4
+    discontinuity: float
     planes: F8
     plane_id: I4
     height: F4
@@ -99,7 +100,7 @@ def measure_object_features(
     features = np.zeros(segments.parent.size, OBJECT_FEATURES)
     rows = features["surroundings"]
     rows["low_profile"] = low_profile
-    seen = grid.inverse_depth, model.planes, *model.heights, model.walls
+    seen = grid.inverse_depth, grid.discontinuity, model.planes, *model.heights, model.walls
     field = LabelledGrid(*seen, labels, graph.spans, segments.parent)
     _count_cells(field, _border_lines(grid), 1 / range_m + DISCONTINUITY / 2, rows)
     _measure_plane(field, segments, rows)
@@ -129,7 +130,7 @@ def _count_cells(
     ``last`` is the inverse depth below which a cell is at the range limit, 1/m; ``rows`` (n + 1,)
     are records of `_SURROUNDINGS`.
     """
-    inv_depth, planes, plane_id, _, walls, labels, spans, owner = field
+    inv_depth, jump, planes, plane_id, _, walls, labels, spans, owner = field
     last_row, last_column = labels.shape[0] - 1, labels.shape[1] - 1
     top, bottom, left, right = border
     for i in range(labels.shape[0]):
@@ -142,8 +143,8 @@ def _count_cells(
             row.on_wall += walls[i, j] == ON_WALL
             for di, dj in SIDES:
                 y, x = min(max(i + di, 0), last_row), min(max(j + dj, 0), last_column)
-                row.depth_edge += 0 < inv_depth[y, x] <= here - DISCONTINUITY
-                if plane_id[y, x] != 0 or abs(inv_depth[y, x] - here) >= DISCONTINUITY:
+                row.depth_edge += 0 < inv_depth[y, x] <= here - jump
+                if plane_id[y, x] != 0 or abs(inv_depth[y, x] - here) >= jump:
                     continue
                 k = plane_id[i, j] - 1
                 if inv_depth[y, x] > max(planes[k, 0] * x + planes[k, 1] * y + planes[k, 2], 0):

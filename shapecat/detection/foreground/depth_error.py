@@ -9,7 +9,6 @@ import numpy as np
 from shapecat.arrays import F4, F8, I4
 from shapecat.detection.connected_components import SIDES
 from shapecat.detection.foreground.settings import LOW
-from shapecat.geometry import DISCONTINUITY
 from shapecat.jit import kernel
 
 __all__ = [
@@ -98,7 +97,14 @@ def _find_low(
 
 @kernel
 def clear_contact(
-    inv_depth: F4, plane_id: I4, height: F4, number: int, residual: F4, stack: I4, drop: F4
+    inv_depth: F4,
+    plane_id: I4,
+    height: F4,
+    number: int,
+    jump: float,
+    residual: F4,
+    stack: I4,
+    drop: F4,
 ) -> None:
     """Set the residual to 0 on the steep foot of higher objects.
 
@@ -109,6 +115,7 @@ def clear_contact(
     ----------
     inv_depth, plane_id, height : (rows, columns) inverse depth, 1/m, and as in `HeightMap`.
     number : number of the plane, from 1, as in ``plane_id``.
+    jump : largest change from cell to cell on the side of an object, 1/m.
     residual : (rows, columns) 1/m, changed in place.
     stack, drop : (cells,) work space.
     """
@@ -135,10 +142,7 @@ def clear_contact(
             if edge[j]:
                 for di, dj in SIDES:
                     y, x = i + di, j + dj
-                    if (
-                        residual[y, x] != 0
-                        and abs(inv_depth[y, x] - inv_depth[i, j]) < DISCONTINUITY
-                    ):
+                    if residual[y, x] != 0 and abs(inv_depth[y, x] - inv_depth[i, j]) < jump:
                         stack[top], drop[top] = y * columns + x, residual[y, x]
                         residual[y, x] = 0
                         top += 1
@@ -152,7 +156,7 @@ def clear_contact(
             if (
                 residual[y, x] != 0
                 and here - residual[y, x] > LOW.slope
-                and abs(inv_depth[y, x] - inv_depth[i, j]) < DISCONTINUITY
+                and abs(inv_depth[y, x] - inv_depth[i, j]) < jump
             ):
                 stack[top], drop[top] = y * columns + x, residual[y, x]
                 residual[y, x] = 0

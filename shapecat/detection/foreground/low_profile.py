@@ -60,7 +60,7 @@ def find_low_profile(
     low_profile : (rows, columns) zeros; set to 1, 2, ... on low-profile objects.
     largest_m : maximum width of a low-profile object, metres.
     """
-    inv_depth, (plane_id, height) = grid.inverse_depth, heights
+    inv_depth, jump, (plane_id, height) = grid.inverse_depth, grid.discontinuity, heights
     shape, size = inv_depth.shape, inv_depth.size
     widest = largest_m * grid.intrinsics.fx
     residuals, high_passes = unset(shape, np.float32), unset(shape, np.float32)
@@ -83,15 +83,15 @@ def find_low_profile(
         residual, high_pass = residuals[start:end], high_passes[start:end]
         if measure_residual(values, plane_ids, above, plane, number, residual) < LOW.least_cells:
             continue
-        clear_contact(values, plane_ids, above, number, residual, scratch.seeds, drops)
+        clear_contact(values, plane_ids, above, number, 2 * jump, residual, scratch.seeds, drops)
         filter_high_pass(residual, high_pass)
         clear = max(LOW.step, LOW.steady * measure_noise(high_pass, plane_ids, number))
         step = max(clear, LOW.slip * math.hypot(plane[0], plane[1]))
-        bounds = (step, np.float32(min(clear, LOW.fine)), widest)
+        bounds = (step, np.float32(min(clear, LOW.fine)), widest, jump)
         objects, parts = _raise(
             values, high_pass, plane_ids, number, bounds, marks, objects, parts, scratch
         )
-        parts = _lower(values, residual, plane_ids, number, step, marks, parts, scratch)
+        parts = _lower(values, residual, plane_ids, number, (step, jump), marks, parts, scratch)
 
 
 @kernel(inline=True)
@@ -121,7 +121,7 @@ def _raise(
     high_pass: F4,
     plane_id: I4,
     number: int,
-    bounds: tuple[float, float, float],
+    bounds: tuple[float, float, float, float],
     low_profile: I4,
     objects: int,
     me: int,
@@ -134,7 +134,7 @@ def _raise(
     the minimum mean rise and the unit of the levels, both 1/m, and the greatest width, in cells at
     a depth of 1 m.
     """
-    rise_least, level_least, widest = bounds
+    rise_least, level_least, widest, jump = bounds
     flat, marks, plane_ids = high_pass.reshape(-1), low_profile.reshape(-1), plane_id.reshape(-1)
     seen, part, seeds, stack = scratch
     visited, parts = seen.reshape(-1), part.reshape(-1)
@@ -159,7 +159,7 @@ def _raise(
                 continue
             filled = fill_hull(high_pass, part, stack, count)
             outline = measure_outline(
-                inv_depth, high_pass, plane_id, part, stack, filled, number, rise_least
+                inv_depth, high_pass, plane_id, part, stack, filled, number, (rise_least, jump)
             )
             for p in stack[count:filled]:
                 best = max(best, merits[marks[p]])
@@ -231,7 +231,7 @@ def _lower(
     residual: F4,
     plane_id: I4,
     number: int,
-    rise_least: float,
+    bounds: tuple[float, float],
     low_profile: I4,
     me: int,
     scratch: Scratch,
@@ -265,9 +265,7 @@ def _lower(
         count = _flood(above, np.float32(0), s, me, part, stack)
         if count < LOW.small_part:
             continue
-        line = measure_outline(
-            inv_depth, residual, plane_id, part, stack, count, number, rise_least
-        )
+        line = measure_outline(inv_depth, residual, plane_id, part, stack, count, number, bounds)
         if line.table >= LOW.beside * line.sides and line.rise < line.table:
             for t in range(count):
                 plane_ids[stack[t]] = -number

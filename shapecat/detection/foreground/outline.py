@@ -5,7 +5,6 @@ from typing import NamedTuple
 from shapecat.arrays import F4, I4
 from shapecat.detection.depth_grid import row_and_column
 from shapecat.detection.foreground.settings import LOW, OUTLINES
-from shapecat.geometry import DISCONTINUITY
 from shapecat.jit import kernel
 
 __all__ = ["Outline", "is_object", "measure_outline", "width_of_part"]
@@ -72,7 +71,7 @@ def measure_outline(
     stack: I4,
     count: int,
     number: int,
-    rise_least: float,
+    bounds: tuple[float, float],
 ) -> Outline:
     """Measure the outline of a part.
 
@@ -84,10 +83,12 @@ def measure_outline(
     part : (rows, columns) numbers of the parts.
     stack, count : the first ``count`` of ``stack`` are the flat cells of this part.
     number : number of its plane, from 1, as in ``plane_id``.
-    rise_least : minimum mean rise across the outline of an object, 1/m.
+    bounds : minimum mean rise across the outline of an object, and the step that separates two
+        surfaces, both 1/m.
     """
     rows, columns = residual.shape
     parts = part.reshape(-1)
+    rise_least, jump = bounds
     sides = table = known = hidden = steep = 0
     rise, outward = 0.0, LOW.apart - OUTLINES.inward
     me = parts[stack[0]]
@@ -105,14 +106,14 @@ def measure_outline(
             known += (
                 residual[y, x] == 0
                 and inv_depth[y, x] > 0
-                and abs(inv_depth[y, x] - inv_depth[i, j]) < DISCONTINUITY
+                and abs(inv_depth[y, x] - inv_depth[i, j]) < jump
             )
-            hidden += inv_depth[y, x] <= 0 or inv_depth[y, x] > inv_depth[i, j] + DISCONTINUITY
+            hidden += inv_depth[y, x] <= 0 or inv_depth[y, x] > inv_depth[i, j] + jump
             y, x = i + outward * di, j + outward * dj
             v, u = i - OUTLINES.inward * di, j - OUTLINES.inward * dj
             if min(y, x) < 0 or min(v, u) < 0 or max(y, v) >= rows or max(x, u) >= columns:
                 continue
-            known += 0 < inv_depth[y, x] < inv_depth[i, j] - DISCONTINUITY
+            known += 0 < inv_depth[y, x] < inv_depth[i, j] - jump
             if plane_id[y, x] != -number or residual[y, x] == 0 or abs(plane_id[v, u]) != number:
                 continue
             table += 1

@@ -19,7 +19,6 @@ from shapecat.detection.planes.height_map import (
     HeightMap,
     is_inside_outline,
 )
-from shapecat.geometry import DISCONTINUITY
 from shapecat.jit import kernel, unset
 
 __all__ = ["extend_overhang"]
@@ -108,7 +107,7 @@ def _goes_on(over: Overhang, i: int, j: int) -> bool:
         y, x = i + di, j + dj
         if not (0 <= y < rows and 0 <= x < columns and 0 <= over.heights.plane_id[y, x] < over.me):
             continue
-        if abs(over.grid.inverse_depth[y, x] - here) < DISCONTINUITY:
+        if abs(over.grid.inverse_depth[y, x] - here) < over.grid.discontinuity:
             some |= _height_beside(over, y, x) > 0
     return some
 
@@ -128,7 +127,7 @@ def _extend(over: Overhang, i: int, j: int, stack: I4) -> None:
             if y < 0 or x < 0 or y >= rows or x >= columns or over.visited[y, x] == me:
                 continue
             mine = plane_id[y, x] == me
-            if abs(inv_depth[y, x] - inv_depth[i, j]) >= DISCONTINUITY:
+            if abs(inv_depth[y, x] - inv_depth[i, j]) >= over.grid.discontinuity:
                 continue
             if mine or (0 <= plane_id[y, x] < me and _height_beside(over, y, x) > 0):
                 over.visited[y, x] = me

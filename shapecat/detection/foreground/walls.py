@@ -15,7 +15,7 @@ from shapecat.detection.planes.ransac import (
     sample_grid,
 )
 from shapecat.detection.planes.settings import PLANES
-from shapecat.geometry import DISCONTINUITY, cross
+from shapecat.geometry import cross
 from shapecat.jit import kernel, unset
 
 __all__ = ["CLEARED", "ON_WALL", "remove_walls"]
@@ -141,7 +141,7 @@ def _clear(grid: DepthGrid, plane_id: I4, plane: F8, normal: F8, walls: U1) -> N
     inv_depth = grid.inverse_depth
     rows, columns = inv_depth.shape
     stack, found = unset(inv_depth.size, np.int32), unset(inv_depth.shape, np.uint8)
-    _mark(inv_depth, plane_id, plane, found)
+    _mark(grid, plane_id, plane, found)
     total = 0.0
     for i in range(rows):
         for j in range(columns):
@@ -189,13 +189,14 @@ def _flood(
 
 
 @kernel(inline=True)
-def _mark(inv_depth: F4, plane_id: I4, plane: F8, found: U1) -> None:
+def _mark(grid: DepthGrid, plane_id: I4, plane: F8, found: U1) -> None:
     """Mark the cells on a wall as `UNSEEN`, unless they are on a level plane; write 0 elsewhere."""
-    a = np.float32(plane[0])
+    a, inv_depth = np.float32(plane[0]), grid.inverse_depth
+    jump = np.float32(grid.discontinuity)
     for i in range(inv_depth.shape[0]):
         values, plane_ids, states = inv_depth[i], plane_id[i], found[i]
         at_row = np.float32(plane[1] * i + plane[2])
         for j in range(inv_depth.shape[1]):
             off = abs(values[j] - (a * np.float32(j) + at_row))
-            on = (plane_ids[j] >= 0) & (values[j] > 0) & (off < np.float32(DISCONTINUITY))
+            on = (plane_ids[j] >= 0) & (values[j] > 0) & (off < jump)
             states[j] = UNSEEN if on else 0

@@ -5,24 +5,20 @@ import math
 import numpy as np
 
 from shapecat.arrays import F4, F8, I4, Bool
-from shapecat.detection.depth_grid import PinholeIntrinsics, row_and_column
+from shapecat.detection.depth_grid import DepthGrid, row_and_column
 from shapecat.detection.merging.segments import SAMPLES, Segments, merge
 from shapecat.detection.merging.settings import MERGING
-from shapecat.geometry import DISCONTINUITY
 from shapecat.jit import kernel
 
 __all__ = ["merge_across_occluder"]
 
 
 @kernel
-def merge_across_occluder(
-    segments: Segments, inv_depth: F4, intrinsics: PinholeIntrinsics, normal: F4, labels: I4
-) -> None:
+def merge_across_occluder(segments: Segments, grid: DepthGrid, normal: F4, labels: I4) -> None:
     """Merge segments behind the same occluder that continue each other, the best pair first.
 
     Parameters
     ----------
-    inv_depth : (rows, columns) inverse depth, 1/m.
     normal : (rows, 3, columns) as in `SurfaceGraph`.
     labels : (rows, columns) int16, the segments.
     """
@@ -36,11 +32,11 @@ def merge_across_occluder(
                     continue
                 scores[p, q] = 0
                 if behind_one[p, q]:
-                    a = _local_planes(segments.samples[p], inv_depth, intrinsics, normal)
-                    b = _local_planes(segments.samples[q], inv_depth, intrinsics, normal)
+                    a = _local_planes(segments.samples[p], grid, normal)
+                    b = _local_planes(segments.samples[q], grid, normal)
                     share, lines = _find_partners(a, b)
                     if share >= MERGING.partners and _is_hidden(
-                        segments, p, q, inv_depth, intrinsics, labels, lines
+                        segments, p, q, grid, labels, lines
                     ):
                         scores[p, q] = share
         best = np.argmax(scores)
@@ -73,8 +69,9 @@ def _find_behind_one(segments: Segments) -> Bool:
 
 
 @kernel(inner=True)
-def _local_planes(samples: I4, inv_depth: F4, intrinsics: PinholeIntrinsics, normal: F4) -> F8:
+def _local_planes(samples: I4, grid: DepthGrid, normal: F4) -> F8:
     """Return the positions and normals of a segment's samples, (2, n, 3) metres, sensor frame."""
+    inv_depth, intrinsics = grid.inverse_depth, grid.intrinsics
     n = 0
     for cell in samples:
         n += int(cell >= 0)
@@ -137,12 +134,12 @@ def _is_hidden(
     segments: Segments,
     p: int,
     q: int,
-    inv_depth: F4,
-    intrinsics: PinholeIntrinsics,
+    grid: DepthGrid,
     labels: I4,
     lines: F8,
 ) -> bool:
     """Return whether lines (n, 2, 3) between two segments are hidden, not in free space."""
+    inv_depth, intrinsics = grid.inverse_depth, grid.intrinsics
     free = hidden = looked = 0
     for k in range(len(lines)):
         for step in range(1, MERGING.line_steps):
@@ -155,7 +152,7 @@ def _is_hidden(
             owner = segments.parent[labels[i, j]]
             looked += inv_depth[i, j] > 0
             if inv_depth[i, j] > 0 and owner not in (p, q):
-                before = inv_depth[i, j] - 1 / z > DISCONTINUITY
+                before = inv_depth[i, j] - 1 / z > grid.discontinuity
                 hidden += before
                 free += not before
     return free <= MERGING.free_share * looked and hidden >= MERGING.hidden_share * looked

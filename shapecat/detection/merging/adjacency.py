@@ -4,13 +4,13 @@ import math
 
 import numpy as np
 
-from shapecat.arrays import F4, F8, I4, U1
+from shapecat.arrays import F8, I4, U1
 from shapecat.detection.connected_components import DOWN, RIGHT
+from shapecat.detection.depth_grid import DepthGrid
 from shapecat.detection.merging.segments import SAMPLES, Segments
 from shapecat.detection.merging.settings import MERGING
 from shapecat.detection.planes.height_map import HeightMap
 from shapecat.detection.segmentation.connectivity import SurfaceGraph
-from shapecat.geometry import DISCONTINUITY
 from shapecat.jit import kernel
 
 __all__ = ["measure_adjacency"]
@@ -18,17 +18,17 @@ __all__ = ["measure_adjacency"]
 
 @kernel
 def measure_adjacency(
-    inv_depth: F4, heights: HeightMap, graph: SurfaceGraph, labels: I4, up: F8, segments: Segments
+    grid: DepthGrid, heights: HeightMap, graph: SurfaceGraph, labels: I4, up: F8, segments: Segments
 ) -> None:
     """Measure the boundaries and contacts of segments, and choose their samples.
 
     Parameters
     ----------
-    inv_depth : (rows, columns) 1/m.
     labels : (rows, columns) the segments.
     up : (3,) unit vector, sensor frame.
     segments : from `measure_segments`, still without these measurements; changed in place.
     """
+    inv_depth = grid.inverse_depth
     rows, columns = inv_depth.shape
     plane_id, links, statistics = heights.plane_id, graph.links, segments.statistics
     change, met = np.zeros(columns, np.uint8), np.zeros((2 * columns, 6), np.int32)
@@ -63,7 +63,7 @@ def measure_adjacency(
                     met[n, 0], met[n, 1], met[n, 2], met[n, 3] = j, y, x, down
                     met[n, 4], met[n, 5] = gap, 0 if gap > 0 else link
                     n += 1
-        _count(inv_depth, heights, graph, labels, up, i, met[:n], segments)
+        _count(grid, heights, graph, labels, up, i, met[:n], segments)
     _choose_samples(graph, labels, segments)
 
 
@@ -85,7 +85,7 @@ def _find_changes(links: U1, here: I4, below: I4, change: U1) -> bool:
 
 @kernel(inline=True)
 def _count(
-    inv_depth: F4,
+    grid: DepthGrid,
     heights: HeightMap,
     graph: SurfaceGraph,
     labels: I4,
@@ -103,6 +103,7 @@ def _count(
         the first, 0 if it is to the right; number of cells without a reading between them; and
         not 0 if the surface continues.
     """
+    inv_depth, jump = grid.inverse_depth, grid.discontinuity
     plane_id, height = heights.plane_id, heights.height
     normal, concavity = graph.normal, graph.concavity
     statistics, pairs = segments.statistics, segments.pairs
@@ -117,11 +118,11 @@ def _count(
         if p == 0:
             continue
         ahead = inv_depth[i, j] - inv_depth[y, x]
-        statistics[p].upper_silhouette += fall > steep and ahead > DISCONTINUITY
+        statistics[p].upper_silhouette += fall > steep and ahead > jump
         if q == 0:
-            if ahead < -DISCONTINUITY:
+            if ahead < -jump:
                 statistics[p].hidden += 1
-            elif ahead < DISCONTINUITY and plane_id[y, x] < 0 and gap <= MERGING.gap_cells:
+            elif ahead < jump and plane_id[y, x] < 0 and gap <= MERGING.gap_cells:
                 if plane_id[y, x] == -plane_id[i, j]:
                     statistics[p].plane_contact += 1
                 else:
@@ -136,9 +137,9 @@ def _count(
             if labels[v, u] == q and facing > MERGING.up_cos:
                 pairs[p, q].rests_on += 1
                 pairs[p, q].rests_on_height += height[v, u]
-        elif ahead >= DISCONTINUITY:
+        elif ahead >= jump:
             pairs[p, q].in_front += 1
-        elif ahead > -DISCONTINUITY and gap <= MERGING.gap_cells:
+        elif ahead > -jump and gap <= MERGING.gap_cells:
             pairs[p, q].near += 1
 
 

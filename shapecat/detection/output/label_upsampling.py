@@ -11,7 +11,7 @@ from shapecat.detection.connected_components import span_of
 from shapecat.detection.depth_grid import DepthGrid, row_and_column
 from shapecat.detection.planes.height_map import HEIGHT_NOISE, MIN_HEIGHT_M
 from shapecat.detection.records import Segmentation
-from shapecat.geometry import DISCONTINUITY, NEAREST_M
+from shapecat.geometry import NEAREST_M
 from shapecat.jit import kernel, unset
 
 __all__ = [
@@ -38,6 +38,7 @@ class GridLabels(NamedTuple):
     filled: U1
     planes: F8
     plane_ids: I4
+    discontinuity: float
 
 
 def label_pixels(depth: F4, grid: DepthGrid, found: Segmentation, *, range_m: float) -> list[U4]:
@@ -60,7 +61,12 @@ def label_pixels(depth: F4, grid: DepthGrid, found: Segmentation, *, range_m: fl
 def grid_labels_of(grid: DepthGrid, found: Segmentation) -> GridLabels:
     """Collect the fields that the kernels here read."""
     return GridLabels(
-        grid.inverse_depth, found.labels, found.filled, found.model.planes, found.plane_ids
+        grid.inverse_depth,
+        found.labels,
+        found.filled,
+        found.model.planes,
+        found.plane_ids,
+        grid.discontinuity,
     )
 
 
@@ -97,6 +103,7 @@ def _list_pixels(
     runs, n = np.zeros((4 * width, 3), np.int32), 0
     code, spans = _code_cells(grid_labels)
     far, shift, scale = np.float32(range_m), (factor - 1) * 0.5, 1.0 / factor
+    jump = np.float32(grid_labels.discontinuity)
     for i in range(rows):
         if spans[i, 0] == spans[i, 1]:
             continue
@@ -105,7 +112,7 @@ def _list_pixels(
         for y in range(i * factor, (i + 1) * factor if i + 1 < rows else height):
             if n + width > len(runs):
                 runs = np.concatenate((runs, np.zeros_like(runs)))
-            _mark(depth, wide_w, wide_code, (y, x0, x1), far, line)
+            _mark(depth, wide_w, wide_code, (y, x0, x1), far, jump, line)
             unsure = _find_unsure(line, x0, x1, cells)
             for m in range(unsure):
                 x = cells[1, m]
@@ -195,14 +202,14 @@ def _code_cells(grid_labels: GridLabels) -> tuple[I4, I4]:
     The code is the label of the cell if all these pixels have it, `UNSURE` if they may have it,
     `BARE` if the cell has none but a neighbour does, and 0 away from all labels.
     """
-    inv_depth, labels, filled, planes, plane_ids = grid_labels
+    inv_depth, labels, filled, planes, plane_ids, jump = grid_labels
     code, spans = unset(labels.shape, np.int16), np.zeros((len(labels), 2), np.int32)
     scratch = np.zeros(labels.shape[1] + 2, np.int16)
     high = np.zeros((len(planes), labels.shape[1]), np.uint8)
     for i in range(len(labels)):
         find_near(labels, i, scratch, code)
         spans[i, 0], spans[i, 1] = span_of(code[i])
-        _find_high(planes, inv_depth, i, spans[i], high)
+        _find_high(planes, inv_depth, np.float32(jump), i, spans[i], high)
         for j in range(np.uint64(spans[i, 0]), np.uint64(spans[i, 1])):
             label = labels[i, j]
             sure = filled[i, j] | high[np.uint32(plane_ids[np.uint16(label)]), j]
@@ -213,9 +220,9 @@ def _code_cells(grid_labels: GridLabels) -> tuple[I4, I4]:
 
 
 @kernel(inline=True)
-def _find_high(planes: F8, inv_depth: F4, i: int, span: I4, high: U1) -> None:
+def _find_high(planes: F8, inv_depth: F4, jump: float, i: int, span: I4, high: U1) -> None:
     """Write whether all pixels that fit a cell are above each plane, for a span of row i."""
-    jump, zero, nowhere = np.float32(DISCONTINUITY), np.float32(0), np.float32(1e-3)
+    zero, nowhere = np.float32(0), np.float32(1e-3)
     base = np.float32(CLEANUP.fringe * HEIGHT_NOISE)
     slope = np.float32(CLEANUP.fringe * MIN_HEIGHT_M)
     for k in range(len(planes)):
@@ -252,7 +259,13 @@ def _widen(
 
 @kernel(inline=True)
 def _mark(
-    depth: F4, inv_depth: F4, code: I4, run: tuple[int, int, int], range_m: float, marks: I4
+    depth: F4,
+    inv_depth: F4,
+    code: I4,
+    run: tuple[int, int, int],
+    range_m: float,
+    jump: float,
+    marks: I4,
 ) -> None:
     """Write the labels of a run of pixels, `UNSURE` where a closer test is needed.
 
@@ -265,7 +278,7 @@ def _mark(
         z = depth[y, x]
         fitting = code[x] if code[x] != bare else zero
         other = unsure if code[x] != zero else zero
-        mark = fitting if _fits(inv_depth[x], z) else other
+        mark = fitting if _fits(inv_depth[x], z, jump) else other
         marks[x] = mark if (z >= least) & (z <= range_m) else zero
 
 
@@ -282,14 +295,14 @@ def settle_labels(grid_labels: GridLabels, cells: I4, places: F8, n: int, marks:
     inv_depth, labels, filled = grid_labels.inverse_depth, grid_labels.labels, grid_labels.filled
     planes, plane_ids = grid_labels.planes, grid_labels.plane_ids
     rows, columns = inv_depth.shape
-    jump = np.float32(DISCONTINUITY)
+    jump = np.float32(grid_labels.discontinuity)
     for m in range(n):
         i, j = cells[0, m], cells[1, m]
         u, v, z = places[0, m], places[1, m], np.float32(places[2, m])
         marks[m] = 0
         if not abs(inv_depth[i, j] * z - np.float32(1)) < jump * z:
             # The neighbour whose depth fits best, if any is within two discontinuities.
-            row, column, nearest = -1, -1, np.float32(2 * DISCONTINUITY) * z
+            row, column, nearest = -1, -1, np.float32(2) * jump * z
             for y in range(max(i - 1, 0), min(i + 2, rows)):
                 for x in range(max(j - 1, 0), min(j + 2, columns)):
                     gap = abs(inv_depth[y, x] * z - np.float32(1))
@@ -309,6 +322,6 @@ def settle_labels(grid_labels: GridLabels, cells: I4, places: F8, n: int, marks:
 
 
 @kernel(inline=True)
-def _fits(inv_depth: float, z: float) -> bool:
-    """Return whether a depth is within a `DISCONTINUITY` of a cell; computed without a division."""
-    return bool(abs(inv_depth * z - np.float32(1)) < np.float32(DISCONTINUITY) * z)
+def _fits(inv_depth: float, z: float, jump: float) -> bool:
+    """Return whether a depth is within ``jump``, 1/m, of a cell; computed without a division."""
+    return bool(abs(inv_depth * z - np.float32(1)) < jump * z)

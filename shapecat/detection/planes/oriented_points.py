@@ -8,7 +8,6 @@ from shapecat.arrays import F4, F8
 from shapecat.detection.depth_grid import DepthGrid, PinholeIntrinsics
 from shapecat.detection.planes.ransac import DepthSamples
 from shapecat.detection.planes.settings import PLANES
-from shapecat.geometry import DISCONTINUITY
 from shapecat.jit import kernel
 
 __all__ = ["OrientedPoints", "level_samples", "orient_points"]
@@ -42,12 +41,14 @@ def orient_points(grid: DepthGrid) -> OrientedPoints:
     """Return every third sample, with its normal if its neighbours lie on a plane with it."""
     coarse = np.ascontiguousarray(grid.inverse_depth[FIRST::STRIDE, FIRST::STRIDE])
     normals, positions = np.zeros((2, 3, coarse.size), np.float32)
-    smooth = _orient(coarse, grid.intrinsics, normals, positions)
+    smooth = _orient(coarse, grid.intrinsics, grid.discontinuity, normals, positions)
     return OrientedPoints(coarse, normals, positions, smooth)
 
 
 @kernel
-def _orient(coarse: F4, intrinsics: PinholeIntrinsics, normals: F4, positions: F4) -> int:
+def _orient(
+    coarse: F4, intrinsics: PinholeIntrinsics, jump: float, normals: F4, positions: F4
+) -> int:
     """Write the normals and positions; return the number of points on smooth surface."""
     rows, columns = coarse.shape
     x = np.zeros(columns, np.float32)
@@ -56,17 +57,25 @@ def _orient(coarse: F4, intrinsics: PinholeIntrinsics, normals: F4, positions: F
     smooth = 0
     for r in range(1, rows - 1):
         y = np.float32((r * STRIDE + FIRST - intrinsics.cy) / intrinsics.fy)
-        smooth += _orient_row(coarse, r, y, x, (intrinsics.fx, intrinsics.fy), normals, positions)
+        focal = (intrinsics.fx, intrinsics.fy)
+        smooth += _orient_row(coarse, r, y, x, focal, np.float32(2 * jump), normals, positions)
     return smooth
 
 
 @kernel(fast=True, inner=True)
 def _orient_row(
-    coarse: F4, r: int, y: float, x: F4, focal: tuple[float, float], normals: F4, positions: F4
+    coarse: F4,
+    r: int,
+    y: float,
+    x: F4,
+    focal: tuple[float, float],
+    bend: float,
+    normals: F4,
+    positions: F4,
 ) -> int:
     """Write the points of a row; return the number on smooth surface. The loop vectorises."""
     zero, one, two = np.float32(0), np.float32(1), np.float32(2)
-    bend, count = np.float32(2 * DISCONTINUITY), np.int32(0)
+    count = np.int32(0)
     across, down = np.float32(focal[0] / (2 * STRIDE)), np.float32(focal[1] / (2 * STRIDE))
     above, here, below = coarse[r - 1], coarse[r], coarse[r + 1]
     row = slice(r * here.size, (r + 1) * here.size)

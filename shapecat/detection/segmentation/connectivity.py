@@ -14,7 +14,6 @@ from shapecat.detection.depth_grid import DepthGrid, PinholeIntrinsics
 from shapecat.detection.planes.height_map import HeightMap
 from shapecat.detection.segmentation.normals import fit_local_planes, padded
 from shapecat.detection.segmentation.settings import SEGMENTATION
-from shapecat.geometry import DISCONTINUITY
 from shapecat.jit import kernel, unset
 
 __all__ = ["SurfaceGraph", "connect_surfaces"]
@@ -61,15 +60,15 @@ class FlatGraph(NamedTuple):
 
 def connect_surfaces(grid: DepthGrid, heights: HeightMap) -> SurfaceGraph:
     """Fit local planes to the object cells, link them and measure concave angles."""
-    inv_depth, intrinsics, plane_id = grid.inverse_depth, grid.intrinsics, heights.plane_id
+    inv_depth, plane_id = grid.inverse_depth, heights.plane_id
     spans = spans_of(plane_id)
     columns = inv_depth.shape[1]
     local_plane, normal = _blank(spans, columns)
-    fit_local_planes(inv_depth, intrinsics, plane_id, spans, local_plane, normal)
+    fit_local_planes(grid, plane_id, spans, local_plane, normal)
     links = np.zeros(inv_depth.shape, np.uint8)
-    _link(inv_depth, plane_id, spans, local_plane, links)
+    _link(grid, plane_id, spans, local_plane, links)
     graph = SurfaceGraph(local_plane, normal, links, np.zeros(inv_depth.shape, np.uint8), spans)
-    _measure_concavity(inv_depth, intrinsics, graph)
+    _measure_concavity(grid, graph)
     return graph
 
 
@@ -92,8 +91,9 @@ def _blank(spans: I4, columns: int) -> F4:
 
 
 @kernel
-def _link(inv_depth: F4, plane_id: I4, spans: I4, local_plane: F4, links: U1) -> None:
+def _link(grid: DepthGrid, plane_id: I4, spans: I4, local_plane: F4, links: U1) -> None:
     """Link neighbours at similar depths, or where one lies on the local plane of the other."""
+    inv_depth, jump = grid.inverse_depth, np.float32(grid.discontinuity)
     rows, columns = inv_depth.shape
     depths, owners = inv_depth.reshape(-1), plane_id.reshape(-1)
     planes, bits = local_plane.reshape(-1), links.reshape(-1)
@@ -103,15 +103,15 @@ def _link(inv_depth: F4, plane_id: I4, spans: I4, local_plane: F4, links: U1) ->
             continue
         cell, fit = i * columns + start, 3 * i * columns + start
         run, right = (cell, fit, end - 1 - start), (1, 1, columns)
-        _link_some(owners, depths, planes, run, right, RIGHT, bits)
+        _link_some(owners, depths, planes, jump, run, right, RIGHT, bits)
         if i + 1 < rows:
             run, below = (cell, fit, end - start), (columns, 3 * columns, 2 * columns)
-            _link_some(owners, depths, planes, run, below, DOWN, bits)
-        _part_steps(inv_depth, plane_id, i, start, end, links)
+            _link_some(owners, depths, planes, jump, run, below, DOWN, bits)
+        _part_steps(grid, plane_id, i, start, end, links)
 
 
 @kernel(inline=True)
-def _part_steps(inv_depth: F4, plane_id: I4, i: int, start: int, end: int, links: U1) -> None:
+def _part_steps(grid: DepthGrid, plane_id: I4, i: int, start: int, end: int, links: U1) -> None:
     """Remove links that cross a step and are supported by a local plane only.
 
     At a step the readings change more from one cell to the next than before and after it. The
@@ -119,6 +119,7 @@ def _part_steps(inv_depth: F4, plane_id: I4, i: int, start: int, end: int, links
     with the can it stands on. At the edge of a surface seen at a grazing angle, only one side has
     the slope.
     """
+    inv_depth, jump = grid.inverse_depth, grid.discontinuity
     some = False
     for j in range(np.uint64(start), np.uint64(end)):
         some |= links[i, j] > (RIGHT | DOWN)  # few rows have any; this vectorises
@@ -139,7 +140,7 @@ def _part_steps(inv_depth: F4, plane_id: I4, i: int, start: int, end: int, links
             before = abs(step - (inv_depth[i, j] - inv_depth[i0, j0]) / REACH)
             after = abs(step - (inv_depth[i2, j2] - inv_depth[i1, j1]) / REACH)
             least, most = min(before, after), max(before, after)
-            if least >= SEGMENTATION.sure * DISCONTINUITY and most >= DISCONTINUITY:
+            if least >= SEGMENTATION.sure * jump and most >= jump:
                 links[i, j] &= ~bit
         links[i, j] &= RIGHT | DOWN
 
@@ -149,6 +150,7 @@ def _link_some(
     plane_id: I4,
     inv_depth: F4,
     planes: F4,
+    jump: float,
     run: tuple[int, int, int],
     steps: tuple[int, int, int],
     bit: int,
@@ -158,13 +160,14 @@ def _link_some(
 
     Parameters
     ----------
+    jump : step in inverse depth that separates two surfaces, 1/m.
     run : the index of its first cell, the index of that cell's local plane, and the number of
         cells.
     steps : index offsets from a cell to its neighbour, from its local plane to the neighbour's, and
         from the inverse depth of a local plane to its slope in that direction.
     bit : `RIGHT` or `DOWN`.
     """
-    zero, jump = np.float32(0), np.float32(DISCONTINUITY)
+    zero = np.float32(0)
     cell, fit, step = np.uint64(run[0]), np.uint64(run[1]), np.uint64(steps[0])
     along, slope = np.uint64(steps[1]), np.uint64(steps[2])
     for k in range(np.uint64(max(run[2], 0))):
@@ -180,8 +183,9 @@ def _link_some(
 
 
 @kernel
-def _measure_concavity(inv_depth: F4, intrinsics: PinholeIntrinsics, graph: SurfaceGraph) -> None:
+def _measure_concavity(grid: DepthGrid, graph: SurfaceGraph) -> None:
     """Write the largest concave angle between the surfaces on opposite sides of each cell."""
+    inv_depth, gate = grid.inverse_depth, np.float32(2 * grid.discontinuity)
     rows, columns = inv_depth.shape
     local_plane, concavity = graph.local_plane, graph.concavity
     flat = FlatGraph(inv_depth.reshape(-1), local_plane.reshape(-1), graph.normal.reshape(-1))
@@ -200,7 +204,7 @@ def _measure_concavity(inv_depth: F4, intrinsics: PinholeIntrinsics, graph: Surf
             last = min(padded(first, last), columns - abs(dj))
             if i - di >= 0 and i + di < rows and first < last:
                 cells, shift = (i, first, last, columns), (di, dj)
-                _raise_concavity(flat, intrinsics, cells, shift, gaps, chords, worst)
+                _raise_concavity(flat, grid.intrinsics, gate, cells, shift, gaps, chords, worst)
         _write_angles(local_plane[i, 0, start:end], worst[start:end], concavity[i, start:end])
 
 
@@ -208,6 +212,7 @@ def _measure_concavity(inv_depth: F4, intrinsics: PinholeIntrinsics, graph: Surf
 def _raise_concavity(
     flat: FlatGraph,
     intrinsics: PinholeIntrinsics,
+    gate: float,
     cells: tuple[int, int, int, int],
     shift: tuple[int, int],
     gaps: F4,
@@ -218,6 +223,7 @@ def _raise_concavity(
 
     Parameters
     ----------
+    gate : largest distance of both planes from the cell, 1/m.
     cells : the row, the first column, one after the last, and the number of columns.
     shift : offset, in rows and columns, from a cell to the normals that are compared, both ways.
     gaps, chords : (columns,) work space.
@@ -230,7 +236,7 @@ def _raise_concavity(
     """
     i, first, last, columns = cells
     di, dj = shift
-    zero, one, gate = np.float32(0), np.float32(1), np.float32(2 * DISCONTINUITY)
+    zero, one = np.float32(0), np.float32(1)
     per_x, per_y = np.float32(1 / intrinsics.fx), np.float32(1 / intrinsics.fy)
     y1, y2 = np.float32(i - di - intrinsics.cy) * per_y, np.float32(i + di - intrinsics.cy) * per_y
     x1 = np.float32(first - dj - intrinsics.cx) * per_x

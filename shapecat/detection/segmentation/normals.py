@@ -10,8 +10,9 @@ from typing import Any
 import numpy as np
 
 from shapecat.arrays import F4, I4
-from shapecat.detection.depth_grid import PinholeIntrinsics
+from shapecat.detection.depth_grid import DepthGrid, PinholeIntrinsics
 from shapecat.detection.segmentation.settings import SEGMENTATION
+from shapecat.geometry import DISCONTINUITY
 from shapecat.jit import kernel
 
 __all__ = ["fit_local_planes", "padded"]
@@ -30,14 +31,7 @@ PITCH = RUN + 2 * WINDOW
 
 
 @kernel
-def fit_local_planes(
-    inv_depth: F4,
-    intrinsics: PinholeIntrinsics,
-    plane_id: I4,
-    spans: I4,
-    local_plane: F4,
-    normal: F4,
-) -> None:
+def fit_local_planes(grid: DepthGrid, plane_id: I4, spans: I4, local_plane: F4, normal: F4) -> None:
     """Write the local planes and normals of the object cells, as in `SurfaceGraph`.
 
     A plane is fitted to those of 25 cells, in a checkerboard pattern, that are above the same
@@ -45,21 +39,21 @@ def fit_local_planes(
 
     Parameters
     ----------
-    inv_depth, plane_id : (rows, columns) inverse depth, 1/m, and as in `HeightMap`.
+    plane_id : (rows, columns) as in `HeightMap`.
     spans : (rows, 2) first column of the object cells of each row, and one after the last.
     local_plane, normal : (rows, 3, columns), written in place.
     """
     values = np.zeros(SIDE * PITCH, np.float32)
     fits = np.zeros(6 * PITCH, np.float32)
-    depths, owners = inv_depth.reshape(-1), plane_id.reshape(-1)
+    depths, owners = grid.inverse_depth.reshape(-1), plane_id.reshape(-1)
     planes, normals = local_plane.reshape(-1), normal.reshape(-1)
-    shape = inv_depth.shape
+    shape, wider = plane_id.shape, np.float32(grid.discontinuity / DISCONTINUITY)
     for i in range(shape[0]):
         end, last = np.int64(spans[i, 0]), np.int64(spans[i, 1])
         while end < last:
             start, end = _next_run(owners, i * shape[1], end, last)
             _copy_windows(depths, owners, shape, (i, start, end), values)
-            _fit_run(values, intrinsics, i, start, padded(start, end) - start, fits)
+            _fit_run(values, grid.intrinsics, wider, i, start, padded(start, end) - start, fits)
             _write(fits, planes, normals, 3 * i * shape[1] + start, shape[1], end - start)
 
 
@@ -130,19 +124,22 @@ def _copy_windows(
 
 @kernel(fast=True, inner=True)
 def _fit_run(
-    values: F4, intrinsics: PinholeIntrinsics, i: int, start: int, n: int, fits: F4
+    values: F4,
+    intrinsics: PinholeIntrinsics,
+    wider: float,
+    i: int,
+    start: int,
+    n: int,
+    fits: F4,
 ) -> None:
-    """Fit planes to the windows of ``n`` cells from (i, ``start``) on.
+    """Fit planes to the windows of ``n`` cells from (i, ``start``) on; gates are ``wider`` times.
 
     The rows of ``fits`` are inverse depth, its change per column and per row, and the normal (3);
     0 where there is no fit.
     """
     zero, one = np.float32(0), np.float32(1)
-    g0, g1 = np.float32(SEGMENTATION.gate), np.float32(SEGMENTATION.gate + SEGMENTATION.gate_slope)
-    g2, g3 = (
-        np.float32(SEGMENTATION.gate + SEGMENTATION.gate_slope * 2),
-        np.float32(SEGMENTATION.gate + SEGMENTATION.gate_slope * 3),
-    )
+    g0, slope = wider * np.float32(SEGMENTATION.gate), wider * np.float32(SEGMENTATION.gate_slope)
+    g1, g2, g3 = g0 + slope, g0 + np.float32(2) * slope, g0 + np.float32(3) * slope
     least, spread = np.float32(SEGMENTATION.fewest_samples), np.float32(SEGMENTATION.least_spread)
     fx, fy, y = np.float32(intrinsics.fx), np.float32(intrinsics.fy), np.float32(i - intrinsics.cy)
     for k in range(n):

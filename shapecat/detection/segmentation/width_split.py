@@ -16,7 +16,6 @@ from shapecat.detection.planes.height_map import HeightMap
 from shapecat.detection.segmentation.connectivity import SurfaceGraph
 from shapecat.detection.segmentation.settings import SEGMENTATION
 from shapecat.detection.segmentation.watershed import relabel_above
-from shapecat.geometry import DISCONTINUITY
 from shapecat.jit import kernel
 
 __all__ = ["split_at_width_changes"]
@@ -179,6 +178,6 @@ def _is_free(grid: DepthGrid, at: int, sign: float, side: F8) -> bool:
         x = j + round(sign * step * side[0] / across)
         if y < 0 or x < 0 or y >= rows or x >= columns:
             return False
-        if inv_depth[y, x] - inv_depth[i, j] > DISCONTINUITY:
+        if inv_depth[y, x] - inv_depth[i, j] > grid.discontinuity:
             return False
     return True
