@@ -230,6 +230,20 @@ def only_key(pattern: str) -> str:
     return source.key
 
 
+def test_names_in_a_bucket_cannot_leave_the_folder(tmp_path: Path) -> None:
+    """A bucket is not trusted: its keys may contain ``..``."""
+    with fsspec.open("memory://hostile/bag/metadata.yaml", "wb") as file:
+        file.write(b"files: []")
+    store = fsspec.filesystem("memory").store
+    store["/hostile/bag/../../evil"] = store["/hostile/bag/metadata.yaml"]
+    try:
+        with pytest.raises(RecordingError, match=r"leads out of the folder"):
+            Location("memory://hostile/bag", RecordingError).download(tmp_path / "in" / "bag")
+    finally:
+        del store["/hostile/bag/../../evil"]
+    assert not (tmp_path / "evil").exists()
+
+
 def test_bag_in_bucket_is_processed(shapecat: Run, bucket: Path, tmp_path: Path) -> None:
     bag = record(tmp_path / "bag", 4, container="ros2")
     for file in bag.iterdir():

@@ -158,7 +158,8 @@ class Location:
 
         Raises
         ------
-        ShapecatError : the file does not exist, or the transfer failed.
+        ShapecatError : the file does not exist, the transfer failed, or the name of a file leads
+            out of the folder.
         """
 
         def get(source: str, file: Path) -> None:  # `get` would take some names for patterns
@@ -169,7 +170,11 @@ class Location:
             if not self._tried("downloaded", lambda: self._system.isdir(self._path)):
                 self._tried("downloaded", lambda: get(self._path, target))
             for info in self._list(deep=True) if not target.exists() else ():
-                file = target / PurePosixPath(info["name"]).relative_to(self._path)
+                name = PurePosixPath(info["name"]).relative_to(self._path)
+                if ".." in name.parts:
+                    msg = f"{self.url}: the name {str(name)!r} leads out of the folder"
+                    raise self._error(msg)
+                file = target / name
                 self._tried("downloaded", partial(get, info["name"], file))
         if not target.exists():
             msg = f"{self.url}: does not exist"
