@@ -24,7 +24,7 @@ from shapecat.perception import perceive
 from shapecat.simulation import PlacedObject, render_frame
 from shapecat.simulation.paths import Filming
 from shapecat.simulation.piles import bin_picking, pile, shelf_bin
-from shapecat.simulation.sensors import PRESETS
+from shapecat.simulation.presets import PRESETS
 from shapecat.types import CATEGORIES, Detection
 
 Array = NDArray[Any]

@@ -21,7 +21,7 @@ from shapecat.evaluation.overlap import MATCHED_F, match_masks
 from shapecat.learning import Categorizer, load_model
 from shapecat.perception import perceive
 from shapecat.simulation import make_scene, render_frame
-from shapecat.simulation.sensors import PRESETS
+from shapecat.simulation.presets import PRESETS
 from shapecat.simulation.worlds import FIRST_OBJECT_LABEL
 
 Array = NDArray[Any]

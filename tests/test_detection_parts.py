@@ -107,7 +107,7 @@ def test_objects_are_oversegmented_without_learned_merging(seed: int) -> None:
 
 @pytest.mark.many
 def test_training_pairs_do_not_depend_on_the_number_of_processes() -> None:
-    one, two = (collect(SCENES, 1.0, jobs) for jobs in (1, 2))
+    one, two = (collect(SCENES, jobs) for jobs in (1, 2))
     assert np.array_equal(one.features, two.features)
     assert np.array_equal(one.same, two.same)
     assert 0.05 < one.same.mean() < 0.95

@@ -17,7 +17,7 @@ from shapecat.simulation.furniture import make_table
 from shapecat.simulation.layout import Layout, Piece, make_piece
 from shapecat.simulation.paths import Filming, arc_orbit
 from shapecat.simulation.placement import StablePose
-from shapecat.simulation.sensors import KINECT
+from shapecat.simulation.presets import KINECT
 from shapecat.types import CATEGORIES, Pose
 
 Run = Callable[..., Result]

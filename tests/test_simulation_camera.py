@@ -10,10 +10,11 @@ from shapecat.arrays import F8
 from shapecat.simulation.measuring import measure
 from shapecat.simulation.mesh import Mesh
 from shapecat.simulation.paths import looking_at
+from shapecat.simulation.presets import IDEAL, KINECT, PRESETS, REALSENSE
 from shapecat.simulation.primitives import lathe, rounded_box
 from shapecat.simulation.render import Geometry, Image, alone_pixels, cropped, geometry, render
 from shapecat.simulation.scenes import make_scene
-from shapecat.simulation.sensors import IDEAL, KINECT, PRESETS, REALSENSE, Sensor, resized
+from shapecat.simulation.sensors import Sensor, resized
 from shapecat.types import Camera, Pose
 
 HERE = Pose(np.eye(3), np.zeros(3))

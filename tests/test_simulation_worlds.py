@@ -19,11 +19,11 @@ from shapecat.errors import OutputError
 from shapecat.geometry import compose, inverse, rotation_from_quaternion, transform
 from shapecat.simulation import World, make_piece, make_scene, make_stage, render_frame, simulate
 from shapecat.simulation.mesh import Mesh
+from shapecat.simulation.presets import IDEAL, KINECT
 from shapecat.simulation.recorder import EPOCH_NS, robot_links
 from shapecat.simulation.render import geometry, render
 from shapecat.simulation.scans import load_mesh, upright_poses, uprighted
 from shapecat.simulation.scenes import SceneKind
-from shapecat.simulation.sensors import IDEAL, KINECT
 from shapecat.types import CATEGORIES, Camera, Pose
 
 SETTLED = {"pile", "bin", "shelf_bin", "room"}  # with physics: objects touch and lie in each other

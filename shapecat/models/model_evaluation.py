@@ -29,7 +29,7 @@ from shapecat.models.sets import (
 )
 from shapecat.models.worlds import WorldView, simulate_views, simulate_world
 from shapecat.simulation.distractors import DISTRACTORS
-from shapecat.simulation.sensors import PRESETS
+from shapecat.simulation.presets import PRESETS
 from shapecat.types import UNKNOWN
 
 __all__ = ["evaluate_model"]

@@ -32,8 +32,8 @@ from shapecat.detection.pipeline import Task, oversegment
 from shapecat.models.growing import Growth, collect_chunks, grow, growing_options
 from shapecat.models.viewpoints import random_viewpoint
 from shapecat.simulation import KINECT, REALSENSE, make_scene, render_frame
+from shapecat.simulation.presets import IDEAL, PRESETS
 from shapecat.simulation.scenes import SceneKind
-from shapecat.simulation.sensors import IDEAL, PRESETS
 from shapecat.trees import write_trees
 from shapecat.types import CATEGORIES, Camera
 
@@ -92,22 +92,17 @@ class Pairs(NamedTuple):
 
 
 @click.command()
-@click.option("--share", default=1.0, show_default=True, help="Fraction of the scenes to use.")
 @growing_options(Path(learned.__file__).with_name(learned.FILE))
-def main(*, share: float, seed: int, jobs: int, out: Path) -> None:
+def main(*, seed: int, jobs: int, out: Path) -> None:
     """Train the trees that decide which segments to merge, on simulated scenes."""
-    pairs = collect(_SERIES, share, jobs)
+    pairs = collect(_SERIES, jobs)
     write_trees(out, grow(*pairs, _GROWTH, seed), PAIR_FEATURES)
     click.echo(f"{len(pairs.same)} pairs, {pairs.same.mean():.0%} of one object; {out}")
 
 
-def collect(scenes: Sequence[Series], share: float, jobs: int) -> Pairs:
-    """Return the pairs of segments of a fraction of the scenes.
-
-    The number of jobs does not affect the result.
-    """
-    fewer = (series._replace(scenes=round(series.scenes * share)) for series in scenes)
-    both = collect_chunks(_collect, fewer, _CHUNK, jobs)
+def collect(scenes: Sequence[Series], jobs: int) -> Pairs:
+    """Return the pairs of segments of the scenes, whatever the number of jobs."""
+    both = collect_chunks(_collect, scenes, _CHUNK, jobs)
     return Pairs(np.concatenate([p.features for p in both]), np.concatenate([p.same for p in both]))
 
 

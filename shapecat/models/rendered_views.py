@@ -9,8 +9,9 @@ from shapecat.arrays import F8, I4
 from shapecat.models.arrangements import Arrangement
 from shapecat.simulation.measuring import measure
 from shapecat.simulation.paths import looking_at
+from shapecat.simulation.presets import PRESETS
 from shapecat.simulation.render import Geometry, render
-from shapecat.simulation.sensors import PRESETS, Sensor, interpolated, resized
+from shapecat.simulation.sensors import Sensor, interpolated, resized
 from shapecat.types import Camera, Frame, Pose
 
 __all__ = ["RenderedView", "render_view"]

@@ -35,8 +35,9 @@ from shapecat.models.viewpoints import move_to_floor, random_viewpoint
 from shapecat.simulation import make_scene, render_frame
 from shapecat.simulation.equipment import make_own_arms, make_resting_arms
 from shapecat.simulation.furniture import EQUIPMENT, make_rack, make_tote
+from shapecat.simulation.presets import PRESETS
 from shapecat.simulation.scenes import SceneKind
-from shapecat.simulation.sensors import PRESETS, resized
+from shapecat.simulation.sensors import resized
 from shapecat.simulation.worlds import Support, World
 from shapecat.trees import BoostedTrees, write_trees
 from shapecat.types import Camera, Frame, Pose

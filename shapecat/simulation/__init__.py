@@ -5,9 +5,10 @@ The seed alone determines the result, on every machine.
 
 from shapecat.simulation.layout import Piece, make_piece
 from shapecat.simulation.measuring import measure
+from shapecat.simulation.presets import IDEAL, KINECT, REALSENSE
 from shapecat.simulation.recorder import record, simulate
 from shapecat.simulation.scenes import make_scene, make_stage
-from shapecat.simulation.sensors import IDEAL, KINECT, REALSENSE, Sensor
+from shapecat.simulation.sensors import Sensor
 from shapecat.simulation.views import render_frame
 from shapecat.simulation.worlds import PlacedObject, Support, World
 

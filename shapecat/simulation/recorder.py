@@ -15,8 +15,9 @@ from shapecat.errors import OutputError
 from shapecat.geometry import compose, inverse
 from shapecat.simulation.colour_camera import COLOUR, jpeg, render_colour
 from shapecat.simulation.containers import CONTAINERS, Container
+from shapecat.simulation.presets import SENSORS
 from shapecat.simulation.scenes import SceneKind, make_scene
-from shapecat.simulation.sensors import SENSORS, Sensor
+from shapecat.simulation.sensors import Sensor
 from shapecat.simulation.truth import frame_truth
 from shapecat.simulation.views import render_frame
 from shapecat.simulation.worlds import World

@@ -5,8 +5,9 @@ from numpy.random import Generator
 
 from shapecat.arrays import U1
 from shapecat.simulation.measuring import measure
+from shapecat.simulation.presets import KINECT
 from shapecat.simulation.render import render
-from shapecat.simulation.sensors import KINECT, Sensor
+from shapecat.simulation.sensors import Sensor
 from shapecat.simulation.worlds import World
 from shapecat.types import Frame, Pose
 
