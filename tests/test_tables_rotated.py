@@ -177,9 +177,10 @@ def test_tracker_reads_boxes_in_fixed_frame(run: Path) -> None:
 
     assert [frame.frame for frame in found] == list(range(FRAMES))
     for k, frame in enumerate(found):
-        assert frame.axes is not None
+        assert frame.orientations is not None
+        axes = Rotation.from_quat(frame.orientations).as_matrix()
         assert_allclose(frame.centers, CENTERS, atol=1e-5)
-        assert_allclose(frame.axes, np.tile(AXES.as_matrix(), (3, 1, 1)), atol=1e-5)
+        assert_allclose(axes, np.tile(AXES.as_matrix(), (3, 1, 1)), atol=1e-5)
         assert frame.partial.tolist() == [PARTIAL[k], False, False]
         assert_allclose(frame.posteriors, POSTERIORS[k % 2], atol=1e-6)
         assert_allclose(frame.novelties, NOVELTIES[k], rtol=1e-6)

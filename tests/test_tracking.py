@@ -55,7 +55,7 @@ def frame(
         np.broadcast_to(posterior, (n, 2)),
         np.zeros(n),
         np.full(n, 0.5),
-        np.broadcast_to(np.eye(3), (n, 3, 3)),
+        np.broadcast_to((0, 0, 0, 1), (n, 4)),
     )
 
 

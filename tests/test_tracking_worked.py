@@ -38,7 +38,7 @@ def frame(k: int, centers: Any, **changes: Any) -> FrameDetections:
         np.broadcast_to((0.8, 0.2), (n, 2)),
         np.zeros(n),
         np.full(n, 0.5),
-        np.broadcast_to(np.eye(3), (n, 3, 3)),
+        np.broadcast_to((0, 0, 0, 1), (n, 4)),
     )
     return replace(found, **changes)
 
@@ -311,33 +311,32 @@ def turned_hits() -> Hits:
     """Return two detections in one frame whose boxes have different yaws."""
     other = Rotation.from_euler("z", 0.5).as_matrix() @ TURNED
     places = [[0.31, -0.12, 0.83], [0.42, -0.05, 0.79]]
-    sizes, axes = np.array([[0.12, 0.05, 0.2], [0.07, 0.16, 0.09]]), np.stack([TURNED, other])
-    return next(gather([frame(0, places, sizes=sizes, axes=axes), frame(1, [])]))
+    sizes = np.array([[0.12, 0.05, 0.2], [0.07, 0.16, 0.09]])
+    turns = Rotation.from_matrix(np.stack([TURNED, other])).as_quat()
+    return next(gather([frame(0, places, sizes=sizes, orientations=turns), frame(1, [])]))
 
 
 def test_joint_box_encloses_corners_of_both_pieces() -> None:
     """Along the axes of the first: longer side, shorter side, height."""
     hits = turned_hits()
     signs = np.array(np.meshgrid(*[[-0.5, 0.5]] * 3)).reshape(3, -1).T
-    assert hits.axes is not None
+    axes = hits.axes(slice(None))
     corners = [
-        hits.centers[k] + (signs * hits.sizes[k]) @ hits.axes[k].T for k in range(2)
+        hits.centers[k] + (signs * hits.sizes[k]) @ axes[k].T for k in range(2)
     ]  # of either box
     for i, j in ((0, 1), (1, 0)):
-        lengths = np.ptp(np.concatenate(corners) @ hits.axes[i], axis=0)
+        lengths = np.ptp(np.concatenate(corners) @ axes[i], axis=0)
         expected = [*sorted(lengths[:2], reverse=True), lengths[2]]
-        assert_allclose(_joint(hits, hits.axes, np.array([[i, j]])), [expected], rtol=1e-6)
+        assert_allclose(_joint(hits, np.array([[i, j]])), [expected], rtol=1e-6)
 
 
 def test_pieces_fit_into_whole_that_neither_fills() -> None:
     hits = turned_hits()
-    axes = hits.axes
-    assert axes is not None
     pair = np.array([[0, 1]])
-    both = np.minimum(*(_joint(hits, axes, each) for each in (pair, pair[:, ::-1])))[0]
+    both = np.minimum(*(_joint(hits, each) for each in (pair, pair[:, ::-1])))[0]
 
     def fits(whole: F8, other: F8) -> bool:
-        return bool(fit_pieces(hits, axes, pair, np.array([[whole, other]]))[0])
+        return bool(fit_pieces(hits, pair, np.array([[whole, other]]))[0])
 
     nothing = np.zeros(3)
     assert fits(both, nothing)
@@ -381,10 +380,10 @@ def test_change_of_tracks_is_their_overlap() -> None:
 
 def test_point_in_box_is_tested_along_axes_of_box() -> None:
     hits = turned_hits()
-    assert hits.axes is not None
+    (axes,) = hits.axes(slice(1))
     offsets = np.array([0.0599, -0.0249, 0.0999]) * [1, -1, -1]
-    inside = hits.centers[0] + hits.axes[0] @ offsets
-    outside = [hits.centers[0] + hits.axes[0] @ (offsets * k) for k in np.eye(3) * 0.01 + 1]
+    inside = hits.centers[0] + axes @ offsets
+    outside = [hits.centers[0] + axes @ (offsets * k) for k in np.eye(3) * 0.01 + 1]
 
     assert _in_box(hits, np.array([0]), inside[None]).tolist() == [True]
     assert _in_box(hits, np.zeros(3, int), np.array(outside)).tolist() == [False] * 3
@@ -394,7 +393,9 @@ def test_point_in_box_is_tested_along_axes_of_box() -> None:
 
 
 def test_level_frame_is_upright_and_right_handed() -> None:
-    level = _level(np.stack([TURNED, Rotation.from_euler("x", 0.02).as_matrix() @ TURNED]))
+    turns = np.stack([TURNED, Rotation.from_euler("x", 0.02).as_matrix() @ TURNED])
+    orientations = Rotation.from_matrix(turns).as_quat()
+    level = _level(next(gather([frame(0, np.zeros((2, 3)), orientations=orientations)])))
 
     assert_allclose(level @ level.T, np.eye(3), atol=1e-12)
     assert np.linalg.det(level) == pytest.approx(1)
@@ -403,7 +404,8 @@ def test_level_frame_is_upright_and_right_handed() -> None:
 
 def test_rotation_in_plane_is_rotation_about_up() -> None:
     """It must move points in the plane and keep their heights."""
-    level = _level(TURNED[None])
+    turned = Rotation.from_matrix(TURNED[None]).as_quat()
+    level = _level(next(gather([frame(0, [0.1, 0.2, 0.9], orientations=turned)])))
     turn, shift = np.exp(1j * np.array([0.4, -1.1])), np.array([0.3 - 0.2j, 0.05 + 0.7j])
     motion = _in_space(level, turn, shift)
     points = np.random.default_rng(5).normal(size=(7, 3))
@@ -417,8 +419,8 @@ def test_rotation_in_plane_is_rotation_about_up() -> None:
         alone = CommonMotion(motion.rotations[k : k + 1], motion.translations[k : k + 1])
         back = alone.still(next(gather([frame(0, points)])))
         assert_allclose(back.centers, expected, atol=1e-6)  # kept in single precision
-        assert back.axes is not None
-        assert_allclose(back.axes, np.broadcast_to(motion.rotations[k], (7, 3, 3)))
+        turns = np.broadcast_to(motion.rotations[k], (7, 3, 3))
+        assert_allclose(back.axes(slice(None)), turns, atol=1e-6)
 
 
 def test_rotation_and_shift_are_fitted_per_frame() -> None:

@@ -131,13 +131,19 @@ def _read_frames(folder: Path, categories: int, fixed: set[str]) -> Iterator[Fra
     wanted = ["topic", "frame", "stamp_ns", "fixed_rotation"]
     for frames, detections in read_together(folder, {"frames": wanted, "detections": _COLUMNS}):
         rows, columns = frame_rows(detections), _columns_of(detections, categories)
-        for frame in frames.to_pylist():
+        seen = frames.to_pylist()
+        turns = np.tile(_NO_TURN, (detections.num_rows, 1))
+        for frame in seen:
+            if frame["topic"] in fixed and frame["fixed_rotation"] is not None:
+                of_frame = rows.get((frame["topic"], frame["frame"]), slice(0, 0))
+                turns[of_frame] = frame["fixed_rotation"]
+        columns["orientation"] = _turned(columns["orientation"], turns.reshape(-1, 3, 3))
+        for frame in seen:
             of_frame = rows.get((frame["topic"], frame["frame"]), slice(0, 0))
             here = {name: values[of_frame] for name, values in columns.items()}
             if frame["topic"] in fixed:
                 placed = ~np.isnan(here["center_fixed"][:, 0])
                 here = {name: values[placed] for name, values in here.items()}
-            turn = frame["fixed_rotation"] if frame["topic"] in fixed else None
             yield FrameDetections(
                 topic=frame["topic"],
                 frame=frame["frame"],
@@ -148,7 +154,7 @@ def _read_frames(folder: Path, categories: int, fixed: set[str]) -> Iterator[Fra
                 posteriors=here["posterior"],
                 partial=here["partial"],
                 novelties=here["novelty"],
-                axes=np.reshape(turn or _NO_TURN, (3, 3)) @ here["axes"],
+                orientations=here["orientation"],
                 described=here["described"],
             )
 
@@ -159,8 +165,6 @@ def _columns_of(table: pa.Table, categories: int) -> dict[str, Any]:
     widths = {"center": 3, "size": 3, "orientation": 4, "posterior": categories}
     for name, width in widths.items():
         columns[name] = numbers(table[name]).reshape(-1, width)
-    turns = columns.pop("orientation")
-    columns["axes"] = Rotation.from_quat(turns).as_matrix() if len(turns) else np.zeros((0, 3, 3))
     first = table["reused_from"].combine_chunks()
     columns["described"] = np.where(first.is_null(), table["frame"], first.fill_null(0))
     columns["center_fixed"] = numbers_or_nan(table["center_fixed"]).astype(np.float64)
@@ -168,6 +172,13 @@ def _columns_of(table: pa.Table, categories: int) -> dict[str, Any]:
         *(table[n].to_numpy() for n in ("touches_border", "occluded"))
     )
     return columns
+
+
+def _turned(orientations: F4, turns: F8) -> F8:
+    """Return quaternions (n, 4) turned by rotation matrices (n, 3, 3)."""
+    if not len(orientations):
+        return np.zeros((0, 4))
+    return np.asarray((Rotation.from_matrix(turns) * Rotation.from_quat(orientations)).as_quat())
 
 
 def _streams_with_poses(folder: Path) -> set[str]:

@@ -6,6 +6,7 @@ from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.spatial.transform import Rotation
 
 from shapecat.arrays import F8, I4
 from shapecat.tracking.hits import Hits
@@ -38,14 +39,15 @@ class CommonMotion:
     def still(self, hits: Hits) -> Hits:
         """Return the detections transformed into the coordinate frame of the still objects."""
         centers = np.zeros(hits.centers.shape)
-        axes = None if hits.axes is None else np.zeros(hits.axes.shape, np.float32)
+        orientations = None if hits.orientations is None else np.zeros_like(hits.orientations)
         for block in hits.blocks():
             turns = self.rotations[hits.rows[block]]
             shifts = self.translations[hits.rows[block]]
             centers[block] = np.einsum("nij,nj->ni", turns, hits.centers[block]) + shifts
-            if axes is not None and hits.axes is not None:
-                axes[block] = turns @ hits.axes[block]
-        return replace(hits, centers=centers, axes=axes)
+            if orientations is not None:
+                turned = Rotation.from_matrix(turns @ hits.axes(block))
+                orientations[block] = turned.as_quat()
+        return replace(hits, centers=centers, orientations=orientations)
 
     def moved(self, rows: I4, places: F8) -> F8:
         """Transform positions (k, 3), metres, from the still scene into frames ``rows`` (k,)."""
@@ -77,14 +79,14 @@ def find_common_motion(hits: Hits, members: Sequence[I4]) -> CommonMotion | None
     neighbouring frames. Outliers get less weight (Cauchy).
     """
     long = [member for member in members if len(member) >= _LONG]
-    if hits.axes is None or len(long) < 3:
+    if hits.orientations is None or len(long) < 3:
         return None
     lengths = [len(member) for member in long]
     moved = [_extent(hits.centers[member]) > _MOVED_M for member in long]
     if np.average(moved, weights=lengths) < _MOST:
         return None
     which, owner = np.concatenate(long), np.repeat(np.arange(len(long)), lengths)
-    level = _level(hits.axes)
+    level = _level(hits)
     local = hits.centers[which] @ level.T
     plane = local[:, 0] + 1j * local[:, 1]
     rows, count = hits.rows[which], len(hits.stamps_ns)
@@ -108,9 +110,9 @@ def _extent(centers: F8) -> float:
     return float(np.linalg.norm(high - low))
 
 
-def _level(axes: F8) -> F8:
-    """Return the rotation (3, 3) into a frame whose z axis is the mean up of boxes (n, 3, 3)."""
-    up = axes[:, :, 2].mean(axis=0, dtype=np.float64)
+def _level(hits: Hits) -> F8:
+    """Return the rotation (3, 3) into a frame whose z axis is the mean up of the boxes."""
+    up = np.sum([hits.axes(block)[:, :, 2].sum(axis=0) for block in hits.blocks()], axis=0)
     first = np.cross(up, np.eye(3)[np.argmin(np.abs(up))])
     first /= np.linalg.norm(first)
     up /= np.linalg.norm(up)

@@ -6,6 +6,7 @@ from heapq import merge
 from typing import Any, Self
 
 import numpy as np
+from scipy.spatial.transform import Rotation
 
 from shapecat.arrays import F4, F8, I4, Bool
 from shapecat.tracking.fusion import view_weights
@@ -24,7 +25,7 @@ _OF_HITS: dict[str, tuple[str, tuple[Any, ...]]] = {
     "posteriors": ("f4", ("c",)),
     "partial": ("?", ()),
     "novelties": ("f4", ()),
-    "axes": ("f4", (3, 3)),
+    "orientations": ("f4", (4,)),
     "described": ("i4", ()),
 }
 
@@ -33,7 +34,7 @@ _OF_HITS: dict[str, tuple[str, tuple[Any, ...]]] = {
 class Hits:
     """All detections of a stream, called hits, in the order of the frames.
 
-    A hit takes only about 110 bytes, as the hits of many hours are kept at once.
+    A hit takes only about 90 bytes, as the hits of many hours are kept at once.
 
     Attributes
     ----------
@@ -43,7 +44,7 @@ class Hits:
     rows : (n,) index of the frame of each hit, ascending.
     numbers, centers, sizes, posteriors, partial, novelties, described : (n, ...) as ``detections``
         and the other columns in `FrameDetections`.
-    axes : (n, 3, 3) axes of the boxes; None if some hits have no axes.
+    orientations : (n, 4) quaternions (x, y, z, w) of the boxes; None if some hits have none.
     """
 
     names: tuple[str, ...]
@@ -58,12 +59,19 @@ class Hits:
     posteriors: F4
     partial: Bool
     novelties: F4
-    axes: F4 | None
+    orientations: F4 | None
     described: I4
 
     def without_boxes(self) -> Self:
-        """Return the hits without sizes and axes, which tracks do not need."""
-        return replace(self, sizes=np.zeros((0, 3), np.float32), axes=None)
+        """Return the hits without sizes and orientations, which tracks do not need."""
+        return replace(self, sizes=np.zeros((0, 3), np.float32), orientations=None)
+
+    def axes(self, which: I4 | slice) -> F8:
+        """Return the axes (k, 3, 3) of the boxes of hits ``which``, as columns."""
+        some = None if self.orientations is None else self.orientations[which]
+        if some is None or len(some) == 0:
+            return np.zeros((0, 3, 3))
+        return np.asarray(Rotation.from_quat(some).as_matrix())
 
     def blocks(self) -> Iterator[slice]:
         """Yield slices of hits that cover all frames in order, never dividing a frame."""

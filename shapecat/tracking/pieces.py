@@ -7,7 +7,7 @@ from functools import cache, partial
 import numpy as np
 from scipy.spatial import cKDTree
 
-from shapecat.arrays import F4, F8, I4, Bool
+from shapecat.arrays import F8, I4, Bool
 from shapecat.tracking.association import sorted_sides
 from shapecat.tracking.hits import Hits
 
@@ -42,9 +42,9 @@ def join_pieces(hits: Hits, members: Sequence[I4]) -> list[I4]:
     -------
     The hits (k,) of each object, ascending, in the order of their first track.
     """
-    if hits.axes is None or len(members) < 2:
+    if hits.orientations is None or len(members) < 2:
         return list(members)
-    counts = _count_fits(hits, hits.axes, members)
+    counts = _count_fits(hits, members)
     root = np.arange(len(members))
     for (a, b), count in sorted((+counts).items(), key=lambda item: (-item[1], item[0])):
         common = np.intersect1d(hits.rows[members[a]], hits.rows[members[b]]).size
@@ -54,14 +54,14 @@ def join_pieces(hits: Hits, members: Sequence[I4]) -> list[I4]:
     return [_largest(hits, np.concatenate(group)) for group in groups]
 
 
-def _count_fits(hits: Hits, axes: F4, members: Sequence[I4]) -> Counter[tuple[int, int]]:
+def _count_fits(hits: Hits, members: Sequence[I4]) -> Counter[tuple[int, int]]:
     """Return the number of frames in which two tracks are pieces of one object, for each pair."""
     owner, counts = hits.owners(members), Counter[tuple[int, int]]()
     rooms = _Rooms(hits, members)
     for block in hits.blocks():
         pairs = _neighbours(hits, owner, block)
         duos, which = np.unique(np.sort(owner[pairs], axis=1), axis=0, return_inverse=True)
-        fits = _fit(hits, axes, pairs, rooms.of(pairs, owner, duos, which.ravel()))
+        fits = _fit(hits, pairs, rooms.of(pairs, owner, duos, which.ravel()))
         fitting = np.bincount(which.ravel()[fits], minlength=len(duos))
         counts.update(dict(zip(map(tuple, duos.tolist()), fitting.tolist(), strict=True)))
     return counts
@@ -146,14 +146,14 @@ def _changes(hits: Hits, members: Sequence[I4], duos: I4) -> F8:
     return np.where(within, np.inf, share)
 
 
-def _fit(hits: Hits, axes: F4, pairs: I4, wholes: F8) -> Bool:
+def _fit(hits: Hits, pairs: I4, wholes: F8) -> Bool:
     """Return the mask (p,) of pairs of hits (p, 2) that are pieces of one object.
 
     ``wholes`` (p, 2, 3) are the lengths of the whole object from either track. The joint box of two
     pieces is no larger than the whole object, and neither piece is as large as the whole object, as
     a bowl with an object in it would be.
     """
-    joint = np.minimum(_joint(hits, axes, pairs), _joint(hits, axes, pairs[:, ::-1]))
+    joint = np.minimum(_joint(hits, pairs), _joint(hits, pairs[:, ::-1]))
     lengths = sorted_sides(hits.sizes[pairs.ravel()]).reshape(-1, 2, 3)
     room = wholes * _SLACK + _SLACK_M
     lacking = np.any(lengths.max(axis=1)[:, None] < _LACKING * wholes, axis=2)
@@ -161,10 +161,10 @@ def _fit(hits: Hits, axes: F4, pairs: I4, wholes: F8) -> Bool:
     return np.asarray(np.any(fitting & lacking, axis=1))
 
 
-def _joint(hits: Hits, axes: F4, pairs: I4) -> F8:
+def _joint(hits: Hits, pairs: I4) -> F8:
     """Return the lengths (p, 3) of the box around each pair, along the first box's axes, metres."""
     i, j = pairs.T
-    own_axes, others = axes[i].astype(np.float64), axes[j].astype(np.float64)
+    own_axes, others = hits.axes(i), hits.axes(j)
     offset = np.einsum("pji,pj->pi", own_axes, hits.centers[j] - hits.centers[i])
     turned = np.abs(np.einsum("pji,pjk->pik", own_axes, others))
     reach = 0.5 * np.einsum("pik,pk->pi", turned, hits.sizes[j])

@@ -22,7 +22,8 @@ class FrameDetections(Record):
     posteriors : (n, c) posteriors of the single views; each sums to 1.
     partial : (n,) whether the image border or an occluder cuts the object.
     novelties : (n,) novelties of the single views.
-    axes : (n, 3, 3) axes of the boxes as columns, in the frame of the centres; None if unknown.
+    orientations : (n, 4) unit quaternions (x, y, z, w) of the boxes, in the frame of the centres;
+        None if unknown.
     described : (n,) number of the frame whose description each detection repeats, its own number
         if it was described itself; None if all were.
     """
@@ -36,7 +37,7 @@ class FrameDetections(Record):
     posteriors: F4 = array("n c", "f4")
     partial: Bool = array("n", "?")
     novelties: F4 = array("n", "f4")
-    axes: F8 | None = array("n 3 3", "f8", default=None)
+    orientations: F4 | None = array("n 4", "f4", default=None)
     described: I4 | None = array("n", "i4", default=None)
 
 

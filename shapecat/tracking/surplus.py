@@ -48,7 +48,7 @@ def without_pieces(hits: Hits, members: Sequence[I4], max_gap_s: float) -> list[
     centre outside that box. ``members`` are the hits (k,) of each track, ascending; gaps in a track
     that are longer than ``max_gap_s`` are not checked.
     """
-    if hits.axes is None:
+    if hits.orientations is None:
         return list(members)
     owner = hits.owners(members)
     covered = [
@@ -90,6 +90,5 @@ def _covered_beside(hits: Hits, k: int, members: Sequence[I4], owner: I4) -> int
 
 def _in_box(hits: Hits, which: I4, places: F8) -> Bool:
     """Return whether each position (n, 3) lies in the box of the hit ``which`` (n,): (n,) bool."""
-    axes = np.zeros((0, 3, 3)) if hits.axes is None else hits.axes
-    local = np.einsum("nji,nj->ni", axes[which], places - hits.centers[which])
+    local = np.einsum("nji,nj->ni", hits.axes(which), places - hits.centers[which])
     return np.asarray((np.abs(local) <= 0.5 * hits.sizes[which]).all(axis=1))
