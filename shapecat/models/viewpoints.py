@@ -17,14 +17,25 @@ _CLOSER_M = 0.08
 """Least distance of the target beyond the sensor's near limit."""
 
 
-def random_viewpoint(world: World, sensor: Sensor, rng: np.random.Generator) -> Pose | int:
-    """Return a random ``world_from_camera`` facing the objects; the path's if there are none."""
+def random_viewpoint(
+    world: World,
+    sensor: Sensor,
+    rng: np.random.Generator,
+    *,
+    distance_m: tuple[float, float] = _DISTANCE_M,
+) -> Pose | int:
+    """Return a random ``world_from_camera`` facing the objects; the path's if there are none.
+
+    Parameters
+    ----------
+    distance_m : range of the distance to a point among the objects.
+    """
     places = [item.pose.translation for item in world.objects]
     if not places:
         return 0
     target = (np.mean(places, axis=0) + places[rng.integers(len(places))]) / 2
-    nearest = max(_DISTANCE_M[0], sensor.nearest_m + _CLOSER_M)
-    distance = float(np.exp(rng.uniform(np.log(nearest), np.log(_DISTANCE_M[1]))))
+    nearest, farthest = max(distance_m[0], sensor.nearest_m + _CLOSER_M), distance_m[1]
+    distance = float(np.exp(rng.uniform(np.log(nearest), np.log(max(nearest, farthest)))))
     (pose,) = arc_orbit(
         rng,
         np.asarray(target),

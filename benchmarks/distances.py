@@ -1,0 +1,75 @@
+"""Objects found by the distance of the camera, with every simulated sensor.
+
+    python -m benchmarks.distances --first 1168000 --count 60
+
+Each scene (a table, clutter, a pile) is seen once at a random distance in each range, from a random
+direction; the sensors take turns. Sensors that do not measure so near are left out.
+"""
+
+from typing import Any
+
+import click
+import numpy as np
+
+from benchmarks.measure import markdown
+from benchmarks.scenes import SEEN_PIXELS
+from shapecat.config import Settings
+from shapecat.detection import detect
+from shapecat.evaluation.overlap import MATCHED_F, match_masks
+from shapecat.models.viewpoints import random_viewpoint
+from shapecat.simulation import Sensor, World, make_scene, render_frame
+from shapecat.simulation.presets import PRESETS
+from shapecat.simulation.scenes import SceneKind
+from shapecat.simulation.worlds import FIRST_OBJECT_LABEL
+
+KINDS: tuple[SceneKind, ...] = ("tabletop", "clutter", "pile")
+RANGES_M = ((0.3, 0.45), (0.45, 0.7), (0.7, 1.1), (1.1, 1.7), (1.7, 2.6))
+MARGIN_M = 0.05
+"""Sensors whose near limit is closer than this to the end of a range are left out of it."""
+HEAD = ("distance, m", "frames", "objects", "found", "mean F", "surplus a frame")
+
+
+def judge(world: World, sensor: Sensor, range_m: tuple[float, float], seed: int) -> np.ndarray:
+    """Return the number of objects, of those found, the sum of their F, and the surplus."""
+    rng = np.random.default_rng(seed)
+    view = random_viewpoint(world, sensor, rng, distance_m=range_m)
+    frame, labels = render_frame(world, view, rng=rng, sensor=sensor)
+    scene = detect(frame, settings=Settings().detection, rng=np.random.default_rng(0))
+    labels = labels.reshape(-1)
+    masks = [np.flatnonzero(labels == label) for label in np.unique(labels)]
+    seen = [mask for mask in masks if labels[mask[0]] >= FIRST_OBJECT_LABEL]
+    matches = match_masks([c.indices for c in scene.candidates], seen)
+    best = np.zeros(len(seen))
+    for row, k in matches.pairs:
+        best[k] = matches.f[row, k]
+    best = best[[len(mask) >= SEEN_PIXELS for mask in seen]]
+    off = [np.mean(labels[c.indices] >= FIRST_OBJECT_LABEL) <= 0.5 for c in scene.candidates]
+    return np.array([best.size, (best >= MATCHED_F).sum(), best.sum(), sum(off)])
+
+
+def row(first: int, count: int, range_m: tuple[float, float]) -> tuple[Any, ...]:
+    """Return the row of the table for a range of distances."""
+    sensors = [s for s in PRESETS.values() if s.nearest_m < range_m[1] - MARGIN_M]
+    total = np.zeros(4)
+    for k in range(count):
+        world = make_scene(KINDS[k % len(KINDS)], np.random.default_rng(first + k), frames=1)
+        sensor = sensors[k // len(KINDS) % len(sensors)]
+        total += judge(world, sensor, range_m, first + k)
+    objects, found, overlap, surplus = total
+    share, mean = found / max(objects, 1), overlap / max(objects, 1)
+    low, high = range_m
+    figures = (f"{share:.3f}", f"{mean:.3f}", f"{surplus / max(count, 1):.2f}")
+    return (f"{low} to {high}", count, int(objects), *figures)
+
+
+@click.command()
+@click.option("--first", default=3000, show_default=True, help="Seed of the first scene.")
+@click.option("--count", default=60, show_default=True, help="Number of scenes.")
+def main(first: int, count: int) -> None:
+    """Count the objects found in each range of distances, and print a table."""
+    rows = [row(first, count, range_m) for range_m in RANGES_M]
+    click.echo(markdown("Objects found by distance", HEAD, rows))
+
+
+if __name__ == "__main__":
+    main()
