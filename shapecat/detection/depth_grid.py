@@ -1,7 +1,8 @@
 """Depth grid: the depth image, downsampled to the working resolution of detection.
 
 All steps use inverse depth ``w = 1 / z`` (1/m): a plane is exactly linear in (column, row, w), and
-the noise of disparity cameras is constant in w, so thresholds do not depend on range.
+the noise of disparity cameras is constant in w, so thresholds do not depend on range, except near
+the camera.
 """
 
 import math

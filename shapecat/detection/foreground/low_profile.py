@@ -131,8 +131,8 @@ def _raise(
 
     The objects are numbered from ``objects`` + 1 on, the tested parts from ``me`` + 1 on; the last
     numbers are returned. ``high_pass`` (rows, columns) is from `filter_high_pass`; ``bounds`` are
-    the minimum mean rise and the unit of the levels, both 1/m, and the greatest width, in cells at
-    a depth of 1 m.
+    the minimum mean rise and the unit of the levels, both 1/m, the greatest width, in cells at a
+    depth of 1 m, and the step that separates two surfaces, 1/m.
     """
     rise_least, level_least, widest, jump = bounds
     flat, marks, plane_ids = high_pass.reshape(-1), low_profile.reshape(-1), plane_id.reshape(-1)
@@ -238,7 +238,8 @@ def _lower(
 ) -> int:
     """Assign flat parts of low object cells to the plane if their outline is that of depth error.
 
-    The parts are numbered from ``me`` + 1 on; the last number is returned.
+    The parts are numbered from ``me`` + 1 on; the last number is returned. ``bounds`` are those of
+    `measure_outline`.
     """
     rows, columns = residual.shape
     _, part, seeds, stack = scratch

@@ -132,7 +132,9 @@ def _fit_run(
     n: int,
     fits: F4,
 ) -> None:
-    """Fit planes to the windows of ``n`` cells from (i, ``start``) on; gates are ``wider`` times.
+    """Fit planes to the windows of ``n`` cells from (i, ``start``) on.
+
+    ``wider`` multiplies the gates of `SEGMENTATION`.
 
     The rows of ``fits`` are inverse depth, its change per column and per row, and the normal (3);
     0 where there is no fit.
