@@ -6,6 +6,8 @@ Each scene (a table, clutter, a pile) is seen once at a random distance in each 
 direction; the sensors take turns. Sensors that do not measure so near are left out.
 """
 
+from collections.abc import Sequence
+from itertools import cycle, islice
 from typing import Any
 
 import click
@@ -40,19 +42,18 @@ def judge(world: World, sensor: Sensor, range_m: tuple[float, float], seed: int)
     seen = [mask for mask in masks if labels[mask[0]] >= FIRST_OBJECT_LABEL]
     matches = match_masks([c.indices for c in scene.candidates], seen)
     best = np.zeros(len(seen))
-    for row, k in matches.pairs:
-        best[k] = matches.f[row, k]
+    for found, k in matches.pairs:
+        best[k] = matches.f[found, k]
     best = best[[len(mask) >= SEEN_PIXELS for mask in seen]]
     off = [np.mean(labels[c.indices] >= FIRST_OBJECT_LABEL) <= 0.5 for c in scene.candidates]
     return np.array([best.size, (best >= MATCHED_F).sum(), best.sum(), sum(off)])
 
 
-def row(first: int, count: int, range_m: tuple[float, float]) -> tuple[Any, ...]:
-    """Return the row of the table for a range of distances."""
+def row(worlds: Sequence[World], first: int, range_m: tuple[float, float]) -> tuple[Any, ...]:
+    """Return the row of the table for a range of distances, metres."""
     sensors = [s for s in PRESETS.values() if s.nearest_m < range_m[1] - MARGIN_M]
-    total = np.zeros(4)
-    for k in range(count):
-        world = make_scene(KINDS[k % len(KINDS)], np.random.default_rng(first + k), frames=1)
+    total, count = np.zeros(4), len(worlds)
+    for k, world in enumerate(worlds):
         sensor = sensors[k // len(KINDS) % len(sensors)]
         total += judge(world, sensor, range_m, first + k)
     objects, found, overlap, surplus = total
@@ -67,7 +68,11 @@ def row(first: int, count: int, range_m: tuple[float, float]) -> tuple[Any, ...]
 @click.option("--count", default=60, show_default=True, help="Number of scenes.")
 def main(first: int, count: int) -> None:
     """Count the objects found in each range of distances, and print a table."""
-    rows = [row(first, count, range_m) for range_m in RANGES_M]
+    kinds = islice(cycle(KINDS), count)
+    worlds = [
+        make_scene(kind, np.random.default_rng(first + k), frames=1) for k, kind in enumerate(kinds)
+    ]
+    rows = [row(worlds, first, range_m) for range_m in RANGES_M]
     click.echo(markdown("Objects found by distance", HEAD, rows))
 
 

@@ -243,7 +243,10 @@ def _occupied(place: F4, left: float, top: float, scale: float, side: int) -> in
 def _project(
     points: F4, place: F4, intrinsics: PinholeIntrinsics, jump: float, inv_depth: F4, cell: I4
 ) -> int:
-    """Average the nearest points of each cell; return the number of points well behind them."""
+    """Average the nearest points of each cell; return the number of points well behind them.
+
+    ``jump`` is the step in inverse depth that separates two surfaces, 1/m.
+    """
     rows, columns = inv_depth.shape
     nearest = np.zeros(inv_depth.shape, np.float32)
     count = np.zeros(inv_depth.shape, np.float32)
@@ -276,7 +279,10 @@ def _project(
 
 @kernel
 def _close_holes(inv_depth: F4, jump: float) -> None:
-    """Fill empty cells between two neighbours on one surface with their mean."""
+    """Fill empty cells between two neighbours on one surface with their mean.
+
+    Neighbours are on one surface if they differ by less than ``jump``, 1/m.
+    """
     rows, columns = inv_depth.shape
     source = inv_depth.copy()
     for i in range(1, rows - 1):

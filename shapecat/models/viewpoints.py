@@ -28,7 +28,7 @@ def random_viewpoint(
 
     Parameters
     ----------
-    distance_m : range of the distance to a point among the objects.
+    distance_m : nearest and farthest distance of a point among the objects, metres.
     """
     places = [item.pose.translation for item in world.objects]
     if not places:

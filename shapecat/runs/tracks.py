@@ -17,6 +17,7 @@ from shapecat.config import TrackingSettings
 from shapecat.runs.full_boxes import FullBoxes, full_columns
 from shapecat.runs.tables import (
     TRACKS,
+    Key,
     arrow_table,
     first_stamp,
     frame_rows,
@@ -134,12 +135,11 @@ def _read_frames(folder: Path, categories: int, fixed: set[str]) -> Iterator[Fra
         seen = frames.to_pylist()
         turns = np.tile(_NO_TURN, (detections.num_rows, 1))
         for frame in seen:
-            if frame["topic"] in fixed and frame["fixed_rotation"] is not None:
-                of_frame = rows.get((frame["topic"], frame["frame"]), slice(0, 0))
-                turns[of_frame] = frame["fixed_rotation"]
+            if frame["topic"] in fixed and frame["fixed_rotation"]:
+                turns[_rows_of(frame, rows)] = frame["fixed_rotation"]
         columns["orientation"] = _turned(columns["orientation"], turns.reshape(-1, 3, 3))
         for frame in seen:
-            of_frame = rows.get((frame["topic"], frame["frame"]), slice(0, 0))
+            of_frame = _rows_of(frame, rows)
             here = {name: values[of_frame] for name, values in columns.items()}
             if frame["topic"] in fixed:
                 placed = ~np.isnan(here["center_fixed"][:, 0])
@@ -174,8 +174,13 @@ def _columns_of(table: pa.Table, categories: int) -> dict[str, Any]:
     return columns
 
 
+def _rows_of(frame: dict[str, Any], rows: dict[Key, slice]) -> slice:
+    """Return the rows of a frame's detections; none if it is not in ``rows``."""
+    return rows.get((frame["topic"], frame["frame"]), slice(0, 0))
+
+
 def _turned(orientations: F4, turns: F8) -> F8:
-    """Return quaternions (n, 4) turned by rotation matrices (n, 3, 3)."""
+    """Return quaternions (n, 4), x y z w, turned by rotation matrices (n, 3, 3)."""
     if not len(orientations):
         return np.zeros((0, 4))
     return np.asarray((Rotation.from_matrix(turns) * Rotation.from_quat(orientations)).as_quat())

@@ -34,7 +34,7 @@ _OF_HITS: dict[str, tuple[str, tuple[Any, ...]]] = {
 class Hits:
     """All detections of a stream, called hits, in the order of the frames.
 
-    A hit takes only about 90 bytes, as the hits of many hours are kept at once.
+    A hit takes only about 100 bytes, as the hits of many hours are kept at once.
 
     Attributes
     ----------
@@ -67,7 +67,7 @@ class Hits:
         return replace(self, sizes=np.zeros((0, 3), np.float32), orientations=None)
 
     def axes(self, which: I4 | slice) -> F8:
-        """Return the axes (k, 3, 3) of the boxes of hits ``which``, as columns."""
+        """Return the axes (k, 3, 3) of the boxes of hits ``which``, as columns; none if unknown."""
         some = None if self.orientations is None else self.orientations[which]
         if some is None or len(some) == 0:
             return np.zeros((0, 3, 3))

@@ -49,7 +49,7 @@ def track_recording(
 
     Notes
     -----
-    Time and memory grow linearly with the number of detections, memory by some 90 bytes each.
+    Time and memory grow linearly with the number of detections, memory by some 100 bytes each.
     """
     streams = [_track_stream(hits, settings) for hits in gather(frames, together)]
     found = [(stream, member) for stream in streams for member in stream.members]

@@ -221,7 +221,10 @@ def _code_cells(grid_labels: GridLabels) -> tuple[I4, I4]:
 
 @kernel(inline=True)
 def _find_high(planes: F8, inv_depth: F4, jump: float, i: int, span: I4, high: U1) -> None:
-    """Write whether all pixels that fit a cell are above each plane, for a span of row i."""
+    """Write whether all pixels that fit a cell are above each plane, for a span of row i.
+
+    A pixel fits within ``jump``, 1/m.
+    """
     zero, nowhere = np.float32(0), np.float32(1e-3)
     base = np.float32(CLEANUP.fringe * HEIGHT_NOISE)
     slope = np.float32(CLEANUP.fringe * MIN_HEIGHT_M)
@@ -270,7 +273,8 @@ def _mark(
     """Write the labels of a run of pixels, `UNSURE` where a closer test is needed.
 
     ``run`` is the row, the first column, and one after the last; ``inv_depth`` and ``code`` are
-    those of the cells, by column of the pixels. This vectorises.
+    those of the cells, by column of the pixels; a pixel fits a cell within ``jump``, 1/m. This
+    vectorises.
     """
     least, zero, unsure, bare = np.float32(NEAREST_M), np.int16(0), np.int16(UNSURE), np.int16(BARE)
     y, start, end = run

@@ -73,7 +73,10 @@ def _orient_row(
     normals: F4,
     positions: F4,
 ) -> int:
-    """Write the points of a row; return the number on smooth surface. The loop vectorises."""
+    """Write the points of a row; return the number on smooth surface. The loop vectorises.
+
+    ``bend`` is the largest second difference of the inverse depth on a smooth surface, 1/m.
+    """
     zero, one, two = np.float32(0), np.float32(1), np.float32(2)
     count = np.int32(0)
     across, down = np.float32(focal[0] / (2 * STRIDE)), np.float32(focal[1] / (2 * STRIDE))
