@@ -4,8 +4,8 @@ import numpy as np
 import pytest
 
 from shapecat.detection.depth_grid import find_borders
-from shapecat.detection.output.label_upsampling import list_runs, split_lists
 from shapecat.detection.output.occluded_points import label_occluded_points
+from shapecat.detection.output.pixel_runs import list_runs, split_lists
 from shapecat.geometry import rotation_from_quaternion, upright_box
 
 

@@ -1,6 +1,5 @@
 """Label upsampling: the labels of cells transferred to pixels at full resolution."""
 
-from itertools import pairwise
 from typing import NamedTuple
 
 import numpy as np
@@ -9,6 +8,7 @@ from shapecat.arrays import F4, F8, I4, U1, U4
 from shapecat.detection.cleanup.settings import CLEANUP
 from shapecat.detection.connected_components import span_of
 from shapecat.detection.depth_grid import DepthGrid, row_and_column
+from shapecat.detection.output.pixel_runs import end_run, list_runs, split_lists
 from shapecat.detection.planes.height_map import HEIGHT_NOISE, MIN_HEIGHT_M
 from shapecat.detection.records import Segmentation
 from shapecat.geometry import NEAREST_M
@@ -19,9 +19,7 @@ __all__ = [
     "find_near",
     "grid_labels_of",
     "label_pixels",
-    "list_runs",
     "settle_labels",
-    "split_lists",
 ]
 
 UNSURE, BARE = -1, -2
@@ -68,11 +66,6 @@ def grid_labels_of(grid: DepthGrid, found: Segmentation) -> GridLabels:
         found.plane_ids,
         grid.discontinuity,
     )
-
-
-def split_lists(order: U4, ends: I4) -> list[U4]:
-    """Split the results of `list_runs`, (n,) and (labels,), into one list per label from 1."""
-    return [order[a:b] for a, b in pairwise(ends.tolist())]
 
 
 @kernel(inner=True)
@@ -127,43 +120,12 @@ def _list_pixels(
                     mark = marks[unsure]
                     unsure += 1
                 if mark != label:
-                    n = _end_run(label, first + start, first + x, runs, n)
+                    n = end_run(label, first + start, first + x, runs, n)
                     label, start = mark, x
                 x = _end_of(line, x + 1, x1, label)
-            n = _end_run(label, first + start, first + x1, runs, n)
+            n = end_run(label, first + start, first + x1, runs, n)
     listed: tuple[U4, I4] = list_runs(runs[:n], labels)
     return listed
-
-
-@kernel(inner=True)
-def _end_run(label: int, first: int, end: int, runs: I4, n: int) -> int:
-    """Append a run of pixels to the n runs unless its label is 0; return their new number."""
-    if label > 0:
-        runs[n, 0], runs[n, 1], runs[n, 2] = label, first, end
-        n += 1
-    return n
-
-
-@kernel
-def list_runs(runs: I4, labels: int) -> tuple[U4, I4]:
-    """Return the pixel indices (n,) of runs, sorted by label, and where each label ends (labels,).
-
-    ``runs`` is (r, 3): label, first pixel, and one after the last. Label 0 has no pixels: its end
-    is 0.
-    """
-    place, total = np.zeros(labels, np.int64), 0  # where the next pixel of each label goes
-    for r in range(len(runs)):
-        place[runs[r, 0]] += runs[r, 2] - runs[r, 1]
-    for label in range(labels):
-        place[label], total = total, total + place[label]
-    order = np.zeros(total, np.uint32)
-    for r in range(len(runs)):
-        label, first, size = runs[r, 0], runs[r, 1], runs[r, 2] - runs[r, 1]
-        start = np.uint64(place[label])
-        for k in range(np.uint64(size)):
-            order[start + k] = first + k
-        place[label] += size
-    return order, place
 
 
 @kernel(inline=True)

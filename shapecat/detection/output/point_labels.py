@@ -8,11 +8,10 @@ from shapecat.detection.output.label_upsampling import (
     GridLabels,
     find_near,
     grid_labels_of,
-    list_runs,
     settle_labels,
-    split_lists,
 )
 from shapecat.detection.output.occluded_points import label_occluded_points
+from shapecat.detection.output.pixel_runs import list_runs, split_lists
 from shapecat.detection.output.settings import OUTPUT
 from shapecat.detection.planes.height_map import HEIGHT_NOISE, MIN_HEIGHT_M, is_inside_outline
 from shapecat.detection.records import Segmentation

@@ -1,0 +1,49 @@
+"""Runs of consecutive pixels with one label, and the list of each label's pixels."""
+
+from itertools import pairwise
+
+import numpy as np
+
+from shapecat.arrays import I4, U4
+from shapecat.jit import kernel
+
+__all__ = ["end_run", "list_runs", "split_lists"]
+
+
+@kernel(inner=True)
+def end_run(label: int, first: int, end: int, runs: I4, n: int) -> int:
+    """Append a run of pixels to the first ``n`` rows of ``runs``; return their new number.
+
+    ``runs`` is as in `list_runs`; a run whose label is 0 is left out.
+    """
+    if label > 0:
+        runs[n, 0], runs[n, 1], runs[n, 2] = label, first, end
+        n += 1
+    return n
+
+
+@kernel
+def list_runs(runs: I4, labels: int) -> tuple[U4, I4]:
+    """Return the pixel indices (n,) of runs, sorted by label, and where each label ends (labels,).
+
+    ``runs`` is (r, 3): label, first pixel, and one after the last. Label 0 has no pixels: its end
+    is 0.
+    """
+    place, total = np.zeros(labels, np.int64), 0  # where the next pixel of each label goes
+    for r in range(len(runs)):
+        place[runs[r, 0]] += runs[r, 2] - runs[r, 1]
+    for label in range(labels):
+        place[label], total = total, total + place[label]
+    order = np.zeros(total, np.uint32)
+    for r in range(len(runs)):
+        label, first, size = runs[r, 0], runs[r, 1], runs[r, 2] - runs[r, 1]
+        start = np.uint64(place[label])
+        for k in range(np.uint64(size)):
+            order[start + k] = first + k
+        place[label] += size
+    return order, place
+
+
+def split_lists(order: U4, ends: I4) -> list[U4]:
+    """Split the results of `list_runs`, (n,) and (labels,), into one list per label from 1."""
+    return [order[a:b] for a, b in pairwise(ends.tolist())]
