@@ -47,8 +47,8 @@ def features_of(shapes: list[Shape], tilt_deg: float) -> tuple[Array, Array]:
     found = oversegment(grid, Task(settings, np.random.default_rng(0)))
     assert found is not None
     model, oversegmentation = found
-    known = merge_segments(grid, model, oversegmentation)
-    features = measure_object_features(grid, model, oversegmentation, known, settings.max_range_m)
+    merge_segments(grid, model, oversegmentation)
+    features = measure_object_features(grid, model, oversegmentation, settings.max_range_m)
     segments = oversegmentation.segments
     rejected = find_background(segments, features, grid, settings, load_trees())
     used = features["visibility"]["cells"] > 0
@@ -81,12 +81,23 @@ def test_height_and_noise_of_plane_around_segment_are_measured() -> None:
     inv_depth, owner = np.full((11, 11), 0.5, np.float32), np.arange(2, dtype=np.int16)
     walls, spans = np.zeros((11, 11), np.uint8), np.tile(np.array([0, 11], np.int32), (11, 1))
     planes = np.zeros((1, OUTLINE + DIRECTIONS))
-    seen = inv_depth, DISCONTINUITY, planes, plane_id, height, walls
+    low_profile = np.zeros((11, 11), np.int16)
+    seen = inv_depth, DISCONTINUITY, planes, plane_id, height, low_profile, walls
     field = LabelledGrid(*seen, labels, spans, owner)
     _measure_plane(field, segments, rows)
     least = 0.004 + 0.0025 * 2.0**2
     assert rows["plane_height"][1] == pytest.approx(0.001 / least)
     assert rows["plane_noise"][1] == pytest.approx(0.002 / least)
+
+
+@pytest.mark.parametrize(("height_m", "shares"), [(0.008, (0.8, 1.0)), (0.12, (0.0, 0.0))])
+def test_share_of_low_profile_cells_is_measured(height_m: float, shares: Array) -> None:
+    """The trees keep what is thin if it is a low-profile object, and not noise."""
+    slab = box((0, 0, 0), (0.12, 0.1, height_m))
+    features, rejected = features_of([table(), slab], tilt_deg=35)
+    assert len(features) == 1
+    assert shares[0] <= features["surroundings"]["low_profile"][0] <= shares[1]
+    assert not rejected.any()
 
 
 def _features(cells: int) -> Array:

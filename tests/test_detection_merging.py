@@ -6,7 +6,6 @@ import pytest
 from shapecat.detection.depth_grid import DepthGrid, PinholeIntrinsics
 from shapecat.detection.merging.across_occlusion import merge_across_occluder
 from shapecat.detection.merging.adjacency import measure_adjacency
-from shapecat.detection.merging.low_profile import merge_low_profile
 from shapecat.detection.merging.pair_features import (
     PAIR_FEATURES,
     ViewGeometry,
@@ -143,14 +142,3 @@ def test_coplanar_parts_without_an_occluder_are_not_merged() -> None:
     segments, graph, grid = measured(depth, labels)
     merge_across_occluder(segments, grid, graph.normal, labels)
     assert segments.parent.tolist() == [0, 1, 2]
-
-
-def test_segments_of_a_low_profile_object_are_merged() -> None:
-    """Both lie mostly within it; the box beside it does not."""
-    depth, labels = two_boxes(0)
-    labels[90:100, 50:140] = 3
-    segments, graph, _ = measured(depth, labels)
-    low = np.where((labels == 1) | (labels == 3), 1, 0).astype(np.int16)
-    known = merge_low_profile(segments, low, labels, graph.spans)
-    assert segments.parent.tolist() == [0, 1, 2, 1]
-    assert known.tolist() == [False, True, False, False]

@@ -21,7 +21,7 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import ArrayLike
 
-from shapecat.arrays import F4, F8, I4, Bool
+from shapecat.arrays import F4, F8, I4
 from shapecat.config import DetectionSettings
 from shapecat.detection.cleanup import structure
 from shapecat.detection.cleanup.holes import fill_contact_boundary, fill_holes
@@ -34,7 +34,6 @@ from shapecat.detection.foreground.walls import remove_walls
 from shapecat.detection.merging import learned
 from shapecat.detection.merging.across_occlusion import merge_across_occluder
 from shapecat.detection.merging.adjacency import measure_adjacency
-from shapecat.detection.merging.low_profile import merge_low_profile
 from shapecat.detection.merging.pair_features import ViewGeometry
 from shapecat.detection.merging.segments import measure_segments
 from shapecat.detection.output.label_upsampling import label_pixels
@@ -153,8 +152,8 @@ def label(
     if model is None:
         return None
     oversegmentation = _oversegment(grid, model)
-    known = merge_segments(grid, model, oversegmentation)
-    representatives = _clean_up(grid, model, oversegmentation, known, task.settings)
+    merge_segments(grid, model, oversegmentation)
+    representatives = _clean_up(grid, model, oversegmentation, task.settings)
     return _fill(grid, model, oversegmentation, representatives, task)
 
 
@@ -216,29 +215,23 @@ def _oversegment(grid: DepthGrid, model: PlaneModel) -> OverSegmentation:
     return OverSegmentation(graph, labels, segments)
 
 
-def merge_segments(grid: DepthGrid, model: PlaneModel, oversegmentation: OverSegmentation) -> Bool:
-    """Merge the segments of each object, in place.
-
-    Return the mask (segments,) of those known to be low-profile objects.
-    """
+def merge_segments(grid: DepthGrid, model: PlaneModel, oversegmentation: OverSegmentation) -> None:
+    """Merge the segments of each object, in place."""
     graph, labels, segments = oversegmentation
-    known: Bool = merge_low_profile(segments, model.low_profile, labels, graph.spans)
     view_geometry = ViewGeometry(grid.intrinsics.fx, model.up[2])
     learned.merge_learned(segments, view_geometry, learned.load_trees())
     merge_across_occluder(segments, grid, graph.normal, labels)
-    return known
 
 
 def _clean_up(
     grid: DepthGrid,
     model: PlaneModel,
     oversegmentation: OverSegmentation,
-    known: Bool,
     settings: DetectionSettings,
 ) -> I4:
     """Reject structure, and number the objects; return their representative segments."""
     graph, labels, segments = oversegmentation
-    features = measure_object_features(grid, model, oversegmentation, known, settings.max_range_m)
+    features = measure_object_features(grid, model, oversegmentation, settings.max_range_m)
     trees = structure.load_trees()
     rejected = find_background(segments, features, grid, settings, trees)
     representatives: I4 = number_objects(segments.parent, rejected, labels, graph.spans)

@@ -19,7 +19,6 @@ from shapecat.config import DetectionSettings
 from shapecat.detection.depth_grid import DepthGrid, downsample
 from shapecat.detection.merging import learned
 from shapecat.detection.merging.across_occlusion import merge_across_occluder
-from shapecat.detection.merging.low_profile import merge_low_profile
 from shapecat.detection.merging.pair_features import (
     FEATURES,
     PAIR_FEATURES,
@@ -141,7 +140,6 @@ def _pairs(
     if found is None:
         return
     ground, (graph, labels, segments) = found
-    merge_low_profile(segments, ground.low_profile, labels, graph.spans)
     merge_across_occluder(segments, grid, graph.normal, labels)
     counts = count_labels(pixel_labels.reshape(depth.shape), labels, grid)
     view_geometry, seen = ViewGeometry(grid.intrinsics.fx, float(ground.up[2])), set()

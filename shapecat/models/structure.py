@@ -271,8 +271,8 @@ def label_objects(frame: Frame, pixel_labels: U1, object_labels: I4) -> Iterator
     if grid is None or found is None:
         return
     model, oversegmentation = found
-    known = merge_segments(grid, model, oversegmentation)
-    features = measure_object_features(grid, model, oversegmentation, known, settings.max_range_m)
+    merge_segments(grid, model, oversegmentation)
+    features = measure_object_features(grid, model, oversegmentation, settings.max_range_m)
     _, labels, segments = oversegmentation
     counts = count_labels(pixel_labels.reshape(frame.depth.shape), labels, grid)
     merged = np.zeros_like(counts)

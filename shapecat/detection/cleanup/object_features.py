@@ -10,7 +10,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from shapecat.arrays import F4, F8, I4, U1, Bool
+from shapecat.arrays import F4, F8, I4, U1
 from shapecat.detection.cleanup.settings import CLEANUP
 from shapecat.detection.connected_components import SIDES
 from shapecat.detection.depth_grid import DepthGrid, find_borders, row_and_column
@@ -39,7 +39,7 @@ _SURROUNDINGS = np.dtype(
         ("least_outside_m", "f4"),  # distance of the samples outside the outline of the plane
         ("mean_outside_m", "f4"),
         ("most_outside_m", "f4"),
-        ("low_profile", "f4"),  # 1 for a known low-profile object
+        ("low_profile", "f4"),  # share of the cells on low-profile objects
         ("depth_edge", "f4"),  # share of the boundary in front of what is farther away
         ("plane_height", "f4"),  # heights of the plane around it, over the least of an object's
         ("plane_noise", "f4"),  # sample: their mean, and their standard deviation
@@ -76,6 +76,7 @@ class LabelledGrid(NamedTuple):
     planes: F8
     plane_id: I4
     height: F4
+    low_profile: I4
     walls: U1
     labels: I4
     spans: I4
@@ -86,22 +87,20 @@ def measure_object_features(
     grid: DepthGrid,
     model: PlaneModel,
     oversegmentation: OverSegmentation,
-    low_profile: Bool,
     range_m: float,
 ) -> Records:
     """Return the `OBJECT_FEATURES` (n + 1,) of merged segments; zeros for merged parts.
 
     Parameters
     ----------
-    low_profile : (n + 1,) the known low-profile objects, from `merge_low_profile`.
     range_m : the range limit, metres.
     """
     graph, labels, segments = oversegmentation
     features = np.zeros(segments.parent.size, OBJECT_FEATURES)
     rows = features["surroundings"]
-    rows["low_profile"] = low_profile
-    seen = grid.inverse_depth, grid.discontinuity, model.planes, *model.heights, model.walls
-    field = LabelledGrid(*seen, labels, graph.spans, segments.parent)
+    seen = grid.inverse_depth, grid.discontinuity, model.planes, *model.heights
+    marks = model.low_profile, model.walls
+    field = LabelledGrid(*seen, *marks, labels, graph.spans, segments.parent)
     _count_cells(field, _border_lines(grid), 1 / range_m + DISCONTINUITY / 2, rows)
     _measure_plane(field, segments, rows)
     _measure(grid, model.planes, segments, model.up[2], features)
@@ -130,7 +129,7 @@ def _count_cells(
     ``last`` is the inverse depth below which a cell is at the range limit, 1/m; ``rows`` (n + 1,)
     are records of `_SURROUNDINGS`.
     """
-    inv_depth, jump, planes, plane_id, _, walls, labels, spans, owner = field
+    inv_depth, jump, planes, plane_id, _, low, walls, labels, spans, owner = field
     last_row, last_column = labels.shape[0] - 1, labels.shape[1] - 1
     top, bottom, left, right = border
     for i in range(labels.shape[0]):
@@ -141,6 +140,7 @@ def _count_cells(
             row.image_border += (i == top) | (i == bottom) | (j == left) | (j == right)
             row.range_limit += here < last
             row.on_wall += walls[i, j] == ON_WALL
+            row.low_profile += low[i, j] > 0
             for di, dj in SIDES:
                 y, x = min(max(i + di, 0), last_row), min(max(j + dj, 0), last_column)
                 row.depth_edge += 0 < inv_depth[y, x] <= here - jump
@@ -190,6 +190,7 @@ def _measure(grid: DepthGrid, planes: F8, segments: Segments, down: float, out: 
         around.image_border = share(around.image_border, 4 * math.sqrt(shape.count))
         around.range_limit = share(around.range_limit, shape.count)
         around.on_wall = share(around.on_wall, shape.count)
+        around.low_profile = share(around.low_profile, shape.count)
         around.beyond = share(around.beyond, shape.boundary)
         around.into_wall = share(around.into_wall, shape.boundary)
         around.depth_edge = share(around.depth_edge, shape.boundary)

@@ -39,8 +39,6 @@ class MergingSettings(NamedTuple):
     objects, a missing merge seldom one."""
     hopeless: float = -3.0
     """Partial logit below which evaluation stops: with -2.5, none of 500 scenes would differ."""
-    low_share: float = 0.5
-    """Minimum fraction of a segment's cells in a low-profile object to which it belongs."""
     coplanar_m: float = 0.006
     """Largest distance of a sample from the local plane of another: two steps of a Kinect."""
     coplanar_slope: float = 0.05
