@@ -1,6 +1,6 @@
 """Full boxes of tracks, fused from the full boxes of their detections."""
 
-from collections.abc import Collection, Sequence
+from collections.abc import Callable, Collection, Sequence
 from dataclasses import dataclass
 from itertools import accumulate
 from pathlib import Path
@@ -34,50 +34,60 @@ _WIDTH = sum(FULL_WIDTHS.values())
 _TELLING = 1000
 """Largest number of views from which a track's box is fused, spread over its time span."""
 _AT_ONCE = 8  # row groups
+_NO_ROWS = np.zeros(0, np.int64)
+
+
+class _Values(NamedTuple):
+    """Numbers to read from rows of a table: the columns, how many numbers, and how to get them."""
+
+    columns: list[str]
+    width: int
+    of: Callable[[pa.Table], F4]
+
+
+def _boxes_of(table: pa.Table) -> F4:
+    cut = np.logical_or(*(table[name].to_numpy() for name in _CUT))
+    return np.column_stack([full_boxes_of(table), cut])
+
+
+def _details_of(table: pa.Table) -> F4:
+    columns = [numbers(table[name]).reshape(len(table), -1) for name in _DETAILS.columns]
+    return np.hstack(columns)
+
+
+_CUT = ("touches_border", "occluded")
+_BOXES = _Values([*FULL_BOX, *_CUT], BOX_WIDTH + 1, _boxes_of)
+"""The full box of a detection, NaN if unknown, and whether it is occluded or cut off."""
+_DETAILS = _Values(["size_full_std", "outline_full"], 3 + DIRECTIONS, _details_of)
+"""The standard deviations and the outline of the full box of a detection."""
 
 
 @dataclass(frozen=True)
 class FullBoxes:
     """The full boxes of all detections of a run, estimated from single views.
 
-    Outlines and standard deviations, nine tenths of the numbers, are read when they are needed.
+    Only where each frame is in the table is kept; boxes are read when they are needed.
 
     Attributes
     ----------
     table : path of the detections table.
     groups : (g + 1,) first row of each row group, and the number of rows.
     frames : the frames of the run.
-    rows : (n, 10) float32 centre and size (metres) and orientation (x y z w) in the sensor frame;
-        NaN if unknown.
-    partial : (n,) whether the object is occluded or cut off by the image border.
     """
 
     table: Path
     groups: I4
     frames: PlacedFrames
-    rows: F4
-    partial: Bool
 
     @classmethod
     def read(cls, folder: Path, placed: Collection[str]) -> "FullBoxes":
-        """Read the full boxes of a run; the topics ``placed`` are tracked in the fixed frame."""
+        """Read the frames of a run; the topics ``placed`` are tracked in the fixed frame."""
         frames, groups = PlacedFrames(placed), [0]
-        rows, partial = bytearray(), bytearray()
-        cut = ("touches_border", "occluded")
-        wanted = ["topic", "frame", *cut, *FULL_BOX]
-        tables = {"frames": PlacedFrames.COLUMNS, "detections": wanted}
+        tables = {"frames": PlacedFrames.COLUMNS, "detections": ("topic", "frame")}
         for seen, detections in read_together(folder, tables):
             frames.add(seen, detections, groups[-1])
-            rows += full_boxes_of(detections).tobytes()
-            partial += np.logical_or(*(detections[name].to_numpy() for name in cut)).tobytes()
             groups.append(groups[-1] + detections.num_rows)
-        return cls(
-            folder / "detections.parquet",
-            np.array(groups),
-            frames,
-            np.frombuffer(rows, np.float32).reshape(-1, BOX_WIDTH),
-            np.frombuffer(partial, np.bool_),
-        )
+        return cls(folder / "detections.parquet", np.array(groups), frames)
 
     def of_tracks(self, tracks: Sequence[Track], categories: Sequence[str]) -> F4:
         """Return the fused boxes of some tracks in each of their frames, track after track.
@@ -85,33 +95,52 @@ class FullBoxes:
         Returns
         -------
         (k, 13) float32 with the columns of `FULL_WIDTHS`, in the sensor frame; NaN if unknown.
+
+        Raises
+        ------
+        OutputError : the table of detections is unreadable.
         """
-        seen = [self._seen(track) for track in tracks]
+        seen = self._seen(tracks)
         telling = [_spread(len(one.rows)) for one in seen]
         rows = [one.rows[some] for one, some in zip(seen, telling, strict=True)]
-        details = self._details(np.concatenate([np.zeros(0, np.int64), *rows]))
+        details = self._read(np.concatenate([_NO_ROWS, *rows]), _DETAILS)
         stops = list(accumulate(len(track.frames) for track in tracks))
         result = np.full((stops[-1] if stops else 0, _WIDTH), np.nan, np.float32)
         ends = accumulate(map(len, telling))
         for track, one, some, stop, end in zip(tracks, seen, telling, stops, ends, strict=True):
             if len(some):
                 views = self._views(one, some, details[end - len(some) : end])
-                weights = view_weights(self.partial[one.rows[some]])
-                fused = fuse_boxes(views, weights, track.posterior, categories)
+                fused = fuse_boxes(
+                    views, view_weights(one.partial[some]), track.posterior, categories
+                )
                 self._show(fused, one, result[stop - len(track.frames) : stop])
         return result
 
-    def _seen(self, track: Track) -> "_Seen":
-        """Return the detections of a track that have a full box."""
-        at = np.flatnonzero(np.asarray(track.detections) >= 0)
-        found = self.frames.find([track.topics[k] for k in at], track.frames[at])
-        rows = self.frames.first[found] + track.detections[at]
-        known = ~np.isnan(self.rows[rows, 0])
-        return _Seen(at[known], rows[known], found[known])
+    def _seen(self, tracks: Sequence[Track]) -> "list[_Seen]":
+        """Return the detections of each track that have a full box."""
+        shown = [np.flatnonzero(np.asarray(track.detections) >= 0) for track in tracks]
+        frames = [
+            self.frames.find([track.topics[k] for k in at], track.frames[at])
+            for track, at in zip(tracks, shown, strict=True)
+        ]
+        rows = [
+            self.frames.first[found] + track.detections[at]
+            for track, at, found in zip(tracks, shown, frames, strict=True)
+        ]
+        boxes = self._read(np.concatenate([_NO_ROWS, *rows]), _BOXES)
+        result = []
+        for at, own, found, end in zip(
+            shown, rows, frames, accumulate(map(len, rows)), strict=True
+        ):
+            here = boxes[end - len(own) : end]
+            known = ~np.isnan(here[:, 0])
+            here, partial = here[known, :BOX_WIDTH], here[known, BOX_WIDTH] > 0
+            result.append(_Seen(at[known], own[known], found[known], here, partial))
+        return result
 
     def _views(self, seen: "_Seen", some: I4, details: F4) -> BoxViews:
-        """Return the boxes of some views of a track in the fixed frame; see `_details`."""
-        boxes, poses = self.rows[seen.rows[some]], self.frames.poses[seen.frames[some]]
+        """Return the boxes of some views of a track in the fixed frame; see `_DETAILS`."""
+        boxes, poses = seen.boxes[some], self.frames.poses[seen.frames[some]]
         centers, axes = _placed(boxes, poses)
         sizes, stds = boxes[:, 3:6].astype(np.float64), details[:, :3].astype(np.float64)
         return BoxViews(centers, axes, sizes, stds, details[:, 3:], poses[:, :, 3])
@@ -119,42 +148,46 @@ class FullBoxes:
     def _show(self, fused: FusedBox, seen: "_Seen", result: F4) -> None:
         """Write the fused box to ``result``, in the sensor frame of each view."""
         for first in range(0, len(seen.rows), _BLOCK):
-            at, rows, frames = (values[first : first + _BLOCK] for values in seen)
-            boxes, poses = self.rows[rows], self.frames.poses[frames]
+            block = slice(first, first + _BLOCK)
+            boxes, poses = seen.boxes[block], self.frames.poses[seen.frames[block]]
             shown = fused.in_views(*_placed(boxes, poses), boxes[:, 3:6])
             turns, places = poses[:, :, :3], poses[:, :, 3]
             back = np.einsum("kji,kj->ki", turns, shown.centers - places)
             own = Rotation.from_matrix(np.swapaxes(turns, 1, 2) @ shown.axes).as_quat()
-            result[at] = np.hstack([back, shown.sizes, own, shown.stds])
+            result[seen.at[block]] = np.hstack([back, shown.sizes, own, shown.stds])
 
-    def _details(self, rows: I4) -> F4:
-        """Return the standard deviations and outlines (n, 3 + `DIRECTIONS`) of detections."""
-        result = np.zeros((len(rows), 3 + DIRECTIONS), np.float32)
+    def _read(self, rows: I4, values: _Values) -> F4:
+        """Return the values (n, k) of some rows of the table."""
+        result = np.zeros((len(rows), values.width), np.float32)
         groups = np.unique(np.searchsorted(self.groups, rows, side="right") - 1)
         with opened(self.table) as file:
             for k in range(0, len(groups), _AT_ONCE):
                 some = groups[k : k + _AT_ONCE]
-                table = file.read_row_groups(some.tolist(), ["size_full_std", "outline_full"])
+                table = file.read_row_groups(some.tolist(), values.columns, use_threads=False)
                 position = np.concatenate(
                     [np.arange(self.groups[g], self.groups[g + 1]) for g in some]
                 )
                 inside = np.flatnonzero(np.isin(rows, position))
-                here = pa.array(np.searchsorted(position, rows[inside]))
-                for columns, name in (
-                    (slice(3), "size_full_std"),
-                    (slice(3, None), "outline_full"),
-                ):
-                    values = numbers(table[name].take(here))
-                    result[inside, columns] = values.reshape(len(inside), -1)
+                here = np.searchsorted(position, rows[inside])
+                result[inside] = values.of(table.take(pa.array(here)))
         return result
 
 
 class _Seen(NamedTuple):
-    """The views of a track: their indices in the track, in the detections and in the frames."""
+    """The views of a track that have a full box.
+
+    Attributes
+    ----------
+    at, rows, frames : (k,) indices in the track, in the detections and in the frames.
+    boxes : (k, 10) float32 centre and size (metres) and orientation (x y z w) in the sensor frame.
+    partial : (k,) whether the object is occluded or cut off by the image border.
+    """
 
     at: I4
     rows: I4
     frames: I4
+    boxes: F4
+    partial: Bool
 
 
 def _spread(count: int) -> I4:
