@@ -15,6 +15,8 @@ from importlib import import_module
 from pathlib import Path
 from urllib.parse import unquote
 
+import pyarrow as pa
+import pyarrow.parquet as pq
 import pytest
 from click.testing import Result
 
@@ -457,3 +459,22 @@ def test_full_disk_behind_stdout_is_reported_in_one_line(
 
     assert done.returncode == 1
     assert done.stderr == "Error: cannot write the output: No space left on device\n"
+
+
+@pytest.mark.parametrize("below", [[1, 0], [99, None]])
+def test_scene_of_damaged_table_is_refused(
+    shapecat: Run, guessed_run: Path, tmp_path: Path, below: list[int | None]
+) -> None:
+    """Two objects on each other would be climbed down for ever, an object on nothing crashes."""
+    folder = tmp_path / "run"
+    shutil.copytree(guessed_run, folder)
+    table = pq.read_table(folder / "detections.parquet")
+    at = table.column_names.index("on_detection")
+    column = pa.array([*below, *[None] * (table.num_rows - 2)], pa.int32())
+    pq.write_table(table.set_column(at, "on_detection", column), folder / "detections.parquet")
+    frame = table["frame"][0].as_py()
+
+    done = shapecat("scene", folder, "--frame", frame)
+
+    assert done.exit_code != 0
+    assert "has objects on nothing; process the recording again" in " ".join(done.stderr.split())

@@ -42,12 +42,32 @@ def describe_scene(folder: Path, frame: int, *, topic: str | None = None) -> str
 
 
 def read_scene(folder: Path, topic: str, frame: int) -> Scene:
-    """Return the planes and objects of a frame as detection found them."""
+    """Return the planes and objects of a frame as detection found them.
+
+    Raises
+    ------
+    OutputError : an object stands on a plane or an object that the frame lacks, or on itself.
+    """
     up = _rows(folder, "frames", topic, frame, ["topic", "frame", "up"])[0]["up"]
     planes = [plane_of(row) for row in _rows(folder, "planes", topic, frame)]
     rows = _rows(folder, "detections", topic, frame)
+    if not _standing([row["on_detection"] for row in rows]) or any(
+        row["plane"] not in (None, *range(len(planes))) for row in rows
+    ):
+        msg = (
+            f"{folder}: damaged; frame {frame} has objects on nothing; process the recording again"
+        )
+        raise OutputError(msg)
     objects = [_candidate(row, planes) for row in rows]
     return Scene(up, tuple(planes), tuple(objects))
+
+
+def _standing(below: Sequence[int | None]) -> bool:
+    """Return whether all objects stand on a plane, directly or through the objects ``below``."""
+    standing: set[int | None] = {None}
+    while more := {k for k, lower in enumerate(below) if lower in standing} - standing:
+        standing |= more
+    return len(standing) == len(below) + 1
 
 
 def _candidate(row: dict[str, Any], planes: Sequence[Plane]) -> Candidate:
