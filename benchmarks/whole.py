@@ -148,16 +148,8 @@ def speed(
                 figures[f"{camera}, {count} cores"] = rates
                 rows.append((camera, count, *rates.values()))
         recording.unlink()
-    columns = (
-        "camera",
-        "cores",
-        "frames/s",
-        "CPU ms/frame",
-        "start-up s",
-        "peak MB",
-        "ratio",
-        "CPU ratio",
-    )
+    ratios = ("ratio", "CPU ratio") if against else ()
+    columns = ("camera", "cores", "frames/s", "CPU ms/frame", "start-up s", "peak MB", *ratios)
     title = f"End to end, {objects} objects, 640×480, all outputs, {frames} frames"
     return markdown(title, columns, rows) + f"\n{THESIS}.\n", figures
 
@@ -174,18 +166,19 @@ def _measure(
             done = whole.run["counts"]["frames"] - few.run["counts"]["frames"]
             fps = done / (whole.wall_s - few.wall_s)
             cpu_ms = 1e3 * (whole.cpu_s - few.cpu_s) / done
-            found = (fps, cpu_ms, few.wall_s, whole.peak_mb)
-            rates.setdefault(checkout, []).append(found)
+            measured = (fps, cpu_ms, few.wall_s, whole.peak_mb)
+            rates.setdefault(checkout, []).append(measured)
     fps, cpu_ms, startup_s, peak_mb = max(rates[None])
-    other, other_cpu_ms, *_ = max(rates[against]) if against else (None, None)
-    return {
+    found: dict[str, Any] = {
         "fps": round(fps, 1),
         "cpu_ms": round(cpu_ms, 2),
         "startup_s": round(startup_s, 2),
         "peak_mb": round(peak_mb),
-        "ratio": round(fps / other, 2) if other else None,
-        "cpu_ratio": round(other_cpu_ms / cpu_ms, 2) if other_cpu_ms else None,
     }
+    if against:
+        other, other_cpu_ms, *_ = max(rates[against])
+        found |= {"ratio": round(fps / other, 2), "cpu_ratio": round(other_cpu_ms / cpu_ms, 2)}
+    return found
 
 
 def growth(folder: Path, counts: list[int]) -> tuple[str, dict[str, Any]]:
