@@ -17,7 +17,7 @@ from scipy.spatial import ConvexHull
 from shapecat.arrays import Bool
 from shapecat.errors import OutputError
 from shapecat.geometry import compose, inverse, rotation_from_quaternion, transform
-from shapecat.simulation import World, make_piece, make_scene, make_stage, render_frame, simulate
+from shapecat.simulation import World, make_scene, render_frame, simulate
 from shapecat.simulation.mesh import Mesh
 from shapecat.simulation.presets import IDEAL, KINECT
 from shapecat.simulation.recorder import EPOCH_NS, robot_links
@@ -137,19 +137,6 @@ def test_scene_is_independent_of_number_of_frames() -> None:
     assert len(short.objects) == len(long.objects)
     for a, b in zip(short.path, long.path, strict=False):
         assert np.array_equal(a.translation, b.translation)
-
-
-def test_stage_shows_its_object_from_all_sides() -> None:
-    rng = np.random.default_rng(3)
-    world = make_stage([make_piece("cup", rng, resting_pose="lying")], rng, views=6)
-    (item,) = world.objects
-    sides = {round(np.arctan2(*pose.translation[1::-1])) for pose in world.path}
-
-    assert item.lying
-    assert len(sides) >= 3
-    for view in range(6):
-        _, labels = render_frame(world, view, rng=rng)
-        assert (labels == item.label).sum() > 100
 
 
 @pytest.mark.parametrize("seed", [3, pytest.param(4, marks=pytest.mark.many)])

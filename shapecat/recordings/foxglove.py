@@ -10,17 +10,7 @@ import numpy as np
 from shapecat.geometry import rotation_from_quaternion
 from shapecat.types import Pose
 
-__all__ = ["FOXGLOVE_TYPES", "as_ros", "ros_counterpart"]
-
-FOXGLOVE_TYPES = {
-    "foxglove.PointCloud": "sensor_msgs/msg/PointCloud2",
-    "foxglove.RawImage": "sensor_msgs/msg/Image",
-    "foxglove.CompressedImage": "sensor_msgs/msg/CompressedImage",
-    "foxglove.CameraCalibration": "sensor_msgs/msg/CameraInfo",
-    "foxglove.FrameTransform": "tf2_msgs/msg/TFMessage",
-    "foxglove.FrameTransforms": "tf2_msgs/msg/TFMessage",
-}
-"""The ROS type that corresponds to each Foxglove type."""
+__all__ = ["as_ros", "ros_counterpart"]
 
 _POINT_FIELDS = {1: 2, 2: 1, 3: 4, 4: 3, 5: 6, 6: 5, 7: 7, 8: 8}
 """PointField datatype of each PackedElementField type."""
@@ -31,13 +21,14 @@ def as_ros(kind: str, message: Any) -> Any:
 
     Messages of other types are returned unchanged. Byte fields may be base64 text, as in JSON.
     """
-    convert = _CONVERSIONS.get(_plain(kind))
-    return message if convert is None else convert(message)
+    known = _COUNTERPARTS.get(_plain(kind))
+    return message if known is None else known[1](message)
 
 
 def ros_counterpart(kind: str) -> str:
     """Return the ROS type that corresponds to a Foxglove type; any other type unchanged."""
-    return FOXGLOVE_TYPES.get(_plain(kind), kind)
+    known = _COUNTERPARTS.get(_plain(kind))
+    return kind if known is None else known[0]
 
 
 def _plain(kind: str) -> str:
@@ -155,11 +146,12 @@ def _transforms(message: Any) -> Any:
     )
 
 
-_CONVERSIONS: dict[str, Callable[[Any], Any]] = {
-    "foxglove.PointCloud": _cloud,
-    "foxglove.RawImage": _image,
-    "foxglove.CompressedImage": _compressed,
-    "foxglove.CameraCalibration": _calibration,
-    "foxglove.FrameTransform": _transforms,
-    "foxglove.FrameTransforms": _transforms,
+_COUNTERPARTS: dict[str, tuple[str, Callable[[Any], Any]]] = {
+    "foxglove.PointCloud": ("sensor_msgs/msg/PointCloud2", _cloud),
+    "foxglove.RawImage": ("sensor_msgs/msg/Image", _image),
+    "foxglove.CompressedImage": ("sensor_msgs/msg/CompressedImage", _compressed),
+    "foxglove.CameraCalibration": ("sensor_msgs/msg/CameraInfo", _calibration),
+    "foxglove.FrameTransform": ("tf2_msgs/msg/TFMessage", _transforms),
+    "foxglove.FrameTransforms": ("tf2_msgs/msg/TFMessage", _transforms),
 }
+"""The ROS type that corresponds to each Foxglove type, and the conversion of its messages."""

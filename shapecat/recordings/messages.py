@@ -90,11 +90,6 @@ class Message(NamedTuple):
         """The type of the message, normalized as in `Channel`."""
         return self.channel.type
 
-    @property
-    def encoding(self) -> str:
-        """The encoding of ``data``."""
-        return self.channel.encoding
-
 
 @dataclass(frozen=True)
 class Topic:

@@ -7,7 +7,7 @@ from shapecat.simulation.layout import Piece, make_piece
 from shapecat.simulation.measuring import measure
 from shapecat.simulation.presets import IDEAL, KINECT, REALSENSE
 from shapecat.simulation.recorder import record, simulate
-from shapecat.simulation.scenes import make_scene, make_stage
+from shapecat.simulation.scenes import make_scene
 from shapecat.simulation.sensors import Sensor
 from shapecat.simulation.views import render_frame
 from shapecat.simulation.worlds import PlacedObject, Support, World
@@ -23,7 +23,6 @@ __all__ = [
     "World",
     "make_piece",
     "make_scene",
-    "make_stage",
     "measure",
     "record",
     "render_frame",

@@ -9,7 +9,7 @@ from shapecat.arrays import F8
 from shapecat.geometry import quaternion_from_rotation, rotation_from_quaternion
 from shapecat.types import Pose
 
-__all__ = ["Filming", "arc_orbit", "lateral_pass", "looking_at", "random_views", "static_view"]
+__all__ = ["Filming", "arc_orbit", "lateral_pass", "looking_at", "static_view"]
 
 
 class Filming(NamedTuple):
@@ -142,19 +142,3 @@ def static_view(
     up = np.radians(elevation)
     eye = target + distance * np.array([0, -np.cos(up), np.sin(up)])
     return (looking_at(eye, target, roll=float(np.radians(rng.normal(0, 1.0)))),) * frames
-
-
-def random_views(rng: Generator, target: F8, count: int) -> tuple[Pose, ...]:
-    """Return ``count`` random views of a target, from 15 to 60 degrees above.
-
-    ``target`` (3,) is in metres, world frame; the camera is 0.5 to 2 m away.
-    """
-    poses = []
-    for _ in range(count):
-        up, side = np.radians(rng.uniform(15.0, 60.0)), rng.uniform(0, 2 * np.pi)
-        far = rng.uniform(0.5, 2.0)
-        direction = np.array([np.cos(up) * np.cos(side), np.cos(up) * np.sin(side), np.sin(up)])
-        aim = target + rng.uniform(-0.05, 0.05, 3) * far
-        roll = float(np.radians(rng.normal(0, 2.0)))
-        poses.append(looking_at(target + far * direction, aim, roll=roll))
-    return tuple(poses)

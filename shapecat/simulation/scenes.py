@@ -8,15 +8,15 @@ import numpy as np
 from numpy.random import Generator
 
 from shapecat.simulation.furniture import make_room, make_shelf, make_table, round_table
-from shapecat.simulation.layout import Layout, Piece
+from shapecat.simulation.layout import Layout
 from shapecat.simulation.moving import crossing, rearranged, walking
-from shapecat.simulation.paths import Filming, arc_orbit, random_views, static_view
+from shapecat.simulation.paths import Filming, arc_orbit, static_view
 from shapecat.simulation.piles import bin_picking, pile, shelf_bin
 from shapecat.simulation.rooms import room
 from shapecat.simulation.worlds import World
 from shapecat.types import CATEGORIES
 
-__all__ = ["SCENES", "SceneKind", "make_scene", "make_stage"]
+__all__ = ["SCENES", "SceneKind", "make_scene"]
 
 SceneKind = Literal[
     "tabletop",
@@ -77,26 +77,6 @@ def make_scene(
         msg = f"no scene {kind!r}; known: {', '.join(SCENES)}"
         raise ValueError(msg)
     return SCENES[kind](rng, _SceneSpec(Filming(frames, rate_hz), tuple(categories)))
-
-
-def make_stage(pieces: Sequence[Piece], rng: Generator, *, views: int = 8) -> World:
-    """Place given objects on a table, seen from random directions.
-
-    Each frame is a view from any side, 0.5 to 2 m away and 15 to 60 degrees above. Objects that do
-    not fit are left out; a single object stands in the middle.
-
-    Parameters
-    ----------
-    pieces : from `make_piece`, or a scanned mesh with one of its `upright_poses`.
-    views : number of frames.
-    """
-    room, table = make_room(rng, wall_chance=0.2), make_table(rng)
-    layout = Layout(rng, gap=rng.uniform(0.005, 0.04))
-    half = np.array([0.3, 0.25]) if len(pieces) > 1 else np.zeros(2)
-    for piece in pieces:
-        layout.put_piece(piece, table, half)
-    path = random_views(rng, np.array([0, 0, table.height + 0.04]), views)
-    return World("stage", (*room, table), tuple(layout.objects), path)
 
 
 def _tabletop(rng: Generator, spec: _SceneSpec) -> World:

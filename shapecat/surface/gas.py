@@ -10,6 +10,7 @@ from shapecat.jit import kernel
 from shapecat.surface.graph import edge_list, link
 from shapecat.surface.growth import Cloud, Rates, grow_fritzke, grow_thesis
 from shapecat.surface.neurons import FAR, Gas, connect, empty_gas
+from shapecat.surface.voxels import read_only
 from shapecat.types import NeuralGas
 
 __all__ = ["MIN_POINTS", "reconstruct"]
@@ -63,13 +64,9 @@ def reconstruct(
     Sources: Fritzke, *A growing neural gas network learns topologies*, 1995; thesis ch. 5.
     Deviations are marked ``differs:`` in the kernels.
     """
-    points = np.ascontiguousarray(points, np.float32).view()
-    if points.ndim != 2 or points.shape[1] != 3:
-        msg = f"expected points of shape (m, 3), got {points.shape}"
-        raise ValueError(msg)
+    points = read_only(points)
     if len(points) < MIN_POINTS:
         return None
-    points.flags.writeable = False  # one compiled version for read-only and other arrays
     seed = int(rng.integers(1 << 62))
     if settings.method == "thesis":
         found = _by_thesis(points, seed, settings.neurons, settings.component_share)
