@@ -13,7 +13,6 @@ from typing import Any
 import pytest
 
 from shapecat import geometry, rehearsal
-from shapecat.detection.merging import low_profile
 from shapecat.detection.planes import horizontal, strips, supporting
 from shapecat.rehearsal import compile_all, find_ball, recognize_ball
 from shapecat.reuse import agreement
@@ -21,7 +20,6 @@ from shapecat.reuse import agreement
 KERNELS = [
     (geometry, "_mean"),
     (horizontal, "_turn"),
-    (low_profile, "_count_overlap"),
     (strips, "_level_strips"),
     (supporting, "_is_enclosed"),
     (supporting, "_look_below"),
