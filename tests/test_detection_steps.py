@@ -137,15 +137,15 @@ def test_enclosed_holes_are_filled_and_open_ones_are_not() -> None:
 
 def test_statistics_of_two_segments_add_up() -> None:
     """Ranges are joined and sums added; a forgotten field would be lost in every merge."""
-    a, b = np.zeros(1, SEGMENT), np.zeros(1, SEGMENT)
+    segments = np.zeros(2, SEGMENT)
     for k, name in enumerate(SEGMENT.names or ()):
-        a[name], b[name] = k + 1, 100 + k
-    first = a.copy()
-    add_statistics(a[0], b[0])
+        segments[name] = k + 1, 100 + k
+    a, b = segments.copy()
+    add_statistics(segments, 0, 1)
     for name in SEGMENT.names or ():
         join = {"left": min, "bottom": min, "right": max, "top": max}.get(name)
-        expected = join(first[name][0], b[name][0]) if join else first[name][0] + b[name][0]
-        assert a[name][0] == expected, name
+        assert segments[name][0] == (join(a[name], b[name]) if join else a[name] + b[name]), name
+        assert segments[name][1] == b[name]
 
 
 def test_feature_records_are_contiguous_floats() -> None:

@@ -20,7 +20,7 @@ from shapecat.detection.merging.segment_features import (
     share,
     write_segment_features,
 )
-from shapecat.detection.merging.segments import Records, Row, Segments, depth_of, is_root
+from shapecat.detection.merging.segments import Records, Row, Segments, depth_of
 from shapecat.detection.planes.extent import COS, DIRECTIONS, SIN
 from shapecat.detection.planes.height_map import HEIGHT_NOISE, MIN_HEIGHT_M, OUTLINE
 from shapecat.detection.records import OverSegmentation, PlaneModel
@@ -181,7 +181,7 @@ def _measure_plane(field: LabelledGrid, segments: Segments, rows: Records) -> No
 def _measure(grid: DepthGrid, planes: F8, segments: Segments, down: float, out: Records) -> None:
     """Write the features of merged segments, given the counts of `_count_cells`."""
     for p in range(1, segments.parent.size):
-        if not is_root(segments, p):
+        if segments.parent[p] != p:
             continue
         shape, around, seen = segments.statistics[p], out[p].surroundings, out[p].visibility
         depth = depth_of(segments, p)

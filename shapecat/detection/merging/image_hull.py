@@ -8,14 +8,9 @@ from shapecat.arrays import F4
 from shapecat.detection.planes.extent import COS, DIRECTIONS, SIN
 from shapecat.jit import kernel
 
-__all__ = ["empty_hulls", "extend_hull", "hull_area", "merge_hulls"]
+__all__ = ["extend_hull", "hull_area"]
 
 _COS, _SIN = COS.astype(np.float32), SIN.astype(np.float32)
-
-
-def empty_hulls(count: int) -> F4:
-    """Return the hulls (count, `DIRECTIONS`) of segments without cells."""
-    return np.full((count, DIRECTIONS), -1e9, np.float32)
 
 
 @kernel(inline=True)
@@ -24,13 +19,6 @@ def extend_hull(hull: F4, row: int, first: int, last: int) -> None:
     for d in range(DIRECTIONS):
         column = np.float32(first if _COS[d] < 0 else last)
         hull[d] = max(hull[d], column * _COS[d] + row * _SIN[d])
-
-
-@kernel(inline=True)
-def merge_hulls(hull: F4, other: F4) -> None:
-    """Extend a hull (`DIRECTIONS`,), in place, to contain another one."""
-    for d in range(DIRECTIONS):
-        hull[d] = max(hull[d], other[d])
 
 
 @kernel(inner=True)

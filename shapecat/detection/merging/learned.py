@@ -9,21 +9,17 @@ handle, or the halves of a toy from two objects that touch or are stacked. A few
 
 from functools import cache
 from importlib.resources import files
-from typing import NamedTuple
 
 import numpy as np
 
-from shapecat.arrays import F4, F8
+from shapecat.arrays import F8
 from shapecat.detection.merging.pair_features import (
     PAIR_FEATURES,
     ViewGeometry,
     find_adjacent,
     write_pair_features,
 )
-from shapecat.detection.merging.segment_features import (
-    SEGMENT_FEATURES,
-    write_segment_features,
-)
+from shapecat.detection.merging.segment_features import SEGMENT_FEATURES, write_segment_features
 from shapecat.detection.merging.segments import Records, Segments, merge
 from shapecat.detection.merging.settings import MERGING
 from shapecat.jit import kernel
@@ -42,32 +38,16 @@ def load_trees() -> BoostedTrees:
     )
 
 
-class Scratch(NamedTuple):
-    """Memory for the features of one pair, which the trees read.
-
-    ``pair`` (1,) is a record of `PAIR_FEATURES`; ``features`` (features,) is a view of its fields.
-    """
-
-    pair: Records
-    features: F4
-
-
+@kernel
 def merge_learned(segments: Segments, view_geometry: ViewGeometry, grown: BoostedTrees) -> None:
     """Merge segments that are probably one object, in place, the most probable pair first."""
-    pair = np.zeros(1, PAIR_FEATURES)
-    _merge(segments, view_geometry, grown, Scratch(pair, pair.view(np.float32)))
-
-
-@kernel
-def _merge(
-    segments: Segments, view_geometry: ViewGeometry, grown: BoostedTrees, scratch: Scratch
-) -> None:
     n = segments.parent.size
     logits, features = np.full((n, n), -np.inf), np.zeros(n, SEGMENT_FEATURES)
+    pair = np.zeros(1, PAIR_FEATURES)
     for p in range(1, n):
         write_segment_features(segments, p, features[p])
     for p in range(1, n):
-        _rate(segments, features, p, p + 1, view_geometry, grown, scratch, logits)
+        _rate(segments, features, p, p + 1, view_geometry, grown, pair, logits)
     while True:
         best = np.argmax(logits)
         p, q = int(best // n), int(best % n)
@@ -77,7 +57,7 @@ def _merge(
         write_segment_features(segments, p, features[p])  # those of other segments do not change
         for k in range(n):
             logits[q, k] = logits[k, q] = -np.inf
-        _rate(segments, features, p, 1, view_geometry, grown, scratch, logits)
+        _rate(segments, features, p, 1, view_geometry, grown, pair, logits)
 
 
 @kernel(inner=True)
@@ -88,14 +68,17 @@ def _rate(
     first: int,
     view_geometry: ViewGeometry,
     grown: BoostedTrees,
-    scratch: Scratch,
+    pair: Records,
     logits: F8,
 ) -> None:
-    """Write the logits of ``p`` with segments from ``first`` on; the lower number is the row."""
-    adjacent = find_adjacent(segments, p)
+    """Write the logits of ``p`` with segments from ``first`` on; the lower number is the row.
+
+    ``pair`` (1,) is work space for the features of a pair, which the trees read as numbers.
+    """
+    adjacent, numbers = find_adjacent(segments, p), pair.view(np.float32)
     for q in range(first, adjacent.size):
         low, high = min(p, q), max(p, q)
         logits[low, high] = -np.inf
         if adjacent[q]:
-            write_pair_features(segments, features, low, high, view_geometry, scratch.pair[0])
-            logits[low, high] = logit_of(grown, scratch.features, MERGING.hopeless, np.inf)
+            write_pair_features(segments, features, low, high, view_geometry, pair[0])
+            logits[low, high] = logit_of(grown, numbers, MERGING.hopeless, np.inf)

@@ -15,7 +15,6 @@ from shapecat.detection.merging.segment_features import (
     SEGMENT_FEATURES,
     depth_difference,
     lateral_curvature,
-    lateral_distance,
     normal_position_correlation,
     share,
     width_of,
@@ -170,12 +169,11 @@ def write_pair_features(
     relation.second_convexity = share(b.count, second)
     relation.both_convexity = share(a.count + b.count, hull)
     relation.hull_growth = share(hull, first + second)
-    both = np.zeros(1, SEGMENT)[0]
-    both.left, both.right = np.inf, -np.inf
-    add_statistics(both, a)
-    add_statistics(both, b)
-    relation.lateral_curvature = lateral_curvature(both)
-    relation.normal_position_correlation = normal_position_correlation(both)
+    both = np.zeros(2, SEGMENT)
+    both[0], both[1] = a, b
+    add_statistics(both, 0, 1)
+    relation.lateral_curvature = lateral_curvature(both[0])
+    relation.normal_position_correlation = normal_position_correlation(both[0])
     relation.cells, relation.cell_m, relation.down = a.count, cell, view_geometry.down
 
 
@@ -214,7 +212,7 @@ def _write_relation(a: Row, b: Row, out: Row) -> None:
     left, right = b.left - a.left, a.right - b.right
     common = min(a.right, b.right) - max(a.left, b.left)
     out.area_ratio, out.width_ratio = share(a.area, b.area), share(narrow, wide)
-    out.lateral_distance = share(lateral_distance(a, b), most)
+    out.lateral_distance = share(abs(a.left + a.right - b.left - b.right) / 2, most)
     out.depth_difference_m = depth_difference(a, b)
     out.depth_difference = share(depth_difference(a, b), most)
     out.overlap = share(common, min(narrow, wide))

@@ -12,7 +12,6 @@ __all__ = [
     "SEGMENT_FEATURES",
     "depth_difference",
     "lateral_curvature",
-    "lateral_distance",
     "normal_position_correlation",
     "share",
     "width_of",
@@ -47,12 +46,6 @@ SEGMENT_FEATURES = np.dtype(
 def width_of(row: Row) -> float:
     """Return the lateral extent of a segment, metres; ``row`` is a `SEGMENT`."""
     return float(row.right - row.left)
-
-
-@kernel(inline=True)
-def lateral_distance(a: Row, b: Row) -> float:
-    """Return the lateral distance between the middles of two segments, metres."""
-    return float(abs(a.left + a.right - b.left - b.right) / 2)
 
 
 @kernel(inner=True)

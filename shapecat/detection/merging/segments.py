@@ -7,9 +7,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from shapecat.arrays import F4, F8, I4
-from shapecat.detection.depth_grid import DepthGrid, PinholeIntrinsics
-from shapecat.detection.merging.image_hull import empty_hulls, extend_hull, merge_hulls
+from shapecat.detection.depth_grid import DepthGrid
+from shapecat.detection.merging.image_hull import extend_hull
 from shapecat.detection.merging.settings import MERGING
+from shapecat.detection.planes.extent import DIRECTIONS
 from shapecat.detection.planes.height_map import HeightMap
 from shapecat.detection.segmentation.connectivity import SurfaceGraph
 from shapecat.geometry import level_axes
@@ -25,7 +26,6 @@ __all__ = [
     "Segments",
     "add_statistics",
     "depth_of",
-    "is_root",
     "lateral_axis",
     "measure_segments",
     "merge",
@@ -33,12 +33,12 @@ __all__ = [
 
 SEGMENT = np.dtype(
     [
-        ("count", "f4"),  # cells
-        ("boundary", "f4"),  # sides of cells on the boundary
-        ("left", "f4"),  # lateral range, metres
-        ("right", "f4"),
-        ("bottom", "f4"),  # range of heights above the plane, metres
+        ("left", "f4"),  # minima: lateral position, metres,
+        ("bottom", "f4"),  # and height above the plane, metres
+        ("right", "f4"),  # maxima of both
         ("top", "f4"),
+        ("count", "f4"),  # sums from here on: cells
+        ("boundary", "f4"),  # sides of cells on the boundary
         ("area", "f4"),  # of the visible surface, m2
         ("depth_sum", "f4"),
         ("fitted", "f4"),  # cells with a local plane; the next eleven are sums over these:
@@ -60,6 +60,8 @@ SEGMENT = np.dtype(
     ]
 )
 """The statistics of a segment."""
+_MINIMA, _MAXIMA, _FIELDS = 2, 4, SEGMENT.itemsize // 4
+"""The indices at which its minima and its maxima end, and the number of its fields."""
 PAIR = np.dtype(
     [
         ("contact", "f4"),  # linked neighbours
@@ -90,7 +92,7 @@ class Segments(NamedTuple):
     pairs : (n + 1, n + 1) records of `PAIR`.
     statistics : (n + 1,) records of `SEGMENT`.
     top_area : (n + 1, BANDS) float32, area of upward-facing surface by height, m2.
-    hulls : (n + 1, DIRECTIONS) float32, convex hulls in the image, from `empty_hulls`.
+    hulls : (n + 1, DIRECTIONS) float32, support functions of the convex hulls in the image, cells.
     samples : (n + 1, SAMPLES) int32, flat cells away from edges; -1 beyond the last.
     plane_id : (n + 1,) int8, the plane below each, as in `HeightMap.plane_id`.
     parent : (n + 1,) int16, the segment that each has been merged into, at first itself.
@@ -113,8 +115,7 @@ def measure_segments(
     ``labels`` (rows, columns) are the segments; ``up`` is a unit vector (3,), sensor frame.
     """
     segments: Segments = _blank(n + 1)
-    axis, intrinsics = lateral_axis(up), grid.intrinsics
-    _measure(grid.inverse_depth, intrinsics, heights, graph, labels, up, axis, segments)
+    _measure(grid, heights, graph, labels, up, segments)
     return segments
 
 
@@ -124,7 +125,7 @@ def _blank(size: int) -> Segments:
         np.zeros((size, size), PAIR),
         np.zeros(size, SEGMENT),
         np.zeros((size, BANDS), np.float32),
-        empty_hulls(size),
+        np.full((size, DIRECTIONS), -1e9, np.float32),
         np.full((size, SAMPLES), -1, np.int32),
         np.zeros(size, np.int8),
         np.arange(size).astype(np.int16),
@@ -145,16 +146,10 @@ def lateral_axis(up: F8) -> F8:
 
 @kernel
 def _measure(
-    inv_depth: F4,
-    intrinsics: PinholeIntrinsics,
-    heights: HeightMap,
-    graph: SurfaceGraph,
-    labels: I4,
-    up: F8,
-    side: F8,
-    segments: Segments,
+    grid: DepthGrid, heights: HeightMap, graph: SurfaceGraph, labels: I4, up: F8, segments: Segments
 ) -> None:
     """Add the cells of labels 1..n to the statistics."""
+    inv_depth, intrinsics, side = grid.inverse_depth, grid.intrinsics, lateral_axis(up)
     plane_ids, top_area = segments.plane_id, segments.top_area
     plane_id, height = heights.plane_id, heights.height
     zero, one, far_off = np.float32(0), np.float32(1), np.float32(np.inf)
@@ -230,19 +225,22 @@ def _measure(
 @kernel
 def merge(segments: Segments, p: int, q: int) -> None:
     """Merge segment ``q`` into segment ``p``, in place; both must be roots."""
-    n = segments.parent.size
-    pairs = segments.pairs
+    n, pairs, hulls = segments.parent.size, segments.pairs.view(np.float32), segments.hulls
+    fields = pairs.shape[1] // n
+    for k in range(n * fields):
+        pairs[p, k] += pairs[q, k]
+        pairs[q, k] = 0
     for k in range(n):
-        _add_pair(pairs[p, k], pairs[q, k])
-    for k in range(n):
-        _add_pair(pairs[k, p], pairs[k, q])
-    own = pairs[p, p]
-    own.contact = own.concavity = own.in_front = 0.0
-    own.near = own.rests_on = own.rests_on_height = 0.0
+        for f in range(fields):
+            pairs[k, p * fields + f] += pairs[k, q * fields + f]
+            pairs[k, q * fields + f] = 0
+    for f in range(fields):
+        pairs[p, p * fields + f] = 0
     for band in range(BANDS):
         segments.top_area[p, band] += segments.top_area[q, band]
-    merge_hulls(segments.hulls[p], segments.hulls[q])
-    add_statistics(segments.statistics[p], segments.statistics[q])
+    for d in range(DIRECTIONS):
+        hulls[p, d] = max(hulls[p, d], hulls[q, d])
+    add_statistics(segments.statistics, p, q)
     # Half of the samples from each side.
     samples, first, mixed = segments.samples, np.zeros(SAMPLES, np.int32), 0
     for k in range(SAMPLES):
@@ -257,44 +255,14 @@ def merge(segments: Segments, p: int, q: int) -> None:
             segments.parent[k] = p
 
 
-@kernel(inner=True)
-def _add_pair(a: Row, b: Row) -> None:
-    """Add the statistics ``b`` of a pair to ``a``, and clear ``b``; both are records of `PAIR`."""
-    a.contact += b.contact
-    a.concavity += b.concavity
-    a.in_front += b.in_front
-    a.near += b.near
-    a.rests_on += b.rests_on
-    a.rests_on_height += b.rests_on_height
-    b.contact = b.concavity = b.in_front = 0.0
-    b.near = b.rests_on = b.rests_on_height = 0.0
-
-
 @kernel
-def add_statistics(a: Row, b: Row) -> None:
-    """Add the statistics ``b`` of a segment to ``a``; both are records of `SEGMENT`."""
-    a.count += b.count
-    a.boundary += b.boundary
-    a.left, a.right = min(a.left, b.left), max(a.right, b.right)
-    a.bottom, a.top = min(a.bottom, b.bottom), max(a.top, b.top)
-    a.area += b.area
-    a.depth_sum += b.depth_sum
-    a.fitted += b.fitted
-    a.position_x_sum += b.position_x_sum
-    a.position_y_sum += b.position_y_sum
-    a.position_z_sum += b.position_z_sum
-    a.facing_x_sum += b.facing_x_sum
-    a.facing_y_sum += b.facing_y_sum
-    a.facing_z_sum += b.facing_z_sum
-    a.x_sum += b.x_sum
-    a.xx_sum += b.xx_sum
-    a.normal_x_sum += b.normal_x_sum
-    a.normal_xx_sum += b.normal_xx_sum
-    a.x_normal_x_sum += b.x_normal_x_sum
-    a.plane_contact += b.plane_contact
-    a.hidden += b.hidden
-    a.shelf_edge += b.shelf_edge
-    a.upper_silhouette += b.upper_silhouette
+def add_statistics(statistics: Records, p: int, q: int) -> None:
+    """Add the statistics of segment ``q`` to those of ``p``; they are records of `SEGMENT`."""
+    values = statistics.view(np.float32)
+    for f in range(_FIELDS):
+        a, b = values[p * _FIELDS + f], values[q * _FIELDS + f]
+        joined = min(a, b) if f < _MINIMA else max(a, b) if f < _MAXIMA else a + b
+        values[p * _FIELDS + f] = joined
 
 
 @kernel(inner=True)
@@ -302,9 +270,3 @@ def depth_of(segments: Segments, p: int) -> float:
     """Return the mean depth of a segment, metres; 1 if it has no cells."""
     count = segments.statistics[p].count
     return float(segments.statistics[p].depth_sum / count) if count > 0 else 1.0
-
-
-@kernel(inner=True)
-def is_root(segments: Segments, p: int) -> bool:
-    """Return whether a segment has not been merged into another."""
-    return bool(segments.parent[p] == p)
