@@ -19,7 +19,6 @@ __all__ = [
     "BORDER_SHARE",
     "DepthGrid",
     "PinholeIntrinsics",
-    "count_at_range_limit",
     "discontinuity_at",
     "downsample",
     "find_borders",
@@ -83,7 +82,8 @@ def downsample(depth: F4, camera: Camera, *, range_m: float) -> DepthGrid | None
     sample = _sampled(depth, 5 if min(depth.shape) > 50 else 1, np.float32(range_m))
     if sample.size == 0:
         return None
-    depth_m = _median_of(sample)
+    # The upper median; `numpy.median` takes twice as long.
+    depth_m = float(np.partition(sample, sample.size // 2)[sample.size // 2])
     pixel_m = depth_m / max(abs(camera.fx), 1e-6)
     least = math.sqrt(depth.size / MOST_CELLS)
     factor = round(min(max(CELL_M / max(pixel_m, 1e-9), least, 1.0), LARGEST_FACTOR, *depth.shape))
@@ -104,11 +104,6 @@ def downsample(depth: F4, camera: Camera, *, range_m: float) -> DepthGrid | None
 def discontinuity_at(depth_m: float) -> float:
     """Return the step in inverse depth that separates two surfaces at a depth, 1/m."""
     return max(DISCONTINUITY, STEP_M / depth_m**2)
-
-
-def _median_of(values: F4) -> float:
-    """Return the upper median of values (n,), n >= 1; `numpy.median` takes twice as long."""
-    return float(np.partition(values, values.size // 2)[values.size // 2])
 
 
 @kernel
@@ -137,36 +132,6 @@ def smallest_object_at(grid: DepthGrid, depth_m: float) -> float:
     """Return the number of cells that the smallest object, of `SMALL_M2`, covers at a depth."""
     covered = SMALL_M2 * grid.intrinsics.fx**2 / depth_m**2
     return float(min(max(covered, FEWEST_CELLS), ENOUGH_CELLS))
-
-
-@kernel(inline=True)
-def count_at_range_limit(inv_depth: F4, labels: I4, size: int, range_m: float) -> I4:
-    """Count the samples of each label that are at the range limit.
-
-    Parameters
-    ----------
-    inv_depth : (rows, columns) 1/m.
-    labels : (rows, columns) labels below ``size``.
-    size : number of labels, including 0.
-    range_m : the limit, metres.
-
-    Returns
-    -------
-    (size,) counts; 0 for label 0.
-    """
-    count = np.zeros(size, np.int64)
-    most = np.float32(1 / range_m + DISCONTINUITY / 2)
-    for i in range(inv_depth.shape[0]):
-        some = False
-        for j in range(inv_depth.shape[1]):
-            # Most rows have none, and this vectorises.
-            some |= (labels[i, j] > 0) & (inv_depth[i, j] < most)
-        if not some:
-            continue
-        for j in range(inv_depth.shape[1]):
-            if labels[i, j] > 0 and inv_depth[i, j] < most:
-                count[labels[i, j]] += 1
-    return count
 
 
 @kernel

@@ -95,7 +95,8 @@ def _find_partners(a: F8, b: F8) -> tuple[float, F8]:
     some of the pairs, (n, 2, 3). ``a`` and ``b`` are from `_local_planes`.
     """
     with_a, with_b = np.zeros(a.shape[1], np.bool_), np.zeros(b.shape[1], np.bool_)
-    pairs, n = np.zeros((SAMPLES * SAMPLES, 2), np.uint8), 0
+    pairs = np.zeros((SAMPLES * SAMPLES, 2), np.uint8)
+    n = in_a = in_b = 0
     if min(with_a.size, with_b.size) < MERGING.fewest_samples:
         return 0.0, np.zeros((0, 2, 3))
     for s in range(with_a.size):
@@ -109,6 +110,7 @@ def _find_partners(a: F8, b: F8) -> tuple[float, F8]:
                 off_b += step * b[1, t, d]
             limit = MERGING.coplanar_m + MERGING.coplanar_slope * math.sqrt(distance)
             if alike >= MERGING.coplanar_cos and abs(off_a) <= limit and abs(off_b) <= limit:
+                in_a, in_b = in_a + (not with_a[s]), in_b + (not with_b[t])
                 with_a[s] = with_b[t] = True
                 pairs[n, 0], pairs[n, 1] = s, t
                 n += 1
@@ -118,26 +120,11 @@ def _find_partners(a: F8, b: F8) -> tuple[float, F8]:
         s, t = pairs[k * every]
         for d in range(3):
             lines[k, 0, d], lines[k, 1, d] = a[0, s, d], b[0, t, d]
-    return min(_share(with_a), _share(with_b)), lines
-
-
-@kernel(inner=True)
-def _share(flags: Bool) -> float:
-    count = 0
-    for flag in flags:
-        count += int(flag)
-    return count / flags.size
+    return min(in_a / with_a.size, in_b / with_b.size), lines
 
 
 @kernel(inline=True)
-def _is_hidden(
-    segments: Segments,
-    p: int,
-    q: int,
-    grid: DepthGrid,
-    labels: I4,
-    lines: F8,
-) -> bool:
+def _is_hidden(segments: Segments, p: int, q: int, grid: DepthGrid, labels: I4, lines: F8) -> bool:
     """Return whether lines (n, 2, 3) between two segments are hidden, not in free space."""
     inv_depth, intrinsics = grid.inverse_depth, grid.intrinsics
     free = hidden = looked = 0

@@ -150,12 +150,7 @@ def _choose_samples(graph: SurfaceGraph, labels: I4, segments: Segments) -> None
     ``labels`` (rows, columns) are the segments.
     """
     rows, columns = labels.shape
-    spans, local_plane, concavity, samples = (
-        graph.spans,
-        graph.local_plane,
-        graph.concavity,
-        segments.samples,
-    )
+    spans, local_plane, concavity = graph.spans, graph.local_plane, graph.concavity
     n = segments.parent.size
     stride, wait, taken = np.zeros(n, np.int32), np.zeros(n, np.int32), np.zeros(n, np.int32)
     for p in range(n):
@@ -167,6 +162,6 @@ def _choose_samples(graph: SurfaceGraph, labels: I4, segments: Segments) -> None
                 continue
             wait[p] -= 1
             if wait[p] == 0 and taken[p] < SAMPLES:
-                samples[p, taken[p]] = i * columns + j
+                segments.samples[p, taken[p]] = i * columns + j
                 taken[p] += 1
                 wait[p] = stride[p]

@@ -5,17 +5,12 @@ from typing import NamedTuple
 import numpy as np
 
 from shapecat.arrays import F4, F8, I4, Bool
-from shapecat.detection.connected_components import span_of
-from shapecat.detection.depth_grid import (
-    DepthGrid,
-    PinholeIntrinsics,
-    count_at_range_limit,
-    smallest_object_at,
-)
+from shapecat.detection.connected_components import spans_of
+from shapecat.detection.depth_grid import DepthGrid, smallest_object_at
 from shapecat.detection.merging.segments import Segments, depth_of
 from shapecat.detection.merging.settings import MERGING
 from shapecat.detection.output.settings import OUTPUT
-from shapecat.geometry import level_axes, level_box
+from shapecat.geometry import DISCONTINUITY, level_axes, level_box
 from shapecat.jit import kernel
 
 __all__ = ["ObjectMeasurements", "measure_objects"]
@@ -78,14 +73,8 @@ def measure_objects(
         np.zeros(count, np.bool_),
         np.zeros(count, np.float32),
     )
-    _measure_boxes(
-        grid.inverse_depth,
-        grid.intrinsics,
-        labels,
-        np.array(level_axes(up[0], up[1], up[2])),
-        measured,
-    )
-    last = count_at_range_limit(grid.inverse_depth, labels, representatives.size, range_m)
+    _measure_boxes(grid, labels, np.array(level_axes(up[0], up[1], up[2])), measured)
+    last = _count_at_range_limit(grid.inverse_depth, labels, representatives.size, range_m)
     for k in range(count):
         p = representatives[k + 1]
         measured.last[k] = last[k + 1] >= MERGING.few
@@ -104,21 +93,36 @@ def measure_objects(
 
 
 @kernel(inline=True)
+def _count_at_range_limit(inv_depth: F4, labels: I4, size: int, range_m: float) -> I4:
+    """Count the samples of each label below ``size`` that are at the range limit, (size,)."""
+    count = np.zeros(size, np.int64)
+    most = np.float32(1 / range_m + DISCONTINUITY / 2)
+    for i in range(inv_depth.shape[0]):
+        some = False
+        for j in range(inv_depth.shape[1]):
+            # Most rows have none, and this vectorises.
+            some |= (labels[i, j] > 0) & (inv_depth[i, j] < most)
+        if not some:
+            continue
+        for j in range(inv_depth.shape[1]):
+            if labels[i, j] > 0 and inv_depth[i, j] < most:
+                count[labels[i, j]] += 1
+    return count
+
+
+@kernel(inline=True)
 def _supporting_object(segments: Segments, representatives: I4, p: int) -> tuple[int, float]:
     """Return the label below a segment, 0 for its plane, and the height of this support, metres."""
-    pairs, statistics = segments.pairs[p], segments.statistics
+    pairs, statistics, own = segments.pairs[p], segments.statistics, segments.statistics[p]
     best = 0
     for k in range(1, representatives.size):
         more = pairs[representatives[k]].rests_on > pairs[representatives[best]].rests_on
         best = k if more else best
     met = pairs[representatives[best]].rests_on
-    if met >= MERGING.few and met > segments.statistics[p].plane_contact:
+    if met >= MERGING.few and met > own.plane_contact:
         height = float(pairs[representatives[best]].rests_on_height / met)
-        return (0, 0.0) if statistics[p].bottom < height - OUTPUT.sunk_m else (best, height)
-    if (
-        statistics[p].bottom > OUTPUT.lifted_m
-        and segments.statistics[p].plane_contact < MERGING.few
-    ):
+        return (0, 0.0) if own.bottom < height - OUTPUT.sunk_m else (best, height)
+    if own.bottom > OUTPUT.lifted_m and own.plane_contact < MERGING.few:
         best = _hidden_support(segments, representatives, p)
         return best, float(statistics[representatives[best]].top) if best else 0.0
     return 0, 0.0
@@ -154,14 +158,8 @@ def _break_cycles(measured: ObjectMeasurements) -> None:
 
 
 @kernel(fast=True, inner=True)
-def _measure_boxes(
-    inv_depth: F4,
-    intrinsics: PinholeIntrinsics,
-    labels: I4,
-    level: F8,
-    measured: ObjectMeasurements,
-) -> None:
-    points, start = _outer_points(inv_depth, intrinsics, labels, level, measured)
+def _measure_boxes(grid: DepthGrid, labels: I4, level: F8, measured: ObjectMeasurements) -> None:
+    points, start = _outer_points(grid, labels, level, measured)
     for k in range(start.size - 1):
         if start[k] < start[k + 1]:
             center, size, turned = level_box(points[:, start[k] : start[k + 1]], level)
@@ -173,11 +171,7 @@ def _measure_boxes(
 
 @kernel(fast=True, inline=True)
 def _outer_points(
-    inv_depth: F4,
-    intrinsics: PinholeIntrinsics,
-    labels: I4,
-    level: F8,
-    measured: ObjectMeasurements,
+    grid: DepthGrid, labels: I4, level: F8, measured: ObjectMeasurements
 ) -> tuple[F4, I4]:
     """Return points of each object in the level frame (3, n), and the index where each begins.
 
@@ -185,11 +179,11 @@ def _outer_points(
     is inside its outline. Also writes ``low`` and ``high`` of the measurements.
     """
     rows, columns = labels.shape
+    inv_depth, intrinsics = grid.inverse_depth, grid.intrinsics
     low, high = measured.low, measured.high
-    spans, outer = np.zeros((rows, 2), np.int64), np.zeros(columns, np.bool_)
+    spans, outer = spans_of(labels), np.zeros(columns, np.bool_)
     cells = n = 0
     for i in range(rows):
-        spans[i, 0], spans[i, 1] = span_of(labels[i])
         cells += spans[i, 1] - spans[i, 0]
     chosen = np.zeros((cells, 2), np.int32)
     start = np.zeros(low.shape[0] + 1, np.int64)

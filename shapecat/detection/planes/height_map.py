@@ -5,7 +5,7 @@ from typing import NamedTuple
 import numpy as np
 
 from shapecat.arrays import F4, F8, I4
-from shapecat.detection.depth_grid import DepthGrid, PinholeIntrinsics
+from shapecat.detection.depth_grid import DepthGrid
 from shapecat.detection.planes.extent import COS, DIRECTIONS, SIN, SupportingPlane
 from shapecat.geometry import gravity_rotation
 from shapecat.jit import kernel
@@ -70,36 +70,21 @@ def measure_heights(grid: DepthGrid, planes: F8, highest_m: float) -> HeightMap:
     planes : from `pack_planes`, lowest first.
     highest_m : greatest height above the plane, metres.
     """
-    plane_id = np.zeros(grid.inverse_depth.shape, np.int8)
-    height = np.zeros(grid.inverse_depth.shape, np.float32)
+    shape = grid.inverse_depth.shape
+    heights = HeightMap(np.zeros(shape, np.int8), np.zeros(shape, np.float32))
     for number in range(len(planes), 0, -1):
-        _assign(
-            grid.inverse_depth,
-            grid.intrinsics,
-            planes[number - 1],
-            number,
-            highest_m,
-            plane_id,
-            height,
-        )
-    return HeightMap(plane_id, height)
+        _assign(grid, planes[number - 1], number, highest_m, heights)
+    return heights
 
 
 @kernel(inline=True)
-def _assign(
-    inv_depth: F4,
-    intrinsics: PinholeIntrinsics,
-    plane: F8,
-    number: int,
-    highest: float,
-    plane_id: I4,
-    height: F4,
-) -> None:
+def _assign(grid: DepthGrid, plane: F8, number: int, highest: float, heights: HeightMap) -> None:
     """Assign the free cells inside the outline of a plane to it; the loops over a row vectorise.
 
     Compiled without ``fast``: with it, the inlined copy would round heights differently in the
     process that compiles and in later ones.
     """
+    inv_depth, intrinsics, (plane_id, height) = grid.inverse_depth, grid.intrinsics, heights
     rows, columns = inv_depth.shape
     a, scale, zero, one = np.float32(plane[0]), np.float32(plane[3]), np.float32(0), np.float32(1)
     least, noise, below = np.float32(MIN_HEIGHT_M), np.float32(HEIGHT_NOISE), np.float32(OUT)

@@ -2,14 +2,14 @@
 
 import numpy as np
 
-from shapecat.arrays import F4, I4, U1, Bool
+from shapecat.arrays import I4, U1, Bool
 from shapecat.detection.connected_components import DOWN, RIGHT, connected_components, spans_of
 from shapecat.detection.planes.height_map import HeightMap
 from shapecat.detection.segmentation.connectivity import SurfaceGraph
 from shapecat.detection.segmentation.settings import SEGMENTATION
 from shapecat.jit import kernel, unset
 
-__all__ = ["relabel_above", "watershed"]
+__all__ = ["watershed"]
 
 NO_EDGE = 255
 """Concave angle that no edge reaches, degrees."""
@@ -120,21 +120,3 @@ def _find_ways(links: U1, labels: I4, spans: I4, columns: int, ways: U1) -> None
             ways[p] |= links[p] & down if labels[p + below] <= 0 else none
         for p in range(first, end if i > 0 else first):
             ways[p] |= up if (links[p - below] & down > 0) & (labels[p - below] <= 0) else none
-
-
-@kernel(inline=True)
-def relabel_above(labels: I4, spans: I4, height: F4, label: int, level: float, name: int) -> None:
-    """Change the label of the cells that are higher than a level, in place.
-
-    Parameters
-    ----------
-    labels : (rows, columns) changed in place; not 0 only within ``spans``.
-    spans : (rows, 2) as in `SurfaceGraph`.
-    height : (rows, columns) metres.
-    label, level : cells with this label and a height above this level, metres, are changed.
-    name : the new label.
-    """
-    for i in range(labels.shape[0]):
-        for j in range(spans[i, 0], spans[i, 1]):
-            if labels[i, j] == label and height[i, j] > level:
-                labels[i, j] = name

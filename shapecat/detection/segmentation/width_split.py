@@ -15,7 +15,6 @@ from shapecat.detection.merging.segments import BAND_M, BANDS, lateral_axis
 from shapecat.detection.planes.height_map import HeightMap
 from shapecat.detection.segmentation.connectivity import SurfaceGraph
 from shapecat.detection.segmentation.settings import SEGMENTATION
-from shapecat.detection.segmentation.watershed import relabel_above
 from shapecat.jit import kernel
 
 __all__ = ["split_at_width_changes"]
@@ -61,19 +60,24 @@ def split_at_width_changes(
         for band in range(BANDS if _find_cuts(grid, outlines, p, side, cuts) else 0):
             if cuts[band]:
                 fresh += 1
-                relabel_above(labels, graph.spans, heights.height, rest, band * BAND_M, fresh)
+                _relabel_above(labels, graph.spans, heights.height, rest, band * BAND_M, fresh)
                 rest = fresh
     return fresh
 
 
 @kernel(inline=True)
+def _relabel_above(labels: I4, spans: I4, height: F4, label: int, level: float, name: int) -> None:
+    """Change the label of the cells that are higher than ``level``, metres, to ``name``."""
+    for i in range(labels.shape[0]):
+        for j in range(spans[i, 0], spans[i, 1]):
+            if labels[i, j] == label and height[i, j] > level:
+                labels[i, j] = name
+
+
+@kernel(inline=True)
 def _outlines_of(grid: DepthGrid, height: F4, spans: I4, labels: I4, n: int, side: F8) -> Outlines:
     """Collect the outlines of the labels 1..n."""
-    inv_depth, intrinsics, columns = (
-        grid.inverse_depth,
-        grid.intrinsics,
-        grid.inverse_depth.shape[1],
-    )
+    inv_depth, intrinsics, columns = grid.inverse_depth, grid.intrinsics, labels.shape[1]
     one, per_band = np.float32(1), np.float32(1 / BAND_M)
     # Lateral position over depth is linear in column and row.
     a, b = np.float32(side[0] / intrinsics.fx), np.float32(side[1] / intrinsics.fy)
