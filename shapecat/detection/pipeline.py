@@ -127,13 +127,9 @@ def _in_cloud(points: F4, hint: F8 | None, task: Task) -> Scene | None:
         found = None if view is None else _seen(view, hint, task)
     if view is None or found is None:
         return None
-    indices, pose = (
-        label_points(view, found, fused=view.crowded > OUTPUT.crowded),
-        view.view_from_sensor,
-    )
-    return build_scene(
-        view.grid, found, indices, inverse(pose), settings=task.settings, points=view.points
-    )
+    indices = label_points(view, found, fused=view.crowded > OUTPUT.crowded)
+    pose = inverse(view.view_from_sensor)
+    return build_scene(view.grid, found, indices, pose, settings=task.settings, points=view.points)
 
 
 def _seen(view: VirtualImage, hint: F8 | None, task: Task) -> Segmentation | None:

@@ -107,11 +107,8 @@ def top_view(
     height = sample @ normal.T - np.einsum("ij,ij->i", a, normal)
     best = int(np.argmax(np.count_nonzero(abs(height) < 0.01, axis=0)))
     up, above = normal[best], height[:, best]
-    if (
-        up @ hint
-        if hint is not None
-        else np.sum(abs(above) > 0.01, where=above > 0) * 2 - np.count_nonzero(abs(above) > 0.01)
-    ) < 0:
+    more_above = np.count_nonzero(above > 0.01) - np.count_nonzero(above < -0.01)
+    if (more_above if hint is None else up @ hint) < 0:
         up = -up
     middle = np.median(sample, axis=0)
     side = gravity_rotation(up)[1]
@@ -141,13 +138,7 @@ def _middle(points: F4, origin: F8, range_m: float) -> tuple[F8, int]:
 
 @kernel
 def _turn(
-    points: F4,
-    rotation: F8,
-    translation: F8,
-    range_m: float,
-    turned: F4,
-    place: F4,
-    bounds: F8,
+    points: F4, rotation: F8, translation: F8, range_m: float, turned: F4, place: F4, bounds: F8
 ) -> int:
     """Transform the points in view to the frame of the virtual camera; return their number.
 
@@ -290,13 +281,10 @@ def _close_holes(inv_depth: F4, jump: float) -> None:
             if source[i, j] > 0:
                 continue
             total, n = np.float32(0), 0
-            a, b = source[i, j - 1], source[i, j + 1]
-            if (a > 0) & (b > 0) & (abs(a - b) < jump):
-                total += a + b
-                n += 2
-            a, b = source[i - 1, j], source[i + 1, j]
-            if (a > 0) & (b > 0) & (abs(a - b) < jump):
-                total += a + b
-                n += 2
+            for di, dj in ((0, 1), (1, 0)):
+                a, b = source[i - di, j - dj], source[i + di, j + dj]
+                if (a > 0) & (b > 0) & (abs(a - b) < jump):
+                    total += a + b
+                    n += 2
             if n > 0:
                 inv_depth[i, j] = total / n

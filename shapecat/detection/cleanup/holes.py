@@ -33,10 +33,8 @@ def fill_contact_boundary(grid: DepthGrid, heights: HeightMap, labels: I4) -> No
     inv_depth, (plane_id, height) = grid.inverse_depth, heights
     rows, columns = labels.shape
     before, low = labels.copy(), np.zeros(columns, np.bool_)
-    least, noise = (
-        np.float32(CLEANUP.fringe * MIN_HEIGHT_M),
-        np.float32(CLEANUP.fringe * HEIGHT_NOISE),
-    )
+    least = np.float32(CLEANUP.fringe * MIN_HEIGHT_M)
+    noise = np.float32(CLEANUP.fringe * HEIGHT_NOISE)
     for i in range(rows):
         some = False
         for j in range(np.uint64(columns)):  # few rows have any, and this vectorises

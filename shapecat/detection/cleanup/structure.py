@@ -49,12 +49,8 @@ FILES = {"structure.npz": OBJECT_FEATURES, "structure_in_context.npz": CONTEXT_F
 def load_trees() -> RejectionTrees:
     """Load shapecat's trees for rejecting structure."""
     folder = files("shapecat.detection.cleanup")
-    return RejectionTrees(
-        *(
-            read_trees(folder.joinpath(name).read_bytes(), features)
-            for name, features in FILES.items()
-        )
-    )
+    both = (read_trees(folder.joinpath(name).read_bytes(), use) for name, use in FILES.items())
+    return RejectionTrees(*both)
 
 
 def find_background(

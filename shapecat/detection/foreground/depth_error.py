@@ -9,15 +9,10 @@ import numpy as np
 from shapecat.arrays import F4, F8, I4
 from shapecat.detection.connected_components import SIDES
 from shapecat.detection.foreground.settings import LOW
+from shapecat.detection.planes.height_map import HeightMap
 from shapecat.jit import kernel
 
-__all__ = [
-    "EVERY",
-    "clear_contact",
-    "filter_high_pass",
-    "measure_noise",
-    "measure_residual",
-]
+__all__ = ["EVERY", "clear_contact", "filter_high_pass", "measure_noise", "measure_residual"]
 
 STEPS = 2**20
 """Steps per 1/m of the integer sums: for a window full of samples 1/m off, they fit in 32 bits."""
@@ -26,18 +21,16 @@ BIN, BINS, EVERY = 2e-5, 500, 3
 
 
 @kernel
-def measure_residual(
-    inv_depth: F4, plane_id: I4, height: F4, plane: F8, number: int, out: F4
-) -> int:
+def measure_residual(inv_depth: F4, heights: HeightMap, plane: F8, number: int, out: F4) -> int:
     """Write the smoothed inverse depth of a plane's low cells, relative to the plane; 0 elsewhere.
 
     Returns the number of low cells, without those on the border of the image.
 
     Parameters
     ----------
-    inv_depth, plane_id, height : (rows, columns) inverse depth, 1/m, and as in `HeightMap`.
+    inv_depth : (rows, columns) 1/m.
     plane : (3,) or more, beginning with a, b, c of its inverse depth.
-    number : number of the plane, from 1, as in ``plane_id``.
+    number : number of the plane, from 1, as in `HeightMap.plane_id`.
     out : (rows, columns) 1/m, written in place.
     """
     rows, columns = inv_depth.shape
@@ -51,7 +44,7 @@ def measure_residual(
         out[0, j] = out[rows - 1, j] = zero
     for i in range(rows):
         before = some
-        some = _find_low(inv_depth, plane_id, height, plane, number, i, raw, mark)
+        some = _find_low(inv_depth, heights, plane, number, i, raw, mark)
         if i < 2:
             continue
         for j in range(np.uint64(columns)):
@@ -74,13 +67,14 @@ def measure_residual(
 
 @kernel(inline=True)
 def _find_low(
-    inv_depth: F4, plane_id: I4, height: F4, plane: F8, number: int, i: int, raw: F4, mark: F4
+    inv_depth: F4, heights: HeightMap, plane: F8, number: int, i: int, raw: F4, mark: F4
 ) -> bool:
     """Write the inverse depth of the low cells of row ``i`` relative to the plane, and a mark of 1.
 
     ``raw`` and ``mark`` (3, columns) hold the last three rows; other cells are 0. Returns whether
     the row has low cells.
     """
+    plane_id, height = heights
     zero, one, low = np.float32(0), np.float32(1), np.float32(LOW.low_m)
     slope, base = np.float32(plane[0]), np.float32(plane[1] * i + plane[2])
     above, on = np.int8(number), np.int8(-number)
@@ -97,14 +91,7 @@ def _find_low(
 
 @kernel
 def clear_contact(
-    inv_depth: F4,
-    plane_id: I4,
-    height: F4,
-    number: int,
-    jump: float,
-    residual: F4,
-    stack: I4,
-    drop: F4,
+    inv_depth: F4, heights: HeightMap, number: int, jump: float, residual: F4, stack: I4, drop: F4
 ) -> None:
     """Set the residual to 0 on the steep foot of higher objects.
 
@@ -113,13 +100,13 @@ def clear_contact(
 
     Parameters
     ----------
-    inv_depth, plane_id, height : (rows, columns) inverse depth, 1/m, and as in `HeightMap`.
-    number : number of the plane, from 1, as in ``plane_id``.
+    inv_depth : (rows, columns) 1/m.
+    number : number of the plane, from 1, as in `HeightMap.plane_id`.
     jump : largest change from cell to cell on the side of an object, 1/m.
     residual : (rows, columns) 1/m, changed in place.
     stack, drop : (cells,) work space.
     """
-    rows, columns = residual.shape
+    (rows, columns), (plane_id, height) = residual.shape, heights
     top = 0
     high, edge = np.float32(LOW.low_m), np.zeros(columns, np.bool_)
     one, me = np.uint64(1), np.int8(number)

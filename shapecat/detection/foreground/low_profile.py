@@ -10,6 +10,7 @@ from typing import NamedTuple
 import numpy as np
 
 from shapecat.arrays import F4, F8, I4
+from shapecat.detection.connected_components import SIDES
 from shapecat.detection.depth_grid import DepthGrid
 from shapecat.detection.foreground.convex_hull import fill_hull
 from shapecat.detection.foreground.depth_error import (
@@ -78,12 +79,12 @@ def find_low_profile(
         if start == end:
             continue
         plane[2] += start * plane[1]  # rows count from ``start`` from here on
-        values, plane_ids = inv_depth[start:end], plane_id[start:end]
-        above, marks = height[start:end], low_profile[start:end]
+        values, plane_ids, marks = inv_depth[start:end], plane_id[start:end], low_profile[start:end]
         residual, high_pass = residuals[start:end], high_passes[start:end]
-        if measure_residual(values, plane_ids, above, plane, number, residual) < LOW.least_cells:
+        above = HeightMap(plane_ids, height[start:end])
+        if measure_residual(values, above, plane, number, residual) < LOW.least_cells:
             continue
-        clear_contact(values, plane_ids, above, number, 2 * jump, residual, scratch.seeds, drops)
+        clear_contact(values, above, number, 2 * jump, residual, scratch.seeds, drops)
         filter_high_pass(residual, high_pass)
         clear = max(LOW.step, LOW.steady * measure_noise(high_pass, plane_ids, number))
         step = max(clear, LOW.slip * math.hypot(plane[0], plane[1]))
@@ -278,9 +279,8 @@ def _is_flat(residual: F4, i: int, j: int) -> bool:
     """Return whether a low cell is not on the side of an object."""
     rows, columns = residual.shape
     here = residual[i, j]
-    for d in range(4):
-        y = i + (2 if d == 0 else -2 if d == 1 else 0)
-        x = j + (2 if d == 2 else -2 if d == 3 else 0)
+    for di, dj in SIDES:
+        y, x = i + 2 * di, j + 2 * dj
         if y < 0 or x < 0 or y >= rows or x >= columns:
             continue
         if residual[y, x] == 0 or abs(residual[y, x] - here) > LOW.side:

@@ -75,11 +75,10 @@ def _is_wall(
         along += WALLS.strip_m * (strips[1, k] > WALLS.strip_m**2)
     if area <= WALLS.least_m2 or area <= WALLS.filled * across * along:
         return False
-    if math.hypot(across, along) > WALLS.cut_off * largest_m and _is_cut_off(
-        grid.inverse_depth, samples, plane
-    ):
+    if max(across, along) > largest_m:
         return True
-    return bool(max(across, along) > largest_m)
+    large = math.hypot(across, along) > WALLS.cut_off * largest_m
+    return bool(large and _is_cut_off(grid.inverse_depth, samples, plane))
 
 
 @kernel(inline=True)
@@ -110,12 +109,7 @@ def _bounds(samples: DepthSamples, plane: F8, tolerance: float) -> F8:
 
 @kernel(inline=True)
 def _measure(
-    intrinsics: PinholeIntrinsics,
-    samples: DepthSamples,
-    plane: F8,
-    normal: F8,
-    up: F8,
-    strips: F8,
+    intrinsics: PinholeIntrinsics, samples: DepthSamples, plane: F8, normal: F8, up: F8, strips: F8
 ) -> float:
     """Return the area of the inliers of a plane, m², and add it to the strips they lie in."""
     total, side = 0.0, cross(normal, up)

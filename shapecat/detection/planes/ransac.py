@@ -164,10 +164,8 @@ def ransac_plane(
             continue
         a, b = plane[0] * intrinsics.fx, plane[1] * intrinsics.fy
         c = plane[0] * intrinsics.cx + plane[1] * intrinsics.cy + plane[2]
-        along, norm = (
-            -(a * guide[0] + b * guide[1] + c * guide[2]),
-            math.sqrt(a * a + b * b + c * c),
-        )
+        along = -(a * guide[0] + b * guide[1] + c * guide[2])
+        norm = math.sqrt(a * a + b * b + c * c)
         if not ((along >= cosines[0] * norm) & (along <= cosines[1] * norm)):
             continue
         # (2) count the inliers

@@ -124,20 +124,12 @@ def _copy_windows(
 
 @kernel(fast=True, inner=True)
 def _fit_run(
-    values: F4,
-    intrinsics: PinholeIntrinsics,
-    wider: float,
-    i: int,
-    start: int,
-    n: int,
-    fits: F4,
+    values: F4, intrinsics: PinholeIntrinsics, wider: float, i: int, start: int, n: int, fits: F4
 ) -> None:
     """Fit planes to the windows of ``n`` cells from (i, ``start``) on.
 
-    ``wider`` multiplies the gates of `SEGMENTATION`.
-
-    The rows of ``fits`` are inverse depth, its change per column and per row, and the normal (3);
-    0 where there is no fit.
+    ``wider`` multiplies the gates of `SEGMENTATION`. The rows of ``fits`` are inverse depth, its
+    change per column and per row, and the normal (3); 0 where there is no fit.
     """
     zero, one = np.float32(0), np.float32(1)
     g0, slope = wider * np.float32(SEGMENTATION.gate), wider * np.float32(SEGMENTATION.gate_slope)
