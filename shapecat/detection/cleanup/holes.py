@@ -26,9 +26,7 @@ the hole, and those where the surface continues."""
 def fill_contact_boundary(grid: DepthGrid, heights: HeightMap, labels: I4) -> None:
     """Give the label of an object to adjacent cells that are slightly above its plane, in place.
 
-    Parameters
-    ----------
-    labels : (rows, columns) int16, the objects, 0 elsewhere.
+    ``labels`` (rows, columns) int16 are the objects, 0 elsewhere.
     """
     inv_depth, (plane_id, height) = grid.inverse_depth, heights
     rows, columns = labels.shape

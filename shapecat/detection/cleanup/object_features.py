@@ -91,9 +91,7 @@ def measure_object_features(
 ) -> Records:
     """Return the `OBJECT_FEATURES` (n + 1,) of merged segments; zeros for merged parts.
 
-    Parameters
-    ----------
-    range_m : the range limit, metres.
+    ``range_m`` is the range limit, metres.
     """
     graph, labels, segments = oversegmentation
     features = np.zeros(segments.parent.size, OBJECT_FEATURES)

@@ -96,12 +96,9 @@ def _count(
 ) -> None:
     """Add pairs of cells on a boundary to the counts of the segments on both sides.
 
-    Parameters
-    ----------
-    row : the row of the first cells.
-    met : (n, 6) column of the first cell; row and column of the second; 1 if the second is below
-        the first, 0 if it is to the right; number of cells without a reading between them; and
-        not 0 if the surface continues.
+    The first cells are in row ``row``. ``met`` (n, 6) holds their column; row and column of the
+    second; 1 if the second is below the first, 0 if it is to the right; the number of cells without
+    a reading between them; and not 0 if the surface continues.
     """
     inv_depth, jump = grid.inverse_depth, grid.discontinuity
     plane_id, height = heights.plane_id, heights.height
@@ -145,10 +142,7 @@ def _count(
 
 @kernel(inline=True)
 def _choose_samples(graph: SurfaceGraph, labels: I4, segments: Segments) -> None:
-    """Choose evenly spaced samples of each segment, away from edges, in place.
-
-    ``labels`` (rows, columns) are the segments.
-    """
+    """Choose evenly spaced samples of each segment, away from edges, in place."""
     rows, columns = labels.shape
     spans, local_plane, concavity = graph.spans, graph.local_plane, graph.concavity
     n = segments.parent.size

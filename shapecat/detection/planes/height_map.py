@@ -65,10 +65,8 @@ def pack_planes(supports: list[SupportingPlane]) -> F8:
 def measure_heights(grid: DepthGrid, planes: F8, highest_m: float) -> HeightMap:
     """Assign each sample to the highest plane below it.
 
-    Parameters
-    ----------
-    planes : from `pack_planes`, lowest first.
-    highest_m : greatest height above the plane, metres.
+    ``planes`` are from `pack_planes`, lowest first; ``highest_m`` is the greatest height above the
+    plane, metres.
     """
     shape = grid.inverse_depth.shape
     heights = HeightMap(np.zeros(shape, np.int8), np.zeros(shape, np.float32))

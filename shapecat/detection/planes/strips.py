@@ -38,9 +38,7 @@ BINS = 600
 def may_have_strips(grid: DepthGrid, points: OrientedPoints, found: list[PlaneCandidate]) -> bool:
     """Return whether some height has many points with few below it, and so may have strips.
 
-    Parameters
-    ----------
-    found : parallel planes, at least one.
+    ``found`` are parallel planes, at least one.
     """
     count = _count_by_height(points, found[0].plane.up)
     return any(_may_be_strips(grid, found, *peak) for peak in _peaks(count, STRIPS.least_points))
@@ -65,15 +63,8 @@ def add_strip_planes(grid: DepthGrid, found: list[PlaneCandidate]) -> list[Plane
     """Add the planes of which only narrow strips are visible.
 
     Hardly any surface lies below such a plane. A board shows some surface at its own height; a
-    covered table shows more just above, on the objects that cover it.
-
-    Parameters
-    ----------
-    found : parallel planes, lowest first, at least one.
-
-    Returns
-    -------
-    All planes, lowest first. A plane of ``found`` may have a larger extent now.
+    covered table shows more just above, on the objects that cover it. ``found`` are parallel
+    planes, lowest first, at least one; so is the result, where they may have a larger extent.
     """
     up = max(found, key=lambda one: one.plane.area_m2).plane.up
     strips, area = _level_strips(grid.inverse_depth, grid.intrinsics, up)
@@ -96,12 +87,8 @@ def add_strip_planes(grid: DepthGrid, found: list[PlaneCandidate]) -> list[Plane
 
 
 def _is_at_the_end(inv_depth: F4, strips: DepthSamples) -> bool:
-    """Return whether strips lie at the end of the range, where nothing below them is visible.
-
-    ``inv_depth`` (rows, columns) is the inverse depth of the grid, 1/m; every fourth row and column
-    shows where the range ends.
-    """
-    some = inv_depth[::4, ::4]
+    """Return whether strips lie at the end of the range, where nothing below them is visible."""
+    some = inv_depth[::4, ::4]  # enough to show where the range ends
     seen = some[some > 0]
     return bool(np.median(strips.inverse_depth) < STRIPS.end * seen.min(initial=np.inf))
 
@@ -150,15 +137,9 @@ def _area_over(strips: F4, intrinsics: PinholeIntrinsics, plane: SupportingPlane
 def _peaks(amount: F8, least: float) -> F8:
     """Find the heights of level surface with next to nothing below it.
 
-    Parameters
-    ----------
-    amount : (BINS,) level surface by height, the lowest first.
-    least : minimum amount in a peak and the two bins beside it.
-
-    Returns
-    -------
-    (n, 2) the heights above the sensor, metres, ascending; and the amount just above each, relative
-    to that of the peak: the tops of objects that cover it.
+    ``amount`` (BINS,) is level surface by height, the lowest first; a peak and the two bins beside
+    it hold more than ``least``. Returns (n, 2) the heights above the sensor, metres, ascending; and
+    the amount just above each, relative to that of the peak: the tops of objects that cover it.
     """
     peaks, n, bins = np.zeros((BINS, 2)), 0, STRIPS.below - 2
     for k in range(STRIPS.below, BINS - 3):
@@ -197,12 +178,8 @@ def _level_strips(inv_depth: F4, intrinsics: PinholeIntrinsics, up: F8) -> tuple
     """Find the samples on level surface.
 
     At least three of the four neighbours of such a sample are closer to a level surface through it
-    than to a vertical one.
-
-    Returns
-    -------
-    Columns, rows, inverse depths and heights (4, n) of the samples; and the area of their surface
-    by height, (BINS,) m², the lowest first.
+    than to a vertical one. Returns columns, rows, inverse depths and heights (4, n) of the samples;
+    and the area of their surface by height, (BINS,) m², the lowest first.
     """
     rows, columns = inv_depth.shape
     across, down = np.float32(up[0] / intrinsics.fx), np.float32(up[1] / intrinsics.fy)

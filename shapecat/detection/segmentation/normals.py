@@ -103,9 +103,7 @@ def _copy_windows(
 ) -> None:
     """Copy the rows around a run and `WINDOW` cells beyond its ends; `NONE` above other planes.
 
-    Parameters
-    ----------
-    run : its row, its first column, and one after its last.
+    ``run`` is its row, its first column, and one after its last.
     """
     rows, columns = shape
     i, start, end = run
