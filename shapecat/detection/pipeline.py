@@ -149,8 +149,7 @@ def label(
         return None
     oversegmentation = _oversegment(grid, model)
     merge_segments(grid, model, oversegmentation)
-    representatives = _clean_up(grid, model, oversegmentation, task.settings)
-    return _fill(grid, model, oversegmentation, representatives, task)
+    return _clean_up(grid, model, oversegmentation, task.settings)
 
 
 def oversegment(grid: DepthGrid, task: Task) -> tuple[PlaneModel, OverSegmentation] | None:
@@ -224,25 +223,13 @@ def _clean_up(
     model: PlaneModel,
     oversegmentation: OverSegmentation,
     settings: DetectionSettings,
-) -> I4:
-    """Reject structure, and number the objects; return their representative segments."""
+) -> Segmentation:
+    """Reject structure, fill contact boundaries and holes, and measure the objects."""
     graph, labels, segments = oversegmentation
     features = measure_object_features(grid, model, oversegmentation, settings.max_range_m)
-    trees = structure.load_trees()
-    rejected = find_background(segments, features, grid, settings, trees)
+    rejected = find_background(segments, features, grid, settings, structure.load_trees())
     representatives: I4 = number_objects(segments.parent, rejected, labels, graph.spans)
-    return representatives
-
-
-def _fill(
-    grid: DepthGrid,
-    model: PlaneModel,
-    oversegmentation: OverSegmentation,
-    representatives: I4,
-    task: Task,
-) -> Segmentation:
-    """Fill contact boundaries and holes in the labels, and measure the objects."""
-    _, labels, segments = oversegmentation  # since `_clean_up`, the labels are those of objects
+    # From here on, the labels are those of objects.
     fill_contact_boundary(grid, model.heights, labels)
     filled = np.zeros(labels.shape, np.uint8)
     fill_holes(grid, labels, representatives.size - 1, filled)
@@ -250,6 +237,6 @@ def _fill(
         filled |= (model.low_profile > 0) & (labels > 0)
     plane_ids = segments.plane_id[representatives].astype(np.int64) - 1
     plane_ids[0] = 0
-    range_m = task.settings.max_range_m
+    range_m = settings.max_range_m
     measured = measure_objects(grid, labels, segments, representatives, model.up, range_m)
     return Segmentation(model, labels, filled, plane_ids, measured)
