@@ -209,9 +209,8 @@ def _spacing(place: F4, bounds: F8, n: int) -> float:
     """
     span = max(bounds[2] - bounds[0], bounds[3] - bounds[1], 1e-6)
     side = 1024
-    while side > 16:
-        if n >= LOAD * _occupied(place, bounds[0], bounds[1], side / span * 0.999, side):
-            break
+    left, top, *_ = bounds
+    while side > 16 and n < LOAD * _occupied(place, left, top, side / span * 0.999, side):
         side = int(side / 1.25)
     return float(span / side)
 

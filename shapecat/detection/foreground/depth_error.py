@@ -127,12 +127,8 @@ def clear_contact(
             continue
         for j in range(1, columns - 1):
             if edge[j]:
-                for di, dj in SIDES:
-                    y, x = i + di, j + dj
-                    if residual[y, x] != 0 and abs(inv_depth[y, x] - inv_depth[i, j]) < jump:
-                        stack[top], drop[top] = y * columns + x, residual[y, x]
-                        residual[y, x] = 0
-                        top += 1
+                stack[top], drop[top] = i * columns + j, np.inf
+                top += 1
     done = 0
     while done < top:
         i, j = stack[done] // columns, stack[done] % columns
@@ -140,11 +136,8 @@ def clear_contact(
         done += 1
         for di, dj in SIDES:
             y, x = i + di, j + dj
-            if (
-                residual[y, x] != 0
-                and here - residual[y, x] > LOW.slope
-                and abs(inv_depth[y, x] - inv_depth[i, j]) < jump
-            ):
+            falls = residual[y, x] != 0 and here - residual[y, x] > LOW.slope
+            if falls and abs(inv_depth[y, x] - inv_depth[i, j]) < jump:
                 stack[top], drop[top] = y * columns + x, residual[y, x]
                 residual[y, x] = 0
                 top += 1
@@ -210,11 +203,8 @@ def _add_windows(sums: I4, counts: I4, total: I4, count: I4) -> None:
 def measure_noise(high_pass: F4, plane_id: I4, number: int) -> float:
     """Return the median rise, 1/m, between cells of a plane that are `LOW.apart` cells apart.
 
-    Parameters
-    ----------
-    high_pass : (rows, columns) 1/m, from `filter_high_pass`.
-    plane_id : (rows, columns) as in `HeightMap`.
-    number : number of the plane, from 1, as in ``plane_id``.
+    ``high_pass`` (rows, columns), 1/m, is from `filter_high_pass`; ``number``, from 1, is that of
+    the plane in ``plane_id`` (rows, columns), which is as in `HeightMap`.
     """
     rows, columns = high_pass.shape
     histogram = np.zeros(BINS, np.int64)

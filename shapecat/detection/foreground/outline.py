@@ -53,13 +53,11 @@ def is_object(outline: Outline, count: int) -> bool:
     if table < OUTLINES.known * sides and sides * sides > OUTLINES.ragged * count:
         return False
     seen = sides - (outline.hidden if count > OUTLINES.broad * sides else 0)
-    if (
-        table < max(OUTLINES.least_sides, OUTLINES.along * sides)
-        or outline.known < OUTLINES.known * seen
-    ):
+    least = max(OUTLINES.least_sides, OUTLINES.along * sides)
+    if table < least or outline.known < OUTLINES.known * seen:
         return False
-    least = max(table * (1 + OUTLINES.chance / sides), OUTLINES.all_around * sides)
-    return bool(outline.rise > least and outline.steep > OUTLINES.steep_share * table)
+    least_rise = max(table * (1 + OUTLINES.chance / sides), OUTLINES.all_around * sides)
+    return bool(outline.rise > least_rise and outline.steep > OUTLINES.steep_share * table)
 
 
 @kernel(inner=True)

@@ -22,11 +22,8 @@ def measure_adjacency(
 ) -> None:
     """Measure the boundaries and contacts of segments, and choose their samples.
 
-    Parameters
-    ----------
-    labels : (rows, columns) the segments.
-    up : (3,) unit vector, sensor frame.
-    segments : from `measure_segments`, still without these measurements; changed in place.
+    ``labels`` (rows, columns) are the segments, ``up`` is a unit vector (3,), sensor frame, and
+    ``segments`` are from `measure_segments`, changed in place.
     """
     inv_depth = grid.inverse_depth
     rows, columns = inv_depth.shape

@@ -242,9 +242,7 @@ def merge(segments: Segments, p: int, q: int) -> None:
         hulls[p, d] = max(hulls[p, d], hulls[q, d])
     add_statistics(segments.statistics, p, q)
     # Half of the samples from each side.
-    samples, first, mixed = segments.samples, np.zeros(SAMPLES, np.int32), 0
-    for k in range(SAMPLES):
-        first[k] = samples[p, k]
+    samples, first, mixed = segments.samples, segments.samples[p].copy(), 0
     for k in range(2 * SAMPLES):
         cell = samples[q, k // 2] if k % 2 else first[k // 2]
         if cell >= 0 and mixed < SAMPLES:

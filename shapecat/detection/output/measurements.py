@@ -85,9 +85,8 @@ def measure_objects(
         hidden = segments.statistics[p].hidden
         for q in range(segments.parent.size):
             hidden += segments.pairs[q, p].in_front
-        measured.hidden[k] = hidden > np.float32(OUTPUT.occluded_share) * max(
-            segments.statistics[p].boundary, np.float32(1)
-        )
+        around = max(segments.statistics[p].boundary, np.float32(1))
+        measured.hidden[k] = hidden > np.float32(OUTPUT.occluded_share) * around
     _break_cycles(measured)
     return measured
 

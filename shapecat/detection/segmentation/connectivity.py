@@ -50,14 +50,6 @@ class SurfaceGraph(NamedTuple):
     spans: I4
 
 
-class FlatGraph(NamedTuple):
-    """The inverse depth, the local planes and the normals of all cells, flattened."""
-
-    inv_depth: F4
-    plane: F4
-    normal: F4
-
-
 def connect_surfaces(grid: DepthGrid, heights: HeightMap) -> SurfaceGraph:
     """Fit local planes to the object cells, link them and measure concave angles."""
     inv_depth, plane_id = grid.inverse_depth, heights.plane_id
@@ -188,7 +180,7 @@ def _measure_concavity(grid: DepthGrid, graph: SurfaceGraph) -> None:
     inv_depth, gate = grid.inverse_depth, np.float32(2 * grid.discontinuity)
     rows, columns = inv_depth.shape
     local_plane, concavity = graph.local_plane, graph.concavity
-    flat = FlatGraph(inv_depth.reshape(-1), local_plane.reshape(-1), graph.normal.reshape(-1))
+    flat = (inv_depth.reshape(-1), local_plane.reshape(-1), graph.normal.reshape(-1))
     gaps, chords = np.zeros(columns, np.float32), np.zeros(columns, np.float32)
     worst = np.zeros(columns, np.float32)
     for i in range(rows):
@@ -210,7 +202,7 @@ def _measure_concavity(grid: DepthGrid, graph: SurfaceGraph) -> None:
 
 @kernel(fast=True, inner=True)
 def _raise_concavity(
-    flat: FlatGraph,
+    flat: tuple[F4, F4, F4],
     intrinsics: PinholeIntrinsics,
     gate: float,
     cells: tuple[int, int, int, int],
@@ -223,6 +215,7 @@ def _raise_concavity(
 
     Parameters
     ----------
+    flat : inverse depth, local planes and normals of all cells, flattened.
     gate : largest distance of both planes from the cell, 1/m.
     cells : the row, the first column, one after the last, and the number of columns.
     shift : offset, in rows and columns, from a cell to the normals that are compared, both ways.

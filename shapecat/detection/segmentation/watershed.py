@@ -35,7 +35,11 @@ def watershed(heights: HeightMap, graph: SurfaceGraph) -> tuple[I4, int]:
 def _label_parts(plane_id: I4, graph: SurfaceGraph, edge_deg: int, labels: I4, n: int) -> int:
     """Label connected cells with angles below ``edge_deg``, from ``n`` + 1 on; return the last."""
     inside: Bool = np.zeros(labels.shape, np.bool_)
-    _find_unlabelled(plane_id, graph.concavity, graph.spans, edge_deg, labels, inside)
+    concavity, spans, most = graph.concavity, graph.spans, np.uint8(edge_deg)
+    for i in range(len(spans)):
+        for j in range(np.uint64(spans[i, 0]), np.uint64(spans[i, 1])):  # this vectorises
+            flat = concavity[i, j] < most
+            inside[i, j] = (plane_id[i, j] > 0) & (labels[i, j] == 0) & flat
     spans, component = spans_of(inside.view(np.int8)), unset(labels.shape, np.int32)
     sizes = connected_components(inside, graph.links, spans, component)
     names = np.zeros(sizes.size, np.int16)
@@ -47,20 +51,6 @@ def _label_parts(plane_id: I4, graph: SurfaceGraph, edge_deg: int, labels: I4, n
         for j in range(spans[i, 0], spans[i, 1]):
             labels[i, j] |= names[component[i, j]]
     return n
-
-
-@kernel(inline=True)
-def _find_unlabelled(
-    plane_id: I4, concavity: U1, spans: I4, edge_deg: int, labels: I4, inside: Bool
-) -> None:
-    """Mark the object cells without a label whose angle is below ``edge_deg``; this vectorises."""
-    columns, most = labels.shape[1], np.uint8(edge_deg)
-    plane_ids, angle = plane_id.reshape(-1), concavity.reshape(-1)
-    flat, marks = labels.reshape(-1), inside.reshape(-1)
-    for i in range(len(spans)):
-        first, end = np.uint64(i * columns + spans[i, 0]), np.uint64(i * columns + spans[i, 1])
-        for p in range(first, end):
-            marks[p] = (plane_ids[p] > 0) & (flat[p] == 0) & (angle[p] < most)
 
 
 @kernel
