@@ -93,7 +93,7 @@ def measure_objects(
 
 @kernel(inline=True)
 def _count_at_range_limit(inv_depth: F4, labels: I4, size: int, range_m: float) -> I4:
-    """Count the samples of each label below ``size`` that are at the range limit, (size,)."""
+    """Count the samples (rows, columns) of each label at the range limit, metres: (size,)."""
     count = np.zeros(size, np.int64)
     most = np.float32(1 / range_m + DISCONTINUITY / 2)
     for i in range(inv_depth.shape[0]):
