@@ -1,5 +1,6 @@
 """Tests of full boxes of cylinders, boxes and balls of known size, from one or several views."""
 
+import sys
 from pathlib import Path
 
 import numpy as np
@@ -21,6 +22,12 @@ LEVEL = gravity_rotation(UP)
 PLACE = np.array([0.21, 1.03, -0.74])
 """Position of the object in the level frame of the camera."""
 RNG = np.random.default_rng(5)
+
+
+@pytest.fixture(autouse=True)
+def reseeded(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Draw the same numbers in each test, whatever ran before it."""
+    monkeypatch.setattr(sys.modules[__name__], "RNG", np.random.default_rng(5))
 
 
 def above(height: float) -> np.ndarray:
