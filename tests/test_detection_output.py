@@ -5,13 +5,13 @@ import pytest
 
 from shapecat.detection.depth_grid import find_borders
 from shapecat.detection.output.occluded_points import label_occluded_points
-from shapecat.detection.output.pixel_runs import list_runs, split_lists
+from shapecat.detection.output.pixel_runs import pixels_by_label, split_by_label
 from shapecat.geometry import rotation_from_quaternion, upright_box
 
 
 def test_runs_are_listed_by_label() -> None:
     runs = np.array([[2, 3, 5], [1, 7, 9], [2, 11, 12]], np.int32)
-    lists = split_lists(*list_runs(runs, 4))
+    lists = split_by_label(*pixels_by_label(runs, 4))
     assert [each.tolist() for each in lists] == [[7, 8], [3, 4, 11], []]
 
 

@@ -51,23 +51,22 @@ def read_scene(folder: Path, topic: str, frame: int) -> Scene:
     up = _rows(folder, "frames", topic, frame, ["topic", "frame", "up"])[0]["up"]
     planes = [plane_of(row) for row in _rows(folder, "planes", topic, frame)]
     rows = _rows(folder, "detections", topic, frame)
-    if not _standing([row["on_detection"] for row in rows]) or any(
+    if not _are_supported([row["on_detection"] for row in rows]) or any(
         row["plane"] not in (None, *range(len(planes))) for row in rows
     ):
-        msg = (
-            f"{folder}: damaged; frame {frame} has objects on nothing; process the recording again"
-        )
+        damage = f"damaged; frame {frame} has objects on nothing"
+        msg = f"{folder}: {damage}; process the recording again"
         raise OutputError(msg)
     objects = [_candidate(row, planes) for row in rows]
     return Scene(up, tuple(planes), tuple(objects))
 
 
-def _standing(below: Sequence[int | None]) -> bool:
+def _are_supported(below: Sequence[int | None]) -> bool:
     """Return whether all objects stand on a plane, directly or through the objects ``below``."""
-    standing: set[int | None] = {None}
-    while more := {k for k, lower in enumerate(below) if lower in standing} - standing:
-        standing |= more
-    return len(standing) == len(below) + 1
+    supported: set[int | None] = {None}
+    while more := {k for k, lower in enumerate(below) if lower in supported} - supported:
+        supported |= more
+    return len(supported) == len(below) + 1
 
 
 def _candidate(row: dict[str, Any], planes: Sequence[Plane]) -> Candidate:

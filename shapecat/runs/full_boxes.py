@@ -29,16 +29,14 @@ __all__ = ["FullBoxes", "full_columns"]
 
 _BLOCK = 2**16
 _WIDTH = sum(FULL_WIDTHS.values())
-
-
 _TELLING = 1000
 """Largest number of views from which a track's box is fused, spread over its time span."""
 _AT_ONCE = 8  # row groups
 _NO_ROWS = np.zeros(0, np.int64)
 
 
-class _Values(NamedTuple):
-    """Numbers to read from rows of a table: the columns, how many numbers, and how to get them."""
+class _Selection(NamedTuple):
+    """What to read of a row: its columns, their numbers as a row of an array, and how many."""
 
     columns: list[str]
     width: int
@@ -46,19 +44,21 @@ class _Values(NamedTuple):
 
 
 def _boxes_of(table: pa.Table) -> F4:
+    """Return `_BOXES` (n, 11): metres, x y z w, and 1 if occluded or cut off."""
     cut = np.logical_or(*(table[name].to_numpy() for name in _CUT))
     return np.column_stack([full_boxes_of(table), cut])
 
 
 def _details_of(table: pa.Table) -> F4:
+    """Return `_DETAILS` (n, 3 + `DIRECTIONS`), metres."""
     columns = [numbers(table[name]).reshape(len(table), -1) for name in _DETAILS.columns]
     return np.hstack(columns)
 
 
 _CUT = ("touches_border", "occluded")
-_BOXES = _Values([*FULL_BOX, *_CUT], BOX_WIDTH + 1, _boxes_of)
+_BOXES = _Selection([*FULL_BOX, *_CUT], BOX_WIDTH + 1, _boxes_of)
 """The full box of a detection, NaN if unknown, and whether it is occluded or cut off."""
-_DETAILS = _Values(["size_full_std", "outline_full"], 3 + DIRECTIONS, _details_of)
+_DETAILS = _Selection(["size_full_std", "outline_full"], 3 + DIRECTIONS, _details_of)
 """The standard deviations and the outline of the full box of a detection."""
 
 
@@ -156,7 +156,7 @@ class FullBoxes:
             own = Rotation.from_matrix(np.swapaxes(turns, 1, 2) @ shown.axes).as_quat()
             result[seen.at[block]] = np.hstack([back, shown.sizes, own, shown.stds])
 
-    def _read(self, rows: I4, values: _Values) -> F4:
+    def _read(self, rows: I4, values: _Selection) -> F4:
         """Return the values (n, k) of some rows of the table."""
         result = np.zeros((len(rows), values.width), np.float32)
         groups = np.unique(np.searchsorted(self.groups, rows, side="right") - 1)

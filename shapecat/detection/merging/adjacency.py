@@ -139,7 +139,10 @@ def _count(
 
 @kernel(inline=True)
 def _choose_samples(graph: SurfaceGraph, labels: I4, segments: Segments) -> None:
-    """Choose evenly spaced samples of each segment, away from edges, in place."""
+    """Choose evenly spaced samples of each segment, away from edges, in place.
+
+    ``labels`` (rows, columns) are the segments.
+    """
     rows, columns = labels.shape
     spans, local_plane, concavity = graph.spans, graph.local_plane, graph.concavity
     n = segments.parent.size

@@ -255,7 +255,10 @@ def merge(segments: Segments, p: int, q: int) -> None:
 
 @kernel
 def add_statistics(statistics: Records, p: int, q: int) -> None:
-    """Add the statistics of segment ``q`` to those of ``p``; they are records of `SEGMENT`."""
+    """Add the statistics of segment ``q`` to those of ``p``, in place.
+
+    ``statistics`` (n + 1,) are records of `SEGMENT`.
+    """
     values = statistics.view(np.float32)
     for f in range(_FIELDS):
         a, b = values[p * _FIELDS + f], values[q * _FIELDS + f]

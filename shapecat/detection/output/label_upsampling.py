@@ -8,7 +8,7 @@ from shapecat.arrays import F4, F8, I4, U1, U4
 from shapecat.detection.cleanup.settings import CLEANUP
 from shapecat.detection.connected_components import span_of
 from shapecat.detection.depth_grid import DepthGrid, row_and_column
-from shapecat.detection.output.pixel_runs import end_run, list_runs, split_lists
+from shapecat.detection.output.pixel_runs import append_run, pixels_by_label, split_by_label
 from shapecat.detection.planes.height_map import HEIGHT_NOISE, MIN_HEIGHT_M
 from shapecat.detection.records import Segmentation
 from shapecat.geometry import NEAREST_M
@@ -51,7 +51,7 @@ def label_pixels(depth: F4, grid: DepthGrid, found: Segmentation, *, range_m: fl
     range_m : readings farther away have no label, metres.
     """
     grid_labels = grid_labels_of(grid, found)
-    return split_lists(
+    return split_by_label(
         *_list_pixels(depth, grid_labels, grid.factor, range_m, found.plane_ids.size)
     )
 
@@ -86,7 +86,7 @@ def find_near(labels: I4, i: int, scratch: I4, near: I4) -> None:
 def _list_pixels(
     depth: F4, grid_labels: GridLabels, factor: int, range_m: float, labels: int
 ) -> tuple[U4, I4]:
-    """Return the pixels of the labels below ``labels``, as `list_runs` does."""
+    """Return the pixels of the labels below ``labels``, as `pixels_by_label` does."""
     rows, columns = grid_labels.inverse_depth.shape
     height, width = depth.shape
     # The cells of a row at full resolution, and the marks of its pixels.
@@ -120,11 +120,11 @@ def _list_pixels(
                     mark = marks[unsure]
                     unsure += 1
                 if mark != label:
-                    n = end_run(label, first + start, first + x, runs, n)
+                    n = append_run(label, first + start, first + x, runs, n)
                     label, start = mark, x
                 x = _end_of(line, x + 1, x1, label)
-            n = end_run(label, first + start, first + x1, runs, n)
-    listed: tuple[U4, I4] = list_runs(runs[:n], labels)
+            n = append_run(label, first + start, first + x1, runs, n)
+    listed: tuple[U4, I4] = pixels_by_label(runs[:n], labels)
     return listed
 
 

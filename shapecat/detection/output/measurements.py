@@ -93,7 +93,11 @@ def measure_objects(
 
 @kernel(inline=True)
 def _count_at_range_limit(inv_depth: F4, labels: I4, size: int, range_m: float) -> I4:
-    """Count the samples (rows, columns) of each label at the range limit, metres: (size,)."""
+    """Return the number of samples at the range limit of each label, (size,); 0 for label 0.
+
+    ``inv_depth`` (rows, columns) is in 1/m, ``range_m`` in metres; ``labels`` (rows, columns) are
+    below ``size``.
+    """
     count = np.zeros(size, np.int64)
     most = np.float32(1 / range_m + DISCONTINUITY / 2)
     for i in range(inv_depth.shape[0]):

@@ -7,14 +7,14 @@ import numpy as np
 from shapecat.arrays import I4, U4
 from shapecat.jit import kernel
 
-__all__ = ["end_run", "list_runs", "split_lists"]
+__all__ = ["append_run", "pixels_by_label", "split_by_label"]
 
 
 @kernel(inner=True)
-def end_run(label: int, first: int, end: int, runs: I4, n: int) -> int:
+def append_run(label: int, first: int, end: int, runs: I4, n: int) -> int:
     """Append a run of pixels to the first ``n`` rows of ``runs``; return their new number.
 
-    ``runs`` is as in `list_runs`; a run whose label is 0 is left out.
+    ``runs`` is as in `pixels_by_label`; a run whose label is 0 is left out.
     """
     if label > 0:
         runs[n, 0], runs[n, 1], runs[n, 2] = label, first, end
@@ -23,7 +23,7 @@ def end_run(label: int, first: int, end: int, runs: I4, n: int) -> int:
 
 
 @kernel
-def list_runs(runs: I4, labels: int) -> tuple[U4, I4]:
+def pixels_by_label(runs: I4, labels: int) -> tuple[U4, I4]:
     """Return the pixel indices (n,) of runs, sorted by label, and where each label ends (labels,).
 
     ``runs`` is (r, 3): label, first pixel, and one after the last. Label 0 has no pixels: its end
@@ -44,6 +44,6 @@ def list_runs(runs: I4, labels: int) -> tuple[U4, I4]:
     return order, place
 
 
-def split_lists(order: U4, ends: I4) -> list[U4]:
-    """Split the results of `list_runs`, (n,) and (labels,), into one list per label from 1."""
+def split_by_label(order: U4, ends: I4) -> list[U4]:
+    """Split the result of `pixels_by_label` into a list (k,) of pixels for each label from 1."""
     return [order[a:b] for a, b in pairwise(ends.tolist())]

@@ -11,7 +11,7 @@ from shapecat.detection.output.label_upsampling import (
     settle_labels,
 )
 from shapecat.detection.output.occluded_points import label_occluded_points
-from shapecat.detection.output.pixel_runs import list_runs, split_lists
+from shapecat.detection.output.pixel_runs import pixels_by_label, split_by_label
 from shapecat.detection.output.settings import OUTPUT
 from shapecat.detection.planes.height_map import HEIGHT_NOISE, MIN_HEIGHT_M, is_inside_outline
 from shapecat.detection.records import Segmentation
@@ -41,7 +41,7 @@ def label_points(view: VirtualImage, found: Segmentation, *, fused: bool) -> lis
             labels = max(labels, int(marks.max()) + 1)
     edges = np.flatnonzero(np.diff(marks, prepend=0, append=0)).astype(np.int32)
     runs = np.stack([marks[edges[:-1]], edges[:-1], edges[1:]], 1, dtype=np.int32)
-    return split_lists(*list_runs(runs, labels))
+    return split_by_label(*pixels_by_label(runs, labels))
 
 
 @kernel

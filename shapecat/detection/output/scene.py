@@ -135,15 +135,16 @@ def _cut_cloud(grid: DepthGrid, found: Segmentation, sensor_from_view: Pose) -> 
     last_row, last_column = valid.shape[0] - 1, valid.shape[1] - 1
     i = np.concatenate([rows, rows, *_ends(valid[:, columns], last_row)])
     j = np.concatenate([*_ends(valid[rows].T, last_column), columns, columns])
-    k = grid.intrinsics
-    ray = np.stack([(j - k.cx) / k.fx, (i - k.cy) / k.fy, np.ones(i.size)], 1)
+    intrinsics = grid.intrinsics
+    x, y = (j - intrinsics.cx) / intrinsics.fx, (i - intrinsics.cy) / intrinsics.fy
+    ray = np.stack([x, y, np.ones(i.size)], 1)
     seen = ray @ sensor_from_view.rotation.T
     ray = seen if (seen[:, 2] > OUTPUT.forward_cos).all() else ray  # else no optical frame
     place = ray[:, :2] / ray[:, 2:]
     spans = np.ptp(place, axis=0)
     for axis in range(2):
         for along in (place[:, axis], -place[:, axis]):
-            near = along > along.max() - OUTPUT.border_cells / k.fx
+            near = along > along.max() - OUTPUT.border_cells / intrinsics.fx
             if np.ptp(place[near, 1 - axis]) > OUTPUT.straight_share * spans[1 - axis]:
                 result[found.labels[i[near], j[near]]] = True
     return result[1:]

@@ -79,6 +79,7 @@ def measure_heights(grid: DepthGrid, planes: F8, highest_m: float) -> HeightMap:
 def _assign(grid: DepthGrid, plane: F8, number: int, highest: float, heights: HeightMap) -> None:
     """Assign the free cells inside the outline of a plane to it; the loops over a row vectorise.
 
+    ``plane`` is a row of `pack_planes`, and ``highest`` the greatest height above it, metres.
     Compiled without ``fast``: with it, the inlined copy would round heights differently in the
     process that compiles and in later ones.
     """

@@ -64,7 +64,8 @@ def add_strip_planes(grid: DepthGrid, found: list[PlaneCandidate]) -> list[Plane
 
     Hardly any surface lies below such a plane. A board shows some surface at its own height; a
     covered table shows more just above, on the objects that cover it. ``found`` are parallel
-    planes, lowest first, at least one; so is the result, where they may have a larger extent.
+    planes, lowest first, at least one. The result has the same order, and planes of ``found`` may
+    have a larger extent in it.
     """
     up = max(found, key=lambda one: one.plane.area_m2).plane.up
     strips, area = _level_strips(grid.inverse_depth, grid.intrinsics, up)
@@ -87,7 +88,10 @@ def add_strip_planes(grid: DepthGrid, found: list[PlaneCandidate]) -> list[Plane
 
 
 def _is_at_the_end(inv_depth: F4, strips: DepthSamples) -> bool:
-    """Return whether strips lie at the end of the range, where nothing below them is visible."""
+    """Return whether strips lie at the end of the range, where nothing below them is visible.
+
+    ``inv_depth`` is (rows, columns), 1/m.
+    """
     some = inv_depth[::4, ::4]  # enough to show where the range ends
     seen = some[some > 0]
     return bool(np.median(strips.inverse_depth) < STRIPS.end * seen.min(initial=np.inf))

@@ -67,7 +67,10 @@ def split_at_width_changes(
 
 @kernel(inline=True)
 def _relabel_above(labels: I4, spans: I4, height: F4, label: int, level: float, name: int) -> None:
-    """Change the label of the cells that are higher than ``level``, metres, to ``name``."""
+    """Change the label of the cells that are higher than ``level``, metres, to ``name``, in place.
+
+    ``labels`` (rows, columns) are 0 outside ``spans``; ``height`` (rows, columns) is in metres.
+    """
     for i in range(labels.shape[0]):
         for j in range(spans[i, 0], spans[i, 1]):
             if labels[i, j] == label and height[i, j] > level:
