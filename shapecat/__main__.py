@@ -5,7 +5,7 @@ from importlib import import_module
 from typing import Any
 
 from shapecat.system.garbage import collect_seldom
-from shapecat.system.libraries import block_pandas
+from shapecat.system.libraries import block_unused
 from shapecat.system.stopping import leave
 
 
@@ -13,7 +13,7 @@ def run() -> None:
     """Run the command line. Until it handles signals itself, a signal ends the process."""
     _handle(leave)
     collect_seldom()
-    block_pandas()
+    block_unused()
     try:
         # By name: type checkers see this package as the top-level folder cli.
         import_module("shapecat.cli.main").main(prog_name="shapecat")

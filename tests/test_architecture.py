@@ -6,6 +6,8 @@ from functools import cache
 from pathlib import Path
 from typing import Any
 
+import pytest
+
 from tests.loading import loaded_by
 
 ROOT = Path(__file__).parents[1]
@@ -173,15 +175,35 @@ def test_processing_loads_no_library_too_early() -> None:
     assert loaded_by(code, never) == set()
 
 
-def test_commands_do_not_load_pandas() -> None:
-    """Arrow would load pandas with its first array, which takes half a second."""
+@pytest.mark.parametrize(
+    ("use", "library"),
+    [
+        ("pyarrow.array([1])", "pandas"),
+        ("shapecat.geometry.level_box(np.ones((1, 3), np.float32), np.eye(3))", "scipy.linalg"),
+    ],
+)
+def test_commands_do_not_load_libraries_that_others_ask_for(use: str, library: str) -> None:
+    """Arrow with its first array, numba with its first kernel: half and a fifth of a second."""
     code = (
-        "import types, pyarrow, shapecat.__main__ as entry;"
-        "command = types.SimpleNamespace(main=lambda **_: pyarrow.array([1]));"
+        "import types, pyarrow, numpy as np, shapecat.geometry, shapecat.__main__ as entry;"
+        f"command = types.SimpleNamespace(main=lambda **_: {use});"
         "entry.import_module = lambda _: command; entry.run()"
     )
 
-    assert loaded_by(code, {"pandas"}) == set()
+    assert loaded_by(code, {library}) == set()
+    assert loaded_by(code + ";import scipy.spatial", {"scipy.linalg"}) == {"scipy.linalg"}
+
+
+def test_kernels_do_without_linear_algebra_of_numpy() -> None:
+    """Commands keep numba from loading SciPy for it, so that such a kernel would not compile."""
+    for path in (ROOT / "shapecat").rglob("*.py"):
+        for function in ast.walk(ast.parse(path.read_text("utf-8"))):
+            decorators = getattr(function, "decorator_list", [])
+            if any("kernel" in ast.unparse(one) for one in decorators):
+                for node in ast.walk(function):
+                    assert not isinstance(node, ast.MatMult), (path, function)
+                    name = getattr(node, "attr", "")
+                    assert name not in {"linalg", "dot", "vdot", "outer", "kron"}, (path, name)
 
 
 def test_root_of_package_has_few_files() -> None:

@@ -6,6 +6,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from shapecat.arrays import F4, F8
+from shapecat.description.linear import principal_axes
 from shapecat.description.outline import OUTLINE_NAMES, OUTLINE_SLICES, outline
 from shapecat.description.ranges import inner_range
 from shapecat.description.revolution import fit_axis
@@ -32,6 +33,24 @@ def half_cone(rng: np.random.Generator, *, slope: float) -> tuple[F8, F8]:
     outward = np.stack([np.cos(angle), np.sin(angle), np.full(600, -slope)], axis=1)
     points = np.stack([radius * np.cos(angle), radius * np.sin(angle), height], axis=1)
     return points, outward / np.linalg.norm(outward, axis=1, keepdims=True)
+
+
+@pytest.mark.parametrize("values", [(-3, 1, 2), (0, 0, 5), (4, 4, 4), (1, 1, 3), (0, 0, 0)])
+@given(seed=st.integers(0, 999), exponent=st.integers(-12, 12), turned=st.booleans())
+@settings(max_examples=25, deadline=None)
+def test_principal_axes_solve_eigenvalue_problem(
+    values: tuple[float, ...], seed: int, exponent: int, turned: bool
+) -> None:
+    """A sphere, a cylinder and a plate have equal or no eigenvalues."""
+    scale = 10.0**exponent
+    q = np.linalg.qr(np.random.default_rng(seed).normal(size=(3, 3)))[0] if turned else np.eye(3)
+    A = (q * np.array(values)) @ q.T * scale
+    A = (A + A.T) / 2
+    found, axes = principal_axes(A.copy())
+
+    np.testing.assert_allclose(found, np.linalg.eigvalsh(A), rtol=1e-12, atol=1e-13 * scale)
+    np.testing.assert_allclose(A @ axes, axes * found, rtol=1e-12, atol=1e-13 * scale)
+    np.testing.assert_allclose(axes.T @ axes, np.eye(3), atol=1e-13)
 
 
 @pytest.mark.parametrize("slope", [0.0, 0.2])

@@ -3,6 +3,7 @@
 import numpy as np
 
 from shapecat.arrays import F4, F8
+from shapecat.description.linear import principal_axes
 from shapecat.description.profile import vertical_axis
 from shapecat.jit import kernel
 
@@ -193,12 +194,12 @@ def _spreads(x: F4, y: F4, z: F4, weight: F4, normals: F4, out: F4) -> None:
             for b in range(3):
                 spread[a, b] += weight[i] * p[a] * p[b]
                 bend[a, b] += weight[i] * normals[a, i] * normals[b, i]
-    values, vectors = np.linalg.eigh(spread)
+    values, vectors = principal_axes(spread)
     out[0] = values[1] / max(values[2], 1e-9)
     out[1] = values[0] / max(values[2], 1e-9)
     out[2] = abs(vectors[2, 2])
     out[3] = abs(vectors[2, 0])
-    values, vectors = np.linalg.eigh(bend)
+    values, vectors = principal_axes(bend)
     out[4] = values[1]
     out[5] = values[0]
     out[6] = abs(vectors[2, 0])

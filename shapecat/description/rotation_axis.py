@@ -3,6 +3,7 @@
 import numpy as np
 
 from shapecat.arrays import F4, F8
+from shapecat.description.linear import principal_axes
 from shapecat.jit import kernel
 
 __all__ = ["rotation_axis"]
@@ -50,7 +51,7 @@ def rotation_axis(x: F4, y: F4, z: F4, weight: F4, normals: F4) -> tuple[F8, F8,
         for j in range(3):
             for k in range(3):
                 C[i, j] += B[k, i] * moment[k, j]
-    values, vectors = np.linalg.eigh(C)
+    values, vectors = principal_axes(C)
     axis, foot, rest = np.zeros(3), np.zeros(3), np.zeros(3)
     for i in range(3):
         axis[i] = vectors[i, 0]

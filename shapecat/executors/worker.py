@@ -18,7 +18,7 @@ from typing import Any, NamedTuple
 from shapecat.executors.cores import single_threaded
 from shapecat.system import stopping
 from shapecat.system.garbage import collect_seldom
-from shapecat.system.libraries import block_pandas
+from shapecat.system.libraries import block_unused
 
 __all__ = ["Task", "Worker", "WorkerLostError"]
 
@@ -149,7 +149,7 @@ def _serve(connection: socket.socket, asked: Connection) -> None:
     Threads receive the next call and send the previous answer during the current call.
     """
     collect_seldom()
-    block_pandas()
+    block_unused()
     threading.Thread(target=_watch_parent, args=(asked,), daemon=True).start()
     calls: SimpleQueue[Any] = SimpleQueue()
     answers: SimpleQueue[Any] = SimpleQueue()

@@ -1,29 +1,43 @@
-"""Keep the processes of this program from loading a library that they do not use."""
+"""Keep the processes of this program from loading libraries that they do not use."""
 
 import sys
 from importlib.abc import MetaPathFinder
+from types import FrameType
 from typing import Any
 
-__all__ = ["block_pandas"]
+__all__ = ["block_unused"]
+
+_LINEAR_ALGEBRA = "scipy.linalg"
+_ASKS = "numba.np.linalg"
+"""The module with which numba looks for linear algebra."""
 
 
-class _PandasBlocker(MetaPathFinder):
-    """Raises for pandas, even if it is installed.
+class _Blocker(MetaPathFinder):
+    """Raises for pandas, and for SciPy's linear algebra if numba asks, even if they are installed.
 
     None in `sys.modules` would do the same, but scikit-learn looks for a module there.
     """
 
     def find_spec(self, fullname: str, *_: Any) -> None:
-        """Raise ModuleNotFoundError for pandas; leave other modules to other finders."""
-        if fullname == "pandas":
-            msg = "this process does without pandas"
+        """Raise ModuleNotFoundError for what is blocked; leave other modules to other finders."""
+        if fullname == "pandas" or (fullname == _LINEAR_ALGEBRA and _is_importing(_ASKS)):
+            msg = f"this process does without {fullname}"
             raise ModuleNotFoundError(msg, name=fullname)
 
 
-def block_pandas() -> None:
-    """Keep this process from importing pandas; for processes that run nothing but shapecat.
+def _is_importing(module: str) -> bool:
+    """Return whether code of a module is among the callers."""
+    frame: FrameType | None = sys._getframe()  # noqa: SLF001  inspect takes longer
+    while frame is not None and frame.f_globals.get("__name__") != module:
+        frame = frame.f_back
+    return frame is not None
+
+
+def block_unused() -> None:
+    """Keep this process from importing what no command uses; for processes of shapecat alone.
 
     With its first array, Arrow loads pandas where it is installed, in order to recognise data
-    frames. That takes 0.4 s in each process, and no command uses data frames.
+    frames: 0.4 s in each process. With its first kernel, numba loads SciPy's linear algebra, which
+    no kernel calls: 0.2 s.
     """
-    sys.meta_path.insert(0, _PandasBlocker())
+    sys.meta_path.insert(0, _Blocker())
