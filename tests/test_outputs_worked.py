@@ -25,6 +25,7 @@ from shapecat.detection.scene_graph import Node, format_tree
 from shapecat.errors import OutputError
 from shapecat.outputs.annotated_mcap import _annotations, _encoding
 from shapecat.outputs.annotation import Annotation
+from shapecat.outputs.annotations import encoder_for
 from shapecat.outputs.colouring import with_colour
 from shapecat.outputs.colours import colour_of
 from shapecat.outputs.dataset_frames import (
@@ -135,6 +136,16 @@ def test_annotations_outlive_their_period_and_are_deleted_once() -> None:
         (150, ()),  # the next frame comes late
         (150, (4,)),
     ]
+
+
+@pytest.mark.parametrize("encoding", ["cdr", "ros1", "protobuf", "json"])
+def test_lifetime_does_not_span_jump_of_clock(encoding: str) -> None:
+    """From the time since start-up to that since 1970: the seconds of a ROS duration overflow."""
+    frames = [shown_frame("/a", 12 * 10**9, 1), shown_frame("/a", 1_700_000_000 * 10**9, 1)]
+    for annotation in _annotations(frames):
+        assert annotation.lifetime_ns == 5400 * 10**9
+        for _, encode in encoder_for(encoding, markers=True):
+            assert encode(annotation)
 
 
 def test_simultaneous_images_of_two_cameras_are_annotated(

@@ -34,6 +34,8 @@ _BUFFER = 4 << 20
 """Two threads that write to the same file wait for each other, so each writes much at a time."""
 _PERIOD_NS = 1_000_000_000
 """Frame period assumed for a stream with a single frame."""
+_LONGEST_NS = 3600 * 10**9
+"""Longest frame period: a clock that is set during a recording jumps by decades."""
 _F = TypeVar("_F", Annotation, ImageFrame)
 
 
@@ -163,7 +165,7 @@ def _annotations(frames: Iterable[ShownFrame]) -> Iterator[Annotation]:
         elif frame.topic in last:
             periods[frame.topic] = max(1, frame.stamp_ns - last[frame.topic])
         last[frame.topic] = frame.stamp_ns
-        period = periods.get(frame.topic, _PERIOD_NS)
+        period = min(periods.get(frame.topic, _PERIOD_NS), _LONGEST_NS)
         here = {box.track for box in frame.objects}
         gone = (shown.get(frame.topic, set()) | set(frame.ended)) - here
         shown[frame.topic] = here
