@@ -373,6 +373,24 @@ def test_correction_is_on_disk_before_confirmation(run: Path, drawn: RunReport) 
     assert (run / "tracks.original.csv").read_bytes() == first
 
 
+def test_page_of_replaced_run_changes_nothing(run: Path, drawn: RunReport) -> None:
+    """Tracks of a run that was processed again have other numbers: an old page names others."""
+    with serving(run, drawn) as (address, labels):
+        text = (run / "run.json").read_text("utf-8")
+        work = json.loads(text)["work"]
+        (run / "run.json").write_text(text.replace(work, "0" * len(work)), "utf-8")
+        before = (run / "tracks.csv").read_bytes()
+        answers = [
+            ask(address, "POST", labels, correction(1, "delete")),
+            ask(address, "GET", labels),
+            ask(address),
+        ]
+
+    assert [status for status, _ in answers] == [500, 500, 500]
+    assert all("was processed again" in text for _, text in answers)
+    assert (run / "tracks.csv").read_bytes() == before
+
+
 def test_simultaneous_corrections_are_all_written(run: Path, drawn: RunReport) -> None:
     """Each reads and writes the whole table: without a lock the last would undo the others."""
     tracks = list(labels_on_disk(run))

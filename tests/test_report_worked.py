@@ -279,7 +279,7 @@ def test_index_counts_tracks_left_to_check(run: Path) -> None:
     for file in ("tracks.original.csv", "tracks.csv"):
         (run / file).write_text("\n".join(table) + "\n")
 
-    listed = RunReport(run, read_timelines(run), Pictures({}, []), {}).listed("x")
+    listed = RunReport(run, "", read_timelines(run), Pictures({}, []), {}).listed("x")
     assert (listed.unsure, listed.checked) == (2, 2)
     assert listed.categories == {"can": len(rows) - 2, "cup": 2}
 
@@ -294,7 +294,7 @@ def test_merged_tracks_count_once_in_index(run: Path) -> None:
         cells = rows[k].split(",")
         rows[k] = ",".join([*cells[:at], label, *cells[at + 1 :]])
     (run / "tracks.csv").write_text("\n".join(rows) + "\n")
-    listed = RunReport(run, read_timelines(run), Pictures({}, []), {}).listed("x")
+    listed = RunReport(run, "", read_timelines(run), Pictures({}, []), {}).listed("x")
 
     assert listed.categories["mug"] == 1
     assert listed.categories.total() == len(names) - 3

@@ -37,6 +37,7 @@ __all__ = [
     "has_labels",
     "read_labels",
     "relabel",
+    "require_work",
 ]
 
 PREVIOUS = "tracks.previous.csv"
@@ -170,12 +171,13 @@ def relabel(folder: Path, labels: Mapping[int, str]) -> dict[int, str]:
     return refused
 
 
-def correct_label(folder: Path, track: int, label: str, *, seen: str) -> str:
+def correct_label(folder: Path, track: int, label: str, *, seen: str, work: str) -> str:
     """Set the label of a track of a run, unless it has changed since the caller read it.
 
     Parameters
     ----------
     seen : the label that the caller read.
+    work : the value in the run.json that the caller read.
 
     Returns
     -------
@@ -183,15 +185,28 @@ def correct_label(folder: Path, track: int, label: str, *, seen: str) -> str:
 
     Raises
     ------
-    OutputError : as for `relabel`.
+    OutputError : as for `relabel`, or the run has been replaced.
     """
     with holding(folder):
+        require_work(folder, work)
         rows = {row.track: row for row in read_track_table(folder / "tracks.csv").rows}
         if track not in rows:
             return f"there is no track #{track}"
         if rows[track].label != seen:
             return f"its label is now {rows[track].label!r}"
         return relabel(folder, {track: label}).get(track, "")
+
+
+def require_work(folder: Path, work: str) -> None:
+    """Check that a run has not been replaced since its run.json was read: its tracks are others.
+
+    Raises
+    ------
+    OutputError : ``work`` differs from that in run.json, or there is none.
+    """
+    if read_run(folder).get("work", "") != work:
+        msg = f"{folder}: was processed again since its report was made; make the report again"
+        raise OutputError(msg)
 
 
 def _given(

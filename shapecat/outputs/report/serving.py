@@ -22,7 +22,7 @@ from urllib.parse import unquote
 
 from shapecat.errors import ConfigError, OutputError, explained
 from shapecat.outputs.report.writing import INDEX, PAGE, Reports, RunReport
-from shapecat.runs.corrections import correct_label
+from shapecat.runs.corrections import correct_label, require_work
 from shapecat.runs.track_table import read_track_table
 
 __all__ = ["serve_reports"]
@@ -79,6 +79,7 @@ class _Site:
         if report is not None and name == PAGE:
             return _Answer(HTTPStatus.OK, report.page(served=True))
         if report is not None and name == _LABELS:
+            require_work(report.folder, report.work)
             return _Answer(HTTPStatus.OK, {"labels": _labels(report.folder)})
         return _Answer(HTTPStatus.NOT_FOUND, "no such page")
 
@@ -91,7 +92,7 @@ class _Site:
         if wanted is None:
             return _Answer(HTTPStatus.BAD_REQUEST, "expected track, label and seen")
         track, label, seen = wanted
-        problem = correct_label(report.folder, track, label, seen=seen)
+        problem = correct_label(report.folder, track, label, seen=seen, work=report.work)
         status = HTTPStatus.CONFLICT if problem else HTTPStatus.OK
         return _Answer(status, {"labels": _labels(report.folder), "problem": problem})
 

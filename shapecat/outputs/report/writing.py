@@ -14,6 +14,7 @@ from shapecat.outputs.report.choosing import choose_frames
 from shapecat.outputs.report.page import Listed, index_page, run_page
 from shapecat.outputs.report.pictures import Pictures, take_pictures
 from shapecat.outputs.report.tracks import Timeline, read_stage_seconds, read_timelines
+from shapecat.runs.corrections import require_work
 from shapecat.runs.finished import find_runs, read_finished
 from shapecat.runs.track_table import TrackTable, read_track_table
 from shapecat.system.files import replacing
@@ -29,11 +30,12 @@ _FACES = 6
 class RunReport:
     """The content of a run's page, except the labels, which are read when the page is made.
 
-    ``stages`` has the seconds (frames,) of each stage; ``index`` is the link to the index of
-    several runs, None if there is none.
+    ``work`` is that of run.json, ``stages`` has the seconds (frames,) of each stage, and ``index``
+    is the link to the index of several runs, None if there is none.
     """
 
     folder: Path
+    work: str
     timelines: Mapping[int, Timeline]
     pictures: Pictures
     stages: Mapping[str, F8]
@@ -48,8 +50,9 @@ class RunReport:
 
         Raises
         ------
-        OutputError : the tracks.csv of the run is invalid.
+        OutputError : the tracks.csv of the run is invalid, or the run has been replaced.
         """
+        require_work(self.folder, self.work)
         table, reason = self._table, self.pictures.reason
         notes = [f"surfaces are drawn from their meshes, without points: {reason}"]
         return run_page(
@@ -167,7 +170,8 @@ def read_report(folder: Path, *, index: str | None = None) -> RunReport:
     rows = read_track_table(folder / "tracks.csv").rows
     timelines = read_timelines(folder)
     pictures = take_pictures(finished, rows, choose_frames(folder, timelines))
-    return RunReport(folder, timelines, pictures, read_stage_seconds(folder), index)
+    work = finished.run.get("work", "")
+    return RunReport(folder, work, timelines, pictures, read_stage_seconds(folder), index)
 
 
 def _above(runs: Sequence[Path]) -> Path:
