@@ -104,8 +104,8 @@ def export(
     if recording is not None and len(runs) > 1:
         msg = f"--recording is for a single run, not for {len(runs)}"
         raise click.UsageError(msg)
-    if kind not in ("crops", *_DATASETS):
-        _require_own_names(runs)
+    if kind not in _DATASETS:
+        _require_own_names(runs, kind)
     if boxes is not None and kind not in _WITH_BOXES:
         msg = f"--boxes is for --format {' and '.join(_WITH_BOXES)}, not {kind}"
         raise click.UsageError(msg)
@@ -155,13 +155,18 @@ def _export_dataset(
         )
 
 
-def _require_own_names(runs: Sequence[Path]) -> None:
+def _require_own_names(runs: Sequence[Path], kind: str) -> None:
     """Refuse runs with the same name: their exports would collide."""
     from shapecat.errors import OutputError
+    from shapecat.outputs.exports_crops import crops_prefix
+    from shapecat.runs.finished import read_finished
 
     names: dict[str, Path] = {}
     for run in runs:
-        other = names.setdefault(run.resolve().name, run)
+        crops = kind == "crops"
+        name = crops_prefix(read_finished(run)) if crops else run.resolve().name
+        other = names.setdefault(name, run)
         if other is not run:
-            msg = f"{other} and {run} have the same name; export them to different folders (--out)"
+            todo = "rename one of them" if crops else "export them to different folders (--out)"
+            msg = f"{other} and {run} have the same name; {todo}"
             raise OutputError(msg)

@@ -125,6 +125,24 @@ def test_crops_are_upright_at_height_zero_with_viewpoint(run: Path, tmp_path: Pa
         assert_allclose(view.points[:, :2].mean(axis=0), 0, atol=1e-4)
 
 
+@pytest.mark.parametrize(
+    ("form", "todo"), [("crops", "rename one"), ("kitti", "different folders")]
+)
+def test_exports_of_runs_with_one_name_do_not_collide(
+    run: Path, tmp_path: Path, shapecat: Run, form: str, todo: str
+) -> None:
+    """Runs of one recording, one for each camera: the second export would replace the first."""
+    for camera in ("left", "right"):
+        shutil.copytree(run, tmp_path / camera / "lab")
+    folders = [tmp_path / "left" / "lab", tmp_path / "right" / "lab"]
+    result = shapecat("export", *folders, "--format", form, "--out", tmp_path / "out")
+
+    assert result.exit_code != 0
+    assert "have the same name" in result.output
+    assert todo in result.output
+    assert not (tmp_path / "out").exists()
+
+
 def test_exporting_again_removes_views_with_earlier_labels(run: Path, tmp_path: Path) -> None:
     """A stale view teaches the model the mistake that was corrected."""
     folder = tmp_path / "table"

@@ -286,6 +286,11 @@ def test_crops_of_two_cameras_do_not_replace_each_other(tmp_path: Path) -> None:
     assert instance.relative_to(tmp_path) == Path("bowl/lab.01234567.track-4")
     assert len(list(instance.iterdir())) == 2
 
+    run["options"]["topics"] = topics = ["/a/depth", "/a_depth"]  # names of files do not differ
+    frames = [(replace(one, topic=topic), replace(frame(), topic=topic), None) for topic in topics]
+    assert write_crops(tmp_path, frames, lab) == 2
+    assert len(list(instance.iterdir())) == 2
+
     run["options"]["topics"] = topics[:1]
     assert write_crops(tmp_path, frames[:1], lab) == 1
     assert [path.name for path in tmp_path.glob("*/*/*")] == ["000000.pcd"]

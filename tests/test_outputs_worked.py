@@ -421,6 +421,38 @@ def test_export_of_another_recording_is_not_replaced(tmp_path: Path) -> None:
         _require_own(tmp_path, tuesday)
 
 
+def test_export_of_other_topics_is_not_replaced(tmp_path: Path) -> None:
+    """Two runs of one recording, one for each camera, may have the same name."""
+    left, right = ({**KITTI, "topics": [name]} for name in ("/left", "/right"))
+    mark = tmp_path / "export.json"
+    mark.write_text(json.dumps({**left, "made": [], "objects": 3}))
+
+    _require_own(tmp_path, left)
+    with pytest.raises(OutputError, match="of other topics; choose another --out"):
+        _require_own(tmp_path, right)
+    mark.write_text(json.dumps({**KITTI, "made": [], "objects": 3}))  # by an earlier version
+    _require_own(tmp_path, right)
+
+
+def test_file_moved_into_export_is_not_deleted_with_it(tmp_path: Path) -> None:
+    """It keeps its time, which may be before that of the export."""
+    out, mine = tmp_path / "out", tmp_path / "mine.png"
+    mine.write_bytes(b"mine")
+    os.utime(mine, ns=(0, 0))
+
+    def write(hidden: Path) -> int:
+        (hidden / "images").mkdir()
+        (hidden / "images" / "new.png").write_bytes(b"new")
+        return 1
+
+    _staged(out, KITTI, write)
+    _staged(out, KITTI, write)
+    mine.rename(out / "images" / "mine.png")
+    with pytest.raises(OutputError, match="images: was changed after the export"):
+        _staged(out, KITTI, write)
+    assert (out / "images" / "mine.png").read_bytes() == b"mine"
+
+
 def test_export_excludes_files_of_interrupted_export(tmp_path: Path) -> None:
     """Images of other options would have no labels, and be taken for background."""
     out = tmp_path / "out"

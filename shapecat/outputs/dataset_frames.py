@@ -17,7 +17,7 @@ from shapecat.errors import OutputError
 from shapecat.outputs.colouring import Coloured, with_colour
 from shapecat.outputs.exports_points import depth_in_mm
 from shapecat.outputs.png import png
-from shapecat.outputs.wording import safe_name
+from shapecat.outputs.wording import different_names
 from shapecat.recordings import MessageError
 from shapecat.recordings.colour_image import encoded, pixels_of
 from shapecat.runs.finished import FinishedRun, open_source
@@ -118,11 +118,12 @@ def images_of(
         raise OutputError(msg)
     corrected = _corrected(finished.folder)
     chosen = _chosen(finished, selection, corrected)
-    several = len(finished.run["options"]["topics"]) > 1
+    topics = finished.run["options"]["topics"]
+    names = dict(zip(topics, different_names(topics), strict=True))
     with open_source(finished.run, recording) as source:
         frames = (f for f in finished.frames() if (f.topic, f.index) in chosen)
         for labelled, frame, coloured in with_colour(frames, source, finished.run):
-            topic = f"{safe_name(labelled.topic)}_" if several else ""
+            topic = f"{names[labelled.topic]}_" if len(names) > 1 else ""
             name = f"{stem}_{topic}{labelled.index:06d}"
             try:
                 image = _image(name, labelled, frame, coloured, selection, corrected)

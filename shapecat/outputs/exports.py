@@ -5,7 +5,6 @@ from collections import Counter
 from collections.abc import Callable, Collection, Iterable, Iterator, Mapping, Sequence
 from contextlib import suppress
 from dataclasses import dataclass, replace
-from itertools import chain, count
 from pathlib import Path
 from typing import Any
 
@@ -17,7 +16,7 @@ from shapecat.outputs.exports_crops import write_crops
 from shapecat.outputs.exports_kitti import write_kitti
 from shapecat.outputs.exports_labelcloud import write_labelcloud
 from shapecat.outputs.exports_points import write_point_labels
-from shapecat.outputs.wording import safe_name
+from shapecat.outputs.wording import different_names
 from shapecat.runs.finished import FinishedRun, open_source, read_finished
 from shapecat.runs.folder import clear, recover, staged
 from shapecat.system.files import flush, replacing
@@ -106,7 +105,12 @@ def export_run(
         pairs = _observed(triples, total, observe)
         if format == "crops":
             return FORMATS[format](out, pairs, finished)
-        about = {"format": format, "run": finished.run["id"], "input": finished.run["input"]}
+        about = {
+            "format": format,
+            "run": finished.run["id"],
+            "input": finished.run["input"],
+            "topics": finished.run["options"]["topics"],
+        }
         write = FORMATS[format]
         return _staged(out / finished.name, about, lambda hidden: write(hidden, pairs, finished))
 
@@ -143,7 +147,7 @@ def export_dataset(
     runs = [read_finished(folder) for folder in folders]
     categories = _common(runs)
     total = sum(int(run.run["counts"]["frames"]) for run in runs)
-    stems = _different_names([safe_name(run.name) for run in runs])
+    stems = different_names([run.name for run in runs])
 
     counts, left_out = Counter[str](), Counter[str]()
     uncertain = 0
@@ -186,15 +190,6 @@ def _common(runs: Sequence[FinishedRun]) -> list[str]:
             msg = f"the runs spell a category {spelled[name.lower()]!r} and {name!r}; relabel one"
             raise OutputError(msg)
     return names
-
-
-def _different_names(names: Sequence[str]) -> list[str]:
-    """Return names with ``-2``, ``-3``, ... added to those that occur again."""
-    found: list[str] = []
-    for name in names:
-        numbered = (f"{name}-{k}" for k in count(2))
-        found.append(next(n for n in chain([name], numbered) if n not in found))
-    return found
 
 
 def _staged(
@@ -264,7 +259,8 @@ def _require_own(target: Path, about: Mapping[str, Any]) -> None:
 
     Raises
     ------
-    OutputError : the folder holds something else, or a file was changed after the export.
+    OutputError : the folder holds something else, or a file in it was changed, added or removed
+        after the export.
     """
     if not target.exists() or (target.is_dir() and not any(target.iterdir())):
         return
@@ -276,9 +272,13 @@ def _require_own(target: Path, about: Mapping[str, Any]) -> None:
     if _recording_of(earlier) != _recording_of(about):
         msg = f"{target}: holds the {format} export of another recording; choose another --out"
         raise OutputError(msg)
+    if earlier.get("topics", about.get("topics")) != about.get("topics"):
+        msg = f"{target}: holds the {format} export of other topics; choose another --out"
+        raise OutputError(msg)
     exported = (target / _MARK).stat().st_mtime_ns
-    changed = next((f for f in sorted(target.rglob("*")) if _is_later(f, exported)), None)
-    if changed is not None:
+    later = [path for path in target.rglob("*") if path.stat().st_mtime_ns > exported]
+    if later:
+        changed = min(later, key=lambda path: (path.is_dir(), path))
         msg = f"{changed}: was changed after the export; choose another --out, or move it away"
         raise OutputError(msg)
 
@@ -287,7 +287,3 @@ def _recording_of(about: Mapping[str, Any]) -> Any:
     """Return the digest of the recording that was exported; None for data sets of several runs."""
     source = about.get("input")
     return source.get("digest") if isinstance(source, dict) else None
-
-
-def _is_later(file: Path, than_ns: int) -> bool:
-    return file.is_file() and file.stat().st_mtime_ns > than_ns

@@ -13,10 +13,10 @@ from pathlib import Path
 from shapecat.errors import OutputError, explained
 from shapecat.outputs.colouring import ExportedFrame
 from shapecat.outputs.level_clouds import upright_cloud, write_pcd
-from shapecat.outputs.wording import safe_name
+from shapecat.outputs.wording import different_names, safe_name
 from shapecat.runs.finished import FinishedRun
 
-__all__ = ["write_crops"]
+__all__ = ["crops_prefix", "write_crops"]
 
 
 def write_crops(out: Path, frames: Iterable[ExportedFrame], finished: FinishedRun) -> int:
@@ -29,10 +29,10 @@ def write_crops(out: Path, frames: Iterable[ExportedFrame], finished: FinishedRu
     ------
     OutputError : ``out`` is not writable.
     """
-    # The digest distinguishes recordings that have the same name.
-    prefix = f"{safe_name(finished.name)}.{finished.run['input']['digest'].rpartition(':')[2][:8]}"
+    prefix = crops_prefix(finished)
     hidden = out / f".{prefix}.partial"
-    several = len(finished.run["options"]["topics"]) > 1
+    topics = finished.run["options"]["topics"]
+    names = dict(zip(topics, different_names(topics), strict=True))
     count, new = 0, not out.exists()
     try:
         with explained(f"{out}: cannot be written", OutputError):
@@ -44,7 +44,7 @@ def write_crops(out: Path, frames: Iterable[ExportedFrame], finished: FinishedRu
                         continue
                     instance = hidden / safe_name(item.category) / f"{prefix}.track-{item.track}"
                     instance.mkdir(parents=True, exist_ok=True)
-                    stem = f"{safe_name(labelled.topic)}." if several else ""
+                    stem = f"{names[labelled.topic]}." if len(names) > 1 else ""
                     view = instance / f"{stem}{labelled.index:06d}.pcd"
                     write_pcd(view, cloud[0], viewpoint=cloud[1])
                     count += 1
@@ -55,6 +55,15 @@ def write_crops(out: Path, frames: Iterable[ExportedFrame], finished: FinishedRu
             with suppress(OSError):  # not empty, unless writing has failed
                 out.rmdir()
     return count
+
+
+def crops_prefix(finished: FinishedRun) -> str:
+    """Return how the names of the views of a run begin; those of the same recording are equal.
+
+    The digest distinguishes recordings that have the same name.
+    """
+    digest = finished.run["input"]["digest"].rpartition(":")[2]
+    return f"{safe_name(finished.name)}.{digest[:8]}"
 
 
 def _replace(out: Path, prefix: str, hidden: Path) -> None:

@@ -1,10 +1,12 @@
 """Format captions, confidences, times and names, the same in every output."""
 
 import re
+from collections.abc import Sequence
+from itertools import chain, count
 
 from shapecat.types import UNKNOWN
 
-__all__ = ["caption", "confidence_text", "safe_name", "time_span"]
+__all__ = ["caption", "confidence_text", "different_names", "safe_name", "time_span"]
 
 
 def caption(track: int, category: str, confidence: float) -> str:
@@ -59,3 +61,18 @@ def safe_name(text: str) -> str:
     '_wine glass'
     """
     return re.sub(r"[^\w .+&'()-]", "_", text).strip(". ")[:120] or "_"
+
+
+def different_names(texts: Sequence[str]) -> list[str]:
+    """Return a `safe_name` for each text, with ``-2``, ``-3``, ... added to those that occur again.
+
+    Examples
+    --------
+    >>> different_names(["/left/depth", "/left_depth"])
+    ['_left_depth', '_left_depth-2']
+    """
+    found: list[str] = []
+    for name in map(safe_name, texts):
+        numbered = (f"{name}-{k}" for k in count(2))
+        found.append(next(n for n in chain([name], numbered) if n not in found))
+    return found
