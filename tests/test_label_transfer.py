@@ -550,6 +550,19 @@ def test_table_alone_is_matched_by_positions(tmp_path: Path, place: str) -> None
     assert transfer.by == TABLE_ALONE
 
 
+def test_table_alone_may_have_categories_of_target(tmp_path: Path) -> None:
+    """*pan* is one letter from *can*, but the model of the run has learned it."""
+    table = tmp_path / "table.csv"
+    write_csv(table, {4: static(CUP)}, "wfar", {4: "pan"})
+    target = second(tmp_path / "target", {2: static(CUP)})
+    run = read_run(target)
+    run["model"]["categories"] += ["pan"]
+    write_run(target, run)
+
+    assert not transfer_labels(table, target).missed
+    assert labels_of(target) == {2: "pan"}
+
+
 # ---- the real command
 
 

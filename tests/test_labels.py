@@ -2,6 +2,7 @@
 
 import json
 import shutil
+import unicodedata
 from collections.abc import Callable
 from pathlib import Path
 
@@ -14,6 +15,7 @@ from mcap.reader import make_reader
 from mcap_ros2.decoder import DecoderFactory
 
 from shapecat.errors import OutputError
+from shapecat.outputs.wording import safe_name
 from shapecat.pipeline import annotate_again
 from shapecat.runs.corrections import _given, adopt_labels, read_labels, relabel
 from shapecat.runs.finished import FinishedRun
@@ -319,6 +321,35 @@ def test_outdated_page_undoes_no_labels(run: Path) -> None:
     assert (run / "tracks.previous.csv").read_text() == labelled(t4="bowl", t1="box")
 
 
+def test_page_table_in_place_of_own_table_clears_labels_later(run: Path) -> None:
+    """Its column of labels that were seen would keep a label that is cleared in a copy of it."""
+    header, *lines = labelled(t4="mug").splitlines()
+    own = run / "tracks.csv"
+    own.write_text("\n".join([f"{header},label_seen", *(f"{line}," for line in lines)]))
+    adopt_labels(own, run)
+    assert "label_seen" not in own.read_text()
+    corrected = run.parent / "mine.csv"
+    corrected.write_text(own.read_text().replace("mug", ""))
+    adopt_labels(corrected, run)
+
+    assert read_labels(own)[4].category == "unknown"
+
+
+def test_linked_table_gets_corrections(run: Path) -> None:
+    """A person may keep the tables of all runs in one folder under version control."""
+    kept = run.parent / "kept.csv"
+    (run / "tracks.csv").rename(kept)
+    (run / "tracks.csv").symlink_to(kept)
+    corrected = run.parent / "mine.csv"
+    corrected.write_text(labelled(t4="bowl"))
+    adopt_labels(corrected, run)
+    relabel(run, {1: "box"})
+
+    assert (run / "tracks.csv").is_symlink()
+    labels = read_labels(kept.rename(run / "tracks.csv"))
+    assert [labels[k].category for k in (4, 1)] == ["bowl", "box"]
+
+
 def test_cleared_labels_are_reported_and_kept_in_copy(
     shapecat: Callable[..., Result], guessed_run: Path, tmp_path: Path
 ) -> None:
@@ -368,6 +399,48 @@ def test_tables_saved_by_spreadsheets_are_read(tmp_path: Path, content: bytes) -
     path.write_bytes(content)
 
     assert read_labels(path) == {4: TrackLabel(4, "bowl", 1.0)}
+
+
+@pytest.mark.parametrize(
+    ("label", "encoding"),
+    [
+        ("コップ", "cp932"),
+        ("кружка", "cp1251"),
+        ("stół", "cp1250"),
+        ("컵", "cp949"),
+        ("Krügel", "cp1252"),
+    ],
+)
+def test_label_in_unknown_encoding_is_refused(tmp_path: Path, label: str, encoding: str) -> None:
+    """It would become a category of other letters."""
+    path = tmp_path / "tracks.csv"
+    text = f"track,category,confidence,label\n4,unknown,0.5,{label}\n"
+    path.write_bytes(text.encode(encoding))
+    with pytest.raises(OutputError, match=r"line 2: the label .* save the table as CSV UTF-8"):
+        read_labels(path)
+
+    path.write_text(text, "utf-8")
+    assert read_labels(path) == {4: TrackLabel(4, label, 1.0)}
+
+
+@pytest.mark.parametrize("label", ["चाकू", "น้ำ", "cafe\u0301"])
+def test_label_may_have_combining_letters(tmp_path: Path, label: str) -> None:
+    """Vowel signs of Indian and Thai scripts, and accents as macOS writes them."""
+    path = tmp_path / "tracks.csv"
+    path.write_text(f"track,category,confidence,label\n4,unknown,0.5,{label}\n", "utf-8")
+
+    assert read_labels(path)[4].category == unicodedata.normalize("NFC", label)
+    assert safe_name(label) == label
+
+
+@pytest.mark.parametrize("labels", [("new pan", "pan"), ("pan", "new pan")])
+def test_new_name_counts_for_all_lines(tmp_path: Path, labels: tuple[str, str]) -> None:
+    """*pan* is one letter from *can*, so that only *new* tells that it is meant."""
+    path = tmp_path / "tracks.csv"
+    lines = [f"{k},unknown,0.5,{label}\n" for k, label in enumerate(labels)]
+    path.write_text("track,category,confidence,label\n" + "".join(lines))
+
+    assert {label.category for label in read_labels(path).values()} == {"pan"}
 
 
 @pytest.mark.parametrize(

@@ -1,12 +1,17 @@
 """Format captions, confidences, times and names, the same in every output."""
 
 import re
+import unicodedata
 from collections.abc import Sequence
 from itertools import chain, count
 
 from shapecat.types import UNKNOWN
 
 __all__ = ["caption", "confidence_text", "different_names", "safe_name", "time_span"]
+
+_SAFE = re.compile(r"[\w .+&'()-]")
+_LONGEST_BYTES = 120
+"""File systems allow 255 bytes, of which others need some."""
 
 
 def caption(track: int, category: str, confidence: float) -> str:
@@ -55,12 +60,15 @@ def time_span(first_s: float, last_s: float) -> str:
 def safe_name(text: str) -> str:
     """Return a text as the name of a file or folder, without separators and not hidden.
 
+    Letters of all scripts stay, with their accents and vowel signs.
+
     Examples
     --------
     >>> safe_name("../wine glass")
     '_wine glass'
     """
-    return re.sub(r"[^\w .+&'()-]", "_", text).strip(". ")[:120] or "_"
+    kept = (c if _SAFE.match(c) or unicodedata.category(c)[0] == "M" else "_" for c in text)
+    return "".join(kept).strip(". ").encode()[:_LONGEST_BYTES].decode(errors="ignore") or "_"
 
 
 def different_names(texts: Sequence[str]) -> list[str]:

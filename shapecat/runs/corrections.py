@@ -20,6 +20,7 @@ from shapecat.runs.label_meaning import (
     resolve_labels,
 )
 from shapecat.runs.track_table import (
+    LABEL_SEEN,
     ORIGINAL,
     TrackRow,
     TrackTable,
@@ -91,7 +92,8 @@ def _read_own(path: Path) -> tuple[TrackTable, list[str]]:
         for row in own.rows
         if row.track in given
     )
-    columns = tuple(dict.fromkeys((*own.columns, *table.columns)))
+    # Only in the table that a page writes does it tell which labels are new.
+    columns = tuple(n for n in dict.fromkeys((*own.columns, *table.columns)) if n != LABEL_SEEN)
     restored = _relabelled(TrackTable(columns, rows, ()), table.rows)
     return restored, problems
 
@@ -137,7 +139,7 @@ def _adopt(corrected: Path, folder: Path) -> None:
         _refuse(current, problems)
         table = read_track_table(corrected)
         _require_same_run(corrected, table, folder, known=False)
-        given = (row for row in table.rows if row.cells.get("label_seen") != row.label)
+        given = (row for row in table.rows if row.cells.get(LABEL_SEEN) != row.label)
         result, problems = _relabelled(own, given), [*table.problems, *_contradictions(table, own)]
     known_categories = read_run(folder)["model"]["categories"]
     _, misread = resolve_labels(result.rows, known_categories, one_frame=_one_frame(folder))
@@ -145,7 +147,7 @@ def _adopt(corrected: Path, folder: Path) -> None:
     if any(a.label not in {"", b.label} for a, b in zip(own.rows, result.rows, strict=True)):
         with replacing(folder / PREVIOUS) as path:
             write_track_table(path, own)
-    with replacing(current) as path:
+    with replacing(current.resolve()) as path:  # it may be a symbolic link
         write_track_table(path, result)
 
 
@@ -166,7 +168,7 @@ def relabel(folder: Path, labels: Mapping[int, str]) -> dict[int, str]:
     before = find_misread(base.rows, categories, one_frame=one_frame)
     _refuse(current, [*problems, *_lines(base.rows, before)])
     rows, refused = _given(base.rows, labels, categories, one_frame=one_frame)
-    with replacing(current) as path:
+    with replacing(current.resolve()) as path:
         write_track_table(path, replace(base, rows=rows))
     return refused
 

@@ -4,6 +4,7 @@ A label is a category, a new category, ``delete``, or ``merge with N``.
 """
 
 import re
+import unicodedata
 from collections.abc import Iterable, Mapping, Sequence
 from typing import NamedTuple
 
@@ -84,7 +85,7 @@ def resolve_labels(
     known = {n.lower(): n for n in (UNKNOWN, *CATEGORIES, *categories, *(r.category for r in rows))}
     verdicts: dict[int, _Verdict] = {}
     misread = {}
-    for row in rows:
+    for row in sorted(rows, key=lambda row: _NEW.fullmatch(row.label) is None):  # new names first
         try:
             verdicts[row.track] = _understand(row.label, known) if row.label else row.category
         except ValueError as error:
@@ -141,6 +142,7 @@ def _understand(label: str, known: dict[str, str]) -> _Verdict:
     ------
     ValueError : the label is malformed, or likely a misspelt known name.
     """
+    label = unicodedata.normalize("NFC", label)
     if label.lower() in known:
         return known[label.lower()]
     if label.lower() == DELETE:
@@ -151,7 +153,7 @@ def _understand(label: str, known: dict[str, str]) -> _Verdict:
     new = _NEW.fullmatch(label)
     name = new[1] if new else label
     command = re.match(r"(merged?( |$)|del$|remove$)", label, re.IGNORECASE)
-    if command or name.lower() in _RESERVED or not _NAME.fullmatch(name):
+    if command or name.lower() in _RESERVED or not _NAME.fullmatch(_without_marks(name)):
         msg = f"{label!r} is not a category, `{DELETE}` or `merge with N`"
         raise ValueError(msg)
     near = _nearest(name.lower(), [*known, DELETE])
@@ -160,6 +162,11 @@ def _understand(label: str, known: dict[str, str]) -> _Verdict:
         msg = f"{label!r}: did you mean {meant}? For a new category write `new {name}`"
         raise ValueError(msg)
     return known.setdefault(name.lower(), name)
+
+
+def _without_marks(text: str) -> str:
+    """Return a text without accents and vowel signs that are characters of their own."""
+    return "".join(c for c in text if not unicodedata.category(c).startswith("M"))
 
 
 def _nearest(name: str, known: Sequence[str]) -> str | None:

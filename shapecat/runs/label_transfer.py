@@ -140,7 +140,7 @@ def match_labels(source: Path, target: Path) -> Transfer:
     table = read_track_table(path)
     _require_whole(path, table)
     folder = path.parent if _is_in_its_run(path, table) else None
-    categories = read_run(folder)["model"]["categories"] if folder is not None else ()
+    categories = read_run(folder or target)["model"]["categories"]
     misread = find_misread(table.rows, categories)
     labelled = [row for row in table.rows if row.label and row.track not in misread]
     wrong = tuple(

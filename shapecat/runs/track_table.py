@@ -12,6 +12,7 @@ from pathlib import Path
 from shapecat.errors import OutputError, explained
 
 __all__ = [
+    "LABEL_SEEN",
     "ORIGINAL",
     "TrackRow",
     "TrackTable",
@@ -23,6 +24,8 @@ __all__ = [
 
 ORIGINAL = "tracks.original.csv"
 """The table as the run wrote it, beside tracks.csv, which a person may edit."""
+LABEL_SEEN = "label_seen"
+"""The column of the table of a report page that holds the labels as the page was made."""
 _COLUMNS = ("track", "category", "confidence", "label")
 _LARGEST_TABLE = 64 << 20
 
@@ -67,7 +70,7 @@ def read_track_table(path: Path) -> TrackTable:
     ------
     OutputError : the file is unreadable, or lacks columns of tracks.csv.
     """
-    text = _text(path)
+    text, unicode = _text(path)
     lines = csv.reader(io.StringIO(text, newline=""), delimiter=_separator(text))
     rows: dict[int, TrackRow] = {}
     problems: list[str] = []
@@ -84,6 +87,11 @@ def read_track_table(path: Path) -> TrackTable:
                 problems.append(row)
             elif row.track in rows:
                 problems.append(f"line {row.line}: track {row.track} is listed twice")
+            elif not (unicode or row.label.isascii()):
+                problems.append(
+                    f"line {row.line}: the label {row.label!r} may be misread; save the table as "
+                    "CSV UTF-8"
+                )
             else:
                 rows[row.track] = row
     except csv.Error as error:
@@ -93,8 +101,8 @@ def read_track_table(path: Path) -> TrackTable:
     return TrackTable(columns, tuple(rows.values()), tuple(problems))
 
 
-def _text(path: Path) -> str:
-    """Return the text of a table, in any of the encodings that spreadsheets use."""
+def _text(path: Path) -> tuple[str, bool]:
+    """Return the text of a table, in any encoding in which ASCII is ASCII, and if it is Unicode."""
     with explained(f"{path}: cannot be read", OutputError):
         if path.stat().st_size > _LARGEST_TABLE:
             msg = f"{path}: larger than {_LARGEST_TABLE >> 20} MB, too large for a tracks.csv"
@@ -103,7 +111,7 @@ def _text(path: Path) -> str:
     wide = content.startswith((b"\xff\xfe", b"\xfe\xff"))
     for encoding in ("utf-16",) if wide else ("utf-8-sig", "cp1252"):
         try:
-            return content.decode(encoding)
+            return content.decode(encoding), encoding != "cp1252"
         except UnicodeDecodeError:
             continue
     msg = f"{path}: not a text file; save the table as CSV"
@@ -165,6 +173,8 @@ def with_label(row: TrackRow, label: str) -> TrackRow:
 def write_track_table(path: Path, table: TrackTable) -> None:
     """Write a table, with all its columns."""
     with path.open("w", newline="", encoding="utf-8") as file:
-        writer = csv.DictWriter(file, table.columns, lineterminator="\n", restval="")
+        writer = csv.DictWriter(
+            file, table.columns, lineterminator="\n", restval="", extrasaction="ignore"
+        )
         writer.writeheader()
         writer.writerows(row.cells for row in table.rows)
