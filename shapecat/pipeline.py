@@ -248,6 +248,10 @@ def annotate(folder: Path, recording: Recording, run: RunInfo, observe: Observer
             fixed_frame=run["fixed_frame"],
         )
 
+    if run["options"]["mcap"] and any(t.name.startswith("/shapecat/") for t in recording.topics):
+        recording.warn(
+            "annotated.mcap keeps the annotations of an earlier run beside those of this"
+        )
     if run["options"]["rrd"]:
         _once("review.rrd", folder, run, write_rrd)
     known = [*run["warnings"], *recording.warnings]

@@ -282,6 +282,21 @@ def test_bad_recording_does_not_stop_the_others(
     assert {path.name for path in out.iterdir()} == {"table", "manifest.jsonl"}
 
 
+def test_annotations_of_earlier_run_are_reported(
+    shapecat: Run, guessed_run: Path, tmp_path: Path
+) -> None:
+    """All messages are kept, so that viewers show the objects of both runs."""
+    result = shapecat("process", guessed_run / "annotated.mcap", "--out", tmp_path, "--no-rrd")
+    first, second = (
+        json.loads((folder / "run.json").read_text())["warnings"]
+        for folder in (guessed_run, tmp_path / "annotated")
+    )
+
+    assert result.exit_code == 0, result.output
+    assert not any("earlier run" in warning for warning in first)
+    assert sum("has the annotations of an earlier run" in warning for warning in second) == 1
+
+
 def test_commands_accept_run_without_objects(shapecat: Run, tmp_path: Path) -> None:
     """Empty tables must not be shaped as if they had a row."""
     path = simulate(tmp_path / "bare.mcap", scene="empty", frames=3, seed=2)
