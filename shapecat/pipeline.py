@@ -250,7 +250,7 @@ def annotate(folder: Path, recording: Recording, run: RunInfo, observe: Observer
 
     if run["options"]["mcap"] and any(t.name.startswith("/shapecat/") for t in recording.topics):
         recording.warn(
-            "annotated.mcap keeps the annotations of an earlier run beside those of this"
+            "annotated.mcap has the annotations of an earlier run besides those of this one"
         )
     if run["options"]["rrd"]:
         _once("review.rrd", folder, run, write_rrd)
