@@ -407,6 +407,7 @@ def test_interrupted_batch_ends_and_can_be_resumed(
     assert_same(one_by_one, tmp_path)
 
 
+@pytest.mark.many
 def test_dask_gives_same_tables_after_killed_worker(
     recordings: Path, one_by_one: Path, tmp_path: Path
 ) -> None:

@@ -76,7 +76,14 @@ def run_here(line: str, shapecat: Callable[..., Result]) -> None:
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("page", ["tutorial.md", "howto-labelling.md", "howto-bag.md"])
+@pytest.mark.parametrize(
+    "page",
+    [
+        "tutorial.md",
+        "howto-bag.md",
+        pytest.param("howto-labelling.md", marks=pytest.mark.many),  # see `test_labelling_loop`
+    ],
+)
 def test_documented_commands_work(
     page: str,
     shapecat: Callable[..., Result],

@@ -125,6 +125,7 @@ for words in ("simulate s.mcap --frames 2", "process s.mcap --out out --jobs 1")
 """Two commands in one process, since loading libraries takes longer than either."""
 
 
+@pytest.mark.many
 def test_wheel_simulates_and_processes_a_recording(bare: Path, tmp_path: Path) -> None:
     """An import of a development dependency would fail only for users."""
     environment = {**os.environ, "PYTHONPATH": "", "PYTHONDONTWRITEBYTECODE": "1"}
