@@ -54,7 +54,7 @@ from shapecat.evaluation.comparison_pictures import (
     _shades,
     draw_frame,
 )
-from shapecat.evaluation.labellings import LabelledItem, Labelling, find_frame
+from shapecat.evaluation.labellings import LabelledItem, Labelling, find_frame, index_frames
 from shapecat.evaluation.overlap import Overlap, box_iou
 from shapecat.evaluation.references import open_reference
 from shapecat.evaluation.references_coco import CocoLabels, filled_polygon, rle_mask
@@ -86,17 +86,24 @@ FOUND: list[list[tuple[int | None, list[int], str]]] = [
 FINAL = {1: "cup", 2: "can", 3: "box", 4: "cup"}
 
 
-def write_run(folder: Path, *, digest: str = "one", shift_ns: int = 0) -> Path:
-    """Write the tables of a run of three frames by hand; there is no recording."""
+def write_run(
+    folder: Path,
+    *,
+    digest: str = "one",
+    shift_ns: int = 0,
+    step: int = STEP,
+    part: slice = slice(0, 3),
+) -> Path:
+    """Write the tables of a run of ``part`` of three frames by hand; there is no recording."""
     folder.mkdir(parents=True)
-    stamps = [START + shift_ns + STEP * k for k in range(3)]
+    stamps = [START + shift_ns + step * k for k in range(3)[part]]
     none: dict[str, Any] = dict.fromkeys(FRAMES.names)
     frames = [
         none | {"topic": "/d", "frame": k, "stamp_ns": stamp, "up": [0, -1, 0]}
         for k, stamp in enumerate(stamps)
     ]
     rows, tracks = [], []
-    for k, found in enumerate(FOUND):
+    for k, found in enumerate(FOUND[part]):
         for n, (track, pixels, category) in enumerate(found):
             head = {"topic": "/d", "frame": k, "stamp_ns": stamps[k], "detection": n}
             scores = [0.8 if name == category else 0.1 for name in NAMES]
@@ -114,7 +121,7 @@ def write_run(folder: Path, *, digest: str = "one", shift_ns: int = 0) -> Path:
     about = run_info(
         input={"path": str(folder / "gone.mcap"), "digest": digest},
         model={"categories": NAMES},
-        counts={"frames": 3},
+        counts={"frames": len(stamps)},
         options={"topics": ["/d"]},
     )
     (folder / "run.json").write_text(json.dumps(about))
@@ -681,7 +688,8 @@ def test_object_with_wrong_category_counts_as_found() -> None:
 
 def test_labels_of_frame_match_its_topic_and_stamp() -> None:
     """Labels without a topic, or by frame number, count only if there are no better ones."""
-    frames = {(None, 5): "any", ("/d", 5): "own", ("/d", START): "stamp", (None, START): "old"}
+    names = {(None, 5): "any", ("/d", 5): "own", ("/d", START): "stamp", (None, START): "old"}
+    frames = index_frames(((*place, None), name) for place, name in names.items())
     asked = ((("/d", 5), START), (("/e", 5), START), (("/d", 5), 1), (("/e", 5), 1), (("/e", 6), 1))
 
     assert [find_frame(frames, *place) for place in asked] == ["stamp", "old", "own", "any", None]
@@ -751,6 +759,28 @@ def test_run_differs_from_corrected_run_only_in_labels(shapecat: Run, run: Path)
     assert changed["differences"] == {"category": 3, "surplus": 1}
     # The fraction found is of the true objects, not of the detections.
     assert changed["objects"] == {"true": 8, "detections": 9, "found": 8, "share_found": 1}
+
+
+def test_runs_with_different_start_are_compared_by_stamp(run: Path) -> None:
+    """Frames are numbered from the start, so equal numbers would be different images."""
+    later = write_run(run.parent / "later", part=slice(1, 3))
+    ends = compare(later, run), compare(run, later)
+
+    assert [found.as_dict()["differences"] for found in ends] == [{}, {}]
+    assert [found.figures["frames"] for found in ends] == [
+        {"compared": 2, "only_in_run": 0, "only_in_reference": 1},
+        {"compared": 2, "only_in_run": 1, "only_in_reference": 0},
+    ]
+
+
+def test_frames_of_runs_with_equal_stamps_are_told_apart(tmp_path: Path) -> None:
+    """Some drivers write the same stamp into several messages."""
+    run, same = (write_run(tmp_path / name, step=0) for name in ("lab", "same"))
+    short = write_run(tmp_path / "short", step=0, part=slice(0, 1))
+    found = compare(run, same), compare(run, short), compare(short, run)
+
+    assert [each.as_dict()["differences"] for each in found] == [{}, {}, {}]
+    assert [each.figures["frames"]["compared"] for each in found] == [3, 1, 1]
 
 
 def test_merged_tracks_have_one_identity(run: Path, truth: Path) -> None:

@@ -25,7 +25,13 @@ from shapecat.evaluation.comparison_pictures import DifferenceImage, draw_frame
 from shapecat.evaluation.identities import SeenTogether
 from shapecat.evaluation.labellings import LabelledItem, Labelling, Reference
 from shapecat.evaluation.overlap import MATCHED_F, Overlap
-from shapecat.evaluation.references import OtherRun, open_reference, read_complete, run_labellings
+from shapecat.evaluation.references import (
+    OtherRun,
+    open_reference,
+    read_complete,
+    repeated_stamps,
+    run_labellings,
+)
 from shapecat.runs.finished import FinishedRun, open_source
 from shapecat.runs.run_info import Options
 from shapecat.runs.selection import read_frames
@@ -107,12 +113,13 @@ def compare(
     other = open_reference(reference, finished.categories)
     if isinstance(other, OtherRun):
         _require_same_recording(finished, other)
-    tally = _Tally()
+    tally, repeated = _Tally(), repeated_stamps(folder)
     with ExitStack() as stack:
         clouds, notes = _clouds(finished, recording, stack)
         total = int(finished.run["counts"]["frames"])
         for done, (key, row, found) in enumerate(run_labellings(finished), start=1):
-            true = other.at(key, row["stamp_ns"])
+            place = (row["topic"], row["stamp_ns"])
+            true = other.at(key, row["stamp_ns"], repeated=place in repeated)
             if true is None:
                 tally.only_run += 1
             else:

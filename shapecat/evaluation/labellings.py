@@ -1,7 +1,8 @@
 """Labelled objects of a frame, from any source."""
 
 from abc import ABC, abstractmethod
-from collections.abc import Mapping
+from collections import Counter
+from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
 from typing import TypeVar
 
@@ -9,9 +10,11 @@ from shapecat.arrays import F4, U4, Bool
 from shapecat.runs.tables import Key
 from shapecat.types import Box
 
-__all__ = ["LabelledItem", "Labelling", "Reference", "find_frame"]
+__all__ = ["LabelledItem", "Labelling", "Reference", "find_frame", "index_frames"]
 
 _Frame = TypeVar("_Frame")
+_Place = tuple[str | None, int, int | None]
+"""Topic, None for any; timestamp (ns) or frame number; and frame number besides a timestamp."""
 
 
 @dataclass(frozen=True)
@@ -67,10 +70,11 @@ class Reference(ABC):
     """Whether objects have identities over time."""
 
     @abstractmethod
-    def at(self, key: Key, stamp_ns: int) -> Labelling | None:
+    def at(self, key: Key, stamp_ns: int, *, repeated: bool = False) -> Labelling | None:
         """Return the objects of a frame; None if the reference lacks this frame.
 
-        ``key`` is the topic and the number of the frame, ``stamp_ns`` its timestamp.
+        ``key`` is the topic and the number of the frame, ``stamp_ns`` its timestamp; ``repeated``
+        is whether other frames of its topic have the same timestamp.
         """
 
     @abstractmethod
@@ -78,14 +82,40 @@ class Reference(ABC):
         """Describe the range of frames in a few words."""
 
 
+def index_frames(frames: Iterable[tuple[_Place, _Frame]]) -> dict[_Place, _Frame]:
+    """Return entries as `find_frame` needs them.
+
+    Frames of a topic with equal timestamps are found only together with their numbers.
+
+    Parameters
+    ----------
+    frames : entries with their topic, None for any topic; their timestamp (ns) or frame number;
+        and the frame number besides a timestamp, None if unknown.
+    """
+    known = list(frames)
+    counts = Counter((topic, stamp) for (topic, stamp, _), _ in known)
+    index = dict(known)
+    index |= {
+        (topic, stamp, None): entry
+        for (topic, stamp, _), entry in known
+        if counts[topic, stamp] == 1
+    }
+    return index
+
+
 def find_frame(
-    frames: Mapping[tuple[str | None, int], _Frame], key: Key, stamp_ns: int
+    index: Mapping[_Place, _Frame], key: Key, stamp_ns: int, *, repeated: bool = False
 ) -> _Frame | None:
     """Return the entry of a frame; None if there is none.
 
     Parameters
     ----------
-    frames : entries by topic, None for any topic, and by timestamp (ns) or frame number.
+    index : from `index_frames`.
+    repeated : whether other frames of its topic have the same timestamp.
     """
-    places = ((topic, number) for number in (stamp_ns, key[1]) for topic in (key[0], None))
-    return next((frames[place] for place in places if place in frames), None)
+    number = key[1]
+    numbers = [(stamp_ns, number), (stamp_ns, None), (number, None)]
+    if repeated:
+        numbers.remove((stamp_ns, None))
+    places = ((topic, *pair) for pair in numbers for topic in (key[0], None))
+    return next((index[place] for place in places if place in index), None)

@@ -2,6 +2,7 @@
 
 import json
 import zipfile
+from collections import Counter
 from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import IO, Any, cast
@@ -10,7 +11,13 @@ import numpy as np
 
 from shapecat.arrays import F8, U1
 from shapecat.errors import OutputError, RecordingError
-from shapecat.evaluation.labellings import LabelledItem, Labelling, Reference
+from shapecat.evaluation.labellings import (
+    LabelledItem,
+    Labelling,
+    Reference,
+    find_frame,
+    index_frames,
+)
 from shapecat.evaluation.references_coco import CocoLabels
 from shapecat.evaluation.references_kitti import KittiLabels
 from shapecat.runs.finished import FinishedRun, read_finished
@@ -20,7 +27,14 @@ from shapecat.runs.shown import ShownTracks
 from shapecat.runs.tables import Key, keys_of, read_row_groups, read_together
 from shapecat.types import Box
 
-__all__ = ["OtherRun", "SimulatedTruth", "open_reference", "read_complete", "run_labellings"]
+__all__ = [
+    "OtherRun",
+    "SimulatedTruth",
+    "open_reference",
+    "read_complete",
+    "repeated_stamps",
+    "run_labellings",
+]
 
 
 def open_reference(path: Path, categories: Sequence[str] = ()) -> Reference:
@@ -76,7 +90,13 @@ class SimulatedTruth(Reference):
         labels = path.with_name(f"{path.name.removesuffix('truth.json')}labels.npz")
         self._labels = _LabelImages(labels)
 
-    def at(self, key: Key, stamp_ns: int) -> Labelling | None:  # noqa: ARG002  stamps are enough
+    def at(
+        self,
+        key: Key,  # noqa: ARG002  stamps are enough
+        stamp_ns: int,
+        *,
+        repeated: bool = False,  # noqa: ARG002  the simulator repeats none
+    ) -> Labelling | None:
         """Return the objects of a frame; None if the ground truth lacks this frame."""
         entry = self._by_stamp.get(stamp_ns)
         if entry is None:
@@ -162,29 +182,46 @@ class OtherRun(Reference):
 
     def __init__(self, folder: Path) -> None:
         self.finished = read_complete(folder)
-        groups = read_row_groups(folder / "frames.parquet", ["topic", "frame"])
-        self._keys: set[Key] = {key for group in groups for key in keys_of(group)}
-        self.frames = len(self._keys)
+        frames = list(_frames(folder))
+        self._stamps = [stamp for _, stamp in frames]
+        self._keys = index_frames(((key[0], stamp, key[1]), key) for key, stamp in frames)
+        self.frames = len(frames)
         self._rest = run_labellings(self.finished)
 
-    def at(self, key: Key, stamp_ns: int) -> Labelling | None:  # noqa: ARG002  keys are enough
+    def at(self, key: Key, stamp_ns: int, *, repeated: bool = False) -> Labelling | None:
         """Return the objects of a frame; None if the other run lacks this frame.
 
         Raises
         ------
         OutputError : the two runs have their frames in a different order.
         """
-        if key not in self._keys:
+        wanted = find_frame(self._keys, key, stamp_ns, repeated=repeated)
+        if wanted is None:
             return None
         for other, _, labelling in self._rest:
-            if other == key:
+            if other == wanted:
                 return labelling
         msg = f"{self.finished.folder}: its frames are in a different order; process it again"
         raise OutputError(msg)
 
     def describe_frames(self) -> str:
-        """Return the topics."""
-        return f"frames of {', '.join(sorted({topic for topic, _ in self._keys})) or 'no topic'}"
+        """Return the topics and the range of timestamps."""
+        topics = sorted({topic for topic, *_ in self._keys if topic is not None})
+        if not topics:
+            return "no frames"
+        return f"frames of {', '.join(topics)}, stamps {min(self._stamps)} to {max(self._stamps)}"
+
+
+def repeated_stamps(folder: Path) -> set[tuple[str, int]]:
+    """Return the topics and timestamps (ns) that several frames of a run have."""
+    counts = Counter((topic, stamp) for (topic, _), stamp in _frames(folder))
+    return {place for place, count in counts.items() if count > 1}
+
+
+def _frames(folder: Path) -> Iterator[tuple[Key, int]]:
+    """Yield topic and number of each frame of a run, and its timestamp, ns."""
+    for group in read_row_groups(folder / "frames.parquet", ["topic", "frame", "stamp_ns"]):
+        yield from zip(keys_of(group), group["stamp_ns"].to_pylist(), strict=True)
 
 
 def read_complete(folder: Path) -> FinishedRun:

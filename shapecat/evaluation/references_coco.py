@@ -10,7 +10,13 @@ import numpy as np
 
 from shapecat.arrays import I4, Bool
 from shapecat.errors import RecordingError
-from shapecat.evaluation.labellings import LabelledItem, Labelling, Reference, find_frame
+from shapecat.evaluation.labellings import (
+    LabelledItem,
+    Labelling,
+    Reference,
+    find_frame,
+    index_frames,
+)
 from shapecat.runs.tables import Key
 
 __all__ = ["CocoLabels", "filled_polygon", "rle_mask"]
@@ -36,21 +42,21 @@ class CocoLabels(Reference):
         self._labels = defaultdict(list)
         for item in content["annotations"]:
             self._labels[item["image_id"]].append({**item, "name": names[item["category_id"]]})
-        self._images = {
-            (image.get("topic"), _number_of(image)): image for image in content["images"]
-        }
+        self._images = index_frames(
+            ((image.get("topic"), _number_of(image), None), image) for image in content["images"]
+        )
         self.frames = len(self._images)
         items = [item for some in self._labels.values() for item in some]
         self.tracked = bool(items) and all(_track_of(item) is not None for item in items)
 
-    def at(self, key: Key, stamp_ns: int) -> Labelling | None:
+    def at(self, key: Key, stamp_ns: int, *, repeated: bool = False) -> Labelling | None:
         """Return the objects of a frame; None if the labels lack this frame.
 
         Raises
         ------
         RecordingError : the image size or a mask is invalid.
         """
-        image = find_frame(self._images, key, stamp_ns)
+        image = find_frame(self._images, key, stamp_ns, repeated=repeated)
         if image is None:
             return None
         height, width = int(image["height"]), int(image["width"])
@@ -75,7 +81,7 @@ class CocoLabels(Reference):
 
     def describe_frames(self) -> str:
         """Return the range of timestamps or frame numbers."""
-        numbers = [number for _, number in self._images]
+        numbers = [number for _, number, _ in self._images]
         return f"images {min(numbers)} to {max(numbers)}" if numbers else "no images"
 
 

@@ -8,7 +8,13 @@ import numpy as np
 
 from shapecat.arrays import F8
 from shapecat.errors import RecordingError
-from shapecat.evaluation.labellings import LabelledItem, Labelling, Reference, find_frame
+from shapecat.evaluation.labellings import (
+    LabelledItem,
+    Labelling,
+    Reference,
+    find_frame,
+    index_frames,
+)
 from shapecat.geometry import quaternion_from_rotation
 from shapecat.outputs.exports_kitti import kitti_type
 from shapecat.runs.tables import Key
@@ -36,22 +42,21 @@ class KittiLabels(Reference):
         self._categories = {kitti_type(name): name for name in reversed(categories)}
         numbers = sorted(path.stem for path in (folder / "label_2").glob("*.txt"))
         try:
-            self._names = _stamps(folder / "frames.csv") or {
-                (None, int(name)): name for name in numbers
-            }
+            names = _stamps(folder / "frames.csv") or {(None, int(name)): name for name in numbers}
         except (OSError, ValueError, KeyError) as error:
             msg = f"{folder}: not a folder of KITTI labels ({error})"
             raise RecordingError(msg) from error
+        self._names = index_frames(((*place, None), name) for place, name in names.items())
         self.frames = len(self._names)
 
-    def at(self, key: Key, stamp_ns: int) -> Labelling | None:
+    def at(self, key: Key, stamp_ns: int, *, repeated: bool = False) -> Labelling | None:
         """Return the objects of a frame; None if the labels lack this frame.
 
         Raises
         ------
         RecordingError : a label or calibration file is missing or damaged.
         """
-        name = find_frame(self._names, key, stamp_ns)
+        name = find_frame(self._names, key, stamp_ns, repeated=repeated)
         if name is None:
             return None
         path = self._folder / "label_2" / f"{name}.txt"
@@ -70,7 +75,7 @@ class KittiLabels(Reference):
 
     def describe_frames(self) -> str:
         """Return the range of timestamps or frame numbers."""
-        known = [number for _, number in self._names]
+        known = [number for _, number, _ in self._names]
         return f"frames {min(known)} to {max(known)}" if known else "no frames"
 
 
