@@ -56,7 +56,7 @@ from shapecat.evaluation.comparison_pictures import (
 )
 from shapecat.evaluation.labellings import LabelledItem, Labelling, find_frame, index_frames
 from shapecat.evaluation.overlap import Overlap, box_iou
-from shapecat.evaluation.references import open_reference
+from shapecat.evaluation.references import open_reference, read_complete, run_labellings
 from shapecat.evaluation.references_coco import CocoLabels, filled_polygon, rle_mask
 from shapecat.evaluation.references_kitti import KittiLabels
 from shapecat.runs.tables import DETECTIONS, FRAMES, TRACKS
@@ -793,6 +793,26 @@ def test_merged_tracks_have_one_identity(run: Path, truth: Path) -> None:
     assert found.figures["tracking"]["switches"] == 0
     assert {row.track for row in found.rows if row.true_track == 11} == {1}
     assert "identity" not in {row.difference for row in found.rows}
+
+
+def test_merged_tracks_in_one_frame_are_one_object(run: Path) -> None:
+    """All outputs join them. Two objects of one identity would be errors of any tracker."""
+    text = (run / "tracks.csv").read_text()
+    (run / "tracks.csv").write_text(text.replace("3,box,0.9,", "3,box,0.9,merge with 2"))
+    figures = compare(run, run).figures
+    *_, (_, _, last) = run_labellings(read_complete(run))
+    joined = last.items[1]
+    assert joined.pixels is not None
+    assert joined.box is not None
+    assert joined.posterior is not None
+
+    assert (figures["objects"]["true"], figures["tracking"]["idf1"]) == (7, 1)
+    assert (joined.track, joined.category, joined.view_category) == (2, "can", "box")
+    assert joined.pixels.tolist() == sorted([*LESS, *BOX])
+    # Boxes of 0.1 by 0.2 by 0.3 with centres at x = 0.1 and 0.2; the vertical is y.
+    np.testing.assert_allclose(joined.box.center, [0.15, 0, 1], atol=1e-6)
+    np.testing.assert_allclose(sorted(joined.box.size), [0.2, 0.2, 0.3], atol=1e-6)
+    np.testing.assert_allclose(joined.posterior, [0.1, 0.45, 0.45], atol=1e-6)
 
 
 def test_coco_masks_are_read_in_all_forms(shapecat: Run, run: Path) -> None:

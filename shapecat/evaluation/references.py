@@ -17,6 +17,7 @@ from shapecat.evaluation.labellings import (
     Reference,
     find_frame,
     index_frames,
+    join_merged,
 )
 from shapecat.evaluation.references_coco import CocoLabels
 from shapecat.evaluation.references_kitti import KittiLabels
@@ -242,7 +243,8 @@ def run_labellings(finished: FinishedRun) -> Iterator[tuple[Key, Mapping[str, An
     """Yield the frames of a run in order: topic and number, the frame's table row, its objects.
 
     Detections without a track keep the category of the single view; detections of deleted tracks
-    are left out. Boxes are full boxes where these are known, else visible ones.
+    are left out, those of merged tracks in one frame are joined. Boxes are full boxes where these
+    are known, else visible ones.
     """
     folder = finished.folder
     tracks = _tracks(folder)
@@ -256,7 +258,8 @@ def run_labellings(finished: FinishedRun) -> Iterator[tuple[Key, Mapping[str, An
             key = (row["topic"], row["frame"])
             full = {item.detection: shown.full[item.row] for item in shown.of(key)}
             items = (_item(r, tracks, finished, full) for r in found.get(key, []))
-            yield key, row, Labelling(tuple(item for item in items if item is not None))
+            seen = [item for item in items if item is not None]
+            yield key, row, Labelling(tuple(join_merged(seen, row["up"])))
 
 
 def _tracks(folder: Path) -> dict[tuple[str, int, int], int]:
