@@ -962,6 +962,35 @@ def test_labels_of_two_topics_are_not_mixed(tmp_path: Path) -> None:
     np.testing.assert_allclose([box.center, box.size], [[1, 1.85, 4], [0.5, 0.1, 0.3]], rtol=1e-6)
 
 
+def test_labels_of_frames_with_equal_stamps_are_told_apart(tmp_path: Path) -> None:
+    """Some drivers repeat stamps: every frame would get the labels of one of them."""
+    numbers = (3, 4, 6)  # frame 5 is not labelled, frame 6 has its own stamp
+    stamps = {3: START, 4: START, 6: START + STEP}
+    square = [[1, 0, 3, 0, 3, 2, 1, 2]]
+    head = {"topic": "/d", "file_name": "x", "width": 4, "height": 3}
+    images = [{**head, "id": k, "frame": k, "stamp_ns": stamps[k]} for k in numbers]
+    annotations = [
+        {"id": k, "image_id": k, "category_id": k, "segmentation": square} for k in numbers
+    ]
+    names = [{"id": k, "name": f"cup{k}"} for k in numbers]
+    content = {"categories": names, "annotations": annotations, "images": images}
+    (tmp_path / "label_2").mkdir()
+    rows = [f"{k},/d,{k},{stamps[k]}" for k in numbers]
+    (tmp_path / "frames.csv").write_text("\n".join(["number,topic,frame,stamp_ns", *rows]))
+    for k in numbers:
+        line = f"cup{k} 0 0 0 0 0 0 0 0.3 0.1 0.5 1 2 4 0.6\n"
+        (tmp_path / "label_2" / f"{k}.txt").write_text(line)
+
+    for labels in (CocoLabels(Path("labels.json"), content), KittiLabels(tmp_path)):
+        found = [labels.at(("/d", k), START, repeated=True) for k in (3, 4, 5)]
+        found += [labels.at(("/d", 9), START + STEP * k, repeated=k == 2) for k in (1, 2)]
+        found.append(labels.at(("/d", 9), START + STEP, repeated=True))
+        assert labels.frames == 3
+        assert [one and one.items[0].category for one in found] == [
+            "cup3", "cup4", None, "cup6", None, None
+        ]  # fmt: skip
+
+
 def test_labels_of_single_topic_fit_a_renamed_topic(tmp_path: Path) -> None:
     """An equal stamp is enough, an equal frame number is not."""
     (tmp_path / "label_2").mkdir()

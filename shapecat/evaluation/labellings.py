@@ -14,10 +14,18 @@ from shapecat.geometry import box_around
 from shapecat.runs.tables import Key
 from shapecat.types import Box
 
-__all__ = ["LabelledItem", "Labelling", "Reference", "find_frame", "index_frames", "join_merged"]
+__all__ = [
+    "LabelledItem",
+    "Labelling",
+    "Place",
+    "Reference",
+    "find_frame",
+    "index_frames",
+    "join_merged",
+]
 
 _Frame = TypeVar("_Frame")
-_Place = tuple[str | None, int, int | None]
+Place = tuple[str | None, int, int | None]
 """Topic, None for any; timestamp (ns) or frame number; and frame number besides a timestamp."""
 
 
@@ -113,7 +121,7 @@ def _join(parts: Sequence[LabelledItem], up: ArrayLike) -> LabelledItem:
     )
 
 
-def index_frames(frames: Iterable[tuple[_Place, _Frame]]) -> dict[_Place, _Frame]:
+def index_frames(frames: Iterable[tuple[Place, _Frame]]) -> dict[Place, _Frame]:
     """Return entries as `find_frame` needs them.
 
     Frames of a topic with equal timestamps are found only together with their numbers.
@@ -135,7 +143,7 @@ def index_frames(frames: Iterable[tuple[_Place, _Frame]]) -> dict[_Place, _Frame
 
 
 def find_frame(
-    index: Mapping[_Place, _Frame], key: Key, stamp_ns: int, *, repeated: bool = False
+    index: Mapping[Place, _Frame], key: Key, stamp_ns: int, *, repeated: bool = False
 ) -> _Frame | None:
     """Return the entry of a frame; None if there is none.
 

@@ -13,6 +13,7 @@ from shapecat.errors import RecordingError
 from shapecat.evaluation.labellings import (
     LabelledItem,
     Labelling,
+    Place,
     Reference,
     find_frame,
     index_frames,
@@ -29,9 +30,9 @@ _A_STAMP = 10**12
 class CocoLabels(Reference):
     """Masks of a COCO file, as polygons or run lengths.
 
-    An image names its frame by ``stamp_ns``, by ``frame``, or by a number in its ``file_name``: a
-    timestamp in nanoseconds, else the last number, which is the frame number. An image without
-    ``topic`` matches any topic.
+    An image names its frame by ``stamp_ns`` (with ``frame`` where stamps repeat), by ``frame``, or
+    by a number in its ``file_name``: a timestamp in nanoseconds, else the last number, which is
+    the frame number. An image without ``topic`` matches any topic.
     """
 
     kind = "COCO labels"
@@ -42,10 +43,9 @@ class CocoLabels(Reference):
         self._labels = defaultdict(list)
         for item in content["annotations"]:
             self._labels[item["image_id"]].append({**item, "name": names[item["category_id"]]})
-        self._images = index_frames(
-            ((image.get("topic"), _number_of(image), None), image) for image in content["images"]
-        )
-        self.frames = len(self._images)
+        images = content["images"]
+        self._images = index_frames((_place_of(image), image) for image in images)
+        self.frames = len(images)
         items = [item for some in self._labels.values() for item in some]
         self.tracked = bool(items) and all(_track_of(item) is not None for item in items)
 
@@ -90,11 +90,14 @@ def _track_of(item: Mapping[str, Any]) -> int | None:
     return None if own is None else int(own)
 
 
-def _number_of(image: Mapping[str, Any]) -> int:
-    """Return the timestamp of an image, ns, or its frame number."""
-    for name in ("stamp_ns", "frame"):
-        if name in image:
-            return int(image[name])
+def _place_of(image: Mapping[str, Any]) -> Place:
+    numbers = [int(image[name]) for name in ("stamp_ns", "frame") if image.get(name) is not None]
+    numbers = numbers or [_number_in_name(image)]
+    return image.get("topic"), numbers[0], numbers[1] if len(numbers) > 1 else None
+
+
+def _number_in_name(image: Mapping[str, Any]) -> int:
+    """Return the timestamp in the name of an image, ns, or the frame number."""
     digits = re.findall(r"\d+", Path(image["file_name"]).stem)
     if not digits:
         msg = f"the name {image['file_name']!r} holds neither a timestamp nor a frame number"

@@ -1,7 +1,7 @@
 """KITTI 3D labels: label_2 and calib, as `shapecat export --format kitti` writes them."""
 
 import csv
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 
 import numpy as np
@@ -11,6 +11,7 @@ from shapecat.errors import RecordingError
 from shapecat.evaluation.labellings import (
     LabelledItem,
     Labelling,
+    Place,
     Reference,
     find_frame,
     index_frames,
@@ -26,10 +27,11 @@ __all__ = ["KittiLabels"]
 class KittiLabels(Reference):
     """Boxes of KITTI labels, without masks and identities.
 
-    ``frames.csv`` gives the timestamp of each label file, and its topic where there are several;
-    without it, the file's number is the frame number. Boxes are in the rectified camera frame;
-    the row ``Tr_rect_to_sensor`` of the calibration turns them into the sensor frame. Without it,
-    as in KITTI's own data, the frames are the same.
+    ``frames.csv`` gives the timestamp of each label file, its frame number where timestamps
+    repeat, and its topic where there are several; without it, the file's number is the frame
+    number. Boxes are in the rectified camera frame; the row ``Tr_rect_to_sensor`` of the
+    calibration turns them into the sensor frame. Without it, as in KITTI's own data, the frames
+    are the same.
 
     A type cannot hold spaces. It stands for the first of ``categories`` that is written this way;
     in any other type, each ``_`` is a space.
@@ -42,12 +44,13 @@ class KittiLabels(Reference):
         self._categories = {kitti_type(name): name for name in reversed(categories)}
         numbers = sorted(path.stem for path in (folder / "label_2").glob("*.txt"))
         try:
-            names = _stamps(folder / "frames.csv") or {(None, int(name)): name for name in numbers}
+            names = _listed(folder / "frames.csv")
+            names = names or [((None, int(name), None), name) for name in numbers]
         except (OSError, ValueError, KeyError) as error:
             msg = f"{folder}: not a folder of KITTI labels ({error})"
             raise RecordingError(msg) from error
-        self._names = index_frames(((*place, None), name) for place, name in names.items())
-        self.frames = len(self._names)
+        self._names = index_frames(names)
+        self.frames = len(names)
 
     def at(self, key: Key, stamp_ns: int, *, repeated: bool = False) -> Labelling | None:
         """Return the objects of a frame; None if the labels lack this frame.
@@ -79,19 +82,22 @@ class KittiLabels(Reference):
         return f"frames {min(known)} to {max(known)}" if known else "no frames"
 
 
-def _stamps(path: Path) -> dict[tuple[str | None, int], str]:
-    """Return the name of each label file by topic and timestamp, ns; empty without ``frames.csv``.
+def _listed(path: Path) -> list[tuple[Place, str]]:
+    """Return the frame and the name of each label file; none without ``frames.csv``.
 
     Labels of a single topic match any topic, since the recording may use another name.
     """
     if not path.is_file():
-        return {}
+        return []
     with path.open(newline="", encoding="utf-8") as file:
         rows = list(csv.DictReader(file))
     several = len({row.get("topic") for row in rows}) > 1
-    return {
-        (row["topic"] if several else None, int(row["stamp_ns"])): row["number"] for row in rows
-    }
+    return [(_place(row, several=several), row["number"]) for row in rows]
+
+
+def _place(row: Mapping[str, str], *, several: bool) -> Place:
+    frame = row.get("frame")
+    return row["topic"] if several else None, int(row["stamp_ns"]), int(frame) if frame else None
 
 
 def _sensor_from_rectified(path: Path) -> F8:
