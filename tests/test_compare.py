@@ -472,15 +472,43 @@ def test_table_has_each_number_in_its_column(tmp_path: Path) -> None:
         ("session2_000012.png", ("/d", 12)),
         ("camera1/7_depth_12.v3.jpg", ("/d", 3)),
         (f"12_{START}_5.png", ("/d", 99)),
+        ("20240101123456_000012.png", ("/d", 12)),
     ],
 )
 def test_frame_of_image_is_read_from_its_name(name: str, key: tuple[str, int]) -> None:
-    """Names may begin with session and camera numbers; a timestamp is recognised by its size."""
+    """Names may begin with dates and camera numbers; a timestamp is recognised by its size."""
     images = [{"id": 1, "file_name": name, "width": 4, "height": 3}]
     labels = CocoLabels(Path("x.json"), {"categories": [], "annotations": [], "images": images})
 
     assert labels.at(key, START) is not None
     assert [labels.at(("/d", k), 0) is None for k in (1, 2, 5, 7)] == [True] * 4
+
+
+@pytest.mark.parametrize(
+    "places",
+    [
+        [{"file_name": "left_000004.png"}, {"file_name": "right_000004.png"}],
+        [{"stamp_ns": START}, {"stamp_ns": START}],
+        [{"stamp_ns": START, "frame": 4}, {"stamp_ns": START, "frame": 4}],
+    ],
+)
+def test_coco_images_of_the_same_frame_are_refused(places: list[dict[str, Any]]) -> None:
+    """Otherwise, the labels of one of them would count for both."""
+    images = [{"id": k, "width": 4, "height": 3, **place} for k, place in enumerate(places)]
+    content = {"categories": [], "annotations": [], "images": images}
+
+    with pytest.raises(RecordingError, match=r"x.json: frame .* of any topic is labelled twice"):
+        CocoLabels(Path("x.json"), content)
+
+
+def test_kitti_label_files_of_the_same_frame_are_refused(tmp_path: Path) -> None:
+    """Otherwise, the labels of one of them would count for both."""
+    (tmp_path / "label_2").mkdir()
+    for name in ("4", "000004"):
+        (tmp_path / "label_2" / f"{name}.txt").touch()
+
+    with pytest.raises(RecordingError, match="frame 4 of any topic is labelled twice"):
+        KittiLabels(tmp_path)
 
 
 def test_truth_skips_label_images_of_missing_frames(tmp_path: Path) -> None:
@@ -689,7 +717,7 @@ def test_object_with_wrong_category_counts_as_found() -> None:
 def test_labels_of_frame_match_its_topic_and_stamp() -> None:
     """Labels without a topic, or by frame number, count only if there are no better ones."""
     names = {(None, 5): "any", ("/d", 5): "own", ("/d", START): "stamp", (None, START): "old"}
-    frames = index_frames(((*place, None), name) for place, name in names.items())
+    frames = index_frames(Path("x"), (((*place, None), name) for place, name in names.items()))
     asked = ((("/d", 5), START), (("/e", 5), START), (("/d", 5), 1), (("/e", 5), 1), (("/e", 6), 1))
 
     assert [find_frame(frames, *place) for place in asked] == ["stamp", "old", "own", "any", None]

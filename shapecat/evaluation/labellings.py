@@ -4,12 +4,14 @@ from abc import ABC, abstractmethod
 from collections import Counter
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
+from pathlib import Path
 from typing import TypeVar
 
 import numpy as np
 from numpy.typing import ArrayLike
 
 from shapecat.arrays import F4, U4, Bool
+from shapecat.errors import RecordingError
 from shapecat.geometry import box_around
 from shapecat.runs.tables import Key
 from shapecat.types import Box
@@ -121,25 +123,32 @@ def _join(parts: Sequence[LabelledItem], up: ArrayLike) -> LabelledItem:
     )
 
 
-def index_frames(frames: Iterable[tuple[Place, _Frame]]) -> dict[Place, _Frame]:
+def index_frames(path: Path, frames: Iterable[tuple[Place, _Frame]]) -> dict[Place, _Frame]:
     """Return entries as `find_frame` needs them.
 
     Frames of a topic with equal timestamps are found only together with their numbers.
 
     Parameters
     ----------
+    path : of the reference, for the message.
     frames : entries with their topic, None for any topic; their timestamp (ns) or frame number;
         and the frame number besides a timestamp, None if unknown.
+
+    Raises
+    ------
+    RecordingError : two entries are of the same frame.
     """
-    known = list(frames)
-    counts = Counter((topic, stamp) for (topic, stamp, _), _ in known)
-    index = dict(known)
-    index |= {
-        (topic, stamp, None): entry
-        for (topic, stamp, _), entry in known
-        if counts[topic, stamp] == 1
-    }
-    return index
+    index: dict[Place, _Frame] = {}
+    for place, entry in frames:
+        if place in index:
+            topic, stamp, number = place
+            name = stamp if number is None else number
+            msg = f"{path}: frame {name} of {topic or 'any topic'} is labelled twice"
+            raise RecordingError(msg)
+        index[place] = entry
+    counts = Counter((topic, stamp) for topic, stamp, _ in index)
+    unique = {place: entry for place, entry in index.items() if counts[place[:2]] == 1}
+    return index | {(topic, stamp, None): entry for (topic, stamp, _), entry in unique.items()}
 
 
 def find_frame(

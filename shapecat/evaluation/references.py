@@ -185,7 +185,7 @@ class OtherRun(Reference):
         self.finished = read_complete(folder)
         frames = list(_frames(folder))
         self._stamps = [stamp for _, stamp in frames]
-        self._keys = index_frames(((key[0], stamp, key[1]), key) for key, stamp in frames)
+        self._keys = index_frames(folder, (((key[0], stamp, key[1]), key) for key, stamp in frames))
         self.frames = len(frames)
         self._rest = run_labellings(self.finished)
 

@@ -23,8 +23,9 @@ from shapecat.runs.tables import Key
 __all__ = ["CocoLabels", "filled_polygon", "rle_mask"]
 
 _MOST_PIXELS = 50_000_000
-_A_STAMP = 10**12
-"""Larger numbers in image names are timestamps in nanoseconds, smaller ones frame numbers."""
+_A_STAMP = 10**17
+"""Larger numbers in image names are timestamps in nanoseconds, smaller ones frame numbers or dates,
+of which the longest, with milliseconds, have 17 digits."""
 
 
 class CocoLabels(Reference):
@@ -44,7 +45,7 @@ class CocoLabels(Reference):
         for item in content["annotations"]:
             self._labels[item["image_id"]].append({**item, "name": names[item["category_id"]]})
         images = content["images"]
-        self._images = index_frames((_place_of(image), image) for image in images)
+        self._images = index_frames(path, ((_place_of(image), image) for image in images))
         self.frames = len(images)
         items = [item for some in self._labels.values() for item in some]
         self.tracked = bool(items) and all(_track_of(item) is not None for item in items)

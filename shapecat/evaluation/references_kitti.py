@@ -49,7 +49,7 @@ class KittiLabels(Reference):
         except (OSError, ValueError, KeyError) as error:
             msg = f"{folder}: not a folder of KITTI labels ({error})"
             raise RecordingError(msg) from error
-        self._names = index_frames(names)
+        self._names = index_frames(folder, names)
         self.frames = len(names)
 
     def at(self, key: Key, stamp_ns: int, *, repeated: bool = False) -> Labelling | None:
