@@ -1019,6 +1019,35 @@ def test_labels_of_frames_with_equal_stamps_are_told_apart(tmp_path: Path) -> No
         ]  # fmt: skip
 
 
+def test_images_of_other_recordings_are_left_out(run: Path) -> None:
+    """Recordings of a data set may have equal stamps, as all simulated ones do.
+
+    A single recording may have another name than the run: folders can be renamed.
+    """
+    square = [[0, 0, 4, 0, 4, 5, 0, 5]]
+    head = {"topic": "/d", "frame": 0, "stamp_ns": START, "width": 10, "height": 10}
+    names = ("first", "lab", "last")
+    content: dict[str, Any] = {
+        "categories": [{"id": k, "name": name} for k, name in enumerate(names)],
+        "images": [{**head, "id": k, "recording": name} for k, name in enumerate(names)],
+        "annotations": [
+            {"id": k, "image_id": k, "category_id": k, "segmentation": square} for k in range(3)
+        ],
+    }
+    (run.parent / "coco.json").write_text(json.dumps(content))
+    found = compare(run, run.parent / "coco.json")
+
+    assert {row.true_category for row in found.rows} == {None, "lab"}
+    assert found.figures["frames"]["only_in_reference"] == 0
+    with pytest.raises(RecordingError, match="images of first, lab, last, not of other"):
+        compare(run.rename(run.parent / "other"), run.parent / "coco.json")
+
+    content["images"] = [{**content["images"][2], "recording": "single"}]
+    (run.parent / "coco.json").write_text(json.dumps(content))
+    renamed = compare(run.parent / "other", run.parent / "coco.json")
+    assert {row.true_category for row in renamed.rows} == {None, "last"}
+
+
 def test_labels_of_single_topic_fit_a_renamed_topic(tmp_path: Path) -> None:
     """An equal stamp is enough, an equal frame number is not."""
     (tmp_path / "label_2").mkdir()

@@ -110,7 +110,7 @@ def compare(
     RecordingError : the reference cannot be read, or has no frame in common with the run.
     """
     finished = read_complete(folder)
-    other = open_reference(reference, finished.categories)
+    other = open_reference(reference, finished.categories, finished.name)
     if isinstance(other, OtherRun):
         _require_same_recording(finished, other)
     tally, repeated = _Tally(), repeated_stamps(folder)

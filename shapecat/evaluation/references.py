@@ -38,7 +38,7 @@ __all__ = [
 ]
 
 
-def open_reference(path: Path, categories: Sequence[str] = ()) -> Reference:
+def open_reference(path: Path, categories: Sequence[str] = (), run: str = "") -> Reference:
     """Open a reference.
 
     Parameters
@@ -46,6 +46,7 @@ def open_reference(path: Path, categories: Sequence[str] = ()) -> Reference:
     path : a run folder; a KITTI folder, which has a folder ``label_2``; a JSON file of `shapecat
         simulate` or COCO; or a simulated recording with its ground truth beside it.
     categories : those of the run to compare; they show which ``_`` in a KITTI type are spaces.
+    run : name of the run to compare; it shows which images of several recordings are used.
 
     Raises
     ------
@@ -68,7 +69,7 @@ def open_reference(path: Path, categories: Sequence[str] = ()) -> Reference:
         content = json.loads(path.read_text("utf-8"))
         if isinstance(content, list):
             return SimulatedTruth(path, content)
-        return CocoLabels(path, content)
+        return CocoLabels(path, content, run)
     except (OSError, ValueError, KeyError, TypeError, AttributeError) as error:
         reason = f"it lacks {error}" if isinstance(error, KeyError) else error
         msg = f"{path}: neither ground truth of `shapecat simulate` nor COCO labels ({reason})"

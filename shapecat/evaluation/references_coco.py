@@ -33,18 +33,19 @@ class CocoLabels(Reference):
 
     An image names its frame by ``stamp_ns`` (with ``frame`` where stamps repeat), by ``frame``, or
     by a number in its ``file_name``: a timestamp in nanoseconds, else the last number, which is
-    the frame number. An image without ``topic`` matches any topic.
+    the frame number. An image without ``topic`` matches any topic. If several recordings are named
+    by ``recording``, the images of the one with the name of the ``run`` are used.
     """
 
     kind = "COCO labels"
 
-    def __init__(self, path: Path, content: Mapping[str, Any]) -> None:
+    def __init__(self, path: Path, content: Mapping[str, Any], run: str = "") -> None:
         self._path = path
         names = {item["id"]: str(item["name"]) for item in content["categories"]}
         self._labels = defaultdict(list)
         for item in content["annotations"]:
             self._labels[item["image_id"]].append({**item, "name": names[item["category_id"]]})
-        images = content["images"]
+        images = _images_of(run, path, content["images"])
         self._images = index_frames(path, ((_place_of(image), image) for image in images))
         self.frames = len(images)
         items = [item for some in self._labels.values() for item in some]
@@ -89,6 +90,24 @@ class CocoLabels(Reference):
 def _track_of(item: Mapping[str, Any]) -> int | None:
     own = item.get("track_id", item.get("attributes", {}).get("track_id"))
     return None if own is None else int(own)
+
+
+def _images_of(
+    run: str, path: Path, images: Sequence[Mapping[str, Any]]
+) -> Sequence[Mapping[str, Any]]:
+    """Return the images of a run's recording; all images if they name only one, or none.
+
+    Raises
+    ------
+    RecordingError : there are several recordings, none of which has the name of the run.
+    """
+    names = {str(image["recording"]) for image in images if "recording" in image}
+    if len(names) < 2:
+        return images
+    if run not in names:
+        msg = f"{path}: has images of {', '.join(sorted(names))}, not of {run}"
+        raise RecordingError(msg)
+    return [image for image in images if str(image.get("recording")) == run]
 
 
 def _place_of(image: Mapping[str, Any]) -> Place:
