@@ -171,7 +171,7 @@ def _probe(
 
 
 def _is_other(name: str) -> bool:
-    return any(word in name.lower() for word in _OTHER_WORDS)
+    return any(word in f"/{name.lower()}" for word in _OTHER_WORDS)
 
 
 def _raw_encoding(first: Any) -> str:

@@ -216,7 +216,7 @@ def _probe_cloud(topic: Topic, first: Any, _recording: Recording) -> Stream:
 
 def _probe_image(topic: Topic, first: Any, recording: Recording) -> Stream | None:
     name, encoding = topic.name.lower(), str(first.encoding)
-    infrared = "infra" in name or "/ir/" in name
+    infrared = "infra" in name or "/ir/" in f"/{name}"
     # Cameras publish infrared, and grey images of 16 bits, with the same encodings.
     if (
         encoding not in DEPTH_ENCODINGS
@@ -249,7 +249,8 @@ def info_topic_of(image: str, recording: Recording) -> str | None:
         if ros_counterpart(topic.type) == INFO and topic.count != 0
     ]
     parts = image.split("/")[:-1]
-    for length in range(len(parts), 1, -1):
+    outermost = 2 if image.startswith("/") else 1  # the first part of /depth/image is empty
+    for length in range(len(parts), outermost - 1, -1):
         for name in _INFO_NAMES:
             sibling = "/".join([*parts[:length], name])
             if sibling in infos:
