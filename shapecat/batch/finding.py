@@ -19,6 +19,8 @@ __all__ = ["Found", "Source", "find_recordings", "look_at"]
 _log = logging.getLogger(__name__)
 
 SUFFIXES = {".mcap", ".bag", ".db3"}
+_PARTS = {".mcap", ".db3"}
+"""Suffixes of the files in a ROS 2 bag folder."""
 _GAP_NS = 10**10
 """The longest time between the parts of a bag; takes are farther apart, or overlap."""
 _MAGIC = (b"\x89MCAP", b"#ROSBAG", b"SQLite format 3")
@@ -186,7 +188,7 @@ def _is_bag(folder: Path) -> bool:
         return True
     base = first.stem.rpartition("_")[0]
     in_sequence = [f"{base}_{k}{first.suffix}" for k in range(len(parts))]
-    if not parts or parts != set(in_sequence):
+    if first.suffix not in _PARTS or parts != set(in_sequence):
         return False
     compressed = any(path.suffix == ".zstd" for path in paths)
     return base == folder.name or compressed or _adjoin([folder / name for name in in_sequence])
