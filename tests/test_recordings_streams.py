@@ -5,8 +5,9 @@ from typing import Any
 
 import pytest
 
-from shapecat.recordings import cloud_streams, open_recording
-from tests.messages import EPOCH, image, info, wavy_depth, write
+from shapecat.recordings import choose_streams, cloud_streams, open_recording
+from tests.depth_encodings import png
+from tests.messages import EPOCH, compressed, image, info, wavy_depth, write
 
 Item = tuple[str, int, Any]
 
@@ -29,3 +30,38 @@ def test_calibration_is_found_beside_topic_without_slash(tmp_path: Path, lead: s
         found = [(s.topic, s.info_topic) for s in cloud_streams(recording)]
 
     assert found == [(f"{lead}depth/image", f"{lead}depth/camera_info")]
+
+
+def test_confidence_map_is_not_taken_for_depth(tmp_path: Path) -> None:
+    """ZED cameras publish it as 32FC1 beside the depth, whose name says that it is registered."""
+    zed = "/zed/zed_node"
+    confidence, depth = f"{zed}/confidence/confidence_map", f"{zed}/depth/depth_registered"
+    items = [
+        *depth_and_info(confidence, f"{zed}/depth/camera_info", "32FC1"),
+        *depth_and_info(depth, f"{zed}/depth/camera_info", "32FC1"),
+        *depth_and_info(f"{zed}/other/image", f"{zed}/depth/camera_info", "32FC1"),
+    ]
+
+    with open_recording(write(tmp_path / "a.mcap", items)) as recording:
+        assert [stream.topic for stream in choose_streams(recording)] == [depth]
+        assert [stream.topic for stream in choose_streams(recording, [confidence])] == [confidence]
+        assert confidence not in {stream.topic for stream in cloud_streams(recording)}
+
+
+@pytest.mark.parametrize(
+    "topic",
+    [
+        "/thermal_mast/camera/image_raw",
+        "/thermal_mast/depth",
+        "/oak/stereo/image_raw",
+        "/oak/stereo/image_raw/compressedDepth",
+    ],
+)
+def test_depth_needs_no_particular_name(tmp_path: Path, topic: str) -> None:
+    """Guards against losing depth because of the name of the robot or camera."""
+    items = depth_and_info(topic, f"{topic.rpartition('/')[0]}/camera_info")
+    if topic.endswith("compressedDepth"):
+        items[1] = (topic, EPOCH, compressed(EPOCH, png(wavy_depth())))
+
+    with open_recording(write(tmp_path / "a.mcap", items)) as recording:
+        assert [stream.topic for stream in choose_streams(recording)] == [topic]

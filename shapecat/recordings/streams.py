@@ -35,6 +35,8 @@ _PEEK = 5
 """Messages tried to find out what a topic holds: the first may be damaged."""
 _WARNINGS = 3
 """Warnings about a recording that an error repeats."""
+_OTHER_WORDS = ("confidence", "disparity", "thermal", "mask")
+"""Images on topics with these words, encoded like depth, are something else."""
 
 
 @dataclass(frozen=True)
@@ -58,15 +60,20 @@ class Stream:
         return self.kind == "points" or self.info_topic is not None
 
 
-def cloud_streams(recording: Recording) -> tuple[Stream, ...]:
+def cloud_streams(recording: Recording, wanted: Sequence[str] = ()) -> tuple[Stream, ...]:
     """Find the clouds and depth images of a recording, sorted by topic.
 
-    The encoding of the first message distinguishes depth images from colour images. A depth image
-    is paired with the calibration in its own namespace (``depth/image_raw`` with
-    ``depth/camera_info``), or with the only calibration in the recording.
+    The encoding of the first message distinguishes depth images from colour images. Topics named
+    after confidence, disparity, thermal images or masks are left out unless they are ``wanted``,
+    with or without a leading slash. A depth image is paired with the calibration in its own
+    namespace (``depth/image_raw`` with ``depth/camera_info``), or with the only calibration in the
+    recording.
     """
     streams = []
+    named = {name.strip("/") for name in wanted}
     for topic in recording.topics:
+        if _is_other(topic) and topic.name.strip("/") not in named:
+            continue
         probe = _PROBES.get(ros_counterpart(topic.type))
         if probe is not None and topic.count != 0:
             first = first_message(recording, topic.name, topic.type)
@@ -81,7 +88,8 @@ def choose_streams(recording: Recording, wanted: Sequence[str] = ()) -> tuple[St
     Streams belong to the same sensor if they share a frame or the sensor's namespace
     (``/camera/depth/points`` and ``/camera/aligned_depth_to_color/image_raw``). Within a sensor
     the preference is, in this order: depth images, since a cloud holds the same data in eight
-    times the bytes; images not aligned to another camera; more messages; the alphabetical order.
+    times the bytes; images on a topic named after depth; images not aligned to another camera; more
+    messages; the alphabetical order.
 
     Parameters
     ----------
@@ -92,7 +100,7 @@ def choose_streams(recording: Recording, wanted: Sequence[str] = ()) -> tuple[St
     NoStreamError : no stream can be processed, a wanted one is missing or lacks a calibration, or
         nothing is wanted and there are several sensors.
     """
-    streams = cloud_streams(recording)
+    streams = cloud_streams(recording, wanted)
     if wanted:
         return _wanted(recording, streams, wanted)
     usable = [stream for stream in streams if stream.usable]
@@ -191,9 +199,22 @@ def _sensor_namespace(topic: str) -> tuple[str, ...]:
     return parts
 
 
-def _rank(stream: Stream) -> tuple[int, int, int, str]:
+def _rank(stream: Stream) -> tuple[bool, bool, bool, int, str]:
     aligned = any(word in stream.topic for word in ("aligned", "registered"))
-    return (stream.kind != "depth", aligned, -(stream.count or 0), stream.topic)
+    unnamed = stream.kind == "depth" and "depth" not in _image_name(stream.topic)
+    return (stream.kind != "depth", unnamed, aligned, -(stream.count or 0), stream.topic)
+
+
+def _image_name(topic: str) -> str:
+    """Return a topic in lower case, without the transport that compresses its images."""
+    return topic.lower().removesuffix("/compresseddepth")
+
+
+def _is_other(topic: Topic) -> bool:
+    """Return whether an image topic is named after something other than depth."""
+    last = "/".join(_image_name(topic.name).split("/")[-2:])  # without the robot and the camera
+    named = last.rpartition("depth")[2]
+    return ros_counterpart(topic.type) != CLOUD and any(word in named for word in _OTHER_WORDS)
 
 
 def first_message(recording: Recording, topic: str, kind: str | None = None) -> Any:
