@@ -3,9 +3,12 @@
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 import pytest
 
 from shapecat.recordings import choose_streams, cloud_streams, open_recording
+from shapecat.recordings.colour_streams import choose_colour
+from tests.colour_messages import gradient, raw
 from tests.depth_encodings import png
 from tests.messages import EPOCH, compressed, image, info, wavy_depth, write
 
@@ -65,3 +68,21 @@ def test_depth_needs_no_particular_name(tmp_path: Path, topic: str) -> None:
 
     with open_recording(write(tmp_path / "a.mcap", items)) as recording:
         assert [stream.topic for stream in choose_streams(recording)] == [topic]
+
+
+def test_blank_first_image_does_not_hide_its_topic(tmp_path: Path) -> None:
+    """Some drivers publish an image without encoding or pixels when they start."""
+    blank = image(EPOCH, np.zeros((0, 0), np.uint16), "", frame_id="")
+    items = [
+        ("/cam/depth/image", EPOCH, blank),
+        *depth_and_info("/cam/depth/image", "/cam/depth/camera_info"),
+        ("/cam/color/image", EPOCH, blank),
+        ("/cam/color/image", EPOCH, raw(EPOCH, gradient(), "rgb8", "color")),
+    ]
+
+    with open_recording(write(tmp_path / "a.mcap", items)) as recording:
+        (depth,) = choose_streams(recording)
+        colour = choose_colour(recording, depth)
+    assert (depth.topic, depth.frame_id) == ("/cam/depth/image", "camera")
+    assert colour is not None
+    assert (colour.topic, colour.frame_id) == ("/cam/color/image", "color")

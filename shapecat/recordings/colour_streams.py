@@ -1,6 +1,7 @@
 """Find the colour streams of a recording, and the one that belongs to a depth stream."""
 
 from collections.abc import Sequence
+from contextlib import suppress
 from dataclasses import dataclass, replace
 from pathlib import PurePosixPath
 from typing import Any, Literal
@@ -17,7 +18,7 @@ from shapecat.recordings.streams import (
     Stream,
     by_sensor,
     cloud_streams,
-    first_message,
+    first_messages,
     info_topic_of,
 )
 
@@ -33,7 +34,7 @@ class ColourStream:
     """A topic of colour images, or of clouds with a packed ``rgb`` field.
 
     ``info_topic`` is the topic of the calibration, None if there is none; ``count`` is the number
-    of messages, None if unknown; ``frame_id`` and ``encoding`` are from the first message.
+    of messages, None if unknown; ``frame_id`` and ``encoding`` are from the first image.
     """
 
     topic: str
@@ -158,16 +159,17 @@ def _probe(
     kind: Literal["raw", "compressed", "cloud"],
     recording: Recording,
 ) -> ColourStream | None:
-    first = first_message(recording, topic.name, topic.type)
-    try:
-        encoding = _ENCODINGS[kind](first)
-        if not encoding or (encoding == "mono8" and _is_other(topic.name)):
-            return None
-        frame_id = str(first.header.frame_id)
-    except (AttributeError, TypeError):  # a definition without the fields of its type
-        return None
-    info = info_topic_of(topic.name, recording) if kind != "cloud" else None
-    return ColourStream(topic.name, topic.type, kind, info, topic.count, frame_id, encoding)
+    with suppress(AttributeError, TypeError):  # a definition without the fields of its type
+        for first in first_messages(recording, topic.name, topic.type):  # some may be blank
+            encoding = _ENCODINGS[kind](first)
+            if not encoding:
+                continue
+            if encoding == "mono8" and _is_other(topic.name):
+                return None
+            info = info_topic_of(topic.name, recording) if kind != "cloud" else None
+            frame_id = str(first.header.frame_id)
+            return ColourStream(topic.name, topic.type, kind, info, topic.count, frame_id, encoding)
+    return None
 
 
 def _is_other(name: str) -> bool:

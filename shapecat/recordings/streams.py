@@ -1,6 +1,6 @@
 """Find the depth streams of a recording, and choose which to process."""
 
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from contextlib import suppress
 from dataclasses import dataclass
 from itertools import islice
@@ -23,6 +23,7 @@ __all__ = [
     "choose_streams",
     "cloud_streams",
     "first_message",
+    "first_messages",
     "info_topic_of",
 ]
 
@@ -32,7 +33,7 @@ COMPRESSED = "sensor_msgs/msg/CompressedImage"
 INFO = "sensor_msgs/msg/CameraInfo"
 
 _PEEK = 5
-"""Messages tried to find out what a topic holds: the first may be damaged."""
+"""Messages tried to find out what a topic holds: the first may be damaged or blank."""
 _WARNINGS = 3
 """Warnings about a recording that an error repeats."""
 _OTHER_WORDS = ("confidence", "disparity", "thermal", "mask")
@@ -63,11 +64,11 @@ class Stream:
 def cloud_streams(recording: Recording, wanted: Sequence[str] = ()) -> tuple[Stream, ...]:
     """Find the clouds and depth images of a recording, sorted by topic.
 
-    The encoding of the first message distinguishes depth images from colour images. Topics named
-    after confidence, disparity, thermal images or masks are left out unless they are ``wanted``,
-    with or without a leading slash. A depth image is paired with the calibration in its own
-    namespace (``depth/image_raw`` with ``depth/camera_info``), or with the only calibration in the
-    recording.
+    The encoding of the first images, of which some may be blank, distinguishes depth from colour.
+    Topics named after confidence, disparity, thermal images or masks are left out unless they are
+    ``wanted``, with or without a leading slash. A depth image is paired with the calibration in its
+    own namespace (``depth/image_raw`` with ``depth/camera_info``), or with the only calibration in
+    the recording.
     """
     streams = []
     named = {name.strip("/") for name in wanted}
@@ -76,9 +77,10 @@ def cloud_streams(recording: Recording, wanted: Sequence[str] = ()) -> tuple[Str
             continue
         probe = _PROBES.get(ros_counterpart(topic.type))
         if probe is not None and topic.count != 0:
-            first = first_message(recording, topic.name, topic.type)
             with suppress(AttributeError):  # a definition without the fields of its type
-                streams.append(probe(topic, first, recording))
+                first = first_messages(recording, topic.name, topic.type)
+                found = (probe(topic, message, recording) for message in first)
+                streams.append(next((stream for stream in found if stream is not None), None))
     return tuple(stream for stream in streams if stream is not None)
 
 
@@ -218,17 +220,19 @@ def _is_other(topic: Topic) -> bool:
 
 
 def first_message(recording: Recording, topic: str, kind: str | None = None) -> Any:
-    """Return the first of a topic's first few messages that can be decoded; None if none can.
+    """Return the first of `first_messages`; None if there is none."""
+    return next(first_messages(recording, topic, kind), None)
+
+
+def first_messages(recording: Recording, topic: str, kind: str | None = None) -> Iterator[Any]:
+    """Yield those of a topic's first few messages that can be decoded.
 
     With ``kind``, messages of other types are left out.
     """
     same = (m for m in recording.messages([topic]) if kind is None or m.type == kind)
     for message in islice(same, _PEEK):
-        try:
-            return recording.decode(message)
-        except MessageError:
-            continue
-    return None
+        with suppress(MessageError):
+            yield recording.decode(message)
 
 
 def _probe_cloud(topic: Topic, first: Any, _recording: Recording) -> Stream:
