@@ -1,10 +1,12 @@
 """Tests of recording containers: messages are read, and damage is reported, never raised."""
 
 import os
+import shutil
 import struct
 from collections.abc import Iterator
 from contextlib import nullcontext
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
@@ -617,3 +619,45 @@ def test_odd_file_is_read_or_refused(path: Path) -> None:
             assert np.frombuffer(message.data, np.uint8).size == len(message.data)
 
         assert read == counts
+
+
+def killed_recorder(path: Path) -> Path:
+    """Write a database whose last two messages are in its write-ahead log alone."""
+    import sqlite3  # noqa: PLC0415  only used here
+
+    whole, left = write_folder(path / "bag", StoragePlugin.SQLITE3) / "bag.db3", path / "left"
+    base = sqlite3.connect(whole)
+    base.execute("PRAGMA journal_mode=WAL")
+    rows = base.execute("SELECT * FROM messages WHERE timestamp >= ?", [3 * SECOND]).fetchall()
+    base.execute("DELETE FROM messages WHERE timestamp >= ?", [3 * SECOND])
+    base.commit()
+    base.execute("PRAGMA wal_checkpoint(TRUNCATE)")
+    base.executemany("INSERT INTO messages VALUES (?, ?, ?, ?)", rows)
+    base.commit()
+    left.mkdir()
+    for name in ("bag.db3", "bag.db3-wal"):
+        shutil.copy(whole.with_name(name), left)
+    base.close()
+    return left / "bag.db3"
+
+
+@pytest.mark.parametrize("free", [1 << 40, 1000])
+def test_log_of_killed_recorder_is_read(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, free: int
+) -> None:
+    """SQLite would merge the log into the database, but recordings must not be changed."""
+    path = killed_recorder(tmp_path)
+    before = [file.read_bytes() for file in sorted(path.parent.iterdir())]
+    temporary = tmp_path / "tmp"
+    temporary.mkdir()
+    monkeypatch.setattr("tempfile.tempdir", str(temporary))
+    monkeypatch.setattr("shutil.disk_usage", lambda _: SimpleNamespace(free=free))
+
+    with open_recording(path) as recording:
+        read = [recording.decode(message).data for message in recording.messages()]
+        (warning,) = recording.warnings
+
+    assert read == [f"message {k}" for k in range(5 if free > 1000 else 3)]
+    assert ("not read: not enough space" in warning) is (free == 1000)
+    assert [file.read_bytes() for file in sorted(path.parent.iterdir())] == before
+    assert list(temporary.iterdir()) == []

@@ -1,6 +1,8 @@
 """ROS 2 bags in one SQLite file (.db3)."""
 
+import shutil
 from collections.abc import Iterator
+from contextlib import ExitStack, closing
 from pathlib import Path
 from typing import Any, ClassVar
 
@@ -21,6 +23,7 @@ from shapecat.recordings.messages import (
     sum_topics,
 )
 from shapecat.recordings.recording import Recording
+from shapecat.system.files import scratch_folder
 
 __all__ = ["DatabaseRecording"]
 
@@ -28,6 +31,7 @@ _ZSTD = b"\x28\xb5\x2f\xfd"
 """First bytes of a compressed message; a CDR message begins with a zero byte."""
 _LARGEST = 1 << 30
 """Compressed messages that claim a larger decompressed size, in bytes, are skipped."""
+_SCRATCH = "shapecat-parts-"
 _SCHEMAS = {MessageDefinitionFormat.MSG: "ros2msg", MessageDefinitionFormat.IDL: "ros2idl"}
 
 
@@ -44,11 +48,13 @@ class DatabaseRecording(Recording):
         RecordingError : the file is not a ROS 2 bag, or is damaged.
         """
         super().__init__(path)
-        self._reader = Reader(path)
+        self._cleanup = ExitStack()
+        self._reader = Reader(self._with_log())
         try:
             self._reader.open()
             self._channels = {c.id: _channel(c) for c in self._reader.connections}
         except (ReaderError, apsw.Error, *LIBRARY_ERRORS) as error:
+            self._cleanup.close()
             msg = f"not a readable ROS 2 bag: {str(error) or type(error).__name__}"
             raise RecordingError(msg) from error
         channels = ((self._channels[c.id], c.msgcount) for c in self._reader.connections)
@@ -62,8 +68,34 @@ class DatabaseRecording(Recording):
             self.warn("no message definitions: those of ROS 2 Humble are assumed")
 
     def close(self) -> None:
-        """Close the database."""
+        """Close the database, and remove its copy if there is one."""
         self._reader.close()
+        self._cleanup.close()
+
+    def _with_log(self) -> Path:
+        """Return the database, or a copy with the messages of a killed recorder's write-ahead log.
+
+        The copy and its log use at most half of the free space of the temporary folder.
+        """
+        log = self.path.with_name(f"{self.path.name}-wal")
+        if not (log.exists() and log.stat().st_size):
+            return self.path
+        try:
+            folder = self._cleanup.enter_context(scratch_folder(_SCRATCH))
+            copy = folder / "a.db3"
+            room = shutil.disk_usage(folder).free // 2
+            if self.path.stat().st_size + 2 * log.stat().st_size > room:  # it is added to the copy
+                msg = "not enough space in the temporary folder to copy it"
+                raise OSError(msg)  # noqa: TRY301  handled like a full disk
+            shutil.copyfile(self.path, copy)
+            shutil.copyfile(log, f"{copy}-wal")
+            with closing(apsw.Connection(str(copy))) as base:
+                base.execute("PRAGMA wal_checkpoint(TRUNCATE)").fetchall()
+        except (OSError, apsw.Error) as error:
+            self.warn(f"not finished; the last messages, in {log.name}, are not read: {error}")
+            return self.path
+        self.warn(f"not finished; messages recovered from {log.name}")
+        return copy
 
     def _read(self, selection: Selection) -> Iterator[Message]:
         wanted = [c for c in self._reader.connections if selection.has_topic(c.topic)]
