@@ -8,7 +8,7 @@ import pytest
 
 from shapecat.recordings import choose_streams, cloud_streams, open_recording
 from shapecat.recordings.colour_streams import choose_colour
-from tests.colour_messages import gradient, raw
+from tests.colour_messages import gradient, packed, raw
 from tests.depth_encodings import png
 from tests.messages import EPOCH, compressed, image, info, wavy_depth, write
 
@@ -86,3 +86,19 @@ def test_blank_first_image_does_not_hide_its_topic(tmp_path: Path) -> None:
     assert (depth.topic, depth.frame_id) == ("/cam/depth/image", "camera")
     assert colour is not None
     assert (colour.topic, colour.frame_id) == ("/cam/color/image", "color")
+
+
+@pytest.mark.parametrize("encoding", ["16UC1", "mono16", "32FC1"])
+def test_depth_compressed_as_png_is_not_colour(tmp_path: Path, encoding: str) -> None:
+    """The same frame id would put it before the images of the colour camera."""
+    body = png(wavy_depth())
+    items = [
+        *depth_and_info("/cam/depth/image", "/cam/depth/camera_info"),
+        ("/cam/depth/image/compressed", EPOCH, packed(EPOCH, body, f"{encoding}; png compressed ")),
+        ("/cam/color/image", EPOCH, raw(EPOCH, gradient(), "rgb8", "color")),
+    ]
+
+    with open_recording(write(tmp_path / "a.mcap", items)) as recording:
+        colour = choose_colour(recording, choose_streams(recording)[0])
+    assert colour is not None
+    assert colour.topic == "/cam/color/image"

@@ -8,6 +8,7 @@ from typing import Any, Literal
 
 from shapecat.errors import NoStreamError
 from shapecat.recordings.colour_image import COLOUR_ENCODINGS, compressed_kind
+from shapecat.recordings.depth_image import DEPTH_ENCODINGS
 from shapecat.recordings.foxglove import ros_counterpart
 from shapecat.recordings.messages import Topic
 from shapecat.recordings.recording import Recording
@@ -185,8 +186,10 @@ def _compressed_encoding(first: Any) -> str:
     if "compressedDepth" in str(first.format):
         return ""
     kind = compressed_kind(bytes(first.data[:8]))
-    words = str(first.format).split(";")[0].strip()
-    return "mono8" if kind and words == "mono8" else kind
+    pixels = str(first.format).split(";")[0].strip()
+    if pixels in DEPTH_ENCODINGS:  # packed like colour, such as "16UC1; png compressed"
+        return ""
+    return "mono8" if kind and pixels == "mono8" else kind
 
 
 def _cloud_encoding(first: Any) -> str:
