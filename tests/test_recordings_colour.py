@@ -3,6 +3,7 @@
 from collections import Counter
 from collections.abc import Sequence
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
@@ -13,12 +14,14 @@ from rosbags.typesys import Stores, get_types_from_msg, get_typestore
 from shapecat.cameras.colour import ColourImage, ColourView
 from shapecat.errors import NoStreamError
 from shapecat.geometry import rotation_from_quaternion
-from shapecat.recordings import choose_streams, open_recording
+from shapecat.recordings import choose_streams, extrinsics, open_recording
 from shapecat.recordings.colour_frames import frames_with_colour
 from shapecat.recordings.colour_image import cloud_colours, pixels_of
-from shapecat.recordings.colour_streams import choose_colour
-from shapecat.recordings.messages import MessageError
+from shapecat.recordings.colour_streams import ColourStream, choose_colour
+from shapecat.recordings.extrinsics import Extrinsics
+from shapecat.recordings.messages import MessageError, Topic
 from shapecat.recordings.overview import describe_recording
+from shapecat.recordings.streams import Stream
 from shapecat.types import Camera, Frame
 from tests.colour_messages import gradient, jpeg, packed, png, raw
 from tests.messages import (
@@ -414,6 +417,35 @@ def test_realsense_extrinsics_are_read_column_by_column(tmp_path: Path) -> None:
     assert view.colour_from_depth is not None
     np.testing.assert_allclose(view.colour_from_depth.rotation, rotation, atol=1e-12)
     np.testing.assert_allclose(view.colour_from_depth.translation, [0.015, 0.001, -0.002])
+
+
+@pytest.mark.parametrize(
+    ("metres", "expected"),
+    [
+        ({"/cam1": 1.0, "/cam2": 2.0}, 2.0),
+        ({"/cam": 3.0, "/cam2": 2.0}, 2.0),  # not a part of the name
+        ({"/cam1": 1.0, "/cam2": np.nan}, None),
+        ({"": 3.0, "/cam2": np.nan}, 3.0),
+        ({"/cam1": 1.0}, 1.0),
+        ({"/cam1": 1.0, "/cam3": 2.0}, None),
+    ],
+)
+def test_extrinsics_are_those_of_the_same_camera(
+    monkeypatch: pytest.MonkeyPatch, metres: dict[str, float], expected: float | None
+) -> None:
+    """With two cameras, colours would be projected with the calibration of the other one."""
+    topics = {f"{space}/extrinsics/depth_to_color": x for space, x in metres.items()}
+    messages = {
+        name: SimpleNamespace(rotation=np.eye(3).ravel(), translation=[x, 0, 0])
+        for name, x in topics.items()
+    }
+    monkeypatch.setattr(extrinsics, "first_message", lambda _, name: messages[name])
+    recording: Any = SimpleNamespace(topics=[Topic(name, "", "cdr", 1) for name in topics])
+    depth = Stream("/cam2/depth/image_rect_raw", "", "depth", None, 1, "d")
+    colour = ColourStream("/cam2/color/image_raw", "", "raw", None, 1, "c", "rgb8")
+
+    pose = Extrinsics(recording, depth, colour)._realsense
+    assert (None if pose is None else pose.translation[0]) == expected
 
 
 @pytest.mark.parametrize("container", ["mcap", "ros1", "ros2"])

@@ -23,6 +23,8 @@ from shapecat.types import Pose
 
 __all__ = ["Extrinsics"]
 
+_DRIVER = "/extrinsics/depth_to_color"
+
 
 class Extrinsics:
     """The transform from a depth sensor to a colour camera.
@@ -90,14 +92,21 @@ class Extrinsics:
     @cached_property
     def _realsense(self) -> Pose | None:
         """Read librealsense's ``p_colour = rotation @ p_depth + translation``; None if absent."""
-        for topic in self._recording.topics:
-            if topic.name.endswith("/extrinsics/depth_to_color"):
-                with suppress(RecordingError, *MALFORMED):
-                    return _driver_pose(first_message(self._recording, topic.name))
+        for topic in self._driver_topics():
+            with suppress(RecordingError, *MALFORMED):
+                pose = _driver_pose(first_message(self._recording, topic))
+                if pose is not None:
+                    return pose
         depth, colour = (self._recorder_pose(s.topic) for s in (self._depth, self._colour))
         if depth is None or colour is None:
             return None
         return compose(colour, inverse(depth))
+
+    def _driver_topics(self) -> list[str]:
+        """Return the topics around the depth topic, nearest first, or the only one there is."""
+        names = {t.name for t in self._recording.topics if f"/{t.name}".endswith(_DRIVER)}
+        around = [n for n in names if self._depth.topic.startswith(n.removesuffix(_DRIVER[1:]))]
+        return sorted(around, key=len, reverse=True) or (list(names) if len(names) == 1 else [])
 
     def _recorder_pose(self, image: str) -> Pose | None:
         """Return ``stream_from_reference`` as librealsense's recorder wrote it; None if absent."""
