@@ -1,5 +1,6 @@
 """Tests of the up direction: its sources and their reliability."""
 
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -176,6 +177,26 @@ def test_imu_is_used_if_transforms_lack_the_sensor(tmp_path: Path) -> None:
 
     assert up is not None
     np.testing.assert_allclose(up, [0, -1, 0], atol=1e-6)
+
+
+def in_frames(path: Path, *links: tuple[str, str]) -> Path:
+    """Write static transforms from parents to children, each turned once more."""
+    poses = [(parent, child, Pose(TURN, np.zeros(3))) for parent, child in links]
+    return write(path, [("/tf_static", EPOCH, MAKE.transforms(poses, EPOCH))])
+
+
+def test_frames_of_a_robot_may_have_its_name_in_front(tmp_path: Path) -> None:
+    """With several robots, r1/map is the map of one of them; each has its own up direction."""
+    links = ("r1/map", "r1/camera"), ("r2/map", "r2/base"), ("r2/base", "r2/camera")
+    with open_recording(in_frames(tmp_path / "a.mcap", *links)) as recording:
+        upright = Upright.of(recording, up="tf", fixed_frame=None)
+        found = [upright.orient(replace(frame(EPOCH), frame_id=f"/r{k}/camera")) for k in (1, 2)]
+
+    assert [one.source for one in found] == [f"transforms, z of r{k}/map" for k in (1, 2)]
+    assert found[1].up is not None
+    np.testing.assert_allclose(found[1].up, (TURN @ TURN)[2])
+    assert upright.fixed_frame == "r1/map"
+    assert upright.failed == 1  # the second robot is not in the map of the first
 
 
 def test_failed_transform_look_ups_are_counted(tmp_path: Path) -> None:

@@ -18,7 +18,7 @@ from shapecat.types import Frame, Pose
 __all__ = ["Orientation", "Upright"]
 
 _LEVEL_FRAMES = ("map", "odom", "world", "earth", "base_footprint", "base_link")
-"""Frames whose z axis is up by convention (REP 105, REP 103)."""
+"""Frames whose z axis is up by convention (REP 105, REP 103), also after the name of a robot."""
 _SOURCES = {"auto": ("tf", "imu"), "tf": ("tf",), "imu": ("imu",)}
 
 
@@ -87,7 +87,7 @@ class Upright:
             known = ", ".join(known_frames) or "none, it has no transforms"
             msg = f"--fixed-frame {fixed_frame}: not in {recording.path}; its frames: {known}"
             raise ConfigError(msg)
-        if up == "tf" and not set(_LEVEL_FRAMES) & set(known_frames):
+        if up == "tf" and not _level_frames(known_frames, ""):
             msg = (
                 f"--up tf: {recording.path} has no transforms to any of {', '.join(_LEVEL_FRAMES)}"
             )
@@ -146,8 +146,7 @@ class Upright:
             self.warnings.append(f"up ({source}) {off} and is ignored; give --up {name} to use it")
 
     def _from_transforms(self, frame: Frame) -> tuple[str, F4 | None]:
-        frames = self.transforms.tree.frames
-        for level in (name for name in _LEVEL_FRAMES if name in frames):
+        for level in _level_frames(self.transforms.tree.frames, frame.frame_id.lstrip("/")):
             pose = self._lookup(level, frame)
             if pose is not None:
                 return f"transforms, z of {level}", np.asarray(pose.rotation[2], np.float32)
@@ -174,6 +173,16 @@ class Upright:
             self.failed += 1
             self.first_failure = self.first_failure or str(error)
             return None
+
+
+def _level_frames(frames: Sequence[str], sensor: str) -> list[str]:
+    """Return the level frames, best first: those of the sensor's robot before those of others."""
+
+    def order(name: str) -> tuple[int, bool, bool]:
+        robot, _, plain = name.rpartition("/")
+        return _LEVEL_FRAMES.index(plain), robot != "", not sensor.startswith(f"{robot}/")
+
+    return sorted((n for n in frames if n.rpartition("/")[2] in _LEVEL_FRAMES), key=order)
 
 
 def _parse_vector(text: str) -> F4:
