@@ -199,6 +199,15 @@ def test_frames_of_a_robot_may_have_its_name_in_front(tmp_path: Path) -> None:
     assert upright.failed == 1  # the second robot is not in the map of the first
 
 
+def test_wanted_fixed_frame_may_begin_with_a_slash(tmp_path: Path) -> None:
+    """ROS 1 wrote frame ids so, and the transforms are stored without it."""
+    with open_recording(in_frames(tmp_path / "a.mcap", ("/map", "/camera"))) as recording:
+        upright = Upright.of(recording, up="tf", fixed_frame="/map")
+
+        assert upright.orient(frame(EPOCH)).fixed_from_sensor is not None
+        assert upright.fixed_frame == "map"
+
+
 def test_failed_transform_look_ups_are_counted(tmp_path: Path) -> None:
     items = [("/tf", EPOCH, MAKE.transforms([("map", "elsewhere", IDENTITY)], EPOCH))]
     with open_recording(write(tmp_path / "a.mcap", items)) as recording:

@@ -73,7 +73,8 @@ class Upright:
         ----------
         up : ``tf``, ``imu``, ``auto`` for the first of these that is available, or a vector
             ``X,Y,Z`` in the sensor frame.
-        fixed_frame : name of the frame in which the scene is at rest; None to choose one.
+        fixed_frame : name of the frame in which the scene is at rest, with or without a leading
+            slash; None to choose one.
 
         Raises
         ------
@@ -83,7 +84,8 @@ class Upright:
         vector = None if sources else _parse_vector(up)
         transforms = TransformWindow.of(recording)
         known_frames = transforms.tree.frames
-        if fixed_frame is not None and fixed_frame not in known_frames:
+        wanted = None if fixed_frame is None else fixed_frame.lstrip("/")
+        if wanted is not None and wanted not in known_frames:
             known = ", ".join(known_frames) or "none, it has no transforms"
             msg = f"--fixed-frame {fixed_frame}: not in {recording.path}; its frames: {known}"
             raise ConfigError(msg)
@@ -96,7 +98,7 @@ class Upright:
         if up == "imu" and not (found and found.measure_anything()):
             msg = f"--up imu: {recording.path} has no sensor_msgs/Imu with accelerations"
             raise ConfigError(msg)
-        return cls(transforms, fixed_frame, vector, sources, found)
+        return cls(transforms, wanted, vector, sources, found)
 
     def orient(self, frame: Frame) -> Orientation:
         """Look up what the recording tells about the sensor in a frame."""
