@@ -15,6 +15,7 @@ from shapecat.geometry import IDENTITY
 from shapecat.pipeline import process
 from shapecat.recordings import open_recording
 from shapecat.recordings.gravity import Orientation, Upright
+from shapecat.recordings.streams import Stream
 from shapecat.recordings.transform_window import TransformWindow
 from shapecat.recordings.transforms import TransformBuffer
 from shapecat.runs import perceiving
@@ -206,6 +207,20 @@ def test_wanted_fixed_frame_may_begin_with_a_slash(tmp_path: Path) -> None:
 
         assert upright.orient(frame(EPOCH)).fixed_from_sensor is not None
         assert upright.fixed_frame == "map"
+
+
+def test_fixed_frame_is_chosen_for_all_sensors(tmp_path: Path) -> None:
+    """The first frame may be of a sensor on a tripod, which is in no map."""
+    links = ("mount", "tripod"), ("robot", "camera"), ("map", "robot")
+    streams = [Stream(f"/{f}", "", "depth", None, 1, f) for f in ("tripod", "camera")]
+    with open_recording(in_frames(tmp_path / "a.mcap", *links)) as recording:
+        chosen = []
+        for order in (streams, streams[::-1], streams[:1]):
+            upright = Upright.of(recording, up="tf", fixed_frame=None, streams=order)
+            upright.orient(replace(frame(EPOCH), frame_id="tripod"))
+            chosen.append(upright.fixed_frame)
+
+    assert chosen == ["map", "map", "mount"]
 
 
 def test_failed_transform_look_ups_are_counted(tmp_path: Path) -> None:

@@ -11,6 +11,7 @@ from shapecat.errors import ConfigError
 from shapecat.geometry import unit_direction
 from shapecat.recordings.imu import Accelerometers
 from shapecat.recordings.recording import Recording
+from shapecat.recordings.streams import Stream
 from shapecat.recordings.transform_window import TransformWindow
 from shapecat.recordings.transforms import TransformError, fixed_frame
 from shapecat.types import Frame, Pose
@@ -52,6 +53,7 @@ class Upright:
     dropped : for each topic whose given up direction is ignored, the source of that direction.
     failed, first_failure : the number of failed look-ups, and the error of the first.
     given : the number of frames whose up direction is from each source.
+    sensors : the frame ids of all sensors, as far as they are known.
     """
 
     transforms: TransformWindow
@@ -64,9 +66,17 @@ class Upright:
     failed: int = 0
     first_failure: str = ""
     given: dict[str, int] = field(default_factory=dict)
+    sensors: tuple[str, ...] = ()
 
     @classmethod
-    def of(cls, recording: Recording, *, up: str, fixed_frame: str | None) -> "Upright":
+    def of(
+        cls,
+        recording: Recording,
+        *,
+        up: str,
+        fixed_frame: str | None,
+        streams: Sequence[Stream] = (),
+    ) -> "Upright":
         """Read the first transforms and accelerations of a recording.
 
         Parameters
@@ -75,6 +85,7 @@ class Upright:
             ``X,Y,Z`` in the sensor frame.
         fixed_frame : name of the frame in which the scene is at rest, with or without a leading
             slash; None to choose one.
+        streams : those whose frames will be looked up.
 
         Raises
         ------
@@ -98,7 +109,8 @@ class Upright:
         if up == "imu" and not (found and found.measure_anything()):
             msg = f"--up imu: {recording.path} has no sensor_msgs/Imu with accelerations"
             raise ConfigError(msg)
-        return cls(transforms, wanted, vector, sources, found)
+        sensors = tuple(stream.frame_id for stream in streams)
+        return cls(transforms, wanted, vector, sources, found, sensors=sensors)
 
     def orient(self, frame: Frame) -> Orientation:
         """Look up what the recording tells about the sensor in a frame."""
@@ -107,10 +119,15 @@ class Upright:
     def fixed_from_sensor(self, frame: Frame) -> Pose | None:
         """Return the pose of the sensor in the fixed frame, or None if it is unknown."""
         if self.fixed_frame is None:
-            self.fixed_frame = fixed_frame(self.transforms.tree, frame.frame_id)
+            self.fixed_frame = self._choose_fixed_frame(frame.frame_id)
         if self.fixed_frame is None:
             return None
         return self._lookup(self.fixed_frame, frame)
+
+    def _choose_fixed_frame(self, first: str) -> str | None:
+        """Choose the fixed frame of all sensors, one named after a map or odometry if there is."""
+        found = [fixed_frame(self.transforms.tree, name) for name in (first, *self.sensors)]
+        return min((name for name in found if name is not None), key=_rank, default=None)
 
     def accept(self, topic: str, orientation: Orientation) -> F4 | None:
         """Count where an up direction comes from, and return it; None if the topic's is dropped."""
@@ -181,10 +198,16 @@ def _level_frames(frames: Sequence[str], sensor: str) -> list[str]:
     """Return the level frames, best first: those of the sensor's robot before those of others."""
 
     def order(name: str) -> tuple[int, bool, bool]:
-        robot, _, plain = name.rpartition("/")
-        return _LEVEL_FRAMES.index(plain), robot != "", not sensor.startswith(f"{robot}/")
+        robot = name.rpartition("/")[0]
+        return _rank(name), robot != "", not sensor.startswith(f"{robot}/")
 
-    return sorted((n for n in frames if n.rpartition("/")[2] in _LEVEL_FRAMES), key=order)
+    return sorted((name for name in frames if _rank(name) < len(_LEVEL_FRAMES)), key=order)
+
+
+def _rank(name: str) -> int:
+    """Return the place of a frame among the level ones, whatever its robot; after all if none."""
+    plain = name.rpartition("/")[2]
+    return _LEVEL_FRAMES.index(plain) if plain in _LEVEL_FRAMES else len(_LEVEL_FRAMES)
 
 
 def _parse_vector(text: str) -> F4:

@@ -20,7 +20,7 @@ from shapecat.errors import NoStreamError, RecordingError, explained
 from shapecat.executors.order import Processes
 from shapecat.learning import Categorizer
 from shapecat.perception import Perceiver, View, find_up
-from shapecat.recordings import Recording
+from shapecat.recordings import Recording, choose_streams
 from shapecat.recordings.gravity import Orientation, Upright
 from shapecat.rehearsal import rehearse
 from shapecat.runs.jobs import Job
@@ -81,7 +81,8 @@ def perceive_all(work: Work) -> None:
     ):
         if (total or 0) - tables.done >= _MANY:
             processes.start()
-        upright = Upright.of(recording, up=job.up, fixed_frame=job.fixed_frame)
+        streams = choose_streams(recording, run["options"]["topics"])
+        upright = Upright.of(recording, up=job.up, fixed_frame=job.fixed_frame, streams=streams)
 
         def view(reading: _Oriented) -> tuple[FrameRow, View]:
             frame, colour, orientation = reading
@@ -148,7 +149,8 @@ def _views_again(
     recording: Recording, run: RunInfo, job: Job, chosen: dict[Key, Revision]
 ) -> Iterator[tuple[FrameRow, View]]:
     """Yield the chosen frames with their revised up directions."""
-    upright = Upright.of(recording, up=job.up, fixed_frame=run["fixed_frame"])
+    streams = choose_streams(recording, run["options"]["topics"])
+    upright = Upright.of(recording, up=job.up, fixed_frame=run["fixed_frame"], streams=streams)
     recent = RecentFrames(job.settings.detection.fuse_frames)
     for frame, colour in _readings(recording, run, job, Counter()):
         pose = upright.fixed_from_sensor(frame)
