@@ -481,7 +481,7 @@ CASES: dict[str, Case] = {
     "clock from power-on": Case(lambda p: clocks(p, "uptime"), reported="does not count from 1970"),
     "clock missing": Case(lambda p: clocks(p, "zero"), reported="stamp is 0"),
     "clock jump": Case(lambda p: clocks(p, "jump"), reported="jumps"),
-    "static transforms last": Case(late_transforms),
+    "static transforms last": Case(late_transforms, reported="form a loop"),
     "every image too short": Case(bad_frames, 4, 0, "no usable frame"),
     "no clouds": Case(text_only, 4, 0, "no point clouds"),
     "empty file": Case(lambda p: file(p, "a.bag", b""), 3, 0, "is empty"),

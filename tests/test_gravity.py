@@ -223,6 +223,18 @@ def test_fixed_frame_is_chosen_for_all_sensors(tmp_path: Path) -> None:
     assert chosen == ["map", "map", "mount"]
 
 
+def test_loop_of_other_frames_is_reported_and_ignored(tmp_path: Path) -> None:
+    """Two drivers that name each other's frames must not cost the whole run its fixed frame."""
+    links = ("map", "camera"), ("u", "v"), ("v", "u")
+    with open_recording(in_frames(tmp_path / "a.mcap", *links)) as recording:
+        upright = Upright.of(recording, up="tf", fixed_frame=None)
+
+        assert upright.orient(frame(EPOCH)).fixed_from_sensor is not None
+        assert upright.fixed_frame == "map"
+    (warning,) = upright.warnings
+    assert warning.startswith("transforms: the frames u < v < u form a loop")
+
+
 def test_failed_transform_look_ups_are_counted(tmp_path: Path) -> None:
     items = [("/tf", EPOCH, MAKE.transforms([("map", "elsewhere", IDENTITY)], EPOCH))]
     with open_recording(write(tmp_path / "a.mcap", items)) as recording:

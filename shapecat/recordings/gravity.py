@@ -109,8 +109,10 @@ class Upright:
         if up == "imu" and not (found and found.measure_anything()):
             msg = f"--up imu: {recording.path} has no sensor_msgs/Imu with accelerations"
             raise ConfigError(msg)
+        loop = transforms.tree.find_loop()
+        warnings = [f"transforms: {loop}"] if loop else []
         sensors = tuple(stream.frame_id for stream in streams)
-        return cls(transforms, wanted, vector, sources, found, sensors=sensors)
+        return cls(transforms, wanted, vector, sources, found, warnings, sensors=sensors)
 
     def orient(self, frame: Frame) -> Orientation:
         """Look up what the recording tells about the sensor in a frame."""

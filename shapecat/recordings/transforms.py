@@ -5,6 +5,7 @@ Stamps are integer nanoseconds: today's time as a float in seconds has a resolut
 
 import sys
 from bisect import bisect_right
+from contextlib import suppress
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -136,6 +137,15 @@ class TransformBuffer:
         """
         return self._ancestors(self._known(frame_id))[-1]
 
+    def find_loop(self) -> str:
+        """Return the error of a loop in the latest transforms; empty if there is none."""
+        for name in self.frames:
+            try:
+                self._ancestors(name)
+            except TransformLoopError as error:
+                return str(error)
+        return ""
+
     def lookup(self, target: str, source: str, stamp_ns: int) -> Pose:
         """Return ``target_from_source`` at a time.
 
@@ -220,19 +230,25 @@ def fixed_frame(buffer: TransformBuffer, frame_id: str) -> str | None:
 
     Returns
     -------
-    The frame id; None if ``frame_id`` is in no transform, if it is the root itself, or if frames
-    form a loop.
+    The frame id; None if ``frame_id`` is in no transform, if it is the root itself, or if it is in
+    a loop of frames.
     """
     try:
         root = buffer.root_of(frame_id)
-        connected = [name for name in buffer.frames if buffer.root_of(name) == root]
     except TransformError:
         return None
+    connected = [name for name in buffer.frames if _is_below(buffer, name, root)]
     for wanted in _FIXED:
         for name in connected:
             if name.rsplit("/", 1)[-1] == wanted:
                 return name
     return root if root != frame_id.lstrip("/") else None
+
+
+def _is_below(buffer: TransformBuffer, name: str, root: str) -> bool:
+    with suppress(TransformLoopError):
+        return buffer.root_of(name) == root
+    return False
 
 
 def read_transforms(recording: Recording, *, static_only: bool = False) -> TransformBuffer:
