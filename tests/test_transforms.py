@@ -25,6 +25,9 @@ from shapecat.recordings.transforms import (
     TransformLoopError,
     UnknownFrameError,
 )
+from shapecat.simulation.messages import MessageFactory
+from shapecat.types import Pose
+from tests.messages import write
 
 IDENTITY = ((0.0, 0.0, 0.0), (0.0, 0.0, 0.0, 1.0))
 SECOND = 10**9
@@ -248,3 +251,35 @@ def test_transforms_of_old_ros1_recording_are_read(tmp_path: Path) -> None:
         buffer = read_transforms(recording)
 
     assert buffer.lookup("map", "camera", EPOCH).translation[0] == 3.0
+
+
+def stamped(parent: str, child: str, x: float, stamp: int) -> Any:
+    pose = Pose(np.eye(3), np.array([x, 0.0, 0.0]))
+    return MessageFactory(2).transforms([(parent, child, pose)], stamp)
+
+
+@pytest.mark.parametrize(
+    ("moving", "near", "expected", "warned"),
+    [
+        ({"/r1": 1.0, "/r2": 2.0}, "/r1/camera/image", 1.0, "/r2/tf are ignored"),
+        ({"/r1": 1.0, "/r2": 2.0}, "r2/camera/image", 2.0, "/r1/tf are ignored"),
+        ({"/r1": 1.0, "/r11": 2.0}, "/r11/camera/image", 2.0, "/r1/tf are ignored"),
+        ({"/r1": 1.0, "/r2": 1.0}, "/camera/image", 1.0, "on /r1/tf and /r2/tf have frames of"),
+        ({"": 1.0, "/r2": 1.0}, "/r2/camera/image", 1.0, ""),
+    ],
+)
+def test_transforms_of_other_robots_are_left_out(
+    tmp_path: Path, moving: dict[str, float], near: str, expected: float, warned: str
+) -> None:
+    """Robots with their own namespaces use the same names of frames, in different places."""
+    items = [
+        (f"{space}/tf", EPOCH + k, stamped("odom", "base", x, EPOCH))
+        for k, (space, x) in enumerate(moving.items())
+    ]
+    items.append(("/mocap/tf", EPOCH, stamped("map", "odom", 10.0, EPOCH)))
+    with open_recording(write(tmp_path / "a.mcap", items)) as recording:
+        buffer = read_transforms(recording, near=[near])
+
+        assert buffer.lookup("map", "base", EPOCH).translation[0] == 10 + expected
+        assert warned in "".join(recording.warnings)
+        assert len(recording.warnings) == (warned != "")

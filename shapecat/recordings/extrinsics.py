@@ -41,11 +41,11 @@ class Extrinsics:
 
     @cached_property
     def _still(self) -> TransformBuffer:
-        return read_transforms(self._recording, static_only=True)
+        return read_transforms(self._recording, static_only=True, near=[self._depth.topic])
 
     @cached_property
     def _moving(self) -> TransformWindow:
-        return TransformWindow.of(self._recording)
+        return TransformWindow.of(self._recording, [self._depth.topic])
 
     def colour_from_depth(
         self, depth_frame: str, colour_frame: str, log_time_ns: int, stamp_ns: int

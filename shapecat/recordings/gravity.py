@@ -93,7 +93,7 @@ class Upright:
         """
         sources = _SOURCES.get(up, ())
         vector = None if sources else _parse_vector(up)
-        transforms = TransformWindow.of(recording)
+        transforms = TransformWindow.of(recording, [stream.topic for stream in streams])
         known_frames = transforms.tree.frames
         wanted = None if fixed_frame is None else fixed_frame.lstrip("/")
         if wanted is not None and wanted not in known_frames:

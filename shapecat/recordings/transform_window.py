@@ -1,14 +1,15 @@
 """The transforms of a recording around its frames, in constant memory."""
 
+from collections.abc import Sequence
 from copy import deepcopy
 
 from shapecat.recordings.look_ahead import AROUND_NS, LookAhead, is_read_at_once
 from shapecat.recordings.recording import Recording
+from shapecat.recordings.transform_topics import transform_topics
 from shapecat.recordings.transforms import (
     TransformBuffer,
     TransformReader,
     read_transforms,
-    transform_topics,
 )
 
 __all__ = ["TransformWindow"]
@@ -37,10 +38,14 @@ class TransformWindow:
         self._known, self._ahead = known, ahead
 
     @classmethod
-    def of(cls, recording: Recording) -> "TransformWindow":
-        """Read the static transforms of a recording, and the first and last of the others."""
-        topics = transform_topics(recording).moving
-        known = read_transforms(recording, static_only=not is_read_at_once(recording))
+    def of(cls, recording: Recording, near: Sequence[str] = ()) -> "TransformWindow":
+        """Read the static transforms of a recording, and the first and last of the others.
+
+        The topics in ``near`` decide between robots, see `transform_topics`.
+        """
+        topics = transform_topics(recording, near).moving
+        static_only = not is_read_at_once(recording)
+        known = read_transforms(recording, static_only=static_only, near=near)
         if is_read_at_once(recording) or not topics:
             return cls(known)
         reader = TransformReader(recording, known)

@@ -5,8 +5,9 @@ Stamps are integer nanoseconds: today's time as a float in seconds has a resolut
 
 import sys
 from bisect import bisect_right
+from collections.abc import Sequence
 from contextlib import suppress
-from typing import Any, NamedTuple
+from typing import Any
 
 import numpy as np
 
@@ -22,6 +23,7 @@ from shapecat.recordings.transform_samples import (
     interpolated,
     pose_of,
 )
+from shapecat.recordings.transform_topics import TF_TYPES, transform_topics
 from shapecat.types import Pose
 
 __all__ = [
@@ -31,14 +33,11 @@ __all__ = [
     "TransformError",
     "TransformLoopError",
     "TransformReader",
-    "TransformTopics",
     "UnknownFrameError",
     "fixed_frame",
     "read_transforms",
-    "transform_topics",
 ]
 
-TF_TYPES = ("tf2_msgs/msg/TFMessage", "tf/msg/tfMessage")
 _DEEPEST = 200
 _FIXED = ("map", "odom", "world")
 
@@ -251,33 +250,22 @@ def _is_below(buffer: TransformBuffer, name: str, root: str) -> bool:
     return False
 
 
-def read_transforms(recording: Recording, *, static_only: bool = False) -> TransformBuffer:
+def read_transforms(
+    recording: Recording, *, static_only: bool = False, near: Sequence[str] = ()
+) -> TransformBuffer:
     """Read all transforms of a recording in one pass.
 
     Parameters
     ----------
+    near : topics of the sensors, which decide between robots, see `transform_topics`.
     static_only : read only static transforms, which are few: their topics end in ``tf_static``.
     """
     reader = TransformReader(recording, TransformBuffer())
-    static, moving = transform_topics(recording)
+    static, moving = transform_topics(recording, near)
     topics = static if static_only else static | moving
     for message in recording.messages(topics) if topics else ():
         reader.take(message)
     return reader.buffer
-
-
-class TransformTopics(NamedTuple):
-    """The topics with static transforms, and those with others."""
-
-    static: set[str]
-    moving: set[str]
-
-
-def transform_topics(recording: Recording) -> TransformTopics:
-    """Return the topics of a recording that hold transforms."""
-    topics = {t.name for t in recording.topics if ros_counterpart(t.type) in TF_TYPES}
-    static = {name for name in topics if name.endswith("tf_static")}
-    return TransformTopics(static, topics - static)
 
 
 class TransformReader:
