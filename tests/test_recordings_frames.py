@@ -598,6 +598,20 @@ def test_error_names_why_no_stream_is_usable(tmp_path: Path) -> None:
         choose_streams(recording)
 
 
+def test_clouds_of_changing_size_keep_their_sizes(tmp_path: Path) -> None:
+    """A camera for the whole image also reprojects the points of a cropped one."""
+    points = organized_points(wavy_depth())
+    sizes = [(48, 64), (36, 64), (36, 50)]
+    items = [("/points", k, cloud(EPOCH + k, points[:h, :w])) for k, (h, w) in enumerate(sizes)]
+
+    found, skipped, _ = read(write(tmp_path / "a.mcap", items))
+
+    assert not skipped
+    assert [frame.depth is not None and frame.depth.shape for frame in found] == sizes
+    cameras = [frame.camera for frame in found if frame.camera is not None]
+    assert [(camera.height, camera.width) for camera in cameras] == sizes
+
+
 @pytest.mark.parametrize("pack", [png, rvl])
 def test_compressed_depth_is_decoded(tmp_path: Path, pack: Any) -> None:
     depth = wavy_depth()

@@ -79,9 +79,12 @@ def fit_pinhole(points: F4) -> PinholeFit | None:
 
 def still_fits(fit: PinholeFit, points: F4) -> bool:
     """Return whether the camera of a fit also fits another organized cloud (h, w, 3)."""
-    camera, sample = fit.camera, _sample(points)
+    camera = fit.camera
+    if points.shape[:2] != (camera.height, camera.width):
+        return False
+    sample = _sample(points)
     if sample is None:
-        return points.shape[:2] == (camera.height, camera.width)  # too few points to contradict it
+        return True  # too few points to contradict it
     largest, rms = _errors(camera, sample)
     return largest < LARGEST_ERROR_PX and rms < 2 * fit.error_px + 0.02
 
