@@ -58,6 +58,10 @@ def test_rectified_image_uses_p_and_raw_image_uses_k() -> None:
         ("/camera/depth/image_raw", False),
         ("/camera/depth/image_raw/compressedDepth", False),
         ("/rectified_camera/depth/image_raw", False),
+        ("/camera/depth/image_unrectified", False),
+        ("/camera/direct/image_raw", False),
+        ("/camera/depth/rectified", True),
+        ("/camera/depth/depth_rect", True),
     ],
 )
 def test_topic_name_decides_whether_image_is_rectified(topic: str, rectified: bool) -> None:

@@ -1,5 +1,6 @@
 """The pinhole camera behind an organized cloud or a camera calibration."""
 
+import re
 from dataclasses import dataclass
 from typing import Any
 
@@ -182,7 +183,8 @@ def distortion_of(info: Any) -> tuple[float, ...]:
 
 def is_rectified(topic: str) -> bool:
     """Return whether the images of a topic are rectified, as in ``image_rect_raw``."""
-    return any("rect" in part for part in topic.split("/")[-2:])
+    end = "/".join(topic.split("/")[-2:])
+    return re.search(r"(?<!un)(?<!di)rect", end) is not None  # not "unrectified" or "direct"
 
 
 def _field(info: Any, name: str) -> F8:
