@@ -252,6 +252,7 @@ def test_folders_are_searched_and_bags_stay_whole(tmp_path: Path) -> None:
         *("runs/run_1.mcap", "runs/run_2.mcap", "takes/take_0.mcap", "takes/take_1.mcap"),
         *("days/monday.db3", "days/tuesday.db3"),
         *("robot/robot_0.bag", "robot/robot_1.bag"),  # ROS 1 has no bag folders
+        *("card/LAB.MCAP", "card/LAB.DB3", "killed/z.bag.active"),
     }
     for name in ("x.mcap", "y.db3", "d/z.bag", *takes, *bags):
         (tmp_path / name).parent.mkdir(exist_ok=True)

@@ -570,8 +570,10 @@ def test_unreadable_file_gives_one_line_error(
 
 def test_format_is_detected_from_content_not_suffix(tmp_path: Path) -> None:
     path = write_mcap(tmp_path / "a.bag", [1])
+    database = write_folder(tmp_path / "bag", StoragePlugin.SQLITE3) / "bag.db3"
 
     assert times_read(path) == [1]
+    assert len(times_read(database.rename(tmp_path / "LAB.DB3"))) == 5
 
 
 @pytest.mark.parametrize(

@@ -80,7 +80,7 @@ def _of_path(path: Path) -> Source:
 
 def _of_url(url: str, key: str, size: int) -> Source:
     pure = PurePosixPath(url.partition("://")[2].partition("?")[0])
-    stem = pure.stem if pure.suffix in SUFFIXES else pure.name
+    stem = pure.stem if _named_like_one(pure.name) else pure.name
     return Source("", url, stem, pure.parent.name, key, size)
 
 
@@ -94,7 +94,7 @@ def _at(url: str) -> list[Source]:
     location = Location(url)
     if any(character in url.partition("?")[0] for character in "*["):  # signed URLs have queries
         found = [(name, content_key(info), _size(info)) for name, info in location.matches()]
-        kept = [known for known in found if PurePosixPath(known[0]).suffix in SUFFIXES]
+        kept = [known for known in found if _named_like_one(known[0])]
         if kept or location.info() is None:  # otherwise a name with brackets
             return [_of_url(*known) for known in sorted(kept)]
     if url.endswith("/"):
@@ -133,7 +133,7 @@ def _search_remote(location: Location) -> Iterator[tuple[str, str, int]]:
             bags.add(parent)
         elif name in {"run.json", "frames.parquet"}:
             runs.add(parent)
-        elif PurePosixPath(name.removesuffix(".zstd")).suffix in SUFFIXES and "/." not in url:
+        elif _named_like_one(name.removesuffix(".zstd")) and "/." not in url:
             files.append((url, content_key(info), _size(info)))
     parts: dict[str, list[tuple[str, str, int]]] = {bag: [] for bag in bags}
     for url, key, size in files:
@@ -224,7 +224,7 @@ def _search(folder: Path, searched: set[Path]) -> Iterator[Path]:
     for path, is_folder in found:
         if is_folder and not _is_bag(path):
             yield from _search(path, searched)
-        elif is_folder or path.suffix in SUFFIXES:
+        elif is_folder or _named_like_one(path.name):
             yield path
 
 
@@ -233,8 +233,13 @@ def _whole(path: Path) -> Path:
     return Path(os.path.realpath(path))
 
 
+def _named_like_one(name: str) -> bool:
+    """Return whether a file has the suffix of a recording, or of one whose recorder was killed."""
+    return name.endswith(".bag.active") or PurePosixPath(name).suffix.lower() in SUFFIXES
+
+
 def _looks_like_one(path: Path) -> bool:
-    if path.suffix in SUFFIXES:
+    if _named_like_one(path.name):
         return True
     try:
         with path.open("rb") as file:

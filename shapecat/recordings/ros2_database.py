@@ -9,8 +9,9 @@ from typing import Any, ClassVar
 import apsw
 import zstandard
 from rosbags.interfaces import MessageDefinitionFormat
-from rosbags.rosbag2 import Reader, ReaderError
+from rosbags.rosbag2 import ReaderError
 from rosbags.rosbag2.metadata import dump_qos_v8
+from rosbags.rosbag2.storage_sqlite3 import Sqlite3Reader
 
 from shapecat.errors import RecordingError
 from shapecat.recordings.decoding import LIBRARY_ERRORS
@@ -49,7 +50,7 @@ class DatabaseRecording(Recording):
         """
         super().__init__(path)
         self._cleanup = ExitStack()
-        self._reader = Reader(self._with_log())
+        self._reader = Sqlite3Reader(self._with_log())
         try:
             self._reader.open()
             self._channels = {c.id: _channel(c) for c in self._reader.connections}
@@ -62,8 +63,9 @@ class DatabaseRecording(Recording):
             Topic(channel.topic, channel.type, channel.encoding, count)
             for channel, count in channels
         )
-        if self._reader.message_count:
-            self.start_ns, self.end_ns = self._reader.start_time, self._reader.end_time - 1
+        times = self._reader.metadata
+        if times.message_count:
+            self.start_ns, self.end_ns = times.start_time, times.end_time - 1
         if any(c.encoding == "cdr" and not c.schema for c in self._channels.values()):
             self.warn("no message definitions: those of ROS 2 Humble are assumed")
 
