@@ -11,6 +11,7 @@ from typing import Any
 
 import numpy as np
 import pytest
+import zstandard
 from mcap.writer import CompressionType, IndexType, Writer
 from rosbags.interfaces import (
     Qos,
@@ -525,6 +526,15 @@ def test_missing_split_is_reported(tmp_path: Path) -> None:
 
     with open_recording(path) as recording:
         assert recording.warnings == ["parts named in metadata.yaml are missing: gone.db3"]
+
+
+def test_part_beside_its_compressed_copy_is_read_once(tmp_path: Path) -> None:
+    """A recorder that is killed while it compresses a part leaves both, and no metadata."""
+    path = write_folder(tmp_path / "bag", StoragePlugin.SQLITE3)
+    (path / "metadata.yaml").unlink()
+    (path / "bag.db3.zstd").write_bytes(zstandard.compress((path / "bag.db3").read_bytes()))
+
+    assert times_read(path) == [k * SECOND for k in range(5)]
 
 
 def test_database_without_definitions_uses_humble(tmp_path: Path) -> None:

@@ -92,10 +92,12 @@ class FolderRecording(Recording):
         """Return the files that belong to the bag."""
         present = [file for file in sorted(self.path.iterdir()) if _suffix(file) in _PARTS]
         listed = self._listed_names()
-        missing = sorted(listed - {file.name for file in present})
+        names = {file.name for file in present}
+        missing = sorted(listed - names)
         if missing:
             self.warn(f"parts named in metadata.yaml are missing: {', '.join(missing)}")
-        chosen = [file for file in present if file.name in listed] or present
+        whole = [f for f in present if f.suffix != ".zstd" or f.stem not in names]  # no copies
+        chosen = [file for file in present if file.name in listed] or whole
         if not chosen:
             msg = "a folder without .mcap or .db3 files"
             raise RecordingError(msg)
