@@ -537,6 +537,14 @@ def test_part_beside_its_compressed_copy_is_read_once(tmp_path: Path) -> None:
     assert times_read(path) == [k * SECOND for k in range(5)]
 
 
+def test_end_beyond_any_time_selects_the_rest(tmp_path: Path) -> None:
+    """SQLite refuses integers of more than 64 bits, which `--end 1e10` gives."""
+    path = write_folder(tmp_path / "bag", StoragePlugin.SQLITE3)
+
+    assert len(times_read(path, start_ns=SECOND, stop_ns=10**19)) == 4
+    assert times_read(path, start_ns=10**19) == []
+
+
 def test_database_without_definitions_uses_humble(tmp_path: Path) -> None:
     """Bags from before ROS 2 Iron do not hold the definitions of their messages."""
     import sqlite3  # noqa: PLC0415  only used here

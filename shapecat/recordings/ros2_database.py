@@ -32,6 +32,8 @@ _ZSTD = b"\x28\xb5\x2f\xfd"
 """First bytes of a compressed message; a CDR message begins with a zero byte."""
 _LARGEST = 1 << 30
 """Compressed messages that claim a larger decompressed size, in bytes, are skipped."""
+_LAST_NS = 2**63 - 1
+"""The largest time that SQLite can hold."""
 _SCRATCH = "shapecat-parts-"
 _SCHEMAS = {MessageDefinitionFormat.MSG: "ros2msg", MessageDefinitionFormat.IDL: "ros2idl"}
 
@@ -103,7 +105,8 @@ class DatabaseRecording(Recording):
         wanted = [c for c in self._reader.connections if selection.has_topic(c.topic)]
         if not wanted:
             return
-        times = selection.start_ns, selection.stop_ns
+        limits = selection.start_ns, selection.stop_ns
+        times = [None if limit is None else min(limit, _LAST_NS) for limit in limits]
         raw: Iterator[Any] = self._reader.messages(wanted, *times)  # data of any type
         while True:
             try:
