@@ -38,6 +38,7 @@ from shapecat.runs.jobs import (
     identify,
     keep_labels,
     require_unchanged,
+    require_utf8,
     summarize,
 )
 from shapecat.runs.label_meaning import TrackLabel
@@ -79,6 +80,7 @@ def process(job: Job, observe: Observer = ignore, *, cores: int = 1) -> Summary:
     Stopped : a signal asked the process to stop; frames in progress are finished and kept.
     """
     begun = time.perf_counter()
+    require_utf8(job)
     with open_recording(job.source) as recording, ContentDigest(job.source) as content:
         categorizer = load_model(job.model)
         categorizer.require_descriptor(DESCRIPTOR_NAMES)

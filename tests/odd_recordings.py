@@ -1,6 +1,7 @@
 """Recordings of every format variant, damaged and unusual ones, with their expected outcomes."""
 
 import json
+import os
 import shutil
 import sqlite3
 import struct
@@ -486,6 +487,9 @@ CASES: dict[str, Case] = {
     "no clouds": Case(text_only, 4, 0, "no point clouds"),
     "empty file": Case(lambda p: file(p, "a.bag", b""), 3, 0, "is empty"),
     "text": Case(lambda p: file(p, "a.mcap", b"hello world\n"), 3, 0, "not a recording"),
+    "name that is not utf-8": Case(
+        lambda p: mcap(p).rename(p / os.fsdecode(b"k\xfcche.mcap")), 3, 0, "not valid UTF-8"
+    ),
     "magic alone": Case(lambda p: file(p, "a.mcap", b"\x89MCAP0\r\n"), 4, 0, "empty"),
     "zeros": Case(lambda p: file(p, "a.db3", b"SQLite format 3\0" + bytes(999)), 3, 0, "not a"),
     "old bag": Case(lambda p: file(p, "a.bag", b"#ROSBAG V1.2\n"), 3, 0, "version 2.0"),

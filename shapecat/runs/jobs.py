@@ -33,6 +33,7 @@ __all__ = [
     "identify",
     "keep_labels",
     "require_unchanged",
+    "require_utf8",
     "summarize",
 ]
 
@@ -197,6 +198,21 @@ def require_unchanged(folder: Path, run: RunInfo, source: Path) -> None:
         clear(folder)
         msg = f"{source}: changed while it was processed; run the same command again"
         raise RecordingError(msg)
+
+
+def require_utf8(job: Job) -> None:
+    """Check that Arrow and Rerun can write the names of the recording and of its run folder.
+
+    Raises
+    ------
+    RecordingError : they are not valid UTF-8.
+    """
+    try:
+        f"{job.source}{job.folder}".encode()
+    except UnicodeEncodeError as error:
+        shown = job.name.encode(errors="surrogateescape").decode(errors="replace")
+        msg = f"{shown}: the name is not valid UTF-8; rename it"
+        raise RecordingError(msg) from error
 
 
 def keep_labels(folder: Path, run: RunInfo, job: Job) -> None:
