@@ -9,9 +9,8 @@ from typing import Any, ClassVar
 import apsw
 import zstandard
 from rosbags.interfaces import MessageDefinitionFormat
-from rosbags.rosbag2 import ReaderError
+from rosbags.rosbag2 import Reader, ReaderError
 from rosbags.rosbag2.metadata import dump_qos_v8
-from rosbags.rosbag2.storage_sqlite3 import Sqlite3Reader
 
 from shapecat.errors import RecordingError
 from shapecat.recordings.decoding import LIBRARY_ERRORS
@@ -52,7 +51,7 @@ class DatabaseRecording(Recording):
         """
         super().__init__(path)
         self._cleanup = ExitStack()
-        self._reader = Sqlite3Reader(self._with_log())
+        self._reader = Reader(self._with_log())
         try:
             self._reader.open()
             self._channels = {c.id: _channel(c) for c in self._reader.connections}
@@ -65,9 +64,8 @@ class DatabaseRecording(Recording):
             Topic(channel.topic, channel.type, channel.encoding, count)
             for channel, count in channels
         )
-        times = self._reader.metadata
-        if times.message_count:
-            self.start_ns, self.end_ns = times.start_time, times.end_time - 1
+        if self._reader.message_count:
+            self.start_ns, self.end_ns = self._reader.start_time, self._reader.end_time - 1
         if any(c.encoding == "cdr" and not c.schema for c in self._channels.values()):
             self.warn("no message definitions: those of ROS 2 Humble are assumed")
 
@@ -83,7 +81,7 @@ class DatabaseRecording(Recording):
         """
         log = self.path.with_name(f"{self.path.name}-wal")
         if not (log.exists() and log.stat().st_size):
-            return self.path
+            return self.path if self.path.suffix == ".db3" else self._renamed()
         try:
             folder = self._cleanup.enter_context(scratch_folder(_SCRATCH))
             copy = folder / "a.db3"
@@ -100,6 +98,12 @@ class DatabaseRecording(Recording):
             return self.path
         self.warn(f"not finished; messages recovered from {log.name}")
         return copy
+
+    def _renamed(self) -> Path:
+        """Return a link to the database with the only suffix that its reader accepts."""
+        link = self._cleanup.enter_context(scratch_folder(_SCRATCH)) / "a.db3"
+        link.symlink_to(self.path.resolve())
+        return link
 
     def _read(self, selection: Selection) -> Iterator[Message]:
         wanted = [c for c in self._reader.connections if selection.has_topic(c.topic)]
