@@ -189,6 +189,43 @@ def test_recording_may_have_one_frame_or_none() -> None:
     assert list(track_recording([frame(0, []), frame(1, [])], SETTINGS)) == []
 
 
+def cameras(count: int, *, frames: int, apart: float) -> list[FrameDetections]:
+    """Return the frames of cameras that take turns; each sees two objects of its own."""
+    random, stamp = np.random.default_rng(3), 0
+    found = []
+    for k in range(frames):
+        for camera in range(count):
+            places = np.array([[camera * apart, y, 0.05] for y in (0.0, 0.7)])
+            sizes = np.array([[0.05, 0.05, 0.1], [0.2, 0.2, 0.05]]) * (1 + camera)
+            posteriors = np.eye(7)[[(2 * camera) % 7, (2 * camera + 1) % 7]] * 0.9 + 0.1 / 7
+            noisy = places + random.normal(0, 0.002, places.shape)
+            columns = (np.arange(2), noisy, sizes, posteriors, np.zeros(2), np.zeros(2))
+            found.append(FrameDetections(f"/cam{camera}", k, stamp, *columns))
+            stamp += SECOND // 60
+    return found
+
+
+@pytest.mark.parametrize("count", [1, 2, 3, 4])
+def test_cameras_that_see_different_objects_are_no_scene_cuts(count: int) -> None:
+    """Neighbouring frames of a stream show nothing in common, if its cameras take turns."""
+    frames = cameras(count, frames=30, apart=0.15)
+    together = {frame.topic for frame in frames}
+    (hits,) = gather(frames, together)
+
+    assert not scene_cuts(hits, SETTINGS).any()
+    tracks = list(track_recording(frames, SETTINGS, together=together))
+    assert [track.hits for track in tracks] == [30] * (2 * count)
+
+
+@pytest.mark.parametrize("frames", [1, 2])
+def test_single_images_of_several_cameras_keep_every_detection(frames: int) -> None:
+    """Images of other cameras are no chance to see an object again."""
+    found = cameras(3, frames=frames, apart=0.6)
+    tracks = track_recording(found, SETTINGS, together={frame.topic for frame in found})
+
+    assert sum(track.hits for track in tracks) == 6 * frames
+
+
 def test_false_detection_gets_no_track() -> None:
     frames = [frame(k, [[0, 0, 0], [0.5, 0, 0]] if k == 7 else [0, 0, 0]) for k in range(20)]
     (track,) = track_recording(frames, SETTINGS)

@@ -1,6 +1,7 @@
 """Hindsight: detecting scene cuts, and stitching the track fragments of one object."""
 
 from collections.abc import Iterator
+from heapq import merge
 
 import numpy as np
 from scipy.spatial import cKDTree
@@ -167,24 +168,40 @@ def scene_cuts(hits: Hits, settings: TrackingSettings) -> Bool:
     Recordings of single images can show different objects at the same position from one frame to
     the next. Two frames disagree if fewer than half of the objects that have a neighbour in the
     other frame are found again. A single odd frame is no cut: the frames on both sides of it must
-    disagree too. Frames without detections are ignored. A clock that jumps back by more than
-    ``max_missed_s`` also begins a new scene.
+    disagree too. Only frames of one topic are compared, as other sensors may see other objects.
+    Frames without detections are ignored. A clock that jumps back by more than ``max_missed_s``
+    also begins a new scene.
     """
-    stamps = hits.stamps_ns
+    stamps, filled = hits.stamps_ns, np.unique(hits.rows)
     result = np.diff(stamps, prepend=stamps[:1]) < -settings.max_missed_s * 1e9
-    filled = np.unique(hits.rows).tolist()
-    for n in range(1, len(filled)):
-        last, k = filled[n - 1], filled[n]
-        slow = bool(stamps[k] - stamps[k - 1] > _SLOW_S * 1e9)
-        if k - last > 1 and not slow:
+    steps = (_steps(hits, filled, topic) for topic in range(len(hits.names)))
+    for k, last, before, older, later in merge(*steps):
+        slow = bool(stamps[k] - stamps[before] > _SLOW_S * 1e9)
+        if before > last and not slow:
             continue  # after some frames out of view, an object may be anywhere
+        if result[last + 1 : k].any():
+            continue  # another topic shows that the scene has changed
         pairs = [(last, k)]
-        if n + 1 < len(filled):
-            pairs.append((last, filled[n + 1]))
-        if n > 1 and not result[last]:
-            pairs.append((filled[n - 2], k))
+        if later >= 0:
+            pairs.append((last, later))
+        if older >= 0 and not result[last]:
+            pairs.append((older, k))
         result[k] |= not any(_continues(hits, i, j, slow=slow, settings=settings) for i, j in pairs)
     return np.asarray(result)
+
+
+def _steps(hits: Hits, filled: I4, topic: int) -> Iterator[tuple[int, int, int, int, int]]:
+    """Yield the frames of a topic with detections from the second on, each with four others.
+
+    These are the previous frame with detections, the previous frame, the second previous and the
+    next one with detections, -1 if there is none. ``filled`` are the frames with detections.
+    """
+    own, seen = np.flatnonzero(hits.topics == topic), filled[hits.topics[filled] == topic]
+    before = own[np.searchsorted(own, seen) - 1]
+    for n in range(1, len(seen)):
+        older = int(seen[n - 2]) if n > 1 else -1
+        later = int(seen[n + 1]) if n + 1 < len(seen) else -1
+        yield int(seen[n]), int(seen[n - 1]), int(before[n]), older, later
 
 
 def _continues(hits: Hits, i: int, j: int, *, slow: bool, settings: TrackingSettings) -> bool:

@@ -193,13 +193,18 @@ def _line(hits: Hits, some: I4, at: int) -> tuple[F8, F8]:
 
 
 def _needed(hits: Hits, scenes: I4, row: int, min_hits: int) -> int:
-    """Return the number of hits that confirm a track born in frame ``row``."""
-    near, stamps = 1, hits.stamps_ns
+    """Return the number of hits that confirm a track born in frame ``row``.
+
+    Frames of other topics do not count, as their sensors may not see the object.
+    """
+    near, stamps, topics = 1, hits.stamps_ns, hits.topics
     for direction in (1, -1):
-        for k in range(row + direction, row + direction * min_hits, direction):
-            if not (0 <= k < len(stamps)) or scenes[k] != scenes[row]:
+        left, k = min_hits - 1, row + direction
+        while left and 0 <= k < len(stamps) and scenes[k] == scenes[row]:
+            if abs(stamps[k] - stamps[row]) > _BURST_NS:
                 break
-            near += bool(abs(stamps[k] - stamps[row]) <= _BURST_NS)
+            own = bool(topics[k] == topics[row])
+            near, left, k = near + own, left - own, k + direction
     return min(min_hits, near)
 
 
