@@ -73,7 +73,7 @@ class OpenRecording:
 
     def frames(
         self,
-        topics: Sequence[str] = (),
+        topics: str | Sequence[str] = (),
         *,
         start_s: float | None = None,
         end_s: float | None = None,
@@ -89,7 +89,8 @@ class OpenRecording:
         NoStreamError : a topic is missing or not usable, or none is given and none can be chosen.
         """
         _require_selection(start_s, end_s, every)
-        streams = choose_streams(self.recording, topics)
+        chosen = (topics,) if isinstance(topics, str) else topics
+        streams = choose_streams(self.recording, chosen)
         return frames(
             self.recording,
             streams,

@@ -40,7 +40,8 @@ class DetectionSettings:
     """Candidates with fewer points than this, at full resolution, are dropped."""
 
     def __post_init__(self) -> None:
-        """Reject a ``fuse_frames`` that is out of range."""
+        """Reject numbers that are out of range."""
+        _check_range("detection.max_range_m", self.max_range_m, 0.01, 1000.0)
         _check_range("detection.fuse_frames", self.fuse_frames, 1, 30)
 
 

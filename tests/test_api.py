@@ -237,6 +237,23 @@ def test_camera_matrix_equals_four_numbers() -> None:
         assert camera == Camera(64, 48, 61, 62, 33, 25)
 
 
+def test_crop_of_image_is_perceived() -> None:
+    """The centre of a cropped camera may be outside of the image."""
+    camera = shapecat.perceive(np.zeros((48, 64)), (61, 62, -10.5, 50)).reading.camera
+    assert camera == Camera(64, 48, 61, 62, -10.5, 50)
+
+    with pytest.raises(ConfigError, match="expected fx, fy, cx, cy"):
+        shapecat.perceive(np.zeros((48, 64)), (61, 62, 600, 24))
+
+
+def test_frames_of_one_topic_are_read(page_folder: Path) -> None:
+    """A name alone is taken for one topic, as `process` takes it."""
+    with shapecat.open_recording(page_folder / "demo.mcap") as recording:
+        frame = next(iter(recording.frames("/camera/depth/image_raw")))
+
+    assert frame.topic == "/camera/depth/image_raw"
+
+
 def test_model_is_read_once_until_its_file_changes(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:

@@ -578,6 +578,20 @@ def test_track_of_two_sensors_ends_after_its_latest_view(tmp_path: Path) -> None
     assert ended == {("/a", 2): (7,)}
 
 
+def test_track_does_not_end_where_clock_is_set_back(tmp_path: Path) -> None:
+    """Within a topic, the order of the frames counts, not their stamps."""
+    scene = Scene(np.array([0, -1, 0]), (), ())
+    with PerceptionTables(tmp_path, categories=("cup", "can"), model_id="m") as tables:
+        for index, stamp in enumerate([10, 20, 5, 15]):
+            perception = Perception("/a", index, stamp, "cam", scene, (), {})
+            tables.write([perception], [FrameRow(stamp, None)])
+    frames = {("/a", index): slice(index, index + 1) for index in range(3)}
+
+    ended = _ended(tmp_path, frames, np.array([7, 7, 7]), np.array([10, 20, 5]))
+
+    assert ended == {("/a", 3): (7,)}
+
+
 def replayed(path: Path) -> list[tuple[int, set[str]]]:
     """Replay the scene of a recording; return the entities after each message, and its time."""
     alive: dict[str, float] = {}

@@ -272,6 +272,23 @@ def test_long_path_keeps_newest_positions() -> None:
     assert drawn[-1] == []
 
 
+def test_path_of_ended_track_leaves_all_sensors() -> None:
+    """The sensor that saw it last tells its end; paths of others would stay for ever."""
+    drawn: list[Any] = []
+    columns: Any = SimpleNamespace(
+        add=lambda entity, *row, **_: drawn.append((entity, len(row[1])))
+    )
+    paths = Paths(columns)
+    for k in range(2):
+        for entity, tracks in (("/left", (4, 5)), ("/right", (4,))):
+            place = np.array([0.02 * k, 0, 1])
+            paths.add(entity, (k, k), dict.fromkeys(tracks, ("cup", place)), ())
+    assert drawn == [("/left", 2), ("/right", 1)]
+    paths.add("/right", (2, 2), {}, (4,))
+
+    assert drawn[2:] == [("/left", 1), ("/right", 0)]
+
+
 # ---- data sets of images: which frames
 
 

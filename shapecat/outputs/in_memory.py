@@ -41,13 +41,13 @@ def frame_of(reading: ArrayLike, intrinsics: ArrayLike | None = None) -> Frame:
         if values.dtype.kind not in "fiu" or values.ndim not in {2, 3} or values.shape[-1] != 3:
             msg = f"expected points (n, 3), or a depth image with intrinsics, got {values.shape}"
             raise ConfigError(msg)
-        points = values.reshape(-1, 3).astype(np.float32)
+        points = values.reshape(-1, 3).astype(np.float32, order="C")
         points[~np.isfinite(points).all(axis=1)] = np.nan
         return frame(points=points)
     if values.dtype.kind not in "fiu" or values.ndim != 2:
         msg = f"expected a depth image (h, w) of numbers, got {values.dtype} {values.shape}"
         raise ConfigError(msg)
-    depth = values.astype(np.float32) * (1.0 if values.dtype.kind == "f" else 0.001)
+    depth = values.astype(np.float32, order="C") * (1.0 if values.dtype.kind == "f" else 0.001)
     depth[~(np.isfinite(depth) & (depth > 0))] = 0
     if depth.any() and np.median(depth[depth > 0]) > _FARTHEST_M:
         msg = "expected depth in metres; divide millimetres by 1000, or pass integers"
@@ -56,14 +56,14 @@ def frame_of(reading: ArrayLike, intrinsics: ArrayLike | None = None) -> Frame:
 
 
 def _camera(intrinsics: ArrayLike, height: int, width: int) -> Camera:
-    """Return the camera of an image, whose centre must be in the image."""
+    """Return the camera of an image; its centre is at most twice the image's size away from it."""
     with suppress(TypeError, ValueError):  # not numbers, or rows of different lengths
         given = np.asarray(intrinsics, np.float64)
         if given.shape == (3, 3) and (given[_FIXED] == np.eye(3)[_FIXED]).all():
             given = given[[0, 1, 0, 1], [0, 1, 2, 2]]
         if given.shape == (4,) and np.isfinite(given).all():
             fx, fy, cx, cy = given.tolist()
-            if min(fx, fy) > 0 and 0 < cx < width and 0 < cy < height:
+            if min(fx, fy) > 0 and abs(cx) <= 3 * width and abs(cy) <= 3 * height:
                 return Camera(width, height, fx, fy, cx, cy)
     msg = (
         f"expected fx, fy, cx, cy in pixels of an image {width} x {height}, or its camera matrix "

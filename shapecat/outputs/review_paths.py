@@ -47,14 +47,24 @@ class Paths:
     def add(
         self, entity: str, at: At, seen: Mapping[int, tuple[str, F8]], ended: Iterable[int]
     ) -> None:
-        """Add the category and position of each track in a frame; remove ended tracks."""
-        known = self._paths.setdefault(entity, {})
-        gone = [known.pop(number) for number in ended if number in known]
-        grown = [
-            known.setdefault(number, _Path(category)).grow(place)
-            for number, (category, place) in seen.items()
-        ]
-        if any(grown) or any(path.drawn for path in gone):
-            ways = [(path.category, np.array(path.places)) for path in known.values() if path.drawn]
-            size = sum(places.size for _, places in ways)
-            self._columns.add(entity, at, ways, paths, size=size)
+        """Add the category and position of each track in a frame; remove tracks that have ended.
+
+        Another entity may have a part of their path, from another sensor.
+        """
+        gone, known = set(ended), self._paths.setdefault(entity, {})
+        changed = set()
+        for other, own in self._paths.items():
+            removed = [own.pop(number) for number in gone & own.keys()]
+            if any(path.drawn for path in removed):
+                changed.add(other)
+        for number, (category, place) in seen.items():
+            if known.setdefault(number, _Path(category)).grow(place):
+                changed.add(entity)
+        for other in sorted(changed):
+            self._write(other, at)
+
+    def _write(self, entity: str, at: At) -> None:
+        known = self._paths[entity].values()
+        ways = [(path.category, np.array(path.places)) for path in known if path.drawn]
+        size = sum(places.size for _, places in ways)
+        self._columns.add(entity, at, ways, paths, size=size)

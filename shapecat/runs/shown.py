@@ -216,14 +216,18 @@ def _join(parts: Sequence[ShownBox], up: F4) -> ShownBox:
 def _ended(
     folder: Path, frames: Mapping[Key, slice], tracks: I4, stamps_ns: I4
 ) -> dict[Key, tuple[int, ...]]:
-    """Return the tracks that end in each frame: those whose last frame is the one before it."""
+    """Return the tracks that end in each frame: those whose last frame is the one before it.
+
+    Of the last frames of a track in several topics, the latest counts. Within a topic, numbers of
+    frames decide, as a clock may be set back.
+    """
     keys = np.repeat(np.arange(len(frames)), [rows.stop - rows.start for rows in frames.values()])
-    latest = np.argsort(stamps_ns, kind="stable")[::-1]
-    gone, at = np.unique(tracks[latest], return_index=True)
     names = list(frames)
-    last = {
-        track: names[k] for track, k in zip(gone.tolist(), keys[latest[at]].tolist(), strict=True)
-    }
+    _, topics = np.unique([topic for topic, _ in names], return_inverse=True)
+    by_topic = tracks.astype(np.int64) * len(names) + topics[keys]
+    at = len(tracks) - 1 - np.unique(by_topic[::-1], return_index=True)[1]
+    at = at[np.argsort(stamps_ns[at], kind="stable")]
+    last = {t: names[k] for t, k in zip(tracks[at].tolist(), keys[at].tolist(), strict=True)}
     following = _next_of_topic(folder, set(last.values()))
     ended: dict[Key, list[int]] = {}
     for track, frame in last.items():
