@@ -206,6 +206,34 @@ def test_content_is_compared_if_copy_keeps_times(source: Path) -> None:
     assert not same_content(known, source, lambda: content_digest(source))
 
 
+def test_only_files_of_a_bag_count_as_its_content(tmp_path: Path) -> None:
+    """File managers and editors leave files in the folder, whose names need not be UTF-8."""
+    bag, others = tmp_path / "bag", (".DS_Store", ".bag_0.mcap.swp", os.fsdecode(b"n\xff.txt"))
+    bag.mkdir()
+    for name in ("bag_0.mcap", "bag_1.db3.zstd", "metadata.yaml"):
+        (bag / name).write_bytes(name.encode())
+    known: Any = {"files": file_stats(bag), "digest": content_digest(bag)}
+    for name in others:
+        (bag / name).write_bytes(b"something else")
+
+    assert unchanged(known["files"], bag)
+    assert same_content(known, bag, lambda: "")
+    assert content_digest(bag) == known["digest"]
+    (bag / "bag_1.db3.zstd").write_bytes(b"longer than before")
+    assert not unchanged(known["files"], bag)
+    assert not same_content(known, bag, lambda: content_digest(bag))
+
+
+def test_run_of_earlier_version_fits_bag_without_its_other_files(tmp_path: Path) -> None:
+    """They were part of the digest and of the files in run.json."""
+    (tmp_path / "bag_0.mcap").write_bytes(b"recording")
+    files = [[".DS_Store", 6, 1, 1], *file_stats(tmp_path)]
+    known: Any = {"files": files, "digest": "xxh3-128:0123"}
+
+    assert unchanged(files, tmp_path)
+    assert same_content(known, tmp_path, lambda: "")
+
+
 def test_unneeded_digest_is_stopped(source: Path) -> None:
     """Stopping is no error before the thread starts, and ends it afterwards."""
     with ContentDigest(source) as content:

@@ -81,6 +81,19 @@ def test_copy_with_other_file_times_is_same_recording(
     assert "already complete" in result.stdout
 
 
+def test_new_file_beside_parts_of_bag_is_no_change(shapecat: Run, tmp_path: Path) -> None:
+    """A note or a thumbnail would keep corrected labels from being applied."""
+    lab = record(tmp_path / "lab", 12, container="ros2")
+    command = ("process", lab, "--out", tmp_path / "out", *OPTIONS)
+    assert shapecat(*command).exit_code == 0
+    (lab / "Thumbs.db").write_text("pictures")
+
+    again, annotated = shapecat(*command), shapecat("annotate", tmp_path / "out" / "lab")
+
+    assert "already complete" in again.stdout, again.stderr
+    assert annotated.exit_code == 0, annotated.stderr
+
+
 def test_each_failure_is_printed_once(shapecat: Run, recording: Path, tmp_path: Path) -> None:
     """On stderr when it happens, and not again in the closing table."""
     (tmp_path / "lab.mcap").write_bytes(recording.read_bytes())

@@ -199,7 +199,11 @@ def test_digest_covers_whole_file(tmp_path: Path) -> None:
 def test_folder_digest_covers_names_and_file_boundaries(tmp_path: Path) -> None:
     digests = set()
     for k, files in enumerate(
-        ({"a": "xy", "b": "z"}, {"a": "x", "b": "yz"}, {"a": "xy", "c": "z"})
+        (
+            {"a.db3": "xy", "b.db3": "z"},
+            {"a.db3": "x", "b.db3": "yz"},
+            {"a.db3": "xy", "c.db3": "z"},
+        )
     ):
         (tmp_path / str(k)).mkdir()
         for name, text in files.items():

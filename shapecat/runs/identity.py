@@ -6,6 +6,7 @@ tracks.csv has it in each line.
 """
 
 import json
+import os
 import secrets
 from collections.abc import Callable, Sequence
 from pathlib import Path
@@ -16,7 +17,7 @@ import xxhash
 
 from shapecat.errors import RecordingError
 from shapecat.runs.run_info import InputInfo, RunInfo
-from shapecat.system.files import input_files
+from shapecat.system.files import input_files, is_of_bag
 
 __all__ = [
     "ContentDigest",
@@ -65,13 +66,18 @@ def unchanged(before: Sequence[Sequence[Any]], path: Path) -> bool:
     ``before`` is from `file_stats`.
     """
     try:
-        return [list(s[:3]) for s in before] == [s[:3] for s in file_stats(path)]
+        return [s[:3] for s in _of_input(before, path)] == [s[:3] for s in file_stats(path)]
     except OSError:
         return False
 
 
+def _of_input(stats: Sequence[Sequence[Any]], path: Path) -> Stats:
+    """Leave out other files in the folder of a bag, which earlier versions stored too."""
+    return [list(s) for s in stats if not path.is_dir() or is_of_bag(s[0])]
+
+
 def content_digest(path: Path, *, cancelled: Event | None = None) -> str:
-    """Return a digest of the whole content of a recording: of a file, or of a folder's files.
+    """Return a digest of the whole content of a recording: of a file, or of a bag's files.
 
     XXH3 with 128 bits (Collet 2019) is as fast as memory and detects damage, but not forgery.
 
@@ -84,7 +90,7 @@ def content_digest(path: Path, *, cancelled: Event | None = None) -> str:
     block = memoryview(bytearray(_BLOCK))
     for file in input_files(path):
         if path.is_dir():
-            total.update(f"{file.name}\0{file.stat().st_size}\0".encode())
+            total.update(os.fsencode(file.name) + f"\0{file.stat().st_size}\0".encode())
         with file.open("rb", buffering=0) as stream:
             while count := stream.readinto(block):
                 if cancelled is not None and cancelled.is_set():
@@ -147,6 +153,6 @@ def same_content(known: InputInfo, path: Path, digest: Callable[[], str]) -> boo
 
     ``digest`` is called only if the names, sizes or times of the files differ.
     """
-    if known.get("files") == file_stats(path):
+    if _of_input(known.get("files", ()), path) == file_stats(path):
         return True
     return bool(known.get("digest")) and known["digest"] == digest()

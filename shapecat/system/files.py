@@ -24,6 +24,7 @@ __all__ = [
     "holding",
     "input_files",
     "input_size",
+    "is_of_bag",
     "lock",
     "partial_path",
     "replacing",
@@ -33,6 +34,7 @@ __all__ = [
 
 FSYNC = "SHAPECAT_FSYNC"
 """The environment variable that disables flushing; worker processes inherit it."""
+_PARTS = (".mcap", ".db3", ".mcap.zstd", ".db3.zstd")
 _NEW_S = 60
 """Age up to which a temporary folder may not be locked yet."""
 
@@ -170,11 +172,18 @@ def scratch_folder(prefix: str) -> Iterator[Path]:
         yield Path(folder)
 
 
+def is_of_bag(name: str) -> bool:
+    """Return whether a file in the folder of a ROS 2 bag belongs to it: a part or the metadata."""
+    return name == "metadata.yaml" or name.endswith(_PARTS)
+
+
 def input_files(path: Path) -> list[Path]:
-    """Return a file itself, or the files in a folder, sorted by name."""
-    return [f for f in sorted(path.iterdir()) if f.is_file()] if path.is_dir() else [path]
+    """Return a file itself, or the files of the ROS 2 bag in a folder, sorted by name."""
+    if not path.is_dir():
+        return [path]
+    return [file for file in sorted(path.iterdir()) if is_of_bag(file.name) and file.is_file()]
 
 
 def input_size(path: Path) -> int:
-    """Return the size of a file, or of the files in a folder, bytes."""
+    """Return the size of a file, or of the ROS 2 bag in a folder, bytes."""
     return sum(file.stat().st_size for file in input_files(path))
