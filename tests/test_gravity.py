@@ -1,5 +1,6 @@
 """Tests of the up direction: its sources and their reliability."""
 
+from collections.abc import Iterator
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -159,6 +160,42 @@ def test_given_up_is_dropped_only_if_no_plane_confirms_it(
 
     assert [item for item, *_ in returned] == frames
     assert upright.dropped == ({"/d": "tf"} if dropped else {})
+
+
+@pytest.mark.parametrize(("up", "most"), [(None, 1), (np.array([0.0, -1.0, 0.0]), 65)])
+def test_topic_that_ends_early_does_not_hold_frames_back(
+    monkeypatch: pytest.MonkeyPatch, up: Any, most: int
+) -> None:
+    """All other frames of a long recording would be kept in memory, and nothing be saved."""
+    monkeypatch.setattr(perceiving, "find_up", lambda *_: None)
+    upright = Upright(TransformWindow(TransformBuffer()), None, None, ("tf", "imu"))
+    frames = [frame(EPOCH + k) for k in range(300)]
+    frames[1] = replace(frames[1], topic="/short")
+    held: set[int] = set()
+
+    def read() -> Iterator[Any]:
+        for item in frames:
+            held.add(item.stamp_ns)
+            assert len(held) <= most
+            yield item, None, Orientation("tf" if up is not None else "", up, None)
+
+    for item, *_ in perceiving._UpTrial(upright, Settings()).before(read()):
+        held.remove(item.stamp_ns)
+    assert not held
+
+
+def test_up_that_is_given_later_is_tested(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Transforms often begin after the first frames, which must not decide for the others."""
+    upright = Upright(TransformWindow(TransformBuffer()), None, None, ("tf", "imu"))
+    given, plane = np.array([0.0, -1.0, 0.0]), np.array([0.0, 0.0, -1.0])
+    monkeypatch.setattr(perceiving, "find_up", lambda *_: plane)
+    ups = [Orientation("", None, None)] * 4 + [Orientation("tf", given, None)] * 4
+    oriented = ((frame(EPOCH + k), None, up) for k, up in enumerate(ups))
+
+    returned = list(perceiving._UpTrial(upright, Settings()).before(oriented))
+
+    assert [item.stamp_ns - EPOCH for item, *_ in returned] == list(range(8))
+    assert upright.dropped == {"/d": "tf"}
 
 
 def test_up_without_other_source_comes_from_planes(tmp_path: Path) -> None:

@@ -43,6 +43,8 @@ _CONFIRMS_DEG = 15.0
 """A plane confirms an up direction within this angle, as in `detect`."""
 _DOUBTS, _LOOKS = 3, 10
 """Frames with a plane that must contradict the up direction, and frames that are checked."""
+_MOST_HELD = 64
+"""Frames that are held back at most: a topic may have few frames, or none for a long time."""
 
 
 _Reading = tuple[Frame, ColourView | None]
@@ -181,36 +183,45 @@ class _UpTrial:
         self._decided: set[str] = set()
 
     def before(self, source: Iterator[_Oriented]) -> Iterator[_Oriented]:
-        """Yield all frames, but hold the first ones back until the up directions are decided."""
+        """Yield all frames, but hold the first ones back until the up directions are decided.
+
+        Only topics with a given up direction are waited for.
+        """
         held: list[_Oriented] = []
         for reading in source:
             frame, _, orientation = reading
             held.append(reading)
             if frame.topic not in self._decided:
                 self._look(frame, orientation)
-            if self._looks.keys() <= self._decided:
+            if len(held) == _MOST_HELD:
+                self._decide_all()
+            if self._off_deg.keys() <= self._decided:
                 yield from held
                 held.clear()
-        for topic in sorted(self._looks.keys() - self._decided):
-            self._decide(topic)
+        self._decide_all()
         yield from held
 
     def _look(self, frame: Frame, orientation: Orientation) -> None:
         self._looks[frame.topic] += 1
-        off = self._off_deg.setdefault(frame.topic, [])
-        given = orientation.up
-        found = None if given is None else find_up(frame, self._settings)
-        if given is not None and found is not None:
-            off.append(float(np.degrees(np.arccos(np.clip(given @ found, -1, 1)))))
-            self._sources[frame.topic] = orientation.source
+        given, off = orientation.up, self._off_deg.get(frame.topic, [])
+        if given is not None:
+            off = self._off_deg.setdefault(frame.topic, off)
+            found = find_up(frame, self._settings)
+            if found is not None:
+                off.append(float(np.degrees(np.arccos(np.clip(given @ found, -1, 1)))))
+                self._sources[frame.topic] = orientation.source
         enough = len(off) == _DOUBTS or self._looks[frame.topic] == _LOOKS
         if enough or min(off, default=np.inf) <= _CONFIRMS_DEG:
             self._decide(frame.topic)
 
+    def _decide_all(self) -> None:
+        for topic in sorted(self._off_deg.keys() - self._decided):
+            self._decide(topic)
+
     def _decide(self, topic: str) -> None:
         """Reject the up direction of a topic if no frame confirms it and enough contradict it."""
         self._decided.add(topic)
-        off = self._off_deg[topic]
+        off = self._off_deg.get(topic, [])
         enough = len(off) >= min(_DOUBTS, self._looks[topic])
         if enough and min(off) > _CONFIRMS_DEG:
             self._upright.contradict(topic, self._sources[topic], off)
