@@ -190,6 +190,25 @@ def test_mailbox_delivers_messages_and_ignores_missing_listeners(tmp_path: Path)
     post(str(tmp_path / "no such place"), "nor here")
 
 
+@pytest.mark.parametrize("places", ["long", "none"])
+def test_long_temporary_folder_costs_at_most_the_reports(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, places: str
+) -> None:
+    """The path of a socket has at most 107 bytes, and clusters give each job a long one."""
+    long = tmp_path / ("d" * 82)
+    long.mkdir()
+    monkeypatch.setattr("tempfile.tempdir", str(long))
+    if places == "none":
+        monkeypatch.setattr("shapecat.executors.mailbox._SHORT", str(long))
+    received: SimpleQueue[Any] = SimpleQueue()
+    with Mailbox(received.put) as mailbox:
+        post(mailbox.address, ["kitchen", 3])
+        if places == "long":
+            assert received.get(timeout=5) == ["kitchen", 3]
+    assert not [*long.iterdir()]
+    assert not mailbox.address or not Path(mailbox.address).parent.exists()
+
+
 @pytest.mark.parametrize(
     ("jobs", "recordings", "expected"),
     [

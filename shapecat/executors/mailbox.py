@@ -4,7 +4,7 @@ import json
 import socket
 import tempfile
 from collections.abc import Callable
-from contextlib import suppress
+from contextlib import ExitStack, suppress
 from pathlib import Path
 from threading import Thread
 from typing import Any, Self
@@ -12,6 +12,7 @@ from typing import Any, Self
 __all__ = ["Mailbox", "post"]
 
 _MOST_BYTES = 4096
+_SHORT = "/tmp"  # noqa: S108  the folder in it is private
 
 
 class Mailbox:
@@ -22,29 +23,44 @@ class Mailbox:
 
     Attributes
     ----------
-    address : path of the socket, the address for `post`.
+    address : path of the socket, the address for `post`; empty if no socket can be made, and then
+        no report arrives.
     """
 
     def __init__(self, receive: Callable[[Any], None]) -> None:
         """Call ``receive`` with each report."""
         self._receive = receive
-        self._folder = tempfile.TemporaryDirectory(prefix="shapecat-", ignore_cleanup_errors=True)
-        self.address = str(Path(self._folder.name) / "mailbox")
+        self._folder = ExitStack()
         self._socket = socket.socket(socket.AF_UNIX, socket.SOCK_DGRAM)
-        self._socket.bind(self.address)
+        self.address = self._bind()
         self._thread = Thread(target=self._listen, daemon=True)
 
     def __enter__(self) -> Self:
-        self._thread.start()
+        if self.address:
+            self._thread.start()
         return self
 
     def __exit__(self, *error: object) -> None:
         """Stop listening."""
-        with suppress(OSError), socket.socket(socket.AF_UNIX, socket.SOCK_DGRAM) as end:
-            end.sendto(b"", self.address)
-        self._thread.join(timeout=1)
+        if self.address:
+            with suppress(OSError), socket.socket(socket.AF_UNIX, socket.SOCK_DGRAM) as end:
+                end.sendto(b"", self.address)
+            self._thread.join(timeout=1)
         self._socket.close()
-        self._folder.cleanup()
+        self._folder.close()
+
+    def _bind(self) -> str:
+        """Bind the socket in the temporary folder, or in /tmp if its path is too long."""
+        for place in (None, _SHORT):
+            with suppress(OSError), ExitStack() as folder:
+                made = tempfile.TemporaryDirectory(
+                    prefix="shapecat-", dir=place, ignore_cleanup_errors=True
+                )
+                address = str(Path(folder.enter_context(made)) / "mailbox")
+                self._socket.bind(address)
+                self._folder = folder.pop_all()
+                return address
+        return ""
 
     def _listen(self) -> None:
         with suppress(OSError):  # the socket was closed
