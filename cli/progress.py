@@ -1,7 +1,6 @@
 """Progress of ``process`` on stderr: bars, plain lines, or JSON lines."""
 
 import json
-import os
 import sys
 import time
 from collections import Counter
@@ -120,7 +119,7 @@ class Progress:
 
     def note(self, text: str) -> None:
         """Show a line."""
-        _say(text)
+        click.echo(text, err=True)
 
     def show(self, folder: str) -> None:
         """Show the progress of a recording."""
@@ -224,15 +223,7 @@ class JsonProgress(Progress):
 
 def _event(event: str, **values: Any) -> None:
     known = {name: value for name, value in values.items() if value is not None}
-    _say(json.dumps({"event": event, **known}))
-
-
-def _say(text: str) -> None:
-    """Write a line to stderr; if nobody reads it any more, the work goes on without."""
-    try:
-        click.echo(text, err=True)
-    except BrokenPipeError:
-        os.dup2(os.open(os.devnull, os.O_WRONLY), 2)
+    click.echo(json.dumps({"event": event, **known}), err=True)
 
 
 class LiveProgress(Progress):

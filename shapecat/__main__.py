@@ -6,12 +6,14 @@ from typing import Any
 
 from shapecat.system.garbage import collect_seldom
 from shapecat.system.libraries import block_unused
+from shapecat.system.stderr import forgive_stderr
 from shapecat.system.stopping import leave
 
 
 def run() -> None:
     """Run the command line. Until it handles signals itself, a signal ends the process."""
     _handle(leave)
+    forgive_stderr()
     collect_seldom()
     block_unused()
     try:

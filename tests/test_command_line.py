@@ -2,6 +2,7 @@
 
 import json
 import logging
+import os
 import re
 import shutil
 import signal
@@ -459,6 +460,34 @@ def test_full_disk_behind_stdout_is_reported_in_one_line(
 
     assert done.returncode == 1
     assert done.stderr == "Error: cannot write the output: No space left on device\n"
+
+
+@pytest.mark.skipif(not Path("/dev/full").exists(), reason="needs a device that is always full")
+@pytest.mark.parametrize(
+    ("kind", "how"), [("jsonl", "full"), ("rich", "full"), ("jsonl", "pipe"), ("auto", "closed")]
+)
+def test_unwritable_stderr_does_not_end_the_work(
+    recording: Path, tmp_path: Path, kind: str, how: str
+) -> None:
+    """A log may fill its disk, and a terminal may be closed; the code is that of the failure."""
+    bad = tmp_path / "bad.mcap"
+    bad.write_text("no recording")
+    command = [sys.executable, "-m", "shapecat", "process", str(recording), str(bad)]
+    command += ["--out", str(tmp_path), "--no-rrd", "--no-mcap", "--jobs", "1", "--progress", kind]
+    reader, pipe = os.pipe()
+    os.close(reader)
+    with Path("/dev/full").open("w") as full:
+        done = subprocess.run(
+            command,
+            stdout=subprocess.PIPE,
+            stderr=pipe if how == "pipe" else full,
+            preexec_fn=(lambda: os.close(2)) if how == "closed" else None,
+            check=False,
+        )
+    os.close(pipe)
+
+    assert done.returncode == 1
+    assert b"1 complete, 1 failed" in done.stdout
 
 
 @pytest.mark.parametrize("below", [[1, 0], [99, None]])

@@ -1,0 +1,36 @@
+"""Keep a command at work when nobody can read its messages."""
+
+import io
+import os
+import sys
+from contextlib import suppress
+
+__all__ = ["forgive_stderr"]
+
+
+class _Forgiving(io.TextIOWrapper):
+    """A stream that drops what cannot be written."""
+
+    def write(self, text: str) -> int:
+        """Write a text, or drop it."""
+        with suppress(OSError):
+            super().write(text)
+        return len(text)
+
+    def flush(self) -> None:
+        """Write what is in the buffer, as far as possible."""
+        with suppress(OSError):
+            super().flush()
+
+
+def forgive_stderr() -> None:
+    """Make stderr drop messages if its disk is full or its terminal or reader is gone.
+
+    If it was closed before the start, it becomes the null device: otherwise the next file that is
+    opened would get its number, and messages of libraries.
+    """
+    if sys.stderr is None:
+        os.dup2(os.open(os.devnull, os.O_WRONLY), 2)
+    encoding = getattr(sys.stderr, "encoding", None)
+    stream = os.fdopen(2, "wb", closefd=False)
+    sys.stderr = _Forgiving(stream, encoding, "backslashreplace", line_buffering=True)
