@@ -9,6 +9,7 @@ import hashlib
 import os
 import shutil
 from collections.abc import Callable
+from contextlib import suppress
 from functools import cache
 from pathlib import Path
 from typing import Any, TypeVar
@@ -109,8 +110,11 @@ def _places(stage: Path) -> tuple[Path, ...]:
     mine = f"{stage.name}-{hashlib.sha256(str(stage).encode()).hexdigest()[:16]}"
     if config.CACHE_DIR:
         return (Path(config.CACHE_DIR, mine),)
-    own = Path(os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache", "shapecat", mine)
-    return stage / "__pycache__", own
+    places = [stage / "__pycache__"]
+    with suppress(RuntimeError):  # the user has no home
+        cache = os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache"
+        places.append(Path(cache, "shapecat", mine))
+    return tuple(places)
 
 
 def _keep_freed_memory() -> None:

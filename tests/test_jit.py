@@ -110,6 +110,26 @@ def test_kernel_is_compiled_without_any_cache_folder(
     assert run() == "7 0"
 
 
+@pytest.mark.parametrize("place", ["beside", "cache"])
+def test_user_without_home_can_cache_kernels_elsewhere(
+    stage: Path, run: Run, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, place: str
+) -> None:
+    """Containers run with users that have neither HOME nor an entry in the list of users."""
+
+    def fail() -> Path:
+        msg = "Could not determine home directory."
+        raise RuntimeError(msg)
+
+    monkeypatch.setattr(Path, "home", fail)
+    monkeypatch.delenv("XDG_CACHE_HOME", raising=False)
+    if place == "cache":
+        stage.joinpath("__pycache__").write_text("")
+        monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path / "own"))
+
+    assert run() == "7 0"
+    assert run() == "7 1"
+
+
 def test_stage_includes_its_subpackages() -> None:
     """Kernels call kernels of other subpackages of their stage, so any edit counts."""
     here = Path(shapecat.__file__).parent
