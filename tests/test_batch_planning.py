@@ -789,6 +789,33 @@ def test_run_keeps_folder_when_recording_of_same_name_is_added(
         assert [task.name for task in batch.tasks] == ["tuesday_lab", name]
 
 
+@pytest.mark.parametrize("known_from", ["all", "1-of-2", "relative path", "run.json"])
+def test_run_at_url_keeps_folder_when_recording_of_same_name_is_added(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, known_from: str
+) -> None:
+    """All shards must agree on the names, or some recordings would be in none of them."""
+    monkeypatch.setattr("shapecat.batch.plans.load_model", lambda _path: MODEL)
+    for day in ("monday", "tuesday"):
+        (tmp_path / day).mkdir()
+        (tmp_path / day / "lab.mcap").write_bytes(day.encode())
+    out, path = f"memory://added-{known_from[:3]}", str(tmp_path / "monday" / "lab.mcap")
+    noted = known_from in {"all", "1-of-2"}
+    run = {} if noted else run_info(input={"path": path})
+    (Location(out) / "lab" / "run.json").write(json.dumps(run).encode())
+    monkeypatch.chdir(tmp_path / "tuesday")  # where the relative path leads to the other one
+    if known_from != "run.json":
+        recording = "lab.mcap" if known_from == "relative path" else path
+        with RemoteManifest(out, known_from if noted else "") as manifest:
+            manifest.record([Entry("lab", recording, "complete")])
+    days = [str(tmp_path / day / "lab.mcap") for day in ("tuesday", "monday")]
+
+    names = []
+    for shard in ("0/2", "1/2"):
+        with plan_batch(Job(Path(), Path()), days, out, shard=shard) as batch:
+            names += [(task.name, task.path) for task in batch.tasks]
+    assert dict(names) == {"lab": path, "tuesday_lab": days[0]}
+
+
 def test_numbered_folder_name_may_already_be_taken() -> None:
     """Two recordings in one folder would be confused, and one would be lost."""
     folders = name_folders(["a_x_3", "x", "x", "a_x_4", "x"], ["b", "a", "a", "b", "a"])

@@ -22,7 +22,15 @@ from uuid import uuid4
 from shapecat.batch.storage import Location, content_key, is_url
 from shapecat.errors import OutputError, ShapecatError, explained
 
-__all__ = ["MANIFEST", "Entry", "Manifest", "RemoteManifest", "State", "open_manifest"]
+__all__ = [
+    "MANIFEST",
+    "Entry",
+    "Manifest",
+    "RemoteManifest",
+    "State",
+    "entries_at",
+    "open_manifest",
+]
 
 MANIFEST = "manifest.jsonl"
 
@@ -215,6 +223,19 @@ def open_manifest(out: str, *, shard: str | None = None) -> Manifest:
     if is_url(out):
         return RemoteManifest(out, shard.replace("/", "-of-") if shard else "")
     return Manifest(Path(out) / MANIFEST)
+
+
+def entries_at(url: str) -> dict[str, Entry]:
+    """Return the entries of the manifests of all shards at a URL.
+
+    Raises
+    ------
+    OutputError : the storage cannot be read.
+    """
+    entries: dict[str, Entry] = {}
+    for shard in sorted((Location(url, OutputError) / _PARTS).names()):
+        entries |= RemoteManifest(url, shard).entries
+    return entries
 
 
 def _line(entry: Entry) -> bytes:

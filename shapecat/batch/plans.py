@@ -16,9 +16,9 @@ from typing import Literal
 
 from shapecat.batch.claims import claim_name
 from shapecat.batch.finding import Source, find_recordings, look_at
-from shapecat.batch.manifest import Entry, Manifest, open_manifest
+from shapecat.batch.manifest import Entry, Manifest, entries_at, open_manifest
 from shapecat.batch.storage import Location, is_url
-from shapecat.errors import ConfigError, OutputError
+from shapecat.errors import ConfigError, OutputError, ShapecatError
 from shapecat.learning import load_model
 from shapecat.runs.folder import OUTPUT_OPTIONS, read_run
 from shapecat.runs.identity import file_stats
@@ -201,7 +201,7 @@ def plan_batch(
     part = Shard.parse(shard) if shard is not None else None
     found = find_recordings(sources)
     there = Location(out, OutputError).names() if is_url(out) else _names_in(Path(out))
-    known = {} if is_url(out) else _known_names(found.kept, Path(out), there)
+    known = _known_names(found.kept, out, there)
     names = name_folders([s.stem for s in found.kept], [s.parent for s in found.kept], known)
     named = list(zip(names, found.kept, strict=True))
     with open_manifest(out, shard=shard) if len(named) > 1 else nullcontext() as manifest:
@@ -247,7 +247,7 @@ class _Planner:
         return "retry" if entry is not None and entry.state == "failed" else "new"
 
 
-def _known_names(sources: Sequence[Source], out: Path, there: set[str]) -> dict[int, str]:
+def _known_names(sources: Sequence[Source], out: str, there: set[str]) -> dict[int, str]:
     """Return the names of the run folders that recordings with a common name have in ``out``.
 
     A recording that comes to a batch later must not rename the run of another one.
@@ -255,14 +255,29 @@ def _known_names(sources: Sequence[Source], out: Path, there: set[str]) -> dict[
     counts = Counter(source.stem for source in sources)
     common = {source.url or os.path.realpath(source.path): k for k, source in enumerate(sources)}
     common = {path: k for path, k in common.items() if counts[sources[k].stem] > 1}
+    entries = entries_at(out) if common and is_url(out) else {}
     known: dict[int, str] = {}
     for name in sorted(there) if common else ():
         if any(sources[k].stem in name for k in common.values()):
-            with suppress(OutputError):
-                k = common.get(read_run(out / name)["input"]["path"])
-                if k is not None:
-                    known.setdefault(k, name)
+            k = common.get(_recording_of(out, name, entries.get(name)))
+            if k is not None:
+                known.setdefault(k, name)
     return known
+
+
+def _recording_of(out: str, name: str, entry: Entry | None) -> str:
+    """Return the path or URL of the recording of a run; empty if there is no readable run."""
+    noted = entry.recording if entry is not None else ""
+    if is_url(noted):
+        return noted
+    if Path(noted).is_absolute():  # other paths depend on the current folder
+        return os.path.realpath(noted)
+    with suppress(ShapecatError, ValueError, LookupError, TypeError):
+        if not is_url(out):
+            return read_run(Path(out, name))["input"]["path"]
+        content = (Location(out) / name / "run.json").read() or b"{}"
+        return str(json.loads(content)["input"]["path"])
+    return ""
 
 
 def _names_in(folder: Path) -> set[str]:
