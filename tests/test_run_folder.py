@@ -180,6 +180,16 @@ def test_run_json_round_trips_and_is_validated(tmp_path: Path) -> None:
         read_run(tmp_path / "nowhere")
 
 
+@pytest.mark.parametrize("length", [249, 253, 300])
+def test_name_too_long_for_hidden_folder_is_explained(tmp_path: Path, length: int) -> None:
+    """Recordings of robots may have long names, and the hidden folders add nine characters."""
+    folder = tmp_path / ("n" * length)
+    with pytest.raises(OutputError, match=r"n: .*: File name too long"):
+        recover(folder)
+        with staged(folder):
+            pytest.fail("there is no such folder")
+
+
 def test_digest_covers_whole_file(tmp_path: Path) -> None:
     path = tmp_path / "f"
     whole = b"a" * 3_000_000

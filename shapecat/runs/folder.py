@@ -87,8 +87,9 @@ def staged(
         to it.
     """
     hidden = partial_path(folder)
-    for place in (folder, hidden):
-        require_ours(place, marker)
+    with explained(f"{folder}: cannot be written", OutputError):  # its name may be too long
+        for place in (folder, hidden):
+            require_ours(place, marker)
     created = _missing_parents(folder)
     try:
         hidden.mkdir(parents=True, exist_ok=True)
@@ -170,17 +171,17 @@ def recover(folder: Path, marker: Marker = made_by_run) -> None:
     OutputError : the folder cannot be written.
     """
     previous, hidden = previous_path(folder), partial_path(folder)
-    if not previous.is_dir():
-        return
-    with (
-        suppress(_BusyError),  # the other run does it
-        explained(f"{folder}: cannot be written", OutputError),
-        _locked(hidden if hidden.is_dir() else previous),
-    ):
-        if not folder.exists() and marker(previous) is not None:
-            previous.rename(folder)
-        elif folder.exists() and marker(folder) is not None:
-            _retire(folder, marker)
+    with explained(f"{folder}: cannot be written", OutputError):
+        if not previous.is_dir():
+            return
+        with (
+            suppress(_BusyError),  # the other run does it
+            _locked(hidden if hidden.is_dir() else previous),
+        ):
+            if not folder.exists() and marker(previous) is not None:
+                previous.rename(folder)
+            elif folder.exists() and marker(folder) is not None:
+                _retire(folder, marker)
 
 
 def clear(folder: Path, names: Collection[str] = _MADE) -> None:
