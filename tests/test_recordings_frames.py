@@ -46,6 +46,7 @@ from tests.messages import (
     wavy_depth,
     write,
 )
+from tests.scenes import record
 
 DATA = Path(__file__).parents[2] / "shared" / "data"
 
@@ -56,6 +57,16 @@ def read(path: Path, *topics: str, **options: Any) -> tuple[list[Frame], Counter
         chosen = choose_streams(recording, topics)
         result = list(frames(recording, chosen, skipped=skipped, **options))
         return result, skipped, recording.warnings
+
+
+@pytest.mark.parametrize("container", ["mcap", "ros1", "ros2"])
+@pytest.mark.parametrize("end_s", [1e12, 1e300])
+def test_end_may_be_far_after_the_end(tmp_path: Path, container: str, end_s: float) -> None:
+    """Nanoseconds of such a time fit neither into a database nor into an integer."""
+    path = record(tmp_path / "lab", 3, container=container)
+
+    assert len(read(path, end_s=end_s)[0]) == 3
+    assert not read(path, start_s=end_s)[0]
 
 
 @pytest.mark.parametrize("chunk_size", [1 << 20, 25_000])  # one chunk, or one for each 5 images

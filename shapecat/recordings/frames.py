@@ -11,6 +11,9 @@ from shapecat.types import Frame
 
 __all__ = ["frames"]
 
+_FAR_NS = 2**62
+"""A century: later times would not fit into the integers of a database."""
+
 
 def frames(
     recording: Recording,
@@ -55,7 +58,8 @@ def frames(
     for source in sources.values():
         if isinstance(source, DepthSource):
             infos.setdefault(source.info_topic, []).append(source)
-    limits = [None if s is None else recording.start_ns + round(s * 1e9) for s in (start_s, end_s)]
+    offsets = [None if s is None else round(min(s * 1e9, _FAR_NS)) for s in (start_s, end_s)]
+    limits = [None if offset is None else recording.start_ns + offset for offset in offsets]
     heard = heard or {}
 
     def is_needed(topic: str, log_time_ns: int) -> bool:
