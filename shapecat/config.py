@@ -3,6 +3,7 @@
 import dataclasses
 import difflib
 import json
+import sys
 import tomllib
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
@@ -140,8 +141,8 @@ def load_settings(path: Path | None = None, overrides: Sequence[str] = ()) -> Se
     tree: Mapping[str, Any] = {}
     if path is not None:
         try:
-            tree = tomllib.loads(path.read_text("utf-8"))
-        except (OSError, UnicodeDecodeError, tomllib.TOMLDecodeError) as error:
+            tree = tomllib.loads(path.read_text("utf-8-sig"))
+        except (OSError, ValueError) as error:
             msg = f"{path}: not a readable TOML file: {error}"
             raise ConfigError(msg) from error
     return with_overrides(with_settings(Settings(), tree), overrides)
@@ -196,7 +197,7 @@ def _check_range(name: str, value: float, least: float, most: float) -> None:
 def _parse_value(text: str) -> Any:
     try:
         return json.loads(text)
-    except json.JSONDecodeError:
+    except ValueError:
         return text.strip()
 
 
@@ -227,6 +228,9 @@ def _checked(name: str, value: Any, kind: Any) -> Any:
             msg = f"{name} must be one of {', '.join(map(str, get_args(kind)))}, got {value!r}"
             raise ConfigError(msg)
         return value
+    if isinstance(value, int) and abs(value) > sys.float_info.max:
+        msg = f"{name} is too large"
+        raise ConfigError(msg)
     if kind is float and isinstance(value, int) and not isinstance(value, bool):
         value = float(value)
     if type(value) is not kind:

@@ -30,6 +30,10 @@ def test_command_line_overrides_file_and_file_overrides_defaults(tmp_path: Path)
         ("tracking.gate_m=wide", "must be of type float"),
         ("tracking.gate_m=-1", "must not be negative"),
         ("tracking.gate_m=NaN", "must be finite"),
+        (f"tracking.gate_m=1{400 * '0'}", "tracking.gate_m is too large"),
+        (f"tracking.gate_m=-1{400 * '0'}", "tracking.gate_m is too large"),
+        (f"detection.min_points=1{400 * '0'}", "detection.min_points is too large"),
+        (f"seed=1{5000 * '0'}", "must be of type int"),
         ("tracking.gate_m=true", "must be of type float"),
         ("tracking.fusion=median", "must be one of mean"),
         ("tracking=1", "group of settings"),
@@ -44,7 +48,15 @@ def test_error_names_invalid_setting(override: str, message: str) -> None:
         with_overrides(Settings(), [override])
 
 
-@pytest.mark.parametrize("content", [b"a = ", b"\xff\xfe", None])
+def test_file_may_begin_with_byte_order_mark(tmp_path: Path) -> None:
+    """Editors on Windows write one."""
+    path = tmp_path / "s.toml"
+    path.write_bytes(b"\xef\xbb\xbfseed = 3\r\n")
+
+    assert load_settings(path).seed == 3
+
+
+@pytest.mark.parametrize("content", [b"a = ", b"\xff\xfe", b"seed = 1" + 5000 * b"0", None])
 def test_unreadable_file_is_config_error(tmp_path: Path, content: bytes | None) -> None:
     path = tmp_path / "s.toml"
     if content is not None:
