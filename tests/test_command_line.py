@@ -279,6 +279,24 @@ def test_index_of_scattered_runs_links_to_their_pages(shapecat: Run, runs: Path)
         assert [(page.parent / unquote(link)).resolve() for link in back] == [index.resolve()]
 
 
+def test_index_of_others_is_kept(shapecat: Run, runs: Path) -> None:
+    """The folder of the runs may be that of a web site; earlier versions made the last page."""
+    index, pages = runs / "a" / "index.html", [*runs.rglob("*.html")]
+    for page in pages:
+        page.unlink()
+    index.write_text("<html>my robots, not a shapecat report</html>")
+    refused = shapecat("report", runs / "a")
+
+    assert refused.exit_code == 1
+    assert f"Error: {index}: shapecat did not make this" in refused.stderr
+    assert [*runs.rglob("*.html")] == [index]
+    assert "my robots" in index.read_text()
+    index.write_text('<html>\n  <p class="kicker">shapecat report</p>\n</html>')
+    for _ in range(2):
+        assert shapecat("report", runs / "a").exit_code == 0
+    assert 'href="lab/report.html"' in index.read_text()
+
+
 def test_path_of_moved_recording_can_be_given(
     shapecat: Run, recording: Path, tmp_path: Path
 ) -> None:

@@ -9,6 +9,7 @@ from pathlib import Path
 from urllib.parse import quote
 
 from shapecat.arrays import F8
+from shapecat.errors import OutputError, explained
 from shapecat.outputs.report.cards import Card, is_unsure
 from shapecat.outputs.report.choosing import choose_frames
 from shapecat.outputs.report.page import Listed, index_page, run_page
@@ -23,6 +24,8 @@ from shapecat.system.progress import Observer, ignore
 __all__ = ["INDEX", "PAGE", "Reports", "RunReport", "read_report", "read_reports"]
 
 PAGE, INDEX = "report.html", "index.html"
+_MARK = b'<p class="kicker">shapecat report</p>'
+"""A part of index.html in each version."""
 _FACES = 6
 
 
@@ -124,10 +127,12 @@ class Reports:
 
         Raises
         ------
-        OutputError : a page cannot be written, or a tracks.csv is invalid.
+        OutputError : a page cannot be written, a tracks.csv is invalid, or shapecat did not make
+            the index that is there.
         """
         pages = {report.folder / PAGE: report.page() for report in self.runs}
         if self.indexed:
+            _require_ours(self.above / INDEX)
             pages[self.above / INDEX] = self.index()
         for page, text in pages.items():
             with replacing(page) as path:
@@ -172,6 +177,14 @@ def read_report(folder: Path, *, index: str | None = None) -> RunReport:
     pictures = take_pictures(finished, rows, choose_frames(folder, timelines))
     work = finished.run.get("work", "")
     return RunReport(folder, work, timelines, pictures, read_stage_seconds(folder), index)
+
+
+def _require_ours(index: Path) -> None:
+    with explained(f"{index}: cannot be written", OutputError):
+        if not index.exists() or _MARK in index.read_bytes():
+            return
+    msg = f"{index}: shapecat did not make this; move it away, or name only one run"
+    raise OutputError(msg)
 
 
 def _above(runs: Sequence[Path]) -> Path:
