@@ -15,6 +15,7 @@ from shapecat.arrays import F4
 from shapecat.learning import Categorizer
 from shapecat.learning.baselines import make_baselines
 from shapecat.learning.boosted import Dictionary, grow_dictionary
+from shapecat.learning.boosting import Tree, grow_tree
 from shapecat.learning.calibration import fit_temperature, softmax
 from shapecat.learning.features import FeatureBank
 from shapecat.learning.forest import FlatForest
@@ -30,6 +31,7 @@ from shapecat.learning.training import (
     fit_categorizer,
     fit_chain,
 )
+from shapecat.system import stopping
 from shapecat.types import UNKNOWN
 
 NAMES = tuple(f"x{k}" for k in range(8))
@@ -147,6 +149,23 @@ def test_first_tree_makes_the_best_split(monkeypatch: pytest.MonkeyPatch) -> Non
 
     assert (int(model.forest.feature[0]), float(model.forest.threshold[0])) == (feature, cut)
     np.testing.assert_allclose(model.votes[:2, 0], step, rtol=2e-3)
+
+
+def test_growing_trees_can_be_interrupted(monkeypatch: pytest.MonkeyPatch) -> None:
+    """With many categories it takes minutes, after which a stopped command would write a model."""
+    monkeypatch.setattr(stopping, "_received", [])
+    grown = []
+
+    def grow_one(*inputs: Any) -> Tree:
+        grown.append(inputs)
+        if len(grown) == 5:  # in the second of twenty rounds
+            stopping.request()
+        return grow_tree(*inputs)
+
+    monkeypatch.setattr("shapecat.learning.boosted.grow_tree", grow_one)
+    with pytest.raises(stopping.Stopped):
+        fit()
+    assert len(grown) == 8
 
 
 def test_more_rounds_reduce_the_training_loss() -> None:

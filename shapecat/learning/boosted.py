@@ -9,6 +9,7 @@ import numpy as np
 from shapecat.arrays import F4, F8, I4
 from shapecat.learning.boosting import Bins, Tree, TreeSettings, grow_tree, joined, make_bins
 from shapecat.learning.forest import FlatForest
+from shapecat.system import stopping
 
 __all__ = ["Dictionary", "grow_dictionary"]
 
@@ -58,6 +59,10 @@ def grow_dictionary(
     rate : learning rate.
     jobs : number of trees grown at the same time; it does not affect the result.
 
+    Raises
+    ------
+    Stopped : a signal asked the process to stop.
+
     Source: thesis 7.3, 7.4; differs: the trees are boosted, instead of a random forest with linear
     classifiers on top, see docs/decisions/0008-boosted-dictionary.md.
     """
@@ -87,6 +92,7 @@ def _boost(
     trees: list[Tree] = []
     with ThreadPoolExecutor(jobs or 1) as pool:
         for _ in range(rounds):
+            stopping.check()
             posterior = np.exp(scores - scores.max(axis=0))
             posterior /= posterior.sum(axis=0)
             draws = [_draw(bins, rng) for _ in scores]
