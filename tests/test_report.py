@@ -449,6 +449,54 @@ def test_corrections_made_in_browser_are_adopted(
     assert browser.run("return document.querySelectorAll('.changed').length") == 4
 
 
+def changes(browser: Browser) -> dict[int, str]:
+    """Return what each changed card of the open page says about its label."""
+    script = (
+        "return [...document.querySelectorAll('.card.changed')].map("
+        "(card) => [+card.dataset.track, card.querySelector('.fix').textContent])"
+    )
+    return dict(browser.run(script))
+
+
+def open_anew(browser: Browser, page: Path) -> None:
+    """Open a page without the corrections that other tests made on the same tracks."""
+    browser.open(page)
+    browser.run("localStorage.clear()")
+    browser.open(page)
+
+
+def test_new_page_keeps_corrections_not_downloaded(
+    browser: Browser, run: Path, drawn: RunReport
+) -> None:
+    """A label that was given elsewhere must cost no correction of another track."""
+    reports = Reports([replace(drawn, folder=run)])
+    (page,) = reports.write()
+    a, b = (row.track for row in read_track_table(run / "tracks.csv").rows[:2])
+    open_anew(browser, page)
+    for track in (a, b):
+        browser.click(f"#track-{track} button[data-label='delete']")
+    relabel(run, {b: "teapot"})
+    reports.write()
+    browser.open(page)
+
+    assert changes(browser) == {a: "→ delete", b: "→ teapot"}
+    assert browser.complaints() == []
+
+
+def test_corrections_are_kept_for_one_run_only(run: Path, drawn: RunReport) -> None:
+    """Tracks of a run that was processed again have other numbers."""
+    work = drawn.work[:-1] + ("1" if drawn.work.endswith("0") else "0")
+    keys = [data_of(replace(drawn, folder=run).page())["key"]]
+    relabel(run, {read_track_table(run / "tracks.csv").rows[0].track: "teapot"})
+    keys.append(data_of(replace(drawn, folder=run).page())["key"])
+    for name in ("run.json", "tracks.csv", "tracks.original.csv"):
+        text = (run / name).read_text("utf-8")
+        (run / name).write_text(text.replace(drawn.work, work), "utf-8")
+    keys.append(data_of(replace(drawn, folder=run, work=work).page())["key"])
+
+    assert keys[0] == keys[1] != keys[2]
+
+
 def test_filters_select_cards(browser: Browser, reported_run: Path) -> None:
     page = reported_run / "report.html"
     rows = read_track_table(reported_run / "tracks.csv").rows

@@ -93,7 +93,7 @@ def run_page(
         facts=_facts(run),
         glossary=asset("glossary.html"),
         names="".join(f'<option value="{escape(name)}">' for name in names),
-        data=_data(names, table, served=served),
+        data=_data(names, run, table, served=served),
     )
 
 
@@ -223,7 +223,7 @@ def _facts(run: Mapping[str, Any]) -> str:
     )
 
 
-def _data(names: Sequence[str], table: TrackTable, *, served: bool) -> str:
+def _data(names: Sequence[str], run: Mapping[str, Any], table: TrackTable, *, served: bool) -> str:
     """Return the data for the script as JSON, escaped so that it cannot end the script element."""
     rows = [
         {
@@ -240,11 +240,16 @@ def _data(names: Sequence[str], table: TrackTable, *, served: bool) -> str:
         "categories": names,
         "colours": {name: css_colour(name) for name in names},
         "served": served,
+        "key": _key(run, table),
     }
     text = json.dumps(content, ensure_ascii=False, separators=(",", ":"))
-    key = hashlib.sha256(text.encode()).hexdigest()[:16]
-    text = json.dumps(content | {"key": key}, ensure_ascii=False, separators=(",", ":"))
     return re.sub(r"[<>&\u2028\u2029]", lambda found: f"\\u{ord(found[0]):04x}", text)
+
+
+def _key(run: Mapping[str, Any], table: TrackTable) -> str:
+    """Return the name under which a browser keeps corrections: equal for all pages of a run."""
+    tracks = sorted(row.track for row in table.rows)
+    return hashlib.sha256(json.dumps([run.get("work", ""), tracks]).encode()).hexdigest()[:16]
 
 
 def _listed(item: Listed) -> str:

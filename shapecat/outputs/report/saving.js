@@ -8,17 +8,19 @@ function save(track) {
   if (data.served) send(track); else keep();
 }
 
+// Keep each correction with the label that it replaces.
 function keep() {
   try {
-    const pairs = data.rows.map((row) => row.track).filter((t) => labels.get(t) !== onDisk.get(t));
-    localStorage.setItem(storage, JSON.stringify(Object.fromEntries(pairs.map((t) => [t, labels.get(t)]))));
+    const kept = Object.fromEntries(unsaved().map((track) => [track, [labels.get(track), onDisk.get(track)]]));
+    localStorage.setItem(storage, JSON.stringify(kept));
   } catch { /* a browser that keeps nothing for files still downloads */ }
 }
 
+// Restore the corrections that were not downloaded, except of labels that have changed since.
 function recall() {
   try {
     const kept = JSON.parse(localStorage.getItem(storage) || "{}");
-    for (const [track, label] of Object.entries(kept)) if (labels.has(track)) labels.set(track, label);
+    for (const [track, [label, seen]] of Object.entries(kept)) if (onDisk.get(track) === seen) labels.set(track, label);
   } catch { /* the same */ }
 }
 
