@@ -483,6 +483,25 @@ def test_new_page_keeps_corrections_not_downloaded(
     assert browser.complaints() == []
 
 
+@pytest.mark.parametrize("keys", ["npen", "m2", "m9x"])
+def test_escape_leaves_label_as_it_was(browser: Browser, reported_run: Path, keys: str) -> None:
+    """It gave the label typed so far, and an invalid one kept the focus."""
+    page = reported_run / "report.html"
+    a, b, c = (row.track for row in read_track_table(reported_run / "tracks.csv").rows[:3])
+    open_anew(browser, page)
+    browser.click(f"#track-{a} button[data-label='delete']")
+    browser.type(f"#track-{b} .other", "mug\n")
+    for track in (a, b, c):
+        browser.run(f"document.getElementById('track-{track}').focus()")
+        browser.press(*keys, "Escape")
+        browser.wait(f"return document.activeElement.id === 'track-{track}'")
+
+    assert changes(browser) == {a: "→ delete", b: "→ mug"}
+    fields = "return [...document.querySelectorAll('.other')].map((one) => one.value)"
+    assert list(filter(None, browser.run(fields))) == ["mug"]
+    assert browser.run("return document.querySelectorAll('.other:invalid').length") == 0
+
+
 def test_corrections_are_kept_for_one_run_only(run: Path, drawn: RunReport) -> None:
     """Tracks of a run that was processed again have other numbers."""
     work = drawn.work[:-1] + ("1" if drawn.work.endswith("0") else "0")

@@ -25,7 +25,14 @@ function showCard(card) {
     named = named || pressed;
   }
   const other = card.querySelector(".other");
-  if (document.activeElement !== other) other.value = named ? "" : label;
+  other.defaultValue = named ? "" : label;
+  if (document.activeElement !== other) restore(other);
+}
+
+// Show the label again in a text field, instead of what was typed.
+function restore(other) {
+  other.value = other.defaultValue;
+  other.setCustomValidity("");
 }
 
 function fits(card) {
@@ -111,7 +118,7 @@ gallery.addEventListener("click", (event) => {
   setLabel(button.closest(".card").dataset.track, pressed ? "" : button.dataset.label);
 });
 gallery.addEventListener("change", (event) => {
-  if (!event.target.matches(".other")) return;
+  if (!event.target.matches(".other") || event.target.value === event.target.defaultValue) return;
   const track = event.target.closest(".card").dataset.track;
   const label = known(event.target.value.trim().replace(/\s+/g, " "));
   const wrong = problem(track, label);
