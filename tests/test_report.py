@@ -483,6 +483,20 @@ def test_new_page_keeps_corrections_not_downloaded(
     assert browser.complaints() == []
 
 
+def test_new_name_has_its_key_after_reload(browser: Browser, reported_run: Path) -> None:
+    """It was listed nowhere, so the next object had to be named again."""
+    page = reported_run / "report.html"
+    a, b = (row.track for row in read_track_table(reported_run / "tracks.csv").rows[:2])
+    open_anew(browser, page)
+    browser.type(f"#track-{a} .other", "mug\n")
+    browser.open(page)
+    browser.run(f"document.getElementById('track-{b}').focus()")
+    browser.press("8")
+
+    assert changes(browser) == {a: "→ mug", b: "→ mug"}
+    assert "8 mug" in browser.run("return document.getElementById('digits').textContent")
+
+
 @pytest.mark.parametrize("keys", ["npen", "m2", "m9x"])
 def test_escape_leaves_label_as_it_was(browser: Browser, reported_run: Path, keys: str) -> None:
     """It gave the label typed so far, and an invalid one kept the focus."""

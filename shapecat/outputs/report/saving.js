@@ -20,7 +20,11 @@ function keep() {
 function recall() {
   try {
     const kept = JSON.parse(localStorage.getItem(storage) || "{}");
-    for (const [track, [label, seen]] of Object.entries(kept)) if (onDisk.get(track) === seen) labels.set(track, label);
+    for (const [track, [label, seen]] of Object.entries(kept)) {
+      if (onDisk.get(track) !== seen) continue;
+      labels.set(track, label);
+      learn(label);
+    }
   } catch { /* the same */ }
 }
 
