@@ -33,7 +33,14 @@ from shapecat.outputs.report.writing import Reports, RunReport
 from shapecat.outputs.wording import caption, confidence_text, time_span
 from shapecat.runs.corrections import read_labels, relabel
 from shapecat.runs.finished import FinishedRun, read_finished
-from shapecat.runs.track_table import TrackRow, TrackTable, read_track_table
+from shapecat.runs.label_meaning import find_misread
+from shapecat.runs.track_table import (
+    TrackRow,
+    TrackTable,
+    read_track_table,
+    with_label,
+    write_track_table,
+)
 from shapecat.types import Box, Camera, Frame, LabelledFrame, LabelledObject, NeuralGas
 from tests.browser import Browser
 
@@ -514,6 +521,96 @@ def test_escape_leaves_label_as_it_was(browser: Browser, reported_run: Path, key
     fields = "return [...document.querySelectorAll('.other')].map((one) => one.value)"
     assert list(filter(None, browser.run(fields))) == ["mug"]
     assert browser.run("return document.querySelectorAll('.other:invalid').length") == 0
+
+
+LABELS = (
+    *("cup", "CUP", "boxx", "new boxx", "cups", "cpu", "pan", "New  pot", "bowling ball", "botle"),
+    *(
+        "wine glass",
+        "glas",
+        "café",
+        "cafe\u0301",
+        "क\u093cलम",
+        "стакан",
+        "杯",
+        "a",
+        "x_",
+        "x-",
+        "é",
+    ),
+    *("9 pin", "_x", "½ cup", "m²", "cup!", "50%", "pen=1", "a,b", "-", "new", "new ", "new 7up"),
+    *("a" * 60, "a" * 61, "new " + "b" * 60, "new " + "b" * 61),
+    *("none", "DontCare", "new none", "delete", "Delete", "delte", "del", "remove", "removed"),
+    *("merge", "merger", "merge 3", "merged x", "mergers", "merge with", "merge with 999"),
+    *("Merged into #{b}", "merge with {b}.0", "merge with 0{b}", "merge with {b}x"),
+    *("merge with {a}", "merge with {b}", "merge with {c}", "merge with {d}", "merge with {e}"),
+)
+"""Labels for track a: b has a new name, c is deleted, d merges with a, e is of another topic."""
+
+
+def test_page_and_annotate_accept_the_same_labels(
+    browser: Browser, run: Path, drawn: RunReport
+) -> None:
+    """One label that `annotate` refuses costs all corrections of a downloaded table."""
+    a, b, c, d, e = (row.track for row in read_track_table(run / "tracks.csv").rows[:5])
+    for name in ("tracks.csv", "tracks.original.csv"):
+        table = read_track_table(run / name)
+        moved = (
+            replace(row, cells={**row.cells, "topic": "/other"}) if row.track == e else row
+            for row in table.rows
+        )
+        write_track_table(run / name, replace(table, rows=tuple(moved)))
+    info = json.loads((run / "run.json").read_text())
+    (run / "run.json").write_text(json.dumps(info | {"fixed_frame": None}))
+    assert relabel(run, {b: "new pan", c: "delete", d: f"merge with {a}"}) == {}
+    (page,) = Reports([replace(drawn, folder=run)]).write()
+    labels = [label.format(a=a, b=b, c=c, d=d, e=e) for label in LABELS]
+    open_anew(browser, page)
+    accepted = browser.run(
+        f"const field = document.querySelector('#track-{a} .other');"
+        f"return {json.dumps(labels)}.filter((label) => {{"
+        "  field.value = label;"
+        "  field.dispatchEvent(new Event('change', { bubbles: true }));"
+        "  if (field.validity.valid) document.getElementById('undo').click();"
+        "  return field.validity.valid; });"
+    )
+    rows = read_track_table(run / "tracks.csv").rows
+    readable = [
+        label
+        for label in labels
+        if not find_misread(
+            [with_label(row, " ".join(label.split())) if row.track == a else row for row in rows],
+            info["model"]["categories"],
+            one_frame=False,
+        )
+    ]
+
+    assert accepted == readable
+    assert 15 < len(accepted) < len(labels) - 15
+
+
+def test_page_refuses_to_delete_a_track_that_others_are_merged_with(
+    browser: Browser, reported_run: Path
+) -> None:
+    """Keys and buttons give labels, too. The capital is of one who types the label."""
+    page = reported_run / "report.html"
+    a, b = (row.track for row in read_track_table(reported_run / "tracks.csv").rows[:2])
+    open_anew(browser, page)
+    browser.type(f"#track-{a} .other", f"merge with {b}\n")
+    browser.run(f"document.getElementById('track-{b}').focus()")
+    browser.press("d")
+    assert changes(browser) == {a: f"→ merge with {b}"}
+    said = browser.run("return document.getElementById('said').textContent")
+    assert said == f"#{b}: #{a}: #{b} is deleted."
+
+    browser.type(f"#track-{b} .other", "Delete\n")
+    assert b not in changes(browser)
+    browser.press("Escape")
+    browser.run(f"document.getElementById('track-{a}').focus()")
+    browser.press("Backspace")
+    browser.type(f"#track-{b} .other", "Delete\n")
+    assert changes(browser) == {b: "→ delete"}
+    assert browser.run("return document.querySelectorAll('.card.deleted').length") == 1
 
 
 def test_corrections_are_kept_for_one_run_only(run: Path, drawn: RunReport) -> None:

@@ -8,7 +8,7 @@ function cardOf(track) { return byTrack.get(track); }
 
 function showCard(card) {
   if (!card) return;
-  const track = card.dataset.track, label = labels.get(track), category = card.dataset.category;
+  const track = card.dataset.track, label = labelOf(track), category = card.dataset.category;
   const changed = label !== "" && label !== category;
   card.classList.toggle("changed", changed);
   card.classList.toggle("confirmed", label === category);
@@ -36,7 +36,7 @@ function restore(other) {
 }
 
 function fits(card) {
-  const label = labels.get(card.dataset.track);
+  const label = labelOf(card.dataset.track);
   const state = byId("state").value;
   if (hiddenCategories.has(card.dataset.category)) return false;
   if (Number(card.dataset.confidence) * 100 > Number(byId("confidence").value)) return false;
@@ -72,13 +72,13 @@ function element(name, text, className) {
 }
 
 function shownAs(row) {
-  const label = labels.get(row.track);
+  const label = labelOf(row.track);
   return MERGE.test(label) ? "merged" : label === "delete" ? "deleted" : label;
 }
 
 function summarize() {
   const checked = data.rows.filter((row) => labels.get(row.track) !== "");
-  const right = checked.filter((row) => labels.get(row.track) === row.category).length;
+  const right = checked.filter((row) => labelOf(row.track) === row.category).length;
   byId("download").textContent = checked.length ? `Download tracks.csv (${checked.length})` : "Download tracks.csv";
   byId("verdict").textContent = checked.length
     ? `${right} of ${checked.length} checked ${checked.length === 1 ? "track was" : "tracks were"} right. Rows: detected category; columns: your label.`
@@ -120,10 +120,9 @@ gallery.addEventListener("click", (event) => {
 gallery.addEventListener("change", (event) => {
   if (!event.target.matches(".other") || event.target.value === event.target.defaultValue) return;
   const track = event.target.closest(".card").dataset.track;
-  const label = known(event.target.value.trim().replace(/\s+/g, " "));
-  const wrong = problem(track, label);
-  event.target.setCustomValidity(wrong);
-  if (wrong) event.target.reportValidity(); else setLabel(track, label);
+  const label = known(event.target.value.normalize("NFC").trim().replace(/\s+/g, " "));
+  event.target.setCustomValidity(setLabel(track, label));
+  event.target.reportValidity();
 });
 gallery.addEventListener("input", (event) => {
   if (event.target.matches(".other")) event.target.setCustomValidity("");

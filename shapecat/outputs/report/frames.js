@@ -5,7 +5,7 @@ let open = 0;
 
 function showBoxes(track) {
   const row = data.rows.find((one) => one.track === track);
-  const label = labels.get(track), merge = label.match(MERGE);
+  const label = labelOf(track), merge = label.match(MERGE);
   const category = label && !merge && label !== "delete" ? label : row.category;
   for (const box of document.querySelectorAll(`.box[data-track="${track}"]`)) {
     box.classList.toggle("deleted", label === "delete");

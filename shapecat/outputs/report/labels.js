@@ -1,24 +1,16 @@
 // The labels of the tracks as this page has them, and how to undo the last.
 const data = JSON.parse(document.getElementById("data").textContent);
 const byId = (id) => document.getElementById(id);
-const MERGE = /^merged? +(?:with|into) +#?(\d+)$/i;
 const labels = new Map(data.rows.map((row) => [row.track, row.label]));
 const past = [];
 
-function known(name) {
-  const found = data.categories.find((category) => category.toLowerCase() === name.toLowerCase());
-  return found === undefined ? name : found;
+// A label as this page spells it: `Delete` and `CUP` mean `delete` and `cup`.
+function known(label) {
+  const found = ["delete", ...data.categories].find((name) => name.toLowerCase() === label.toLowerCase());
+  return found === undefined ? label : found;
 }
 
-function problem(track, label) {
-  const merge = label.match(MERGE);
-  if (merge && merge[1] === track) return `A track cannot be merged with itself.`;
-  if (merge && !labels.has(merge[1])) return `There is no track #${merge[1]}.`;
-  if (!merge && /^merged? /i.test(label)) return "Write: merge with #3";
-  if (!merge && label && !/^\p{L}/u.test(label)) return "A name begins with a letter.";
-  if (/[\/\\:*?"<>|,;]/.test(label)) return "Use only letters, digits, spaces and - _ . + & ' ( )";
-  return "";
-}
+function labelOf(track) { return known(labels.get(track)); }
 
 function say(text, bad = false) {
   byId("said").textContent = text;
@@ -35,11 +27,15 @@ function learn(label) {
   showDigits();
 }
 
+// Give a track a label, unless that is invalid; return the problem.
 function setLabel(track, label) {
   const before = labels.get(track);
-  if (before === label) return;
+  if (before === label) return "";
+  const wrong = problem(track, label);
+  if (wrong) { say(`#${track}: ${wrong}`, true); return wrong; }
   past.push([track, before]);
   put(track, label);
+  return "";
 }
 
 function put(track, label) {

@@ -26,11 +26,11 @@ from shapecat.outputs.report.cards import (
 from shapecat.outputs.report.pictures import StripFrame
 from shapecat.runs.finished import FinishedRun
 from shapecat.runs.track_table import TrackTable
-from shapecat.types import UNKNOWN
+from shapecat.types import CATEGORIES, UNKNOWN
 
 __all__ = ["Listed", "index_page", "run_page"]
 
-_SCRIPTS = ("labels.js", "saving.js", "cards.js", "frames.js", "keys.js")
+_SCRIPTS = ("labels.js", "meaning.js", "saving.js", "cards.js", "frames.js", "keys.js")
 
 
 @dataclass(frozen=True)
@@ -238,6 +238,8 @@ def _data(names: Sequence[str], run: Mapping[str, Any], table: TrackTable, *, se
         "columns": table.columns,
         "rows": rows,
         "categories": names,
+        "known": [UNKNOWN, *CATEGORIES, *run["model"]["categories"]],
+        "oneFrame": run["fixed_frame"] is not None,
         "colours": {name: css_colour(name) for name in names},
         "served": served,
         "key": _key(run, table),
