@@ -21,7 +21,10 @@ if TYPE_CHECKING:
 @click.option(
     "--port", type=click.IntRange(0, 65535), help="Port of --serve; by default a free one."
 )
-def report(*, folders: tuple[Path, ...], serve: bool, port: int | None) -> None:
+@click.pass_context
+def report(
+    ctx: click.Context, /, *, folders: tuple[Path, ...], serve: bool, port: int | None
+) -> None:
     """Make a page per run to review and correct tracks in a browser.
 
     Each DIR is a run, or a folder of runs. The page of a run is RUN/report.html; several runs, and
@@ -46,11 +49,14 @@ def report(*, folders: tuple[Path, ...], serve: bool, port: int | None) -> None:
     with progress_bars() as bars:
         reports = read_reports(folders, bars)
         pages = reports.write()
-    if serve:
+    for error in reports.failed.values():
+        click.echo(f"Error: {error}", err=True)
+    if serve and reports.runs:
         _serve(reports, port or 0)
-        return
-    for page in pages:
-        click.echo(page)
+    elif not serve:
+        for page in pages:
+            click.echo(page)
+    ctx.exit(1 if reports.failed else 0)
 
 
 def _serve(reports: "Reports", port: int) -> None:

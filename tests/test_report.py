@@ -196,6 +196,35 @@ def test_index_lists_runs_and_links_to_them(
     assert shapecat("report", run.parent.parent / "nothing").exit_code == 1
 
 
+def test_damaged_run_does_not_prevent_pages_of_others(shapecat: Run, run: Path) -> None:
+    """One bad label among many runs left all of them without a page."""
+    bad, broken = (run.with_name(name) for name in ("another", "broken"))
+    for folder in (bad, broken):
+        shutil.copytree(run, folder)
+    table = read_track_table(bad / "tracks.csv")
+    first, *rest = table.rows
+    rows = (with_label(first, "merge with 999"), *rest)
+    write_track_table(bad / "tracks.csv", replace(table, rows=rows))
+    (broken / "run.json").write_text("{}")
+    index = run.parent / "index.html"
+    result = shapecat("report", run.parent)
+
+    assert result.exit_code == 1
+    assert result.stdout.splitlines() == [str(run / "report.html"), str(index)]
+    assert "there is no track 999" in result.stderr
+    assert [f"Error: {folder}/" in result.stderr for folder in (bad, broken)] == [True, True]
+    assert re.findall(r'class="run" href="([^"]+)"', index.read_text("utf-8")) == [
+        "table/report.html"
+    ]
+    assert 'href="../index.html"' in (run / "report.html").read_text("utf-8")
+
+    index.unlink()
+    result = shapecat("report", bad, broken)
+    assert (result.exit_code, result.stdout) == (1, "")
+    assert result.stderr.count("Error: ") == 2
+    assert not index.exists()
+
+
 def decode(image: str) -> np.ndarray:
     opened = Image.open(io.BytesIO(base64.b64decode(image.partition(",")[2])))
     return np.asarray(opened.convert("RGBA")).astype(int)

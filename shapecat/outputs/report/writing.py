@@ -3,7 +3,7 @@
 import os
 from collections import Counter
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from functools import cached_property
 from pathlib import Path
 from urllib.parse import quote
@@ -102,15 +102,20 @@ class RunReport:
 
 @dataclass(frozen=True)
 class Reports:
-    """The reports of runs; ``indexed`` is whether there is an index in their common folder."""
+    """The reports of runs; ``indexed`` is whether there is an index in their common folder.
+
+    ``failed`` holds the reason for each run that has no report.
+    """
 
     runs: Sequence[RunReport]
     indexed: bool = False
+    failed: Mapping[Path, OutputError] = field(default_factory=dict)
 
     @cached_property
     def above(self) -> Path:
         """The deepest folder that contains all runs, relative if the first run is."""
-        above, first = _above([report.folder for report in self.runs]), self.runs[0].folder
+        folders = [*(report.folder for report in self.runs), *self.failed]
+        above, first = _above(folders), folders[0]
         return above if first.is_absolute() else Path(os.path.relpath(above))
 
     def link(self, report: RunReport) -> str:
@@ -131,7 +136,7 @@ class Reports:
             the index that is there.
         """
         pages = {report.folder / PAGE: report.page() for report in self.runs}
-        if self.indexed:
+        if self.indexed and self.runs:
             _require_ours(self.above / INDEX)
             pages[self.above / INDEX] = self.index()
         for page, text in pages.items():
@@ -150,16 +155,19 @@ def read_reports(folders: Sequence[Path], observe: Observer = ignore) -> Reports
 
     Raises
     ------
-    OutputError : a folder holds no run, or a table of a run is unreadable or invalid.
+    OutputError : a folder holds no run.
     """
     runs = find_runs(folders)
     indexed = len(runs) > 1 or any(folder not in runs for folder in folders)
     index = _above(runs) / INDEX
-    reports = []
+    reports, failed = [], {}
     for done, run in enumerate(runs, start=1):
-        reports.append(read_report(run, index=_link(run, index) if indexed else None))
+        try:
+            reports.append(read_report(run, index=_link(run, index) if indexed else None))
+        except OutputError as error:
+            failed[run] = error
         observe("report", done, len(runs))
-    return Reports(reports, indexed)
+    return Reports(reports, indexed, failed)
 
 
 def read_report(folder: Path, *, index: str | None = None) -> RunReport:
