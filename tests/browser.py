@@ -5,6 +5,7 @@ import shutil
 import socket
 import subprocess
 import time
+from contextlib import suppress
 import urllib.request
 from pathlib import Path
 from typing import Any
@@ -169,8 +170,9 @@ class Browser:
     def downloaded(self) -> Path:
         """Wait for a download to be complete."""
         for _ in range(100):
-            found = [file for file in self.downloads.iterdir() if file.stat().st_size]
-            if [file.suffix for file in found] == [".csv"]:  # not .crdownload, nor its placeholder
-                return found[0]
+            with suppress(FileNotFoundError):  # the browser renames it
+                found = [file for file in self.downloads.iterdir() if file.stat().st_size]
+                if [file.suffix for file in found] == [".csv"]:  # no .crdownload or placeholder
+                    return found[0]
             time.sleep(0.05)
         pytest.fail("nothing was downloaded")
