@@ -5,8 +5,8 @@ import shutil
 import socket
 import subprocess
 import time
-from contextlib import suppress
 import urllib.request
+from contextlib import suppress
 from pathlib import Path
 from typing import Any
 
