@@ -212,6 +212,35 @@ def test_learning_without_new_category_raises(trained: Path, tmp_path: Path) -> 
         learn_on_folder(trained, dataset, tmp_path / "m.npz")
 
 
+@pytest.mark.parametrize(
+    ("names", "reason"),
+    [
+        (("Box", "cone"), "Box: the model calls it box; rename the folder"),
+        (("Unknown", "cone"), "Unknown: the model calls it unknown"),
+        (("cone", "Cone"), "cone: there is also a folder Cone"),
+        (("tea  pot", "cone"), "tea  pot: expected 'tea pot'"),
+        (("cafe\u0301", "cone"), "expected 'caf\u00e9' instead of 'cafe\\\\u0301'"),
+        (("delete", "cone"), "delete: reserved"),
+        (("merge with 3", "cone"), "merge with 3: reserved"),
+        (("DontCare", "cone"), "DontCare: reserved"),
+        (("50%", "cone"), "50%: reserved, or not a letter"),
+    ],
+)
+def test_folder_names_that_no_label_can_have_are_refused(
+    tmp_path: Path, names: tuple[str, ...], reason: str
+) -> None:
+    """Runs of a model with such a category could not be exported."""
+    for name in names:
+        (tmp_path / "data" / name / "x").mkdir(parents=True)
+        (tmp_path / "data" / name / "x" / "0.npz").touch()
+
+    with pytest.raises(RecordingError, match=reason):
+        learn_on_folder(None, tmp_path / "data", tmp_path / "m.npz")
+    if names[0] != "Box":
+        with pytest.raises(RecordingError, match=reason):
+            train_on_folder(tmp_path / "data", tmp_path / "m.npz")
+
+
 def test_evaluation_on_untrained_category_raises(trained: Path, tmp_path: Path) -> None:
     """Counted as wrong, it would distort the metrics without notice."""
     dataset = write_dataset(tmp_path / "data", ("plate",), instances=1)

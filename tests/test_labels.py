@@ -102,6 +102,8 @@ def test_category_names_are_normalised(run: Path, label: str, meant: str) -> Non
         ("pan", "For a new category write `new pan`"),
         ("merge with", "is not a category, `delete` or `merge with N`"),
         ("merge 2", "is not a category"),
+        ("new delete", "is not a category"),
+        ("new merge with 1", "is not a category"),
         ("merge with 77", "there is no track 77"),
         ("merge with 4", "forms a loop: 4 -> 4"),
         ("7", "is not a category"),

@@ -12,6 +12,7 @@ from shapecat.config import Settings
 from shapecat.description import BLOCKS, DESCRIPTOR_NAMES
 from shapecat.errors import ModelError, RecordingError
 from shapecat.evaluation.dataset import read_dataset
+from shapecat.evaluation.names import require_category_names
 from shapecat.evaluation.report import evaluate
 from shapecat.evaluation.views import DescribedViews, describe_views
 from shapecat.learning import Categorizer, load_model, save_model
@@ -46,7 +47,8 @@ def train_on_folder(
 
     Raises
     ------
-    RecordingError : there are no views, one cannot be read, or there are fewer than two categories.
+    RecordingError : there are no views, one cannot be read, a folder has an invalid name, or there
+        are fewer than two categories.
     OutputError : the model cannot be written.
     """
     views = _describe_folder(root, seed, observe)
@@ -85,7 +87,7 @@ def learn_on_folder(
 
     Raises
     ------
-    RecordingError : there are no views, or one cannot be read.
+    RecordingError : there are no views, one cannot be read, or a folder has an invalid name.
     ModelError : the model is unusable, or there is no new category.
     OutputError : the result cannot be written.
     """
@@ -94,7 +96,7 @@ def learn_on_folder(
 
     categorizer = load_model(model)
     categorizer.require_descriptor(DESCRIPTOR_NAMES)
-    views = _describe_folder(root, seed, observe)
+    views = _describe_folder(root, seed, observe, categorizer.categories)
     views = views.where(views.labels != UNKNOWN)
     if not set(views.labels.tolist()) - set(categorizer.categories):
         msg = (
@@ -157,8 +159,12 @@ def split_instances(labels: np.ndarray, instances: np.ndarray, rng: np.random.Ge
     return held_out
 
 
-def _describe_folder(root: Path, seed: int, observe: Observer) -> DescribedViews:
+def _describe_folder(
+    root: Path, seed: int, observe: Observer, known: tuple[str, ...] = ()
+) -> DescribedViews:
+    """Describe a data set from which a model that has ``known`` categories will learn."""
     dataset = read_dataset(root)
+    require_category_names(root, dataset.categories, known)
     settings = replace(Settings(), seed=seed)
     return describe_views(
         dataset, settings=settings, total=len(dataset), phase="train", observe=observe

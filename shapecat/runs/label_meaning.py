@@ -11,11 +11,20 @@ from typing import NamedTuple
 from shapecat.runs.track_table import TrackRow
 from shapecat.types import CATEGORIES, UNKNOWN
 
-__all__ = ["DELETE", "TrackLabel", "find_misread", "merged_with", "merging_with", "resolve_labels"]
+__all__ = [
+    "DELETE",
+    "TrackLabel",
+    "find_misread",
+    "is_category_name",
+    "merged_with",
+    "merging_with",
+    "resolve_labels",
+]
 
 DELETE = "delete"
 
 _MERGE = re.compile(r"merged? +(?:with|into) +#?(\d{1,9})(?:[.,]0*)?", re.IGNORECASE)
+_COMMAND = re.compile(r"(merged?( |$)|del(ete)?$|remove$)", re.IGNORECASE)
 _NEW = re.compile(r"new +(.+)", re.IGNORECASE)
 _RESERVED = ("none", "dontcare")
 """Names that mean "no object" in exported formats."""
@@ -152,8 +161,7 @@ def _understand(label: str, known: dict[str, str]) -> _Verdict:
         return merge
     new = _NEW.fullmatch(label)
     name = new[1] if new else label
-    command = re.match(r"(merged?( |$)|del$|remove$)", label, re.IGNORECASE)
-    if command or name.lower() in _RESERVED or not _NAME.fullmatch(_without_marks(name)):
+    if not is_category_name(name):
         msg = f"{label!r} is not a category, `{DELETE}` or `merge with N`"
         raise ValueError(msg)
     near = _nearest(name.lower(), [*known, DELETE])
@@ -162,6 +170,18 @@ def _understand(label: str, known: dict[str, str]) -> _Verdict:
         msg = f"{label!r}: did you mean {meant}? For a new category write `new {name}`"
         raise ValueError(msg)
     return known.setdefault(name.lower(), name)
+
+
+def is_category_name(name: str) -> bool:
+    """Return whether a text can name a category: neither a command nor a reserved name.
+
+    Examples
+    --------
+    >>> is_category_name("tea pot"), is_category_name("merge with 3"), is_category_name("none")
+    (True, False, False)
+    """
+    allowed = _NAME.fullmatch(_without_marks(name)) and not _COMMAND.match(name)
+    return bool(allowed) and name.lower() not in _RESERVED
 
 
 def _without_marks(text: str) -> str:

@@ -1,0 +1,44 @@
+"""Names of category folders to learn from: runs of the model must accept them as labels."""
+
+import unicodedata
+from collections.abc import Iterable
+from pathlib import Path
+
+from shapecat.errors import RecordingError
+from shapecat.runs.label_meaning import is_category_name
+from shapecat.types import UNKNOWN
+
+__all__ = ["require_category_names"]
+
+
+def require_category_names(root: Path, names: Iterable[str], known: Iterable[str] = ()) -> None:
+    """Check the category folders of a data set for training.
+
+    Parameters
+    ----------
+    root : folder of the data set, which error messages name.
+    names : names of its category folders.
+    known : categories that the model knows already.
+
+    Raises
+    ------
+    RecordingError : a name cannot be a label, or differs only in case from another one.
+    """
+    known = (UNKNOWN, *known)
+    spelled = {name.lower(): name for name in known}
+    for name in sorted(set(names) - set(known)):
+        plain = " ".join(unicodedata.normalize("NFC", name).split())
+        if plain.lower() in spelled:
+            problem = f"the model calls it {spelled[plain.lower()]}"
+            if spelled[plain.lower()] not in known:
+                problem = f"there is also a folder {spelled[plain.lower()]}"
+        elif plain != name:
+            # Labels have single spaces and composed accents.
+            problem = f"expected {plain!r} instead of {name!a}"
+        elif not is_category_name(name):
+            problem = "reserved, or not a letter and up to 59 letters, digits and .+&'()-_"
+        else:
+            spelled[name.lower()] = name
+            continue
+        msg = f"{root / name}: {problem}; rename the folder"
+        raise RecordingError(msg)
