@@ -180,6 +180,16 @@ def test_views_are_sorted_by_path(tmp_path: Path) -> None:
     assert dataset.categories == ("a", "b")
 
 
+def test_hidden_files_are_no_views(tmp_path: Path) -> None:
+    """Notebooks, macOS and waste bins leave them; the data set itself may be in a hidden folder."""
+    root = tmp_path / ".cache" / "data"
+    for name in ("cup/a/0.pcd", "cup/a/._0.pcd", "cup/.ipynb_checkpoints/0.pcd", ".Trash/b/0.pcd"):
+        (root / name).parent.mkdir(parents=True, exist_ok=True)
+        (root / name).touch()
+
+    assert read_dataset(root).files == (root / "cup" / "a" / "0.pcd",)
+
+
 @pytest.mark.parametrize(
     ("points", "reason"),
     [

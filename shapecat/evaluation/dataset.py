@@ -53,13 +53,20 @@ class Dataset:
 
 
 def read_dataset(root: Path) -> Dataset:
-    """Find the files of a data set.
+    """Find the files of a data set; hidden files and folders are no part of it.
 
     Raises
     ------
     RecordingError : the folder holds no views.
     """
-    files = tuple(sorted(path for path in root.glob("*/*/*") if path.suffix.lower() in _READERS))
+    files = tuple(
+        sorted(
+            path
+            for path in root.glob("*/*/*")
+            if path.suffix.lower() in _READERS
+            and not any(part.startswith(".") for part in path.relative_to(root).parts)
+        )
+    )
     if not files:
         msg = (
             f"{root}: no views found; expected files such as "
