@@ -20,13 +20,13 @@ from shapecat.learning.calibration import fit_temperature, softmax
 from shapecat.learning.features import FeatureBank
 from shapecat.learning.forest import FlatForest
 from shapecat.learning.incremental import _STEPS, _fit_new, _Inputs, _shift, add_categories
+from shapecat.learning.known_views import choose_evenly
 from shapecat.learning.pnn import fit_bank
 from shapecat.learning.shape_functions import shape_functions
 from shapecat.learning.training import (
     Examples,
     LearningSettings,
     calibrate,
-    choose_evenly,
     encode,
     fit_categorizer,
     fit_chain,
@@ -356,6 +356,22 @@ def test_categories_can_be_added_twice(categorizer: Categorizer) -> None:
     assert np.mean(twice.predict(far).posteriors.argmax(axis=1) == 4) > 0.9
     with pytest.raises(ValueError, match="no new category"):
         add_categories(twice, far, ["spoon"] * 20, rng=rng)
+
+
+def test_learning_stores_a_limited_number_of_views(
+    categorizer: Categorizer, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """With all views of large data sets, the model file would be too large to be read."""
+    monkeypatch.setattr("shapecat.learning.incremental.KNOWN_VIEWS", 100)
+    cone = blobs(90, 7, ("cone",))
+    model = add_categories(
+        categorizer, cone.descriptors, cone.labels.tolist(), rng=np.random.default_rng(0)
+    )
+
+    assert np.bincount(model.known_category).tolist() == [20] * 5
+    z = categorizer.bank.standardise(cone.descriptors).astype(np.float16)
+    stored = model.known_descriptors[model.known_category == 3]
+    assert all(np.any(np.all(row == z, axis=1)) for row in stored)
 
 
 @pytest.mark.parametrize("left", [[1, 1, 0], [1, 0], [2, 0, 0], [1, 2, 3, 0, 0]])

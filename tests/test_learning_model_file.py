@@ -94,6 +94,19 @@ def test_model_file_is_reproducible(saved: Path, tmp_path: Path) -> None:
     assert second.read_bytes() == saved.read_bytes()
 
 
+@pytest.mark.parametrize("limit", ["_LARGEST_FILE", "_LARGEST_PART"])
+def test_too_large_models_replace_nothing(
+    saved: Path, monkeypatch: pytest.MonkeyPatch, limit: str
+) -> None:
+    """Nothing could read them."""
+    before = saved.read_bytes()
+    monkeypatch.setattr(model_file, limit, 1000)
+
+    with pytest.raises(OutputError, match="the model is too large"):
+        save_model(saved, tiny())
+    assert saved.read_bytes() == before
+
+
 def test_model_id_depends_on_content(saved: Path) -> None:
     def raise_temperature(members: dict[str, bytes]) -> None:
         header = json.loads(members["header.json"])

@@ -13,6 +13,7 @@ from shapecat.arrays import F4, F8, I4, Bool
 from shapecat.errors import ModelError
 from shapecat.learning.categorizer import Categorizer
 from shapecat.learning.features import FeatureBank
+from shapecat.learning.known_views import KNOWN_VIEWS, choose_evenly
 
 __all__ = ["add_categories"]
 
@@ -100,6 +101,8 @@ def add_categories(
     linear[: old.shape[1], : categorizer.linear.shape[1]] = categorizer.linear
     linear[old.shape[1] :] = learned[: bank.width].T
     votes = np.concatenate([categorizer.votes, learned[bank.width : -1]], axis=1)
+    columns = np.argsort(order)[truth]
+    stored = choose_evenly(columns, KNOWN_VIEWS, rng)
     return replace(
         categorizer,
         categories=categories,
@@ -107,8 +110,8 @@ def add_categories(
         votes=votes[:, order],
         linear=linear[order],
         bias=np.concatenate([categorizer.bias, learned[-1]])[order],
-        known_descriptors=z,
-        known_category=np.argsort(order)[truth],
+        known_descriptors=z[stored],
+        known_category=columns[stored],
         notes={**categorizer.notes, "added": [*categorizer.notes.get("added", []), *added]},
     )
 

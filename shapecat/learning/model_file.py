@@ -36,7 +36,8 @@ def save_model(path: Path, categorizer: Categorizer) -> None:
 
     Raises
     ------
-    OutputError : the file cannot be written, or exists and is not a model.
+    OutputError : the file cannot be written, or exists and is not a model, or the model is larger
+        than `load_model` reads.
     """
     require_model_path(path)
     parts = parts_of(categorizer)
@@ -50,6 +51,13 @@ def save_model(path: Path, categorizer: Categorizer) -> None:
             little = parts[name].astype(parts[name].dtype.newbyteorder("<"), copy=False)
             np.lib.format.write_array(content, np.ascontiguousarray(little), allow_pickle=False)
             _write_member(archive, f"{name}.npy", content.getvalue())
+        unpacked = sum(item.file_size for item in archive.infolist())
+    if buffer.tell() > _LARGEST_FILE or unpacked > _LARGEST_PART:
+        msg = (
+            f"{path}: the model is too large ({buffer.tell() >> 20} MB, unpacked "
+            f"{unpacked >> 20} MB); learn fewer categories"
+        )
+        raise OutputError(msg)
     with replacing(path) as hidden:
         hidden.write_bytes(buffer.getvalue())
 

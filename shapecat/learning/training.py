@@ -12,13 +12,13 @@ from shapecat.learning.boosted import Dictionary, grow_dictionary
 from shapecat.learning.calibration import fit_temperature
 from shapecat.learning.categorizer import Categorizer
 from shapecat.learning.features import FeatureBank
+from shapecat.learning.known_views import KNOWN_VIEWS, choose_evenly
 from shapecat.learning.pnn import fit_bank
 
 __all__ = [
     "Examples",
     "LearningSettings",
     "calibrate",
-    "choose_evenly",
     "encode",
     "fit_categorizer",
     "fit_chain",
@@ -40,7 +40,7 @@ class LearningSettings:
     """Maximum number of leaves (words) of a tree."""
     rate: float = 0.06
     """Learning rate of the boosting."""
-    known_views: int = 3000
+    known_views: int = KNOWN_VIEWS
     """Views stored in the model as negative examples for new categories."""
     rejected: float = 0.05
     """Fraction of held-out views of known categories that the novelty threshold rejects."""
@@ -160,22 +160,6 @@ def fit_chain(
 def _notes_of(settings: LearningSettings) -> dict[str, Any]:
     """Return the settings that affect the model: all except the number of jobs."""
     return {name: value for name, value in asdict(settings).items() if name != "jobs"}
-
-
-def choose_evenly(codes: I4, count: int, rng: np.random.Generator) -> I4:
-    """Return up to ``count`` indices of views, ascending, drawn evenly from all categories.
-
-    Parameters
-    ----------
-    codes : (n,) category of each view; views with a negative code are left out.
-    """
-    order = rng.permutation(len(codes))
-    order = order[codes[order] >= 0]
-    rank = np.zeros(len(order), np.int64)
-    for code in np.unique(codes[order]):
-        mine = codes[order] == code
-        rank[mine] = np.arange(np.count_nonzero(mine))
-    return np.sort(order[np.argsort(rank, kind="stable")][:count])
 
 
 def calibrate(categorizer: Categorizer, held_out: Examples, *, rejected: float) -> Categorizer:

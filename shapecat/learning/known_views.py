@@ -1,0 +1,26 @@
+"""The views that a model stores as negative examples for new categories."""
+
+import numpy as np
+
+from shapecat.arrays import I4
+
+__all__ = ["KNOWN_VIEWS", "choose_evenly"]
+
+KNOWN_VIEWS = 3000
+"""Most views that a model stores."""
+
+
+def choose_evenly(codes: I4, count: int, rng: np.random.Generator) -> I4:
+    """Return up to ``count`` indices of views, ascending, drawn evenly from all categories.
+
+    Parameters
+    ----------
+    codes : (n,) category of each view; views with a negative code are left out.
+    """
+    order = rng.permutation(len(codes))
+    order = order[codes[order] >= 0]
+    rank = np.zeros(len(order), np.int64)
+    for code in np.unique(codes[order]):
+        mine = codes[order] == code
+        rank[mine] = np.arange(np.count_nonzero(mine))
+    return np.sort(order[np.argsort(rank, kind="stable")][:count])
