@@ -33,6 +33,11 @@ def train(*, dataset: Path, out: Path, seed: int, as_json: bool) -> None:
     require_model_path(out)
     with progress_bars() as bars:
         result = train_on_folder(dataset, out, seed=seed, observe=bars)
+    if not result["calibrated"]:
+        click.echo(
+            "the confidence is not calibrated: most categories have only one object",
+            err=True,
+        )
     if as_json:
         print_json(result)
     else:

@@ -321,7 +321,7 @@ CALLS = {
         "shapecat.evaluation.training.train_on_folder",
         [Path("data"), Path("m.npz")],
         {"seed": 5},
-        {"categories": ["cup", "can"], "views": 1},
+        {"categories": ["cup", "can"], "views": 1, "calibrated": True},
         "m.npz: 1 view of cup, can\n",
     ),
     "export a b --format coco --out o --every 3 --per-track 7 --min-confidence 0.6 "
@@ -372,6 +372,18 @@ def test_options_are_passed_on_and_results_printed(
 
     assert (done.exit_code, done.stdout) == (0, printed), done.stderr
     assert calls == [(words, options)]
+
+
+def test_train_says_that_confidences_are_not_calibrated(
+    shapecat: Run, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Users would trust them."""
+    answer = {"categories": ["cup", "can"], "views": 2, "calibrated": False}
+    monkeypatch.setattr("shapecat.evaluation.training.train_on_folder", lambda *_, **__: answer)
+    done = shapecat("train", "data", "--out", tmp_path / "m.npz")
+
+    assert done.exit_code == 0
+    assert done.stderr.startswith("the confidence is not calibrated")
 
 
 def test_annotate_reports_written_files_and_untransferred_labels(

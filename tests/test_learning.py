@@ -282,7 +282,29 @@ def test_temperature_is_recovered(temperature: float, seed: int) -> None:
     above = rng.random((4000, 1)) > np.cumsum(softmax(logits), axis=1)
     labels = above[:, :4].sum(axis=1)
 
-    assert fit_temperature(logits * temperature, labels) == pytest.approx(temperature, rel=0.12)
+    fitted = fit_temperature(logits * temperature, labels, len(labels))
+    assert fitted == pytest.approx(temperature, rel=0.12)
+
+
+@pytest.mark.parametrize("objects", [1, 8, 98])
+def test_confidence_is_limited_by_number_of_held_out_objects(objects: int) -> None:
+    """If all are right, the most probable confidence is 1, also of wrong labels."""
+    logits = np.eye(3)[np.arange(30) % 3] * 6.0
+    temperature = fit_temperature(logits, np.arange(30) % 3, objects)
+
+    confidence = softmax(logits / temperature).max(axis=1)
+    assert confidence == pytest.approx((objects + 1) / (objects + 2), abs=1e-4)
+
+
+@pytest.mark.parametrize(("names", "fitted"), [(("cup",), False), (("cup", "can"), True)])
+def test_temperature_needs_views_of_half_of_the_categories(
+    categorizer: Categorizer, names: tuple[str, ...], fitted: bool
+) -> None:
+    """Views of one category say nothing about the others."""
+    model = calibrate(categorizer, blobs(20, 2, names), rejected=0.05)
+
+    assert (model.temperature != 1.0) == fitted
+    assert model.threshold != categorizer.threshold
 
 
 def test_unused_blocks_have_no_influence() -> None:

@@ -42,8 +42,9 @@ def train_on_folder(
 
     Returns
     -------
-    Plain values: ``views``, ``skipped``, ``categories``, ``model`` (its id), and ``held_out``, the
-    report on the instances held out.
+    Plain values: ``views``, ``skipped``, ``categories``, ``model`` (its id), ``calibrated``,
+    whether enough instances were held out to fit the temperature, and ``held_out``, the report on
+    them.
 
     Raises
     ------
@@ -51,6 +52,9 @@ def train_on_folder(
         are fewer than two categories.
     OutputError : the model cannot be written.
     """
+    # Only training needs these parts of SciPy.
+    from shapecat.learning.calibration import can_calibrate  # noqa: PLC0415
+
     views = _describe_folder(root, seed, observe)
     categories = order_categories(views.labels)
     if len(categories) < 2:
@@ -67,7 +71,8 @@ def train_on_folder(
     )
     model = replace(model, threshold=judged.threshold)
     save_model(out, model)
-    return _summary(views, model) | {"held_out": report.as_dict()}
+    calibrated = can_calibrate(judges.labels.tolist(), categories)
+    return _summary(views, model) | {"calibrated": calibrated, "held_out": report.as_dict()}
 
 
 def learn_on_folder(

@@ -1,11 +1,19 @@
 """Calibration of confidences by one temperature, fitted on held-out instances."""
 
+from collections.abc import Iterable
+
 import numpy as np
 from scipy.optimize import minimize_scalar
 
 from shapecat.arrays import F8, I4
 
-__all__ = ["fit_temperature", "softmax"]
+__all__ = ["can_calibrate", "fit_temperature", "softmax"]
+
+
+def can_calibrate(held_out: Iterable[str], categories: Iterable[str]) -> bool:
+    """Return whether the labels of held-out views cover at least half of the categories."""
+    names = set(categories)
+    return 2 * len(names & set(held_out)) >= len(names)
 
 
 def softmax(logits: F8) -> F8:
@@ -14,31 +22,37 @@ def softmax(logits: F8) -> F8:
     return np.asarray(shifted / shifted.sum(axis=1, keepdims=True))
 
 
-def fit_temperature(logits: F8, labels: I4) -> float:
+def fit_temperature(logits: F8, labels: I4, objects: int) -> float:
     """Return the temperature T that makes ``softmax(logits / T)`` fit the labels best.
 
     T minimises the negative log-likelihood in [0.05, 20]. It does not change the order of the
-    categories of a view.
+    categories of a view. If all n objects are categorized correctly, the likelihood would be
+    largest for a confidence of 1; the target is then (n + 1) / (n + 2) for the true category.
 
     Parameters
     ----------
     logits : (n, c).
     labels : (n,) true column of each row.
+    objects : number of objects that the rows show.
 
-    Source: Guo et al. 2017, section 4.2.
+    Sources: Guo et al. 2017, section 4.2; targets: Platt 1999.
 
     Examples
     --------
     >>> logits = np.log([[0.8, 0.2]] * 5)
-    >>> round(fit_temperature(3 * logits, np.array([0, 0, 0, 0, 1])), 2)
+    >>> round(fit_temperature(3 * logits, np.array([0, 0, 0, 0, 1]), 5), 2)
     3.0
     """
-    rows = np.arange(len(labels))
+    targets = np.eye(logits.shape[1])[labels]
+    if np.all(logits.argmax(axis=1) == labels):
+        doubt = 1.0 / (objects + 2)
+        targets = np.where(targets > 0, 1.0 - doubt, doubt / (logits.shape[1] - 1))
 
     def loss(log_temperature: float) -> float:
         scaled = logits / np.exp(log_temperature)
         scaled = scaled - scaled.max(axis=1, keepdims=True)
-        return float(np.mean(np.log(np.exp(scaled).sum(axis=1)) - scaled[rows, labels]))
+        own = (targets * scaled).sum(axis=1)
+        return float(np.mean(np.log(np.exp(scaled).sum(axis=1)) - own))
 
     bounds = (np.log(0.05), np.log(20.0))
     found = minimize_scalar(loss, bounds=bounds, method="bounded", options={"xatol": 1e-6})

@@ -9,7 +9,7 @@ from sklearn.utils import check_random_state
 
 from shapecat.arrays import F4, I4
 from shapecat.learning.boosted import Dictionary, grow_dictionary
-from shapecat.learning.calibration import fit_temperature
+from shapecat.learning.calibration import can_calibrate, fit_temperature
 from shapecat.learning.categorizer import Categorizer
 from shapecat.learning.features import FeatureBank
 from shapecat.learning.known_views import KNOWN_VIEWS, choose_evenly
@@ -165,6 +165,8 @@ def _notes_of(settings: LearningSettings) -> dict[str, Any]:
 def calibrate(categorizer: Categorizer, held_out: Examples, *, rejected: float) -> Categorizer:
     """Fit the temperature and the novelty threshold on held-out views.
 
+    The temperature stays 1 if less than half of the categories have held-out views.
+
     Parameters
     ----------
     held_out : views of instances that training has not seen. Views whose label is not a category of
@@ -172,12 +174,16 @@ def calibrate(categorizer: Categorizer, held_out: Examples, *, rejected: float) 
     rejected : fraction of the views that the novelty threshold rejects.
     """
     codes = encode(held_out.labels, categorizer.categories)
-    views, codes = held_out.descriptors[codes >= 0], codes[codes >= 0]
+    known = codes >= 0
+    views, codes = held_out.descriptors[known], codes[known]
     if codes.size == 0:
         return categorizer
-    plain = replace(categorizer, temperature=1.0).predict(views)
-    logits = np.log(np.maximum(plain.posteriors.astype(np.float64), 1e-30))
-    fitted = replace(categorizer, temperature=fit_temperature(logits, codes))
+    fitted = replace(categorizer, temperature=1.0)
+    if can_calibrate(held_out.labels.tolist(), categorizer.categories):
+        posteriors = fitted.predict(views).posteriors.astype(np.float64)
+        objects = np.unique(held_out.instances[known]).size
+        temperature = fit_temperature(np.log(np.maximum(posteriors, 1e-30)), codes, objects)
+        fitted = replace(fitted, temperature=temperature)
     return fit_threshold(fitted, held_out, rejected=rejected)
 
 
