@@ -1,6 +1,8 @@
 """Tests of point cloud files of data sets: every encoding, and hostile input."""
 
+import io
 import struct
+import zipfile
 from pathlib import Path
 
 import numpy as np
@@ -215,6 +217,53 @@ def test_pickled_points_are_not_loaded(tmp_path: Path) -> None:
 
     with pytest.raises(RecordingError, match=r"not an \.npz file"):
         read_view(path)
+
+
+def damaged_archives() -> dict[str, bytes]:
+    """Return archives that NumPy and zipfile refuse, each with another kind of error."""
+    stream = io.BytesIO()
+    np.savez_compressed(stream, allow_pickle=False, points=np.random.default_rng(0).random((99, 3)))
+    deflated = bytearray(stream.getvalue())
+    deflated[60:64] = b"\xff" * 4  # the first bytes behind the name
+    found = {"damaged deflate": bytes(deflated)}
+    for name, method in (("lzma", zipfile.ZIP_LZMA), ("bzip2", zipfile.ZIP_BZIP2)):
+        stream = io.BytesIO()
+        with zipfile.ZipFile(stream, "w", method) as archive:
+            archive.writestr("points.npy", bytes(range(256)) * 20)
+        content = bytearray(stream.getvalue())
+        content[50:90] = b"\xff" * 40
+        found[f"damaged {name}"] = bytes(content)
+    stream = io.BytesIO()
+    np.save(stream, np.zeros((5, 3)))
+    found["one array"] = stream.getvalue()
+    stream = io.BytesIO()
+    header = {"descr": "<f8", "fortran_order": False, "shape": (10**12, 3)}
+    with zipfile.ZipFile(stream, "w") as archive, archive.open("points.npy", "w") as member:
+        np.lib.format.write_array_header_1_0(member, header)
+    found["endless"] = stream.getvalue()
+    unknown = bytearray(found["endless"])
+    unknown[unknown.index(b"PK\x01\x02") + 10] = 99
+    found["unknown compression"] = bytes(unknown)
+    return found
+
+
+@pytest.mark.parametrize("kind", damaged_archives())
+def test_damaged_archives_raise_with_path(tmp_path: Path, kind: str) -> None:
+    """Each part of the reader has errors of its own."""
+    path = tmp_path / "cup" / "mug" / "0.npz"
+    path.parent.mkdir(parents=True)
+    path.write_bytes(damaged_archives()[kind])
+
+    with pytest.raises(RecordingError, match=r"not an \.npz file"):
+        read_view(path)
+
+
+def test_viewpoint_far_away_counts_as_unknown(tmp_path: Path) -> None:
+    """Distances to it would be infinite."""
+    points = np.random.default_rng(0).random((50, 3)).astype(np.float32)
+    view = read_view(save(tmp_path, points, viewpoint=np.array([1e300, 0, 1])))
+
+    assert view.eye.tolist() == find_viewpoint(points).tolist()
 
 
 @pytest.mark.parametrize("azimuth_deg", [0, 45, 130, 250])

@@ -4,7 +4,9 @@ Each file holds one partial view, in metres, with z up and the supporting plane 
 VIEWPOINT of a PCD file is the position of the sensor.
 """
 
+import lzma
 import zipfile
+import zlib
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from pathlib import Path
@@ -18,6 +20,19 @@ from shapecat.evaluation.clouds import CloudFile, read_pcd, read_ply
 __all__ = ["Dataset", "View", "find_viewpoint", "read_dataset", "read_view"]
 
 _FARTHEST_M = 100.0
+_DAMAGED = (
+    OSError,
+    ValueError,
+    KeyError,
+    EOFError,
+    TypeError,  # the content of an .npy file
+    MemoryError,  # a header that claims too many points
+    RuntimeError,  # encrypted, or an unknown compression
+    zipfile.BadZipFile,
+    zlib.error,
+    lzma.LZMAError,
+)
+"""Errors of NumPy for damaged .npz files."""
 
 
 class View(Record):
@@ -107,7 +122,7 @@ def _read_npz(path: Path) -> CloudFile:
         with np.load(path, allow_pickle=False) as content:
             points = np.asarray(content["points"], np.float64)
             eye = np.asarray(content["viewpoint"], np.float64) if "viewpoint" in content else None
-    except (OSError, ValueError, KeyError, EOFError, zipfile.BadZipFile) as error:
+    except _DAMAGED as error:
         msg = f"{path}: not an .npz file with an array `points`: {error}"
         raise RecordingError(msg) from error
     return CloudFile(points, eye)
@@ -122,9 +137,9 @@ _READERS: dict[str, Callable[[Path], CloudFile]] = {
 
 def _valid_eye(eye: F8 | None) -> F8 | None:
     """Return a viewpoint (3,); None if it is invalid or the origin, which means unknown."""
-    if eye is None or eye.shape != (3,) or not np.all(np.isfinite(eye)) or not np.any(eye):
+    if eye is None or eye.shape != (3,) or not np.any(eye):
         return None
-    return eye
+    return eye if np.all(np.abs(eye) <= _FARTHEST_M) else None
 
 
 def find_viewpoint(points: F4) -> F8:
