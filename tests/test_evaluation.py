@@ -241,6 +241,18 @@ def test_folder_names_that_no_label_can_have_are_refused(
             train_on_folder(tmp_path / "data", tmp_path / "m.npz")
 
 
+def test_too_many_categories_are_refused_before_views_are_described(tmp_path: Path) -> None:
+    """It would fail only after the fit. The default model has seven categories."""
+    for k in range(255):
+        (tmp_path / "data" / f"kind {k}" / "x").mkdir(parents=True)
+        (tmp_path / "data" / f"kind {k}" / "x" / "0.npz").touch()
+
+    with pytest.raises(ModelError, match="can have 254 categories, not 262"):
+        learn_on_folder(None, tmp_path / "data", tmp_path / "m.npz")
+    with pytest.raises(ModelError, match="can have 254 categories, not 255"):
+        train_on_folder(tmp_path / "data", tmp_path / "m.npz")
+
+
 def test_evaluation_on_untrained_category_raises(trained: Path, tmp_path: Path) -> None:
     """Counted as wrong, it would distort the metrics without notice."""
     dataset = write_dataset(tmp_path / "data", ("plate",), instances=1)

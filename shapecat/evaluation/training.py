@@ -16,6 +16,7 @@ from shapecat.evaluation.names import require_category_names
 from shapecat.evaluation.report import evaluate
 from shapecat.evaluation.views import DescribedViews, describe_views
 from shapecat.learning import Categorizer, load_model, save_model
+from shapecat.learning.categorizer import MOST_CATEGORIES
 from shapecat.system.progress import Observer, ignore
 from shapecat.types import CATEGORIES, UNKNOWN
 
@@ -50,6 +51,7 @@ def train_on_folder(
     ------
     RecordingError : there are no views, one cannot be read, a folder has an invalid name, or there
         are fewer than two categories.
+    ModelError : there are too many categories.
     OutputError : the model cannot be written.
     """
     # Only training needs these parts of SciPy.
@@ -93,7 +95,7 @@ def learn_on_folder(
     Raises
     ------
     RecordingError : there are no views, one cannot be read, or a folder has an invalid name.
-    ModelError : the model is unusable, or there is no new category.
+    ModelError : the model is unusable, or there is no new category, or there are too many.
     OutputError : the result cannot be written.
     """
     # Only learning needs these parts of SciPy.
@@ -170,6 +172,10 @@ def _describe_folder(
     """Describe a data set from which a model that has ``known`` categories will learn."""
     dataset = read_dataset(root)
     require_category_names(root, dataset.categories, known)
+    count = len({*known, *dataset.categories} - {UNKNOWN})
+    if count > MOST_CATEGORIES:
+        msg = f"{root}: a model can have {MOST_CATEGORIES} categories, not {count}"
+        raise ModelError(msg)
     settings = replace(Settings(), seed=seed)
     return describe_views(
         dataset, settings=settings, total=len(dataset), phase="train", observe=observe

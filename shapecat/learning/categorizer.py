@@ -15,7 +15,10 @@ from shapecat.jit import kernel
 from shapecat.learning.features import FeatureBank, write_features
 from shapecat.learning.forest import FlatForest, apply
 
-__all__ = ["Categorizer", "Prediction", "parts_of"]
+__all__ = ["MOST_CATEGORIES", "Categorizer", "Prediction", "parts_of"]
+
+MOST_CATEGORIES = 254
+"""Most categories of a model."""
 
 _LARGEST = 1e6
 """Bound on the weights of a model: far above real ones, and their sums stay finite."""
@@ -80,7 +83,7 @@ class Categorizer(Record):
             "categories": self.bias.size - len(self.categories) in {0, 1}
             and self.bank.categories == len(self.categories),
             "category names": len(set(self.categories)) == len(self.categories)
-            and 0 < len(self.categories) <= 254,
+            and 0 < len(self.categories) <= MOST_CATEGORIES,
             "words": self.forest.words == len(self.votes),
             "features": self.linear.shape[1]
             == self.bank.width
