@@ -7,7 +7,7 @@ import click
 from shapecat.outputs.counts import plural
 
 from .options import ANY_PATH, json_option, seed_option
-from .render import print_json, progress_bars
+from .render import note_skipped, print_json, progress_bars
 
 
 @click.command()
@@ -34,6 +34,7 @@ def learn(*, model: Path, dataset: Path, out: Path, seed: int, as_json: bool) ->
     require_model_path(out)
     with progress_bars() as bars:
         result = learn_on_folder(source, dataset, out, seed=seed, observe=bars)
+    note_skipped(result)
     if as_json:
         print_json(result)
     else:

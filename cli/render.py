@@ -89,6 +89,14 @@ def print_table(columns: Sequence[str], rows: Sequence[Sequence[Any]]) -> None:
     Console(width=None if Console().is_terminal else 200).print(table)
 
 
+def note_skipped(learned: Mapping[str, Any]) -> None:
+    """Print to stderr how many views `train` or `learn` skipped, and the categories without any."""
+    if learned["skipped"]:
+        none = f"; none is left of {', '.join(learned['lost'])}" if learned["lost"] else ""
+        views = plural(learned["skipped"], "view")
+        click.echo(f"skipped {views} with too few points for a surface{none}", err=True)
+
+
 def missed_words(missed: Mapping[str, Any]) -> str:
     """Describe a label that was not transferred, with the reason."""
     return f"  track {missed['old_track']}, {missed['label']}: {missed['reason']}"

@@ -7,7 +7,7 @@ import click
 from shapecat.outputs.counts import plural
 
 from .options import ANY_PATH, json_option, seed_option
-from .render import print_json, progress_bars
+from .render import note_skipped, print_json, progress_bars
 
 
 @click.command()
@@ -33,6 +33,7 @@ def train(*, dataset: Path, out: Path, seed: int, as_json: bool) -> None:
     require_model_path(out)
     with progress_bars() as bars:
         result = train_on_folder(dataset, out, seed=seed, observe=bars)
+    note_skipped(result)
     if not result["calibrated"]:
         click.echo(
             "the confidence is not calibrated: most categories have only one object",

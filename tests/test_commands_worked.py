@@ -314,14 +314,14 @@ CALLS = {
         "shapecat.evaluation.training.learn_on_folder",
         [None, Path("data"), Path("m.npz")],
         {"seed": 5},
-        {"added": ["jar", "mug"], "views": 1075},
+        {"added": ["jar", "mug"], "views": 1075, "skipped": 0},
         "m.npz: learned jar, mug from a data set of 1,075 views\n",
     ),
     "train data --out m.npz --seed 5": (
         "shapecat.evaluation.training.train_on_folder",
         [Path("data"), Path("m.npz")],
         {"seed": 5},
-        {"categories": ["cup", "can"], "views": 1, "calibrated": True},
+        {"categories": ["cup", "can"], "views": 1, "skipped": 0, "calibrated": True},
         "m.npz: 1 view of cup, can\n",
     ),
     "export a b --format coco --out o --every 3 --per-track 7 --min-confidence 0.6 "
@@ -374,16 +374,25 @@ def test_options_are_passed_on_and_results_printed(
     assert calls == [(words, options)]
 
 
-def test_train_says_that_confidences_are_not_calibrated(
-    shapecat: Run, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+@pytest.mark.parametrize(
+    ("answer", "said"),
+    [
+        ({"calibrated": False}, "the confidence is not calibrated: most categories have only one"),
+        ({"skipped": 1}, "skipped 1 view with too few points for a surface\n"),
+        ({"skipped": 9, "lost": ["pen", "key"]}, "skipped 9 views .*; none is left of pen, key\n"),
+    ],
+)
+def test_train_names_the_defects_of_its_model(
+    shapecat: Run, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, answer: Any, said: str
 ) -> None:
-    """Users would trust them."""
-    answer = {"categories": ["cup", "can"], "views": 2, "calibrated": False}
-    monkeypatch.setattr("shapecat.evaluation.training.train_on_folder", lambda *_, **__: answer)
+    """Users would trust the confidences, and look for the missing categories in vain."""
+    good = {"categories": ["cup", "can"], "views": 2, "calibrated": True, "skipped": 0, "lost": []}
+    target = "shapecat.evaluation.training.train_on_folder"
+    monkeypatch.setattr(target, lambda *_, **__: good | answer)
     done = shapecat("train", "data", "--out", tmp_path / "m.npz")
 
     assert done.exit_code == 0
-    assert done.stderr.startswith("the confidence is not calibrated")
+    assert re.match(said, done.stderr)
 
 
 def test_annotate_reports_written_files_and_untransferred_labels(

@@ -253,6 +253,19 @@ def test_too_many_categories_are_refused_before_views_are_described(tmp_path: Pa
         train_on_folder(tmp_path / "data", tmp_path / "m.npz")
 
 
+def test_categories_without_usable_views_are_named(trained: Path, tmp_path: Path) -> None:
+    """Otherwise the model already knows all categories, or lacks one without notice."""
+    dataset = write_dataset(tmp_path / "data", ("box", "ball"), instances=2)
+    (dataset / "pen" / "x").mkdir(parents=True)
+    for k in range(3):
+        np.savez(dataset / "pen" / "x" / f"{k}.npz", points=np.eye(3) * 0.01)
+
+    with pytest.raises(RecordingError, match="no view of pen has enough points"):
+        learn_on_folder(trained, dataset, tmp_path / "m.npz")
+    done = train_on_folder(dataset, tmp_path / "m.npz")
+    assert (done["lost"], done["skipped"], done["categories"]) == (["pen"], 3, ["box", "ball"])
+
+
 def test_evaluation_on_untrained_category_raises(trained: Path, tmp_path: Path) -> None:
     """Counted as wrong, it would distort the metrics without notice."""
     dataset = write_dataset(tmp_path / "data", ("plate",), instances=1)

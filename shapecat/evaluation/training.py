@@ -43,9 +43,9 @@ def train_on_folder(
 
     Returns
     -------
-    Plain values: ``views``, ``skipped``, ``categories``, ``model`` (its id), ``calibrated``,
-    whether enough instances were held out to fit the temperature, and ``held_out``, the report on
-    them.
+    Plain values: ``views``, ``skipped``, ``lost``, categories of which all views were skipped,
+    ``categories``, ``model`` (its id), ``calibrated``, whether enough instances were held out to
+    fit the temperature, and ``held_out``, the report on them.
 
     Raises
     ------
@@ -57,7 +57,7 @@ def train_on_folder(
     # Only training needs these parts of SciPy.
     from shapecat.learning.calibration import can_calibrate  # noqa: PLC0415
 
-    views = _describe_folder(root, seed, observe)
+    views, lost = _describe_folder(root, seed, observe)
     categories = order_categories(views.labels)
     if len(categories) < 2:
         found = ", ".join(categories) or "none"
@@ -74,7 +74,7 @@ def train_on_folder(
     model = replace(model, threshold=judged.threshold)
     save_model(out, model)
     calibrated = can_calibrate(judges.labels.tolist(), categories)
-    return _summary(views, model) | {"calibrated": calibrated, "held_out": report.as_dict()}
+    return _summary(views, lost, model) | {"calibrated": calibrated, "held_out": report.as_dict()}
 
 
 def learn_on_folder(
@@ -90,11 +90,13 @@ def learn_on_folder(
 
     Returns
     -------
-    Plain values: number of views, categories, added categories, model id.
+    Plain values as of `train_on_folder`, with ``added``, the new categories, but without
+    calibration.
 
     Raises
     ------
-    RecordingError : there are no views, one cannot be read, or a folder has an invalid name.
+    RecordingError : there are no views, one cannot be read, a folder has an invalid name, or all
+        views of the new categories have too few points.
     ModelError : the model is unusable, or there is no new category, or there are too many.
     OutputError : the result cannot be written.
     """
@@ -103,9 +105,12 @@ def learn_on_folder(
 
     categorizer = load_model(model)
     categorizer.require_descriptor(DESCRIPTOR_NAMES)
-    views = _describe_folder(root, seed, observe, categorizer.categories)
+    views, lost = _describe_folder(root, seed, observe, categorizer.categories)
     views = views.where(views.labels != UNKNOWN)
     if not set(views.labels.tolist()) - set(categorizer.categories):
+        if new := [name for name in lost if name not in {UNKNOWN, *categorizer.categories}]:
+            msg = f"{root}: no view of {', '.join(new)} has enough points for a surface"
+            raise RecordingError(msg)
         msg = (
             f"{root}: model {categorizer.model_id} already knows all its categories; "
             "`shapecat train` trains a new model"
@@ -116,7 +121,7 @@ def learn_on_folder(
     )
     save_model(out, learned)
     added = learned.categories[len(categorizer.categories) :]
-    return _summary(views, learned) | {"added": list(added)}
+    return _summary(views, lost, learned) | {"added": list(added)}
 
 
 def fit_views(
@@ -168,8 +173,11 @@ def split_instances(labels: np.ndarray, instances: np.ndarray, rng: np.random.Ge
 
 def _describe_folder(
     root: Path, seed: int, observe: Observer, known: tuple[str, ...] = ()
-) -> DescribedViews:
-    """Describe a data set from which a model that has ``known`` categories will learn."""
+) -> tuple[DescribedViews, list[str]]:
+    """Describe a data set from which a model that has ``known`` categories will learn.
+
+    Return the described views, and the categories without any.
+    """
     dataset = read_dataset(root)
     require_category_names(root, dataset.categories, known)
     count = len({*known, *dataset.categories} - {UNKNOWN})
@@ -177,15 +185,17 @@ def _describe_folder(
         msg = f"{root}: a model can have {MOST_CATEGORIES} categories, not {count}"
         raise ModelError(msg)
     settings = replace(Settings(), seed=seed)
-    return describe_views(
+    views = describe_views(
         dataset, settings=settings, total=len(dataset), phase="train", observe=observe
     )
+    return views, sorted(set(dataset.categories) - set(views.labels.tolist()))
 
 
-def _summary(views: DescribedViews, model: Categorizer) -> dict[str, Any]:
+def _summary(views: DescribedViews, lost: list[str], model: Categorizer) -> dict[str, Any]:
     return {
         "views": len(views.labels),
         "skipped": views.skipped,
+        "lost": lost,
         "categories": list(model.categories),
         "model": model.model_id,
     }
