@@ -641,6 +641,15 @@ def test_baselines_need_two_objects_of_each_category(trained: Path, tmp_path: Pa
         evaluate_folder(dataset, trained, baselines=dataset)
 
 
+def test_baselines_are_not_tested_on_unknown_shapes_alone(trained: Path, tmp_path: Path) -> None:
+    """scikit-learn raises an error for empty input."""
+    test = write_dataset(tmp_path / "test", ("unknown",), instances=1)
+    train = write_dataset(tmp_path / "train", ("box", "ball"), instances=2)
+
+    with pytest.raises(RecordingError, match="test: baselines need views with a category"):
+        evaluate_folder(test, trained, baselines=train)
+
+
 def test_accuracy_is_broken_down_by_sensor_pose(compared: Report) -> None:
     """From above, a can looks like a plate, which one figure for all poses hides."""
     assert [name for name, _ in compared.breakdowns] == ["distance", "elevation", "points"]

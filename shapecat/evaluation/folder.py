@@ -5,6 +5,7 @@ from pathlib import Path
 
 from shapecat.config import Settings
 from shapecat.description import DESCRIPTOR_NAMES
+from shapecat.errors import RecordingError
 from shapecat.evaluation.baselines import compare_learners
 from shapecat.evaluation.dataset import Dataset, read_dataset
 from shapecat.evaluation.report import Report, evaluate, require_categories
@@ -45,6 +46,9 @@ def evaluate_folder(
     report = evaluate(views, categorizer)
     if baselines is None:
         return report
+    if report.n == 0:
+        msg = f"{root}: baselines need views with a category to be tested on"
+        raise RecordingError(msg)
     train = None
     if baselines.resolve() != root.resolve():
         train = _described(read_dataset(baselines), "train", observe, with_functions=True)
