@@ -53,12 +53,12 @@ def rich_progress() -> Any:
     from rich.console import Console
 
     columns = (
-        rich.TextColumn("{task.description}"),
+        rich.TextColumn("{task.description}", markup=False),
         rich.BarColumn(),
         rich.MofNCompleteColumn(),
         rich.TimeRemainingColumn(),
     )
-    return rich.Progress(*columns, console=Console(stderr=True))
+    return rich.Progress(*columns, console=Console(stderr=True, markup=False, emoji=False))
 
 
 @contextmanager
@@ -76,7 +76,7 @@ def print_json(value: Any) -> None:
 
 
 def print_table(columns: Sequence[str], rows: Sequence[Sequence[Any]]) -> None:
-    """Print a table with right-aligned columns of numbers."""
+    """Print a table with right-aligned columns of numbers; names are printed as they are."""
     from rich.console import Console
     from rich.table import Table
 
@@ -86,7 +86,8 @@ def print_table(columns: Sequence[str], rows: Sequence[Sequence[Any]]) -> None:
         table.add_column(name, justify="right" if numeric else "left", overflow="fold")
     for row in rows:
         table.add_row(*map(str, row))
-    Console(width=None if Console().is_terminal else 200).print(table)
+    width = None if Console().is_terminal else 200
+    Console(width=width, markup=False, emoji=False).print(table)
 
 
 def note_skipped(learned: Mapping[str, Any]) -> None:

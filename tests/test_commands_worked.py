@@ -395,6 +395,28 @@ def test_train_names_the_defects_of_its_model(
     assert re.match(said, done.stderr)
 
 
+ODD = ("/cam[left]/depth", "k [/night].mcap", "box :car:")
+
+
+def test_tables_and_bars_show_names_as_they_are(
+    capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Topics and files may contain what Rich takes for markup and emoji."""
+    RENDER.print_table(("name",), [[name] for name in ODD])
+    assert [line.rstrip() for line in capsys.readouterr().out.splitlines()] == ["name", *ODD]
+
+    monkeypatch.setenv("FORCE_COLOR", "1")
+    monkeypatch.setenv("COLUMNS", "200")
+    with PROGRESS.open_progress("rich", [task(name) for name in ODD]) as progress:
+        for name in ODD:
+            progress.progress(name, "perceive", 1, 2)
+            progress.note(f"note on {name}")
+    shown = re.sub(r"\x1b\[[0-9;?]*[a-zA-Z]", "", capsys.readouterr().err)
+    for name in ODD:
+        assert f"{name}: finding" in shown
+        assert f"note on {name}" in shown
+
+
 def test_annotate_reports_written_files_and_untransferred_labels(
     shapecat: Run, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:

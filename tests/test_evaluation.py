@@ -479,6 +479,18 @@ def test_printed_report_has_each_number_under_its_name() -> None:
     assert cells[head + 4 :] == expected
 
 
+def test_printed_report_shows_long_and_odd_names_as_they_are() -> None:
+    """Wrapped names are unreadable, and markup would change a name or end in a traceback."""
+    names = ("cup [big]", "[/bold]", "box :car:", *(f"a rather long category {k}" for k in "abcde"))
+    counts = tuple(tuple(100 * (i == k) for i in range(8)) for k in range(8))
+    report = replace(worked(), categories=names, confusion=counts, recall=dict.fromkeys(names, 1.0))
+
+    lines = [re.split(r"\s{2,}", line.strip()) for line in format_report(report).splitlines()]
+    head = lines.index([*names, "recall"])
+    assert [row[0] for row in lines[head + 1 : head + 9]] == list(names)
+    assert {len(row) for row in lines[head + 1 : head + 9]} == {10}
+
+
 def test_html_and_markdown_have_each_number_in_its_place() -> None:
     report = worked()
     page = format_page(report, title="a|b & c")

@@ -41,6 +41,8 @@ Ranges: TypeAlias = Sequence[tuple[str, int, float]]
 
 _ELEVATIONS = (-math.inf, 15.0, 30.0, 45.0, 60.0, math.inf)
 _DISTANCES_M = (0.0, 0.8, 1.1, 1.4, 1.7, math.inf)
+_WIDEST = 1_000_000
+"""Characters: enough for the longest names of most categories."""
 _POINTS = (0, 60, 120, 250, 500, 1000, math.inf)
 
 
@@ -224,9 +226,9 @@ def _defined(value: float) -> float | None:
 
 
 def format_report(report: Report) -> str:
-    """Return a report as text tables, 100 columns wide."""
+    """Return a report as text tables; names are printed as they are, and no table is wrapped."""
     stream = io.StringIO()
-    console = Console(file=stream, width=100, highlight=False)
+    console = Console(file=stream, width=_WIDEST, highlight=False, markup=False, emoji=False)
     skipped = f"; skipped {report.skipped} without a surface" if report.skipped else ""
     console.print(f"{report.n} views, model {report.model}{skipped}")
     console.print(_grid(None, ("", ""), _figures(report)))
@@ -243,7 +245,7 @@ def format_report(report: Report) -> str:
 def _grid(title: str | None, head: Iterable[str], rows: Rows) -> Table:
     table = Table(title=title, title_justify="left", box=None, pad_edge=False, padding=(0, 2, 0, 0))
     for k, name in enumerate(head):
-        table.add_column(name, justify="left" if k == 0 else "right")
+        table.add_column(name, justify="left" if k == 0 else "right", no_wrap=True)
     for row in rows:
         table.add_row(*row)
     return table
