@@ -20,6 +20,7 @@ from shapecat.evaluation.clouds import CloudFile, read_pcd, read_ply
 __all__ = ["Dataset", "View", "find_viewpoint", "read_dataset", "read_view"]
 
 _FARTHEST_M = 100.0
+_LARGEST_M = 5.0
 _DAMAGED = (
     OSError,
     ValueError,
@@ -110,6 +111,10 @@ def read_view(path: Path) -> View:
         raise RecordingError(msg)
     if np.abs(points).max() > _FARTHEST_M:
         msg = f"{path}: a point is {np.abs(points).max():.0f} m away; points must be in metres"
+        raise RecordingError(msg)
+    extent = np.ptp(points, axis=0).max()
+    if extent > _LARGEST_M:
+        msg = f"{path}: the points extend over {extent:.0f} m; they must show one object, in metres"
         raise RecordingError(msg)
     eye = _valid_eye(said)
     if eye is None:
