@@ -68,6 +68,15 @@ def test_fields_of_several_values_shift_later_fields(tmp_path: Path, encoding: s
     assert read_pcd(tmp_path / "x.pcd").points.tolist() == [[1.5, 2.5, 3.5], [4.5, 5.5, 6.5]]
 
 
+def test_blank_lines_between_points_are_skipped(tmp_path: Path) -> None:
+    """The last points would be missing."""
+    path = tmp_path / "x.pcd"
+    head, body = pcd("ascii").split(b"ascii\n")
+    path.write_bytes(head + b"ascii\n" + body.replace(b"\n", b"\n\n"))
+
+    np.testing.assert_array_equal(read_pcd(path).points.astype(np.float32), POINTS)
+
+
 @pytest.mark.parametrize("kind", ["ascii", "binary_little_endian", "binary_big_endian"])
 def test_every_encoding_of_ply_is_read(tmp_path: Path, kind: str) -> None:
     """Faces may follow the vertices."""

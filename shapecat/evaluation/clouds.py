@@ -4,6 +4,7 @@ Open3D reads both formats, but ignores the VIEWPOINT of PCD files and cannot be 
 machine without display libraries. Data sets must be readable there too.
 """
 
+import itertools
 import re
 from pathlib import Path
 from typing import NamedTuple
@@ -157,8 +158,9 @@ def _xyz(body: bytes, layout: _Layout) -> F8:
     """Return the points (n, 3) of an ascii or binary body; the body's size bounds the memory."""
     if layout.encoding == "ascii":
         columns = _ascii_columns(layout.point)
-        lines = body.decode("ascii", "replace").splitlines()[: layout.number]
-        words = [line.split() for line in lines if line.strip()]
+        lines = body.decode("ascii", "replace").splitlines()
+        filled = (line.split() for line in lines if line.strip())
+        words = list(itertools.islice(filled, layout.number))
         if len(words) != layout.number:
             msg = f"{layout.number} points announced, {len(words)} found"
             raise ValueError(msg)
