@@ -58,7 +58,8 @@ def evaluate(
     with progress_bars() as bars:
         report = evaluate_folder(dataset, model, baselines=baselines, observe=bars)
     if page is not None:
-        write_page(page, report, title=f"{dataset.name}: {plural(report.n, 'view')}")
+        name = dataset.resolve().name  # of `.` too
+        write_page(page, report, title=f"{name}: {plural(report.n, 'view')}")
     if as_json:
         print_json(report.as_dict())
     else:

@@ -479,6 +479,10 @@ def test_printed_report_has_each_number_under_its_name() -> None:
     assert cells[head + 4 :] == expected
 
 
+def test_printed_report_of_one_view_says_view() -> None:
+    assert format_report(replace(worked(), n=1, skipped=0)).startswith("1 view, model m-7\n")
+
+
 def test_printed_report_shows_long_and_odd_names_as_they_are() -> None:
     """Wrapped names are unreadable, and markup would change a name or end in a traceback."""
     names = ("cup [big]", "[/bold]", "box :car:", *(f"a rather long category {k}" for k in "abcde"))
@@ -596,12 +600,17 @@ def test_markdown_page_has_its_pictures_beside_it(trained: Path, tmp_path: Path)
     assert "| 3 | 4 | 1.000 | 0.250 |" in page
 
 
-def test_command_writes_the_page(trained: Path, tmp_path: Path) -> None:
+@pytest.mark.parametrize("given", ["data", "."])
+def test_command_writes_the_page(
+    trained: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, given: str
+) -> None:
+    """Its title names the data set, also if that is the current folder."""
     dataset = write_dataset(tmp_path / "data", ("box", "ball"), instances=2)
+    monkeypatch.chdir(dataset if given == "." else tmp_path)
     page = tmp_path / "page.html"
     command = import_module("shapecat.cli.evaluate").evaluate
     result = CliRunner().invoke(
-        command, [str(dataset), "--model", str(trained), "--report", str(page), "--json"]
+        command, [given, "--model", str(trained), "--report", str(page), "--json"]
     )
 
     assert result.exit_code == 0, result.output

@@ -86,7 +86,7 @@ def read_dataset(root: Path) -> Dataset:
     if not files:
         msg = (
             f"{root}: no views found; expected files such as "
-            f"{root.name}/cup/red_mug/000.pcd (or .ply, .npz)"
+            f"{root.resolve().name}/cup/red_mug/000.pcd (or .ply, .npz)"
         )
         raise RecordingError(msg)
     return Dataset(files)

@@ -20,6 +20,7 @@ from shapecat.evaluation.fused import Fused, fuse_views
 from shapecat.evaluation.markup import figure_text
 from shapecat.evaluation.views import DescribedViews
 from shapecat.learning import Categorizer
+from shapecat.outputs.counts import plural
 from shapecat.types import UNKNOWN
 
 __all__ = [
@@ -230,7 +231,7 @@ def format_report(report: Report) -> str:
     stream = io.StringIO()
     console = Console(file=stream, width=_WIDEST, highlight=False, markup=False, emoji=False)
     skipped = f"; skipped {report.skipped} without a surface" if report.skipped else ""
-    console.print(f"{report.n} views, model {report.model}{skipped}")
+    console.print(f"{plural(report.n, 'view')}, model {report.model}{skipped}")
     console.print(_grid(None, ("", ""), _figures(report)))
     head = ("", *report.categories, "recall")
     title = "\nrows: true category; columns: predicted category"
