@@ -85,7 +85,8 @@ def simulate(
     from shapecat.simulation.recorder import written_paths
 
     container = _format_of(out, container)
-    there = [path for path in written_paths(out, container, color=color) if path.exists()]
+    # Without --color too, colour labels of another scene must not remain.
+    there = [path for path in written_paths(out, container, color=True) if path.exists()]
     if there and not overwrite:
         msg = f"{there[0]} exists already; --overwrite replaces it"
         raise click.UsageError(msg)

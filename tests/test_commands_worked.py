@@ -123,16 +123,26 @@ def test_closing_table_lists_a_hundred_recordings_or_none(
 
 
 @pytest.mark.parametrize("name", ["a.mcap", "a.truth.json", "a.labels.npz", "a.color_labels.npz"])
+@pytest.mark.parametrize("options", [(), ("--color",)])
 def test_simulate_replaces_no_file_without_overwrite(
-    shapecat: Run, tmp_path: Path, name: str
+    shapecat: Run, tmp_path: Path, name: str, options: tuple[str, ...]
 ) -> None:
     """The ground truth may remain where the recording itself was moved elsewhere."""
     (tmp_path / name).write_text("mine")
-    found = shapecat("simulate", tmp_path / "a.mcap", "--color", "--frames", 1)
+    found = shapecat("simulate", tmp_path / "a.mcap", *options, "--frames", 1)
 
     assert found.exit_code == 2
     assert f"{name} exists already" in found.stderr
     assert [(path.name, path.read_text()) for path in tmp_path.iterdir()] == [(name, "mine")]
+
+
+def test_simulate_leaves_no_colour_labels_of_another_scene(shapecat: Run, tmp_path: Path) -> None:
+    """They would be taken for the truth of the new recording."""
+    (tmp_path / "a.color_labels.npz").write_text("old")
+    done = shapecat("simulate", tmp_path / "a.mcap", "--overwrite", "--frames", 1)
+
+    assert done.exit_code == 0, done.stderr
+    assert sorted(p.name for p in tmp_path.iterdir()) == ["a.labels.npz", "a.mcap", "a.truth.json"]
 
 
 @pytest.mark.parametrize(("end", "refused"), [("2.4", True), ("2.5", True), ("2.6", False)])

@@ -56,7 +56,8 @@ def simulate(
     Topics: /camera/depth/image_raw (16UC1, mm) or /camera/depth/points, /camera/depth/camera_info,
     /tf (map, base_link, camera_link) and /tf_static. Beside the recording, ``NAME.truth.json``
     lists the objects of each frame with their poses, and ``NAME.labels.npz`` holds the object of
-    each depth pixel. The same arguments give the same messages on every machine.
+    each depth pixel. All of them replace those of an earlier recording of this name. The same
+    arguments give the same messages on every machine.
 
     Parameters
     ----------
@@ -146,6 +147,8 @@ def record(
             truth.write_text("[" + ",\n".join(map(json.dumps, found)) + "]\n", "utf-8")
             for path in paths:
                 _move(Path(hidden) / path.name, path)
+            for path in written_paths(out, format, color=True)[len(paths) :]:
+                path.unlink(missing_ok=True)  # colour labels of another scene
     except OSError as error:
         msg = f"{out}: cannot write the recording: {error.strerror or error}"
         raise OutputError(msg) from error
