@@ -482,7 +482,13 @@ def test_full_disk_behind_stdout_is_reported_in_one_line(
 
 @pytest.mark.skipif(not Path("/dev/full").exists(), reason="needs a device that is always full")
 @pytest.mark.parametrize(
-    ("kind", "how"), [("jsonl", "full"), ("rich", "full"), ("jsonl", "pipe"), ("auto", "closed")]
+    ("kind", "how"),
+    [
+        ("jsonl", "full"),
+        ("auto", "closed"),
+        pytest.param("rich", "full", marks=pytest.mark.many),
+        pytest.param("jsonl", "pipe", marks=pytest.mark.many),
+    ],
 )
 def test_unwritable_stderr_does_not_end_the_work(
     recording: Path, tmp_path: Path, kind: str, how: str

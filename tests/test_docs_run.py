@@ -79,8 +79,8 @@ def run_here(line: str, shapecat: Callable[..., Result]) -> None:
 @pytest.mark.parametrize(
     "page",
     [
-        "tutorial.md",
         "howto-bag.md",
+        pytest.param("tutorial.md", marks=pytest.mark.many),
         pytest.param("howto-labelling.md", marks=pytest.mark.many),  # see `test_labelling_loop`
     ],
 )
