@@ -183,7 +183,7 @@ def test_processing_loads_no_library_too_early() -> None:
     ],
 )
 def test_commands_do_not_load_libraries_that_others_ask_for(use: str, library: str) -> None:
-    """Arrow with its first array, numba with its first kernel: half and a fifth of a second."""
+    """Arrow with its first array, numba with its first kernel: half and a tenth of a second."""
     code = (
         "import types, pyarrow, numpy as np, shapecat.geometry, shapecat.__main__ as entry;"
         f"command = types.SimpleNamespace(main=lambda **_: {use});"

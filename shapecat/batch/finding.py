@@ -13,14 +13,13 @@ from typing import Any
 from shapecat.batch.storage import Location, content_key, is_url
 from shapecat.errors import RecordingError
 from shapecat.recordings import open_recording
+from shapecat.system.files import is_of_bag
 
 __all__ = ["Found", "Source", "find_recordings", "look_at"]
 
 _log = logging.getLogger(__name__)
 
 SUFFIXES = {".mcap", ".bag", ".db3"}
-_PARTS = {".mcap", ".db3"}
-"""Suffixes of the files in a ROS 2 bag folder."""
 _GAP_NS = 10**10
 """The longest time between the parts of a bag; takes are farther apart, or overlap."""
 _MAGIC = (b"\x89MCAP", b"#ROSBAG", b"SQLite format 3")
@@ -188,7 +187,7 @@ def _is_bag(folder: Path) -> bool:
         return True
     base = first.stem.rpartition("_")[0]
     in_sequence = [f"{base}_{k}{first.suffix}" for k in range(len(parts))]
-    if first.suffix not in _PARTS or parts != set(in_sequence):
+    if not is_of_bag(first.name) or parts != set(in_sequence):
         return False
     compressed = any(path.suffix == ".zstd" for path in paths)
     return base == folder.name or compressed or _adjoin([folder / name for name in in_sequence])

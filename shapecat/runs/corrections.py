@@ -11,7 +11,7 @@ from dataclasses import replace
 from pathlib import Path
 
 from shapecat.errors import OutputError
-from shapecat.runs.folder import read_run
+from shapecat.runs.folder import read_run, require_work
 from shapecat.runs.label_meaning import (
     DELETE,
     TrackLabel,
@@ -38,7 +38,6 @@ __all__ = [
     "has_labels",
     "read_labels",
     "relabel",
-    "require_work",
 ]
 
 PREVIOUS = "tracks.previous.csv"
@@ -197,18 +196,6 @@ def correct_label(folder: Path, track: int, label: str, *, seen: str, work: str)
         if rows[track].label != seen:
             return f"its label is now {rows[track].label!r}"
         return relabel(folder, {track: label}).get(track, "")
-
-
-def require_work(folder: Path, work: str) -> None:
-    """Check that a run has not been replaced since its run.json was read: its tracks are others.
-
-    Raises
-    ------
-    OutputError : ``work`` differs from that in run.json, or there is none.
-    """
-    if read_run(folder).get("work", "") != work:
-        msg = f"{folder}: was processed again since its report was made; make the report again"
-        raise OutputError(msg)
 
 
 def _given(

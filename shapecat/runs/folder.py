@@ -27,6 +27,7 @@ __all__ = [
     "read_run",
     "recover",
     "require_ours",
+    "require_work",
     "staged",
     "sweep",
     "write_run",
@@ -66,6 +67,18 @@ def made_by_run(folder: Path) -> Collection[str] | None:
         if read_run(folder).get("id"):
             return _MADE
     return None
+
+
+def require_work(folder: Path, work: str) -> None:
+    """Check that a run has not been replaced since its run.json was read: its tracks are others.
+
+    Raises
+    ------
+    OutputError : ``work`` differs from that in run.json, or there is none.
+    """
+    if read_run(folder).get("work", "") != work:
+        msg = f"{folder}: was processed again since its report was made; make the report again"
+        raise OutputError(msg)
 
 
 @contextmanager

@@ -1,6 +1,7 @@
 """tracks.csv: one line per track, to read and correct, for example in a spreadsheet.
 
-Any separator, quotes, line ends, encoding, order of columns, and numbers such as ``1.0`` are read.
+Any separator, quotes, line ends, order of columns, and numbers such as ``1.0`` are read, and other
+encodings than Unicode if the labels are ASCII.
 """
 
 import csv
@@ -102,7 +103,12 @@ def read_track_table(path: Path) -> TrackTable:
 
 
 def _text(path: Path) -> tuple[str, bool]:
-    """Return the text of a table, in any encoding in which ASCII is ASCII, and if it is Unicode."""
+    """Return the text of a table, and whether it is Unicode; otherwise only ASCII is certain.
+
+    Raises
+    ------
+    OutputError : the file is unreadable, too large or not a text.
+    """
     with explained(f"{path}: cannot be read", OutputError):
         if path.stat().st_size > _LARGEST_TABLE:
             msg = f"{path}: larger than {_LARGEST_TABLE >> 20} MB, too large for a tracks.csv"

@@ -174,8 +174,8 @@ def scene_cuts(hits: Hits, settings: TrackingSettings) -> Bool:
     """
     stamps, filled = hits.stamps_ns, np.unique(hits.rows)
     result = np.diff(stamps, prepend=stamps[:1]) < -settings.max_missed_s * 1e9
-    steps = (_steps(hits, filled, topic) for topic in range(len(hits.names)))
-    for k, last, before, older, later in merge(*steps):
+    topics = (_with_neighbours(hits, filled, topic) for topic in range(len(hits.names)))
+    for k, last, before, older, later in merge(*topics):
         slow = bool(stamps[k] - stamps[before] > _SLOW_S * 1e9)
         if before > last and not slow:
             continue  # after some frames out of view, an object may be anywhere
@@ -190,11 +190,13 @@ def scene_cuts(hits: Hits, settings: TrackingSettings) -> Bool:
     return np.asarray(result)
 
 
-def _steps(hits: Hits, filled: I4, topic: int) -> Iterator[tuple[int, int, int, int, int]]:
+def _with_neighbours(
+    hits: Hits, filled: I4, topic: int
+) -> Iterator[tuple[int, int, int, int, int]]:
     """Yield the frames of a topic with detections from the second on, each with four others.
 
     These are the previous frame with detections, the previous frame, the second previous and the
-    next one with detections, -1 if there is none. ``filled`` are the frames with detections.
+    next one with detections, -1 if there is none. ``filled`` (k,) are all frames with detections.
     """
     own, seen = np.flatnonzero(hits.topics == topic), filled[hits.topics[filled] == topic]
     before = own[np.searchsorted(own, seen) - 1]
