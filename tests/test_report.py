@@ -552,6 +552,27 @@ def test_escape_leaves_label_as_it_was(browser: Browser, reported_run: Path, key
     assert browser.run("return document.querySelectorAll('.other:invalid').length") == 0
 
 
+@pytest.mark.parametrize("key", ["Enter", "Escape"])
+def test_focus_leaves_text_field_before_next_key(
+    browser: Browser, reported_run: Path, key: str
+) -> None:
+    """It left a moment later: out of the text field that the next key had opened."""
+    open_anew(browser, reported_run / "report.html")
+    track = read_track_table(reported_run / "tracks.csv").rows[0].track
+    browser.type(f"#track-{track} .other", "mug")
+    press = f"{{ key: '{key}', bubbles: true, cancelable: true, isComposing: composing }}"
+    browser.run(
+        f"window.press = (composing) => document.activeElement.dispatchEvent("
+        f"new KeyboardEvent('keydown', {press}))"
+    )
+    focused = "return document.activeElement.id || document.activeElement.className"
+
+    assert browser.run(f"press(true); {focused}") == "other"  # the key ends a composed character
+    assert changes(browser) == {}
+    assert browser.run(f"press(false); {focused}") == f"track-{track}"
+    assert changes(browser) == ({track: "→ mug"} if key == "Enter" else {})
+
+
 LABELS = (
     *("cup", "CUP", "boxx", "new boxx", "cups", "cpu", "pan", "New  pot", "bowling ball", "botle"),
     *(

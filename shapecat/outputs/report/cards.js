@@ -35,6 +35,17 @@ function restore(other) {
   other.setCustomValidity("");
 }
 
+// Take the label that was typed; return whether it is valid.
+function take(other) {
+  if (other.value !== other.defaultValue) {
+    const label = known(other.value.normalize("NFC").trim().replace(/\s+/g, " "));
+    const wrong = setLabel(other.closest(".card").dataset.track, label);
+    if (!wrong) restore(other);
+    other.setCustomValidity(wrong);
+  }
+  return other.reportValidity();
+}
+
 function fits(card) {
   const label = labelOf(card.dataset.track);
   const state = byId("state").value;
@@ -117,13 +128,7 @@ gallery.addEventListener("click", (event) => {
   const pressed = button.getAttribute("aria-pressed") === "true";
   setLabel(button.closest(".card").dataset.track, pressed ? "" : button.dataset.label);
 });
-gallery.addEventListener("change", (event) => {
-  if (!event.target.matches(".other") || event.target.value === event.target.defaultValue) return;
-  const track = event.target.closest(".card").dataset.track;
-  const label = known(event.target.value.normalize("NFC").trim().replace(/\s+/g, " "));
-  event.target.setCustomValidity(setLabel(track, label));
-  event.target.reportValidity();
-});
+gallery.addEventListener("change", (event) => event.target.matches(".other") && take(event.target));
 gallery.addEventListener("input", (event) => {
   if (event.target.matches(".other")) event.target.setCustomValidity("");
 });

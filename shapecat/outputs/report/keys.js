@@ -66,8 +66,10 @@ addEventListener("keydown", (event) => {
   if (large.open || !current) return;
   if (field) {
     const leaves = event.target.matches(".other") && ["Escape", "Enter"].includes(event.key);
-    if (leaves && event.key === "Escape") restore(event.target);
-    if (leaves) setTimeout(() => event.target.validity.valid && enter(current.dataset.track));
+    if (!leaves || event.isComposing) return;
+    event.preventDefault();
+    if (event.key === "Escape") restore(event.target);
+    if (event.key === "Escape" || take(event.target)) enter(current.dataset.track);
   } else if ((event.ctrlKey || event.metaKey) && event.key === "z") {
     event.preventDefault();
     undo();
