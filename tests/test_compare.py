@@ -59,7 +59,7 @@ from shapecat.evaluation.overlap import Overlap, box_iou
 from shapecat.evaluation.references import open_reference, read_complete, run_labellings
 from shapecat.evaluation.references_coco import CocoLabels, filled_polygon, rle_mask
 from shapecat.evaluation.references_kitti import KittiLabels
-from shapecat.runs.tables import DETECTIONS, FRAMES, TRACKS
+from shapecat.runs.table_schemas import DETECTIONS, FRAMES, TRACKS
 from shapecat.types import Box, Camera, Frame
 from tests.run_info import run_info
 

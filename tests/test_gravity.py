@@ -22,7 +22,7 @@ from shapecat.recordings.transforms import TransformBuffer
 from shapecat.runs import perceiving
 from shapecat.runs.folder import read_run
 from shapecat.runs.jobs import Job
-from shapecat.runs.tables import DETECTIONS, FRAMES, PLANES
+from shapecat.runs.table_schemas import DETECTIONS, FRAMES, PLANES
 from shapecat.runs.up_report import report_up
 from shapecat.simulation.messages import MessageFactory
 from shapecat.types import Frame, Pose

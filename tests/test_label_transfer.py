@@ -19,7 +19,8 @@ from shapecat.runs.folder import read_run, write_run
 from shapecat.runs.identity import new_id
 from shapecat.runs.label_transfer import TABLE_ALONE, match_labels, transfer_labels
 from shapecat.runs.same_objects import Match, _by_majority, _mutual_nearest
-from shapecat.runs.tables import DETECTIONS, FRAMES, TRACKS, write_table
+from shapecat.runs.table_schemas import DETECTIONS, FRAMES, TRACKS
+from shapecat.runs.tables import write_table
 from shapecat.runs.track_table import read_track_table
 from tests.run_info import run_info
 from tests.scenes import record

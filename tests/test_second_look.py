@@ -20,7 +20,7 @@ from shapecat.runs import perceiving
 from shapecat.runs.folder import read_run
 from shapecat.runs.jobs import Job
 from shapecat.runs.second_look import _around, _streams, frames_to_revise
-from shapecat.runs.tables import FRAMES, PLANES
+from shapecat.runs.table_schemas import FRAMES, PLANES
 from shapecat.simulation import IDEAL, make_scene, render_frame
 from shapecat.simulation.messages import MessageFactory
 from shapecat.simulation.recorder import LINK_FROM_OPTICAL, robot_links

@@ -6,6 +6,7 @@ from types import SimpleNamespace
 from typing import get_type_hints
 
 import numpy as np
+import pyarrow as pa
 import pyarrow.parquet as pq
 import pytest
 from numpy.testing import assert_allclose
@@ -20,15 +21,8 @@ from shapecat.runs.perceived import _SEGMENT_FRAMES, FrameRow, PerceptionTables
 from shapecat.runs.run_info import Counts, InputInfo, Options, RunInfo
 from shapecat.runs.segments import count_segments
 from shapecat.runs.shown import _next_of_topic, read_shown_frames
-from shapecat.runs.tables import (
-    DETECTIONS,
-    FRAMES,
-    PLANES,
-    TRACKS,
-    lists,
-    read_row_groups,
-    write_table,
-)
+from shapecat.runs.table_schemas import DETECTIONS, FRAMES, PLANES, TABLES, TRACKS
+from shapecat.runs.tables import lists, read_row_groups, write_table
 from shapecat.types import Box, Candidate, Detection, NeuralGas, Perception, Plane, Pose, Scene
 from tests.track_tables import write_tracks
 
@@ -227,6 +221,22 @@ def test_foreign_file_is_rejected_as_table(tmp_path: Path) -> None:
     (tmp_path / "frames.parquet").write_bytes(b"hello")
     with pytest.raises(OutputError, match="process the recording again"):
         list(read_row_groups(tmp_path / "frames.parquet"))
+
+
+@pytest.mark.parametrize("table", TABLES)
+def test_table_with_other_columns_is_rejected(tmp_path: Path, table: str) -> None:
+    """One of another version, or rewritten by a data frame library, gave a traceback later."""
+    path = tmp_path / f"{table}.parquet"
+    empty = TABLES[table].empty_table()
+    for k, field in enumerate(TABLES[table]):
+        other = empty.set_column(k, field.name, pa.array([], pa.float64()))
+        for damaged in (empty.drop_columns([field.name]), other):
+            pq.write_table(damaged, path)
+            with pytest.raises(OutputError, match=rf"column {field.name}\b.*process the recording"):
+                next(read_row_groups(path))
+
+    pq.write_table(empty.append_column("new", pa.array([], pa.int8())), path)
+    assert [len(group) for group in read_row_groups(path)] == [0]
 
 
 def test_run_json_matches_its_schema(guessed_run: Path, coloured_run: Path) -> None:

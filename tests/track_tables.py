@@ -3,7 +3,8 @@
 from collections.abc import Sequence
 from pathlib import Path
 
-from shapecat.runs.tables import TRACKS, write_table
+from shapecat.runs.table_schemas import TRACKS
+from shapecat.runs.tables import write_table
 
 __all__ = ["write_tracks"]
 

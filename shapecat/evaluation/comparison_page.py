@@ -15,7 +15,8 @@ from shapecat.evaluation.comparison_matching import Difference
 from shapecat.evaluation.comparison_pictures import COLOURS, Caption, DifferenceImage, words_of
 from shapecat.evaluation.markup import figure_text, html_table
 from shapecat.outputs.counts import plural
-from shapecat.runs.tables import FRAME_COLUMNS, write_table
+from shapecat.runs.table_schemas import FRAME_COLUMNS
+from shapecat.runs.tables import write_table
 from shapecat.system.files import complete_folder
 
 __all__ = [

@@ -9,28 +9,11 @@ import numpy as np
 import pyarrow as pa
 
 from shapecat.arrays import U4
+from shapecat.runs.table_schemas import MASKS
 from shapecat.runs.tables import Key, numbers, read_row_groups
 from shapecat.types import ImageMasks, Perception
 
-__all__ = ["MASKS", "mask_columns", "read_masks"]
-
-MASKS = pa.schema(
-    [
-        ("topic", pa.string()),
-        ("frame", pa.int32()),
-        ("color_topic", pa.string()),
-        ("color_stamp_ns", pa.int64()),
-        ("color_log_time_ns", pa.int64()),
-        ("color_frame_id", pa.string()),
-        ("width", pa.int32()),
-        ("height", pa.int32()),
-        ("detection", pa.list_(pa.int32())),
-        ("box", pa.list_(pa.int32())),
-        ("counts", pa.list_(pa.list_(pa.uint32()))),
-    ]
-)
-"""One row per frame that has a colour image: the size of the image, and for each detection visible
-in it the box (left, top, width, height; pixels) and the run lengths of the mask."""
+__all__ = ["mask_columns", "read_masks"]
 
 
 def mask_columns(perceptions: Iterable[Perception]) -> dict[str, Any]:

@@ -14,7 +14,6 @@ from shapecat.geometry import transform
 from shapecat.runs.masks import mask_columns
 from shapecat.runs.segments import (
     GROUP_FRAMES,
-    PERCEIVED,
     REVISIONS,
     SEGMENTS,
     group_frames,
@@ -23,7 +22,8 @@ from shapecat.runs.segments import (
     row_groups,
     write_segment,
 )
-from shapecat.runs.tables import SCHEMA_VERSION, arrow_table, lists, open_writer
+from shapecat.runs.table_schemas import PERCEIVED, SCHEMA_VERSION
+from shapecat.runs.tables import arrow_table, lists, open_writer
 from shapecat.system.files import complete_folder, replacing
 from shapecat.types import Perception, Pose
 

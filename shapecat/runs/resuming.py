@@ -11,7 +11,8 @@ from shapecat.runs.folder import OUTPUT_OPTIONS, clear, read_run, write_run
 from shapecat.runs.identity import same_content, unchanged
 from shapecat.runs.jobs import differences
 from shapecat.runs.run_info import RunInfo
-from shapecat.runs.segments import PERCEIVED, count_segments
+from shapecat.runs.segments import count_segments
+from shapecat.runs.table_schemas import PERCEIVED
 from shapecat.runs.tables import count_rows
 
 __all__ = ["has_work", "resume", "take_over_frames"]

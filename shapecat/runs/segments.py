@@ -13,12 +13,11 @@ from pathlib import Path
 import pyarrow as pa
 
 from shapecat.errors import OutputError
-from shapecat.runs.masks import MASKS
-from shapecat.runs.tables import DETECTIONS, FRAMES, PLANES, Key, frame_rows, numbers
+from shapecat.runs.table_schemas import PERCEIVED
+from shapecat.runs.tables import Key, frame_rows, numbers
 
 __all__ = [
     "GROUP_FRAMES",
-    "PERCEIVED",
     "REVISIONS",
     "SEGMENTS",
     "count_segments",
@@ -35,8 +34,6 @@ GROUP_FRAMES = 32
 """Minimum number of frames of a row group."""
 _BALANCE = 4096
 """Number of frames above which row groups grow with its square root."""
-PERCEIVED = {"frames": FRAMES, "detections": DETECTIONS, "planes": PLANES, "masks": MASKS}
-"""The tables of perceive; recordings without colour have no masks."""
 SEGMENTS, REVISIONS = "segments", "revisions"
 
 

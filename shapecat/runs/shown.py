@@ -14,9 +14,8 @@ import pyarrow.parquet as pq
 from shapecat.arrays import F4, F8, I4
 from shapecat.geometry import box_around
 from shapecat.runs.label_meaning import TrackLabel
+from shapecat.runs.table_schemas import BOX_WIDTH, FULL_BOX
 from shapecat.runs.tables import (
-    BOX_WIDTH,
-    FULL_BOX,
     Key,
     frame_rows,
     full_boxes_of,

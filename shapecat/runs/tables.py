@@ -1,9 +1,7 @@
-"""The Parquet tables between the phases: their columns, and how to read and write them.
+"""Reading and writing the Parquet tables between the phases.
 
-A run folder holds ``frames``, ``detections``, ``planes`` and, with colour images, ``masks``
-(written by perceive), and ``tracks`` (written by track). Row groups of all but ``tracks`` cover the
-same frames, so that they can be read side by side in constant memory. Adding a column is allowed
-within a schema version; changing the meaning of one is not.
+Row groups of all tables but ``tracks`` cover the same frames, so that they can be read side by side
+in constant memory.
 """
 
 from collections.abc import Iterator, Mapping, Sequence
@@ -17,17 +15,9 @@ import pyarrow.parquet as pq
 
 from shapecat.arrays import F4, I4
 from shapecat.errors import OutputError
+from shapecat.runs.table_schemas import FULL_BOX, TABLES
 
 __all__ = [
-    "BOX_WIDTH",
-    "DETECTIONS",
-    "FRAMES",
-    "FRAME_COLUMNS",
-    "FULL_BOX",
-    "FULL_WIDTHS",
-    "PLANES",
-    "SCHEMA_VERSION",
-    "TRACKS",
     "Key",
     "arrow_table",
     "count_rows",
@@ -49,109 +39,6 @@ __all__ = [
 
 # Arrow's own allocator holds 50 MB more while a long recording is read, and takes longer.
 pa.set_memory_pool(pa.system_memory_pool())
-
-SCHEMA_VERSION = "1"
-
-_VEC3 = pa.list_(pa.float32(), 3)
-_POSITION = pa.list_(pa.float64(), 3)
-"""A position in the fixed frame, whose origin may be thousands of kilometres away."""
-_QUATERNION = pa.list_(pa.float32(), 4)
-_FLOATS = pa.list_(pa.float32())
-_FULL = (
-    ("center_full", _VEC3),
-    ("size_full", _VEC3),
-    ("orientation_full", _QUATERNION),
-    ("size_full_std", _VEC3),
-)
-
-FULL_WIDTHS = {name: kind.list_size for name, kind in _FULL}
-"""Columns of full boxes, and the number of values in each."""
-FULL_BOX = ("center_full", "size_full", "orientation_full")
-"""Columns of the box itself: centre and size in metres, and a quaternion, in the sensor frame."""
-BOX_WIDTH = sum(FULL_WIDTHS[name] for name in FULL_BOX)
-FRAME_COLUMNS = (("topic", pa.string()), ("frame", pa.int32()), ("stamp_ns", pa.int64()))
-"""Columns that identify a frame: topic, number on that topic, and stamp."""
-
-FRAMES = pa.schema(
-    [
-        *FRAME_COLUMNS,
-        ("log_time_ns", pa.int64()),
-        ("frame_id", pa.string()),
-        ("up", _VEC3),
-        ("up_given", _VEC3),
-        ("revised", pa.bool_()),
-        ("reused_from", pa.int32()),
-        ("fixed_translation", _POSITION),
-        ("fixed_rotation", pa.list_(pa.float64(), 9)),
-        ("stages", pa.list_(pa.string())),
-        ("seconds", _FLOATS),
-    ]
-)
-"""One row per frame read, also without detections. ``up`` is the up direction that detection used;
-``up_given`` is from transforms, an IMU or an option, null without these. ``revised`` is true if
-the result is from a second look, with the up direction of the whole recording. ``reused_from`` is
-the earlier frame whose scene this one repeats, null if none. ``fixed_*`` is ``fixed_from_sensor``
-(rotation row by row), null if unknown. ``seconds`` has one entry per entry of ``stages``."""
-
-DETECTIONS = pa.schema(
-    [
-        *FRAME_COLUMNS,
-        ("frame_id", pa.string()),
-        ("detection", pa.int32()),
-        ("plane", pa.int16()),
-        ("on_detection", pa.int32()),
-        ("touches_border", pa.bool_()),
-        ("occluded", pa.bool_()),
-        ("center", _VEC3),
-        ("size", _VEC3),
-        ("orientation", _QUATERNION),
-        ("center_fixed", _POSITION),
-        *_FULL,
-        ("outline_full", _FLOATS),
-        ("height_m", pa.float32()),
-        ("points", pa.int32()),
-        ("indices", pa.list_(pa.uint32())),
-        ("posterior", _FLOATS),
-        ("category", pa.string()),
-        ("confidence", pa.float32()),
-        ("novelty", pa.float32()),
-        ("reused_from", pa.int32()),
-        ("descriptor", _FLOATS),
-        ("neurons", _FLOATS),
-        ("edges", pa.list_(pa.uint16())),
-        ("seconds", pa.float32()),
-    ]
-)
-"""One row per object per frame; lengths in metres, ``center`` and ``neurons`` in ``frame_id``.
-``*_full`` is the box of the whole object, null if only the visible part is known. The columns
-``posterior`` to ``edges`` are copied from the frame ``reused_from``, unless that is null."""
-
-PLANES = pa.schema(
-    [
-        *FRAME_COLUMNS,
-        ("plane", pa.int16()),
-        ("normal", _VEC3),
-        ("offset", pa.float32()),
-        ("height_m", pa.float32()),
-        ("area_m2", pa.float32()),
-        ("outline", _FLOATS),
-    ]
-)
-"""One row per supporting plane per frame; ``outline`` is x, y, z of each corner in turn."""
-
-TRACKS = pa.schema(
-    [
-        ("track", pa.int32()),
-        *FRAME_COLUMNS,
-        ("detection", pa.int32()),
-        ("center_fixed", _POSITION),
-        *_FULL,
-        ("posterior", _FLOATS),
-    ]
-)
-"""One row per track per frame; ``detection`` is null while the track coasts; ``posterior`` is
-causal. ``center_fixed`` is in the fixed frame, or the sensor frame if there is none.
-``center_full`` and ``orientation_full`` are in the sensor frame, null while the track coasts."""
 
 Key = tuple[str, int]
 """A frame: its topic, and its number on that topic."""
@@ -281,14 +168,28 @@ def opened(path: Path, *, read_dictionary: Sequence[str] = ()) -> Iterator[pq.Pa
 
     Raises
     ------
-    OutputError : the table is missing or unreadable.
+    OutputError : the table is missing or unreadable, or lacks a column of its schema.
     """
     try:
         with pq.ParquetFile(path, read_dictionary=list(read_dictionary)) as file:
+            if wrong := _wrong_column(file.schema_arrow, TABLES[path.stem]):
+                msg = f"{path}: {wrong}; process the recording again"
+                raise OutputError(msg)
             yield file
     except (OSError, pa.ArrowException) as error:
         msg = f"{path}: not a readable table of a run folder ({error}); process the recording again"
         raise OutputError(msg) from error
+
+
+def _wrong_column(found: pa.Schema, wanted: pa.Schema) -> str:
+    """Describe the first column that another version, or another program, wrote otherwise."""
+    for field in wanted:
+        if field.name not in found.names:
+            return f"no column {field.name}"
+        kind = found.field(field.name).type
+        if (kind.value_type if pa.types.is_dictionary(kind) else kind) != field.type:
+            return f"column {field.name} holds {kind}, not {field.type}"
+    return ""
 
 
 def open_writer(path: Path, schema: pa.Schema) -> pq.ParquetWriter:

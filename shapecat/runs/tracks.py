@@ -15,8 +15,8 @@ from scipy.spatial.transform import Rotation
 from shapecat.arrays import F4, F8
 from shapecat.config import TrackingSettings
 from shapecat.runs.full_boxes import FullBoxes, full_columns
+from shapecat.runs.table_schemas import TRACKS
 from shapecat.runs.tables import (
-    TRACKS,
     Key,
     arrow_table,
     first_stamp,
