@@ -18,7 +18,7 @@ from shapecat.runs.corrections import read_labels
 from shapecat.runs.labels import _join, read_labelled_frames
 from shapecat.runs.perceived import FrameRow, PerceptionTables
 from shapecat.runs.shown import read_shown_frames
-from shapecat.runs.tracks import _Line, _read_frames, track_run
+from shapecat.runs.tracks import _line, _read_frames, track_run
 from shapecat.tracking.records import Track
 from shapecat.types import (
     Box,
@@ -431,8 +431,8 @@ def test_track_position_is_median() -> None:
         novelty=0.4,
     )
 
-    line = _Line.of(track, CATEGORIES)
+    line = _line(track, CATEGORIES, 0, "")
 
-    assert_allclose(line.center, [0.315, 1.125, 0.71])
-    assert (line.track, line.category, line.hits) == (3, "can", 3)
-    assert (line.first_ns, line.last_ns) == (0, 3 * SECOND)
+    assert_allclose([line[name] for name in "xyz"], [0.315, 1.125, 0.71])
+    assert (line["track"], line["category"], line["frames"]) == (3, "can", 3)
+    assert (line["first_s"], line["last_s"]) == (0, 3)

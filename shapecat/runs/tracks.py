@@ -4,7 +4,7 @@ import csv
 from collections import Counter
 from collections.abc import Iterable, Iterator, Sequence
 from pathlib import Path
-from typing import Any, NamedTuple, Self
+from typing import Any
 
 import numpy as np
 import pyarrow as pa
@@ -38,6 +38,23 @@ __all__ = ["track_run"]
 
 _BATCH = 2**17  # rows of tracks.parquet written at a time
 _NO_TURN = (1.0, 0.0, 0.0, 0.0, 1.0, 0.0, 0.0, 0.0, 1.0)
+_CSV = {
+    "track": "",
+    "first_s": ".3f",
+    "last_s": ".3f",
+    "frames": "",
+    "category": "",
+    "confidence": ".3f",
+    "label": "",
+    "x": ".3f",
+    "y": ".3f",
+    "z": ".3f",
+    "novelty": ".2f",
+    "guess": "",
+    "topic": "",
+    "run": "",
+}
+"""The columns of tracks.csv and the format of their numbers."""
 _COLUMNS = (
     "topic",
     "frame",
@@ -74,20 +91,20 @@ def track_run(
     placed = _streams_with_poses(folder)
     frames = _read_frames(folder, len(categories), placed)
     tracks = track_recording(frames, settings, together=placed)
-    lines = []
+    lines, start_ns = [], first_stamp(folder)
     with replacing(folder / "tracks.parquet") as path, open_writer(path, TRACKS) as writer:
         release_memory()
         full = FullBoxes.read(folder, placed)
         release_memory()
         for some in _batches(tracks):
             _write(writer, some, full, categories)
-            lines += [_Line.of(track, categories) for track in some]
+            lines += [_line(track, categories, start_ns, work) for track in some]
             some.clear()  # the next batch may be as long
             release_memory()
     for name in (ORIGINAL, "tracks.csv"):
         with replacing(folder / name) as path:
-            _write_csv(path, lines, first_stamp(folder), work)
-    return dict(Counter(line.category for line in lines))
+            _write_csv(path, lines)
+    return dict(Counter(line["category"] for line in lines))
 
 
 def _write(
@@ -220,78 +237,36 @@ def _columns(tracks: Sequence[Track], boxes: F4, categories: Sequence[str]) -> d
     }
 
 
-class _Line(NamedTuple):
-    """The values of a track in tracks.csv."""
-
-    track: int
-    first_ns: int
-    last_ns: int
-    hits: int
-    category: str
-    confidence: float
-    center: F8
-    novelty: float
-    guess: str
-    topic: str
-
-    @classmethod
-    def of(cls, track: Track, categories: Sequence[str]) -> Self:
-        guess = categories[int(np.argmax(track.posterior))]
-        return cls(
-            track.id,
-            int(track.stamps_ns[0]),
-            int(track.stamps_ns[-1]),
-            track.hits,
-            UNKNOWN if track.novelty > 1 else guess,
-            track.confidence,
-            np.median(track.centers, axis=0),
-            track.novelty,
-            guess,
-            track.topic,
-        )
+def _line(track: Track, categories: Sequence[str], start_ns: int, work: str) -> dict[str, Any]:
+    """Return the values of a track in tracks.csv."""
+    guess = categories[int(np.argmax(track.posterior))]
+    x, y, z = np.median(track.centers, axis=0)
+    return {
+        "track": track.id,
+        "first_s": (int(track.stamps_ns[0]) - start_ns) * 1e-9,
+        "last_s": (int(track.stamps_ns[-1]) - start_ns) * 1e-9,
+        "frames": track.hits,
+        "category": UNKNOWN if track.novelty > 1 else guess,
+        "confidence": track.confidence,
+        "label": "",
+        "x": x,
+        "y": y,
+        "z": z,
+        "novelty": track.novelty,
+        "guess": guess,
+        "topic": track.topic,
+        "run": work,
+    }
 
 
-_CSV = (
-    "track",
-    "first_s",
-    "last_s",
-    "frames",
-    "category",
-    "confidence",
-    "label",
-    "x",
-    "y",
-    "z",
-    "novelty",
-    "guess",
-    "topic",
-    "run",
-)
-
-
-def _write_csv(path: Path, lines: Sequence[_Line], start_ns: int, work: str) -> None:
+def _write_csv(path: Path, lines: Sequence[dict[str, Any]]) -> None:
     """Write a line per track, unknown categories first, then by ascending confidence."""
-    rows = sorted(lines, key=lambda line: (line.category != UNKNOWN, line.confidence, line.track))
+
+    def order(line: dict[str, Any]) -> tuple[bool, float, int]:
+        return line["category"] != UNKNOWN, line["confidence"], line["track"]
+
     with path.open("w", newline="", encoding="utf-8") as file:
         writer = csv.writer(file, lineterminator="\n")
         writer.writerow(_CSV)
-        for line in rows:
-            x, y, z = line.center
-            writer.writerow(
-                (
-                    line.track,
-                    f"{(line.first_ns - start_ns) * 1e-9:.3f}",
-                    f"{(line.last_ns - start_ns) * 1e-9:.3f}",
-                    line.hits,
-                    line.category,
-                    f"{line.confidence:.3f}",
-                    "",
-                    f"{x:.3f}",
-                    f"{y:.3f}",
-                    f"{z:.3f}",
-                    f"{line.novelty:.2f}",
-                    line.guess,
-                    line.topic,
-                    work,
-                )
-            )
+        for line in sorted(lines, key=order):
+            writer.writerow(format(line[name], kind) for name, kind in _CSV.items())
