@@ -7,9 +7,9 @@ from pathlib import Path
 from typing import Any, NamedTuple
 
 from google.protobuf.descriptor_pb2 import FileDescriptorSet
-from mcap.writer import Writer
 
 from shapecat.recordings.protobuf import message_class
+from tests.mcap_files import mcap_writer
 
 SECOND = 10**9
 EPOCH = 1_700_000_000 * SECOND
@@ -132,9 +132,7 @@ def content(data: bytes, encoding: str) -> Any:
 def write(path: Path, encoding: str, items: list[tuple[str, str, dict[str, Any]]]) -> Path:
     """Write messages given as topic, type and values."""
     schema_encoding = "protobuf" if encoding == "protobuf" else "jsonschema"
-    with path.open("wb") as file:
-        writer = Writer(file)
-        writer.start("", "test")
+    with mcap_writer(path, "") as writer:
         for k, (topic, kind, values) in enumerate(items):
             text = descriptors() if encoding == "protobuf" else b"{}"
             schema = writer.register_schema(kind, schema_encoding, text)
@@ -143,5 +141,4 @@ def write(path: Path, encoding: str, items: list[tuple[str, str, dict[str, Any]]
             filled = {"timestamp": time(EPOCH, encoding)} | own | values
             data = encode(filled, kind) if encoding == "protobuf" else json.dumps(filled).encode()
             writer.add_message(channel, EPOCH + k, data, EPOCH + k)
-        writer.finish()
     return path

@@ -6,10 +6,10 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from mcap.writer import Writer
 from rosbags.typesys import Stores, get_typestore
 
 from shapecat.types import Camera, Frame
+from tests.mcap_files import mcap_writer
 
 STORE = get_typestore(Stores.ROS2_HUMBLE)
 SECOND = 10**9
@@ -78,9 +78,7 @@ def write(
     empty: Iterable[tuple[str, str]] = (),
 ) -> Path:
     """Write messages given as topic, log time, message or bytes, and ``empty`` topics."""
-    with path.open("wb") as file:
-        writer = Writer(file, chunk_size=chunk_size)
-        writer.start("ros2", "test")
+    with mcap_writer(path, chunk_size=chunk_size) as writer:
         channels: dict[tuple[str, str], int] = {}
 
         def declare(topic: str, kind: str) -> None:
@@ -96,7 +94,6 @@ def write(
                 declare(topic, kind)
             raw = item[1] if isinstance(item, tuple) else bytes(STORE.serialize_cdr(item, kind))
             writer.add_message(channels[topic, kind], time, raw, time)
-        writer.finish()
     return path
 
 

@@ -22,6 +22,7 @@ from shapecat.simulation.messages import MessageFactory
 from tests import depth_encodings as depth
 from tests import foxglove_messages as foxglove
 from tests import messages as ros
+from tests.mcap_files import mcap_writer
 from tests.messages import EPOCH, SECOND
 from tests.scenes import OPTICAL, PERIOD, back_and_forth, record, serialized, stream, views
 
@@ -74,16 +75,10 @@ def write_all(writer: Any, items: Iterable[tuple[str, str, int, bytes]], types: 
 def mcap(path: Path, *, finish: bool = True, cut: int = 0, last: Any = (), **options: Any) -> Path:
     """Write the table and ``last`` messages; remove ``cut`` bytes from the end."""
     path /= "a.mcap"
-    with path.open("wb") as file:
-        writer = Writer(file, **({"chunk_size": 60_000} | options))
-        writer.start("ros2", "zoo")
+    with mcap_writer(path, finish=finish, **({"chunk_size": 60_000} | options)) as writer:
         channels = McapChannels(writer, FACTORY)
         for item in [*serialized(stream(FACTORY, FRAMES), FACTORY), *last]:
             channels.write(*item)
-        if finish:
-            writer.finish()
-        else:
-            writer.flush()
     if cut:
         path.write_bytes(path.read_bytes()[:-cut])
     return path
@@ -159,13 +154,10 @@ def splits(path: Path) -> Path:
 def ros1_mcap(path: Path) -> Path:
     """Write ROS 1 messages to MCAP, as `mcap convert` does."""
     path /= "a.mcap"
-    with path.open("wb") as file:
-        writer = Writer(file)
-        writer.start("ros1", "zoo")
+    with mcap_writer(path, "ros1") as writer:
         channels = McapChannels(writer, FACTORY1, version=1)
         for item in serialized(stream(FACTORY1, FRAMES), FACTORY1):
             channels.write(*item)
-        writer.finish()
     return path
 
 
@@ -297,9 +289,7 @@ def distorted(path: Path, *, strong: bool) -> Path:
 def foreign(path: Path) -> Path:
     """Add channels of other programs: a service event, and unknown encodings and schemas."""
     found = path / "a.mcap"
-    with found.open("wb") as file:
-        writer = Writer(file)
-        writer.start("ros2", "zoo")
+    with mcap_writer(found) as writer:
         broken = writer.register_schema("my/srv/Do_Event", "ros2msg", b"service_msgs/Nothing info")
         channels = [
             writer.register_channel("/do/_service_event", "cdr", broken),
@@ -312,7 +302,6 @@ def foreign(path: Path) -> Path:
             for channel in channels:
                 writer.add_message(channel, item[2], b"\x00\x01\x00\x00\xff\xff\xff\xff", item[2])
             own.write(*item)
-        writer.finish()
     return found
 
 

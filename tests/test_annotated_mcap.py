@@ -18,7 +18,7 @@ from hypothesis import strategies as st
 from mcap import records
 from mcap.data_stream import RecordBuilder
 from mcap.reader import NonSeekingReader, make_reader
-from mcap.writer import CompressionType, Writer
+from mcap.writer import CompressionType
 from mcap_ros2.decoder import DecoderFactory
 from rosbags.highlevel import AnyReader
 from rosbags.rosbag1 import Writer as BagWriter
@@ -34,6 +34,7 @@ from shapecat.outputs.mcap_append import Appender, copy_bytes
 from shapecat.recordings import open_recording
 from shapecat.recordings.mcap_records import ChunkError, read_chunk_index, write_chunk_index
 from shapecat.types import CATEGORIES, ShownBox, ShownFrame
+from tests.mcap_files import mcap_writer, read_ros, summary_of
 from tests.test_recordings import QOS
 
 STORE = get_typestore(Stores.ROS2_HUMBLE)
@@ -94,10 +95,8 @@ def string(value: str) -> bytes:
     return bytes(STORE.serialize_cdr(STORE.types[STRING](data=value), STRING))
 
 
-def write_mcap(path: Path, *, unfinished: bool = False, **options: Any) -> Path:
-    with path.open("wb") as file:
-        writer = Writer(file, **({"chunk_size": 100} | options))
-        writer.start("ros2", "test")
+def write_mcap(path: Path, **options: Any) -> Path:
+    with mcap_writer(path, **({"chunk_size": 100} | options)) as writer:
         text = STORE.generate_msgdef(STRING, ros_version=2)[0].encode()
         schema = writer.register_schema(STRING, "ros2msg", text)
         channel = writer.register_channel("/points", "cdr", schema)
@@ -106,10 +105,6 @@ def write_mcap(path: Path, *, unfinished: bool = False, **options: Any) -> Path:
             if k == 4:
                 writer.add_attachment(1, 2, "photo", "image/png", b"\x89PNG")
                 writer.add_metadata("robot", {"name": "r2"})
-        if unfinished:
-            writer.flush()
-        else:
-            writer.finish()
     return path
 
 
@@ -126,12 +121,6 @@ def digest(path: Path) -> Counter[tuple[Any, ...]]:
         )
 
 
-def decoded(path: Path, topic: str) -> list[Any]:
-    with path.open("rb") as file:
-        reader = make_reader(file, decoder_factories=[DecoderFactory()])
-        return [(m.log_time, d) for *_, m, d in reader.iter_decoded_messages(topics=[topic])]
-
-
 @pytest.mark.parametrize("compression", list(CompressionType))
 def test_original_messages_stay_byte_for_byte(tmp_path: Path, compression: CompressionType) -> None:
     source = write_mcap(tmp_path / "a.mcap", compression=compression)
@@ -141,9 +130,7 @@ def test_original_messages_stay_byte_for_byte(tmp_path: Path, compression: Compr
 
     assert not digest(source) - digest(target)
     assert digest(target).total() == 9 + 3 * 3
-    with target.open("rb") as file:
-        summary = make_reader(file).get_summary()
-    assert summary is not None
+    summary = summary_of(target)
     # Users who record without zstd may be unable to read it.
     name = compression.name.lower().replace("none", "")
     assert {chunk.compression for chunk in summary.chunk_indexes} == {name}
@@ -186,9 +173,7 @@ def test_other_readers_accept_the_file(tmp_path: Path) -> None:
 def test_original_channels_keep_their_ids(tmp_path: Path, *, markers: bool) -> None:
     """Ids may have gaps; a duplicate would mix the messages of two topics."""
     source, target, text = tmp_path / "a.mcap", tmp_path / "out.mcap", b"string data"
-    with source.open("wb") as file:
-        writer = Writer(file)
-        writer.start("ros2", "test")
+    with mcap_writer(source) as writer:
         for k, topic in enumerate(("/first", "/gone", "/points", "/last")):
             schema = writer.register_schema(STRING, "ros2msg", text + bytes(k))
             channel = writer.register_channel(topic, "cdr", schema)
@@ -196,7 +181,6 @@ def test_original_channels_keep_their_ids(tmp_path: Path, *, markers: bool) -> N
                 writer.add_message(channel, EPOCH + k, string(topic), EPOCH, k)
         for kind in ("channels", "schemas"):  # the library itself leaves nothing out
             vars(writer)[f"_Writer__{kind}"].pop(2)
-        writer.finish()
     annotate(source, target, markers=markers)
 
     own = {f"/{name}": string(f"/{name}") for name in ("first", "points", "last")}
@@ -223,7 +207,7 @@ def test_original_channels_keep_their_ids(tmp_path: Path, *, markers: bool) -> N
         f"/shapecat/{name}": len(FRAMES) for name in added
     }
     for name in added:
-        assert [time for time, _ in decoded(target, f"/shapecat/{name}")] == [
+        assert [time for time, _ in read_ros(target, f"/shapecat/{name}")] == [
             frame.log_time_ns for frame in FRAMES
         ]
 
@@ -245,7 +229,7 @@ def test_detections_have_categories_and_boxes(tmp_path: Path) -> None:
     target = tmp_path / "out.mcap"
     annotate(write_mcap(tmp_path / "a.mcap"), target)
 
-    (time, first), (_, second), (_, third) = decoded(target, "/shapecat/detections")
+    (time, first), (_, second), (_, third) = read_ros(target, "/shapecat/detections")
 
     assert time == EPOCH + 7
     assert (first.header.stamp.sec, first.header.stamp.nanosec) == (EPOCH // SECOND, 0)
@@ -265,7 +249,7 @@ def test_scene_adds_updates_and_removes_tracks(tmp_path: Path) -> None:
     target = tmp_path / "out.mcap"
     annotate(write_mcap(tmp_path / "a.mcap"), target)
 
-    scenes = [scene for _, scene in decoded(target, "/shapecat/scene")]
+    scenes = [scene for _, scene in read_ros(target, "/shapecat/scene")]
 
     assert [[e.id for e in scene.entities] for scene in scenes] == [
         ["track-3", "track-4"],
@@ -292,7 +276,7 @@ def test_markers_of_ended_tracks_are_deleted(tmp_path: Path) -> None:
     target = tmp_path / "out.mcap"
     annotate(write_mcap(tmp_path / "a.mcap"), target, markers=True)
 
-    messages = [message for _, message in decoded(target, "/shapecat/markers")]
+    messages = [message for _, message in read_ros(target, "/shapecat/markers")]
 
     assert [[(m.id, m.type, m.action) for m in message.markers] for message in messages] == [
         [(3, 1, 0), (3, 9, 0), (4, 1, 0), (4, 9, 0)],
@@ -302,7 +286,7 @@ def test_markers_of_ended_tracks_are_deleted(tmp_path: Path) -> None:
 
 
 def test_truncated_recording_is_rewritten(tmp_path: Path) -> None:
-    source = write_mcap(tmp_path / "a.mcap", unfinished=True)
+    source = write_mcap(tmp_path / "a.mcap", finish=False)
     source.write_bytes(source.read_bytes()[:-5])
     target = tmp_path / "out.mcap"
 
@@ -318,21 +302,18 @@ def test_truncated_recording_is_rewritten(tmp_path: Path) -> None:
     assert kept[2] == (EPOCH + 2, EPOCH, 2, string("message 2"))  # logged, published, sequence
     with target.open("rb") as file:
         assert {m.name for m in make_reader(file).iter_metadata()} == {"robot", "shapecat"}
-    assert len(decoded(target, "/shapecat/scene")) == 3
+    assert len(read_ros(target, "/shapecat/scene")) == 3
 
 
 def test_both_definitions_of_a_type_are_kept(tmp_path: Path) -> None:
     """Recordings of two robots, merged and cut: each topic keeps its own definition."""
     texts = {"/a": b"uint32 a", "/b": b"uint32 a\nuint32 b"}
     source, target = tmp_path / "a.mcap", tmp_path / "out.mcap"
-    with source.open("wb") as file:
-        writer = Writer(file)
-        writer.start("ros2", "test")
+    with mcap_writer(source, finish=False) as writer:
         for topic, text in texts.items():
             schema = writer.register_schema("lab/msg/Own", "ros2msg", text)
             channel = writer.register_channel(topic, "cdr", schema)
             writer.add_message(channel, EPOCH, b"\0\1\0\0\7\0\0\0", EPOCH)
-        writer.flush()
 
     annotate(source, target)
 
@@ -373,9 +354,7 @@ def test_messages_of_ros2_folder_stay_byte_for_byte(tmp_path: Path, plugin: Stor
 
     annotate(source, target)
 
-    with target.open("rb") as file:
-        summary = make_reader(file).get_summary()
-    assert summary is not None
+    summary = summary_of(target)
     (channel,) = (one for one in summary.channels.values() if one.topic == "/points")
     # Without it, subscribers would not receive the played messages.
     assert parse_qos(channel.metadata["offered_qos_profiles"]) == [QOS]
@@ -383,7 +362,7 @@ def test_messages_of_ros2_folder_stay_byte_for_byte(tmp_path: Path, plugin: Stor
         chosen = [c for c in reader.connections if c.topic == "/points"]
         read = [bytes(data) for _, _, data in reader.messages(chosen)]
     assert read == [string(f"message {k}") for k in range(5)]
-    assert [time for time, _ in decoded(target, "/points")] == [EPOCH + k for k in range(5)]
+    assert [time for time, _ in read_ros(target, "/points")] == [EPOCH + k for k in range(5)]
 
 
 def ros1_messages() -> Iterator[tuple[str, str, Any]]:
@@ -414,9 +393,9 @@ def test_ros1_bag_is_converted_to_ros2(tmp_path: Path) -> None:
 
     annotate(source, target)
 
-    ((time, header),) = decoded(target, "/header")
-    ((_, info),) = decoded(target, "/info")
-    ((_, own),) = decoded(target, "/own")
+    ((time, header),) = read_ros(target, "/header")
+    ((_, info),) = read_ros(target, "/info")
+    ((_, own),) = read_ros(target, "/own")
     assert time == EPOCH
     assert (header.stamp.sec, header.frame_id) == (1, "frame")
     assert list(info.k) == list(range(9))  # ROS 1 calls it K
@@ -466,13 +445,10 @@ def test_annotations_use_encoding_of_source(
     tmp_path: Path, profile: str, encoding: str, schema: tuple[str, str], expected: str
 ) -> None:
     source, target = tmp_path / "a.mcap", tmp_path / "out.mcap"
-    with source.open("wb") as file:
-        writer = Writer(file)
-        writer.start(profile, "test")
+    with mcap_writer(source, profile) as writer:
         number = writer.register_schema(*schema, b"string data" if encoding == "ros1" else b"{}")
         channel = writer.register_channel("/points", encoding, number)
         writer.add_message(channel, EPOCH, b"\1\0\0\0a" if encoding == "ros1" else b"{}", EPOCH)
-        writer.finish()
 
     annotate(source, target)
 
@@ -487,11 +463,8 @@ def test_annotations_use_encoding_of_source(
 def test_json_messages_match_their_schemas(tmp_path: Path) -> None:
     jsonschema = pytest.importorskip("jsonschema")
     source, target = tmp_path / "a.mcap", tmp_path / "out.mcap"
-    with source.open("wb") as file:
-        writer = Writer(file)
-        writer.start("", "test")
+    with mcap_writer(source, "") as writer:
         writer.register_channel("/points", "json", 0)
-        writer.finish()
 
     annotate(source, target)
 

@@ -1,6 +1,7 @@
 """Tests of annotations of a rotated box in every encoding; all numbers differ, so swaps show."""
 
 import json
+from collections.abc import Iterable
 from dataclasses import replace
 from pathlib import Path
 from types import SimpleNamespace
@@ -9,14 +10,12 @@ from typing import Any
 import numpy as np
 import pytest
 from mcap.reader import make_reader
-from mcap.records import ChunkIndex
-from mcap_ros2.decoder import DecoderFactory
 from numpy.testing import assert_allclose
 from rosbags.typesys import Stores, get_types_from_msg, get_typestore
 from scipy.spatial.transform import Rotation
 
 from shapecat.outputs.annotated_mcap import write_annotated
-from shapecat.outputs.annotation import Annotation, text_position
+from shapecat.outputs.annotation import Annotation, AnnotationChannel, text_position
 from shapecat.outputs.annotations import encoder_for
 from shapecat.outputs.colours import colour_of
 from shapecat.outputs.image_annotations import ImageBox, ImageFrame, image_encoder_for
@@ -25,6 +24,7 @@ from shapecat.outputs.ros_annotations import RosMessages
 from shapecat.recordings import open_recording
 from shapecat.recordings.protobuf import message_decoder
 from shapecat.types import Box, ShownBox, ShownFrame
+from tests.mcap_files import read_ros, summary_of
 from tests.test_annotated_mcap import EPOCH, write_mcap
 
 SECOND = 10**9
@@ -64,21 +64,20 @@ def plain(message: Any) -> Any:
     return SimpleNamespace(**{name: plain(fields[name]) for name in names})
 
 
+def read_back(channel: AnnotationChannel, data: bytes) -> Any:
+    """Return a message, decoded by its channel's own schema."""
+    if channel.encoding == "json":
+        return plain(json.loads(data))
+    if channel.encoding == "protobuf":
+        return plain(message_decoder(channel.schema, channel.schema_name)(data))
+    ros1 = channel.encoding == "ros1"
+    return plain(decode_ros(channel.schema_name, channel.schema, bytes(data), ros1=ros1))
+
+
 def messages(encoding: str) -> dict[str, Any]:
-    """Return the message of each topic, decoded by its channel's own schema."""
-    found = {}
-    for channel, encode in encoder_for(encoding, markers=True):
-        data = encode(ANNOTATION)
-        if encoding == "json":
-            message = json.loads(data)
-        elif encoding == "protobuf":
-            message = message_decoder(channel.schema, channel.schema_name)(data)
-        else:
-            message = decode_ros(
-                channel.schema_name, channel.schema, bytes(data), ros1=encoding == "ros1"
-            )
-        found[channel.topic] = plain(message)
-    return found
+    """Return the message of each topic."""
+    encoders = encoder_for(encoding, markers=True)
+    return {channel.topic: read_back(channel, make(ANNOTATION)) for channel, make in encoders}
 
 
 def numbers(record: Any, names: str) -> list[float]:
@@ -174,11 +173,12 @@ def test_markers_match_boxes(encoding: str) -> None:
     assert_allclose(numbers(text.color, "rgba"), [*colour, 1.0], atol=1e-6)
 
 
-def chunk_indexes(path: Path) -> list[ChunkIndex]:
-    with path.open("rb") as file:
-        summary = make_reader(file).get_summary()
-    assert summary is not None
-    return list(summary.chunk_indexes)
+def annotated(folder: Path, frames: Iterable[ShownFrame], *, markers: bool = False) -> Path:
+    """Return a recording with annotations."""
+    target = folder / "out.mcap"
+    with open_recording(write_mcap(folder / "a.mcap")) as recording:
+        write_annotated(recording, target, iter(frames), run={}, markers=markers)
+    return target
 
 
 def index_end(data: bytes, at: int, count: int) -> int:
@@ -192,10 +192,8 @@ def index_end(data: bytes, at: int, count: int) -> int:
 def test_chunk_indexes_have_length_of_message_indexes(tmp_path: Path) -> None:
     """Readers that fetch a chunk with its index in one request rely on this length."""
     frames = [replace(FRAME, index=k, log_time_ns=STAMP + k) for k in range(900)]
-    target = tmp_path / "out.mcap"
-    with open_recording(write_mcap(tmp_path / "a.mcap")) as recording:
-        write_annotated(recording, target, iter(frames), run={}, markers=True)
-    data, found = target.read_bytes(), chunk_indexes(target)
+    target = annotated(tmp_path, frames, markers=True)
+    data, found = target.read_bytes(), summary_of(target).chunk_indexes
 
     assert len(found) > 3
     for index in found:
@@ -208,11 +206,8 @@ def test_chunk_indexes_have_length_of_message_indexes(tmp_path: Path) -> None:
 def test_added_messages_are_found_by_time(tmp_path: Path) -> None:
     """A seek reads only the chunks whose time range contains the target."""
     frames = [replace(FRAME, index=k, log_time_ns=STAMP + k * SECOND) for k in range(400)]
-    target = tmp_path / "out.mcap"
-    with open_recording(write_mcap(tmp_path / "a.mcap")) as recording:
-        write_annotated(recording, target, iter(frames), run={}, markers=False)
-    with target.open("rb") as file:
-        reader = make_reader(file, decoder_factories=[DecoderFactory()])
+    with annotated(tmp_path, frames).open("rb") as file:
+        reader = make_reader(file)
         window = {"starting_at": STAMP + 150 * SECOND, "ending_before": STAMP + 155 * SECOND}
         times = [
             message.log_time
@@ -234,10 +229,7 @@ def test_unordered_messages_are_found_by_time(tmp_path: Path) -> None:
     """Messages of two sensors arrive interleaved."""
     offsets = (50, 20, 90, 70)
     frames = [replace(FRAME, index=k, log_time_ns=EPOCH + t) for k, t in enumerate(offsets)]
-    target = tmp_path / "out.mcap"
-    with open_recording(write_mcap(tmp_path / "a.mcap")) as recording:
-        write_annotated(recording, target, iter(frames), run={}, markers=False)
-    with target.open("rb") as file:
+    with annotated(tmp_path, frames).open("rb") as file:
         reader = make_reader(file)
         for start, stop, expected in ((20, 21, [20]), (80, 99, [90]), (3, 60, [20, 50])):
             window = {"starting_at": EPOCH + start, "ending_before": EPOCH + stop}
@@ -267,13 +259,8 @@ def test_statistics_cover_times_of_all_messages(
     The messages of the original are at 0 to 8.
     """
     frames = [replace(FRAME, index=k, log_time_ns=EPOCH + t) for k, t in enumerate(offsets)]
-    target = tmp_path / "out.mcap"
-    with open_recording(write_mcap(tmp_path / "a.mcap")) as recording:
-        write_annotated(recording, target, iter(frames), run={}, markers=False)
-    with target.open("rb") as file:
-        summary = make_reader(file).get_summary()
+    summary = summary_of(annotated(tmp_path, frames))
 
-    assert summary is not None
     assert summary.statistics is not None
     assert summary.statistics.message_start_time == EPOCH + first
     assert summary.statistics.message_end_time == EPOCH + last
@@ -292,12 +279,7 @@ def test_object_visible_to_another_sensor_is_not_deleted(tmp_path: Path) -> None
         frame_of("/a", 2, visible=False),
         frame_of("/b", 3, visible=False),
     ]
-    target = tmp_path / "out.mcap"
-    with open_recording(write_mcap(tmp_path / "a.mcap")) as recording:
-        write_annotated(recording, target, iter(frames), run={})
-    with target.open("rb") as file:
-        reader = make_reader(file, decoder_factories=[DecoderFactory()])
-        scenes = [d for *_, d in reader.iter_decoded_messages(topics=["/shapecat/scene"])]
+    scenes = [scene for _, scene in read_ros(annotated(tmp_path, frames), "/shapecat/scene")]
 
     assert [[d.id for d in scene.deletions] for scene in scenes] == [[], [], [], ["track-7"]]
 
@@ -307,19 +289,9 @@ IMAGE = ImageFrame(STAMP, STAMP + 3, "colour", (IMAGE_BOX,))
 
 
 def image_messages(encoding: str) -> dict[str, Any]:
-    """Return the annotations of an image by topic, decoded with their channel's schema."""
-    found = {}
-    for channel, encode in image_encoder_for(encoding):
-        data = encode(IMAGE)
-        if encoding == "json":
-            message = json.loads(data)
-        elif encoding == "protobuf":
-            message = message_decoder(channel.schema, channel.schema_name)(data)
-        else:
-            ros1 = encoding == "ros1"
-            message = decode_ros(channel.schema_name, channel.schema, bytes(data), ros1=ros1)
-        found[channel.topic] = plain(message)
-    return found
+    """Return the annotations of an image by topic."""
+    encoders = image_encoder_for(encoding)
+    return {channel.topic: read_back(channel, make(IMAGE)) for channel, make in encoders}
 
 
 @pytest.mark.parametrize("encoding", ["cdr", "ros1", "json", "protobuf"])

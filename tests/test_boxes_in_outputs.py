@@ -9,8 +9,8 @@ import numpy as np
 import pyarrow.parquet as pq
 import pytest
 from click.testing import Result
-from mcap.reader import make_reader
-from mcap_ros2.decoder import DecoderFactory
+
+from tests.mcap_files import read_ros
 
 Sizes = dict[tuple[int, str], list[float]]
 
@@ -18,14 +18,12 @@ Sizes = dict[tuple[int, str], list[float]]
 def annotated(folder: Path) -> Sizes:
     """Return the sizes in annotated.mcap by stamp and track."""
     found = {}
-    with (folder / "annotated.mcap").open("rb") as file:
-        reader = make_reader(file, decoder_factories=[DecoderFactory()])
-        for _, _, _, message in reader.iter_decoded_messages(["/shapecat/detections"]):
-            stamp = message.header.stamp
-            for item in message.detections:
-                size = item.bbox.size
-                key = (stamp.sec * 10**9 + stamp.nanosec, item.id)
-                found[key] = [size.x, size.y, size.z]
+    for _, message in read_ros(folder / "annotated.mcap", "/shapecat/detections"):
+        stamp = message.header.stamp
+        for item in message.detections:
+            size = item.bbox.size
+            key = (stamp.sec * 10**9 + stamp.nanosec, item.id)
+            found[key] = [size.x, size.y, size.z]
     return found
 
 

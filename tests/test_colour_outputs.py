@@ -13,8 +13,6 @@ import numpy as np
 import pyarrow.parquet as pq
 import pytest
 from click.testing import Result
-from mcap.reader import make_reader
-from mcap_ros2.decoder import DecoderFactory
 
 import shapecat.pipeline
 from shapecat.cameras.colour import ColourImage, ColourView
@@ -43,6 +41,7 @@ from shapecat.runs.masks import read_masks
 from shapecat.types import ImageMasks
 from tests.colour_messages import gradient, png
 from tests.conftest import Guesser
+from tests.mcap_files import read_ros
 from tests.test_exports import relabel
 from tests.test_review import TOPIC, labelled_object, rows, scene, stamp
 
@@ -54,14 +53,6 @@ FRAMES = 4
 def run(coloured_run: Path) -> Path:
     """Return a run with colour."""
     return coloured_run
-
-
-def recorded(path: Path, topic: str) -> list[tuple[int, Any]]:
-    """Return log time and decoded message of a topic."""
-    with path.open("rb") as file:
-        reader = make_reader(file, decoder_factories=[DecoderFactory()])
-        found = reader.iter_decoded_messages(topics=[topic])
-        return [(message.log_time, decoded) for _, _, message, decoded in found]
 
 
 def test_masks_of_run_match_simulated_truth(run: Path) -> None:
@@ -101,7 +92,7 @@ def test_review_has_original_images_and_boxes_of_tracks(run: Path) -> None:
     """
     entity = "/images//camera/depth/image_raw"
     source = run.parents[1] / "table.mcap"
-    images = [bytes(message.data) for _, message in recorded(source, IMAGES)]
+    images = [bytes(message.data) for _, message in read_ros(source, IMAGES)]
     stored = {r["frame"]: bytes(bytearray(r["EncodedImage:blob"][0])) for r in _rows(run, entity)}
     assert stored == {frame: images[frame] for frame in stored}
     drawn = _rows(run, "/world/seen//camera/depth/image_raw/scene")
@@ -148,9 +139,9 @@ def _rows(run: Path, entity: str) -> list[dict[str, Any]]:
 
 def test_image_annotations_have_stamp_and_frame_of_image(run: Path) -> None:
     """Foxglove draws only annotations with exactly the timestamp of the image."""
-    images = recorded(run / "annotated.mcap", IMAGES)
-    found = recorded(run / "annotated.mcap", "/shapecat/detections_2d")
-    drawn = recorded(run / "annotated.mcap", "/shapecat/image_annotations")
+    images = read_ros(run / "annotated.mcap", IMAGES)
+    found = read_ros(run / "annotated.mcap", "/shapecat/detections_2d")
+    drawn = read_ros(run / "annotated.mcap", "/shapecat/image_annotations")
     assert len(images) == len(found) == len(drawn) == FRAMES
     for (_, masks), (time, image), (time_2d, array), (_, drawing) in zip(
         read_masks(run), images, found, drawn, strict=True
@@ -197,7 +188,7 @@ def test_corrections_change_image_annotations(run: Path, tmp_path: Path) -> None
     before = (folder / "masks.parquet").stat().st_mtime_ns
     shapecat.pipeline.annotate_again(folder, None)
 
-    arrays = [m for _, m in recorded(folder / "annotated.mcap", "/shapecat/detections_2d")]
+    arrays = [m for _, m in read_ros(folder / "annotated.mcap", "/shapecat/detections_2d")]
     shown = [(d.id, d.results[0].hypothesis.class_id) for a in arrays for d in a.detections]
     assert ("2", "wine glass") in shown
     assert "1" not in {track for track, _ in shown}
@@ -212,7 +203,7 @@ def test_colour_can_be_disabled_and_wrong_topic_is_refused(
     source = run.parents[1] / "table.mcap"
     process(Job(source=source, folder=tmp_path / "a", color="", rrd=False, end_s=0.04))
     assert not (tmp_path / "a" / "masks.parquet").exists()
-    assert not recorded(tmp_path / "a" / "annotated.mcap", "/shapecat/detections_2d")
+    assert not read_ros(tmp_path / "a" / "annotated.mcap", "/shapecat/detections_2d")
     with pytest.raises(NoStreamError, match="/tf holds no colour images; colour images: /camera"):
         process(Job(source=source, folder=tmp_path / "b", color="/tf"))
     result = shapecat("process", source, "--out", tmp_path, "--color", "/x", "--no-color")

@@ -23,7 +23,8 @@ from shapecat.recordings import MessageError
 from shapecat.recordings.colour_image import pixels_of
 from shapecat.runs.finished import FinishedRun, read_finished
 from shapecat.runs.masks import read_masks
-from tests.test_colour_outputs import IMAGES, recorded
+from tests.mcap_files import read_ros
+from tests.test_colour_outputs import IMAGES
 from tests.test_exports import relabel
 
 Run = Callable[..., Result]
@@ -74,7 +75,7 @@ def test_coco_has_original_images_and_masks_of_tracks(run: Path, tmp_path: Path)
     assert min(names) == 1
     source = Path(read_finished(run).run["input"]["path"])
     files = [tmp_path / "out/images/train" / image["file_name"] for image in data["images"]]
-    assert [f.read_bytes() for f in files] == [bytes(m.data) for _, m in recorded(source, IMAGES)]
+    assert [f.read_bytes() for f in files] == [bytes(m.data) for _, m in read_ros(source, IMAGES)]
     assert all(
         np.asarray(Image.open(io.BytesIO(f.read_bytes()))).shape == (720, 960, 3) for f in files
     )
@@ -230,7 +231,7 @@ def test_depth_images_are_millimetres_with_their_own_masks(run: Path, tmp_path: 
     export_dataset([run], "coco", tmp_path / "out", Selection(depth=True))
     data = read_coco(tmp_path / "out")
     source = Path(read_finished(run).run["input"]["path"])
-    (first, *_), messages = data["images"], recorded(source, "/camera/depth/image_raw")
+    (first, *_), messages = data["images"], read_ros(source, "/camera/depth/image_raw")
     pixels = np.asarray(Image.open(tmp_path / "out/images/train" / first["file_name"]))
     stored = np.frombuffer(bytes(messages[0][1].data), "<u2").reshape(480, 640)
     np.testing.assert_array_equal(pixels, stored)

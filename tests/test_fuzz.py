@@ -10,7 +10,7 @@ from typing import Any, NamedTuple
 import numpy as np
 import pytest
 from mcap.reader import make_reader
-from mcap.writer import CompressionType, Writer
+from mcap.writer import CompressionType
 from rosbags.rosbag1 import Writer as BagWriter
 from rosbags.rosbag2 import StoragePlugin
 from rosbags.rosbag2 import Writer as FolderWriter
@@ -22,6 +22,7 @@ from shapecat.recordings.gravity import Upright
 from shapecat.recordings.ros1_bag import BagRecording
 from shapecat.simulation.messages import MessageFactory
 from shapecat.types import Camera
+from tests.mcap_files import mcap_writer
 from tests.messages import EPOCH, SECOND
 
 CAMERA = Camera(16, 12, 20.0, 20.0, 7.5, 5.5)
@@ -48,9 +49,7 @@ def items(make: MessageFactory) -> Any:
 
 def mcap(parent: Path, **options: Any) -> Path:
     make, path = MessageFactory(2), parent / "a.mcap"
-    with path.open("wb") as file:
-        writer = Writer(file, **({"chunk_size": 4000} | options))
-        writer.start("ros2", "test")
+    with mcap_writer(path, **({"chunk_size": 4000} | options)) as writer:
         channels: dict[str, int] = {}
         for topic, time, message in items(make):
             kind = message.__msgtype__
@@ -59,7 +58,6 @@ def mcap(parent: Path, **options: Any) -> Path:
                 schema = writer.register_schema(kind, "ros2msg", text)
                 channels[topic] = writer.register_channel(topic, "cdr", schema)
             writer.add_message(channels[topic], time, make.serialize(message), time)
-        writer.finish()
     return path
 
 

@@ -10,8 +10,6 @@ import numpy as np
 import pyarrow as pa
 import pytest
 from click.testing import Result
-from mcap.reader import make_reader
-from mcap_ros2.decoder import DecoderFactory
 
 from shapecat.errors import OutputError
 from shapecat.runs.corrections import adopt_labels, read_labels
@@ -22,6 +20,7 @@ from shapecat.runs.same_objects import Match, _by_majority, _mutual_nearest
 from shapecat.runs.table_schemas import DETECTIONS, FRAMES, TRACKS
 from shapecat.runs.tables import write_table
 from shapecat.runs.track_table import read_track_table
+from tests.mcap_files import read_ros
 from tests.run_info import run_info
 from tests.scenes import record
 
@@ -597,12 +596,8 @@ def place_of(row: Mapping[str, str]) -> list[float]:
 
 def annotated_classes(run: Path) -> set[str]:
     """Return the classes in annotated.mcap."""
-    found = set()
-    with (run / "annotated.mcap").open("rb") as file:
-        reader = make_reader(file, decoder_factories=[DecoderFactory()])
-        for *_, message in reader.iter_decoded_messages(topics=["/shapecat/detections"]):
-            found |= {item.results[0].hypothesis.class_id for item in message.detections}
-    return found
+    found = read_ros(run / "annotated.mcap", "/shapecat/detections")
+    return {item.results[0].hypothesis.class_id for _, one in found for item in one.detections}
 
 
 def test_overwriting_keeps_corrections_unless_discarded(

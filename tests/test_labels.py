@@ -11,8 +11,6 @@ import pytest
 from click.testing import Result
 from hypothesis import given, settings
 from hypothesis import strategies as st
-from mcap.reader import make_reader
-from mcap_ros2.decoder import DecoderFactory
 
 from shapecat.errors import OutputError
 from shapecat.outputs.wording import safe_name
@@ -25,6 +23,7 @@ from shapecat.runs.perceived import FrameRow, PerceptionTables
 from shapecat.runs.shown import _ended
 from shapecat.runs.track_table import read_track_table
 from shapecat.types import Box, Candidate, Detection, NeuralGas, Perception, Plane, Scene
+from tests.mcap_files import read_ros
 from tests.run_info import run_info
 from tests.track_tables import write_tracks
 
@@ -598,20 +597,16 @@ def replayed(path: Path) -> list[tuple[int, set[str]]]:
     """Replay the scene of a recording; return the entities after each message, and its time."""
     alive: dict[str, float] = {}
     shown = []
-    with path.open("rb") as file:
-        reader = make_reader(file, decoder_factories=[DecoderFactory()])
-        messages = reader.iter_decoded_messages(topics=["/shapecat/scene"])
-        for _, _, message, scene in messages:
-            now = message.log_time
-            for deletion in scene.deletions:
-                alive.pop(deletion.id, None)
-            alive = {name: end for name, end in alive.items() if end > now}
-            for entity in scene.entities:
-                lifetime = entity.lifetime.sec * 10**9 + entity.lifetime.nanosec
-                assert lifetime > 0
-                alive[entity.id] = now + lifetime
-            assert len({entity.id for entity in scene.entities}) == len(scene.entities)
-            shown.append((now, set(alive)))
+    for now, scene in read_ros(path, "/shapecat/scene"):
+        for deletion in scene.deletions:
+            alive.pop(deletion.id, None)
+        alive = {name: end for name, end in alive.items() if end > now}
+        for entity in scene.entities:
+            lifetime = entity.lifetime.sec * 10**9 + entity.lifetime.nanosec
+            assert lifetime > 0
+            alive[entity.id] = now + lifetime
+        assert len({entity.id for entity in scene.entities}) == len(scene.entities)
+        shown.append((now, set(alive)))
     return shown
 
 

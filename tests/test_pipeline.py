@@ -12,11 +12,11 @@ import pyarrow.parquet as pq
 import pytest
 from click.testing import Result
 from mcap.reader import make_reader
-from mcap_ros2.decoder import DecoderFactory
 from numpy.testing import assert_allclose
 
 from shapecat.pipeline import annotate
 from shapecat.simulation import simulate
+from tests.mcap_files import read_ros
 
 Run = Callable[..., Result]
 FILES = {
@@ -71,14 +71,9 @@ def test_originals_are_kept_and_annotations_decode(recording: Path, run_folder: 
     assert not messages(recording) - messages(run_folder / "annotated.mcap")
 
     topics = ["/shapecat/detections", "/shapecat/scene"]
-    with (run_folder / "annotated.mcap").open("rb") as file:
-        reader = make_reader(file, decoder_factories=[DecoderFactory()])
-        decoded = [
-            (channel.topic, message)
-            for _, channel, _, message in reader.iter_decoded_messages(topics=topics)
-        ]
-    assert Counter(topic for topic, _ in decoded) == dict.fromkeys(topics, 20)
-    assert sum(len(m.detections) for t, m in decoded if t == topics[0]) > 100
+    found = {topic: read_ros(run_folder / "annotated.mcap", topic) for topic in topics}
+    assert {topic: len(messages) for topic, messages in found.items()} == dict.fromkeys(topics, 20)
+    assert sum(len(message.detections) for _, message in found[topics[0]]) > 100
 
 
 def test_objects_are_detected_categorized_and_tracked(recording: Path, run_folder: Path) -> None:
@@ -215,10 +210,8 @@ def test_corrected_label_appears_in_annotations(
 
     assert result.exit_code == 0, result.output
     names = Counter[str]()
-    with (folder / "annotated.mcap").open("rb") as file:
-        reader = make_reader(file, decoder_factories=[DecoderFactory()])
-        for *_, message in reader.iter_decoded_messages(topics=["/shapecat/detections"]):
-            names.update(d.results[0].hypothesis.class_id for d in message.detections)
+    for _, message in read_ros(folder / "annotated.mcap", "/shapecat/detections"):
+        names.update(d.results[0].hypothesis.class_id for d in message.detections)
     assert names["heirloom"] >= 1
 
 

@@ -12,7 +12,7 @@ from typing import Any
 import numpy as np
 import pytest
 import zstandard
-from mcap.writer import CompressionType, IndexType, Writer
+from mcap.writer import CompressionType, IndexType
 from rosbags.interfaces import (
     Qos,
     QosDurability,
@@ -30,6 +30,7 @@ from shapecat.errors import RecordingError
 from shapecat.recordings import Channel, MessageError, Topic, open_recording
 from shapecat.recordings.decoding import typestore_of
 from shapecat.system.files import lock
+from tests.mcap_files import mcap_writer
 
 STORE = get_typestore(Stores.ROS2_HUMBLE)
 STORE1 = get_typestore(Stores.ROS1_NOETIC)
@@ -42,21 +43,15 @@ def text(value: str) -> bytes:
     return bytes(STORE.serialize_cdr(STORE.types[STRING](data=value), STRING))
 
 
-def write_mcap(path: Path, times: list[int], *, unfinished: bool = False, **options: Any) -> Path:
+def write_mcap(path: Path, times: list[int], **options: Any) -> Path:
     """Write a text message at each time, /a and /b in turn."""
     options = {"chunk_size": 200, "compression": CompressionType.NONE} | options
-    with path.open("wb") as file:
-        writer = Writer(file, **options)
-        writer.start("ros2", "test")
+    with mcap_writer(path, **options) as writer:
         definition = STORE.generate_msgdef(STRING, ros_version=2)[0].encode()
         schema = writer.register_schema(STRING, "ros2msg", definition)
         channels = [writer.register_channel(topic, "cdr", schema) for topic in ("/a", "/b")]
         for k, time in enumerate(times):
             writer.add_message(channels[k % 2], time, text(f"message {k}"), time + 1, k)
-        if unfinished:
-            writer.flush()
-        else:
-            writer.finish()
     return path
 
 
@@ -125,7 +120,7 @@ def test_message_indexes_are_not_needed(tmp_path: Path, index: IndexType) -> Non
 
 
 def test_unfinished_mcap_is_recovered(tmp_path: Path) -> None:
-    path = write_mcap(tmp_path / "a.mcap", list(range(20)), unfinished=True)
+    path = write_mcap(tmp_path / "a.mcap", list(range(20)), finish=False)
     path.write_bytes(path.read_bytes()[:-10])
 
     with open_recording(path) as recording:
@@ -139,7 +134,7 @@ def test_unfinished_mcap_is_recovered(tmp_path: Path) -> None:
 @pytest.mark.parametrize("rest", [b"", b"\x05" + struct.pack("<Q", 1000) + b"abc"])
 def test_warning_states_lost_bytes_of_unfinished_mcap(tmp_path: Path, rest: bytes) -> None:
     """The user must learn whether a power cut cost twelve bytes or nothing."""
-    path = write_mcap(tmp_path / "a.mcap", list(range(20)), unfinished=True)
+    path = write_mcap(tmp_path / "a.mcap", list(range(20)), finish=False)
     path.write_bytes(path.read_bytes() + rest)
     with open_recording(path) as recording:
         (warning,) = recording.warnings
@@ -155,16 +150,13 @@ def test_chunk_without_messages_does_not_set_start(tmp_path: Path) -> None:
     `--end 5` would then read nothing. Some writers begin with a chunk of schemas and channels.
     """
     path = tmp_path / "a.mcap"
-    with path.open("wb") as file:
-        writer = Writer(file, compression=CompressionType.NONE)
-        writer.start("ros2", "test")
+    with mcap_writer(path, compression=CompressionType.NONE) as writer:
         schema = writer.register_schema(STRING, "ros2msg", b"string data")
         channel = writer.register_channel("/a", "cdr", schema)
         vars(writer)["_Writer__chunk_builder"].num_messages = 1  # the library writes no such chunk
         getattr(writer, "_Writer__finalize_chunk")()  # noqa: B009  a plain name would be mangled
         for k in range(3):
             writer.add_message(channel, 10**18 + k, text("hello"), 10**18 + k)
-        writer.finish()
     with open_recording(path) as recording:
         assert (recording.start_ns, recording.end_ns) == (10**18, 10**18 + 2)
         assert [m.log_time_ns - 10**18 for m in recording.messages()] == [0, 1, 2]
@@ -210,16 +202,13 @@ def test_chunk_is_read_only_up_to_last_wanted_message(
     """Otherwise reading transforms would decompress the whole recording again."""
     path = tmp_path / "a.mcap"
     noise = np.random.default_rng(0).integers(0, 256, 100_000, np.uint8).tobytes()
-    with path.open("wb") as file:
-        writer = Writer(file, chunk_size=10**6, compression=compression)
-        writer.start("ros2", "test")
+    with mcap_writer(path, chunk_size=10**6, compression=compression) as writer:
         schema = writer.register_schema(STRING, "ros2msg", b"string data")
         small, large = (writer.register_channel(name, "cdr", schema) for name in ("/a", "/b"))
         for time in range(3):
             writer.add_message(small, time, text(f"message {time}"), time)
         for time in range(3, 6):
             writer.add_message(large, time, noise, time)
-        writer.finish()
     data = bytearray(path.read_bytes())
     data[len(data) // 2] ^= 0xFF  # in an image
 
@@ -274,13 +263,10 @@ def test_memory_does_not_grow_with_recording(tmp_path: Path) -> None:
     """Only the chunks that overlap in time are held."""
     tracemalloc = pytest.importorskip("tracemalloc")
     path = tmp_path / "a.mcap"
-    with path.open("wb") as file:
-        writer = Writer(file, compression=CompressionType.NONE, chunk_size=1 << 20)
-        writer.start("", "test")
+    with mcap_writer(path, "", compression=CompressionType.NONE, chunk_size=1 << 20) as writer:
         channel = writer.register_channel("/blob", "raw", 0)
         for time in range(64):
             writer.add_message(channel, time, bytes(1 << 20), time)
-        writer.finish()
     with open_recording(path) as recording:
         tracemalloc.start()
         count = sum(1 for _ in recording.messages())
@@ -468,15 +454,12 @@ def two_publishers(path: Path, container: str) -> Path:
     """Write three and four messages on /a, by two publishers, and two on /b."""
     published = [("/a", "one", 3), ("/a", "two", 4), ("/b", "one", 2)]
     if container == "mcap":
-        with path.open("wb") as file:
-            writer = Writer(file)
-            writer.start("ros2", "test")
+        with mcap_writer(path) as writer:
             schema = writer.register_schema(STRING, "ros2msg", b"string data")
             for topic, publisher, count in published:
                 channel = writer.register_channel(topic, "cdr", schema, {"who": publisher})
                 for k in range(count):
                     writer.add_message(channel, 10 + k, text("hello"), 10 + k)
-            writer.finish()
     elif container == "ros1":
         store = get_typestore(Stores.ROS1_NOETIC)
         with BagWriter(path) as bag:
@@ -606,13 +589,10 @@ def test_format_is_detected_from_content_not_suffix(tmp_path: Path) -> None:
 )
 def test_hostile_definition_is_message_error(tmp_path: Path, definition: str) -> None:
     path = tmp_path / "a.mcap"
-    with path.open("wb") as file:
-        writer = Writer(file)
-        writer.start("ros2", "test")
+    with mcap_writer(path) as writer:
         schema = writer.register_schema("a/msg/Self", "ros2msg", definition.encode())
         channel = writer.register_channel("/a", "cdr", schema)
         writer.add_message(channel, 1, b"\0\1\0\0", 1)
-        writer.finish()
     with open_recording(path) as recording, pytest.raises(MessageError, match="/a: cannot decode"):
         recording.decode(next(iter(recording.messages())))
 

@@ -8,7 +8,6 @@ import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
-from mcap.writer import Writer
 from rosbags.typesys import Stores, get_types_from_msg, get_typestore
 from scipy.spatial.transform import Rotation
 
@@ -27,6 +26,7 @@ from tests.foxglove_messages import (
     encode,
     write,
 )
+from tests.mcap_files import mcap_writer
 
 CAMERA = Camera(4, 3, 60.0, 61.0, 1.5, 1.0)
 
@@ -106,15 +106,12 @@ def test_foxglove_messages_in_ros_keep_nanoseconds(tmp_path: Path) -> None:
     data = np.array([1, 2, 3], "<f4").view(np.uint8)
     message = store.types[kind](time(*divmod(stamp, SECOND)), "camera", 12, fields, data)
     path = tmp_path / "a.mcap"
-    with path.open("wb") as file:
-        writer = Writer(file)
-        writer.start("ros2", "test")
+    with mcap_writer(path) as writer:
         text = store.generate_msgdef(kind, ros_version=2)[0].encode()
         channel = writer.register_channel(
             "/p", "cdr", writer.register_schema(kind, "ros2msg", text)
         )
         writer.add_message(channel, EPOCH, bytes(store.serialize_cdr(message, kind)), EPOCH)
-        writer.finish()
 
     (frame,) = read(path)
 

@@ -10,7 +10,6 @@ import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
-from mcap.writer import Writer
 
 from shapecat.errors import NoStreamError
 from shapecat.recordings import (
@@ -29,6 +28,7 @@ from shapecat.recordings.sources import DepthSource
 from shapecat.runs.selection import count_frames
 from shapecat.types import Camera, Frame
 from tests.depth_encodings import png, rvl
+from tests.mcap_files import mcap_writer
 from tests.messages import (
     CAMERA,
     CLOUD,
@@ -297,14 +297,11 @@ def test_invalid_messages_are_skipped_and_counted(tmp_path: Path) -> None:
 def test_definition_without_fields_of_its_type_is_skipped(tmp_path: Path) -> None:
     """Any program may name its own type sensor_msgs/msg/Image."""
     path = tmp_path / "a.mcap"
-    with path.open("wb") as file:
-        writer = Writer(file)
-        writer.start("ros2", "test")
+    with mcap_writer(path) as writer:
         for kind in (CLOUD, IMAGE, INFO, "tf2_msgs/msg/TFMessage"):
             schema = writer.register_schema(kind, "ros2msg", b"uint8 header")
             channel = writer.register_channel(f"/{kind}", "cdr", schema)
             writer.add_message(channel, 0, b"\0\1\0\0\0", 0)
-        writer.finish()
 
     with open_recording(path) as recording:
         assert cloud_streams(recording) == ()

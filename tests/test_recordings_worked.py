@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 import pytest
 from mcap.reader import make_reader
-from mcap.writer import CompressionType, Writer
+from mcap.writer import CompressionType
 from numpy.testing import assert_allclose
 from rosbags.rosbag1 import Reader as BagReader
 from rosbags.rosbag1 import Writer as BagWriter
@@ -35,6 +35,7 @@ from shapecat.recordings.transform_samples import _slerp
 from shapecat.recordings.transforms import ExtrapolationError, TransformBuffer
 from shapecat.types import Camera
 from tests.colour_messages import gradient, jpeg, packed, png, raw
+from tests.mcap_files import mcap_writer
 from tests.messages import EPOCH, SECOND, cloud, image, info, make, organized_points, wavy_depth
 from tests.messages import write as record
 from tests.test_recordings_colour import MS, WIDE, depth_items, in_order, read, static
@@ -538,14 +539,11 @@ TEXTS = {"/a": 0, "/b": 1}
 
 def mcap_of(path: Path) -> Path:
     """Write one message per chunk, not in order of time."""
-    with path.open("wb") as file:
-        writer = Writer(file, chunk_size=1, compression=CompressionType.NONE)
-        writer.start("ros2", "test")
+    with mcap_writer(path, chunk_size=1, compression=CompressionType.NONE) as writer:
         schema = writer.register_schema("std_msgs/msg/String", "ros2msg", b"string data")
         channels = [writer.register_channel(topic, "cdr", schema) for topic in TEXTS]
         for k, time in enumerate([*TIMES[6:], *TIMES[:6]]):
             writer.add_message(channels[k % 2], time, b"\0\1\0\0" + bytes([k]), time)
-        writer.finish()
     return path
 
 

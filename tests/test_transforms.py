@@ -10,7 +10,6 @@ import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
-from mcap.writer import Writer
 from pytransform3d.rotations import quaternion_slerp
 from pytransform3d.transform_manager import TransformManager
 from pytransform3d.transformations import transform_from_pq
@@ -27,6 +26,7 @@ from shapecat.recordings.transforms import (
 )
 from shapecat.simulation.messages import MessageFactory
 from shapecat.types import Pose
+from tests.mcap_files import mcap_writer
 from tests.messages import write
 
 IDENTITY = ((0.0, 0.0, 0.0), (0.0, 0.0, 0.0, 1.0))
@@ -214,9 +214,7 @@ def transform(store: Any, parent: str, child: str, stamp: int, x: float) -> Any:
 def test_transforms_of_ros2_recording_are_read(tmp_path: Path) -> None:
     store, kind = get_typestore(Stores.ROS2_HUMBLE), "tf2_msgs/msg/TFMessage"
     path = tmp_path / "a.mcap"
-    with path.open("wb") as file:
-        writer = Writer(file)
-        writer.start("ros2", "test")
+    with mcap_writer(path) as writer:
         text = store.generate_msgdef(kind, ros_version=2)[0].encode()
         schema = writer.register_schema(kind, "ros2msg", text)
         fixed, moving = (writer.register_channel(t, "cdr", schema) for t in ("/tf_static", "/tf"))
@@ -228,7 +226,6 @@ def test_transforms_of_ros2_recording_are_read(tmp_path: Path) -> None:
         data = store.serialize_cdr(store.types[kind]([item]), kind)
         writer.add_message(moving, 3, b"\0\1\0\0rubbish", 3)
         writer.add_message(fixed, 4, bytes(data), 4)
-        writer.finish()
 
     with open_recording(path) as recording:
         buffer = read_transforms(recording)
