@@ -237,7 +237,8 @@ class _Planner:
     def _status(self, task: Task) -> Status:
         entry = self._manifest.entries.get(task.name) if self._manifest is not None else None
         there = task.name in self._there
-        begun = not self._there.isdisjoint(_begun(task.name))
+        names_in_progress = {partial_path(Path(task.name)).name, claim_name(task.name)}
+        begun = not self._there.isdisjoint(names_in_progress)
         if begun and (self._job.overwrite or not there):
             return "resume"
         if there and not self._job.overwrite:
@@ -285,11 +286,6 @@ def _names_in(folder: Path) -> set[str]:
     with suppress(OSError):
         return {path.name for path in folder.iterdir()}
     return set()
-
-
-def _begun(name: str) -> set[str]:
-    """Return the names that exist beside a run folder while a run is in progress."""
-    return {partial_path(Path(name)).name, claim_name(name)}
 
 
 def _whole(task: Task) -> bool:

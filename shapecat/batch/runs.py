@@ -133,7 +133,7 @@ def _outcomes(
             begin(waiting.pop())
             running += 1
         task, future = _next(ended)
-        error = _error(future)
+        error = CancelledError() if future.cancelled() else future.exception()
         if error is not None and is_lost(error) and ledger.lost(task, error, most=_TRIES):
             begin(task)
             continue
@@ -153,10 +153,6 @@ def _next(ended: SimpleQueue[_Ended]) -> _Ended:
         stopping.check()
         with suppress(Empty):
             return ended.get(timeout=_HEED_S)
-
-
-def _error(future: Future[Outcome]) -> BaseException | None:
-    return CancelledError() if future.cancelled() else future.exception()
 
 
 def _unknown(job: Job, error: BaseException) -> Outcome:

@@ -147,7 +147,8 @@ class Location:
 
     def _put(self, done: str, call: Callable[[], Any]) -> None:
         if not self._is_s3():  # S3 would create a bucket with a misspelt name
-            self._tried(done, lambda: self._system.makedirs(self._parent(), exist_ok=True))
+            parent = self._path.rstrip("/").rpartition("/")[0]
+            self._tried(done, lambda: self._system.makedirs(parent, exist_ok=True))
         try:
             self._tried(done, call)
         except FileNotFoundError as error:
@@ -259,9 +260,6 @@ class Location:
 
     def _is_s3(self) -> bool:
         return "s3" in self._system.protocol
-
-    def _parent(self) -> str:
-        return self._path.rstrip("/").rpartition("/")[0]
 
 
 def _connect(url: str, error: type[ShapecatError]) -> tuple[Any, str]:

@@ -103,7 +103,7 @@ def staged(
     with explained(f"{folder}: cannot be written", OutputError):  # its name may be too long
         for place in (folder, hidden):
             require_ours(place, marker)
-    created = _missing_parents(folder)
+    created = [parent for parent in folder.parents if not parent.exists()]
     try:
         hidden.mkdir(parents=True, exist_ok=True)
         with _locked(hidden):
@@ -252,10 +252,6 @@ def _discard(hidden: Path, created: list[Path]) -> None:
     for parent in created:
         with suppress(OSError):  # not empty: something was written there
             parent.rmdir()
-
-
-def _missing_parents(folder: Path) -> list[Path]:
-    return [parent for parent in folder.parents if not parent.exists()]
 
 
 def write_run(folder: Path, run: RunInfo) -> None:

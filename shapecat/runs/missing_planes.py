@@ -1,7 +1,6 @@
 """Explain why most frames of a run have no supporting plane, and so no objects."""
 
 from collections import Counter
-from collections.abc import Iterator
 from itertools import islice
 from pathlib import Path
 
@@ -40,7 +39,9 @@ def explain_missing_planes(
     text = f"no supporting plane in {bare} of {frames} frames"
     readings = far = 0
     typical: list[float] = []
-    for frame in islice(_frames(recording, run, first), len(first)):
+    pairs = read_frames(recording, run["options"], skipped=Counter())
+    chosen = (frame for frame, _ in pairs if (frame.topic, frame.index) in first)
+    for frame in islice(chosen, len(first)):
         distance = _distances(frame)
         readings += distance.size
         far += int(np.count_nonzero(distance > range_m))
@@ -76,12 +77,6 @@ def _count(folder: Path) -> tuple[int, int, set[Key]]:
         count, bare = count + frames.num_rows, bare + len(without)
         first += without[: _FRAMES - len(first)]
     return count, bare, set(first)
-
-
-def _frames(recording: Recording, run: RunInfo, wanted: set[Key]) -> Iterator[Frame]:
-    for frame, _ in read_frames(recording, run["options"], skipped=Counter()):
-        if (frame.topic, frame.index) in wanted:
-            yield frame
 
 
 def _distances(frame: Frame) -> F4:

@@ -245,9 +245,5 @@ def _readings(
     """Yield the frames of a run; an OSError becomes a RecordingError."""
     with explained(f"{job.source}: cannot be read", RecordingError):
         for frame, colour in read_frames(recording, run["options"], skipped=skipped):
-            yield frame, None if colour is None else _without_pixels(colour)
-
-
-def _without_pixels(view: ColourView) -> ColourView:
-    """Remove the pixels, which masks do not need, before the image is sent to other processes."""
-    return replace(view, image=replace(view.image, data=b""))
+            # Masks need no pixels, and frames are sent to other processes.
+            yield frame, colour and replace(colour, image=replace(colour.image, data=b""))
