@@ -71,7 +71,9 @@ def figures_of(
     return {
         "frames": dict(frames),
         "objects": _objects(rows, overlap),
-        "overlap": None if overlap is None else _overlap(overlap),
+        "overlap": None
+        if overlap is None
+        else {name: round(getattr(overlap, name), 4) for name in ("f", "precision", "recall")},
         "category": _category(pairs, categories),
         "box_iou": {"n": len(boxes), "mean": _mean(boxes)},
         "tracking": None if seen is None else _tracking(seen, threshold),
@@ -83,16 +85,8 @@ def _objects(rows: Sequence[Difference], overlap: Overlap | None) -> dict[str, A
     true = sum(row.difference != "surplus" for row in rows)
     detections = sum(row.difference != "missed" for row in rows)
     hits = overlap.hits if overlap else sum(r.difference not in {"surplus", "missed"} for r in rows)
-    share = _share(hits, true)
+    share = round(hits / true, 4) if true else None
     return {"true": true, "detections": detections, "found": hits, "share_found": share}
-
-
-def _overlap(overlap: Overlap) -> dict[str, float]:
-    return {
-        "f": round(overlap.f, 4),
-        "precision": round(overlap.precision, 4),
-        "recall": round(overlap.recall, 4),
-    }
 
 
 def _category(pairs: Pairs, categories: Sequence[str]) -> dict[str, Any]:
@@ -138,7 +132,3 @@ def _tracking(seen: Sequence[SeenTogether], threshold: float) -> dict[str, Any]:
 
 def _mean(values: Sequence[float]) -> float | None:
     return round(float(np.mean(values)), 4) if len(values) else None
-
-
-def _share(part: int, whole: int) -> float | None:
-    return round(part / whole, 4) if whole else None

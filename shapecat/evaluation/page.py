@@ -48,7 +48,11 @@ def write_page(path: Path, report: Report, *, title: str) -> None:
     """
     files = {path: format_page(report, title=title)}
     if path.suffix.lower() == ".md":
-        drawn = _pictures(report)
+        drawn = {
+            "confusion": confusion_svg(report.categories, report.confusion),
+            "calibration": calibration_svg(report.calibration),
+            **{name: accuracy_svg(rows) for name, rows in report.breakdowns},
+        }
         pictures = {name: f"{path.stem}_{name}.svg" for name in drawn}
         files = {
             path: format_markdown(report, title=title, pictures=pictures),
@@ -63,15 +67,6 @@ def write_page(path: Path, report: Report, *, title: str) -> None:
 _CALIBRATION = (
     "Accuracy by confidence. On the diagonal, 80 % of the views with a confidence of 0.8 are right."
 )
-
-
-def _pictures(report: Report) -> dict[str, str]:
-    """Return the pictures, as SVG, by name."""
-    return {
-        "confusion": confusion_svg(report.categories, report.confusion),
-        "calibration": calibration_svg(report.calibration),
-        **{name: accuracy_svg(rows) for name, rows in report.breakdowns},
-    }
 
 
 def format_page(report: Report, *, title: str) -> str:

@@ -107,7 +107,8 @@ def describe_views(
             name = f"{view.category}/{view.instance}"
             found.append((described, view.category, name, distance, elevation))
             if with_functions:
-                functions.append(_functions(view, (settings.seed, count, 1)))
+                rng = np.random.default_rng((settings.seed, count, 1))
+                functions.append(shape_functions(view.points, rng))
         observe(phase, count, total)
     return DescribedViews(
         descriptors=np.array([item[0].descriptor for item in found], np.float32).reshape(
@@ -122,7 +123,3 @@ def describe_views(
         elevations=np.array([item[4] for item in found]),
         functions=np.array(functions, np.float32) if with_functions else _NOT_ASKED,
     )
-
-
-def _functions(view: View, seed: tuple[int, ...]) -> F4:
-    return shape_functions(view.points, np.random.default_rng(seed))
