@@ -25,7 +25,7 @@ from shapecat.outputs.level_clouds import finite_points, upward
 from shapecat.recordings import MessageError
 from shapecat.recordings.colour_image import pixels_of
 from shapecat.runs.finished import FinishedRun
-from shapecat.types import Camera, Frame, LabelledFrame, LabelledObject, Pose
+from shapecat.types import Camera, Frame, LabelledObject, Pose
 
 __all__ = ["kitti_type", "rectified_from_sensor", "write_kitti"]
 
@@ -50,7 +50,8 @@ def write_kitti(out: Path, frames: Iterable[ExportedFrame], _finished: FinishedR
         for number, (labelled, frame, coloured) in enumerate(frames):
             seen = _write_image(out, number, frame, coloured)
             index.writerow((f"{number:06d}", labelled.topic, labelled.index, labelled.stamp_ns))
-            turn = rectified_from_sensor(upward(labelled), optical=_optical(labelled, frame))
+            up = upward(labelled)
+            turn = rectified_from_sensor(up, optical=frame.organized or bool(up[1] < -0.7))
             lines = [_label(item, frame, turn, seen) for item in labelled.objects]
             (out / "label_2" / f"{number:06d}.txt").write_text("".join(lines), "utf-8")
             (out / "calib" / f"{number:06d}.txt").write_text(_calibration(seen, turn), "utf-8")
@@ -59,11 +60,6 @@ def write_kitti(out: Path, frames: Iterable[ExportedFrame], _finished: FinishedR
             rows.astype("<f4").tofile(out / "velodyne" / f"{number:06d}.bin")
             count += len(lines)
     return count
-
-
-def _optical(labelled: LabelledFrame, frame: Frame) -> bool:
-    """Return whether the sensor looks along its z axis, as a camera does."""
-    return frame.organized or bool(upward(labelled)[1] < -0.7)
 
 
 def rectified_from_sensor(up: F8, *, optical: bool) -> F8:

@@ -165,16 +165,12 @@ def _probe(
             encoding = _ENCODINGS[kind](first)
             if not encoding:
                 continue
-            if encoding == "mono8" and _is_other(topic.name):
+            if encoding == "mono8" and any(w in f"/{topic.name.lower()}" for w in _OTHER_WORDS):
                 return None
             info = info_topic_of(topic.name, recording) if kind != "cloud" else None
             frame_id = str(first.header.frame_id)
             return ColourStream(topic.name, topic.type, kind, info, topic.count, frame_id, encoding)
     return None
-
-
-def _is_other(name: str) -> bool:
-    return any(word in f"/{name.lower()}" for word in _OTHER_WORDS)
 
 
 def _raw_encoding(first: Any) -> str:

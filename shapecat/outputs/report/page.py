@@ -76,6 +76,7 @@ def run_page(
     counts = Counter(card.row.category for card in cards)
     names = (UNKNOWN, *finished.categories)
     end = max((float(c.timeline.seconds[-1]) for c in cards if len(c.timeline.seconds)), default=0)
+    shown = [name for name in names if name in counts] + sorted(counts.keys() - set(names))
     connect = "'self'" if served else "'none'"
     return template("page.html").substitute(
         title=escape(finished.name),
@@ -83,10 +84,18 @@ def run_page(
         script="\n".join(map(asset, _SCRIPTS)),
         back=f'<a href="{escape(index)}">all runs</a> ·' if index else "",
         subtitle=escape(_subtitle(run)),
-        tiles=_tiles(_run_tiles(run, len(cards), sum(is_unsure(c.row) for c in cards), end)),
+        tiles=_tiles(
+            {
+                "frames": run["counts"]["frames"],
+                "length": f"{end:.1f} s",
+                "detections": run["counts"]["detections"],
+                "tracks": len(cards),
+                "uncertain": sum(is_unsure(card.row) for card in cards),
+            }
+        ),
         warnings=_warnings([*run["warnings"], *notes]),
         strip=_strip(frames, cards),
-        chips="".join(_chip(name, counts[name]) for name in _ordered(counts, names)),
+        chips="".join(_chip(name, counts[name]) for name in shown),
         cards="".join(card_html(card, run["model"]["categories"], names, end) for card in cards),
         next=_next_step(finished, served=served),
         timings=_timings(run["seconds"], stages),
@@ -124,23 +133,9 @@ def _head(title: str, scripts: str = "") -> str:
     return filled.rstrip("\n")
 
 
-def _ordered(counts: Mapping[str, int], names: Sequence[str]) -> list[str]:
-    return [name for name in names if name in counts] + sorted(set(counts) - set(names))
-
-
 def _subtitle(run: Mapping[str, Any]) -> str:
     topics = ", ".join(run["options"]["topics"])
     return f"{run['input']['path']} · {run['input']['bytes'] / 1e6:.1f} MB · {topics}"
-
-
-def _run_tiles(run: Mapping[str, Any], tracks: int, unsure: int, end: float) -> dict[str, Any]:
-    return {
-        "frames": run["counts"]["frames"],
-        "length": f"{end:.1f} s",
-        "detections": run["counts"]["detections"],
-        "tracks": tracks,
-        "uncertain": unsure,
-    }
 
 
 def _tiles(values: Mapping[str, Any]) -> str:
