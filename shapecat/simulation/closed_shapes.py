@@ -21,25 +21,16 @@ def make_can(rng: Generator) -> Mesh:
         ["soda", "tin", "flat", "tube", "jar", "plain", "drum"],
         p=[0.2, 0.2, 0.16, 0.12, 0.1, 0.15, 0.07],
     )
-    diameter, ratio = {
-        "soda": (log_uniform(rng, 0.052, 0.072), rng.uniform(1.35, 2.6)),
-        "tin": (log_uniform(rng, 0.05, 0.11), rng.uniform(0.75, 1.7)),
-        "flat": (log_uniform(rng, 0.055, 0.15), rng.uniform(0.25, 0.65)),
-        "tube": (log_uniform(rng, 0.035, 0.09), rng.uniform(2.2, 4.7)),
-        "jar": (log_uniform(rng, 0.05, 0.11), rng.uniform(0.7, 1.9)),
-        "plain": (log_uniform(rng, 0.035, 0.14), log_uniform(rng, 0.4, 2.6)),
-        "drum": (log_uniform(rng, 0.11, 0.22), rng.uniform(0.35, 1.2)),
+    diameter, ratio, make_profile = {
+        "soda": (log_uniform(rng, 0.052, 0.072), rng.uniform(1.35, 2.6), _soda),
+        "tin": (log_uniform(rng, 0.05, 0.11), rng.uniform(0.75, 1.7), _tin),
+        "flat": (log_uniform(rng, 0.055, 0.15), rng.uniform(0.25, 0.65), _tin),
+        "tube": (log_uniform(rng, 0.035, 0.09), rng.uniform(2.2, 4.7), _tube_can),
+        "jar": (log_uniform(rng, 0.05, 0.11), rng.uniform(0.7, 1.9), _jar),
+        "plain": (log_uniform(rng, 0.035, 0.14), log_uniform(rng, 0.4, 2.6), _plain),
+        "drum": (log_uniform(rng, 0.11, 0.22), rng.uniform(0.35, 1.2), _tin),
     }[str(family)]
-    radius, height = diameter / 2, min(ratio * diameter, 0.32)
-    profile = {
-        "soda": _soda,
-        "tin": _tin,
-        "flat": _tin,
-        "tube": _tube_can,
-        "jar": _jar,
-        "plain": _plain,
-        "drum": _tin,
-    }[str(family)](rng, radius, height)
+    profile = make_profile(rng, diameter / 2, min(ratio * diameter, 0.32))
     section: dict[str, Any] = {"segments": 44}
     if family in {"tin", "flat", "drum"} and rng.random() < 0.06:
         section["stretch"] = rng.uniform(0.75, 0.92)
