@@ -14,7 +14,7 @@ from shapecat.recordings.colour_image import bytes_per_row, cloud_colours, compr
 from shapecat.recordings.colour_streams import ColourStream
 from shapecat.recordings.extrinsics import Extrinsics
 from shapecat.recordings.frames import frames
-from shapecat.recordings.messages import MALFORMED, Message, MessageError
+from shapecat.recordings.messages import MALFORMED, Message, MessageError, reason_of
 from shapecat.recordings.pinhole import camera_of_info, distortion_of, is_rectified
 from shapecat.recordings.recording import Recording
 from shapecat.recordings.stamps import stamp_ns
@@ -129,7 +129,7 @@ class _Partner:
             image = self._recording.decode(message)
             stamp = stamp_ns(image.header) or message.log_time_ns
         except (RecordingError, *MALFORMED) as error:
-            self._left_out[_reason(error, self.stream.topic)] += 1
+            self._left_out[reason_of(error, self.stream.topic)] += 1
             return
         if self._newest is not None and stamp > self._newest:
             self._steps.append(stamp - self._newest)
@@ -147,7 +147,7 @@ class _Partner:
             self._lens = _lens_of(self._recording.decode(message), self.stream.topic)
             self._calibration = content
         except (RecordingError, *MALFORMED) as error:
-            self._left_out[f"calibration: {_reason(error, self.stream.topic)}"] += 1
+            self._left_out[f"calibration: {reason_of(error, self.stream.topic)}"] += 1
 
     def reaches(self, frame: Frame) -> bool:
         """Return whether the newest image is not older than a frame: later ones are not nearer."""
@@ -162,7 +162,7 @@ class _Partner:
         try:
             return self._view(frame, *nearest)
         except (RecordingError, *MALFORMED) as error:
-            self._left_out[_reason(error, self.stream.topic)] += 1
+            self._left_out[reason_of(error, self.stream.topic)] += 1
             return None
 
     def report(self) -> None:
@@ -209,12 +209,6 @@ class _Partner:
             return ColourView(image, lens)
         msg = f"no transform between {frame.frame_id} and {image.frame_id}"
         raise MessageError(msg)
-
-
-def _reason(error: Exception, topic: str) -> str:
-    if isinstance(error, RecordingError):
-        return str(error).removeprefix(f"{topic}: ")[:160]
-    return "message does not match its type"
 
 
 def _lens(camera: Camera | None) -> LensCamera | None:

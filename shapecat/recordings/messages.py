@@ -16,6 +16,7 @@ __all__ = [
     "Stamp",
     "Topic",
     "Topics",
+    "reason_of",
     "ros_type",
     "sum_topics",
 ]
@@ -34,6 +35,13 @@ MALFORMED = (ArithmeticError, AttributeError, LookupError, TypeError, ValueError
 
 class MessageError(RecordingError):
     """A message cannot be decoded; the rest of the recording is unaffected."""
+
+
+def reason_of(error: Exception, topic: str) -> str:
+    """Return why a message of a topic is unusable, from a RecordingError or one of `MALFORMED`."""
+    if isinstance(error, RecordingError):
+        return str(error).removeprefix(f"{topic}: ")[:160]
+    return "message does not match its type"
 
 
 class Selection(NamedTuple):

@@ -14,7 +14,7 @@ from shapecat.recordings.compressed_depth import depth_of_compressed
 from shapecat.recordings.depth_image import depth_of_image
 from shapecat.recordings.foxglove import ros_counterpart
 from shapecat.recordings.lens import Lens
-from shapecat.recordings.messages import MALFORMED, Message, MessageError
+from shapecat.recordings.messages import MALFORMED, Message, MessageError, reason_of
 from shapecat.recordings.pinhole import (
     PinholeFit,
     camera_of_info,
@@ -37,10 +37,8 @@ def _counting(skipped: Counter[str], topic: str) -> Iterator[None]:
     """Count unreadable messages of a topic by reason instead of raising."""
     try:
         yield
-    except MessageError as error:
-        skipped[str(error).removeprefix(f"{topic}: ")[:160]] += 1
-    except MALFORMED:
-        skipped["message does not match its type"] += 1
+    except (MessageError, *MALFORMED) as error:
+        skipped[reason_of(error, topic)] += 1
 
 
 class Source:
