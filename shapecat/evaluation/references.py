@@ -3,7 +3,7 @@
 import json
 import zipfile
 from collections import Counter
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Container, Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import IO, Any, cast
 
@@ -23,6 +23,7 @@ from shapecat.evaluation.references_coco import CocoLabels
 from shapecat.evaluation.references_kitti import KittiLabels
 from shapecat.runs.finished import FinishedRun, read_finished
 from shapecat.runs.folder import read_run
+from shapecat.runs.label_meaning import TrackLabel
 from shapecat.runs.labels import rows_by_frame
 from shapecat.runs.shown import ShownTracks
 from shapecat.runs.tables import Key, keys_of, read_row_groups, read_together
@@ -248,7 +249,7 @@ def run_labellings(finished: FinishedRun) -> Iterator[tuple[Key, Mapping[str, An
     are known, else visible ones.
     """
     folder = finished.folder
-    tracks = _tracks(folder)
+    deleted = _deleted(folder, finished.labels)
     wanted = ("topic", "frame", "detection", "center", "size", "orientation", "indices")
     columns = [*wanted, "posterior", "category", "confidence"]
     shown = ShownTracks.read(folder, finished.labels)
@@ -257,20 +258,23 @@ def run_labellings(finished: FinishedRun) -> Iterator[tuple[Key, Mapping[str, An
         found = rows_by_frame(detections)
         for row in frames.to_pylist():
             key = (row["topic"], row["frame"])
-            full = {item.detection: shown.full[item.row] for item in shown.of(key)}
-            items = (_item(r, tracks, finished, full) for r in found.get(key, []))
-            seen = [item for item in items if item is not None]
-            yield key, row, Labelling(tuple(join_merged(seen, row["up"])))
+            tracked = {item.detection: (item.label, shown.full[item.row]) for item in shown.of(key)}
+            items = (
+                _item(r, *tracked.get(r["detection"], (None, None)))
+                for r in found.get(key, [])
+                if (*key, r["detection"]) not in deleted
+            )
+            yield key, row, Labelling(tuple(join_merged(items, row["up"])))
 
 
-def _tracks(folder: Path) -> dict[tuple[str, int, int], int]:
-    """Return the track of each detection, by topic, frame and detection."""
-    tracks: dict[tuple[str, int, int], int] = {}
+def _deleted(folder: Path, labels: Container[int]) -> set[tuple[str, int, int]]:
+    """Return topic, frame and detection of each detection whose track a person has deleted."""
     names = ("topic", "frame", "detection", "track")
+    found = set()
     for group in read_row_groups(folder / "tracks.parquet", names):
         rows = zip(*(group[name].to_pylist() for name in names), strict=True)
-        tracks |= {row[:3]: row[3] for row in rows if row[2] is not None}
-    return tracks
+        found |= {row[:3] for row in rows if row[3] not in labels}
+    return found
 
 
 def _box(row: Mapping[str, Any], full: F8 | None) -> Box:
@@ -280,22 +284,13 @@ def _box(row: Mapping[str, Any], full: F8 | None) -> Box:
     return Box(full[:3], full[3:6], full[6:])
 
 
-def _item(
-    row: Mapping[str, Any],
-    tracks: Mapping[tuple[str, int, int], int],
-    finished: FinishedRun,
-    full: Mapping[int, F8],
-) -> LabelledItem | None:
-    """Return a detection with the final label of its track; None if a person has deleted it."""
-    track = tracks.get((row["topic"], row["frame"], row["detection"]))
-    label = None if track is None else finished.labels.get(track)
-    if track is not None and label is None:
-        return None
+def _item(row: Mapping[str, Any], label: TrackLabel | None, full: F8 | None) -> LabelledItem:
+    """Return a detection with the final label of its track, if it has one."""
     return LabelledItem(
         track=None if label is None else label.track,
         category=row["category"] if label is None else label.category,
         pixels=cast("Any", row["indices"]).astype(np.int64),
-        box=_box(row, full.get(row["detection"])),
+        box=_box(row, full),
         confidence=row["confidence"] if label is None else label.confidence,
         view_category=row["category"],
         posterior=row["posterior"],
