@@ -9,6 +9,7 @@ from mcap.reader import make_reader
 from mcap.summary import Summary
 from mcap.writer import Writer
 from mcap_ros2.decoder import DecoderFactory
+from rosbags.typesys.store import Typestore
 
 
 @contextmanager
@@ -24,6 +25,30 @@ def mcap_writer(
             writer.finish()
         else:
             writer.flush()
+
+
+class McapChannels:
+    """Writes serialized ROS messages to an MCAP file, with a channel for each topic and type."""
+
+    def __init__(self, writer: Writer, types: Typestore, version: int = 2) -> None:
+        self._writer, self._types, self._version = writer, types, version
+        self._known: dict[tuple[str, str], int] = {}
+
+    def declare(self, topic: str, kind: str) -> int:
+        """Return the channel, after registering it if it is new."""
+        if (topic, kind) not in self._known:
+            text = self._types.generate_msgdef(kind, ros_version=self._version)[0].encode()
+            name, encodings = kind, ("ros2msg", "cdr")
+            if self._version == 1:
+                name, encodings = kind.replace("/msg/", "/"), ("ros1msg", "ros1")
+            schema = self._writer.register_schema(name, encodings[0], text)
+            channel = self._writer.register_channel(topic, encodings[1], schema)
+            self._known[topic, kind] = channel
+        return self._known[topic, kind]
+
+    def write(self, topic: str, kind: str, time: int, data: bytes) -> None:
+        """Write a message."""
+        self._writer.add_message(self.declare(topic, kind), time, data, time)
 
 
 def read_ros(path: Path, topic: str) -> list[tuple[int, Any]]:

@@ -9,7 +9,7 @@ import numpy as np
 from rosbags.typesys import Stores, get_typestore
 
 from shapecat.types import Camera, Frame
-from tests.mcap_files import mcap_writer
+from tests.mcap_files import McapChannels, mcap_writer
 
 STORE = get_typestore(Stores.ROS2_HUMBLE)
 SECOND = 10**9
@@ -74,26 +74,18 @@ def write(
     path: Path,
     items: Iterable[tuple[str, int, Any]],
     *,
-    chunk_size: int = 1 << 20,
     empty: Iterable[tuple[str, str]] = (),
+    **options: Any,
 ) -> Path:
     """Write messages given as topic, log time, message or bytes, and ``empty`` topics."""
-    with mcap_writer(path, chunk_size=chunk_size) as writer:
-        channels: dict[tuple[str, str], int] = {}
-
-        def declare(topic: str, kind: str) -> None:
-            text = STORE.generate_msgdef(kind, ros_version=2)[0].encode()
-            schema = writer.register_schema(kind, "ros2msg", text)
-            channels[topic, kind] = writer.register_channel(topic, "cdr", schema)
-
+    with mcap_writer(path, **options) as writer:
+        channels = McapChannels(writer, STORE)
         for topic, kind in empty:
-            declare(topic, kind)
+            channels.declare(topic, kind)
         for topic, time, item in items:
             kind = item[0] if isinstance(item, tuple) else item.__msgtype__
-            if (topic, kind) not in channels:
-                declare(topic, kind)
             raw = item[1] if isinstance(item, tuple) else bytes(STORE.serialize_cdr(item, kind))
-            writer.add_message(channels[topic, kind], time, raw, time)
+            channels.write(topic, kind, time, raw)
     return path
 
 

@@ -12,7 +12,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 import zstandard
-from mcap.writer import CompressionType, IndexType, Writer
+from mcap.writer import CompressionType, IndexType
 from rosbags.rosbag1 import Writer as BagWriter
 from rosbags.rosbag2 import CompressionFormat, CompressionMode, StoragePlugin
 from rosbags.rosbag2 import Writer as FolderWriter
@@ -22,7 +22,7 @@ from shapecat.simulation.messages import MessageFactory
 from tests import depth_encodings as depth
 from tests import foxglove_messages as foxglove
 from tests import messages as ros
-from tests.mcap_files import mcap_writer
+from tests.mcap_files import McapChannels, mcap_writer
 from tests.messages import EPOCH, SECOND
 from tests.scenes import OPTICAL, PERIOD, back_and_forth, record, serialized, stream, views
 
@@ -39,29 +39,6 @@ class Case(NamedTuple):
     reported: str = ""
 
 
-class McapChannels:
-    """Writes serialized ROS messages to an MCAP file; registers a channel for each new topic."""
-
-    def __init__(self, writer: Writer, make: MessageFactory, version: int = 2) -> None:
-        self._writer, self._make, self._version = writer, make, version
-        self._known: dict[str, int] = {}
-
-    def write(self, topic: str, kind: str, time: int, data: bytes) -> None:
-        """Write a message."""
-        if topic not in self._known:
-            self._known[topic] = self._register(topic, kind)
-        self._writer.add_message(self._known[topic], time, data, time)
-
-    def _register(self, topic: str, kind: str) -> int:
-        definition = self._make.typestore.generate_msgdef(kind, ros_version=self._version)[0]
-        name, encodings = kind, ("ros2msg", "cdr")
-        if self._version == 1:
-            name, encodings = kind.replace("/msg/", "/"), ("ros1msg", "ros1")
-        schema = self._writer.register_schema(name, encodings[0], definition.encode())
-        channel: int = self._writer.register_channel(topic, encodings[1], schema)
-        return channel
-
-
 def write_all(writer: Any, items: Iterable[tuple[str, str, int, bytes]], types: Any) -> None:
     """Write serialized messages with a writer of rosbags."""
     known: dict[str, Any] = {}
@@ -72,12 +49,12 @@ def write_all(writer: Any, items: Iterable[tuple[str, str, int, bytes]], types: 
             writer.write(known[topic], time, data)
 
 
-def mcap(path: Path, *, finish: bool = True, cut: int = 0, last: Any = (), **options: Any) -> Path:
-    """Write the table and ``last`` messages; remove ``cut`` bytes from the end."""
+def mcap(path: Path, *, finish: bool = True, cut: int = 0, **options: Any) -> Path:
+    """Write the table; remove ``cut`` bytes from the end."""
     path /= "a.mcap"
     with mcap_writer(path, finish=finish, **({"chunk_size": 60_000} | options)) as writer:
-        channels = McapChannels(writer, FACTORY)
-        for item in [*serialized(stream(FACTORY, FRAMES), FACTORY), *last]:
+        channels = McapChannels(writer, FACTORY.typestore)
+        for item in serialized(stream(FACTORY, FRAMES), FACTORY):
             channels.write(*item)
     if cut:
         path.write_bytes(path.read_bytes()[:-cut])
@@ -155,7 +132,7 @@ def ros1_mcap(path: Path) -> Path:
     """Write ROS 1 messages to MCAP, as `mcap convert` does."""
     path /= "a.mcap"
     with mcap_writer(path, "ros1") as writer:
-        channels = McapChannels(writer, FACTORY1, version=1)
+        channels = McapChannels(writer, FACTORY1.typestore, version=1)
         for item in serialized(stream(FACTORY1, FRAMES), FACTORY1):
             channels.write(*item)
     return path
@@ -297,7 +274,7 @@ def foreign(path: Path) -> Path:
             writer.register_channel("/no_schema", "cdr", 0),
             writer.register_channel("/tf", "cdr", broken),
         ]
-        own = McapChannels(writer, FACTORY)
+        own = McapChannels(writer, FACTORY.typestore)
         for item in serialized(stream(FACTORY, FRAMES), FACTORY):
             for channel in channels:
                 writer.add_message(channel, item[2], b"\x00\x01\x00\x00\xff\xff\xff\xff", item[2])

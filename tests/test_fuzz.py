@@ -22,8 +22,9 @@ from shapecat.recordings.gravity import Upright
 from shapecat.recordings.ros1_bag import BagRecording
 from shapecat.simulation.messages import MessageFactory
 from shapecat.types import Camera
-from tests.mcap_files import mcap_writer
-from tests.messages import EPOCH, SECOND
+from tests.messages import EPOCH, SECOND, write
+from tests.odd_recordings import write_all
+from tests.scenes import serialized
 
 CAMERA = Camera(16, 12, 20.0, 20.0, 7.5, 5.5)
 FRAMES = 12
@@ -48,26 +49,7 @@ def items(make: MessageFactory) -> Any:
 
 
 def mcap(parent: Path, **options: Any) -> Path:
-    make, path = MessageFactory(2), parent / "a.mcap"
-    with mcap_writer(path, **({"chunk_size": 4000} | options)) as writer:
-        channels: dict[str, int] = {}
-        for topic, time, message in items(make):
-            kind = message.__msgtype__
-            if topic not in channels:
-                text = make.typestore.generate_msgdef(kind, ros_version=2)[0].encode()
-                schema = writer.register_schema(kind, "ros2msg", text)
-                channels[topic] = writer.register_channel(topic, "cdr", schema)
-            writer.add_message(channels[topic], time, make.serialize(message), time)
-    return path
-
-
-def write_all(writer: Any, make: MessageFactory) -> None:
-    known: dict[str, Any] = {}
-    for topic, time, message in items(make):
-        if topic not in known:
-            kind = message.__msgtype__
-            known[topic] = writer.add_connection(topic, kind, typestore=make.typestore)
-        writer.write(known[topic], time, make.serialize(message))
+    return write(parent / "a.mcap", items(MessageFactory(2)), **({"chunk_size": 4000} | options))
 
 
 def bag(parent: Path, compression: Any = None) -> Path:
@@ -76,15 +58,14 @@ def bag(parent: Path, compression: Any = None) -> Path:
     writer.chunk_threshold = 4000
     if compression is not None:
         writer.set_compression(compression)
-    with writer:
-        write_all(writer, make)
+    write_all(writer, serialized(items(make), make), make.typestore)
     return path
 
 
 def folder(parent: Path, plugin: StoragePlugin) -> Path:
     make, path = MessageFactory(2), parent / "a"
-    with FolderWriter(path, version=9, storage_plugin=plugin) as writer:
-        write_all(writer, make)
+    writer = FolderWriter(path, version=9, storage_plugin=plugin)
+    write_all(writer, serialized(items(make), make), make.typestore)
     (part,) = (file for file in path.iterdir() if file.suffix in {".db3", ".mcap"})
     return part
 
