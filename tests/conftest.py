@@ -171,6 +171,14 @@ def guessed_run(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return folder / "out" / "table"
 
 
+@pytest.fixture
+def run(guessed_run: Path, tmp_path: Path) -> Path:
+    """Return a copy of that run, to change it."""
+    folder = tmp_path / "out" / "table"
+    shutil.copytree(guessed_run, folder)
+    return folder
+
+
 @pytest.fixture(scope="session")
 def drawn(guessed_run: Path) -> Any:
     """Draw the pictures of that run once; `replace` its folder by that of a copy of the run.

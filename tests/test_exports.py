@@ -9,7 +9,6 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-import pyarrow.parquet as pq
 import pytest
 from click.testing import Result
 from numpy.testing import assert_allclose
@@ -26,6 +25,7 @@ from shapecat.runs.label_meaning import TrackLabel
 from shapecat.runs.selection import read_frames
 from shapecat.runs.track_table import read_track_table
 from shapecat.types import Box, Frame, LabelledFrame, LabelledObject, NeuralGas
+from tests.track_tables import rows
 
 Run = Callable[..., Result]
 
@@ -46,11 +46,6 @@ def relabel(folder: Path, labels: dict[int, str]) -> None:
         writer.writerow(("track", "category", "confidence", "label"))
         writer.writerows((track, "cup", 0, label) for track, label in labels.items())
     adopt_labels(corrected, folder)
-
-
-def rows(folder: Path, table: str) -> list[dict[str, Any]]:
-    found: list[dict[str, Any]] = pq.read_table(folder / f"{table}.parquet").to_pylist()
-    return found
 
 
 def boxes(folder: Path, which: str = "_full") -> dict[int, list[tuple[int, np.ndarray]]]:

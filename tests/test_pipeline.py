@@ -17,6 +17,7 @@ from numpy.testing import assert_allclose
 from shapecat.pipeline import annotate
 from shapecat.simulation import simulate
 from tests.mcap_files import read_ros
+from tests.track_tables import rows
 
 Run = Callable[..., Result]
 FILES = {
@@ -53,13 +54,6 @@ def messages(path: Path) -> Counter[tuple[str, int, int, bytes]]:
             (channel.topic, message.log_time, message.publish_time, message.data)
             for _, channel, message in make_reader(file, validate_crcs=True).iter_messages()
         )
-
-
-def rows(folder: Path, table: str, *columns: str) -> list[dict[str, Any]]:
-    found: list[dict[str, Any]] = pq.read_table(
-        folder / f"{table}.parquet", columns=list(columns) or None
-    ).to_pylist()
-    return found
 
 
 def test_run_folder_has_exactly_the_documented_files(run_folder: Path) -> None:

@@ -47,13 +47,6 @@ from tests.browser import Browser
 Run = Callable[..., Result]
 
 
-@pytest.fixture
-def run(guessed_run: Path, tmp_path: Path) -> Path:
-    folder = tmp_path / "out" / "table"
-    shutil.copytree(guessed_run, folder)
-    return folder
-
-
 def data_of(page: str) -> dict[str, Any]:
     found = re.search(r'<script type="application/json" id="data">(.*?)</script>', page, re.DOTALL)
     assert found

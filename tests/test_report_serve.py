@@ -37,13 +37,6 @@ SAVED = (
 
 
 @pytest.fixture
-def run(guessed_run: Path, tmp_path: Path) -> Path:
-    folder = tmp_path / "out" / "table"
-    shutil.copytree(guessed_run, folder)
-    return folder
-
-
-@pytest.fixture
 def long_run(run: Path) -> Path:
     """Return a run with `TRACKS` tracks, copies of those found; its recording is missing."""
     with (run / "tracks.csv").open(newline="") as file:

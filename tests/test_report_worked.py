@@ -2,7 +2,6 @@
 
 import json
 import re
-import shutil
 from collections import Counter
 from dataclasses import replace
 from pathlib import Path
@@ -45,13 +44,6 @@ from shapecat.types import (
 )
 
 NAMES = ("cup", "can", "box")
-
-
-@pytest.fixture
-def run(guessed_run: Path, tmp_path: Path) -> Path:
-    folder = tmp_path / "out" / "table"
-    shutil.copytree(guessed_run, folder)
-    return folder
 
 
 def test_card_shows_views_times_and_sorted_posterior() -> None:

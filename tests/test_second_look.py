@@ -9,7 +9,6 @@ from typing import Any
 
 import numpy as np
 import pyarrow as pa
-import pyarrow.parquet as pq
 import pytest
 
 from shapecat.config import Settings
@@ -29,6 +28,7 @@ from shapecat.types import Camera, Frame, Pose
 from tests.messages import EPOCH, write
 from tests.scenes import OPTICAL, PERIOD, STEP
 from tests.test_crash import assert_same_tables
+from tests.track_tables import rows
 
 MAKE = MessageFactory(2)
 TOPIC = "/depth/image_raw"
@@ -103,13 +103,6 @@ def run(path: Path, messages: Iterator[Any], *, cores: int = 1, **options: Any) 
     out = path.with_suffix("")
     process(Job(write(path, messages), out, mcap=False, rrd=False, **options), cores=cores)
     return out
-
-
-def rows(out: Path, table: str, *columns: str) -> list[dict[str, Any]]:
-    found: list[dict[str, Any]] = pq.read_table(
-        out / f"{table}.parquet", columns=list(columns)
-    ).to_pylist()
-    return found
 
 
 def revised(out: Path) -> list[int]:

@@ -6,7 +6,6 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-import pyarrow.parquet as pq
 import pytest
 from numpy.testing import assert_allclose
 from scipy.spatial.transform import Rotation
@@ -31,6 +30,7 @@ from shapecat.types import (
     Pose,
     Scene,
 )
+from tests.track_tables import rows
 
 CATEGORIES = ("cup", "can", "bowl")
 SECOND = 10**9
@@ -103,11 +103,6 @@ def write_run(folder: Path, origin: Any) -> Path:
             tables.write([perception], [FrameRow(stamp + 5, pose, up)])
     track_run(folder, TrackingSettings(), CATEGORIES, work="w0123")
     return folder
-
-
-def rows(folder: Path, table: str) -> list[dict[str, Any]]:
-    found: list[dict[str, Any]] = pq.read_table(folder / f"{table}.parquet").to_pylist()
-    return found
 
 
 def lines(folder: Path) -> list[dict[str, str]]:

@@ -1,12 +1,15 @@
-"""Builder of track tables for synthetic runs."""
+"""Builder of track tables for synthetic runs, and reader of tables."""
 
 from collections.abc import Sequence
 from pathlib import Path
+from typing import Any
+
+import pyarrow.parquet as pq
 
 from shapecat.runs.table_schemas import TRACKS
 from shapecat.runs.tables import write_table
 
-__all__ = ["write_tracks"]
+__all__ = ["rows", "write_tracks"]
 
 
 def write_tracks(
@@ -28,3 +31,9 @@ def write_tracks(
     }
     full = {name: [None] * len(rows) for name in TRACKS.names if "_full" in name}
     write_table(folder / "tracks.parquet", full | columns, TRACKS)
+
+
+def rows(folder: Path, table: str, *columns: str) -> list[dict[str, Any]]:
+    """Return the rows of a table of a run, with all columns unless some are named."""
+    found = pq.read_table(folder / f"{table}.parquet", columns=list(columns) or None)
+    return list(found.to_pylist())
