@@ -123,7 +123,10 @@ class _Review:
         fixed_frame: str | None,
     ) -> None:
         self._stream, self._columns = stream, Columns(stream)
-        self._categories = tuple(categories)
+        self._curves: dict[str, Any] = {
+            "names": list(categories),
+            "colors": [colour_of(category) for category in categories],
+        }
         self._fixed_frame = fixed_frame
         self._eyes: dict[str, Eye] = {}
         self._low, self._high = (
@@ -184,9 +187,10 @@ class _Review:
             ]
         nothing = (world, "no frame", Eye(np.ones(3), np.zeros(3), np.array([0.0, 0.0, 1.0])))
         tracks = [self._tracks[number] for number in sorted(self._tracks)]
+        dots = rr.SeriesPoints(**self._curves, marker_sizes=[4.0] * len(self._curves["names"]))
         for track in tracks:
             if track.frames == 1:  # a line with one point is invisible
-                self._log(f"{track.entity}/posterior", self._dots(), static=True)
+                self._log(f"{track.entity}/posterior", dots, static=True)
         images = self._images.entities
         self._stream.send_blueprint(lay_out(scenes or [nothing], tracks, images))
 
@@ -262,19 +266,8 @@ class _Review:
     def _add_track(self, item: LabelledObject) -> None:
         entity = f"/tracks/{item.track}"
         self._tracks[item.track] = TrackView(entity, shapes.label(item))
-        lines = rr.SeriesLines(
-            names=list(self._categories),
-            colors=[colour_of(category) for category in self._categories],
-            widths=[1.5] * len(self._categories),
-        )
+        lines = rr.SeriesLines(**self._curves, widths=[1.5] * len(self._curves["names"]))
         self._log(f"{entity}/posterior", lines, static=True)
-
-    def _dots(self) -> rr.SeriesPoints:
-        return rr.SeriesPoints(
-            names=list(self._categories),
-            colors=[colour_of(category) for category in self._categories],
-            marker_sizes=[4.0] * len(self._categories),
-        )
 
     def _plot(self, labelled: LabelledFrame) -> None:
         at = (labelled.stamp_ns, labelled.index)

@@ -142,16 +142,6 @@ def _points(clouds: Sequence[PaintedCloud]) -> _Columns:
     yield from rr.Points3D.columns(radii=[cloud.radius_m for cloud in clouds])
 
 
-def _scene(scenes: Sequence[DrawnScene]) -> _Columns:
-    """Return the points on no object."""
-    return _points([moment.scene for moment in scenes])
-
-
-def _objects(scenes: Sequence[DrawnScene]) -> _Columns:
-    """Return the points on objects."""
-    return _points([moment.points for moment in scenes])
-
-
 def _dashes(scenes: Sequence[DrawnScene]) -> _Columns:
     """Return the edges of the full boxes, dashed."""
     known = [[o for o in m.objects if o.full is not None] for m in scenes]
@@ -234,14 +224,11 @@ def _faces(meshes: Sequence[U4]) -> rr.ComponentColumn:
     return column.partition([len(mesh) for mesh in meshes])
 
 
+# The colours of points are shaded already.
+_FLAT = rr.Points3D.from_fields(point_shading=rr.components.PointShading.Flat)
 SCENE: Mapping[str, Drawing] = {
-    # The colours of points are shaded already.
-    "scene": Drawing(
-        rr.Points3D.from_fields(point_shading=rr.components.PointShading.Flat), _scene
-    ),
-    "objects/points": Drawing(
-        rr.Points3D.from_fields(point_shading=rr.components.PointShading.Flat), _objects
-    ),
+    "scene": Drawing(_FLAT, lambda scenes: _points([moment.scene for moment in scenes])),
+    "objects/points": Drawing(_FLAT, lambda scenes: _points([moment.points for moment in scenes])),
     "planes": Drawing(rr.LineStrips3D.from_fields(colors=_PLANE, radii=0.001), _outlines),
     "planes/fill": Drawing(rr.Mesh3D.from_fields(albedo_factor=(*_PLANE, 28)), _fills),
     "objects/full": Drawing(rr.LineStrips3D.from_fields(radii=0.0008), _dashes),
