@@ -132,7 +132,7 @@ def _labelled_frame(
         ended=shown.ended.get(key, ()),
         seconds=dict(zip(row["stages"], row["seconds"], strict=True)),
         up=row["up"],
-        reused_from=row.get("reused_from"),  # none in runs of older versions
+        reused_from=row["reused_from"],
     )
 
 
