@@ -32,7 +32,7 @@ def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
 def test_batch_sizes_do_not_change_tracks(folder: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """Batches may end within a frame, a track or a row group; a track may span several."""
     whole, lines = tracked(folder)
-    sizes = {(tracks, "_BATCH"): 100, (full_boxes, "_BLOCK"): 7, (full_boxes, "_AT_ONCE"): 1}
+    sizes = {(tracks, "_BATCH"): 100, (full_boxes, "_BLOCK"): 7}
     sizes |= {(hits, "_BLOCK"): 50, (fusion, "_BLOCK"): 33}
     for (module, name), size in sizes.items():
         monkeypatch.setattr(module, name, size)

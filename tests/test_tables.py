@@ -22,7 +22,7 @@ from shapecat.runs.run_info import Counts, InputInfo, Options, RunInfo
 from shapecat.runs.segments import count_segments
 from shapecat.runs.shown import _next_of_topic, read_shown_frames
 from shapecat.runs.table_schemas import DETECTIONS, FRAMES, PLANES, TABLES, TRACKS
-from shapecat.runs.tables import lists, read_row_groups, write_table
+from shapecat.runs.tables import arrow_table, lists, read_row_groups
 from shapecat.types import Box, Candidate, Detection, NeuralGas, Perception, Plane, Pose, Scene
 from tests.track_tables import write_tracks
 
@@ -188,11 +188,8 @@ def test_ended_tracks_are_reported_in_next_frame_of_sensor(tmp_path: Path) -> No
     assert _next_of_topic(tmp_path, wanted) == {("/a", 0): ("/a", 30), ("/b", 20): ("/b", 40)}
 
 
-def test_detections_keep_tracks_when_rows_are_read_in_parts(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_detections_keep_tracks_when_rows_are_read_in_parts(tmp_path: Path) -> None:
     """Rows are sorted by track but shown by frame; some boxes are missing."""
-    monkeypatch.setattr(shown, "_ROWS", 2)
     write_run_tables(tmp_path, [2, 2, 1])
     rows = [(5, 0, 1), (5, 1, 0), (5, 2, None), (6, 0, 0), (6, 2, 0), (7, 1, 1)]
     write_tracks(tmp_path, rows)
@@ -200,7 +197,8 @@ def test_detections_keep_tracks_when_rows_are_read_in_parts(
     table["posterior"] = [[0.1 * k, 1 - 0.1 * k] for k in range(6)]
     for name, width in (("center_full", 3), ("size_full", 3), ("orientation_full", 4)):
         table[name] = [None if k in {1, 3} else [0.5 + k] * width for k in range(6)]
-    write_table(tmp_path / "tracks.parquet", table, TRACKS)
+    path = tmp_path / "tracks.parquet"
+    pq.write_table(arrow_table(table, TRACKS), path, row_group_size=2)
     labels = {track: TrackLabel(track, "cup", 0.7) for track in (5, 6)}
 
     found = shown.ShownTracks.read(tmp_path, labels, causal=True)

@@ -15,7 +15,7 @@ from shapecat.arrays import F4, F8, I4, Bool
 from shapecat.completion import DIRECTIONS, BoxViews, FusedBox, fuse_boxes
 from shapecat.runs.placed_frames import PlacedFrames
 from shapecat.runs.table_schemas import BOX_WIDTH, FULL_BOX, FULL_WIDTHS
-from shapecat.runs.tables import full_boxes_of, numbers, opened, read_together
+from shapecat.runs.tables import full_boxes_of, numbers, opened, read_rows, read_together
 from shapecat.tracking import Track, view_weights
 
 __all__ = ["FullBoxes", "full_columns"]
@@ -64,23 +64,21 @@ class FullBoxes:
     Attributes
     ----------
     table : path of the detections table.
-    groups : (g + 1,) first row of each row group, and the number of rows.
     frames : the frames of the run.
     """
 
     table: Path
-    groups: I4
     frames: PlacedFrames
 
     @classmethod
     def read(cls, folder: Path, placed: Collection[str]) -> "FullBoxes":
         """Read the frames of a run; the topics ``placed`` are tracked in the fixed frame."""
-        frames, groups = PlacedFrames(placed), [0]
+        frames, first = PlacedFrames(placed), 0
         tables = {"frames": PlacedFrames.COLUMNS, "detections": ("topic", "frame")}
         for seen, detections in read_together(folder, tables):
-            frames.add(seen, detections, groups[-1])
-            groups.append(groups[-1] + detections.num_rows)
-        return cls(folder / "detections.parquet", np.array(groups), frames)
+            frames.add(seen, detections, first)
+            first += detections.num_rows
+        return cls(folder / "detections.parquet", frames)
 
     def of_tracks(self, tracks: Sequence[Track], categories: Sequence[str]) -> F4:
         """Return the fused boxes of some tracks in each of their frames, track after track.
@@ -152,17 +150,9 @@ class FullBoxes:
     def _read(self, rows: I4, values: _Selection) -> F4:
         """Return the values (n, k) of some rows of the table."""
         result = np.zeros((len(rows), values.width), np.float32)
-        groups = np.unique(np.searchsorted(self.groups, rows, side="right") - 1)
         with opened(self.table) as file:
-            for k in range(0, len(groups), _AT_ONCE):
-                some = groups[k : k + _AT_ONCE]
-                table = file.read_row_groups(some.tolist(), values.columns, use_threads=False)
-                position = np.concatenate(
-                    [np.arange(self.groups[g], self.groups[g + 1]) for g in some]
-                )
-                inside = np.flatnonzero(np.isin(rows, position))
-                here = np.searchsorted(position, rows[inside])
-                result[inside] = values.of(table.take(pa.array(here)))
+            for at, table in read_rows(file, values.columns, rows, at_once=_AT_ONCE):
+                result[at] = values.of(table)
         return result
 
 

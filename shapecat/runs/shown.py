@@ -1,6 +1,6 @@
 """The detections to show with the labels of their tracks, and the boxes to annotate."""
 
-from collections.abc import Callable, Container, Iterator, Mapping, Sequence
+from collections.abc import Container, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from itertools import accumulate
 from pathlib import Path
@@ -23,6 +23,7 @@ from shapecat.runs.tables import (
     numbers,
     opened,
     read_row_groups,
+    read_rows,
     read_together,
     rows_of,
     topic_codes,
@@ -32,7 +33,6 @@ from shapecat.types import Box, ShownBox, ShownFrame
 __all__ = ["ShownTracks", "read_shown_frames"]
 
 _AT_ONCE = 8  # row groups of boxes in memory
-_ROWS = 2**13  # rows of tracks.parquet in memory
 _NO_ROWS = slice(0, 0)
 _NONE = np.zeros((0, 0), np.float32)
 
@@ -153,35 +153,20 @@ def _box(label: TrackLabel, row: Sequence[float]) -> ShownBox:
 
 def _causal(file: pq.ParquetFile, rows: I4) -> F4:
     """Return the causal posteriors (n, k) of some rows."""
-
-    def values(table: pa.Table) -> F4:
-        return np.reshape(numbers(table["posterior"]), (len(table), -1))
-
-    return _gather(file, ["posterior"], rows, values)
+    found = _NONE
+    for at, table in read_rows(file, ["posterior"], rows):
+        values = np.reshape(numbers(table["posterior"]), (len(table), -1))
+        if not len(found):
+            found = np.zeros((len(rows), values.shape[1]), np.float32)
+        found[at] = values
+    return found
 
 
 def _full(file: pq.ParquetFile, rows: I4) -> F4:
     """Return the full boxes (n, 10) of some rows; NaN if unknown."""
-    if "center_full" not in file.schema_arrow.names:  # from an older version
-        return np.full((len(rows), BOX_WIDTH), np.nan, np.float32)
-    found = _gather(file, list(FULL_BOX), rows, full_boxes_of)
-    return found.reshape(-1, BOX_WIDTH)  # also without rows
-
-
-def _gather(
-    file: pq.ParquetFile, columns: list[str], rows: I4, values: Callable[[pa.Table], F4]
-) -> F4:
-    """Return the ``values`` (n, k) of some rows; few rows at a time are in memory."""
-    place = np.full(file.metadata.num_rows, -1)
-    place[rows] = np.arange(len(rows))
-    found, start = _NONE, 0
-    for batch in file.iter_batches(_ROWS, columns=columns, use_threads=False):
-        some = values(pa.Table.from_batches([batch]))
-        if not start:
-            found = np.zeros((len(rows), some.shape[1]), np.float32)
-        at = place[start : start + len(some)]
-        found[at[at >= 0]] = some[at >= 0]
-        start += len(some)
+    found = np.zeros((len(rows), BOX_WIDTH), np.float32)
+    for at, table in read_rows(file, FULL_BOX, rows):
+        found[at] = full_boxes_of(table)
     return found
 
 

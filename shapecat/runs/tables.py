@@ -30,6 +30,7 @@ __all__ = [
     "open_writer",
     "opened",
     "read_row_groups",
+    "read_rows",
     "read_together",
     "rows_as_lists",
     "rows_of",
@@ -86,6 +87,32 @@ def read_row_groups(
             yield file.read_row_groups(
                 range(first, min(first + at_once, count)), columns=columns, use_threads=False
             )
+
+
+def read_rows(
+    file: pq.ParquetFile, columns: Sequence[str], rows: I4, *, at_once: int = 1
+) -> Iterator[tuple[I4, pa.Table]]:
+    """Yield some rows of an open table, ``at_once`` row groups in memory at a time.
+
+    Parameters
+    ----------
+    rows : (n,) numbers of the rows, in any order.
+
+    Yields
+    ------
+    Indices (k,) in ``rows``, and the table of these rows.
+    """
+    sizes = [file.metadata.row_group(k).num_rows for k in range(file.num_row_groups)]
+    starts, rows = np.cumsum([0, *sizes]), rows.astype(np.int64)
+    order = np.argsort(rows, kind="stable")
+    bounds = np.searchsorted(rows[order], starts)
+    groups = np.flatnonzero(np.diff(bounds))
+    for k in range(0, len(groups), at_once):
+        some = groups[k : k + at_once]
+        at = np.concatenate([order[bounds[g] : bounds[g + 1]] for g in some])
+        skipped = starts[some] - np.cumsum([0, *np.diff(starts)[some[:-1]]])
+        table = file.read_row_groups(some.tolist(), list(columns), use_threads=False)
+        yield at, table.take(pa.array(rows[at] - np.repeat(skipped, np.diff(bounds)[some])))
 
 
 def read_together(
