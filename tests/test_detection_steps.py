@@ -12,6 +12,7 @@ from shapecat.detection.foreground.convex_hull import fill_hull
 from shapecat.detection.merging.pair_features import FEATURES, PAIR_FEATURES
 from shapecat.detection.merging.segments import PAIR, SEGMENT, add_statistics
 from shapecat.detection.planes import find_supporting_planes
+from shapecat.detection.planes.extent import DIRECTIONS, SupportingPlane
 from shapecat.detection.planes.height_map import HeightMap, measure_heights, pack_planes
 from shapecat.detection.planes.ransac import (
     draw_trials,
@@ -71,6 +72,22 @@ def test_samples_beyond_the_edge_of_a_plane_have_no_height() -> None:
     np.testing.assert_allclose(heights.height[105:135, 85:115], 0.08, atol=1e-4)
     assert (heights.plane_id[100:140, 285:] == 0).all()
     assert (heights.plane_id[180:200, 20:100] == -1).all()
+
+
+def test_far_sample_below_a_plane_by_noise_is_on_it() -> None:
+    """At 100 m noise is as large as 25 m: a placeholder must not be taken for such a height."""
+    extent = np.full(DIRECTIONS, 1000.0)
+    plane = SupportingPlane(*_level_plane(40.0), UP, -40.0, extent, 1.0)
+    inv_depth = np.zeros((240, 320), np.float32)
+    inv_depth[60, 100] = level(40.0)[60, 100] / (1 + 15 / 40)  # 15 m below the plane
+    heights = measure_heights(DepthGrid(inv_depth, INTRINSICS, 2), pack_planes([plane]), 0.6)
+    assert heights.plane_id[60, 100] == -1
+    np.testing.assert_allclose(heights.height[60, 100], -15, atol=0.01)
+
+
+def _level_plane(below_m: float) -> tuple[float, float, float]:
+    a, b, c = horizontal_plane(INTRINSICS, UP, -below_m).tolist()
+    return a, b, c
 
 
 @pytest.mark.parametrize(("rise", "segments"), [(0.0, 1), (1.0, 2)])

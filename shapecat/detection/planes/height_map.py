@@ -25,8 +25,8 @@ MIN_HEIGHT_M = 0.004
 HEIGHT_NOISE = 0.0025
 BEYOND_M = 0.1
 """Surface level with a plane, and this near to its outline, is not an object on a lower plane."""
-OUT = -9.0
-"""Placeholder for the height of cells that do not belong to a plane."""
+OUT = -1e6
+"""Placeholder for the height of cells that do not belong to a plane: below all noise."""
 OUTLINE = 10
 """Index at which the outline begins in a row of `pack_planes`."""
 FINE = 65536
