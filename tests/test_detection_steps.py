@@ -7,6 +7,7 @@ import pytest
 
 from shapecat.arrays import freeze
 from shapecat.detection.cleanup.holes import fill_holes
+from shapecat.detection.connected_components import DOWN, RIGHT, spans_of
 from shapecat.detection.depth_grid import DepthGrid, downsample
 from shapecat.detection.foreground.convex_hull import fill_hull
 from shapecat.detection.merging.pair_features import FEATURES, PAIR_FEATURES
@@ -22,7 +23,8 @@ from shapecat.detection.planes.ransac import (
     ransac_plane,
     sample_grid,
 )
-from shapecat.detection.segmentation.connectivity import connect_surfaces
+from shapecat.detection.segmentation.connectivity import SurfaceGraph, connect_surfaces
+from shapecat.detection.segmentation.settings import SEGMENTATION
 from shapecat.detection.segmentation.watershed import watershed
 from shapecat.types import Camera
 from tests.level_planes import INTRINSICS, UP, level
@@ -109,6 +111,25 @@ def test_watershed_splits_faces_at_a_concave_edge(rise: float, segments: int) ->
     assert n == segments
     assert (labels[90:150, 120:200] > 0).all()
     assert (labels[90, 120] != labels[149, 120]) == (segments == 2)
+
+
+def test_crowded_image_keeps_its_largest_segments() -> None:
+    """Speckle at the top of an image must not use up the segments of the objects below it."""
+    plane_id = np.zeros((240, 320), np.int8)
+    for i in range(0, 60, 6):
+        for j in range(0, 318, 6):
+            plane_id[i : i + 4, j : j + 4] = 1
+    plane_id[100:140, 100:140] = 1
+    links = np.full(plane_id.shape, RIGHT | DOWN, np.uint8)
+    blank = np.zeros((0, 3, 0), np.float32)
+    flat = np.zeros(plane_id.shape, np.uint8)
+    heights = HeightMap(plane_id, np.zeros(plane_id.shape, np.float32))
+
+    labels, n = watershed(heights, SurfaceGraph(blank, blank, links, flat, spans_of(plane_id)))
+
+    assert n == SEGMENTATION.most_segments
+    assert (labels[100:140, 100:140] == n).all()
+    assert np.unique(labels).tolist() == [*range(n + 1)]
 
 
 @pytest.mark.parametrize("distance", [0.3, 0.45, 0.9])

@@ -35,7 +35,7 @@ class SegmentationSettings(NamedTuple):
     least_cells: int = 12
     """Minimum number of cells of a segment; smaller parts join the segments around them."""
     most_segments: int = 250
-    """Maximum number of segments: the time grows with its square."""
+    """Maximum number of segments, the largest ones: the time grows with its square."""
     bucket_deg: int = 4
     """Cells whose angles are in the same range of this width are flooded together: the angles are
     not more precise."""

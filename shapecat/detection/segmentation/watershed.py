@@ -42,15 +42,33 @@ def _label_parts(plane_id: I4, graph: SurfaceGraph, edge_deg: int, labels: I4, n
             inside[i, j] = (plane_id[i, j] > 0) & (labels[i, j] == 0) & flat
     spans, component = spans_of(inside.view(np.int8)), unset(labels.shape, np.int32)
     sizes = connected_components(inside, graph.links, spans, component)
-    names = np.zeros(sizes.size, np.int16)
+    names, (least, ties) = np.zeros(sizes.size, np.int16), _least_size(sizes, n)
     for k in range(1, sizes.size):
-        if sizes[k] >= SEGMENTATION.least_cells and n < SEGMENTATION.most_segments:
-            n += 1
+        tie = sizes[k] == least and ties > 0
+        if sizes[k] > least or tie:
+            n, ties = n + 1, ties - tie
             names[k] = n
     for i in range(len(spans)):
         for j in range(spans[i, 0], spans[i, 1]):
             labels[i, j] |= names[component[i, j]]
     return n
+
+
+@kernel(inline=True)
+def _least_size(sizes: I4, n: int) -> tuple[int, int]:
+    """Return the size of the smallest components to label, and how many of this size.
+
+    The largest ones of ``sizes`` (k,) are labelled, as many as ``n`` segments leave room for.
+    """
+    least, room = SEGMENTATION.least_cells - 1, SEGMENTATION.most_segments - n
+    while True:
+        larger, smallest = 0, np.iinfo(np.int32).max
+        for k in range(1, sizes.size):
+            if sizes[k] > least:
+                larger, smallest = larger + 1, min(smallest, sizes[k])
+        if larger <= room:
+            return least, room - larger if least >= SEGMENTATION.least_cells else 0
+        least = smallest
 
 
 @kernel
