@@ -652,6 +652,16 @@ def test_objects_are_detected_in_fused_cloud_of_two_sides() -> None:
         assert own[:, 1].max() - own[:, 1].min() > 0.07  # both sides
 
 
+@pytest.mark.parametrize("share", [0.9, 1.05])
+def test_cloud_beyond_the_range_has_no_objects(share: float) -> None:
+    """As in a depth image, whether few points are within the range or none."""
+    points = frame_of(render(SCENE)[0]).xyz()
+    near = np.nanquantile(np.linalg.norm(points, axis=1), 0.02)
+    settings = DetectionSettings(max_range_m=float(share * near))
+    cloud = Frame("cloud", 0, 0, 0, "camera", points=points)
+    assert detect(cloud, settings=settings, rng=np.random.default_rng(0)).candidates == ()
+
+
 @pytest.mark.parametrize("distance", [0.28, 0.34, 0.42])
 def test_objects_close_to_the_camera_stay_whole(distance: float) -> None:
     """A camera at the wrist of a robot: on slanted faces, inverse depth changes fast."""

@@ -5,7 +5,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from shapecat.arrays import F4, F8, I4
+from shapecat.arrays import F4, F8, I4, Bool
 from shapecat.detection.depth_grid import CELL_M, DepthGrid, PinholeIntrinsics, discontinuity_at
 from shapecat.geometry import NEAREST_M, gravity_rotation
 from shapecat.jit import kernel
@@ -20,7 +20,6 @@ OUTSIDE = 9.0
 MOST_CELLS = 400_000
 MOST_ROWS = 2000
 LEAST_POINTS = 100
-FARTHEST_M = 100.0
 LOAD = 1.8
 """Minimum number of points per occupied cell, on average; with fewer, surfaces have holes."""
 
@@ -83,14 +82,16 @@ def top_view(
     points : (n, 3) metres, sensor frame; rows that are not finite are ignored.
     hint : (3,) the up direction, if it is known. Then only planes within 15 degrees of level are
         considered, and their upper side is the one that faces up.
-    range_m : points at a greater depth in the image are ignored, metres; at least 2 m.
+    range_m : points farther from the origin are ignored, metres.
     rng : source of the random points.
 
     Returns
     -------
     The image; None if there are fewer than `LEAST_POINTS` points or no plane.
     """
-    used = points[np.isfinite(points).all(axis=1) & (np.abs(points) < FARTHEST_M).all(axis=1)]
+    near: Bool = np.asarray((np.abs(points) <= range_m).all(axis=1))  # never so for NaN
+    near[near] = np.linalg.norm(points[near], axis=1) <= range_m
+    used = points[near]
     if len(used) < LEAST_POINTS:
         return None
     sample = used[rng.choice(len(used), min(len(used), 4000), replace=False)].astype(np.float64)
@@ -113,7 +114,8 @@ def top_view(
     middle = np.median(sample, axis=0)
     side = gravity_rotation(up)[1]
     origin = middle + math.sqrt(0.5) * (up - side)
-    return virtual_image(points, range_m=max(range_m, 2.0), origin=origin)
+    seen = np.where(near[:, None], points, np.float32(np.nan))
+    return virtual_image(seen, range_m=max(range_m, 2.0), origin=origin)
 
 
 @kernel
