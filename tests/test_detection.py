@@ -652,6 +652,14 @@ def test_objects_are_detected_in_fused_cloud_of_two_sides() -> None:
         assert own[:, 1].max() - own[:, 1].min() > 0.07  # both sides
 
 
+def test_hidden_wall_in_fused_cloud_is_no_object() -> None:
+    """The largest sizes apply to what the virtual camera does not see, as to what it sees."""
+    shapes = [table(), box((-0.12, 0, 0), (0.1, 0.1, 0.12)), box((0, 0.3, 0), (0.9, 0.03, 0.25))]
+    points = np.concatenate([world_points(shapes, 0, 0), world_points(shapes, 180, 1)])
+    scene = found(Frame("cloud", 0, 0, 0, "table", points=points))
+    assert [round(c.box.center[0], 1) for c in scene.candidates] == [-0.1]
+
+
 @pytest.mark.parametrize("share", [0.9, 1.05])
 def test_cloud_beyond_the_range_has_no_objects(share: float) -> None:
     """As in a depth image, whether few points are within the range or none."""

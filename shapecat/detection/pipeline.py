@@ -127,7 +127,8 @@ def _in_cloud(points: F4, hint: F8 | None, task: Task) -> Scene | None:
         found = None if view is None else _seen(view, hint, task)
     if view is None or found is None:
         return None
-    indices = label_points(view, found, fused=view.crowded > OUTPUT.crowded)
+    fused, highest_m = view.crowded > OUTPUT.crowded, task.settings.max_height_m
+    indices = label_points(view, found, fused=fused, highest_m=highest_m)
     pose = inverse(view.view_from_sensor)
     return build_scene(view.grid, found, indices, pose, settings=task.settings, points=view.points)
 

@@ -21,11 +21,13 @@ from shapecat.jit import kernel
 __all__ = ["label_points"]
 
 
-def label_points(view: VirtualImage, found: Segmentation, *, fused: bool) -> list[U4]:
+def label_points(
+    view: VirtualImage, found: Segmentation, *, fused: bool, highest_m: float
+) -> list[U4]:
     """Return the points of each label 1, 2, ...: ascending indices (k,) uint32.
 
-    If ``fused``, points behind the visible surface join the objects they touch. Lists beyond the
-    labels are clusters that touch no visible object.
+    If ``fused``, points behind the visible surface, at most ``highest_m`` above a plane, join the
+    objects they touch. Lists beyond the labels are clusters that touch no visible object.
     """
     points, grid, labels = view.points, view.grid, found.plane_ids.size
     marks = np.zeros(len(points), np.int16)
@@ -33,7 +35,7 @@ def label_points(view: VirtualImage, found: Segmentation, *, fused: bool) -> lis
     if fused:
         above = marks > 0
         for plane in found.model.planes:
-            above |= _above(points, view.cell, grid.intrinsics, plane)
+            above |= _above(points, view.cell, grid.intrinsics, plane, highest_m)
         loose = np.flatnonzero(above)
         if loose.size:
             spread = label_occluded_points(points[loose], marks[loose].astype(np.int64), labels)
@@ -45,7 +47,9 @@ def label_points(view: VirtualImage, found: Segmentation, *, fused: bool) -> lis
 
 
 @kernel
-def _above(points: F4, cell: I4, intrinsics: PinholeIntrinsics, plane: F8) -> Bool:
+def _above(
+    points: F4, cell: I4, intrinsics: PinholeIntrinsics, plane: F8, highest_m: float
+) -> Bool:
     """Return which points (n, 3) are above a plane and inside its outline, (n,)."""
     result = np.zeros(len(points), np.bool_)
     for k in range(len(points)):
@@ -57,7 +61,7 @@ def _above(points: F4, cell: I4, intrinsics: PinholeIntrinsics, plane: F8) -> Bo
             h = (1 / z - level - plane[2]) * z * plane[3]
             result[k] = (
                 h > MIN_HEIGHT_M + HEIGHT_NOISE * z * z
-                and h < OUTPUT.highest_m
+                and h < highest_m
                 and is_inside_outline(plane, x, y, z, 0.0)
             )
     return result

@@ -7,6 +7,7 @@ import numpy as np
 
 from shapecat.arrays import F4, I4, U4, Bool, freeze
 from shapecat.config import DetectionSettings
+from shapecat.detection.cleanup.settings import CLEANUP
 from shapecat.detection.depth_grid import DepthGrid, find_borders
 from shapecat.detection.output.measurements import ObjectMeasurements
 from shapecat.detection.output.settings import OUTPUT
@@ -51,10 +52,14 @@ def build_scene(
     cut = _cut(grid, measured) if points is None else _cut_cloud(grid, found, sensor_from_view)
     cut |= measured.last
     kept = _kept(grid, measured, indices, settings.min_points, image=points is None)
-    # Without a visible plane below it, an object cut off by the border is probably furniture.
-    kept = [k for k in kept if k >= seen or plane_id[k] is not None or not cut[k]]
-    position = {k + 1: n for n, k in enumerate(kept)}
     boxes = _boxes(found, indices, points, sensor_from_view)
+    # Without a visible plane below it, an object cut off by the border is probably furniture.
+    kept = [
+        k
+        for k in kept
+        if (_fits(boxes[k], settings) if k >= seen else plane_id[k] is not None or not cut[k])
+    ]
+    position = {k + 1: n for n, k in enumerate(kept)}
     candidates = []
     for k in kept:
         on = position.get(supported_by[k]) if k < seen else None
@@ -89,6 +94,13 @@ def _kept(
         limits = [max(least, n * grid.factor**2) for n in measured.least.tolist()]
     enough = (k for k, limit in enumerate(limits) if indices[k].size >= limit)
     return sorted(enough, key=lambda k: int(indices[k][0]))
+
+
+def _fits(box: Box, settings: DetectionSettings) -> bool:
+    """Return whether a box is that of an object, not of a wall or furniture."""
+    length, width, height = box.size.tolist()
+    low = height <= settings.max_height_m - CLEANUP.cut_off_m
+    return bool(low and max(length, width) <= settings.max_size_m)
 
 
 def _boxes(

@@ -23,8 +23,6 @@ class OutputSettings(NamedTuple):
     """Edge of the voxels in which occluded points are connected, metres."""
     most_labels: int = 1000
     """Largest label of a cluster of occluded points; this bounds the time."""
-    highest_m: float = 0.6
-    """Greatest height of occluded points above a plane, metres."""
     border_cells: float = 2.5
     """Width of the border of a cloud, in cells."""
     straight_share: float = 0.3
