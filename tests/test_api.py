@@ -212,6 +212,8 @@ IMAGE = np.ones((4, 6), np.float32)
             )
         ),
         (IMAGE * 900, {"intrinsics": (5, 5, 3, 2)}, "divide millimetres by 1000"),
+        (np.full((9, 3), [-300, 90, np.nan]), {"up": (0, 0)}, "up: expected a direction"),
+        ([[-300, 90, 0], [np.nan, 0, 1], [20, -900, 40]], {}, "points in metres"),
         (np.ones((4, 6, 3)), {"intrinsics": (5, 5, 3, 2)}, r"depth image \(h, w\)"),
         (np.array([["a"]]), {"intrinsics": (5, 5, 3, 2)}, "depth image"),
         (np.ones((9, 3)), {"up": (0, 0, 0)}, "up: expected a direction"),

@@ -19,7 +19,7 @@ from shapecat.types import Camera, Detection, Frame, LabelledFrame, LabelledObje
 __all__ = ["frame_of", "perceive_alone"]
 
 _FARTHEST_M = 100.0
-"""A depth image whose median is larger is not in metres."""
+"""A reading whose median depth, or coordinate, is larger is not in metres."""
 _FIXED = ([0, 1, 2, 2, 2], [1, 0, 0, 1, 2])
 """The elements of a camera matrix that are the same for all cameras, without skew."""
 
@@ -33,7 +33,7 @@ def frame_of(reading: ArrayLike, intrinsics: ArrayLike | None = None) -> Frame:
 
     Raises
     ------
-    ConfigError : the shape, the type or a number is wrong, or depth is not in metres.
+    ConfigError : the shape, the type or a number is wrong, or the unit is not metres.
     """
     values = np.asarray(reading)
     frame = partial(Frame, topic="", index=0, stamp_ns=0, log_time_ns=0, frame_id="")
@@ -42,7 +42,12 @@ def frame_of(reading: ArrayLike, intrinsics: ArrayLike | None = None) -> Frame:
             msg = f"expected points (n, 3), or a depth image with intrinsics, got {values.shape}"
             raise ConfigError(msg)
         points = values.reshape(-1, 3).astype(np.float32, order="C")
-        points[~np.isfinite(points).all(axis=1)] = np.nan
+        known = np.isfinite(points).all(axis=1)
+        points[~known] = np.nan
+        some = points[known][:: 1 + len(points) // 10_000]  # enough for their median
+        if some.size and np.median(np.abs(some).max(axis=1)) > _FARTHEST_M:
+            msg = "expected points in metres, near the sensor; divide millimetres by 1000"
+            raise ConfigError(msg)
         return frame(points=points)
     if values.dtype.kind not in "fiu" or values.ndim != 2:
         msg = f"expected a depth image (h, w) of numbers, got {values.dtype} {values.shape}"
