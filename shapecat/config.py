@@ -7,6 +7,7 @@ import sys
 import tomllib
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
+from numbers import Integral, Real
 from pathlib import Path
 from typing import Any, Literal, get_args, get_origin, get_type_hints
 
@@ -228,6 +229,8 @@ def _checked(name: str, value: Any, kind: Any) -> Any:
             msg = f"{name} must be one of {', '.join(map(str, get_args(kind)))}, got {value!r}"
             raise ConfigError(msg)
         return value
+    if not isinstance(value, bool) and isinstance(value, Real):  # also numbers of numpy
+        value = int(value) if isinstance(value, Integral) else float(value)
     if isinstance(value, int) and abs(value) > sys.float_info.max:
         msg = f"{name} is too large"
         raise ConfigError(msg)

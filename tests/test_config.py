@@ -1,9 +1,11 @@
 """Tests of settings: files, overrides and errors."""
 
 import dataclasses
+import json
 from pathlib import Path
 from typing import Any, Literal, get_args, get_origin, get_type_hints
 
+import numpy as np
 import pytest
 
 from shapecat.config import Settings, load_settings, with_overrides, with_settings
@@ -20,6 +22,26 @@ def test_command_line_overrides_file_and_file_overrides_defaults(tmp_path: Path)
     assert settings.tracking.gate_m == 0.5
     assert settings.tracking.fusion == "vote"
     assert settings.surface == Settings().surface
+
+
+def test_numbers_of_numpy_are_settings() -> None:
+    """A number computed from an image was refused: float64 "must be of type float"."""
+    given = {
+        "max_range_m": np.float64(1.5),
+        "max_size_m": np.float32(0.5),
+        "min_points": np.int64(9),
+    }
+
+    settings = with_settings(Settings(), {"seed": np.uint8(3), "detection": given})
+
+    assert json.dumps(settings.as_dict()) == json.dumps(
+        with_settings(
+            Settings(),
+            {"seed": 3, "detection": {"max_range_m": 1.5, "max_size_m": 0.5, "min_points": 9}},
+        ).as_dict()
+    )
+    with pytest.raises(ConfigError, match="min_points must be of type int"):
+        with_settings(Settings(), {"detection": {"min_points": np.float64(9)}})
 
 
 @pytest.mark.parametrize(
