@@ -1,5 +1,6 @@
 """Tests of the Python interface: imports, shapes of arrays, and the examples of its page."""
 
+import json
 import re
 import runpy
 import subprocess
@@ -357,6 +358,18 @@ def test_frames_that_the_command_refuses_are_refused(
     with recording, pytest.raises(ConfigError, match=problem):
         recording.frames(**options)
     assert list(tmp_path.iterdir()) == []
+
+
+def test_times_may_be_numbers_of_numpy(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """They could not be written to run.json, after all frames had been processed."""
+    jobs: list[Any] = []
+    times: Any = {"start_s": np.float32(0.5), "end_s": np.int64(2)}
+    monkeypatch.setattr("shapecat.pipeline.process", lambda job, *_, **__: jobs.append(job))
+
+    with pytest.raises(OutputError, match=r"no run\.json"):
+        shapecat.process(FIXTURE, tmp_path, **times)
+
+    assert '"start_s": 0.5, "end_s": 2.0' in json.dumps(jobs[0].selection())
 
 
 def test_process_accepts_single_topic_and_up_vector(page_folder: Path, tmp_path: Path) -> None:
