@@ -11,6 +11,7 @@ from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
+import pyarrow as pa
 import pyarrow.compute as pc
 import pyarrow.parquet as pq
 import pytest
@@ -306,12 +307,18 @@ def test_table_columns_become_arrays(page_folder: Path) -> None:
         run.posterior(999)
 
 
+def test_lists_of_text_become_an_array(tmp_path: Path) -> None:
+    """The stages of frames.parquet are text; reading them ended in a traceback."""
+    table = pa.table({"stages": [["detect", "masks"], ["detect", "track"]]})
+    pq.write_table(table, tmp_path / "t.parquet")
+
+    stages = Table(tmp_path / "t.parquet").numpy("stages")
+
+    assert stages.tolist() == [["detect", "masks"], ["detect", "track"]]
+
+
 def test_null_list_becomes_row_of_nan(tmp_path: Path) -> None:
     """Arrow may or may not store values behind a null; later rows must not shift."""
-    import pyarrow as pa  # noqa: PLC0415  beside its only use
-
-    from shapecat.outputs.opened_run import Table  # noqa: PLC0415  the same
-
     kind = pa.list_(pa.float32(), 2)
     column = pa.array([[1, 2], None, [5, 6]], kind)
     pq.write_table(pa.table({"a": column}), tmp_path / "t.parquet")

@@ -70,7 +70,12 @@ class Table:
             return values.to_numpy(zero_copy_only=False)
         lengths = set(values.value_lengths().to_pylist())
         if len(lengths) == 1 and None not in lengths:
-            return numbers(pa.chunked_array([values])).reshape(len(values), -1)
+            flat = values.flatten()
+            text = not pa.types.is_primitive(flat.type)
+            items = (
+                flat.to_numpy(zero_copy_only=False) if text else numbers(pa.chunked_array([flat]))
+            )
+            return items.reshape(len(values), -1)
         ragged = np.zeros(len(values), object)
         ragged[:] = [np.asarray(row) for row in values.to_pylist()]
         return ragged
