@@ -30,7 +30,8 @@ class DetectionSettings:
     """Planes and object candidates (thesis ch. 4). Lengths in metres, angles in degrees."""
 
     max_range_m: float = 3.0
-    """Points farther from the sensor than this are ignored (thesis 4.2)."""
+    """Points farther from the sensor than this are ignored (thesis 4.2); in a cloud, farther from
+    the origin of its frame."""
     fuse_frames: int = 1
     """Number of consecutive depth images that are fused before detection, including the current one
     (thesis 4.2); 1 turns fusion off."""
