@@ -6,11 +6,22 @@ from typing import Any
 import numpy as np
 import pytest
 
+from shapecat.errors import NoStreamError
 from shapecat.recordings import choose_streams, cloud_streams, open_recording
 from shapecat.recordings.colour_streams import choose_colour
+from shapecat.recordings.sensors import by_sensor
 from tests.colour_messages import gradient, packed, raw
 from tests.depth_encodings import png
-from tests.messages import EPOCH, compressed, image, info, wavy_depth, write
+from tests.messages import (
+    EPOCH,
+    cloud,
+    compressed,
+    image,
+    info,
+    organized_points,
+    wavy_depth,
+    write,
+)
 
 Item = tuple[str, int, Any]
 
@@ -102,3 +113,80 @@ def test_depth_compressed_as_png_is_not_colour(tmp_path: Path, encoding: str) ->
         colour = choose_colour(recording, choose_streams(recording)[0])
     assert colour is not None
     assert colour.topic == "/cam/color/image"
+
+
+def in_frame(items: list[Item], frame_id: str) -> list[Item]:
+    """Return messages with another frame id."""
+    for _, _, message in items:
+        message.header.frame_id = frame_id
+    return items
+
+
+def depth_in(topic: str, frame_id: str) -> list[Item]:
+    return in_frame(depth_and_info(topic, f"{topic.rpartition('/')[0]}/camera_info"), frame_id)
+
+
+@pytest.mark.parametrize(
+    "cameras",
+    [
+        [("/spot/depth/left/image", "left_fisheye"), ("/spot/depth/right/image", "right_fisheye")],
+        [("/robot/depth_front/image", "front"), ("/robot/depth_rear/image", "rear")],
+        [("/r1/camera/depth/image_raw", "optical"), ("/r2/camera/depth/image_raw", "optical")],
+        [("/cam1/image_raw", "camera"), ("/cam2/image_raw", "camera")],
+        [("/depth_left/image", "left"), ("/depth_right/image", "right")],
+    ],
+)
+def test_cameras_with_similar_topics_are_several_sensors(
+    tmp_path: Path, cameras: list[tuple[str, str]]
+) -> None:
+    """The others would be left out without a word."""
+    items = [item for topic, frame_id in cameras for item in depth_in(topic, frame_id)]
+
+    with (
+        open_recording(write(tmp_path / "a.mcap", items)) as recording,
+        pytest.raises(NoStreamError, match="several sensors"),
+    ):
+        choose_streams(recording)
+
+
+def test_robots_of_one_kind_stay_apart_with_clouds(tmp_path: Path) -> None:
+    """The cloud of one robot has the frame of the other robot's images."""
+    items: list[Item] = []
+    for robot in ("/r1", "/r2"):
+        points = cloud(EPOCH, organized_points(wavy_depth()))
+        items += depth_in(f"{robot}/camera/depth/image_raw", "optical")
+        items += in_frame([(f"{robot}/camera/depth/points", EPOCH, points)], "optical")
+
+    with open_recording(write(tmp_path / "a.mcap", items)) as recording:
+        sensors = by_sensor(cloud_streams(recording))
+
+    assert [{stream.topic[:3] for stream in sensor} for sensor in sensors] == [{"/r1"}, {"/r2"}]
+
+
+@pytest.mark.parametrize(
+    ("cameras", "chosen"),
+    [
+        # The driver of the Azure Kinect has no namespace.
+        (
+            [("/depth/image_raw", "depth_link"), ("/depth_to_rgb/image_raw", "rgb_link")],
+            "/depth/image_raw",
+        ),
+        # A copy with fewer images.
+        (
+            [("/cam/depth/image_raw", "camera"), ("/slow/cam/depth/image_raw", "camera")],
+            "/cam/depth/image_raw",
+        ),
+        (
+            [("/head/depth/image_raw", "optical"), ("/head/depth_downsample/image_raw", "optical")],
+            "/head/depth/image_raw",
+        ),
+    ],
+)
+def test_topics_of_one_camera_are_one_sensor(
+    tmp_path: Path, cameras: list[tuple[str, str]], chosen: str
+) -> None:
+    """The user would have to name a topic for a single camera."""
+    items = [item for topic, frame_id in cameras for item in depth_in(topic, frame_id)]
+
+    with open_recording(write(tmp_path / "a.mcap", items)) as recording:
+        assert [stream.topic for stream in choose_streams(recording)] == [chosen]

@@ -12,12 +12,12 @@ from shapecat.recordings.depth_image import DEPTH_ENCODINGS
 from shapecat.recordings.foxglove import ros_counterpart
 from shapecat.recordings.messages import Topic
 from shapecat.recordings.recording import Recording
+from shapecat.recordings.sensors import by_sensor
 from shapecat.recordings.streams import (
     CLOUD,
     COMPRESSED,
     IMAGE,
     Stream,
-    by_sensor,
     cloud_streams,
     first_messages,
     info_topic_of,

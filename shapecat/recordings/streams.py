@@ -2,16 +2,15 @@
 
 from collections.abc import Iterator, Sequence
 from contextlib import suppress
-from dataclasses import dataclass
 from itertools import islice
-from pathlib import PurePosixPath
-from typing import Any, Literal
+from typing import Any
 
 from shapecat.errors import NoStreamError
 from shapecat.recordings.depth_image import DEPTH_ENCODINGS
 from shapecat.recordings.foxglove import ros_counterpart
 from shapecat.recordings.messages import MessageError, Topic
 from shapecat.recordings.recording import Recording
+from shapecat.recordings.sensors import Stream, by_sensor
 
 __all__ = [
     "CLOUD",
@@ -19,7 +18,6 @@ __all__ = [
     "IMAGE",
     "INFO",
     "Stream",
-    "by_sensor",
     "choose_streams",
     "cloud_streams",
     "first_message",
@@ -38,27 +36,6 @@ _WARNINGS = 3
 """Warnings about a recording that an error repeats."""
 _OTHER_WORDS = ("confidence", "disparity", "thermal", "mask")
 """Images on topics with these words, encoded like depth, are something else."""
-
-
-@dataclass(frozen=True)
-class Stream:
-    """A topic of depth images or clouds.
-
-    ``info_topic`` is the topic of a depth image's calibration, None if there is none; ``count`` is
-    the number of messages, None if unknown; ``frame_id`` is from the first message.
-    """
-
-    topic: str
-    type: str
-    kind: Literal["depth", "points"]
-    info_topic: str | None
-    count: int | None
-    frame_id: str
-
-    @property
-    def usable(self) -> bool:
-        """Whether the stream gives frames: depth images need a calibration."""
-        return self.kind == "points" or self.info_topic is not None
 
 
 def cloud_streams(recording: Recording, wanted: Sequence[str] = ()) -> tuple[Stream, ...]:
@@ -87,11 +64,10 @@ def cloud_streams(recording: Recording, wanted: Sequence[str] = ()) -> tuple[Str
 def choose_streams(recording: Recording, wanted: Sequence[str] = ()) -> tuple[Stream, ...]:
     """Choose the streams to process: the wanted ones, or the best one of the only sensor.
 
-    Streams belong to the same sensor if they share a frame or the sensor's namespace
-    (``/camera/depth/points`` and ``/camera/aligned_depth_to_color/image_raw``). Within a sensor
-    the preference is, in this order: depth images, since a cloud holds the same data in eight
-    times the bytes; images on a topic named after depth; images not aligned to another camera; more
-    messages; the alphabetical order.
+    `by_sensor` says which streams belong to the same sensor. Within a sensor the preference is, in
+    this order: depth images, since a cloud holds the same data in eight times the bytes; images on
+    a topic named after depth; images not aligned to another camera; more messages; the alphabetical
+    order.
 
     Parameters
     ----------
@@ -175,34 +151,8 @@ def _warnings(recording: Recording) -> str:
     return f"; warnings: {'; '.join(texts)}" if texts else ""
 
 
-def by_sensor(streams: Sequence[Stream]) -> list[list[Stream]]:
-    """Group streams by sensor, see `choose_streams`."""
-    groups: list[list[Stream]] = []
-    for stream in streams:
-        same = [group for group in groups if any(_same_sensor(stream, other) for other in group)]
-        groups = [group for group in groups if group not in same]
-        groups.append([*(other for group in same for other in group), stream])
-    return groups
-
-
-def _same_sensor(a: Stream, b: Stream) -> bool:
-    if a.frame_id and a.frame_id == b.frame_id:
-        return True
-    space = _sensor_namespace(a.topic)
-    return len(space) > 0 and space == _sensor_namespace(b.topic)
-
-
-def _sensor_namespace(topic: str) -> tuple[str, ...]:
-    """Return the part of a topic's namespace that names the sensor."""
-    parts = PurePosixPath(topic.strip("/")).parts[:-1]
-    for k, part in enumerate(parts):
-        if any(word in part for word in ("depth", "points", "cloud", "image", "aligned")):
-            return parts[:k]
-    return parts
-
-
 def _rank(stream: Stream) -> tuple[bool, bool, bool, int, str]:
-    aligned = any(word in stream.topic for word in ("aligned", "registered"))
+    aligned = any(word in stream.topic for word in ("aligned", "registered", "depth_to_"))
     unnamed = stream.kind == "depth" and "depth" not in _image_name(stream.topic)
     return (stream.kind != "depth", unnamed, aligned, -(stream.count or 0), stream.topic)
 

@@ -1,0 +1,105 @@
+"""Depth streams, and which of them come from the same sensor."""
+
+import re
+from collections.abc import Sequence
+from dataclasses import dataclass
+from itertools import permutations
+from typing import Literal, NamedTuple
+
+__all__ = ["Stream", "by_sensor"]
+
+_KINDS = ("depth", "points", "cloud", "image", "aligned")
+"""The first part of a topic with one of these words ends the namespace of the sensor."""
+_PLAIN = {
+    *("aligned", "color", "colour", "depth", "hw", "image", "raw", "rect", "rectified"),
+    *("registered", "rgb", "sw", "cloud", "point", "pointcloud", "points"),
+}
+"""Words between that namespace and the name of the topic that do not name a camera."""
+
+
+@dataclass(frozen=True)
+class Stream:
+    """A topic of depth images or clouds.
+
+    ``info_topic`` is the topic of a depth image's calibration, None if there is none; ``count`` is
+    the number of messages, None if unknown; ``frame_id`` is from the first message.
+    """
+
+    topic: str
+    type: str
+    kind: Literal["depth", "points"]
+    info_topic: str | None
+    count: int | None
+    frame_id: str
+
+    @property
+    def usable(self) -> bool:
+        """Whether the stream gives frames: depth images need a calibration."""
+        return self.kind == "points" or self.info_topic is not None
+
+
+class _Place(NamedTuple):
+    """The parts of a topic: the sensor's namespace, the rest, and words that name a camera."""
+
+    space: tuple[str, ...]
+    rest: tuple[str, ...]
+    camera: frozenset[str]
+
+
+def by_sensor(streams: Sequence[Stream]) -> list[list[Stream]]:
+    """Group streams by sensor.
+
+    Streams belong to the same sensor if they share the sensor's namespace (``/camera/depth/points``
+    and ``/camera/aligned_depth_to_color/image_raw``), unless what follows names different cameras
+    (``/spot/depth/left/image`` and ``/spot/depth/right/image``), or if they share a frame, unless
+    one driver seems to run in both of their namespaces, as on two robots of one kind.
+    """
+    places = {stream.topic: _place(stream.topic) for stream in streams}
+    twins = {
+        (places[a.topic].space, places[b.topic].space)
+        for a, b in permutations(streams, 2)
+        if _are_twins(a, b)
+    }
+
+    def are_same(a: Stream, b: Stream) -> bool:
+        one, other = places[a.topic], places[b.topic]
+        one_frame = a.frame_id != "" and a.frame_id == b.frame_id
+        return _share_namespace(one, other) or (one_frame and (one.space, other.space) not in twins)
+
+    groups: list[list[Stream]] = []
+    for stream in streams:
+        same = [group for group in groups if any(are_same(stream, other) for other in group)]
+        groups = [group for group in groups if group not in same]
+        groups.append([*(other for group in same for other in group), stream])
+    return groups
+
+
+def _place(topic: str) -> _Place:
+    parts = tuple(topic.strip("/").split("/"))
+    spaces = parts[:-1]
+    ends = (k for k, part in enumerate(spaces) if any(word in part for word in _KINDS))
+    end = next(ends, len(spaces))
+    words = (word for part in parts[end:-1] for word in re.sub("_to_.*", "", part).split("_"))
+    return _Place(parts[:end], parts[end:], frozenset(words) - _PLAIN)
+
+
+def _share_namespace(a: _Place, b: _Place) -> bool:
+    if a.space != b.space or a.camera != b.camera:
+        return False
+    # Without a namespace, the topics of a depth camera are beside those of any other sensor.
+    return a.space != () or all("depth" in "/".join(one.rest[:-1]) for one in (a, b))
+
+
+def _are_twins(a: Stream, b: Stream) -> bool:
+    """Return whether the same topic of a driver is in two namespaces, each with its calibration.
+
+    A namespace within another one, as of throttled topics, holds a copy. Clouds have no
+    calibration, so the last two parts of their topics are compared.
+    """
+    one, other = _place(a.topic), _place(b.topic)
+    short, long = sorted((one.space, other.space), key=len)
+    if one.rest != other.rest or long[len(long) - len(short) :] == short:
+        return False
+    if a.kind == "depth":
+        return a.info_topic != b.info_topic
+    return a.topic.split("/")[-2:] == b.topic.split("/")[-2:]
