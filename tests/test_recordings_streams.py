@@ -69,6 +69,8 @@ def test_confidence_map_is_not_taken_for_depth(tmp_path: Path) -> None:
         "/thermal_mast/depth",
         "/oak/stereo/image_raw",
         "/oak/stereo/image_raw/compressedDepth",
+        "/camera/aligned_depth_to_infra1/image_raw",
+        "/ir_robot/camera/depth",
     ],
 )
 def test_depth_needs_no_particular_name(tmp_path: Path, topic: str) -> None:
@@ -79,6 +81,25 @@ def test_depth_needs_no_particular_name(tmp_path: Path, topic: str) -> None:
 
     with open_recording(write(tmp_path / "a.mcap", items)) as recording:
         assert [stream.topic for stream in choose_streams(recording)] == [topic]
+
+
+@pytest.mark.parametrize(
+    "topic",
+    [
+        "/kinect2/sd/image_ir_rect",
+        "/kinect2/sd/image_ir_rect/compressedDepth",
+        "/camera/left_ir/image_raw",
+    ],
+)
+def test_infrared_image_is_not_taken_for_depth(tmp_path: Path, topic: str) -> None:
+    """It has an encoding of depth, and images are preferred to the cloud beside them."""
+    points = cloud(EPOCH, organized_points(wavy_depth()))
+    items = [*depth_in(topic, "camera"), (f"{topic.rpartition('/')[0]}/points", EPOCH, points)]
+    if topic.endswith("compressedDepth"):
+        items[1] = (topic, EPOCH, compressed(EPOCH, png(wavy_depth())))
+
+    with open_recording(write(tmp_path / "a.mcap", items)) as recording:
+        assert [stream.kind for stream in choose_streams(recording)] == ["points"]
 
 
 def test_blank_first_image_does_not_hide_its_topic(tmp_path: Path) -> None:

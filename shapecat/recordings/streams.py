@@ -1,5 +1,6 @@
 """Find the depth streams of a recording, and choose which to process."""
 
+import re
 from collections.abc import Iterator, Sequence
 from contextlib import suppress
 from itertools import islice
@@ -164,9 +165,18 @@ def _image_name(topic: str) -> str:
 
 def _is_other(topic: Topic) -> bool:
     """Return whether an image topic is named after something other than depth."""
-    last = "/".join(_image_name(topic.name).split("/")[-2:])  # without the robot and the camera
-    named = last.rpartition("depth")[2]
-    return ros_counterpart(topic.type) != CLOUD and any(word in named for word in _OTHER_WORDS)
+    own = _own_name(topic.name)
+    return ros_counterpart(topic.type) != CLOUD and any(word in own for word in _OTHER_WORDS)
+
+
+def _is_infrared(topic: str) -> bool:
+    name = re.sub("depth_to_[^/]*", "depth", f"/{topic.lower()}")  # aligned depth_to_infra1
+    return "infra" in name or "/ir/" in name or "ir" in re.split("[/_]", _own_name(name))
+
+
+def _own_name(topic: str) -> str:
+    """Return what the end of an image topic says after ``depth``, without robot and camera."""
+    return "/".join(_image_name(topic).split("/")[-2:]).rpartition("depth")[2]
 
 
 def first_message(recording: Recording, topic: str, kind: str | None = None) -> Any:
@@ -191,11 +201,10 @@ def _probe_cloud(topic: Topic, first: Any, _recording: Recording) -> Stream:
 
 def _probe_image(topic: Topic, first: Any, recording: Recording) -> Stream | None:
     name, encoding = topic.name.lower(), str(first.encoding)
-    infrared = "infra" in name or "/ir/" in f"/{name}"
     # Cameras publish infrared, and grey images of 16 bits, with the same encodings.
     if (
         encoding not in DEPTH_ENCODINGS
-        or infrared
+        or _is_infrared(topic.name)
         or (encoding == "mono16" and "depth" not in name)
     ):
         return None
@@ -204,7 +213,8 @@ def _probe_image(topic: Topic, first: Any, recording: Recording) -> Stream | Non
 
 def _probe_compressed(topic: Topic, first: Any, recording: Recording) -> Stream | None:
     encoding = str(first.format)
-    return _depth_stream(topic, first, recording) if "compressedDepth" in encoding else None
+    is_depth = "compressedDepth" in encoding and not _is_infrared(topic.name)
+    return _depth_stream(topic, first, recording) if is_depth else None
 
 
 def _depth_stream(topic: Topic, first: Any, recording: Recording) -> Stream:
