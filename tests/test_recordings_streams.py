@@ -46,6 +46,32 @@ def test_calibration_is_found_beside_topic_without_slash(tmp_path: Path, lead: s
     assert found == [(f"{lead}depth/image", f"{lead}depth/camera_info")]
 
 
+def test_calibration_of_the_same_frame_is_found(tmp_path: Path) -> None:
+    """Aligned depth has the calibration of the colour camera, which may be recorded alone."""
+    items = depth_and_info("/cam/aligned_depth_to_color/image_raw", "/cam/color/camera_info")
+    items = [
+        *in_frame(items, "color"),
+        *in_frame([("/cam/depth/camera_info", EPOCH, info(EPOCH))], "depth"),
+    ]
+
+    with open_recording(write(tmp_path / "a.mcap", items)) as recording:
+        assert choose_streams(recording)[0].info_topic == "/cam/color/camera_info"
+        assert not recording.warnings
+
+
+def test_only_calibration_of_another_frame_causes_warning(tmp_path: Path) -> None:
+    """Objects get wrong sizes with the intrinsics of the colour camera."""
+    depth, info_topic = "/cam/depth/image_raw", "/cam/color/camera_info"
+    items = depth_and_info(depth, info_topic)
+    in_frame(items[:1], "color")
+
+    with open_recording(write(tmp_path / "a.mcap", items)) as recording:
+        assert choose_streams(recording)[0].info_topic == info_topic
+        (warning,) = recording.warnings
+    assert depth in warning
+    assert "intrinsics of another camera?" in warning
+
+
 def test_confidence_map_is_not_taken_for_depth(tmp_path: Path) -> None:
     """ZED cameras publish it as 32FC1 beside the depth, whose name says that it is registered."""
     zed = "/zed/zed_node"

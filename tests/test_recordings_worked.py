@@ -299,11 +299,12 @@ def with_topics(infos: list[str]) -> Any:
         ("/cam/infra/image_raw", "/cam/camera_info"),
         ("/device_0/sensor_0/Depth_0/image/data", "/device_0/sensor_0/Depth_0/info/camera_info"),
         ("/other/image", None),  # several, of which none is near
+        ("/image", "/camera_info"),  # beside it
     ],
 )
 def test_calibration_sharing_most_of_path_is_chosen(image_topic: str, expected: str | None) -> None:
     infos = ["/cam/camera_info", "/cam/depth/camera_info", "/cam/color/camera_info",
-             "/device_0/sensor_0/Depth_0/info/camera_info"]  # fmt: skip
+             "/device_0/sensor_0/Depth_0/info/camera_info", "/camera_info"]  # fmt: skip
     assert info_topic_of(image_topic, with_topics(infos)) == expected
     assert info_topic_of(image_topic, with_topics(["/far/camera_info"])) == "/far/camera_info"
 

@@ -218,15 +218,16 @@ def _probe_compressed(topic: Topic, first: Any, recording: Recording) -> Stream 
 
 
 def _depth_stream(topic: Topic, first: Any, recording: Recording) -> Stream:
-    info = info_topic_of(topic.name, recording)
     frame_id = first.header.frame_id
+    info = info_topic_of(topic.name, recording, frame_id)
     return Stream(topic.name, topic.type, "depth", info, topic.count, frame_id)
 
 
-def info_topic_of(image: str, recording: Recording) -> str | None:
+def info_topic_of(image: str, recording: Recording, frame_id: str = "") -> str | None:
     """Return the calibration topic that shares the longest namespace with an image topic.
 
-    Without a common namespace it is the only calibration topic, or None if there are several.
+    Without a common namespace it is the only calibration of the frame ``frame_id``, or the only one
+    in the recording, of which a warning says that it is of another frame; otherwise None.
     """
     infos = [
         topic.name
@@ -235,12 +236,29 @@ def info_topic_of(image: str, recording: Recording) -> str | None:
     ]
     parts = image.split("/")[:-1]
     outermost = 2 if image.startswith("/") else 1  # the first part of /depth/image is empty
-    for length in range(len(parts), outermost - 1, -1):
+    for length in range(len(parts), min(len(parts), outermost) - 1, -1):
         for name in _INFO_NAMES:
             sibling = "/".join([*parts[:length], name])
             if sibling in infos:
                 return sibling
-    return infos[0] if len(infos) == 1 else None
+    if not frame_id:
+        return infos[0] if len(infos) == 1 else None
+    frames = {name: _frame_of(recording, name) for name in infos}
+    same = [name for name in infos if frames[name].strip("/") == frame_id.strip("/")]
+    found = next((names[0] for names in (same, infos) if len(names) == 1), None)
+    if found is not None and found not in same and frames[found]:
+        recording.warn(
+            f"{image}: the frame of its images is {frame_id}, but the only calibration, {found}, "
+            f"is of {frames[found]}: are these the intrinsics of another camera?"
+        )
+    return found
+
+
+def _frame_of(recording: Recording, topic: str) -> str:
+    """Return the frame id of a topic's first message; empty if it has none."""
+    with suppress(AttributeError):
+        return str(first_message(recording, topic).header.frame_id)
+    return ""
 
 
 _INFO_NAMES = ("camera_info", "info/camera_info", "calibration")
