@@ -18,6 +18,7 @@ from scipy.spatial.transform import Rotation, Slerp
 
 from shapecat.cameras.colour import ColourImage
 from shapecat.errors import NoStreamError
+from shapecat.geometry import IDENTITY
 from shapecat.recordings import choose_streams, open_recording, time_order
 from shapecat.recordings.colour_image import cloud_colours, compressed_size, pixels_of
 from shapecat.recordings.colour_streams import choose_colour, pair_colours
@@ -211,6 +212,26 @@ def test_colour_is_registered_only_if_cameras_are_equal(
     if view is not None:
         assert view.lens is not None
         assert view.lens.pinhole == camera
+
+
+@pytest.mark.parametrize("frame_id", ["camera", "color"])
+@pytest.mark.parametrize(("k1", "registered"), [(0.4, False), (0.01, True)])
+def test_distorted_colour_is_not_registered_to_rectified_depth(
+    tmp_path: Path, k1: float, frame_id: str, *, registered: bool
+) -> None:
+    """OAK cameras rectify the depth aligned to their colour camera, but not its images."""
+    items = depth_items(EPOCH)
+    calibration = info(EPOCH, DEPTH, (k1, 0, 0, 0, 0))
+    items.append(("/cam/color/camera_info", EPOCH, calibration))
+    items.append(("/cam/color/image_raw", EPOCH + 1, raw(EPOCH, gradient(), "rgb8", frame_id)))
+    ((_, view),), _ = read(record(tmp_path / "a.mcap", in_order(items)))
+
+    assert view is not None
+    assert view.lens is not None
+    assert view.lens.coefficients[0] == k1
+    assert view.registered == registered
+    if not registered:
+        assert view.colour_from_depth is IDENTITY
 
 
 def test_colour_image_of_other_size_than_calibration_is_unused(tmp_path: Path) -> None:

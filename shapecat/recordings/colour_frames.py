@@ -2,14 +2,16 @@
 
 from collections import Counter, deque
 from collections.abc import Iterator, Mapping, Sequence
+from functools import lru_cache
 from statistics import median
 from typing import Any
 
 import numpy as np
 
 from shapecat.cameras.colour import ColourImage, ColourView, LensCamera
-from shapecat.cameras.lenses import LENS_MODELS
+from shapecat.cameras.lenses import LENS_MODELS, distort
 from shapecat.errors import RecordingError
+from shapecat.geometry import IDENTITY
 from shapecat.recordings.colour_image import bytes_per_row, cloud_colours, compressed_size
 from shapecat.recordings.colour_streams import ColourStream
 from shapecat.recordings.extrinsics import Extrinsics
@@ -35,6 +37,9 @@ _USUAL_PERIOD_NS = 100_000_000
 """Image period assumed if neither stamps nor count and duration give one."""
 _NEAR, _EQUAL = 0.01, 1e-6
 """Intrinsics that differ by less than these fractions of the image width are similar, or equal."""
+_STRAIGHT_PX, _STEPS = 2.0, 9
+"""A lens that moves no pixel of a grid farther than this leaves an image registered. Depth images
+with less distortion are taken for those of a pinhole camera as well."""
 
 
 def frames_with_colour(
@@ -193,7 +198,9 @@ class _Partner:
             raise MessageError(msg)
         recorder = self.stream.topic.startswith("/device_")
         one_frame = image.frame_id == frame.frame_id and not recorder
-        if same_shape and one_frame and (lens is None or _alike(lens, frame.camera, _NEAR)):
+        straight = lens is None or _bend_px(lens, frame.camera) < _STRAIGHT_PX
+        alike = lens is None or (straight and _alike(lens, frame.camera, _NEAR))
+        if same_shape and one_frame and alike:
             return ColourView(image, lens or _lens(frame.camera))
         if lens is None:
             msg = "colour images without a sensor_msgs/CameraInfo"
@@ -206,7 +213,7 @@ class _Partner:
         if same_shape and _alike(
             lens, frame.camera, _EQUAL
         ):  # two cameras are never calibrated to the same numbers
-            return ColourView(image, lens)
+            return ColourView(image, lens, None if straight else IDENTITY)
         msg = f"no transform between {frame.frame_id} and {image.frame_id}"
         raise MessageError(msg)
 
@@ -236,6 +243,19 @@ def _alike(lens: LensCamera, camera: Camera | None, share: float) -> bool:
         return False
     own, other = ((c.fx, c.fy, c.cx, c.cy) for c in (lens.pinhole, camera))
     return bool(np.abs(np.subtract(own, other)).max() < share * camera.width)
+
+
+@lru_cache(maxsize=8)
+def _bend_px(lens: LensCamera, camera: Camera | None) -> float:
+    """Return how far the lens moves what a pixel of `camera` sees, at most, pixels."""
+    if camera is None or not lens.model:
+        return 0.0
+    own = lens.pinhole
+    steps = np.linspace(0, 1, _STEPS)
+    pixels = np.stack(np.meshgrid(steps * (camera.width - 1), steps * (camera.height - 1)), -1)
+    rays = (pixels - (camera.cx, camera.cy)) / (camera.fx, camera.fy)
+    seen = distort(rays, lens.model, lens.coefficients) * (own.fx, own.fy) + (own.cx, own.cy)
+    return float(np.abs(seen - pixels).max())
 
 
 def _bytes(data: Any) -> memoryview:
