@@ -124,7 +124,7 @@ def fisheye_of_opencv(ray: Any, k: Any) -> Any:
 FISHEYE = (-0.021, 0.0043, -0.0117, 0.0029)
 
 
-@pytest.mark.parametrize("model", ["equidistant", "fisheye"])
+@pytest.mark.parametrize("model", ["equidistant", "fisheye", "kannala_brandt"])
 @pytest.mark.parametrize("ray", [(0.31, -0.52), (1.2, 0.4), (-0.05, 0.02)])
 def test_fisheye_matches_published_formula(model: str, ray: tuple[float, float]) -> None:
     assert_allclose(distort(np.array(ray), model, FISHEYE), fisheye_of_opencv(ray, FISHEYE))
