@@ -78,6 +78,14 @@ def test_rectified_image_without_p_uses_k() -> None:
     assert (camera.fx, camera.cy) == (531.7, 243.9)
 
 
+def test_image_without_k_uses_p() -> None:
+    """Programs that publish depth of rectified images may fill in P alone."""
+    camera, distorted = camera_of_info(calibration(k=np.zeros(9)), rectified=False)
+
+    assert camera == Camera(*SIZE, 498.4, 503.2, 317.6, 239.3)
+    assert not distorted
+
+
 def test_region_of_interest_shifts_principal_point() -> None:
     """Cutting 80 columns and 30 rows moves it from (322.3, 243.9) to (242.3, 213.9)."""
     camera, _ = camera_of_info(calibration(roi=region(80, 30, 400, 300)), rectified=False)

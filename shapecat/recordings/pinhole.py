@@ -143,6 +143,7 @@ def camera_of_info(info: Any, *, rectified: bool) -> tuple[Camera, bool]:
     Parameters
     ----------
     rectified : whether the image is rectified: P describes rectified images, K and D the others.
+        If one of the two is zero, the other one is used.
 
     Returns
     -------
@@ -154,7 +155,7 @@ def camera_of_info(info: Any, *, rectified: bool) -> tuple[Camera, bool]:
     MessageError : a focal length is not positive, or a value is not finite.
     """
     k, p, d = (_field(info, name) for name in "kpd")
-    use_p = rectified and p.size == 12 and p[0] > 0
+    use_p = p.size == 12 and p[0] > 0 and (rectified or k.size < 9 or k[0] == 0)
     fx, fy, cx, cy = (p[0], p[5], p[2], p[6]) if use_p else (k[0], k[4], k[2], k[5])
     width, height = int(info.width), int(info.height)
     bin_x, bin_y = max(1, int(info.binning_x)), max(1, int(info.binning_y))
@@ -167,7 +168,7 @@ def camera_of_info(info: Any, *, rectified: bool) -> tuple[Camera, bool]:
         msg = "camera info without a calibration (focal length 0)"
         raise MessageError(msg)
     camera = Camera(width // bin_x, height // bin_y, *(float(value) for value in values))
-    return camera, bool(not rectified and np.any(d != 0))
+    return camera, bool(not (rectified or use_p) and np.any(d != 0))
 
 
 def off_center(camera: Camera) -> bool:
