@@ -280,3 +280,12 @@ def test_transforms_of_other_robots_are_left_out(
         assert buffer.lookup("map", "base", EPOCH).translation[0] == 10 + expected
         assert warned in "".join(recording.warnings)
         assert len(recording.warnings) == (warned != "")
+
+
+def test_transforms_without_stamps_use_log_times(tmp_path: Path) -> None:
+    """Images and accelerations without stamps do as well, and would find no transform."""
+    items = [("/tf", EPOCH + k * SECOND, stamped("odom", "base", float(k), 0)) for k in range(3)]
+    with open_recording(write(tmp_path / "a.mcap", items)) as recording:
+        buffer = read_transforms(recording)
+
+    assert buffer.lookup("odom", "base", EPOCH + SECOND // 2).translation[0] == 0.5

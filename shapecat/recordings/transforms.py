@@ -289,21 +289,21 @@ class TransformReader:
         static = message.topic.endswith("tf_static")
         try:
             for transform in self._recording.decode(message).transforms:
-                if not self._add(transform, static=static):
+                stamp = stamp_ns(transform.header) or message.log_time_ns
+                if not self._add(transform, stamp, static=static):
                     self._recording.warn("skipped invalid transforms (NaN, no name)")
                 if not static:
-                    lag = abs(stamp_ns(transform.header) - message.log_time_ns)
-                    self.lag_ns = max(self.lag_ns, lag)
+                    self.lag_ns = max(self.lag_ns, abs(stamp - message.log_time_ns))
         except (AttributeError, TypeError, ValueError, RecordingError) as error:
             self._recording.warn(f"skipped transforms: {error}")
 
-    def _add(self, transform: Any, *, static: bool) -> bool:
+    def _add(self, transform: Any, stamp: int, *, static: bool) -> bool:
         """Add a decoded geometry_msgs/TransformStamped; return False if it is invalid."""
         move, turn = transform.transform.translation, transform.transform.rotation
         return self.buffer.add(
             transform.header.frame_id,
             transform.child_frame_id,
-            stamp_ns(transform.header),
+            stamp,
             ((move.x, move.y, move.z), (turn.x, turn.y, turn.z, turn.w)),
             static=static,
         )
