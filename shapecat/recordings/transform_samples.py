@@ -22,10 +22,16 @@ class TransformSample(NamedTuple):
 
 
 class TransformTrack:
-    """The transforms from one frame to its parent, sorted by time, in packed arrays."""
+    """The transforms from one frame to its parent, sorted by time, in packed arrays.
+
+    Attributes
+    ----------
+    held : whether the last one remains valid.
+    """
 
     def __init__(self) -> None:
         """Start without samples."""
+        self.held = False
         self.stamps = array("q")
         self._parents: list[str] = []
         self._numbers = array("d")  # seven per sample

@@ -96,6 +96,7 @@ class TransformBuffer:
         parent_from_child: tuple[Any, Any],
         *,
         static: bool,
+        held: bool = False,
     ) -> bool:
         """Add a transform, unless it is invalid.
 
@@ -103,6 +104,7 @@ class TransformBuffer:
         ----------
         parent_from_child : translation (x, y, z) in metres and quaternion (x, y, z, w).
         static : whether it is valid for all times; then ``stamp_ns`` is ignored.
+        held : whether it is valid until the next one, however late that is.
 
         Returns
         -------
@@ -124,7 +126,9 @@ class TransformBuffer:
         if static:
             self._static[child] = sample
         else:
-            self._moving.setdefault(child, TransformTrack()).add(stamp_ns, sample)
+            track = self._moving.setdefault(child, TransformTrack())
+            track.held |= held
+            track.add(stamp_ns, sample)
         return True
 
     def root_of(self, frame_id: str) -> str:
@@ -204,7 +208,7 @@ class TransformBuffer:
             return pose_of(self._static[frame_id])
         track = self._moving[frame_id]
         stamps = track.stamps
-        late = stamp_ns - stamps[-1]
+        late = 0 if track.held else stamp_ns - stamps[-1]
         early = stamps[0] - stamp_ns
         if max(late, early) > self.tolerance_ns:
             side = (
@@ -287,17 +291,18 @@ class TransformReader:
         if ros_counterpart(message.type) not in TF_TYPES:
             return
         static = message.topic.endswith("tf_static")
+        held = ros_counterpart(message.type) != message.type  # Foxglove's rule
         try:
             for transform in self._recording.decode(message).transforms:
                 stamp = stamp_ns(transform.header) or message.log_time_ns
-                if not self._add(transform, stamp, static=static):
+                if not self._add(transform, stamp, static=static, held=held):
                     self._recording.warn("skipped invalid transforms (NaN, no name)")
                 if not static:
                     self.lag_ns = max(self.lag_ns, abs(stamp - message.log_time_ns))
         except (AttributeError, TypeError, ValueError, RecordingError) as error:
             self._recording.warn(f"skipped transforms: {error}")
 
-    def _add(self, transform: Any, stamp: int, *, static: bool) -> bool:
+    def _add(self, transform: Any, stamp: int, *, static: bool, held: bool) -> bool:
         """Add a decoded geometry_msgs/TransformStamped; return False if it is invalid."""
         move, turn = transform.transform.translation, transform.transform.rotation
         return self.buffer.add(
@@ -306,4 +311,5 @@ class TransformReader:
             stamp,
             ((move.x, move.y, move.z), (turn.x, turn.y, turn.z, turn.w)),
             static=static,
+            held=held,
         )
