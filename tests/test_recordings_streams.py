@@ -9,6 +9,7 @@ import pytest
 from shapecat.errors import NoStreamError
 from shapecat.recordings import choose_streams, cloud_streams, open_recording
 from shapecat.recordings.colour_streams import choose_colour
+from shapecat.recordings.depth_image import DEPTH_ENCODINGS
 from shapecat.recordings.sensors import by_sensor
 from tests.colour_messages import gradient, packed, raw
 from tests.depth_encodings import png
@@ -146,13 +147,13 @@ def test_blank_first_image_does_not_hide_its_topic(tmp_path: Path) -> None:
     assert (colour.topic, colour.frame_id) == ("/cam/color/image", "color")
 
 
-@pytest.mark.parametrize("encoding", ["16UC1", "mono16", "32FC1"])
-def test_depth_compressed_as_png_is_not_colour(tmp_path: Path, encoding: str) -> None:
+@pytest.mark.parametrize("kind", [*(f"{e}; png compressed " for e in DEPTH_ENCODINGS), "png"])
+def test_depth_compressed_as_png_is_not_colour(tmp_path: Path, kind: str) -> None:
     """The same frame id would put it before the images of the colour camera."""
     body = png(wavy_depth())
     items = [
         *depth_and_info("/cam/depth/image", "/cam/depth/camera_info"),
-        ("/cam/depth/image/compressed", EPOCH, packed(EPOCH, body, f"{encoding}; png compressed ")),
+        ("/cam/depth/image/compressed", EPOCH, packed(EPOCH, body, kind)),
         ("/cam/color/image", EPOCH, raw(EPOCH, gradient(), "rgb8", "color")),
     ]
 

@@ -28,6 +28,8 @@ __all__ = ["ColourStream", "choose_colour", "colour_streams", "pair_colours"]
 _COLOUR_WORDS = ("color", "colour", "rgb")
 _OTHER_WORDS = ("infra", "/ir/", "depth/image", "confidence", "thermal", "mask")
 """Grey images on topics with these words are not from a colour camera."""
+_GREY_16 = b"\x10\x00"
+"""Bit depth and colour type of a grey PNG of 16 bits: bytes 24 and 25 of the file."""
 
 
 @dataclass(frozen=True)
@@ -181,9 +183,11 @@ def _raw_encoding(first: Any) -> str:
 def _compressed_encoding(first: Any) -> str:
     if "compressedDepth" in str(first.format):
         return ""
-    kind = compressed_kind(bytes(first.data[:8]))
+    begin = bytes(first.data[:26])
+    kind = compressed_kind(begin)
     pixels = str(first.format).split(";")[0].strip()
-    if pixels in DEPTH_ENCODINGS:  # packed like colour, such as "16UC1; png compressed"
+    # Packed like colour, such as "16UC1; png compressed", or just "png" in Foxglove.
+    if pixels in DEPTH_ENCODINGS or (kind == "png" and begin[24:] == _GREY_16):
         return ""
     return "mono8" if kind and pixels == "mono8" else kind
 
