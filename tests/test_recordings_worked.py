@@ -102,6 +102,8 @@ def colour(topic: str, frame_id: str = "far", count: int = 1) -> list[tuple[str,
         (colour("/cam/depth/view/image"), colour("/cam/color/x/compressed", count=2)),
         # Named after colour.
         (colour("/cam/zcolour/image"), colour("/cam/aview/x/compressed", count=2)),
+        # Rectified.
+        (colour("/cam/zrgb/image_rect"), colour("/cam/acolor/x/compressed", count=2)),
         # More messages.
         (colour("/cam/zrgb/image", count=2), colour("/cam/acolor/x/compressed")),
         # Compressed.

@@ -11,6 +11,7 @@ from shapecat.recordings.colour_image import COLOUR_ENCODINGS, compressed_kind
 from shapecat.recordings.depth_image import DEPTH_ENCODINGS
 from shapecat.recordings.foxglove import ros_counterpart
 from shapecat.recordings.messages import Topic
+from shapecat.recordings.pinhole import is_rectified
 from shapecat.recordings.recording import Recording
 from shapecat.recordings.sensors import by_sensor
 from shapecat.recordings.streams import (
@@ -95,9 +96,10 @@ def choose_colour(
     A cloud with colours is its own colour stream. Colour images belong to a depth stream if they
     have the same frame or if the topic names begin with the same namespace
     (``/camera/color/image_raw`` and ``/camera/depth/image_raw``). Among several, the preference is,
-    in this order: the same frame, the longest common namespace, a topic named after colour, more
-    messages, compressed images, the alphabetical order of topics. If a recording has one depth
-    sensor and one stream of colour images, they belong together whatever their names.
+    in this order: the same frame, the longest common namespace, a topic named after colour,
+    rectified images, more messages, compressed images, the alphabetical order of topics. If a
+    recording has one depth sensor and one stream of colour images, raw or compressed or both, they
+    belong together whatever their names.
 
     Parameters
     ----------
@@ -139,11 +141,12 @@ def _wanted(recording: Recording, streams: tuple[ColourStream, ...], wanted: str
     raise NoStreamError(msg)
 
 
-def _rank(one: ColourStream, stream: Stream) -> tuple[bool, int, bool, int, bool, str]:
+def _rank(one: ColourStream, stream: Stream) -> tuple[bool, int, bool, bool, int, bool, str]:
     return (
         not (one.frame_id and one.frame_id == stream.frame_id),
         -_shared(one, stream),
         not any(word in one.topic.lower() for word in _COLOUR_WORDS),
+        not is_rectified(one.topic),
         -(one.count or 0),
         one.kind != "compressed",
         one.topic,
