@@ -123,9 +123,16 @@ def test_criteria_for_colour_stream_apply_in_order(tmp_path: Path, better: Any, 
 
 
 def test_unrelated_colour_camera_is_used_only_if_single(tmp_path: Path) -> None:
-    path = record(tmp_path / "a.mcap", in_order([*depth_items(EPOCH), *colour("/one/image")]))
-    both = in_order([*depth_items(EPOCH), *colour("/one/image"), *colour("/two/image")])
-    for file, wanted in ((path, "/one/image"), (record(tmp_path / "b.mcap", both), None)):
+    compressed = "/one/image/compressed"
+    cases: dict[str, str | None] = {
+        "/one/image": "/one/image",
+        compressed: compressed,  # the same images
+        "/two/image": None,
+    }
+    for k, (second, wanted) in enumerate(cases.items()):
+        items = [*depth_items(EPOCH), *colour("/one/image")]
+        items += colour(second) if second != "/one/image" else []
+        file = record(tmp_path / f"{k}.mcap", in_order(items))
         with open_recording(file) as recording:
             (stream,) = choose_streams(recording)
             chosen = choose_colour(recording, stream)

@@ -122,8 +122,8 @@ def choose_colour(
         images = [one for one in streams if one.kind != "cloud" and not one.grey]
         near = [one for one in images if one.frame_id == stream.frame_id or _shared(one, stream)]
         found = own or near
-        if not found and len(images) == 1 and len(by_sensor(cloud_streams(recording))) == 1:
-            found = images
+        if not found and len({one.topic.removesuffix("/compressed") for one in images}) == 1:
+            found = images if len(by_sensor(cloud_streams(recording))) == 1 else []
         chosen = min(found, key=lambda one: _rank(one, stream), default=None)
     if chosen is not None and chosen.info_topic == stream.info_topic:
         return replace(chosen, info_topic=None)  # the calibration of the other camera
