@@ -60,6 +60,21 @@ def test_calibration_of_the_same_frame_is_found(tmp_path: Path) -> None:
         assert not recording.warnings
 
 
+def test_calibrations_of_any_name_are_found_by_their_frames(tmp_path: Path) -> None:
+    """Foxglove has no convention for the names of their topics."""
+    items = depth_in("/cam/depth/image", "depth")
+    items[0] = ("/cam/depth/intrinsics", *items[0][1:])
+    items += in_frame([("/cam/color/intrinsics", EPOCH, info(EPOCH))], "color")
+    items.append(("/cam/color/image", EPOCH, raw(EPOCH, gradient(), "rgb8", "color")))
+
+    with open_recording(write(tmp_path / "a.mcap", items)) as recording:
+        (depth,) = choose_streams(recording)
+        colour = choose_colour(recording, depth)
+    assert colour is not None
+    assert depth.info_topic == "/cam/depth/intrinsics"
+    assert colour.info_topic == "/cam/color/intrinsics"
+
+
 def test_only_calibration_of_another_frame_causes_warning(tmp_path: Path) -> None:
     """Objects get wrong sizes with the intrinsics of the colour camera."""
     depth, info_topic = "/cam/depth/image_raw", "/cam/color/camera_info"

@@ -335,8 +335,9 @@ def with_topics(infos: list[str]) -> Any:
 def test_calibration_sharing_most_of_path_is_chosen(image_topic: str, expected: str | None) -> None:
     infos = ["/cam/camera_info", "/cam/depth/camera_info", "/cam/color/camera_info",
              "/device_0/sensor_0/Depth_0/info/camera_info", "/camera_info"]  # fmt: skip
-    assert info_topic_of(image_topic, with_topics(infos)) == expected
-    assert info_topic_of(image_topic, with_topics(["/far/camera_info"])) == "/far/camera_info"
+    assert info_topic_of(image_topic, with_topics(infos), "") == expected
+    single = with_topics(["/far/camera_info"])
+    assert info_topic_of(image_topic, single, "camera") == "/far/camera_info"
 
 
 def test_camera_still_fits_points_within_its_fit_error() -> None:

@@ -172,8 +172,8 @@ def _probe(
                 continue
             if encoding == "mono8" and any(w in f"/{topic.name.lower()}" for w in _OTHER_WORDS):
                 return None
-            info = info_topic_of(topic.name, recording) if kind != "cloud" else None
             frame_id = str(first.header.frame_id)
+            info = info_topic_of(topic.name, recording, frame_id) if kind != "cloud" else None
             return ColourStream(topic.name, topic.type, kind, info, topic.count, frame_id, encoding)
     return None
 

@@ -220,20 +220,37 @@ def _probe_compressed(topic: Topic, first: Any, recording: Recording) -> Stream 
 def _depth_stream(topic: Topic, first: Any, recording: Recording) -> Stream:
     frame_id = first.header.frame_id
     info = info_topic_of(topic.name, recording, frame_id)
+    if info is not None and frame_id and _nearest(topic.name, [info]) is None:
+        other = _frame_of(recording, info)
+        if other and other.strip("/") != frame_id.strip("/"):
+            recording.warn(
+                f"{topic.name}: the frame of its images is {frame_id}, but the only calibration, "
+                f"{info}, is of {other}: are these the intrinsics of another camera?"
+            )
     return Stream(topic.name, topic.type, "depth", info, topic.count, frame_id)
 
 
-def info_topic_of(image: str, recording: Recording, frame_id: str = "") -> str | None:
+def info_topic_of(image: str, recording: Recording, frame_id: str) -> str | None:
     """Return the calibration topic that shares the longest namespace with an image topic.
 
-    Without a common namespace it is the only calibration of the frame ``frame_id``, or the only one
-    in the recording, of which a warning says that it is of another frame; otherwise None.
+    Without a common namespace it is the only calibration of the images' frame ``frame_id``, or the
+    only one in the recording; otherwise None.
     """
     infos = [
         topic.name
         for topic in recording.topics
         if ros_counterpart(topic.type) == INFO and topic.count != 0
     ]
+    found = _nearest(image, infos)
+    if found is not None or len(infos) < 2:
+        return found or next(iter(infos), None)
+    frame = frame_id.strip("/")
+    same = [name for name in infos if frame and _frame_of(recording, name).strip("/") == frame]
+    return same[0] if len(same) == 1 else None
+
+
+def _nearest(image: str, infos: Sequence[str]) -> str | None:
+    """Return the calibration topic that shares the longest namespace with an image topic."""
     parts = image.split("/")[:-1]
     outermost = 2 if image.startswith("/") else 1  # the first part of /depth/image is empty
     for length in range(len(parts), min(len(parts), outermost) - 1, -1):
@@ -241,17 +258,7 @@ def info_topic_of(image: str, recording: Recording, frame_id: str = "") -> str |
             sibling = "/".join([*parts[:length], name])
             if sibling in infos:
                 return sibling
-    if not frame_id:
-        return infos[0] if len(infos) == 1 else None
-    frames = {name: _frame_of(recording, name) for name in infos}
-    same = [name for name in infos if frames[name].strip("/") == frame_id.strip("/")]
-    found = next((names[0] for names in (same, infos) if len(names) == 1), None)
-    if found is not None and found not in same and frames[found]:
-        recording.warn(
-            f"{image}: the frame of its images is {frame_id}, but the only calibration, {found}, "
-            f"is of {frames[found]}: are these the intrinsics of another camera?"
-        )
-    return found
+    return None
 
 
 def _frame_of(recording: Recording, topic: str) -> str:
