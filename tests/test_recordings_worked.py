@@ -672,6 +672,17 @@ def test_description_has_times_sizes_and_uses_of_topics(tmp_path: Path) -> None:
     assert "Look for *depth stream* or *points stream* in the column `use`" in page
 
 
+def test_description_names_all_depth_streams_of_a_colour_camera(tmp_path: Path) -> None:
+    """All but the last one seemed to have no colour."""
+    aligned = "/cam/aligned_depth_to_color/image_raw"
+    items = [*depth_items(EPOCH), (aligned, EPOCH, image(EPOCH, wavy_depth(), frame_id="color"))]
+    items.append(("/cam/color/image_raw", EPOCH, raw(EPOCH, gradient(), "rgb8", "color")))
+    path = record(tmp_path / "a.mcap", in_order(items))
+
+    uses = {topic["name"]: topic["use"] for topic in describe_recording(path)["topics"]}
+    assert uses["/cam/color/image_raw"] == f"colour of {aligned}, /cam/depth/image_raw"
+
+
 def test_description_marks_depth_stream_without_calibration(tmp_path: Path) -> None:
     """`process` refuses it, which `info` must foretell."""
     images = [item for item in depth_items(EPOCH) if not item[0].endswith("camera_info")]

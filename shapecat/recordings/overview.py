@@ -55,7 +55,8 @@ def _uses(recording: Recording, streams: Mapping[str, Stream]) -> dict[str, str]
         if colour.kind == "cloud":
             uses[topic] += " with colours"
             continue
-        uses[colour.topic] = f"colour of {topic}"
+        known = uses.get(colour.topic, "")
+        uses[colour.topic] = f"{known}, {topic}" if known else f"colour of {topic}"
         if colour.info_topic:
             uses.setdefault(colour.info_topic, "camera")
     return uses
