@@ -164,6 +164,24 @@ def test_single_colour_camera_is_not_used_for_two_sensors(
     assert {colour.topic for colour in wanted.values()} == {"/one/image"}
 
 
+def test_colour_camera_of_another_sensor_is_not_used(tmp_path: Path) -> None:
+    """Each object would have two masks on its images, one from each depth camera."""
+    items = []
+    for side in ("left", "right"):
+        items += [
+            (f"/robot/{side}/depth/camera_info", EPOCH, info(EPOCH)),
+            (f"/robot/{side}/depth/image", EPOCH, image(EPOCH, wavy_depth(), frame_id=side)),
+        ]
+    items += colour("/robot/left/color/image")
+    with open_recording(record(tmp_path / "a.mcap", in_order(items))) as recording:
+        streams = choose_streams(recording, [f"/robot/{s}/depth/image" for s in ("left", "right")])
+        pairs = pair_colours(recording, streams, None)
+
+    assert {depth: colour.topic for depth, colour in pairs.items()} == {
+        "/robot/left/depth/image": "/robot/left/color/image"
+    }
+
+
 def test_new_colour_calibration_changes_lens(tmp_path: Path) -> None:
     """Each image uses the last calibration before it; a repeated one changes nothing."""
     items = [*depth_items(EPOCH, EPOCH + 100 * MS, EPOCH + 200 * MS)]

@@ -95,11 +95,11 @@ def choose_colour(
 
     A cloud with colours is its own colour stream. Colour images belong to a depth stream if they
     have the same frame or if the topic names begin with the same namespace
-    (``/camera/color/image_raw`` and ``/camera/depth/image_raw``). Among several, the preference is,
-    in this order: the same frame, the longest common namespace, a topic named after colour,
-    rectified images, more messages, compressed images, the alphabetical order of topics. If a
-    recording has one depth sensor and one stream of colour images, raw or compressed or both, they
-    belong together whatever their names.
+    (``/camera/color/image_raw`` and ``/camera/depth/image_raw``), unless they share more of it with
+    another depth sensor. Among several, the preference is, in this order: the same frame, the
+    longest common namespace, a topic named after colour, rectified images, more messages,
+    compressed images, the alphabetical order of topics. If a recording has one depth sensor and one
+    stream of colour images, raw or compressed or both, they belong together whatever their names.
 
     Parameters
     ----------
@@ -120,14 +120,24 @@ def choose_colour(
     else:
         own = [one for one in streams if one.kind == "cloud" and one.topic == stream.topic]
         images = [one for one in streams if one.kind != "cloud" and not one.grey]
-        near = [one for one in images if one.frame_id == stream.frame_id or _shared(one, stream)]
-        found = own or near
-        if not found and len({one.topic.removesuffix("/compressed") for one in images}) == 1:
-            found = images if len(by_sensor(cloud_streams(recording))) == 1 else []
+        sensors = by_sensor(cloud_streams(recording)) if images else []
+        found = own or [one for one in images if _belongs(one, stream, sensors)]
+        single = len({one.topic.removesuffix("/compressed") for one in images}) == 1
+        if not found and single and len(sensors) == 1:
+            found = images
         chosen = min(found, key=lambda one: _rank(one, stream), default=None)
     if chosen is not None and chosen.info_topic == stream.info_topic:
         return replace(chosen, info_topic=None)  # the calibration of the other camera
     return chosen
+
+
+def _belongs(one: ColourStream, stream: Stream, sensors: Sequence[Sequence[Stream]]) -> bool:
+    """Return whether images are those of a depth stream's sensor, see `choose_colour`."""
+    if one.frame_id == stream.frame_id:
+        return True
+    others = (other for sensor in sensors if stream not in sensor for other in sensor)
+    shared = [_shared(one, other) for other in others if other.kind == stream.kind]
+    return _shared(one, stream) > 0 and max(shared, default=0) <= _shared(one, stream)
 
 
 def _wanted(recording: Recording, streams: tuple[ColourStream, ...], wanted: str) -> ColourStream:
