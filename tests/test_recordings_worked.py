@@ -261,6 +261,19 @@ def test_distorted_colour_is_not_registered_to_rectified_depth(
         assert view.colour_from_depth is IDENTITY
 
 
+@pytest.mark.parametrize("same", [True, False])
+def test_images_without_frame_ids_need_equal_calibrations(tmp_path: Path, *, same: bool) -> None:
+    """Masks would be off by the distance of the two cameras."""
+    items = depth_items(EPOCH, frame_id="")
+    items.append(("/cam/color/camera_info", EPOCH, info(EPOCH, DEPTH if same else WIDE)))
+    colours = gradient() if same else gradient(60, 80)
+    items.append(("/cam/color/image_raw", EPOCH + 1, raw(EPOCH, colours, "rgb8", "")))
+    ((_, view),), warnings = read(record(tmp_path / "a.mcap", in_order(items)))
+
+    assert (view is not None and view.registered) == same
+    assert any("between a frame without a name and" in text for text in warnings) != same
+
+
 def test_colour_image_of_other_size_than_calibration_is_unused(tmp_path: Path) -> None:
     items = depth_items(EPOCH)
     items.append(("/cam/color/camera_info", EPOCH, info(EPOCH, WIDE)))

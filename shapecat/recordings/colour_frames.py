@@ -214,7 +214,8 @@ class _Partner:
             lens, frame.camera, _EQUAL
         ):  # two cameras are never calibrated to the same numbers
             return ColourView(image, lens, None if straight else IDENTITY)
-        msg = f"no transform between {frame.frame_id} and {image.frame_id}"
+        names = (name or "a frame without a name" for name in (frame.frame_id, image.frame_id))
+        msg = f"no transform between {' and '.join(names)}"
         raise MessageError(msg)
 
 

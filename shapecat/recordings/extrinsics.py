@@ -60,7 +60,7 @@ class Extrinsics:
         """
         recorder = self._depth.topic.startswith("/device_")  # whose frame ids are numbers
         if depth_frame == colour_frame and not recorder:
-            return IDENTITY
+            return IDENTITY if depth_frame else self._realsense  # two cameras may have no name
         frames = depth_frame, colour_frame
         if frames in self._static:
             return self._static[frames]
