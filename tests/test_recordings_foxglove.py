@@ -1,5 +1,6 @@
 """Tests of recordings with Foxglove messages in JSON and Protocol Buffers."""
 
+import json
 from collections import Counter
 from pathlib import Path
 from types import SimpleNamespace
@@ -16,6 +17,7 @@ from shapecat.outputs.foxglove_encoders import descriptors_of, encode_foxglove
 from shapecat.recordings import choose_streams, frames, open_recording, read_transforms
 from shapecat.recordings.decoding import LIBRARY_ERRORS
 from shapecat.recordings.protobuf import message_decoder
+from shapecat.recordings.transform_window import TransformWindow
 from shapecat.types import Camera, Frame, ShownFrame
 from tests.depth_encodings import png
 from tests.foxglove_messages import (
@@ -172,6 +174,33 @@ def test_transforms_are_read(tmp_path: Path, encoding: str) -> None:
         np.testing.assert_array_equal(
             transforms.lookup("map", "camera", stamp).translation, [1, 2, 3]
         )
+
+
+def test_transform_long_before_first_frame_is_known(tmp_path: Path) -> None:
+    """With --start, an earlier pose would be taken for the present one."""
+    path = tmp_path / "a.mcap"
+    with path.open("wb") as file:
+        writer = Writer(file, chunk_size=100)
+        writer.start("", "test")
+        kind = writer.register_schema("foxglove.FrameTransform", "jsonschema", b"{}")
+        channel = writer.register_channel("/tf", "json", kind)
+        for second, x in ((0, 1.0), (20, 2.0), (60, 2.0)):
+            values = {
+                "timestamp": {"sec": EPOCH // SECOND + second, "nsec": 0},
+                "parent_frame_id": "map",
+                "child_frame_id": "camera",
+                "translation": {"x": x, "y": 0, "z": 0},
+                "rotation": {"x": 0, "y": 0, "z": 0, "w": 1},
+            }
+            stamp = EPOCH + second * SECOND
+            writer.add_message(channel, stamp, json.dumps(values).encode(), stamp)
+        writer.finish()
+
+    stamp = EPOCH + 45 * SECOND
+    with open_recording(path) as recording:
+        transforms = TransformWindow.of(recording).around(stamp, stamp)
+
+    assert transforms.lookup("map", "camera", stamp).translation[0] == 2
 
 
 def test_protobuf_scene_is_decoded_by_embedded_descriptors() -> None:

@@ -35,6 +35,8 @@ class LookAhead:
         topics: Collection[str],
         take: Callable[[Message], None],
         forget: Callable[[int], None],
+        *,
+        skips: bool = True,
     ) -> None:
         """Hand over the first messages.
 
@@ -43,9 +45,11 @@ class LookAhead:
         take : called with each message, in the order of the recording.
         forget : called with a stamp (ns): earlier messages are no longer needed, except the last
             one before it.
+        skips : whether messages may be left out that are long before a frame and long after the
+            one before.
         """
         self._recording, self._topics = recording, topics
-        self._take, self._forget = take, forget
+        self._take, self._forget, self._skips = take, forget, skips
         self._stamp_ns: int | None = None
         self._forgotten_ns = self._reached_ns = 0
         self.whole = is_read_at_once(recording)
@@ -60,7 +64,8 @@ class LookAhead:
         """Hand over what a frame may look up, given its log time and stamp in nanoseconds."""
         if self.whole:
             return
-        if log_time_ns > self._reached_ns + AROUND_NS:  # the frames begin later, or have a gap
+        # The frames begin later, or have a gap.
+        if self._skips and log_time_ns > self._reached_ns + AROUND_NS:
             self._read_from(log_time_ns - AROUND_NS)
         self._read_until(log_time_ns + AROUND_NS)
         # The earlier of two stamps, since one may be wrong.

@@ -9,7 +9,7 @@ from shapecat.recordings.messages import MALFORMED
 from shapecat.recordings.recording import Recording
 from shapecat.recordings.streams import first_messages
 
-__all__ = ["TF_TYPES", "TransformTopics", "transform_topics"]
+__all__ = ["TF_TYPES", "TransformTopics", "is_held", "transform_topics"]
 
 TF_TYPES = ("tf2_msgs/msg/TFMessage", "tf/msg/tfMessage")
 
@@ -34,6 +34,11 @@ def transform_topics(recording: Recording, near: Sequence[str] = ()) -> Transfor
         topics -= _of_other_robots(recording, spaces, near)
     static = {name for name in topics if name.endswith("tf_static")}
     return TransformTopics(static, topics - static)
+
+
+def is_held(kind: str) -> bool:
+    """Return whether transforms in messages of a type are valid until the next: Foxglove's are."""
+    return ros_counterpart(kind) in TF_TYPES and kind not in TF_TYPES
 
 
 def _of_other_robots(

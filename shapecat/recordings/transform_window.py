@@ -5,7 +5,7 @@ from copy import deepcopy
 
 from shapecat.recordings.look_ahead import AROUND_NS, LookAhead, is_read_at_once
 from shapecat.recordings.recording import Recording
-from shapecat.recordings.transform_topics import transform_topics
+from shapecat.recordings.transform_topics import is_held, transform_topics
 from shapecat.recordings.transforms import (
     TransformBuffer,
     TransformReader,
@@ -49,7 +49,9 @@ class TransformWindow:
         if is_read_at_once(recording) or not topics:
             return cls(known)
         reader = TransformReader(recording, known)
-        ahead = LookAhead(recording, topics, reader.take, known.forget)
+        kinds = {topic.type for topic in recording.topics if topic.name in topics}
+        skips = not any(map(is_held, kinds))
+        ahead = LookAhead(recording, topics, reader.take, known.forget, skips=skips)
         end = TransformReader(recording, deepcopy(known))
         for message in recording.messages(topics, start_ns=recording.end_ns - AROUND_NS):
             end.take(message)

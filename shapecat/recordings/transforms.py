@@ -23,7 +23,7 @@ from shapecat.recordings.transform_samples import (
     interpolated,
     pose_of,
 )
-from shapecat.recordings.transform_topics import TF_TYPES, transform_topics
+from shapecat.recordings.transform_topics import TF_TYPES, is_held, transform_topics
 from shapecat.types import Pose
 
 __all__ = [
@@ -291,7 +291,7 @@ class TransformReader:
         if ros_counterpart(message.type) not in TF_TYPES:
             return
         static = message.topic.endswith("tf_static")
-        held = ros_counterpart(message.type) != message.type  # Foxglove's rule
+        held = is_held(message.type)
         try:
             for transform in self._recording.decode(message).transforms:
                 stamp = stamp_ns(transform.header) or message.log_time_ns
