@@ -274,6 +274,20 @@ def test_images_without_frame_ids_need_equal_calibrations(tmp_path: Path, *, sam
     assert any("between a frame without a name and" in text for text in warnings) != same
 
 
+@pytest.mark.parametrize("k1", [0.0, 0.4])
+def test_warning_says_why_points_have_no_masks(tmp_path: Path, k1: float) -> None:
+    """Depth of a lens with strong distortion, as from an Azure Kinect, becomes loose points."""
+    items = depth_items(EPOCH)
+    items[0][2].d = np.array([k1, 0, 0, 0, 0])
+    items.append(("/cam/color/camera_info", EPOCH, info(EPOCH, WIDE)))
+    items.append(("/cam/color/image_raw", EPOCH + 1, raw(EPOCH, gradient(60, 80), "rgb8")))
+    ((frame, view),), warnings = read(record(tmp_path / "a.mcap", in_order(items)))
+
+    assert view is not None
+    assert frame.organized == (k1 == 0)
+    assert any("no masks on colour images" in text for text in warnings) == (k1 != 0)
+
+
 def test_colour_image_of_other_size_than_calibration_is_unused(tmp_path: Path) -> None:
     items = depth_items(EPOCH)
     items.append(("/cam/color/camera_info", EPOCH, info(EPOCH, WIDE)))

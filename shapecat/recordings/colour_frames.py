@@ -190,6 +190,10 @@ class _Partner:
         shape = (image.height, image.width)
         if self.stream.kind == "cloud":
             return ColourView(image, _lens(frame.camera))
+        if frame.depth is None:
+            self._recording.warn(
+                f"{frame.topic}: no masks on colour images, since its points are not an image"
+            )
         same_shape = frame.depth is not None and frame.depth.shape == shape
         lens = self._lens
         if lens is not None and (lens.pinhole.height, lens.pinhole.width) != shape:
