@@ -156,6 +156,25 @@ def test_depth_image_is_read(tmp_path: Path, encoding: str, *, compressed: bool)
     np.testing.assert_array_equal(frame.depth, depth / np.float32(1000))
 
 
+def test_calibration_may_lack_the_fields_of_a_lens(tmp_path: Path) -> None:
+    """Programs that write JSON leave out what a pinhole camera does not need."""
+    size = {"width": 4, "height": 3}
+    pixels = content(np.full((3, 4), 700, "<u2").tobytes(), "json")
+    k = [60.0, 0.0, 1.5, 0.0, 61.0, 1.0, 0.0, 0.0, 1.0]
+    items = [
+        ("/depth/calibration", "foxglove.CameraCalibration", size | {"K": k}),
+        (
+            "/depth/image",
+            "foxglove.RawImage",
+            size | {"encoding": "16UC1", "step": 8, "data": pixels},
+        ),
+    ]
+
+    (frame,) = read(write(tmp_path / "a.mcap", "json", items))
+
+    assert frame.camera == CAMERA
+
+
 @both_encodings
 def test_transforms_are_read(tmp_path: Path, encoding: str) -> None:
     values = {

@@ -120,7 +120,7 @@ def _calibration(message: Any) -> Any:
         header=_header(message),
         height=int(message.height),
         width=int(message.width),
-        distortion_model=str(message.distortion_model),
+        distortion_model=str(getattr(message, "distortion_model", "")),
         **matrices,
         binning_x=0,
         binning_y=0,
