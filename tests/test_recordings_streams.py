@@ -243,6 +243,11 @@ def test_robots_of_one_kind_stay_apart_with_clouds(tmp_path: Path) -> None:
             [("/head/depth/image_raw", "optical"), ("/head/depth_downsample/image_raw", "optical")],
             "/head/depth/image_raw",
         ),
+        # The driver of the Kinect v2 publishes several resolutions.
+        (
+            [("/kinect2/qhd/image_depth_rect", "rgb"), ("/kinect2/hd/image_depth_rect", "rgb")],
+            "/kinect2/hd/image_depth_rect",
+        ),
     ],
 )
 def test_topics_of_one_camera_are_one_sensor(

@@ -93,12 +93,14 @@ def _share_namespace(a: _Place, b: _Place) -> bool:
 def _are_twins(a: Stream, b: Stream) -> bool:
     """Return whether the same topic of a driver is in two namespaces, each with its calibration.
 
-    A namespace within another one, as of throttled topics, holds a copy. Clouds have no
-    calibration, so the last two parts of their topics are compared.
+    Namespaces that begin equally (``/kinect2/hd``, ``/kinect2/qhd``) belong to one driver, and one
+    within another, as of throttled topics, holds a copy. Clouds have no calibration, so the last
+    two parts of their topics are compared.
     """
     one, other = _place(a.topic), _place(b.topic)
     short, long = sorted((one.space, other.space), key=len)
-    if one.rest != other.rest or long[len(long) - len(short) :] == short:
+    copied = one.space[:1] == other.space[:1] or long[len(long) - len(short) :] == short
+    if one.rest != other.rest or copied:
         return False
     if a.kind == "depth":
         return a.info_topic != b.info_topic
