@@ -198,9 +198,7 @@ def test_transforms_are_read(tmp_path: Path, encoding: str) -> None:
 def test_transform_long_before_first_frame_is_known(tmp_path: Path) -> None:
     """With --start, an earlier pose would be taken for the present one."""
     path = tmp_path / "a.mcap"
-    with path.open("wb") as file:
-        writer = Writer(file, chunk_size=100)
-        writer.start("", "test")
+    with mcap_writer(path, "", chunk_size=100) as writer:
         kind = writer.register_schema("foxglove.FrameTransform", "jsonschema", b"{}")
         channel = writer.register_channel("/tf", "json", kind)
         for second, x in ((0, 1.0), (20, 2.0), (60, 2.0)):
@@ -213,7 +211,6 @@ def test_transform_long_before_first_frame_is_known(tmp_path: Path) -> None:
             }
             stamp = EPOCH + second * SECOND
             writer.add_message(channel, stamp, json.dumps(values).encode(), stamp)
-        writer.finish()
 
     stamp = EPOCH + 45 * SECOND
     with open_recording(path) as recording:
