@@ -93,7 +93,7 @@ function summarize() {
   byId("download").textContent = checked.length ? `Download tracks.csv (${checked.length})` : "Download tracks.csv";
   byId("verdict").textContent = checked.length
     ? `${right} of ${checked.length} checked ${checked.length === 1 ? "track was" : "tracks were"} right. Rows: detected category; columns: your label.`
-    : "Press a digit, or click a category on a card, to confirm or correct it.";
+    : "To confirm or correct a track, press a digit, or click a category on its card.";
   byId("confusion").replaceChildren(...(checked.length ? [confusion(checked)] : []));
 }
 

@@ -175,7 +175,7 @@ def _next_step(finished: FinishedRun, *, served: bool) -> str:
         text, command = "Corrections are already in tracks.csv.", f"shapecat annotate {folder}"
     else:
         text = "Download tracks.csv first."
-        command = f"shapecat annotate {folder} --labels tracks.csv"
+        command = f"shapecat annotate {folder} --labels ~/Downloads/tracks.csv"
     return (
         f"{text} To write the corrections to annotated.mcap, review.rrd and later exports, run "
         f"<code>{escape(command)}</code>"
@@ -183,20 +183,18 @@ def _next_step(finished: FinishedRun, *, served: bool) -> str:
 
 
 def _timings(phases: Mapping[str, float], stages: Mapping[str, F8]) -> str:
-    rows = [("stage, per frame", "median", "95th percentile", "")]
+    lines = [_line("th", "stage, per frame", "median, ms", "95th percentile, ms")]
     for name, values in stages.items():
         middle, high = np.percentile(values, [50, 95]) * 1000 if len(values) else (0.0, 0.0)
-        rows.append((name, f"{middle:.1f}", f"{high:.1f}", "ms"))
-    rows.append(("phase", "total", "", ""))
+        lines.append(_line("td", name, f"{middle:.1f}", f"{high:.1f}"))
+    lines.append(_line("th", "phase", "total, s", ""))
     last = sorted(phases.items(), key=lambda phase: phase[0] == "total")
-    rows += [(name, f"{seconds:.1f}", "", "s") for name, seconds in last]
-    lines = []
-    for cells in rows:
-        kind = "th" if not cells[3] else "td"
-        lines.append(
-            "<tr>" + "".join(f"<{kind}>{escape(cell)}</{kind}>" for cell in cells) + "</tr>"
-        )
+    lines += [_line("td", name, f"{seconds:.1f}", "") for name, seconds in last]
     return f"<table>{''.join(lines)}</table>"
+
+
+def _line(kind: str, *cells: str) -> str:
+    return "<tr>" + "".join(f"<{kind}>{escape(cell)}</{kind}>" for cell in cells) + "</tr>"
 
 
 def _facts(run: Mapping[str, Any]) -> str:
