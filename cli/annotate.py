@@ -15,7 +15,7 @@ from .render import changed_labels, missed_words, progress_bars
     "--labels",
     type=ANY_PATH,
     metavar="LABELS",
-    help="Corrected table; RUN/tracks.csv by default.",
+    help="Corrected table; by default RUN/tracks.csv.",
 )
 @click.option(
     "--by-place",
@@ -35,8 +35,8 @@ def annotate(
 ) -> None:
     """Write corrected labels into annotated.mcap and review.rrd.
 
-    Correct the column `label` of RUN/tracks.csv in a spreadsheet, or in the page that `shapecat
-    report` makes.
+    Fill in the column `label` of RUN/tracks.csv in a spreadsheet, or correct tracks in the page
+    that `shapecat report` makes.
 
     \b
     shapecat annotate results/lab --labels corrected.csv
@@ -46,7 +46,7 @@ def annotate(
     from shapecat.runs.folder import OUTPUTS
 
     if by_place and labels is None:
-        msg = "--by-place needs --labels, the folder or the table of the other run"
+        msg = "--by-place needs --labels: the folder or the tracks.csv of the other run"
         raise click.UsageError(msg)
     before = _labels_of(run)
     with progress_bars() as bars:

@@ -28,8 +28,7 @@ def compare(
 
     TRUTH is the NAME.truth.json that `shapecat simulate` writes (or the recording beside it), a
     COCO file, a KITTI folder that contains label_2, or another run of the same recording.
-    Frames are matched by timestamp. Frames of another run, and frames without a timestamp, are
-    matched by number.
+    Frames are matched by timestamp, or by number if TRUTH has no timestamps.
 
     \b
     shapecat compare results/demo demo.truth.json

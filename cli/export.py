@@ -39,7 +39,7 @@ _FORMATS = (*_DATASETS, "crops", *_WITH_BOXES, "point-labels")
     "--per-track",
     type=click.IntRange(0),
     default=0,
-    help="coco, yolo: keep only the frames with the N most different views of each track; 0 keeps "
+    help="coco, yolo: keep only the frames with the N most varied views of each track; 0 keeps "
     "all.",
     metavar="N",
 )
@@ -47,6 +47,7 @@ _FORMATS = (*_DATASETS, "crops", *_WITH_BOXES, "point-labels")
     "--min-confidence",
     type=click.FloatRange(0, 1),
     default=0.0,
+    metavar="CONFIDENCE",
     help="coco, yolo: label only objects with at least this confidence, or labelled by a person.",
 )
 @click.option(
@@ -62,6 +63,7 @@ _FORMATS = (*_DATASETS, "crops", *_WITH_BOXES, "point-labels")
     type=click.FloatRange(0, 1, max_open=True),
     default=0.2,
     show_default=True,
+    metavar="FRACTION",
     help="coco, yolo: fraction of the recordings in the validation split.",
 )
 @boxes_option("kitti, labelcloud: {}; full by default.")
@@ -85,17 +87,18 @@ def export(
     OUT; the other formats write one folder per run, OUT/NAME, named after the run.
 
     \b
-    coco          image segmentation: colour images with masks (RLE), boxes, tracks
-    yolo          image segmentation: colour images with a polygon per object
-    crops         data set for `shapecat train` and `learn`: the points of each object
+    coco          image segmentation: images with masks (RLE), boxes and tracks
+    yolo          image segmentation: images with a polygon per object
+    crops         points of each object, for `shapecat train` and `learn`
     kitti         3D detection: label_2, calib, velodyne, image_2
-    labelcloud    editing 3D boxes by hand in the tool labelCloud
-    point-labels  3D segmentation: masks for depth images, SemanticKITTI labels for clouds
+    labelcloud    3D boxes to edit by hand in the tool labelCloud
+    point-labels  3D segmentation: masks of depth images, or labels of points
+                  (SemanticKITTI) for clouds
 
     \b
     shapecat export results/lab --format crops --out crops
     shapecat export results --format kitti --out kitti
-    shapecat export results --format coco --out coco --per-track 20 --min-confidence 0.8
+    shapecat export results --format coco --out coco --min-confidence 0.8
     """
     from shapecat.outputs.exports import common_categories, export_run
     from shapecat.runs.finished import find_runs
@@ -144,13 +147,12 @@ def _export_dataset(
         found = export_dataset(runs, kind, out, selection, recording=recording, observe=bars)
     click.echo(f"{plural(len(runs), 'run')}: {plural(found.objects, 'labelled view')} in {out}")
     train, val = (found.images.get(split, 0) for split in ("train", "val"))
-    why = "one recording is" if len(runs) == 1 else "recordings are"
-    hint = "" if val or not selection.val else f": {why} never split"
+    hint = "" if val or not selection.val else ": all frames of a recording go to the same split"
     click.echo(f"{plural(train, 'image')} in train, {val:,} in val{hint}")
     if kind == "yolo" and found.uncertain:
         click.echo(
-            f"Warning: {plural(found.uncertain, 'visible object')} without a certain label will be "
-            "background in training; coco can mark them to be ignored",
+            f"Warning: training will take {plural(found.uncertain, 'visible object')} without a "
+            "certain label for background; coco marks such objects as ignored",
             err=True,
         )
 

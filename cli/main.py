@@ -64,9 +64,9 @@ def main() -> None:
     """Turn robot recordings into reviewed, labelled 3D objects.
 
     \b
-    shapecat simulate demo.mcap                 make a recording to try shapecat on
-    shapecat process demo.mcap --out results    find, categorize and track objects
-    shapecat view results/demo                  review them in Rerun
+    shapecat simulate demo.mcap               make a recording to try shapecat on
+    shapecat process demo.mcap --out results  find, categorize and track objects
+    shapecat view results/demo                review them in Rerun
     """
     # Unlike Arrow's default, the system's allocator returns freed memory during long recordings.
     os.environ.setdefault("ARROW_DEFAULT_MEMORY_POOL", "system")

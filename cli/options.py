@@ -76,10 +76,20 @@ recording_option = click.option(
 )
 
 
-def choice_option(name: str, choices: Sequence[str], text: str) -> Any:
-    """Return an option with one of several values, by default the first; ``text`` is its help."""
+def choice_option(
+    name: str, choices: Sequence[str], text: str, *, metavar: str | None = None
+) -> Any:
+    """Return an option with one of several values, by default the first.
+
+    ``text`` is its help; ``metavar`` replaces a list of choices that is too long for a line.
+    """
     return click.option(
-        name, type=click.Choice(choices), default=choices[0], show_default=True, help=text
+        name,
+        type=click.Choice(choices),
+        default=choices[0],
+        show_default=True,
+        metavar=metavar,
+        help=text,
     )
 
 
@@ -94,5 +104,6 @@ seed_option = click.option(
     type=click.IntRange(0),
     default=0,
     show_default=True,
+    metavar="N",
     help="Seed of the random generator.",
 )

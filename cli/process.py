@@ -37,7 +37,7 @@ _MOST_ROWS = 100
     "topics",
     multiple=True,
     metavar="TOPIC",
-    help="Topic of depth images or point clouds, if there are several cameras. Repeatable.",
+    help="Topic of depth images or point clouds; needed if there are several cameras. Repeatable.",
 )
 @click.option(
     "--up",
@@ -62,7 +62,7 @@ _MOST_ROWS = 100
     "--jobs",
     type=click.IntRange(1),
     metavar="N",
-    help="Number of processes; one per core by default. If there are fewer recordings than "
+    help="Number of processes; by default one per core. If there are fewer recordings than "
     "processes, several processes share the frames of one.",
 )
 @choice_option(
@@ -135,9 +135,9 @@ def process(
 
     Each RECORDING is an MCAP file, a ROS 1 bag, a ROS 2 bag (file or folder), a folder with
     recordings, or a URL. The results of lab.mcap go to OUT/lab: tables, annotated.mcap for
-    Foxglove, and review.rrd for Rerun. If recordings have the same name, their parent folders'
-    names are prepended: OUT/monday_lab. For several recordings, OUT/manifest.jsonl records the
-    state of each. Run the same command again to resume.
+    Foxglove, and review.rrd for Rerun. If recordings have the same name, the names of their
+    folders are prepended: OUT/monday_lab. For several recordings, OUT/manifest.jsonl records the
+    state of each. To resume after an interruption, run the same command again.
 
     \b
     shapecat process lab.mcap kitchen.bag --out results

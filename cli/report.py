@@ -19,7 +19,10 @@ if TYPE_CHECKING:
 @click.argument("folders", nargs=-1, required=True, type=ANY_PATH, metavar="DIR...")
 @click.option("--serve", is_flag=True, help="Serve the pages on this machine until Ctrl+C.")
 @click.option(
-    "--port", type=click.IntRange(0, 65535), help="Port of --serve; by default a free one."
+    "--port",
+    type=click.IntRange(0, 65535),
+    metavar="PORT",
+    help="Port of --serve; by default a free one.",
 )
 @click.pass_context
 def report(
@@ -30,7 +33,7 @@ def report(
     Each DIR is a run, or a folder of runs. The page of a run is RUN/report.html; several runs, and
     a folder of runs, also get an index.html in the folder that contains them all. A page needs no
     network and can be mailed. Download the corrected tracks.csv from it and apply the file with
-    `shapecat annotate`. With --serve the page writes corrections to RUN/tracks.csv as you make
+    `shapecat annotate`. With --serve, the page writes corrections to RUN/tracks.csv as you make
     them.
 
     \b

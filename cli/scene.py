@@ -9,7 +9,9 @@ from .options import ANY_PATH
 
 @click.command()
 @click.argument("run", type=ANY_PATH)
-@click.option("--frame", type=click.IntRange(0), required=True, help="Frame number, from 0.")
+@click.option(
+    "--frame", type=click.IntRange(0), required=True, metavar="N", help="Frame number, from 0."
+)
 @click.option("--topic", metavar="TOPIC", help="Topic of the frame, if the run has several.")
 def scene(*, run: Path, frame: int, topic: str | None) -> None:
     """Print which object stands on which in one frame of a run.

@@ -27,14 +27,16 @@ _SENSORS = (
 
 @click.command()
 @click.argument("out", type=ANY_PATH)
-@choice_option("--scene", _SCENES, "Kind of scene, listed above.")
+@choice_option("--scene", _SCENES, "Kind of scene, listed above.", metavar="SCENE")
 @click.option(
     "--format",
     "container",
     type=click.Choice(["mcap", "ros1", "ros2"]),
     help="Format of the recording; by default that of OUT's suffix.",
 )
-@choice_option("--sensor", _SENSORS, "Depth camera to simulate.")
+@choice_option(
+    "--sensor", _SENSORS, f"Depth camera to simulate: {', '.join(_SENSORS)}.", metavar="SENSOR"
+)
 @click.option(
     "--frames",
     type=click.IntRange(1),

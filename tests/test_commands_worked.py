@@ -347,7 +347,10 @@ CALLS = {
         [[Path("a"), Path("b")], "yolo", Path("o"), Selection()],
         {"recording": None},
         Exported(7, 0, {"train": 1}),
-        "2 runs: 7 labelled views in o\n1 image in train, 0 in val: recordings are never split\n",
+        (
+            "2 runs: 7 labelled views in o\n"
+            "1 image in train, 0 in val: all frames of a recording go to the same split\n"
+        ),
     ),
     "export a --format kitti --out o --every 3 --boxes visible --recording r.bag": (
         "shapecat.outputs.exports.export_run",

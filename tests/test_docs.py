@@ -36,6 +36,17 @@ def test_help_of_every_command_has_an_example(shapecat: Callable[..., Result], n
             assert parameter.help or parameter.name in {"seed", "scene", "sensor"}, parameter.name
 
 
+@pytest.mark.parametrize("name", ["", *sorted(commands())])
+def test_help_fits_terminal_of_80_columns(
+    shapecat: Callable[..., Result], monkeypatch: pytest.MonkeyPatch, name: str
+) -> None:
+    """A terminal breaks longer lines of examples and of lists of choices in mid-word."""
+    monkeypatch.setenv("COLUMNS", "80")
+    lines = shapecat(*name.split(), "--help").stdout.splitlines()
+
+    assert [line for line in lines if len(line) > 80] == []
+
+
 def test_root_help_truncates_no_description(shapecat: Callable[..., Result]) -> None:
     """Click ends descriptions that are too long with dots."""
     assert "..." not in shapecat("--help").stdout.partition("Commands:")[2]

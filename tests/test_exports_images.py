@@ -149,9 +149,10 @@ def test_export_warns_about_missing_validation_and_labels(
     options = ("--format", kind, "--out", tmp_path / "out")
     done = shapecat("export", run, *options, "--corrected-only")
 
-    line = f"{len(data['images'])} images in train, 0 in val: one recording is never split"
+    why = "all frames of a recording go to the same split"
+    line = f"{len(data['images'])} images in train, 0 in val: {why}"
     assert done.stdout.splitlines()[1:] == [line]
-    warning = f"Warning: {crowds} visible objects without a certain label will be background"
+    warning = f"Warning: training will take {crowds} visible objects without a certain label for"
     assert (warning in done.stderr) == (kind == "yolo")
     assert shapecat("export", run, *options).stderr == ""
 

@@ -83,7 +83,7 @@ class SimulatedTruth(Reference):
     Objects of which too few pixels are visible are ignored.
     """
 
-    kind = "truth of every pixel"
+    kind = "ground truth of each pixel"
 
     def __init__(self, path: Path, content: list[dict[str, Any]]) -> None:
         self._by_stamp = {int(entry["stamp_ns"]): entry for entry in content}
