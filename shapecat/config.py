@@ -46,6 +46,9 @@ class DetectionSettings:
         """Reject numbers that are out of range."""
         _check_range("detection.max_range_m", self.max_range_m, 0.01, 1000.0)
         _check_range("detection.fuse_frames", self.fuse_frames, 1, 30)
+        _check_least("detection.max_height_m", self.max_height_m, 0.001)
+        _check_least("detection.max_size_m", self.max_size_m, 0.001)
+        _check_least("detection.min_points", self.min_points, 1)
 
 
 @dataclass(frozen=True)
@@ -72,6 +75,8 @@ class SurfaceSettings:
         """Reject numbers and lengths that are out of range."""
         # When distances are compared, the index of a neuron replaces their 10 lowest bits.
         _check_range("surface.neurons", self.neurons, 3, 512)
+        _check_least("surface.signals", self.signals, 1)
+        _check_range("surface.component_share", self.component_share, 0.0, 1.0)
         _check_range("surface.voxel_m", self.voxel_m, 0.0001, 1.0)
         if self.smooth_radius_m != 0:
             _check_range("surface.smooth_radius_m, if not 0,", self.smooth_radius_m, 0.0001, 1.0)
@@ -96,6 +101,11 @@ class TrackingSettings:
     fusion: Literal["mean", "product", "vote"] = "product"
     """Fusion of the posteriors of all views: `product`, `mean` or `vote`. The product is
     tempered by the number of views, so that more views alone do not raise the confidence."""
+
+    def __post_init__(self) -> None:
+        """Reject numbers that are out of range."""
+        _check_least("tracking.gate_m", self.gate_m, 0.001)
+        _check_least("tracking.min_hits", self.min_hits, 1)
 
 
 @dataclass(frozen=True)
@@ -188,6 +198,12 @@ def with_overrides(settings: Settings, overrides: Sequence[str]) -> Settings:
             tree = {part: tree}
         settings = _build(settings, tree, "")
     return settings
+
+
+def _check_least(name: str, value: float, least: float) -> None:
+    if value < least:
+        msg = f"{name} must be at least {least}, got {value}"
+        raise ConfigError(msg)
 
 
 def _check_range(name: str, value: float, least: float, most: float) -> None:

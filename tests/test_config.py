@@ -2,6 +2,8 @@
 
 import dataclasses
 import json
+from contextlib import suppress
+from importlib.resources import files
 from pathlib import Path
 from typing import Any, Literal, get_args, get_origin, get_type_hints
 
@@ -86,6 +88,25 @@ def test_unreadable_file_is_config_error(tmp_path: Path, content: bytes | None) 
 
     with pytest.raises(ConfigError, match=r"s\.toml"):
         load_settings(path)
+
+
+def test_settings_outside_schema_are_refused() -> None:
+    """`detection.max_size_m=0`, meant as no limit, would reject every object without a word."""
+    schema = json.loads(files("shapecat.schemas").joinpath("run.json").read_text("utf-8"))
+    accepted = []
+    for group, part in schema["$defs"]["settings"]["properties"].items():
+        for name, field in part.get("properties", {"": part}).items():
+            whole, setting = field.get("type") == "integer", ".".join(filter(None, (group, name)))
+            step = 1 if whole else 0.5
+            outside = [field[key] - step for key in ("minimum",) if key in field]
+            outside += [field[key] + step for key in ("maximum",) if key in field]
+            outside += [field[key] for key in ("exclusiveMinimum",) if key in field]
+            for value in outside:
+                with suppress(ConfigError):
+                    with_overrides(Settings(), [f"{setting}={value}"])
+                    accepted.append(f"{setting}={value}")
+
+    assert accepted == []
 
 
 def test_as_dict_has_every_field() -> None:
