@@ -655,10 +655,11 @@ def test_baselines_may_have_their_own_training_set(trained: Path, tmp_path: Path
 
 
 def test_baselines_need_two_objects_of_each_category(trained: Path, tmp_path: Path) -> None:
-    """Views of a single object would be in training and test."""
-    dataset = write_dataset(tmp_path / "data", ("box", "ball"), instances=1)
+    """Views of a single object would be in training and test; the error names its category."""
+    write_dataset(tmp_path / "data", ("box",), instances=2)
+    dataset = write_dataset(tmp_path / "data", ("ball",), instances=1)
 
-    with pytest.raises(RecordingError, match="two objects each"):
+    with pytest.raises(RecordingError, match="of each category; only one of ball"):
         evaluate_folder(dataset, trained, baselines=dataset)
 
 

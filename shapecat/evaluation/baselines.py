@@ -53,9 +53,12 @@ def compare_learners(
     RecordingError : there are fewer than two categories, or, for cross-validation, a category with
         only one instance.
     """
+    if train is None and (ones := ", ".join(_single(test))):
+        msg = f"{root}: cross-validation needs two objects of each category; only one of {ones}"
+        raise RecordingError(msg)
     splits = list(_folds(test)) if train is None else [(train, test)]
-    if not splits or any(len(_known(part.labels)) < 2 for part, _ in splits):
-        msg = f"{root}: training needs at least two categories with at least two objects each"
+    if any(len(_known(part.labels)) < 2 for part, _ in splits):
+        msg = f"{root}: training needs at least two categories"
         raise RecordingError(msg)
     learners = _learners()
     rows = []
@@ -70,15 +73,22 @@ def _folds(views: DescribedViews) -> Iterator[tuple[DescribedViews, DescribedVie
     """Yield training and test views; all views of an instance are on one side."""
     from sklearn.model_selection import StratifiedGroupKFold  # noqa: PLC0415  only needed here
 
-    fewest = min(
-        (np.unique(views.instances[views.labels == name]).size for name in _known(views.labels)),
-        default=0,
-    )
-    if fewest < 2:
-        return
+    fewest = min(_instances(views).values())
     folds = StratifiedGroupKFold(min(_FOLDS, fewest), shuffle=True, random_state=0)
     for train, test in folds.split(views.descriptors, views.labels, views.instances):
         yield views.where(train), views.where(test)
+
+
+def _single(views: DescribedViews) -> list[str]:
+    """Return the categories with only one instance."""
+    return [name for name, count in _instances(views).items() if count == 1]
+
+
+def _instances(views: DescribedViews) -> dict[str, int]:
+    """Return the number of instances of each category."""
+    return {
+        name: np.unique(views.instances[views.labels == name]).size for name in _known(views.labels)
+    }
 
 
 def _known(labels: np.ndarray) -> list[str]:
