@@ -113,6 +113,12 @@ def test_reference_lists_every_setting_with_default() -> None:
     assert [row for row in expected if row not in reference] == []
 
 
+def test_reference_lists_phases_of_progress() -> None:
+    phases = ", ".join(f"`{name}`" for name in import_module("shapecat.cli.progress")._SHARES)
+
+    assert f"`phase` ({phases})" in (ROOT / "docs" / "reference.md").read_text("utf-8")
+
+
 def test_links_between_pages_resolve() -> None:
     for page in [*PAGES, ROOT / "ARCHITECTURE.md", ROOT / "CONTRIBUTING.md"]:
         for target in re.findall(r"\]\((?!http)([^)#]+)\)", page.read_text("utf-8")):
