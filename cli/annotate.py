@@ -54,7 +54,7 @@ def annotate(
             run, labels, bars, by_place=by_place, boxes=boxes, recording=recording
         )
     written = [name for name in OUTPUTS if (run / name).exists()]
-    click.echo(f"{run}: wrote {' and '.join(written) or 'no file but its tables'}")
+    click.echo(f"{run}: wrote {' and '.join(written) or 'only its tables'}")
     if changes := changed_labels(before, _labels_of(run)):
         click.echo(f"{run}: {changes}")
     if transfer is not None:

@@ -13,7 +13,7 @@ from shapecat.system import stopping
 PHASES = {
     "simulate": "simulating",
     "perceive": "finding and categorizing objects",
-    "revise": "revising frames that disagree",
+    "revise": "revising doubtful frames",
     "annotate": "writing annotated.mcap",
     "review": "writing review.rrd",
     "report": "drawing reports",
@@ -93,7 +93,7 @@ def print_table(columns: Sequence[str], rows: Sequence[Sequence[Any]]) -> None:
 def note_skipped(learned: Mapping[str, Any]) -> None:
     """Print to stderr how many views `train` or `learn` skipped, and the categories without any."""
     if learned["skipped"]:
-        none = f"; none is left of {', '.join(learned['lost'])}" if learned["lost"] else ""
+        none = f"; no view is left of {', '.join(learned['lost'])}" if learned["lost"] else ""
         views = plural(learned["skipped"], "view")
         click.echo(f"skipped {views} with too few points for a surface{none}", err=True)
 

@@ -114,7 +114,7 @@ def perceive(
     Parameters
     ----------
     up : (3,) up direction in the sensor frame, a unit vector; None to estimate it from planes.
-    earlier : frames to fuse with this one. Candidates contain only pixels that have a reading in
+    earlier : frames to fuse with this one. Candidates contain only pixels that have depth in
         ``frame`` itself.
     """
     view = View(frame, up, tuple(earlier))
@@ -230,7 +230,7 @@ def _repeated(frame: Frame, first: Perception) -> Perception:
 
 
 def _of_frame(frame: Frame, perception: Perception) -> Perception:
-    """Remove pixels without a reading in the frame itself from the candidates."""
+    """Remove pixels without depth in the frame itself from the candidates."""
     scene = with_own_readings(perception.scene, frame)
     detections = tuple(
         replace(detection, candidate=candidate)

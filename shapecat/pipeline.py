@@ -288,7 +288,7 @@ def annotate_again(
     Raises
     ------
     OutputError : the folder is not a finished run, the table does not fit it, another process is
-        writing the outputs, or the content of the recording differs from what was processed.
+        writing the outputs, or the content of the recording has changed since it was processed.
     RecordingError : the recording is missing or unreadable.
     """
     from shapecat.runs.finished import open_source  # noqa: PLC0415  on first use

@@ -392,7 +392,10 @@ def test_options_are_passed_on_and_results_printed(
     [
         ({"calibrated": False}, "the confidence is not calibrated: most categories have only one"),
         ({"skipped": 1}, "skipped 1 view with too few points for a surface\n"),
-        ({"skipped": 9, "lost": ["pen", "key"]}, "skipped 9 views .*; none is left of pen, key\n"),
+        (
+            {"skipped": 9, "lost": ["pen", "key"]},
+            "skipped 9 views .*; no view is left of pen, key\n",
+        ),
     ],
 )
 def test_train_names_the_defects_of_its_model(
@@ -454,7 +457,7 @@ def test_annotate_reports_written_files_and_untransferred_labels(
 
     chosen = {"by_place": True, "boxes": "visible", "recording": Path("r.bag")}
     assert calls == [([Path("lab"), Path("t.csv")], chosen)] * 2
-    assert without_files.stdout.splitlines()[0] == "lab: wrote no file but its tables"
+    assert without_files.stdout.splitlines()[0] == "lab: wrote only its tables"
     assert done.stdout.splitlines() == [
         "lab: wrote annotated.mcap and review.rrd", "5 of 6 labels transferred"
     ]  # fmt: skip

@@ -115,7 +115,7 @@ class Claim:
         OutputError : another process has taken it over, because this one was silent too long.
         """
         if not self._is_held():
-            msg = f"{self._url}: another run has taken over, since this one was silent for too long"
+            msg = f"{self._url}: another run has taken over, since this one did not renew its claim"
             raise OutputError(msg)
 
     def beat(self) -> bool:

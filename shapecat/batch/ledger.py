@@ -44,7 +44,7 @@ class Ledger:
         self._open: dict[str, Entry] = {}
 
     def plan(self, tasks: Iterable[Task]) -> None:
-        """Record the recordings to process, unless the manifest has them already."""
+        """List the recordings to process in the manifest, except those already listed."""
         entries = (task.entry() for task in tasks if task.status != "complete")
         new = (entry for entry in entries if not self._has(entry, "planned"))
         while some := list(islice(new, _LINES)):

@@ -52,7 +52,7 @@ def splat_depth(
 
     Parameters
     ----------
-    depth : (h, w) metres, 0 where there is no reading.
+    depth : (h, w) metres, 0 where depth is missing.
     camera : the depth camera.
     objects : for each object, (k,) uint32 flat indices of its pixels in ``depth``.
     lens : the colour camera.

@@ -46,7 +46,7 @@ class _OutlinePrior(NamedTuple):
     ----------
     stray : share of the points that noise and mixed pixels put outside the outline: less where
         the surface curves away than where many points lie on the outline, as on a wall.
-    noise : metres, the spread in depth of the readings on a flat side.
+    noise : metres, the spread of the depths on a flat side.
     roundness : weight of the prior for a circle, as a number of directions: one side says little
         about the depth.
     fits : largest deviation of the visible side from an accepted oval, as a share of its radius.

@@ -1,7 +1,7 @@
 """Consecutive depth images become one with less noise and fewer holes (thesis 4.2).
 
 Each pixel of the current image is projected into the earlier ones. So the pixels stay those of the
-current camera, a surface that an earlier image does not see is never mixed in, and readings of
+current camera, a surface that an earlier image does not see is never mixed in, and depths of
 anything that has moved since disagree and are left out.
 """
 
@@ -20,23 +20,23 @@ from shapecat.types import Camera, Frame, Pose, Scene
 __all__ = ["fuse", "with_own_readings"]
 
 LEAST_SHARE = 0.9
-"""Minimum fraction of the compared readings that differ by less than a `DISCONTINUITY`; below it,
+"""Minimum fraction of the compared depths that differ by less than a `DISCONTINUITY`; below it,
 the pose of the earlier image is considered wrong."""
 STRIDE = 8
 """Distance between the pixels that are compared for `LEAST_SHARE`, pixels."""
 REACH = 2
-"""Largest distance, in pixels, from a hole to a reading whose surface may continue into the
+"""Largest distance, in pixels, from a hole to a depth whose surface may continue into the
 hole."""
 
 
 def fuse(frame: Frame, earlier: Sequence[Earlier], *, range_m: float) -> Frame:
-    """Average the readings of a depth image with those of earlier ones, and fill its holes.
+    """Average the depths of a depth image with those of earlier ones, and fill its holes.
 
-    1. An earlier image counts if most of its readings agree with the current ones.
-    2. A reading becomes the mean of itself and the earlier readings that agree with it (`AGREE`; a
+    1. An earlier image counts if most of its depths agree with the current ones.
+    2. A depth becomes the mean of itself and the earlier depths that agree with it (`AGREE`; a
        larger limit would smear low objects that move). Where they disagree, something has moved or
-       was hidden, and the current reading stays.
-    3. A hole gets the mean of the earlier readings that continue a surface beside it in the current
+       was hidden, and the current depth stays.
+    3. A hole gets the mean of the earlier depths that continue a surface beside it in the current
        image. Readings of an object that has since moved away are not used.
 
     differs: the thesis merges the clouds and subsamples them.
@@ -45,7 +45,7 @@ def fuse(frame: Frame, earlier: Sequence[Earlier], *, range_m: float) -> Frame:
     ----------
     frame : the current frame; a point cloud is returned unchanged.
     earlier : from `RecentFrames`, the newest first.
-    range_m : metres; readings farther away are not changed.
+    range_m : metres; depths farther away are not changed.
 
     Returns
     -------
@@ -76,7 +76,7 @@ def fuse(frame: Frame, earlier: Sequence[Earlier], *, range_m: float) -> Frame:
 
 
 def with_own_readings(scene: Scene, frame: Frame) -> Scene:
-    """Remove from the candidates of a scene the pixels where the frame itself has no reading."""
+    """Remove from the candidates of a scene the pixels where the frame itself has no depth."""
     if frame.depth is None:
         return scene
     seen = frame.depth.reshape(-1) > 0
@@ -130,7 +130,7 @@ def _guide(depth: F4, range_m: float) -> F4:
 
 @kernel
 def _share(guide: F4, before: F4, lens: F4, shift: F4) -> float:
-    """Return the share of readings, among those in both images, that show the same surface."""
+    """Return the share of depths, among those in both images, that show the same surface."""
     columns = guide.shape[1]
     places = np.zeros((3, columns), np.float32)
     x, y, z = places[0], places[1], places[2]
@@ -164,7 +164,7 @@ def _add_resting(guide: F4, before: F4, total: F4, count: F4) -> None:
 
 @kernel
 def _add_moved(guide: F4, before: F4, lens: F4, shift: F4, total: F4, count: F4) -> None:
-    """Add the earlier readings that agree; a hole that gets one becomes a reading in ``guide``."""
+    """Add the earlier depths that agree; a hole that gets one becomes a depth in ``guide``."""
     agree, jump = np.float32(AGREE), np.float32(DISCONTINUITY)
     places = np.zeros((3, guide.shape[1]), np.float32)
     x, y, z = places[0], places[1], places[2]
@@ -203,7 +203,7 @@ def _place(wanted: F4, v: int, lens: F4, shift: F4, x: F4, y: F4, z: F4) -> None
 
 @kernel(inner=True)
 def _read(before: F4, x: float, y: float) -> Any:
-    """Interpolate between the four readings around (x, y); 0 if over half the weight is missing."""
+    """Interpolate between the four depths around (x, y); 0 if over half the weight is missing."""
     rows, columns = before.shape
     zero, one = np.float32(0), np.float32(1)
     if not ((x >= 0) & (y >= 0) & (x < columns - 1) & (y < rows - 1)):

@@ -37,7 +37,7 @@ class RecentFrames:
 
         Earlier frames are dropped after a jump of the clock, a gap, a change of the camera or the
         sensor frame, and when the pose becomes known or unknown. Point clouds are not fused:
-        without pixels, readings of an object that has moved away cannot be recognised.
+        without pixels, depths of an object that has moved away cannot be recognised.
         """
         if not self._kept:
             return ()
@@ -59,7 +59,7 @@ class RecentFrames:
             for topic, n in self._loose.items()
         ] + [
             f"{topic}: the pose of the sensor is unknown in {n} frames: "
-            "they are fused as if it had not moved, where their readings agree"
+            "they are fused as if it had not moved, where their depths agree"
             for topic, n in self._unplaced.items()
             if n
         ]

@@ -240,7 +240,7 @@ def _sum(rows: F4) -> float:
 
 @kernel
 def _height_range(z: F4) -> tuple[float, float]:
-    """Return the 2 % and 98 % quantiles of ``z`` (n,), from a histogram of 256 bins."""
+    """Return the 2nd and 98th percentiles of ``z`` (n,), from a histogram of 256 bins."""
     low, high = outer_range(z)
     if not high > low:
         return low, high

@@ -14,7 +14,7 @@ _LEAST = 1e-30
 
 @kernel(fast=True)
 def inner_range(values: F4) -> tuple[float, float]:
-    """Return the 2 % and 98 % quantiles of values (n,), interpolated in a histogram."""
+    """Return the 2nd and 98th percentiles of values (n,), interpolated in a histogram."""
     low = high = values[0]
     for k in range(values.size):
         low = values[k] if values[k] < low else low

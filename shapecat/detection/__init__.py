@@ -1,6 +1,6 @@
 """Detection: supporting planes, objects and the support graph of a scene (thesis ch. 4).
 
-`detect` turns a frame into a `shapecat.types.Scene`; `Hierarchy` tells what stands on what.
+`detect` turns a frame into a `shapecat.types.Scene`; `Hierarchy` is the support graph.
 """
 
 from shapecat.detection.pipeline import detect

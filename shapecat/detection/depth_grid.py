@@ -52,11 +52,11 @@ class PinholeIntrinsics(NamedTuple):
 
 
 class DepthGrid(NamedTuple):
-    """A downsampled depth image; its elements are called cells, or samples if they have a reading.
+    """A downsampled depth image; its elements are called cells, or samples if they have depth.
 
     Attributes
     ----------
-    inverse_depth : (rows, columns) float32, 1/m; 0 where there is no reading.
+    inverse_depth : (rows, columns) float32, 1/m; 0 where depth is missing.
     intrinsics : the camera in units of cells.
     factor : pixels along the edge of a cell.
     discontinuity : step in inverse depth that separates two surfaces, 1/m.
@@ -71,13 +71,13 @@ class DepthGrid(NamedTuple):
 def downsample(depth: F4, camera: Camera, *, range_m: float) -> DepthGrid | None:
     """Average, in each cell, the depths close to the nearest one; return the inverse means.
 
-    Return None if no reading is within ``range_m``; in images larger than 50 pixels, only every
+    Return None if no depth is within ``range_m``; in images larger than 50 pixels, only every
     fifth row and column is searched for one.
 
     Parameters
     ----------
-    depth : (h, w) metres, 0 where there is no reading.
-    range_m : readings farther away are ignored (thesis 4.2, pass-through filter).
+    depth : (h, w) metres, 0 where depth is missing.
+    range_m : depths farther away are ignored (thesis 4.2, pass-through filter).
     """
     sample = _sampled(depth, 5 if min(depth.shape) > 50 else 1, np.float32(range_m))
     if sample.size == 0:
@@ -108,7 +108,7 @@ def discontinuity_at(depth_m: float) -> float:
 
 @kernel
 def _sampled(depth: F4, step: int, range_m: float) -> F4:
-    """Return the readings in range of every ``step``-th pixel, (n,) metres."""
+    """Return the depths in range of every ``step``-th pixel, (n,) metres."""
     rows, columns = depth.shape
     result = np.zeros((rows // step + 1) * (columns // step + 1), np.float32)
     n, one, least = np.uint64(0), np.uint64(1), np.float32(NEAREST_M)

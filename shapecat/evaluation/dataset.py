@@ -69,7 +69,7 @@ class Dataset:
 
 
 def read_dataset(root: Path) -> Dataset:
-    """Find the files of a data set; hidden files and folders are no part of it.
+    """Find the files of a data set; hidden files and folders are ignored.
 
     Raises
     ------

@@ -196,7 +196,7 @@ class OtherRun(Reference):
 
         Raises
         ------
-        OutputError : the two runs have their frames in a different order.
+        OutputError : the two runs list their frames in different orders.
         """
         wanted = find_frame(self._keys, key, stamp_ns, repeated=repeated)
         if wanted is None:

@@ -1,6 +1,6 @@
 """Where tasks run: every executor has the interface of `concurrent.futures.Executor`.
 
-Executors are independent of what the tasks do. `local` needs no other package; `dask` and `ray`
+Executors do not depend on the tasks. `local` needs no other package; `dask` and `ray`
 are thin adapters for libraries in the extras ``cluster`` and ``ray``.
 """
 

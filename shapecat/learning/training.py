@@ -133,7 +133,7 @@ def fit_chain(
     Parameters
     ----------
     descriptors : (n, d).
-    codes : (n,) from `encode`; the -1 of unknown shapes gets trees and a logit of its own, after
+    codes : (n,) from `encode`; -1, unknown shapes, gets its own trees and logit, after
         those of the categories.
     blocks : range of each block in the descriptor, by name.
     """

@@ -128,7 +128,7 @@ def _pairs(
 
     Parameters
     ----------
-    depth : (h, w) metres, 0 where there is no reading.
+    depth : (h, w) metres, 0 where depth is missing.
     pixel_labels : (h, w) pixel labels of the scene.
     object_labels : (k,) labels of objects.
     """

@@ -30,7 +30,7 @@ Write = Callable[[Path, Iterable[ExportedFrame], FinishedRun], int]
 
 @dataclass(frozen=True)
 class Exported:
-    """What a data set of images holds.
+    """Counts of an exported data set of images.
 
     Attributes
     ----------

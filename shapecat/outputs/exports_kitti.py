@@ -37,8 +37,8 @@ _VELO_FROM_RECTIFIED = np.array([[0.0, 0.0, 1.0], [-1.0, 0.0, 0.0], [0.0, -1.0, 
 def write_kitti(out: Path, frames: Iterable[ExportedFrame], _finished: FinishedRun) -> int:
     """Write label_2/, calib/ and velodyne/, with six-digit names; return the number of objects.
 
-    Colour images are written to image_2/ as undistorted PNG. ``frames.csv`` lists the frame of
-    each number. Points are in the level frame of the sensor (x forward, y left, z up), with
+    Colour images are written to image_2/ as undistorted PNG. ``frames.csv`` maps each
+    number to its frame. Points are in the level frame of the sensor (x forward, y left, z up), with
     intensity 0. The type is the category, with spaces replaced by ``_``.
     """
     for name in ("label_2", "calib", "velodyne"):
@@ -65,7 +65,7 @@ def write_kitti(out: Path, frames: Iterable[ExportedFrame], _finished: FinishedR
 def rectified_from_sensor(up: F8, *, optical: bool) -> F8:
     """Return the rotation (3, 3) from the sensor to a level camera: x right, y down, z forward.
 
-    If the sensor looks straight down or up, forward is the direction of its upper side.
+    If the sensor looks straight down or up, the top of its image points forward.
 
     Parameters
     ----------

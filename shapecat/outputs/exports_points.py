@@ -31,7 +31,7 @@ def write_point_labels(out: Path, frames: Iterable[ExportedFrame], finished: Fin
     """Write the labels of all points; return the number of objects.
 
     For depth images it writes depth/ (millimetres), semantic/ and instance/ as 16-bit PNG; for
-    clouds velodyne/ (x, y, z and 0 for each point with a reading, sensor frame) and labels/.
+    clouds velodyne/ (x, y, z and 0 for each point with depth, sensor frame) and labels/.
     frames.csv lists the frame of each number, and its camera.
 
     Raises
@@ -91,7 +91,7 @@ def _write_masks(out: Path, name: str, frame: Frame, labels: U4) -> None:
 
 
 def depth_in_mm(depth: F4) -> U2:
-    """Return a depth image (h, w), metres, in millimetres; 0, no reading, beyond 65.535 m."""
+    """Return a depth image (h, w), metres, in millimetres; 0, no depth, beyond 65.535 m."""
     millimetres = np.round(depth.astype(np.float64) * 1000)
     return np.where(millimetres <= _LARGEST, millimetres, 0).astype(np.uint16)
 

@@ -55,7 +55,7 @@ class ImageFrame(NamedTuple):
 def read_image_frames(folder: Path, labels: Mapping[int, TrackLabel]) -> Iterator[ImageFrame]:
     """Yield the annotations of the colour images of a run, each image once.
 
-    The colours of unorganized clouds are not an image.
+    Unorganized clouds have no colour image.
     """
     shown = ShownTracks.read(folder, labels)
     latest: dict[str, int] = {}

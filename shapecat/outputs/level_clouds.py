@@ -27,7 +27,7 @@ def write_pcd(path: Path, points: F4, *, viewpoint: Pose) -> None:
 
 
 def finite_points(frame: Frame, indices: U4 | None = None) -> F4:
-    """Return the points (n, 3) of a frame that have a reading, in order, metres, sensor frame.
+    """Return the points (n, 3) of a frame that have depth, in order, metres, sensor frame.
 
     ``indices`` selects pixels or points; None selects all.
     """
@@ -60,7 +60,7 @@ def upright_cloud(
 ) -> tuple[F4, Pose] | None:
     """Return the points (n, 3) of an object in the level frame, and the sensor's pose in it.
 
-    The support is at z = 0; metres. None if no point has a reading.
+    The support is at z = 0; metres. None if no point has depth.
     """
     points = finite_points(frame, item.indices)
     if not len(points):

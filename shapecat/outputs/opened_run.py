@@ -212,7 +212,7 @@ class Run:
         Raises
         ------
         RecordingError : the recording is missing or unreadable.
-        OutputError : its content differs from what was processed.
+        OutputError : its content has changed since it was processed.
         """
         moved = None if recording is None else Path(recording)
         with open_source(self.info, moved) as source:

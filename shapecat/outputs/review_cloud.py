@@ -136,7 +136,7 @@ def _step(size: int, limit: int) -> int:
 
 
 def _measured(frame: Frame, pixels: I4) -> I4:
-    """Return the indices of the pixels or points that have a reading."""
+    """Return the indices of the pixels or points that have depth."""
     if frame.depth is not None:
         return np.asarray(pixels[frame.depth.reshape(-1)[pixels] > 0])
     return np.asarray(pixels[np.isfinite(frame.xyz(pixels)).all(axis=1)])

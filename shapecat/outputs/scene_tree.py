@@ -1,4 +1,4 @@
-"""The objects of a frame and what they stand on, as a text tree, from the tables of a run."""
+"""The objects of a frame on their supports, as a text tree, from the tables of a run."""
 
 from collections.abc import Collection, Mapping, Sequence
 from dataclasses import replace

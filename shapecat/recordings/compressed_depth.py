@@ -27,7 +27,7 @@ def depth_of_compressed(message: Any) -> F4:
 
     Returns
     -------
-    (h, w) float32 metres, 0 where there is no reading.
+    (h, w) float32 metres, 0 where depth is missing.
 
     Raises
     ------

@@ -22,7 +22,7 @@ def depth_of_image(message: Any, units: float | None = None) -> F4:
 
     Returns
     -------
-    (h, w) float32 metres, 0 where there is no reading.
+    (h, w) float32 metres, 0 where depth is missing.
 
     Raises
     ------

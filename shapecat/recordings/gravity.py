@@ -24,7 +24,7 @@ _SOURCES = {"auto": ("tf", "imu"), "tf": ("tf",), "imu": ("imu",)}
 
 
 class Orientation(NamedTuple):
-    """What a recording tells about the sensor in a frame.
+    """Up direction and pose of the sensor in a frame, from the recording.
 
     Attributes
     ----------
@@ -115,7 +115,7 @@ class Upright:
         return cls(transforms, wanted, vector, sources, found, warnings, sensors=sensors)
 
     def orient(self, frame: Frame) -> Orientation:
-        """Look up what the recording tells about the sensor in a frame."""
+        """Look up the up direction and the pose of the sensor in a frame."""
         return Orientation(*self._find(frame), self.fixed_from_sensor(frame))
 
     def fixed_from_sensor(self, frame: Frame) -> Pose | None:

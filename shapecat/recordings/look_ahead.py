@@ -61,7 +61,7 @@ class LookAhead:
         self._read_until(None)
 
     def reach(self, log_time_ns: int, stamp_ns: int) -> None:
-        """Hand over what a frame may look up, given its log time and stamp in nanoseconds."""
+        """Hand over the messages around a frame, given its log time and stamp in nanoseconds."""
         if self.whole:
             return
         # The frames begin later, or have a gap.

@@ -50,7 +50,7 @@ def fit_pinhole(points: F4) -> PinholeFit | None:
 
     Parameters
     ----------
-    points : (h, w, 3) metres, not finite where there is no reading.
+    points : (h, w, 3) metres, not finite where depth is missing.
 
     Returns
     -------

@@ -78,7 +78,7 @@ def organized(points: F4, camera: Camera) -> dict[str, Any]:
 def unorganized(points: F4) -> dict[str, Any]:
     """Return the content of a `Frame` from a cloud (h, w, 3): its points (h * w, 3), row by row.
 
-    Points without a reading become NaN. Drivers mark them with NaN, infinity or the origin.
+    Points without depth become NaN. Drivers mark them with NaN, infinity or the origin.
     """
     flat = np.array(points.reshape(-1, 3), np.float32)
     valid = np.isfinite(flat).all(1) & flat.any(1)

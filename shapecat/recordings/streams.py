@@ -32,7 +32,7 @@ COMPRESSED = "sensor_msgs/msg/CompressedImage"
 INFO = "sensor_msgs/msg/CameraInfo"
 
 _PEEK = 5
-"""Messages tried to find out what a topic holds: the first may be damaged or blank."""
+"""Number of messages tried to classify a topic: the first may be damaged or blank."""
 _WARNINGS = 3
 """Warnings about a recording that an error repeats."""
 _OTHER_WORDS = ("confidence", "disparity", "thermal", "mask")

@@ -24,7 +24,7 @@ class TransformWindow:
     Attributes
     ----------
     tree : the static transforms, and the others from the first and the last seconds of the
-        recording. They tell which frames there are, and their parents.
+        recording. They give the names of all frames, and their parents.
     """
 
     def __init__(

@@ -12,7 +12,7 @@ __all__ = ["agreement"]
 _SAMPLES = 256
 """Approximate number of points to compare."""
 _KNOWN = 0.5
-"""Minimum fraction of the compared points that must have a reading in the other image."""
+"""Minimum fraction of the compared points that must have depth in the other image."""
 
 
 def agreement(
@@ -23,14 +23,14 @@ def agreement(
     Parameters
     ----------
     pixels : (n,) flat indices of the object's pixels in ``depth``.
-    depth, other : (h, w) metres, 0 where there is no reading.
+    depth, other : (h, w) metres, 0 where depth is missing.
     camera, other_camera : the cameras of ``depth`` and ``other``.
     other_from_one : pose of the sensor of ``depth`` in the sensor frame of ``other``.
 
     Returns
     -------
     The share of the compared points that agree with ``other``, and the mean inverse depth, in 1/m,
-    by which ``other`` sees these points nearer; (0, 0) if too few points have a reading there.
+    by which ``other`` sees these points nearer; (0, 0) if too few points have depth there.
     """
     turn, shift = other_from_one.rotation, other_from_one.translation
     known, agreeing, total = _compare(
@@ -97,10 +97,10 @@ def _compare(
 
 @kernel(inline=True)
 def _nearest_reading(depth: F4, row: int, column: int, expected: float) -> tuple[bool, float]:
-    """Return whether there is a reading, and its inverse depth minus the expected one.
+    """Return whether there is depth, and its inverse minus the expected one.
 
     If the pixel itself does not agree, its best neighbour counts: at an edge, the outline may be
-    off by a pixel. Outside the image there is a reading with an infinite difference.
+    off by a pixel. Outside the image there is depth with an infinite difference.
     """
     height, width = depth.shape
     if not (0 <= row < height and 0 <= column < width):

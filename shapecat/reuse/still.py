@@ -27,7 +27,7 @@ def shows_the_same(
     ----------
     now, then : the frames to compare.
     pose, then_pose : ``fixed_from_sensor`` of each; None where there is no fixed frame.
-    range_m : metres; readings farther away in both frames are not compared.
+    range_m : metres; depths farther away in both frames are not compared.
 
     Notes
     -----
@@ -50,7 +50,7 @@ def _at_rest(pose: Pose | None, then: Pose | None) -> bool:
 
 @kernel
 def _changed(now: F4, then: F4, range_m: float) -> bool:
-    """Return whether there is a square of readings that all differ."""
+    """Return whether there is a square of pixels whose depths all differ."""
     height, width = now.shape
     rows = np.zeros(width, np.int64)  # consecutive rows with a long enough run that ends here
     differs = np.zeros(width, np.bool_)
@@ -67,7 +67,7 @@ def _changed(now: F4, then: F4, range_m: float) -> bool:
 
 @kernel(inline=True)
 def _mark(now: F4, then: F4, range_m: float, differs: Bool) -> None:
-    """Mark the readings of a row that differ, unless both are out of range."""
+    """Mark the depths of a row that differ, unless both are out of range."""
     for u in range(len(now)):
         a, b = now[u], then[u]
         near = (a <= range_m) | (b <= range_m)
@@ -76,9 +76,9 @@ def _mark(now: F4, then: F4, range_m: float, differs: Bool) -> None:
 
 @kernel(inline=True)
 def _alone(now: F4, then: F4, row: int, column: int) -> bool:
-    """Return whether neither reading of a pixel occurs in the other image, there or beside it.
+    """Return whether neither depth of a pixel occurs in the other image, there or beside it.
 
-    Two missing readings are equal.
+    Two missing depths are equal.
     """
     a, b = now[row, column], then[row, column]
     return a != b and not (

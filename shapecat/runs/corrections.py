@@ -70,7 +70,7 @@ def _read_own(path: Path) -> tuple[TrackTable, list[str]]:
     """Read the tracks.csv of a run; return it with the problems of its lines.
 
     A person may edit the labels and add columns. Other cells are as in tracks.original.csv, which
-    tells when tracks are missing or a category was edited.
+    reveals missing tracks and edited categories.
     """
     table = read_track_table(path)
     _require_same_run(path, table, path.parent)

@@ -100,7 +100,7 @@ def open_source(run: RunInfo, moved_to: Path | None = None) -> Iterator[Recordin
     Raises
     ------
     RecordingError : the recording is missing or unreadable.
-    OutputError : the content of the recording differs from what was processed.
+    OutputError : the content of the recording has changed since it was processed.
     """
     path = moved_to or Path(run["input"]["path"])
     if moved_to is None and not path.exists():

@@ -29,7 +29,7 @@ _NO_ROWS = np.zeros(0, np.int64)
 
 
 class _Selection(NamedTuple):
-    """What to read of a row: its columns, their numbers as a row of an array, and how many."""
+    """Columns to read of a table: their names, and a function that joins them as (n, width)."""
 
     columns: list[str]
     width: int

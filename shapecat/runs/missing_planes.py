@@ -19,7 +19,7 @@ _NO_ROOM_M = 10.0
 """A median depth that no camera indoors measures; the unit is wrong rather than the range."""
 
 _FRAMES = 3
-"""Number of frames without a plane whose readings are examined."""
+"""Number of frames without a plane whose depths are examined."""
 
 
 def explain_missing_planes(

@@ -39,8 +39,8 @@ _SEGMENT_FRAMES = 2 * GROUP_FRAMES
 class FrameRow:
     """Values of the frames table that a `Perception` lacks.
 
-    ``up_given`` is (3,), a unit vector in the sensor frame, None if planes tell it; ``again`` marks
-    a frame that is perceived for the second time.
+    ``up_given`` is (3,), a unit vector in the sensor frame, None if estimated from planes;
+    ``again`` marks a frame that is perceived for the second time.
     """
 
     log_time_ns: int

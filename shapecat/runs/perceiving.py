@@ -50,7 +50,7 @@ _MOST_HELD = 64
 _Reading = tuple[Frame, ColourView | None]
 """A frame and its colour image; None if it has none."""
 _Oriented = tuple[Frame, ColourView | None, Orientation]
-"""The same, and what the recording tells about the sensor."""
+"""The same, with the up direction and pose of the sensor."""
 
 
 class Work(NamedTuple):

@@ -19,7 +19,7 @@ class _Blocker(MetaPathFinder):
     """
 
     def find_spec(self, fullname: str, *_: Any) -> None:
-        """Raise ModuleNotFoundError for what is blocked; leave other modules to other finders."""
+        """Raise ModuleNotFoundError for blocked modules; leave others to other finders."""
         if fullname == "pandas" or (fullname == _LINEAR_ALGEBRA and _is_importing(_ASKS)):
             msg = f"this process does without {fullname}"
             raise ModuleNotFoundError(msg, name=fullname)

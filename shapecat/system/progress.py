@@ -1,4 +1,4 @@
-"""How long work tells its caller about its progress."""
+"""Progress of long work, reported to the caller."""
 
 from collections.abc import Callable
 

@@ -105,7 +105,7 @@ def find_common_motion(hits: Hits, members: Sequence[I4]) -> CommonMotion | None
 
 
 def _extent(centers: F8) -> float:
-    """Return the diagonal between the 10 % and the 90 % quantiles of centres (k, 3), metres."""
+    """Return the diagonal between the 10th and the 90th percentiles of centres (k, 3), metres."""
     low, high = np.quantile(centers, [0.1, 0.9], axis=0)
     return float(np.linalg.norm(high - low))
 

@@ -119,7 +119,7 @@ def _wholes(hits: Hits, member: I4) -> F8:
 
 
 def _whole(hits: Hits, member: I4) -> F8:
-    """Return the 75 % quantile (3,) of the lengths of whole views, or of all if none is whole."""
+    """Return the 75th percentile (3,) of the lengths of whole views, or of all if none is whole."""
     uncut = member[~hits.partial[member]]
     lengths = sorted_sides(hits.sizes[member if len(uncut) == 0 else uncut])
     return np.asarray(np.quantile(lengths, 0.75, axis=0))

@@ -41,8 +41,8 @@ class Frame(Record):
     stamp_ns : time of the measurement (``header.stamp``).
     log_time_ns : time of the recording.
     frame_id : name of the sensor frame.
-    depth : (h, w) metres along the optical axis; 0 where there is no reading, never NaN.
-    points : (n, 3) metres, sensor frame; rows of NaN where there is no reading.
+    depth : (h, w) metres along the optical axis; 0 where depth is missing, never NaN.
+    points : (n, 3) metres, sensor frame; rows of NaN where depth is missing.
     """
 
     topic: str
@@ -74,7 +74,7 @@ class Frame(Record):
     def xyz(self, indices: U4 | None = None) -> F4:
         """Return the points at ``indices``, by default all: (n, 3) metres, sensor frame.
 
-        Points without a reading are rows of NaN.
+        Points without depth are rows of NaN.
         """
         if self.depth is None or self.camera is None:
             points = self.points if self.points is not None else np.zeros((0, 3), np.float32)

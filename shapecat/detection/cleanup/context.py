@@ -29,8 +29,8 @@ CONTEXT_FEATURES = np.dtype(
 def measure_borders(segments: Segments) -> tuple[I4, F4]:
     """Return the merged segments (r,), and the lengths of the borders between them.
 
-    The lengths (4, r, r), in cells, are of the borders where the two are connected, where the
-    second is behind and in front of the first, and where both are near without being connected.
+    The lengths (4, r, r), in cells, are those of four kinds of border: the two are connected, the
+    second is behind the first, the second is in front of it, and they are near but not connected.
     """
     roots = np.flatnonzero(segments.parent == np.arange(segments.parent.size))[1:]
     both = np.ix_(roots, roots)

@@ -109,7 +109,7 @@ def _count_sides(
 ) -> None:
     """Count the sides of holes by label, (n, labels, 3), and in ``total`` (n,).
 
-    The total includes sides next to cells without a reading. If a hole is not enclosed, the total
+    The total includes sides next to cells without depth. If a hole is not enclosed, the total
     is so large that no label has a sufficient share.
     """
     inv_depth, jump = grid.inverse_depth, grid.discontinuity

@@ -18,7 +18,7 @@ class Outline(NamedTuple):
     sides : all sides.
     table : sides that face the plane.
     known : ``table`` sides, sides next to higher cells, and sides in front of a farther surface.
-    hidden : sides next to a nearer surface or a cell without a reading.
+    hidden : sides next to a nearer surface or a cell without depth.
     rise : sum of the rises of the ``table`` sides, each divided by the minimum mean rise.
     steep : steep sides among the ``table`` sides.
     """

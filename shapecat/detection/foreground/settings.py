@@ -46,7 +46,7 @@ class LowProfileSettings(NamedTuple):
 
 
 class OutlineSettings(NamedTuple):
-    """Thresholds that tell objects from depth error by the sides that `Outline` counts."""
+    """Thresholds that separate objects from depth error by the counts of an `Outline`."""
 
     steep: float = 0.5
     """Minimum rise of a steep side, relative to the minimum mean rise: more than noise."""

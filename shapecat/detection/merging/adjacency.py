@@ -95,7 +95,7 @@ def _count(
 
     The first cells are in row ``row``. ``met`` (n, 6) holds their column; row and column of the
     second; 1 if the second is below the first, 0 if it is to the right; the number of cells without
-    a reading between them; and not 0 if the surface continues.
+    a depth between them; and not 0 if the surface continues.
     """
     inv_depth, jump = grid.inverse_depth, grid.discontinuity
     plane_id, height = heights.plane_id, heights.height

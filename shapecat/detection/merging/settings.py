@@ -17,9 +17,9 @@ class MergingSettings(NamedTuple):
     flat_deg: int = 20
     """Largest concave angle, degrees, of a sample of a segment; others are too near an edge."""
     gap_cells: int = 3
-    """Maximum number of cells without a reading within one surface."""
+    """Maximum number of cells without depth within one surface."""
     shadow_cells: int = 15
-    """Maximum number of cells without a reading between two surfaces: the nearer one shadows the
+    """Maximum number of cells without depth between two surfaces: the nearer one shadows the
     projector."""
     inward_cells: int = 3
     """Distance from a border, in cells, at which the normal of a surface is taken."""

@@ -47,8 +47,8 @@ def label_pixels(depth: F4, grid: DepthGrid, found: Segmentation, *, range_m: fl
 
     Parameters
     ----------
-    depth : (height, width) metres, 0 where there is no reading.
-    range_m : readings farther away have no label, metres.
+    depth : (height, width) metres, 0 where depth is missing.
+    range_m : depths farther away have no label, metres.
     """
     grid_labels = grid_labels_of(grid, found)
     return split_by_label(
@@ -250,12 +250,12 @@ def _mark(
 
 @kernel(inner=True)
 def settle_labels(grid_labels: GridLabels, cells: I4, places: F8, n: int, marks: I4) -> None:
-    """Find the labels of the first ``n`` of m depth readings.
+    """Find the labels of the first ``n`` of m depths.
 
     Parameters
     ----------
-    cells : (2, m) row and column of the cell of each reading.
-    places : (3, m) column and row of each reading in units of cells, and its depth, metres.
+    cells : (2, m) row and column of the cell of each depth.
+    places : (3, m) column and row of each depth in units of cells, and the depth, metres.
     marks : (m,) the labels are written here, 0 where there is none.
     """
     inv_depth, labels, filled = grid_labels.inverse_depth, grid_labels.labels, grid_labels.filled

@@ -163,7 +163,7 @@ def _cut_cloud(grid: DepthGrid, found: Segmentation, sensor_from_view: Pose) -> 
 
 
 def _ends(valid: Bool, last: int) -> tuple[I4, I4]:
-    """Return the first and last row with a reading in each column; each column must have one."""
+    """Return the first and last row with depth in each column; each column must have one."""
     return np.argmax(valid, axis=0), last - np.argmax(valid[::-1], axis=0)
 
 

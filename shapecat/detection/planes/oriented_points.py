@@ -27,7 +27,7 @@ class OrientedPoints(NamedTuple):
     inverse_depth : (rows, columns) float32, 1/m.
     normals : (3, n) float32 unit vectors towards the camera, sensor frame; 0 where the surface is
         not smooth.
-    positions : (3, n) float32, metres, sensor frame; 0 where there is no reading.
+    positions : (3, n) float32, metres, sensor frame; 0 where depth is missing.
     smooth : the number of points on smooth surface.
     """
 

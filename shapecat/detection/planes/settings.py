@@ -121,7 +121,7 @@ class StripSettings(NamedTuple):
 
 
 class AssumedSettings(NamedTuple):
-    """Constants of the plane that is assumed below samples above no visible plane."""
+    """Constants for a plane assumed below samples that no visible plane supports."""
 
     near_m: float = 2.0
     """Depth up to which such samples may be objects that hide their support, metres; farther away

@@ -161,7 +161,7 @@ def _to_edge(
         ahead = seen - 1 / (z + step * tz)
         if seen > 0 and ahead < -2 * PLANES.tolerance:
             return x, y, z
-        if seen <= 0 or ahead > 2 * PLANES.tolerance:  # no reading, or an object on the plane
+        if seen <= 0 or ahead > 2 * PLANES.tolerance:  # no depth, or an object on the plane
             break
         x, y, z = x + step * tx, y + step * ty, z + step * tz
     return 0.0, 0.0, 0.0

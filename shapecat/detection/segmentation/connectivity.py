@@ -106,7 +106,7 @@ def _link(grid: DepthGrid, plane_id: I4, spans: I4, local_plane: F4, links: U1) 
 def _part_steps(grid: DepthGrid, plane_id: I4, i: int, start: int, end: int, links: U1) -> None:
     """Remove links that cross a step and are supported by a local plane only.
 
-    At a step the readings change more from one cell to the next than before and after it. The
+    At a step the depths change more from one cell to the next than before and after it. The
     window of a local plane spans the step and takes it for a slope, so that a plate would be linked
     with the can it stands on. At the edge of a surface seen at a grazing angle, only one side has
     the slope.

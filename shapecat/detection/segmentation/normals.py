@@ -34,13 +34,13 @@ PITCH = RUN + 2 * WINDOW
 def fit_local_planes(grid: DepthGrid, plane_id: I4, spans: I4, local_plane: F4, normal: F4) -> None:
     """Write the local planes and normals of the object cells, as in `SurfaceGraph`.
 
-    A plane is fitted to those of 25 cells, in a checkerboard pattern, that are above the same
-    supporting plane; weights are 0 or 1.
+    Each plane is fitted to up to 25 cells in a checkerboard pattern: those above the same
+    supporting plane have weight 1, the others 0.
 
     Parameters
     ----------
     plane_id : (rows, columns) as in `HeightMap`.
-    spans : (rows, 2) first column of the object cells of each row, and one after the last.
+    spans : (rows, 2) first column of the object cells of each row, and one past the last.
     local_plane, normal : (rows, 3, columns), written in place.
     """
     values = np.zeros(SIDE * PITCH, np.float32)

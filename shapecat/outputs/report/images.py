@@ -41,7 +41,7 @@ _SAME_SURFACE = 0.02
 """Neighbours whose inverse depths differ by less than this share are on the same surface."""
 _NEAR_TONE, _FAR_TONE = np.array([[255, 238, 205], [92, 112, 168]], np.float32)
 _BLANK = 24
-"""Grey level of pixels without a reading."""
+"""Grey level of pixels without depth."""
 _LIGHT = np.array([-0.45, -0.65, -0.62], np.float32)
 """Direction to the light in the optical frame: above, left and towards the camera."""
 
