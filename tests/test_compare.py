@@ -310,6 +310,16 @@ def test_page_has_each_metric_in_its_place(run: Path, truth: Path) -> None:
     assert listed["1", "box taken for can #2"] == ["box", "can", "#2", "0.90", "0.86", ""]
 
 
+@pytest.mark.parametrize(("category", "text"), [("can", "0.99"), ("unknown", "")])
+def test_page_words_confidences_like_the_report(category: str, text: str) -> None:
+    """1.00 would pass for certain, and that of an unknown object is of its likeliest category."""
+    row = Difference("/d", 7, START, "surplus", track=22, category=category, confidence=0.9961)
+    page = format_page(replace(worked(), rows=(row,)))
+    cells = re.findall(r"<td>(.*?)</td>", page.rpartition("<table>")[2])
+
+    assert cells == ["7", f"surplus {category} #22", "", category, "#22", text, "", ""]
+
+
 def worked() -> Comparison:
     """Return a comparison in which no two numbers are equal."""
     head = "/d", 6, START

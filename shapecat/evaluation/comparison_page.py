@@ -15,9 +15,11 @@ from shapecat.evaluation.comparison_matching import Difference
 from shapecat.evaluation.comparison_pictures import COLOURS, Caption, DifferenceImage, words_of
 from shapecat.evaluation.markup import figure_text, html_table
 from shapecat.outputs.counts import plural
+from shapecat.outputs.wording import confidence_text
 from shapecat.runs.table_schemas import FRAME_COLUMNS
 from shapecat.runs.tables import write_table
 from shapecat.system.files import complete_folder
+from shapecat.types import UNKNOWN
 
 __all__ = [
     "OBJECTS",
@@ -184,6 +186,13 @@ def format_page(found: Comparison) -> str:
 _HEAD = ("frame", "difference", "true", "found", "track", "confidence", "overlap F", "box IoU")
 
 
+def _confidence(row: Difference) -> str:
+    """Return the confidence as captions have it: none for an unknown object."""
+    if row.confidence is None or row.category == UNKNOWN:
+        return ""
+    return confidence_text(row.confidence)
+
+
 def _count(rows: Sequence[Difference]) -> str:
     more = f"; the first {_MOST_ROWS} are listed" if len(rows) > _MOST_ROWS else ""
     return f"{plural(len(rows), 'difference')}{more}"
@@ -196,7 +205,7 @@ def _cells(row: Difference) -> tuple[str, ...]:
         row.true_category or "",
         row.category or "",
         "" if row.track is None else f"#{row.track}",
-        "" if row.confidence is None else f"{row.confidence:.2f}",
+        _confidence(row),
         "" if row.f is None else f"{row.f:.2f}",
         "" if row.box_iou is None else f"{row.box_iou:.2f}",
     )
