@@ -37,12 +37,16 @@ def main(words: list[str] | None = None) -> int:
 
 def _parse(words: list[str] | None) -> argparse.Namespace:
     parser = argparse.ArgumentParser("python -m tests.faults", description=__doc__)
-    parser.add_argument("--count", type=int, default=50, help="how many cases")
+    parser.add_argument("--count", type=int, default=50, help="number of cases")
     parser.add_argument("--seed", type=int, default=0, help="the seed of the first case")
     parser.add_argument("--kind", choices=[*KINDS, *GROUPS], default="all")
-    parser.add_argument("--jobs", type=int, choices=[1, 2], help="only scenarios with so many")
-    parser.add_argument("--at-once", type=int, default=2, help="cases at the same time")
-    parser.add_argument("--minutes", type=float, default=15.0, help="begin no case later")
+    parser.add_argument(
+        "--jobs", type=int, choices=[1, 2], help="only scenarios with this number of jobs"
+    )
+    parser.add_argument("--at-once", type=int, default=2, help="number of cases at the same time")
+    parser.add_argument(
+        "--minutes", type=float, default=15.0, help="begin no case after this number of minutes"
+    )
     parser.add_argument("--only", type=int, metavar="SEED", help="one case of --kind")
     return parser.parse_args(words)
 
