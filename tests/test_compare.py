@@ -542,6 +542,22 @@ def test_truth_skips_label_images_of_missing_frames(tmp_path: Path) -> None:
         ]
 
 
+@pytest.mark.parametrize("place", [60, 500])
+def test_damaged_label_images_are_reported_in_one_line(tmp_path: Path, place: int) -> None:
+    """Damaged content has errors of its own, which appear when the file is opened or read."""
+    images = np.random.default_rng(0).integers(0, 9, (4, 30, 40), np.uint8)
+    path = tmp_path / "lab.labels.npz"
+    np.savez_compressed(path, labels=images)
+    content = bytearray(path.read_bytes())
+    content[place : place + 40] = b"\xff" * 40
+    path.write_bytes(content)
+    truth = [{"frame": k, "stamp_ns": START + k, "objects": []} for k in range(4)]
+    (tmp_path / "lab.truth.json").write_text(json.dumps(truth))
+
+    with pytest.raises(RecordingError, match=r"not the labels|damaged at image"):
+        open_reference(tmp_path / "lab.mcap").at(("/d", 3), START + 3)
+
+
 @pytest.mark.parametrize(("side", "depth"), [(30, True), (5, True), (5, False)])
 def test_labels_of_images_with_another_size_are_refused(side: int, depth: bool) -> None:
     """A colour image has other pixels than the depth image: its labels would match nothing."""

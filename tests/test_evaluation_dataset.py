@@ -247,6 +247,9 @@ def damaged_archives() -> dict[str, bytes]:
     np.save(stream, np.zeros((5, 3)))
     found["one array"] = stream.getvalue()
     stream = io.BytesIO()
+    np.savez(stream, allow_pickle=False, points=np.zeros((999, 3)))
+    found["damaged header"] = stream.getvalue().replace(b"}", b" ")
+    stream = io.BytesIO()
     header = {"descr": "<f8", "fortran_order": False, "shape": (10**12, 3)}
     with zipfile.ZipFile(stream, "w") as archive, archive.open("points.npy", "w") as member:
         np.lib.format.write_array_header_1_0(member, header)

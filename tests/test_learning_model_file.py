@@ -162,6 +162,10 @@ def put(name: str, value: object, dtype: str) -> Callable[[dict[str, bytes]], No
     return lambda members: members.update({f"{name}.npy": npy(value, dtype)})
 
 
+def break_header(members: dict[str, bytes]) -> None:
+    members["votes.npy"] = members["votes.npy"].replace(b"}", b" ", 1)
+
+
 _HOSTILE = {
     "newer": (edit_header(version=3), "version 3"),
     "other format": (edit_header(format="x"), "does not say"),
@@ -175,6 +179,7 @@ _HOSTILE = {
     "a category missing": (edit_header(categories=["cup"]), "categories"),
     "a name is no text": (edit_header(categories=["cup", 3]), "wrong type"),
     "an array missing": (lambda m: m.pop("votes.npy"), "no votes"),
+    "an array without header": (break_header, "header of an array is damaged"),
     "of another type": (put("votes", np.zeros((4, 2)), "f8"), "wrong type"),
     "of objects": (put("votes", np.zeros((4, 2)), "c8"), "differs from its header"),
     "a loop": (put("forest.left", [1, 0, 0, 3, 0, 0], "u4"), "damaged"),

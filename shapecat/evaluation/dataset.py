@@ -5,6 +5,7 @@ VIEWPOINT of a PCD file is the position of the sensor.
 """
 
 import lzma
+import tokenize
 import zipfile
 import zlib
 from collections.abc import Callable, Iterator
@@ -17,11 +18,11 @@ from shapecat.arrays import F4, F8, Record, array
 from shapecat.errors import RecordingError
 from shapecat.evaluation.clouds import CloudFile, read_pcd, read_ply
 
-__all__ = ["Dataset", "View", "find_viewpoint", "read_dataset", "read_view"]
+__all__ = ["DAMAGED", "Dataset", "View", "find_viewpoint", "read_dataset", "read_view"]
 
 _FARTHEST_M = 100.0
 _LARGEST_M = 5.0
-_DAMAGED = (
+DAMAGED = (
     OSError,
     ValueError,
     KeyError,
@@ -29,6 +30,8 @@ _DAMAGED = (
     TypeError,  # the content of an .npy file
     MemoryError,  # a header that claims too many points
     RuntimeError,  # encrypted, or an unknown compression
+    SyntaxError,  # the header of an .npy file, as is the next
+    tokenize.TokenError,
     zipfile.BadZipFile,
     zlib.error,
     lzma.LZMAError,
@@ -127,7 +130,7 @@ def _read_npz(path: Path) -> CloudFile:
         with np.load(path, allow_pickle=False) as content:
             points = np.asarray(content["points"], np.float64)
             eye = np.asarray(content["viewpoint"], np.float64) if "viewpoint" in content else None
-    except _DAMAGED as error:
+    except DAMAGED as error:
         msg = f"{path}: not an .npz file with an array `points`: {error}"
         raise RecordingError(msg) from error
     return CloudFile(points, eye)

@@ -11,6 +11,7 @@ import numpy as np
 
 from shapecat.arrays import F8, U1
 from shapecat.errors import OutputError, RecordingError
+from shapecat.evaluation.dataset import DAMAGED
 from shapecat.evaluation.labellings import (
     LabelledItem,
     Labelling,
@@ -137,7 +138,7 @@ class _LabelImages:
             # Closed together with this object, as frames are read until then.
             self._file = zipfile.ZipFile(path).open("labels.npy")  # noqa: SIM115
             self._shape = _image_shape(self._file)
-        except (OSError, ValueError, KeyError, zipfile.BadZipFile) as error:
+        except DAMAGED as error:
             msg = f"{path}: not the labels of a simulated recording ({error})"
             raise RecordingError(msg) from error
 
@@ -153,7 +154,7 @@ class _LabelImages:
         try:
             self._file.seek(self._file.tell() + (index - self._next) * size)
             data = self._file.read(size)
-        except (OSError, ValueError, zipfile.BadZipFile) as error:
+        except DAMAGED as error:
             msg = f"{self._path}: damaged at image {index} ({error})"
             raise RecordingError(msg) from error
         self._next = index + 1

@@ -3,6 +3,7 @@
 import io
 import json
 import math
+import tokenize
 import zipfile
 import zlib
 from collections.abc import Mapping
@@ -175,7 +176,11 @@ def _parse_array(data: bytes) -> np.ndarray:
     if np.lib.format.read_magic(stream) != (1, 0):
         msg = "an array has an unknown version"
         raise _NotAModelError(msg)
-    shape, fortran, dtype = np.lib.format.read_array_header_1_0(stream)
+    try:
+        shape, fortran, dtype = np.lib.format.read_array_header_1_0(stream)
+    except (SyntaxError, tokenize.TokenError) as error:
+        msg = "the header of an array is damaged"
+        raise _NotAModelError(msg) from error
     rest = data[stream.tell() :]
     if fortran or dtype.kind not in "fiu" or math.prod(shape) * dtype.itemsize != len(rest):
         msg = "the size of an array differs from its header"
