@@ -2,6 +2,7 @@
 
 import hashlib
 import json
+import resource
 from dataclasses import replace
 from itertools import pairwise
 from pathlib import Path
@@ -20,10 +21,11 @@ from shapecat.geometry import compose, inverse, rotation_from_quaternion, transf
 from shapecat.simulation import World, make_scene, render_frame, simulate
 from shapecat.simulation.mesh import Mesh
 from shapecat.simulation.presets import IDEAL, KINECT
-from shapecat.simulation.recorder import EPOCH_NS, robot_links
+from shapecat.simulation.recorder import EPOCH_NS, record, robot_links
 from shapecat.simulation.render import geometry, render
 from shapecat.simulation.scans import load_mesh, upright_poses, uprighted
 from shapecat.simulation.scenes import SceneKind
+from shapecat.simulation.sensors import resized
 from shapecat.types import CATEGORIES, Camera, Pose
 
 SETTLED = {"pile", "bin", "shelf_bin", "room"}  # with physics: objects touch and lie in each other
@@ -349,6 +351,21 @@ def test_unwritable_path_raises_output_error(tmp_path: Path) -> None:
 
     with pytest.raises(OutputError, match="cannot write"):
         simulate(tmp_path / "file" / "demo.mcap", frames=1)
+
+
+def test_full_disk_raises_output_error(tmp_path: Path) -> None:
+    """SQLite, which writes ROS 2 recordings, has errors of its own."""
+    world, sensor = make_scene("empty", np.random.default_rng(0), frames=4), resized(KINECT, 0.25)
+    render_frame(world, 0, rng=np.random.default_rng(0), sensor=sensor)  # compiles, which writes
+    before = resource.getrlimit(resource.RLIMIT_FSIZE)
+    resource.setrlimit(resource.RLIMIT_FSIZE, (20_000, before[1]))
+    try:
+        with pytest.raises(OutputError, match="cannot write the recording"):
+            record(world, tmp_path / "a", format="ros2", seed=0, sensor=sensor)
+    finally:
+        resource.setrlimit(resource.RLIMIT_FSIZE, before)
+
+    assert list(tmp_path.iterdir()) == []
 
 
 # --- scanned meshes ------------------------------------------------------------------------------

@@ -1,6 +1,7 @@
 """Simulated recordings with ground truth."""
 
 import json
+import sqlite3
 import tempfile
 import zipfile
 from contextlib import ExitStack
@@ -149,8 +150,9 @@ def record(
                 _move(Path(hidden) / path.name, path)
             for path in written_paths(out, format, color=True)[len(paths) :]:
                 path.unlink(missing_ok=True)  # colour labels of another scene
-    except OSError as error:
-        msg = f"{out}: cannot write the recording: {error.strerror or error}"
+    except (OSError, sqlite3.Error) as error:
+        reason = getattr(error, "strerror", None) or error
+        msg = f"{out}: cannot write the recording: {reason}"
         raise OutputError(msg) from error
     return out
 
