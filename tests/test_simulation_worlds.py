@@ -368,6 +368,15 @@ def test_full_disk_raises_output_error(tmp_path: Path) -> None:
     assert list(tmp_path.iterdir()) == []
 
 
+@pytest.mark.parametrize("odd", [{"frames": 0}, {"rate_hz": 0.0}, {"rate_hz": float("nan")}])
+def test_recordings_without_frames_or_rate_are_refused(tmp_path: Path, odd: dict[str, Any]) -> None:
+    """Without frames, an empty recording would replace another one."""
+    with pytest.raises(ValueError, match="expected at least 1 frame and a positive rate"):
+        simulate(tmp_path / "a.mcap", scene="empty", **{"frames": 1} | odd)
+
+    assert list(tmp_path.iterdir()) == []
+
+
 # --- scanned meshes ------------------------------------------------------------------------------
 
 

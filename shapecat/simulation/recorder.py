@@ -1,6 +1,7 @@
 """Simulated recordings with ground truth."""
 
 import json
+import math
 import sqlite3
 import tempfile
 import zipfile
@@ -76,11 +77,15 @@ def simulate(
 
     Raises
     ------
-    ValueError : the scene, format or sensor does not exist.
+    ValueError : the scene, format or sensor does not exist, there is no frame, or the rate is not
+        positive.
     OutputError : the recording cannot be written.
     """
     if sensor not in SENSORS:
         msg = f"no sensor {sensor!r}; known: {', '.join(SENSORS)}"
+        raise ValueError(msg)
+    if frames < 1 or not 0 < rate_hz < math.inf:
+        msg = f"expected at least 1 frame and a positive rate, got {frames} at {rate_hz} Hz"
         raise ValueError(msg)
     world = make_scene(scene, np.random.default_rng(seed), frames=frames, rate_hz=rate_hz)
     return record(
