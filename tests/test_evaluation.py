@@ -448,7 +448,7 @@ TABLES = [
     [["distance", "views", "accuracy"], ["0-0.8 m", "11", "0.500"], ["0.8-1.1 m", "44", "0.875"]],
     [["elevation", "views", "accuracy"], ["below 15°", "17", "0.125"]],
     [["points", "views", "accuracy"], ["0-60", "13", "0.250"]],
-    [["views fused", "objects", "accuracy", "calibration error"], ["3", "19", "0.888", "0.112"]],
+    [["views fused", "groups", "accuracy", "calibration error"], ["3", "19", "0.888", "0.112"]],
     [
         ["classifier", "training views", "accuracy", "balanced", "calibration error"],
         ["forest", "140", "0.666", "0.554"],

@@ -285,7 +285,7 @@ def comparison_tables(report: Report, missing: str = "–") -> list[tuple[str, R
     text = partial(figure_text, missing=missing)
     tables: list[tuple[str, Row, Rows]] = []
     if report.fused:
-        head: Row = ("views fused", "objects", "accuracy", "calibration error")
+        head: Row = ("views fused", "groups", "accuracy", "calibration error")
         rows: Rows = [
             (str(one.views), str(one.groups), text(one.accuracy), text(one.ece))
             for one in report.fused
