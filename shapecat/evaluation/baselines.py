@@ -60,11 +60,12 @@ def compare_learners(
     if any(len(_known(part.labels)) < 2 for part, _ in splits):
         msg = f"{root}: training needs at least two categories"
         raise RecordingError(msg)
-    learners = _learners()
+    learners, labels = _learners(), splits[0][0].labels
     rows = []
     for k, (name, learner) in enumerate(learners.items(), start=1):
         truth, posteriors = _judged(learner, splits, categories)
-        rows.append(_compared(name, len(splits[0][0].labels), truth, posteriors))
+        learned = labels if learner is _chain else labels[labels != UNKNOWN]
+        rows.append(_compared(name, len(learned), truth, posteriors))
         observe("baselines", k, len(learners))
     return tuple(rows)
 
