@@ -54,6 +54,9 @@ def evaluate(
     from shapecat.system.files import require_writable
 
     if page is not None:
+        if page.suffix.lower() not in {".html", ".htm", ".md"}:
+            msg = f"--report {page}: name it .html or .md"
+            raise click.UsageError(msg)
         require_writable(page)
     with progress_bars() as bars:
         report = evaluate_folder(dataset, model, baselines=baselines, observe=bars)

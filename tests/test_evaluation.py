@@ -617,6 +617,18 @@ def test_command_writes_the_page(
     assert "data: 8 views" in page.read_text("utf-8")
 
 
+def test_reports_of_other_formats_are_refused(tmp_path: Path) -> None:
+    """HTML under the name of a PDF opens nowhere, and would replace a model."""
+    page = tmp_path / "mine.npz"
+    page.write_text("a model")
+    command = import_module("shapecat.cli.evaluate").evaluate
+    result = CliRunner().invoke(command, [str(tmp_path), "--report", str(page)])
+
+    assert result.exit_code == 2
+    assert "name it .html or .md" in result.output
+    assert page.read_text() == "a model"
+
+
 @pytest.fixture(scope="module")
 def compared(
     trained: Path,
