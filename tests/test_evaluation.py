@@ -8,6 +8,7 @@ from importlib import import_module
 from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
+from urllib.parse import unquote
 from xml.etree import ElementTree as ET
 
 import numpy as np
@@ -589,12 +590,13 @@ def test_markdown_page_has_its_pictures_beside_it(trained: Path, tmp_path: Path)
     dataset = write_dataset(tmp_path / "data", ("box", "ball"), instances=2)
     report = evaluate_folder(dataset, trained)
     changed = replace(report, recall={"a|b": 1.0}, fused=(Fused(3, 4, 1.0, 0.25),))
-    write_page(tmp_path / "out" / "all.md", changed, title="all")
-    page = (tmp_path / "out" / "all.md").read_text("utf-8")
+    write_page(tmp_path / "out" / "all (2).md", changed, title="all")
+    page = (tmp_path / "out" / "all (2).md").read_text("utf-8")
 
-    pictures = re.findall(r"!\[[\w ]+\]\((.*?)\)", page)
+    # Spaces and brackets would end the link.
+    pictures = re.findall(r"!\[[\w ]+\]\(([\w%.]+)\)", page)
     for name in pictures:
-        ET.parse(tmp_path / "out" / name)  # noqa: S314  we wrote it
+        ET.parse(tmp_path / "out" / unquote(name))  # noqa: S314  we wrote it
     assert page.count("![") == len(pictures) == 5
     assert "recall of a\\|b" in page
     assert "| 3 | 4 | 1.000 | 0.250 |" in page

@@ -3,6 +3,7 @@
 from collections.abc import Mapping, Sequence
 from html import escape
 from pathlib import Path
+from urllib.parse import quote
 
 from shapecat.errors import OutputError, explained
 from shapecat.evaluation.markup import figure_text, html_table
@@ -96,6 +97,7 @@ def format_page(report: Report, *, title: str) -> str:
 
 def format_markdown(report: Report, *, title: str, pictures: Mapping[str, str]) -> str:
     """Return an evaluation as Markdown; ``pictures`` are the pictures' file names, by name."""
+    pictures = {name: quote(file) for name, file in pictures.items()}
     parts = [
         f"# {_plain(title)}",
         _markdown(("", ""), _figures(report)),
