@@ -461,6 +461,16 @@ def test_page_shows_all_content_in_its_place() -> None:
     ) == 2  # fmt: skip
 
 
+def test_page_names_the_topics_if_there_are_several() -> None:
+    """Both cameras have a frame 9."""
+    found = worked()
+    rows = (*found.rows, found.rows[-1]._replace(topic="/e"))
+    page = format_page(replace(found, rows=rows))
+
+    assert "<td>/d 9</td>" in page
+    assert "<td>/e 9</td>" in page
+
+
 def test_table_has_each_number_in_its_column(tmp_path: Path) -> None:
     """Other programs read the table by its column names."""
     found = worked()

@@ -156,7 +156,8 @@ def _percent(share: float | None) -> str:
 def format_page(found: Comparison) -> str:
     """Return a comparison as an HTML page with embedded pictures."""
     differing = [row for row in found.rows if row.difference]
-    rows = [_cells(row) for row in differing[:_MOST_ROWS]]
+    several = len({row.topic for row in found.rows}) > 1
+    rows = [_cells(row, with_topic=several) for row in differing[:_MOST_ROWS]]
     return _PAGE.substitute(
         title=escape(f"{Path(found.run).name} compared with {Path(found.reference).name}"),
         subtitle=escape(f"{found.run} · {found.reference} ({found.kind})"),
@@ -198,9 +199,9 @@ def _count(rows: Sequence[Difference]) -> str:
     return f"{plural(len(rows), 'difference')}{more}"
 
 
-def _cells(row: Difference) -> tuple[str, ...]:
+def _cells(row: Difference, *, with_topic: bool) -> tuple[str, ...]:
     return (
-        str(row.frame),
+        f"{row.topic} {row.frame}" if with_topic else str(row.frame),
         words_of(row),
         row.true_category or "",
         row.category or "",
