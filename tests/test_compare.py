@@ -1115,6 +1115,8 @@ def test_errors_are_one_line_with_reason_and_exit_code(
     (half / "tracks.csv").unlink()
     later = write_run(tmp_path / "later", digest="two", shift_ns=STEP // 2)
     (tmp_path / "odd.json").write_text('{"images": []}')
+    coco = {"categories": [], "annotations": [], "images": [{"id": 1, "stamp_ns": START}]}
+    (tmp_path / "no_size.json").write_text(json.dumps(coco))
     (tmp_path / "bad").mkdir()
     broken = write_truth(tmp_path / "bad")
     broken.with_name("lab.labels.npz").write_bytes(b"PK")
@@ -1127,6 +1129,7 @@ def test_errors_are_one_line_with_reason_and_exit_code(
         ((run, tmp_path / "none.json"), 3, "nothing to compare with"),
         ((run, tmp_path / "odd.json"), 3, "lacks 'categories'"),
         ((run, broken), 3, "not the labels of a simulated recording"),
+        ((run, tmp_path / "no_size.json"), 3, "COCO labels (it lacks 'height')"),
         ((run, truth, "--recording", tmp_path / "no.mcap"), 3, "no.mcap"),
     ):
         assert refused(shapecat, *words)[0] == code, words

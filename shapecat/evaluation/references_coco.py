@@ -4,7 +4,7 @@ import re
 from collections import defaultdict
 from collections.abc import Mapping, Sequence
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 
@@ -28,6 +28,14 @@ _A_STAMP = 10**17
 of which the longest, with milliseconds, have 17 digits."""
 
 
+class _Image(NamedTuple):
+    """An image of a COCO file, with its size in pixels."""
+
+    id: Any
+    height: int
+    width: int
+
+
 class CocoLabels(Reference):
     """Masks of a COCO file, as polygons or run lengths.
 
@@ -46,7 +54,8 @@ class CocoLabels(Reference):
         for item in content["annotations"]:
             self._labels[item["image_id"]].append({**item, "name": names[item["category_id"]]})
         images = _images_of(run, path, content["images"])
-        self._images = index_frames(path, ((_place_of(image), image) for image in images))
+        sized = (_Image(image["id"], int(image["height"]), int(image["width"])) for image in images)
+        self._images = index_frames(path, zip(map(_place_of, images), sized, strict=True))
         self.frames = len(images)
         items = [item for some in self._labels.values() for item in some]
         self.tracked = bool(items) and all(_track_of(item) is not None for item in items)
@@ -61,11 +70,11 @@ class CocoLabels(Reference):
         image = find_frame(self._images, key, stamp_ns, repeated=repeated)
         if image is None:
             return None
-        height, width = int(image["height"]), int(image["width"])
+        name, height, width = image
         if not 0 < height * width <= _MOST_PIXELS:
-            msg = f"{self._path}: image {image['id']} is {width}×{height}"
+            msg = f"{self._path}: image {name} is {width}×{height}"
             raise RecordingError(msg)
-        items = (self._item(item, height, width) for item in self._labels[image["id"]])
+        items = (self._item(item, height, width) for item in self._labels[name])
         return Labelling(tuple(items), None, (height, width))
 
     def _item(self, item: Mapping[str, Any], height: int, width: int) -> LabelledItem:
