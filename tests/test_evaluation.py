@@ -467,8 +467,7 @@ def test_printed_report_has_each_number_under_its_name() -> None:
     assert first == "57 views, model m-7; skipped 4 without a surface"
     assert cells[:split] == [*map(list, FIGURES.items()), ["ms per object", "34.500"]]
     head = next(k for k, row in enumerate(cells) if row[-1] == "recall")
-    text = " ".join(word for row in cells[split:head] for word in row)
-    assert text == "rows: true category; columns: predicted category"
+    assert cells[split:head] == [["rows: true category; columns: predicted category"]]
     assert cells[head : head + 4] == [
         ["cup", "can", "box", "recall"],
         ["cup", "12", "5", "1", "0.667"],

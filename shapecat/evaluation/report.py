@@ -232,19 +232,19 @@ def format_report(report: Report) -> str:
     console = Console(file=stream, width=_WIDEST, highlight=False, markup=False, emoji=False)
     skipped = f"; skipped {report.skipped} without a surface" if report.skipped else ""
     console.print(f"{plural(report.n, 'view')}, model {report.model}{skipped}")
-    console.print(_grid(None, ("", ""), _figures(report)))
-    head = ("", *report.categories, "recall")
-    title = "\nrows: true category; columns: predicted category"
-    console.print(_grid(title, head, _confusion(report)))
+    console.print(_grid(("", ""), _figures(report)))
+    # As the title of the table, it would be wrapped to the table's width.
+    console.print("\nrows: true category; columns: predicted category")
+    console.print(_grid(("", *report.categories, "recall"), _confusion(report)))
     tables = [breakdown_table(name, ranges) for name, ranges in report.breakdowns]
     tables += [(head, rows) for _, head, rows in comparison_tables(report, "-")]
     for head, rows in tables:
-        console.print(_grid(None, [f"\n{name}" for name in head], rows))
+        console.print(_grid([f"\n{name}" for name in head], rows))
     return "\n".join(line.rstrip() for line in stream.getvalue().splitlines())
 
 
-def _grid(title: str | None, head: Iterable[str], rows: Rows) -> Table:
-    table = Table(title=title, title_justify="left", box=None, pad_edge=False, padding=(0, 2, 0, 0))
+def _grid(head: Iterable[str], rows: Rows) -> Table:
+    table = Table(box=None, pad_edge=False, padding=(0, 2, 0, 0))
     for k, name in enumerate(head):
         table.add_column(name, justify="left" if k == 0 else "right", no_wrap=True)
     for row in rows:
