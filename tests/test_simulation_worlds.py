@@ -346,6 +346,20 @@ def test_older_recording_is_replaced(tmp_path: Path) -> None:
     assert not [p for p in tmp_path.iterdir() if p.name.startswith(".")]
 
 
+def test_foreign_folder_is_refused_before_the_first_frame(tmp_path: Path) -> None:
+    """A long simulation must not end with an error that was certain from the beginning."""
+    (tmp_path / "bag").mkdir()
+    (tmp_path / "bag" / "thesis.txt").write_text("mine")
+    seen: list[int] = []
+
+    with pytest.raises(OutputError, match="not a recording"):
+        simulate(
+            tmp_path / "bag", format="ros2", scene="empty", frames=1,
+            observe=lambda _, done, __: seen.append(done),
+        )  # fmt: skip
+    assert seen == []
+
+
 def test_unwritable_path_raises_output_error(tmp_path: Path) -> None:
     (tmp_path / "file").write_text("")
 

@@ -129,6 +129,7 @@ def record(
     paths = written_paths(out, format, color=color)
     out = paths[0]
     try:
+        _require_replaceable(out)
         out.parent.mkdir(parents=True, exist_ok=True)
         with tempfile.TemporaryDirectory(dir=out.parent, prefix=".simulated-") as hidden:
             recording, truth, *labels = (Path(hidden) / path.name for path in paths)
@@ -243,20 +244,30 @@ def written_paths(out: Path, format: str, *, color: bool = False) -> list[Path]:
     return [out.with_name(name) for name in names]
 
 
-def _move(made: Path, path: Path) -> None:
-    """Move a finished file or folder to its path, replacing a file or a recorded folder.
+def _require_replaceable(path: Path) -> list[Path]:
+    """Return the files of a folder that a recording may replace; none if it is no folder.
 
     Raises
     ------
     OutputError : the path is a folder that holds anything but a ROS 2 bag.
     """
+    files = list(path.iterdir()) if path.is_dir() and not path.is_symlink() else []
+    if any(file.name != "metadata.yaml" and file.suffix != ".db3" for file in files):
+        msg = f"{path}: a folder that is not a recording; choose another name"
+        raise OutputError(msg)
+    return files
+
+
+def _move(made: Path, path: Path) -> None:
+    """Move a finished file or folder to its path, replacing a file or a recorded folder.
+
+    Raises
+    ------
+    OutputError : as for `_require_replaceable`.
+    """
+    for file in _require_replaceable(path):
+        file.unlink()
     if path.is_dir() and not path.is_symlink():
-        files = list(path.iterdir())
-        if any(file.name != "metadata.yaml" and file.suffix != ".db3" for file in files):
-            msg = f"{path}: a folder that is not a recording; choose another name"
-            raise OutputError(msg)
-        for file in files:
-            file.unlink()
         path.rmdir()
     flush(made)
     made.replace(path)
