@@ -270,30 +270,33 @@ def test_lidar_looks_along_its_x_axis(up: Any, forward: Any) -> None:
     assert rotation[0] @ np.array([0, -1, 0]) > 0.9  # x is right
 
 
-def test_crops_of_two_cameras_do_not_replace_each_other(tmp_path: Path) -> None:
-    """The frames of each topic are numbered from 0."""
-    topics = ["/left/depth", "/right/depth"]
-    run: dict[str, Any] = {
-        "input": {"digest": "xxh3-128:0123456789"},
-        "options": {"topics": topics},
-    }
-    lab: Any = SimpleNamespace(name="lab", run=run)
+def crops_run(*topics: str) -> Any:
+    run = {"input": {"digest": "xxh3-128:0123456789"}, "options": {"topics": list(topics)}}
+    return SimpleNamespace(name="lab", run=run)
+
+
+def crops_frames(*topics: str) -> list[Any]:
     one = labelled(cut=False, hidden=False)
-    frames = [(replace(one, topic=topic), replace(frame(), topic=topic), None) for topic in topics]
+    return [(replace(one, topic=topic), replace(frame(), topic=topic), None) for topic in topics]
 
-    assert write_crops(tmp_path, frames, lab) == 2
-    (instance,) = tmp_path.glob("*/*")
-    assert instance.relative_to(tmp_path) == Path("bowl/lab.01234567.track-4")
-    assert len(list(instance.iterdir())) == 2
 
-    run["options"]["topics"] = topics = ["/a/depth", "/a_depth"]  # names of files do not differ
-    frames = [(replace(one, topic=topic), replace(frame(), topic=topic), None) for topic in topics]
-    assert write_crops(tmp_path, frames, lab) == 2
-    assert len(list(instance.iterdir())) == 2
+@pytest.mark.parametrize("topics", [("/left/depth", "/right/depth"), ("/a/depth", "/a_depth")])
+def test_crops_of_two_cameras_do_not_replace_each_other(tmp_path: Path, topics: Any) -> None:
+    """The frames of each topic are numbered from 0; names of files may not differ."""
+    for _ in range(2):  # the second export replaces the first
+        assert write_crops(tmp_path, crops_frames(*topics), crops_run(*topics)) == 2
+        (instance,) = tmp_path.glob("*/*")
+        assert re.fullmatch(r"lab\.[0-9a-f]{8}\.track-4", instance.name)
+        assert instance.parent.name == "bowl"
+        assert len(list(instance.iterdir())) == 2
 
-    run["options"]["topics"] = topics[:1]
-    assert write_crops(tmp_path, frames[:1], lab) == 1
-    assert [path.name for path in tmp_path.glob("*/*/*")] == ["000000.pcd"]
+
+def test_crops_of_runs_of_two_cameras_do_not_replace_each_other(tmp_path: Path) -> None:
+    """Two runs of one recording, one for each camera, may have the same name."""
+    for topic in ("/left/depth", "/right/depth"):
+        assert write_crops(tmp_path, crops_frames(topic), crops_run(topic)) == 1
+
+    assert [path.name for path in tmp_path.glob("*/*/*")] == ["000000.pcd"] * 2
 
 
 def dataset_image() -> DatasetImage:

@@ -10,6 +10,8 @@ from collections.abc import Iterable
 from contextlib import suppress
 from pathlib import Path
 
+import xxhash
+
 from shapecat.errors import OutputError, explained
 from shapecat.outputs.colouring import ExportedFrame
 from shapecat.outputs.level_clouds import upright_cloud, write_pcd
@@ -22,8 +24,8 @@ __all__ = ["crops_prefix", "write_crops"]
 def write_crops(out: Path, frames: Iterable[ExportedFrame], finished: FinishedRun) -> int:
     """Add the views of a run to a data set; return their number.
 
-    Earlier views of the same recording are replaced, so that none keeps an outdated label. Deleted
-    tracks are left out; ``unknown`` is a category like any other.
+    Earlier views of the same topics of the recording are replaced, so that none keeps an outdated
+    label. Deleted tracks are left out; ``unknown`` is a category like any other.
 
     Raises
     ------
@@ -58,12 +60,13 @@ def write_crops(out: Path, frames: Iterable[ExportedFrame], finished: FinishedRu
 
 
 def crops_prefix(finished: FinishedRun) -> str:
-    """Return how the names of the views of a run begin; those of the same recording are equal.
+    """Return how the names of the views of a run begin.
 
-    The digest distinguishes recordings that have the same name.
+    A digest distinguishes runs of the same name: of other recordings, or of other topics.
     """
-    digest = finished.run["input"]["digest"].rpartition(":")[2]
-    return f"{safe_name(finished.name)}.{digest[:8]}"
+    run = finished.run
+    source = "\0".join([run["input"]["digest"], *sorted(run["options"]["topics"])])
+    return f"{safe_name(finished.name)}.{xxhash.xxh3_64_hexdigest(source.encode())[:8]}"
 
 
 def _replace(out: Path, prefix: str, hidden: Path) -> None:
