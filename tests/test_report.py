@@ -512,6 +512,25 @@ def test_new_page_keeps_corrections_not_downloaded(
     assert browser.complaints() == []
 
 
+def test_two_tabs_keep_corrections_of_both(browser: Browser, reported_run: Path) -> None:
+    """The last tab replaced what the other had kept, which was lost when both were closed."""
+    page = reported_run / "report.html"
+    a, b, c = (row.track for row in read_track_table(reported_run / "tracks.csv").rows[:3])
+    open_anew(browser, page)
+    browser.click(f"#track-{c} button[data-label='delete']")
+    one, two = browser.tabs()[0], browser.tab()
+    browser.turn_to(two)
+    browser.open(page)
+    browser.turn_to(one)
+    browser.click(f"#track-{a} button[data-label='delete']")
+    browser.turn_to(two)
+    browser.click(f"#track-{b} button[data-label='delete']")
+    browser.click(f"#track-{c} button[data-label='delete']")  # clears it
+    browser.open(page)
+
+    assert changes(browser) == {a: "→ delete", b: "→ delete"}
+
+
 def test_new_name_has_its_key_after_reload(browser: Browser, reported_run: Path) -> None:
     """It was listed nowhere, so the next object had to be named again."""
     page = reported_run / "report.html"

@@ -5,23 +5,27 @@ const sending = new Set();
 let lost = "", before = Promise.resolve();
 
 function save(track) {
-  if (data.served) send(track); else keep();
+  if (data.served) send(track); else keep(track);
 }
 
-// Keep each correction with the label that it replaces.
-function keep() {
+// Keep a correction with the label that it replaces, besides those of other tabs.
+function keep(track) {
   try {
-    const kept = Object.fromEntries(unsaved().map((track) => [track, [labels.get(track), onDisk.get(track)]]));
-    localStorage.setItem(storage, JSON.stringify(kept));
+    const all = kept(), [label, seen] = [labels.get(track), onDisk.get(track)];
+    if (label === seen) delete all[track]; else all[track] = [label, seen];
+    localStorage.setItem(storage, JSON.stringify(all));
   } catch { /* a browser that keeps nothing for files still downloads */ }
 }
 
-// Restore the corrections that were not downloaded, except of labels that have changed since.
+// The corrections that were not downloaded, except of labels that have changed since.
+function kept() {
+  const all = Object.entries(JSON.parse(localStorage.getItem(storage) || "{}"));
+  return Object.fromEntries(all.filter(([track, [, seen]]) => onDisk.get(track) === seen));
+}
+
 function recall() {
   try {
-    const kept = JSON.parse(localStorage.getItem(storage) || "{}");
-    for (const [track, [label, seen]] of Object.entries(kept)) {
-      if (onDisk.get(track) !== seen) continue;
+    for (const [track, [label]] of Object.entries(kept())) {
       labels.set(track, label);
       learn(label);
     }
