@@ -731,6 +731,30 @@ def test_filters_select_cards(browser: Browser, reported_run: Path) -> None:
     assert browser.complaints() == []
 
 
+def test_keys_label_no_hidden_card(browser: Browser, reported_run: Path) -> None:
+    """The current card stayed current when a filter hid it, and got the label unseen."""
+    open_anew(browser, reported_run / "report.html")
+    rows = read_track_table(reported_run / "tracks.csv").rows
+    shown = next(row.track for row in rows if row.category != rows[0].category)
+    browser.click(f".chip[data-category='{rows[0].category}']")
+    browser.run("document.activeElement.blur()")
+    browser.press("d")
+    assert changes(browser) == {shown: "→ delete"}
+
+    for row in rows:
+        browser.run(
+            f"const chip = document.querySelector(\".chip[data-category='{row.category}']\");"
+            "if (chip.getAttribute('aria-pressed') === 'true') chip.click()"
+        )
+    browser.press("Backspace")
+    assert changes(browser) == {shown: "→ delete"}
+    browser.click(f".chip[data-category='{rows[0].category}']")
+    browser.run("document.activeElement.blur()")
+    browser.press("d")
+    assert changes(browser) == {shown: "→ delete", rows[0].track: "→ delete"}
+    assert browser.complaints() == []
+
+
 @pytest.mark.parametrize("theme", ["light", "dark"])
 def test_text_is_readable_in_both_themes(browser: Browser, reported_run: Path, theme: str) -> None:
     """WCAG AA asks for a contrast of at least 4.5."""

@@ -65,6 +65,8 @@ function filter() {
   }
   byId("shown").textContent = `${count} of ${cards.length} ${cards.length === 1 ? "track" : "tracks"}`;
   byId("empty").hidden = count > 0;
+  // Keys act on the current card, which must be in sight.
+  if (!current || current.hidden) makeCurrent([...gallery.children].find((card) => !card.hidden));
 }
 
 function order() {

@@ -88,7 +88,4 @@ showDigits();
 filter();
 summarize();
 showSaved();
-if (cards.length) {
-  makeCurrent(cards[0]);
-  if (!location.hash) cards[0].focus({ preventScroll: true });
-}
+if (current && !location.hash) current.focus({ preventScroll: true });
