@@ -221,7 +221,7 @@ def annotate(folder: Path, recording: Recording, run: RunInfo, observe: Observer
         from shapecat.outputs.image_annotations import read_image_frames  # noqa: PLC0415  the same
         from shapecat.runs.shown import read_shown_frames  # noqa: PLC0415  the same
 
-        images = read_image_frames(folder, labels()) if run.get("color") else None
+        topics = list(dict.fromkeys(run.get("color", {}).values()))
         boxes = run.get("boxes") or settings.get("boxes", "full")
         shown = read_shown_frames(folder, labels(), visible=boxes == "visible")
         write_annotated(
@@ -230,7 +230,8 @@ def annotate(folder: Path, recording: Recording, run: RunInfo, observe: Observer
             _observed(shown, "annotate", total, observe),
             run=run,
             markers=settings["markers"],
-            images=images,
+            images=read_image_frames(folder, labels()) if topics else (),
+            image_topics=topics,
         )
 
     def write_rrd() -> None:

@@ -18,7 +18,7 @@ from shapecat.outputs.annotated_mcap import write_annotated
 from shapecat.outputs.annotation import Annotation, AnnotationChannel, text_position
 from shapecat.outputs.annotations import encoder_for
 from shapecat.outputs.colours import colour_of
-from shapecat.outputs.image_annotations import ImageBox, ImageFrame, image_encoder_for
+from shapecat.outputs.image_annotations import ImageBox, ImageFrame, image_encoders_for
 from shapecat.outputs.review_shapes import _above
 from shapecat.outputs.ros_annotations import RosMessages
 from shapecat.recordings import open_recording
@@ -285,12 +285,12 @@ def test_object_visible_to_another_sensor_is_not_deleted(tmp_path: Path) -> None
 
 
 IMAGE_BOX = ImageBox(7, "bowl", 0.625, (31, 44, 120, 66))
-IMAGE = ImageFrame(STAMP, STAMP + 3, "colour", (IMAGE_BOX,))
+IMAGE = ImageFrame("/color", STAMP, STAMP + 3, "colour", (IMAGE_BOX,))
 
 
 def image_messages(encoding: str) -> dict[str, Any]:
     """Return the annotations of an image by topic."""
-    encoders = image_encoder_for(encoding)
+    encoders = image_encoders_for(encoding, ["/color"])["/color"]
     return {channel.topic: read_back(channel, make(IMAGE)) for channel, make in encoders}
 
 
@@ -309,6 +309,28 @@ def test_image_annotations_are_equal_in_every_encoding(encoding: str) -> None:
     assert_allclose(numbers(text.background_color, "rgb"), np.array(colour) / 255, atol=1e-6)
     assert (text.position.x, text.position.y) == corners[0]
     assert "bowl" in text.text
+
+
+def test_each_of_several_cameras_has_its_annotations(tmp_path: Path) -> None:
+    """Viewers draw all messages of a channel on an image: also the boxes of other cameras."""
+    images = [
+        ImageFrame(topic, STAMP, STAMP + k, "colour", (IMAGE_BOX,) * boxes)
+        for k, (topic, boxes) in enumerate([("/l/rgb", 1), ("r/rgb", 2), ("/l/rgb", 3)])
+    ]
+    target, topics = tmp_path / "out.mcap", ["/l/rgb", "r/rgb"]
+    with open_recording(write_mcap(tmp_path / "a.mcap")) as recording:
+        write_annotated(recording, target, [], run={}, images=iter(images), image_topics=topics)
+    found: dict[str, list[int]] = {}
+    with target.open("rb") as file:
+        reader = make_reader(file, decoder_factories=[DecoderFactory()])
+        for _, channel, _, message in reader.iter_decoded_messages():
+            boxes = getattr(message, "points", None) or getattr(message, "detections", [])
+            found.setdefault(channel.topic, []).append(len(boxes))
+    del found["/points"]
+
+    kinds = ("/shapecat/image_annotations", "/shapecat/detections_2d")
+    expected = {"/l/rgb": [1, 3], "/r/rgb": [2]}
+    assert found == {kind + topic: boxes for kind in kinds for topic, boxes in expected.items()}
 
 
 @pytest.mark.parametrize("encoding", ["cdr", "ros1"])

@@ -26,7 +26,7 @@ from shapecat.outputs.colouring import Coloured, with_colour
 from shapecat.outputs.image_annotations import (
     ImageBox,
     ImageFrame,
-    image_encoder_for,
+    image_encoders_for,
     read_image_frames,
 )
 from shapecat.outputs.review import write_review
@@ -257,6 +257,7 @@ def test_run_json_names_colour_topic(run: Path) -> None:
 
 
 DRAWING = ImageFrame(
+    "/c",
     1_700_000_000_123_456_789,
     5,
     "optical",
@@ -266,11 +267,11 @@ DRAWING = ImageFrame(
 
 def test_annotations_in_json_and_protobuf_are_equal() -> None:
     """Read back with the embedded schema, as Foxglove does."""
-    ((as_json, encode),) = image_encoder_for("json")
+    ((as_json, encode),) = image_encoders_for("json", ["/c"])["/c"]
     plain = json.loads(encode(DRAWING))
     validate: Any = import_module("jsonschema").validate
     validate(plain, json.loads(as_json.schema))
-    ((packed, pack),) = image_encoder_for("protobuf")
+    ((packed, pack),) = image_encoders_for("protobuf", ["/c"])["/c"]
     decode = message_decoder(packed.schema, packed.schema_name)
     message = decode(pack(DRAWING))
 

@@ -7,7 +7,7 @@ MCAP. Annotations use the encoding of the source.
 import gc
 import json
 from collections import Counter
-from collections.abc import Iterable, Iterator, Mapping
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import contextmanager
 from heapq import merge
@@ -18,7 +18,7 @@ from typing import BinaryIO, TypeVar
 
 from shapecat.outputs.annotation import Annotation, AnnotationChannel, EncodedMessage, Encoders
 from shapecat.outputs.annotations import ENCODERS, encoder_for
-from shapecat.outputs.image_annotations import ImageFrame, image_encoder_for
+from shapecat.outputs.image_annotations import ImageFrame, image_encoders_for
 from shapecat.outputs.mcap_append import Appender, copy_bytes
 from shapecat.recordings import Recording
 from shapecat.recordings.mcap_file import McapRecording
@@ -46,7 +46,8 @@ def write_annotated(
     *,
     run: Mapping[str, object],
     markers: bool = False,
-    images: Iterable[ImageFrame] | None = None,
+    images: Iterable[ImageFrame] = (),
+    image_topics: Sequence[str] = (),
 ) -> None:
     """Write a copy of a recording with annotation channels.
 
@@ -61,7 +62,9 @@ def write_annotated(
     markers : whether to write ``/shapecat/markers`` for RViz, for ROS only.
     images : the boxes to show on the colour images, in the order of the recording, for
         ``/shapecat/image_annotations`` and, for ROS, ``/shapecat/detections_2d``, with the stamp,
-        frame id and log time of the image; None to write neither.
+        frame id and log time of the image.
+    image_topics : the topics of these images. If there are several, each has channels of its own:
+        ``/shapecat/image_annotations/TOPIC``.
 
     Raises
     ------
@@ -71,12 +74,12 @@ def write_annotated(
     with _uncollected(), replacing(path) as hidden, hidden.open("wb", buffering=_BUFFER) as file:
         if isinstance(recording, McapRecording) and recording.indexed:
             with _copying(recording, hidden, file):
-                channels, items = _encoded(recording, frames, images, markers=markers)
+                channels, items = _encoded(recording, frames, images, image_topics, markers=markers)
                 _append(recording.summary, file, channels, items, metadata)
         else:
             from shapecat.outputs.mcap_rewrite import rewrite  # noqa: PLC0415  loads YAML for ROS 1
 
-            channels, items = _encoded(recording, frames, images, markers=markers)
+            channels, items = _encoded(recording, frames, images, image_topics, markers=markers)
             rewrite(recording, file, channels, items, metadata)
 
 
@@ -106,7 +109,8 @@ def _copying(recording: McapRecording, path: Path, file: BinaryIO) -> Iterator[N
 def _encoded(
     recording: Recording,
     frames: Iterable[ShownFrame],
-    images: Iterable[ImageFrame] | None,
+    images: Iterable[ImageFrame],
+    image_topics: Sequence[str],
     *,
     markers: bool,
 ) -> tuple[list[AnnotationChannel], Iterator[EncodedMessage]]:
@@ -115,21 +119,23 @@ def _encoded(
     first = next(annotations, None)
     encoding = _encoding(recording, first)
     kinds = encoder_for(encoding, markers=markers)
-    items = _items(chain([first] if first else [], annotations), kinds, 0)
     channels = [channel for channel, _ in kinds]
-    if images is None:
-        return channels, items
-    drawn = image_encoder_for(encoding)
-    more = _items(images, drawn, len(channels))
-    channels += [channel for channel, _ in drawn]
+    known = chain([first] if first else [], annotations)
+    items = chain.from_iterable(_messages(one, kinds, 0) for one in known)
+    drawn, starts = image_encoders_for(encoding, image_topics), dict[str, int]()
+    for topic, encoders in drawn.items():
+        starts[topic] = len(channels)
+        channels += [channel for channel, _ in encoders]
+    more = chain.from_iterable(
+        _messages(image, drawn[image.topic], starts[image.topic]) for image in images
+    )
     return channels, merge(items, more, key=attrgetter("log_time_ns"))
 
 
-def _items(frames: Iterable[_F], encoders: Encoders[_F], first: int) -> Iterator[EncodedMessage]:
-    """Encode frames; their channels are numbered from ``first``."""
-    for frame in frames:
-        for number, (_, encode) in enumerate(encoders, start=first):
-            yield EncodedMessage(number, frame.log_time_ns, encode(frame))
+def _messages(frame: _F, encoders: Encoders[_F], first: int) -> Iterator[EncodedMessage]:
+    """Encode a frame for each channel; the channels are numbered from ``first``."""
+    for number, (_, encode) in enumerate(encoders, start=first):
+        yield EncodedMessage(number, frame.log_time_ns, encode(frame))
 
 
 def _append(

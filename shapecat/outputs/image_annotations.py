@@ -1,6 +1,6 @@
 """Annotations of colour images, for each message encoding."""
 
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Iterable, Iterator, Mapping
 from functools import partial
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -15,7 +15,7 @@ from shapecat.runs.label_meaning import TrackLabel
 from shapecat.runs.masks import read_masks
 from shapecat.runs.shown import ShownTracks
 
-__all__ = ["ImageBox", "ImageFrame", "image_encoder_for", "read_image_frames"]
+__all__ = ["ImageBox", "ImageFrame", "image_encoders_for", "read_image_frames"]
 
 DETECTIONS_2D = "/shapecat/detections_2d"
 DRAWN = "/shapecat/image_annotations"
@@ -46,6 +46,7 @@ class ImageBox(NamedTuple):
 class ImageFrame(NamedTuple):
     """An image and the objects on it."""
 
+    topic: str
     stamp_ns: int
     log_time_ns: int
     frame_id: str
@@ -73,22 +74,27 @@ def read_image_frames(folder: Path, labels: Mapping[int, TrackLabel]) -> Iterato
             for track, detections in parts.items()
             if (box := box_of(masks, detections)) is not None
         ]
-        yield ImageFrame(masks.stamp_ns, masks.log_time_ns, masks.frame_id, tuple(boxes))
+        image = (masks.topic, masks.stamp_ns, masks.log_time_ns, masks.frame_id)
+        yield ImageFrame(*image, tuple(boxes))
 
 
-def image_encoder_for(encoding: str) -> Encoders[ImageFrame]:
-    """Return the channels that annotate images in an encoding, each with its encoder.
+def image_encoders_for(encoding: str, topics: Iterable[str]) -> dict[str, Encoders[ImageFrame]]:
+    """Return the channels that annotate the images of each topic, each with its encoder.
 
-    An unknown encoding is replaced by JSON.
+    Channels of several topics are named after these, since viewers draw all messages of a channel
+    on an image. An unknown encoding is replaced by JSON.
     """
-    return _ENCODERS.get(encoding, _ENCODERS["json"])()
+    encoders, names = _ENCODERS.get(encoding, _ENCODERS["json"]), list(topics)
+    several = len(names) > 1
+    return {name: encoders(f"/{name.strip('/')}" if several else "") for name in names}
 
 
-def _ros(*, ros1: bool) -> Encoders[ImageFrame]:
-    ros = RosMessages(ros1=ros1)
+def _ros(of_topic: str, *, ros1: bool) -> Encoders[ImageFrame]:
+    ros, found = RosMessages(ros1=ros1), "vision_msgs/msg/Detection2DArray"
+    drawn = "foxglove_msgs/msg/ImageAnnotations"
     return [
-        ros.encoder(DETECTIONS_2D, "vision_msgs/msg/Detection2DArray", partial(_detections, ros)),
-        ros.encoder(DRAWN, "foxglove_msgs/msg/ImageAnnotations", partial(_drawn, ros)),
+        ros.encoder(DETECTIONS_2D + of_topic, found, partial(_detections, ros)),
+        ros.encoder(DRAWN + of_topic, drawn, partial(_drawn, ros)),
     ]
 
 
@@ -157,10 +163,10 @@ def _drawn(ros: RosMessages, frame: ImageFrame) -> Any:
     return ros.make("ImageAnnotations", [], points, texts)
 
 
-_IMAGES = (DRAWN, "foxglove.ImageAnnotations", _plain)
-_ENCODERS: dict[str, Callable[[], Encoders[ImageFrame]]] = {
+_NAME = "foxglove.ImageAnnotations"
+_ENCODERS: dict[str, Callable[[str], Encoders[ImageFrame]]] = {
     "cdr": partial(_ros, ros1=False),
     "ros1": partial(_ros, ros1=True),
-    "json": partial(json_encoder, *_IMAGES),
-    "protobuf": partial(protobuf_encoder, *_IMAGES),
+    "json": lambda of_topic: json_encoder(DRAWN + of_topic, _NAME, _plain),
+    "protobuf": lambda of_topic: protobuf_encoder(DRAWN + of_topic, _NAME, _plain),
 }
