@@ -110,6 +110,27 @@ def test_page_shows_current_labels(run: Path, drawn: RunReport) -> None:
     assert [counts["teapot"] for _, counts in (before, after)] == [0, 1]
 
 
+def test_page_of_table_saved_by_spreadsheet_has_the_values_of_the_run(
+    run: Path, drawn: RunReport
+) -> None:
+    """A sorted table with fewer columns cost the order of the cards, and facts about tracks."""
+    whole = data_of(replace(drawn, folder=run).page())
+    table = read_track_table(run / "tracks.csv")
+    rows = sorted(table.rows, key=lambda row: row.track)
+    assert rows != list(table.rows)
+    lines = [f"{row.track};{row.category};{row.confidence};note;" for row in rows]
+    text = "\n".join(["Track;Category;Confidence;mine;Label", *lines])
+    (run / "tracks.csv").write_text(text.replace(".", ","))
+    page = replace(drawn, folder=run).page()
+    found = data_of(page)
+
+    cards = [int(track) for track in re.findall(r'class="card" id="track-(\d+)"', page)]
+    assert cards == [row.track for row in table.rows]
+    assert "novelty" in page
+    assert found["columns"] == [*whole["columns"], "mine"]
+    assert [row["cells"][:-1] for row in found["rows"]] == [row["cells"] for row in whole["rows"]]
+
+
 def test_confidence_text_is_same_after_rounding_in_table() -> None:
     """Cards show it beside the posterior, which is not rounded."""
     for value in np.random.default_rng(0).uniform(0, 0.99, 2000).tolist():

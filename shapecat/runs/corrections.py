@@ -1,8 +1,4 @@
-"""Corrections of a run: the column ``label`` of tracks.csv, checked and applied.
-
-The table may have passed through a spreadsheet: separators, quotes, line ends, the order of
-columns and numbers such as ``1.0`` do not matter.
-"""
+"""Corrections of a run: the column ``label`` of tracks.csv, checked and applied."""
 
 import re
 from collections.abc import Iterable, Mapping, Sequence
@@ -37,6 +33,7 @@ __all__ = [
     "correct_label",
     "has_labels",
     "read_labels",
+    "read_own_table",
     "relabel",
 ]
 
@@ -60,17 +57,20 @@ def read_labels(path: Path, categories: Iterable[str] = ()) -> dict[int, TrackLa
     OutputError : the table is unreadable, belongs to another run, or has invalid lines, which the
         error message lists.
     """
-    table, problems = _read_own(path)
+    table, problems = read_own_table(path)
     labels, misread = resolve_labels(table.rows, categories, one_frame=_one_frame(path.parent))
     _refuse(path, [*problems, *_lines(table.rows, misread)])
     return labels
 
 
-def _read_own(path: Path) -> tuple[TrackTable, list[str]]:
-    """Read the tracks.csv of a run; return it with the problems of its lines.
+def read_own_table(path: Path) -> tuple[TrackTable, list[str]]:
+    """Read the labels and added columns in the tracks.csv of a run, and the problems of its lines.
 
-    A person may edit the labels and add columns. Other cells are as in tracks.original.csv, which
-    reveals missing tracks and edited categories.
+    Other cells and the order are those of tracks.original.csv; missing tracks are a problem.
+
+    Raises
+    ------
+    OutputError : the table is unreadable, or belongs to another run.
     """
     table = read_track_table(path)
     _require_same_run(path, table, path.parent)
@@ -132,7 +132,7 @@ def adopt_labels(corrected: Path, folder: Path) -> None:
 
 def _adopt(corrected: Path, folder: Path) -> None:
     current = folder / "tracks.csv"
-    own, problems = _read_own(current)
+    own, problems = read_own_table(current)
     result = own
     if not (corrected.exists() and corrected.samefile(current)):
         _refuse(current, problems)
@@ -162,7 +162,7 @@ def relabel(folder: Path, labels: Mapping[int, str]) -> dict[int, str]:
     OutputError : the run's table is unreadable, invalid or another run's, or cannot be written.
     """
     current = folder / "tracks.csv"
-    base, problems = _read_own(current)
+    base, problems = read_own_table(current)
     categories, one_frame = read_run(folder)["model"]["categories"], _one_frame(folder)
     before = find_misread(base.rows, categories, one_frame=one_frame)
     _refuse(current, [*problems, *_lines(base.rows, before)])

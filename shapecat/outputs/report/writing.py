@@ -15,9 +15,10 @@ from shapecat.outputs.report.choosing import choose_frames
 from shapecat.outputs.report.page import Listed, index_page, run_page
 from shapecat.outputs.report.pictures import Pictures, take_pictures
 from shapecat.outputs.report.tracks import Timeline, read_stage_seconds, read_timelines
+from shapecat.runs.corrections import read_own_table
 from shapecat.runs.finished import find_runs, read_finished
 from shapecat.runs.folder import require_work
-from shapecat.runs.track_table import TrackTable, read_track_table
+from shapecat.runs.track_table import TrackTable
 from shapecat.system.files import replacing
 from shapecat.system.progress import Observer, ignore
 
@@ -90,7 +91,7 @@ class RunReport:
 
     @property
     def _table(self) -> TrackTable:
-        return read_track_table(self.folder / "tracks.csv")
+        return read_own_table(self.folder / "tracks.csv")[0]
 
     def _cards(self, table: TrackTable) -> list[Card]:
         return [
@@ -180,7 +181,7 @@ def read_report(folder: Path, *, index: str | None = None) -> RunReport:
     OutputError : the folder is not a finished run, or its tracks.csv is invalid.
     """
     finished = read_finished(folder)
-    rows = read_track_table(folder / "tracks.csv").rows
+    rows = read_own_table(folder / "tracks.csv")[0].rows
     timelines = read_timelines(folder)
     pictures = take_pictures(finished, rows, choose_frames(folder, timelines))
     work = finished.run.get("work", "")
