@@ -13,8 +13,9 @@ from click.testing import Result
 
 from shapecat.errors import OutputError
 from shapecat.runs.corrections import adopt_labels, read_labels
-from shapecat.runs.folder import read_run, write_run
+from shapecat.runs.folder import read_run, staged, write_run
 from shapecat.runs.identity import new_id
+from shapecat.runs.jobs import Job, keep_labels
 from shapecat.runs.label_transfer import TABLE_ALONE, match_labels, transfer_labels
 from shapecat.runs.same_objects import Match, _by_majority, _mutual_nearest
 from shapecat.runs.table_schemas import DETECTIONS, FRAMES, TRACKS
@@ -561,6 +562,22 @@ def test_table_alone_may_have_categories_of_target(tmp_path: Path) -> None:
 
     assert not transfer_labels(table, target).missed
     assert labels_of(target) == {2: "pan"}
+
+
+def test_labels_without_match_survive_later_runs(tmp_path: Path) -> None:
+    """Someone tries other settings, and goes back: the labels were in no file any more."""
+    folder, job = tmp_path / "lab", Job(tmp_path / "lab.mcap", tmp_path / "lab")
+    for label in ("teapot", "vase", ""):
+        with staged(folder) as new:
+            run = run_info(id=new_id())
+            if folder.exists():  # without the tables of the new run, no label finds its object
+                keep_labels(new, run, job)
+            text = f"track,category,confidence,label\n1,can,0.5,{label}\n"
+            (new / "tracks.csv").write_text(text)
+            write_run(new, run)
+
+    kept = {label for table in folder.glob("tracks.*csv") for label in labels_in(table)}
+    assert kept == {"teapot", "vase"}
 
 
 # ---- the real command

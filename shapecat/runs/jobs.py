@@ -8,6 +8,8 @@ from importlib.metadata import version
 from pathlib import Path
 from typing import Any
 
+import xxhash
+
 from shapecat import __version__
 from shapecat.config import Settings
 from shapecat.errors import OutputError, RecordingError
@@ -218,7 +220,8 @@ def require_utf8(job: Job) -> None:
 def keep_labels(folder: Path, run: RunInfo, job: Job) -> None:
     """Transfer the corrected labels of the replaced results to the new ones.
 
-    The table with the original labels is kept as tracks.previous.csv.
+    The table with the original labels is kept as tracks.previous.csv. If labels were not
+    transferred, a copy is kept beside the replaced results, and so beside all later ones.
 
     Raises
     ------
@@ -227,12 +230,17 @@ def keep_labels(folder: Path, run: RunInfo, job: Job) -> None:
     previous = job.folder / "tracks.csv"
     if job.discard_labels or not has_labels(previous):
         return
+    table = previous.read_bytes()
     with replacing(folder / PREVIOUS) as path:
-        path.write_bytes(previous.read_bytes())
+        path.write_bytes(table)
     try:
         transfer = transfer_labels(job.folder, folder)
     except OutputError as error:
         transfer = lost_labels(job.folder, str(error))
+    if transfer.missed:
+        copy = f"tracks.previous-{xxhash.xxh3_64_hexdigest(table)[:8]}.csv"
+        with replacing(job.folder / copy) as path:
+            path.write_bytes(table)
     run["corrections"] = transfer.as_dict()
 
 
