@@ -173,7 +173,7 @@ def test_colours_of_unorganized_cloud_are_not_annotated(
         (("/d", k), ImageMasks("/colour", 7 + k, 7, "camera", 64, height, {}, {}))
         for k, height in enumerate((1, 48))
     ]
-    monkeypatch.setattr(image_annotations, "read_masks", lambda *_, **__: iter(masks))
+    monkeypatch.setattr(image_annotations, "read_nearest_masks", lambda *_: iter(masks))
     nothing = SimpleNamespace(read=lambda *_: SimpleNamespace(of=lambda _: ()))
     monkeypatch.setattr(image_annotations, "ShownTracks", nothing)
 

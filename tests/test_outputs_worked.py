@@ -48,7 +48,9 @@ from shapecat.outputs.review_scenes import choose_scenes, with_clouds
 from shapecat.outputs.scene_tree import _apply_labels, _candidate, _described, _topic
 from shapecat.recordings.messages import Topic
 from shapecat.runs.label_meaning import TrackLabel, _slips
+from shapecat.runs.masks import read_nearest_masks
 from shapecat.runs.shown import ShownDetection
+from shapecat.runs.tables import Key
 from shapecat.types import (
     Box,
     Camera,
@@ -148,6 +150,28 @@ def test_lifetime_does_not_span_jump_of_clock(encoding: str) -> None:
             assert encode(annotation)
 
 
+def patch_masks(
+    monkeypatch: pytest.MonkeyPatch, masks: list[tuple[Key, ImageMasks]], stamps: list[int]
+) -> None:
+    """Replace the masks of a run, and the stamps of their frames."""
+    frames = [(key, stamp) for (key, _), stamp in zip(masks, stamps, strict=True)]
+    monkeypatch.setattr("shapecat.runs.masks.read_masks", lambda _folder, **_: iter(masks))
+    monkeypatch.setattr("shapecat.runs.masks._frame_stamps", lambda _folder: iter(frames))
+
+
+def test_image_has_masks_of_the_frame_nearest_in_time(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Colour images are often rarer: the boxes were those of the first frame, half a period ago."""
+    stamps = [20, 40, 55, 90, 150, 160]
+    masks = [
+        (("/d", k), ImageMasks("/l", image, image + 1, "c", 40, 30, {}, {}))
+        for k, image in enumerate([50, 50, 50, 150, 150, 150])
+    ]
+    patch_masks(monkeypatch, masks, stamps)
+
+    found = [(key, image.stamp_ns) for key, image in read_nearest_masks(Path())]
+    assert found == [(("/d", 2), 50), (("/d", 4), 150)]
+
+
 def test_simultaneous_images_of_two_cameras_are_annotated(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
@@ -158,10 +182,10 @@ def test_simultaneous_images_of_two_cameras_are_annotated(
         for k, (topic, stamp, height) in enumerate(images)
     ]
     item = ShownDetection(0, TrackLabel(6, "cup", 0.8), 0)
-    place = "shapecat.outputs.image_annotations"
-    monkeypatch.setattr(f"{place}.read_masks", lambda _folder, **_: iter(masks))
+    patch_masks(monkeypatch, masks, [5] * len(masks))
     tracks = SimpleNamespace(of=lambda _key: [item])
-    monkeypatch.setattr(f"{place}.ShownTracks.read", lambda _folder, _labels: tracks)
+    place = "shapecat.outputs.image_annotations.ShownTracks.read"
+    monkeypatch.setattr(place, lambda _folder, _labels: tracks)
     frames = list(read_image_frames(Path(), {}))
 
     assert [frame.stamp_ns for frame in frames] == [5, 5, 9]
@@ -179,7 +203,7 @@ def test_merged_track_has_one_box_on_image(
         ShownDetection(k, label, 0) for k, label in enumerate((whole, other, whole, whole))
     ]  # the last one has no mask
     place = "shapecat.outputs.image_annotations"
-    monkeypatch.setattr(f"{place}.read_masks", lambda _folder, **_: iter([(("/d", 0), masks)]))
+    monkeypatch.setattr(f"{place}.read_nearest_masks", lambda _folder: iter([(("/d", 0), masks)]))
     tracks = SimpleNamespace(of=lambda _key: items)
     monkeypatch.setattr(f"{place}.ShownTracks.read", lambda _folder, _labels: tracks)
     (frame,) = read_image_frames(Path(), {})

@@ -12,7 +12,7 @@ from shapecat.outputs.foxglove_encoders import json_encoder, protobuf_encoder
 from shapecat.outputs.ros_annotations import RosMessages
 from shapecat.outputs.wording import caption
 from shapecat.runs.label_meaning import TrackLabel
-from shapecat.runs.masks import read_masks
+from shapecat.runs.masks import read_nearest_masks
 from shapecat.runs.shown import ShownTracks
 
 __all__ = ["ImageBox", "ImageFrame", "image_encoders_for", "read_image_frames"]
@@ -54,16 +54,14 @@ class ImageFrame(NamedTuple):
 
 
 def read_image_frames(folder: Path, labels: Mapping[int, TrackLabel]) -> Iterator[ImageFrame]:
-    """Yield the annotations of the colour images of a run, each image once.
+    """Yield the annotations of the colour images of a run; see `read_nearest_masks`.
 
     Unorganized clouds have no colour image.
     """
     shown = ShownTracks.read(folder, labels)
-    latest: dict[str, int] = {}
-    for key, masks in read_masks(folder, boxes_only=True):
-        if masks.height <= 1 or latest.get(masks.topic) == masks.stamp_ns:
+    for key, masks in read_nearest_masks(folder):
+        if masks.height <= 1:
             continue
-        latest[masks.topic] = masks.stamp_ns
         parts: dict[int, list[int]] = {}
         named: dict[int, TrackLabel] = {}
         for item in shown.of(key):

@@ -10,10 +10,10 @@ import pyarrow as pa
 
 from shapecat.arrays import U4
 from shapecat.runs.table_schemas import MASKS
-from shapecat.runs.tables import Key, numbers, read_row_groups
+from shapecat.runs.tables import Key, keys_of, numbers, read_row_groups
 from shapecat.types import ImageMasks, Perception
 
-__all__ = ["mask_columns", "read_masks"]
+__all__ = ["mask_columns", "read_masks", "read_nearest_masks"]
 
 
 def mask_columns(perceptions: Iterable[Perception]) -> dict[str, Any]:
@@ -53,6 +53,31 @@ def read_masks(folder: Path, *, boxes_only: bool = False) -> Iterator[tuple[Key,
             runs = {} if counts is None else {n: next(counts) for n in detections}
             named = dict(zip(detections, map(tuple, boxes), strict=True))
             yield key, ImageMasks(**of_image, boxes=named, counts=runs)
+
+
+def read_nearest_masks(folder: Path) -> Iterator[tuple[Key, ImageMasks]]:
+    """Yield each image once, with the boxes of the masks of the frame nearest to it in time.
+
+    Several frames have the same image if images are rarer. Run lengths are left out.
+    """
+    best: dict[str, tuple[int, Key, ImageMasks]] = {}
+    stamps = _frame_stamps(folder)
+    for key, masks in read_masks(folder, boxes_only=True):
+        stamp = next(stamp for other, stamp in stamps if other == key)
+        apart, before = abs(stamp - masks.stamp_ns), best.get(masks.topic)
+        if before is not None and before[2].stamp_ns != masks.stamp_ns:
+            yield before[1:]
+            before = None
+        if before is None or apart < before[0]:
+            best[masks.topic] = apart, key, masks
+    for _, key, masks in best.values():
+        yield key, masks
+
+
+def _frame_stamps(folder: Path) -> Iterator[tuple[Key, int]]:
+    """Yield each frame and its stamp in nanoseconds, in the order of the frames table."""
+    for group in read_row_groups(folder / "frames.parquet", ["topic", "frame", "stamp_ns"]):
+        yield from zip(keys_of(group), numbers(group["stamp_ns"]).tolist(), strict=True)
 
 
 def _run_lengths(column: pa.ChunkedArray) -> Iterator[U4]:
