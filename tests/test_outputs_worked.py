@@ -352,6 +352,20 @@ def test_frames_are_thinned_per_topic() -> None:
     assert chosen == {("/a", 0), ("/b", 1), ("/a", 3), ("/b", 6)}
 
 
+@pytest.mark.parametrize("per_track", [0, 9])
+def test_image_is_in_a_data_set_once(per_track: int) -> None:
+    """Colour images are often rarer than frames: the others have masks half a period off."""
+    images = [("/c", 1), ("/c", 1), ("/e", 1), ("/c", 3), None]
+    masks = [one and ImageMasks(one[0], one[1] * MS, 0, "c", 4, 3, {}, {}) for one in images]
+    views = (labelled_frame(k, labelled_object(1, range(9 + k))) for k in range(len(images)))
+    frames = [replace(view, masks=one) for view, one in zip(views, masks, strict=True)]
+
+    chosen = _chosen(finished(frames), Selection(per_track=per_track), set())
+    assert chosen == {("/depth", k) for k in (1, 2, 3, 4)}
+    depth = Selection(per_track=per_track, depth=True)
+    assert _chosen(finished(frames), depth, set()) == {("/depth", k) for k in range(5)}
+
+
 def test_most_different_views_of_track_are_selected() -> None:
     """The first has most pixels; each next one differs most from those chosen."""
     columns = np.zeros((5, 8))

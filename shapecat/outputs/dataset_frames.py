@@ -208,24 +208,37 @@ def snapped_masks(frame: Frame, coloured: Coloured, pixels: U1) -> tuple[Mask, .
 def _chosen(
     finished: FinishedRun, selection: Selection, corrected: set[int]
 ) -> set[tuple[str, int]]:
-    """Return the selected frames, by topic and number."""
+    """Return the selected frames, by topic and number.
+
+    Of the frames with the same colour image, only the one nearest to it in time is selected.
+    """
     seen: Counter[str] = Counter()
     keys: list[tuple[str, int]] = []
     views: dict[int, list[tuple[int, Any]]] = {}
+    nearest: dict[tuple[str, int], tuple[int, int]] = {}
+    left_out: set[int] = set()
     for labelled in finished.frames():
         number = seen[labelled.topic]
         seen[labelled.topic] += 1
         if number % selection.every:
             continue
+        if (image := labelled.masks) is not None and not selection.depth:
+            here = abs(labelled.stamp_ns - image.stamp_ns), len(keys)
+            place = (image.topic, image.stamp_ns)
+            other = nearest.setdefault(place, here)
+            nearest[place] = min(here, other)
+            left_out |= {k for _, k in (here, other)} - {nearest[place][1]}
         for item in labelled.objects if selection.per_track else ():
             if _is_sure(item, selection, corrected):
                 views.setdefault(item.track, []).append((len(keys), _view(labelled, item)))
         keys.append((labelled.topic, labelled.index))
     if not selection.per_track:
-        return set(keys)
+        return {key for k, key in enumerate(keys) if k not in left_out}
+    kept = {track: [row for row in rows if row[0] not in left_out] for track, rows in views.items()}
     return {
         keys[rows[k][0]]
-        for rows in views.values()
+        for rows in kept.values()
+        if rows
         for k in _different(np.array([view for _, view in rows]), selection.per_track)
     }
 
