@@ -238,12 +238,13 @@ def annotate(folder: Path, recording: Recording, run: RunInfo, observe: Observer
         from shapecat.outputs.review import write_review  # noqa: PLC0415  loads Rerun on first use
         from shapecat.outputs.review_scenes import with_clouds  # noqa: PLC0415  the same
         from shapecat.runs.labels import read_labelled_frames  # noqa: PLC0415  the same
+        from shapecat.runs.placed_frames import streams_with_poses  # noqa: PLC0415  the same
 
         labelled = read_labelled_frames(folder, labels())
         shown = _observed(labelled, "review", total, observe)
         write_review(
             folder / "review.rrd",
-            with_clouds(shown, recording, run),
+            with_clouds(shown, recording, run, streams_with_poses(folder)),
             name=recording.path.name,
             run=run,
             categories=run["model"]["categories"],

@@ -25,8 +25,7 @@ from shapecat.recordings.transforms import TransformBuffer
 from shapecat.reuse import KeyView, find_repeats, sight_of
 from shapecat.reuse.agreement import agreement
 from shapecat.runs.perceived import FrameRow, PerceptionTables
-from shapecat.runs.placed_frames import PlacedFrames
-from shapecat.runs.tracks import _streams_with_poses
+from shapecat.runs.placed_frames import PlacedFrames, streams_with_poses
 from shapecat.tracking.hits import gather
 from shapecat.tracking.records import FrameDetections
 from shapecat.types import Camera, Frame, Pose
@@ -260,7 +259,7 @@ def test_each_topic_has_its_own_poses(tmp_path: Path) -> None:
     for part in (slice(0, 2), slice(2, 5)):
         placed.add(frame_rows[part], found[part], part.start)
 
-    assert _streams_with_poses(tmp_path) == {"/head"}
+    assert streams_with_poses(tmp_path) == {"/head"}
     rows = placed.find([topic for topic, _ in order], np.array([k for _, k in order]))
     assert rows.tolist() == list(range(5))
     assert placed.poses[rows, 0, 3].tolist() == [float(topic == "/head") for topic, _ in order]

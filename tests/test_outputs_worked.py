@@ -259,6 +259,18 @@ def test_moving_camera_does_not_redraw_static_scene(
     assert [one.labelled.index for one in found if one.frame is not None] == drawn
 
 
+def test_scene_at_unknown_place_is_not_drawn() -> None:
+    """Before the first transform, the cloud was at the origin of the fixed frame, on its side."""
+    pose = Pose(np.eye(3), np.array([0.4, 0.7, 1.5]))
+    frames = [
+        replace(labelled_frame(1000 * k, topic=topic), fixed_from_sensor=pose if known else None)
+        for k, (topic, known) in enumerate([("/a", 0), ("/a", 1), ("/a", 0), ("/a", 1), ("/b", 0)])
+    ]
+
+    chosen = choose_scenes(frames, fixed=True, placed={"/a"})
+    assert [drawn for _, drawn in chosen] == [False, True, False, True, True]
+
+
 def test_scene_is_redrawn_if_object_moves_or_time_goes_back() -> None:
     """The visible part of an object at rest varies from frame to frame."""
     resting = box_at((0.31, -0.24, 1.17), (0.12, 0.07, 0.19))

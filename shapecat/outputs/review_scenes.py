@@ -1,7 +1,7 @@
 """Choose the frames of a review whose scene is drawn, and paint them."""
 
 import math
-from collections.abc import Iterable, Iterator
+from collections.abc import Collection, Iterable, Iterator
 from itertools import tee
 from typing import NamedTuple
 
@@ -31,22 +31,28 @@ class ReviewFrame(NamedTuple):
 
 
 def with_clouds(
-    frames: Iterable[LabelledFrame], recording: Recording, run: RunInfo
+    frames: Iterable[LabelledFrame],
+    recording: Recording,
+    run: RunInfo,
+    placed: Collection[str] = (),
 ) -> Iterator[ReviewFrame]:
     """Yield all frames of a run; those whose scene is drawn have their points and colour image.
+
+    ``placed`` is as for `choose_scenes`.
 
     Raises
     ------
     OutputError : the recording no longer holds one of the frames.
     """
-    first, second = tee(choose_scenes(frames, fixed=run["fixed_frame"] is not None))
+    chosen = choose_scenes(frames, fixed=run["fixed_frame"] is not None, placed=placed)
+    first, second = tee(chosen)
     read = with_colour((labelled for labelled, drawn in first if drawn), recording, run)
     for labelled, drawn in second:
         yield ReviewFrame(*next(read)) if drawn else ReviewFrame(labelled)
 
 
 def choose_scenes(
-    frames: Iterable[LabelledFrame], *, fixed: bool
+    frames: Iterable[LabelledFrame], *, fixed: bool, placed: Collection[str] = ()
 ) -> Iterator[tuple[LabelledFrame, bool]]:
     """Yield each frame, and whether its scene is drawn.
 
@@ -55,11 +61,13 @@ def choose_scenes(
     Parameters
     ----------
     fixed : whether motion is measured in the fixed frame, where a moving camera does not count.
+    placed : topics whose scenes are drawn only at a known place in the fixed frame.
     """
     last: dict[str, LabelledFrame] = {}  # last drawn frame of each topic
     for labelled in frames:
         before = last.get(labelled.topic)
-        drawn = before is None or _is_due(labelled, before, fixed=fixed)
+        drawn = labelled.topic not in placed or labelled.fixed_from_sensor is not None
+        drawn = drawn and (before is None or _is_due(labelled, before, fixed=fixed))
         if drawn:
             last[labelled.topic] = labelled
         yield labelled, drawn

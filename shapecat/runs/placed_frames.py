@@ -1,16 +1,25 @@
 """The sensor pose and the first detection of each frame of a run."""
 
+from collections import Counter
 from collections.abc import Collection, Sequence
 from functools import cached_property
+from pathlib import Path
 
 import numpy as np
 import pyarrow as pa
 import pyarrow.compute
 
 from shapecat.arrays import F8, I4, Bool
-from shapecat.runs.tables import frame_rows, keys_of, numbers, numbers_or_nan, topic_codes
+from shapecat.runs.tables import (
+    frame_rows,
+    keys_of,
+    numbers,
+    numbers_or_nan,
+    read_row_groups,
+    topic_codes,
+)
 
-__all__ = ["PlacedFrames"]
+__all__ = ["PlacedFrames", "streams_with_poses"]
 
 
 class PlacedFrames:
@@ -70,3 +79,16 @@ def _poses(frames: pa.Table, placed: Bool) -> F8:
     result[known, :, :3] = turns[known]
     result[known, :, 3] = numbers_or_nan(frames["fixed_translation"])[known]
     return result
+
+
+def streams_with_poses(folder: Path) -> set[str]:
+    """Return the topics whose sensor pose in the fixed frame is known in most frames.
+
+    Their detections in the other frames are not tracked.
+    """
+    balance: Counter[str] = Counter()
+    for group in read_row_groups(folder / "frames.parquet", ["topic", "fixed_translation"]):
+        known = pa.compute.is_valid(group["fixed_translation"]).to_pylist()
+        for topic, has_pose in zip(group["topic"].to_pylist(), known, strict=True):
+            balance[topic] += 1 if has_pose else -1
+    return {topic for topic, count in balance.items() if count > 0}

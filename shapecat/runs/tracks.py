@@ -15,6 +15,7 @@ from scipy.spatial.transform import Rotation
 from shapecat.arrays import F4, F8
 from shapecat.config import TrackingSettings
 from shapecat.runs.full_boxes import FullBoxes, full_columns
+from shapecat.runs.placed_frames import streams_with_poses
 from shapecat.runs.table_schemas import TRACKS
 from shapecat.runs.tables import (
     Key,
@@ -24,7 +25,6 @@ from shapecat.runs.tables import (
     numbers,
     numbers_or_nan,
     open_writer,
-    read_row_groups,
     read_together,
     rows_as_lists,
 )
@@ -88,7 +88,7 @@ def track_run(
     ------
     OutputError : a table of the run is unreadable, or a table cannot be written.
     """
-    placed = _streams_with_poses(folder)
+    placed = streams_with_poses(folder)
     frames = _read_frames(folder, len(categories), placed)
     tracks = track_recording(frames, settings, together=placed)
     lines, start_ns = [], first_stamp(folder)
@@ -201,19 +201,6 @@ def _turned(orientations: F4, turns: F8) -> F8:
     if not len(orientations):
         return np.zeros((0, 4))
     return np.asarray((Rotation.from_matrix(turns) * Rotation.from_quat(orientations)).as_quat())
-
-
-def _streams_with_poses(folder: Path) -> set[str]:
-    """Return the topics whose sensor pose in the fixed frame is known in most frames.
-
-    Their detections in the other frames are not tracked.
-    """
-    balance: Counter[str] = Counter()
-    for group in read_row_groups(folder / "frames.parquet", ["topic", "fixed_translation"]):
-        known = pa.compute.is_valid(group["fixed_translation"]).to_pylist()
-        for topic, has_pose in zip(group["topic"].to_pylist(), known, strict=True):
-            balance[topic] += 1 if has_pose else -1
-    return {topic for topic, count in balance.items() if count > 0}
 
 
 def _columns(tracks: Sequence[Track], boxes: F4, categories: Sequence[str]) -> dict[str, Any]:
