@@ -299,6 +299,23 @@ def test_two_sensors_are_drawn_separately(tmp_path: Path, monkeypatch: pytest.Mo
         assert np.allclose(views[side][2].target, [0.1 + side, 0.1, 1])
 
 
+def test_counts_of_two_sensors_are_separate_lines(tmp_path: Path) -> None:
+    """In one line, the count jumped between those of the two sensors."""
+    topics, scenes = ("/left/depth", "/right/depth"), []
+    for k in range(4):
+        seen = [labelled_object(track) for track in range(1 + k % 2)]
+        labelled, frame = scene(k, seen)
+        topic = topics[k % 2]
+        here = dataclasses.replace(labelled, topic=topic), dataclasses.replace(frame, topic=topic)
+        scenes.append(here)
+    run = {"options": {"topics": list(topics)}}
+    path = write(tmp_path / "r.rrd", scenes, run=run)
+
+    counts = [scalars(path, f"/plots/objects/{topic}/cup") for topic in topics]
+    assert counts == [[[1], [1]], [[2], [2]]]
+    assert scalars(path, "/plots/objects/cup") == []
+
+
 def test_two_sensors_may_share_their_colour_camera() -> None:
     stream = rr.RecordingStream("test")
     images = Images(stream, Columns(stream))

@@ -24,7 +24,7 @@ Entities
     ├── boxes                  around the masks
     └── captions               labelled as in 3D
     tracks/<n>/posterior       fused posterior up to each frame, a line per category
-    plots/objects/<category>   objects in view
+    plots/objects/<category>   objects in view; of several topics, plots/objects/<topic>/<category>
     plots/seconds/<stage>      time spent on each frame
     log                        starts and ends of tracks, warnings of the run
     run                        run.json as text
@@ -35,7 +35,8 @@ Timelines: ``sensor_time`` (the stamp) and ``frame``.
 import json
 import uuid
 from collections import Counter
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -139,7 +140,8 @@ class _Review:
         self._paths = Paths(self._columns)
         self._images = Images(stream, self._columns)
         self._styled: set[str] = set()  # entities whose style is written
-        self._counted: dict[str, None] = {}  # categories so far, in order
+        self._counted: dict[str, dict[str, None]] = {}  # categories so far of each topic, in order
+        self._several = False  # whether the run has several topics
         self._warnings: list[str] = []
 
     def begin(self, run: Mapping[str, object]) -> None:
@@ -147,6 +149,8 @@ class _Review:
         self._log(
             "run", rr.TextDocument(shapes.markdown(run), media_type="text/markdown"), static=True
         )
+        options = run.get("options")
+        self._several = isinstance(options, Mapping) and len(options.get("topics", ())) > 1
         warnings = run.get("warnings", ())
         if isinstance(warnings, Sequence) and not isinstance(warnings, str):
             self._warnings = [str(text) for text in warnings]
@@ -275,25 +279,33 @@ class _Review:
             self._tracks[item.track].frames += 1
             self._columns.add(f"/tracks/{item.track}/posterior", at, item.causal, curve)
         counts = Counter(item.category for item in labelled.objects)
-        self._counted.update(dict.fromkeys(counts))
-        for category in self._counted:
-            self._plot_line("objects", category, at, counts[category])
+        counted = self._counted.setdefault(labelled.topic, {})
+        counted.update(dict.fromkeys(counts))
+        group, sensor = "objects", ""
+        if self._several:
+            sensor = f" {labelled.topic}"
+            group += f"/{rr.escape_entity_path_part(labelled.topic)}"
+        for category in counted:
+            style = partial(_steps, category, sensor)
+            self._plot_line(group, category, style, at, counts[category])
         for stage, seconds in labelled.seconds.items():
-            self._plot_line("seconds", stage, at, seconds)
+            style = partial(rr.SeriesLines, names=stage, widths=2)
+            self._plot_line("seconds", stage, style, at, seconds)
 
-    def _plot_line(self, group: str, name: str, at: At, value: float) -> None:
+    def _plot_line(
+        self, group: str, name: str, style: Callable[[], rr.SeriesLines], at: At, value: float
+    ) -> None:
         entity = f"/plots/{group}/{rr.escape_entity_path_part(name)}"
         if entity not in self._styled:
             self._styled.add(entity)
-            line = _steps(name) if group == "objects" else rr.SeriesLines(names=name, widths=2)
-            self._log(entity, line, static=True)
+            self._log(entity, style(), static=True)
         self._columns.add(entity, at, [value], curve)
 
 
-def _steps(category: str) -> rr.SeriesLines:
+def _steps(category: str, sensor: str) -> rr.SeriesLines:
     """Return the style of a count, which changes in steps."""
     return rr.SeriesLines(
-        names=category,
+        names=category + sensor,
         colors=colour_of(category),
         widths=2,
         interpolation_mode=rr.components.InterpolationMode.StepAfter,
