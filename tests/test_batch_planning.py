@@ -5,6 +5,7 @@ import os
 from collections.abc import Mapping
 from concurrent.futures import CancelledError, Executor, Future
 from dataclasses import replace
+from itertools import islice
 from pathlib import Path
 from types import SimpleNamespace
 from typing import Any, get_args
@@ -14,7 +15,8 @@ import pytest
 from shapecat.batch.finding import Source, _key_of_all, find_recordings
 from shapecat.batch.ledger import Ledger, Outcome
 from shapecat.batch.manifest import Entry, Manifest, RemoteManifest, State
-from shapecat.batch.plans import Shard, name_folders, plan_batch
+from shapecat.batch.naming import name_folders
+from shapecat.batch.plans import Shard, plan_batch
 from shapecat.batch.remote import Ticket
 from shapecat.batch.runs import _reporter, exit_code, process_here, process_on
 from shapecat.batch.storage import Location, content_key
@@ -455,6 +457,43 @@ def test_batch_checks_run_without_its_outputs(
 
     assert status_of(job, source, out) == status
     assert status_of(replace(job, overwrite=True), source, out) == "resume"
+
+
+def overwritten(sources: Path, out: Path, *, most: int = 9, **changes: Any) -> dict[str, Any]:
+    """Overwrite, until ``most`` runs are complete; return the status with which each began."""
+    job = Job(Path(), Path(), mcap=False, rrd=False, overwrite=True, **changes)
+    watcher = SimpleNamespace(ended=lambda _outcome: None)
+    with plan_batch(job, [str(sources)], str(out)) as batch:
+        list(islice(process_here(batch.tasks, watcher, manifest=batch.manifest), most))
+        return {task.name: task.status for task in batch.tasks}
+
+
+def test_interrupted_overwriting_continues(
+    source: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """The command says that finished work is kept; another command replaces all of it."""
+    (source.parent / "other.mcap").write_bytes(b"another")
+    monkeypatch.setattr("shapecat.batch.plans.load_model", lambda _path: MODEL)
+
+    def attempt(job: Job, *_: object, **__: object) -> Outcome:
+        job.folder.mkdir(parents=True, exist_ok=True)
+        write_run(job.folder, planned(job.source))
+        counts = {"frames": 3, "tracks": {"cup": 2}}
+        return Outcome(job, Summary(job.name, job.folder, counts, 1.5, ()))
+
+    monkeypatch.setattr("shapecat.batch.runs.attempt", attempt)
+    out = tmp_path / "out"
+    overwritten(source.parent, out)
+    assert overwritten(source.parent, out, most=1) == {"lab": "new", "other": "new"}
+
+    assert overwritten(source.parent, out, most=1, discard_labels=True)["lab"] == "new"
+    assert overwritten(source.parent, out, most=1, every=2)["lab"] == "new"
+    for _ in range(2):  # interrupted again, before the next is complete
+        assert overwritten(source.parent, out, most=1, every=2)["lab"] == "complete"
+    (out / "lab" / "run.json").unlink()
+    assert overwritten(source.parent, out, most=0, every=2)["lab"] == "new"
+    assert overwritten(source.parent, out, every=2) == {"lab": "new", "other": "new"}
+    assert overwritten(source.parent, out, every=2) == {"lab": "new", "other": "new"}
 
 
 def test_full_disk_leaves_no_partial_line(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

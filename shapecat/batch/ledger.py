@@ -54,9 +54,9 @@ class Ledger:
         return None if self._manifest is None else self._manifest.entries.get(folder)
 
     def _has(self, entry: Entry, state: State) -> bool:
-        """Return whether the manifest has the same work in this state."""
+        """Return whether the manifest has the same work of the same command in this state."""
         known = self._last_entry(entry.folder)
-        return known is not None and known.state == state and known.same_work(entry)
+        return known is not None and known.state == state and known.same_command(entry)
 
     def known(self, task: Task) -> Outcome:
         """Return the outcome of a task that was complete before."""

@@ -51,8 +51,9 @@ class Entry:
     """A line of the manifest: a recording and its state.
 
     ``folder`` is the name of the run folder. ``input`` changes with the content of the recording,
-    ``work`` with the options, settings and model. ``tries`` counts attempts, ``seconds`` is the
-    duration, and ``tracks`` counts the tracks of each category. ``time`` is UTC in ISO 8601.
+    ``work`` with the options, settings and model. ``command`` identifies a command that overwrites.
+    ``tries`` counts attempts, ``seconds`` is the duration, and ``tracks`` counts the tracks of each
+    category. ``time`` is UTC in ISO 8601.
     """
 
     folder: str
@@ -60,6 +61,7 @@ class Entry:
     state: State
     input: str = ""
     work: str = ""
+    command: str = ""
     tries: int = 0
     seconds: float | None = None
     frames: int | None = None
@@ -71,6 +73,10 @@ class Entry:
     def same_work(self, other: "Entry") -> bool:
         """Return whether two entries have the same input and work."""
         return (self.input, self.work) == (other.input, other.work)
+
+    def same_command(self, other: "Entry") -> bool:
+        """Return whether two entries have the same input and work, from the same command."""
+        return self.same_work(other) and self.command == other.command
 
 
 _NAMES = tuple(field.name for field in fields(Entry))
@@ -257,7 +263,11 @@ def _parse(line: bytes) -> Entry | None:
 
 def _shared(name: str, value: Any) -> Any:
     """Intern a value that many entries have in common, to save memory."""
-    return sys.intern(value) if name in {"state", "work"} and isinstance(value, str) else value
+    return (
+        sys.intern(value)
+        if name in {"state", "work", "command"} and isinstance(value, str)
+        else value
+    )
 
 
 @contextmanager

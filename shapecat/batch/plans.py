@@ -3,22 +3,21 @@
 import dataclasses
 import hashlib
 import json
-import os
-from collections import Counter
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import contextmanager, nullcontext, suppress
 from dataclasses import dataclass
-from itertools import chain, count
+from itertools import chain
 from pathlib import Path
-from types import MappingProxyType
 from typing import Literal
+from uuid import uuid4
 
 from shapecat.batch.claims import claim_name
 from shapecat.batch.finding import Source, find_recordings, look_at
-from shapecat.batch.manifest import Entry, Manifest, entries_at, open_manifest
+from shapecat.batch.manifest import Entry, Manifest, open_manifest
+from shapecat.batch.naming import known_names, name_folders
 from shapecat.batch.storage import Location, is_url
-from shapecat.errors import ConfigError, OutputError, ShapecatError
+from shapecat.errors import ConfigError, OutputError
 from shapecat.learning import load_model
 from shapecat.runs.folder import OUTPUT_OPTIONS, read_run
 from shapecat.runs.identity import file_stats
@@ -29,7 +28,6 @@ __all__ = [
     "Batch",
     "Shard",
     "Task",
-    "name_folders",
     "plan_batch",
 ]
 
@@ -57,6 +55,7 @@ class Task:
     bytes : size of the recording, 0 if unknown.
     input, work : keys; ``input`` changes with the content of the recording, ``work`` with the
         options, settings and model.
+    command : identifies a command that overwrites; empty for others.
     """
 
     like: Job
@@ -68,6 +67,7 @@ class Task:
     bytes: int
     input: str
     work: str
+    command: str = ""
 
     @property
     def recording(self) -> str:
@@ -94,6 +94,7 @@ class Task:
             state="planned",
             input=self.input,
             work=self.work,
+            command=self.command,
         )
 
 
@@ -146,39 +147,6 @@ class Batch:
     left_out: int
 
 
-def name_folders(
-    names: Sequence[str], parents: Sequence[str], known: Mapping[int, str] = MappingProxyType({})
-) -> list[str]:
-    """Return a unique run folder name for each recording: its own name without suffix.
-
-    Recordings with the same name get the name of their parent folder in front, then a number.
-
-    Parameters
-    ----------
-    known : the names that some recordings, by index, already have.
-
-    Examples
-    --------
-    >>> name_folders(["x", "x", "y"], ["a", "b", ""])
-    ['a_x', 'b_x', 'y']
-    >>> name_folders(["x", "x", "y"], ["a", "b", ""], {0: "x"})
-    ['x', 'b_x', 'y']
-    """
-    counts = Counter(names)
-    taken = set(known.values())
-    folders = []
-    for k, (name, parent) in enumerate(zip(names, parents, strict=True)):
-        if k in known:
-            folders.append(known[k])
-            continue
-        unique = name if counts[name] == 1 else f"{parent}_{name}"
-        numbered = (f"{unique}_{number}" for number in count(k + 1))
-        free = next(folder for folder in chain([unique], numbered) if folder not in taken)
-        taken.add(free)
-        folders.append(free)
-    return folders
-
-
 @contextmanager
 def plan_batch(
     job: Job, sources: Sequence[str], out: str, *, shard: str | None = None
@@ -201,7 +169,7 @@ def plan_batch(
     part = Shard.parse(shard) if shard is not None else None
     found = find_recordings(sources)
     there = Location(out, OutputError).names() if is_url(out) else _names_in(Path(out))
-    known = _known_names(found.kept, out, there)
+    known = known_names(found.kept, out, there)
     names = name_folders([s.stem for s in found.kept], [s.parent for s in found.kept], known)
     named = list(zip(names, found.kept, strict=True))
     with open_manifest(out, shard=shard) if len(named) > 1 else nullcontext() as manifest:
@@ -217,9 +185,14 @@ class _Planner:
         self._job, self._out, self._there, self._manifest = job, out, there, manifest
         model_id = load_model(job.model).model_id if manifest is not None else ""
         self._work = _hash([job.settings.as_dict(), job.selection(), model_id])
+        self._command = ""
 
     def tasks(self, named: Sequence[_Named]) -> list[Task]:
         """Return the task of each recording."""
+        if self._job.overwrite:
+            self._command = _command(
+                self._job, self._work, (self._entry(name) for name, _ in named)
+            )
         chunks = [named[first : first + _LOOKS] for first in range(0, len(named), _LOOKS)]
         with ThreadPoolExecutor(_LOOKS_AT_ONCE) as pool:
             looked = pool.map(lambda chunk: [self._task(*each) for each in chunk], chunks)
@@ -230,55 +203,52 @@ class _Planner:
         if not key:
             key, size = look_at(source.url) if source.url else _input_key(Path(source.path))
         task = Task(
-            self._job, self._out, name, source.path, source.url, "new", size, key, self._work
+            self._job,
+            self._out,
+            name,
+            source.path,
+            source.url,
+            "new",
+            size,
+            key,
+            self._work,
+            self._command,
         )
         return dataclasses.replace(task, status=self._status(task))
 
+    def _entry(self, name: str) -> Entry | None:
+        return self._manifest.entries.get(name) if self._manifest is not None else None
+
     def _status(self, task: Task) -> Status:
-        entry = self._manifest.entries.get(task.name) if self._manifest is not None else None
+        entry, overwrite = self._entry(task.name), self._job.overwrite
         there = task.name in self._there
-        names_in_progress = {partial_path(Path(task.name)).name, claim_name(task.name)}
-        begun = not self._there.isdisjoint(names_in_progress)
-        if begun and (self._job.overwrite or not there):
+        if there and entry is not None and entry.state == "complete":
+            same = entry.same_command if overwrite else entry.same_work
+            if same(task.entry()) and _whole(task):
+                return "complete"
+        in_progress = {partial_path(Path(task.name)).name, claim_name(task.name)}
+        if (overwrite or not there) and not self._there.isdisjoint(in_progress):
             return "resume"
-        if there and not self._job.overwrite:
-            same = entry is not None and entry.same_work(task.entry())
-            done = same and entry is not None and entry.state == "complete" and _whole(task)
-            return "complete" if done else "check"
+        if there and not overwrite:
+            return "check"
         return "retry" if entry is not None and entry.state == "failed" else "new"
 
 
-def _known_names(sources: Sequence[Source], out: str, there: set[str]) -> dict[int, str]:
-    """Return the names of the run folders that recordings with a common name have in ``out``.
+def _command(job: Job, work: str, entries: Iterable[Entry | None]) -> str:
+    """Return the id of a command that overwrites: of an interrupted one, or a new one.
 
-    A recording that comes to a batch later must not rename the run of another one.
+    ``entries`` are those of its recordings.
     """
-    counts = Counter(source.stem for source in sources)
-    common = {source.url or os.path.realpath(source.path): k for k, source in enumerate(sources)}
-    common = {path: k for path, k in common.items() if counts[sources[k].stem] > 1}
-    entries = entries_at(out) if common and is_url(out) else {}
-    known: dict[int, str] = {}
-    for name in sorted(there) if common else ():
-        if any(sources[k].stem in name for k in common.values()):
-            k = common.get(_recording_of(out, name, entries.get(name)))
-            if k is not None:
-                known.setdefault(k, name)
-    return known
-
-
-def _recording_of(out: str, name: str, entry: Entry | None) -> str:
-    """Return the path or URL of the recording of a run; empty if there is no readable run."""
-    noted = entry.recording if entry is not None else ""
-    if is_url(noted):
-        return noted
-    if Path(noted).is_absolute():  # other paths depend on the current folder
-        return os.path.realpath(noted)
-    with suppress(ShapecatError, ValueError, LookupError, TypeError):
-        if not is_url(out):
-            return read_run(Path(out, name))["input"]["path"]
-        content = (Location(out) / name / "run.json").read() or b"{}"
-        return str(json.loads(content)["input"]["path"])
-    return ""
+    kind = "discard-labels" if job.discard_labels else "overwrite"
+    begun = [
+        entry
+        for entry in entries
+        if entry is not None
+        and (entry.work, entry.command.partition(":")[0]) == (work, kind)
+        and entry.state in {"planned", "running"}
+    ]
+    last = max(begun, key=lambda entry: entry.time, default=None)
+    return f"{kind}:{uuid4().hex[:8]}" if last is None else last.command
 
 
 def _names_in(folder: Path) -> set[str]:
