@@ -42,7 +42,7 @@ from shapecat.runs.jobs import (
 )
 from shapecat.runs.resuming import has_work, resume
 from shapecat.runs.run_info import RunInfo
-from shapecat.system.files import partial_path
+from shapecat.system.files import input_size, partial_path
 from tests.run_info import run_info
 
 MODEL: Any = SimpleNamespace(model_id="m1", categories=("cup", "can"))
@@ -224,6 +224,24 @@ def test_only_files_of_a_bag_count_as_its_content(tmp_path: Path) -> None:
     (bag / "bag_1.db3.zstd").write_bytes(b"longer than before")
     assert not unchanged(known["files"], bag)
     assert not same_content(known, bag, lambda: content_digest(bag))
+
+
+@pytest.mark.parametrize("whole", [True, False])
+def test_write_ahead_log_is_content_of_its_database(tmp_path: Path, *, whole: bool) -> None:
+    """Its messages are read, so results without them are those of another recording."""
+    base, log = tmp_path / "bag" / "a.db3", tmp_path / "bag" / "a.db3-wal"
+    base.parent.mkdir()
+    base.write_bytes(b"database")
+    source = base.parent if whole else base
+    known: Any = {"files": file_stats(source), "digest": content_digest(source)}
+    log.touch()  # readers of SQLite leave an empty one
+    assert unchanged(known["files"], source)
+    assert content_digest(source) == known["digest"]
+
+    log.write_bytes(b"more messages")
+    assert not unchanged(known["files"], source)
+    assert not same_content(known, source, lambda: content_digest(source))
+    assert input_size(source) == 21
 
 
 def test_run_of_earlier_version_fits_bag_without_its_other_files(tmp_path: Path) -> None:

@@ -24,7 +24,7 @@ from shapecat.batch import claims, storage
 from shapecat.batch.claims import claimed
 from shapecat.batch.finding import find_recordings, look_at
 from shapecat.batch.manifest import Entry, RemoteManifest
-from shapecat.batch.remote import Ticket, process_remote, upload
+from shapecat.batch.remote import Ticket, _download, process_remote, upload
 from shapecat.batch.storage import Location
 from shapecat.errors import OutputError, RecordingError
 from shapecat.runs.folder import RUN_FILES
@@ -242,6 +242,17 @@ def test_names_in_a_bucket_cannot_leave_the_folder(tmp_path: Path) -> None:
     finally:
         del store["/hostile/bag/../../evil"]
     assert not (tmp_path / "evil").exists()
+
+
+def test_write_ahead_log_comes_with_its_database(tmp_path: Path) -> None:
+    """The last messages of a killed recorder are in it."""
+    for name in ("a.db3", "a.db3-wal", "b.db3"):
+        with fsspec.open(f"memory://logs/{name}", "wb") as file:
+            file.write(name.encode())
+    for name in ("a.db3", "b.db3"):
+        _download(f"memory://logs/{name}", tmp_path)
+
+    assert {path.name for path in tmp_path.glob("*.db3*")} == {"a.db3", "a.db3-wal", "b.db3"}
 
 
 def test_bag_in_bucket_is_processed(shapecat: Run, bucket: Path, tmp_path: Path) -> None:

@@ -5,13 +5,13 @@ uploaded last; without run.json, its files do not count as a run.
 """
 
 import dataclasses
-from contextlib import nullcontext
+from contextlib import nullcontext, suppress
 from dataclasses import dataclass
 from pathlib import Path, PurePosixPath
 
 from shapecat.batch.claims import Claim, claimed
 from shapecat.batch.storage import Location
-from shapecat.errors import OutputError, ShapecatError
+from shapecat.errors import OutputError, RecordingError, ShapecatError
 from shapecat.pipeline import process
 from shapecat.runs.folder import OUTPUTS, RUN_FILES, read_run, require_ours, write_run
 from shapecat.runs.jobs import Job, Summary, summarize
@@ -97,6 +97,12 @@ def _process(job: Job, local: Job, observe: Observer, cores: int) -> Summary:
 def _download(url: str, folder: Path) -> Path:
     target = folder / PurePosixPath(url.partition("?")[0].rstrip("/")).name
     Location(url).download(target)
+    if target.suffix.lower() == ".db3" and target.is_file() and "?" not in url:
+        log, there = Location(f"{url}-wal"), None  # of a recorder that was killed
+        with suppress(RecordingError):  # where listing is forbidden, so is asking for a missing one
+            there = log.info()
+        if there is not None:
+            log.download(target.with_name(f"{target.name}-wal"))
     return target
 
 

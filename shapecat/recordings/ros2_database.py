@@ -23,7 +23,7 @@ from shapecat.recordings.messages import (
     sum_topics,
 )
 from shapecat.recordings.recording import Recording
-from shapecat.system.files import scratch_folder
+from shapecat.system.files import scratch_folder, write_ahead_log
 
 __all__ = ["DatabaseRecording"]
 
@@ -79,8 +79,8 @@ class DatabaseRecording(Recording):
 
         The copy and its log use at most half of the free space of the temporary folder.
         """
-        log = self.path.with_name(f"{self.path.name}-wal")
-        if not (log.exists() and log.stat().st_size):
+        log = write_ahead_log(self.path)
+        if log is None:
             return self.path if self.path.suffix == ".db3" else self._renamed()
         try:
             folder = self._cleanup.enter_context(scratch_folder(_SCRATCH))

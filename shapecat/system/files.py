@@ -30,11 +30,14 @@ __all__ = [
     "replacing",
     "require_writable",
     "scratch_folder",
+    "write_ahead_log",
 ]
 
 FSYNC = "SHAPECAT_FSYNC"
 """The environment variable that disables flushing; worker processes inherit it."""
 _PARTS = (".mcap", ".db3", ".mcap.zstd", ".db3.zstd")
+_LOG = "-wal"
+"""End of the name of the write-ahead log that a killed recorder leaves beside its database."""
 _NEW_S = 60
 """Age up to which a temporary folder may not be locked yet."""
 
@@ -174,14 +177,22 @@ def scratch_folder(prefix: str) -> Iterator[Path]:
 
 def is_of_bag(name: str) -> bool:
     """Return whether a file in the folder of a ROS 2 bag belongs to it: a part or the metadata."""
-    return name == "metadata.yaml" or name.endswith(_PARTS)
+    return name == "metadata.yaml" or name.removesuffix(_LOG).endswith(_PARTS)
+
+
+def write_ahead_log(database: Path) -> Path | None:
+    """Return the log beside a database with messages that are not in it; None without any."""
+    log = database.with_name(f"{database.name}{_LOG}")
+    return log if log.is_file() and log.stat().st_size else None
 
 
 def input_files(path: Path) -> list[Path]:
-    """Return a file itself, or the files of the ROS 2 bag in a folder, sorted by name."""
+    """Return a file and its write-ahead log, or the files of the ROS 2 bag in a folder, sorted."""
     if not path.is_dir():
-        return [path]
-    return [file for file in sorted(path.iterdir()) if is_of_bag(file.name) and file.is_file()]
+        log = write_ahead_log(path)
+        return [path] if log is None else [path, log]
+    files = [file for file in sorted(path.iterdir()) if is_of_bag(file.name) and file.is_file()]
+    return [file for file in files if not file.name.endswith(_LOG) or file.stat().st_size]
 
 
 def input_size(path: Path) -> int:
