@@ -17,7 +17,7 @@ from shapecat.outputs.counts import plural
 from shapecat.recordings.colour_image import pixels_of
 from shapecat.runs.finished import FinishedRun, open_source, read_finished
 from shapecat.runs.run_info import RunInfo
-from shapecat.runs.tables import first_stamp, numbers, numbers_or_nan
+from shapecat.runs.tables import first_stamp, numbers_or_nan
 from shapecat.types import Frame, LabelledFrame, LabelledObject
 
 __all__ = ["Run", "RunFrame", "Table"]
@@ -70,12 +70,7 @@ class Table:
             return values.to_numpy(zero_copy_only=False)
         lengths = set(values.value_lengths().to_pylist())
         if len(lengths) == 1 and None not in lengths:
-            flat = values.flatten()
-            text = not pa.types.is_primitive(flat.type)
-            items = (
-                flat.to_numpy(zero_copy_only=False) if text else numbers(pa.chunked_array([flat]))
-            )
-            return items.reshape(len(values), -1)
+            return values.flatten().to_numpy(zero_copy_only=False).reshape(len(values), -1)
         ragged = np.zeros(len(values), object)
         ragged[:] = [np.asarray(row) for row in values.to_pylist()]
         return ragged
