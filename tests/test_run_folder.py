@@ -92,7 +92,8 @@ def test_foreign_folder_is_not_touched(tmp_path: Path, name: str, file: str) -> 
 def test_file_or_link_at_target_is_not_touched(tmp_path: Path) -> None:
     (tmp_path / "lab").write_text("mine")
     (tmp_path / "link").symlink_to(make_run(tmp_path / "elsewhere"))
-    for name in ("lab", "link"):
+    (tmp_path / "broken").symlink_to(tmp_path / "disk that is not mounted")
+    for name in ("lab", "link", "broken"):
         with pytest.raises(OutputError, match="did not make this"), staged(tmp_path / name):
             pytest.fail("must not begin")
 

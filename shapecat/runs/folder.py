@@ -135,7 +135,7 @@ def require_ours(folder: Path, marker: Marker = made_by_run) -> None:
         begun = not any(_strangers(folder, _BEGUN))
         if begun or marker(folder) is not None:
             return
-    elif not folder.exists():
+    elif not os.path.lexists(folder):  # a link may lead to a disk that is not mounted
         return
     msg = f"{folder}: shapecat did not make this; choose another --out, or move it away"
     raise OutputError(msg)
