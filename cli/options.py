@@ -2,6 +2,7 @@
 
 import logging
 import math
+import os
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
@@ -10,11 +11,17 @@ import click
 
 
 class _NonEmptyPath(click.Path):
-    """A path that is not empty: an unset variable of a shell must not mean the current folder."""
+    """A path that is not empty: an unset variable of a shell must not mean the current folder.
+
+    ``~`` is the home folder also where the shell leaves it, as Bash does in ``--out=~/results``.
+    """
 
     def convert(self, value: Any, param: click.Parameter | None, ctx: click.Context | None) -> Any:
         if value == "":
             self.fail("the path is empty", param, ctx)
+        of_home = isinstance(value, str) and value.partition("/")[0] == "~"
+        if of_home:
+            value = os.path.expanduser(value)  # noqa: PTH111  the other raises without a home
         return super().convert(value, param, ctx)
 
 

@@ -5,6 +5,7 @@
 
 import difflib
 import math
+import os
 from collections import Counter
 from collections.abc import Collection, Iterator, Sequence
 from functools import lru_cache
@@ -47,7 +48,7 @@ def open_run(folder: str | Path) -> Run:
     ------
     OutputError : the folder is not a finished run.
     """
-    return Run(Path(folder))
+    return Run(_path(folder))
 
 
 class OpenRecording:
@@ -108,7 +109,7 @@ def open_recording(path: str | Path) -> OpenRecording:
     ------
     RecordingError : the path is not a readable recording, or a folder of several.
     """
-    return OpenRecording(_open_recording(_one_recording(Path(path))))
+    return OpenRecording(_open_recording(_one_recording(_path(path))))
 
 
 def process(
@@ -161,18 +162,18 @@ def process(
     if cores > 1 and runs_again():
         msg = f'cores={cores} starts processes: a script needs `if __name__ == "__main__":`'
         raise ConfigError(msg)
-    source = _one_recording(Path(recording))
+    source = _one_recording(_path(recording))
     job = Job(
         source=source,
-        folder=Path(out) / (source.resolve().name if source.is_dir() else source.stem),
-        settings=with_settings(load_settings(None if config is None else Path(config)), settings),
+        folder=_path(out) / (source.resolve().name if source.is_dir() else source.stem),
+        settings=with_settings(load_settings(None if config is None else _path(config)), settings),
         topics=(topics,) if isinstance(topics, str) else tuple(topics),
         up=up if isinstance(up, str) else ",".join(str(float(part)) for part in up),
         fixed_frame=fixed_frame,
         start_s=None if start_s is None else float(start_s),
         end_s=None if end_s is None else float(end_s),
         every=int(every),
-        model=None if model is None else Path(model),
+        model=None if model is None else _path(model),
         mcap=mcap,
         rrd=rrd,
         color=color,
@@ -217,8 +218,8 @@ def perceive(
     ModelError : the model cannot be read.
     """
     _require_known(settings, perceive.__annotations__)
-    chosen = with_settings(load_settings(None if config is None else Path(config)), settings)
-    categorizer = load_model(None) if model is None else _model_at(Path(model))
+    chosen = with_settings(load_settings(None if config is None else _path(config)), settings)
+    categorizer = load_model(None) if model is None else _model_at(_path(model))
     frame = frame_of(reading, intrinsics)
     compile_all()
     return perceive_alone(frame, up=up, categorizer=categorizer, settings=chosen)
@@ -260,6 +261,11 @@ def _require_known(settings: Collection[str], options: Collection[str]) -> None:
             hint = f"; did you mean {near[0]}?" if near else f"; known: {', '.join(known)}"
             msg = f"unknown option or setting {name}{hint}"
             raise ConfigError(msg)
+
+
+def _path(given: str | Path) -> Path:
+    """Return a path; ``~`` is the home folder."""
+    return Path(os.path.expanduser(given))  # noqa: PTH111  the other raises without a home
 
 
 def _one_recording(path: Path) -> Path:

@@ -21,6 +21,8 @@ import pyarrow.parquet as pq
 import pytest
 from click.testing import Result
 
+from shapecat.api import open_recording
+from shapecat.errors import RecordingError
 from shapecat.runs.folder import read_run
 from tests.scenes import record
 from tests.test_executors import wait_for
@@ -212,6 +214,21 @@ def test_empty_path_is_wrong_usage(
     assert result.exit_code == 2
     assert "the path is empty" in result.stderr
     assert list(tmp_path.iterdir()) == []
+
+
+@pytest.mark.parametrize("kind", ["ANY_PATH", "PATH_OR_URL"])
+def test_home_folder_is_expanded(monkeypatch: pytest.MonkeyPatch, kind: str) -> None:
+    """Bash leaves it in ``--out=~/results``: Arrow would write elsewhere than the other files."""
+    monkeypatch.setenv("HOME", "/home/robot")
+
+    convert = getattr(import_module("shapecat.cli.options"), kind).convert
+
+    given = ("~/results", "~", "~results", "a~/b")
+    assert [os.fspath(convert(path, None, None)) for path in given] == [
+        "/home/robot/results", "/home/robot", "~results", "a~/b",
+    ]  # fmt: skip
+    with pytest.raises(RecordingError, match="/home/robot/none"):
+        open_recording("~/none.mcap")
 
 
 @pytest.mark.parametrize("there", ["x.mcap", "x.truth.json", "x.labels.npz"])
