@@ -15,7 +15,7 @@ import pytest
 from shapecat.batch.finding import Source, _key_of_all, find_recordings
 from shapecat.batch.ledger import Ledger, Outcome
 from shapecat.batch.manifest import Entry, Manifest, RemoteManifest, State
-from shapecat.batch.naming import name_folders
+from shapecat.batch.naming import known_names, name_folders
 from shapecat.batch.plans import Shard, plan_batch
 from shapecat.batch.remote import Ticket
 from shapecat.batch.runs import _reporter, exit_code, process_here, process_on
@@ -844,6 +844,22 @@ def test_run_keeps_folder_when_recording_of_same_name_is_added(
 
     with plan_batch(Job(Path(), Path()), days, out) as batch:
         assert [task.name for task in batch.tasks] == ["tuesday_lab", name]
+
+
+def test_copy_of_run_keeps_its_name(tmp_path: Path) -> None:
+    """It would be overwritten instead of the run, if its name contains that of the recording."""
+    for name in ("a copy of monday_lab", "monday_lab"):
+        (tmp_path / "out" / name).mkdir(parents=True)
+        path = str((tmp_path / "monday" / "lab.mcap").resolve())
+        write_run(tmp_path / "out" / name, run_info(input={"path": path}))
+    for day in ("monday", "tuesday"):
+        (tmp_path / day).mkdir()
+        (tmp_path / day / "lab.mcap").write_bytes(day.encode())
+    sources = find_recordings([str(tmp_path / day) for day in ("monday", "tuesday")]).kept
+
+    assert known_names(sources, str(tmp_path / "out"), {"a copy of monday_lab", "monday_lab"}) == {
+        0: "monday_lab"
+    }
 
 
 @pytest.mark.parametrize("known_from", ["all", "1-of-2", "relative path", "run.json"])

@@ -2,6 +2,7 @@
 
 import json
 import os
+import re
 from collections import Counter
 from collections.abc import Mapping, Sequence
 from contextlib import suppress
@@ -16,6 +17,8 @@ from shapecat.errors import ShapecatError
 from shapecat.runs.folder import read_run
 
 __all__ = ["known_names", "name_folders"]
+
+_NUMBER = re.compile(r"_\d+$")
 
 
 def name_folders(
@@ -60,9 +63,11 @@ def known_names(sources: Sequence[Source], out: str, there: set[str]) -> dict[in
     common = {source.url or os.path.realpath(source.path): k for k, source in enumerate(sources)}
     common = {path: k for path, k in common.items() if counts[sources[k].stem] > 1}
     entries = entries_at(out) if common and is_url(out) else {}
+    own = {sources[k].stem for k in common.values()}
+    own |= {f"{sources[k].parent}_{sources[k].stem}" for k in common.values()}
     known: dict[int, str] = {}
     for name in sorted(there) if common else ():
-        if any(sources[k].stem in name for k in common.values()):
+        if name in own or _NUMBER.sub("", name) in own:
             k = common.get(_recording_of(out, name, entries.get(name)))
             if k is not None:
                 known.setdefault(k, name)
