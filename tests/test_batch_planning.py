@@ -862,6 +862,22 @@ def test_copy_of_run_keeps_its_name(tmp_path: Path) -> None:
     }
 
 
+def test_recording_of_a_batch_keeps_its_name_alone(tmp_path: Path) -> None:
+    """To process it again by itself must not make a second run of it."""
+    (tmp_path / "monday").mkdir()
+    (tmp_path / "monday" / "lab.mcap").write_bytes(b"recording")
+    name, out = "monday_lab", tmp_path / "out"
+    path = (tmp_path / "monday" / "lab.mcap").resolve()
+    (out / name).mkdir(parents=True)
+    write_run(out / name, run_info(input={"path": str(path)}))
+    sources = find_recordings([str(path)]).kept
+
+    assert known_names(sources, str(out), {name}) == {0: name}
+    assert known_names(sources, str(out), {name, "lab"}) == {}
+    write_run(out / name, run_info(input={"path": "/another/monday/lab.mcap"}))
+    assert known_names(sources, str(out), {name}) == {}
+
+
 @pytest.mark.parametrize("known_from", ["all", "1-of-2", "relative path", "run.json"])
 def test_run_at_url_keeps_folder_when_recording_of_same_name_is_added(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, known_from: str

@@ -55,22 +55,30 @@ def name_folders(
 
 
 def known_names(sources: Sequence[Source], out: str, there: set[str]) -> dict[int, str]:
-    """Return the names of the run folders that recordings with a common name have in ``out``.
+    """Return the names of the run folders that recordings, by index, already have in ``out``.
 
-    A recording that comes to a batch later must not rename the run of another one.
+    A recording that comes to a batch later, or is processed alone, must not rename a run. Those
+    whose own name no other recording shares, and is in ``out``, are left out.
+
+    Parameters
+    ----------
+    there : the names in ``out``.
     """
     counts = Counter(source.stem for source in sources)
-    common = {source.url or os.path.realpath(source.path): k for k, source in enumerate(sources)}
-    common = {path: k for path, k in common.items() if counts[sources[k].stem] > 1}
-    entries = entries_at(out) if common and is_url(out) else {}
-    own = {sources[k].stem for k in common.values()}
-    own |= {f"{sources[k].parent}_{sources[k].stem}" for k in common.values()}
+    unsure = {
+        source.url or os.path.realpath(source.path): k
+        for k, source in enumerate(sources)
+        if counts[source.stem] > 1 or source.stem not in there
+    }
+    named = [sources[k] for k in unsure.values()]
+    own = {name for source in named for name in (source.stem, f"{source.parent}_{source.stem}")}
+    found = sorted(name for name in there if name in own or _NUMBER.sub("", name) in own)
+    entries = entries_at(out) if found and is_url(out) else {}
     known: dict[int, str] = {}
-    for name in sorted(there) if common else ():
-        if name in own or _NUMBER.sub("", name) in own:
-            k = common.get(_recording_of(out, name, entries.get(name)))
-            if k is not None:
-                known.setdefault(k, name)
+    for name in found:
+        k = unsure.get(_recording_of(out, name, entries.get(name)))
+        if k is not None:
+            known.setdefault(k, name)
     return known
 
 
