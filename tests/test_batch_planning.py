@@ -2,7 +2,7 @@
 
 import json
 import os
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from concurrent.futures import CancelledError, Executor, Future
 from dataclasses import replace
 from itertools import islice
@@ -477,6 +477,35 @@ def test_batch_checks_run_without_its_outputs(
     assert status_of(replace(job, overwrite=True), source, out) == "resume"
 
 
+CHANGED: Mapping[str, Callable[[RunInfo], object]] = {
+    "settings": lambda run: run["settings"].update(seed=8),
+    "model": lambda run: run["model"].update({"id": "m2"}),
+    "range": lambda run: run["options"].update({"end_s": 3.0}),
+    "topics": lambda run: run["options"].update({"topics": ["/b"]}),
+}
+
+
+@pytest.mark.parametrize("name", [None, *CHANGED])
+def test_batch_notices_run_that_was_replaced_alone(
+    source: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, name: str | None
+) -> None:
+    """A command for one recording, and Python, write no manifest."""
+    (source.parent / "other.mcap").write_bytes(b"another")
+    out, job = tmp_path / "out", Job(Path(), Path(), topics=("a",), mcap=False, rrd=False)
+    (out / "lab").mkdir(parents=True)
+    run = planned(source, topics=("/a",))  # as the topic is called in the recording
+    if name is not None:
+        CHANGED[name](run)
+    write_run(out / "lab", run)
+    monkeypatch.setattr("shapecat.batch.plans.load_model", lambda _path: MODEL)
+    with plan_batch(job, [str(source.parent)], str(out)) as batch:
+        assert batch.manifest is not None
+        (task,) = (task for task in batch.tasks if task.name == "lab")
+        batch.manifest.record([replace(task.entry(), state="complete")])
+
+    assert status_of(job, source, out) == ("complete" if name is None else "check")
+
+
 def overwritten(sources: Path, out: Path, *, most: int = 9, **changes: Any) -> dict[str, Any]:
     """Overwrite, until ``most`` runs are complete; return the status with which each began."""
     job = Job(Path(), Path(), mcap=False, rrd=False, overwrite=True, **changes)
@@ -495,7 +524,7 @@ def test_interrupted_overwriting_continues(
 
     def attempt(job: Job, *_: object, **__: object) -> Outcome:
         job.folder.mkdir(parents=True, exist_ok=True)
-        write_run(job.folder, planned(job.source))
+        write_run(job.folder, planned(job.source, every=job.every))
         counts = {"frames": 3, "tracks": {"cup": 2}}
         return Outcome(job, Summary(job.name, job.folder, counts, 1.5, ()))
 

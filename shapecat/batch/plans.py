@@ -38,6 +38,9 @@ _LOOKS_AT_ONCE = 16
 _LOOKS = 256
 """Recordings per unit of work of such a thread."""
 
+_SELECTION = ("up", "fixed_frame", "start_s", "end_s", "every", "color")
+"""Options that a run keeps as they were given; the topics are those that were chosen."""
+
 Status = Literal["complete", "resume", "retry", "check", "new"]
 
 
@@ -183,8 +186,8 @@ class _Planner:
 
     def __init__(self, job: Job, out: str, there: set[str], manifest: Manifest | None) -> None:
         self._job, self._out, self._there, self._manifest = job, out, there, manifest
-        model_id = load_model(job.model).model_id if manifest is not None else ""
-        self._work = _hash([job.settings.as_dict(), job.selection(), model_id])
+        self._model_id = load_model(job.model).model_id if manifest is not None else ""
+        self._work = _hash([job.settings.as_dict(), job.selection(), self._model_id])
         self._command = ""
 
     def tasks(self, named: Sequence[_Named]) -> list[Task]:
@@ -224,7 +227,7 @@ class _Planner:
         there = task.name in self._there
         if there and entry is not None and entry.state == "complete":
             same = entry.same_command if overwrite else entry.same_work
-            if same(task.entry()) and _whole(task):
+            if same(task.entry()) and _whole(task, self._model_id):
                 return "complete"
         in_progress = {partial_path(Path(task.name)).name, claim_name(task.name)}
         if (overwrite or not there) and not self._there.isdisjoint(in_progress):
@@ -258,17 +261,28 @@ def _names_in(folder: Path) -> set[str]:
     return set()
 
 
-def _whole(task: Task) -> bool:
-    """Return whether a run has all its outputs; an interrupted `annotate` leaves some missing."""
+def _whole(task: Task, model_id: str) -> bool:
+    """Return whether a run that the manifest lists as complete is the one wanted, with its outputs.
+
+    A command for this recording alone may have replaced it, and an interrupted `annotate` leaves
+    outputs missing.
+    """
     job = task.job
     if job.target:
         return True  # complete if the manifest says so
-    outputs = [name for option, name in OUTPUT_OPTIONS.items() if getattr(job, option)]
     try:
         run = read_run(job.folder)
     except OutputError:
         return False
-    return all(name in run["seconds"] and (job.folder / name).exists() for name in outputs)
+    outputs = [name for option, name in OUTPUT_OPTIONS.items() if getattr(job, option)]
+    topics = [topic.strip("/") for topic in run["options"]["topics"]]
+    return (
+        all(name in run["seconds"] and (job.folder / name).exists() for name in outputs)
+        and run["settings"] == job.settings.as_dict()
+        and run["model"]["id"] == model_id
+        and all(run["options"].get(name) == getattr(job, name) for name in _SELECTION)
+        and (not job.topics or topics == [topic.strip("/") for topic in job.topics])
+    )
 
 
 def _input_key(source: Path) -> tuple[str, int]:
