@@ -35,6 +35,7 @@ from shapecat.runs.jobs import (
     Summary,
     describe_run,
     differences,
+    forget_old_labels,
     identify,
     keep_labels,
     require_unchanged,
@@ -111,8 +112,10 @@ def process(job: Job, observe: Observer = ignore, *, cores: int = 1) -> Summary:
             write_run(folder, run)
             discard_segments(folder)
             _once("track", folder, run, lambda: track(folder, run, job))
-            _once("labels", folder, run, lambda: keep_labels(folder, run, job))
-            annotate(folder, recording, run, observe)
+            for _ in range(2):  # labels may be given while the outputs are written
+                forget_old_labels(folder, run, job)
+                _once("labels", folder, run, lambda: keep_labels(folder, run, job))
+                annotate(folder, recording, run, observe)
             require_unchanged(folder, run, job.source)
             run["seconds"]["compile"] = compiling_s
             run["seconds"]["total"] = earlier + time.perf_counter() - begun

@@ -14,6 +14,7 @@ from shapecat.config import Settings, with_overrides
 from shapecat.errors import OutputError
 from shapecat.runs.folder import read_run, write_run
 from shapecat.runs.jobs import Job
+from shapecat.runs.track_table import read_track_table
 from shapecat.system.files import partial_path
 from tests.conftest import Guesser
 
@@ -187,3 +188,66 @@ def test_seconds_of_killed_run_count_once(
 
     before = total or 100 * len(run["seconds"])
     assert before < read_run(job.folder)["seconds"]["total"] < before + 90
+
+
+def give_label(folder: Path, label: str) -> None:
+    """Give the first track a label, or none."""
+    rows = [row for row in read_track_table(folder / "tracks.csv").rows if row.track == 1]
+    assert len(rows) == 1
+    lines = (folder / "tracks.csv").read_text("utf-8").splitlines()
+    at = lines[0].split(",").index("label")
+    for k, line in enumerate(lines):
+        cells = line.split(",")
+        if cells[0] == "1":
+            lines[k] = ",".join([*cells[:at], label, *cells[at + 1 :]])
+    (folder / "tracks.csv").write_text("\n".join(lines) + "\n", "utf-8")
+
+
+def labels(folder: Path) -> set[str]:
+    return {row.label for row in read_track_table(folder / "tracks.csv").rows} - {""}
+
+
+@pytest.mark.usefixtures("perceiving_fails")
+@pytest.mark.parametrize(("later", "kept"), [("bowl", {"bowl"}), ("", set()), ("vase", {"vase"})])
+def test_labels_given_after_an_interruption_are_transferred(
+    job: Job, monkeypatch: pytest.MonkeyPatch, later: str, kept: set[str]
+) -> None:
+    """The replaced run is labelled until the new one is complete."""
+    job = replace(job, settings=changed("tracking.gate_m=0.1"), rrd=False, mcap=False)
+    give_label(job.folder, "vase")
+    with monkeypatch.context() as patch, pytest.raises(KeyboardInterrupt):
+        patch.setattr(pipeline, "require_unchanged", interrupt)
+        pipeline.process(job)
+    assert labels(job.folder) == labels(partial_path(job.folder)) == {"vase"}
+    give_label(job.folder, later)
+
+    summary = pipeline.process(job)
+
+    assert labels(job.folder) == kept
+    assert bool(summary.corrections) == bool(kept)
+
+
+def interrupt(*_: Any) -> None:
+    raise KeyboardInterrupt
+
+
+@pytest.mark.usefixtures("perceiving_fails")
+def test_labels_given_while_outputs_are_written_are_transferred(
+    job: Job, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """That takes minutes in a long recording."""
+    job = replace(job, settings=changed("tracking.gate_m=0.1"), rrd=False)
+    written, write = [], pipeline.annotate
+
+    def annotate(folder: Path, recording: Any, run: Any, observe: Any) -> None:
+        if "annotated.mcap" not in run["seconds"]:
+            written.append(labels(folder))
+        write(folder, recording, run, observe)
+        if len(written) == 1:
+            give_label(job.folder, "vase")
+
+    monkeypatch.setattr(pipeline, "annotate", annotate)
+    pipeline.process(job)
+
+    assert written == [set(), {"vase"}]
+    assert labels(job.folder) == {"vase"}

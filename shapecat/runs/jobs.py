@@ -15,7 +15,7 @@ from shapecat.config import Settings
 from shapecat.errors import OutputError, RecordingError
 from shapecat.learning import Categorizer
 from shapecat.runs.corrections import PREVIOUS, has_labels
-from shapecat.runs.folder import clear
+from shapecat.runs.folder import OUTPUTS, clear, write_run
 from shapecat.runs.identity import (
     ContentDigest,
     file_stats,
@@ -25,6 +25,7 @@ from shapecat.runs.identity import (
 )
 from shapecat.runs.label_transfer import lost_labels, transfer_labels
 from shapecat.runs.run_info import Options, RunInfo
+from shapecat.runs.track_table import ORIGINAL
 from shapecat.system.files import input_size, replacing
 
 __all__ = [
@@ -32,6 +33,7 @@ __all__ = [
     "Summary",
     "describe_run",
     "differences",
+    "forget_old_labels",
     "identify",
     "keep_labels",
     "require_unchanged",
@@ -227,8 +229,8 @@ def keep_labels(folder: Path, run: RunInfo, job: Job) -> None:
     ------
     OutputError : the table of the replaced results is unreadable, or a file cannot be written.
     """
-    previous = job.folder / "tracks.csv"
-    if job.discard_labels or not has_labels(previous):
+    table = _labelled_table(job)
+    if not table:
         return
     table = previous.read_bytes()
     with replacing(folder / PREVIOUS) as path:
@@ -242,6 +244,34 @@ def keep_labels(folder: Path, run: RunInfo, job: Job) -> None:
         with replacing(job.folder / copy) as path:
             path.write_bytes(table)
     run["corrections"] = transfer.as_dict()
+
+
+def forget_old_labels(folder: Path, run: RunInfo, job: Job) -> None:
+    """Undo `keep_labels` if the replaced results have got other labels since.
+
+    Labels and outputs then count as missing in ``run``.
+
+    Raises
+    ------
+    OutputError : as for `keep_labels`.
+    """
+    previous = folder / PREVIOUS
+    kept = previous.read_bytes() if previous.exists() else b""
+    if "labels" not in run["seconds"] or kept == _labelled_table(job):
+        return
+    with replacing(folder / "tracks.csv") as path:
+        path.write_bytes((folder / ORIGINAL).read_bytes())
+    run.pop("corrections", None)
+    for phase in ("labels", *OUTPUTS):
+        run["seconds"].pop(phase, None)
+    write_run(folder, run)
+    previous.unlink(missing_ok=True)
+
+
+def _labelled_table(job: Job) -> bytes:
+    """Return the table of the replaced results if it has labels to keep, else nothing."""
+    table = job.folder / "tracks.csv"
+    return b"" if job.discard_labels or not has_labels(table) else table.read_bytes()
 
 
 def summarize(job: Job, run: RunInfo, *, processed: bool = True) -> Summary:
