@@ -1,12 +1,20 @@
 import errno
 import os
 from pathlib import Path
+from threading import Thread
 from typing import Any
 
 import pytest
 
 from shapecat.errors import OutputError
-from shapecat.runs.folder import previous_path, read_run, recover, staged, write_run
+from shapecat.runs.folder import (
+    previous_path,
+    read_run,
+    recover,
+    staged,
+    write_run,
+    writing_outputs,
+)
 from shapecat.runs.identity import content_digest, file_stats, new_id, same_content
 from shapecat.system.files import holding, partial_path, replacing, require_writable
 from tests.run_info import run_info
@@ -99,6 +107,25 @@ def test_file_or_link_at_target_is_not_touched(tmp_path: Path) -> None:
 
     assert (tmp_path / "lab").read_text() == "mine"
     assert (tmp_path / "elsewhere" / "run.json").exists()
+
+
+def test_run_is_replaced_after_its_outputs_are_written(tmp_path: Path) -> None:
+    """Otherwise `annotate` ends by writing the old run.json into the new run."""
+    make_run(tmp_path / "lab", tracks_parquet="old")
+
+    def replace_it() -> None:
+        with staged(tmp_path / "lab") as hidden:
+            write_run(hidden, run_info(id=new_id()))
+            (hidden / "tracks.parquet").write_text("new")
+
+    replacing = Thread(target=replace_it)
+    with writing_outputs(tmp_path / "lab"):
+        replacing.start()
+        replacing.join(0.3)
+        assert contents(tmp_path / "lab")["tracks.parquet"] == "old"
+    replacing.join()
+
+    assert contents(tmp_path / "lab")["tracks.parquet"] == "new"
 
 
 def test_user_files_move_to_new_results(tmp_path: Path) -> None:

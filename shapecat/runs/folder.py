@@ -8,13 +8,13 @@ import json
 import os
 import shutil
 from collections.abc import Callable, Collection, Iterator, Mapping
-from contextlib import contextmanager, suppress
+from contextlib import contextmanager, nullcontext, suppress
 from pathlib import Path
 from typing import Literal
 
 from shapecat.errors import OutputError, explained
 from shapecat.runs.run_info import RunInfo, is_run_info
-from shapecat.system.files import flush, lock, partial_path, replacing
+from shapecat.system.files import flush, holding, lock, partial_path, replacing
 
 __all__ = [
     "OUTPUTS",
@@ -52,6 +52,10 @@ _MADE = (
     *(partial_path(Path(name)).name for name in RUN_FILES),
     *RUN_FILES,
 )
+
+_OF_OUTPUTS = "tracks.parquet"
+"""The file whose lock is for the outputs, since nothing replaces it. The lock of the folder is for
+labels, which never wait long."""
 
 _BEGUN = (".run.json.partial", ".export.json.partial")
 """Files that a kill may leave in a folder without a marker."""
@@ -147,11 +151,16 @@ def _strangers(folder: Path, names: Collection[str]) -> Iterator[Path]:
 
 
 def _replace(folder: Path, hidden: Path, marker: Marker) -> None:
-    """Rename the complete hidden folder; at any moment the old or the new folder is complete."""
+    """Rename the complete hidden folder; at any moment the old or the new folder is complete.
+
+    If a command writes the outputs of the old folder, wait for it: it would go on in the new one.
+    """
     flush(hidden)
     if folder.exists():
         require_ours(folder, marker)
-        folder.rename(previous_path(folder))
+        outputs = folder / _OF_OUTPUTS
+        with holding(outputs) if outputs.exists() else nullcontext():
+            folder.rename(previous_path(folder))
     hidden.rename(folder)
     flush(folder.parent)
     _retire(folder, marker)
@@ -236,8 +245,7 @@ def writing_outputs(folder: Path) -> Iterator[None]:
     OutputError : another process is writing them, or the folder is not a finished run.
     """
     with explained(str(folder), OutputError):
-        # Nothing replaces this file. The lock of the folder is for labels, which never wait long.
-        held = lock(folder / "tracks.parquet")
+        held = lock(folder / _OF_OUTPUTS)
     if held is None:
         msg = f"{folder}: another command is writing its outputs; wait for it and run this again"
         raise OutputError(msg)
