@@ -320,7 +320,7 @@ PLACES = ["memory://half/run", "s3://lab/half/run"]
 def test_interrupted_upload_shows_no_run(
     made: Path, monkeypatch: pytest.MonkeyPatch, url: str
 ) -> None:
-    """run.json must appear after all other files."""
+    """run.json must appear after all other files, and annotated.mcap not look like a recording."""
     names = {path.name for path in made.iterdir()}
     sent = Location.upload
     for cut in range(len(names)):
@@ -339,6 +339,8 @@ def test_interrupted_upload_shows_no_run(
                 upload(made, url, claim)
         assert "run.json" not in files(url)
         assert len(files(url)) == cut
+        with pytest.raises(RecordingError, match="no recording found"):
+            find_recordings([url.removesuffix("run")])
 
     with claimed(url, "one") as claim:
         upload(made, url, claim)

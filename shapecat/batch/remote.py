@@ -155,7 +155,9 @@ def _replaced(place: Location) -> Location:
 
 
 def upload(folder: Path, url: str, claim: Claim) -> None:
-    """Upload a run folder, run.json last.
+    """Upload a run folder, frames.parquet first and run.json last.
+
+    One of them shows a search for recordings that annotated.mcap is none.
 
     Raises
     ------
@@ -174,7 +176,7 @@ def upload(folder: Path, url: str, claim: Claim) -> None:
                 (place / name).copy(old / name)
         (place / "run.json").remove()
     sent = sorted(path.name for path in folder.iterdir() if path.name in RUN_FILES)
-    for name in sorted(sent, key=lambda name: name == "run.json"):
+    for name in sorted(sent, key=lambda name: (name == "run.json", name != "frames.parquet")):
         if name == "run.json":
             claim.require()
         (place / name).upload(folder / name)
