@@ -232,7 +232,6 @@ def keep_labels(folder: Path, run: RunInfo, job: Job) -> None:
     table = _labelled_table(job)
     if not table:
         return
-    table = previous.read_bytes()
     with replacing(folder / PREVIOUS) as path:
         path.write_bytes(table)
     try:
