@@ -1,8 +1,8 @@
 """A headless Chromium, if installed, driven over the WebDriver protocol."""
 
 import json
+import re
 import shutil
-import socket
 import subprocess
 import time
 import urllib.request
@@ -13,6 +13,8 @@ from typing import Any
 import pytest
 
 __all__ = ["Browser"]
+
+_WAIT_S = 60
 
 _KEYS = {
     "Backspace": "\ue003",
@@ -37,18 +39,17 @@ class Browser:
     """A headless Chromium, driven over the WebDriver protocol."""
 
     def __init__(self, folder: Path) -> None:
-        with socket.socket() as free:
-            free.bind(("127.0.0.1", 0))
-            port = free.getsockname()[1]
         driver = shutil.which("chromedriver")
         if driver is None or not (shutil.which("chromium") or shutil.which("google-chrome")):
             pytest.skip("no Chromium with its driver on this machine")
-        self._base = f"http://127.0.0.1:{port}"
         self.downloads = folder / "downloads"
         self.downloads.mkdir()
         self._process = subprocess.Popen(
-            [driver, f"--port={port}"], stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL
+            [driver, "--port=0"], stdout=subprocess.PIPE, stderr=subprocess.DEVNULL, text=True
         )
+        assert self._process.stdout is not None
+        ports = (re.search(r"successfully on port (\d+)", line) for line in self._process.stdout)
+        self._base = f"http://127.0.0.1:{next(filter(None, ports))[1]}"
         arguments = [
             "--headless",
             "--no-sandbox",
@@ -63,17 +64,10 @@ class Browser:
             "goog:loggingPrefs": {"browser": "ALL"},
             "timeouts": {"pageLoad": 60000},
         }
-        for _ in range(100):
-            try:
-                self.session = self._send(
-                    "POST", "/session", {"capabilities": {"alwaysMatch": wanted}}
-                )["sessionId"]
-                break
-            except ConnectionError:
-                time.sleep(0.1)
-            except urllib.error.URLError:
-                time.sleep(0.1)
-        self._allow_downloads()
+        found = self._send("POST", "/session", {"capabilities": {"alwaysMatch": wanted}})
+        self.session = found["sessionId"]
+        where = {"behavior": "allow", "downloadPath": str(self.downloads)}
+        self.cdp("Browser.setDownloadBehavior", where)
 
     def close(self) -> None:
         """End the browser and its driver."""
@@ -81,7 +75,7 @@ class Browser:
             self._send("DELETE", f"/session/{self.session}")
         finally:
             self._process.terminate()
-            self._process.wait(10)
+            self._process.communicate(timeout=60)
 
     def _send(self, method: str, path: str, body: object = None) -> Any:
         content = None if body is None else json.dumps(body).encode()
@@ -136,24 +130,21 @@ class Browser:
         self._ask("DELETE", "/window")
 
     def renew(self) -> None:
-        """Replace all tabs by a new one and clear their console messages."""
-        new, left = self.tab(), self.tabs()
-        for tab in left:
+        """Leave one empty tab, without stored corrections and console messages of other tests."""
+        first, *others = self.tabs()
+        for tab in others:
             self.turn_to(tab)
-            if tab != new:
-                self.close_tab()
-        self.turn_to(new)
-        self._allow_downloads()
+            self.close_tab()
+        self.turn_to(first)
+        self.open("about:blank")
+        stored = {"origin": "file://", "storageTypes": "local_storage"}
+        self.cdp("Storage.clearDataForOrigin", stored)
         self.complaints()
-
-    def _allow_downloads(self) -> None:
-        """Allow downloads in the current tab; each tab needs this."""
-        where = {"behavior": "allow", "downloadPath": str(self.downloads)}
-        self.cdp("Browser.setDownloadBehavior", where)
 
     def wait(self, script: str) -> None:
         """Wait until a script returns true."""
-        for _ in range(400):
+        deadline = time.monotonic() + _WAIT_S
+        while time.monotonic() < deadline:
             if self.run(script) is True:
                 return
             time.sleep(0.05)
@@ -169,7 +160,8 @@ class Browser:
 
     def downloaded(self) -> Path:
         """Wait for a download to be complete."""
-        for _ in range(100):
+        deadline = time.monotonic() + _WAIT_S
+        while time.monotonic() < deadline:
             with suppress(FileNotFoundError):  # the browser renames it
                 found = [file for file in self.downloads.iterdir() if file.stat().st_size]
                 if [file.suffix for file in found] == [".csv"]:  # no .crdownload or placeholder

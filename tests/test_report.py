@@ -508,13 +508,6 @@ def changes(browser: Browser) -> dict[int, str]:
     return dict(browser.run(script))
 
 
-def open_anew(browser: Browser, page: Path) -> None:
-    """Open a page without the corrections that other tests made on the same tracks."""
-    browser.open(page)
-    browser.run("localStorage.clear()")
-    browser.open(page)
-
-
 def test_new_page_keeps_corrections_not_downloaded(
     browser: Browser, run: Path, drawn: RunReport
 ) -> None:
@@ -522,7 +515,7 @@ def test_new_page_keeps_corrections_not_downloaded(
     reports = Reports([replace(drawn, folder=run)])
     (page,) = reports.write()
     a, b = (row.track for row in read_track_table(run / "tracks.csv").rows[:2])
-    open_anew(browser, page)
+    browser.open(page)
     for track in (a, b):
         browser.click(f"#track-{track} button[data-label='delete']")
     relabel(run, {b: "teapot"})
@@ -556,7 +549,7 @@ def test_new_name_has_its_key_after_reload(browser: Browser, reported_run: Path)
     """It was listed nowhere, so the next object had to be named again."""
     page = reported_run / "report.html"
     a, b = (row.track for row in read_track_table(reported_run / "tracks.csv").rows[:2])
-    open_anew(browser, page)
+    browser.open(page)
     browser.type(f"#track-{a} .other", "mug\n")
     browser.open(page)
     browser.run(f"document.getElementById('track-{b}').focus()")
@@ -566,44 +559,41 @@ def test_new_name_has_its_key_after_reload(browser: Browser, reported_run: Path)
     assert "8 mug" in browser.run("return document.getElementById('digits').textContent")
 
 
-@pytest.mark.parametrize("keys", ["npen", "m2", "m9x"])
-def test_escape_leaves_label_as_it_was(browser: Browser, reported_run: Path, keys: str) -> None:
+def test_escape_leaves_label_as_it_was(browser: Browser, reported_run: Path) -> None:
     """It gave the label typed so far, and an invalid one kept the focus."""
-    page = reported_run / "report.html"
     a, b, c = (row.track for row in read_track_table(reported_run / "tracks.csv").rows[:3])
-    open_anew(browser, page)
+    browser.open(reported_run / "report.html")
     browser.click(f"#track-{a} button[data-label='delete']")
     browser.type(f"#track-{b} .other", "mug\n")
-    for track in (a, b, c):
-        browser.run(f"document.getElementById('track-{track}').focus()")
-        browser.press(*keys, "Escape")
-        browser.wait(f"return document.activeElement.id === 'track-{track}'")
+    for keys in ("npen", "m2", "m9x"):
+        for track in (a, b, c):
+            browser.run(f"document.getElementById('track-{track}').focus()")
+            browser.press(*keys, "Escape")
+            browser.wait(f"return document.activeElement.id === 'track-{track}'")
 
-    assert changes(browser) == {a: "→ delete", b: "→ mug"}
-    fields = "return [...document.querySelectorAll('.other')].map((one) => one.value)"
-    assert list(filter(None, browser.run(fields))) == ["mug"]
-    assert browser.run("return document.querySelectorAll('.other:invalid').length") == 0
+        assert changes(browser) == {a: "→ delete", b: "→ mug"}, keys
+        fields = "return [...document.querySelectorAll('.other')].map((one) => one.value)"
+        assert list(filter(None, browser.run(fields))) == ["mug"], keys
+        assert browser.run("return document.querySelectorAll('.other:invalid').length") == 0, keys
 
 
-@pytest.mark.parametrize("key", ["Enter", "Escape"])
-def test_focus_leaves_text_field_before_next_key(
-    browser: Browser, reported_run: Path, key: str
-) -> None:
+def test_focus_leaves_text_field_before_next_key(browser: Browser, reported_run: Path) -> None:
     """It left a moment later: out of the text field that the next key had opened."""
-    open_anew(browser, reported_run / "report.html")
+    browser.open(reported_run / "report.html")
     track = read_track_table(reported_run / "tracks.csv").rows[0].track
-    browser.type(f"#track-{track} .other", "mug")
-    press = f"{{ key: '{key}', bubbles: true, cancelable: true, isComposing: composing }}"
     browser.run(
-        f"window.press = (composing) => document.activeElement.dispatchEvent("
-        f"new KeyboardEvent('keydown', {press}))"
+        "window.press = (key, isComposing) => document.activeElement.dispatchEvent("
+        "new KeyboardEvent('keydown', { key, bubbles: true, cancelable: true, isComposing }))"
     )
     focused = "return document.activeElement.id || document.activeElement.className"
+    for key, changed in (("Escape", {}), ("Enter", {track: "→ mug"})):
+        browser.type(f"#track-{track} .other", "mug")
 
-    assert browser.run(f"press(true); {focused}") == "other"  # the key ends a composed character
-    assert changes(browser) == {}
-    assert browser.run(f"press(false); {focused}") == f"track-{track}"
-    assert changes(browser) == ({track: "→ mug"} if key == "Enter" else {})
+        # The key ends a composed character.
+        assert browser.run(f"press('{key}', true); {focused}") == "other", key
+        assert changes(browser) == {}, key
+        assert browser.run(f"press('{key}', false); {focused}") == f"track-{track}", key
+        assert changes(browser) == changed, key
 
 
 LABELS = (
@@ -648,7 +638,7 @@ def test_page_and_annotate_accept_the_same_labels(
     assert relabel(run, {b: "new pan", c: "delete", d: f"merge with {a}"}) == {}
     (page,) = Reports([replace(drawn, folder=run)]).write()
     labels = [label.format(a=a, b=b, c=c, d=d, e=e) for label in LABELS]
-    open_anew(browser, page)
+    browser.open(page)
     accepted = browser.run(
         f"const field = document.querySelector('#track-{a} .other');"
         f"return {json.dumps(labels)}.filter((label) => {{"
@@ -678,7 +668,7 @@ def test_page_refuses_to_delete_a_track_that_others_are_merged_with(
     """Keys and buttons give labels, too. The capital is of one who types the label."""
     page = reported_run / "report.html"
     a, b = (row.track for row in read_track_table(reported_run / "tracks.csv").rows[:2])
-    open_anew(browser, page)
+    browser.open(page)
     browser.type(f"#track-{a} .other", f"merge with {b}\n")
     browser.run(f"document.getElementById('track-{b}').focus()")
     browser.press("d")
@@ -713,8 +703,6 @@ def test_corrections_are_kept_for_one_run_only(run: Path, drawn: RunReport) -> N
 def test_filters_select_cards(browser: Browser, reported_run: Path) -> None:
     page = reported_run / "report.html"
     rows = read_track_table(reported_run / "tracks.csv").rows
-    browser.open(page)
-    browser.run("localStorage.clear()")
     browser.open(page)
     shown = (
         "return [...document.querySelectorAll('.card:not([hidden])')].map(c => +c.dataset.track)"
@@ -754,7 +742,7 @@ def test_filters_select_cards(browser: Browser, reported_run: Path) -> None:
 
 def test_keys_label_no_hidden_card(browser: Browser, reported_run: Path) -> None:
     """The current card stayed current when a filter hid it, and got the label unseen."""
-    open_anew(browser, reported_run / "report.html")
+    browser.open(reported_run / "report.html")
     rows = read_track_table(reported_run / "tracks.csv").rows
     shown = next(row.track for row in rows if row.category != rows[0].category)
     browser.click(f".chip[data-category='{rows[0].category}']")
@@ -776,31 +764,30 @@ def test_keys_label_no_hidden_card(browser: Browser, reported_run: Path) -> None
     assert browser.complaints() == []
 
 
-@pytest.mark.parametrize("theme", ["light", "dark"])
-def test_text_is_readable_in_both_themes(browser: Browser, reported_run: Path, theme: str) -> None:
+def test_text_is_readable_in_both_themes(browser: Browser, reported_run: Path) -> None:
     """WCAG AA asks for a contrast of at least 4.5."""
-    page = reported_run / "report.html"
-    features = [{"name": "prefers-color-scheme", "value": theme}]
-    browser.cdp("Emulation.setEmulatedMedia", {"features": features})
-    browser.open(page)
-    pairs = browser.run("""
-        const seen = [];
-        for (const s of ["h1", ".muted", ".number", ".bars span:last-child", ".tiles dt",
-                         "#download", ".chip b", ".actions button", "code"]) {
-          const e = document.querySelector(s);
-          let back = e, colour = "rgba(0, 0, 0, 0)";
-          while (back && colour === "rgba(0, 0, 0, 0)") {
-            colour = getComputedStyle(back).backgroundColor; back = back.parentElement; }
-          seen.push([s, getComputedStyle(e).color, colour]);
-        }
-        return seen;
-    """)
+    browser.open(reported_run / "report.html")
+    for theme in ("light", "dark"):
+        features = [{"name": "prefers-color-scheme", "value": theme}]
+        browser.cdp("Emulation.setEmulatedMedia", {"features": features})
+        pairs = browser.run("""
+            const seen = [];
+            for (const s of ["h1", ".muted", ".number", ".bars span:last-child", ".tiles dt",
+                             "#download", ".chip b", ".actions button", "code"]) {
+              const e = document.querySelector(s);
+              let back = e, colour = "rgba(0, 0, 0, 0)";
+              while (back && colour === "rgba(0, 0, 0, 0)") {
+                colour = getComputedStyle(back).backgroundColor; back = back.parentElement; }
+              seen.push([s, getComputedStyle(e).color, colour]);
+            }
+            return seen;
+        """)
+        for selector, front, back in pairs:
+            a, b = sorted((luminance(front), luminance(back)), reverse=True)
+            assert (a + 0.05) / (b + 0.05) >= 4.5, (theme, selector, front, back)
+        page_is_dark = luminance(pairs[0][2]) < 0.1
+        assert page_is_dark == (theme == "dark")
     browser.cdp("Emulation.setEmulatedMedia", {"features": []})
-    for selector, front, back in pairs:
-        a, b = sorted((luminance(front), luminance(back)), reverse=True)
-        assert (a + 0.05) / (b + 0.05) >= 4.5, (selector, front, back)
-    page_is_dark = luminance(pairs[0][2]) < 0.1
-    assert page_is_dark == (theme == "dark")
 
 
 def luminance(colour: str) -> float:
@@ -809,15 +796,15 @@ def luminance(colour: str) -> float:
     return float(linear @ [0.2126, 0.7152, 0.0722])
 
 
-def test_page_of_five_hundred_tracks_opens(browser: Browser, run: Path) -> None:
+def test_page_of_many_tracks_opens(browser: Browser, run: Path) -> None:
     """The docs promise at most 70 kB per object."""
-    text = many_tracks(run, 500)
+    text = many_tracks(run, 150)
     page = run / "many.html"
     page.write_text(text, "utf-8")
     browser.open(page)
 
-    assert len(text.encode()) < 500 * 70e3
-    assert browser.run("return document.querySelectorAll('.card').length") == 500
+    assert len(text.encode()) < 150 * 70e3
+    assert browser.run("return document.querySelectorAll('.card').length") == 150
     assert browser.run("return document.body.dataset.ready") == "yes"
 
 

@@ -186,7 +186,7 @@ def test_later_corrections_survive_late_or_lost_answer(
     """A late answer must not undo later labels; a lost request is sent again."""
     with serving(run, drawn) as (address, _):
         browser.open(address)
-        browser.press("Right", "Left")
+        browser.run("dispatchEvent(new Event('focus'))")
         browser.wait(LOADED)
         browser.run(
             "const real = fetch; let sent = 0; window.answered = 0;"
@@ -470,10 +470,7 @@ def test_taken_port_is_refused(shapecat: Run, long_run: Path) -> None:
 
 def test_keys_undo_move_and_open(browser: Browser, reported_run: Path) -> None:
     """The same keys work in a page from a file."""
-    page = reported_run / "report.html"
-    browser.open(page)
-    browser.run("localStorage.clear()")  # of another test that has corrected the same tracks
-    browser.open(page)
+    browser.open(reported_run / "report.html")
     a, b, c = order_of(browser)[:3]
     ring = "return getComputedStyle(document.activeElement).outlineWidth"
     assert browser.run(ring) == "3px"
