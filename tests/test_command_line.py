@@ -32,14 +32,14 @@ Run = Callable[..., Result]
 
 @pytest.fixture(scope="module")
 def recording(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    return record(tmp_path_factory.mktemp("door") / "lab.mcap", 12)
+    return record(tmp_path_factory.mktemp("door") / "lab.mcap", 4)
 
 
 @pytest.fixture(scope="module")
 def runs(shapecat: Run, recording: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """Process the recording into three runs in different folders."""
+    """Process the recording into two runs in different folders."""
     out = tmp_path_factory.mktemp("runs")
-    for name in ("a", "b", "deep/c"):
+    for name in ("a", "deep/c"):
         done = shapecat("process", recording, "--out", out / name, "--no-rrd", "--jobs", 1)
         assert done.exit_code == 0, done.stderr
     return out
@@ -280,7 +280,7 @@ class Links(HTMLParser):
 
 
 def test_index_of_scattered_runs_links_to_their_pages(shapecat: Run, runs: Path) -> None:
-    folders = [runs / "a" / "lab", runs / "b", runs / "deep" / "c"]
+    folders = [runs / "a" / "lab", runs / "deep" / "c"]
     result = shapecat("report", *folders)
 
     assert result.exit_code == 0, result.stderr
@@ -288,7 +288,7 @@ def test_index_of_scattered_runs_links_to_their_pages(shapecat: Run, runs: Path)
     assert index.parent == runs
     links = [unquote(link) for link in Links(index).found if not re.match(r"[a-z]+:|#", link)]
     pages = {(index.parent / link).resolve() for link in links}
-    names = ("a", "b", "deep/c")
+    names = ("a", "deep/c")
     assert pages == {(runs / name / "lab" / "report.html").resolve() for name in names}
     assert all(page.exists() for page in pages)
     for page in pages:
@@ -329,7 +329,7 @@ def test_path_of_moved_recording_can_be_given(
     crops = ("--format", "crops", "--out", tmp_path / "crops")
     assert "--recording" in shapecat("export", tmp_path / "lab", *crops).stderr
 
-    other = record(tmp_path / "other.mcap", 13)
+    other = record(tmp_path / "other.mcap", 5)
     wrong = shapecat("annotate", tmp_path / "lab", "--recording", other)
     assert (wrong.exit_code, "another recording" in wrong.stderr) == (1, True)
     exported = shapecat("export", tmp_path / "lab", *crops, "--recording", lab)
@@ -451,7 +451,7 @@ def test_web_viewer_listens_only_on_localhost(tmp_path: Path) -> None:
     finally:
         processes = descendants(viewer.pid)
         viewer.send_signal(signal.SIGINT)
-        _, errors = viewer.communicate(timeout=20)
+        _, errors = viewer.communicate(timeout=60)
     assert (viewer.returncode, errors) == (0, "stopping the viewer\n")
     wait_for(lambda: not any(Path(f"/proc/{pid}").exists() for pid in processes))
 
@@ -477,8 +477,15 @@ FIXTURE = str(Path(__file__).parents[1] / "fixtures" / "tabletop.mcap")
 
 
 @pytest.mark.skipif(not Path("/dev/full").exists(), reason="needs a device that is always full")
-@pytest.mark.parametrize("words", [("info", FIXTURE), ("--help",)])
-@pytest.mark.parametrize("unbuffered", ["", "1"])
+@pytest.mark.parametrize(
+    ("words", "unbuffered"),
+    [
+        (("--help",), ""),
+        (("--help",), "1"),
+        (("info", FIXTURE), ""),
+        pytest.param(("info", FIXTURE), "1", marks=pytest.mark.many),
+    ],
+)
 def test_full_disk_behind_stdout_is_reported_in_one_line(
     words: tuple[str, ...], unbuffered: str, monkeypatch: pytest.MonkeyPatch
 ) -> None:

@@ -28,7 +28,7 @@ from shapecat.trees import BoostedTrees, logit_of, read_trees, write_trees
 from tests.test_detection import overlaps
 
 SCENES = (Series("clutter", 2000, 1), Series("pile", 85_000, 1))
-GROWTH = Growth(100, 32, 0.1)
+GROWTH = Growth(40, 16, 0.3)
 
 
 @pytest.mark.parametrize(
@@ -115,7 +115,7 @@ def test_training_pairs_do_not_depend_on_the_number_of_processes() -> None:
 
 def test_grown_trees_fit_their_training_data_and_are_reproducible() -> None:
     rng = np.random.default_rng(0)
-    features = rng.normal(size=(2000, FEATURES)).astype(np.float32)
+    features = rng.normal(size=(1000, FEATURES)).astype(np.float32)
     same = (features[:, 4] > 0) ^ (features[:, 40] > 0.3)
     first, second = (grow(features, same, GROWTH, seed=1) for _ in range(2))
     assert all(np.array_equal(a, b) for a, b in zip(first.trees, second.trees, strict=True))
