@@ -58,9 +58,13 @@ class Command:
                 return
         pytest.fail("ended before it could be interrupted")
 
-    def signal_group(self, signum: int) -> None:
-        """Send a signal as a terminal does: to the command and its workers."""
-        os.killpg(self.running.pid, signum)
+    def signal_group(self, *signums: int) -> None:
+        """Send signals as a terminal does: to the command and its workers.
+
+        All arrive at once: between two of them, a command on a busy machine might end.
+        """
+        for signum in (signal.SIGSTOP, *signums, signal.SIGCONT):
+            os.killpg(self.running.pid, signum)
 
     def end(self) -> tuple[int, str]:
         """Return the exit code, and the output after the signal."""
@@ -155,8 +159,7 @@ def test_second_signal_ends_command(recording: Path, undisturbed: Path, tmp_path
     """At once: a command that finishes the frames in work says how to continue."""
     command = Command(recording, tmp_path, "--jobs", "2")
     command.wait_for_frames(40)
-    command.signal_group(signal.SIGINT)
-    command.signal_group(signal.SIGTERM)
+    command.signal_group(signal.SIGINT, signal.SIGTERM)
     returned, errors = command.end()
 
     assert returned in {130, 143}
