@@ -22,13 +22,13 @@ from shapecat.system.garbage import collect_seldom
 from tests.browser import Browser
 
 LONGEST = (
-    *("test_docs_run", "test_report_serve", "test_batch", "test_report", "test_remote"),
-    *("test_stopping", "test_odd", "test_packaging", "test_second_look", "test_executors"),
-    *("test_crash", "test_simulation_worlds", "test_simulation_physics", "test_api"),
-    *("test_labelling_loop", "test_architecture", "test_review", "test_learning_default_model"),
-    *("test_pipeline", "test_command_line", "test_exports_images", "test_evaluation"),
-    *("test_learning", "test_jit", "test_rehearsal", "test_detection_stacks"),
-    *("test_exports_readback", "test_tracking_scenes"),
+    *("test_report_serve", "test_remote", "test_stopping", "test_report", "test_batch", "test_api"),
+    *("test_odd", "test_command_line", "test_learning_default_model", "test_exports_images"),
+    *("test_labelling_loop", "test_crash", "test_second_look", "test_packaging", "test_executors"),
+    *("test_simulation_worlds", "test_simulation_physics", "test_architecture", "test_docs_run"),
+    *("test_detection_stacks", "test_detection", "test_review", "test_pipeline"),
+    *("test_detection_shelf", "test_evaluation", "test_tracking_scenes", "test_depth_fusion"),
+    *("test_learning", "test_jit", "test_rehearsal", "test_exports_readback"),
 )
 """Test files by duration, longest first."""
 SHARED = Path(__file__).parents[2] / "shared" / "data"
