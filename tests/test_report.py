@@ -530,7 +530,7 @@ def test_two_tabs_keep_corrections_of_both(browser: Browser, reported_run: Path)
     """The last tab replaced what the other had kept, which was lost when both were closed."""
     page = reported_run / "report.html"
     a, b, c = (row.track for row in read_track_table(reported_run / "tracks.csv").rows[:3])
-    open_anew(browser, page)
+    browser.open(page)
     browser.click(f"#track-{c} button[data-label='delete']")
     one, two = browser.tabs()[0], browser.tab()
     browser.turn_to(two)
