@@ -1,9 +1,11 @@
 import json
+import math
+from collections.abc import Callable
 from dataclasses import replace
 from importlib.resources import files
 from pathlib import Path
 from types import SimpleNamespace
-from typing import get_type_hints
+from typing import Any, get_type_hints
 
 import numpy as np
 import pyarrow as pa
@@ -18,7 +20,7 @@ from shapecat.runs.folder import read_run
 from shapecat.runs.label_meaning import TrackLabel
 from shapecat.runs.labels import read_labelled_frames
 from shapecat.runs.perceived import _SEGMENT_FRAMES, FrameRow, PerceptionTables
-from shapecat.runs.run_info import Counts, InputInfo, Options, RunInfo
+from shapecat.runs.run_info import Counts, InputInfo, ModelInfo, Options, OriginInfo, RunInfo
 from shapecat.runs.segments import count_segments
 from shapecat.runs.shown import _next_of_topic, read_shown_frames
 from shapecat.runs.table_schemas import DETECTIONS, FRAMES, PLANES, TABLES, TRACKS
@@ -245,9 +247,53 @@ def test_run_json_matches_its_schema(guessed_run: Path, coloured_run: Path) -> N
 
     for folder in (guessed_run, coloured_run):
         jsonschema.validate(read_run(folder), schema)
-    assert set(schema["properties"]) == set(RunInfo.__annotations__)
-    for name, kind in (("input", InputInfo), ("options", Options), ("counts", Counts)):
-        assert set(schema["properties"][name]["properties"]) == set(get_type_hints(kind))
+
+
+@pytest.mark.parametrize(
+    ("entry", "kind"),
+    [
+        ("", RunInfo),
+        ("input", InputInfo),
+        ("options", Options),
+        ("model", ModelInfo),
+        ("counts", Counts),
+        ("origin", OriginInfo),
+    ],
+)
+def test_schema_requires_what_the_reader_requires(entry: str, kind: Any) -> None:
+    """A file that the published schema accepts would be refused."""
+    schema = json.loads(files("shapecat.schemas").joinpath("run.json").read_text("utf-8"))
+    part = schema["properties"][entry] if entry else schema
+    assert set(part["required"]) == kind.__required_keys__
+    assert part["properties"].keys() == get_type_hints(kind).keys()
+
+
+@pytest.mark.parametrize(
+    ("change", "wrong"),
+    [
+        (lambda info: info.pop("counts"), ": counts"),
+        (lambda info: info["counts"].pop("skipped"), ": counts.skipped"),
+        (lambda info: info["counts"].update(frames="4"), ": counts.frames"),
+        (lambda info: info["seconds"].update(perceive=True), ": seconds.perceive"),
+        (lambda info: info["input"].pop("digest"), ": input.digest"),
+        (lambda info: info["model"].update(categories=None), ": model.categories"),
+        (lambda info: info["options"].update(start_s=math.nan), ": options.start_s"),
+        (lambda info: info["options"].update(topics=["/depth", 3]), ": options.topics"),
+        (lambda info: info.update(options=[]), ": options"),
+        (lambda info: info.update(boxes=3), ": boxes"),
+        (lambda info: info.clear(), ": id"),
+    ],
+)
+def test_incomplete_run_json_is_refused(
+    guessed_run: Path, tmp_path: Path, change: Callable[[dict[str, Any]], object], wrong: str
+) -> None:
+    """Another program's run.json, or one edited by hand, must not end in a traceback."""
+    info = json.loads((guessed_run / "run.json").read_text())
+    change(info)
+    (tmp_path / "run.json").write_text(json.dumps(info))
+
+    with pytest.raises(OutputError, match=f"run.json: not a description of a run{wrong} is"):
+        read_run(tmp_path)
 
 
 def test_schema_has_every_setting() -> None:

@@ -13,7 +13,7 @@ from pathlib import Path
 from typing import Literal
 
 from shapecat.errors import OutputError, explained
-from shapecat.runs.run_info import RunInfo, is_run_info
+from shapecat.runs.run_info import RunInfo, wrong_entry
 from shapecat.system.files import flush, holding, lock, partial_path, replacing
 
 __all__ = [
@@ -278,14 +278,16 @@ def read_run(folder: Path) -> RunInfo:
 
     Raises
     ------
-    OutputError : the folder has no readable run.json.
+    OutputError : the folder has no run.json, or one with missing or wrong entries.
     """
     try:
-        run = json.loads((folder / "run.json").read_text("utf-8"))
+        run: RunInfo = json.loads((folder / "run.json").read_text("utf-8"))
     except (OSError, UnicodeDecodeError, json.JSONDecodeError) as error:
         msg = f"{folder}: no run.json there; expected a folder made by `shapecat process`"
         raise OutputError(msg) from error
-    if not is_run_info(run):
-        msg = f"{folder / 'run.json'}: not a description of a run"
+    wrong = wrong_entry(run)
+    if wrong is not None:
+        what = f": {wrong} is missing or wrong" if wrong else ""
+        msg = f"{folder / 'run.json'}: not a description of a run{what}"
         raise OutputError(msg)
     return run

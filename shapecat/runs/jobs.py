@@ -148,7 +148,7 @@ def describe_run(job: Job, categorizer: Categorizer) -> RunInfo:
         "model": {"id": categorizer.model_id, "categories": list(categorizer.categories)},
         "fixed_frame": None,
         "up": {},
-        "counts": {},
+        "counts": {"frames": 0, "skipped": {}, "detections": 0},
         "seconds": {},
         "warnings": [],
     }

@@ -119,8 +119,8 @@ def _is_complete(folder: Path, run: RunInfo) -> bool:
     counts = run["counts"]
     return (
         {"perceive", "revise"} <= run["seconds"].keys()
-        and count_rows(folder, "frames") == counts.get("frames")
-        and count_rows(folder, "detections") == counts.get("detections")
+        and count_rows(folder, "frames") == counts["frames"]
+        and count_rows(folder, "detections") == counts["detections"]
         and ("color" not in counts or count_rows(folder, "masks") == counts["color"])
     )
 

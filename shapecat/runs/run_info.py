@@ -1,6 +1,16 @@
 """The contents of run.json, which describes a run; `schemas/run.json` documents each entry."""
 
-from typing import Any, NotRequired, TypedDict, TypeGuard
+import math
+from types import UnionType
+from typing import (
+    Any,
+    NotRequired,
+    TypedDict,
+    get_args,
+    get_origin,
+    get_type_hints,
+    is_typeddict,
+)
 
 __all__ = [
     "Counts",
@@ -9,7 +19,7 @@ __all__ = [
     "Options",
     "OriginInfo",
     "RunInfo",
-    "is_run_info",
+    "wrong_entry",
 ]
 
 
@@ -31,7 +41,7 @@ class Options(TypedDict):
     start_s: float | None
     end_s: float | None
     every: int
-    color: NotRequired[str | None]
+    color: str | None
     mcap: bool
     rrd: bool
 
@@ -43,7 +53,7 @@ class ModelInfo(TypedDict):
     categories: list[str]
 
 
-class Counts(TypedDict, total=False):
+class Counts(TypedDict):
     """Numbers of frames, detections and tracks.
 
     ``skipped`` is by reason, ``tracks`` by category; ``resumed`` and ``revised`` count frames;
@@ -53,10 +63,10 @@ class Counts(TypedDict, total=False):
     frames: int
     skipped: dict[str, int]
     detections: int
-    resumed: int
-    revised: int
-    tracks: dict[str, int]
-    color: int
+    resumed: NotRequired[int]
+    revised: NotRequired[int]
+    tracks: NotRequired[dict[str, int]]
+    color: NotRequired[int]
 
 
 class OriginInfo(TypedDict):
@@ -91,19 +101,28 @@ class RunInfo(TypedDict):
     corrections: NotRequired[dict[str, Any]]
 
 
-_PARTS: dict[str, Any] = {"input": InputInfo, "options": Options, "model": ModelInfo}
+def wrong_entry(content: Any, kind: Any = RunInfo, name: str = "") -> str | None:
+    """Return the first entry of a run.json that is missing or of a wrong type, None if all fit.
 
-
-def is_run_info(content: Any) -> TypeGuard[RunInfo]:
-    """Return whether the content of a file has the entries that every run.json has."""
-    return (
-        isinstance(content, dict)
-        and content.keys() >= RunInfo.__required_keys__
-        and all(isinstance(content[name], dict) for name in ("settings", "counts", "seconds"))
-        and all(
-            isinstance(content[name], dict) and content[name].keys() >= part.__required_keys__
-            for name, part in _PARTS.items()
-        )
-        and isinstance(content["model"]["categories"], list)
-        and all(isinstance(name, str) for name in content["model"]["categories"])
-    )
+    ``kind`` is the type that ``content``, at ``name``, must have.
+    """
+    origin, parts = get_origin(kind), get_args(kind)
+    if origin is UnionType:
+        fits = any(wrong_entry(content, part) is None for part in parts)
+    elif kind is float:
+        fits = type(content) in {int, float} and math.isfinite(content)
+    else:
+        fits = kind is Any or type(content) is (dict if is_typeddict(kind) else origin or kind)
+    if not fits:
+        return name
+    within: list[tuple[str, Any, Any]] = []
+    if is_typeddict(kind):
+        hints = get_type_hints(kind)
+        known = [key for key in hints if key in content or key in kind.__required_keys__]
+        within = [(f"{name}.{key}".strip("."), content.get(key, ...), hints[key]) for key in known]
+    elif origin is dict:
+        within = [(f"{name}.{key}", value, parts[1]) for key, value in content.items()]
+    elif origin is list:
+        within = [(name, item, parts[0]) for item in content]
+    found = (wrong_entry(value, part, place) for place, value, part in within)
+    return next((wrong for wrong in found if wrong is not None), None)

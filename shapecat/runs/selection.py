@@ -28,7 +28,7 @@ def read_frames(
     NoStreamError : a topic is missing or not usable.
     """
     streams = choose_streams(recording, options["topics"])
-    colours = pair_colours(recording, streams, options.get("color"))
+    colours = pair_colours(recording, streams, options["color"])
     return frames_with_colour(
         recording,
         streams,
