@@ -76,13 +76,12 @@ def code_folder(stage: Path) -> Path | None:
     name = f"kernels-{_digest(stage)}"
     for place in _places(stage):
         folder = place / name
-        if folder.is_dir() and os.access(folder, os.W_OK):
-            return folder
-        try:
-            folder.mkdir(parents=True)
-        except OSError:
+        known = folder.is_dir()
+        with suppress(OSError):
+            folder.mkdir(parents=True, exist_ok=True)  # or another process has just made it
+        if not (folder.is_dir() and os.access(folder, os.W_OK)):
             continue
-        for other in place.glob("kernels-*"):
+        for other in () if known else place.glob("kernels-*"):
             if other.name != name:
                 shutil.rmtree(other, ignore_errors=True)
         return folder
@@ -97,7 +96,10 @@ def _stage_of(file: Path) -> Path:
 
 def _digest(stage: Path) -> str:
     """Return a digest of the files of a stage and of the shared files."""
-    files = set(_SHARED) if stage == _HERE else {*stage.rglob("*.py"), *_SHARED}
+    files = set(_SHARED)
+    if stage != _HERE:  # os.walk, since another process may be removing folders of kernels
+        found = (Path(folder, name) for folder, _, names in os.walk(stage) for name in names)
+        files.update(file for file in found if file.suffix == ".py")
     digest = hashlib.sha256()
     for file in sorted(files):
         name = file.relative_to(_HERE if file in _SHARED else stage)

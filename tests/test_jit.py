@@ -6,6 +6,7 @@ import subprocess
 import sys
 from collections.abc import Callable
 from pathlib import Path
+from typing import Any
 
 import pytest
 
@@ -68,6 +69,36 @@ def test_edit_of_callee_recompiles_the_caller(stage: Path, run: Run, decorator: 
     (stage / "callee.py").write_text(callee.replace("2 * x", "20 * x"))
     assert run() == "61 0"
     assert len([*stage.glob("__pycache__/kernels-*")]) == 1, "code of earlier files is left"
+
+
+def test_folder_that_another_process_removes_is_no_error(
+    stage: Path, run: Run, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """After an update, several processes that start at once remove the old kernels."""
+    assert run() == "7 0"
+    scan = os.scandir
+
+    def vanished(path: Any) -> Any:
+        if Path(path).name.startswith("kernels-"):
+            raise FileNotFoundError(path)
+        return scan(path)
+
+    monkeypatch.setattr(os, "scandir", vanished)
+    assert code_folder(stage) is not None
+    assert run() == "7 1"
+
+
+def test_folder_that_another_process_has_just_made_is_used(
+    stage: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """It fell back to the user's cache, where everything was compiled again."""
+    code_folder.cache_clear()
+    folder = code_folder(stage)
+    assert folder is not None
+    code_folder.cache_clear()
+    answers = iter([False])  # as it was before the other process made it
+    monkeypatch.setattr(Path, "is_dir", lambda path: next(answers, path.exists()))
+    assert code_folder(stage) == folder
 
 
 def test_process_with_older_sources_does_not_spoil_the_cache(stage: Path, run: Run) -> None:
