@@ -50,6 +50,7 @@ from shapecat.recordings.messages import Topic
 from shapecat.runs.label_meaning import TrackLabel, _slips
 from shapecat.runs.masks import read_nearest_masks
 from shapecat.runs.shown import ShownDetection
+from shapecat.runs.table_schemas import FRAMES
 from shapecat.runs.tables import Key
 from shapecat.types import (
     Box,
@@ -729,8 +730,9 @@ def test_scene_shows_merged_objects_once_and_no_deleted_ones() -> None:
 
 def test_missing_frame_error_lists_existing_frames(tmp_path: Path) -> None:
     """With a time range or every n-th message, frames are not numbered from 0 to the end."""
-    rows = pa.table({"topic": ["/a", "/b", "/a", "/b", "/a"], "frame": [3, 0, 6, 2, 9]})
-    pq.write_table(rows, tmp_path / "frames.parquet")
+    keys = [("/a", 3), ("/b", 0), ("/a", 6), ("/b", 2), ("/a", 9)]
+    rows = [{"topic": topic, "frame": frame} for topic, frame in keys]
+    pq.write_table(pa.Table.from_pylist(rows, FRAMES), tmp_path / "frames.parquet")
 
     assert _topic(tmp_path, 6, None) == "/a"
     for frame, topic, message in (
