@@ -406,6 +406,19 @@ def test_upload_removes_files_of_replaced_run(made: Path) -> None:
     assert files("memory://renewed") == {f"run/{name}" for name in names}
 
 
+def test_labels_that_were_not_transferred_stay_at_the_url(made: Path, tmp_path: Path) -> None:
+    """They were left in the temporary folder."""
+    place, copy = Location("memory://kept/run"), "tracks.previous-3fa2b1c0.csv"
+    shutil.copytree(made, tmp_path / "run")
+    (tmp_path / "run" / copy).write_text("labels")
+    for folder in (tmp_path / "run", made):
+        with claimed(place.url, "one") as claim:
+            upload(folder, place.url, claim)
+        (place / "run.json").remove()  # as if interrupted
+
+    assert (place / copy).read() == b"labels"
+
+
 def test_summary_names_run_folder_not_scratch(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:

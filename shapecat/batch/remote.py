@@ -7,12 +7,14 @@ uploaded last; without run.json, its files do not count as a run.
 import dataclasses
 from contextlib import nullcontext, suppress
 from dataclasses import dataclass
+from fnmatch import fnmatchcase
 from pathlib import Path, PurePosixPath
 
 from shapecat.batch.claims import Claim, claimed
 from shapecat.batch.storage import Location
 from shapecat.errors import OutputError, RecordingError, ShapecatError
 from shapecat.pipeline import process
+from shapecat.runs.corrections import LOST
 from shapecat.runs.folder import OUTPUTS, RUN_FILES, read_run, require_ours, write_run
 from shapecat.runs.jobs import Job, Summary, summarize
 from shapecat.runs.run_info import OriginInfo, RunInfo
@@ -142,10 +144,14 @@ def _require_ours(place: Location) -> set[str]:
     OutputError : the folder holds files that shapecat did not write, and no run.json.
     """
     names = place.names()
-    if "run.json" not in names and names - set(RUN_FILES):
+    if "run.json" not in names and not all(map(_is_of_run, names)):
         msg = f"{place.url}: shapecat did not make this; choose another --out, or move it away"
         raise OutputError(msg)
     return names
+
+
+def _is_of_run(name: str) -> bool:
+    return name in RUN_FILES or fnmatchcase(name, LOST)
 
 
 def _replaced(place: Location) -> Location:
@@ -175,7 +181,7 @@ def upload(folder: Path, url: str, claim: Claim) -> None:
             if name in names:
                 (place / name).copy(old / name)
         (place / "run.json").remove()
-    sent = sorted(path.name for path in folder.iterdir() if path.name in RUN_FILES)
+    sent = sorted(path.name for path in folder.iterdir() if _is_of_run(path.name))
     for name in sorted(sent, key=lambda name: (name == "run.json", name != "frames.parquet")):
         if name == "run.json":
             claim.require()

@@ -28,6 +28,7 @@ from shapecat.runs.track_table import (
 from shapecat.system.files import holding, replacing
 
 __all__ = [
+    "LOST",
     "PREVIOUS",
     "adopt_labels",
     "correct_label",
@@ -38,6 +39,8 @@ __all__ = [
 ]
 
 PREVIOUS = "tracks.previous.csv"
+LOST = "tracks.previous-*.csv"
+"""Names of replaced tables of which labels could not be transferred; nothing replaces these."""
 _LISTED = 10
 """Maximum number of missing tracks that an error lists."""
 

@@ -14,7 +14,7 @@ from shapecat import __version__
 from shapecat.config import Settings
 from shapecat.errors import OutputError, RecordingError
 from shapecat.learning import Categorizer
-from shapecat.runs.corrections import PREVIOUS, has_labels
+from shapecat.runs.corrections import LOST, PREVIOUS, has_labels
 from shapecat.runs.folder import OUTPUTS, clear, write_run
 from shapecat.runs.identity import (
     ContentDigest,
@@ -239,7 +239,7 @@ def keep_labels(folder: Path, run: RunInfo, job: Job) -> None:
     except OutputError as error:
         transfer = lost_labels(job.folder, str(error))
     if transfer.missed:
-        copy = f"tracks.previous-{xxhash.xxh3_64_hexdigest(table)[:8]}.csv"
+        copy = LOST.replace("*", xxhash.xxh3_64_hexdigest(table)[:8])
         with replacing(job.folder / copy) as path:
             path.write_bytes(table)
     run["corrections"] = transfer.as_dict()
