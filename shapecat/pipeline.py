@@ -101,7 +101,9 @@ def process(job: Job, observe: Observer = ignore, *, cores: int = 1) -> Summary:
             if "perceive" not in run["seconds"]:
                 run = take_over_frames(job.folder, folder, run, job.source, content.result)
             run["color"] = {topic: colour.topic for topic, colour in colours.items()}
-            compiling_s = compile_all(lambda: observe("compile", 0, None), cores=cores)
+            compiling_s = compile_all(
+                lambda: observe("compile", 0, None), cores=cores, colour=bool(colours)
+            )
             content.start()
             # A kill after the last phase leaves a total.
             earlier = run["seconds"].pop("total", None) or sum(run["seconds"].values())

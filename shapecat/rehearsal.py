@@ -22,6 +22,9 @@ import numba
 import numpy as np
 
 from shapecat.arrays import F4
+from shapecat.cameras.colour import ColourImage, ColourView, LensCamera
+from shapecat.colour.image_masks import find_masks, mask_of
+from shapecat.colour.projection import project
 from shapecat.completion import complete
 from shapecat.config import Settings
 from shapecat.description import describe
@@ -39,7 +42,7 @@ from shapecat.system.files import lock
 from shapecat.system.scripts import runs_again
 from shapecat.types import Camera, Candidate, Detection, Frame, NeuralGas, Pose, Scene
 
-__all__ = ["compile_all", "find_ball", "main", "recognize_ball", "rehearse"]
+__all__ = ["compile_all", "find_ball", "find_mask", "main", "recognize_ball", "rehearse"]
 
 _RADIUS_M, _TOP_M = 0.05, 0.11
 """Radii of the ball, and of the plate and the top of the block."""
@@ -112,12 +115,25 @@ def recognize_ball() -> str:
     return model.categories[int(model.predict(descriptor[None]).posteriors[0].argmax())]
 
 
+def find_mask() -> int:
+    """Find a square on two colour images, the second from another camera; return its pixels."""
+    frame = _frame_of(np.full((480, 640), 0.7))
+    v, u = np.mgrid[200:240, 300:340]
+    square = (v * 640 + u).ravel().astype(np.uint32)
+    lens = LensCamera(Camera(640, 480, 525, 525, 320, 240), "plumb_bob", (0.01, 0, 0, 0))
+    image = ColourImage("rgb", 0, 0, "camera", "rgb8", 640, 480, 1920, b"")
+    turned = Pose(np.eye(3), np.array([0.02, 0, 0]))
+    views = (ColourView(image), ColourView(image, lens, turned))
+    project(np.zeros((1, 3), np.float32), lens, turned)
+    return sum(mask_of(find_masks(frame, view, [square]), [0]).area for view in views)
+
+
 _REHEARSALS: tuple[Callable[[], object], ...] = (find_ball, recognize_ball)
 """Functions that compile the kernels, for processes that share no kernel and take equally long."""
 _POLL_S = 0.1
 _TELL_S = 10.0
 _STAGES = ("completion", "description", "detection", "learning", "reuse", "surface")
-"""Folders with the kernels to compile."""
+"""Folders with the kernels for depth images; those for colour images are in ``colour``."""
 
 
 def rehearse() -> None:
@@ -126,7 +142,9 @@ def rehearse() -> None:
         rehearsal()
 
 
-def compile_all(begin: Callable[[], None] = lambda: None, *, cores: int = 2) -> float:
+def compile_all(
+    begin: Callable[[], None] = lambda: None, *, cores: int = 2, colour: bool = False
+) -> float:
     """Compile the kernels in other processes unless that is done; return the seconds it took.
 
     Only one process at a time compiles; others wait for it.
@@ -135,6 +153,7 @@ def compile_all(begin: Callable[[], None] = lambda: None, *, cores: int = 2) -> 
     ----------
     begin : called before compilation begins.
     cores : largest number of processes.
+    colour : whether colour images need masks.
 
     Raises
     ------
@@ -142,7 +161,7 @@ def compile_all(begin: Callable[[], None] = lambda: None, *, cores: int = 2) -> 
     RuntimeError : this is a worker process that runs the main script again, since the script lacks
         ``if __name__ == "__main__":``. It would wait for its parent, which waits for it.
     """
-    notes = _notes()
+    notes = _notes(colour=colour)
     if notes is None or notes.exists():
         return 0.0
     if getattr(current_process(), "_inheriting", False):  # multiprocessing makes the same check
@@ -158,30 +177,34 @@ def compile_all(begin: Callable[[], None] = lambda: None, *, cores: int = 2) -> 
             begin()
             # The rest is compiled when it is called; another version may remove the folder.
             with suppress(WorkerLostError, FileNotFoundError):
-                _rehearse(cores)
+                _rehearse(cores, (*_REHEARSALS, find_mask) if colour else _REHEARSALS)
                 notes.touch()
+                if colour and (of_depth := _notes(colour=False)) is not None:
+                    of_depth.touch()
     finally:
         os.close(held)
     return time.perf_counter() - begun
 
 
-def _notes() -> Path | None:
+def _notes(*, colour: bool) -> Path | None:
     """Return the file that marks completion; None if machine code cannot be stored."""
-    folders = [code_folder(Path(__file__).with_name(stage)) for stage in _STAGES]
+    stages = (*_STAGES, "colour") if colour else _STAGES
+    folders = [code_folder(Path(__file__).with_name(stage)) for stage in stages]
     names = [folder.name for folder in folders if folder is not None]
-    if folders[0] is None or len(names) < len(_STAGES):
+    if folders[0] is None or len(names) < len(stages):
         return None
     made_of = (*names, numba.__version__, str(sys.implementation.cache_tag))
     return folders[0] / f"complete-{hashlib.sha256(' '.join(made_of).encode()).hexdigest()[:16]}"
 
 
-def _rehearse(cores: int) -> None:
+def _rehearse(cores: int, rehearsals: Sequence[Callable[[], object]]) -> None:
     if current_process().daemon or runs_again():  # may not start processes
-        rehearse()
+        for rehearsal in rehearsals:
+            rehearsal()
         return
     executor = LocalExecutor(min(cores, len(_REHEARSALS)))
     try:
-        waiting = {executor.submit(_uncollected, rehearsal) for rehearsal in _REHEARSALS}
+        waiting = {executor.submit(_uncollected, rehearsal) for rehearsal in rehearsals}
         while waiting:
             stopping.check()
             done, waiting = wait(waiting, timeout=_POLL_S)
@@ -199,7 +222,7 @@ def _uncollected(rehearsal: Callable[[], object]) -> None:
 
 def _count() -> int:
     """Return the number of kernels that are compiled and stored."""
-    folders = (code_folder(Path(__file__).with_name(stage)) for stage in _STAGES)
+    folders = (code_folder(Path(__file__).with_name(stage)) for stage in (*_STAGES, "colour"))
     return sum(len([*folder.rglob("*.nbi")]) for folder in folders if folder is not None)
 
 
@@ -230,7 +253,7 @@ def main(words: Sequence[str] | None = None) -> None:
 
     teller = threading.Thread(target=tell, daemon=True)
     try:
-        seconds = compile_all(teller.start)
+        seconds = compile_all(teller.start, colour=True)
     finally:
         ended.set()
         if teller.is_alive():

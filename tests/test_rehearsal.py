@@ -14,7 +14,7 @@ import pytest
 
 from shapecat import geometry, rehearsal
 from shapecat.detection.planes import horizontal, strips, supporting
-from shapecat.rehearsal import compile_all, find_ball, recognize_ball
+from shapecat.rehearsal import compile_all, find_ball, find_mask, recognize_ball
 from shapecat.reuse import agreement
 
 KERNELS = [
@@ -45,6 +45,7 @@ def test_rehearsals_call_rarely_used_kernels(monkeypatch: pytest.MonkeyPatch) ->
 
     assert find_ball() == 2
     assert recognize_ball() == "ball"
+    assert 1500 < find_mask() / 2 < 1700
     assert called == {name for _, name in KERNELS}
     assert in_c_order == {True, False}  # the rotations of a pose and of an inverse
 
@@ -58,8 +59,8 @@ def mark(path: Path) -> None:
 @pytest.fixture
 def trace(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
     path = tmp_path / "trace"
-    monkeypatch.setattr(rehearsal, "_notes", lambda: tmp_path / "complete")
-    monkeypatch.setattr(rehearsal, "_rehearse", lambda _: mark(path))
+    monkeypatch.setattr(rehearsal, "_notes", lambda **_: tmp_path / "complete")
+    monkeypatch.setattr(rehearsal, "_rehearse", lambda *_: mark(path))
     return path
 
 
@@ -73,14 +74,34 @@ def test_kernels_are_compiled_only_once(trace: Path) -> None:
     assert trace.read_text() == "x"
 
 
+def test_kernels_for_colour_are_compiled_when_needed(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Without them, the first colour image takes ten seconds, and in a container each time."""
+    calls: list[int] = []
+    monkeypatch.setattr(
+        rehearsal, "_notes", lambda *, colour: tmp_path / ("colour" if colour else "depth")
+    )
+    monkeypatch.setattr(rehearsal, "_rehearse", lambda _, called: calls.append(len(called)))
+
+    for colour, expected in ((False, [2]), (True, [2, 3]), (False, [2, 3]), (True, [2, 3])):
+        compile_all(colour=colour)
+        assert calls == expected
+    (tmp_path / "depth").unlink()
+    (tmp_path / "colour").unlink()
+    compile_all(colour=True)
+    compile_all()
+    assert calls == [2, 3, 3]
+
+
 def test_compiling_survives_removal_of_its_folder(
     trace: Path, monkeypatch: pytest.MonkeyPatch, tmp_path: Path
 ) -> None:
     """An update during a batch must not fail the remaining recordings."""
-    monkeypatch.setattr(rehearsal, "_notes", lambda: tmp_path / "removed" / "complete")
+    monkeypatch.setattr(rehearsal, "_notes", lambda **_: tmp_path / "removed" / "complete")
 
     with monkeypatch.context() as patch:
-        patch.setattr(rehearsal, "_rehearse", lambda _: shutil.rmtree(tmp_path / "removed"))
+        patch.setattr(rehearsal, "_rehearse", lambda *_: shutil.rmtree(tmp_path / "removed"))
         assert compile_all() > 0
     assert compile_all() > 0
     assert compile_all() == 0
@@ -89,7 +110,7 @@ def test_compiling_survives_removal_of_its_folder(
 
 def test_interrupted_compiling_is_repeated(trace: Path, monkeypatch: pytest.MonkeyPatch) -> None:
 
-    def interrupt(_cores: int) -> None:
+    def interrupt(*_: object) -> None:
         raise KeyboardInterrupt
 
     with monkeypatch.context() as patch, pytest.raises(KeyboardInterrupt):
@@ -111,7 +132,7 @@ def test_compiling_reports_its_progress(
 
     monkeypatch.setattr(rehearsal, "_TELL_S", 0.001)
     monkeypatch.setattr(rehearsal, "_count", count)
-    monkeypatch.setattr(rehearsal, "_rehearse", lambda _: counted.wait())
+    monkeypatch.setattr(rehearsal, "_rehearse", lambda *_: counted.wait())
 
     rehearsal.main([])
     first, second, *_, last = capfd.readouterr().out.splitlines()
@@ -136,10 +157,9 @@ def test_help_and_wrong_usage_do_not_compile(
     assert not trace.exists()
 
 
-def test_compiling_processes_end(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_compiling_processes_end() -> None:
     before = set(multiprocessing.active_children())
-    monkeypatch.setattr(rehearsal, "_REHEARSALS", (multiprocessing.active_children,) * 2)
-    rehearsal._rehearse(1)
+    rehearsal._rehearse(1, (multiprocessing.active_children,) * 2)
     left = set(multiprocessing.active_children()) - before
     for process in left:
         process.join(timeout=10)
@@ -149,7 +169,7 @@ def test_compiling_processes_end(monkeypatch: pytest.MonkeyPatch) -> None:
 UNGUARDED = """{says}
 from pathlib import Path
 from shapecat import rehearsal
-rehearsal._notes = lambda: Path({notes!r})
+rehearsal._notes = lambda **_: Path({notes!r})
 rehearsal._REHEARSALS = (int, int)
 assert rehearsal.compile_all(cores=1) > 0
 print("processed")
