@@ -1,6 +1,7 @@
 """The contents of run.json, which describes a run; `schemas/run.json` documents each entry."""
 
 import math
+from functools import cache
 from types import UnionType
 from typing import (
     Any,
@@ -101,6 +102,10 @@ class RunInfo(TypedDict):
     corrections: NotRequired[dict[str, Any]]
 
 
+_hints_of = cache(get_type_hints)
+"""The type of each entry of a class, without `NotRequired`."""
+
+
 def wrong_entry(content: Any, kind: Any = RunInfo, name: str = "") -> str | None:
     """Return the first entry of a run.json that is missing or of a wrong type, None if all fit.
 
@@ -117,7 +122,7 @@ def wrong_entry(content: Any, kind: Any = RunInfo, name: str = "") -> str | None
         return name
     within: list[tuple[str, Any, Any]] = []
     if is_typeddict(kind):
-        hints = get_type_hints(kind)
+        hints = _hints_of(kind)
         known = [key for key in hints if key in content or key in kind.__required_keys__]
         within = [(f"{name}.{key}".strip("."), content.get(key, ...), hints[key]) for key in known]
     elif origin is dict:
