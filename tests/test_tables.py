@@ -24,7 +24,14 @@ from shapecat.runs.run_info import Counts, InputInfo, ModelInfo, Options, Origin
 from shapecat.runs.segments import count_segments
 from shapecat.runs.shown import _next_of_topic, read_shown_frames
 from shapecat.runs.table_schemas import DETECTIONS, FRAMES, PLANES, TABLES, TRACKS
-from shapecat.runs.tables import arrow_table, lists, read_row_groups
+from shapecat.runs.tables import (
+    arrow_table,
+    lists,
+    open_writer,
+    opened,
+    read_row_groups,
+    read_rows,
+)
 from shapecat.types import Box, Candidate, Detection, NeuralGas, Perception, Plane, Pose, Scene
 from tests.track_tables import write_tracks
 
@@ -223,6 +230,24 @@ def test_foreign_file_is_rejected_as_table(tmp_path: Path) -> None:
         list(read_row_groups(tmp_path / "frames.parquet"))
 
 
+@pytest.mark.parametrize("at_once", [1, 2, 3, 8])
+def test_chosen_rows_are_read_from_all_row_groups(tmp_path: Path, at_once: int) -> None:
+    """A row of another track, or of another object, would be shown."""
+    path, sizes = tmp_path / "tracks.parquet", (7, 100, 1, 0, 50, 2)
+    with open_writer(path, TRACKS) as writer:
+        for first, size in zip(np.cumsum([0, *sizes]).tolist(), sizes, strict=False):
+            group = [{"track": first + k} for k in range(size)]
+            writer.write_table(pa.Table.from_pylist(group, TRACKS))
+    rng = np.random.default_rng(4)
+    for count in (0, 1, 5, 90, 160):
+        rows = rng.choice(sum(sizes), count, replace=False)
+        found = np.full(count, -1)
+        with opened(path) as file:
+            for at, table in read_rows(file, ["track"], rows, at_once=at_once):
+                found[at] = table["track"].to_numpy()
+        np.testing.assert_array_equal(found, rows)
+
+
 @pytest.mark.parametrize("table", TABLES)
 def test_table_with_other_columns_is_rejected(tmp_path: Path, table: str) -> None:
     """One of another version, or rewritten by a data frame library, gave a traceback later."""
@@ -235,6 +260,12 @@ def test_table_with_other_columns_is_rejected(tmp_path: Path, table: str) -> Non
             with pytest.raises(OutputError, match=rf"column {field.name}\b.*process the recording"):
                 next(read_row_groups(path))
 
+    pq.write_table(empty.drop_columns(["topic"]), path)
+    with (
+        pytest.raises(OutputError, match="no column topic"),
+        opened(path, read_dictionary=["topic"]),
+    ):
+        pass
     pq.write_table(empty.append_column("new", pa.array([], pa.int8())), path)
     assert [len(group) for group in read_row_groups(path)] == [0]
 

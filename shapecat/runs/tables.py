@@ -198,7 +198,7 @@ def opened(path: Path, *, read_dictionary: Sequence[str] = ()) -> Iterator[pq.Pa
     OutputError : the table is missing or unreadable, or lacks a column of its schema.
     """
     try:
-        with pq.ParquetFile(path, read_dictionary=list(read_dictionary)) as file:
+        with _parquet(path, read_dictionary) as file:
             if wrong := _wrong_column(file.schema_arrow, TABLES[path.stem]):
                 msg = f"{path}: {wrong}; process the recording again"
                 raise OutputError(msg)
@@ -206,6 +206,14 @@ def opened(path: Path, *, read_dictionary: Sequence[str] = ()) -> Iterator[pq.Pa
     except (OSError, pa.ArrowException) as error:
         msg = f"{path}: not a readable table of a run folder ({error}); process the recording again"
         raise OutputError(msg) from error
+
+
+def _parquet(path: Path, read_dictionary: Sequence[str]) -> pq.ParquetFile:
+    try:
+        return pq.ParquetFile(path, read_dictionary=list(read_dictionary))
+    except KeyError as error:
+        msg = f"no column {', '.join(read_dictionary)}"
+        raise pa.ArrowInvalid(msg) from error
 
 
 def _wrong_column(found: pa.Schema, wanted: pa.Schema) -> str:
