@@ -263,8 +263,7 @@ def annotate(folder: Path, recording: Recording, run: RunInfo, observe: Observer
         )
     if run["options"]["rrd"]:
         _once("review.rrd", folder, run, write_rrd)
-    known = [*run["warnings"], *recording.warnings]
-    run["warnings"] = list(dict.fromkeys(known))
+    run["warnings"] = list(dict.fromkeys([*run["warnings"], *recording.warnings]))
     if run["options"]["mcap"]:
         _once("annotated.mcap", folder, run, write_mcap)
 

@@ -116,15 +116,15 @@ def recognize_ball() -> str:
 
 
 def find_mask() -> int:
-    """Find a square on two colour images, the second from another camera; return its pixels."""
+    """Find a square on images of its own and of another camera; return the number of pixels."""
     frame = _frame_of(np.full((480, 640), 0.7))
     v, u = np.mgrid[200:240, 300:340]
     square = (v * 640 + u).ravel().astype(np.uint32)
     lens = LensCamera(Camera(640, 480, 525, 525, 320, 240), "plumb_bob", (0.01, 0, 0, 0))
     image = ColourImage("rgb", 0, 0, "camera", "rgb8", 640, 480, 1920, b"")
-    turned = Pose(np.eye(3), np.array([0.02, 0, 0]))
-    views = (ColourView(image), ColourView(image, lens, turned))
-    project(np.zeros((1, 3), np.float32), lens, turned)
+    shifted = Pose(np.eye(3), np.array([0.02, 0, 0]))
+    views = (ColourView(image), ColourView(image, lens, shifted))
+    project(np.zeros((1, 3), np.float32), lens, shifted)
     return sum(mask_of(find_masks(frame, view, [square]), [0]).area for view in views)
 
 

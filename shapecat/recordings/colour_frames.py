@@ -252,7 +252,7 @@ def _alike(lens: LensCamera, camera: Camera | None, share: float) -> bool:
 
 @lru_cache(maxsize=8)
 def _bend_px(lens: LensCamera, camera: Camera | None) -> float:
-    """Return how far the lens moves what a pixel of `camera` sees, at most, pixels."""
+    """Return the largest distance (px) from a pixel of `camera` to where `lens` sees its ray."""
     if camera is None or not lens.model:
         return 0.0
     own = lens.pinhole

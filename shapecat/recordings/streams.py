@@ -175,7 +175,7 @@ def _is_infrared(topic: str) -> bool:
 
 
 def _own_name(topic: str) -> str:
-    """Return what the end of an image topic says after ``depth``, without robot and camera."""
+    """Return the end of an image topic: the part after ``depth``, without robot and camera."""
     return "/".join(_image_name(topic).split("/")[-2:]).rpartition("depth")[2]
 
 
