@@ -282,6 +282,18 @@ def test_training_needs_two_categories(tmp_path: Path) -> None:
         train_on_folder(dataset, tmp_path / "m.npz")
 
 
+@pytest.mark.usefixtures("few_trees")
+def test_too_few_views_give_no_model(tmp_path: Path) -> None:
+    """Trees without a split give all objects the same posterior, and thus the same category."""
+    dataset = write_dataset(tmp_path / "data", ("ball", "box"), instances=1)
+    for path in dataset.glob("*/*/1.*"):
+        path.unlink()
+
+    with pytest.raises(RecordingError, match="2 views are too few to tell box, ball apart"):
+        train_on_folder(dataset, tmp_path / "m.npz")
+    assert not (tmp_path / "m.npz").exists()
+
+
 def test_error_of_empty_folder_shows_the_layout(tmp_path: Path) -> None:
     with pytest.raises(RecordingError, match=r"cup/red_mug/000\.pcd"):
         read_dataset(tmp_path)

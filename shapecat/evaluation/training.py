@@ -49,8 +49,8 @@ def train_on_folder(
 
     Raises
     ------
-    RecordingError : there are no views, one cannot be read, a folder has an invalid name, or there
-        are fewer than two categories.
+    RecordingError : there are no views, one cannot be read, a folder has an invalid name, there
+        are fewer than two categories, or too few views to tell them apart.
     ModelError : there are too many categories.
     OutputError : the model cannot be written.
     """
@@ -71,6 +71,12 @@ def train_on_folder(
         fit_views(views, views.where(held_out & False), seed=seed),
         temperature=judged.temperature,
     )
+    if not model.forest.left.any():
+        msg = (
+            f"{root}: {len(views.labels)} views are too few to tell {', '.join(categories)} apart; "
+            "add views of more objects"
+        )
+        raise RecordingError(msg)
     model = replace(model, threshold=judged.threshold)
     save_model(out, model)
     calibrated = can_calibrate(judges.labels.tolist(), categories)
