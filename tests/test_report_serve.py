@@ -21,6 +21,7 @@ import pyarrow.parquet as pq
 import pytest
 from click.testing import Result
 
+from shapecat.errors import OutputError
 from shapecat.outputs.report.serving import _names_this_machine, serve_reports
 from shapecat.outputs.report.writing import Reports, RunReport, read_report
 from shapecat.runs.corrections import adopt_labels, read_labels
@@ -382,6 +383,17 @@ def test_page_of_replaced_run_changes_nothing(run: Path, drawn: RunReport) -> No
     assert [status for status, _ in answers] == [500, 500, 500]
     assert all("was processed again" in text for _, text in answers)
     assert (run / "tracks.csv").read_bytes() == before
+
+
+def test_replaced_run_does_not_keep_other_pages_from_being_written(
+    run: Path, drawn: RunReport
+) -> None:
+    """A server that ends writes the corrections into all pages, whatever became of one run."""
+    gone = replace(drawn, folder=run.with_name("gone"))
+    with pytest.raises(OutputError, match="gone"):
+        Reports([gone, replace(drawn, folder=run)]).write()
+
+    assert (run / "report.html").is_file()
 
 
 def test_simultaneous_corrections_are_all_written(run: Path, drawn: RunReport) -> None:

@@ -2,7 +2,7 @@
 
 import os
 from collections import Counter
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
 from functools import cached_property
 from pathlib import Path
@@ -133,16 +133,23 @@ class Reports:
 
         Raises
         ------
-        OutputError : a page cannot be written, a tracks.csv is invalid, or shapecat did not make
-            the index that is there.
+        OutputError : a page cannot be written, a tracks.csv is invalid, a run has been replaced, or
+            shapecat did not make the index that is there. The other pages are written.
         """
-        pages = {report.folder / PAGE: report.page() for report in self.runs}
+        pages: dict[Path, Callable[[], str]] = {r.folder / PAGE: r.page for r in self.runs}
         if self.indexed and self.runs:
             _require_ours(self.above / INDEX)
-            pages[self.above / INDEX] = self.index()
-        for page, text in pages.items():
-            with replacing(page) as path:
-                path.write_text(text, "utf-8")
+            pages[self.above / INDEX] = self.index
+        failures = []
+        for page, make in pages.items():
+            try:
+                text = make()
+                with replacing(page) as path:
+                    path.write_text(text, "utf-8")
+            except OutputError as error:
+                failures.append(error)
+        if failures:
+            raise failures[0]
         return list(pages)
 
 
