@@ -552,6 +552,28 @@ def test_truth_skips_label_images_of_missing_frames(tmp_path: Path) -> None:
         ]
 
 
+@pytest.mark.parametrize(
+    ("change", "message"),
+    [
+        ({"parts": None}, "lacks 'parts'"),
+        ({"ambiguous": None}, "lacks 'ambiguous'"),
+        ({"box": {"center": [0, 0, 1], "size": [1, 1]}}, "is damaged"),
+    ],
+)
+def test_truth_without_a_field_is_refused_in_one_line(
+    tmp_path: Path, change: dict[str, Any], message: str
+) -> None:
+    """Truth written by hand often lacks what only the simulator knows."""
+    path = write_truth(tmp_path)
+    truth = json.loads(path.read_text())
+    first = truth[1]["objects"][0]
+    truth[1]["objects"][0] = {k: v for k, v in (first | change).items() if v is not None}
+    path.write_text(json.dumps(truth))
+
+    with pytest.raises(RecordingError, match=f"lab.truth.json: the frame .*{message}"):
+        open_reference(path).at(("/d", 1), START + STEP)
+
+
 @pytest.mark.parametrize("place", [60, 500])
 def test_damaged_label_images_are_reported_in_one_line(tmp_path: Path, place: int) -> None:
     """Damaged content has errors of its own, which appear when the file is opened or read."""

@@ -87,6 +87,7 @@ class SimulatedTruth(Reference):
     kind = "ground truth of each pixel"
 
     def __init__(self, path: Path, content: list[dict[str, Any]]) -> None:
+        self._path = path
         self._by_stamp = {int(entry["stamp_ns"]): entry for entry in content}
         self.frames = len(content)
         objects = [item for entry in content for item in entry["objects"]]
@@ -101,31 +102,45 @@ class SimulatedTruth(Reference):
         *,
         repeated: bool = False,  # noqa: ARG002  the simulator repeats none
     ) -> Labelling | None:
-        """Return the objects of a frame; None if the ground truth lacks this frame."""
+        """Return the objects of a frame; None if the ground truth lacks this frame.
+
+        Raises
+        ------
+        RecordingError : an object lacks a field or has a wrong one, or its image is damaged.
+        """
         entry = self._by_stamp.get(stamp_ns)
         if entry is None:
             return None
-        image = self._labels.read(int(entry["frame"]))
-        flat = image.reshape(-1)
-        items = (
-            LabelledItem(
-                track=item.get("track"),
-                category=str(item["category"]),
-                pixels=np.flatnonzero(np.isin(flat, item["parts"])),
-                box=Box(**item["box"]) if "box" in item else None,
-                decidable=not item["ambiguous"],
-            )
-            for item in entry["objects"]
-        )
-        small = [part for item in entry.get("hidden", ()) for part in item["parts"]]
-        ignored = np.isin(flat, small)
-        size = image.shape[0], image.shape[1]
-        return Labelling(tuple(items), (flat > 0) & ~ignored, size, ignored)
+        try:
+            return _true_labelling(entry, self._labels.read(int(entry["frame"])))
+        except (KeyError, TypeError, ValueError, AttributeError) as error:
+            reason = f"lacks {error}" if isinstance(error, KeyError) else f"is damaged ({error})"
+            msg = f"{self._path}: the frame with stamp {stamp_ns} {reason}"
+            raise RecordingError(msg) from error
 
     def describe_frames(self) -> str:
         """Return the range of timestamps."""
         stamps = list(self._by_stamp)
         return f"stamps {min(stamps)} to {max(stamps)}" if stamps else "no frames"
+
+
+def _true_labelling(entry: Mapping[str, Any], image: U1) -> Labelling:
+    """Return the objects of an entry of the ground truth with its label image (h, w)."""
+    flat = image.reshape(-1)
+    items = (
+        LabelledItem(
+            track=item.get("track"),
+            category=str(item["category"]),
+            pixels=np.flatnonzero(np.isin(flat, item["parts"])),
+            box=Box(**item["box"]) if "box" in item else None,
+            decidable=not item["ambiguous"],
+        )
+        for item in entry["objects"]
+    )
+    small = [part for item in entry.get("hidden", ()) for part in item["parts"]]
+    ignored = np.isin(flat, small)
+    size = image.shape[0], image.shape[1]
+    return Labelling(tuple(items), (flat > 0) & ~ignored, size, ignored)
 
 
 class _LabelImages:
