@@ -220,6 +220,31 @@ def test_detections_keep_tracks_when_rows_are_read_in_parts(tmp_path: Path) -> N
     assert_allclose(found.full[3], np.full(10, 4.5))
 
 
+@pytest.mark.parametrize(
+    "change", [lambda rows: rows[1:], lambda rows: rows[::-1], lambda rows: rows[:0]]
+)
+def test_edited_detections_are_refused(tmp_path: Path, change: Callable[[Any], Any]) -> None:
+    """Boxes are found by their row: a filtered or sorted table gave tracks those of others."""
+    write_run_tables(tmp_path, [2, 1])
+    write_tracks(tmp_path, [(5, 0, 0), (6, 0, 1)])
+    path = tmp_path / "detections.parquet"
+    pq.write_table(pa.Table.from_pylist(change(pq.read_table(path).to_pylist()), DETECTIONS), path)
+    labels = {5: TrackLabel(5, "cup", 0.7), 6: TrackLabel(6, "cup", 0.7)}
+
+    with pytest.raises(OutputError, match="tracks do not fit its detections"):
+        list(read_shown_frames(tmp_path, labels))
+
+
+def test_track_of_missing_detection_is_refused(tmp_path: Path) -> None:
+    """It was a KeyError."""
+    write_run_tables(tmp_path, [2])
+    write_tracks(tmp_path, [(5, 0, 2)])
+
+    for read in (read_shown_frames, read_labelled_frames):
+        with pytest.raises(OutputError, match="tracks do not fit its detections"):
+            list(read(tmp_path, {5: TrackLabel(5, "cup", 0.7)}))
+
+
 def test_no_lists_give_empty_column() -> None:
     assert lists([], DETECTIONS.field("indices").type.value_type).to_pylist() == []
 

@@ -13,7 +13,7 @@ from shapecat.arrays import F4
 from shapecat.geometry import box_around
 from shapecat.runs.label_meaning import TrackLabel
 from shapecat.runs.masks import read_masks
-from shapecat.runs.shown import ShownTracks
+from shapecat.runs.shown import ShownTracks, misfit
 from shapecat.runs.tables import Key, numbers, read_together
 from shapecat.system.memory import release_memory
 from shapecat.types import (
@@ -52,6 +52,10 @@ def read_labelled_frames(folder: Path, labels: Mapping[int, TrackLabel]) -> Iter
 
     Tracks missing from ``labels`` (deleted by a person) are left out. Merged tracks have the same
     number; if several of them are in one frame, they are joined into one object.
+
+    Raises
+    ------
+    OutputError : a table is unreadable, or tracks and detections do not fit together.
     """
     shown = ShownTracks.read(folder, labels, causal=True)
     release_memory()  # of the table of tracks
@@ -62,7 +66,10 @@ def read_labelled_frames(folder: Path, labels: Mapping[int, TrackLabel]) -> Iter
         supports = rows_by_frame(planes)
         for row in frames.to_pylist():
             key = (row["topic"], row["frame"])
-            frame = _labelled_frame(row, objects.get(key, []), supports.get(key, []), shown)
+            found = {row["detection"]: row for row in objects.get(key, [])}
+            if any(item.detection not in found for item in shown.of(key)):
+                raise misfit(folder)
+            frame = _labelled_frame(row, found, supports.get(key, []), shown)
             yield replace(frame, masks=masks.of(key))
 
 
@@ -105,12 +112,11 @@ def _values(column: pa.ChunkedArray) -> Sequence[Any]:
 
 def _labelled_frame(
     row: Mapping[str, Any],
-    objects: Sequence[Mapping[str, Any]],
+    found: Mapping[int, Mapping[str, Any]],
     planes: Sequence[Mapping[str, Any]],
     shown: ShownTracks,
 ) -> LabelledFrame:
     key = (row["topic"], row["frame"])
-    found = {row["detection"]: row for row in objects}
     pose = None
     if row["fixed_translation"] is not None:
         pose = Pose(np.reshape(row["fixed_rotation"], (3, 3)), row["fixed_translation"])

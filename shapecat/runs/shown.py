@@ -12,6 +12,7 @@ import pyarrow.compute
 import pyarrow.parquet as pq
 
 from shapecat.arrays import F4, F8, I4
+from shapecat.errors import OutputError
 from shapecat.geometry import box_around
 from shapecat.runs.label_meaning import TrackLabel
 from shapecat.runs.table_schemas import BOX_WIDTH, FULL_BOX
@@ -30,7 +31,7 @@ from shapecat.runs.tables import (
 )
 from shapecat.types import Box, ShownBox, ShownFrame
 
-__all__ = ["ShownTracks", "read_shown_frames"]
+__all__ = ["ShownTracks", "misfit", "read_shown_frames"]
 
 _AT_ONCE = 8  # row groups of boxes in memory
 _NO_ROWS = slice(0, 0)
@@ -110,16 +111,20 @@ def read_shown_frames(
     This omits points, surfaces and posteriors, and is several times as fast as
     `shapecat.runs.labels.read_labelled_frames`. Boxes enclose whole objects where their size is
     known; with ``visible``, only their visible parts.
+
+    Raises
+    ------
+    OutputError : a table is unreadable, or tracks and detections do not fit together.
     """
     shown = ShownTracks.read(folder, labels)
     wanted = ("topic", "frame", "stamp_ns", "log_time_ns", "frame_id", "up")
-    found = ("topic", "frame", "center", "size", "orientation")
+    found = ("topic", "frame", "detection", "center", "size", "orientation")
     merged = len({label.track for label in labels.values()}) < len(labels)
     tables = {"frames": wanted, "detections": found}
     for frames, detections in read_together(folder, tables, at_once=_AT_ONCE):
         plain = [frames[name].to_pylist() for name in wanted[:-1]]
         keys = list(zip(*plain[:2], strict=True))
-        boxes = _boxes(keys, shown, detections, visible=visible)
+        boxes = _boxes(folder, keys, shown, detections, visible=visible)
         if merged:
             ups = numbers(frames["up"]).reshape(-1, 3)
             boxes = map(_joined, boxes, ups)
@@ -127,23 +132,33 @@ def read_shown_frames(
         yield from map(ShownFrame, *plain, boxes, ended)
 
 
+def misfit(folder: Path) -> OutputError:
+    """Return the error that a track of a run has a detection that is not in its table."""
+    msg = f"{folder}: its tracks do not fit its detections; process the recording again"
+    return OutputError(msg)
+
+
 def _boxes(
-    keys: Sequence[Key], shown: ShownTracks, detections: pa.Table, *, visible: bool
+    folder: Path, keys: Sequence[Key], shown: ShownTracks, detections: pa.Table, *, visible: bool
 ) -> Iterator[tuple[ShownBox, ...]]:
     """Yield the boxes to show in each of some frames."""
     all_rows, places = frame_rows(detections), _places(detections)
     spans = [shown.frames.get(key, _NO_ROWS) for key in keys]
-    firsts = [all_rows.get(key, _NO_ROWS).start for key in keys]
+    of_frames = [all_rows.get(key, _NO_ROWS) for key in keys]
+    firsts, ends = [rows.start for rows in of_frames], [rows.stop for rows in of_frames]
     counts = [span.stop - span.start for span in spans]
     numbered = np.concatenate([shown.detections[span] for span in spans])
-    places = places[np.repeat(firsts, counts) + numbered]  # detections are numbered by their rows
+    rows = np.repeat(firsts, counts) + numbered  # detections are numbered by their rows
+    known = numbers(detections["detection"])
+    if np.any(rows >= np.repeat(ends, counts)) or np.any(known[rows] != numbered):
+        raise misfit(folder)
+    places = places[rows]
     if not visible:
         full = np.concatenate([shown.full[span] for span in spans])
         places = np.where(np.isnan(full), places, full)
     for span, stop in zip(spans, accumulate(counts), strict=True):
         labels = [shown.labels[track] for track in shown.tracks[span].tolist()]
-        rows = places[stop - len(labels) : stop].tolist()
-        yield tuple(map(_box, labels, rows))
+        yield tuple(map(_box, labels, places[stop - len(labels) : stop].tolist()))
 
 
 def _box(label: TrackLabel, row: Sequence[float]) -> ShownBox:
