@@ -31,6 +31,7 @@ from shapecat.runs.tables import (
     opened,
     read_row_groups,
     read_rows,
+    read_together,
 )
 from shapecat.types import Box, Candidate, Detection, NeuralGas, Perception, Plane, Pose, Scene
 from tests.track_tables import write_tracks
@@ -243,6 +244,16 @@ def test_track_of_missing_detection_is_refused(tmp_path: Path) -> None:
     for read in (read_shown_frames, read_labelled_frames):
         with pytest.raises(OutputError, match="tracks do not fit its detections"):
             list(read(tmp_path, {5: TrackLabel(5, "cup", 0.7)}))
+
+
+def test_rewritten_table_with_other_row_groups_is_refused(tmp_path: Path) -> None:
+    """Data frame libraries write all rows as one group."""
+    path = tmp_path / "detections.parquet"
+    write_run_tables(tmp_path, [1] * (_SEGMENT_FRAMES + 1))
+    pq.write_table(pq.read_table(path), path)
+
+    with pytest.raises(OutputError, match="frames, detections have different row groups"):
+        list(read_together(tmp_path, {"frames": ["topic"], "detections": ["topic"]}))
 
 
 def test_no_lists_give_empty_column() -> None:

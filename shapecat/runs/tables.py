@@ -84,9 +84,8 @@ def read_row_groups(
     with opened(path) as file:
         count = file.num_row_groups
         for first in range(0, count, at_once):
-            yield file.read_row_groups(
-                range(first, min(first + at_once, count)), columns=columns, use_threads=False
-            )
+            groups = range(first, min(first + at_once, count))
+            yield file.read_row_groups(groups, columns=columns, use_threads=False)
 
 
 def read_rows(
@@ -124,13 +123,18 @@ def read_together(
 
     Raises
     ------
-    OutputError : a table is missing or unreadable.
+    OutputError : a table is missing or unreadable, or their row groups differ in number.
     """
     groups = (
         read_row_groups(folder / f"{name}.parquet", wanted, at_once=at_once)
         for name, wanted in columns.items()
     )
-    return zip(*groups, strict=True)
+    try:
+        yield from zip(*groups, strict=True)
+    except ValueError as error:  # of zip
+        names = ", ".join(columns)
+        msg = f"{folder}: {names} have different row groups; process the recording again"
+        raise OutputError(msg) from error
 
 
 def keys_of(table: pa.Table) -> list[Key]:
