@@ -256,6 +256,22 @@ def test_rewritten_table_with_other_row_groups_is_refused(tmp_path: Path) -> Non
         list(read_together(tmp_path, {"frames": ["topic"], "detections": ["topic"]}))
 
 
+@pytest.mark.parametrize(
+    ("column", "value"),
+    [("posterior", [np.nan, 0.5]), ("center", [0, np.inf, 1]), ("size", [0.1, -0.1, 0.2])],
+)
+def test_values_that_no_run_writes_are_refused(tmp_path: Path, column: str, value: Any) -> None:
+    """NaN reached pictures and data sets, or ended in a traceback far from its table."""
+    write_run_tables(tmp_path, [2])
+    path = tmp_path / "detections.parquet"
+    rows = pq.read_table(path).to_pylist()
+    rows[1][column] = value
+    pq.write_table(pa.Table.from_pylist(rows, DETECTIONS), path)
+
+    with pytest.raises(OutputError, match=f"detections.parquet: .*column {column} holds"):
+        list(read_row_groups(path, ["frame", column]))
+
+
 def test_no_lists_give_empty_column() -> None:
     assert lists([], DETECTIONS.field("indices").type.value_type).to_pylist() == []
 

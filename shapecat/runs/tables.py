@@ -41,6 +41,9 @@ __all__ = [
 # Arrow's own allocator holds 50 MB more while a long recording is read, and takes longer.
 pa.set_memory_pool(pa.system_memory_pool())
 
+_NUMBERS = {"center", "size", "orientation", "posterior", *FULL_BOX}
+"""Columns whose numbers are finite."""
+
 Key = tuple[str, int]
 """A frame: its topic, and its number on that topic."""
 
@@ -79,13 +82,13 @@ def read_row_groups(
 
     Raises
     ------
-    OutputError : the table is missing or unreadable.
+    OutputError : the table is missing or unreadable, or holds values that no run writes.
     """
     with opened(path) as file:
         count = file.num_row_groups
         for first in range(0, count, at_once):
             groups = range(first, min(first + at_once, count))
-            yield file.read_row_groups(groups, columns=columns, use_threads=False)
+            yield _sound(file.read_row_groups(groups, columns=columns, use_threads=False))
 
 
 def read_rows(
@@ -110,7 +113,7 @@ def read_rows(
         some = groups[k : k + at_once]
         at = np.concatenate([order[bounds[g] : bounds[g + 1]] for g in some])
         skipped = starts[some] - np.cumsum([0, *np.diff(starts)[some[:-1]]])
-        table = file.read_row_groups(some.tolist(), list(columns), use_threads=False)
+        table = _sound(file.read_row_groups(some.tolist(), list(columns), use_threads=False))
         yield at, table.take(pa.array(rows[at] - np.repeat(skipped, np.diff(bounds)[some])))
 
 
@@ -210,6 +213,21 @@ def opened(path: Path, *, read_dictionary: Sequence[str] = ()) -> Iterator[pq.Pa
     except (OSError, pa.ArrowException) as error:
         msg = f"{path}: not a readable table of a run folder ({error}); process the recording again"
         raise OutputError(msg) from error
+
+
+def _sound(table: pa.Table) -> pa.Table:
+    """Return rows of a table unchanged.
+
+    Raises
+    ------
+    pa.ArrowInvalid : a box or a posterior holds NaN or infinity, or a visible size is negative.
+    """
+    for name in _NUMBERS.intersection(table.column_names):
+        values = numbers(table[name].drop_null())
+        if not np.isfinite(values).all() or (name == "size" and np.any(values < 0)):
+            msg = f"column {name} holds NaN, infinity or a negative size"
+            raise pa.ArrowInvalid(msg)
+    return table
 
 
 def _parquet(path: Path, read_dictionary: Sequence[str]) -> pq.ParquetFile:
