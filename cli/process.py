@@ -22,7 +22,7 @@ from .options import (
     verbose_option,
 )
 from .progress import KINDS, Progress, describe_plan, open_progress
-from .render import count_words, missed_words, print_json, print_table
+from .render import count_words, for_any_reader, missed_words, print_json, print_table
 
 _MOST_ROWS = 100
 
@@ -176,10 +176,11 @@ def process(
         tally = _Tally(keep_all=as_json)
         for outcome in _run(batch, watcher, jobs, executor, scheduler):
             tally.add(outcome)
-    if as_json:
-        print_json([_plain(outcome) for outcome in tally.kept])
-    else:
-        _print_closing(batch.tasks, tally)
+    with for_any_reader():
+        if as_json:
+            print_json([_plain(outcome) for outcome in tally.kept])
+        else:
+            _print_closing(batch.tasks, tally)
     ctx.exit(exit_code(list(tally.of_each_code.values())))
 
 

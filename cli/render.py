@@ -1,6 +1,8 @@
 """Output of the commands: progress on stderr, results on stdout. Rich loads on first use."""
 
 import json
+import os
+import sys
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from typing import Any
@@ -87,7 +89,20 @@ def print_table(columns: Sequence[str], rows: Sequence[Sequence[Any]]) -> None:
     for row in rows:
         table.add_row(*map(str, row))
     width = None if Console().is_terminal else 200
-    Console(width=width, markup=False, emoji=False).print(table)
+    console = Console(width=width, markup=False, emoji=False)
+    with console.capture() as printed:  # Rich would end the process if nobody reads
+        console.print(table)
+    click.echo(printed.get(), nl=False)
+
+
+@contextmanager
+def for_any_reader() -> Iterator[None]:
+    """Print on stdout during the block; a reader that leaves early, such as `head`, is no error."""
+    try:
+        yield
+        sys.stdout.flush()
+    except BrokenPipeError:
+        os.dup2(os.open(os.devnull, os.O_WRONLY), 1)  # for what is still in the buffer
 
 
 def note_skipped(learned: Mapping[str, Any]) -> None:

@@ -504,6 +504,28 @@ def test_full_disk_behind_stdout_is_reported_in_one_line(
     assert done.stderr == "Error: cannot write the output: No space left on device\n"
 
 
+@pytest.mark.parametrize(
+    "line", ["print_table(['recording'], [['lab']])", "print_json(list(range(99999)))"]
+)
+def test_reader_that_leaves_early_does_not_change_the_exit_code(line: str) -> None:
+    """`process ... | head` said that recordings had failed."""
+    reader, pipe = os.pipe()
+    os.close(reader)
+    program = f"""
+import sys
+from shapecat.cli.render import for_any_reader, print_json, print_table
+with for_any_reader():
+    {line}
+sys.exit(5)
+"""
+    done = subprocess.run(
+        [sys.executable, "-c", program], stdout=pipe, stderr=subprocess.PIPE, check=False
+    )
+    os.close(pipe)
+
+    assert (done.returncode, done.stderr) == (5, b"")
+
+
 @pytest.mark.skipif(not Path("/dev/full").exists(), reason="needs a device that is always full")
 @pytest.mark.parametrize(
     ("kind", "how"),
