@@ -161,6 +161,10 @@ def process(
     _require_range(choices["start_s"], choices["end_s"])
     if no_fsync:
         os.environ[FSYNC] = "0"  # which worker processes inherit
+    if executor != "local":  # its workers may have another current folder
+        recordings, out = tuple(map(_from_root, recordings)), _from_root(out)
+        if choices["model"] is not None:
+            choices["model"] = choices["model"].absolute()
     chosen = [f"outputs.boxes={boxes}"] if boxes else []
     job = Job(
         source=Path(),
@@ -182,6 +186,13 @@ def process(
         else:
             _print_closing(batch.tasks, tally)
     ctx.exit(exit_code(list(tally.of_each_code.values())))
+
+
+def _from_root(place: str) -> str:
+    """Return an absolute path, or a URL as it is."""
+    from shapecat.batch.storage import is_url
+
+    return place if is_url(place) else str(Path(place).absolute())
 
 
 def _require_range(start_s: float | None, end_s: float | None) -> None:

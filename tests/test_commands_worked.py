@@ -3,6 +3,7 @@
 import json
 import re
 from collections.abc import Callable
+from concurrent.futures import Executor, Future
 from importlib import import_module
 from pathlib import Path
 from types import SimpleNamespace
@@ -409,6 +410,35 @@ def test_train_names_the_defects_of_its_model(
 
     assert done.exit_code == 0
     assert re.match(said, done.stderr)
+
+
+class _JobCollector(Executor):
+    """Keeps the jobs it is given, and fails them."""
+
+    def __init__(self) -> None:
+        self.jobs: list[Any] = []
+
+    def submit(self, _function: Any, /, *args: Any, **_: Any) -> Future[Any]:
+        self.jobs.append(args[0])
+        future: Future[Any] = Future()
+        future.set_exception(ValueError("not processed"))
+        return future
+
+
+def test_workers_of_a_cluster_get_absolute_paths(
+    shapecat: Run, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """They may have another current folder: they missed recordings, and wrote results there."""
+    monkeypatch.chdir(tmp_path)
+    Path("a.mcap").write_bytes(b"\x89MCAP")
+    workers = _JobCollector()
+    monkeypatch.setattr("shapecat.executors.open_executor", lambda *_, **__: workers)
+    shapecat("process", "a.mcap", "--out", "out", "--model", "m.npz", "--executor", "dask")
+
+    (job,) = workers.jobs
+    assert [job.source, job.folder, job.model] == [
+        tmp_path / "a.mcap", tmp_path / "out" / "a", tmp_path / "m.npz"
+    ]  # fmt: skip
 
 
 ODD = ("/cam[left]/depth", "k [/night].mcap", "box :car:")
