@@ -772,6 +772,15 @@ def test_object_with_wrong_category_counts_as_found() -> None:
     assert figures["box_iou"] == {"n": 2, "mean": 0.25}
 
 
+def test_frames_without_objects_have_no_overlap() -> None:
+    """An overlap of 0 would say that two empty tables have nothing in common."""
+    options: Any = {"seen": None, "rows": [], "categories": NAMES, "threshold": 0.25}
+    for pixels, found in ((0, False), (4, True)):
+        overlap = Overlap(found=pixels)
+        figures = figures_of({}, Pairs(), overlap=overlap, **options)
+        assert (figures["overlap"] is not None) == found
+
+
 def test_labels_of_frame_match_its_topic_and_stamp() -> None:
     """Labels without a topic, or by frame number, count only if there are no better ones."""
     names = {(None, 5): "any", ("/d", 5): "own", ("/d", START): "stamp", (None, START): "old"}

@@ -72,7 +72,7 @@ def figures_of(
         "frames": dict(frames),
         "objects": _objects(rows, overlap),
         "overlap": None
-        if overlap is None
+        if overlap is None or not overlap.found + overlap.true
         else {name: round(getattr(overlap, name), 4) for name in ("f", "precision", "recall")},
         "category": _category(pairs, categories),
         "box_iou": {"n": len(boxes), "mean": _mean(boxes)},
