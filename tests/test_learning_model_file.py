@@ -176,6 +176,10 @@ _HOSTILE = {
     "not a number": (edit_header(temperature=float("nan")), "numbers"),
     "temperature near 0": (edit_header(temperature=1e-300), "numbers"),
     "a category twice": (edit_header(categories=["cup", "cup"]), "category names"),
+    "a category without a name": (edit_header(categories=["cup", ""]), "category names"),
+    "a name of two lines": (edit_header(categories=["cup", "a\nb"]), "category names"),
+    "a name that is no Unicode": (edit_header(categories=["cup", "\ud800"]), "category names"),
+    "unknown as a category": (edit_header(categories=["cup", "unknown"]), "category names"),
     "a category missing": (edit_header(categories=["cup"]), "categories"),
     "a name is no text": (edit_header(categories=["cup", 3]), "wrong type"),
     "an array missing": (lambda m: m.pop("votes.npy"), "no votes"),
@@ -195,6 +199,7 @@ _HOSTILE = {
     "no threshold": (edit_header(threshold=float("inf")), "numbers"),
     "two learners too many": (put("bias", [0.0, 0.1, 0.2, 0.3], "f8"), "not a usable"),
     "infinite votes": (put("votes", np.full((4, 2), np.inf), "f2"), "numbers"),
+    "known views of NaN": (put("known_descriptors", np.full((2, 3), np.nan), "f2"), "numbers"),
     "an unknown category": (put("known_category", [0, 7], "u1"), "known views"),
 }
 

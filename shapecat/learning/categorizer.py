@@ -14,6 +14,7 @@ from shapecat.errors import ModelError
 from shapecat.jit import kernel
 from shapecat.learning.features import FeatureBank, write_features
 from shapecat.learning.forest import FlatForest, apply
+from shapecat.types import UNKNOWN
 
 __all__ = ["MOST_CATEGORIES", "Categorizer", "Prediction", "parts_of"]
 
@@ -83,7 +84,8 @@ class Categorizer(Record):
             "categories": self.bias.size - len(self.categories) in {0, 1}
             and self.bank.categories == len(self.categories),
             "category names": len(set(self.categories)) == len(self.categories)
-            and 0 < len(self.categories) <= MOST_CATEGORIES,
+            and 0 < len(self.categories) <= MOST_CATEGORIES
+            and all(name and name.isprintable() and name != UNKNOWN for name in self.categories),
             "words": self.forest.words == len(self.votes),
             "features": self.linear.shape[1]
             == self.bank.width
@@ -92,7 +94,7 @@ class Categorizer(Record):
             and bool(np.all(self.known_category < self.bias.size)),
             "numbers": all(
                 bool(np.all(np.abs(values.astype(np.float64)) <= _LARGEST))
-                for values in (self.votes, self.linear, self.bias)
+                for values in (self.votes, self.linear, self.bias, self.known_descriptors)
             )
             and 1e-3 <= self.temperature <= 1e3
             and abs(self.threshold) <= _LARGEST,
