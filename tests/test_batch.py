@@ -2,6 +2,7 @@
 
 import json
 import os
+import re
 import resource
 import shutil
 import signal
@@ -328,6 +329,28 @@ def test_recording_that_kills_its_workers_is_given_up(recordings: Path, tmp_path
     (failed,) = [o for o in watcher.outcomes if o.job.folder.name == "bag"]
     assert "gave up after 2 tries" in failed.message
     assert states(tmp_path) == {**ALL_DONE, "bag": "failed"}
+
+
+class OtherVersion(Executor):
+    """An executor whose workers have another version of shapecat than the command."""
+
+    def submit(self, fn: Any, /, *args: Any, **kwargs: Any) -> Future[Any]:
+        """Run the call at once."""
+        future: Future[Any] = Future()
+        with pytest.MonkeyPatch.context() as patch:
+            patch.setattr("shapecat.batch.runs.__version__", "9.9")
+            future.set_result(fn(*args, **kwargs))
+        return future
+
+
+def test_workers_of_another_version_are_refused(tmp_path: Path) -> None:
+    """They would ignore options that they do not know, without a word."""
+    (tmp_path / "a.mcap").write_bytes(b"\x89MCAP")
+    with plan_batch(Job(Path(), Path()), [str(tmp_path / "a.mcap")], str(tmp_path)) as batch:
+        (outcome,) = process_on(OtherVersion(), batch.tasks, Watcher())
+
+    assert outcome.code == 1
+    assert re.search(r"a worker has shapecat 9\.9, this command \d", outcome.message)
 
 
 def test_recording_that_only_waited_has_one_try(recordings: Path, tmp_path: Path) -> None:

@@ -9,6 +9,7 @@ from queue import Empty, SimpleQueue
 from typing import Any, Protocol
 from uuid import uuid4
 
+from shapecat import __version__
 from shapecat.batch.ledger import Ledger, Outcome
 from shapecat.batch.manifest import Manifest
 from shapecat.batch.plans import Task
@@ -121,7 +122,8 @@ def _outcomes(
 
     def begin(task: Task) -> None:
         ledger.begin(task)
-        future = executor.submit(_attempt_elsewhere, task.job, address, cores, _ticket(task, batch))
+        ticket = _ticket(task, batch)
+        future = executor.submit(_attempt_elsewhere, task.job, address, cores, ticket, __version__)
         future.add_done_callback(lambda done: ended.put((task, done)))
 
     yield from (ledger.known(task) for task in tasks if task.status == "complete")
@@ -163,8 +165,11 @@ def _unknown(job: Job, error: BaseException) -> Outcome:
     return Outcome(job, message=f"{job.name}: {type(error).__name__}: {error}", code=1)
 
 
-def _attempt_elsewhere(job: Job, address: str, cores: int, ticket: Ticket) -> Outcome:
-    """Process one job in a worker."""
+def _attempt_elsewhere(job: Job, address: str, cores: int, ticket: Ticket, version: str) -> Outcome:
+    """Process one job in a worker; refuse a command of another version of shapecat."""
+    if version != __version__:
+        what = f"a worker has shapecat {__version__}, this command {version}"
+        return Outcome(job, message=f"{job.name}: {what}; install one version", code=1)
     logging.basicConfig(level=logging.ERROR, format="%(levelname)s %(message)s")
     return attempt(job, _reporter(job.folder.name, address), cores=cores, ticket=ticket)
 
