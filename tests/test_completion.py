@@ -217,6 +217,17 @@ def test_partial_views_do_not_shrink_fused_box() -> None:
     np.testing.assert_allclose(fused.centers[0], 0, atol=0.005)
 
 
+def test_thin_object_that_moved_has_no_negative_size() -> None:
+    """One side is seen before it moves, the other afterwards: between them is less than nothing."""
+    sizes = np.tile([0.01, 0.2, 0.3], (6, 1))
+    centers = np.array([[0.02, 0, 0]] * 3 + [[-0.02, 0, 0]] * 3)
+    views = views_of(centers, np.tile(np.eye(3), (6, 1, 1)), sizes)
+    sensors = np.array([[-1.0, 0, 0]] * 3 + [[1.0, 0, 0]] * 3)
+    fused = fused_in(views._replace(sensors=sensors), np.ones(6), one_hot("box"), CATEGORIES)
+
+    assert_allclose(np.sort(fused.sizes[0]), [0.005, 0.2, 0.3], atol=0.002)
+
+
 def test_view_of_moved_object_keeps_its_pose() -> None:
     """Its size is that of the other views."""
     centers, sizes = np.zeros((7, 3)), np.tile([0.2, 0.1, 0.3], (7, 1))

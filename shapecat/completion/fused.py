@@ -13,6 +13,8 @@ __all__ = ["BoxViews", "FusedBox", "FusedBoxes", "fuse_boxes"]
 
 _STILL_M = 0.05
 """While the centre moves less than this, the object stands still."""
+_NARROWEST = 0.5
+"""Least width of the overlaid outline, as a share of the narrowest view."""
 _UNSEEN = 0.05
 """Weight of an outline in directions that do not face the sensor; in those that do it is 1."""
 _SQUARE = 0.2
@@ -138,7 +140,16 @@ def _overlaid(views: BoxViews, weights: F8, origin: F8, base: F8) -> tuple[F8, F
     shown = _median(reached[whole], each[whole])
     reached = np.where(whole[:, None], reached, np.maximum(reached, shown))
     share = (weights[:, None] * facing).sum(axis=0) / weights.sum()
-    return _median(reached, each), share
+    seen = _median(reached, each)
+    # Of a thin object that moves a little, opposite sides may come from views that exclude each
+    # other.
+    least = _NARROWEST * _across(reached).min(axis=0)
+    return seen + np.maximum(least - _across(seen), 0.0) / 2, share
+
+
+def _across(outlines: F8) -> F8:
+    """Return the width of outlines (..., 96) in each direction, metres."""
+    return np.asarray(outlines + np.roll(outlines, DIRECTIONS // 2, axis=-1))
 
 
 def _turned(outlines: F8, angles: F8) -> F8:
