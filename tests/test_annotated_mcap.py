@@ -413,6 +413,31 @@ def test_ros1_bag_is_converted_to_ros2(tmp_path: Path) -> None:
         assert other.message_count == 4 + 6
 
 
+def test_ros1_type_that_ros2_has_extended_keeps_its_definition(tmp_path: Path) -> None:
+    """Markers have textures in ROS 2: read as such, the end of a recorded one is missing."""
+    source, target = tmp_path / "a.bag", tmp_path / "out.mcap"
+    kind, types = "visualization_msgs/msg/Marker", STORE1.types
+    header = types["std_msgs/msg/Header"](7, types["builtin_interfaces/msg/Time"](1, 2), "map")
+    place = types["geometry_msgs/msg/Point"](0.1, 0.2, 0.3)
+    pose = types["geometry_msgs/msg/Pose"](
+        place, types["geometry_msgs/msg/Quaternion"](0.4, 0.5, 0.6, 0.7)
+    )
+    scale = types["geometry_msgs/msg/Vector3"](0.8, 0.9, 1.1)
+    colour = types["std_msgs/msg/ColorRGBA"](0.25, 0.5, 0.75, 1.0)
+    lifetime = types["builtin_interfaces/msg/Duration"](3, 4)
+    rest = (lifetime, True, [place], [colour], "words", "package://mesh", True)
+    marker = types[kind](header, "shapes", 5, 1, 0, pose, scale, colour, *rest)
+    with BagWriter(source) as writer:
+        connection = writer.add_connection("/marker", kind, typestore=STORE1)
+        writer.write(connection, EPOCH, STORE1.serialize_ros1(marker, kind))
+
+    annotate(source, target)
+
+    ((_, read),) = read_ros(target, "/marker")
+    assert (read.id, read.scale.y, read.text, read.mesh_resource) == (5, 0.9, "words", rest[5])
+    assert (read.lifetime.nanosec, read.points[0].z, read.colors[0].b) == (4, 0.3, 0.75)
+
+
 def test_unconvertible_message_is_wrapped(tmp_path: Path) -> None:
     """Two encodings in one file would make it unreadable for ROS tools."""
     source, target = tmp_path / "a.bag", tmp_path / "out.mcap"

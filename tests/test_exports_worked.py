@@ -11,6 +11,7 @@ from typing import Any
 import numpy as np
 import pytest
 from numpy.testing import assert_allclose
+from PIL import Image
 from scipy.spatial.transform import Rotation
 
 from shapecat.cameras.colour import ColourImage, ColourView, LensCamera
@@ -150,6 +151,43 @@ def test_kitti_calibration_projects_points_into_colour_camera(tmp_path: Path) ->
     assert_allclose(back.center, item.box.center, atol=2e-5)
     error = Rotation.from_quat(back.orientation).inv() * Rotation.from_quat(item.box.orientation)
     assert error.magnitude() < 1e-4
+
+
+def test_kitti_image_is_that_of_its_pinhole_camera(tmp_path: Path) -> None:
+    """P2 has no lens distortion, so what it projects must be there in image_2."""
+    camera = Camera(200, 150, 171.0, 166.0, 103.2, 71.5)
+    k1, k2, p1, p2, k3 = lens = (-0.31, 0.12, 0.004, -0.003, 0.02)
+    pose = Pose(
+        Rotation.from_euler("xyz", [0.05, -0.08, 0.03]).as_matrix(), np.array([0.06, -0.02, 0.01])
+    )
+    column, row = 17, 21
+    x, y, z = pose.rotation @ frame().xyz()[row * CAMERA.width + column] + pose.translation
+    x, y = x / z, y / z
+    r2 = x * x + y * y
+    radial = 1 + r2 * (k1 + r2 * (k2 + r2 * k3))  # the model plumb_bob
+    bent_x = x * radial + 2 * p1 * x * y + p2 * (r2 + 2 * x * x)
+    bent_y = y * radial + p1 * (r2 + 2 * y * y) + 2 * p2 * x * y
+    u, v = round(171.0 * bent_x + 103.2), round(166.0 * bent_y + 71.5)
+    pixels = np.zeros((150, 200, 3), np.uint8)
+    pixels[v - 1 : v + 2, u - 1 : u + 2] = 255
+    image = ColourImage("/color", 5, 6, "color", "rgb8", 200, 150, 600, pixels.tobytes())
+    view = ColourView(image, LensCamera(camera, "plumb_bob", lens), pose)
+    views: Any = [(labelled(cut=False, hidden=False), frame(), Coloured(view, ()))]
+    unused: Any = SimpleNamespace()
+    write_kitti(tmp_path, views, unused)
+
+    text = (tmp_path / "calib" / "000000.txt").read_text()
+    projection, mount = (
+        np.array(list(map(float, re.findall(rf"{name}: (.*)", text)[0].split()))).reshape(3, 4)
+        for name in ("P2", "Tr_velo_to_cam")
+    )
+    points = np.fromfile(tmp_path / "velodyne" / "000000.bin", "<f4").reshape(-1, 4)
+    at = projection @ [*(mount @ [*points[row * CAMERA.width + column, :3], 1]), 1]
+    expected = at[:2] / at[2]
+    drawn = np.asarray(Image.open(tmp_path / "image_2" / "000000.png").convert("L"), float)
+    found = [float(np.average(axis, weights=drawn)) for axis in np.mgrid[:150, :200][::-1]]
+    assert_allclose(found, expected, atol=1.0)
+    assert np.hypot(*(expected - (u, v))) > 4  # the lens moves this point by more than that
 
 
 @pytest.mark.parametrize(

@@ -112,7 +112,7 @@ def test_records_print_in_one_short_line() -> None:
 
 def shown_frame(topic: str, stamp: int, *tracks: int, ended: tuple[int, ...] = ()) -> ShownFrame:
     boxes = tuple(ShownBox(t, "cup", 0.9, (0, 0, 1), (1, 1, 1), UPRIGHT) for t in tracks)
-    return ShownFrame(topic, stamp, stamp, stamp, "cam", boxes, ended)
+    return ShownFrame(topic, stamp, stamp, 3 * stamp + 7, "cam", boxes, ended)
 
 
 def test_annotations_outlive_their_period_and_are_deleted_once() -> None:
