@@ -231,6 +231,23 @@ def test_detection_of_hidden_object_is_not_false(run: Path, truth: Path) -> None
     assert before["true"] - after["true"] == 3
 
 
+def test_pixels_on_hidden_object_are_not_wrong(run: Path, truth: Path) -> None:
+    """Of a detection that covers a corner of a hidden object, the other pixels count."""
+    content = json.loads(truth.read_text())
+    for entry in content:
+        entry["hidden"] = [{"label": 6, "parts": [6]}]
+    truth.write_text(json.dumps(content))
+    with np.load(truth.with_name("lab.labels.npz")) as file:
+        labels = file["labels"]
+    labels[:, 0, :2] = 6  # two of the 20 pixels of the cup, which is found in each frame
+    np.savez_compressed(truth.with_name("lab.labels.npz"), labels=labels)
+    overlap = compare(run, truth).figures["overlap"]
+
+    shared, found, true = 3 * 18 + 3 * 12 + 2 * 15, 3 * 18 + 3 * 12 + 2 * 15 + 2, 3 * (18 + 16 + 15)
+    assert overlap["precision"] == pytest.approx(shared / found, abs=1e-4)
+    assert overlap["recall"] == pytest.approx(shared / true, abs=1e-4)
+
+
 @pytest.mark.parametrize(("beside", "kept"), [(2, [10, 11, 12]), (3, None)])
 def test_detection_is_left_out_if_mostly_ignored(beside: int, kept: list[int] | None) -> None:
     """One that merely touches an ignored object is compared by its other pixels."""

@@ -8,6 +8,7 @@ from typing import Any
 import numpy as np
 import pyarrow.parquet as pq
 import pytest
+from scipy.spatial.transform import Rotation
 
 import shapecat.pipeline
 from shapecat.config import Settings
@@ -21,7 +22,7 @@ from shapecat.simulation.recorder import record
 from shapecat.simulation.worlds import Motion, World
 from shapecat.tracking.hits import gather
 from shapecat.tracking.records import FrameDetections
-from shapecat.types import Detection, Frame, Perception, Pose
+from shapecat.types import Detection, Frame, FullBox, Perception, Pose
 from tests.conftest import Guesser
 
 FRAMES, CHANGE = 6, 3
@@ -171,7 +172,13 @@ def test_slowly_moving_object_is_described_again() -> None:
     assert len(set(origins)) >= 3
 
 
-def test_reused_surfaces_stay_in_place_while_camera_moves() -> None:
+def placed(fixed_from_sensor: Pose, box: FullBox) -> tuple[Any, Rotation]:
+    """Return the centre and the rotation of a box in the fixed frame."""
+    turn = Rotation.from_matrix(fixed_from_sensor.rotation)
+    return transform(fixed_from_sensor, box.center), turn * Rotation.from_quat(box.orientation)
+
+
+def test_reused_surfaces_and_boxes_stay_in_place_while_camera_moves() -> None:
     """They stay exactly in place in the fixed frame."""
     world = make_scene("tabletop", np.random.default_rng(11), frames=FRAMES, rate_hz=30.0)
     perceptions = perceive(world)
@@ -191,6 +198,11 @@ def test_reused_surfaces_stay_in_place_while_camera_moves() -> None:
         assert now.full is not None
         assert then.full is not None
         assert np.allclose(now.full.size, then.full.size)
+        (place, turn), (old_place, old_turn) = (
+            placed(world.path[k], now.full), placed(world.path[now.reused_from or 0], then.full)
+        )  # fmt: skip
+        assert np.allclose(place, old_place, atol=1e-5)
+        assert (turn.inv() * old_turn).magnitude() < 1e-5
 
 
 def test_wrong_pose_prevents_reuse() -> None:
