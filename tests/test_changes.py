@@ -262,6 +262,7 @@ def test_each_topic_has_its_own_poses(tmp_path: Path) -> None:
     assert streams_with_poses(tmp_path) == {"/head"}
     rows = placed.find([topic for topic, _ in order], np.array([k for _, k in order]))
     assert rows.tolist() == list(range(5))
+    assert placed.first[rows].tolist() == list(range(5))  # of one detection in each frame
     assert placed.poses[rows, 0, 3].tolist() == [float(topic == "/head") for topic, _ in order]
 
 

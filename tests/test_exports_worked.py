@@ -190,6 +190,29 @@ def test_kitti_image_is_that_of_its_pinhole_camera(tmp_path: Path) -> None:
     assert np.hypot(*(expected - (u, v))) > 4  # the lens moves this point by more than that
 
 
+def test_kitti_image_on_depth_pixels_has_the_depth_camera(tmp_path: Path) -> None:
+    """Drivers publish registered images with the calibration of the colour camera."""
+    pixels = np.random.default_rng(1).integers(0, 256, (120, 160, 3), np.uint8)
+    image = ColourImage("/color", 5, 6, "optical", "rgb8", 160, 120, 480, pixels.tobytes())
+    lens = LensCamera(Camera(160, 120, 144.1, 140.3, 76.2, 62.8), "plumb_bob", (0.02, 0, 0, 0, 0))
+    coloured = Coloured(ColourView(image, lens), ())
+    views: Any = [(labelled(cut=False, hidden=False), frame(), coloured)]
+    unused: Any = SimpleNamespace()
+    write_kitti(tmp_path, views, unused)
+
+    text = (tmp_path / "calib" / "000000.txt").read_text()
+    projection, mount = (
+        np.array(list(map(float, re.findall(rf"{name}: (.*)", text)[0].split()))).reshape(3, 4)
+        for name in ("P2", "Tr_velo_to_cam")
+    )
+    points = np.fromfile(tmp_path / "velodyne" / "000000.bin", "<f4").reshape(-1, 4)
+    points[:, 3] = 1
+    at = projection @ np.vstack([mount @ points.T, np.ones(len(points))])
+    v, u = np.mgrid[:120, :160]
+    assert_allclose(at[:2] / at[2], [u.ravel(), v.ravel()], atol=2e-3)
+    assert np.array_equal(np.asarray(Image.open(tmp_path / "image_2" / "000000.png")), pixels)
+
+
 @pytest.mark.parametrize(
     ("left", "top", "width", "height", "box"),
     [

@@ -580,6 +580,22 @@ def test_labels_without_match_survive_later_runs(tmp_path: Path) -> None:
     assert kept == {"teapot", "vase"}
 
 
+@pytest.mark.parametrize(("there", "copies"), [([CUP, BOWL], []), ([CUP], [{"mug", "vase"}])])
+def test_table_is_kept_for_good_if_any_label_is_lost(
+    tmp_path: Path, there: list[Any], copies: list[set[str]]
+) -> None:
+    """The next run replaces tracks.previous.csv, and transfers only the labels that were found."""
+    objects = {4: static(CUP), 5: static(BOWL)}
+    old = make_run(tmp_path / "lab", objects, labels={4: "mug", 5: "vase"})
+    new = make_run(tmp_path / "new", {k: static(place) for k, place in enumerate(there, start=1)})
+    run = read_run(new)
+    keep_labels(new, run, Job(tmp_path / "lab.mcap", old))
+
+    assert list(labels_of(new).values()) == ["mug", "vase"][: len(there)]
+    assert labels_in(new / "tracks.previous.csv") == {"mug", "vase"}
+    assert [labels_in(table) for table in old.glob("tracks.previous-*.csv")] == copies
+
+
 # ---- the real command
 
 

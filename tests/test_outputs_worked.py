@@ -21,12 +21,15 @@ from numpy.typing import ArrayLike
 from PIL import Image
 from scipy.spatial.transform import Rotation
 
+from shapecat.cameras.colour import ColourImage, ColourView, LensCamera
+from shapecat.colour.masks import Mask
 from shapecat.detection.scene_graph import Node, format_tree
 from shapecat.errors import OutputError
+from shapecat.geometry import IDENTITY
 from shapecat.outputs.annotated_mcap import _annotations, _encoding
 from shapecat.outputs.annotation import Annotation
 from shapecat.outputs.annotations import encoder_for
-from shapecat.outputs.colouring import with_colour
+from shapecat.outputs.colouring import Coloured, with_colour
 from shapecat.outputs.colours import colour_of
 from shapecat.outputs.dataset_frames import (
     Selection,
@@ -35,6 +38,7 @@ from shapecat.outputs.dataset_frames import (
     _different,
     _view,
     images_of,
+    snapped_masks,
     split_runs,
 )
 from shapecat.outputs.exports import _made_by_export, _require_own, _staged, _thinned
@@ -441,6 +445,24 @@ def test_images_without_certain_objects_are_omitted(monkeypatch: pytest.MonkeyPa
 
     assert list(found) == [images[1], images[4]]
     assert left_out == {"no image": 1, "no object with a certain label": 2}
+
+
+@pytest.mark.parametrize(("pose", "most"), [(IDENTITY, 160), (None, 840)])
+def test_outlines_move_by_pixels_of_the_depth_camera(pose: Pose | None, most: int) -> None:
+    """At three times the resolution of the depth, 7 pixels are a small error, else a large one."""
+    inside = np.zeros((110, 130), bool)
+    inside[25:85, 35:95] = True
+    pixels = np.where(inside[..., None], (128, 138, 148), (120, 130, 140)).astype(np.uint8)
+    image = ColourImage("/color", 5, 6, "color", "rgb8", 130, 110, 390, pixels.tobytes())
+    lens = LensCamera(Camera(130, 110, 129.0, 127.0, 66.0, 52.0))
+    mask = Mask(28, 25, np.ones((60, 60), bool))
+    coloured = Coloured(ColourView(image, lens, pose), (mask,))
+    depth = np.ones((37, 43), np.float32)
+    frame = Frame("/depth", 0, 0, 0, "cam", depth, Camera(43, 37, 43.0, 42.0, 21.0, 18.0))
+
+    (moved,) = snapped_masks(frame, coloured, pixels)
+    wrong = int((moved.full(110, 130) ^ inside).sum())
+    assert most / 2 < wrong <= most if pose is None else wrong <= most
 
 
 def test_depth_images_are_millimetres_without_overflow() -> None:

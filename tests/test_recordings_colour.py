@@ -425,6 +425,7 @@ def test_realsense_extrinsics_are_read_column_by_column(tmp_path: Path) -> None:
         ({"/cam1": 1.0, "/cam2": 2.0}, 2.0),
         ({"/cam": 3.0, "/cam2": 2.0}, 2.0),  # not a part of the name
         ({"/cam1": 1.0, "/cam2": np.nan}, None),
+        ({"": 3.0, "/cam2": 2.0}, 2.0),  # the nearer one
         ({"": 3.0, "/cam2": np.nan}, 3.0),
         ({"/cam1": 1.0}, 1.0),
         ({"/cam1": 1.0, "/cam3": 2.0}, None),
