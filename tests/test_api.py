@@ -22,8 +22,10 @@ from shapecat import api
 from shapecat.errors import ConfigError, ModelError, OutputError, RecordingError
 from shapecat.outputs.opened_run import Table
 from shapecat.types import Camera
+from tests import messages
 from tests.conftest import Guesser
 from tests.loading import loaded_by
+from tests.messages import EPOCH
 from tests.test_docs_run import run_here
 
 PAGE = Path(__file__).parents[1] / "docs" / "python.md"
@@ -258,6 +260,24 @@ def test_frames_of_one_topic_are_read(page_folder: Path) -> None:
     assert frame.topic == "/camera/depth/image_raw"
 
 
+def test_frames_are_those_of_the_selection(tmp_path: Path) -> None:
+    """Steps count from the start of the range, whose end is left out."""
+    items = [("/d/camera_info", EPOCH, messages.info(EPOCH))]
+    for k in range(12):
+        stamp = EPOCH + k * 100_000_000
+        items += [("/d/image", stamp, messages.image(stamp, messages.wavy_depth()))]
+    ranges: list[tuple[dict[str, Any], list[int]]] = [
+        ({"start_s": 0.25, "end_s": 0.9, "every": 2}, [3, 5, 7]),
+        ({"start_s": 0.95}, [10, 11]),
+        ({"end_s": 0.2}, [0, 1]),
+        ({"every": 5}, [0, 5, 10]),
+    ]
+    with shapecat.open_recording(messages.write(tmp_path / "a.mcap", items)) as recording:
+        for options, expected in ranges:
+            stamps = [frame.stamp_ns - EPOCH for frame in recording.frames("/d/image", **options)]
+            assert stamps == [100_000_000 * k for k in expected]
+
+
 def test_model_is_read_once_until_its_file_changes(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -377,6 +397,27 @@ def test_times_may_be_numbers_of_numpy(tmp_path: Path, monkeypatch: pytest.Monke
         shapecat.process(FIXTURE, tmp_path, **times)
 
     assert '"start_s": 0.5, "end_s": 2.0' in json.dumps(jobs[0].selection())
+
+
+def test_options_of_process_reach_the_run(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Each of them is named again on its way, and one that is forgotten has its default."""
+    jobs: list[tuple[Any, int]] = []
+    monkeypatch.setattr(
+        "shapecat.pipeline.process", lambda job, *_, cores: jobs.append((job, cores))
+    )
+    monkeypatch.setattr(api, "runs_again", lambda: False)
+    given: dict[str, Any] = {
+        "up": "imu", "fixed_frame": "odom", "start_s": 0.5, "end_s": 2.0, "every": 3,
+        "model": tmp_path / "mine.npz", "color": "/rgb", "mcap": False, "rrd": False,
+        "overwrite": True, "discard_labels": True,
+    }  # fmt: skip
+    with pytest.raises(OutputError, match=r"no run\.json"):
+        shapecat.process(FIXTURE, tmp_path, topics=["/b", "/a"], cores=2, seed=7, **given)
+
+    ((job, cores),) = jobs
+    assert {name: getattr(job, name) for name in given} == given
+    assert (job.topics, job.settings.seed, cores) == (("/b", "/a"), 7, 2)
+    assert (job.source, job.folder) == (FIXTURE, tmp_path / "tabletop")
 
 
 def test_process_accepts_single_topic_and_up_vector(page_folder: Path, tmp_path: Path) -> None:

@@ -18,7 +18,7 @@ from scipy.spatial import ConvexHull
 from shapecat.arrays import Bool
 from shapecat.errors import OutputError
 from shapecat.geometry import compose, inverse, rotation_from_quaternion, transform
-from shapecat.simulation import World, make_scene, render_frame, simulate
+from shapecat.simulation import World, make_scene, render_frame, simulate, truth
 from shapecat.simulation.mesh import Mesh
 from shapecat.simulation.presets import IDEAL, KINECT
 from shapecat.simulation.recorder import EPOCH_NS, record, robot_links
@@ -26,6 +26,7 @@ from shapecat.simulation.render import geometry, render
 from shapecat.simulation.scans import load_mesh, upright_poses, uprighted
 from shapecat.simulation.scenes import SceneKind
 from shapecat.simulation.sensors import resized
+from shapecat.simulation.truth import AMBIGUOUS_PIXELS, frame_truth
 from shapecat.types import CATEGORIES, Camera, Pose
 
 SETTLED = {"pile", "bin", "shelf_bin", "room"}  # with physics: objects touch and lie in each other
@@ -36,6 +37,29 @@ WORLDS = [
     *((kind, 1) for kind in KINDS),
     *(pytest.param((kind, 2), marks=pytest.mark.many) for kind in KINDS),
 ]
+
+
+def test_category_is_ambiguous_if_little_of_object_is_visible(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    """Few pixels are enough, and so is a small share of the side that faces the camera."""
+    world = make_scene("tabletop", np.random.default_rng(11), frames=1)
+    _, labels = render_frame(world, 0, rng=np.random.default_rng(0), sensor=KINECT)
+    clear = [t for t in frame_truth(world, 0, labels, KINECT).objects if not t["ambiguous"]]
+    largest = max(clear, key=lambda one: one["pixels"])
+
+    def judged(shown: float) -> dict[str, Any]:
+        cut, own = labels.copy(), np.flatnonzero(labels == largest["label"])
+        cut.reshape(-1)[own[round(shown * len(own)) :]] = world.supports[0].label
+        found = frame_truth(world, 0, cut, KINECT).objects
+        return next(one for one in found if one["label"] == largest["label"])
+
+    less = judged(0.3)
+    assert less["pixels"] > 2 * AMBIGUOUS_PIXELS
+    assert less["visible"] == pytest.approx(0.3 * largest["visible"], abs=0.01)
+    assert [judged(shown)["ambiguous"] for shown in (1.0, 0.5, 0.3)] == [False, False, True]
+    monkeypatch.setattr(truth, "AMBIGUOUS_PIXELS", judged(0.8)["pixels"])
+    assert [judged(shown)["ambiguous"] for shown in (0.8, 0.79)] == [False, True]
 
 
 @pytest.fixture(scope="module", params=WORLDS, ids=str)
