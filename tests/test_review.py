@@ -12,6 +12,7 @@ from typing import Any
 import numpy as np
 import pytest
 import rerun as rr
+from scipy.spatial.transform import Rotation
 
 from shapecat.errors import OutputError
 from shapecat.outputs import review, review_layout, review_viewer
@@ -234,6 +235,26 @@ def test_fixed_frame_has_sensor_poses_and_track_paths(tmp_path: Path) -> None:
     assert np.allclose(np.array(translations)[:, 0, 0], [0, 0.1, 0.2])
     track_path = rows(path, f"/world/paths/{TOPIC}")[-1]["LineStrips3D:strips"]
     assert np.allclose(track_path, [[[0, 0.1, 1], [0.1, 0.1, 1], [0.2, 0.1, 1]]])
+
+
+def test_path_of_track_joins_centres_of_whole_object(tmp_path: Path) -> None:
+    """The visible part of an object at rest wanders while the camera moves around it."""
+    turns = [Rotation.from_euler("zyx", [0.3 * k, 0.2, -0.7]) for k in range(3)]
+    poses = [Pose(turn.as_matrix(), np.array([0.5, 0.1 * k, 1.3])) for k, turn in enumerate(turns)]
+    place = np.array([0.2, 0.7, 0.4])  # in the fixed frame
+    scenes = []
+    for k, pose in enumerate(poses):
+        center = turns[k].inv().apply(place - pose.translation)
+        seen = labelled_object(1, x=0.3 * k)
+        full = Box(center, seen.box.size, np.array([0, 0, 0, 1])) if k else None
+        scenes.append(scene(k, [dataclasses.replace(seen, full=full)], pose=pose))
+    path = write(tmp_path / "r.rrd", scenes, fixed_frame="map")
+
+    first = turns[0].apply([0, 0.1, 1.0]) + poses[0].translation  # only the visible box is known
+    (strip,) = rows(path, f"/world/paths/{TOPIC}")[-1]["LineStrips3D:strips"]
+    assert np.allclose(strip[0], first, atol=1e-6)
+    assert len(strip) > 1
+    assert np.allclose(strip[1:], place, atol=1e-6)
 
 
 def test_frame_without_pose_is_reviewed(tmp_path: Path) -> None:
