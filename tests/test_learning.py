@@ -415,6 +415,21 @@ def test_novelty_threshold_rejects_requested_share(rejected: float) -> None:
     assert np.mean(fresh) == pytest.approx(rejected, abs=0.35 * rejected)
 
 
+def test_confidence_grows_with_objects_rather_than_views(categorizer: Categorizer) -> None:
+    """If all views are right, their number says little: a video has hundreds of one object."""
+    views = blobs(4, 2)
+    found = categorizer.predict(views.descriptors).posteriors.argmax(axis=1)
+    views = views.where(found == encode(views.labels, categorizer.categories))
+    video = views.where(np.repeat(np.arange(len(views.labels)), 30))
+    names = np.array([f"{k}" for k in range(len(video.labels))])
+    one, same, more = (
+        calibrate(categorizer, seen, rejected=0.05).temperature
+        for seen in (views, video, video._replace(instances=names))
+    )
+    assert one == pytest.approx(same, rel=1e-4)
+    assert more < 0.9 * one
+
+
 def test_unknown_shapes_do_not_affect_calibration(categorizer: Categorizer) -> None:
     """Counted as known, they would loosen the threshold."""
     known = blobs(60, 2)
