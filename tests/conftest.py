@@ -1,5 +1,6 @@
 """Shared fixtures: the installed command, real data if present, a simulated recording."""
 
+import hashlib
 import os
 import shutil
 import signal
@@ -17,7 +18,7 @@ import pytest
 from click.testing import CliRunner, Result
 
 from shapecat.executors.order import Processes
-from shapecat.system.files import FSYNC
+from shapecat.system.files import FSYNC, holding
 from shapecat.system.garbage import collect_seldom
 from tests.browser import Browser
 
@@ -159,16 +160,27 @@ class Guesser:
 @pytest.fixture(scope="session")
 def guessed_run(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """Process a short simulated recording; its categories are guesses. Copy it to change it."""
+    return guess_once("guessed", tmp_path_factory, frames=8, rrd=False)
+
+
+def guess_once(
+    name: str, factory: pytest.TempPathFactory, *, rrd: bool = True, **scene: Any
+) -> Path:
+    """Simulate a recording and process it, once for all test processes."""
     import shapecat.pipeline  # noqa: PLC0415  only the tests that ask for it pay for it
     from shapecat.runs.jobs import Job  # noqa: PLC0415  the same
     from shapecat.simulation import simulate  # noqa: PLC0415  the same
 
-    folder = tmp_path_factory.mktemp("guessed")
-    source = simulate(folder / "table.mcap", frames=8, seed=7)
-    with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(shapecat.pipeline, "load_model", lambda _path: Guesser())
-        shapecat.pipeline.process(Job(source=source, folder=folder / "out" / "table", rrd=False))
-    return folder / "out" / "table"
+    base = factory.getbasetemp()
+    folder = (base.parent if "PYTEST_XDIST_WORKER" in os.environ else base) / name
+    folder.mkdir(exist_ok=True)
+    run = folder / "out" / "table"
+    with holding(folder), pytest.MonkeyPatch.context() as patch:
+        if not run.exists():
+            source = simulate(folder / "table.mcap", seed=7, **scene)
+            patch.setattr(shapecat.pipeline, "load_model", lambda _path: Guesser())
+            shapecat.pipeline.process(Job(source=source, folder=run, rrd=rrd))
+    return run
 
 
 @pytest.fixture
@@ -188,6 +200,37 @@ def drawn(guessed_run: Path) -> Any:
     from shapecat.outputs.report.writing import read_report  # noqa: PLC0415  the same
 
     return read_report(guessed_run)
+
+
+@pytest.fixture(scope="module")
+def snapped_once() -> Iterator[None]:
+    """Move the outlines of the same masks on the same image only once, for all exports."""
+    from shapecat.colour.snapping import snapped  # noqa: PLC0415  the same
+
+    known: dict[str, Any] = {}
+
+    def recall(masks: Any, pixels: Any, scale: float) -> Any:
+        digest = hashlib.sha256(repr((pixels.shape, scale)).encode())
+        for part in (pixels, *(part for mask in masks for part in (mask.box, mask.pixels))):
+            digest.update(np.ascontiguousarray(part).tobytes())
+        key = digest.hexdigest()
+        if key not in known:
+            known[key] = snapped(masks, pixels, scale)
+        return known[key]
+
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr("shapecat.outputs.dataset_frames.snapped", recall)
+        yield
+
+
+@pytest.fixture
+def without_pictures(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Leave the pictures out of reports: they take half a second per run."""
+    from shapecat.outputs.report.pictures import Pictures  # noqa: PLC0415  the same
+
+    monkeypatch.setattr(
+        "shapecat.outputs.report.writing.take_pictures", lambda *_: Pictures({}, ())
+    )
 
 
 @pytest.fixture(scope="session")
@@ -218,16 +261,7 @@ def coloured_run(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
     Copy it to change it.
     """
-    import shapecat.pipeline  # noqa: PLC0415  the same
-    from shapecat.runs.jobs import Job  # noqa: PLC0415  the same
-    from shapecat.simulation import simulate  # noqa: PLC0415  the same
-
-    folder = tmp_path_factory.mktemp("coloured")
-    source = simulate(folder / "table.mcap", frames=4, seed=7, color=True)
-    with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(shapecat.pipeline, "load_model", lambda _path: Guesser())
-        shapecat.pipeline.process(Job(source=source, folder=folder / "out" / "table"))
-    return folder / "out" / "table"
+    return guess_once("coloured", tmp_path_factory, frames=4, color=True)
 
 
 @pytest.fixture(scope="module")

@@ -27,6 +27,8 @@ from tests.mcap_files import read_ros
 from tests.test_colour_outputs import IMAGES
 from tests.test_exports import relabel
 
+pytestmark = pytest.mark.usefixtures("snapped_once")
+
 Run = Callable[..., Result]
 BAND_PX = 6
 """Outlines may move by three pixels of the depth image, and corners a little more."""

@@ -18,6 +18,8 @@ from shapecat.outputs.exports import export_dataset
 from tests.test_exports import relabel
 from tests.test_exports_images import decoded, read_coco
 
+pytestmark = pytest.mark.usefixtures("snapped_once")
+
 Run = Callable[..., Result]
 RUNS = 5
 
