@@ -24,6 +24,7 @@ from click.testing import Result
 from shapecat.api import open_recording
 from shapecat.errors import RecordingError
 from shapecat.runs.folder import read_run
+from shapecat.system.stderr import forgive_stderr
 from tests.scenes import record
 from tests.test_executors import wait_for
 
@@ -279,6 +280,7 @@ class Links(HTMLParser):
         self.found += [value for name, value in attrs if name == "href" and value]
 
 
+@pytest.mark.usefixtures("without_pictures")
 def test_index_of_scattered_runs_links_to_their_pages(shapecat: Run, runs: Path) -> None:
     folders = [runs / "a" / "lab", runs / "deep" / "c"]
     result = shapecat("report", *folders)
@@ -296,6 +298,7 @@ def test_index_of_scattered_runs_links_to_their_pages(shapecat: Run, runs: Path)
         assert [(page.parent / unquote(link)).resolve() for link in back] == [index.resolve()]
 
 
+@pytest.mark.usefixtures("without_pictures")
 def test_index_of_others_is_kept(shapecat: Run, runs: Path) -> None:
     """The folder of the runs may be that of a web site; earlier versions made the last page."""
     index, pages = runs / "a" / "index.html", [*runs.rglob("*.html")]
@@ -476,7 +479,12 @@ def test_compile_notice_appears_once(capsys: pytest.CaptureFixture[str], kind: s
 FIXTURE = str(Path(__file__).parents[1] / "fixtures" / "tabletop.mcap")
 
 
-@pytest.mark.skipif(not Path("/dev/full").exists(), reason="needs a device that is always full")
+needs_full_device = pytest.mark.skipif(
+    not Path("/dev/full").exists(), reason="needs a device that is always full"
+)
+
+
+@needs_full_device
 @pytest.mark.parametrize(
     ("words", "unbuffered"),
     [
@@ -526,7 +534,29 @@ sys.exit(5)
     assert (done.returncode, done.stderr) == (5, b"")
 
 
-@pytest.mark.skipif(not Path("/dev/full").exists(), reason="needs a device that is always full")
+@contextmanager
+def unwritable_stderr(how: str) -> Iterator[None]:
+    """Close stderr during the block, or let it lead to a full disk or to a reader that left."""
+    before, (reader, pipe) = os.dup(2), os.pipe()
+    os.close(reader)
+    with Path("/dev/full").open("w") as full:
+        if how == "closed":
+            os.close(2)
+        else:
+            os.dup2(pipe if how == "pipe" else full.fileno(), 2)
+    try:
+        yield
+    finally:
+        with Path(os.devnull).open("w") as nowhere:
+            os.dup2(nowhere.fileno(), 2)
+            if sys.stderr is not None:
+                sys.stderr.flush()  # what could not be written is still in its buffer
+        os.dup2(before, 2)
+        os.close(before)
+        os.close(pipe)
+
+
+@needs_full_device
 @pytest.mark.parametrize(
     ("kind", "how"),
     [
@@ -537,27 +567,49 @@ sys.exit(5)
     ],
 )
 def test_unwritable_stderr_does_not_end_the_work(
-    recording: Path, tmp_path: Path, kind: str, how: str
+    recording: Path,
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+    capfd: pytest.CaptureFixture[str],
+    kind: str,
+    how: str,
 ) -> None:
     """A log may fill its disk, and a terminal may be closed; the code is that of the failure."""
     bad = tmp_path / "bad.mcap"
     bad.write_text("no recording")
-    command = [sys.executable, "-m", "shapecat", "process", str(recording), str(bad)]
-    command += ["--out", str(tmp_path), "--no-rrd", "--no-mcap", "--jobs", "1", "--progress", kind]
-    reader, pipe = os.pipe()
-    os.close(reader)
-    with Path("/dev/full").open("w") as full:
-        done = subprocess.run(
-            command,
-            stdout=subprocess.PIPE,
-            stderr=pipe if how == "pipe" else full,
-            preexec_fn=(lambda: os.close(2)) if how == "closed" else None,
-            check=False,
-        )
-    os.close(pipe)
+    words = ["process", str(recording), str(bad), "--out", str(tmp_path / "out"), "--no-rrd"]
+    words += ["--no-mcap", "--jobs", "1", "--progress", kind]
+    command = import_module("shapecat.cli.main").main
+    monkeypatch.setattr(sys, "stderr", None if how == "closed" else sys.__stderr__)
+    with unwritable_stderr(how), pytest.raises(SystemExit) as ended:
+        forgive_stderr()
+        command(words, prog_name="shapecat")
 
-    assert done.returncode == 1
-    assert b"1 complete, 1 failed" in done.stdout
+    assert ended.value.code == 1
+    assert "1 complete, 1 failed" in capfd.readouterr().out
+
+
+COMPLAIN = """
+import sys, types, shapecat.__main__ as entry
+
+def main(**_):
+    print("x" * 99_999, file=sys.stderr)
+    print("worked")
+    sys.exit(3)
+
+entry.import_module = lambda _: types.SimpleNamespace(main=main)
+entry.run()
+"""
+
+
+@needs_full_device
+@pytest.mark.parametrize("how", ["full", "closed", "pipe"])
+def test_unwritable_stderr_keeps_exit_code(how: str) -> None:
+    """Python flushes stderr at the end; if that fails, the code becomes 120."""
+    with unwritable_stderr(how):
+        done = subprocess.run([sys.executable, "-c", COMPLAIN], stdout=subprocess.PIPE, check=False)
+
+    assert (done.returncode, done.stdout) == (3, b"worked\n")
 
 
 @pytest.mark.parametrize("below", [[1, 0], [99, None]])

@@ -6,10 +6,14 @@ import signal
 import subprocess
 import sys
 from collections.abc import Callable, Iterator
+from itertools import count
 from pathlib import Path
+from typing import Any
 
 import pytest
+from click.testing import Result
 
+from shapecat import perception
 from shapecat.config import Settings
 from shapecat.executors.order import _HELD
 from shapecat.pipeline import process
@@ -18,7 +22,7 @@ from shapecat.runs.jobs import Job
 from shapecat.runs.segments import list_segments, read_segment
 from shapecat.system import stopping
 from tests.scenes import record
-from tests.test_batch import heed_interrupts
+from tests.test_batch import heed_interrupts, heed_interrupts_at_low_priority
 from tests.test_crash import assert_same_tables, contents
 
 FRAMES = 100
@@ -27,12 +31,6 @@ FRAMES = 100
 @pytest.fixture(scope="module")
 def recording(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return record(tmp_path_factory.mktemp("stopping") / "table.mcap", FRAMES)
-
-
-def heed_interrupts_at_low_priority() -> None:
-    """Yield to the sender of the signal: on a busy machine, the command might end first."""
-    heed_interrupts()
-    os.nice(10)
 
 
 class Command:
@@ -76,7 +74,7 @@ class Command:
     ("signum", "code", "jobs"),
     [
         (signal.SIGINT, 130, "2"),
-        (signal.SIGTERM, 143, "1"),
+        pytest.param(signal.SIGTERM, 143, "1", marks=pytest.mark.many),
         pytest.param(signal.SIGINT, 130, "1", marks=pytest.mark.many),
         pytest.param(signal.SIGTERM, 143, "2", marks=pytest.mark.many),
     ],
@@ -94,6 +92,36 @@ def test_signal_keeps_finished_frames(
     assert "Traceback" not in errors
     assert "run the same command again to continue" in errors
     assert not (tmp_path / "table").exists()
+
+    process(Job(recording, tmp_path / "table", rrd=False))
+
+    assert read_run(tmp_path / "table")["counts"]["resumed"] >= 40
+    assert contents(tmp_path) == contents(undisturbed)
+    assert_same_tables(tmp_path / "table", undisturbed / "table")
+
+
+def test_termination_keeps_finished_frames(
+    shapecat: Callable[..., Result],
+    recording: Path,
+    undisturbed: Path,
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    """A scheduler of jobs sends SIGTERM, to a command without other processes too."""
+    calls = count()
+
+    def perceive(*given: Any) -> Any:
+        if next(calls) == 40:
+            os.kill(os.getpid(), signal.SIGTERM)
+        return real(*given)
+
+    with monkeypatch.context() as patch:
+        real = perception._perceive
+        patch.setattr(perception, "_perceive", perceive)
+        done = shapecat("process", recording, "--out", tmp_path, "--no-rrd", "--jobs", 1)
+    assert done.exit_code == 143
+    assert "run the same command again to continue" in done.stderr
+    assert next(calls) < 60  # at the next opportunity, not at the end
 
     process(Job(recording, tmp_path / "table", rrd=False))
 
