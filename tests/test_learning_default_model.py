@@ -26,7 +26,7 @@ from shapecat.models.card import write_card
 from shapecat.models.fragments import cut_fragment, remove_base
 from shapecat.models.sets import SimulatedViews, collect, partial_views
 from shapecat.models.worlds import describe_arrangement, simulate_views, simulate_world
-from shapecat.simulation import piles
+from shapecat.simulation import physics, piles
 from shapecat.simulation.distractors import make_distractor
 from shapecat.simulation.mesh import Mesh, moved
 from shapecat.simulation.primitives import rounded_box
@@ -147,6 +147,8 @@ def test_training_uses_only_given_kinds_of_distractors(
     only = arrangements._SETTLED[number][0]
     monkeypatch.setattr(arrangements, "_SETTLED", ((only, 1.0, Arrangement([], ())),))
     monkeypatch.setattr(piles, "make_distractor", make)
+    monkeypatch.setattr(physics, "_FALL_STEPS", 10)  # they need not come to rest
+    monkeypatch.setattr(physics, "_MAX_STEPS", 0)
     options = ArrangementOptions(3, ("pan", "hammer"), unknown=1.0, settled=1.0)
     objects = arrange(options, np.random.default_rng(5)).objects
 

@@ -37,13 +37,13 @@ def table(height: float = 0.7) -> Mesh:
     return Mesh(slab.vertices + np.array([0, 0, height - 0.03]), slab.triangles)
 
 
-@pytest.mark.parametrize("category", ["cup", "bowl", "plate"])
-def test_only_open_shapes_are_divided_into_convex_parts(category: str) -> None:
+def test_only_open_shapes_are_divided_into_convex_parts() -> None:
     """The convex hull of a cup is solid, and nothing could lie in it."""
     for seed in range(3):
         rng = np.random.default_rng(seed)
-        assert hollowness(make_object(category, rng)) > 0.25
-        assert len(convex_parts(make_object(category, rng))) > 10
+        for category in ("cup", "bowl", "plate"):
+            assert hollowness(make_object(category, rng)) > 0.25
+            assert len(convex_parts(make_object(category, rng))) > 10
         for closed in ("box", "can", "bottle", "ball"):
             assert len(convex_parts(make_object(closed, rng))) == 1
 
@@ -123,14 +123,15 @@ def test_settled_objects_lie_on_support_without_interpenetration(
     support = next(s for s in world.supports if s.name == world_support(world.kind))
     for points, _ in solids:
         assert points[:, 2].min() > support.height - 0.02  # it may hang over an edge
-    for i, (points, _) in enumerate(solids):
-        for j, (_, parts) in enumerate(solids):
-            if i == j:
-                continue
-            for part in parts:
-                hull = ConvexHull(part).equations
-                inside = -(points @ hull[:, :3].T + hull[:, 3]).max(axis=1)
-                assert inside.max() < 0.006, (i, j)
+    for j, (_, parts) in enumerate(solids):
+        for part in parts:
+            hull = ConvexHull(part).equations
+            low, high = part.min(axis=0), part.max(axis=0)
+            for i, (points, _) in enumerate(solids):
+                near = points[((points > low) & (points < high)).all(axis=1)]
+                if i != j and len(near):  # no other point can be inside
+                    inside = -(near @ hull[:, :3].T + hull[:, 3]).max(axis=1)
+                    assert inside.max() < 0.006, (i, j)
 
 
 def moved_part(part: np.ndarray, pose: Pose) -> np.ndarray:
@@ -144,19 +145,18 @@ def world_support(kind: str) -> str:
 def test_tilted_objects_are_marked() -> None:
     """Their category accuracy is reported separately."""
     tilted = straight = 0
-    for seed in (1, 4):
-        for item in settled("pile", seed).objects:
-            upright = np.degrees(np.arccos(np.clip(np.abs(item.pose.rotation[2]).max(), 0, 1)))
-            assert item.tilted == (upright > 15)
-            tilted += item.tilted
-            straight += not item.tilted
+    for item in settled("pile", 1).objects:
+        upright = np.degrees(np.arccos(np.clip(np.abs(item.pose.rotation[2]).max(), 0, 1)))
+        assert item.tilted == (upright > 15)
+        tilted += item.tilted
+        straight += not item.tilted
     assert tilted > 1
     assert straight > 5
 
 
 def test_truth_of_pile_has_support_relations(tmp_path: Path) -> None:
     """They refer to listed tracks."""
-    path = record(settled("pile", 4), tmp_path / "pile.mcap", seed=4, sensor=KINECT)
+    path = record(settled("pile", 1), tmp_path / "pile.mcap", seed=1, sensor=KINECT)
     first, _ = json.loads(path.with_suffix(".truth.json").read_text("utf-8"))
     objects = {o["track"]: o for o in [*first["objects"], *first["hidden"]]}
     assert len(objects) > 3

@@ -188,10 +188,10 @@ def test_moving_objects_stay_on_table_and_do_not_collide(seed: int) -> None:
 
 
 def test_truth_lists_only_present_objects(tmp_path: Path) -> None:
-    path = simulate(tmp_path / "a.mcap", scene="rearranged", frames=12, rate_hz=2, seed=5)
+    path = simulate(tmp_path / "a.mcap", scene="rearranged", frames=6, rate_hz=1, seed=5)
     truth = json.loads(path.with_name("a.truth.json").read_text())
     labels = np.load(path.with_name("a.labels.npz"))["labels"]
-    world = make_scene("rearranged", np.random.default_rng(5), frames=12, rate_hz=2)
+    world = make_scene("rearranged", np.random.default_rng(5), frames=6, rate_hz=1)
     counts = []
     for k, frame in enumerate(truth):
         listed = {o["track"]: o["pixels"] for o in frame["objects"] + frame["hidden"]}
