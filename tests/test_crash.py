@@ -162,7 +162,7 @@ def test_finished_phases_are_not_repeated(
         with pytest.raises(KeyboardInterrupt):
             process(job)
     assert [path.name for path in tmp_path.iterdir()] == [".table.partial"]
-    monkeypatch.setattr("shapecat.perception.perceive", interrupt)
+    monkeypatch.setattr("shapecat.perception._perceive", None)
 
     process(job)
 
