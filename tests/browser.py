@@ -55,6 +55,9 @@ class Browser:
             "--no-sandbox",
             "--disable-gpu",
             "--disable-background-networking",
+            "--disable-component-update",
+            "--disable-extensions",
+            "--disable-features=Translate,OptimizationHints,MediaRouter",
             "--window-size=1400,1000",
             f"--user-data-dir={folder / 'profile'}",
         ]

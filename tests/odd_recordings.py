@@ -150,7 +150,7 @@ def changed(path: Path, change: Callable[[str, Any], Any], *, clouds: bool = Fal
 
 
 def compressed_depth(path: Path, pack: Callable[[Any], bytes]) -> Path:
-    """Write the table with compressed depth images."""
+    """Write two frames of the table with compressed depth images."""
 
     def change(topic: str, message: Any) -> Any:
         if not topic.endswith("image_raw"):
@@ -161,7 +161,7 @@ def compressed_depth(path: Path, pack: Callable[[Any], bytes]) -> Path:
         packed.header.frame_id = OPTICAL
         return packed
 
-    return changed(path, change)
+    return plain(path, ((t, time, change(t, m)) for t, time, m in stream(FACTORY, 2)))
 
 
 def realsense(path: Path) -> Path:
@@ -431,8 +431,8 @@ CASES: dict[str, Case] = {
     "ros 2 beside other files": Case(lambda p: with_other_files(p, note="mine")),
     "db3": Case(lambda p: database(p, definitions=True)),
     "db3 without definitions": Case(lambda p: database(p, definitions=False), reported="Humble"),
-    "compressed depth png": Case(lambda p: compressed_depth(p, depth.png)),
-    "compressed depth rvl": Case(lambda p: compressed_depth(p, depth.rvl)),
+    "compressed depth png": Case(lambda p: compressed_depth(p, depth.png), frames=2),
+    "compressed depth rvl": Case(lambda p: compressed_depth(p, depth.rvl), frames=2),
     "realsense viewer": Case(realsense),
     "organized cloud": Case(lambda p: record(p / "a.mcap", FRAMES, clouds=True)),
     **{

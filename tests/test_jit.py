@@ -4,6 +4,7 @@ import os
 import runpy
 import subprocess
 import sys
+import time
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
@@ -108,6 +109,7 @@ def test_process_with_older_sources_does_not_spoil_the_cache(stage: Path, run: R
     with subprocess.Popen(command, stdin=subprocess.PIPE, stdout=subprocess.PIPE) as late:
         while not [*stage.glob("**/stage_*")]:  # it has read its files by then
             assert late.poll() is None
+            time.sleep(0.005)
         (stage / "callee.py").write_text(CALLEE.replace("2 * x", "20 * x"))
         assert late.communicate(b"")[0] == b"7 0\n"
     (stage / "caller.py").write_text(CALLER)

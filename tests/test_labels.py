@@ -466,7 +466,7 @@ def test_missing_table_is_reported(run: Path) -> None:
     | st.text("track,category;confidence\tlabel\n\r\"'1.0 merge with", max_size=300)
 )
 def test_any_text_is_read_or_refused(tmp_path_factory: pytest.TempPathFactory, text: str) -> None:
-    path = tmp_path_factory.mktemp("fuzz") / "tracks.csv"
+    path = tmp_path_factory.getbasetemp() / "any.csv"
     path.write_text("track,category,confidence,label\n" + text, "utf-8", newline="")
     try:
         labels = read_labels(path)
