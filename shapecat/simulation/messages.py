@@ -1,6 +1,7 @@
 """Frames and transforms as ROS 1 or ROS 2 messages."""
 
 from collections.abc import Sequence
+from functools import cache
 from typing import Any
 
 import numpy as np
@@ -17,6 +18,14 @@ _TF = "tf2_msgs/msg/TFMessage"
 _DISTORTION = 5
 
 
+@cache  # it compiles the code of each message type that it writes
+def _typestore(ros_version: int) -> Typestore:
+    store = get_typestore(Stores.ROS1_NOETIC if ros_version == 1 else Stores.ROS2_HUMBLE)
+    if _TF not in store.types:
+        store.register(get_types_from_msg("geometry_msgs/TransformStamped[] transforms", _TF))
+    return store
+
+
 class MessageFactory:
     """Makes messages of one ROS version; their timestamps are in nanoseconds.
 
@@ -27,12 +36,7 @@ class MessageFactory:
 
     def __init__(self, ros_version: int) -> None:
         self.ros_version = ros_version
-        self.typestore: Typestore = get_typestore(
-            Stores.ROS1_NOETIC if ros_version == 1 else Stores.ROS2_HUMBLE
-        )
-        if _TF not in self.typestore.types:
-            definition = "geometry_msgs/TransformStamped[] transforms"
-            self.typestore.register(get_types_from_msg(definition, _TF))
+        self.typestore = _typestore(ros_version)
 
     def serialize(self, message: Any) -> bytes:
         """Return a message as bytes: the ROS 1 encoding, or CDR for ROS 2."""
