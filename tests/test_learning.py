@@ -316,6 +316,7 @@ def test_unused_blocks_have_no_influence() -> None:
     assert np.array_equal(model.predict(x).posteriors, model.predict(other).posteriors)
 
 
+@pytest.mark.usefixtures("few_trees")
 def test_baselines_learn() -> None:
     train, test = blobs(60, 1), blobs(40, 2)
     for name, make in make_baselines(tuple(BLOCKS.values())).items():
