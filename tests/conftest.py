@@ -32,6 +32,12 @@ LONGEST = (
     *("test_learning", "test_jit", "test_rehearsal", "test_exports_readback"),
 )
 """Test files by duration, longest first."""
+TOGETHER = {
+    "test_report_serve": "test_report",  # a browser and pictures of a run
+    "test_simulation_camera": "test_simulation_worlds",  # Open3D, which takes seconds to load
+    "test_evaluation_dataset": "test_simulation_worlds",
+}
+"""Test files that run in the process of another one, with which they share something costly."""
 SHARED = Path(__file__).parents[2] / "shared" / "data"
 
 
@@ -53,6 +59,22 @@ def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
     """
     rank = {name: k for k, name in enumerate(LONGEST)}
     items.sort(key=lambda item: rank.get(item.path.stem, len(rank)))
+
+
+@pytest.hookimpl(optionalhook=True)
+def pytest_xdist_make_scheduler(config: pytest.Config, log: Any) -> Any:
+    """Give each worker whole files, as ``--dist loadfile`` does, and those that belong together."""
+    if config.getvalue("dist") != "loadfile":
+        return None
+
+    def unit_of(test: str) -> str:
+        file = test.partition("::")[0]
+        name = Path(file).stem
+        return file.replace(name, TOGETHER.get(name, name))
+
+    scheduling: Any = import_module("xdist.scheduler").LoadFileScheduling(config, log)
+    scheduling._split_scope = unit_of
+    return scheduling
 
 
 @pytest.fixture(scope="session")

@@ -23,7 +23,7 @@ from shapecat.runs.folder import read_run, writing_outputs
 from shapecat.runs.jobs import Job
 from tests.scenes import record
 
-FRAMES = 70
+FRAMES = 50
 TABLES = ("frames", "detections", "planes", "tracks")
 
 

@@ -2,6 +2,7 @@
 
 from collections.abc import Sequence
 from dataclasses import replace
+from functools import cache
 from pathlib import Path
 from typing import Any
 
@@ -29,10 +30,14 @@ FRAMES, CHANGE = 6, 3
 """Frames of a scene, and the first one in which something is different."""
 
 
+@cache
+def table() -> World:
+    return make_scene("tabletop", np.random.default_rng(11), frames=1)
+
+
 def still_world(frames: int = FRAMES, **changes: Any) -> World:
     """Return a table with objects and a camera at rest."""
-    world = make_scene("tabletop", np.random.default_rng(11), frames=frames)
-    return replace(world, path=(world.path[0],) * frames, turns=np.zeros(frames), **changes)
+    return replace(table(), path=table().path * frames, turns=np.zeros(frames), **changes)
 
 
 def shifted(track: int, shifts: Sequence[Any]) -> Motion:
@@ -225,9 +230,13 @@ def test_wrong_pose_prevents_reuse() -> None:
     assert {d.reused_from for d in second.detections} == {None}
 
 
+@cache
+def rendered() -> Frame:
+    return render_frame(still_world(1), 0, rng=np.random.default_rng(0), sensor=KINECT)[0]
+
+
 def blank(index: int = 0) -> Frame:
-    frame, _ = render_frame(still_world(1), 0, rng=np.random.default_rng(0), sensor=KINECT)
-    return replace(frame, index=index)
+    return replace(rendered(), index=index)
 
 
 @pytest.mark.parametrize(
