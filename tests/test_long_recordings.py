@@ -29,9 +29,17 @@ def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return folder
 
 
-def test_batch_sizes_do_not_change_tracks(folder: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+@pytest.fixture(scope="module")
+def usual(folder: Path) -> tuple[pa.Table, str]:
+    """Return the tracks with the usual sizes of batches."""
+    return tracked(folder)
+
+
+def test_batch_sizes_do_not_change_tracks(
+    folder: Path, usual: tuple[pa.Table, str], monkeypatch: pytest.MonkeyPatch
+) -> None:
     """Batches may end within a frame, a track or a row group; a track may span several."""
-    whole, lines = tracked(folder)
+    whole, lines = usual
     sizes = {(tracks, "_BATCH"): 100, (full_boxes, "_BLOCK"): 7}
     sizes |= {(hits, "_BLOCK"): 50, (fusion, "_BLOCK"): 33}
     for (module, name), size in sizes.items():
@@ -45,10 +53,10 @@ def test_batch_sizes_do_not_change_tracks(folder: Path, monkeypatch: pytest.Monk
 
 
 def test_full_box_from_sample_matches_all_views(
-    folder: Path, monkeypatch: pytest.MonkeyPatch
+    folder: Path, usual: tuple[pa.Table, str], monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """Boxes agree in every row, within the noise of the outlines."""
-    whole, _ = tracked(folder)
+    whole, _ = usual
     monkeypatch.setattr(full_boxes, "_TELLING", 60)
 
     few, _ = tracked(folder)

@@ -14,6 +14,8 @@ from concurrent.futures import ThreadPoolExecutor
 from contextlib import contextmanager
 from dataclasses import replace
 from pathlib import Path
+from queue import SimpleQueue
+from typing import Any
 from urllib.parse import urlsplit
 
 import pyarrow as pa
@@ -448,23 +450,41 @@ def test_two_tabs_do_not_overwrite_each_other(
 
 
 @pytest.mark.slow
+@pytest.mark.usefixtures("without_pictures")
 def test_interrupted_server_writes_corrections_into_page(
-    served: Callable[..., Server], run: Path
+    shapecat: Run, run: Path, monkeypatch: pytest.MonkeyPatch, capfd: pytest.CaptureFixture[str]
 ) -> None:
     """A page that is mailed afterwards must show the corrections."""
-    server = served(without_recording(run).parent)
-    assert urlsplit(server.address).path.endswith("/index.html")
-    page = server.address.replace("index.html", "table/report.html")
-    assert ask(page, "GET")[0] == 200
-    labels = urlsplit(page).path.replace("report.html", "labels")
-    assert ask(page, "POST", labels, correction(1, "teapot"))[0] == 200
-    assert "1 checked" in ask(server.address)[1]
-    server.send_signal(signal.SIGINT)
-    _, errors = server.communicate()
+    addresses = SimpleQueue[str]()
 
-    assert server.returncode == 0  # the command asks users to end it this way
-    assert errors.splitlines()[-1] == "stopping the server"
-    assert "corrections are written to tracks.csv as you make them" in errors
+    @contextmanager
+    def serve(*given: Any, **options: Any) -> Iterator[str]:
+        with serve_reports(*given, **options) as address:
+            addresses.put(address)
+            yield address
+
+    def correct_and_interrupt() -> None:
+        address = addresses.get(timeout=60)
+        try:
+            assert urlsplit(address).path.endswith("/index.html")
+            page = address.replace("index.html", "table/report.html")
+            assert ask(page, "GET")[0] == 200
+            labels = urlsplit(page).path.replace("report.html", "labels")
+            assert ask(page, "POST", labels, correction(1, "teapot"))[0] == 200
+            assert "1 checked" in ask(address)[1]
+        finally:
+            os.kill(os.getpid(), signal.SIGINT)
+
+    monkeypatch.setattr("shapecat.outputs.report.serving.serve_reports", serve)
+    with ThreadPoolExecutor(1) as pool:
+        visit = pool.submit(correct_and_interrupt)
+        done = shapecat("report", "--serve", run.parent)
+    visit.result()
+
+    assert done.exit_code == 0  # the command asks users to end it this way
+    assert done.stdout.count("\n") == 1
+    assert capfd.readouterr().err == "stopping the server\n"
+    assert "corrections are written to tracks.csv as you make them" in done.stderr
     assert '"label":"teapot"' in (run / "report.html").read_text("utf-8")
     assert "1 checked" in (run.parent / "index.html").read_text("utf-8")
 
