@@ -244,7 +244,7 @@ def test_frames_in_progress_are_finished(
 
 def test_recording_changed_during_processing_gives_no_results(tmp_path: Path) -> None:
     """Otherwise half of the tables would be from another recording."""
-    source = record(tmp_path / "table.mcap", 30)
+    source = record(tmp_path / "table.mcap", 16)
     process(Job(source, tmp_path / "before" / "table", rrd=False))
 
     def write(phase: str, done: int, _total: int | None) -> None:
