@@ -88,6 +88,16 @@ def test_box_dropped_on_box_is_supported_by_it() -> None:
     np.testing.assert_allclose(second.pose.rotation, YAWED, atol=0.02)
 
 
+def test_falling_object_comes_to_rest() -> None:
+    """A tall box that stands on an edge takes longer to fall over than the time between drops."""
+    tall = rounded_box([0.05, 0.04, 0.24])
+    tipped = rotation_from_quaternion([0, np.sin(0.15), 0, np.cos(0.15)])
+    (settled_pose,) = settle([table()], [Drop(tall, YAWED @ tipped, np.array([-0.1, 0.08]))])
+    points = transform(settled_pose.pose, tall.vertices)
+    assert points[:, 2].min() == pytest.approx(0.7, abs=2e-3)
+    assert points[:, 2].max() == pytest.approx(0.75, abs=2e-3)
+
+
 def test_object_beside_table_falls() -> None:
     box = make_box(np.random.default_rng(2))
     (settled_pose,) = settle([table()], [Drop(box, np.eye(3), np.array([0.9, 0.0]))])
