@@ -220,6 +220,8 @@ def _run(
         return
     started = open_executor(name, workers=workers, address=scheduler)
     with _closing(started) as executor, watcher:
+        if getattr(executor, "waits", bool)():
+            watcher.note("the scheduler has no worker yet: waiting for one")
         yield from process_on(executor, batch.tasks, watcher, cores=cores, manifest=batch.manifest)
 
 

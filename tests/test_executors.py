@@ -254,6 +254,19 @@ def test_dask_runs_equal_calls_separately() -> None:
         assert first.result() != second.result()
 
 
+def test_dask_without_a_worker_is_known_to_wait() -> None:
+    """The command was silent until a worker came, for example if none could start."""
+    distributed = pytest.importorskip("distributed")
+    cluster = distributed.LocalCluster(
+        n_workers=0, processes=False, dashboard_address="127.0.0.1:0"
+    )
+    with _DaskExecutor(distributed.Client(cluster), cluster) as executor:
+        assert executor.waits()
+        cluster.scale(1)
+        assert executor.submit(abs, -3).result(timeout=60) == 3
+        assert not executor.waits()
+
+
 def test_processes_keep_order_and_hold_few_items() -> None:
     """A recording does not fit into memory, and its tables must not depend on timing."""
     used: list[tuple[int, int]] = []
