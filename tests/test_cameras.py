@@ -179,6 +179,33 @@ def test_undistorted_rays_match_numerical_inverse(model: str, d: Any, project: A
         assert_allclose(rays[v, u], found.x, atol=1e-4)
 
 
+WIDE = (4.7247, 3.2092, 0.0, 0.0001, 0.1706, 5.0559, 4.7758, 0.8865)
+"""A depth camera of 120 degrees (Azure Kinect, wide field of view)."""
+
+
+def test_wide_lens_is_inverted_up_to_its_edge() -> None:
+    """It compresses the edge so much that slow convergence passed for a lens without inverse."""
+    camera = Camera(64, 64, 31.5, 31.5, 32.1, 31.8)
+    rays = undistorted_rays(camera, "rational_polynomial", WIDE)
+    assert rays is not None
+
+    pixels = distort(rays, "rational_polynomial", WIDE) * 31.5 + (32.1, 31.8)
+    u, v = np.meshgrid(np.arange(64), np.arange(64))
+    assert_allclose(pixels, np.stack([u, v], axis=-1), atol=0.01)
+    assert np.linalg.norm(rays[32, 0]) > 1.7
+
+
+def test_pixels_outside_the_image_of_a_lens_see_no_ray() -> None:
+    """They used to make the lens count as one that cannot be inverted."""
+    camera, d = Camera(64, 64, 40.0, 40.0, 32.0, 32.0), (-0.3, 0, 0, 0, 0)  # at most a slope of 0.7
+    rays = undistorted_rays(camera, "plumb_bob", d)
+    assert rays is not None
+
+    pixels = distort(rays, "plumb_bob", d) * 40.0 + 32.0
+    assert np.isnan(rays[0, 0]).all()
+    assert_allclose(pixels[32, 10], [10, 32], atol=0.01)
+
+
 def test_fisheye_depth_image_gives_points_along_true_rays(tmp_path: Path) -> None:
     message = info(EPOCH, d=FISHEYE)
     message.distortion_model = "equidistant"

@@ -492,6 +492,22 @@ def test_ignored_distortion_is_explained(
     assert [problem in text for text in warnings] == [True]
 
 
+def test_pixels_that_see_no_ray_have_no_points(tmp_path: Path) -> None:
+    """The corners outside the round image of a wide lens must not spoil the rest."""
+    calibration = info(EPOCH, d=(-0.9, 0, 0, 0, 0))
+    items = [
+        ("/depth/camera_info", 0, calibration),
+        ("/depth/image", 1, image(EPOCH, np.full((48, 64), 1000, np.uint16))),
+    ]
+
+    (frame,), _, warnings = read(write(tmp_path / "a.mcap", items))
+
+    assert frame.points is not None
+    assert np.isnan(frame.points[0]).all()
+    assert np.isfinite(frame.points[24 * 64 + 32]).all()
+    assert any("pixels" in text for text in warnings)
+
+
 def test_new_distortion_changes_rays(tmp_path: Path) -> None:
     """Otherwise the rays of the first calibration would be used for the whole recording."""
     depth = np.full((48, 64), 1000, np.uint16)

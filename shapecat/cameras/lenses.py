@@ -17,7 +17,11 @@ FISHEYE_MODELS = ("equidistant", "fisheye", "kannala_brandt")
 LENS_MODELS = ("plumb_bob", "rational_polynomial", *FISHEYE_MODELS)
 """The supported lens models of OpenCV's calibration."""
 
-_ROUNDS = 20
+_ROUNDS, _ENOUGH_PX = 30, 1e-4
+"""Most iterations, which lenses of 120 degrees need near the edge, and the error that ends them."""
+_WRONG_PX, _LEAST_SHARE = 0.1, 0.3
+"""Pixels with a larger error see no ray: they are outside the round image of a wide lens. If fewer
+pixels than this share see one, the coefficients are not those of a lens."""
 
 
 def distort(rays: F8, model: str, coefficients: Sequence[float]) -> F8:
@@ -57,19 +61,27 @@ def undistorted_rays(camera: Camera, model: str, coefficients: Sequence[float]) 
 
     Returns
     -------
-    (h, w, 2) slopes; None if the model is not known, the coefficients are not finite, or the
-    iteration does not converge at every pixel.
+    (h, w, 2) slopes, NaN at pixels where the iteration does not converge; None if these are most
+    pixels, the model is not known, or the coefficients are not finite.
     """
     if model not in LENS_MODELS or not np.isfinite(coefficients).all():
         return None
     u, v = np.meshgrid(np.arange(camera.width), np.arange(camera.height))
     seen = np.stack([(u - camera.cx) / camera.fx, (v - camera.cy) / camera.fy], axis=-1)
-    rays = seen.copy()
-    with np.errstate(all="ignore"):  # absurd coefficients diverge: rejected below
+    goals = seen.reshape(-1, 2)
+    rays, error, left = goals.copy(), np.full(len(goals), np.inf), np.arange(len(goals))
+    with np.errstate(all="ignore"):  # beyond the image of the lens it diverges: rejected below
         for _ in range(_ROUNDS):
-            rays += seen - distort(rays, model, coefficients)
-        error = np.abs(distort(rays, model, coefficients) - seen) * (camera.fx, camera.fy)
-    return rays if np.isfinite(rays).all() and error.max() < 0.1 else None
+            bent = distort(rays[left], model, coefficients)
+            off = goals[left] - bent
+            # A step by the error alone is slow where the lens compresses the image.
+            stretch = np.linalg.norm(rays[left], axis=1) / np.linalg.norm(bent, axis=1)
+            rays[left] += off * np.where(stretch > 0, stretch, 1)[:, None]
+            error[left] = np.abs(off * (camera.fx, camera.fy)).max(axis=1)
+            left = left[error[left] > _ENOUGH_PX]
+    good = error < _WRONG_PX  # never so for NaN
+    rays[~good] = np.nan
+    return rays.reshape(seen.shape) if good.mean() >= _LEAST_SHARE else None
 
 
 def _polynomial(rays: F8, d: F8) -> F8:

@@ -51,6 +51,11 @@ class Lens:
         self._key, self._fit = key, None
         self._rays = undistorted_rays(*key)
         if self._rays is not None:
+            blind = float(np.isnan(self._rays[..., 0]).mean())
+            if blind > 0:
+                self._warn(
+                    f"{blind:.0%} of its pixels, which the lens model leaves out, are ignored"
+                )
             self._fit = fit_pinhole(_points_along(self._rays, np.ones(depth.shape, np.float32)))
 
     def _warn(self, text: str) -> None:

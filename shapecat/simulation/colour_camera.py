@@ -68,7 +68,7 @@ def _lookup(lens: LensCamera) -> tuple[Camera, I4, I4]:
     """Return a finer pinhole camera, and its row and column (h, w) for each pixel of the lens."""
     camera = lens.pinhole
     rays = undistorted_rays(camera, lens.model, lens.coefficients)
-    if rays is None:
+    if rays is None or np.isnan(rays).any():
         msg = f"lens {lens} cannot be simulated"
         raise ValueError(msg)
     fx, fy = _FINE * camera.fx, _FINE * camera.fy
