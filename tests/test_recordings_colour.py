@@ -269,6 +269,22 @@ def test_pairing_waits_for_image_logged_late(tmp_path: Path) -> None:
     assert [v and v.image.stamp_ns for _, v in pairs] == stamps
 
 
+@pytest.mark.parametrize("bare", [0, 2])
+def test_missing_stamps_are_estimated_in_simulated_time(tmp_path: Path, bare: int) -> None:
+    """The log time, decades later, would double all tracks; a simulation may begin at 0."""
+    expected = [7 + k * SECOND for k in range(4)]
+    items = depth_items(*expected)
+    items += [("/cam/color/image_raw", t + 9, raw(t, gradient(), "rgb8")) for t in expected]
+    for _, _, message in items:
+        if message.header.stamp.sec == bare:
+            message.header = header(0, message.header.frame_id)
+    logged = [(topic, EPOCH + time, message) for topic, time, message in in_order(items)]
+    pairs, _ = read(write(tmp_path / "a.mcap", logged))
+
+    assert [frame.stamp_ns for frame, _ in pairs] == expected
+    assert [view and view.image.stamp_ns for _, view in pairs] == expected
+
+
 def test_damaged_images_are_skipped_and_reported(tmp_path: Path) -> None:
     """A damaged image must neither end a run nor go unreported."""
     body = jpeg(gradient())

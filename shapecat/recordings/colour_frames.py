@@ -2,7 +2,7 @@
 
 from collections import Counter, deque
 from collections.abc import Iterator, Mapping, Sequence
-from functools import lru_cache
+from functools import cached_property, lru_cache
 from statistics import median
 from typing import Any
 
@@ -19,7 +19,7 @@ from shapecat.recordings.frames import frames
 from shapecat.recordings.messages import MALFORMED, Message, MessageError, reason_of
 from shapecat.recordings.pinhole import camera_of_info, distortion_of, is_rectified
 from shapecat.recordings.recording import Recording
-from shapecat.recordings.stamps import stamp_ns
+from shapecat.recordings.stamps import delay_ns, stamp_ns
 from shapecat.recordings.streams import Stream
 from shapecat.types import Camera, Frame
 
@@ -132,7 +132,7 @@ class _Partner:
             return
         try:
             image = self._recording.decode(message)
-            stamp = stamp_ns(image.header) or message.log_time_ns
+            stamp = stamp_ns(image.header) or max(message.log_time_ns - self._delay_ns, 0)
         except (RecordingError, *MALFORMED) as error:
             self._left_out[reason_of(error, self.stream.topic)] += 1
             return
@@ -142,6 +142,10 @@ class _Partner:
         self._images.append((stamp, message.log_time_ns, image))
         while len(self._images) > _KEPT_IMAGES or self._too_much():
             self._images.popleft()
+
+    @cached_property
+    def _delay_ns(self) -> int:
+        return delay_ns(self._recording, self.stream.topic)
 
     def calibrate(self, message: Message) -> None:
         """Update the lens if the calibration has changed."""

@@ -25,7 +25,7 @@ from shapecat.recordings.pinhole import (
 )
 from shapecat.recordings.pointcloud2 import cloud_points, organized, unorganized
 from shapecat.recordings.recording import Recording
-from shapecat.recordings.stamps import Clock, stamp_ns
+from shapecat.recordings.stamps import Clock, delay_ns, stamp_ns
 from shapecat.recordings.streams import COMPRESSED, Stream, first_message
 from shapecat.types import Camera, Frame, Pose
 
@@ -69,14 +69,21 @@ class Source:
         if not 0 <= message.log_time_ns < 2**63:
             msg = "log time out of range"
             raise MessageError(msg)
+        stamp, time = stamp_ns(header), message.log_time_ns
+        if stamp == 0:
+            time = max(time - self._delay_ns, 0)
         return Frame(
             topic=self.stream.topic,
             index=index,
-            stamp_ns=self.clock.check(stamp_ns(header), message.log_time_ns),
+            stamp_ns=self.clock.check(stamp, time),
             log_time_ns=message.log_time_ns,
             frame_id=str(header.frame_id),
             **content,
         )
+
+    @cached_property
+    def _delay_ns(self) -> int:
+        return delay_ns(self.recording, self.stream.topic)
 
 
 class PointsSource(Source):

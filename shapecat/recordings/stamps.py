@@ -1,16 +1,20 @@
 """Stamps of messages, and checks for unreliable clocks."""
 
+from contextlib import suppress
+from itertools import islice
 from typing import Any
 
-from shapecat.recordings.messages import MessageError
+from shapecat.recordings.messages import MALFORMED, MessageError
 from shapecat.recordings.recording import Recording
 
-__all__ = ["Clock", "stamp_ns"]
+__all__ = ["Clock", "delay_ns", "stamp_ns"]
 
 _EPOCH_NS = 946_684_800 * 10**9
 """1 January 2000: earlier stamps probably count from when the sensor was switched on."""
 _JUMP_NS = 10 * 10**9
 """A larger change of the delay between stamp and log time counts as a jump."""
+_FIRST = 5
+"""Number of messages in which a stamp is sought that is not 0."""
 
 
 def stamp_ns(header: Any) -> int:
@@ -25,6 +29,20 @@ def stamp_ns(header: Any) -> int:
         msg = f"header.stamp of {stamp:.3g} ns"
         raise MessageError(msg)
     return stamp
+
+
+def delay_ns(recording: Recording, topic: str) -> int:
+    """Return the log time minus the stamp (ns) of the first message on a topic with a stamp.
+
+    Where a stamp is 0, the log time less this delay is in the same clock as the other stamps, which
+    may count from the start of a simulation. Returns 0 if none of the first messages has a stamp.
+    """
+    for message in islice(recording.messages([topic]), _FIRST):
+        with suppress(MessageError, *MALFORMED):
+            stamp = stamp_ns(recording.decode(message).header)
+            if stamp:
+                return message.log_time_ns - stamp
+    return 0
 
 
 class Clock:
@@ -57,7 +75,7 @@ class Clock:
 
 
 _TEXTS = {
-    "zero": "header.stamp is 0 ({}×): the log time is used instead",
+    "zero": "header.stamp is 0 ({}×): it is estimated from the log time",
     "epoch": "header.stamp does not count from 1970 ({}×): transforms may not match",
     "back": "header.stamp goes backwards ({}×)",
     "jump": "header.stamp jumps relative to the log time ({}×)",
