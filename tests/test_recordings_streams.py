@@ -1,5 +1,6 @@
 """Tests of the choice of depth and colour streams among the topics of a recording."""
 
+from collections import Counter
 from pathlib import Path
 from typing import Any
 
@@ -7,7 +8,7 @@ import numpy as np
 import pytest
 
 from shapecat.errors import NoStreamError
-from shapecat.recordings import choose_streams, cloud_streams, open_recording
+from shapecat.recordings import choose_streams, cloud_streams, frames, open_recording
 from shapecat.recordings.colour_streams import choose_colour
 from shapecat.recordings.depth_image import DEPTH_ENCODINGS
 from shapecat.recordings.sensors import by_sensor
@@ -176,6 +177,35 @@ def test_depth_compressed_as_png_is_not_colour(tmp_path: Path, kind: str) -> Non
         colour = choose_colour(recording, choose_streams(recording)[0])
     assert colour is not None
     assert colour.topic == "/cam/color/image"
+
+
+@pytest.mark.parametrize(
+    ("topic", "kind", "known"),
+    [
+        ("/cam/depth/image/compressed", "16UC1; png compressed ", True),
+        ("/cam/range/compressed", "16UC1; png compressed ", True),
+        ("/cam/depth/image", "png", True),
+        ("/cam/depth/image/compressedDepth", "16UC1; compressedDepth png", True),
+        ("/cam/grey/compressed", "mono16; png compressed mono16", False),
+        ("/cam/infra1/image/compressed", "16UC1; png compressed ", False),
+        ("/cam/depth/image/compressed", "32FC1; png compressed ", False),
+    ],
+)
+def test_depth_may_be_a_png_file(tmp_path: Path, topic: str, kind: str, *, known: bool) -> None:
+    """`compressed_image_transport` writes 16-bit depth as such, without loss."""
+    items = [
+        ("/cam/camera_info", EPOCH, info(EPOCH)),
+        (topic, EPOCH, packed(EPOCH, png(wavy_depth()), kind)),
+    ]
+
+    with open_recording(write(tmp_path / "a.mcap", items)) as recording:
+        streams = cloud_streams(recording)
+        found = list(frames(recording, streams, skipped=Counter()))
+
+    assert len(found) == known
+    for frame in found:
+        assert frame.depth is not None
+        np.testing.assert_array_equal(frame.depth, wavy_depth() / np.float32(1000))
 
 
 def in_frame(items: list[Item], frame_id: str) -> list[Item]:

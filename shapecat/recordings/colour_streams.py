@@ -8,6 +8,7 @@ from typing import Any, Literal
 
 from shapecat.errors import NoStreamError
 from shapecat.recordings.colour_image import COLOUR_ENCODINGS, compressed_kind
+from shapecat.recordings.compressed_depth import is_grey_png16
 from shapecat.recordings.depth_image import DEPTH_ENCODINGS
 from shapecat.recordings.foxglove import ros_counterpart
 from shapecat.recordings.messages import Topic
@@ -29,8 +30,6 @@ __all__ = ["ColourStream", "choose_colour", "colour_streams", "pair_colours"]
 _COLOUR_WORDS = ("color", "colour", "rgb")
 _OTHER_WORDS = ("infra", "/ir/", "depth/image", "confidence", "thermal", "mask")
 """Grey images on topics with these words are not from a colour camera."""
-_GREY_16 = b"\x10\x00"
-"""Bit depth and colour type of a grey PNG of 16 bits: bytes 24 and 25 of the file."""
 
 
 @dataclass(frozen=True)
@@ -200,7 +199,7 @@ def _compressed_encoding(first: Any) -> str:
     kind = compressed_kind(begin)
     pixels = str(first.format).split(";")[0].strip()
     # Packed like colour, such as "16UC1; png compressed", or just "png" in Foxglove.
-    if pixels in DEPTH_ENCODINGS or (kind == "png" and begin[24:] == _GREY_16):
+    if pixels in DEPTH_ENCODINGS or is_grey_png16(begin):
         return ""
     return "mono8" if kind and pixels == "mono8" else kind
 

@@ -1,4 +1,4 @@
-"""Depth images compressed by compressed_depth_image_transport: 16-bit PNG or RVL."""
+"""Compressed depth images: 16-bit PNG, or what compressed_depth_image_transport writes."""
 
 import struct
 import zlib
@@ -11,19 +11,28 @@ from shapecat.jit import kernel
 from shapecat.recordings.depth_image import clean_depth
 from shapecat.recordings.messages import MessageError
 
-__all__ = ["depth_of_compressed"]
+__all__ = ["depth_of_compressed", "is_grey_png16"]
 
 _HEADER = struct.Struct("<iff")
 _PNG = b"\x89PNG\r\n\x1a\n"
+_GREY_16 = b"\x10\x00"
+"""Bit depth and colour type of a grey PNG of 16 bits: bytes 24 and 25 of the file."""
 _LARGEST = 1 << 26
 """Images with more pixels are rejected."""
+
+
+def is_grey_png16(data: Any) -> bool:
+    """Return whether image data, of which 26 bytes are enough, is a PNG file of 16-bit grey."""
+    begin = bytes(data[:26])
+    return begin.startswith(_PNG) and begin[24:] == _GREY_16
 
 
 def depth_of_compressed(message: Any) -> F4:
     """Read a decoded sensor_msgs/CompressedImage with a format such as ``16UC1; compressedDepth``.
 
-    The data begins with 12 bytes: the compression format and two parameters A and B. For 32FC1 the
-    stored value is A / depth + B, with depth in metres; for 16UC1 it is in millimetres.
+    The data is a PNG file, or begins with 12 bytes: the compression format and two parameters A and
+    B. For 32FC1 the stored value is A / depth + B, with depth in metres; otherwise it is in
+    millimetres.
 
     Returns
     -------
@@ -37,10 +46,14 @@ def depth_of_compressed(message: Any) -> F4:
     if len(data) < _HEADER.size + 8:
         msg = f"compressed depth of only {len(data)} bytes"
         raise MessageError(msg)
+    bare, inverse = bytes(data[:8]) == _PNG, str(message.format).startswith("32FC1")
+    if bare and inverse:
+        msg = "compressed depth in 32FC1 without its parameters"
+        raise MessageError(msg)
     _, a, b = _HEADER.unpack_from(data)
-    body = bytes(data[_HEADER.size :])
+    body = bytes(data if bare else data[_HEADER.size :])
     values = _read_png(body) if body.startswith(_PNG) else _read_rvl(body)
-    if not str(message.format).startswith("32FC1"):
+    if not inverse:
         return clean_depth(values, 1000)
     depth = np.zeros(values.shape, np.float32)
     with np.errstate(divide="ignore", invalid="ignore", over="ignore"):
@@ -121,7 +134,7 @@ def _read_rvl(data: bytes) -> U2:
     words = np.frombuffer(data, "<u4", (len(data) - 8) // 4, 8)
     # A nibble can hold a run of zeros of any length, so only the number of pixels is checked.
     if not 0 < height * width <= _LARGEST or words.size == 0:
-        msg = f"compressed depth of {width} x {height} pixels in {len(data)} bytes"
+        msg = "compressed depth is neither PNG nor RVL"
         raise MessageError(msg)
     values = np.zeros(height * width, np.uint16)
     if not _expand_rvl(words.astype(np.uint32), values):

@@ -7,6 +7,7 @@ from itertools import islice
 from typing import Any
 
 from shapecat.errors import NoStreamError
+from shapecat.recordings.compressed_depth import is_grey_png16
 from shapecat.recordings.depth_image import DEPTH_ENCODINGS
 from shapecat.recordings.foxglove import ros_counterpart
 from shapecat.recordings.messages import MessageError, Topic
@@ -212,9 +213,15 @@ def _probe_image(topic: Topic, first: Any, recording: Recording) -> Stream | Non
 
 
 def _probe_compressed(topic: Topic, first: Any, recording: Recording) -> Stream | None:
-    encoding = str(first.format)
-    is_depth = "compressedDepth" in encoding and not _is_infrared(topic.name)
-    return _depth_stream(topic, first, recording) if is_depth else None
+    name, encoding = topic.name.lower(), str(first.format)
+    is_depth = "compressedDepth" in encoding or (
+        is_grey_png16(first.data)
+        and not encoding.startswith("32FC1")
+        and (encoding.startswith("16UC1") or "depth" in name)
+    )
+    if not is_depth or _is_infrared(topic.name):
+        return None
+    return _depth_stream(topic, first, recording)
 
 
 def _depth_stream(topic: Topic, first: Any, recording: Recording) -> Stream:
