@@ -45,17 +45,31 @@ from tests.test_recordings_frames import read as read_depth
 OTHER = Camera(80, 60, 69.5, 73.5, 39.1, 30.3)
 
 
-def test_error_lists_supported_depth_encodings(tmp_path: Path) -> None:
-    """Depth in another encoding, such as 64FC1, was refused as if its topic held no image."""
-    path = record(tmp_path / "a.mcap", colour("/cam/depth/image_raw"))
+@pytest.mark.parametrize("kind", ["64FC1", "16UC1; jpeg compressed "])
+def test_error_lists_encodings(tmp_path: Path, kind: str) -> None:
+    """Depth in another encoding was refused as if its topic held no image."""
+    topic, message = "/cam/depth/image", packed(EPOCH, jpeg(gradient()), kind)
+    if kind == "64FC1":
+        message = image(EPOCH, np.ones((3, 4)), kind)
+    path = record(tmp_path / "a.mcap", [(topic, EPOCH, message)])
 
-    with open_recording(path) as recording, pytest.raises(NoStreamError) as found:
-        choose_streams(recording)
+    errors = []
+    for wanted in ([], [topic]):
+        with open_recording(path) as recording, pytest.raises(NoStreamError) as found:
+            choose_streams(recording, wanted)
+        errors.append(str(found.value))
 
-    assert str(found.value) == (
-        f"{path}: no point clouds or depth images (16UC1, mono16, 32FC1); "
-        "topics found: /cam/depth/image_raw (sensor_msgs/msg/Image)"
-    )
+    name = "Image" if kind == "64FC1" else "CompressedImage"
+    assert errors == [
+        (
+            f"{path}: no point clouds or depth images (16UC1, mono16, 32FC1); "
+            f"topics found: {topic} (sensor_msgs/msg/{name}, {kind.strip()})"
+        ),
+        (
+            f"{path}: topic {topic} holds no clouds or depth images ({kind.strip()}); "
+            "usable topics: none"
+        ),
+    ]
 
 
 def test_error_about_a_truncated_recording_says_so(tmp_path: Path) -> None:

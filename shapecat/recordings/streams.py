@@ -36,6 +36,7 @@ _PEEK = 5
 """Number of messages tried to classify a topic: the first may be damaged or blank."""
 _WARNINGS = 3
 """Warnings about a recording that an error repeats."""
+_UNREADABLE = "no readable messages"
 _OTHER_WORDS = ("confidence", "disparity", "thermal", "mask")
 """Images on topics with these words, encoded like depth, are something else."""
 
@@ -114,8 +115,12 @@ def _why_unusable(recording: Recording, streams: tuple[Stream, ...], name: str) 
     """Return the error for a wanted topic that is missing or holds no depth."""
     known = ", ".join(stream.topic for stream in streams) or "none"
     there = [t for t in recording.topics if t.name.strip("/") == name.strip("/")]
+    details = [detail for topic in there if (detail := _detail(recording, topic))]
     state = "holds no clouds or depth images" if there else "does not exist"
-    state = "has no readable messages" if any(_is_empty(recording, t) for t in there) else state
+    if _UNREADABLE in details:
+        state = f"has {_UNREADABLE}"
+    elif details:
+        state = f"{state} ({', '.join(details)})"
     return f"{recording.path}: topic {name} {state}; usable topics: {known}{_warnings(recording)}"
 
 
@@ -124,11 +129,8 @@ def _why_none(recording: Recording, streams: tuple[Stream, ...]) -> str:
         names = ", ".join(stream.topic for stream in streams)
         what = f"depth images without a sensor_msgs/CameraInfo: {names}"
         return f"{recording.path}: {what}{_warnings(recording)}"
-    found = [
-        f"{t.name} ({t.type or t.encoding}"
-        f"{', no readable messages' if _is_empty(recording, t) else ''})"
-        for t in recording.topics
-    ]
+    details = ((topic, _detail(recording, topic)) for topic in recording.topics)
+    found = [f"{t.name} ({', '.join(filter(None, (t.type or t.encoding, d)))})" for t, d in details]
     shown = ", ".join(found[:12]) + (", …" if len(found) > 12 else "")
     images = any(t.type.endswith("Image") for t in recording.topics)
     kinds = f" ({', '.join(DEPTH_ENCODINGS)})" if images else ""
@@ -138,11 +140,14 @@ def _why_none(recording: Recording, streams: tuple[Stream, ...]) -> str:
     )
 
 
-def _is_empty(recording: Recording, topic: Topic) -> bool:
-    """Return whether a topic of clouds or images has no message that can be decoded."""
+def _detail(recording: Recording, topic: Topic) -> str:
+    """Return the encoding of a topic's images, or that none of its messages can be decoded."""
     if ros_counterpart(topic.type) not in _PROBES:
-        return False
-    return topic.count == 0 or first_message(recording, topic.name, topic.type) is None
+        return ""
+    first = first_message(recording, topic.name, topic.type) if topic.count != 0 else None
+    if first is None:
+        return _UNREADABLE
+    return str(getattr(first, "encoding", getattr(first, "format", ""))).strip()
 
 
 def _warnings(recording: Recording) -> str:
