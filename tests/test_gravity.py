@@ -12,7 +12,7 @@ import pytest
 
 from shapecat.config import Settings
 from shapecat.errors import ConfigError
-from shapecat.geometry import IDENTITY
+from shapecat.geometry import IDENTITY, transform
 from shapecat.pipeline import process
 from shapecat.recordings import open_recording
 from shapecat.recordings.gravity import Orientation, Upright
@@ -27,7 +27,7 @@ from shapecat.runs.up_report import report_up
 from shapecat.simulation.messages import MessageFactory
 from shapecat.types import Frame, Pose
 from tests.messages import CAMERA, EPOCH, SECOND, header, make, write
-from tests.scenes import OPTICAL, stream
+from tests.scenes import OPTICAL, stream, views
 
 MAKE = MessageFactory(2)
 TURN = np.array([[0.0, 0, 1], [1, 0, 0], [0, 1, 0]])
@@ -196,6 +196,22 @@ def test_up_that_is_given_later_is_tested(monkeypatch: pytest.MonkeyPatch) -> No
 
     assert [item.stamp_ns - EPOCH for item, *_ in returned] == list(range(8))
     assert upright.dropped == {"/d": "tf"}
+
+
+def test_table_above_the_origin_of_a_cloud_does_not_contradict_up(tmp_path: Path) -> None:
+    """In the frame of a robot's base, its points look like a table that is seen from below."""
+    links = [("map", "base_link", Pose(np.eye(3), np.array([0.1, -1.2, -0.8])))]
+    items: list[tuple[str, int, Any]] = [("/tf_static", EPOCH, MAKE.transforms(links, EPOCH))]
+    for k, view in enumerate(views()):
+        points = transform(view.pose, view.points()) - links[0][2].translation
+        cloud = MAKE.cloud(points.astype(np.float32), EPOCH + k, "base_link")
+        items.append(("/points", EPOCH + k, cloud))
+    process(Job(write(tmp_path / "a.mcap", items), tmp_path / "out", mcap=False, rrd=False))
+    run = read_run(tmp_path / "out")
+
+    assert run["up"]["source"] == "transforms, z of map"
+    (warning,) = run["warnings"]
+    assert "base_link, which is not the frame of a camera" in warning
 
 
 def test_up_without_other_source_comes_from_planes(tmp_path: Path) -> None:

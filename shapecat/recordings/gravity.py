@@ -16,7 +16,7 @@ from shapecat.recordings.transform_window import TransformWindow
 from shapecat.recordings.transforms import TransformError, fixed_frame
 from shapecat.types import Frame, Pose
 
-__all__ = ["Orientation", "Upright"]
+__all__ = ["Orientation", "Upright", "is_level"]
 
 _LEVEL_FRAMES = ("map", "odom", "world", "earth", "base_footprint", "base_link")
 """Frames whose z axis is up by convention (REP 105, REP 103), also after the name of a robot."""
@@ -203,7 +203,12 @@ def _level_frames(frames: Sequence[str], sensor: str) -> list[str]:
         robot = name.rpartition("/")[0]
         return _rank(name), robot != "", not sensor.startswith(f"{robot}/")
 
-    return sorted((name for name in frames if _rank(name) < len(_LEVEL_FRAMES)), key=order)
+    return sorted(filter(is_level, frames), key=order)
+
+
+def is_level(frame_id: str) -> bool:
+    """Return whether z is up in a frame by convention, and the frame thus not one of a camera."""
+    return _rank(frame_id) < len(_LEVEL_FRAMES)
 
 
 def _rank(name: str) -> int:

@@ -21,7 +21,7 @@ from shapecat.executors.order import Processes
 from shapecat.learning import Categorizer
 from shapecat.perception import Perceiver, View, find_up
 from shapecat.recordings import Recording, choose_streams
-from shapecat.recordings.gravity import Orientation, Upright
+from shapecat.recordings.gravity import Orientation, Upright, is_level
 from shapecat.rehearsal import rehearse
 from shapecat.runs.jobs import Job
 from shapecat.runs.perceived import FrameRow, PerceptionTables
@@ -204,11 +204,20 @@ class _UpTrial:
     def _look(self, frame: Frame, orientation: Orientation) -> None:
         self._looks[frame.topic] += 1
         given, off = orientation.up, self._off_deg.get(frame.topic, [])
+        elsewhere = frame.points is not None and is_level(frame.frame_id)
+        if elsewhere and self._looks[frame.topic] == 1:
+            self._upright.warnings.append(
+                f"{frame.topic}: its clouds are in {frame.frame_id}, which is not the frame of a "
+                "camera: without its viewpoint, objects may be missed or fall apart"
+            )
         if given is not None:
             off = self._off_deg.setdefault(frame.topic, off)
             found = find_up(frame, self._settings)
             if found is not None:
-                off.append(float(np.degrees(np.arccos(np.clip(given @ found, -1, 1)))))
+                angle = float(np.degrees(np.arccos(np.clip(given @ found, -1, 1))))
+                if elsewhere:  # from the base of a robot, a table seems to be seen from below
+                    angle = min(angle, 180 - angle)
+                off.append(angle)
                 self._sources[frame.topic] = orientation.source
         enough = len(off) == _DOUBTS or self._looks[frame.topic] == _LOOKS
         if enough or min(off, default=np.inf) <= _CONFIRMS_DEG:
