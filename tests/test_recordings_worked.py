@@ -72,6 +72,23 @@ def test_error_lists_encodings(tmp_path: Path, kind: str) -> None:
     ]
 
 
+def test_error_says_why_images_cannot_be_decoded(tmp_path: Path) -> None:
+    """Some converters store incomplete definitions; their messages only counted as unreadable."""
+    path, topic = tmp_path / "a.mcap", "/cam/depth/image"
+    with mcap_writer(path) as writer:
+        schema = writer.register_schema(
+            "sensor_msgs/msg/Image", "ros2msg", b"std_msgs/Header header\n"
+        )
+        channel = writer.register_channel(topic, "cdr", schema)
+        writer.add_message(channel, EPOCH, bytes(40), EPOCH)
+
+    for wanted in ([], [topic]):
+        with open_recording(path) as recording, pytest.raises(NoStreamError) as found:
+            choose_streams(recording, wanted)
+        assert "no readable messages: cannot decode sensor_msgs/msg/Image: " in str(found.value)
+        assert "std_msgs/msg/Header" in str(found.value)
+
+
 def test_error_about_a_truncated_recording_says_so(tmp_path: Path) -> None:
     """It listed the topic of the depth images among the topics of a recording without any."""
     topic = "/cam/depth/image_raw"

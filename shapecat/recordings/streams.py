@@ -10,7 +10,7 @@ from shapecat.errors import NoStreamError
 from shapecat.recordings.compressed_depth import is_grey_png16
 from shapecat.recordings.depth_image import DEPTH_ENCODINGS
 from shapecat.recordings.foxglove import ros_counterpart
-from shapecat.recordings.messages import MessageError, Topic
+from shapecat.recordings.messages import MessageError, Topic, reason_of
 from shapecat.recordings.recording import Recording
 from shapecat.recordings.sensors import Stream, by_sensor
 
@@ -117,8 +117,9 @@ def _why_unusable(recording: Recording, streams: tuple[Stream, ...], name: str) 
     there = [t for t in recording.topics if t.name.strip("/") == name.strip("/")]
     details = [detail for topic in there if (detail := _detail(recording, topic))]
     state = "holds no clouds or depth images" if there else "does not exist"
-    if _UNREADABLE in details:
-        state = f"has {_UNREADABLE}"
+    unreadable = [detail for detail in details if detail.startswith(_UNREADABLE)]
+    if unreadable:
+        state = f"has {unreadable[0]}"
     elif details:
         state = f"{state} ({', '.join(details)})"
     return f"{recording.path}: topic {name} {state}; usable topics: {known}{_warnings(recording)}"
@@ -141,11 +142,16 @@ def _why_none(recording: Recording, streams: tuple[Stream, ...]) -> str:
 
 
 def _detail(recording: Recording, topic: Topic) -> str:
-    """Return the encoding of a topic's images, or that none of its messages can be decoded."""
+    """Return the encoding of a topic's images, or why none of its messages can be decoded."""
     if ros_counterpart(topic.type) not in _PROBES:
         return ""
     first = first_message(recording, topic.name, topic.type) if topic.count != 0 else None
     if first is None:
+        for message in islice(recording.messages([topic.name]), 1):
+            try:
+                recording.decode(message)
+            except MessageError as error:
+                return f"{_UNREADABLE}: {reason_of(error, topic.name)}"
         return _UNREADABLE
     return str(getattr(first, "encoding", getattr(first, "format", ""))).strip()
 
