@@ -285,6 +285,30 @@ def test_missing_stamps_are_estimated_in_simulated_time(tmp_path: Path, bare: in
     assert [view and view.image.stamp_ns for _, view in pairs] == expected
 
 
+@pytest.mark.parametrize("kind", ["nv12", "h264", "foxglove.CompressedVideo"])
+def test_unread_colour_is_reported(tmp_path: Path, kind: str) -> None:
+    """A run without colour did not say that the recording has some."""
+    items = [
+        *depth_items(EPOCH),
+        ("/cam/aligned_depth_to_color", EPOCH, image(EPOCH, wavy_depth())),
+    ]
+    if kind == "nv12":
+        colours = raw(EPOCH, np.zeros((48, 64), np.uint8), kind)
+        items.append(("/cam/color/image_raw", EPOCH, colours))
+    if kind == "h264":
+        items.append(("/cam/color/image_raw", EPOCH, packed(EPOCH, b"\0\0\0\1g", kind)))
+    path = write(tmp_path / "a.mcap", items)
+    with open_recording(path) as recording:
+        if kind.startswith("foxglove"):
+            recording.topics += (Topic("/cam/color/image_raw", kind, "protobuf", 1),)
+        assert (
+            choose_colour(recording, choose_streams(recording, ["/cam/depth/image_raw"])[0]) is None
+        )
+        (warning,) = recording.warnings
+
+    assert warning == f"/cam/color/image_raw: there is no colour, since {kind} cannot be read"
+
+
 def test_damaged_images_are_skipped_and_reported(tmp_path: Path) -> None:
     """A damaged image must neither end a run nor go unreported."""
     body = jpeg(gradient())

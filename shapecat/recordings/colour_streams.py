@@ -28,6 +28,8 @@ from shapecat.recordings.streams import (
 __all__ = ["ColourStream", "choose_colour", "colour_streams", "pair_colours"]
 
 _COLOUR_WORDS = ("color", "colour", "rgb")
+_VIDEO = ("CompressedVideo", "FFMPEGPacket")
+"""Ends of the types of video messages, which are not read."""
 _OTHER_WORDS = ("infra", "/ir/", "depth/image", "confidence", "thermal", "mask")
 """Grey images on topics with these words are not from a colour camera."""
 
@@ -125,9 +127,26 @@ def choose_colour(
         if not found and single and len(sensors) == 1:
             found = images
         chosen = min(found, key=lambda one: _rank(one, stream), default=None)
+        if not streams:
+            _warn_about_unread(recording)
     if chosen is not None and chosen.info_topic == stream.info_topic:
         return replace(chosen, info_topic=None)  # the calibration of the other camera
     return chosen
+
+
+def _warn_about_unread(recording: Recording) -> None:
+    """Warn about topics named after colour whose images or videos cannot be read."""
+    for topic in recording.topics:
+        if topic.count == 0 or not any(word in topic.name.lower() for word in _COLOUR_WORDS):
+            continue
+        kind = ros_counterpart(topic.type)
+        name = topic.type if topic.type.endswith(_VIDEO) else ""
+        if kind in {IMAGE, COMPRESSED}:
+            first = next(first_messages(recording, topic.name, topic.type), None)
+            name = str(getattr(first, "encoding", getattr(first, "format", ""))).strip()
+            name = "" if name.startswith(tuple(DEPTH_ENCODINGS)) else name
+        if name:
+            recording.warn(f"{topic.name}: there is no colour, since {name} cannot be read")
 
 
 def _belongs(one: ColourStream, stream: Stream, sensors: Sequence[Sequence[Stream]]) -> bool:
