@@ -13,6 +13,7 @@ from scipy.spatial.transform import Rotation
 from shapecat.cameras.lenses import distort, undistorted_rays
 from shapecat.recordings.compressed_depth import depth_of_compressed
 from shapecat.recordings.depth_image import depth_of_image
+from shapecat.recordings.messages import MessageError
 from shapecat.recordings.pinhole import camera_of_info, fit_pinhole
 from shapecat.recordings.sources import DepthSource
 from shapecat.recordings.streams import IMAGE, Stream
@@ -78,12 +79,21 @@ def test_rectified_image_without_p_uses_k() -> None:
     assert (camera.fx, camera.cy) == (531.7, 243.9)
 
 
-def test_image_without_k_uses_p() -> None:
-    """Programs that publish depth of rectified images may fill in P alone."""
-    camera, distorted = camera_of_info(calibration(k=np.zeros(9)), rectified=False)
+@pytest.mark.parametrize("k", [np.zeros((3, 3)), np.eye(3)])
+def test_image_without_k_uses_p(k: Any) -> None:
+    """Drivers of rectified depth may fill in P alone; a focal length of 1 px spoils all shapes."""
+    camera, distorted = camera_of_info(calibration(k=k.ravel()), rectified=False)
 
     assert camera == Camera(*SIZE, 498.4, 503.2, 317.6, 239.3)
     assert not distorted
+
+
+def test_identity_is_no_calibration() -> None:
+    """Drivers publish it for uncalibrated cameras."""
+    matrices = {"k": np.eye(3).ravel(), "p": np.eye(3, 4).ravel()}
+
+    with pytest.raises(MessageError, match="without a calibration"):
+        camera_of_info(calibration(**matrices), rectified=True)
 
 
 def test_region_of_interest_shifts_principal_point() -> None:

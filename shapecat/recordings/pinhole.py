@@ -27,6 +27,8 @@ LARGEST_ERROR_PX = 0.6
 _OFF_CENTER = 0.12
 """Share of the width or height. Depth cameras stay below 0.05; intrinsics for 640 x 480 pixels with
 images of 848 x 480 have 0.123."""
+_UNIT = 1
+"""Focal length in a matrix that is the identity since the driver left it out."""
 _SAMPLES = 4096
 _FEWEST = 100
 _SPREAD = 0.1
@@ -143,7 +145,7 @@ def camera_of_info(info: Any, *, rectified: bool) -> tuple[Camera, bool]:
     Parameters
     ----------
     rectified : whether the image is rectified: P describes rectified images, K and D the others.
-        If one of the two is zero, the other one is used.
+        If one of the two is zero, or the identity, the other one is used.
 
     Returns
     -------
@@ -152,10 +154,10 @@ def camera_of_info(info: Any, *, rectified: bool) -> tuple[Camera, bool]:
 
     Raises
     ------
-    MessageError : a focal length is not positive, or a value is not finite.
+    MessageError : a focal length is at most one pixel, or a value is not finite.
     """
     k, p, d = (_field(info, name) for name in "kpd")
-    use_p = p.size == 12 and p[0] > 0 and (rectified or k.size < 9 or k[0] == 0)
+    use_p = p.size == 12 and p[0] > _UNIT and (rectified or k.size < 9 or k[0] in {0, _UNIT})
     fx, fy, cx, cy = (p[0], p[5], p[2], p[6]) if use_p else (k[0], k[4], k[2], k[5])
     width, height = int(info.width), int(info.height)
     bin_x, bin_y = max(1, int(info.binning_x)), max(1, int(info.binning_y))
@@ -164,8 +166,8 @@ def camera_of_info(info: Any, *, rectified: bool) -> tuple[Camera, bool]:
         width, height = int(roi.width), int(roi.height)
         cx, cy = cx - int(roi.x_offset), cy - int(roi.y_offset)
     values = (fx / bin_x, fy / bin_y, cx / bin_x, cy / bin_y)
-    if not (np.isfinite(values).all() and fx > 0 and fy > 0):
-        msg = "camera info without a calibration (focal length 0)"
+    if not (np.isfinite(values).all() and fx > _UNIT and fy > _UNIT):
+        msg = f"camera info without a calibration (focal length {fx:g})"
         raise MessageError(msg)
     camera = Camera(width // bin_x, height // bin_y, *(float(value) for value in values))
     return camera, bool(not (rectified or use_p) and np.any(d != 0))
