@@ -45,7 +45,8 @@ def test_warning_names_range_if_table_is_beyond_it(tmp_path: Path) -> None:
 
     assert warning == (
         "no supporting plane in 3 of 3 frames: 100% of their depth is beyond "
-        "detection.max_range_m, 0.3 m; try a larger one"
+        "detection.max_range_m, 0.3 m; try a larger one, if the median of 1.3 m is right "
+        "(16UC1 is in millimetres, 32FC1 and clouds in metres)"
     )
     assert not warnings_of(path, tmp_path / "again", range_m=2.0)
 

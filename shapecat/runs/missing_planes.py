@@ -51,10 +51,11 @@ def explain_missing_planes(
         return [f"{text}: they have no valid depth"]
     if 2 * far > readings:
         share, setting = far / readings, f"detection.max_range_m, {range_m:g} m"
-        hint = "try a larger one"
-        if (middle := float(np.median(typical))) > _NO_ROOM_M:
-            unit = "16UC1 is in millimetres, 32FC1 and clouds in metres"
-            hint = f"the median is {middle:.0f} m: is the unit right? {unit}"
+        unit = "16UC1 is in millimetres, 32FC1 and clouds in metres"
+        middle = float(np.median(typical))
+        hint = f"the median is {middle:.0f} m: is the unit right? {unit}"
+        if middle <= _NO_ROOM_M:
+            hint = f"try a larger one, if the median of {middle:.2g} m is right ({unit})"
         return [f"{text}: {share:.0%} of their depth is beyond {setting}; {hint}"]
     source = run["up"]["source"]
     if source == "option":
