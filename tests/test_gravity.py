@@ -198,6 +198,31 @@ def test_up_that_is_given_later_is_tested(monkeypatch: pytest.MonkeyPatch) -> No
     assert upright.dropped == {"/d": "tf"}
 
 
+@pytest.mark.parametrize("clouds", [False, True])
+def test_transforms_of_optical_data_in_another_frame_are_corrected(
+    tmp_path: Path, *, clouds: bool
+) -> None:
+    """Gazebo names the frame of the link: a moving camera gave each object many tracks."""
+    poses = []
+    for name, frame_id in (("right", OPTICAL), ("wrong", "camera_link")):
+        items = list(stream(MAKE, 4, clouds=clouds))
+        for topic, _, message in items:
+            if "depth" in topic:
+                message.header.frame_id = frame_id
+        path = write(tmp_path / f"{name}.mcap", items)
+        process(Job(path, tmp_path / name, mcap=False, rrd=False))
+        table = pq.read_table(tmp_path / name / "frames.parquet")
+        names = ("fixed_rotation", "fixed_translation", "up", "up_given")
+        poses.append([np.array(table[column].to_pylist()) for column in names])
+    run = read_run(tmp_path / "wrong")
+
+    for right, wrong in zip(*poses, strict=True):
+        np.testing.assert_allclose(wrong, right, atol=1e-6)
+    assert run["up"]["source"] == "transforms, z of map"
+    (warning,) = run["warnings"]
+    assert "optical frame" in warning
+
+
 def test_table_above_the_origin_of_a_cloud_does_not_contradict_up(tmp_path: Path) -> None:
     """In the frame of a robot's base, its points look like a table that is seen from below."""
     links = [("map", "base_link", Pose(np.eye(3), np.array([0.1, -1.2, -0.8])))]

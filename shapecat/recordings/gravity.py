@@ -16,10 +16,12 @@ from shapecat.recordings.transform_window import TransformWindow
 from shapecat.recordings.transforms import TransformError, fixed_frame
 from shapecat.types import Frame, Pose
 
-__all__ = ["Orientation", "Upright", "is_level"]
+__all__ = ["Orientation", "Upright", "in_optical", "is_level"]
 
 _LEVEL_FRAMES = ("map", "odom", "world", "earth", "base_footprint", "base_link")
 """Frames whose z axis is up by convention (REP 105, REP 103), also after the name of a robot."""
+_FROM_OPTICAL = np.array([[0.0, 0, 1], [-1, 0, 0], [0, -1, 0]])
+"""Rotation from an optical frame (x right, z forward) to that of its camera (x forward, z up)."""
 _SOURCES = {"auto": ("tf", "imu"), "tf": ("tf",), "imu": ("imu",)}
 
 
@@ -53,6 +55,7 @@ class Upright:
     dropped : for each topic whose given up direction is ignored, the source of that direction.
     failed, first_failure : the number of failed look-ups, and the error of the first.
     given : the number of frames whose up direction is from each source.
+    optical : topics with data in an optical frame, although their frame is not one.
     sensors : the frame ids of all sensors, as far as they are known.
     """
 
@@ -66,6 +69,7 @@ class Upright:
     failed: int = 0
     first_failure: str = ""
     given: dict[str, int] = field(default_factory=dict)
+    optical: set[str] = field(default_factory=set)
     sensors: tuple[str, ...] = ()
 
     @classmethod
@@ -130,6 +134,23 @@ class Upright:
         """Choose the fixed frame of all sensors, one named after a map or odometry if there is."""
         found = [fixed_frame(self.transforms.tree, name) for name in (first, *self.sensors)]
         return min((name for name in found if name is not None), key=_rank, default=None)
+
+    def corrected(self, topic: str, orientation: Orientation) -> Orientation:
+        """Return an orientation of the data on a topic, given that of the frame they name."""
+        source, up, pose = orientation
+        if topic not in self.optical:
+            return orientation
+        if pose is not None:
+            pose = Pose(pose.rotation @ _FROM_OPTICAL, pose.translation)
+        return Orientation(source, None if up is None else in_optical(up), pose)
+
+    def assume_optical(self, topic: str) -> None:
+        """Take the data on a topic for those of an optical frame from now on, with a warning."""
+        self.optical.add(topic)
+        self.warnings.append(
+            f"{topic}: its data are in an optical frame (z forward), although the frame they name "
+            "has x forward; its transforms are corrected"
+        )
 
     def accept(self, topic: str, orientation: Orientation) -> F4 | None:
         """Count where an up direction comes from, and return it; None if the topic's is dropped."""
@@ -204,6 +225,11 @@ def _level_frames(frames: Sequence[str], sensor: str) -> list[str]:
         return _rank(name), robot != "", not sensor.startswith(f"{robot}/")
 
     return sorted(filter(is_level, frames), key=order)
+
+
+def in_optical(up: F4) -> F4:
+    """Return a direction (3,) of a camera's frame, x forward, in its optical frame, z forward."""
+    return np.asarray(up @ _FROM_OPTICAL, np.float32)
 
 
 def is_level(frame_id: str) -> bool:

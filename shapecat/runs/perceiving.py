@@ -13,6 +13,7 @@ from typing import NamedTuple
 
 import numpy as np
 
+from shapecat.arrays import F4
 from shapecat.cameras.colour import ColourView
 from shapecat.config import Settings
 from shapecat.depth_fusion import RecentFrames
@@ -21,7 +22,7 @@ from shapecat.executors.order import Processes
 from shapecat.learning import Categorizer
 from shapecat.perception import Perceiver, View, find_up
 from shapecat.recordings import Recording, choose_streams
-from shapecat.recordings.gravity import Orientation, Upright, is_level
+from shapecat.recordings.gravity import Orientation, Upright, in_optical, is_level
 from shapecat.rehearsal import rehearse
 from shapecat.runs.jobs import Job
 from shapecat.runs.perceived import FrameRow, PerceptionTables
@@ -88,6 +89,7 @@ def perceive_all(work: Work) -> None:
 
         def view(reading: _Oriented) -> tuple[FrameRow, View]:
             frame, colour, orientation = reading
+            orientation = upright.corrected(frame.topic, orientation)
             pose = orientation.fixed_from_sensor
             up = upright.accept(frame.topic, orientation)
             row = FrameRow(frame.log_time_ns, pose, up)
@@ -154,8 +156,12 @@ def _views_again(
     streams = choose_streams(recording, run["options"]["topics"])
     upright = Upright.of(recording, up=job.up, fixed_frame=run["fixed_frame"], streams=streams)
     recent = RecentFrames(job.settings.detection.fuse_frames)
-    for frame, colour in _readings(recording, run, job, Counter()):
-        pose = upright.fixed_from_sensor(frame)
+    source = (
+        (frame, colour, upright.orient(frame))
+        for frame, colour in _readings(recording, run, job, Counter())
+    )
+    for frame, colour, orientation in _UpTrial(upright, job.settings).before(source):
+        pose = upright.corrected(frame.topic, orientation).fixed_from_sensor
         earlier = recent.before(frame, pose)
         revision = chosen.get((frame.topic, frame.index))
         if revision is not None:
@@ -178,6 +184,7 @@ class _UpTrial:
     def __init__(self, upright: Upright, settings: Settings) -> None:
         self._upright, self._settings = upright, settings
         self._off_deg: dict[str, list[float]] = {}
+        self._optical_off_deg: dict[str, list[float]] = {}
         self._sources: dict[str, str] = {}
         self._looks: Counter[str] = Counter()
         self._decided: set[str] = set()
@@ -214,7 +221,9 @@ class _UpTrial:
             off = self._off_deg.setdefault(frame.topic, off)
             found = find_up(frame, self._settings)
             if found is not None:
-                angle = float(np.degrees(np.arccos(np.clip(given @ found, -1, 1))))
+                angle = _angle_deg(given, found)
+                optical = self._optical_off_deg.setdefault(frame.topic, [])
+                optical.append(_angle_deg(in_optical(given), found))
                 if elsewhere:  # from the base of a robot, a table seems to be seen from below
                     angle = min(angle, 180 - angle)
                 off.append(angle)
@@ -232,8 +241,17 @@ class _UpTrial:
         self._decided.add(topic)
         off = self._off_deg.get(topic, [])
         enough = len(off) >= min(_DOUBTS, self._looks[topic])
-        if enough and min(off) > _CONFIRMS_DEG:
-            self._upright.contradict(topic, self._sources[topic], off)
+        if not enough or min(off) <= _CONFIRMS_DEG:
+            return
+        source, optical_off = self._sources[topic], self._optical_off_deg[topic]
+        if source.startswith("transforms") and max(optical_off) <= _CONFIRMS_DEG:
+            self._upright.assume_optical(topic)
+        else:
+            self._upright.contradict(topic, source, off)
+
+
+def _angle_deg(a: F4, b: F4) -> float:
+    return float(np.degrees(np.arccos(np.clip(a @ b, -1, 1))))
 
 
 def _tables(
