@@ -326,6 +326,21 @@ def test_impossible_stamps_and_log_times_are_counted(tmp_path: Path) -> None:
     assert skipped.total() == 2
 
 
+def test_calibration_without_size_is_that_of_the_image(tmp_path: Path) -> None:
+    """Some drivers fill in K and leave width and height at 0."""
+    calibration = info(EPOCH)
+    calibration.width = calibration.height = 0
+    items = [
+        ("/depth/camera_info", 0, calibration),
+        ("/depth/image", 1, image(EPOCH, wavy_depth())),
+    ]
+
+    (frame,), skipped, _ = read(write(tmp_path / "a.mcap", items))
+
+    assert frame.camera == CAMERA
+    assert not skipped
+
+
 def test_invalid_points_of_cloud_are_nan(tmp_path: Path) -> None:
     rows = [[1, 2, 3], [np.nan, 1, 1], [np.inf, 0, 1], [0, 0, 0], [0, 0, 1]]
     points = np.array([rows], np.float32)

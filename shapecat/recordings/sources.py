@@ -3,6 +3,7 @@
 from collections import Counter
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager, suppress
+from dataclasses import replace
 from functools import cached_property
 from typing import Any
 
@@ -198,6 +199,8 @@ class DepthSource(Source):
         camera, distorted = camera_of_info(self._info, rectified=self.rectified)
         compressed = ros_counterpart(self.stream.type) == COMPRESSED
         depth = depth_of_compressed(image) if compressed else depth_of_image(image, self.units)
+        if camera.width == camera.height == 0:  # drivers may leave out the size alone
+            camera = replace(camera, height=depth.shape[0], width=depth.shape[1])
         if depth.shape != (camera.height, camera.width):
             shape = f"{depth.shape[1]} x {depth.shape[0]}"
             size = f"{camera.width} x {camera.height}"
