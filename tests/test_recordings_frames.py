@@ -341,6 +341,17 @@ def test_calibration_without_size_is_that_of_the_image(tmp_path: Path) -> None:
     assert not skipped
 
 
+def test_step_shorter_than_a_row_is_named(tmp_path: Path) -> None:
+    """The error said that the image needs fewer bytes than it has."""
+    message = image(EPOCH, wavy_depth())
+    message.step = message.width
+    items = [("/depth/camera_info", 0, info(EPOCH)), ("/depth/image", 1, message)]
+
+    _, skipped, _ = read(write(tmp_path / "a.mcap", items))
+
+    assert dict(skipped) == {"image of 64 pixels in 16UC1 per row with a step of 64 bytes": 1}
+
+
 def test_invalid_points_of_cloud_are_nan(tmp_path: Path) -> None:
     rows = [[1, 2, 3], [np.nan, 1, 1], [np.inf, 0, 1], [0, 0, 0], [0, 0, 1]]
     points = np.array([rows], np.float32)

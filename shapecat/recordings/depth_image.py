@@ -37,7 +37,10 @@ def depth_of_image(message: Any, units: float | None = None) -> F4:
     row = int(message.step) or width * pixel.itemsize
     data = np.frombuffer(message.data, np.uint8)
     need = (height - 1) * row + width * pixel.itemsize
-    if height * width == 0 or row < width * pixel.itemsize or need > data.size:
+    if 0 < row < width * pixel.itemsize:
+        msg = f"image of {width} pixels in {message.encoding} per row with a step of {row} bytes"
+        raise MessageError(msg)
+    if height * width == 0 or need > data.size:
         msg = f"image of {width} x {height} pixels needs {need} bytes and has {data.size}"
         raise MessageError(msg)
     values = np.ndarray((height, width), pixel, data, 0, (row, pixel.itemsize))
