@@ -393,9 +393,12 @@ def test_replaced_run_does_not_keep_other_pages_from_being_written(
     """A server that ends writes the corrections into all pages, whatever became of one run."""
     gone = replace(drawn, folder=run.with_name("gone"))
     with pytest.raises(OutputError, match="gone"):
-        Reports([gone, replace(drawn, folder=run)]).write()
+        Reports([gone, replace(drawn, folder=run)], indexed=True).write()
 
     assert (run / "report.html").is_file()
+    index = (run.parent / "index.html").read_text("utf-8")
+    assert f"{run.name}/report.html" in index
+    assert "gone/report.html" not in index
 
 
 def test_simultaneous_corrections_are_all_written(run: Path, drawn: RunReport) -> None:

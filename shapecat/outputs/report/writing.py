@@ -3,6 +3,7 @@
 import os
 from collections import Counter
 from collections.abc import Callable, Mapping, Sequence
+from contextlib import suppress
 from dataclasses import dataclass, field
 from functools import cached_property
 from pathlib import Path
@@ -124,8 +125,14 @@ class Reports:
         return _link(self.above, report.folder / PAGE)
 
     def index(self) -> str:
-        """Return the page that lists the runs, with their current labels."""
-        listed = [report.listed(self.link(report)) for report in self.runs]
+        """Return the page that lists the runs, with their current labels.
+
+        A run that is gone or has an invalid table is left out; its own page says why.
+        """
+        listed = []
+        for report in self.runs:
+            with suppress(OutputError):
+                listed.append(report.listed(self.link(report)))
         return index_page(self.above.resolve().name, listed)
 
     def write(self) -> list[Path]:
