@@ -258,7 +258,13 @@ def test_rewritten_table_with_other_row_groups_is_refused(tmp_path: Path) -> Non
 
 @pytest.mark.parametrize(
     ("column", "value"),
-    [("posterior", [np.nan, 0.5]), ("center", [0, np.inf, 1]), ("size", [0.1, -0.1, 0.2])],
+    [
+        ("posterior", [np.nan, 0.5]),
+        ("center", [0, np.inf, 1]),
+        ("size", [0.1, -0.1, 0.2]),
+        ("neurons", [0.1, 0.2, 0.3, 0.4]),
+        ("edges", [0, 1, 2]),
+    ],
 )
 def test_values_that_no_run_writes_are_refused(tmp_path: Path, column: str, value: Any) -> None:
     """NaN reached pictures and data sets, or ended in a traceback far from its table."""

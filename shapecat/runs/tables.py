@@ -43,6 +43,8 @@ pa.set_memory_pool(pa.system_memory_pool())
 
 _NUMBERS = {"center", "size", "orientation", "posterior", *FULL_BOX}
 """Columns whose numbers are finite."""
+_TUPLES = {"edges": 2, "neurons": 3, "outline": 3}
+"""Columns of lists of this many numbers for each item."""
 
 Key = tuple[str, int]
 """A frame: its topic, and its number on that topic."""
@@ -220,8 +222,14 @@ def _sound(table: pa.Table) -> pa.Table:
 
     Raises
     ------
-    pa.ArrowInvalid : a box or a posterior holds NaN or infinity, or a visible size is negative.
+    pa.ArrowInvalid : a box or a posterior holds NaN or infinity, a visible size is negative, or a
+        list ends within an item.
     """
+    for name in _TUPLES.keys() & set(table.column_names):
+        lengths = (np.diff(chunk.offsets.to_numpy()) for chunk in table[name].chunks)
+        if any((length % _TUPLES[name]).any() for length in lengths):
+            msg = f"column {name} holds a list that is not of {_TUPLES[name]} numbers per item"
+            raise pa.ArrowInvalid(msg)
     for name in _NUMBERS.intersection(table.column_names):
         values = numbers(table[name].drop_null())
         if not np.isfinite(values).all() or (name == "size" and np.any(values < 0)):
