@@ -162,7 +162,7 @@ def process(
     if no_fsync:
         os.environ[FSYNC] = "0"  # which worker processes inherit
     if executor != "local":  # its workers may have another current folder
-        recordings, out = tuple(map(_from_root, recordings)), _from_root(out)
+        recordings, out = tuple(map(_absolute, recordings)), _absolute(out)
         if choices["model"] is not None:
             choices["model"] = choices["model"].absolute()
     chosen = [f"outputs.boxes={boxes}"] if boxes else []
@@ -188,7 +188,7 @@ def process(
     ctx.exit(exit_code(list(tally.of_each_code.values())))
 
 
-def _from_root(place: str) -> str:
+def _absolute(place: str) -> str:
     """Return an absolute path, or a URL as it is."""
     from shapecat.batch.storage import is_url
 
@@ -220,7 +220,7 @@ def _run(
         return
     started = open_executor(name, workers=workers, address=scheduler)
     with _closing(started) as executor, watcher:
-        if getattr(executor, "waits", bool)():
+        if getattr(executor, "lacks_workers", bool)():
             watcher.note("the scheduler has no worker yet: waiting for one")
         yield from process_on(executor, batch.tasks, watcher, cores=cores, manifest=batch.manifest)
 

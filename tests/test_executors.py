@@ -261,10 +261,10 @@ def test_dask_without_a_worker_is_known_to_wait() -> None:
         n_workers=0, processes=False, dashboard_address="127.0.0.1:0"
     )
     with _DaskExecutor(distributed.Client(cluster), cluster) as executor:
-        assert executor.waits()
+        assert executor.lacks_workers()
         cluster.scale(1)
         assert executor.submit(abs, -3).result(timeout=60) == 3
-        assert not executor.waits()
+        assert not executor.lacks_workers()
 
 
 def test_processes_keep_order_and_hold_few_items() -> None:

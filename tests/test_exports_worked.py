@@ -127,12 +127,7 @@ def test_kitti_calibration_projects_points_into_colour_camera(tmp_path: Path) ->
 
     x, y, z = (frame().xyz() @ pose.rotation.T + pose.translation).T
     u, v = 171.0 * x / z + 103.2, 166.0 * y / z + 71.5
-    text = (tmp_path / "calib" / "000000.txt").read_text()
-    projection, mount = (
-        np.array(list(map(float, re.findall(rf"{name}: (.*)", text)[0].split()))).reshape(3, 4)
-        for name in ("P2", "Tr_velo_to_cam")
-    )
-    points = np.fromfile(tmp_path / "velodyne" / "000000.bin", "<f4").reshape(-1, 4)
+    projection, mount, points = read_kitti(tmp_path)
     points[:, 3] = 1
     pixels = projection @ np.vstack([mount @ points.T, np.ones(len(points))])
     assert_allclose(pixels[:2] / pixels[2], [u, v], atol=2e-3)
@@ -151,6 +146,17 @@ def test_kitti_calibration_projects_points_into_colour_camera(tmp_path: Path) ->
     assert_allclose(back.center, item.box.center, atol=2e-5)
     error = Rotation.from_quat(back.orientation).inv() * Rotation.from_quat(item.box.orientation)
     assert error.magnitude() < 1e-4
+
+
+def read_kitti(folder: Path) -> tuple[Any, Any, Any]:
+    """Return ``P2`` (3, 4), ``Tr_velo_to_cam`` (3, 4) and the points (n, 4) of the first frame."""
+    text = (folder / "calib" / "000000.txt").read_text()
+    projection, mount = (
+        np.array(list(map(float, re.findall(rf"{name}: (.*)", text)[0].split()))).reshape(3, 4)
+        for name in ("P2", "Tr_velo_to_cam")
+    )
+    points = np.fromfile(folder / "velodyne" / "000000.bin", "<f4").reshape(-1, 4)
+    return projection, mount, points
 
 
 def test_kitti_image_is_that_of_its_pinhole_camera(tmp_path: Path) -> None:
@@ -176,12 +182,7 @@ def test_kitti_image_is_that_of_its_pinhole_camera(tmp_path: Path) -> None:
     unused: Any = SimpleNamespace()
     write_kitti(tmp_path, views, unused)
 
-    text = (tmp_path / "calib" / "000000.txt").read_text()
-    projection, mount = (
-        np.array(list(map(float, re.findall(rf"{name}: (.*)", text)[0].split()))).reshape(3, 4)
-        for name in ("P2", "Tr_velo_to_cam")
-    )
-    points = np.fromfile(tmp_path / "velodyne" / "000000.bin", "<f4").reshape(-1, 4)
+    projection, mount, points = read_kitti(tmp_path)
     at = projection @ [*(mount @ [*points[row * CAMERA.width + column, :3], 1]), 1]
     expected = at[:2] / at[2]
     drawn = np.asarray(Image.open(tmp_path / "image_2" / "000000.png").convert("L"), float)
@@ -200,12 +201,7 @@ def test_kitti_image_on_depth_pixels_has_the_depth_camera(tmp_path: Path) -> Non
     unused: Any = SimpleNamespace()
     write_kitti(tmp_path, views, unused)
 
-    text = (tmp_path / "calib" / "000000.txt").read_text()
-    projection, mount = (
-        np.array(list(map(float, re.findall(rf"{name}: (.*)", text)[0].split()))).reshape(3, 4)
-        for name in ("P2", "Tr_velo_to_cam")
-    )
-    points = np.fromfile(tmp_path / "velodyne" / "000000.bin", "<f4").reshape(-1, 4)
+    projection, mount, points = read_kitti(tmp_path)
     points[:, 3] = 1
     at = projection @ np.vstack([mount @ points.T, np.ones(len(points))])
     v, u = np.mgrid[:120, :160]

@@ -61,8 +61,8 @@ def undistorted_rays(camera: Camera, model: str, coefficients: Sequence[float]) 
 
     Returns
     -------
-    (h, w, 2) slopes, NaN at pixels where the iteration does not converge; None if these are most
-    pixels, the model is not known, or the coefficients are not finite.
+    (h, w, 2) slopes, NaN at pixels where the iteration does not converge; None if it converges
+    at fewer than 30 % of them, the model is not known, or the coefficients are not finite.
     """
     if model not in LENS_MODELS or not np.isfinite(coefficients).all():
         return None

@@ -143,11 +143,11 @@ def _overlaid(views: BoxViews, weights: F8, origin: F8, base: F8) -> tuple[F8, F
     seen = _median(reached, each)
     # Of a thin object that moves a little, opposite sides may come from views that exclude each
     # other.
-    least = _NARROWEST * _across(reached).min(axis=0)
-    return seen + np.maximum(least - _across(seen), 0.0) / 2, share
+    least = _NARROWEST * _widths(reached).min(axis=0)
+    return seen + np.maximum(least - _widths(seen), 0.0) / 2, share
 
 
-def _across(outlines: F8) -> F8:
+def _widths(outlines: F8) -> F8:
     """Return the width of outlines (..., 96) in each direction, metres."""
     return np.asarray(outlines + np.roll(outlines, DIRECTIONS // 2, axis=-1))
 

@@ -29,7 +29,7 @@ class _DaskExecutor(Executor):
         self._executor.shutdown(wait=wait and not cancel_futures)  # without waiting it cancels
         self._close(_CLOSE_S)
 
-    def waits(self) -> bool:
+    def lacks_workers(self) -> bool:
         """Return whether the scheduler has no worker yet, as that of an adaptive cluster."""
         return not self._client.nthreads()
 

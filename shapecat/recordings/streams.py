@@ -115,7 +115,7 @@ def _why_unusable(recording: Recording, streams: tuple[Stream, ...], name: str) 
     """Return the error for a wanted topic that is missing or holds no depth."""
     known = ", ".join(stream.topic for stream in streams) or "none"
     there = [t for t in recording.topics if t.name.strip("/") == name.strip("/")]
-    details = [detail for topic in there if (detail := _detail(recording, topic))]
+    details = [detail for topic in there if (detail := _encoding_or_error(recording, topic))]
     state = "holds no clouds or depth images" if there else "does not exist"
     unreadable = [detail for detail in details if detail.startswith(_UNREADABLE)]
     if unreadable:
@@ -130,7 +130,7 @@ def _why_none(recording: Recording, streams: tuple[Stream, ...]) -> str:
         names = ", ".join(stream.topic for stream in streams)
         what = f"depth images without a sensor_msgs/CameraInfo: {names}"
         return f"{recording.path}: {what}{_warnings(recording)}"
-    details = ((topic, _detail(recording, topic)) for topic in recording.topics)
+    details = ((topic, _encoding_or_error(recording, topic)) for topic in recording.topics)
     found = [f"{t.name} ({', '.join(filter(None, (t.type or t.encoding, d)))})" for t, d in details]
     shown = ", ".join(found[:12]) + (", …" if len(found) > 12 else "")
     images = any(t.type.endswith("Image") for t in recording.topics)
@@ -141,7 +141,7 @@ def _why_none(recording: Recording, streams: tuple[Stream, ...]) -> str:
     )
 
 
-def _detail(recording: Recording, topic: Topic) -> str:
+def _encoding_or_error(recording: Recording, topic: Topic) -> str:
     """Return the encoding of a topic's images, or why none of its messages can be decoded."""
     if ros_counterpart(topic.type) not in _PROBES:
         return ""

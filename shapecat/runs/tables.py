@@ -90,7 +90,7 @@ def read_row_groups(
         count = file.num_row_groups
         for first in range(0, count, at_once):
             groups = range(first, min(first + at_once, count))
-            yield _sound(file.read_row_groups(groups, columns=columns, use_threads=False))
+            yield _validated(file.read_row_groups(groups, columns=columns, use_threads=False))
 
 
 def read_rows(
@@ -115,7 +115,7 @@ def read_rows(
         some = groups[k : k + at_once]
         at = np.concatenate([order[bounds[g] : bounds[g + 1]] for g in some])
         skipped = starts[some] - np.cumsum([0, *np.diff(starts)[some[:-1]]])
-        table = _sound(file.read_row_groups(some.tolist(), list(columns), use_threads=False))
+        table = _validated(file.read_row_groups(some.tolist(), list(columns), use_threads=False))
         yield at, table.take(pa.array(rows[at] - np.repeat(skipped, np.diff(bounds)[some])))
 
 
@@ -207,7 +207,7 @@ def opened(path: Path, *, read_dictionary: Sequence[str] = ()) -> Iterator[pq.Pa
     OutputError : the table is missing or unreadable, or lacks a column of its schema.
     """
     try:
-        with _parquet(path, read_dictionary) as file:
+        with _open_parquet(path, read_dictionary) as file:
             if wrong := _wrong_column(file.schema_arrow, TABLES[path.stem]):
                 msg = f"{path}: {wrong}; process the recording again"
                 raise OutputError(msg)
@@ -217,7 +217,7 @@ def opened(path: Path, *, read_dictionary: Sequence[str] = ()) -> Iterator[pq.Pa
         raise OutputError(msg) from error
 
 
-def _sound(table: pa.Table) -> pa.Table:
+def _validated(table: pa.Table) -> pa.Table:
     """Return rows of a table unchanged.
 
     Raises
@@ -238,7 +238,7 @@ def _sound(table: pa.Table) -> pa.Table:
     return table
 
 
-def _parquet(path: Path, read_dictionary: Sequence[str]) -> pq.ParquetFile:
+def _open_parquet(path: Path, read_dictionary: Sequence[str]) -> pq.ParquetFile:
     try:
         return pq.ParquetFile(path, read_dictionary=list(read_dictionary))
     except KeyError as error:
