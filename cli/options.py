@@ -25,7 +25,16 @@ class _NonEmptyPath(click.Path):
         return super().convert(value, param, ctx)
 
 
-ANY_PATH = _NonEmptyPath(path_type=Path)
+class _LocalPath(_NonEmptyPath):
+    """A path on this machine: as one, a URL would lose a slash and name a local folder."""
+
+    def convert(self, value: Any, param: click.Parameter | None, ctx: click.Context | None) -> Any:
+        if isinstance(value, str) and "://" in value:
+            self.fail(f"{value} is a URL; only RECORDING and --out of `process` may be", param, ctx)
+        return super().convert(value, param, ctx)
+
+
+ANY_PATH = _LocalPath(path_type=Path)
 PATH_OR_URL = _NonEmptyPath(path_type=str, readable=False)
 
 

@@ -16,6 +16,7 @@ from numpy.typing import ArrayLike
 
 from shapecat import pipeline
 from shapecat.batch.finding import find_recordings
+from shapecat.batch.storage import is_url
 from shapecat.config import Settings, load_settings, with_settings
 from shapecat.errors import ConfigError, ModelError, RecordingError, explained
 from shapecat.learning import Categorizer, load_model
@@ -46,6 +47,7 @@ def open_run(folder: str | Path) -> Run:
 
     Raises
     ------
+    ConfigError : the folder is a URL.
     OutputError : the folder is not a finished run.
     """
     return Run(_path(folder))
@@ -107,6 +109,7 @@ def open_recording(path: str | Path) -> OpenRecording:
 
     Raises
     ------
+    ConfigError : the path is a URL.
     RecordingError : the path is not a readable recording, or a folder of several.
     """
     return OpenRecording(_open_recording(_one_recording(_path(path))))
@@ -264,7 +267,10 @@ def _require_known(settings: Collection[str], options: Collection[str]) -> None:
 
 
 def _path(given: str | Path) -> Path:
-    """Return a path; ``~`` is the home folder."""
+    """Return a path; ``~`` is the home folder. Refuse a URL, which would become a local path."""
+    if is_url(os.fspath(given)):
+        msg = f"{given} is a URL; from Python, shapecat reads and writes local paths only"
+        raise ConfigError(msg)
     return Path(os.path.expanduser(given))  # noqa: PTH111  the other raises without a home
 
 

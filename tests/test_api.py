@@ -445,6 +445,17 @@ def test_folder_of_recordings_is_refused(page_folder: Path, tmp_path: Path) -> N
     assert not (tmp_path / "out").exists()
 
 
+def test_url_is_refused(page_folder: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """The command takes URLs; as a path, ``s3://lab`` would become the local folder ``s3:/lab``."""
+    monkeypatch.chdir(tmp_path)
+
+    with pytest.raises(ConfigError, match="s3://lab is a URL"):
+        shapecat.process(page_folder / "demo.mcap", "s3://lab")
+    with pytest.raises(ConfigError, match=r"s3://lab/day\.mcap is a URL"):
+        shapecat.open_recording("s3://lab/day.mcap")
+    assert list(tmp_path.iterdir()) == []
+
+
 def test_import_does_not_load_numpy() -> None:
     """Every command imports the package, so a heavy import would delay `--help`."""
     assert loaded_by("import shapecat", {"numpy"}) == set()

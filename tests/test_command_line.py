@@ -217,6 +217,27 @@ def test_empty_path_is_wrong_usage(
     assert list(tmp_path.iterdir()) == []
 
 
+@pytest.mark.parametrize(
+    "words",
+    [
+        *(("info", "{url}"), ("report", "{url}"), ("simulate", "{url}.mcap", "--frames", "1")),
+        *(("export", "a", "--format", "crops", "--out", "{url}"), ("train", "a", "--out", "{url}")),
+        ("process", "a", "--out", "q", "--model", "{url}"),
+    ],
+)
+def test_url_is_refused_where_it_would_be_a_local_path(
+    shapecat: Run, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, words: tuple[str, ...]
+) -> None:
+    """As paths, URLs lose a slash, and results would land in the local folder ``s3:``."""
+    monkeypatch.chdir(tmp_path)
+    result = shapecat(*(word.format(url="s3://lab/day") for word in words))
+
+    assert result.exit_code == 2
+    assert "s3://lab/day" in result.stderr
+    assert "is a URL" in result.stderr
+    assert list(tmp_path.iterdir()) == []
+
+
 @pytest.mark.parametrize("kind", ["ANY_PATH", "PATH_OR_URL"])
 def test_home_folder_is_expanded(monkeypatch: pytest.MonkeyPatch, kind: str) -> None:
     """Bash leaves it in ``--out=~/results``: Arrow would write elsewhere than the other files."""
