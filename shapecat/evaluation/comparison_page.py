@@ -257,7 +257,8 @@ _PAGE = Template(
 body{font:15px/1.5 system-ui,sans-serif;max-width:70em;margin:2em auto;padding:0 1em;color:#222}
 h1{margin-bottom:0}.sub,.note{color:#666}.note{border-left:3px solid #e65100;padding-left:.6em}
 table{border-collapse:collapse;margin:1em 0}td,th{padding:.2em 1em .2em 0;text-align:left}
-tr+tr{border-top:1px solid #ddd}td:nth-child(2){font-variant-numeric:tabular-nums}
+tr+tr{border-top:1px solid #ddd}td:first-child{white-space:pre}
+td:nth-child(2){font-variant-numeric:tabular-nums}
 .pictures{display:grid;grid-template-columns:repeat(auto-fill,minmax(26em,1fr));gap:1.2em}
 figure{margin:0}figure svg{width:100%;border-radius:4px;display:block}
 figcaption{font-size:13px;color:#444}
