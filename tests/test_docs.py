@@ -14,6 +14,7 @@ from click.testing import Result
 
 from shapecat import config
 from shapecat.config import Settings
+from shapecat.runs.table_schemas import TABLES
 
 ROOT = Path(__file__).parents[1]
 PAGES = [ROOT / "README.md", *sorted((ROOT / "docs").glob("*.md"))]
@@ -61,6 +62,26 @@ def test_help_explains_each_choice(
     lines = shapecat(command, "--help").stdout.splitlines()
 
     assert [c for c in choice.choices if not any(x.startswith(f"  {c}  ") for x in lines)] == []
+
+
+@pytest.mark.parametrize(
+    ("command", "option", "registry"),
+    [
+        ("simulate", "scene", ("shapecat.simulation.scenes", "SCENES")),
+        ("simulate", "sensor", ("shapecat.simulation.presets", "PRESETS")),
+        ("export", "kind", ("shapecat.outputs.exports", "FORMATS")),
+        ("export", "kind", ("shapecat.outputs.exports", "DATASETS")),
+    ],
+)
+def test_command_offers_what_the_library_has(
+    command: str, option: str, registry: tuple[str, str]
+) -> None:
+    """Commands repeat the names, so that ``--help`` loads nothing heavy."""
+    choice = next(p.type for p in commands()[command].params if p.name == option)
+    assert isinstance(choice, click.Choice)
+
+    names = set(getattr(import_module(registry[0]), registry[1])) - {"empty"}  # a scene of tests
+    assert names <= set(choice.choices)
 
 
 def documented_commands() -> list[tuple[str, str]]:
@@ -117,6 +138,14 @@ def test_reference_lists_phases_of_progress() -> None:
     phases = ", ".join(f"`{name}`" for name in import_module("shapecat.cli.progress")._SHARES)
 
     assert f"`phase` ({phases})" in (ROOT / "docs" / "reference.md").read_text("utf-8")
+
+
+@pytest.mark.parametrize("name", sorted(TABLES))
+def test_tables_page_describes_every_column(name: str) -> None:
+    page = (ROOT / "docs" / "tables.md").read_text("utf-8")
+    section = page.partition(f"## {name}.parquet")[2].partition("\n## ")[0]
+
+    assert [column for column in TABLES[name].names if f"`{column}`" not in section] == []
 
 
 def test_links_between_pages_resolve() -> None:
