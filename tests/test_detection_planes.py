@@ -101,7 +101,7 @@ def test_strips_at_range_limit_are_no_plane(seed: int) -> None:
 
 
 def test_box_top_below_smaller_box_is_not_covered() -> None:
-    """A top face lies above it, as above a covered table, but all of it is visible."""
+    """Like a covered table, the top of the larger box has a face above it, but it is visible."""
     boxes = [block(0, 0, 0, (0.3, 0.3, 0.2)), block(0.05, 0.05, 0.2, (0.2, 0.2, 0.05))]
     _, covered_m2 = heights([block(0, 0, -0.03, (1.2, 1.0, 0.03)), *boxes])
     assert covered_m2 == [0] * len(covered_m2)

@@ -188,7 +188,7 @@ def test_labelled_frames_join_tracks_and_labels(tmp_path: Path) -> None:
 
 
 def test_ended_tracks_are_reported_in_next_frame_of_sensor(tmp_path: Path) -> None:
-    """A viewer would not look for it in a frame of another sensor."""
+    """A viewer would not look for the end of a track in a frame of another sensor."""
     names = ("/a", "/b", "/b", "/a", "/b")
     with PerceptionTables(tmp_path, categories=CATEGORIES, model_id="m1") as tables:
         for k, name in enumerate(names):

@@ -189,7 +189,10 @@ def _reporter(name: str, address: str) -> Observer:
 
 
 def attempt(job: Job, observe: Observer, *, cores: int = 1, ticket: Ticket) -> Outcome:
-    """Process one job; an error becomes its outcome, and an unexpected one is logged in full."""
+    """Process one job; an error becomes its outcome, and an unexpected one is logged in full.
+
+    ``cores`` is the number of processes that perceive frames; only a job with URLs uses ``ticket``.
+    """
     try:
         if job.origin or job.target:
             return Outcome(job, process_remote(job, observe, cores=cores, ticket=ticket))

@@ -168,7 +168,7 @@ def describe_arrangement(
     ----------
     name : prefix of the instance names.
     cameras : number of viewpoints, each with its own sensor.
-    background : whether to describe thin detections of background as well.
+    background : whether to add thin detections that show no object, as unknown.
     keep : whether to keep the points of the views.
     """
     objects = arrangement.objects

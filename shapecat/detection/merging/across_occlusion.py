@@ -17,8 +17,8 @@ __all__ = ["merge_across_occluder"]
 def merge_across_occluder(segments: Segments, grid: DepthGrid, normal: F4, labels: I4) -> None:
     """Merge segments behind the same occluder that continue each other, the best pair first.
 
-    ``normal`` (rows, 3, columns) is as in `SurfaceGraph`; ``labels`` (rows, columns) int16 are the
-    segments.
+    ``segments`` are changed in place; ``normal`` (rows, 3, columns) is as in `SurfaceGraph`, and
+    ``labels`` (rows, columns) int16 are the segments.
     """
     n = segments.parent.size
     scores, changed = np.zeros((n, n)), np.ones(n, np.bool_)

@@ -20,10 +20,10 @@ __all__ = ["measure_adjacency"]
 def measure_adjacency(
     grid: DepthGrid, heights: HeightMap, graph: SurfaceGraph, labels: I4, up: F8, segments: Segments
 ) -> None:
-    """Measure the boundaries and contacts of segments, and choose their samples.
+    """Measure the boundaries and contacts of segments, and choose some cells of each as samples.
 
     ``labels`` (rows, columns) are the segments, ``up`` is a unit vector (3,), sensor frame, and
-    ``segments`` are from `measure_segments`, changed in place.
+    ``segments`` are from `measure_segments`; the results are written into them.
     """
     inv_depth = grid.inverse_depth
     rows, columns = inv_depth.shape
