@@ -57,7 +57,7 @@ from shapecat.evaluation.comparison_pictures import (
 from shapecat.evaluation.labellings import LabelledItem, Labelling, find_frame, index_frames
 from shapecat.evaluation.overlap import Overlap, box_iou
 from shapecat.evaluation.references import open_reference, read_complete, run_labellings
-from shapecat.evaluation.references_coco import CocoLabels, filled_polygon, rle_mask
+from shapecat.evaluation.references_coco import CocoLabels, decode_rle, filled_polygon
 from shapecat.evaluation.references_kitti import KittiLabels
 from shapecat.runs.table_schemas import DETECTIONS, FRAMES, TRACKS
 from shapecat.types import Box, Camera, Frame
@@ -977,12 +977,12 @@ def compressed(counts: list[int]) -> str:
 def test_compressed_run_lengths_are_decoded() -> None:
     """Long, short and falling run lengths: differences of both signs, several letters."""
     counts = [3, 40, 1000, 5, 7, 900, 2, 1, 42]
-    expected = rle_mask(counts, 40, 50)
+    expected = decode_rle(counts, 40, 50)
 
     assert expected.sum() == 40 + 5 + 900 + 1
-    assert (rle_mask(compressed(counts), 40, 50) == expected).all()
+    assert (decode_rle(compressed(counts), 40, 50) == expected).all()
     with pytest.raises(ValueError, match="1999"):
-        rle_mask([1999], 40, 50)
+        decode_rle([1999], 40, 50)
 
 
 def test_filled_polygon_has_its_area() -> None:

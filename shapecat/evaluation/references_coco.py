@@ -20,7 +20,7 @@ from shapecat.evaluation.labellings import (
 )
 from shapecat.runs.tables import Key
 
-__all__ = ["CocoLabels", "filled_polygon", "rle_mask"]
+__all__ = ["CocoLabels", "decode_rle", "filled_polygon"]
 
 _MOST_PIXELS = 50_000_000
 _A_STAMP = 10**17
@@ -139,14 +139,14 @@ def _mask(segmentation: Any, height: int, width: int) -> Bool:
         if tuple(segmentation["size"]) != (height, width):
             msg = f"size {segmentation['size']}, the image is {[height, width]}"
             raise ValueError(msg)
-        return rle_mask(segmentation["counts"], height, width)
+        return decode_rle(segmentation["counts"], height, width)
     mask = np.zeros((height, width), np.bool_)
     for polygon in segmentation:
         mask |= filled_polygon(np.reshape(polygon, (-1, 2)), height, width)
     return mask
 
 
-def rle_mask(counts: str | Sequence[int], height: int, width: int) -> Bool:
+def decode_rle(counts: str | Sequence[int], height: int, width: int) -> Bool:
     """Decode run lengths into a mask (h, w).
 
     Parameters
@@ -160,7 +160,7 @@ def rle_mask(counts: str | Sequence[int], height: int, width: int) -> Bool:
 
     Examples
     --------
-    >>> rle_mask([1, 2, 1], 2, 2).astype(int)
+    >>> decode_rle([1, 2, 1], 2, 2).astype(int)
     array([[0, 1],
            [1, 0]])
     """
