@@ -62,4 +62,4 @@ def _show(overview: dict[str, Any]) -> None:
     ]
     print_table(("topic", "type", "encoding", "messages", "use"), rows)
     for warning in overview["warnings"]:
-        click.echo(f"warning: {warning}")
+        click.echo(f"Warning: {warning}")

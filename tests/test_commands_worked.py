@@ -229,7 +229,7 @@ def test_info_prints_content_of_recording(capsys: pytest.CaptureFixture[str]) ->
         ["/tf", "tf2_msgs/TFMessage", "ros1", "1075"],
         ["/x", "y/Z", "cdr", "?"],  # not known without reading the whole recording
     ]
-    assert last == "warning: the last chunk is cut"
+    assert last == "Warning: the last chunk is cut"
 
 
 def test_json_events_keep_zeros_and_omit_unknown_values(
