@@ -7,9 +7,8 @@ annotating needs only the tables and the recording.
 
 import logging
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Callable
 from pathlib import Path
-from typing import TypeVar
 
 from shapecat.description import DESCRIPTOR_NAMES
 from shapecat.errors import NoStreamError, OutputError
@@ -49,15 +48,12 @@ from shapecat.runs.perceiving import Work, perceive_all, revise
 from shapecat.runs.resuming import has_work, resume, take_over_frames
 from shapecat.runs.run_info import RunInfo
 from shapecat.runs.segments import discard_segments
-from shapecat.system import stopping
 from shapecat.system.files import holding
 from shapecat.system.memory import release_memory
-from shapecat.system.progress import Observer, ignore
-from shapecat.types import LabelledFrame, ShownFrame
+from shapecat.system.progress import Observer, ignore, observed
 
 __all__ = ["annotate", "annotate_again", "process", "track"]
 
-_Shown = TypeVar("_Shown", LabelledFrame, ShownFrame)
 
 _log = logging.getLogger(__name__)
 
@@ -232,7 +228,7 @@ def annotate(folder: Path, recording: Recording, run: RunInfo, observe: Observer
         write_annotated(
             recording,
             folder / "annotated.mcap",
-            _observed(shown, "annotate", total, observe),
+            observed(shown, "annotate", total, observe),
             run=run,
             markers=settings["markers"],
             images=read_image_frames(folder, labels()) if topics else (),
@@ -246,7 +242,7 @@ def annotate(folder: Path, recording: Recording, run: RunInfo, observe: Observer
         from shapecat.runs.placed_frames import streams_with_poses  # noqa: PLC0415  the same
 
         labelled = read_labelled_frames(folder, labels())
-        shown = _observed(labelled, "review", total, observe)
+        shown = observed(labelled, "review", total, observe)
         write_review(
             folder / "review.rrd",
             with_clouds(shown, recording, run, streams_with_poses(folder)),
@@ -319,12 +315,3 @@ def _adopt(labels: Path | None, folder: Path, *, by_place: bool) -> Transfer | N
             return transfer_labels(labels, folder)
     adopt_labels(labels or folder / "tracks.csv", folder)
     return None
-
-
-def _observed(
-    items: Iterator[_Shown], phase: str, total: int, observe: Observer
-) -> Iterator[_Shown]:
-    for done, item in enumerate(items, start=1):
-        stopping.check()
-        yield item
-        observe(phase, done, total)

@@ -12,8 +12,8 @@ def figure_text(value: float | None, missing: str = "–") -> str:
 
 
 def html_table(head: Sequence[str], rows: Sequence[Sequence[str]]) -> str:
-    """Return a table as HTML, without a header if its cells are empty."""
-    cells = [("th", head)] if any(head) else []
+    """Return a table as HTML; ``head`` is its header, empty for none."""
+    cells = [("th", head)] if head else []
     cells += [("td", row) for row in rows]
     lines = (
         f"<tr>{''.join(f'<{tag}>{escape(cell)}</{tag}>' for cell in row)}</tr>"

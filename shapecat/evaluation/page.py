@@ -74,7 +74,7 @@ def format_page(report: Report, *, title: str) -> str:
     """Return an evaluation as an HTML page."""
     parts = [
         f"<h1>{escape(title)}</h1>",
-        html_table(("", ""), _figures(report)),
+        html_table((), _figures(report)),
         "<h2>Confusion</h2><p>Rows: true category; columns: predicted category.</p>",
         confusion_svg(report.categories, report.confusion),
         f"<h2>Calibration</h2><p>{_CALIBRATION}</p>",

@@ -42,7 +42,7 @@ def grow_dictionary(
     rounds: int,
     leaves: int,
     rate: float,
-    jobs: int | None,
+    jobs: int,
     rng: np.random.Generator,
 ) -> Dictionary:
     """Grow gradient-boosted trees; a logit is the sum of the values of a view's words.
@@ -79,7 +79,7 @@ def _boost(
     scores: F4,
     rounds: int,
     settings: TreeSettings,
-    jobs: int | None,
+    jobs: int,
     rng: np.random.Generator,
 ) -> list[Tree]:
     """Grow one tree per category in each round; return them round by round.
@@ -90,7 +90,7 @@ def _boost(
     # One of K logits is free, so each moves (K - 1) / K of the way (Friedman 2001, eq. 36).
     freedom = np.float32(len(scores) / (len(scores) - 1))
     trees: list[Tree] = []
-    with ThreadPoolExecutor(jobs or 1) as pool:
+    with ThreadPoolExecutor(jobs) as pool:
         for _ in range(rounds):
             stopping.check()
             posterior = np.exp(scores - scores.max(axis=0))

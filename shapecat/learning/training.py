@@ -44,7 +44,7 @@ class LearningSettings:
     """Views stored in the model as negative examples for new categories."""
     rejected: float = 0.05
     """Fraction of held-out views of known categories that the novelty threshold rejects."""
-    jobs: int | None = None
+    jobs: int = 1
     """Number of trees grown at the same time."""
 
 

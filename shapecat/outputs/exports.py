@@ -20,7 +20,7 @@ from shapecat.outputs.wording import different_names
 from shapecat.runs.finished import FinishedRun, open_source, read_finished
 from shapecat.runs.folder import clear, recover, staged
 from shapecat.system.files import flush, replacing
-from shapecat.system.progress import Observer, ignore
+from shapecat.system.progress import Observer, ignore, observed
 from shapecat.types import LabelledFrame
 
 __all__ = ["FORMATS", "Exported", "common_categories", "export_dataset", "export_run"]
@@ -102,7 +102,7 @@ def export_run(
         full = format in _WITH_BOXES and not visible_boxes
         labelled = finished.frames_with_full_boxes() if full else finished.frames()
         triples = with_colour(_thinned(labelled, every), source, finished.run)
-        pairs = _observed(triples, total, observe)
+        pairs = observed(triples, "export", total, observe)
         if format == "crops":
             return FORMATS[format](out, pairs, finished)
         about = {
@@ -244,14 +244,6 @@ def _thinned(frames: Iterable[LabelledFrame], every: int) -> Iterator[LabelledFr
         if seen[frame.topic] % every == 0:
             yield frame
         seen[frame.topic] += 1
-
-
-def _observed(
-    pairs: Iterable[ExportedFrame], total: int, observe: Observer
-) -> Iterator[ExportedFrame]:
-    for done, pair in enumerate(pairs, start=1):
-        yield pair
-        observe("export", done, total)
 
 
 def _require_own(target: Path, about: Mapping[str, Any]) -> None:

@@ -207,12 +207,12 @@ def make_chair(rng: Generator, place: ArrayLike, *, degrees: float) -> list[Mesh
     return [_put(part, place, degrees) for part in parts]
 
 
-def make_curtain(rng: Generator, width: float, height: float, place: ArrayLike) -> Mesh:
-    """Return a folded curtain along x.
+def make_curtain(rng: Generator, width: float, place: ArrayLike) -> Mesh:
+    """Return a folded curtain along x, 2.2 m high.
 
     Its lower edge is centred at ``place`` (3,); lengths are in metres.
     """
-    x, z = np.linspace(-width / 2, width / 2, 160), np.linspace(0, height, 4)
+    x, z = np.linspace(-width / 2, width / 2, 160), np.linspace(0, 2.2, 4)
     depth = rng.uniform(0.02, 0.06) * np.sin(x / rng.uniform(0.02, 0.05))
     depth = depth * (1 + 0.5 * np.sin(3 * x + rng.uniform(0, 6)))
     u, v = np.meshgrid(x, z)

@@ -107,7 +107,7 @@ def _surroundings(rng: Generator) -> Iterator[Mesh]:
         yield from make_chair(rng, place, degrees=float(np.degrees(np.arctan2(*place[:2]))))
     if rng.random() < 0.35:
         hung = [rng.uniform(-0.5, 0.5), rng.uniform(0.8, 1.4), 0.1]
-        yield make_curtain(rng, rng.uniform(0.6, 2.0), 2.2, hung)
+        yield make_curtain(rng, rng.uniform(0.6, 2.0), hung)
     if rng.random() < 0.3:
         plant = make_plant(rng)
         shift = _position_beside_table(rng).astype(np.float32)

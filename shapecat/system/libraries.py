@@ -20,15 +20,15 @@ class _Blocker(MetaPathFinder):
 
     def find_spec(self, fullname: str, *_: Any) -> None:
         """Raise ModuleNotFoundError for blocked modules; leave others to other finders."""
-        if fullname == "pandas" or (fullname == _LINEAR_ALGEBRA and _is_importing(_ASKS)):
+        if fullname == "pandas" or (fullname == _LINEAR_ALGEBRA and _numba_asks()):
             msg = f"this process does without {fullname}"
             raise ModuleNotFoundError(msg, name=fullname)
 
 
-def _is_importing(module: str) -> bool:
-    """Return whether code of a module is among the callers."""
+def _numba_asks() -> bool:
+    """Return whether numba's search for linear algebra is among the callers."""
     frame: FrameType | None = sys._getframe()  # noqa: SLF001  inspect takes longer
-    while frame is not None and frame.f_globals.get("__name__") != module:
+    while frame is not None and frame.f_globals.get("__name__") != _ASKS:
         frame = frame.f_back
     return frame is not None
 

@@ -1,8 +1,13 @@
 """Progress of long work, reported to the caller."""
 
-from collections.abc import Callable
+from collections.abc import Callable, Iterable, Iterator
+from typing import TypeVar
 
-__all__ = ["Observer", "ignore"]
+from shapecat.system import stopping
+
+__all__ = ["Observer", "ignore", "observed"]
+
+_Item = TypeVar("_Item")
 
 Observer = Callable[[str, int, int | None], None]
 """Called with the phase, the number of items done, and the total (None if unknown)."""
@@ -10,3 +15,21 @@ Observer = Callable[[str, int, int | None], None]
 
 def ignore(_phase: str, _done: int, _total: int | None) -> None:
     """Ignore the progress."""
+
+
+def observed(
+    items: Iterable[_Item], phase: str, total: int | None, observe: Observer
+) -> Iterator[_Item]:
+    """Yield items, and report the progress after each; raise `Stopped` if a signal asked to stop.
+
+    Examples
+    --------
+    >>> list(observed("ab", "spell", 2, print))
+    spell 1 2
+    spell 2 2
+    ['a', 'b']
+    """
+    for done, item in enumerate(items, start=1):
+        stopping.check()
+        yield item
+        observe(phase, done, total)

@@ -16,6 +16,8 @@ SIDE = 160
 """Width and height of a picture in pixels."""
 
 _SHADES = 14
+_PASSES = 3
+"""Number of times that holes are closed, and that nearness is smoothed."""
 MOST_POINTS = 8000
 _LIGHT = np.array([-0.4, 0.65, 0.65]) / np.linalg.norm([-0.4, 0.65, 0.65])
 
@@ -141,9 +143,9 @@ def _nearest(spots: F8) -> F8:
     return near
 
 
-def _closed(near: F8, passes: int = 3) -> F8:
+def _closed(near: F8) -> F8:
     """Fill empty pixels of ``near`` (h, w) that are mostly surrounded by the object."""
-    for _ in range(passes):
+    for _ in range(_PASSES):
         solid = np.isfinite(near)
         share = _blurred(solid.astype(np.float64))
         mean = _blurred(np.where(solid, near, 0.0)) / np.maximum(share, 1e-9)
@@ -151,10 +153,10 @@ def _closed(near: F8, passes: int = 3) -> F8:
     return near
 
 
-def _smoothed(near: F8, bare: Bool, passes: int = 3) -> F8:
+def _smoothed(near: F8, bare: Bool) -> F8:
     """Average each pixel (h, w), even if empty, with its neighbours on the object."""
     weight, value = (~bare).astype(np.float64), np.where(bare, 0.0, near)
-    for _ in range(passes):
+    for _ in range(_PASSES):
         value, weight = _blurred(value * weight), _blurred(weight)
         value = np.divide(value, weight, out=np.zeros_like(value), where=weight > 0)
         weight = np.minimum(weight, 1.0)
