@@ -206,16 +206,16 @@ class _Planner:
         if not key:
             key, size = look_at(source.url) if source.url else _input_key(Path(source.path))
         task = Task(
-            self._job,
-            self._out,
-            name,
-            source.path,
-            source.url,
-            "new",
-            size,
-            key,
-            self._work,
-            self._command,
+            like=self._job,
+            out=self._out,
+            name=name,
+            path=source.path,
+            url=source.url,
+            status="new",
+            bytes=size,
+            input=key,
+            work=self._work,
+            command=self._command,
         )
         return dataclasses.replace(task, status=self._status(task))
 

@@ -135,19 +135,19 @@ def _describe(hits: Hits, fragments: Sequence[I4], scenes: I4) -> Fragments:
     ends = [_line(hits, f[-_LINE:], -1) for f in fragments]
     fused = [_fused(hits, f) for f in fragments]
     return Fragments(
-        np.array([hits.stamps(f[0]) for f in fragments], np.int64),
-        np.array([hits.stamps(f[-1]) for f in fragments], np.int64),
-        np.reshape([place for place, _ in starts], (n, 3)),
-        np.reshape([place for place, _ in ends], (n, 3)),
-        np.reshape([velocity for _, velocity in starts], (n, 3)),
-        np.reshape([velocity for _, velocity in ends], (n, 3)),
-        np.reshape([_extent(hits, f) for f in fragments], (n, 3)),
-        np.array([np.sum(~hits.partial[f]) for f in fragments], np.int32),
-        np.reshape([_rest(hits, f) for f in fragments], (n, 3)),
-        np.reshape([hits.partial[f[[0, -1]]] for f in fragments], (n, 2)),
-        np.reshape([posterior for posterior, _ in fused], (n, -1 if n else 0)),
-        np.array([novelty for _, novelty in fused]),
-        np.array([scenes[hits.rows[f[0]]] for f in fragments], np.int32),
+        first_ns=np.array([hits.stamps(f[0]) for f in fragments], np.int64),
+        last_ns=np.array([hits.stamps(f[-1]) for f in fragments], np.int64),
+        start=np.reshape([place for place, _ in starts], (n, 3)),
+        end=np.reshape([place for place, _ in ends], (n, 3)),
+        start_velocity=np.reshape([velocity for _, velocity in starts], (n, 3)),
+        end_velocity=np.reshape([velocity for _, velocity in ends], (n, 3)),
+        sizes=np.reshape([_extent(hits, f) for f in fragments], (n, 3)),
+        whole=np.array([np.sum(~hits.partial[f]) for f in fragments], np.int32),
+        rest=np.reshape([_rest(hits, f) for f in fragments], (n, 3)),
+        cut=np.reshape([hits.partial[f[[0, -1]]] for f in fragments], (n, 2)),
+        posteriors=np.reshape([posterior for posterior, _ in fused], (n, -1 if n else 0)),
+        novelties=np.array([novelty for _, novelty in fused]),
+        scenes=np.array([scenes[hits.rows[f[0]]] for f in fragments], np.int32),
     )
 
 
@@ -217,15 +217,15 @@ def _build_track(number: int, stream: _Followed, member: I4, settings: TrackingS
     at = np.searchsorted(hits.rows[member], rows, side="right") - 1
     places = hits.places(member, rows)
     return Track(
-        number,
-        tuple(map(hits.names.__getitem__, hits.topics[rows].tolist())),
-        len(member),
-        hits.frames[rows],
-        hits.stamps_ns[rows],
-        np.where(source, hits.numbers[member][at], -1),
-        places if stream.motion is None else stream.motion.moved(rows, places),
-        causal(views, settings.fusion, weights)[at],
-        posterior,
-        float(posterior.max()),
-        fuse_novelty(hits.novelties[member], weights),
+        id=number,
+        topics=tuple(map(hits.names.__getitem__, hits.topics[rows].tolist())),
+        hits=len(member),
+        frames=hits.frames[rows],
+        stamps_ns=hits.stamps_ns[rows],
+        detections=np.where(source, hits.numbers[member][at], -1),
+        centers=places if stream.motion is None else stream.motion.moved(rows, places),
+        causal=causal(views, settings.fusion, weights)[at],
+        posterior=posterior,
+        confidence=float(posterior.max()),
+        novelty=fuse_novelty(hits.novelties[member], weights),
     )
