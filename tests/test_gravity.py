@@ -228,7 +228,7 @@ def test_table_above_the_origin_of_a_cloud_does_not_contradict_up(tmp_path: Path
     links = [("map", "base_link", Pose(np.eye(3), np.array([0.1, -1.2, -0.8])))]
     items: list[tuple[str, int, Any]] = [("/tf_static", EPOCH, MAKE.transforms(links, EPOCH))]
     for k, view in enumerate(views()):
-        points = transform(view.pose, view.points()) - links[0][2].translation
+        points = transform(view.pose, view.points().reshape(1, -1, 3)) - links[0][2].translation
         cloud = MAKE.cloud(points.astype(np.float32), EPOCH + k, "base_link")
         items.append(("/points", EPOCH + k, cloud))
     process(Job(write(tmp_path / "a.mcap", items), tmp_path / "out", mcap=False, rrd=False))

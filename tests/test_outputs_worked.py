@@ -105,7 +105,8 @@ def test_records_print_in_one_short_line() -> None:
     assert repr(item.gas) == "NeuralGas(neurons=float32 (0, 3), edges=uint16 (0, 2))"
     assert repr(depth).endswith(
         "frame_id='cam', depth=float32 (4, 6), "
-        "camera=Camera(width=6, height=4, fx=5, fy=5, cx=3, cy=2), points=None)"
+        "camera=Camera(width=6, height=4, fx=5, fy=5, cx=3, cy=2), points=None, "
+        "frame_from_sensor=None)"
     )
     masks = ImageMasks("/color", 0, 0, "cam", 6, 4, {}, {3: np.arange(999, dtype=np.uint32)})
     assert repr(masks).endswith("boxes={}, counts={3: uint32 (999,)})")

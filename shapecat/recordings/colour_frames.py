@@ -11,7 +11,7 @@ import numpy as np
 from shapecat.cameras.colour import ColourImage, ColourView, LensCamera
 from shapecat.cameras.lenses import LENS_MODELS, distort
 from shapecat.errors import RecordingError
-from shapecat.geometry import IDENTITY
+from shapecat.geometry import IDENTITY, compose
 from shapecat.recordings.colour_image import bytes_per_row, cloud_colours, compressed_size
 from shapecat.recordings.colour_streams import ColourStream
 from shapecat.recordings.extrinsics import Extrinsics
@@ -217,7 +217,8 @@ class _Partner:
             frame.frame_id, image.frame_id, frame.log_time_ns, frame.stamp_ns
         )
         if pose is not None:
-            return ColourView(image, lens, pose)
+            own = frame.frame_from_sensor
+            return ColourView(image, lens, pose if own is None else compose(pose, own))
         if same_shape and _alike(
             lens, frame.camera, _EQUAL
         ):  # two cameras are never calibrated to the same numbers

@@ -8,7 +8,7 @@ import numpy as np
 
 from shapecat.arrays import F4
 from shapecat.errors import ConfigError
-from shapecat.geometry import unit_direction
+from shapecat.geometry import compose, unit_direction
 from shapecat.recordings.imu import Accelerometers
 from shapecat.recordings.recording import Recording
 from shapecat.recordings.streams import Stream
@@ -125,15 +125,18 @@ class Upright:
     def fixed_from_sensor(self, frame: Frame) -> Pose | None:
         """Return the pose of the sensor in the fixed frame, or None if it is unknown."""
         if self.fixed_frame is None:
-            self.fixed_frame = self._choose_fixed_frame(frame.frame_id)
+            self.fixed_frame = self._choose_fixed_frame(frame)
         if self.fixed_frame is None:
             return None
         return self._lookup(self.fixed_frame, frame)
 
-    def _choose_fixed_frame(self, first: str) -> str | None:
+    def _choose_fixed_frame(self, first: Frame) -> str | None:
         """Choose the fixed frame of all sensors, one named after a map or odometry if there is."""
-        found = [fixed_frame(self.transforms.tree, name) for name in (first, *self.sensors)]
-        return min((name for name in found if name is not None), key=_rank, default=None)
+        found = [
+            fixed_frame(self.transforms.tree, name) for name in (first.frame_id, *self.sensors)
+        ]
+        own = None if first.frame_from_sensor is None else first.frame_id.lstrip("/")
+        return min((name for name in found if name is not None), key=_rank, default=own)
 
     def corrected(self, topic: str, orientation: Orientation) -> Orientation:
         """Return an orientation of the data on a topic, given that of the frame they name."""
@@ -188,7 +191,9 @@ class Upright:
             self.warnings.append(f"up ({source}) {off} and is ignored; give --up {name} to use it")
 
     def _from_transforms(self, frame: Frame) -> tuple[str, F4 | None]:
-        for level in _level_frames(self.transforms.tree.frames, frame.frame_id.lstrip("/")):
+        name = frame.frame_id.lstrip("/")
+        own = () if frame.frame_from_sensor is None else (name,)
+        for level in _level_frames((*self.transforms.tree.frames, *own), name):
             pose = self._lookup(level, frame)
             if pose is not None:
                 return f"transforms, z of {level}", np.asarray(pose.rotation[2], np.float32)
@@ -200,7 +205,7 @@ class Upright:
         for sensor in self.accelerometers.around(frame.log_time_ns, frame.stamp_ns):
             up = sensor.up(frame.stamp_ns)
             pose = None
-            if sensor.frame_id != frame.frame_id:
+            if sensor.frame_id != frame.frame_id or frame.frame_from_sensor is not None:
                 pose = self._lookup(sensor.frame_id, frame)
                 up = None if pose is None or up is None else up @ pose.rotation
             if up is not None:
@@ -208,9 +213,14 @@ class Upright:
         return "", None
 
     def _lookup(self, target: str, frame: Frame) -> Pose | None:
+        """Return the pose of the sensor in a frame; None if it is unknown."""
         transforms = self.transforms.around(frame.log_time_ns, frame.stamp_ns)
+        own = frame.frame_from_sensor
+        if own is not None and target == frame.frame_id.lstrip("/"):  # it may be in no transform
+            return own
         try:
-            return transforms.lookup(target, frame.frame_id, frame.stamp_ns)
+            pose = transforms.lookup(target, frame.frame_id, frame.stamp_ns)
+            return pose if own is None else compose(pose, own)
         except TransformError as error:
             self.failed += 1
             self.first_failure = self.first_failure or str(error)

@@ -1,12 +1,13 @@
 """The pinhole camera behind an organized cloud or a camera calibration."""
 
 import re
+from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
 
-from shapecat.arrays import F4, F8
+from shapecat.arrays import F4, F8, Bool
 from shapecat.recordings.messages import MessageError
 from shapecat.types import Camera
 
@@ -18,6 +19,7 @@ __all__ = [
     "fit_pinhole",
     "is_rectified",
     "off_center",
+    "sample_pixels",
     "still_fits",
 ]
 
@@ -102,24 +104,30 @@ def _errors(camera: Camera, sample: tuple[F8, F8, F8, F8]) -> tuple[float, float
 
 def _sample(points: F4) -> tuple[F8, F8, F8, F8] | None:
     """Return u, v, x / z and y / z, each (n,), of points spread over the image; None if few."""
+    found = sample_pixels(points, lambda flat: flat[:, 2] > 0)
+    if found is None:
+        return None
+    u, v, chosen = found
+    return u, v, chosen[:, 0] / chosen[:, 2], chosen[:, 1] / chosen[:, 2]
+
+
+def sample_pixels(points: F4, valid: Callable[[F4], Bool]) -> tuple[F8, F8, F8] | None:
+    """Return u and v (n,), and the points (n, 3), of pixels spread over the image; None if few.
+
+    Of the points (h, w, 3), only finite ones that are ``valid`` are chosen.
+    """
     height, width = points.shape[:2]
     # A stride that shares no factor with the width visits all columns.
     stride = max(1, height * width // (4 * _SAMPLES)) | 1
     while np.gcd(stride, width) > 1:
         stride += 2
     flat = points.reshape(-1, 3)[::stride]
-    index = np.flatnonzero(np.isfinite(flat).all(1) & (flat[:, 2] > 0))
+    index = np.flatnonzero(np.isfinite(flat).all(1) & valid(flat))
     if index.size < _FEWEST:
         return None
     index = index[:: max(1, index.size // _SAMPLES)]
-    chosen = flat[index].astype(np.float64)
     v, u = np.divmod(index * stride, width)
-    return (
-        u.astype(float),
-        v.astype(float),
-        chosen[:, 0] / chosen[:, 2],
-        chosen[:, 1] / chosen[:, 2],
-    )
+    return u.astype(float), v.astype(float), flat[index].astype(np.float64)
 
 
 def _medians(a: F8, b: F8) -> tuple[F8, F8]:

@@ -28,7 +28,8 @@ from shapecat.recordings.pointcloud2 import cloud_points, organized, unorganized
 from shapecat.recordings.recording import Recording
 from shapecat.recordings.stamps import Clock, delay_ns, stamp_ns
 from shapecat.recordings.streams import COMPRESSED, Stream, first_message
-from shapecat.types import Camera, Frame, Pose
+from shapecat.recordings.viewpoint import find_viewpoint, seen_from
+from shapecat.types import Frame, Pose
 
 __all__ = ["SOURCES", "DepthSource", "PointsSource", "Source"]
 
@@ -94,6 +95,7 @@ class PointsSource(Source):
         """Start without a camera."""
         super().__init__(recording, stream)
         self.fit: PinholeFit | None = None
+        self.pose: Pose | None = None
 
     def read(self, message: Message, skipped: Counter[str]) -> Iterator[Frame]:
         """Yield the frame of a cloud, or none if it is unreadable."""
@@ -109,16 +111,23 @@ class PointsSource(Source):
         if points.size == 0:
             msg = "empty cloud"
             raise MessageError(msg)
-        camera = self._camera(points) if min(points.shape[:2]) > 1 else None
-        return unorganized(points) if camera is None else organized(points, camera)
+        content = self._image(points) if min(points.shape[:2]) > 1 else None
+        return unorganized(points) if content is None else content
 
-    def _camera(self, points: F4) -> Camera | None:
-        """Return the camera of earlier frames if it still fits, or a new one; None if none fits."""
-        if self.fit is not None and still_fits(self.fit, points):
-            return self.fit.camera
-        fit = fit_pinhole(points)
-        self.fit = fit or self.fit
-        return fit.camera if fit is not None else None
+    def _image(self, points: F4) -> dict[str, Any] | None:
+        """Return the depth image of an organized cloud; None if no camera fits.
+
+        The camera of earlier frames is kept if it still fits.
+        """
+        image = points if self.pose is None else seen_from(self.pose, points)
+        if self.fit is None or not still_fits(self.fit, image):
+            own = fit_pinhole(points)
+            found = find_viewpoint(points, self.fit) if own is None else (own, None)
+            if found is None:
+                return None
+            self.fit, self.pose = found
+            image = points if self.pose is None else seen_from(self.pose, points)
+        return {**organized(image, self.fit.camera), "frame_from_sensor": self.pose}
 
 
 def _placed(points: F4, pose: Pose | None) -> F4:

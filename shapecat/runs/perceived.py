@@ -40,13 +40,15 @@ class FrameRow:
     """Values of the frames table that a `Perception` lacks.
 
     ``up_given`` is (3,), a unit vector in the sensor frame, None if estimated from planes;
-    ``again`` marks a frame that is perceived for the second time.
+    ``again`` marks a frame that is perceived for the second time; ``frame_from_sensor`` is as in
+    `Frame`.
     """
 
     log_time_ns: int
     fixed_from_sensor: Pose | None
     up_given: F4 | None = None
     again: bool = False
+    frame_from_sensor: Pose | None = None
 
 
 class PerceptionTables:
@@ -154,14 +156,17 @@ def _frame_columns(rows: Sequence[tuple[Perception, FrameRow]]) -> dict[str, Any
         "up_given": [row.up_given for _, row in rows],
         "revised": [row.again and bool(p.scene.planes or p.detections) for p, row in rows],
         "reused_from": [p.reused_from for p, _ in rows],
-        "fixed_translation": [
-            row.fixed_from_sensor and row.fixed_from_sensor.translation for _, row in rows
-        ],
-        "fixed_rotation": [
-            row.fixed_from_sensor and row.fixed_from_sensor.rotation.ravel() for _, row in rows
-        ],
+        **_pose_columns("fixed", [row.fixed_from_sensor for _, row in rows]),
+        **_pose_columns("frame", [row.frame_from_sensor for _, row in rows]),
         "stages": [list(p.seconds) for p, _ in rows],
         "seconds": [list(p.seconds.values()) for p, _ in rows],
+    }
+
+
+def _pose_columns(name: str, poses: Sequence[Pose | None]) -> dict[str, Any]:
+    return {
+        f"{name}_translation": [pose and pose.translation for pose in poses],
+        f"{name}_rotation": [pose and pose.rotation.ravel() for pose in poses],
     }
 
 

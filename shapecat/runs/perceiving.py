@@ -92,7 +92,7 @@ def perceive_all(work: Work) -> None:
             orientation = upright.corrected(frame.topic, orientation)
             pose = orientation.fixed_from_sensor
             up = upright.accept(frame.topic, orientation)
-            row = FrameRow(frame.log_time_ns, pose, up)
+            row = FrameRow(frame.log_time_ns, pose, up, frame_from_sensor=frame.frame_from_sensor)
             return row, View(frame, up, recent.before(frame, pose), pose, colour)
 
         source = (
@@ -165,7 +165,10 @@ def _views_again(
         earlier = recent.before(frame, pose)
         revision = chosen.get((frame.topic, frame.index))
         if revision is not None:
-            row = FrameRow(frame.log_time_ns, pose, revision.up_given, again=True)
+            own = frame.frame_from_sensor
+            row = FrameRow(
+                frame.log_time_ns, pose, revision.up_given, again=True, frame_from_sensor=own
+            )
             yield row, View(frame, revision.up, earlier, pose, colour)
 
 

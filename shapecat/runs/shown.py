@@ -4,7 +4,7 @@ from collections.abc import Container, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from itertools import accumulate
 from pathlib import Path
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 import pyarrow as pa
@@ -13,7 +13,12 @@ import pyarrow.parquet as pq
 
 from shapecat.arrays import F4, F8, I4
 from shapecat.errors import OutputError
-from shapecat.geometry import box_around
+from shapecat.geometry import (
+    box_around,
+    quaternion_from_rotation,
+    rotation_from_quaternion,
+    transform,
+)
 from shapecat.runs.label_meaning import TrackLabel
 from shapecat.runs.table_schemas import BOX_WIDTH, FULL_BOX
 from shapecat.runs.tables import (
@@ -29,7 +34,7 @@ from shapecat.runs.tables import (
     rows_of,
     topic_codes,
 )
-from shapecat.types import Box, ShownBox, ShownFrame
+from shapecat.types import Box, Pose, ShownBox, ShownFrame
 
 __all__ = ["ShownTracks", "misfit", "read_shown_frames"]
 
@@ -110,24 +115,28 @@ def read_shown_frames(
 
     This omits points, surfaces and posteriors, and is several times as fast as
     `shapecat.runs.labels.read_labelled_frames`. Boxes enclose whole objects where their size is
-    known; with ``visible``, only their visible parts.
+    known; with ``visible``, only their visible parts. They are in the frame ``frame_id``.
 
     Raises
     ------
     OutputError : a table is unreadable, or tracks and detections do not fit together.
     """
     shown = ShownTracks.read(folder, labels)
-    wanted = ("topic", "frame", "stamp_ns", "log_time_ns", "frame_id", "up")
+    plain_columns = ("topic", "frame", "stamp_ns", "log_time_ns", "frame_id")
+    wanted = (*plain_columns, "up", "frame_translation", "frame_rotation")
     found = ("topic", "frame", "detection", "center", "size", "orientation")
     merged = len({label.track for label in labels.values()}) < len(labels)
     tables = {"frames": wanted, "detections": found}
     for frames, detections in read_together(folder, tables, at_once=_AT_ONCE):
-        plain = [frames[name].to_pylist() for name in wanted[:-1]]
+        plain = [frames[name].to_pylist() for name in plain_columns]
         keys = list(zip(*plain[:2], strict=True))
         boxes = _boxes(folder, keys, shown, detections, visible=visible)
         if merged:
             ups = numbers(frames["up"]).reshape(-1, 3)
             boxes = map(_joined, boxes, ups)
+        if frames["frame_rotation"].null_count < len(frames):
+            poses = (frames[name].to_pylist() for name in wanted[-2:])
+            boxes = map(_in_named_frame, boxes, *poses)
         ended = (shown.ended.get(key, ()) for key in keys)
         yield from map(ShownFrame, *plain, boxes, ended)
 
@@ -209,6 +218,23 @@ def _join(parts: Sequence[ShownBox], up: F4) -> ShownBox:
         center=tuple(box.center.tolist()),
         size=tuple(box.size.tolist()),
         orientation=tuple(box.orientation.tolist()),
+    )
+
+
+def _in_named_frame(
+    boxes: Sequence[ShownBox], translation: Sequence[float] | None, rotation: Any
+) -> tuple[ShownBox, ...]:
+    """Transform boxes by ``frame_from_sensor``, whose parts are None if it is not needed."""
+    if translation is None:
+        return tuple(boxes)
+    pose = Pose(np.reshape(rotation, (3, 3)), np.array(translation))
+    centers = [transform(pose, box.center).tolist() for box in boxes]
+    turns = [pose.rotation @ rotation_from_quaternion(box.orientation) for box in boxes]
+    return tuple(
+        box._replace(
+            center=tuple(center), orientation=tuple(quaternion_from_rotation(turn).tolist())
+        )
+        for box, center, turn in zip(boxes, centers, turns, strict=True)
     )
 
 

@@ -27,6 +27,7 @@ SCHEMA_VERSION = "1"
 _VEC3 = pa.list_(pa.float32(), 3)
 _POSITION = pa.list_(pa.float64(), 3)
 """A position in the fixed frame, whose origin may be thousands of kilometres away."""
+_ROTATION = pa.list_(pa.float64(), 9)
 _QUATERNION = pa.list_(pa.float32(), 4)
 _FLOATS = pa.list_(pa.float32())
 _FULL = (
@@ -54,7 +55,9 @@ FRAMES = pa.schema(
         ("revised", pa.bool_()),
         ("reused_from", pa.int32()),
         ("fixed_translation", _POSITION),
-        ("fixed_rotation", pa.list_(pa.float64(), 9)),
+        ("fixed_rotation", _ROTATION),
+        ("frame_translation", _POSITION),
+        ("frame_rotation", _ROTATION),
         ("stages", pa.list_(pa.string())),
         ("seconds", _FLOATS),
     ]
@@ -63,7 +66,8 @@ FRAMES = pa.schema(
 ``up_given`` is from transforms, an IMU or an option, null without these. ``revised`` is true if
 the result is from a second look, with the up direction of the whole recording. ``reused_from`` is
 the earlier frame whose scene this one repeats, null if none. ``fixed_*`` is ``fixed_from_sensor``
-(rotation row by row), null if unknown. ``seconds`` has one entry per entry of ``stages``."""
+(rotation row by row), null if unknown; ``frame_*`` is ``frame_from_sensor``, null if ``frame_id``
+is the frame of the sensor. ``seconds`` has one entry per entry of ``stages``."""
 
 DETECTIONS = pa.schema(
     [
@@ -94,7 +98,7 @@ DETECTIONS = pa.schema(
         ("seconds", pa.float32()),
     ]
 )
-"""One row per object per frame; lengths in metres, ``center`` and ``neurons`` in ``frame_id``.
+"""One row per object per frame; lengths in metres, ``center`` and ``neurons`` in the sensor frame.
 ``*_full`` is the box of the whole object, null if only the visible part is known. The columns
 ``posterior`` to ``edges`` are copied from the frame ``reused_from``, unless that is null."""
 

@@ -40,9 +40,10 @@ class Frame(Record):
     index : number of the frame in its stream, from 0 at the selected start, including skipped ones.
     stamp_ns : time of the measurement (``header.stamp``).
     log_time_ns : time of the recording.
-    frame_id : name of the sensor frame.
+    frame_id : name of the sensor frame, or of the frame that ``frame_from_sensor`` relates it to.
     depth : (h, w) metres along the optical axis; 0 where depth is missing, never NaN.
     points : (n, 3) metres, sensor frame; rows of NaN where depth is missing.
+    frame_from_sensor : pose of the sensor in the frame ``frame_id``; None if that is its own.
     """
 
     topic: str
@@ -53,6 +54,7 @@ class Frame(Record):
     depth: F4 | None = array("h w", "f4", default=None)
     camera: Camera | None = None
     points: F4 | None = array("n 3", "f4", default=None)
+    frame_from_sensor: Pose | None = None
 
     def __post_init__(self) -> None:
         """Check that the frame has either depth or points, and a camera of the same size."""

@@ -86,6 +86,7 @@ KNOWN_BY: dict[str, Sequence[str]] = {
     "shapecat.recordings.protobuf": ("test_recordings_foxglove",),
     "shapecat.recordings.transform": ("test_recordings_worked", "test_transforms",
                                        "test_cameras", "test_look_ahead"),
+    "shapecat.recordings.viewpoint": ("test_viewpoint",),
     "shapecat.runs": ("test_tables_rotated", "test_tables", "test_batch_planning", "test_labels"),
     "shapecat.runs.corrections": ("test_outputs_worked", "test_labels", "test_label_transfer"),
     "shapecat.runs.finished": ("test_tables_truth", "test_exports"),

@@ -1,0 +1,98 @@
+"""The viewpoint of an organized cloud that was transformed, as into a robot's base frame."""
+
+import numpy as np
+
+from shapecat.arrays import F4, F8
+from shapecat.geometry import NEAREST_M
+from shapecat.recordings.pinhole import PinholeFit, fit_pinhole, sample_pixels, still_fits
+from shapecat.types import Pose
+
+__all__ = ["find_viewpoint", "seen_from"]
+
+_AWAY_M = 0.05
+"""A cloud that was taken from nearer to its origin is in the frame of its sensor."""
+_LONGEST = 10
+"""Focal length in image widths; that of a height map, which no point sees, is greater."""
+_CLEAR = 1e-4
+"""The squared residual is at most this share of the next singular value, squared. For the points
+of a single plane, any of many cameras fits, and both are equal."""
+_ROUNDS = 3
+
+
+def find_viewpoint(points: F4, known: PinholeFit | None) -> tuple[PinholeFit, Pose] | None:
+    """Find the pinhole camera that took an organized cloud, and its pose in the cloud's frame.
+
+    The method is the direct linear transform (Hartley and Zisserman 2004, 7.1) with normalized
+    coordinates, repeated without outliers.
+
+    Parameters
+    ----------
+    points : (h, w, 3) metres, not finite or zero where depth is missing.
+    known : the camera of an earlier cloud, which is kept if it fits.
+
+    Returns
+    -------
+    The camera and ``frame_from_camera``; None if no camera fits, if the points do not determine
+    one, as those of a single plane, or if the cloud was taken from its origin.
+    """
+    sample = sample_pixels(points, lambda flat: np.asarray(flat.any(axis=1)))
+    if sample is None:
+        return None
+    width = points.shape[1]
+    u, v, chosen = sample
+    pixels = np.column_stack([u / width - 0.5, v / width - 0.5])
+    middle, scale = chosen.mean(axis=0), float(chosen.std()) or 1.0
+    places = np.column_stack([(chosen - middle) / scale, np.ones(len(chosen))])
+    keep = np.ones(len(places), bool)
+    for _ in range(_ROUNDS):
+        matrix, unclear = _projection(places[keep], pixels[keep])
+        with np.errstate(divide="ignore", invalid="ignore"):
+            seen = places @ matrix.T
+            error = np.linalg.norm(seen[:, :2] / seen[:, 2:] - pixels, axis=1)
+        error[np.isnan(error)] = np.inf
+        keep = error <= max(3 * float(np.median(error)), 1e-3 / width)
+    linear = matrix[:, :3] * np.sign(np.linalg.det(matrix[:, :3]))
+    if unclear > _CLEAR or not linear.any():
+        return None
+    center = middle - scale * np.linalg.solve(matrix[:, :3], matrix[:, 3])
+    if np.linalg.norm(center) < _AWAY_M:
+        return None
+    pose = Pose(_rotation(linear).T, center)
+    image = seen_from(pose, points)
+    fit = known if known is not None and still_fits(known, image) else fit_pinhole(image)
+    return None if fit is None or fit.camera.fx > _LONGEST * width else (fit, pose)
+
+
+def seen_from(pose: Pose, points: F4) -> F4:
+    """Transform a cloud (h, w, 3) into the frame of its camera; NaN where depth is missing.
+
+    ``pose`` is ``frame_from_camera``. Invalid points may have become the camera's centre.
+    """
+    with np.errstate(over="ignore", invalid="ignore"):
+        image = (points - pose.translation.astype(np.float32)) @ pose.rotation.astype(np.float32)
+        given = np.einsum("ijk,ijk->ij", points, points) > 0
+    depth = image[..., 2]
+    depth[~(given & (depth > NEAREST_M))] = np.nan
+    return np.asarray(image)
+
+
+def _projection(places: F8, pixels: F8) -> tuple[F8, float]:
+    """Return the matrix (3, 4) that projects places (n, 4) to pixels (n, 2), and how unclear it is.
+
+    That is the squared ratio of the two smallest singular values of the equations.
+    """
+    zero = np.zeros_like(places)
+    rows = np.vstack(
+        [
+            np.hstack([places, zero, -pixels[:, :1] * places]),
+            np.hstack([zero, places, -pixels[:, 1:] * places]),
+        ]
+    )
+    values, vectors = np.linalg.eigh(rows.T @ rows)
+    return vectors[:, 0].reshape(3, 4), float(max(values[0], 0) / max(values[1], 1e-300))
+
+
+def _rotation(linear: F8) -> F8:
+    """Return the rotation of a matrix (3, 3) that is an upper triangular one times a rotation."""
+    rows, triangle = np.linalg.qr(linear[::-1].T)
+    return np.asarray(rows.T[::-1] * np.sign(np.diag(triangle)[::-1, None]))
