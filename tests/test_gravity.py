@@ -16,6 +16,7 @@ from shapecat.geometry import IDENTITY, transform
 from shapecat.pipeline import process
 from shapecat.recordings import open_recording
 from shapecat.recordings.gravity import Orientation, Upright
+from shapecat.recordings.pointcloud2 import cloud_points
 from shapecat.recordings.streams import Stream
 from shapecat.recordings.transform_window import TransformWindow
 from shapecat.recordings.transforms import TransformBuffer
@@ -25,6 +26,7 @@ from shapecat.runs.jobs import Job
 from shapecat.runs.table_schemas import DETECTIONS, FRAMES, PLANES
 from shapecat.runs.up_report import report_up
 from shapecat.simulation.messages import MessageFactory
+from shapecat.simulation.recorder import LINK_FROM_OPTICAL
 from shapecat.types import Frame, Pose
 from tests.messages import CAMERA, EPOCH, SECOND, header, make, write
 from tests.scenes import OPTICAL, stream, views
@@ -221,6 +223,31 @@ def test_transforms_of_optical_data_in_another_frame_are_corrected(
     assert run["up"]["source"] == "transforms, z of map"
     (warning,) = run["warnings"]
     assert "optical frame" in warning
+
+
+@pytest.mark.parametrize(
+    ("turn", "how"),
+    [(LINK_FROM_OPTICAL.rotation, "x forward"), (np.diag([1.0, -1.0, -1.0]), "OpenGL")],
+)
+def test_transforms_of_clouds_in_other_axes_are_corrected(
+    turn: Any, how: str, tmp_path: Path
+) -> None:
+    """Gazebo's clouds have x forward, also in an optical frame: positions in the map were wrong."""
+    items = list(stream(MAKE, 4, clouds=True))
+    for k, (topic, time, message) in enumerate(items):
+        if topic.endswith("points"):
+            points = cloud_points(message) @ turn.T
+            items[k] = (topic, time, MAKE.cloud(points, time, OPTICAL))
+    path = write(tmp_path / "a.mcap", items)
+    process(Job(path, tmp_path / "out", mcap=False, rrd=False))
+    run, table = read_run(tmp_path / "out"), pq.read_table(tmp_path / "out" / "frames.parquet")
+
+    (warning,) = run["warnings"]
+    assert how in warning
+    assert run["up"]["source"] == "transforms, z of map"
+    for view, rotation in zip(views(), table["fixed_rotation"].to_pylist(), strict=True):
+        right = view.pose.rotation @ turn.T
+        np.testing.assert_allclose(np.reshape(rotation, (3, 3)), right, atol=1e-6)
 
 
 def test_table_above_the_origin_of_a_cloud_does_not_contradict_up(tmp_path: Path) -> None:

@@ -6,7 +6,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from shapecat.arrays import F4
+from shapecat.arrays import F4, F8
 from shapecat.errors import ConfigError
 from shapecat.geometry import compose, unit_direction
 from shapecat.recordings.imu import Accelerometers
@@ -16,12 +16,25 @@ from shapecat.recordings.transform_window import TransformWindow
 from shapecat.recordings.transforms import TransformError, fixed_frame
 from shapecat.types import Frame, Pose
 
-__all__ = ["Orientation", "Upright", "in_optical", "is_level"]
+__all__ = ["MISNAMED", "Orientation", "Upright", "is_level", "turned"]
 
 _LEVEL_FRAMES = ("map", "odom", "world", "earth", "base_footprint", "base_link")
 """Frames whose z axis is up by convention (REP 105, REP 103), also after the name of a robot."""
 _FROM_OPTICAL = np.array([[0.0, 0, 1], [-1, 0, 0], [0, -1, 0]])
 """Rotation from an optical frame (x right, z forward) to that of its camera (x forward, z up)."""
+MISNAMED = {
+    "its data are in an optical frame (z forward), although the frame they name has x forward": (
+        _FROM_OPTICAL
+    ),
+    "its points have x forward, although the frame they name is an optical one (z forward)": (
+        _FROM_OPTICAL.T
+    ),
+    "its data and the frame they name differ as the conventions of ROS and OpenGL (z backward)": (
+        np.diag([1.0, -1.0, -1.0])
+    ),
+}
+"""Ways in which simulators name a frame that is not that of the data, the usual one first: the
+rotation from the frame of the data to the frame they name."""
 _SOURCES = {"auto": ("tf", "imu"), "tf": ("tf",), "imu": ("imu",)}
 
 
@@ -55,7 +68,7 @@ class Upright:
     dropped : for each topic whose given up direction is ignored, the source of that direction.
     failed, first_failure : the number of failed look-ups, and the error of the first.
     given : the number of frames whose up direction is from each source.
-    optical : topics with data in an optical frame, although their frame is not one.
+    misnamed : the rotation, of `MISNAMED`, of each topic whose data are not in the frame they name.
     sensors : the frame ids of all sensors, as far as they are known.
     """
 
@@ -69,7 +82,7 @@ class Upright:
     failed: int = 0
     first_failure: str = ""
     given: dict[str, int] = field(default_factory=dict)
-    optical: set[str] = field(default_factory=set)
+    misnamed: dict[str, F8] = field(default_factory=dict)
     sensors: tuple[str, ...] = ()
 
     @classmethod
@@ -141,19 +154,17 @@ class Upright:
     def corrected(self, topic: str, orientation: Orientation) -> Orientation:
         """Return an orientation of the data on a topic, given that of the frame they name."""
         source, up, pose = orientation
-        if topic not in self.optical:
+        turn = self.misnamed.get(topic)
+        if turn is None:
             return orientation
         if pose is not None:
-            pose = Pose(pose.rotation @ _FROM_OPTICAL, pose.translation)
-        return Orientation(source, None if up is None else in_optical(up), pose)
+            pose = Pose(pose.rotation @ turn, pose.translation)
+        return Orientation(source, None if up is None else turned(up, turn), pose)
 
-    def assume_optical(self, topic: str) -> None:
-        """Take the data on a topic for those of an optical frame from now on, with a warning."""
-        self.optical.add(topic)
-        self.warnings.append(
-            f"{topic}: its data are in an optical frame (z forward), although the frame they name "
-            "has x forward; its transforms are corrected"
-        )
+    def assume_misnamed(self, topic: str, how: str) -> None:
+        """Take the data on a topic for misnamed in one of the ways of `MISNAMED` from now on."""
+        self.misnamed[topic] = MISNAMED[how]
+        self.warnings.append(f"{topic}: {how}; its transforms are corrected")
 
     def accept(self, topic: str, orientation: Orientation) -> F4 | None:
         """Count where an up direction comes from, and return it; None if the topic's is dropped."""
@@ -237,9 +248,9 @@ def _level_frames(frames: Sequence[str], sensor: str) -> list[str]:
     return sorted(filter(is_level, frames), key=order)
 
 
-def in_optical(up: F4) -> F4:
-    """Return a direction (3,) of a camera's frame, x forward, in its optical frame, z forward."""
-    return np.asarray(up @ _FROM_OPTICAL, np.float32)
+def turned(up: F4, named_from_data: F8) -> F4:
+    """Return a direction (3,) of the frame that data name in the frame of the data."""
+    return np.asarray(up @ named_from_data, np.float32)
 
 
 def is_level(frame_id: str) -> bool:

@@ -22,7 +22,7 @@ from shapecat.executors.order import Processes
 from shapecat.learning import Categorizer
 from shapecat.perception import Perceiver, View, find_up
 from shapecat.recordings import Recording, choose_streams
-from shapecat.recordings.gravity import Orientation, Upright, in_optical, is_level
+from shapecat.recordings.gravity import MISNAMED, Orientation, Upright, is_level, turned
 from shapecat.rehearsal import rehearse
 from shapecat.runs.jobs import Job
 from shapecat.runs.perceived import FrameRow, PerceptionTables
@@ -187,7 +187,7 @@ class _UpTrial:
     def __init__(self, upright: Upright, settings: Settings) -> None:
         self._upright, self._settings = upright, settings
         self._off_deg: dict[str, list[float]] = {}
-        self._optical_off_deg: dict[str, list[float]] = {}
+        self._misnamed_off_deg: dict[tuple[str, str], list[float]] = {}
         self._sources: dict[str, str] = {}
         self._looks: Counter[str] = Counter()
         self._decided: set[str] = set()
@@ -225,8 +225,9 @@ class _UpTrial:
             found = find_up(frame, self._settings)
             if found is not None:
                 angle = _angle_deg(given, found)
-                optical = self._optical_off_deg.setdefault(frame.topic, [])
-                optical.append(_angle_deg(in_optical(given), found))
+                for how, turn in MISNAMED.items():
+                    others = self._misnamed_off_deg.setdefault((frame.topic, how), [])
+                    others.append(_angle_deg(turned(given, turn), found))
                 if elsewhere:  # from the base of a robot, a table seems to be seen from below
                     angle = min(angle, 180 - angle)
                 off.append(angle)
@@ -246,9 +247,10 @@ class _UpTrial:
         enough = len(off) >= min(_DOUBTS, self._looks[topic])
         if not enough or min(off) <= _CONFIRMS_DEG:
             return
-        source, optical_off = self._sources[topic], self._optical_off_deg[topic]
-        if source.startswith("transforms") and max(optical_off) <= _CONFIRMS_DEG:
-            self._upright.assume_optical(topic)
+        source = self._sources[topic]
+        fits = [n for n in MISNAMED if max(self._misnamed_off_deg[topic, n]) <= _CONFIRMS_DEG]
+        if source.startswith("transforms") and fits:
+            self._upright.assume_misnamed(topic, fits[0])
         else:
             self._upright.contradict(topic, source, off)
 
