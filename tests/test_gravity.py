@@ -352,6 +352,29 @@ def test_failed_transform_look_ups_are_counted(tmp_path: Path) -> None:
     assert warning.startswith("failed transform look-ups: 2, the first: ")
 
 
+@pytest.mark.parametrize(
+    ("begins", "loss"),
+    [
+        (1, "unknown in 1 of 4 frames, whose objects are not tracked"),
+        (3, "unknown in 3 of 4 frames: its tracks are in the frame of the sensor"),
+    ],
+)
+def test_frames_without_pose_are_reported_with_what_they_cost(
+    begins: int, loss: str, tmp_path: Path
+) -> None:
+    """Transforms that begin late cost detections silently, or put tracks in another frame."""
+    rows = [dict.fromkeys(FRAMES.names) | {"topic": "/d", "frame": k} for k in range(4)]
+    for row in rows[begins:]:
+        row["fixed_translation"] = [0.0, 0.0, 1.0]
+    pq.write_table(pa.Table.from_pylist(rows, FRAMES), tmp_path / "frames.parquet")
+    upright = Upright(TransformWindow(TransformBuffer()), "map", None, ("tf",))
+    upright.failed = begins
+
+    report_up(upright, tmp_path)
+
+    assert upright.warnings[1:] == [f"/d: its pose in map is {loss}"]
+
+
 def test_frame_with_objects_does_not_count_as_without_plane(tmp_path: Path) -> None:
     """An assumed plane is in no table; the run would contradict its own warning."""
     for name, schema, frames in (

@@ -3,6 +3,7 @@
 from collections import Counter
 from collections.abc import Collection, Sequence
 from functools import cached_property
+from itertools import compress
 from pathlib import Path
 
 import numpy as np
@@ -19,7 +20,7 @@ from shapecat.runs.tables import (
     topic_codes,
 )
 
-__all__ = ["PlacedFrames", "streams_with_poses"]
+__all__ = ["PlacedFrames", "count_poses", "streams_with_poses"]
 
 
 class PlacedFrames:
@@ -86,9 +87,16 @@ def streams_with_poses(folder: Path) -> set[str]:
 
     Their detections in the other frames are not tracked.
     """
-    balance: Counter[str] = Counter()
+    return {topic for topic, (known, count) in count_poses(folder).items() if 2 * known > count}
+
+
+def count_poses(folder: Path) -> dict[str, tuple[int, int]]:
+    """Return, for each topic, the numbers of frames with a known sensor pose, and of all frames."""
+    known: Counter[str] = Counter()
+    count: Counter[str] = Counter()
     for group in read_row_groups(folder / "frames.parquet", ["topic", "fixed_translation"]):
-        known = pa.compute.is_valid(group["fixed_translation"]).to_pylist()
-        for topic, has_pose in zip(group["topic"].to_pylist(), known, strict=True):
-            balance[topic] += 1 if has_pose else -1
-    return {topic for topic, count in balance.items() if count > 0}
+        has_pose = pa.compute.is_valid(group["fixed_translation"]).to_pylist()
+        topics = group["topic"].to_pylist()
+        known.update(compress(topics, has_pose))
+        count.update(topics)
+    return {topic: (known[topic], count[topic]) for topic in count}

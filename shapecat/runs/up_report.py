@@ -1,5 +1,6 @@
 """Where the up direction of a run came from, and how well the planes confirm it."""
 
+from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
@@ -16,7 +17,7 @@ _DISAGREE_DEG = 10
 def report_up(upright: Upright, folder: Path) -> dict[str, Any]:
     """Return the source of the up direction and its agreement with the planes, for run.json.
 
-    Failed look-ups and large differences are added to the warnings of ``upright``.
+    Failed look-ups, what they cost, and large differences are added to the warnings of ``upright``.
 
     Parameters
     ----------
@@ -26,6 +27,7 @@ def report_up(upright: Upright, folder: Path) -> dict[str, Any]:
         upright.warnings.append(
             f"failed transform look-ups: {upright.failed}, the first: {upright.first_failure}"
         )
+        upright.warnings += _unplaced(folder, upright.fixed_frame)
     given = upright.given
     report: dict[str, Any] = {"source": max(given, key=lambda name: given[name], default="planes")}
     if upright.dropped:
@@ -39,6 +41,21 @@ def report_up(upright: Upright, folder: Path) -> dict[str, Any]:
         if typical is not None and typical > _DISAGREE_DEG:
             upright.warnings.append(f"up and the detected planes differ by {typical} degrees")
     return report
+
+
+def _unplaced(folder: Path, fixed_frame: str | None) -> Iterator[str]:
+    """Yield a warning for each topic of which frames have no pose in the fixed frame."""
+    if fixed_frame is None:  # all tracks are in the sensor frame
+        return
+    from shapecat.runs.placed_frames import count_poses  # noqa: PLC0415  loads pyarrow.compute
+
+    for topic, (known, count) in count_poses(folder).items():
+        loss = ", whose objects are not tracked"
+        if 2 * known <= count:
+            loss = ": its tracks are in the frame of the sensor"
+        if known < count:
+            frames = f"{count - known} of {count} frames"
+            yield f"{topic}: its pose in {fixed_frame} is unknown in {frames}{loss}"
 
 
 def _angles_to_planes(folder: Path) -> tuple[list[float], int]:
