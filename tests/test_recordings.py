@@ -368,7 +368,7 @@ def test_ros2_folder_is_read(
     tmp_path: Path, plugin: StoragePlugin, mode: CompressionMode | None, metadata: Any
 ) -> None:
     if plugin is StoragePlugin.MCAP and mode is CompressionMode.MESSAGE:
-        pytest.skip("rosbag2 does not write this")
+        pytest.skip("only rosbag2 itself writes this, see the next test")
     path = write_folder(tmp_path / "bag", plugin, mode)
     if not metadata:
         (path / "metadata.yaml").unlink()
@@ -379,6 +379,26 @@ def test_ros2_folder_is_read(
         assert read == [f"message {k}" for k in range(5)]
         assert recording.topics == (Topic("/a", STRING, "cdr", 5),)
         assert bool(recording.warnings) is not metadata
+
+
+def test_messages_compressed_one_by_one_in_mcap_are_read(tmp_path: Path) -> None:
+    """``ros2 bag record -s mcap --compression-mode message`` writes what few tools can read."""
+    pack = zstandard.ZstdCompressor().compress
+    with mcap_writer(tmp_path / "a.mcap") as writer:
+        schema = writer.register_schema(STRING, "ros2msg", b"string data")
+        a = writer.register_channel("/a", "cdr", schema)
+        for k in range(3):
+            writer.add_message(a, k, pack(text(f"message {k}")), k)
+        writer.add_message(a, 3, pack(text("damaged"))[:-3], 3)
+        raw = writer.register_channel("/raw", "x-video", 0)
+        writer.add_message(raw, 4, pack(b"frame"), 4)
+
+    with open_recording(tmp_path / "a.mcap") as recording:
+        *messages, other = recording.messages()
+        read = [recording.decode(message).data for message in messages]
+        assert read == ["message 0", "message 1", "message 2"]
+        assert bytes(other.data) == pack(b"frame")
+        assert recording.warnings == ["/a: skipped a damaged compressed message"]
 
 
 def test_file_not_listed_in_metadata_is_not_read(tmp_path: Path) -> None:

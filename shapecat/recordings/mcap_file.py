@@ -34,6 +34,7 @@ from shapecat.recordings.mcap_records import (
     walk,
 )
 from shapecat.recordings.mcap_summary import Summary, read_summary
+from shapecat.recordings.message_compression import plain_data
 from shapecat.recordings.messages import (
     Channel,
     Message,
@@ -109,11 +110,14 @@ class McapRecording(Recording):
             if not selection.has_time(message.log_time):
                 continue
             channel = self._channels[message.channel_id]
-            data: bytes | memoryview = message.data
+            data: bytes | memoryview | None
             if selection.needed and not selection.needed(channel.topic, message.log_time):
                 data = b""
-            elif len(data) <= _SMALL:
-                data = bytes(data)
+            else:
+                data = plain_data(self, channel, message.data)
+                if data is None:
+                    continue
+                data = bytes(data) if len(data) <= _SMALL else data
             yield Message(channel, message.log_time, message.publish_time, message.sequence, data)
 
     def top_level(self) -> Iterator[Record]:

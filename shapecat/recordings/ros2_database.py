@@ -7,13 +7,13 @@ from pathlib import Path
 from typing import Any, ClassVar
 
 import apsw
-import zstandard
 from rosbags.interfaces import MessageDefinitionFormat
 from rosbags.rosbag2 import Reader, ReaderError
 from rosbags.rosbag2.metadata import dump_qos_v8
 
 from shapecat.errors import RecordingError
 from shapecat.recordings.decoding import LIBRARY_ERRORS
+from shapecat.recordings.message_compression import plain_data
 from shapecat.recordings.messages import (
     Channel,
     Message,
@@ -27,10 +27,6 @@ from shapecat.system.files import scratch_folder, write_ahead_log
 
 __all__ = ["DatabaseRecording"]
 
-_ZSTD = b"\x28\xb5\x2f\xfd"
-"""First bytes of a compressed message; a CDR message begins with a zero byte."""
-_LARGEST = 1 << 30
-"""Compressed messages that claim a larger decompressed size, in bytes, are skipped."""
 _LAST_NS = 2**63 - 1
 """The largest time that SQLite can hold."""
 _SCRATCH = "shapecat-parts-"
@@ -126,22 +122,9 @@ class DatabaseRecording(Recording):
             if not isinstance(data, bytes | memoryview):
                 self.warn(f"{channel.topic}: skipped a message without bytes")
                 continue
-            plain = self._plain(channel, bytes(data))
+            plain = plain_data(self, channel, bytes(data))
             if plain is not None:
                 yield Message(channel, time, time, 0, plain)
-
-    def _plain(self, channel: Channel, data: bytes) -> bytes | None:
-        """Return a message's data, decompressed if necessary; None if that fails."""
-        if not data.startswith(_ZSTD):
-            return data
-        try:
-            if zstandard.frame_content_size(data) > _LARGEST:
-                self.warn(f"{channel.topic}: skipped a message that claims more than 1 GiB")
-                return None
-            return zstandard.ZstdDecompressor().decompress(data, max_output_size=_LARGEST)
-        except (zstandard.ZstdError, MemoryError):
-            self.warn(f"{channel.topic}: skipped a damaged compressed message")
-            return None
 
 
 def _channel(connection: Any) -> Channel:

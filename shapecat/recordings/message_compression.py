@@ -1,0 +1,29 @@
+"""Messages that rosbag2 compressed one by one (``--compression-mode message``)."""
+
+import zstandard
+
+from shapecat.recordings.messages import Channel
+from shapecat.recordings.recording import Recording
+
+__all__ = ["plain_data"]
+
+_ZSTD = b"\x28\xb5\x2f\xfd"
+"""First bytes of a compressed message; a CDR message begins with a zero byte."""
+_LARGEST = 1 << 30
+"""Compressed messages that claim a larger decompressed size, in bytes, are skipped."""
+
+
+def plain_data(
+    recording: Recording, channel: Channel, data: bytes | memoryview
+) -> bytes | memoryview | None:
+    """Return a message's data, decompressed if necessary; None, with a warning, if that fails."""
+    if data[: len(_ZSTD)] != _ZSTD or channel.encoding != "cdr":
+        return data
+    try:
+        if zstandard.frame_content_size(data) > _LARGEST:
+            recording.warn(f"{channel.topic}: skipped a message that claims more than 1 GiB")
+            return None
+        return zstandard.ZstdDecompressor().decompress(data, max_output_size=_LARGEST)
+    except (zstandard.ZstdError, MemoryError):
+        recording.warn(f"{channel.topic}: skipped a damaged compressed message")
+        return None
