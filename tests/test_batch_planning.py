@@ -99,6 +99,21 @@ def test_unreadable_folder_does_not_end_search(
     assert caplog.messages == [f"{tmp_path / 'lost+found'}: skipped: Permission denied"]
 
 
+def test_compressed_recordings_in_a_folder_are_named(
+    tmp_path: Path, caplog: pytest.LogCaptureFixture
+) -> None:
+    """Packed to save space, they would be missing from the results without a word."""
+    for name in ("a.mcap", "b.mcap.zstd", "c.bag.gz", "notes.txt.gz"):
+        (tmp_path / name).write_bytes(b"x")
+
+    found = find_recordings([str(tmp_path)])
+
+    assert [kept.stem for kept in found.kept] == ["a"]
+    assert [text.partition(": ")[0] for text in caplog.messages] == [
+        str(tmp_path / name) for name in ("b.mcap.zstd", "c.bag.gz")
+    ]
+
+
 def test_files_of_a_bag_are_not_counted_as_skipped(tmp_path: Path) -> None:
     """A shell pattern may list them beside their bag."""
     bag, note = tmp_path / "bag", tmp_path / "note.txt"

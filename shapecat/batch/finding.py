@@ -22,6 +22,7 @@ _log = logging.getLogger(__name__)
 SUFFIXES = {".mcap", ".bag", ".db3"}
 _GAP_NS = 10**10
 """The longest time between the parts of a bag; takes are farther apart, or overlap."""
+_PACKED = {".zst", ".zstd", ".gz", ".bz2", ".xz", ".lz4", ".zip"}
 _MAGIC = (b"\x89MCAP", b"#ROSBAG", b"SQLite format 3")
 
 
@@ -225,6 +226,8 @@ def _search(folder: Path, searched: set[Path]) -> Iterator[Path]:
             yield from _search(path, searched)
         elif is_folder or _named_like_one(path.name):
             yield path
+        elif path.suffix.lower() in _PACKED and _named_like_one(path.stem):
+            _log.error("%s: skipped: a compressed file, unpack it first", path)
 
 
 def _whole(path: Path) -> Path:

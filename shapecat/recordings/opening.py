@@ -54,6 +54,8 @@ _READERS: dict[str, Callable[[Path], Recording]] = {
 }
 """Readers by the first bytes of a file; ``folder`` for folders."""
 
+_PACKED = ("(\xb5/\xfd", "\x1f\x8b", "BZh", "\xfd7zXZ", "\x04\x22\x4d\x18", "PK\x03\x04")
+"""First bytes of files compressed with zstd, gzip, bzip2, xz and lz4, and of zip archives."""
 _EXPECTED = "expected an .mcap, .bag or .db3 file, or a ROS 2 bag folder"
 
 
@@ -68,6 +70,9 @@ def _sniff(path: Path) -> str:
     for magic in _READERS:
         if begin.startswith(magic):
             return magic
+    if begin.startswith(_PACKED):
+        msg = f"a compressed file: unpack it first; {_EXPECTED}"
+        raise RecordingError(msg)
     found = f"begins with {begin[:8]!r}" if begin else "is empty"
     msg = f"not a recording: {found}; {_EXPECTED}"
     raise RecordingError(msg)
