@@ -328,6 +328,24 @@ def test_fixed_frame_is_chosen_for_all_sensors(tmp_path: Path) -> None:
     assert chosen == ["map", "map", "mount"]
 
 
+@pytest.mark.parametrize("period", [1, 6])  # the longer recording is not read at once
+@pytest.mark.parametrize(("begins", "chosen"), [(4, "map"), (6, "odom")])
+def test_map_that_is_known_too_late_is_not_the_fixed_frame(
+    begins: int, chosen: str, period: int, tmp_path: Path
+) -> None:
+    """Until someone sets a pose, there is only odometry: no frame had a pose before."""
+    items = []
+    for k in range(11):
+        links = [("odom", "camera", IDENTITY)] + [("map", "odom", IDENTITY)] * (k >= begins)
+        stamp = EPOCH + k * period * SECOND
+        items.append(("/tf", stamp, MAKE.transforms(links, stamp)))
+    with open_recording(write(tmp_path / "a.mcap", items)) as recording:
+        upright = Upright.of(recording, up="auto", fixed_frame=None)
+        upright.orient(frame(EPOCH))
+
+    assert upright.fixed_frame == chosen
+
+
 def test_loop_of_other_frames_is_reported_and_ignored(tmp_path: Path) -> None:
     """Two drivers that name each other's frames must not cost the whole run its fixed frame."""
     links = ("map", "camera"), ("u", "v"), ("v", "u")

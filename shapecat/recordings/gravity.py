@@ -70,6 +70,7 @@ class Upright:
     given : the number of frames whose up direction is from each source.
     misnamed : the rotation, of `MISNAMED`, of each topic whose data are not in the frame they name.
     sensors : the frame ids of all sensors, as far as they are known.
+    middle_ns : log time of the middle of the recording, nanoseconds.
     """
 
     transforms: TransformWindow
@@ -84,6 +85,7 @@ class Upright:
     given: dict[str, int] = field(default_factory=dict)
     misnamed: dict[str, F8] = field(default_factory=dict)
     sensors: tuple[str, ...] = ()
+    middle_ns: int = 0
 
     @classmethod
     def of(
@@ -129,7 +131,17 @@ class Upright:
         loop = transforms.tree.find_loop()
         warnings = [f"transforms: {loop}"] if loop else []
         sensors = tuple(stream.frame_id for stream in streams)
-        return cls(transforms, wanted, vector, sources, found, warnings, sensors=sensors)
+        middle_ns = (recording.start_ns + recording.end_ns) // 2
+        return cls(
+            transforms,
+            wanted,
+            vector,
+            sources,
+            found,
+            warnings,
+            sensors=sensors,
+            middle_ns=middle_ns,
+        )
 
     def orient(self, frame: Frame) -> Orientation:
         """Look up the up direction and the pose of the sensor in a frame."""
@@ -144,9 +156,15 @@ class Upright:
         return self._lookup(self.fixed_frame, frame)
 
     def _choose_fixed_frame(self, first: Frame) -> str | None:
-        """Choose the fixed frame of all sensors, one named after a map or odometry if there is."""
+        """Choose the fixed frame of all sensors, one named after a map or odometry if there is.
+
+        The pose of the sensors should be known in it halfway through the recording, since most
+        frames must have a pose for their objects to be tracked there.
+        """
+        halfway_ns = first.stamp_ns + max(0, self.middle_ns - first.log_time_ns)
         found = [
-            fixed_frame(self.transforms.tree, name) for name in (first.frame_id, *self.sensors)
+            fixed_frame(self.transforms.tree, name, halfway_ns)
+            for name in (first.frame_id, *self.sensors)
         ]
         own = None if first.frame_from_sensor is None else first.frame_id.lstrip("/")
         return min((name for name in found if name is not None), key=_rank, default=own)

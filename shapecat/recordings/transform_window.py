@@ -16,6 +16,8 @@ __all__ = ["TransformWindow"]
 
 _LAG_NS = AROUND_NS // 2
 """If transforms are logged farther from their stamps, all are read at once."""
+_NEAR_NS = 1_000_000_000
+"""Half the time around the middle of the recording of which transforms are read at first."""
 
 
 class TransformWindow:
@@ -23,8 +25,8 @@ class TransformWindow:
 
     Attributes
     ----------
-    tree : the static transforms, and the others from the first and the last seconds of the
-        recording. They give the names of all frames, and their parents.
+    tree : the static transforms, and the others from the first, the middle and the last seconds of
+        the recording. They give the names of all frames, and their parents.
     """
 
     def __init__(
@@ -39,7 +41,7 @@ class TransformWindow:
 
     @classmethod
     def of(cls, recording: Recording, near: Sequence[str] = ()) -> "TransformWindow":
-        """Read the static transforms of a recording, and the first and last of the others.
+        """Read the static transforms of a recording, and the first, middle and last of the others.
 
         The topics in ``near`` decide between robots, see `transform_topics`.
         """
@@ -53,8 +55,11 @@ class TransformWindow:
         skips = not any(map(is_held, kinds))
         ahead = LookAhead(recording, topics, reader.take, known.forget, skips=skips)
         end = TransformReader(recording, deepcopy(known))
-        for message in recording.messages(topics, start_ns=recording.end_ns - AROUND_NS):
-            end.take(message)
+        middle_ns, end_ns = (recording.start_ns + recording.end_ns) // 2, recording.end_ns
+        spans = (middle_ns - _NEAR_NS, middle_ns + _NEAR_NS), (end_ns - AROUND_NS, None)
+        for start_ns, stop_ns in spans:
+            for message in recording.messages(topics, start_ns, stop_ns):
+                end.take(message)
         if max(reader.lag_ns, end.lag_ns) <= _LAG_NS:
             return cls(known, end.buffer, ahead)
         ahead.read_all()

@@ -228,8 +228,13 @@ class TransformBuffer:
         return interpolated(before, after, share)
 
 
-def fixed_frame(buffer: TransformBuffer, frame_id: str) -> str | None:
+def fixed_frame(buffer: TransformBuffer, frame_id: str, at_ns: int | None = None) -> str | None:
     """Choose the fixed frame for a sensor frame: map, odom, world, or the root of its tree.
+
+    Parameters
+    ----------
+    at_ns : prefer frames in which the pose of the sensor is known at this stamp: localization may
+        begin late. None to choose by name alone.
 
     Returns
     -------
@@ -241,11 +246,18 @@ def fixed_frame(buffer: TransformBuffer, frame_id: str) -> str | None:
     except TransformError:
         return None
     connected = [name for name in buffer.frames if _is_below(buffer, name, root)]
-    for wanted in _FIXED:
-        for name in connected:
-            if name.rsplit("/", 1)[-1] == wanted:
-                return name
-    return root if root != frame_id.lstrip("/") else None
+    found = [n for wanted in _FIXED for n in connected if n.rsplit("/", 1)[-1] == wanted]
+    found += [root] if root != frame_id.lstrip("/") else []
+    known = [name for name in found if at_ns is None or _reaches(buffer, name, frame_id, at_ns)]
+    return next(iter(known or found), None)
+
+
+def _reaches(buffer: TransformBuffer, target: str, source: str, stamp_ns: int) -> bool:
+    try:
+        buffer.lookup(target, source, stamp_ns)
+    except TransformError:
+        return False
+    return True
 
 
 def _is_below(buffer: TransformBuffer, name: str, root: str) -> bool:
