@@ -96,6 +96,14 @@ def test_identity_is_no_calibration() -> None:
         camera_of_info(calibration(**matrices), rectified=True)
 
 
+def test_error_shows_the_focal_length_that_is_wrong() -> None:
+    """Engines with y up give a negative one for rows; the error showed that of columns."""
+    k = np.diag([500.0, -510.0, 1.0]).ravel()
+
+    with pytest.raises(MessageError, match="focal length -510"):
+        camera_of_info(calibration(k=k), rectified=False)
+
+
 def test_region_of_interest_shifts_principal_point() -> None:
     """Cutting 80 columns and 30 rows moves it from (322.3, 243.9) to (242.3, 213.9)."""
     camera, _ = camera_of_info(calibration(roi=region(80, 30, 400, 300)), rectified=False)

@@ -175,7 +175,7 @@ def camera_of_info(info: Any, *, rectified: bool) -> tuple[Camera, bool]:
         cx, cy = cx - int(roi.x_offset), cy - int(roi.y_offset)
     values = (fx / bin_x, fy / bin_y, cx / bin_x, cy / bin_y)
     if not (np.isfinite(values).all() and fx > _UNIT and fy > _UNIT):
-        msg = f"camera info without a calibration (focal length {fx:g})"
+        msg = f"camera info without a calibration (focal length {min(fx, fy):g})"
         raise MessageError(msg)
     camera = Camera(width // bin_x, height // bin_y, *(float(value) for value in values))
     return camera, bool(not (rectified or use_p) and np.any(d != 0))
