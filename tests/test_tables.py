@@ -1,5 +1,6 @@
 import json
 import math
+import shutil
 from collections.abc import Callable
 from dataclasses import replace
 from importlib.resources import files
@@ -16,6 +17,7 @@ from numpy.testing import assert_allclose
 from shapecat.config import Settings
 from shapecat.errors import OutputError
 from shapecat.runs import shown
+from shapecat.runs.corrections import read_labels
 from shapecat.runs.folder import read_run
 from shapecat.runs.label_meaning import TrackLabel
 from shapecat.runs.labels import read_labelled_frames
@@ -23,7 +25,7 @@ from shapecat.runs.perceived import _SEGMENT_FRAMES, FrameRow, PerceptionTables
 from shapecat.runs.run_info import Counts, InputInfo, ModelInfo, Options, OriginInfo, RunInfo
 from shapecat.runs.segments import count_segments
 from shapecat.runs.shown import _next_of_topic, read_shown_frames
-from shapecat.runs.table_schemas import DETECTIONS, FRAMES, PLANES, TABLES, TRACKS
+from shapecat.runs.table_schemas import ADDED, DETECTIONS, FRAMES, PLANES, TABLES, TRACKS
 from shapecat.runs.tables import (
     arrow_table,
     lists,
@@ -306,6 +308,17 @@ def test_chosen_rows_are_read_from_all_row_groups(tmp_path: Path, at_once: int) 
         np.testing.assert_array_equal(found, rows)
 
 
+def test_run_of_an_earlier_version_is_annotated(guessed_run: Path, tmp_path: Path) -> None:
+    """Columns that were added since must not cost the corrections of a finished run."""
+    run = shutil.copytree(guessed_run, tmp_path / "run")
+    labels = read_labels(run / "tracks.csv")
+    now = list(read_shown_frames(run, labels))
+    table = pq.read_table(run / "frames.parquet")
+    assert set(table.column_names) >= ADDED
+    pq.write_table(table.drop_columns(sorted(ADDED)), run / "frames.parquet")
+    assert list(read_shown_frames(run, labels)) == now
+
+
 @pytest.mark.parametrize("table", TABLES)
 def test_table_with_other_columns_is_rejected(tmp_path: Path, table: str) -> None:
     """One of another version, or rewritten by a data frame library, gave a traceback later."""
@@ -313,7 +326,8 @@ def test_table_with_other_columns_is_rejected(tmp_path: Path, table: str) -> Non
     empty = TABLES[table].empty_table()
     for k, field in enumerate(TABLES[table]):
         other = empty.set_column(k, field.name, pa.array([], pa.float64()))
-        for damaged in (empty.drop_columns([field.name]), other):
+        lacking = [] if field.name in ADDED else [empty.drop_columns([field.name])]
+        for damaged in (*lacking, other):
             pq.write_table(damaged, path)
             with pytest.raises(OutputError, match=rf"column {field.name}\b.*process the recording"):
                 next(read_row_groups(path))

@@ -15,7 +15,7 @@ import pyarrow.parquet as pq
 
 from shapecat.arrays import F4, I4
 from shapecat.errors import OutputError
-from shapecat.runs.table_schemas import FULL_BOX, TABLES
+from shapecat.runs.table_schemas import ADDED, FULL_BOX, TABLES
 
 __all__ = [
     "Key",
@@ -90,7 +90,8 @@ def read_row_groups(
         count = file.num_row_groups
         for first in range(0, count, at_once):
             groups = range(first, min(first + at_once, count))
-            yield _validated(file.read_row_groups(groups, columns=columns, use_threads=False))
+            table = file.read_row_groups(groups, columns=columns, use_threads=False)
+            yield _validated(_with_added(table, TABLES[path.stem], columns))
 
 
 def read_rows(
@@ -204,7 +205,8 @@ def opened(path: Path, *, read_dictionary: Sequence[str] = ()) -> Iterator[pq.Pa
 
     Raises
     ------
-    OutputError : the table is missing or unreadable, or lacks a column of its schema.
+    OutputError : the table is missing or unreadable, or lacks a column of its schema that is not
+        in `ADDED`.
     """
     try:
         with _open_parquet(path, read_dictionary) as file:
@@ -238,6 +240,15 @@ def _validated(table: pa.Table) -> pa.Table:
     return table
 
 
+def _with_added(table: pa.Table, schema: pa.Schema, columns: Sequence[str] | None) -> pa.Table:
+    """Add the chosen columns that a table of an earlier version lacks."""
+    for name in ADDED.intersection(schema.names if columns is None else columns):
+        if name not in table.column_names:
+            nulls = pa.nulls(len(table), schema.field(name).type)
+            table = table.append_column(schema.field(name), nulls)
+    return table
+
+
 def _open_parquet(path: Path, read_dictionary: Sequence[str]) -> pq.ParquetFile:
     try:
         return pq.ParquetFile(path, read_dictionary=list(read_dictionary))
@@ -250,6 +261,8 @@ def _wrong_column(found: pa.Schema, wanted: pa.Schema) -> str:
     """Describe the first column that another version, or another program, wrote otherwise."""
     for field in wanted:
         if field.name not in found.names:
+            if field.name in ADDED:
+                continue
             return f"no column {field.name}"
         kind = found.field(field.name).type
         if (kind.value_type if pa.types.is_dictionary(kind) else kind) != field.type:
