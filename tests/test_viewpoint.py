@@ -21,6 +21,7 @@ from shapecat.runs.jobs import Job
 from shapecat.runs.label_meaning import TrackLabel
 from shapecat.runs.shown import read_shown_frames
 from shapecat.simulation.messages import MessageFactory
+from shapecat.simulation.recorder import LINK_FROM_OPTICAL
 from shapecat.types import Frame, Pose
 from tests.colour_messages import gradient, raw
 from tests.messages import CAMERA, EPOCH, cloud, info, organized_points, wavy_depth, write
@@ -32,6 +33,8 @@ MOUNTS = {
     "world": Pose(rotation_from_quaternion((0.0, 0.0, 0.7, 0.7)), np.array([-20.0, 31.0, 2.0])),
 }
 """Poses of frames in the map."""
+LINK = "camera_link"
+"""The frame of the camera with x forward, in which ZED cameras publish their clouds."""
 
 
 def posed(points: F4, quaternion: Any = (0.3, -0.6, 0.4, 0.5), place: Any = (0.3, -1.2, 0.8)) -> F4:
@@ -120,14 +123,16 @@ def test_viewpoint_is_found_again_after_it_moved(tmp_path: Path) -> None:
     assert len({frame.camera for frame in found}) == 1
 
 
-@pytest.mark.parametrize("mount", MOUNTS)
+@pytest.mark.parametrize("mount", [*MOUNTS, LINK])
 def test_cloud_in_other_frame_gives_the_results_of_its_camera(mount: str, tmp_path: Path) -> None:
     """Transformed on the robot, its objects fell apart: the origin was taken for the camera."""
-    map_from_mount = MOUNTS[mount]
+    map_from_mounts = [
+        MOUNTS.get(mount) or compose(view.pose, inverse(LINK_FROM_OPTICAL)) for view in views(2)
+    ]
     runs = []
     for name in (OPTICAL, mount):
         items: list[tuple[str, int, Any]] = []
-        for k, view in enumerate(views(2)):
+        for k, (view, map_from_mount) in enumerate(zip(views(2), map_from_mounts, strict=True)):
             map_from_camera = view.pose
             stamp = EPOCH + k
             links = [("map", OPTICAL, map_from_camera), ("map", mount, map_from_mount)]
@@ -149,13 +154,16 @@ def test_cloud_in_other_frame_gives_the_results_of_its_camera(mount: str, tmp_pa
     np.testing.assert_allclose(places[1], places[0], atol=2e-4)
     # What viewers draw is in the frame that the messages name.
     labels = {n: TrackLabel(n, "cup", 1.0) for n in own["tracks"]["track"].to_pylist()}
-    shown = [box for f in read_shown_frames(out, labels, visible=True) for box in f.objects]
-    drawn = transform(map_from_mount, np.array([box.center for box in shown]))
+    shown = list(read_shown_frames(out, labels, visible=True))
+    boxes = [
+        (box, pose) for f, pose in zip(shown, map_from_mounts, strict=True) for box in f.objects
+    ]
+    drawn = np.array([transform(pose, np.array(box.center)) for box, pose in boxes])
     tracked = np.array(other["tracks"]["center_fixed"].to_pylist())
     assert len(drawn) == len(tracked) > 4
     assert np.linalg.norm(drawn[:, None] - places[1], axis=2).min(axis=1).max() < 1e-5
-    ups = [rotation_from_quaternion(box.orientation)[:, 2] for box in shown]
-    np.testing.assert_allclose(ups @ map_from_mount.rotation[2], 1, atol=1e-2)
+    turns = [pose.rotation @ rotation_from_quaternion(box.orientation) for box, pose in boxes]
+    np.testing.assert_allclose([turn[2, 2] for turn in turns], 1, atol=1e-2)
 
 
 def test_cloud_in_the_map_needs_no_transforms(tmp_path: Path) -> None:

@@ -9,8 +9,6 @@ from shapecat.types import Pose
 
 __all__ = ["find_viewpoint", "seen_from"]
 
-_AWAY_M = 0.05
-"""A cloud that was taken from nearer to its origin is in the frame of its sensor."""
 _LONGEST = 10
 """Focal length in image widths; that of a height map, which no point sees, is greater."""
 _CLEAR = 1e-4
@@ -32,8 +30,8 @@ def find_viewpoint(points: F4, known: PinholeFit | None) -> tuple[PinholeFit, Po
 
     Returns
     -------
-    The camera and ``frame_from_camera``; None if no camera fits, if the points do not determine
-    one, as those of a single plane, or if the cloud was taken from its origin.
+    The camera and ``frame_from_camera``; None if no camera fits, or if the points do not determine
+    one, as those of a single plane.
     """
     sample = sample_pixels(points, lambda flat: np.asarray(flat.any(axis=1)))
     if sample is None:
@@ -55,8 +53,6 @@ def find_viewpoint(points: F4, known: PinholeFit | None) -> tuple[PinholeFit, Po
     if unclear > _CLEAR or not linear.any():
         return None
     center = middle - scale * np.linalg.solve(matrix[:, :3], matrix[:, 3])
-    if np.linalg.norm(center) < _AWAY_M:
-        return None
     pose = Pose(_rotation(linear).T, center)
     image = seen_from(pose, points)
     fit = known if known is not None and still_fits(known, image) else fit_pinhole(image)
