@@ -22,6 +22,7 @@ from shapecat.runs.labels import read_labelled_frames
 from shapecat.runs.perceived import FrameRow, PerceptionTables
 from shapecat.runs.shown import _ended
 from shapecat.runs.track_table import read_track_table
+from shapecat.runs.tracks import _CSV, _write_csv
 from shapecat.types import Box, Candidate, Detection, NeuralGas, Perception, Plane, Scene
 from tests.mcap_files import read_ros
 from tests.run_info import run_info
@@ -422,6 +423,32 @@ def test_label_in_unknown_encoding_is_refused(tmp_path: Path, label: str, encodi
 
     path.write_text(text, "utf-8")
     assert read_labels(path) == {4: TrackLabel(4, label, 1.0)}
+
+
+def opened_in_excel(path: Path) -> str:
+    """Return the text that Excel shows in western Europe."""
+    content = path.read_bytes()
+    return content.decode("utf-8-sig" if content.startswith(b"\xef\xbb\xbf") else "cp1252")
+
+
+@pytest.mark.parametrize("label", ["Schüssel", "can"])
+def test_labels_survive_a_spreadsheet(run: Path, label: str) -> None:
+    """Excel made *SchÃ¼ssel* of a label with an umlaut, and saved it as a new category."""
+    assert relabel(run, {2: label}) == {}
+    corrected = run.parent / "mine.csv"
+    corrected.write_text(opened_in_excel(run / "tracks.csv"), "utf-8-sig")
+    adopt_labels(corrected, run)
+
+    assert read_labels(run / "tracks.csv")[2].category == label
+    assert (run / "tracks.csv").read_bytes().startswith(b"track,") == label.isascii()
+
+
+def test_new_table_with_umlauts_opens_in_a_spreadsheet(tmp_path: Path) -> None:
+    """Corrections were refused, as Excel had changed the categories of a model with umlauts."""
+    line = dict.fromkeys(_CSV, 1) | dict.fromkeys(("category", "guess", "topic", "run"), "Krügel")
+    _write_csv(tmp_path / "tracks.csv", [line])
+
+    assert "Krügel" in opened_in_excel(tmp_path / "tracks.csv")
 
 
 @pytest.mark.parametrize("label", ["चाकू", "น้ำ", "cafe\u0301"])

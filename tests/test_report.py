@@ -467,7 +467,7 @@ def test_corrections_made_in_browser_are_adopted(
 
     browser.click(f"#track-{a} button[data-label='{other}']")
     browser.click(f"#track-{b} button[data-label='delete']")
-    browser.type(f"#track-{c} .other", "wine glass\n")
+    browser.type(f"#track-{c} .other", "Weingläser\n")
     browser.type(f"#track-{d} .other", f"merge with {a}\n")
     browser.click(f"#track-{e} button[data-label='{rows[4].category}']")
     browser.type(f"#track-{rows[5].track} .other", "merge with 999\n")
@@ -482,13 +482,14 @@ def test_corrections_made_in_browser_are_adopted(
     assert browser.run("return document.querySelectorAll('.changed').length") == 4
     browser.click("#download")
     table = browser.downloaded()
+    assert table.read_bytes().startswith(b"\xef\xbb\xbf")  # so that Excel shows the umlaut
     result = shapecat("annotate", run, "--labels", table)
     table.unlink()
 
     assert result.exit_code == 0, result.output
     labels = read_labels(run / "tracks.csv")
     assert labels[a].category == labels[d].category == other
-    assert (labels[d].track, labels[c].category, labels[e].confidence) == (a, "wine glass", 1.0)
+    assert (labels[d].track, labels[c].category, labels[e].confidence) == (a, "Weingläser", 1.0)
     assert b not in labels
     assert browser.complaints() == []
 

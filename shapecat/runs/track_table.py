@@ -6,7 +6,7 @@ encodings than Unicode if the labels are ASCII.
 
 import csv
 import io
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 
@@ -20,6 +20,7 @@ __all__ = [
     "parse_number",
     "read_track_table",
     "with_label",
+    "write_csv",
     "write_track_table",
 ]
 
@@ -178,9 +179,16 @@ def with_label(row: TrackRow, label: str) -> TrackRow:
 
 def write_track_table(path: Path, table: TrackTable) -> None:
     """Write a table, with all its columns."""
-    with path.open("w", newline="", encoding="utf-8") as file:
-        writer = csv.DictWriter(
-            file, table.columns, lineterminator="\n", restval="", extrasaction="ignore"
-        )
-        writer.writeheader()
-        writer.writerows(row.cells for row in table.rows)
+    lines = ([row.cells.get(name, "") for name in table.columns] for row in table.rows)
+    write_csv(path, [table.columns, *lines])
+
+
+def write_csv(path: Path, lines: Iterable[Iterable[str]]) -> None:
+    """Write lines of cells, with a byte order mark unless they are ASCII.
+
+    Without the mark, Excel would read and save other letters as those of another encoding.
+    """
+    file = io.StringIO(newline="")
+    csv.writer(file, lineterminator="\n").writerows(lines)
+    text = file.getvalue()
+    path.write_bytes(text.encode("utf-8" if text.isascii() else "utf-8-sig"))

@@ -1,6 +1,5 @@
 """Track the detections of a run, and write the tables of tracks."""
 
-import csv
 from collections import Counter
 from collections.abc import Iterable, Iterator, Sequence
 from pathlib import Path
@@ -28,7 +27,7 @@ from shapecat.runs.tables import (
     read_together,
     rows_as_lists,
 )
-from shapecat.runs.track_table import ORIGINAL
+from shapecat.runs.track_table import ORIGINAL, write_csv
 from shapecat.system.files import replacing
 from shapecat.system.memory import release_memory
 from shapecat.tracking import FrameDetections, Track, track_recording
@@ -252,8 +251,7 @@ def _write_csv(path: Path, lines: Sequence[dict[str, Any]]) -> None:
     def order(line: dict[str, Any]) -> tuple[bool, float, int]:
         return line["category"] != UNKNOWN, line["confidence"], line["track"]
 
-    with path.open("w", newline="", encoding="utf-8") as file:
-        writer = csv.writer(file, lineterminator="\n")
-        writer.writerow(_CSV)
-        for line in sorted(lines, key=order):
-            writer.writerow(format(line[name], kind) for name, kind in _CSV.items())
+    cells = (
+        [format(line[n], kind) for n, kind in _CSV.items()] for line in sorted(lines, key=order)
+    )
+    write_csv(path, [list(_CSV), *cells])

@@ -121,7 +121,9 @@ function csv() {
   // With the labels as this page was made, so that it does not undo labels given elsewhere since.
   const lines = data.rows.map((row) => [...data.columns.map((name, k) =>
     quote(name === "label" ? labels.get(row.track) : row.cells[k])), quote(row.label)].join(","));
-  return [[...data.columns, "label_seen"].map(quote).join(","), ...lines, ""].join("\n");
+  const text = [[...data.columns, "label_seen"].map(quote).join(","), ...lines, ""].join("\n");
+  // Excel takes the letters of a table without a byte order mark for others.
+  return /^[\x00-\x7f]*$/.test(text) ? text : `\ufeff${text}`;
 }
 
 gallery.addEventListener("click", (event) => {
