@@ -248,6 +248,7 @@ def annotate(folder: Path, recording: Recording, run: RunInfo, observe: Observer
             with_clouds(shown, recording, run, streams_with_poses(folder)),
             name=recording.path.name,
             run=run,
+            labels=labels(),
             categories=run["model"]["categories"],
             cloud_points=settings["cloud_points"],
             fixed_frame=run["fixed_frame"],

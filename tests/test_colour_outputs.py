@@ -330,6 +330,7 @@ def test_review_omits_only_damaged_image(tmp_path: Path) -> None:
         scenes,
         name="lab",
         run={},
+        labels={},
         categories=("cup", "can"),
         cloud_points=1000,
         fixed_frame=None,

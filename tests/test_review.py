@@ -23,6 +23,7 @@ from shapecat.outputs.review_images import Images, Picture
 from shapecat.outputs.review_layout import Eye, TrackView, _track_tabs, stepped_back
 from shapecat.outputs.review_scenes import ReviewFrame, choose_scenes
 from shapecat.outputs.review_shapes import _fan, markdown, short_label
+from shapecat.runs.label_meaning import TrackLabel
 from shapecat.types import Box, Camera, Frame, LabelledFrame, LabelledObject, NeuralGas, Plane, Pose
 from tests.test_executors import alive
 
@@ -88,6 +89,7 @@ def write_frames(path: Path, frames: Iterable[ReviewFrame], **options: Any) -> P
     settings: dict[str, Any] = {
         "name": "lab",
         "run": {"warnings": ["no transforms"], "counts": {"frames": 3}},
+        "labels": {},
         "categories": CATEGORIES,
         "cloud_points": 1000,
         "fixed_frame": None,
@@ -221,6 +223,36 @@ def test_same_run_gives_same_content(tmp_path: Path) -> None:
     one, two = write(tmp_path / "1.rrd", scenes), write(tmp_path / "2.rrd", scenes)
     compared = subprocess.run([RERUN, "rrd", "compare", one, two], check=False, capture_output=True)
     assert compared.returncode == 0, compared.stderr
+
+
+def stores(path: Path, kind: str) -> list[tuple[str, str]]:
+    """Return application and id of the recordings or blueprints in a file."""
+    from rerun.chunk import RrdReader  # noqa: PLC0415  heavy
+
+    found = getattr(RrdReader(str(path)), kind)()
+    return [(one.application_id, one.recording_id) for one in found]
+
+
+def test_corrected_review_is_another_recording(tmp_path: Path) -> None:
+    """A viewer joins a file with the recording of its id, so that deleted tracks stayed."""
+    ids = set()
+    for category in ("cup", "can"):
+        path = write(tmp_path / category, [scene(0)], labels={1: TrackLabel(1, category, 1.0)})
+        ids |= set(stores(path, "recordings"))
+
+    assert len(ids) == 2
+
+
+def test_layout_is_only_for_its_own_review(tmp_path: Path) -> None:
+    """A viewer draws all recordings of an application in the layout that it opened last."""
+    found = []
+    for k, warnings in enumerate(([], ["no transforms"])):
+        path = write(tmp_path / f"{k}.rrd", [scene(0)], run={"warnings": warnings})
+        (application, _), *_ = stores(path, "recordings")
+        assert {name for name, _ in stores(path, "blueprints")} == {application}
+        found.append(application)
+
+    assert found[0] != found[1]
 
 
 def test_fixed_frame_has_sensor_poses_and_track_paths(tmp_path: Path) -> None:

@@ -54,6 +54,7 @@ from shapecat.outputs.review_paths import Paths
 from shapecat.outputs.review_scenes import PaintedFrame, ReviewFrame, paint_frame
 from shapecat.outputs.review_shapes import SCENE, SKETCH, Drawing, DrawnScene
 from shapecat.outputs.review_viewer import open_viewer, take_screenshot
+from shapecat.runs.label_meaning import TrackLabel
 from shapecat.types import Camera, Frame, LabelledFrame, LabelledObject, Pose
 
 __all__ = ["open_viewer", "take_screenshot", "write_review"]
@@ -67,6 +68,7 @@ def write_review(
     *,
     name: str,
     run: Mapping[str, object],
+    labels: Mapping[int, TrackLabel],
     categories: Sequence[str],
     cloud_points: int,
     fixed_frame: str | None,
@@ -79,6 +81,7 @@ def write_review(
     frames : all frames in the order of the recording, with points if their scene is drawn.
     name : name of the recording in the viewer.
     run : the content of run.json; a list under ``warnings`` is also logged.
+    labels : the final label of each track; a review with others is another recording.
     categories : in the order of the posteriors.
     cloud_points : approximate number of points to keep of each cloud; 0 keeps all.
     fixed_frame : name of the frame in which tracks are shown; None for the sensor frame.
@@ -92,7 +95,7 @@ def write_review(
     The content depends only on the arguments. Memory does not grow with the number of frames,
     except for some numbers per track.
     """
-    stream = _stream(name, run)
+    stream = _stream(name, run, labels)
     with open_review(path, stream) as file:
         stream.send_recording_name(name)
         review = _Review(stream, categories, fixed_frame)
@@ -106,10 +109,17 @@ def write_review(
         file.flush()
 
 
-def _stream(name: str, run: Mapping[str, object]) -> rr.RecordingStream:
-    """Return a stream whose content depends only on what is logged."""
-    identity = uuid.uuid5(uuid.NAMESPACE_OID, name + json.dumps(run, sort_keys=True, default=str))
-    stream = rr.RecordingStream("shapecat", recording_id=identity, send_properties=False)
+def _stream(
+    name: str, run: Mapping[str, object], labels: Mapping[int, TrackLabel]
+) -> rr.RecordingStream:
+    """Return a stream whose content depends only on what is logged.
+
+    A viewer joins files of the same recording, and has one layout for each application.
+    """
+    content = json.dumps([name, run, sorted(labels.items())], sort_keys=True, default=str)
+    identity = uuid.uuid5(uuid.NAMESPACE_OID, content)
+    application = f"shapecat-{identity.hex[:8]}"
+    stream = rr.RecordingStream(application, recording_id=identity, send_properties=False)
     stream.set_log_time_enabled(False)
     return stream
 
