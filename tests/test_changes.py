@@ -6,7 +6,6 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-import pyarrow.parquet as pq
 import pytest
 
 from shapecat.cameras.colour import LensCamera
@@ -26,6 +25,7 @@ from shapecat.reuse import KeyView, find_repeats, sight_of
 from shapecat.reuse.agreement import agreement
 from shapecat.runs.perceived import FrameRow, PerceptionTables
 from shapecat.runs.placed_frames import PlacedFrames, streams_with_poses
+from shapecat.runs.tables import read_row_groups
 from shapecat.tracking.hits import gather
 from shapecat.tracking.records import FrameDetections
 from shapecat.types import Camera, Frame, Pose
@@ -254,7 +254,9 @@ def test_each_topic_has_its_own_poses(tmp_path: Path) -> None:
         for topic, k in order:
             pose = None if (topic, k) == ("/hand", 1) else moved
             tables.write([replace(perception(k, 1), topic=topic)], [FrameRow(k, pose)])
-    frame_rows, found = (pq.read_table(tmp_path / f"{n}.parquet") for n in ("frames", "detections"))
+    (frame_rows,), (found,) = (
+        read_row_groups(tmp_path / f"{n}.parquet") for n in ("frames", "detections")
+    )
     placed = PlacedFrames({"/head"})
     for part in (slice(0, 2), slice(2, 5)):
         placed.add(frame_rows[part], found[part], part.start)

@@ -16,6 +16,7 @@ from numpy.testing import assert_allclose
 
 from shapecat.config import Settings
 from shapecat.errors import OutputError
+from shapecat.outputs.opened_run import Table
 from shapecat.runs import shown
 from shapecat.runs.corrections import read_labels
 from shapecat.runs.folder import read_run
@@ -34,6 +35,8 @@ from shapecat.runs.tables import (
     read_row_groups,
     read_rows,
     read_together,
+    with_fixed_lists,
+    write_table,
 )
 from shapecat.types import Box, Candidate, Detection, NeuralGas, Perception, Plane, Pose, Scene
 from tests.track_tables import write_tracks
@@ -81,7 +84,7 @@ def test_tables_have_documented_columns(tmp_path: Path) -> None:
     table = pq.read_table(tmp_path / "detections.parquet")
     row = table.to_pylist()[1]
 
-    assert table.schema.equals(DETECTIONS)
+    assert with_fixed_lists(table).schema.equals(DETECTIONS)
     assert table.num_rows == 5
     assert table.schema.metadata[b"categories"] == b"cup,can"
     assert table.schema.metadata[b"model"] == b"m1"
@@ -91,7 +94,8 @@ def test_tables_have_documented_columns(tmp_path: Path) -> None:
     assert_allclose(row["center_fixed"], [0.1, 0, 11])
     assert_allclose(row["height_m"], 0.1, atol=1e-6)
     assert pq.read_table(tmp_path / "planes.parquet").schema.equals(PLANES)
-    assert pq.read_table(tmp_path / "frames.parquet").schema.equals(FRAMES)
+    frames = with_fixed_lists(pq.read_table(tmp_path / "frames.parquet"))
+    assert frames.schema.equals(FRAMES)
     assert pq.read_table(tmp_path / "frames.parquet")["frame"].to_pylist() == [0, 1, 2]
 
 
@@ -278,6 +282,31 @@ def test_values_that_no_run_writes_are_refused(tmp_path: Path, column: str, valu
 
     with pytest.raises(OutputError, match=f"detections.parquet: .*column {column} holds"):
         list(read_row_groups(path, ["frame", column]))
+
+
+@pytest.mark.parametrize("name", TABLES)
+def test_older_readers_open_tables_with_nulls(tmp_path: Path, name: str) -> None:
+    """Arrow before version 26, and pandas with it, refuses nulls among lists of fixed size."""
+    path = tmp_path / f"{name}.parquet"
+    schema = TABLES[name].with_metadata({"model": "m"})
+    write_table(path, {field.name: [None] for field in schema}, schema)
+
+    for field in pq.read_schema(path):
+        never_null = {"center", "size", "orientation", "normal", "up"}
+        assert not pa.types.is_fixed_size_list(field.type) or field.name in never_null
+    for table in (*read_row_groups(path), Table(path).arrow()):
+        assert (table.schema, table.schema.metadata) == (schema, schema.metadata)
+
+
+def test_list_of_wrong_size_is_refused(tmp_path: Path) -> None:
+    write_run_tables(tmp_path, [2], Pose(np.eye(3), np.zeros(3)))
+    path = tmp_path / "frames.parquet"
+    rows = pq.read_table(path).to_pylist()
+    rows[0]["fixed_translation"] = [0.0, 1.0]
+    pq.write_table(pa.Table.from_pylist(rows, pq.read_schema(path)), path)
+
+    with pytest.raises(OutputError, match=r"frames.parquet: .* all the expected size"):
+        list(read_row_groups(path, ["fixed_translation"]))
 
 
 def test_no_lists_give_empty_column() -> None:

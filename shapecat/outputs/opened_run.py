@@ -17,7 +17,7 @@ from shapecat.outputs.counts import plural
 from shapecat.recordings.colour_image import pixels_of
 from shapecat.runs.finished import FinishedRun, open_source, read_finished
 from shapecat.runs.run_info import RunInfo
-from shapecat.runs.tables import first_stamp, numbers_or_nan
+from shapecat.runs.tables import first_stamp, numbers_or_nan, with_fixed_lists
 from shapecat.types import Frame, LabelledFrame, LabelledObject
 
 __all__ = ["Run", "RunFrame", "Table"]
@@ -47,7 +47,8 @@ class Table:
                 msg = f"{self.path}: no column {missing[0]}; known: {', '.join(known)}"
                 raise OutputError(msg)
             with pq.ParquetFile(self.path) as file:
-                return file.read(columns=None if columns is None else list(columns))
+                table = file.read(columns=None if columns is None else list(columns))
+            return with_fixed_lists(table)
         except (OSError, pa.ArrowException) as error:
             msg = f"{self.path}: not a readable table of a run ({error})"
             raise OutputError(msg) from error

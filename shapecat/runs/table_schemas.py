@@ -11,11 +11,13 @@ __all__ = [
     "ADDED",
     "BOX_WIDTH",
     "DETECTIONS",
+    "FIXED_LISTS",
     "FRAMES",
     "FRAME_COLUMNS",
     "FULL_BOX",
     "FULL_WIDTHS",
     "MASKS",
+    "MAY_BE_NULL",
     "PERCEIVED",
     "PLANES",
     "SCHEMA_VERSION",
@@ -42,6 +44,13 @@ FULL_WIDTHS = {name: kind.list_size for name, kind in _FULL}
 """Columns of full boxes, and the number of values in each."""
 FULL_BOX = ("center_full", "size_full", "orientation_full")
 """Columns of the box itself: centre and size in metres, and a quaternion, in the sensor frame."""
+MAY_BE_NULL = (
+    "up_given",
+    *(f"{frame}_{part}" for frame in ("fixed", "frame") for part in ("translation", "rotation")),
+    "center_fixed",
+    *FULL_WIDTHS,
+)
+"""Columns of lists of fixed size that may be null."""
 BOX_WIDTH = sum(FULL_WIDTHS[name] for name in FULL_BOX)
 FRAME_COLUMNS = (("topic", pa.string()), ("frame", pa.int32()), ("stamp_ns", pa.int64()))
 """Columns that identify a frame: topic, number on that topic, and stamp."""
@@ -155,3 +164,10 @@ PERCEIVED = {"frames": FRAMES, "detections": DETECTIONS, "planes": PLANES, "mask
 """The tables of perceive; recordings without colour have no masks."""
 TABLES = {**PERCEIVED, "tracks": TRACKS}
 """The tables of a run, by name."""
+FIXED_LISTS = {
+    field.name: field.type
+    for schema in TABLES.values()
+    for field in schema
+    if pa.types.is_fixed_size_list(field.type)
+}
+"""The types of the columns of lists of fixed size."""

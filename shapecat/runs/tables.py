@@ -15,7 +15,7 @@ import pyarrow.parquet as pq
 
 from shapecat.arrays import F4, I4
 from shapecat.errors import OutputError
-from shapecat.runs.table_schemas import ADDED, FULL_BOX, TABLES
+from shapecat.runs.table_schemas import ADDED, FIXED_LISTS, FULL_BOX, MAY_BE_NULL, TABLES
 
 __all__ = [
     "Key",
@@ -35,6 +35,7 @@ __all__ = [
     "rows_as_lists",
     "rows_of",
     "topic_codes",
+    "with_fixed_lists",
     "write_table",
 ]
 
@@ -220,13 +221,14 @@ def opened(path: Path, *, read_dictionary: Sequence[str] = ()) -> Iterator[pq.Pa
 
 
 def _validated(table: pa.Table) -> pa.Table:
-    """Return rows of a table unchanged.
+    """Return rows of a table, with lists of fixed size.
 
     Raises
     ------
     pa.ArrowInvalid : a box or a posterior holds NaN or infinity, a visible size is negative, or a
         list ends within an item.
     """
+    table = with_fixed_lists(table)
     for name in _TUPLES.keys() & set(table.column_names):
         lengths = (np.diff(chunk.offsets.to_numpy()) for chunk in table[name].chunks)
         if any((length % _TUPLES[name]).any() for length in lengths):
@@ -249,6 +251,19 @@ def _with_added(table: pa.Table, schema: pa.Schema, columns: Sequence[str] | Non
     return table
 
 
+def with_fixed_lists(table: pa.Table) -> pa.Table:
+    """Return rows of a table as read, with the lists of fixed size that `open_writer` writes.
+
+    Raises
+    ------
+    pa.ArrowInvalid : a list has another length.
+    """
+    for k, field in enumerate(table.schema):
+        if (kind := FIXED_LISTS.get(field.name, field.type)) != field.type:
+            table = table.set_column(k, field.name, table[k].cast(kind))
+    return table
+
+
 def _open_parquet(path: Path, read_dictionary: Sequence[str]) -> pq.ParquetFile:
     try:
         return pq.ParquetFile(path, read_dictionary=list(read_dictionary))
@@ -265,9 +280,24 @@ def _wrong_column(found: pa.Schema, wanted: pa.Schema) -> str:
                 continue
             return f"no column {field.name}"
         kind = found.field(field.name).type
-        if (kind.value_type if pa.types.is_dictionary(kind) else kind) != field.type:
+        if (kind.value_type if pa.types.is_dictionary(kind) else kind) not in _readable(field.type):
             return f"column {field.name} holds {kind}, not {field.type}"
     return ""
+
+
+def _readable(kind: pa.DataType) -> tuple[pa.DataType, ...]:
+    """Return the types that a column may have in a file; earlier versions wrote no plain lists."""
+    return (kind, pa.list_(kind.value_type)) if pa.types.is_fixed_size_list(kind) else (kind,)
+
+
+class _Writer(pq.ParquetWriter):  # type: ignore[misc]  # pyarrow has no types
+    """Writes row groups with the lists of fixed size that may be null as plain lists.
+
+    Arrow before version 26, and what uses it, cannot read nulls among lists of fixed size.
+    """
+
+    def write_table(self, table: pa.Table) -> None:
+        super().write_table(table.cast(self.schema))
 
 
 def open_writer(path: Path, schema: pa.Schema) -> pq.ParquetWriter:
@@ -275,9 +305,11 @@ def open_writer(path: Path, schema: pa.Schema) -> pq.ParquetWriter:
     # Ascending pixel indices shrink tenfold as differences; a dictionary does not help floats.
     texts = [f.name for f in schema if f.type == pa.string()]
     deltas = {f"{n}.list.element": "DELTA_BINARY_PACKED" for n in ("indices",) if n in schema.names}
-    return pq.ParquetWriter(
+    plain = {name: pa.list_(FIXED_LISTS[name].value_type) for name in MAY_BE_NULL}
+    fields = [field.with_type(plain.get(field.name, field.type)) for field in schema]
+    return _Writer(
         path,
-        schema,
+        pa.schema(fields, schema.metadata),
         compression="zstd",
         use_dictionary=texts,
         column_encoding=deltas or None,
