@@ -6,6 +6,7 @@ import re
 import shutil
 import subprocess
 import sys
+import tomllib
 import zipfile
 from importlib.metadata import distribution, requires
 from pathlib import Path
@@ -148,3 +149,10 @@ def test_lock_file_covers_every_dependency() -> None:
     needed = {re.split(r"[\s;<>=!~\[(]", n)[0].lower() for n in declared}
 
     assert needed <= locked
+
+
+def test_only_versions_of_arrow_that_work_are_allowed() -> None:
+    """Up to version 25, types are converted by pandas, which `process` does without: it failed."""
+    project = tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]
+    (least,) = (n for n in project["dependencies"] if n.startswith("pyarrow>="))
+    assert int(least.removeprefix("pyarrow>=").partition(".")[0]) >= 26
