@@ -135,15 +135,23 @@ def test_annotations_outlive_their_period_and_are_deleted_once() -> None:
     found = [(a.lifetime_ns, a.gone) for a in _annotations(frames)]
 
     assert found == [
-        (60, ()),  # 40 to the next
-        (60, (1,)),  # 40 from the one before, as another topic follows
+        (180, ()),  # 120 of log time to the next
+        (180, (1,)),  # 120 from the one before, as another topic follows
         (1_500_000_000, ()),  # a topic's first frame: a second is assumed
-        (90, (9,)),  # 2 is still visible on /b
-        (150, (2, 7)),
-        (60, ()),
-        (150, ()),  # the next frame comes late
-        (150, (4,)),
+        (270, (9,)),  # 2 is still visible on /b
+        (450, (2, 7)),
+        (180, ()),
+        (450, ()),  # the next frame comes late
+        (450, (4,)),
     ]
+
+
+@pytest.mark.parametrize("slow", [1, 3])
+def test_boxes_stay_until_the_next_message(slow: int) -> None:
+    """Viewers count in log time, which passes faster than the time of a slow simulation."""
+    frames = [replace(shown_frame("/a", 100 * k, 1), log_time_ns=100 * slow * k) for k in (1, 2)]
+
+    assert [a.lifetime_ns for a in _annotations(frames)] == [150 * slow] * 2
 
 
 @pytest.mark.parametrize("encoding", ["cdr", "ros1", "protobuf", "json"])

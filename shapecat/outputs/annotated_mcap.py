@@ -161,22 +161,28 @@ def _append(
 def _annotations(frames: Iterable[ShownFrame]) -> Iterator[Annotation]:
     """Add lifetimes, from the time of the next frame, and tracks to delete, from earlier frames."""
     periods: dict[str, int] = {}
-    last: dict[str, int] = {}
+    last: dict[str, ShownFrame] = {}
     shown: dict[str, set[int]] = {}
     for frame, following in pairwise(chain(frames, [None])):
         if frame is None:
             return
         if following is not None and following.topic == frame.topic:
-            periods[frame.topic] = max(1, following.stamp_ns - frame.stamp_ns)
+            periods[frame.topic] = _period(frame, following)
         elif frame.topic in last:
-            periods[frame.topic] = max(1, frame.stamp_ns - last[frame.topic])
-        last[frame.topic] = frame.stamp_ns
+            periods[frame.topic] = _period(last[frame.topic], frame)
+        last[frame.topic] = frame
         period = min(periods.get(frame.topic, _PERIOD_NS), _LONGEST_NS)
         here = {box.track for box in frame.objects}
         gone = (shown.get(frame.topic, set()) | set(frame.ended)) - here
         shown[frame.topic] = here
         gone -= set().union(*shown.values())  # unless another sensor still sees it
         yield Annotation(frame, round(_LIFETIME * period), tuple(sorted(gone)))
+
+
+def _period(frame: ShownFrame, following: ShownFrame) -> int:
+    """Return the time between two frames, ns: of viewers, whose time is the log time, at least."""
+    by_stamp = following.stamp_ns - frame.stamp_ns
+    return max(1, by_stamp, following.log_time_ns - frame.log_time_ns)
 
 
 def _encoding(recording: Recording, first: Annotation | None) -> str:
