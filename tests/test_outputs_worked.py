@@ -136,14 +136,27 @@ def test_annotations_outlive_their_period_and_are_deleted_once() -> None:
 
     assert found == [
         (180, ()),  # 120 of log time to the next
-        (180, (1,)),  # 120 from the one before, as another topic follows
-        (1_500_000_000, ()),  # a topic's first frame: a second is assumed
+        (270, (1,)),
+        (450, ()),  # 300 to the next of its topic
         (270, (9,)),  # 2 is still visible on /b
         (450, (2, 7)),
         (180, ()),
         (450, ()),  # the next frame comes late
         (450, (4,)),
     ]
+
+
+def test_boxes_of_two_cameras_stay_until_the_next_frame_of_their_own() -> None:
+    """With frames of both in turn, a box vanished wherever a camera dropped a frame."""
+    frames = [shown_frame(t, s, 1) for s in (0, 10, 40, 50) for t in ("/a", "/b")]
+    frames += [shown_frame("/b", 50 + k, 1) for k in range(1, 200)]
+    frames.append(shown_frame("/a", 900, 1))
+
+    found = list(_annotations(frames))
+    assert [one.frame for one in found] == frames
+    lifetimes = [one.lifetime_ns for one in found if one.frame.topic == "/a"]
+    # 1.5 * 3, the factor of log time; beyond 64 frames, the time before a frame is used
+    assert lifetimes == [45, 135, 45, 45, 3825]
 
 
 @pytest.mark.parametrize("slow", [1, 3])

@@ -6,12 +6,13 @@ MCAP. Annotations use the encoding of the source.
 
 import gc
 import json
-from collections import Counter
+from collections import Counter, deque
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import contextmanager
+from dataclasses import dataclass
 from heapq import merge
-from itertools import chain, pairwise
+from itertools import chain
 from operator import attrgetter
 from pathlib import Path
 from typing import BinaryIO, TypeVar
@@ -36,6 +37,8 @@ _PERIOD_NS = 1_000_000_000
 """Frame period assumed for a stream with a single frame."""
 _LONGEST_NS = 3600 * 10**9
 """Longest frame period: a clock that is set during a recording jumps by decades."""
+_AHEAD = 64
+"""Frames that wait until the next frame of their topic is known, if others come first."""
 _F = TypeVar("_F", Annotation, ImageFrame)
 
 
@@ -160,23 +163,40 @@ def _append(
 
 def _annotations(frames: Iterable[ShownFrame]) -> Iterator[Annotation]:
     """Add lifetimes, from the time of the next frame, and tracks to delete, from earlier frames."""
-    periods: dict[str, int] = {}
-    last: dict[str, ShownFrame] = {}
     shown: dict[str, set[int]] = {}
-    for frame, following in pairwise(chain(frames, [None])):
-        if frame is None:
-            return
-        if following is not None and following.topic == frame.topic:
-            periods[frame.topic] = _period(frame, following)
-        elif frame.topic in last:
-            periods[frame.topic] = _period(last[frame.topic], frame)
-        last[frame.topic] = frame
-        period = min(periods.get(frame.topic, _PERIOD_NS), _LONGEST_NS)
+    for frame, period in _with_periods(frames):
         here = {box.track for box in frame.objects}
         gone = (shown.get(frame.topic, set()) | set(frame.ended)) - here
         shown[frame.topic] = here
         gone -= set().union(*shown.values())  # unless another sensor still sees it
-        yield Annotation(frame, round(_LIFETIME * period), tuple(sorted(gone)))
+        lifetime = round(_LIFETIME * min(period, _LONGEST_NS))
+        yield Annotation(frame, lifetime, tuple(sorted(gone)))
+
+
+@dataclass(slots=True)
+class _Held:
+    """A frame, and the time to the next frame of its topic, ns; None if not yet known."""
+
+    frame: ShownFrame
+    period: int | None = None
+
+
+def _with_periods(frames: Iterable[ShownFrame]) -> Iterator[tuple[ShownFrame, int]]:
+    """Yield frames with the time, ns, to the next frame of their topic, else from the last one."""
+    held: deque[_Held] = deque()
+    last: dict[str, _Held] = {}
+    periods: dict[str, int] = {}
+    for frame in frames:
+        if frame.topic in last:
+            before = last[frame.topic]
+            periods[frame.topic] = before.period = _period(before.frame, frame)
+        last[frame.topic] = _Held(frame)
+        held.append(last[frame.topic])
+        while held[0].period is not None or len(held) > _AHEAD:
+            one = held.popleft()
+            yield one.frame, one.period or periods.get(one.frame.topic, _PERIOD_NS)
+    for one in held:
+        yield one.frame, one.period or periods.get(one.frame.topic, _PERIOD_NS)
 
 
 def _period(frame: ShownFrame, following: ShownFrame) -> int:
