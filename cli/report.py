@@ -32,13 +32,13 @@ def report(
 
     Each DIR is a run, or a folder of runs. The page of a run is RUN/report.html; several runs, and
     a folder of runs, also get an index.html in the folder that contains them all. A page needs no
-    network and can be mailed. Download the corrected tracks.csv from it and apply the file with
+    network and can be mailed. Download the corrected table from it and apply it with
     `shapecat annotate`. With --serve, the page writes corrections to RUN/tracks.csv as you make
     them.
 
     \b
     shapecat report results
-    shapecat annotate results/lab --labels ~/Downloads/tracks.csv
+    shapecat annotate results/lab --labels downloaded.csv
 
     \b
     shapecat report results/lab --serve

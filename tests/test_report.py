@@ -482,6 +482,10 @@ def test_corrections_made_in_browser_are_adopted(
     assert browser.run("return document.querySelectorAll('.changed').length") == 4
     browser.click("#download")
     table = browser.downloaded()
+    # A second table of the same name would be renamed, and the command apply the first.
+    command = browser.run("return document.querySelector('#command').textContent")
+    assert command == f"shapecat annotate {run} --labels ~/Downloads/{table.name}"
+    assert re.fullmatch(r"tracks-\d{14}\.csv", table.name)
     assert table.read_bytes().startswith(b"\xef\xbb\xbf")  # so that Excel shows the umlaut
     result = shapecat("annotate", run, "--labels", table)
     table.unlink()

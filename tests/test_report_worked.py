@@ -167,7 +167,7 @@ def test_run_page_has_right_values(*, served: bool) -> None:
     (instruction,) = re.findall(
         r'</div>\s*<p class="muted">(.*?)</code>', text[text.index("confusion") :]
     )
-    option = "" if served else " --labels ~/Downloads/tracks.csv"
+    option = "" if served else " --labels ~/Downloads/tracks-….csv"
 
     assert facts == {
         "frames": "61", "length": "3.2 s", "detections": "143", "tracks": "1", "uncertain": "1",

@@ -92,7 +92,7 @@ function shownAs(row) {
 function summarize() {
   const checked = data.rows.filter((row) => labels.get(row.track) !== "");
   const right = checked.filter((row) => labelOf(row.track) === row.category).length;
-  byId("download").textContent = checked.length ? `Download tracks.csv (${checked.length})` : "Download tracks.csv";
+  byId("download").textContent = checked.length ? `Download table (${checked.length})` : "Download table";
   byId("verdict").textContent = checked.length
     ? `${right} of ${checked.length} checked ${checked.length === 1 ? "track was" : "tracks were"} right. Rows: detected category; columns: your label.`
     : "To confirm or correct a track, press a digit, or click a category on its card.";
@@ -153,7 +153,10 @@ byId("meshes").addEventListener("change", (event) =>
 byId("download").addEventListener("click", () => {
   const link = document.createElement("a");
   link.href = URL.createObjectURL(new Blob([csv()], { type: "text/csv" }));
-  link.download = "tracks.csv";
+  // A name of its own: the browser would rename a second tracks.csv, and the command read the first.
+  link.download = `tracks-${new Date().toLocaleString("sv").replace(/\D/g, "")}.csv`;
+  const command = byId("command");
+  command.textContent = `${command.dataset.annotate} --labels ~/Downloads/${link.download}`;
   link.click();
   setTimeout(() => URL.revokeObjectURL(link.href), 10000);
 });

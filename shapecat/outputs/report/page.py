@@ -170,15 +170,15 @@ def _chip(name: str, count: int) -> str:
 
 def _next_step(finished: FinishedRun, *, served: bool) -> str:
     """Return instructions for writing the corrections to the other outputs."""
-    folder = shlex.quote(str(finished.folder))
+    annotate = f"shapecat annotate {shlex.quote(str(finished.folder))}"
     if served:
-        text, command = "Corrections are already in tracks.csv.", f"shapecat annotate {folder}"
+        text, command = "Corrections are already in tracks.csv.", annotate
     else:
-        text = "Download tracks.csv first."
-        command = f"shapecat annotate {folder} --labels ~/Downloads/tracks.csv"
+        text = "Download the table first."
+        command = f"{annotate} --labels ~/Downloads/tracks-….csv"
     return (
         f"{text} To write the corrections to annotated.mcap, review.rrd and later exports, run "
-        f"<code>{escape(command)}</code>"
+        f'<code id="command" data-annotate="{escape(annotate)}">{escape(command)}</code>'
     )
 
 
