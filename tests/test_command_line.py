@@ -583,8 +583,8 @@ def unwritable_stderr(how: str) -> Iterator[None]:
     [
         ("jsonl", "full"),
         ("auto", "closed"),
+        ("jsonl", "pipe"),
         pytest.param("rich", "full", marks=pytest.mark.many),
-        pytest.param("jsonl", "pipe", marks=pytest.mark.many),
     ],
 )
 def test_unwritable_stderr_does_not_end_the_work(
