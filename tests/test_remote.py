@@ -316,7 +316,7 @@ def made(served: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
     return folder
 
 
-PLACES = ["memory://half/run", "s3://lab/half/run"]
+PLACES = ["memory://half/run", pytest.param("s3://lab/half/run", marks=pytest.mark.many)]
 
 
 @pytest.mark.parametrize("url", PLACES)
@@ -352,7 +352,9 @@ def test_interrupted_upload_shows_no_run(
     assert files(url.removesuffix("/run")) == {f"run/{name}" for name in names}
 
 
-@pytest.mark.parametrize("url", ["memory://old/run", "s3://lab/old/run"])
+@pytest.mark.parametrize(
+    "url", [pytest.param("memory://old/run", marks=pytest.mark.many), "s3://lab/old/run"]
+)
 @pytest.mark.usefixtures("bucket")
 def test_labels_survive_killed_replacement(
     shapecat: Run, served: Path, monkeypatch: pytest.MonkeyPatch, url: str
