@@ -375,8 +375,8 @@ def test_recording_that_only_waited_has_one_try(recordings: Path, tmp_path: Path
 def test_full_disk_fails_only_large_recording(shapecat: Run, tmp_path: Path) -> None:
     """A limit on the file size simulates a full disk."""
     (tmp_path / "in").mkdir()
-    record(tmp_path / "in" / "long.mcap", FRAMES)
-    record(tmp_path / "in" / "short.mcap", 4)
+    record(tmp_path / "in" / "long.mcap", 8)
+    record(tmp_path / "in" / "short.mcap", 2)
     options = ("--jobs", 1, "--no-rrd", "--set", "reuse_frames=1")
     command = ("process", tmp_path / "in", *options, "--out", tmp_path / "out")
     assert shapecat(*command[:-1], tmp_path / "free").exit_code == 0
