@@ -10,6 +10,7 @@ from pathlib import Path
 from types import SimpleNamespace
 from typing import Any, get_args
 
+import fsspec
 import pytest
 
 from shapecat.batch.finding import Source, _key_of_all, find_recordings
@@ -112,6 +113,21 @@ def test_compressed_recordings_in_a_folder_are_named(
     assert [text.partition(": ")[0] for text in caplog.messages] == [
         str(tmp_path / name) for name in ("b.mcap.zstd", "c.bag.gz")
     ]
+
+
+def test_compressed_recordings_in_storage_are_named(caplog: pytest.LogCaptureFixture) -> None:
+    """As in a folder of this machine; those in a bag are parts of it."""
+    names = ("a.mcap", "b.mcap.zstd", "c.bag.gz", "bag/metadata.yaml", "bag/bag_0.db3.zstd")
+    for name in names:
+        with fsspec.open(f"memory://packed/{name}", "wb") as file:
+            file.write(b"x")
+
+    found = find_recordings(["memory://packed/"])
+
+    assert [kept.url for kept in found.kept] == ["memory:///packed/a.mcap", "memory:///packed/bag"]
+    assert [text.partition(": ")[0] for text in caplog.messages] == [
+        "memory:///packed/b.mcap.zstd", "memory:///packed/c.bag.gz"
+    ]  # fmt: skip
 
 
 def test_files_of_a_bag_are_not_counted_as_skipped(tmp_path: Path) -> None:

@@ -23,6 +23,7 @@ SUFFIXES = {".mcap", ".bag", ".db3"}
 _GAP_NS = 10**10
 """The longest time between the parts of a bag; takes are farther apart, or overlap."""
 _PACKED = {".zst", ".zstd", ".gz", ".bz2", ".xz", ".lz4", ".zip"}
+_UNPACK = "skipped: a compressed file, unpack it first"
 _MAGIC = (b"\x89MCAP", b"#ROSBAG", b"SQLite format 3")
 
 
@@ -133,14 +134,16 @@ def _search_remote(location: Location) -> Iterator[tuple[str, str, int]]:
             bags.add(parent)
         elif name in {"run.json", "frames.parquet"}:
             runs.add(parent)
-        elif _named_like_one(name.removesuffix(".zstd")) and "/." not in url:
+        elif (_named_like_one(name) or _is_packed(name)) and "/." not in url:
             files.append((url, content_key(info), _size(info)))
     parts: dict[str, list[tuple[str, str, int]]] = {bag: [] for bag in bags}
     for url, key, size in files:
         parent = url.rpartition("/")[0]
         if parent in bags:
             parts[parent].append((url, key, size))
-        elif parent not in runs and not url.endswith(".zstd"):
+        elif parent not in runs and _is_packed(url):
+            _log.error("%s: %s", url, _UNPACK)
+        elif parent not in runs:
             yield url, key, size
     for bag, found in parts.items():
         if found:
@@ -226,8 +229,14 @@ def _search(folder: Path, searched: set[Path]) -> Iterator[Path]:
             yield from _search(path, searched)
         elif is_folder or _named_like_one(path.name):
             yield path
-        elif path.suffix.lower() in _PACKED and _named_like_one(path.stem):
-            _log.error("%s: skipped: a compressed file, unpack it first", path)
+        elif _is_packed(path.name):
+            _log.error("%s: %s", path, _UNPACK)
+
+
+def _is_packed(name: str) -> bool:
+    """Return whether a path or URL ends like a compressed recording."""
+    path = PurePosixPath(name)
+    return path.suffix.lower() in _PACKED and _named_like_one(path.stem)
 
 
 def _whole(path: Path) -> Path:
