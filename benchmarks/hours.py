@@ -26,7 +26,7 @@ from shapecat.completion import DIRECTIONS
 from shapecat.config import TrackingSettings
 from shapecat.runs.segments import group_frames
 from shapecat.runs.table_schemas import DETECTIONS, FRAMES
-from shapecat.runs.tables import arrow_table, open_writer
+from shapecat.runs.table_writing import arrow_table, open_writer
 from shapecat.runs.tracks import track_run
 from shapecat.types import CATEGORIES
 

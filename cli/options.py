@@ -29,7 +29,9 @@ class _LocalPath(_NonEmptyPath):
     """A path on this machine: as one, a URL would lose a slash and name a local folder."""
 
     def convert(self, value: Any, param: click.Parameter | None, ctx: click.Context | None) -> Any:
-        if isinstance(value, str) and "://" in value:
+        from shapecat.batch.storage import is_url
+
+        if isinstance(value, str) and is_url(value):
             self.fail(f"{value} is a URL; only RECORDING and --out of `process` may be", param, ctx)
         return super().convert(value, param, ctx)
 

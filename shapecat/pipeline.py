@@ -241,14 +241,14 @@ def annotate(folder: Path, recording: Recording, run: RunInfo, observe: Observer
         from shapecat.runs.labels import read_labelled_frames  # noqa: PLC0415  the same
         from shapecat.runs.placed_frames import streams_with_poses  # noqa: PLC0415  the same
 
-        labelled = read_labelled_frames(folder, labels())
-        shown = observed(labelled, "review", total, observe)
+        final = labels()
+        shown = observed(read_labelled_frames(folder, final), "review", total, observe)
         write_review(
             folder / "review.rrd",
             with_clouds(shown, recording, run, streams_with_poses(folder)),
             name=recording.path.name,
             run=run,
-            labels=labels(),
+            labels=final,
             categories=run["model"]["categories"],
             cloud_points=settings["cloud_points"],
             fixed_frame=run["fixed_frame"],

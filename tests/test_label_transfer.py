@@ -19,7 +19,7 @@ from shapecat.runs.jobs import Job, keep_labels
 from shapecat.runs.label_transfer import TABLE_ALONE, match_labels, transfer_labels
 from shapecat.runs.same_objects import Match, _by_majority, _mutual_nearest
 from shapecat.runs.table_schemas import DETECTIONS, FRAMES, TRACKS
-from shapecat.runs.tables import write_table
+from shapecat.runs.table_writing import write_table
 from shapecat.runs.track_table import read_track_table
 from tests.mcap_files import read_ros
 from tests.run_info import run_info

@@ -27,17 +27,8 @@ from shapecat.runs.run_info import Counts, InputInfo, ModelInfo, Options, Origin
 from shapecat.runs.segments import count_segments
 from shapecat.runs.shown import _next_of_topic, read_shown_frames
 from shapecat.runs.table_schemas import ADDED, DETECTIONS, FRAMES, PLANES, TABLES, TRACKS
-from shapecat.runs.tables import (
-    arrow_table,
-    lists,
-    open_writer,
-    opened,
-    read_row_groups,
-    read_rows,
-    read_together,
-    with_fixed_lists,
-    write_table,
-)
+from shapecat.runs.table_writing import arrow_table, lists, open_writer, write_table
+from shapecat.runs.tables import opened, read_row_groups, read_rows, read_together, with_fixed_lists
 from shapecat.types import Box, Candidate, Detection, NeuralGas, Perception, Plane, Pose, Scene
 from tests.track_tables import write_tracks
 

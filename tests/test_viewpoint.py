@@ -61,7 +61,7 @@ def test_camera_of_transformed_cloud_is_found(invalid: float) -> None:
     found = find_viewpoint(posed(points), None)
 
     assert found is not None
-    fit, pose = found
+    fit, pose, _ = found
     for name in ("fx", "fy", "cx", "cy"):
         assert abs(getattr(fit.camera, name) - getattr(CAMERA, name)) < 0.01
     np.testing.assert_allclose(pose.translation, [0.3, -1.2, 0.8], atol=1e-4)

@@ -7,7 +7,7 @@ from typing import Any
 import pyarrow.parquet as pq
 
 from shapecat.runs.table_schemas import TRACKS
-from shapecat.runs.tables import write_table
+from shapecat.runs.table_writing import write_table
 
 __all__ = ["rows", "write_tracks"]
 

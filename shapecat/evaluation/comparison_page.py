@@ -17,7 +17,7 @@ from shapecat.evaluation.markup import figure_text, html_table
 from shapecat.outputs.counts import plural
 from shapecat.outputs.wording import confidence_text
 from shapecat.runs.table_schemas import FRAME_COLUMNS
-from shapecat.runs.tables import write_table
+from shapecat.runs.table_writing import write_table
 from shapecat.system.files import complete_folder
 from shapecat.types import UNKNOWN
 

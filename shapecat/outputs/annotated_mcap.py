@@ -174,33 +174,33 @@ def _annotations(frames: Iterable[ShownFrame]) -> Iterator[Annotation]:
 
 
 @dataclass(slots=True)
-class _Held:
-    """A frame, and the time to the next frame of its topic, ns; None if not yet known."""
+class _WaitingFrame:
+    """A frame, and the time to the next frame of its topic, ns: that before until it is known."""
 
     frame: ShownFrame
-    period: int | None = None
+    period: int = _PERIOD_NS
+    known: bool = False
 
 
 def _with_periods(frames: Iterable[ShownFrame]) -> Iterator[tuple[ShownFrame, int]]:
     """Yield frames with the time, ns, to the next frame of their topic, else from the last one."""
-    held: deque[_Held] = deque()
-    last: dict[str, _Held] = {}
-    periods: dict[str, int] = {}
+    waiting: deque[_WaitingFrame] = deque()
+    last: dict[str, _WaitingFrame] = {}
     for frame in frames:
-        if frame.topic in last:
-            before = last[frame.topic]
-            periods[frame.topic] = before.period = _period(before.frame, frame)
-        last[frame.topic] = _Held(frame)
-        held.append(last[frame.topic])
-        while held[0].period is not None or len(held) > _AHEAD:
-            one = held.popleft()
-            yield one.frame, one.period or periods.get(one.frame.topic, _PERIOD_NS)
-    for one in held:
-        yield one.frame, one.period or periods.get(one.frame.topic, _PERIOD_NS)
+        one = _WaitingFrame(frame)
+        if before := last.get(frame.topic):
+            before.period, before.known = _period(before.frame, frame), True
+            one.period = before.period
+        last[frame.topic] = one
+        waiting.append(one)
+        while waiting[0].known or len(waiting) > _AHEAD:
+            first = waiting.popleft()
+            yield first.frame, first.period
+    yield from ((one.frame, one.period) for one in waiting)
 
 
 def _period(frame: ShownFrame, following: ShownFrame) -> int:
-    """Return the time between two frames, ns: of viewers, whose time is the log time, at least."""
+    """Return the time between two frames, ns: by stamp, or by the log time of viewers if longer."""
     by_stamp = following.stamp_ns - frame.stamp_ns
     return max(1, by_stamp, following.log_time_ns - frame.log_time_ns)
 

@@ -16,7 +16,7 @@ from shapecat.recordings.transform_window import TransformWindow
 from shapecat.recordings.transforms import TransformError, fixed_frame
 from shapecat.types import Frame, Pose
 
-__all__ = ["MISNAMED", "Orientation", "Upright", "is_level", "turned"]
+__all__ = ["MISNAMED", "Orientation", "Upright", "has_z_up", "turned"]
 
 _LEVEL_FRAMES = ("map", "odom", "world", "earth", "base_footprint", "base_link")
 """Frames whose z axis is up by convention (REP 105, REP 103), also after the name of a robot."""
@@ -263,7 +263,7 @@ def _level_frames(frames: Sequence[str], sensor: str) -> list[str]:
         robot = name.rpartition("/")[0]
         return _rank(name), robot != "", not sensor.startswith(f"{robot}/")
 
-    return sorted(filter(is_level, frames), key=order)
+    return sorted(filter(has_z_up, frames), key=order)
 
 
 def turned(up: F4, named_from_data: F8) -> F4:
@@ -271,7 +271,7 @@ def turned(up: F4, named_from_data: F8) -> F4:
     return np.asarray(up @ named_from_data, np.float32)
 
 
-def is_level(frame_id: str) -> bool:
+def has_z_up(frame_id: str) -> bool:
     """Return whether z is up in a frame by convention, and the frame thus not one of a camera."""
     return _rank(frame_id) < len(_LEVEL_FRAMES)
 

@@ -34,7 +34,7 @@ from shapecat.recordings.mcap_records import (
     walk,
 )
 from shapecat.recordings.mcap_summary import Summary, read_summary
-from shapecat.recordings.message_compression import plain_data
+from shapecat.recordings.message_compression import decompressed
 from shapecat.recordings.messages import (
     Channel,
     Message,
@@ -114,7 +114,7 @@ class McapRecording(Recording):
             if selection.needed and not selection.needed(channel.topic, message.log_time):
                 data = b""
             else:
-                data = plain_data(self, channel, message.data)
+                data = decompressed(self, channel, message.data)
                 if data is None:
                     continue
                 data = bytes(data) if len(data) <= _SMALL else data

@@ -5,7 +5,7 @@ import zstandard
 from shapecat.recordings.messages import Channel
 from shapecat.recordings.recording import Recording
 
-__all__ = ["plain_data"]
+__all__ = ["decompressed"]
 
 _ZSTD = b"\x28\xb5\x2f\xfd"
 """First bytes of a compressed message; a CDR message begins with a zero byte."""
@@ -13,7 +13,7 @@ _LARGEST = 1 << 30
 """Compressed messages that claim a larger decompressed size, in bytes, are skipped."""
 
 
-def plain_data(
+def decompressed(
     recording: Recording, channel: Channel, data: bytes | memoryview
 ) -> bytes | memoryview | None:
     """Return a message's data, decompressed if necessary; None, with a warning, if that fails."""

@@ -13,7 +13,7 @@ from rosbags.rosbag2.metadata import dump_qos_v8
 
 from shapecat.errors import RecordingError
 from shapecat.recordings.decoding import LIBRARY_ERRORS
-from shapecat.recordings.message_compression import plain_data
+from shapecat.recordings.message_compression import decompressed
 from shapecat.recordings.messages import (
     Channel,
     Message,
@@ -122,7 +122,7 @@ class DatabaseRecording(Recording):
             if not isinstance(data, bytes | memoryview):
                 self.warn(f"{channel.topic}: skipped a message without bytes")
                 continue
-            plain = plain_data(self, channel, bytes(data))
+            plain = decompressed(self, channel, bytes(data))
             if plain is not None:
                 yield Message(channel, time, time, 0, plain)
 

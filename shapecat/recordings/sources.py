@@ -111,10 +111,10 @@ class PointsSource(Source):
         if points.size == 0:
             msg = "empty cloud"
             raise MessageError(msg)
-        content = self._image(points) if min(points.shape[:2]) > 1 else None
+        content = self._depth_image(points) if min(points.shape[:2]) > 1 else None
         return unorganized(points) if content is None else content
 
-    def _image(self, points: F4) -> dict[str, Any] | None:
+    def _depth_image(self, points: F4) -> dict[str, Any] | None:
         """Return the depth image of an organized cloud; None if no camera fits.
 
         The camera of earlier frames is kept if it still fits.
@@ -122,11 +122,10 @@ class PointsSource(Source):
         image = points if self.pose is None else seen_from(self.pose, points)
         if self.fit is None or not still_fits(self.fit, image):
             own = fit_pinhole(points)
-            found = find_viewpoint(points, self.fit) if own is None else (own, None)
+            found = find_viewpoint(points, self.fit) if own is None else (own, None, points)
             if found is None:
                 return None
-            self.fit, self.pose = found
-            image = points if self.pose is None else seen_from(self.pose, points)
+            self.fit, self.pose, image = found
         return {**organized(image, self.fit.camera), "frame_from_sensor": self.pose}
 
 

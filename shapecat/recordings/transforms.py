@@ -248,11 +248,13 @@ def fixed_frame(buffer: TransformBuffer, frame_id: str, at_ns: int | None = None
     connected = [name for name in buffer.frames if _is_below(buffer, name, root)]
     found = [n for wanted in _FIXED for n in connected if n.rsplit("/", 1)[-1] == wanted]
     found += [root] if root != frame_id.lstrip("/") else []
-    known = [name for name in found if at_ns is None or _reaches(buffer, name, frame_id, at_ns)]
+    known = [
+        name for name in found if at_ns is None or _can_transform(buffer, name, frame_id, at_ns)
+    ]
     return next(iter(known or found), None)
 
 
-def _reaches(buffer: TransformBuffer, target: str, source: str, stamp_ns: int) -> bool:
+def _can_transform(buffer: TransformBuffer, target: str, source: str, stamp_ns: int) -> bool:
     try:
         buffer.lookup(target, source, stamp_ns)
     except TransformError:

@@ -17,7 +17,7 @@ of a single plane, any of many cameras fits, and both are equal."""
 _ROUNDS = 3
 
 
-def find_viewpoint(points: F4, known: PinholeFit | None) -> tuple[PinholeFit, Pose] | None:
+def find_viewpoint(points: F4, known: PinholeFit | None) -> tuple[PinholeFit, Pose, F4] | None:
     """Find the pinhole camera that took an organized cloud, and its pose in the cloud's frame.
 
     The method is the direct linear transform (Hartley and Zisserman 2004, 7.1) with normalized
@@ -30,8 +30,8 @@ def find_viewpoint(points: F4, known: PinholeFit | None) -> tuple[PinholeFit, Po
 
     Returns
     -------
-    The camera and ``frame_from_camera``; None if no camera fits, or if the points do not determine
-    one, as those of a single plane.
+    The camera, ``frame_from_camera``, and the points (h, w, 3) in the frame of the camera; None if
+    no camera fits, or if the points do not determine one, as those of a single plane.
     """
     sample = sample_pixels(points, lambda flat: np.asarray(flat.any(axis=1)))
     if sample is None:
@@ -43,7 +43,7 @@ def find_viewpoint(points: F4, known: PinholeFit | None) -> tuple[PinholeFit, Po
     places = np.column_stack([(chosen - middle) / scale, np.ones(len(chosen))])
     keep = np.ones(len(places), bool)
     for _ in range(_ROUNDS):
-        matrix, unclear = _projection(places[keep], pixels[keep])
+        matrix, unclear = _projection_matrix(places[keep], pixels[keep])
         with np.errstate(divide="ignore", invalid="ignore"):
             seen = places @ matrix.T
             error = np.linalg.norm(seen[:, :2] / seen[:, 2:] - pixels, axis=1)
@@ -53,10 +53,10 @@ def find_viewpoint(points: F4, known: PinholeFit | None) -> tuple[PinholeFit, Po
     if unclear > _CLEAR or not linear.any():
         return None
     center = middle - scale * np.linalg.solve(matrix[:, :3], matrix[:, 3])
-    pose = Pose(_rotation(linear).T, center)
+    pose = Pose(_rq_rotation(linear).T, center)
     image = seen_from(pose, points)
     fit = known if known is not None and still_fits(known, image) else fit_pinhole(image)
-    return None if fit is None or fit.camera.fx > _LONGEST * width else (fit, pose)
+    return None if fit is None or fit.camera.fx > _LONGEST * width else (fit, pose, image)
 
 
 def seen_from(pose: Pose, points: F4) -> F4:
@@ -72,7 +72,7 @@ def seen_from(pose: Pose, points: F4) -> F4:
     return np.asarray(image)
 
 
-def _projection(places: F8, pixels: F8) -> tuple[F8, float]:
+def _projection_matrix(places: F8, pixels: F8) -> tuple[F8, float]:
     """Return the matrix (3, 4) that projects places (n, 4) to pixels (n, 2), and how unclear it is.
 
     That is the squared ratio of the two smallest singular values of the equations.
@@ -88,7 +88,7 @@ def _projection(places: F8, pixels: F8) -> tuple[F8, float]:
     return vectors[:, 0].reshape(3, 4), float(max(values[0], 0) / max(values[1], 1e-300))
 
 
-def _rotation(linear: F8) -> F8:
-    """Return the rotation of a matrix (3, 3) that is an upper triangular one times a rotation."""
+def _rq_rotation(linear: F8) -> F8:
+    """Return the rotation R of a matrix (3, 3) that is an upper triangular one times R."""
     rows, triangle = np.linalg.qr(linear[::-1].T)
     return np.asarray(rows.T[::-1] * np.sign(np.diag(triangle)[::-1, None]))

@@ -23,7 +23,7 @@ from shapecat.runs.segments import (
     write_segment,
 )
 from shapecat.runs.table_schemas import PERCEIVED, SCHEMA_VERSION
-from shapecat.runs.tables import arrow_table, lists, open_writer
+from shapecat.runs.table_writing import arrow_table, lists, open_writer
 from shapecat.system.files import complete_folder, replacing
 from shapecat.types import Perception, Pose
 

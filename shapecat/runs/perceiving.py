@@ -22,7 +22,7 @@ from shapecat.executors.order import Processes
 from shapecat.learning import Categorizer
 from shapecat.perception import Perceiver, View, find_up
 from shapecat.recordings import Recording, choose_streams
-from shapecat.recordings.gravity import MISNAMED, Orientation, Upright, is_level, turned
+from shapecat.recordings.gravity import MISNAMED, Orientation, Upright, has_z_up, turned
 from shapecat.rehearsal import rehearse
 from shapecat.runs.jobs import Job
 from shapecat.runs.perceived import FrameRow, PerceptionTables
@@ -214,7 +214,7 @@ class _UpTrial:
     def _look(self, frame: Frame, orientation: Orientation) -> None:
         self._looks[frame.topic] += 1
         given, off = orientation.up, self._off_deg.get(frame.topic, [])
-        elsewhere = frame.points is not None and is_level(frame.frame_id)
+        elsewhere = frame.points is not None and has_z_up(frame.frame_id)
         if elsewhere and self._looks[frame.topic] == 1:
             self._upright.warnings.append(
                 f"{frame.topic}: its clouds are in {frame.frame_id}, which is not the frame of a "

@@ -123,7 +123,8 @@ def read_shown_frames(
     """
     shown = ShownTracks.read(folder, labels)
     plain_columns = ("topic", "frame", "stamp_ns", "log_time_ns", "frame_id")
-    wanted = (*plain_columns, "up", "frame_translation", "frame_rotation")
+    pose_columns = ("frame_translation", "frame_rotation")
+    wanted = (*plain_columns, "up", *pose_columns)
     found = ("topic", "frame", "detection", "center", "size", "orientation")
     merged = len({label.track for label in labels.values()}) < len(labels)
     tables = {"frames": wanted, "detections": found}
@@ -135,7 +136,7 @@ def read_shown_frames(
             ups = numbers(frames["up"]).reshape(-1, 3)
             boxes = map(_joined, boxes, ups)
         if frames["frame_rotation"].null_count < len(frames):
-            poses = (frames[name].to_pylist() for name in wanted[-2:])
+            poses = (frames[name].to_pylist() for name in pose_columns)
             boxes = map(_in_named_frame, boxes, *poses)
         ended = (shown.ended.get(key, ()) for key in keys)
         yield from map(ShownFrame, *plain, boxes, ended)

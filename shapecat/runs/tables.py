@@ -15,11 +15,10 @@ import pyarrow.parquet as pq
 
 from shapecat.arrays import F4, I4
 from shapecat.errors import OutputError
-from shapecat.runs.table_schemas import ADDED, FIXED_LISTS, FULL_BOX, MAY_BE_NULL, TABLES
+from shapecat.runs.table_schemas import ADDED, FIXED_LISTS, FULL_BOX, TABLES
 
 __all__ = [
     "Key",
-    "arrow_table",
     "count_rows",
     "first_stamp",
     "frame_rows",
@@ -27,20 +26,14 @@ __all__ = [
     "keys_of",
     "numbers",
     "numbers_or_nan",
-    "open_writer",
     "opened",
     "read_row_groups",
     "read_rows",
     "read_together",
-    "rows_as_lists",
     "rows_of",
     "topic_codes",
     "with_fixed_lists",
-    "write_table",
 ]
-
-# Arrow's own allocator holds 50 MB more while a long recording is read, and takes longer.
-pa.set_memory_pool(pa.system_memory_pool())
 
 _NUMBERS = {"center", "size", "orientation", "posterior", *FULL_BOX}
 """Columns whose numbers are finite."""
@@ -69,13 +62,6 @@ def first_stamp(folder: Path) -> int:
     """
     groups = read_row_groups(folder / "frames.parquet", ["stamp_ns"])
     return min((int(numbers(group["stamp_ns"]).min()) for group in groups if len(group)), default=0)
-
-
-def write_table(path: Path, columns: dict[str, Any], schema: pa.Schema) -> None:
-    """Write a table as one row group."""
-    writer = open_writer(path, schema)
-    with writer:
-        writer.write_table(arrow_table(columns, schema))
 
 
 def read_row_groups(
@@ -252,7 +238,7 @@ def _with_added(table: pa.Table, schema: pa.Schema, columns: Sequence[str] | Non
 
 
 def with_fixed_lists(table: pa.Table) -> pa.Table:
-    """Return rows of a table as read, with the lists of fixed size that `open_writer` writes.
+    """Return rows of a table as read, with the lists of fixed size of its schema.
 
     Raises
     ------
@@ -280,62 +266,13 @@ def _wrong_column(found: pa.Schema, wanted: pa.Schema) -> str:
                 continue
             return f"no column {field.name}"
         kind = found.field(field.name).type
-        if (kind.value_type if pa.types.is_dictionary(kind) else kind) not in _readable(field.type):
+        if (kind.value_type if pa.types.is_dictionary(kind) else kind) not in _file_types(
+            field.type
+        ):
             return f"column {field.name} holds {kind}, not {field.type}"
     return ""
 
 
-def _readable(kind: pa.DataType) -> tuple[pa.DataType, ...]:
+def _file_types(kind: pa.DataType) -> tuple[pa.DataType, ...]:
     """Return the types that a column may have in a file; earlier versions wrote no plain lists."""
     return (kind, pa.list_(kind.value_type)) if pa.types.is_fixed_size_list(kind) else (kind,)
-
-
-class _Writer(pq.ParquetWriter):  # type: ignore[misc]  # pyarrow has no types
-    """Writes row groups with the lists of fixed size that may be null as plain lists.
-
-    Arrow before version 26, and what uses it, cannot read nulls among lists of fixed size.
-    """
-
-    def write_table(self, table: pa.Table) -> None:
-        super().write_table(table.cast(self.schema))
-
-
-def open_writer(path: Path, schema: pa.Schema) -> pq.ParquetWriter:
-    """Open a table for writing row groups."""
-    # Ascending pixel indices shrink tenfold as differences; a dictionary does not help floats.
-    texts = [f.name for f in schema if f.type == pa.string()]
-    deltas = {f"{n}.list.element": "DELTA_BINARY_PACKED" for n in ("indices",) if n in schema.names}
-    plain = {name: pa.list_(FIXED_LISTS[name].value_type) for name in MAY_BE_NULL}
-    fields = [field.with_type(plain.get(field.name, field.type)) for field in schema]
-    return _Writer(
-        path,
-        pa.schema(fields, schema.metadata),
-        compression="zstd",
-        use_dictionary=texts,
-        column_encoding=deltas or None,
-        # The statistics of all columns of a long recording take ten megabytes to read.
-        write_statistics=[n for n in ("topic", "frame", "stamp_ns", "track") if n in schema.names],
-    )
-
-
-def arrow_table(columns: dict[str, Any], schema: pa.Schema) -> pa.Table:
-    """Make a table with the given schema from columns by name."""
-    arrays = [
-        column if isinstance(column, pa.Array) else pa.array(column, field.type)
-        for field, column in ((field, columns[field.name]) for field in schema)
-    ]
-    return pa.Table.from_arrays(arrays, schema=schema)
-
-
-def lists(rows: Sequence[Any], kind: pa.DataType) -> pa.Array:
-    """Return rows of numbers, which may differ in length, as a list column of type ``kind``."""
-    flat = [np.ravel(row) for row in rows]
-    offsets = np.concatenate([[0], np.cumsum([row.size for row in flat])]).astype(np.int32)
-    values = np.concatenate(flat) if flat else np.zeros(0)
-    return pa.ListArray.from_arrays(offsets, pa.array(values.astype(kind.to_pandas_dtype())))
-
-
-def rows_as_lists(values: F4) -> pa.Array:
-    """Return the rows of an array (n, c) as a list column of float32."""
-    offsets = np.arange(len(values) + 1, dtype=np.int32) * values.shape[1]
-    return pa.ListArray.from_arrays(offsets, pa.array(values.astype(np.float32).ravel()))

@@ -16,16 +16,14 @@ from shapecat.config import TrackingSettings
 from shapecat.runs.full_boxes import FullBoxes, full_columns
 from shapecat.runs.placed_frames import streams_with_poses
 from shapecat.runs.table_schemas import TRACKS
+from shapecat.runs.table_writing import arrow_table, open_writer, rows_as_lists
 from shapecat.runs.tables import (
     Key,
-    arrow_table,
     first_stamp,
     frame_rows,
     numbers,
     numbers_or_nan,
-    open_writer,
     read_together,
-    rows_as_lists,
 )
 from shapecat.runs.track_table import ORIGINAL, write_csv
 from shapecat.system.files import replacing

@@ -27,7 +27,7 @@ def report_up(upright: Upright, folder: Path) -> dict[str, Any]:
         upright.warnings.append(
             f"failed transform look-ups: {upright.failed}, the first: {upright.first_failure}"
         )
-        upright.warnings += _unplaced(folder, upright.fixed_frame)
+        upright.warnings += _missing_poses(folder, upright.fixed_frame)
     given = upright.given
     report: dict[str, Any] = {"source": max(given, key=lambda name: given[name], default="planes")}
     if upright.dropped:
@@ -43,7 +43,7 @@ def report_up(upright: Upright, folder: Path) -> dict[str, Any]:
     return report
 
 
-def _unplaced(folder: Path, fixed_frame: str | None) -> Iterator[str]:
+def _missing_poses(folder: Path, fixed_frame: str | None) -> Iterator[str]:
     """Yield a warning for each topic of which frames have no pose in the fixed frame."""
     if fixed_frame is None:  # all tracks are in the sensor frame
         return
