@@ -428,7 +428,9 @@ CASES: dict[str, Case] = {
     "ros 2 mcap file-compressed": Case(lambda p: folder(p, _MCAP, _MODE.FILE)),
     "ros 2 splits": Case(splits, frames=2 * FRAMES, reported="metadata"),
     "ros 2 with a damaged part": Case(damaged_part, reported="skipped a_1.db3"),
-    "ros 2 beside other files": Case(lambda p: with_other_files(p, note="mine")),
+    "ros 2 beside other files": Case(
+        lambda p: with_other_files(p, note="mine"), reported="old.mcap"
+    ),
     "db3": Case(lambda p: database(p, definitions=True)),
     "db3 without definitions": Case(lambda p: database(p, definitions=False), reported="Humble"),
     "compressed depth png": Case(lambda p: compressed_depth(p, depth.png), frames=2),

@@ -412,6 +412,9 @@ def test_file_not_listed_in_metadata_is_not_read(tmp_path: Path) -> None:
         listed = plain.replace("- bag.mcap\n", f"- {quote}bag.mcap{quote}\n")
         (path / "metadata.yaml").write_text(listed)
         assert times_read(path) == [k * SECOND for k in range(5)]
+    with open_recording(path) as recording:  # or a take in the wrong folder would be missed
+        skipped = "files that metadata.yaml does not name are not read: another.mcap"
+        assert recording.warnings == [skipped]
     (path / "metadata.yaml").unlink()
     assert len(times_read(path)) == 7
 

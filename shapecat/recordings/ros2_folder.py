@@ -98,6 +98,10 @@ class FolderRecording(Recording):
             self.warn(f"parts named in metadata.yaml are missing: {', '.join(missing)}")
         whole = [f for f in present if f.suffix != ".zstd" or f.stem not in names]  # no copies
         chosen = [file for file in present if file.name in listed] or whole
+        used = {file.name.removesuffix(".zstd") for file in chosen}
+        others = [file.name for file in present if file.name.removesuffix(".zstd") not in used]
+        if others:
+            self.warn(f"files that metadata.yaml does not name are not read: {', '.join(others)}")
         if not chosen:
             msg = "a folder without .mcap or .db3 files"
             raise RecordingError(msg)
