@@ -63,6 +63,7 @@ def evaluate(
     if page is not None:
         name = dataset.resolve().name  # of `.` too
         write_page(page, report, title=f"{name}: {plural(report.n, 'view')}")
+        click.echo(page, err=True)  # stdout has the figures
     if as_json:
         print_json(report.as_dict())
     else:

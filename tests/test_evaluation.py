@@ -576,11 +576,16 @@ def test_report_pictures_are_drawn_to_scale() -> None:
 
     curve = calibration_svg(report.calibration)
     assert drawn(curve, "circle", "cx", "cy", "r") == [
-        (f"{34 + 224 * 0.9:.1f}", f"{18 + 224 * 0.25:.1f}", f"{2 + 14 * 0.8**0.5:.1f}"),
-        (f"{34 + 224 * 0.6:.1f}", f"{18 + 224 * 0.5:.1f}", f"{2 + 14 * 0.2**0.5:.1f}"),
+        (f"{46 + 224 * 0.9:.1f}", f"{18 + 224 * 0.25:.1f}", f"{2 + 14 * 0.8**0.5:.1f}"),
+        (f"{46 + 224 * 0.6:.1f}", f"{18 + 224 * 0.5:.1f}", f"{2 + 14 * 0.2**0.5:.1f}"),
     ]
-    assert drawn(curve, "line", "x1", "y1", "x2", "y2") == [("34.0", "242.0", "258.0", "18.0")]
-    assert drawn(curve, "text", "text") == [("confidence",), ("accuracy",)]
+    assert drawn(curve, "line", "x1", "y1", "x2", "y2") == [("46.0", "242.0", "270.0", "18.0")]
+    assert drawn(curve, "text", "text", "x", "y")[1:] == [
+        ("accuracy", None, None),
+        ("0", "46.0", "257.0"), ("0", "41.0", "246.0"),
+        ("0.5", "158.0", "257.0"), ("0.5", "41.0", "134.0"),
+        ("1", "270.0", "257.0"), ("1", "41.0", "22.0"),
+    ]  # fmt: skip
 
     bars = accuracy_svg(report.by_distance)
     assert drawn(bars, "rect", "x", "y", "width", "height")[:-1] == [
@@ -588,7 +593,7 @@ def test_report_pictures_are_drawn_to_scale() -> None:
         ("96", f"{51 - 26 / 2:.1f}", f"{328 * 0.875:.1f}", "26.0"),
     ]
     confusion = confusion_svg(report.categories, report.confusion)
-    for picture, width, height in ((confusion, 212, 212), (curve, 280, 280), (bars, 480, 68)):
+    for picture, width, height in ((confusion, 212, 212), (curve, 290, 290), (bars, 480, 68)):
         whole = drawn(picture, "svg", "width", "height", "viewBox")  # otherwise they are cut off
         assert whole == [(str(width), str(height), f"0 0 {width} {height}")]
     assert drawn(bars, "text", "text", "y") == [
@@ -628,6 +633,8 @@ def test_command_writes_the_page(
 
     assert result.exit_code == 0, result.output
     assert "data: 8 views" in page.read_text("utf-8")
+    assert result.stderr == f"{page}\n"
+    assert json.loads(result.stdout)["n"] == 8
 
 
 def test_reports_of_other_formats_are_refused(tmp_path: Path) -> None:

@@ -231,6 +231,17 @@ def test_timelines_end_with_the_last_track(run: Path) -> None:
     assert [line.split()[-1].split(",")[0] for line in lines[::3]] == ["120", "300", "144"]
 
 
+def test_card_of_a_single_frame_has_no_timeline() -> None:
+    """A plot over no time is an empty box."""
+    card = worked_card()
+    line = Timeline(np.zeros(1), np.ones(1, bool), card.timeline.causal[:1], ())
+    text = card_html(replace(card, timeline=line), NAMES, ("unknown", *NAMES), 0.0)
+
+    assert 'class="line"' not in text
+    assert "1 view · 0.0 s" in text
+    assert 'class="line"' in card_html(card, NAMES, ("unknown", *NAMES), 4.0)
+
+
 def test_long_timeline_includes_both_ends() -> None:
     """The last posterior of a track is the one that counts."""
     assert _few(80).tolist() == list(range(80))

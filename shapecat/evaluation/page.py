@@ -161,15 +161,22 @@ def confusion_svg(categories: Sequence[str], table: Sequence[Sequence[int]]) -> 
 
 def calibration_svg(curve: Sequence[Bin]) -> str:
     """Return a calibration curve as SVG; the area of a dot shows its number of views."""
-    size = 280
-    low, top, side = 34.0, 18.0, size - 56.0  # room for the largest dot in a corner
+    size = 290
+    low, top, side = 46.0, 18.0, size - 66.0  # room for the largest dot in a corner
     high, bottom = low + side, top + side
+    centred = 'text-anchor="middle"'
     parts = [
         f'<rect x="{low}" y="{top}" width="{side}" height="{side}" fill="none" stroke="#999"/>',
         f'<line x1="{low}" y1="{bottom}" x2="{high}" y2="{top}" stroke="#bbb"/>',
-        f'<text x="{low + side / 2}" y="{size - 8}" text-anchor="middle">confidence</text>',
-        f'<text transform="translate(16 {top + side / 2}) rotate(-90)">accuracy</text>',
+        f'<text x="{low + side / 2}" y="{size - 10}" {centred}>confidence</text>',
+        f'<text transform="translate(12 {top + side / 2}) rotate(-90)" {centred}>accuracy</text>',
     ]
+    for share in (0.0, 0.5, 1.0):
+        x, y = low + side * share, bottom - side * share
+        parts += [
+            f'<text x="{x}" y="{bottom + 15}" {centred} fill="#777">{share:g}</text>',
+            f'<text x="{low - 5}" y="{y + 4}" text-anchor="end" fill="#777">{share:g}</text>',
+        ]
     total = max(sum(item.views for item in curve), 1)
     parts += [
         f'<circle cx="{low + side * item.confidence:.1f}" '

@@ -152,11 +152,16 @@ def _bar(name: str, share: float, digit: str) -> str:
 
 
 def _time_line(line: Timeline, categories: Sequence[str], end: float) -> str:
-    """Return a plot of the causal posterior over time, with the times of detection below it."""
+    """Return a plot of the causal posterior over time, with the times of detection below it.
+
+    It is empty if the recording has a single frame.
+    """
+    if end <= 0:
+        return ""
     chosen = _few(len(line.seconds))
     if len(chosen) == 1:
         chosen = chosen.repeat(2)  # a line with one point is not drawn
-    x = np.round(300 * line.seconds[chosen] / (end or 1), 1)
+    x = np.round(300 * line.seconds[chosen] / end, 1)
     best = np.argsort(-line.causal.max(axis=0, initial=0), kind="stable")[:_LINES]
     lines = []
     for k in best[::-1].tolist():
@@ -167,7 +172,7 @@ def _time_line(line: Timeline, categories: Sequence[str], end: float) -> str:
         lines.append(f'<polyline points="{dots}" stroke="{css_colour(categories[k])}"/>')
     seen = "".join(
         f'<rect class="seen" x="{a:.1f}" y="38" width="{max(b - a, 1.5):.1f}" height="3" rx="1"/>'
-        for a, b in _spans(line.seconds, line.seen, 300 / (end or 1))
+        for a, b in _spans(line.seconds, line.seen, 300 / end)
     )
     return (
         '<svg class="line" viewBox="0 0 300 44" preserveAspectRatio="none" role="img" '
