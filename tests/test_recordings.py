@@ -575,7 +575,7 @@ def test_database_without_definitions_uses_humble(tmp_path: Path) -> None:
         ("empty.bag", b"", "is empty"),
         ("text.mcap", b"hello world", "begins with 'hello wo'"),
         ("a.mcap.zstd", zstandard.compress(b"\x89MCAP0"), "a compressed file: unpack it first"),
-        ("a.bag.gz", gzip.compress(b"#ROSBAG"), "a compressed file: unpack it first"),
+        ("a.bag.gz", gzip.compress(b"#ROSBAG", mtime=0), "a compressed file: unpack it first"),
         ("bag.bag", b"#ROSBAG V1.2\n", "not a readable ROS 1 bag"),
         ("base.db3", b"SQLite format 3\0" + bytes(200), "not a readable ROS 2 bag"),
     ],
