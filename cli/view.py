@@ -34,6 +34,9 @@ def view(*, run: Path, web: bool, screenshot: Path | None) -> None:
     from shapecat.runs.folder import read_run
     from shapecat.system.files import require_writable
 
+    if web and screenshot is not None:
+        msg = "--web and --screenshot exclude each other"
+        raise click.UsageError(msg)
     review = run if run.is_file() else run / "review.rrd"
     if not review.is_file():
         read_run(run)  # if there is no run, says that

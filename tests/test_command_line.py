@@ -195,6 +195,28 @@ def test_simulate_needs_name_of_recording(
 
 
 @pytest.mark.parametrize(
+    ("words", "said"),
+    [
+        (("report", "a", "--port", "8000"), "--port needs --serve"),
+        (("view", "a", "--web", "--screenshot", "a.png"), "--web and --screenshot exclude"),
+    ],
+)
+def test_option_without_effect_is_wrong_usage(
+    shapecat: Run,
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+    words: tuple[str, ...],
+    said: str,
+) -> None:
+    """Ignoring one of two options surprises whoever gave both."""
+    monkeypatch.chdir(tmp_path)
+    result = shapecat(*words)
+
+    assert result.exit_code == 2
+    assert said in result.stderr
+
+
+@pytest.mark.parametrize(
     "words",
     [
         *(("info", ""), ("report", ""), ("view", ""), ("simulate", ""), ("annotate", "")),
