@@ -632,6 +632,17 @@ def test_unwritable_stderr_does_not_end_the_work(
     assert "1 complete, 1 failed" in capfd.readouterr().out
 
 
+def test_stderr_can_be_flushed_when_python_ends(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Python 3.13 flushes it after all names of its module are None, and prints errors of that."""
+    monkeypatch.setattr(sys, "stderr", sys.__stderr__)
+    forgive_stderr()
+    module = import_module("shapecat.system.stderr")
+    for name in [name for name in vars(module) if not name.startswith("__")]:
+        monkeypatch.setattr(module, name, None)
+    sys.stderr.write("")
+    sys.stderr.flush()
+
+
 COMPLAIN = """
 import sys, types, shapecat.__main__ as entry
 

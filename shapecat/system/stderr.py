@@ -3,24 +3,29 @@
 import io
 import os
 import sys
-from contextlib import suppress
 
 __all__ = ["forgive_stderr"]
 
 
 class _Forgiving(io.TextIOWrapper):
-    """A stream that drops what cannot be written."""
+    """A stream that drops what cannot be written.
+
+    Its methods use no global name: Python flushes stderr after it has cleared the modules.
+    """
 
     def write(self, text: str) -> int:
         """Write a text, or drop it."""
-        with suppress(OSError):
-            super().write(text)
-        return len(text)
+        try:
+            return super().write(text)
+        except OSError:
+            return len(text)
 
     def flush(self) -> None:
         """Write what is in the buffer, as far as possible."""
-        with suppress(OSError):
+        try:  # noqa: SIM105  `suppress` would be a global name
             super().flush()
+        except OSError:
+            pass
 
 
 def forgive_stderr() -> None:
