@@ -420,6 +420,20 @@ def test_partial_run_of_other_work_is_discarded(source: Path, tmp_path: Path, wh
     assert read_run(folder)["id"] == wanted["id"]
 
 
+@pytest.mark.parametrize(
+    "name", ["segments/000000/frames.arrow", "revisions/000000/planes.arrow", "planes.parquet"]
+)
+def test_truncated_partial_run_is_discarded(source: Path, tmp_path: Path, name: str) -> None:
+    """After a power cut with --no-fsync, each further command would stop at the same file."""
+    folder, wanted = tmp_path / "half", planned(source)
+    partial(folder, planned(source))
+    (folder / name).parent.mkdir(parents=True, exist_ok=True)
+    (folder / name).write_bytes(b"")
+
+    assert resume(folder, wanted, source, lambda: "")["id"] == wanted["id"]
+    assert not (folder / name).exists()
+
+
 def status_of(job: Job, source: Path, out: Path) -> str:
     with plan_batch(job, [str(source.parent)], str(out)) as batch:
         return next(task.status for task in batch.tasks if task.job.folder.name == source.stem)

@@ -11,7 +11,7 @@ from shapecat.runs.folder import OUTPUT_OPTIONS, clear, read_run, write_run
 from shapecat.runs.identity import same_content, unchanged
 from shapecat.runs.jobs import differences
 from shapecat.runs.run_info import RunInfo
-from shapecat.runs.segments import count_segments
+from shapecat.runs.segments import count_segments, require_whole
 from shapecat.runs.table_schemas import PERCEIVED
 from shapecat.runs.tables import count_rows
 
@@ -24,8 +24,9 @@ _LATER = ("tracking.", "outputs.")
 def resume(folder: Path, planned: RunInfo, source: Path, digest: Callable[[], str]) -> RunInfo:
     """Return the run.json of the interrupted run in a folder if ``planned`` can continue it.
 
-    That is possible if settings, options, model, versions and recording are the same. Otherwise
-    clear the folder, write ``planned`` as its run.json and return ``planned``.
+    That is possible if settings, options, model, versions and recording are the same, and its
+    files are whole. Otherwise clear the folder, write ``planned`` as its run.json and return
+    ``planned``.
 
     Parameters
     ----------
@@ -41,6 +42,7 @@ def resume(folder: Path, planned: RunInfo, source: Path, digest: Callable[[], st
         if not differences(run, planned) and _same_recording_and_versions(
             run, planned, source, digest
         ):
+            _require_whole(folder)
             if "perceive" in run["seconds"]:
                 run["counts"]["resumed"] = run["counts"]["frames"]
             return {**run, "input": planned["input"]}
@@ -95,6 +97,19 @@ def has_work(folder: Path) -> bool:
     with suppress(OutputError):
         return count_segments(folder) > 0 or "perceive" in read_run(folder)["seconds"]
     return False
+
+
+def _require_whole(folder: Path) -> None:
+    """Check that all files of perceive can be opened: a power cut may have truncated them.
+
+    Raises
+    ------
+    OutputError : a file is unreadable.
+    """
+    require_whole(folder)
+    for table in PERCEIVED:
+        if (folder / f"{table}.parquet").exists():
+            count_rows(folder, table)
 
 
 def _with_outputs(run: RunInfo, planned: RunInfo) -> RunInfo:

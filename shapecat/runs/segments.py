@@ -6,6 +6,7 @@ them again and again, so a kill while they are joined does no harm.
 
 import shutil
 from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
 from functools import lru_cache
 from math import isqrt
 from pathlib import Path
@@ -26,6 +27,7 @@ __all__ = [
     "list_segments",
     "read_segment",
     "read_segments",
+    "require_whole",
     "row_groups",
     "write_segment",
 ]
@@ -156,12 +158,30 @@ def read_segment(segment: Path, name: str) -> pa.Table:
     ------
     OutputError : the file is unreadable.
     """
-    path = _part(segment, name)
+    with _opened(_part(segment, name)) as reader:
+        return reader.read_all()
+
+
+def require_whole(folder: Path) -> None:
+    """Check that all segments of an interrupted run can be opened; their rows are not read.
+
+    Raises
+    ------
+    OutputError : a file is unreadable.
+    """
+    for name in (SEGMENTS, REVISIONS):
+        for part in (folder / name).glob("[0-9]*/*"):
+            with _opened(part):
+                pass
+
+
+@contextmanager
+def _opened(path: Path) -> Iterator[pa.ipc.RecordBatchFileReader]:
     try:
         with pa.OSFile(str(path), "rb") as source, pa.ipc.open_file(source) as reader:
-            return reader.read_all()
+            yield reader
     except (OSError, pa.ArrowException) as error:
-        msg = f"{path}: unreadable, left by a killed run ({error}); use --overwrite"
+        msg = f"{path}: unreadable, left by a killed run ({error})"
         raise OutputError(msg) from error
 
 
