@@ -78,8 +78,12 @@ def make_run(
     fixed_frame: str | None = "map",
     size: float | tuple[float, float, float] = 0.08,
     labels: Mapping[int, str] | None = None,
+    alike: int = 1,
 ) -> Path:
-    """Write the tables of a run whose tracks are at the given positions."""
+    """Write the tables of a run whose tracks are at the given positions.
+
+    ``alike`` is the number of successive frames with the same stamp.
+    """
     folder.mkdir(parents=True)
     work = work or f"w{folder.name}"
     source = {"path": f"/recordings/{folder.name}.mcap", "digest": digest, "files": []}
@@ -92,7 +96,7 @@ def make_run(
         for frame, place in enumerate(path)
         if place is not None
     ]
-    stamps = [1_000 + 33 * frame for _, frame, _ in rows]
+    stamps = [1_000 + 33 * (frame // alike) for _, frame, _ in rows]
     counts: dict[int, int] = {}
     detections = []
     for _, frame, _ in rows:
@@ -265,6 +269,17 @@ def test_skipped_frames_do_not_count_against_a_match(tmp_path: Path) -> None:
     transfer_labels(source, target)
 
     assert labels_of(target) == {5: "mug"}
+
+
+def test_frames_with_equal_stamps_are_told_apart(tmp_path: Path) -> None:
+    """If each message is recorded twice, no label would have a majority of the frames."""
+    objects = {1: static(CUP), 2: static(CAN)}
+    source = make_run(tmp_path / "source", objects, labels={1: "mug", 2: "tin"}, alike=2)
+    target = make_run(tmp_path / "target", objects, alike=2)
+
+    transfer_labels(source, target)
+
+    assert labels_of(target) == {1: "mug", 2: "tin"}
 
 
 def test_both_parts_of_split_track_are_labelled(tmp_path: Path) -> None:

@@ -13,10 +13,10 @@ from typing import NamedTuple
 
 import numpy as np
 
-from shapecat.arrays import F4, F8, I4
+from shapecat.arrays import F8
 from shapecat.errors import OutputError
 from shapecat.runs.folder import read_run
-from shapecat.runs.tables import frame_rows, numbers, opened, read_row_groups
+from shapecat.runs.seen_tracks import SeenTracks, extents_of, read_seen_tracks
 from shapecat.runs.track_table import TrackRow, parse_number
 
 __all__ = ["Group", "Match", "Matches", "match_in_place", "match_in_time"]
@@ -36,9 +36,6 @@ _CLEAR_M = 0.03
 """A match is ambiguous unless the second nearest object is farther by at least this."""
 _SIZE_RATIO = 1.8
 """Largest ratio between the largest extents of an object in two recordings."""
-_SAMPLES = 40
-"""About this many detections of each track are read for its size."""
-
 
 Group = Callable[[int], int]
 """Maps a track to a number that is the same for tracks that a person merged."""
@@ -59,45 +56,6 @@ class Matches:
     reasons: Mapping[int, str]
 
 
-class _Tracks(NamedTuple):
-    """All detections of the tracks of a run, sorted by topic and stamp.
-
-    Attributes
-    ----------
-    tracks, numbers, detections : (n,) track, frame and detection numbers.
-    frames : topic and stamp (ns) of each detection.
-    centers : (n, 3) metres, fixed frame.
-    keys : the rows of each topic and stamp.
-    """
-
-    tracks: I4
-    frames: list[tuple[str, int]]
-    numbers: I4
-    detections: I4
-    centers: F8
-    keys: dict[tuple[str, int], slice]
-
-
-def _read_tracks(folder: Path) -> _Tracks:
-    """Read the detections of the tracks of a run."""
-    columns = ["track", "topic", "frame", "stamp_ns", "detection", "center_fixed"]
-    with opened(folder / "tracks.parquet") as file:
-        table = file.read(columns=columns)
-    table = table.filter(table["detection"].is_valid())
-    table = table.sort_by([("topic", "ascending"), ("stamp_ns", "ascending")])
-    keys = list(zip(table["topic"].to_pylist(), table["stamp_ns"].to_pylist(), strict=True))
-    starts = [k for k, key in enumerate(keys) if not k or key != keys[k - 1]]
-    rows = map(slice, starts, [*starts[1:], len(keys)])
-    return _Tracks(
-        numbers(table["track"]),
-        keys,
-        numbers(table["frame"]),
-        numbers(table["detection"]),
-        numbers(table["center_fixed"]).reshape(-1, 3).astype(np.float64),
-        dict(zip((keys[k] for k in starts), rows, strict=True)),
-    )
-
-
 def match_in_time(source: Path, target: Path, group: Group) -> Matches:
     """Match tracks that are mutual nearest neighbours in most frames common to both runs.
 
@@ -106,7 +64,7 @@ def match_in_time(source: Path, target: Path, group: Group) -> Matches:
     source, target : run folders of the same recording.
     group : maps merged tracks of the source to the same number; they are one object.
     """
-    old, new = _read_tracks(source), _read_tracks(target)
+    old, new = read_seen_tracks(source), read_seen_tracks(target)
     old_widths, new_widths = _widths(source, old), _widths(target, new)
     votes: Counter[tuple[int, int]] = Counter()
     apart: defaultdict[tuple[int, int], float] = defaultdict(float)
@@ -148,9 +106,9 @@ def _by_majority(
     return Matches(found, reasons)
 
 
-def _widths(folder: Path, seen: _Tracks) -> F8:
+def _widths(folder: Path, seen: SeenTracks) -> F8:
     """Return the width of each row's track (n,), metres."""
-    extents = _extents(folder, seen)
+    extents = extents_of(folder, seen)
     return np.array([extents[track][0] for track in seen.tracks.tolist()])
 
 
@@ -294,8 +252,8 @@ def _place_of(row: TrackRow) -> F8:
 
 def _standing(folder: Path) -> tuple[list[_Standing], list[int]]:
     """Return the tracks of a run that are at rest, and the numbers of those that moved."""
-    seen = _read_tracks(folder)
-    extents = _extents(folder, seen)
+    seen = read_seen_tracks(folder)
+    extents = extents_of(folder, seen)
     still, moved = [], []
     for track in np.unique(seen.tracks).tolist():
         centers = seen.centers[seen.tracks == track]
@@ -307,21 +265,3 @@ def _standing(folder: Path) -> tuple[list[_Standing], list[int]]:
         else:
             still.append(_Standing(track, middle, width, extent))
     return still, moved
-
-
-def _extents(folder: Path, seen: _Tracks) -> dict[int, tuple[float, float]]:
-    """Return the width and largest extent of each track, metres: medians of some views."""
-    wanted: dict[tuple[str, int], list[int]] = {}
-    for track in np.unique(seen.tracks):
-        rows = np.flatnonzero(seen.tracks == track)
-        for row in rows[:: max(1, len(rows) // _SAMPLES)].tolist():
-            wanted.setdefault((seen.frames[row][0], int(seen.numbers[row])), []).append(row)
-    sizes: dict[int, list[F4]] = {}
-    for group in read_row_groups(folder / "detections.parquet", ["topic", "frame", "size"]):
-        size = numbers(group["size"]).reshape(-1, 3)
-        for key, span in frame_rows(group).items():
-            for row in wanted.get(key, ()):
-                found = size[span][seen.detections[row]]
-                sizes.setdefault(int(seen.tracks[row]), []).append(found)
-    middles = {track: np.median(np.stack(found), axis=0) for track, found in sizes.items()}
-    return {t: (float(max(m[:2])), float(max(m))) for t, m in middles.items()}

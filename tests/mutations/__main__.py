@@ -98,6 +98,7 @@ KNOWN_BY: dict[str, Sequence[str]] = {
     "shapecat.runs.masks": ("test_colour_outputs", "test_exports_images"),
     "shapecat.runs.perceiving": ("test_pipeline", "test_crash"),
     "shapecat.runs.same_objects": ("test_label_transfer",),
+    "shapecat.runs.seen_tracks": ("test_label_transfer",),
     "shapecat.runs.second_look": ("test_second_look",),
     "shapecat.runs.segments": ("test_tables", "test_tables_rotated"),
     "shapecat.runs.track_table": ("test_labels", "test_label_transfer"),
