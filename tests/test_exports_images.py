@@ -347,6 +347,26 @@ def test_frames_are_selected_by_interval_and_by_track(run: Path, tmp_path: Path)
     assert image["frame"] == max(pixels, key=lambda frame: pixels[frame])
 
 
+def test_no_frames_are_kept_for_views_that_are_not_labelled(
+    coloured_run: Path, tmp_path: Path
+) -> None:
+    """Objects that a person called unknown would add images without a label of theirs."""
+    folder = tmp_path / "table"
+    shutil.copytree(coloured_run, folder)
+    frames = list(read_finished(folder).frames())
+    best: dict[int, tuple[int, int]] = {}
+    for frame in frames:
+        for item in frame.objects:
+            best[item.track] = max(best.get(item.track, (0, 0)), (item.indices.size, frame.index))
+    named = min(best)
+    other = next(track for track in best if best[track][1] != best[named][1])
+    relabel(folder, {named: "vase", other: "unknown"})
+
+    export_dataset([folder], "coco", tmp_path / "out", Selection(per_track=1, corrected_only=True))
+
+    assert [i["frame"] for i in read_coco(tmp_path / "out")["images"]] == [best[named][1]]
+
+
 def test_only_earlier_export_is_replaced(run: Path, tmp_path: Path) -> None:
     out = tmp_path / "out"
     export_dataset([run], "coco", out, Selection())

@@ -145,9 +145,9 @@ def _corrected(folder: Path) -> set[int]:
 
 
 def _is_sure(item: LabelledObject, selection: Selection, corrected: set[int]) -> bool:
-    by_hand = item.track in corrected
-    if item.category == "unknown" and not by_hand:
+    if item.category == "unknown":
         return False
+    by_hand = item.track in corrected
     return by_hand or (item.confidence >= selection.min_confidence and not selection.corrected_only)
 
 
