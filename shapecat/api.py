@@ -71,8 +71,8 @@ class OpenRecording:
 
     @property
     def topics(self) -> tuple[str, ...]:
-        """The names of all topics."""
-        return tuple(channel.topic for channel in self.recording.channels())
+        """The names of all topics, each once."""
+        return tuple(dict.fromkeys(channel.topic for channel in self.recording.channels()))
 
     def frames(
         self,

@@ -25,6 +25,7 @@ from shapecat.types import Camera
 from tests import messages
 from tests.conftest import Guesser
 from tests.loading import loaded_by
+from tests.mcap_files import mcap_writer
 from tests.messages import EPOCH
 from tests.test_docs_run import run_here
 
@@ -258,6 +259,16 @@ def test_frames_of_one_topic_are_read(page_folder: Path) -> None:
         frame = next(iter(recording.frames("/camera/depth/image_raw")))
 
     assert frame.topic == "/camera/depth/image_raw"
+
+
+def test_topic_of_several_publishers_is_listed_once(tmp_path: Path) -> None:
+    """Bags have a connection for each publisher of a topic such as /tf."""
+    with mcap_writer(tmp_path / "a.mcap") as writer:
+        for topic in ("/tf", "/scan", "/tf"):
+            writer.add_message(writer.register_channel(topic, "json", 0), 5, b"{}", 5)
+
+    with shapecat.open_recording(tmp_path / "a.mcap") as recording:
+        assert recording.topics == ("/tf", "/scan")
 
 
 def test_frames_are_those_of_the_selection(tmp_path: Path) -> None:
