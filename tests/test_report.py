@@ -618,6 +618,7 @@ LABELS = (
     *("a" * 60, "a" * 61, "new " + "b" * 60, "new " + "b" * 61),
     *("none", "DontCare", "new none", "delete", "Delete", "delte", "del", "remove", "removed"),
     *("merge", "merger", "merge 3", "merged x", "mergers", "merge with", "merge with 999"),
+    *("new delete", "new del", "new Remove", "new merge with {b}", "new merger", "new removal"),
     *("Merged into #{b}", "merge with {b}.0", "merge with 0{b}", "merge with {b}x"),
     *("merge with {a}", "merge with {b}", "merge with {c}", "merge with {d}", "merge with {e}"),
 )
