@@ -253,6 +253,16 @@ def test_crop_of_image_is_perceived() -> None:
         shapecat.perceive(np.zeros((48, 64)), (61, 62, 600, 24))
 
 
+def test_moved_recording_may_be_in_home_folder(
+    page_folder: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """As for all other paths, no shell replaces the ``~``."""
+    monkeypatch.setenv("HOME", str(page_folder))
+    run = shapecat.open_run("~/results/demo")
+
+    assert next(run.frames(recording="~/demo.mcap")).labelled.index == 0
+
+
 def test_frames_of_one_topic_are_read(page_folder: Path) -> None:
     """A name alone is taken for one topic, as `process` takes it."""
     with shapecat.open_recording(page_folder / "demo.mcap") as recording:

@@ -1,5 +1,6 @@
 """A finished run in Python: tables as arrays, frames with points."""
 
+import os
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from functools import cached_property
@@ -210,7 +211,9 @@ class Run:
         RecordingError : the recording is missing or unreadable.
         OutputError : its content has changed since it was processed.
         """
-        moved = None if recording is None else Path(recording)
+        moved = None
+        if recording is not None:
+            moved = Path(os.path.expanduser(recording))  # noqa: PTH111  the other needs a home
         with open_source(self.info, moved) as source:
             shown = with_colour(self.labelled_frames(), source, self.info)
             for labelled, reading, coloured in shown:
