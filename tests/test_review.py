@@ -499,11 +499,11 @@ def test_missing_review_or_viewer_is_reported(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     with pytest.raises(OutputError, match="no review there"):
-        review.open_viewer(tmp_path / "none.rrd")
+        review_viewer.open_viewer(tmp_path / "none.rrd")
     (tmp_path / "r.rrd").touch()
     monkeypatch.setattr("shutil.which", lambda *_, **__: None)
     with pytest.raises(OutputError, match="rerun-sdk"):
-        review.take_screenshot(tmp_path / "r.rrd", tmp_path / "r.png")
+        review_viewer.take_screenshot(tmp_path / "r.rrd", tmp_path / "r.png")
 
 
 _ANSWERS = "import socket, time; s = socket.create_server(('127.0.0.1', PORT)); time.sleep(0.5)"
@@ -526,7 +526,7 @@ def test_viewer_without_graphics_names_missing_package(
     fake.chmod(0o755)
     monkeypatch.setattr(review_viewer, "_viewer", lambda: str(fake))
     with pytest.raises(OutputError, match="mesa-vulkan-drivers"):
-        review.take_screenshot(fake, tmp_path / "r.png")
+        review_viewer.take_screenshot(fake, tmp_path / "r.png")
 
 
 def test_screenshot_ends_viewer_process(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -538,7 +538,7 @@ def test_screenshot_ends_viewer_process(tmp_path: Path, monkeypatch: pytest.Monk
     monkeypatch.setattr(review_viewer, "_LOAD_S", 0.6)
     monkeypatch.setattr(review_viewer, "_SETTLE_S", 0.1)
     with pytest.raises(OutputError, match="no answer"):
-        review.take_screenshot(fake, tmp_path / "r.png")
+        review_viewer.take_screenshot(fake, tmp_path / "r.png")
     pid = int((tmp_path / "pid").read_text())
     deadline = time.monotonic() + 10  # killed at once, but a zombie until reaped
     while alive(pid) and time.monotonic() < deadline:
@@ -556,7 +556,7 @@ def test_screenshot_shows_scene(
     """Views that fail to draw, or an eye that looks away, would give an empty picture."""
     monkeypatch.setattr(review_viewer, "_SETTLE_S", 2.0)  # welcome messages may still be visible
     png = tmp_path / "r.png"
-    review.take_screenshot(recording, png, size=(640, 480), stamp_ns=stamp(0))
+    review_viewer.take_screenshot(recording, png, size=(640, 480), stamp_ns=stamp(0))
     image_module = pytest.importorskip("PIL.Image")
     with image_module.open(png) as picture:
         assert picture.size == (640, 480)

@@ -53,11 +53,10 @@ from shapecat.outputs.review_layout import Eye, TrackView, choose_eye, lay_out, 
 from shapecat.outputs.review_paths import Paths
 from shapecat.outputs.review_scenes import PaintedFrame, ReviewFrame, paint_frame
 from shapecat.outputs.review_shapes import SCENE, SKETCH, Drawing, DrawnScene
-from shapecat.outputs.review_viewer import open_viewer, take_screenshot
 from shapecat.runs.label_meaning import TrackLabel
 from shapecat.types import Camera, Frame, LabelledFrame, LabelledObject, Pose
 
-__all__ = ["open_viewer", "take_screenshot", "write_review"]
+__all__ = ["write_review"]
 
 _FLUSH_FRAMES = 32
 
