@@ -140,8 +140,9 @@ class Reports:
 
         Raises
         ------
-        OutputError : a page cannot be written, a tracks.csv is invalid, a run has been replaced, or
-            shapecat did not make the index that is there. The other pages are written.
+        OutputError : shapecat did not make the index that is there; then nothing is written. Or a
+            page cannot be written, a tracks.csv is invalid, or a run has been replaced; the other
+            pages are written.
         """
         pages: dict[Path, Callable[[], str]] = {r.folder / PAGE: r.page for r in self.runs}
         if self.indexed and self.runs:
