@@ -342,6 +342,22 @@ def test_index_of_scattered_runs_links_to_their_pages(shapecat: Run, runs: Path)
 
 
 @pytest.mark.usefixtures("without_pictures")
+def test_index_of_links_is_beside_the_links(shapecat: Run, runs: Path, tmp_path: Path) -> None:
+    """It was made in a folder that holds all their targets, for example the home folder."""
+    chosen = tmp_path / "chosen"
+    chosen.mkdir()
+    for name in ("a", "deep/c"):
+        (chosen / name[-1]).symlink_to(runs / name / "lab")
+    (tmp_path / "way").symlink_to(chosen)
+    result = shapecat("report", tmp_path / "way" / "a", chosen)
+
+    assert result.exit_code == 0, result.stderr
+    links = [link for link in Links(chosen / "index.html").found if link.endswith("report.html")]
+    assert sorted(links) == ["a/report.html", "c/report.html"]
+    assert "../index.html" in Links(chosen / "c" / "report.html").found
+
+
+@pytest.mark.usefixtures("without_pictures")
 def test_index_of_others_is_kept(shapecat: Run, runs: Path) -> None:
     """The folder of the runs may be that of a web site; earlier versions made the last page."""
     index, pages = runs / "a" / "index.html", [*runs.rglob("*.html")]

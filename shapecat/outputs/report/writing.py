@@ -122,7 +122,7 @@ class Reports:
 
     def link(self, report: RunReport) -> str:
         """Return the address of a page, relative to the common folder."""
-        return _link(self.above, report.folder / PAGE)
+        return _link(self.above, _place(report.folder) / PAGE)
 
     def index(self) -> str:
         """Return the page that lists the runs, with their current labels.
@@ -179,7 +179,7 @@ def read_reports(folders: Sequence[Path], observe: Observer = ignore) -> Reports
     reports, failed = [], {}
     for done, run in enumerate(runs, start=1):
         try:
-            reports.append(read_report(run, index=_link(run, index) if indexed else None))
+            reports.append(read_report(run, index=_link(_place(run), index) if indexed else None))
         except OutputError as error:
             failed[run] = error
         observe("report", done, len(runs))
@@ -212,11 +212,17 @@ def _require_ours(index: Path) -> None:
 
 
 def _above(runs: Sequence[Path]) -> Path:
-    return Path(os.path.commonpath([run.resolve().parent for run in runs]))
+    return Path(os.path.commonpath([_place(run).parent for run in runs]))
+
+
+def _place(run: Path) -> Path:
+    """Return the absolute path of a run; a run that is a link is where the link is."""
+    whole = Path(os.path.abspath(run))  # noqa: PTH100  `resolve` would follow the link
+    return whole.parent.resolve() / whole.name
 
 
 def _link(start: Path, target: Path) -> str:
-    return quote(Path(os.path.relpath(target.resolve(), start.resolve())).as_posix())
+    return quote(Path(os.path.relpath(target, start)).as_posix())
 
 
 def _faces(cards: Sequence[Card]) -> tuple[str, ...]:
