@@ -299,6 +299,19 @@ def test_only_labels_and_additional_columns_can_be_edited(run: Path) -> None:
     assert "2,0.000,can,0.500,box,/depth,dusty" in (run / "tracks.csv").read_text()
 
 
+def test_notes_in_columns_without_a_name_are_kept(run: Path) -> None:
+    """Only the last of several such columns was written again."""
+    names = f"{HEADER.strip()},,,label"
+    lines = [f"{line},dusty,left shelf,can" for line in labelled(t4="bowl").splitlines()[1:]]
+    (run / "tracks.csv").write_text("\n".join([names, *lines]))
+    adopt_labels(run / "tracks.csv", run)
+
+    saved = (run / "tracks.csv").read_text().splitlines()
+    assert saved[1] == "4,0.000,unknown,0.500,bowl,/depth,dusty,left shelf,can"
+    adopt_labels(run / "tracks.csv", run)
+    assert (run / "tracks.csv").read_text().splitlines() == saved
+
+
 @pytest.mark.parametrize("label", ["none", "new None", "DontCare"])
 def test_names_reserved_by_export_formats_are_refused(run: Path, label: str) -> None:
     """KITTI readers ignore objects called DontCare; class 0 of point labels is called none."""
