@@ -317,6 +317,22 @@ def test_results_at_url_must_match_input_and_work(
     assert Ticket("b", *asked).made(run) is made
 
 
+def test_bag_is_the_same_recording_through_links_and_within(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """A killed recorder leaves no metadata: named by its only part, the bag got a second run."""
+    bag = tmp_path / "data" / "walk"
+    bag.mkdir(parents=True)
+    (bag / "walk_0.mcap").write_bytes(b"\x89MCAP")
+    (tmp_path / "links").mkdir()
+    (tmp_path / "links" / "monday").symlink_to(bag)
+    monkeypatch.chdir(bag)
+
+    for named in (bag, tmp_path / "links", Path()):
+        (source,) = find_recordings([str(named)]).kept
+        assert (source.stem, source.parent, Path(source.path).resolve()) == ("walk", "data", bag)
+
+
 def test_looping_links_are_followed_once(tmp_path: Path) -> None:
     """Two links to their own folder made the search endless, one gave paths of 40 links."""
     (tmp_path / "z").mkdir()

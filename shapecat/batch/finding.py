@@ -194,7 +194,11 @@ def _is_bag(folder: Path) -> bool:
     if not is_of_bag(first.name) or parts != set(in_sequence):
         return False
     compressed = any(path.suffix == ".zstd" for path in paths)
-    return base == folder.name or compressed or _adjoin([folder / name for name in in_sequence])
+    return (
+        base == _whole(folder).name
+        or compressed
+        or _adjoin([folder / name for name in in_sequence])
+    )
 
 
 def _adjoin(paths: Sequence[Path]) -> bool:
