@@ -565,6 +565,20 @@ def test_file_moved_into_export_is_not_deleted_with_it(tmp_path: Path) -> None:
     assert (out / "images" / "mine.png").read_bytes() == b"mine"
 
 
+def test_link_in_export_counts_by_its_own_time(tmp_path: Path) -> None:
+    """A link to a missing file ended in a traceback."""
+    gone, mark = tmp_path / "gone", tmp_path / "export.json"
+    gone.symlink_to("nowhere")
+    mark.write_text(json.dumps({**KITTI, "made": [], "objects": 3}))
+    exported = mark.stat().st_mtime_ns
+    os.utime(gone, ns=(exported, exported), follow_symlinks=False)
+    _require_own(tmp_path, KITTI)
+
+    os.utime(gone, ns=(exported, exported + 1000), follow_symlinks=False)
+    with pytest.raises(OutputError, match="gone: was changed after the export"):
+        _require_own(tmp_path, KITTI)
+
+
 def test_export_excludes_files_of_interrupted_export(tmp_path: Path) -> None:
     """Images of other options would have no labels, and be taken for background."""
     out = tmp_path / "out"

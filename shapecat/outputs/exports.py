@@ -268,7 +268,7 @@ def _require_own(target: Path, about: Mapping[str, Any]) -> None:
         msg = f"{target}: holds the {format} export of other topics; choose another --out"
         raise OutputError(msg)
     exported = (target / _MARK).stat().st_mtime_ns
-    later = [path for path in target.rglob("*") if path.stat().st_mtime_ns > exported]
+    later = [path for path in target.rglob("*") if path.lstat().st_mtime_ns > exported]
     if later:
         changed = min(later, key=lambda path: (path.is_dir(), path))
         msg = f"{changed}: was changed after the export; choose another --out, or move it away"
