@@ -437,7 +437,13 @@ def test_partial_run_of_other_work_is_discarded(source: Path, tmp_path: Path, wh
 
 
 @pytest.mark.parametrize(
-    "name", ["segments/000000/frames.arrow", "revisions/000000/planes.arrow", "planes.parquet"]
+    "name",
+    [
+        "segments/000000/frames.arrow",
+        "revisions/000000/planes.arrow",
+        "planes.parquet",
+        "tracks.parquet",
+    ],
 )
 def test_truncated_partial_run_is_discarded(source: Path, tmp_path: Path, name: str) -> None:
     """After a power cut with --no-fsync, each further command would stop at the same file."""

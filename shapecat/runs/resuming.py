@@ -12,7 +12,7 @@ from shapecat.runs.identity import same_content, unchanged
 from shapecat.runs.jobs import differences
 from shapecat.runs.run_info import RunInfo
 from shapecat.runs.segments import count_segments, require_whole
-from shapecat.runs.table_schemas import PERCEIVED
+from shapecat.runs.table_schemas import PERCEIVED, TABLES
 from shapecat.runs.tables import count_rows
 
 __all__ = ["has_work", "resume", "take_over_frames"]
@@ -100,14 +100,14 @@ def has_work(folder: Path) -> bool:
 
 
 def _require_whole(folder: Path) -> None:
-    """Check that all files of perceive can be opened: a power cut may have truncated them.
+    """Check that all segments and tables can be opened: a power cut may have truncated them.
 
     Raises
     ------
     OutputError : a file is unreadable.
     """
     require_whole(folder)
-    for table in PERCEIVED:
+    for table in TABLES:
         if (folder / f"{table}.parquet").exists():
             count_rows(folder, table)
 
