@@ -1,6 +1,7 @@
 """Tests of the tables of a moving, rotated sensor; all numbers differ, so swaps are noticed."""
 
 import csv
+import math
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -405,6 +406,9 @@ def test_parts_of_merged_track_become_one_object(run: Path) -> None:
 
     assert bottoms[1] < bottoms[0] - 0.1
     assert float(up @ whole.box.center) - whole.height_m == pytest.approx(bottoms[1])
+    above = replace(high, height_m=math.nan)  # no plane was found below it
+    for some in ([above, parts[1]], [parts[1], above]):
+        assert _join(some, up.tolist()).height_m == pytest.approx(whole.height_m)
     assert whole.detections == (*high.detections, *low.detections)
     assert len(set(whole.detections)) == 2
 

@@ -189,7 +189,7 @@ def _join(parts: Sequence[LabelledObject], up: Sequence[float]) -> LabelledObjec
         gas=NeuralGas(np.concatenate([part.gas.neurons for part in parts]), np.concatenate(edges)),
         posterior=np.mean([part.posterior for part in parts], axis=0),
         causal=np.mean([part.causal for part in parts], axis=0),
-        height_m=float(np.dot(up, box.center)) - min(bottoms),
+        height_m=float(np.dot(up, box.center) - np.fmin.reduce(bottoms)),  # NaN without a plane
         touches_border=any(part.touches_border for part in parts),
         occluded=any(part.occluded for part in parts),
         detections=tuple(number for part in parts for number in part.detections),
