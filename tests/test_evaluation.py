@@ -1,5 +1,6 @@
 """Tests of evaluation: metrics, training and reports on a data set folder, and pages."""
 
+import errno
 import json
 import math
 import re
@@ -21,7 +22,7 @@ from sklearn import metrics as reference
 from shapecat.arrays import F4
 from shapecat.config import Settings
 from shapecat.description import DESCRIPTOR_NAMES
-from shapecat.errors import ModelError, RecordingError
+from shapecat.errors import ModelError, OutputError, RecordingError
 from shapecat.evaluation import Report, evaluate_folder, format_report, metrics, read_dataset
 from shapecat.evaluation.dataset import View
 from shapecat.evaluation.fused import Fused, fuse_views
@@ -332,6 +333,23 @@ def test_page_is_complete_and_escapes_names(trained: Path, tmp_path: Path) -> No
     for picture in re.findall(r"<svg.*?</svg>", page, re.DOTALL):
         ET.fromstring(picture)  # noqa: S314  we wrote it
     assert page.count("<svg") == 2 + len(report.breakdowns) == 5
+
+
+def test_full_disk_leaves_the_former_page(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Half a page would be taken for a whole one."""
+    page = tmp_path / "page.html"
+    page.write_text("former")
+
+    def fill(path: Path, text: str, _encoding: str) -> None:
+        path.write_bytes(text[:99].encode())
+        raise OSError(errno.ENOSPC, "No space left on device")
+
+    monkeypatch.setattr(Path, "write_text", fill)
+    with pytest.raises(OutputError, match="No space left"):
+        write_page(page, worked(), title="a")
+
+    assert page.read_text() == "former"
+    assert list(tmp_path.iterdir()) == [page]
 
 
 def test_accuracies_over_ranges_match_hand_calculation() -> None:

@@ -15,6 +15,7 @@ from shapecat.evaluation.report import (
     breakdown_table,
     comparison_tables,
 )
+from shapecat.system.files import replacing
 
 __all__ = [
     "accuracy_svg",
@@ -62,7 +63,8 @@ def write_page(path: Path, report: Report, *, title: str) -> None:
     with explained(f"{path}: cannot write the report", OutputError):
         path.parent.mkdir(parents=True, exist_ok=True)
         for place, content in files.items():
-            place.write_text(content, "utf-8")
+            with replacing(place) as hidden:
+                hidden.write_text(content, "utf-8")
 
 
 _CALIBRATION = (
