@@ -18,6 +18,7 @@ from shapecat import pipeline
 from shapecat.batch.finding import find_recordings
 from shapecat.batch.storage import is_url
 from shapecat.config import Settings, load_settings, with_settings
+from shapecat.description import DESCRIPTOR_NAMES
 from shapecat.errors import ConfigError, ModelError, RecordingError, explained
 from shapecat.learning import Categorizer, load_model
 from shapecat.outputs.in_memory import frame_of, perceive_alone
@@ -218,11 +219,12 @@ def perceive(
     Raises
     ------
     ConfigError : an argument has the wrong shape or value, or a setting does not exist.
-    ModelError : the model cannot be read.
+    ModelError : the model cannot be read, or was trained on another descriptor.
     """
     _require_known(settings, perceive.__annotations__)
     chosen = with_settings(load_settings(None if config is None else _path(config)), settings)
     categorizer = load_model(None) if model is None else _model_at(_path(model))
+    categorizer.require_descriptor(DESCRIPTOR_NAMES)
     frame = frame_of(reading, intrinsics)
     compile_all()
     return perceive_alone(frame, up=up, categorizer=categorizer, settings=chosen)

@@ -6,6 +6,7 @@ import runpy
 import subprocess
 import sys
 from collections.abc import Callable
+from dataclasses import replace
 from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
@@ -20,6 +21,7 @@ from click.testing import Result
 import shapecat
 from shapecat import api
 from shapecat.errors import ConfigError, ModelError, OutputError, RecordingError
+from shapecat.learning import load_model, save_model
 from shapecat.outputs.opened_run import Table
 from shapecat.types import Camera
 from tests import messages
@@ -321,6 +323,16 @@ def test_model_is_read_once_until_its_file_changes(
     assert len(read) == 2
     with pytest.raises(ModelError, match=r"none\.npz: cannot read the model: No such file"):
         shapecat.perceive(np.zeros((48, 64)), (60, 60, 32, 24), model="none.npz")
+
+
+def test_model_of_another_version_is_refused(tmp_path: Path) -> None:
+    """With other components it ended in a traceback, with reordered ones in wrong categories."""
+    model = load_model()
+    reordered = (*model.descriptor_names[1:], model.descriptor_names[0])
+    save_model(tmp_path / "old.npz", replace(model, descriptor_names=reordered))
+
+    with pytest.raises(ModelError, match="was trained on another descriptor"):
+        shapecat.perceive(np.zeros((48, 64)), (60, 60, 32, 24), model=tmp_path / "old.npz")
 
 
 @pytest.mark.parametrize("reading", [np.zeros((48, 64)), np.full((48, 64), np.nan)])
