@@ -191,6 +191,20 @@ def test_views_are_sorted_by_path(tmp_path: Path) -> None:
     assert dataset.categories == ("a", "b")
 
 
+def test_category_without_folders_of_objects_is_refused(tmp_path: Path) -> None:
+    """Its views were left out without notice if other categories had such folders."""
+    for name in ("cup/a/0.pcd", "cup/scan.ply", "mug/0.PCD", ".mug/0.pcd"):
+        (tmp_path / name).parent.mkdir(parents=True, exist_ok=True)
+        (tmp_path / name).touch()
+    refused = r"mug/0\.PCD: expected a folder for each object, such as mug/object/0\.PCD"
+
+    with pytest.raises(RecordingError, match=refused):
+        read_dataset(tmp_path)
+
+    (tmp_path / "mug" / "0.PCD").unlink()
+    assert read_dataset(tmp_path).files == (tmp_path / "cup" / "a" / "0.pcd",)
+
+
 def test_hidden_files_are_no_views(tmp_path: Path) -> None:
     """Notebooks, macOS and waste bins leave them; the data set itself may be in a hidden folder."""
     root = tmp_path / ".cache" / "data"

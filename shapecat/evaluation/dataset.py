@@ -76,23 +76,33 @@ def read_dataset(root: Path) -> Dataset:
 
     Raises
     ------
-    RecordingError : the folder holds no views.
+    RecordingError : the folder holds no views, or the views of a category are not in folders of
+        objects.
     """
-    files = tuple(
-        sorted(
-            path
-            for path in root.glob("*/*/*")
-            if path.suffix.lower() in _READERS
-            and not any(part.startswith(".") for part in path.relative_to(root).parts)
-        )
-    )
+    files = tuple(_views_among(root, "*/*/*"))
     if not files:
         msg = (
             f"{root}: no views found; expected files such as "
             f"{root.resolve().name}/cup/red_mug/000.pcd (or .ply, .npz)"
         )
         raise RecordingError(msg)
+    complete = {path.parent.parent for path in files}
+    for path in _views_among(root, "*/*"):
+        if path.parent not in complete and path.is_file():
+            place = Path(path.parent.name, "object", path.name)
+            msg = f"{path}: expected a folder for each object, such as {place}"
+            raise RecordingError(msg)
     return Dataset(files)
+
+
+def _views_among(root: Path, pattern: str) -> list[Path]:
+    """Return the paths below a folder that end like views, sorted, without hidden ones."""
+    return sorted(
+        path
+        for path in root.glob(pattern)
+        if path.suffix.lower() in _READERS
+        and not any(part.startswith(".") for part in path.relative_to(root).parts)
+    )
 
 
 def read_view(path: Path) -> View:
