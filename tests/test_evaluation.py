@@ -5,6 +5,7 @@ import json
 import math
 import re
 from dataclasses import replace
+from functools import partial
 from importlib import import_module
 from pathlib import Path
 from types import SimpleNamespace
@@ -23,7 +24,14 @@ from shapecat.arrays import F4
 from shapecat.config import Settings
 from shapecat.description import DESCRIPTOR_NAMES
 from shapecat.errors import ModelError, OutputError, RecordingError
-from shapecat.evaluation import Report, evaluate_folder, format_report, metrics, read_dataset
+from shapecat.evaluation import (
+    Report,
+    baselines,
+    evaluate_folder,
+    format_report,
+    metrics,
+    read_dataset,
+)
 from shapecat.evaluation.dataset import View
 from shapecat.evaluation.fused import Fused, fuse_views
 from shapecat.evaluation.metrics import Bin
@@ -691,6 +699,28 @@ def test_baselines_are_compared_with_shapecat(compared: Report, tmp_path: Path) 
     assert "forest on D2" in format_report(compared)
     write_page(tmp_path / "page.md", compared, title="compared")
     assert "| forest on D2 | 8 |" in (tmp_path / "page.md").read_text("utf-8")
+
+
+def test_training_views_of_cross_validation_are_mean_over_folds(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    """Where one object has most views, those of the first fold alone were a tenth of the others."""
+    sizes = {"cup": [3, 3, 3, 200], "can": [3, 4, 5, 6], "unknown": [8]}
+    labels = np.repeat(list(sizes), [sum(views) for views in sizes.values()])
+    objects = np.repeat(np.arange(9), np.concatenate(list(sizes.values()))).astype(str)
+    nothing = np.zeros(len(labels))
+    views = DescribedViews(nothing[:, None], labels, objects, nothing, nothing, nothing)
+
+    def chain(_: Any, test: DescribedViews, __: Any) -> np.ndarray:
+        return np.full((len(test.labels), 2), 0.5)
+
+    monkeypatch.setattr(baselines, "_chain", chain)
+    learners = {"shapecat": chain, "plain": partial(chain)}
+    monkeypatch.setattr(baselines, "_learners", lambda: learners)
+    rows = baselines.compare_learners(views, None, categories=("cup", "can"), root=Path("data"))
+
+    # Each view is tested once, so that it is left out in one of the four folds.
+    assert [row.learned for row in rows] == [round(235 * 3 / 4), round(227 * 3 / 4)]
 
 
 @pytest.mark.usefixtures("few_trees")

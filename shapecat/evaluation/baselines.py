@@ -60,12 +60,12 @@ def compare_learners(
     if any(len(_known(part.labels)) < 2 for part, _ in splits):
         msg = f"{root}: training needs at least two categories"
         raise RecordingError(msg)
-    learners, labels = _learners(), splits[0][0].labels
+    learners = _learners()
     rows = []
     for k, (name, learner) in enumerate(learners.items(), start=1):
         truth, posteriors = _judged(learner, splits, categories)
-        learned = labels if learner is _chain else labels[labels != UNKNOWN]
-        rows.append(_compared(name, len(learned), truth, posteriors))
+        learned = _mean_views(splits, with_unknown=learner is _chain)
+        rows.append(_compared(name, learned, truth, posteriors))
         observe("baselines", k, len(learners))
     return tuple(rows)
 
@@ -78,6 +78,12 @@ def _folds(views: DescribedViews) -> Iterator[tuple[DescribedViews, DescribedVie
     folds = StratifiedGroupKFold(min(_FOLDS, fewest), shuffle=True, random_state=0)
     for train, test in folds.split(views.descriptors, views.labels, views.instances):
         yield views.where(train), views.where(test)
+
+
+def _mean_views(splits: list[tuple[DescribedViews, DescribedViews]], *, with_unknown: bool) -> int:
+    """Return the mean number of training views of the splits."""
+    counts = [np.sum(with_unknown | (train.labels != UNKNOWN)) for train, _ in splits]
+    return round(float(np.mean(counts)))
 
 
 def _single(views: DescribedViews) -> list[str]:

@@ -50,7 +50,8 @@ _POINTS = (0, 60, 120, 250, 500, 1000, math.inf)
 class Compared(NamedTuple):
     """Results of a classifier; undefined metrics are None.
 
-    ``learned`` is the number of views that it was trained on.
+    ``learned`` is the number of views that it was trained on, in cross-validation the mean over the
+    folds.
     """
 
     learner: str
