@@ -405,6 +405,26 @@ def test_report_metrics_match_hand_calculation() -> None:
     assert report.by_elevation == ()
 
 
+def test_time_per_object_leaves_out_loading_of_kernels(monkeypatch: pytest.MonkeyPatch) -> None:
+    """The first view takes 300 times as long, and a minute after an installation."""
+    clock = iter((9.0, 0.5))  # seconds of each prediction
+    now = [0.0]
+
+    def predict(descriptors: F4) -> Any:
+        now[0] += next(clock)
+        count = len(descriptors)
+        return SimpleNamespace(posteriors=np.ones((count, 1)), novelty=np.zeros(count))
+
+    monkeypatch.setattr("time.perf_counter", lambda: now[0])
+    model: Any = SimpleNamespace(model_id="m", categories=("cup",), predict=predict)
+    seconds = np.array([60.0, 0.2, 0.3, 0.25, 0.2])
+    views = DescribedViews(
+        np.zeros((5, 1)), np.full(5, "cup"), np.full(5, "a"), np.ones(5), np.ones(5), seconds
+    )
+
+    assert evaluate(views, model).seconds_per_object == pytest.approx(0.25 + 0.5 / 5)
+
+
 def test_sensor_pose_is_relative_to_centre_of_object(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:

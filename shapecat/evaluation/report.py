@@ -73,6 +73,8 @@ class Report:
     recall : recall of each category.
     confusion : (c, c) number of views of each true category (row) by predicted category (column),
         in the order of ``categories``.
+    seconds_per_object : median time from points to descriptor, which leaves out the loading of
+        kernels for the first view, and the mean time to predict.
     novelty : ``n`` unknown shapes, ``rejected``, the fraction of them with a novelty above 1, and
         ``auroc``; None without unknown shapes.
     rejected_known : fraction of the known shapes with a novelty above 1.
@@ -138,6 +140,7 @@ def evaluate(views: DescribedViews, categorizer: Categorizer) -> Report:
     ModelError : the model does not know a label.
     """
     require_categories(np.unique(views.labels).tolist(), categorizer)
+    categorizer.predict(views.descriptors[:1])  # loads the kernel
     begun = time.perf_counter()
     prediction = categorizer.predict(views.descriptors)
     predicting = (time.perf_counter() - begun) / max(len(views.labels), 1)
@@ -159,7 +162,7 @@ def evaluate(views: DescribedViews, categorizer: Categorizer) -> Report:
         ece=_defined(metrics.expected_calibration_error(truth, posteriors)),
         recall=dict(zip(categories, map(_defined, metrics.recall(table)), strict=True)),
         confusion=tuple(tuple(row) for row in table.tolist()),
-        seconds_per_object=_defined(_mean(views.seconds) + predicting),
+        seconds_per_object=_defined(_median(views.seconds) + predicting),
         novelty=novelty,
         rejected_known=_defined(_mean(prediction.novelty[known] > 1)),
         skipped=views.skipped,
@@ -217,6 +220,10 @@ def _accuracy_over(
 
 def _as_dicts(rows: Sequence[tuple[str, int, float]]) -> list[dict[str, Any]]:
     return [{"range": name, "n": n, "accuracy": value} for name, n, value in rows]
+
+
+def _median(values: np.ndarray) -> float:
+    return float(np.median(values)) if len(values) else math.nan
 
 
 def _mean(values: np.ndarray) -> float:
