@@ -370,6 +370,25 @@ def test_lists_of_text_become_an_array(tmp_path: Path) -> None:
     assert stages.tolist() == [["detect", "masks"], ["detect", "track"]]
 
 
+def test_arrays_of_run_without_objects_join_those_of_others(
+    page_folder: Path, tmp_path: Path
+) -> None:
+    """One empty recording among many ended the joining of their descriptors in an error."""
+    flat = messages.image(EPOCH, np.full((48, 64), 2.0))
+    items = [("/d/camera_info", EPOCH, messages.info(EPOCH)), ("/d/image", EPOCH, flat)]
+    recording = messages.write(tmp_path / "a.mcap", items)
+    empty = shapecat.process(recording, tmp_path, mcap=False, rrd=False)
+    full = shapecat.open_run(page_folder / "results" / "demo")
+
+    assert empty.info["counts"]["detections"] == 0
+    for name in ("posterior", "descriptor", "outline_full", "center"):
+        expected = full.detections.numpy(name)
+        joined = np.concatenate([empty.detections.numpy(name), expected])
+        assert (joined.dtype, joined.shape) == (expected.dtype, expected.shape)
+    assert empty.tracks.numpy("posterior").shape == (0, len(empty.categories))
+    assert empty.detections.numpy("indices").shape == (0,)
+
+
 def test_null_list_becomes_row_of_nan(tmp_path: Path) -> None:
     """Arrow may or may not store values behind a null; later rows must not shift."""
     kind = pa.list_(pa.float32(), 2)

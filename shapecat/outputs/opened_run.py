@@ -1,8 +1,8 @@
 """A finished run in Python: tables as arrays, frames with points."""
 
 import os
-from collections.abc import Iterator, Sequence
-from dataclasses import dataclass
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass, field
 from functools import cached_property
 from pathlib import Path
 from typing import Any
@@ -12,6 +12,8 @@ import pyarrow as pa
 import pyarrow.parquet as pq
 
 from shapecat.arrays import F4, I4, U1, Bool
+from shapecat.completion import DIRECTIONS
+from shapecat.description import DESCRIPTOR_NAMES
 from shapecat.errors import OutputError
 from shapecat.outputs.colouring import Coloured, with_colour
 from shapecat.outputs.counts import plural
@@ -26,9 +28,13 @@ __all__ = ["Run", "RunFrame", "Table"]
 
 @dataclass(frozen=True)
 class Table:
-    """A table of a run; reads the requested columns on demand."""
+    """A table of a run; reads the requested columns on demand.
+
+    ``widths`` are the lengths of lists that are equally long in all rows, for tables without rows.
+    """
 
     path: Path
+    widths: Mapping[str, int] = field(default_factory=dict, compare=False, repr=False)
 
     @property
     def columns(self) -> tuple[str, ...]:
@@ -71,6 +77,8 @@ class Table:
         if not pa.types.is_list(values.type):
             return values.to_numpy(zero_copy_only=False)
         lengths = set(values.value_lengths().to_pylist())
+        if not lengths and column in self.widths:
+            return np.zeros((0, self.widths[column]), values.type.value_type.to_pandas_dtype())
         if len(lengths) == 1 and None not in lengths:
             return values.flatten().to_numpy(zero_copy_only=False).reshape(len(values), -1)
         ragged = np.zeros(len(values), object)
@@ -153,8 +161,13 @@ class Run:
     def __init__(self, folder: Path) -> None:
         self.folder = folder
         self._finished: FinishedRun = read_finished(folder)
-        self.detections = Table(folder / "detections.parquet")
-        self.tracks = Table(folder / "tracks.parquet")
+        widths = {
+            "posterior": len(self.info["model"]["categories"]),
+            "descriptor": len(DESCRIPTOR_NAMES),
+            "outline_full": DIRECTIONS,
+        }
+        self.detections = Table(folder / "detections.parquet", widths)
+        self.tracks = Table(folder / "tracks.parquet", widths)
         self.frame_table = Table(folder / "frames.parquet")
         self.planes = Table(folder / "planes.parquet")
 
