@@ -3,6 +3,7 @@
 import json
 import re
 import runpy
+import shutil
 import subprocess
 import sys
 from collections.abc import Callable
@@ -23,6 +24,7 @@ from shapecat import api
 from shapecat.errors import ConfigError, ModelError, OutputError, RecordingError
 from shapecat.learning import load_model, save_model
 from shapecat.outputs.opened_run import Table
+from shapecat.runs.corrections import adopt_labels
 from shapecat.types import Camera
 from tests import messages
 from tests.conftest import Guesser
@@ -263,6 +265,22 @@ def test_moved_recording_may_be_in_home_folder(
     run = shapecat.open_run("~/results/demo")
 
     assert next(run.frames(recording="~/demo.mcap")).labelled.index == 0
+
+
+def test_merged_tracks_are_described_as_one(guessed_run: Path, tmp_path: Path) -> None:
+    """Its frames show one object, so that the description of the run counted one too many."""
+    folder = tmp_path / "run"
+    shutil.copytree(guessed_run, folder)
+    count = len(shapecat.open_run(folder).labels)
+    (tmp_path / "corrected.csv").write_text(
+        "track,category,confidence,label\n2,cup,0,merge with 1\n"
+    )
+    adopt_labels(tmp_path / "corrected.csv", folder)
+
+    run = shapecat.open_run(folder)
+
+    assert run.labels[2] == run.labels[1]
+    assert repr(run).endswith(f": 8 frames, {count - 1} tracks>")
 
 
 def test_frames_of_one_topic_are_read(page_folder: Path) -> None:

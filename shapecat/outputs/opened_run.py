@@ -172,8 +172,9 @@ class Run:
         self.planes = Table(folder / "planes.parquet")
 
     def __repr__(self) -> str:
-        counts = self.info["counts"]
-        return f"<Run {self.folder}: {counts['frames']} frames, {len(self.labels)} tracks>"
+        frames, labels = self.info["counts"]["frames"], self._finished.labels.values()
+        tracks = plural(len({label.track for label in labels}), "track")
+        return f"<Run {self.folder}: {plural(frames, 'frame')}, {tracks}>"
 
     @property
     def info(self) -> RunInfo:
@@ -187,7 +188,11 @@ class Run:
 
     @cached_property
     def labels(self) -> dict[int, str]:
-        """The final category of each track, with corrections; deleted tracks are missing."""
+        """The final category of each track of the tables, with corrections.
+
+        Deleted tracks are missing. A merged track has the category of the track it was merged with,
+        whose number the objects in `frames` have.
+        """
         return {track: label.category for track, label in self._finished.labels.items()}
 
     def posterior(self, track: int) -> tuple[Any, Any]:
