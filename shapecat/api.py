@@ -206,7 +206,7 @@ def perceive(
     ----------
     reading : a depth image (h, w) along the optical axis, floats in metres or integers in
         millimetres; or points (n, 3) or (h, w, 3) in the sensor frame, metres. Zero, negative and
-        non-finite depth, and non-finite points, are missing.
+        non-finite depth, non-finite points, and values that NumPy masks are missing.
     intrinsics : fx, fy, cx, cy of the depth image, pixels, or its camera matrix (3, 3).
     up : (3,) up direction in the sensor frame; None to estimate it from planes.
     model, config, settings : as for `process`.

@@ -162,6 +162,19 @@ def test_perceive_finds_same_objects_as_processing_recording(image: Any, tmp_pat
         assert (result.labels > 0).sum() == sum(o.indices.size for o in result.objects)
 
 
+def test_masked_values_are_missing(image: Any) -> None:
+    """What users masked, say all beyond their table, was perceived without notice."""
+    far = image.depth > np.median(image.depth)
+    depth = shapecat.perceive(np.ma.array(image.depth, mask=far), intrinsics(image.camera))
+    masked = np.zeros((3, 4, 3), bool)
+    masked[1, 2, 0] = True
+    points = shapecat.perceive(np.ma.array(np.ones((3, 4, 3)), mask=masked))
+
+    np.testing.assert_array_equal(depth.reading.depth, np.where(far, 0, image.depth))
+    np.testing.assert_array_equal(np.isnan(points.points).all(axis=1), np.arange(12) == 6)
+    assert np.isfinite(np.delete(points.points, 6, axis=0)).all()
+
+
 def test_perceiving_points_finds_same_objects_as_depth_image(image: Any) -> None:
     """Invalid rows stay in place, so that masks fit the caller's points."""
     from_points = shapecat.perceive(image.xyz(), up=(0, -6.2, -7.8))

@@ -36,13 +36,14 @@ def frame_of(reading: ArrayLike, intrinsics: ArrayLike | None = None) -> Frame:
     ConfigError : the shape, the type or a number is wrong, or the unit is not metres.
     """
     values = np.asarray(reading)
+    masked = np.ma.getmaskarray(reading if isinstance(reading, np.ma.MaskedArray) else values)
     frame = partial(Frame, topic="", index=0, stamp_ns=0, log_time_ns=0, frame_id="")
     if intrinsics is None:
         if values.dtype.kind not in "fiu" or values.ndim not in {2, 3} or values.shape[-1] != 3:
             msg = f"expected points (n, 3), or a depth image with intrinsics, got {values.shape}"
             raise ConfigError(msg)
         points = values.reshape(-1, 3).astype(np.float32, order="C")
-        known = np.isfinite(points).all(axis=1)
+        known = np.isfinite(points).all(axis=1) & ~masked.reshape(-1, 3).any(axis=1)
         points[~known] = np.nan
         some = points[known][:: 1 + len(points) // 10_000]  # enough for their median
         if some.size and np.median(np.abs(some).max(axis=1)) > _FARTHEST_M:
@@ -53,7 +54,7 @@ def frame_of(reading: ArrayLike, intrinsics: ArrayLike | None = None) -> Frame:
         msg = f"expected a depth image (h, w) of numbers, got {values.dtype} {values.shape}"
         raise ConfigError(msg)
     depth = values.astype(np.float32, order="C") * (1.0 if values.dtype.kind == "f" else 0.001)
-    depth[~(np.isfinite(depth) & (depth > 0))] = 0
+    depth[masked | ~(np.isfinite(depth) & (depth > 0))] = 0
     if depth.any() and np.median(depth[depth > 0]) > _FARTHEST_M:
         msg = "expected depth in metres; divide millimetres by 1000, or pass integers"
         raise ConfigError(msg)
