@@ -391,6 +391,16 @@ def test_table_columns_become_arrays(page_folder: Path) -> None:
         run.posterior(999)
 
 
+def test_name_of_one_column_is_no_list_of_letters(tmp_path: Path) -> None:
+    """The error said that there is no column `a`."""
+    pq.write_table(pa.table({"area_m2": [0.5, 2.0], "plane": [0, 1]}), tmp_path / "t.parquet")
+    table = Table(tmp_path / "t.parquet")
+
+    assert table.arrow("area_m2").to_pydict() == {"area_m2": [0.5, 2.0]}
+    with pytest.raises(OutputError, match=r"no column area; known: area_m2, plane"):
+        table.arrow("area")
+
+
 def test_lists_of_text_become_an_array(tmp_path: Path) -> None:
     """The stages of frames.parquet are text; reading them ended in a traceback."""
     table = pa.table({"stages": [["detect", "masks"], ["detect", "track"]]})

@@ -41,26 +41,27 @@ class Table:
         """Names of the columns."""
         return tuple(pq.read_schema(self.path).names)
 
-    def arrow(self, columns: Sequence[str] | None = None) -> pa.Table:
-        """Read the table, or some columns, as an Arrow table.
+    def arrow(self, columns: str | Sequence[str] | None = None) -> pa.Table:
+        """Read the table, or some columns, as an Arrow table; a name alone is one column.
 
         Raises
         ------
         OutputError : the table is unreadable, or has no such column.
         """
+        wanted = [columns] if isinstance(columns, str) else columns
         try:
             known = self.columns
-            if missing := [name for name in columns or () if name not in known]:
+            if missing := [name for name in wanted or () if name not in known]:
                 msg = f"{self.path}: no column {missing[0]}; known: {', '.join(known)}"
                 raise OutputError(msg)
             with pq.ParquetFile(self.path) as file:
-                table = file.read(columns=None if columns is None else list(columns))
+                table = file.read(columns=None if wanted is None else list(wanted))
             return with_fixed_lists(table)
         except (OSError, pa.ArrowException) as error:
             msg = f"{self.path}: not a readable table of a run ({error})"
             raise OutputError(msg) from error
 
-    def pandas(self, columns: Sequence[str] | None = None) -> Any:
+    def pandas(self, columns: str | Sequence[str] | None = None) -> Any:
         """Read the table, or some columns, as a pandas data frame; pandas must be installed."""
         return self.arrow(columns).to_pandas()
 
