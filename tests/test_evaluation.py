@@ -743,6 +743,17 @@ def test_training_views_of_cross_validation_are_mean_over_folds(
     assert [row.learned for row in rows] == [round(235 * 3 / 4), round(227 * 3 / 4)]
 
 
+def test_few_unknown_shapes_are_no_problem_for_cross_validation() -> None:
+    """scikit-learn printed a warning that there are too few of them for all folds."""
+    labels, nothing = np.array([*["cup", "can"] * 3, "unknown"]), np.zeros(7)
+    objects = np.arange(7).astype(str)
+    views = DescribedViews(nothing[:, None], labels, objects, nothing, nothing, nothing)
+
+    tested = [sorted(set(test.labels) - {"unknown"}) for _, test in baselines._folds(views)]
+
+    assert tested == [["can", "cup"]] * 3
+
+
 @pytest.mark.usefixtures("few_trees")
 def test_baselines_may_have_their_own_training_set(trained: Path, tmp_path: Path) -> None:
     """It may have other categories in another order: each baseline has its own columns."""

@@ -1,5 +1,6 @@
 """Comparison of shapecat's classifier with baselines on the same views."""
 
+import warnings
 from collections.abc import Callable, Iterator
 from operator import attrgetter
 from pathlib import Path
@@ -76,7 +77,10 @@ def _folds(views: DescribedViews) -> Iterator[tuple[DescribedViews, DescribedVie
 
     fewest = min(_instances(views).values())
     folds = StratifiedGroupKFold(min(_FOLDS, fewest), shuffle=True, random_state=0)
-    for train, test in folds.split(views.descriptors, views.labels, views.instances):
+    with warnings.catch_warnings():  # of unknown shapes, there may be fewer than folds
+        warnings.simplefilter("ignore", UserWarning)
+        splits = list(folds.split(views.descriptors, views.labels, views.instances))
+    for train, test in splits:
         yield views.where(train), views.where(test)
 
 
