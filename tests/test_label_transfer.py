@@ -437,6 +437,22 @@ def test_misspelt_label_does_not_block_the_others(tmp_path: Path) -> None:
     assert labels_of(target) == {5: "mug", 6: ""}
 
 
+def test_category_unknown_to_target_is_transferred_as_new(tmp_path: Path) -> None:
+    """Processed again with the model before *pan* was learned, all pans would lose their label."""
+    source = make_run(
+        tmp_path / "source", {1: static(CUP), 2: static(CAN)}, labels={1: "pan", 2: "mug"}
+    )
+    run = read_run(source)
+    run["model"]["categories"] += ["pan"]
+    write_run(source, run)
+    target = make_run(tmp_path / "target", {5: static(CUP), 6: static(CAN)})
+
+    for _ in range(2):
+        assert not transfer_labels(source, target).missed
+        assert labels_of(target) == {5: "new pan", 6: "mug"}
+    assert read_labels(target / "tracks.csv", ["can"])[5].category == "pan"
+
+
 @pytest.mark.parametrize(
     ("found", "broken", "told"),
     [

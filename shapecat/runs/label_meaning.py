@@ -16,6 +16,7 @@ __all__ = [
     "TrackLabel",
     "find_misread",
     "is_category_name",
+    "marked_as_new",
     "merged_with",
     "merging_with",
     "resolve_labels",
@@ -63,6 +64,18 @@ def merging_with(track: int) -> str:
     'merge with 7'
     """
     return f"merge with {track}"
+
+
+def marked_as_new(label: str) -> str:
+    """Return a label whose category is marked as new, unless it is marked or has none.
+
+    Examples
+    --------
+    >>> marked_as_new("pan"), marked_as_new("new pan"), marked_as_new("delete")
+    ('new pan', 'new pan', 'delete')
+    """
+    named = is_category_name(label) and not _NEW.fullmatch(label)
+    return f"new {label}" if named else label
 
 
 _Verdict = str | int | None

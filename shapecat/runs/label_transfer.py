@@ -1,6 +1,6 @@
 """Transfer labels from one run to another, to the same objects."""
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Container, Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -8,7 +8,7 @@ from typing import Any, NamedTuple
 from shapecat.errors import OutputError
 from shapecat.runs.corrections import relabel
 from shapecat.runs.folder import read_run, write_run
-from shapecat.runs.label_meaning import find_misread, merged_with, merging_with
+from shapecat.runs.label_meaning import find_misread, marked_as_new, merged_with, merging_with
 from shapecat.runs.run_info import RunInfo
 from shapecat.runs.same_objects import Group, Matches, match_in_place, match_in_time
 from shapecat.runs.track_table import TrackRow, TrackTable, read_track_table
@@ -98,7 +98,10 @@ def transfer_labels(source: Path, target: Path) -> Transfer:
     run = read_run(target)
     transfer = match_labels(source, target)
     transfer = _without(transfer, _labelled_otherwise(transfer, target, run))
-    refused = relabel(target, {item.track: item.label for item in transfer.transferred})
+    refused = relabel(target, _labels(transfer))
+    if refused:  # as a typo, perhaps, since the model there does not know the category
+        transfer = _with_new_categories(transfer, refused)
+        refused = relabel(target, _labels(transfer))
     transfer = _without(transfer, refused)
     run["corrections"] = transfer.as_dict()
     write_run(target, run)
@@ -116,6 +119,19 @@ def _labelled_otherwise(transfer: Transfer, target: Path, run: RunInfo) -> dict[
         for item in transfer.transferred
         if own[item.track] not in ("", item.label) and (item.track, own[item.track]) not in earlier
     }
+
+
+def _labels(transfer: Transfer) -> dict[int, str]:
+    return {item.track: item.label for item in transfer.transferred}
+
+
+def _with_new_categories(transfer: Transfer, tracks: Container[int]) -> Transfer:
+    """Return a transfer in which the categories of some tracks are marked as new."""
+    items = (
+        item._replace(label=marked_as_new(item.label)) if item.track in tracks else item
+        for item in transfer.transferred
+    )
+    return replace(transfer, transferred=tuple(items))
 
 
 def _without(transfer: Transfer, reasons: Mapping[int, str]) -> Transfer:
