@@ -47,12 +47,12 @@ from shapecat.evaluation.report import Compared, _accuracy_over, evaluate
 from shapecat.evaluation.training import (
     fit_views,
     learn_on_folder,
-    order_categories,
     split_instances,
     train_on_folder,
 )
 from shapecat.evaluation.views import DescribedView, DescribedViews, describe_views
 from shapecat.learning import Categorizer, load_model
+from shapecat.runs.label_meaning import order_categories
 
 
 def test_calibration_error_weights_bins_by_views() -> None:

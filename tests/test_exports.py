@@ -16,11 +16,12 @@ from numpy.testing import assert_allclose
 from shapecat.errors import OutputError, RecordingError
 from shapecat.evaluation.dataset import read_dataset
 from shapecat.geometry import rotation_from_quaternion
-from shapecat.outputs.exports import export_run
+from shapecat.outputs.exports import common_categories, export_run
 from shapecat.outputs.exports_kitti import rectified_from_sensor
 from shapecat.outputs.exports_points import write_point_labels
 from shapecat.runs.corrections import adopt_labels
 from shapecat.runs.finished import FinishedRun, open_source, read_finished
+from shapecat.runs.folder import read_run, write_run
 from shapecat.runs.label_meaning import TrackLabel
 from shapecat.runs.selection import read_frames
 from shapecat.runs.track_table import read_track_table
@@ -307,6 +308,21 @@ def test_runs_exported_together_share_category_numbers(
         )
         (number,) = set(semantic[instance == 2].tolist())
         assert legends[0][str(number)] == label
+
+
+def test_numbers_of_categories_depend_on_their_names_alone(run: Path, tmp_path: Path) -> None:
+    """An export of runs in another order, or of a model that learned them, cannot be added."""
+    runs = [tmp_path / name for name in "ab"]
+    for folder, label in zip(runs, ("zebra", "apple"), strict=True):
+        shutil.copytree(run, folder)
+        relabel(folder, {2: label})
+    names = common_categories(runs)
+    info = read_run(runs[0])
+    info["model"]["categories"] += ["zebra"]
+    write_run(runs[0], info)
+
+    assert names[-2:] == ("apple", "zebra")
+    assert common_categories(runs) == common_categories(runs[::-1]) == names
 
 
 def test_point_labels_match_pixels_of_each_object(run: Path, tmp_path: Path) -> None:

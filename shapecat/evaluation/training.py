@@ -1,6 +1,5 @@
 """Training on a labelled data set: a whole model, or new categories for an existing one."""
 
-from collections.abc import Iterable
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -17,13 +16,13 @@ from shapecat.evaluation.report import evaluate
 from shapecat.evaluation.views import DescribedViews, describe_views
 from shapecat.learning import Categorizer, load_model, save_model
 from shapecat.learning.categorizer import MOST_CATEGORIES
+from shapecat.runs.label_meaning import order_categories
 from shapecat.system.progress import Observer, ignore
-from shapecat.types import CATEGORIES, UNKNOWN
+from shapecat.types import UNKNOWN
 
 __all__ = [
     "fit_views",
     "learn_on_folder",
-    "order_categories",
     "split_instances",
     "train_on_folder",
 ]
@@ -155,12 +154,6 @@ def fit_views(
         settings=LearningSettings(**choices),
         seed=seed,
     )
-
-
-def order_categories(labels: Iterable[str]) -> tuple[str, ...]:
-    """Return the categories among labels: first the default model's, then the others by name."""
-    found = {str(label) for label in labels} - {UNKNOWN}
-    return (*(name for name in CATEGORIES if name in found), *sorted(found - set(CATEGORIES)))
 
 
 def split_instances(labels: np.ndarray, instances: np.ndarray, rng: np.random.Generator) -> Bool:

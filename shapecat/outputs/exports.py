@@ -19,6 +19,7 @@ from shapecat.outputs.exports_points import write_point_labels
 from shapecat.outputs.wording import different_names
 from shapecat.runs.finished import FinishedRun, open_source, read_finished
 from shapecat.runs.folder import clear, recover, staged
+from shapecat.runs.label_meaning import order_categories
 from shapecat.system.files import flush, replacing
 from shapecat.system.progress import Observer, ignore, observed
 from shapecat.types import LabelledFrame
@@ -171,8 +172,8 @@ def export_dataset(
     return Exported(objects, uncertain, counts)
 
 
-def common_categories(folders: Sequence[Path]) -> list[str]:
-    """Return the categories of several runs, each once.
+def common_categories(folders: Sequence[Path]) -> tuple[str, ...]:
+    """Return the categories of several runs, in an order that depends on their names alone.
 
     Raises
     ------
@@ -182,8 +183,8 @@ def common_categories(folders: Sequence[Path]) -> list[str]:
     return _common([read_finished(folder) for folder in folders])
 
 
-def _common(runs: Sequence[FinishedRun]) -> list[str]:
-    names = list(dict.fromkeys(name for run in runs for name in run.categories))
+def _common(runs: Sequence[FinishedRun]) -> tuple[str, ...]:
+    names = order_categories(name for run in runs for name in run.categories)
     spelled: dict[str, str] = {}
     for name in names:
         if spelled.setdefault(name.lower(), name) != name:

@@ -19,6 +19,7 @@ __all__ = [
     "marked_as_new",
     "merged_with",
     "merging_with",
+    "order_categories",
     "resolve_labels",
 ]
 
@@ -195,6 +196,12 @@ def is_category_name(name: str) -> bool:
     """
     allowed = _NAME.fullmatch(_without_marks(name)) and not _COMMAND.match(name)
     return bool(allowed) and name.lower() not in _RESERVED
+
+
+def order_categories(labels: Iterable[str]) -> tuple[str, ...]:
+    """Return the categories among labels: first the default model's, then the others by name."""
+    found = {str(label) for label in labels} - {UNKNOWN}
+    return (*(name for name in CATEGORIES if name in found), *sorted(found - set(CATEGORIES)))
 
 
 def _without_marks(text: str) -> str:
