@@ -562,6 +562,22 @@ def test_new_name_has_its_key_after_reload(browser: Browser, reported_run: Path)
     assert "8 mug" in browser.run("return document.getElementById('digits').textContent")
 
 
+def test_label_that_begins_with_new_counts_under_its_category(
+    browser: Browser, reported_run: Path
+) -> None:
+    """A model that had learned *pan* was wrong wherever a person had written `new pan`."""
+    a, b, c = read_track_table(reported_run / "tracks.csv").rows[:3]
+    browser.open(reported_run / "report.html")
+    for row, label in ((a, f"new {a.category}"), (b, "new pan"), (c, "pan")):
+        browser.type(f"#track-{row.track} .other", f"{label}\n")
+
+    assert changes(browser) == {b.track: "→ pan", c.track: "→ pan"}
+    assert "1 of 3" in browser.run("return document.querySelector('#verdict').textContent")
+    script = "return [...document.querySelectorAll('.confusion tr:first-child th')]"
+    columns = browser.run(f"{script}.map((cell) => cell.textContent)")
+    assert sorted(columns) == sorted(["", a.category, "pan"])
+
+
 def test_escape_leaves_label_as_it_was(browser: Browser, reported_run: Path) -> None:
     """It gave the label typed so far, and an invalid one kept the focus."""
     a, b, c = (row.track for row in read_track_table(reported_run / "tracks.csv").rows[:3])

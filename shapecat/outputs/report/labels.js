@@ -10,7 +10,8 @@ function known(label) {
   return found === undefined ? label : found;
 }
 
-function labelOf(track) { return known(labels.get(track)); }
+// What a label says: the category itself, also for `new pan`.
+function labelOf(track) { return known(labels.get(track).replace(NEW, "$1")); }
 
 function say(text, bad = false) {
   byId("said").textContent = text;
