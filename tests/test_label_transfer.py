@@ -475,6 +475,17 @@ def test_damaged_lines_are_not_silently_skipped(
     assert labels_of(target) == {5: "", 6: ""}
 
 
+def test_runs_without_common_frames_are_matched_by_place(tmp_path: Path) -> None:
+    """With another --start and --every, all labels were lost, though every object was found."""
+    odd = [CUP if k % 2 else None for k in range(FRAMES_EACH)]
+    source = make_run(tmp_path / "source", {1: odd}, labels={1: "mug"})
+    even = [None if k % 2 else shifted(CUP, z=0.01) for k in range(FRAMES_EACH)]
+    target = make_run(tmp_path / "target", {5: even, 6: static(CAN, frames=range(1))})
+
+    assert not transfer_labels(source, target).missed
+    assert labels_of(target) == {5: "mug", 6: ""}
+
+
 # ---- a second recording of the same place
 
 

@@ -23,7 +23,7 @@ __all__ = [
     "transfer_labels",
 ]
 
-IN_TIME, IN_PLACE = "frames in common", "places in another recording"
+IN_TIME, IN_PLACE = "frames in common", "places in other frames"
 TABLE_ALONE = "places in the table alone"
 """`Transfer.by` for a table without its run: fixed frame and moved objects are unknown."""
 
@@ -165,9 +165,10 @@ def match_labels(source: Path, target: Path) -> Transfer:
     if not labelled:
         return Transfer(table.run, (), wrong)
     group = _groups(labelled)
+    by, matches = IN_TIME, None
     if folder is not None and _same_recording(read_run(folder), read_run(target)):
-        by, matches = IN_TIME, match_in_time(folder, target, group)
-    else:
+        matches = match_in_time(folder, target, group)
+    if matches is None:
         by = TABLE_ALONE if folder is None else IN_PLACE
         matches = match_in_place(table.rows, folder, target, group)
     transferred, missed = _translate(labelled, group, matches)

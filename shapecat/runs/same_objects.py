@@ -1,8 +1,8 @@
 """Find the tracks of two runs that are the same object.
 
-Two runs of one recording have common frames, in which detections of the same object are mutual
-nearest neighbours. Two recordings of one place have only a fixed frame in common, in which only
-objects at rest can be found again. Ambiguous cases are reported, not guessed.
+Two runs of one recording usually have common frames, in which detections of the same object are
+mutual nearest neighbours. Others have only a fixed frame in common, in which only objects at rest
+can be found again. Ambiguous cases are reported, not guessed.
 """
 
 from collections import Counter, defaultdict
@@ -56,8 +56,8 @@ class Matches:
     reasons: Mapping[int, str]
 
 
-def match_in_time(source: Path, target: Path, group: Group) -> Matches:
-    """Match tracks that are mutual nearest neighbours in most frames common to both runs.
+def match_in_time(source: Path, target: Path, group: Group) -> Matches | None:
+    """Match tracks that are mutual nearest neighbours in most common frames; None without any.
 
     Parameters
     ----------
@@ -65,11 +65,14 @@ def match_in_time(source: Path, target: Path, group: Group) -> Matches:
     group : maps merged tracks of the source to the same number; they are one object.
     """
     old, new = read_seen_tracks(source), read_seen_tracks(target)
+    common = sorted(old.keys.keys() & new.keys.keys())
+    if not common and old.keys and new.keys:
+        return None
     old_widths, new_widths = _widths(source, old), _widths(target, new)
     votes: Counter[tuple[int, int]] = Counter()
     apart: defaultdict[tuple[int, int], float] = defaultdict(float)
     seen: Counter[int] = Counter()
-    for key in old.keys.keys() & new.keys.keys():
+    for key in common:
         here, there = old.keys[key], new.keys[key]
         seen.update(new.tracks[there].tolist())
         reach = _reach_at_once(old_widths[here], new_widths[there])
