@@ -384,6 +384,26 @@ def test_cleared_labels_are_reported_and_kept_in_copy(
     assert (folder / "tracks.previous.csv").read_text() == labelled_table
 
 
+def test_labels_of_someone_else_are_not_silently_replaced(
+    shapecat: Callable[..., Result], guessed_run: Path, tmp_path: Path
+) -> None:
+    """The second of two people with copies of one table is told what the first one said."""
+    folder = tmp_path / "table"
+    shutil.copytree(guessed_run, folder)
+    rows = sorted(read_track_table(folder / "tracks.csv").rows, key=lambda row: row.track)
+    first = rows[0]
+    lines = [f"{row.track},{row.category},0.5," for row in rows]
+    mine = tmp_path / "mine.csv"
+    mine.write_text(
+        "\n".join(["track,category,confidence,label", f"{lines[0]}bowl", f"{lines[1]}box"])
+    )
+    relabel(folder, {first.track: "mug"})
+    done = shapecat("annotate", folder, "--labels", mine)
+
+    told = f"{folder}: 1 label set, 1 label replaced (#{first.track} mug)"
+    assert done.output.splitlines()[-1] == told
+
+
 def test_missing_lines_keep_their_label(run: Path) -> None:
     """A filtered spreadsheet must not delete the labels of hidden lines."""
     corrected = run.parent / "mine.csv"
