@@ -22,7 +22,7 @@ from shapecat.recordings import MessageError
 from shapecat.recordings.colour_image import encoded, pixels_of
 from shapecat.runs.finished import FinishedRun, open_source
 from shapecat.runs.track_table import read_track_table
-from shapecat.types import Frame, LabelledFrame, LabelledObject
+from shapecat.types import UNKNOWN, Frame, LabelledFrame, LabelledObject
 
 __all__ = ["DatasetImage", "Selection", "images_of", "snapped_masks", "split_runs"]
 
@@ -145,10 +145,11 @@ def _corrected(folder: Path) -> set[int]:
 
 
 def _is_sure(item: LabelledObject, selection: Selection, corrected: set[int]) -> bool:
-    if item.category == "unknown":
+    """Return whether an object has a label to train on; *unknown* is none, also if by hand."""
+    if item.category == UNKNOWN:
         return False
-    by_hand = item.track in corrected
-    return by_hand or (item.confidence >= selection.min_confidence and not selection.corrected_only)
+    certain = item.confidence >= selection.min_confidence and not selection.corrected_only
+    return certain or item.track in corrected
 
 
 def _image(
@@ -167,7 +168,7 @@ def _image(
     kept = [
         (item, mask, _is_sure(item, selection, corrected))
         for item, mask in zip(labelled.objects, masks, strict=True)
-        if mask.pixels.size and item.category != "unknown"
+        if mask.pixels.size and item.category != UNKNOWN
     ]
     objects, seen, sure = (
         (tuple(column) for column in zip(*kept, strict=True)) if kept else [()] * 3
