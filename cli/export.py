@@ -169,6 +169,8 @@ def _require_own_names(runs: Sequence[Path], kind: str) -> None:
         name = crops_prefix(read_finished(run)) if crops else run.resolve().name
         other = names.setdefault(name, run)
         if other is not run:
-            todo = "rename one of them" if crops else "export them to different folders (--out)"
-            msg = f"{other} and {run} have the same name; {todo}"
+            todo = "; export them to different folders (--out)"
+            if crops:  # under two names, one object would count as two
+                todo = " and recording; export only one, or rename one if their frames differ"
+            msg = f"{other} and {run} have the same name{todo}"
             raise OutputError(msg)

@@ -122,12 +122,12 @@ def test_crops_are_upright_at_height_zero_with_viewpoint(run: Path, tmp_path: Pa
 
 
 @pytest.mark.parametrize(
-    ("form", "todo"), [("crops", "rename one"), ("kitti", "different folders")]
+    ("form", "todo"), [("crops", "export only one"), ("kitti", "different folders")]
 )
 def test_exports_of_runs_with_one_name_do_not_collide(
     run: Path, tmp_path: Path, shapecat: Run, form: str, todo: str
 ) -> None:
-    """Runs of one recording, one for each camera: the second export would replace the first."""
+    """The second export would replace the first; if renamed, each object would be there twice."""
     for camera in ("left", "right"):
         shutil.copytree(run, tmp_path / camera / "lab")
     folders = [tmp_path / "left" / "lab", tmp_path / "right" / "lab"]
