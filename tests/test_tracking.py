@@ -571,6 +571,23 @@ def test_two_sensors_share_tracks_despite_clock_jump(single: bool) -> None:
     assert all(track.topics.count("/b") == 20 for track in tracks)
 
 
+@pytest.mark.parametrize("per_s", [10, 2])
+def test_scraps_at_image_border_are_no_scene_cut(per_s: int) -> None:
+    """Of the last object in a camera that pans away, and of the first, only an edge is visible."""
+    whole, scrap = (0.08, 0.07, 0.07), (0.04, 0.02, 0.07)
+    sizes = [whole] * 10 + [scrap] + [None] * 20 + [scrap] + [whole] * 10
+    frames = [
+        replace(
+            frame(k, [] if size is None else [0, 0, 0], size=size or whole),
+            stamp_ns=k * SECOND // per_s,
+            partial=np.full(int(size is not None), size == scrap),
+        )
+        for k, size in enumerate(sizes)
+    ]
+    assert not scene_cuts(next(gather(frames)), SETTINGS).any()
+    assert [track.hits for track in track_recording(frames, SETTINGS)] == [22]
+
+
 def test_gap_is_interpolated_in_time_not_frames() -> None:
     """A robot that drops a second of frames would otherwise place the object halfway."""
     seconds = [*np.arange(11) / 10, 1.8, *np.arange(20, 30) / 10]

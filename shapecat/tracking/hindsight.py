@@ -8,7 +8,7 @@ from scipy.spatial import cKDTree
 
 from shapecat.arrays import F8, I4, Bool, Record, array
 from shapecat.config import TrackingSettings
-from shapecat.tracking.association import posterior_difference, size_difference, size_key
+from shapecat.tracking.association import posterior_difference, size_key
 from shapecat.tracking.hits import Hits
 from shapecat.tracking.tracker import reach
 
@@ -107,15 +107,15 @@ def _links(fragments: Fragments, settings: TrackingSettings) -> list[tuple[int, 
     return [(i, j) for _, i, j in sorted(found)]
 
 
-def _contradiction(key: F8, others: F8, known: Bool, others_known: Bool) -> F8:
-    """Return the contradictions (k,) between a `size_key` (3,) and others (k, 3).
+def _contradiction(keys: F8, others: F8, known: Bool, others_known: Bool) -> F8:
+    """Return the contradictions (...) between `size_key` results (..., 3), which are broadcast.
 
     An object of unknown size may be larger than seen so far, so only lengths beyond a known size
-    count.
+    count. ``known`` and ``others_known`` (...) say which sizes are known.
     """
-    excess = key - others
-    counts = np.where(excess > 0, others_known[:, None], known)
-    return np.asarray((np.abs(excess) * counts).mean(axis=1))
+    excess = keys - others
+    counts = np.where(excess > 0, others_known[..., None], known[..., None])
+    return np.asarray((np.abs(excess) * counts).mean(axis=-1))
 
 
 def _successors(fragments: Fragments, limit: F8, settings: TrackingSettings) -> Iterator[I4]:
@@ -209,8 +209,8 @@ def _with_neighbours(
 def _continues(hits: Hits, i: int, j: int, *, slow: bool, settings: TrackingSettings) -> bool:
     """Return whether frames i and j may show the same scene: at least half of the objects match.
 
-    With ``slow``, positions and posteriors must agree better, as the frames are not expected to
-    show motion.
+    A partial view may be smaller than its object. With ``slow``, positions and posteriors must
+    agree better, as the frames are not expected to show motion.
     """
     a, b = hits.of_frame(i), hits.of_frame(j)
     distance = np.linalg.norm(hits.centers[a][:, None] - hits.centers[b][None], axis=2)
@@ -219,11 +219,13 @@ def _continues(hits: Hits, i: int, j: int, *, slow: bool, settings: TrackingSett
     if comparable == 0:
         return True
     keys_a, keys_b = size_key(hits.sizes[a]), size_key(hits.sizes[b])
+    whole_a, whole_b = ~hits.partial[a][:, None], ~hits.partial[b][None]
+    size = _contradiction(keys_a[:, None], keys_b[None], whole_a, whole_b)
     limit = 0.5 * reach(keys_a, settings.gate_m) if slow else np.full(len(keys_a), settings.gate_m)
     other = posterior_difference(hits.posteriors[a], hits.posteriors[b])
     same = (
         (distance <= limit[:, None])
-        & (size_difference(keys_a, keys_b) <= _SAME_SIZE)
+        & (size <= _SAME_SIZE)
         & (other <= (_SAME_POSTERIOR if slow else 1.0))
     )
     found = min(int(same.any(axis=1).sum()), int(same.any(axis=0).sum()))
