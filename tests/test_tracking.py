@@ -461,6 +461,14 @@ def test_object_put_into_bowl_gets_own_track() -> None:
     assert sorted(track.hits for track in tracks) == [8, 38]
 
 
+def test_object_in_bowl_keeps_its_track_if_it_is_missed_once() -> None:
+    """One frame more in which the bowl covers its place must not discard all of its detections."""
+    bowl, filled = [(0.0, 0.2)], [(0.0, 0.2), (0.1, 0.16)]
+    frames = [bowl] * 30 + [filled] * 4 + [bowl] + [filled] * 4
+    tracks = tuple(track_recording(boxed(frames), SETTINGS))
+    assert sorted(track.hits for track in tracks) == [8, 39]
+
+
 def test_object_entering_view_in_fragments_is_one_track() -> None:
     """Only its later size shows that they are fragments."""
     whole, split = [(0.0, 0.2)], [(0.0, 0.08), (0.08, 0.2)]

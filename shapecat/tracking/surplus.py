@@ -70,10 +70,10 @@ def _covered_beside(hits: Hits, k: int, members: Sequence[I4], owner: I4) -> int
     """Count the frames before and after a track in which it lies in a neighbour's box.
 
     The track is assumed to move along with the neighbour. On either side, half as many frames are
-    checked as the track has hits. One side alone does not make it a piece, as an object may be put
-    into a bowl, or pushed against another object and merged with it from then on.
+    checked as the track has hits. One side alone does not count, as an object may be put into a
+    bowl, or pushed against another object and merged with it from then on.
     """
-    member, count = members[k], 0
+    member, counts = members[k], list[int]()
     most = len(member) // 2
     for end, way in ((0, -1), (-1, 1)):
         beside, _ = hits.at(hits.rows[member[[end]]])
@@ -84,8 +84,8 @@ def _covered_beside(hits: Hits, k: int, members: Sequence[I4], owner: I4) -> int
             then = host[max(i - most, 0) : i] if way < 0 else host[i + 1 : i + 1 + most]
             place = hits.centers[member[end]] + hits.centers[then] - hits.centers[hit]
             found.append(int(_in_box(hits, then, place).sum()))
-        count += max(found)
-    return count
+        counts.append(max(found))
+    return sum(counts) if all(counts) else 0
 
 
 def _in_box(hits: Hits, which: I4, places: F8) -> Bool:
