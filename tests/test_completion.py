@@ -241,6 +241,21 @@ def test_view_of_moved_object_keeps_its_pose() -> None:
     assert_allclose(fused.sizes, np.tile([0.2, 0.1, 0.3], (7, 1)))
 
 
+def test_box_of_carried_object_is_that_of_its_longest_rest() -> None:
+    """The median of its places is on the way, where its box reaches down to the table."""
+    there, on_the_way = np.array([0.8, 0.5, 0]), np.linspace(0.1, 0.9, 14)[:, None]
+    height = 0.3 * on_the_way * (1 - on_the_way)  # of the centre, in a box that reaches down
+    carried = on_the_way * there + height * [0, 0, 1]
+    centers = np.concatenate([np.zeros((10, 3)), carried, np.tile(there, (12, 1))])
+    sizes = np.tile([0.2, 0.1, 0.3], (36, 1))
+    sizes[10:24, 2:] += 2 * height
+    views = views_of(centers, np.tile(np.eye(3), (36, 1, 1)), sizes)
+    fused = fused_in(views, np.ones(36), one_hot("box"), CATEGORIES)
+
+    assert_allclose(fused.sizes[0], [0.2, 0.1, 0.3], atol=0.005)
+    assert_allclose(fused.centers[[0, -1]], [0 * there, there], atol=0.005)
+
+
 def test_fused_views_give_true_size_of_oval_bottle() -> None:
     """It looks round from each side; only all views together show its two widths."""
     points, normals = cylinder(1.0, 0.25)

@@ -5,7 +5,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from shapecat.arrays import F8
+from shapecat.arrays import F8, Bool
 from shapecat.completion.outline import COSINES, DIRECTIONS, SINES
 from shapecat.completion.whole import faced, footprint
 
@@ -73,7 +73,7 @@ class FusedBox(NamedTuple):
 
         A view that shows the object elsewhere keeps its own centre and yaw.
         """
-        still = np.linalg.norm(centers - self.place, axis=1) < _STILL_M
+        still = _near(centers, self.place)
         return FusedBoxes(
             np.where(still[:, None], self.center, centers),
             np.where(still[:, None, None], self.axes, _alike(axes, sizes, self.size)),
@@ -94,9 +94,8 @@ def fuse_boxes(views: BoxViews, weights: F8, posterior: F8, categories: Sequence
     weights : (k,) the weight of each view.
     posterior : (c,) probabilities of the track, in the order of ``categories``.
     """
-    middle = _median(views.centers, weights)
-    first = int(np.linalg.norm(views.centers - middle, axis=1).argmin())
-    still = np.linalg.norm(views.centers - views.centers[first], axis=1) < _STILL_M
+    first = _resting(views.centers, weights)
+    still = _near(views.centers, views.centers[first])
     some, own = BoxViews(*(values[still] for values in views)), weights[still]
     base, origin = _mean_axes(some, own), views.centers[first]
     seen, facing = _overlaid(some, own, origin, base)
@@ -112,6 +111,25 @@ def fuse_boxes(views: BoxViews, weights: F8, posterior: F8, categories: Sequence
         np.array([*plan.size, height]),
         std * np.sqrt(_COMMON + (1 - _COMMON) / len(own)),
     )
+
+
+def _resting(centers: F8, weights: F8) -> int:
+    """Return the most central view of those that show the object where it stands longest.
+
+    Between two places, a carried object is not on its support, from which boxes are estimated.
+    """
+    away = np.linalg.norm(centers - _median(centers, weights), axis=1)
+    first = int(away.argmin())
+    total = weights.sum()
+    if weights[_near(centers, centers[first])].sum() >= 0.5 * total:
+        return first
+    around = [weights[_near(centers, center)].sum() for center in centers]
+    return int(np.lexsort((away, -np.array(around)))[0])
+
+
+def _near(centers: F8, place: F8) -> Bool:
+    """Return which centres (k, 3) are so near a place (3,) that the object stands still: (k,)."""
+    return np.asarray(np.linalg.norm(centers - place, axis=1) < _STILL_M)
 
 
 def _mean_axes(views: BoxViews, weights: F8) -> F8:
