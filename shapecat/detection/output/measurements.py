@@ -133,15 +133,19 @@ def _supporting_object(segments: Segments, representatives: I4, p: int) -> tuple
 
 @kernel(inline=True)
 def _hidden_support(segments: Segments, representatives: I4, p: int) -> int:
-    """Return the label that has the most contact with a segment from below; 0 if there is none."""
+    """Return the label that has the most contact with a segment from below; 0 if there is none.
+
+    A segment that lies mostly below the top of another one is not on it, but behind it.
+    """
     statistics, pairs = segments.statistics, segments.pairs
+    most_overlap = min(OUTPUT.overlap_m, (statistics[p].top - statistics[p].bottom) / 2)
     middle = (statistics[p].left + statistics[p].right) / 2
     best, most = 0, 0.0
     for k in range(1, representatives.size):
         q = representatives[k]
         met = pairs[p, q].contact + pairs[p, q].near + pairs[p, q].in_front + pairs[q, p].in_front
         overlap = statistics[q].top - statistics[p].bottom
-        below = -OUTPUT.gap_m < overlap < OUTPUT.overlap_m
+        below = -OUTPUT.gap_m < overlap < most_overlap
         beside = statistics[q].left < middle < statistics[q].right
         if q != p and below and beside and met > most:
             best, most = k, met
