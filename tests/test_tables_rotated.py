@@ -435,3 +435,6 @@ def test_track_position_is_median() -> None:
     assert_allclose([line[name] for name in "xyz"], [0.315, 1.125, 0.71])
     assert (line["track"], line["category"], line["frames"]) == (3, "can", 3)
     assert (line["first_s"], line["last_s"]) == (0, 3)
+    late = replace(track, stamps_ns=np.array([1, 0, 3, 2]) * SECOND)  # frames arrived out of order
+    line = _line(late, CATEGORIES, 0, "")
+    assert (line["first_s"], line["last_s"]) == (0, 3)

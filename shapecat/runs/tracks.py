@@ -227,8 +227,8 @@ def _line(track: Track, categories: Sequence[str], start_ns: int, work: str) -> 
     x, y, z = np.median(track.centers, axis=0)
     return {
         "track": track.id,
-        "first_s": (int(track.stamps_ns[0]) - start_ns) * 1e-9,
-        "last_s": (int(track.stamps_ns[-1]) - start_ns) * 1e-9,
+        "first_s": (int(track.stamps_ns.min()) - start_ns) * 1e-9,
+        "last_s": (int(track.stamps_ns.max()) - start_ns) * 1e-9,
         "frames": track.hits,
         "category": UNKNOWN if track.novelty > 1 else guess,
         "confidence": track.confidence,
