@@ -45,6 +45,7 @@ from shapecat.runs.label_meaning import TrackLabel
 from shapecat.runs.label_transfer import Transfer, transfer_labels
 from shapecat.runs.missing_planes import explain_missing_planes
 from shapecat.runs.perceiving import Work, perceive_all, revise
+from shapecat.runs.pose_jumps import explain_jumps
 from shapecat.runs.resuming import has_work, resume, take_over_frames
 from shapecat.runs.run_info import RunInfo
 from shapecat.runs.segments import discard_segments
@@ -135,11 +136,13 @@ def _require_begun(job: Job, recording: Recording) -> None:
 
 
 def _revise(work: Work) -> None:
-    """Perceive again the frames that disagree with the rest; warn if most have no plane."""
+    """Perceive again the frames that disagree with the rest; warn of what will cost tracks."""
     revise(work)
     range_m = work.job.settings.detection.max_range_m
-    found = explain_missing_planes(work.recording, work.folder, work.run, range_m)
-    work.run["warnings"] += found
+    work.run["warnings"] += [
+        *explain_missing_planes(work.recording, work.folder, work.run, range_m),
+        *explain_jumps(work.folder, work.run["fixed_frame"]),
+    ]
 
 
 def _once(phase: str, folder: Path, run: RunInfo, work: Callable[[], object]) -> None:
