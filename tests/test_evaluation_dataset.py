@@ -47,6 +47,18 @@ def test_every_encoding_of_pcd_is_read(tmp_path: Path, encoding: str) -> None:
     np.testing.assert_array_equal(cloud.viewpoint, [0.5, -0.25, 1.25])
 
 
+@pytest.mark.parametrize("encoding", ["binary", "binary_compressed"])
+def test_any_kind_of_nan_is_read_without_a_warning(tmp_path: Path, encoding: str) -> None:
+    """NumPy warns when it converts a signalling NaN."""
+    path = tmp_path / "x.pcd"
+    y = struct.pack("<f", POINTS[1, 1])
+    path.write_bytes(pcd(encoding).replace(y, struct.pack("<I", 0x7FA00000)))
+
+    expected = POINTS.copy()
+    expected[1, 1] = np.nan
+    np.testing.assert_array_equal(read_pcd(path).points.astype(np.float32), expected)
+
+
 @pytest.mark.parametrize("encoding", ["ascii", "binary"])
 def test_fields_of_several_values_shift_later_fields(tmp_path: Path, encoding: str) -> None:
     """Some files have normals or histograms before x."""

@@ -170,7 +170,8 @@ def _xyz(body: bytes, layout: _Layout) -> F8:
         msg = f"unknown encoding {layout.encoding}, or a negative number of points"
         raise ValueError(msg)
     rows = np.frombuffer(body, layout.point, count=layout.number)
-    return np.stack([rows[axis].astype(np.float64) for axis in "xyz"], axis=1)
+    with np.errstate(invalid="ignore"):  # signalling NaN
+        return np.stack([rows[axis].astype(np.float64) for axis in "xyz"], axis=1)
 
 
 def _ascii_columns(point: np.dtype) -> list[int]:
@@ -198,7 +199,8 @@ def _unpack_pcd(body: bytes, layout: _Layout) -> F8:
     for name in layout.point.names or ():
         end = start + layout.number * layout.point[name].itemsize
         if name in {"x", "y", "z"}:
-            columns[name] = flat[start:end].view(layout.point[name]).astype(np.float64)
+            with np.errstate(invalid="ignore"):  # signalling NaN
+                columns[name] = flat[start:end].view(layout.point[name]).astype(np.float64)
         start = end
     return np.stack([columns[axis] for axis in "xyz"], axis=1)
 
