@@ -9,11 +9,12 @@ import pytest
 from scipy.spatial import ConvexHull
 
 from shapecat.geometry import rotation_from_quaternion, transform
-from shapecat.simulation import KINECT, make_scene, record, render_frame
+from shapecat.simulation import KINECT, make_scene, piles, record, render_frame
 from shapecat.simulation.closed_shapes import make_ball, make_box
 from shapecat.simulation.convex_parts import convex_parts, hollowness
+from shapecat.simulation.furniture import make_table
 from shapecat.simulation.mesh import Mesh
-from shapecat.simulation.physics import Drop, settle
+from shapecat.simulation.physics import Drop, SettledPose, settle
 from shapecat.simulation.primitives import lathe, rounded_box
 from shapecat.simulation.scenes import SceneKind
 from shapecat.simulation.shapes import make_object
@@ -102,6 +103,17 @@ def test_object_beside_table_falls() -> None:
     box = make_box(np.random.default_rng(2))
     (settled_pose,) = settle([table()], [Drop(box, np.eye(3), np.array([0.9, 0.0]))])
     assert transform(settled_pose.pose, box.vertices)[:, 2].max() < 0.5
+
+
+def test_objects_on_one_that_is_left_out_are_left_out(monkeypatch: pytest.MonkeyPatch) -> None:
+    """They would float in the air, and the truth would say that they stand on the table."""
+    below = make_table(np.random.default_rng(0))
+    fallen, shelf = Pose(np.eye(3), np.zeros(3)), Pose(np.eye(3), np.array([0, 0, below.height]))
+    landed = [(shelf, 1), (shelf, 2), (fallen, None), (shelf, None), (shelf, 3)]
+    monkeypatch.setattr(piles, "settle", lambda *_: [SettledPose(*pose) for pose in landed])
+    mesh = make_box(np.random.default_rng(2))
+    objects = piles.settled([piles.Item("box", "box", mesh)] * 5, [], [below], below)
+    assert [(item.on_support, item.on_track) for item in objects] == [(below.name, None), (None, 0)]
 
 
 @pytest.mark.parametrize(

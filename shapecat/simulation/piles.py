@@ -143,22 +143,24 @@ def settled(
     """Drop items onto supports; return the objects that come to rest on the support ``below``.
 
     They are numbered from 0 in the order of ``items``. Objects that rise ``highest_m`` metres or
-    more above the surface of ``below`` are left out too.
+    more above the surface of ``below`` are left out too, and so is what rests on objects left out.
     """
     settled_poses = settle([support.mesh for support in supports], drops)
     stays = [
         _rests_on(k.mesh, landed, below, highest_m)
         for k, landed in zip(items, settled_poses, strict=True)
     ]
+    for _ in stays:  # a support may come after what it carries
+        stays = [
+            stay and (landed.supported_by is None or stays[landed.supported_by])
+            for stay, landed in zip(stays, settled_poses, strict=True)
+        ]
     tracks = np.cumsum(stays) - 1
-    objects = []
-    for k, (item, landed) in enumerate(zip(items, settled_poses, strict=True)):
-        if not stays[k]:
-            continue
-        below_it = landed.supported_by
-        supported_by = below_it if below_it is not None and stays[below_it] else None
-        objects.append(_placed_object(int(tracks[k]), item, landed, below, tracks, supported_by))
-    return tuple(objects)
+    return tuple(
+        _placed_object(int(tracks[k]), item, landed, below, tracks)
+        for k, (item, landed) in enumerate(zip(items, settled_poses, strict=True))
+        if stays[k]
+    )
 
 
 def _rests_on(mesh: Mesh, landed: SettledPose, below: Support, highest_m: float) -> bool:
@@ -176,8 +178,8 @@ def _placed_object(
     landed: SettledPose,
     below: Support,
     tracks: F8,
-    supported_by: int | None,
 ) -> PlacedObject:
+    supported_by = landed.supported_by
     axes = landed.pose.rotation[2]  # world z of the object's own axes
     return PlacedObject(
         track,
