@@ -885,6 +885,23 @@ def test_runs_with_different_start_are_compared_by_stamp(run: Path) -> None:
     ]
 
 
+@pytest.mark.parametrize(
+    ("start_s", "name", "warned"), [(0.1, "1.png", True), (None, "1.png", False), (0.1, "", False)]
+)
+def test_frame_numbers_of_a_run_with_start_give_a_note(
+    run: Path, start_s: float | None, name: str, *, warned: bool
+) -> None:
+    """Numbers of the whole recording would silently be those of other images."""
+    about = json.loads((run / "run.json").read_text())
+    about["options"]["start_s"] = start_s
+    (run / "run.json").write_text(json.dumps(about))
+    image = {"id": 1, "file_name": name or f"{START}.png", "width": 10, "height": 10}
+    labels = run.parent / "coco.json"
+    labels.write_text(json.dumps({"categories": [], "images": [image], "annotations": []}))
+
+    assert any("counts from --start" in note for note in compare(run, labels).notes) == warned
+
+
 def test_frames_of_runs_with_equal_stamps_are_told_apart(tmp_path: Path) -> None:
     """Some drivers write the same stamp into several messages."""
     run, same = (write_run(tmp_path / name, step=0) for name in ("lab", "same"))

@@ -23,7 +23,7 @@ from shapecat.evaluation.comparison_matching import (
 )
 from shapecat.evaluation.comparison_pictures import DifferenceImage, draw_frame
 from shapecat.evaluation.identities import SeenTogether
-from shapecat.evaluation.labellings import LabelledItem, Labelling, Reference
+from shapecat.evaluation.labellings import LabelledItem, Labelling, Reference, numbering_notes
 from shapecat.evaluation.overlap import MATCHED_F, Overlap
 from shapecat.evaluation.references import (
     OtherRun,
@@ -116,6 +116,7 @@ def compare(
     tally, repeated = _Tally(), repeated_stamps(folder)
     with ExitStack() as stack:
         clouds, notes = _clouds(finished, recording, stack)
+        notes += numbering_notes(other, finished.run["options"]["start_s"])
         total = int(finished.run["counts"]["frames"])
         for done, (key, row, found) in enumerate(run_labellings(finished), start=1):
             place = (row["topic"], row["stamp_ns"])

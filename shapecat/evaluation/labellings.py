@@ -24,6 +24,7 @@ __all__ = [
     "find_frame",
     "index_frames",
     "join_merged",
+    "numbering_notes",
 ]
 
 _Frame = TypeVar("_Frame")
@@ -82,6 +83,8 @@ class Reference(ABC):
     """Number of frames."""
     tracked: bool = False
     """Whether objects have identities over time."""
+    numbered: bool = False
+    """Whether frames are named by their numbers alone."""
 
     @abstractmethod
     def at(self, key: Key, stamp_ns: int, *, repeated: bool = False) -> Labelling | None:
@@ -94,6 +97,20 @@ class Reference(ABC):
     @abstractmethod
     def describe_frames(self) -> str:
         """Describe the range of frames in a few words."""
+
+
+def numbering_notes(other: Reference, start_s: float | None) -> list[str]:
+    """Return a remark if the numbers of frames may count from another frame than the run's.
+
+    ``start_s`` is where the run began in its recording, None for the beginning.
+    """
+    if not (other.numbered and start_s):
+        return []
+    note = (
+        f"Frames are matched by number, which the run counts from --start {start_s:g}: labels "
+        "numbered from the start of the recording are of other frames, and need timestamps."
+    )
+    return [note]
 
 
 def join_merged(items: Iterable[LabelledItem], up: ArrayLike) -> Iterator[LabelledItem]:

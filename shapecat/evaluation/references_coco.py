@@ -57,6 +57,7 @@ class CocoLabels(Reference):
         sized = (_Image(image["id"], int(image["height"]), int(image["width"])) for image in images)
         self._images = index_frames(path, zip(map(_place_of, images), sized, strict=True))
         self.frames = len(images)
+        self.numbered = any(map(_is_numbered, images))
         items = [item for some in self._labels.values() for item in some]
         self.tracked = bool(items) and all(_track_of(item) is not None for item in items)
 
@@ -123,6 +124,13 @@ def _place_of(image: Mapping[str, Any]) -> Place:
     numbers = [int(image[name]) for name in ("stamp_ns", "frame") if image.get(name) is not None]
     numbers = numbers or [_number_in_name(image)]
     return image.get("topic"), numbers[0], numbers[1] if len(numbers) > 1 else None
+
+
+def _is_numbered(image: Mapping[str, Any]) -> bool:
+    """Return whether an image names its frame by a number, not by a timestamp."""
+    if image.get("stamp_ns") is not None:
+        return False
+    return image.get("frame") is not None or _number_in_name(image) <= _A_STAMP
 
 
 def _number_in_name(image: Mapping[str, Any]) -> int:

@@ -45,6 +45,7 @@ class KittiLabels(Reference):
         numbers = sorted(path.stem for path in (folder / "label_2").glob("*.txt"))
         try:
             names = _listed(folder / "frames.csv")
+            self.numbered = not names
             names = names or [((None, int(name), None), name) for name in numbers]
         except (OSError, ValueError, KeyError) as error:
             msg = f"{folder}: not a folder of KITTI labels ({error})"
