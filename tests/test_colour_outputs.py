@@ -4,6 +4,7 @@ import json
 import shutil
 from collections.abc import Callable, Sequence
 from copy import deepcopy
+from dataclasses import replace
 from importlib import import_module
 from pathlib import Path
 from types import SimpleNamespace
@@ -33,20 +34,24 @@ from shapecat.outputs.review import write_review
 from shapecat.outputs.review_scenes import ReviewFrame
 from shapecat.perception import Perceiver
 from shapecat.pipeline import annotate_again, process
+from shapecat.recordings import open_recording
 from shapecat.recordings.protobuf import message_decoder
 from shapecat.runs.corrections import read_labels
 from shapecat.runs.finished import open_source, read_finished
 from shapecat.runs.jobs import Job
 from shapecat.runs.masks import read_masks
-from shapecat.types import ImageMasks
-from tests.colour_messages import gradient, png
+from shapecat.types import ImageMasks, LabelledFrame
+from tests.colour_messages import gradient, png, raw
 from tests.conftest import Guesser
 from tests.mcap_files import read_ros
+from tests.messages import EPOCH, SECOND, write
 from tests.test_exports import relabel
+from tests.test_recordings_colour import MS, depth_items
 from tests.test_review import TOPIC, labelled_object, rows, scene, stamp
 
 IMAGES = "/camera/color/image_raw/compressed"
 FRAMES = 4
+UP = np.array([0.0, -1.0, 0.0])
 
 
 @pytest.fixture
@@ -131,6 +136,29 @@ def test_selected_frames_keep_their_own_image(run: Path, wanted: Sequence[int]) 
                 for item in labelled.objects
             ]
             assert len(coloured.masks) > 3
+
+
+def test_frames_keep_their_image_if_the_clock_was_set_back(tmp_path: Path) -> None:
+    """Masks lay on an image from before, as its stamp was as near: wrong in exports and review."""
+    logged = [EPOCH + k * 100 * MS for k in range(20)]
+    stamps = [time - (k > 9) * SECOND for k, time in enumerate(logged)]
+    items: list[tuple[str, int, Any]] = []
+    labelled = []
+    for k, (time, at) in enumerate(zip(logged, stamps, strict=True)):
+        items += [(topic, time, message) for topic, _, message in depth_items(at)]
+        items.append(("/cam/color/image_raw", time + MS, raw(at, gradient(), "rgb8")))
+        masks = ImageMasks("/cam/color/image_raw", at, time + MS, "camera", 64, 48, {}, {})
+        one = LabelledFrame("/cam/depth/image_raw", k, at, time, "camera", None, (), (), (), {}, UP)
+        labelled.append(replace(one, masks=masks))
+    options = {"topics": ["/cam/depth/image_raw"], "color": None, "every": 1}
+    run: Any = {"options": options | {"start_s": None, "end_s": None}, "color": {}}
+    wanted = [labelled[k] for k in (2, 3, 6, 12, 13, 14, 17)]
+    with open_recording(write(tmp_path / "a.mcap", items)) as source:
+        found = list(with_colour(wanted, source, run))
+
+    assert [labelled.index for labelled, _, _ in found] == [2, 3, 6, 12, 13, 14, 17]
+    images = [None if one is None else one.view.image.log_time_ns for _, _, one in found]
+    assert images == [labelled.log_time_ns + MS for labelled in wanted]
 
 
 def _rows(run: Path, entity: str) -> list[dict[str, Any]]:

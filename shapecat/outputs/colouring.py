@@ -52,7 +52,14 @@ def with_colour(
     OutputError : the recording no longer holds one of the frames.
     """
     awaited = _Awaited(labelled, run)
-    read = read_frames(recording, run["options"], skipped=Counter(), needed=awaited.needs)
+    # A clock that was set back gives other images the same stamps, so the nearest may be another.
+    read = read_frames(
+        recording,
+        run["options"],
+        skipped=Counter(),
+        needed=awaited.needs,
+        known=awaited.image_of,
+    )
     for label in awaited:
         for frame, view in read:
             if (label.topic, label.index) == (frame.topic, frame.index):
@@ -92,6 +99,12 @@ class _Awaited:
             times += [one.log_time_ns for one in self._next]
         later = len(self._next) == _AHEAD and log_time_ns >= max(times, default=0)
         return later or log_time_ns in times
+
+    def image_of(self, topic: str, number: int) -> int | None:
+        """Return the log time, ns, of the image of an awaited frame; None if it has none."""
+        named = (one for one in self._next if (one.topic, one.index) == (topic, number))
+        masks = next((one.masks for one in named), None)
+        return None if masks is None else masks.log_time_ns
 
 
 def _coloured(labelled: LabelledFrame, view: ColourView | None) -> Coloured | None:

@@ -1,10 +1,10 @@
 """Frames of a depth sensor, each with the colour image nearest to it in time."""
 
 from collections import Counter, deque
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from functools import cached_property, lru_cache
 from statistics import median
-from typing import Any
+from typing import Any, TypeAlias
 
 import numpy as np
 
@@ -23,7 +23,7 @@ from shapecat.recordings.stamps import delay_ns, stamp_ns
 from shapecat.recordings.streams import Stream
 from shapecat.types import Camera, Frame
 
-__all__ = ["frames_with_colour"]
+__all__ = ["KnownImages", "frames_with_colour"]
 
 _HELD_FRAMES = 8
 """At most this many frames wait for a later colour image."""
@@ -42,12 +42,17 @@ _STRAIGHT_PX, _STEPS = 2.0, 9
 with less distortion are taken for those of a pinhole camera as well."""
 
 
+KnownImages: TypeAlias = Callable[[str, int], int | None] | None
+"""The log time (ns) of the colour image of a frame, given by topic and number, if it has one."""
+
+
 def frames_with_colour(
     recording: Recording,
     streams: Sequence[Stream],
     colours: Mapping[str, ColourStream],
     *,
     skipped: Counter[str],
+    known: KnownImages = None,
     **chosen: Any,
 ) -> Iterator[tuple[Frame, ColourView | None]]:
     """Read frames as `shapecat.recordings.frames` does, each with its colour image.
@@ -56,6 +61,7 @@ def frames_with_colour(
     ----------
     colours : the colour stream of each depth topic that has one.
     skipped : as for `frames`.
+    known : the images that the frames had when all were read; by default those nearest in time.
     chosen : ``start_s``, ``end_s``, ``every`` and ``needed`` as for `frames`; ``needed`` is also
         called for colour images.
 
@@ -66,7 +72,7 @@ def frames_with_colour(
     recording count the missing images.
     """
     partners = {
-        stream.topic: _Partner(recording, stream, colours[stream.topic])
+        stream.topic: _Partner(recording, stream, colours[stream.topic], known)
         for stream in streams
         if stream.topic in colours
     }
@@ -115,8 +121,11 @@ def _paired(frame: Frame, partners: Mapping[str, "_Partner"]) -> tuple[Frame, Co
 class _Partner:
     """The latest colour images for one depth stream."""
 
-    def __init__(self, recording: Recording, depth: Stream, colour: ColourStream) -> None:
+    def __init__(
+        self, recording: Recording, depth: Stream, colour: ColourStream, known: KnownImages
+    ) -> None:
         self.stream = colour
+        self._known = known
         self._recording = recording
         self._images: deque[tuple[int, int, Any]] = deque()  # stamp, log time, decoded
         self._calibration = b""
@@ -159,13 +168,26 @@ class _Partner:
             self._left_out[f"calibration: {reason_of(error, self.stream.topic)}"] += 1
 
     def reaches(self, frame: Frame) -> bool:
-        """Return whether the newest image is not older than a frame: later ones are not nearer."""
+        """Return whether the newest image is not older than a frame: later ones are not nearer.
+
+        If the image of the frame is known, return whether it was read.
+        """
+        if self._known is not None:
+            return self._known(frame.topic, frame.index) is None or bool(self._candidates(frame))
         return self._newest is not None and self._newest >= frame.stamp_ns
+
+    def _candidates(self, frame: Frame) -> Sequence[tuple[int, int, Any]]:
+        if self._known is None:
+            period = self._period()
+            return [i for i in self._images if 2 * abs(i[0] - frame.stamp_ns) <= period]
+        logged = self._known(frame.topic, frame.index)
+        return [one for one in self._images if one[1] == logged]
 
     def view(self, frame: Frame) -> ColourView | None:
         """Return the colour image nearest to a frame in time; None if none is usable."""
-        nearest = min(self._images, key=lambda one: abs(one[0] - frame.stamp_ns), default=None)
-        if nearest is None or 2 * abs(nearest[0] - frame.stamp_ns) > self._period():
+        near = self._candidates(frame)
+        nearest = min(near, key=lambda one: abs(one[0] - frame.stamp_ns), default=None)
+        if nearest is None:
             self._left_out["no colour image near the time of the frame"] += 1
             return None
         try:

@@ -5,7 +5,7 @@ from collections.abc import Iterator
 
 from shapecat.cameras.colour import ColourView
 from shapecat.recordings import Recording, choose_streams
-from shapecat.recordings.colour_frames import frames_with_colour
+from shapecat.recordings.colour_frames import KnownImages, frames_with_colour
 from shapecat.recordings.colour_streams import pair_colours
 from shapecat.recordings.messages import Needed
 from shapecat.runs.run_info import Options
@@ -15,13 +15,19 @@ __all__ = ["count_frames", "read_frames"]
 
 
 def read_frames(
-    recording: Recording, options: Options, *, skipped: Counter[str], needed: Needed = None
+    recording: Recording,
+    options: Options,
+    *,
+    skipped: Counter[str],
+    needed: Needed = None,
+    known: KnownImages = None,
 ) -> Iterator[tuple[Frame, ColourView | None]]:
     """Read the selected frames, each with its colour image, or None.
 
     Parameters
     ----------
     skipped, needed : as for `shapecat.recordings.frames`.
+    known : as for `frames_with_colour`.
 
     Raises
     ------
@@ -38,6 +44,7 @@ def read_frames(
         every=options["every"],
         skipped=skipped,
         needed=needed,
+        known=known,
     )
 
 
