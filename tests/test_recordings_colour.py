@@ -257,6 +257,23 @@ def test_frames_pair_with_nearest_image_within_half_a_period(tmp_path: Path) -> 
     assert any("(1×): no colour image near the time of the frame" in w for w in warnings)
 
 
+@pytest.mark.parametrize("early", [False, True])
+def test_pairing_keeps_to_its_side_of_a_clock_step(tmp_path: Path, early: bool) -> None:
+    """After a clock was set back by 0.2 s, images from before had the same stamps: wrong masks."""
+    stamps = [EPOCH + (33 * k - 198 * (k > 9)) * MS for k in range(20)]
+    logged = [EPOCH + 33 * k * MS for k in range(20)]
+    items: list[tuple[str, int, Any]] = []
+    for time, at in zip(logged, stamps, strict=True):
+        items += [(topic, time + 2 * MS, message) for topic, _, message in depth_items(at)]
+        colour = raw(at + MS, gradient(), "rgb8")
+        items.append(("/cam/color/image_raw", time + (1 if early else 5) * MS, colour))
+    pairs, _ = read(write(tmp_path / "a.mcap", in_order(items)))
+
+    delay = -MS if early else 3 * MS
+    found = [view and view.image.log_time_ns - frame.log_time_ns for frame, view in pairs]
+    assert found == [delay] * 20
+
+
 def test_pairing_waits_for_image_logged_late(tmp_path: Path) -> None:
     """Compression takes time: the right image is often logged after the next frame."""
     stamps = [EPOCH + t * MS for t in (0, 33, 66)]

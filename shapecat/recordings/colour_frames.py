@@ -8,11 +8,11 @@ from typing import Any, TypeAlias
 
 import numpy as np
 
-from shapecat.cameras.colour import ColourImage, ColourView, LensCamera
+from shapecat.cameras.colour import ColourView, LensCamera
 from shapecat.cameras.lenses import LENS_MODELS, distort
 from shapecat.errors import RecordingError
 from shapecat.geometry import IDENTITY, compose
-from shapecat.recordings.colour_image import bytes_per_row, cloud_colours, compressed_size
+from shapecat.recordings.colour_image import IMAGES
 from shapecat.recordings.colour_streams import ColourStream
 from shapecat.recordings.extrinsics import Extrinsics
 from shapecat.recordings.frames import frames
@@ -79,6 +79,8 @@ def frames_with_colour(
     waiting: deque[Frame] = deque()
     for frame in frames(recording, streams, skipped=skipped, heard=_heard(partners), **chosen):
         waiting.append(frame)
+        if frame.topic in partners:
+            partners[frame.topic].expect(frame)
         while waiting and _decided(waiting, partners):
             yield _paired(waiting.popleft(), partners)
     while waiting:
@@ -127,7 +129,9 @@ class _Partner:
         self.stream = colour
         self._known = known
         self._recording = recording
-        self._images: deque[tuple[int, int, Any]] = deque()  # stamp, log time, decoded
+        self._images: deque[tuple[int, int, Any, int]] = deque()
+        """Stamp, log time, decoded, and how often the clock had been set back."""
+        self._setbacks, self._latest = 0, 0
         self._calibration = b""
         self._lens: LensCamera | None = None
         self._steps: deque[int] = deque(maxlen=9)
@@ -147,8 +151,9 @@ class _Partner:
             return
         if self._newest is not None and stamp > self._newest:
             self._steps.append(stamp - self._newest)
+        self._setbacks += stamp < (self._newest or 0)
         self._newest = stamp
-        self._images.append((stamp, message.log_time_ns, image))
+        self._images.append((stamp, message.log_time_ns, image, self._setbacks))
         while len(self._images) > _KEPT_IMAGES or self._too_much():
             self._images.popleft()
 
@@ -167,6 +172,12 @@ class _Partner:
         except (RecordingError, *MALFORMED) as error:
             self._left_out[f"calibration: {reason_of(error, self.stream.topic)}"] += 1
 
+    def expect(self, frame: Frame) -> None:
+        """Take note of a new frame: if the clock was set back, earlier images are not its own."""
+        if frame.stamp_ns < self._latest:
+            self._setbacks, self._newest = self._setbacks + 1, None
+        self._latest = frame.stamp_ns
+
     def reaches(self, frame: Frame) -> bool:
         """Return whether the newest image is not older than a frame: later ones are not nearer.
 
@@ -176,12 +187,15 @@ class _Partner:
             return self._known(frame.topic, frame.index) is None or bool(self._candidates(frame))
         return self._newest is not None and self._newest >= frame.stamp_ns
 
-    def _candidates(self, frame: Frame) -> Sequence[tuple[int, int, Any]]:
-        if self._known is None:
-            period = self._period()
-            return [i for i in self._images if 2 * abs(i[0] - frame.stamp_ns) <= period]
-        logged = self._known(frame.topic, frame.index)
-        return [one for one in self._images if one[1] == logged]
+    def _candidates(self, frame: Frame) -> list[tuple[int, int, Any, int]]:
+        if self._known is not None:
+            logged = self._known(frame.topic, frame.index)
+            return [one for one in self._images if one[1] == logged]
+        period = self._period()
+        near = [one for one in self._images if 2 * abs(one[0] - frame.stamp_ns) <= period]
+        # If the clock was set back, images from before may have the same stamps.
+        closest = min(near, key=lambda one: abs(one[1] - frame.log_time_ns), default=None)
+        return [one for one in near if closest is None or one[3] == closest[3]]
 
     def view(self, frame: Frame) -> ColourView | None:
         """Return the colour image nearest to a frame in time; None if none is usable."""
@@ -191,7 +205,7 @@ class _Partner:
             self._left_out["no colour image near the time of the frame"] += 1
             return None
         try:
-            return self._view(frame, *nearest)
+            return self._view(frame, *nearest[:3])
         except (RecordingError, *MALFORMED) as error:
             self._left_out[reason_of(error, self.stream.topic)] += 1
             return None
@@ -202,7 +216,7 @@ class _Partner:
             self._recording.warn(f"{self.stream.topic}: frames without colour ({count}×): {reason}")
 
     def _too_much(self) -> bool:
-        kept = sum(len(image.data) for _, _, image in self._images)
+        kept = sum(len(image.data) for _, _, image, _ in self._images)
         return kept > _KEPT_BYTES and len(self._images) > 2
 
     def _period(self) -> int:
@@ -212,7 +226,7 @@ class _Partner:
         return span // (count - 1) if count > 1 and span > 0 else _USUAL_PERIOD_NS
 
     def _view(self, frame: Frame, stamp: int, log_time_ns: int, decoded: Any) -> ColourView:
-        image = _IMAGES[self.stream.kind](self.stream.topic, stamp, log_time_ns, decoded)
+        image = IMAGES[self.stream.kind](self.stream.topic, stamp, log_time_ns, decoded)
         shape = (image.height, image.width)
         if self.stream.kind == "cloud":
             return ColourView(image, _lens(frame.camera))
@@ -288,39 +302,3 @@ def _bend_px(lens: LensCamera, camera: Camera | None) -> float:
     rays = (pixels - (camera.cx, camera.cy)) / (camera.fx, camera.fy)
     seen = distort(rays, lens.model, lens.coefficients) * (own.fx, own.fy) + (own.cx, own.cy)
     return float(np.abs(seen - pixels).max())
-
-
-def _bytes(data: Any) -> memoryview:
-    return memoryview(data).cast("B") if len(data) else memoryview(b"")
-
-
-def _raw(topic: str, stamp: int, log_time_ns: int, decoded: Any) -> ColourImage:
-    width, height, step = int(decoded.width), int(decoded.height), int(decoded.step)
-    image = ColourImage(
-        topic, stamp, log_time_ns, str(decoded.header.frame_id), str(decoded.encoding),
-        width, height, step, _bytes(decoded.data),
-    )  # fmt: skip
-    bytes_per_row(image)  # raises if the image is truncated
-    return image
-
-
-def _compressed(topic: str, stamp: int, log_time_ns: int, decoded: Any) -> ColourImage:
-    data = _bytes(decoded.data)
-    kind, width, height = compressed_size(data)
-    frame_id = str(decoded.header.frame_id)
-    return ColourImage(topic, stamp, log_time_ns, frame_id, kind, width, height, 0, data)
-
-
-def _cloud(topic: str, stamp: int, log_time_ns: int, decoded: Any) -> ColourImage:
-    colours = cloud_colours(decoded)
-    if colours is None:
-        msg = "cloud without colours"
-        raise MessageError(msg)
-    height, width, _ = colours.shape
-    frame_id = str(decoded.header.frame_id)
-    return ColourImage(
-        topic, stamp, log_time_ns, frame_id, "rgb8", width, height, 3 * width, colours.tobytes()
-    )
-
-
-_IMAGES = {"raw": _raw, "compressed": _compressed, "cloud": _cloud}

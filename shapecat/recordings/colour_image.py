@@ -12,6 +12,7 @@ from shapecat.recordings.messages import MessageError
 
 __all__ = [
     "COLOUR_ENCODINGS",
+    "IMAGES",
     "bytes_per_row",
     "cloud_colours",
     "compressed_kind",
@@ -254,3 +255,40 @@ def cloud_colours(message: Any) -> U1 | None:
     packed = np.ndarray((height, width, 4), np.uint8, data, offset, (row, step, 1))
     order = [1, 2, 3] if message.is_bigendian else [2, 1, 0]  # 0xAARRGGBB
     return np.ascontiguousarray(packed[..., order])
+
+
+def _bytes(data: Any) -> memoryview:
+    return memoryview(data).cast("B") if len(data) else memoryview(b"")
+
+
+def _raw(topic: str, stamp: int, log_time_ns: int, decoded: Any) -> ColourImage:
+    width, height, step = int(decoded.width), int(decoded.height), int(decoded.step)
+    image = ColourImage(
+        topic, stamp, log_time_ns, str(decoded.header.frame_id), str(decoded.encoding),
+        width, height, step, _bytes(decoded.data),
+    )  # fmt: skip
+    bytes_per_row(image)  # raises if the image is truncated
+    return image
+
+
+def _compressed(topic: str, stamp: int, log_time_ns: int, decoded: Any) -> ColourImage:
+    data = _bytes(decoded.data)
+    kind, width, height = compressed_size(data)
+    frame_id = str(decoded.header.frame_id)
+    return ColourImage(topic, stamp, log_time_ns, frame_id, kind, width, height, 0, data)
+
+
+def _cloud(topic: str, stamp: int, log_time_ns: int, decoded: Any) -> ColourImage:
+    colours = cloud_colours(decoded)
+    if colours is None:
+        msg = "cloud without colours"
+        raise MessageError(msg)
+    height, width, _ = colours.shape
+    frame_id = str(decoded.header.frame_id)
+    return ColourImage(
+        topic, stamp, log_time_ns, frame_id, "rgb8", width, height, 3 * width, colours.tobytes()
+    )
+
+
+IMAGES = {"raw": _raw, "compressed": _compressed, "cloud": _cloud}
+"""Functions that make a `ColourImage` from topic, stamp, log time (ns) and decoded message."""
