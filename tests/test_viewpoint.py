@@ -69,6 +69,18 @@ def test_camera_of_transformed_cloud_is_found(invalid: float) -> None:
     np.testing.assert_allclose(pose.rotation, rotation, atol=1e-4)
 
 
+def test_missing_points_at_the_origin_of_another_frame_have_no_depth(tmp_path: Path) -> None:
+    """A camera that looks at the base of its robot would see a wall of such points."""
+    depth, quaternion = wavy_depth(), (0.3, -0.6, 0.4, 0.5)
+    place = rotation_from_quaternion(quaternion) @ [0.05, -0.02, -0.7]
+    points = posed(organized_points(depth), quaternion, place)
+    points[depth == 0] = 0
+    (frame,) = read(write(tmp_path / "a.mcap", [("/points", EPOCH, cloud(EPOCH, points))]))
+
+    assert frame.depth is not None
+    np.testing.assert_allclose(frame.depth, depth / 1000, atol=1e-4)
+
+
 def lidar_rings() -> F4:
     """Return the organized cloud of a rotating lidar that stands beside the origin."""
     elevation, azimuth = np.radians(np.mgrid[-15:15:16j, 0:360:400j])
