@@ -469,6 +469,13 @@ def test_object_in_bowl_keeps_its_track_if_it_is_missed_once() -> None:
     assert sorted(track.hits for track in tracks) == [8, 39]
 
 
+def test_object_put_onto_plate_on_tray_gets_own_track() -> None:
+    """Plate and tray both enclose its place before, which is evidence from one side only."""
+    empty = [(0.0, 0.4), (0.08, 0.26)]
+    tracks = track_recording(boxed([empty] * 30 + [[*empty, (0.1, 0.16)]] * 8), SETTINGS)
+    assert sorted(track.hits for track in tracks) == [8, 38, 38]
+
+
 def test_object_entering_view_in_fragments_is_one_track() -> None:
     """Only its later size shows that they are fragments."""
     whole, split = [(0.0, 0.2)], [(0.0, 0.08), (0.08, 0.2)]
