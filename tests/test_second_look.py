@@ -424,6 +424,19 @@ def test_poses_relate_up_directions_of_moving_camera() -> None:
     np.testing.assert_allclose(chosen["/d", 4].up, truth[4], atol=1e-5)
 
 
+def test_frames_without_planes_do_not_decide_up_in_fixed_frame() -> None:
+    """They are most frames where the camera looks away from the table for long."""
+    truth, fixed_up = leaning(np.linspace(10, 70, 20)), np.array([0.6, 0.0, 0.8])
+    rotation = [rotation_between(v, fixed_up) for v in truth]
+    up, offsets = truth.copy(), np.full(20, -0.9)
+    up[6:18], offsets[6:18] = (1, 0, 0), np.nan
+
+    chosen = frames_to_revise(tables(up, rotation=rotation, offsets=offsets))
+
+    assert [frame for _, frame in chosen] == list(range(6, 18))
+    np.testing.assert_allclose(chosen["/d", 9].up, truth[9], atol=1e-5)
+
+
 def rotation_between(a: Any, b: Any) -> Any:
     """Return a rotation (3, 3) that takes one unit vector to another."""
     from scipy.spatial.transform import Rotation  # noqa: PLC0415  beside its only use
