@@ -229,7 +229,7 @@ def test_thin_object_that_moved_has_no_negative_size() -> None:
 
 
 def test_view_of_moved_object_keeps_its_pose() -> None:
-    """Its size is that of the other views."""
+    """Its size is that of the other views, and does not become more certain by this view."""
     centers, sizes = np.zeros((7, 3)), np.tile([0.2, 0.1, 0.3], (7, 1))
     centers[5:], axes = [0.4, 0.1, 0], np.tile(np.eye(3), (7, 1, 1))
     sizes[6], axes[6] = [0.1, 0.2, 0.3], about_z(0.5)
@@ -239,6 +239,7 @@ def test_view_of_moved_object_keeps_its_pose() -> None:
     assert_allclose(fused.axes[5], np.eye(3), atol=1e-12)
     assert_allclose(fused.axes[6], about_z(0.5 + np.pi / 2), atol=1e-12)
     assert_allclose(fused.sizes, np.tile([0.2, 0.1, 0.3], (7, 1)))
+    assert_allclose(fused.stds[:, 2], 0.01 * np.sqrt(0.5 + 0.5 / 5))
 
 
 def test_box_of_carried_object_is_that_of_its_longest_rest() -> None:
