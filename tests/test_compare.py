@@ -1042,6 +1042,19 @@ def test_kitti_types_match_categories_of_run(run: Path) -> None:
     assert found.as_dict()["differences"] == {}
 
 
+def test_labels_without_masks_may_end_with_an_empty_frame(run: Path) -> None:
+    """Its detections have masks, but an overlap of this frame alone would be 0."""
+    labels = run.parent / "kitti"
+    (labels / "label_2").mkdir(parents=True)
+    (labels / "label_2" / "000000.txt").write_text("cup 0 0 0 0 0 0 0 0.2 0.3 0.1 0 0.1 1 0\n")
+    (labels / "label_2" / "000002.txt").write_text("")
+    found = compare(run, labels).figures
+
+    assert found["frames"]["compared"] == 2
+    assert found["overlap"] is None
+    assert found["objects"]["found"] == found["box_iou"]["n"] == 1
+
+
 def test_kitti_dont_care_regions_are_no_objects(tmp_path: Path) -> None:
     """Lines as in KITTI's own data, which has neither frames.csv nor spaces in types."""
     (tmp_path / "label_2").mkdir()
