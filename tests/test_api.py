@@ -513,6 +513,22 @@ def test_options_of_process_reach_the_run(tmp_path: Path, monkeypatch: pytest.Mo
     assert (job.source, job.folder) == (FIXTURE, tmp_path / "tabletop")
 
 
+def test_run_of_the_current_folder_has_its_name(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Without a name, the results would be written into ``out`` itself, beside other runs."""
+    jobs: list[Any] = []
+    monkeypatch.setattr("shapecat.pipeline.process", lambda job, *_, **__: jobs.append(job))
+    (tmp_path / "monday.1").mkdir()
+    (tmp_path / "monday.1" / "part_0.db3").touch()
+    monkeypatch.chdir(tmp_path / "monday.1")
+
+    with pytest.raises(OutputError, match=r"no run\.json"):
+        shapecat.process(".", tmp_path / "out")
+
+    assert jobs[0].folder == tmp_path / "out" / "monday.1"
+
+
 def test_process_accepts_single_topic_and_up_vector(page_folder: Path, tmp_path: Path) -> None:
     """A topic was taken for a list of letters, and a list of numbers ended in a traceback."""
     plain: Any = {"every": 8, "mcap": False, "rrd": False}
