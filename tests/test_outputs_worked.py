@@ -753,11 +753,14 @@ def test_scene_node_text_has_track_size_and_flags() -> None:
 
 
 def test_scene_shows_merged_objects_once_and_no_deleted_ones() -> None:
-    """A mug found in three parts stands on a deleted plate, and a ball on the upper part."""
+    """A mug found in three parts stands on a deleted plate, and a ball on the upper part.
+
+    Its first part was thought to stand on the can beside it.
+    """
     plane = Plane(np.array([0, 0, 1.0]), 0.0, np.zeros((3, 3)), 0.5, 0.7)
     heights = {"rim": 0.12, "ball": 0.2, "plate": 0.01, "handle": 0.09, "body": 0.05, "can": 0.3}
     number = {name: k for k, name in enumerate(heights)}
-    below = {"rim": "body", "ball": "rim", "handle": "body", "body": "plate", "can": "plate"}
+    below = {"rim": "can", "ball": "rim", "handle": "body", "body": "plate", "can": "plate"}
     candidates = [
         Candidate(
             np.array([k]), box_at((0, 0, height), (0.01, 0.01, 0.01)), 0,
