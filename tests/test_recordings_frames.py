@@ -69,6 +69,24 @@ def test_end_may_be_far_after_the_end(tmp_path: Path, container: str, end_s: flo
     assert not read(path, start_s=end_s)[0]
 
 
+def test_messages_of_another_type_on_the_topic_are_no_frames(tmp_path: Path) -> None:
+    """Two nodes may publish under one name: the numbers of frames would depend on the other."""
+    items = []
+    for k in range(3):
+        stamp = EPOCH + k * SECOND
+        items += [
+            ("/points", stamp, cloud(stamp, organized_points(wavy_depth()))),
+            ("/points", stamp + 1, info(stamp)),
+        ]
+    found, skipped, _ = read(write(tmp_path / "a.mcap", items), every=2)
+
+    assert [(frame.index, frame.stamp_ns) for frame in found] == [
+        (0, EPOCH),
+        (2, EPOCH + 2 * SECOND),
+    ]
+    assert not skipped
+
+
 @pytest.mark.parametrize("chunk_size", [1 << 20, 25_000])  # one chunk, or one for each 5 images
 def test_needed_frames_equal_those_of_full_read(tmp_path: Path, chunk_size: int) -> None:
     """In an indexed file the others are skipped, but still counted."""
