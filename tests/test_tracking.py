@@ -429,6 +429,13 @@ def test_fragments_of_repeatedly_split_object_get_no_tracks() -> None:
     assert [track.hits for track in tracks] == [36]
 
 
+def test_object_that_is_mostly_split_is_one_track() -> None:
+    """Its size is known from the minority of frames that show it whole."""
+    whole, split = [(0.0, 0.2)], [(0.0, 0.12), (0.12, 0.2)]
+    tracks = tuple(track_recording(boxed(([whole] * 3 + [split] * 7) * 4), SETTINGS))
+    assert [track.hits for track in tracks] == [40]
+
+
 def test_burst_of_splits_gets_no_track() -> None:
     """The fragment is never missed while the burst lasts; only other frames reveal it."""
     whole, split = [(0.0, 0.2)], [(0.0, 0.12), (0.12, 0.2)]
