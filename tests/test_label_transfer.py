@@ -593,6 +593,20 @@ def test_table_alone_is_matched_by_positions(tmp_path: Path, place: str) -> None
     assert transfer.by == TABLE_ALONE
 
 
+@pytest.mark.parametrize(("size", "label"), [(0.08, ""), (0.31, "mug")])
+def test_large_objects_are_matched_farther_to_table_alone(
+    tmp_path: Path, size: float, label: str
+) -> None:
+    """The table has no sizes, but the run has them."""
+    table = tmp_path / "table.csv"
+    write_csv(table, {4: static(CUP)}, "wfar", {4: "mug"})
+    target = second(tmp_path / "target", {2: static(shifted(CUP, x=0.09))}, size=size)
+
+    transfer_labels(table, target)
+
+    assert labels_of(target) == {2: label}
+
+
 def test_table_alone_may_have_categories_of_target(tmp_path: Path) -> None:
     """*pan* is one letter from *can*, but the model of the run has learned it."""
     table = tmp_path / "table.csv"
