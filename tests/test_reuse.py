@@ -17,13 +17,14 @@ from shapecat.errors import ConfigError
 from shapecat.geometry import IDENTITY, transform
 from shapecat.perception import Perceiver, View
 from shapecat.reuse import shows_the_same
+from shapecat.reuse.views import _alike, sight_of
 from shapecat.runs.jobs import Job
 from shapecat.simulation import KINECT, make_scene, render_frame
 from shapecat.simulation.recorder import record
 from shapecat.simulation.worlds import Motion, World
 from shapecat.tracking.hits import gather
 from shapecat.tracking.records import FrameDetections
-from shapecat.types import Detection, Frame, FullBox, Perception, Pose
+from shapecat.types import Box, Candidate, Detection, Frame, FullBox, Perception, Pose
 from tests.conftest import Guesser
 
 FRAMES, CHANGE = 6, 3
@@ -208,6 +209,23 @@ def test_reused_surfaces_and_boxes_stay_in_place_while_camera_moves() -> None:
         )  # fmt: skip
         assert np.allclose(place, old_place, atol=1e-5)
         assert (turn.inv() * old_turn).magnitude() < 1e-5
+
+
+@pytest.mark.parametrize(("pixels", "alike"), [(1350, True), (1400, False)])
+def test_nearer_view_with_flipped_yaw_is_alike_up_to_noise(pixels: int, *, alike: bool) -> None:
+    """Nearer by a factor of 0.951, as many pixels are 1.22 and 1.27 times those of before."""
+    center, sights = np.array([0.1, -0.2, 1.0]), []
+    half = np.sqrt(0.5)
+    for share, count, sides, turn in (
+        (1.0, 1000, (0.2, 0.12, 0.3), (0, 0, 0, 1)),
+        (0.951, pixels, (0.12, 0.2, 0.3), (0, 0, half, half)),
+    ):
+        box = Box(share * center, np.array(sides), np.array(turn))
+        found = Candidate(np.arange(count), box, 0, None, 0.0, False, False)
+        pose = Pose(np.eye(3), (1 - share) * center)
+        sights.append(sight_of(rendered(), pose, found, np.array([0, 0, 1.0]), 0.15).numbers)
+
+    assert _alike(sights[1], sights[0]) == alike
 
 
 def test_wrong_pose_prevents_reuse() -> None:
