@@ -159,8 +159,8 @@ def test_empty_time_range_is_refused(
 
 
 def test_recording_option_is_refused_for_several_runs(shapecat: Run, tmp_path: Path) -> None:
-    """A folder of runs also counts as several runs."""
-    for name in ("a", "b"):
+    """A folder of runs also counts as several runs; one in the making does not count."""
+    for name in ("a", "b", ".c.partial"):
         (tmp_path / "runs" / name).mkdir(parents=True)
         (tmp_path / "runs" / name / "run.json").write_text("{}")
     for kind in ("crops", "coco"):
