@@ -47,6 +47,7 @@ from shapecat.outputs.image_annotations import ImageBox, read_image_frames
 from shapecat.outputs.level_clouds import support_offset, upright_cloud
 from shapecat.outputs.opened_run import RunFrame
 from shapecat.outputs.png import png
+from shapecat.outputs.review_images import picture_of
 from shapecat.outputs.review_paths import Paths
 from shapecat.outputs.review_scenes import choose_scenes, with_clouds
 from shapecat.outputs.scene_tree import _apply_labels, _candidate, _described, _topic
@@ -784,6 +785,27 @@ def test_scene_shows_merged_objects_once_and_no_deleted_ones() -> None:
         "  object in no track",
     ]
     assert lines[1].endswith(": 8 x 10 x 14 cm, occluded")
+
+
+# ---- masks on images
+
+
+def test_overlay_with_more_categories_than_colours_shows_all_masks() -> None:
+    """Two pixels share a byte: a number beyond 15 would change or clear the pixel beside it."""
+    names = [f"kind {'abcdefghijklmnopqrst'[k]}" for k in range(20)]
+    tones = list(dict.fromkeys(map(colour_of, names)))
+    objects = [labelled_object(k, [k], category=name) for k, name in enumerate(names)]
+    masks = tuple(Mask(k + 1, 1, np.ones((1, 1), bool)) for k in range(len(names)))
+    image = ColourImage("/c", 5, 6, "c", "mono8", 23, 3, 23, bytes(3 * 23))
+    coloured = Coloured(ColourView(image, None, None), masks)
+    picture = picture_of(labelled_frame(0, *objects), coloured)
+    assert picture is not None
+    overlay = np.asarray(Image.open(io.BytesIO(picture.masks)).convert("RGBA"))
+
+    assert len(tones) > 15
+    assert np.argwhere(overlay[..., 3]).tolist() == [[1, k + 1] for k in range(len(names))]
+    shown = [tones[min(tones.index(colour_of(name)), 14)] for name in names]
+    assert overlay[1, 1:21, :3].tolist() == [list(tone) for tone in shown]
 
 
 # ---- image boxes and labels
