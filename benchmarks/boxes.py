@@ -26,7 +26,7 @@ from shapecat.geometry import gravity_rotation, rotation_from_quaternion
 from shapecat.pipeline import process
 from shapecat.runs.jobs import Job
 from shapecat.simulation import simulate
-from shapecat.simulation.scenes import SceneKind
+from shapecat.simulation.scenes.kinds import SceneKind
 
 Array = NDArray[Any]
 SEEN_PIXELS = 250

@@ -17,12 +17,12 @@ from benchmarks.measure import markdown
 from benchmarks.scenes import SEEN_PIXELS
 from shapecat.config import Settings
 from shapecat.detection import detect
-from shapecat.evaluation.overlap import MATCHED_F, match_masks
+from shapecat.evaluation.comparison.overlap import MATCHED_F, match_masks
 from shapecat.models.viewpoints import random_viewpoint
 from shapecat.simulation import Sensor, World, make_scene, render_frame
-from shapecat.simulation.presets import PRESETS
-from shapecat.simulation.scenes import SceneKind
-from shapecat.simulation.worlds import FIRST_OBJECT_LABEL
+from shapecat.simulation.camera.presets import PRESETS
+from shapecat.simulation.scenes.kinds import SceneKind
+from shapecat.simulation.scenes.worlds import FIRST_OBJECT_LABEL
 
 KINDS: tuple[SceneKind, ...] = ("tabletop", "clutter", "pile")
 RANGES_M = ((0.3, 0.45), (0.45, 0.7), (0.7, 1.1), (1.1, 1.7), (1.7, 2.6))

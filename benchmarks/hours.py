@@ -24,9 +24,9 @@ import pyarrow as pa
 from benchmarks.measure import markdown, save
 from shapecat.completion import DIRECTIONS
 from shapecat.config import TrackingSettings
-from shapecat.runs.segments import group_frames
-from shapecat.runs.table_schemas import DETECTIONS, FRAMES
-from shapecat.runs.table_writing import arrow_table, open_writer
+from shapecat.runs.tables.schemas import DETECTIONS, FRAMES
+from shapecat.runs.tables.segments import group_frames
+from shapecat.runs.tables.writing import arrow_table, open_writer
 from shapecat.runs.tracks import track_run
 from shapecat.types import CATEGORIES
 

@@ -22,16 +22,16 @@ from benchmarks.measure import markdown
 from shapecat.config import DetectionSettings, Settings, SurfaceSettings
 from shapecat.learning import Categorizer, load_model, save_model
 from shapecat.pipeline import process
-from shapecat.runs.corrections import relabel
 from shapecat.runs.jobs import Job
-from shapecat.runs.label_meaning import merged_with
-from shapecat.runs.label_transfer import match_labels
-from shapecat.runs.tables import read_row_groups
-from shapecat.runs.track_table import read_track_table
+from shapecat.runs.labels.corrections import relabel
+from shapecat.runs.labels.meaning import merged_with
+from shapecat.runs.labels.track_table import read_track_table
+from shapecat.runs.labels.transfer import match_labels
+from shapecat.runs.tables.reading import read_row_groups
 from shapecat.simulation import KINECT, make_scene
-from shapecat.simulation.paths import Filming, arc_orbit
 from shapecat.simulation.recorder import record
-from shapecat.simulation.worlds import FIRST_OBJECT_LABEL, World
+from shapecat.simulation.scenes.paths import Filming, arc_orbit
+from shapecat.simulation.scenes.worlds import FIRST_OBJECT_LABEL, World
 
 SCENES = ("tabletop", "clutter", "walking", "rearranged")
 OTHER = Settings(

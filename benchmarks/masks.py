@@ -20,14 +20,14 @@ import numpy as np
 from benchmarks.boxes import SEEN_PIXELS, by_frame, matches
 from benchmarks.measure import markdown
 from shapecat.outputs.colouring import with_colour
-from shapecat.outputs.dataset_frames import snapped_masks
+from shapecat.outputs.exports.dataset_frames import snapped_masks
 from shapecat.pipeline import process
 from shapecat.recordings import open_recording
-from shapecat.recordings.colour_image import pixels_of
-from shapecat.runs.corrections import read_labels
+from shapecat.recordings.decoding.colour_image import pixels_of
 from shapecat.runs.folder import read_run
 from shapecat.runs.jobs import Job
-from shapecat.runs.labels import read_labelled_frames
+from shapecat.runs.labelled_frames import read_labelled_frames
+from shapecat.runs.labels.corrections import read_labels
 from shapecat.simulation import simulate
 
 SEEN_ON_IMAGE = 300

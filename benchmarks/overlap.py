@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 from benchmarks.scenes import labelled_clutter, labelled_tables
 from shapecat.config import DetectionSettings
 from shapecat.detection import detect
-from shapecat.evaluation.overlap import Overlap, match_masks
+from shapecat.evaluation.comparison.overlap import Overlap, match_masks
 from shapecat.types import Frame
 
 Array = NDArray[Any]

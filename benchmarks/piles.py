@@ -17,14 +17,14 @@ from numpy.typing import NDArray
 from benchmarks.measure import markdown
 from benchmarks.scenes import SEEN_PIXELS
 from shapecat.config import Settings
+from shapecat.evaluation.comparison.overlap import MATCHED_F, match_masks
 from shapecat.evaluation.metrics import auroc, expected_calibration_error
-from shapecat.evaluation.overlap import MATCHED_F, match_masks
 from shapecat.learning import Categorizer, load_model
 from shapecat.perception import perceive
 from shapecat.simulation import PlacedObject, render_frame
-from shapecat.simulation.paths import Filming
-from shapecat.simulation.piles import bin_picking, pile, shelf_bin
-from shapecat.simulation.presets import PRESETS
+from shapecat.simulation.camera.presets import PRESETS
+from shapecat.simulation.scenes.paths import Filming
+from shapecat.simulation.scenes.piles import bin_picking, pile, shelf_bin
 from shapecat.types import CATEGORIES, Detection
 
 Array = NDArray[Any]

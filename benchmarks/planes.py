@@ -21,10 +21,10 @@ from shapecat.config import DetectionSettings
 from shapecat.detection import detect
 from shapecat.geometry import inverse
 from shapecat.simulation import KINECT, PlacedObject, Support, World, make_scene, render_frame
-from shapecat.simulation.furniture import make_room, make_table
-from shapecat.simulation.paths import looking_at
-from shapecat.simulation.primitives import rounded_box
-from shapecat.simulation.render import render
+from shapecat.simulation.camera.render import render
+from shapecat.simulation.scenes.furniture import make_room, make_table
+from shapecat.simulation.scenes.paths import looking_at
+from shapecat.simulation.shapes.primitives import rounded_box
 from shapecat.types import Camera, Frame, Pose, Scene
 
 Array = NDArray[Any]

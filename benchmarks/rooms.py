@@ -17,12 +17,12 @@ from numpy.typing import NDArray
 from benchmarks.measure import markdown
 from benchmarks.scenes import SEEN_PIXELS
 from shapecat.config import Settings
-from shapecat.evaluation.overlap import MATCHED_F, match_masks
+from shapecat.evaluation.comparison.overlap import MATCHED_F, match_masks
 from shapecat.learning import Categorizer, load_model
 from shapecat.perception import perceive
 from shapecat.simulation import make_scene, render_frame
-from shapecat.simulation.presets import PRESETS
-from shapecat.simulation.worlds import FIRST_OBJECT_LABEL
+from shapecat.simulation.camera.presets import PRESETS
+from shapecat.simulation.scenes.worlds import FIRST_OBJECT_LABEL
 
 Array = NDArray[Any]
 HEAD = ("sensor", "frames", "detections", "surplus", "of these pieces", "found", "surplus a frame")

@@ -18,7 +18,7 @@ from numpy.typing import NDArray
 from benchmarks.measure import markdown
 from shapecat import open_recording
 from shapecat.simulation import make_scene, render_frame
-from shapecat.simulation.presets import PRESETS
+from shapecat.simulation.camera.presets import PRESETS
 from shapecat.types import Frame
 
 Array = NDArray[Any]

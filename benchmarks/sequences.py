@@ -21,13 +21,13 @@ from scipy.optimize import linear_sum_assignment
 
 from benchmarks.measure import markdown
 from shapecat.arrays import F8, U1
-from shapecat.evaluation.identities import SeenTogether, judge_identities
+from shapecat.evaluation.comparison.identities import SeenTogether, judge_identities
 from shapecat.evaluation.metrics import expected_calibration_error
 from shapecat.pipeline import process
 from shapecat.runs.jobs import Job
-from shapecat.runs.track_table import read_track_table
+from shapecat.runs.labels.track_table import read_track_table
 from shapecat.simulation import simulate
-from shapecat.simulation.scenes import SceneKind
+from shapecat.simulation.scenes.kinds import SceneKind
 from shapecat.tracking.fusion import fuse, view_weights
 from shapecat.types import CATEGORIES
 

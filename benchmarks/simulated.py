@@ -22,8 +22,8 @@ from shapecat.config import DetectionSettings
 from shapecat.detection import detect
 from shapecat.geometry import inverse
 from shapecat.simulation import KINECT, make_scene, render_frame
-from shapecat.simulation.scenes import SceneKind
-from shapecat.simulation.worlds import PlacedObject, World
+from shapecat.simulation.scenes.kinds import SceneKind
+from shapecat.simulation.scenes.worlds import PlacedObject, World
 from shapecat.types import Frame, Scene
 
 Array = NDArray[Any]

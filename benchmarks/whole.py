@@ -25,7 +25,7 @@ from benchmarks.measure import markdown, save
 from shapecat.simulation import KINECT, make_scene, render_frame
 from shapecat.simulation.containers import CONTAINERS
 from shapecat.simulation.recorder import LINK_FROM_OPTICAL, robot_links
-from shapecat.simulation.worlds import World
+from shapecat.simulation.scenes.worlds import World
 from shapecat.types import Frame, Pose
 
 OPTICAL = "camera_depth_optical_frame"

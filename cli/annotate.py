@@ -64,7 +64,7 @@ def annotate(
 def _labels_of(run: Path) -> dict[int, str]:
     """Return the label of each track of a run; none if it has no readable table."""
     from shapecat.errors import OutputError
-    from shapecat.runs.track_table import read_track_table
+    from shapecat.runs.labels.track_table import read_track_table
 
     try:
         return {row.track: row.label for row in read_track_table(run / "tracks.csv").rows}
@@ -73,7 +73,7 @@ def _labels_of(run: Path) -> dict[int, str]:
 
 
 def _show(transfer: dict[str, Any], labels: Path | None) -> None:
-    from shapecat.runs.label_transfer import TABLE_ALONE
+    from shapecat.runs.labels.transfer import TABLE_ALONE
 
     done, missed = transfer["transferred"], transfer["not_transferred"]
     click.echo(f"{len(done)} of {len(done) + len(missed)} labels transferred")

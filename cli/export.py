@@ -100,7 +100,7 @@ def export(
     shapecat export results --format kitti --out kitti
     shapecat export results --format coco --out coco --min-confidence 0.8
     """
-    from shapecat.outputs.exports import common_categories, export_run
+    from shapecat.outputs.exports.formats import common_categories, export_run
     from shapecat.runs.finished import find_runs
 
     runs = find_runs(folders)
@@ -139,8 +139,8 @@ def _export_dataset(
     runs: Sequence[Path], kind: str, out: Path, recording: Path | None, chosen: dict[str, Any]
 ) -> None:
     """Export several runs as one data set."""
-    from shapecat.outputs.dataset_frames import Selection
-    from shapecat.outputs.exports import export_dataset
+    from shapecat.outputs.exports.dataset_frames import Selection
+    from shapecat.outputs.exports.formats import export_dataset
 
     with progress_bars() as bars:
         selection = Selection(**chosen)
@@ -160,7 +160,7 @@ def _export_dataset(
 def _require_own_names(runs: Sequence[Path], kind: str) -> None:
     """Refuse runs with the same name: their exports would collide."""
     from shapecat.errors import OutputError
-    from shapecat.outputs.exports_crops import crops_prefix
+    from shapecat.outputs.exports.crops import crops_prefix
     from shapecat.runs.finished import read_finished
 
     names: dict[str, Path] = {}

@@ -30,7 +30,7 @@ def view(*, run: Path, web: bool, screenshot: Path | None) -> None:
     shapecat view results/lab --web
     shapecat view results/lab --screenshot lab.png
     """
-    from shapecat.outputs.review_viewer import open_viewer, take_screenshot
+    from shapecat.outputs.review.viewer import open_viewer, take_screenshot
     from shapecat.runs.folder import read_run
     from shapecat.system.files import require_writable
 
@@ -52,7 +52,7 @@ def view(*, run: Path, web: bool, screenshot: Path | None) -> None:
 
 def _serve(review: Path) -> None:
     """Serve until the viewer ends or a signal arrives."""
-    from shapecat.outputs.review_viewer import serve_viewer
+    from shapecat.outputs.review.viewer import serve_viewer
 
     stops = stopping.noticing("stopping the viewer")
     with serve_viewer(review) as (address, viewer), stops:

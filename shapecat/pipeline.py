@@ -16,7 +16,6 @@ from shapecat.learning import load_model
 from shapecat.recordings import Recording, choose_streams, open_recording
 from shapecat.recordings.colour_streams import pair_colours
 from shapecat.rehearsal import compile_all
-from shapecat.runs.corrections import adopt_labels, read_labels
 from shapecat.runs.folder import (
     OUTPUT_OPTIONS,
     OUTPUTS,
@@ -41,14 +40,15 @@ from shapecat.runs.jobs import (
     require_utf8,
     summarize,
 )
-from shapecat.runs.label_meaning import TrackLabel
-from shapecat.runs.label_transfer import Transfer, transfer_labels
-from shapecat.runs.missing_planes import explain_missing_planes
-from shapecat.runs.perceiving import Work, perceive_all, revise
-from shapecat.runs.pose_jumps import explain_jumps
-from shapecat.runs.resuming import has_work, resume, take_over_frames
+from shapecat.runs.labels.corrections import adopt_labels, read_labels
+from shapecat.runs.labels.meaning import TrackLabel
+from shapecat.runs.labels.transfer import Transfer, transfer_labels
+from shapecat.runs.perceive.missing_planes import explain_missing_planes
+from shapecat.runs.perceive.phases import Work, perceive_all, revise
+from shapecat.runs.perceive.pose_jumps import explain_jumps
+from shapecat.runs.perceive.resuming import has_work, resume, take_over_frames
 from shapecat.runs.run_info import RunInfo
-from shapecat.runs.segments import discard_segments
+from shapecat.runs.tables.segments import discard_segments
 from shapecat.system.files import holding
 from shapecat.system.memory import release_memory
 from shapecat.system.progress import Observer, ignore, observed
@@ -221,8 +221,8 @@ def annotate(folder: Path, recording: Recording, run: RunInfo, observe: Observer
         return read_labels(folder / "tracks.csv", run["model"]["categories"])
 
     def write_mcap() -> None:
-        from shapecat.outputs.annotated_mcap import write_annotated  # noqa: PLC0415  on first use
-        from shapecat.outputs.image_annotations import read_image_frames  # noqa: PLC0415  the same
+        from shapecat.outputs.annotation.annotated_mcap import write_annotated  # noqa: PLC0415  on first use
+        from shapecat.outputs.annotation.image_annotations import read_image_frames  # noqa: PLC0415  the same
         from shapecat.runs.shown import read_shown_frames  # noqa: PLC0415  the same
 
         topics = list(dict.fromkeys(run.get("color", {}).values()))
@@ -239,10 +239,10 @@ def annotate(folder: Path, recording: Recording, run: RunInfo, observe: Observer
         )
 
     def write_rrd() -> None:
-        from shapecat.outputs.review import write_review  # noqa: PLC0415  loads Rerun on first use
-        from shapecat.outputs.review_scenes import with_clouds  # noqa: PLC0415  the same
-        from shapecat.runs.labels import read_labelled_frames  # noqa: PLC0415  the same
-        from shapecat.runs.placed_frames import streams_with_poses  # noqa: PLC0415  the same
+        from shapecat.outputs.review.scenes import with_clouds  # noqa: PLC0415  the same
+        from shapecat.outputs.review.writing import write_review  # noqa: PLC0415  loads Rerun on first use
+        from shapecat.runs.labelled_frames import read_labelled_frames  # noqa: PLC0415  the same
+        from shapecat.runs.tables.placed_frames import streams_with_poses  # noqa: PLC0415  the same
 
         final = labels()
         shown = observed(read_labelled_frames(folder, final), "review", total, observe)

@@ -241,7 +241,7 @@ def snapped_once() -> Iterator[None]:
         return known[key]
 
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr("shapecat.outputs.dataset_frames.snapped", recall)
+        patch.setattr("shapecat.outputs.exports.dataset_frames.snapped", recall)
         yield
 
 

@@ -25,7 +25,7 @@ from mcap.writer import Writer
 from shapecat.runs.jobs import Job
 from shapecat.simulation import KINECT, Sensor, make_scene, record
 from shapecat.simulation.messages import MessageFactory
-from shapecat.simulation.scenes import SceneKind
+from shapecat.simulation.scenes.kinds import SceneKind
 from shapecat.types import Camera
 from tests.foxglove_messages import descriptors, encode, time
 

@@ -8,7 +8,7 @@ from typing import Any, NamedTuple
 
 from google.protobuf.descriptor_pb2 import FileDescriptorSet
 
-from shapecat.recordings.protobuf import message_class
+from shapecat.recordings.decoding.protobuf import message_class
 from tests.mcap_files import mcap_writer
 
 SECOND = 10**9

@@ -28,11 +28,15 @@ from rosbags.rosbag2.metadata import parse_qos
 from rosbags.typesys import Stores, get_types_from_msg, get_typestore
 
 from shapecat.errors import OutputError
-from shapecat.outputs.annotated_mcap import write_annotated
+from shapecat.outputs.annotation.annotated_mcap import write_annotated
+from shapecat.outputs.annotation.mcap_append import Appender, copy_bytes
 from shapecat.outputs.colours import CATEGORY_COLOURS, colour_of
-from shapecat.outputs.mcap_append import Appender, copy_bytes
 from shapecat.recordings import open_recording
-from shapecat.recordings.mcap_records import ChunkError, read_chunk_index, write_chunk_index
+from shapecat.recordings.containers.mcap_records import (
+    ChunkError,
+    read_chunk_index,
+    write_chunk_index,
+)
 from shapecat.types import CATEGORIES, ShownBox, ShownFrame
 from tests.mcap_files import mcap_writer, read_ros, summary_of
 from tests.test_recordings import QOS

@@ -14,15 +14,15 @@ from numpy.testing import assert_allclose
 from rosbags.typesys import Stores, get_types_from_msg, get_typestore
 from scipy.spatial.transform import Rotation
 
-from shapecat.outputs.annotated_mcap import write_annotated
-from shapecat.outputs.annotation import Annotation, AnnotationChannel, text_position
-from shapecat.outputs.annotations import encoder_for
+from shapecat.outputs.annotation.annotated_mcap import write_annotated
+from shapecat.outputs.annotation.channels import encoder_for
+from shapecat.outputs.annotation.content import Annotation, AnnotationChannel, text_position
+from shapecat.outputs.annotation.image_annotations import ImageBox, ImageFrame, image_encoders_for
+from shapecat.outputs.annotation.ros_annotations import RosMessages
 from shapecat.outputs.colours import colour_of
-from shapecat.outputs.image_annotations import ImageBox, ImageFrame, image_encoders_for
-from shapecat.outputs.review_shapes import _above
-from shapecat.outputs.ros_annotations import RosMessages
+from shapecat.outputs.review.shapes import _above
 from shapecat.recordings import open_recording
-from shapecat.recordings.protobuf import message_decoder
+from shapecat.recordings.decoding.protobuf import message_decoder
 from shapecat.types import Box, ShownBox, ShownFrame
 from tests.mcap_files import read_ros, summary_of
 from tests.test_annotated_mcap import EPOCH, write_mcap

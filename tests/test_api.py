@@ -24,7 +24,7 @@ from shapecat import api
 from shapecat.errors import ConfigError, ModelError, OutputError, RecordingError
 from shapecat.learning import load_model, save_model
 from shapecat.outputs.opened_run import Table
-from shapecat.runs.corrections import adopt_labels
+from shapecat.runs.labels.corrections import adopt_labels
 from shapecat.types import Camera
 from tests import messages
 from tests.conftest import Guesser

@@ -164,10 +164,10 @@ def test_processing_loads_no_library_too_early() -> None:
     late |= {"google.protobuf", "PIL", "rerun"}
     never = {"open3d", "matplotlib", "sklearn"}
     code = (
-        "import sys, shapecat.batch, shapecat.recordings.decoding;"
+        "import sys, shapecat.batch, shapecat.recordings.decoding.decoders;"
         f"print(*{late} & set(sys.modules)); shapecat.open_run;"
         f"print(*{never | {'rerun', 'pandas'}} & set(sys.modules));"
-        "import shapecat.outputs.annotated_mcap, shapecat.outputs.review"
+        "import shapecat.outputs.annotation.annotated_mcap, shapecat.outputs.review.writing"
     )
 
     assert loaded_by(code, never) == set()

@@ -41,7 +41,7 @@ from shapecat.runs.jobs import (
     require_unchanged,
     summarize,
 )
-from shapecat.runs.resuming import has_work, resume
+from shapecat.runs.perceive.resuming import has_work, resume
 from shapecat.runs.run_info import RunInfo
 from shapecat.system.files import input_size, partial_path
 from tests.run_info import run_info

@@ -11,8 +11,8 @@ from scipy.optimize import least_squares
 from scipy.spatial.transform import Rotation
 
 from shapecat.cameras.lenses import distort, undistorted_rays
-from shapecat.recordings.compressed_depth import depth_of_compressed
-from shapecat.recordings.depth_image import depth_of_image
+from shapecat.recordings.decoding.compressed_depth import depth_of_compressed
+from shapecat.recordings.decoding.depth_image import depth_of_image
 from shapecat.recordings.messages import MessageError
 from shapecat.recordings.pinhole import camera_of_info, fit_pinhole
 from shapecat.recordings.sources import DepthSource
@@ -281,9 +281,9 @@ def test_rays_agree_with_pixels_to_a_thousandth_of_a_pixel() -> None:
 
 def test_up_is_rotated_from_fixed_frame_into_sensor_frame() -> None:
     """Z of the fixed frame, seen by the sensor, is the last row of fixed_from_sensor."""
-    from shapecat.recordings.gravity import Upright  # noqa: PLC0415  beside its only use
-    from shapecat.recordings.transform_window import TransformWindow  # noqa: PLC0415  the same
-    from shapecat.recordings.transforms import TransformBuffer  # noqa: PLC0415  the same
+    from shapecat.recordings.transforms.buffer import TransformBuffer  # noqa: PLC0415  the same
+    from shapecat.recordings.transforms.gravity import Upright  # noqa: PLC0415  beside its only use
+    from shapecat.recordings.transforms.window import TransformWindow  # noqa: PLC0415  the same
 
     turn = Rotation.from_euler("xyz", [-2.1, 0.3, 0.8])
     transforms = TransformBuffer()

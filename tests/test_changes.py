@@ -11,21 +11,21 @@ import pytest
 from shapecat.cameras.colour import LensCamera
 from shapecat.colour.projection import rectified
 from shapecat.geometry import IDENTITY
+from shapecat.outputs.annotation.ros_annotations import RosMessages
 from shapecat.outputs.colours import colour_of
-from shapecat.outputs.ros_annotations import RosMessages
 from shapecat.recordings import choose_streams, frames, open_recording
 from shapecat.recordings.colour_frames import frames_with_colour
 from shapecat.recordings.colour_streams import pair_colours
-from shapecat.recordings.decoding import decode
-from shapecat.recordings.gravity import Upright
+from shapecat.recordings.decoding.decoders import decode
 from shapecat.recordings.messages import Channel, Message
-from shapecat.recordings.transform_window import TransformWindow
-from shapecat.recordings.transforms import TransformBuffer
+from shapecat.recordings.transforms.buffer import TransformBuffer
+from shapecat.recordings.transforms.gravity import Upright
+from shapecat.recordings.transforms.window import TransformWindow
 from shapecat.reuse import KeyView, find_repeats, sight_of
 from shapecat.reuse.agreement import agreement
-from shapecat.runs.perceived import FrameRow, PerceptionTables
-from shapecat.runs.placed_frames import PlacedFrames, streams_with_poses
-from shapecat.runs.tables import read_row_groups
+from shapecat.runs.perceive.perceived import FrameRow, PerceptionTables
+from shapecat.runs.tables.placed_frames import PlacedFrames, streams_with_poses
+from shapecat.runs.tables.reading import read_row_groups
 from shapecat.tracking.hits import gather
 from shapecat.tracking.records import FrameDetections
 from shapecat.types import Camera, Frame, Pose

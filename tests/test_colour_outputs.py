@@ -22,24 +22,24 @@ from shapecat.colour.masks import Mask
 from shapecat.colour.rle import rle_counts, rle_mask, rle_text
 from shapecat.config import Settings
 from shapecat.errors import NoStreamError
-from shapecat.outputs import image_annotations
-from shapecat.outputs.colouring import Coloured, with_colour
-from shapecat.outputs.image_annotations import (
+from shapecat.outputs.annotation import image_annotations
+from shapecat.outputs.annotation.image_annotations import (
     ImageBox,
     ImageFrame,
     image_encoders_for,
     read_image_frames,
 )
-from shapecat.outputs.review import write_review
-from shapecat.outputs.review_scenes import ReviewFrame
+from shapecat.outputs.colouring import Coloured, with_colour
+from shapecat.outputs.review.scenes import ReviewFrame
+from shapecat.outputs.review.writing import write_review
 from shapecat.perception import Perceiver
 from shapecat.pipeline import annotate_again, process
 from shapecat.recordings import open_recording
-from shapecat.recordings.protobuf import message_decoder
-from shapecat.runs.corrections import read_labels
+from shapecat.recordings.decoding.protobuf import message_decoder
 from shapecat.runs.finished import open_source, read_finished
 from shapecat.runs.jobs import Job
-from shapecat.runs.masks import read_masks
+from shapecat.runs.labels.corrections import read_labels
+from shapecat.runs.tables.masks import read_masks
 from shapecat.types import ImageMasks, LabelledFrame
 from tests.colour_messages import gradient, png, raw
 from tests.conftest import Guesser
@@ -264,7 +264,7 @@ def test_masks_do_not_depend_on_processes_or_interruptions(
 
     process(job("one"))
     with monkeypatch.context() as patched:
-        patched.setattr("shapecat.runs.perceiving.Perceiver", in_other_process)
+        patched.setattr("shapecat.runs.perceive.phases.Perceiver", in_other_process)
         process(job("sent"))
     assert len(sent) == FRAMES
     with pytest.raises(KeyboardInterrupt):

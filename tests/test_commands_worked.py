@@ -12,9 +12,9 @@ from typing import Any
 import pytest
 from click.testing import Result
 
-from shapecat.outputs.dataset_frames import Selection
-from shapecat.outputs.exports import Exported
-from shapecat.runs.label_transfer import TABLE_ALONE
+from shapecat.outputs.exports.dataset_frames import Selection
+from shapecat.outputs.exports.formats import Exported
+from shapecat.runs.labels.transfer import TABLE_ALONE
 from tests.scenes import record
 
 Run = Callable[..., Result]
@@ -337,14 +337,14 @@ CALLS = {
     ),
     "export a b --format coco --out o --every 3 --per-track 7 --min-confidence 0.6 "
     "--corrected-only --depth --val 0.4": (
-        "shapecat.outputs.exports.export_dataset",
+        "shapecat.outputs.exports.formats.export_dataset",
         [[Path("a"), Path("b")], "coco", Path("o"), Selection(3, 7, 0.6, True, True, 0.4)],
         {"recording": None},
         Exported(1075, 3, {"train": 1400, "val": 20}),
         "2 runs: 1,075 labelled views in o\n1,400 images in train, 20 in val\n",
     ),
     "export a b --format yolo --out o": (
-        "shapecat.outputs.exports.export_dataset",
+        "shapecat.outputs.exports.formats.export_dataset",
         [[Path("a"), Path("b")], "yolo", Path("o"), Selection()],
         {"recording": None},
         Exported(7, 0, {"train": 1}),
@@ -354,7 +354,7 @@ CALLS = {
         ),
     ),
     "export a --format kitti --out o --every 3 --boxes visible --recording r.bag": (
-        "shapecat.outputs.exports.export_run",
+        "shapecat.outputs.exports.formats.export_run",
         [Path("a"), "kitti", Path("o")],
         {"every": 3, "visible_boxes": True, "recording": Path("r.bag"), "categories": ["of a"]},
         1,
@@ -380,7 +380,7 @@ def test_options_are_passed_on_and_results_printed(
     monkeypatch.chdir(tmp_path)
     monkeypatch.setattr(target, stub)
     monkeypatch.setattr("shapecat.runs.finished.find_runs", list)
-    common = "shapecat.outputs.exports.common_categories"
+    common = "shapecat.outputs.exports.formats.common_categories"
     monkeypatch.setattr(common, lambda runs: [f"of {run}" for run in runs])
     done = shapecat(*line.split())
 

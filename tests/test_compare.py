@@ -24,8 +24,8 @@ from scipy.spatial import ConvexHull, HalfspaceIntersection
 from scipy.spatial.transform import Rotation
 
 from shapecat.errors import RecordingError
-from shapecat.evaluation import comparing
-from shapecat.evaluation.comparing import (
+from shapecat.evaluation.comparison import comparing
+from shapecat.evaluation.comparison.comparing import (
     Comparison,
     _compare_frame,
     _kind,
@@ -33,20 +33,27 @@ from shapecat.evaluation.comparing import (
     _Tally,
     compare,
 )
-from shapecat.evaluation.comparison_figures import Pairs, figures_of
-from shapecat.evaluation.comparison_matching import (
+from shapecat.evaluation.comparison.figures import Pairs, figures_of
+from shapecat.evaluation.comparison.labellings import (
+    LabelledItem,
+    Labelling,
+    find_frame,
+    index_frames,
+)
+from shapecat.evaluation.comparison.matching import (
     Difference,
     Matched,
     match_objects,
     seen_together,
 )
-from shapecat.evaluation.comparison_page import (
+from shapecat.evaluation.comparison.overlap import Overlap, box_iou
+from shapecat.evaluation.comparison.page import (
     figure_rows,
     format_page,
     place_captions,
     write_comparison,
 )
-from shapecat.evaluation.comparison_pictures import (
+from shapecat.evaluation.comparison.pictures import (
     COLOURS,
     Caption,
     DifferenceImage,
@@ -54,12 +61,10 @@ from shapecat.evaluation.comparison_pictures import (
     _shades,
     draw_frame,
 )
-from shapecat.evaluation.labellings import LabelledItem, Labelling, find_frame, index_frames
-from shapecat.evaluation.overlap import Overlap, box_iou
-from shapecat.evaluation.references import open_reference, read_complete, run_labellings
-from shapecat.evaluation.references_coco import CocoLabels, decode_rle, filled_polygon
-from shapecat.evaluation.references_kitti import KittiLabels
-from shapecat.runs.table_schemas import DETECTIONS, FRAMES, TRACKS
+from shapecat.evaluation.comparison.references import open_reference, read_complete, run_labellings
+from shapecat.evaluation.comparison.references_coco import CocoLabels, decode_rle, filled_polygon
+from shapecat.evaluation.comparison.references_kitti import KittiLabels
+from shapecat.runs.tables.schemas import DETECTIONS, FRAMES, TRACKS
 from shapecat.types import Box, Camera, Frame
 from tests.run_info import run_info
 

@@ -162,7 +162,7 @@ def test_finished_phases_are_not_repeated(
     job = Job(recording, tmp_path / "table", end_s=0.3, rrd=False)
     target = {
         "track": "shapecat.runs.tracks.track_run",
-        "annotated.mcap": "shapecat.outputs.annotated_mcap.write_annotated",
+        "annotated.mcap": "shapecat.outputs.annotation.annotated_mcap.write_annotated",
     }[phase]
     with monkeypatch.context() as patch:
         patch.setattr(target, interrupt)
@@ -189,7 +189,7 @@ def test_interrupted_annotation_is_finished(
     process(job)
     before = contents(folder)
     with monkeypatch.context() as patch:
-        patch.setattr("shapecat.outputs.annotated_mcap.write_annotated", interrupt)
+        patch.setattr("shapecat.outputs.annotation.annotated_mcap.write_annotated", interrupt)
         with pytest.raises(KeyboardInterrupt):
             annotate_again(folder, None)
     (folder / "annotated.mcap").unlink()

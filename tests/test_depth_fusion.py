@@ -22,7 +22,7 @@ from shapecat.runs.folder import read_run
 from shapecat.runs.jobs import Job
 from shapecat.simulation import KINECT, make_scene, render_frame
 from shapecat.simulation.messages import MessageFactory
-from shapecat.simulation.paths import looking_at
+from shapecat.simulation.scenes.paths import looking_at
 from shapecat.types import Camera, Frame, Pose
 from tests.conftest import Guesser
 from tests.messages import SECOND, write

@@ -18,12 +18,12 @@ from shapecat.detection.planes.ransac import draw_trials
 from shapecat.detection.planes.settings import UP as UP_SETTINGS
 from shapecat.detection.planes.strips import add_strip_planes
 from shapecat.detection.planes.up_direction import estimate_up
-from shapecat.evaluation.overlap import MATCHED_F
+from shapecat.evaluation.comparison.overlap import MATCHED_F
 from shapecat.learning import load_model
-from shapecat.simulation.mesh import Mesh, moved
-from shapecat.simulation.paths import looking_at
-from shapecat.simulation.primitives import rounded_box
-from shapecat.simulation.render import geometry, render
+from shapecat.simulation.camera.render import geometry, render
+from shapecat.simulation.scenes.paths import looking_at
+from shapecat.simulation.shapes.mesh import Mesh, moved
+from shapecat.simulation.shapes.primitives import rounded_box
 from shapecat.types import Camera, Pose
 from tests.test_detection import ball, frame_of
 from tests.test_detection import render as render_shapes

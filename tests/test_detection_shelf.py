@@ -11,7 +11,7 @@ from shapecat.config import DetectionSettings
 from shapecat.detection import detect
 from shapecat.geometry import inverse
 from shapecat.simulation import KINECT, make_scene, render_frame
-from shapecat.simulation.scenes import SceneKind
+from shapecat.simulation.scenes.kinds import SceneKind
 from shapecat.types import Camera, Frame
 
 FIRST_OBJECT = 20

@@ -14,7 +14,7 @@ from click.testing import Result
 
 from shapecat import config
 from shapecat.config import Settings
-from shapecat.runs.table_schemas import TABLES
+from shapecat.runs.tables.schemas import TABLES
 
 ROOT = Path(__file__).parents[1]
 PAGES = [ROOT / "README.md", *sorted((ROOT / "docs").glob("*.md"))]
@@ -67,10 +67,10 @@ def test_help_explains_each_choice(
 @pytest.mark.parametrize(
     ("command", "option", "registry"),
     [
-        ("simulate", "scene", ("shapecat.simulation.scenes", "SCENES")),
-        ("simulate", "sensor", ("shapecat.simulation.presets", "PRESETS")),
-        ("export", "kind", ("shapecat.outputs.exports", "FORMATS")),
-        ("export", "kind", ("shapecat.outputs.exports", "DATASETS")),
+        ("simulate", "scene", ("shapecat.simulation.scenes.kinds", "SCENES")),
+        ("simulate", "sensor", ("shapecat.simulation.camera.presets", "PRESETS")),
+        ("export", "kind", ("shapecat.outputs.exports.formats", "FORMATS")),
+        ("export", "kind", ("shapecat.outputs.exports.formats", "DATASETS")),
     ],
 )
 def test_command_offers_what_the_library_has(

@@ -52,7 +52,7 @@ from shapecat.evaluation.training import (
 )
 from shapecat.evaluation.views import DescribedView, DescribedViews, describe_views
 from shapecat.learning import Categorizer, load_model
-from shapecat.runs.label_meaning import order_categories
+from shapecat.runs.labels.meaning import order_categories
 
 
 def test_calibration_error_weights_bins_by_views() -> None:

@@ -16,15 +16,15 @@ from numpy.testing import assert_allclose
 from shapecat.errors import OutputError, RecordingError
 from shapecat.evaluation.dataset import read_dataset
 from shapecat.geometry import rotation_from_quaternion
-from shapecat.outputs.exports import common_categories, export_run
-from shapecat.outputs.exports_kitti import rectified_from_sensor
-from shapecat.outputs.exports_points import write_point_labels
-from shapecat.runs.corrections import adopt_labels
+from shapecat.outputs.exports.formats import common_categories, export_run
+from shapecat.outputs.exports.kitti import rectified_from_sensor
+from shapecat.outputs.exports.points import write_point_labels
 from shapecat.runs.finished import FinishedRun, open_source, read_finished
 from shapecat.runs.folder import read_run, write_run
-from shapecat.runs.label_meaning import TrackLabel
-from shapecat.runs.selection import read_frames
-from shapecat.runs.track_table import read_track_table
+from shapecat.runs.labels.corrections import adopt_labels
+from shapecat.runs.labels.meaning import TrackLabel
+from shapecat.runs.labels.track_table import read_track_table
+from shapecat.runs.perceive.selection import read_frames
 from shapecat.types import Box, Frame, LabelledFrame, LabelledObject, NeuralGas
 from tests.track_tables import rows
 

@@ -17,12 +17,12 @@ from shapecat.colour.image_masks import mask_of
 from shapecat.colour.masks import Mask
 from shapecat.colour.outline import joined, outlines
 from shapecat.errors import OutputError
-from shapecat.outputs.dataset_frames import Selection, split_runs
-from shapecat.outputs.exports import export_dataset, export_run
+from shapecat.outputs.exports.dataset_frames import Selection, split_runs
+from shapecat.outputs.exports.formats import export_dataset, export_run
 from shapecat.recordings import MessageError
-from shapecat.recordings.colour_image import pixels_of
+from shapecat.recordings.decoding.colour_image import pixels_of
 from shapecat.runs.finished import FinishedRun, read_finished
-from shapecat.runs.masks import read_masks
+from shapecat.runs.tables.masks import read_masks
 from tests.mcap_files import read_ros
 from tests.test_colour_outputs import IMAGES
 from tests.test_exports import relabel
@@ -272,7 +272,7 @@ def test_export_without_images_says_why(
         msg = "jpeg image is damaged"
         raise MessageError(msg)
 
-    monkeypatch.setattr("shapecat.outputs.dataset_frames.pixels_of", failing)
+    monkeypatch.setattr("shapecat.outputs.exports.dataset_frames.pixels_of", failing)
     words = ("export", coloured_run, "--format", "coco", "--out", tmp_path / "out", *options)
     result = shapecat(*words)
 
@@ -447,7 +447,7 @@ def test_kitti_boxes_project_onto_colour_image(run: Path, tmp_path: Path) -> Non
 
 def test_damaged_image_is_skipped(run: Path, tmp_path: Path, monkeypatch: Any) -> None:
     """One bad frame among thousands must not end the export."""
-    from shapecat.outputs import dataset_frames  # noqa: PLC0415  to be changed
+    from shapecat.outputs.exports import dataset_frames  # noqa: PLC0415  to be changed
 
     calls = iter(range(99))
     read = pixels_of

@@ -13,8 +13,8 @@ import pytest
 from click.testing import Result
 from PIL import Image
 
-from shapecat.outputs.dataset_frames import Selection
-from shapecat.outputs.exports import export_dataset
+from shapecat.outputs.exports.dataset_frames import Selection
+from shapecat.outputs.exports.formats import export_dataset
 from tests.test_exports import relabel
 from tests.test_exports_images import decoded, read_coco
 

@@ -17,14 +17,14 @@ from scipy.spatial.transform import Rotation
 from shapecat.cameras.colour import ColourImage, ColourView, LensCamera
 from shapecat.colour.masks import Mask
 from shapecat.evaluation.clouds import read_pcd
-from shapecat.evaluation.references_kitti import KittiLabels
+from shapecat.evaluation.comparison.references_kitti import KittiLabels
 from shapecat.geometry import IDENTITY
 from shapecat.outputs.colouring import Coloured
-from shapecat.outputs.dataset_frames import DatasetImage
-from shapecat.outputs.exports_coco import write_coco, write_yolo
-from shapecat.outputs.exports_crops import write_crops
-from shapecat.outputs.exports_kitti import rectified_from_sensor, write_kitti
-from shapecat.outputs.exports_labelcloud import _described, write_labelcloud
+from shapecat.outputs.exports.coco import write_coco, write_yolo
+from shapecat.outputs.exports.crops import write_crops
+from shapecat.outputs.exports.dataset_frames import DatasetImage
+from shapecat.outputs.exports.kitti import rectified_from_sensor, write_kitti
+from shapecat.outputs.exports.labelcloud import _described, write_labelcloud
 from shapecat.types import Box, Camera, Frame, LabelledFrame, LabelledObject, NeuralGas, Pose
 
 CAMERA = Camera(160, 120, 143.0, 139.0, 77.4, 61.9)

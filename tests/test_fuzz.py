@@ -18,8 +18,8 @@ from rosbags.rosbag2 import Writer as FolderWriter
 from shapecat.errors import NoStreamError, RecordingError
 from shapecat.geometry import IDENTITY
 from shapecat.recordings import choose_streams, frames, open_recording
-from shapecat.recordings.gravity import Upright
-from shapecat.recordings.ros1_bag import BagRecording
+from shapecat.recordings.containers.ros1_bag import BagRecording
+from shapecat.recordings.transforms.gravity import Upright
 from shapecat.simulation.messages import MessageFactory
 from shapecat.types import Camera
 from tests.messages import EPOCH, SECOND, write

@@ -15,16 +15,16 @@ from shapecat.errors import ConfigError
 from shapecat.geometry import IDENTITY, transform
 from shapecat.pipeline import process
 from shapecat.recordings import open_recording
-from shapecat.recordings.gravity import Orientation, Upright
-from shapecat.recordings.pointcloud2 import cloud_points
+from shapecat.recordings.decoding.pointcloud2 import cloud_points
 from shapecat.recordings.streams import Stream
-from shapecat.recordings.transform_window import TransformWindow
-from shapecat.recordings.transforms import TransformBuffer
-from shapecat.runs import perceiving
+from shapecat.recordings.transforms.buffer import TransformBuffer
+from shapecat.recordings.transforms.gravity import Orientation, Upright
+from shapecat.recordings.transforms.window import TransformWindow
 from shapecat.runs.folder import read_run
 from shapecat.runs.jobs import Job
-from shapecat.runs.table_schemas import DETECTIONS, FRAMES, PLANES
-from shapecat.runs.up_report import report_up
+from shapecat.runs.perceive import phases as perceiving
+from shapecat.runs.perceive.up_report import report_up
+from shapecat.runs.tables.schemas import DETECTIONS, FRAMES, PLANES
 from shapecat.simulation.messages import MessageFactory
 from shapecat.simulation.recorder import LINK_FROM_OPTICAL
 from shapecat.types import Frame, Pose

@@ -8,8 +8,8 @@ import motmetrics
 import numpy as np
 import pytest
 
-from shapecat.evaluation.identities import SeenTogether, judge_identities
-from shapecat.evaluation.overlap import box_iou, match_masks
+from shapecat.evaluation.comparison.identities import SeenTogether, judge_identities
+from shapecat.evaluation.comparison.overlap import box_iou, match_masks
 from shapecat.geometry import quaternion_from_rotation, rotation_from_quaternion
 from shapecat.types import Box
 

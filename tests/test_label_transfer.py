@@ -12,15 +12,15 @@ import pytest
 from click.testing import Result
 
 from shapecat.errors import OutputError
-from shapecat.runs.corrections import adopt_labels, read_labels
 from shapecat.runs.folder import read_run, staged, write_run
 from shapecat.runs.identity import new_id
 from shapecat.runs.jobs import Job, keep_labels
-from shapecat.runs.label_transfer import TABLE_ALONE, match_labels, transfer_labels
-from shapecat.runs.same_objects import Match, _by_majority, _mutual_nearest
-from shapecat.runs.table_schemas import DETECTIONS, FRAMES, TRACKS
-from shapecat.runs.table_writing import write_table
-from shapecat.runs.track_table import read_track_table
+from shapecat.runs.labels.corrections import adopt_labels, read_labels
+from shapecat.runs.labels.same_objects import Match, _by_majority, _mutual_nearest
+from shapecat.runs.labels.track_table import read_track_table
+from shapecat.runs.labels.transfer import TABLE_ALONE, match_labels, transfer_labels
+from shapecat.runs.tables.schemas import DETECTIONS, FRAMES, TRACKS
+from shapecat.runs.tables.writing import write_table
 from tests.mcap_files import read_ros
 from tests.run_info import run_info
 from tests.scenes import record

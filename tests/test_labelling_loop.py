@@ -12,12 +12,12 @@ import pytest
 from click.testing import Result
 
 from shapecat.simulation import World, record
-from shapecat.simulation.distractors import make_distractor
-from shapecat.simulation.furniture import make_table
-from shapecat.simulation.layout import Layout, Piece, make_piece
-from shapecat.simulation.paths import Filming, arc_orbit
-from shapecat.simulation.placement import StablePose
-from shapecat.simulation.presets import KINECT
+from shapecat.simulation.camera.presets import KINECT
+from shapecat.simulation.scenes.furniture import make_table
+from shapecat.simulation.scenes.layout import Layout, Piece, make_piece
+from shapecat.simulation.scenes.paths import Filming, arc_orbit
+from shapecat.simulation.scenes.placement import StablePose
+from shapecat.simulation.shapes.distractors import make_distractor
 from shapecat.types import CATEGORIES, Pose
 
 Run = Callable[..., Result]

@@ -15,13 +15,13 @@ from hypothesis import strategies as st
 from shapecat.errors import OutputError
 from shapecat.outputs.wording import safe_name
 from shapecat.pipeline import annotate_again
-from shapecat.runs.corrections import _given, adopt_labels, read_labels, relabel
 from shapecat.runs.finished import FinishedRun
-from shapecat.runs.label_meaning import TrackLabel
-from shapecat.runs.labels import read_labelled_frames
-from shapecat.runs.perceived import FrameRow, PerceptionTables
+from shapecat.runs.labelled_frames import read_labelled_frames
+from shapecat.runs.labels.corrections import _given, adopt_labels, read_labels, relabel
+from shapecat.runs.labels.meaning import TrackLabel
+from shapecat.runs.labels.track_table import read_track_table
+from shapecat.runs.perceive.perceived import FrameRow, PerceptionTables
 from shapecat.runs.shown import _ended
-from shapecat.runs.track_table import read_track_table
 from shapecat.runs.tracks import _CSV, _write_csv
 from shapecat.types import Box, Candidate, Detection, NeuralGas, Perception, Plane, Scene
 from tests.mcap_files import read_ros
@@ -264,7 +264,7 @@ def test_line_deleted_from_own_table_is_refused(run: Path) -> None:
 
 
 def test_error_lists_few_of_many_missing_tracks(run: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("shapecat.runs.corrections._LISTED", 2)
+    monkeypatch.setattr("shapecat.runs.labels.corrections._LISTED", 2)
     (run / "tracks.csv").write_text(HEADER)
 
     with pytest.raises(OutputError, match="missing: #4, #2 and 2 more; restore"):

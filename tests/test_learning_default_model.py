@@ -27,10 +27,10 @@ from shapecat.models.card import write_card
 from shapecat.models.fragments import cut_fragment, remove_base
 from shapecat.models.sets import SimulatedViews, collect, partial_views
 from shapecat.models.worlds import describe_arrangement, simulate_views, simulate_world
-from shapecat.simulation import physics, piles
-from shapecat.simulation.distractors import make_distractor
-from shapecat.simulation.mesh import Mesh, moved
-from shapecat.simulation.primitives import rounded_box
+from shapecat.simulation.scenes import physics, piles
+from shapecat.simulation.shapes.distractors import make_distractor
+from shapecat.simulation.shapes.mesh import Mesh, moved
+from shapecat.simulation.shapes.primitives import rounded_box
 from shapecat.types import CATEGORIES, Pose
 
 DATA = Path(__file__).parents[2] / "shared" / "data"

@@ -10,7 +10,7 @@ import pytest
 from benchmarks.hours import make_tables
 from shapecat.config import TrackingSettings
 from shapecat.runs import full_boxes, tracks
-from shapecat.runs.segments import group_frames
+from shapecat.runs.tables.segments import group_frames
 from shapecat.tracking import fusion, hits
 from shapecat.types import CATEGORIES
 

@@ -13,10 +13,10 @@ from rosbags.rosbag2 import Writer as FolderWriter
 
 from shapecat.errors import ConfigError
 from shapecat.recordings import Message, Recording, open_recording, read_transforms
-from shapecat.recordings.gravity import Upright
 from shapecat.recordings.look_ahead import AROUND_NS
-from shapecat.recordings.transform_window import TransformWindow
-from shapecat.recordings.transforms import TransformError, fixed_frame
+from shapecat.recordings.transforms.buffer import TransformError, fixed_frame
+from shapecat.recordings.transforms.gravity import Upright
+from shapecat.recordings.transforms.window import TransformWindow
 from shapecat.simulation.messages import MessageFactory
 from shapecat.types import Frame, Pose
 from tests import messages as ros

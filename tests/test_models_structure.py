@@ -20,9 +20,10 @@ from shapecat.models.structure import (
     label_objects,
 )
 from shapecat.models.viewpoints import move_to_floor, random_viewpoint
-from shapecat.simulation import IDEAL, KINECT, make_scene, physics, render_frame
-from shapecat.simulation.furniture import EQUIPMENT, make_rack, make_tote
-from shapecat.simulation.worlds import World
+from shapecat.simulation import IDEAL, KINECT, make_scene, render_frame
+from shapecat.simulation.scenes import physics
+from shapecat.simulation.scenes.furniture import EQUIPMENT, make_rack, make_tote
+from shapecat.simulation.scenes.worlds import World
 from shapecat.types import Pose
 
 SERIES = (Series("bin", 2000, 2, ("kinect",)), Series("clutter", 2000, 1, ("kinect",), scale=1.5))

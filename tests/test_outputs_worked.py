@@ -26,12 +26,13 @@ from shapecat.colour.masks import Mask
 from shapecat.detection.scene_graph import Node, format_tree
 from shapecat.errors import OutputError
 from shapecat.geometry import IDENTITY
-from shapecat.outputs.annotated_mcap import _annotations, _encoding
-from shapecat.outputs.annotation import Annotation
-from shapecat.outputs.annotations import encoder_for
+from shapecat.outputs.annotation.annotated_mcap import _annotations, _encoding
+from shapecat.outputs.annotation.channels import encoder_for
+from shapecat.outputs.annotation.content import Annotation
+from shapecat.outputs.annotation.image_annotations import ImageBox, read_image_frames
 from shapecat.outputs.colouring import Coloured, with_colour
 from shapecat.outputs.colours import colour_of
-from shapecat.outputs.dataset_frames import (
+from shapecat.outputs.exports.dataset_frames import (
     Selection,
     _chosen,
     _depth_file,
@@ -41,22 +42,21 @@ from shapecat.outputs.dataset_frames import (
     snapped_masks,
     split_runs,
 )
-from shapecat.outputs.exports import _made_by_export, _require_own, _staged, _thinned
-from shapecat.outputs.exports_points import write_point_labels
-from shapecat.outputs.image_annotations import ImageBox, read_image_frames
+from shapecat.outputs.exports.formats import _made_by_export, _require_own, _staged, _thinned
+from shapecat.outputs.exports.points import write_point_labels
 from shapecat.outputs.level_clouds import support_offset, upright_cloud
 from shapecat.outputs.opened_run import RunFrame
 from shapecat.outputs.png import png
-from shapecat.outputs.review_images import picture_of
-from shapecat.outputs.review_paths import Paths
-from shapecat.outputs.review_scenes import choose_scenes, with_clouds
+from shapecat.outputs.review.images import picture_of
+from shapecat.outputs.review.paths import Paths
+from shapecat.outputs.review.scenes import choose_scenes, with_clouds
 from shapecat.outputs.scene_tree import _apply_labels, _candidate, _described, _topic
 from shapecat.recordings.messages import Topic
-from shapecat.runs.label_meaning import TrackLabel, _slips
-from shapecat.runs.masks import read_nearest_masks
+from shapecat.runs.labels.meaning import TrackLabel, _slips
 from shapecat.runs.shown import ShownDetection
-from shapecat.runs.table_schemas import FRAMES
-from shapecat.runs.tables import Key
+from shapecat.runs.tables.masks import read_nearest_masks
+from shapecat.runs.tables.reading import Key
+from shapecat.runs.tables.schemas import FRAMES
 from shapecat.types import (
     Box,
     Camera,
@@ -183,8 +183,8 @@ def patch_masks(
 ) -> None:
     """Replace the masks of a run, and the stamps of their frames."""
     frames = [(key, stamp) for (key, _), stamp in zip(masks, stamps, strict=True)]
-    monkeypatch.setattr("shapecat.runs.masks.read_masks", lambda _folder, **_: iter(masks))
-    monkeypatch.setattr("shapecat.runs.masks._frame_stamps", lambda _folder: iter(frames))
+    monkeypatch.setattr("shapecat.runs.tables.masks.read_masks", lambda _folder, **_: iter(masks))
+    monkeypatch.setattr("shapecat.runs.tables.masks._frame_stamps", lambda _folder: iter(frames))
 
 
 def test_image_has_masks_of_the_frame_nearest_in_time(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -212,7 +212,7 @@ def test_simultaneous_images_of_two_cameras_are_annotated(
     item = ShownDetection(0, TrackLabel(6, "cup", 0.8), 0)
     patch_masks(monkeypatch, masks, [5] * len(masks))
     tracks = SimpleNamespace(of=lambda _key: [item])
-    place = "shapecat.outputs.image_annotations.ShownTracks.read"
+    place = "shapecat.outputs.annotation.image_annotations.ShownTracks.read"
     monkeypatch.setattr(place, lambda _folder, _labels: tracks)
     frames = list(read_image_frames(Path(), {}))
 
@@ -230,7 +230,7 @@ def test_merged_track_has_one_box_on_image(
     items = [
         ShownDetection(k, label, 0) for k, label in enumerate((whole, other, whole, whole))
     ]  # the last one has no mask
-    place = "shapecat.outputs.image_annotations"
+    place = "shapecat.outputs.annotation.image_annotations"
     monkeypatch.setattr(f"{place}.read_nearest_masks", lambda _folder: iter([(("/d", 0), masks)]))
     tracks = SimpleNamespace(of=lambda _key: items)
     monkeypatch.setattr(f"{place}.ShownTracks.read", lambda _folder, _labels: tracks)
@@ -276,7 +276,7 @@ def test_moving_camera_does_not_redraw_static_scene(
         one = labelled_frame(k, labelled_object(6, box=box))
         frames.append(replace(one, stamp_ns=100 * k * MS, fixed_from_sensor=pose))
     monkeypatch.setattr(
-        "shapecat.outputs.review_scenes.with_colour",
+        "shapecat.outputs.review.scenes.with_colour",
         lambda some, _recording, _run: ((one, object(), None) for one in some),
     )
     run: Any = {"fixed_frame": fixed_frame}
@@ -447,7 +447,7 @@ def test_images_without_certain_objects_are_omitted(monkeypatch: pytest.MonkeyPa
         None,
         *(SimpleNamespace(sure=sure) for sure in ((False, True), (False,), (), (True,))),
     ]
-    place = "shapecat.outputs.dataset_frames"
+    place = "shapecat.outputs.exports.dataset_frames"
     labelled = [labelled_frame(k) for k in range(len(images))]
     stubs: dict[str, Any] = {
         "_corrected": lambda _folder: set(),

@@ -10,8 +10,8 @@ from shapecat.geometry import compose
 from shapecat.pipeline import process
 from shapecat.runs.folder import read_run
 from shapecat.runs.jobs import Job
-from shapecat.runs.perceived import FrameRow, PerceptionTables
-from shapecat.runs.pose_jumps import explain_jumps
+from shapecat.runs.perceive.perceived import FrameRow, PerceptionTables
+from shapecat.runs.perceive.pose_jumps import explain_jumps
 from shapecat.simulation.containers import CONTAINERS
 from shapecat.simulation.recorder import robot_links
 from shapecat.types import Perception, Pose, Scene

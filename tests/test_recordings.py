@@ -29,7 +29,7 @@ from rosbags.typesys import Stores, get_typestore
 
 from shapecat.errors import RecordingError
 from shapecat.recordings import Channel, MessageError, Topic, open_recording
-from shapecat.recordings.decoding import typestore_of
+from shapecat.recordings.decoding.decoders import typestore_of
 from shapecat.system.files import lock
 from tests.mcap_files import mcap_writer
 

@@ -14,14 +14,15 @@ from rosbags.typesys import Stores, get_types_from_msg, get_typestore
 from shapecat.cameras.colour import ColourImage, ColourView
 from shapecat.errors import NoStreamError
 from shapecat.geometry import rotation_from_quaternion
-from shapecat.recordings import choose_streams, extrinsics, open_recording
+from shapecat.recordings import choose_streams, open_recording
 from shapecat.recordings.colour_frames import frames_with_colour
-from shapecat.recordings.colour_image import cloud_colours, pixels_of
 from shapecat.recordings.colour_streams import ColourStream, choose_colour
-from shapecat.recordings.extrinsics import Extrinsics
+from shapecat.recordings.decoding.colour_image import cloud_colours, pixels_of
 from shapecat.recordings.messages import MessageError, Topic
 from shapecat.recordings.overview import describe_recording
 from shapecat.recordings.streams import Stream
+from shapecat.recordings.transforms import extrinsics
+from shapecat.recordings.transforms.extrinsics import Extrinsics
 from shapecat.types import Camera, Frame
 from tests.colour_messages import gradient, jpeg, packed, png, raw
 from tests.messages import (
@@ -509,7 +510,7 @@ def test_extrinsics_are_those_of_the_same_camera(
 @pytest.mark.parametrize("container", ["mcap", "ros1", "ros2"])
 def test_simulated_colour_camera_is_equal_in_all_containers(tmp_path: Path, container: Any) -> None:
     from shapecat.simulation import simulate  # noqa: PLC0415  slow to load
-    from shapecat.simulation.colour_camera import COLOUR  # noqa: PLC0415  the same
+    from shapecat.simulation.camera.colour_camera import COLOUR  # noqa: PLC0415  the same
 
     path = simulate(tmp_path / "s", format=container, frames=2, seed=4, color=True)
     pairs, warnings = read(path)

@@ -12,12 +12,12 @@ from hypothesis import strategies as st
 from rosbags.typesys import Stores, get_types_from_msg, get_typestore
 from scipy.spatial.transform import Rotation
 
-from shapecat.outputs.annotated_mcap import write_annotated
-from shapecat.outputs.foxglove_encoders import descriptors_of, encode_foxglove
+from shapecat.outputs.annotation.annotated_mcap import write_annotated
+from shapecat.outputs.annotation.foxglove_encoders import descriptors_of, encode_foxglove
 from shapecat.recordings import choose_streams, frames, open_recording, read_transforms
-from shapecat.recordings.decoding import LIBRARY_ERRORS
-from shapecat.recordings.protobuf import message_decoder
-from shapecat.recordings.transform_window import TransformWindow
+from shapecat.recordings.decoding.decoders import LIBRARY_ERRORS
+from shapecat.recordings.decoding.protobuf import message_decoder
+from shapecat.recordings.transforms.window import TransformWindow
 from shapecat.types import Camera, Frame, ShownFrame
 from tests.depth_encodings import png
 from tests.foxglove_messages import (

@@ -20,12 +20,12 @@ from shapecat.recordings import (
     open_recording,
     read_transforms,
 )
-from shapecat.recordings.compressed_depth import depth_of_compressed
+from shapecat.recordings.decoding.compressed_depth import depth_of_compressed
+from shapecat.recordings.decoding.pointcloud2 import cloud_points
 from shapecat.recordings.messages import Message
 from shapecat.recordings.pinhole import fit_pinhole, still_fits
-from shapecat.recordings.pointcloud2 import cloud_points
 from shapecat.recordings.sources import DepthSource
-from shapecat.runs.selection import count_frames
+from shapecat.runs.perceive.selection import count_frames
 from shapecat.types import Camera, Frame
 from tests.depth_encodings import png, rvl
 from tests.mcap_files import mcap_writer

@@ -10,7 +10,7 @@ import pytest
 from shapecat.errors import NoStreamError
 from shapecat.recordings import choose_streams, cloud_streams, frames, open_recording
 from shapecat.recordings.colour_streams import choose_colour
-from shapecat.recordings.depth_image import DEPTH_ENCODINGS
+from shapecat.recordings.decoding.depth_image import DEPTH_ENCODINGS
 from shapecat.recordings.sensors import by_sensor
 from tests.colour_messages import gradient, packed, raw
 from tests.depth_encodings import png

@@ -19,21 +19,22 @@ from scipy.spatial.transform import Rotation, Slerp
 from shapecat.cameras.colour import ColourImage
 from shapecat.errors import NoStreamError
 from shapecat.geometry import IDENTITY
-from shapecat.recordings import choose_streams, open_recording, time_order
-from shapecat.recordings.colour_image import cloud_colours, compressed_size, pixels_of
+from shapecat.recordings import choose_streams, open_recording
 from shapecat.recordings.colour_streams import choose_colour, pair_colours
-from shapecat.recordings.extrinsics import Extrinsics
-from shapecat.recordings.imu import Accelerometer
-from shapecat.recordings.mcap_records import Opcode, TruncatedError, walk
+from shapecat.recordings.containers import time_order
+from shapecat.recordings.containers.mcap_records import Opcode, TruncatedError, walk
+from shapecat.recordings.containers.ros1_records import BagError, split
+from shapecat.recordings.containers.time_order import Timed, in_time_order
+from shapecat.recordings.decoding.colour_image import cloud_colours, compressed_size, pixels_of
 from shapecat.recordings.messages import MessageError, Topic
 from shapecat.recordings.overview import describe_recording
 from shapecat.recordings.pinhole import PinholeFit, still_fits
-from shapecat.recordings.ros1_records import BagError, split
 from shapecat.recordings.stamps import Clock
 from shapecat.recordings.streams import info_topic_of
-from shapecat.recordings.time_order import Timed, in_time_order
-from shapecat.recordings.transform_samples import _slerp
-from shapecat.recordings.transforms import ExtrapolationError, TransformBuffer
+from shapecat.recordings.transforms.buffer import ExtrapolationError, TransformBuffer
+from shapecat.recordings.transforms.extrinsics import Extrinsics
+from shapecat.recordings.transforms.imu import Accelerometer
+from shapecat.recordings.transforms.samples import _slerp
 from shapecat.types import Camera
 from tests.colour_messages import gradient, jpeg, packed, png, raw
 from tests.mcap_files import mcap_writer

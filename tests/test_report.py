@@ -31,10 +31,10 @@ from shapecat.outputs.report.surfaces import SIDE, Snapshot, draw
 from shapecat.outputs.report.tracks import Timeline, read_timelines
 from shapecat.outputs.report.writing import Reports, RunReport
 from shapecat.outputs.wording import caption, confidence_text, time_span
-from shapecat.runs.corrections import read_labels, relabel
 from shapecat.runs.finished import FinishedRun, read_finished
-from shapecat.runs.label_meaning import find_misread
-from shapecat.runs.track_table import (
+from shapecat.runs.labels.corrections import read_labels, relabel
+from shapecat.runs.labels.meaning import find_misread
+from shapecat.runs.labels.track_table import (
     TrackRow,
     TrackTable,
     read_track_table,

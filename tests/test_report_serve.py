@@ -26,8 +26,8 @@ from click.testing import Result
 from shapecat.errors import OutputError
 from shapecat.outputs.report.serving import _names_this_machine, serve_reports
 from shapecat.outputs.report.writing import Reports, RunReport, read_report
-from shapecat.runs.corrections import adopt_labels, read_labels
-from shapecat.runs.track_table import read_track_table
+from shapecat.runs.labels.corrections import adopt_labels, read_labels
+from shapecat.runs.labels.track_table import read_track_table
 from tests.browser import Browser
 
 Run = Callable[..., Result]

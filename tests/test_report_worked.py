@@ -30,9 +30,9 @@ from shapecat.outputs.report.surfaces import Snapshot, SurfaceDrawing, draw
 from shapecat.outputs.report.tracks import Timeline, read_timelines
 from shapecat.outputs.report.writing import RunReport, _faces
 from shapecat.runs.finished import FinishedRun, read_finished
-from shapecat.runs.label_meaning import TrackLabel
-from shapecat.runs.table_schemas import FRAMES, TRACKS
-from shapecat.runs.track_table import TrackRow, TrackTable, read_track_table
+from shapecat.runs.labels.meaning import TrackLabel
+from shapecat.runs.labels.track_table import TrackRow, TrackTable, read_track_table
+from shapecat.runs.tables.schemas import FRAMES, TRACKS
 from shapecat.types import (
     Box,
     Camera,

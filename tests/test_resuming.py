@@ -14,7 +14,7 @@ from shapecat.config import Settings, with_overrides
 from shapecat.errors import OutputError
 from shapecat.runs.folder import read_run, write_run
 from shapecat.runs.jobs import Job
-from shapecat.runs.track_table import read_track_table
+from shapecat.runs.labels.track_table import read_track_table
 from shapecat.system.files import partial_path
 from tests.conftest import Guesser
 

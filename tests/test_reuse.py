@@ -21,7 +21,7 @@ from shapecat.reuse.views import _alike, sight_of
 from shapecat.runs.jobs import Job
 from shapecat.simulation import KINECT, make_scene, render_frame
 from shapecat.simulation.recorder import record
-from shapecat.simulation.worlds import Motion, World
+from shapecat.simulation.scenes.worlds import Motion, World
 from shapecat.tracking.hits import gather
 from shapecat.tracking.records import FrameDetections
 from shapecat.types import Box, Candidate, Detection, Frame, FullBox, Perception, Pose

@@ -15,15 +15,17 @@ import rerun as rr
 from scipy.spatial.transform import Rotation
 
 from shapecat.errors import OutputError
-from shapecat.outputs import review, review_layout, review_viewer
 from shapecat.outputs.colours import colour_of
-from shapecat.outputs.review_cloud import paint
-from shapecat.outputs.review_columns import Columns
-from shapecat.outputs.review_images import Images, Picture
-from shapecat.outputs.review_layout import Eye, TrackView, _track_tabs, stepped_back
-from shapecat.outputs.review_scenes import ReviewFrame, choose_scenes
-from shapecat.outputs.review_shapes import _fan, markdown, short_label
-from shapecat.runs.label_meaning import TrackLabel
+from shapecat.outputs.review import layout as review_layout
+from shapecat.outputs.review import viewer as review_viewer
+from shapecat.outputs.review import writing as review
+from shapecat.outputs.review.clouds import paint
+from shapecat.outputs.review.columns import Columns
+from shapecat.outputs.review.images import Images, Picture
+from shapecat.outputs.review.layout import Eye, TrackView, _track_tabs, stepped_back
+from shapecat.outputs.review.scenes import ReviewFrame, choose_scenes
+from shapecat.outputs.review.shapes import _fan, markdown, short_label
+from shapecat.runs.labels.meaning import TrackLabel
 from shapecat.types import Box, Camera, Frame, LabelledFrame, LabelledObject, NeuralGas, Plane, Pose
 from tests.test_executors import alive
 

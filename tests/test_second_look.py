@@ -14,12 +14,12 @@ import pytest
 from shapecat.config import Settings
 from shapecat.geometry import IDENTITY
 from shapecat.pipeline import process
-from shapecat.recordings.gravity import Orientation
-from shapecat.runs import perceiving
+from shapecat.recordings.transforms.gravity import Orientation
 from shapecat.runs.folder import read_run
 from shapecat.runs.jobs import Job
-from shapecat.runs.second_look import _around, _streams, frames_to_revise
-from shapecat.runs.table_schemas import FRAMES, PLANES
+from shapecat.runs.perceive import phases as perceiving
+from shapecat.runs.perceive.second_look import _around, _streams, frames_to_revise
+from shapecat.runs.tables.schemas import FRAMES, PLANES
 from shapecat.simulation import IDEAL, make_scene, render_frame
 from shapecat.simulation.messages import MessageFactory
 from shapecat.simulation.recorder import LINK_FROM_OPTICAL, robot_links
@@ -182,7 +182,7 @@ def test_recording_with_tenth_of_frames_disturbed_loses_no_track(
 def test_second_look_finds_more_objects_in_disturbed_frames(
     rest: Path, spoilt: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr("shapecat.runs.perceiving.frames_to_revise", lambda _tables: {})
+    monkeypatch.setattr("shapecat.runs.perceive.phases.frames_to_revise", lambda _tables: {})
     once = run(tmp_path / "once.mcap", items(moving=False, poses=False, disturbed=DISTURBED))
 
     assert share_found(spoilt, rest) > share_found(once, rest) + 0.1
@@ -198,7 +198,7 @@ def test_consecutive_disturbed_frames_end_no_track(
 
     plain = run(tmp_path / "plain.mcap", recording(()))
     out = run(tmp_path / "spoilt.mcap", recording(BRIEF))
-    monkeypatch.setattr("shapecat.runs.perceiving.frames_to_revise", lambda _tables: {})
+    monkeypatch.setattr("shapecat.runs.perceive.phases.frames_to_revise", lambda _tables: {})
     once = run(tmp_path / "once.mcap", recording(BRIEF))
 
     assert revised(out) == [*BRIEF]
@@ -289,7 +289,7 @@ def test_kill_between_revised_tables_is_repaired(
 
     def prepare(phase: str, _done: int, _total: int | None) -> None:
         if phase == "revise":
-            monkeypatch.setattr("shapecat.runs.perceiving.count_rows", die)
+            monkeypatch.setattr("shapecat.runs.perceive.phases.count_rows", die)
 
     with pytest.raises(KeyboardInterrupt):
         process(job, prepare)

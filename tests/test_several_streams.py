@@ -7,7 +7,7 @@ from pathlib import Path
 import pyarrow.parquet as pq
 from click.testing import Result
 
-from shapecat.outputs.exports import export_run
+from shapecat.outputs.exports.formats import export_run
 from shapecat.simulation.messages import MessageFactory
 from tests.messages import write
 from tests.scenes import stream

@@ -7,14 +7,21 @@ import pytest
 from scipy.ndimage import binary_dilation, find_objects, label, uniform_filter
 
 from shapecat.arrays import F8
-from shapecat.simulation.measuring import measure
-from shapecat.simulation.mesh import Mesh
-from shapecat.simulation.paths import looking_at
-from shapecat.simulation.presets import IDEAL, KINECT, PRESETS, REALSENSE
-from shapecat.simulation.primitives import lathe, rounded_box
-from shapecat.simulation.render import Geometry, Image, alone_pixels, cropped, geometry, render
-from shapecat.simulation.scenes import make_scene
-from shapecat.simulation.sensors import Sensor, resized
+from shapecat.simulation.camera.measuring import measure
+from shapecat.simulation.camera.presets import IDEAL, KINECT, PRESETS, REALSENSE
+from shapecat.simulation.camera.render import (
+    Geometry,
+    Image,
+    alone_pixels,
+    cropped,
+    geometry,
+    render,
+)
+from shapecat.simulation.camera.sensors import Sensor, resized
+from shapecat.simulation.scenes.kinds import make_scene
+from shapecat.simulation.scenes.paths import looking_at
+from shapecat.simulation.shapes.mesh import Mesh
+from shapecat.simulation.shapes.primitives import lathe, rounded_box
 from shapecat.types import Camera, Pose
 
 HERE = Pose(np.eye(3), np.zeros(3))

@@ -9,16 +9,17 @@ import pytest
 from scipy.spatial import ConvexHull
 
 from shapecat.geometry import rotation_from_quaternion, transform
-from shapecat.simulation import KINECT, make_scene, piles, record, render_frame
-from shapecat.simulation.closed_shapes import make_ball, make_box
-from shapecat.simulation.convex_parts import convex_parts, hollowness
-from shapecat.simulation.furniture import make_table
-from shapecat.simulation.mesh import Mesh
-from shapecat.simulation.physics import Drop, SettledPose, settle
-from shapecat.simulation.primitives import lathe, rounded_box
-from shapecat.simulation.scenes import SceneKind
-from shapecat.simulation.shapes import make_object
-from shapecat.simulation.worlds import World
+from shapecat.simulation import KINECT, make_scene, record, render_frame
+from shapecat.simulation.scenes import piles
+from shapecat.simulation.scenes.furniture import make_table
+from shapecat.simulation.scenes.kinds import SceneKind
+from shapecat.simulation.scenes.physics import Drop, SettledPose, settle
+from shapecat.simulation.scenes.worlds import World
+from shapecat.simulation.shapes.categories import make_object
+from shapecat.simulation.shapes.closed_shapes import make_ball, make_box
+from shapecat.simulation.shapes.convex_parts import convex_parts, hollowness
+from shapecat.simulation.shapes.mesh import Mesh
+from shapecat.simulation.shapes.primitives import lathe, rounded_box
 from shapecat.types import Pose
 
 SETTLED: tuple[SceneKind, ...] = ("pile", "bin", "shelf_bin", "room")

@@ -5,9 +5,9 @@ import pytest
 
 from benchmarks.rooms import count
 from shapecat.simulation import make_scene
-from shapecat.simulation.distractors import make_distractor
-from shapecat.simulation.procedural import PROCEDURAL
-from shapecat.simulation.worlds import FIRST_OBJECT_LABEL
+from shapecat.simulation.scenes.worlds import FIRST_OBJECT_LABEL
+from shapecat.simulation.shapes.distractors import make_distractor
+from shapecat.simulation.shapes.procedural import PROCEDURAL
 
 FIRST = FIRST_OBJECT_LABEL
 

@@ -19,13 +19,13 @@ from shapecat.arrays import Bool
 from shapecat.errors import OutputError
 from shapecat.geometry import compose, inverse, rotation_from_quaternion, transform
 from shapecat.simulation import World, make_scene, render_frame, simulate, truth
-from shapecat.simulation.mesh import Mesh
-from shapecat.simulation.presets import IDEAL, KINECT
+from shapecat.simulation.camera.presets import IDEAL, KINECT
+from shapecat.simulation.camera.render import geometry, render
+from shapecat.simulation.camera.sensors import resized
 from shapecat.simulation.recorder import EPOCH_NS, record, robot_links
-from shapecat.simulation.render import geometry, render
-from shapecat.simulation.scans import load_mesh, upright_poses, uprighted
-from shapecat.simulation.scenes import SceneKind
-from shapecat.simulation.sensors import resized
+from shapecat.simulation.scenes.kinds import SceneKind
+from shapecat.simulation.shapes.mesh import Mesh
+from shapecat.simulation.shapes.scans import load_mesh, upright_poses, uprighted
 from shapecat.simulation.truth import AMBIGUOUS_PIXELS, frame_truth
 from shapecat.types import CATEGORIES, Camera, Pose
 

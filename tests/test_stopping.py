@@ -19,7 +19,7 @@ from shapecat.executors.order import _HELD
 from shapecat.pipeline import process
 from shapecat.runs.folder import read_run
 from shapecat.runs.jobs import Job
-from shapecat.runs.segments import list_segments, read_segment
+from shapecat.runs.tables.segments import list_segments, read_segment
 from shapecat.system import stopping
 from tests.scenes import record
 from tests.test_batch import heed_interrupts, heed_interrupts_at_low_priority

@@ -18,17 +18,23 @@ from shapecat.config import Settings
 from shapecat.errors import OutputError
 from shapecat.outputs.opened_run import Table
 from shapecat.runs import shown
-from shapecat.runs.corrections import read_labels
 from shapecat.runs.folder import read_run
-from shapecat.runs.label_meaning import TrackLabel
-from shapecat.runs.labels import read_labelled_frames
-from shapecat.runs.perceived import _SEGMENT_FRAMES, FrameRow, PerceptionTables
+from shapecat.runs.labelled_frames import read_labelled_frames
+from shapecat.runs.labels.corrections import read_labels
+from shapecat.runs.labels.meaning import TrackLabel
+from shapecat.runs.perceive.perceived import _SEGMENT_FRAMES, FrameRow, PerceptionTables
 from shapecat.runs.run_info import Counts, InputInfo, ModelInfo, Options, OriginInfo, RunInfo
-from shapecat.runs.segments import count_segments
 from shapecat.runs.shown import _next_of_topic, read_shown_frames
-from shapecat.runs.table_schemas import ADDED, DETECTIONS, FRAMES, PLANES, TABLES, TRACKS
-from shapecat.runs.table_writing import arrow_table, lists, open_writer, write_table
-from shapecat.runs.tables import opened, read_row_groups, read_rows, read_together, with_fixed_lists
+from shapecat.runs.tables.reading import (
+    opened,
+    read_row_groups,
+    read_rows,
+    read_together,
+    with_fixed_lists,
+)
+from shapecat.runs.tables.schemas import ADDED, DETECTIONS, FRAMES, PLANES, TABLES, TRACKS
+from shapecat.runs.tables.segments import count_segments
+from shapecat.runs.tables.writing import arrow_table, lists, open_writer, write_table
 from shapecat.types import Box, Candidate, Detection, NeuralGas, Perception, Plane, Pose, Scene
 from tests.track_tables import write_tracks
 
@@ -121,7 +127,7 @@ def test_segments_are_written_when_full_or_old(
 ) -> None:
     """A kill may cost two seconds of work; many quick frames would fill the memory sooner."""
     clock = [7.0]
-    place = "shapecat.runs.perceived"
+    place = "shapecat.runs.perceive.perceived"
     monkeypatch.setattr(f"{place}.time", SimpleNamespace(monotonic=lambda: clock[0]))
     stored = []
     with PerceptionTables(tmp_path, categories=CATEGORIES, model_id="m1") as tables:

@@ -14,9 +14,9 @@ from scipy.spatial.transform import Rotation
 from shapecat.completion import DIRECTIONS
 from shapecat.config import TrackingSettings
 from shapecat.outputs.report.tracks import read_timelines
-from shapecat.runs.corrections import read_labels
-from shapecat.runs.labels import _join, read_labelled_frames
-from shapecat.runs.perceived import FrameRow, PerceptionTables
+from shapecat.runs.labelled_frames import _join, read_labelled_frames
+from shapecat.runs.labels.corrections import read_labels
+from shapecat.runs.perceive.perceived import FrameRow, PerceptionTables
 from shapecat.runs.shown import read_shown_frames
 from shapecat.runs.tracks import _line, _read_frames, track_run
 from shapecat.tracking.records import Track

@@ -18,7 +18,7 @@ from rosbags.typesys import Stores, get_types_from_msg, get_typestore
 
 from shapecat.geometry import quaternion_from_rotation
 from shapecat.recordings import TransformBuffer, fixed_frame, open_recording, read_transforms
-from shapecat.recordings.transforms import (
+from shapecat.recordings.transforms.buffer import (
     DisconnectedError,
     ExtrapolationError,
     TransformLoopError,

@@ -18,7 +18,7 @@ from shapecat.recordings.pinhole import fit_pinhole
 from shapecat.recordings.viewpoint import find_viewpoint
 from shapecat.runs.folder import read_run
 from shapecat.runs.jobs import Job
-from shapecat.runs.label_meaning import TrackLabel
+from shapecat.runs.labels.meaning import TrackLabel
 from shapecat.runs.shown import read_shown_frames
 from shapecat.simulation.messages import MessageFactory
 from shapecat.simulation.recorder import LINK_FROM_OPTICAL

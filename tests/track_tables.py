@@ -6,8 +6,8 @@ from typing import Any
 
 import pyarrow.parquet as pq
 
-from shapecat.runs.table_schemas import TRACKS
-from shapecat.runs.table_writing import write_table
+from shapecat.runs.tables.schemas import TRACKS
+from shapecat.runs.tables.writing import write_table
 
 __all__ = ["rows", "write_tracks"]
 

@@ -14,9 +14,9 @@ from shapecat.batch.claims import Claim, claimed
 from shapecat.batch.storage import Location
 from shapecat.errors import OutputError, RecordingError, ShapecatError
 from shapecat.pipeline import process
-from shapecat.runs.corrections import LOST
 from shapecat.runs.folder import OUTPUTS, RUN_FILES, read_run, require_ours, write_run
 from shapecat.runs.jobs import Job, Summary, summarize
+from shapecat.runs.labels.corrections import LOST
 from shapecat.runs.run_info import OriginInfo, RunInfo
 from shapecat.system.files import scratch_folder
 from shapecat.system.progress import Observer

@@ -5,7 +5,7 @@ from collections.abc import Iterable
 from pathlib import Path
 
 from shapecat.errors import RecordingError
-from shapecat.runs.label_meaning import is_category_name
+from shapecat.runs.labels.meaning import is_category_name
 from shapecat.types import UNKNOWN
 
 __all__ = ["require_category_names"]

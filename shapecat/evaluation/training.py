@@ -16,7 +16,7 @@ from shapecat.evaluation.report import evaluate
 from shapecat.evaluation.views import DescribedViews, describe_views
 from shapecat.learning import Categorizer, load_model, save_model
 from shapecat.learning.categorizer import MOST_CATEGORIES
-from shapecat.runs.label_meaning import order_categories
+from shapecat.runs.labels.meaning import order_categories
 from shapecat.system.progress import Observer, ignore
 from shapecat.types import UNKNOWN
 

@@ -6,7 +6,7 @@ from pathlib import Path
 import numpy as np
 
 from shapecat.models.worlds import WorldView, simulate_mesh
-from shapecat.simulation.scans import load_mesh, upright_poses, uprighted
+from shapecat.simulation.shapes.scans import load_mesh, upright_poses, uprighted
 
 __all__ = ["mesh_views"]
 

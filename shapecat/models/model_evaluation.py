@@ -28,8 +28,8 @@ from shapecat.models.sets import (
     options_of,
 )
 from shapecat.models.worlds import WorldView, simulate_views, simulate_world
-from shapecat.simulation.distractors import DISTRACTORS
-from shapecat.simulation.presets import PRESETS
+from shapecat.simulation.camera.presets import PRESETS
+from shapecat.simulation.shapes.distractors import DISTRACTORS
 from shapecat.types import UNKNOWN
 
 __all__ = ["evaluate_model"]

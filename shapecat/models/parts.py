@@ -31,8 +31,8 @@ from shapecat.detection.pipeline import Task, oversegment
 from shapecat.models.growing import Growth, collect_chunks, grow, growing_options
 from shapecat.models.viewpoints import random_viewpoint
 from shapecat.simulation import KINECT, REALSENSE, make_scene, render_frame
-from shapecat.simulation.presets import IDEAL, PRESETS
-from shapecat.simulation.scenes import SceneKind
+from shapecat.simulation.camera.presets import IDEAL, PRESETS
+from shapecat.simulation.scenes.kinds import SceneKind
 from shapecat.trees import write_trees
 from shapecat.types import CATEGORIES, Camera
 

@@ -7,11 +7,11 @@ import numpy as np
 
 from shapecat.arrays import F8, I4
 from shapecat.models.arrangements import Arrangement
-from shapecat.simulation.measuring import measure
-from shapecat.simulation.paths import looking_at
-from shapecat.simulation.presets import PRESETS
-from shapecat.simulation.render import Geometry, render
-from shapecat.simulation.sensors import Sensor, interpolated, resized
+from shapecat.simulation.camera.measuring import measure
+from shapecat.simulation.camera.presets import PRESETS
+from shapecat.simulation.camera.render import Geometry, render
+from shapecat.simulation.camera.sensors import Sensor, interpolated, resized
+from shapecat.simulation.scenes.paths import looking_at
 from shapecat.types import Camera, Frame, Pose
 
 __all__ = ["RenderedView", "render_view"]

@@ -14,8 +14,8 @@ from shapecat.arrays import Bool
 from shapecat.evaluation.views import DescribedViews
 from shapecat.models.arrangements import ArrangementOptions
 from shapecat.models.worlds import WorldView, simulate_views
-from shapecat.simulation.distractors import DISTRACTORS
-from shapecat.simulation.procedural import PROCEDURAL
+from shapecat.simulation.shapes.distractors import DISTRACTORS
+from shapecat.simulation.shapes.procedural import PROCEDURAL
 
 __all__ = [
     "MOSTLY_VISIBLE",

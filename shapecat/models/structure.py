@@ -33,12 +33,12 @@ from shapecat.models.growing import Growth, collect_chunks, grow, growing_option
 from shapecat.models.parts import count_labels
 from shapecat.models.viewpoints import move_to_floor, random_viewpoint
 from shapecat.simulation import make_scene, render_frame
-from shapecat.simulation.equipment import make_own_arms, make_resting_arms
-from shapecat.simulation.furniture import EQUIPMENT, make_rack, make_tote
-from shapecat.simulation.presets import PRESETS
-from shapecat.simulation.scenes import SceneKind
-from shapecat.simulation.sensors import resized
-from shapecat.simulation.worlds import Support, World
+from shapecat.simulation.camera.presets import PRESETS
+from shapecat.simulation.camera.sensors import resized
+from shapecat.simulation.scenes.equipment import make_own_arms, make_resting_arms
+from shapecat.simulation.scenes.furniture import EQUIPMENT, make_rack, make_tote
+from shapecat.simulation.scenes.kinds import SceneKind
+from shapecat.simulation.scenes.worlds import Support, World
 from shapecat.trees import BoostedTrees, write_trees
 from shapecat.types import Camera, Frame, Pose
 

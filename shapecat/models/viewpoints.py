@@ -4,9 +4,9 @@ from dataclasses import replace
 
 import numpy as np
 
-from shapecat.simulation.paths import Filming, arc_orbit
-from shapecat.simulation.sensors import Sensor
-from shapecat.simulation.worlds import World
+from shapecat.simulation.camera.sensors import Sensor
+from shapecat.simulation.scenes.paths import Filming, arc_orbit
+from shapecat.simulation.scenes.worlds import World
 from shapecat.types import Pose
 
 __all__ = ["move_to_floor", "random_viewpoint"]

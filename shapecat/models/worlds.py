@@ -32,9 +32,9 @@ from shapecat.models.arrangements import (
 )
 from shapecat.models.fragments import cut_fragment, remove_base
 from shapecat.models.rendered_views import RenderedView, render_view
-from shapecat.simulation.mesh import Mesh, moved
-from shapecat.simulation.placement import StablePose
-from shapecat.simulation.render import geometry
+from shapecat.simulation.camera.render import geometry
+from shapecat.simulation.scenes.placement import StablePose
+from shapecat.simulation.shapes.mesh import Mesh, moved
 from shapecat.surface import voxelize
 from shapecat.types import UNKNOWN, Candidate, Scene
 

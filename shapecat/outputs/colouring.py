@@ -10,8 +10,8 @@ from shapecat.colour.image_masks import mask_of
 from shapecat.colour.masks import Mask
 from shapecat.errors import OutputError
 from shapecat.recordings import Recording
+from shapecat.runs.perceive.selection import read_frames
 from shapecat.runs.run_info import RunInfo
-from shapecat.runs.selection import read_frames
 from shapecat.types import Frame, LabelledFrame
 
 __all__ = ["Coloured", "ExportedFrame", "with_colour"]

@@ -17,10 +17,10 @@ from shapecat.description import DESCRIPTOR_NAMES
 from shapecat.errors import OutputError
 from shapecat.outputs.colouring import Coloured, with_colour
 from shapecat.outputs.counts import plural
-from shapecat.recordings.colour_image import pixels_of
+from shapecat.recordings.decoding.colour_image import pixels_of
 from shapecat.runs.finished import FinishedRun, open_source, read_finished
 from shapecat.runs.run_info import RunInfo
-from shapecat.runs.tables import first_stamp, numbers_or_nan, with_fixed_lists
+from shapecat.runs.tables.reading import first_stamp, numbers_or_nan, with_fixed_lists
 from shapecat.types import Frame, LabelledFrame, LabelledObject
 
 __all__ = ["Run", "RunFrame", "Table"]

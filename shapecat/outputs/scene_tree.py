@@ -10,8 +10,8 @@ import pyarrow as pa
 from shapecat.detection.scene_graph import Node, format_tree
 from shapecat.errors import OutputError
 from shapecat.runs.finished import read_finished
-from shapecat.runs.labels import plane_of
-from shapecat.runs.tables import keys_of, read_row_groups
+from shapecat.runs.labelled_frames import plane_of
+from shapecat.runs.tables.reading import keys_of, read_row_groups
 from shapecat.types import Box, Candidate, LabelledObject, Plane, Scene
 
 __all__ = ["describe_scene", "read_scene"]

@@ -1,11 +1,11 @@
 """Read frames from robot recordings: containers, clouds, depth images, transforms."""
 
+from shapecat.recordings.containers.opening import open_recording
 from shapecat.recordings.frames import frames
 from shapecat.recordings.messages import Channel, Message, MessageError, Topic
-from shapecat.recordings.opening import open_recording
 from shapecat.recordings.recording import Recording
 from shapecat.recordings.streams import Stream, choose_streams, cloud_streams
-from shapecat.recordings.transforms import (
+from shapecat.recordings.transforms.buffer import (
     TransformBuffer,
     TransformError,
     fixed_frame,

@@ -12,15 +12,15 @@ from shapecat.cameras.colour import ColourView, LensCamera
 from shapecat.cameras.lenses import LENS_MODELS, distort
 from shapecat.errors import RecordingError
 from shapecat.geometry import IDENTITY, compose
-from shapecat.recordings.colour_image import IMAGES
 from shapecat.recordings.colour_streams import ColourStream
-from shapecat.recordings.extrinsics import Extrinsics
+from shapecat.recordings.decoding.colour_image import IMAGES
 from shapecat.recordings.frames import frames
 from shapecat.recordings.messages import MALFORMED, Message, MessageError, reason_of
 from shapecat.recordings.pinhole import camera_of_info, distortion_of, is_rectified
 from shapecat.recordings.recording import Recording
 from shapecat.recordings.stamps import delay_ns, stamp_ns
 from shapecat.recordings.streams import Stream
+from shapecat.recordings.transforms.extrinsics import Extrinsics
 from shapecat.types import Camera, Frame
 
 __all__ = ["KnownImages", "frames_with_colour"]

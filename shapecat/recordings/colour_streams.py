@@ -7,10 +7,10 @@ from pathlib import PurePosixPath
 from typing import Any, Literal
 
 from shapecat.errors import NoStreamError
-from shapecat.recordings.colour_image import COLOUR_ENCODINGS, compressed_kind
-from shapecat.recordings.compressed_depth import is_grey_png16
-from shapecat.recordings.depth_image import DEPTH_ENCODINGS
-from shapecat.recordings.foxglove import ros_counterpart
+from shapecat.recordings.decoding.colour_image import COLOUR_ENCODINGS, compressed_kind
+from shapecat.recordings.decoding.compressed_depth import is_grey_png16
+from shapecat.recordings.decoding.depth_image import DEPTH_ENCODINGS
+from shapecat.recordings.decoding.foxglove import ros_counterpart
 from shapecat.recordings.messages import Topic
 from shapecat.recordings.pinhole import is_rectified
 from shapecat.recordings.recording import Recording

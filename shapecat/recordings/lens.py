@@ -7,8 +7,8 @@ import numpy as np
 
 from shapecat.arrays import F4, F8
 from shapecat.cameras.lenses import LENS_MODELS, undistorted_rays
+from shapecat.recordings.decoding.pointcloud2 import unorganized
 from shapecat.recordings.pinhole import PinholeFit, distortion_of, fit_pinhole
-from shapecat.recordings.pointcloud2 import unorganized
 from shapecat.recordings.recording import Recording
 from shapecat.types import Camera
 

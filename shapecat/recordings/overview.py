@@ -5,7 +5,7 @@ from pathlib import Path
 from typing import Any
 
 from shapecat.recordings.colour_streams import choose_colour
-from shapecat.recordings.opening import open_recording
+from shapecat.recordings.containers.opening import open_recording
 from shapecat.recordings.recording import Recording
 from shapecat.recordings.streams import Stream, cloud_streams
 from shapecat.system.files import input_size

@@ -94,7 +94,7 @@ class Recording(ABC):
         ------
         MessageError : the message, or the definition of its type, is malformed or unsupported.
         """
-        from shapecat.recordings.decoding import decode  # noqa: PLC0415  # loads rosbags
+        from shapecat.recordings.decoding.decoders import decode  # noqa: PLC0415  # loads rosbags
 
         return decode(message, self._decoders)
 

@@ -11,9 +11,10 @@ import numpy as np
 
 from shapecat.arrays import F4
 from shapecat.geometry import transform
-from shapecat.recordings.compressed_depth import depth_of_compressed
-from shapecat.recordings.depth_image import depth_of_image
-from shapecat.recordings.foxglove import ros_counterpart
+from shapecat.recordings.decoding.compressed_depth import depth_of_compressed
+from shapecat.recordings.decoding.depth_image import depth_of_image
+from shapecat.recordings.decoding.foxglove import ros_counterpart
+from shapecat.recordings.decoding.pointcloud2 import cloud_points, organized, unorganized
 from shapecat.recordings.lens import Lens
 from shapecat.recordings.messages import MALFORMED, Message, MessageError, reason_of
 from shapecat.recordings.pinhole import (
@@ -24,7 +25,6 @@ from shapecat.recordings.pinhole import (
     off_center,
     still_fits,
 )
-from shapecat.recordings.pointcloud2 import cloud_points, organized, unorganized
 from shapecat.recordings.recording import Recording
 from shapecat.recordings.stamps import Clock, delay_ns, stamp_ns
 from shapecat.recordings.streams import COMPRESSED, Stream, first_message

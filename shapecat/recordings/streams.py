@@ -7,9 +7,9 @@ from itertools import islice
 from typing import Any
 
 from shapecat.errors import NoStreamError
-from shapecat.recordings.compressed_depth import is_grey_png16
-from shapecat.recordings.depth_image import DEPTH_ENCODINGS
-from shapecat.recordings.foxglove import ros_counterpart
+from shapecat.recordings.decoding.compressed_depth import is_grey_png16
+from shapecat.recordings.decoding.depth_image import DEPTH_ENCODINGS
+from shapecat.recordings.decoding.foxglove import ros_counterpart
 from shapecat.recordings.messages import MessageError, Topic, reason_of
 from shapecat.recordings.recording import Recording
 from shapecat.recordings.sensors import Stream, by_sensor

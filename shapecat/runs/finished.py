@@ -7,11 +7,11 @@ from pathlib import Path
 
 from shapecat.errors import OutputError, RecordingError
 from shapecat.recordings import Recording, open_recording
-from shapecat.runs.corrections import read_labels
 from shapecat.runs.folder import read_run
 from shapecat.runs.identity import content_digest, same_content
-from shapecat.runs.label_meaning import TrackLabel
-from shapecat.runs.labels import read_labelled_frames
+from shapecat.runs.labelled_frames import read_labelled_frames
+from shapecat.runs.labels.corrections import read_labels
+from shapecat.runs.labels.meaning import TrackLabel
 from shapecat.runs.run_info import RunInfo
 from shapecat.types import LabelledFrame
 

@@ -13,9 +13,9 @@ from scipy.spatial.transform import Rotation
 
 from shapecat.arrays import F4, F8, I4, Bool
 from shapecat.completion import DIRECTIONS, BoxViews, FusedBox, fuse_boxes
-from shapecat.runs.placed_frames import PlacedFrames
-from shapecat.runs.table_schemas import BOX_WIDTH, FULL_BOX, FULL_WIDTHS
-from shapecat.runs.tables import full_boxes_of, numbers, opened, read_rows, read_together
+from shapecat.runs.tables.placed_frames import PlacedFrames
+from shapecat.runs.tables.reading import full_boxes_of, numbers, opened, read_rows, read_together
+from shapecat.runs.tables.schemas import BOX_WIDTH, FULL_BOX, FULL_WIDTHS
 from shapecat.tracking import Track, view_weights
 
 __all__ = ["FullBoxes", "full_columns"]

@@ -14,7 +14,6 @@ from shapecat import __version__
 from shapecat.config import Settings
 from shapecat.errors import OutputError, RecordingError
 from shapecat.learning import Categorizer
-from shapecat.runs.corrections import LOST, PREVIOUS, has_labels
 from shapecat.runs.folder import OUTPUTS, clear, write_run
 from shapecat.runs.identity import (
     ContentDigest,
@@ -23,9 +22,10 @@ from shapecat.runs.identity import (
     unchanged,
     work_id,
 )
-from shapecat.runs.label_transfer import lost_labels, transfer_labels
+from shapecat.runs.labels.corrections import LOST, PREVIOUS, has_labels
+from shapecat.runs.labels.track_table import ORIGINAL
+from shapecat.runs.labels.transfer import lost_labels, transfer_labels
 from shapecat.runs.run_info import Options, RunInfo
-from shapecat.runs.track_table import ORIGINAL
 from shapecat.system.files import input_size, replacing
 
 __all__ = [

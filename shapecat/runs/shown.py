@@ -19,9 +19,8 @@ from shapecat.geometry import (
     rotation_from_quaternion,
     transform,
 )
-from shapecat.runs.label_meaning import TrackLabel
-from shapecat.runs.table_schemas import BOX_WIDTH, FULL_BOX
-from shapecat.runs.tables import (
+from shapecat.runs.labels.meaning import TrackLabel
+from shapecat.runs.tables.reading import (
     Key,
     frame_rows,
     full_boxes_of,
@@ -34,6 +33,7 @@ from shapecat.runs.tables import (
     rows_of,
     topic_codes,
 )
+from shapecat.runs.tables.schemas import BOX_WIDTH, FULL_BOX
 from shapecat.types import Box, Pose, ShownBox, ShownFrame
 
 __all__ = ["ShownTracks", "misfit", "read_shown_frames"]
@@ -114,7 +114,7 @@ def read_shown_frames(
     """Yield the annotations of a run, frame by frame in reading order.
 
     This omits points, surfaces and posteriors, and is several times as fast as
-    `shapecat.runs.labels.read_labelled_frames`. Boxes enclose whole objects where their size is
+    `shapecat.runs.labelled_frames.read_labelled_frames`. Boxes enclose whole objects where their size is
     known; with ``visible``, only their visible parts. They are in the frame ``frame_id``.
 
     Raises

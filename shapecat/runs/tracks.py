@@ -14,10 +14,9 @@ from scipy.spatial.transform import Rotation
 from shapecat.arrays import F4, F8
 from shapecat.config import TrackingSettings
 from shapecat.runs.full_boxes import FullBoxes, full_columns
-from shapecat.runs.placed_frames import streams_with_poses
-from shapecat.runs.table_schemas import TRACKS
-from shapecat.runs.table_writing import arrow_table, open_writer, rows_as_lists
-from shapecat.runs.tables import (
+from shapecat.runs.labels.track_table import ORIGINAL, write_csv
+from shapecat.runs.tables.placed_frames import streams_with_poses
+from shapecat.runs.tables.reading import (
     Key,
     first_stamp,
     frame_rows,
@@ -25,7 +24,8 @@ from shapecat.runs.tables import (
     numbers_or_nan,
     read_together,
 )
-from shapecat.runs.track_table import ORIGINAL, write_csv
+from shapecat.runs.tables.schemas import TRACKS
+from shapecat.runs.tables.writing import arrow_table, open_writer, rows_as_lists
 from shapecat.system.files import replacing
 from shapecat.system.memory import release_memory
 from shapecat.tracking import FrameDetections, Track, track_recording

@@ -15,14 +15,14 @@ import numpy as np
 from shapecat.arrays import U1
 from shapecat.errors import OutputError
 from shapecat.geometry import compose, inverse
-from shapecat.simulation.colour_camera import COLOUR, jpeg, render_colour
+from shapecat.simulation.camera.colour_camera import COLOUR, jpeg, render_colour
+from shapecat.simulation.camera.presets import SENSORS
+from shapecat.simulation.camera.sensors import Sensor
+from shapecat.simulation.camera.views import render_frame
 from shapecat.simulation.containers import CONTAINERS, Container
-from shapecat.simulation.presets import SENSORS
-from shapecat.simulation.scenes import SceneKind, make_scene
-from shapecat.simulation.sensors import Sensor
+from shapecat.simulation.scenes.kinds import SceneKind, make_scene
+from shapecat.simulation.scenes.worlds import World
 from shapecat.simulation.truth import frame_truth
-from shapecat.simulation.views import render_frame
-from shapecat.simulation.worlds import World
 from shapecat.system.files import flush
 from shapecat.system.progress import Observer, ignore
 from shapecat.types import Camera, Frame, Pose

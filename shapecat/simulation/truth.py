@@ -7,9 +7,9 @@ import numpy as np
 
 from shapecat.arrays import F8, U1
 from shapecat.geometry import compose, inverse, transform, upright_box
-from shapecat.simulation.render import Geometry, alone_pixels
-from shapecat.simulation.sensors import Sensor
-from shapecat.simulation.worlds import PlacedObject, World
+from shapecat.simulation.camera.render import Geometry, alone_pixels
+from shapecat.simulation.camera.sensors import Sensor
+from shapecat.simulation.scenes.worlds import PlacedObject, World
 
 __all__ = ["AMBIGUOUS_PIXELS", "AMBIGUOUS_SHARE", "LISTED_PIXELS", "Truth", "frame_truth"]
 

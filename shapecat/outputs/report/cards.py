@@ -16,7 +16,7 @@ from shapecat.outputs.report.pictures import StripFrame, TrackPictures
 from shapecat.outputs.report.surfaces import SIDE, SurfaceDrawing
 from shapecat.outputs.report.tracks import Timeline
 from shapecat.outputs.wording import confidence_text, time_span
-from shapecat.runs.track_table import TrackRow
+from shapecat.runs.labels.track_table import TrackRow
 from shapecat.types import UNKNOWN
 
 __all__ = ["Card", "asset", "card_html", "css_colour", "frame_html", "is_unsure", "template"]

@@ -12,8 +12,8 @@ from typing import NamedTuple
 import numpy as np
 
 from shapecat.outputs.report.tracks import Detected, Timeline
-from shapecat.runs.masks import read_masks
-from shapecat.runs.tables import Key, read_row_groups
+from shapecat.runs.tables.masks import read_masks
+from shapecat.runs.tables.reading import Key, read_row_groups
 from shapecat.types import ImageMasks
 
 __all__ = ["Choice", "choose_frames"]

@@ -16,7 +16,7 @@ from shapecat.detection.output.settings import OUTPUT
 from shapecat.detection.virtual_camera import top_view, virtual_image
 from shapecat.geometry import gravity_rotation
 from shapecat.outputs.colouring import Coloured
-from shapecat.recordings.colour_image import pixels_of
+from shapecat.recordings.decoding.colour_image import pixels_of
 from shapecat.recordings.messages import MessageError
 from shapecat.types import Camera, Frame, LabelledFrame
 

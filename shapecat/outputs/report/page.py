@@ -25,7 +25,7 @@ from shapecat.outputs.report.cards import (
 )
 from shapecat.outputs.report.pictures import StripFrame
 from shapecat.runs.finished import FinishedRun
-from shapecat.runs.track_table import TrackTable
+from shapecat.runs.labels.track_table import TrackTable
 from shapecat.types import CATEGORIES, UNKNOWN
 
 __all__ = ["Listed", "index_page", "run_page"]

@@ -16,9 +16,9 @@ from shapecat.outputs.report.choosing import Choice
 from shapecat.outputs.report.images import Crop, SeenFrame, crop_of, encode, look, worth_of
 from shapecat.outputs.report.surfaces import MOST_POINTS, Snapshot, SurfaceDrawing, draw
 from shapecat.runs.finished import FinishedRun, open_source
-from shapecat.runs.label_meaning import TrackLabel
-from shapecat.runs.labels import read_labelled_frames
-from shapecat.runs.track_table import TrackRow
+from shapecat.runs.labelled_frames import read_labelled_frames
+from shapecat.runs.labels.meaning import TrackLabel
+from shapecat.runs.labels.track_table import TrackRow
 from shapecat.types import Frame, LabelledFrame, LabelledObject, NeuralGas
 
 __all__ = ["Pictures", "StripFrame", "TrackPictures", "take_pictures"]

@@ -22,9 +22,9 @@ from urllib.parse import unquote
 
 from shapecat.errors import ConfigError, OutputError, explained
 from shapecat.outputs.report.writing import INDEX, PAGE, Reports, RunReport
-from shapecat.runs.corrections import correct_label
 from shapecat.runs.folder import require_work
-from shapecat.runs.track_table import read_track_table
+from shapecat.runs.labels.corrections import correct_label
+from shapecat.runs.labels.track_table import read_track_table
 
 __all__ = ["serve_reports"]
 

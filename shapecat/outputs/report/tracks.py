@@ -7,7 +7,7 @@ import pyarrow as pa
 import pyarrow.compute
 
 from shapecat.arrays import F4, F8, Bool, Record, array
-from shapecat.runs.tables import first_stamp, opened, read_row_groups
+from shapecat.runs.tables.reading import first_stamp, opened, read_row_groups
 
 __all__ = ["Detected", "Timeline", "read_stage_seconds", "read_timelines"]
 

@@ -16,10 +16,10 @@ from shapecat.outputs.report.choosing import choose_frames
 from shapecat.outputs.report.page import Listed, index_page, run_page
 from shapecat.outputs.report.pictures import Pictures, take_pictures
 from shapecat.outputs.report.tracks import Timeline, read_stage_seconds, read_timelines
-from shapecat.runs.corrections import read_own_table
 from shapecat.runs.finished import find_runs, read_finished
 from shapecat.runs.folder import require_work
-from shapecat.runs.track_table import TrackTable
+from shapecat.runs.labels.corrections import read_own_table
+from shapecat.runs.labels.track_table import TrackTable
 from shapecat.system.files import replacing
 from shapecat.system.progress import Observer, ignore
 

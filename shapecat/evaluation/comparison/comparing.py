@@ -1,0 +1,333 @@
+"""Comparison of a run with ground truth, labels of other tools, or another run."""
+
+from collections import Counter
+from collections.abc import Iterator, Mapping, Sequence
+from contextlib import ExitStack
+from dataclasses import dataclass, field, replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from shapecat.arrays import Bool
+from shapecat.errors import OutputError, RecordingError
+from shapecat.evaluation.comparison.figures import Pairs, figures_of
+from shapecat.evaluation.comparison.identities import SeenTogether
+from shapecat.evaluation.comparison.labellings import (
+    LabelledItem,
+    Labelling,
+    Reference,
+    numbering_notes,
+)
+from shapecat.evaluation.comparison.matching import (
+    SAME_BOX,
+    SAME_MASK,
+    Difference,
+    Matched,
+    item_box_iou,
+    match_objects,
+    seen_together,
+)
+from shapecat.evaluation.comparison.overlap import MATCHED_F, Overlap
+from shapecat.evaluation.comparison.pictures import DifferenceImage, draw_frame
+from shapecat.evaluation.comparison.references import (
+    OtherRun,
+    open_reference,
+    read_complete,
+    repeated_stamps,
+    run_labellings,
+)
+from shapecat.runs.finished import FinishedRun, open_source
+from shapecat.runs.perceive.selection import read_frames
+from shapecat.runs.run_info import Options
+from shapecat.runs.tables.reading import Key
+from shapecat.system.progress import Observer, ignore
+from shapecat.types import Frame
+
+__all__ = ["Comparison", "compare"]
+
+_PICTURES = 12
+_DOUBTFUL = 0.1
+"""With a smaller fraction of the objects matched, the reference may be of another recording."""
+
+
+@dataclass(frozen=True)
+class Comparison:
+    """The results of a comparison.
+
+    Attributes
+    ----------
+    run, reference : paths of the two.
+    kind : kind of the reference, in words.
+    figures : metrics by name, plain values; None if they cannot be computed.
+    rows : all objects of all compared frames.
+    pictures : the frames that differ most, in temporal order.
+    notes : remarks for the reader.
+    """
+
+    run: str
+    reference: str
+    kind: str
+    figures: Mapping[str, Any]
+    rows: tuple[Difference, ...]
+    pictures: tuple[DifferenceImage, ...]
+    notes: tuple[str, ...]
+
+    def as_dict(self) -> dict[str, Any]:
+        """Return plain values for ``--json``."""
+        kinds = Counter(row.difference for row in self.rows if row.difference)
+        head = {"run": self.run, "reference": self.reference, "kind": self.kind}
+        return {**head, **self.figures, "differences": dict(kinds), "notes": list(self.notes)}
+
+
+@dataclass
+class _Tally:
+    """Counts over all frames."""
+
+    overlap: Overlap = field(default_factory=Overlap)
+    pairs: Pairs = field(default_factory=Pairs)
+    seen: list[SeenTogether] = field(default_factory=list)
+    rows: list[Difference] = field(default_factory=list)
+    last: dict[int, int] = field(default_factory=dict)
+    pictures: dict[int, DifferenceImage] = field(default_factory=dict)
+    compared: int = 0
+    only_run: int = 0
+    masks: bool = True
+
+
+def compare(
+    folder: Path,
+    reference: Path,
+    *,
+    recording: Path | None = None,
+    observe: Observer = ignore,
+) -> Comparison:
+    """Compare a finished run with a reference.
+
+    Parameters
+    ----------
+    reference : path as for `open_reference`.
+    recording : current path of the recording, if it was moved; only the pictures need it.
+
+    Raises
+    ------
+    OutputError : the folder is not a complete run, or the reference is a run of another recording.
+    RecordingError : the reference cannot be read, or has no frame in common with the run.
+    """
+    finished = read_complete(folder)
+    other = open_reference(reference, finished.categories, finished.name)
+    if isinstance(other, OtherRun):
+        _require_same_recording(finished, other)
+    tally, repeated = _Tally(), repeated_stamps(folder)
+    with ExitStack() as stack:
+        clouds, notes = _clouds(finished, recording, stack)
+        notes += numbering_notes(other, finished.run["options"]["start_s"])
+        total = int(finished.run["counts"]["frames"])
+        for done, (key, row, found) in enumerate(run_labellings(finished), start=1):
+            place = (row["topic"], row["stamp_ns"])
+            true = other.at(key, row["stamp_ns"], repeated=place in repeated)
+            if true is None:
+                tally.only_run += 1
+            else:
+                _compare_frame(
+                    tally, key, row, found, true, clouds, (done - 1) * _PICTURES // total
+                )
+            observe("compare", done, total)
+    if not tally.compared:
+        raise RecordingError(_nothing_in_common(finished, reference, other))
+    if _hardly_matches(tally.rows):
+        notes.append(
+            f"Hardly any object matches: is {reference} of the same recording? Labels of images "
+            "must be of its depth images (--format coco --depth)."
+        )
+    return Comparison(
+        run=str(folder),
+        reference=str(reference),
+        kind=other.kind,
+        figures=_figures(tally, other, finished),
+        rows=tuple(tally.rows),
+        pictures=tuple(tally.pictures[k] for k in sorted(tally.pictures)),
+        notes=tuple(notes),
+    )
+
+
+def _require_same_recording(finished: FinishedRun, other: OtherRun) -> None:
+    a, b = finished.run["input"], other.finished.run["input"]
+    if a["digest"] != b["digest"]:
+        msg = f"{other.finished.folder}: a run of another recording, {b['path']}, not {a['path']}"
+        raise OutputError(msg)
+
+
+def _nothing_in_common(finished: FinishedRun, reference: Path, other: Reference) -> str:
+    stamps = [row["stamp_ns"] for _, row, _ in run_labellings(finished)]
+    own = f"stamps {min(stamps)} to {max(stamps)}" if stamps else "none"
+    return (
+        f"{reference}: no frame in common with {finished.folder}: it has "
+        f"{other.describe_frames()}, the run {own}; is it of another recording?"
+    )
+
+
+def _hardly_matches(rows: Sequence[Difference]) -> bool:
+    """Return whether both sides have objects, of which few match."""
+    found, true = (Counter(row.difference for row in rows)[kind] for kind in ("surplus", "missed"))
+    matched = len(rows) - found - true
+    return min(found, true) > 0 and matched < _DOUBTFUL * (matched + min(found, true))
+
+
+def _clouds(
+    finished: FinishedRun, recording: Path | None, stack: ExitStack
+) -> tuple[Iterator[Frame], list[str]]:
+    """Return the frames of the recording; if it is missing, no frames and a note."""
+    try:
+        source = stack.enter_context(open_source(finished.run, recording))
+        options: Options = {**finished.run["options"], "color": ""}
+        return (frame for frame, _ in read_frames(source, options, skipped=Counter())), []
+    except (RecordingError, OutputError) as error:
+        if recording is not None:
+            raise
+        return iter(()), [f"The pictures lack depth: {error}"]
+
+
+def _compare_frame(
+    tally: _Tally,
+    key: Key,
+    row: Mapping[str, Any],
+    found: Labelling,
+    true: Labelling,
+    clouds: Iterator[Frame],
+    part: int,
+) -> None:
+    """Match the objects of a frame and count agreements and differences."""
+    tally.compared += 1
+    frame = next((f for f in clouds if (f.topic, f.index) == key), None)
+    _require_same_size(found, true, frame, key)
+    found = _labelled_part(found, true)
+    matched = match_objects(found.items, true.items)
+    tally.masks &= matched.overlap is not None
+    tally.overlap += matched.overlap or Overlap()
+    rows = list(_differences(tally, key, row["stamp_ns"], found.items, true.items, matched))
+    tally.rows += rows
+    tally.pairs.add(found.items, true.items, matched)
+    tally.seen.append(seen_together(found.items, true.items, matched))
+    differing = [item for item in rows if item.difference]
+    severity = len(differing) + 1 - float(np.mean([item.iou or 0 for item in rows] or [1]))
+    best = tally.pictures.get(part)
+    if differing and (best is None or severity > best.severity):
+        picture = draw_frame(key, frame, found, true, matched.pairs, rows, severity)
+        if picture is not None:
+            tally.pictures[part] = picture
+
+
+def _require_same_size(found: Labelling, true: Labelling, frame: Frame | None, key: Key) -> None:
+    """Check that the labels are of images with the size of the depth image.
+
+    Without the recording (``frame`` is None), only too small images are noticed.
+
+    Raises
+    ------
+    RecordingError : the images differ in size.
+    """
+    if true.shape is None:
+        return
+    height, width = true.shape
+    size, depth = height * width, None if frame is None else frame.depth
+    pixels = [item.pixels for item in found.items if item.pixels is not None and item.pixels.size]
+    if depth is not None and depth.shape != true.shape:
+        other = f"the depth image has {depth.shape[1]} x {depth.shape[0]}"
+    elif any(int(some.max()) >= size for some in pixels):
+        other = "the depth image is larger"
+    else:
+        return
+    msg = (
+        f"frame {key[1]} of {key[0]}: the labels are of an image of {width} x {height} pixels, but "
+        f"{other}; export labels of depth images (--format coco --depth)"
+    )
+    raise RecordingError(msg)
+
+
+def _labelled_part(found: Labelling, true: Labelling) -> Labelling:
+    """Return the detections without the pixels that have no label in the truth.
+
+    Detections of which more than half is ignored in the truth are left out.
+    """
+    if true.known is None:
+        return found
+    items = (
+        item if item.pixels is None else replace(item, pixels=item.pixels[true.known[item.pixels]])
+        for item in found.items
+        if not _is_ignored(item, true.ignored)
+    )
+    return Labelling(tuple(items))
+
+
+def _is_ignored(item: LabelledItem, ignored: Bool | None) -> bool:
+    if ignored is None or item.pixels is None or not item.pixels.size:
+        return False
+    return bool(ignored[item.pixels].mean() > 0.5)
+
+
+def _differences(
+    tally: _Tally,
+    key: Key,
+    stamp_ns: int,
+    found: Sequence[LabelledItem],
+    true: Sequence[LabelledItem],
+    matched: Matched,
+) -> Iterator[Difference]:
+    """Yield the rows of a frame: pairs, missed and surplus objects."""
+    head = (*key, stamp_ns)
+    for i, a in enumerate(found):
+        if i not in matched.pairs:
+            yield Difference(
+                *head, "surplus", track=a.track, category=a.category, confidence=a.confidence
+            )
+            continue
+        b, j = true[matched.pairs[i]], matched.pairs[i]
+        f = None if matched.f is None else float(matched.f[i, j])
+        iou = None if f is None else float(matched.similarity[i, j])
+        kind = _kind(tally, a, b, f)
+        yield Difference(
+            *head,
+            kind,
+            true_track=b.track,
+            true_category=b.category,
+            track=a.track,
+            category=a.category,
+            confidence=a.confidence,
+            f=f,
+            iou=iou,
+            box_iou=item_box_iou(a, b),
+        )
+    for j, b in enumerate(true):
+        if j not in matched.pairs.values():
+            yield Difference(*head, "missed", true_track=b.track, true_category=b.category)
+
+
+def _kind(tally: _Tally, a: LabelledItem, b: LabelledItem, f: float | None) -> str | None:
+    """Return the most serious difference of a pair."""
+    switched = False
+    if a.track is not None and b.track is not None:
+        switched = tally.last.get(b.track, a.track) != a.track
+        tally.last[b.track] = a.track
+    if b.decidable and a.category != b.category:
+        return "category"
+    if switched:
+        return "identity"
+    return "outline" if f is not None and f < MATCHED_F else None
+
+
+def _figures(tally: _Tally, other: Reference, finished: FinishedRun) -> dict[str, Any]:
+    frames = {
+        "compared": tally.compared,
+        "only_in_run": tally.only_run,
+        "only_in_reference": max(other.frames - tally.compared, 0),
+    }
+    return figures_of(
+        frames,
+        tally.pairs,
+        overlap=tally.overlap if tally.masks else None,
+        seen=tally.seen if other.tracked else None,
+        rows=tally.rows,
+        categories=tuple(finished.run["model"]["categories"]),
+        threshold=SAME_MASK if tally.masks else SAME_BOX,
+    )

@@ -1,0 +1,186 @@
+"""Labelled objects of a frame, from any source."""
+
+from abc import ABC, abstractmethod
+from collections import Counter
+from collections.abc import Iterable, Iterator, Mapping, Sequence
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import TypeVar
+
+import numpy as np
+from numpy.typing import ArrayLike
+
+from shapecat.arrays import F4, U4, Bool
+from shapecat.errors import RecordingError
+from shapecat.geometry import box_around
+from shapecat.runs.tables.reading import Key
+from shapecat.types import Box
+
+__all__ = [
+    "LabelledItem",
+    "Labelling",
+    "Place",
+    "Reference",
+    "find_frame",
+    "index_frames",
+    "join_merged",
+    "numbering_notes",
+]
+
+_Frame = TypeVar("_Frame")
+Place = tuple[str | None, int, int | None]
+"""Topic, None for any; timestamp (ns) or frame number; and frame number besides a timestamp."""
+
+
+@dataclass(frozen=True)
+class LabelledItem:
+    """An object in a frame.
+
+    Attributes
+    ----------
+    track : number of its track; None if it has none.
+    pixels : (n,) flat indices into the frame; None if there is no mask.
+    box : 3D box in the sensor frame; None if there is none.
+    decidable : whether its category is unambiguous in this view.
+    confidence : confidence of the final label; only in runs.
+    view_category, posterior : category and posterior (c,) of the single view; only in runs.
+    """
+
+    track: int | None
+    category: str
+    pixels: U4 | None = None
+    box: Box | None = None
+    decidable: bool = True
+    confidence: float = 1.0
+    view_category: str = ""
+    posterior: F4 | None = None
+
+
+@dataclass(frozen=True)
+class Labelling:
+    """The objects of a frame.
+
+    Attributes
+    ----------
+    known : (n,) which pixels of the frame have a label; None if all have.
+    shape : height and width of the image; None if unknown.
+    ignored : (n,) which pixels show objects that need not be found, nor are false if they are;
+        None if there are none.
+    """
+
+    items: tuple[LabelledItem, ...]
+    known: Bool | None = None
+    shape: tuple[int, int] | None = None
+    ignored: Bool | None = None
+
+
+class Reference(ABC):
+    """A reference for comparisons; frames are requested in recording order."""
+
+    kind: str
+    """Kind of the reference, in words."""
+    frames: int
+    """Number of frames."""
+    tracked: bool = False
+    """Whether objects have identities over time."""
+    numbered: bool = False
+    """Whether frames are named by their numbers alone."""
+
+    @abstractmethod
+    def at(self, key: Key, stamp_ns: int, *, repeated: bool = False) -> Labelling | None:
+        """Return the objects of a frame; None if the reference lacks this frame.
+
+        ``key`` is the topic and the number of the frame, ``stamp_ns`` its timestamp; ``repeated``
+        is whether other frames of its topic have the same timestamp.
+        """
+
+    @abstractmethod
+    def describe_frames(self) -> str:
+        """Describe the range of frames in a few words."""
+
+
+def numbering_notes(other: Reference, start_s: float | None) -> list[str]:
+    """Return a remark if the numbers of frames may count from another frame than the run's.
+
+    ``start_s`` is where the run began in its recording, None for the beginning.
+    """
+    if not (other.numbered and start_s):
+        return []
+    note = (
+        f"Frames are matched by number, which the run counts from --start {start_s:g}: labels "
+        "numbered from the start of the recording are of other frames, and need timestamps."
+    )
+    return [note]
+
+
+def join_merged(items: Iterable[LabelledItem], up: ArrayLike) -> Iterator[LabelledItem]:
+    """Join the objects of a run's frame that have the same track, since a person merged theirs.
+
+    Parameters
+    ----------
+    up : (3,) up direction in the sensor frame.
+    """
+    parts: dict[tuple[int | None, int], list[LabelledItem]] = {}
+    for k, item in enumerate(items):
+        parts.setdefault((item.track, k if item.track is None else 0), []).append(item)
+    return (_join(some, up) for some in parts.values())
+
+
+def _join(parts: Sequence[LabelledItem], up: ArrayLike) -> LabelledItem:
+    """Join the parts of an object; the largest one gives the category of the single view."""
+    if len(parts) == 1:
+        return parts[0]
+    masks = [part.pixels for part in parts if part.pixels is not None]
+    posteriors = [part.posterior for part in parts if part.posterior is not None]
+    return replace(
+        parts[int(np.argmax([mask.size for mask in masks]))],
+        pixels=np.unique(np.concatenate(masks)),
+        box=box_around([part.box for part in parts if part.box is not None], up),
+        posterior=np.mean(posteriors, axis=0),
+    )
+
+
+def index_frames(path: Path, frames: Iterable[tuple[Place, _Frame]]) -> dict[Place, _Frame]:
+    """Return entries as `find_frame` needs them.
+
+    Frames of a topic with equal timestamps are found only together with their numbers.
+
+    Parameters
+    ----------
+    path : of the reference, for the message.
+    frames : entries with their topic, None for any topic; their timestamp (ns) or frame number;
+        and the frame number besides a timestamp, None if unknown.
+
+    Raises
+    ------
+    RecordingError : two entries are of the same frame.
+    """
+    index: dict[Place, _Frame] = {}
+    for place, entry in frames:
+        if place in index:
+            topic, stamp, number = place
+            name = stamp if number is None else number
+            msg = f"{path}: frame {name} of {topic or 'any topic'} is labelled twice"
+            raise RecordingError(msg)
+        index[place] = entry
+    counts = Counter((topic, stamp) for topic, stamp, _ in index)
+    unique = {place: entry for place, entry in index.items() if counts[place[:2]] == 1}
+    return index | {(topic, stamp, None): entry for (topic, stamp, _), entry in unique.items()}
+
+
+def find_frame(
+    index: Mapping[Place, _Frame], key: Key, stamp_ns: int, *, repeated: bool = False
+) -> _Frame | None:
+    """Return the entry of a frame; None if there is none.
+
+    Parameters
+    ----------
+    index : from `index_frames`.
+    repeated : whether other frames of its topic have the same timestamp.
+    """
+    number = key[1]
+    numbers = [(stamp_ns, number), (stamp_ns, None), (number, None)]
+    if repeated:
+        numbers.remove((stamp_ns, None))
+    places = ((topic, *pair) for pair in numbers for topic in (key[0], None))
+    return next((index[place] for place in places if place in index), None)

@@ -1,0 +1,114 @@
+"""Matching of the found and true objects of a frame."""
+
+from collections.abc import Sequence
+from typing import Any, NamedTuple
+
+import numpy as np
+from scipy.optimize import linear_sum_assignment
+
+from shapecat.evaluation.comparison.identities import SeenTogether
+from shapecat.evaluation.comparison.labellings import LabelledItem
+from shapecat.evaluation.comparison.overlap import Overlap, box_iou, match_masks
+
+__all__ = [
+    "SAME_BOX",
+    "SAME_MASK",
+    "Difference",
+    "Matched",
+    "item_box_iou",
+    "match_objects",
+    "seen_together",
+]
+
+SAME_MASK = 0.5
+"""Lowest IoU of two masks that count as the same object (PASCAL VOC)."""
+SAME_BOX = 0.25
+"""Lowest IoU of two 3D boxes that count as the same object; less than for masks, as hidden sides
+are estimates (SUN RGB-D, Song 2015)."""
+
+
+class Difference(NamedTuple):
+    """A row of the table: a true object and the detection matched to it, or one without the other.
+
+    Attributes
+    ----------
+    difference : ``missed``, ``surplus``, ``outline`` (``f`` below 0.75), ``category``, ``identity``
+        (another track than before), or None if both agree.
+    true_track, true_category : from the reference; None without a true object.
+    track, category, confidence : from the run; None without a detection.
+    f, iou : overlap of the masks; None without masks.
+    box_iou : overlap of the 3D boxes; None without boxes.
+    """
+
+    topic: str
+    frame: int
+    stamp_ns: int
+    difference: str | None
+    true_track: int | None = None
+    true_category: str | None = None
+    track: int | None = None
+    category: str | None = None
+    confidence: float | None = None
+    f: float | None = None
+    iou: float | None = None
+    box_iou: float | None = None
+
+
+class Matched(NamedTuple):
+    """Matched objects of a frame.
+
+    Attributes
+    ----------
+    pairs : index of the true object for each matched found object.
+    similarity : (found, true) IoU of the masks, or of the 3D boxes if matched by boxes.
+    f : (found, true) overlap F of the masks; None if matched by boxes.
+    overlap : counts of the masks' pixels; None if matched by boxes.
+    """
+
+    pairs: dict[int, int]
+    similarity: Any
+    f: Any
+    overlap: Overlap | None
+
+
+def match_objects(found: Sequence[LabelledItem], true: Sequence[LabelledItem]) -> Matched:
+    """Match the objects of a frame one to one.
+
+    If all objects of both sides have masks, pairs maximise the sum of overlap F and need an IoU of
+    at least 0.5. Otherwise all objects are matched by 3D boxes: pairs maximise the sum of IoU and
+    need an IoU of at least 0.25.
+    """
+    masks = [[i.pixels for i in items if i.pixels is not None] for items in (found, true)]
+    if len(masks[0]) == len(found) and len(masks[1]) == len(true):
+        by_mask = match_masks(masks[0], masks[1])
+        same = {i: j for i, j in by_mask.pairs if by_mask.iou[i, j] >= SAME_MASK}
+        return Matched(same, by_mask.iou, by_mask.f, by_mask.overlap)
+    iou = np.array([[item_box_iou(a, b) or 0.0 for b in true] for a in found])
+    iou = iou.reshape(len(found), len(true))
+    return Matched(_best(iou), iou, None, None)
+
+
+def _best(iou: Any) -> dict[int, int]:
+    pairs = zip(*(places.tolist() for places in linear_sum_assignment(-iou)), strict=True)
+    return {i: j for i, j in pairs if iou[i, j] >= SAME_BOX}
+
+
+def item_box_iou(a: LabelledItem, b: LabelledItem) -> float | None:
+    """Return the IoU of two objects' 3D boxes; None if a box is missing."""
+    return None if a.box is None or b.box is None else box_iou(a.box, b.box)
+
+
+def seen_together(
+    found: Sequence[LabelledItem], true: Sequence[LabelledItem], matched: Matched
+) -> SeenTogether:
+    """Return the identities of a frame; a track with several detections keeps the most similar."""
+    best: dict[int, int] = {}
+    for i, item in enumerate(found):
+        if item.track is None:
+            continue
+        now = best.setdefault(item.track, i)
+        if matched.similarity[i].max(initial=0) > matched.similarity[now].max(initial=0):
+            best[item.track] = i
+    asked = {item.track: j for j, item in enumerate(true) if item.track is not None}
+    similarity = matched.similarity[np.ix_(list(best.values()), list(asked.values()))].T
+    return SeenTogether(list(asked), list(best), similarity)

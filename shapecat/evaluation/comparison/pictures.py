@@ -1,0 +1,165 @@
+"""Pictures of frames in which a run and the truth differ."""
+
+import base64
+from collections.abc import Mapping, Sequence
+from typing import NamedTuple
+
+import numpy as np
+
+from shapecat.arrays import U1
+from shapecat.evaluation.comparison.labellings import LabelledItem, Labelling
+from shapecat.evaluation.comparison.matching import Difference
+from shapecat.outputs.png import png
+from shapecat.runs.tables.reading import Key
+from shapecat.types import Frame
+
+__all__ = ["COLOURS", "DifferenceImage", "draw_frame", "words_of"]
+
+_SHADES = 48
+COLOURS = {
+    "both": (66, 160, 71),
+    "missed": (230, 81, 0),
+    "surplus": (30, 100, 220),
+    "category": (160, 40, 170),
+}
+"""Colours of the pixels: run and truth agree, only in the truth, only in the run, and same object
+but different category."""
+_INK = 0.55
+
+
+class Caption(NamedTuple):
+    """A text and its position in the picture, pixels."""
+
+    x: float
+    y: float
+    text: str
+
+
+class DifferenceImage(NamedTuple):
+    """A picture of a frame: a PNG as a data URI, with captions and the differences it shows.
+
+    ``severity`` grows with the number of differences.
+    """
+
+    topic: str
+    frame: int
+    image: str
+    width: int
+    height: int
+    captions: tuple[Caption, ...]
+    severity: float
+    rows: tuple[Difference, ...]
+
+
+def draw_frame(
+    key: Key,
+    frame: Frame | None,
+    found: Labelling,
+    true: Labelling,
+    pairs: Mapping[int, int],
+    rows: Sequence[Difference],
+    severity: float,
+) -> DifferenceImage | None:
+    """Draw found and true masks over the depth image.
+
+    Parameters
+    ----------
+    frame : the depth frame; None for a plain background.
+    pairs : index of the true object for each matched found object.
+    rows : differences of the frame: those of the found objects, then those of the missed ones, both
+        in their order.
+
+    Returns
+    -------
+    The picture; None if the frame is not an image.
+    """
+    shape = true.shape
+    if frame is not None:
+        shape = frame.depth.shape if frame.depth is not None else None
+    if shape is None:
+        return None
+    height, width = shape
+    image = _shades(frame, height, width) + _SHADES * _states(
+        found, true, pairs, rows, height * width
+    )
+    code = base64.b64encode(png(image.reshape(height, width).astype(np.uint8), _palette())).decode()
+    differing = tuple(row for row in rows if row.difference)
+    captions = _captions(rows, found.items, true.items, pairs, width)
+    uri = f"data:image/png;base64,{code}"
+    return DifferenceImage(*key, uri, width, height, captions, severity, differing)
+
+
+def _states(
+    found: Labelling,
+    true: Labelling,
+    pairs: Mapping[int, int],
+    rows: Sequence[Difference],
+    size: int,
+) -> U1:
+    """Return the colour number of each pixel, (n,), from 1; 0 without an object.
+
+    Where a found object lies on a true one that it is not matched with, its pixels are surplus, so
+    that split objects show.
+    """
+    state = np.zeros(size, np.int64)
+    for number, labelling in ((2, true), (3, found)):
+        for item in labelling.items:
+            if item.pixels is not None:
+                state[item.pixels] = number
+    for i, j in pairs.items():
+        mine, theirs = found.items[i].pixels, true.items[j].pixels
+        if mine is not None and theirs is not None:
+            state[np.intersect1d(mine, theirs)] = 4 if rows[i].difference == "category" else 1
+    return state
+
+
+def _shades(frame: Frame | None, height: int, width: int) -> U1:
+    """Return the grey level of each pixel, (n,), shaded from the camera; nearer is brighter."""
+    if frame is None or frame.depth is None:
+        return np.full(height * width, _SHADES * 3 // 4)
+    depth = np.asarray(frame.depth, np.float64)
+    seen = depth > 0
+    z = np.where(seen, depth, np.nan)
+    near, far = np.nanpercentile(z, [2, 90]) if seen.any() else (0.0, 1.0)
+    distance = np.clip((z - near) / max(far - near, 1e-3), 0, 1)
+    slope = np.hypot(*np.gradient(z)) / z
+    light = 1 / np.sqrt(1 + (slope * 250) ** 2)
+    shade = (0.35 + 0.65 * light) * (1 - 0.5 * distance)
+    level = np.nan_to_num(shade, nan=0.2) * (_SHADES - 1)
+    return np.where(seen, level, 2).astype(np.int64).reshape(-1)
+
+
+def _palette() -> U1:
+    """Return the colour table (k, 3): shades of grey, then these shades tinted with each colour."""
+    grey = np.repeat(np.linspace(0, 255, _SHADES)[:, None], 3, axis=1)
+    tinted = [grey * (1 - _INK) + _INK * np.array(colour) for colour in COLOURS.values()]
+    return np.concatenate([grey, *tinted]).astype(np.uint8)
+
+
+def _captions(
+    rows: Sequence[Difference],
+    found: Sequence[LabelledItem],
+    true: Sequence[LabelledItem],
+    pairs: Mapping[int, int],
+    width: int,
+) -> tuple[Caption, ...]:
+    """Return a caption for each difference, at the position of its object."""
+    missed = [item for j, item in enumerate(true) if j not in pairs.values()]
+    captions = []
+    for row, item in zip(rows, [*found, *missed], strict=True):
+        if row.difference and item.pixels is not None and item.pixels.size:
+            y, x = np.divmod(item.pixels, width)
+            captions.append(Caption(float(x.mean()), float(y.min()) - 4, words_of(row)))
+    return tuple(captions)
+
+
+def words_of(row: Difference) -> str:
+    """Describe a difference as a short phrase; its ``difference`` must not be None."""
+    track = "" if row.track is None else f" #{row.track}"
+    return {
+        "missed": f"missed {row.true_category}",
+        "surplus": f"surplus {row.category}{track}",
+        "category": f"{row.true_category} taken for {row.category}{track}",
+        "identity": f"{row.true_category} now{track}",
+        "outline": f"{row.category}{track}: outline differs",
+    }[str(row.difference)]

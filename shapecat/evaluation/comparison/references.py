@@ -1,0 +1,313 @@
+"""References for comparisons: simulated ground truth, labels of other tools, another run."""
+
+import json
+import zipfile
+from collections import Counter
+from collections.abc import Container, Iterator, Mapping, Sequence
+from pathlib import Path
+from typing import IO, Any, cast
+
+import numpy as np
+
+from shapecat.arrays import F8, U1
+from shapecat.errors import OutputError, RecordingError
+from shapecat.evaluation.comparison.labellings import (
+    LabelledItem,
+    Labelling,
+    Reference,
+    find_frame,
+    index_frames,
+    join_merged,
+)
+from shapecat.evaluation.comparison.references_coco import CocoLabels
+from shapecat.evaluation.comparison.references_kitti import KittiLabels
+from shapecat.evaluation.dataset import DAMAGED
+from shapecat.runs.finished import FinishedRun, read_finished
+from shapecat.runs.folder import read_run
+from shapecat.runs.labelled_frames import rows_by_frame
+from shapecat.runs.labels.meaning import TrackLabel
+from shapecat.runs.shown import ShownTracks
+from shapecat.runs.tables.reading import Key, keys_of, read_row_groups, read_together
+from shapecat.types import Box
+
+__all__ = [
+    "OtherRun",
+    "SimulatedTruth",
+    "open_reference",
+    "read_complete",
+    "repeated_stamps",
+    "run_labellings",
+]
+
+
+def open_reference(path: Path, categories: Sequence[str] = (), run: str = "") -> Reference:
+    """Open a reference.
+
+    Parameters
+    ----------
+    path : a run folder; a KITTI folder, which has a folder ``label_2``; a JSON file of `shapecat
+        simulate` or COCO; or a simulated recording with its ground truth beside it.
+    categories : those of the run to compare; they show which ``_`` in a KITTI type are spaces.
+    run : name of the run to compare; it shows which images of several recordings are used.
+
+    Raises
+    ------
+    RecordingError : the path is none of these, or is damaged.
+    """
+    if (path / "run.json").is_file():
+        return OtherRun(path)
+    if (path / "label_2").is_dir():
+        return KittiLabels(path, categories)
+    beside = path.with_name(f"{path.stem}.truth.json")
+    if path.suffix != ".json" and beside.is_file():
+        path = beside
+    if path.suffix != ".json" or not path.is_file():
+        msg = (
+            f"{path}: nothing to compare with; expected NAME.truth.json of `shapecat simulate`, "
+            "a COCO file, a folder with label_2 (KITTI), or a run"
+        )
+        raise RecordingError(msg)
+    try:
+        content = json.loads(path.read_text("utf-8"))
+        if isinstance(content, list):
+            return SimulatedTruth(path, content)
+        return CocoLabels(path, content, run)
+    except (OSError, ValueError, KeyError, TypeError, AttributeError) as error:
+        reason = f"it lacks {error}" if isinstance(error, KeyError) else error
+        msg = f"{path}: neither ground truth of `shapecat simulate` nor COCO labels ({reason})"
+        raise RecordingError(msg) from error
+
+
+class SimulatedTruth(Reference):
+    """Ground truth of `shapecat simulate`: NAME.truth.json and NAME.labels.npz.
+
+    Objects of which too few pixels are visible are ignored.
+    """
+
+    kind = "ground truth of each pixel"
+
+    def __init__(self, path: Path, content: list[dict[str, Any]]) -> None:
+        self._path = path
+        self._by_stamp = {int(entry["stamp_ns"]): entry for entry in content}
+        self.frames = len(content)
+        objects = [item for entry in content for item in entry["objects"]]
+        self.tracked = bool(objects) and all("track" in item for item in objects)
+        labels = path.with_name(f"{path.name.removesuffix('truth.json')}labels.npz")
+        self._labels = _LabelImages(labels)
+
+    def at(
+        self,
+        key: Key,  # noqa: ARG002  stamps are enough
+        stamp_ns: int,
+        *,
+        repeated: bool = False,  # noqa: ARG002  the simulator repeats none
+    ) -> Labelling | None:
+        """Return the objects of a frame; None if the ground truth lacks this frame.
+
+        Raises
+        ------
+        RecordingError : an object lacks a field or has a wrong one, or its image is damaged.
+        """
+        entry = self._by_stamp.get(stamp_ns)
+        if entry is None:
+            return None
+        try:
+            return _true_labelling(entry, self._labels.read(int(entry["frame"])))
+        except (KeyError, TypeError, ValueError, AttributeError) as error:
+            reason = f"lacks {error}" if isinstance(error, KeyError) else f"is damaged ({error})"
+            msg = f"{self._path}: the frame with stamp {stamp_ns} {reason}"
+            raise RecordingError(msg) from error
+
+    def describe_frames(self) -> str:
+        """Return the range of timestamps."""
+        stamps = list(self._by_stamp)
+        return f"stamps {min(stamps)} to {max(stamps)}" if stamps else "no frames"
+
+
+def _true_labelling(entry: Mapping[str, Any], image: U1) -> Labelling:
+    """Return the objects of an entry of the ground truth with its label image (h, w)."""
+    flat = image.reshape(-1)
+    items = (
+        LabelledItem(
+            track=item.get("track"),
+            category=str(item["category"]),
+            pixels=np.flatnonzero(np.isin(flat, item["parts"])),
+            box=Box(**item["box"]) if "box" in item else None,
+            decidable=not item["ambiguous"],
+        )
+        for item in entry["objects"]
+    )
+    small = [part for item in entry.get("hidden", ()) for part in item["parts"]]
+    ignored = np.isin(flat, small)
+    size = image.shape[0], image.shape[1]
+    return Labelling(tuple(items), (flat > 0) & ~ignored, size, ignored)
+
+
+class _LabelImages:
+    """The array ``labels`` (t, h, w), uint8, of an .npz, read image by image, forward only."""
+
+    def __init__(self, path: Path) -> None:
+        self._path = path
+        self._next = 0
+        try:
+            # Closed together with this object, as frames are read until then.
+            self._file = zipfile.ZipFile(path).open("labels.npy")  # noqa: SIM115
+            self._shape = _image_shape(self._file)
+        except DAMAGED as error:
+            msg = f"{path}: not the labels of a simulated recording ({error})"
+            raise RecordingError(msg) from error
+
+    def read(self, index: int) -> U1:
+        """Return an image (h, w); afterwards, earlier images cannot be read any more.
+
+        Raises
+        ------
+        RecordingError : the file is damaged, or ends before this image.
+        """
+        _, height, width = self._shape
+        size = height * width
+        try:
+            self._file.seek(self._file.tell() + (index - self._next) * size)
+            data = self._file.read(size)
+        except DAMAGED as error:
+            msg = f"{self._path}: damaged at image {index} ({error})"
+            raise RecordingError(msg) from error
+        self._next = index + 1
+        if index >= self._shape[0] or len(data) < size:
+            msg = f"{self._path}: ends before image {index}; simulate the recording again"
+            raise RecordingError(msg)
+        return np.frombuffer(data, np.uint8).reshape(height, width)
+
+
+def _image_shape(file: IO[bytes]) -> tuple[int, int, int]:
+    """Read the header of an array of images; return their number, height and width.
+
+    Raises
+    ------
+    ValueError : the array does not hold uint8 images.
+    """
+    version = np.lib.format.read_magic(file)
+    shape, _, dtype = np.lib.format.read_array_header_1_0(file)
+    if version != (1, 0) or len(shape) != 3 or dtype != np.uint8:
+        msg = f"expected images of uint8, got {shape} {dtype}"
+        raise ValueError(msg)
+    return shape[0], shape[1], shape[2]
+
+
+class OtherRun(Reference):
+    """Another run of the same recording, whose final labels count as the truth."""
+
+    kind, tracked = "another run", True
+
+    def __init__(self, folder: Path) -> None:
+        self.finished = read_complete(folder)
+        frames = list(_frames(folder))
+        self._stamps = [stamp for _, stamp in frames]
+        self._keys = index_frames(folder, (((key[0], stamp, key[1]), key) for key, stamp in frames))
+        self.frames = len(frames)
+        self._rest = run_labellings(self.finished)
+
+    def at(self, key: Key, stamp_ns: int, *, repeated: bool = False) -> Labelling | None:
+        """Return the objects of a frame; None if the other run lacks this frame.
+
+        Raises
+        ------
+        OutputError : the two runs list their frames in different orders.
+        """
+        wanted = find_frame(self._keys, key, stamp_ns, repeated=repeated)
+        if wanted is None:
+            return None
+        for other, _, labelling in self._rest:
+            if other == wanted:
+                return labelling
+        msg = f"{self.finished.folder}: its frames are in a different order; process it again"
+        raise OutputError(msg)
+
+    def describe_frames(self) -> str:
+        """Return the topics and the range of timestamps."""
+        topics = sorted({topic for topic, *_ in self._keys if topic is not None})
+        if not topics:
+            return "no frames"
+        return f"frames of {', '.join(topics)}, stamps {min(self._stamps)} to {max(self._stamps)}"
+
+
+def repeated_stamps(folder: Path) -> set[tuple[str, int]]:
+    """Return the topics and timestamps (ns) that several frames of a run have."""
+    counts = Counter((topic, stamp) for (topic, _), stamp in _frames(folder))
+    return {place for place, count in counts.items() if count > 1}
+
+
+def _frames(folder: Path) -> Iterator[tuple[Key, int]]:
+    """Yield topic and number of each frame of a run, and its timestamp, ns."""
+    for group in read_row_groups(folder / "frames.parquet", ["topic", "frame", "stamp_ns"]):
+        yield from zip(keys_of(group), group["stamp_ns"].to_pylist(), strict=True)
+
+
+def read_complete(folder: Path) -> FinishedRun:
+    """Read a complete run.
+
+    Raises
+    ------
+    OutputError : the folder is not a run, or the run is not complete.
+    """
+    read_run(folder)  # says if there is no run
+    if not ((folder / "tracks.parquet").is_file() and (folder / "tracks.csv").is_file()):
+        msg = f"{folder}: the run is not complete; run the same command again to resume"
+        raise OutputError(msg)
+    return read_finished(folder)
+
+
+def run_labellings(finished: FinishedRun) -> Iterator[tuple[Key, Mapping[str, Any], Labelling]]:
+    """Yield the frames of a run in order: topic and number, the frame's table row, its objects.
+
+    Detections without a track keep the category of the single view; detections of deleted tracks
+    are left out, those of merged tracks in one frame are joined. Boxes are full boxes where these
+    are known, else visible ones.
+    """
+    folder = finished.folder
+    deleted = _deleted(folder, finished.labels)
+    wanted = ("topic", "frame", "detection", "center", "size", "orientation", "indices")
+    columns = [*wanted, "posterior", "category", "confidence"]
+    shown = ShownTracks.read(folder, finished.labels)
+    tables = {"frames": ["topic", "frame", "stamp_ns", "up"], "detections": columns}
+    for frames, detections in read_together(folder, tables):
+        found = rows_by_frame(detections)
+        for row in frames.to_pylist():
+            key = (row["topic"], row["frame"])
+            tracked = {item.detection: (item.label, shown.full[item.row]) for item in shown.of(key)}
+            items = (
+                _item(r, *tracked.get(r["detection"], (None, None)))
+                for r in found.get(key, [])
+                if (*key, r["detection"]) not in deleted
+            )
+            yield key, row, Labelling(tuple(join_merged(items, row["up"])))
+
+
+def _deleted(folder: Path, labels: Container[int]) -> set[tuple[str, int, int]]:
+    """Return topic, frame and detection of each detection whose track a person has deleted."""
+    names = ("topic", "frame", "detection", "track")
+    found = set()
+    for group in read_row_groups(folder / "tracks.parquet", names):
+        rows = zip(*(group[name].to_pylist() for name in names), strict=True)
+        found |= {row[:3] for row in rows if row[3] not in labels}
+    return found
+
+
+def _box(row: Mapping[str, Any], full: F8 | None) -> Box:
+    """Return the full box of an object, or the visible one if the full one is unknown."""
+    if full is None or np.isnan(full[0]):
+        return Box(row["center"], row["size"], row["orientation"])
+    return Box(full[:3], full[3:6], full[6:])
+
+
+def _item(row: Mapping[str, Any], label: TrackLabel | None, full: F8 | None) -> LabelledItem:
+    """Return a detection with the final label of its track, if it has one."""
+    return LabelledItem(
+        track=None if label is None else label.track,
+        category=row["category"] if label is None else label.category,
+        pixels=cast("Any", row["indices"]).astype(np.int64),
+        box=_box(row, full),
+        confidence=row["confidence"] if label is None else label.confidence,
+        view_category=row["category"],
+        posterior=row["posterior"],
+    )

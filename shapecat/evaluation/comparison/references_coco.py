@@ -1,0 +1,216 @@
+"""COCO instance labels on images with the size of the depth images."""
+
+import re
+from collections import defaultdict
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import numpy as np
+
+from shapecat.arrays import I4, Bool
+from shapecat.errors import RecordingError
+from shapecat.evaluation.comparison.labellings import (
+    LabelledItem,
+    Labelling,
+    Place,
+    Reference,
+    find_frame,
+    index_frames,
+)
+from shapecat.runs.tables.reading import Key
+
+__all__ = ["CocoLabels", "decode_rle", "filled_polygon"]
+
+_MOST_PIXELS = 50_000_000
+_A_STAMP = 10**17
+"""Larger numbers in image names are timestamps in nanoseconds, smaller ones frame numbers or dates,
+of which the longest, with milliseconds, have 17 digits."""
+
+
+class _Image(NamedTuple):
+    """An image of a COCO file, with its size in pixels."""
+
+    id: Any
+    height: int
+    width: int
+
+
+class CocoLabels(Reference):
+    """Masks of a COCO file, as polygons or run lengths.
+
+    An image names its frame by ``stamp_ns`` (with ``frame`` where stamps repeat), by ``frame``, or
+    by a number in its ``file_name``: a timestamp in nanoseconds, else the last number, which is
+    the frame number. An image without ``topic`` matches any topic. If several recordings are named
+    by ``recording``, the images of the one with the name of the ``run`` are used.
+    """
+
+    kind = "COCO labels"
+
+    def __init__(self, path: Path, content: Mapping[str, Any], run: str = "") -> None:
+        self._path = path
+        names = {item["id"]: str(item["name"]) for item in content["categories"]}
+        self._labels = defaultdict(list)
+        for item in content["annotations"]:
+            self._labels[item["image_id"]].append({**item, "name": names[item["category_id"]]})
+        images = _images_of(run, path, content["images"])
+        sized = (_Image(image["id"], int(image["height"]), int(image["width"])) for image in images)
+        self._images = index_frames(path, zip(map(_place_of, images), sized, strict=True))
+        self.frames = len(images)
+        self.numbered = any(map(_is_numbered, images))
+        items = [item for some in self._labels.values() for item in some]
+        self.tracked = bool(items) and all(_track_of(item) is not None for item in items)
+
+    def at(self, key: Key, stamp_ns: int, *, repeated: bool = False) -> Labelling | None:
+        """Return the objects of a frame; None if the labels lack this frame.
+
+        Raises
+        ------
+        RecordingError : the image size or a mask is invalid.
+        """
+        image = find_frame(self._images, key, stamp_ns, repeated=repeated)
+        if image is None:
+            return None
+        name, height, width = image
+        if not 0 < height * width <= _MOST_PIXELS:
+            msg = f"{self._path}: image {name} is {width}×{height}"
+            raise RecordingError(msg)
+        items = (self._item(item, height, width) for item in self._labels[name])
+        return Labelling(tuple(items), None, (height, width))
+
+    def _item(self, item: Mapping[str, Any], height: int, width: int) -> LabelledItem:
+        try:
+            mask = _mask(item["segmentation"], height, width)
+        except (KeyError, ValueError, TypeError, IndexError) as error:
+            msg = f"{self._path}: annotation {item.get('id')} has no readable mask ({error!r})"
+            raise RecordingError(msg) from error
+        return LabelledItem(
+            track=_track_of(item),
+            category=item["name"],
+            pixels=np.flatnonzero(mask),
+            decidable=not item.get("iscrowd"),
+        )
+
+    def describe_frames(self) -> str:
+        """Return the range of timestamps or frame numbers."""
+        numbers = [number for _, number, _ in self._images]
+        return f"images {min(numbers)} to {max(numbers)}" if numbers else "no images"
+
+
+def _track_of(item: Mapping[str, Any]) -> int | None:
+    own = item.get("track_id", item.get("attributes", {}).get("track_id"))
+    return None if own is None else int(own)
+
+
+def _images_of(
+    run: str, path: Path, images: Sequence[Mapping[str, Any]]
+) -> Sequence[Mapping[str, Any]]:
+    """Return the images of a run's recording; all images if they name only one, or none.
+
+    Raises
+    ------
+    RecordingError : there are several recordings, none of which has the name of the run.
+    """
+    names = {str(image["recording"]) for image in images if "recording" in image}
+    if len(names) < 2:
+        return images
+    if run not in names:
+        msg = f"{path}: has images of {', '.join(sorted(names))}, not of {run}"
+        raise RecordingError(msg)
+    return [image for image in images if str(image.get("recording")) == run]
+
+
+def _place_of(image: Mapping[str, Any]) -> Place:
+    numbers = [int(image[name]) for name in ("stamp_ns", "frame") if image.get(name) is not None]
+    numbers = numbers or [_number_in_name(image)]
+    return image.get("topic"), numbers[0], numbers[1] if len(numbers) > 1 else None
+
+
+def _is_numbered(image: Mapping[str, Any]) -> bool:
+    """Return whether an image names its frame by a number, not by a timestamp."""
+    if image.get("stamp_ns") is not None:
+        return False
+    return image.get("frame") is not None or _number_in_name(image) <= _A_STAMP
+
+
+def _number_in_name(image: Mapping[str, Any]) -> int:
+    """Return the timestamp in the name of an image, ns, or the frame number."""
+    digits = re.findall(r"\d+", Path(image["file_name"]).stem)
+    if not digits:
+        msg = f"the name {image['file_name']!r} holds neither a timestamp nor a frame number"
+        raise ValueError(msg)
+    return max(map(int, digits)) if int(max(digits, key=int)) > _A_STAMP else int(digits[-1])
+
+
+def _mask(segmentation: Any, height: int, width: int) -> Bool:
+    if isinstance(segmentation, Mapping):
+        if tuple(segmentation["size"]) != (height, width):
+            msg = f"size {segmentation['size']}, the image is {[height, width]}"
+            raise ValueError(msg)
+        return decode_rle(segmentation["counts"], height, width)
+    mask = np.zeros((height, width), np.bool_)
+    for polygon in segmentation:
+        mask |= filled_polygon(np.reshape(polygon, (-1, 2)), height, width)
+    return mask
+
+
+def decode_rle(counts: str | Sequence[int], height: int, width: int) -> Bool:
+    """Decode run lengths into a mask (h, w).
+
+    Parameters
+    ----------
+    counts : run lengths in column-major order, beginning with zeros; or COCO's compressed string.
+    height, width : size of the image, pixels.
+
+    Raises
+    ------
+    ValueError : the run lengths are negative or do not fill the image.
+
+    Examples
+    --------
+    >>> decode_rle([1, 2, 1], 2, 2).astype(int)
+    array([[0, 1],
+           [1, 0]])
+    """
+    lengths = _uncompressed(counts) if isinstance(counts, str) else list(map(int, counts))
+    if sum(lengths) != height * width or min(lengths, default=0) < 0:
+        msg = f"run lengths of {sum(lengths)} pixels for an image of {height * width}"
+        raise ValueError(msg)
+    values = np.arange(len(lengths)) % 2 == 1
+    return np.asarray(np.repeat(values, lengths).reshape(width, height).T)
+
+
+def _uncompressed(text: str) -> list[int]:
+    """Return the run lengths of a compressed string.
+
+    Each character holds five bits; from the fourth run on, values are differences from the run two
+    before.
+    """
+    lengths: list[int] = []
+    value = shift = 0
+    for letter in text.encode("ascii"):
+        bits = letter - 48
+        value |= (bits & 0x1F) << shift
+        shift += 5
+        if bits & 0x20:
+            continue
+        if bits & 0x10:
+            value -= 1 << shift
+        lengths.append(value + (lengths[-2] if len(lengths) > 2 else 0))
+        value = shift = 0
+    return lengths
+
+
+def filled_polygon(corners: I4, height: int, width: int) -> Bool:
+    """Return the mask (height, width) of pixels with their centre inside a polygon.
+
+    ``corners`` (n, 2) are x and y in pixels; the centre of pixel (0, 0) is at (0.5, 0.5).
+    """
+    corners = np.asarray(corners, np.float64)
+    x, y = np.arange(width) + 0.5, np.arange(height) + 0.5
+    inside = np.zeros((height, width), np.bool_)
+    for (x0, y0), (x1, y1) in zip(corners, np.roll(corners, -1, axis=0), strict=True):
+        rows = np.flatnonzero((y0 <= y) != (y1 <= y))
+        crossing = x0 + (y[rows] - y0) * (x1 - x0) / (y1 - y0 or 1.0)
+        inside[rows] ^= x < crossing[:, None]
+    return inside

@@ -1,0 +1,121 @@
+"""KITTI 3D labels: label_2 and calib, as `shapecat export --format kitti` writes them."""
+
+import csv
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+
+import numpy as np
+
+from shapecat.arrays import F8
+from shapecat.errors import RecordingError
+from shapecat.evaluation.comparison.labellings import (
+    LabelledItem,
+    Labelling,
+    Place,
+    Reference,
+    find_frame,
+    index_frames,
+)
+from shapecat.geometry import quaternion_from_rotation
+from shapecat.outputs.exports.kitti import kitti_type
+from shapecat.runs.tables.reading import Key
+from shapecat.types import Box
+
+__all__ = ["KittiLabels"]
+
+
+class KittiLabels(Reference):
+    """Boxes of KITTI labels, without masks and identities.
+
+    ``frames.csv`` gives the timestamp of each label file, its frame number where timestamps
+    repeat, and its topic where there are several; without it, the file's number is the frame
+    number. Boxes are in the rectified camera frame; the row ``Tr_rect_to_sensor`` of the
+    calibration turns them into the sensor frame. Without it, as in KITTI's own data, the frames
+    are the same.
+
+    A type cannot hold spaces. It stands for the first of ``categories`` that is written this way;
+    in any other type, each ``_`` is a space.
+    """
+
+    kind = "KITTI labels"
+
+    def __init__(self, folder: Path, categories: Sequence[str] = ()) -> None:
+        self._folder = folder
+        self._categories = {kitti_type(name): name for name in reversed(categories)}
+        numbers = sorted(path.stem for path in (folder / "label_2").glob("*.txt"))
+        try:
+            names = _listed(folder / "frames.csv")
+            self.numbered = not names
+            names = names or [((None, int(name), None), name) for name in numbers]
+        except (OSError, ValueError, KeyError) as error:
+            msg = f"{folder}: not a folder of KITTI labels ({error})"
+            raise RecordingError(msg) from error
+        self._names = index_frames(folder, names)
+        self.frames = len(names)
+
+    def at(self, key: Key, stamp_ns: int, *, repeated: bool = False) -> Labelling | None:
+        """Return the objects of a frame; None if the labels lack this frame.
+
+        Raises
+        ------
+        RecordingError : a label or calibration file is missing or damaged.
+        """
+        name = find_frame(self._names, key, stamp_ns, repeated=repeated)
+        if name is None:
+            return None
+        path = self._folder / "label_2" / f"{name}.txt"
+        try:
+            turn = _sensor_from_rectified(self._folder / "calib" / f"{name}.txt")
+            lines = path.read_text("utf-8").splitlines()
+            items = [self._item(line.split(), turn) for line in lines if line.strip()]
+        except (OSError, ValueError, IndexError, np.linalg.LinAlgError) as error:
+            msg = f"{path}: not a KITTI label file ({error})"
+            raise RecordingError(msg) from error
+        return Labelling(tuple(item for item in items if item.category != "DontCare"))
+
+    def _item(self, words: list[str], turn: F8) -> LabelledItem:
+        category = self._categories.get(words[0], words[0].replace("_", " "))
+        return LabelledItem(track=None, category=category, box=_box(words, turn))
+
+    def describe_frames(self) -> str:
+        """Return the range of timestamps or frame numbers."""
+        known = [number for _, number, _ in self._names]
+        return f"frames {min(known)} to {max(known)}" if known else "no frames"
+
+
+def _listed(path: Path) -> list[tuple[Place, str]]:
+    """Return the frame and the name of each label file; none without ``frames.csv``.
+
+    Labels of a single topic match any topic, since the recording may use another name.
+    """
+    if not path.is_file():
+        return []
+    with path.open(newline="", encoding="utf-8") as file:
+        rows = list(csv.DictReader(file))
+    several = len({row.get("topic") for row in rows}) > 1
+    return [(_place(row, several=several), row["number"]) for row in rows]
+
+
+def _place(row: Mapping[str, str], *, several: bool) -> Place:
+    frame = row.get("frame")
+    return row["topic"] if several else None, int(row["stamp_ns"]), int(frame) if frame else None
+
+
+def _sensor_from_rectified(path: Path) -> F8:
+    """Return the rotation (3, 3) from a calibration file; the identity if it has none."""
+    text = path.read_text("utf-8") if path.is_file() else ""
+    lines = dict(line.split(":", 1) for line in text.splitlines() if ":" in line)
+    transform = lines.get("Tr_rect_to_sensor", "1 0 0 0 0 1 0 0 0 0 1 0")
+    return np.array(transform.split(), np.float64).reshape(3, 4)[:, :3]
+
+
+def _box(words: list[str], turn: F8) -> Box:
+    """Return the box of a line: type truncated occluded alpha bbox h w l x y z rotation_y."""
+    height, width, length, x, y, z, yaw = map(float, words[8:15])
+    c, s = np.cos(yaw), np.sin(yaw)
+    axes = np.array([[c, s, 0.0], [0.0, 0.0, -1.0], [-s, c, 0.0]])  # columns: along, across, up
+    return Box(
+        turn @ np.array([x, y - height / 2, z]),
+        np.array([length, width, height]),
+        quaternion_from_rotation(turn @ axes),
+    )

@@ -1,0 +1,220 @@
+"""The annotated recording: all original messages, and the labelled objects.
+
+A finished MCAP file is copied byte for byte and extended; any other recording is rewritten as
+MCAP. Annotations use the encoding of the source.
+"""
+
+import gc
+import json
+from collections import Counter, deque
+from collections.abc import Iterable, Iterator, Mapping, Sequence
+from concurrent.futures import ThreadPoolExecutor
+from contextlib import contextmanager
+from dataclasses import dataclass
+from heapq import merge
+from itertools import chain
+from operator import attrgetter
+from pathlib import Path
+from typing import BinaryIO, TypeVar
+
+from shapecat.outputs.annotation.channels import ENCODERS, encoder_for
+from shapecat.outputs.annotation.content import (
+    Annotation,
+    AnnotationChannel,
+    EncodedMessage,
+    Encoders,
+)
+from shapecat.outputs.annotation.image_annotations import ImageFrame, image_encoders_for
+from shapecat.outputs.annotation.mcap_append import Appender, copy_bytes
+from shapecat.recordings import Recording
+from shapecat.recordings.containers.mcap_file import McapRecording
+from shapecat.recordings.containers.mcap_summary import Summary
+from shapecat.system.files import replacing
+from shapecat.types import ShownFrame
+
+__all__ = ["write_annotated"]
+
+_LIFETIME = 1.5
+"""Lifetime of scene entities, as a multiple of the frame period."""
+_BUFFER = 4 << 20
+"""Two threads that write to the same file wait for each other, so each writes much at a time."""
+_PERIOD_NS = 1_000_000_000
+"""Frame period assumed for a stream with a single frame."""
+_LONGEST_NS = 3600 * 10**9
+"""Longest frame period: a clock that is set during a recording jumps by decades."""
+_AHEAD = 64
+"""Frames that wait until the next frame of their topic is known, if others come first."""
+_F = TypeVar("_F", Annotation, ImageFrame)
+
+
+def write_annotated(
+    recording: Recording,
+    path: Path,
+    frames: Iterable[ShownFrame],
+    *,
+    run: Mapping[str, object],
+    markers: bool = False,
+    images: Iterable[ImageFrame] = (),
+    image_topics: Sequence[str] = (),
+) -> None:
+    """Write a copy of a recording with annotation channels.
+
+    Each frame, with or without objects, gets a message on ``/shapecat/scene`` and, for ROS, on
+    ``/shapecat/detections``. Messages have the stamp, frame id and log time of the frame. The
+    metadata record ``shapecat`` holds ``run`` as JSON under ``run.json``. The file gets its name
+    when it is complete.
+
+    Parameters
+    ----------
+    frames : the boxes to show in each frame, in the order of the recording.
+    markers : whether to write ``/shapecat/markers`` for RViz, for ROS only.
+    images : the boxes to show on the colour images, in the order of the recording, for
+        ``/shapecat/image_annotations`` and, for ROS, ``/shapecat/detections_2d``, with the stamp,
+        frame id and log time of the image.
+    image_topics : the topics of these images. If there are several, each has channels of its own:
+        ``/shapecat/image_annotations/TOPIC``.
+
+    Raises
+    ------
+    OutputError : the file cannot be written.
+    """
+    metadata = {"run.json": json.dumps(run)}
+    with _uncollected(), replacing(path) as hidden, hidden.open("wb", buffering=_BUFFER) as file:
+        if isinstance(recording, McapRecording) and recording.indexed:
+            with _copying(recording, hidden, file):
+                channels, items = _encoded(recording, frames, images, image_topics, markers=markers)
+                _append(recording.summary, file, channels, items, metadata)
+        else:
+            from shapecat.outputs.annotation.mcap_rewrite import rewrite  # noqa: PLC0415  loads YAML for ROS 1
+
+            channels, items = _encoded(recording, frames, images, image_topics, markers=markers)
+            rewrite(recording, file, channels, items, metadata)
+
+
+@contextmanager
+def _uncollected() -> Iterator[None]:
+    """Pause the garbage collector in the block, which makes no reference cycles."""
+    enabled = gc.isenabled()
+    gc.disable()
+    try:
+        yield
+    finally:
+        if enabled:
+            gc.enable()
+
+
+@contextmanager
+def _copying(recording: McapRecording, path: Path, file: BinaryIO) -> Iterator[None]:
+    """Copy the data section of a recording to ``path`` while the block writes annotations."""
+    length = recording.summary.data_end
+    with ThreadPoolExecutor(1) as pool:  # the copy does not hold the interpreter lock
+        copying = pool.submit(copy_bytes, recording.path, path, length)
+        yield
+        copying.result()
+    file.truncate()
+
+
+def _encoded(
+    recording: Recording,
+    frames: Iterable[ShownFrame],
+    images: Iterable[ImageFrame],
+    image_topics: Sequence[str],
+    *,
+    markers: bool,
+) -> tuple[list[AnnotationChannel], Iterator[EncodedMessage]]:
+    """Return the annotation channels, and an iterator that encodes their messages by log time."""
+    annotations = _annotations(frames)
+    first = next(annotations, None)
+    encoding = _encoding(recording, first)
+    kinds = encoder_for(encoding, markers=markers)
+    channels = [channel for channel, _ in kinds]
+    known = chain([first] if first else [], annotations)
+    items = chain.from_iterable(_messages(one, kinds, 0) for one in known)
+    drawn, starts = image_encoders_for(encoding, image_topics), dict[str, int]()
+    for topic, encoders in drawn.items():
+        starts[topic] = len(channels)
+        channels += [channel for channel, _ in encoders]
+    more = chain.from_iterable(
+        _messages(image, drawn[image.topic], starts[image.topic]) for image in images
+    )
+    return channels, merge(items, more, key=attrgetter("log_time_ns"))
+
+
+def _messages(frame: _F, encoders: Encoders[_F], first: int) -> Iterator[EncodedMessage]:
+    """Encode a frame for each channel; the channels are numbered from ``first``."""
+    for number, (_, encode) in enumerate(encoders, start=first):
+        yield EncodedMessage(number, frame.log_time_ns, encode(frame))
+
+
+def _append(
+    summary: Summary,
+    file: BinaryIO,
+    channels: Iterable[AnnotationChannel],
+    items: Iterable[EncodedMessage],
+    metadata: Mapping[str, str],
+) -> None:
+    """Write the annotations after the end of the original data section."""
+    file.seek(summary.data_end)
+    compression = summary.chunks[0].compression if summary.chunks else "zstd"
+    with Appender(file, summary, compression) as appender:
+        numbers = [appender.add_channel(channel) for channel in channels]
+        sequences: Counter[int] = Counter()
+        for number, log_time, data in items:
+            appender.add_message(numbers[number], log_time, sequences[number], data)
+            sequences[number] += 1
+        appender.add_metadata("shapecat", metadata)
+        appender.finish()
+
+
+def _annotations(frames: Iterable[ShownFrame]) -> Iterator[Annotation]:
+    """Add lifetimes, from the time of the next frame, and tracks to delete, from earlier frames."""
+    shown: dict[str, set[int]] = {}
+    for frame, period in _with_periods(frames):
+        here = {box.track for box in frame.objects}
+        gone = (shown.get(frame.topic, set()) | set(frame.ended)) - here
+        shown[frame.topic] = here
+        gone -= set().union(*shown.values())  # unless another sensor still sees it
+        lifetime = round(_LIFETIME * min(period, _LONGEST_NS))
+        yield Annotation(frame, lifetime, tuple(sorted(gone)))
+
+
+@dataclass(slots=True)
+class _WaitingFrame:
+    """A frame, and the time to the next frame of its topic, ns: that before until it is known."""
+
+    frame: ShownFrame
+    period: int = _PERIOD_NS
+    known: bool = False
+
+
+def _with_periods(frames: Iterable[ShownFrame]) -> Iterator[tuple[ShownFrame, int]]:
+    """Yield frames with the time, ns, to the next frame of their topic, else from the last one."""
+    waiting: deque[_WaitingFrame] = deque()
+    last: dict[str, _WaitingFrame] = {}
+    for frame in frames:
+        one = _WaitingFrame(frame)
+        if before := last.get(frame.topic):
+            before.period, before.known = _period(before.frame, frame), True
+            one.period = before.period
+        last[frame.topic] = one
+        waiting.append(one)
+        while waiting[0].known or len(waiting) > _AHEAD:
+            first = waiting.popleft()
+            yield first.frame, first.period
+    yield from ((one.frame, one.period) for one in waiting)
+
+
+def _period(frame: ShownFrame, following: ShownFrame) -> int:
+    """Return the time between two frames, ns: by stamp, or by the log time of viewers if longer."""
+    by_stamp = following.stamp_ns - frame.stamp_ns
+    return max(1, by_stamp, following.log_time_ns - frame.log_time_ns)
+
+
+def _encoding(recording: Recording, first: Annotation | None) -> str:
+    """Return the encoding for annotations: that of the annotated topic, else the most common."""
+    if recording.kind == "ros1":
+        return "cdr"
+    topics = [topic for topic in recording.topics if topic.encoding in ENCODERS]
+    own = [topic.encoding for topic in topics if first and topic.name == first.frame.topic]
+    common = Counter(topic.encoding for topic in topics).most_common(1)
+    return own[0] if own else common[0][0] if common else "json"

@@ -1,0 +1,136 @@
+"""Convert ROS 1 messages to ROS 2 messages: same fields, other encoding."""
+
+from collections.abc import Callable
+from functools import cache
+from importlib.resources import files
+from typing import Any
+
+import numpy as np
+from rosbags.interfaces import (
+    Nodetype,
+    Qos,
+    QosDurability,
+    QosHistory,
+    QosLiveliness,
+    QosReliability,
+    QosTime,
+)
+from rosbags.rosbag2.metadata import dump_qos_v8
+from rosbags.typesys import Stores, get_types_from_msg, get_typestore
+from rosbags.typesys.store import Typestore
+
+from shapecat.outputs.annotation.content import AnnotationChannel
+from shapecat.recordings.decoding.decoders import LIBRARY_ERRORS, typestore_of
+from shapecat.recordings.messages import Channel
+
+__all__ = ["RAW_TYPE", "ConvertedChannel", "convert_channel", "raw_channel", "wrap_raw"]
+
+RAW_TYPE = "shapecat_msgs/msg/RawMessage"
+_RENAMED = {"tf/msg/tfMessage": "tf2_msgs/msg/TFMessage"}
+_FOREVER = QosTime(2147483647, 4294967295)
+_LATCHED = Qos(
+    QosHistory.KEEP_LAST,
+    1,
+    QosReliability.RELIABLE,
+    QosDurability.TRANSIENT_LOCAL,
+    _FOREVER,
+    _FOREVER,
+    QosLiveliness.AUTOMATIC,
+    _FOREVER,
+    avoid_ros_namespace_conventions=False,
+)
+"""The quality of service that corresponds to a latched ROS 1 topic."""
+_HEADER = "std_msgs/msg/Header"
+
+ConvertedChannel = tuple[AnnotationChannel, Callable[[bytes | memoryview], memoryview]]
+
+
+def convert_channel(channel: Channel) -> ConvertedChannel | None:
+    """Convert a ROS 1 channel to ROS 2.
+
+    Types that exist in ROS 2 with the same layout get the ROS 2 definition, in which some field
+    names differ (``K`` became ``k``). All others keep the definition in the bag. Only the sequence
+    number of headers is lost, since ROS 2 has none.
+
+    Returns
+    -------
+    The channel to write, and the function that converts its messages; None if the definition is
+    invalid.
+    """
+    name = _RENAMED.get(channel.type, channel.type)
+    try:
+        types = dict(typestore_of(channel).fielddefs)
+        if name != channel.type:
+            types[name] = types.pop(channel.type)
+        modern = get_typestore(Stores.ROS2_HUMBLE)
+        store = get_typestore(Stores.EMPTY)
+        types[_HEADER] = modern.fielddefs[_HEADER]
+        known = name in modern.fielddefs and _same_layout(name, types, modern.fielddefs)
+        store.register({**types, **(_reachable(name, modern) if known else {})})
+        text, _ = store.generate_msgdef(name, ros_version=2)
+        store.get_msgdef(name)
+    except LIBRARY_ERRORS:
+        return None
+    latched = dict(channel.metadata).get("latching") == "1"
+    quality = (("offered_qos_profiles", dump_qos_v8([_LATCHED])),) if latched else ()
+    described = AnnotationChannel(channel.topic, "cdr", name, "ros2msg", text.encode(), quality)
+    return described, lambda data: store.ros1_to_cdr(data, name)
+
+
+def _same_layout(name: str, old: Any, new: Any) -> bool:
+    """Return whether two definitions have fields of the same types in order, with any names."""
+    if name == _HEADER:
+        return True
+    if name not in old or name not in new or len(old[name][1]) != len(new[name][1]):
+        return False
+    for (_, a), (_, b) in zip(old[name][1], new[name][1], strict=True):
+        if a != b:
+            return False
+        inner = a[1][0] if a[0] in {Nodetype.ARRAY, Nodetype.SEQUENCE} else a
+        if inner[0] == Nodetype.NAME and not _same_layout(inner[1], old, new):
+            return False
+    return True
+
+
+def _reachable(name: str, store: Typestore) -> dict[str, Any]:
+    """Return the definitions of a type and of the types it contains."""
+    found: dict[str, Any] = {}
+    waiting = [name]
+    while waiting:
+        current = waiting.pop()
+        if current in found:
+            continue
+        found[current] = store.fielddefs[current]
+        for _, field in store.fielddefs[current][1]:
+            inner: Any = field[1][0] if field[0] in {Nodetype.ARRAY, Nodetype.SEQUENCE} else field
+            if inner[0] == Nodetype.NAME:
+                waiting.append(str(inner[1]))
+    return found
+
+
+def raw_channel(topic: str) -> AnnotationChannel:
+    """Return the channel for messages that are kept as recorded; see `wrap_raw`."""
+    text = files("shapecat.schemas").joinpath("RawMessage.msg").read_bytes()
+    return AnnotationChannel(topic, "cdr", RAW_TYPE, "ros2msg", text)
+
+
+def wrap_raw(channel: Channel, data: bytes | memoryview) -> memoryview:
+    """Wrap a message that cannot be converted, with its type, encoding and definition.
+
+    Most ROS tools cannot play or open a file with two encodings.
+    """
+    store = _raw_store()
+    message = store.types[RAW_TYPE](
+        type=channel.type,
+        encoding=channel.encoding,
+        definition=channel.schema.decode("utf-8", "replace"),
+        data=np.frombuffer(data, np.uint8),
+    )
+    return store.serialize_cdr(message, RAW_TYPE)
+
+
+@cache
+def _raw_store() -> Typestore:
+    store = get_typestore(Stores.EMPTY)
+    store.register(get_types_from_msg(raw_channel("").schema.decode(), RAW_TYPE))
+    return store

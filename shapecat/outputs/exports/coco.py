@@ -1,0 +1,115 @@
+"""Data sets of images with instance masks: COCO, and YOLO segmentation labels.
+
+Source: the data format of the COCO challenge (Lin et al. 2014); the label files of Ultralytics
+YOLO, with a line per object: class, then x and y of each corner, relative to the image size.
+"""
+
+import json
+from collections.abc import Iterable, Sequence
+from pathlib import Path
+from typing import Any
+
+from shapecat.colour.outline import joined, outlines
+from shapecat.colour.rle import rle_counts, rle_text
+from shapecat.outputs.exports.dataset_frames import DatasetImage
+from shapecat.runs.finished import FinishedRun
+
+__all__ = ["DATASETS", "write_coco", "write_yolo"]
+
+Images = Iterable[tuple[str, FinishedRun, DatasetImage]]
+"""Split, run and image."""
+
+
+def write_coco(out: Path, images: Images, categories: Sequence[str]) -> int:
+    """Write images/SPLIT/ and annotations/instances_SPLIT.json; return the number of objects.
+
+    Masks are compressed run lengths. Objects with an uncertain label have ``iscrowd`` set, so that
+    evaluation ignores them, and are not counted. ``track_id`` is unique in the data set;
+    ``attributes`` holds the run and the track number in that run.
+    """
+    tracks: dict[tuple[str, int], int] = {}
+    splits: dict[str, dict[str, list[dict[str, Any]]]] = {}
+    count = 0
+    for split, finished, image in images:
+        part = splits.setdefault(split, {"images": [], "annotations": []})
+        folder = out / "images" / split
+        folder.mkdir(parents=True, exist_ok=True)
+        (folder / image.name).write_bytes(image.contents)
+        number = len(part["images"]) + 1
+        part["images"].append(_coco_image(number, finished, image))
+        for item, mask, sure in zip(image.objects, image.masks, image.sure, strict=True):
+            track = tracks.setdefault((str(finished.folder), item.track), len(tracks) + 1)
+            size = [image.height, image.width]
+            part["annotations"].append(
+                {
+                    "id": len(part["annotations"]) + 1,
+                    "image_id": number,
+                    "category_id": categories.index(item.category) + 1,
+                    "bbox": list(map(float, mask.box)),
+                    "area": float(mask.area),
+                    "segmentation": {"size": size, "counts": rle_text(rle_counts(mask, *size))},
+                    "iscrowd": int(not sure),
+                    "track_id": track,
+                    "score": round(item.confidence, 4),
+                    "attributes": {
+                        "run": finished.name,
+                        "track": item.track,
+                        "occluded": item.occluded,
+                    },
+                }
+            )
+            count += sure
+    named = [{"id": k, "name": name, "supercategory": ""} for k, name in enumerate(categories, 1)]
+    (out / "annotations").mkdir(exist_ok=True)
+    for split, part in splits.items():
+        whole = {"info": {"description": "shapecat"}, "licenses": [], "categories": named, **part}
+        path = out / "annotations" / f"instances_{split}.json"
+        path.write_text(json.dumps(whole), "utf-8")
+    return count
+
+
+def _coco_image(number: int, finished: FinishedRun, image: DatasetImage) -> dict[str, Any]:
+    labelled = image.labelled
+    return {
+        "id": number,
+        "file_name": image.name,
+        "width": image.width,
+        "height": image.height,
+        "recording": finished.name,
+        "topic": labelled.topic,
+        "frame": labelled.index,
+        "stamp_ns": labelled.stamp_ns,
+    }
+
+
+def write_yolo(out: Path, images: Images, categories: Sequence[str]) -> int:
+    """Write images/SPLIT/, labels/SPLIT/ and data.yaml; return the number of objects.
+
+    The format allows one polygon per object: the parts of an object are linked, and holes are
+    filled. Objects with an uncertain label are left out.
+    """
+    count, splits = 0, set()
+    for split, _, image in images:
+        splits.add(split)
+        for folder in (out / "images" / split, out / "labels" / split):
+            folder.mkdir(parents=True, exist_ok=True)
+        (out / "images" / split / image.name).write_bytes(image.contents)
+        lines = []
+        for item, mask, sure in zip(image.objects, image.masks, image.sure, strict=True):
+            if sure:
+                polygon = joined(outlines(mask)) / (image.width, image.height)
+                numbers = " ".join(f"{value:.6f}" for value in polygon.ravel())
+                lines.append(f"{categories.index(item.category)} {numbers}\n")
+        label = (out / "labels" / split / image.name).with_suffix(".txt")
+        label.write_text("".join(lines), "utf-8")
+        count += len(lines)
+    names = [f"  {k}: {json.dumps(name)}" for k, name in enumerate(categories)]
+    val = "val" if "val" in splits else "train"
+    # Without "path", the paths are relative to data.yaml, wherever training is started.
+    about = ["train: images/train", f"val: images/{val}", "names:", *names]
+    (out / "data.yaml").write_text("\n".join(about) + "\n", "utf-8")
+    return count
+
+
+DATASETS = {"coco": write_coco, "yolo": write_yolo}
+"""Formats that merge several runs into one data set."""

@@ -1,0 +1,265 @@
+"""Select frames, objects and splits for an image data set."""
+
+import logging
+from collections import Counter
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import xxhash
+
+from shapecat.arrays import F8, U1
+from shapecat.colour.masks import Mask, dense_masks
+from shapecat.colour.snapping import snapped
+from shapecat.errors import OutputError
+from shapecat.outputs.colouring import Coloured, with_colour
+from shapecat.outputs.exports.points import depth_in_mm
+from shapecat.outputs.png import png
+from shapecat.outputs.wording import different_names
+from shapecat.recordings import MessageError
+from shapecat.recordings.decoding.colour_image import encoded, pixels_of
+from shapecat.runs.finished import FinishedRun, open_source
+from shapecat.runs.labels.track_table import read_track_table
+from shapecat.types import UNKNOWN, Frame, LabelledFrame, LabelledObject
+
+__all__ = ["DatasetImage", "Selection", "images_of", "snapped_masks", "split_runs"]
+
+_log = logging.getLogger(__name__)
+
+
+@dataclass(frozen=True)
+class Selection:
+    """Options of a data set.
+
+    Attributes
+    ----------
+    every : take every n-th frame of a stream.
+    per_track : number of views per track, chosen to differ; only their frames are taken. 0 takes
+        all views.
+    min_confidence : objects with a lower confidence are not used for training.
+    corrected_only : only objects with a label from a person are used for training.
+    depth : the images are depth images in millimetres, not colour images.
+    val : share of the recordings for the validation split, from 0 to below 1.
+    """
+
+    every: int = 1
+    per_track: int = 0
+    min_confidence: float = 0.0
+    corrected_only: bool = False
+    depth: bool = False
+    val: float = 0.2
+
+
+@dataclass(frozen=True)
+class DatasetImage:
+    """An image of a data set, and the objects on it.
+
+    ``name`` is the file name with suffix, ``contents`` its bytes. ``masks`` and ``sure`` are per
+    object: its mask, and whether its label is certain enough for training.
+    """
+
+    name: str
+    contents: bytes
+    width: int
+    height: int
+    labelled: LabelledFrame
+    objects: tuple[LabelledObject, ...]
+    masks: tuple[Mask, ...]
+    sure: tuple[bool, ...]
+
+
+def split_runs(runs: Sequence[FinishedRun], val: float) -> list[str]:
+    """Return ``train`` or ``val`` for each run; runs of the same recording are in the same split.
+
+    The random draw depends on the content of the recordings, so that adding runs changes little. A
+    single recording goes to the training split.
+
+    Raises
+    ------
+    ValueError : ``val`` is not in [0, 1).
+    """
+    if not 0 <= val < 1:
+        msg = f"val must be at least 0 and less than 1, got {val}"
+        raise ValueError(msg)
+    known = {run.run["input"]["digest"] or run.name for run in runs}
+    order = sorted(known, key=lambda digest: xxhash.xxh3_64_hexdigest(digest.encode()))
+    chosen = set(order[: min(round(val * len(order)), len(order) - 1)])
+    return ["val" if (r.run["input"]["digest"] or r.name) in chosen else "train" for r in runs]
+
+
+def images_of(
+    finished: FinishedRun,
+    selection: Selection,
+    recording: Path | None = None,
+    *,
+    stem: str,
+    left_out: Counter[str],
+) -> Iterator[DatasetImage]:
+    """Yield the images of a run with at least one object to train on; log damaged images.
+
+    The images also list objects whose label is not certain enough, but no unknown objects.
+
+    Parameters
+    ----------
+    recording : path of the recording; by default where it was processed.
+    stem : the names of the images begin with it.
+    left_out : counts the other frames by reason.
+
+    Raises
+    ------
+    OutputError : the run has no colour images and ``selection.depth`` is False, or the content of
+        the recording has changed.
+    RecordingError : the recording is missing or unreadable.
+    """
+    if not selection.depth and not finished.run.get("color"):
+        msg = f"{finished.folder}: no colour images; --depth exports depth images"
+        raise OutputError(msg)
+    corrected = _corrected(finished.folder)
+    chosen = _chosen(finished, selection, corrected)
+    topics = finished.run["options"]["topics"]
+    names = dict(zip(topics, different_names(topics), strict=True))
+    with open_source(finished.run, recording) as source:
+        frames = (f for f in finished.frames() if (f.topic, f.index) in chosen)
+        for labelled, frame, coloured in with_colour(frames, source, finished.run):
+            topic = f"{names[labelled.topic]}_" if len(names) > 1 else ""
+            name = f"{stem}_{topic}{labelled.index:06d}"
+            try:
+                image = _image(name, labelled, frame, coloured, selection, corrected)
+            except MessageError as error:
+                _log.warning("%s: skipped frame %d: %s", finished.name, labelled.index, error)
+                left_out["damaged image"] += 1
+                continue
+            if image is None:
+                left_out["no image"] += 1
+            elif not any(image.sure):
+                left_out["no object with a certain label"] += 1
+            else:
+                yield image
+
+
+def _corrected(folder: Path) -> set[int]:
+    """Return the tracks with a corrected label."""
+    return {row.track for row in read_track_table(folder / "tracks.csv").rows if row.label}
+
+
+def _is_sure(item: LabelledObject, selection: Selection, corrected: set[int]) -> bool:
+    """Return whether an object has a label to train on; *unknown* is none, also if by hand."""
+    if item.category == UNKNOWN:
+        return False
+    certain = item.confidence >= selection.min_confidence and not selection.corrected_only
+    return certain or item.track in corrected
+
+
+def _image(
+    name: str,
+    labelled: LabelledFrame,
+    frame: Frame,
+    coloured: Coloured | None,
+    selection: Selection,
+    corrected: set[int],
+) -> DatasetImage | None:
+    """Return the image of a frame; None if it has none."""
+    found = _depth_file(labelled, frame) if selection.depth else _colour_file(frame, coloured)
+    if found is None:
+        return None
+    suffix, contents, (height, width), masks = found
+    kept = [
+        (item, mask, _is_sure(item, selection, corrected))
+        for item, mask in zip(labelled.objects, masks, strict=True)
+        if mask.pixels.size and item.category != UNKNOWN
+    ]
+    objects, seen, sure = (
+        (tuple(column) for column in zip(*kept, strict=True)) if kept else [()] * 3
+    )
+    return DatasetImage(f"{name}{suffix}", contents, width, height, labelled, objects, seen, sure)
+
+
+_File = tuple[str, bytes, tuple[int, int], tuple[Mask, ...]]
+
+
+def _colour_file(frame: Frame, coloured: Coloured | None) -> _File | None:
+    """Return suffix, content, (height, width) and snapped masks of a colour image, or None."""
+    if coloured is None or coloured.view.image.height <= 1:
+        return None
+    image = coloured.view.image
+    pixels = pixels_of(image)
+    suffix, contents = encoded(image, pixels)
+    masks = snapped_masks(frame, coloured, pixels)
+    return suffix, contents, (image.height, image.width), masks
+
+
+def _depth_file(labelled: LabelledFrame, frame: Frame) -> _File | None:
+    """Return suffix, content, (height, width) and masks of a depth image (PNG), or None."""
+    if frame.depth is None:
+        return None
+    masks = dense_masks(frame, [item.indices for item in labelled.objects])
+    return ".png", png(depth_in_mm(frame.depth), level=4), frame.depth.shape, masks
+
+
+def snapped_masks(frame: Frame, coloured: Coloured, pixels: U1) -> tuple[Mask, ...]:
+    """Return the masks of a frame with outlines moved to edges of its colour image (h, w, 3)."""
+    lens, camera, scale = coloured.view.lens, frame.camera, 1.0
+    if not coloured.view.registered and lens is not None and camera is not None:
+        scale = lens.pinhole.fx / camera.fx
+    return snapped(coloured.masks, pixels, scale)
+
+
+def _chosen(
+    finished: FinishedRun, selection: Selection, corrected: set[int]
+) -> set[tuple[str, int]]:
+    """Return the selected frames, by topic and number.
+
+    Of the frames with the same colour image, only the one nearest to it in time is selected.
+    """
+    seen: Counter[str] = Counter()
+    keys: list[tuple[str, int]] = []
+    views: dict[int, list[tuple[int, Any]]] = {}
+    nearest: dict[tuple[str, int], tuple[int, int]] = {}
+    left_out: set[int] = set()
+    for labelled in finished.frames():
+        number = seen[labelled.topic]
+        seen[labelled.topic] += 1
+        if number % selection.every:
+            continue
+        if (image := labelled.masks) is not None and not selection.depth:
+            here = abs(labelled.stamp_ns - image.stamp_ns), len(keys)
+            place = (image.topic, image.stamp_ns)
+            other = nearest.setdefault(place, here)
+            nearest[place] = min(here, other)
+            left_out |= {k for _, k in (here, other)} - {nearest[place][1]}
+        for item in labelled.objects if selection.per_track else ():
+            if _is_sure(item, selection, corrected):
+                views.setdefault(item.track, []).append((len(keys), _view(labelled, item)))
+        keys.append((labelled.topic, labelled.index))
+    if not selection.per_track:
+        return {key for k, key in enumerate(keys) if k not in left_out}
+    kept = {track: [row for row in rows if row[0] not in left_out] for track, rows in views.items()}
+    return {
+        keys[rows[k][0]]
+        for rows in kept.values()
+        if rows
+        for k in _different(np.array([view for _, view in rows]), selection.per_track)
+    }
+
+
+def _view(labelled: LabelledFrame, item: LabelledObject) -> F8:
+    """Return features (8,) to choose different views: direction, distance, pixels and shape."""
+    pose, center = labelled.fixed_from_sensor, np.asarray(item.box.center, np.float64)
+    distance = float(np.linalg.norm(center))
+    way = -center / max(distance, 1e-6)
+    way = way if pose is None else pose.rotation @ way
+    size = np.asarray(item.box.size, np.float64) / max(float(item.box.size.max()), 1e-6)
+    pixels = np.log(max(item.indices.size, 1))
+    return np.concatenate([way, [np.log(max(distance, 1e-6)), 0.3 * pixels], 0.5 * size])
+
+
+def _different(views: F8, count: int) -> list[int]:
+    """Choose views (n, 8) by farthest-point sampling, starting with the one with most pixels."""
+    chosen = [int(views[:, 4].argmax())]
+    apart = np.linalg.norm(views - views[chosen[0]], axis=1)
+    while len(chosen) < min(count, len(views)):
+        chosen.append(int(apart.argmax()))
+        apart = np.minimum(apart, np.linalg.norm(views - views[chosen[-1]], axis=1))
+    return chosen

@@ -1,0 +1,282 @@
+"""Export the labels of runs in the formats of other tools."""
+
+import json
+from collections import Counter
+from collections.abc import Callable, Collection, Iterable, Iterator, Mapping, Sequence
+from contextlib import suppress
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Any
+
+from shapecat.errors import OutputError
+from shapecat.outputs.colouring import ExportedFrame, with_colour
+from shapecat.outputs.exports.coco import DATASETS
+from shapecat.outputs.exports.crops import write_crops
+from shapecat.outputs.exports.dataset_frames import DatasetImage, Selection, images_of, split_runs
+from shapecat.outputs.exports.kitti import write_kitti
+from shapecat.outputs.exports.labelcloud import write_labelcloud
+from shapecat.outputs.exports.points import write_point_labels
+from shapecat.outputs.wording import different_names
+from shapecat.runs.finished import FinishedRun, open_source, read_finished
+from shapecat.runs.folder import clear, recover, staged
+from shapecat.runs.labels.meaning import order_categories
+from shapecat.system.files import flush, replacing
+from shapecat.system.progress import Observer, ignore, observed
+from shapecat.types import LabelledFrame
+
+__all__ = ["FORMATS", "Exported", "common_categories", "export_dataset", "export_run"]
+
+Write = Callable[[Path, Iterable[ExportedFrame], FinishedRun], int]
+
+
+@dataclass(frozen=True)
+class Exported:
+    """Counts of an exported data set of images.
+
+    Attributes
+    ----------
+    objects : number of objects labelled for training, summed over all images.
+    uncertain : number of visible objects without a certain label, summed in the same way.
+    images : number of images in each split.
+    """
+
+    objects: int
+    uncertain: int
+    images: Mapping[str, int]
+
+
+FORMATS: dict[str, Write] = {
+    "crops": write_crops,
+    "kitti": write_kitti,
+    "labelcloud": write_labelcloud,
+    "point-labels": write_point_labels,
+}
+_WITH_BOXES = ("kitti", "labelcloud")
+_MARK = "export.json"
+
+
+def export_run(
+    folder: Path,
+    format: str,  # noqa: A002  # the word users know
+    out: Path,
+    *,
+    every: int = 1,
+    visible_boxes: bool = False,
+    categories: Sequence[str] = (),
+    recording: Path | None = None,
+    observe: Observer = ignore,
+) -> int:
+    """Export the labels of a finished run with their points.
+
+    Crops are added to the data set ``out``. The other formats are written to ``out/NAME``, where
+    NAME is the name of the run folder; only an earlier export is replaced.
+
+    Parameters
+    ----------
+    format : a key of `FORMATS`.
+    every : export every n-th frame of a stream.
+    visible_boxes : whether boxes enclose only the visible part of objects, not the whole.
+    categories : those of all runs that are exported together, so that their numbers agree.
+    recording : path of the recording; by default where it was processed.
+    observe : called with the phase, the number of frames done, and the total.
+
+    Returns
+    -------
+    The number of objects written, summed over all frames.
+
+    Raises
+    ------
+    ValueError : the format is unknown.
+    OutputError : the folder is not a finished run, the content of the recording has changed, or
+        ``out`` is not writable, is a run, or holds something else.
+    RecordingError : the recording is missing or unreadable.
+    """
+    if format not in FORMATS:
+        msg = f"no export format {format!r}; known: {', '.join(FORMATS)}"
+        raise ValueError(msg)
+    if (out / "run.json").exists():
+        msg = f"{out}: is a run; choose another --out"
+        raise OutputError(msg)
+    finished = replace(read_finished(folder), common=tuple(categories))
+    total = -(-int(finished.run["counts"]["frames"]) // every)
+    with open_source(finished.run, recording) as source:
+        full = format in _WITH_BOXES and not visible_boxes
+        labelled = finished.frames_with_full_boxes() if full else finished.frames()
+        triples = with_colour(_thinned(labelled, every), source, finished.run)
+        pairs = observed(triples, "export", total, observe)
+        if format == "crops":
+            return FORMATS[format](out, pairs, finished)
+        about = {
+            "format": format,
+            "run": finished.run["id"],
+            "input": finished.run["input"],
+            "topics": finished.run["options"]["topics"],
+        }
+        write = FORMATS[format]
+        return _staged(out / finished.name, about, lambda hidden: write(hidden, pairs, finished))
+
+
+def export_dataset(
+    folders: Sequence[Path],
+    format: str,  # noqa: A002  # the word users know
+    out: Path,
+    selection: Selection,
+    *,
+    recording: Path | None = None,
+    observe: Observer = ignore,
+) -> Exported:
+    """Export the images of several runs with their labels as one data set.
+
+    ``out`` is replaced only if an earlier export wrote it. Damaged images are left out.
+
+    Parameters
+    ----------
+    format : ``coco`` or ``yolo``.
+    recording : path of the recording of a single run; by default where it was processed.
+    observe : called with the phase, the number of images done, and the number of frames.
+
+    Raises
+    ------
+    ValueError : the format is unknown.
+    OutputError : a folder is not a finished run, a run has no images, no image can be exported, the
+        content of a recording has changed, or ``out`` is not writable or holds something else.
+    RecordingError : a recording is missing or unreadable.
+    """
+    if format not in DATASETS:
+        msg = f"no data set format {format!r}; known: {', '.join(DATASETS)}"
+        raise ValueError(msg)
+    runs = [read_finished(folder) for folder in folders]
+    categories = _common(runs)
+    total = sum(int(run.run["counts"]["frames"]) for run in runs)
+    stems = different_names([run.name for run in runs])
+
+    counts, left_out = Counter[str](), Counter[str]()
+    uncertain = 0
+
+    def images() -> Iterator[tuple[str, FinishedRun, DatasetImage]]:
+        nonlocal uncertain
+        for split, stem, run in zip(split_runs(runs, selection.val), stems, runs, strict=True):
+            for image in images_of(run, selection, recording, stem=stem, left_out=left_out):
+                counts[split] += 1
+                uncertain += image.sure.count(False)
+                observe("export", counts.total(), total)
+                yield split, run, image
+        if not counts:
+            reasons = ", ".join(f"{reason} ({count}×)" for reason, count in left_out.items())
+            msg = f"no image to export: {reasons or 'no object with a certain label'}"
+            raise OutputError(msg)
+
+    ids = {stem: run.run["id"] for stem, run in zip(stems, runs, strict=True)}
+    about = {"format": format, "runs": ids}
+    objects = _staged(out, about, lambda hidden: DATASETS[format](hidden, images(), categories))
+    return Exported(objects, uncertain, counts)
+
+
+def common_categories(folders: Sequence[Path]) -> tuple[str, ...]:
+    """Return the categories of several runs, in an order that depends on their names alone.
+
+    Raises
+    ------
+    OutputError : a folder is not a finished run, its tracks.csv is invalid, or two runs spell a
+        category differently.
+    """
+    return _common([read_finished(folder) for folder in folders])
+
+
+def _common(runs: Sequence[FinishedRun]) -> tuple[str, ...]:
+    names = order_categories(name for run in runs for name in run.categories)
+    spelled: dict[str, str] = {}
+    for name in names:
+        if spelled.setdefault(name.lower(), name) != name:
+            msg = f"the runs spell a category {spelled[name.lower()]!r} and {name!r}; relabel one"
+            raise OutputError(msg)
+    return names
+
+
+def _staged(
+    target: Path,
+    about: Mapping[str, Any],
+    write: Callable[[Path], int],
+) -> int:
+    """Let ``write`` fill a folder that appears when complete, with the marker of an export."""
+    recover(target, _made_by_export)
+    _require_own(target, about)
+    with staged(target, _made_by_export) as hidden:
+        clear(hidden, _made_by_export(hidden) or ())
+        _mark(hidden, about)
+        objects = write(hidden)
+        for file in hidden.rglob("*"):
+            flush(file)
+        _mark(hidden, {**about, "objects": objects})
+    return objects
+
+
+def _mark(folder: Path, about: Mapping[str, Any]) -> None:
+    """Write the marker of an export: its source, and the names that it made."""
+    made = sorted(path.name for path in folder.iterdir() if path.name != _MARK)
+    with replacing(folder / _MARK) as path:
+        path.write_text(json.dumps({**about, "made": made}, indent=1) + "\n", "utf-8")
+
+
+def _read_mark(folder: Path) -> dict[str, Any]:
+    """Return the marker of an export; empty if it has none."""
+    with suppress(OSError, ValueError):
+        about = json.loads((folder / _MARK).read_text("utf-8"))
+        if isinstance(about, dict) and isinstance(about.get("made"), list):
+            return about
+    return {}
+
+
+def _made_by_export(folder: Path) -> Collection[str] | None:
+    """Return the names that an export made in a folder; None if no export made the folder.
+
+    A killed export leaves no complete list: everything in its hidden folder belongs to it.
+    """
+    about = _read_mark(folder)
+    if not about:
+        return None
+    names = about["made"] if "objects" in about else [path.name for path in folder.iterdir()]
+    return [*(Path(str(name)).name for name in names if name != _MARK), _MARK]
+
+
+def _thinned(frames: Iterable[LabelledFrame], every: int) -> Iterator[LabelledFrame]:
+    seen: Counter[str] = Counter()
+    for frame in frames:
+        if seen[frame.topic] % every == 0:
+            yield frame
+        seen[frame.topic] += 1
+
+
+def _require_own(target: Path, about: Mapping[str, Any]) -> None:
+    """Check that a folder is missing, empty, or an unchanged earlier export of the same.
+
+    Raises
+    ------
+    OutputError : the folder holds something else, or a file in it was changed, added or removed
+        after the export.
+    """
+    if not target.exists() or (target.is_dir() and not any(target.iterdir())):
+        return
+    earlier, format = _read_mark(target), about["format"]  # noqa: A001  # the word users know
+    if earlier.get("format") != format:
+        made = earlier.get("format", "something else")
+        msg = f"{target}: holds {made}, not an earlier {format} export; choose another --out"
+        raise OutputError(msg)
+    if _recording_of(earlier) != _recording_of(about):
+        msg = f"{target}: holds the {format} export of another recording; choose another --out"
+        raise OutputError(msg)
+    if earlier.get("topics", about.get("topics")) != about.get("topics"):
+        msg = f"{target}: holds the {format} export of other topics; choose another --out"
+        raise OutputError(msg)
+    exported = (target / _MARK).stat().st_mtime_ns
+    later = [path for path in target.rglob("*") if path.lstat().st_mtime_ns > exported]
+    if later:
+        changed = min(later, key=lambda path: (path.is_dir(), path))
+        msg = f"{changed}: was changed after the export; choose another --out, or move it away"
+        raise OutputError(msg)
+
+
+def _recording_of(about: Mapping[str, Any]) -> Any:
+    """Return the digest of the recording that was exported; None for data sets of several runs."""
+    source = about.get("input")
+    return source.get("digest") if isinstance(source, dict) else None

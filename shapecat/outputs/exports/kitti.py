@@ -1,0 +1,169 @@
+"""KITTI 3D object detection: label_2, calib and velodyne of each frame.
+
+KITTI boxes rotate only about the vertical, so the rectified camera frame is level: its z axis is
+the horizontal direction in which the sensor looks. ``P2`` includes the rotation back to the real
+camera. It maps rectified points to pixels of the undistorted colour image in image_2, or of the
+depth image if a frame has no colour image. Source: the readme of the KITTI object development kit
+(Geiger 2012).
+"""
+
+import csv
+import logging
+from collections.abc import Iterable
+from pathlib import Path
+from typing import NamedTuple
+
+import numpy as np
+from PIL import Image
+
+from shapecat.arrays import F8
+from shapecat.cameras.colour import LensCamera
+from shapecat.colour.projection import project, rectified
+from shapecat.geometry import IDENTITY, rotation_from_quaternion
+from shapecat.outputs.colouring import Coloured, ExportedFrame
+from shapecat.outputs.level_clouds import finite_points, upward
+from shapecat.recordings import MessageError
+from shapecat.recordings.decoding.colour_image import pixels_of
+from shapecat.runs.finished import FinishedRun
+from shapecat.types import Camera, Frame, LabelledObject, Pose
+
+__all__ = ["kitti_type", "rectified_from_sensor", "write_kitti"]
+
+_log = logging.getLogger(__name__)
+
+_VELO_FROM_RECTIFIED = np.array([[0.0, 0.0, 1.0], [-1.0, 0.0, 0.0], [0.0, -1.0, 0.0]])
+
+
+def write_kitti(out: Path, frames: Iterable[ExportedFrame], _finished: FinishedRun) -> int:
+    """Write label_2/, calib/ and velodyne/, with six-digit names; return the number of objects.
+
+    Colour images are written to image_2/ as undistorted PNG. ``frames.csv`` maps each
+    number to its frame. Points are in the level frame of the sensor (x forward, y left, z up), with
+    intensity 0. The type is the category, with spaces replaced by ``_``.
+    """
+    for name in ("label_2", "calib", "velodyne"):
+        (out / name).mkdir()
+    count = 0
+    with (out / "frames.csv").open("w", newline="", encoding="utf-8") as file:
+        index = csv.writer(file, lineterminator="\n")
+        index.writerow(("number", "topic", "frame", "stamp_ns"))
+        for number, (labelled, frame, coloured) in enumerate(frames):
+            seen = _write_image(out, number, frame, coloured)
+            index.writerow((f"{number:06d}", labelled.topic, labelled.index, labelled.stamp_ns))
+            up = upward(labelled)
+            turn = rectified_from_sensor(up, optical=frame.organized or bool(up[1] < -0.7))
+            lines = [_label(item, frame, turn, seen) for item in labelled.objects]
+            (out / "label_2" / f"{number:06d}.txt").write_text("".join(lines), "utf-8")
+            (out / "calib" / f"{number:06d}.txt").write_text(_calibration(seen, turn), "utf-8")
+            points = finite_points(frame) @ (_VELO_FROM_RECTIFIED @ turn).T
+            rows = np.concatenate([points, np.zeros((len(points), 1))], axis=1)
+            rows.astype("<f4").tofile(out / "velodyne" / f"{number:06d}.bin")
+            count += len(lines)
+    return count
+
+
+def rectified_from_sensor(up: F8, *, optical: bool) -> F8:
+    """Return the rotation (3, 3) from the sensor to a level camera: x right, y down, z forward.
+
+    If the sensor looks straight down or up, the top of its image points forward.
+
+    Parameters
+    ----------
+    up : (3,) up direction in the sensor frame.
+    optical : whether the sensor looks along z with y down, else along x with z up.
+    """
+    up = np.asarray(up, np.float64) / np.linalg.norm(up)
+    axes = np.array([[0, 0, 1], [0, -1, 0]] if optical else [[1, 0, 0], [0, 0, 1]], np.float64)
+    level = axes - np.outer(axes @ up, up)
+    forward = level[0] if np.linalg.norm(level[0]) > 0.1 else level[1]
+    forward /= np.linalg.norm(forward)
+    return np.stack([np.cross(-up, forward), -up, forward])
+
+
+class _Seen(NamedTuple):
+    """The camera for 2D boxes and P2; None for clouds.
+
+    ``pose`` is ``camera_from_sensor``; ``image`` is whether a colour image was written.
+    """
+
+    camera: Camera | None
+    pose: Pose
+    image: bool
+
+
+def _write_image(out: Path, number: int, frame: Frame, coloured: Coloured | None) -> _Seen:
+    """Write the colour image of a frame and return its camera; without one, the depth camera."""
+    own = _Seen(frame.camera, IDENTITY, image=False)
+    if coloured is None or coloured.view.image.height <= 1:
+        return own
+    view = coloured.view
+    lens = view.lens
+    if view.registered and frame.camera is not None:
+        lens = LensCamera(frame.camera)
+    if lens is None:
+        return own
+    try:
+        pixels = rectified(pixels_of(view.image), lens)
+    except MessageError as error:
+        _log.warning("image_2/%06d.png is missing: %s", number, error)
+        return own
+    (out / "image_2").mkdir(exist_ok=True)
+    Image.fromarray(pixels).save(out / "image_2" / f"{number:06d}.png", compress_level=4)
+    return _Seen(lens.pinhole, view.colour_from_depth or IDENTITY, image=True)
+
+
+def kitti_type(category: str) -> str:
+    """Return the KITTI type of a category: a type cannot hold spaces."""
+    return category.replace(" ", "_")
+
+
+def _label(item: LabelledObject, frame: Frame, turn: F8, seen: _Seen) -> str:
+    """Return a line of 15 values: type truncated occluded alpha bbox(4) h w l x y z rotation_y."""
+    length, width, height = map(float, item.box.size)
+    x, y, z = turn @ item.box.center
+    heading = turn @ rotation_from_quaternion(item.box.orientation)[:, 0]
+    yaw = float(np.arctan2(-heading[2], heading[0]))
+    alpha = (yaw - float(np.arctan2(x, z)) + np.pi) % (2 * np.pi) - np.pi
+    numbers = (
+        float(item.touches_border),
+        int(item.occluded),
+        *(f"{value:.5f}" for value in (alpha, *_pixels(item, frame, seen))),
+        *(f"{value:.5f}" for value in (height, width, length, x, y + height / 2, z, yaw)),
+    )
+    return " ".join([kitti_type(item.category), *map(str, numbers)]) + "\n"
+
+
+def _pixels(item: LabelledObject, frame: Frame, seen: _Seen) -> tuple[float, ...]:
+    """Return left, top, right and bottom of an object, pixels; all -1 if it is not visible."""
+    camera, nowhere = seen.camera, (-1.0, -1.0, -1.0, -1.0)
+    if camera is None or not item.indices.size:
+        return nowhere
+    u, v, _ = project(frame.xyz(item.indices), LensCamera(camera), seen.pose).astype(np.float64).T
+    inside = (u > -0.5) & (u < camera.width - 0.5) & (v > -0.5) & (v < camera.height - 0.5)
+    if not inside.any():
+        return nowhere
+    u, v = np.rint(u[inside]), np.rint(v[inside])
+    return (float(u.min()), float(v.min()), float(u.max()), float(v.max()))
+
+
+def _calibration(seen: _Seen, turn: F8) -> str:
+    camera = seen.camera
+    intrinsic = np.eye(3)
+    if camera is not None:
+        intrinsic = np.array(
+            [[camera.fx, 0, camera.cx], [0, camera.fy, camera.cy], [0, 0, 1]], np.float64
+        )
+    rotation, translation = seen.pose.rotation @ turn.T, seen.pose.translation[:, None]
+    projection = intrinsic @ np.concatenate([rotation, translation], axis=1)
+    still = np.zeros((3, 1))
+    rows = {
+        **{f"P{k}": projection for k in range(4)},
+        "R0_rect": np.eye(3),
+        "Tr_velo_to_cam": np.concatenate([_VELO_FROM_RECTIFIED.T, still], axis=1),
+        "Tr_imu_to_velo": np.concatenate([np.eye(3), still], axis=1),
+        "Tr_rect_to_sensor": np.concatenate([turn.T, still], axis=1),
+    }
+    return "".join(
+        f"{name}: {' '.join(f'{value:.12e}' for value in matrix.ravel())}\n"
+        for name, matrix in rows.items()
+    )

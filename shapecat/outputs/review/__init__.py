@@ -1,0 +1,1 @@
+"""The review: a Rerun recording of what was detected, and its viewer."""

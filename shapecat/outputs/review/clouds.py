@@ -1,0 +1,212 @@
+"""The clouds of the review: choose points and colour them."""
+
+from collections.abc import Sequence
+
+import numpy as np
+
+from shapecat.arrays import F4, I4, U1, U2, U4, Record, array
+from shapecat.cameras.colour import ColourView
+from shapecat.jit import kernel
+from shapecat.outputs.colours import colour_of
+from shapecat.outputs.review.colour import true_colours
+from shapecat.types import Frame, LabelledObject, Plane
+
+__all__ = ["PaintedCloud", "paint"]
+
+_GROUND = np.array([118, 128, 140], np.uint8)  # points on no plane and no object
+_PLANES = np.array([[128, 112, 92], [104, 120, 108], [112, 104, 126], [100, 118, 128]], np.uint8)
+_RADIUS_M = 0.003  # of points of unorganized clouds
+_PLANE_M = 0.015  # largest distance of points from the plane that they belong to
+
+
+class PaintedCloud(Record):
+    """Points (n, 3), metres, sensor frame, with colours (n,) packed as 0xRRGGBBAA.
+
+    Drawn with ``radius_m``, they nearly close the surface.
+    """
+
+    points: F4 = array("n 3", "f4")
+    colours: U4 = array("n", "u4")
+    radius_m: float
+
+
+def paint(
+    frame: Frame,
+    planes: Sequence[Plane],
+    objects: Sequence[LabelledObject],
+    *,
+    limit: int,
+    view: ColourView | None = None,
+) -> tuple[PaintedCloud, PaintedCloud]:
+    """Return the points on no object and the points on objects, together about ``limit``.
+
+    Images are thinned on a grid of pixels, clouds by taking every k-th point; objects have a finer
+    grid, up to half of the points. Points on objects have the colour of the category, points on
+    planes a muted colour; all others are grey. Depth images are shaded as if lit from above the
+    camera. Points that a colour camera sees have their true colours, tinted on objects.
+
+    Parameters
+    ----------
+    limit : approximate number of points; 0 for all.
+    view : the colour image; None for none.
+
+    Raises
+    ------
+    MessageError : the colour image is damaged.
+    """
+    owner = _owners(frame, objects)
+    fine, near = _thin(frame, owner, limit // 2)
+    coarse, far = _grid(frame, max(limit - near.size, 1) if limit else 0)
+    near, far = _measured(frame, near), _measured(frame, far[owner[far] == 0])
+    own = np.array([colour_of(o.category) for o in objects], np.uint8).reshape(-1, 3)
+    palette = np.concatenate([_GROUND[None], own, _PLANES])
+    pixels = np.concatenate([far, near])
+    points, tones = frame.xyz(pixels), owner[pixels]
+    colours = np.zeros(pixels.size, np.uint32)
+    if view is not None:
+        colours = true_colours(frame, view, points, pixels, fine, palette, tones)
+    rest = np.flatnonzero(colours == 0)
+    colours[rest] = _shaded(frame, pixels[rest], points[rest], tones[rest], palette, planes)
+    n = far.size
+    return (
+        PaintedCloud(points[:n], colours[:n], _radius(frame, points[:n], coarse)),
+        PaintedCloud(points[n:], colours[n:], _radius(frame, points[n:], fine)),
+    )
+
+
+def _shaded(
+    frame: Frame, pixels: I4, points: F4, tones: U2, palette: U1, planes: Sequence[Plane]
+) -> U4:
+    """Return the colours (n,) of points, 0xRRGGBBAA, from the palette or by plane, shaded."""
+    light = np.ones(pixels.size, np.float32)
+    if frame.depth is not None and frame.camera is not None:
+        light = _light(frame.depth, pixels, frame.camera.fx, frame.camera.fy)
+    rows = _plane_rows(planes)
+    return np.asarray(_colours(points, light, tones, palette, rows, len(_PLANES)))
+
+
+def _radius(frame: Frame, points: F4, step: int) -> float:
+    """Return the radius, metres, at which points ``step`` pixels apart nearly touch."""
+    if frame.camera is None:
+        return _RADIUS_M
+    middle = float(np.median(points[::16, 2])) if len(points) else 0.0
+    return 0.55 * step * middle / frame.camera.fx
+
+
+def _owners(frame: Frame, objects: Sequence[LabelledObject]) -> U2:
+    """Return the number of each pixel's or point's object (n,), from 1; 0 without an object."""
+    source = frame.depth if frame.depth is not None else frame.points
+    size = 0 if source is None else source.size if frame.organized else len(source)
+    owner = np.zeros(size, np.uint16)
+    for number, item in enumerate(objects, 1):
+        owner[item.indices] = number
+    return owner
+
+
+def _grid(frame: Frame, limit: int) -> tuple[int, I4]:
+    """Return the step of a pixel grid, and the flat indices of about ``limit`` pixels on it.
+
+    For a cloud, these are k and the indices of every k-th point. A limit of 0 means all.
+    """
+    if frame.depth is None:
+        n = 0 if frame.points is None else len(frame.points)
+        step = -(-n // limit) if limit and n else 1
+        return step, np.arange(0, n, step)
+    height, width = frame.depth.shape
+    readings = 64 * int(np.count_nonzero(frame.depth[::8, ::8]))  # an estimate is enough
+    step = _step(readings, limit)
+    rows, columns = np.arange(step // 2, height, step), np.arange(step // 2, width, step)
+    return step, (rows[:, None] * width + columns).ravel()
+
+
+def _thin(frame: Frame, owner: U2, limit: int) -> tuple[int, I4]:
+    """Return step and indices as `_grid` does, but only of pixels or points on objects."""
+    if frame.depth is None:
+        pixels = np.flatnonzero(owner != 0)
+        step = -(-pixels.size // limit) if limit and pixels.size else 1
+        return step, pixels[::step]
+    width = frame.depth.shape[1]
+    step = _step(int(np.count_nonzero(owner)), limit)
+    rows, columns = np.nonzero(owner.reshape(frame.depth.shape)[::step, ::step] != 0)
+    return step, (rows * width + columns) * step
+
+
+def _step(size: int, limit: int) -> int:
+    return int(np.ceil(np.sqrt(size / limit))) if limit and size > limit else 1
+
+
+def _measured(frame: Frame, pixels: I4) -> I4:
+    """Return the indices of the pixels or points that have depth."""
+    if frame.depth is not None:
+        return np.asarray(pixels[frame.depth.reshape(-1)[pixels] > 0])
+    return np.asarray(pixels[np.isfinite(frame.xyz(pixels)).all(axis=1)])
+
+
+def _plane_rows(planes: Sequence[Plane]) -> F4:
+    """Return normal, offset, centre of the outline and its squared radius, (p, 8), metres."""
+    rows = []
+    for plane in planes:
+        middle = plane.outline.mean(axis=0) if len(plane.outline) else np.zeros(3)
+        reach = ((plane.outline - middle) ** 2).sum(axis=1).max(initial=0.0)
+        rows.append([*plane.normal, plane.offset, *middle, reach])
+    return np.array(rows, np.float32).reshape(-1, 8)
+
+
+@kernel
+def _colours(points: F4, light: F4, tones: U2, palette: U1, planes: F4, plane_tones: int) -> U4:
+    """Return the colours (n,) of points, 0xRRGGBBAA.
+
+    Parameters
+    ----------
+    points : (n, 3) metres, sensor frame.
+    light : (n,) factors of brightness.
+    tones : (n,) indices into the palette; points of index 0 get the colour of a near plane.
+    palette : (k, 3); the last ``plane_tones`` entries are for planes, in turn.
+    planes : (p, 8), from `_plane_rows`.
+    """
+    result = np.zeros(len(points), np.uint32)
+    for i in range(len(points)):
+        tone = int(tones[i])
+        if tone == 0:
+            x, y, z = points[i, 0], points[i, 1], points[i, 2]
+            for k in range(len(planes)):
+                a, b, c, offset, u, v, w, reach = planes[k]
+                inside = (x - u) ** 2 + (y - v) ** 2 + (z - w) ** 2 <= reach
+                if inside and abs(a * x + b * y + c * z - offset) < _PLANE_M:
+                    tone = len(palette) - plane_tones + k % plane_tones
+        packed = np.uint32(0)
+        for channel in range(3):
+            value = np.uint32(min(palette[tone, channel] * light[i], np.float32(255)))
+            packed = (packed << np.uint32(8)) | value
+        result[i] = (packed << np.uint32(8)) | np.uint32(255)
+    return result
+
+
+@kernel
+def _light(depth: F4, pixels: I4, fx: float, fy: float) -> F4:
+    """Return the brightness (n,), 0.55 to 1.2, of pixels lit from above left of the camera.
+
+    Parameters
+    ----------
+    depth : (h, w) metres.
+    pixels : (n,) flat indices.
+    fx, fy : focal lengths, pixels.
+    """
+    height, width = depth.shape
+    result = np.ones(pixels.size, np.float32)
+    reach = 3  # pixels: beyond the quantisation of the depth
+    for k in range(pixels.size):
+        v, u = pixels[k] // width, pixels[k] % width
+        z = depth[v, u]
+        near = 0.05 * z  # a larger difference is an edge, not a slope
+        slope_x = slope_y = np.float32(0)
+        left, right = depth[v, max(u - reach, 0)], depth[v, min(u + reach, width - 1)]
+        if abs(left - z) < near and abs(right - z) < near:
+            slope_x = (right - left) * fx / (2 * reach * z)
+        above, below = depth[max(v - reach, 0), u], depth[min(v + reach, height - 1), u]
+        if abs(above - z) < near and abs(below - z) < near:
+            slope_y = (below - above) * fy / (2 * reach * z)
+        # The normal is (slope_x, slope_y, -1); the light comes from (-0.4, -0.7, -0.6).
+        facing = (-0.4 * slope_x - 0.7 * slope_y + 0.6) / np.sqrt(1 + slope_x**2 + slope_y**2)
+        result[k] = 0.55 + 0.65 * max(facing, 0.0)
+    return result

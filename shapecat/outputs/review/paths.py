@@ -1,0 +1,70 @@
+"""The paths of tracks in the review."""
+
+from collections.abc import Iterable, Mapping
+from dataclasses import dataclass, field
+
+import numpy as np
+
+from shapecat.arrays import F8
+from shapecat.outputs.review.columns import At, Columns
+from shapecat.outputs.review.shapes import paths
+
+__all__ = ["Paths"]
+
+_STEP_M, _POINTS = 0.015, 500
+"""Distance at which a position is added to a path, and number of positions kept."""
+
+
+@dataclass
+class _Path:
+    """The positions (3,) of a track so far, metres."""
+
+    category: str
+    places: list[F8] = field(default_factory=list)
+
+    @property
+    def drawn(self) -> bool:
+        """Whether the path has at least two positions."""
+        return len(self.places) > 1
+
+    def grow(self, place: F8) -> bool:
+        """Add a position if the object has moved; return whether the path has changed."""
+        if self.places and np.linalg.norm(place - self.places[-1]) <= _STEP_M:
+            return False
+        self.places.append(place)
+        del self.places[:-_POINTS]
+        return self.drawn
+
+
+class Paths:
+    """The paths of tracks, by Rerun entity; an entity is rewritten when its paths grow or end."""
+
+    def __init__(self, columns: Columns) -> None:
+        """Start without paths."""
+        self._columns = columns
+        self._paths: dict[str, dict[int, _Path]] = {}
+
+    def add(
+        self, entity: str, at: At, seen: Mapping[int, tuple[str, F8]], ended: Iterable[int]
+    ) -> None:
+        """Add the category and position of each track in a frame; remove tracks that have ended.
+
+        Another entity may have a part of their path, from another sensor.
+        """
+        gone, known = set(ended), self._paths.setdefault(entity, {})
+        changed = set()
+        for other, own in self._paths.items():
+            removed = [own.pop(number) for number in gone & own.keys()]
+            if any(path.drawn for path in removed):
+                changed.add(other)
+        for number, (category, place) in seen.items():
+            if known.setdefault(number, _Path(category)).grow(place):
+                changed.add(entity)
+        for other in sorted(changed):
+            self._write(other, at)
+
+    def _write(self, entity: str, at: At) -> None:
+        known = self._paths[entity].values()
+        ways = [(path.category, np.array(path.places)) for path in known if path.drawn]
+        size = sum(places.size for _, places in ways)
+        self._columns.add(entity, at, ways, paths, size=size)

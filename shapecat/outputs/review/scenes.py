@@ -1,0 +1,128 @@
+"""Choose the frames of a review whose scene is drawn, and paint them."""
+
+import math
+from collections.abc import Collection, Iterable, Iterator
+from itertools import tee
+from typing import NamedTuple
+
+from shapecat.arrays import F8
+from shapecat.geometry import IDENTITY, transform
+from shapecat.outputs.colouring import Coloured, with_colour
+from shapecat.outputs.review.clouds import PaintedCloud, paint
+from shapecat.outputs.review.images import Picture, picture_of
+from shapecat.recordings import MessageError, Recording
+from shapecat.runs.run_info import RunInfo
+from shapecat.types import Frame, LabelledFrame
+
+__all__ = ["PaintedFrame", "ReviewFrame", "choose_scenes", "paint_frame", "with_clouds"]
+
+_SOON_NS, _LATE_NS = 90_000_000, 240_000_000
+"""Shortest time between two drawn scenes, and longest time between scenes that differ."""
+_STILL_M = 0.015
+"""After a motion of this size, the scene is drawn as soon as allowed."""
+
+
+class ReviewFrame(NamedTuple):
+    """A frame to write, with its points and colour image if its scene is drawn."""
+
+    labelled: LabelledFrame
+    frame: Frame | None = None
+    coloured: Coloured | None = None
+
+
+def with_clouds(
+    frames: Iterable[LabelledFrame],
+    recording: Recording,
+    run: RunInfo,
+    placed: Collection[str] = (),
+) -> Iterator[ReviewFrame]:
+    """Yield all frames of a run; those whose scene is drawn have their points and colour image.
+
+    ``placed`` is as for `choose_scenes`.
+
+    Raises
+    ------
+    OutputError : the recording no longer holds one of the frames.
+    """
+    chosen = choose_scenes(frames, fixed=run["fixed_frame"] is not None, placed=placed)
+    first, second = tee(chosen)
+    read = with_colour((labelled for labelled, drawn in first if drawn), recording, run)
+    for labelled, drawn in second:
+        yield ReviewFrame(*next(read)) if drawn else ReviewFrame(labelled)
+
+
+def choose_scenes(
+    frames: Iterable[LabelledFrame], *, fixed: bool, placed: Collection[str] = ()
+) -> Iterator[tuple[LabelledFrame, bool]]:
+    """Yield each frame, and whether its scene is drawn.
+
+    Repeated scenes are not drawn, and scenes in which nothing moves are drawn less often.
+
+    Parameters
+    ----------
+    fixed : whether motion is measured in the fixed frame, where a moving camera does not count.
+    placed : topics whose scenes are drawn only at a known place in the fixed frame.
+    """
+    last: dict[str, LabelledFrame] = {}  # last drawn frame of each topic
+    for labelled in frames:
+        before = last.get(labelled.topic)
+        drawn = labelled.topic not in placed or labelled.fixed_from_sensor is not None
+        drawn = drawn and (before is None or _is_due(labelled, before, fixed=fixed))
+        if drawn:
+            last[labelled.topic] = labelled
+        yield labelled, drawn
+
+
+def _is_due(labelled: LabelledFrame, before: LabelledFrame, *, fixed: bool) -> bool:
+    """Return whether to draw a scene, given the last one drawn."""
+    passed_ns = labelled.stamp_ns - before.stamp_ns
+    if _first_seen(labelled) == _first_seen(before) or 0 <= passed_ns < _SOON_NS:
+        return False
+    if not 0 <= passed_ns < _LATE_NS:
+        return True
+    now, then = (_places(each, fixed=fixed) for each in (labelled, before))
+    return now.keys() != then.keys() or any(math.dist(now[k], then[k]) > _STILL_M for k in now)
+
+
+def _first_seen(labelled: LabelledFrame) -> int:
+    return labelled.index if labelled.reused_from is None else labelled.reused_from
+
+
+def _places(labelled: LabelledFrame, *, fixed: bool) -> dict[int, F8]:
+    """Return the position (3,) of each track, in the fixed frame if ``fixed`` and known."""
+    pose = labelled.fixed_from_sensor if fixed else None
+    return {
+        o.track: transform(pose or IDENTITY, (o.full or o.box).center) for o in labelled.objects
+    }
+
+
+class PaintedFrame(NamedTuple):
+    """A frame ready to write.
+
+    ``clouds`` are the points on no object and on objects, None if the scene is not drawn;
+    ``picture`` is None without a colour image; ``damage`` says why that is unreadable, or is empty.
+    """
+
+    labelled: LabelledFrame
+    frame: Frame | None
+    clouds: tuple[PaintedCloud, PaintedCloud] | None
+    picture: Picture | None
+    damage: str
+
+
+def paint_frame(chosen: ReviewFrame, *, limit: int) -> PaintedFrame:
+    """Paint the clouds and masks of a frame, without colour if its image is damaged.
+
+    ``limit`` is the approximate number of points to keep, 0 for all.
+    """
+    labelled, frame, coloured = chosen
+    damage, parts = "", (labelled.planes, labelled.objects)
+    if frame is None:
+        return PaintedFrame(labelled, None, None, None, "")
+    if coloured is not None:
+        try:
+            clouds = paint(frame, *parts, limit=limit, view=coloured.view)
+            return PaintedFrame(labelled, frame, clouds, picture_of(labelled, coloured), "")
+        except MessageError as error:
+            damage = f"{coloured.view.image.topic}: {error}"
+    return PaintedFrame(labelled, frame, paint(frame, *parts, limit=limit), None, damage)

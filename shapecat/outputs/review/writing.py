@@ -1,0 +1,327 @@
+"""``review.rrd``: a run as a Rerun recording. Only this module and its siblings use Rerun.
+
+Entities
+--------
+::
+
+    world                      handedness and up; the fixed frame if there is one
+    ├── paths/<topic>          paths of the tracks (below <topic> without a fixed frame)
+    ├── <topic>                the sensor: fixed_from_sensor, in every frame
+    │   ├── camera             pinhole, for depth images
+    │   └── objects
+    │       ├── boxes          labelled "#track category confidence"
+    │       └── captions       shorter, drawn above the boxes
+    └── seen/<topic>           the scene, four to ten times a second if it changes, with the sensor
+        ├── scene              pose of its frame (below <topic> without a fixed frame)
+        ├── planes             outlines;  planes/fill  translucent
+        └── objects
+            ├── points         in the colour of the category
+            ├── full           boxes of the whole objects, dashed
+            ├── graphs         edges of the growing neural gas
+            └── surfaces       triangles of the growing neural gas
+    images/<topic>             the colour image of a scene, as recorded if compressed
+    ├── masks                  the pixels of each object, translucent in the colour of the category
+    ├── boxes                  around the masks
+    └── captions               labelled as in 3D
+    tracks/<n>/posterior       fused posterior up to each frame, a line per category
+    plots/objects/<category>   objects in view; of several topics, plots/objects/<topic>/<category>
+    plots/seconds/<stage>      time spent on each frame
+    log                        starts and ends of tracks, warnings of the run
+    run                        run.json as text
+
+Timelines: ``sensor_time`` (the stamp) and ``frame``.
+"""
+
+import json
+import uuid
+from collections import Counter
+from collections.abc import Callable, Iterable, Mapping, Sequence
+from functools import partial
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import rerun as rr
+
+from shapecat.geometry import IDENTITY, transform
+from shapecat.outputs.colours import colour_of
+from shapecat.outputs.review import shapes
+from shapecat.outputs.review.columns import At, Columns, curve
+from shapecat.outputs.review.file import open_review
+from shapecat.outputs.review.images import Images
+from shapecat.outputs.review.layout import Eye, TrackView, choose_eye, lay_out, stepped_back
+from shapecat.outputs.review.paths import Paths
+from shapecat.outputs.review.scenes import PaintedFrame, ReviewFrame, paint_frame
+from shapecat.outputs.review.shapes import SCENE, SKETCH, Drawing, DrawnScene
+from shapecat.runs.labels.meaning import TrackLabel
+from shapecat.types import Camera, Frame, LabelledFrame, LabelledObject, Pose
+
+__all__ = ["write_review"]
+
+_FLUSH_FRAMES = 32
+
+
+def write_review(
+    path: Path,
+    frames: Iterable[ReviewFrame],
+    *,
+    name: str,
+    run: Mapping[str, object],
+    labels: Mapping[int, TrackLabel],
+    categories: Sequence[str],
+    cloud_points: int,
+    fixed_frame: str | None,
+) -> None:
+    """Write a run as a Rerun recording with its layout embedded.
+
+    Parameters
+    ----------
+    path : the file; it appears when complete and replaces an older one.
+    frames : all frames in the order of the recording, with points if their scene is drawn.
+    name : name of the recording in the viewer.
+    run : the content of run.json; a list under ``warnings`` is also logged.
+    labels : the final label of each track; a review with others is another recording.
+    categories : in the order of the posteriors.
+    cloud_points : approximate number of points to keep of each cloud; 0 keeps all.
+    fixed_frame : name of the frame in which tracks are shown; None for the sensor frame.
+
+    Raises
+    ------
+    OutputError : the file cannot be written.
+
+    Notes
+    -----
+    The content depends only on the arguments. Memory does not grow with the number of frames,
+    except for some numbers per track.
+    """
+    stream = _stream(name, run, labels)
+    with open_review(path, stream) as file:
+        stream.send_recording_name(name)
+        review = _Review(stream, categories, fixed_frame)
+        review.begin(run)
+        for k, frame in enumerate(frames):
+            file.check()
+            review.add(paint_frame(frame, limit=cloud_points))
+            if k % _FLUSH_FRAMES == _FLUSH_FRAMES - 1:
+                file.flush()
+        review.end()
+        file.flush()
+
+
+def _stream(
+    name: str, run: Mapping[str, object], labels: Mapping[int, TrackLabel]
+) -> rr.RecordingStream:
+    """Return a stream whose content depends only on what is logged.
+
+    A viewer joins files of the same recording, and has one layout for each application.
+    """
+    content = json.dumps([name, run, sorted(labels.items())], sort_keys=True, default=str)
+    identity = uuid.uuid5(uuid.NAMESPACE_OID, content)
+    application = f"shapecat-{identity.hex[:8]}"
+    stream = rr.RecordingStream(application, recording_id=identity, send_properties=False)
+    stream.set_log_time_enabled(False)
+    return stream
+
+
+class _Review:
+    """Writes a review frame by frame, and keeps the data for its layout and paths."""
+
+    def __init__(
+        self,
+        stream: rr.RecordingStream,
+        categories: Sequence[str],
+        fixed_frame: str | None,
+    ) -> None:
+        self._stream, self._columns = stream, Columns(stream)
+        self._curves: dict[str, Any] = {
+            "names": list(categories),
+            "colors": [colour_of(category) for category in categories],
+        }
+        self._fixed_frame = fixed_frame
+        self._eyes: dict[str, Eye] = {}
+        self._low, self._high = (
+            np.full(3, np.inf),
+            np.full(3, -np.inf),
+        )  # bounds of objects in the fixed frame
+        self._cameras: dict[str, Camera] = {}
+        self._tracks: dict[int, TrackView] = {}
+        self._aimed: set[str] = set()  # topics whose eye was chosen with an object in view
+        self._paths = Paths(self._columns)
+        self._images = Images(stream, self._columns)
+        self._styled: set[str] = set()  # entities whose style is written
+        self._counted: dict[str, dict[str, None]] = {}  # categories so far of each topic, in order
+        self._several = False  # whether the run has several topics
+        self._warnings: list[str] = []
+
+    def begin(self, run: Mapping[str, object]) -> None:
+        """Write the static data."""
+        self._log(
+            "run", rr.TextDocument(shapes.markdown(run), media_type="text/markdown"), static=True
+        )
+        options = run.get("options")
+        self._several = isinstance(options, Mapping) and len(options.get("topics", ())) > 1
+        warnings = run.get("warnings", ())
+        if isinstance(warnings, Sequence) and not isinstance(warnings, str):
+            self._warnings = [str(text) for text in warnings]
+        if self._fixed_frame is not None:
+            self._log("world", rr.ViewCoordinates.RIGHT_HAND_Z_UP, static=True)
+
+    def add(self, painted: PaintedFrame) -> None:
+        """Write one frame."""
+        labelled, frame = painted.labelled, painted.frame
+        entity = rr.new_entity_path(["world", labelled.topic])
+        self._stream.set_time("sensor_time", timestamp=np.datetime64(labelled.stamp_ns, "ns"))
+        self._stream.set_time("frame", sequence=labelled.index)
+        if frame is not None:
+            self._place_sensor(entity, labelled, frame)
+        self._draw(entity, painted)
+        if painted.picture is not None:
+            at = (labelled.stamp_ns, labelled.index)
+            self._images.add(labelled.topic, at, painted.picture)
+        if painted.damage:
+            self._log("log", rr.TextLog(painted.damage, level="WARN"))
+        self._trace(entity, labelled)
+        self._log_events(labelled)
+        self._plot(labelled)
+
+    def end(self) -> None:
+        """Write the remaining rows and the layout."""
+        self._columns.send()
+        world = "/world"
+        scenes = [
+            (world if self._fixed_frame else entity, self._fixed_frame or topic, eye)
+            for topic, eye in self._eyes.items()
+            for entity in [rr.new_entity_path(["world", topic])]
+        ]
+        if self._fixed_frame:
+            scenes = [
+                (entity, title, stepped_back(eye, self._low, self._high))
+                for entity, title, eye in scenes[:1]
+            ]
+        nothing = (world, "no frame", Eye(np.ones(3), np.zeros(3), np.array([0.0, 0.0, 1.0])))
+        tracks = [self._tracks[number] for number in sorted(self._tracks)]
+        dots = rr.SeriesPoints(**self._curves, marker_sizes=[4.0] * len(self._curves["names"]))
+        for track in tracks:
+            if track.frames == 1:  # a line with one point is invisible
+                self._log(f"{track.entity}/posterior", dots, static=True)
+        images = self._images.entities
+        self._stream.send_blueprint(lay_out(scenes or [nothing], tracks, images))
+
+    def _draw(self, entity: str, painted: PaintedFrame) -> None:
+        """Write the sensor pose and the boxes, and the scene if it is drawn."""
+        labelled = painted.labelled
+        at, pose = (labelled.stamp_ns, labelled.index), self._pose(labelled)
+        if pose is not None:
+            self._columns.add(entity, at, pose, shapes.places)
+        for name, drawing in SKETCH.items():
+            self._add(f"{entity}/{name}", drawing, at, shapes.sketch(labelled), 64)
+        if painted.clouds is None:
+            return
+        if self._fixed_frame is not None:
+            entity = rr.new_entity_path(["world", "seen", labelled.topic])
+            self._columns.add(entity, at, pose or IDENTITY, shapes.places)
+        scene = DrawnScene.of(labelled, *painted.clouds)
+        for name, drawing in SCENE.items():
+            self._add(f"{entity}/{name}", drawing, at, scene, scene.size)
+
+    def _add(self, entity: str, drawing: Drawing, at: At, row: Any, size: int) -> None:
+        if drawing.style is not None and entity not in self._styled:
+            self._styled.add(entity)
+            self._log(entity, drawing.style, static=True)
+        self._columns.add(entity, at, row, drawing.columns, size=size)
+
+    def _log(self, entity: str, *what: rr.AsComponents, static: bool = False) -> None:
+        self._stream.log(entity, *what, static=static)
+
+    def _place_sensor(self, entity: str, labelled: LabelledFrame, frame: Frame) -> None:
+        """Write the axes and the frustum of the sensor if they are new."""
+        topic = labelled.topic
+        if topic not in self._eyes or (labelled.objects and topic not in self._aimed):
+            self._eyes[topic] = choose_eye(labelled, frame, fixed=self._fixed_frame is not None)
+            self._log(entity, _axes(frame, self._eyes[topic]), static=True)
+        if labelled.objects:
+            self._aimed.add(topic)
+        if frame.camera is not None and frame.camera != self._cameras.get(topic):
+            self._cameras[topic] = frame.camera
+            self._log(f"{entity}/camera", shapes.pinhole(frame.camera))
+
+    def _pose(self, labelled: LabelledFrame) -> Pose | None:
+        return None if self._fixed_frame is None else labelled.fixed_from_sensor
+
+    def _trace(self, entity: str, labelled: LabelledFrame) -> None:
+        """Extend the paths of the tracks, unless the pose in the fixed frame is unknown."""
+        pose = self._pose(labelled)
+        seen = {}
+        if pose is not None or self._fixed_frame is None:
+            for item in labelled.objects:
+                place = np.asarray((item.full or item.box).center, np.float64)
+                seen[item.track] = item.category, place if pose is None else transform(pose, place)
+        if self._fixed_frame is not None:
+            entity = "world"
+            for _, place in seen.values():
+                self._low = np.minimum(self._low, place)
+                self._high = np.maximum(self._high, place)
+        where = f"{entity}/paths/{rr.escape_entity_path_part(labelled.topic)}"
+        self._paths.add(where, (labelled.stamp_ns, labelled.index), seen, labelled.ended)
+
+    def _log_events(self, labelled: LabelledFrame) -> None:
+        for text in self._warnings:
+            self._log("log", rr.TextLog(text, level="WARN"))
+        self._warnings = []
+        for item in labelled.objects:
+            if item.track not in self._tracks:
+                self._add_track(item)
+                self._log("log", rr.TextLog(f"{shapes.label(item)} appears", level="INFO"))
+        for number in labelled.ended:
+            title = self._tracks[number].title if number in self._tracks else f"#{number}"
+            self._log("log", rr.TextLog(f"{title} disappears", level="INFO"))
+
+    def _add_track(self, item: LabelledObject) -> None:
+        entity = f"/tracks/{item.track}"
+        self._tracks[item.track] = TrackView(entity, shapes.label(item))
+        lines = rr.SeriesLines(**self._curves, widths=[1.5] * len(self._curves["names"]))
+        self._log(f"{entity}/posterior", lines, static=True)
+
+    def _plot(self, labelled: LabelledFrame) -> None:
+        at = (labelled.stamp_ns, labelled.index)
+        for item in labelled.objects:
+            self._tracks[item.track].frames += 1
+            self._columns.add(f"/tracks/{item.track}/posterior", at, item.causal, curve)
+        counts = Counter(item.category for item in labelled.objects)
+        counted = self._counted.setdefault(labelled.topic, {})
+        counted.update(dict.fromkeys(counts))
+        group, sensor = "objects", ""
+        if self._several:
+            sensor = f" {labelled.topic}"
+            group += f"/{rr.escape_entity_path_part(labelled.topic)}"
+        for category in counted:
+            style = partial(_steps, category, sensor)
+            self._plot_line(group, category, style, at, counts[category])
+        for stage, seconds in labelled.seconds.items():
+            style = partial(rr.SeriesLines, names=stage, widths=2)
+            self._plot_line("seconds", stage, style, at, seconds)
+
+    def _plot_line(
+        self, group: str, name: str, style: Callable[[], rr.SeriesLines], at: At, value: float
+    ) -> None:
+        entity = f"/plots/{group}/{rr.escape_entity_path_part(name)}"
+        if entity not in self._styled:
+            self._styled.add(entity)
+            self._log(entity, style(), static=True)
+        self._columns.add(entity, at, [value], curve)
+
+
+def _steps(category: str, sensor: str) -> rr.SeriesLines:
+    """Return the style of a count, which changes in steps."""
+    return rr.SeriesLines(
+        names=category + sensor,
+        colors=colour_of(category),
+        widths=2,
+        interpolation_mode=rr.components.InterpolationMode.StepAfter,
+    )
+
+
+def _axes(frame: Frame, eye: Eye) -> rr.ViewCoordinates:
+    """Return the axes of the sensor: optical for images and for up along -y, else z up."""
+    optical = frame.organized or eye.up[1] < -0.7
+    return rr.ViewCoordinates.RDF if optical else rr.ViewCoordinates.RIGHT_HAND_Z_UP

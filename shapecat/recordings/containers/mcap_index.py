@@ -1,0 +1,61 @@
+"""The index of the messages in each chunk of an MCAP file."""
+
+import struct
+from itertools import chain
+from typing import BinaryIO, NamedTuple
+
+from mcap import records
+
+from shapecat.recordings.containers.mcap_records import (
+    RawMessage,
+    TruncatedError,
+    read_content,
+    walk,
+)
+
+__all__ = ["IndexedMessage", "overlaps", "read_message_index", "unread"]
+
+_HEAD = struct.Struct("<HI")
+_ENTRY = struct.Struct("<QQ")
+"""Head of a message index: channel and bytes of entries. An entry: log time and offset."""
+
+
+class IndexedMessage(NamedTuple):
+    """An index entry; ``place`` is the byte offset of the message in the decompressed chunk."""
+
+    channel_id: int
+    log_time: int
+    place: int
+
+
+def overlaps(
+    chunk: records.ChunkIndex, wanted: set[int], start_ns: int | None, stop_ns: int | None
+) -> bool:
+    """Return whether a chunk may hold messages of wanted channels in ``[start_ns, stop_ns)``."""
+    if start_ns is not None and chunk.message_end_time < start_ns:
+        return False
+    if stop_ns is not None and chunk.message_start_time >= stop_ns:
+        return False
+    # Without message indexes any chunk may hold any channel.
+    return not chunk.message_index_offsets or not wanted.isdisjoint(chunk.message_index_offsets)
+
+
+def read_message_index(file: BinaryIO, chunk: records.ChunkIndex) -> list[IndexedMessage]:
+    """Return the index entries of a chunk; none if an entry is damaged or a channel is missing."""
+    begin = chunk.chunk_start_offset + chunk.chunk_length
+    found: dict[int, list[IndexedMessage]] = {}
+    try:
+        for record in walk(file, begin, begin + chunk.message_index_length):
+            content = read_content(file, record)
+            channel, length = _HEAD.unpack_from(content)
+            entries = _ENTRY.iter_unpack(content[_HEAD.size :][:length])
+            found[channel] = [IndexedMessage(channel, time, place) for time, place in entries]
+    except (TruncatedError, struct.error):
+        return []
+    complete = found.keys() == chunk.message_index_offsets.keys()
+    return list(chain(*found.values())) if complete else []
+
+
+def unread(message: IndexedMessage) -> RawMessage:
+    """Return an indexed message with empty data."""
+    return RawMessage(message.channel_id, 0, message.log_time, message.log_time, memoryview(b""))

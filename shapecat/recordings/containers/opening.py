@@ -1,0 +1,78 @@
+"""Open a recording with the reader for its format."""
+
+from collections.abc import Callable
+from pathlib import Path
+
+from shapecat.errors import RecordingError, explained
+from shapecat.recordings.containers.mcap_file import McapRecording
+from shapecat.recordings.recording import Recording
+
+__all__ = ["open_recording"]
+
+
+def open_recording(path: Path) -> Recording:
+    """Open an MCAP file, a ROS 1 bag, or a ROS 2 bag (a .db3 file or a folder).
+
+    The first bytes of a file determine its format, not its name.
+
+    Raises
+    ------
+    RecordingError : the path does not exist or is not a readable recording.
+    """
+    path = Path(path)
+    with explained(f"{path}: cannot be read", RecordingError):
+        try:
+            return _READERS[_sniff(path)](path)
+        except RecordingError as error:
+            msg = f"{path}: {error}"
+            raise RecordingError(msg) from error
+
+
+def _bag(path: Path) -> Recording:
+    from shapecat.recordings.containers.ros1_bag import BagRecording  # noqa: PLC0415  # loads rosbags
+
+    return BagRecording(path)
+
+
+def _database(path: Path) -> Recording:
+    from shapecat.recordings.containers.ros2_database import DatabaseRecording  # noqa: PLC0415  # the same
+
+    return DatabaseRecording(path)
+
+
+def _folder(path: Path) -> Recording:
+    from shapecat.recordings.containers.ros2_folder import FolderRecording  # noqa: PLC0415  # the same
+
+    return FolderRecording(path)
+
+
+_READERS: dict[str, Callable[[Path], Recording]] = {
+    "\x89MCAP": McapRecording,
+    "#ROSBAG": _bag,
+    "SQLite format 3": _database,
+    "folder": _folder,
+}
+"""Readers by the first bytes of a file; ``folder`` for folders."""
+
+_PACKED = ("(\xb5/\xfd", "\x1f\x8b", "BZh", "\xfd7zXZ", "\x04\x22\x4d\x18", "PK\x03\x04")
+"""First bytes of files compressed with zstd, gzip, bzip2, xz and lz4, and of zip archives."""
+_EXPECTED = "expected an .mcap, .bag or .db3 file, or a ROS 2 bag folder"
+
+
+def _sniff(path: Path) -> str:
+    if path.is_dir():
+        return "folder"
+    if not path.exists():
+        msg = f"does not exist; {_EXPECTED}"
+        raise RecordingError(msg)
+    with path.open("rb") as file:
+        begin = file.read(16).decode("latin-1")
+    for magic in _READERS:
+        if begin.startswith(magic):
+            return magic
+    if begin.startswith(_PACKED):
+        msg = f"a compressed file: unpack it first; {_EXPECTED}"
+        raise RecordingError(msg)
+    found = f"begins with {begin[:8]!r}" if begin else "is empty"
+    msg = f"not a recording: {found}; {_EXPECTED}"
+    raise RecordingError(msg)

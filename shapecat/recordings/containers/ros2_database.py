@@ -1,0 +1,139 @@
+"""ROS 2 bags in one SQLite file (.db3)."""
+
+import shutil
+from collections.abc import Iterator
+from contextlib import ExitStack, closing
+from pathlib import Path
+from typing import Any, ClassVar
+
+import apsw
+from rosbags.interfaces import MessageDefinitionFormat
+from rosbags.rosbag2 import Reader, ReaderError
+from rosbags.rosbag2.metadata import dump_qos_v8
+
+from shapecat.errors import RecordingError
+from shapecat.recordings.containers.message_compression import decompressed
+from shapecat.recordings.decoding.decoders import LIBRARY_ERRORS
+from shapecat.recordings.messages import (
+    Channel,
+    Message,
+    Selection,
+    Topic,
+    ros_type,
+    sum_topics,
+)
+from shapecat.recordings.recording import Recording
+from shapecat.system.files import scratch_folder, write_ahead_log
+
+__all__ = ["DatabaseRecording"]
+
+_LAST_NS = 2**63 - 1
+"""The largest time that SQLite can hold."""
+_SCRATCH = "shapecat-parts-"
+_SCHEMAS = {MessageDefinitionFormat.MSG: "ros2msg", MessageDefinitionFormat.IDL: "ros2idl"}
+
+
+class DatabaseRecording(Recording):
+    """A ROS 2 bag in SQLite; the log time of a message is when it was recorded."""
+
+    kind: ClassVar[str] = "ros2"
+
+    def __init__(self, path: Path) -> None:
+        """Open the database and read its topics.
+
+        Raises
+        ------
+        RecordingError : the file is not a ROS 2 bag, or is damaged.
+        """
+        super().__init__(path)
+        self._cleanup = ExitStack()
+        self._reader = Reader(self._with_log())
+        try:
+            self._reader.open()
+            self._channels = {c.id: _channel(c) for c in self._reader.connections}
+        except (ReaderError, apsw.Error, *LIBRARY_ERRORS) as error:
+            self._cleanup.close()
+            msg = f"not a readable ROS 2 bag: {str(error) or type(error).__name__}"
+            raise RecordingError(msg) from error
+        channels = ((self._channels[c.id], c.msgcount) for c in self._reader.connections)
+        self.topics = sum_topics(
+            Topic(channel.topic, channel.type, channel.encoding, count)
+            for channel, count in channels
+        )
+        if self._reader.message_count:
+            self.start_ns, self.end_ns = self._reader.start_time, self._reader.end_time - 1
+        if any(c.encoding == "cdr" and not c.schema for c in self._channels.values()):
+            self.warn("no message definitions: those of ROS 2 Humble are assumed")
+
+    def close(self) -> None:
+        """Close the database, and remove its copy if there is one."""
+        self._reader.close()
+        self._cleanup.close()
+
+    def _with_log(self) -> Path:
+        """Return the database, or a copy with the messages of a killed recorder's write-ahead log.
+
+        The copy and its log use at most half of the free space of the temporary folder.
+        """
+        log = write_ahead_log(self.path)
+        if log is None:
+            return self.path if self.path.suffix == ".db3" else self._renamed()
+        try:
+            folder = self._cleanup.enter_context(scratch_folder(_SCRATCH))
+            copy = folder / "a.db3"
+            room = shutil.disk_usage(folder).free // 2
+            if self.path.stat().st_size + 2 * log.stat().st_size > room:  # it is added to the copy
+                msg = "not enough space in the temporary folder to copy it"
+                raise OSError(msg)  # noqa: TRY301  handled like a full disk
+            shutil.copyfile(self.path, copy)
+            shutil.copyfile(log, f"{copy}-wal")
+            with closing(apsw.Connection(str(copy))) as base:
+                base.execute("PRAGMA wal_checkpoint(TRUNCATE)").fetchall()
+        except (OSError, apsw.Error) as error:
+            self.warn(f"not finished; the last messages, in {log.name}, are not read: {error}")
+            return self.path
+        self.warn(f"not finished; messages recovered from {log.name}")
+        return copy
+
+    def _renamed(self) -> Path:
+        """Return a link to the database with the only suffix that its reader accepts."""
+        link = self._cleanup.enter_context(scratch_folder(_SCRATCH)) / "a.db3"
+        link.symlink_to(self.path.resolve())
+        return link
+
+    def _read(self, selection: Selection) -> Iterator[Message]:
+        wanted = [c for c in self._reader.connections if selection.has_topic(c.topic)]
+        if not wanted:
+            return
+        limits = selection.start_ns, selection.stop_ns
+        times = [None if limit is None else min(limit, _LAST_NS) for limit in limits]
+        raw: Iterator[Any] = self._reader.messages(wanted, *times)  # data of any type
+        while True:
+            try:
+                connection, time, data = next(raw)
+            except StopIteration:
+                return
+            except (ReaderError, apsw.Error, OSError, *LIBRARY_ERRORS) as error:
+                self.warn(
+                    f"damaged: nothing after this was read: {str(error) or type(error).__name__}"
+                )
+                return
+            channel = self._channels[connection.id]
+            if not isinstance(data, bytes | memoryview):
+                self.warn(f"{channel.topic}: skipped a message without bytes")
+                continue
+            plain = decompressed(self, channel, bytes(data))
+            if plain is not None:
+                yield Message(channel, time, time, 0, plain)
+
+
+def _channel(connection: Any) -> Channel:
+    return Channel(
+        connection.topic,
+        ros_type(connection.msgtype),
+        connection.ext.serialization_format,
+        connection.msgtype,
+        _SCHEMAS.get(connection.msgdef.format, ""),
+        connection.msgdef.data.encode(),
+        (("offered_qos_profiles", dump_qos_v8(connection.ext.offered_qos_profiles)),),
+    )

@@ -1,0 +1,1 @@
+"""Messages become point clouds, depth images and colour images."""

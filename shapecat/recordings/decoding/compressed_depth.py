@@ -1,0 +1,184 @@
+"""Compressed depth images: 16-bit PNG, or what compressed_depth_image_transport writes."""
+
+import struct
+import zlib
+from typing import Any
+
+import numpy as np
+
+from shapecat.arrays import F4, U1, U2
+from shapecat.jit import kernel
+from shapecat.recordings.decoding.depth_image import clean_depth
+from shapecat.recordings.messages import MessageError
+
+__all__ = ["depth_of_compressed", "is_grey_png16"]
+
+_HEADER = struct.Struct("<iff")
+_PNG = b"\x89PNG\r\n\x1a\n"
+_GREY_16 = b"\x10\x00"
+"""Bit depth and colour type of a grey PNG of 16 bits: bytes 24 and 25 of the file."""
+_LARGEST = 1 << 26
+"""Images with more pixels are rejected."""
+
+
+def is_grey_png16(data: Any) -> bool:
+    """Return whether image data, of which 26 bytes are enough, is a PNG file of 16-bit grey."""
+    begin = bytes(data[:26])
+    return begin.startswith(_PNG) and begin[24:] == _GREY_16
+
+
+def depth_of_compressed(message: Any) -> F4:
+    """Read a decoded sensor_msgs/CompressedImage with a format such as ``16UC1; compressedDepth``.
+
+    The data is a PNG file, or begins with 12 bytes: the compression format and two parameters A and
+    B. For 32FC1 the stored value is A / depth + B, with depth in metres; otherwise it is in
+    millimetres.
+
+    Returns
+    -------
+    (h, w) float32 metres, 0 where depth is missing.
+
+    Raises
+    ------
+    MessageError : the data is damaged, or is neither a 16-bit grey PNG nor RVL.
+    """
+    data = memoryview(message.data).cast("B").toreadonly()
+    if len(data) < _HEADER.size + 8:
+        msg = f"compressed depth of only {len(data)} bytes"
+        raise MessageError(msg)
+    bare, inverse = bytes(data[:8]) == _PNG, str(message.format).startswith("32FC1")
+    if bare and inverse:
+        msg = "compressed depth in 32FC1 without its parameters"
+        raise MessageError(msg)
+    _, a, b = _HEADER.unpack_from(data)
+    body = bytes(data if bare else data[_HEADER.size :])
+    values = _read_png(body) if body.startswith(_PNG) else _read_rvl(body)
+    if not inverse:
+        return clean_depth(values, 1000)
+    depth = np.zeros(values.shape, np.float32)
+    with np.errstate(divide="ignore", invalid="ignore", over="ignore"):
+        np.divide(a, values - np.float32(b), out=depth, where=values > 0)
+    return clean_depth(depth)
+
+
+def _read_png(data: bytes) -> U2:
+    """Read a 16-bit grey PNG (h, w) without interlacing, as the transport writes it."""
+    offset, packed, shape = len(_PNG), b"", (0, 0)
+    while offset + 8 <= len(data):
+        length, name = struct.unpack_from(">I4s", data, offset)
+        content = data[offset + 8 : offset + 8 + length]
+        if name == b"IHDR" and len(content) == 13:
+            width, height, *kind = struct.unpack(">IIBBBBB", content)
+            if kind[0] != 16 or kind[1] != 0 or kind[4] != 0:
+                msg = "compressed depth is not a 16-bit grey PNG"
+                raise MessageError(msg)
+            shape = (height, width)
+        elif name == b"IDAT":
+            packed += content
+        offset += 12 + length
+    height, width = shape
+    need = height * (1 + 2 * width)
+    if not 0 < height * width <= _LARGEST:
+        msg = f"compressed depth of {width} x {height} pixels"
+        raise MessageError(msg)
+    try:
+        plain = zlib.decompressobj().decompress(packed, need)
+    except zlib.error as error:
+        msg = f"compressed depth is damaged: {error}"
+        raise MessageError(msg) from error
+    if len(plain) != need:
+        msg = "compressed depth is truncated"
+        raise MessageError(msg)
+    rows = np.frombuffer(plain, np.uint8).reshape(height, 1 + 2 * width)
+    return np.asarray(_unfilter(rows).view(">u2").astype(np.uint16))
+
+
+@kernel
+def _unfilter(rows: U1) -> U1:
+    """Undo the row filters of a 16-bit grey PNG (ISO/IEC 15948, 9.2).
+
+    Parameters
+    ----------
+    rows : (h, 1 + 2 w) bytes; each row begins with its filter type.
+
+    Returns
+    -------
+    (h, 2 w) bytes.
+    """
+    height, width = rows.shape[0], rows.shape[1] - 1
+    out = np.zeros((height, width), np.uint8)
+    for y in range(height):
+        method = rows[y, 0]
+        for x in range(width):
+            left = int(out[y, x - 2]) if x >= 2 else 0
+            up = int(out[y - 1, x]) if y > 0 else 0
+            corner = int(out[y - 1, x - 2]) if y > 0 and x >= 2 else 0
+            guess = 0
+            if method == 1:
+                guess = left
+            elif method == 2:
+                guess = up
+            elif method == 3:
+                guess = (left + up) // 2
+            elif method == 4:
+                p = left + up - corner
+                dl, du, dc = abs(p - left), abs(p - up), abs(p - corner)
+                guess = left if dl <= du and dl <= dc else (up if du <= dc else corner)
+            out[y, x] = (rows[y, x + 1] + guess) & 255
+    return out
+
+
+def _read_rvl(data: bytes) -> U2:
+    """Read RVL data: width, height, then nibbles in little-endian 32-bit words."""
+    width, height = struct.unpack_from("<II", data)
+    words = np.frombuffer(data, "<u4", (len(data) - 8) // 4, 8)
+    # A nibble can hold a run of zeros of any length, so only the number of pixels is checked.
+    if not 0 < height * width <= _LARGEST or words.size == 0:
+        msg = "compressed depth is neither PNG nor RVL"
+        raise MessageError(msg)
+    values = np.zeros(height * width, np.uint16)
+    if not _expand_rvl(words.astype(np.uint32), values):
+        msg = "compressed depth (RVL) is damaged"
+        raise MessageError(msg)
+    return values.reshape(height, width)
+
+
+@kernel(inner=True)
+def _number(words: Any, at: int) -> tuple[int, int]:
+    """Read a number from the nibble `at`; return it and the index after it, -1 if the data ends."""
+    value, shift = 0, 0
+    while at < 8 * words.size and shift < 30:
+        nibble = int(words[at // 8] >> np.uint32(28 - 4 * (at % 8))) & 15
+        at += 1
+        value |= (nibble & 7) << shift  # three bits of the value; the fourth is set if more follow
+        shift += 3
+        if nibble & 8 == 0:
+            return value, at
+    return 0, -1
+
+
+@kernel
+def _expand_rvl(words: Any, out: U2) -> bool:
+    """Decode RVL words into `out`, depth values (h * w,); return False if they are damaged.
+
+    Source: Wilson 2017, Fast Lossless Depth Image Compression, DecompressRVL.
+    """
+    at, filled, previous = 0, 0, 0
+    while filled < out.size:
+        zeros, at = _number(words, at)  # (1) length of the run of zeros
+        if at < 0 or zeros > out.size - filled:
+            return False
+        filled += zeros
+        others, at = _number(words, at)  # (2) number of values after it
+        if at < 0 or others > out.size - filled or zeros + others == 0:
+            return False
+        for _ in range(
+            others
+        ):  # (3) each value, as a zigzag-coded difference from the previous one
+            value, at = _number(words, at)
+            if at < 0:
+                return False
+            previous += (value >> 1) ^ -(value & 1)
+            out[filled] = previous & 65535
+            filled += 1
+    return True

@@ -1,0 +1,1 @@
+"""Transforms between frames, poses of cameras, and the up direction."""

@@ -1,0 +1,329 @@
+"""Transforms between coordinate frames over time.
+
+Stamps are integer nanoseconds: today's time as a float in seconds has a resolution of 238 ns.
+"""
+
+import sys
+from bisect import bisect_right
+from collections.abc import Sequence
+from contextlib import suppress
+from typing import Any
+
+import numpy as np
+
+from shapecat.errors import RecordingError, ShapecatError
+from shapecat.geometry import IDENTITY, compose, inverse
+from shapecat.recordings.decoding.foxglove import ros_counterpart
+from shapecat.recordings.messages import Message
+from shapecat.recordings.recording import Recording
+from shapecat.recordings.stamps import stamp_ns
+from shapecat.recordings.transforms.samples import (
+    TransformSample,
+    TransformTrack,
+    interpolated,
+    pose_of,
+)
+from shapecat.recordings.transforms.topics import TF_TYPES, is_held, transform_topics
+from shapecat.types import Pose
+
+__all__ = [
+    "DisconnectedError",
+    "ExtrapolationError",
+    "TransformBuffer",
+    "TransformError",
+    "TransformLoopError",
+    "TransformReader",
+    "UnknownFrameError",
+    "fixed_frame",
+    "read_transforms",
+]
+
+_DEEPEST = 200
+_FIXED = ("map", "odom", "world")
+
+
+class TransformError(ShapecatError):
+    """A transform cannot be determined from the recording."""
+
+
+class UnknownFrameError(TransformError):
+    """A frame does not occur in any transform."""
+
+
+class DisconnectedError(TransformError):
+    """No chain of transforms connects two frames."""
+
+
+class ExtrapolationError(TransformError):
+    """A time is before the first or after the last transform of a frame."""
+
+
+class TransformLoopError(TransformError):
+    """A frame is its own ancestor."""
+
+
+class TransformBuffer:
+    """Transforms between frames; static ones are valid for all times.
+
+    Parameters
+    ----------
+    tolerance_ns : time before its first and after its last sample during which a transform is
+        assumed to be constant, nanoseconds.
+    """
+
+    def __init__(self, *, tolerance_ns: int = 100_000_000) -> None:
+        """Make an empty buffer."""
+        self.tolerance_ns = tolerance_ns
+        self._static: dict[str, TransformSample] = {}
+        self._moving: dict[str, TransformTrack] = {}
+        self._frames: set[str] = set()
+
+    def forget(self, stamp_ns: int) -> None:
+        """Remove the transforms before a time, except the last one of each frame before it."""
+        for track in self._moving.values():
+            track.forget(stamp_ns)
+
+    @property
+    def frames(self) -> tuple[str, ...]:
+        """The names of all frames, sorted."""
+        return tuple(sorted(self._frames))
+
+    def add(
+        self,
+        parent: str,
+        child: str,
+        stamp_ns: int,
+        parent_from_child: tuple[Any, Any],
+        *,
+        static: bool,
+        held: bool = False,
+    ) -> bool:
+        """Add a transform, unless it is invalid.
+
+        Parameters
+        ----------
+        parent_from_child : translation (x, y, z) in metres and quaternion (x, y, z, w).
+        static : whether it is valid for all times; then ``stamp_ns`` is ignored.
+        held : whether it is valid until the next one, however late that is.
+
+        Returns
+        -------
+        Whether it was added; False if the transform is invalid: a frame has no name or is its own
+        parent, a number is not finite, or the quaternion is zero.
+        """
+        parent, child = parent.strip().lstrip("/"), child.strip().lstrip("/")
+        translation, quaternion = (np.asarray(part, np.float64) for part in parent_from_child)
+        with np.errstate(over="ignore", invalid="ignore"):
+            norm = float(np.linalg.norm(quaternion))
+        fine = np.isfinite(translation).all() and np.isfinite(norm) and norm > 1e-6
+        if not (fine and parent and child and parent != child):
+            return False
+        parent = sys.intern(parent)  # one for all samples
+        sample = TransformSample(
+            parent, tuple(translation.tolist()), tuple((quaternion / norm).tolist())
+        )
+        self._frames |= {parent, child}
+        if static:
+            self._static[child] = sample
+        else:
+            track = self._moving.setdefault(child, TransformTrack())
+            track.held |= held
+            track.add(stamp_ns, sample)
+        return True
+
+    def root_of(self, frame_id: str) -> str:
+        """Return the root of a frame's tree, according to the latest transforms.
+
+        Raises
+        ------
+        UnknownFrameError, TransformLoopError
+        """
+        return self._ancestors(self._known(frame_id))[-1]
+
+    def find_loop(self) -> str:
+        """Return the error of a loop in the latest transforms; empty if there is none."""
+        for name in self.frames:
+            try:
+                self._ancestors(name)
+            except TransformLoopError as error:
+                return str(error)
+        return ""
+
+    def lookup(self, target: str, source: str, stamp_ns: int) -> Pose:
+        """Return ``target_from_source`` at a time.
+
+        Between two samples, translations are interpolated linearly and rotations by slerp.
+
+        Raises
+        ------
+        UnknownFrameError, DisconnectedError, ExtrapolationError, TransformLoopError
+        """
+        target, source = self._known(target), self._known(source)
+        up, down = self._ancestors(source, stamp_ns), self._ancestors(target, stamp_ns)
+        shared = next((frame for frame in up if frame in set(down)), None)
+        if shared is None:
+            roots = f"{down[-1]} and {up[-1]}"
+            msg = f"no transform between {target} and {source}: their roots are {roots}"
+            raise DisconnectedError(msg)
+        shared_from_source = self._chain(up[: up.index(shared)], stamp_ns)
+        shared_from_target = self._chain(down[: down.index(shared)], stamp_ns)
+        return compose(inverse(shared_from_target), shared_from_source)
+
+    def _known(self, frame_id: str) -> str:
+        name = frame_id.lstrip("/")
+        if name not in self._frames:
+            some = ", ".join(self.frames[:12]) or "none"
+            msg = f"no transform names the frame {name!r}; known frames: {some}"
+            raise UnknownFrameError(msg)
+        return name
+
+    def _ancestors(self, frame_id: str, stamp_ns: int | None = None) -> list[str]:
+        """Return a frame and its ancestors at a time; by the latest transforms if it is None."""
+        chain = [frame_id]
+        while (parent := self._parent(chain[-1], stamp_ns)) is not None:
+            if parent in chain or len(chain) > _DEEPEST:
+                msg = f"the frames {' < '.join([*chain[-5:], parent])} form a loop"
+                raise TransformLoopError(msg)
+            chain.append(parent)
+        return chain
+
+    def _parent(self, frame_id: str, stamp_ns: int | None) -> str | None:
+        if frame_id in self._static:
+            return self._static[frame_id].parent
+        track = self._moving.get(frame_id)
+        if track is None:
+            return None
+        at = len(track.stamps) if stamp_ns is None else bisect_right(track.stamps, stamp_ns)
+        return track[max(0, at - 1)].parent
+
+    def _chain(self, frames: list[str], stamp_ns: int) -> Pose:
+        """Return the transform from the first frame to the parent of the last."""
+        pose = IDENTITY
+        for frame_id in frames:
+            pose = compose(self._to_parent(frame_id, stamp_ns), pose)
+        return pose
+
+    def _to_parent(self, frame_id: str, stamp_ns: int) -> Pose:
+        if frame_id in self._static:
+            return pose_of(self._static[frame_id])
+        track = self._moving[frame_id]
+        stamps = track.stamps
+        late = 0 if track.held else stamp_ns - stamps[-1]
+        early = stamps[0] - stamp_ns
+        if max(late, early) > self.tolerance_ns:
+            side = (
+                f"{late * 1e-9:.3f} s after the last"
+                if late > 0
+                else f"{early * 1e-9:.3f} s before the first"
+            )
+            msg = f"no transform of {frame_id} at {stamp_ns} ns: that is {side} one"
+            raise ExtrapolationError(msg)
+        at = bisect_right(stamps, stamp_ns)
+        if at in {0, len(stamps)}:
+            return pose_of(track[max(0, at - 1)])
+        before, after = track[at - 1], track[at]
+        if before.parent != after.parent or before == after:
+            return pose_of(before)
+        share = (stamp_ns - stamps[at - 1]) / (stamps[at] - stamps[at - 1])
+        return interpolated(before, after, share)
+
+
+def fixed_frame(buffer: TransformBuffer, frame_id: str, at_ns: int | None = None) -> str | None:
+    """Choose the fixed frame for a sensor frame: map, odom, world, or the root of its tree.
+
+    Parameters
+    ----------
+    at_ns : prefer frames in which the pose of the sensor is known at this stamp: localization may
+        begin late. None to choose by name alone.
+
+    Returns
+    -------
+    The frame id; None if ``frame_id`` is in no transform, if it is the root itself, or if it is in
+    a loop of frames.
+    """
+    try:
+        root = buffer.root_of(frame_id)
+    except TransformError:
+        return None
+    connected = [name for name in buffer.frames if _is_below(buffer, name, root)]
+    found = [n for wanted in _FIXED for n in connected if n.rsplit("/", 1)[-1] == wanted]
+    found += [root] if root != frame_id.lstrip("/") else []
+    known = [
+        name for name in found if at_ns is None or _can_transform(buffer, name, frame_id, at_ns)
+    ]
+    return next(iter(known or found), None)
+
+
+def _can_transform(buffer: TransformBuffer, target: str, source: str, stamp_ns: int) -> bool:
+    try:
+        buffer.lookup(target, source, stamp_ns)
+    except TransformError:
+        return False
+    return True
+
+
+def _is_below(buffer: TransformBuffer, name: str, root: str) -> bool:
+    with suppress(TransformLoopError):
+        return buffer.root_of(name) == root
+    return False
+
+
+def read_transforms(
+    recording: Recording, *, static_only: bool = False, near: Sequence[str] = ()
+) -> TransformBuffer:
+    """Read all transforms of a recording in one pass.
+
+    Parameters
+    ----------
+    near : topics of the sensors, which decide between robots, see `transform_topics`.
+    static_only : read only static transforms, which are few: their topics end in ``tf_static``.
+    """
+    reader = TransformReader(recording, TransformBuffer())
+    static, moving = transform_topics(recording, near)
+    topics = static if static_only else static | moving
+    for message in recording.messages(topics) if topics else ():
+        reader.take(message)
+    return reader.buffer
+
+
+class TransformReader:
+    """Adds the transforms in messages to a buffer.
+
+    Attributes
+    ----------
+    lag_ns : the largest difference between stamp and log time of a transform that is not static.
+    """
+
+    def __init__(self, recording: Recording, buffer: TransformBuffer) -> None:
+        """Read messages of ``recording`` into ``buffer``."""
+        self.buffer = buffer
+        self.lag_ns = 0
+        self._recording = recording
+
+    def take(self, message: Message) -> None:
+        """Add the transforms in a message; invalid ones cause a warning."""
+        if ros_counterpart(message.type) not in TF_TYPES:
+            return
+        static = message.topic.endswith("tf_static")
+        held = is_held(message.type)
+        try:
+            for transform in self._recording.decode(message).transforms:
+                stamp = stamp_ns(transform.header) or message.log_time_ns
+                if not self._add(transform, stamp, static=static, held=held):
+                    self._recording.warn("skipped invalid transforms (NaN, no name)")
+                if not static:
+                    self.lag_ns = max(self.lag_ns, abs(stamp - message.log_time_ns))
+        except (AttributeError, TypeError, ValueError, RecordingError) as error:
+            self._recording.warn(f"skipped transforms: {error}")
+
+    def _add(self, transform: Any, stamp: int, *, static: bool, held: bool) -> bool:
+        """Add a decoded geometry_msgs/TransformStamped; return False if it is invalid."""
+        move, turn = transform.transform.translation, transform.transform.rotation
+        return self.buffer.add(
+            transform.header.frame_id,
+            transform.child_frame_id,
+            stamp,
+            ((move.x, move.y, move.z), (turn.x, turn.y, turn.z, turn.w)),
+            static=static,
+            held=held,
+        )

@@ -1,0 +1,130 @@
+"""The pose of the depth sensor in the frame of the colour camera."""
+
+from contextlib import suppress
+from functools import cached_property
+from typing import Any
+
+import numpy as np
+
+from shapecat.errors import RecordingError
+from shapecat.geometry import IDENTITY, compose, inverse, rotation_from_quaternion
+from shapecat.recordings.colour_streams import ColourStream
+from shapecat.recordings.messages import MALFORMED
+from shapecat.recordings.recording import Recording
+from shapecat.recordings.streams import Stream, first_message
+from shapecat.recordings.transforms.buffer import (
+    ExtrapolationError,
+    TransformBuffer,
+    TransformError,
+    read_transforms,
+)
+from shapecat.recordings.transforms.window import TransformWindow
+from shapecat.types import Pose
+
+__all__ = ["Extrinsics"]
+
+_DRIVER = "/extrinsics/depth_to_color"
+
+
+class Extrinsics:
+    """The transform from a depth sensor to a colour camera.
+
+    Sources are, in this order: static transforms, all transforms, and librealsense's own messages
+    (``extrinsics/depth_to_color`` of its ROS driver, ``tf/N`` of its recorder).
+    """
+
+    def __init__(self, recording: Recording, depth: Stream, colour: ColourStream) -> None:
+        """Store the streams; transforms are read on first use."""
+        self._recording = recording
+        self._depth, self._colour = depth, colour
+        self._static: dict[tuple[str, str], Pose] = {}
+
+    @cached_property
+    def _still(self) -> TransformBuffer:
+        return read_transforms(self._recording, static_only=True, near=[self._depth.topic])
+
+    @cached_property
+    def _moving(self) -> TransformWindow:
+        return TransformWindow.of(self._recording, [self._depth.topic])
+
+    def colour_from_depth(
+        self, depth_frame: str, colour_frame: str, log_time_ns: int, stamp_ns: int
+    ) -> Pose | None:
+        """Return ``colour_from_depth`` at a time, or None if the recording does not hold it.
+
+        Parameters
+        ----------
+        depth_frame, colour_frame : frame ids of the messages.
+        log_time_ns, stamp_ns : those of the depth image, nanoseconds. Images come in the order of
+            the recording.
+        """
+        recorder = self._depth.topic.startswith("/device_")  # whose frame ids are numbers
+        if depth_frame == colour_frame and not recorder:
+            return IDENTITY if depth_frame else self._realsense  # two cameras may have no name
+        frames = depth_frame, colour_frame
+        if frames in self._static:
+            return self._static[frames]
+        if not recorder:
+            pose = self._lookup(self._still, depth_frame, colour_frame, stamp_ns)
+            if pose is not None:
+                self._static[frames] = pose
+                return pose
+            moving = self._moving.around(log_time_ns, stamp_ns)
+            pose = self._lookup(moving, depth_frame, colour_frame, stamp_ns)
+            if pose is not None:
+                return pose
+        return self._realsense
+
+    def _lookup(
+        self, buffer: TransformBuffer, depth_frame: str, colour_frame: str, stamp_ns: int
+    ) -> Pose | None:
+        """Look up a transform; None if it is missing."""
+        with suppress(TransformError):
+            try:
+                return buffer.lookup(colour_frame, depth_frame, stamp_ns)
+            except ExtrapolationError:
+                self._recording.warn(
+                    f"{self._colour.topic}: no transform from {depth_frame} to {colour_frame} "
+                    "at the time of some frames"
+                )
+        return None
+
+    @cached_property
+    def _realsense(self) -> Pose | None:
+        """Read librealsense's ``p_colour = rotation @ p_depth + translation``; None if absent."""
+        for topic in self._driver_topics():
+            with suppress(RecordingError, *MALFORMED):
+                pose = _driver_pose(first_message(self._recording, topic))
+                if pose is not None:
+                    return pose
+        depth, colour = (self._recorder_pose(s.topic) for s in (self._depth, self._colour))
+        if depth is None or colour is None:
+            return None
+        return compose(colour, inverse(depth))
+
+    def _driver_topics(self) -> list[str]:
+        """Return the topics around the depth topic, nearest first, or the only one there is."""
+        names = {t.name for t in self._recording.topics if f"/{t.name}".endswith(_DRIVER)}
+        around = [n for n in names if self._depth.topic.startswith(n.removesuffix(_DRIVER[1:]))]
+        return sorted(around, key=len, reverse=True) or (list(names) if len(names) == 1 else [])
+
+    def _recorder_pose(self, image: str) -> Pose | None:
+        """Return ``stream_from_reference`` as librealsense's recorder wrote it; None if absent."""
+        prefix = f"{image.rpartition('/image')[0]}/tf/"
+        for topic in self._recording.topics:
+            if topic.name.startswith(prefix) and len(prefix) > 4:
+                with suppress(RecordingError, *MALFORMED):
+                    message = first_message(self._recording, topic.name)
+                    move, turn = message.translation, message.rotation
+                    rotation = rotation_from_quaternion((turn.x, turn.y, turn.z, turn.w))
+                    return Pose(rotation, np.array([move.x, move.y, move.z]))
+        return None
+
+
+def _driver_pose(message: Any) -> Pose | None:
+    rotation = np.asarray(message.rotation, np.float64).reshape(3, 3).T  # stored by columns
+    translation = np.asarray(message.translation, np.float64)
+    good = (
+        np.allclose(rotation @ rotation.T, np.eye(3), atol=1e-3) and np.isfinite(translation).all()
+    )
+    return Pose(rotation, translation) if good else None

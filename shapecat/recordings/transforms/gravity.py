@@ -1,0 +1,290 @@
+"""The up direction and the sensor pose in each frame of a recording."""
+
+from collections.abc import Sequence
+from dataclasses import dataclass, field
+from typing import NamedTuple
+
+import numpy as np
+
+from shapecat.arrays import F4, F8
+from shapecat.errors import ConfigError
+from shapecat.geometry import compose, unit_direction
+from shapecat.recordings.recording import Recording
+from shapecat.recordings.streams import Stream
+from shapecat.recordings.transforms.buffer import TransformError, fixed_frame
+from shapecat.recordings.transforms.imu import Accelerometers
+from shapecat.recordings.transforms.window import TransformWindow
+from shapecat.types import Frame, Pose
+
+__all__ = ["MISNAMED", "Orientation", "Upright", "has_z_up", "turned"]
+
+_LEVEL_FRAMES = ("map", "odom", "world", "earth", "base_footprint", "base_link")
+"""Frames whose z axis is up by convention (REP 105, REP 103), also after the name of a robot."""
+_FROM_OPTICAL = np.array([[0.0, 0, 1], [-1, 0, 0], [0, -1, 0]])
+"""Rotation from an optical frame (x right, z forward) to that of its camera (x forward, z up)."""
+MISNAMED = {
+    "its data are in an optical frame (z forward), although the frame they name has x forward": (
+        _FROM_OPTICAL
+    ),
+    "its points have x forward, although the frame they name is an optical one (z forward)": (
+        _FROM_OPTICAL.T
+    ),
+    "its data and the frame they name differ as the conventions of ROS and OpenGL (z backward)": (
+        np.diag([1.0, -1.0, -1.0])
+    ),
+}
+"""Ways in which simulators name a frame that is not that of the data, the usual one first: the
+rotation from the frame of the data to the frame they name."""
+_SOURCES = {"auto": ("tf", "imu"), "tf": ("tf",), "imu": ("imu",)}
+
+
+class Orientation(NamedTuple):
+    """Up direction and pose of the sensor in a frame, from the recording.
+
+    Attributes
+    ----------
+    source : source of ``up``; empty without one.
+    up : (3,) the up direction in the sensor frame, a unit vector; None if unknown.
+    fixed_from_sensor : the pose of the sensor in the fixed frame; None if unknown.
+    """
+
+    source: str
+    up: F4 | None
+    fixed_from_sensor: Pose | None
+
+
+@dataclass
+class Upright:
+    """The up direction, and the pose of the sensor in the fixed frame, for each frame.
+
+    Frames are looked up in the order of the recording, since little is kept of what came before.
+
+    Attributes
+    ----------
+    fixed_frame : None until it is chosen at the first frame.
+    vector : (3,) the up direction in the sensor frame that the user gave, or None.
+    sources : ``tf`` and ``imu``, in the order in which they are tried; empty with a vector.
+    warnings : for the user.
+    dropped : for each topic whose given up direction is ignored, the source of that direction.
+    failed, first_failure : the number of failed look-ups, and the error of the first.
+    given : the number of frames whose up direction is from each source.
+    misnamed : the rotation, of `MISNAMED`, of each topic whose data are not in the frame they name.
+    sensors : the frame ids of all sensors, as far as they are known.
+    middle_ns : log time of the middle of the recording, nanoseconds.
+    """
+
+    transforms: TransformWindow
+    fixed_frame: str | None
+    vector: F4 | None
+    sources: tuple[str, ...]
+    accelerometers: Accelerometers | None = None
+    warnings: list[str] = field(default_factory=list)
+    dropped: dict[str, str] = field(default_factory=dict)
+    failed: int = 0
+    first_failure: str = ""
+    given: dict[str, int] = field(default_factory=dict)
+    misnamed: dict[str, F8] = field(default_factory=dict)
+    sensors: tuple[str, ...] = ()
+    middle_ns: int = 0
+
+    @classmethod
+    def of(
+        cls,
+        recording: Recording,
+        *,
+        up: str,
+        fixed_frame: str | None,
+        streams: Sequence[Stream] = (),
+    ) -> "Upright":
+        """Read the first transforms and accelerations of a recording.
+
+        Parameters
+        ----------
+        up : ``tf``, ``imu``, ``auto`` for the first of these that is available, or a vector
+            ``X,Y,Z`` in the sensor frame.
+        fixed_frame : name of the frame in which the scene is at rest, with or without a leading
+            slash; None to choose one.
+        streams : those whose frames will be looked up.
+
+        Raises
+        ------
+        ConfigError : ``up`` is malformed, or the recording lacks the wanted source or frame.
+        """
+        sources = _SOURCES.get(up, ())
+        vector = None if sources else _parse_vector(up)
+        transforms = TransformWindow.of(recording, [stream.topic for stream in streams])
+        known_frames = transforms.tree.frames
+        wanted = None if fixed_frame is None else fixed_frame.lstrip("/")
+        if wanted is not None and wanted not in known_frames:
+            known = ", ".join(known_frames) or "none, it has no transforms"
+            msg = f"--fixed-frame {fixed_frame}: not in {recording.path}; its frames: {known}"
+            raise ConfigError(msg)
+        if up == "tf" and not _level_frames(known_frames, ""):
+            msg = (
+                f"--up tf: {recording.path} has no transforms to any of {', '.join(_LEVEL_FRAMES)}"
+            )
+            raise ConfigError(msg)
+        found = Accelerometers(recording) if "imu" in sources else None
+        if up == "imu" and not (found and found.measure_anything()):
+            msg = f"--up imu: {recording.path} has no sensor_msgs/Imu with accelerations"
+            raise ConfigError(msg)
+        loop = transforms.tree.find_loop()
+        warnings = [f"transforms: {loop}"] if loop else []
+        sensors = tuple(stream.frame_id for stream in streams)
+        middle_ns = (recording.start_ns + recording.end_ns) // 2
+        return cls(
+            transforms,
+            wanted,
+            vector,
+            sources,
+            found,
+            warnings,
+            sensors=sensors,
+            middle_ns=middle_ns,
+        )
+
+    def orient(self, frame: Frame) -> Orientation:
+        """Look up the up direction and the pose of the sensor in a frame."""
+        return Orientation(*self._find(frame), self.fixed_from_sensor(frame))
+
+    def fixed_from_sensor(self, frame: Frame) -> Pose | None:
+        """Return the pose of the sensor in the fixed frame, or None if it is unknown."""
+        if self.fixed_frame is None:
+            self.fixed_frame = self._choose_fixed_frame(frame)
+        if self.fixed_frame is None:
+            return None
+        return self._lookup(self.fixed_frame, frame)
+
+    def _choose_fixed_frame(self, first: Frame) -> str | None:
+        """Choose the fixed frame of all sensors, one named after a map or odometry if there is.
+
+        The pose of the sensors should be known in it halfway through the recording, since most
+        frames must have a pose for their objects to be tracked there.
+        """
+        halfway_ns = first.stamp_ns + max(0, self.middle_ns - first.log_time_ns)
+        found = [
+            fixed_frame(self.transforms.tree, name, halfway_ns)
+            for name in (first.frame_id, *self.sensors)
+        ]
+        own = None if first.frame_from_sensor is None else first.frame_id.lstrip("/")
+        return min((name for name in found if name is not None), key=_rank, default=own)
+
+    def corrected(self, topic: str, orientation: Orientation) -> Orientation:
+        """Return an orientation of the data on a topic, given that of the frame they name."""
+        source, up, pose = orientation
+        turn = self.misnamed.get(topic)
+        if turn is None:
+            return orientation
+        if pose is not None:
+            pose = Pose(pose.rotation @ turn, pose.translation)
+        return Orientation(source, None if up is None else turned(up, turn), pose)
+
+    def assume_misnamed(self, topic: str, how: str) -> None:
+        """Take the data on a topic for misnamed in one of the ways of `MISNAMED` from now on."""
+        self.misnamed[topic] = MISNAMED[how]
+        self.warnings.append(f"{topic}: {how}; its transforms are corrected")
+
+    def accept(self, topic: str, orientation: Orientation) -> F4 | None:
+        """Count where an up direction comes from, and return it; None if the topic's is dropped."""
+        up = None if topic in self.dropped else orientation.up
+        source = "planes" if up is None else orientation.source
+        self.given[source] = self.given.get(source, 0) + 1
+        return up
+
+    def _find(self, frame: Frame) -> tuple[str, F4 | None]:
+        if not self.sources:
+            return "option", self.vector
+        source, vector = "", None
+        if "tf" in self.sources:
+            source, vector = self._from_transforms(frame)
+        if "imu" in self.sources and vector is None:
+            source, vector = self._from_accelerometer(frame)
+        return source, vector
+
+    def contradict(self, topic: str, source: str, angles_deg: Sequence[float]) -> None:
+        """Warn that the planes contradict a topic's up direction; drop it unless the user chose it.
+
+        Parameters
+        ----------
+        source : source of the up direction, as in `Orientation`.
+        angles_deg : angles between the up direction and that of the planes, one per frame.
+        """
+        off = f"differs by {np.median(angles_deg):.0f} degrees from the planes of {topic}"
+        if not self.sources:
+            self.warnings.append(f"--up {off}: is it right? --up auto estimates up from the planes")
+        elif len(self.sources) == 1:
+            self.warnings.append(f"up ({source}) {off}: is --up {self.sources[0]} right?")
+        else:
+            self.dropped[topic] = source
+            name = "imu" if source.startswith("imu") else "tf"
+            self.warnings.append(f"up ({source}) {off} and is ignored; give --up {name} to use it")
+
+    def _from_transforms(self, frame: Frame) -> tuple[str, F4 | None]:
+        name = frame.frame_id.lstrip("/")
+        own = () if frame.frame_from_sensor is None else (name,)
+        for level in _level_frames((*self.transforms.tree.frames, *own), name):
+            pose = self._lookup(level, frame)
+            if pose is not None:
+                return f"transforms, z of {level}", np.asarray(pose.rotation[2], np.float32)
+        return "", None
+
+    def _from_accelerometer(self, frame: Frame) -> tuple[str, F4 | None]:
+        if self.accelerometers is None:
+            return "", None
+        for sensor in self.accelerometers.around(frame.log_time_ns, frame.stamp_ns):
+            up = sensor.up(frame.stamp_ns)
+            pose = None
+            if sensor.frame_id != frame.frame_id or frame.frame_from_sensor is not None:
+                pose = self._lookup(sensor.frame_id, frame)
+                up = None if pose is None or up is None else up @ pose.rotation
+            if up is not None:
+                return f"imu, {sensor.topic}", np.asarray(up, np.float32)
+        return "", None
+
+    def _lookup(self, target: str, frame: Frame) -> Pose | None:
+        """Return the pose of the sensor in a frame; None if it is unknown."""
+        transforms = self.transforms.around(frame.log_time_ns, frame.stamp_ns)
+        own = frame.frame_from_sensor
+        if own is not None and target == frame.frame_id.lstrip("/"):  # it may be in no transform
+            return own
+        try:
+            pose = transforms.lookup(target, frame.frame_id, frame.stamp_ns)
+            return pose if own is None else compose(pose, own)
+        except TransformError as error:
+            self.failed += 1
+            self.first_failure = self.first_failure or str(error)
+            return None
+
+
+def _level_frames(frames: Sequence[str], sensor: str) -> list[str]:
+    """Return the level frames, best first: those of the sensor's robot before those of others."""
+
+    def order(name: str) -> tuple[int, bool, bool]:
+        robot = name.rpartition("/")[0]
+        return _rank(name), robot != "", not sensor.startswith(f"{robot}/")
+
+    return sorted(filter(has_z_up, frames), key=order)
+
+
+def turned(up: F4, named_from_data: F8) -> F4:
+    """Return a direction (3,) of the frame that data name in the frame of the data."""
+    return np.asarray(up @ named_from_data, np.float32)
+
+
+def has_z_up(frame_id: str) -> bool:
+    """Return whether z is up in a frame by convention, and the frame thus not one of a camera."""
+    return _rank(frame_id) < len(_LEVEL_FRAMES)
+
+
+def _rank(name: str) -> int:
+    """Return the place of a frame among the level ones, whatever its robot; after all if none."""
+    plain = name.rpartition("/")[2]
+    return _LEVEL_FRAMES.index(plain) if plain in _LEVEL_FRAMES else len(_LEVEL_FRAMES)
+
+
+def _parse_vector(text: str) -> F4:
+    try:
+        return unit_direction([float(part) for part in text.split(",")]).astype(np.float32)
+    except ValueError:
+        msg = f"--up {text}: expected auto, tf, imu, or a vector such as 0,-1,0"
+        raise ConfigError(msg) from None

@@ -1,0 +1,76 @@
+"""Find the topics with transforms, which several robots may publish in their own namespaces."""
+
+from collections.abc import Mapping, Sequence
+from contextlib import suppress
+from typing import NamedTuple
+
+from shapecat.recordings.decoding.foxglove import ros_counterpart
+from shapecat.recordings.messages import MALFORMED
+from shapecat.recordings.recording import Recording
+from shapecat.recordings.streams import first_messages
+
+__all__ = ["TF_TYPES", "TransformTopics", "is_held", "transform_topics"]
+
+TF_TYPES = ("tf2_msgs/msg/TFMessage", "tf/msg/tfMessage")
+
+
+class TransformTopics(NamedTuple):
+    """The topics with static transforms, and those with others."""
+
+    static: set[str]
+    moving: set[str]
+
+
+def transform_topics(recording: Recording, near: Sequence[str] = ()) -> TransformTopics:
+    """Return the topics of a recording that hold transforms.
+
+    If frames of the same name are on ``/r1/tf`` and ``/r2/tf``, the namespace around the topics in
+    ``near`` counts, and the topic of the other robot is left out. ``/tf`` always counts.
+    """
+    topics = {t.name for t in recording.topics if ros_counterpart(t.type) in TF_TYPES}
+    spaces = {topic: topic.strip("/").rpartition("/")[0] for topic in sorted(topics)}
+    spaces = {topic: space for topic, space in spaces.items() if space}
+    if len(set(spaces.values())) > 1:
+        topics -= _of_other_robots(recording, spaces, near)
+    static = {name for name in topics if name.endswith("tf_static")}
+    return TransformTopics(static, topics - static)
+
+
+def is_held(kind: str) -> bool:
+    """Return whether transforms in messages of a type are valid until the next: Foxglove's are."""
+    return ros_counterpart(kind) in TF_TYPES and kind not in TF_TYPES
+
+
+def _of_other_robots(
+    recording: Recording, spaces: Mapping[str, str], near: Sequence[str]
+) -> set[str]:
+    """Return the topics to leave out, given the namespace of each."""
+    around = {
+        max(
+            (s for s in spaces.values() if name.strip("/").startswith(f"{s}/")), key=len, default=""
+        )
+        for name in near
+    }
+    left: set[str] = set()
+    known: dict[str, str] = {}  # a topic by frame
+    for topic in sorted(spaces, key=lambda topic: spaces[topic] not in around):
+        frames = _frames(recording, topic)
+        others = [known[f] for f in frames if f in known and spaces[known[f]] != spaces[topic]]
+        nearer = [other for other in others if spaces[other] in around]
+        if nearer and spaces[topic] not in around:
+            recording.warn(f"transforms on {topic} are ignored: those on {nearer[0]} are nearer")
+            left.add(topic)
+            continue
+        if others:
+            recording.warn(f"transforms on {others[0]} and {topic} have frames of the same name")
+        known |= {frame: topic for frame in frames if frame not in known}
+    return left
+
+
+def _frames(recording: Recording, topic: str) -> list[str]:
+    """Return the child frames in the first transforms on a topic, sorted."""
+    frames: set[str] = set()
+    with suppress(*MALFORMED):
+        for message in first_messages(recording, topic):
+            frames |= {one.child_frame_id.strip().lstrip("/") for one in message.transforms}
+    return sorted(frames)

@@ -1,0 +1,72 @@
+"""The transforms of a recording around its frames, in constant memory."""
+
+from collections.abc import Sequence
+from copy import deepcopy
+
+from shapecat.recordings.look_ahead import AROUND_NS, LookAhead, is_read_at_once
+from shapecat.recordings.recording import Recording
+from shapecat.recordings.transforms.buffer import (
+    TransformBuffer,
+    TransformReader,
+    read_transforms,
+)
+from shapecat.recordings.transforms.topics import is_held, transform_topics
+
+__all__ = ["TransformWindow"]
+
+_LAG_NS = AROUND_NS // 2
+"""If transforms are logged farther from their stamps, all are read at once."""
+_NEAR_NS = 1_000_000_000
+"""Half the time around the middle of the recording of which transforms are read at first."""
+
+
+class TransformWindow:
+    """The transforms that are known when a frame looks one up.
+
+    Attributes
+    ----------
+    tree : the static transforms, and the others from the first, the middle and the last seconds of
+        the recording. They give the names of all frames, and their parents.
+    """
+
+    def __init__(
+        self,
+        known: TransformBuffer,
+        tree: TransformBuffer | None = None,
+        ahead: LookAhead | None = None,
+    ) -> None:
+        """Use ``known``, which ``ahead`` keeps filled; without it, these are all transforms."""
+        self.tree = known if tree is None else tree
+        self._known, self._ahead = known, ahead
+
+    @classmethod
+    def of(cls, recording: Recording, near: Sequence[str] = ()) -> "TransformWindow":
+        """Read the static transforms of a recording, and the first, middle and last of the others.
+
+        The topics in ``near`` decide between robots, see `transform_topics`.
+        """
+        topics = transform_topics(recording, near).moving
+        static_only = not is_read_at_once(recording)
+        known = read_transforms(recording, static_only=static_only, near=near)
+        if is_read_at_once(recording) or not topics:
+            return cls(known)
+        reader = TransformReader(recording, known)
+        kinds = {topic.type for topic in recording.topics if topic.name in topics}
+        skips = not any(map(is_held, kinds))
+        ahead = LookAhead(recording, topics, reader.take, known.forget, skips=skips)
+        end = TransformReader(recording, deepcopy(known))
+        middle_ns, end_ns = (recording.start_ns + recording.end_ns) // 2, recording.end_ns
+        spans = (middle_ns - _NEAR_NS, middle_ns + _NEAR_NS), (end_ns - AROUND_NS, None)
+        for start_ns, stop_ns in spans:
+            for message in recording.messages(topics, start_ns, stop_ns):
+                end.take(message)
+        if max(reader.lag_ns, end.lag_ns) <= _LAG_NS:
+            return cls(known, end.buffer, ahead)
+        ahead.read_all()
+        return cls(known)
+
+    def around(self, log_time_ns: int, stamp_ns: int) -> TransformBuffer:
+        """Return the transforms for a frame, given its log time and stamp in nanoseconds."""
+        if self._ahead is not None:
+            self._ahead.reach(log_time_ns, stamp_ns)
+        return self._known

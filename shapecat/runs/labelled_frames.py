@@ -1,0 +1,197 @@
+"""Join the tables and labels of a run into labelled frames for the outputs."""
+
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pyarrow as pa
+import pyarrow.compute
+
+from shapecat.arrays import F4
+from shapecat.geometry import box_around
+from shapecat.runs.labels.meaning import TrackLabel
+from shapecat.runs.shown import ShownTracks, misfit
+from shapecat.runs.tables.masks import read_masks
+from shapecat.runs.tables.reading import Key, numbers, read_together
+from shapecat.system.memory import release_memory
+from shapecat.types import (
+    Box,
+    ImageMasks,
+    LabelledFrame,
+    LabelledObject,
+    NeuralGas,
+    Plane,
+    Pose,
+)
+
+__all__ = ["plane_of", "read_labelled_frames", "rows_by_frame"]
+
+
+_OBJECT = (
+    "topic",
+    "frame",
+    "detection",
+    "touches_border",
+    "occluded",
+    "center",
+    "size",
+    "orientation",
+    "height_m",
+    "indices",
+    "posterior",
+    "neurons",
+    "edges",
+)
+"""Columns of a detection that the outputs show."""
+
+
+def read_labelled_frames(folder: Path, labels: Mapping[int, TrackLabel]) -> Iterator[LabelledFrame]:
+    """Yield the frames of a run in reading order, with their final labels.
+
+    Tracks missing from ``labels`` (deleted by a person) are left out. Merged tracks have the same
+    number; if several of them are in one frame, they are joined into one object.
+
+    Raises
+    ------
+    OutputError : a table is unreadable, or tracks and detections do not fit together.
+    """
+    shown = ShownTracks.read(folder, labels, causal=True)
+    release_memory()  # of the table of tracks
+    masks = _MasksByFrame(read_masks(folder))
+    tables = {"frames": None, "detections": _OBJECT, "planes": None}
+    for frames, detections, planes in read_together(folder, tables):
+        objects = rows_by_frame(detections)
+        supports = rows_by_frame(planes)
+        for row in frames.to_pylist():
+            key = (row["topic"], row["frame"])
+            found = {row["detection"]: row for row in objects.get(key, [])}
+            if any(item.detection not in found for item in shown.of(key)):
+                raise misfit(folder)
+            frame = _labelled_frame(row, found, supports.get(key, []), shown)
+            yield replace(frame, masks=masks.of(key))
+
+
+class _MasksByFrame:
+    """The masks of frames, requested in the order of the table; some frames have none."""
+
+    def __init__(self, rows: Iterator[tuple[Key, ImageMasks]]) -> None:
+        self._rows = rows
+        self._next = next(rows, None)
+
+    def of(self, key: Key) -> ImageMasks | None:
+        """Return the masks of a frame; None if it has none."""
+        if self._next is None or self._next[0] != key:
+            return None
+        found, self._next = self._next[1], next(self._rows, None)
+        return found
+
+
+def rows_by_frame(table: pa.Table) -> dict[tuple[str, int], list[dict[str, Any]]]:
+    """Group rows by frame; the values of list columns without nulls become arrays."""
+    columns = {name: _values(table[name]) for name in table.column_names}
+    grouped: dict[tuple[str, int], list[dict[str, Any]]] = {}
+    for k in range(table.num_rows):
+        row = {name: values[k] for name, values in columns.items()}
+        grouped.setdefault((row["topic"], row["frame"]), []).append(row)
+    return grouped
+
+
+def _values(column: pa.ChunkedArray) -> Sequence[Any]:
+    """Return the values of a column: arrays for a list column without nulls, else Python values."""
+    fixed = pa.types.is_fixed_size_list(column.type)
+    if column.null_count or not (fixed or pa.types.is_list(column.type)):
+        return list(column.to_pylist())
+    if fixed:
+        return list(numbers(column).reshape(len(column), column.type.list_size))
+    stops = np.cumsum(pa.compute.list_value_length(column).to_numpy()).tolist()
+    flat = numbers(column)
+    return [flat[a:b] for a, b in zip([0, *stops[:-1]], stops, strict=True)] if stops else []
+
+
+def _labelled_frame(
+    row: Mapping[str, Any],
+    found: Mapping[int, Mapping[str, Any]],
+    planes: Sequence[Mapping[str, Any]],
+    shown: ShownTracks,
+) -> LabelledFrame:
+    key = (row["topic"], row["frame"])
+    pose = None
+    if row["fixed_translation"] is not None:
+        pose = Pose(np.reshape(row["fixed_rotation"], (3, 3)), row["fixed_translation"])
+    parts: dict[int, list[LabelledObject]] = {}
+    for item in shown.of(key):
+        causal = shown.causal[item.row]
+        full = shown.full[item.row]
+        part = _labelled_object(found[item.detection], causal, item.label, full)
+        parts.setdefault(item.label.track, []).append(part)
+    return LabelledFrame(
+        topic=row["topic"],
+        index=row["frame"],
+        stamp_ns=row["stamp_ns"],
+        log_time_ns=row["log_time_ns"],
+        frame_id=row["frame_id"],
+        fixed_from_sensor=pose,
+        planes=tuple(plane_of(plane) for plane in planes),
+        objects=tuple(_join(seen, row["up"]) for seen in parts.values()),
+        ended=shown.ended.get(key, ()),
+        seconds=dict(zip(row["stages"], row["seconds"], strict=True)),
+        up=row["up"],
+        reused_from=row["reused_from"],
+    )
+
+
+def plane_of(row: Mapping[str, Any]) -> Plane:
+    """Return the plane of a row of planes.parquet."""
+    return Plane(
+        normal=row["normal"],
+        offset=row["offset"],
+        outline=np.reshape(row["outline"], (-1, 3)),
+        area_m2=row["area_m2"],
+        height_m=row["height_m"],
+    )
+
+
+def _labelled_object(
+    row: Mapping[str, Any], causal: F4, label: TrackLabel, full: F4
+) -> LabelledObject:
+    return LabelledObject(
+        track=label.track,
+        category=label.category,
+        confidence=label.confidence,
+        box=Box(row["center"], row["size"], row["orientation"]),
+        indices=row["indices"],
+        gas=NeuralGas(row["neurons"].reshape(-1, 3), row["edges"].reshape(-1, 2)),
+        posterior=row["posterior"],
+        causal=causal,
+        height_m=row["height_m"],
+        touches_border=row["touches_border"],
+        occluded=row["occluded"],
+        detections=(row["detection"],),
+        full=None if np.isnan(full[0]) else Box(full[:3], full[3:6], full[6:]),
+    )
+
+
+def _join(parts: Sequence[LabelledObject], up: Sequence[float]) -> LabelledObject:
+    """Join the parts of a merged track in one frame into one object."""
+    if len(parts) == 1:
+        return parts[0]
+    box = box_around([part.box for part in parts], up)
+    full = box_around([part.full or part.box for part in parts], up)
+    bottoms = [float(np.dot(up, part.box.center)) - part.height_m for part in parts]
+    starts = np.cumsum([0, *(len(part.gas.neurons) for part in parts)])
+    edges = [part.gas.edges + start for part, start in zip(parts, starts[:-1], strict=True)]
+    return replace(
+        parts[0],
+        box=box,
+        indices=np.unique(np.concatenate([part.indices for part in parts])),
+        gas=NeuralGas(np.concatenate([part.gas.neurons for part in parts]), np.concatenate(edges)),
+        posterior=np.mean([part.posterior for part in parts], axis=0),
+        causal=np.mean([part.causal for part in parts], axis=0),
+        height_m=float(np.dot(up, box.center) - np.fmin.reduce(bottoms)),  # NaN without a plane
+        touches_border=any(part.touches_border for part in parts),
+        occluded=any(part.occluded for part in parts),
+        detections=tuple(number for part in parts for number in part.detections),
+        full=full if any(part.full for part in parts) else None,
+    )

@@ -1,0 +1,1 @@
+"""The labels that a person gives the tracks of a run: read, interpreted, applied, transferred."""

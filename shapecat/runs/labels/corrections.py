@@ -1,0 +1,330 @@
+"""Corrections of a run: the column ``label`` of tracks.csv, checked and applied."""
+
+import re
+from collections.abc import Iterable, Mapping, Sequence
+from contextlib import suppress
+from dataclasses import replace
+from pathlib import Path
+
+from shapecat.errors import OutputError
+from shapecat.runs.folder import read_run, require_work
+from shapecat.runs.labels.meaning import (
+    DELETE,
+    TrackLabel,
+    find_misread,
+    merged_with,
+    resolve_labels,
+)
+from shapecat.runs.labels.track_table import (
+    LABEL_SEEN,
+    ORIGINAL,
+    TrackRow,
+    TrackTable,
+    parse_number,
+    read_track_table,
+    with_label,
+    write_track_table,
+)
+from shapecat.system.files import holding, replacing
+
+__all__ = [
+    "LOST",
+    "PREVIOUS",
+    "adopt_labels",
+    "correct_label",
+    "has_labels",
+    "read_labels",
+    "read_own_table",
+    "relabel",
+]
+
+PREVIOUS = "tracks.previous.csv"
+LOST = "tracks.previous-*.csv"
+"""Names of replaced tables of which labels could not be transferred; nothing replaces these."""
+_LISTED = 10
+"""Maximum number of missing tracks that an error lists."""
+
+
+def read_labels(path: Path, categories: Iterable[str] = ()) -> dict[int, TrackLabel]:
+    """Read the final label of each track; deleted tracks are missing.
+
+    A label that a person filled in replaces the category and has confidence 1. Two tracks can be
+    merged if they have a topic in common, or if run.json beside the table has a fixed frame.
+
+    Parameters
+    ----------
+    categories : the model's categories; the categories in the table are known as well.
+
+    Raises
+    ------
+    OutputError : the table is unreadable, belongs to another run, or has invalid lines, which the
+        error message lists.
+    """
+    table, problems = read_own_table(path)
+    labels, misread = resolve_labels(table.rows, categories, one_frame=_one_frame(path.parent))
+    _refuse(path, [*problems, *_lines(table.rows, misread)])
+    return labels
+
+
+def read_own_table(path: Path) -> tuple[TrackTable, list[str]]:
+    """Read the labels and added columns in the tracks.csv of a run, and the problems of its lines.
+
+    Other cells and the order are those of tracks.original.csv; missing tracks are a problem.
+
+    Raises
+    ------
+    OutputError : the table is unreadable, or belongs to another run.
+    """
+    table = read_track_table(path)
+    _require_same_run(path, table, path.parent)
+    if not path.with_name(ORIGINAL).exists():  # of a run by an earlier version
+        return table, list(table.problems)
+    own = read_track_table(path.with_name(ORIGINAL))
+    given = {row.track: row for row in table.rows}
+    missing = [f"#{row.track}" for row in own.rows if row.track not in given]
+    problems = [*table.problems, *_contradictions(table, own)]
+    if missing:
+        more = f" and {len(missing) - _LISTED} more" if len(missing) > _LISTED else ""
+        problems.append(
+            f"missing: {', '.join(missing[:_LISTED])}{more}; restore the lines from {ORIGINAL}, or "
+            f"write `{DELETE}` in the column label to remove objects"
+        )
+    rows = tuple(
+        replace(row, cells={**given[row.track].cells, **row.cells})
+        for row in own.rows
+        if row.track in given
+    )
+    # Only in the table that a page writes does it tell which labels are new.
+    columns = tuple(n for n in dict.fromkeys((*own.columns, *table.columns)) if n != LABEL_SEEN)
+    restored = _relabelled(TrackTable(columns, rows, ()), table.rows)
+    return restored, problems
+
+
+def _contradictions(table: TrackTable, own: TrackTable) -> list[str]:
+    """Return the problems of lines that contradict a run's own table."""
+    known = {row.track: row.category for row in own.rows}
+    problems = []
+    for row in table.rows:
+        if row.track not in known:
+            problems.append(f"line {row.line}: there is no track {row.track}")
+        elif row.category.lower() != known[row.track].lower():
+            problems.append(
+                f"line {row.line}: the category of track {row.track} is {known[row.track]!r}, not "
+                f"{row.category!r}; write corrections into the column label"
+            )
+    return problems
+
+
+def adopt_labels(corrected: Path, folder: Path) -> None:
+    """Apply the labels of a corrected table to a run.
+
+    Only the column ``label`` is read. Tracks that a table elsewhere does not list keep their label,
+    and so do those whose label equals that in a column ``label_seen``, which a report page writes:
+    it may be older than other corrections. If labels are replaced, the table before is kept as
+    tracks.previous.csv. ``corrected`` may be the run's own tracks.csv, which must list all tracks.
+
+    Raises
+    ------
+    OutputError : the table is unreadable, belongs to another run, names tracks that the run does
+        not have or other categories in the column ``category``, or has invalid labels. The error
+        message lists all these lines, and nothing is written.
+    """
+    with holding(folder):
+        _adopt(corrected, folder)
+
+
+def _adopt(corrected: Path, folder: Path) -> None:
+    current = folder / "tracks.csv"
+    own, problems = read_own_table(current)
+    result = own
+    if not (corrected.exists() and corrected.samefile(current)):
+        _refuse(current, problems)
+        table = read_track_table(corrected)
+        _require_same_run(corrected, table, folder, known=False)
+        given = (row for row in table.rows if row.cells.get(LABEL_SEEN) != row.label)
+        result, problems = _relabelled(own, given), [*table.problems, *_contradictions(table, own)]
+    known_categories = read_run(folder)["model"]["categories"]
+    _, misread = resolve_labels(result.rows, known_categories, one_frame=_one_frame(folder))
+    _refuse(corrected, problems + _lines(result.rows, misread))
+    if any(a.label not in {"", b.label} for a, b in zip(own.rows, result.rows, strict=True)):
+        with replacing(folder / PREVIOUS) as path:
+            write_track_table(path, own)
+    with replacing(current.resolve()) as path:  # it may be a symbolic link
+        write_track_table(path, result)
+
+
+def relabel(folder: Path, labels: Mapping[int, str]) -> dict[int, str]:
+    """Set the labels of some tracks of a run; keep the other labels.
+
+    Returns
+    -------
+    The reason for each track whose label was rejected: it is invalid, or contradicts other labels.
+
+    Raises
+    ------
+    OutputError : the run's table is unreadable, invalid or another run's, or cannot be written.
+    """
+    current = folder / "tracks.csv"
+    base, problems = read_own_table(current)
+    categories, one_frame = read_run(folder)["model"]["categories"], _one_frame(folder)
+    before = find_misread(base.rows, categories, one_frame=one_frame)
+    _refuse(current, [*problems, *_lines(base.rows, before)])
+    rows, refused = _given(base.rows, labels, categories, one_frame=one_frame)
+    with replacing(current.resolve()) as path:
+        write_track_table(path, replace(base, rows=rows))
+    return refused
+
+
+def correct_label(folder: Path, track: int, label: str, *, seen: str, work: str) -> str:
+    """Set the label of a track of a run, unless it has changed since the caller read it.
+
+    Parameters
+    ----------
+    seen : the label that the caller read.
+    work : the value in the run.json that the caller read.
+
+    Returns
+    -------
+    The reason why the label was rejected; empty if it was set.
+
+    Raises
+    ------
+    OutputError : as for `relabel`, or the run has been replaced.
+    """
+    with holding(folder):
+        require_work(folder, work)
+        rows = {row.track: row for row in read_track_table(folder / "tracks.csv").rows}
+        if track not in rows:
+            return f"there is no track #{track}"
+        if rows[track].label != seen:
+            return f"its label is now {rows[track].label!r}"
+        return relabel(folder, {track: label}).get(track, "")
+
+
+def _given(
+    rows: tuple[TrackRow, ...],
+    labels: Mapping[int, str],
+    categories: Iterable[str],
+    *,
+    one_frame: bool,
+) -> tuple[tuple[TrackRow, ...], dict[int, str]]:
+    """Return the rows with their new labels, and the reasons for rejected ones, by track.
+
+    If the labels are not valid together, they are set one by one, merges last.
+    """
+    given = _labelled(rows, labels)
+    if not find_misread(given, categories, one_frame=one_frame):
+        return given, {}
+    refused = {}
+    for track in sorted(labels, key=lambda track: merged_with(labels[track]) is not None):
+        given = _labelled(rows, {track: labels[track]})
+        if misread := find_misread(given, categories, one_frame=one_frame):
+            refused[track] = misread.get(track) or next(iter(misread.values()))
+        else:
+            rows = given
+    return rows, refused
+
+
+def _labelled(rows: Iterable[TrackRow], labels: Mapping[int, str]) -> tuple[TrackRow, ...]:
+    return tuple(with_label(row, labels.get(row.track, row.label)) for row in rows)
+
+
+def has_labels(path: Path) -> bool:
+    """Return whether a table exists and has labels.
+
+    Raises
+    ------
+    OutputError : the table is unreadable.
+    """
+    return path.exists() and any(row.label for row in read_track_table(path).rows)
+
+
+def _require_same_run(path: Path, table: TrackTable, folder: Path, *, known: bool = True) -> None:
+    """Check that a table belongs to the run in ``folder``.
+
+    Parameters
+    ----------
+    known : whether the table is in the folder itself, so that it needs no column ``run``. Any
+        other table without this column must have its tracks at the same positions.
+
+    Raises
+    ------
+    OutputError : the table belongs to another run or to several, or has other positions.
+    """
+    own = read_run(folder).get("work", "") if (folder / "run.json").exists() else ""
+    if not own or set(table.runs) == {own}:
+        return
+    if not table.runs and (known or _places_agree(table, folder)):
+        return
+    if len(table.runs) > 1:
+        found = f"holds tracks of several runs ({', '.join(table.runs)})"
+    elif table.runs:
+        found = f"holds the tracks of {_described(path.parent, table.run)}"
+    else:
+        found = "has tracks at other positions (and no column `run`)"
+    msg = (
+        f"{path}: {found}, not those of {_described(folder, own)}; to match objects by "
+        "place, use --by-place"
+    )
+    raise OutputError(msg)
+
+
+def _places_agree(table: TrackTable, folder: Path) -> bool:
+    """Return whether the tracks of a table have no positions, or the same as in the run."""
+    own = {row.track: row for row in read_track_table(folder / "tracks.csv").rows}
+    return all(
+        _number(row.cells.get(axis)) in {None, _number(own[row.track].cells.get(axis))}
+        for row in table.rows
+        if row.track in own
+        for axis in "xyz"
+    )
+
+
+def _number(cell: str | None) -> float | None:
+    """Return the number in a cell; None if it is not a number."""
+    with suppress(ValueError):
+        return parse_number(cell or "")
+    return None
+
+
+def _described(folder: Path, work: str) -> str:
+    """Return a description of a run, with its folder and recording if the folder holds it."""
+    with suppress(OutputError, KeyError):
+        run = read_run(folder)
+        if run["work"] == work:
+            return f"run {work} ({folder}, of {run['input']['path']})"
+    return f"run {work}"
+
+
+def _relabelled(base: TrackTable, rows: Iterable[TrackRow]) -> TrackTable:
+    """Return a table with the labels and line numbers of other rows."""
+    given = {row.track: row for row in rows}
+    changed = [
+        replace(with_label(row, given[row.track].label), line=given[row.track].line)
+        if row.track in given
+        else row
+        for row in base.rows
+    ]
+    return replace(base, rows=tuple(changed))
+
+
+def _refuse(path: Path, problems: Sequence[str]) -> None:
+    if problems:
+        listed = "\n  ".join(sorted(problems, key=_line_of))
+        msg = f"{path}: nothing was written:\n  {listed}"
+        raise OutputError(msg)
+
+
+def _line_of(problem: str) -> int:
+    """Return the number of the line that a problem names; 0 if it names none."""
+    line = re.match(r"line (\d+)", problem)
+    return int(line[1]) if line else 0
+
+
+def _one_frame(folder: Path) -> bool:
+    """Return whether a run has a fixed frame, so that its sensors share coordinates."""
+    return (folder / "run.json").exists() and read_run(folder).get("fixed_frame") is not None
+
+
+def _lines(rows: Iterable[TrackRow], misread: Mapping[int, str]) -> list[str]:
+    return [f"line {row.line}: {misread[row.track]}" for row in rows if row.track in misread]

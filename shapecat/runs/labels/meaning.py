@@ -1,0 +1,229 @@
+"""The meaning of the label that a person gives a track.
+
+A label is a category, a new category, ``delete``, or ``merge with N``.
+"""
+
+import re
+import unicodedata
+from collections.abc import Iterable, Mapping, Sequence
+from typing import NamedTuple
+
+from shapecat.runs.labels.track_table import TrackRow
+from shapecat.types import CATEGORIES, UNKNOWN
+
+__all__ = [
+    "DELETE",
+    "TrackLabel",
+    "find_misread",
+    "is_category_name",
+    "marked_as_new",
+    "merged_with",
+    "merging_with",
+    "order_categories",
+    "resolve_labels",
+]
+
+DELETE = "delete"
+
+_MERGE = re.compile(r"merged? +(?:with|into) +#?(\d{1,9})(?:[.,]0*)?", re.IGNORECASE)
+_COMMAND = re.compile(r"(merged?( |$)|del(ete)?$|remove$)", re.IGNORECASE)
+_NEW = re.compile(r"new +(.+)", re.IGNORECASE)
+_RESERVED = ("none", "dontcare")
+"""Names that mean "no object" in exported formats."""
+_NAME = re.compile(r"[^\W\d_][\w .+&'()-]{0,58}[\w)]|[^\W\d_]")
+
+
+class TrackLabel(NamedTuple):
+    """The number, category and confidence with which a track is shown.
+
+    A track that was merged with another one takes all three from the other.
+    """
+
+    track: int
+    category: str
+    confidence: float
+
+
+def merged_with(label: str) -> int | None:
+    """Return the number of the track that a label merges with; None for any other label.
+
+    Examples
+    --------
+    >>> merged_with("merge with 7"), merged_with("cup")
+    (7, None)
+    """
+    merge = _MERGE.fullmatch(label)
+    return int(merge[1]) if merge else None
+
+
+def merging_with(track: int) -> str:
+    """Return the label that merges another track with ``track``.
+
+    Examples
+    --------
+    >>> merging_with(7)
+    'merge with 7'
+    """
+    return f"merge with {track}"
+
+
+def marked_as_new(label: str) -> str:
+    """Return a label whose category is marked as new, unless it is marked or has none.
+
+    Examples
+    --------
+    >>> marked_as_new("pan"), marked_as_new("new pan"), marked_as_new("delete")
+    ('new pan', 'new pan', 'delete')
+    """
+    named = is_category_name(label) and not _NEW.fullmatch(label)
+    return f"new {label}" if named else label
+
+
+_Verdict = str | int | None
+"""A category, the number of the track to merge with, or None to delete."""
+
+
+def find_misread(
+    rows: Sequence[TrackRow], categories: Iterable[str] = (), *, one_frame: bool = True
+) -> dict[int, str]:
+    """Return the problem of each invalid or contradictory label, by track number."""
+    return resolve_labels(rows, categories, one_frame=one_frame)[1]
+
+
+def resolve_labels(
+    rows: Sequence[TrackRow], categories: Iterable[str], *, one_frame: bool
+) -> tuple[dict[int, TrackLabel], dict[int, str]]:
+    """Interpret the labels of all tracks.
+
+    Parameters
+    ----------
+    categories : known categories, besides those in the rows.
+    one_frame : whether tracks of different topics may be merged.
+
+    Returns
+    -------
+    The final labels, and the problems of invalid labels, both by track number. Deleted tracks have
+    neither.
+    """
+    known = {n.lower(): n for n in (UNKNOWN, *CATEGORIES, *categories, *(r.category for r in rows))}
+    verdicts: dict[int, _Verdict] = {}
+    misread = {}
+    for row in sorted(rows, key=lambda row: _NEW.fullmatch(row.label) is None):  # new names first
+        try:
+            verdicts[row.track] = _understand(row.label, known) if row.label else row.category
+        except ValueError as error:
+            misread[row.track] = str(error)
+            verdicts[row.track] = row.category
+    by_track = {row.track: row for row in rows}
+    labels = {}
+    for row in rows:
+        try:
+            shown = by_track[_follow(row.track, verdicts)]
+            if not (one_frame or _share_a_topic(shown, row)):
+                msg = f"track {shown.track} belongs to another topic, {shown.topic or 'none'}"
+                raise ValueError(msg)  # noqa: TRY301  collected with those of the calls
+        except ValueError as error:
+            misread[row.track] = f"{row.label!r}: {error}"
+            continue
+        category = verdicts[shown.track]
+        if isinstance(category, str):
+            confidence = 1.0 if shown.label else shown.confidence
+            labels[row.track] = TrackLabel(shown.track, category, confidence)
+    return labels, misread
+
+
+def _share_a_topic(a: TrackRow, b: TrackRow) -> bool:
+    return a.topic == b.topic or bool(set(a.topic.split()) & set(b.topic.split()))
+
+
+def _follow(track: int, verdicts: Mapping[int, _Verdict]) -> int:
+    """Return the track at the end of a chain of merges.
+
+    Raises
+    ------
+    ValueError : a track in the chain is missing or deleted, or the chain is a loop.
+    """
+    seen = [track]
+    while isinstance(target := verdicts[seen[-1]], int):
+        if target not in verdicts:
+            msg = f"there is no track {target}"
+            raise ValueError(msg)
+        if target in seen:
+            msg = f"forms a loop: {' -> '.join(map(str, [*seen, target]))}"
+            raise ValueError(msg)
+        seen.append(target)
+        if verdicts[target] is None:
+            msg = f"track {target} is deleted"
+            raise ValueError(msg)
+    return seen[-1]
+
+
+def _understand(label: str, known: dict[str, str]) -> _Verdict:
+    """Interpret a label; add a new category to ``known``.
+
+    Raises
+    ------
+    ValueError : the label is malformed, or likely a misspelt known name.
+    """
+    label = unicodedata.normalize("NFC", label)
+    if label.lower() in known:
+        return known[label.lower()]
+    if label.lower() == DELETE:
+        return None
+    merge = merged_with(label)
+    if merge is not None:
+        return merge
+    new = _NEW.fullmatch(label)
+    name = new[1] if new else label
+    if not is_category_name(name):
+        msg = f"{label!r} is not a category, `{DELETE}` or `merge with N`"
+        raise ValueError(msg)
+    near = _nearest(name.lower(), [*known, DELETE])
+    if near and not new:
+        meant = known.get(near, near)
+        msg = f"{label!r}: did you mean {meant}? For a new category write `new {name}`"
+        raise ValueError(msg)
+    return known.setdefault(name.lower(), name)
+
+
+def is_category_name(name: str) -> bool:
+    """Return whether a text can name a category: neither a command nor a reserved name.
+
+    Examples
+    --------
+    >>> is_category_name("tea pot"), is_category_name("merge with 3"), is_category_name("none")
+    (True, False, False)
+    """
+    allowed = _NAME.fullmatch(_without_marks(name)) and not _COMMAND.match(name)
+    return bool(allowed) and name.lower() not in _RESERVED
+
+
+def order_categories(labels: Iterable[str]) -> tuple[str, ...]:
+    """Return the categories among labels: first the default model's, then the others by name."""
+    found = {str(label) for label in labels} - {UNKNOWN}
+    return (*(name for name in CATEGORIES if name in found), *sorted(found - set(CATEGORIES)))
+
+
+def _without_marks(text: str) -> str:
+    """Return a text without accents and vowel signs that are characters of their own."""
+    return "".join(c for c in text if not unicodedata.category(c).startswith("M"))
+
+
+def _nearest(name: str, known: Sequence[str]) -> str | None:
+    """Return the nearest known name within one edit (short names) or two; None if there is none."""
+    distances = [(_slips(name, other), other) for other in known]
+    slips, other = min(distances)
+    return other if slips <= (1 if min(len(name), len(other)) < 5 else 2) else None
+
+
+def _slips(a: str, b: str) -> int:
+    """Return the edit distance: letters added, dropped, changed or swapped (Damerau 1964)."""
+    before, last = list[int](), list(range(len(b) + 1))
+    for i, x in enumerate(a, start=1):
+        row = [i]
+        for j, y in enumerate(b, start=1):
+            row.append(min(last[j] + 1, row[j - 1] + 1, last[j - 1] + (x != y)))
+            if i > 1 and j > 1 and x == b[j - 2] and a[i - 2] == y:
+                row[j] = min(row[j], before[j - 2] + 1)
+        before, last = last, row
+    return last[-1]

@@ -1,0 +1,270 @@
+"""Find the tracks of two runs that are the same object.
+
+Two runs of one recording usually have common frames, in which detections of the same object are
+mutual nearest neighbours. Others have only a fixed frame in common, in which only objects at rest
+can be found again. Ambiguous cases are reported, not guessed.
+"""
+
+from collections import Counter, defaultdict
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import NamedTuple
+
+import numpy as np
+
+from shapecat.arrays import F8
+from shapecat.errors import OutputError
+from shapecat.runs.folder import read_run
+from shapecat.runs.labels.seen_tracks import SeenTracks, extents_of, read_seen_tracks
+from shapecat.runs.labels.track_table import TrackRow, parse_number
+
+__all__ = ["Group", "Match", "Matches", "match_in_place", "match_in_time"]
+
+_MOST_REACH_M = 0.10
+"""Largest distance between two detections of one object in one frame, however segmented."""
+_MAJORITY = 0.6
+"""Smallest share of common frames in which matching tracks are mutual nearest neighbours."""
+_RIVAL = 0.25
+"""Another track with at least this share makes a match ambiguous."""
+_STILL_M = 0.04
+"""Largest scatter of the centres of an object at rest, seen from several places."""
+_REACH = 0.5
+"""Largest distance between the centres of one object in two views, relative to its width."""
+_LEAST_REACH_M = 0.04
+_CLEAR_M = 0.03
+"""A match is ambiguous unless the second nearest object is farther by at least this."""
+_SIZE_RATIO = 1.8
+"""Largest ratio between the largest extents of an object in two recordings."""
+
+Group = Callable[[int], int]
+"""Maps a track to a number that is the same for tracks that a person merged."""
+
+
+class Match(NamedTuple):
+    """A track of the target, and the distance of its centre from the source track's, metres."""
+
+    track: int
+    distance_m: float
+
+
+@dataclass(frozen=True)
+class Matches:
+    """For each track of the source: its matches in the target, or the reason why it has none."""
+
+    found: Mapping[int, Sequence[Match]]
+    reasons: Mapping[int, str]
+
+
+def match_in_time(source: Path, target: Path, group: Group) -> Matches | None:
+    """Match tracks that are mutual nearest neighbours in most common frames; None without any.
+
+    Parameters
+    ----------
+    source, target : run folders of the same recording.
+    group : maps merged tracks of the source to the same number; they are one object.
+    """
+    old, new = read_seen_tracks(source), read_seen_tracks(target)
+    common = sorted(old.keys.keys() & new.keys.keys())
+    if not common and old.keys and new.keys:
+        return None
+    old_widths, new_widths = _widths(source, old), _widths(target, new)
+    votes: Counter[tuple[int, int]] = Counter()
+    apart: defaultdict[tuple[int, int], float] = defaultdict(float)
+    seen: Counter[int] = Counter()
+    for key in common:
+        here, there = old.keys[key], new.keys[key]
+        seen.update(new.tracks[there].tolist())
+        reach = _reach_at_once(old_widths[here], new_widths[there])
+        for a, b, distance in _mutual_nearest(old.centers[here], new.centers[there], reach):
+            pair = int(old.tracks[here][a]), int(new.tracks[there][b])
+            votes[pair] += 1
+            apart[pair] += distance
+    return _by_majority(votes, apart, seen, group)
+
+
+def _by_majority(
+    votes: Mapping[tuple[int, int], int],
+    apart: Mapping[tuple[int, int], float],
+    seen: Counter[int],
+    group: Group,
+) -> Matches:
+    """Match each track of the target with the object of the source that most frames agree on."""
+    found: dict[int, list[Match]] = {}
+    reasons: dict[int, str] = {}
+    claims: dict[int, dict[int, list[int]]] = {}
+    for old, new in sorted(votes):
+        claims.setdefault(new, {}).setdefault(group(old), []).append(old)
+    for new, objects in claims.items():
+        shares = {k: sum(votes[old, new] for old in o) / seen[new] for k, o in objects.items()}
+        best, *others = sorted(shares, key=lambda k: (-shares[k], k))
+        rivals = [k for k in others if shares[k] >= _RIVAL]
+        if shares[best] < _MAJORITY or rivals:
+            for old in (old for k in (best, *rivals) for old in objects[k]):
+                reasons[old] = f"track {new} matches it only part of the time"
+            continue
+        for old in objects[best]:
+            mean = apart[old, new] / votes[old, new]
+            found.setdefault(old, []).append(Match(new, round(mean, 4)))
+    return Matches(found, reasons)
+
+
+def _widths(folder: Path, seen: SeenTracks) -> F8:
+    """Return the width of each row's track (n,), metres."""
+    extents = extents_of(folder, seen)
+    return np.array([extents[track][0] for track in seen.tracks.tolist()])
+
+
+def _reach_at_once(a: F8, b: F8) -> F8:
+    """Return the largest distance (n, m) between detections of one object, given their widths.
+
+    Two objects side by side are farther apart than half of their mean width.
+    """
+    mean = (a[:, None] + b[None]) / 2
+    return np.clip(_REACH * mean, _LEAST_REACH_M, _MOST_REACH_M)
+
+
+def _mutual_nearest(a: F8, b: F8, reach: F8) -> Iterator[tuple[int, int, float]]:
+    """Yield index pairs and distances of mutual nearest neighbours of points (n, 3) and (m, 3).
+
+    ``reach`` (n, m) is the largest distance of each pair, metres.
+    """
+    apart = np.linalg.norm(a[:, None] - b[None], axis=2)
+    nearest = apart.argmin(axis=1)
+    for k, j in enumerate(nearest.tolist()):
+        if apart[k, j] <= reach[k, j] and int(apart[:, j].argmin()) == k:
+            yield k, j, float(apart[k, j])
+
+
+class _Standing(NamedTuple):
+    """Centre (3,), width and largest extent of a track at rest, metres; NaN if unknown."""
+
+    track: int
+    center: F8
+    width_m: float
+    extent_m: float
+
+
+def match_in_place(
+    rows: Sequence[TrackRow], source: Path | None, target: Path, group: Group
+) -> Matches:
+    """Match objects that are at rest at the same place in two recordings.
+
+    Parameters
+    ----------
+    rows : the tracks of the source; their positions are used if ``source`` is None.
+    source : folder of the source run; None if only its tracks.csv exists.
+    target : folder of the other run.
+    group : as for `match_in_time`.
+
+    Raises
+    ------
+    OutputError : the fixed frames are missing or differ, or a row has no position.
+    """
+    _require_one_frame(source, target)
+    new, _ = _standing(target)
+    if source is None:
+        old = [_Standing(row.track, _place_of(row), np.nan, np.nan) for row in rows]
+        reasons: dict[int, str] = {}
+    else:
+        old, gone = _standing(source)
+        reasons = dict.fromkeys(gone, "it was moved, so it cannot be found by its place")
+    found: dict[int, list[Match]] = {}
+    taken: dict[int, int] = {}
+    for item in old:
+        others = [other for other in old if group(other.track) != group(item.track)]
+        match, reason = _nearest_there(item, others, new)
+        if match is None:
+            reasons[item.track] = reason
+        elif group(taken.get(match.track, item.track)) != group(item.track):
+            reasons[item.track] = f"track {match.track} could also be track {taken[match.track]}"
+        else:
+            taken[match.track] = item.track
+            found[item.track] = [match]
+    return Matches(found, reasons)
+
+
+def _nearest_there(
+    item: _Standing, old: Sequence[_Standing], new: Sequence[_Standing]
+) -> tuple[Match | None, str]:
+    """Return the only object at the place of ``item``, or the reason why there is none.
+
+    ``old`` are the other objects of the source, ``new`` the objects of the target.
+    """
+    near = sorted((_apart(item, other), k) for k, other in enumerate(new))
+    reached = [(d, k) for d, k in near if d <= _match_radius(item, new[k])]
+    if not reached:
+        return None, "nothing was found there"
+    (distance, first), *others = reached
+    here = new[first]
+    if others and others[0][0] - distance < _CLEAR_M:
+        return None, f"tracks {here.track} and {new[others[0][1]].track} are both there"
+    rivals = [other.track for other in old if _apart(other, here) < distance + _CLEAR_M]
+    if rivals:
+        return None, f"track {here.track} could also be track {rivals[0]}"
+    ratio = max(item.extent_m, here.extent_m) / min(item.extent_m, here.extent_m)
+    if ratio > _SIZE_RATIO:
+        return None, f"track {here.track} is there, but has another size"
+    return Match(here.track, round(distance, 4)), ""
+
+
+def _apart(a: _Standing, b: _Standing) -> float:
+    return float(np.linalg.norm(a.center - b.center))
+
+
+def _match_radius(a: _Standing, b: _Standing) -> float:
+    return max(_LEAST_REACH_M, _REACH * float(np.fmax(a.width_m, b.width_m)))
+
+
+def _require_one_frame(source: Path | None, target: Path) -> None:
+    """Check that positions in two runs can be compared.
+
+    Raises
+    ------
+    OutputError : a run has no fixed frame, or the fixed frames differ.
+    """
+    names = [_fixed_frame(folder) for folder in (source, target) if folder is not None]
+    if len(set(names)) > 1:
+        found = " and ".join(names)
+        msg = f"{target}: the fixed frames differ ({found}); process with --fixed-frame"
+        raise OutputError(msg)
+
+
+def _fixed_frame(folder: Path) -> str:
+    name = read_run(folder)["fixed_frame"]
+    if name is None:
+        msg = f"{folder}: has no fixed frame, which is needed to find objects by place"
+        raise OutputError(msg)
+    return name
+
+
+def _place_of(row: TrackRow) -> F8:
+    """Return the position (3,) in a line of tracks.csv, metres.
+
+    Raises
+    ------
+    OutputError : the line has no position.
+    """
+    try:
+        place = [parse_number(row.cells[name]) for name in "xyz"]
+    except (KeyError, ValueError) as error:
+        msg = f"line {row.line}: no position x, y, z of track {row.track}"
+        raise OutputError(msg) from error
+    return np.array(place)
+
+
+def _standing(folder: Path) -> tuple[list[_Standing], list[int]]:
+    """Return the tracks of a run that are at rest, and the numbers of those that moved."""
+    seen = read_seen_tracks(folder)
+    extents = extents_of(folder, seen)
+    still, moved = [], []
+    for track in np.unique(seen.tracks).tolist():
+        centers = seen.centers[seen.tracks == track]
+        middle = np.median(centers, axis=0)
+        spread = float(np.median(np.linalg.norm(centers - middle, axis=1)))
+        width, extent = extents.get(track, (np.nan, np.nan))
+        if spread > max(_STILL_M, _REACH / 2 * width):
+            moved.append(track)
+        else:
+            still.append(_Standing(track, middle, width, extent))
+    return still, moved

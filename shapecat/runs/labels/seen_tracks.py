@@ -1,0 +1,88 @@
+"""The detections of the tracks of a run, to compare them with those of another run."""
+
+from collections.abc import Iterator
+from itertools import compress, groupby
+from operator import itemgetter
+from pathlib import Path
+from typing import NamedTuple
+
+import numpy as np
+import pyarrow as pa
+
+from shapecat.arrays import F4, F8, I4
+from shapecat.runs.tables.reading import frame_rows, numbers, opened, read_row_groups
+
+__all__ = ["SeenTracks", "extents_of", "read_seen_tracks"]
+
+_SAMPLES = 40
+"""About this many detections of each track are read for its size."""
+
+_Moment = tuple[str, int, int]
+"""A frame: its topic, its stamp (ns), and its place, from 0, among the frames of this stamp."""
+
+
+class SeenTracks(NamedTuple):
+    """All detections of the tracks of a run, sorted by moment.
+
+    Attributes
+    ----------
+    tracks, numbers, detections : (n,) track, frame and detection numbers.
+    frames : the moment of each detection.
+    centers : (n, 3) metres, fixed frame.
+    keys : the rows of each moment.
+    """
+
+    tracks: I4
+    frames: list[_Moment]
+    numbers: I4
+    detections: I4
+    centers: F8
+    keys: dict[_Moment, slice]
+
+
+def read_seen_tracks(folder: Path) -> SeenTracks:
+    """Read the detections of the tracks of a run."""
+    columns = ["track", "topic", "frame", "stamp_ns", "detection", "center_fixed"]
+    with opened(folder / "tracks.parquet") as file:
+        table = file.read(columns=columns)
+    table = table.sort_by([(name, "ascending") for name in ("topic", "stamp_ns", "frame")])
+    seen = table["detection"].is_valid()
+    keys = list(compress(_moments(table), seen.to_pylist()))
+    table = table.filter(seen)
+    starts = [k for k, key in enumerate(keys) if not k or key != keys[k - 1]]
+    rows = map(slice, starts, [*starts[1:], len(keys)])
+    return SeenTracks(
+        numbers(table["track"]),
+        keys,
+        numbers(table["frame"]),
+        numbers(table["detection"]),
+        numbers(table["center_fixed"]).reshape(-1, 3).astype(np.float64),
+        dict(zip((keys[k] for k in starts), rows, strict=True)),
+    )
+
+
+def _moments(table: pa.Table) -> Iterator[_Moment]:
+    """Yield the moment of each row of a sorted table of tracks."""
+    cells = (table[name].to_pylist() for name in ("topic", "stamp_ns", "frame"))
+    for (topic, stamp), rows in groupby(zip(*cells, strict=True), key=itemgetter(0, 1)):
+        places: dict[int, int] = {}
+        for *_, frame in rows:
+            yield topic, stamp, places.setdefault(frame, len(places))
+
+
+def extents_of(folder: Path, seen: SeenTracks) -> dict[int, tuple[float, float]]:
+    """Return the width and largest extent of each track, metres: medians of some views."""
+    wanted: dict[tuple[str, int], list[int]] = {}
+    for track in np.unique(seen.tracks):
+        rows = np.flatnonzero(seen.tracks == track)
+        for row in rows[:: max(1, len(rows) // _SAMPLES)].tolist():
+            wanted.setdefault((seen.frames[row][0], int(seen.numbers[row])), []).append(row)
+    sizes: dict[int, list[F4]] = {}
+    for group in read_row_groups(folder / "detections.parquet", ["topic", "frame", "size"]):
+        size = numbers(group["size"]).reshape(-1, 3)
+        for key, span in frame_rows(group).items():
+            for row in wanted.get(key, ()):
+                found = size[span][seen.detections[row]]
+                sizes.setdefault(int(seen.tracks[row]), []).append(found)
+    middles = {track: np.median(np.stack(found), axis=0) for track, found in sizes.items()}
+    return {t: (float(max(m[:2])), float(max(m))) for t, m in middles.items()}

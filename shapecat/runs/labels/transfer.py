@@ -1,0 +1,256 @@
+"""Transfer labels from one run to another, to the same objects."""
+
+from collections.abc import Container, Mapping, Sequence
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Any, NamedTuple
+
+from shapecat.errors import OutputError
+from shapecat.runs.folder import read_run, write_run
+from shapecat.runs.labels.corrections import relabel
+from shapecat.runs.labels.meaning import find_misread, marked_as_new, merged_with, merging_with
+from shapecat.runs.labels.same_objects import Group, Matches, match_in_place, match_in_time
+from shapecat.runs.labels.track_table import TrackRow, TrackTable, read_track_table
+from shapecat.runs.run_info import RunInfo
+
+__all__ = [
+    "TABLE_ALONE",
+    "Missed",
+    "Transfer",
+    "Transferred",
+    "lost_labels",
+    "match_labels",
+    "transfer_labels",
+]
+
+IN_TIME, IN_PLACE = "frames in common", "places in other frames"
+TABLE_ALONE = "places in the table alone"
+"""`Transfer.by` for a table without its run: fixed frame and moved objects are unknown."""
+
+
+class Transferred(NamedTuple):
+    """A transferred label; ``distance_m`` is the distance of the centres in the two runs."""
+
+    old_track: int
+    track: int
+    label: str
+    distance_m: float
+
+
+class Missed(NamedTuple):
+    """A label that could not be transferred, and the reason."""
+
+    old_track: int
+    label: str
+    reason: str
+
+
+@dataclass(frozen=True)
+class Transfer:
+    """The outcome of a label transfer.
+
+    ``source`` is the ``work`` id of the labels' run, empty if unknown; ``by`` says how objects were
+    matched.
+    """
+
+    source: str
+    transferred: tuple[Transferred, ...]
+    missed: tuple[Missed, ...]
+    by: str = ""
+
+    def as_dict(self) -> dict[str, Any]:
+        """Return plain values for run.json."""
+        return {
+            "from": self.source,
+            "by": self.by,
+            "transferred": [item._asdict() for item in self.transferred],
+            "not_transferred": [item._asdict() for item in self.missed],
+        }
+
+
+def lost_labels(source: Path, reason: str) -> Transfer:
+    """Return the outcome if none of a run's labels can be transferred.
+
+    Raises
+    ------
+    OutputError : the tracks.csv of ``source`` is unreadable.
+    """
+    table = read_track_table(source / "tracks.csv")
+    missed = (Missed(row.track, row.label, reason) for row in table.rows if row.label)
+    return Transfer(table.run, (), tuple(missed))
+
+
+def transfer_labels(source: Path, target: Path) -> Transfer:
+    """Transfer the labels of another run to the same objects in a run.
+
+    The labels are written to tracks.csv of ``target``, the outcome to its run.json. If a person
+    gave a track of ``target`` another label, that label is kept.
+
+    Parameters
+    ----------
+    source : a run folder, or a tracks.csv.
+    target : a run folder with tracks.
+
+    Raises
+    ------
+    OutputError : one of them is unreadable, or the two have different fixed frames or none.
+    """
+    run = read_run(target)
+    transfer = match_labels(source, target)
+    transfer = _without(transfer, _labelled_otherwise(transfer, target, run))
+    refused = relabel(target, _labels(transfer))
+    if refused:  # as a typo, perhaps, since the model there does not know the category
+        transfer = _with_new_categories(transfer, refused)
+        refused = relabel(target, _labels(transfer))
+    transfer = _without(transfer, refused)
+    run["corrections"] = transfer.as_dict()
+    write_run(target, run)
+    return transfer
+
+
+def _labelled_otherwise(transfer: Transfer, target: Path, run: RunInfo) -> dict[int, str]:
+    """Return messages for tracks that have another label, unless it is from a transfer."""
+    earlier = {
+        (item["track"], item["label"]) for item in run.get("corrections", {}).get("transferred", ())
+    }
+    own = {row.track: row.label for row in read_track_table(target / "tracks.csv").rows}
+    return {
+        item.track: f"track {item.track} already has the label {own[item.track]}"
+        for item in transfer.transferred
+        if own[item.track] not in ("", item.label) and (item.track, own[item.track]) not in earlier
+    }
+
+
+def _labels(transfer: Transfer) -> dict[int, str]:
+    return {item.track: item.label for item in transfer.transferred}
+
+
+def _with_new_categories(transfer: Transfer, tracks: Container[int]) -> Transfer:
+    """Return a transfer in which the categories of some tracks are marked as new."""
+    items = (
+        item._replace(label=marked_as_new(item.label)) if item.track in tracks else item
+        for item in transfer.transferred
+    )
+    return replace(transfer, transferred=tuple(items))
+
+
+def _without(transfer: Transfer, reasons: Mapping[int, str]) -> Transfer:
+    """Return a transfer in which the labels of the given tracks are missed for these reasons."""
+    kept = tuple(item for item in transfer.transferred if item.track not in reasons)
+    missed = (
+        Missed(item.old_track, item.label, reasons[item.track])
+        for item in transfer.transferred
+        if item.track in reasons
+    )
+    return replace(transfer, transferred=kept, missed=(*transfer.missed, *missed))
+
+
+def match_labels(source: Path, target: Path) -> Transfer:
+    """Find the tracks of a run that are the same objects as the labelled tracks of a table.
+
+    Raises
+    ------
+    OutputError : as for `transfer_labels`.
+    """
+    path = source / "tracks.csv" if source.is_dir() else source
+    table = read_track_table(path)
+    _require_whole(path, table)
+    folder = path.parent if _is_in_its_run(path, table) else None
+    categories = read_run(folder or target)["model"]["categories"]
+    misread = find_misread(table.rows, categories)
+    labelled = [row for row in table.rows if row.label and row.track not in misread]
+    wrong = tuple(
+        Missed(r.track, r.label, misread[r.track]) for r in table.rows if r.track in misread
+    )
+    if not labelled:
+        return Transfer(table.run, (), wrong)
+    group = _groups(labelled)
+    by, matches = IN_TIME, None
+    if folder is not None and _same_recording(read_run(folder), read_run(target)):
+        matches = match_in_time(folder, target, group)
+    if matches is None:
+        by = TABLE_ALONE if folder is None else IN_PLACE
+        matches = match_in_place(table.rows, folder, target, group)
+    transferred, missed = _translate(labelled, group, matches)
+    return Transfer(table.run, transferred, (*wrong, *missed), by)
+
+
+def _require_whole(path: Path, table: TrackTable) -> None:
+    """Check that a table has only valid lines, all from one run.
+
+    Raises
+    ------
+    OutputError : a line is invalid, or the table holds tracks of several runs.
+    """
+    if table.problems:
+        msg = f"{path}: {table.problems[0]}"
+        raise OutputError(msg)
+    if len(table.runs) > 1:
+        msg = (
+            f"{path}: holds tracks of several runs ({', '.join(table.runs)}); give one run's table"
+        )
+        raise OutputError(msg)
+
+
+def _is_in_its_run(path: Path, table: TrackTable) -> bool:
+    """Return whether the other tables in the folder of a tracks.csv are from the same run."""
+    folder = path.parent
+    if not (folder / "run.json").exists() or not (folder / "tracks.parquet").exists():
+        return False
+    if not table.run:
+        return path.name == "tracks.csv"
+    return bool(table.run == read_run(folder).get("work"))
+
+
+def _groups(labelled: Sequence[TrackRow]) -> Group:
+    """Return a function that maps a track to the track at the end of its merges."""
+    partners = {row.track: merged_with(row.label) for row in labelled}
+
+    def root(track: int) -> int:
+        seen = {track}
+        while (partner := partners.get(track)) is not None and partner not in seen:
+            seen.add(partner)
+            track = partner
+        return track
+
+    return root
+
+
+def _same_recording(a: Mapping[str, Any], b: Mapping[str, Any]) -> bool:
+    digests = [run["input"].get("digest") for run in (a, b)]
+    return bool(digests[0]) and digests[0] == digests[1] and a["fixed_frame"] == b["fixed_frame"]
+
+
+def _translate(
+    labelled: Sequence[TrackRow], group: Group, matches: Matches
+) -> tuple[tuple[Transferred, ...], tuple[Missed, ...]]:
+    """Return the labels for the tracks of the target, and the labels without a match.
+
+    A *whole* is a track that others were merged with. Its label is copied to its matches. Matches
+    of the other tracks are merged with the first match of the whole.
+    """
+    given: dict[int, Transferred] = {}
+    missed = []
+    for row in sorted(labelled, key=lambda row: group(row.track) != row.track):
+        whole = group(row.track)
+        there = matches.found.get(row.track, ())
+        if whole not in matches.found:
+            missed.append(Missed(row.track, row.label, _why(row.track, whole, matches)))
+        elif whole == row.track:
+            given |= {
+                m.track: Transferred(row.track, m.track, row.label, m.distance_m) for m in there
+            }
+        else:
+            first, *others = (match.track for match in matches.found[whole])
+            for match in there:  # empty if the part has no match of its own
+                if match.track not in (first, *others):
+                    label = merging_with(first)
+                    item = Transferred(row.track, match.track, label, match.distance_m)
+                    given.setdefault(match.track, item)
+    return tuple(given.values()), tuple(missed)
+
+
+def _why(track: int, whole: int, matches: Matches) -> str:
+    """Return the reason why the whole that a track belongs to has no match."""
+    reason = matches.reasons.get(whole, "nothing was found there")
+    return reason if track == whole else f"track {whole}, which it is merged with: {reason}"

@@ -1,0 +1,1 @@
+"""The phases that perceive the frames of a recording, and what they report."""

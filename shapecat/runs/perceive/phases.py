@@ -1,0 +1,281 @@
+"""The expensive phases: perceive every frame, then revise some with a better up direction.
+
+Before the first frame is perceived, the up direction that the recording gives is compared with the
+planes in the first frames: a fixed frame whose z axis is not up would spoil all of them.
+"""
+
+from collections import Counter
+from collections.abc import Iterator
+from dataclasses import replace
+from itertools import islice
+from pathlib import Path
+from typing import NamedTuple
+
+import numpy as np
+
+from shapecat.arrays import F4
+from shapecat.cameras.colour import ColourView
+from shapecat.config import Settings
+from shapecat.depth_fusion import RecentFrames
+from shapecat.errors import NoStreamError, RecordingError, explained
+from shapecat.executors.order import Processes
+from shapecat.learning import Categorizer
+from shapecat.perception import Perceiver, View, find_up
+from shapecat.recordings import Recording, choose_streams
+from shapecat.recordings.transforms.gravity import MISNAMED, Orientation, Upright, has_z_up, turned
+from shapecat.rehearsal import rehearse
+from shapecat.runs.jobs import Job
+from shapecat.runs.perceive.perceived import FrameRow, PerceptionTables
+from shapecat.runs.perceive.second_look import Revision, frames_to_revise
+from shapecat.runs.perceive.selection import count_frames, read_frames
+from shapecat.runs.perceive.up_report import report_up
+from shapecat.runs.run_info import RunInfo
+from shapecat.runs.tables.reading import Key, count_rows, read_row_groups
+from shapecat.runs.tables.segments import read_segments
+from shapecat.system import stopping
+from shapecat.system.progress import Observer, ignore
+from shapecat.types import Frame
+
+__all__ = ["Work", "perceive_all", "revise"]
+
+_MANY = 100
+"""With at least this many frames, other processes are started before anything is read."""
+_CONFIRMS_DEG = 15.0
+"""A plane confirms an up direction within this angle, as in `detect`."""
+_DOUBTS, _LOOKS = 3, 10
+"""Frames with a plane that must contradict the up direction, and frames that are checked."""
+_MOST_HELD = 64
+"""Frames that are held back at most: a topic may have few frames, or none for a long time."""
+
+
+_Reading = tuple[Frame, ColourView | None]
+"""A frame and its colour image; None if it has none."""
+_Oriented = tuple[Frame, ColourView | None, Orientation]
+"""The same, with the up direction and pose of the sensor."""
+
+
+class Work(NamedTuple):
+    """A job with its open recording, the folder of its tables, and the content of run.json."""
+
+    recording: Recording
+    folder: Path
+    run: RunInfo
+    job: Job
+    categorizer: Categorizer
+    observe: Observer = ignore
+    cores: int = 1
+
+
+def perceive_all(work: Work) -> None:
+    """Perceive every frame in constant memory; write frames, detections, planes and masks.
+
+    Raises
+    ------
+    NoStreamError : no frame could be read.
+    """
+    recording, folder, run, job, categorizer, observe, cores = work
+    skipped: Counter[str] = Counter()
+    total = count_frames(recording, run["options"])
+    recent = RecentFrames(job.settings.detection.fuse_frames)
+    count = 0
+    with (
+        Processes(Perceiver(categorizer, job.settings, job.model), cores, rehearse) as processes,
+        _tables(folder, run, categorizer) as tables,
+    ):
+        if (total or 0) - tables.done >= _MANY:
+            processes.start()
+        streams = choose_streams(recording, run["options"]["topics"])
+        upright = Upright.of(recording, up=job.up, fixed_frame=job.fixed_frame, streams=streams)
+
+        def view(reading: _Oriented) -> tuple[FrameRow, View]:
+            frame, colour, orientation = reading
+            orientation = upright.corrected(frame.topic, orientation)
+            pose = orientation.fixed_from_sensor
+            up = upright.accept(frame.topic, orientation)
+            row = FrameRow(frame.log_time_ns, pose, up, frame_from_sensor=frame.frame_from_sensor)
+            return row, View(frame, up, recent.before(frame, pose), pose, colour)
+
+        source = (
+            (frame, colour, upright.orient(frame))
+            for frame, colour in _readings(recording, run, job, skipped)
+        )
+        views = map(view, _UpTrial(upright, job.settings).before(source))
+        for count, _ in enumerate(stopping.until_asked(islice(views, tables.done)), start=1):
+            observe("perceive", count, total)
+        for rows, perceptions in processes.in_order(_blocks(views, job.settings.reuse_frames)):
+            tables.write(perceptions, rows)
+            for _ in rows:
+                count += 1
+                observe("perceive", count, total)
+        stopping.check()
+    if not count:
+        reasons = ", ".join(f"{n} {reason}" for reason, n in skipped.items()) or "none in range"
+        msg = f"{job.source}: no usable frame on {', '.join(run['options']['topics'])} ({reasons})"
+        raise NoStreamError(msg)
+    found = count_rows(folder, "detections")
+    run["counts"] = {"frames": count, "skipped": dict(skipped), "detections": found}
+    if run.get("color"):
+        run["counts"]["color"] = count_rows(folder, "masks")
+    if tables.done:
+        run["counts"]["resumed"] = tables.done
+    run["fixed_frame"], run["up"] = upright.fixed_frame, report_up(upright, folder)
+    run["warnings"] = [*recording.warnings, *upright.warnings, *recent.warnings()]
+
+
+def revise(work: Work) -> None:
+    """Perceive again the frames that disagree with the rest, and rewrite the tables.
+
+    An up direction that the user gave is never revised. A frame keeps its first result if the
+    second look finds nothing.
+    """
+    recording, folder, run, job, categorizer, observe, cores = work
+    chosen = frames_to_revise(read_segments(folder)) if run["up"]["source"] != "option" else {}
+    if not chosen:
+        return
+    with (
+        Processes(Perceiver(categorizer, job.settings, job.model), cores, rehearse) as processes,
+        _tables(folder, run, categorizer, again=True) as tables,
+    ):
+        views = islice(_views_again(recording, run, job, chosen), len(chosen))
+        count = sum(1 for _ in stopping.until_asked(islice(views, tables.done)))
+        for rows, perceptions in processes.in_order(_blocks(views, job.settings.reuse_frames)):
+            tables.write(perceptions, rows)
+            for _ in rows:
+                count += 1
+                observe("revise", count, len(chosen))
+        stopping.check()
+    run["counts"]["detections"] = count_rows(folder, "detections")
+    revised = read_row_groups(folder / "frames.parquet", ["revised"])
+    run["counts"]["revised"] = sum(sum(group["revised"].to_pylist()) for group in revised)
+
+
+def _views_again(
+    recording: Recording, run: RunInfo, job: Job, chosen: dict[Key, Revision]
+) -> Iterator[tuple[FrameRow, View]]:
+    """Yield the chosen frames with their revised up directions."""
+    streams = choose_streams(recording, run["options"]["topics"])
+    upright = Upright.of(recording, up=job.up, fixed_frame=run["fixed_frame"], streams=streams)
+    recent = RecentFrames(job.settings.detection.fuse_frames)
+    source = (
+        (frame, colour, upright.orient(frame))
+        for frame, colour in _readings(recording, run, job, Counter())
+    )
+    for frame, colour, orientation in _UpTrial(upright, job.settings).before(source):
+        pose = upright.corrected(frame.topic, orientation).fixed_from_sensor
+        earlier = recent.before(frame, pose)
+        revision = chosen.get((frame.topic, frame.index))
+        if revision is not None:
+            own = frame.frame_from_sensor
+            row = FrameRow(
+                frame.log_time_ns, pose, revision.up_given, again=True, frame_from_sensor=own
+            )
+            yield row, View(frame, revision.up, earlier, pose, colour)
+
+
+def _blocks(
+    views: Iterator[tuple[FrameRow, View]], size: int
+) -> Iterator[tuple[tuple[FrameRow, ...], tuple[View, ...]]]:
+    """Yield blocks of ``size`` frames, the same in every run, until asked to stop."""
+    while not stopping.asked() and (block := tuple(islice(views, size))):
+        rows, seen = zip(*block, strict=True)
+        yield rows, seen
+
+
+class _UpTrial:
+    """Compares the given up direction with the planes in the first frames of each topic."""
+
+    def __init__(self, upright: Upright, settings: Settings) -> None:
+        self._upright, self._settings = upright, settings
+        self._off_deg: dict[str, list[float]] = {}
+        self._misnamed_off_deg: dict[tuple[str, str], list[float]] = {}
+        self._sources: dict[str, str] = {}
+        self._looks: Counter[str] = Counter()
+        self._decided: set[str] = set()
+
+    def before(self, source: Iterator[_Oriented]) -> Iterator[_Oriented]:
+        """Yield all frames, but hold the first ones back until the up directions are decided.
+
+        Only topics with a given up direction are waited for.
+        """
+        held: list[_Oriented] = []
+        for reading in source:
+            frame, _, orientation = reading
+            held.append(reading)
+            if frame.topic not in self._decided:
+                self._look(frame, orientation)
+            if len(held) == _MOST_HELD:
+                self._decide_all()
+            if self._off_deg.keys() <= self._decided:
+                yield from held
+                held.clear()
+        self._decide_all()
+        yield from held
+
+    def _look(self, frame: Frame, orientation: Orientation) -> None:
+        self._looks[frame.topic] += 1
+        given, off = orientation.up, self._off_deg.get(frame.topic, [])
+        elsewhere = frame.points is not None and has_z_up(frame.frame_id)
+        if elsewhere and self._looks[frame.topic] == 1:
+            self._upright.warnings.append(
+                f"{frame.topic}: its clouds are in {frame.frame_id}, which is not the frame of a "
+                "camera: without its viewpoint, objects may be missed or fall apart"
+            )
+        if given is not None:
+            off = self._off_deg.setdefault(frame.topic, off)
+            found = find_up(frame, self._settings)
+            if found is not None:
+                angle = _angle_deg(given, found)
+                for how, turn in MISNAMED.items():
+                    others = self._misnamed_off_deg.setdefault((frame.topic, how), [])
+                    others.append(_angle_deg(turned(given, turn), found))
+                if elsewhere:  # from the base of a robot, a table seems to be seen from below
+                    angle = min(angle, 180 - angle)
+                off.append(angle)
+                self._sources[frame.topic] = orientation.source
+        enough = len(off) == _DOUBTS or self._looks[frame.topic] == _LOOKS
+        if enough or min(off, default=np.inf) <= _CONFIRMS_DEG:
+            self._decide(frame.topic)
+
+    def _decide_all(self) -> None:
+        for topic in sorted(self._off_deg.keys() - self._decided):
+            self._decide(topic)
+
+    def _decide(self, topic: str) -> None:
+        """Reject the up direction of a topic if no frame confirms it and enough contradict it."""
+        self._decided.add(topic)
+        off = self._off_deg.get(topic, [])
+        enough = len(off) >= min(_DOUBTS, self._looks[topic])
+        if not enough or min(off) <= _CONFIRMS_DEG:
+            return
+        source = self._sources[topic]
+        fits = [n for n in MISNAMED if max(self._misnamed_off_deg[topic, n]) <= _CONFIRMS_DEG]
+        if source.startswith("transforms") and fits:
+            self._upright.assume_misnamed(topic, fits[0])
+        else:
+            self._upright.contradict(topic, source, off)
+
+
+def _angle_deg(a: F4, b: F4) -> float:
+    return float(np.degrees(np.arccos(np.clip(a @ b, -1, 1))))
+
+
+def _tables(
+    folder: Path, run: RunInfo, categorizer: Categorizer, *, again: bool = False
+) -> PerceptionTables:
+    return PerceptionTables(
+        folder,
+        categories=categorizer.categories,
+        model_id=categorizer.model_id,
+        colour=bool(run.get("color")),
+        again=again,
+    )
+
+
+def _readings(
+    recording: Recording, run: RunInfo, job: Job, skipped: Counter[str]
+) -> Iterator[_Reading]:
+    """Yield the frames of a run; an OSError becomes a RecordingError."""
+    with explained(f"{job.source}: cannot be read", RecordingError):
+        for frame, colour in read_frames(recording, run["options"], skipped=skipped):
+            # Masks need no pixels, and frames are sent to other processes.
+            yield frame, colour and replace(colour, image=replace(colour.image, data=b""))

@@ -1,0 +1,74 @@
+"""Warn if the pose of a sensor jumps in the fixed frame, as when localization corrects a map."""
+
+from collections.abc import Iterator
+from pathlib import Path
+
+import numpy as np
+
+from shapecat.arrays import F8, I4
+from shapecat.runs.tables.reading import (
+    first_stamp,
+    numbers,
+    numbers_or_nan,
+    read_row_groups,
+    topic_codes,
+)
+
+__all__ = ["explain_jumps"]
+
+_JUMP_M, _JUMP_M_S = 0.1, 2.0
+"""Smallest distance and speed of a jump: the tracker follows objects over shorter distances, and
+cameras of robots indoors are slower."""
+_SUDDEN = 5
+"""A jump is this many times as fast as the motion before and after it."""
+
+
+def explain_jumps(folder: Path, fixed_frame: str | None) -> Iterator[str]:
+    """Yield a warning for each topic whose sensor jumps in the fixed frame.
+
+    Parameters
+    ----------
+    folder : with the table of frames.
+    """
+    if fixed_frame is None:
+        return
+    start_ns = first_stamp(folder)
+    for topic, (places, stamps_ns) in _read_places(folder).items():
+        jumps, steps = _jumps(places, stamps_ns)
+        if len(jumps):
+            seconds = (stamps_ns[jumps[0] + 1] - start_ns) * 1e-9
+            times = f"{len(jumps)} times, first" if len(jumps) > 1 else "once,"
+            yield (
+                f"{topic}: its pose in {fixed_frame} jumps {times} at {seconds:.1f} s, by up to "
+                f"{steps.max():.2f} m, and objects may get new tracks; if odometry has a frame of "
+                "its own, give its name to --fixed-frame"
+            )
+
+
+def _read_places(folder: Path) -> dict[str, tuple[F8, I4]]:
+    """Read, for each topic, the points (n, 3) 1 m before the sensor, metres, and their stamps."""
+    found: dict[str, list[tuple[F8, I4]]] = {}
+    columns = ["topic", "stamp_ns", "fixed_translation", "fixed_rotation"]
+    for group in read_row_groups(folder / "frames.parquet", columns):
+        topics, codes = topic_codes(group)
+        turns = numbers_or_nan(group["fixed_rotation"]).reshape(-1, 3, 3)
+        places = numbers_or_nan(group["fixed_translation"]) + turns[:, :, 2]
+        for code, topic in enumerate(topics):
+            rows = (codes == code) & ~np.isnan(places[:, 0])
+            found.setdefault(topic, []).append((places[rows], numbers(group["stamp_ns"])[rows]))
+    return {
+        topic: (np.concatenate([p for p, _ in parts]), np.concatenate([s for _, s in parts]))
+        for topic, parts in found.items()
+    }
+
+
+def _jumps(places: F8, stamps_ns: I4) -> tuple[I4, F8]:
+    """Return after which of the positions (n, 3) there is a jump (k,), and its distance (k,)."""
+    steps = np.linalg.norm(np.diff(places, axis=0), axis=1)
+    seconds = np.diff(stamps_ns) * 1e-9
+    speeds = np.divide(steps, seconds, out=np.zeros_like(steps), where=seconds > 0)
+    padded = np.pad(speeds, 1)
+    usual = np.maximum(padded[:-2], padded[2:])
+    sudden = speeds > np.maximum(_SUDDEN * usual, _JUMP_M_S)
+    found = np.flatnonzero((steps > _JUMP_M) & sudden)
+    return found, steps[found]

@@ -1,0 +1,152 @@
+"""Continue earlier work: an interrupted run, or a finished one whose frames need not change."""
+
+import os
+import shutil
+from collections.abc import Callable
+from contextlib import suppress
+from pathlib import Path
+
+from shapecat.errors import OutputError
+from shapecat.runs.folder import OUTPUT_OPTIONS, clear, read_run, write_run
+from shapecat.runs.identity import same_content, unchanged
+from shapecat.runs.jobs import differences
+from shapecat.runs.run_info import RunInfo
+from shapecat.runs.tables.reading import count_rows
+from shapecat.runs.tables.schemas import PERCEIVED, TABLES
+from shapecat.runs.tables.segments import count_segments, require_whole
+
+__all__ = ["has_work", "resume", "take_over_frames"]
+
+_LATER = ("tracking.", "outputs.")
+"""Groups of settings that perceiving does not use."""
+
+
+def resume(folder: Path, planned: RunInfo, source: Path, digest: Callable[[], str]) -> RunInfo:
+    """Return the run.json of the interrupted run in a folder if ``planned`` can continue it.
+
+    That is possible if settings, options, model, versions and recording are the same, and its
+    files are whole. Otherwise clear the folder, write ``planned`` as its run.json and return
+    ``planned``.
+
+    Parameters
+    ----------
+    digest : returns the digest of the recording; called only if names, sizes or times of its files
+        differ.
+
+    Raises
+    ------
+    OutputError : the folder cannot be written.
+    """
+    with suppress(OutputError):
+        run = _with_outputs(read_run(folder), planned)
+        if not differences(run, planned) and _same_recording_and_versions(
+            run, planned, source, digest
+        ):
+            _require_whole(folder)
+            if "perceive" in run["seconds"]:
+                run["counts"]["resumed"] = run["counts"]["frames"]
+            return {**run, "input": planned["input"]}
+    clear(folder)
+    write_run(folder, planned)
+    return planned
+
+
+def take_over_frames(
+    finished: Path, folder: Path, planned: RunInfo, source: Path, digest: Callable[[], str]
+) -> RunInfo:
+    """Take over the perceived frames of a finished run that differs only in later phases.
+
+    That is possible if settings of tracking or of outputs differ, but nothing else. If nothing
+    differs, the user wants all computed again. The tables are linked or copied.
+
+    Parameters
+    ----------
+    finished : the folder of the finished run, which need not exist.
+    folder : the folder of the new run, whose run.json has the content ``planned``.
+
+    Returns
+    -------
+    The content of the new run.json; ``planned`` if the frames must be perceived.
+
+    Raises
+    ------
+    OutputError : the folder cannot be written.
+    """
+    try:
+        run = _with_outputs(read_run(finished), planned)
+        changed = differences(run, planned)
+        later = bool(changed) and all(each.startswith(_LATER) for each in changed)
+        alike = later and _same_recording_and_versions(run, planned, source, digest)
+        if not (alike and _is_complete(finished, run)):
+            return planned
+    except OutputError:
+        return planned
+    for table in PERCEIVED:
+        _link(finished / f"{table}.parquet", folder)
+    new = planned.copy()
+    new["counts"] = {**run["counts"], "resumed": run["counts"]["frames"]}
+    new["counts"].pop("tracks", None)
+    new["seconds"] = {phase: run["seconds"][phase] for phase in ("perceive", "revise")}
+    new["fixed_frame"], new["up"], new["warnings"] = run["fixed_frame"], run["up"], run["warnings"]
+    write_run(folder, new)
+    return new
+
+
+def has_work(folder: Path) -> bool:
+    """Return whether an interrupted run has anything to resume."""
+    with suppress(OutputError):
+        return count_segments(folder) > 0 or "perceive" in read_run(folder)["seconds"]
+    return False
+
+
+def _require_whole(folder: Path) -> None:
+    """Check that all segments and tables can be opened: a power cut may have truncated them.
+
+    Raises
+    ------
+    OutputError : a file is unreadable.
+    """
+    require_whole(folder)
+    for table in TABLES:
+        if (folder / f"{table}.parquet").exists():
+            count_rows(folder, table)
+
+
+def _with_outputs(run: RunInfo, planned: RunInfo) -> RunInfo:
+    """Return a run whose options ask for the outputs of ``planned``."""
+    for name in OUTPUT_OPTIONS:
+        run["options"][name] = planned["options"][name]
+    return run
+
+
+def _same_recording_and_versions(
+    run: RunInfo, planned: RunInfo, source: Path, digest: Callable[[], str]
+) -> bool:
+    """Return whether a run was made by the same versions from the same recording."""
+    if run.get("versions") != planned["versions"]:
+        return False
+    known = run["input"]
+    return unchanged(known["files"], source) or same_content(known, source, digest)
+
+
+def _is_complete(folder: Path, run: RunInfo) -> bool:
+    """Return whether both phases are done and the tables have all rows of the counts."""
+    counts = run["counts"]
+    return (
+        {"perceive", "revise"} <= run["seconds"].keys()
+        and count_rows(folder, "frames") == counts["frames"]
+        and count_rows(folder, "detections") == counts["detections"]
+        and ("color" not in counts or count_rows(folder, "masks") == counts["color"])
+    )
+
+
+def _link(file: Path, folder: Path) -> None:
+    """Link a table, if it exists, into a folder; copy it where links are impossible."""
+    target = folder / file.name
+    target.unlink(missing_ok=True)
+    try:
+        os.link(file, target)  # tables are replaced, never edited
+    except FileNotFoundError:
+        return
+    except OSError:
+        shutil.copyfile(file, target)

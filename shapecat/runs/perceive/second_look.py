@@ -1,0 +1,197 @@
+"""Choose the frames to perceive again with the up direction of the whole recording.
+
+If the sensor poses are known, all frames have the same up direction in the fixed frame. If they are
+unknown and the frames before and after a frame agree with each other, the camera is assumed to be
+at rest, and the up direction of these frames is used.
+"""
+
+from collections.abc import Iterable, Iterator
+from itertools import chain
+from typing import NamedTuple
+
+import numpy as np
+import pyarrow as pa
+
+from shapecat.arrays import F4, F8, I4, Bool
+from shapecat.runs.tables.reading import (
+    Key,
+    frame_rows,
+    numbers,
+    numbers_or_nan,
+    rows_of,
+    topic_codes,
+)
+
+__all__ = ["Revision", "frames_to_revise"]
+
+_OFF_DEG = 10.0
+"""A frame is revised if its up direction differs by more from the recording's."""
+_AGREES_DEG = 5.0
+"""A frame is not revised if the given up direction differs by less from the recording's."""
+_STILL_DEG, _STILL_SHARE = 3.0, 0.6
+"""The camera is at rest if more than this share of the nearby frames agree to this angle."""
+_FIXED_SHARE = 0.5
+"""Up is known in the fixed frame if more than this share of the frames agree to `_OFF_DEG`."""
+_AROUND, _AROUND_NS = 30, 3_000_000_000
+"""Nearby frames: at most this many before and after, and at most this far in time."""
+_FEWEST = 4
+"""With fewer frames to compare, nothing is decided."""
+_STILL_M, _OFF_M = 0.03, 0.08
+"""Largest variation of the height of a support below a camera at rest, and smallest height
+difference to another support."""
+
+
+class Revision(NamedTuple):
+    """The up direction to use for a frame, and the one that was given before.
+
+    Both are unit vectors (3,) in the sensor frame; ``up_given`` is None if there was none.
+    """
+
+    up: F4
+    up_given: F4 | None
+
+
+class _Stream(NamedTuple):
+    """The frames of a topic, in their order.
+
+    Attributes
+    ----------
+    up : (n, 3) up directions in the sensor frame.
+    given : (n, 3) up directions from other sources than planes; NaN if there is none.
+    rotation : (n, 3, 3) of ``fixed_from_sensor``; NaN if unknown.
+    offsets : of each frame's planes along its up direction, ascending, metres.
+    """
+
+    frames: I4
+    stamps_ns: I4
+    up: F8
+    given: F8
+    rotation: F8
+    offsets: list[F4]
+
+    @property
+    def level(self) -> Bool:
+        """Whether each frame has a plane, (n,)."""
+        return np.array([len(offsets) > 0 for offsets in self.offsets], np.bool_)
+
+
+def frames_to_revise(tables: Iterable[tuple[pa.Table, pa.Table]]) -> dict[Key, Revision]:
+    """Return the frames without a plane, or with one that disagrees with the recording.
+
+    Parameters
+    ----------
+    tables : pairs of frames and planes tables, segment by segment.
+
+    Returns
+    -------
+    The frames whose up direction is now known better, in their order.
+
+    Notes
+    -----
+    Memory holds a few numbers per frame.
+    """
+    found: dict[Key, Revision] = {}
+    for topic, stream in _streams(tables).items():
+        posed = np.isfinite(stream.rotation[:, 0, 0])
+        expected = _fixed_up(stream, posed) if 2 * posed.sum() > len(posed) else _still_up(stream)
+        off = ~stream.level | ~(_cosine(stream.up, expected) > _cos(_OFF_DEG))
+        off |= ~posed & _other_support(stream, off)
+        agrees = _cosine(stream.given, expected) > _cos(_AGREES_DEG)
+        for k in np.flatnonzero(np.isfinite(expected[:, 0]) & off & ~agrees):
+            given = stream.given[k].astype(np.float32) if np.isfinite(stream.given[k, 0]) else None
+            key = (topic, int(stream.frames[k]))
+            found[key] = Revision(expected[k].astype(np.float32), given)
+    return found
+
+
+def _fixed_up(stream: _Stream, posed: Bool) -> F8:
+    """Return the up directions (n, 3) if most frames agree on one in the fixed frame; else NaN."""
+    in_fixed = np.einsum("nij,nj->ni", stream.rotation, stream.up)
+    agreed = _agreed(in_fixed[posed & stream.level], _OFF_DEG, _FIXED_SHARE)
+    return np.asarray(np.einsum("nji,j->ni", stream.rotation, agreed))
+
+
+def _still_up(stream: _Stream) -> F8:
+    """Return the up directions (n, 3) of nearby frames if the camera was at rest; else NaN."""
+    level, expected = stream.level, np.full(stream.up.shape, np.nan)
+    for k in range(len(expected)):
+        near = _around(stream, k)
+        expected[k] = _agreed(stream.up[near][level[near]], _STILL_DEG, _STILL_SHARE)
+    return expected
+
+
+def _around(stream: _Stream, k: int) -> I4:
+    """Return the indices of the frames near frame ``k``, without ``k``."""
+    near = np.arange(max(0, k - _AROUND), min(len(stream.frames), k + _AROUND + 1))
+    soon = np.abs(stream.stamps_ns[near] - stream.stamps_ns[k]) <= _AROUND_NS
+    return np.asarray(near[soon & (near != k)])
+
+
+def _other_support(stream: _Stream, off: Bool) -> Bool:
+    """Return whether all planes of a frame differ in height from the lowest ones of nearby frames.
+
+    ``off`` (n,) marks the frames that are not compared; the result is (n,) too.
+    """
+    found = np.zeros(len(off), np.bool_)
+    for k in np.flatnonzero(~off):
+        near = _around(stream, int(k))
+        lowest = np.array([stream.offsets[m][0] for m in near[~off[near]]])
+        if len(lowest) < _FEWEST:
+            continue
+        usual = np.median(lowest)
+        still = np.mean(np.abs(lowest - usual) < _STILL_M) > _STILL_SHARE
+        found[k] = still and np.min(np.abs(stream.offsets[k] - usual)) > _OFF_M
+    return found
+
+
+def _agreed(up: F8, within_deg: float, share: float) -> F8:
+    """Return the direction (3,) on which more than `share` of ``up`` (n, 3) agree; NaN if none."""
+    if len(up) < _FEWEST:
+        return np.full(3, np.nan)
+    near = _cosine(up, np.median(up, axis=0)) > _cos(within_deg)
+    if near.mean() <= share:
+        return np.full(3, np.nan)
+    mean = up[near].mean(axis=0)
+    return np.asarray(mean / np.linalg.norm(mean))
+
+
+def _cosine(a: F8, b: F8) -> F8:
+    """Return the cosines (n,) between directions (n, 3) and other directions, (n, 3) or (3,)."""
+    lengths = np.linalg.norm(a, axis=-1) * np.linalg.norm(b, axis=-1)
+    return np.asarray((a * b).sum(axis=-1) / np.maximum(lengths, 1e-9))
+
+
+def _cos(degrees: float) -> float:
+    return float(np.cos(np.radians(degrees)))
+
+
+def _streams(tables: Iterable[tuple[pa.Table, pa.Table]]) -> dict[str, _Stream]:
+    parts: dict[str, list[_Stream]] = {}
+    for frames, planes in tables:
+        for topic, part in _parts(frames, planes):
+            parts.setdefault(topic, []).append(part)
+    return {topic: _joined(of_topic) for topic, of_topic in parts.items()}
+
+
+def _parts(frames: pa.Table, planes: pa.Table) -> Iterator[tuple[str, _Stream]]:
+    """Yield the frames of each topic in a part of the tables."""
+    topics, codes = topic_codes(frames)
+    rows, offsets = frame_rows(planes), numbers(planes["offset"]).copy()
+    index, stamps = numbers(frames["frame"]), numbers(frames["stamp_ns"])
+    keys = list(rows_of(topics, codes, index))
+    of_frame = [offsets[rows.get(key, slice(0, 0))] for key in keys]
+    up, given, rotation = (
+        numbers_or_nan(frames[name]).astype(np.float64)
+        for name in ("up", "up_given", "fixed_rotation")
+    )
+    rotation = rotation.reshape(-1, 3, 3)
+    for code, topic in enumerate(topics):
+        of = np.flatnonzero(codes == code)
+        chosen = [of_frame[k] for k in of]
+        yield topic, _Stream(index[of], stamps[of], up[of], given[of], rotation[of], chosen)
+
+
+def _joined(parts: list[_Stream]) -> _Stream:
+    *arrays, offsets = zip(*parts, strict=True)
+    frames, stamps, up, given, rotation = map(np.concatenate, arrays)
+    return _Stream(frames, stamps, up, given, rotation, list(chain.from_iterable(offsets)))

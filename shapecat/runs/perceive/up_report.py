@@ -1,0 +1,82 @@
+"""Where the up direction of a run came from, and how well the planes confirm it."""
+
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from shapecat.recordings.transforms.gravity import Upright
+from shapecat.runs.tables.reading import keys_of, read_together
+
+__all__ = ["report_up"]
+
+_DISAGREE_DEG = 10
+
+
+def report_up(upright: Upright, folder: Path) -> dict[str, Any]:
+    """Return the source of the up direction and its agreement with the planes, for run.json.
+
+    Failed look-ups, what they cost, and large differences are added to the warnings of ``upright``.
+
+    Parameters
+    ----------
+    folder : with the tables of frames, planes and detections.
+    """
+    if upright.failed:
+        upright.warnings.append(
+            f"failed transform look-ups: {upright.failed}, the first: {upright.first_failure}"
+        )
+        upright.warnings += _missing_poses(folder, upright.fixed_frame)
+    given = upright.given
+    report: dict[str, Any] = {"source": max(given, key=lambda name: given[name], default="planes")}
+    if upright.dropped:
+        report["dropped"] = dict(upright.dropped)
+    if len(given) > 1:
+        report["frames"] = dict(given)
+    if set(given) - {"planes"}:
+        angles, bare = _angles_to_planes(folder)
+        typical = round(float(np.median(angles)), 1) if angles else None
+        report |= {"planes_differ_deg": typical, "frames_without_plane": bare}
+        if typical is not None and typical > _DISAGREE_DEG:
+            upright.warnings.append(f"up and the detected planes differ by {typical} degrees")
+    return report
+
+
+def _missing_poses(folder: Path, fixed_frame: str | None) -> Iterator[str]:
+    """Yield a warning for each topic of which frames have no pose in the fixed frame."""
+    if fixed_frame is None:  # all tracks are in the sensor frame
+        return
+    from shapecat.runs.tables.placed_frames import count_poses  # noqa: PLC0415  loads pyarrow.compute
+
+    for topic, (known, count) in count_poses(folder).items():
+        loss = ", whose objects are not tracked"
+        if 2 * known <= count:
+            loss = ": its tracks are in the frame of the sensor"
+        if known < count:
+            frames = f"{count - known} of {count} frames"
+            yield f"{topic}: its pose in {fixed_frame} is unknown in {frames}{loss}"
+
+
+def _angles_to_planes(folder: Path) -> tuple[list[float], int]:
+    """Compare the given up directions with the planes.
+
+    Returns
+    -------
+    The angle between the two in each frame, degrees; and the number of frames that have a given up
+    direction, but neither a plane nor an object, which implies one.
+    """
+    angles, bare = [], 0
+    rows = ["topic", "frame"]
+    wanted = {"frames": [*rows, "up", "up_given"], "planes": rows, "detections": rows}
+    for frames, *found in read_together(folder, wanted):
+        planes, objects = (set(keys_of(table)) for table in found)
+        for row in frames.to_pylist():
+            key = (row["topic"], row["frame"])
+            if row["up_given"] is None:
+                continue
+            if key in planes:
+                cosine = np.clip(np.dot(row["up"], row["up_given"]), -1, 1)
+                angles.append(float(np.degrees(np.arccos(cosine))))
+            bare += key not in planes and key not in objects
+    return angles, bare

@@ -1,0 +1,88 @@
+"""The table of masks: the pixels of each detection on the colour image."""
+
+from collections.abc import Iterable, Iterator
+from itertools import chain, pairwise
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pyarrow as pa
+
+from shapecat.arrays import U4
+from shapecat.runs.tables.reading import Key, keys_of, numbers, read_row_groups
+from shapecat.runs.tables.schemas import MASKS
+from shapecat.types import ImageMasks, Perception
+
+__all__ = ["mask_columns", "read_masks", "read_nearest_masks"]
+
+
+def mask_columns(perceptions: Iterable[Perception]) -> dict[str, Any]:
+    """Return the columns of the table for some frames."""
+    pairs = [(p, p.masks) for p in perceptions if p.masks is not None]
+    return {
+        "topic": [p.topic for p, _ in pairs],
+        "frame": [p.index for p, _ in pairs],
+        "color_topic": [m.topic for _, m in pairs],
+        "color_stamp_ns": [m.stamp_ns for _, m in pairs],
+        "color_log_time_ns": [m.log_time_ns for _, m in pairs],
+        "color_frame_id": [m.frame_id for _, m in pairs],
+        "width": [m.width for _, m in pairs],
+        "height": [m.height for _, m in pairs],
+        "detection": [list(m.boxes) for _, m in pairs],
+        "box": [list(chain.from_iterable(m.boxes.values())) for _, m in pairs],
+        "counts": [list(m.counts.values()) for _, m in pairs],
+    }
+
+
+def read_masks(folder: Path, *, boxes_only: bool = False) -> Iterator[tuple[Key, ImageMasks]]:
+    """Yield frames and their masks in the order of the frames table; nothing without colour.
+
+    ``boxes_only`` leaves out the run lengths, which make up most of the table.
+    """
+    path = folder / "masks.parquet"
+    if not path.exists():
+        return
+    plain = MASKS.names[: -1 if boxes_only else None]
+    for group in read_row_groups(path, plain):
+        counts = None if boxes_only else _run_lengths(group["counts"])
+        for row in group.select(MASKS.names[:-1]).to_pylist():
+            detections = row.pop("detection")
+            boxes = np.reshape(row.pop("box"), (-1, 4)).astype(int).tolist()
+            key = row.pop("topic"), row.pop("frame")
+            of_image = {name.removeprefix("color_"): value for name, value in row.items()}
+            runs = {} if counts is None else {n: next(counts) for n in detections}
+            named = dict(zip(detections, map(tuple, boxes), strict=True))
+            yield key, ImageMasks(**of_image, boxes=named, counts=runs)
+
+
+def read_nearest_masks(folder: Path) -> Iterator[tuple[Key, ImageMasks]]:
+    """Yield each image once, with the boxes of the masks of the frame nearest to it in time.
+
+    Several frames have the same image if images are rarer. Run lengths are left out.
+    """
+    best: dict[str, tuple[int, Key, ImageMasks]] = {}
+    stamps = _frame_stamps(folder)
+    for key, masks in read_masks(folder, boxes_only=True):
+        stamp = next(stamp for other, stamp in stamps if other == key)
+        apart, before = abs(stamp - masks.stamp_ns), best.get(masks.topic)
+        if before is not None and before[2].stamp_ns != masks.stamp_ns:
+            yield before[1:]
+            before = None
+        if before is None or apart < before[0]:
+            best[masks.topic] = apart, key, masks
+    for _, key, masks in best.values():
+        yield key, masks
+
+
+def _frame_stamps(folder: Path) -> Iterator[tuple[Key, int]]:
+    """Yield each frame and its stamp in nanoseconds, in the order of the frames table."""
+    for group in read_row_groups(folder / "frames.parquet", ["topic", "frame", "stamp_ns"]):
+        yield from zip(keys_of(group), numbers(group["stamp_ns"]).tolist(), strict=True)
+
+
+def _run_lengths(column: pa.ChunkedArray) -> Iterator[U4]:
+    """Yield the run lengths (r,) of each mask, without making Python lists, which is slow."""
+    masks = column.combine_chunks().flatten()
+    ends, values = np.from_dlpack(masks.offsets), numbers(pa.chunked_array([masks]))
+    ends = ends - ends[0] if len(ends) else ends
+    return (values[start:end] for start, end in pairwise(ends.tolist()))

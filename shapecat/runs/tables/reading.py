@@ -1,0 +1,278 @@
+"""Reading and writing the Parquet tables between the phases.
+
+Row groups of all tables but ``tracks`` cover the same frames, so that they can be read side by side
+in constant memory.
+"""
+
+from collections.abc import Iterator, Mapping, Sequence
+from contextlib import contextmanager
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pyarrow as pa
+import pyarrow.parquet as pq
+
+from shapecat.arrays import F4, I4
+from shapecat.errors import OutputError
+from shapecat.runs.tables.schemas import ADDED, FIXED_LISTS, FULL_BOX, TABLES
+
+__all__ = [
+    "Key",
+    "count_rows",
+    "first_stamp",
+    "frame_rows",
+    "full_boxes_of",
+    "keys_of",
+    "numbers",
+    "numbers_or_nan",
+    "opened",
+    "read_row_groups",
+    "read_rows",
+    "read_together",
+    "rows_of",
+    "topic_codes",
+    "with_fixed_lists",
+]
+
+_NUMBERS = {"center", "size", "orientation", "posterior", *FULL_BOX}
+"""Columns whose numbers are finite."""
+_TUPLES = {"edges": 2, "neurons": 3, "outline": 3}
+"""Columns of lists of this many numbers for each item."""
+
+Key = tuple[str, int]
+"""A frame: its topic, and its number on that topic."""
+
+
+def count_rows(folder: Path, table: str) -> int:
+    """Return the number of rows of a table in a run folder.
+
+    Raises
+    ------
+    OutputError : the table is missing or unreadable.
+    """
+    with opened(folder / f"{table}.parquet") as file:
+        return int(file.metadata.num_rows)
+
+
+def first_stamp(folder: Path) -> int:
+    """Return the earliest stamp of the frames of a run, ns; 0 without frames.
+
+    It need not be that of the first row: frames are in the order in which they were recorded.
+    """
+    groups = read_row_groups(folder / "frames.parquet", ["stamp_ns"])
+    return min((int(numbers(group["stamp_ns"]).min()) for group in groups if len(group)), default=0)
+
+
+def read_row_groups(
+    path: Path, columns: Sequence[str] | None = None, *, at_once: int = 1
+) -> Iterator[pa.Table]:
+    """Yield the row groups of a table of a run folder, ``at_once`` at a time.
+
+    Raises
+    ------
+    OutputError : the table is missing or unreadable, or holds values that no run writes.
+    """
+    with opened(path) as file:
+        count = file.num_row_groups
+        for first in range(0, count, at_once):
+            groups = range(first, min(first + at_once, count))
+            table = file.read_row_groups(groups, columns=columns, use_threads=False)
+            yield _validated(_with_added(table, TABLES[path.stem], columns))
+
+
+def read_rows(
+    file: pq.ParquetFile, columns: Sequence[str], rows: I4, *, at_once: int = 1
+) -> Iterator[tuple[I4, pa.Table]]:
+    """Yield some rows of an open table, ``at_once`` row groups in memory at a time.
+
+    Parameters
+    ----------
+    rows : (n,) numbers of the rows, in any order.
+
+    Yields
+    ------
+    Indices (k,) in ``rows``, and the table of these rows.
+    """
+    sizes = [file.metadata.row_group(k).num_rows for k in range(file.num_row_groups)]
+    starts, rows = np.cumsum([0, *sizes]), rows.astype(np.int64)
+    order = np.argsort(rows, kind="stable")
+    bounds = np.searchsorted(rows[order], starts)
+    groups = np.flatnonzero(np.diff(bounds))
+    for k in range(0, len(groups), at_once):
+        some = groups[k : k + at_once]
+        at = np.concatenate([order[bounds[g] : bounds[g + 1]] for g in some])
+        skipped = starts[some] - np.cumsum([0, *np.diff(starts)[some[:-1]]])
+        table = _validated(file.read_row_groups(some.tolist(), list(columns), use_threads=False))
+        yield at, table.take(pa.array(rows[at] - np.repeat(skipped, np.diff(bounds)[some])))
+
+
+def read_together(
+    folder: Path, columns: Mapping[str, Sequence[str] | None], *, at_once: int = 1
+) -> Iterator[tuple[pa.Table, ...]]:
+    """Yield the row groups of the same frames from several tables of a run folder.
+
+    ``columns`` are those to read of each table, by its name; None for all.
+
+    Raises
+    ------
+    OutputError : a table is missing or unreadable, or their row groups differ in number.
+    """
+    groups = (
+        read_row_groups(folder / f"{name}.parquet", wanted, at_once=at_once)
+        for name, wanted in columns.items()
+    )
+    try:
+        yield from zip(*groups, strict=True)
+    except ValueError as error:  # of zip
+        names = ", ".join(columns)
+        msg = f"{folder}: {names} have different row groups; process the recording again"
+        raise OutputError(msg) from error
+
+
+def keys_of(table: pa.Table) -> list[Key]:
+    """Return the topic and frame of each row."""
+    return list(zip(table["topic"].to_pylist(), table["frame"].to_pylist(), strict=True))
+
+
+def frame_rows(table: pa.Table) -> dict[Key, slice]:
+    """Return the slice of rows of each frame of a table; the rows of a frame are consecutive."""
+    return rows_of(*topic_codes(table), numbers(table["frame"]))
+
+
+def topic_codes(table: pa.Table) -> tuple[list[str], I4]:
+    """Return the topics in a table, and the index of each row's topic, (rows,)."""
+    column = table["topic"].combine_chunks().dictionary_encode()
+    return column.dictionary.to_pylist(), np.from_dlpack(column.indices)
+
+
+def rows_of(topics: Sequence[str], codes: I4, frames: I4) -> dict[Key, slice]:
+    """Return the slice of rows of each frame; the rows of a frame are consecutive.
+
+    Parameters
+    ----------
+    codes : (rows,) index of each row's topic.
+    frames : (rows,) number of each row's frame.
+    """
+    changes = (np.diff(codes) != 0) | (np.diff(frames) != 0)
+    starts = np.flatnonzero(np.concatenate([np.ones(min(1, len(frames)), np.bool_), changes]))
+    names = map(topics.__getitem__, codes[starts].tolist())
+    stops = [*starts[1:].tolist(), len(frames)]
+    rows = map(slice, starts.tolist(), stops)
+    return dict(zip(zip(names, frames[starts].tolist(), strict=True), rows, strict=True))
+
+
+def numbers(column: pa.ChunkedArray) -> Any:
+    """Return a column without nulls as a flat array; lists are concatenated.
+
+    Arrow's own conversion loads pandas, which takes a third of a second.
+    """
+    array = column.combine_chunks()
+    return np.from_dlpack(array if pa.types.is_primitive(array.type) else array.flatten())
+
+
+def numbers_or_nan(column: pa.ChunkedArray) -> Any:
+    """Return a column of lists of fixed size as an array (rows, size); null becomes NaN."""
+    width, kind = column.type.list_size, column.type.value_type.to_pandas_dtype()
+    result = np.full((len(column), width), np.nan, kind)
+    known = pa.compute.is_valid(column).to_numpy()
+    if known.any():
+        result[known] = numbers(column.drop_null()).reshape(-1, width)
+    return result
+
+
+def full_boxes_of(table: pa.Table) -> F4:
+    """Return the columns `FULL_BOX` as one array (rows, `BOX_WIDTH`); NaN if unknown."""
+    return np.hstack([numbers_or_nan(table[name]) for name in FULL_BOX])
+
+
+@contextmanager
+def opened(path: Path, *, read_dictionary: Sequence[str] = ()) -> Iterator[pq.ParquetFile]:
+    """Open a table of a run folder; the columns ``read_dictionary`` are read as dictionaries.
+
+    Raises
+    ------
+    OutputError : the table is missing or unreadable, or lacks a column of its schema that is not
+        in `ADDED`.
+    """
+    try:
+        with _open_parquet(path, read_dictionary) as file:
+            if wrong := _wrong_column(file.schema_arrow, TABLES[path.stem]):
+                msg = f"{path}: {wrong}; process the recording again"
+                raise OutputError(msg)
+            yield file
+    except (OSError, pa.ArrowException) as error:
+        msg = f"{path}: not a readable table of a run folder ({error}); process the recording again"
+        raise OutputError(msg) from error
+
+
+def _validated(table: pa.Table) -> pa.Table:
+    """Return rows of a table, with lists of fixed size.
+
+    Raises
+    ------
+    pa.ArrowInvalid : a box or a posterior holds NaN or infinity, a visible size is negative, or a
+        list ends within an item.
+    """
+    table = with_fixed_lists(table)
+    for name in _TUPLES.keys() & set(table.column_names):
+        lengths = (np.diff(chunk.offsets.to_numpy()) for chunk in table[name].chunks)
+        if any((length % _TUPLES[name]).any() for length in lengths):
+            msg = f"column {name} holds a list that is not of {_TUPLES[name]} numbers per item"
+            raise pa.ArrowInvalid(msg)
+    for name in _NUMBERS.intersection(table.column_names):
+        values = numbers(table[name].drop_null())
+        if not np.isfinite(values).all() or (name == "size" and np.any(values < 0)):
+            msg = f"column {name} holds NaN, infinity or a negative size"
+            raise pa.ArrowInvalid(msg)
+    return table
+
+
+def _with_added(table: pa.Table, schema: pa.Schema, columns: Sequence[str] | None) -> pa.Table:
+    """Add the chosen columns that a table of an earlier version lacks."""
+    for name in ADDED.intersection(schema.names if columns is None else columns):
+        if name not in table.column_names:
+            nulls = pa.nulls(len(table), schema.field(name).type)
+            table = table.append_column(schema.field(name), nulls)
+    return table
+
+
+def with_fixed_lists(table: pa.Table) -> pa.Table:
+    """Return rows of a table as read, with the lists of fixed size of its schema.
+
+    Raises
+    ------
+    pa.ArrowInvalid : a list has another length.
+    """
+    for k, field in enumerate(table.schema):
+        if (kind := FIXED_LISTS.get(field.name, field.type)) != field.type:
+            table = table.set_column(k, field.name, table[k].cast(kind))
+    return table
+
+
+def _open_parquet(path: Path, read_dictionary: Sequence[str]) -> pq.ParquetFile:
+    try:
+        return pq.ParquetFile(path, read_dictionary=list(read_dictionary))
+    except KeyError as error:
+        msg = f"no column {', '.join(read_dictionary)}"
+        raise pa.ArrowInvalid(msg) from error
+
+
+def _wrong_column(found: pa.Schema, wanted: pa.Schema) -> str:
+    """Describe the first column that another version, or another program, wrote otherwise."""
+    for field in wanted:
+        if field.name not in found.names:
+            if field.name in ADDED:
+                continue
+            return f"no column {field.name}"
+        kind = found.field(field.name).type
+        if (kind.value_type if pa.types.is_dictionary(kind) else kind) not in _file_types(
+            field.type
+        ):
+            return f"column {field.name} holds {kind}, not {field.type}"
+    return ""
+
+
+def _file_types(kind: pa.DataType) -> tuple[pa.DataType, ...]:
+    """Return the types that a column may have in a file; earlier versions wrote no plain lists."""
+    return (kind, pa.list_(kind.value_type)) if pa.types.is_fixed_size_list(kind) else (kind,)

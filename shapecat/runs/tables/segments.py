@@ -1,0 +1,189 @@
+"""Segments: finished parts of the tables, which survive a kill of the run.
+
+Segments are folders that appear when complete and never change. The tables can be joined from
+them again and again, so a kill while they are joined does no harm.
+"""
+
+import shutil
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
+from functools import lru_cache
+from math import isqrt
+from pathlib import Path
+
+import pyarrow as pa
+
+from shapecat.errors import OutputError
+from shapecat.runs.tables.reading import Key, frame_rows, numbers
+from shapecat.runs.tables.schemas import PERCEIVED
+
+__all__ = [
+    "GROUP_FRAMES",
+    "REVISIONS",
+    "SEGMENTS",
+    "count_segments",
+    "discard_segments",
+    "group_frames",
+    "list_segments",
+    "read_segment",
+    "read_segments",
+    "require_whole",
+    "row_groups",
+    "write_segment",
+]
+
+GROUP_FRAMES = 32
+"""Minimum number of frames of a row group."""
+_BALANCE = 4096
+"""Number of frames above which row groups grow with its square root."""
+SEGMENTS, REVISIONS = "segments", "revisions"
+
+
+def count_segments(folder: Path) -> int:
+    """Return the number of segments of an interrupted run."""
+    return len(list_segments(folder / SEGMENTS))
+
+
+def discard_segments(folder: Path) -> None:
+    """Remove all segments, after they have been joined."""
+    for name in (SEGMENTS, REVISIONS):
+        shutil.rmtree(folder / name, ignore_errors=True)
+
+
+def read_segments(folder: Path) -> Iterator[tuple[pa.Table, pa.Table]]:
+    """Yield frames and planes of the first look, segment by segment.
+
+    Raises
+    ------
+    OutputError : a segment is unreadable.
+    """
+    for segment in list_segments(folder / SEGMENTS):
+        yield read_segment(segment, "frames"), read_segment(segment, "planes")
+
+
+def list_segments(place: Path) -> list[Path]:
+    """Return the complete segments in a folder, in order."""
+    return sorted(place.glob("[0-9]*"))
+
+
+_Tables = dict[str, pa.Table]
+
+
+def _read_tables(segment: Path) -> _Tables:
+    names = [name for name in PERCEIVED if _part(segment, name).exists()]
+    return {name: read_segment(segment, name) for name in names}
+
+
+def _latest(folder: Path) -> Iterator[_Tables]:
+    """Yield the tables of each segment; the results of a second look replace the first ones."""
+    places = {
+        key: segment
+        for segment in list_segments(folder / REVISIONS)
+        for key in _revised(read_segment(segment, "frames"))
+    }
+    read = lru_cache(maxsize=2)(_read_tables)  # both are in the order of the recording
+    for segment in list_segments(folder / SEGMENTS):
+        first = _read_tables(segment)
+        keys = list(frame_rows(first["frames"]))
+        if places.keys().isdisjoint(keys):
+            yield first
+        else:
+            sources = [read(places[key]) if key in places else first for key in keys]
+            yield {name: _picked(name, keys, sources) for name in first}
+
+
+def _revised(frames: pa.Table) -> Iterator[Key]:
+    """Yield the frames in which a second look found a plane or a detection."""
+    kept = numbers(frames["revised"].cast(pa.int8()))
+    return (key for key, revised in zip(frame_rows(frames), kept, strict=True) if revised)
+
+
+def _picked(name: str, keys: Sequence[Key], sources: Sequence[_Tables]) -> pa.Table:
+    """Return the rows of a table; the rows of each frame come from the source at its index."""
+    rows = {id(tables): frame_rows(tables[name]) for tables in sources}
+    chosen = [
+        (tables[name], rows[id(tables)].get(key, slice(0, 0)))
+        for key, tables in zip(keys, sources, strict=True)
+    ]
+    return pa.concat_tables(table[of] for table, of in chosen)
+
+
+def group_frames(frames: int) -> int:
+    """Return the number of frames per row group, for a table of ``frames`` frames.
+
+    A reader holds one row group in memory, and 30 kB of metadata for every row group. So both the
+    length and the number of row groups grow with the square root of the number of frames.
+    """
+    return GROUP_FRAMES * max(1, isqrt(frames // _BALANCE))
+
+
+def row_groups(folder: Path, length: int) -> Iterator[_Tables]:
+    """Yield the tables of ``length`` frames at a time, whatever the length of the segments."""
+    held: _Tables = {}
+    for new in _latest(folder):
+        held = {name: pa.concat_tables([held[name], new[name]]) for name in new} if held else new
+        while held["frames"].num_rows >= length:
+            group, held = _cut(held, length)
+            yield group
+    if held and held["frames"].num_rows:
+        yield held
+
+
+def _cut(tables: _Tables, count: int) -> tuple[_Tables, _Tables]:
+    """Split tables after ``count`` frames."""
+    first = set(frame_rows(tables["frames"][:count]))
+    ends = {"frames": count}
+    for name in tables.keys() - ends.keys():
+        rows = frame_rows(tables[name])
+        ends[name] = max((rows[key].stop for key in first & set(rows)), default=0)
+    return (
+        {name: tables[name][:end].combine_chunks() for name, end in ends.items()},
+        {name: tables[name][end:] for name, end in ends.items()},
+    )
+
+
+def write_segment(segment: Path, name: str, table: pa.Table) -> None:
+    """Write a segment's part of a table; uncompressed, because it is soon read again."""
+    with (
+        pa.OSFile(str(_part(segment, name)), "wb") as sink,
+        pa.ipc.new_file(sink, table.schema) as writer,
+    ):
+        writer.write_table(table)
+
+
+def read_segment(segment: Path, name: str) -> pa.Table:
+    """Read the rows of a table that a segment holds.
+
+    Raises
+    ------
+    OutputError : the file is unreadable.
+    """
+    with _opened(_part(segment, name)) as reader:
+        return reader.read_all()
+
+
+def require_whole(folder: Path) -> None:
+    """Check that all segments of an interrupted run can be opened; their rows are not read.
+
+    Raises
+    ------
+    OutputError : a file is unreadable.
+    """
+    for name in (SEGMENTS, REVISIONS):
+        for part in (folder / name).glob("[0-9]*/*"):
+            with _opened(part):
+                pass
+
+
+@contextmanager
+def _opened(path: Path) -> Iterator[pa.ipc.RecordBatchFileReader]:
+    try:
+        with pa.OSFile(str(path), "rb") as source, pa.ipc.open_file(source) as reader:
+            yield reader
+    except (OSError, pa.ArrowException) as error:
+        msg = f"{path}: unreadable, left by a killed run ({error})"
+        raise OutputError(msg) from error
+
+
+def _part(segment: Path, name: str) -> Path:
+    return segment / f"{name}.arrow"

@@ -1,0 +1,1 @@
+"""Simulated depth cameras: rendering, and the errors of each sensor."""

@@ -1,0 +1,304 @@
+"""Error model of a depth camera: from rendered depth to measured depth."""
+
+import numpy as np
+from numpy.random import Generator
+
+from shapecat.arrays import F4, F8, I4, Bool
+from shapecat.jit import kernel
+from shapecat.simulation.camera.noise import fixed_error, noise
+from shapecat.simulation.camera.render import Image
+from shapecat.simulation.camera.sensors import Sensor
+
+__all__ = ["measure"]
+
+_DISCONTINUITY = 0.03
+"""Discontinuity of the inverse depth that separates two surfaces, 1/m."""
+_MARGIN_DISCONTINUITY = 0.07
+"""Discontinuity of the inverse depth beside which stereo matching fails, 1/m."""
+
+
+def measure(image: Image, sensor: Sensor, rng: Generator) -> tuple[F4, I4]:
+    """Measure a rendered image with the errors of a depth camera.
+
+    Parameters
+    ----------
+    image : rendered with the sensor's camera, or with a crop of it.
+    rng : generator of the noise and of missing depth.
+
+    Returns
+    -------
+    depth : (h, w) float32 metres, 0 where it is missing.
+    mesh_ids : (h, w) int16 index of the measured mesh, -1 where there is no depth.
+    """
+    inverse, mesh_ids, cosine = _jitter_edges(image, sensor, rng)
+    lost = np.zeros(image.inverse.shape, np.bool_)
+    if sensor.stereo_margin_px:
+        _drop_margins(inverse, sensor.stereo_margin_px, lost)
+    for place in sensor.shadow_m:
+        _cast_shadow(inverse, place * sensor.camera.fx, lost)
+    if sensor.shadow_fill_px > 0:
+        middle = round(sensor.shadow_fill_px)
+        growth_px = rng.integers(middle - 1, middle + 2, (inverse.shape[0] // 3 + 1, 16), np.int8)
+        _fill_shadow(inverse, mesh_ids, lost, growth_px)
+    _drop_grazing(_scaled_by_reflectance(cosine, mesh_ids, sensor), sensor, rng, lost)
+    _drop_random_holes(sensor, rng, lost)
+    _drop_border(sensor, lost)
+    if sensor.smoothing_px:
+        inverse = _smoothed_surfaces(inverse, sensor.smoothing_px)
+    if sensor.blend_px:
+        inverse = _blended_edges(inverse, sensor.blend_px)
+    depth = np.zeros(inverse.shape, np.float32)
+    error = _inverse_depth_error(inverse, sensor, rng)
+    limits = np.array([sensor.step, sensor.nearest_m, sensor.farthest_m])
+    _write_depth(inverse, error, lost, limits, depth, mesh_ids)
+    return depth, mesh_ids
+
+
+def _jitter_edges(image: Image, sensor: Sensor, rng: Generator) -> tuple[F8, I4, F4]:
+    """Sample the true image at randomly displaced pixels, which makes its edges ragged.
+
+    Returns the inverse depth (1/m), mesh ids and cosines, all (h, w).
+
+    Source: Barron and Malik 2013.
+    """
+    inverse = np.array(image.inverse)
+    mesh_ids, cosine = np.array(image.mesh_ids), np.array(image.cosine)
+    if sensor.edge_jitter_px > 0:
+        shape, window, size = inverse.shape, sensor.edge_jitter_window, sensor.edge_jitter_px
+        across = noise(shape, window, size, rng, smoothings=sensor.smoothings)
+        down = noise(shape, window, size, rng, smoothings=sensor.smoothings)
+        _sample_beside(
+            image.inverse, image.mesh_ids, image.cosine, across, down, inverse, mesh_ids, cosine
+        )
+    return inverse, mesh_ids, cosine
+
+
+def _inverse_depth_error(inverse: F8, sensor: Sensor, rng: Generator) -> F4:
+    """Return the error (h, w) of the inverse depth before quantization, 1/m."""
+    error = np.zeros(inverse.shape, np.float32)
+    if sensor.noise > 0:
+        error += noise(
+            inverse.shape, sensor.noise_window, sensor.noise, rng, smoothings=sensor.smoothings
+        )
+    if sensor.noise_m > 0:
+        relative = noise(inverse.shape, sensor.noise_window, sensor.noise_m, rng)
+        error += relative * inverse.astype(np.float32)
+    if sensor.fixed_error > 0:
+        error += fixed_error(
+            inverse.shape, sensor.fixed_error, sensor.fixed_error_px, sensor.device
+        )
+    return error
+
+
+def _scaled_by_reflectance(cosine: F4, mesh_ids: I4, sensor: Sensor) -> F4:
+    """Return the cosines (h, w) of incidence, scaled by the reflectance of each mesh."""
+    if sensor.log_reflectance_std <= 0 or mesh_ids.max(initial=-1) < 0:
+        return cosine
+    draws = np.random.default_rng((sensor.device, 2)).normal(
+        0, sensor.log_reflectance_std, mesh_ids.max() + 1
+    )
+    reflectance = np.append(np.exp(draws), 1.0).astype(np.float32)
+    return cosine * reflectance[mesh_ids]
+
+
+def _drop_grazing(cosine: F4, sensor: Sensor, rng: Generator, lost: Bool) -> None:
+    """Mark missing depth on oblique surfaces."""
+    if sensor.grazing_cosine > 0:
+        window = (sensor.hole_px, sensor.hole_px)
+        threshold_noise = noise(cosine.shape, window, 0.5 * sensor.grazing_cosine, rng)
+        lost |= cosine < threshold_noise + np.float32(sensor.grazing_cosine)
+
+
+def _drop_border(sensor: Sensor, lost: Bool) -> None:
+    left, right, top, bottom = sensor.border_px
+    lost[:top] = True
+    lost[len(lost) - bottom :] = True
+    lost[:, :left] = True
+    lost[:, lost.shape[1] - right :] = True
+
+
+def _drop_random_holes(sensor: Sensor, rng: Generator, lost: Bool) -> None:
+    """Mark missing depth in random holes."""
+    area = 0.32 * (sensor.hole_px + 2) ** 2  # about the mean of width times height
+    count = rng.poisson(sensor.holes * lost.size / area) if sensor.holes > 0 else 0
+    rows = rng.integers(0, lost.shape[0], count)
+    columns = rng.integers(0, lost.shape[1], count)
+    sizes = rng.integers(1, sensor.hole_px + 2, (count, 2))
+    for v, u, (tall, wide) in zip(rows, columns, sizes, strict=True):
+        lost[v : v + tall, u : u + wide] = True
+
+
+def _smoothed_surfaces(inverse: F8, width: int) -> F8:
+    """Average the inverse depth over a window within each surface, which rounds its edges."""
+    for _ in range(2):  # along the rows, then along the columns
+        along = np.zeros_like(inverse)
+        _smooth(inverse, width // 2, along)
+        inverse = np.ascontiguousarray(along.T)
+    return inverse
+
+
+def _blended_edges(inverse: F8, width: int) -> F8:
+    """Mix near and far inverse depth at edges, as stereo windows and smoothing filters do."""
+    result = np.zeros_like(inverse)
+    _blend(inverse, width // 2, result)
+    return result
+
+
+@kernel
+def _write_depth(inverse: F8, error: F4, lost: Bool, limits: F8, depth: F4, mesh_ids: I4) -> None:
+    """Write the depth with its error, quantized, where it is within the limits."""
+    step, nearest, farthest = limits
+    for v in range(inverse.shape[0]):
+        for u in range(inverse.shape[1]):
+            if not lost[v, u] and inverse[v, u] > 0:
+                inverse_depth = inverse[v, u] + error[v, u]
+                if step > 0:
+                    inverse_depth = np.floor(inverse_depth / step + 0.5) * step
+                if inverse_depth > 0:
+                    z = 1.0 / inverse_depth
+                    if nearest <= z <= farthest:
+                        depth[v, u] = z
+            if depth[v, u] == 0:
+                mesh_ids[v, u] = -1
+
+
+@kernel
+def _sample_beside(
+    inverse: F8, mesh_ids: I4, cosine: F4, across: F4, down: F4, out: F8, ids_out: I4, angle: F4
+) -> None:
+    """Sample at displaced pixels; fill ``out``, ``ids_out`` and ``angle``."""
+    height, width = inverse.shape
+    for v in range(height):
+        for u in range(width):
+            x, y = int(np.floor(u + across[v, u] + 0.5)), int(np.floor(v + down[v, u] + 0.5))
+            x, y = min(max(x, 0), width - 1), min(max(y, 0), height - 1)
+            there, here = inverse[y, x], inverse[v, u]
+            # Only edges move; on a surface, the pixel keeps its own true depth.
+            if abs(there - here) < _DISCONTINUITY and mesh_ids[y, x] == mesh_ids[v, u]:
+                x, y = u, v
+            out[v, u] = inverse[y, x]
+            ids_out[v, u] = mesh_ids[y, x]
+            angle[v, u] = cosine[y, x]
+
+
+@kernel
+def _drop_margins(inverse: F8, width: int, lost: Bool) -> None:
+    """Mark missing depth up to ``width`` rows and columns beside a nearer surface."""
+    height, columns = inverse.shape
+    nearest = np.zeros(inverse.shape)
+    for v in range(height):
+        for u in range(columns):
+            best = inverse[v, u]
+            for x in range(max(u - width, 0), min(u + width + 1, columns)):
+                best = max(best, inverse[v, x])
+            nearest[v, u] = best
+    for v in range(height):
+        first, last = max(v - width, 0), min(v + width + 1, height)
+        for u in range(columns):
+            for y in range(first, last):
+                if nearest[y, u] > inverse[v, u] + _MARGIN_DISCONTINUITY:
+                    lost[v, u] = True
+                    break
+
+
+@kernel
+def _cast_shadow(inverse: F8, shift: float, shadow: Bool) -> None:
+    """Mark pixels that are occluded from a second viewpoint beside the camera.
+
+    ``shift`` is the viewpoint's x position in metres times the focal length in pixels.
+    """
+    height, width = inverse.shape
+    margin = int(abs(shift) * 5) + 2
+    nearest = np.zeros(width + 2 * margin)
+    for v in range(height):
+        nearest[:] = 0.0
+        for u in range(width):
+            inverse_depth = inverse[v, u]
+            x = u - shift * inverse_depth
+            start = int(np.floor(x + 0.5))
+            end = start
+            # The same surface continues.
+            if u + 1 < width and abs(inverse[v, u + 1] - inverse_depth) < _DISCONTINUITY:
+                end = max(start, int(np.floor(u + 1 - shift * inverse[v, u + 1] + 0.5)) - 1)
+            for cell in range(start, end + 1):
+                at = cell + margin
+                if 0 <= at < nearest.size and inverse_depth > nearest[at]:
+                    nearest[at] = inverse_depth
+        for u in range(width):
+            inverse_depth = inverse[v, u]
+            at = int(np.floor(u - shift * inverse_depth + 0.5)) + margin
+            if 0 <= at < nearest.size and nearest[at] > inverse_depth + _DISCONTINUITY:
+                shadow[v, u] = True
+
+
+@kernel
+def _fill_shadow(inverse: F8, mesh_ids: I4, shadow: Bool, growth_px: I4) -> None:
+    """Grow the nearer side of each shadow into it, as the windows of stereo matching do.
+
+    ``growth_px`` (h // 3 + 1, 16) holds the widths of this growth, which vary over the image.
+    """
+    height, width = inverse.shape
+    for v in range(height):
+        u = 0
+        while u < width:
+            if not shadow[v, u]:
+                u += 1
+                continue
+            end = u
+            while end < width and shadow[v, end]:
+                end += 1
+            grow = growth_px[v // 3, (u // 8) % growth_px.shape[1]]
+            before = inverse[v, u - 1] if u > 0 else 0.0
+            after = inverse[v, end] if end < width else 0.0
+            if before > after:
+                for k in range(u, min(u + grow, end)):
+                    inverse[v, k], mesh_ids[v, k] = before, mesh_ids[v, u - 1]
+                    shadow[v, k] = False
+            elif after > 0:
+                for k in range(max(end - grow, u), end):
+                    inverse[v, k], mesh_ids[v, k] = after, mesh_ids[v, end]
+                    shadow[v, k] = False
+            u = end
+
+
+@kernel
+def _blend(inverse: F8, radius: int, out: F8) -> None:
+    height, width = inverse.shape
+    for v in range(height):
+        for u in range(width):
+            here = inverse[v, u]
+            out[v, u] = here
+            if not (radius <= u < width - radius and radius <= v < height - radius) or here <= 0:
+                continue
+            edge = False
+            for k in range(1, radius + 1):
+                edge = edge or abs(inverse[v, u - k] - here) > _DISCONTINUITY
+                edge = edge or abs(inverse[v, u + k] - here) > _DISCONTINUITY
+            if not edge:
+                continue
+            total, count = 0.0, 0
+            for y in range(v - radius, v + radius + 1):
+                for x in range(u - radius, u + radius + 1):
+                    if inverse[y, x] > 0:
+                        total += inverse[y, x]
+                        count += 1
+            out[v, u] = total / count
+
+
+@kernel
+def _smooth(inverse: F8, radius: int, out: F8) -> None:
+    """Average along rows, up to ``radius`` pixels to each side, within one surface."""
+    height, width = inverse.shape
+    for v in range(height):
+        for u in range(width):
+            total, count = inverse[v, u], 1
+            for way in (-1, 1):
+                last = inverse[v, u]
+                for k in range(1, radius + 1):
+                    x = u + way * k
+                    if not 0 <= x < width or abs(inverse[v, x] - last) >= _DISCONTINUITY:
+                        break
+                    last = inverse[v, x]
+                    total += last
+                    count += 1
+            out[v, u] = total / count

@@ -1,0 +1,1 @@
+"""Scenes of objects on supports, arranged at random or by physics, at rest or in motion."""

@@ -1,0 +1,212 @@
+"""Place objects on supports and on each other without collisions."""
+
+from typing import NamedTuple
+
+import numpy as np
+from numpy.random import Generator
+
+from shapecat.arrays import F8
+from shapecat.geometry import IDENTITY, compose
+from shapecat.simulation.scenes.footprints import Footprint, footprint, inside, overlap
+from shapecat.simulation.scenes.placement import StablePose, choose_stable_pose, stable_poses
+from shapecat.simulation.scenes.worlds import PlacedObject, Support, pose_from_yaw
+from shapecat.simulation.shapes.categories import make_object
+from shapecat.simulation.shapes.distractors import make_distractor
+from shapecat.simulation.shapes.mesh import Mesh
+from shapecat.types import Pose
+
+__all__ = ["Layout", "Piece", "make_piece"]
+
+_LYING = {"can": 0.2, "bottle": 0.22, "cup": 0.12, "box": 0.7}
+"""Probability that an object of a category lies; a box lies on any face."""
+_UPSIDE_DOWN = {"cup": 0.06, "bowl": 0.06, "plate": 0.03}
+"""Probability that an open object stands on its rim."""
+_WIDEST_M = 0.42
+_SUPPORTING = {"box", "can"}
+"""Categories that other objects are stacked on."""
+_SMALLEST_TOP_M = 0.035
+"""Minimum width of a top face that supports another object."""
+_EDGE_M = 0.01
+"""Minimum distance of the contact area from the edge of the support."""
+
+
+class Piece(NamedTuple):
+    """An object to be placed, with its stable pose."""
+
+    category: str
+    kind: str
+    mesh: Mesh
+    stable_pose: StablePose
+
+
+def make_piece(category: str, rng: Generator, *, resting_pose: str | None = None) -> Piece:
+    """Make a random object and choose its resting pose.
+
+    Parameters
+    ----------
+    category : one of the shape categories, or ``unknown`` for a distractor, which stays upright.
+    resting_pose : ``upright``, ``lying`` or ``upside_down``; random by default. An object without
+        such a stable pose stands upright.
+    """
+    if category == "unknown":
+        kind, mesh = make_distractor(rng)
+    else:
+        kind, mesh = category, make_object(category, rng)
+    wanted = resting_pose or _draw_resting_pose(category, rng)
+    stable_pose = StablePose(IDENTITY, "upright")
+    if wanted != "upright" and category not in {"ball", "unknown"}:
+        stable_pose = choose_stable_pose(stable_poses(mesh), wanted, rng) or stable_pose
+    return Piece(category, kind, mesh, stable_pose)
+
+
+def _draw_resting_pose(category: str, rng: Generator) -> str:
+    draw = rng.random()
+    upside_down = _UPSIDE_DOWN.get(category, 0.0)
+    if draw < upside_down:
+        return "upside_down"
+    return "lying" if draw < upside_down + _LYING.get(category, 0.0) else "upright"
+
+
+class Layout:
+    """Objects on supports, placed one by one.
+
+    Parameters
+    ----------
+    gap : minimum distance between footprints, metres.
+    headroom : maximum height of an object's top above its support, metres.
+    enclosed : whether objects must stay within the edges of their support.
+    """
+
+    def __init__(
+        self, rng: Generator, *, gap: float, headroom: float = 1.0, enclosed: bool = False
+    ) -> None:
+        self.objects: list[PlacedObject] = []
+        self.gap = gap
+        self._rng = rng
+        self._headroom = headroom
+        self._enclosed = enclosed
+        self._places: list[Footprint] = []
+        self._base_supports: list[Support] = []
+
+    def put(
+        self, category: str, support: Support, half: F8, *, stack: float = 0.0, attempts: int = 6
+    ) -> bool:
+        """Place a new object; return whether there was room for it.
+
+        Parameters
+        ----------
+        half : (2,) half the size along x and y, metres, of the area around the support's centre.
+        stack : probability of placing it on another object.
+        attempts : number of objects to make and try before giving up.
+        """
+        for _ in range(attempts):
+            piece = make_piece(category, self._rng)
+            size = footprint(piece.mesh, piece.stable_pose.pose)
+            if size.high > self._headroom or np.ptp(size.outline, axis=0).max() > _WIDEST_M:
+                continue
+            if self._rng.random() < stack and self._put_on_object(piece):
+                return True
+            if self.put_piece(piece, support, half):
+                return True
+        return False
+
+    def put_piece(self, piece: Piece, support: Support, half: F8, *, tries: int = 40) -> bool:
+        """Place a given object on a support; return whether there was room for it.
+
+        ``half`` (2,) is as for `put`; ``tries`` is the number of random positions to try.
+        """
+        middle = support.outline[:, :2].mean(axis=0)
+        resting = footprint(piece.mesh, piece.stable_pose.pose)
+        for _ in range(tries):
+            spot = middle + self._rng.uniform(-half, half)
+            turn = self._random_yaw_pose(np.array([*spot, support.height]))
+            here = resting.moved(turn)
+            if self._fits(here, support):
+                self._add(piece, turn, here, support, None)
+                return True
+        return False
+
+    def reserve_position(self, k: int, support: Support, half: F8) -> F8 | None:
+        """Reserve a second position for object ``k``, which keeps its first one.
+
+        ``half`` (2,) is as for `put`.
+
+        Returns
+        -------
+        The translation (3,) of its pose there, metres, or None if there is no room.
+        """
+        item, middle = self.objects[k], support.outline[:, :2].mean(axis=0)
+        first = self._places[k]
+        for _ in range(200):
+            spot = np.round(middle + self._rng.uniform(-half, half), 6)
+            place = np.array([*spot, item.pose.translation[2]])
+            here = first.moved(Pose(np.eye(3), place - item.pose.translation))
+            if self._fits(here, support):
+                self._places.append(here)
+                return place
+        return None
+
+    def _put_on_object(self, piece: Piece) -> bool:
+        candidates = [k for k in range(len(self.objects)) if self._can_support(k)]
+        if not candidates or piece.category == "ball":
+            return False
+        resting = footprint(piece.mesh, piece.stable_pose.pose)
+        for _ in range(8):
+            k = candidates[int(self._rng.integers(len(candidates)))]
+            below = self._places[k]
+            slack = 0.25 * np.ptp(below.top, axis=0)
+            spot = [*below.top.mean(axis=0) + self._rng.uniform(-slack, slack), below.high]
+            turn = self._random_yaw_pose(np.array(spot))
+            here = resting.moved(turn)
+            if _supports(below, here) and self._fits(here, self._base_supports[k]):
+                self._add(piece, turn, here, self._base_supports[k], self.objects[k].track)
+                return True
+        return False
+
+    def _random_yaw_pose(self, place: F8) -> Pose:
+        """Return a random turn about z that moves the origin to ``place`` (3,)."""
+        angle = self._rng.uniform(0, 2 * np.pi)
+        return pose_from_yaw(angle, np.round(place, 6))
+
+    def _fits(self, here: Footprint, support: Support) -> bool:
+        on_board = here.low < support.height + 1e-4
+        edge = support.outline[:, :2]
+        if on_board and not inside(here.contact, edge, _EDGE_M):
+            return False
+        if self._enclosed and not inside(here.outline, edge, 0.003):
+            return False
+        if here.high > support.height + self._headroom:
+            return False
+        beside = [p for p in self._places if p.low < here.high and p.high > here.low + 1e-6]
+        return not any(overlap(here.outline, p.outline, self.gap) for p in beside)
+
+    def _can_support(self, k: int) -> bool:
+        top = self._places[k].top
+        flat = len(top) > 2 and float(np.ptp(top, axis=0).min()) > _SMALLEST_TOP_M
+        return flat and self.objects[k].category in _SUPPORTING
+
+    def _add(
+        self, piece: Piece, turn: Pose, here: Footprint, support: Support, on_track: int | None
+    ) -> None:
+        # No pose of a box is its upright one.
+        resting_pose = "upright" if piece.category == "box" else piece.stable_pose.name
+        item = PlacedObject(
+            len(self.objects),
+            piece.category,
+            piece.kind,
+            piece.mesh,
+            compose(turn, piece.stable_pose.pose),
+            support.name if on_track is None else None,
+            on_track,
+            lying=resting_pose == "lying",
+            upside_down=resting_pose == "upside_down",
+        )
+        self.objects.append(item)
+        self._places.append(here)
+        self._base_supports.append(support)
+
+
+def _supports(below: Footprint, above: Footprint) -> bool:
+    """Return whether the central 60 % of the upper object's contact lies on the lower one's top."""
+    middle = above.contact.mean(axis=0)
+    return inside(middle + 0.6 * (above.contact - middle), below.top, 0.002)

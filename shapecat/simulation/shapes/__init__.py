@@ -1,0 +1,1 @@
+"""Meshes of objects: the seven categories, and what belongs to none."""

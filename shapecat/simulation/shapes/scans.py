@@ -1,0 +1,139 @@
+"""Scanned and CAD meshes: reading them, and turning them upright."""
+
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from scipy.spatial import ConvexHull
+
+from shapecat.arrays import F8, I4
+from shapecat.errors import ConfigError, RecordingError
+from shapecat.simulation.camera.render import geometry, render
+from shapecat.simulation.scenes.placement import StablePose, stable_poses
+from shapecat.simulation.shapes.mesh import Mesh, moved, standing
+from shapecat.types import Camera, Pose
+
+__all__ = ["load_mesh", "upright_poses", "uprighted"]
+
+_AXES = np.array(
+    [
+        [[1, 0, 0], [0, 1, 0], [0, 0, 1]],
+        [[1, 0, 0], [0, -1, 0], [0, 0, -1]],
+        [[0, 1, 0], [0, 0, 1], [1, 0, 0]],
+        [[0, 1, 0], [0, 0, -1], [-1, 0, 0]],
+        [[1, 0, 0], [0, 0, -1], [0, 1, 0]],
+        [[1, 0, 0], [0, 0, 1], [0, -1, 0]],
+    ],
+    np.float64,
+)
+"""Rotations that turn +z, -z, +x, -x, +y, -y of the file to +z."""
+
+
+def load_mesh(path: Path) -> Mesh:
+    """Read a triangle mesh in metres (.ply, .obj, .stl), with the axes of the file.
+
+    Raises
+    ------
+    RecordingError : the file holds no triangles.
+    ConfigError : Open3D is not installed.
+    """
+    try:
+        import open3d  # noqa: PLC0415  # an extra
+    except ImportError as error:
+        how = "in a clone of shapecat, pip install '.[meshes]'"
+        msg = f"{path}: reading meshes needs Open3D: {how} ({error})"
+        raise ConfigError(msg) from error
+    read: Any = open3d.io.read_triangle_mesh(path)
+    if len(read.triangles) == 0:
+        msg = f"{path}: no triangles found; expected a triangle mesh in metres"
+        raise RecordingError(msg)
+    return Mesh(np.asarray(read.vertices), np.asarray(read.triangles, np.int32))
+
+
+def uprighted(mesh: Mesh, category: str) -> Mesh:
+    """Turn a mesh of a category upright, estimating which of its six axis directions is up.
+
+    A can stands on the axis along which its outline is roundest; a bottle also prefers its longest
+    axis, with its narrow end up. A cup, bowl or plate is turned so that its surface, seen from
+    above, lies deepest below its top. A box or a ball keeps the axes of the file.
+    """
+    points = np.asarray(mesh.vertices, np.float64)
+    points = points - (points.min(axis=0) + points.max(axis=0)) / 2
+    if category in {"box", "ball"}:
+        return standing(mesh)
+    if category in {"bottle", "can"}:
+        scores = [_roundness(points @ r.T) for r in _AXES[::2]]
+        if category == "bottle":
+            scores = [
+                s + float(np.ptp(points @ r[2])) * 4
+                for s, r in zip(scores, _AXES[::2], strict=True)
+            ]
+        best = 2 * int(np.argmax(scores))
+        if category == "bottle" and _narrow_end(points @ _AXES[best].T, mesh.triangles) < 0:
+            best += 1
+    else:
+        best = int(np.argmax([_hollow(points @ r.T, mesh) for r in _AXES]))
+    return standing(moved(mesh, Pose(_AXES[best], np.zeros(3))))
+
+
+def upright_poses(mesh: Mesh, category: str) -> tuple[StablePose, ...]:
+    """Return the stable poses of a mesh turned by `uprighted`, upright ones first.
+
+    Raises
+    ------
+    ValueError : no face of the convex hull is stable.
+    """
+    found = stable_poses(uprighted(mesh, category))
+    if not found:
+        msg = f"a {category} that cannot stand or lie"
+        raise ValueError(msg)
+    order = {"upright": 0, "lying": 1, "upside_down": 2}
+    return tuple(sorted(found, key=lambda stable: order[stable.name]))
+
+
+def _roundness(points: F8) -> float:
+    """Return the smallest width of the outline seen along z divided by the greatest."""
+    angle = np.arange(16) * (np.pi / 16)
+    flat = points[:, :2] @ [np.cos(angle), np.sin(angle)]
+    widths = np.ptp(flat, axis=0)
+    return float(widths.min() / widths.max())
+
+
+def _narrow_end(points: F8, triangles: I4) -> float:
+    """Return a positive number if the cross-sections of the upper half are the smaller ones."""
+    low, high = points[:, 2].min(), points[:, 2].max()
+    levels = np.linspace(low, high, 18)[1:-1]
+    areas = [_slice_area(points[triangles], float(z)) for z in levels]
+    return sum(areas[:8]) - sum(areas[8:])
+
+
+def _slice_area(corners: F8, z: float) -> float:
+    """Return the area of the convex hull of the horizontal section of triangles (m, 3, 3)."""
+    a, b = corners, np.roll(corners, -1, axis=1)
+    cut = (a[..., 2] < z) != (b[..., 2] < z)
+    a, b = a[cut], b[cut]
+    if len(a) < 3:
+        return 0.0
+    share = (z - a[:, 2]) / (b[:, 2] - a[:, 2])
+    return float(ConvexHull(a[:, :2] + share[:, None] * (b[:, :2] - a[:, :2])).volume)
+
+
+def _hollow(points: F8, mesh: Mesh) -> float:
+    """Return the median depth, below the top, of the central surface as seen from above.
+
+    The depth is relative to the greatest distance from the z axis.
+    """
+    turned = Mesh(points, mesh.triangles)
+    far = 40 * float(np.abs(points).max())
+    span = float(np.abs(points[:, :2]).max())
+    camera = Camera(64, 64, 31 * far / span, 31 * far / span, 31.5, 31.5)
+    above = Pose(np.array([[1.0, 0, 0], [0, -1, 0], [0, 0, -1]]), np.array([0, 0, far]))
+    image = render(geometry([(turned, Pose(np.eye(3), np.zeros(3)))]), camera, above)
+    seen = image.mesh_ids >= 0
+    height = far - image.depth
+    middle = np.zeros_like(seen)
+    middle[20:44, 20:44] = True
+    inside = height[seen & middle]
+    if inside.size == 0:
+        return 0.0
+    return float(points[:, 2].max() - np.median(inside)) / span
