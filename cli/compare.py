@@ -34,7 +34,7 @@ def compare(
     shapecat compare results/demo demo.truth.json
     shapecat compare results/lab results-before/lab --out differences
     """
-    from shapecat.evaluation.comparison.comparing import compare as compare_run
+    from shapecat.evaluation.comparison import compare as compare_run
     from shapecat.evaluation.comparison.page import figure_rows, require_new, write_comparison
 
     if out is not None:

@@ -381,8 +381,9 @@ def test_annotate_again_writes_both_outputs(
     """Otherwise a review or an annotated recording would keep its old labels."""
     folder, written = tmp_path / "table", []
     shutil.copytree(coloured_run, folder)
-    for name in ("annotated_mcap.write_annotated", "review.write_review"):
+    writers = ["annotation.annotated_mcap.write_annotated", "review.writing.write_review"]
+    for name in writers:
         monkeypatch.setattr(f"shapecat.outputs.{name}", lambda *_, n=name, **__: written.append(n))
     annotate_again(folder, None)
 
-    assert sorted(written) == ["annotated_mcap.write_annotated", "review.write_review"]
+    assert sorted(written) == writers

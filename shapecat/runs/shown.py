@@ -114,8 +114,8 @@ def read_shown_frames(
     """Yield the annotations of a run, frame by frame in reading order.
 
     This omits points, surfaces and posteriors, and is several times as fast as
-    `shapecat.runs.labelled_frames.read_labelled_frames`. Boxes enclose whole objects where their size is
-    known; with ``visible``, only their visible parts. They are in the frame ``frame_id``.
+    `shapecat.runs.labelled_frames.read_labelled_frames`. Boxes enclose whole objects where their
+    size is known; with ``visible``, only their visible parts. They are in the frame ``frame_id``.
 
     Raises
     ------

@@ -57,8 +57,8 @@ class PerceptionTables:
     Frames are first written as *segments*, folders that appear when complete, so that an
     interrupted run resumes after its last segment. Leaving the block joins the segments into
     tables, which do not depend on where a run was interrupted. Frames that are perceived a second
-    time (`shapecat.runs.perceive.second_look`) have segments of their own, and replace the earlier results
-    when the tables are joined.
+    time (`shapecat.runs.perceive.second_look`) have segments of their own, and replace the earlier
+    results when the tables are joined.
 
     Attributes
     ----------
