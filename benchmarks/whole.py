@@ -22,9 +22,10 @@ import click
 import numpy as np
 
 from benchmarks.measure import markdown, save
+from shapecat.geometry import LINK_FROM_OPTICAL
 from shapecat.simulation import KINECT, make_scene, render_frame
 from shapecat.simulation.containers import CONTAINERS
-from shapecat.simulation.recorder import LINK_FROM_OPTICAL, robot_links
+from shapecat.simulation.recorder import robot_links
 from shapecat.simulation.scenes.worlds import World
 from shapecat.types import Frame, Pose
 

@@ -16,6 +16,7 @@ __all__ = [
     "BOX_EDGES",
     "DISCONTINUITY",
     "IDENTITY",
+    "LINK_FROM_OPTICAL",
     "NEAREST_M",
     "box_around",
     "box_corners",
@@ -44,6 +45,8 @@ NEAREST_M = 0.05
 """Smallest depth considered, metres: no sensor measures nearer, and inverse depth stays bounded."""
 IDENTITY = Pose(np.eye(3), np.zeros(3))
 """The pose that changes nothing."""
+LINK_FROM_OPTICAL = Pose(np.array([[0, 0, 1], [-1, 0, 0], [0, -1, 0]]), np.zeros(3))
+"""Pose of an optical frame (x right, z forward) in that of a camera (x forward, z up; REP 103)."""
 BOX_EDGES = np.array(
     [(k, (k + 1) % 4) for k in range(4)]
     + [(k + 4, (k + 1) % 4 + 4) for k in range(4)]

@@ -8,10 +8,11 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from shapecat.arrays import F4
+from shapecat.geometry import LINK_FROM_OPTICAL
 from shapecat.simulation import IDEAL, make_scene, render_frame
 from shapecat.simulation.containers import CONTAINERS
 from shapecat.simulation.messages import MessageFactory
-from shapecat.simulation.recorder import LINK_FROM_OPTICAL, robot_links
+from shapecat.simulation.recorder import robot_links
 from shapecat.types import Camera, Frame, Pose
 from tests.messages import EPOCH, SECOND
 

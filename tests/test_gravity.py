@@ -12,7 +12,7 @@ import pytest
 
 from shapecat.config import Settings
 from shapecat.errors import ConfigError
-from shapecat.geometry import IDENTITY, transform
+from shapecat.geometry import IDENTITY, LINK_FROM_OPTICAL, transform
 from shapecat.pipeline import process
 from shapecat.recordings import open_recording
 from shapecat.recordings.decoding.pointcloud2 import cloud_points
@@ -26,7 +26,6 @@ from shapecat.runs.perceive import phases as perceiving
 from shapecat.runs.perceive.up_report import report_up
 from shapecat.runs.tables.schemas import DETECTIONS, FRAMES, PLANES
 from shapecat.simulation.messages import MessageFactory
-from shapecat.simulation.recorder import LINK_FROM_OPTICAL
 from shapecat.types import Frame, Pose
 from tests.messages import CAMERA, EPOCH, SECOND, header, make, write
 from tests.scenes import OPTICAL, stream, views

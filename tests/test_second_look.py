@@ -12,7 +12,7 @@ import pyarrow as pa
 import pytest
 
 from shapecat.config import Settings
-from shapecat.geometry import IDENTITY
+from shapecat.geometry import IDENTITY, LINK_FROM_OPTICAL
 from shapecat.pipeline import process
 from shapecat.recordings.transforms.gravity import Orientation
 from shapecat.runs.folder import read_run
@@ -22,7 +22,7 @@ from shapecat.runs.perceive.second_look import _around, _streams, frames_to_revi
 from shapecat.runs.tables.schemas import FRAMES, PLANES
 from shapecat.simulation import IDEAL, make_scene, render_frame
 from shapecat.simulation.messages import MessageFactory
-from shapecat.simulation.recorder import LINK_FROM_OPTICAL, robot_links
+from shapecat.simulation.recorder import robot_links
 from shapecat.system import stopping
 from shapecat.types import Camera, Frame, Pose
 from tests.messages import EPOCH, write

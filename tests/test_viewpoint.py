@@ -9,7 +9,13 @@ import pyarrow.parquet as pq
 import pytest
 
 from shapecat.arrays import F4
-from shapecat.geometry import compose, inverse, rotation_from_quaternion, transform
+from shapecat.geometry import (
+    LINK_FROM_OPTICAL,
+    compose,
+    inverse,
+    rotation_from_quaternion,
+    transform,
+)
 from shapecat.pipeline import process
 from shapecat.recordings import choose_streams, frames, open_recording
 from shapecat.recordings.colour_frames import frames_with_colour
@@ -21,7 +27,6 @@ from shapecat.runs.jobs import Job
 from shapecat.runs.labels.meaning import TrackLabel
 from shapecat.runs.shown import read_shown_frames
 from shapecat.simulation.messages import MessageFactory
-from shapecat.simulation.recorder import LINK_FROM_OPTICAL
 from shapecat.types import Frame, Pose
 from tests.colour_messages import gradient, raw
 from tests.messages import CAMERA, EPOCH, cloud, info, organized_points, wavy_depth, write

@@ -14,7 +14,7 @@ import numpy as np
 
 from shapecat.arrays import U1
 from shapecat.errors import OutputError
-from shapecat.geometry import compose, inverse
+from shapecat.geometry import LINK_FROM_OPTICAL, compose, inverse
 from shapecat.simulation.camera.colour_camera import COLOUR, jpeg, render_colour
 from shapecat.simulation.camera.presets import SENSORS
 from shapecat.simulation.camera.sensors import Sensor
@@ -27,13 +27,10 @@ from shapecat.system.files import flush
 from shapecat.system.progress import Observer, ignore
 from shapecat.types import Camera, Frame, Pose
 
-__all__ = ["EPOCH_NS", "LINK_FROM_OPTICAL", "record", "robot_links", "simulate", "written_paths"]
+__all__ = ["EPOCH_NS", "record", "robot_links", "simulate", "written_paths"]
 
 EPOCH_NS = 1_700_200_000_000_000_000
 """Timestamp of the first frame."""
-
-LINK_FROM_OPTICAL = Pose(np.array([[0, 0, 1], [-1, 0, 0], [0, -1, 0]]), np.zeros(3))
-"""Pose of the optical frame (z forward, y down) in camera_link (x forward, z up, REP 103)."""
 
 _LATENCY_NS = 12_000_000
 _OPTICAL = "camera_depth_optical_frame"

@@ -8,7 +8,7 @@ import numpy as np
 
 from shapecat.arrays import F4, F8
 from shapecat.errors import ConfigError
-from shapecat.geometry import compose, unit_direction
+from shapecat.geometry import LINK_FROM_OPTICAL, compose, unit_direction
 from shapecat.recordings.recording import Recording
 from shapecat.recordings.streams import Stream
 from shapecat.recordings.transforms.buffer import TransformError, fixed_frame
@@ -20,14 +20,12 @@ __all__ = ["MISNAMED", "Orientation", "Upright", "has_z_up", "turned"]
 
 _LEVEL_FRAMES = ("map", "odom", "world", "earth", "base_footprint", "base_link")
 """Frames whose z axis is up by convention (REP 105, REP 103), also after the name of a robot."""
-_FROM_OPTICAL = np.array([[0.0, 0, 1], [-1, 0, 0], [0, -1, 0]])
-"""Rotation from an optical frame (x right, z forward) to that of its camera (x forward, z up)."""
 MISNAMED = {
     "its data are in an optical frame (z forward), although the frame they name has x forward": (
-        _FROM_OPTICAL
+        LINK_FROM_OPTICAL.rotation
     ),
     "its points have x forward, although the frame they name is an optical one (z forward)": (
-        _FROM_OPTICAL.T
+        LINK_FROM_OPTICAL.rotation.T
     ),
     "its data and the frame they name differ as the conventions of ROS and OpenGL (z backward)": (
         np.diag([1.0, -1.0, -1.0])
