@@ -29,7 +29,6 @@ from shapecat.evaluation.comparison.comparing import (
     Comparison,
     _compare_frame,
     _kind,
-    _labelled_part,
     _Tally,
     compare,
 )
@@ -43,6 +42,7 @@ from shapecat.evaluation.comparison.labellings import (
 from shapecat.evaluation.comparison.matching import (
     Difference,
     Matched,
+    labelled_part,
     match_objects,
     seen_together,
 )
@@ -260,7 +260,7 @@ def test_detection_is_left_out_if_mostly_ignored(beside: int, kept: list[int] | 
     ignored[13 : 13 + beside] = True
     true = Labelling((), ~ignored, (SIDE, SIDE), ignored)
     item = LabelledItem(1, "cup", np.arange(13 + beside - 5, 13 + beside))
-    rest = _labelled_part(Labelling((item,)), true).items
+    rest = labelled_part(Labelling((item,)), true).items
 
     assert [known.pixels.tolist() for known in rest if known.pixels is not None] == (
         [] if kept is None else [kept]

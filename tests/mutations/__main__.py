@@ -100,8 +100,8 @@ KNOWN_BY: dict[str, Sequence[str]] = {
     "shapecat.runs.tables.masks": ("test_colour_outputs", "test_exports_images"),
     "shapecat.runs.tables.segments": ("test_tables", "test_tables_rotated"),
     "shapecat.system": ("test_run_folder", "test_batch_planning"),
-    "shapecat.tracking": ("test_tracking_worked", "test_tracking", "test_tables_rotated", "test_reuse",
-                          "test_changes"),
+    "shapecat.tracking": ("test_tracking_worked", "test_tracking", "test_tables_rotated",
+                          "test_changes", "test_reuse"),
     "shapecat.tracking.full_boxes": ("test_completion", "test_tables_rotated"),
 }  # fmt: skip
 """Test files by prefix of a module's name; the longest prefix counts."""

@@ -3,13 +3,12 @@
 from collections import Counter
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import ExitStack
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
-from shapecat.arrays import Bool
 from shapecat.errors import OutputError, RecordingError
 from shapecat.evaluation.comparison.figures import Pairs, figures_of
 from shapecat.evaluation.comparison.identities import SeenTogether
@@ -25,6 +24,7 @@ from shapecat.evaluation.comparison.matching import (
     Difference,
     Matched,
     item_box_iou,
+    labelled_part,
     match_objects,
     seen_together,
 )
@@ -201,7 +201,7 @@ def _compare_frame(
     tally.compared += 1
     frame = next((f for f in clouds if (f.topic, f.index) == key), None)
     _require_same_size(found, true, frame, key)
-    found = _labelled_part(found, true)
+    found = labelled_part(found, true)
     matched = match_objects(found.items, true.items)
     tally.masks &= matched.overlap is not None
     tally.overlap += matched.overlap or Overlap()
@@ -243,27 +243,6 @@ def _require_same_size(found: Labelling, true: Labelling, frame: Frame | None, k
         f"{other}; export labels of depth images (--format coco --depth)"
     )
     raise RecordingError(msg)
-
-
-def _labelled_part(found: Labelling, true: Labelling) -> Labelling:
-    """Return the detections without the pixels that have no label in the truth.
-
-    Detections of which more than half is ignored in the truth are left out.
-    """
-    if true.known is None:
-        return found
-    items = (
-        item if item.pixels is None else replace(item, pixels=item.pixels[true.known[item.pixels]])
-        for item in found.items
-        if not _is_ignored(item, true.ignored)
-    )
-    return Labelling(tuple(items))
-
-
-def _is_ignored(item: LabelledItem, ignored: Bool | None) -> bool:
-    if ignored is None or item.pixels is None or not item.pixels.size:
-        return False
-    return bool(ignored[item.pixels].mean() > 0.5)
 
 
 def _differences(

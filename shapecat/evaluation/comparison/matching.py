@@ -1,13 +1,15 @@
 """Matching of the found and true objects of a frame."""
 
 from collections.abc import Sequence
+from dataclasses import replace
 from typing import Any, NamedTuple
 
 import numpy as np
 from scipy.optimize import linear_sum_assignment
 
+from shapecat.arrays import Bool
 from shapecat.evaluation.comparison.identities import SeenTogether
-from shapecat.evaluation.comparison.labellings import LabelledItem
+from shapecat.evaluation.comparison.labellings import LabelledItem, Labelling
 from shapecat.evaluation.comparison.overlap import Overlap, box_iou, match_masks
 
 __all__ = [
@@ -16,6 +18,7 @@ __all__ = [
     "Difference",
     "Matched",
     "item_box_iou",
+    "labelled_part",
     "match_objects",
     "seen_together",
 ]
@@ -112,3 +115,24 @@ def seen_together(
     asked = {item.track: j for j, item in enumerate(true) if item.track is not None}
     similarity = matched.similarity[np.ix_(list(best.values()), list(asked.values()))].T
     return SeenTogether(list(asked), list(best), similarity)
+
+
+def labelled_part(found: Labelling, true: Labelling) -> Labelling:
+    """Return the detections without the pixels that have no label in the truth.
+
+    Detections of which more than half is ignored in the truth are left out.
+    """
+    if true.known is None:
+        return found
+    items = (
+        item if item.pixels is None else replace(item, pixels=item.pixels[true.known[item.pixels]])
+        for item in found.items
+        if not _is_ignored(item, true.ignored)
+    )
+    return Labelling(tuple(items))
+
+
+def _is_ignored(item: LabelledItem, ignored: Bool | None) -> bool:
+    if ignored is None or item.pixels is None or not item.pixels.size:
+        return False
+    return bool(ignored[item.pixels].mean() > 0.5)
