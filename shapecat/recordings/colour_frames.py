@@ -4,7 +4,7 @@ from collections import Counter, deque
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from functools import cached_property, lru_cache
 from statistics import median
-from typing import Any, TypeAlias
+from typing import Any, NamedTuple, TypeAlias
 
 import numpy as np
 
@@ -40,7 +40,6 @@ _NEAR, _EQUAL = 0.01, 1e-6
 _STRAIGHT_PX, _STEPS = 2.0, 9
 """A lens that moves no pixel of a grid farther than this leaves an image registered. Depth images
 with less distortion are taken for those of a pinhole camera as well."""
-
 
 KnownImages: TypeAlias = Callable[[str, int], int | None] | None
 """The log time (ns) of the colour image of a frame, given by topic and number, if it has one."""
@@ -80,7 +79,7 @@ def frames_with_colour(
     for frame in frames(recording, streams, skipped=skipped, heard=_heard(partners), **chosen):
         waiting.append(frame)
         if frame.topic in partners:
-            partners[frame.topic].expect(frame)
+            partners[frame.topic].notice(frame)
         while waiting and _decided(waiting, partners):
             yield _paired(waiting.popleft(), partners)
     while waiting:
@@ -120,6 +119,15 @@ def _paired(frame: Frame, partners: Mapping[str, "_Partner"]) -> tuple[Frame, Co
     return frame, None if partner is None else partner.view(frame)
 
 
+class _KeptImage(NamedTuple):
+    """A decoded image message, and how often the clock had been set back before it."""
+
+    stamp_ns: int
+    log_time_ns: int
+    decoded: Any
+    setbacks: int
+
+
 class _Partner:
     """The latest colour images for one depth stream."""
 
@@ -129,8 +137,7 @@ class _Partner:
         self.stream = colour
         self._known = known
         self._recording = recording
-        self._images: deque[tuple[int, int, Any, int]] = deque()
-        """Stamp, log time, decoded, and how often the clock had been set back."""
+        self._images: deque[_KeptImage] = deque()
         self._setbacks, self._latest = 0, 0
         self._calibration = b""
         self._lens: LensCamera | None = None
@@ -153,7 +160,7 @@ class _Partner:
             self._steps.append(stamp - self._newest)
         self._setbacks += stamp < (self._newest or 0)
         self._newest = stamp
-        self._images.append((stamp, message.log_time_ns, image, self._setbacks))
+        self._images.append(_KeptImage(stamp, message.log_time_ns, image, self._setbacks))
         while len(self._images) > _KEPT_IMAGES or self._too_much():
             self._images.popleft()
 
@@ -172,7 +179,7 @@ class _Partner:
         except (RecordingError, *MALFORMED) as error:
             self._left_out[f"calibration: {reason_of(error, self.stream.topic)}"] += 1
 
-    def expect(self, frame: Frame) -> None:
+    def notice(self, frame: Frame) -> None:
         """Take note of a new frame: if the clock was set back, earlier images are not its own."""
         if frame.stamp_ns < self._latest:
             self._setbacks, self._newest = self._setbacks + 1, None
@@ -187,25 +194,26 @@ class _Partner:
             return self._known(frame.topic, frame.index) is None or bool(self._candidates(frame))
         return self._newest is not None and self._newest >= frame.stamp_ns
 
-    def _candidates(self, frame: Frame) -> list[tuple[int, int, Any, int]]:
+    def _candidates(self, frame: Frame) -> list[_KeptImage]:
+        """Return the images that may be that of a frame."""
         if self._known is not None:
             logged = self._known(frame.topic, frame.index)
-            return [one for one in self._images if one[1] == logged]
+            return [one for one in self._images if one.log_time_ns == logged]
         period = self._period()
-        near = [one for one in self._images if 2 * abs(one[0] - frame.stamp_ns) <= period]
+        near = [one for one in self._images if 2 * abs(one.stamp_ns - frame.stamp_ns) <= period]
         # If the clock was set back, images from before may have the same stamps.
-        closest = min(near, key=lambda one: abs(one[1] - frame.log_time_ns), default=None)
-        return [one for one in near if closest is None or one[3] == closest[3]]
+        closest = min(near, key=lambda one: abs(one.log_time_ns - frame.log_time_ns), default=None)
+        return [one for one in near if closest is None or one.setbacks == closest.setbacks]
 
     def view(self, frame: Frame) -> ColourView | None:
         """Return the colour image nearest to a frame in time; None if none is usable."""
         near = self._candidates(frame)
-        nearest = min(near, key=lambda one: abs(one[0] - frame.stamp_ns), default=None)
+        nearest = min(near, key=lambda one: abs(one.stamp_ns - frame.stamp_ns), default=None)
         if nearest is None:
             self._left_out["no colour image near the time of the frame"] += 1
             return None
         try:
-            return self._view(frame, *nearest[:3])
+            return self._view(frame, nearest)
         except (RecordingError, *MALFORMED) as error:
             self._left_out[reason_of(error, self.stream.topic)] += 1
             return None
@@ -216,7 +224,7 @@ class _Partner:
             self._recording.warn(f"{self.stream.topic}: frames without colour ({count}×): {reason}")
 
     def _too_much(self) -> bool:
-        kept = sum(len(image.data) for _, _, image, _ in self._images)
+        kept = sum(len(image.decoded.data) for image in self._images)
         return kept > _KEPT_BYTES and len(self._images) > 2
 
     def _period(self) -> int:
@@ -225,8 +233,8 @@ class _Partner:
         count, span = self.stream.count or 0, self._recording.end_ns - self._recording.start_ns
         return span // (count - 1) if count > 1 and span > 0 else _USUAL_PERIOD_NS
 
-    def _view(self, frame: Frame, stamp: int, log_time_ns: int, decoded: Any) -> ColourView:
-        image = IMAGES[self.stream.kind](self.stream.topic, stamp, log_time_ns, decoded)
+    def _view(self, frame: Frame, kept: _KeptImage) -> ColourView:
+        image = IMAGES[self.stream.kind](self.stream.topic, *kept[:3])
         shape = (image.height, image.width)
         if self.stream.kind == "cloud":
             return ColourView(image, _lens(frame.camera))

@@ -32,11 +32,10 @@ def explain_jumps(folder: Path, fixed_frame: str | None) -> Iterator[str]:
     """
     if fixed_frame is None:
         return
-    start_ns = first_stamp(folder)
     for topic, (places, stamps_ns) in _read_places(folder).items():
         jumps, steps = _jumps(places, stamps_ns)
         if len(jumps):
-            seconds = (stamps_ns[jumps[0] + 1] - start_ns) * 1e-9
+            seconds = (stamps_ns[jumps[0] + 1] - first_stamp(folder)) * 1e-9
             times = f"{len(jumps)} times, first" if len(jumps) > 1 else "once,"
             yield (
                 f"{topic}: its pose in {fixed_frame} jumps {times} at {seconds:.1f} s, by up to "
