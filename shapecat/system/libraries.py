@@ -7,28 +7,27 @@ from typing import Any
 
 __all__ = ["block_unused"]
 
-_LINEAR_ALGEBRA = "scipy.linalg"
-_ASKS = "numba.np.linalg"
-"""The module with which numba looks for linear algebra."""
+_ASKS = {"scipy.linalg": "numba.np.linalg", "coverage": "numba.misc.coverage_support"}
+"""Modules that are blocked for one module of numba only."""
 
 
 class _Blocker(MetaPathFinder):
-    """Raises for pandas, and for SciPy's linear algebra if numba asks, even if they are installed.
+    """Raises for pandas, and for what numba looks for without need, even if they are installed.
 
     None in `sys.modules` would do the same, but scikit-learn looks for a module there.
     """
 
     def find_spec(self, fullname: str, *_: Any) -> None:
         """Raise ModuleNotFoundError for blocked modules; leave others to other finders."""
-        if fullname == "pandas" or (fullname == _LINEAR_ALGEBRA and _numba_asks()):
+        if fullname == "pandas" or (fullname in _ASKS and _calls(_ASKS[fullname])):
             msg = f"this process does without {fullname}"
             raise ModuleNotFoundError(msg, name=fullname)
 
 
-def _numba_asks() -> bool:
-    """Return whether numba's search for linear algebra is among the callers."""
+def _calls(module: str) -> bool:
+    """Return whether a module is among the callers."""
     frame: FrameType | None = sys._getframe()  # noqa: SLF001  inspect takes longer
-    while frame is not None and frame.f_globals.get("__name__") != _ASKS:
+    while frame is not None and frame.f_globals.get("__name__") != module:
         frame = frame.f_back
     return frame is not None
 
@@ -38,6 +37,7 @@ def block_unused() -> None:
 
     With its first array, Arrow loads pandas where it is installed, in order to recognise data
     frames: 0.4 s in each process. With its first kernel, numba loads SciPy's linear algebra, which
-    no kernel calls: 0.1 s.
+    no kernel calls: 0.1 s. It also loads the library that measures the coverage of tests, if a
+    developer has it: 0.05 s.
     """
     sys.meta_path.insert(0, _Blocker())
