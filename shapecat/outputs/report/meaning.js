@@ -1,4 +1,4 @@
-// Which labels are valid, by the rules of label_meaning.py: `annotate` refuses a table with one that is not.
+// Which labels are valid, by the rules of runs/labels/meaning.py: `annotate` refuses a table with one that is not.
 const MERGE = /^merged? +(?:with|into) +#?0*(\d{1,9})(?:[.,]0*)?$/i;
 const NEW = /^new +(.+)$/i;
 const NAME = /^(?!\p{Nd})[\p{L}\p{N}](?:[\p{L}\p{N}_ .+&'()-]{0,58}[\p{L}\p{N}_)])?$/u;
