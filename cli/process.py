@@ -8,6 +8,7 @@ from typing import Any
 
 import click
 
+from shapecat.outputs.counts import count_words
 from shapecat.system.stopping import Stopped
 
 from .options import (
@@ -22,7 +23,7 @@ from .options import (
     verbose_option,
 )
 from .progress import KINDS, Progress, describe_plan, open_progress
-from .render import count_words, for_any_reader, missed_words, print_json, print_table
+from .render import for_any_reader, missed_words, print_json, print_table
 
 _MOST_ROWS = 100
 

@@ -132,9 +132,3 @@ def changed_labels(before: Mapping[int, str], after: Mapping[int, str]) -> str:
         if tracks:
             parts.append(f"{plural(len(tracks), 'label')} {what}{f' ({lost})' if lost else ''}")
     return ", ".join(parts)
-
-
-def count_words(counts: Mapping[str, int]) -> str:
-    """Return counts as text, largest first: ``cup 3, can 2``."""
-    ordered = sorted(counts.items(), key=lambda item: (-item[1], item[0]))
-    return ", ".join(f"{name} {count}" for name, count in ordered) or "none"

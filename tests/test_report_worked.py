@@ -270,6 +270,18 @@ def test_index_sums_its_runs() -> None:
     assert "can 6, cup 4" in text
 
 
+def test_index_orders_categories_of_equal_counts() -> None:
+    """Labels come from a set, whose order differs from one process to the next."""
+    info = {"counts": {"frames": 1}, "seconds": {}, "warnings": []}
+    pages = [
+        index_page("runs", [Listed("0.html", "run 0", info, Counter(names), 0, 0, ())])
+        for names in (["cup", "can", "box", "box"], ["box", "can", "cup", "box"])
+    ]
+
+    assert pages[0] == pages[1]
+    assert "box 2, can 1, cup 1" in pages[0]
+
+
 def test_index_counts_tracks_left_to_check(run: Path) -> None:
     """A labelled track is no longer uncertain."""
     header, *lines = (run / "tracks.csv").read_text().splitlines()

@@ -1,6 +1,8 @@
 """Format counts, the same in every output; loads nothing, as the help of the command needs it."""
 
-__all__ = ["plural"]
+from collections.abc import Mapping
+
+__all__ = ["by_count", "count_words", "plural"]
 
 
 def plural(count: int, noun: str) -> str:
@@ -13,3 +15,25 @@ def plural(count: int, noun: str) -> str:
     """
     ending = "" if count == 1 else "es" if noun.endswith(("s", "ch")) else "s"
     return f"{count:,} {noun}{ending}"
+
+
+def by_count(counts: Mapping[str, int]) -> list[tuple[str, int]]:
+    """Return names and counts, largest first, equal ones by name.
+
+    Examples
+    --------
+    >>> by_count({"plate": 1, "cup": 3, "can": 1})
+    [('cup', 3), ('can', 1), ('plate', 1)]
+    """
+    return sorted(counts.items(), key=lambda item: (-item[1], item[0]))
+
+
+def count_words(counts: Mapping[str, int], none: str = "none") -> str:
+    """Return counts as text, largest first; ``none`` if there are none.
+
+    Examples
+    --------
+    >>> count_words({"can": 2, "cup": 3}), count_words({})
+    ('cup 3, can 2', 'none')
+    """
+    return ", ".join(f"{name} {count}" for name, count in by_count(counts)) or none

@@ -13,7 +13,7 @@ from typing import Any
 import numpy as np
 
 from shapecat.arrays import F8
-from shapecat.outputs.counts import plural
+from shapecat.outputs.counts import by_count, count_words, plural
 from shapecat.outputs.report.cards import (
     Card,
     asset,
@@ -119,7 +119,7 @@ def index_page(title: str, runs: Sequence[Listed]) -> str:
     return template("index.html").substitute(
         head=_head(title),
         title=escape(title),
-        subtitle=escape(", ".join(f"{name} {n}" for name, n in total.most_common())),
+        subtitle=escape(count_words(total, "no tracks")),
         tiles=_tiles(tiles),
         runs="".join(map(_listed, runs)),
     )
@@ -250,9 +250,9 @@ def _key(run: Mapping[str, Any], table: TrackTable) -> str:
 def _listed(item: Listed) -> str:
     share = "".join(
         f'<span style="--c:{css_colour(name)};--n:{count}" title="{escape(name)} {count}"></span>'
-        for name, count in item.categories.most_common()
+        for name, count in by_count(item.categories)
     )
-    words = ", ".join(f"{name} {count}" for name, count in item.categories.most_common())
+    words = count_words(item.categories, "no tracks")
     seconds = item.run["seconds"].get("total", 0.0)
     notes = [plural(item.run["counts"]["frames"], "frame"), f"processed in {seconds:.1f} s"]
     notes += [f"{item.unsure} uncertain"] if item.unsure else []
@@ -263,6 +263,6 @@ def _listed(item: Listed) -> str:
     return (
         f'<a class="run" href="{escape(item.link)}"><div><h3>{escape(item.name)}</h3>'
         f'<p class="muted">{escape(" · ".join(notes))}{warn}</p></div>'
-        f'<div><div class="share">{share}</div><p class="muted">{escape(words) or "no tracks"}</p>'
+        f'<div><div class="share">{share}</div><p class="muted">{escape(words)}</p>'
         f'</div><div class="faces">{faces}</div></a>'
     )
