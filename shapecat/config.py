@@ -254,7 +254,8 @@ def _checked(name: str, value: Any, kind: Any) -> Any:
     if kind is float and isinstance(value, int) and not isinstance(value, bool):
         value = float(value)
     if type(value) is not kind:
-        msg = f"{name} must be of type {kind.__name__}, got {value!r}"
+        expected = "true or false" if kind is bool else f"of type {kind.__name__}"
+        msg = f"{name} must be {expected}, got {value!r}"
         raise ConfigError(msg)
     if isinstance(value, float) and not abs(value) < float("inf"):
         msg = f"{name} must be finite, got {value!r}"

@@ -59,6 +59,7 @@ def test_numbers_of_numpy_are_settings() -> None:
         (f"detection.min_points=1{400 * '0'}", "detection.min_points is too large"),
         (f"seed=1{5000 * '0'}", "must be of type int"),
         ("tracking.gate_m=true", "must be of type float"),
+        ("outputs.markers=False", "must be true or false, got 'False'"),
         ("tracking.fusion=median", "must be one of mean"),
         ("tracking=1", "group of settings"),
         ("surface.neurons=513", "surface.neurons must be from 3 to 512, got 513"),

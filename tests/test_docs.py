@@ -13,7 +13,8 @@ import pytest
 from click.testing import Result
 
 from shapecat import config
-from shapecat.config import Settings
+from shapecat.config import Settings, with_overrides
+from shapecat.errors import ConfigError
 from shapecat.runs.tables.schemas import TABLES
 
 ROOT = Path(__file__).parents[1]
@@ -104,10 +105,18 @@ def test_documented_commands_and_options_exist(page: str, line: str) -> None:
     assert options <= known, f"{page}: {line}"
 
 
-def setting_rows() -> list[str]:
-    """Return the table of settings as the reference should have it, from the source."""
+def documented_settings() -> dict[str, list[str]]:
+    """Return default, range and meaning of each setting in the reference, by name."""
+    page = (ROOT / "docs" / "reference.md").read_text("utf-8")
+    table = page.partition("## Settings")[2].partition("###")[0]
+    rows = [line[2:-2].split(" | ") for line in table.splitlines() if line.startswith("| `")]
+    return {name.strip("`"): [default.strip("`"), *others] for name, default, *others in rows}
+
+
+def setting_rows() -> list[tuple[str, str, str]]:
+    """Return name, default and meaning of each setting, from the source."""
     defaults = Settings().as_dict()
-    rows = [f"| `seed` | `{defaults['seed']}` | fixes every random choice |"]
+    rows = [("seed", str(defaults["seed"]), "fixes every random choice")]
     source = ast.parse(Path(config.__file__).read_text("utf-8"))
     classes = {node.name: node for node in source.body if isinstance(node, ast.ClassDef)}
     for group, values in defaults.items():
@@ -120,18 +129,36 @@ def setting_rows() -> list[str]:
                     ast.unparse(line.target),
                     " ".join(ast.literal_eval(text.value).split()),
                 )
-                rows.append(f"| `{group}.{name}` | `{values[name]}` | {meaning} |")
+                default = str(values[name]).replace("False", "false")  # as in TOML
+                rows.append((f"{group}.{name}", default, meaning))
     return rows
 
 
 def test_reference_lists_every_setting_with_default() -> None:
-    reference = (ROOT / "docs" / "reference.md").read_text("utf-8").splitlines()
+    found = documented_settings()
     expected = setting_rows()
     count = 1 + sum(
         len(group) for group in Settings().as_dict().values() if isinstance(group, dict)
     )
     assert len(expected) == count, "a setting without a docstring"
-    assert [row for row in expected if row not in reference] == []
+    for name, default, meaning in expected:
+        assert [found[name][0], found[name][2]] == [default, meaning]
+
+
+@pytest.mark.parametrize(("name", "row"), documented_settings().items())
+def test_reference_lists_range_of_every_setting(name: str, row: list[str]) -> None:
+    """The ends of a range, or all choices, are allowed; what is beyond the ends is not."""
+    default, limits, _ = row
+    choices = re.findall("`([^`]+)`", limits)
+    ends = [float(number) for number in re.findall(r"[0-9.]+", limits)]
+    number = float if "." in default else int
+    for value in [default, *choices, *map(number, ends)]:
+        with_overrides(Settings(), [f"{name}={value}"])
+    assert choices or ends
+    steps = {ends[0]: -1, **({ends[-1]: 1} if len(ends) > 1 else {})} if ends else {}
+    for value in ["some", *(number(end + step) for end, step in steps.items())]:
+        with pytest.raises(ConfigError):
+            with_overrides(Settings(), [f"{name}={value}"])
 
 
 def test_reference_lists_phases_of_progress() -> None:
