@@ -24,7 +24,7 @@ from .render import print_json, progress_bars
     type=ANY_PATH,
     metavar="TRAINING_SET",
     help="Train shapecat's model and simpler classifiers on these views and compare them on "
-    "DATASET. If TRAINING_SET is DATASET, use five-fold cross-validation by instance.",
+    "DATASET. If TRAINING_SET is DATASET, use cross-validation by instance with up to five folds.",
 )
 @json_option
 def evaluate(

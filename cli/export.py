@@ -151,8 +151,8 @@ def _export_dataset(
     click.echo(f"{plural(train, 'image')} in train, {val:,} in val{hint}")
     if kind == "yolo" and found.uncertain:
         click.echo(
-            f"Warning: training will take {plural(found.uncertain, 'visible object')} without a "
-            "certain label for background; coco marks such objects as ignored",
+            f"Warning: a model will learn {plural(found.uncertain, 'visible object')} without a "
+            "reliable label as background; the format coco marks such objects as ignored",
             err=True,
         )
 

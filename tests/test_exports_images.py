@@ -154,7 +154,7 @@ def test_export_warns_about_missing_validation_and_labels(
     why = "all frames of a recording go to the same split"
     line = f"{len(data['images'])} images in train, 0 in val: {why}"
     assert done.stdout.splitlines()[1:] == [line]
-    warning = f"Warning: training will take {crowds} visible objects without a certain label for"
+    warning = f"Warning: a model will learn {crowds} visible objects without a reliable label as"
     assert (warning in done.stderr) == (kind == "yolo")
     assert shapecat("export", run, *options).stderr == ""
 
@@ -254,8 +254,8 @@ def test_run_without_colour_suggests_depth_option(
     ("options", "reason"),
     [
         ((), "damaged image (4×)"),
-        (("--depth", "--corrected-only"), "no object with a certain label (4×)"),
-        (("--depth", "--corrected-only", "--per-track", "1"), "no object with a certain label"),
+        (("--depth", "--corrected-only"), "no object with a reliable label (4×)"),
+        (("--depth", "--corrected-only", "--per-track", "1"), "no object with a reliable label"),
     ],
 )
 def test_export_without_images_says_why(

@@ -467,7 +467,7 @@ def test_images_without_certain_objects_are_omitted(monkeypatch: pytest.MonkeyPa
     found = images_of(finished, Selection(), stem="lab", left_out=left_out)
 
     assert list(found) == [images[1], images[4]]
-    assert left_out == {"no image": 1, "no object with a certain label": 2}
+    assert left_out == {"no image": 1, "no object with a reliable label": 2}
 
 
 @pytest.mark.parametrize(("pose", "most"), [(IDENTITY, 160), (None, 840)])

@@ -40,7 +40,7 @@ def compare_learners(
     Parameters
     ----------
     test : test views; those labelled ``unknown`` are left out.
-    train : training views. If None, use ``test`` in five-fold cross-validation by instance.
+    train : training views. If None, use ``test`` in cross-validation by instance, up to 5 folds.
     categories : order of the posteriors; a category without training views counts as missed.
     root : folder of the data set, which error messages name.
 

@@ -30,7 +30,7 @@ def evaluate_folder(
     root : folder of the data set.
     model : model file; the default model by default.
     baselines : folder of a data set on which shapecat's classifier and baselines are trained, to be
-        tested on ``root``. If it is ``root`` itself, use five-fold cross-validation by instance.
+        tested on ``root``. If it is ``root`` itself, use cross-validation by instance.
 
     Raises
     ------

@@ -134,7 +134,7 @@ def images_of(
             if image is None:
                 left_out["no image"] += 1
             elif not any(image.sure):
-                left_out["no object with a certain label"] += 1
+                left_out["no object with a reliable label"] += 1
             else:
                 yield image
 

@@ -36,7 +36,7 @@ class Exported:
     Attributes
     ----------
     objects : number of objects labelled for training, summed over all images.
-    uncertain : number of visible objects without a certain label, summed in the same way.
+    uncertain : number of visible objects without a reliable label, summed in the same way.
     images : number of images in each split.
     """
 
@@ -163,7 +163,7 @@ def export_dataset(
                 yield split, run, image
         if not counts:
             reasons = ", ".join(f"{reason} ({count}×)" for reason, count in left_out.items())
-            msg = f"no image to export: {reasons or 'no object with a certain label'}"
+            msg = f"no image to export: {reasons or 'no object with a reliable label'}"
             raise OutputError(msg)
 
     ids = {stem: run.run["id"] for stem, run in zip(stems, runs, strict=True)}
