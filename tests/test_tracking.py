@@ -610,6 +610,21 @@ def test_scraps_at_image_border_are_no_scene_cut(per_s: int) -> None:
     assert [track.hits for track in track_recording(frames, SETTINGS)] == [22]
 
 
+def test_slow_views_past_an_occluder_are_no_scene_cut() -> None:
+    """A camera that moves on between two frames may see only parts of all objects."""
+    places = np.arange(3)[:, None] * [0.4, 0, 0]
+    whole = [frame(k, places, stamp_ns=k * SECOND) for k in range(3)]
+    parts = [
+        replace(
+            frame(k, places + np.array([0.05, 0, 0]), posterior=0.25 * CUP + 0.75 * BOX),
+            stamp_ns=k * SECOND,
+            partial=np.ones(3, np.bool_),
+        )
+        for k in range(3, 6)
+    ]
+    assert not scene_cuts(next(gather([*whole, *parts])), SETTINGS).any()
+
+
 def test_gap_is_interpolated_in_time_not_frames() -> None:
     """A robot that drops a second of frames would otherwise place the object halfway."""
     seconds = [*np.arange(11) / 10, 1.8, *np.arange(20, 30) / 10]

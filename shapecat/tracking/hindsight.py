@@ -19,6 +19,8 @@ _SLOW_S = 0.3  # beyond this interval between frames, motion does not explain a 
 _KNOWN = 8  # whole views needed to know the size, as some views only seem whole
 _SAME_SIZE = 0.25  # largest difference of size keys of the same object
 _SAME_POSTERIOR = 0.5  # largest total variation distance of posteriors of the same object
+_SLOW_REACH = 0.5  # share of the gate radius that an object at rest may seem to move
+_PARTIAL_SLACK = 1.5  # factor of the last two limits for pairs with a partial view
 _TRUSTED = 0.4  # added to that if few views are whole, for the same position and size
 _LOOKAHEAD = 8  # later fragments at the same position that are considered
 
@@ -210,7 +212,7 @@ def _continues(hits: Hits, i: int, j: int, *, slow: bool, settings: TrackingSett
     """Return whether frames i and j may show the same scene: at least half of the objects match.
 
     A partial view may be smaller than its object. With ``slow``, positions and posteriors must
-    agree better, as the frames are not expected to show motion.
+    agree better, as the frames are not expected to show motion; those of partial views less so.
     """
     a, b = hits.of_frame(i), hits.of_frame(j)
     distance = np.linalg.norm(hits.centers[a][:, None] - hits.centers[b][None], axis=2)
@@ -221,12 +223,11 @@ def _continues(hits: Hits, i: int, j: int, *, slow: bool, settings: TrackingSett
     keys_a, keys_b = size_key(hits.sizes[a]), size_key(hits.sizes[b])
     whole_a, whole_b = ~hits.partial[a][:, None], ~hits.partial[b][None]
     size = _contradiction(keys_a[:, None], keys_b[None], whole_a, whole_b)
-    limit = 0.5 * reach(keys_a, settings.gate_m) if slow else np.full(len(keys_a), settings.gate_m)
-    other = posterior_difference(hits.posteriors[a], hits.posteriors[b])
-    same = (
-        (distance <= limit[:, None])
-        & (size <= _SAME_SIZE)
-        & (other <= (_SAME_POSTERIOR if slow else 1.0))
-    )
+    same = (distance <= settings.gate_m) & (size <= _SAME_SIZE)
+    if slow:
+        slack = np.where(whole_a & whole_b, 1.0, _PARTIAL_SLACK)
+        other = posterior_difference(hits.posteriors[a], hits.posteriors[b])
+        same &= distance <= slack * _SLOW_REACH * reach(keys_a, settings.gate_m)[:, None]
+        same &= other <= slack * _SAME_POSTERIOR
     found = min(int(same.any(axis=1).sum()), int(same.any(axis=0).sum()))
     return 2 * found >= comparable
