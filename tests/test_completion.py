@@ -242,6 +242,22 @@ def test_view_of_moved_object_keeps_its_pose() -> None:
     assert_allclose(fused.stds[:, 2], 0.01 * np.sqrt(0.5 + 0.5 / 5))
 
 
+@pytest.mark.parametrize("turn", [40, 90])
+def test_box_of_object_turned_in_place_turns_with_it(turn: float) -> None:
+    """A person may turn a box to show another side; a mean of both yaws is neither."""
+    yaws = np.radians(np.where(np.arange(24) < 13, 10, 10 + turn)) + RNG.normal(0, 0.05, 24)
+    axes = np.stack([about_z(yaw) for yaw in yaws])
+    sizes = np.tile([0.2, 0.1, 0.3], (24, 1))
+    fused = fused_in(
+        views_of(np.zeros((24, 3)), axes, sizes), np.ones(24), one_hot("box"), CATEGORIES
+    )
+
+    longer = int(fused.sizes[0, 1] > fused.sizes[0, 0])
+    assert_allclose(fused.sizes[0, [longer, 1 - longer, 2]], [0.2, 0.1, 0.3], atol=0.012)
+    same = np.abs((fused.axes[:, :, longer] * axes[:, :, 0]).sum(axis=1)) > np.cos(0.2)
+    assert np.delete(same, [13, 14]).all()  # single views may err: their neighbours must agree
+
+
 def test_box_of_carried_object_is_that_of_its_longest_rest() -> None:
     """The median of its places is on the way, where its box reaches down to the table."""
     there, on_the_way = np.array([0.8, 0.5, 0]), np.linspace(0.1, 0.9, 14)[:, None]

@@ -13,6 +13,11 @@ __all__ = ["BoxViews", "FusedBox", "FusedBoxes", "fuse_boxes"]
 
 _STILL_M = 0.05
 """While the centre moves less than this, the object stands still."""
+_TURNED_DEG, _ROUND, _STEADY = 20.0, 0.2, 0.7
+"""Smallest turn of an object that counts; elongation below which no side is the longer one; length
+of the mean of unit vectors that agree."""
+_NEIGHBOURS, _TRIED = 2, 16
+"""Views before and after a view that must show the same yaw; yaws that are tried."""
 _NARROWEST = 0.5
 """Least width of the overlaid outline, as a share of the narrowest view."""
 _UNSEEN = 0.05
@@ -71,9 +76,10 @@ class FusedBox(NamedTuple):
     def in_views(self, centers: F8, axes: F8, sizes: F8) -> FusedBoxes:
         """Return the box in views (k,) of the object, given their boxes as in `BoxViews`.
 
-        A view that shows the object elsewhere keeps its own centre and yaw.
+        A view that shows the object elsewhere, or turned, keeps its own centre and yaw.
         """
-        still = _near(centers, self.place)
+        elongation = float(_elongation(self.size[None])[0])
+        still = _near(centers, self.place) & ~_turned_from(self.axes, elongation, axes, sizes)
         return FusedBoxes(
             np.where(still[:, None], self.center, centers),
             np.where(still[:, None, None], self.axes, _alike(axes, sizes, self.size)),
@@ -95,9 +101,10 @@ def fuse_boxes(views: BoxViews, weights: F8, posterior: F8, categories: Sequence
     posterior : (c,) probabilities of the track, in the order of ``categories``.
     """
     first = _resting(views.centers, weights)
-    still = _near(views.centers, views.centers[first])
+    still = np.flatnonzero(_near(views.centers, views.centers[first]))
+    still = still[_not_turned(views.axes[still], views.sizes[still], weights[still])]
     some, own = BoxViews(*(values[still] for values in views)), weights[still]
-    base, origin = _mean_axes(some, own), views.centers[first]
+    base, origin = _mean_axes(some.axes, some.sizes, own), views.centers[first]
     seen, facing = _overlaid(some, own, origin, base)
     plan = footprint(seen, facing, posterior, categories)
     places = (some.centers - origin) @ base
@@ -132,13 +139,59 @@ def _near(centers: F8, place: F8) -> Bool:
     return np.asarray(np.linalg.norm(centers - place, axis=1) < _STILL_M)
 
 
-def _mean_axes(views: BoxViews, weights: F8) -> F8:
-    """Return the axes (3, 3) of the first view, turned to the mean yaw modulo 90 degrees."""
-    first = views.axes[0]
-    x, y, _ = first.T @ views.axes[:, :, 0].T
-    length, width = views.sizes[:, 0], views.sizes[:, 1]
-    elongation = abs(length - width) / np.maximum(np.maximum(length, width), 1e-6)
-    total = np.sum(weights * (_SQUARE + elongation) * np.exp(4j * np.arctan2(y, x)))
+def _not_turned(axes: F8, sizes: F8, weights: F8) -> Bool:
+    """Return in which views (k,) an object that stands in one place has its most usual yaw."""
+    found = np.ones(len(axes), np.bool_)
+    most, longer = 0.0, _elongation(sizes)
+    for k in np.unique(np.linspace(0, len(axes) - 1, _TRIED).astype(np.int64)).tolist():
+        near = slice(max(0, k - _NEIGHBOURS), k + _NEIGHBOURS + 1)
+        base = _mean_axes(axes[near], sizes[near], weights[near])
+        angle, own = _yaws(base, axes[near]), longer[near]
+        along, most_along = np.mean(own * np.cos(2 * angle)), np.mean(abs(own))
+        turning = np.mean(np.cos(4 * angle)) < _STEADY or (
+            most_along > _ROUND and abs(along) < _STEADY * most_along
+        )
+        same = ~_turned_from(base, float(along), axes, sizes)
+        if not turning and weights[same].sum() > most:
+            found, most = same, weights[same].sum()
+    return found
+
+
+def _turned_from(base: F8, elongation: float, axes: F8, sizes: F8) -> Bool:
+    """Return in which views (k,) an object has turned from a box with the axes ``base``.
+
+    Neighbouring views must agree, as a single one may err. ``elongation`` is that of the box.
+    """
+    angle, longer, count = _yaws(base, axes), _elongation(sizes), np.ones(len(axes))
+    weights = _SQUARE + abs(longer)
+    around = count[: 2 * _NEIGHBOURS + 1]
+    yaw = np.convolve(weights * np.exp(4j * angle), around, "same")
+    along = np.convolve(longer * np.cos(2 * angle), around, "same")
+    agree = abs(yaw) > _STEADY * np.convolve(weights, around, "same")
+    off = abs(np.angle(yaw)) > np.radians(4 * _TURNED_DEG)
+    across = -np.sign(elongation) * along > _ROUND * np.convolve(count, around, "same")
+    return np.asarray(agree & (off | (across & (abs(elongation) > _ROUND))))
+
+
+def _yaws(base: F8, axes: F8) -> F8:
+    """Return the yaws (k,) of boxes with the axes (k, 3, 3) in a box with the axes ``base``."""
+    x, y, _ = (axes[:, :, 0] @ base).T
+    return np.asarray(np.arctan2(y, x))
+
+
+def _elongation(sizes: F8) -> F8:
+    """Return how much longer boxes (k, 3) are along their first axis than along the second: (k,).
+
+    It is -1 to 1, and 0 for a square.
+    """
+    length, width = sizes[:, 0], sizes[:, 1]
+    return np.asarray((length - width) / np.maximum(np.maximum(length, width), 1e-6))
+
+
+def _mean_axes(axes: F8, sizes: F8, weights: F8) -> F8:
+    """Return the first of some axes (k, 3, 3), turned to the mean yaw modulo 90 degrees."""
+    first = axes[0]
+    total = np.sum(weights * (_SQUARE + abs(_elongation(sizes))) * np.exp(4j * _yaws(first, axes)))
     return np.asarray(first @ _about_z(float(np.angle(total)) / 4))
 
 
@@ -147,8 +200,7 @@ def _overlaid(views: BoxViews, weights: F8, origin: F8, base: F8) -> tuple[F8, F
 
     Both are (96,), from the first of the axes ``base`` to the second.
     """
-    x, y, _ = (views.axes[:, :, 0] @ base).T
-    around = _turned(views.outlines, np.arctan2(y, x))
+    around = _turned(views.outlines, _yaws(base, views.axes))
     places = (views.centers - origin) @ base
     reached = around + places[:, :1] * COSINES + places[:, 1:2] * SINES
     facing = faced(((views.sensors - origin) @ base)[:, :2])
