@@ -50,8 +50,8 @@ def measure_objects(
     """Measure the objects.
 
     The box is a `shapecat.geometry.upright_box` around the outermost cells. An object stands on
-    another if it has more contact with the other's upward-facing surface than with the plane. If
-    the contact is hidden, the bottom of the upper object must be at the top of the lower one.
+    another if it is over it, and has more contact with the other's upward-facing surface than with
+    the plane. If the contact is hidden, its bottom must be at the top of the other one.
 
     Parameters
     ----------
@@ -79,8 +79,9 @@ def measure_objects(
         p = representatives[k + 1]
         measured.last[k] = last[k + 1] >= MERGING.few
         measured.least[k] = smallest_object_at(grid, depth_of(segments, p))
+        below = _objects_below(measured, up, k)
         measured.supported_by[k], measured.support_m[k] = _supporting_object(
-            segments, representatives, p
+            segments, representatives, p, below
         )
         hidden = segments.statistics[p].hidden
         for q in range(segments.parent.size):
@@ -114,25 +115,65 @@ def _count_at_range_limit(inv_depth: F4, labels: I4, size: int, range_m: float) 
 
 
 @kernel(inline=True)
-def _supporting_object(segments: Segments, representatives: I4, p: int) -> tuple[int, float]:
+def _objects_below(measured: ObjectMeasurements, up: F8, k: int) -> Bool:
+    """Return which labels, (n + 1,), have the middle of object ``k`` above them, seen from above.
+
+    What hides behind the visible part of an object may be a bit of it. An object whose middle is
+    farther behind stands behind it, even if its visible part begins at the top of the other.
+    """
+    count = measured.center.shape[0]
+    below = np.zeros(count + 1, np.bool_)
+    for q in range(count):
+        x, y, z, w = measured.orientation[q]
+        axis = (1 - 2 * (y * y + z * z), 2 * (x * y + z * w), 2 * (x * z - y * w))
+        height = rise = 0.0
+        for d in range(3):
+            height += measured.center[q, d] * up[d]
+            rise += (measured.center[k, d] - measured.center[q, d]) * up[d]
+        distance2 = behind = apart2 = turn = 0.0
+        for d in range(3):
+            away = measured.center[q, d] - height * up[d]
+            shift = measured.center[k, d] - measured.center[q, d] - rise * up[d]
+            distance2 += away * away
+            behind += shift * away
+            apart2 += shift * shift
+            turn += axis[d] * away
+        distance = max(np.sqrt(distance2), 1e-9)
+        behind /= distance
+        beside = np.sqrt(max(apart2 - behind * behind, 0.0))
+        c = min(abs(turn) / distance, 1.0)
+        s = np.sqrt(1 - c * c)
+        depth = (c * measured.size[q, 0] + s * measured.size[q, 1]) / 2
+        width = (s * measured.size[q, 0] + c * measured.size[q, 1]) / 2
+        below[q + 1] = (
+            beside < width + OUTPUT.beside_m
+            and -depth - OUTPUT.beside_m < behind < depth + OUTPUT.behind_m
+        )
+    return below
+
+
+@kernel(inline=True)
+def _supporting_object(
+    segments: Segments, representatives: I4, p: int, below: Bool
+) -> tuple[int, float]:
     """Return the label below a segment, 0 for its plane, and the height of this support, metres."""
     pairs, statistics, own = segments.pairs[p], segments.statistics, segments.statistics[p]
     best = 0
     for k in range(1, representatives.size):
         more = pairs[representatives[k]].rests_on > pairs[representatives[best]].rests_on
-        best = k if more else best
+        best = k if more and below[k] else best
     met = pairs[representatives[best]].rests_on
     if met >= MERGING.few and met > own.plane_contact:
         height = float(pairs[representatives[best]].rests_on_height / met)
         return (0, 0.0) if own.bottom < height - OUTPUT.sunk_m else (best, height)
     if own.bottom > OUTPUT.lifted_m and own.plane_contact < MERGING.few:
-        best = _hidden_support(segments, representatives, p)
+        best = _hidden_support(segments, representatives, p, below)
         return best, float(statistics[representatives[best]].top) if best else 0.0
     return 0, 0.0
 
 
 @kernel(inline=True)
-def _hidden_support(segments: Segments, representatives: I4, p: int) -> int:
+def _hidden_support(segments: Segments, representatives: I4, p: int, below: Bool) -> int:
     """Return the label that has the most contact with a segment from below; 0 if there is none.
 
     A segment that lies mostly below the top of another one is not on it, but behind it.
@@ -145,9 +186,9 @@ def _hidden_support(segments: Segments, representatives: I4, p: int) -> int:
         q = representatives[k]
         met = pairs[p, q].contact + pairs[p, q].near + pairs[p, q].in_front + pairs[q, p].in_front
         overlap = statistics[q].top - statistics[p].bottom
-        below = -OUTPUT.gap_m < overlap < most_overlap
+        lower = -OUTPUT.gap_m < overlap < most_overlap
         beside = statistics[q].left < middle < statistics[q].right
-        if q != p and below and beside and met > most:
+        if q != p and below[k] and lower and beside and met > most:
             best, most = k, met
     return best if most >= MERGING.few else 0
 

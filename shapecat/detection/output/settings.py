@@ -15,6 +15,10 @@ class OutputSettings(NamedTuple):
     between is hidden."""
     overlap_m: float = 0.04
     """Largest overlap of the two, metres: a strip of the support may be labelled as the object."""
+    beside_m: float = 0.01
+    """Largest distance, metres, from an object to the middle of another one that stands on it."""
+    behind_m: float = 0.04
+    """The same behind its visible part, metres: its back is hidden."""
     lifted_m: float = 0.03
     """An object with a bottom higher than this above its plane, metres, does not stand on it."""
     sunk_m: float = 0.015
