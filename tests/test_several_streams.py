@@ -4,11 +4,16 @@ import json
 from collections.abc import Callable
 from pathlib import Path
 
+import numpy as np
 import pyarrow.parquet as pq
+import pytest
 from click.testing import Result
 
 from shapecat.outputs.exports.formats import export_run
+from shapecat.runs.perceive.clocks import explain_clocks
+from shapecat.runs.perceive.perceived import FrameRow, PerceptionTables
 from shapecat.simulation.messages import MessageFactory
+from shapecat.types import Perception, Scene
 from tests.messages import write
 from tests.scenes import stream
 
@@ -48,6 +53,27 @@ def test_object_seen_by_two_sensors_is_one_track(shapecat: Run, tmp_path: Path) 
     # Frames of both sensors have equal numbers; their files must not collide.
     crops = export_run(tmp_path / "both" / "a", "crops", tmp_path / "crops")
     assert len(list((tmp_path / "crops").glob("*/*/*.pcd"))) == crops > 12
+
+
+@pytest.mark.parametrize(("ahead_s", "fixed_frame"), [(0.5, "map"), (0.1, "map"), (0.5, None)])
+def test_clocks_that_differ_are_reported(
+    tmp_path: Path, ahead_s: float, fixed_frame: str | None
+) -> None:
+    """Two cameras at two computers: poses are looked up at the wrong time; nothing else says so."""
+    scene = Scene(np.array([0, 0, 1], np.float32), (), ())
+    with PerceptionTables(tmp_path, categories=("can",), model_id="m") as tables:
+        for k in range(9):
+            for topic, own_s, late_s in ((DEPTH, ahead_s, 0.02), (POINTS, 0, 0.05)):
+                logged = k * 10**8 + round(late_s * 1e9)
+                stamp = k * 10**8 + round(own_s * 1e9)
+                perception = Perception(topic, k, stamp, "cam", scene, (), {})
+                tables.write([perception], [FrameRow(logged, None)])
+    warnings = list(explain_clocks(tmp_path, fixed_frame))
+
+    expected = [f"the clock of {DEPTH} is 0.53 s ahead of that of {POINTS}"]
+    assert [text.split(",")[0] for text in warnings] == expected * (
+        ahead_s > 0.3 and bool(fixed_frame)
+    )
 
 
 def test_without_fixed_frame_sensors_share_no_tracks(shapecat: Run, tmp_path: Path) -> None:

@@ -1,0 +1,52 @@
+"""Warn if the clocks of two sensors differ: their computers are not synchronized."""
+
+from collections.abc import Iterator
+from pathlib import Path
+
+import numpy as np
+
+from shapecat.arrays import I4
+from shapecat.runs.tables.reading import numbers, read_row_groups, topic_codes
+
+__all__ = ["explain_clocks"]
+
+_DIFFERENT_S = 0.3
+"""Smallest difference of two clocks; how long drivers take to log an image differs by less."""
+
+
+def explain_clocks(folder: Path, fixed_frame: str | None) -> Iterator[str]:
+    """Yield a warning if the sensors of a run have different clocks.
+
+    The recorder has one clock: the time from the stamp of an image to its log time is the same for
+    all sensors but for their clocks.
+
+    Parameters
+    ----------
+    folder : with the table of frames.
+    fixed_frame : None if the sensors are tracked apart; then their clocks do not matter.
+    """
+    if fixed_frame is None:
+        return
+    delays_s = {
+        topic: float(np.median(np.concatenate(parts))) * 1e-9
+        for topic, parts in _read_delays(folder).items()
+    }
+    first, last = min(delays_s, key=delays_s.__getitem__), max(delays_s, key=delays_s.__getitem__)
+    ahead_s = delays_s[last] - delays_s[first]
+    if ahead_s > _DIFFERENT_S:
+        yield (
+            f"the clock of {first} is {ahead_s:.2f} s ahead of that of {last}, by their log times: "
+            "poses of a moving sensor are wrong, and a moving object gets two tracks; synchronize "
+            "the clocks of the computers"
+        )
+
+
+def _read_delays(folder: Path) -> dict[str, list[I4]]:
+    """Read the log times minus the stamps (n,) of each topic, ns, in parts."""
+    found: dict[str, list[I4]] = {}
+    for group in read_row_groups(folder / "frames.parquet", ["topic", "stamp_ns", "log_time_ns"]):
+        topics, codes = topic_codes(group)
+        delays = numbers(group["log_time_ns"]) - numbers(group["stamp_ns"])
+        for code, topic in enumerate(topics):
+            found.setdefault(topic, []).append(delays[codes == code])
+    return found
