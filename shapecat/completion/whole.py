@@ -33,6 +33,8 @@ _HANDLE = 0.06
 """Minimum length by which a handle sticks out of a cup's oval, as a fraction of the radius."""
 _EDGEWISE = -0.2
 """Cosine of the angle to the sensor above which an outline is visible: just past edge-on."""
+_THINNEST_M = 0.005
+"""Least length of a box: a face that the sensor sees straight on shows no thickness."""
 _NOISE_M, _GUESS = 0.006, 0.35
 """Standard deviation of a visible length; that of the guessed part, as a share of it."""
 _ANGULAR, _HANDLED = "box", "cup"
@@ -115,7 +117,7 @@ def complete(
     around = seen - x * COSINES - y * SINES
     return FullBox(
         level.T @ (x, y, (bottom + top) / 2 + offset),
-        np.array([*plan.size, top - bottom]),
+        np.array([*plan.size, max(top - bottom, _THINNEST_M)]),
         quaternion_from_rotation(sensor_from_box),
         np.array([*plan.std, math.hypot(_NOISE_M, _GUESS * (lowest - bottom))]),
         np.roll(around, -plan.side),
@@ -161,7 +163,7 @@ def footprint(seen: F8, facing: F8, posterior: F8, categories: Sequence[str]) ->
     c, s = COSINES[side], SINES[side]
     return Footprint(
         np.array([c * along - s * across, s * along + c * across]),
-        np.array(size),
+        np.maximum(size, _THINNEST_M),
         np.hypot(_NOISE_M, np.hypot(_GUESS * guessed, doubt)),
         side,
     )
