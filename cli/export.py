@@ -107,8 +107,10 @@ def export(
     if recording is not None and len(runs) > 1:
         msg = f"--recording is for a single run, not for {len(runs)}"
         raise click.UsageError(msg)
-    if kind not in _DATASETS:
-        _require_own_names(runs, kind)
+    if kind == "crops":
+        _require_own_frames(runs)
+    elif kind not in _DATASETS:
+        _require_own_names(runs)
     if boxes is not None and kind not in _WITH_BOXES:
         msg = f"--boxes is for --format {' and '.join(_WITH_BOXES)}, not {kind}"
         raise click.UsageError(msg)
@@ -157,20 +159,30 @@ def _export_dataset(
         )
 
 
-def _require_own_names(runs: Sequence[Path], kind: str) -> None:
+def _require_own_names(runs: Sequence[Path]) -> None:
     """Refuse runs with the same name: their exports would collide."""
     from shapecat.errors import OutputError
-    from shapecat.outputs.exports.crops import crops_prefix
-    from shapecat.runs.finished import read_finished
 
     names: dict[str, Path] = {}
     for run in runs:
-        crops = kind == "crops"
-        name = crops_prefix(read_finished(run)) if crops else run.resolve().name
-        other = names.setdefault(name, run)
+        other = names.setdefault(run.resolve().name, run)
         if other is not run:
-            todo = "; export them to different folders (--out)"
-            if crops:  # under two names, one object would count as two
-                todo = " and recording; export only one, or rename one if their frames differ"
-            msg = f"{other} and {run} have the same name{todo}"
+            todo = "export them to different folders (--out)"
+            msg = f"{other} and {run} have the same name; {todo}"
             raise OutputError(msg)
+
+
+def _require_own_frames(runs: Sequence[Path]) -> None:
+    """Refuse runs of the same frames: each object would count as two."""
+    from shapecat.errors import OutputError
+    from shapecat.outputs.exports.crops import Origin
+    from shapecat.runs.finished import read_finished
+
+    origins: dict[Path, Origin] = {}
+    for run in runs:
+        origin = Origin.of(read_finished(run))
+        for other, earlier in origins.items():
+            if origin.shares_frames(earlier):
+                msg = f"{other} and {run} hold the same frames of a recording; export only one"
+                raise OutputError(msg)
+        origins[run] = origin

@@ -122,20 +122,24 @@ def test_crops_are_upright_at_height_zero_with_viewpoint(run: Path, tmp_path: Pa
 
 
 @pytest.mark.parametrize(
-    ("form", "todo"), [("crops", "export only one"), ("kitti", "different folders")]
+    ("form", "second", "problem"),
+    [
+        ("crops", "lab", "hold the same frames of a recording; export only one"),
+        ("crops", "lab2", "hold the same frames of a recording; export only one"),
+        ("kitti", "lab", "have the same name; export them to different folders"),
+    ],
 )
-def test_exports_of_runs_with_one_name_do_not_collide(
-    run: Path, tmp_path: Path, shapecat: Run, form: str, todo: str
+def test_exports_of_two_runs_do_not_collide(
+    run: Path, tmp_path: Path, shapecat: Run, form: str, second: str, problem: str
 ) -> None:
-    """The second export would replace the first; if renamed, each object would be there twice."""
-    for camera in ("left", "right"):
-        shutil.copytree(run, tmp_path / camera / "lab")
-    folders = [tmp_path / "left" / "lab", tmp_path / "right" / "lab"]
+    """The second export would replace the first."""
+    folders = [tmp_path / "left" / "lab", tmp_path / "right" / second]
+    for folder in folders:
+        shutil.copytree(run, folder)
     result = shapecat("export", *folders, "--format", form, "--out", tmp_path / "out")
 
     assert result.exit_code != 0
-    assert "have the same name" in result.output
-    assert todo in result.output
+    assert problem in result.output
     assert not (tmp_path / "out").exists()
 
 

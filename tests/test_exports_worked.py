@@ -327,9 +327,10 @@ def test_lidar_looks_along_its_x_axis(up: Any, forward: Any) -> None:
     assert rotation[0] @ np.array([0, -1, 0]) > 0.9  # x is right
 
 
-def crops_run(*topics: str) -> Any:
-    run = {"input": {"digest": "xxh3-128:0123456789"}, "options": {"topics": list(topics)}}
-    return SimpleNamespace(name="lab", run=run)
+def crops_run(*topics: str, name: str = "lab", **options: float | None) -> Any:
+    made = {"topics": list(topics), "start_s": None, "end_s": None, **options}
+    run = {"input": {"digest": "xxh3-128:0123456789"}, "options": made}
+    return SimpleNamespace(name=name, run=run)
 
 
 def crops_frames(*topics: str) -> list[Any]:
@@ -343,7 +344,7 @@ def test_crops_of_two_cameras_do_not_replace_each_other(tmp_path: Path, topics: 
     for _ in range(2):  # the second export replaces the first
         assert write_crops(tmp_path, crops_frames(*topics), crops_run(*topics)) == 2
         (instance,) = tmp_path.glob("*/*")
-        assert re.fullmatch(r"lab\.[0-9a-f]{8}\.track-4", instance.name)
+        assert re.fullmatch(r"lab\.[0-9a-f]{12}\.track-4", instance.name)
         assert instance.parent.name == "bowl"
         assert len(list(instance.iterdir())) == 2
 
@@ -354,6 +355,33 @@ def test_crops_of_runs_of_two_cameras_do_not_replace_each_other(tmp_path: Path) 
         assert write_crops(tmp_path, crops_frames(topic), crops_run(topic)) == 1
 
     assert [path.name for path in tmp_path.glob("*/*/*")] == ["000000.pcd"] * 2
+
+
+def test_crops_of_a_renamed_run_replace_the_earlier_ones(tmp_path: Path) -> None:
+    """A training set would hold each object twice, with two labels if they were corrected."""
+    for name in ("lab", "lab 2.a"):
+        write_crops(tmp_path, crops_frames("/depth"), crops_run("/depth", name=name))
+
+    assert [path.name[:7] for path in tmp_path.glob("*/*")] == ["lab 2.a"]
+
+
+@pytest.mark.parametrize(
+    ("ranges", "kept"),
+    [
+        ([(None, 10.0), (10.0, 20.5), (20.5, None)], 3),
+        ([(None, 10.0), (10.0, 20.5), (5.0, None)], 1),
+        ([(3.0, 10.0), (12.0, 20.5), (None, 11.0)], 2),
+        ([(3.0, 10.0), (None, None)], 1),
+        ([(None, None), (3.0, 10.0)], 1),
+    ],
+)
+def test_crops_of_other_time_ranges_stay(tmp_path: Path, ranges: Any, kept: int) -> None:
+    """Those of overlapping ranges are replaced: they show the same objects in the same frames."""
+    for start, end in ranges:
+        made = crops_run("/depth", start_s=start, end_s=end)
+        assert write_crops(tmp_path, crops_frames("/depth"), made) == 1
+
+    assert len(list(tmp_path.glob("*/*/*.pcd"))) == kept
 
 
 def dataset_image() -> DatasetImage:

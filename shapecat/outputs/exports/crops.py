@@ -4,11 +4,13 @@
 pose of the sensor.
 """
 
-import glob
+import math
+import re
 import shutil
 from collections.abc import Iterable
 from contextlib import suppress
 from pathlib import Path
+from typing import NamedTuple
 
 import xxhash
 
@@ -18,20 +20,61 @@ from shapecat.outputs.level_clouds import upright_cloud, write_pcd
 from shapecat.outputs.wording import different_names, safe_name
 from shapecat.runs.finished import FinishedRun
 
-__all__ = ["crops_prefix", "write_crops"]
+__all__ = ["Origin", "write_crops"]
+
+_INSTANCE = re.compile(r".*\.([0-9a-f]{12})(?:\.([\d.]+)-([\d.]+|inf))?\.track-\d+", re.DOTALL)
+
+
+class Origin(NamedTuple):
+    """Where the views of a run come from; the name of the run does not matter.
+
+    ``source`` is a digest of the recording and the topics; ``start_s`` and ``end_s`` bound the time
+    range, seconds.
+    """
+
+    source: str
+    start_s: float
+    end_s: float
+
+    @classmethod
+    def of(cls, finished: FinishedRun) -> "Origin":
+        """Return the origin of the views of a run."""
+        options = finished.run["options"]
+        source = "\0".join([finished.run["input"]["digest"], *sorted(options["topics"])])
+        start, end = options.get("start_s"), options.get("end_s")
+        digest = xxhash.xxh3_64_hexdigest(source.encode())[:12]
+        return cls(digest, start or 0.0, math.inf if end is None else end)
+
+    @classmethod
+    def read(cls, instance: str) -> "Origin | None":
+        """Return the origin in the name of an instance; None if no run made it."""
+        if found := _INSTANCE.fullmatch(instance):
+            return cls(found[1], float(found[2] or 0), float(found[3] or "inf"))
+        return None
+
+    def shares_frames(self, other: "Origin") -> bool:
+        """Return whether both may show the same frames."""
+        begin, end = max(self.start_s, other.start_s), min(self.end_s, other.end_s)
+        return self.source == other.source and begin < end
+
+    def __str__(self) -> str:
+        whole = (self.start_s, self.end_s) == (0, math.inf)
+        return self.source if whole else f"{self.source}.{self.start_s:.3f}-{self.end_s:.3f}"
 
 
 def write_crops(out: Path, frames: Iterable[ExportedFrame], finished: FinishedRun) -> int:
     """Add the views of a run to a data set; return their number.
 
-    Earlier views of the same topics of the recording are replaced, so that none keeps an outdated
-    label. Deleted tracks are left out; ``unknown`` is a category like any other.
+    Earlier views of the same topics of the recording are replaced, whatever the name of their run,
+    so that none keeps an outdated label or is there twice; those of another time range stay.
+    Deleted tracks are left out; ``unknown`` is a category like any other.
 
     Raises
     ------
     OutputError : ``out`` is not writable.
     """
-    prefix = crops_prefix(finished)
+    origin = Origin.of(finished)
+    prefix = f"{safe_name(finished.name)}.{origin}"
     hidden = out / f".{prefix}.partial"
     topics = finished.run["options"]["topics"]
     names = dict(zip(topics, different_names(topics), strict=True))
@@ -50,7 +93,7 @@ def write_crops(out: Path, frames: Iterable[ExportedFrame], finished: FinishedRu
                     view = instance / f"{stem}{labelled.index:06d}.pcd"
                     write_pcd(view, cloud[0], viewpoint=cloud[1])
                     count += 1
-            _replace(out, prefix, hidden)
+            _replace(out, origin, hidden)
     finally:
         shutil.rmtree(hidden, ignore_errors=True)
         if new:
@@ -59,18 +102,11 @@ def write_crops(out: Path, frames: Iterable[ExportedFrame], finished: FinishedRu
     return count
 
 
-def crops_prefix(finished: FinishedRun) -> str:
-    """Return how the names of the views of a run begin.
-
-    A digest distinguishes runs of the same name: of other recordings, or of other topics.
-    """
-    run = finished.run
-    source = "\0".join([run["input"]["digest"], *sorted(run["options"]["topics"])])
-    return f"{safe_name(finished.name)}.{xxhash.xxh3_64_hexdigest(source.encode())[:8]}"
-
-
-def _replace(out: Path, prefix: str, hidden: Path) -> None:
-    for old in out.glob(f"*/{glob.escape(prefix)}.track-*"):
+def _replace(out: Path, origin: Origin, hidden: Path) -> None:
+    for old in list(out.glob("[!.]*/*.track-*")):
+        earlier = Origin.read(old.name)
+        if earlier is None or not earlier.shares_frames(origin):
+            continue
         shutil.rmtree(old)
         if not any(old.parent.iterdir()):
             old.parent.rmdir()
