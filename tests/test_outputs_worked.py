@@ -38,6 +38,7 @@ from shapecat.outputs.exports.dataset_frames import (
     _depth_file,
     _different,
     _view,
+    image_stems,
     images_of,
     snapped_masks,
     split_runs,
@@ -464,10 +465,24 @@ def test_images_without_certain_objects_are_omitted(monkeypatch: pytest.MonkeyPa
     )
 
     left_out = Counter[str]()
-    found = images_of(finished, Selection(), stem="lab", left_out=left_out)
+    found = images_of(finished, Selection(), stems={"/depth": "lab"}, left_out=left_out)
 
     assert list(found) == [images[1], images[4]]
     assert left_out == {"no image": 1, "no object with a reliable label": 2}
+
+
+def test_images_of_a_run_named_like_a_topic_keep_their_names() -> None:
+    """Images of one would replace images of the other, under the labels of both."""
+    named = [("a", ["/left", "/x/y", "/x_y"]), ("a__left", ["/left"]), ("a", ["/left"])]
+    runs: Any = [
+        SimpleNamespace(name=name, run={"options": {"topics": topics}}) for name, topics in named
+    ]
+
+    assert [list(stems.values()) for stems in image_stems(runs)] == [
+        ["a__left", "a__x_y", "a__x_y-2"],
+        ["a__left-2"],
+        ["a-2"],
+    ]
 
 
 @pytest.mark.parametrize(("pose", "most"), [(IDENTITY, 160), (None, 840)])

@@ -2,7 +2,7 @@
 
 import logging
 from collections import Counter
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -24,7 +24,14 @@ from shapecat.runs.finished import FinishedRun, open_source
 from shapecat.runs.labels.track_table import read_track_table
 from shapecat.types import UNKNOWN, Frame, LabelledFrame, LabelledObject
 
-__all__ = ["DatasetImage", "Selection", "images_of", "snapped_masks", "split_runs"]
+__all__ = [
+    "DatasetImage",
+    "Selection",
+    "image_stems",
+    "images_of",
+    "snapped_masks",
+    "split_runs",
+]
 
 _log = logging.getLogger(__name__)
 
@@ -89,12 +96,25 @@ def split_runs(runs: Sequence[FinishedRun], val: float) -> list[str]:
     return ["val" if (r.run["input"]["digest"] or r.name) in chosen else "train" for r in runs]
 
 
+def image_stems(runs: Sequence[FinishedRun]) -> list[dict[str, str]]:
+    """Return for each run how the names of the images of each topic begin; all differ."""
+    names = different_names([run.name for run in runs])
+    topics = [run.run["options"]["topics"] for run in runs]
+    stems = [
+        f"{name}_{topic}" if len(own) > 1 else name
+        for name, own in zip(names, topics, strict=True)
+        for topic in own
+    ]
+    different = iter(different_names(stems))
+    return [{topic: next(different) for topic in own} for own in topics]
+
+
 def images_of(
     finished: FinishedRun,
     selection: Selection,
     recording: Path | None = None,
     *,
-    stem: str,
+    stems: Mapping[str, str],
     left_out: Counter[str],
 ) -> Iterator[DatasetImage]:
     """Yield the images of a run with at least one object to train on; log damaged images.
@@ -104,7 +124,7 @@ def images_of(
     Parameters
     ----------
     recording : path of the recording; by default where it was processed.
-    stem : the names of the images begin with it.
+    stems : how the names of the images of each topic begin.
     left_out : counts the other frames by reason.
 
     Raises
@@ -118,13 +138,10 @@ def images_of(
         raise OutputError(msg)
     corrected = _corrected(finished.folder)
     chosen = _chosen(finished, selection, corrected)
-    topics = finished.run["options"]["topics"]
-    names = dict(zip(topics, different_names(topics), strict=True))
     with open_source(finished.run, recording) as source:
         frames = (f for f in finished.frames() if (f.topic, f.index) in chosen)
         for labelled, frame, coloured in with_colour(frames, source, finished.run):
-            topic = f"{names[labelled.topic]}_" if len(names) > 1 else ""
-            name = f"{stem}_{topic}{labelled.index:06d}"
+            name = f"{stems[labelled.topic]}_{labelled.index:06d}"
             try:
                 image = _image(name, labelled, frame, coloured, selection, corrected)
             except MessageError as error:

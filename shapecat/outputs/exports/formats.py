@@ -12,7 +12,13 @@ from shapecat.errors import OutputError
 from shapecat.outputs.colouring import ExportedFrame, with_colour
 from shapecat.outputs.exports.coco import DATASETS
 from shapecat.outputs.exports.crops import write_crops
-from shapecat.outputs.exports.dataset_frames import DatasetImage, Selection, images_of, split_runs
+from shapecat.outputs.exports.dataset_frames import (
+    DatasetImage,
+    Selection,
+    image_stems,
+    images_of,
+    split_runs,
+)
 from shapecat.outputs.exports.kitti import write_kitti
 from shapecat.outputs.exports.labelcloud import write_labelcloud
 from shapecat.outputs.exports.points import write_point_labels
@@ -148,15 +154,15 @@ def export_dataset(
     runs = [read_finished(folder) for folder in folders]
     categories = _common(runs)
     total = sum(int(run.run["counts"]["frames"]) for run in runs)
-    stems = different_names([run.name for run in runs])
 
     counts, left_out = Counter[str](), Counter[str]()
     uncertain = 0
 
     def images() -> Iterator[tuple[str, FinishedRun, DatasetImage]]:
         nonlocal uncertain
-        for split, stem, run in zip(split_runs(runs, selection.val), stems, runs, strict=True):
-            for image in images_of(run, selection, recording, stem=stem, left_out=left_out):
+        splits = split_runs(runs, selection.val)
+        for split, stems, run in zip(splits, image_stems(runs), runs, strict=True):
+            for image in images_of(run, selection, recording, stems=stems, left_out=left_out):
                 counts[split] += 1
                 uncertain += image.sure.count(False)
                 observe("export", counts.total(), total)
@@ -166,7 +172,8 @@ def export_dataset(
             msg = f"no image to export: {reasons or 'no object with a reliable label'}"
             raise OutputError(msg)
 
-    ids = {stem: run.run["id"] for stem, run in zip(stems, runs, strict=True)}
+    names = different_names([run.name for run in runs])
+    ids = {name: run.run["id"] for name, run in zip(names, runs, strict=True)}
     about = {"format": format, "runs": ids}
     objects = _staged(out, about, lambda hidden: DATASETS[format](hidden, images(), categories))
     return Exported(objects, uncertain, counts)
