@@ -35,6 +35,7 @@ from shapecat.evaluation import (
 from shapecat.evaluation.dataset import View
 from shapecat.evaluation.fused import Fused, fuse_views
 from shapecat.evaluation.metrics import Bin
+from shapecat.evaluation.names import require_category_names
 from shapecat.evaluation.page import (
     accuracy_svg,
     calibration_svg,
@@ -249,6 +250,22 @@ def test_folder_names_that_no_label_can_have_are_refused(
     if names[0] != "Box":
         with pytest.raises(RecordingError, match=reason):
             train_on_folder(tmp_path / "data", tmp_path / "m.npz")
+
+
+def test_folder_with_decomposed_accents_is_told_from_its_category(tmp_path: Path) -> None:
+    """File managers of macOS decompose accents: `does not know café (it knows café)` helps nobody.
+
+    `there is also a folder café`, for a folder with composed accents, would not help either.
+    """
+    for name in ("box", "caf\u00e9", "cafe\u0301"):
+        (tmp_path / "data" / name / "x").mkdir(parents=True)
+        (tmp_path / "data" / name / "x" / "0.npz").touch()
+    expected = "expected 'caf\u00e9' instead of 'cafe\\\\u0301'; rename the folder"
+
+    with pytest.raises(RecordingError, match=expected):
+        evaluate_folder(tmp_path / "data")
+    with pytest.raises(RecordingError, match=expected):
+        require_category_names(tmp_path / "data", ["cafe\u0301"], ["caf\u00e9"])
 
 
 def test_too_many_categories_are_refused_before_views_are_described(tmp_path: Path) -> None:

@@ -8,6 +8,7 @@ from shapecat.description import DESCRIPTOR_NAMES
 from shapecat.errors import RecordingError
 from shapecat.evaluation.baselines import compare_learners
 from shapecat.evaluation.dataset import Dataset, read_dataset
+from shapecat.evaluation.names import require_category_names
 from shapecat.evaluation.report import Report, evaluate, require_categories
 from shapecat.evaluation.views import DescribedViews, describe_views
 from shapecat.learning import load_model
@@ -34,12 +35,14 @@ def evaluate_folder(
 
     Raises
     ------
-    RecordingError : there are no views, one cannot be read, or there are too few to train on.
+    RecordingError : there are no views, one cannot be read, a folder has an invalid name, or there
+        are too few to train on.
     ModelError : the model is unusable, or does not know a category of the data set.
     """
     categorizer = load_model(model)
     categorizer.require_descriptor(DESCRIPTOR_NAMES)
     dataset = read_dataset(root)
+    require_category_names(root, dataset.categories, categorizer.categories)
     require_categories(dataset.categories, categorizer)
     wanted = baselines is not None
     views = _described(dataset, "evaluate", observe, with_functions=wanted)

@@ -1,4 +1,4 @@
-"""Names of category folders to learn from: runs of the model must accept them as labels."""
+"""Names of category folders: runs of a model that learned them must accept them as labels."""
 
 import unicodedata
 from collections.abc import Iterable
@@ -12,7 +12,7 @@ __all__ = ["require_category_names"]
 
 
 def require_category_names(root: Path, names: Iterable[str], known: Iterable[str] = ()) -> None:
-    """Check the category folders of a data set for training.
+    """Check the category folders of a data set.
 
     Parameters
     ----------
@@ -28,13 +28,13 @@ def require_category_names(root: Path, names: Iterable[str], known: Iterable[str
     spelled = {name.lower(): name for name in known}
     for name in sorted(set(names) - set(known)):
         plain = " ".join(unicodedata.normalize("NFC", name).split())
-        if plain.lower() in spelled:
-            problem = f"the model calls it {spelled[plain.lower()]}"
-            if spelled[plain.lower()] not in known:
-                problem = f"there is also a folder {spelled[plain.lower()]}"
-        elif plain != name:
+        if plain != name:
             # Labels have single spaces and composed accents.
             problem = f"expected {plain!r} instead of {name!a}"
+        elif name.lower() in spelled:
+            problem = f"the model calls it {spelled[name.lower()]}"
+            if spelled[name.lower()] not in known:
+                problem = f"there is also a folder {spelled[name.lower()]}"
         elif not is_category_name(name):
             problem = "reserved, or not a letter and up to 59 letters, digits and .+&'()-_"
         else:
