@@ -208,6 +208,24 @@ def test_truth_lists_only_present_objects(tmp_path: Path) -> None:
     assert min(counts) < max(counts) <= len(world.objects)
 
 
+def test_carried_object_stands_on_nothing(tmp_path: Path) -> None:
+    """Support relations that are measured against the truth would be judged wrong."""
+    path = simulate(tmp_path / "a.mcap", scene="rearranged", frames=12, rate_hz=4, seed=5)
+    truth = json.loads(path.with_name("a.truth.json").read_text())
+    start = {
+        item.track: item
+        for item in make_scene("rearranged", np.random.default_rng(5), frames=12, rate_hz=4).objects
+    }
+    heights = []
+    for entry in (o for frame in truth for o in frame["objects"] + frame["hidden"]):
+        item = start[entry["track"]]
+        bottom = float(transform(item.pose, item.mesh.vertices)[:, 2].min())
+        lifted = entry["center"][2] - entry["box"]["size"][2] / 2 - bottom > 0.002
+        heights.append(lifted)
+        assert (entry["on_support"] is None) == lifted
+    assert 0 < sum(heights) < len(heights) / 2
+
+
 def test_unknown_scene_raises() -> None:
     with pytest.raises(ValueError, match="kitchen"):
         make_scene("kitchen", np.random.default_rng(0))  # type: ignore[arg-type]  # the mistake

@@ -78,7 +78,9 @@ def _object_truth(
     sensor: Sensor,
 ) -> dict[str, Any]:
     camera_from_world = inverse(world.path[frame])
-    camera_from_mesh = compose(camera_from_world, world.pose_of(item, frame))
+    pose = world.pose_of(item, frame)
+    camera_from_mesh = compose(camera_from_world, pose)
+    carried = pose.translation[2] > item.pose.translation[2]
     points = transform(camera_from_mesh, item.mesh.vertices).astype(np.float32)
     box = upright_box(points, camera_from_world.rotation[:, 2])
     total = alone_pixels(geometry, mesh_id, sensor.camera, world.path[frame])
@@ -101,8 +103,8 @@ def _object_truth(
         "lying": item.lying,
         "upside_down": item.upside_down,
         "tilted": item.tilted,
-        "on_support": item.on_support,
-        "on_track": item.on_track,
+        "on_support": None if carried else item.on_support,
+        "on_track": None if carried else item.on_track,
         "visible": round(share, 4),
     }
 
