@@ -312,9 +312,9 @@ def test_notes_in_columns_without_a_name_are_kept(run: Path) -> None:
     assert (run / "tracks.csv").read_text().splitlines() == saved
 
 
-@pytest.mark.parametrize("label", ["none", "new None", "DontCare"])
-def test_names_reserved_by_export_formats_are_refused(run: Path, label: str) -> None:
-    """KITTI readers ignore objects called DontCare; class 0 of point labels is called none."""
+@pytest.mark.parametrize("label", ["none", "new None", "DontCare", "NA", "new nan", "Null"])
+def test_names_that_mean_no_object_to_readers_are_refused(run: Path, label: str) -> None:
+    """KITTI readers ignore DontCare; class 0 of point labels is none; pandas reads no NA or nan."""
     (run / "tracks.csv").write_text(labelled(t4=label))
 
     with pytest.raises(OutputError, match="is not a category"):

@@ -28,8 +28,8 @@ DELETE = "delete"
 _MERGE = re.compile(r"merged? +(?:with|into) +#?(\d{1,9})(?:[.,]0*)?", re.IGNORECASE)
 _COMMAND = re.compile(r"(merged?( |$)|del(ete)?$|remove$)", re.IGNORECASE)
 _NEW = re.compile(r"new +(.+)", re.IGNORECASE)
-_RESERVED = ("none", "dontcare")
-"""Names that mean "no object" in exported formats."""
+_RESERVED = ("none", "dontcare", "na", "nan", "null")
+"""Names that mean "no object" in exported formats, or "no value" to readers of tables."""
 _NAME = re.compile(r"[^\W\d_][\w .+&'()-]{0,58}[\w)]|[^\W\d_]")
 
 
