@@ -36,6 +36,7 @@ from shapecat.runs.jobs import (
     forget_old_labels,
     identify,
     keep_labels,
+    require_model,
     require_unchanged,
     require_utf8,
     summarize,
@@ -83,6 +84,7 @@ def process(job: Job, observe: Observer = ignore, *, cores: int = 1) -> Summary:
     with open_recording(job.source) as recording, ContentDigest(job.source) as content:
         categorizer = load_model(job.model)
         categorizer.require_descriptor(DESCRIPTOR_NAMES)
+        require_model(job, categorizer)
         run = describe_run(job, categorizer)
         _require_begun(job, recording)
         streams = choose_streams(recording, job.topics)

@@ -19,12 +19,13 @@ import pyarrow.parquet as pq
 import pytest
 from click.testing import Result
 
-from shapecat.batch import Batch, Outcome, exit_code, plan_batch, process_on
+from shapecat.batch import Batch, Outcome, exit_code, plan_batch, process_here, process_on
 from shapecat.batch.finding import find_recordings
 from shapecat.batch.manifest import Manifest
 from shapecat.config import Settings
 from shapecat.errors import RecordingError
 from shapecat.executors import LocalExecutor, WorkerLostError, open_executor
+from shapecat.learning import load_model, save_model
 from shapecat.runs.jobs import Job
 from tests.messages import EPOCH, SECOND, make, write
 from tests.scenes import record
@@ -350,6 +351,23 @@ def test_workers_of_another_version_are_refused(tmp_path: Path) -> None:
 
     assert outcome.code == 1
     assert re.search(r"a worker has shapecat 9\.9, this command \d", outcome.message)
+
+
+def test_model_that_was_replaced_meanwhile_is_refused(tmp_path: Path) -> None:
+    """A worker may have another file at this path, and a long batch may outlive the file.
+
+    Some of the recordings would have results of the other model.
+    """
+    model = tmp_path / "mine.npz"
+    for number in range(2):
+        shutil.copy("fixtures/foxglove.mcap", tmp_path / f"{number}.mcap")
+    save_model(model, load_model())
+    with plan_batch(Job(Path(), Path(), model=model), [str(tmp_path)], str(tmp_path)) as batch:
+        save_model(model, replace(load_model(), temperature=2.0))
+        outcomes = list(process_here(batch.tasks, Watcher()))
+
+    assert {outcome.code for outcome in outcomes} == {2}
+    assert all("mine.npz: is not the model" in outcome.message for outcome in outcomes)
 
 
 def test_recording_that_only_waited_has_one_try(recordings: Path, tmp_path: Path) -> None:

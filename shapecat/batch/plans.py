@@ -185,8 +185,10 @@ class _Planner:
     """Determines the status of each recording, given the names in the folder of results."""
 
     def __init__(self, job: Job, out: str, there: set[str], manifest: Manifest | None) -> None:
-        self._job, self._out, self._there, self._manifest = job, out, there, manifest
-        self._model_id = load_model(job.model).model_id if manifest is not None else ""
+        self._out, self._there, self._manifest = out, there, manifest
+        asked = manifest is not None or job.model is not None
+        self._model_id = load_model(job.model).model_id if asked else ""
+        self._job = dataclasses.replace(job, model_id=self._model_id)
         self._work = _hash([job.settings.as_dict(), job.selection(), self._model_id])
         self._command = ""
 

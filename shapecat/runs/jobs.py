@@ -12,7 +12,7 @@ import xxhash
 
 from shapecat import __version__
 from shapecat.config import Settings
-from shapecat.errors import OutputError, RecordingError
+from shapecat.errors import ModelError, OutputError, RecordingError
 from shapecat.learning import Categorizer
 from shapecat.runs.folder import OUTPUTS, clear, write_run
 from shapecat.runs.identity import (
@@ -36,6 +36,7 @@ __all__ = [
     "forget_old_labels",
     "identify",
     "keep_labels",
+    "require_model",
     "require_unchanged",
     "require_utf8",
     "summarize",
@@ -57,6 +58,7 @@ class Job:
     start_s, end_s : seconds from the start of the recording; None for no limit.
     every : every n-th frame is processed.
     model : path of the model file; None for the default model.
+    model_id : id that the model must have; empty for any.
     color : topic of the colour images; None to choose one, empty for none.
     mcap, rrd : whether to write annotated.mcap and review.rrd.
     overwrite : whether to replace results of another input, settings or model.
@@ -75,6 +77,7 @@ class Job:
     end_s: float | None = None
     every: int = 1
     model: Path | None = None
+    model_id: str = ""
     color: str | None = None
     mcap: bool = True
     rrd: bool = True
@@ -189,6 +192,23 @@ def identify(run: RunInfo, content: ContentDigest) -> None:
     """
     run["input"]["digest"] = run["input"]["digest"] or content.result()
     run["work"] = work_id(run)
+
+
+def require_model(job: Job, categorizer: Categorizer) -> None:
+    """Check that the model is still the one with which the command began.
+
+    Raises
+    ------
+    ModelError : it is another one: the file was replaced, or differs on this machine.
+    """
+    if job.model_id not in ("", categorizer.model_id):
+        name = job.model or "the default model"
+        ids = f"{categorizer.model_id} instead of {job.model_id}"
+        msg = (
+            f"{name}: is not the model with which the command began ({ids}); give all machines one "
+            "model, and run the command again"
+        )
+        raise ModelError(msg)
 
 
 def require_unchanged(folder: Path, run: RunInfo, source: Path) -> None:
