@@ -10,6 +10,7 @@ import json
 import os
 import resource
 import shutil
+import socket
 import tempfile
 import threading
 from collections.abc import Callable, Iterator
@@ -552,8 +553,33 @@ def test_manifest_parts_stay_small(monkeypatch: pytest.MonkeyPatch) -> None:
     assert len(RemoteManifest("memory://parts").entries) == 100
 
 
+@pytest.mark.parametrize("case", ["no locks", "another machine"])
+def test_scratch_that_may_be_in_use_is_not_removed(
+    own_scratch: Path, monkeypatch: pytest.MonkeyPatch, case: str
+) -> None:
+    """The recording would vanish while another command reads it.
+
+    On NFS, a lock on a folder is known to its own machine only.
+    """
+
+    def no_locks(*_: object) -> None:
+        raise OSError(errno.ENOLCK, "No locks available")
+
+    if case == "no locks":
+        monkeypatch.setattr("fcntl.flock", no_locks)
+    with scratch_folder("shapecat-scratch-") as mine:
+        os.utime(mine, (0, 0))
+        if case == "another machine":
+            monkeypatch.setattr("socket.gethostname", lambda: "robot2")
+            monkeypatch.setattr("fcntl.flock", lambda *_: None)
+        with scratch_folder("shapecat-scratch-"):
+            assert mine.exists()
+    assert not list(own_scratch.iterdir())
+
+
 def test_scratch_of_killed_processes_is_removed(own_scratch: Path) -> None:
-    old, new = own_scratch / "shapecat-scratch-old", own_scratch / "shapecat-scratch-new"
+    name = f"shapecat-scratch-{socket.gethostname()}"
+    old, new = own_scratch / f"{name}-old", own_scratch / f"{name}-new"
     for left in (old, new):
         left.mkdir()
     os.utime(old, (0, 0))

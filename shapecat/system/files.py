@@ -7,8 +7,10 @@ skips flushing, for temporary data.
 
 import errno
 import fcntl
+import glob
 import os
 import shutil
+import socket
 import time
 from collections.abc import Iterator
 from contextlib import contextmanager, suppress
@@ -161,18 +163,36 @@ def holding(folder: Path) -> Iterator[None]:
 def scratch_folder(prefix: str) -> Iterator[Path]:
     """Provide a temporary folder for the block; remove those of killed processes.
 
+    Only those of this machine are removed, since NFS does not tell other machines of locks on
+    folders, and only where there are locks: others may be in use.
+
     Parameters
     ----------
     prefix : beginning of the names of these folders.
     """
-    for left in Path(gettempdir()).glob(f"{prefix}*"):
+    own = f"{prefix}{socket.gethostname()}-"
+    for left in Path(gettempdir()).glob(f"{glob.escape(own)}*"):
         with suppress(OSError):
-            if time.time() - left.stat().st_mtime > _NEW_S and (held := lock(left)) is not None:
-                shutil.rmtree(left, ignore_errors=True)
-                os.close(held)
-    temporary = TemporaryDirectory(prefix=prefix, ignore_cleanup_errors=True)
+            if time.time() - left.stat().st_mtime > _NEW_S:
+                _remove_unused(left)
+    temporary = TemporaryDirectory(prefix=own, ignore_cleanup_errors=True)
     with temporary as folder, holding(Path(folder)):
         yield Path(folder)
+
+
+def _remove_unused(folder: Path) -> None:
+    """Remove a folder.
+
+    Raises
+    ------
+    OSError : another process holds its lock, or the file system has no locks.
+    """
+    held = os.open(folder, os.O_RDONLY)
+    try:
+        fcntl.flock(held, fcntl.LOCK_EX | fcntl.LOCK_NB)
+        shutil.rmtree(folder, ignore_errors=True)
+    finally:
+        os.close(held)
 
 
 def is_of_bag(name: str) -> bool:
