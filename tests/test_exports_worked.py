@@ -413,7 +413,9 @@ def test_coco_entries_have_right_values(tmp_path: Path) -> None:
     assert [a["area"] for a in (first, second)] == [28, 12]
     assert first["segmentation"]["size"] == [20, 40]
     assert [a["score"] for a in (first, second)] == [0.9, 0.4]
-    assert first["attributes"] == {"run": "lab", "track": 4, "occluded": True}
+    attributes = {"run": "lab", "track": 4, "occluded": True, "truncated": False}
+    assert first["attributes"] == attributes
+    assert second["attributes"]["truncated"]  # of such an object, a wide image has a partial mask
     assert len({a["id"] for a in (first, second)}) == len({a["track_id"] for a in (first, second)})
 
 

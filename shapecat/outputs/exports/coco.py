@@ -25,7 +25,8 @@ def write_coco(out: Path, images: Images, categories: Sequence[str]) -> int:
 
     Masks are compressed run lengths. Objects with an uncertain label have ``iscrowd`` set, so that
     evaluation ignores them, and are not counted. ``track_id`` is unique in the data set;
-    ``attributes`` holds the run and the track number in that run.
+    ``attributes`` holds the run, the track number in that run, whether another object hides a part
+    and whether the border of the depth image cuts the object: its mask then lacks the rest.
     """
     tracks: dict[tuple[str, int], int] = {}
     splits: dict[str, dict[str, list[dict[str, Any]]]] = {}
@@ -55,6 +56,7 @@ def write_coco(out: Path, images: Images, categories: Sequence[str]) -> int:
                         "run": finished.name,
                         "track": item.track,
                         "occluded": item.occluded,
+                        "truncated": item.touches_border,
                     },
                 }
             )
