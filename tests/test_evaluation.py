@@ -4,6 +4,7 @@ import errno
 import json
 import math
 import re
+import shutil
 from dataclasses import replace
 from functools import partial
 from importlib import import_module
@@ -780,6 +781,17 @@ def test_baselines_may_have_their_own_training_set(trained: Path, tmp_path: Path
 
     assert all((item.accuracy or 0) >= 0.75 for item in report.baselines)
     assert {item.learned for item in report.baselines} == {18}
+
+
+def test_baselines_are_not_tested_on_objects_they_learned(trained: Path, tmp_path: Path) -> None:
+    """All runs in one data set and one of them in another gave figures that are too good."""
+    train = write_dataset(tmp_path / "train", ("ball", "box"), instances=3, seed=3)
+    test = write_dataset(tmp_path / "test", ("ball", "box"), instances=2, seed=4)
+    path = train / "box" / "box_1" / "0.npz"
+    shutil.copy(path, test / path.relative_to(train))
+
+    with pytest.raises(RecordingError, match=f"{path.name}: is also in .*test"):
+        evaluate_folder(test, trained, baselines=train)
 
 
 def test_baselines_need_two_objects_of_each_category(trained: Path, tmp_path: Path) -> None:

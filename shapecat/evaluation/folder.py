@@ -1,5 +1,6 @@
 """Evaluation of a model, and optionally of baselines, on a labelled data set."""
 
+import filecmp
 from dataclasses import replace
 from pathlib import Path
 
@@ -36,7 +37,7 @@ def evaluate_folder(
     Raises
     ------
     RecordingError : there are no views, one cannot be read, a folder has an invalid name, or there
-        are too few to train on.
+        are too few to train on, or the training set of the baselines holds a view of ``root``.
     ModelError : the model is unusable, or does not know a category of the data set.
     """
     categorizer = load_model(model)
@@ -45,6 +46,8 @@ def evaluate_folder(
     require_category_names(root, dataset.categories, categorizer.categories)
     require_categories(dataset.categories, categorizer)
     wanted = baselines is not None
+    if baselines is not None and baselines.resolve() != root.resolve():
+        _require_other_views(dataset, root, baselines)
     views = _described(dataset, "evaluate", observe, with_functions=wanted)
     report = evaluate(views, categorizer)
     if baselines is None:
@@ -59,6 +62,20 @@ def evaluate_folder(
         views, train, categories=categorizer.categories, root=baselines, observe=observe
     )
     return replace(report, baselines=rows)
+
+
+def _require_other_views(test: Dataset, root: Path, training_set: Path) -> None:
+    """Check that a training set holds none of the views that are tested.
+
+    Raises
+    ------
+    RecordingError : it holds one.
+    """
+    for path in test.files:
+        other = training_set / path.relative_to(root)
+        if other.is_file() and filecmp.cmp(path, other, shallow=False):
+            msg = f"{other}: is also in {root}; baselines must be tested on other objects"
+            raise RecordingError(msg)
 
 
 def _described(
