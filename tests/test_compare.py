@@ -543,6 +543,19 @@ def test_coco_images_of_the_same_frame_are_refused(places: list[dict[str, Any]])
         CocoLabels(Path("x.json"), content)
 
 
+def test_coco_rectangles_are_refused() -> None:
+    """Tools write them with an empty list of polygons, and each object seemed to be missed."""
+    item = {"id": 7, "image_id": 0, "category_id": 1, "bbox": [1, 1, 2, 1], "segmentation": []}
+    content = {
+        "categories": [{"id": 1, "name": "cup"}],
+        "annotations": [item],
+        "images": [{"id": 0, "width": 4, "height": 3, "stamp_ns": START}],
+    }
+
+    with pytest.raises(RecordingError, match=r"annotation 7 has no readable mask .*only a box"):
+        CocoLabels(Path("x.json"), content).at(("/depth", 0), START)
+
+
 def test_kitti_label_files_of_the_same_frame_are_refused(tmp_path: Path) -> None:
     """Otherwise, the labels of one of them would count for both."""
     (tmp_path / "label_2").mkdir()

@@ -148,6 +148,9 @@ def _mask(segmentation: Any, height: int, width: int) -> Bool:
             msg = f"size {segmentation['size']}, the image is {[height, width]}"
             raise ValueError(msg)
         return decode_rle(segmentation["counts"], height, width)
+    if not segmentation:
+        msg = "it has only a box"
+        raise ValueError(msg)
     mask = np.zeros((height, width), np.bool_)
     for polygon in segmentation:
         mask |= filled_polygon(np.reshape(polygon, (-1, 2)), height, width)
