@@ -5,7 +5,8 @@ planes in the first frames: a fixed frame whose z axis is not up would spoil all
 """
 
 from collections import Counter
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
 from dataclasses import replace
 from itertools import islice
 from pathlib import Path
@@ -21,7 +22,7 @@ from shapecat.errors import NoStreamError, RecordingError, explained
 from shapecat.executors.order import Processes
 from shapecat.learning import Categorizer
 from shapecat.perception import Perceiver, View, find_up
-from shapecat.recordings import Recording, choose_streams
+from shapecat.recordings import Recording, Stream
 from shapecat.recordings.transforms.gravity import MISNAMED, Orientation, Upright, has_z_up, turned
 from shapecat.rehearsal import rehearse
 from shapecat.runs.jobs import Job
@@ -48,16 +49,15 @@ _MOST_HELD = 64
 """Frames that are held back at most: a topic may have few frames, or none for a long time."""
 
 
-_Reading = tuple[Frame, ColourView | None]
-"""A frame and its colour image; None if it has none."""
 _Oriented = tuple[Frame, ColourView | None, Orientation]
-"""The same, with the up direction and pose of the sensor."""
+"""A frame, its colour image, if it has one, and the up direction and pose of the sensor."""
 
 
 class Work(NamedTuple):
     """A job with its open recording, the folder of its tables, and the content of run.json."""
 
     recording: Recording
+    streams: tuple[Stream, ...]
     folder: Path
     run: RunInfo
     job: Job
@@ -73,41 +73,20 @@ def perceive_all(work: Work) -> None:
     ------
     NoStreamError : no frame could be read.
     """
-    recording, folder, run, job, categorizer, observe, cores = work
+    recording, folder, run, job = work.recording, work.folder, work.run, work.job
     skipped: Counter[str] = Counter()
-    total = count_frames(recording, run["options"])
     recent = RecentFrames(job.settings.detection.fuse_frames)
-    count = 0
-    with (
-        Processes(Perceiver(categorizer, job.settings, job.model), cores, rehearse) as processes,
-        _tables(folder, run, categorizer) as tables,
-    ):
-        if (total or 0) - tables.done >= _MANY:
-            processes.start()
-        streams = choose_streams(recording, run["options"]["topics"])
-        upright = Upright.of(recording, up=job.up, fixed_frame=job.fixed_frame, streams=streams)
+    total = count_frames(work.streams, run["options"])
+    with _perceiving(work, "perceive", total) as perceive:
+        upright = _upright(work, job.fixed_frame)
 
-        def view(reading: _Oriented) -> tuple[FrameRow, View]:
-            frame, colour, orientation = reading
-            orientation = upright.corrected(frame.topic, orientation)
-            pose = orientation.fixed_from_sensor
-            up = upright.accept(frame.topic, orientation)
+        def view(oriented: _Oriented) -> tuple[FrameRow, View]:
+            frame, colour, (_, _, pose) = oriented
+            up = upright.accept(frame.topic, oriented[2])
             row = FrameRow(frame.log_time_ns, pose, up, frame_from_sensor=frame.frame_from_sensor)
             return row, View(frame, up, recent.before(frame, pose), pose, colour)
 
-        source = (
-            (frame, colour, upright.orient(frame))
-            for frame, colour in _readings(recording, run, job, skipped)
-        )
-        views = map(view, _UpTrial(upright, job.settings).before(source))
-        for count, _ in enumerate(stopping.until_asked(islice(views, tables.done)), start=1):
-            observe("perceive", count, total)
-        for rows, perceptions in processes.in_order(_blocks(views, job.settings.reuse_frames)):
-            tables.write(perceptions, rows)
-            for _ in rows:
-                count += 1
-                observe("perceive", count, total)
-        stopping.check()
+        count, resumed = perceive(map(view, _oriented(work, upright, skipped)))
     if not count:
         reasons = ", ".join(f"{n} {reason}" for reason, n in skipped.items()) or "none in range"
         msg = f"{job.source}: no usable frame on {', '.join(run['options']['topics'])} ({reasons})"
@@ -116,8 +95,8 @@ def perceive_all(work: Work) -> None:
     run["counts"] = {"frames": count, "skipped": dict(skipped), "detections": found}
     if run.get("color"):
         run["counts"]["color"] = count_rows(folder, "masks")
-    if tables.done:
-        run["counts"]["resumed"] = tables.done
+    if resumed:
+        run["counts"]["resumed"] = resumed
     run["fixed_frame"], run["up"] = upright.fixed_frame, report_up(upright, folder)
     run["warnings"] = [*recording.warnings, *upright.warnings, *recent.warnings()]
 
@@ -128,40 +107,22 @@ def revise(work: Work) -> None:
     An up direction that the user gave is never revised. A frame keeps its first result if the
     second look finds nothing.
     """
-    recording, folder, run, job, categorizer, observe, cores = work
+    folder, run = work.folder, work.run
     chosen = frames_to_revise(read_segments(folder)) if run["up"]["source"] != "option" else {}
     if not chosen:
         return
-    with (
-        Processes(Perceiver(categorizer, job.settings, job.model), cores, rehearse) as processes,
-        _tables(folder, run, categorizer, again=True) as tables,
-    ):
-        views = islice(_views_again(recording, run, job, chosen), len(chosen))
-        count = sum(1 for _ in stopping.until_asked(islice(views, tables.done)))
-        for rows, perceptions in processes.in_order(_blocks(views, job.settings.reuse_frames)):
-            tables.write(perceptions, rows)
-            for _ in rows:
-                count += 1
-                observe("revise", count, len(chosen))
-        stopping.check()
+    with _perceiving(work, "revise", len(chosen), again=True) as perceive:
+        perceive(islice(_views_again(work, chosen), len(chosen)))
     run["counts"]["detections"] = count_rows(folder, "detections")
     revised = read_row_groups(folder / "frames.parquet", ["revised"])
     run["counts"]["revised"] = sum(sum(group["revised"].to_pylist()) for group in revised)
 
 
-def _views_again(
-    recording: Recording, run: RunInfo, job: Job, chosen: dict[Key, Revision]
-) -> Iterator[tuple[FrameRow, View]]:
+def _views_again(work: Work, chosen: dict[Key, Revision]) -> Iterator[tuple[FrameRow, View]]:
     """Yield the chosen frames with their revised up directions."""
-    streams = choose_streams(recording, run["options"]["topics"])
-    upright = Upright.of(recording, up=job.up, fixed_frame=run["fixed_frame"], streams=streams)
-    recent = RecentFrames(job.settings.detection.fuse_frames)
-    source = (
-        (frame, colour, upright.orient(frame))
-        for frame, colour in _readings(recording, run, job, Counter())
-    )
-    for frame, colour, orientation in _UpTrial(upright, job.settings).before(source):
-        pose = upright.corrected(frame.topic, orientation).fixed_from_sensor
+    upright = _upright(work, work.run["fixed_frame"])
+    recent = RecentFrames(work.job.settings.detection.fuse_frames)
+    for frame, colour, (_, _, pose) in _oriented(work, upright, Counter()):
         earlier = recent.before(frame, pose)
         revision = chosen.get((frame.topic, frame.index))
         if revision is not None:
@@ -170,6 +131,48 @@ def _views_again(
                 frame.log_time_ns, pose, revision.up_given, again=True, frame_from_sensor=own
             )
             yield row, View(frame, revision.up, earlier, pose, colour)
+
+
+@contextmanager
+def _perceiving(
+    work: Work, phase: str, total: int | None, *, again: bool = False
+) -> Iterator[Callable[[Iterator[tuple[FrameRow, View]]], tuple[int, int]]]:
+    """Let the block perceive frames in several processes; then join the tables.
+
+    Yields
+    ------
+    A function that perceives frames and writes them, except those that an interrupted run has
+    written. It returns the number of frames, and that of these exceptions.
+    """
+    job, categorizer = work.job, work.categorizer
+    perceiver = Perceiver(categorizer, job.settings, job.model)
+    with (
+        Processes(perceiver, work.cores, rehearse) as processes,
+        PerceptionTables(
+            work.folder,
+            categories=categorizer.categories,
+            model_id=categorizer.model_id,
+            colour=bool(work.run.get("color")),
+            again=again,
+        ) as tables,
+    ):
+        if (total or 0) - tables.done >= _MANY:
+            processes.start()
+
+        def perceive(views: Iterator[tuple[FrameRow, View]]) -> tuple[int, int]:
+            count = 0
+            for count, _ in enumerate(stopping.until_asked(islice(views, tables.done)), start=1):
+                if not again:  # the frames of a second look are few
+                    work.observe(phase, count, total)
+            for rows, perceptions in processes.in_order(_blocks(views, job.settings.reuse_frames)):
+                tables.write(perceptions, rows)
+                for _ in rows:
+                    count += 1
+                    work.observe(phase, count, total)
+            stopping.check()
+            return count, tables.done
+
+        yield perceive
 
 
 def _blocks(
@@ -259,23 +262,21 @@ def _angle_deg(a: F4, b: F4) -> float:
     return float(np.degrees(np.arccos(np.clip(a @ b, -1, 1))))
 
 
-def _tables(
-    folder: Path, run: RunInfo, categorizer: Categorizer, *, again: bool = False
-) -> PerceptionTables:
-    return PerceptionTables(
-        folder,
-        categories=categorizer.categories,
-        model_id=categorizer.model_id,
-        colour=bool(run.get("color")),
-        again=again,
-    )
+def _upright(work: Work, fixed_frame: str | None) -> Upright:
+    streams = work.streams
+    return Upright.of(work.recording, up=work.job.up, fixed_frame=fixed_frame, streams=streams)
 
 
-def _readings(
-    recording: Recording, run: RunInfo, job: Job, skipped: Counter[str]
-) -> Iterator[_Reading]:
+def _oriented(work: Work, upright: Upright, skipped: Counter[str]) -> Iterator[_Oriented]:
+    """Yield the frames of a run with their orientations, once the up directions are decided."""
+    source = ((frame, colour, upright.orient(frame)) for frame, colour in _readings(work, skipped))
+    for frame, colour, orientation in _UpTrial(upright, work.job.settings).before(source):
+        yield frame, colour, upright.corrected(frame.topic, orientation)
+
+
+def _readings(work: Work, skipped: Counter[str]) -> Iterator[tuple[Frame, ColourView | None]]:
     """Yield the frames of a run; an OSError becomes a RecordingError."""
-    with explained(f"{job.source}: cannot be read", RecordingError):
-        for frame, colour in read_frames(recording, run["options"], skipped=skipped):
+    with explained(f"{work.job.source}: cannot be read", RecordingError):
+        for frame, colour in read_frames(work.recording, work.run["options"], skipped=skipped):
             # Masks need no pixels, and frames are sent to other processes.
             yield frame, colour and replace(colour, image=replace(colour.image, data=b""))

@@ -1,10 +1,10 @@
 """The frames of a recording that the options of a run select."""
 
 from collections import Counter
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 
 from shapecat.cameras.colour import ColourView
-from shapecat.recordings import Recording, choose_streams
+from shapecat.recordings import Recording, Stream, choose_streams
 from shapecat.recordings.colour_frames import KnownImages, frames_with_colour
 from shapecat.recordings.colour_streams import pair_colours
 from shapecat.recordings.messages import Needed
@@ -48,14 +48,8 @@ def read_frames(
     )
 
 
-def count_frames(recording: Recording, options: Options) -> int | None:
-    """Return the approximate number of selected frames; None if it is not known in advance.
-
-    Raises
-    ------
-    NoStreamError : a topic is missing or not usable.
-    """
+def count_frames(streams: Sequence[Stream], options: Options) -> int | None:
+    """Return the approximate number of selected frames; None if it is not known in advance."""
     if options["start_s"] is not None or options["end_s"] is not None:
         return None
-    streams = choose_streams(recording, options["topics"])
     return sum(-(-(stream.count or 0) // options["every"]) for stream in streams) or None
