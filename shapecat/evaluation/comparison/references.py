@@ -27,7 +27,7 @@ from shapecat.runs.folder import read_run
 from shapecat.runs.labelled_frames import rows_by_frame
 from shapecat.runs.labels.meaning import TrackLabel
 from shapecat.runs.shown import ShownTracks
-from shapecat.runs.tables.reading import Key, keys_of, read_row_groups, read_together
+from shapecat.runs.tables.reading import Key, read_row_groups, read_stamps, read_together
 from shapecat.types import Box
 
 __all__ = [
@@ -201,7 +201,7 @@ class OtherRun(Reference):
 
     def __init__(self, folder: Path) -> None:
         self.finished = read_complete(folder)
-        frames = list(_frames(folder))
+        frames = list(read_stamps(folder))
         self._stamps = [stamp for _, stamp in frames]
         self._keys = index_frames(folder, (((key[0], stamp, key[1]), key) for key, stamp in frames))
         self.frames = len(frames)
@@ -233,14 +233,8 @@ class OtherRun(Reference):
 
 def repeated_stamps(folder: Path) -> set[tuple[str, int]]:
     """Return the topics and timestamps (ns) that several frames of a run have."""
-    counts = Counter((topic, stamp) for (topic, _), stamp in _frames(folder))
+    counts = Counter((topic, stamp) for (topic, _), stamp in read_stamps(folder))
     return {place for place, count in counts.items() if count > 1}
-
-
-def _frames(folder: Path) -> Iterator[tuple[Key, int]]:
-    """Yield topic and number of each frame of a run, and its timestamp, ns."""
-    for group in read_row_groups(folder / "frames.parquet", ["topic", "frame", "stamp_ns"]):
-        yield from zip(keys_of(group), group["stamp_ns"].to_pylist(), strict=True)
 
 
 def read_complete(folder: Path) -> FinishedRun:

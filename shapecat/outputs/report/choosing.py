@@ -13,7 +13,7 @@ import numpy as np
 
 from shapecat.outputs.report.tracks import Detected, Timeline
 from shapecat.runs.tables.masks import read_masks
-from shapecat.runs.tables.reading import Key, read_row_groups
+from shapecat.runs.tables.reading import Key, read_row_groups, read_stamps
 from shapecat.types import ImageMasks
 
 __all__ = ["Choice", "choose_frames"]
@@ -62,7 +62,8 @@ def choose_frames(folder: Path, timelines: Mapping[int, Timeline]) -> Choice:
     shown: dict[Key, set[int]] = {}
     for (topic, frame, _), track in owner.items():
         shown.setdefault((topic, frame), set()).add(track)
-    strip = _strip(_stamps(folder), shown)
+    stamps = sorted((stamp_ns, key) for key, stamp_ns in read_stamps(folder))
+    strip = _strip(stamps, shown)
     return Choice({key: frozenset(tracks) for key, tracks in candidates.items()}, strip)
 
 
@@ -103,19 +104,10 @@ def _best_of_parts(views: Sequence[_View]) -> list[_View]:
     return [max(part, key=lambda view: (view.worth, -view.place)) for part in parts]
 
 
-def _stamps(folder: Path) -> list[tuple[int, Key]]:
-    """Return stamp (ns) and key of each frame, sorted by time."""
-    columns = ["stamp_ns", "topic", "frame"]
-    rows = [
-        (stamp, (topic, frame))
-        for group in read_row_groups(folder / "frames.parquet", columns)
-        for stamp, topic, frame in zip(*(group[c].to_pylist() for c in columns), strict=True)
-    ]
-    return sorted(rows)
-
-
 def _strip(stamps: Sequence[tuple[int, Key]], shown: Mapping[Key, set[int]]) -> dict[Key, float]:
     """Return one frame of each part of a run, with its seconds since the first frame.
+
+    ``stamps`` are the stamp (ns) and the key of each frame, sorted by time.
 
     In each part it is the frame with the most tracks that no earlier one shows; on ties, the one
     with the most tracks, then the one nearest to the middle.

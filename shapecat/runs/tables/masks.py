@@ -9,7 +9,7 @@ import numpy as np
 import pyarrow as pa
 
 from shapecat.arrays import U4
-from shapecat.runs.tables.reading import Key, keys_of, numbers, read_row_groups
+from shapecat.runs.tables.reading import Key, numbers, read_row_groups, read_stamps
 from shapecat.runs.tables.schemas import MASKS
 from shapecat.types import ImageMasks, Perception
 
@@ -61,7 +61,7 @@ def read_nearest_masks(folder: Path) -> Iterator[tuple[Key, ImageMasks]]:
     Several frames have the same image if images are rarer. Run lengths are left out.
     """
     best: dict[str, tuple[int, Key, ImageMasks]] = {}
-    stamps = _frame_stamps(folder)
+    stamps = read_stamps(folder)
     for key, masks in read_masks(folder, boxes_only=True):
         stamp = next(stamp for other, stamp in stamps if other == key)
         apart, before = abs(stamp - masks.stamp_ns), best.get(masks.topic)
@@ -72,12 +72,6 @@ def read_nearest_masks(folder: Path) -> Iterator[tuple[Key, ImageMasks]]:
             best[masks.topic] = apart, key, masks
     for _, key, masks in best.values():
         yield key, masks
-
-
-def _frame_stamps(folder: Path) -> Iterator[tuple[Key, int]]:
-    """Yield each frame and its stamp in nanoseconds, in the order of the frames table."""
-    for group in read_row_groups(folder / "frames.parquet", ["topic", "frame", "stamp_ns"]):
-        yield from zip(keys_of(group), numbers(group["stamp_ns"]).tolist(), strict=True)
 
 
 def _run_lengths(column: pa.ChunkedArray) -> Iterator[U4]:

@@ -1,4 +1,4 @@
-"""Reading and writing the Parquet tables between the phases.
+"""Read the Parquet tables of a run folder.
 
 Row groups of all tables but ``tracks`` cover the same frames, so that they can be read side by side
 in constant memory.
@@ -29,6 +29,7 @@ __all__ = [
     "opened",
     "read_row_groups",
     "read_rows",
+    "read_stamps",
     "read_together",
     "rows_of",
     "topic_codes",
@@ -62,6 +63,12 @@ def first_stamp(folder: Path) -> int:
     """
     groups = read_row_groups(folder / "frames.parquet", ["stamp_ns"])
     return min((int(numbers(group["stamp_ns"]).min()) for group in groups if len(group)), default=0)
+
+
+def read_stamps(folder: Path) -> Iterator[tuple[Key, int]]:
+    """Yield each frame of a run and its stamp in nanoseconds, in the order of the frames table."""
+    for group in read_row_groups(folder / "frames.parquet", ["topic", "frame", "stamp_ns"]):
+        yield from zip(keys_of(group), numbers(group["stamp_ns"]).tolist(), strict=True)
 
 
 def read_row_groups(
