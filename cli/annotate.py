@@ -67,7 +67,7 @@ def _labels_of(run: Path) -> dict[int, str]:
     from shapecat.runs.labels.track_table import read_track_table
 
     try:
-        return {row.track: row.label for row in read_track_table(run / "tracks.csv").rows}
+        return read_track_table(run / "tracks.csv").labels
     except OutputError:
         return {}
 

@@ -137,7 +137,7 @@ def write_csv(
 
 
 def labels_of(folder: Path) -> dict[int, str]:
-    return {row.track: row.label for row in read_track_table(folder / "tracks.csv").rows}
+    return read_track_table(folder / "tracks.csv").labels
 
 
 def shifted(place: Sequence[float], x: float = 0, y: float = 0, z: float = 0) -> list[float]:

@@ -95,7 +95,7 @@ def served() -> Iterator[Callable[..., Server]]:
 
 
 def labels_on_disk(run: Path) -> dict[int, str]:
-    return {row.track: row.label for row in read_track_table(run / "tracks.csv").rows}
+    return read_track_table(run / "tracks.csv").labels
 
 
 def order_of(browser: Browser) -> list[int]:
@@ -160,7 +160,7 @@ def test_page_reports_corrections_lost_by_killed_server(
     message = browser.run("return document.getElementById('saved').textContent")
     browser.click("#download")
     table = browser.downloaded()
-    downloaded = {row.track: row.label for row in read_track_table(table).rows}
+    downloaded = read_track_table(table).labels
     table.unlink()
 
     on_disk = labels_on_disk(long_run)

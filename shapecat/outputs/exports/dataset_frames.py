@@ -136,7 +136,8 @@ def images_of(
     if not selection.depth and not finished.run.get("color"):
         msg = f"{finished.folder}: no colour images; --depth exports depth images"
         raise OutputError(msg)
-    corrected = _corrected(finished.folder)
+    labels = read_track_table(finished.folder / "tracks.csv").labels
+    corrected = {track for track, label in labels.items() if label}
     chosen = _chosen(finished, selection, corrected)
     with open_source(finished.run, recording) as source:
         frames = (f for f in finished.frames() if (f.topic, f.index) in chosen)
@@ -154,11 +155,6 @@ def images_of(
                 left_out["no object with a reliable label"] += 1
             else:
                 yield image
-
-
-def _corrected(folder: Path) -> set[int]:
-    """Return the tracks with a corrected label."""
-    return {row.track for row in read_track_table(folder / "tracks.csv").rows if row.label}
 
 
 def _is_sure(item: LabelledObject, selection: Selection, corrected: set[int]) -> bool:

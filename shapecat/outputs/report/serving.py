@@ -15,7 +15,6 @@ from contextlib import contextmanager
 from dataclasses import dataclass, field
 from http import HTTPStatus
 from http.server import BaseHTTPRequestHandler
-from pathlib import Path
 from socketserver import ThreadingTCPServer
 from typing import Any, NamedTuple
 from urllib.parse import unquote
@@ -81,7 +80,7 @@ class _Site:
             return _Answer(HTTPStatus.OK, report.page(served=True))
         if report is not None and name == _LABELS:
             require_work(report.folder, report.work)
-            return _Answer(HTTPStatus.OK, {"labels": _labels(report.folder)})
+            return _Answer(HTTPStatus.OK, {"labels": _labels(report)})
         return _Answer(HTTPStatus.NOT_FOUND, "no such page")
 
     def post(self, address: str, body: bytes) -> _Answer:
@@ -95,7 +94,7 @@ class _Site:
         track, label, seen = wanted
         problem = correct_label(report.folder, track, label, seen=seen, work=report.work)
         status = HTTPStatus.CONFLICT if problem else HTTPStatus.OK
-        return _Answer(status, {"labels": _labels(report.folder), "problem": problem})
+        return _Answer(status, {"labels": _labels(report), "problem": problem})
 
     def _find(self, address: str) -> tuple[RunReport | None, str]:
         """Return the run whose folder contains an address, or None, and the resource's name."""
@@ -106,8 +105,8 @@ class _Site:
         return None, name
 
 
-def _labels(folder: Path) -> dict[int, str]:
-    return {row.track: row.label for row in read_track_table(folder / "tracks.csv").rows}
+def _labels(report: RunReport) -> dict[int, str]:
+    return read_track_table(report.folder / "tracks.csv").labels
 
 
 def _correction(body: bytes) -> tuple[int, str, str] | None:

@@ -193,11 +193,11 @@ def correct_label(folder: Path, track: int, label: str, *, seen: str, work: str)
     """
     with holding(folder):
         require_work(folder, work)
-        rows = {row.track: row for row in read_track_table(folder / "tracks.csv").rows}
-        if track not in rows:
+        labels = read_track_table(folder / "tracks.csv").labels
+        if track not in labels:
             return f"there is no track #{track}"
-        if rows[track].label != seen:
-            return f"its label is now {rows[track].label!r}"
+        if labels[track] != seen:
+            return f"its label is now {labels[track]!r}"
         return relabel(folder, {track: label}).get(track, "")
 
 
@@ -236,7 +236,7 @@ def has_labels(path: Path) -> bool:
     ------
     OutputError : the table is unreadable.
     """
-    return path.exists() and any(row.label for row in read_track_table(path).rows)
+    return path.exists() and any(read_track_table(path).labels.values())
 
 
 def _require_same_run(path: Path, table: TrackTable, folder: Path, *, known: bool = True) -> None:

@@ -54,6 +54,11 @@ class TrackTable:
     problems: tuple[str, ...]
 
     @property
+    def labels(self) -> dict[int, str]:
+        """The label of each track, empty without one."""
+        return {row.track: row.label for row in self.rows}
+
+    @property
     def run(self) -> str:
         """The ``work`` id of the run of the tracks; empty if unknown."""
         return next(iter(self.runs), "")

@@ -113,7 +113,7 @@ def _labelled_otherwise(transfer: Transfer, target: Path, run: RunInfo) -> dict[
     earlier = {
         (item["track"], item["label"]) for item in run.get("corrections", {}).get("transferred", ())
     }
-    own = {row.track: row.label for row in read_track_table(target / "tracks.csv").rows}
+    own = read_track_table(target / "tracks.csv").labels
     return {
         item.track: f"track {item.track} already has the label {own[item.track]}"
         for item in transfer.transferred
