@@ -24,6 +24,7 @@ from shapecat.batch.storage import Location, content_key
 from shapecat.config import Settings, with_overrides
 from shapecat.errors import OutputError
 from shapecat.executors import WorkerLostError
+from shapecat.recordings.files import input_size
 from shapecat.runs.folder import read_run, write_run
 from shapecat.runs.identity import (
     ContentDigest,
@@ -43,7 +44,7 @@ from shapecat.runs.jobs import (
 )
 from shapecat.runs.perceive.resuming import has_work, resume
 from shapecat.runs.run_info import RunInfo
-from shapecat.system.files import input_size, partial_path
+from shapecat.system.files import partial_path
 from tests.run_info import run_info
 
 MODEL: Any = SimpleNamespace(model_id="m1", categories=("cup", "can"))

@@ -438,7 +438,7 @@ def test_parts_unpacked_by_killed_process_are_removed(
 ) -> None:
     path = write_folder(tmp_path / "bag", StoragePlugin.SQLITE3, CompressionMode.FILE)
     temporary = tmp_path / "tmp"
-    old, other = temporary / "shapecat-parts-old", temporary / "shapecat-parts-other"
+    old, other = temporary / "shapecat-scratch-old", temporary / "shapecat-scratch-other"
     for folder in (old, other):
         folder.mkdir(parents=True)
         os.utime(folder, (0, 0))

@@ -583,9 +583,9 @@ def test_scratch_of_killed_processes_is_removed(own_scratch: Path) -> None:
     for left in (old, new):
         left.mkdir()
     os.utime(old, (0, 0))
-    with scratch_folder("shapecat-scratch-") as mine:
+    with scratch_folder() as mine:
         os.utime(mine, (0, 0))
-        with scratch_folder("shapecat-scratch-") as other:
+        with scratch_folder() as other:
             assert mine.exists()
             assert other.exists()
         assert not old.exists()

@@ -13,7 +13,7 @@ from typing import Any
 from shapecat.batch.storage import Location, content_key, is_url
 from shapecat.errors import RecordingError
 from shapecat.recordings import open_recording
-from shapecat.system.files import is_of_bag
+from shapecat.recordings.files import is_of_bag
 
 __all__ = ["Found", "Source", "find_recordings", "look_at"]
 

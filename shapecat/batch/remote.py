@@ -23,7 +23,6 @@ from shapecat.system.progress import Observer
 
 __all__ = ["Ticket", "process_remote", "upload"]
 
-_SCRATCH = "shapecat-scratch-"
 _PREVIOUS = tuple(name for name in RUN_FILES if name not in {*OUTPUTS, "report.html"})
 """Files of the previous run from which labels are transferred to a new run; run.json last."""
 
@@ -68,7 +67,7 @@ def process_remote(job: Job, observe: Observer, *, cores: int, ticket: Ticket) -
     OutputError : the storage is not writable, or another process works on the run folder.
     """
     claim = claimed(job.target, ticket.batch) if job.target else nullcontext()
-    with scratch_folder(_SCRATCH) as folder, claim as held:
+    with scratch_folder() as folder, claim as held:
         local = job
         if job.target:
             local, run = _fetch_run(

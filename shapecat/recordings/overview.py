@@ -6,9 +6,9 @@ from typing import Any
 
 from shapecat.recordings.colour_streams import choose_colour
 from shapecat.recordings.containers.opening import open_recording
+from shapecat.recordings.files import input_size
 from shapecat.recordings.recording import Recording
 from shapecat.recordings.streams import Stream, cloud_streams
-from shapecat.system.files import input_size
 
 __all__ = ["describe_recording"]
 

@@ -16,8 +16,8 @@ from typing import Any, Self
 import xxhash
 
 from shapecat.errors import RecordingError
+from shapecat.recordings.files import input_files, is_of_bag
 from shapecat.runs.run_info import InputInfo, RunInfo
-from shapecat.system.files import input_files, is_of_bag
 
 __all__ = [
     "ContentDigest",

@@ -14,6 +14,7 @@ from shapecat import __version__
 from shapecat.config import Settings
 from shapecat.errors import ModelError, OutputError, RecordingError
 from shapecat.learning import Categorizer
+from shapecat.recordings.files import input_size
 from shapecat.runs.folder import OUTPUTS, clear, write_run
 from shapecat.runs.identity import (
     ContentDigest,
@@ -26,7 +27,7 @@ from shapecat.runs.labels.corrections import LOST, PREVIOUS, has_labels
 from shapecat.runs.labels.track_table import ORIGINAL
 from shapecat.runs.labels.transfer import lost_labels, transfer_labels
 from shapecat.runs.run_info import Options, RunInfo
-from shapecat.system.files import input_size, replacing
+from shapecat.system.files import replacing
 
 __all__ = [
     "Job",

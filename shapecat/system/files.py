@@ -24,22 +24,16 @@ __all__ = [
     "complete_folder",
     "flush",
     "holding",
-    "input_files",
-    "input_size",
-    "is_of_bag",
     "lock",
     "partial_path",
     "replacing",
     "require_writable",
     "scratch_folder",
-    "write_ahead_log",
 ]
 
 FSYNC = "SHAPECAT_FSYNC"
 """The environment variable that disables flushing; worker processes inherit it."""
-_PARTS = (".mcap", ".db3", ".mcap.zstd", ".db3.zstd")
-_LOG = "-wal"
-"""End of the name of the write-ahead log that a killed recorder leaves beside its database."""
+_SCRATCH = "shapecat-scratch-"
 _NEW_S = 60
 """Age up to which a temporary folder may not be locked yet."""
 
@@ -160,17 +154,13 @@ def holding(folder: Path) -> Iterator[None]:
 
 
 @contextmanager
-def scratch_folder(prefix: str) -> Iterator[Path]:
+def scratch_folder() -> Iterator[Path]:
     """Provide a temporary folder for the block; remove those of killed processes.
 
     Only those of this machine are removed, since NFS does not tell other machines of locks on
     folders, and only where there are locks: others may be in use.
-
-    Parameters
-    ----------
-    prefix : beginning of the names of these folders.
     """
-    own = f"{prefix}{socket.gethostname()}-"
+    own = f"{_SCRATCH}{socket.gethostname()}-"
     for left in Path(gettempdir()).glob(f"{glob.escape(own)}*"):
         with suppress(OSError):
             if time.time() - left.stat().st_mtime > _NEW_S:
@@ -193,28 +183,3 @@ def _remove_unused(folder: Path) -> None:
         shutil.rmtree(folder, ignore_errors=True)
     finally:
         os.close(held)
-
-
-def is_of_bag(name: str) -> bool:
-    """Return whether a file in the folder of a ROS 2 bag belongs to it: a part or the metadata."""
-    return name == "metadata.yaml" or name.removesuffix(_LOG).endswith(_PARTS)
-
-
-def write_ahead_log(database: Path) -> Path | None:
-    """Return the log beside a database with messages that are not in it; None without any."""
-    log = database.with_name(f"{database.name}{_LOG}")
-    return log if log.is_file() and log.stat().st_size else None
-
-
-def input_files(path: Path) -> list[Path]:
-    """Return a file and its write-ahead log, or the files of the ROS 2 bag in a folder, sorted."""
-    if not path.is_dir():
-        log = write_ahead_log(path)
-        return [path] if log is None else [path, log]
-    files = [file for file in sorted(path.iterdir()) if is_of_bag(file.name) and file.is_file()]
-    return [file for file in files if not file.name.endswith(_LOG) or file.stat().st_size]
-
-
-def input_size(path: Path) -> int:
-    """Return the size of a file, or of the ROS 2 bag in a folder, bytes."""
-    return sum(file.stat().st_size for file in input_files(path))

@@ -14,6 +14,7 @@ from rosbags.rosbag2.metadata import dump_qos_v8
 from shapecat.errors import RecordingError
 from shapecat.recordings.containers.message_compression import decompressed
 from shapecat.recordings.decoding.decoders import LIBRARY_ERRORS
+from shapecat.recordings.files import write_ahead_log
 from shapecat.recordings.messages import (
     Channel,
     Message,
@@ -23,13 +24,12 @@ from shapecat.recordings.messages import (
     sum_topics,
 )
 from shapecat.recordings.recording import Recording
-from shapecat.system.files import scratch_folder, write_ahead_log
+from shapecat.system.files import scratch_folder
 
 __all__ = ["DatabaseRecording"]
 
 _LAST_NS = 2**63 - 1
 """The largest time that SQLite can hold."""
-_SCRATCH = "shapecat-parts-"
 _SCHEMAS = {MessageDefinitionFormat.MSG: "ros2msg", MessageDefinitionFormat.IDL: "ros2idl"}
 
 
@@ -79,7 +79,7 @@ class DatabaseRecording(Recording):
         if log is None:
             return self.path if self.path.suffix == ".db3" else self._renamed()
         try:
-            folder = self._cleanup.enter_context(scratch_folder(_SCRATCH))
+            folder = self._cleanup.enter_context(scratch_folder())
             copy = folder / "a.db3"
             room = shutil.disk_usage(folder).free // 2
             if self.path.stat().st_size + 2 * log.stat().st_size > room:  # it is added to the copy
@@ -97,7 +97,7 @@ class DatabaseRecording(Recording):
 
     def _renamed(self) -> Path:
         """Return a link to the database with the only suffix that its reader accepts."""
-        link = self._cleanup.enter_context(scratch_folder(_SCRATCH)) / "a.db3"
+        link = self._cleanup.enter_context(scratch_folder()) / "a.db3"
         link.symlink_to(self.path.resolve())
         return link
 

@@ -26,9 +26,6 @@ _PARTS: dict[str, Callable[[Path], Recording]] = {
 }
 
 
-_SCRATCH = "shapecat-parts-"
-
-
 class FolderRecording(Recording):
     """A bag folder as ``ros2 bag record`` writes it, with or without metadata.yaml.
 
@@ -139,7 +136,7 @@ class FolderRecording(Recording):
     def _decompressed(self, file: Path) -> Path:
         """Decompress a file into a temporary folder, using at most half of the free space."""
         if self._scratch is None:
-            self._scratch = self._cleanup.enter_context(scratch_folder(_SCRATCH))
+            self._scratch = self._cleanup.enter_context(scratch_folder())
         plain = self._scratch / file.stem
         room = shutil.disk_usage(self._scratch).free // 2
         reader = zstandard.ZstdDecompressor()
