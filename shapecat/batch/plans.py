@@ -38,9 +38,6 @@ _LOOKS_AT_ONCE = 16
 _LOOKS = 256
 """Recordings per unit of work of such a thread."""
 
-_SELECTION = ("up", "fixed_frame", "start_s", "end_s", "every", "color")
-"""Options that a run keeps as they were given; the topics are those that were chosen."""
-
 Status = Literal["complete", "resume", "retry", "check", "new"]
 
 
@@ -229,7 +226,7 @@ class _Planner:
         there = task.name in self._there
         if there and entry is not None and entry.state == "complete":
             same = entry.same_command if overwrite else entry.same_work
-            if same(task.entry()) and _whole(task, self._model_id):
+            if same(task.entry()) and _is_wanted_run(task, self._model_id):
                 return "complete"
         in_progress = {partial_path(Path(task.name)).name, claim_name(task.name)}
         if (overwrite or not there) and not self._there.isdisjoint(in_progress):
@@ -263,7 +260,7 @@ def _names_in(folder: Path) -> set[str]:
     return set()
 
 
-def _whole(task: Task, model_id: str) -> bool:
+def _is_wanted_run(task: Task, model_id: str) -> bool:
     """Return whether a run that the manifest lists as complete is the one wanted, with its outputs.
 
     A command for this recording alone may have replaced it, and an interrupted `annotate` leaves
@@ -277,12 +274,14 @@ def _whole(task: Task, model_id: str) -> bool:
     except OutputError:
         return False
     outputs = [name for option, name in OUTPUT_OPTIONS.items() if getattr(job, option)]
-    topics = [topic.strip("/") for topic in run["options"]["topics"]]
+    topics = [topic.strip("/") for topic in run["options"]["topics"]]  # those that were chosen
+    others = {"topics", *OUTPUT_OPTIONS}
+    given = {name: value for name, value in job.selection().items() if name not in others}
     return (
         all(name in run["seconds"] and (job.folder / name).exists() for name in outputs)
         and run["settings"] == job.settings.as_dict()
         and run["model"]["id"] == model_id
-        and all(run["options"].get(name) == getattr(job, name) for name in _SELECTION)
+        and given.items() <= run["options"].items()
         and (not job.topics or topics == [topic.strip("/") for topic in job.topics])
     )
 
