@@ -68,7 +68,7 @@ marker."""
 def made_by_run(folder: Path) -> Collection[str] | None:
     """Return the names that a run makes in its folder; None if the folder holds no run."""
     with suppress(OutputError):
-        if read_run(folder).get("id"):
+        if read_run(folder)["id"]:
             return _MADE
     return None
 
@@ -80,7 +80,7 @@ def require_work(folder: Path, work: str) -> None:
     ------
     OutputError : ``work`` differs from that in run.json, or there is none.
     """
-    if read_run(folder).get("work", "") != work:
+    if read_run(folder)["work"] != work:
         msg = f"{folder}: was processed again since its report was made; make the report again"
         raise OutputError(msg)
 

@@ -153,6 +153,6 @@ def same_content(known: InputInfo, path: Path, digest: Callable[[], str]) -> boo
 
     ``digest`` is called only if the names, sizes or times of the files differ.
     """
-    if _of_input(known.get("files", ()), path) == file_stats(path):
+    if _of_input(known["files"], path) == file_stats(path):
         return True
-    return bool(known.get("digest")) and known["digest"] == digest()
+    return bool(known["digest"]) and known["digest"] == digest()

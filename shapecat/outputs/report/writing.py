@@ -199,7 +199,7 @@ def read_report(folder: Path, *, index: str | None = None) -> RunReport:
     rows = read_own_table(folder / "tracks.csv")[0].rows
     timelines = read_timelines(folder)
     pictures = take_pictures(finished, rows, choose_frames(folder, timelines))
-    work = finished.run.get("work", "")
+    work = finished.run["work"]
     return RunReport(folder, work, timelines, pictures, read_stage_seconds(folder), index)
 
 

@@ -251,7 +251,7 @@ def _require_same_run(path: Path, table: TrackTable, folder: Path, *, known: boo
     ------
     OutputError : the table belongs to another run or to several, or has other positions.
     """
-    own = read_run(folder).get("work", "") if (folder / "run.json").exists() else ""
+    own = read_run(folder)["work"] if (folder / "run.json").exists() else ""
     if not own or set(table.runs) == {own}:
         return
     if not table.runs and (known or _places_agree(table, folder)):
@@ -323,7 +323,7 @@ def _line_of(problem: str) -> int:
 
 def _one_frame(folder: Path) -> bool:
     """Return whether a run has a fixed frame, so that its sensors share coordinates."""
-    return (folder / "run.json").exists() and read_run(folder).get("fixed_frame") is not None
+    return (folder / "run.json").exists() and read_run(folder)["fixed_frame"] is not None
 
 
 def _lines(rows: Iterable[TrackRow], misread: Mapping[int, str]) -> list[str]:

@@ -199,7 +199,7 @@ def _is_in_its_run(path: Path, table: TrackTable) -> bool:
         return False
     if not table.run:
         return path.name == "tracks.csv"
-    return bool(table.run == read_run(folder).get("work"))
+    return table.run == read_run(folder)["work"]
 
 
 def _groups(labelled: Sequence[TrackRow]) -> Group:
@@ -216,9 +216,10 @@ def _groups(labelled: Sequence[TrackRow]) -> Group:
     return root
 
 
-def _same_recording(a: Mapping[str, Any], b: Mapping[str, Any]) -> bool:
-    digests = [run["input"].get("digest") for run in (a, b)]
-    return bool(digests[0]) and digests[0] == digests[1] and a["fixed_frame"] == b["fixed_frame"]
+def _same_recording(a: RunInfo, b: RunInfo) -> bool:
+    digest = a["input"]["digest"]
+    same = bool(digest) and digest == b["input"]["digest"]
+    return same and a["fixed_frame"] == b["fixed_frame"]
 
 
 def _translate(

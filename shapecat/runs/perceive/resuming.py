@@ -123,7 +123,7 @@ def _same_recording_and_versions(
     run: RunInfo, planned: RunInfo, source: Path, digest: Callable[[], str]
 ) -> bool:
     """Return whether a run was made by the same versions from the same recording."""
-    if run.get("versions") != planned["versions"]:
+    if run["versions"] != planned["versions"]:
         return False
     known = run["input"]
     return unchanged(known["files"], source) or same_content(known, source, digest)
