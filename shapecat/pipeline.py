@@ -42,7 +42,6 @@ from shapecat.runs.jobs import (
     summarize,
 )
 from shapecat.runs.labels.corrections import adopt_labels, read_labels
-from shapecat.runs.labels.meaning import TrackLabel
 from shapecat.runs.labels.transfer import Transfer, transfer_labels
 from shapecat.runs.perceive.clocks import explain_clocks
 from shapecat.runs.perceive.missing_planes import explain_missing_planes
@@ -95,7 +94,7 @@ def process(job: Job, observe: Observer = ignore, *, cores: int = 1) -> Summary:
         )
         recover(job.folder)
         if made_by_run(job.folder) is not None and not job.overwrite:
-            return _finished(job, recording, run, content, observe)
+            return _add_outputs(job, recording, run, content, observe)
         with staged(job.folder, worth_keeping=has_work) as folder:
             run = resume(folder, run, job.source, content.result)
             if "perceive" not in run["seconds"]:
@@ -109,7 +108,7 @@ def process(job: Job, observe: Observer = ignore, *, cores: int = 1) -> Summary:
             earlier = run["seconds"].pop("total", None) or sum(run["seconds"].values())
             work = Work(recording, streams, folder, run, job, categorizer, observe, cores)
             _once("perceive", folder, run, lambda: perceive_all(work))
-            _once("revise", folder, run, lambda: _revise(work))
+            _once("revise", folder, run, lambda: _revise_and_warn(work))
             identify(run, content)
             write_run(folder, run)
             discard_segments(folder)
@@ -138,7 +137,7 @@ def _require_begun(job: Job, recording: Recording) -> None:
         raise NoStreamError(msg)
 
 
-def _revise(work: Work) -> None:
+def _revise_and_warn(work: Work) -> None:
     """Perceive again the frames that disagree with the rest; warn of what will cost tracks."""
     revise(work)
     range_m = work.job.settings.detection.max_range_m
@@ -163,7 +162,7 @@ def _once(phase: str, folder: Path, run: RunInfo, work: Callable[[], object]) ->
     write_run(folder, run)
 
 
-def _finished(
+def _add_outputs(
     job: Job,
     recording: Recording,
     planned: RunInfo,
@@ -219,57 +218,49 @@ def annotate(folder: Path, recording: Recording, run: RunInfo, observe: Observer
     ------
     OutputError : a file cannot be written, or tracks.csv is invalid.
     """
-    settings, total = run["settings"]["outputs"], run["counts"]["frames"]
-
-    def labels() -> dict[int, TrackLabel]:
-        return read_labels(folder / "tracks.csv", run["model"]["categories"])
-
-    def write_mcap() -> None:
-        from shapecat.outputs.annotation.annotated_mcap import write_annotated  # noqa: PLC0415  on first use
-        from shapecat.outputs.annotation.image_annotations import read_image_frames  # noqa: PLC0415  the same
-        from shapecat.runs.shown import read_shown_frames  # noqa: PLC0415  the same
-
-        topics = list(dict.fromkeys(run.get("color", {}).values()))
-        boxes = run.get("boxes") or settings.get("boxes", "full")
-        shown = read_shown_frames(folder, labels(), visible=boxes == "visible")
-        write_annotated(
-            recording,
-            folder / "annotated.mcap",
-            observed(shown, "annotate", total, observe),
-            run=run,
-            markers=settings["markers"],
-            images=read_image_frames(folder, labels()) if topics else (),
-            image_topics=topics,
-        )
-
-    def write_rrd() -> None:
-        from shapecat.outputs.review.scenes import with_clouds  # noqa: PLC0415  the same
-        from shapecat.outputs.review.writing import write_review  # noqa: PLC0415  loads Rerun on first use
-        from shapecat.runs.labelled_frames import read_labelled_frames  # noqa: PLC0415  the same
-        from shapecat.runs.tables.placed_frames import streams_with_poses  # noqa: PLC0415  the same
-
-        final = labels()
-        shown = observed(read_labelled_frames(folder, final), "review", total, observe)
-        write_review(
-            folder / "review.rrd",
-            with_clouds(shown, recording, run, streams_with_poses(folder)),
-            name=recording.path.name,
-            run=run,
-            labels=final,
-            categories=run["model"]["categories"],
-            cloud_points=settings["cloud_points"],
-            fixed_frame=run["fixed_frame"],
-        )
-
     if run["options"]["mcap"] and any(t.name.startswith("/shapecat/") for t in recording.topics):
         recording.warn(
             "annotated.mcap has the annotations of an earlier run besides those of this one"
         )
     if run["options"]["rrd"]:
-        _once("review.rrd", folder, run, write_rrd)
+        _once("review.rrd", folder, run, lambda: _write_review(folder, recording, run, observe))
     run["warnings"] = list(dict.fromkeys([*run["warnings"], *recording.warnings]))
     if run["options"]["mcap"]:
-        _once("annotated.mcap", folder, run, write_mcap)
+        _once("annotated.mcap", folder, run, lambda: _write_mcap(folder, recording, run, observe))
+
+
+def _write_review(folder: Path, recording: Recording, run: RunInfo, observe: Observer) -> None:
+    from shapecat.outputs.review.scenes import with_clouds  # noqa: PLC0415  on first use
+    from shapecat.outputs.review.writing import write_review  # noqa: PLC0415  loads Rerun
+    from shapecat.runs.labelled_frames import read_labelled_frames  # noqa: PLC0415  on first use
+    from shapecat.runs.tables.placed_frames import streams_with_poses  # noqa: PLC0415  the same
+
+    labels = read_labels(folder / "tracks.csv", run["model"]["categories"])
+    shown = read_labelled_frames(folder, labels)
+    shown = observed(shown, "review", run["counts"]["frames"], observe)
+    frames = with_clouds(shown, recording, run, streams_with_poses(folder))
+    write_review(folder / "review.rrd", frames, name=recording.path.name, run=run, labels=labels)
+
+
+def _write_mcap(folder: Path, recording: Recording, run: RunInfo, observe: Observer) -> None:
+    from shapecat.outputs.annotation.annotated_mcap import write_annotated  # noqa: PLC0415  on first use
+    from shapecat.outputs.annotation.image_annotations import read_image_frames  # noqa: PLC0415  the same
+    from shapecat.runs.shown import read_shown_frames  # noqa: PLC0415  the same
+
+    settings = run["settings"]["outputs"]
+    labels = read_labels(folder / "tracks.csv", run["model"]["categories"])
+    topics = list(dict.fromkeys(run.get("color", {}).values()))
+    boxes = run.get("boxes", settings["boxes"])
+    shown = read_shown_frames(folder, labels, visible=boxes == "visible")
+    write_annotated(
+        recording,
+        folder / "annotated.mcap",
+        observed(shown, "annotate", run["counts"]["frames"], observe),
+        run=run,
+        markers=settings["markers"],
+        images=read_image_frames(folder, labels) if topics else (),
+        image_topics=topics,
+    )
 
 
 def annotate_again(

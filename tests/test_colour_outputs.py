@@ -353,16 +353,14 @@ def test_review_omits_only_damaged_image(tmp_path: Path) -> None:
         views.append(Coloured(ColourView(image), (Mask(3, 4, np.ones((5, 6), bool)),)))
     scenes = [ReviewFrame(*scene(k, [labelled_object(1)]), view) for k, view in enumerate(views)]
     path = tmp_path / "review.rrd"
-    write_review(
-        path,
-        scenes,
-        name="lab",
-        run={},
-        labels={},
-        categories=("cup", "can"),
-        cloud_points=1000,
-        fixed_frame=None,
-    )
+    run: Any = {
+        "warnings": [],
+        "options": {"topics": [TOPIC]},
+        "settings": {"outputs": {"cloud_points": 1000}},
+        "model": {"categories": ["cup", "can"]},
+        "fixed_frame": None,
+    }
+    write_review(path, scenes, name="lab", run=run, labels={})
 
     entity = f"/images/{TOPIC}"
     images = [row for row in rows(path, entity) if row.get("EncodedImage:blob")]

@@ -78,7 +78,7 @@ def scene(
 
 def write(path: Path, scenes: Iterable[tuple[LabelledFrame, Frame]], **options: Any) -> Path:
     pairs = list(scenes)
-    fixed = options.get("fixed_frame") is not None
+    fixed = options.get("run", {}).get("fixed_frame") is not None
     chosen = choose_scenes([labelled for labelled, _ in pairs], fixed=fixed)
     frames = [
         ReviewFrame(labelled, frame if due else None)
@@ -88,15 +88,16 @@ def write(path: Path, scenes: Iterable[tuple[LabelledFrame, Frame]], **options: 
 
 
 def write_frames(path: Path, frames: Iterable[ReviewFrame], **options: Any) -> Path:
-    settings: dict[str, Any] = {
-        "name": "lab",
-        "run": {"warnings": ["no transforms"], "counts": {"frames": 3}},
-        "labels": {},
-        "categories": CATEGORIES,
-        "cloud_points": 1000,
+    run: Any = {
+        "warnings": ["no transforms"],
+        "counts": {"frames": 3},
+        "options": {"topics": [TOPIC]},
+        "settings": {"outputs": {"cloud_points": 1000}},
+        "model": {"categories": list(CATEGORIES)},
         "fixed_frame": None,
     }
-    review.write_review(path, frames, **(settings | options))
+    run |= options.pop("run", {})
+    review.write_review(path, frames, **({"name": "lab", "run": run, "labels": {}} | options))
     return path
 
 
@@ -260,7 +261,7 @@ def test_layout_is_only_for_its_own_review(tmp_path: Path) -> None:
 def test_fixed_frame_has_sensor_poses_and_track_paths(tmp_path: Path) -> None:
     poses = [Pose(np.eye(3), np.array([0.1 * k, 0, 0])) for k in range(3)]
     scenes = [scene(k, [labelled_object(1)], pose=pose) for k, pose in enumerate(poses)]
-    path = write(tmp_path / "r.rrd", scenes, fixed_frame="map")
+    path = write(tmp_path / "r.rrd", scenes, run={"fixed_frame": "map"})
     translations = [
         row["Transform3D:translation"]
         for row in rows(path, f"/world/{TOPIC}")
@@ -282,7 +283,7 @@ def test_path_of_track_joins_centres_of_whole_object(tmp_path: Path) -> None:
         seen = labelled_object(1, x=0.3 * k)
         full = Box(center, seen.box.size, np.array([0, 0, 0, 1])) if k else None
         scenes.append(scene(k, [dataclasses.replace(seen, full=full)], pose=pose))
-    path = write(tmp_path / "r.rrd", scenes, fixed_frame="map")
+    path = write(tmp_path / "r.rrd", scenes, run={"fixed_frame": "map"})
 
     first = turns[0].apply([0, 0.1, 1.0]) + poses[0].translation  # only the visible box is known
     (strip,) = rows(path, f"/world/paths/{TOPIC}")[-1]["LineStrips3D:strips"]
@@ -294,7 +295,7 @@ def test_path_of_track_joins_centres_of_whole_object(tmp_path: Path) -> None:
 def test_frame_without_pose_is_reviewed(tmp_path: Path) -> None:
     """Transforms may be missing at either end of a recording."""
     scenes = [scene(k, [labelled_object(1)]) for k in range(2)]
-    path = write(tmp_path / "r.rrd", scenes, fixed_frame="map")
+    path = write(tmp_path / "r.rrd", scenes, run={"fixed_frame": "map"})
     assert len(rows(path, f"/world/{TOPIC}/objects/boxes")) == 2
 
 

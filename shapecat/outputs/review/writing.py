@@ -35,7 +35,7 @@ Timelines: ``sensor_time`` (the stamp) and ``frame``.
 import json
 import uuid
 from collections import Counter
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -54,6 +54,7 @@ from shapecat.outputs.review.paths import Paths
 from shapecat.outputs.review.scenes import PaintedFrame, ReviewFrame, paint_frame
 from shapecat.outputs.review.shapes import SCENE, SKETCH, Drawing, DrawnScene
 from shapecat.runs.labels.meaning import TrackLabel
+from shapecat.runs.run_info import RunInfo
 from shapecat.types import Camera, Frame, LabelledFrame, LabelledObject, Pose
 
 __all__ = ["write_review"]
@@ -66,11 +67,8 @@ def write_review(
     frames: Iterable[ReviewFrame],
     *,
     name: str,
-    run: Mapping[str, object],
+    run: RunInfo,
     labels: Mapping[int, TrackLabel],
-    categories: Sequence[str],
-    cloud_points: int,
-    fixed_frame: str | None,
 ) -> None:
     """Write a run as a Rerun recording with its layout embedded.
 
@@ -79,11 +77,8 @@ def write_review(
     path : the file; it appears when complete and replaces an older one.
     frames : all frames in the order of the recording, with points if their scene is drawn.
     name : name of the recording in the viewer.
-    run : the content of run.json; a list under ``warnings`` is also logged.
+    run : the content of run.json.
     labels : the final label of each track; a review with others is another recording.
-    categories : in the order of the posteriors.
-    cloud_points : approximate number of points to keep of each cloud; 0 keeps all.
-    fixed_frame : name of the frame in which tracks are shown; None for the sensor frame.
 
     Raises
     ------
@@ -97,20 +92,17 @@ def write_review(
     stream = _stream(name, run, labels)
     with open_review(path, stream) as file:
         stream.send_recording_name(name)
-        review = _Review(stream, categories, fixed_frame)
-        review.begin(run)
+        review, limit = _Review(stream, run), run["settings"]["outputs"]["cloud_points"]
         for k, frame in enumerate(frames):
             file.check()
-            review.add(paint_frame(frame, limit=cloud_points))
+            review.add(paint_frame(frame, limit=limit))
             if k % _FLUSH_FRAMES == _FLUSH_FRAMES - 1:
                 file.flush()
         review.end()
         file.flush()
 
 
-def _stream(
-    name: str, run: Mapping[str, object], labels: Mapping[int, TrackLabel]
-) -> rr.RecordingStream:
+def _stream(name: str, run: RunInfo, labels: Mapping[int, TrackLabel]) -> rr.RecordingStream:
     """Return a stream whose content depends only on what is logged.
 
     A viewer joins files of the same recording, and has one layout for each application.
@@ -126,23 +118,19 @@ def _stream(
 class _Review:
     """Writes a review frame by frame, and keeps the data for its layout and paths."""
 
-    def __init__(
-        self,
-        stream: rr.RecordingStream,
-        categories: Sequence[str],
-        fixed_frame: str | None,
-    ) -> None:
+    def __init__(self, stream: rr.RecordingStream, run: RunInfo) -> None:
+        """Write what does not change over time."""
         self._stream, self._columns = stream, Columns(stream)
+        self._log = stream.log
+        categories = run["model"]["categories"]
         self._curves: dict[str, Any] = {
-            "names": list(categories),
+            "names": categories,
             "colors": [colour_of(category) for category in categories],
         }
-        self._fixed_frame = fixed_frame
+        self._fixed_frame = run["fixed_frame"]
         self._eyes: dict[str, Eye] = {}
-        self._low, self._high = (
-            np.full(3, np.inf),
-            np.full(3, -np.inf),
-        )  # bounds of objects in the fixed frame
+        # Bounds of objects in the fixed frame.
+        self._low, self._high = np.full(3, np.inf), np.full(3, -np.inf)
         self._cameras: dict[str, Camera] = {}
         self._tracks: dict[int, TrackView] = {}
         self._aimed: set[str] = set()  # topics whose eye was chosen with an object in view
@@ -150,19 +138,10 @@ class _Review:
         self._images = Images(stream, self._columns)
         self._styled: set[str] = set()  # entities whose style is written
         self._counted: dict[str, dict[str, None]] = {}  # categories so far of each topic, in order
-        self._several = False  # whether the run has several topics
-        self._warnings: list[str] = []
-
-    def begin(self, run: Mapping[str, object]) -> None:
-        """Write the static data."""
-        self._log(
-            "run", rr.TextDocument(shapes.markdown(run), media_type="text/markdown"), static=True
-        )
-        options = run.get("options")
-        self._several = isinstance(options, Mapping) and len(options.get("topics", ())) > 1
-        warnings = run.get("warnings", ())
-        if isinstance(warnings, Sequence) and not isinstance(warnings, str):
-            self._warnings = [str(text) for text in warnings]
+        self._several = len(run["options"]["topics"]) > 1
+        self._warnings = run["warnings"]
+        text = rr.TextDocument(shapes.markdown(run), media_type="text/markdown")
+        self._log("run", text, static=True)
         if self._fixed_frame is not None:
             self._log("world", rr.ViewCoordinates.RIGHT_HAND_Z_UP, static=True)
 
@@ -229,9 +208,6 @@ class _Review:
             self._styled.add(entity)
             self._log(entity, drawing.style, static=True)
         self._columns.add(entity, at, row, drawing.columns, size=size)
-
-    def _log(self, entity: str, *what: rr.AsComponents, static: bool = False) -> None:
-        self._stream.log(entity, *what, static=static)
 
     def _place_sensor(self, entity: str, labelled: LabelledFrame, frame: Frame) -> None:
         """Write the axes and the frustum of the sensor if they are new."""
