@@ -293,7 +293,7 @@ def answer(status: int) -> Exception:
 )
 def test_only_temporary_errors_are_retried(error: Exception, *, passes: bool) -> None:
     """A busy server must not end a batch, and a wrong key must not delay one."""
-    assert storage._may_pass(error) is passes
+    assert storage._is_transient(error) is passes
 
 
 def test_listings_are_read_in_pages(bucket: Path, monkeypatch: pytest.MonkeyPatch) -> None:

@@ -25,7 +25,7 @@ _WAITS_S = (0.5, 1.0, 2.0, 4.0, 8.0)
 _DIGESTS = ("ETag", "etag", "md5Hash", "content_md5")
 _TIMES = ("mtime", "LastModified", "last_modified", "created")
 """Entries of a file's info that change with its content, or with the time it was written."""
-_PASSING = {
+_TRANSIENT = {
     errno.EAGAIN,
     errno.EBUSY,  # s3fs: SlowDown, ServiceUnavailable
     errno.ECONNREFUSED,
@@ -34,7 +34,7 @@ _PASSING = {
     errno.ETIMEDOUT,
     getattr(errno, "EREMOTEIO", errno.EIO),  # s3fs: InternalError
 }
-_PASSING_NAMES = {"ClientPayloadError", "ServerDisconnectedError"}
+_TRANSIENT_NAMES = {"ClientPayloadError", "ServerDisconnectedError"}
 """Errors of aiohttp by name, since it need not be installed."""
 _PAGE = 1000
 """Names per page of a listing, the most that S3 returns."""
@@ -84,7 +84,7 @@ class Location:
     def __truediv__(self, name: str) -> "Location":
         return Location(f"{self.url.rstrip('/')}/{name}", self._error)
 
-    def _tried(self, done: str, call: Callable[[], _T]) -> _T:
+    def _retry(self, done: str, call: Callable[[], _T]) -> _T:
         """Return the result of a call; repeat the call while it may still succeed.
 
         Raises
@@ -98,7 +98,7 @@ class Location:
             except (FileNotFoundError, FileExistsError):
                 raise
             except Exception as error:  # every storage has errors of its own
-                if not wait_s or not _may_pass(error):
+                if not wait_s or not _is_transient(error):
                     raise self._as_error(done, error) from error
             time.sleep(wait_s * random.uniform(0.5, 1.5))  # noqa: S311  no secret
         raise AssertionError
@@ -110,14 +110,14 @@ class Location:
     def info(self) -> Mapping[str, Any] | None:
         """Return size, times and digest of a file, as fsspec names them; None if it is missing."""
         with suppress(FileNotFoundError):
-            known: Mapping[str, Any] = self._tried("read", lambda: self._system.info(self._path))
+            known: Mapping[str, Any] = self._retry("read", lambda: self._system.info(self._path))
             return known
         return None
 
     def read(self) -> bytes | None:
         """Return the content of a small file; None if it does not exist."""
         with suppress(FileNotFoundError):
-            return bytes(self._tried("read", lambda: self._system.cat_file(self._path)))
+            return bytes(self._retry("read", lambda: self._system.cat_file(self._path)))
         return None
 
     def write(self, content: bytes) -> None:
@@ -148,9 +148,9 @@ class Location:
     def _put(self, done: str, call: Callable[[], Any]) -> None:
         if not self._is_s3():  # S3 would create a bucket with a misspelt name
             parent = self._path.rstrip("/").rpartition("/")[0]
-            self._tried(done, lambda: self._system.makedirs(parent, exist_ok=True))
+            self._retry(done, lambda: self._system.makedirs(parent, exist_ok=True))
         try:
-            self._tried(done, call)
+            self._retry(done, call)
         except FileNotFoundError as error:
             raise self._as_error(done, error) from error
 
@@ -168,15 +168,15 @@ class Location:
             self._system.get_file(source, str(file), **self._in_parts())
 
         with suppress(FileNotFoundError):
-            if not self._tried("downloaded", lambda: self._system.isdir(self._path)):
-                self._tried("downloaded", lambda: get(self._path, target))
+            if not self._retry("downloaded", lambda: self._system.isdir(self._path)):
+                self._retry("downloaded", lambda: get(self._path, target))
             for info in self._list(deep=True) if not target.exists() else ():
                 name = PurePosixPath(info["name"]).relative_to(self._path)
                 if ".." in name.parts:
                     msg = f"{self.url}: the name {str(name)!r} leads out of the folder"
                     raise self._error(msg)
                 file = target / name
-                self._tried("downloaded", partial(get, info["name"], file))
+                self._retry("downloaded", partial(get, info["name"], file))
         if not target.exists():
             msg = f"{self.url}: does not exist"
             raise self._error(msg)
@@ -188,7 +188,7 @@ class Location:
     def remove(self) -> None:
         """Remove a file, if it exists."""
         with suppress(FileNotFoundError):
-            self._tried("removed", lambda: self._system.rm_file(self._path))
+            self._retry("removed", lambda: self._system.rm_file(self._path))
 
     def names(self) -> set[str]:
         """Return the names of the files and folders in a folder."""
@@ -207,7 +207,7 @@ class Location:
 
     def matches(self) -> Iterator[tuple[str, Mapping[str, Any]]]:
         """Yield URL and info of the files that match this URL, which is a pattern."""
-        found = self._tried("listed", lambda: self._system.glob(self._path, detail=True))
+        found = self._retry("listed", lambda: self._system.glob(self._path, detail=True))
         for info in found.values():
             yield self._url_of(info), info
 
@@ -219,9 +219,9 @@ class Location:
         if self._is_s3():
             yield from self._list_pages(deep=deep)
         elif deep:
-            yield from self._tried("listed", lambda: system.find(path, detail=True)).values()
+            yield from self._retry("listed", lambda: system.find(path, detail=True)).values()
         else:
-            yield from self._tried("listed", lambda: system.ls(path, detail=True))
+            yield from self._retry("listed", lambda: system.ls(path, detail=True))
 
     def _list_pages(self, *, deep: bool) -> Iterator[Mapping[str, Any]]:
         """Yield the infos of a folder in S3, page by page: a bucket may hold millions."""
@@ -232,10 +232,8 @@ class Location:
         call = self._system.call_s3
         while True:
             try:
-                page = self._tried("listed", lambda: call("list_objects_v2", **options))
-            except (
-                FileNotFoundError
-            ) as error:  # the bucket is missing; a missing folder is an empty one
+                page = self._retry("listed", lambda: call("list_objects_v2", **options))
+            except FileNotFoundError as error:  # no such bucket; a missing folder is an empty one
                 raise self._as_error(done="listed", error=error) from error
             for item in page.get("Contents", ()):
                 yield {**item, "name": f"{bucket}/{item['Key']}", "size": item["Size"]}
@@ -252,11 +250,11 @@ class Location:
         bucket, key, _ = self._system.split_path(self._path)
         call = self._system.call_s3
         options = {"Bucket": bucket, "Prefix": f"{key}/"}
-        begun = self._tried("listed", lambda: call("list_multipart_uploads", **options))
+        begun = self._retry("listed", lambda: call("list_multipart_uploads", **options))
         for upload in begun.get("Uploads", ()):
             known = {"Bucket": bucket, "Key": upload["Key"], "UploadId": upload["UploadId"]}
             with suppress(FileNotFoundError):
-                self._tried("removed", partial(call, "abort_multipart_upload", **known))
+                self._retry("removed", partial(call, "abort_multipart_upload", **known))
 
     def _is_s3(self) -> bool:
         return "s3" in self._system.protocol
@@ -281,12 +279,13 @@ def _connect(url: str, error: type[ShapecatError]) -> tuple[Any, str]:
     return system, str(path)
 
 
-def _may_pass(error: Exception) -> bool:
+def _is_transient(error: Exception) -> bool:
     """Return whether a call may succeed later: the server is busy, or a connection broke."""
     status = getattr(error, "status", None)
     if isinstance(status, int):
         return status == 429 or status >= 500
     known = (
-        isinstance(error, TimeoutError | ConnectionError) or type(error).__name__ in _PASSING_NAMES
+        isinstance(error, TimeoutError | ConnectionError)
+        or type(error).__name__ in _TRANSIENT_NAMES
     )
-    return known or getattr(error, "errno", None) in _PASSING
+    return known or getattr(error, "errno", None) in _TRANSIENT
