@@ -44,9 +44,7 @@ def true_colours(
         return result
     finer = image.width / frame.camera.width if frame.camera is not None else 1.0
     apart = 1.5 * pitch * finer
-    shrink = next(
-        (k for k in (4, 2) if k <= apart), 1
-    )  # still finer than the distance of the points
+    shrink = next((k for k in (4, 2) if k <= apart), 1)  # still finer than the points
     if view.colour_from_depth is None or view.lens is None:
         seen = np.stack(np.divmod(pixels, image.width)[::-1], axis=1).astype(np.float32)
     else:

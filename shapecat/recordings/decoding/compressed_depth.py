@@ -172,9 +172,7 @@ def _expand_rvl(words: Any, out: U2) -> bool:
         others, at = _number(words, at)  # (2) number of values after it
         if at < 0 or others > out.size - filled or zeros + others == 0:
             return False
-        for _ in range(
-            others
-        ):  # (3) each value, as a zigzag-coded difference from the previous one
+        for _ in range(others):  # (3) each value: its zigzag-coded difference from the previous
             value, at = _number(words, at)
             if at < 0:
                 return False
