@@ -512,7 +512,8 @@ def test_packed_colours_must_reach_last_point() -> None:
 
 def test_clock_counts_each_kind_of_fault() -> None:
     year2000 = 946_684_800 * SECOND
-    clock = Clock("/t")
+    nothing: Any = SimpleNamespace(messages=lambda _topics: iter(()))
+    clock = Clock(nothing, "/t")
     jump = 10 * SECOND
     times = [
         (EPOCH, EPOCH + 5),

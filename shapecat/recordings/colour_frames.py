@@ -2,23 +2,24 @@
 
 from collections import Counter, deque
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from functools import cached_property, lru_cache
+from functools import lru_cache
 from statistics import median
 from typing import Any, NamedTuple, TypeAlias
 
 import numpy as np
 
 from shapecat.cameras.colour import ColourView, LensCamera
-from shapecat.cameras.lenses import LENS_MODELS, distort
+from shapecat.cameras.lenses import distort
 from shapecat.errors import RecordingError
 from shapecat.geometry import IDENTITY, compose
 from shapecat.recordings.colour_streams import ColourStream
 from shapecat.recordings.decoding.colour_image import IMAGES
 from shapecat.recordings.frames import frames
+from shapecat.recordings.lens import distortion_problem
 from shapecat.recordings.messages import MALFORMED, Message, MessageError, reason_of
 from shapecat.recordings.pinhole import camera_of_info, distortion_of, is_rectified
 from shapecat.recordings.recording import Recording
-from shapecat.recordings.stamps import delay_ns, stamp_ns
+from shapecat.recordings.stamps import Clock, stamp_ns
 from shapecat.recordings.streams import Stream
 from shapecat.recordings.transforms.extrinsics import Extrinsics
 from shapecat.types import Camera, Frame
@@ -137,6 +138,7 @@ class _Partner:
         self.stream = colour
         self._known = known
         self._recording = recording
+        self._clock = Clock(recording, colour.topic)
         self._images: deque[_KeptImage] = deque()
         self._setbacks, self._latest = 0, 0
         self._calibration = b""
@@ -152,7 +154,7 @@ class _Partner:
             return
         try:
             image = self._recording.decode(message)
-            stamp = stamp_ns(image.header) or max(message.log_time_ns - self._delay_ns, 0)
+            stamp = self._clock.check(stamp_ns(image.header), message.log_time_ns)
         except (RecordingError, *MALFORMED) as error:
             self._left_out[reason_of(error, self.stream.topic)] += 1
             return
@@ -163,10 +165,6 @@ class _Partner:
         self._images.append(_KeptImage(stamp, message.log_time_ns, image, self._setbacks))
         while len(self._images) > _KEPT_IMAGES or self._too_much():
             self._images.popleft()
-
-    @cached_property
-    def _delay_ns(self) -> int:
-        return delay_ns(self._recording, self.stream.topic)
 
     def calibrate(self, message: Message) -> None:
         """Update the lens if the calibration has changed."""
@@ -263,9 +261,8 @@ class _Partner:
         if pose is not None:
             own = frame.frame_from_sensor
             return ColourView(image, lens, pose if own is None else compose(pose, own))
-        if same_shape and _alike(
-            lens, frame.camera, _EQUAL
-        ):  # two cameras are never calibrated to the same numbers
+        # Two cameras are never calibrated to the same numbers.
+        if same_shape and _alike(lens, frame.camera, _EQUAL):
             return ColourView(image, lens, None if straight else IDENTITY)
         names = (name or "a frame without a name" for name in (frame.frame_id, image.frame_id))
         msg = f"no transform between {' and '.join(names)}"
@@ -280,14 +277,9 @@ def _lens_of(info: Any, topic: str) -> LensCamera:
     camera, distorted = camera_of_info(info, rectified=is_rectified(topic))
     if not distorted:
         return LensCamera(camera)
-    model = str(info.distortion_model)
-    if model not in LENS_MODELS:
-        msg = f"unknown lens distortion {model!r}"
-        raise MessageError(msg)
-    coefficients = distortion_of(info)
-    if not np.isfinite(coefficients).all():
-        msg = "lens distortion that is not finite"
-        raise MessageError(msg)
+    model, coefficients = str(info.distortion_model), distortion_of(info)
+    if problem := distortion_problem(model, coefficients):
+        raise MessageError(problem)
     return LensCamera(camera, model, coefficients)
 
 

@@ -80,4 +80,4 @@ def frames(
     for source in sources.values():
         yield from source.finish(skipped)
         if needed is None:  # otherwise it has not seen every stamp
-            source.clock.report(recording)
+            source.clock.report()

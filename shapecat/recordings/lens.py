@@ -12,7 +12,7 @@ from shapecat.recordings.pinhole import PinholeFit, distortion_of, fit_pinhole
 from shapecat.recordings.recording import Recording
 from shapecat.types import Camera
 
-__all__ = ["Lens"]
+__all__ = ["Lens", "distortion_problem"]
 
 
 class Lens:
@@ -38,7 +38,9 @@ class Lens:
         coefficients = distortion_of(info)
         self._calibrate((camera, model, coefficients), depth)
         if self._rays is None:
-            self._warn(f"{_describe_problem(model, coefficients)} is ignored")
+            problem = distortion_problem(model, coefficients)
+            problem = problem or f"lens distortion {model!r} that cannot be inverted"
+            self._warn(f"{problem} is ignored")
             return {"depth": depth, "camera": camera}
         if self._fit is not None:
             return {"depth": depth, "camera": self._fit.camera}
@@ -62,13 +64,11 @@ class Lens:
         self._recording.warn(f"{self._topic}: {text}")
 
 
-def _describe_problem(model: str, coefficients: Sequence[float]) -> str:
-    """Describe a lens for which `undistorted_rays` returns None."""
+def distortion_problem(model: str, coefficients: Sequence[float]) -> str:
+    """Return what is wrong with the distortion in a CameraInfo; empty if it is usable."""
     if model not in LENS_MODELS:
         return f"unknown lens distortion {model!r}"
-    if not np.isfinite(coefficients).all():
-        return "lens distortion that is not finite"
-    return f"lens distortion {model!r} that cannot be inverted"
+    return "" if np.isfinite(coefficients).all() else "lens distortion that is not finite"
 
 
 def _points_along(rays: F8, depth: F4) -> F4:

@@ -26,7 +26,7 @@ from shapecat.recordings.pinhole import (
     still_fits,
 )
 from shapecat.recordings.recording import Recording
-from shapecat.recordings.stamps import Clock, delay_ns, stamp_ns
+from shapecat.recordings.stamps import Clock, stamp_ns
 from shapecat.recordings.streams import COMPRESSED, Stream, first_message
 from shapecat.recordings.viewpoint import find_viewpoint, seen_from
 from shapecat.types import Frame, Pose
@@ -51,7 +51,7 @@ class Source:
         self.recording = recording
         self.stream = stream
         self.index = 0
-        self.clock = Clock(stream.topic)
+        self.clock = Clock(recording, stream.topic)
 
     def read(self, message: Message, skipped: Counter[str]) -> Iterator[Frame]:
         """Yield the frames that a message completes: its own or an earlier one, or none."""
@@ -71,21 +71,14 @@ class Source:
         if not 0 <= message.log_time_ns < 2**63:
             msg = "log time out of range"
             raise MessageError(msg)
-        stamp, time = stamp_ns(header), message.log_time_ns
-        if stamp == 0:
-            time = max(time - self._delay_ns, 0)
         return Frame(
             topic=self.stream.topic,
             index=index,
-            stamp_ns=self.clock.check(stamp, time),
+            stamp_ns=self.clock.check(stamp_ns(header), message.log_time_ns),
             log_time_ns=message.log_time_ns,
             frame_id=str(header.frame_id),
             **content,
         )
-
-    @cached_property
-    def _delay_ns(self) -> int:
-        return delay_ns(self.recording, self.stream.topic)
 
 
 class PointsSource(Source):

@@ -1,6 +1,7 @@
 """Stamps of messages, and checks for unreliable clocks."""
 
 from contextlib import suppress
+from functools import cached_property
 from itertools import islice
 from typing import Any
 
@@ -46,20 +47,20 @@ def delay_ns(recording: Recording, topic: str) -> int:
 
 
 class Clock:
-    """Counts odd stamps in one stream."""
+    """Replaces missing stamps on one topic, and counts odd ones."""
 
-    def __init__(self, topic: str) -> None:
+    def __init__(self, recording: Recording, topic: str) -> None:
         """Start before the first stamp of a topic."""
-        self.topic = topic
+        self.recording, self.topic = recording, topic
         self.last: int | None = None
         self.delay: int | None = None
         self.counts = dict.fromkeys(_TEXTS, 0)
 
     def check(self, stamp: int, log_time: int) -> int:
-        """Return the stamp, or the log time if the stamp is 0; both in nanoseconds."""
+        """Return a stamp; if it is 0, the log time less the `delay_ns` of the topic. All in ns."""
         if stamp == 0:
             self.counts["zero"] += 1
-            return log_time
+            return max(log_time - self._delay_ns, 0)
         self.counts["epoch"] += stamp < _EPOCH_NS <= log_time
         self.counts["back"] += self.last is not None and stamp < self.last
         delay = log_time - stamp
@@ -67,11 +68,15 @@ class Clock:
         self.last, self.delay = stamp, delay
         return stamp
 
-    def report(self, recording: Recording) -> None:
+    @cached_property
+    def _delay_ns(self) -> int:
+        return delay_ns(self.recording, self.topic)
+
+    def report(self) -> None:
         """Add warnings about odd stamps to the recording."""
         for name, count in self.counts.items():
             if count:
-                recording.warn(f"{self.topic}: {_TEXTS[name].format(count)}")
+                self.recording.warn(f"{self.topic}: {_TEXTS[name].format(count)}")
 
 
 _TEXTS = {
