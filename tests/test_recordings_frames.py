@@ -15,7 +15,7 @@ from shapecat.errors import NoStreamError
 from shapecat.recordings import (
     MessageError,
     choose_streams,
-    cloud_streams,
+    depth_streams,
     frames,
     open_recording,
     read_transforms,
@@ -322,7 +322,7 @@ def test_definition_without_fields_of_its_type_is_skipped(tmp_path: Path) -> Non
             writer.add_message(channel, 0, b"\0\1\0\0\0", 0)
 
     with open_recording(path) as recording:
-        assert cloud_streams(recording) == ()
+        assert depth_streams(recording) == ()
         assert read_transforms(recording).frames == ()
         assert "skipped transforms" in recording.warnings[0]
 
@@ -611,7 +611,7 @@ def test_one_stream_of_a_sensor_is_chosen(tmp_path: Path) -> None:
     path = write(tmp_path / "a.mcap", items)
 
     with open_recording(path) as recording:
-        found = {s.topic: (s.kind, s.info_topic) for s in cloud_streams(recording)}
+        found = {s.topic: (s.kind, s.info_topic) for s in depth_streams(recording)}
         (chosen,) = choose_streams(recording)
         wanted = choose_streams(recording, ["cam/depth/points", "/cam/depth/points"])
 

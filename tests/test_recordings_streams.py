@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from shapecat.errors import NoStreamError
-from shapecat.recordings import choose_streams, cloud_streams, frames, open_recording
+from shapecat.recordings import choose_streams, depth_streams, frames, open_recording
 from shapecat.recordings.colour_streams import choose_colour
 from shapecat.recordings.decoding.depth_image import DEPTH_ENCODINGS
 from shapecat.recordings.sensors import by_sensor
@@ -43,7 +43,7 @@ def test_calibration_is_found_beside_topic_without_slash(tmp_path: Path, lead: s
     ]
 
     with open_recording(write(tmp_path / "a.mcap", items)) as recording:
-        found = [(s.topic, s.info_topic) for s in cloud_streams(recording)]
+        found = [(s.topic, s.info_topic) for s in depth_streams(recording)]
 
     assert found == [(f"{lead}depth/image", f"{lead}depth/camera_info")]
 
@@ -102,7 +102,7 @@ def test_confidence_map_is_not_taken_for_depth(tmp_path: Path) -> None:
     with open_recording(write(tmp_path / "a.mcap", items)) as recording:
         assert [stream.topic for stream in choose_streams(recording)] == [depth]
         assert [stream.topic for stream in choose_streams(recording, [confidence])] == [confidence]
-        assert confidence not in {stream.topic for stream in cloud_streams(recording)}
+        assert confidence not in {stream.topic for stream in depth_streams(recording)}
 
 
 @pytest.mark.parametrize(
@@ -199,7 +199,7 @@ def test_depth_may_be_a_png_file(tmp_path: Path, topic: str, kind: str, *, known
     ]
 
     with open_recording(write(tmp_path / "a.mcap", items)) as recording:
-        streams = cloud_streams(recording)
+        streams = depth_streams(recording)
         found = list(frames(recording, streams, skipped=Counter()))
 
     assert len(found) == known
@@ -251,7 +251,7 @@ def test_robots_of_one_kind_stay_apart_with_clouds(tmp_path: Path) -> None:
         items += in_frame([(f"{robot}/camera/depth/points", EPOCH, points)], "optical")
 
     with open_recording(write(tmp_path / "a.mcap", items)) as recording:
-        sensors = by_sensor(cloud_streams(recording))
+        sensors = by_sensor(depth_streams(recording))
 
     assert [{stream.topic[:3] for stream in sensor} for sensor in sensors] == [{"/r1"}, {"/r2"}]
 

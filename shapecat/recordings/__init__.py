@@ -4,7 +4,7 @@ from shapecat.recordings.containers.opening import open_recording
 from shapecat.recordings.frames import frames
 from shapecat.recordings.messages import Channel, Message, MessageError, Topic
 from shapecat.recordings.recording import Recording
-from shapecat.recordings.streams import Stream, choose_streams, cloud_streams
+from shapecat.recordings.streams import Stream, choose_streams, depth_streams
 from shapecat.recordings.transforms.buffer import (
     TransformBuffer,
     TransformError,
@@ -22,7 +22,7 @@ __all__ = [
     "TransformBuffer",
     "TransformError",
     "choose_streams",
-    "cloud_streams",
+    "depth_streams",
     "fixed_frame",
     "frames",
     "open_recording",

@@ -20,7 +20,7 @@ from shapecat.recordings.streams import (
     COMPRESSED,
     IMAGE,
     Stream,
-    cloud_streams,
+    depth_streams,
     first_messages,
     info_topic_of,
 )
@@ -121,7 +121,7 @@ def choose_colour(
     else:
         own = [one for one in streams if one.kind == "cloud" and one.topic == stream.topic]
         images = [one for one in streams if one.kind != "cloud" and not one.grey]
-        sensors = by_sensor(cloud_streams(recording)) if images else []
+        sensors = by_sensor(depth_streams(recording)) if images else []
         found = own or [one for one in images if _belongs(one, stream, sensors)]
         single = len({one.topic.removesuffix("/compressed") for one in images}) == 1
         if not found and single and len(sensors) == 1:

@@ -13,7 +13,7 @@ __all__ = [
     "MessageError",
     "Needed",
     "Selection",
-    "Stamp",
+    "TimeLimit",
     "Topic",
     "Topics",
     "reason_of",
@@ -23,7 +23,7 @@ __all__ = [
 
 Topics: TypeAlias = Collection[str] | None
 """The names of topics; None means all."""
-Stamp: TypeAlias = int | None
+TimeLimit: TypeAlias = int | None
 """A log time in nanoseconds; None means no limit."""
 Needed: TypeAlias = Callable[[str, int], bool] | None
 """Whether a message's data is needed, given its topic and log time (ns); None means always."""
@@ -48,8 +48,8 @@ class Selection(NamedTuple):
     """The messages of a recording to read; see `Recording.messages`."""
 
     topics: Topics
-    start_ns: Stamp
-    stop_ns: Stamp
+    start_ns: TimeLimit
+    stop_ns: TimeLimit
     needed: Needed
 
     def has_topic(self, topic: str) -> bool:

@@ -8,7 +8,7 @@ from shapecat.recordings.colour_streams import choose_colour
 from shapecat.recordings.containers.opening import open_recording
 from shapecat.recordings.files import input_size
 from shapecat.recordings.recording import Recording
-from shapecat.recordings.streams import Stream, cloud_streams
+from shapecat.recordings.streams import Stream, depth_streams
 
 __all__ = ["describe_recording"]
 
@@ -21,7 +21,7 @@ def describe_recording(path: Path) -> dict[str, Any]:
     RecordingError : the recording cannot be read.
     """
     with open_recording(path) as recording:
-        streams = {stream.topic: stream for stream in cloud_streams(recording)}
+        streams = {stream.topic: stream for stream in depth_streams(recording)}
         uses = _uses(recording, streams)
         start, end = recording.start_ns, recording.end_ns
         return {

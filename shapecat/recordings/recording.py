@@ -10,7 +10,7 @@ from shapecat.recordings.messages import (
     Message,
     Needed,
     Selection,
-    Stamp,
+    TimeLimit,
     Topic,
     Topics,
 )
@@ -57,8 +57,8 @@ class Recording(ABC):
     def messages(
         self,
         topics: Topics = None,
-        start_ns: Stamp = None,
-        stop_ns: Stamp = None,
+        start_ns: TimeLimit = None,
+        stop_ns: TimeLimit = None,
         needed: Needed = None,
     ) -> Iterator[Message]:
         """Yield undecoded messages in constant memory.

@@ -21,7 +21,7 @@ __all__ = [
     "INFO",
     "Stream",
     "choose_streams",
-    "cloud_streams",
+    "depth_streams",
     "first_message",
     "first_messages",
     "info_topic_of",
@@ -41,7 +41,7 @@ _OTHER_WORDS = ("confidence", "disparity", "thermal", "mask")
 """Images on topics with these words, encoded like depth, are something else."""
 
 
-def cloud_streams(recording: Recording, wanted: Sequence[str] = ()) -> tuple[Stream, ...]:
+def depth_streams(recording: Recording, wanted: Sequence[str] = ()) -> tuple[Stream, ...]:
     """Find the clouds and depth images of a recording, sorted by topic.
 
     The encoding of the first images, of which some may be blank, distinguishes depth from colour.
@@ -81,7 +81,7 @@ def choose_streams(recording: Recording, wanted: Sequence[str] = ()) -> tuple[St
     NoStreamError : no stream can be processed, a wanted one is missing or lacks a calibration, or
         nothing is wanted and there are several sensors.
     """
-    streams = cloud_streams(recording, wanted)
+    streams = depth_streams(recording, wanted)
     if wanted:
         return _wanted(recording, streams, wanted)
     usable = [stream for stream in streams if stream.usable]
