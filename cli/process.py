@@ -221,7 +221,7 @@ def _run(
         return
     started = open_executor(name, workers=workers, address=scheduler)
     with _closing(started) as executor, watcher:
-        if getattr(executor, "lacks_workers", bool)():
+        if executor.lacks_workers():
             watcher.note("the scheduler has no worker yet: waiting for one")
         yield from process_on(executor, batch.tasks, watcher, cores=cores, manifest=batch.manifest)
 
@@ -232,7 +232,7 @@ def _closing(executor: Any) -> Iterator[Any]:
     try:
         yield executor
     except Stopped:
-        getattr(executor, "stop", executor.terminate)()  # Dask and Ray have no way to ask
+        executor.stop()
         raise
     except BaseException:
         executor.terminate()

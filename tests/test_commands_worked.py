@@ -3,7 +3,7 @@
 import json
 import re
 from collections.abc import Callable
-from concurrent.futures import Executor, Future
+from concurrent.futures import Future
 from importlib import import_module
 from pathlib import Path
 from types import SimpleNamespace
@@ -12,6 +12,7 @@ from typing import Any
 import pytest
 from click.testing import Result
 
+from shapecat.executors import WorkerExecutor
 from shapecat.outputs.counts import count_words
 from shapecat.outputs.exports.dataset_frames import Selection
 from shapecat.outputs.exports.formats import Exported
@@ -413,7 +414,7 @@ def test_train_names_the_defects_of_its_model(
     assert re.match(said, done.stderr)
 
 
-class _JobCollector(Executor):
+class _JobCollector(WorkerExecutor):
     """Keeps the jobs it is given, and fails them."""
 
     def __init__(self) -> None:
@@ -424,6 +425,9 @@ class _JobCollector(Executor):
         future: Future[Any] = Future()
         future.set_exception(ValueError("not processed"))
         return future
+
+    def terminate(self) -> None:
+        """There are no workers."""
 
 
 def test_workers_of_a_cluster_get_absolute_paths(

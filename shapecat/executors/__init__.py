@@ -1,14 +1,14 @@
-"""Where tasks run: every executor has the interface of `concurrent.futures.Executor`.
+"""Where tasks run: every executor is a `WorkerExecutor`.
 
 Executors do not depend on the tasks. `local` needs no other package; `dask` and `ray`
 are thin adapters for libraries in the extras ``cluster`` and ``ray``.
 """
 
 from collections.abc import Callable
-from concurrent.futures import Executor
 
 from shapecat.errors import ConfigError
 from shapecat.executors.cores import share_cores, single_threaded, usable_cores
+from shapecat.executors.interface import WorkerExecutor
 from shapecat.executors.local import LocalExecutor
 from shapecat.executors.mailbox import Mailbox, post
 from shapecat.executors.worker import WorkerLostError
@@ -16,6 +16,7 @@ from shapecat.executors.worker import WorkerLostError
 __all__ = [
     "LocalExecutor",
     "Mailbox",
+    "WorkerExecutor",
     "WorkerLostError",
     "is_dropped",
     "is_lost",
@@ -35,7 +36,7 @@ _DROPPED = {"CancelledError", "FutureCancelledError", "CommClosedError"}
 """Errors by name, since neither Dask nor Ray need be installed."""
 
 
-def open_executor(name: str, *, workers: int, address: str | None = None) -> Executor:
+def open_executor(name: str, *, workers: int, address: str | None = None) -> WorkerExecutor:
     """Start worker processes, or connect to running ones.
 
     Parameters
@@ -54,19 +55,19 @@ def open_executor(name: str, *, workers: int, address: str | None = None) -> Exe
     return _OPENERS[name](workers, address)
 
 
-def _dask(workers: int, address: str | None) -> Executor:
+def _dask(workers: int, address: str | None) -> WorkerExecutor:
     from shapecat.executors.dask import open_dask  # noqa: PLC0415  an extra
 
     return open_dask(workers, address)
 
 
-def _ray(workers: int, address: str | None) -> Executor:
+def _ray(workers: int, address: str | None) -> WorkerExecutor:
     from shapecat.executors.ray import RayExecutor  # noqa: PLC0415  an extra
 
     return RayExecutor(workers, address)
 
 
-_OPENERS: dict[str, Callable[[int, str | None], Executor]] = {
+_OPENERS: dict[str, Callable[[int, str | None], WorkerExecutor]] = {
     "local": lambda workers, _: LocalExecutor(workers),
     "dask": _dask,
     "ray": _ray,

@@ -1,11 +1,12 @@
 """Adapter for Dask, whose client already has the interface of `concurrent.futures`."""
 
-from concurrent.futures import Executor, Future
+from concurrent.futures import Future
 from contextlib import suppress
 from typing import Any
 
 from shapecat.errors import ConfigError
 from shapecat.executors.cores import single_threaded
+from shapecat.executors.interface import WorkerExecutor
 
 __all__ = ["open_dask"]
 
@@ -13,7 +14,7 @@ _ANSWER_S = 30
 _CLOSE_S = 10
 
 
-class _DaskExecutor(Executor):
+class _DaskExecutor(WorkerExecutor):
     """The executor of a client; it also closes the client and the cluster started here."""
 
     def __init__(self, client: Any, cluster: Any) -> None:
@@ -45,7 +46,7 @@ class _DaskExecutor(Executor):
                     each.close(timeout=timeout_s)
 
 
-def open_dask(workers: int, address: str | None) -> Executor:
+def open_dask(workers: int, address: str | None) -> WorkerExecutor:
     """Connect to a scheduler, or start one with processes on this machine.
 
     The parameters are as for `open_executor`.

@@ -4,12 +4,13 @@ import atexit
 import signal
 import threading
 from collections.abc import Callable
-from concurrent.futures import Executor, Future
+from concurrent.futures import Future
 from contextlib import suppress
 from multiprocessing import resource_tracker
 from queue import Empty, SimpleQueue
 from typing import Any
 
+from shapecat.executors.interface import WorkerExecutor
 from shapecat.executors.worker import Task, Worker, WorkerLostError
 
 __all__ = ["LocalExecutor"]
@@ -17,7 +18,7 @@ __all__ = ["LocalExecutor"]
 _SIGNALS = {signal.SIGINT, signal.SIGTERM}
 
 
-class LocalExecutor(Executor):
+class LocalExecutor(WorkerExecutor):
     """Runs tasks in spawned processes, as `concurrent.futures.ProcessPoolExecutor` does.
 
     It differs as follows: a worker that dies fails only its own tasks and is replaced; workers end

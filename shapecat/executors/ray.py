@@ -1,10 +1,11 @@
 """Adapter for Ray: its remote functions behind the interface of `concurrent.futures`."""
 
-from concurrent.futures import Executor, Future
+from concurrent.futures import Future
 from typing import Any
 
 from shapecat.errors import ConfigError
 from shapecat.executors.cores import THREAD_LIMITS
+from shapecat.executors.interface import WorkerExecutor
 
 __all__ = ["RayExecutor"]
 
@@ -12,7 +13,7 @@ _STORE_BYTES = 100 * 2**20
 """Shared memory for arguments and results, which are small; Ray's default is a third of all."""
 
 
-class RayExecutor(Executor):
+class RayExecutor(WorkerExecutor):
     """Runs each call as a Ray task on one core."""
 
     def __init__(self, workers: int, address: str | None) -> None:
