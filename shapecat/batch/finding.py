@@ -7,6 +7,7 @@ from contextlib import suppress
 from dataclasses import dataclass
 from hashlib import sha256
 from itertools import pairwise
+from operator import attrgetter
 from pathlib import Path, PurePosixPath
 from typing import Any
 
@@ -79,7 +80,7 @@ def _of_path(path: Path) -> Source:
     return Source(str(path), "", whole.name if path.is_dir() else path.stem, whole.parent.name)
 
 
-def _of_url(url: str, key: str, size: int) -> Source:
+def _of_url(url: str, key: str = "", size: int = 0) -> Source:
     pure = PurePosixPath(url.partition("://")[2].partition("?")[0])
     stem = pure.stem if _named_like_one(pure.name) else pure.name
     return Source("", url, stem, pure.parent.name, key, size)
@@ -94,13 +95,16 @@ def _at(url: str) -> list[Source]:
     """
     location = Location(url)
     if any(character in url.partition("?")[0] for character in "*["):  # signed URLs have queries
-        found = [(name, content_key(info), _size(info)) for name, info in location.matches()]
-        kept = [known for known in found if _named_like_one(known[0])]
-        if kept or location.info() is None:  # otherwise a name with brackets
-            return [_of_url(*known) for known in sorted(kept)]
+        found = [
+            _of_url(name, content_key(info), _size(info))
+            for name, info in location.matches()
+            if _named_like_one(name)
+        ]
+        if found or location.info() is None:  # otherwise a name with brackets
+            return sorted(found, key=attrgetter("url"))
     if url.endswith("/"):
-        return [_of_url(*known) for known in sorted(_search_remote(location))]
-    return [_of_url(url, "", 0)]
+        return sorted(_search_remote(location), key=attrgetter("url"))
+    return [_of_url(url)]
 
 
 def look_at(url: str) -> tuple[str, int]:
@@ -124,9 +128,9 @@ def _size(info: Mapping[str, Any]) -> int:
     return int(info.get("size") or 0)
 
 
-def _search_remote(location: Location) -> Iterator[tuple[str, str, int]]:
-    """Yield URL, key and size in bytes of the recordings and ROS 2 bag folders below a folder."""
-    files: list[tuple[str, str, int]] = []
+def _search_remote(location: Location) -> Iterator[Source]:
+    """Yield the recordings and ROS 2 bag folders below a folder."""
+    files: list[Source] = []
     bags, runs = set(), set()
     for url, info in location.walk():
         parent, _, name = url.rpartition("/")
@@ -135,19 +139,19 @@ def _search_remote(location: Location) -> Iterator[tuple[str, str, int]]:
         elif name in {"run.json", "frames.parquet"}:
             runs.add(parent)
         elif (_named_like_one(name) or _is_packed(name)) and "/." not in url:
-            files.append((url, content_key(info), _size(info)))
-    parts: dict[str, list[tuple[str, str, int]]] = {bag: [] for bag in bags}
-    for url, key, size in files:
-        parent = url.rpartition("/")[0]
+            files.append(_of_url(url, content_key(info), _size(info)))
+    parts: dict[str, list[Source]] = {bag: [] for bag in bags}
+    for file in files:
+        parent = file.url.rpartition("/")[0]
         if parent in bags:
-            parts[parent].append((url, key, size))
-        elif parent not in runs and _is_packed(url):
-            _log.error("%s: %s", url, _UNPACK)
+            parts[parent].append(file)
+        elif parent not in runs and _is_packed(file.url):
+            _log.error("%s: %s", file.url, _UNPACK)
         elif parent not in runs:
-            yield url, key, size
+            yield file
     for bag, found in parts.items():
         if found:
-            yield bag, _key_of_all(key for _, key, _ in found), sum(size for *_, size in found)
+            yield _of_url(bag, _key_of_all(f.key for f in found), sum(f.bytes for f in found))
 
 
 def _find_paths(sources: Sequence[Path]) -> tuple[list[Path], int]:
