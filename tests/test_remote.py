@@ -567,12 +567,12 @@ def test_scratch_that_may_be_in_use_is_not_removed(
 
     if case == "no locks":
         monkeypatch.setattr("fcntl.flock", no_locks)
-    with scratch_folder("shapecat-scratch-") as mine:
+    with scratch_folder() as mine:
         os.utime(mine, (0, 0))
         if case == "another machine":
             monkeypatch.setattr("socket.gethostname", lambda: "robot2")
             monkeypatch.setattr("fcntl.flock", lambda *_: None)
-        with scratch_folder("shapecat-scratch-"):
+        with scratch_folder():
             assert mine.exists()
     assert not list(own_scratch.iterdir())
 

@@ -3,7 +3,7 @@
 import colorsys
 import zlib
 
-__all__ = ["CATEGORY_COLOURS", "colour_of"]
+__all__ = ["CATEGORY_COLOURS", "colour_of", "hex_colour"]
 
 CATEGORY_COLOURS: dict[str, tuple[int, int, int]] = {
     "cup": (229, 72, 77),
@@ -33,3 +33,14 @@ def colour_of(category: str) -> tuple[int, int, int]:
     hue = zlib.crc32(category.encode()) / 2**32
     red, green, blue = (round(255 * part) for part in colorsys.hls_to_rgb(hue, 0.6, 0.6))
     return red, green, blue
+
+
+def hex_colour(category: str) -> str:
+    """Return the colour of a category as text.
+
+    Examples
+    --------
+    >>> hex_colour("cup")
+    '#e5484d'
+    """
+    return "#{:02x}{:02x}{:02x}".format(*colour_of(category))

@@ -14,7 +14,7 @@ import numpy as np
 from shapecat.arrays import F8
 from shapecat.geometry import box_corners, gravity_rotation, rotation_from_quaternion
 from shapecat.outputs.colouring import ExportedFrame
-from shapecat.outputs.colours import colour_of
+from shapecat.outputs.colours import hex_colour
 from shapecat.outputs.level_clouds import finite_points, upward, write_pcd
 from shapecat.runs.finished import FinishedRun
 from shapecat.types import LabelledObject, Pose
@@ -55,10 +55,7 @@ def _folder(out: Path, kind: str) -> Path:
 
 def _classes(finished: FinishedRun, kind: str) -> str:
     names = ("unknown", *finished.categories)
-    classes = [
-        {"name": name, "id": k, "color": "#" + "".join(f"{part:02x}" for part in colour_of(name))}
-        for k, name in enumerate(names)
-    ]
+    classes = [{"name": name, "id": k, "color": hex_colour(name)} for k, name in enumerate(names)]
     made_by = {"name": "shapecat", "version": finished.run["versions"]["shapecat"]}
     content = {"classes": classes, "default": 0, "type": "object_detection", "format": kind}
     return json.dumps({**content, "created_with": made_by}, indent=1)

@@ -10,7 +10,7 @@ from string import Template
 import numpy as np
 
 from shapecat.arrays import F8, I4, Bool
-from shapecat.outputs.colours import colour_of
+from shapecat.outputs.colours import hex_colour
 from shapecat.outputs.counts import plural
 from shapecat.outputs.report.pictures import StripFrame, TrackPictures
 from shapecat.outputs.report.surfaces import SIDE, SurfaceDrawing
@@ -19,7 +19,7 @@ from shapecat.outputs.wording import confidence_text, time_span
 from shapecat.runs.labels.track_table import TrackRow
 from shapecat.types import UNKNOWN
 
-__all__ = ["Card", "asset", "card_html", "css_colour", "frame_html", "is_unsure", "template"]
+__all__ = ["Card", "asset", "card_html", "frame_html", "is_unsure", "template"]
 
 _LINES = 3  # categories in a timeline
 _MOST_STEPS = 80
@@ -47,11 +47,6 @@ def template(name: str) -> Template:
     return Template(asset(name))
 
 
-def css_colour(category: str) -> str:
-    """Return the colour of a category in CSS notation."""
-    return "#" + "".join(f"{part:02x}" for part in colour_of(category))
-
-
 def is_unsure(row: TrackRow) -> bool:
     """Return whether a track should be checked first: its category is unknown or uncertain."""
     return row.category == UNKNOWN or row.confidence < 0.8
@@ -73,7 +68,7 @@ def card_html(card: Card, categories: Sequence[str], names: Sequence[str], end: 
         guess=_guess(row),
         value=f"{row.confidence:.4g}",
         first=f"{line.seconds[0] if len(line.seconds) else 0.0:.4g}",
-        colour=css_colour(row.category),
+        colour=hex_colour(row.category),
         confidence=confidence_text(row.confidence),
         pictures=_pictures(card),
         line=_time_line(line, categories, end),
@@ -143,7 +138,7 @@ def _digit(name: str, names: Sequence[str]) -> str:
 
 def _bar(name: str, share: float, digit: str) -> str:
     key = f"<kbd>{digit}</kbd>" if digit else "<span></span>"
-    style = f"--c:{css_colour(name)};--w:{share:.1%}"
+    style = f"--c:{hex_colour(name)};--w:{share:.1%}"
     return (
         f'<li><button type="button" tabindex="-1" data-label="{escape(name)}" style="{style}">'
         f"{key}<span>{escape(name)}</span><i></i><span>{confidence_text(share)}</span>"
@@ -169,7 +164,7 @@ def _time_line(line: Timeline, categories: Sequence[str], end: float) -> str:
             continue
         y = np.round(33 - 31 * line.causal[chosen, k], 1)
         dots = " ".join(f"{a:g},{b:g}" for a, b in zip(x.tolist(), y.tolist(), strict=True))
-        lines.append(f'<polyline points="{dots}" stroke="{css_colour(categories[k])}"/>')
+        lines.append(f'<polyline points="{dots}" stroke="{hex_colour(categories[k])}"/>')
     seen = "".join(
         f'<rect class="seen" x="{a:.1f}" y="38" width="{max(b - a, 1.5):.1f}" height="3" rx="1"/>'
         for a, b in _spans(line.seconds, line.seen, 300 / end)
@@ -230,6 +225,6 @@ def _box(
     top, height = (100 * side / frame.height for side in box[1::2])
     style = f"left:{left:.1f}%;top:{top:.1f}%;width:{width:.1f}%;height:{height:.1f}%"
     return (
-        f'<span class="box" data-track="{track}" style="{style};--c:{css_colour(category)}">'
+        f'<span class="box" data-track="{track}" style="{style};--c:{hex_colour(category)}">'
         f"<b>#{track}<i> {escape(category)}</i></b></span>"
     )

@@ -13,12 +13,12 @@ from typing import Any
 import numpy as np
 
 from shapecat.arrays import F8
+from shapecat.outputs.colours import hex_colour
 from shapecat.outputs.counts import by_count, count_words, plural
 from shapecat.outputs.report.cards import (
     Card,
     asset,
     card_html,
-    css_colour,
     frame_html,
     is_unsure,
     template,
@@ -163,7 +163,7 @@ def _strip(frames: Sequence[StripFrame], cards: Sequence[Card]) -> str:
 def _chip(name: str, count: int) -> str:
     return (
         f'<button type="button" class="chip" data-category="{escape(name)}" aria-pressed="true" '
-        f'style="--c:{css_colour(name)}"><span class="dot"></span>{escape(name)} <b>{count}</b>'
+        f'style="--c:{hex_colour(name)}"><span class="dot"></span>{escape(name)} <b>{count}</b>'
         "</button>"
     )
 
@@ -233,7 +233,7 @@ def _data(names: Sequence[str], run: Mapping[str, Any], table: TrackTable, *, se
         "categories": names,
         "known": [UNKNOWN, *CATEGORIES, *run["model"]["categories"]],
         "oneFrame": run["fixed_frame"] is not None,
-        "colours": {name: css_colour(name) for name in names},
+        "colours": {name: hex_colour(name) for name in names},
         "served": served,
         "key": _key(run, table),
     }
@@ -249,7 +249,7 @@ def _key(run: Mapping[str, Any], table: TrackTable) -> str:
 
 def _listed(item: Listed) -> str:
     share = "".join(
-        f'<span style="--c:{css_colour(name)};--n:{count}" title="{escape(name)} {count}"></span>'
+        f'<span style="--c:{hex_colour(name)};--n:{count}" title="{escape(name)} {count}"></span>'
         for name, count in by_count(item.categories)
     )
     words = count_words(item.categories, "no tracks")
