@@ -5,7 +5,7 @@ import itertools
 import math
 import time
 from collections.abc import Iterable, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from functools import partial
 from typing import Any, NamedTuple, TypeAlias
 
@@ -37,7 +37,7 @@ __all__ = [
 
 Row: TypeAlias = tuple[str, ...]
 Rows: TypeAlias = list[Row]
-Ranges: TypeAlias = Sequence[tuple[str, int, float]]
+Ranges: TypeAlias = tuple[tuple[str, int, float], ...]
 """Range, number of views and accuracy."""
 
 _ELEVATIONS = (-math.inf, 15.0, 30.0, 45.0, 60.0, math.inf)
@@ -98,14 +98,14 @@ class Report:
     rejected_known: float | None = None
     skipped: int = 0
     calibration: tuple[metrics.Bin, ...] = ()
-    by_distance: tuple[tuple[str, int, float], ...] = field(default=())
-    by_points: tuple[tuple[str, int, float], ...] = field(default=())
+    by_distance: Ranges = ()
+    by_points: Ranges = ()
     fused: tuple[Fused, ...] = ()
-    by_elevation: tuple[tuple[str, int, float], ...] = field(default=())
+    by_elevation: Ranges = ()
     baselines: tuple[Compared, ...] = ()
 
     @property
-    def breakdowns(self) -> tuple[tuple[str, tuple[tuple[str, int, float], ...]], ...]:
+    def breakdowns(self) -> tuple[tuple[str, Ranges], ...]:
         """The name and the rows of each breakdown that has rows."""
         parts = (
             ("distance", self.by_distance),
@@ -150,6 +150,7 @@ def evaluate(views: DescribedViews, categorizer: Categorizer) -> Report:
     posteriors = prediction.posteriors[known]
     predicted = posteriors.argmax(axis=1).astype(np.int64)
     table = metrics.confusion(truth, predicted, len(categories))
+    elevations = views.elevations if len(views.elevations) else np.full(known.shape, np.nan)
     novelty = None
     if not np.all(known):
         novelty = _novelty_figures(prediction.novelty[~known], prediction.novelty[known])
@@ -169,12 +170,7 @@ def evaluate(views: DescribedViews, categorizer: Categorizer) -> Report:
         calibration=metrics.calibration_curve(truth, posteriors),
         by_distance=_accuracy_over(views.distances[known], truth == predicted, _DISTANCES_M, " m"),
         by_points=_accuracy_over(views.points[known], truth == predicted, _POINTS, ""),
-        by_elevation=_accuracy_over(
-            views.elevations[known] if len(views.elevations) else np.zeros(0),
-            truth == predicted if len(views.elevations) else np.zeros(0, bool),
-            _ELEVATIONS,
-            "°",
-        ),
+        by_elevation=_accuracy_over(elevations[known], truth == predicted, _ELEVATIONS, "°"),
         fused=fuse_views(truth, posteriors, views.instances[known]),
     )
 
@@ -204,9 +200,7 @@ def _novelty_figures(unknown: F4, known: F4) -> dict[str, float | None]:
     }
 
 
-def _accuracy_over(
-    values: np.ndarray, right: I4, edges: Sequence[float], unit: str
-) -> tuple[tuple[str, int, float], ...]:
+def _accuracy_over(values: np.ndarray, right: I4, edges: Sequence[float], unit: str) -> Ranges:
     """Return (range, views, accuracy) for each range between ``edges`` that has views."""
     rows = []
     for low, high in itertools.pairwise(edges):
@@ -218,7 +212,7 @@ def _accuracy_over(
     return tuple(rows)
 
 
-def _as_dicts(rows: Sequence[tuple[str, int, float]]) -> list[dict[str, Any]]:
+def _as_dicts(rows: Ranges) -> list[dict[str, Any]]:
     return [{"range": name, "n": n, "accuracy": value} for name, n, value in rows]
 
 
@@ -284,8 +278,8 @@ def _confusion(report: Report) -> Rows:
 
 def breakdown_table(name: str, ranges: Ranges) -> tuple[Row, Rows]:
     """Return header and rows of a table of accuracies."""
-    rows = [(label, str(count), figure_text(value)) for label, count, value in ranges]
-    return (name, "views", "accuracy"), [*rows]
+    rows: Rows = [(label, str(count), figure_text(value)) for label, count, value in ranges]
+    return (name, "views", "accuracy"), rows
 
 
 def comparison_tables(report: Report, missing: str = "–") -> list[tuple[str, Row, Rows]]:

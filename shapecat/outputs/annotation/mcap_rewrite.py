@@ -19,6 +19,9 @@ from shapecat.recordings.decoding.decoders import LIBRARY_ERRORS, schema_of
 
 __all__ = ["rewrite"]
 
+_Registered = tuple[int, Callable[[bytes | memoryview], memoryview] | None]
+"""The number of a channel in the written file, and the conversion of its messages."""
+
 
 def rewrite(
     recording: Recording,
@@ -59,9 +62,7 @@ class _Source:
     def __init__(self, writer: Writer, *, convert: bool) -> None:
         self.writer = writer
         self.convert = convert
-        self.known: dict[
-            Channel, tuple[int, Callable[[bytes | memoryview], memoryview] | None]
-        ] = {}
+        self.known: dict[Channel, _Registered] = {}
         self.schemas: dict[tuple[str, str, bytes], int] = {}
         self.raw: dict[str, int] = {}
 
@@ -77,17 +78,13 @@ class _Source:
         times = (message.log_time_ns, bytes(data), message.publish_time_ns)
         self.writer.add_message(number, *times, message.sequence)
 
-    def number(
-        self, channel: Channel
-    ) -> tuple[int, Callable[[bytes | memoryview], memoryview] | None]:
+    def number(self, channel: Channel) -> _Registered:
         """Return the number of a channel, and the function that converts its messages, or None."""
         if channel not in self.known:
             self.known[channel] = self._register(channel)
         return self.known[channel]
 
-    def _register(
-        self, channel: Channel
-    ) -> tuple[int, Callable[[bytes | memoryview], memoryview] | None]:
+    def _register(self, channel: Channel) -> _Registered:
         if not (self.convert and channel.encoding == "ros1"):
             described = AnnotationChannel(
                 channel.topic, channel.encoding, *schema_of(channel), channel.metadata
