@@ -180,6 +180,7 @@ def process(
         watcher = open_progress(progress, batch.tasks)
         tally = _Tally(keep_all=as_json)
         for outcome in _run(batch, watcher, jobs, executor, scheduler):
+            watcher.ended(outcome)
             tally.add(outcome)
     with for_any_reader():
         if as_json:
@@ -210,6 +211,7 @@ def _run(
     from shapecat.batch import process_here, process_on
     from shapecat.executors import open_executor, share_cores
 
+    report = watcher.progress
     workers, cores = share_cores(jobs, sum(task.status != "complete" for task in batch.tasks))
     if len(batch.tasks) > 1:
         watcher.plan(describe_plan(batch.tasks, batch.left_out, workers, cores))
@@ -217,13 +219,13 @@ def _run(
         watcher.plan("no recordings in this shard")
     if name == "local" and scheduler is None and workers <= 1:
         with watcher:
-            yield from process_here(batch.tasks, watcher, cores=cores, manifest=batch.manifest)
+            yield from process_here(batch.tasks, report, cores=cores, manifest=batch.manifest)
         return
     started = open_executor(name, workers=workers, address=scheduler)
     with _closing(started) as executor, watcher:
         if executor.lacks_workers():
             watcher.note("the scheduler has no worker yet: waiting for one")
-        yield from process_on(executor, batch.tasks, watcher, cores=cores, manifest=batch.manifest)
+        yield from process_on(executor, batch.tasks, report, cores=cores, manifest=batch.manifest)
 
 
 @contextmanager

@@ -44,19 +44,14 @@ class Watcher:
 
     def __init__(self, act: Callable[[str, str], None] | None = None) -> None:
         self.reported: set[str] = set()
-        self.outcomes: list[Outcome] = []
         self._act = act
 
-    def progress(self, folder: str, phase: str, done: int, total: int | None) -> None:
+    def __call__(self, folder: str, phase: str, done: int, total: int | None) -> None:
         """Receive the progress of a recording."""
         assert total is None or done <= total
         self.reported.add(folder)
         if self._act is not None:
             self._act(folder, phase)
-
-    def ended(self, outcome: Outcome) -> None:
-        """Receive the outcome of a recording."""
-        self.outcomes.append(outcome)
 
 
 @pytest.fixture(scope="module")
@@ -321,12 +316,12 @@ class Fragile(Executor):
 
 
 def test_recording_that_kills_its_workers_is_given_up(recordings: Path, tmp_path: Path) -> None:
-    fragile, watcher = Fragile("bag"), Watcher()
+    fragile = Fragile("bag")
     with planned(recordings, tmp_path, end_s=0.1) as batch:
-        drain(batch, fragile, watcher)
+        outcomes = drain(batch, fragile, Watcher())
 
     assert fragile.begun.count("bag") == 2
-    (failed,) = [o for o in watcher.outcomes if o.job.folder.name == "bag"]
+    (failed,) = [o for o in outcomes if o.job.folder.name == "bag"]
     assert "gave up after 2 tries" in failed.message
     assert states(tmp_path) == {**ALL_DONE, "bag": "failed"}
 

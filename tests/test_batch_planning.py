@@ -574,12 +574,15 @@ def test_batch_notices_run_that_was_replaced_alone(
     assert status_of(job, source, out) == ("complete" if name is None else "check")
 
 
+def ignore(*_: object) -> None:
+    """Ignore progress."""
+
+
 def overwritten(sources: Path, out: Path, *, most: int = 9, **changes: Any) -> dict[str, Any]:
     """Overwrite, until ``most`` runs are complete; return the status with which each began."""
     job = Job(Path(), Path(), mcap=False, rrd=False, overwrite=True, **changes)
-    watcher = SimpleNamespace(ended=lambda _outcome: None)
     with plan_batch(job, [str(sources)], str(out)) as batch:
-        list(islice(process_here(batch.tasks, watcher, manifest=batch.manifest), most))
+        list(islice(process_here(batch.tasks, ignore, manifest=batch.manifest), most))
         return {task.name: task.status for task in batch.tasks}
 
 
@@ -853,9 +856,9 @@ def test_largest_recordings_start_first(tmp_path: Path, monkeypatch: pytest.Monk
     )
     for name, size in (("a", 20), ("b", 3000), ("c", 400)):
         (tmp_path / f"{name}.mcap").write_bytes(bytes(size))
-    executor, watcher = NameCollector(), SimpleNamespace(ended=lambda _outcome: None)
+    executor = NameCollector()
     with plan_batch(Job(Path(), Path()), [str(tmp_path)], str(tmp_path / "out")) as batch:
-        list(process_on(executor, batch.tasks, watcher))
+        list(process_on(executor, batch.tasks, ignore))
 
     assert executor.names == ["b", "c", "a"]
 
@@ -873,9 +876,9 @@ def test_recording_is_complete_in_manifest_before_outcome_is_returned(
     monkeypatch.setattr("shapecat.batch.runs.attempt", attempt)
     for name in ("a", "b"):
         (tmp_path / f"{name}.mcap").write_bytes(b"\x89MCAP")
-    watcher, out = SimpleNamespace(ended=lambda _outcome: None), tmp_path / "out"
+    out = tmp_path / "out"
     with plan_batch(Job(Path(), Path()), [str(tmp_path)], str(out)) as batch:
-        first = next(process_here(batch.tasks, watcher, manifest=batch.manifest))
+        first = next(process_here(batch.tasks, ignore, manifest=batch.manifest))
         lines = Manifest(out / "manifest.jsonl").entries
 
     assert {name: entry.state for name, entry in lines.items()} == {

@@ -2,11 +2,11 @@
 
 import logging
 import time
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import CancelledError, Executor, Future
 from contextlib import suppress
 from queue import Empty, SimpleQueue
-from typing import Any, Protocol
+from typing import Any
 from uuid import uuid4
 
 from shapecat import __version__
@@ -21,7 +21,7 @@ from shapecat.runs.jobs import Job
 from shapecat.system import stopping
 from shapecat.system.progress import Observer
 
-__all__ = ["Outcome", "Watcher", "attempt", "exit_code", "process_here", "process_on"]
+__all__ = ["Outcome", "attempt", "exit_code", "process_here", "process_on"]
 
 _log = logging.getLogger(__name__)
 
@@ -36,25 +36,19 @@ _HEED_S = 0.1
 
 
 _Ended = tuple[Task, Future[Outcome]]
-
-
-class Watcher(Protocol):
-    """Receives progress and outcomes, possibly from several threads."""
-
-    def progress(self, folder: str, phase: str, done: int, total: int | None) -> None:
-        """Receive the phase of a recording, the frames done, and the total (None if unknown)."""
-
-    def ended(self, outcome: Outcome) -> None:
-        """Receive the outcome of a recording."""
+_Report = Callable[[str, str, int, int | None], None]
+"""Called with the run folder of a recording, its phase, the frames done, and the total (None if
+unknown), possibly from several threads."""
 
 
 def process_here(
-    tasks: Sequence[Task], watcher: Watcher, *, cores: int = 1, manifest: Manifest | None = None
+    tasks: Sequence[Task], report: _Report, *, cores: int = 1, manifest: Manifest | None = None
 ) -> Iterator[Outcome]:
     """Process the tasks one by one in this process; yield their outcomes.
 
     Parameters
     ----------
+    report : receives the progress.
     cores : processes that perceive the frames of a recording.
     manifest : receives the state of each recording.
 
@@ -68,7 +62,7 @@ def process_here(
         stopping.check()
 
         def observe(phase: str, done: int, total: int | None, name: str = task.name) -> None:
-            watcher.progress(name, phase, done, total)
+            report(name, phase, done, total)
 
         if task.status == "complete":
             outcome = ledger.known(task)
@@ -77,14 +71,13 @@ def process_here(
             ledger.running(task.name)
             outcome = attempt(task.job, observe, cores=cores, ticket=_ticket(task, batch))
             ledger.ended(task, outcome)
-        watcher.ended(outcome)
         yield outcome
 
 
 def process_on(
     executor: Executor,
     tasks: Sequence[Task],
-    watcher: Watcher,
+    report: _Report,
     *,
     cores: int = 1,
     manifest: Manifest | None = None,
@@ -103,15 +96,13 @@ def process_on(
     ledger = Ledger(manifest)
     ledger.plan(tasks)
 
-    def receive(report: Any) -> None:
-        name, phase, done, total = report
+    def receive(progress: Any) -> None:
+        name, phase, done, total = progress
         ledger.running(name)
-        watcher.progress(name, phase, done, total)
+        report(name, phase, done, total)
 
     with Mailbox(receive) as mailbox:
-        for outcome in _outcomes(executor, tasks, ledger, mailbox.address, cores):
-            watcher.ended(outcome)
-            yield outcome
+        yield from _outcomes(executor, tasks, ledger, mailbox.address, cores)
 
 
 def _outcomes(
