@@ -33,15 +33,14 @@ from shapecat.runs.jobs import (
     Summary,
     describe_run,
     differences,
-    forget_old_labels,
     identify,
-    keep_labels,
     require_model,
     require_unchanged,
     require_utf8,
     summarize,
 )
 from shapecat.runs.labels.corrections import adopt_labels, read_labels
+from shapecat.runs.labels.replaced import forget_old_labels, keep_labels
 from shapecat.runs.labels.transfer import Transfer, transfer_labels
 from shapecat.runs.perceive.clocks import explain_clocks
 from shapecat.runs.perceive.missing_planes import explain_missing_planes

@@ -14,8 +14,9 @@ from click.testing import Result
 from shapecat.errors import OutputError
 from shapecat.runs.folder import read_run, staged, write_run
 from shapecat.runs.identity import new_id
-from shapecat.runs.jobs import Job, keep_labels
+from shapecat.runs.jobs import Job
 from shapecat.runs.labels.corrections import adopt_labels, read_labels
+from shapecat.runs.labels.replaced import keep_labels
 from shapecat.runs.labels.same_objects import Match, _by_majority, _mutual_nearest
 from shapecat.runs.labels.track_table import read_track_table
 from shapecat.runs.labels.transfer import TABLE_ALONE, match_labels, transfer_labels

@@ -8,14 +8,12 @@ from importlib.metadata import version
 from pathlib import Path
 from typing import Any
 
-import xxhash
-
 from shapecat import __version__
 from shapecat.config import Settings
-from shapecat.errors import ModelError, OutputError, RecordingError
+from shapecat.errors import ModelError, RecordingError
 from shapecat.learning import Categorizer
 from shapecat.recordings.files import input_size
-from shapecat.runs.folder import OUTPUTS, clear, write_run
+from shapecat.runs.folder import clear
 from shapecat.runs.identity import (
     ContentDigest,
     file_stats,
@@ -23,20 +21,14 @@ from shapecat.runs.identity import (
     unchanged,
     work_id,
 )
-from shapecat.runs.labels.corrections import LOST, PREVIOUS, has_labels
-from shapecat.runs.labels.track_table import ORIGINAL
-from shapecat.runs.labels.transfer import lost_labels, transfer_labels
 from shapecat.runs.run_info import Options, RunInfo
-from shapecat.system.files import replacing
 
 __all__ = [
     "Job",
     "Summary",
     "describe_run",
     "differences",
-    "forget_old_labels",
     "identify",
-    "keep_labels",
     "require_model",
     "require_unchanged",
     "require_utf8",
@@ -238,60 +230,6 @@ def require_utf8(job: Job) -> None:
         shown = job.name.encode(errors="surrogateescape").decode(errors="replace")
         msg = f"{shown}: the name is not valid UTF-8; rename it"
         raise RecordingError(msg) from error
-
-
-def keep_labels(folder: Path, run: RunInfo, job: Job) -> None:
-    """Transfer the corrected labels of the replaced results to the new ones.
-
-    The table with the original labels is kept as tracks.previous.csv. If labels were not
-    transferred, a copy is kept beside the replaced results, and so beside all later ones.
-
-    Raises
-    ------
-    OutputError : the table of the replaced results is unreadable, or a file cannot be written.
-    """
-    table = _labelled_table(job)
-    if not table:
-        return
-    with replacing(folder / PREVIOUS) as path:
-        path.write_bytes(table)
-    try:
-        transfer = transfer_labels(job.folder, folder)
-    except OutputError as error:
-        transfer = lost_labels(job.folder, str(error))
-    if transfer.missed:
-        copy = LOST.replace("*", xxhash.xxh3_64_hexdigest(table)[:8])
-        with replacing(job.folder / copy) as path:
-            path.write_bytes(table)
-    run["corrections"] = transfer.as_dict()
-
-
-def forget_old_labels(folder: Path, run: RunInfo, job: Job) -> None:
-    """Undo `keep_labels` if the replaced results have got other labels since.
-
-    Labels and outputs then count as missing in ``run``.
-
-    Raises
-    ------
-    OutputError : as for `keep_labels`.
-    """
-    previous = folder / PREVIOUS
-    kept = previous.read_bytes() if previous.exists() else b""
-    if "labels" not in run["seconds"] or kept == _labelled_table(job):
-        return
-    with replacing(folder / "tracks.csv") as path:
-        path.write_bytes((folder / ORIGINAL).read_bytes())
-    run.pop("corrections", None)
-    for phase in ("labels", *OUTPUTS):
-        run["seconds"].pop(phase, None)
-    write_run(folder, run)
-    previous.unlink(missing_ok=True)
-
-
-def _labelled_table(job: Job) -> bytes:
-    """Return the table of the replaced results if it has labels to keep, else nothing."""
-    table = job.folder / "tracks.csv"
-    return b"" if job.discard_labels or not has_labels(table) else table.read_bytes()
 
 
 def summarize(job: Job, run: RunInfo, *, processed: bool = True) -> Summary:

@@ -1,0 +1,70 @@
+"""Keep the labels of a run that a new one replaces."""
+
+from pathlib import Path
+
+import xxhash
+
+from shapecat.errors import OutputError
+from shapecat.runs.folder import OUTPUTS, write_run
+from shapecat.runs.jobs import Job
+from shapecat.runs.labels.corrections import LOST, PREVIOUS, has_labels
+from shapecat.runs.labels.track_table import ORIGINAL
+from shapecat.runs.labels.transfer import lost_labels, transfer_labels
+from shapecat.runs.run_info import RunInfo
+from shapecat.system.files import replacing
+
+__all__ = ["forget_old_labels", "keep_labels"]
+
+
+def keep_labels(folder: Path, run: RunInfo, job: Job) -> None:
+    """Transfer the corrected labels of the replaced results to the new ones.
+
+    The table with the original labels is kept as tracks.previous.csv. If labels were not
+    transferred, a copy is kept beside the replaced results, and so beside all later ones.
+
+    Raises
+    ------
+    OutputError : the table of the replaced results is unreadable, or a file cannot be written.
+    """
+    table = _labelled_table(job)
+    if not table:
+        return
+    with replacing(folder / PREVIOUS) as path:
+        path.write_bytes(table)
+    try:
+        transfer = transfer_labels(job.folder, folder)
+    except OutputError as error:
+        transfer = lost_labels(job.folder, str(error))
+    if transfer.missed:
+        copy = LOST.replace("*", xxhash.xxh3_64_hexdigest(table)[:8])
+        with replacing(job.folder / copy) as path:
+            path.write_bytes(table)
+    run["corrections"] = transfer.as_dict()
+
+
+def forget_old_labels(folder: Path, run: RunInfo, job: Job) -> None:
+    """Undo `keep_labels` if the replaced results have got other labels since.
+
+    Labels and outputs then count as missing in ``run``.
+
+    Raises
+    ------
+    OutputError : as for `keep_labels`.
+    """
+    previous = folder / PREVIOUS
+    kept = previous.read_bytes() if previous.exists() else b""
+    if "labels" not in run["seconds"] or kept == _labelled_table(job):
+        return
+    with replacing(folder / "tracks.csv") as path:
+        path.write_bytes((folder / ORIGINAL).read_bytes())
+    run.pop("corrections", None)
+    for phase in ("labels", *OUTPUTS):
+        run["seconds"].pop(phase, None)
+    write_run(folder, run)
+    previous.unlink(missing_ok=True)
+
+
+def _labelled_table(job: Job) -> bytes:
+    """Return the table of the replaced results if it has labels to keep, else nothing."""
+    table = job.folder / "tracks.csv"
+    return b"" if job.discard_labels or not has_labels(table) else table.read_bytes()
