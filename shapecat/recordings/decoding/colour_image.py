@@ -13,6 +13,7 @@ from shapecat.recordings.messages import MessageError
 __all__ = [
     "COLOUR_ENCODINGS",
     "IMAGES",
+    "MOST_PIXELS",
     "bytes_per_row",
     "cloud_colours",
     "compressed_kind",
@@ -21,7 +22,7 @@ __all__ = [
     "pixels_of",
 ]
 
-_LARGEST = 1 << 26
+MOST_PIXELS = 1 << 26
 """Images with more pixels are rejected."""
 
 _CHANNELS = {
@@ -76,7 +77,7 @@ def compressed_size(data: bytes | memoryview) -> tuple[str, int, int]:
         msg = f"compressed image is neither JPEG nor PNG: begins with {bytes(view[:4])!r}"
         raise MessageError(msg)
     width, height = _jpeg_size(view) if kind == "jpeg" else _png_size(view)
-    if not 0 < width * height <= _LARGEST:
+    if not 0 < width * height <= MOST_PIXELS:
         msg = f"image of {width} x {height} pixels"
         raise MessageError(msg)
     end = b"\xff\xd9" if kind == "jpeg" else b"IEND"
@@ -101,7 +102,7 @@ def bytes_per_row(image: ColourImage) -> int:
     used = width * _PIXEL_BYTES[image.encoding]
     row = image.step or used
     need = (height - 1) * row + used
-    if not 0 < width * height <= _LARGEST or row < used or need > size:
+    if not 0 < width * height <= MOST_PIXELS or row < used or need > size:
         msg = f"image of {width} x {height} pixels needs {need} bytes and has {size}"
         raise MessageError(msg)
     return row

@@ -8,23 +8,21 @@ import numpy as np
 
 from shapecat.arrays import F4, U1, U2
 from shapecat.jit import kernel
+from shapecat.recordings.decoding.colour_image import MOST_PIXELS, compressed_kind
 from shapecat.recordings.decoding.depth_image import clean_depth
 from shapecat.recordings.messages import MessageError
 
 __all__ = ["depth_of_compressed", "is_grey_png16"]
 
 _HEADER = struct.Struct("<iff")
-_PNG = b"\x89PNG\r\n\x1a\n"
 _GREY_16 = b"\x10\x00"
 """Bit depth and colour type of a grey PNG of 16 bits: bytes 24 and 25 of the file."""
-_LARGEST = 1 << 26
-"""Images with more pixels are rejected."""
 
 
 def is_grey_png16(data: Any) -> bool:
     """Return whether image data, of which 26 bytes are enough, is a PNG file of 16-bit grey."""
     begin = bytes(data[:26])
-    return begin.startswith(_PNG) and begin[24:] == _GREY_16
+    return compressed_kind(begin) == "png" and begin[24:] == _GREY_16
 
 
 def depth_of_compressed(message: Any) -> F4:
@@ -46,13 +44,13 @@ def depth_of_compressed(message: Any) -> F4:
     if len(data) < _HEADER.size + 8:
         msg = f"compressed depth of only {len(data)} bytes"
         raise MessageError(msg)
-    bare, inverse = bytes(data[:8]) == _PNG, str(message.format).startswith("32FC1")
+    bare, inverse = compressed_kind(data) == "png", str(message.format).startswith("32FC1")
     if bare and inverse:
         msg = "compressed depth in 32FC1 without its parameters"
         raise MessageError(msg)
     _, a, b = _HEADER.unpack_from(data)
     body = bytes(data if bare else data[_HEADER.size :])
-    values = _read_png(body) if body.startswith(_PNG) else _read_rvl(body)
+    values = _read_png(body) if compressed_kind(body) == "png" else _read_rvl(body)
     if not inverse:
         return clean_depth(values, 1000)
     depth = np.zeros(values.shape, np.float32)
@@ -63,7 +61,7 @@ def depth_of_compressed(message: Any) -> F4:
 
 def _read_png(data: bytes) -> U2:
     """Read a 16-bit grey PNG (h, w) without interlacing, as the transport writes it."""
-    offset, packed, shape = len(_PNG), b"", (0, 0)
+    offset, packed, shape = 8, b"", (0, 0)  # after the first bytes, which mark a PNG file
     while offset + 8 <= len(data):
         length, name = struct.unpack_from(">I4s", data, offset)
         content = data[offset + 8 : offset + 8 + length]
@@ -78,7 +76,7 @@ def _read_png(data: bytes) -> U2:
         offset += 12 + length
     height, width = shape
     need = height * (1 + 2 * width)
-    if not 0 < height * width <= _LARGEST:
+    if not 0 < height * width <= MOST_PIXELS:
         msg = f"compressed depth of {width} x {height} pixels"
         raise MessageError(msg)
     try:
@@ -133,7 +131,7 @@ def _read_rvl(data: bytes) -> U2:
     width, height = struct.unpack_from("<II", data)
     words = np.frombuffer(data, "<u4", (len(data) - 8) // 4, 8)
     # A nibble can hold a run of zeros of any length, so only the number of pixels is checked.
-    if not 0 < height * width <= _LARGEST or words.size == 0:
+    if not 0 < height * width <= MOST_PIXELS or words.size == 0:
         msg = "compressed depth is neither PNG nor RVL"
         raise MessageError(msg)
     values = np.zeros(height * width, np.uint16)
