@@ -16,6 +16,7 @@ __all__ = [
     "TimeLimit",
     "Topic",
     "Topics",
+    "detached",
     "reason_of",
     "ros_type",
     "sum_topics",
@@ -28,6 +29,8 @@ TimeLimit: TypeAlias = int | None
 Needed: TypeAlias = Callable[[str, int], bool] | None
 """Whether a message's data is needed, given its topic and log time (ns); None means always."""
 
+
+_SMALL = 1 << 16  # bytes
 
 MALFORMED = (ArithmeticError, AttributeError, LookupError, TypeError, ValueError)
 """Raised by the use of a decoded message whose definition lacks fields of its type."""
@@ -107,6 +110,11 @@ class Topic:
     type: str
     encoding: str
     count: int | None
+
+
+def detached(data: bytes | memoryview) -> bytes | memoryview:
+    """Copy the data of a message if it is small, so that it does not keep its chunk in memory."""
+    return bytes(data) if len(data) <= _SMALL else data
 
 
 def sum_topics(topics: Iterable[Topic]) -> tuple[Topic, ...]:

@@ -41,6 +41,7 @@ from shapecat.recordings.messages import (
     Message,
     Selection,
     Topic,
+    detached,
     ros_type,
     sum_topics,
 )
@@ -48,8 +49,6 @@ from shapecat.recordings.recording import Recording
 
 __all__ = ["McapRecording"]
 
-_SMALL = 1 << 16
-"""Messages up to this size are copied, so that they do not keep their chunk in memory."""
 _PART = 0.9
 """If more than this share of a chunk is needed, the whole chunk is decompressed and verified."""
 
@@ -117,7 +116,7 @@ class McapRecording(Recording):
                 data = decompressed(self, channel, message.data)
                 if data is None:
                     continue
-                data = bytes(data) if len(data) <= _SMALL else data
+                data = detached(data)
             yield Message(channel, message.log_time, message.publish_time, message.sequence, data)
 
     def top_level(self) -> Iterator[Record]:

@@ -35,15 +35,13 @@ from shapecat.recordings.messages import (
     Message,
     Selection,
     Topic,
+    detached,
     ros_type,
     sum_topics,
 )
 from shapecat.recordings.recording import Recording
 
 __all__ = ["BagRecording"]
-
-_SMALL = 1 << 16
-"""Messages up to this size are copied, so that they do not keep their chunk in memory."""
 
 
 class _ChunkInfo(NamedTuple):
@@ -93,8 +91,7 @@ class BagRecording(Recording):
         wanted = {n for n, c in self._channels.items() if selection.has_topic(c.topic)}
         for number, time, data in self._raw(wanted, selection.start_ns, selection.stop_ns):
             if selection.has_time(time):
-                plain = bytes(data) if len(data) <= _SMALL else data
-                yield Message(self._channels[number], time, time, 0, plain)
+                yield Message(self._channels[number], time, time, 0, detached(data))
 
     def _raw(
         self, wanted: set[int], start_ns: int | None, stop_ns: int | None
