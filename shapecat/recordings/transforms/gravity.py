@@ -127,18 +127,15 @@ class Upright:
             msg = f"--up imu: {recording.path} has no sensor_msgs/Imu with accelerations"
             raise ConfigError(msg)
         loop = transforms.tree.find_loop()
-        warnings = [f"transforms: {loop}"] if loop else []
-        sensors = tuple(stream.frame_id for stream in streams)
-        middle_ns = (recording.start_ns + recording.end_ns) // 2
         return cls(
-            transforms,
-            wanted,
-            vector,
-            sources,
-            found,
-            warnings,
-            sensors=sensors,
-            middle_ns=middle_ns,
+            transforms=transforms,
+            fixed_frame=wanted,
+            vector=vector,
+            sources=sources,
+            accelerometers=found,
+            warnings=[f"transforms: {loop}"] if loop else [],
+            sensors=tuple(stream.frame_id for stream in streams),
+            middle_ns=(recording.start_ns + recording.end_ns) // 2,
         )
 
     def orient(self, frame: Frame) -> Orientation:

@@ -46,9 +46,9 @@ class TransformWindow:
         The topics in ``near`` decide between robots, see `transform_topics`.
         """
         topics = transform_topics(recording, near).moving
-        static_only = not is_read_at_once(recording)
-        known = read_transforms(recording, static_only=static_only, near=near)
-        if is_read_at_once(recording) or not topics:
+        whole = is_read_at_once(recording)
+        known = read_transforms(recording, static_only=not whole, near=near)
+        if whole or not topics:
             return cls(known)
         reader = TransformReader(recording, known)
         kinds = {topic.type for topic in recording.topics if topic.name in topics}
