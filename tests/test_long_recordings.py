@@ -57,7 +57,7 @@ def test_full_box_from_sample_matches_all_views(
 ) -> None:
     """Boxes agree in every row, within the noise of the outlines."""
     whole, _ = usual
-    monkeypatch.setattr(full_boxes, "_TELLING", 60)
+    monkeypatch.setattr(full_boxes, "_MOST_VIEWS", 60)
 
     few, _ = tracked(folder)
 

@@ -23,7 +23,7 @@ from click.testing import Result
 
 from shapecat.batch import claims, storage
 from shapecat.batch.claims import claimed
-from shapecat.batch.finding import find_recordings, look_at
+from shapecat.batch.finding import find_recordings, stat_url
 from shapecat.batch.manifest import Entry, RemoteManifest
 from shapecat.batch.remote import Ticket, _download, process_remote, upload
 from shapecat.batch.storage import Location
@@ -174,8 +174,8 @@ def test_patterns_and_folders_of_storage_are_expanded(served: Path) -> None:
     assert {source.url for source in find_recordings([f"{url}/*.mcap"]).kept} == both
     every = {source.url for source in find_recordings([f"{url}/"]).kept}
     assert every == {*both, f"{url}/b.bag"}
-    assert look_at(f"{url}/a.mcap")[1] == (served / "a.mcap").stat().st_size
-    assert look_at(f"{url}/none.mcap") == ("", 0)
+    assert stat_url(f"{url}/a.mcap")[1] == (served / "a.mcap").stat().st_size
+    assert stat_url(f"{url}/none.mcap") == ("", 0)
 
 
 @pytest.mark.parametrize("lab", ["memory://brackets", "s3://lab/brackets"])
@@ -225,7 +225,7 @@ def test_storage_is_searched_like_a_folder(place: str) -> None:
     before = found[f"{place}/x.mcap"].key
     assert before == only_key(f"{place}/*.mcap")
     if place.startswith("s3"):  # fsspec's memory gives times of another type in listings
-        assert before == look_at(f"{place}/x.mcap")[0]
+        assert before == stat_url(f"{place}/x.mcap")[0]
     (root / "x.mcap").write(b"other content")
     assert only_key(f"{place}/*.mcap") != before
 

@@ -16,7 +16,7 @@ from shapecat.errors import RecordingError
 from shapecat.recordings import open_recording
 from shapecat.recordings.files import is_of_bag
 
-__all__ = ["Found", "Source", "find_recordings", "look_at"]
+__all__ = ["Found", "Source", "find_recordings", "stat_url"]
 
 _log = logging.getLogger(__name__)
 
@@ -107,7 +107,7 @@ def _at(url: str) -> list[Source]:
     return [_of_url(url)]
 
 
-def look_at(url: str) -> tuple[str, int]:
+def stat_url(url: str) -> tuple[str, int]:
     """Return a key of the content at a URL and its size in bytes; empty and 0 if unknown."""
     location = Location(url)
     with suppress(RecordingError):  # reported when it is downloaded

@@ -13,7 +13,7 @@ from typing import Literal
 from uuid import uuid4
 
 from shapecat.batch.claims import claim_name
-from shapecat.batch.finding import Source, find_recordings, look_at
+from shapecat.batch.finding import Source, find_recordings, stat_url
 from shapecat.batch.manifest import Entry, Manifest, open_manifest
 from shapecat.batch.naming import known_names, name_folders
 from shapecat.batch.storage import Location, is_url
@@ -33,9 +33,9 @@ __all__ = [
 
 _Named = tuple[str, Source]
 
-_LOOKS_AT_ONCE = 16
+_THREADS = 16
 """Threads that check files: on a network disk each check is a round trip."""
-_LOOKS = 256
+_CHUNK = 256
 """Recordings per unit of work of such a thread."""
 
 Status = Literal["complete", "resume", "retry", "check", "new"]
@@ -195,15 +195,15 @@ class _Planner:
             self._command = _command(
                 self._job, self._work, (self._entry(name) for name, _ in named)
             )
-        chunks = [named[first : first + _LOOKS] for first in range(0, len(named), _LOOKS)]
-        with ThreadPoolExecutor(_LOOKS_AT_ONCE) as pool:
-            looked = pool.map(lambda chunk: [self._task(*each) for each in chunk], chunks)
-            return list(chain.from_iterable(looked))
+        chunks = [named[first : first + _CHUNK] for first in range(0, len(named), _CHUNK)]
+        with ThreadPoolExecutor(_THREADS) as pool:
+            tasks = pool.map(lambda chunk: [self._task(*each) for each in chunk], chunks)
+            return list(chain.from_iterable(tasks))
 
     def _task(self, name: str, source: Source) -> Task:
         key, size = source.key, source.bytes
         if not key:
-            key, size = look_at(source.url) if source.url else _input_key(Path(source.path))
+            key, size = stat_url(source.url) if source.url else _input_key(Path(source.path))
         task = Task(
             like=self._job,
             out=self._out,

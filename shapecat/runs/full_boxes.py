@@ -22,7 +22,7 @@ __all__ = ["FullBoxes", "full_columns"]
 
 _BLOCK = 2**16
 _WIDTH = sum(FULL_WIDTHS.values())
-_TELLING = 1000
+_MOST_VIEWS = 1000
 """Largest number of views from which a track's box is fused, spread over its time span."""
 _AT_ONCE = 8  # row groups
 _NO_ROWS = np.zeros(0, np.int64)
@@ -92,13 +92,13 @@ class FullBoxes:
         OutputError : the table of detections is unreadable.
         """
         seen = self._seen(tracks)
-        telling = [_spread(len(one.rows)) for one in seen]
-        rows = [one.rows[some] for one, some in zip(seen, telling, strict=True)]
+        chosen = [_spread(len(one.rows)) for one in seen]
+        rows = [one.rows[some] for one, some in zip(seen, chosen, strict=True)]
         details = self._read(np.concatenate([_NO_ROWS, *rows]), _DETAILS)
         stops = list(accumulate(len(track.frames) for track in tracks))
         result = np.full((stops[-1] if stops else 0, _WIDTH), np.nan, np.float32)
-        ends = accumulate(map(len, telling))
-        for track, one, some, stop, end in zip(tracks, seen, telling, stops, ends, strict=True):
+        ends = accumulate(map(len, chosen))
+        for track, one, some, stop, end in zip(tracks, seen, chosen, stops, ends, strict=True):
             if len(some):
                 views = self._views(one, some, details[end - len(some) : end])
                 fused = fuse_boxes(
@@ -174,8 +174,8 @@ class _Seen(NamedTuple):
 
 
 def _spread(count: int) -> I4:
-    """Return at most `_TELLING` of ``count`` positions, spread evenly from first to last."""
-    return np.linspace(0, count - 1, min(count, _TELLING)).round().astype(np.int64)
+    """Return at most `_MOST_VIEWS` of ``count`` positions, spread evenly from first to last."""
+    return np.linspace(0, count - 1, min(count, _MOST_VIEWS)).round().astype(np.int64)
 
 
 def _placed(boxes: F4, poses: F8) -> tuple[F8, F8]:
