@@ -105,7 +105,7 @@ def process(job: Job, observe: Observer = ignore, *, cores: int = 1) -> Summary:
             content.start()
             # A kill after the last phase leaves a total.
             earlier = run["seconds"].pop("total", None) or sum(run["seconds"].values())
-            work = Work(recording, streams, folder, run, job, categorizer, observe, cores)
+            work = Work(recording, streams, colours, folder, run, job, categorizer, observe, cores)
             _once("perceive", folder, run, lambda: perceive_all(work))
             _once("revise", folder, run, lambda: _revise_and_warn(work))
             identify(run, content)

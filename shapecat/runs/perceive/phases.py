@@ -23,6 +23,7 @@ from shapecat.executors.order import Processes
 from shapecat.learning import Categorizer
 from shapecat.perception import Perceiver, View, find_up
 from shapecat.recordings import Recording, Stream
+from shapecat.recordings.colour_streams import ColourStream
 from shapecat.recordings.transforms.gravity import MISNAMED, Orientation, Upright, has_z_up, turned
 from shapecat.rehearsal import rehearse
 from shapecat.runs.jobs import Job
@@ -54,10 +55,11 @@ _Oriented = tuple[Frame, ColourView | None, Orientation]
 
 
 class Work(NamedTuple):
-    """A job with its open recording, the folder of its tables, and the content of run.json."""
+    """A job with its open recording and its streams, the folder of its tables, and run.json."""
 
     recording: Recording
     streams: tuple[Stream, ...]
+    colours: dict[str, ColourStream]
     folder: Path
     run: RunInfo
     job: Job
@@ -277,6 +279,12 @@ def _oriented(work: Work, upright: Upright, skipped: Counter[str]) -> Iterator[_
 def _readings(work: Work, skipped: Counter[str]) -> Iterator[tuple[Frame, ColourView | None]]:
     """Yield the frames of a run; an OSError becomes a RecordingError."""
     with explained(f"{work.job.source}: cannot be read", RecordingError):
-        for frame, colour in read_frames(work.recording, work.run["options"], skipped=skipped):
+        for frame, colour in read_frames(
+            work.recording,
+            work.run["options"],
+            skipped=skipped,
+            streams=work.streams,
+            colours=work.colours,
+        ):
             # Masks need no pixels, and frames are sent to other processes.
             yield frame, colour and replace(colour, image=replace(colour.image, data=b""))

@@ -1,12 +1,12 @@
 """The frames of a recording that the options of a run select."""
 
 from collections import Counter
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 
 from shapecat.cameras.colour import ColourView
 from shapecat.recordings import Recording, Stream, choose_streams
 from shapecat.recordings.colour_frames import KnownImages, frames_with_colour
-from shapecat.recordings.colour_streams import pair_colours
+from shapecat.recordings.colour_streams import ColourStream, pair_colours
 from shapecat.recordings.messages import Needed
 from shapecat.runs.run_info import Options
 from shapecat.types import Frame
@@ -19,6 +19,8 @@ def read_frames(
     options: Options,
     *,
     skipped: Counter[str],
+    streams: Sequence[Stream] | None = None,
+    colours: Mapping[str, ColourStream] | None = None,
     needed: Needed = None,
     known: KnownImages = None,
 ) -> Iterator[tuple[Frame, ColourView | None]]:
@@ -26,6 +28,7 @@ def read_frames(
 
     Parameters
     ----------
+    streams, colours : the selected streams, and the colour stream of each; looked for by default.
     skipped, needed : as for `shapecat.recordings.frames`.
     known : as for `frames_with_colour`.
 
@@ -33,8 +36,10 @@ def read_frames(
     ------
     NoStreamError : a topic is missing or not usable.
     """
-    streams = choose_streams(recording, options["topics"])
-    colours = pair_colours(recording, streams, options["color"])
+    if streams is None:
+        streams = choose_streams(recording, options["topics"])
+    if colours is None:
+        colours = pair_colours(recording, streams, options["color"])
     return frames_with_colour(
         recording,
         streams,
