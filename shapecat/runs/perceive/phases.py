@@ -52,6 +52,8 @@ _MOST_HELD = 64
 
 _Oriented = tuple[Frame, ColourView | None, Orientation]
 """A frame, its colour image, if it has one, and the up direction and pose of the sensor."""
+_Item = tuple[FrameRow, View]
+"""A frame to perceive, and the values of its row that a `Perception` lacks."""
 
 
 class Work(NamedTuple):
@@ -82,7 +84,7 @@ def perceive_all(work: Work) -> None:
     with _perceiving(work, "perceive", total) as perceive:
         upright = _upright(work, job.fixed_frame)
 
-        def view(oriented: _Oriented) -> tuple[FrameRow, View]:
+        def view(oriented: _Oriented) -> _Item:
             frame, colour, (_, _, pose) = oriented
             up = upright.accept(frame.topic, oriented[2])
             row = FrameRow(frame.log_time_ns, pose, up, frame_from_sensor=frame.frame_from_sensor)
@@ -120,7 +122,7 @@ def revise(work: Work) -> None:
     run["counts"]["revised"] = sum(sum(group["revised"].to_pylist()) for group in revised)
 
 
-def _views_again(work: Work, chosen: dict[Key, Revision]) -> Iterator[tuple[FrameRow, View]]:
+def _views_again(work: Work, chosen: dict[Key, Revision]) -> Iterator[_Item]:
     """Yield the chosen frames with their revised up directions."""
     upright = _upright(work, work.run["fixed_frame"])
     recent = RecentFrames(work.job.settings.detection.fuse_frames)
@@ -138,7 +140,7 @@ def _views_again(work: Work, chosen: dict[Key, Revision]) -> Iterator[tuple[Fram
 @contextmanager
 def _perceiving(
     work: Work, phase: str, total: int | None, *, again: bool = False
-) -> Iterator[Callable[[Iterator[tuple[FrameRow, View]]], tuple[int, int]]]:
+) -> Iterator[Callable[[Iterator[_Item]], tuple[int, int]]]:
     """Let the block perceive frames in several processes; then join the tables.
 
     Yields
@@ -161,7 +163,7 @@ def _perceiving(
         if (total or 0) - tables.done >= _MANY:
             processes.start()
 
-        def perceive(views: Iterator[tuple[FrameRow, View]]) -> tuple[int, int]:
+        def perceive(views: Iterator[_Item]) -> tuple[int, int]:
             count = 0
             for count, _ in enumerate(stopping.until_asked(islice(views, tables.done)), start=1):
                 if not again:  # the frames of a second look are few
@@ -178,7 +180,7 @@ def _perceiving(
 
 
 def _blocks(
-    views: Iterator[tuple[FrameRow, View]], size: int
+    views: Iterator[_Item], size: int
 ) -> Iterator[tuple[tuple[FrameRow, ...], tuple[View, ...]]]:
     """Yield blocks of ``size`` frames, the same in every run, until asked to stop."""
     while not stopping.asked() and (block := tuple(islice(views, size))):
