@@ -367,6 +367,20 @@ def test_no_frames_are_kept_for_views_that_are_not_labelled(
     assert [i["frame"] for i in read_coco(tmp_path / "out")["images"]] == [best[named][1]]
 
 
+@pytest.mark.parametrize("out", [".", "/"])
+def test_current_folder_is_not_replaced(shapecat: Run, run: Path, tmp_path: Path, out: str) -> None:
+    """`--out .` ended in a traceback."""
+    with pytest.MonkeyPatch.context() as patch:
+        patch.chdir(tmp_path)
+        results = [
+            shapecat("export", run, "--format", "yolo", "--out", out),
+            shapecat("train", tmp_path, "--out", out),
+        ]
+    for result in results:
+        assert result.exit_code == 1
+        assert f"Error: {out}: name a file or folder in it" in result.output
+
+
 def test_only_earlier_export_is_replaced(run: Path, tmp_path: Path) -> None:
     out = tmp_path / "out"
     export_dataset([run], "coco", out, Selection())

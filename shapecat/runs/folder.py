@@ -192,7 +192,7 @@ def recover(folder: Path, marker: Marker = made_by_run) -> None:
     ------
     OutputError : the folder cannot be written.
     """
-    previous, hidden = previous_path(folder), partial_path(folder)
+    hidden, previous = partial_path(folder), previous_path(folder)
     with explained(f"{folder}: cannot be written", OutputError):
         if not previous.is_dir():
             return

@@ -39,7 +39,15 @@ _NEW_S = 60
 
 
 def partial_path(path: Path) -> Path:
-    """Return the hidden name that a file or folder has until it is complete."""
+    """Return the hidden name that a file or folder has until it is complete.
+
+    Raises
+    ------
+    OutputError : the path has no name, as that of the current folder or of the root.
+    """
+    if not path.name:
+        msg = f"{path}: name a file or folder in it"
+        raise OutputError(msg)
     return path.with_name(f".{path.name}.partial")
 
 
