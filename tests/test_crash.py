@@ -101,9 +101,10 @@ def survive_kills(recording: Path, out: Path, undisturbed: Path, moments: list[f
 
 
 def test_killed_run_resumes(recording: Path, undisturbed: Path, tmp_path: Path) -> None:
-    """Only frames of the unfinished segment are processed again."""
-    segment = tmp_path / ".table.partial" / "segments" / "000000"
-    assert kill_after(command(recording, tmp_path), segment, 0.0)
+    """Only frames of the unfinished segment are processed again, whatever an earlier kill left."""
+    partial = tmp_path / ".table.partial"
+    for begun, seconds in ((partial, 0.15), (partial / "segments" / "000000", 0.0)):
+        assert kill_after(command(recording, tmp_path), begun, seconds)
     assert not (tmp_path / "table").exists()
 
     process(Job(recording, tmp_path / "table", rrd=False))
@@ -113,6 +114,7 @@ def test_killed_run_resumes(recording: Path, undisturbed: Path, tmp_path: Path) 
     assert read_run(tmp_path / "table")["counts"]["resumed"] > 0
 
 
+@pytest.mark.many
 def test_run_survives_kills_at_random_moments(
     recording: Path, undisturbed: Path, tmp_path: Path
 ) -> None:
