@@ -159,7 +159,8 @@ def test_training_uses_only_given_kinds_of_distractors(
     only = arrangements._SETTLED[number][0]
     monkeypatch.setattr(arrangements, "_SETTLED", ((only, 1.0, Arrangement([], ())),))
     monkeypatch.setattr(piles, "make_distractor", make)
-    monkeypatch.setattr(physics, "_FALL_STEPS", 10)  # they need not come to rest
+    monkeypatch.setattr("shapecat.simulation.shapes.convex_parts.hollowness", lambda _: 0.0)
+    monkeypatch.setattr(physics, "_FALL_STEPS", 10)  # they need not come to rest, nor be open
     monkeypatch.setattr(physics, "_MAX_STEPS", 0)
     options = ArrangementOptions(3, ("pan", "hammer"), unknown=1.0, settled=1.0)
     objects = arrange(options, np.random.default_rng(5)).objects

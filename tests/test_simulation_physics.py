@@ -29,8 +29,20 @@ YAWED = rotation_from_quaternion([0, 0, np.sin(0.3), np.cos(0.3)])
 
 @cache
 def settled(kind: SceneKind, seed: int) -> World:
-    """Return a scene of two frames, which all tests share."""
-    return make_scene(kind, np.random.default_rng(seed), frames=2)
+    """Return a scene of two frames, which all tests share; remember the parts of its objects."""
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr("shapecat.simulation.scenes.physics.convex_parts", known_parts)
+        return make_scene(kind, np.random.default_rng(seed), frames=2)
+
+
+KNOWN: dict[int, tuple[Mesh, list[np.ndarray]]] = {}
+
+
+def known_parts(mesh: Mesh) -> list[np.ndarray]:
+    """Return the convex parts of a mesh; they take longer than the physics."""
+    if id(mesh) not in KNOWN:
+        KNOWN[id(mesh)] = mesh, convex_parts(mesh)
+    return KNOWN[id(mesh)][1]
 
 
 def table(height: float = 0.7) -> Mesh:
@@ -141,7 +153,7 @@ def test_settled_objects_lie_on_support_without_interpenetration(
     solids = [
         (transform(item.pose, item.mesh.vertices), [moved_part(p, item.pose) for p in parts])
         for item in world.objects
-        for parts in [convex_parts(item.mesh)]
+        for parts in [known_parts(item.mesh)]
     ]
     support = next(s for s in world.supports if s.name == world_support(world.kind))
     for points, _ in solids:
