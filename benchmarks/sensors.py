@@ -132,13 +132,15 @@ def draw(path: Path, seed: int, real: tuple[Path, ...]) -> None:
     ]
     taken += [(folder.name, next(_frames(folder))) for folder in real]
     figure, axes = plt.subplots(-(-len(taken) // 5), 5, figsize=(15, 2.6 * -(-len(taken) // 5)))
+    colours = mpl.colormaps["gray"].with_extremes(bad="lightskyblue")
     for axis in axes.flat:
         axis.axis("off")
+        axis.set_anchor("N")
     for (name, frame), axis in zip(taken, axes.flat, strict=False):
         camera = frame.camera
         shade = _shaded(np.asarray(frame.depth, np.float64), camera.fx if camera else 525.0)
-        axis.imshow(shade, cmap="gray", vmin=0.2, vmax=1.0)
-        axis.set_title(name, fontsize=9)
+        axis.imshow(shade, cmap=colours, vmin=0.2, vmax=1.0)
+        axis.set_title(name, fontsize=13)
     figure.tight_layout()
     figure.savefig(path, dpi=70)
 
