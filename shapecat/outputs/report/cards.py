@@ -203,7 +203,7 @@ def frame_html(frame: StripFrame, categories: Mapping[int, str], *, several: boo
     categories : the category of each track to show.
     several : whether the run has several topics, so that the caption names the topic.
     """
-    name = f"{frame.seconds:.1f} s" + (f" {frame.topic}" if several else "")
+    name = f"{frame.seconds:.2f} s" + (f" {frame.topic}" if several else "")
     boxes = "".join(
         _box(frame, track, box, categories[track])
         for track, box in frame.boxes.items()
