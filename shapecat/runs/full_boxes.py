@@ -8,7 +8,6 @@ from typing import Any, NamedTuple
 
 import numpy as np
 import pyarrow as pa
-import pyarrow.compute
 from scipy.spatial.transform import Rotation
 
 from shapecat.arrays import F4, F8, I4, Bool

@@ -7,7 +7,6 @@ from typing import Any
 
 import numpy as np
 import pyarrow as pa
-import pyarrow.compute
 
 from shapecat.arrays import F4
 from shapecat.geometry import box_around
@@ -105,7 +104,7 @@ def _values(column: pa.ChunkedArray) -> Sequence[Any]:
         return list(column.to_pylist())
     if fixed:
         return list(numbers(column).reshape(len(column), column.type.list_size))
-    stops = np.cumsum(pa.compute.list_value_length(column).to_numpy()).tolist()
+    stops = np.cumsum(column.combine_chunks().value_lengths().to_numpy()).tolist()
     flat = numbers(column)
     return [flat[a:b] for a, b in zip([0, *stops[:-1]], stops, strict=True)] if stops else []
 

@@ -8,7 +8,6 @@ from typing import Any, NamedTuple
 
 import numpy as np
 import pyarrow as pa
-import pyarrow.compute
 import pyarrow.parquet as pq
 
 from shapecat.arrays import F4, F8, I4
@@ -82,8 +81,8 @@ class ShownTracks:
         with opened(folder / "tracks.parquet", read_dictionary=["topic"]) as file:
             table = file.read(columns=["track", "topic", "frame", "stamp_ns", "detection"])
             topics, codes = topic_codes(table)
-            seen = pa.compute.indices_nonzero(table["detection"].is_valid())
-            rows, detections = np.from_dlpack(seen), numbers(table["detection"].drop_null())
+            rows = np.flatnonzero(table["detection"].is_valid().to_numpy())
+            detections = numbers(table["detection"].drop_null())
             frames, tracks = numbers(table["frame"])[rows], numbers(table["track"])[rows]
             order = np.lexsort((detections, frames, codes[rows]))
             order = order[np.isin(tracks[order], list(labels))]

@@ -3,8 +3,6 @@
 from pathlib import Path
 
 import numpy as np
-import pyarrow as pa
-import pyarrow.compute
 
 from shapecat.arrays import F4, F8, Bool, Record, array
 from shapecat.runs.tables.reading import first_stamp, opened, read_row_groups
@@ -41,7 +39,7 @@ def read_timelines(folder: Path) -> dict[int, Timeline]:
     tracks = table["track"].to_numpy()
     seconds = (table["stamp_ns"].to_numpy() - start) * 1e-9
     causal = table["posterior"].combine_chunks().flatten().to_numpy().reshape(-1, width or 1)
-    detections = pa.compute.fill_null(table["detection"], -1).to_numpy()
+    detections = table["detection"].fill_null(-1).to_numpy()
     topics, frames = table["topic"].to_pylist(), table["frame"].to_pylist()
     timelines = {}
     order = np.lexsort((seconds, tracks))

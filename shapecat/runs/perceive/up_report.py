@@ -7,6 +7,7 @@ from typing import Any
 import numpy as np
 
 from shapecat.recordings.transforms.gravity import Upright
+from shapecat.runs.tables.placed_frames import count_poses
 from shapecat.runs.tables.reading import keys_of, read_together
 
 __all__ = ["report_up"]
@@ -47,8 +48,6 @@ def _missing_poses(folder: Path, fixed_frame: str | None) -> Iterator[str]:
     """Yield a warning for each topic of which frames have no pose in the fixed frame."""
     if fixed_frame is None:  # all tracks are in the sensor frame
         return
-    from shapecat.runs.tables.placed_frames import count_poses  # noqa: PLC0415  loads pyarrow.compute
-
     for topic, (known, count) in count_poses(folder).items():
         loss = ", whose objects are not tracked"
         if 2 * known <= count:

@@ -8,7 +8,6 @@ from pathlib import Path
 
 import numpy as np
 import pyarrow as pa
-import pyarrow.compute
 
 from shapecat.arrays import F8, I4, Bool
 from shapecat.runs.tables.reading import (
@@ -95,7 +94,7 @@ def count_poses(folder: Path) -> dict[str, tuple[int, int]]:
     known: Counter[str] = Counter()
     count: Counter[str] = Counter()
     for group in read_row_groups(folder / "frames.parquet", ["topic", "fixed_translation"]):
-        has_pose = pa.compute.is_valid(group["fixed_translation"]).to_pylist()
+        has_pose = group["fixed_translation"].is_valid().to_pylist()
         topics = group["topic"].to_pylist()
         known.update(compress(topics, has_pose))
         count.update(topics)

@@ -182,7 +182,7 @@ def numbers_or_nan(column: pa.ChunkedArray) -> Any:
     """Return a column of lists of fixed size as an array (rows, size); null becomes NaN."""
     width, kind = column.type.list_size, column.type.value_type.to_pandas_dtype()
     result = np.full((len(column), width), np.nan, kind)
-    known = pa.compute.is_valid(column).to_numpy()
+    known = column.is_valid().to_numpy()
     if known.any():
         result[known] = numbers(column.drop_null()).reshape(-1, width)
     return result
