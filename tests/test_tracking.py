@@ -579,6 +579,27 @@ def test_backward_clock_jump_is_scene_cut() -> None:
     assert [track.hits for track in track_recording(frames, SETTINGS)] == [5, 5]
 
 
+def test_late_message_is_no_scene_cut() -> None:
+    """A message that arrives after a newer one must not end the tracks of all objects."""
+    stamps = [*range(20), 21, 20, *range(22, 40)]
+    frames = [frame(k, [0, 0, 0], stamp_ns=s * SECOND // 10) for k, s in enumerate(stamps)]
+    assert not scene_cuts(next(gather(frames)), SETTINGS).any()
+    assert [track.hits for track in track_recording(frames, SETTINGS)] == [40]
+
+
+def test_late_messages_of_one_sensor_do_not_put_it_behind_the_other() -> None:
+    """All that it sees later would come after the end of the other's frames."""
+    late = [*range(10), 12, 13, 10, 11, *range(14, 60)]
+    frames = [
+        frame(k, [0, 0, 0], stamp_ns=(s * SECOND + half) // 10, topic=topic)
+        for topic, stamps, half in (("/a", range(60), 0), ("/b", late, SECOND // 2))
+        for k, s in enumerate(stamps)
+    ]
+    (track,) = track_recording(frames, SETTINGS, together={"/a", "/b"})
+    assert track.hits == 120
+    assert np.diff(track.stamps_ns).min() >= -3 * SECOND // 10
+
+
 @pytest.mark.parametrize("single", [False, True])
 def test_two_sensors_share_tracks_despite_clock_jump(single: bool) -> None:
     """Also after a single wrong stamp, neither sensor may lag behind."""
@@ -746,6 +767,16 @@ def test_short_track_inside_longer_one_is_removed(begin: int, x: float, *, kept:
     found = without_shadows(next(gather(frames)), tracks)
 
     assert [len(member) for member in found] == ([24, 3] if kept else [24])
+
+
+def test_cup_shown_briefly_beside_tall_bottle_keeps_its_track() -> None:
+    """Only what is near the middle of a narrow object may count as a piece of it."""
+    bottle, cup = (0.07, 0.08, 0.31), (0.08, 0.09, 0.1)
+    frames = []
+    for k in range(40):
+        seen = [[0.0, 0, 0.155], [0.1, 0, 0.05]] if 20 <= k < 24 else [[0.0, 0, 0.155]]
+        frames.append(frame(k, seen, size=[bottle, cup][: len(seen)]))
+    assert [track.hits for track in track_recording(frames, SETTINGS)] == [40, 4]
 
 
 def test_fragment_is_joined_to_only_one_of_two_predecessors() -> None:
