@@ -206,9 +206,9 @@ def test_needed_detections_depend_on_nearby_frames() -> None:
 def test_fragment_summarises_its_detections() -> None:
     """The object enters the view cut off, moves on and stays whole."""
     places = [[[9.0, 9, 9], [0.1 * k, 0.02 * k, 0.7]] for k in range(4)]
-    cut = [True, False, True, False]
+    cut, lengths = [True, False, True, False], [0.13, 0.11, 0.16, 0.14]
     frames = [
-        frame(k, place, partial=np.array([False, cut[k]]), sizes=np.full((2, 3), 0.1 + 0.01 * k))
+        frame(k, place, partial=np.array([False, cut[k]]), sizes=np.full((2, 3), lengths[k]))
         for k, place in enumerate(places)
     ]
     hits = next(gather(frames))
@@ -219,7 +219,7 @@ def test_fragment_summarises_its_detections() -> None:
     assert _describe(hits, [np.array([1, 3])], np.zeros(4, int)).cut.tolist() == [[True, False]]
     assert found.whole.tolist() == [1, 1]
     assert found.scenes.tolist() == [4, 5]
-    assert_allclose(found.sizes[:, 0], [0.11, 0.13], rtol=1e-6)  # of the whole views
+    assert_allclose(found.sizes[:, 0], [0.11, 0.14], rtol=1e-6)  # of the whole views
     assert (found.start[0] < found.end[0])[:2].all()
 
 
