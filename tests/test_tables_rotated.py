@@ -197,6 +197,27 @@ def test_tracker_reads_which_views_are_reused(tmp_path: Path) -> None:
     assert [np.array(frame.described).tolist() for frame in frames] == [[0], [0], [0], [3]]
 
 
+@pytest.mark.parametrize("flag", ["touches_border", "occluded"])
+def test_view_with_either_flag_counts_as_partial(tmp_path: Path, flag: str) -> None:
+    """A view of a half-hidden object would weigh as much as four of its kind."""
+    with PerceptionTables(tmp_path, categories=CATEGORIES, model_id="m") as tables:
+        for k in range(FRAMES):
+            one = detection_of(k, 1)
+            flags: dict[str, Any] = {"touches_border": False, "occluded": False, flag: k == 5}
+            one = replace(one, candidate=replace(one.candidate, **flags))
+            up = ROTATIONS[k].inv().apply(UP)
+            scene = Scene(up, (Plane(up, -0.5, OUTLINE, 0.7, 0.0),), ())
+            stamp = EPOCH + k * SECOND // 10
+            perception = Perception("/depth", k, stamp, "cam", scene, (one,), {})
+            pose = Pose(ROTATIONS[k].as_matrix(), POSITIONS[k])
+            tables.write([perception], [FrameRow(stamp, pose, up)])
+    track_run(tmp_path, TrackingSettings(), CATEGORIES)
+
+    views = POSTERIORS[np.arange(FRAMES) % 2, 1]
+    fused = np.exp(np.average(np.log(views), axis=0, weights=[1, 1, 1, 1, 1, 0.25]))
+    assert_allclose(rows(tmp_path, "tracks")[-1]["posterior"], fused / fused.sum(), atol=1e-6)
+
+
 def test_track_boxes_match_object_poses(run: Path) -> None:
     tracks = rows(run, "tracks")
 
@@ -251,7 +272,8 @@ def test_equal_frame_numbers_of_two_sensors_are_not_confused(tmp_path: Path) -> 
         assert_allclose(row["center_full"], own, atol=0.02)
 
 
-def test_cut_views_have_less_weight_for_full_box(tmp_path: Path) -> None:
+@pytest.mark.parametrize("flag", ["touches_border", "occluded"])
+def test_cut_views_have_less_weight_for_full_box(tmp_path: Path, flag: str) -> None:
     """Four cut views weigh as much as one of the two whole views."""
     cut = (True, False, True, True, False, True)
     heights = [0.11 if one else 0.21 for one in cut]
@@ -260,10 +282,11 @@ def test_cut_views_have_less_weight_for_full_box(tmp_path: Path) -> None:
             up = ROTATIONS[k].inv().apply(UP)
             found = [detection_of(k, item) for item in range(3)]
             first, whole = found[1].candidate, found[1].full
+            flags: dict[str, Any] = {flag: cut[k]}
             assert whole is not None
             found[1] = replace(
                 found[1],
-                candidate=replace(first, occluded=cut[k]),
+                candidate=replace(first, **flags),
                 full=replace(whole, size=np.array([*whole.size[:2], heights[k]])),
             )
             scene = Scene(up, (Plane(up, -0.5, OUTLINE, 0.7, 0.0),), ())
@@ -394,6 +417,36 @@ def test_confidence_and_guess_use_all_views(run: Path) -> None:
         assert row["category"] in {row["guess"], "unknown"}
 
 
+def test_merged_box_is_upright_in_named_frame(tmp_path: Path) -> None:
+    """A cloud in the frame of the robot is drawn there; up is known in the sensor frame."""
+    robot = Pose(
+        Rotation.from_euler("xyz", [-1.8, 0.3, 0.7]).as_matrix(), np.array([0.2, -0.4, 1.1])
+    )
+    with PerceptionTables(tmp_path, categories=CATEGORIES, model_id="m") as tables:
+        for k in range(FRAMES):
+            up = ROTATIONS[k].inv().apply(UP)
+            scene = Scene(up, (Plane(up, -0.5, OUTLINE, 0.7, 0.0),), ())
+            found = tuple(detection_of(k, item) for item in range(3))
+            stamp = EPOCH + k * SECOND // 10
+            perception = Perception("/depth", k, stamp, "base", scene, found, {})
+            pose = Pose(ROTATIONS[k].as_matrix(), POSITIONS[k])
+            tables.write([perception], [FrameRow(stamp, pose, up, frame_from_sensor=robot)])
+    track_run(tmp_path, TrackingSettings(), CATEGORIES)
+    labels = read_labels(tmp_path / "tracks.csv", CATEGORIES)
+    labels[3] = labels[1]
+
+    for frame in read_shown_frames(tmp_path, labels, visible=True):
+        (merged,) = (box for box in frame.objects if box.track == 1)
+        axes = Rotation.from_quat(merged.orientation).as_matrix()
+        up = robot.rotation @ ROTATIONS[frame.index].inv().apply(UP)
+        assert_allclose(axes[:, 2], up, atol=1e-5)
+        centers = ROTATIONS[frame.index].inv().apply(CENTERS - POSITIONS[frame.index])
+        apart = centers @ robot.rotation.T + robot.translation - merged.center
+        inside = (np.abs(apart @ axes) < np.array(merged.size) / 2).all(axis=1)
+        assert inside.sum() >= 2
+        assert merged.size[2] < SIZE[2] + 0.21  # their heights differ by 0.2 at most
+
+
 def test_parts_of_merged_track_become_one_object(run: Path) -> None:
     """One part may rest on the other: the lower support counts."""
     frame = next(read_labelled_frames(run, read_labels(run / "tracks.csv", CATEGORIES)))
@@ -409,6 +462,10 @@ def test_parts_of_merged_track_become_one_object(run: Path) -> None:
     above = replace(high, height_m=math.nan)  # no plane was found below it
     for some in ([above, parts[1]], [parts[1], above]):
         assert _join(some, up.tolist()).height_m == pytest.approx(whole.height_m)
+    hidden, cut = replace(parts[0], occluded=True), replace(parts[1], touches_border=True)
+    for some in ([hidden, cut], [cut, hidden]):  # a part that is not whole makes the object so
+        joined = _join(some, up.tolist())
+        assert (joined.occluded, joined.touches_border) == (True, True)
     assert whole.detections == (*high.detections, *low.detections)
     assert len(set(whole.detections)) == 2
 
