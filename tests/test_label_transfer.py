@@ -561,6 +561,20 @@ def test_identical_cups_that_swap_are_not_labelled(tmp_path: Path) -> None:
     assert {item.old_track for item in transfer.missed} == {1, 2}
 
 
+@pytest.mark.parametrize(("apart", "found"), [(0.045, False), (0.08, True)])
+def test_object_between_two_old_places_is_not_labelled(
+    tmp_path: Path, apart: float, *, found: bool
+) -> None:
+    """It may be either of them: that one is nearer by 5 mm is chance."""
+    places = {1: static(CUP), 2: static(shifted(CUP, y=apart))}
+    source = make_run(tmp_path / "source", places, labels={1: "mug", 2: "tin"})
+    target = second(tmp_path / "target", {1: static(shifted(CUP, y=0.02))})
+
+    transfer_labels(source, target)
+
+    assert labels_of(target) == {1: "mug" if found else ""}
+
+
 def test_object_of_another_size_does_not_match(tmp_path: Path) -> None:
     source = make_run(tmp_path / "source", {1: static(CUP)}, labels={1: "mug"})
     target = second(tmp_path / "target", {1: static(CUP)}, size=0.2)
