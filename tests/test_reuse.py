@@ -116,6 +116,11 @@ def test_only_moved_object_is_described_again() -> None:
     assert detection_at(world, perceptions, CHANGE + 1, place + shift).reused_from == CHANGE
     others = [d.reused_from for d in perceptions[CHANGE].detections if d is not moved]
     assert others.count(0) >= len(others) - 1
+    # A repeat names the view that was described: one that names another would count twice.
+    assert perceptions[CHANGE + 1].reused_from == CHANGE
+    again = [d.reused_from for d in perceptions[CHANGE + 1].detections]
+    origins = [d.reused_from for d in perceptions[CHANGE].detections]
+    assert again == [CHANGE if origin is None else origin for origin in origins]
 
 
 def test_another_object_at_same_place_is_described_again() -> None:
