@@ -25,6 +25,7 @@ from shapecat.runs.labels.meaning import TrackLabel
 from shapecat.runs.perceive.perceived import _SEGMENT_FRAMES, FrameRow, PerceptionTables
 from shapecat.runs.run_info import Counts, InputInfo, ModelInfo, Options, OriginInfo, RunInfo
 from shapecat.runs.shown import _next_of_topic, read_shown_frames
+from shapecat.runs.tables.masks import read_masks
 from shapecat.runs.tables.reading import (
     opened,
     read_row_groups,
@@ -35,7 +36,17 @@ from shapecat.runs.tables.reading import (
 from shapecat.runs.tables.schemas import ADDED, DETECTIONS, FRAMES, PLANES, TABLES, TRACKS
 from shapecat.runs.tables.segments import count_segments
 from shapecat.runs.tables.writing import arrow_table, lists, open_writer, write_table
-from shapecat.types import Box, Candidate, Detection, NeuralGas, Perception, Plane, Pose, Scene
+from shapecat.types import (
+    Box,
+    Candidate,
+    Detection,
+    ImageMasks,
+    NeuralGas,
+    Perception,
+    Plane,
+    Pose,
+    Scene,
+)
 from tests.track_tables import write_tracks
 
 CATEGORIES = ("cup", "can")
@@ -155,6 +166,31 @@ def test_second_look_without_result_does_not_replace_frame(
     assert read["frames"]["revised"].to_pylist() == [False, True, False, False]
     assert read["detections"]["frame"].to_pylist() == [0, 0, 1, 1, 1, 3, 3]
     assert read["planes"]["frame"].to_pylist() == [0, 0, 1, 1, 2, 2, 3, 3]
+
+
+def test_second_look_replaces_masks(tmp_path: Path) -> None:
+    """Detections of a revised frame have other numbers: older masks would be of other objects."""
+
+    def masked(index: int, boxes: dict[int, tuple[int, int, int, int]]) -> Perception:
+        counts = {n: np.array([24 - 2 * n, 2 * n], np.uint32) for n in boxes}
+        masks = ImageMasks("/color", 5 + index, 7, "cam", 6, 4, boxes, counts)
+        return replace(perception(index, 3), masks=masks)
+
+    options: Any = {"categories": CATEGORIES, "model_id": "m1", "colour": True}
+    with PerceptionTables(tmp_path, **options) as tables:
+        for k in range(4):
+            tables.write([masked(k, {1: (k, 0, 2, 1)})], [FrameRow(k, None)])
+    with PerceptionTables(tmp_path, **options, again=True) as tables:
+        boxes = {0: (3, 1, 1, 2), 2: (4, 2, 2, 2)}
+        tables.write([masked(2, boxes)], [FrameRow(2, None, again=True)])
+
+    found = [(key[1], masks.boxes) for key, masks in read_masks(tmp_path)]
+    assert found == [
+        (0, {1: (0, 0, 2, 1)}),
+        (1, {1: (1, 0, 2, 1)}),
+        (2, boxes),
+        (3, {1: (3, 0, 2, 1)}),
+    ]
 
 
 @pytest.mark.parametrize("count", [0, 2])
