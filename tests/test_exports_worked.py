@@ -349,6 +349,14 @@ def test_crops_of_two_cameras_do_not_replace_each_other(tmp_path: Path, topics: 
         assert len(list(instance.iterdir())) == 2
 
 
+def test_crops_are_replaced_whatever_the_order_of_topics(tmp_path: Path) -> None:
+    """Processed again with the options swapped, each view would be there twice."""
+    topics = ("/left/depth", "/right/depth")
+    for order in (topics, topics[::-1]):
+        assert write_crops(tmp_path, crops_frames(*topics), crops_run(*order)) == 2
+    assert len(list(tmp_path.glob("*/*/*.pcd"))) == 2
+
+
 def test_crops_of_runs_of_two_cameras_do_not_replace_each_other(tmp_path: Path) -> None:
     """Two runs of one recording, one for each camera, may have the same name."""
     for topic in ("/left/depth", "/right/depth"):
