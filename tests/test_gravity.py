@@ -9,6 +9,7 @@ import numpy as np
 import pyarrow as pa
 import pyarrow.parquet as pq
 import pytest
+from scipy.spatial.transform import Rotation
 
 from shapecat.config import Settings
 from shapecat.errors import ConfigError
@@ -269,6 +270,22 @@ def test_up_without_other_source_comes_from_planes(tmp_path: Path) -> None:
     process(Job(write(tmp_path / "a.mcap", items), tmp_path / "out", mcap=False, rrd=False))
 
     assert read_run(tmp_path / "out")["up"] == {"source": "planes"}
+
+
+def test_imu_up_is_rotated_into_sensor_of_transformed_cloud(tmp_path: Path) -> None:
+    """The cloud names the frame of the IMU; up is needed in that of the sensor behind it."""
+    items = [("/imu", EPOCH, imu(EPOCH, [1.2, -3.1, 9.0], "base"))]
+    turn = Rotation.from_euler("xyz", [-1.9, 0.2, 0.6]).as_matrix()
+    seen = replace(
+        frame(EPOCH), frame_id="base", frame_from_sensor=Pose(turn, np.array([0.1, 0.3, 1.2]))
+    )
+    with open_recording(write(tmp_path / "a.mcap", items)) as recording:
+        up = Upright.of(recording, up="imu", fixed_frame=None).orient(seen).up
+
+    assert up is not None
+    np.testing.assert_allclose(
+        turn @ up * np.linalg.norm([1.2, -3.1, 9.0]), [1.2, -3.1, 9.0], atol=1e-5
+    )
 
 
 def test_imu_is_used_if_transforms_lack_the_sensor(tmp_path: Path) -> None:
