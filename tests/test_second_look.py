@@ -417,6 +417,7 @@ def test_poses_relate_up_directions_of_moving_camera() -> None:
     rotation = [rotation_between(v, fixed_up) for v in truth]
     up, offsets = truth.copy(), np.full(20, -0.9)
     up[4], offsets[8] = (1, 0, 0), np.nan
+    offsets[14] = -0.5  # a shelf, which a moving camera may well see
 
     chosen = frames_to_revise(tables(up, rotation=rotation, offsets=offsets))
 
