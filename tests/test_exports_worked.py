@@ -318,6 +318,21 @@ def test_kitti_keeps_cloud_of_level_lidar(tmp_path: Path) -> None:
     assert_allclose(rows[:, :3], points, atol=1e-6)
 
 
+def test_kitti_turns_loose_points_of_camera_like_its_image(tmp_path: Path) -> None:
+    """Taken for a laser scanner with x forward, the scene would be beside the camera."""
+    cloud = Frame("/points", 0, 5, 6, "optical", points=frame().xyz())
+    unused: Any = SimpleNamespace()
+    found = []
+    for name, seen in (("image", frame()), ("cloud", cloud)):
+        (tmp_path / name).mkdir()
+        views: Any = [(labelled(cut=False, hidden=False), seen, None)]
+        write_kitti(tmp_path / name, views, unused)
+        found.append(np.fromfile(tmp_path / name / "velodyne" / "000000.bin", "<f4"))
+
+    assert_allclose(found[1], found[0])
+    assert found[0].reshape(-1, 4)[:, 0].min() > 0.7  # x is forward
+
+
 @pytest.mark.parametrize(("up", "forward"), [((0, 0, 1), (1, 0, 0)), ((0.3, 0, 0.95), (1, 0, 0))])
 def test_lidar_looks_along_its_x_axis(up: Any, forward: Any) -> None:
     """REP 103: x forward, y left, z up; a camera looks along z."""
