@@ -370,7 +370,8 @@ def test_strip_frames_show_new_tracks_first() -> None:
     assert strip == {("/d", k): pytest.approx(0.5 * k) for k in frames}
 
 
-def test_whole_views_are_preferred_to_larger_cut_ones(run: Path) -> None:
+@pytest.mark.parametrize("flag", ["touches_border", "occluded"])
+def test_whole_views_are_preferred_to_larger_cut_ones(run: Path, flag: str) -> None:
     """The crop of a card should show the whole object."""
     table = pq.read_table(run / "detections.parquet")
     (run / "masks.parquet").unlink(missing_ok=True)
@@ -380,7 +381,8 @@ def test_whole_views_are_preferred_to_larger_cut_ones(run: Path) -> None:
     rows = table.to_pylist()
     for row in rows:
         cut = owned.get((row["topic"], row["frame"], row["detection"]), 1) % 2 == 0
-        row |= {"points": 3000 if cut else 1000, "touches_border": cut, "occluded": False}
+        row |= {"points": 3000 if cut else 1000, "touches_border": False, "occluded": False}
+        row[flag] = cut
     pq.write_table(pa.Table.from_pylist(rows, table.schema), run / "detections.parquet")
     chosen = choose_frames(run, timelines).candidates
     views = [k for (topic, frame, _), k in owned.items() if track in chosen.get((topic, frame), ())]
