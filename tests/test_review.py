@@ -292,6 +292,19 @@ def test_path_of_track_joins_centres_of_whole_object(tmp_path: Path) -> None:
     assert np.allclose(strip[1:], place, atol=1e-6)
 
 
+def test_path_leaves_out_frame_without_pose(tmp_path: Path) -> None:
+    """Its positions, known in the sensor frame alone, would be drawn at the origin of the map."""
+    pose = Pose(Rotation.from_euler("zyx", [0.3, 0.2, -0.7]).as_matrix(), np.array([0.5, 0.1, 1.3]))
+    scenes = [
+        scene(k, [labelled_object(1, x=0.2 * k)], pose=None if k == 1 else pose) for k in range(3)
+    ]
+    path = write(tmp_path / "r.rrd", scenes, fixed_frame="map")
+
+    (strip,) = rows(path, f"/world/paths/{TOPIC}")[-1]["LineStrips3D:strips"]
+    places = [pose.rotation @ [x, 0.1, 1.0] + pose.translation for x in (0.0, 0.4)]
+    assert np.allclose(strip, places, atol=1e-6)
+
+
 def test_frame_without_pose_is_reviewed(tmp_path: Path) -> None:
     """Transforms may be missing at either end of a recording."""
     scenes = [scene(k, [labelled_object(1)]) for k in range(2)]
