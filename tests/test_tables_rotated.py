@@ -18,6 +18,7 @@ from shapecat.runs.labelled_frames import _join, read_labelled_frames
 from shapecat.runs.labels.corrections import read_labels
 from shapecat.runs.perceive.perceived import FrameRow, PerceptionTables
 from shapecat.runs.shown import read_shown_frames
+from shapecat.runs.tables.placed_frames import streams_with_poses
 from shapecat.runs.tracks import _line, _read_frames, track_run
 from shapecat.tracking.records import Track
 from shapecat.types import (
@@ -322,6 +323,11 @@ def test_pose_missing_in_half_of_frames_is_not_used(tmp_path: Path, posed: int) 
     assert [row["frame"] for row in tracks] == list(range(count))
     assert_allclose([row["center_fixed"] for row in tracks], [place] * count, atol=1e-5)
     assert [row["frames"] for row in lines(tmp_path)] == [str(count)]
+    placed = streams_with_poses(tmp_path)
+    turn = (ROTATIONS[0] if placed else Rotation.identity()) * ROTATIONS[0].inv() * AXES
+    for frame in _read_frames(tmp_path, len(CATEGORIES), placed):
+        axes = Rotation.from_quat(frame.orientations).as_matrix()
+        assert_allclose(axes, np.tile(turn.as_matrix(), (len(axes), 1, 1)), atol=1e-5)
 
 
 def test_causal_posteriors_use_current_and_earlier_views(run: Path) -> None:
