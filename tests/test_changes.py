@@ -26,7 +26,7 @@ from shapecat.reuse.agreement import agreement
 from shapecat.runs.perceive.perceived import FrameRow, PerceptionTables
 from shapecat.runs.tables.placed_frames import PlacedFrames, streams_with_poses
 from shapecat.runs.tables.reading import read_row_groups
-from shapecat.tracking.hits import gather
+from shapecat.tracking.detection_table import gather
 from shapecat.tracking.records import FrameDetections
 from shapecat.types import Camera, Frame, Pose
 from tests.colour_messages import gradient, raw

@@ -11,7 +11,7 @@ from benchmarks.hours import make_tables
 from shapecat.config import TrackingSettings
 from shapecat.runs import full_boxes, tracks
 from shapecat.runs.tables.segments import group_frames
-from shapecat.tracking import fusion, hits
+from shapecat.tracking import detection_table, fusion
 from shapecat.types import CATEGORIES
 
 FRAMES = 300
@@ -41,7 +41,7 @@ def test_batch_sizes_do_not_change_tracks(
     """Batches may end within a frame, a track or a row group; a track may span several."""
     whole, lines = usual
     sizes = {(tracks, "_BATCH"): 100, (full_boxes, "_BLOCK"): 7}
-    sizes |= {(hits, "_BLOCK"): 50, (fusion, "_BLOCK"): 33}
+    sizes |= {(detection_table, "_BLOCK"): 50, (fusion, "_BLOCK"): 33}
     for (module, name), size in sizes.items():
         monkeypatch.setattr(module, name, size)
 

@@ -22,7 +22,7 @@ from shapecat.runs.jobs import Job
 from shapecat.simulation import KINECT, make_scene, render_frame
 from shapecat.simulation.recorder import record
 from shapecat.simulation.scenes.worlds import Motion, World
-from shapecat.tracking.hits import gather
+from shapecat.tracking.detection_table import gather
 from shapecat.tracking.records import FrameDetections
 from shapecat.types import Box, Candidate, Detection, Frame, FullBox, Perception, Pose
 from tests.conftest import Guesser

@@ -23,10 +23,10 @@ from shapecat.tracking import (
 )
 from shapecat.tracking.association import assign, size_key
 from shapecat.tracking.common_motion import find_common_motion
+from shapecat.tracking.detection_table import gather
+from shapecat.tracking.false_tracks import without_duplicates
 from shapecat.tracking.fusion import fuse_novelty, view_weights
-from shapecat.tracking.hits import gather
 from shapecat.tracking.recording import _without_gaps
-from shapecat.tracking.surplus import without_shadows
 
 SETTINGS = TrackingSettings()
 SECOND = 1_000_000_000
@@ -556,7 +556,7 @@ def test_common_motion_stabilises_detections_and_can_be_inverted(speed: float) -
     hits = next(gather(frames))
     motion = find_common_motion(hits, [np.arange(k, 400, 5) for k in range(5)])
     assert motion is not None
-    still = motion.still(hits).centers.reshape(80, 5, 3)
+    still = motion.stabilised(hits).centers.reshape(80, 5, 3)
     assert still.std(axis=0).max() < 0.01
     back = motion.moved(hits.rows, still.reshape(-1, 3))
     assert back == pytest.approx(hits.centers, abs=1e-6)
@@ -764,7 +764,7 @@ def test_short_track_inside_longer_one_is_removed(begin: int, x: float, *, kept:
             count += present
     tracks = [np.array(member) for member in members]
 
-    found = without_shadows(next(gather(frames)), tracks)
+    found = without_duplicates(next(gather(frames)), tracks)
 
     assert [len(member) for member in found] == ([24, 3] if kept else [24])
 

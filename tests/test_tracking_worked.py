@@ -14,13 +14,13 @@ from shapecat.config import TrackingSettings
 from shapecat.tracking import track_recording, tracker
 from shapecat.tracking.association import size_key
 from shapecat.tracking.common_motion import CommonMotion, _fit, _in_space, _level
-from shapecat.tracking.hindsight import Fragments, _contradiction, _distances
-from shapecat.tracking.hits import Hits, gather
-from shapecat.tracking.pieces import _changes, _joint, _largest
+from shapecat.tracking.detection_table import DetectionTable, gather
+from shapecat.tracking.false_tracks import _in_box
 from shapecat.tracking.pieces import _fit as fit_pieces
+from shapecat.tracking.pieces import _joint, _largest, _time_overlap
 from shapecat.tracking.recording import _describe, _line, _needed
 from shapecat.tracking.records import FrameDetections
-from shapecat.tracking.surplus import _in_box
+from shapecat.tracking.stitching import Fragments, _contradiction, _distances
 from shapecat.tracking.tracker import Tracker
 
 SETTINGS = TrackingSettings()
@@ -307,7 +307,7 @@ def test_tracks_of_all_sensors_are_numbered_by_birth() -> None:
 # ---- pieces
 
 
-def turned_hits() -> Hits:
+def turned_table() -> DetectionTable:
     """Return two detections in one frame whose boxes have different yaws."""
     other = Rotation.from_euler("z", 0.5).as_matrix() @ TURNED
     places = [[0.31, -0.12, 0.83], [0.42, -0.05, 0.79]]
@@ -318,7 +318,7 @@ def turned_hits() -> Hits:
 
 def test_joint_box_encloses_corners_of_both_pieces() -> None:
     """Along the axes of the first: longer side, shorter side, height."""
-    hits = turned_hits()
+    hits = turned_table()
     signs = np.array(np.meshgrid(*[[-0.5, 0.5]] * 3)).reshape(3, -1).T
     axes = hits.axes(slice(None))
     corners = [
@@ -331,7 +331,7 @@ def test_joint_box_encloses_corners_of_both_pieces() -> None:
 
 
 def test_pieces_fit_into_whole_that_neither_fills() -> None:
-    hits = turned_hits()
+    hits = turned_table()
     pair = np.array([[0, 1]])
     both = np.minimum(*(_joint(hits, each) for each in (pair, pair[:, ::-1])))[0]
 
@@ -373,13 +373,13 @@ def test_change_of_tracks_is_their_overlap() -> None:
             members[m].append(at)
             at += 1
     duos = np.array([[0, 1], [0, 2]])
-    share = _changes(next(gather(frames)), [np.array(m) for m in members], duos)
+    share = _time_overlap(next(gather(frames)), [np.array(m) for m in members], duos)
 
     assert share.tolist() == [0.2, np.inf]
 
 
 def test_point_in_box_is_tested_along_axes_of_box() -> None:
-    hits = turned_hits()
+    hits = turned_table()
     (axes,) = hits.axes(slice(1))
     offsets = np.array([0.0599, -0.0249, 0.0999]) * [1, -1, -1]
     inside = hits.centers[0] + axes @ offsets
@@ -417,7 +417,7 @@ def test_rotation_in_plane_is_rotation_about_up() -> None:
         assert_allclose(still, expected, atol=1e-12)
         assert_allclose(motion.moved(np.full(7, k), still), points, atol=1e-12)
         alone = CommonMotion(motion.rotations[k : k + 1], motion.translations[k : k + 1])
-        back = alone.still(next(gather([frame(0, points)])))
+        back = alone.stabilised(next(gather([frame(0, points)])))
         assert_allclose(back.centers, expected, atol=1e-6)  # kept in single precision
         turns = np.broadcast_to(motion.rotations[k], (7, 3, 3))
         assert_allclose(back.axes(slice(None)), turns, atol=1e-6)

@@ -4,9 +4,9 @@
 """
 
 from shapecat.tracking.fusion import causal, fuse, view_weights
-from shapecat.tracking.hindsight import Fragments, merge_fragments, scene_cuts
 from shapecat.tracking.recording import track_recording
 from shapecat.tracking.records import FrameDetections, Track
+from shapecat.tracking.stitching import Fragments, merge_fragments, scene_cuts
 from shapecat.tracking.tracker import Tracker
 
 __all__ = [

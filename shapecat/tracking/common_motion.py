@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
 from shapecat.arrays import F8, I4
-from shapecat.tracking.hits import Hits
+from shapecat.tracking.detection_table import DetectionTable
 
 __all__ = ["CommonMotion", "find_common_motion"]
 
@@ -36,18 +36,18 @@ class CommonMotion:
     rotations: F8
     translations: F8
 
-    def still(self, hits: Hits) -> Hits:
+    def stabilised(self, table: DetectionTable) -> DetectionTable:
         """Return the detections transformed into the coordinate frame of the still objects."""
-        centers = np.zeros(hits.centers.shape)
-        orientations = None if hits.orientations is None else np.zeros_like(hits.orientations)
-        for block in hits.blocks():
-            turns = self.rotations[hits.rows[block]]
-            shifts = self.translations[hits.rows[block]]
-            centers[block] = np.einsum("nij,nj->ni", turns, hits.centers[block]) + shifts
+        centers = np.zeros(table.centers.shape)
+        orientations = None if table.orientations is None else np.zeros_like(table.orientations)
+        for block in table.blocks():
+            turns = self.rotations[table.rows[block]]
+            shifts = self.translations[table.rows[block]]
+            centers[block] = np.einsum("nij,nj->ni", turns, table.centers[block]) + shifts
             if orientations is not None:
-                turned = Rotation.from_matrix(turns @ hits.axes(block))
+                turned = Rotation.from_matrix(turns @ table.axes(block))
                 orientations[block] = turned.as_quat()
-        return replace(hits, centers=centers, orientations=orientations)
+        return replace(table, centers=centers, orientations=orientations)
 
     def moved(self, rows: I4, places: F8) -> F8:
         """Transform positions (k, 3), metres, from the still scene into frames ``rows`` (k,)."""
@@ -56,15 +56,15 @@ class CommonMotion:
         )
 
 
-def find_common_motion(hits: Hits, members: Sequence[I4]) -> CommonMotion | None:
+def find_common_motion(table: DetectionTable, tracks: Sequence[I4]) -> CommonMotion | None:
     """Find the motion that all objects have in common, relative to the sensor, if there is one.
 
     In each frame it is a rotation about the up direction and a horizontal translation.
 
     Parameters
     ----------
-    hits : all detections of a stream.
-    members : for each track, the indices of its detections in ``hits``, ascending; several tracks
+    table : all detections of a stream.
+    tracks : for each track, the indices of its detections in ``table``, ascending; several tracks
         may belong to one object.
 
     Returns
@@ -78,18 +78,18 @@ def find_common_motion(hits: Hits, members: Sequence[I4]) -> CommonMotion | None
     alternately (generalized Procrustes analysis, Gower 1975), starting from the motion between
     neighbouring frames. Outliers get less weight (Cauchy).
     """
-    long = [member for member in members if len(member) >= _LONG]
-    if hits.orientations is None or len(long) < 3:
+    long = [track for track in tracks if len(track) >= _LONG]
+    if table.orientations is None or len(long) < 3:
         return None
-    lengths = [len(member) for member in long]
-    moved = [_extent(hits.centers[member]) > _MOVED_M for member in long]
+    lengths = [len(track) for track in long]
+    moved = [_extent(table.centers[track]) > _MOVED_M for track in long]
     if np.average(moved, weights=lengths) < _MOST:
         return None
     which, owner = np.concatenate(long), np.repeat(np.arange(len(long)), lengths)
-    level = _level(hits)
-    local = hits.centers[which] @ level.T
+    level = _level(table)
+    local = table.centers[which] @ level.T
     plane = local[:, 0] + 1j * local[:, 1]
-    rows, count = hits.rows[which], len(hits.stamps_ns)
+    rows, count = table.rows[which], len(table.stamps_ns)
     turn, shift = _between_neighbours(plane, rows, owner, count)
     weights = np.ones(len(which))
     for _ in range(_ROUNDS):
@@ -110,9 +110,9 @@ def _extent(centers: F8) -> float:
     return float(np.linalg.norm(high - low))
 
 
-def _level(hits: Hits) -> F8:
+def _level(table: DetectionTable) -> F8:
     """Return the rotation (3, 3) into a frame whose z axis is the mean up of the boxes."""
-    up = np.sum([hits.axes(block)[:, :, 2].sum(axis=0) for block in hits.blocks()], axis=0)
+    up = np.sum([table.axes(block)[:, :, 2].sum(axis=0) for block in table.blocks()], axis=0)
     first = np.cross(up, np.eye(3)[np.argmin(np.abs(up))])
     first /= np.linalg.norm(first)
     up /= np.linalg.norm(up)

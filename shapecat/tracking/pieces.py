@@ -9,7 +9,7 @@ from scipy.spatial import cKDTree
 
 from shapecat.arrays import F8, I4, Bool
 from shapecat.tracking.association import sorted_sides
-from shapecat.tracking.hits import Hits
+from shapecat.tracking.detection_table import DetectionTable
 
 __all__ = ["join_pieces"]
 
@@ -21,7 +21,7 @@ _PASSING = 0.25  # largest overlap in time of two tracks while an object passes 
 _CHANGING = 0.5  # the same, if one detection sometimes covers both sides of the occluder
 
 
-def join_pieces(hits: Hits, members: Sequence[I4]) -> list[I4]:
+def join_pieces(table: DetectionTable, tracks: Sequence[I4]) -> list[I4]:
     """Join tracks that are pieces of one object.
 
     The size of the whole object is known from frames in which it was not split. The box around two
@@ -36,145 +36,147 @@ def join_pieces(hits: Hits, members: Sequence[I4]) -> list[I4]:
 
     Parameters
     ----------
-    members : hits of each track, ascending.
+    tracks : the indices (k,) of the detections of each track, ascending.
 
     Returns
     -------
-    The hits (k,) of each object, ascending, in the order of their first track.
+    The detections (k,) of each object, ascending, in the order of their first track.
     """
-    if hits.orientations is None or len(members) < 2:
-        return list(members)
-    counts = _count_fits(hits, members)
-    root = np.arange(len(members))
+    if table.orientations is None or len(tracks) < 2:
+        return list(tracks)
+    counts = _count_fits(table, tracks)
+    root = np.arange(len(tracks))
     for (a, b), count in sorted((+counts).items(), key=lambda item: (-item[1], item[0])):
-        common = np.intersect1d(hits.rows[members[a]], hits.rows[members[b]]).size
+        common = np.intersect1d(table.rows[tracks[a]], table.rows[tracks[b]]).size
         if count > _MOSTLY * common:
             root[root == max(root[a], root[b])] = min(root[a], root[b])
-    groups = [[members[k] for k in _where(root == r)] for r in np.unique(root)]
-    return [_largest(hits, np.concatenate(group)) for group in groups]
+    groups = [[tracks[k] for k in _where(root == r)] for r in np.unique(root)]
+    return [_largest(table, np.concatenate(group)) for group in groups]
 
 
-def _count_fits(hits: Hits, members: Sequence[I4]) -> Counter[tuple[int, int]]:
+def _count_fits(table: DetectionTable, tracks: Sequence[I4]) -> Counter[tuple[int, int]]:
     """Return the number of frames in which two tracks are pieces of one object, for each pair."""
-    owner, counts = hits.owners(members), Counter[tuple[int, int]]()
-    rooms = _Rooms(hits, members)
-    for block in hits.blocks():
-        pairs = _neighbours(hits, owner, block)
-        duos, which = np.unique(np.sort(owner[pairs], axis=1), axis=0, return_inverse=True)
-        fits = _fit(hits, pairs, rooms.of(pairs, owner, duos, which.ravel()))
-        fitting = np.bincount(which.ravel()[fits], minlength=len(duos))
-        counts.update(dict(zip(map(tuple, duos.tolist()), fitting.tolist(), strict=True)))
+    owner, counts = table.track_of_each(tracks), Counter[tuple[int, int]]()
+    sizes = _WholeSizes(table, tracks)
+    for block in table.blocks():
+        pairs = _neighbours(table, owner, block)
+        track_pairs, which = np.unique(np.sort(owner[pairs], axis=1), axis=0, return_inverse=True)
+        fits = _fit(table, pairs, sizes.of(pairs, owner, track_pairs, which.ravel()))
+        fitting = np.bincount(which.ravel()[fits], minlength=len(track_pairs))
+        counts.update(dict(zip(map(tuple, track_pairs.tolist()), fitting.tolist(), strict=True)))
     return counts
 
 
-class _Rooms:
+class _WholeSizes:
     """Sizes of the whole object that two pieces may belong to."""
 
-    def __init__(self, hits: Hits, members: Sequence[I4]) -> None:
-        self._hits, self._members = hits, members
-        self._wholes = np.array([_wholes(hits, member) for member in members])
-        # A cached method would make a reference cycle, which could keep gigabytes of hits alive.
-        self._in_one = cache(partial(_seen_in_one, hits, members))
+    def __init__(self, table: DetectionTable, tracks: Sequence[I4]) -> None:
+        self._table, self._tracks = table, tracks
+        self._wholes = np.array([_wholes(table, track) for track in tracks])
+        # A cached method would make a reference cycle, which could keep gigabytes alive.
+        self._in_one = cache(partial(_seen_in_one, table, tracks))
 
-    def of(self, pairs: I4, owner: I4, duos: I4, which: I4) -> F8:
+    def of(self, pairs: I4, owner: I4, track_pairs: I4, which: I4) -> F8:
         """Return the lengths (p, 2, 3) of the whole object from either track, metres.
 
-        ``pairs`` (p, 2) are pairs of hits, ``duos`` (q, 2) the pairs of tracks, and ``which`` (p,)
-        the position of each pair's tracks in ``duos``.
+        ``pairs`` (p, 2) are pairs of detections, ``track_pairs`` (q, 2) the pairs of tracks, and
+        ``which`` (p,) the position of each pair's tracks in ``track_pairs``.
         """
-        hits = self._hits
-        rooms = self._wholes[owner[pairs], hits.topics[hits.rows[pairs]]]
-        share = _changes(hits, self._members, duos)
-        passing = (share <= _PASSING)[which] & hits.partial[pairs].all(axis=1)
-        rooms[passing, :, 1] = rooms[passing, :, 0]
+        table = self._table
+        sizes = self._wholes[owner[pairs], table.topics[table.rows[pairs]]]
+        share = _time_overlap(table, self._tracks, track_pairs)
+        passing = (share <= _PASSING)[which] & table.partial[pairs].all(axis=1)
+        sizes[passing, :, 1] = sizes[passing, :, 0]
         for k in _where(share <= _CHANGING):
-            rooms[which == k] = np.maximum(rooms[which == k], self._in_one(*duos[k].tolist()))
-        return np.asarray(rooms)
+            sizes[which == k] = np.maximum(
+                sizes[which == k], self._in_one(*track_pairs[k].tolist())
+            )
+        return np.asarray(sizes)
 
 
-def _seen_in_one(hits: Hits, members: Sequence[I4], a: int, b: int) -> F8:
-    """Return the largest lengths (3,) of hits where only one of two tracks has a hit, metres.
+def _seen_in_one(table: DetectionTable, tracks: Sequence[I4], a: int, b: int) -> F8:
+    """Return the largest lengths (3,) in frames where only one of two tracks is seen, metres.
 
     Only frames while both tracks last count; 0 if there are none.
     """
-    both = np.concatenate([members[a], members[b]])
-    start = max(hits.rows[members[k][0]] for k in (a, b))
-    stop = min(hits.rows[members[k][-1]] for k in (a, b))
-    rows, at, counts = np.unique(hits.rows[both], return_index=True, return_counts=True)
+    both = np.concatenate([tracks[a], tracks[b]])
+    start = max(table.rows[tracks[k][0]] for k in (a, b))
+    stop = min(table.rows[tracks[k][-1]] for k in (a, b))
+    rows, at, counts = np.unique(table.rows[both], return_index=True, return_counts=True)
     alone = both[at[(counts == 1) & (rows > start) & (rows < stop)]]
-    return np.asarray(sorted_sides(hits.sizes[alone]).max(axis=0, initial=0))
+    return np.asarray(sorted_sides(table.sizes[alone]).max(axis=0, initial=0))
 
 
 def _where(mask: Bool) -> list[int]:
     return [int(k) for k in np.flatnonzero(mask)]
 
 
-def _wholes(hits: Hits, member: I4) -> F8:
+def _wholes(table: DetectionTable, track: I4) -> F8:
     """Return the whole object's lengths (topics, 3) as seen by each topic, metres; 0 if unseen."""
-    topics = hits.topics[hits.rows[member]]
-    result = np.zeros((len(hits.names), 3))
+    topics = table.topics[table.rows[track]]
+    result = np.zeros((len(table.names), 3))
     for topic in _where(np.bincount(topics) > 0):
-        result[topic] = _whole(hits, member[topics == topic])
+        result[topic] = _whole(table, track[topics == topic])
     return result
 
 
-def _whole(hits: Hits, member: I4) -> F8:
+def _whole(table: DetectionTable, track: I4) -> F8:
     """Return the 75th percentile (3,) of the lengths of whole views, or of all if none is whole."""
-    uncut = member[~hits.partial[member]]
-    lengths = sorted_sides(hits.sizes[member if len(uncut) == 0 else uncut])
+    uncut = track[~table.partial[track]]
+    lengths = sorted_sides(table.sizes[track if len(uncut) == 0 else uncut])
     return np.asarray(np.quantile(lengths, 0.75, axis=0))
 
 
-def _neighbours(hits: Hits, owner: I4, block: slice) -> I4:
-    """Return the pairs (p, 2) of tracked hits in the same frame that are near each other."""
+def _neighbours(table: DetectionTable, owner: I4, block: slice) -> I4:
+    """Return the pairs (p, 2) of tracked detections in the same frame that are near each other."""
     tracked = block.start + np.flatnonzero(owner[block] >= 0)
-    places = np.column_stack([hits.centers[tracked], hits.rows[tracked]])
+    places = np.column_stack([table.centers[tracked], table.rows[tracked]])
     found = cKDTree(places).query_pairs(_NEAR_M, output_type="ndarray")
     pairs = tracked[found]
     return np.asarray(pairs[np.lexsort(pairs.T)])
 
 
-def _changes(hits: Hits, members: Sequence[I4], duos: I4) -> F8:
+def _time_overlap(table: DetectionTable, tracks: Sequence[I4], track_pairs: I4) -> F8:
     """Return the overlap in time (q,) of pairs of tracks (q, 2), relative to the shorter track.
 
     It is inf if one track lies within the other.
     """
-    first = np.array([hits.rows[member[0]] for member in members])[duos]
-    last = np.array([hits.rows[member[-1]] for member in members])[duos]
+    first = np.array([table.rows[track[0]] for track in tracks])[track_pairs]
+    last = np.array([table.rows[track[-1]] for track in tracks])[track_pairs]
     share = (last.min(axis=1) - first.max(axis=1) + 1) / (last - first + 1).min(axis=1)
     within = np.argmin(first, axis=1) != np.argmin(last, axis=1)
     return np.where(within, np.inf, share)
 
 
-def _fit(hits: Hits, pairs: I4, wholes: F8) -> Bool:
-    """Return the mask (p,) of pairs of hits (p, 2) that are pieces of one object.
+def _fit(table: DetectionTable, pairs: I4, wholes: F8) -> Bool:
+    """Return the mask (p,) of pairs of detections (p, 2) that are pieces of one object.
 
     ``wholes`` (p, 2, 3) are the lengths of the whole object from either track. The joint box of two
     pieces is no larger than the whole object, and neither piece is as large as the whole object, as
     a bowl with an object in it would be.
     """
-    joint = np.minimum(_joint(hits, pairs), _joint(hits, pairs[:, ::-1]))
-    lengths = sorted_sides(hits.sizes[pairs.ravel()]).reshape(-1, 2, 3)
+    joint = np.minimum(_joint(table, pairs), _joint(table, pairs[:, ::-1]))
+    lengths = sorted_sides(table.sizes[pairs.ravel()]).reshape(-1, 2, 3)
     room = wholes * _SLACK + _SLACK_M
     lacking = np.any(lengths.max(axis=1)[:, None] < _LACKING * wholes, axis=2)
     fitting = np.all(joint[:, None] <= room, axis=2)
     return np.asarray(np.any(fitting & lacking, axis=1))
 
 
-def _joint(hits: Hits, pairs: I4) -> F8:
+def _joint(table: DetectionTable, pairs: I4) -> F8:
     """Return the lengths (p, 3) of the box around each pair, along the first box's axes, metres."""
     i, j = pairs.T
-    own_axes, others = hits.axes(i), hits.axes(j)
-    offset = np.einsum("pji,pj->pi", own_axes, hits.centers[j] - hits.centers[i])
+    own_axes, others = table.axes(i), table.axes(j)
+    offset = np.einsum("pji,pj->pi", own_axes, table.centers[j] - table.centers[i])
     turned = np.abs(np.einsum("pji,pjk->pik", own_axes, others))
-    reach = 0.5 * np.einsum("pik,pk->pi", turned, hits.sizes[j])
-    own = 0.5 * hits.sizes[i].astype(np.float64)
+    reach = 0.5 * np.einsum("pik,pk->pi", turned, table.sizes[j])
+    own = 0.5 * table.sizes[i].astype(np.float64)
     return sorted_sides(np.maximum(own, offset + reach) - np.minimum(-own, offset - reach))
 
 
-def _largest(hits: Hits, member: I4) -> I4:
-    """Return the largest hit of each frame."""
-    volume = hits.sizes[member].astype(np.float64).prod(axis=1)
-    order = member[np.lexsort([-volume, hits.rows[member]])]
-    first = np.concatenate([[True], np.diff(hits.rows[order]) > 0])
+def _largest(table: DetectionTable, track: I4) -> I4:
+    """Return the largest detection of each frame."""
+    volume = table.sizes[track].astype(np.float64).prod(axis=1)
+    order = track[np.lexsort([-volume, table.rows[track]])]
+    first = np.concatenate([[True], np.diff(table.rows[order]) > 0])
     return np.asarray(order[first])

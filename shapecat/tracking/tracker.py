@@ -11,7 +11,7 @@ from shapecat.arrays import F8, I4, Bool, freeze
 from shapecat.config import TrackingSettings
 from shapecat.tracking.association import assign, posterior_difference, size_difference, size_key
 
-__all__ = ["Tracker", "reach"]
+__all__ = ["Tracker", "gate_radius"]
 
 _SPEED_M_S = 0.15  # standard deviation of an object's velocity; most stand still
 _SPEED_MEMORY_S = 1.0  # time constant with which a velocity decays
@@ -23,7 +23,7 @@ _PATIENCE_S = 0.5  # shortest time without detections after which a track may en
 _MEMORY_HITS = 10  # number of detections over which a track's size and posterior are averaged
 
 
-def reach(size_keys: F8, gate_m: float) -> F8:
+def gate_radius(size_keys: F8, gate_m: float) -> F8:
     """Return the gate radius (m,), metres, of objects with a given `size_key` (m, 3).
 
     A change of view, or an occluder, can move the centre of the visible part by half the object's
@@ -220,7 +220,7 @@ def _costs(tracks: _Active, found: _Active, clock_ns: int, settings: TrackingSet
     distance = np.linalg.norm(tracks.position[:, None] - found.position[None], axis=2)
     unseen_s = np.minimum((clock_ns - tracks.seen_ns) * 1e-9, 0.2)
     gate = np.minimum(
-        reach(tracks.size, settings.gate_m) + _SURPRISE_M_S * unseen_s, settings.gate_m
+        gate_radius(tracks.size, settings.gate_m) + _SURPRISE_M_S * unseen_s, settings.gate_m
     )[:, None]
     costs = (
         (distance / np.maximum(gate, 1e-9)) ** 2

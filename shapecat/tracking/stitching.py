@@ -1,4 +1,4 @@
-"""Hindsight: detecting scene cuts, and stitching the track fragments of one object."""
+"""Track stitching: scene cuts, and the track fragments of one object joined in hindsight."""
 
 from collections.abc import Iterator
 from heapq import merge
@@ -9,8 +9,8 @@ from scipy.spatial import cKDTree
 from shapecat.arrays import F8, I4, Bool, Record, array
 from shapecat.config import TrackingSettings
 from shapecat.tracking.association import posterior_difference, size_key
-from shapecat.tracking.hits import Hits
-from shapecat.tracking.tracker import reach
+from shapecat.tracking.detection_table import DetectionTable
+from shapecat.tracking.tracker import gate_radius
 
 __all__ = ["Fragments", "merge_fragments", "scene_cuts"]
 
@@ -87,8 +87,9 @@ def merge_fragments(fragments: Fragments, settings: TrackingSettings) -> I4:
 def _links(fragments: Fragments, settings: TrackingSettings) -> list[tuple[int, int]]:
     """Return the possible links (earlier, later), the cheapest first."""
     keys = size_key(fragments.sizes)
-    limit = reach(keys, settings.gate_m)
-    hidden = 2 * reach(keys, np.inf)  # one side disappears behind an occluder, the other emerges
+    limit = gate_radius(keys, settings.gate_m)
+    # One side disappears behind an occluder, the other emerges.
+    hidden = 2 * gate_radius(keys, np.inf)
     known = fragments.whole >= _KNOWN
     vague = (fragments.whole == 0) | (fragments.novelties > 1)  # the posterior is meaningless
     found = []
@@ -164,7 +165,7 @@ def _distances(fragments: Fragments, i: int, after: I4, settings: TrackingSettin
     return np.asarray(np.minimum(resting, moving))
 
 
-def scene_cuts(hits: Hits, settings: TrackingSettings) -> Bool:
+def scene_cuts(table: DetectionTable, settings: TrackingSettings) -> Bool:
     """Return the mask (f,) of frames of a stream that begin a new scene.
 
     Recordings of single images can show different objects at the same position from one frame to
@@ -174,9 +175,9 @@ def scene_cuts(hits: Hits, settings: TrackingSettings) -> Bool:
     Frames without detections are ignored. A clock that jumps back by more than ``max_missed_s``
     also begins a new scene.
     """
-    stamps, filled = hits.stamps_ns, np.unique(hits.rows)
+    stamps, filled = table.stamps_ns, np.unique(table.rows)
     result = np.diff(stamps, prepend=stamps[:1]) < -settings.max_missed_s * 1e9
-    topics = (_with_neighbours(hits, filled, topic) for topic in range(len(hits.names)))
+    topics = (_with_neighbours(table, filled, topic) for topic in range(len(table.names)))
     for k, last, before, older, later in merge(*topics):
         slow = bool(stamps[k] - stamps[before] > _SLOW_S * 1e9)
         if before > last and not slow:
@@ -188,19 +189,21 @@ def scene_cuts(hits: Hits, settings: TrackingSettings) -> Bool:
             pairs.append((last, later))
         if older >= 0 and not result[last]:
             pairs.append((older, k))
-        result[k] |= not any(_continues(hits, i, j, slow=slow, settings=settings) for i, j in pairs)
+        result[k] |= not any(
+            _continues(table, i, j, slow=slow, settings=settings) for i, j in pairs
+        )
     return np.asarray(result)
 
 
 def _with_neighbours(
-    hits: Hits, filled: I4, topic: int
+    table: DetectionTable, filled: I4, topic: int
 ) -> Iterator[tuple[int, int, int, int, int]]:
     """Yield the frames of a topic with detections from the second on, each with four others.
 
     These are the previous frame with detections, the previous frame, the second previous and the
     next one with detections, -1 if there is none. ``filled`` (k,) are all frames with detections.
     """
-    own, seen = np.flatnonzero(hits.topics == topic), filled[hits.topics[filled] == topic]
+    own, seen = np.flatnonzero(table.topics == topic), filled[table.topics[filled] == topic]
     before = own[np.searchsorted(own, seen) - 1]
     for n in range(1, len(seen)):
         older = int(seen[n - 2]) if n > 1 else -1
@@ -208,26 +211,28 @@ def _with_neighbours(
         yield int(seen[n]), int(seen[n - 1]), int(before[n]), older, later
 
 
-def _continues(hits: Hits, i: int, j: int, *, slow: bool, settings: TrackingSettings) -> bool:
+def _continues(
+    table: DetectionTable, i: int, j: int, *, slow: bool, settings: TrackingSettings
+) -> bool:
     """Return whether frames i and j may show the same scene: at least half of the objects match.
 
     A partial view may be smaller than its object. With ``slow``, positions and posteriors must
     agree better, as the frames are not expected to show motion; those of partial views less so.
     """
-    a, b = hits.of_frame(i), hits.of_frame(j)
-    distance = np.linalg.norm(hits.centers[a][:, None] - hits.centers[b][None], axis=2)
+    a, b = table.of_frame(i), table.of_frame(j)
+    distance = np.linalg.norm(table.centers[a][:, None] - table.centers[b][None], axis=2)
     near = distance < _NEIGHBOURHOOD_M
     comparable = min(int(near.any(axis=1).sum()), int(near.any(axis=0).sum()))
     if comparable == 0:
         return True
-    keys_a, keys_b = size_key(hits.sizes[a]), size_key(hits.sizes[b])
-    whole_a, whole_b = ~hits.partial[a][:, None], ~hits.partial[b][None]
+    keys_a, keys_b = size_key(table.sizes[a]), size_key(table.sizes[b])
+    whole_a, whole_b = ~table.partial[a][:, None], ~table.partial[b][None]
     size = _contradiction(keys_a[:, None], keys_b[None], whole_a, whole_b)
     same = (distance <= settings.gate_m) & (size <= _SAME_SIZE)
     if slow:
         slack = np.where(whole_a & whole_b, 1.0, _PARTIAL_SLACK)
-        other = posterior_difference(hits.posteriors[a], hits.posteriors[b])
-        same &= distance <= slack * _SLOW_REACH * reach(keys_a, settings.gate_m)[:, None]
+        other = posterior_difference(table.posteriors[a], table.posteriors[b])
+        same &= distance <= slack * _SLOW_REACH * gate_radius(keys_a, settings.gate_m)[:, None]
         same &= other <= slack * _SAME_POSTERIOR
     found = min(int(same.any(axis=1).sum()), int(same.any(axis=0).sum()))
     return 2 * found >= comparable

@@ -12,13 +12,13 @@ from shapecat.arrays import F4, F8, I4, Bool
 from shapecat.tracking.fusion import view_weights
 from shapecat.tracking.records import FrameDetections
 
-__all__ = ["Hits", "gather"]
+__all__ = ["DetectionTable", "gather"]
 
 _BLOCK = 2**16  # detections processed at once
 _SET_BACK_NS = 1_000_000_000  # a clock was set back by more than this; late messages differ by less
 
 _OF_FRAMES = {"topics": "i4", "frames": "i4", "stamps_ns": "i8"}
-_OF_HITS: dict[str, tuple[str, tuple[Any, ...]]] = {
+_OF_DETECTIONS: dict[str, tuple[str, tuple[Any, ...]]] = {
     "numbers": ("i4", ()),
     "centers": ("f8", (3,)),
     "sizes": ("f4", (3,)),
@@ -31,20 +31,20 @@ _OF_HITS: dict[str, tuple[str, tuple[Any, ...]]] = {
 
 
 @dataclass(frozen=True)
-class Hits:
-    """All detections of a stream, called hits, in the order of the frames.
+class DetectionTable:
+    """All detections of a stream, in the order of the frames.
 
-    A hit takes only about 100 bytes, as the hits of many hours are kept at once.
+    A detection takes only about 100 bytes, as those of many hours are kept at once.
 
     Attributes
     ----------
     names : the topics of the stream.
     topics, frames, stamps_ns : (f,) index into ``names``, number and time of each frame.
-    first : (f + 1,) index of the first hit of each frame.
-    rows : (n,) index of the frame of each hit, ascending.
+    first : (f + 1,) index of the first detection of each frame.
+    rows : (n,) index of the frame of each detection, ascending.
     numbers, centers, sizes, posteriors, partial, novelties, described : (n, ...) as ``detections``
         and the other columns in `FrameDetections`.
-    orientations : (n, 4) quaternions (x, y, z, w) of the boxes; None if some hits have none.
+    orientations : (n, 4) quaternions (x, y, z, w) of the boxes; None if some detections have none.
     """
 
     names: tuple[str, ...]
@@ -63,67 +63,67 @@ class Hits:
     described: I4
 
     def without_boxes(self) -> Self:
-        """Return the hits without sizes and orientations, which tracks do not need."""
+        """Return the detections without sizes and orientations, which tracks do not need."""
         return replace(self, sizes=np.zeros((0, 3), np.float32), orientations=None)
 
     def axes(self, which: I4 | slice) -> F8:
-        """Return the axes (k, 3, 3) of the boxes of hits ``which``, as columns; none if unknown."""
+        """Return the axes (k, 3, 3) of the boxes of ``which``, as columns; none if unknown."""
         some = None if self.orientations is None else self.orientations[which]
         if some is None or len(some) == 0:
             return np.zeros((0, 3, 3))
         return np.asarray(Rotation.from_quat(some).as_matrix())
 
     def blocks(self) -> Iterator[slice]:
-        """Yield slices of hits that cover all frames in order, never dividing a frame."""
+        """Yield slices of detections that cover all frames in order, never dividing a frame."""
         stops = np.searchsorted(self.first, np.arange(_BLOCK, len(self.rows), _BLOCK))
         bounds = np.unique([0, *self.first[stops], len(self.rows)]).tolist()
         yield from map(slice, bounds[:-1], bounds[1:])
 
     def of_frame(self, row: int) -> slice:
-        """Return the slice of a frame's hits."""
+        """Return the slice of a frame's detections."""
         return slice(int(self.first[row]), int(self.first[row + 1]))
 
-    def owners(self, members: Sequence[I4]) -> I4:
-        """Return the track index of each hit, (n,), -1 if it has none.
+    def track_of_each(self, tracks: Sequence[I4]) -> I4:
+        """Return the track index of each detection, (n,), -1 if it has none.
 
-        ``members`` are the hits of each track.
+        ``tracks`` are the indices of the detections of each track.
         """
         owner = np.full(len(self.rows), -1, np.int32)
-        for k, member in enumerate(members):
-            owner[member] = k
+        for k, track in enumerate(tracks):
+            owner[track] = k
         return owner
 
-    def stamps(self, hits: I4) -> I4:
-        """Return the times (k,) of hits (k,), ns."""
-        return np.asarray(self.stamps_ns[self.rows[hits]])
+    def stamps(self, which: I4) -> I4:
+        """Return the times (k,) of detections ``which`` (k,), ns."""
+        return np.asarray(self.stamps_ns[self.rows[which]])
 
-    def weights(self, member: I4) -> F8:
-        """Return the weights (k,) of a track's hits ``member`` (k,) in the fusion.
+    def weights(self, track: I4) -> F8:
+        """Return the weights in the fusion (k,) of the detections of a track (k,).
 
         A repeated view counts only once.
         """
-        topics = self.topics[self.rows[member]].astype(np.int64)
-        _, first = np.unique((topics << 32) + self.described[member], return_index=True)
-        new = np.zeros(len(member), np.bool_)
+        topics = self.topics[self.rows[track]].astype(np.int64)
+        _, first = np.unique((topics << 32) + self.described[track], return_index=True)
+        new = np.zeros(len(track), np.bool_)
         new[first] = True
-        return np.where(new, view_weights(self.partial[member]), 0.0)
+        return np.where(new, view_weights(self.partial[track]), 0.0)
 
-    def at(self, rows: I4) -> tuple[I4, I4]:
-        """Return the hits (k,) of frames ``rows``, and the index in ``rows`` (k,) of each hit."""
+    def of_frames(self, rows: I4) -> tuple[I4, I4]:
+        """Return the detections (k,) of frames ``rows``, and the index in ``rows`` (k,) of each."""
         first, stop = self.first[rows], self.first[rows + 1]
         which = np.repeat(np.arange(len(rows)), stop - first)
         return np.arange(which.size) - (np.cumsum(stop - first) - stop)[which], which
 
-    def places(self, member: I4, rows: I4) -> F8:
+    def positions(self, track: I4, rows: I4) -> F8:
         """Return the positions (k, 3) of a track in frames ``rows`` (k,), metres.
 
-        They are linear in time between its hits, ``member``.
+        They are linear in time between its detections, ``track`` (d,).
         """
         if len(rows) == 0:
             return np.zeros((0, 3))
-        # Use only hits near these frames, as long tracks are queried for many short spans.
-        before, after = np.searchsorted(member, self.first[[rows.min() + 1, rows.max()]])
-        near = member[max(before - 1, 0) : after + 1]
+        # Use only detections near these frames, as long tracks are queried for many short spans.
+        before, after = np.searchsorted(track, self.first[[rows.min() + 1, rows.max()]])
+        near = track[max(before - 1, 0) : after + 1]
         last = np.maximum(np.searchsorted(self.rows[near], rows, side="right") - 1, 0)
         a, b = near[last], near[np.minimum(last + 1, len(near) - 1)]
         start, stop = self.stamps(a), self.stamps(b)
@@ -131,35 +131,39 @@ class Hits:
         step = self.centers[b] - self.centers[a]
         return np.asarray(self.centers[a] + share[:, None] * step)
 
-    def life(self, member: I4, max_gap_s: float) -> tuple[I4, Bool]:
-        """Return the frames (k,) of a track from its first to its last hit, and a mask of its hits.
+    def frame_span(self, track: I4, max_gap_s: float) -> tuple[I4, Bool]:
+        """Return the frames (k,) from the first to the last detection of a track.
 
-        Gaps longer than ``max_gap_s`` are left out, and so are topics without any of its hits.
+        Also returns a mask (k,) of those with a detection.
+
+        Gaps longer than ``max_gap_s`` are left out, and so are topics that never see it.
         """
-        seen = self.rows[member]
+        seen = self.rows[track]
         gap_s = np.diff(self.stamps_ns[seen]) * 1e-9
         lengths = np.append(np.where(gap_s <= max_gap_s, np.diff(seen), 1), 1)
         rows = np.repeat(seen - (np.cumsum(lengths) - lengths), lengths) + np.arange(lengths.sum())
-        rows = rows[self.sees(member, rows)]
+        rows = rows[self.sees(track, rows)]
         return rows, np.isin(rows, seen)
 
-    def sees(self, member: I4, rows: I4) -> Bool:
-        """Return the mask (n,) of frames ``rows`` whose topics have hits ``member`` of a track."""
-        return np.isin(self.topics[rows], self.topics[self.rows[member]])
+    def sees(self, track: I4, rows: I4) -> Bool:
+        """Return the mask (n,) of frames ``rows`` (n,) whose topics have detections of a track."""
+        return np.isin(self.topics[rows], self.topics[self.rows[track]])
 
-    def seen_with(self, member: I4, other: I4) -> I4:
-        """Return the hits ``other`` whose topics also have hits of the track ``member``."""
-        return other if len(self.names) == 1 else other[self.sees(member, self.rows[other])]
+    def seen_with(self, track: I4, other: I4) -> I4:
+        """Return the detections ``other`` whose topics also have detections of a track."""
+        return other if len(self.names) == 1 else other[self.sees(track, self.rows[other])]
 
 
-def gather(frames: Iterable[FrameDetections], together: Collection[str] = ()) -> Iterator[Hits]:
-    """Yield the hits of each stream; the topics in ``together`` form one stream, sorted by time."""
+def gather(
+    frames: Iterable[FrameDetections], together: Collection[str] = ()
+) -> Iterator[DetectionTable]:
+    """Yield the table of each stream; the topics ``together`` form one stream, sorted by time."""
     streams: dict[str, _Gathered] = {}
     for frame in frames:
         name = "" if frame.topic in together else frame.topic
         streams.setdefault(name, _Gathered()).add(frame)
     while streams:  # free each stream as soon as possible
-        yield Hits(**streams.pop(next(iter(streams))).columns())
+        yield DetectionTable(**streams.pop(next(iter(streams))).columns())
 
 
 class _Gathered:
@@ -168,7 +172,7 @@ class _Gathered:
     def __init__(self) -> None:
         self._names: dict[str, int] = {}
         self._counts: list[int] = []
-        self._bytes = {name: bytearray() for name in (*_OF_FRAMES, *_OF_HITS)}
+        self._bytes = {name: bytearray() for name in (*_OF_FRAMES, *_OF_DETECTIONS)}
         self._categories = 0
 
     def add(self, frame: FrameDetections) -> None:
@@ -182,11 +186,11 @@ class _Gathered:
         if count == 0:
             return
         self._categories = categories
-        for name, (kind, _) in _OF_HITS.items():
+        for name, (kind, _) in _OF_DETECTIONS.items():
             self._bytes[name] += np.asarray(_column(frame, name), kind).tobytes()
 
     def columns(self) -> dict[str, Any]:
-        """Return the columns of `Hits`, and free the bytes they were made from."""
+        """Return the columns of `DetectionTable`, and free the bytes they were made from."""
         counts = np.array(self._counts, np.int32)
         of_frames = {name: self._taken(name, kind) for name, kind in _OF_FRAMES.items()}
         which: Any = slice(None)
@@ -200,7 +204,7 @@ class _Gathered:
         columns["first"] = np.concatenate([[0], np.cumsum(counts)])
         columns["rows"] = np.repeat(np.arange(len(counts), dtype=np.int32), counts)
         total = len(columns["rows"])
-        for name, (kind, shape) in _OF_HITS.items():
+        for name, (kind, shape) in _OF_DETECTIONS.items():
             values = self._taken(name, kind)
             widths = tuple(self._categories if width == "c" else width for width in shape)
             whole = values.size == total * int(np.prod(widths))

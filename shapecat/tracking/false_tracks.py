@@ -1,0 +1,94 @@
+"""Removal of false tracks: pieces of objects that were split in some frames."""
+
+from collections.abc import Sequence
+from functools import cache
+
+import numpy as np
+
+from shapecat.arrays import F8, I4, Bool
+from shapecat.tracking.detection_table import DetectionTable
+
+__all__ = ["without_duplicates", "without_pieces"]
+
+_LONGER = 5  # a track is removed only inside one that has this many times as many detections
+_COVERED = 0.5  # ratio of covered frames to detections above which a track is a piece
+
+
+def without_duplicates(table: DetectionTable, tracks: Sequence[I4]) -> list[I4]:
+    """Remove short tracks near the centre of much longer ones: pieces of a briefly split object.
+
+    A real object is rarely that close to another one's centre. ``tracks`` are the indices
+    (k,) of the detections of each track, ascending.
+    """
+    lengths = np.array([len(track) for track in tracks])
+    first = np.array([table.rows[track[0]] for track in tracks])
+    last = np.array([table.rows[track[-1]] for track in tracks])
+    radius = cache(lambda k: 0.6 * float(np.median(table.sizes[tracks[k]], axis=0).min()))
+    kept = []
+    for track in tracks:
+        low, high = table.rows[track[0]], table.rows[track[-1]]
+        hosts = (_LONGER * len(track) <= lengths) & (first <= high) & (last >= low)
+        places = np.flatnonzero(hosts).tolist()
+        if not any(_inside(table, track, tracks[k], radius(k)) for k in places):
+            kept.append(track)
+    return kept
+
+
+def _inside(table: DetectionTable, track: I4, host: I4, radius: float) -> bool:
+    place = table.positions(host, table.rows[track])
+    distance = np.linalg.norm(table.centers[track] - place, axis=1)
+    return bool(np.median(distance) <= radius)
+
+
+def without_pieces(table: DetectionTable, tracks: Sequence[I4], max_gap_s: float) -> list[I4]:
+    """Remove tracks that are often a part of another object.
+
+    If an object is split in some frames, the track of a piece lies, in the other frames, in the box
+    of the whole object. An object that only stands near another one, or is hidden by it, has its
+    centre outside that box. ``tracks`` are the indices (k,) of the detections of each track,
+    ascending; gaps in a track that are longer than ``max_gap_s`` are not checked.
+    """
+    if table.orientations is None:
+        return list(tracks)
+    owner = table.track_of_each(tracks)
+    covered = [
+        _covered(table, track, max_gap_s) + _covered_beside(table, k, tracks, owner)
+        for k, track in enumerate(tracks)
+    ]
+    return [m for m, count in zip(tracks, covered, strict=True) if count <= _COVERED * len(m)]
+
+
+def _covered(table: DetectionTable, track: I4, max_gap_s: float) -> int:
+    """Count the frames between a track's detections in which it lies in another detection's box."""
+    rows, seen = table.frame_span(track, max_gap_s)
+    others, which = table.of_frames(rows[~seen])
+    place = table.positions(track, rows[~seen])[which]
+    return len(np.unique(which[_in_box(table, others, place)]))
+
+
+def _covered_beside(table: DetectionTable, k: int, tracks: Sequence[I4], owner: I4) -> int:
+    """Count the frames before and after a track in which it lies in a neighbour's box.
+
+    The track is assumed to move along with the neighbour. On either side, half as many frames are
+    checked as the track has detections. One side alone does not count, as an object may be put into
+    a bowl, or pushed against another object and merged with it from then on.
+    """
+    track, counts = tracks[k], list[int]()
+    most = len(track) // 2
+    for end, way in ((0, -1), (-1, 1)):
+        beside, _ = table.of_frames(table.rows[track[[end]]])
+        found = [0]
+        for other in beside[(owner[beside] >= 0) & (owner[beside] != k)].tolist():
+            host = table.seen_with(track, tracks[owner[other]])
+            i = int(np.searchsorted(host, other))
+            then = host[max(i - most, 0) : i] if way < 0 else host[i + 1 : i + 1 + most]
+            place = table.centers[track[end]] + table.centers[then] - table.centers[other]
+            found.append(int(_in_box(table, then, place).sum()))
+        counts.append(max(found))
+    return sum(counts) if all(counts) else 0
+
+
+def _in_box(table: DetectionTable, which: I4, places: F8) -> Bool:
+    """Return whether positions (n, 3) lie in the boxes of detections ``which`` (n,): (n,) bool."""
+    local = np.einsum("nji,nj->ni", table.axes(which), places - table.centers[which])
+    return np.asarray((np.abs(local) <= 0.5 * table.sizes[which]).all(axis=1))
