@@ -18,13 +18,13 @@ from shapecat.cameras.colour import ColourView
 from shapecat.colour.image_masks import find_masks
 from shapecat.completion import ENOUGH_POINTS, complete
 from shapecat.config import Settings
-from shapecat.depth_fusion import Earlier, fuse, with_own_readings
+from shapecat.depth_fusion import Earlier, drop_missing_depth, fuse
 from shapecat.description import DESCRIPTOR_NAMES, describe
 from shapecat.detection import detect
 from shapecat.errors import ModelError
 from shapecat.geometry import inverse, level_from_sensor, transform
 from shapecat.learning import Categorizer, load_model
-from shapecat.reuse import KeyView, find_repeats, reused, shows_the_same, sight_of
+from shapecat.reuse import KeyView, find_repeats, reused, shows_the_same, view_object
 from shapecat.surface import reconstruct, thin
 from shapecat.types import (
     Candidate,
@@ -36,11 +36,11 @@ from shapecat.types import (
     Scene,
 )
 
-__all__ = ["Perceiver", "View", "find_up", "perceive"]
+__all__ = ["Perceiver", "PerceptionInput", "find_up", "perceive"]
 
 
-class View(NamedTuple):
-    """A frame with its context.
+class PerceptionInput(NamedTuple):
+    """A frame to perceive, with what is known about it.
 
     Attributes
     ----------
@@ -70,14 +70,14 @@ class Perceiver:
     settings: Settings
     model: Path | None
 
-    def __call__(self, views: Sequence[View]) -> list[Perception]:
+    def __call__(self, inputs: Sequence[PerceptionInput]) -> list[Perception]:
         """Perceive consecutive frames; later ones may reuse the results of earlier ones."""
-        known: dict[str, _Known] = {}
+        states: dict[str, _BlockState] = {}
         perceptions = []
-        for view in views:
-            topic = view.frame.topic
-            perception, known[topic] = _perceive(view, known.get(topic, _NOTHING), self)
-            perceptions.append(_with_masks(view, perception))
+        for given in inputs:
+            topic = given.frame.topic
+            perception, states[topic] = _perceive(given, states.get(topic, _NEW_BLOCK), self)
+            perceptions.append(_add_masks(given, perception))
         return perceptions
 
     def __reduce__(self) -> tuple[Any, ...]:
@@ -117,38 +117,40 @@ def perceive(
     earlier : frames to fuse with this one. Candidates contain only pixels that have depth in
         ``frame`` itself.
     """
-    view = View(frame, up, tuple(earlier))
-    perception, _ = _perceive(view, _NOTHING, Perceiver(categorizer, settings, None))
+    given = PerceptionInput(frame, up, tuple(earlier))
+    perception, _ = _perceive(given, _NEW_BLOCK, Perceiver(categorizer, settings, None))
     return perception
 
 
-class _Known(NamedTuple):
+class _BlockState(NamedTuple):
     """Results of the earlier frames of a topic in the same block.
 
     Attributes
     ----------
-    view : the last frame that was not a repetition, after fusion; None if there is none.
+    reference : the last frame that repeated no other, after fusion; None if there is none.
     perception : the result of that frame.
     keys : described objects, for comparison with later frames.
     """
 
-    view: View | None
+    reference: PerceptionInput | None
     perception: Perception | None
     keys: tuple[KeyView, ...]
 
 
-_NOTHING = _Known(None, None, ())
+_NEW_BLOCK = _BlockState(None, None, ())
 
 
-def _perceive(view: View, known: _Known, perceiver: Perceiver) -> tuple[Perception, _Known]:
+def _perceive(
+    given: PerceptionInput, state: _BlockState, perceiver: Perceiver
+) -> tuple[Perception, _BlockState]:
     """Perceive a frame; return the result and the state for the next frame."""
-    clock, frame, range_m = _Clock(), view.frame, perceiver.settings.detection.max_range_m
-    seen = view._replace(frame=fuse(frame, view.earlier, range_m=range_m), earlier=())
-    if known.perception is not None and _repeats(seen, known.view, range_m):
-        repeated = _repeated(frame, known.perception)
+    clock, frame, range_m = _Clock(), given.frame, perceiver.settings.detection.max_range_m
+    fused = given._replace(frame=fuse(frame, given.earlier, range_m=range_m), earlier=())
+    if state.perception is not None and _repeats_frame(fused, state.reference, range_m):
+        repeated = _copy_for(frame, state.perception)
         clock.lap("detect")
-        return replace(repeated, seconds=clock.seconds), known
-    scene, detections, keys = _look(seen, known.keys, perceiver, clock)
+        return replace(repeated, seconds=clock.seconds), state
+    scene, detections, keys = _perceive_objects(fused, state.keys, perceiver, clock)
     perception = Perception(
         topic=frame.topic,
         index=frame.index,
@@ -158,62 +160,63 @@ def _perceive(view: View, known: _Known, perceiver: Perceiver) -> tuple[Percepti
         detections=detections,
         seconds=clock.seconds,
     )
-    after = _Known(seen, perception, keys)
-    return (perception if seen.frame is frame else _of_frame(frame, perception)), after
+    after = _BlockState(fused, perception, keys)
+    return (perception if fused.frame is frame else _restrict_to(frame, perception)), after
 
 
-def _look(
-    view: View, keys: tuple[KeyView, ...], perceiver: Perceiver, clock: "_Clock"
+def _perceive_objects(
+    given: PerceptionInput, keys: tuple[KeyView, ...], perceiver: Perceiver, clock: "_Clock"
 ) -> tuple[Scene, tuple[Detection, ...], tuple[KeyView, ...]]:
     """Detect the objects of a frame, and describe those that match no earlier view."""
-    frame, settings = view.frame, perceiver.settings
-    scene = detect(frame, up=view.up, settings=settings.detection, rng=_rng(settings, frame, 0))
+    frame, settings = given.frame, perceiver.settings
+    scene = detect(frame, up=given.up, settings=settings.detection, rng=_rng(settings, frame, 0))
     clock.lap("detect")
-    sights = [
-        sight_of(frame, view.pose, each, scene.up, scene.height_of(each))
+    views = [
+        view_object(frame, given.pose, each, scene.up, scene.height_of(each))
         for each in scene.candidates
     ]
-    repeats = find_repeats(sights, keys)
+    repeats = find_repeats(views, keys)
     new = [k for k, repeat in enumerate(repeats) if repeat is None]
     shapes = [
         _describe(frame, scene, scene.candidates[k], settings, _rng(settings, frame, k + 1))
         for k in new
     ]
     clock.lap("describe")
-    found = [scene.candidates[k] for k in new]
-    named = _categorize(found, shapes, perceiver.categorizer)
+    candidates = [scene.candidates[k] for k in new]
+    categorized = _categorize(candidates, shapes, perceiver.categorizer)
     clock.lap("categorize")
-    whole = [_completed(frame, scene, d, perceiver.categorizer.categories) for d in named]
-    described = dict(zip(new, whole, strict=True))
+    categories = perceiver.categorizer.categories
+    completed = [_add_full_box(frame, scene, d, categories) for d in categorized]
+    described = dict(zip(new, completed, strict=True))
     detections = tuple(
-        described[k] if repeat is None else reused(repeat, sights[k])
+        described[k] if repeat is None else reused(repeat, views[k])
         for k, repeat in enumerate(repeats)
     )
     clock.lap("complete")
-    return scene, detections, (*keys, *(KeyView(sights[k], described[k]) for k in new))
+    return scene, detections, (*keys, *(KeyView(views[k], described[k]) for k in new))
 
 
-def _with_masks(view: View, perception: Perception) -> Perception:
+def _add_masks(given: PerceptionInput, perception: Perception) -> Perception:
     """Add the masks of the objects on the colour image, if there is one."""
-    if view.colour is None:
+    if given.colour is None:
         return perception
     begun = time.perf_counter()
     objects = [detection.candidate.indices for detection in perception.detections]
-    masks = find_masks(view.frame, view.colour, objects)
+    masks = find_masks(given.frame, given.colour, objects)
     seconds = {**perception.seconds, "masks": time.perf_counter() - begun}
     return replace(perception, seconds=seconds, masks=masks)
 
 
-def _repeats(view: View, then: View | None, range_m: float) -> bool:
+def _repeats_frame(now: PerceptionInput, then: PerceptionInput | None, range_m: float) -> bool:
     """Return whether a frame shows the same as an earlier one, with the same up direction."""
-    if then is None or (view.up is None) != (then.up is None):
+    if then is None or (now.up is None) != (then.up is None):
         return False
-    if view.up is not None and then.up is not None and view.up @ then.up < _SAME_UP:
+    if now.up is not None and then.up is not None and now.up @ then.up < _SAME_UP:
         return False
-    return shows_the_same(view.frame, view.pose, then.frame, then.pose, range_m=range_m)
+    return shows_the_same(now.frame, now.pose, then.frame, then.pose, range_m=range_m)
 
 
-def _repeated(frame: Frame, first: Perception) -> Perception:
+def _copy_for(frame: Frame, first: Perception) -> Perception:
     """Return the result of an earlier frame as the result of this one."""
     detections = tuple(
         replace(d, seconds=0.0, reused_from=first.index if d.reused_from is None else d.reused_from)
@@ -226,12 +229,12 @@ def _repeated(frame: Frame, first: Perception) -> Perception:
         detections=detections,
         reused_from=first.index,
     )
-    return _of_frame(frame, again)
+    return _restrict_to(frame, again)
 
 
-def _of_frame(frame: Frame, perception: Perception) -> Perception:
+def _restrict_to(frame: Frame, perception: Perception) -> Perception:
     """Remove pixels without depth in the frame itself from the candidates."""
-    scene = with_own_readings(perception.scene, frame)
+    scene = drop_missing_depth(perception.scene, frame)
     detections = tuple(
         replace(detection, candidate=candidate)
         for detection, candidate in zip(perception.detections, scene.candidates, strict=True)
@@ -255,7 +258,7 @@ class _Clock:
 def find_up(frame: Frame, settings: Settings) -> F4 | None:
     """Return up (3,), sensor frame, from the supporting planes; None if these are too small."""
     scene = detect(frame, settings=settings.detection, rng=_rng(settings, frame, 0))
-    return scene.up if sum(plane.area_m2 for plane in scene.planes) >= _TELLS_M2 else None
+    return scene.up if sum(plane.area_m2 for plane in scene.planes) >= _ENOUGH_M2 else None
 
 
 def _rng(settings: Settings, frame: Frame, item: int) -> np.random.Generator:
@@ -281,7 +284,7 @@ def _describe(
     return _Shape(in_sensor, descriptor, time.perf_counter() - begun)
 
 
-def _completed(
+def _add_full_box(
     frame: Frame, scene: Scene, detection: Detection, categories: Sequence[str]
 ) -> Detection:
     """Add the estimated box of the whole object to a detection."""
@@ -293,7 +296,7 @@ def _completed(
 
 
 def _categorize(
-    found: Sequence[Candidate], shapes: Sequence[_Shape], categorizer: Categorizer
+    candidates: Sequence[Candidate], shapes: Sequence[_Shape], categorizer: Categorizer
 ) -> list[Detection]:
     """Categorize candidates in one call; the posterior is uniform for those without a surface."""
     if not shapes:
@@ -312,11 +315,11 @@ def _categorize(
             novelty=float(prediction.novelty[k]) if known[k] else _UNDECIDED,
             seconds=shape.seconds + each,
         )
-        for k, (candidate, shape) in enumerate(zip(found, shapes, strict=True))
+        for k, (candidate, shape) in enumerate(zip(candidates, shapes, strict=True))
     ]
 
 
-_TELLS_M2 = 0.1
+_ENOUGH_M2 = 0.1
 """Planes with a smaller total area give no up direction: they may be the face of an object."""
 _UNDECIDED = 2.0
 """Novelty of an object with too few points for a surface: above the threshold, so unknown."""

@@ -34,7 +34,7 @@ from shapecat.executors.worker import WorkerLostError
 from shapecat.geometry import level_from_sensor
 from shapecat.jit import code_folder
 from shapecat.learning import load_model
-from shapecat.reuse import KeyView, find_repeats, shows_the_same, sight_of
+from shapecat.reuse import KeyView, find_repeats, shows_the_same, view_object
 from shapecat.surface import reconstruct, thin
 from shapecat.surface.triangles import triangles_of
 from shapecat.system import stopping
@@ -75,10 +75,10 @@ def find_ball() -> int:
     same = shows_the_same(frame, None, frame, None, range_m=2.0)
     # A moving sensor: the inverse of its pose is in another order, for another version of a kernel.
     now, before = (
-        [sight_of(frame, pose, ball, scene.up, _RADIUS_M) for ball in scene.candidates]
+        [view_object(frame, pose, ball, scene.up, _RADIUS_M) for ball in scene.candidates]
         for pose in (Pose(np.eye(3), np.zeros(3)), Pose(np.eye(3), np.full(3, 1e-4)))
     )
-    keys = [KeyView(sight, _undescribed(sight.candidate)) for sight in before]
+    keys = [KeyView(view, _undescribed(view.candidate)) for view in before]
     return sum(repeat is not None for repeat in find_repeats(now, keys)) if same else 0
 
 

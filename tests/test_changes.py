@@ -21,7 +21,7 @@ from shapecat.recordings.messages import Channel, Message
 from shapecat.recordings.transforms.buffer import TransformBuffer
 from shapecat.recordings.transforms.gravity import Upright
 from shapecat.recordings.transforms.window import TransformWindow
-from shapecat.reuse import KeyView, find_repeats, sight_of
+from shapecat.reuse import KeyView, find_repeats, view_object
 from shapecat.reuse.agreement import agreement
 from shapecat.runs.perceive.perceived import FrameRow, PerceptionTables
 from shapecat.runs.tables.placed_frames import PlacedFrames, streams_with_poses
@@ -214,10 +214,10 @@ def test_only_views_of_same_kind_are_reused() -> None:
     frame = Frame("/depth", 0, 0, 0, "camera", depth=depth, camera=CAMERA)
     whole = detection(3, points=40).candidate
     up = np.array([0, -1, 0], np.float32)
-    (key,) = [KeyView(sight_of(frame, None, whole, up, 0.1), detection(3))]
+    (key,) = [KeyView(view_object(frame, None, whole, up, 0.1), detection(3))]
 
     def repeats(pose: Pose | None = None, **changes: Any) -> bool:
-        sight = sight_of(frame, pose, replace(whole, **changes), up, 0.1)
+        sight = view_object(frame, pose, replace(whole, **changes), up, 0.1)
         return find_repeats([sight], [key])[0] is not None
 
     assert repeats()

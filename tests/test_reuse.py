@@ -15,9 +15,9 @@ import shapecat.pipeline
 from shapecat.config import Settings
 from shapecat.errors import ConfigError
 from shapecat.geometry import IDENTITY, transform
-from shapecat.perception import Perceiver, View
+from shapecat.perception import Perceiver, PerceptionInput
 from shapecat.reuse import shows_the_same
-from shapecat.reuse.views import _alike, sight_of
+from shapecat.reuse.views import _similar, view_object
 from shapecat.runs.jobs import Job
 from shapecat.simulation import KINECT, make_scene, render_frame
 from shapecat.simulation.recorder import record
@@ -59,7 +59,7 @@ def perceive(world: World, **settings: Any) -> list[Perception]:
     for k in range(len(world)):
         frame, _ = render_frame(world, k, rng=np.random.default_rng(k), sensor=KINECT)
         frame = replace(frame, index=k, stamp_ns=1000 + 70 * k)
-        views.append(View(frame, None, (), world.path[k]))
+        views.append(PerceptionInput(frame, None, (), world.path[k]))
     guesser: Any = Guesser()
     return Perceiver(guesser, Settings(**settings), None)(views)
 
@@ -228,9 +228,9 @@ def test_nearer_view_with_flipped_yaw_is_alike_up_to_noise(pixels: int, *, alike
         box = Box(share * center, np.array(sides), np.array(turn))
         found = Candidate(np.arange(count), box, 0, None, 0.0, False, False)
         pose = Pose(np.eye(3), (1 - share) * center)
-        sights.append(sight_of(rendered(), pose, found, np.array([0, 0, 1.0]), 0.15).numbers)
+        sights.append(view_object(rendered(), pose, found, np.array([0, 0, 1.0]), 0.15).summary)
 
-    assert _alike(sights[1], sights[0]) == alike
+    assert _similar(sights[1], sights[0]) == alike
 
 
 def test_wrong_pose_prevents_reuse() -> None:
@@ -239,7 +239,7 @@ def test_wrong_pose_prevents_reuse() -> None:
     still = replace(world, path=(world.path[0],) * 12)
     guesser: Any = Guesser()
     views = [
-        View(
+        PerceptionInput(
             replace(
                 render_frame(world, k, rng=np.random.default_rng(k), sensor=KINECT)[0], index=k
             ),
@@ -279,7 +279,11 @@ def test_nothing_is_reused_across_topics_or_up_directions() -> None:
     tilted = up + np.float32(0.04) * np.array([1, 0, 0], np.float32)
     tilted /= np.linalg.norm(tilted)
     ups = {"/left": (up, tilted, None), "/right": (up,)}
-    views = [View(replace(frame, topic=topic), up) for topic, given in ups.items() for up in given]
+    views = [
+        PerceptionInput(replace(frame, topic=topic), up)
+        for topic, given in ups.items()
+        for up in given
+    ]
     guesser: Any = Guesser()
     perceptions = Perceiver(guesser, Settings(), None)(views)
 
@@ -359,7 +363,7 @@ def test_blocks_of_one_frame_reuse_nothing() -> None:
     perceiver = Perceiver(guesser, Settings(), None)
     frame = blank()
     for k in range(2):
-        (perception,) = perceiver([View(replace(frame, index=k), None, (), IDENTITY)])
+        (perception,) = perceiver([PerceptionInput(replace(frame, index=k), None, (), IDENTITY)])
         assert {d.reused_from for d in perception.detections} == {None}
 
 

@@ -17,7 +17,7 @@ from shapecat.geometry import AGREE, DISCONTINUITY, IDENTITY, NEAREST_M
 from shapecat.jit import kernel
 from shapecat.types import Camera, Frame, Pose, Scene
 
-__all__ = ["fuse", "with_own_readings"]
+__all__ = ["drop_missing_depth", "fuse"]
 
 LEAST_SHARE = 0.9
 """Minimum fraction of the compared depths that differ by less than a `DISCONTINUITY`; below it,
@@ -75,7 +75,7 @@ def fuse(frame: Frame, earlier: Sequence[Earlier], *, range_m: float) -> Frame:
     return replace(frame, depth=total / np.maximum(count, 1))
 
 
-def with_own_readings(scene: Scene, frame: Frame) -> Scene:
+def drop_missing_depth(scene: Scene, frame: Frame) -> Scene:
     """Remove from the candidates of a scene the pixels where the frame itself has no depth."""
     if frame.depth is None:
         return scene

@@ -21,7 +21,7 @@ from shapecat.geometry import (
 from shapecat.reuse.agreement import agreement
 from shapecat.types import Candidate, Detection, Frame, FullBox, NeuralGas, Pose
 
-__all__ = ["KeyView", "Repeat", "Sight", "find_repeats", "reused", "sight_of"]
+__all__ = ["KeyView", "ObjectView", "Repeat", "find_repeats", "reused", "view_object"]
 
 _PLACE_M = 0.015
 """Largest shift of the visible centre of an object at rest, between similar views, metres."""
@@ -39,13 +39,13 @@ _TRIES = 3
 """Number of earlier views to compare point by point, the newest first: masks may flicker."""
 
 
-class Sight(NamedTuple):
+class ObjectView(NamedTuple):
     """A view of an object, before it is described.
 
     Attributes
     ----------
     pose : ``fixed_from_sensor``; None where there is no fixed frame.
-    numbers : (15,) a summary, which is compared before the points: box centre (3), vector from the
+    summary : (15,) numbers that are compared before the points: box centre (3), vector from the
         sensor to it (3) and up (3), in the fixed frame if there is one, else in the sensor frame;
         longer side, shorter side and height of the box; height above the support; number of
         pixels; flags as an integer. Lengths are in metres.
@@ -54,18 +54,18 @@ class Sight(NamedTuple):
     frame: Frame
     pose: Pose | None
     candidate: Candidate
-    numbers: F8
+    summary: F8
 
 
 _PLACE, _RAY, _UP, _SIZE = slice(3), slice(3, 6), slice(6, 9), slice(9, 12)
 _HEIGHT, _PIXELS, _KIND = 12, 13, 14
-"""Indices into `Sight.numbers`."""
+"""Indices into `ObjectView.summary`."""
 
 
-def sight_of(
+def view_object(
     frame: Frame, pose: Pose | None, candidate: Candidate, up: F4, height_m: float
-) -> Sight:
-    """Return the view of a candidate, with the numbers for its comparison with earlier views.
+) -> ObjectView:
+    """Return the view of a candidate, with its summary.
 
     Parameters
     ----------
@@ -79,14 +79,14 @@ def sight_of(
     size = (max(length, width), min(length, width), height)  # the yaw of a box may flip
     kind = candidate.touches_border + 2 * candidate.occluded + 4 * (pose is None)
     pixels = len(candidate.indices)
-    numbers = np.array([*(ray + shift), *ray, *(turn @ up), *size, height_m, pixels, kind])
-    return Sight(frame, pose, candidate, numbers)
+    summary = np.array([*(ray + shift), *ray, *(turn @ up), *size, height_m, pixels, kind])
+    return ObjectView(frame, pose, candidate, summary)
 
 
 class KeyView(NamedTuple):
     """A view and its description, for reuse in later frames."""
 
-    sight: Sight
+    view: ObjectView
     detection: Detection
 
 
@@ -109,56 +109,56 @@ class Repeat(NamedTuple):
     move: Move
 
 
-def find_repeats(sights: Sequence[Sight], keys: Sequence[KeyView]) -> list[Repeat | None]:
+def find_repeats(views: Sequence[ObjectView], keys: Sequence[KeyView]) -> list[Repeat | None]:
     """Find the earlier view that each object of a frame repeats; None for a new object.
 
     Parameters
     ----------
-    sights : the objects of the frame.
+    views : the objects of the frame.
     keys : described views in earlier frames of the same topic, the oldest first.
 
     Notes
     -----
     Only depth images are compared: point clouds do not show which surface hides which.
     """
-    if not keys or not sights:
-        return [None] * len(sights)
-    now = np.array([sight.numbers for sight in sights])
-    then = np.array([key.sight.numbers for key in keys])
-    alike, moves = _alike(now[:, None], then[None]), dict[int, Move]()
+    if not keys or not views:
+        return [None] * len(views)
+    now = np.array([view.summary for view in views])
+    then = np.array([key.view.summary for key in keys])
+    alike, moves = _similar(now[:, None], then[None]), dict[int, Move]()
     found: list[Repeat | None] = []
-    for sight, row in zip(sights, alike, strict=True):
+    for view, row in zip(views, alike, strict=True):
         newest_first = np.flatnonzero(row)[::-1].tolist()
-        tries = (_repeat(sight, keys[k], moves) for k in newest_first[:_TRIES])
+        tries = (_repeat(view, keys[k], moves) for k in newest_first[:_TRIES])
         found.append(next((repeat for repeat in tries if repeat is not None), None))
     return found
 
 
-def _repeat(sight: Sight, key: KeyView, moves: dict[int, Move]) -> Repeat | None:
+def _repeat(view: ObjectView, key: KeyView, moves: dict[int, Move]) -> Repeat | None:
     """Return the repeat of a view if the points of the object agree as well, else None."""
-    earlier = key.sight.frame.index
+    earlier = key.view.frame.index
     if earlier not in moves:
-        moves[earlier] = _between(key.sight, sight)
+        moves[earlier] = _between(key.view, view)
     move = moves[earlier]
-    same = _agree(key.sight, sight, move.pose) and _agree(sight, key.sight, move.back)
+    same = _agree(key.view, view, move.pose) and _agree(view, key.view, move.back)
     return Repeat(key, move) if same else None
 
 
-def reused(repeat: Repeat, sight: Sight) -> Detection:
+def reused(repeat: Repeat, view: ObjectView) -> Detection:
     """Return the detection of an object that repeats a view.
 
     Its surface and full box are moved to the current sensor frame.
     """
     (key, move), first = repeat, repeat.key.detection
     return Detection(
-        candidate=sight.candidate,
+        candidate=view.candidate,
         gas=first.gas if move is _REST else _moved_gas(move, first.gas),
         descriptor=first.descriptor,
         posterior=first.posterior,
         novelty=first.novelty,
         seconds=0.0,
         full=first.full if move is _REST else _moved_box(move, first.full),
-        reused_from=key.sight.frame.index,
+        reused_from=key.view.frame.index,
     )
 
 
@@ -175,8 +175,8 @@ def _moved_box(move: Move, box: FullBox | None) -> FullBox | None:
     return replace(box, center=transform(move.pose, box.center), orientation=turned)
 
 
-def _alike(now: F8, then: F8) -> Bool:
-    """Return which pairs of `Sight.numbers` (..., 15) are alike: (...) bool."""
+def _similar(now: F8, then: F8) -> Bool:
+    """Return which pairs of `ObjectView.summary` (..., 15) are alike: (...) bool."""
     far, before = (np.linalg.norm(each[..., _RAY], axis=-1) for each in (now, then))
     area = now[..., _PIXELS] * far**2 / (then[..., _PIXELS] * before**2)
     turned = (now[..., _RAY] * then[..., _RAY]).sum(axis=-1) / (far * before)
@@ -193,7 +193,7 @@ def _alike(now: F8, then: F8) -> Bool:
     )
 
 
-def _agree(one: Sight, other: Sight, move: Pose) -> bool:
+def _agree(one: ObjectView, other: ObjectView, move: Pose) -> bool:
     """Return whether the points of an object agree with the depth image of another view.
 
     ``move`` is ``other_from_one``.
@@ -208,7 +208,7 @@ def _agree(one: Sight, other: Sight, move: Pose) -> bool:
 _REST = Move(IDENTITY, IDENTITY, np.array([0.0, 0.0, 0.0, 1.0]))
 
 
-def _between(one: Sight, other: Sight) -> Move:
+def _between(one: ObjectView, other: ObjectView) -> Move:
     """Return the motion of the sensor from one view to another."""
     a, b = one.pose, other.pose
     if a is None or b is None:

@@ -21,7 +21,7 @@ from shapecat.depth_fusion import RecentFrames
 from shapecat.errors import NoStreamError, RecordingError, explained
 from shapecat.executors.order import Processes
 from shapecat.learning import Categorizer
-from shapecat.perception import Perceiver, View, find_up
+from shapecat.perception import Perceiver, PerceptionInput, find_up
 from shapecat.recordings import Recording, Stream
 from shapecat.recordings.colour_streams import ColourStream
 from shapecat.recordings.transforms.gravity import MISNAMED, Orientation, Upright, has_z_up, turned
@@ -52,7 +52,7 @@ _MOST_HELD = 64
 
 _Oriented = tuple[Frame, ColourView | None, Orientation]
 """A frame, its colour image, if it has one, and the up direction and pose of the sensor."""
-_Item = tuple[FrameRow, View]
+_Item = tuple[FrameRow, PerceptionInput]
 """A frame to perceive, and the values of its row that a `Perception` lacks."""
 
 
@@ -88,7 +88,7 @@ def perceive_all(work: Work) -> None:
             frame, colour, (_, _, pose) = oriented
             up = upright.accept(frame.topic, oriented[2])
             row = FrameRow(frame.log_time_ns, pose, up, frame_from_sensor=frame.frame_from_sensor)
-            return row, View(frame, up, recent.before(frame, pose), pose, colour)
+            return row, PerceptionInput(frame, up, recent.before(frame, pose), pose, colour)
 
         count, resumed = perceive(map(view, _oriented(work, upright, skipped)))
     if not count:
@@ -134,7 +134,7 @@ def _views_again(work: Work, chosen: dict[Key, Revision]) -> Iterator[_Item]:
             row = FrameRow(
                 frame.log_time_ns, pose, revision.up_given, again=True, frame_from_sensor=own
             )
-            yield row, View(frame, revision.up, earlier, pose, colour)
+            yield row, PerceptionInput(frame, revision.up, earlier, pose, colour)
 
 
 @contextmanager
@@ -181,7 +181,7 @@ def _perceiving(
 
 def _blocks(
     views: Iterator[_Item], size: int
-) -> Iterator[tuple[tuple[FrameRow, ...], tuple[View, ...]]]:
+) -> Iterator[tuple[tuple[FrameRow, ...], tuple[PerceptionInput, ...]]]:
     """Yield blocks of ``size`` frames, the same in every run, until asked to stop."""
     while not stopping.asked() and (block := tuple(islice(views, size))):
         rows, seen = zip(*block, strict=True)
