@@ -39,10 +39,10 @@ def read_trees(content: bytes, features: np.dtype[Any]) -> BoostedTrees:
         return BoostedTrees(Trees(*(arrays[name] for name in Trees._fields)), arrays["value"])
 
 
-def write_trees(path: Path, grown: BoostedTrees, features: np.dtype[Any]) -> None:
+def write_trees(path: Path, ensemble: BoostedTrees, features: np.dtype[Any]) -> None:
     """Write trees to a file, with the names of the fields of ``features``; these may be nested."""
     names = np.array(list(_names(features)))
-    np.savez_compressed(path, **grown.trees._asdict(), value=grown.value, names=names)
+    np.savez_compressed(path, **ensemble.trees._asdict(), value=ensemble.value, names=names)
 
 
 def _names(features: np.dtype[Any]) -> Iterator[str]:
@@ -52,12 +52,12 @@ def _names(features: np.dtype[Any]) -> Iterator[str]:
 
 
 @kernel
-def logit_of(grown: BoostedTrees, features: F4, least: float, most: float) -> float:
+def logit_of(ensemble: BoostedTrees, features: F4, least: float, most: float) -> float:
     """Return the logit of features (f,): the sum of the values of the leaves they reach.
 
     The sum stops early, `LANES` trees at a time, once it is below ``least`` or above ``most``.
     """
-    (roots, feature, threshold, left), value = grown
+    (roots, feature, threshold, left), value = ensemble
     leaves, logit = np.zeros(LANES, np.int32), 0.0
     for first in range(0, roots.size, LANES):
         count = find_leaves(features, roots, feature, threshold, left, first, leaves)

@@ -58,7 +58,7 @@ def find_background(
     features: Records,
     grid: DepthGrid,
     settings: DetectionSettings,
-    grown: RejectionTrees,
+    trees: RejectionTrees,
 ) -> Bool:
     """Return the merged segments to reject, as structure or for their size: (n + 1,) bool.
 
@@ -67,11 +67,11 @@ def find_background(
     rejected = np.zeros(len(features), np.bool_)
     roots, weights = measure_borders(segments)
     merged = features[roots]
-    alone = logits_of(as_rows(merged), grown.alone)
+    alone = logits_of(as_rows(merged), trees.alone)
     again = is_uncertain(alone)
     context = add_context(merged, alone, weights)[again]
     logits = alone.copy()
-    logits[again] = logits_of(as_rows(context), grown.in_context)
+    logits[again] = logits_of(as_rows(context), trees.in_context)
     segment, cells = features["segment"], features["visibility"]["cells"]
     depths = merged["visibility"]["depth_m"]
     large = cells > CLEANUP.large_share * grid.inverse_depth.size
@@ -101,7 +101,7 @@ def is_uncertain(logits: F4) -> Bool:
 
 
 @kernel
-def logits_of(features: F4, grown: BoostedTrees) -> F4:
+def logits_of(features: F4, ensemble: BoostedTrees) -> F4:
     """Return the logits (n,) that segments with these features (n, f) are objects.
 
     They are within `CleanupSettings.certain_logit` of 0.
@@ -109,7 +109,7 @@ def logits_of(features: F4, grown: BoostedTrees) -> F4:
     certain = CLEANUP.certain_logit
     logits = np.zeros(len(features), np.float32)
     for p in range(len(features)):
-        logit = logit_of(grown, features[p], -certain, certain)
+        logit = logit_of(ensemble, features[p], -certain, certain)
         logits[p] = min(max(logit, -certain), certain)
     return logits
 

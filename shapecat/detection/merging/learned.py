@@ -39,7 +39,7 @@ def load_trees() -> BoostedTrees:
 
 
 @kernel
-def merge_learned(segments: Segments, view_geometry: ViewGeometry, grown: BoostedTrees) -> None:
+def merge_learned(segments: Segments, view_geometry: ViewGeometry, ensemble: BoostedTrees) -> None:
     """Merge segments that are probably one object, in place, the most probable pair first."""
     n = segments.parent.size
     logits, features = np.full((n, n), -np.inf), np.zeros(n, SEGMENT_FEATURES)
@@ -47,7 +47,7 @@ def merge_learned(segments: Segments, view_geometry: ViewGeometry, grown: Booste
     for p in range(1, n):
         write_segment_features(segments, p, features[p])
     for p in range(1, n):
-        _rate(segments, features, p, p + 1, view_geometry, grown, pair, logits)
+        _rate(segments, features, p, p + 1, view_geometry, ensemble, pair, logits)
     while True:
         best = np.argmax(logits)
         p, q = int(best // n), int(best % n)
@@ -57,7 +57,7 @@ def merge_learned(segments: Segments, view_geometry: ViewGeometry, grown: Booste
         write_segment_features(segments, p, features[p])  # those of other segments do not change
         for k in range(n):
             logits[q, k] = logits[k, q] = -np.inf
-        _rate(segments, features, p, 1, view_geometry, grown, pair, logits)
+        _rate(segments, features, p, 1, view_geometry, ensemble, pair, logits)
 
 
 @kernel(inner=True)
@@ -67,7 +67,7 @@ def _rate(
     p: int,
     first: int,
     view_geometry: ViewGeometry,
-    grown: BoostedTrees,
+    ensemble: BoostedTrees,
     pair: Records,
     logits: F8,
 ) -> None:
@@ -81,4 +81,4 @@ def _rate(
         logits[low, high] = -np.inf
         if adjacent[q]:
             write_pair_features(segments, features, low, high, view_geometry, pair[0])
-            logits[low, high] = logit_of(grown, numbers, MERGING.hopeless, np.inf)
+            logits[low, high] = logit_of(ensemble, numbers, MERGING.hopeless, np.inf)
