@@ -55,21 +55,21 @@ def fuse(frame: Frame, earlier: Sequence[Earlier], *, range_m: float) -> Frame:
     depth, camera = frame.depth, frame.camera
     if depth is None or camera is None or not earlier:
         return frame
-    guide = _guide(depth, np.float32(range_m))
+    expected = _expected_depth(depth, np.float32(range_m))
     total, count = depth.copy(), (depth > 0).astype(np.float32)
     fused = 0
     for other, pose in earlier:
-        before = other.depth
-        if before is None or other.camera != camera:
+        then = other.depth
+        if then is None or other.camera != camera:
             continue
-        lens, shift = _projection(camera, IDENTITY if pose is None else pose)
-        if _share(guide, before, lens, shift) < LEAST_SHARE:
+        homography, shift = _homography(camera, IDENTITY if pose is None else pose)
+        if _agreeing_share(expected, then, homography, shift) < LEAST_SHARE:
             continue
         fused += 1
-        if np.allclose(lens, np.eye(3), atol=1e-5) and np.abs(shift).max() < 0.01:
-            _add_resting(guide, before, total, count)
+        if np.allclose(homography, np.eye(3), atol=1e-5) and np.abs(shift).max() < 0.01:
+            _add_unmoved(expected, then, total, count)
         else:
-            _add_moved(guide, before, lens, shift, total, count)
+            _add_moved(expected, then, homography, shift, total, count)
     if not fused:
         return frame
     return replace(frame, depth=total / np.maximum(count, 1))
@@ -88,28 +88,28 @@ def drop_missing_depth(scene: Scene, frame: Frame) -> Scene:
     )
 
 
-def _projection(camera: Camera, earlier_from_sensor: Pose) -> tuple[F4, F4]:
+def _homography(camera: Camera, earlier_from_sensor: Pose) -> tuple[F4, F4]:
     """Return H (3, 3) and h (3,), which map pixels of this image to pixels of an earlier one.
 
     The point at depth z in pixel (u, v) has the depth z' and the pixel (u', v') in the earlier
     image, where ``(z' u', z' v', z') = z * H @ (u, v, 1) + h``.
     """
     k = np.array([[camera.fx, 0, camera.cx], [0, camera.fy, camera.cy], [0, 0, 1]])
-    lens = k @ earlier_from_sensor.rotation @ np.linalg.inv(k)
-    return lens.astype(np.float32), (k @ earlier_from_sensor.translation).astype(np.float32)
+    homography = k @ earlier_from_sensor.rotation @ np.linalg.inv(k)
+    return homography.astype(np.float32), (k @ earlier_from_sensor.translation).astype(np.float32)
 
 
 @kernel
-def _guide(depth: F4, range_m: float) -> F4:
-    """Return the depth to look for at each pixel: its own, or for a hole, minus a neighbour's.
+def _expected_depth(depth: F4, range_m: float) -> F4:
+    """Return the depth to expect at each pixel: its own, or for a hole, minus a neighbour's.
 
     It is 0 beyond the range and without a neighbour.
     """
     rows, columns = depth.shape
-    guide = np.zeros((rows, columns), np.float32)
+    expected = np.zeros((rows, columns), np.float32)
     for v in range(rows):
         for u in range(columns):
-            guide[v, u] = depth[v, u] if depth[v, u] <= range_m else np.float32(0)
+            expected[v, u] = depth[v, u] if depth[v, u] <= range_m else np.float32(0)
             if depth[v, u] > 0:
                 continue
             for step in range(1, REACH + 1):
@@ -123,59 +123,59 @@ def _guide(depth: F4, range_m: float) -> F4:
                 if (z == 0) & (v + step < rows):
                     z = depth[min(v + step, rows - 1), u]
                 if (z > 0) & (z <= range_m):
-                    guide[v, u] = -z
+                    expected[v, u] = -z
                     break
-    return guide
+    return expected
 
 
 @kernel
-def _share(guide: F4, before: F4, lens: F4, shift: F4) -> float:
+def _agreeing_share(expected: F4, earlier: F4, homography: F4, shift: F4) -> float:
     """Return the share of depths, among those in both images, that show the same surface."""
-    columns = guide.shape[1]
+    columns = expected.shape[1]
     places = np.zeros((3, columns), np.float32)
     x, y, z = places[0], places[1], places[2]
     compared = agreed = 0
-    for v in range(STRIDE // 2, guide.shape[0], STRIDE):
-        _place(guide[v], v, lens, shift, x, y, z)
+    for v in range(STRIDE // 2, expected.shape[0], STRIDE):
+        _project_row(expected[v], v, homography, shift, x, y, z)
         for u in range(STRIDE // 2, columns, STRIDE):
-            read = _read(before, x[u], y[u])
-            if (guide[v, u] > 0) & (read > 0):
+            read = _interpolate(earlier, x[u], y[u])
+            if (expected[v, u] > 0) & (read > 0):
                 compared += 1
                 agreed += abs(read - z[u]) <= DISCONTINUITY * read * z[u]
     return agreed / max(compared, 1)
 
 
 @kernel
-def _add_resting(guide: F4, before: F4, total: F4, count: F4) -> None:
+def _add_unmoved(expected: F4, earlier: F4, total: F4, count: F4) -> None:
     """Do the same as `_add_moved`, for a camera that has not moved."""
     agree, jump = np.float32(AGREE), np.float32(DISCONTINUITY)
     zero, one = np.float32(0), np.float32(1)
-    for v in range(guide.shape[0]):
-        wanted, then, sums, counts = guide[v], before[v], total[v], count[v]
-        for u in range(wanted.size):
-            g, read = wanted[u], then[u]
+    for v in range(expected.shape[0]):
+        row, then, sums, counts = expected[v], earlier[v], total[v], count[v]
+        for u in range(row.size):
+            g, read = row[u], then[u]
             z = abs(g)
             limit = (agree if g > 0 else jump) * z * read
             same = (read > 0) & (z > 0) & (abs(read - z) <= limit)
             sums[u] += read if same else zero
             counts[u] += one if same else zero
-            wanted[u] = read if same & (g < 0) else g
+            row[u] = read if same & (g < 0) else g
 
 
 @kernel
-def _add_moved(guide: F4, before: F4, lens: F4, shift: F4, total: F4, count: F4) -> None:
-    """Add the earlier depths that agree; a hole that gets one becomes a depth in ``guide``."""
+def _add_moved(expected: F4, earlier: F4, homography: F4, shift: F4, total: F4, count: F4) -> None:
+    """Add the earlier depths that agree; a hole that gets one becomes a depth in ``expected``."""
     agree, jump = np.float32(AGREE), np.float32(DISCONTINUITY)
-    places = np.zeros((3, guide.shape[1]), np.float32)
+    places = np.zeros((3, expected.shape[1]), np.float32)
     x, y, z = places[0], places[1], places[2]
-    for v in range(guide.shape[0]):
-        wanted = guide[v]
-        _place(wanted, v, lens, shift, x, y, z)
-        for u in range(wanted.size):
-            g = wanted[u]
+    for v in range(expected.shape[0]):
+        row = expected[v]
+        _project_row(row, v, homography, shift, x, y, z)
+        for u in range(row.size):
+            g = row[u]
             if g == 0:
                 continue
-            read = _read(before, x[u], y[u])
+            read = _interpolate(earlier, x[u], y[u])
             # A surface may slope between a hole and its neighbour.
             limit = (agree if g > 0 else jump) * z[u] * read
             if (read > 0) & (abs(read - z[u]) <= limit):
@@ -183,34 +183,34 @@ def _add_moved(guide: F4, before: F4, lens: F4, shift: F4, total: F4, count: F4)
                 total[v, u] += found
                 count[v, u] += np.float32(1)
                 if g < 0:
-                    wanted[u] = found
+                    row[u] = found
 
 
 @kernel(inner=True)
-def _place(wanted: F4, v: int, lens: F4, shift: F4, x: F4, y: F4, z: F4) -> None:
-    """Write the column x, row y and depth z, in the earlier image, of the points of one row."""
+def _project_row(depths: F4, v: int, homography: F4, shift: F4, x: F4, y: F4, z: F4) -> None:
+    """Write column x, row y and depth z, in the earlier image, of the points of row ``v``."""
     least = np.float32(NEAREST_M)
     row = np.float32(v)
-    a, b = lens[0, 1] * row + lens[0, 2], lens[1, 1] * row + lens[1, 2]
-    c = lens[2, 1] * row + lens[2, 2]
-    for u in range(wanted.size):
-        depth, column = abs(wanted[u]), np.float32(u)
-        z[u] = max(depth * (lens[2, 0] * column + c) + shift[2], least)
+    a, b = homography[0, 1] * row + homography[0, 2], homography[1, 1] * row + homography[1, 2]
+    c = homography[2, 1] * row + homography[2, 2]
+    for u in range(depths.size):
+        depth, column = abs(depths[u]), np.float32(u)
+        z[u] = max(depth * (homography[2, 0] * column + c) + shift[2], least)
         inverse = np.float32(1) / z[u]
-        x[u] = (depth * (lens[0, 0] * column + a) + shift[0]) * inverse
-        y[u] = (depth * (lens[1, 0] * column + b) + shift[1]) * inverse
+        x[u] = (depth * (homography[0, 0] * column + a) + shift[0]) * inverse
+        y[u] = (depth * (homography[1, 0] * column + b) + shift[1]) * inverse
 
 
 @kernel(inner=True)
-def _read(before: F4, x: float, y: float) -> Any:
+def _interpolate(earlier: F4, x: float, y: float) -> Any:
     """Interpolate between the four depths around (x, y); 0 if over half the weight is missing."""
-    rows, columns = before.shape
+    rows, columns = earlier.shape
     zero, one = np.float32(0), np.float32(1)
     if not ((x >= 0) & (y >= 0) & (x < columns - 1) & (y < rows - 1)):
         return zero
     j, i = np.uint32(x), np.uint32(y)
     right, down = x - np.float32(j), y - np.float32(i)
-    top, bottom = before[i], before[i + 1]
+    top, bottom = earlier[i], earlier[i + 1]
     a, b, c, d = top[j], top[j + 1], bottom[j], bottom[j + 1]
     wa = (one - right) * (one - down) if a > 0 else zero
     wb = right * (one - down) if b > 0 else zero
