@@ -14,10 +14,10 @@ from shapecat.arrays import F4, F8, I4
 from shapecat.config import SurfaceSettings
 from shapecat.jit import kernel
 from shapecat.surface import MIN_POINTS, reconstruct, voxelize
-from shapecat.surface.graph import link
+from shapecat.surface.graph import finish_graph
 from shapecat.surface.growth import Cloud, Rates, grow_fritzke
-from shapecat.surface.lanes import adapt, three_nearest, two_nearest
 from shapecat.surface.neurons import connect, empty_gas, index_mask
+from shapecat.surface.simd import adapt, three_nearest, two_nearest
 from shapecat.surface.triangles import triangles_of
 from shapecat.types import NeuralGas
 
@@ -230,19 +230,32 @@ def test_simd_search_finds_nearest_neurons(size: int) -> None:
 
 
 @kernel
-def _adapt(x: F4, y: F4, z: F4, born: I4, wins: I4, row: int, winner: int, rates: F8) -> Any:
+def _adapt(x: F4, y: F4, z: F4, edge_birth: I4, wins: I4, row: int, winner: int, rates: F8) -> Any:
     return adapt(
-        x, y, z, x.size, 1.0, 2.0, 3.0, born, row, 1 << 29, wins, winner, rates[0], rates[1]
+        x,
+        y,
+        z,
+        x.size,
+        1.0,
+        2.0,
+        3.0,
+        edge_birth,
+        row,
+        1 << 29,
+        wins,
+        winner,
+        rates[0],
+        rates[1],
     )
 
 
 def test_simd_adaptation_moves_only_winner_and_its_neighbours() -> None:
     places = rng().uniform(-1, 1, (3, 48)).astype(np.float32)
-    born = np.full((2, 48), 1 << 29, np.int32)
+    edge_birth = np.full((2, 48), 1 << 29, np.int32)
     wins = np.arange(48, dtype=np.int32)
-    born[1, [3, 20, 47]] = [1, 15, 40]
+    edge_birth[1, [3, 20, 47]] = [1, 15, 40]
     x, y, z = places.copy()
-    age = _adapt(x, y, z, born.reshape(-1), wins, 48, 17, np.array([0.5, 0.1]))
+    age = _adapt(x, y, z, edge_birth.reshape(-1), wins, 48, 17, np.array([0.5, 0.1]))
     rate = np.zeros(48)
     rate[[3, 20, 47]] = 0.1
     rate[17] = 0.5
@@ -300,13 +313,13 @@ def test_kernel_matches_published_algorithm() -> None:
     connect(gas, 0, 1)
     count = grow_fritzke(
         Cloud(*(np.ascontiguousarray(axis) for axis in points.T)),
-        np.uint64(7), gas, 2, 20, 600, 18, Rates(0.1, 0.006, 10),
+        np.uint64(7), gas, 20, 600, 18, Rates(0.1, 0.006, 10),
     )  # fmt: skip
     expected = _fritzke(points, 7, 20, 600, 18)
     assert count == len(expected.neurons) == 20
     found = np.stack([gas.x, gas.y, gas.z], axis=1)[:count]
     np.testing.assert_allclose(found, expected.neurons, atol=1e-4)
-    linked = gas.born.reshape(gas.x.size, -1)[:count, :count] < 1 << 29
+    linked = gas.edge_birth.reshape(gas.x.size, -1)[:count, :count] < 1 << 29
     np.testing.assert_array_equal(np.argwhere(np.triu(linked)), expected.edges)
 
 
@@ -322,7 +335,7 @@ def test_distant_third_neighbour_is_not_linked() -> None:
     gas.x[: len(neurons)], gas.y[: len(neurons)], gas.z[: len(neurons)] = neurons.T
     cloud = Cloud(*(np.ascontiguousarray(axis) for axis in many.T))
 
-    adjacent = link(cloud, gas, len(neurons), 0.2)
+    adjacent = finish_graph(cloud, gas, len(neurons), 0.2)
 
     between = adjacent[:8, 8:]
     assert adjacent.shape == (10, 10)

@@ -1,13 +1,11 @@
 """Surface reconstruction: from the points of an object to a graph of neurons."""
 
-from typing import TypeAlias
-
 import numpy as np
 
 from shapecat.arrays import F4, F8, U2
 from shapecat.config import SurfaceSettings
 from shapecat.jit import kernel
-from shapecat.surface.graph import edge_list, link
+from shapecat.surface.graph import edge_list, finish_graph
 from shapecat.surface.growth import Cloud, Rates, grow_fritzke, grow_thesis
 from shapecat.surface.neurons import FAR, Gas, connect, empty_gas
 from shapecat.surface.voxels import read_only
@@ -21,6 +19,8 @@ _MAX_POINTS = 1200
 """Maximum number of points used, every k-th of a larger cloud: more only make the gas slower."""
 _NEURONS_PER_POINT = 0.45
 _FEWEST_NEURONS = 12
+_SPACING_SAMPLES = 64
+"""Approximate number of points whose distance to the nearest one is averaged."""
 _RATES = Rates(winner=0.1, neighbour=0.006, oldest=30)
 _GROWTH = 0.6
 """Share of the signals within which all neurons are inserted."""
@@ -67,70 +67,60 @@ def reconstruct(
     points = read_only(points)
     if len(points) < MIN_POINTS:
         return None
-    seed = int(rng.integers(1 << 62))
-    if settings.method == "thesis":
-        found = _by_thesis(points, seed, settings.neurons, settings.component_share)
-    else:
-        found = _by_fritzke(
-            points, seed, settings.neurons, settings.signals, settings.component_share
-        )
-    neurons, edges, finite = found
-    if not finite:
+    if not np.isfinite(points).all():
         msg = "points must be finite"
         raise ValueError(msg)
+    seed = int(rng.integers(1 << 62))
+    if settings.method == "thesis":
+        neurons, edges = _by_thesis(points, seed, settings.neurons, settings.component_share)
+    else:
+        neurons, edges = _by_fritzke(
+            points, seed, settings.neurons, settings.signals, settings.component_share
+        )
     return NeuralGas(neurons, edges) if len(neurons) else None
 
 
-_Found: TypeAlias = tuple[F4, U2, bool]
-"""Neurons, edges, and whether the points were finite."""
-
-
 @kernel
-def _by_fritzke(points: F4, seed: int, neurons: int, signals: int, share: float) -> _Found:
+def _by_fritzke(points: F4, seed: int, neurons: int, signals: int, share: float) -> tuple[F4, U2]:
     """Grow a gas on points (m, 3) by Algorithm 3 of the thesis."""
     cloud, frame = _normalise(points)
-    target = _wanted(cloud, neurons)
+    target = _target_size(cloud, neurons)
     gas = empty_gas(target)
     state = np.uint64(seed)
-    if not frame[3] < np.inf:
-        return np.zeros((0, 3), np.float32), np.zeros((0, 2), np.uint16), False
     interval = int(_GROWTH * signals) // target
-    count = _two_points(cloud, gas, state)
-    count = grow_fritzke(cloud, state, gas, count, target, signals, max(interval, 1), _RATES)
-    adjacent = link(cloud, gas, count, share)
-    return _in_metres(gas, adjacent.shape[0], frame), edge_list(adjacent), True
+    _link_two_points(cloud, gas, state)
+    count = grow_fritzke(cloud, state, gas, target, signals, max(interval, 1), _RATES)
+    adjacent = finish_graph(cloud, gas, count, share)
+    return _in_metres(gas, adjacent.shape[0], frame), edge_list(adjacent)
 
 
 @kernel
-def _by_thesis(points: F4, seed: int, neurons: int, share: float) -> _Found:
+def _by_thesis(points: F4, seed: int, neurons: int, share: float) -> tuple[F4, U2]:
     """Grow a gas on points (m, 3) by Algorithm 4 of the thesis."""
     cloud, frame = _normalise(points)
-    target = _wanted(cloud, neurons)
+    target = _target_size(cloud, neurons)
     # differs: a bound on the neurons, for memory; and thresholds relative to the object. A neuron
     # with its share of the surface, a square of side h, has a mean squared distance of h**2 / 6.
     gas = empty_gas(2 * target)
-    if not frame[3] < np.inf:
-        return np.zeros((0, 3), np.float32), np.zeros((0, 2), np.uint16), False
     state = np.uint64(seed)
-    count = _two_points(cloud, gas, state)
-    spacing = _spacing(cloud, 64)
+    _link_two_points(cloud, gas, state)
+    spacing = _spacing(cloud)
     each = cloud.x.size / target
     square = each * (1.15 * spacing) ** 2
     count = grow_thesis(
-        cloud, state, gas, count, 2 * target, _EPOCHS,
+        cloud, state, gas, 2 * target, _EPOCHS,
         _ERROR_LIMIT * each * square / 6, _DISTANCE_LIMIT * spacing,
         _RATES,
     )  # fmt: skip
-    adjacent = link(cloud, gas, count, share)
-    return _in_metres(gas, adjacent.shape[0], frame), edge_list(adjacent), True
+    adjacent = finish_graph(cloud, gas, count, share)
+    return _in_metres(gas, adjacent.shape[0], frame), edge_list(adjacent)
 
 
 @kernel(inner=True)
 def _normalise(points: F4) -> tuple[Cloud, F8]:
     """Return at most `_MAX_POINTS` points, scaled to -1 to 1, and the frame (4,) to undo it.
 
-    The frame is x, y, z of the mean, and the largest distance from it along an axis, which is
-    infinite if a point is not finite.
+    The frame is x, y, z of the mean, and the largest distance from it along an axis.
     """
     step = (points.shape[0] + _MAX_POINTS - 1) // _MAX_POINTS
     size = (points.shape[0] + step - 1) // step
@@ -140,9 +130,7 @@ def _normalise(points: F4) -> tuple[Cloud, F8]:
             frame[axis] += points[i, axis] / size
     for i in range(points.shape[0]):
         for axis in range(3):
-            distance = abs(points[i, axis] - frame[axis])
-            if not distance <= frame[3]:  # also for NaN
-                frame[3] = distance if distance < np.inf else np.inf
+            frame[3] = max(frame[3], abs(points[i, axis] - frame[axis]))
     unit = frame[3] if frame[3] > 0 else 1.0
     x = np.zeros(size, np.float32)
     y = np.zeros(size, np.float32)
@@ -165,27 +153,26 @@ def _in_metres(gas: Gas, count: int, frame: F8) -> F4:
 
 
 @kernel(inner=True)
-def _wanted(cloud: Cloud, neurons: int) -> int:
+def _target_size(cloud: Cloud, neurons: int) -> int:
     most = max(_FEWEST_NEURONS, int(_NEURONS_PER_POINT * cloud.x.size))
     return max(3, min(neurons, most))
 
 
 @kernel
-def _two_points(cloud: Cloud, gas: Gas, state: np.uint64) -> int:
-    """Do steps 1 to 3: link two random points, one from each half of the cloud; return 2."""
+def _link_two_points(cloud: Cloud, gas: Gas, state: np.uint64) -> None:
+    """Do steps 1 to 3: begin with two linked neurons at random points, one from each half."""
     half = cloud.x.size // 2
     for i in range(2):
         k = i * half + np.int64((state >> np.uint64(20 * i)) % np.uint64(half))
         gas.x[i], gas.y[i], gas.z[i] = cloud.x[k], cloud.y[k], cloud.z[k]
     connect(gas, 0, 1)
-    return 2
 
 
 @kernel(fast=True, inner=True)
-def _spacing(cloud: Cloud, samples: int) -> float:
+def _spacing(cloud: Cloud) -> float:
     """Return the mean distance to the nearest other point, over a sample of the points."""
     x, y, z = cloud.x, cloud.y, cloud.z
-    step = max(1, x.size // samples)
+    step = max(1, x.size // _SPACING_SAMPLES)
     total = 0.0
     taken = 0
     for i in range(0, x.size, step):

@@ -5,19 +5,19 @@ import numpy as np
 from shapecat.arrays import I4, U2, Bool
 from shapecat.jit import kernel
 from shapecat.surface.growth import Cloud
-from shapecat.surface.lanes import LANES, three_nearest
 from shapecat.surface.neurons import FAR, Gas, index_mask, is_edge
+from shapecat.surface.simd import LANES, three_nearest
 
-__all__ = ["edge_list", "link"]
+__all__ = ["edge_list", "finish_graph"]
 
-_GAP = 1.15
+_GRID_SPACING = 1.15
 """Spacing of a square grid of the same density, relative to the mean nearest distance."""
 _LONGEST = 3.0
 """Longest edge between neurons that are not the two nearest of a point, in spacings."""
 
 
 @kernel
-def link(cloud: Cloud, gas: Gas, count: int, share: float) -> Bool:
+def finish_graph(cloud: Cloud, gas: Gas, count: int, share: float) -> Bool:
     """Finish the graph of a gas; return the adjacency (n, n) of the n neurons that are kept.
 
     1. Remove neurons that are nearest to no point.
@@ -54,21 +54,21 @@ def link(cloud: Cloud, gas: Gas, count: int, share: float) -> Bool:
     stays = np.zeros(count, np.bool_)
     for i in range(count):
         stays[i] = members[i] > 0
-    kept = _keep(gas, adjacent, members, stays, count)
+    kept = _compact(gas, adjacent, members, stays, count)
     if kept < 3:
         return adjacent[:0, :0]
     if kept < count:
         _three_nearest(cloud, gas, kept, nearest)
     # 2.
-    _settle(cloud, gas, kept, nearest)
+    _move_to_means(cloud, gas, kept, nearest)
     # 3.
-    limit = (_LONGEST * _GAP * _mean_gap(gas, kept)) ** 2
+    limit = (_LONGEST * _GRID_SPACING * _mean_spacing(gas, kept)) ** 2
     for k in range(cloud.x.size):
         a, b, c = np.int64(nearest[k, 0]), np.int64(nearest[k, 1]), np.int64(nearest[k, 2])
         adjacent[a, b] = adjacent[b, a] = True
-        if not adjacent[a, c] and _squared(gas, a, c) < limit:
+        if not adjacent[a, c] and _squared_distance(gas, a, c) < limit:
             adjacent[a, c] = adjacent[c, a] = True
-        if not adjacent[b, c] and _squared(gas, b, c) < limit:
+        if not adjacent[b, c] and _squared_distance(gas, b, c) < limit:
             adjacent[b, c] = adjacent[c, b] = True
     # 4.
     part = np.zeros(kept, np.int64)
@@ -82,7 +82,7 @@ def link(cloud: Cloud, gas: Gas, count: int, share: float) -> Bool:
             heaviest = k if weight[k] > weight[heaviest] else heaviest
         for i in range(kept):
             stays[i] = part[i] == heaviest or weight[part[i]] >= share * cloud.x.size
-        kept = _keep(gas, adjacent, members, stays, kept)
+        kept = _compact(gas, adjacent, members, stays, kept)
         if kept < 3:
             return adjacent[:0, :0]
         # 5.
@@ -116,7 +116,7 @@ def _three_nearest(cloud: Cloud, gas: Gas, count: int, nearest: I4) -> None:
 
 
 @kernel(inline=True)
-def _settle(cloud: Cloud, gas: Gas, count: int, nearest: I4) -> None:
+def _move_to_means(cloud: Cloud, gas: Gas, count: int, nearest: I4) -> None:
     """Move each neuron to the mean of the points it is nearest to."""
     sums = np.zeros((count, 4))
     for k in range(cloud.x.size):
@@ -133,7 +133,7 @@ def _settle(cloud: Cloud, gas: Gas, count: int, nearest: I4) -> None:
 
 
 @kernel(fast=True, inner=True)
-def _mean_gap(gas: Gas, count: int) -> float:
+def _mean_spacing(gas: Gas, count: int) -> float:
     """Return the mean distance from a neuron to the nearest other one."""
     x, y, z = gas.x, gas.y, gas.z
     total = 0.0
@@ -151,13 +151,13 @@ def _mean_gap(gas: Gas, count: int) -> float:
 
 
 @kernel(inner=True)
-def _squared(gas: Gas, i: int, j: int) -> float:
+def _squared_distance(gas: Gas, i: int, j: int) -> float:
     dx, dy, dz = gas.x[i] - gas.x[j], gas.y[i] - gas.y[j], gas.z[i] - gas.z[j]
     return float(dx * dx + dy * dy + dz * dz)
 
 
 @kernel(inner=True)
-def _keep(gas: Gas, adjacent: Bool, members: I4, stays: Bool, count: int) -> int:
+def _compact(gas: Gas, adjacent: Bool, members: I4, stays: Bool, count: int) -> int:
     """Move the neurons that stay to the front; return their number."""
     kept = 0
     for i in range(count):
@@ -218,7 +218,7 @@ def _bridge(gas: Gas, adjacent: Bool, count: int, part: I4) -> None:
     a, b = 0, 0
     for i in range(count):
         for j in range(i + 1, count):
-            if part[i] != part[j] and _squared(gas, i, j) < best:
-                best = _squared(gas, i, j)
+            if part[i] != part[j] and _squared_distance(gas, i, j) < best:
+                best = _squared_distance(gas, i, j)
                 a, b = i, j
     adjacent[a, b] = adjacent[b, a] = True

@@ -6,7 +6,6 @@ import numpy as np
 
 from shapecat.arrays import F4, I4
 from shapecat.jit import kernel
-from shapecat.surface.lanes import LANES, adapt, two_nearest
 from shapecat.surface.neurons import (
     ABSENT,
     FAR,
@@ -19,6 +18,7 @@ from shapecat.surface.neurons import (
     move,
     refresh,
 )
+from shapecat.surface.simd import LANES, adapt, two_nearest
 
 __all__ = ["Cloud", "Rates", "grow_fritzke", "grow_thesis"]
 
@@ -51,24 +51,24 @@ class Rates(NamedTuple):
 
 
 @kernel(inner=True)
-def _drop_old_edges(degree: I4, wins: I4, born: I4, count: int, a: int, oldest: int) -> None:
+def _drop_old_edges(degree: I4, wins: I4, edge_birth: I4, count: int, a: int, oldest: int) -> None:
     for j in range(count):
-        age = wins[a] + wins[j] - born[a * degree.size + j]
+        age = wins[a] + wins[j] - edge_birth[a * degree.size + j]
         # differs: an edge stays when it is the last of either end, so that no neuron is ever
         # isolated and none has to be removed.
         if age > oldest and degree[a] > 1 and degree[j] > 1:
-            disconnect(degree, born, a, j)
+            disconnect(degree, edge_birth, a, j)
 
 
 @kernel(inner=True)
-def _fire(
+def _adapt_to_signal(
     x: F4,
     y: F4,
     z: F4,
     error: F4,
     degree: I4,
     wins: I4,
-    born: I4,
+    edge_birth: I4,
     count: int,
     mask: int,
     sx: float,
@@ -96,10 +96,11 @@ def _fire(
     error[a] += np.float32(gain) * (dx * dx + dy * dy + dz * dz)
     # 8. move it and its neighbours towards the signal
     age = wins[a] + adapt(
-        x, y, z, padded, sx, sy, sz, born, a * x.size, ABSENT, wins, a, rate_winner, rate_neighbour
-    )
+        x, y, z, padded, sx, sy, sz, edge_birth, a * x.size, ABSENT, wins, a,
+        rate_winner, rate_neighbour,
+    )  # fmt: skip
     # 9. link the two, or reset the age of their edge
-    refresh(degree, wins, born, a, b)
+    refresh(degree, wins, edge_birth, a, b)
     return a, age
 
 
@@ -126,23 +127,21 @@ def grow_fritzke(
     cloud: Cloud,
     state: np.uint64,
     gas: Gas,
-    count: int,
     target: int,
     signals: int,
     interval: int,
     rates: Rates,
 ) -> int:
-    """Adapt a gas to signals drawn from a cloud, and insert neurons; return the number of neurons.
+    """Adapt a gas of two neurons to signals from a cloud, and insert more; return their number.
 
-    Source: Fritzke 1995, thesis Algorithm 3, whose steps are numbered here and in `_fire` (steps
-    1 to 3 are the caller's).
+    Source: Fritzke 1995, thesis Algorithm 3, whose steps are numbered here and in
+    `_adapt_to_signal`; steps 1 to 3 are the caller's.
 
     Parameters
     ----------
     cloud : the points.
     state : state of the random generator, from a seed.
-    gas : at least 2 linked neurons, with room for ``target``; changed in place.
-    count : number of neurons in ``gas``.
+    gas : 2 linked neurons, with room for ``target``; changed in place.
     target : number of neurons to grow to.
     signals : number of signals.
     interval : signals between insertions (lambda).
@@ -150,8 +149,8 @@ def grow_fritzke(
     """
     points = cloud.x.size
     px, py, pz = cloud
-    x, y, z, error, degree, wins, born = gas
-    mask = index_mask(gas.x.size)
+    x, y, z, error, degree, wins, edge_birth = gas
+    count, mask = 2, index_mask(gas.x.size)
     order = _in_order(points)
     cursor = points
     gain = 1.0
@@ -166,13 +165,13 @@ def grow_fritzke(
         cursor += 1
         # 5. to 10. differs: the rates fall to a tenth, so that the gas comes to rest.
         rest = 1.0 - fall * signal
-        a, age = _fire(
-            x, y, z, error, degree, wins, born, count, mask, px[k], py[k], pz[k],
+        a, age = _adapt_to_signal(
+            x, y, z, error, degree, wins, edge_birth, count, mask, px[k], py[k], pz[k],
             gain, rates.winner * rest, rates.neighbour * rest,
         )  # fmt: skip
         # 10. remove edges that are too old
         if age > rates.oldest:
-            _drop_old_edges(degree, wins, born, count, a, rates.oldest)
+            _drop_old_edges(degree, wins, edge_birth, count, a, rates.oldest)
         # 11. insert a neuron where the error is largest, every ``interval`` signals
         until -= 1
         if until == 0 and count < target:
@@ -200,14 +199,13 @@ def grow_thesis(
     cloud: Cloud,
     state: np.uint64,
     gas: Gas,
-    count: int,
     target: int,
     epochs: int,
     error_limit: float,
     distance_limit: float,
     rates: Rates,
 ) -> int:
-    """Grow a gas until its neurons are close to the points; return the number of neurons.
+    """Grow a gas of two neurons until they are close to the points; return the number of neurons.
 
     Source: thesis 5.2, Algorithm 4, which changes two steps of Algorithm 3. Step 12: a neuron is
     inserted where the error exceeds a limit. Step 18: the cloud is presented again until the mean
@@ -215,7 +213,7 @@ def grow_thesis(
 
     Parameters
     ----------
-    cloud, state, gas, count, rates : as in `grow_fritzke`.
+    cloud, state, gas, rates : as in `grow_fritzke`.
     target : maximum number of neurons.
     epochs : maximum number of times that each point is presented.
     error_limit : squared distance, in the units of ``cloud`` (t_gamma).
@@ -223,8 +221,8 @@ def grow_thesis(
     """
     points = cloud.x.size
     px, py, pz = cloud
-    x, y, z, error, degree, wins, born = gas
-    mask = index_mask(gas.x.size)
+    x, y, z, error, degree, wins, edge_birth = gas
+    count, mask = 2, index_mask(gas.x.size)
     order = _in_order(points)
     before = np.zeros(gas.x.size, np.int32)
     fall = 0.9 / (epochs * points)
@@ -237,13 +235,13 @@ def grow_thesis(
         pause = 0
         state = _shuffle(order, state)
         for k in order:
-            a, age = _fire(
-                x, y, z, error, degree, wins, born, count, mask, px[k], py[k], pz[k],
+            a, age = _adapt_to_signal(
+                x, y, z, error, degree, wins, edge_birth, count, mask, px[k], py[k], pz[k],
                 1.0, rates.winner * rest, rates.neighbour * rest,
             )  # fmt: skip
             # 10. remove edges that are too old
             if age > rates.oldest:
-                _drop_old_edges(degree, wins, born, count, a, rates.oldest)
+                _drop_old_edges(degree, wins, edge_birth, count, a, rates.oldest)
             rest -= fall
             # 12. differs: at most once in four signals, and the errors of all three neurons are
             # reset; as published, the gas is full after the first epoch.
@@ -277,7 +275,7 @@ def _prune(gas: Gas, count: int, before: I4) -> int:
                     connect(gas, np.int64(heir), j)
                 else:
                     heir = j
-                disconnect(gas.degree, gas.born, i, j)
+                disconnect(gas.degree, gas.edge_birth, i, j)
         if gas.degree[heir] == 0:
             after = (heir + 1) % count
             connect(gas, np.int64(heir), after if after != i else (i + 1) % count)

@@ -6,7 +6,7 @@ import numpy as np
 
 from shapecat.arrays import F4, I4
 from shapecat.jit import kernel
-from shapecat.surface.lanes import LANES
+from shapecat.surface.simd import LANES
 
 __all__ = [
     "ABSENT",
@@ -35,9 +35,9 @@ class Gas(NamedTuple):
     error : (n,) accumulated squared distances.
     degree : (n,) numbers of edges.
     wins : (n,) number of signals for which each neuron was the nearest.
-    born : (n * n,) for the edge i-j, element ``i * n + j`` is the sum ``wins[i] + wins[j]`` when it
-        was last refreshed; `ABSENT` without an edge. The age of an edge is the growth of that sum,
-        so one increment ages all edges of the winner, and its neighbours are in one row.
+    edge_birth : (n * n,) for the edge i-j, element ``i * n + j`` is the sum ``wins[i] + wins[j]``
+        when it was last refreshed; `ABSENT` without an edge. The age of an edge is the growth of
+        that sum, so one increment ages all edges of the winner, and its neighbours are in one row.
     """
 
     x: F4
@@ -46,7 +46,7 @@ class Gas(NamedTuple):
     error: F4
     degree: I4
     wins: I4
-    born: I4
+    edge_birth: I4
 
 
 @kernel(inner=True)
@@ -63,7 +63,7 @@ def empty_gas(room: int) -> Gas:
         np.zeros(size * size, np.int32),
     )
     gas.x[:] = gas.y[:] = gas.z[:] = FAR
-    gas.born[:] = ABSENT
+    gas.edge_birth[:] = ABSENT
     return gas
 
 
@@ -79,31 +79,31 @@ def index_mask(count: int) -> int:
 @kernel(inner=True)
 def is_edge(gas: Gas, i: int, j: int) -> bool:
     """Return whether two neurons are linked."""
-    return bool(gas.born[i * gas.x.size + j] < ABSENT)
+    return bool(gas.edge_birth[i * gas.x.size + j] < ABSENT)
 
 
 @kernel(inner=True)
 def connect(gas: Gas, i: int, j: int) -> None:
     """Link neurons i and j, or reset the age of their edge."""
-    refresh(gas.degree, gas.wins, gas.born, i, j)
+    refresh(gas.degree, gas.wins, gas.edge_birth, i, j)
 
 
 @kernel(inner=True)
-def refresh(degree: I4, wins: I4, born: I4, i: int, j: int) -> None:
+def refresh(degree: I4, wins: I4, edge_birth: I4, i: int, j: int) -> None:
     """Link neurons i and j, or reset the age of their edge; the arrays are those of a `Gas`."""
-    if born[i * degree.size + j] == ABSENT:
+    if edge_birth[i * degree.size + j] == ABSENT:
         degree[i] += 1
         degree[j] += 1
     now = wins[i] + wins[j]
-    born[i * degree.size + j] = now
-    born[j * degree.size + i] = now
+    edge_birth[i * degree.size + j] = now
+    edge_birth[j * degree.size + i] = now
 
 
 @kernel(inner=True)
-def disconnect(degree: I4, born: I4, i: int, j: int) -> None:
+def disconnect(degree: I4, edge_birth: I4, i: int, j: int) -> None:
     """Remove the edge between neurons i and j; the arrays are those of a `Gas`."""
-    born[i * degree.size + j] = ABSENT
-    born[j * degree.size + i] = ABSENT
+    edge_birth[i * degree.size + j] = ABSENT
+    edge_birth[j * degree.size + i] = ABSENT
     degree[i] -= 1
     degree[j] -= 1
 
@@ -119,7 +119,7 @@ def insert(gas: Gas, count: int, q: int) -> int:
     gas.x[count] = half * (gas.x[q] + gas.x[f])
     gas.y[count] = half * (gas.y[q] + gas.y[f])
     gas.z[count] = half * (gas.z[q] + gas.z[f])
-    disconnect(gas.degree, gas.born, q, np.int64(f))
+    disconnect(gas.degree, gas.edge_birth, q, np.int64(f))
     connect(gas, q, count)
     connect(gas, np.int64(f), count)
     return f
@@ -133,9 +133,11 @@ def move(gas: Gas, last: int, place: int) -> None:
         gas.x[place], gas.y[place], gas.z[place] = gas.x[last], gas.y[last], gas.z[last]
         gas.wins[place], gas.degree[place] = gas.wins[last], gas.degree[last]
         for j in range(last):
-            gas.born[place * size + j] = gas.born[j * size + place] = gas.born[last * size + j]
-        gas.born[place * size + place] = ABSENT
+            gas.edge_birth[place * size + j] = gas.edge_birth[j * size + place] = gas.edge_birth[
+                last * size + j
+            ]
+        gas.edge_birth[place * size + place] = ABSENT
     for j in range(size):
-        gas.born[last * size + j] = gas.born[j * size + last] = ABSENT
+        gas.edge_birth[last * size + j] = gas.edge_birth[j * size + last] = ABSENT
     gas.x[last] = gas.y[last] = gas.z[last] = FAR
     gas.wins[last] = gas.degree[last] = 0

@@ -175,7 +175,7 @@ def adapt(
     sx: Any,
     sy: Any,
     sz: Any,
-    born: Any,
+    edge_birth: Any,
     row: Any,
     absent: Any,
     wins: Any,
@@ -183,33 +183,35 @@ def adapt(
     rate_winner: Any,
     rate_neighbour: Any,
 ) -> Any:
-    """Move the winner and its neighbours towards a point; return the largest ``wins - born``.
+    """Move the winner and its neighbours towards a point; return the largest ``wins - edge_birth``.
 
     Parameters
     ----------
     x, y, z, padded, sx, sy, sz : as in `two_nearest`.
-    born, row : the int32 array of `Gas`, and the index where the row of the winner begins.
-    absent : ``born`` is at least this where there is no edge.
+    edge_birth, row : the int32 array of `Gas`, and the index where the row of the winner begins.
+    absent : ``edge_birth`` is at least this where there is no edge.
     wins : the int32 array of `Gas`.
     winner : index of the winner.
     rate_winner, rate_neighbour : share of the distance to move.
     """
     real, whole = types.float32, types.int64
     places = (x, y, z, whole, real, real, real)
-    return types.int32(*places, born, whole, types.int32, wins, whole, real, real), _emit_adapt
+    return types.int32(
+        *places, edge_birth, whole, types.int32, wins, whole, real, real
+    ), _emit_adapt
 
 
 def _emit_adapt(context: Any, builder: Any, signature: Any, args: Any) -> _Value:
     v, build = _Vectors(context, builder), builder
     arrays = [v.array(signature.args[k], args[k]) for k in range(3)]
     padded, place = args[3], [v.splat(value, _FLOATS) for value in args[4:7]]
-    born = build.gep(v.array(signature.args[7], args[7]), [args[8]])
+    edge_birth = build.gep(v.array(signature.args[7], args[7]), [args[8]])
     absent, wins = v.splat(args[9], _INTS), v.array(signature.args[10], args[10])
     winner = v.splat(build.trunc(args[11], _I32), _INTS)
     rate_winner, rate_neighbour = v.splat(args[12], _FLOATS), v.splat(args[13], _FLOATS)
     oldest = v.variable(_constant(-_LARGEST))
     with v.blocks(padded) as (i, index):
-        edge = v.load(born, i, _INTS)
+        edge = v.load(edge_birth, i, _INTS)
         linked = build.icmp_signed("<", edge, absent)
         rate = build.select(linked, rate_neighbour, ir.Constant(_FLOATS, [0.0] * LANES))
         rate = build.select(build.icmp_signed("==", index, winner), rate_winner, rate)
