@@ -13,7 +13,7 @@ from shapecat.arrays import F4, F8, Record, array
 from shapecat.config import SurfaceSettings
 from shapecat.description import BLOCKS, DESCRIPTOR_NAMES, describe
 from shapecat.description.curvature import assign, fit_surfaces
-from shapecat.description.distances import euclidean, geodesic
+from shapecat.description.distances import euclidean_distances, geodesic_distances
 from shapecat.description.profile import vertical_axis
 from shapecat.description.rotation_axis import rotation_axis
 from shapecat.surface import reconstruct
@@ -280,18 +280,18 @@ def test_edges_beyond_neurons_are_rejected() -> None:
 
 def test_geodesics_are_shortest_paths() -> None:
     view = can()
-    distances = euclidean(*(np.ascontiguousarray(axis) for axis in view.gas.neurons.T))
+    distances = euclidean_distances(*(np.ascontiguousarray(axis) for axis in view.gas.neurons.T))
     i, j = view.gas.edges.astype(int).T
     graph = coo_array((distances[i, j], (i, j)), shape=distances.shape)
     expected = shortest_path(graph.tocsr(), directed=False)
-    np.testing.assert_allclose(geodesic(distances, view.gas.edges), expected, atol=1e-6)
+    np.testing.assert_allclose(geodesic_distances(distances, view.gas.edges), expected, atol=1e-6)
 
 
 def local_fit(view: View, radius: float) -> tuple[F4, F4]:
     x, y, z = (np.ascontiguousarray(axis) for axis in view.gas.neurons.T)
     points, starts = assign(np.ascontiguousarray(view.points.T), x, y, z, np.float32(1.0))
     normals, curvatures = fit_surfaces(
-        points, starts, x, y, z, euclidean(x, y, z), np.float32(radius), EYE
+        points, starts, x, y, z, euclidean_distances(x, y, z), np.float32(radius), EYE
     )
     return normals, curvatures
 

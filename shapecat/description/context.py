@@ -5,6 +5,7 @@ import numpy as np
 from shapecat.arrays import F4, F8
 from shapecat.description.linear import principal_axes
 from shapecat.description.profile import vertical_axis
+from shapecat.description.sampled import Surface
 from shapecat.jit import kernel
 
 __all__ = ["CONTEXT_NAMES", "context"]
@@ -105,42 +106,23 @@ def _sphere(x: F4, y: F4, z: F4, weight: F4) -> tuple[float, float, float]:
 
 @kernel
 def context(
-    points: F4,
-    x: F4,
-    y: F4,
-    z: F4,
-    base: float,
-    weight: F4,
-    normals: F4,
-    curvatures: F4,
-    straight: F4,
-    paths: F4,
-    eye: F4,
-    low: float,
-    high: float,
-    out: F4,
+    surface: Surface, normals: F4, curvatures: F4, low: float, high: float, out: F4
 ) -> tuple[float, float, float]:
     """Write the features named by `CONTEXT_NAMES`, and return three widths of the object.
 
-    All lengths are in units of the mean distance between neurons, with the origin at their mean.
-
     Parameters
     ----------
-    points : (3, m) the points of the object.
-    x, y, z : (k,) positions of the neurons.
-    base : height of the support.
-    weight : (k,) each neuron's share of the points.
     normals, curvatures : (3, k) and (2, k), from `fit_surfaces`.
-    straight, paths : (k, k) Euclidean distances, and distances along the surface.
-    eye : (3,) position of the sensor.
-    low, high : heights of the lowest and highest point.
+    low, high : heights of the lowest and highest point, in units of the surface.
     out : the block ``context``, written in place.
 
     Returns
     -------
     The greatest horizontal width, and the horizontal widths across and along the line of sight.
     """
-    wide, across, along = _extents(points, high - low, eye, out[:5])
+    weight, base = surface.weight, -surface.center[2] / surface.unit
+    x, y, z = surface.neurons[0], surface.neurons[1], surface.neurons[2]
+    wide, across, along = _extents(surface.points, high - low, surface.eye, out[:5])
     _spreads(x, y, z, weight, normals, out[5:12])
     _harmonics(weight, normals, out[12:15])
     level = np.zeros(x.size)
@@ -153,7 +135,7 @@ def context(
     out[30] = 1.0 / (1.0 + size)
     out[31] = min(max((middle - low) / max(high - low, 1e-3), -2.0), 3.0)
     _heights(level, weight, curvatures, out[32:36])
-    _around(straight, paths, out[36:39])
+    _around(surface.euclidean, surface.geodesic, out[36:39])
     out[39] = _ratio(max(low - base, 0.0), high - low)
     return wide, across, along
 
@@ -289,17 +271,17 @@ def _heights(level: F8, weight: F4, curvatures: F4, out: F4) -> None:
 
 
 @kernel(inline=True)
-def _around(straight: F4, paths: F4, out: F4) -> None:
+def _around(euclidean: F4, geodesic: F4, out: F4) -> None:
     """Compare distances along the surface with Euclidean distances."""
-    count = paths.shape[0]
+    count = geodesic.shape[0]
     total = direct = longest = most = 0.0
     least = np.inf
     for i in range(count):
         row = 0.0
         for j in range(count):
-            row += paths[i, j]
-            direct += straight[i, j]
-            longest = max(longest, paths[i, j])
+            row += geodesic[i, j]
+            direct += euclidean[i, j]
+            longest = max(longest, geodesic[i, j])
         total += row
         least, most = min(least, row), max(most, row)
     out[0] = min(total / max(direct, 1e-9), 4.0)

@@ -73,7 +73,7 @@ def assign(points: F4, x: F4, y: F4, z: F4, reach: float) -> tuple[F4, I4]:
 
 @kernel(fast=True)
 def fit_surfaces(
-    points: F4, starts: I4, x: F4, y: F4, z: F4, straight: F4, radius: float, eye: F4
+    points: F4, starts: I4, x: F4, y: F4, z: F4, euclidean: F4, radius: float, eye: F4
 ) -> tuple[F4, F4]:
     """Fit a quadric around each neuron.
 
@@ -85,7 +85,7 @@ def fit_surfaces(
     ----------
     points, starts : from `assign`.
     x, y, z : (k,) positions of the neurons.
-    straight : (k, k) Euclidean distances between the neurons.
+    euclidean : (k, k) Euclidean distances between the neurons.
     radius : radius of the neighbourhoods, in the same unit.
     eye : (3,) position of the sensor.
 
@@ -116,7 +116,7 @@ def fit_surfaces(
         px, py, pz = x[i], y[i], z[i]
         found = zero  # unsigned: no check for negative indices
         for j in range(count):
-            if straight[i, j] >= radius + reach[j]:
+            if euclidean[i, j] >= radius + reach[j]:
                 continue
             for k in range(np.uint64(starts[j]), np.uint64(starts[j + 1])):
                 du = (points[0, k] - px) * scale

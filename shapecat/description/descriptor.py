@@ -1,20 +1,19 @@
 """The shape descriptor of an object: a vector of fixed length."""
 
-from typing import Any
-
 import numpy as np
 
 from shapecat.arrays import F4, F8, I4, U2
 from shapecat.description.blocks import BLOCKS, DESCRIPTOR_NAMES
 from shapecat.description.context import context
 from shapecat.description.curvature import assign, fit_surfaces
-from shapecat.description.distances import euclidean, geodesic, mean_gap
+from shapecat.description.distances import euclidean_distances, geodesic_distances, mean_gap
 from shapecat.description.distributions import distributions
 from shapecat.description.outline import outline
 from shapecat.description.profile import profile, vertical_axis
 from shapecat.description.ranges import outer_range
 from shapecat.description.revolution import revolution
 from shapecat.description.rotation_axis import rotation_axis
+from shapecat.description.sampled import Surface
 from shapecat.description.solids import solids
 from shapecat.jit import kernel
 from shapecat.types import NeuralGas
@@ -77,72 +76,63 @@ def describe(points: F4, gas: NeuralGas, eye: F4) -> F4:
     if gas.edges.size and int(gas.edges.max()) >= len(gas.neurons):
         msg = f"edge to neuron {gas.edges.max()} of {len(gas.neurons)}"
         raise ValueError(msg)
-    if not _describe(points, gas.neurons, gas.edges, eye, result):
+    if not all(np.isfinite(values).all() for values in (points, gas.neurons, eye)):
         msg = "points, neurons and eye must be finite"
         raise ValueError(msg)
+    _describe(points, gas.neurons, gas.edges, eye, result)
     return result
 
 
-def _describe(points: F4, neurons: F4, edges: U2, eye: F4, out: F4) -> bool:
-    """Write the descriptor; return whether the input was finite.
+def _describe(points: F4, neurons: F4, edges: U2, eye: F4, out: F4) -> None:
+    """Write the descriptor.
 
     Each block is a kernel of its own: as one they would take two seconds more to compile.
     """
-    if not (_finite(neurons) and _finite(points) and _finite(eye.reshape(1, 3))):
-        return False
-    cloud, starts, owner, rows, middle, unit, straight, paths, weight, gap, place, away = _prepare(
-        points, neurons, edges, eye
-    )
-    x, y, z = rows
+    surface = _prepare(points, neurons, edges, eye)
+    cloud, starts, nearest, weight = (
+        surface.points, surface.starts, surface.nearest, surface.weight,
+    )  # fmt: skip
+    x, y, z = surface.neurons
+    radius, unit = np.float32(_RADIUS * surface.spacing), surface.unit
     normals, curvatures = fit_surfaces(
-        cloud, starts, x, y, z, straight, np.float32(_RADIUS * gap), place
+        cloud, starts, x, y, z, surface.euclidean, radius, surface.eye
     )
     low, high = _height_range(cloud[2])
-    wide, across, along = context(
-        cloud, x, y, z, -middle[2] / unit, weight, normals, curvatures, straight, paths, place,
-        low, high, out[_CONTEXT:_CURVED],
-    )  # fmt: skip
-    distributions(z, straight, paths, weight, normals, curvatures, out)
-    profile(x, y, z, weight, normals, curvatures, low, high, out[_PROFILE:_REVOLUTION])
+    wide, across, along = context(surface, normals, curvatures, low, high, out[_CONTEXT:_CURVED])
+    distributions(surface, normals, curvatures, out)
+    profile(surface, normals, curvatures, low, high, out[_PROFILE:_REVOLUTION])
     cx, cy, _ = vertical_axis(x, y, normals, weight)
     axis, point, _ = rotation_axis(x, y, z, weight, normals)
     turned, foot = out[_REVOLUTION:_SOLIDS], np.array((cx, cy, 0.0))
-    revolution(cloud, owner, rows, weight, normals, place, axis, point, foot, turned)
-    solids(cloud, owner, x, y, normals, place, low, high, turned, out[_SOLIDS:_OUTLINE])
-    outline(cloud, place, out[_OUTLINE:_METRIC])
+    revolution(surface, normals, axis, point, foot, turned)
+    solids(cloud, nearest, x, y, normals, surface.eye, low, high, turned, out[_SOLIDS:_OUTLINE])
+    outline(cloud, surface.eye, out[_OUTLINE:_METRIC])
+    away_m = surface.eye_distance_m
     out[_METRIC:] = (
         (high - low) * unit,
-        low * unit + middle[2],
+        low * unit + surface.center[2],
         wide * unit,
         across * unit,
         along * unit,
-        gap * unit,
-        (eye[2] - middle[2]) / away if away > 0 else 0.0,
-        away,
+        surface.spacing * unit,
+        (eye[2] - surface.center[2]) / away_m if away_m > 0 else 0.0,
+        away_m,
     )
-    return True
 
 
 @kernel
-def _prepare(points: F4, neurons: F4, edges: U2, eye: F4) -> tuple[Any, ...]:
-    """Return the quantities that several blocks use, in units of `_own_units` unless in metres.
-
-    They are: the points (3, n) sorted by neuron, the index where each neuron's points start, the
-    neuron of each point; the neurons (3, m), their mean and the unit (both in metres), their
-    Euclidean distances and distances along edges, each neuron's share of the points, the mean gap;
-    the sensor's position, and its distance in metres.
-    """
-    x, y, z, straight, middle, unit = _own_units(neurons)
+def _prepare(points: F4, neurons: F4, edges: U2, eye: F4) -> Surface:
+    x, y, z, euclidean, center, unit = _own_units(neurons)
     away = 0.0
     for axis in range(3):
-        away += (eye[axis] - middle[axis]) ** 2
+        away += (eye[axis] - center[axis]) ** 2
     away = np.sqrt(away)
     place = np.zeros(3, np.float32)
     for axis in range(3):
-        place[axis] = (eye[axis] - middle[axis]) / max(unit, away / _FAR)
-    gap = max(mean_gap(straight), 1e-3)
-    paths, rows = geodesic(straight, edges), _in_rows(x, y, z)
-    cloud, starts = assign(_cloud_of(points, middle, unit), x, y, z, np.float32(_REACH * gap))
+        place[axis] = (eye[axis] - center[axis]) / max(unit, away / _FAR)
+    spacing = max(mean_gap(euclidean), 1e-3)
+    geodesic, rows = geodesic_distances(euclidean, edges), _in_rows(x, y, z)
+    cloud, starts = assign(_cloud_of(points, center, unit), x, y, z, np.float32(_REACH * spacing))
     if cloud.shape[1] == 0:
         # no point is near: describe the neurons themselves
         cloud = rows
@@ -151,12 +141,25 @@ def _prepare(points: F4, neurons: F4, edges: U2, eye: F4) -> tuple[Any, ...]:
     weight = np.zeros(x.size, np.float32)
     for i in range(x.size):
         weight[i] = (starts[i + 1] - starts[i]) / cloud.shape[1]
-    owner = _owners(starts)
-    return cloud, starts, owner, rows, middle, unit, straight, paths, weight, gap, place, away
+    nearest = _nearest_neurons(starts)
+    return Surface(
+        cloud,
+        starts,
+        nearest,
+        rows,
+        euclidean,
+        geodesic,
+        weight,
+        spacing,
+        place,
+        away,
+        center,
+        unit,
+    )
 
 
 @kernel(inline=True)
-def _cloud_of(points: F4, middle: F8, unit: float) -> F4:
+def _cloud_of(points: F4, center: F8, unit: float) -> F4:
     """Return every k-th point (3, n) relative to the mean of the neurons, in their unit."""
     step = (points.shape[0] + _MAX_POINTS - 1) // _MAX_POINTS
     total = (points.shape[0] + step - 1) // step
@@ -164,7 +167,7 @@ def _cloud_of(points: F4, middle: F8, unit: float) -> F4:
     for k in range(total):
         for axis in range(3):
             # points this far away belong to no neuron: the bound keeps squares finite
-            value = (points[k * step, axis] - middle[axis]) / unit
+            value = (points[k * step, axis] - center[axis]) / unit
             cloud[axis, k] = min(max(value, -_FAR), _FAR)
     return cloud
 
@@ -179,22 +182,13 @@ def _in_rows(x: F4, y: F4, z: F4) -> F4:
 
 
 @kernel(inline=True)
-def _owners(starts: I4) -> I4:
+def _nearest_neurons(starts: I4) -> I4:
     """Return the neuron of each point, for points sorted by `assign`."""
     owner = np.zeros(starts[-1], np.int64)
     for k in range(starts.size - 1):
         for i in range(starts[k], starts[k + 1]):
             owner[i] = k
     return owner
-
-
-@kernel
-def _finite(rows: F4) -> bool:
-    for i in range(rows.shape[0]):
-        for axis in range(3):
-            if not abs(rows[i, axis]) < np.inf:
-                return False
-    return True
 
 
 @kernel(inline=True)
@@ -205,28 +199,28 @@ def _own_units(neurons: F4) -> tuple[F4, F4, F4, F4, F8, float]:
     unit in metres, which is 1 if all neurons coincide.
     """
     count = neurons.shape[0]
-    middle = np.zeros(3)
+    center = np.zeros(3)
     for i in range(count):
         for axis in range(3):
-            middle[axis] += neurons[i, axis] / count
+            center[axis] += neurons[i, axis] / count
     unit = 0.0
     for i in range(count):
         for axis in range(3):
-            unit = max(unit, abs(neurons[i, axis] - middle[axis]))
+            unit = max(unit, abs(neurons[i, axis] - center[axis]))
     unit = unit if unit > 0 else 1.0
     x = np.zeros(count, np.float32)
     y = np.zeros(count, np.float32)
     z = np.zeros(count, np.float32)
-    straight = np.zeros((count, count), np.float32)
+    euclidean = np.zeros((count, count), np.float32)
     for _ in range(2):  # first by the greatest coordinate, so that squares stay finite
         for i in range(count):
-            x[i] = (neurons[i, 0] - middle[0]) / unit
-            y[i] = (neurons[i, 1] - middle[1]) / unit
-            z[i] = (neurons[i, 2] - middle[2]) / unit
-        straight = euclidean(x, y, z)
-        mean = _sum(straight) / (count * (count - 1))
+            x[i] = (neurons[i, 0] - center[0]) / unit
+            y[i] = (neurons[i, 1] - center[1]) / unit
+            z[i] = (neurons[i, 2] - center[2]) / unit
+        euclidean = euclidean_distances(x, y, z)
+        mean = _sum(euclidean) / (count * (count - 1))
         unit *= mean if mean > 0 else 1.0
-    return x, y, z, straight, middle, unit
+    return x, y, z, euclidean, center, unit
 
 
 @kernel(inline=True)

@@ -5,13 +5,13 @@ import numpy as np
 from shapecat.arrays import F4, U2
 from shapecat.jit import kernel
 
-__all__ = ["euclidean", "geodesic", "mean_gap"]
+__all__ = ["euclidean_distances", "geodesic_distances", "mean_gap"]
 
 _NO_PATH = np.float32(1e30)
 
 
 @kernel(fast=True)
-def euclidean(x: F4, y: F4, z: F4) -> F4:
+def euclidean_distances(x: F4, y: F4, z: F4) -> F4:
     """Return the distances (n, n) between points with coordinates x, y, z (n,)."""
     count = x.size
     result = np.zeros((count, count), np.float32)
@@ -23,7 +23,7 @@ def euclidean(x: F4, y: F4, z: F4) -> F4:
 
 
 @kernel(fast=True)
-def geodesic(straight: F4, edges: U2) -> F4:
+def geodesic_distances(euclidean: F4, edges: U2) -> F4:
     """Return the lengths (n, n) of the shortest paths along the edges of a graph.
 
     A pair without a path gets its Euclidean distance plus the longest path in the graph. Source:
@@ -32,16 +32,16 @@ def geodesic(straight: F4, edges: U2) -> F4:
 
     Parameters
     ----------
-    straight : (n, n) Euclidean distances.
+    euclidean : (n, n) Euclidean distances.
     edges : (m, 2) pairs of nodes.
     """
-    count = straight.shape[0]
+    count = euclidean.shape[0]
     padded = (count + 15) // 16 * 16  # whole vectors: no remainder in the inner loop
     paths = np.zeros((padded, padded), np.float32)
     paths[:] = _NO_PATH
     for e in range(edges.shape[0]):
         a, b = np.int64(edges[e, 0]), np.int64(edges[e, 1])
-        paths[a, b] = paths[b, a] = straight[a, b]
+        paths[a, b] = paths[b, a] = euclidean[a, b]
     for i in range(count):
         paths[i, i] = 0
     via = np.zeros((4, padded), np.float32)
@@ -49,7 +49,7 @@ def geodesic(straight: F4, edges: U2) -> F4:
         _ways(paths, k, via)
         for i in range(count):
             _shorten(paths, i, via, k)
-    joined: F4 = _joined(paths, straight)
+    joined: F4 = _joined(paths, euclidean)
     return joined
 
 
@@ -93,9 +93,9 @@ def _shorten(paths: F4, i: int, via: F4, k: int) -> None:
 
 
 @kernel(fast=True, inline=True)
-def _joined(paths: F4, straight: F4) -> F4:
+def _joined(paths: F4, euclidean: F4) -> F4:
     """Return the paths without padding, and fill in those that do not exist."""
-    count = straight.shape[0]
+    count = euclidean.shape[0]
     result = np.zeros((count, count), np.float32)
     longest = np.float32(0)
     for i in range(count):
@@ -113,17 +113,17 @@ def _joined(paths: F4, straight: F4) -> F4:
     for i in range(count):
         for j in range(count):
             if not result[i, j] < _NO_PATH:
-                result[i, j] = straight[i, j] + longest
+                result[i, j] = euclidean[i, j] + longest
     return result
 
 
 @kernel(fast=True, inner=True)
-def mean_gap(straight: F4) -> float:
+def mean_gap(euclidean: F4) -> float:
     """Return the mean distance from a node to its nearest neighbour, from distances (n, n)."""
-    count = straight.shape[0]
+    count = euclidean.shape[0]
     total = 0.0
     for i in range(count):
-        row = straight[i]
+        row = euclidean[i]
         best = np.float32(np.inf)
         for j in range(i):
             best = row[j] if row[j] < best else best

@@ -14,6 +14,7 @@ from shapecat.description.blocks import (
     UP_BINS,
 )
 from shapecat.description.ranges import outer_range
+from shapecat.description.sampled import Surface
 from shapecat.jit import kernel
 
 __all__ = ["distributions"]
@@ -23,10 +24,10 @@ _DISTANCE_RANGE = 2.6
 _CURVATURE = SHAPE_BINS + CURVED_BINS + MEAN_BINS
 # kernels read numbers, not dictionaries
 _CURVED, _UP = BLOCKS["curvature"].start, BLOCKS["up"].start
-_RING_PATHS, _RING_STRAIGHT, _RING_CURVED = (
+_RING_GEODESIC, _RING_EUCLIDEAN, _RING_CURVED = (
     BLOCKS[f"ring_{name}"].start for name in ("geodesic", "euclid", "curvature")
 )
-_BAND_PATHS, _BAND_STRAIGHT, _BAND_CURVED = (
+_BAND_GEODESIC, _BAND_EUCLIDEAN, _BAND_CURVED = (
     BLOCKS[f"band_{name}"].start for name in ("geodesic", "euclid", "curvature")
 )
 
@@ -57,40 +58,34 @@ def _find_bins(lengths: F4, i: int, scale: float, one: float, bins: I4, shares: 
 
 
 @kernel
-def distributions(
-    z: F4, straight: F4, paths: F4, weight: F4, normals: F4, curvatures: F4, out: F4
-) -> None:
+def distributions(surface: Surface, normals: F4, curvatures: F4, out: F4) -> None:
     """Write the histograms over the whole object, its rings and its bands.
 
-    Parameters
-    ----------
-    z : (n,) heights of the neurons, in units of the mean distance between neurons.
-    straight, paths : (n, n) Euclidean distances, and distances along the surface.
-    weight : (n,) each neuron's share of the points.
-    normals : (3, n) unit vectors.
-    curvatures : (2, n) from `fit_surfaces`.
-    out : the whole descriptor; the blocks ``curvature`` to ``band_curvature`` are written.
+    ``normals`` (3, n) and ``curvatures`` (2, n) are from `fit_surfaces`; ``out`` is the whole
+    descriptor, of which the blocks ``curvature`` to ``band_curvature`` are written.
     """
+    euclidean, geodesic, weight = surface.euclidean, surface.geodesic, surface.weight
+    z = surface.neurons[2]
     count = z.size
     width = 1 + _CURVATURE + 2 * DISTANCE_BINS
     rows = np.zeros((count, width), np.float32)
     sums = np.zeros(count, np.float32)
     for j in range(count):
         for i in range(count):  # column by column: the sums of all rows grow side by side
-            sums[i] += paths[j, i]
+            sums[i] += geodesic[j, i]
     total = 0.0
     for i in range(count):
         total += sums[i]
     pairs = count * (count - 1)
     scale = np.float32(DISTANCE_BINS / _DISTANCE_RANGE)
-    per_path = scale * np.float32(pairs / max(total, 1e-9))
-    per_straight = scale  # the mean is the unit
+    per_geodesic = scale * np.float32(pairs / max(total, 1e-9))
+    per_euclidean = scale  # the mean is the unit
     one = np.float32(1.0 / (count - 1))
     bins, shares = np.zeros((2, count), np.int32), np.zeros((2, count), np.float32)
     for i in range(count):
         row = rows[i]
-        _find_bins(paths, i, per_path, one, bins[0], shares[0])
-        _find_bins(straight, i, per_straight, one, bins[1], shares[1])
+        _find_bins(geodesic, i, per_geodesic, one, bins[0], shares[0])
+        _find_bins(euclidean, i, per_euclidean, one, bins[1], shares[1])
         for j in range(count):
             if i == j:
                 continue
@@ -103,14 +98,14 @@ def distributions(
         first, second = curvatures[0, i], curvatures[1, i]
         _curvature_row(row, first, second)
     curvature = out[_CURVED:_UP]
-    up = out[_UP:_RING_PATHS]
+    up = out[_UP:_RING_GEODESIC]
     for i in range(count):
         for k in range(_CURVATURE):
             curvature[k] += weight[i] * rows[i, 1 + k]
         place = (np.float64(normals[2, i]) + 1) / 2
         _count(up, 0, UP_BINS, place, np.float64(weight[i]))
-    _partition(rows, sums, weight, RINGS, out, _RING_PATHS, _RING_STRAIGHT, _RING_CURVED)
-    _partition(rows, z, weight, BANDS, out, _BAND_PATHS, _BAND_STRAIGHT, _BAND_CURVED)
+    _partition(rows, sums, weight, RINGS, out, _RING_GEODESIC, _RING_EUCLIDEAN, _RING_CURVED)
+    _partition(rows, z, weight, BANDS, out, _BAND_GEODESIC, _BAND_EUCLIDEAN, _BAND_CURVED)
 
 
 @kernel(inline=True)
@@ -134,8 +129,8 @@ def _partition(
     weight: F4,
     parts: int,
     out: F4,
-    at_paths: int,
-    at_straight: int,
+    at_geodesic: int,
+    at_euclidean: int,
     at_curvature: int,
 ) -> None:
     """Write the mean of ``rows`` over each of the equal intervals of ``order``.
@@ -161,7 +156,7 @@ def _partition(
         for k in range(_CURVATURE):
             out[base + 1 + k] = sums[part, 1 + k] * norm
         for k in range(DISTANCE_BINS):
-            out[at_paths + part * DISTANCE_BINS + k] = sums[part, 1 + _CURVATURE + k] * norm
-            out[at_straight + part * DISTANCE_BINS + k] = (
+            out[at_geodesic + part * DISTANCE_BINS + k] = sums[part, 1 + _CURVATURE + k] * norm
+            out[at_euclidean + part * DISTANCE_BINS + k] = (
                 sums[part, 1 + _CURVATURE + DISTANCE_BINS + k] * norm
             )

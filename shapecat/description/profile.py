@@ -3,6 +3,7 @@
 import numpy as np
 
 from shapecat.arrays import F4
+from shapecat.description.sampled import Surface
 from shapecat.jit import kernel
 
 __all__ = ["PROFILE_NAMES", "PROFILE_SLICES", "profile", "vertical_axis"]
@@ -56,15 +57,7 @@ def vertical_axis(x: F4, y: F4, normals: F4, weight: F4) -> tuple[float, float, 
 
 @kernel
 def profile(
-    x: F4,
-    y: F4,
-    z: F4,
-    weight: F4,
-    normals: F4,
-    curvatures: F4,
-    low: float,
-    high: float,
-    out: F4,
+    surface: Surface, normals: F4, curvatures: F4, low: float, high: float, out: F4
 ) -> None:
     """Write the radial profile about the vertical axis, named by `PROFILE_NAMES`.
 
@@ -74,12 +67,12 @@ def profile(
 
     Parameters
     ----------
-    x, y, z : (n,) positions of the neurons, in units of the mean distance between neurons.
-    weight : (n,) each neuron's share of the points.
     normals, curvatures : (3, n) and (2, n), from `fit_surfaces`.
-    low, high : heights of the lowest and highest point.
+    low, high : heights of the lowest and highest point, in units of the surface.
     out : the block ``profile``, written in place.
     """
+    x, y, z = surface.neurons[0], surface.neurons[1], surface.neurons[2]
+    weight = surface.weight
     cx, cy, _ = vertical_axis(x, y, normals, weight)
     widest = 1e-6
     for i in range(x.size):

@@ -4,6 +4,7 @@ import numpy as np
 
 from shapecat.arrays import F4, F8, I4
 from shapecat.description.linear import solve
+from shapecat.description.sampled import Surface
 from shapecat.jit import kernel
 
 __all__ = ["REVOLUTION_NAMES", "REVOLUTION_SLICES", "fit_axis", "revolution"]
@@ -29,37 +30,23 @@ _SHIFTS, _SHIFTS_AND_TILTS = np.int64(2), np.int64(4)  # numba compiles a versio
 
 
 @kernel
-def revolution(
-    cloud: F4,
-    owner: I4,
-    neurons: F4,
-    weight: F4,
-    normals: F4,
-    eye: F4,
-    axis: F8,
-    point: F8,
-    foot: F8,
-    out: F4,
-) -> None:
+def revolution(surface: Surface, normals: F4, axis: F8, point: F8, foot: F8, out: F4) -> None:
     """Write the features named by `REVOLUTION_NAMES`.
 
     Two solids of revolution are fitted to the neurons and measured on the points: one with a
     vertical axis, and one whose axis may tilt. The second is cut into slices, from its wide to its
     narrow end. The features of a slice are its share of the points, the mean radius (relative to
     the largest), the deviation from that radius, and the share of the points that face the axis.
-    Lengths are in units of the mean distance between neurons.
 
     Parameters
     ----------
-    cloud : (3, n) points.
-    owner : (n,) the nearest neuron of each point.
-    neurons, normals : (3, k) positions and unit vectors.
-    weight : (k,) each neuron's share of the points.
-    eye : (3,) position of the sensor.
+    normals : (3, k) from `fit_surfaces`.
     axis, point : (3,) first guess of the tilted axis, from `rotation_axis`; overwritten.
     foot : (3,) a point on the vertical axis, the first guess; overwritten.
     out : the block ``revolution``, written in place.
     """
+    cloud, owner, neurons = surface.points, surface.nearest, surface.neurons
+    weight, eye = surface.weight, surface.eye
     slices = np.zeros((REVOLUTION_SLICES, 4))
     upright, before = np.zeros(3), np.zeros(3)
     upright[2] = 1.0

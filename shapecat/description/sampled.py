@@ -1,0 +1,41 @@
+"""The surface of an object as the blocks of the descriptor read it."""
+
+from typing import NamedTuple
+
+from shapecat.arrays import F4, F8, I4
+
+__all__ = ["Surface"]
+
+
+class Surface(NamedTuple):
+    """The points and neurons of an object, with what follows from them.
+
+    Positions are relative to ``center``, and lengths in units of ``unit``, unless in metres.
+
+    Attributes
+    ----------
+    points : (3, n) sorted by their nearest neuron.
+    starts : (k + 1,) index at which the points of each neuron begin.
+    nearest : (n,) the neuron of each point.
+    neurons : (3, k).
+    euclidean, geodesic : (k, k) distances between neurons, straight and along edges.
+    weight : (k,) each neuron's share of the points.
+    spacing : mean distance from a neuron to the nearest other one.
+    eye : (3,) position of the sensor.
+    eye_distance_m : its distance, metres.
+    center : (3,) mean of the neurons, metres.
+    unit : mean distance between neurons, metres.
+    """
+
+    points: F4
+    starts: I4
+    nearest: I4
+    neurons: F4
+    euclidean: F4
+    geodesic: F4
+    weight: F4
+    spacing: float
+    eye: F4
+    eye_distance_m: float
+    center: F8
+    unit: float
