@@ -20,7 +20,7 @@ from shapecat.detection.planes.extent import (
 )
 from shapecat.detection.planes.height_map import (
     HeightMap,
-    is_inside_outline,
+    distance_outside,
     measure_heights,
     pack_planes,
 )
@@ -91,9 +91,9 @@ def test_rectangular_plane_has_true_outline_and_area() -> None:
 def test_points_within_margin_of_outline_are_inside() -> None:
     plane = SupportingPlane(0, 0, 0, np.array([0.0, 0, -1]), -1.0, np.full(DIRECTIONS, 0.5), 1.0)
     row = pack_planes([plane])[0]
-    assert is_inside_outline(row, 0.45, 0.0, 1.0, 0.0)
-    assert not is_inside_outline(row, 0.6, 0.0, 1.0, 0.0)
-    assert is_inside_outline(row, 0.6, 0.0, 1.0, 0.15)
+    assert distance_outside(row, 0.45, 0.0, 1.0) <= 0.0
+    assert distance_outside(row, 0.6, 0.0, 1.0) > 0.0
+    assert distance_outside(row, 0.6, 0.0, 1.0) <= 0.15
 
 
 @pytest.mark.parametrize(("closed", "kept"), [(True, 1), (False, 2)])

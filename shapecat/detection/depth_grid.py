@@ -19,9 +19,11 @@ __all__ = [
     "BORDER_SHARE",
     "DepthGrid",
     "PinholeIntrinsics",
+    "back_project",
     "discontinuity_at",
     "downsample",
     "find_borders",
+    "project",
     "row_and_column",
     "smallest_object_at",
 ]
@@ -125,6 +127,18 @@ def row_and_column(p: int, columns: int) -> tuple[int, int]:
     """Return row and column of a flat cell index, without division, which takes longer."""
     i = int((p + 0.5) * (1.0 / columns))
     return i, p - i * columns
+
+
+@kernel(inner=True)
+def back_project(k: PinholeIntrinsics, i: float, j: float, z: float) -> tuple[float, float]:
+    """Return x and y, metres, of the point that cell (i, j) sees at the depth z."""
+    return (j - k.cx) / k.fx * z, (i - k.cy) / k.fy * z
+
+
+@kernel(inner=True)
+def project(k: PinholeIntrinsics, x: float, y: float, z: float) -> tuple[int, int]:
+    """Return row and column of the cell that sees a point, metres; it may be outside the grid."""
+    return int(k.cy + k.fy * y / z + 0.5), int(k.cx + k.fx * x / z + 0.5)
 
 
 @kernel

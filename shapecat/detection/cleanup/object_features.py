@@ -13,7 +13,7 @@ import numpy as np
 from shapecat.arrays import F4, F8, I4, U1
 from shapecat.detection.cleanup.settings import CLEANUP
 from shapecat.detection.connected_components import SIDES
-from shapecat.detection.depth_grid import DepthGrid, find_borders, row_and_column
+from shapecat.detection.depth_grid import DepthGrid, back_project, find_borders, row_and_column
 from shapecat.detection.foreground.walls import CLEARED, ON_WALL
 from shapecat.detection.merging.segment_features import (
     SEGMENT_FEATURES,
@@ -21,8 +21,7 @@ from shapecat.detection.merging.segment_features import (
     write_segment_features,
 )
 from shapecat.detection.merging.segments import Records, Row, Segments, depth_of
-from shapecat.detection.planes.extent import COS, DIRECTIONS, SIN
-from shapecat.detection.planes.height_map import HEIGHT_NOISE, MIN_HEIGHT_M, OUTLINE
+from shapecat.detection.planes.height_map import distance_outside, least_height_at
 from shapecat.detection.records import OverSegmentation, PlaneModel
 from shapecat.geometry import DISCONTINUITY
 from shapecat.jit import kernel
@@ -98,9 +97,9 @@ def measure_object_features(
     rows = features["surroundings"]
     seen = grid.inverse_depth, grid.discontinuity, model.planes, *model.heights
     marks = model.low_profile, model.walls
-    field = LabelledGrid(*seen, *marks, labels, graph.spans, segments.parent)
-    _count_cells(field, _border_lines(grid), 1 / range_m + DISCONTINUITY / 2, rows)
-    _measure_plane(field, segments, rows)
+    cells = LabelledGrid(*seen, *marks, labels, graph.spans, segments.parent)
+    _count_by_segment(cells, _border_lines(grid), 1 / range_m + DISCONTINUITY / 2, rows)
+    _measure_plane(cells, segments, rows)
     _measure(grid, model.planes, segments, model.up[2], features)
     return features
 
@@ -119,15 +118,15 @@ def _border_lines(grid: DepthGrid) -> tuple[int, int, int, int]:
 
 
 @kernel
-def _count_cells(
-    field: LabelledGrid, border: tuple[int, int, int, int], last: float, rows: Records
+def _count_by_segment(
+    cells: LabelledGrid, border: tuple[int, int, int, int], last: float, rows: Records
 ) -> None:
     """Count the cells of each segment at borders and on walls, and where its surface continues.
 
     ``last`` is the inverse depth below which a cell is at the range limit, 1/m; ``rows`` (n + 1,)
     are records of `_SURROUNDINGS`.
     """
-    inv_depth, jump, planes, plane_id, _, low, walls, labels, spans, owner = field
+    inv_depth, jump, planes, plane_id, _, low, walls, labels, spans, owner = cells
     last_row, last_column = labels.shape[0] - 1, labels.shape[1] - 1
     top, bottom, left, right = border
     for i in range(labels.shape[0]):
@@ -151,15 +150,15 @@ def _count_cells(
 
 
 @kernel
-def _measure_plane(field: LabelledGrid, segments: Segments, rows: Records) -> None:
+def _measure_plane(cells: LabelledGrid, segments: Segments, rows: Records) -> None:
     """Write mean and standard deviation of the heights of plane samples near each segment."""
-    plane_id, height = field.plane_id, field.height
+    plane_id, height = cells.plane_id, cells.height
     count, (lines, columns) = np.zeros(len(rows)), plane_id.shape
     for i in range(lines):
-        for j in range(field.spans[i, 0], field.spans[i, 1]):
-            if field.labels[i, j] == 0:
+        for j in range(cells.spans[i, 0], cells.spans[i, 1]):
+            if cells.labels[i, j] == 0:
                 continue
-            p = field.owner[field.labels[i, j]]
+            p = cells.owner[cells.labels[i, j]]
             for di, dj in SIDES:
                 y, x = i + CLEANUP.around_cells * di, j + CLEANUP.around_cells * dj
                 if 0 <= y < lines and 0 <= x < columns and plane_id[y, x] < 0:
@@ -168,8 +167,7 @@ def _measure_plane(field: LabelledGrid, segments: Segments, rows: Records) -> No
                     rows[p].plane_noise += height[y, x] ** 2
     for p in range(1, len(rows)):
         if count[p] > 0:
-            row, depth = rows[p], depth_of(segments, p)
-            least = MIN_HEIGHT_M + HEIGHT_NOISE * depth * depth
+            row, least = rows[p], least_height_at(depth_of(segments, p))
             mean = row.plane_height / count[p]
             variance = max(row.plane_noise / count[p] - mean * mean, 0.0)
             row.plane_height, row.plane_noise = mean / least, math.sqrt(variance) / least
@@ -177,7 +175,7 @@ def _measure_plane(field: LabelledGrid, segments: Segments, rows: Records) -> No
 
 @kernel
 def _measure(grid: DepthGrid, planes: F8, segments: Segments, down: float, out: Records) -> None:
-    """Write the features of merged segments, given the counts of `_count_cells`."""
+    """Write the features of merged segments, given the counts of `_count_by_segment`."""
     for p in range(1, segments.parent.size):
         if segments.parent[p] != p:
             continue
@@ -194,7 +192,7 @@ def _measure(grid: DepthGrid, planes: F8, segments: Segments, down: float, out: 
         around.depth_edge = share(around.depth_edge, shape.boundary)
         _measure_outside(grid, planes[segments.plane_id[p] - 1], segments.samples[p], around)
         seen.cells, seen.depth_m, seen.cell_m, seen.down = shape.count, depth, cell, down
-        seen.top_by_noise = shape.top / (MIN_HEIGHT_M + HEIGHT_NOISE * depth * depth)
+        seen.top_by_noise = shape.top / least_height_at(depth)
         seen.slant = share(shape.area, shape.count * cell * depth / grid.intrinsics.fy)
         seen.ragged = share(shape.boundary * shape.boundary, shape.count)
 
@@ -205,18 +203,14 @@ def _measure_outside(grid: DepthGrid, plane: F8, samples: I4, out: Row) -> None:
 
     ``plane`` is a row of `pack_planes`.
     """
-    intrinsics, total, n = grid.intrinsics, 0.0, 0
+    total, n = 0.0, 0
     for s in samples:
         if s < 0:
             break
         i, j = row_and_column(s, grid.inverse_depth.shape[1])
         z = 1 / grid.inverse_depth[i, j]
-        x, y = (j - intrinsics.cx) / intrinsics.fx * z, (i - intrinsics.cy) / intrinsics.fy * z
-        p = plane[4] * x + plane[5] * y + plane[6] * z
-        q = plane[7] * x + plane[8] * y + plane[9] * z
-        outside = -np.inf
-        for k in range(DIRECTIONS):
-            outside = max(outside, COS[k] * p + SIN[k] * q - plane[OUTLINE + k])
+        x, y = back_project(grid.intrinsics, i, j, z)
+        outside = distance_outside(plane, x, y, z)
         out.least_outside_m = min(out.least_outside_m, outside) if n > 0 else outside
         out.most_outside_m = max(out.most_outside_m, outside) if n > 0 else outside
         total += outside

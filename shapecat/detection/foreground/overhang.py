@@ -10,15 +10,10 @@ import numpy as np
 
 from shapecat.arrays import F8, I4, U1
 from shapecat.detection.connected_components import SIDES
-from shapecat.detection.depth_grid import DepthGrid, row_and_column
+from shapecat.detection.depth_grid import DepthGrid, back_project, row_and_column
 from shapecat.detection.foreground.settings import OVERHANG
 from shapecat.detection.foreground.walls import CLEARED
-from shapecat.detection.planes.height_map import (
-    HEIGHT_NOISE,
-    MIN_HEIGHT_M,
-    HeightMap,
-    is_inside_outline,
-)
+from shapecat.detection.planes.height_map import HeightMap, distance_outside, least_height_at
 from shapecat.jit import kernel, unset
 
 __all__ = ["extend_overhang"]
@@ -149,7 +144,7 @@ def _height_beside(over: Overhang, i: int, j: int) -> float:
         return 0.0
     z = 1 / float(w)
     height = (w - (plane[0] * j + plane[1] * i + plane[2])) * z * plane[3]
-    if not (MIN_HEIGHT_M + HEIGHT_NOISE * z * z < height < over.highest_m):
+    if not (least_height_at(z) < height < over.highest_m):
         return 0.0
-    x, y = (j - k.cx) / k.fx * z, (i - k.cy) / k.fy * z
-    return height if is_inside_outline(plane, x, y, z, OVERHANG.reach_m) else 0.0
+    x, y = back_project(k, i, j, z)
+    return height if distance_outside(plane, x, y, z) <= OVERHANG.reach_m else 0.0

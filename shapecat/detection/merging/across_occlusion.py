@@ -5,7 +5,7 @@ import math
 import numpy as np
 
 from shapecat.arrays import F4, F8, I4, Bool
-from shapecat.detection.depth_grid import DepthGrid, row_and_column
+from shapecat.detection.depth_grid import DepthGrid, back_project, project, row_and_column
 from shapecat.detection.merging.segments import SAMPLES, Segments, merge
 from shapecat.detection.merging.settings import MERGING
 from shapecat.jit import kernel
@@ -77,8 +77,7 @@ def _local_planes(samples: I4, grid: DepthGrid, normal: F4) -> F8:
     for k in range(n):
         i, j = row_and_column(samples[k], inv_depth.shape[1])
         z = 1 / inv_depth[i, j]
-        planes[0, k, 0] = (j - intrinsics.cx) / intrinsics.fx * z
-        planes[0, k, 1] = (i - intrinsics.cy) / intrinsics.fy * z
+        planes[0, k, 0], planes[0, k, 1] = back_project(intrinsics, i, j, z)
         planes[0, k, 2] = z
         for d in range(3):
             planes[1, k, d] = normal[i, d, j]
@@ -130,8 +129,7 @@ def _is_hidden(segments: Segments, p: int, q: int, grid: DepthGrid, labels: I4, 
         for step in range(1, MERGING.line_steps):
             u, a, b = step / MERGING.line_steps, lines[k, 0], lines[k, 1]
             x, y, z = a[0] + u * (b[0] - a[0]), a[1] + u * (b[1] - a[1]), a[2] + u * (b[2] - a[2])
-            j = int(intrinsics.cx + intrinsics.fx * x / z + 0.5)
-            i = int(intrinsics.cy + intrinsics.fy * y / z + 0.5)
+            i, j = project(intrinsics, x, y, z)
             if i < 0 or j < 0 or i >= inv_depth.shape[0] or j >= inv_depth.shape[1]:
                 continue
             owner = segments.parent[labels[i, j]]

@@ -15,13 +15,14 @@ __all__ = [
     "MIN_HEIGHT_M",
     "OUTLINE",
     "HeightMap",
-    "is_inside_outline",
+    "distance_outside",
+    "least_height_at",
     "measure_heights",
     "pack_planes",
 ]
 
 MIN_HEIGHT_M = 0.004
-"""Minimum height of an object's sample; `HEIGHT_NOISE` times the squared depth is added."""
+"""Minimum height of an object's sample, metres; `HEIGHT_NOISE` times the squared depth is added."""
 HEIGHT_NOISE = 0.0025
 BEYOND_M = 0.1
 """Surface level with a plane, and this near to its outline, is not an object on a lower plane."""
@@ -158,18 +159,20 @@ def _bounds(
 
 
 @kernel(inner=True)
-def is_inside_outline(plane: F8, x: float, y: float, z: float, slack: float) -> bool:
-    """Return whether a point is inside the outline of a plane, or at most ``slack`` outside.
+def least_height_at(depth_m: float) -> float:
+    """Return the minimum height of an object's sample at a depth, metres."""
+    return MIN_HEIGHT_M + HEIGHT_NOISE * depth_m * depth_m
 
-    Parameters
-    ----------
-    plane : a row of `pack_planes`.
-    x, y, z : the point, metres, sensor frame.
-    slack : metres.
+
+@kernel(inner=True)
+def distance_outside(plane: F8, x: float, y: float, z: float) -> float:
+    """Return how far a point is outside the outline of a plane, metres; negative inside.
+
+    ``plane`` is a row of `pack_planes`; x, y, z are metres, sensor frame.
     """
     p = plane[4] * x + plane[5] * y + plane[6] * z
     q = plane[7] * x + plane[8] * y + plane[9] * z
-    for k in range(DIRECTIONS):  # noqa: SIM110  kernels have no generators
-        if COS[k] * p + SIN[k] * q > plane[OUTLINE + k] + slack:
-            return False
-    return True
+    outside = -np.inf
+    for k in range(DIRECTIONS):
+        outside = max(outside, COS[k] * p + SIN[k] * q - plane[OUTLINE + k])
+    return outside
