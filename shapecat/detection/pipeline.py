@@ -54,7 +54,7 @@ from shapecat.detection.virtual_camera import VirtualImage, top_view, virtual_im
 from shapecat.geometry import IDENTITY, inverse, unit_direction
 from shapecat.types import Camera, Frame, Scene
 
-__all__ = ["Task", "detect", "label", "merge_segments", "oversegment"]
+__all__ = ["Task", "detect", "merge_segments", "oversegment"]
 
 DEFAULT_UP = (0.0, -1.0, 0.0)
 """Up in the optical frame of an upright camera, used if nothing else is known."""
@@ -103,28 +103,28 @@ def detect(
     """
     hint, task = None if up is None else unit_direction(up), Task(settings, rng)
     if frame.depth is not None and frame.camera is not None:
-        scene = _in_image(frame.depth, frame.camera, hint, task)
+        scene = _detect_in_image(frame.depth, frame.camera, hint, task)
     else:
-        scene = _in_cloud(frame.xyz(), hint, task)
+        scene = _detect_in_cloud(frame.xyz(), hint, task)
     return scene or Scene(np.array(DEFAULT_UP) if hint is None else hint, (), ())
 
 
-def _in_image(depth: F4, camera: Camera, hint: F8 | None, task: Task) -> Scene | None:
+def _detect_in_image(depth: F4, camera: Camera, hint: F8 | None, task: Task) -> Scene | None:
     range_m = task.settings.max_range_m
     grid = downsample(depth, camera, range_m=range_m)
-    found = None if grid is None else label(grid, hint, task)
+    found = None if grid is None else _segment(grid, hint, task)
     if grid is None or found is None:
         return None
     indices = label_pixels(depth, grid, found, range_m=range_m)
     return build_scene(grid, found, indices, IDENTITY, settings=task.settings)
 
 
-def _in_cloud(points: F4, hint: F8 | None, task: Task) -> Scene | None:
+def _detect_in_cloud(points: F4, hint: F8 | None, task: Task) -> Scene | None:
     view = virtual_image(points, range_m=task.settings.max_range_m)
-    found = None if view is None else _seen(view, hint, task)
+    found = None if view is None else _segment_view(view, hint, task)
     if found is None:
         view = top_view(points, hint, range_m=task.settings.max_range_m, rng=task.rng)
-        found = None if view is None else _seen(view, hint, task)
+        found = None if view is None else _segment_view(view, hint, task)
     if view is None or found is None:
         return None
     fused, highest_m = view.crowded > OUTPUT.crowded, task.settings.max_height_m
@@ -133,19 +133,19 @@ def _in_cloud(points: F4, hint: F8 | None, task: Task) -> Scene | None:
     return build_scene(view.grid, found, indices, pose, settings=task.settings, points=view.points)
 
 
-def _seen(view: VirtualImage, hint: F8 | None, task: Task) -> Segmentation | None:
+def _segment_view(view: VirtualImage, hint: F8 | None, task: Task) -> Segmentation | None:
     turned = None if hint is None else view.view_from_sensor.rotation @ hint
-    return label(view.grid, turned, task, upright=False)
+    return _segment(view.grid, turned, task, upright=False)
 
 
-def label(
+def _segment(
     grid: DepthGrid, hint: F8 | None, task: Task, *, upright: bool = True
 ) -> Segmentation | None:
     """Find planes and objects in a depth grid; None if there is no supporting plane.
 
     ``hint`` is the up direction (3,), if it is known; ``upright`` as in `find_supporting_planes`.
     """
-    model = _find_planes(grid, hint, task, upright=upright)
+    model = _model_planes(grid, hint, task, upright=upright)
     if model is None:
         return None
     oversegmentation = _oversegment(grid, model)
@@ -155,15 +155,31 @@ def label(
 
 def oversegment(grid: DepthGrid, task: Task) -> tuple[PlaneModel, OverSegmentation] | None:
     """Find planes and the segments of objects; None if there is no supporting plane."""
-    model = _find_planes(grid, None, task)
+    model = _model_planes(grid, None, task)
     return None if model is None else (model, _oversegment(grid, model))
 
 
-def _find_planes(
+def _model_planes(
     grid: DepthGrid, hint: F8 | None, task: Task, *, upright: bool = True
 ) -> PlaneModel | None:
-    """Find planes, heights, low-profile objects and walls; None without a supporting plane."""
-    trials, tallest_m = draw_trials(task.rng), task.settings.max_height_m
+    """Find the planes and what is above them, steps 2 and 3; None without a supporting plane."""
+    trials, settings = draw_trials(task.rng), task.settings
+    found = _find_planes(grid, hint, trials, settings, upright=upright)
+    if found is None:
+        return None
+    up, supports, planes, heights = found
+    low_profile = np.zeros(grid.inverse_depth.shape, np.int16)
+    find_low_profile(grid, heights, planes, low_profile, settings.max_size_m)
+    walls = remove_walls(grid, heights.plane_id, up, settings.max_size_m, trials)
+    extend_overhang(grid, heights, planes, walls, settings.max_height_m)
+    return PlaneModel(up, supports, planes, heights, low_profile, walls)
+
+
+def _find_planes(
+    grid: DepthGrid, hint: F8 | None, trials: F8, settings: DetectionSettings, *, upright: bool
+) -> tuple[F8, list[SupportingPlane], F8, HeightMap] | None:
+    """Return up, the supporting planes, the same packed, and the height map; None without one."""
+    tallest_m = settings.max_height_m
     supports, up = find_supporting_planes(grid, hint, trials, tallest_m=tallest_m, upright=upright)
     if not supports and not upright:  # another view of the cloud may show a plane
         return None
@@ -173,19 +189,12 @@ def _find_planes(
         up = np.array(DEFAULT_UP)
     planes = pack_planes(supports)
     heights = measure_heights(grid, planes, tallest_m)
-    assumed = _find_assumed_plane(grid, heights, up, trials, task.settings)
+    assumed = _find_assumed_plane(grid, heights, up, trials, settings)
     if assumed is not None:
         supports = sorted([*supports, assumed], key=lambda support: support.offset)
         planes = pack_planes(supports)
         heights = measure_heights(grid, planes, tallest_m)
-    if not supports:
-        return None
-    largest_m = task.settings.max_size_m
-    low_profile = np.zeros(grid.inverse_depth.shape, np.int16)
-    find_low_profile(grid, heights, planes, low_profile, largest_m)
-    walls = remove_walls(grid, heights.plane_id, up, largest_m, trials)
-    extend_overhang(grid, heights, planes, walls, tallest_m)
-    return PlaneModel(up, supports, planes, heights, low_profile, walls)
+    return (up, supports, planes, heights) if supports else None
 
 
 def _find_assumed_plane(
