@@ -20,7 +20,7 @@ from shapecat.detection.foreground.depth_error import (
     measure_noise,
     measure_residual,
 )
-from shapecat.detection.foreground.outline import is_object, measure_outline, width_of_part
+from shapecat.detection.foreground.outline import Limits, is_object, measure_outline, width_of_part
 from shapecat.detection.foreground.settings import LOW
 from shapecat.detection.planes.height_map import HeightMap
 from shapecat.jit import kernel, unset
@@ -88,11 +88,11 @@ def find_low_profile(
         filter_high_pass(residual, high_pass)
         clear = max(LOW.step, LOW.steady * measure_noise(high_pass, plane_ids, number))
         step = max(clear, LOW.slip * math.hypot(plane[0], plane[1]))
-        bounds = (step, np.float32(min(clear, LOW.fine)), widest, jump)
-        objects, parts = _raise(
-            values, high_pass, plane_ids, number, bounds, marks, objects, parts, scratch
+        limits = Limits(step, np.float32(min(clear, LOW.fine)), widest, jump)
+        objects, parts = _mark_objects(
+            values, high_pass, plane_ids, number, limits, marks, objects, parts, scratch
         )
-        parts = _lower(values, residual, plane_ids, number, (step, jump), marks, parts, scratch)
+        parts = _drop_error(values, residual, plane_ids, number, limits, marks, parts, scratch)
 
 
 @kernel(inline=True)
@@ -117,50 +117,47 @@ def _rows_of(plane_id: I4, number: int) -> tuple[int, int]:
 
 
 @kernel(inner=True)
-def _raise(
+def _mark_objects(
     inv_depth: F4,
     high_pass: F4,
     plane_id: I4,
     number: int,
-    bounds: tuple[float, float, float, float],
+    limits: Limits,
     low_profile: I4,
     objects: int,
-    me: int,
+    parts: int,
     scratch: Scratch,
 ) -> tuple[int, int]:
     """Mark the parts above each level that have the outline of an object.
 
-    The objects are numbered from ``objects`` + 1 on, the tested parts from ``me`` + 1 on; the last
-    numbers are returned. ``high_pass`` (rows, columns) is from `filter_high_pass`; ``bounds`` are
-    the minimum mean rise and the unit of the levels, both 1/m, the greatest width, in cells at a
-    depth of 1 m, and the step that separates two surfaces, 1/m.
+    The objects are numbered from ``objects`` + 1 on, the tested parts from ``parts`` + 1 on; the
+    last numbers are returned. ``high_pass`` (rows, columns) is from `filter_high_pass`.
     """
-    rise_least, level_least, widest, jump = bounds
     flat, marks, plane_ids = high_pass.reshape(-1), low_profile.reshape(-1), plane_id.reshape(-1)
     seen, part, seeds, stack = scratch
-    visited, parts = seen.reshape(-1), part.reshape(-1)
-    n = _find_seeds(high_pass, level_least * LOW.levels[-1], seeds)
+    visited, part_of = seen.reshape(-1), part.reshape(-1)
+    n = _find_seeds(high_pass, limits.level * LOW.levels[-1], seeds)
     merits = np.zeros(1 + objects + len(LOW.levels) * (flat.size // LOW.least_cells), np.float32)
     for multiple in LOW.levels:
-        level = np.float32(level_least * multiple)
-        first = me
+        level = np.float32(limits.level * multiple)
+        first = parts
         for s in seeds[:n]:
             if visited[s] > first or not flat[s] > level:
                 continue
-            me += 1
-            count = _flood(high_pass, level, s, me, seen, stack)
+            parts += 1
+            count = _flood(high_pass, level, s, parts, seen, stack)
             if count < LOW.least_cells:
                 continue
             known, best = 0, 0.0
             for p in stack[:count]:
-                parts[p] = me
+                part_of[p] = parts
                 known += marks[p] > 0
                 best = max(best, merits[marks[p]])
-            if known > LOW.same * count or width_of_part(inv_depth, stack, count) > widest:
+            if known > LOW.same * count or width_of_part(inv_depth, stack, count) > limits.width:
                 continue
             filled = fill_hull(high_pass, part, stack, count)
             outline = measure_outline(
-                inv_depth, high_pass, plane_id, part, stack, filled, number, (rise_least, jump)
+                inv_depth, high_pass, plane_id, part, stack, filled, number, limits
             )
             for p in stack[count:filled]:
                 best = max(best, merits[marks[p]])
@@ -170,7 +167,7 @@ def _raise(
                 merits[objects] = merit
                 for p in stack[:filled]:
                     marks[p], plane_ids[p] = objects, number
-    return objects, me
+    return objects, parts
 
 
 @kernel(inline=True)
@@ -227,20 +224,19 @@ def _flood(residual: F4, level: float, start: int, n: int, part: I4, stack: I4) 
 
 
 @kernel(inner=True)
-def _lower(
+def _drop_error(
     inv_depth: F4,
     residual: F4,
     plane_id: I4,
     number: int,
-    bounds: tuple[float, float],
+    limits: Limits,
     low_profile: I4,
-    me: int,
+    parts: int,
     scratch: Scratch,
 ) -> int:
     """Assign flat parts of low object cells to the plane if their outline is that of depth error.
 
-    The parts are numbered from ``me`` + 1 on; the last number is returned. ``bounds`` are those of
-    `measure_outline`.
+    The parts are numbered from ``parts`` + 1 on; the last number is returned.
     """
     rows, columns = residual.shape
     _, part, seeds, stack = scratch
@@ -258,20 +254,20 @@ def _lower(
                 above[i, j] = 1
                 seeds[n] = i * columns + j
                 n += 1
-    parts, plane_ids = part.reshape(-1), plane_id.reshape(-1)
-    first = me
+    part_of, plane_ids = part.reshape(-1), plane_id.reshape(-1)
+    first = parts
     for s in seeds[:n]:
-        if parts[s] > first:
+        if part_of[s] > first:
             continue
-        me += 1
-        count = _flood(above, np.float32(0), s, me, part, stack)
+        parts += 1
+        count = _flood(above, np.float32(0), s, parts, part, stack)
         if count < LOW.small_part:
             continue
-        line = measure_outline(inv_depth, residual, plane_id, part, stack, count, number, bounds)
+        line = measure_outline(inv_depth, residual, plane_id, part, stack, count, number, limits)
         if line.table >= LOW.beside * line.sides and line.rise < line.table:
             for t in range(count):
                 plane_ids[stack[t]] = -number
-    return me
+    return parts
 
 
 @kernel(inline=True)

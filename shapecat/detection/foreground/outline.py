@@ -2,12 +2,31 @@
 
 from typing import NamedTuple
 
+import numpy as np
+
 from shapecat.arrays import F4, I4
 from shapecat.detection.depth_grid import row_and_column
 from shapecat.detection.foreground.settings import LOW, OUTLINES
 from shapecat.jit import kernel
 
-__all__ = ["Outline", "is_object", "measure_outline", "width_of_part"]
+__all__ = ["Limits", "Outline", "is_object", "measure_outline", "width_of_part"]
+
+
+class Limits(NamedTuple):
+    """Limits for the low parts of one plane.
+
+    Attributes
+    ----------
+    rise : minimum mean rise across the outline of an object, 1/m.
+    level : unit of `LowProfileSettings.levels`, 1/m.
+    width : greatest width of an object, in cells at a depth of 1 m.
+    discontinuity : step that separates two surfaces, 1/m.
+    """
+
+    rise: float
+    level: np.float32
+    width: float
+    discontinuity: float
 
 
 class Outline(NamedTuple):
@@ -69,7 +88,7 @@ def measure_outline(
     stack: I4,
     count: int,
     number: int,
-    bounds: tuple[float, float],
+    limits: Limits,
 ) -> Outline:
     """Measure the outline of a part.
 
@@ -81,12 +100,10 @@ def measure_outline(
     part : (rows, columns) numbers of the parts.
     stack, count : the first ``count`` of ``stack`` are the flat cells of this part.
     number : number of its plane, from 1, as in ``plane_id``.
-    bounds : minimum mean rise across the outline of an object, and the step that separates two
-        surfaces, both 1/m.
     """
     rows, columns = residual.shape
     parts = part.reshape(-1)
-    rise_least, jump = bounds
+    jump = limits.discontinuity
     sides = table = known = hidden = steep = 0
     rise, outward = 0.0, LOW.apart - OUTLINES.inward
     me = parts[stack[0]]
@@ -116,7 +133,7 @@ def measure_outline(
                 continue
             table += 1
             known += 1
-            step = (residual[v, u] - residual[y, x]) / rise_least
+            step = (residual[v, u] - residual[y, x]) / limits.rise
             if residual[v, u] == 0:  # the inside is not low
                 step = OUTLINES.most_steps
             rise += min(step, OUTLINES.most_steps)
