@@ -14,7 +14,7 @@ from benchmarks.ablation import STEPS, without
 from shapecat.config import DetectionSettings
 from shapecat.detection import Hierarchy, Node, detect, format_tree
 from shapecat.detection.depth_grid import row_and_column
-from shapecat.detection.virtual_camera import _occupied
+from shapecat.detection.virtual_camera import _count_occupied
 from shapecat.types import Camera, Frame, Scene
 
 Array = NDArray[Any]
@@ -550,7 +550,7 @@ def test_rounded_points_stay_within_occupancy_grid() -> None:
     """Beyond their bounds, compiled code would write outside the array."""
     place = np.array([[0.3, 0.3], [0.3 + 2e-6, 0.3 - 1e-6]], np.float32)
 
-    assert _occupied.py_func(place, 0.3, 0.3, 1024 / 1e-6 * 0.999, 1024) == 2
+    assert _count_occupied.py_func(place, 0.3, 0.3, 1024 / 1e-6 * 0.999, 1024) == 2
 
 
 @given(

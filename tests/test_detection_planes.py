@@ -125,7 +125,7 @@ def test_upside_down_camera_is_accepted_for_bare_table() -> None:
     flipped = grid._replace(inverse_depth=np.ascontiguousarray(grid.inverse_depth[::-1, ::-1]))
     trials = draw_trials(np.random.default_rng(0))
     up = estimate_up(
-        orient_points(flipped), flipped.intrinsics, np.zeros(3), trials, UP_SETTINGS.held
+        orient_points(flipped), flipped.intrinsics, np.zeros(3), trials, UP_SETTINGS.roll_penalty
     )
     assert up @ [0, -UP[1], UP[2]] > np.cos(np.radians(2))
 

@@ -19,10 +19,10 @@ from shapecat.reuse import agreement
 
 KERNELS = [
     (geometry, "_mean"),
-    (horizontal, "_turn"),
+    (horizontal, "_refit_parallel"),
     (strips, "_level_strips"),
     (supporting, "_is_enclosed"),
-    (supporting, "_look_below"),
+    (supporting, "_count_below_edge"),
 ]
 
 

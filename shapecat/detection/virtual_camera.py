@@ -13,14 +13,14 @@ from shapecat.types import Pose
 
 __all__ = ["VirtualImage", "top_view", "virtual_image"]
 
-FIELD = 1.5
+WIDEST_SLOPE = 1.5
 """Largest slope x / z or y / z of a point in view."""
 OUTSIDE = 9.0
 """Placeholder for the slope of a point that is not in view."""
 MOST_CELLS = 400_000
 MOST_ROWS = 2000
 LEAST_POINTS = 100
-LOAD = 1.8
+POINTS_PER_CELL = 1.8
 """Minimum number of points per occupied cell, on average; with fewer, surfaces have holes."""
 
 
@@ -56,16 +56,16 @@ def virtual_image(points: F4, *, range_m: float, origin: F8 | None = None) -> Vi
     origin : (3,) the viewpoint, metres, sensor frame; by default the sensor.
     """
     origin = np.zeros(3) if origin is None else origin
-    axis, n = _middle(points, origin, range_m)
+    axis, n = _sum_of_directions(points, origin, range_m)
     if n < LEAST_POINTS or np.linalg.norm(axis) < 0.3 * n:  # few, or all around the sensor
         return None
-    rotation = _facing(axis)
+    rotation = _rotation_to(axis)
     pose = Pose(rotation, -rotation @ origin)
-    turned = np.zeros((len(points), 3), np.float32)
-    place = np.zeros((len(points), 2), np.float32)
+    in_view = np.zeros((len(points), 3), np.float32)
+    slopes = np.zeros((len(points), 2), np.float32)
     bounds = np.array([np.inf, np.inf, -np.inf, -np.inf])
-    n = _turn(points, pose.rotation, pose.translation, range_m, turned, place, bounds)
-    return _imaged(turned, place, bounds, n, pose) if n >= LEAST_POINTS else None
+    n = _to_view(points, pose.rotation, pose.translation, range_m, in_view, slopes, bounds)
+    return _render(in_view, slopes, bounds, n, pose) if n >= LEAST_POINTS else None
 
 
 def top_view(
@@ -95,6 +95,21 @@ def top_view(
     if len(used) < LEAST_POINTS:
         return None
     sample = used[rng.choice(len(used), min(len(used), 4000), replace=False)].astype(np.float64)
+    up = _dominant_plane(sample, hint, rng)
+    if up is None:
+        return None
+    middle = np.median(sample, axis=0)
+    side = gravity_rotation(up)[1]
+    origin = middle + math.sqrt(0.5) * (up - side)
+    seen = np.where(near[:, None], points, np.float32(np.nan))
+    return virtual_image(seen, range_m=max(range_m, 2.0), origin=origin)
+
+
+def _dominant_plane(sample: F8, hint: F8 | None, rng: np.random.Generator) -> F8 | None:
+    """Return the normal (3,) on the upper side of the plane with the most inliers, by RANSAC.
+
+    ``sample`` (n, 3) are points, metres; the result and ``hint`` are as in `top_view`.
+    """
     a, b, c = sample[rng.integers(0, len(sample), (3, 200))]
     normal = np.cross(b - a, c - a)
     length = np.linalg.norm(normal, axis=1)
@@ -107,19 +122,14 @@ def top_view(
         return None
     height = sample @ normal.T - np.einsum("ij,ij->i", a, normal)
     best = int(np.argmax(np.count_nonzero(abs(height) < 0.01, axis=0)))
-    up, above = normal[best], height[:, best]
+    up: F8 = normal[best]
+    above = height[:, best]
     more_above = np.count_nonzero(above > 0.01) - np.count_nonzero(above < -0.01)
-    if (more_above if hint is None else up @ hint) < 0:
-        up = -up
-    middle = np.median(sample, axis=0)
-    side = gravity_rotation(up)[1]
-    origin = middle + math.sqrt(0.5) * (up - side)
-    seen = np.where(near[:, None], points, np.float32(np.nan))
-    return virtual_image(seen, range_m=max(range_m, 2.0), origin=origin)
+    return -up if (more_above if hint is None else up @ hint) < 0 else up
 
 
 @kernel
-def _middle(points: F4, origin: F8, range_m: float) -> tuple[F8, int]:
+def _sum_of_directions(points: F4, origin: F8, range_m: float) -> tuple[F8, int]:
     """Return the sum (3,) of unit vectors to the points within twice the range, and their number.
 
     The vectors start at ``origin``.
@@ -139,12 +149,12 @@ def _middle(points: F4, origin: F8, range_m: float) -> tuple[F8, int]:
 
 
 @kernel
-def _turn(
-    points: F4, rotation: F8, translation: F8, range_m: float, turned: F4, place: F4, bounds: F8
+def _to_view(
+    points: F4, rotation: F8, translation: F8, range_m: float, in_view: F4, slopes: F4, bounds: F8
 ) -> int:
     """Transform the points in view to the frame of the virtual camera; return their number.
 
-    Writes their slopes x / z and y / z to ``place`` (n, 2), with `OUTSIDE` for the other points,
+    Writes their slopes x / z and y / z to ``slopes`` (n, 2), with `OUTSIDE` for the other points,
     and left, top, right and bottom of the slopes to ``bounds`` (4,).
     """
     r, s = rotation, translation
@@ -152,7 +162,7 @@ def _turn(
     left = top = np.inf
     right = bottom = -np.inf
     for k in range(points.shape[0]):
-        place[k, 0] = OUTSIDE
+        slopes[k, 0] = OUTSIDE
         x, y, z = points[k, 0], points[k, 1], points[k, 2]
         depth = r[2, 0] * x + r[2, 1] * y + r[2, 2] * z + s[2]
         if not ((depth >= NEAREST_M) & (depth <= range_m)):
@@ -161,10 +171,10 @@ def _turn(
         down = r[1, 0] * x + r[1, 1] * y + r[1, 2] * z + s[1]
         inverse = 1 / depth
         u, v = across * inverse, down * inverse
-        if not ((abs(u) < FIELD) & (abs(v) < FIELD)):
+        if not ((abs(u) < WIDEST_SLOPE) & (abs(v) < WIDEST_SLOPE)):
             continue
-        turned[k, 0], turned[k, 1], turned[k, 2] = across, down, depth
-        place[k, 0], place[k, 1] = u, v
+        in_view[k, 0], in_view[k, 1], in_view[k, 2] = across, down, depth
+        slopes[k, 0], slopes[k, 1] = u, v
         left, right = min(left, u), max(right, u)
         top, bottom = min(top, v), max(bottom, v)
         n += 1
@@ -172,7 +182,7 @@ def _turn(
     return n
 
 
-def _facing(axis: F8) -> F8:
+def _rotation_to(axis: F8) -> F8:
     """Return a rotation (3, 3) that turns ``axis`` to +z and keeps +x nearly to the right."""
     z = axis / np.linalg.norm(axis)
     x = np.array([1.0, 0.0, 0.0]) if abs(z[0]) < 0.8 else np.array([0.0, -1.0, 0.0])
@@ -181,51 +191,54 @@ def _facing(axis: F8) -> F8:
     return np.stack([x, np.cross(z, x), z])
 
 
-def _imaged(turned: F4, place: F4, bounds: F8, n: int, pose: Pose) -> VirtualImage:
+def _render(in_view: F4, slopes: F4, bounds: F8, n: int, pose: Pose) -> VirtualImage:
     left, top, right, bottom = (float(v) for v in bounds)
     width, height = right - left, bottom - top
-    z = turned[:: max(1, n // 20_000), 2]
+    z = in_view[:: max(1, n // 20_000), 2]
     depth = float(np.median(z[z > 0])) if (z > 0).any() else 1.0
     pitch = max(
         CELL_M / depth,
-        _spacing(place, bounds, n),
+        _spacing(slopes, bounds, n),
         math.sqrt(width * height / MOST_CELLS),
         max(width, height) / MOST_ROWS,
         1e-6,
     )
     intrinsics = PinholeIntrinsics(1 / pitch, 1 / pitch, -left / pitch, -top / pitch)
     inv_depth = np.zeros((int(height / pitch + 1.5), int(width / pitch + 1.5)), np.float32)
-    cell = np.full(len(turned), -1, np.int32)
+    cell = np.full(len(in_view), -1, np.int32)
     jump = discontinuity_at(depth)
-    behind = _project(turned, place, intrinsics, jump, inv_depth, cell)
+    behind = _project(in_view, slopes, intrinsics, jump, inv_depth, cell)
     _close_holes(inv_depth, jump)
     grid = DepthGrid(inv_depth, intrinsics, 1, jump)
-    return VirtualImage(grid, turned, cell, pose, behind / n)
+    return VirtualImage(grid, in_view, cell, pose, behind / n)
 
 
-def _spacing(place: F4, bounds: F8, n: int) -> float:
+def _spacing(slopes: F4, bounds: F8, n: int) -> float:
     """Return the pitch of an image in which nearly every cell of a surface has a point.
 
     In a fine grid every point has a cell of its own; coarser grids are tried until an occupied
-    cell holds ``LOAD`` points on average.
+    cell holds ``POINTS_PER_CELL`` points on average.
     """
     span = max(bounds[2] - bounds[0], bounds[3] - bounds[1], 1e-6)
     side = 1024
     left, top, *_ = bounds
-    while side > 16 and n < LOAD * _occupied(place, left, top, side / span * 0.999, side):
+    while side > 16:
+        occupied = _count_occupied(slopes, left, top, side / span * 0.999, side)
+        if n >= POINTS_PER_CELL * occupied:
+            break
         side = int(side / 1.25)
     return float(span / side)
 
 
 @kernel
-def _occupied(place: F4, left: float, top: float, scale: float, side: int) -> int:
+def _count_occupied(slopes: F4, left: float, top: float, scale: float, side: int) -> int:
     seen = np.zeros((side, side), np.uint8)
     n = 0
-    for k in range(place.shape[0]):
-        if place[k, 0] < OUTSIDE:
-            # Single precision may round a place beyond its bounds, where these are close together.
-            j = min(max(int((place[k, 0] - left) * scale), 0), side - 1)
-            i = min(max(int((place[k, 1] - top) * scale), 0), side - 1)
+    for k in range(slopes.shape[0]):
+        if slopes[k, 0] < OUTSIDE:
+            # Single precision may round a slope beyond its bounds, where these are close together.
+            j = min(max(int((slopes[k, 0] - left) * scale), 0), side - 1)
+            i = min(max(int((slopes[k, 1] - top) * scale), 0), side - 1)
             n += 1 - seen[i, j]
             seen[i, j] = 1
     return n
@@ -233,7 +246,7 @@ def _occupied(place: F4, left: float, top: float, scale: float, side: int) -> in
 
 @kernel
 def _project(
-    points: F4, place: F4, intrinsics: PinholeIntrinsics, jump: float, inv_depth: F4, cell: I4
+    points: F4, slopes: F4, intrinsics: PinholeIntrinsics, jump: float, inv_depth: F4, cell: I4
 ) -> int:
     """Average the nearest points of each cell; return the number of points well behind them.
 
@@ -243,10 +256,10 @@ def _project(
     nearest = np.zeros(inv_depth.shape, np.float32)
     count = np.zeros(inv_depth.shape, np.float32)
     for k in range(points.shape[0]):
-        if place[k, 0] == OUTSIDE:
+        if slopes[k, 0] == OUTSIDE:
             continue
-        j = int(intrinsics.fx * place[k, 0] + intrinsics.cx + 0.5)
-        i = int(intrinsics.fy * place[k, 1] + intrinsics.cy + 0.5)
+        j = int(intrinsics.fx * slopes[k, 0] + intrinsics.cx + 0.5)
+        i = int(intrinsics.fy * slopes[k, 1] + intrinsics.cy + 0.5)
         if i < 0 or j < 0 or i >= rows or j >= columns:
             continue
         cell[k] = i * columns + j

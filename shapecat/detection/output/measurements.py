@@ -23,12 +23,12 @@ class ObjectMeasurements(NamedTuple):
     ----------
     center, size : (n, 3) metres, of the upright box, view frame.
     orientation : (n, 4) quaternion x, y, z, w of the box, view frame.
-    low, high : (n, 2) the first and last row and column of its cells.
+    low, high : (n, 2) the first and last row and column of the cells of each.
     supported_by : (n,) the label of the object that each stands on; 0 for its plane.
     support_m : (n,) the height of that support above the plane.
-    hidden : (n,) whether a nearer surface hides part of it.
-    last : (n,) whether the range limit cuts it off.
-    least : (n,) float32, number of cells of the smallest object at its depth.
+    occluded : (n,) whether a nearer surface hides part of it.
+    at_range_limit : (n,) whether the range limit cuts it off.
+    least_cells : (n,) float32, number of cells of the smallest object at its depth.
     """
 
     center: F8
@@ -38,9 +38,9 @@ class ObjectMeasurements(NamedTuple):
     high: I4
     supported_by: I4
     support_m: F8
-    hidden: Bool
-    last: Bool
-    least: F4
+    occluded: Bool
+    at_range_limit: Bool
+    least_cells: F4
 
 
 @kernel
@@ -74,11 +74,11 @@ def measure_objects(
         np.zeros(count, np.float32),
     )
     _measure_boxes(grid, labels, np.array(level_axes(up[0], up[1], up[2])), measured)
-    last = _count_at_range_limit(grid.inverse_depth, labels, representatives.size, range_m)
+    at_limit = _count_at_range_limit(grid.inverse_depth, labels, representatives.size, range_m)
     for k in range(count):
         p = representatives[k + 1]
-        measured.last[k] = last[k + 1] >= MERGING.few
-        measured.least[k] = smallest_object_at(grid, depth_of(segments, p))
+        measured.at_range_limit[k] = at_limit[k + 1] >= MERGING.few
+        measured.least_cells[k] = smallest_object_at(grid, depth_of(segments, p))
         below = _objects_below(measured, up, k)
         measured.supported_by[k], measured.support_m[k] = _supporting_object(
             segments, representatives, p, below
@@ -87,7 +87,7 @@ def measure_objects(
         for q in range(segments.parent.size):
             hidden += segments.pairs[q, p].in_front
         around = max(segments.statistics[p].boundary, np.float32(1))
-        measured.hidden[k] = hidden > np.float32(OUTPUT.occluded_share) * around
+        measured.occluded[k] = hidden > np.float32(OUTPUT.occluded_share) * around
     _break_cycles(measured)
     return measured
 

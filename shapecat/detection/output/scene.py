@@ -46,11 +46,12 @@ def build_scene(
         for an image.
     """
     measured, seen = found.measured, found.plane_ids.size - 1
-    numbers = _numbers_of_seen(found.model.supports)
+    numbers = _number_visible(found.model.supports)
     plane_id = [numbers[k] for k in found.plane_ids[1:].tolist()]
-    supported_by, hidden = measured.supported_by.tolist(), measured.hidden.tolist()
-    cut = _cut(grid, measured) if points is None else _cut_cloud(grid, found, sensor_from_view)
-    cut |= measured.last
+    supported_by, occluded = measured.supported_by.tolist(), measured.occluded.tolist()
+    at_border = _at_image_border if points is None else _at_view_border
+    cut = at_border(grid, found, sensor_from_view)
+    cut |= measured.at_range_limit
     kept = _kept(grid, measured, indices, settings.min_points, image=points is None)
     boxes = _boxes(found, indices, points, sensor_from_view)
     # Without a visible plane below it, an object cut off by the border is probably furniture.
@@ -71,7 +72,7 @@ def build_scene(
                 on_candidate=on,
                 support_m=0.0 if on is None else float(measured.support_m[k]),
                 touches_border=k < seen and bool(cut[k]),
-                occluded=k < seen and hidden[k],
+                occluded=k < seen and occluded[k],
             )
         )
     seen_planes = [s for s in found.model.supports if s.area_m2 > 0]
@@ -79,7 +80,7 @@ def build_scene(
     return Scene(sensor_from_view.rotation @ found.model.up, planes, tuple(candidates))
 
 
-def _numbers_of_seen(supports: Sequence[SupportingPlane]) -> list[int | None]:
+def _number_visible(supports: Sequence[SupportingPlane]) -> list[int | None]:
     """Return the index of each plane among the visible planes; None for an assumed plane."""
     numbers = count()
     return [next(numbers) if support.area_m2 > 0 else None for support in supports]
@@ -91,7 +92,7 @@ def _kept(
     """Return the lists with enough points for an object, in the order of their first points."""
     limits = [float(least)] * len(indices)
     if image:
-        limits = [max(least, n * grid.factor**2) for n in measured.least.tolist()]
+        limits = [max(least, n * grid.factor**2) for n in measured.least_cells.tolist()]
     enough = (k for k, limit in enumerate(limits) if indices[k].size >= limit)
     return sorted(enough, key=lambda k: int(indices[k][0]))
 
@@ -115,12 +116,13 @@ def _boxes(
     if points is not None:
         extra = indices[found.plane_ids.size - 1 :]
         boxes += [upright_box(points[index], found.model.up) for index in extra]
-    return boxes if sensor_from_view is IDENTITY else [_moved(sensor_from_view, b) for b in boxes]
+    return [_transform_box(sensor_from_view, box) for box in boxes]
 
 
-def _cut(grid: DepthGrid, measured: ObjectMeasurements) -> Bool:
+def _at_image_border(grid: DepthGrid, found: Segmentation, _: Pose) -> Bool:
     """Return whether each object reaches the border of the image, or a blank strip along it."""
-    near, shape = max(1, round(2 / grid.factor)), grid.inverse_depth.shape
+    measured, near = found.measured, max(1, round(2 / grid.factor))
+    shape = grid.inverse_depth.shape
     cut = np.zeros(len(measured.low), bool)
     for side, (blank, extent) in enumerate(find_borders(grid.inverse_depth, near).tolist()):
         axis = side // 2
@@ -133,7 +135,7 @@ def _cut(grid: DepthGrid, measured: ObjectMeasurements) -> Bool:
     return cut
 
 
-def _cut_cloud(grid: DepthGrid, found: Segmentation, sensor_from_view: Pose) -> Bool:
+def _at_view_border(grid: DepthGrid, found: Segmentation, sensor_from_view: Pose) -> Bool:
     """Return whether each object reaches the border of the sensor's view, for a point cloud.
 
     Such a border is a long straight side of the cloud as seen from the sensor. A cloud fused from
@@ -167,7 +169,9 @@ def _ends(valid: Bool, last: int) -> tuple[I4, I4]:
     return np.argmax(valid, axis=0), last - np.argmax(valid[::-1], axis=0)
 
 
-def _moved(sensor_from_view: Pose, box: Box) -> Box:
+def _transform_box(sensor_from_view: Pose, box: Box) -> Box:
+    if sensor_from_view is IDENTITY:
+        return box
     rotation = sensor_from_view.rotation @ rotation_from_quaternion(box.orientation)
     center = transform(sensor_from_view, box.center)
     return Box(center, box.size, quaternion_from_rotation(rotation))

@@ -38,7 +38,7 @@ def find_supporting_planes(
     """
     points = orient_points(grid)
     known = np.zeros(3) if hint is None else hint
-    up = estimate_up(points, grid.intrinsics, known, trials, UP.held if upright else 0.0)
+    up = estimate_up(points, grid.intrinsics, known, trials, UP.roll_penalty if upright else 0.0)
     found = find_horizontal_planes(grid, points, up, trials)
     if not found:
         return [], up

@@ -45,7 +45,7 @@ def assume_plane(grid: DepthGrid, rest: Bool, up: F8, tallest_m: float) -> Suppo
     some.flat[np.flatnonzero(rest)[::EVERY]] = True
     across, along, height = level_coordinates(grid, some, up)
     z = 1 / grid.inverse_depth[some].astype(np.float64)
-    offset = _fullest(height, 1 / (1 + (z / UP.half_m) ** 2), tallest_m)
+    offset = _fullest_interval(height, 1 / (1 + (z / UP.half_weight_m) ** 2), tallest_m)
     if offset >= 0:  # its upper side is not visible
         return None
     held = (height > offset) & (height < offset + tallest_m)
@@ -55,7 +55,7 @@ def assume_plane(grid: DepthGrid, rest: Bool, up: F8, tallest_m: float) -> Suppo
     return SupportingPlane(a, b, c, up, offset, extent, 0.0)
 
 
-def _fullest(height: F8, weight: F8, tallest_m: float) -> float:
+def _fullest_interval(height: F8, weight: F8, tallest_m: float) -> float:
     """Return a height just below the interval of length ``tallest_m`` with the most weight."""
     low = float(height.min())
     count = np.bincount(((height - low) / PLANES.bin_m).astype(np.int64), weight)

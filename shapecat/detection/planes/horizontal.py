@@ -48,24 +48,24 @@ def find_horizontal_planes(
 
     ``up`` is a unit vector (3,), sensor frame; ``trials`` are from `draw_trials`.
     """
-    found = _find(grid, points, up, trials)
+    found = _fitted(grid, points, up, trials)
     better = _common_up(found) if found else up
     if better @ up < PLANES.turned_cos:
-        found = _find(grid, points, better, trials)
+        found = _fitted(grid, points, better, trials)
         better = _common_up(found) if found else better
     if len(found) > 1:
-        turned = [_turn(grid.intrinsics, one.samples, one.plane, better) for one in found]
-        found = _measure(grid, found[0].samples, turned)
+        turned = [_refit_parallel(grid.intrinsics, one.samples, one.plane, better) for one in found]
+        found = _measured(grid, found[0].samples, turned)
     return sorted(found, key=lambda one: one.plane.offset)
 
 
-def _find(grid: DepthGrid, points: OrientedPoints, up: F8, trials: F8) -> list[PlaneCandidate]:
+def _fitted(grid: DepthGrid, points: OrientedPoints, up: F8, trials: F8) -> list[PlaneCandidate]:
     samples, heights = level_samples(points, up)
     planes = fit_horizontal_planes(samples, heights, grid.intrinsics, up, trials)
-    return _measure(grid, samples, planes)
+    return _measured(grid, samples, planes)
 
 
-def _measure(grid: DepthGrid, samples: DepthSamples, planes: Iterable[F8]) -> list[PlaneCandidate]:
+def _measured(grid: DepthGrid, samples: DepthSamples, planes: Iterable[F8]) -> list[PlaneCandidate]:
     found = (PlaneCandidate(measure_plane(grid, samples, plane), samples) for plane in planes)
     return [one for one in found if one.plane.area_m2 >= PLANES.least_m2]
 
@@ -81,7 +81,7 @@ def _common_up(found: list[PlaneCandidate]) -> F8:
 
 
 @kernel(fast=True)
-def _turn(
+def _refit_parallel(
     intrinsics: PinholeIntrinsics, samples: DepthSamples, plane: SupportingPlane, up: F8
 ) -> F8:
     """Fit a plane with the normal ``up`` to the inliers of another plane, by least squares."""
@@ -116,7 +116,7 @@ def fit_horizontal_planes(
     for _ in range(MOST_PLANES):
         if height.size < LEAST_SAMPLES:
             break
-        peak = _fullest(height)
+        peak = _histogram_peak(height)
         near, near_height, rest, height = _split(rest, height, peak)
         if near_height.size < LEAST_SAMPLES:
             break
@@ -141,7 +141,7 @@ def _heights(samples: DepthSamples, intrinsics: PinholeIntrinsics, up: F8) -> F4
 
 
 @kernel(inline=True)
-def _fullest(height: F4) -> float:
+def _histogram_peak(height: F4) -> float:
     """Return the middle of the bin that, with its neighbours, holds the most heights."""
     low = high = float(height[0])
     for h in height:

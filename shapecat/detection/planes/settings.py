@@ -23,19 +23,19 @@ class UpSettings(NamedTuple):
     """Directions tried: one shared by 1 in 25 normals is missed with a probability below 1 %."""
     level_bin_m: float = 0.04
     """Height of a bin, metres: more than the noise at 2 m, less than the gap between boards."""
-    several: float = 1.5
+    levels_exponent: float = 1.5
     """Exponent of the number of levels in the score of an up direction: a shelf has several levels,
     the wall behind it one."""
-    clear: float = 2.0
+    purity_exponent: float = 2.0
     """Exponent, in that score, of the fraction of the surface facing the direction that lies in
     large levels."""
-    aslant: float = 0.6
+    frontal_penalty: float = 0.6
     """Share of the score that a direction along the optical axis loses: it is that of a wall."""
-    held: float = 3.0
+    roll_penalty: float = 3.0
     """Penalty on directions that imply a camera on its side or upside down: a quarter remains."""
-    steep: float = 0.03
+    frontal_sin2: float = 0.03
     """Squared sine of the angle to the optical axis below which a direction implies no roll."""
-    half_m: float = 1.5
+    half_weight_m: float = 1.5
     """Depth at which surface has half the weight: near surface decides."""
 
 

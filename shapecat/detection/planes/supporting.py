@@ -5,7 +5,7 @@ import math
 import numpy as np
 
 from shapecat.arrays import F4
-from shapecat.detection.depth_grid import DepthGrid, PinholeIntrinsics
+from shapecat.detection.depth_grid import DepthGrid, PinholeIntrinsics, back_project, project
 from shapecat.detection.planes.extent import (
     COS,
     DIRECTIONS,
@@ -60,14 +60,14 @@ def supporting_planes(
             continue
         if kept and not high and area_m2 < PLANES.furniture_m2:
             if _is_enclosed(grid, samples, plane):
-                kept.append(_up_to_walls(grid, plane))
+                kept.append(_extend_to_walls(grid, plane))
                 continue
             if area_m2 < PLANES.board_m2:
                 continue
         if drop > tallest_m or area_m2 >= PLANES.furniture_m2:
             kept.append(plane)
             continue
-        on_wall, beyond = _look_below(grid, samples, plane, drop)
+        on_wall, beyond = _count_below_edge(grid, samples, plane, drop)
         enough = on_wall + beyond >= LEAST_BELOW
         closed = enough and on_wall > PLANES.closed * (on_wall + beyond)
         if not closed and (enough or area_m2 >= PLANES.likely_m2):
@@ -81,7 +81,7 @@ def _overlaps(lower: SupportingPlane, upper: SupportingPlane) -> bool:
     return bool(np.all(COS * x + SIN * y < lower.extent))
 
 
-def _up_to_walls(grid: DepthGrid, plane: SupportingPlane) -> SupportingPlane:
+def _extend_to_walls(grid: DepthGrid, plane: SupportingPlane) -> SupportingPlane:
     """Extend the floor of a bin to the walls, since objects hide parts of it.
 
     The extent grows to the samples above the floor that are within 0.2 m of its visible part.
@@ -119,7 +119,7 @@ def _is_enclosed(grid: DepthGrid, samples: DepthSamples, plane: SupportingPlane)
 
 
 @kernel
-def _look_below(
+def _count_below_edge(
     grid: DepthGrid, samples: DepthSamples, plane: SupportingPlane, drop: float
 ) -> tuple[int, int]:
     """Count the samples below the edge of a plane that are on a wall, and those farther away."""
@@ -129,7 +129,7 @@ def _look_below(
         level = plane.a * j + plane.b * i + plane.c
         if level <= 0 or abs(samples.inverse_depth[k] - level) >= PLANES.tolerance:
             continue
-        x, y, z = _to_edge(grid, plane, i, j, 1 / level)
+        x, y, z = _front_edge(grid, plane, i, j, 1 / level)
         if z == 0:
             continue
         for step in range(4, min(DOWN, int(drop / PLANES.step_m))):  # an edge is rounded
@@ -146,12 +146,12 @@ def _look_below(
 
 
 @kernel(inline=True)
-def _to_edge(
+def _front_edge(
     grid: DepthGrid, plane: SupportingPlane, i: float, j: float, z: float
 ) -> tuple[float, float, float]:
     """Follow a plane towards the camera; return its edge, metres, or zeros if none is found."""
     k, up = grid.intrinsics, plane.up
-    x, y = (j - k.cx) / k.fx * z, (i - k.cy) / k.fy * z
+    x, y = back_project(k, i, j, z)
     h = x * up[0] + y * up[1] + z * up[2]
     tx, ty, tz = h * up[0] - x, h * up[1] - y, h * up[2] - z
     length = math.sqrt(tx * tx + ty * ty + tz * tz)
@@ -174,8 +174,7 @@ def _inverse_depth_at(
     """Return the inverse depth of the cell that shows a point; -1 outside the image."""
     if z <= NEAREST_M:
         return -1.0
-    v = int(intrinsics.cy + intrinsics.fy * y / z + 0.5)
-    u = int(intrinsics.cx + intrinsics.fx * x / z + 0.5)
+    v, u = project(intrinsics, x, y, z)
     if v < 0 or u < 0 or v >= inv_depth.shape[0] or u >= inv_depth.shape[1]:
         return -1.0
     return float(inv_depth[v, u])

@@ -24,7 +24,7 @@ BINS = 80
 
 @kernel
 def estimate_up(
-    points: OrientedPoints, intrinsics: PinholeIntrinsics, hint: F8, trials: F8, held: float
+    points: OrientedPoints, intrinsics: PinholeIntrinsics, hint: F8, trials: F8, roll_penalty: float
 ) -> F8:
     """Return the unit normal (3,) of the dominant supporting plane; zeros if there is none.
 
@@ -38,23 +38,23 @@ def estimate_up(
     hint : (3,) unit vector, sensor frame: only normals within 15 degrees of it are considered.
         Zeros if up is unknown.
     trials : from `draw_trials`.
-    held : penalty on directions that imply a camera on its side or upside down:
-        `UpSettings.held`, or 0 if the camera may be held in any way.
+    roll_penalty : penalty on directions that imply a camera on its side or upside down:
+        `UpSettings.roll_penalty`, or 0 if the camera may be held in any way.
     """
     surface = _every_second(points)
     normals, least = surface[:3], UP.least_share * surface.shape[1]
     free = not (hint[0] != 0 or hint[1] != 0 or hint[2] != 0)
     if not free:
-        normals = _part(normals, hint, (UP.hint_cos, 2.0))
+        normals = _select(normals, hint, (UP.hint_cos, 2.0))
     found = _directions(normals, least, trials)
     if len(found) == 0:
         return np.zeros(3)
     hypotheses = _hypotheses(found, UP.corner_cos if free else 0.0)
     best, most = 0, -1.0
     for k in range(len(hypotheses)):
-        merit = _merit(surface, hypotheses[k], held if free else 0.0)
-        best, most = (k, merit) if merit > most else (best, most)
-    up: F8 = _settled(points, surface, intrinsics, hypotheses[best])
+        score = _score(surface, hypotheses[k], roll_penalty if free else 0.0)
+        best, most = (k, score) if score > most else (best, most)
+    up: F8 = _refined(points, surface, intrinsics, hypotheses[best])
     return up
 
 
@@ -67,7 +67,7 @@ def _every_second(points: OrientedPoints) -> F4:
     for k in range(0, normals.shape[1], 2):
         for d in range(3):
             found[d, n], found[3 + d, n] = normals[d, k], positions[d, k]
-        found[6, n] = 1 / (1 + (positions[2, k] / UP.half_m) ** 2)
+        found[6, n] = 1 / (1 + (positions[2, k] / UP.half_weight_m) ** 2)
         n += normals[2, k] != 0
     return found[:, :n].copy()
 
@@ -77,14 +77,14 @@ def _directions(normals: F4, least: float, trials: F8) -> F8:
     """Return directions (n, 3) with many normals, most first, found one by one by RANSAC."""
     found = np.zeros((MOST_DIRECTIONS, 3))
     for k in range(MOST_DIRECTIONS):
-        if normals.shape[1] <= least or _most_faced(normals, trials, found[k]) < least:
+        if normals.shape[1] <= least or _ransac_direction(normals, trials, found[k]) < least:
             return found[:k]
-        normals = _part(normals, found[k], (-2.0, UP.facing_cos))
+        normals = _select(normals, found[k], (-2.0, UP.facing_cos))
     return found
 
 
 @kernel(inner=True)
-def _part(normals: F4, direction: F8, bounds: tuple[float, float]) -> F4:
+def _select(normals: F4, direction: F8, bounds: tuple[float, float]) -> F4:
     """Return the normals (3, n) whose cosine with a direction is within bounds."""
     chosen = np.zeros(normals.shape, np.float32)
     x, y, z = np.float32(direction[0]), np.float32(direction[1]), np.float32(direction[2])
@@ -98,7 +98,7 @@ def _part(normals: F4, direction: F8, bounds: tuple[float, float]) -> F4:
 
 
 @kernel(inline=True)
-def _most_faced(normals: F4, trials: F8, best: F8) -> int:
+def _ransac_direction(normals: F4, trials: F8, best: F8) -> int:
     """Write the direction near which most normals (3, n) are; return their number."""
     n, most = normals.shape[1], 0
     one = np.zeros(3)
@@ -166,7 +166,7 @@ def _hypotheses(found: F8, corner_cos: float) -> F8:
 
 
 @kernel(inline=True)
-def _merit(surface: F4, direction: F8, held: float) -> float:
+def _score(surface: F4, direction: F8, roll_penalty: float) -> float:
     """Return the score of a direction: the weight of large levels, adjusted as in `estimate_up`."""
     count, facing, total = _count_levels(surface, direction)
     level, squares = _large_levels(count, UP.least_share * total)
@@ -174,12 +174,13 @@ def _merit(surface: F4, direction: F8, held: float) -> float:
         return 0.0
     # A shelf has several boards but one back. Objects in front of a wall add levels as well, but of
     # unequal size, and much of the surface parallel to the wall is in no level.
-    levels, clear = level**2 / squares, level / facing
+    levels, purity = level**2 / squares, level / facing
     # A camera that looks down on a board sees it obliquely, and the wall behind it head-on.
-    aslant = 1 - UP.aslant * direction[2] ** 2
+    frontal = 1 - UP.frontal_penalty * direction[2] ** 2
     across, down = direction[0] ** 2, max(direction[1], 0.0) ** 2
-    turned = (across + down) / (across + direction[1] ** 2 + UP.steep)
-    return float(level * levels**UP.several * clear**UP.clear * aslant / (1 + held * turned))
+    roll = (across + down) / (across + direction[1] ** 2 + UP.frontal_sin2)
+    several, pure = levels**UP.levels_exponent, purity**UP.purity_exponent
+    return float(level * several * pure * frontal / (1 + roll_penalty * roll))
 
 
 @kernel(inline=True)
@@ -225,7 +226,7 @@ def _count_levels(surface: F4, direction: F8) -> tuple[F8, float, float]:
 
 
 @kernel(inline=True)
-def _settled(
+def _refined(
     points: OrientedPoints, surface: F4, intrinsics: PinholeIntrinsics, direction: F8
 ) -> F8:
     """Return the refined normal (3,) of the largest plane that faces ``direction``."""

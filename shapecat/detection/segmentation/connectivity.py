@@ -87,7 +87,7 @@ def _link(grid: DepthGrid, plane_id: I4, spans: I4, local_plane: F4, links: U1) 
     """Link neighbours at similar depths, or where one lies on the local plane of the other."""
     inv_depth, jump = grid.inverse_depth, np.float32(grid.discontinuity)
     rows, columns = inv_depth.shape
-    depths, owners = inv_depth.reshape(-1), plane_id.reshape(-1)
+    depths, plane_ids = inv_depth.reshape(-1), plane_id.reshape(-1)
     planes, bits = local_plane.reshape(-1), links.reshape(-1)
     for i in range(rows):
         start, end = spans[i, 0], spans[i, 1]
@@ -95,10 +95,10 @@ def _link(grid: DepthGrid, plane_id: I4, spans: I4, local_plane: F4, links: U1) 
             continue
         cell, fit = i * columns + start, 3 * i * columns + start
         run, right = (cell, fit, end - 1 - start), (1, 1, columns)
-        _link_some(owners, depths, planes, jump, run, right, RIGHT, bits)
+        _link_some(plane_ids, depths, planes, jump, run, right, RIGHT, bits)
         if i + 1 < rows:
             run, below = (cell, fit, end - start), (columns, 3 * columns, 2 * columns)
-            _link_some(owners, depths, planes, jump, run, below, DOWN, bits)
+            _link_some(plane_ids, depths, planes, jump, run, below, DOWN, bits)
         _part_steps(grid, plane_id, i, start, end, links)
 
 

@@ -45,14 +45,14 @@ def fit_local_planes(grid: DepthGrid, plane_id: I4, spans: I4, local_plane: F4, 
     """
     values = np.zeros(SIDE * PITCH, np.float32)
     fits = np.zeros(6 * PITCH, np.float32)
-    depths, owners = grid.inverse_depth.reshape(-1), plane_id.reshape(-1)
+    depths, plane_ids = grid.inverse_depth.reshape(-1), plane_id.reshape(-1)
     planes, normals = local_plane.reshape(-1), normal.reshape(-1)
     shape, wider = plane_id.shape, np.float32(grid.discontinuity / DISCONTINUITY)
     for i in range(shape[0]):
         end, last = np.int64(spans[i, 0]), np.int64(spans[i, 1])
         while end < last:
-            start, end = _next_run(owners, i * shape[1], end, last)
-            _copy_windows(depths, owners, shape, (i, start, end), values)
+            start, end = _next_run(plane_ids, i * shape[1], end, last)
+            _copy_windows(depths, plane_ids, shape, (i, start, end), values)
             _fit_run(values, grid.intrinsics, wider, i, start, padded(start, end) - start, fits)
             _write(fits, planes, normals, 3 * i * shape[1] + start, shape[1], end - start)
 
@@ -79,27 +79,27 @@ def _write(fits: F4, planes: F4, normals: F4, at: int, columns: int, n: int) -> 
 
 
 @kernel(inline=True)
-def _next_run(owners: I4, row: int, j: int, last: int) -> tuple[int, int]:
+def _next_run(plane_ids: I4, row: int, j: int, last: int) -> tuple[int, int]:
     """Return first column, and one after the last, of the next run of cells above one plane.
 
     The search begins at column ``j``. There must be an object cell before ``last``; ``row`` is the
     index of the first cell of the row.
     """
-    while owners[row + j] <= 0:
+    while plane_ids[row + j] <= 0:
         j += 1
     start = end = j
-    me, last = owners[row + j], min(last, start + RUN)
+    me, last = plane_ids[row + j], min(last, start + RUN)
     while j < min(last, end + SEGMENTATION.bridged) and (
-        owners[row + j] <= 0 or owners[row + j] == me
+        plane_ids[row + j] <= 0 or plane_ids[row + j] == me
     ):
-        end = j + 1 if owners[row + j] == me else end
+        end = j + 1 if plane_ids[row + j] == me else end
         j += 1
     return start, end
 
 
 @kernel(inline=True)
 def _copy_windows(
-    depths: F4, owners: I4, shape: tuple[int, int], run: tuple[int, int, int], values: F4
+    depths: F4, plane_ids: I4, shape: tuple[int, int], run: tuple[int, int, int], values: F4
 ) -> None:
     """Copy the rows around a run and `WINDOW` cells beyond its ends; `NONE` above other planes.
 
@@ -107,7 +107,7 @@ def _copy_windows(
     """
     rows, columns = shape
     i, start, end = run
-    me, none = owners[i * columns + start], np.float32(NONE)
+    me, none = plane_ids[i * columns + start], np.float32(NONE)
     left, right = max(start - WINDOW, 0), min(end + WINDOW, columns)
     for d in range(SIDE):
         y, first = i + d - WINDOW, np.uint64(d * PITCH)
@@ -117,7 +117,7 @@ def _copy_windows(
             to = np.uint64(d * PITCH + left - start + WINDOW)
             at = np.uint64(y * columns + left)
             for k in range(np.uint64(right - left)):
-                values[to + k] = depths[at + k] if owners[at + k] == me else none
+                values[to + k] = depths[at + k] if plane_ids[at + k] == me else none
 
 
 @kernel(fast=True, inner=True)
