@@ -13,7 +13,7 @@ from shapecat.arrays import freeze
 from shapecat.cameras.colour import ColourImage, ColourView, LensCamera
 from shapecat.cameras.lenses import distort, undistorted_rays
 from shapecat.colour.image_masks import box_of, find_masks, mask_of
-from shapecat.colour.masks import NOTHING, Mask, dense_masks, label_boxes, labelled_masks, united
+from shapecat.colour.masks import EMPTY_MASK, Mask, dense_masks, label_boxes, labelled_masks, union
 from shapecat.colour.projection import project, rectified
 from shapecat.colour.snapping import snapped
 from shapecat.colour.splatting import splat_depth
@@ -347,10 +347,10 @@ def test_masks_of_a_merged_track_are_united() -> None:
     labels = np.zeros((20, 40), np.int32)
     labels[2:6, 3:9], labels[10:13, 20:31] = 1, 2
     one, two = labelled_masks(labels, label_boxes(labels, 2))
-    both = united((one, NOTHING, two))
+    both = union((one, EMPTY_MASK, two))
     np.testing.assert_array_equal(both.full(20, 40), one.full(20, 40) | two.full(20, 40))
     assert both.box == (4, 2, 25, 11)
-    assert united(()).area == 0
+    assert union(()).area == 0
     assert Mask(0, 0, np.zeros((0, 0), bool)).box == (0, 0, 0, 0)
 
 
@@ -364,7 +364,7 @@ def test_union_of_masks_with_overlapping_boxes_keeps_all_pixels() -> None:
     expected = np.any([mask.full(20, 30) for mask in masks], axis=0)
 
     for order in itertools.permutations(masks):
-        np.testing.assert_array_equal(united(order).full(20, 30), expected)
+        np.testing.assert_array_equal(union(order).full(20, 30), expected)
 
 
 def test_box_of_several_detections_encloses_all() -> None:
@@ -439,7 +439,7 @@ def test_snapped_neighbouring_masks_do_not_overlap() -> None:
     left = Mask(30, 20, np.ones((40, 17), bool))
     right = Mask(47, 20, np.ones((40, 23), bool))
     pixels[20:60, 50:70] = np.where(inside[20:60, 50:70, None], (60, 90, 170), 0)
-    one, nothing, two = snapped([left, NOTHING, right], pixels)
+    one, nothing, two = snapped([left, EMPTY_MASK, right], pixels)
     assert nothing.area == 0
     assert not (one.full(80, 100) & two.full(80, 100)).any()
     # The right one gives up what it had beyond the edge at column 50.

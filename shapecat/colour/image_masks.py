@@ -4,7 +4,7 @@ from collections.abc import Sequence
 
 from shapecat.arrays import U4
 from shapecat.cameras.colour import ColourView
-from shapecat.colour.masks import NOTHING, Mask, dense_masks, united
+from shapecat.colour.masks import EMPTY_MASK, Mask, dense_masks, union
 from shapecat.colour.rle import rle_counts, rle_mask
 from shapecat.types import Frame, ImageMasks
 
@@ -52,7 +52,7 @@ def mask_of(masks: ImageMasks, detections: Sequence[int]) -> Mask:
     """
     counts = [masks.counts[number] for number in detections if number in masks.counts]
     found = [rle_mask(runs, masks.height, masks.width) for runs in counts]
-    return united(found) if found else NOTHING
+    return union(found) if found else EMPTY_MASK
 
 
 def box_of(masks: ImageMasks, detections: Sequence[int]) -> tuple[int, int, int, int] | None:

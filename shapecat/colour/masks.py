@@ -10,7 +10,7 @@ from shapecat.colour.splatting import splat_depth
 from shapecat.jit import kernel
 from shapecat.types import Frame, Pose
 
-__all__ = ["NOTHING", "Mask", "dense_masks", "label_boxes", "labelled_masks", "united"]
+__all__ = ["EMPTY_MASK", "Mask", "dense_masks", "label_boxes", "labelled_masks", "union"]
 
 _NARROW_PX = 4.0
 """Widest gap in an object that is filled, in pixels of the depth image."""
@@ -50,7 +50,7 @@ class Mask(Record):
         return result
 
 
-NOTHING = Mask(0, 0, np.zeros((0, 0), bool))
+EMPTY_MASK = Mask(0, 0, np.zeros((0, 0), bool))
 """The mask of an object that is not visible."""
 
 
@@ -124,22 +124,22 @@ def _smoothed(filled: I4, label: int, box: list[int], reach: int, corner: tuple[
     """Return the mask of a label after a majority filter."""
     left, top, right, bottom = box
     if right <= left:
-        return NOTHING
+        return EMPTY_MASK
     left, top = max(0, left - reach), max(0, top - reach)
     around = filled[top : bottom + reach, left : right + reach]
     pixels = np.zeros(around.shape, np.bool_)
     west, north, east, south = _majority(around, label, reach, pixels)
     if east <= west:
-        return NOTHING
+        return EMPTY_MASK
     left, top = left + corner[0], top + corner[1]
     return Mask(left + west, top + north, pixels[north:south, west:east])
 
 
-def united(masks: Sequence[Mask]) -> Mask:
+def union(masks: Sequence[Mask]) -> Mask:
     """Return the union of masks of one image."""
     seen = [mask for mask in masks if mask.pixels.size]
     if len(seen) < 2:
-        return seen[0] if seen else NOTHING
+        return seen[0] if seen else EMPTY_MASK
     left, top = min(mask.left for mask in seen), min(mask.top for mask in seen)
     right = max(mask.left + mask.box[2] for mask in seen)
     bottom = max(mask.top + mask.box[3] for mask in seen)

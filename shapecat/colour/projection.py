@@ -10,7 +10,7 @@ from shapecat.cameras.lenses import FISHEYE_MODELS, LENS_MODELS, distort
 from shapecat.jit import kernel
 from shapecat.types import Pose
 
-__all__ = ["Lens", "kernel_lens", "project", "rectified", "see"]
+__all__ = ["Lens", "kernel_lens", "project", "project_in_place", "rectified"]
 
 _WIDEST = 3.0
 """Largest slope that a lens with distortion is assumed to see: 72 degrees off the axis."""
@@ -47,9 +47,9 @@ def project(points: F4, lens: LensCamera, colour_from_depth: Pose) -> F4:
     """
     rotation = colour_from_depth.rotation.astype(np.float32)
     shift, seen = colour_from_depth.translation.astype(np.float32), np.zeros((3, len(points)), "f4")
-    _turn(np.asarray(points, np.float32), rotation, shift, seen)
+    _to_camera(np.asarray(points, np.float32), rotation, shift, seen)
     distances = seen[2].copy()
-    see(seen[0], seen[1], seen[2], *kernel_lens(lens))
+    project_in_place(seen[0], seen[1], seen[2], *kernel_lens(lens))
     return np.where(seen[2] > 0, (seen[0], seen[1], distances), np.float32(np.nan)).T
 
 
@@ -120,7 +120,7 @@ def _monotonic_up_to(lens: LensCamera) -> float:
 
 
 @kernel
-def _turn(points: F4, rotation: F4, shift: F4, turned: F4) -> None:
+def _to_camera(points: F4, rotation: F4, shift: F4, turned: F4) -> None:
     """Write points (n, 3) in the frame of a camera, (3, n); z is -1 where they are not finite."""
     for i in range(points.shape[0]):
         x, y, z = points[i, 0], points[i, 1], points[i, 2]
@@ -131,7 +131,7 @@ def _turn(points: F4, rotation: F4, shift: F4, turned: F4) -> None:
 
 
 @kernel(fast=True)
-def see(x: F4, y: F4, z: F4, numbers: F4, kind: int, d: F4, reach: float) -> None:
+def project_in_place(x: F4, y: F4, z: F4, numbers: F4, kind: int, d: F4, reach: float) -> None:
     """Project points, in place, from the camera frame to the image.
 
     Source of the lens models: `shapecat.cameras.lenses.distort`.

@@ -3,7 +3,7 @@
 import numpy as np
 
 from shapecat.arrays import I4, U4, Bool
-from shapecat.colour.masks import NOTHING, Mask
+from shapecat.colour.masks import EMPTY_MASK, Mask
 from shapecat.jit import kernel
 
 __all__ = ["rle_counts", "rle_mask", "rle_text"]
@@ -43,7 +43,7 @@ def rle_mask(counts: U4, height: int, width: int) -> Mask:
     inside = runs[1::2] > 0
     starts, stops = ends[:-1:2][: inside.size][inside], ends[1::2][inside]
     if not starts.size:
-        return NOTHING
+        return EMPTY_MASK
     left, right = int(starts[0] // height), int((stops[-1] - 1) // height) + 1
     columns = np.zeros((right - left) * height, bool)
     _decode(starts - left * height, stops - left * height, columns)

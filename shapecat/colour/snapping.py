@@ -12,7 +12,7 @@ import numpy as np
 from scipy import ndimage
 
 from shapecat.arrays import F4, I4, U1, Bool
-from shapecat.colour.masks import NOTHING, Mask
+from shapecat.colour.masks import EMPTY_MASK, Mask
 from shapecat.jit import kernel
 
 __all__ = ["snapped"]
@@ -55,29 +55,29 @@ def snapped(masks: Sequence[Mask], pixels: U1, scale: float = 1.0) -> tuple[Mask
         height, width = mask.pixels.shape
         part = owners[mask.top : mask.top + height, mask.left : mask.left + width]
         part[mask.pixels] = number
-    judged = [
-        _judged(mask, number, owners, pixels, scale) if mask.pixels.size else None
+    matches = [
+        _match(mask, number, owners, pixels, scale) if mask.pixels.size else None
         for number, mask in enumerate(masks, start=1)
     ]
     # What all masks give up is free for any of them, whatever their order.
-    for number, one in enumerate(judged, start=1):
+    for number, one in enumerate(matches, start=1):
         if one is not None:
             part = owners[one.window]
             part[(part == number) & ~one.wanted] = 0
     return tuple(
-        NOTHING if one is None else _taken(one, number, owners)
-        for number, one in enumerate(judged, start=1)
+        EMPTY_MASK if one is None else _claim(one, number, owners)
+        for number, one in enumerate(matches, start=1)
     )
 
 
-class _Judged(NamedTuple):
+class _Match(NamedTuple):
     """The window (rows and columns) around a mask, and the pixels in it that match it (h, w)."""
 
     window: tuple[slice, slice]
     wanted: Bool
 
 
-def _judged(mask: Mask, number: int, owners: I4, pixels: U1, scale: float) -> _Judged:
+def _match(mask: Mask, number: int, owners: I4, pixels: U1, scale: float) -> _Match:
     """Return the pixels that match a mask; ``owners`` (h, w) are the numbers of the masks."""
     band, reach = max(2.0, _BAND_PX * scale), max(3, round(_WINDOW_PX * scale))
     margin, (left, top, width, height) = int(band) + reach, mask.box
@@ -86,22 +86,22 @@ def _judged(mask: Mask, number: int, owners: I4, pixels: U1, scale: float) -> _J
     window = rows, columns
     inside = owners[window] == number
     if inside.all() or not inside.any():
-        return _Judged(window, inside)
+        return _Match(window, inside)
     # The distance of pixel centres from the outline, positive inside.
     within, without = (ndimage.distance_transform_edt(side) for side in (inside, ~inside))
     depth = np.where(inside, within - 0.5, 0.5 - without).astype(np.float32)
-    likelier = np.zeros(depth.shape, np.float32)
+    log_ratio = np.zeros(depth.shape, np.float32)
     colours = np.ascontiguousarray(pixels[window])
-    _compare(colours, depth, band, _CORE_PX * scale, reach, likelier)
-    score = ndimage.uniform_filter(likelier, 3) + depth / np.float32(_ERROR_PX * scale)
-    return _Judged(window, np.where(np.abs(depth) <= band, score > 0, inside))
+    _compare(colours, depth, band, _CORE_PX * scale, reach, log_ratio)
+    score = ndimage.uniform_filter(log_ratio, 3) + depth / np.float32(_ERROR_PX * scale)
+    return _Match(window, np.where(np.abs(depth) <= band, score > 0, inside))
 
 
-def _taken(judged: _Judged, number: int, owners: I4) -> Mask:
+def _claim(match: _Match, number: int, owners: I4) -> Mask:
     """Return a mask of the pixels that match it and that no other mask has; mark them as taken."""
-    rows, columns = judged.window
-    part = owners[judged.window]
-    found = judged.wanted & ((part == number) | (part == 0))
+    rows, columns = match.window
+    part = owners[match.window]
+    found = match.wanted & ((part == number) | (part == 0))
     part[found] = number
     return _cut_out(found, columns.start, rows.start)
 
@@ -109,14 +109,14 @@ def _taken(judged: _Judged, number: int, owners: I4) -> Mask:
 def _cut_out(inside: Bool, left: int, top: int) -> Mask:
     rows, columns = np.flatnonzero(inside.any(axis=1)), np.flatnonzero(inside.any(axis=0))
     if not rows.size:
-        return NOTHING
+        return EMPTY_MASK
     part = inside[rows[0] : rows[-1] + 1, columns[0] : columns[-1] + 1]
     return Mask(left + int(columns[0]), top + int(rows[0]), np.ascontiguousarray(part))
 
 
 @kernel
-def _compare(colours: U1, depth: F4, band: float, core: float, window: int, likelier: F4) -> None:
-    """Write to ``likelier`` the log-likelihood ratio of inside to outside, for pixels in the band.
+def _compare(colours: U1, depth: F4, band: float, core: float, window: int, log_ratio: F4) -> None:
+    """Write to ``log_ratio`` the log-likelihood ratio of inside to outside, for pixels in the band.
 
     The colours of each side are modelled by a normal distribution with the same variance in all
     channels, fitted to a grid of pixels around it. ``depth`` (h, w) is the distance from the
@@ -147,13 +147,13 @@ def _compare(colours: U1, depth: F4, band: float, core: float, window: int, like
                     else:
                         outside, squares_outside = outside + 1, squares_outside + square
             if min(inside, outside) >= _FEWEST:
-                own = _unlikely(colours[v, u], total[1], squares_inside, inside)
-                other = _unlikely(colours[v, u], total[0], squares_outside, outside)
-                likelier[v, u] = min(max(other - own, -_CERTAIN), _CERTAIN)
+                own = _negative_log_likelihood(colours[v, u], total[1], squares_inside, inside)
+                other = _negative_log_likelihood(colours[v, u], total[0], squares_outside, outside)
+                log_ratio[v, u] = min(max(other - own, -_CERTAIN), _CERTAIN)
 
 
 @kernel(inner=True)
-def _unlikely(colour: U1, total: F4, squares: float, count: int) -> float:
+def _negative_log_likelihood(colour: U1, total: F4, squares: float, count: int) -> float:
     """Return the negative log-likelihood of a colour, up to a constant."""
     apart, of_means = 0.0, 0.0
     for k in range(colour.size):

@@ -7,7 +7,7 @@ import numpy as np
 
 from shapecat.arrays import F4, I4, U4, Bool
 from shapecat.cameras.colour import LensCamera
-from shapecat.colour.projection import Lens, kernel_lens, see
+from shapecat.colour.projection import Lens, kernel_lens, project_in_place
 from shapecat.jit import kernel
 from shapecat.types import Camera, Pose
 
@@ -107,14 +107,15 @@ def _splat(
     width and height of the colour image.
     """
     beside = _list_beside(depth, pixels, parallax)
-    place, around = _see_pixels(depth, pixels, rays, lens), _see_pixels(depth, beside, rays, lens)
-    squares = _land(place, labels, np.float32(scale / 2), size, boxes)
+    place = _project_pixels(depth, pixels, rays, lens)
+    around = _project_pixels(depth, beside, rays, lens)
+    squares = _cover(place, labels, np.float32(scale / 2), size, boxes)
     left, top, right, bottom = _window(boxes, int(_BESIDE_PX * scale), size)
     seen = np.full((bottom - top, right - left), np.int32(-1))
     nearest = np.zeros(seen.shape, np.float32)
     _paint(squares, labels, place[2], (left, top), nearest, seen)
     cell = max(2, int(_SPARSE * scale + 0.5))
-    _hide(_front(around, (left, top), cell, seen.shape), cell, boxes, nearest, seen)
+    _hide(_nearest_surface(around, (left, top), cell, seen.shape), cell, boxes, nearest, seen)
     return left, top, seen
 
 
@@ -179,7 +180,7 @@ def _extent(depth: F4, pixels: U4, own: Bool) -> tuple[int, int, int, int, float
 
 
 @kernel(inner=True)
-def _see_pixels(depth: F4, pixels: U4, rays: tuple[F4, F4, F4], lens: Lens) -> F4:
+def _project_pixels(depth: F4, pixels: U4, rays: tuple[F4, F4, F4], lens: Lens) -> F4:
     """Return the projection (4, n) of depth pixels into a camera.
 
     The rows are column, row, inverse depth in the camera (0 where it does not see the pixel), and
@@ -197,17 +198,17 @@ def _see_pixels(depth: F4, pixels: U4, rays: tuple[F4, F4, F4], lens: Lens) -> F
         if not z > 0:
             moved[2, i] = -1
     numbers, kind, d, reach = lens
-    see(moved[0], moved[1], moved[2], numbers, kind, d, reach)
+    project_in_place(moved[0], moved[1], moved[2], numbers, kind, d, reach)
     return moved
 
 
 @kernel(inner=True)
-def _land(place: F4, labels: I4, half: float, size: tuple[int, int], boxes: I4) -> I4:
+def _cover(place: F4, labels: I4, half: float, size: tuple[int, int], boxes: I4) -> I4:
     """Return the square of image pixels whose centres each depth pixel covers.
 
     Squares are (n, 4) left, top, right + 1, bottom + 1; zeros outside the image. ``boxes`` is set
-    to the box around the squares of each label. ``place`` is from `_see_pixels`; ``half`` is half
-    the colour pixels per depth pixel at equal distance.
+    to the box around the squares of each label. ``place`` is from `_project_pixels`; ``half`` is
+    half the colour pixels per depth pixel at equal distance.
     """
     nought, one = np.float32(0), np.float32(1)
     width, height = np.float32(size[0]), np.float32(size[1])
@@ -264,10 +265,10 @@ def _paint(
 
 
 @kernel(inner=True)
-def _front(around: F4, corner: tuple[int, int], cell: int, shape: tuple[int, int]) -> F4:
+def _nearest_surface(around: F4, corner: tuple[int, int], cell: int, shape: tuple[int, int]) -> F4:
     """Return the greatest inverse depth of points in each cell of a window.
 
-    ``around`` is from `_see_pixels`; cells are squares of ``cell`` pixels.
+    ``around`` is from `_project_pixels`; cells are squares of ``cell`` pixels.
     """
     height, width = np.float32(shape[0]), np.float32(shape[1])
     left, top, per_cell = np.float32(corner[0]), np.float32(corner[1]), np.float32(1 / cell)
