@@ -295,7 +295,7 @@ def few_trees() -> Iterator[None]:
         return RandomForestClassifier(trees // 10, **options)
 
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr("shapecat.learning.baselines.RandomForestClassifier", grow)
+        patch.setattr("shapecat.evaluation.baseline_classifiers.RandomForestClassifier", grow)
         yield
 
 

@@ -12,8 +12,9 @@ from scipy import sparse
 from sklearn.linear_model import LogisticRegression
 
 from shapecat.arrays import F4
+from shapecat.evaluation.baseline_classifiers import make_baselines
+from shapecat.evaluation.shape_functions import shape_functions
 from shapecat.learning import Categorizer
-from shapecat.learning.baselines import make_baselines
 from shapecat.learning.boosted import Dictionary, grow_dictionary
 from shapecat.learning.boosting import Tree, grow_tree
 from shapecat.learning.calibration import fit_temperature, softmax
@@ -22,7 +23,6 @@ from shapecat.learning.forest import FlatForest
 from shapecat.learning.incremental import _STEPS, _fit_new, _Inputs, _shift, add_categories
 from shapecat.learning.known_views import choose_evenly
 from shapecat.learning.pnn import fit_bank
-from shapecat.learning.shape_functions import shape_functions
 from shapecat.learning.training import (
     Examples,
     LearningSettings,

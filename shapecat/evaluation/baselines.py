@@ -46,7 +46,7 @@ def compare_learners(
 
     Returns
     -------
-    Results of shapecat's classifier, of the baselines of `shapecat.learning.baselines`, and of
+    Results of shapecat's classifier, of those in `shapecat.evaluation.baseline_classifiers`, and of
     forests on shape distributions (D2; D2, D3 and A3 together).
 
     Raises
@@ -132,7 +132,7 @@ def _compared(name: str, learned: int, truth: I4, posteriors: F8) -> Compared:
 
 
 def _learners() -> dict[str, _Learner]:
-    from shapecat.learning.baselines import make_baselines  # noqa: PLC0415  scikit-learn
+    from shapecat.evaluation.baseline_classifiers import make_baselines  # noqa: PLC0415  scikit-learn
 
     makers = make_baselines(tuple(BLOCKS.values()))
     descriptors, functions = attrgetter("descriptors"), attrgetter("functions")

@@ -11,7 +11,7 @@ from shapecat.arrays import F4
 from shapecat.config import Settings
 from shapecat.description import DESCRIPTOR_NAMES, describe
 from shapecat.evaluation.dataset import View
-from shapecat.learning.shape_functions import shape_functions
+from shapecat.evaluation.shape_functions import shape_functions
 from shapecat.surface import reconstruct, thin
 from shapecat.system.progress import Observer, ignore
 
@@ -32,7 +32,7 @@ class DescribedViews(NamedTuple):
     seconds : (n,) time from points to descriptor.
     skipped : number of views with too few points for a surface, which are left out.
     elevations : (n,) elevation of the sensor as seen from the object, degrees; may be empty.
-    functions : (n, f) shape distributions from `shapecat.learning.shape_functions`; may
+    functions : (n, f) shape distributions from `shapecat.evaluation.shape_functions`; may
         be empty.
     """
 

@@ -2,8 +2,7 @@
 
 `features` standardises a descriptor and may add Parzen densities. `forest` maps these features to
 words, the leaves of a dictionary of trees. `categorizer` turns the words into a calibrated
-posterior and a novelty. These modules predict and need no scikit-learn; `pnn`, `boosted`,
-`training` and `baselines` train.
+posterior and a novelty. These modules predict; `pnn`, `boosted` and `training` train.
 """
 
 from shapecat.learning.categorizer import Categorizer, Prediction

@@ -5,7 +5,6 @@ from dataclasses import asdict, dataclass, replace
 from typing import Any, NamedTuple
 
 import numpy as np
-from sklearn.utils import check_random_state
 
 from shapecat.arrays import F4, I4
 from shapecat.learning.boosted import Dictionary, grow_dictionary
@@ -137,7 +136,7 @@ def fit_chain(
         those of the categories.
     blocks : range of each block in the descriptor, by name.
     """
-    number = check_random_state(seed).randint(2**31)
+    number = np.random.RandomState(seed).randint(2**31)  # the draw of the default model
     bank = fit_bank(
         descriptors,
         codes,
