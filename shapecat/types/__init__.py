@@ -5,7 +5,9 @@ Transforms are named ``a_from_b``. "Sensor frame" is the frame named by ``frame_
 camera's is the optical frame (x right, y down, z forward).
 """
 
-from shapecat.types.found import (
+from shapecat.types.frame import Camera, Frame, Pose
+from shapecat.types.labelled import LabelledFrame, LabelledObject, ShownBox, ShownFrame
+from shapecat.types.scene import (
     CATEGORIES,
     UNKNOWN,
     Box,
@@ -18,8 +20,6 @@ from shapecat.types.found import (
     Plane,
     Scene,
 )
-from shapecat.types.readings import Camera, Frame, Pose
-from shapecat.types.shown import LabelledFrame, LabelledObject, ShownBox, ShownFrame
 
 __all__ = [
     "CATEGORIES",

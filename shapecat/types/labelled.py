@@ -4,8 +4,8 @@ from dataclasses import dataclass
 from typing import NamedTuple
 
 from shapecat.arrays import F4, U4, Record, array
-from shapecat.types.found import Box, ImageMasks, NeuralGas, Plane
-from shapecat.types.readings import Pose
+from shapecat.types.frame import Pose
+from shapecat.types.scene import Box, ImageMasks, NeuralGas, Plane
 
 __all__ = ["LabelledFrame", "LabelledObject", "ShownBox", "ShownFrame"]
 

@@ -11,7 +11,10 @@ __all__ = ["Camera", "Frame", "Pose"]
 
 @dataclass(frozen=True)
 class Camera:
-    """A pinhole camera: pixel (u, v) sees the ray ((u - cx) / fx, (v - cy) / fy, 1)."""
+    """A pinhole camera: pixel (u, v) sees the ray ((u - cx) / fx, (v - cy) / fy, 1).
+
+    All numbers are in pixels; the centre of the first pixel is (0, 0).
+    """
 
     width: int
     height: int
