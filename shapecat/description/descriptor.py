@@ -89,13 +89,11 @@ def _describe(points: F4, neurons: F4, edges: U2, eye: F4, out: F4) -> None:
     Each block is a kernel of its own: as one they would take two seconds more to compile.
     """
     surface = _prepare(points, neurons, edges, eye)
-    cloud, starts, nearest, weight = (
-        surface.points, surface.starts, surface.nearest, surface.weight,
-    )  # fmt: skip
+    cloud, weight, unit = surface.points, surface.weight, surface.unit
     x, y, z = surface.neurons
-    radius, unit = np.float32(_RADIUS * surface.spacing), surface.unit
+    radius = np.float32(_RADIUS * surface.spacing)
     normals, curvatures = fit_surfaces(
-        cloud, starts, x, y, z, surface.euclidean, radius, surface.eye
+        cloud, surface.starts, x, y, z, surface.euclidean, radius, surface.eye
     )
     low, high = _height_range(cloud[2])
     wide, across, along = context(surface, normals, curvatures, low, high, out[_CONTEXT:_CURVED])
@@ -105,7 +103,10 @@ def _describe(points: F4, neurons: F4, edges: U2, eye: F4, out: F4) -> None:
     axis, point, _ = rotation_axis(x, y, z, weight, normals)
     turned, foot = out[_REVOLUTION:_SOLIDS], np.array((cx, cy, 0.0))
     revolution(surface, normals, axis, point, foot, turned)
-    solids(cloud, nearest, x, y, normals, surface.eye, low, high, turned, out[_SOLIDS:_OUTLINE])
+    solids(
+        cloud, surface.nearest, x, y, normals, surface.eye, low, high, turned,
+        out[_SOLIDS:_OUTLINE],
+    )  # fmt: skip
     outline(cloud, surface.eye, out[_OUTLINE:_METRIC])
     away_m = surface.eye_distance_m
     out[_METRIC:] = (
@@ -122,7 +123,8 @@ def _describe(points: F4, neurons: F4, edges: U2, eye: F4, out: F4) -> None:
 
 @kernel
 def _prepare(points: F4, neurons: F4, edges: U2, eye: F4) -> Surface:
-    x, y, z, euclidean, center, unit = _own_units(neurons)
+    rows, euclidean, center, unit = _own_units(neurons)
+    x, y, z = rows[0], rows[1], rows[2]
     away = 0.0
     for axis in range(3):
         away += (eye[axis] - center[axis]) ** 2
@@ -131,7 +133,7 @@ def _prepare(points: F4, neurons: F4, edges: U2, eye: F4) -> Surface:
     for axis in range(3):
         place[axis] = (eye[axis] - center[axis]) / max(unit, away / _FAR)
     spacing = max(mean_gap(euclidean), 1e-3)
-    geodesic, rows = geodesic_distances(euclidean, edges), _in_rows(x, y, z)
+    geodesic = geodesic_distances(euclidean, edges)
     cloud, starts = assign(_cloud_of(points, center, unit), x, y, z, np.float32(_REACH * spacing))
     if cloud.shape[1] == 0:
         # no point is near: describe the neurons themselves
@@ -173,15 +175,6 @@ def _cloud_of(points: F4, center: F8, unit: float) -> F4:
 
 
 @kernel(inline=True)
-def _in_rows(x: F4, y: F4, z: F4) -> F4:
-    """Return x, y, z (n,) as one array (3, n)."""
-    rows = np.zeros((3, x.size), np.float32)
-    for i in range(x.size):
-        rows[0, i], rows[1, i], rows[2, i] = x[i], y[i], z[i]
-    return rows
-
-
-@kernel(inline=True)
 def _nearest_neurons(starts: I4) -> I4:
     """Return the neuron of each point, for points sorted by `assign`."""
     owner = np.zeros(starts[-1], np.int64)
@@ -192,11 +185,11 @@ def _nearest_neurons(starts: I4) -> I4:
 
 
 @kernel(inline=True)
-def _own_units(neurons: F4) -> tuple[F4, F4, F4, F4, F8, float]:
+def _own_units(neurons: F4) -> tuple[F4, F4, F8, float]:
     """Return the neurons relative to their mean, in units of the mean distance between them.
 
-    The result is x, y, z (n,), the distances (n, n) in this unit, the mean (3,) in metres, and the
-    unit in metres, which is 1 if all neurons coincide.
+    The result is the neurons (3, n), the distances (n, n) in this unit, the mean (3,) in metres,
+    and the unit in metres, which is 1 if all neurons coincide.
     """
     count = neurons.shape[0]
     center = np.zeros(3)
@@ -208,19 +201,16 @@ def _own_units(neurons: F4) -> tuple[F4, F4, F4, F4, F8, float]:
         for axis in range(3):
             unit = max(unit, abs(neurons[i, axis] - center[axis]))
     unit = unit if unit > 0 else 1.0
-    x = np.zeros(count, np.float32)
-    y = np.zeros(count, np.float32)
-    z = np.zeros(count, np.float32)
+    rows = np.zeros((3, count), np.float32)
     euclidean = np.zeros((count, count), np.float32)
     for _ in range(2):  # first by the greatest coordinate, so that squares stay finite
         for i in range(count):
-            x[i] = (neurons[i, 0] - center[0]) / unit
-            y[i] = (neurons[i, 1] - center[1]) / unit
-            z[i] = (neurons[i, 2] - center[2]) / unit
-        euclidean = euclidean_distances(x, y, z)
+            for axis in range(3):
+                rows[axis, i] = (neurons[i, axis] - center[axis]) / unit
+        euclidean = euclidean_distances(rows[0], rows[1], rows[2])
         mean = _sum(euclidean) / (count * (count - 1))
         unit *= mean if mean > 0 else 1.0
-    return x, y, z, euclidean, center, unit
+    return rows, euclidean, center, unit
 
 
 @kernel(inline=True)

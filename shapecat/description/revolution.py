@@ -151,9 +151,7 @@ def _improve(
 ) -> float:
     """Move the axis by one Gauss-Newton step; return the root mean square residual before it."""
     first, second = _across(axis)
-    owner = np.zeros(neurons.shape[1], np.int64)
-    for i in range(owner.size):
-        owner[i] = i
+    owner = np.arange(neurons.shape[1])
     rows, reach = _place(neurons, owner, normals, axis, point, first, second)
     for i in range(owner.size):
         rows[4, i] *= weight[i]
