@@ -105,14 +105,6 @@ def _adapt_to_signal(
 
 
 @kernel(inner=True)
-def _in_order(count: int) -> I4:
-    order = np.zeros(count, np.int64)
-    for i in range(count):
-        order[i] = i
-    return order
-
-
-@kernel(inner=True)
 def _shuffle(order: I4, state: np.uint64) -> np.uint64:
     """Shuffle in place (Fisher-Yates) with a 64-bit linear congruential generator (Knuth)."""
     for i in range(order.size - 1, 0, -1):
@@ -151,7 +143,7 @@ def grow_fritzke(
     px, py, pz = cloud
     x, y, z, error, degree, wins, edge_birth = gas
     count, mask = 2, index_mask(gas.x.size)
-    order = _in_order(points)
+    order = np.arange(points)
     cursor = points
     gain = 1.0
     fall = 0.9 / max(signals, 1)
@@ -223,7 +215,7 @@ def grow_thesis(
     px, py, pz = cloud
     x, y, z, error, degree, wins, edge_birth = gas
     count, mask = 2, index_mask(gas.x.size)
-    order = _in_order(points)
+    order = np.arange(points)
     before = np.zeros(gas.x.size, np.int32)
     fall = 0.9 / (epochs * points)
     rest = 1.0

@@ -88,9 +88,8 @@ class _WholeSizes:
         passing = (share <= _PASSING)[which] & table.partial[pairs].all(axis=1)
         sizes[passing, :, 1] = sizes[passing, :, 0]
         for k in _where(share <= _CHANGING):
-            sizes[which == k] = np.maximum(
-                sizes[which == k], self._in_one(*track_pairs[k].tolist())
-            )
+            own = which == k
+            sizes[own] = np.maximum(sizes[own], self._in_one(*track_pairs[k].tolist()))
         return np.asarray(sizes)
 
 

@@ -99,9 +99,8 @@ def _follow(table: DetectionTable, settings: TrackingSettings) -> list[I4]:
 def _associate(table: DetectionTable, cuts: Bool, settings: TrackingSettings) -> I4:
     """Return the tracker's track number of each detection, (n,)."""
     tracker, ids = Tracker(settings), np.zeros(len(table.rows), np.int32)
-    for row, (stamp_ns, cut) in enumerate(
-        zip(table.stamps_ns.tolist(), cuts.tolist(), strict=True)
-    ):
+    frames = zip(table.stamps_ns.tolist(), cuts.tolist(), strict=True)
+    for row, (stamp_ns, cut) in enumerate(frames):
         if cut:
             tracker.reset()
         here = table.of_frame(row)

@@ -189,9 +189,8 @@ def scene_cuts(table: DetectionTable, settings: TrackingSettings) -> Bool:
             pairs.append((last, later))
         if older >= 0 and not result[last]:
             pairs.append((older, k))
-        result[k] |= not any(
-            _continues(table, i, j, slow=slow, settings=settings) for i, j in pairs
-        )
+        same = (_continues(table, i, j, slow=slow, settings=settings) for i, j in pairs)
+        result[k] |= not any(same)
     return np.asarray(result)
 
 
