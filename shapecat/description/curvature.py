@@ -33,9 +33,7 @@ def assign(points: F4, x: F4, y: F4, z: F4, reach: float) -> tuple[F4, I4]:
         mask = np.int32(mask << 1)
     mask = np.int32(mask - 1)
     keep = np.int32(~mask)
-    lane = np.zeros(count, np.int32)
-    for i in range(count):
-        lane[i] = i
+    lane = np.arange(count).astype(np.int32)
     limit = np.float32(reach * reach)
     nearest = np.zeros(total, np.int32)
     starts = np.zeros(count + 1, np.int64)
@@ -57,9 +55,7 @@ def assign(points: F4, x: F4, y: F4, z: F4, reach: float) -> tuple[F4, I4]:
             nearest[k] = -1
     for i in range(count):
         starts[i + 1] += starts[i]
-    place = np.zeros(count, np.int64)
-    for i in range(count):
-        place[i] = starts[i]
+    place = starts[:count].copy()
     result = np.zeros((3, starts[count]), np.float32)
     for k in range(total):
         if nearest[k] >= 0:

@@ -208,18 +208,9 @@ def _own_units(neurons: F4) -> tuple[F4, F4, F8, float]:
             for axis in range(3):
                 rows[axis, i] = (neurons[i, axis] - center[axis]) / unit
         euclidean = euclidean_distances(rows[0], rows[1], rows[2])
-        mean = _sum(euclidean) / (count * (count - 1))
+        mean = float(np.sum(euclidean)) / (count * (count - 1))
         unit *= mean if mean > 0 else 1.0
     return rows, euclidean, center, unit
-
-
-@kernel(inline=True)
-def _sum(rows: F4) -> float:
-    total = np.float32(0.0)
-    for i in range(rows.shape[0]):
-        for j in range(rows.shape[1]):
-            total += rows[i, j]
-    return float(total)
 
 
 @kernel

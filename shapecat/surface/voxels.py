@@ -126,9 +126,7 @@ def _voxelize(points: F4, voxel: float) -> tuple[F4, bool]:
 @kernel(inline=True)
 def _radix_order(keys: np.ndarray, bound: int) -> np.ndarray:
     """Return the stable order that sorts ``keys``, which are >= 0 and below ``bound``."""
-    order = np.zeros(keys.size, np.int64)
-    for i in range(keys.size):
-        order[i] = i
+    order = np.arange(keys.size)
     other = np.zeros(keys.size, np.int64)
     shift = 0
     while (bound - 1) >> shift > 0:
