@@ -13,6 +13,7 @@ import pytest
 from click.testing import Result
 
 from shapecat.executors import WorkerExecutor
+from shapecat.learning import load_model, save_model
 from shapecat.outputs.counts import count_words
 from shapecat.outputs.exports.dataset_frames import Selection
 from shapecat.outputs.exports.formats import Exported
@@ -436,6 +437,7 @@ def test_workers_of_a_cluster_get_absolute_paths(
     """They may have another current folder: they missed recordings, and wrote results there."""
     monkeypatch.chdir(tmp_path)
     Path("a.mcap").write_bytes(b"\x89MCAP")
+    save_model(Path("m.npz"), load_model())
     workers = _JobCollector()
     monkeypatch.setattr("shapecat.executors.open_executor", lambda *_, **__: workers)
     shapecat("process", "a.mcap", "--out", "out", "--model", "m.npz", "--executor", "dask")

@@ -185,7 +185,7 @@ def patch_masks(
     """Replace the masks of a run, and the stamps of their frames."""
     frames = [(key, stamp) for (key, _), stamp in zip(masks, stamps, strict=True)]
     monkeypatch.setattr("shapecat.runs.tables.masks.read_masks", lambda _folder, **_: iter(masks))
-    monkeypatch.setattr("shapecat.runs.tables.masks._frame_stamps", lambda _folder: iter(frames))
+    monkeypatch.setattr("shapecat.runs.tables.masks.read_stamps", lambda _folder: iter(frames))
 
 
 def test_image_has_masks_of_the_frame_nearest_in_time(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -451,7 +451,7 @@ def test_images_without_certain_objects_are_omitted(monkeypatch: pytest.MonkeyPa
     place = "shapecat.outputs.exports.dataset_frames"
     labelled = [labelled_frame(k) for k in range(len(images))]
     stubs: dict[str, Any] = {
-        "_corrected": lambda _folder: set(),
+        "read_track_table": lambda _path: SimpleNamespace(labels={}),
         "_chosen": lambda *_: {("/depth", k) for k in range(len(images))},
         "open_source": lambda *_: nullcontext(),
         "with_colour": lambda frames, *_: ((one, None, None) for one in frames),

@@ -298,7 +298,7 @@ def test_path_leaves_out_frame_without_pose(tmp_path: Path) -> None:
     scenes = [
         scene(k, [labelled_object(1, x=0.2 * k)], pose=None if k == 1 else pose) for k in range(3)
     ]
-    path = write(tmp_path / "r.rrd", scenes, fixed_frame="map")
+    path = write(tmp_path / "r.rrd", scenes, run={"fixed_frame": "map"})
 
     (strip,) = rows(path, f"/world/paths/{TOPIC}")[-1]["LineStrips3D:strips"]
     places = [pose.rotation @ [x, 0.1, 1.0] + pose.translation for x in (0.0, 0.4)]
