@@ -48,6 +48,21 @@ def test_calibration_is_found_beside_topic_without_slash(tmp_path: Path, lead: s
     assert found == [(f"{lead}depth/image", f"{lead}depth/camera_info")]
 
 
+def test_calibration_below_the_topic_of_its_images_is_found(tmp_path: Path) -> None:
+    """AirSim and MultiSense publish it there: depth and colour, in one frame, had none."""
+    items = depth_in("/sim/front/DepthPlanar", "front")
+    items[0] = ("/sim/front/DepthPlanar/camera_info", *items[0][1:])
+    items += in_frame([("/sim/front/Scene/camera_info", EPOCH, info(EPOCH))], "front")
+    items.append(("/sim/front/Scene", EPOCH, raw(EPOCH, gradient(), "rgb8", "front")))
+
+    with open_recording(write(tmp_path / "a.mcap", items)) as recording:
+        (depth,) = choose_streams(recording)
+        colour = choose_colour(recording, depth)
+    assert depth.info_topic == "/sim/front/DepthPlanar/camera_info"
+    assert colour is not None
+    assert colour.info_topic == "/sim/front/Scene/camera_info"
+
+
 def test_calibration_of_the_same_frame_is_found(tmp_path: Path) -> None:
     """Aligned depth has the calibration of the colour camera, which may be recorded alone."""
     items = depth_and_info("/cam/aligned_depth_to_color/image_raw", "/cam/color/camera_info")

@@ -251,7 +251,8 @@ def _depth_stream(topic: Topic, first: Any, recording: Recording) -> Stream:
 def info_topic_of(image: str, recording: Recording, frame_id: str) -> str | None:
     """Return the calibration topic that shares the longest namespace with an image topic.
 
-    Without a common namespace it is the only calibration of the images' frame ``frame_id``, or the
+    That may be the image topic itself (``depth`` with ``depth/camera_info``), as of AirSim. Without
+    a common namespace it is the only calibration of the images' frame ``frame_id``, or the
     only one in the recording; otherwise None.
     """
     infos = [
@@ -269,9 +270,9 @@ def info_topic_of(image: str, recording: Recording, frame_id: str) -> str | None
 
 def _nearest(image: str, infos: Sequence[str]) -> str | None:
     """Return the calibration topic that shares the longest namespace with an image topic."""
-    parts = image.split("/")[:-1]
+    parts = image.split("/")
     outermost = 2 if image.startswith("/") else 1  # the first part of /depth/image is empty
-    for length in range(len(parts), min(len(parts), outermost) - 1, -1):
+    for length in range(len(parts), min(len(parts) - 1, outermost) - 1, -1):
         for name in _INFO_NAMES:
             sibling = "/".join([*parts[:length], name])
             if sibling in infos:
