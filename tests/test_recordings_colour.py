@@ -419,6 +419,22 @@ def test_moving_colour_camera_has_new_pose_in_each_frame(tmp_path: Path) -> None
     assert [pose.translation[0] for pose in poses if pose is not None] == [-0.05, -0.09]
 
 
+@pytest.mark.parametrize("first_s", [0.0, 0.1])
+def test_calibration_recorded_once_is_used_for_all_images(tmp_path: Path, first_s: float) -> None:
+    """Latched, it may come after the first images, or before those that --start selects."""
+    once = EPOCH + round(first_s * SECOND)
+    items = [("/cam/color/camera_info", once, info(once, WIDE))]
+    for stamp in (EPOCH, EPOCH + 50 * MS, EPOCH + 100 * MS):
+        items += depth_items(stamp, frame_id="color")
+        items.append(("/cam/color/image_raw", stamp, raw(stamp, gradient(60, 80), "rgb8", "color")))
+    path = write(tmp_path / "a.mcap", in_order(items))
+    pairs, warnings = read(path, start_s=0.05 if first_s == 0 else None)
+
+    lenses = [view and view.lens and view.lens.pinhole for _, view in pairs]
+    assert lenses == [WIDE] * (2 if first_s == 0 else 3)
+    assert not warnings
+
+
 def test_colour_without_transform_is_unused(tmp_path: Path) -> None:
     """Misplaced colours are worse than no colours."""
     ((_, view),), warnings = read(paired(tmp_path / "a.mcap"))

@@ -2,7 +2,8 @@
 
 from collections import Counter, deque
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from functools import lru_cache
+from contextlib import suppress
+from functools import cached_property, lru_cache
 from statistics import median
 from typing import Any, NamedTuple, TypeAlias
 
@@ -20,7 +21,7 @@ from shapecat.recordings.messages import MALFORMED, Message, MessageError, reaso
 from shapecat.recordings.pinhole import camera_of_info, distortion_of, is_rectified
 from shapecat.recordings.recording import Recording
 from shapecat.recordings.stamps import Clock, stamp_ns
-from shapecat.recordings.streams import Stream
+from shapecat.recordings.streams import Stream, first_message
 from shapecat.recordings.transforms.extrinsics import Extrinsics
 from shapecat.types import Camera, Frame
 
@@ -241,7 +242,7 @@ class _Partner:
                 f"{frame.topic}: no masks on colour images, since its points are not an image"
             )
         same_shape = frame.depth is not None and frame.depth.shape == shape
-        lens = self._lens
+        lens = self._first_lens if self._lens is None else self._lens
         if lens is not None and (lens.pinhole.height, lens.pinhole.width) != shape:
             size = f"{lens.pinhole.width} x {lens.pinhole.height}"
             msg = f"image of {shape[1]} x {shape[0]} pixels with camera info for {size}"
@@ -267,6 +268,15 @@ class _Partner:
         names = (name or "a frame without a name" for name in (frame.frame_id, image.frame_id))
         msg = f"no transform between {' and '.join(names)}"
         raise MessageError(msg)
+
+    @cached_property
+    def _first_lens(self) -> LensCamera | None:
+        """The lens of the first calibration in the recording, for images before it, or None."""
+        topic = self.stream.info_topic
+        info = None if topic is None else first_message(self._recording, topic)
+        with suppress(RecordingError, *MALFORMED):
+            return None if info is None else _lens_of(info, self.stream.topic)
+        return None
 
 
 def _lens(camera: Camera | None) -> LensCamera | None:
