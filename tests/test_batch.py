@@ -233,6 +233,17 @@ def test_takes_are_not_mixed_in_one_run(tmp_path: Path, gap_s: float, found: int
     assert len(find_recordings([str(tmp_path)]).kept) == found
 
 
+def test_metadata_of_a_data_set_makes_no_bag(tmp_path: Path) -> None:
+    """Its takes were mixed in one run, and takes below it, or bags of ROS 1, not found at all."""
+    takes = {tmp_path / name for name in ("monday.mcap", "tuesday.bag", "more/wednesday.mcap")}
+    (tmp_path / "more").mkdir()
+    for take in takes:
+        take.touch()
+    (tmp_path / "metadata.yaml").write_text("robot: stretch\nlicense: CC0\n")
+
+    assert {Path(source.path) for source in find_recordings([str(tmp_path)]).kept} == takes
+
+
 def test_folders_are_searched_and_bags_stay_whole(tmp_path: Path) -> None:
     """A shell expands folder/** to folders, their contents, and files of other programs."""
     bags = (

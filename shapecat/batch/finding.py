@@ -26,6 +26,8 @@ _GAP_NS = 10**10
 _PACKED = {".zst", ".zstd", ".gz", ".bz2", ".xz", ".lz4", ".zip"}
 _UNPACK = "skipped: a compressed file, unpack it first"
 _MAGIC = (b"\x89MCAP", b"#ROSBAG", b"SQLite format 3")
+_BAG_KEY = b"rosbag2_bagfile_information:"
+"""The first line of a bag's metadata.yaml; data sets have files of this name, too."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -181,7 +183,7 @@ def _is_bag(folder: Path) -> bool:
     files may be different takes, unless they follow each other in time, or one is compressed.
     """
     try:
-        if (folder / "metadata.yaml").exists():
+        if _has_bag_metadata(folder):
             return True
         paths = list(folder.iterdir())
         if any(path.is_dir() for path in paths):
@@ -203,6 +205,14 @@ def _is_bag(folder: Path) -> bool:
         or compressed
         or _adjoin([folder / name for name in in_sequence])
     )
+
+
+def _has_bag_metadata(folder: Path) -> bool:
+    try:
+        with (folder / "metadata.yaml").open("rb") as file:
+            return _BAG_KEY in file.read(1 << 12)
+    except FileNotFoundError:
+        return False
 
 
 def _adjoin(paths: Sequence[Path]) -> bool:
