@@ -63,6 +63,24 @@ def test_calibration_below_the_topic_of_its_images_is_found(tmp_path: Path) -> N
     assert colour.info_topic == "/sim/front/Scene/camera_info"
 
 
+@pytest.mark.parametrize("colour_info", ["camera_info", "color_camera_info"])
+def test_calibration_with_the_word_of_its_images_is_found(tmp_path: Path, colour_info: str) -> None:
+    """Depth silently got the intrinsics of the colour camera beside it, or none."""
+    items = depth_in("/head/depth_image", "optical")
+    items[0] = ("/head/depth_camera_info", *items[0][1:])
+    items += depth_in("/head/aligned_depth_to_color/image", "optical")[1:]
+    items += in_frame([(f"/head/{colour_info}", EPOCH, info(EPOCH))], "optical")
+    items.append(("/head/color_image", EPOCH, raw(EPOCH, gradient(), "rgb8", "optical")))
+
+    with open_recording(write(tmp_path / "a.mcap", items)) as recording:
+        aligned, depth = depth_streams(recording)
+        colour = choose_colour(recording, depth)
+    assert depth.info_topic == "/head/depth_camera_info"
+    assert aligned.info_topic == f"/head/{colour_info}"
+    assert colour is not None
+    assert colour.info_topic == f"/head/{colour_info}"
+
+
 def test_calibration_of_the_same_frame_is_found(tmp_path: Path) -> None:
     """Aligned depth has the calibration of the colour camera, which may be recorded alone."""
     items = depth_and_info("/cam/aligned_depth_to_color/image_raw", "/cam/color/camera_info")

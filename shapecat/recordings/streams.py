@@ -251,9 +251,10 @@ def _depth_stream(topic: Topic, first: Any, recording: Recording) -> Stream:
 def info_topic_of(image: str, recording: Recording, frame_id: str) -> str | None:
     """Return the calibration topic that shares the longest namespace with an image topic.
 
-    That may be the image topic itself (``depth`` with ``depth/camera_info``), as of AirSim. Without
-    a common namespace it is the only calibration of the images' frame ``frame_id``, or the
-    only one in the recording; otherwise None.
+    That may be the image topic itself (``depth`` with ``depth/camera_info``), as of AirSim. Within
+    a namespace, one with a word of the image topic (``depth_image`` with ``depth_camera_info``)
+    comes first. Without a common namespace it is the only calibration of the images' frame
+    ``frame_id``, or the only one in the recording; otherwise None.
     """
     infos = [
         topic.name
@@ -273,7 +274,9 @@ def _nearest(image: str, infos: Sequence[str]) -> str | None:
     parts = image.split("/")
     outermost = 2 if image.startswith("/") else 1  # the first part of /depth/image is empty
     for length in range(len(parts), min(len(parts) - 1, outermost) - 1, -1):
-        for name in _INFO_NAMES:
+        rest = re.sub("[^/]*_to_", "", "/".join(parts[length:]))  # depth_to_color is as color
+        own = (f"{word}_camera_info" for word in re.split("[/_]", rest))
+        for name in (*own, *_INFO_NAMES):
             sibling = "/".join([*parts[:length], name])
             if sibling in infos:
                 return sibling
