@@ -122,6 +122,25 @@ def test_only_calibration_of_another_frame_causes_warning(tmp_path: Path) -> Non
     assert "intrinsics of another camera?" in warning
 
 
+@pytest.mark.parametrize("other", ["aligned_depth_to_color/image_raw", "depth/color/points"])
+def test_stream_with_calibration_of_another_camera_is_chosen_last(
+    tmp_path: Path, other: str
+) -> None:
+    """If only the calibration of the colour camera is recorded, the aligned depth or cloud fits."""
+    items = depth_and_info("/cam/depth/image_rect_raw", "/cam/color/camera_info")
+    in_frame(items[:1], "color")
+    in_frame(items[1:], "depth")
+    if other.endswith("points"):
+        points = cloud(EPOCH, organized_points(wavy_depth()))
+        items += in_frame([(f"/cam/{other}", EPOCH, points)], "depth")
+    else:
+        items += depth_in(f"/cam/{other}", "color")[1:]
+
+    with open_recording(write(tmp_path / "a.mcap", items)) as recording:
+        assert [stream.topic for stream in choose_streams(recording)] == [f"/cam/{other}"]
+        assert not recording.warnings
+
+
 def test_confidence_map_is_not_taken_for_depth(tmp_path: Path) -> None:
     """ZED cameras publish it as 32FC1 beside the depth, whose name says that it is registered."""
     zed = "/zed/zed_node"

@@ -23,6 +23,9 @@ def describe_recording(path: Path) -> dict[str, Any]:
     with open_recording(path) as recording:
         streams = {stream.topic: stream for stream in depth_streams(recording)}
         uses = _uses(recording, streams)
+        for stream in streams.values():
+            if stream.doubt:
+                recording.warn(stream.doubt)
         start, end = recording.start_ns, recording.end_ns
         return {
             "path": str(path),

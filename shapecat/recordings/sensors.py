@@ -22,7 +22,8 @@ class Stream:
     """A topic of depth images or clouds.
 
     ``info_topic`` is the topic of a depth image's calibration, None if there is none; ``count`` is
-    the number of messages, None if unknown; ``frame_id`` is from the first message.
+    the number of messages, None if unknown; ``frame_id`` is from the first message; ``doubt`` says
+    why the calibration may be that of another camera, and is empty if nothing suggests so.
     """
 
     topic: str
@@ -31,6 +32,7 @@ class Stream:
     info_topic: str | None
     count: int | None
     frame_id: str
+    doubt: str = ""
 
     @property
     def usable(self) -> bool:

@@ -68,9 +68,10 @@ def choose_streams(recording: Recording, wanted: Sequence[str] = ()) -> tuple[St
     """Choose the streams to process: the wanted ones, or the best one of the only sensor.
 
     `by_sensor` says which streams belong to the same sensor. Within a sensor the preference is, in
-    this order: depth images, since a cloud holds the same data in eight times the bytes; images on
-    a topic named after depth; images not aligned to another camera; more messages; the alphabetical
-    order.
+    this order: no calibration of another camera; depth images, since a cloud holds the same data in
+    eight times the bytes; images on a topic named after depth; images not aligned to another
+    camera; more messages; the alphabetical order. A chosen stream whose calibration may be of
+    another camera causes a warning.
 
     Parameters
     ----------
@@ -82,8 +83,14 @@ def choose_streams(recording: Recording, wanted: Sequence[str] = ()) -> tuple[St
         nothing is wanted and there are several sensors.
     """
     streams = depth_streams(recording, wanted)
-    if wanted:
-        return _wanted(recording, streams, wanted)
+    chosen = _wanted(recording, streams, wanted) if wanted else (_best(recording, streams),)
+    for stream in chosen:
+        if stream.doubt:
+            recording.warn(stream.doubt)
+    return chosen
+
+
+def _best(recording: Recording, streams: tuple[Stream, ...]) -> Stream:
     usable = [stream for stream in streams if stream.usable]
     if not usable:
         raise NoStreamError(_why_none(recording, streams))
@@ -92,7 +99,7 @@ def choose_streams(recording: Recording, wanted: Sequence[str] = ()) -> tuple[St
         names = ", ".join(f"{s.topic} ({s.kind})" for s in usable)
         msg = f"{recording.path}: several sensors: {names}; choose with --topic"
         raise NoStreamError(msg)
-    return (min(sensors[0], key=_rank),)
+    return min(sensors[0], key=_rank)
 
 
 def _wanted(
@@ -164,10 +171,11 @@ def _warnings(recording: Recording) -> str:
     return f"; warnings: {'; '.join(texts)}" if texts else ""
 
 
-def _rank(stream: Stream) -> tuple[bool, bool, bool, int, str]:
+def _rank(stream: Stream) -> tuple[bool, bool, bool, bool, int, str]:
     aligned = any(word in stream.topic for word in ("aligned", "registered", "depth_to_"))
     unnamed = stream.kind == "depth" and "depth" not in _image_name(stream.topic)
-    return (stream.kind != "depth", unnamed, aligned, -(stream.count or 0), stream.topic)
+    kind = stream.kind != "depth"
+    return (stream.doubt != "", kind, unnamed, aligned, -(stream.count or 0), stream.topic)
 
 
 def _image_name(topic: str) -> str:
@@ -238,14 +246,15 @@ def _probe_compressed(topic: Topic, first: Any, recording: Recording) -> Stream 
 def _depth_stream(topic: Topic, first: Any, recording: Recording) -> Stream:
     frame_id = first.header.frame_id
     info = info_topic_of(topic.name, recording, frame_id)
+    doubt = ""
     if info is not None and frame_id and _nearest(topic.name, [info]) is None:
         other = _frame_of(recording, info)
         if other and other.strip("/") != frame_id.strip("/"):
-            recording.warn(
+            doubt = (
                 f"{topic.name}: the frame of its images is {frame_id}, but the only calibration, "
                 f"{info}, is of {other}: are these the intrinsics of another camera?"
             )
-    return Stream(topic.name, topic.type, "depth", info, topic.count, frame_id)
+    return Stream(topic.name, topic.type, "depth", info, topic.count, frame_id, doubt)
 
 
 def info_topic_of(image: str, recording: Recording, frame_id: str) -> str | None:
