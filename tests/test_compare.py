@@ -23,7 +23,7 @@ from scipy.optimize import linprog
 from scipy.spatial import ConvexHull, HalfspaceIntersection
 from scipy.spatial.transform import Rotation
 
-from shapecat.errors import RecordingError
+from shapecat.errors import OutputError, RecordingError
 from shapecat.evaluation.comparison import comparing
 from shapecat.evaluation.comparison.comparing import (
     Comparison,
@@ -964,6 +964,25 @@ def test_merged_tracks_in_one_frame_are_one_object(run: Path) -> None:
     np.testing.assert_allclose(joined.box.center, [0.15, 0, 1], atol=1e-6)
     np.testing.assert_allclose(sorted(joined.box.size), [0.2, 0.2, 0.3], atol=1e-6)
     np.testing.assert_allclose(joined.posterior, [0.1, 0.45, 0.45], atol=1e-6)
+
+
+def test_detection_without_track_keeps_its_place(run: Path) -> None:
+    """Tables of differences list objects in the order of the detections."""
+    path = run / "tracks.parquet"
+    rows = pq.read_table(path).to_pylist()
+    pq.write_table(pa.Table.from_pylist(rows[1:], TRACKS), path)
+    (_, _, first), *_ = run_labellings(read_complete(run))
+
+    assert [(item.track, item.category) for item in first.items] == [(None, "cup"), (2, "can")]
+
+
+def test_track_of_missing_detection_is_refused(run: Path) -> None:
+    """Its object would count as missed."""
+    path = run / "detections.parquet"
+    pq.write_table(pq.read_table(path).slice(1), path)
+
+    with pytest.raises(OutputError, match="tracks do not fit its detections"):
+        list(run_labellings(read_complete(run)))
 
 
 def test_coco_masks_are_read_in_all_forms(shapecat: Run, run: Path) -> None:

@@ -554,7 +554,7 @@ def write_run(folder: Path) -> None:
                         on_candidate=None,
                         support_m=0.0,
                         touches_border=k == 1,
-                        occluded=False,
+                        occluded=k == 1,
                     ),
                     gas,
                     np.zeros(2),
@@ -597,7 +597,8 @@ def test_merged_parts_of_one_frame_become_one_object(tmp_path: Path) -> None:
     assert np.allclose(np.sort(item.box.size), [0.1, 0.2, 0.3], atol=1e-5)
     assert item.height_m == pytest.approx(0.1, abs=1e-5)
     assert item.gas.edges.tolist() == [[0, 1], [1, 2], [3, 4], [4, 5]]
-    assert item.touches_border
+    assert (item.touches_border, item.occluded) == (True, True)  # only the second part is
+    assert item.detections == (0, 1)
 
 
 def test_new_categories_come_last(tmp_path: Path) -> None:

@@ -54,7 +54,7 @@ from shapecat.outputs.review.scenes import choose_scenes, with_clouds
 from shapecat.outputs.scene_tree import _apply_labels, _candidate, _described, _topic
 from shapecat.recordings.messages import Topic
 from shapecat.runs.labels.meaning import TrackLabel, _slips
-from shapecat.runs.shown import ShownDetection
+from shapecat.runs.shown import ShownTracks
 from shapecat.runs.tables.masks import read_nearest_masks
 from shapecat.runs.tables.reading import Key
 from shapecat.runs.tables.schemas import FRAMES
@@ -210,9 +210,8 @@ def test_simultaneous_images_of_two_cameras_are_annotated(
         (("/d", k), ImageMasks(topic, stamp, stamp + 1, "c", 40, height, {0: (3, 4, 7, 9)}, {}))
         for k, (topic, stamp, height) in enumerate(images)
     ]
-    item = ShownDetection(0, TrackLabel(6, "cup", 0.8), 0)
     patch_masks(monkeypatch, masks, [5] * len(masks))
-    tracks = SimpleNamespace(of=lambda _key: [item])
+    tracks = SimpleNamespace(objects=lambda _key: {TrackLabel(6, "cup", 0.8): {0: 0}})
     place = "shapecat.outputs.annotation.image_annotations.ShownTracks.read"
     monkeypatch.setattr(place, lambda _folder, _labels: tracks)
     frames = list(read_image_frames(Path(), {}))
@@ -228,12 +227,14 @@ def test_merged_track_has_one_box_on_image(
     boxes = {0: (3, 4, 7, 9), 1: (20, 1, 2, 3), 2: (5, 11, 12, 6)}
     masks = ImageMasks("/l", 5, 6, "c", 40, 30, boxes, {})
     whole, other = TrackLabel(6, "cup", 0.8), TrackLabel(9, "can", 0.7)
-    items = [
-        ShownDetection(k, label, 0) for k, label in enumerate((whole, other, whole, whole))
-    ]  # the last one has no mask
+    labels = {6: whole, 9: other, 11: whole, 12: whole}
     place = "shapecat.outputs.annotation.image_annotations"
     monkeypatch.setattr(f"{place}.read_nearest_masks", lambda _folder: iter([(("/d", 0), masks)]))
-    tracks = SimpleNamespace(of=lambda _key: items)
+    none = np.zeros((4, 0))
+    numbers = np.arange(4)  # the last one has no mask
+    tracks = ShownTracks(
+        {("/d", 0): slice(0, 4)}, numbers, np.array([11, 9, 6, 12]), labels, {}, none, none
+    )
     monkeypatch.setattr(f"{place}.ShownTracks.read", lambda _folder, _labels: tracks)
     (frame,) = read_image_frames(Path(), {})
 

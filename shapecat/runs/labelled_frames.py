@@ -66,7 +66,7 @@ def read_labelled_frames(folder: Path, labels: Mapping[int, TrackLabel]) -> Iter
         for row in frames.to_pylist():
             key = (row["topic"], row["frame"])
             found = {row["detection"]: row for row in objects.get(key, [])}
-            if any(item.detection not in found for item in shown.of(key)):
+            if any(rows.keys() - found.keys() for rows in shown.objects(key).values()):
                 raise misfit(folder)
             frame = _labelled_frame(row, found, supports.get(key, []), shown)
             yield replace(frame, masks=masks.of(key))
@@ -119,12 +119,13 @@ def _labelled_frame(
     pose = None
     if row["fixed_translation"] is not None:
         pose = Pose(np.reshape(row["fixed_rotation"], (3, 3)), row["fixed_translation"])
-    parts: dict[int, list[LabelledObject]] = {}
-    for item in shown.of(key):
-        causal = shown.causal[item.row]
-        full = shown.full[item.row]
-        part = _labelled_object(found[item.detection], causal, item.label, full)
-        parts.setdefault(item.label.track, []).append(part)
+    objects = [
+        [
+            _labelled_object(found[number], label, shown.causal[row], shown.full[row])
+            for number, row in rows.items()
+        ]
+        for label, rows in shown.objects(key).items()
+    ]
     return LabelledFrame(
         topic=row["topic"],
         index=row["frame"],
@@ -133,7 +134,7 @@ def _labelled_frame(
         frame_id=row["frame_id"],
         fixed_from_sensor=pose,
         planes=tuple(plane_of(plane) for plane in planes),
-        objects=tuple(_join(seen, row["up"]) for seen in parts.values()),
+        objects=tuple(_join(parts, row["up"]) for parts in objects),
         ended=shown.ended.get(key, ()),
         seconds=dict(zip(row["stages"], row["seconds"], strict=True)),
         up=row["up"],
@@ -153,7 +154,7 @@ def plane_of(row: Mapping[str, Any]) -> Plane:
 
 
 def _labelled_object(
-    row: Mapping[str, Any], causal: F4, label: TrackLabel, full: F4
+    row: Mapping[str, Any], label: TrackLabel, causal: F4, full: F4
 ) -> LabelledObject:
     return LabelledObject(
         track=label.track,

@@ -4,7 +4,7 @@ from collections.abc import Container, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from itertools import accumulate
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any
 
 import numpy as np
 import pyarrow as pa
@@ -40,14 +40,6 @@ __all__ = ["ShownTracks", "misfit", "read_shown_frames"]
 _AT_ONCE = 8  # row groups of boxes in memory
 _NO_ROWS = slice(0, 0)
 _NONE = np.zeros((0, 0), np.float32)
-
-
-class ShownDetection(NamedTuple):
-    """A detection to show: its number in its frame, its label, and its row in `ShownTracks`."""
-
-    detection: int
-    label: TrackLabel
-    row: int
 
 
 @dataclass(frozen=True)
@@ -100,11 +92,18 @@ class ShownTracks:
                 _full(file, rows),
             )
 
-    def of(self, key: Key) -> Iterator[ShownDetection]:
-        """Yield the detections to show in a frame, by number."""
+    def objects(self, key: Key) -> dict[TrackLabel, dict[int, int]]:
+        """Return the objects of a frame by label: the row of each of their detections, by number.
+
+        An object has several detections where a person merged their tracks. Objects are in the
+        order of their first detections.
+        """
         rows = self.frames.get(key, _NO_ROWS)
-        for row in range(rows.start, rows.stop):
-            yield ShownDetection(int(self.detections[row]), self.labels[int(self.tracks[row])], row)
+        found: dict[TrackLabel, dict[int, int]] = {}
+        pairs = zip(self.detections[rows].tolist(), self.tracks[rows].tolist(), strict=True)
+        for row, (number, track) in enumerate(pairs, rows.start):
+            found.setdefault(self.labels[track], {})[number] = row
+        return found
 
 
 def read_shown_frames(
@@ -125,15 +124,12 @@ def read_shown_frames(
     pose_columns = ("frame_translation", "frame_rotation")
     wanted = (*plain_columns, "up", *pose_columns)
     found = ("topic", "frame", "detection", "center", "size", "orientation")
-    merged = len({label.track for label in labels.values()}) < len(labels)
     tables = {"frames": wanted, "detections": found}
     for frames, detections in read_together(folder, tables, at_once=_AT_ONCE):
         plain = [frames[name].to_pylist() for name in plain_columns]
         keys = list(zip(*plain[:2], strict=True))
-        boxes = _boxes(folder, keys, shown, detections, visible=visible)
-        if merged:
-            ups = numbers(frames["up"]).reshape(-1, 3)
-            boxes = map(_joined, boxes, ups)
+        ups = numbers(frames["up"]).reshape(-1, 3)
+        boxes = _boxes(folder, keys, ups, shown, detections, visible=visible)
         if frames["frame_rotation"].null_count < len(frames):
             poses = (frames[name].to_pylist() for name in pose_columns)
             boxes = map(_in_named_frame, boxes, *poses)
@@ -148,9 +144,15 @@ def misfit(folder: Path) -> OutputError:
 
 
 def _boxes(
-    folder: Path, keys: Sequence[Key], shown: ShownTracks, detections: pa.Table, *, visible: bool
+    folder: Path,
+    keys: Sequence[Key],
+    ups: F4,
+    shown: ShownTracks,
+    detections: pa.Table,
+    *,
+    visible: bool,
 ) -> Iterator[tuple[ShownBox, ...]]:
-    """Yield the boxes to show in each of some frames."""
+    """Yield the boxes to show in each of some frames, given the up direction in each."""
     all_rows, places = frame_rows(detections), _places(detections)
     spans = [shown.frames.get(key, _NO_ROWS) for key in keys]
     of_frames = [all_rows.get(key, _NO_ROWS) for key in keys]
@@ -165,9 +167,21 @@ def _boxes(
     if not visible:
         full = np.concatenate([shown.full[span] for span in spans])
         places = np.where(np.isnan(full), places, full)
-    for span, stop in zip(spans, accumulate(counts), strict=True):
-        labels = [shown.labels[track] for track in shown.tracks[span].tolist()]
-        yield tuple(map(_box, labels, places[stop - len(labels) : stop].tolist()))
+    for key, up, span, stop in zip(keys, ups, spans, accumulate(counts), strict=True):
+        objects, here = shown.objects(key), places[stop - span.stop + span.start : stop]
+        if len(objects) < len(here):
+            parts = (np.subtract([*rows.values()], span.start) for rows in objects.values())
+            here = np.array([_join(here[rows], up) for rows in parts])
+        yield tuple(map(_box, objects, here.tolist()))
+
+
+def _join(places: F8, up: F4) -> F8:
+    """Return the box (10,) around the boxes (n, 10) of an object."""
+    place: F8 = places[0]
+    if len(places) > 1:
+        box = box_around((Box(row[:3], row[3:6], row[6:]) for row in places), up)
+        place = np.concatenate([box.center, box.size, box.orientation])
+    return place
 
 
 def _box(label: TrackLabel, row: Sequence[float]) -> ShownBox:
@@ -199,26 +213,6 @@ def _places(table: pa.Table) -> F8:
     widths = {"center": 3, "size": 3, "orientation": 4}
     columns = [numbers(table[name]).reshape(-1, width) for name, width in widths.items()]
     return np.hstack(columns).astype(np.float64)
-
-
-def _joined(boxes: Sequence[ShownBox], up: F4) -> tuple[ShownBox, ...]:
-    """Join the boxes of each merged track into one."""
-    parts: dict[int, list[ShownBox]] = {}
-    for box in boxes:
-        parts.setdefault(box.track, []).append(box)
-    return tuple(_join(some, up) for some in parts.values())
-
-
-def _join(parts: Sequence[ShownBox], up: F4) -> ShownBox:
-    """Join the boxes of a merged track in one frame."""
-    if len(parts) == 1:
-        return parts[0]
-    box = box_around((Box(*map(np.array, part[3:])) for part in parts), up)
-    return parts[0]._replace(
-        center=tuple(box.center.tolist()),
-        size=tuple(box.size.tolist()),
-        orientation=tuple(box.orientation.tolist()),
-    )
 
 
 def _in_named_frame(

@@ -2,17 +2,13 @@
 
 from abc import ABC, abstractmethod
 from collections import Counter
-from collections.abc import Iterable, Iterator, Mapping, Sequence
-from dataclasses import dataclass, replace
+from collections.abc import Iterable, Mapping
+from dataclasses import dataclass
 from pathlib import Path
 from typing import TypeVar
 
-import numpy as np
-from numpy.typing import ArrayLike
-
 from shapecat.arrays import F4, U4, Bool
 from shapecat.errors import RecordingError
-from shapecat.geometry import box_around
 from shapecat.runs.tables.reading import Key
 from shapecat.types import Box
 
@@ -23,7 +19,6 @@ __all__ = [
     "Reference",
     "find_frame",
     "index_frames",
-    "join_merged",
     "numbering_notes",
 ]
 
@@ -111,33 +106,6 @@ def numbering_notes(other: Reference, start_s: float | None) -> list[str]:
         "numbered from the start of the recording are of other frames, and need timestamps."
     )
     return [note]
-
-
-def join_merged(items: Iterable[LabelledItem], up: ArrayLike) -> Iterator[LabelledItem]:
-    """Join the objects of a run's frame that have the same track, since a person merged theirs.
-
-    Parameters
-    ----------
-    up : (3,) up direction in the sensor frame.
-    """
-    parts: dict[tuple[int | None, int], list[LabelledItem]] = {}
-    for k, item in enumerate(items):
-        parts.setdefault((item.track, k if item.track is None else 0), []).append(item)
-    return (_join(some, up) for some in parts.values())
-
-
-def _join(parts: Sequence[LabelledItem], up: ArrayLike) -> LabelledItem:
-    """Join the parts of an object; the largest one gives the category of the single view."""
-    if len(parts) == 1:
-        return parts[0]
-    masks = [part.pixels for part in parts if part.pixels is not None]
-    posteriors = [part.posterior for part in parts if part.posterior is not None]
-    return replace(
-        parts[int(np.argmax([mask.size for mask in masks]))],
-        pixels=np.unique(np.concatenate(masks)),
-        box=box_around([part.box for part in parts if part.box is not None], up),
-        posterior=np.mean(posteriors, axis=0),
-    )
 
 
 def index_frames(path: Path, frames: Iterable[tuple[Place, _Frame]]) -> dict[Place, _Frame]:

@@ -5,7 +5,7 @@ import zipfile
 from collections import Counter
 from collections.abc import Container, Iterator, Mapping, Sequence
 from pathlib import Path
-from typing import IO, Any, cast
+from typing import IO, Any
 
 import numpy as np
 
@@ -17,16 +17,15 @@ from shapecat.evaluation.comparison.labellings import (
     Reference,
     find_frame,
     index_frames,
-    join_merged,
 )
 from shapecat.evaluation.comparison.references_coco import CocoLabels
 from shapecat.evaluation.comparison.references_kitti import KittiLabels
 from shapecat.evaluation.dataset import DAMAGED
+from shapecat.geometry import box_around
 from shapecat.runs.finished import FinishedRun, read_finished
 from shapecat.runs.folder import read_run
 from shapecat.runs.labelled_frames import rows_by_frame
-from shapecat.runs.labels.meaning import TrackLabel
-from shapecat.runs.shown import ShownTracks
+from shapecat.runs.shown import ShownTracks, misfit
 from shapecat.runs.tables.reading import Key, read_row_groups, read_stamps, read_together
 from shapecat.types import Box
 
@@ -265,16 +264,22 @@ def run_labellings(finished: FinishedRun) -> Iterator[tuple[Key, Mapping[str, An
     shown = ShownTracks.read(folder, finished.labels)
     tables = {"frames": ["topic", "frame", "stamp_ns", "up"], "detections": columns}
     for frames, detections in read_together(folder, tables):
-        found = rows_by_frame(detections)
+        by_frame = rows_by_frame(detections)
         for row in frames.to_pylist():
             key = (row["topic"], row["frame"])
-            tracked = {item.detection: (item.label, shown.full[item.row]) for item in shown.of(key)}
-            items = (
-                _item(r, *tracked.get(r["detection"], (None, None)))
-                for r in found.get(key, [])
-                if (*key, r["detection"]) not in deleted
-            )
-            yield key, row, Labelling(tuple(join_merged(items, row["up"])))
+            rest = {r["detection"]: r for r in by_frame.get(key, [])}
+            items = {}
+            for label, rows in shown.objects(key).items():
+                if rows.keys() - rest.keys():
+                    raise misfit(folder)
+                parts = [rest.pop(number) for number in rows]
+                boxes = list(map(_box, parts, shown.full[[*rows.values()]]))
+                items[min(rows)] = _item(label, parts, boxes, row["up"])
+            for number, r in rest.items():
+                if (*key, number) not in deleted:
+                    untracked = (None, r["category"], r["confidence"])
+                    items[number] = _item(untracked, [r], [_box(r)], row["up"])
+            yield key, row, Labelling(tuple(items[number] for number in sorted(items)))
 
 
 def _deleted(folder: Path, labels: Container[int]) -> set[tuple[str, int, int]]:
@@ -287,21 +292,27 @@ def _deleted(folder: Path, labels: Container[int]) -> set[tuple[str, int, int]]:
     return found
 
 
-def _box(row: Mapping[str, Any], full: F8 | None) -> Box:
+def _box(row: Mapping[str, Any], full: F8 | None = None) -> Box:
     """Return the full box of an object, or the visible one if the full one is unknown."""
     if full is None or np.isnan(full[0]):
         return Box(row["center"], row["size"], row["orientation"])
     return Box(full[:3], full[3:6], full[6:])
 
 
-def _item(row: Mapping[str, Any], label: TrackLabel | None, full: F8 | None) -> LabelledItem:
-    """Return a detection with the final label of its track, if it has one."""
+def _item(
+    label: tuple[int | None, str, float],
+    rows: Sequence[Mapping[str, Any]],
+    boxes: Sequence[Box],
+    up: Sequence[float],
+) -> LabelledItem:
+    """Return the object of some detections; the largest gives the category of the single view."""
+    track, category, confidence = label
     return LabelledItem(
-        track=None if label is None else label.track,
-        category=row["category"] if label is None else label.category,
-        pixels=cast("Any", row["indices"]).astype(np.int64),
-        box=_box(row, full),
-        confidence=row["confidence"] if label is None else label.confidence,
-        view_category=row["category"],
-        posterior=row["posterior"],
+        track=track,
+        category=category,
+        pixels=np.unique(np.concatenate([row["indices"] for row in rows])).astype(np.int64),
+        box=boxes[0] if len(boxes) == 1 else box_around(boxes, up),
+        confidence=confidence,
+        view_category=max(rows, key=lambda row: len(row["indices"]))["category"],
+        posterior=np.mean([row["posterior"] for row in rows], axis=0),
     )

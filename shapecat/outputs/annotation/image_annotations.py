@@ -62,15 +62,10 @@ def read_image_frames(folder: Path, labels: Mapping[int, TrackLabel]) -> Iterato
     for key, masks in read_nearest_masks(folder):
         if masks.height <= 1:
             continue
-        parts: dict[int, list[int]] = {}
-        named: dict[int, TrackLabel] = {}
-        for item in shown.of(key):
-            parts.setdefault(item.label.track, []).append(item.detection)
-            named[item.label.track] = item.label
         boxes = [
-            ImageBox(track, named[track].category, named[track].confidence, box)
-            for track, detections in parts.items()
-            if (box := box_of(masks, detections)) is not None
+            ImageBox(*label, box)
+            for label, rows in shown.objects(key).items()
+            if (box := box_of(masks, tuple(rows))) is not None
         ]
         image = (masks.topic, masks.stamp_ns, masks.log_time_ns, masks.frame_id)
         yield ImageFrame(*image, tuple(boxes))
