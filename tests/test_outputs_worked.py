@@ -755,10 +755,11 @@ def test_scene_node_text_has_track_size_and_flags() -> None:
         for changes in ({}, {"touches_border": True, "occluded": True}, {"occluded": True})
     ]
     scene = Scene(np.array([0, 0, 1.0]), (plane,), tuple(found))
-    item: Any = SimpleNamespace(category="cup", track=6, full=None, box=found[0].box)
-    texts = [_described(scene, Node("object", k), {0: item, 1: item}) for k in range(3)]
-    item.full = replace(found[0].box, size=np.array([0.14, 0.08, 0.21]))
-    texts.append(_described(scene, Node("object", 0), {0: item}))
+    item = labelled_object(6, [7, 8], box=found[0].box)
+    items = {0: item, 1: replace(item, touches_border=True, occluded=True)}
+    texts = [_described(scene, Node("object", k), items) for k in range(3)]
+    whole = replace(found[0].box, size=np.array([0.14, 0.08, 0.21]))
+    texts.append(_described(scene, Node("object", 0), {0: replace(item, full=whole)}))
 
     assert _described(scene, Node("plane", 0), {}) == "plane 0: 0.73 m high, 0.57 m2"
     assert texts == [

@@ -14,7 +14,7 @@ from shapecat.runs.labelled_frames import plane_of
 from shapecat.runs.tables.reading import keys_of, read_row_groups
 from shapecat.types import Box, Candidate, LabelledObject, Plane, Scene
 
-__all__ = ["describe_scene", "read_scene"]
+__all__ = ["describe_scene"]
 
 
 def describe_scene(folder: Path, frame: int, *, topic: str | None = None) -> str:
@@ -36,12 +36,12 @@ def describe_scene(folder: Path, frame: int, *, topic: str | None = None) -> str
     labelled = next(f for f in finished.frames() if (f.topic, f.index) == (topic, frame))
     rows = _rows(folder, "tracks", topic, frame, ["topic", "frame", "detection", "track"])
     deleted = {row["detection"] for row in rows if row["track"] not in finished.labels}
-    scene = read_scene(folder, topic, frame)
+    scene = _read_scene(folder, topic, frame)
     scene, objects = _apply_labels(scene, labelled.objects, deleted)
     return format_tree(scene, lambda node: _described(scene, node, objects))
 
 
-def read_scene(folder: Path, topic: str, frame: int) -> Scene:
+def _read_scene(folder: Path, topic: str, frame: int) -> Scene:
     """Return the planes and objects of a frame as detection found them.
 
     Raises
@@ -147,25 +147,16 @@ def _apply_labels(
         return float(scene.up @ box.center - box.size[2] / 2)
 
     def changed(n: int) -> Candidate:
-        """Return a kept candidate with the extent of its object, on what lies below all parts."""
+        """Return a kept candidate with the box of its object, on what lies below all parts."""
         base = scene.candidates[min(parts[n], key=bottom)]
         while (below := base.on_candidate) is not None and index.get(below, index[n]) == index[n]:
             base = scene.candidates[below]
-        found = replace(
+        return replace(
             scene.candidates[n],
+            box=(owner.get(n) or scene.candidates[n]).box,
             plane=base.plane,
             on_candidate=None if below is None else index[below],
             support_m=base.support_m,
-        )
-        item = owner.get(n)
-        if item is None:
-            return found
-        return replace(
-            found,
-            indices=item.indices,
-            box=item.box,
-            touches_border=item.touches_border,
-            occluded=item.occluded,
         )
 
     candidates = tuple(changed(n) for n in kept)
@@ -176,14 +167,11 @@ def _described(scene: Scene, node: Node, objects: Mapping[int, LabelledObject]) 
     if node.kind == "plane":
         plane = scene.planes[node.index]
         return f"plane {node.index}: {plane.height_m:.2f} m high, {plane.area_m2:.2f} m2"
-    item, shown = scene.candidates[node.index], objects.get(node.index)
-    name = "object in no track" if shown is None else f"{shown.category} #{shown.track}"
-    box = item.box if shown is None else shown.full or shown.box
-    flags = [
-        text
-        for text, flag in (("cut by the border", item.touches_border), ("occluded", item.occluded))
-        if flag
-    ]
+    item = objects.get(node.index)
+    name = "object in no track" if item is None else f"{item.category} #{item.track}"
+    seen = item or scene.candidates[node.index]
+    box = seen.box if item is None else item.full or item.box
     x, y, z = (100 * float(side) for side in box.size)
-    note = f", {', '.join(flags)}" if flags else ""
-    return f"{name}: {x:.0f} x {y:.0f} x {z:.0f} cm{note}"
+    border = ", cut by the border" if seen.touches_border else ""
+    occluded = ", occluded" if seen.occluded else ""
+    return f"{name}: {x:.0f} x {y:.0f} x {z:.0f} cm{border}{occluded}"
