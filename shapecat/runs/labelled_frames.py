@@ -121,7 +121,7 @@ def _labelled_frame(
         pose = Pose(np.reshape(row["fixed_rotation"], (3, 3)), row["fixed_translation"])
     objects = [
         [
-            _labelled_object(found[number], label, shown.causal[row], shown.full[row])
+            _labelled_object(found[number], label, shown.causal[row], shown.full_box(row))
             for number, row in rows.items()
         ]
         for label, rows in shown.objects(key).items()
@@ -154,7 +154,7 @@ def plane_of(row: Mapping[str, Any]) -> Plane:
 
 
 def _labelled_object(
-    row: Mapping[str, Any], label: TrackLabel, causal: F4, full: F4
+    row: Mapping[str, Any], label: TrackLabel, causal: F4, full: Box | None
 ) -> LabelledObject:
     return LabelledObject(
         track=label.track,
@@ -169,7 +169,7 @@ def _labelled_object(
         touches_border=row["touches_border"],
         occluded=row["occluded"],
         detections=(row["detection"],),
-        full=None if np.isnan(full[0]) else Box(full[:3], full[3:6], full[6:]),
+        full=full,
     )
 
 

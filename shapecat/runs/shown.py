@@ -105,6 +105,11 @@ class ShownTracks:
             found.setdefault(self.labels[track], {})[number] = row
         return found
 
+    def full_box(self, row: int) -> Box | None:
+        """Return the full box of a row; None if unknown."""
+        full = self.full[row]
+        return None if np.isnan(full[0]) else Box(full[:3], full[3:6], full[6:])
+
 
 def read_shown_frames(
     folder: Path, labels: Mapping[int, TrackLabel], *, visible: bool = False

@@ -9,7 +9,7 @@ from typing import IO, Any
 
 import numpy as np
 
-from shapecat.arrays import F8, U1
+from shapecat.arrays import U1
 from shapecat.errors import OutputError, RecordingError
 from shapecat.evaluation.comparison.labellings import (
     LabelledItem,
@@ -273,12 +273,12 @@ def run_labellings(finished: FinishedRun) -> Iterator[tuple[Key, Mapping[str, An
                 if rows.keys() - rest.keys():
                     raise misfit(folder)
                 parts = [rest.pop(number) for number in rows]
-                boxes = list(map(_box, parts, shown.full[[*rows.values()]]))
-                items[min(rows)] = _item(label, parts, boxes, row["up"])
+                full = [shown.full_box(k) for k in rows.values()]
+                items[min(rows)] = _item(label, parts, full, row["up"])
             for number, r in rest.items():
                 if (*key, number) not in deleted:
                     untracked = (None, r["category"], r["confidence"])
-                    items[number] = _item(untracked, [r], [_box(r)], row["up"])
+                    items[number] = _item(untracked, [r], [None], row["up"])
             yield key, row, Labelling(tuple(items[number] for number in sorted(items)))
 
 
@@ -292,21 +292,18 @@ def _deleted(folder: Path, labels: Container[int]) -> set[tuple[str, int, int]]:
     return found
 
 
-def _box(row: Mapping[str, Any], full: F8 | None = None) -> Box:
-    """Return the full box of an object, or the visible one if the full one is unknown."""
-    if full is None or np.isnan(full[0]):
-        return Box(row["center"], row["size"], row["orientation"])
-    return Box(full[:3], full[3:6], full[6:])
-
-
 def _item(
     label: tuple[int | None, str, float],
     rows: Sequence[Mapping[str, Any]],
-    boxes: Sequence[Box],
+    full: Sequence[Box | None],
     up: Sequence[float],
 ) -> LabelledItem:
     """Return the object of some detections; the largest gives the category of the single view."""
     track, category, confidence = label
+    boxes = [
+        whole or Box(row["center"], row["size"], row["orientation"])
+        for row, whole in zip(rows, full, strict=True)
+    ]
     return LabelledItem(
         track=track,
         category=category,
