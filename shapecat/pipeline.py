@@ -235,26 +235,26 @@ def _write_review(folder: Path, recording: Recording, run: RunInfo, observe: Obs
     from shapecat.runs.tables.placed_frames import streams_with_poses  # noqa: PLC0415  the same
 
     labels = read_labels(folder / "tracks.csv", run["model"]["categories"])
-    shown = read_labelled_frames(folder, labels)
-    shown = observed(shown, "review", run["counts"]["frames"], observe)
-    frames = with_clouds(shown, recording, run, streams_with_poses(folder))
+    labelled = read_labelled_frames(folder, labels)
+    labelled = observed(labelled, "review", run["counts"]["frames"], observe)
+    frames = with_clouds(labelled, recording, run, streams_with_poses(folder))
     write_review(folder / "review.rrd", frames, name=recording.path.name, run=run, labels=labels)
 
 
 def _write_mcap(folder: Path, recording: Recording, run: RunInfo, observe: Observer) -> None:
     from shapecat.outputs.annotation.annotated_mcap import write_annotated  # noqa: PLC0415  on first use
     from shapecat.outputs.annotation.image_annotations import read_image_frames  # noqa: PLC0415  the same
-    from shapecat.runs.shown import read_shown_frames  # noqa: PLC0415  the same
+    from shapecat.runs.labelled_tracks import read_annotation_frames  # noqa: PLC0415  the same
 
     settings = run["settings"]["outputs"]
     labels = read_labels(folder / "tracks.csv", run["model"]["categories"])
     topics = list(dict.fromkeys(run.get("color", {}).values()))
     boxes = run.get("boxes", settings["boxes"])
-    shown = read_shown_frames(folder, labels, visible=boxes == "visible")
+    frames = read_annotation_frames(folder, labels, visible=boxes == "visible")
     write_annotated(
         recording,
         folder / "annotated.mcap",
-        observed(shown, "annotate", run["counts"]["frames"], observe),
+        observed(frames, "annotate", run["counts"]["frames"], observe),
         run=run,
         markers=settings["markers"],
         images=read_image_frames(folder, labels) if topics else (),

@@ -37,7 +37,7 @@ from shapecat.recordings.containers.mcap_records import (
     read_chunk_index,
     write_chunk_index,
 )
-from shapecat.types import CATEGORIES, ShownBox, ShownFrame
+from shapecat.types import CATEGORIES, AnnotationBox, AnnotationFrame
 from tests.mcap_files import mcap_writer, read_ros, summary_of
 from tests.test_recordings import QOS
 
@@ -69,9 +69,11 @@ def test_copying_a_shrinking_recording_fails(
         copy_bytes(source, target, 4000)
 
 
-def shown_frame(index: int, tracks: list[int], *, ended: tuple[int, ...] = ()) -> ShownFrame:
+def annotation_frame(
+    index: int, tracks: list[int], *, ended: tuple[int, ...] = ()
+) -> AnnotationFrame:
     objects = tuple(
-        ShownBox(
+        AnnotationBox(
             track=track,
             category="cup",
             confidence=0.97,
@@ -81,7 +83,7 @@ def shown_frame(index: int, tracks: list[int], *, ended: tuple[int, ...] = ()) -
         )
         for track in tracks
     )
-    return ShownFrame(
+    return AnnotationFrame(
         topic="/points",
         index=index,
         stamp_ns=EPOCH + index * SECOND // 10,
@@ -92,7 +94,11 @@ def shown_frame(index: int, tracks: list[int], *, ended: tuple[int, ...] = ()) -
     )
 
 
-FRAMES = [shown_frame(0, [3, 4]), shown_frame(1, [4]), shown_frame(2, [], ended=(4,))]
+FRAMES = [
+    annotation_frame(0, [3, 4]),
+    annotation_frame(1, [4]),
+    annotation_frame(2, [], ended=(4,)),
+]
 
 
 def string(value: str) -> bytes:
@@ -506,7 +512,7 @@ def test_failure_leaves_no_file(tmp_path: Path) -> None:
     source = write_mcap(tmp_path / "a.mcap")
     target = tmp_path / "out.mcap"
 
-    def failing() -> Iterator[ShownFrame]:
+    def failing() -> Iterator[AnnotationFrame]:
         yield from FRAMES
         raise OSError(28, os.strerror(28))
 

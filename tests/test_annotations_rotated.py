@@ -23,7 +23,7 @@ from shapecat.outputs.colours import colour_of
 from shapecat.outputs.review.shapes import _above
 from shapecat.recordings import open_recording
 from shapecat.recordings.decoding.protobuf import message_decoder
-from shapecat.types import Box, ShownBox, ShownFrame
+from shapecat.types import AnnotationBox, AnnotationFrame, Box
 from tests.mcap_files import read_ros, summary_of
 from tests.test_annotated_mcap import EPOCH, write_mcap
 
@@ -31,8 +31,8 @@ SECOND = 10**9
 STAMP = 1_700_000_123 * SECOND + 456_789_012
 ROTATION = Rotation.from_euler("zyx", [0.9, -0.5, 2.4])
 CENTER, SIZE = (0.31, -0.22, 1.17), (0.06, 0.11, 0.19)
-BOX = ShownBox(7, "bowl", 0.625, CENTER, SIZE, tuple(ROTATION.as_quat().tolist()))
-FRAME = ShownFrame("/points", 4, STAMP, STAMP + 11, "optical", (BOX,), (5, 6))
+BOX = AnnotationBox(7, "bowl", 0.625, CENTER, SIZE, tuple(ROTATION.as_quat().tolist()))
+FRAME = AnnotationFrame("/points", 4, STAMP, STAMP + 11, "optical", (BOX,), (5, 6))
 ANNOTATION = Annotation(FRAME, 2 * SECOND + 250_000_000, (5, 6))
 ABOVE = CENTER + ROTATION.apply([0, 0, SIZE[2] / 2 + 0.03])
 
@@ -173,7 +173,7 @@ def test_markers_match_boxes(encoding: str) -> None:
     assert_allclose(numbers(text.color, "rgba"), [*colour, 1.0], atol=1e-6)
 
 
-def annotated(folder: Path, frames: Iterable[ShownFrame], *, markers: bool = False) -> Path:
+def annotated(folder: Path, frames: Iterable[AnnotationFrame], *, markers: bool = False) -> Path:
     """Return a recording with annotations."""
     target = folder / "out.mcap"
     with open_recording(write_mcap(folder / "a.mcap")) as recording:
@@ -269,9 +269,9 @@ def test_statistics_cover_times_of_all_messages(
 def test_object_visible_to_another_sensor_is_not_deleted(tmp_path: Path) -> None:
     """Two sensors share the tracks of a scene: the last frame with an object ends it."""
 
-    def frame_of(topic: str, k: int, *, visible: bool) -> ShownFrame:
+    def frame_of(topic: str, k: int, *, visible: bool) -> AnnotationFrame:
         boxes = (BOX,) if visible else ()
-        return ShownFrame(topic, k, STAMP + k, STAMP + k, "optical", boxes, ())
+        return AnnotationFrame(topic, k, STAMP + k, STAMP + k, "optical", boxes, ())
 
     frames = [
         frame_of("/a", 0, visible=True),

@@ -203,7 +203,7 @@ def test_colours_of_unorganized_cloud_are_not_annotated(
     ]
     monkeypatch.setattr(image_annotations, "read_nearest_masks", lambda *_: iter(masks))
     nothing = SimpleNamespace(read=lambda *_: SimpleNamespace(objects=lambda _: {}))
-    monkeypatch.setattr(image_annotations, "ShownTracks", nothing)
+    monkeypatch.setattr(image_annotations, "LabelledTracks", nothing)
 
     assert [frame.stamp_ns for frame in read_image_frames(Path(), {})] == [8]
 

@@ -17,11 +17,11 @@ from shapecat.outputs.wording import safe_name
 from shapecat.pipeline import annotate_again
 from shapecat.runs.finished import FinishedRun
 from shapecat.runs.labelled_frames import read_labelled_frames
+from shapecat.runs.labelled_tracks import _ended
 from shapecat.runs.labels.corrections import _given, adopt_labels, read_labels, relabel
 from shapecat.runs.labels.meaning import TrackLabel
 from shapecat.runs.labels.track_table import read_track_table
 from shapecat.runs.perceive.perceived import FrameRow, PerceptionTables
-from shapecat.runs.shown import _ended
 from shapecat.runs.tracks import _CSV, _write_csv
 from shapecat.types import Box, Candidate, Detection, NeuralGas, Perception, Plane, Scene
 from tests.mcap_files import read_ros

@@ -53,12 +53,14 @@ from shapecat.outputs.review.paths import Paths
 from shapecat.outputs.review.scenes import choose_scenes, with_clouds
 from shapecat.outputs.scene_tree import _apply_labels, _candidate, _described, _topic
 from shapecat.recordings.messages import Topic
+from shapecat.runs.labelled_tracks import LabelledTracks
 from shapecat.runs.labels.meaning import TrackLabel, _slips
-from shapecat.runs.shown import ShownTracks
 from shapecat.runs.tables.masks import read_nearest_masks
 from shapecat.runs.tables.reading import Key
 from shapecat.runs.tables.schemas import FRAMES
 from shapecat.types import (
+    AnnotationBox,
+    AnnotationFrame,
     Box,
     Camera,
     Candidate,
@@ -70,8 +72,6 @@ from shapecat.types import (
     Plane,
     Pose,
     Scene,
-    ShownBox,
-    ShownFrame,
 )
 from tests.test_exports_worked import UP
 
@@ -117,22 +117,24 @@ def test_records_print_in_one_short_line() -> None:
 # ---- annotations: lifetime and deletion
 
 
-def shown_frame(topic: str, stamp: int, *tracks: int, ended: tuple[int, ...] = ()) -> ShownFrame:
-    boxes = tuple(ShownBox(t, "cup", 0.9, (0, 0, 1), (1, 1, 1), UPRIGHT) for t in tracks)
-    return ShownFrame(topic, stamp, stamp, 3 * stamp + 7, "cam", boxes, ended)
+def annotation_frame(
+    topic: str, stamp: int, *tracks: int, ended: tuple[int, ...] = ()
+) -> AnnotationFrame:
+    boxes = tuple(AnnotationBox(t, "cup", 0.9, (0, 0, 1), (1, 1, 1), UPRIGHT) for t in tracks)
+    return AnnotationFrame(topic, stamp, stamp, 3 * stamp + 7, "cam", boxes, ended)
 
 
 def test_annotations_outlive_their_period_and_are_deleted_once() -> None:
     """The period is the time to the next frame of the topic, else from the previous one."""
     frames = [
-        shown_frame("/a", 100, 1, 2),
-        shown_frame("/a", 140, 2),
-        shown_frame("/b", 150, 2, 7),
-        shown_frame("/a", 200, 3, ended=(9,)),
-        shown_frame("/b", 250, ended=(7,)),
-        shown_frame("/c", 260, 4),
-        shown_frame("/c", 300, 4),
-        shown_frame("/c", 400),
+        annotation_frame("/a", 100, 1, 2),
+        annotation_frame("/a", 140, 2),
+        annotation_frame("/b", 150, 2, 7),
+        annotation_frame("/a", 200, 3, ended=(9,)),
+        annotation_frame("/b", 250, ended=(7,)),
+        annotation_frame("/c", 260, 4),
+        annotation_frame("/c", 300, 4),
+        annotation_frame("/c", 400),
     ]
     found = [(a.lifetime_ns, a.gone) for a in _annotations(frames)]
 
@@ -150,9 +152,9 @@ def test_annotations_outlive_their_period_and_are_deleted_once() -> None:
 
 def test_boxes_of_two_cameras_stay_until_the_next_frame_of_their_own() -> None:
     """With frames of both in turn, a box vanished wherever a camera dropped a frame."""
-    frames = [shown_frame(t, s, 1) for s in (0, 10, 40, 50) for t in ("/a", "/b")]
-    frames += [shown_frame("/b", 50 + k, 1) for k in range(1, 200)]
-    frames.append(shown_frame("/a", 900, 1))
+    frames = [annotation_frame(t, s, 1) for s in (0, 10, 40, 50) for t in ("/a", "/b")]
+    frames += [annotation_frame("/b", 50 + k, 1) for k in range(1, 200)]
+    frames.append(annotation_frame("/a", 900, 1))
 
     found = list(_annotations(frames))
     assert [one.frame for one in found] == frames
@@ -164,7 +166,9 @@ def test_boxes_of_two_cameras_stay_until_the_next_frame_of_their_own() -> None:
 @pytest.mark.parametrize("slow", [1, 3])
 def test_boxes_stay_until_the_next_message(slow: int) -> None:
     """Viewers count in log time, which passes faster than the time of a slow simulation."""
-    frames = [replace(shown_frame("/a", 100 * k, 1), log_time_ns=100 * slow * k) for k in (1, 2)]
+    frames = [
+        replace(annotation_frame("/a", 100 * k, 1), log_time_ns=100 * slow * k) for k in (1, 2)
+    ]
 
     assert [a.lifetime_ns for a in _annotations(frames)] == [150 * slow] * 2
 
@@ -172,7 +176,10 @@ def test_boxes_stay_until_the_next_message(slow: int) -> None:
 @pytest.mark.parametrize("encoding", ["cdr", "ros1", "protobuf", "json"])
 def test_lifetime_does_not_span_jump_of_clock(encoding: str) -> None:
     """From the time since start-up to that since 1970: the seconds of a ROS duration overflow."""
-    frames = [shown_frame("/a", 12 * 10**9, 1), shown_frame("/a", 1_700_000_000 * 10**9, 1)]
+    frames = [
+        annotation_frame("/a", 12 * 10**9, 1),
+        annotation_frame("/a", 1_700_000_000 * 10**9, 1),
+    ]
     for annotation in _annotations(frames):
         assert annotation.lifetime_ns == 5400 * 10**9
         for _, encode in encoder_for(encoding, markers=True):
@@ -212,7 +219,7 @@ def test_simultaneous_images_of_two_cameras_are_annotated(
     ]
     patch_masks(monkeypatch, masks, [5] * len(masks))
     tracks = SimpleNamespace(objects=lambda _key: {TrackLabel(6, "cup", 0.8): {0: 0}})
-    place = "shapecat.outputs.annotation.image_annotations.ShownTracks.read"
+    place = "shapecat.outputs.annotation.image_annotations.LabelledTracks.read"
     monkeypatch.setattr(place, lambda _folder, _labels: tracks)
     frames = list(read_image_frames(Path(), {}))
 
@@ -232,10 +239,10 @@ def test_merged_track_has_one_box_on_image(
     monkeypatch.setattr(f"{place}.read_nearest_masks", lambda _folder: iter([(("/d", 0), masks)]))
     none = np.zeros((4, 0))
     numbers = np.arange(4)  # the last one has no mask
-    tracks = ShownTracks(
+    tracks = LabelledTracks(
         {("/d", 0): slice(0, 4)}, numbers, np.array([11, 9, 6, 12]), labels, {}, none, none
     )
-    monkeypatch.setattr(f"{place}.ShownTracks.read", lambda _folder, _labels: tracks)
+    monkeypatch.setattr(f"{place}.LabelledTracks.read", lambda _folder, _labels: tracks)
     (frame,) = read_image_frames(Path(), {})
 
     assert frame.boxes == (
@@ -375,7 +382,7 @@ def test_annotations_use_encoding_of_their_topic(
     topics = tuple(Topic(name, "t", encoding, 9) for name, encoding in encodings.items())
     recording: Any = SimpleNamespace(kind=kind, topics=topics)
     unsupported: Any = SimpleNamespace(kind="mcap", topics=topics[3:])
-    first = None if annotated is None else Annotation(shown_frame(annotated, 5, 1), 7, ())
+    first = None if annotated is None else Annotation(annotation_frame(annotated, 5, 1), 7, ())
 
     assert _encoding(recording, first) == expected
     assert _encoding(unsupported, first) == "json"

@@ -18,7 +18,7 @@ from shapecat.recordings import choose_streams, frames, open_recording, read_tra
 from shapecat.recordings.decoding.decoders import LIBRARY_ERRORS
 from shapecat.recordings.decoding.protobuf import message_decoder
 from shapecat.recordings.transforms.window import TransformWindow
-from shapecat.types import Camera, Frame, ShownFrame
+from shapecat.types import AnnotationFrame, Camera, Frame
 from tests.depth_encodings import png
 from tests.foxglove_messages import (
     EPOCH,
@@ -239,7 +239,7 @@ def test_protobuf_scene_is_decoded_by_embedded_descriptors() -> None:
 def test_protobuf_source_gets_protobuf_annotations(tmp_path: Path) -> None:
     source, target = tmp_path / "a.mcap", tmp_path / "out.mcap"
     write(source, "protobuf", [("/p", "foxglove.PointCloud", {})])
-    frame = ShownFrame("/p", 0, EPOCH, EPOCH, "camera", (), (7,))
+    frame = AnnotationFrame("/p", 0, EPOCH, EPOCH, "camera", (), (7,))
 
     with open_recording(source) as recording:
         write_annotated(recording, target, [frame], run={})

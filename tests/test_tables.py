@@ -17,14 +17,14 @@ from numpy.testing import assert_allclose
 from shapecat.config import Settings
 from shapecat.errors import OutputError
 from shapecat.outputs.opened_run import Table
-from shapecat.runs import shown
+from shapecat.runs import labelled_tracks
 from shapecat.runs.folder import read_run
 from shapecat.runs.labelled_frames import read_labelled_frames
+from shapecat.runs.labelled_tracks import _next_of_topic, read_annotation_frames
 from shapecat.runs.labels.corrections import read_labels
 from shapecat.runs.labels.meaning import TrackLabel
 from shapecat.runs.perceive.perceived import _SEGMENT_FRAMES, FrameRow, PerceptionTables
 from shapecat.runs.run_info import Counts, InputInfo, ModelInfo, Options, OriginInfo, RunInfo
-from shapecat.runs.shown import _next_of_topic, read_shown_frames
 from shapecat.runs.tables.masks import read_masks
 from shapecat.runs.tables.reading import (
     opened,
@@ -199,7 +199,7 @@ def test_frames_without_tracks_have_no_objects(tmp_path: Path, count: int) -> No
     write_run_tables(tmp_path, [count, 0])
     write_tracks(tmp_path, [])
 
-    assert [(f.index, tuple(f.objects)) for f in read_shown_frames(tmp_path, {})] == [
+    assert [(f.index, tuple(f.objects)) for f in read_annotation_frames(tmp_path, {})] == [
         (0, ()),
         (1, ()),
     ]
@@ -250,7 +250,7 @@ def test_detections_keep_tracks_when_rows_are_read_in_parts(tmp_path: Path) -> N
     pq.write_table(arrow_table(table, TRACKS), path, row_group_size=2)
     labels = {track: TrackLabel(track, "cup", 0.7) for track in (5, 6)}
 
-    found = shown.ShownTracks.read(tmp_path, labels, causal=True)
+    found = labelled_tracks.LabelledTracks.read(tmp_path, labels, causal=True)
 
     order = [3, 0, 1, 4]  # by frame and detection; 7 was deleted
     assert found.tracks.tolist() == [rows[k][0] for k in order]
@@ -272,7 +272,7 @@ def test_edited_detections_are_refused(tmp_path: Path, change: Callable[[Any], A
     labels = {5: TrackLabel(5, "cup", 0.7), 6: TrackLabel(6, "cup", 0.7)}
 
     with pytest.raises(OutputError, match="tracks do not fit its detections"):
-        list(read_shown_frames(tmp_path, labels))
+        list(read_annotation_frames(tmp_path, labels))
 
 
 def test_track_of_missing_detection_is_refused(tmp_path: Path) -> None:
@@ -280,7 +280,7 @@ def test_track_of_missing_detection_is_refused(tmp_path: Path) -> None:
     write_run_tables(tmp_path, [2])
     write_tracks(tmp_path, [(5, 0, 2)])
 
-    for read in (read_shown_frames, read_labelled_frames):
+    for read in (read_annotation_frames, read_labelled_frames):
         with pytest.raises(OutputError, match="tracks do not fit its detections"):
             list(read(tmp_path, {5: TrackLabel(5, "cup", 0.7)}))
 
@@ -374,11 +374,11 @@ def test_run_of_an_earlier_version_is_annotated(guessed_run: Path, tmp_path: Pat
     """Columns that were added since must not cost the corrections of a finished run."""
     run = shutil.copytree(guessed_run, tmp_path / "run")
     labels = read_labels(run / "tracks.csv")
-    now = list(read_shown_frames(run, labels))
+    now = list(read_annotation_frames(run, labels))
     table = pq.read_table(run / "frames.parquet")
     assert set(table.column_names) >= ADDED
     pq.write_table(table.drop_columns(sorted(ADDED)), run / "frames.parquet")
-    assert list(read_shown_frames(run, labels)) == now
+    assert list(read_annotation_frames(run, labels)) == now
 
 
 @pytest.mark.parametrize("table", TABLES)

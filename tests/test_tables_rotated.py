@@ -15,9 +15,9 @@ from shapecat.completion import DIRECTIONS
 from shapecat.config import TrackingSettings
 from shapecat.outputs.report.tracks import read_timelines
 from shapecat.runs.labelled_frames import _join, read_labelled_frames
+from shapecat.runs.labelled_tracks import read_annotation_frames
 from shapecat.runs.labels.corrections import read_labels
 from shapecat.runs.perceive.perceived import FrameRow, PerceptionTables
-from shapecat.runs.shown import read_shown_frames
 from shapecat.runs.tables.placed_frames import streams_with_poses
 from shapecat.runs.tracks import _line, _read_frames, track_run
 from shapecat.tracking.records import Track
@@ -376,7 +376,7 @@ def test_labelled_frames_and_annotations_have_same_boxes(run: Path, *, merged: b
     labels = read_labels(run / "tracks.csv", CATEGORIES)
     if merged:
         labels[3] = labels[1]
-    shown = list(read_shown_frames(run, labels))
+    shown = list(read_annotation_frames(run, labels))
     labelled = list(read_labelled_frames(run, labels))
 
     assert [frame.index for frame in shown] == [frame.index for frame in labelled]
@@ -441,7 +441,7 @@ def test_merged_box_is_upright_in_named_frame(tmp_path: Path) -> None:
     labels = read_labels(tmp_path / "tracks.csv", CATEGORIES)
     labels[3] = labels[1]
 
-    for frame in read_shown_frames(tmp_path, labels, visible=True):
+    for frame in read_annotation_frames(tmp_path, labels, visible=True):
         (merged,) = (box for box in frame.objects if box.track == 1)
         axes = Rotation.from_quat(merged.orientation).as_matrix()
         up = robot.rotation @ ROTATIONS[frame.index].inv().apply(UP)

@@ -10,8 +10,8 @@ import pyarrow as pa
 
 from shapecat.arrays import F4
 from shapecat.geometry import box_around
+from shapecat.runs.labelled_tracks import LabelledTracks, misfit
 from shapecat.runs.labels.meaning import TrackLabel
-from shapecat.runs.shown import ShownTracks, misfit
 from shapecat.runs.tables.masks import read_masks
 from shapecat.runs.tables.reading import Key, numbers, read_together
 from shapecat.system.memory import release_memory
@@ -56,7 +56,7 @@ def read_labelled_frames(folder: Path, labels: Mapping[int, TrackLabel]) -> Iter
     ------
     OutputError : a table is unreadable, or tracks and detections do not fit together.
     """
-    shown = ShownTracks.read(folder, labels, causal=True)
+    tracks = LabelledTracks.read(folder, labels, causal=True)
     release_memory()  # of the table of tracks
     masks = _MasksByFrame(read_masks(folder))
     tables = {"frames": None, "detections": _OBJECT, "planes": None}
@@ -66,9 +66,9 @@ def read_labelled_frames(folder: Path, labels: Mapping[int, TrackLabel]) -> Iter
         for row in frames.to_pylist():
             key = (row["topic"], row["frame"])
             found = {row["detection"]: row for row in objects.get(key, [])}
-            if any(rows.keys() - found.keys() for rows in shown.objects(key).values()):
+            if any(rows.keys() - found.keys() for rows in tracks.objects(key).values()):
                 raise misfit(folder)
-            frame = _labelled_frame(row, found, supports.get(key, []), shown)
+            frame = _labelled_frame(row, found, supports.get(key, []), tracks)
             yield replace(frame, masks=masks.of(key))
 
 
@@ -113,7 +113,7 @@ def _labelled_frame(
     row: Mapping[str, Any],
     found: Mapping[int, Mapping[str, Any]],
     planes: Sequence[Mapping[str, Any]],
-    shown: ShownTracks,
+    tracks: LabelledTracks,
 ) -> LabelledFrame:
     key = (row["topic"], row["frame"])
     pose = None
@@ -121,10 +121,10 @@ def _labelled_frame(
         pose = Pose(np.reshape(row["fixed_rotation"], (3, 3)), row["fixed_translation"])
     objects = [
         [
-            _labelled_object(found[number], label, shown.causal[row], shown.full_box(row))
+            _labelled_object(found[number], label, tracks.causal[row], tracks.full_box(row))
             for number, row in rows.items()
         ]
-        for label, rows in shown.objects(key).items()
+        for label, rows in tracks.objects(key).items()
     ]
     return LabelledFrame(
         topic=row["topic"],
@@ -135,7 +135,7 @@ def _labelled_frame(
         fixed_from_sensor=pose,
         planes=tuple(plane_of(plane) for plane in planes),
         objects=tuple(_join(parts, row["up"]) for parts in objects),
-        ended=shown.ended.get(key, ()),
+        ended=tracks.ended.get(key, ()),
         seconds=dict(zip(row["stages"], row["seconds"], strict=True)),
         up=row["up"],
         reused_from=row["reused_from"],

@@ -6,7 +6,7 @@ camera's is the optical frame (x right, y down, z forward).
 """
 
 from shapecat.types.frame import Camera, Frame, Pose
-from shapecat.types.labelled import LabelledFrame, LabelledObject, ShownBox, ShownFrame
+from shapecat.types.labelled import AnnotationBox, AnnotationFrame, LabelledFrame, LabelledObject
 from shapecat.types.scene import (
     CATEGORIES,
     UNKNOWN,
@@ -24,6 +24,8 @@ from shapecat.types.scene import (
 __all__ = [
     "CATEGORIES",
     "UNKNOWN",
+    "AnnotationBox",
+    "AnnotationFrame",
     "Box",
     "Camera",
     "Candidate",
@@ -38,6 +40,4 @@ __all__ = [
     "Plane",
     "Pose",
     "Scene",
-    "ShownBox",
-    "ShownFrame",
 ]

@@ -7,7 +7,7 @@ from shapecat.arrays import F4, U4, Record, array
 from shapecat.types.frame import Pose
 from shapecat.types.scene import Box, ImageMasks, NeuralGas, Plane
 
-__all__ = ["LabelledFrame", "LabelledObject", "ShownBox", "ShownFrame"]
+__all__ = ["AnnotationBox", "AnnotationFrame", "LabelledFrame", "LabelledObject"]
 
 
 class LabelledObject(Record):
@@ -72,7 +72,7 @@ class LabelledFrame(Record):
     masks: ImageMasks | None = None
 
 
-class ShownBox(NamedTuple):
+class AnnotationBox(NamedTuple):
     """The annotation of one object, as plain numbers.
 
     ``center`` (metres), ``size`` (metres) and ``orientation`` (x, y, z, w) are those of a `Box`.
@@ -87,7 +87,7 @@ class ShownBox(NamedTuple):
 
 
 @dataclass(frozen=True)
-class ShownFrame:
+class AnnotationFrame:
     """The annotations of one frame; the fields are as in `LabelledFrame`."""
 
     topic: str
@@ -95,5 +95,5 @@ class ShownFrame:
     stamp_ns: int
     log_time_ns: int
     frame_id: str
-    objects: tuple[ShownBox, ...]
+    objects: tuple[AnnotationBox, ...]
     ended: tuple[int, ...]

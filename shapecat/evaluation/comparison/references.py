@@ -25,7 +25,7 @@ from shapecat.geometry import box_around
 from shapecat.runs.finished import FinishedRun, read_finished
 from shapecat.runs.folder import read_run
 from shapecat.runs.labelled_frames import rows_by_frame
-from shapecat.runs.shown import ShownTracks, misfit
+from shapecat.runs.labelled_tracks import LabelledTracks, misfit
 from shapecat.runs.tables.reading import Key, read_row_groups, read_stamps, read_together
 from shapecat.types import Box
 
@@ -261,7 +261,7 @@ def run_labellings(finished: FinishedRun) -> Iterator[tuple[Key, Mapping[str, An
     deleted = _deleted(folder, finished.labels)
     wanted = ("topic", "frame", "detection", "center", "size", "orientation", "indices")
     columns = [*wanted, "posterior", "category", "confidence"]
-    shown = ShownTracks.read(folder, finished.labels)
+    tracks = LabelledTracks.read(folder, finished.labels)
     tables = {"frames": ["topic", "frame", "stamp_ns", "up"], "detections": columns}
     for frames, detections in read_together(folder, tables):
         by_frame = rows_by_frame(detections)
@@ -269,11 +269,11 @@ def run_labellings(finished: FinishedRun) -> Iterator[tuple[Key, Mapping[str, An
             key = (row["topic"], row["frame"])
             rest = {r["detection"]: r for r in by_frame.get(key, [])}
             items = {}
-            for label, rows in shown.objects(key).items():
+            for label, rows in tracks.objects(key).items():
                 if rows.keys() - rest.keys():
                     raise misfit(folder)
                 parts = [rest.pop(number) for number in rows]
-                full = [shown.full_box(k) for k in rows.values()]
+                full = [tracks.full_box(k) for k in rows.values()]
                 items[min(rows)] = _item(label, parts, full, row["up"])
             for number, r in rest.items():
                 if (*key, number) not in deleted:

@@ -30,7 +30,7 @@ from shapecat.recordings import Recording
 from shapecat.recordings.containers.mcap_file import McapRecording
 from shapecat.recordings.containers.mcap_summary import Summary
 from shapecat.system.files import replacing
-from shapecat.types import ShownFrame
+from shapecat.types import AnnotationFrame
 
 __all__ = ["write_annotated"]
 
@@ -50,7 +50,7 @@ _F = TypeVar("_F", Annotation, ImageFrame)
 def write_annotated(
     recording: Recording,
     path: Path,
-    frames: Iterable[ShownFrame],
+    frames: Iterable[AnnotationFrame],
     *,
     run: Mapping[str, object],
     markers: bool = False,
@@ -116,7 +116,7 @@ def _copying(recording: McapRecording, path: Path, file: BinaryIO) -> Iterator[N
 
 def _encoded(
     recording: Recording,
-    frames: Iterable[ShownFrame],
+    frames: Iterable[AnnotationFrame],
     images: Iterable[ImageFrame],
     image_topics: Sequence[str],
     *,
@@ -166,7 +166,7 @@ def _append(
         appender.finish()
 
 
-def _annotations(frames: Iterable[ShownFrame]) -> Iterator[Annotation]:
+def _annotations(frames: Iterable[AnnotationFrame]) -> Iterator[Annotation]:
     """Add lifetimes, from the time of the next frame, and tracks to delete, from earlier frames."""
     shown: dict[str, set[int]] = {}
     for frame, period in _with_periods(frames):
@@ -182,12 +182,12 @@ def _annotations(frames: Iterable[ShownFrame]) -> Iterator[Annotation]:
 class _WaitingFrame:
     """A frame, and the time to the next frame of its topic, ns: that before until it is known."""
 
-    frame: ShownFrame
+    frame: AnnotationFrame
     period: int = _PERIOD_NS
     known: bool = False
 
 
-def _with_periods(frames: Iterable[ShownFrame]) -> Iterator[tuple[ShownFrame, int]]:
+def _with_periods(frames: Iterable[AnnotationFrame]) -> Iterator[tuple[AnnotationFrame, int]]:
     """Yield frames with the time, ns, to the next frame of their topic, else from the last one."""
     waiting: deque[_WaitingFrame] = deque()
     last: dict[str, _WaitingFrame] = {}
@@ -204,7 +204,7 @@ def _with_periods(frames: Iterable[ShownFrame]) -> Iterator[tuple[ShownFrame, in
     yield from ((one.frame, one.period) for one in waiting)
 
 
-def _period(frame: ShownFrame, following: ShownFrame) -> int:
+def _period(frame: AnnotationFrame, following: AnnotationFrame) -> int:
     """Return the time between two frames, ns: by stamp, or by the log time of viewers if longer."""
     by_stamp = following.stamp_ns - frame.stamp_ns
     return max(1, by_stamp, following.log_time_ns - frame.log_time_ns)

@@ -15,7 +15,7 @@ from shapecat.outputs.annotation.content import (
 from shapecat.outputs.annotation.foxglove_encoders import json_encoder, protobuf_encoder
 from shapecat.outputs.annotation.ros_annotations import RosMessages
 from shapecat.outputs.colours import colour_of
-from shapecat.types import ShownBox, ShownFrame
+from shapecat.types import AnnotationBox, AnnotationFrame
 
 __all__ = ["ENCODERS", "encoder_for"]
 
@@ -57,7 +57,9 @@ def _plain_scene(annotation: Annotation, parts: tuple[str, str]) -> dict[str, An
     }
 
 
-def _plain_entity(box: ShownBox, frame: ShownFrame, time: Any, lifetime: Any) -> dict[str, Any]:
+def _plain_entity(
+    box: AnnotationBox, frame: AnnotationFrame, time: Any, lifetime: Any
+) -> dict[str, Any]:
     pose = {
         "position": _plain("xyz", box.center),
         "orientation": _plain("xyzw", box.orientation),

@@ -4,7 +4,7 @@ from collections.abc import Callable
 from typing import NamedTuple, TypeVar
 
 from shapecat.outputs.wording import caption
-from shapecat.types import ShownBox, ShownFrame
+from shapecat.types import AnnotationBox, AnnotationFrame
 
 __all__ = [
     "Annotation",
@@ -35,7 +35,7 @@ class AnnotationChannel(NamedTuple):
 class Annotation(NamedTuple):
     """A frame to write, the lifetime of its entities, and the tracks to delete in it."""
 
-    frame: ShownFrame
+    frame: AnnotationFrame
     lifetime_ns: int
     gone: tuple[int, ...]
 
@@ -62,12 +62,12 @@ def entity_id(track: int) -> str:
     return f"track-{track}"
 
 
-def text(box: ShownBox) -> str:
+def text(box: AnnotationBox) -> str:
     """Return the text above a box."""
     return caption(box.track, box.category, box.confidence)
 
 
-def properties(box: ShownBox) -> dict[str, str]:
+def properties(box: AnnotationBox) -> dict[str, str]:
     """Return the properties of a box for viewers."""
     return {
         "category": box.category,
@@ -76,7 +76,7 @@ def properties(box: ShownBox) -> dict[str, str]:
     }
 
 
-def text_position(box: ShownBox) -> tuple[float, float, float]:
+def text_position(box: AnnotationBox) -> tuple[float, float, float]:
     """Return the position (x, y, z) of the text just above a box, metres, sensor frame."""
     x, y, z = box.center
     qx, qy, qz, qw = box.orientation

@@ -11,8 +11,8 @@ from shapecat.outputs.annotation.foxglove_encoders import json_encoder, protobuf
 from shapecat.outputs.annotation.ros_annotations import RosMessages
 from shapecat.outputs.colours import colour_of
 from shapecat.outputs.wording import caption
+from shapecat.runs.labelled_tracks import LabelledTracks
 from shapecat.runs.labels.meaning import TrackLabel
-from shapecat.runs.shown import ShownTracks
 from shapecat.runs.tables.masks import read_nearest_masks
 
 __all__ = ["ImageBox", "ImageFrame", "image_encoders_for", "read_image_frames"]
@@ -58,13 +58,13 @@ def read_image_frames(folder: Path, labels: Mapping[int, TrackLabel]) -> Iterato
 
     Unorganized clouds have no colour image.
     """
-    shown = ShownTracks.read(folder, labels)
+    tracks = LabelledTracks.read(folder, labels)
     for key, masks in read_nearest_masks(folder):
         if masks.height <= 1:
             continue
         boxes = [
             ImageBox(*label, box)
-            for label, rows in shown.objects(key).items()
+            for label, rows in tracks.objects(key).items()
             if (box := box_of(masks, tuple(rows))) is not None
         ]
         image = (masks.topic, masks.stamp_ns, masks.log_time_ns, masks.frame_id)

@@ -18,7 +18,7 @@ from shapecat.outputs.annotation.content import (
     text_position,
 )
 from shapecat.outputs.colours import colour_of
-from shapecat.types import ShownBox
+from shapecat.types import AnnotationBox
 
 __all__ = ["RosMessages"]
 
@@ -74,7 +74,7 @@ class RosMessages:
         found = [self._detection(annotation, box) for box in annotation.frame.objects]
         return self._types["Detection3DArray"](self._header(annotation.frame), found)
 
-    def _detection(self, annotation: Annotation, box: ShownBox) -> Any:
+    def _detection(self, annotation: Annotation, box: AnnotationBox) -> Any:
         t, pose = self._types, self._pose(box)
         result = t["ObjectHypothesisWithPose"](
             t["ObjectHypothesis"](box.category, float(box.confidence)),
@@ -92,7 +92,7 @@ class RosMessages:
         entities = [self._entity(annotation, box) for box in annotation.frame.objects]
         return t["SceneUpdate"](deletions, entities)
 
-    def _entity(self, annotation: Annotation, box: ShownBox) -> Any:
+    def _entity(self, annotation: Annotation, box: AnnotationBox) -> Any:
         t, frame = self._types, annotation.frame
         cube = t["CubePrimitive"](
             self._pose(box), self._size(box), self.colour("Color", box.category, 0.5)
@@ -111,7 +111,7 @@ class RosMessages:
             [],
         )
 
-    def _text(self, box: ShownBox) -> Any:
+    def _text(self, box: AnnotationBox) -> Any:
         pose, colour = self._text_pose(box), self.colour("Color", box.category, 1.0)
         return self._types["TextPrimitive"](pose, True, 0.03, False, colour, text(box))  # noqa: FBT003  # the order of the definition
 
@@ -129,12 +129,12 @@ class RosMessages:
         ]
         return self._types["MarkerArray"](gone + shown)
 
-    def _cube_marker(self, annotation: Annotation, box: ShownBox) -> Any:
+    def _cube_marker(self, annotation: Annotation, box: AnnotationBox) -> Any:
         given = {"pose": self._pose(box), "scale": self._size(box)}
         colour = self.colour("ColorRGBA", box.category, 0.5)
         return self._marker(annotation, "box", box.track, color=colour, **given)
 
-    def _text_marker(self, annotation: Annotation, box: ShownBox) -> Any:
+    def _text_marker(self, annotation: Annotation, box: AnnotationBox) -> Any:
         given = {"pose": self._text_pose(box), "scale": self._types["Vector3"](0.0, 0.0, 0.03)}
         colour = self.colour("ColorRGBA", box.category, 1.0)
         return self._marker(annotation, "text", box.track, color=colour, text=text(box), **given)
@@ -176,14 +176,14 @@ class RosMessages:
         values = (self._time(frame.stamp_ns), frame.frame_id)
         return self._types["Header"](*((0, *values) if self.ros1 else values))
 
-    def _pose(self, box: ShownBox) -> Any:
+    def _pose(self, box: AnnotationBox) -> Any:
         t = self._types
         return t["Pose"](t["Point"](*box.center), t["Quaternion"](*box.orientation))
 
-    def _text_pose(self, box: ShownBox) -> Any:
+    def _text_pose(self, box: AnnotationBox) -> Any:
         return self._types["Pose"](self._types["Point"](*text_position(box)), self._upright)
 
-    def _size(self, box: ShownBox) -> Any:
+    def _size(self, box: AnnotationBox) -> Any:
         return self._types["Vector3"](*box.size)
 
 

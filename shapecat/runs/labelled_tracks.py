@@ -1,4 +1,4 @@
-"""The detections to show with the labels of their tracks, and the boxes to annotate."""
+"""The tracks of a run with their final labels, and the boxes to annotate."""
 
 from collections.abc import Container, Iterator, Mapping, Sequence
 from dataclasses import dataclass
@@ -33,9 +33,9 @@ from shapecat.runs.tables.reading import (
     topic_codes,
 )
 from shapecat.runs.tables.schemas import BOX_WIDTH, FULL_BOX
-from shapecat.types import Box, Pose, ShownBox, ShownFrame
+from shapecat.types import AnnotationBox, AnnotationFrame, Box, Pose
 
-__all__ = ["ShownTracks", "misfit", "read_shown_frames"]
+__all__ = ["LabelledTracks", "misfit", "read_annotation_frames"]
 
 _AT_ONCE = 8  # row groups of boxes in memory
 _NO_ROWS = slice(0, 0)
@@ -43,8 +43,8 @@ _NONE = np.zeros((0, 0), np.float32)
 
 
 @dataclass(frozen=True)
-class ShownTracks:
-    """The detections to show in each frame of a run.
+class LabelledTracks:
+    """The detections of each frame of a run that have a track, with its final label.
 
     Attributes
     ----------
@@ -68,8 +68,8 @@ class ShownTracks:
     @classmethod
     def read(
         cls, folder: Path, labels: Mapping[int, TrackLabel], *, causal: bool = False
-    ) -> "ShownTracks":
-        """Read the tracks of a run; those missing from ``labels`` are not shown."""
+    ) -> "LabelledTracks":
+        """Read the tracks of a run; those missing from ``labels`` are left out."""
         with opened(folder / "tracks.parquet", read_dictionary=["topic"]) as file:
             table = file.read(columns=["track", "topic", "frame", "stamp_ns", "detection"])
             topics, codes = topic_codes(table)
@@ -81,13 +81,13 @@ class ShownTracks:
             rows, tracks = rows[order], tracks[order]
             of_frames = rows_of(topics, codes[rows], frames[order])
             names, named = np.unique(tracks, return_inverse=True)
-            shown = np.array([labels[name].track for name in names.tolist()], np.int64)[named]
+            final = np.array([labels[name].track for name in names.tolist()], np.int64)[named]
             return cls(
                 of_frames,
                 detections[order],
                 tracks,
                 labels,
-                _ended(folder, of_frames, shown, numbers(table["stamp_ns"])[rows]),
+                _ended(folder, of_frames, final, numbers(table["stamp_ns"])[rows]),
                 _causal(file, rows) if causal else _NONE,
                 _full(file, rows),
             )
@@ -111,9 +111,9 @@ class ShownTracks:
         return None if np.isnan(full[0]) else Box(full[:3], full[3:6], full[6:])
 
 
-def read_shown_frames(
+def read_annotation_frames(
     folder: Path, labels: Mapping[int, TrackLabel], *, visible: bool = False
-) -> Iterator[ShownFrame]:
+) -> Iterator[AnnotationFrame]:
     """Yield the annotations of a run, frame by frame in reading order.
 
     This omits points, surfaces and posteriors, and is several times as fast as
@@ -124,7 +124,7 @@ def read_shown_frames(
     ------
     OutputError : a table is unreadable, or tracks and detections do not fit together.
     """
-    shown = ShownTracks.read(folder, labels)
+    tracks = LabelledTracks.read(folder, labels)
     plain_columns = ("topic", "frame", "stamp_ns", "log_time_ns", "frame_id")
     pose_columns = ("frame_translation", "frame_rotation")
     wanted = (*plain_columns, "up", *pose_columns)
@@ -134,12 +134,12 @@ def read_shown_frames(
         plain = [frames[name].to_pylist() for name in plain_columns]
         keys = list(zip(*plain[:2], strict=True))
         ups = numbers(frames["up"]).reshape(-1, 3)
-        boxes = _boxes(folder, keys, ups, shown, detections, visible=visible)
+        boxes = _boxes(folder, keys, ups, tracks, detections, visible=visible)
         if frames["frame_rotation"].null_count < len(frames):
             poses = (frames[name].to_pylist() for name in pose_columns)
             boxes = map(_in_named_frame, boxes, *poses)
-        ended = (shown.ended.get(key, ()) for key in keys)
-        yield from map(ShownFrame, *plain, boxes, ended)
+        ended = (tracks.ended.get(key, ()) for key in keys)
+        yield from map(AnnotationFrame, *plain, boxes, ended)
 
 
 def misfit(folder: Path) -> OutputError:
@@ -152,32 +152,32 @@ def _boxes(
     folder: Path,
     keys: Sequence[Key],
     ups: F4,
-    shown: ShownTracks,
+    tracks: LabelledTracks,
     detections: pa.Table,
     *,
     visible: bool,
-) -> Iterator[tuple[ShownBox, ...]]:
-    """Yield the boxes to show in each of some frames, given the up direction in each."""
+) -> Iterator[tuple[AnnotationBox, ...]]:
+    """Yield the boxes to annotate in each of some frames, given the up direction in each."""
     all_rows, places = frame_rows(detections), _places(detections)
-    spans = [shown.frames.get(key, _NO_ROWS) for key in keys]
+    spans = [tracks.frames.get(key, _NO_ROWS) for key in keys]
     of_frames = [all_rows.get(key, _NO_ROWS) for key in keys]
     firsts, ends = [rows.start for rows in of_frames], [rows.stop for rows in of_frames]
     counts = [span.stop - span.start for span in spans]
-    numbered = np.concatenate([shown.detections[span] for span in spans])
+    numbered = np.concatenate([tracks.detections[span] for span in spans])
     rows = np.repeat(firsts, counts) + numbered  # detections are numbered by their rows
     known = numbers(detections["detection"])
     if np.any(rows >= np.repeat(ends, counts)) or np.any(known[rows] != numbered):
         raise misfit(folder)
     places = places[rows]
     if not visible:
-        full = np.concatenate([shown.full[span] for span in spans])
+        full = np.concatenate([tracks.full[span] for span in spans])
         places = np.where(np.isnan(full), places, full)
     for key, up, span, stop in zip(keys, ups, spans, accumulate(counts), strict=True):
-        objects, here = shown.objects(key), places[stop - span.stop + span.start : stop]
-        if len(objects) < len(here):
+        objects, boxes = tracks.objects(key), places[stop - span.stop + span.start : stop]
+        if len(objects) < len(boxes):
             parts = (np.subtract([*rows.values()], span.start) for rows in objects.values())
-            here = np.array([_join(here[rows], up) for rows in parts])
-        yield tuple(map(_box, objects, here.tolist()))
+            boxes = np.array([_join(boxes[rows], up) for rows in parts])
+        yield tuple(map(_box, objects, boxes.tolist()))
 
 
 def _join(places: F8, up: F4) -> F8:
@@ -189,9 +189,9 @@ def _join(places: F8, up: F4) -> F8:
     return place
 
 
-def _box(label: TrackLabel, row: Sequence[float]) -> ShownBox:
+def _box(label: TrackLabel, row: Sequence[float]) -> AnnotationBox:
     center, size, orientation = tuple(row[:3]), tuple(row[3:6]), tuple(row[6:])
-    return ShownBox(*label, center, size, orientation)  # type: ignore[arg-type]  # as long as these
+    return AnnotationBox(*label, center, size, orientation)  # type: ignore[arg-type]  # as long as these
 
 
 def _causal(file: pq.ParquetFile, rows: I4) -> F4:
@@ -221,8 +221,8 @@ def _places(table: pa.Table) -> F8:
 
 
 def _in_named_frame(
-    boxes: Sequence[ShownBox], translation: Sequence[float] | None, rotation: Any
-) -> tuple[ShownBox, ...]:
+    boxes: Sequence[AnnotationBox], translation: Sequence[float] | None, rotation: Any
+) -> tuple[AnnotationBox, ...]:
     """Transform boxes by ``frame_from_sensor``, whose parts are None if it is not needed."""
     if translation is None:
         return tuple(boxes)
