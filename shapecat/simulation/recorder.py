@@ -146,7 +146,7 @@ def record(
                     files[0].append(image)
                     if color:
                         files[1].append(_write_colour(writer, world, frame))
-                    found.append(_truth(world, frame, image, sensor, seed))
+                    found.append(_truth(world, frame, image, sensor.camera, seed))
                     observe("simulate", index + 1, len(world))
             truth.write_text("[" + ",\n".join(map(json.dumps, found)) + "]\n", "utf-8")
             for path in paths:
@@ -197,13 +197,13 @@ def _write_colour(writer: Container, world: World, frame: Frame) -> U1:
     return labels
 
 
-def _truth(world: World, frame: Frame, labels: U1, sensor: Sensor, seed: int) -> dict[str, Any]:
+def _truth(world: World, frame: Frame, labels: U1, camera: Camera, seed: int) -> dict[str, Any]:
     return {
         "frame": frame.index,
         "scene": f"sim{seed}",
         "kind": world.kind,
         "stamp_ns": frame.stamp_ns,
-        **vars(frame_truth(world, frame.index, labels, sensor)),
+        **vars(frame_truth(world, frame.index, labels, camera)),
     }
 
 

@@ -7,9 +7,9 @@ import numpy as np
 
 from shapecat.arrays import F8, U1
 from shapecat.geometry import compose, inverse, transform, upright_box
-from shapecat.simulation.camera.render import Geometry, alone_pixels
-from shapecat.simulation.camera.sensors import Sensor
-from shapecat.simulation.scenes.worlds import PlacedObject, World
+from shapecat.simulation.camera.render import alone_pixels
+from shapecat.simulation.scenes.worlds import PlacedObject, Support, World
+from shapecat.types import Camera, Pose
 
 __all__ = ["AMBIGUOUS_PIXELS", "AMBIGUOUS_SHARE", "LISTED_PIXELS", "Truth", "frame_truth"]
 
@@ -31,60 +31,43 @@ class Truth:
     planes: list[dict[str, Any]]
 
 
-def frame_truth(world: World, frame: int, labels: U1, sensor: Sensor) -> Truth:
+def frame_truth(world: World, frame: int, labels: U1, camera: Camera) -> Truth:
     """Return the ground truth of a frame.
 
     Parameters
     ----------
     labels : (h, w) uint8 pixel labels of the frame, from `render_frame`.
+    camera : intrinsics of the frame.
     """
-    geometry = world.geometry(frame)
-    pose = world.path[frame]
+    geometry, world_from_camera = world.geometry(frame), world.path[frame]
     counts = np.bincount(labels.reshape(-1), minlength=256)
     objects: list[dict[str, Any]] = []
     hidden: list[dict[str, Any]] = []
     for mesh_id, item in enumerate(world.objects, start=len(world.supports)):
-        if not world.present(item, frame):
-            continue
-        pixels = int(counts[item.label])
-        entry = _object_truth(world, frame, item, pixels, geometry, mesh_id, sensor)
-        (objects if pixels >= LISTED_PIXELS else hidden).append(entry)
-    camera_from_world = inverse(pose)
-    planes = []
-    for support in world.supports:
-        if support.holds_objects:
-            normal = camera_from_world.rotation[:, 2]
-            point = transform(camera_from_world, support.outline[0])
-            planes.append(
-                {
-                    "label": support.label,
-                    "name": support.name,
-                    "normal": _rounded(normal),
-                    "offset": round(float(normal @ point), 6),
-                    "height": round(support.height, 6),
-                    "pixels": int(counts[support.label]),
-                }
-            )
+        if world.present(item, frame):
+            pixels = int(counts[item.label])
+            total = alone_pixels(geometry, mesh_id, camera, world_from_camera)
+            share = min(1.0, pixels / total) if total else 0.0
+            entry = _object_truth(world, frame, item, pixels, share)
+            (objects if pixels >= LISTED_PIXELS else hidden).append(entry)
+    camera_from_world = inverse(world_from_camera)
+    planes = [
+        _plane_truth(support, camera_from_world, int(counts[support.label]))
+        for support in world.supports
+        if support.holds_objects
+    ]
     return Truth(objects, hidden, planes)
 
 
 def _object_truth(
-    world: World,
-    frame: int,
-    item: PlacedObject,
-    pixels: int,
-    geometry: Geometry,
-    mesh_id: int,
-    sensor: Sensor,
+    world: World, frame: int, item: PlacedObject, pixels: int, share: float
 ) -> dict[str, Any]:
-    camera_from_world = inverse(world.path[frame])
-    pose = world.pose_of(item, frame)
-    camera_from_mesh = compose(camera_from_world, pose)
+    """Return the truth of an object; ``share`` is its visible fraction."""
+    world_from_camera, pose = world.path[frame], world.pose_of(item, frame)
+    camera_from_world = inverse(world_from_camera)
     carried = pose.translation[2] > item.pose.translation[2]
-    points = transform(camera_from_mesh, item.mesh.vertices).astype(np.float32)
+    points = transform(compose(camera_from_world, pose), item.mesh.vertices).astype(np.float32)
     box = upright_box(points, camera_from_world.rotation[:, 2])
-    total = alone_pixels(geometry, mesh_id, sensor.camera, world.path[frame])
-    share = min(1.0, pixels / total) if total else 0.0
     few = pixels < AMBIGUOUS_PIXELS or share < AMBIGUOUS_SHARE
     return {
         "label": item.label,
@@ -94,7 +77,7 @@ def _object_truth(
         "pixels": pixels,
         "track": item.track,
         "kind": item.kind,
-        "center": _rounded(transform(world.path[frame], box.center)),
+        "center": _rounded(transform(world_from_camera, box.center)),
         "box": {
             "center": _rounded(box.center),
             "size": _rounded(box.size),
@@ -106,6 +89,19 @@ def _object_truth(
         "on_support": None if carried else item.on_support,
         "on_track": None if carried else item.on_track,
         "visible": round(share, 4),
+    }
+
+
+def _plane_truth(support: Support, camera_from_world: Pose, pixels: int) -> dict[str, Any]:
+    normal = camera_from_world.rotation[:, 2]
+    point = transform(camera_from_world, support.outline[0])
+    return {
+        "label": support.label,
+        "name": support.name,
+        "normal": _rounded(normal),
+        "offset": round(float(normal @ point), 6),
+        "height": round(support.height, 6),
+        "pixels": pixels,
     }
 
 
