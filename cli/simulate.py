@@ -84,7 +84,7 @@ def simulate(
     shapecat simulate demo.mcap --scene clutter --frames 60 --seed 3
     """
     from shapecat.simulation import simulate as write_simulation
-    from shapecat.simulation.recorder import written_paths
+    from shapecat.simulation.files import written_paths
 
     container = _format_of(out, container)
     # Without --color too, colour labels of another scene must not remain.

@@ -15,7 +15,7 @@ import tempfile
 from collections.abc import Iterator, Sequence
 from dataclasses import replace
 from pathlib import Path
-from typing import Any, Literal, NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 import pyarrow.parquet as pq
@@ -24,6 +24,7 @@ from mcap.writer import Writer
 
 from shapecat.runs.jobs import Job
 from shapecat.simulation import KINECT, Sensor, make_scene, record
+from shapecat.simulation.containers import FormatName
 from shapecat.simulation.messages import MessageFactory
 from shapecat.simulation.scenes.kinds import SceneKind
 from shapecat.types import Camera
@@ -56,7 +57,7 @@ class Scene(NamedTuple):
     """The contents of a recording; its images are ``shrunk`` times smaller than a Kinect's."""
 
     kind: SceneKind
-    container: Literal["mcap", "ros1", "ros2"]
+    container: FormatName
     frames: int
     seed: int
     shrunk: int

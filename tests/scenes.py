@@ -79,7 +79,7 @@ def stream(
 
 def record(path: Path, frames: int, *, container: str = "mcap", clouds: bool = False) -> Path:
     """Write a recording of the table with the simulator's containers."""
-    with CONTAINERS[container][1](path) as writer:
+    with CONTAINERS[container].open(path) as writer:
         for topic, time, message in stream(writer.messages, frames, clouds=clouds):
             writer.write(topic, message, time)
     return path

@@ -87,7 +87,7 @@ def test_motion_during_a_gap_is_no_jump(tmp_path: Path) -> None:
 def test_run_of_a_corrected_map_has_the_warning(tmp_path: Path) -> None:
     """The user reads it in run.json and on the terminal."""
     shift = Pose(np.eye(3), np.array([0.4, -0.3, 0.0]))
-    with CONTAINERS["mcap"][1](tmp_path / "a.mcap") as writer:
+    with CONTAINERS["mcap"].open(tmp_path / "a.mcap") as writer:
         for topic, time, message in stream(writer.messages, 10):
             number = (time - EPOCH) // PERIOD
             if topic == "/tf" and number >= 6:

@@ -6,7 +6,7 @@ import resource
 from dataclasses import replace
 from itertools import pairwise
 from pathlib import Path
-from typing import Any, Literal, get_args
+from typing import Any, get_args
 
 import numpy as np
 import pytest
@@ -22,6 +22,7 @@ from shapecat.simulation import World, make_scene, render_frame, simulate, truth
 from shapecat.simulation.camera.presets import IDEAL, KINECT
 from shapecat.simulation.camera.render import geometry, render
 from shapecat.simulation.camera.sensors import resized
+from shapecat.simulation.containers import FormatName
 from shapecat.simulation.recorder import EPOCH_NS, record, robot_links
 from shapecat.simulation.scenes.kinds import SceneKind
 from shapecat.simulation.shapes.mesh import Mesh
@@ -264,12 +265,10 @@ def test_robot_links_compose_to_the_camera_pose(world: World) -> None:
 
 # --- recordings ----------------------------------------------------------------------------------
 
-Format = Literal["mcap", "ros1", "ros2"]
-
 
 @pytest.fixture(scope="module", params=["mcap", "ros1", "ros2"])
 def recording(request: pytest.FixtureRequest, tmp_path_factory: pytest.TempPathFactory) -> Path:
-    container: Format = request.param
+    container: FormatName = request.param
     out = tmp_path_factory.mktemp("sim") / "demo"
     return simulate(out, format=container, frames=3, seed=11)
 

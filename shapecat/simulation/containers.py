@@ -2,7 +2,7 @@
 
 from collections.abc import Callable
 from pathlib import Path
-from typing import Any, Self, TypeAlias
+from typing import Any, Literal, NamedTuple, Self, TypeAlias
 
 from mcap.writer import CompressionType
 from mcap.writer import Writer as McapFile
@@ -12,7 +12,7 @@ from rosbags.rosbag2 import Writer as Ros2Folder
 
 from shapecat.simulation.messages import MessageFactory
 
-__all__ = ["CONTAINERS", "Container"]
+__all__ = ["CONTAINERS", "Container", "Format", "FormatName"]
 
 _STATIC = "/tf_static"
 _QOS = """- history: {history}
@@ -61,13 +61,16 @@ class _Mcap:
 
 
 class _Bag:
-    """A recording written by rosbags; leaving the ``with`` block completes it."""
+    """A recording written by rosbags; leaving the ``with`` block completes it.
+
+    ``options`` are those of a connection; they depend on whether its topic is latched.
+    """
 
     def __init__(
-        self, ros_version: int, writer: Any, quality: Callable[..., dict[str, Any]]
+        self, ros_version: int, writer: Any, options: Callable[[bool], dict[str, Any]]
     ) -> None:
         self.messages = MessageFactory(ros_version)
-        self._file, self._quality = writer, quality
+        self._file, self._options = writer, options
         self._connections: dict[str, Any] = {}
 
     def __enter__(self) -> Self:
@@ -80,8 +83,8 @@ class _Bag:
     def write(self, topic: str, message: Any, log_time_ns: int) -> None:
         if topic not in self._connections:
             kind, store = message.__msgtype__, self.messages.typestore
-            quality = self._quality(topic == _STATIC)
-            added = self._file.add_connection(topic, kind, typestore=store, **quality)
+            options = self._options(topic == _STATIC)
+            added = self._file.add_connection(topic, kind, typestore=store, **options)
             self._connections[topic] = added
         self._file.write(self._connections[topic], log_time_ns, self.messages.serialize(message))
 
@@ -98,15 +101,15 @@ def _ros2(path: Path) -> _Bag:
 
 
 def _qos(*, latched: bool) -> ros.Qos:
-    kept, ever = ros.QosDurability, ros.QosTime(2147483647, 4294967295)
+    durability, unlimited = ros.QosDurability, ros.QosTime(2147483647, 4294967295)
     return ros.Qos(
         ros.QosHistory.KEEP_LAST,
         1 if latched else 10,
         ros.QosReliability.RELIABLE,
-        kept.TRANSIENT_LOCAL if latched else kept.VOLATILE,
-        *(ever, ever),
+        durability.TRANSIENT_LOCAL if latched else durability.VOLATILE,
+        *(unlimited, unlimited),
         ros.QosLiveliness.AUTOMATIC,
-        ever,
+        unlimited,
         avoid_ros_namespace_conventions=False,
     )
 
@@ -114,9 +117,19 @@ def _qos(*, latched: bool) -> ros.Qos:
 Container: TypeAlias = _Mcap | _Bag
 """A recording being written: its ``messages`` make what ``write`` appends, at a log time in ns."""
 
-CONTAINERS: dict[str, tuple[str, Callable[[Path], Container]]] = {
-    "mcap": (".mcap", _Mcap),
-    "ros1": (".bag", _ros1),
-    "ros2": ("", _ros2),
+FormatName = Literal["mcap", "ros1", "ros2"]
+
+
+class Format(NamedTuple):
+    """A recording format: the suffix of its files, and the function that begins a recording."""
+
+    suffix: str
+    open: Callable[[Path], Container]
+
+
+CONTAINERS: dict[str, Format] = {
+    "mcap": Format(".mcap", _Mcap),
+    "ros1": Format(".bag", _ros1),
+    "ros2": Format("", _ros2),
 }
-"""File suffix and writer of each recording format."""
+"""The recording formats by name."""

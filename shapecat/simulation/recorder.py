@@ -2,32 +2,28 @@
 
 import json
 import math
-import sqlite3
-import tempfile
-import zipfile
 from contextlib import ExitStack
 from dataclasses import replace
 from pathlib import Path
-from typing import IO, Any, Literal, Self
+from typing import Any
 
 import numpy as np
 
 from shapecat.arrays import U1
-from shapecat.errors import OutputError
 from shapecat.geometry import LINK_FROM_OPTICAL, compose, inverse
 from shapecat.simulation.camera.colour_camera import COLOUR, jpeg, render_colour
 from shapecat.simulation.camera.presets import SENSORS
 from shapecat.simulation.camera.sensors import Sensor
 from shapecat.simulation.camera.views import render_frame
-from shapecat.simulation.containers import CONTAINERS, Container
+from shapecat.simulation.containers import CONTAINERS, Container, FormatName
+from shapecat.simulation.files import LabelFile, completed, written_paths
 from shapecat.simulation.scenes.kinds import SceneKind, make_scene
 from shapecat.simulation.scenes.worlds import World
 from shapecat.simulation.truth import frame_truth
-from shapecat.system.files import flush
 from shapecat.system.progress import Observer, ignore
 from shapecat.types import Camera, Frame, Pose
 
-__all__ = ["EPOCH_NS", "record", "robot_links", "simulate", "written_paths"]
+__all__ = ["EPOCH_NS", "record", "robot_links", "simulate"]
 
 EPOCH_NS = 1_700_200_000_000_000_000
 """Timestamp of the first frame."""
@@ -41,7 +37,7 @@ def simulate(
     out: Path,
     *,
     scene: SceneKind = "tabletop",
-    format: Literal["mcap", "ros1", "ros2"] = "mcap",  # noqa: A002  # the word users know
+    format: FormatName = "mcap",  # noqa: A002  # the word users know
     frames: int = 90,
     seed: int = 0,
     sensor: str = "kinect",
@@ -104,7 +100,7 @@ def record(
     *,
     seed: int,
     sensor: Sensor,
-    format: Literal["mcap", "ros1", "ros2"] = "mcap",  # noqa: A002  # the word users know
+    format: FormatName = "mcap",  # noqa: A002  # the word users know
     clouds: bool = False,
     color: bool = False,
     rate_hz: float = 30.0,
@@ -122,42 +118,32 @@ def record(
     if format not in CONTAINERS:
         msg = f"no recording format {format!r}; known: {', '.join(CONTAINERS)}"
         raise ValueError(msg)
-    _, container = CONTAINERS[format]
     paths = written_paths(out, format, color=color)
-    out = paths[0]
-    try:
-        _require_replaceable(out)
-        out.parent.mkdir(parents=True, exist_ok=True)
-        with tempfile.TemporaryDirectory(dir=out.parent, prefix=".simulated-") as hidden:
-            recording, truth, *labels = (Path(hidden) / path.name for path in paths)
-            with container(recording) as writer, ExitStack() as stack:
-                cameras = (sensor.camera, COLOUR.lens.pinhole)
-                files = [
-                    stack.enter_context(_LabelFile(path, len(world), camera))
-                    for path, camera in zip(labels, cameras, strict=False)
-                ]
-                found = []
-                for index in range(len(world)):
-                    rng = np.random.default_rng((seed, index))
-                    frame, image = render_frame(
-                        world, index, rng=rng, sensor=sensor, rate_hz=rate_hz, start_ns=EPOCH_NS
-                    )
-                    _write_frame(writer, world, frame, clouds=clouds, color=color)
-                    files[0].append(image)
-                    if color:
-                        files[1].append(_write_colour(writer, world, frame))
-                    found.append(_truth(world, frame, image, sensor.camera, seed))
-                    observe("simulate", index + 1, len(world))
-            truth.write_text("[" + ",\n".join(map(json.dumps, found)) + "]\n", "utf-8")
-            for path in paths:
-                _move(Path(hidden) / path.name, path)
-            for path in written_paths(out, format, color=True)[len(paths) :]:
-                path.unlink(missing_ok=True)  # colour labels of another scene
-    except (OSError, sqlite3.Error) as error:
-        reason = getattr(error, "strerror", None) or error
-        msg = f"{out}: cannot write the recording: {reason}"
-        raise OutputError(msg) from error
-    return out
+    every = written_paths(out, format, color=True)
+    found = []
+    with (
+        completed(paths, obsolete=every[len(paths) :]) as (recording, truth, *labels),
+        CONTAINERS[format].open(recording) as writer,
+        ExitStack() as stack,
+    ):
+        cameras = (sensor.camera, COLOUR.lens.pinhole)
+        files = [
+            stack.enter_context(LabelFile(path, len(world), camera))
+            for path, camera in zip(labels, cameras, strict=False)
+        ]
+        for index in range(len(world)):
+            rng = np.random.default_rng((seed, index))
+            frame, image = render_frame(
+                world, index, rng=rng, sensor=sensor, rate_hz=rate_hz, start_ns=EPOCH_NS
+            )
+            _write_frame(writer, world, frame, clouds=clouds, color=color)
+            files[0].append(image)
+            if color:
+                files[1].append(_write_colour(writer, world, frame))
+            found.append(_truth(world, frame, image, sensor.camera, seed))
+            observe("simulate", index + 1, len(world))
+        truth.write_text("[" + ",\n".join(map(json.dumps, found)) + "]\n", "utf-8")
+    return paths[0]
 
 
 def _write_frame(
@@ -205,69 +191,6 @@ def _truth(world: World, frame: Frame, labels: U1, camera: Camera, seed: int) ->
         "stamp_ns": frame.stamp_ns,
         **vars(frame_truth(world, frame.index, labels, camera)),
     }
-
-
-class _LabelFile:
-    """A compressed .npz with ``labels`` (t, h, w), uint8, written frame by frame."""
-
-    def __init__(self, path: Path, frames: int, camera: Camera) -> None:
-        self._archive = zipfile.ZipFile(path, "w", zipfile.ZIP_DEFLATED, compresslevel=4)
-        # ZipInfo's fixed date makes equal labels give equal bytes.
-        member = zipfile.ZipInfo("labels.npy")
-        member.compress_type = zipfile.ZIP_DEFLATED
-        self._file: IO[bytes] = self._archive.open(member, "w", force_zip64=True)
-        shape = (frames, camera.height, camera.width)
-        header = {"descr": "|u1", "fortran_order": False, "shape": shape}
-        np.lib.format.write_array_header_1_0(self._file, header)
-
-    def __enter__(self) -> Self:
-        return self
-
-    def __exit__(self, *error: object) -> None:
-        self._file.close()
-        self._archive.close()
-
-    def append(self, labels: U1) -> None:
-        """Add the labels of the next frame."""
-        self._file.write(np.ascontiguousarray(labels).tobytes())
-
-
-def written_paths(out: Path, format: str, *, color: bool = False) -> list[Path]:  # noqa: A002  the word users know
-    """Return the paths that `simulate` writes: the recording, the ground truth, the labels."""
-    suffix, _ = CONTAINERS[format]
-    out = out if out.suffix or not suffix else out.with_name(out.name + suffix)
-    names = [out.name, f"{out.stem}.truth.json", f"{out.stem}.labels.npz"]
-    names += [f"{out.stem}.color_labels.npz"] if color else []
-    return [out.with_name(name) for name in names]
-
-
-def _require_replaceable(path: Path) -> list[Path]:
-    """Return the files of a folder that a recording may replace; none if it is no folder.
-
-    Raises
-    ------
-    OutputError : the path is a folder that holds anything but a ROS 2 bag.
-    """
-    files = list(path.iterdir()) if path.is_dir() and not path.is_symlink() else []
-    if any(file.name != "metadata.yaml" and file.suffix != ".db3" for file in files):
-        msg = f"{path}: a folder that is not a recording; choose another name"
-        raise OutputError(msg)
-    return files
-
-
-def _move(made: Path, path: Path) -> None:
-    """Move a finished file or folder to its path, replacing a file or a recorded folder.
-
-    Raises
-    ------
-    OutputError : as for `_require_replaceable`.
-    """
-    for file in _require_replaceable(path):
-        file.unlink()
-    if path.is_dir() and not path.is_symlink():
-        path.rmdir()
-    flush(made)
-    made.replace(path)
 
 
 def robot_links(world_from_camera: Pose) -> list[tuple[str, str, Pose]]:

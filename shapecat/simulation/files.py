@@ -1,0 +1,109 @@
+"""The files of a simulated recording: their names, and labels that are written frame by frame."""
+
+import sqlite3
+import tempfile
+import zipfile
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
+from pathlib import Path
+from typing import IO, Self
+
+import numpy as np
+
+from shapecat.arrays import U1
+from shapecat.errors import OutputError
+from shapecat.simulation.containers import CONTAINERS
+from shapecat.system.files import flush
+from shapecat.types import Camera
+
+__all__ = ["LabelFile", "completed", "written_paths"]
+
+
+def written_paths(out: Path, format: str, *, color: bool = False) -> list[Path]:  # noqa: A002  the word users know
+    """Return the paths that `simulate` writes: the recording, the ground truth, the labels."""
+    suffix = CONTAINERS[format].suffix
+    out = out if out.suffix or not suffix else out.with_name(out.name + suffix)
+    names = [out.name, f"{out.stem}.truth.json", f"{out.stem}.labels.npz"]
+    names += [f"{out.stem}.color_labels.npz"] if color else []
+    return [out.with_name(name) for name in names]
+
+
+@contextmanager
+def completed(paths: Sequence[Path], *, obsolete: Sequence[Path]) -> Iterator[list[Path]]:
+    """Provide hidden paths; if the block succeeds, move what it wrote there to ``paths``.
+
+    The first path is the recording. ``obsolete`` files of an earlier one are then deleted.
+
+    Raises
+    ------
+    OutputError : the recording cannot be written, or its path is a folder of other files.
+    """
+    out = paths[0]
+    try:
+        _require_replaceable(out)
+        out.parent.mkdir(parents=True, exist_ok=True)
+        with tempfile.TemporaryDirectory(dir=out.parent, prefix=".simulated-") as hidden:
+            made = [Path(hidden) / path.name for path in paths]
+            yield made
+            for file, path in zip(made, paths, strict=True):
+                _move(file, path)
+            for path in obsolete:
+                path.unlink(missing_ok=True)
+    except (OSError, sqlite3.Error) as error:
+        reason = getattr(error, "strerror", None) or error
+        msg = f"{out}: cannot write the recording: {reason}"
+        raise OutputError(msg) from error
+
+
+def _require_replaceable(path: Path) -> list[Path]:
+    """Return the files of a folder that a recording may replace; none if it is no folder.
+
+    Raises
+    ------
+    OutputError : the path is a folder that holds anything but a ROS 2 bag.
+    """
+    files = list(path.iterdir()) if path.is_dir() and not path.is_symlink() else []
+    if any(file.name != "metadata.yaml" and file.suffix != ".db3" for file in files):
+        msg = f"{path}: a folder that is not a recording; choose another name"
+        raise OutputError(msg)
+    return files
+
+
+def _move(made: Path, path: Path) -> None:
+    """Move a finished file or folder to its path, replacing a file or a recorded folder.
+
+    Raises
+    ------
+    OutputError : as for `_require_replaceable`.
+    """
+    for file in _require_replaceable(path):
+        file.unlink()
+    if path.is_dir() and not path.is_symlink():
+        path.rmdir()
+    flush(made)
+    made.replace(path)
+
+
+class LabelFile:
+    """A compressed .npz with ``labels`` (t, h, w), uint8, written frame by frame."""
+
+    def __init__(self, path: Path, frames: int, camera: Camera) -> None:
+        self._archive = zipfile.ZipFile(path, "w", zipfile.ZIP_DEFLATED, compresslevel=4)
+        # ZipInfo's fixed date makes equal labels give equal bytes.
+        member = zipfile.ZipInfo("labels.npy")
+        member.compress_type = zipfile.ZIP_DEFLATED
+        self._file: IO[bytes] = self._archive.open(member, "w", force_zip64=True)
+        shape = (frames, camera.height, camera.width)
+        header = {"descr": "|u1", "fortran_order": False, "shape": shape}
+        np.lib.format.write_array_header_1_0(self._file, header)
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(self, *error: object) -> None:
+        self._file.close()
+        self._archive.close()
+
+    def append(self, labels: U1) -> None:
+        """Add the labels of the next frame."""
+        self._file.write(np.ascontiguousarray(labels).tobytes())
