@@ -12,6 +12,7 @@ from shapecat.simulation.camera.presets import PRESETS
 from shapecat.simulation.camera.render import Geometry, render
 from shapecat.simulation.camera.sensors import Sensor, interpolated, resized
 from shapecat.simulation.scenes.paths import looking_at
+from shapecat.simulation.shapes.randomness import log_uniform
 from shapecat.types import Camera, Frame, Pose
 
 __all__ = ["RenderedView", "render_view"]
@@ -97,7 +98,7 @@ def _viewpoint(arrangement: Arrangement, sensor: Sensor, rng: np.random.Generato
     nearest, farthest = _DISTANCES_M
     nearest = max(nearest, sensor.nearest_m + _CLOSER_M)
     farthest = min(farthest, sensor.farthest_m)
-    distance = float(np.exp(rng.uniform(np.log(nearest), np.log(farthest))))
+    distance = log_uniform(rng, nearest, farthest)
     azimuth = np.radians(rng.uniform(*arrangement.azimuth))
     elevation = np.radians(rng.uniform(*arrangement.elevation))
     back = np.array(

@@ -7,6 +7,7 @@ import numpy as np
 from shapecat.simulation.camera.sensors import Sensor
 from shapecat.simulation.scenes.paths import Filming, arc_orbit
 from shapecat.simulation.scenes.worlds import World
+from shapecat.simulation.shapes.randomness import log_uniform
 from shapecat.types import Pose
 
 __all__ = ["move_to_floor", "random_viewpoint"]
@@ -35,7 +36,7 @@ def random_viewpoint(
         return 0
     target = (np.mean(places, axis=0) + places[rng.integers(len(places))]) / 2
     nearest, farthest = max(distance_m[0], sensor.nearest_m + _CLOSER_M), distance_m[1]
-    distance = float(np.exp(rng.uniform(np.log(nearest), np.log(max(nearest, farthest)))))
+    distance = log_uniform(rng, nearest, max(nearest, farthest))
     (pose,) = arc_orbit(
         rng,
         np.asarray(target),

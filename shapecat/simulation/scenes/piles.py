@@ -15,6 +15,7 @@ from shapecat.simulation.scenes.worlds import PlacedObject, Support, World
 from shapecat.simulation.shapes.categories import make_object
 from shapecat.simulation.shapes.distractors import DISTRACTORS, make_distractor
 from shapecat.simulation.shapes.mesh import Mesh
+from shapecat.simulation.shapes.randomness import log_uniform, random_rotation
 
 __all__ = ["KINDS", "Item", "bin_picking", "make_item", "pile", "settled", "shelf_bin"]
 
@@ -56,14 +57,14 @@ def pile(
     drops, items = [], [make_item(category, rng, kinds) for category in categories]
     for item in items:
         place = np.clip(rng.normal(0, spread, 2), -0.4, 0.4)
-        drops.append(Drop(item.mesh, _random_rotation(rng), place))
+        drops.append(Drop(item.mesh, _dropped_rotation(rng), place))
     objects = settled(items, drops, supports, table)
     target = np.array([0, 0, table.height + 0.05])
     path = arc_orbit(
         rng,
         target,
         filming,
-        distance=float(np.exp(rng.uniform(np.log(0.6), np.log(1.5)))),
+        distance=log_uniform(rng, 0.6, 1.5),
         elevation=(18, 75),
         sweep=(20, 60),
     )
@@ -118,18 +119,17 @@ def _drops_within(rng: Generator, items: Sequence[Item], half: F8) -> list[Drop]
     drops = []
     for item in items:
         room = np.maximum(half - float(item.mesh.extents.max()) / 2 - 0.01, 0)
-        drops.append(Drop(item.mesh, _random_rotation(rng), rng.uniform(-room, room)))
+        drops.append(Drop(item.mesh, _dropped_rotation(rng), rng.uniform(-room, room)))
     return drops
 
 
-def _random_rotation(rng: Generator) -> F8:
-    """Return a random rotation (3, 3): nearly upright with probability `_UPRIGHT`, else any."""
+def _dropped_rotation(rng: Generator) -> F8:
+    """Draw a rotation (3, 3): nearly upright with probability `_UPRIGHT`, else any."""
     if rng.random() >= _UPRIGHT:
-        axis = rng.normal(size=4)
-        return rotation_from_quaternion(axis / np.linalg.norm(axis))
-    tilt, turn = rng.normal(0, np.radians(_TILT_DEG) / 2, 2), rng.uniform(0, np.pi)
-    axis = np.array([*tilt, np.sin(turn), np.cos(turn)])
-    return rotation_from_quaternion(axis / np.linalg.norm(axis))
+        return random_rotation(rng)
+    tilt, half_yaw = rng.normal(0, np.radians(_TILT_DEG) / 2, 2), rng.uniform(0, np.pi)
+    quaternion = np.array([*tilt, np.sin(half_yaw), np.cos(half_yaw)])
+    return rotation_from_quaternion(quaternion / np.linalg.norm(quaternion))
 
 
 def settled(

@@ -1,15 +1,13 @@
 """Closed shapes: cans, bottles, boxes and balls."""
 
-from typing import Any
-
 import numpy as np
 from numpy.random import Generator
 
 from shapecat.arrays import F8
 from shapecat.geometry import rotation_from_quaternion
 from shapecat.simulation.shapes.mesh import Mesh, join, moved, scaled, standing
-from shapecat.simulation.shapes.open_shapes import log_uniform
 from shapecat.simulation.shapes.primitives import extrude, lathe, rounded_box, smooth_path, tube
+from shapecat.simulation.shapes.randomness import log_uniform, with_random_yaw
 from shapecat.types import Pose
 
 __all__ = ["make_ball", "make_bottle", "make_box", "make_can"]
@@ -31,10 +29,9 @@ def make_can(rng: Generator) -> Mesh:
         "drum": (log_uniform(rng, 0.11, 0.22), rng.uniform(0.35, 1.2), _tin),
     }[str(family)]
     profile = make_profile(rng, diameter / 2, min(ratio * diameter, 0.32))
-    section: dict[str, Any] = {"segments": 44}
-    if family in {"tin", "flat", "drum"} and rng.random() < 0.06:
-        section["stretch"] = rng.uniform(0.75, 0.92)
-    return standing(lathe(profile, **section, turn=rng.uniform(0, 1)))
+    oval = family in {"tin", "flat", "drum"} and rng.random() < 0.06
+    stretch = rng.uniform(0.75, 0.92) if oval else 1.0
+    return standing(lathe(profile, segments=44, stretch=stretch, turn=rng.uniform(0, 1)))
 
 
 def _soda(rng: Generator, r: float, h: float) -> F8:
@@ -143,7 +140,7 @@ def make_bottle(rng: Generator) -> Mesh:
         mesh = join([mesh, *_pump(rng, radius * neck, height)])
     if family == "trigger":
         mesh = join([mesh, *_trigger(rng, radius, height)])
-    return standing(_with_random_yaw(mesh, rng))
+    return standing(with_random_yaw(mesh, rng))
 
 
 def _bottle_side(rng: Generator, family: str, body: float) -> F8:
@@ -282,10 +279,3 @@ def make_ball(rng: Generator) -> Mesh:
     mesh = scaled(mesh, rng.uniform(0.97, 1.03, 3) if rng.random() < 0.6 else 1.0)
     quaternion = np.round(rng.normal(size=4), 6)
     return standing(moved(mesh, Pose(rotation_from_quaternion(quaternion), np.zeros(3))))
-
-
-def _with_random_yaw(mesh: Mesh, rng: Generator) -> Mesh:
-    angle = rng.uniform(0, np.pi)
-    return moved(
-        mesh, Pose(rotation_from_quaternion([0, 0, np.sin(angle), np.cos(angle)]), np.zeros(3))
-    )

@@ -7,8 +7,8 @@ from numpy.random import Generator
 
 from shapecat.simulation.shapes.kitchen import KITCHEN
 from shapecat.simulation.shapes.mesh import Mesh, scaled, standing
-from shapecat.simulation.shapes.open_shapes import log_uniform
 from shapecat.simulation.shapes.procedural import PROCEDURAL
+from shapecat.simulation.shapes.randomness import log_uniform
 from shapecat.simulation.shapes.tools import TOOLS
 from shapecat.simulation.shapes.toys import TOYS
 

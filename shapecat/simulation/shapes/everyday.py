@@ -6,9 +6,9 @@ import numpy as np
 from numpy.random import Generator
 
 from shapecat.simulation.shapes.mesh import Mesh, join, standing
-from shapecat.simulation.shapes.open_shapes import log_uniform
 from shapecat.simulation.shapes.parts import ellipsoid, placed, rod
 from shapecat.simulation.shapes.primitives import extrude, rounded_box, smooth_path, tube
+from shapecat.simulation.shapes.randomness import log_uniform
 
 __all__ = ["EVERYDAY"]
 

@@ -9,13 +9,9 @@ from numpy.typing import ArrayLike
 from shapecat.arrays import F8
 from shapecat.simulation.shapes.mesh import Mesh, join, standing
 from shapecat.simulation.shapes.primitives import lathe, smooth_path, tube
+from shapecat.simulation.shapes.randomness import log_uniform, with_random_yaw
 
-__all__ = ["log_uniform", "make_bowl", "make_cup", "make_plate"]
-
-
-def log_uniform(rng: Generator, low: float, high: float) -> float:
-    """Draw a number between ``low`` and ``high`` with a uniformly distributed logarithm."""
-    return float(np.exp(rng.uniform(np.log(low), np.log(high))))
+__all__ = ["make_bowl", "make_cup", "make_plate"]
 
 
 def make_cup(rng: Generator) -> Mesh:
@@ -55,7 +51,7 @@ def make_cup(rng: Generator) -> Mesh:
         sides = [0.0, np.pi] if rng.random() < 0.04 else [0.0]
         shape = _handle_shape(rng, diameter, height)
         body = join([body, *(_handle(outer, shape, wall, side) for side in sides)])
-    return _with_random_yaw(body, rng)
+    return standing(with_random_yaw(body, rng))
 
 
 def make_bowl(rng: Generator) -> Mesh:
@@ -87,9 +83,8 @@ def make_bowl(rng: Generator) -> Mesh:
     outer = _wall([base, middle, 1.0], diameter / 2, height, power=1.0)
     rim = rng.random() < 0.15 and ratio < 0.4
     profile = _hollow(outer, wall, floor=bottom, foot=foot, lip=diameter * 0.06 if rim else 0.0)
-    return _with_random_yaw(
-        lathe(profile, **_section(rng, oval=0.06, square=0.07, facets=0.03)), rng
-    )
+    section = _section(rng, oval=0.06, square=0.07, facets=0.03)
+    return standing(with_random_yaw(lathe(profile, **section), rng))
 
 
 def make_plate(rng: Generator) -> Mesh:
@@ -122,7 +117,7 @@ def make_plate(rng: Generator) -> Mesh:
         under = np.concatenate([under[: at + 1], foot, under[at + 1 :]])
     profile = np.concatenate([under, top[::-1]])
     section = _section(rng, oval=0.08, square=0.13, facets=0.02)
-    return _with_random_yaw(standing(lathe(profile, **section)), rng)
+    return standing(with_random_yaw(standing(lathe(profile, **section)), rng))
 
 
 def _wall(shares: ArrayLike, radius: float, height: float, *, power: float) -> F8:
@@ -217,14 +212,3 @@ def _handle(outer: F8, shape: tuple[F8, float, float], wall: float, side: float)
     reach = start + np.maximum(curve[:, 0], 0)
     points = np.stack([reach * np.cos(side), reach * np.sin(side), height], -1)
     return tube(points, radius, segments=8, flatness=flatness)
-
-
-def _with_random_yaw(mesh: Mesh, rng: Generator) -> Mesh:
-    """Turn a mesh by a random angle about z and place it on the origin."""
-    angle = rng.uniform(0, 2 * np.pi)
-    c, s = np.cos(angle), np.sin(angle)
-    points = np.asarray(mesh.vertices, np.float64)
-    turned = np.stack(
-        [c * points[:, 0] - s * points[:, 1], s * points[:, 0] + c * points[:, 1]], -1
-    )
-    return standing(Mesh(np.column_stack([turned, points[:, 2]]), mesh.triangles))

@@ -5,13 +5,11 @@ from collections.abc import Callable
 import numpy as np
 from numpy.random import Generator
 
-from shapecat.arrays import F8
-from shapecat.geometry import rotation_from_quaternion
 from shapecat.simulation.shapes.everyday import EVERYDAY
 from shapecat.simulation.shapes.mesh import Mesh, join, moved, standing
-from shapecat.simulation.shapes.open_shapes import log_uniform
 from shapecat.simulation.shapes.parts import ellipsoid, rod
 from shapecat.simulation.shapes.primitives import extrude, lathe, rounded_box, smooth_path, tube
+from shapecat.simulation.shapes.randomness import log_uniform, random_rotation
 from shapecat.types import Pose
 
 __all__ = ["PROCEDURAL"]
@@ -23,7 +21,7 @@ def _assembly(rng: Generator) -> Mesh:
     parts, place = [], np.zeros(3)
     for _ in range(int(rng.integers(3, 6))):
         body = _body(rng, size * rng.uniform(0.35, 1.0))
-        parts.append(moved(body, Pose(_random_rotation(rng), place)))
+        parts.append(moved(body, Pose(random_rotation(rng), place)))
         points = np.asarray(parts[-1].vertices, np.float64)
         place = points[int(rng.integers(len(points)))] * rng.uniform(0.6, 1.0)
     return join(parts)
@@ -40,11 +38,6 @@ def _body(rng: Generator, size: float) -> Mesh:
     return lathe(
         [[0, 0], [size * rng.uniform(0.2, 0.8), 0], [size * rng.uniform(0.1, 0.6), size], [0, size]]
     )
-
-
-def _random_rotation(rng: Generator) -> F8:
-    axis = rng.normal(size=4)
-    return rotation_from_quaternion(axis / np.linalg.norm(axis))
 
 
 def _bent_rod(rng: Generator) -> Mesh:
