@@ -52,15 +52,14 @@ def render_colour(world: World, frame: int) -> tuple[U1, U1]:
 
     Returns
     -------
-    The image (h, w, 3), uint8 red, green, blue; and its labels (h, w), uint8: those of
-    ``world.labels``, 0 without surface.
+    The image (h, w, 3), uint8 red, green, blue; and its pixel labels (h, w), uint8, 0 without
+    surface.
     """
     pose = compose(world.path[frame], COLOUR.depth_from_colour)
     fine, rows, columns = _lookup(COLOUR.lens)
     image = render(world.geometry(frame), fine, pose)
-    mesh_ids = image.mesh_ids[rows, columns]
     colours = _paint(world, frame, pose, fine, image, rows, columns)
-    return colours, np.take(np.append(world.labels, np.uint8(0)), mesh_ids, mode="wrap")
+    return colours, world.labels_of(image.mesh_ids[rows, columns])
 
 
 @lru_cache(maxsize=4)  # a recording has one lens

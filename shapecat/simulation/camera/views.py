@@ -1,6 +1,5 @@
 """Simulated depth frames with pixel labels, in memory, for training and evaluation."""
 
-import numpy as np
 from numpy.random import Generator
 
 from shapecat.arrays import U1
@@ -40,10 +39,9 @@ def render_frame(
     pose = world.path[view] if isinstance(view, int) else view
     image = render(world.geometry(index), sensor.camera, pose)
     depth, mesh_ids = measure(image, sensor, rng)
-    labels = np.take(np.append(world.labels, np.uint8(0)), mesh_ids, mode="wrap")  # -1 is the last
     stamp = start_ns + round(index * 1e9 / rate_hz)
     topic = "/camera/depth/image_raw"
     frame = Frame(
         topic, index, stamp, stamp, "camera_depth_optical_frame", depth=depth, camera=sensor.camera
     )
-    return frame, labels
+    return frame, world.labels_of(mesh_ids)

@@ -5,7 +5,7 @@ from functools import cached_property
 import numpy as np
 from numpy.typing import ArrayLike
 
-from shapecat.arrays import F8, U1, Record, array
+from shapecat.arrays import F8, I4, U1, Record, array
 from shapecat.geometry import compose
 from shapecat.simulation.camera.render import Geometry, geometry
 from shapecat.simulation.shapes.mesh import Mesh
@@ -135,15 +135,19 @@ class World(Record):
         return shift is None or bool(np.isfinite(shift[frame]).all())
 
     def geometry(self, frame: int) -> Geometry:
-        """Return all triangles of a frame, in the world frame; mesh ids index `labels`."""
+        """Return the triangles of a frame, world frame: those of the supports come first."""
         moves = self.motions or self.turns is not None
         return self._gather(frame) if moves else self._still
 
+    def labels_of(self, mesh_ids: I4) -> U1:
+        """Return the pixel labels (h, w), uint8, of the visible meshes; 0 for the mesh id -1."""
+        return np.take(self._labels, mesh_ids, mode="wrap")
+
     @cached_property
-    def labels(self) -> U1:
-        """(n,) uint8 pixel label of each mesh: the supports, then the objects."""
+    def _labels(self) -> U1:
+        """(n + 1,) labels of the supports, then of the objects; the last is that of no mesh."""
         found = [s.label for s in self.supports] + [t.label for t in self.objects]
-        return np.array(found, np.uint8)
+        return np.array([*found, 0], np.uint8)
 
     @cached_property
     def _shifts(self) -> dict[int, F8]:
