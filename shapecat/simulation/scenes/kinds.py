@@ -8,7 +8,7 @@ import numpy as np
 from numpy.random import Generator
 
 from shapecat.simulation.scenes.furniture import make_room, make_shelf, make_table, round_table
-from shapecat.simulation.scenes.layout import Layout
+from shapecat.simulation.scenes.layout import SUPPORTING, Layout
 from shapecat.simulation.scenes.moving import crossing, rearranged, walking
 from shapecat.simulation.scenes.paths import Filming, arc_orbit, static_view
 from shapecat.simulation.scenes.piles import bin_picking, pile, shelf_bin
@@ -99,9 +99,7 @@ def _clutter(rng: Generator, spec: _SceneSpec) -> World:
     layout = Layout(rng, gap=0.01)
     half = rng.uniform([0.2, 0.16], [0.32, 0.24])
     wanted = spec.draw(rng, int(rng.integers(7, 13)), unknown=int(rng.integers(0, 3)))
-    wanted.sort(
-        key=lambda category: category not in {"box", "can"}
-    )  # objects that can carry others come first
+    wanted.sort(key=lambda category: category not in SUPPORTING)
     for category in wanted:
         layout.gap = float(rng.choice([0.002, 0.008, 0.02]))
         layout.put(category, table, half, stack=0.3, attempts=4)

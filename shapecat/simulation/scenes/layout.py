@@ -15,14 +15,14 @@ from shapecat.simulation.shapes.distractors import make_distractor
 from shapecat.simulation.shapes.mesh import Mesh
 from shapecat.types import Pose
 
-__all__ = ["Layout", "Piece", "make_piece"]
+__all__ = ["SUPPORTING", "Layout", "Piece", "make_piece"]
 
 _LYING = {"can": 0.2, "bottle": 0.22, "cup": 0.12, "box": 0.7}
 """Probability that an object of a category lies; a box lies on any face."""
 _UPSIDE_DOWN = {"cup": 0.06, "bowl": 0.06, "plate": 0.03}
 """Probability that an open object stands on its rim."""
 _WIDEST_M = 0.42
-_SUPPORTING = {"box", "can"}
+SUPPORTING = {"box", "can"}
 """Categories that other objects are stacked on."""
 _SMALLEST_TOP_M = 0.035
 """Minimum width of a top face that supports another object."""
@@ -183,7 +183,7 @@ class Layout:
     def _can_support(self, k: int) -> bool:
         top = self._places[k].top
         flat = len(top) > 2 and float(np.ptp(top, axis=0).min()) > _SMALLEST_TOP_M
-        return flat and self.objects[k].category in _SUPPORTING
+        return flat and self.objects[k].category in SUPPORTING
 
     def _add(
         self, piece: Piece, turn: Pose, here: Footprint, support: Support, on_track: int | None

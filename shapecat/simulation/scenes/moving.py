@@ -15,6 +15,11 @@ from shapecat.types import Pose
 
 __all__ = ["crossing", "rearranged", "walking"]
 
+_ANYWHERE = np.array([0.6, 0.3])
+"""Half the size of an area around any strip; positions outside the strip are rejected."""
+_MOVERS = ("ball", "can", "cup", "bottle", "box")
+"""Categories of moving objects, most of which fit on a lane."""
+
 
 def walking(rng: Generator, categories: Sequence[str], filming: Filming) -> World:
     """Return a counter with objects of these categories; the camera moves along it and back.
@@ -25,9 +30,8 @@ def walking(rng: Generator, categories: Sequence[str], filming: Filming) -> Worl
     layout = Layout(rng, gap=rng.uniform(0.02, 0.05))
     for k, category in enumerate(categories):
         middle = -0.85 + 1.7 * (k + 0.5) / len(categories)  # spread along the counter
-        layout.put(
-            category, _strip(counter, (middle - 0.3, middle + 0.3), (-0.22, 0.22)), _ANYWHERE
-        )
+        strip = _strip(counter, (middle - 0.3, middle + 0.3), (-0.22, 0.22))
+        layout.put(category, strip, _ANYWHERE)
     target = np.array([0, 0, counter.height + 0.05])
     path = lateral_pass(
         rng, target, filming, distance=(0.95, 1.2), elevation=(30, 48), amplitude=(0.6, 0.75)
@@ -105,11 +109,6 @@ def _orbit_table(
     """
     middle = np.array([0, 0, table.height + 0.05])
     return arc_orbit(rng, middle, filming, distance=(1.0, 1.3), elevation=elevation, sweep=sweep)
-
-
-_ANYWHERE = np.array([0.6, 0.3])
-_MOVERS = ("ball", "can", "cup", "bottle", "box")
-"""Categories of moving objects, most of which fit on a lane."""
 
 
 def _strip(support: Support, x: tuple[float, float], y: tuple[float, float]) -> Support:
