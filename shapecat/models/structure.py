@@ -36,7 +36,7 @@ from shapecat.simulation import make_scene, render_frame
 from shapecat.simulation.camera.presets import PRESETS
 from shapecat.simulation.camera.sensors import resized
 from shapecat.simulation.scenes.equipment import make_own_arms, make_resting_arms
-from shapecat.simulation.scenes.furniture import EQUIPMENT, make_rack, make_tote
+from shapecat.simulation.scenes.furniture import as_equipment, make_rack, make_tote
 from shapecat.simulation.scenes.kinds import SceneKind
 from shapecat.simulation.scenes.worlds import Support, World
 from shapecat.trees import BoostedTrees, write_trees
@@ -248,10 +248,7 @@ def _with_arms(
         meshes = make_own_arms(rng, pose, height)
     else:
         meshes = make_resting_arms(rng, pose, intrinsics, height)
-    added = (
-        Support(f"arm_{k}", EQUIPMENT, mesh, np.zeros((0, 3))) for k, mesh in enumerate(meshes)
-    )
-    return replace(world, supports=(*world.supports, *added))
+    return replace(world, supports=(*world.supports, *as_equipment("arm", meshes)))
 
 
 def label_objects(frame: Frame, pixel_labels: U1, object_labels: I4) -> Iterator[Samples]:

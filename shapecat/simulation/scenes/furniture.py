@@ -13,6 +13,7 @@ from shapecat.simulation.shapes.primitives import extrude, rounded_box
 from shapecat.types import Pose
 
 __all__ = [
+    "as_equipment",
     "make_bin",
     "make_compartment",
     "make_counter",
@@ -27,7 +28,7 @@ __all__ = [
 
 FLOOR, TABLE, BOARD, EQUIPMENT, SIDE, BACK, WALL = 1, 2, 2, 6, 7, 8, 9
 """Pixel labels; the boards of a shelf count up from `BOARD`."""
-_SIDES = ("left_side", "right_side", "front", "back")
+_SIDES = {"left_side", "right_side", "front", "back"}
 """Names of the sides of a bin."""
 
 
@@ -113,20 +114,12 @@ def make_bin(rng: Generator) -> tuple[Support, list[Support]]:
     height, thick = rng.choice([0.01, rng.uniform(0.4, 0.9)]), rng.uniform(0.003, 0.012)
     bottom = _slab("bin", TABLE, (width, depth, 0.01), (0, 0, height))
     beside, before = (width + thick) / 2, (depth + thick) / 2
-    sides = [
-        _board(name, label, size, (x, y, height))
-        for name, (label, size, x, y) in zip(
-            _SIDES,
-            (
-                (SIDE, (thick, depth, tall), -beside, 0),
-                (SIDE, (thick, depth, tall), beside, 0),
-                (BACK, (width + 2 * thick, thick, tall), 0, -before),
-                (BACK, (width + 2 * thick, thick, tall), 0, before),
-            ),
-            strict=True,
-        )
+    return bottom, [
+        _board("left_side", SIDE, (thick, depth, tall), (-beside, 0, height)),
+        _board("right_side", SIDE, (thick, depth, tall), (beside, 0, height)),
+        _board("front", BACK, (width + 2 * thick, thick, tall), (0, -before, height)),
+        _board("back", BACK, (width + 2 * thick, thick, tall), (0, before, height)),
     ]
-    return bottom, sides
 
 
 def make_tote(rng: Generator, supports: Sequence[Support]) -> list[Support]:
@@ -197,4 +190,9 @@ def _upright(name: str, label: int, size: Sequence[float], place: Sequence[float
 def _board(name: str, label: int, size: Sequence[float], place: Sequence[float]) -> Support:
     """Return a board that supports nothing; ``place`` (3,) is the centre of its lower face."""
     shift = Pose(np.eye(3), np.array(place, np.float64))
-    return Support(name, label, moved(rounded_box(size, fine=1), shift), np.zeros((0, 3)))
+    return Support(name, label, moved(rounded_box(size, fine=1), shift))
+
+
+def as_equipment(name: str, meshes: Sequence[Mesh]) -> list[Support]:
+    """Return meshes, in the world frame, as parts of the scene that support nothing."""
+    return [Support(f"{name}_{k}", EQUIPMENT, mesh) for k, mesh in enumerate(meshes)]

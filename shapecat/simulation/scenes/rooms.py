@@ -17,7 +17,7 @@ from shapecat.simulation.scenes.equipment import (
     make_monitor,
     make_plant,
 )
-from shapecat.simulation.scenes.furniture import EQUIPMENT, make_room, make_table, make_wall
+from shapecat.simulation.scenes.furniture import as_equipment, make_room, make_table, make_wall
 from shapecat.simulation.scenes.paths import Filming, arc_orbit
 from shapecat.simulation.scenes.physics import Drop
 from shapecat.simulation.scenes.piles import KINDS, Item, make_item, settled
@@ -46,18 +46,13 @@ def room(
         margin = float(item.mesh.extents[:2].max()) / 2
         place = rng.uniform(-1, 1, 2) * np.clip(half - margin, 0.02, (0.45, 0.3))
         drops.append(Drop(item.mesh, pose_from_yaw(rng.uniform(-0.6, 0.6)).rotation, place))
-    solid = (table, *_as_supports("robot", standing))
+    solid = (table, *as_equipment("robot", standing))
     objects = settled(items, drops, solid, table)
     target = np.array([0, 0, table.height + rng.uniform(0.0, 0.2)])
     path = arc_orbit(rng, target, filming, distance=(0.7, 2.2), elevation=(12, 60), sweep=(15, 60))
     rest = [s for s in supports if s is not table]
-    everything = (*rest, *solid, *_as_supports("room", around))
+    everything = (*rest, *solid, *as_equipment("room", around))
     return World("room", everything, objects, path)
-
-
-def _as_supports(name: str, meshes: Sequence[Mesh]) -> list[Support]:
-    nothing = np.zeros((0, 3))
-    return [Support(f"{name}_{k}", EQUIPMENT, mesh, nothing) for k, mesh in enumerate(meshes)]
 
 
 def _devices(rng: Generator) -> Iterator[tuple[str, Callable[[Generator], Mesh]]]:

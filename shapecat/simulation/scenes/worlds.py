@@ -1,12 +1,12 @@
 """Simulated worlds: supports, objects, their motions, and a camera path."""
 
-from functools import cached_property
+from functools import cached_property, partial
 
 import numpy as np
 from numpy.typing import ArrayLike
 
 from shapecat.arrays import F8, I4, U1, Record, array
-from shapecat.geometry import compose
+from shapecat.geometry import IDENTITY, compose
 from shapecat.simulation.camera.render import Geometry, geometry
 from shapecat.simulation.shapes.mesh import Mesh
 from shapecat.types import Pose
@@ -25,14 +25,14 @@ class Support(Record):
     name : unique in its world.
     label : pixel label, 1 to 9.
     mesh : metres, world frame.
-    outline : (k, 3) corners of its horizontal surface, metres, world frame; k = 0 for a support
-        that nothing can stand on, such as a wall.
+    outline : (k, 3) corners of its horizontal surface, metres, world frame; none, the default,
+        if nothing can stand on it, as on a wall.
     """
 
     name: str
     label: int
     mesh: Mesh
-    outline: F8 = array("k 3", "f8")
+    outline: F8 = array("k 3", "f8", default_factory=partial(np.zeros, (0, 3)))
 
     @property
     def holds_objects(self) -> bool:
@@ -161,12 +161,11 @@ class World(Record):
         return 0.0 if self.turns is None else float(self.turns[frame])
 
     def _gather(self, frame: int) -> Geometry:
-        here = Pose(np.eye(3), np.zeros(3))
         objects = [
             (item.mesh if self.present(item, frame) else _NOTHING, self.pose_of(item, frame))
             for item in self.objects
         ]
-        return geometry([(support.mesh, here) for support in self.supports] + objects)
+        return geometry([(support.mesh, IDENTITY) for support in self.supports] + objects)
 
 
 _NOTHING = Mesh(np.zeros((0, 3)), np.zeros((0, 3)))

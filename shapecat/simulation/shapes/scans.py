@@ -8,6 +8,7 @@ from scipy.spatial import ConvexHull
 
 from shapecat.arrays import F8, I4
 from shapecat.errors import ConfigError, RecordingError
+from shapecat.geometry import IDENTITY
 from shapecat.simulation.camera.render import geometry, render
 from shapecat.simulation.scenes.placement import StablePose, stable_poses
 from shapecat.simulation.shapes.mesh import Mesh, moved, standing
@@ -128,7 +129,7 @@ def _hollow(points: F8, mesh: Mesh) -> float:
     span = float(np.abs(points[:, :2]).max())
     camera = Camera(64, 64, 31 * far / span, 31 * far / span, 31.5, 31.5)
     above = Pose(np.array([[1.0, 0, 0], [0, -1, 0], [0, 0, -1]]), np.array([0, 0, far]))
-    image = render(geometry([(turned, Pose(np.eye(3), np.zeros(3)))]), camera, above)
+    image = render(geometry([(turned, IDENTITY)]), camera, above)
     seen = image.mesh_ids >= 0
     height = far - image.depth
     middle = np.zeros_like(seen)
