@@ -26,7 +26,11 @@ from shapecat.models.arrangements import (
 from shapecat.models.card import write_card
 from shapecat.models.fragments import cut_fragment, remove_base
 from shapecat.models.sets import SimulatedViews, collect, partial_views
-from shapecat.models.worlds import describe_arrangement, simulate_views, simulate_world
+from shapecat.models.simulated_views import (
+    describe_arrangement,
+    simulate_arrangement,
+    simulate_views,
+)
 from shapecat.simulation.scenes import physics, piles
 from shapecat.simulation.shapes.distractors import make_distractor
 from shapecat.simulation.shapes.mesh import Mesh, moved
@@ -81,7 +85,7 @@ def test_new_simulated_objects_are_recognised(model: Categorizer) -> None:
     """A few tables of an unused seed; the card has the real figures."""
     kinds = ("pan", "hammer", "shoe", "chair")
     data = collect(
-        view for k in range(6) for view in simulate_world(ArrangementOptions(99, kinds), k)
+        view for k in range(6) for view in simulate_arrangement(ArrangementOptions(99, kinds), k)
     )
     whole = (data.source != "fragment") & (data.visible > 0.7) & (data.resting_pose == "upright")
     report = evaluate(data.views.where(whole & (data.views.distances < _NEAR_M)), model)
@@ -95,7 +99,7 @@ def test_new_simulated_objects_are_recognised(model: Categorizer) -> None:
 def tables() -> tuple[SimulatedViews, SimulatedViews]:
     """Simulate the same tables in order, and each as another process might: not after the first."""
     sent = deepcopy(WORLD)  # as if it was pickled
-    second, first = (simulate_world(sent, number) for number in (1, 0))
+    second, first = (simulate_arrangement(sent, number) for number in (1, 0))
     return collect(simulate_views(WORLD, range(2))), collect([*first, *second])
 
 
@@ -125,7 +129,7 @@ def test_training_tables_follow_their_options() -> None:
     world = ArrangementOptions(
         7, ("pan",), unknown=0.0, lying=0.9, leaning=0.5, cameras=1, keep=True
     )
-    views = [view for k in range(4) for view in simulate_world(world, k)]
+    views = [view for k in range(4) for view in simulate_arrangement(world, k)]
     resting_poses = [view.resting_pose for view in views if view.label in {"cup", "can", "bottle"}]
 
     assert {"lying", "leaning"} <= set(resting_poses)

@@ -9,7 +9,7 @@ from shapecat.evaluation import View
 from shapecat.learning import Categorizer
 from shapecat.learning.categorizer import Prediction
 from shapecat.models.pictures import draw, worst_mistakes
-from shapecat.models.worlds import WorldView
+from shapecat.models.simulated_views import SimulatedView
 
 
 class Oracle:
@@ -23,11 +23,11 @@ class Oracle:
         return Prediction(np.stack([cup, 1 - cup], axis=1), descriptors[:, 1])
 
 
-def seen(label: str, instance: str, cup: float, novelty: float) -> WorldView:
+def seen(label: str, instance: str, cup: float, novelty: float) -> SimulatedView:
     points = np.random.default_rng(0).normal(0, 0.03, (200, 3)) + np.array([0, 0, 0.05])
     view = View(points, np.array([0.5, 0.0, 0.5]), label, instance)
     descriptor = np.array([cup, novelty], np.float32)
-    return WorldView(
+    return SimulatedView(
         descriptor, label, instance, 200, 0.7, 0.0, "upright", "truth", 1.0, 1.0, "kinect", view,
     )  # fmt: skip
 
@@ -43,7 +43,7 @@ def test_worst_mistakes_are_most_confident_and_one_per_object(tmp_path: Path) ->
     model: Categorizer = Oracle()  # type: ignore[assignment]
     found = worst_mistakes(views, model)
 
-    assert [(m.world_view.instance, m.predicted) for m in found] == [("b", "unknown"), ("a", "cup")]
+    assert [(m.simulated.instance, m.predicted) for m in found] == [("b", "unknown"), ("a", "cup")]
     assert found[0].confidence > found[1].confidence > 0.8 * 0.9
     draw(tmp_path / "worst.png", found)
     with Image.open(tmp_path / "worst.png") as picture:

@@ -5,7 +5,7 @@ from pathlib import Path
 
 import numpy as np
 
-from shapecat.models.worlds import WorldView, simulate_mesh
+from shapecat.models.simulated_views import SimulatedView, simulate_mesh
 from shapecat.simulation.shapes.scans import load_mesh, upright_poses, uprighted
 
 __all__ = ["mesh_views"]
@@ -17,7 +17,7 @@ _NEVER_LIE = {"ball", "bowl", "plate"}
 
 def mesh_views(
     folder: Path, *, seed: int, placements: int = 2, cameras: int = 2
-) -> Iterator[WorldView]:
+) -> Iterator[SimulatedView]:
     """Yield views of each mesh in ``<category>/*.ply``, alone on a table.
 
     Parameters

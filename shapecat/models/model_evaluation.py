@@ -27,7 +27,7 @@ from shapecat.models.sets import (
     collect,
     options_of,
 )
-from shapecat.models.worlds import WorldView, simulate_views, simulate_world
+from shapecat.models.simulated_views import SimulatedView, simulate_arrangement, simulate_views
 from shapecat.simulation.camera.presets import PRESETS
 from shapecat.simulation.shapes.distractors import DISTRACTORS
 from shapecat.types import UNKNOWN
@@ -98,10 +98,10 @@ def evaluate_model(
     click.echo(format_report(clear))
 
 
-def _test_views() -> list[WorldView]:
+def _test_views() -> list[SimulatedView]:
     """Return the clear views of a few test tables, with their points."""
     options = replace(options_of("test"), keep=True)
-    views = [view for number in range(_DRAWN) for view in simulate_world(options, number)]
+    views = [view for number in range(_DRAWN) for view in simulate_arrangement(options, number)]
     return [view for view, clear in zip(views, clear_views(collect(views)), strict=True) if clear]
 
 
@@ -166,7 +166,7 @@ def _counts(sets: dict[str, SimulatedViews]) -> list[tuple[str, ...]]:
     ]
 
 
-def _tracks(jobs: int) -> Iterable[WorldView]:
+def _tracks(jobs: int) -> Iterable[SimulatedView]:
     """Simulate tables, each from many viewpoints."""
     options = ArrangementOptions(
         _TRACK_SEED, tuple(DISTRACTORS), unknown=0.0, cameras=max(FUSED) + 6

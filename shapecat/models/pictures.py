@@ -9,7 +9,7 @@ import numpy as np
 from shapecat.arrays import F8
 from shapecat.evaluation import View
 from shapecat.learning import Categorizer
-from shapecat.models.worlds import WorldView
+from shapecat.models.simulated_views import SimulatedView
 from shapecat.types import UNKNOWN
 
 __all__ = ["Mistake", "draw", "worst_mistakes"]
@@ -20,31 +20,29 @@ _COLUMNS = 6
 class Mistake(NamedTuple):
     """A view with a wrong label, the ``predicted`` one, and its confidence."""
 
-    world_view: WorldView
+    simulated: SimulatedView
     view: View
     predicted: str
     confidence: float
 
 
 def worst_mistakes(
-    views: Sequence[WorldView], model: Categorizer, *, count: int = 12
+    views: Sequence[SimulatedView], model: Categorizer, *, count: int = 12
 ) -> list[Mistake]:
     """Return up to ``count`` mistakes on different objects, most confident first."""
-    answer = model.predict(np.array([world_view.descriptor for world_view in views]))
+    answer = model.predict(np.array([view.descriptor for view in views]))
     found = []
-    for world_view, posterior, novelty in zip(
-        views, answer.posteriors, answer.novelty, strict=True
-    ):
+    for view, posterior, novelty in zip(views, answer.posteriors, answer.novelty, strict=True):
         is_unknown = novelty > 1
         predicted = UNKNOWN if is_unknown else model.categories[int(posterior.argmax())]
         known = 1 - float(novelty) / 2
         confidence = 1 - known if is_unknown else known * float(posterior.max())
-        if predicted != world_view.label and world_view.view is not None:
-            found.append(Mistake(world_view, world_view.view, predicted, confidence))
+        if predicted != view.label and view.view is not None:
+            found.append(Mistake(view, view.view, predicted, confidence))
     found.sort(key=lambda mistake: -mistake.confidence)
     worst: dict[str, Mistake] = {}
     for mistake in found:
-        worst.setdefault(mistake.world_view.instance, mistake)
+        worst.setdefault(mistake.simulated.instance, mistake)
     return list(worst.values())[:count]
 
 
@@ -66,14 +64,14 @@ def draw(path: Path, mistakes: Sequence[Mistake]) -> None:
 
 
 def _draw_one(axis: Any, mistake: Mistake) -> None:
-    world_view = mistake.world_view
+    view = mistake.simulated
     across, depth = _as_seen(mistake.view)
     axis.scatter(*across.T, c=depth, s=3, cmap="viridis_r", linewidths=0)
     axis.set_aspect("equal")
-    where = f"{world_view.sensor}, {world_view.distance:.1f} m, {world_view.points} voxels"
+    where = f"{view.sensor}, {view.distance:.1f} m, {view.points} voxels"
     wrong = f"as {mistake.predicted} ({mistake.confidence:.2f})"
     axis.set_title(
-        f"{world_view.label}, {world_view.resting_pose}\n{wrong}\n{where}",
+        f"{view.label}, {view.resting_pose}\n{wrong}\n{where}",
         fontsize=7,
     )
 

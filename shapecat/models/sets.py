@@ -13,7 +13,7 @@ import numpy as np
 from shapecat.arrays import Bool
 from shapecat.evaluation.views import DescribedViews
 from shapecat.models.arrangements import ArrangementOptions
-from shapecat.models.worlds import WorldView, simulate_views
+from shapecat.models.simulated_views import SimulatedView, simulate_views
 from shapecat.simulation.shapes.distractors import DISTRACTORS
 from shapecat.simulation.shapes.procedural import PROCEDURAL
 
@@ -45,7 +45,7 @@ _TIMES = 3
 
 
 class SimulatedViews(NamedTuple):
-    """Simulated views, and the conditions (n,) of each as in `WorldView`."""
+    """Simulated views, and the conditions (n,) of each as in `SimulatedView`."""
 
     views: DescribedViews
     resting_pose: np.ndarray
@@ -76,10 +76,10 @@ def simulate(name: str, worlds: int, jobs: int) -> SimulatedViews:
     return collect(views)
 
 
-def collect(views: Iterable[WorldView]) -> SimulatedViews:
+def collect(views: Iterable[SimulatedView]) -> SimulatedViews:
     """Collect views into one array (n, ...) for each field."""
     rows = list(views)
-    columns = {name: np.array([getattr(r, name) for r in rows]) for name in WorldView._fields}
+    columns = {name: np.array([getattr(r, name) for r in rows]) for name in SimulatedView._fields}
     described = DescribedViews(
         descriptors=columns["descriptor"],
         labels=columns["label"],

@@ -38,7 +38,7 @@ from shapecat.simulation.shapes.mesh import Mesh, moved
 from shapecat.surface import voxelize
 from shapecat.types import UNKNOWN, Candidate, Scene
 
-__all__ = ["WorldView", "simulate_mesh", "simulate_views", "simulate_world"]
+__all__ = ["SimulatedView", "simulate_arrangement", "simulate_mesh", "simulate_views"]
 
 _LEAST_VISIBLE = 0.3
 _OVERLAP = 0.5
@@ -55,7 +55,7 @@ _FRAGMENTS = 0.3
 _SETTINGS = Settings()
 
 
-class WorldView(NamedTuple):
+class SimulatedView(NamedTuple):
     """One described view and its conditions.
 
     Attributes
@@ -90,7 +90,7 @@ class WorldView(NamedTuple):
 
 
 class _Conditions(NamedTuple):
-    """Label and conditions of an object, or of background, in an image, as in `WorldView`."""
+    """Label and conditions of an object, or of background, in an image, as in `SimulatedView`."""
 
     label: str
     resting_pose: str
@@ -101,12 +101,12 @@ class _Conditions(NamedTuple):
 
 def simulate_views(
     options: ArrangementOptions, numbers: Sequence[int], *, jobs: int = 1
-) -> Iterator[WorldView]:
+) -> Iterator[SimulatedView]:
     """Yield the views of the arrangements with these numbers, in order.
 
     The number of jobs does not affect the result.
     """
-    one = partial(simulate_world, options)
+    one = partial(simulate_arrangement, options)
     if jobs <= 1:
         for number in numbers:
             yield from one(number)
@@ -116,7 +116,7 @@ def simulate_views(
             yield from views
 
 
-def simulate_world(options: ArrangementOptions, number: int) -> list[WorldView]:
+def simulate_arrangement(options: ArrangementOptions, number: int) -> list[SimulatedView]:
     """Simulate one arrangement and describe its objects from several viewpoints."""
     rng = np.random.default_rng((options.seed, number))
     arrangement, name = arrange(options, rng), f"{options.seed}/{number}"
@@ -138,7 +138,7 @@ def simulate_mesh(
     *,
     cameras: int,
     rng: np.random.Generator,
-) -> list[WorldView]:
+) -> list[SimulatedView]:
     """Describe one object, alone on the table, from several viewpoints.
 
     Parameters
@@ -161,7 +161,7 @@ def describe_arrangement(
     rng: np.random.Generator,
     background: bool = False,
     keep: bool = False,
-) -> list[WorldView]:
+) -> list[SimulatedView]:
     """Describe the objects of an arrangement from several viewpoints.
 
     Parameters
@@ -176,7 +176,7 @@ def describe_arrangement(
         return []
     meshes = (*(item.mesh for item in objects), *arrangement.furniture)
     scene_geometry = geometry([(mesh, IDENTITY) for mesh in meshes])
-    views: list[WorldView] = []
+    views: list[SimulatedView] = []
     for _ in range(cameras):
         image = render_view(scene_geometry, arrangement, rng)
         scene = detect(image.frame, up=None, settings=_SETTINGS.detection, rng=rng)
@@ -195,7 +195,7 @@ def _views_of(
     item: ArrangedObject,
     instance: str,
     rng: np.random.Generator,
-) -> list[WorldView]:
+) -> list[SimulatedView]:
     """Return a view of an object, segmented by truth or detection, and sometimes a partial view."""
     found = _segment_by_detection(image, scene, k)
     if found is not None and rng.random() < _DETECTED:
@@ -215,7 +215,7 @@ def _views_of(
     return [each for each in described if each is not None]
 
 
-def _background(image: RenderedView, scene: Scene, objects: int, name: str) -> list[WorldView]:
+def _background(image: RenderedView, scene: Scene, objects: int, name: str) -> list[SimulatedView]:
     """Return the thin detections that do not show any of the first ``objects`` meshes."""
     mesh_ids = image.mesh_ids.reshape(-1)
     views = []
@@ -269,7 +269,7 @@ def _centre(item: ArrangedObject) -> F8:
     return np.asarray((points.min(axis=0) + points.max(axis=0)) / 2)
 
 
-def _described(view: View, source: str, conditions: _Conditions) -> WorldView | None:
+def _described(view: View, source: str, conditions: _Conditions) -> SimulatedView | None:
     """Describe the voxels of a view, which also seed the random generator; None if too few."""
     distance = float(np.linalg.norm(view.points.mean(axis=0) - view.eye))
     view = replace(view, points=voxelize(view.points, voxel_m=_SETTINGS.surface.voxel_m))
@@ -277,7 +277,7 @@ def _described(view: View, source: str, conditions: _Conditions) -> WorldView | 
     described = describe_view(view, settings=_SETTINGS, rng=rng)
     if described is None:
         return None
-    return WorldView(
+    return SimulatedView(
         descriptor=described.descriptor,
         instance=view.instance,
         points=described.points,
