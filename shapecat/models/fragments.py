@@ -7,7 +7,7 @@ import numpy as np
 from shapecat.arrays import F8, Bool
 from shapecat.evaluation import View
 
-__all__ = ["cut_fragment", "remove_base"]
+__all__ = ["cut_fragment", "image_plane_points", "remove_base"]
 
 _FEWEST_POINTS = 60
 _KEPT = (0.3, 0.85)
@@ -24,7 +24,7 @@ def cut_fragment(view: View, rng: np.random.Generator) -> View | None:
     A view with 30 to 85 % of the points, at least 60, some of them near the support; None after
     eight failed attempts.
     """
-    across = _image_plane(view)
+    across = image_plane_points(view)
     height = view.points[:, 2]
     low = height < height.min() + _LOW * np.ptp(height)
     for _ in range(_TRIES):
@@ -47,8 +47,8 @@ def remove_base(view: View, rng: np.random.Generator) -> View:
     return replace(view, points=view.points[kept]) if kept.any() else view
 
 
-def _image_plane(view: View) -> F8:
-    """Return the points (n, 2) projected onto the plane perpendicular to the line of sight."""
+def image_plane_points(view: View) -> F8:
+    """Return the points (n, 2) of a view projected across its line of sight, metres."""
     centre = view.points.mean(axis=0, dtype=np.float64)
     sight = view.eye - centre
     sight /= np.linalg.norm(sight)

@@ -6,9 +6,9 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from shapecat.arrays import F8
 from shapecat.evaluation import View
 from shapecat.learning import Categorizer
+from shapecat.models.fragments import image_plane_points
 from shapecat.models.simulated_views import SimulatedView
 from shapecat.types import UNKNOWN
 
@@ -65,8 +65,9 @@ def draw(path: Path, mistakes: Sequence[Mistake]) -> None:
 
 def _draw_one(axis: Any, mistake: Mistake) -> None:
     view = mistake.simulated
-    across, depth = _as_seen(mistake.view)
-    axis.scatter(*across.T, c=depth, s=3, cmap="viridis_r", linewidths=0)
+    distance = np.linalg.norm(mistake.view.points - mistake.view.eye, axis=1)
+    points = image_plane_points(mistake.view)
+    axis.scatter(*points.T, c=distance, s=3, cmap="viridis_r", linewidths=0)
     axis.set_aspect("equal")
     where = f"{view.sensor}, {view.distance:.1f} m, {view.points} voxels"
     wrong = f"as {mistake.predicted} ({mistake.confidence:.2f})"
@@ -74,14 +75,3 @@ def _draw_one(axis: Any, mistake: Mistake) -> None:
         f"{view.label}, {view.resting_pose}\n{wrong}\n{where}",
         fontsize=7,
     )
-
-
-def _as_seen(view: View) -> tuple[F8, F8]:
-    """Return the points (n, 2) projected across the line of sight, and their depth (n,), metres."""
-    points = np.asarray(view.points, np.float64)
-    sight = points.mean(axis=0) - view.eye
-    sight /= np.linalg.norm(sight)
-    right = np.cross(sight, [0.0, 0.0, 1.0])
-    right /= max(float(np.linalg.norm(right)), 1e-9)
-    across = (points - view.eye) @ np.stack([right, np.cross(right, sight)], axis=1)
-    return across, (points - view.eye) @ sight
