@@ -3,10 +3,10 @@
     python -m benchmarks.boxes --first 1000 --count 20 [--json]
 
 Recordings of a camera that moves past a table or a pile are processed as by `shapecat process`. In
-every frame, three boxes of each found object with at least `SEEN_PIXELS` readings are compared with
-the true box: the visible box, the full box of the single view, and the full box of the track. The
-overlap is the exact IoU of upright boxes. Objects that are round about the vertical have no yaw;
-their true boxes take the yaw of the estimated box.
+every frame, three boxes of each found object with at least `SEEN_PIXELS` depth pixels are compared
+with the true box: the visible box, the full box of the single view, and the full box of the track.
+The overlap is the exact IoU of upright boxes. Objects that are round about the vertical have no
+yaw; their true boxes take the yaw of the estimated box.
 """
 
 import json
@@ -18,19 +18,16 @@ from typing import Any, NamedTuple
 import click
 import numpy as np
 import pyarrow.parquet as pq
-from numpy.typing import NDArray
 from scipy.optimize import linear_sum_assignment
 
 from benchmarks.measure import markdown
+from benchmarks.scenes import SEEN_PIXELS, Array
 from shapecat.geometry import gravity_rotation, rotation_from_quaternion
 from shapecat.pipeline import process
 from shapecat.runs.jobs import Job
 from shapecat.simulation import simulate
 from shapecat.simulation.scenes.kinds import SceneKind
 
-Array = NDArray[Any]
-SEEN_PIXELS = 250
-"""Objects with fewer readings are left out."""
 SAME = 0.5
 """IoU of masks from which a detection matches an object."""
 ROUND = ("cup", "can", "bottle", "bowl", "plate", "ball")

@@ -14,9 +14,7 @@ import click
 import numpy as np
 
 from benchmarks.measure import markdown
-from benchmarks.scenes import SEEN_PIXELS
-from shapecat.config import Settings
-from shapecat.detection import detect
+from benchmarks.scenes import SEEN_PIXELS, detected, object_masks
 from shapecat.evaluation.comparison.overlap import MATCHED_F, match_masks
 from shapecat.models.viewpoints import random_viewpoint
 from shapecat.simulation import Sensor, World, make_scene, render_frame
@@ -36,10 +34,8 @@ def judge(world: World, sensor: Sensor, range_m: tuple[float, float], seed: int)
     rng = np.random.default_rng(seed)
     view = random_viewpoint(world, sensor, rng, distance_m=range_m)
     frame, labels = render_frame(world, view, rng=rng, sensor=sensor)
-    scene = detect(frame, settings=Settings().detection, rng=np.random.default_rng(0))
-    labels = labels.reshape(-1)
-    masks = [np.flatnonzero(labels == label) for label in np.unique(labels)]
-    seen = [mask for mask in masks if labels[mask[0]] >= FIRST_OBJECT_LABEL]
+    scene, labels = detected(frame), labels.reshape(-1)
+    seen = object_masks(labels)
     matches = match_masks([c.indices for c in scene.candidates], seen)
     best = np.zeros(len(seen))
     for found, k in matches.pairs:

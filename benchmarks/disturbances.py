@@ -2,7 +2,7 @@
 
     python -m benchmarks.disturbances --first 500 --count 30
 
-Frames are mirrored, rotated, halved in resolution, made noisier, or lose readings.
+Frames are mirrored, rotated, halved in resolution, made noisier, or lose pixels.
 """
 
 from collections.abc import Callable
@@ -14,7 +14,8 @@ import numpy as np
 from numpy.random import Generator
 
 from benchmarks.measure import markdown
-from benchmarks.overlap import Array, Labelled, labelled_sets, objects_in, score
+from benchmarks.overlap import labelled_sets, objects_in, score
+from benchmarks.scenes import Array, Labelled
 from shapecat.types import Camera, Frame
 
 STEP_PER_M = 0.0029

@@ -30,10 +30,11 @@ from shapecat.runs.labels.transfer import match_labels
 from shapecat.runs.tables.reading import read_row_groups
 from shapecat.simulation import KINECT, make_scene
 from shapecat.simulation.recorder import record
+from shapecat.simulation.scenes.kinds import SceneKind
 from shapecat.simulation.scenes.paths import Filming, arc_orbit
 from shapecat.simulation.scenes.worlds import FIRST_OBJECT_LABEL, World
 
-SCENES = ("tabletop", "clutter", "walking", "rearranged")
+SCENES: tuple[SceneKind, ...] = ("tabletop", "clutter", "walking", "rearranged")
 OTHER = Settings(
     seed=5,
     detection=DetectionSettings(max_range_m=1.8),
@@ -171,7 +172,7 @@ def main(*, first: int, count: int, frames: int) -> None:
         model = other_model(folder)
         for seed in range(first, first + count):
             scene = SCENES[seed % len(SCENES)]
-            world = make_scene(scene, np.random.default_rng(seed), frames=frames)  # type: ignore[arg-type]
+            world = make_scene(scene, np.random.default_rng(seed), frames=frames)
             one = record(world, folder / "one.mcap", seed=seed, sensor=KINECT)
             base, again = folder / f"{seed}" / "one", folder / f"{seed}" / "again"
             process(Job(one, base, mcap=False, rrd=False))

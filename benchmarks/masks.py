@@ -5,20 +5,22 @@
 Recordings of tables and clutter, by a Kinect or a RealSense with a colour camera beside it, are
 processed as by `shapecat process`. Two masks of each object are compared with the truth: that in
 masks.parquet, which comes from depth alone, and the exported one, whose outline follows the colour
-edges. Objects have at least `SEEN_PIXELS` readings and `SEEN_ON_IMAGE` pixels on the colour image.
+edges. Objects have at least `SEEN_PIXELS` pixels on the depth image and `SEEN_ON_IMAGE` on the
+colour image.
 """
 
 import json
 import tempfile
 from collections.abc import Iterator
 from pathlib import Path
-from typing import Any, Literal, NamedTuple
+from typing import Any, NamedTuple
 
 import click
 import numpy as np
 
-from benchmarks.boxes import SEEN_PIXELS, by_frame, matches
+from benchmarks.boxes import by_frame, matches
 from benchmarks.measure import markdown
+from benchmarks.scenes import SEEN_PIXELS
 from shapecat.outputs.colouring import with_colour
 from shapecat.outputs.exports.dataset_frames import snapped_masks
 from shapecat.pipeline import process
@@ -29,10 +31,11 @@ from shapecat.runs.jobs import Job
 from shapecat.runs.labelled_frames import read_labelled_frames
 from shapecat.runs.labels.corrections import read_labels
 from shapecat.simulation import simulate
+from shapecat.simulation.scenes.kinds import SceneKind
 
 SEEN_ON_IMAGE = 300
-KINDS: tuple[Literal["tabletop", "clutter"], ...] = ("tabletop", "clutter")
-SENSORS: tuple[Literal["kinect", "realsense"], ...] = ("kinect", "realsense")
+KINDS: tuple[SceneKind, ...] = ("tabletop", "clutter")
+SENSORS = ("kinect", "realsense")
 FRAMES, RATE_HZ = 2, 4.0
 COLUMNS = ("", "objects", "found", "of depth", "exported", "exported, missed ones are 0")
 

@@ -1,43 +1,29 @@
 """Overlap of found and true objects on simulated clutter and on real tables."""
 
 from collections.abc import Callable, Sequence
-from typing import Any, NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 
-from benchmarks.scenes import labelled_clutter, labelled_tables
-from shapecat.config import DetectionSettings
-from shapecat.detection import detect
+from benchmarks.scenes import Array, Labelled, detected, labelled_clutter, labelled_tables
 from shapecat.evaluation.comparison.overlap import Overlap, match_masks
 from shapecat.types import Frame
 
-Array = NDArray[Any]
 Finder = Callable[[Frame], list[Array]]
 """Returns the pixel indices of each object that it finds in a frame."""
-
-
-class Labelled(NamedTuple):
-    """A frame with its pixel labels (h * w,), 0 if unknown, and the labels of each object."""
-
-    frame: Frame
-    labels: Array
-    objects: list[list[int]]
 
 
 def labelled_sets(count: int, first_seed: int) -> dict[str, list[Labelled]]:
     """Return frames of ``count`` simulated cluttered tables and, if available, real tables."""
     sets = {
-        "simulated clutter": [Labelled(*f) for f in labelled_clutter(count, first_seed)],
-        "real tables": [Labelled(*f) for f in labelled_tables()],
+        "simulated clutter": list(labelled_clutter(count, first_seed)),
+        "real tables": labelled_tables(),
     }
     return {name: frames for name, frames in sets.items() if frames}
 
 
 def objects_in(frame: Frame) -> list[Array]:
     """Find objects by the detection."""
-    scene = detect(frame, settings=DetectionSettings(), rng=np.random.default_rng(0))
-    return [candidate.indices for candidate in scene.candidates]
+    return [candidate.indices for candidate in detected(frame).candidates]
 
 
 def score(frames: Sequence[Labelled], finder: Finder) -> dict[str, float]:

@@ -8,14 +8,13 @@ One frame of each simulated scene of twelve objects, by a Kinect and a RealSense
 
 from collections.abc import Iterator
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import click
 import numpy as np
-from numpy.typing import NDArray
 
 from benchmarks.measure import markdown
-from benchmarks.scenes import SEEN_PIXELS
+from benchmarks.scenes import SEEN_PIXELS, Array
 from shapecat.config import Settings
 from shapecat.evaluation.comparison.overlap import MATCHED_F, match_masks
 from shapecat.evaluation.metrics import auroc, expected_calibration_error
@@ -27,7 +26,6 @@ from shapecat.simulation.scenes.paths import Filming
 from shapecat.simulation.scenes.piles import bin_picking, pile, shelf_bin
 from shapecat.types import CATEGORIES, Detection
 
-Array = NDArray[Any]
 SCENES = {"pile": pile, "bin": bin_picking, "shelf bin": shelf_bin}
 OBJECTS, UNKNOWN = 12, 1 / 6
 """Number of dropped objects, and the fraction of them outside the categories."""

@@ -9,16 +9,13 @@ degrees.
 
 from collections.abc import Callable, Iterator
 from dataclasses import replace
-from typing import Any
 
 import click
 import numpy as np
 from numpy.random import Generator
-from numpy.typing import NDArray
 
 from benchmarks.measure import markdown
-from shapecat.config import DetectionSettings
-from shapecat.detection import detect
+from benchmarks.scenes import Array, detected
 from shapecat.geometry import inverse
 from shapecat.simulation import KINECT, PlacedObject, Support, World, make_scene, render_frame
 from shapecat.simulation.camera.render import render
@@ -27,7 +24,6 @@ from shapecat.simulation.scenes.paths import looking_at
 from shapecat.simulation.shapes.primitives import rounded_box
 from shapecat.types import Camera, Frame, Pose, Scene
 
-Array = NDArray[Any]
 HEIGHT_M, TILT_COS = 0.02, float(np.cos(np.radians(4)))
 """Largest distance and tilt of a found plane from the table."""
 COVERED, SHOWN, SEEN = 0.8, 0.2, 0.01
@@ -96,7 +92,7 @@ def cut(rng: Generator) -> World:
 
 
 def _shown(world: World) -> tuple[float, float]:
-    """Return the fractions of the image with readings of the table and of the objects on it."""
+    """Return the fractions of the image that show the table and the objects on it."""
     seen = render(world.geometry(0), PREVIEW, world.path[0])
     mesh_ids = np.where(seen.depth > KINECT.nearest_m, seen.mesh_ids, -1)
     table = mesh_ids == world.supports.index(_table(world))
@@ -156,8 +152,7 @@ def main(*, first: int, count: int) -> None:
         lost = []
         for seed in range(first, first + count):
             world, frame = view_of(kind, seed)
-            found = detect(frame, settings=DetectionSettings(), rng=np.random.default_rng(0))
-            if not keeps_table(world, found):
+            if not keeps_table(world, detected(frame)):
                 lost.append(seed)
         rows.append((kind, f"{count - len(lost)} of {count}", " ".join(map(str, lost)) or "-"))
     title = f"Planes of tables without a hint of up, scenes {first} to {first + count - 1}"

@@ -12,19 +12,16 @@ from typing import Any, NamedTuple
 
 import click
 import numpy as np
-from numpy.typing import NDArray
 
 from benchmarks.measure import markdown
-from benchmarks.scenes import SEEN_PIXELS
+from benchmarks.scenes import SEEN_PIXELS, Array, object_masks, simulated_frame
 from shapecat.config import Settings
 from shapecat.evaluation.comparison.overlap import MATCHED_F, match_masks
 from shapecat.learning import Categorizer, load_model
 from shapecat.perception import perceive
-from shapecat.simulation import make_scene, render_frame
 from shapecat.simulation.camera.presets import PRESETS
 from shapecat.simulation.scenes.worlds import FIRST_OBJECT_LABEL
 
-Array = NDArray[Any]
 HEAD = ("sensor", "frames", "detections", "surplus", "of these pieces", "found", "surplus a frame")
 
 
@@ -59,18 +56,15 @@ class Counts(NamedTuple):
 
 def judge(sensor: str, seed: int, model: Categorizer, settings: Settings) -> Counts:
     """Perceive a frame of a room and count its detections."""
-    rng = np.random.default_rng(seed)
-    world = make_scene("room", rng, frames=1)
-    frame, labels = render_frame(world, 0, rng=rng, sensor=PRESETS[sensor])
+    _, frame, labels = simulated_frame("room", seed, PRESETS[sensor])
     seen = perceive(frame, up=None, categorizer=model, settings=settings).detections
-    return count([d.candidate.indices for d in seen], labels.reshape(-1))
+    return count([d.candidate.indices for d in seen], labels)
 
 
 def count(detections: list[Array], labels: Array) -> Counts:
     """Count detections, given by their pixels, by the true labels (h * w,) of these pixels."""
     on_objects = [float(np.mean(labels[d] >= FIRST_OBJECT_LABEL)) > 0.5 for d in detections]
-    masks = [np.flatnonzero(labels == label) for label in np.unique(labels)]
-    seen = [m for m in masks if labels[m[0]] >= FIRST_OBJECT_LABEL]
+    seen = object_masks(labels)
     matches = match_masks(detections, seen)
     kept = {row for row, _ in matches.pairs if on_objects[row]}
     listed = [k for k, mask in enumerate(seen) if len(mask) >= SEEN_PIXELS]

@@ -1,26 +1,58 @@
-"""Frames for the benchmarks: simulated clutter and, if available, real tables."""
+"""Frames for the benchmarks: simulated scenes and, if available, real tables."""
 
 import json
 from collections import Counter
 from collections.abc import Iterator
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
+from shapecat.config import DetectionSettings
+from shapecat.detection import detect
 from shapecat.recordings import choose_streams, frames, open_recording
-from shapecat.simulation import KINECT, make_scene, render_frame
-from shapecat.types import Frame
+from shapecat.simulation import KINECT, Sensor, World, make_scene, render_frame
+from shapecat.simulation.scenes.kinds import SceneKind
+from shapecat.simulation.scenes.worlds import FIRST_OBJECT_LABEL
+from shapecat.types import Frame, Scene
 
+Array = NDArray[Any]
 SHARED = Path(__file__).parents[2] / "shared" / "data"
 SEEN_PIXELS = 250
-"""Objects with fewer readings are not expected to be found."""
+"""Objects with fewer depth pixels are not expected to be found."""
+
+
+class Labelled(NamedTuple):
+    """A frame with its pixel labels (h * w,), 0 if unknown, and the labels of each object."""
+
+    frame: Frame
+    labels: Array
+    objects: list[list[int]]
+
+
+def simulated_frame(kind: SceneKind, seed: int, sensor: Sensor) -> tuple[World, Frame, Array]:
+    """Return a random scene, a frame of it, and the pixel labels (h * w,) of the frame."""
+    rng = np.random.default_rng(seed)
+    world = make_scene(kind, rng, frames=1)
+    frame, labels = render_frame(world, 0, rng=rng, sensor=sensor)
+    return world, frame, labels.reshape(-1)
+
+
+def object_masks(labels: Array) -> list[Array]:
+    """Return the pixel indices of each simulated object, by the pixel labels (h * w,)."""
+    seen = np.unique(labels)
+    return [np.flatnonzero(labels == label) for label in seen[seen >= FIRST_OBJECT_LABEL]]
+
+
+def detected(frame: Frame) -> Scene:
+    """Detect objects with the default settings and a fixed seed."""
+    return detect(frame, settings=DetectionSettings(), rng=np.random.default_rng(0))
 
 
 def simulated_clutter(count: int, first_seed: int = 500) -> Iterator[Frame]:
     """Return a Kinect frame of each of ``count`` cluttered tables."""
-    return (frame for frame, _, _ in labelled_clutter(count, first_seed))
+    return (labelled.frame for labelled in labelled_clutter(count, first_seed))
 
 
 def real_tables(every: int = 1) -> Iterator[Frame]:
@@ -32,21 +64,17 @@ def real_tables(every: int = 1) -> Iterator[Frame]:
             yield from frames(recording, streams, every=every, skipped=Counter())
 
 
-def labelled_clutter(
-    count: int, first_seed: int = 500
-) -> Iterator[tuple[Frame, NDArray[Any], list[list[int]]]]:
-    """Yield frames of `simulated_clutter`, pixel labels (h * w,), and each object's labels."""
+def labelled_clutter(count: int, first_seed: int = 500) -> Iterator[Labelled]:
+    """Yield the frames of `simulated_clutter` with their labels."""
     for seed in range(first_seed, first_seed + count):
-        rng = np.random.default_rng(seed)
-        world = make_scene("clutter", rng, frames=1)
-        frame, labels = render_frame(world, 0, rng=rng, sensor=KINECT)
-        seen = np.bincount(labels.reshape(-1), minlength=256)
+        world, frame, labels = simulated_frame("clutter", seed, KINECT)
+        seen = np.bincount(labels, minlength=256)
         objects = [[t.label] for t in world.objects if seen[t.label] >= SEEN_PIXELS]
-        yield frame, labels.reshape(-1), objects
+        yield Labelled(frame, labels, objects)
 
 
-def labelled_tables() -> list[tuple[Frame, NDArray[Any], list[list[int]]]]:
-    """Return the real frames with their labels, as `labelled_clutter`; none if data are missing."""
+def labelled_tables() -> list[Labelled]:
+    """Return the real frames with their labels; none if the data are missing."""
     folder = SHARED / "osd_learn"
     if not (folder / "labels.npz").exists():
         return []
@@ -54,7 +82,7 @@ def labelled_tables() -> list[tuple[Frame, NDArray[Any], list[list[int]]]]:
         labels = file["labels"]
     truth = {t["stamp_ns"]: t for t in json.loads((folder / "truth.json").read_text("utf-8"))}
     return [
-        (
+        Labelled(
             frame,
             labels[truth[frame.stamp_ns]["frame"]].reshape(-1),
             [o["parts"] for o in truth[frame.stamp_ns]["objects"]],

@@ -13,15 +13,14 @@ from typing import Any, NamedTuple
 
 import click
 import numpy as np
-from numpy.typing import NDArray
 
 from benchmarks.measure import markdown
+from benchmarks.scenes import Array, simulated_frame
 from shapecat import open_recording
 from shapecat.simulation import make_scene, render_frame
 from shapecat.simulation.camera.presets import PRESETS
 from shapecat.types import Frame
 
-Array = NDArray[Any]
 WINDOWS = {"roughness": 16, "warp": 96}
 """Width of the windows, pixels of an image 640 pixels wide: the small one shows noise, the large
 one the warping of planes."""
@@ -40,7 +39,7 @@ class Figures(NamedTuple):
     distance : median depth, metres.
     roughness, warp : standard deviation from planes in small and large windows, 1/m.
     edge : width of edges, pixels of an image 640 pixels wide.
-    holes : fraction of pixels without reading inside the area with readings.
+    holes : fraction of pixels without depth inside the area with depth.
     """
 
     distance: float
@@ -51,7 +50,7 @@ class Figures(NamedTuple):
 
 
 def measure_frame(depth: Array) -> Figures:
-    """Measure a depth image (h, w), metres, 0 without reading."""
+    """Measure a depth image (h, w), metres, 0 without depth."""
     scale = depth.shape[1] / 640
     inverse = np.divide(1.0, depth, where=depth > 0, out=np.zeros(depth.shape))
     errors = [_roughness(inverse, max(round(w * scale), 6)) for w in WINDOWS.values()]
@@ -92,9 +91,7 @@ def _edge_width(depth: Array, width: int) -> float:
 
 def _simulated(name: str, first: int, count: int) -> Iterator[Figures]:
     for seed in range(first, first + count):
-        rng = np.random.default_rng(seed)
-        world = make_scene("pile", rng, frames=1)
-        frame, _ = render_frame(world, 0, rng=rng, sensor=PRESETS[name])
+        _, frame, _ = simulated_frame("pile", seed, PRESETS[name])
         yield measure_frame(np.asarray(frame.depth, np.float64))
 
 

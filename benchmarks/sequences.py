@@ -28,6 +28,7 @@ from shapecat.runs.jobs import Job
 from shapecat.runs.labels.track_table import read_track_table
 from shapecat.simulation import simulate
 from shapecat.simulation.scenes.kinds import SceneKind
+from shapecat.simulation.truth import AMBIGUOUS_PIXELS, AMBIGUOUS_SHARE
 from shapecat.tracking.fusion import fuse, view_weights
 from shapecat.types import CATEGORIES
 
@@ -102,7 +103,7 @@ def read_truth(folder: Path) -> list[list[Object]]:
 
 
 def _object(item: dict[str, Any], *, listed: bool) -> Object:
-    few = not listed or item["pixels"] < 250 or item["visible"] < 0.4
+    few = not listed or item["pixels"] < AMBIGUOUS_PIXELS or item["visible"] < AMBIGUOUS_SHARE
     return Object(
         item["track"],
         item["category"],

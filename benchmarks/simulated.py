@@ -2,37 +2,34 @@
 
     python -m benchmarks.simulated shelf empty --first 0 --count 24 [--json]
 
-One Kinect frame of each scene. Only objects with at least `SEEN_PIXELS` readings are expected to be
-found; detections of other objects are ignored.
+One Kinect frame of each scene. Only objects with at least `SEEN_PIXELS` depth pixels are expected
+to be found; detections of other objects are ignored.
 """
 
 import json
 from collections import Counter
 from collections.abc import Iterator
-from typing import Any, NamedTuple, get_args
+from typing import NamedTuple, get_args
 
 import click
 import numpy as np
-from numpy.typing import NDArray
 from scipy.optimize import linear_sum_assignment
 
 from benchmarks.measure import markdown
-from benchmarks.scenes import SEEN_PIXELS
+from benchmarks.scenes import SEEN_PIXELS, Array, detected, simulated_frame
 from shapecat.config import DetectionSettings
-from shapecat.detection import detect
 from shapecat.geometry import inverse
-from shapecat.simulation import KINECT, make_scene, render_frame
+from shapecat.simulation import KINECT
 from shapecat.simulation.scenes.kinds import SceneKind
 from shapecat.simulation.scenes.worlds import PlacedObject, World
 from shapecat.types import Frame, Scene
 
-Array = NDArray[Any]
 HIT_IOU = 0.5
 SEEN_PLANE_PIXELS = 3000
-"""Planes with fewer readings of their upper face are not expected to be found."""
+"""Planes with fewer depth pixels on their upper face are not expected to be found."""
 SAME_HEIGHT_M = 0.03
 FACE_M = 0.004
-"""Readings this near to the height of a board are taken for its upper face."""
+"""Points this near to the height of a board are taken for its upper face."""
 COLUMNS = (
     "objects", "recall", "precision", "planes, scenes", "relations", "empty scenes with objects"
 )  # fmt: skip
@@ -86,11 +83,8 @@ def _figures(c: Counter[str]) -> Iterator[str]:
 
 def _views(kind: SceneKind, first: int, count: int) -> Iterator[View]:
     for seed in range(first, first + count):
-        rng = np.random.default_rng(seed)
-        world = make_scene(kind, rng, frames=1)
-        frame, labels = render_frame(world, 0, rng=rng, sensor=KINECT)
-        found = detect(frame, settings=DetectionSettings(), rng=np.random.default_rng(0))
-        yield View(world, frame, labels.reshape(-1), found)
+        world, frame, labels = simulated_frame(kind, seed, KINECT)
+        yield View(world, frame, labels, detected(frame))
 
 
 def _matches(view: View, total: Counter[str]) -> dict[int, int]:
