@@ -15,9 +15,9 @@ import click
 import numpy as np
 
 from benchmarks.measure import markdown, save
-from benchmarks.overlap import Array, Finder, labelled_sets, objects_in, score
-from shapecat.config import DetectionSettings
-from shapecat.detection import detect
+from benchmarks.open3d_clusters import cluster_above_plane
+from benchmarks.overlap import Finder, labelled_sets, objects_in, score
+from benchmarks.scenes import Array, detected
 from shapecat.detection.segmentation.settings import SEGMENTATION
 from shapecat.detection.segmentation.watershed import NO_EDGE
 from shapecat.types import Frame
@@ -82,16 +82,7 @@ def _clusters(frame: Frame) -> list[Array]:
     cloud = o3d.geometry.PointCloud(o3d.utility.Vector3dVector(points[used]))
     low, high = cloud.get_min_bound(), cloud.get_max_bound()
     cloud, _, members = cloud.voxel_down_sample_and_trace(0.01, low, high)
-    up = detect(frame, settings=DetectionSettings(), rng=np.random.default_rng(0)).up
-    cloud.estimate_normals(o3d.geometry.KDTreeSearchParamKNN(20))
-    o3d.utility.random.seed(0)
-    level = np.flatnonzero(np.abs(np.asarray(cloud.normals) @ up) > 0.95)
-    if level.size < 3:
-        return []
-    (a, b, c, d), _ = cloud.select_by_index(level.tolist()).segment_plane(0.01, 3, 200)
-    height = np.sign(d) * (np.asarray(cloud.points) @ [a, b, c] + d)
-    above = np.flatnonzero((height > 0.01) & (height < 0.6))
-    label = np.asarray(cloud.select_by_index(above.tolist()).cluster_dbscan(0.02, 10))
+    above, label = cluster_above_plane(cloud, detected(frame).up)
     return [
         used[np.concatenate([members[k] for k in above[label == n]])]
         for n in range(int(label.max(initial=-1)) + 1)

@@ -11,6 +11,7 @@ from typing import Any
 import numpy as np
 
 from benchmarks.measure import cpu_ms, markdown, summary
+from benchmarks.open3d_clusters import cluster_above_plane
 from benchmarks.scenes import real_tables, simulated_clutter
 from shapecat.config import DetectionSettings
 from shapecat.detection import detect
@@ -82,18 +83,9 @@ def _time_open3d(frames: list[Frame], ups: list[Any]) -> list[float]:
     except (ImportError, OSError):
         return []
 
-    def work(points: Any, up: Any) -> int:
+    def work(points: Any, up: Any) -> Any:
         cloud = o3d.geometry.PointCloud(o3d.utility.Vector3dVector(points[points[:, 2] < RANGE_M]))
-        cloud = cloud.voxel_down_sample(0.01)
-        cloud.estimate_normals(o3d.geometry.KDTreeSearchParamKNN(20))
-        o3d.utility.random.seed(0)
-        flat = np.abs(np.asarray(cloud.normals) @ up) > 0.95
-        level = cloud.select_by_index(np.flatnonzero(flat).tolist())
-        (a, b, c, d), _ = level.segment_plane(0.01, 3, 200)
-        side = 1.0 if d > 0 else -1.0
-        height = side * (np.asarray(cloud.points) @ [a, b, c] + d)
-        above = cloud.select_by_index(np.flatnonzero((height > 0.01) & (height < 0.6)).tolist())
-        return int(np.max(np.asarray(above.cluster_dbscan(0.02, 10)), initial=-1)) + 1
+        return cluster_above_plane(cloud.voxel_down_sample(0.01), up)
 
     result = []
     for frame, up in zip(frames, ups, strict=True):
