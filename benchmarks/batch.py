@@ -15,14 +15,13 @@ from importlib.util import find_spec
 from pathlib import Path
 
 import click
-import pyarrow.parquet as pq
 
 from benchmarks.measure import markdown, save
 from benchmarks.whole import tabletop, write
 from shapecat.batch.manifest import Manifest
+from tests.faults.invariants import same_results
 
 FORMATS = ("mcap", "ros1", "ros2")
-TABLES = ("frames", "detections", "planes", "tracks")
 SHARDS = 4
 
 
@@ -45,22 +44,6 @@ def process(recordings: Path, out: Path, *options: str) -> tuple[int, float]:
     begun = time.perf_counter()
     done = subprocess.run([*command, *options], check=False, capture_output=True)
     return done.returncode, time.perf_counter() - begun
-
-
-def same(one: Path, two: Path) -> bool:
-    """Return whether two folders of results have equal tables, ignoring processing times."""
-    names = [sorted(path.name for path in folder.glob("*/")) for folder in (one, two)]
-    if names[0] != names[1]:
-        return False
-    for name in names[0]:
-        for table in TABLES:
-            a, b = (pq.read_table(folder / name / f"{table}.parquet") for folder in (one, two))
-            timed = [column for column in a.column_names if column == "seconds"]
-            if not a.drop_columns(timed).equals(b.drop_columns(timed)):
-                return False
-        if (one / name / "tracks.csv").read_bytes() != (two / name / "tracks.csv").read_bytes():
-            return False
-    return True
 
 
 def ways() -> dict[str, Sequence[Sequence[str]]]:
@@ -96,7 +79,8 @@ def main(*, recordings: int, broken: int, frames: int) -> None:
             entries = Manifest(out / "manifest.jsonl").entries.values()
             states = [entry.state for entry in entries]
             reference = reference or out
-            agree = same(reference, out)
+            names = [path.name for path in reference.glob("*/")]
+            agree = not [*same_results(names, out, reference)]
             counts = {state: states.count(state) for state in ("complete", "failed")}
             codes = sorted({code for code, _ in spent})
             rows.append((way, *counts.values(), codes, f"{wall_s:.0f}", f"{wall_s / first:.2f}",

@@ -4,8 +4,8 @@
     python -m benchmarks.cluster --check    compares the model with 1 to 4 workers on this machine
     python -m benchmarks.cluster --limits N measures planning and manifest with N recordings
 
-Measured here are the costs of sending a task to a worker (locally and with Dask), of a line of the
-manifest, and of planning a recording. The CPU time per frame is measured by `benchmarks.whole` and
+Measured here are the costs of sending a task to a worker with Dask, of a line of the manifest, and
+of planning a recording. The CPU time per frame is measured by `benchmarks.whole` and
 given as an option. `Assumed` lists the assumptions.
 """
 
@@ -141,8 +141,8 @@ def _task_s(executor: Executor, count: int) -> float:
     return (time.perf_counter() - begun) / count
 
 
-def measure(frame_s: float) -> dict[str, Measured]:
-    """Measure the costs of the shared resources, with local and with Dask workers."""
+def measure(frame_s: float) -> Measured:
+    """Measure the costs of the shared resources, with Dask workers."""
     with tempfile.TemporaryDirectory() as folder:
         manifest = Manifest(Path(folder) / "manifest.jsonl")
         entry = Entry("kitchen_0123", "/data/2024/kitchen_0123.mcap", "running", "0" * 16, "1" * 16)
@@ -156,11 +156,8 @@ def measure(frame_s: float) -> dict[str, Measured]:
         begun = time.perf_counter()
         with plan_batch(Job(Path(), Path()), list(map(str, files)), f"{folder}/out"):
             plan_s = (time.perf_counter() - begun) / len(files)
-    found = {}
-    for name in ("local", "dask"):
-        with open_executor(name, workers=1) as executor:
-            found[name] = Measured(frame_s, _task_s(executor, 500), line_s, plan_s)
-    return found
+    with open_executor("dask", workers=1) as executor:
+        return Measured(frame_s, _task_s(executor, 500), line_s, plan_s)
 
 
 def draw(path: Path, results: dict[str, list[dict[str, float]]]) -> None:
@@ -243,10 +240,10 @@ def limits(count: int) -> tuple[str, ...]:
         (name := f"kitchen_{k:07}", Source("", f"s3://lab/{name}.mcap", name, "", f"{k:016x}", 4))
         for k in range(count)
     ]
-    out = "memory://out"
+    job, out = Job(Path(), Path()), "memory://out"
     spent, before = [time.process_time()], peak_mb()
     manifest = RemoteManifest(out)
-    tasks = planner(out, set(), manifest).tasks(named)
+    tasks = _Planner(job, out, set(), manifest).tasks(named)
     spent.append(time.process_time())
     ledger = Ledger(manifest)
     ledger.plan(tasks)
@@ -261,18 +258,13 @@ def limits(count: int) -> tuple[str, ...]:
     del manifest, tasks, ledger
     again = RemoteManifest(out)
     spent.append(time.process_time())
-    tasks = planner(out, {name for name, _ in named}, again).tasks(named)
+    tasks = _Planner(job, out, {name for name, _ in named}, again).tasks(named)
     assert tasks[0].name == first
     assert all(task.status == "complete" for task in tasks)
     spent.append(time.process_time())
     seconds = [f"{after - before:.1f}" for before, after in pairwise(spent)]
     stored = sum(info["size"] for _, info in Location(f"{out}/.manifest").walk()) / 1e6
     return (f"{count:,}", *seconds, f"{stored:.0f}", f"{peak_mb() - before - stored:.0f}")
-
-
-def planner(out: str, there: set[str], manifest: Manifest) -> _Planner:
-    """Return the planner that determines the state of each recording."""
-    return _Planner(Job(Path(), Path()), out, there, manifest)
 
 
 def peak_mb() -> float:
@@ -304,7 +296,7 @@ def main(
 def study(given: Assumed, frame_s: float, plot: Path) -> None:
     """Simulate the cluster, print tables, draw a plot."""
     wide = replace(given, storage_mb_s=10 * given.storage_mb_s)
-    costs = measure(frame_s)["dask"]
+    costs = measure(frame_s)
     results = {
         "all outputs, 10 Gbit/s": [simulate(n, costs, given) for n in WORKERS],
         "all outputs, 100 Gbit/s": [simulate(n, costs, wide) for n in WORKERS],

@@ -14,7 +14,7 @@ import os
 import sys
 import tempfile
 import time
-from collections.abc import Iterator
+from itertools import cycle, islice
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -69,22 +69,16 @@ def standing(frames: int, *, objects: int = 8) -> list[View]:
     return [View(render_frame(world, 0, rng=rng, sensor=KINECT)[0], world.path[0]) for rng in sees]
 
 
-def to_and_fro(views: list[View], frames: int) -> Iterator[View]:
-    """Yield the views of a camera that moves back and forth."""
-    cycle = [*views, *views[-2:0:-1]]
-    for k in range(frames):
-        yield cycle[k % len(cycle)]
-
-
 def write(path: Path, views: list[View], frames: int, *, container: str = "mcap") -> Path:
     """Write a recording with ``frames`` frames; ``path`` gets the suffix of the format."""
     suffix, kind = CONTAINERS[container]
     path = path.with_name(path.name.removesuffix(suffix) + suffix)
+    to_and_fro = cycle([*views, *views[-2:0:-1]])
     with kind(path) as writer:
         make = writer.messages
         still = [("camera_link", OPTICAL, LINK_FROM_OPTICAL)]
         writer.write("/tf_static", make.transforms(still, EPOCH_NS), EPOCH_NS)
-        for k, (frame, pose) in enumerate(to_and_fro(views, frames)):
+        for k, (frame, pose) in enumerate(islice(to_and_fro, frames)):
             now = EPOCH_NS + k * PERIOD_NS
             depth = np.round(np.asarray(frame.depth) * 1000) / np.float32(1000)
             camera = frame.camera
