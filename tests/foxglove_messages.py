@@ -10,9 +10,8 @@ from google.protobuf.descriptor_pb2 import FileDescriptorSet
 
 from shapecat.recordings.decoding.protobuf import message_class
 from tests.mcap_files import mcap_writer
+from tests.messages import EPOCH, SECOND
 
-SECOND = 10**9
-EPOCH = 1_700_000_000 * SECOND
 DOUBLE, STRING, MESSAGE, RAW, ENUM, FIXED, INT64 = 1, 9, 11, 12, 14, 7, 3
 
 

@@ -5,15 +5,15 @@ import numpy as np
 from shapecat.arrays import F4
 from shapecat.detection.depth_grid import PinholeIntrinsics
 
-__all__ = ["ALONG", "INTRINSICS", "UP", "I", "J", "level"]
+__all__ = ["INTRINSICS", "RAY_HEIGHTS", "UP", "I", "J", "level"]
 
 INTRINSICS = PinholeIntrinsics(262.5, 262.5, 159.5, 119.5)
 UP = np.array([0.0, -np.sqrt(0.5), -np.sqrt(0.5)])
 I, J = np.mgrid[:240, :320]
-ALONG = ((J - 159.5) * UP[0] + (I - 119.5) * UP[1]) / 262.5 + UP[2]
+RAY_HEIGHTS = ((J - 159.5) * UP[0] + (I - 119.5) * UP[1]) / 262.5 + UP[2]
 """Height of each ray at a depth of one metre."""
 
 
 def level(below_m: float = 0.7) -> F4:
     """Return the inverse depth (240, 320) of a level plane at a given depth below the camera."""
-    return np.asarray(ALONG / -below_m, np.float32)
+    return np.asarray(RAY_HEIGHTS / -below_m, np.float32)

@@ -1,6 +1,5 @@
 """Recordings of every format variant, damaged and unusual ones, with their expected outcomes."""
 
-import json
 import os
 import shutil
 import sqlite3
@@ -61,10 +60,10 @@ def mcap(path: Path, *, finish: bool = True, cut: int = 0, **options: Any) -> Pa
     return path
 
 
-def bag(path: Path, compression: Any = None, *, threshold: int = 60_000) -> Path:
-    """Write the table as a ROS 1 bag in chunks of about ``threshold`` bytes."""
+def bag(path: Path, compression: Any = None) -> Path:
+    """Write the table as a ROS 1 bag in chunks of about 60 kB."""
     writer = BagWriter(path / "a.bag")
-    writer.chunk_threshold = threshold
+    writer.chunk_threshold = 60_000
     if compression is not None:
         writer.set_compression(compression)
     write_all(writer, serialized(stream(FACTORY1, FRAMES), FACTORY1), FACTORY1.typestore)
@@ -373,10 +372,10 @@ def damaged_part(path: Path) -> Path:
     return found
 
 
-def with_other_files(path: Path, *, note: str) -> Path:
+def with_other_files(path: Path) -> Path:
     """Write a recording beside files that do not belong to it."""
     found = folder(path, StoragePlugin.MCAP)
-    (found / "notes.txt").write_text(json.dumps(note))
+    (found / "notes.txt").write_text("mine")
     shutil.copy(found / "a.mcap", found / "old.mcap")
     return found
 
@@ -428,9 +427,7 @@ CASES: dict[str, Case] = {
     "ros 2 mcap file-compressed": Case(lambda p: folder(p, _MCAP, _MODE.FILE)),
     "ros 2 splits": Case(splits, frames=2 * FRAMES, reported="metadata"),
     "ros 2 with a damaged part": Case(damaged_part, reported="skipped a_1.db3"),
-    "ros 2 beside other files": Case(
-        lambda p: with_other_files(p, note="mine"), reported="old.mcap"
-    ),
+    "ros 2 beside other files": Case(with_other_files, reported="old.mcap"),
     "db3": Case(lambda p: database(p, definitions=True)),
     "db3 without definitions": Case(lambda p: database(p, definitions=False), reported="Humble"),
     "compressed depth png": Case(lambda p: compressed_depth(p, depth.png), frames=2),

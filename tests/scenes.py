@@ -2,6 +2,7 @@
 
 from collections.abc import Iterable, Iterator
 from functools import cache
+from itertools import cycle, islice
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -52,11 +53,9 @@ def views(count: int = 4) -> tuple[View, ...]:
 
 
 def back_and_forth(frames: int) -> Iterator[View]:
-    """Yield a number of views of a camera that moves back and forth."""
+    """Return a number of views of a camera that moves back and forth."""
     forward = views()
-    cycle = [*forward, *forward[-2:0:-1]]
-    for k in range(frames):
-        yield cycle[k % len(cycle)]
+    return islice(cycle([*forward, *forward[-2:0:-1]]), frames)
 
 
 def stream(

@@ -28,7 +28,7 @@ from shapecat.detection.planes.horizontal import find_horizontal_planes
 from shapecat.detection.planes.oriented_points import level_samples, orient_points
 from shapecat.detection.planes.ransac import draw_trials, horizontal_plane
 from shapecat.detection.planes.supporting import supporting_planes
-from tests.level_planes import ALONG, INTRINSICS, UP, I, J, level
+from tests.level_planes import INTRINSICS, RAY_HEIGHTS, UP, I, J, level
 
 
 def grid_of(inv_depth: F4) -> DepthGrid:
@@ -75,7 +75,7 @@ def test_parallel_planes_have_one_normal() -> None:
 
 def test_rectangular_plane_has_true_outline_and_area() -> None:
     """A board of 40 by 30 cm, 70 cm below the camera."""
-    z = -0.7 / ALONG
+    z = -0.7 / RAY_HEIGHTS
     x, y, depth = (J - 159.5) / 262.5 * z, (I - 119.5) / 262.5 * z, z
     forward = np.array([0, -np.sqrt(0.5), np.sqrt(0.5)])
     across, along = x, forward[1] * y + forward[2] * depth
@@ -100,13 +100,13 @@ def test_points_within_margin_of_outline_are_inside() -> None:
 def test_board_is_a_supporting_plane_unlike_box_top(closed: bool, kept: int) -> None:
     """Both are 15 cm above the floor and equally large; the box is closed below its edge."""
     inv_depth = level(0.9)
-    z = -0.75 / ALONG
+    z = -0.75 / RAY_HEIGHTS
     forward = np.array([0, -np.sqrt(0.5), np.sqrt(0.5)])
     along = forward[1] * (I - 119.5) / 262.5 * z + forward[2] * z
     top = (abs((J - 159.5) / 262.5 * z) < 0.2) & (abs(along - 0.8) < 0.15)
     edge = 0.65  # distance to the front of the box, which reaches down to the floor
     front = edge / ((I - 119.5) / 262.5 * forward[1] + forward[2])
-    height = ALONG * front
+    height = RAY_HEIGHTS * front
     wall = (height < -0.75) & (height > -0.9) & (abs((J - 159.5) / 262.5 * front) < 0.2)
     if closed:
         inv_depth = np.where(wall, 1 / front, inv_depth)

@@ -21,14 +21,13 @@ from shapecat.recordings.transforms.window import TransformWindow
 from shapecat.types import AnnotationFrame, Camera, Frame
 from tests.depth_encodings import png
 from tests.foxglove_messages import (
-    EPOCH,
-    SECOND,
     content,
     descriptors,
     encode,
     write,
 )
 from tests.mcap_files import mcap_writer
+from tests.messages import EPOCH, SECOND
 
 CAMERA = Camera(4, 3, 60.0, 61.0, 1.5, 1.0)
 
