@@ -39,7 +39,7 @@ COLOUR = ColourCamera(
 _NOTHING = 18
 """Value of red, green and blue where no surface is visible."""
 _GRAIN_M = 0.005
-_SPREAD = (73856093, 19349663, 83492791)
+_HASH_FACTORS = (73856093, 19349663, 83492791)
 """Hash factors that give each cell of the grain one of its levels."""
 _BAND = 0.6
 """Fraction of a band that has the first of its two colours."""
@@ -56,14 +56,14 @@ def render_colour(world: World, frame: int) -> tuple[U1, U1]:
     surface.
     """
     pose = compose(world.path[frame], COLOUR.depth_from_colour)
-    fine, rows, columns = _lookup(COLOUR.lens)
+    fine, rows, columns = _distortion_map(COLOUR.lens)
     image = render(world.geometry(frame), fine, pose)
     colours = _paint(world, frame, pose, fine, image, rows, columns)
     return colours, world.labels_of(image.mesh_ids[rows, columns])
 
 
 @lru_cache(maxsize=4)  # a recording has one lens
-def _lookup(lens: LensCamera) -> tuple[Camera, I4, I4]:
+def _distortion_map(lens: LensCamera) -> tuple[Camera, I4, I4]:
     """Return a finer pinhole camera, and its row and column (h, w) for each pixel of the lens."""
     camera = lens.pinhole
     rays = undistorted_rays(camera, lens.model, lens.coefficients)
@@ -83,18 +83,21 @@ def _lookup(lens: LensCamera) -> tuple[Camera, I4, I4]:
 def _paint(
     world: World, frame: int, pose: Pose, camera: Camera, image: Image, rows: I4, columns: I4
 ) -> U1:
-    """Return the shaded colours (h, w, 3) uint8; the texture moves with each object."""
+    """Return the shaded colours (h, w, 3) uint8; the texture moves with each object.
+
+    ``pose`` is that of the ``camera`` in the world; the other parameters are as for `_colour_in`.
+    """
     supports = len(world.supports)
-    places = [pose] * supports
-    places += [compose(inverse(world.pose_of(item, frame)), pose) for item in world.objects]
-    textures = np.array([_texture(k, plain=k < supports) for k in range(len(places))])
-    turns = np.array([place.rotation for place in places])
-    shifts = np.array([place.translation for place in places])
+    poses = [pose] * supports  # from the camera to the frame of each texture
+    poses += [compose(inverse(world.pose_of(item, frame)), pose) for item in world.objects]
+    textures = np.array([_texture(k, plain=k < supports) for k in range(len(poses))])
+    rotations = np.array([each.rotation for each in poses])
+    translations = np.array([each.translation for each in poses])
     intrinsics = np.array([camera.fx, camera.fy, camera.cx, camera.cy])
     colours = np.full((*rows.shape, 3), _NOTHING, np.uint8)
     _colour_in(
         *(image.inverse, image.mesh_ids, image.cosine, rows, columns),
-        *(intrinsics, turns, shifts, textures, colours),
+        *(intrinsics, rotations, translations, textures, colours),
     )
     return colours
 
@@ -104,23 +107,23 @@ def _texture(number: int, *, plain: bool) -> F8:
 
     The last row is the direction across the bands, divided by their distance, 1/m.
     """
-    draw = np.random.default_rng(number + 71)
-    tone = draw.uniform(90, 180, 3) if plain else draw.uniform(30, 235, 3)
-    other = tone + draw.uniform(-25, 25, 3) if plain else draw.uniform(30, 235, 3)
-    way, width = draw.normal(size=3), draw.uniform(0.03, 0.08)
-    return np.stack([tone, other, way / np.sqrt((way * way).sum()) / width])
+    rng = np.random.default_rng(number + 71)
+    tone = rng.uniform(90, 180, 3) if plain else rng.uniform(30, 235, 3)
+    other = tone + rng.uniform(-25, 25, 3) if plain else rng.uniform(30, 235, 3)
+    direction, width = rng.normal(size=3), rng.uniform(0.03, 0.08)
+    return np.stack([tone, other, direction / np.sqrt((direction * direction).sum()) / width])
 
 
 @kernel
 def _colour_in(
-    near: F8,
+    inverse_depth: F8,
     mesh_ids: I4,
     cosine: F4,
     rows: I4,
     columns: I4,
     intrinsics: F8,
-    turns: F8,
-    shifts: F8,
+    rotations: F8,
+    translations: F8,
     textures: F8,
     colours: U1,
 ) -> None:
@@ -130,11 +133,12 @@ def _colour_in(
 
     Parameters
     ----------
-    near, mesh_ids, cosine : the rendered image: inverse depth (1/m), index of the visible mesh, -1
-        without surface, and cosine of the angle of incidence.
+    inverse_depth, mesh_ids, cosine : the rendered image: inverse depth (1/m), index of the visible
+        mesh, -1 without surface, and cosine of the angle of incidence.
     rows, columns : (h, w) the pixel of that image to show in each pixel of ``colours``.
     intrinsics : fx, fy, cx, cy of the rendered image, pixels.
-    turns, shifts : (k, 3, 3) and (k, 3) from the camera to the frame of each texture, metres.
+    rotations, translations : (k, 3, 3) and (k, 3) from the camera to the frame of each texture,
+        metres.
     textures : (k, 3, 3) from `_texture`.
     """
     fx, fy, cx, cy = intrinsics
@@ -145,13 +149,13 @@ def _colour_in(
             mesh_id = mesh_ids[row, column]
             if mesh_id < 0:
                 continue
-            z = 1.0 / near[row, column]
+            z = 1.0 / inverse_depth[row, column]
             x, y = (column - cx) / fx * z, (row - cy) / fy * z
-            turn, shift, texture = turns[mesh_id], shifts[mesh_id], textures[mesh_id]
+            r, t, texture = rotations[mesh_id], translations[mesh_id], textures[mesh_id]
             cell, along = 0, 0.0
             for k in range(3):
-                point[k] = turn[k, 0] * x + turn[k, 1] * y + turn[k, 2] * z + shift[k]
-                cell ^= int(np.floor(point[k] / _GRAIN_M)) * _SPREAD[k]
+                point[k] = r[k, 0] * x + r[k, 1] * y + r[k, 2] * z + t[k]
+                cell ^= int(np.floor(point[k] / _GRAIN_M)) * _HASH_FACTORS[k]
                 along += point[k] * texture[2, k]
             tone = texture[1] if abs(along - np.floor(along + 0.5)) * 2 > _BAND else texture[0]
             shade = 0.45 + 0.55 * abs(cosine[row, column])

@@ -164,9 +164,9 @@ def _write_depth(inverse: F8, error: F4, lost: Bool, limits: F8, depth: F4, mesh
 
 @kernel
 def _sample_beside(
-    inverse: F8, mesh_ids: I4, cosine: F4, across: F4, down: F4, out: F8, ids_out: I4, angle: F4
+    inverse: F8, mesh_ids: I4, cosine: F4, across: F4, down: F4, out: F8, ids_out: I4, cos_out: F4
 ) -> None:
-    """Sample at displaced pixels; fill ``out``, ``ids_out`` and ``angle``."""
+    """Sample at displaced pixels; fill ``out``, ``ids_out`` and ``cos_out``."""
     height, width = inverse.shape
     for v in range(height):
         for u in range(width):
@@ -178,7 +178,7 @@ def _sample_beside(
                 x, y = u, v
             out[v, u] = inverse[y, x]
             ids_out[v, u] = mesh_ids[y, x]
-            angle[v, u] = cosine[y, x]
+            cos_out[v, u] = cosine[y, x]
 
 
 @kernel
