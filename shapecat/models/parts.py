@@ -141,7 +141,7 @@ def _pairs(
         return
     ground, (graph, labels, segments) = found
     merge_across_occluder(segments, grid, graph.normal, labels)
-    counts = count_labels(pixel_labels.reshape(depth.shape), labels, grid)
+    counts = count_labels(pixel_labels, labels, grid)
     view_geometry, seen = ViewGeometry(grid.intrinsics.fx, float(ground.up[2])), set()
     while True:
         rows, object_of = _segment_objects(segments, counts, object_labels)

@@ -271,7 +271,7 @@ def label_objects(frame: Frame, pixel_labels: U1, object_labels: I4) -> Iterator
     merge_segments(grid, model, oversegmentation)
     features = measure_object_features(grid, model, oversegmentation, settings.max_range_m)
     _, labels, segments = oversegmentation
-    counts = count_labels(pixel_labels.reshape(frame.depth.shape), labels, grid)
+    counts = count_labels(pixel_labels, labels, grid)
     merged = np.zeros_like(counts)
     np.add.at(merged, segments.parent, counts)
     known_cells = merged[:, 1:].sum(axis=1)

@@ -8,7 +8,7 @@ from numpy.random import Generator
 from numpy.typing import ArrayLike
 
 from shapecat.arrays import F8
-from shapecat.simulation.shapes.mesh import Mesh, join, moved, standing
+from shapecat.simulation.shapes.mesh import Mesh, join, standing
 from shapecat.simulation.shapes.parts import ellipsoid, placed, rod
 from shapecat.simulation.shapes.primitives import lathe, rounded_box, smooth_path, tube
 from shapecat.types import Camera, Pose
@@ -125,9 +125,9 @@ def _resting_arm(rng: Generator, start: F8, end: F8) -> list[Mesh]:
     heading = float(np.degrees(np.arctan2(ahead[1], ahead[0]))) + rng.uniform(-20, 20)
     size = [rng.uniform(0.12, 0.25), rng.uniform(0.07, 0.16), rng.uniform(0.06, 0.16)]
     hand = rounded_box(size, radius=rng.uniform(0.005, 0.03))
-    housing = placed(placed(hand, [0, 0, 0], about="z", degrees=heading), _above(end, gap))
+    housing = _put(hand, _above(end, gap), heading)
     finger = placed(rounded_box([0.07, 0.02, 0.02]), [size[0] / 2 + 0.02, 0, 0.3 * size[2]])
-    finger = placed(placed(finger, [0, 0, 0], about="z", degrees=heading), _above(end, gap))
+    finger = _put(finger, _above(end, gap), heading)
     return [housing, finger, *_links([elbow, _above(end, gap + size[2] / 2)], [thick])]
 
 
@@ -138,7 +138,7 @@ def _links(joints: Sequence[F8], radii: Sequence[float]) -> list[Mesh]:
         ends = smooth_path(np.stack([start, end]), 6)
         parts.append(tube(ends, radius * np.array([1, 0.8, 0.75, 0.75, 0.8, 1]), segments=14))
         motor = placed(rod(3 * radius, 1.2 * radius), [0, 0, -1.5 * radius])
-        parts.append(placed(placed(motor, [0, 0, 0], about="x", degrees=90), end))
+        parts.append(placed(placed(motor, about="x", degrees=90), end))
     return parts
 
 
@@ -149,10 +149,7 @@ def _gripper(rng: Generator, hand: F8, tip: F8) -> list[Mesh]:
     palm = placed(rounded_box([wide + 0.05, 0.05, 0.5 * tall]), [0, 0, 0.45 * tall])
     finger = rounded_box([0.012, 0.022, 0.5 * tall], fine=2)
     fingers = [placed(finger, [side * wide / 2, 0, 0]) for side in (-1, 1)]
-    return [
-        placed(placed(part, [0, 0, 0], about="z", degrees=turn), [*hand[:2], tip[2]])
-        for part in (palm, *fingers)
-    ]
+    return [_put(part, [*hand[:2], tip[2]], turn) for part in (palm, *fingers)]
 
 
 def make_forearm(rng: Generator, tip: F8, start: F8) -> list[Mesh]:
@@ -271,5 +268,5 @@ def _above(place: F8, height: float) -> F8:
 
 def _put(mesh: Mesh, place: ArrayLike, degrees: float) -> Mesh:
     """Turn a mesh about z and move it."""
-    turned = placed(mesh, [0, 0, 0], about="z", degrees=degrees)
-    return moved(turned, Pose(np.eye(3), np.asarray(place, np.float64)))
+    # At once, the coordinates would be rounded only once, and recordings differ.
+    return placed(placed(mesh, about="z", degrees=degrees), place)

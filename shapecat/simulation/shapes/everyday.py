@@ -64,7 +64,7 @@ def _bag(rng: Generator) -> Mesh:
     tall = np.sign(points[:, 2]) * np.abs(points[:, 2]) ** rng.uniform(0.8, 1.6) * full
     tall *= 1 + rng.uniform(0.05, 0.35) * crease
     whole = Mesh(np.column_stack([outline, tall]), mesh.triangles)
-    return standing(placed(whole, [0, 0, 0], about="x", degrees=float(rng.choice([0, 0, 80]))))
+    return standing(placed(whole, about="x", degrees=float(rng.choice([0, 0, 80]))))
 
 
 def _gadget(rng: Generator) -> Mesh:
@@ -104,7 +104,7 @@ def _power_tool(rng: Generator) -> Mesh:
     if rng.random() < 0.5:
         foot = rounded_box(np.array([2.6, 2.0, 1.2]) * thick * rng.uniform(0.7, 1.4), fine=2)
         parts.append(placed(foot, [0.15 * long, 0, -grip_m - 0.4 * thick]))
-    return standing(placed(join(parts), [0, 0, 0], about="x", degrees=float(rng.choice([0, 90]))))
+    return standing(placed(join(parts), about="x", degrees=float(rng.choice([0, 90]))))
 
 
 def _vehicle(rng: Generator) -> Mesh:
@@ -143,7 +143,7 @@ def _fixture(rng: Generator) -> Mesh:
 def _any_side(mesh: Mesh, rng: Generator) -> Mesh:
     """Return a mesh that rests on one of its sides."""
     about, degrees = str(rng.choice(["x", "y"])), float(rng.choice([0, 0, 90, 180]))
-    return standing(placed(mesh, [0, 0, 0], about=about, degrees=degrees))
+    return standing(placed(mesh, about=about, degrees=degrees))
 
 
 EVERYDAY: dict[str, Callable[[Generator], Mesh]] = {

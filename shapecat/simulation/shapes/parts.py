@@ -13,7 +13,9 @@ from shapecat.types import Pose
 __all__ = ["ellipsoid", "placed", "rod", "turned_body"]
 
 
-def placed(mesh: Mesh, place: ArrayLike, *, about: str = "", degrees: float = 0.0) -> Mesh:
+def placed(
+    mesh: Mesh, place: ArrayLike = (0, 0, 0), *, about: str = "", degrees: float = 0.0
+) -> Mesh:
     """Turn a mesh about the axis ``x``, ``y`` or ``z``, then move it by ``place`` (3,), metres."""
     half = np.radians(degrees) / 2
     quaternion = [0.0, 0.0, 0.0, float(np.cos(half))]

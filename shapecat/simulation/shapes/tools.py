@@ -89,14 +89,14 @@ def _screwdriver(rng: Generator) -> Mesh:
         [0.35 * r, grip],
     ]
     profile += [[0.25 * r, grip + 0.005], [0.25 * r, grip + shaft], [0, grip + shaft]]
-    return placed(lathe(profile, segments=18), [0, 0, 0], about="y", degrees=90)
+    return placed(lathe(profile, segments=18), about="y", degrees=90)
 
 
 def _dumbbell(rng: Generator) -> Mesh:
     r, long = rng.uniform(0.03, 0.05), rng.uniform(0.12, 0.2)
     weight = lathe([[0, 0], [r, 0.004], [r, 0.04], [0, 0.044]], segments=int(rng.choice([6, 32])))
     upright = join([weight, placed(rod(long, 0.012), [0, 0, 0.02]), placed(weight, [0, 0, long])])
-    return placed(upright, [0, 0, 0], about="y", degrees=90)
+    return placed(upright, about="y", degrees=90)
 
 
 def _mouse(rng: Generator) -> Mesh:

@@ -62,7 +62,7 @@ def _hand(rng: Generator) -> Mesh:
 def _wedge(rng: Generator) -> Mesh:
     a, h = rng.uniform(0.06, 0.16), rng.uniform(0.03, 0.1)
     side = extrude([[0, 0], [a, 0], [rng.uniform(0, 0.3) * a, h]], rng.uniform(0.04, 0.12))
-    return placed(side, [0, 0, 0], about="x", degrees=90)
+    return placed(side, about="x", degrees=90)
 
 
 def _duck(rng: Generator) -> Mesh:
