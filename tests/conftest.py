@@ -189,9 +189,9 @@ def guess_once(
     name: str, factory: pytest.TempPathFactory, *, rrd: bool = True, **scene: Any
 ) -> Path:
     """Simulate a recording and process it, once for all test processes."""
-    import shapecat.pipeline  # noqa: PLC0415  only the tests that ask for it pay for it
-    from shapecat.runs.jobs import Job  # noqa: PLC0415  the same
-    from shapecat.simulation import simulate  # noqa: PLC0415  the same
+    import shapecat.pipeline
+    from shapecat.runs.jobs import Job
+    from shapecat.simulation import simulate
 
     base = factory.getbasetemp()
     folder = (base.parent if "PYTEST_XDIST_WORKER" in os.environ else base) / name
@@ -219,7 +219,7 @@ def drawn(guessed_run: Path) -> Any:
 
     Returns its `RunReport`, whose page shows the labels of the folder.
     """
-    from shapecat.outputs.report.writing import read_report  # noqa: PLC0415  the same
+    from shapecat.outputs.report.writing import read_report
 
     return read_report(guessed_run)
 
@@ -227,7 +227,7 @@ def drawn(guessed_run: Path) -> Any:
 @pytest.fixture(scope="module")
 def snapped_once() -> Iterator[None]:
     """Move the outlines of the same masks on the same image only once, for all exports."""
-    from shapecat.colour.snapping import snapped  # noqa: PLC0415  the same
+    from shapecat.colour.snapping import snapped
 
     known: dict[str, Any] = {}
 
@@ -248,7 +248,7 @@ def snapped_once() -> Iterator[None]:
 @pytest.fixture
 def without_pictures(monkeypatch: pytest.MonkeyPatch) -> None:
     """Leave the pictures out of reports: they take half a second per run."""
-    from shapecat.outputs.report.pictures import Pictures  # noqa: PLC0415  the same
+    from shapecat.outputs.report.pictures import Pictures
 
     monkeypatch.setattr(
         "shapecat.outputs.report.writing.take_pictures", lambda *_: Pictures({}, ())
@@ -258,7 +258,7 @@ def without_pictures(monkeypatch: pytest.MonkeyPatch) -> None:
 @pytest.fixture(scope="session")
 def reported_run(guessed_run: Path, drawn: Any, tmp_path_factory: pytest.TempPathFactory) -> Path:
     """Return that run with its report. Copy it to change it."""
-    from shapecat.outputs.report.writing import Reports  # noqa: PLC0415  the same
+    from shapecat.outputs.report.writing import Reports
 
     folder = tmp_path_factory.mktemp("reported") / "out" / "table"
     shutil.copytree(guessed_run, folder)
@@ -269,8 +269,8 @@ def reported_run(guessed_run: Path, drawn: Any, tmp_path_factory: pytest.TempPat
 @pytest.fixture(scope="module")
 def undisturbed(recording: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
     """Process a test file's recording without interruption; return the parent folder."""
-    from shapecat.pipeline import process  # noqa: PLC0415  the same
-    from shapecat.runs.jobs import Job  # noqa: PLC0415  the same
+    from shapecat.pipeline import process
+    from shapecat.runs.jobs import Job
 
     out = tmp_path_factory.mktemp("undisturbed")
     process(Job(recording, out / "table", rrd=False))
@@ -289,7 +289,7 @@ def coloured_run(tmp_path_factory: pytest.TempPathFactory) -> Path:
 @pytest.fixture(scope="module")
 def few_trees() -> Iterator[None]:
     """Grow a tenth of the trees of the baseline forests, whose accuracy does not matter here."""
-    from sklearn.ensemble import RandomForestClassifier  # noqa: PLC0415  the same
+    from sklearn.ensemble import RandomForestClassifier
 
     def grow(trees: int, **options: Any) -> Any:
         return RandomForestClassifier(trees // 10, **options)
