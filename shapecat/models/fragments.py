@@ -11,6 +11,7 @@ __all__ = ["cut_fragment", "image_plane_points", "remove_base"]
 
 _FEWEST_POINTS = 60
 _KEPT = (0.3, 0.85)
+"""Minimum and maximum fraction of the points that stay visible."""
 _LOW = 0.3
 """A fragment contains points in this lowest fraction of the height, near the support."""
 _TRIES = 8

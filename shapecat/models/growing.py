@@ -17,7 +17,9 @@ __all__ = ["Growth", "collect_chunks", "grow", "growing_options"]
 
 _T = TypeVar("_T")
 
-_L2, _MIN_HESSIAN, _ROWS = 1.0, 2.0, 0.7
+_L2, _MIN_HESSIAN = 1.0, 2.0
+_ROWS = 0.7
+"""Fraction of the samples that each tree is grown on."""
 
 
 class Growth(NamedTuple):

@@ -15,7 +15,6 @@ from shapecat.types import Camera, Pose
 __all__ = ["MessageFactory"]
 
 _TF = "tf2_msgs/msg/TFMessage"
-_DISTORTION = 5
 
 
 @cache  # it compiles the code of each message type that it writes
@@ -95,10 +94,10 @@ class MessageFactory:
     def camera_info(
         self, camera: Camera, stamp_ns: int, frame_id: str, distortion: Sequence[float] = ()
     ) -> Any:
-        """Return a sensor_msgs/CameraInfo; ``distortion`` are ``plumb_bob`` coefficients."""
+        """Return a sensor_msgs/CameraInfo; ``distortion`` are five ``plumb_bob`` coefficients."""
         k = [camera.fx, 0, camera.cx, 0, camera.fy, camera.cy, 0, 0, 1]
         p = [camera.fx, 0, camera.cx, 0, 0, camera.fy, camera.cy, 0, 0, 0, 1, 0]
-        matrices = {"d": [*distortion] or [0] * _DISTORTION, "k": k, "r": np.eye(3).ravel(), "p": p}
+        matrices = {"d": [*distortion] or [0] * 5, "k": k, "r": np.eye(3).ravel(), "p": p}
         if self.ros_version == 1:
             matrices = {name.upper(): value for name, value in matrices.items()}
         return self._make(

@@ -22,6 +22,7 @@ _LYING = {"can": 0.2, "bottle": 0.22, "cup": 0.12, "box": 0.7}
 _UPSIDE_DOWN = {"cup": 0.06, "bowl": 0.06, "plate": 0.03}
 """Probability that an open object stands on its rim."""
 _WIDEST_M = 0.42
+"""Maximum length and width of an object."""
 SUPPORTING = {"box", "can"}
 """Categories that other objects are stacked on."""
 _SMALLEST_TOP_M = 0.035

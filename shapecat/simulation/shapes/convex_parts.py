@@ -17,7 +17,9 @@ _BLOCKS = 4
 _SKIN_M = 0.001
 """Half the minimum thickness of a part: physics engines reject solids without volume."""
 _HOLLOW = 0.2
+"""Hollowness from which a mesh is cut into blocks."""
 _COLUMNS = 9
+"""Columns along x and y in which the hollowness is measured."""
 
 
 def convex_parts(mesh: Mesh) -> list[F8]:
