@@ -16,8 +16,8 @@ from shapecat.simulation.camera.presets import KINECT
 from shapecat.simulation.scenes.furniture import make_table
 from shapecat.simulation.scenes.layout import Layout, Piece, make_piece
 from shapecat.simulation.scenes.paths import Filming, arc_orbit
-from shapecat.simulation.scenes.placement import StablePose
 from shapecat.simulation.shapes.distractors import make_distractor
+from shapecat.simulation.shapes.stable_poses import StablePose
 from shapecat.types import CATEGORIES, Pose
 
 Run = Callable[..., Result]

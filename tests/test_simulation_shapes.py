@@ -9,12 +9,12 @@ from shapecat.arrays import F8
 from shapecat.geometry import compose
 from shapecat.simulation.camera.render import geometry, render
 from shapecat.simulation.scenes.footprints import overlap
-from shapecat.simulation.scenes.placement import choose_stable_pose, stable_poses
 from shapecat.simulation.scenes.worlds import pose_from_yaw
 from shapecat.simulation.shapes.categories import make_object
 from shapecat.simulation.shapes.distractors import DISTRACTORS, make_distractor
 from shapecat.simulation.shapes.mesh import Mesh, moved
 from shapecat.simulation.shapes.primitives import lathe, rounded_box, tube
+from shapecat.simulation.shapes.stable_poses import choose_stable_pose, stable_poses
 from shapecat.types import CATEGORIES, Camera, Pose
 
 HERE = Pose(np.eye(3), np.zeros(3))

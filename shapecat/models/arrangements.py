@@ -9,13 +9,13 @@ import numpy as np
 from shapecat.geometry import rotation_from_quaternion
 from shapecat.simulation.scenes.paths import Filming
 from shapecat.simulation.scenes.piles import bin_picking, pile, shelf_bin
-from shapecat.simulation.scenes.placement import choose_stable_pose, stable_poses
 from shapecat.simulation.scenes.rooms import room
 from shapecat.simulation.scenes.worlds import PlacedObject, World, pose_from_yaw
 from shapecat.simulation.shapes.categories import make_object
 from shapecat.simulation.shapes.distractors import make_distractor
 from shapecat.simulation.shapes.mesh import Mesh, moved, scaled, standing
 from shapecat.simulation.shapes.primitives import rounded_box
+from shapecat.simulation.shapes.stable_poses import choose_stable_pose, stable_poses
 from shapecat.types import CATEGORIES, UNKNOWN, Pose
 
 __all__ = ["BARE_TABLE", "ArrangedObject", "Arrangement", "ArrangementOptions", "arrange", "placed"]

@@ -33,8 +33,8 @@ from shapecat.models.arrangements import (
 from shapecat.models.fragments import cut_fragment, remove_base
 from shapecat.models.rendered_views import RenderedView, render_view
 from shapecat.simulation.camera.render import geometry
-from shapecat.simulation.scenes.placement import StablePose
 from shapecat.simulation.shapes.mesh import Mesh, moved
+from shapecat.simulation.shapes.stable_poses import StablePose
 from shapecat.surface import voxelize
 from shapecat.types import UNKNOWN, Candidate, Scene
 

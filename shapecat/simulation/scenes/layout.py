@@ -8,11 +8,11 @@ from numpy.random import Generator
 from shapecat.arrays import F8
 from shapecat.geometry import IDENTITY, compose
 from shapecat.simulation.scenes.footprints import Footprint, footprint, inside, overlap
-from shapecat.simulation.scenes.placement import StablePose, choose_stable_pose, stable_poses
 from shapecat.simulation.scenes.worlds import PlacedObject, Support, pose_from_yaw
 from shapecat.simulation.shapes.categories import make_object
 from shapecat.simulation.shapes.distractors import make_distractor
 from shapecat.simulation.shapes.mesh import Mesh
+from shapecat.simulation.shapes.stable_poses import StablePose, choose_stable_pose, stable_poses
 from shapecat.types import Pose
 
 __all__ = ["SUPPORTING", "Layout", "Piece", "make_piece"]

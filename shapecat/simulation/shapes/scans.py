@@ -10,8 +10,8 @@ from shapecat.arrays import F8, I4
 from shapecat.errors import ConfigError, RecordingError
 from shapecat.geometry import IDENTITY
 from shapecat.simulation.camera.render import geometry, render
-from shapecat.simulation.scenes.placement import StablePose, stable_poses
 from shapecat.simulation.shapes.mesh import Mesh, moved, standing
+from shapecat.simulation.shapes.stable_poses import StablePose, stable_poses
 from shapecat.types import Camera, Pose
 
 __all__ = ["load_mesh", "upright_poses", "uprighted"]
