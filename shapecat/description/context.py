@@ -5,7 +5,7 @@ import numpy as np
 from shapecat.arrays import F4, F8
 from shapecat.description.linear import principal_axes
 from shapecat.description.profile import vertical_axis
-from shapecat.description.sampled import Surface
+from shapecat.description.surface import Surface
 from shapecat.jit import kernel
 
 __all__ = ["CONTEXT_NAMES", "context"]

@@ -13,8 +13,8 @@ from shapecat.description.profile import profile, vertical_axis
 from shapecat.description.ranges import outer_range
 from shapecat.description.revolution import revolution
 from shapecat.description.rotation_axis import rotation_axis
-from shapecat.description.sampled import Surface
 from shapecat.description.solids import solids
+from shapecat.description.surface import Surface
 from shapecat.jit import kernel
 from shapecat.types import NeuralGas
 

@@ -14,7 +14,7 @@ from shapecat.description.blocks import (
     UP_BINS,
 )
 from shapecat.description.ranges import outer_range
-from shapecat.description.sampled import Surface
+from shapecat.description.surface import Surface
 from shapecat.jit import kernel
 
 __all__ = ["distributions"]

@@ -3,7 +3,7 @@
 import numpy as np
 
 from shapecat.arrays import F4
-from shapecat.description.sampled import Surface
+from shapecat.description.surface import Surface
 from shapecat.jit import kernel
 
 __all__ = ["PROFILE_NAMES", "PROFILE_SLICES", "profile", "vertical_axis"]

@@ -4,7 +4,7 @@ import numpy as np
 
 from shapecat.arrays import F4, F8, I4
 from shapecat.description.linear import solve
-from shapecat.description.sampled import Surface
+from shapecat.description.surface import Surface
 from shapecat.jit import kernel
 
 __all__ = ["REVOLUTION_NAMES", "REVOLUTION_SLICES", "fit_axis", "revolution"]

@@ -1,4 +1,4 @@
-"""Objects over time: association, tracks, hindsight and fusion (thesis 7.5.2).
+"""Objects over time: association, track stitching and fusion (thesis 7.5.2).
 
 `track_recording` combines these steps: it turns the detections of each frame into tracks.
 """
