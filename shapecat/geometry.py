@@ -313,11 +313,11 @@ def _smallest_rectangle(x: F4, y: F4) -> tuple[float, F8, F8]:
             u, v = _COS[t] * x[k] + _SIN[t] * y[k], _COS[t] * y[k] - _SIN[t] * x[k]
             left[t], right[t] = u if u < left[t] else left[t], u if u > right[t] else right[t]
             back[t], front[t] = v if v < back[t] else back[t], v if v > front[t] else front[t]
-    best, least = 0, np.float32(np.inf)
+    best, smallest_area = 0, np.float32(np.inf)
     for t in range(n):
         area = (right[t] - left[t]) * (front[t] - back[t])
-        if area < least:
-            best, least = t, area
+        if area < smallest_area:
+            best, smallest_area = t, area
     low, high = np.zeros(3), np.zeros(3)
     low[0], low[1], high[0], high[1] = left[best], back[best], right[best], front[best]
     return _YAWS[best], low, high

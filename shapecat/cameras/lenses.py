@@ -67,21 +67,21 @@ def undistorted_rays(camera: Camera, model: str, coefficients: Sequence[float]) 
     if model not in LENS_MODELS or not np.isfinite(coefficients).all():
         return None
     u, v = np.meshgrid(np.arange(camera.width), np.arange(camera.height))
-    seen = np.stack([(u - camera.cx) / camera.fx, (v - camera.cy) / camera.fy], axis=-1)
-    goals = seen.reshape(-1, 2)
-    rays, error, left = goals.copy(), np.full(len(goals), np.inf), np.arange(len(goals))
+    distorted = np.stack([(u - camera.cx) / camera.fx, (v - camera.cy) / camera.fy], axis=-1)
+    targets = distorted.reshape(-1, 2)
+    rays, error, active = targets.copy(), np.full(len(targets), np.inf), np.arange(len(targets))
     with np.errstate(all="ignore"):  # beyond the image of the lens it diverges: rejected below
         for _ in range(_ROUNDS):
-            bent = distort(rays[left], model, coefficients)
-            off = goals[left] - bent
+            bent = distort(rays[active], model, coefficients)
+            off = targets[active] - bent
             # A step by the error alone is slow where the lens compresses the image.
-            stretch = np.linalg.norm(rays[left], axis=1) / np.linalg.norm(bent, axis=1)
-            rays[left] += off * np.where(stretch > 0, stretch, 1)[:, None]
-            error[left] = np.abs(off * (camera.fx, camera.fy)).max(axis=1)
-            left = left[error[left] > _ENOUGH_PX]
-    good = error < _WRONG_PX  # never so for NaN
-    rays[~good] = np.nan
-    return rays.reshape(seen.shape) if good.mean() >= _LEAST_SHARE else None
+            stretch = np.linalg.norm(rays[active], axis=1) / np.linalg.norm(bent, axis=1)
+            rays[active] += off * np.where(stretch > 0, stretch, 1)[:, None]
+            error[active] = np.abs(off * (camera.fx, camera.fy)).max(axis=1)
+            active = active[error[active] > _ENOUGH_PX]
+    converged = error < _WRONG_PX  # never so for NaN
+    rays[~converged] = np.nan
+    return rays.reshape(distorted.shape) if converged.mean() >= _LEAST_SHARE else None
 
 
 def _polynomial(rays: F8, d: F8) -> F8:

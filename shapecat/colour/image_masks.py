@@ -26,7 +26,7 @@ def find_masks(frame: Frame, view: ColourView, objects: Sequence[U4]) -> ImageMa
     masks: tuple[Mask, ...] = ()
     if frame.organized:
         masks = dense_masks(frame, objects, view.lens, view.colour_from_depth)
-    seen = {number: mask for number, mask in enumerate(masks) if mask.pixels.size}
+    visible = {number: mask for number, mask in enumerate(masks) if mask.pixels.size}
     return ImageMasks(
         image.topic,
         image.stamp_ns,
@@ -34,8 +34,8 @@ def find_masks(frame: Frame, view: ColourView, objects: Sequence[U4]) -> ImageMa
         image.frame_id,
         image.width,
         image.height,
-        {number: mask.box for number, mask in seen.items()},
-        {n: rle_counts(mask, image.height, image.width) for n, mask in seen.items()},
+        {number: mask.box for number, mask in visible.items()},
+        {n: rle_counts(mask, image.height, image.width) for n, mask in visible.items()},
     )
 
 
@@ -51,8 +51,8 @@ def mask_of(masks: ImageMasks, detections: Sequence[int]) -> Mask:
     ValueError : the run lengths of a mask do not fill the image.
     """
     counts = [masks.counts[number] for number in detections if number in masks.counts]
-    found = [rle_mask(runs, masks.height, masks.width) for runs in counts]
-    return union(found) if found else EMPTY_MASK
+    decoded = [rle_mask(runs, masks.height, masks.width) for runs in counts]
+    return union(decoded) if decoded else EMPTY_MASK
 
 
 def box_of(masks: ImageMasks, detections: Sequence[int]) -> tuple[int, int, int, int] | None:

@@ -98,13 +98,13 @@ def dense_masks(
 
 
 def labelled_masks(
-    seen: I4, boxes: I4, scale: float = 1.0, *, corner: tuple[int, int] = (0, 0)
+    labels: I4, boxes: I4, scale: float = 1.0, *, corner: tuple[int, int] = (0, 0)
 ) -> tuple[Mask, ...]:
     """Return the dense mask of each label, from 1 to n.
 
     Parameters
     ----------
-    seen : (h, w) labels of the objects, from 1; 0 for other surfaces, -1 where nothing is known.
+    labels : (h, w) labels of the objects, from 1; 0 for other surfaces, -1 where nothing is known.
         Its gaps are filled in place.
     boxes : (n + 1, 4) the bounding box of each label, from `label_boxes`.
     scale : pixels of the colour image per pixel of the depth image.
@@ -112,23 +112,23 @@ def labelled_masks(
     """
     narrow, wide = max(1, round(_NARROW_PX * scale)), max(1, round(_WIDE_PX * scale))
     for box in boxes[boxes[:, 2] > 0].tolist():
-        _fill(seen, tuple(box), narrow, wide)
-    reach = max(1, round(_RAGGED_PX * scale / 2))
-    places = boxes.tolist()
+        _fill(labels, tuple(box), narrow, wide)
+    radius = max(1, round(_RAGGED_PX * scale / 2))
+    box_list = boxes.tolist()
     return tuple(
-        _smoothed(seen, label, places[label], reach, corner) for label in range(1, len(boxes))
+        _smoothed(labels, label, box_list[label], radius, corner) for label in range(1, len(boxes))
     )
 
 
-def _smoothed(filled: I4, label: int, box: list[int], reach: int, corner: tuple[int, int]) -> Mask:
+def _smoothed(labels: I4, label: int, box: list[int], radius: int, corner: tuple[int, int]) -> Mask:
     """Return the mask of a label after a majority filter."""
     left, top, right, bottom = box
     if right <= left:
         return EMPTY_MASK
-    left, top = max(0, left - reach), max(0, top - reach)
-    around = filled[top : bottom + reach, left : right + reach]
+    left, top = max(0, left - radius), max(0, top - radius)
+    around = labels[top : bottom + radius, left : right + radius]
     pixels = np.zeros(around.shape, np.bool_)
-    west, north, east, south = _majority(around, label, reach, pixels)
+    west, north, east, south = _majority(around, label, radius, pixels)
     if east <= west:
         return EMPTY_MASK
     left, top = left + corner[0], top + corner[1]
@@ -137,33 +137,33 @@ def _smoothed(filled: I4, label: int, box: list[int], reach: int, corner: tuple[
 
 def union(masks: Sequence[Mask]) -> Mask:
     """Return the union of masks of one image."""
-    seen = [mask for mask in masks if mask.pixels.size]
-    if len(seen) < 2:
-        return seen[0] if seen else EMPTY_MASK
-    left, top = min(mask.left for mask in seen), min(mask.top for mask in seen)
-    right = max(mask.left + mask.box[2] for mask in seen)
-    bottom = max(mask.top + mask.box[3] for mask in seen)
+    nonempty = [mask for mask in masks if mask.pixels.size]
+    if len(nonempty) < 2:
+        return nonempty[0] if nonempty else EMPTY_MASK
+    left, top = min(mask.left for mask in nonempty), min(mask.top for mask in nonempty)
+    right = max(mask.left + mask.box[2] for mask in nonempty)
+    bottom = max(mask.top + mask.box[3] for mask in nonempty)
     pixels = np.zeros((bottom - top, right - left), bool)
-    for mask in seen:
+    for mask in nonempty:
         x, y, width, height = mask.left - left, mask.top - top, *mask.box[2:]
         pixels[y : y + height, x : x + width] |= mask.pixels
     return Mask(left, top, pixels)
 
 
 @kernel
-def label_boxes(seen: I4, count: int) -> I4:
+def label_boxes(labels: I4, count: int) -> I4:
     """Return the bounding box of each label: (count + 1, 4) left, top, right + 1, bottom + 1.
 
     Row 0, and the rows of labels that do not occur, are zeros.
 
     Parameters
     ----------
-    seen : (h, w) labels, from 1 to ``count``; others are ignored.
+    labels : (h, w) labels, from 1 to ``count``; others are ignored.
     """
     boxes = np.zeros((count + 1, 4), np.int64)
-    boxes[:, 0], boxes[:, 1] = seen.shape[1], seen.shape[0]
-    for v in range(seen.shape[0]):
-        row, last = seen[v], 0
+    boxes[:, 0], boxes[:, 1] = labels.shape[1], labels.shape[0]
+    for v in range(labels.shape[0]):
+        row, last = labels[v], 0
         for u in range(row.size):
             label = row[u]
             if label != last:  # where a run of pixels begins or ends
@@ -199,7 +199,7 @@ def _step_row(labels: I4, packed: I4, result: I4) -> None:
 
 
 @kernel
-def _fill(seen: I4, region: tuple[int, int, int, int], narrow: int, wide: int) -> None:
+def _fill(labels: I4, region: tuple[int, int, int, int], narrow: int, wide: int) -> None:
     """Add to objects the pixels that they surround in a region, with one sweep each way.
 
     ``region`` is left, top, right + 1, bottom + 1. A pixel changes only after its old label has
@@ -210,22 +210,22 @@ def _fill(seen: I4, region: tuple[int, int, int, int], narrow: int, wide: int) -
     west = np.zeros((height, width + 1), np.int32)  # `_step` from the left
     north = np.zeros((height + 1, width), np.int32)  # `_step` from above
     for v in range(height):
-        row = seen[top + v, left:right]
+        row = labels[top + v, left:right]
         _step_row(row, north[v], north[v + 1])
         for u in range(width):
             west[v, u + 1] = _step(row[u], west[v, u])
     east, south = np.zeros(width + 1, np.int32), np.zeros((2, width), np.int32)
     for v in range(height - 1, -1, -1):
-        row, below = seen[top + v, left:right], south[v % 2]
+        row, below = labels[top + v, left:right], south[v % 2]
         _step_row(row, south[(v + 1) % 2], below)
         for u in range(width - 1, -1, -1):
             label = row[u]
             east[u] = _step(label, east[u + 1])
             if label < 0 or (label == 0 and west[v, u + 1] >> 16 == east[u] >> 16):
                 w, n = west[v, u + 1], north[v + 1, u]
-                found = _surrounding(label, w, east[u], n, below[u], narrow, wide)
-                if found > 0:
-                    row[u] = found
+                surrounding = _surrounding(label, w, east[u], n, below[u], narrow, wide)
+                if surrounding > 0:
+                    row[u] = surrounding
 
 
 @kernel(inner=True)
@@ -240,11 +240,11 @@ def _surrounding(label: int, w: int, e: int, n: int, s: int, narrow: int, wide: 
         return across if across == along else 0
     if across > 0 or along > 0:
         return across if across > 0 else along
-    found = w >> 16 if w >> 16 == e >> 16 or w >> 16 == n >> 16 else s >> 16
+    candidate = w >> 16 if w >> 16 == e >> 16 or w >> 16 == n >> 16 else s >> 16
     sides = 0
     for packed in (w, e, n, s):
-        sides += packed >> 16 == found and not packed & 1 and _gap(packed) <= wide
-    return found if sides >= 3 and found > 0 else -1
+        sides += packed >> 16 == candidate and not packed & 1 and _gap(packed) <= wide
+    return candidate if sides >= 3 and candidate > 0 else -1
 
 
 @kernel(inner=True)
@@ -253,30 +253,30 @@ def _gap(packed: int) -> int:
 
 
 @kernel
-def _majority(seen: I4, label: int, reach: int, pixels: Bool) -> tuple[int, int, int, int]:
+def _majority(labels: I4, label: int, radius: int, pixels: Bool) -> tuple[int, int, int, int]:
     """Set each pixel if most pixels of the square around it have the label.
 
     Only the part of the square within the image counts. Returns left, top, right + 1 and
     bottom + 1 of the pixels that are set.
     """
-    height, width = seen.shape
+    height, width = labels.shape
     west, north, east, south = width, height, 0, 0
-    column = np.zeros(width + 2 * reach, np.int32)  # pixels of the label, in the rows around
-    middle = column[reach : reach + width]
+    column = np.zeros(width + 2 * radius, np.int32)  # pixels of the label, in the rows around
+    middle = column[radius : radius + width]
     at = np.arange(width)
-    columns = np.minimum(width, at + reach + 1) - np.maximum(0, at - reach)
-    for v in range(-reach, height):
-        if v + reach < height:
-            _count(seen[v + reach], label, 1, middle)
-        if v > reach:
-            _count(seen[v - reach - 1], label, -1, middle)
+    columns = np.minimum(width, at + radius + 1) - np.maximum(0, at - radius)
+    for v in range(-radius, height):
+        if v + radius < height:
+            _count(labels[v + radius], label, 1, middle)
+        if v > radius:
+            _count(labels[v - radius - 1], label, -1, middle)
         if v < 0:
             continue
         count = np.zeros(width, np.int32)
-        for shift in range(2 * reach + 1):
+        for shift in range(2 * radius + 1):
             for u in range(width):
                 count[u] += column[u + shift]
-        rows = min(height, v + reach + 1) - max(0, v - reach)
+        rows = min(height, v + radius + 1) - max(0, v - radius)
         row = pixels[v]
         for u in range(width):
             row[u] = 2 * count[u] > rows * columns[u]

@@ -38,10 +38,10 @@ def outlines(mask: Mask, tolerance_px: float = _TOLERANCE_PX) -> list[F8]:
     ends = np.zeros(inside.size + 1, np.int64)
     count = _trace(inside, corners, ends)
     rings = np.split(corners[: ends[count - 1]] if count else corners[:0], ends[: count - 1])
-    found = [ring for ring in rings if len(ring) and _area(ring) > 0]
-    found.sort(key=_area, reverse=True)
+    valid = [ring for ring in rings if len(ring) and _area(ring) > 0]
+    valid.sort(key=_area, reverse=True)
     offset = np.array([mask.left - 1, mask.top - 1])
-    return [_simplified(ring.astype(np.float64), tolerance_px) + offset for ring in found]
+    return [_simplified(ring.astype(np.float64), tolerance_px) + offset for ring in valid]
 
 
 def joined(rings: Sequence[F8]) -> F8:
@@ -49,13 +49,13 @@ def joined(rings: Sequence[F8]) -> F8:
 
     A double edge links the nearest corners, as in converters of COCO data sets.
     """
-    whole = rings[0]
+    joined_ring = rings[0]
     for ring in rings[1:]:
-        apart = ((whole[:, None] - ring[None]) ** 2).sum(axis=-1)
+        apart = ((joined_ring[:, None] - ring[None]) ** 2).sum(axis=-1)
         i, j = np.unravel_index(int(apart.argmin()), apart.shape)
         around = np.concatenate([ring[j:], ring[: j + 1]])
-        whole = np.concatenate([whole[: i + 1], around, whole[i:]])
-    return whole
+        joined_ring = np.concatenate([joined_ring[: i + 1], around, joined_ring[i:]])
+    return joined_ring
 
 
 def _area(ring: F8) -> float:
@@ -66,14 +66,14 @@ def _area(ring: F8) -> float:
 
 def _simplified(ring: F8, tolerance: float) -> F8:
     """Drop corners of a closed line (Douglas and Peucker 1973)."""
-    far = int(((ring - ring[0]) ** 2).sum(axis=1).argmax())
+    farthest = int(((ring - ring[0]) ** 2).sum(axis=1).argmax())
     closed = np.concatenate([ring, ring[:1]])
     keep = np.zeros(len(closed), np.bool_)
-    keep[[0, far, -1]] = True
-    _keep_far(closed, 0, far, tolerance, keep)
-    _keep_far(closed, far, len(closed) - 1, tolerance, keep)
-    found = closed[:-1][keep[:-1]]
-    return found if len(found) >= 3 else ring
+    keep[[0, farthest, -1]] = True
+    _keep_far(closed, 0, farthest, tolerance, keep)
+    _keep_far(closed, farthest, len(closed) - 1, tolerance, keep)
+    simplified = closed[:-1][keep[:-1]]
+    return simplified if len(simplified) >= 3 else ring
 
 
 @kernel

@@ -46,11 +46,14 @@ def project(points: F4, lens: LensCamera, colour_from_depth: Pose) -> F4:
     array([[370., 190.,   2.]], dtype=float32)
     """
     rotation = colour_from_depth.rotation.astype(np.float32)
-    shift, seen = colour_from_depth.translation.astype(np.float32), np.zeros((3, len(points)), "f4")
-    _to_camera(np.asarray(points, np.float32), rotation, shift, seen)
-    distances = seen[2].copy()
-    project_in_place(seen[0], seen[1], seen[2], *kernel_lens(lens))
-    return np.where(seen[2] > 0, (seen[0], seen[1], distances), np.float32(np.nan)).T
+    shift, projected = (
+        colour_from_depth.translation.astype(np.float32),
+        np.zeros((3, len(points)), "f4"),
+    )
+    _to_camera(np.asarray(points, np.float32), rotation, shift, projected)
+    distances = projected[2].copy()
+    project_in_place(projected[0], projected[1], projected[2], *kernel_lens(lens))
+    return np.where(projected[2] > 0, (projected[0], projected[1], distances), np.float32(np.nan)).T
 
 
 def kernel_lens(lens: LensCamera) -> Lens:
@@ -66,9 +69,9 @@ def kernel_lens(lens: LensCamera) -> Lens:
     d = np.zeros(8, np.float32)
     d[: len(lens.coefficients[:8])] = lens.coefficients[:8]
     kind = 0 if not lens.model else 2 if lens.model in FISHEYE_MODELS else 1
-    camera, reach = lens.pinhole, _monotonic_up_to(lens) ** 2 if kind else np.inf
+    camera, max_slope2 = lens.pinhole, _monotonic_up_to(lens) ** 2 if kind else np.inf
     numbers = np.array((camera.fx, camera.fy, camera.cx, camera.cy), np.float32)
-    return numbers, kind, d, reach
+    return numbers, kind, d, max_slope2
 
 
 def rectified(pixels: U1, lens: LensCamera) -> U1:
@@ -114,24 +117,24 @@ def _monotonic_up_to(lens: LensCamera) -> float:
     Beyond it the polynomial turns back, and would map the sides of the scene into the image.
     """
     slopes = np.linspace(0, _WIDEST, 601)[1:]
-    seen = distort(np.column_stack([slopes, 0 * slopes]), lens.model, lens.coefficients)[:, 0]
-    back = np.flatnonzero(np.diff(seen) <= 0)
+    distorted = distort(np.column_stack([slopes, 0 * slopes]), lens.model, lens.coefficients)[:, 0]
+    back = np.flatnonzero(np.diff(distorted) <= 0)
     return float(slopes[back[0]]) if back.size else _WIDEST
 
 
 @kernel
-def _to_camera(points: F4, rotation: F4, shift: F4, turned: F4) -> None:
+def _to_camera(points: F4, rotation: F4, shift: F4, transformed: F4) -> None:
     """Write points (n, 3) in the frame of a camera, (3, n); z is -1 where they are not finite."""
     for i in range(points.shape[0]):
         x, y, z = points[i, 0], points[i, 1], points[i, 2]
-        known = np.isfinite(x + y + z)
+        finite = np.isfinite(x + y + z)
         for k in range(3):
             value = rotation[k, 0] * x + rotation[k, 1] * y + rotation[k, 2] * z + shift[k]
-            turned[k, i] = value if known else np.float32(-1)
+            transformed[k, i] = value if finite else np.float32(-1)
 
 
 @kernel(fast=True)
-def project_in_place(x: F4, y: F4, z: F4, numbers: F4, kind: int, d: F4, reach: float) -> None:
+def project_in_place(x: F4, y: F4, z: F4, numbers: F4, kind: int, d: F4, max_slope2: float) -> None:
     """Project points, in place, from the camera frame to the image.
 
     Source of the lens models: `shapecat.cameras.lenses.distort`.
@@ -143,13 +146,13 @@ def project_in_place(x: F4, y: F4, z: F4, numbers: F4, kind: int, d: F4, reach: 
     numbers : (4,) fx, fy, cx, cy, pixels.
     kind : kind of distortion: 0 none, 1 polynomial, 2 fisheye.
     d : (8,) distortion coefficients.
-    reach : the square of the largest slope that the lens sees; ignored without distortion.
+    max_slope2 : the square of the largest slope that the lens sees; ignored without distortion.
     """
     one, two, nought = np.float32(1), np.float32(2), np.float32(0)
     for k in range(x.size):
-        near = one / max(z[k], np.float32(1e-3))
-        x[k], y[k] = x[k] * near, y[k] * near
-        z[k] = near if z[k] > np.float32(1e-3) else nought
+        inverse_depth = one / max(z[k], np.float32(1e-3))
+        x[k], y[k] = x[k] * inverse_depth, y[k] * inverse_depth
+        z[k] = inverse_depth if z[k] > np.float32(1e-3) else nought
     if kind == 1:
         k1, k2, p1, p2, k3, k4, k5, k6 = d[0], d[1], d[2], d[3], d[4], d[5], d[6], d[7]
         for k in range(x.size):
@@ -158,7 +161,7 @@ def project_in_place(x: F4, y: F4, z: F4, numbers: F4, kind: int, d: F4, reach: 
             radial = (one + r * (k1 + r * (k2 + r * k3))) / (one + r * (k4 + r * (k5 + r * k6)))
             x[k] = a * radial + two * p1 * a * b + p2 * (r + two * a * a)
             y[k] = b * radial + p1 * (r + two * b * b) + two * p2 * a * b
-            z[k] = z[k] if r < reach else nought
+            z[k] = z[k] if r < max_slope2 else nought
     elif kind == 2:
         for k in range(x.size):
             r = x[k] * x[k] + y[k] * y[k]
@@ -167,6 +170,6 @@ def project_in_place(x: F4, y: F4, z: F4, numbers: F4, kind: int, d: F4, reach: 
             s = angle * angle
             bent = angle * (one + s * (d[0] + s * (d[1] + s * (d[2] + s * d[3])))) / radius
             x[k], y[k] = x[k] * bent, y[k] * bent
-            z[k] = z[k] if r < reach else nought
+            z[k] = z[k] if r < max_slope2 else nought
     for k in range(x.size):
         x[k], y[k] = x[k] * numbers[0] + numbers[2], y[k] * numbers[1] + numbers[3]

@@ -68,12 +68,12 @@ def rle_text(counts: U4) -> str:
     """
     numbers, letters = [int(count) for count in counts], []
     for k, number in enumerate(numbers):
-        rest = number - numbers[k - 2] if k > 2 else number
+        remainder = number - numbers[k - 2] if k > 2 else number
         more = True
         while more:
-            part = rest & 31
-            rest >>= 5
-            more = rest != (-1 if part & 16 else 0)
+            part = remainder & 31
+            remainder >>= 5
+            more = remainder != (-1 if part & 16 else 0)
             letters.append(chr(part + (32 if more else 0) + 48))
     return "".join(letters)
 
@@ -95,10 +95,10 @@ def _encode(pixels: Bool, left: int, top: int, height: int, width: int, runs: U4
         if inside and below > 0:
             runs[count], count, inside, length = length, count + 1, False, 0
         length += below
-    rest = (width - left - pixels.shape[1]) * height
-    if inside and rest > 0:
+    trailing = (width - left - pixels.shape[1]) * height
+    if inside and trailing > 0:
         runs[count], count, length = length, count + 1, 0
-    runs[count] = length + rest
+    runs[count] = length + trailing
     return count + 1
 
 

@@ -79,8 +79,8 @@ class _Match(NamedTuple):
 
 def _match(mask: Mask, number: int, owners: I4, pixels: U1, scale: float) -> _Match:
     """Return the pixels that match a mask; ``owners`` (h, w) are the numbers of the masks."""
-    band, reach = max(2.0, _BAND_PX * scale), max(3, round(_WINDOW_PX * scale))
-    margin, (left, top, width, height) = int(band) + reach, mask.box
+    band_px, radius = max(2.0, _BAND_PX * scale), max(3, round(_WINDOW_PX * scale))
+    margin, (left, top, width, height) = int(band_px) + radius, mask.box
     rows = slice(max(0, top - margin), top + height + margin)
     columns = slice(max(0, left - margin), left + width + margin)
     window = rows, columns
@@ -92,18 +92,18 @@ def _match(mask: Mask, number: int, owners: I4, pixels: U1, scale: float) -> _Ma
     depth = np.where(inside, within - 0.5, 0.5 - without).astype(np.float32)
     log_ratio = np.zeros(depth.shape, np.float32)
     colours = np.ascontiguousarray(pixels[window])
-    _compare(colours, depth, band, _CORE_PX * scale, reach, log_ratio)
+    _compare(colours, depth, band_px, _CORE_PX * scale, radius, log_ratio)
     score = ndimage.uniform_filter(log_ratio, 3) + depth / np.float32(_ERROR_PX * scale)
-    return _Match(window, np.where(np.abs(depth) <= band, score > 0, inside))
+    return _Match(window, np.where(np.abs(depth) <= band_px, score > 0, inside))
 
 
 def _claim(match: _Match, number: int, owners: I4) -> Mask:
     """Return a mask of the pixels that match it and that no other mask has; mark them as taken."""
     rows, columns = match.window
     part = owners[match.window]
-    found = match.wanted & ((part == number) | (part == 0))
-    part[found] = number
-    return _cut_out(found, columns.start, rows.start)
+    claimed = match.wanted & ((part == number) | (part == 0))
+    part[claimed] = number
+    return _cut_out(claimed, columns.start, rows.start)
 
 
 def _cut_out(inside: Bool, left: int, top: int) -> Mask:
@@ -147,9 +147,13 @@ def _compare(colours: U1, depth: F4, band: float, core: float, window: int, log_
                     else:
                         outside, squares_outside = outside + 1, squares_outside + square
             if min(inside, outside) >= _FEWEST:
-                own = _negative_log_likelihood(colours[v, u], total[1], squares_inside, inside)
-                other = _negative_log_likelihood(colours[v, u], total[0], squares_outside, outside)
-                log_ratio[v, u] = min(max(other - own, -_CERTAIN), _CERTAIN)
+                cost_inside = _negative_log_likelihood(
+                    colours[v, u], total[1], squares_inside, inside
+                )
+                cost_outside = _negative_log_likelihood(
+                    colours[v, u], total[0], squares_outside, outside
+                )
+                log_ratio[v, u] = min(max(cost_outside - cost_inside, -_CERTAIN), _CERTAIN)
 
 
 @kernel(inner=True)

@@ -69,10 +69,10 @@ def splat_depth(
     rays, size = _rays(camera, colour_from_depth), (target.width, target.height)
     parallax = max(camera.fx, camera.fy) * float(np.linalg.norm(colour_from_depth.translation))
     boxes = np.zeros((len(objects) + 1, 4), np.int64)
-    left, top, seen = _splat(
+    left, top, splat = _splat(
         depth, pixels, labels, rays, parallax, kernel_lens(lens), scale, size, boxes
     )
-    return SplattedLabels(left, top, seen, boxes)
+    return SplattedLabels(left, top, splat, boxes)
 
 
 def _rays(camera: Camera, colour_from_depth: Pose) -> tuple[F4, F4, F4]:
@@ -107,16 +107,22 @@ def _splat(
     width and height of the colour image.
     """
     beside = _list_beside(depth, pixels, parallax)
-    place = _project_pixels(depth, pixels, rays, lens)
+    projections = _project_pixels(depth, pixels, rays, lens)
     around = _project_pixels(depth, beside, rays, lens)
-    squares = _cover(place, labels, np.float32(scale / 2), size, boxes)
+    squares = _cover(projections, labels, np.float32(scale / 2), size, boxes)
     left, top, right, bottom = _window(boxes, int(_BESIDE_PX * scale), size)
-    seen = np.full((bottom - top, right - left), np.int32(-1))
-    nearest = np.zeros(seen.shape, np.float32)
-    _paint(squares, labels, place[2], (left, top), nearest, seen)
+    splat = np.full((bottom - top, right - left), np.int32(-1))
+    nearest = np.zeros(splat.shape, np.float32)
+    _paint(squares, labels, projections[2], (left, top), nearest, splat)
     cell = max(2, int(_SPARSE * scale + 0.5))
-    _hide(_nearest_surface(around, (left, top), cell, seen.shape), cell, boxes, nearest, seen)
-    return left, top, seen
+    _hide(
+        _nearest_surface(around, (left, top), cell, splat.shape),
+        cell,
+        boxes,
+        nearest,
+        splat,
+    )
+    return left, top, splat
 
 
 @kernel(inner=True)
@@ -127,19 +133,19 @@ def _list_beside(depth: F4, pixels: U4, parallax: float) -> U4:
     parallax: focal length times baseline times the difference of the inverse depths.
     """
     rows, columns = (depth.shape[0] - 1) // _SPARSE + 1, (depth.shape[1] - 1) // _SPARSE + 1
-    own = np.zeros((rows, columns), np.bool_)
-    top, bottom, left, right, near, far = _extent(depth, pixels, own)
-    found, count = np.zeros(own.size, np.uint32), 0
-    if not near < np.inf or bottom < top:
-        return found[:0]
-    margin = int(parallax * max(0.0, 1 / near - 1 / far)) + _BESIDE_PX
+    on_object = np.zeros((rows, columns), np.bool_)
+    top, bottom, left, right, min_depth, max_depth = _extent(depth, pixels, on_object)
+    pixels_beside, count = np.zeros(on_object.size, np.uint32), 0
+    if not min_depth < np.inf or bottom < top:
+        return pixels_beside[:0]
+    margin = int(parallax * max(0.0, 1 / min_depth - 1 / max_depth)) + _BESIDE_PX
     first, last = max(0, left - margin) // _SPARSE, (right + margin) // _SPARSE
     for j in range(max(0, top - margin) // _SPARSE, min((bottom + margin) // _SPARSE + 1, rows)):
         for i in range(first, min(last + 1, columns)):
-            if depth[j * _SPARSE, i * _SPARSE] > 0 and not own[j, i]:
-                found[count] = (j * depth.shape[1] + i) * _SPARSE
+            if depth[j * _SPARSE, i * _SPARSE] > 0 and not on_object[j, i]:
+                pixels_beside[count] = (j * depth.shape[1] + i) * _SPARSE
                 count += 1
-    return found[:count]
+    return pixels_beside[:count]
 
 
 @kernel(inner=True)
@@ -153,30 +159,30 @@ def _row_and_column(pixel: int, row: int, width: int) -> tuple[int, int]:
 
 
 @kernel(inner=True)
-def _extent(depth: F4, pixels: U4, own: Bool) -> tuple[int, int, int, int, float, float]:
+def _extent(depth: F4, pixels: U4, on_object: Bool) -> tuple[int, int, int, int, float, float]:
     """Return the extent of some pixels in the image and in depth.
 
     The result is first and last row, first and last column, the smallest depth of all sparse pixels
-    of the image, and the largest depth of the given pixels. ``own`` is set to True at the sparse
-    pixels among these.
+    of the image, and the largest depth of the given pixels. ``on_object`` is set to True at those
+    that are sparse pixels.
     """
     top, bottom, left, right = depth.shape[0], -1, depth.shape[1], -1
-    near, far = np.float32(np.inf), np.float32(0)
+    min_depth, max_depth = np.float32(np.inf), np.float32(0)
     v, width = 0, depth.shape[1]
     for pixel in pixels:
         v, u = _row_and_column(pixel, v, width)
         z = depth[v, u]
         if z > 0:
-            far = max(far, z)
+            max_depth = max(max_depth, z)
             top, bottom, left, right = min(top, v), max(bottom, v), min(left, u), max(right, u)
             if (v | u) % _SPARSE == 0:  # a power of 2, so that this tests both
-                own[v // _SPARSE, u // _SPARSE] = True
-    for j in range(own.shape[0]):
-        for i in range(own.shape[1]):
+                on_object[v // _SPARSE, u // _SPARSE] = True
+    for j in range(on_object.shape[0]):
+        for i in range(on_object.shape[1]):
             z = depth[j * _SPARSE, i * _SPARSE]
             if z > 0:
-                near = min(near, z)
-    return top, bottom, left, right, float(near), float(far)
+                min_depth = min(min_depth, z)
+    return top, bottom, left, right, float(min_depth), float(max_depth)
 
 
 @kernel(inner=True)
@@ -197,30 +203,30 @@ def _project_pixels(depth: F4, pixels: U4, rays: tuple[F4, F4, F4], lens: Lens) 
         moved[3, i] = z
         if not z > 0:
             moved[2, i] = -1
-    numbers, kind, d, reach = lens
-    project_in_place(moved[0], moved[1], moved[2], numbers, kind, d, reach)
+    numbers, kind, d, max_slope2 = lens
+    project_in_place(moved[0], moved[1], moved[2], numbers, kind, d, max_slope2)
     return moved
 
 
 @kernel(inner=True)
-def _cover(place: F4, labels: I4, half: float, size: tuple[int, int], boxes: I4) -> I4:
+def _cover(projections: F4, labels: I4, half: float, size: tuple[int, int], boxes: I4) -> I4:
     """Return the square of image pixels whose centres each depth pixel covers.
 
     Squares are (n, 4) left, top, right + 1, bottom + 1; zeros outside the image. ``boxes`` is set
-    to the box around the squares of each label. ``place`` is from `_project_pixels`; ``half`` is
-    half the colour pixels per depth pixel at equal distance.
+    to the box around the squares of each label. ``projections`` is from `_project_pixels`;
+    ``half`` is half the colour pixels per depth pixel at equal distance.
     """
     nought, one = np.float32(0), np.float32(1)
     width, height = np.float32(size[0]), np.float32(size[1])
     squares = np.zeros((labels.size, 4), np.int32)
     boxes[:, 0], boxes[:, 1] = size
     for i in range(labels.size):
-        x, y, near = place[0, i], place[1, i], place[2, i]
-        reach = half * place[3, i] * near + np.float32(_FOOTPRINT_PX)
+        x, y, inverse_depth = projections[0, i], projections[1, i], projections[2, i]
+        half_width = half * projections[3, i] * inverse_depth + np.float32(_FOOTPRINT_PX)
         # A cast to int rounds towards 0.
-        left, right = int(max(x - reach + one, nought)), int(min(x + reach + one, width))
-        top, bottom = int(max(y - reach + one, nought)), int(min(y + reach + one, height))
-        if near > nought and left < right and top < bottom:
+        left, right = int(max(x - half_width + one, nought)), int(min(x + half_width + one, width))
+        top, bottom = int(max(y - half_width + one, nought)), int(min(y + half_width + one, height))
+        if inverse_depth > nought and left < right and top < bottom:
             square, box = squares[i], boxes[labels[i]]
             square[0], square[1], square[2], square[3] = left, top, right, bottom
             box[0], box[1] = min(box[0], left), min(box[1], top)
@@ -249,19 +255,24 @@ def _window(boxes: I4, margin: int, size: tuple[int, int]) -> tuple[int, int, in
 
 @kernel(inner=True)
 def _paint(
-    squares: I4, labels: I4, near: F4, corner: tuple[int, int], nearest: F4, seen: I4
+    squares: I4,
+    labels: I4,
+    inverse_depth: F4,
+    corner: tuple[int, int],
+    nearest: F4,
+    splat: I4,
 ) -> None:
     """Paint the labels of squares into the window at ``corner``, where they are the nearest.
 
-    ``near`` (n,) and ``nearest`` (h, w) are inverse depths.
+    ``inverse_depth`` (n,) and ``nearest`` (h, w) are inverse depths.
     """
     left, top = corner
     for i in range(labels.size):
         for v in range(squares[i, 1] - top, squares[i, 3] - top):
             for u in range(squares[i, 0] - left, squares[i, 2] - left):
-                if near[i] > nearest[v, u]:
-                    nearest[v, u] = near[i]
-                    seen[v, u] = labels[i]
+                if inverse_depth[i] > nearest[v, u]:
+                    nearest[v, u] = inverse_depth[i]
+                    splat[v, u] = labels[i]
 
 
 @kernel(inner=True)
@@ -274,23 +285,23 @@ def _nearest_surface(around: F4, corner: tuple[int, int], cell: int, shape: tupl
     left, top, per_cell = np.float32(corner[0]), np.float32(corner[1]), np.float32(1 / cell)
     front = np.zeros((shape[0] // cell + 1, shape[1] // cell + 1), np.float32)
     for i in range(around.shape[1]):
-        near, column, row = around[2, i], around[0, i] - left, around[1, i] - top
-        if near > 0 and 0 <= column < width and 0 <= row < height:
+        inverse_depth, column, row = around[2, i], around[0, i] - left, around[1, i] - top
+        if inverse_depth > 0 and 0 <= column < width and 0 <= row < height:
             y, x = int(row * per_cell), int(column * per_cell)
-            front[y, x] = max(front[y, x], near)
+            front[y, x] = max(front[y, x], inverse_depth)
     return front
 
 
 @kernel(inner=True)
-def _hide(front: F4, cell: int, boxes: I4, nearest: F4, seen: I4) -> None:
+def _hide(front: F4, cell: int, boxes: I4, nearest: F4, splat: I4) -> None:
     """Set the label of pixels in boxes to 0 where the front of their cell is nearer."""
-    limit, share = np.zeros(seen.shape[1], np.float32), np.float32(1 - _HIDDEN)
+    limit, share = np.zeros(splat.shape[1], np.float32), np.float32(1 - _HIDDEN)
     for k in range(boxes.shape[0]):
         left, top, right, bottom = boxes[k, 0], boxes[k, 1], boxes[k, 2], boxes[k, 3]
         for v in range(top, bottom):
             if v == top or v % cell == 0:
                 for x in range(left // cell, (right - 1) // cell + 1):
                     limit[x * cell : (x + 1) * cell] = front[v // cell, x] * share
-            labels, own = seen[v], nearest[v]
+            labels, nearest_row = splat[v], nearest[v]
             for u in range(left, right):
-                labels[u] = 0 if limit[u] > own[u] else labels[u]
+                labels[u] = 0 if limit[u] > nearest_row[u] else labels[u]

@@ -103,20 +103,20 @@ def fuse_boxes(views: BoxViews, weights: F8, posterior: F8, categories: Sequence
     first = _resting(views.centers, weights)
     still = np.flatnonzero(_near(views.centers, views.centers[first]))
     still = still[_not_turned(views.axes[still], views.sizes[still], weights[still])]
-    some, own = BoxViews(*(values[still] for values in views)), weights[still]
-    base, origin = _mean_axes(some.axes, some.sizes, own), views.centers[first]
-    seen, facing = _overlaid(some, own, origin, base)
-    plan = footprint(seen, facing, posterior, categories)
-    places = (some.centers - origin) @ base
-    height = float(_median(some.sizes[:, 2:], own)[0])
-    bottom = float(_median(places[:, 2:] - some.sizes[:, 2:] / 2, own)[0])
-    std = np.array([*plan.std, _median(some.stds[:, 2:], own)[0]])
+    selected, selected_weights = BoxViews(*(values[still] for values in views)), weights[still]
+    base, origin = _mean_axes(selected.axes, selected.sizes, selected_weights), views.centers[first]
+    outline, facing = _overlaid(selected, selected_weights, origin, base)
+    plan = footprint(outline, facing, posterior, categories)
+    positions = (selected.centers - origin) @ base
+    height = float(_median(selected.sizes[:, 2:], selected_weights)[0])
+    bottom = float(_median(positions[:, 2:] - selected.sizes[:, 2:] / 2, selected_weights)[0])
+    std = np.array([*plan.std, _median(selected.stds[:, 2:], selected_weights)[0]])
     return FusedBox(
         origin,
         origin + base @ (*plan.center, bottom + height / 2),
         base @ _about_z(plan.side * 2 * np.pi / DIRECTIONS),
         np.array([*plan.size, height]),
-        std * np.sqrt(_COMMON + (1 - _COMMON) / len(own)),
+        std * np.sqrt(_COMMON + (1 - _COMMON) / len(selected_weights)),
     )
 
 
@@ -125,13 +125,13 @@ def _resting(centers: F8, weights: F8) -> int:
 
     Between two places, a carried object is not on its support, from which boxes are estimated.
     """
-    away = np.linalg.norm(centers - _median(centers, weights), axis=1)
-    first = int(away.argmin())
+    distances = np.linalg.norm(centers - _median(centers, weights), axis=1)
+    first = int(distances.argmin())
     total = weights.sum()
     if weights[_near(centers, centers[first])].sum() >= 0.5 * total:
         return first
     around = [weights[_near(centers, center)].sum() for center in centers]
-    return int(np.lexsort((away, -np.array(around)))[0])
+    return int(np.lexsort((distances, -np.array(around)))[0])
 
 
 def _near(centers: F8, place: F8) -> Bool:
@@ -141,20 +141,23 @@ def _near(centers: F8, place: F8) -> Bool:
 
 def _not_turned(axes: F8, sizes: F8, weights: F8) -> Bool:
     """Return in which views (k,) an object that stands in one place has its most usual yaw."""
-    found = np.ones(len(axes), np.bool_)
-    most, longer = 0.0, _elongation(sizes)
+    result = np.ones(len(axes), np.bool_)
+    best_weight, elongation = 0.0, _elongation(sizes)
     for k in np.unique(np.linspace(0, len(axes) - 1, _TRIED).astype(np.int64)).tolist():
-        near = slice(max(0, k - _NEIGHBOURS), k + _NEIGHBOURS + 1)
-        base = _mean_axes(axes[near], sizes[near], weights[near])
-        angle, own = _yaws(base, axes[near]), longer[near]
-        along, most_along = np.mean(own * np.cos(2 * angle)), np.mean(abs(own))
+        window = slice(max(0, k - _NEIGHBOURS), k + _NEIGHBOURS + 1)
+        base = _mean_axes(axes[window], sizes[window], weights[window])
+        angle, local_elongation = _yaws(base, axes[window]), elongation[window]
+        along, most_along = (
+            np.mean(local_elongation * np.cos(2 * angle)),
+            np.mean(abs(local_elongation)),
+        )
         turning = np.mean(np.cos(4 * angle)) < _STEADY or (
             most_along > _ROUND and abs(along) < _STEADY * most_along
         )
-        same = ~_turned_from(base, float(along), axes, sizes)
-        if not turning and weights[same].sum() > most:
-            found, most = same, weights[same].sum()
-    return found
+        unturned = ~_turned_from(base, float(along), axes, sizes)
+        if not turning and weights[unturned].sum() > best_weight:
+            result, best_weight = unturned, weights[unturned].sum()
+    return result
 
 
 def _turned_from(base: F8, elongation: float, axes: F8, sizes: F8) -> Bool:
@@ -201,20 +204,20 @@ def _overlaid(views: BoxViews, weights: F8, origin: F8, base: F8) -> tuple[F8, F
     Both are (96,), from the first of the axes ``base`` to the second.
     """
     around = _turned(views.outlines, _yaws(base, views.axes))
-    places = (views.centers - origin) @ base
-    reached = around + places[:, :1] * COSINES + places[:, 1:2] * SINES
+    positions = (views.centers - origin) @ base
+    outlines = around + positions[:, :1] * COSINES + positions[:, 1:2] * SINES
     facing = faced(((views.sensors - origin) @ base)[:, :2])
-    each = weights[:, None] * np.where(facing, 1.0, _UNSEEN)
+    view_weights = weights[:, None] * np.where(facing, 1.0, _UNSEEN)
     # The outline of a partial view is smaller: it must not outvote complete views.
-    whole = weights >= weights.max()
-    shown = _median(reached[whole], each[whole])
-    reached = np.where(whole[:, None], reached, np.maximum(reached, shown))
+    complete = weights >= weights.max()
+    complete_outline = _median(outlines[complete], view_weights[complete])
+    outlines = np.where(complete[:, None], outlines, np.maximum(outlines, complete_outline))
     share = (weights[:, None] * facing).sum(axis=0) / weights.sum()
-    seen = _median(reached, each)
+    median = _median(outlines, view_weights)
     # Of a thin object that moves a little, opposite sides may come from views that exclude each
     # other.
-    least = _NARROWEST * _widths(reached).min(axis=0)
-    return seen + np.maximum(least - _widths(seen), 0.0) / 2, share
+    min_width = _NARROWEST * _widths(outlines).min(axis=0)
+    return median + np.maximum(min_width - _widths(median), 0.0) / 2, share
 
 
 def _widths(outlines: F8) -> F8:
@@ -234,9 +237,9 @@ def _turned(outlines: F8, angles: F8) -> F8:
 
 def _alike(axes: F8, sizes: F8, size: F8) -> F8:
     """Return axes (k, 3, 3), turned by 90 degrees where ``size`` has length and width swapped."""
-    other = (sizes[:, 0] < sizes[:, 1]) != (size[0] < size[1])
+    swapped = (sizes[:, 0] < sizes[:, 1]) != (size[0] < size[1])
     quarter = np.array([[0.0, -1, 0], [1, 0, 0], [0, 0, 1]])
-    return np.where(other[:, None, None], axes @ quarter, axes)
+    return np.where(swapped[:, None, None], axes @ quarter, axes)
 
 
 def _about_z(angle: float) -> F8:
@@ -250,5 +253,5 @@ def _median(values: F8, weights: F8) -> F8:
     order = np.argsort(values, axis=0, kind="stable")
     summed = np.cumsum(np.take_along_axis(weights, order, 0), axis=0)
     at = np.argmax(summed >= 0.5 * summed[-1], axis=0)
-    found = np.take_along_axis(order, at[None], 0)
-    return np.asarray(np.take_along_axis(values, found, 0)[0])
+    chosen = np.take_along_axis(order, at[None], 0)
+    return np.asarray(np.take_along_axis(values, chosen, 0)[0])

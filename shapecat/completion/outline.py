@@ -51,23 +51,23 @@ def support_function(
         corrected in proportion.
     cosines, sines : (k,) the directions.
     """
-    most = 0
+    max_skipped = 0
     for count in strays:
-        most = max(most, count)
-    result, highest = np.zeros(cosines.size), np.zeros(most + 1, np.float32)
+        max_skipped = max(max_skipped, count)
+    result, highest = np.zeros(cosines.size), np.zeros(max_skipped + 1, np.float32)
     for k in range(cosines.size):
         a, b = np.float32(cosines[k]), np.float32(sines[k])
         first = highest.size - 1 - strays[k]
         highest[first:] = -np.inf
-        least = highest[first]
+        threshold = highest[first]
         for i in range(x.size):
             value = a * x[i] + b * y[i]
-            if value > least:
+            if value > threshold:
                 _replace_smallest(highest, first, value)
-                least = highest[first]
-        result[k] = least
+                threshold = highest[first]
+        result[k] = threshold
         if noise > 0:
-            result[k] -= _overshoot(x, y, a, b, least, noise, flat)
+            result[k] -= _overshoot(x, y, a, b, threshold, noise, flat)
     return result
 
 
@@ -92,7 +92,7 @@ def _replace_smallest(ascending: F4, first: int, value: float) -> None:
     ascending[at - 1] = value
 
 
-def fit_oval(reached: F8, seen: F8, roundness: float) -> tuple[F8, float, float]:
+def fit_oval(outline: F8, facing_weights: F8, roundness: float) -> tuple[F8, float, float]:
     """Fit an oval to an outline that is seen from one side, by robust least squares.
 
     A direction that faces no sensor counts only if the outline reaches the oval there, as the far
@@ -100,8 +100,8 @@ def fit_oval(reached: F8, seen: F8, roundness: float) -> tuple[F8, float, float]
 
     Parameters
     ----------
-    reached : (`DIRECTIONS`,) metres, from `support_function`.
-    seen : (`DIRECTIONS`,) weight of each direction, 0 for those that face no sensor.
+    outline : (`DIRECTIONS`,) metres, from `support_function`.
+    facing_weights : (`DIRECTIONS`,) weight of each direction, 0 for those that face no sensor.
     roundness : weight of the prior for a circle, as a number of directions.
 
     Returns
@@ -109,24 +109,24 @@ def fit_oval(reached: F8, seen: F8, roundness: float) -> tuple[F8, float, float]
     The support function (`DIRECTIONS`,) of the oval, its mean radius, and the root mean square
     deviation of the directions that face a sensor; metres.
     """
-    rows = np.ones((5, reached.size))
+    rows = np.ones((5, outline.size))
     rows[0], rows[1] = COSINES, SINES
     rows[3], rows[4] = COSINES**2 - SINES**2, 2 * COSINES * SINES
-    weights = seen.copy()
-    oval: F8 = np.zeros(reached.size)
+    weights = facing_weights.copy()
+    oval: F8 = np.zeros(outline.size)
     x: F8 = np.zeros(5)
     for _ in range(_ROUNDS):
         A = (rows * weights) @ rows.T
         A[3, 3] += roundness
         A[4, 4] += roundness
-        x = np.linalg.solve(A, (rows * weights) @ reached)
+        x = np.linalg.solve(A, (rows * weights) @ outline)
         oval = x @ rows
         limit = _OUTLIER * abs(x[2]) + 1e-9
-        off = reached - oval
-        known = np.where(seen > 0, seen, off > -limit)
-        weights = known * np.minimum(1.0, limit / np.maximum(np.abs(off), 1e-12))
-    facing = seen > 0
-    off = (reached - oval)[facing]
+        off = outline - oval
+        reached = np.where(facing_weights > 0, facing_weights, off > -limit)
+        weights = reached * np.minimum(1.0, limit / np.maximum(np.abs(off), 1e-12))
+    facing = facing_weights > 0
+    off = (outline - oval)[facing]
     return oval, float(x[2]), float(np.sqrt((off * off).mean()))
 
 
@@ -136,12 +136,12 @@ def narrowest(reached: F8) -> int:
 
     ``reached`` (`DIRECTIONS`,) is the support function, metres.
     """
-    best, least = 0, np.inf
+    best, smallest_area = 0, np.inf
     for k in range(QUARTER):
         length = reached[k] + reached[k + _HALF]
         width = reached[k + QUARTER] + reached[(k + 3 * QUARTER) % DIRECTIONS]
-        if length * width < least - 1e-9:
-            best, least = k, length * width
+        if length * width < smallest_area - 1e-9:
+            best, smallest_area = k, length * width
     return best
 
 

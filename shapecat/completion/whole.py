@@ -105,16 +105,16 @@ def complete(
     ------
     ValueError : ``points`` is empty.
     """
-    some, level = levelled(points[:: max(1, -(-len(points) // ENOUGH_POINTS))], up)
-    some[:, 2] -= np.float32(offset)
-    facing = faced(-some[:, :2].mean(axis=0, dtype=np.float64))
-    seen = _visible_outline(some, facing, categories[int(np.argmax(posterior))])
-    plan = footprint(seen, facing.astype(np.float64), posterior, categories)
-    bottom, lowest, top = _bounds(some[:, 2])
+    levelled_points, level = levelled(points[:: max(1, -(-len(points) // ENOUGH_POINTS))], up)
+    levelled_points[:, 2] -= np.float32(offset)
+    facing = faced(-levelled_points[:, :2].mean(axis=0, dtype=np.float64))
+    outline = _visible_outline(levelled_points, facing, categories[int(np.argmax(posterior))])
+    plan = footprint(outline, facing.astype(np.float64), posterior, categories)
+    bottom, lowest, top = _bounds(levelled_points[:, 2])
     c, s = COSINES[plan.side], SINES[plan.side]
     sensor_from_box = (np.array([[c, s, 0.0], [-s, c, 0.0], [0.0, 0.0, 1.0]]) @ level).T
     x, y = plan.center
-    around = seen - x * COSINES - y * SINES
+    around = outline - x * COSINES - y * SINES
     return FullBox(
         level.T @ (x, y, (bottom + top) / 2 + offset),
         np.array([*plan.size, max(top - bottom, _THINNEST_M)]),
@@ -133,7 +133,7 @@ def faced(toward: F8) -> Bool:
     return np.asarray(x * COSINES + y * SINES > _EDGEWISE * np.maximum(np.hypot(x, y), 1e-9))
 
 
-def footprint(seen: F8, facing: F8, posterior: F8, categories: Sequence[str]) -> Footprint:
+def footprint(outline: F8, facing: F8, posterior: F8, categories: Sequence[str]) -> Footprint:
     """Estimate the footprint of an object from its visible outline.
 
     For a box, the footprint is the visible outline. For other categories, it is the oval fitted to
@@ -142,23 +142,23 @@ def footprint(seen: F8, facing: F8, posterior: F8, categories: Sequence[str]) ->
 
     Parameters
     ----------
-    seen : (k,) metres, the support function of the visible points.
+    outline : (k,) metres, the support function of the visible points.
     facing : (k,) weight of each direction, 0 for those that face no sensor.
     posterior : (c,) probabilities, in the order of ``categories``.
     """
     likely = dict(zip(categories, np.asarray(posterior).tolist(), strict=True))
     category, angular = max(likely, key=likely.__getitem__), likely.get(_ANGULAR, 0.0)
     prior = _PRIORS.get(category, _OutlinePrior())
-    oval, radius, deviation = fit_oval(seen, facing, prior.roundness)
-    if category == _HANDLED and (seen - oval)[facing > 0].max() > _HANDLE * radius:
-        oval = np.maximum(oval, np.where(facing > 0, seen, oval))
-    whole = oval if deviation < prior.fits * radius else seen
-    chosen = seen if category == _ANGULAR else whole
+    oval, radius, deviation = fit_oval(outline, facing, prior.roundness)
+    if category == _HANDLED and (outline - oval)[facing > 0].max() > _HANDLE * radius:
+        oval = np.maximum(oval, np.where(facing > 0, outline, oval))
+    full_outline = oval if deviation < prior.fits * radius else outline
+    chosen = outline if category == _ANGULAR else full_outline
     side = narrowest(chosen)
     along, across, *size = rectangle(chosen, side)
-    guessed = np.subtract(size, rectangle(seen, side)[2:])
+    guessed = np.subtract(size, rectangle(outline, side)[2:])
     doubt = math.sqrt(angular * (1 - angular)) * np.subtract(
-        rectangle(whole, side)[2:], rectangle(seen, side)[2:]
+        rectangle(full_outline, side)[2:], rectangle(outline, side)[2:]
     )
     c, s = COSINES[side], SINES[side]
     return Footprint(
@@ -181,7 +181,7 @@ def _bounds(heights: F4) -> tuple[float, float, float]:
     """Return bottom, lowest visible height and top, from heights (n,) above the support, metres."""
     ascending, stray = np.sort(heights), int((1 - _TOP) * len(heights))
     lowest, top = float(ascending[stray]), float(ascending[-1 - stray])
-    near = ascending[np.searchsorted(ascending, top - _NOISY_M) :]
-    flat = min(1.0, len(near) / (_FLAT * len(ascending)))
-    top -= flat * (top - float(near[len(near) // 2]))
+    near_top = ascending[np.searchsorted(ascending, top - _NOISY_M) :]
+    flat = min(1.0, len(near_top) / (_FLAT * len(ascending)))
+    top -= flat * (top - float(near_top[len(near_top) // 2]))
     return min(0.0, top), lowest, top

@@ -59,17 +59,17 @@ def fuse(frame: Frame, earlier: Sequence[Earlier], *, range_m: float) -> Frame:
     total, count = depth.copy(), (depth > 0).astype(np.float32)
     fused = 0
     for other, pose in earlier:
-        then = other.depth
-        if then is None or other.camera != camera:
+        earlier_depth = other.depth
+        if earlier_depth is None or other.camera != camera:
             continue
         homography, shift = _homography(camera, IDENTITY if pose is None else pose)
-        if _agreeing_share(expected, then, homography, shift) < LEAST_SHARE:
+        if _agreeing_share(expected, earlier_depth, homography, shift) < LEAST_SHARE:
             continue
         fused += 1
         if np.allclose(homography, np.eye(3), atol=1e-5) and np.abs(shift).max() < 0.01:
-            _add_unmoved(expected, then, total, count)
+            _add_unmoved(expected, earlier_depth, total, count)
         else:
-            _add_moved(expected, then, homography, shift, total, count)
+            _add_moved(expected, earlier_depth, homography, shift, total, count)
     if not fused:
         return frame
     return replace(frame, depth=total / np.maximum(count, 1))
@@ -79,11 +79,11 @@ def drop_missing_depth(scene: Scene, frame: Frame) -> Scene:
     """Remove from the candidates of a scene the pixels where the frame itself has no depth."""
     if frame.depth is None:
         return scene
-    seen = frame.depth.reshape(-1) > 0
+    measured = frame.depth.reshape(-1) > 0
     return replace(
         scene,
         candidates=tuple(
-            replace(item, indices=item.indices[seen[item.indices]]) for item in scene.candidates
+            replace(item, indices=item.indices[measured[item.indices]]) for item in scene.candidates
         ),
     )
 
@@ -151,23 +151,23 @@ def _add_unmoved(expected: F4, earlier: F4, total: F4, count: F4) -> None:
     agree, jump = np.float32(AGREE), np.float32(DISCONTINUITY)
     zero, one = np.float32(0), np.float32(1)
     for v in range(expected.shape[0]):
-        row, then, sums, counts = expected[v], earlier[v], total[v], count[v]
-        for u in range(row.size):
-            g, read = row[u], then[u]
+        expected_row, earlier_row, sums, counts = expected[v], earlier[v], total[v], count[v]
+        for u in range(expected_row.size):
+            g, read = expected_row[u], earlier_row[u]
             z = abs(g)
             limit = (agree if g > 0 else jump) * z * read
-            same = (read > 0) & (z > 0) & (abs(read - z) <= limit)
-            sums[u] += read if same else zero
-            counts[u] += one if same else zero
-            row[u] = read if same & (g < 0) else g
+            agrees = (read > 0) & (z > 0) & (abs(read - z) <= limit)
+            sums[u] += read if agrees else zero
+            counts[u] += one if agrees else zero
+            expected_row[u] = read if agrees & (g < 0) else g
 
 
 @kernel
 def _add_moved(expected: F4, earlier: F4, homography: F4, shift: F4, total: F4, count: F4) -> None:
     """Add the earlier depths that agree; a hole that gets one becomes a depth in ``expected``."""
     agree, jump = np.float32(AGREE), np.float32(DISCONTINUITY)
-    places = np.zeros((3, expected.shape[1]), np.float32)
-    x, y, z = places[0], places[1], places[2]
+    coordinates = np.zeros((3, expected.shape[1]), np.float32)
+    x, y, z = coordinates[0], coordinates[1], coordinates[2]
     for v in range(expected.shape[0]):
         row = expected[v]
         _project_row(row, v, homography, shift, x, y, z)
@@ -179,23 +179,23 @@ def _add_moved(expected: F4, earlier: F4, homography: F4, shift: F4, total: F4, 
             # A surface may slope between a hole and its neighbour.
             limit = (agree if g > 0 else jump) * z[u] * read
             if (read > 0) & (abs(read - z[u]) <= limit):
-                found = abs(g) * (read / z[u])
-                total[v, u] += found
+                estimate = abs(g) * (read / z[u])
+                total[v, u] += estimate
                 count[v, u] += np.float32(1)
                 if g < 0:
-                    row[u] = found
+                    row[u] = estimate
 
 
 @kernel(inner=True)
 def _project_row(depths: F4, v: int, homography: F4, shift: F4, x: F4, y: F4, z: F4) -> None:
     """Write column x, row y and depth z, in the earlier image, of the points of row ``v``."""
-    least = np.float32(NEAREST_M)
+    min_depth = np.float32(NEAREST_M)
     row = np.float32(v)
     a, b = homography[0, 1] * row + homography[0, 2], homography[1, 1] * row + homography[1, 2]
     c = homography[2, 1] * row + homography[2, 2]
     for u in range(depths.size):
         depth, column = abs(depths[u]), np.float32(u)
-        z[u] = max(depth * (homography[2, 0] * column + c) + shift[2], least)
+        z[u] = max(depth * (homography[2, 0] * column + c) + shift[2], min_depth)
         inverse = np.float32(1) / z[u]
         x[u] = (depth * (homography[0, 0] * column + a) + shift[0]) * inverse
         y[u] = (depth * (homography[1, 0] * column + b) + shift[1]) * inverse

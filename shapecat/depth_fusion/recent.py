@@ -48,9 +48,9 @@ class RecentFrames:
         recent = self._recent.setdefault(frame.topic, deque(maxlen=self._kept))
         if recent and not _follows(frame, fixed_from_sensor, *recent[0]):
             recent.clear()
-        found = tuple(Earlier(f, _relative(p, fixed_from_sensor)) for f, p in recent)
+        earlier = tuple(Earlier(f, _relative(p, fixed_from_sensor)) for f, p in recent)
         recent.appendleft((frame, fixed_from_sensor))
-        return found
+        return earlier
 
     def warnings(self) -> list[str]:
         """Return warnings for the user about the frames so far."""

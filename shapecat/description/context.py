@@ -274,16 +274,16 @@ def _heights(level: F8, weight: F4, curvatures: F4, out: F4) -> None:
 def _around(euclidean: F4, geodesic: F4, out: F4) -> None:
     """Compare distances along the surface with Euclidean distances."""
     count = geodesic.shape[0]
-    total = direct = longest = most = 0.0
-    least = np.inf
+    total = direct = longest = max_sum = 0.0
+    min_sum = np.inf
     for i in range(count):
-        row = 0.0
+        row_sum = 0.0
         for j in range(count):
-            row += geodesic[i, j]
+            row_sum += geodesic[i, j]
             direct += euclidean[i, j]
             longest = max(longest, geodesic[i, j])
-        total += row
-        least, most = min(least, row), max(most, row)
+        total += row_sum
+        min_sum, max_sum = min(min_sum, row_sum), max(max_sum, row_sum)
     out[0] = min(total / max(direct, 1e-9), 4.0)
     out[1] = longest / max(total / (count * (count - 1)), 1e-9)
-    out[2] = _ratio(least, most)
+    out[2] = _ratio(min_sum, max_sum)

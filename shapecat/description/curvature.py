@@ -12,15 +12,15 @@ _RIDGE = 1e-3
 
 
 @kernel(fast=True)
-def assign(points: F4, x: F4, y: F4, z: F4, reach: float) -> tuple[F4, I4]:
+def assign(points: F4, x: F4, y: F4, z: F4, max_distance: float) -> tuple[F4, I4]:
     """Sort points by their nearest neuron.
 
     Parameters
     ----------
     points : (3, n) coordinates.
     x, y, z : (k,) positions of the neurons.
-    reach : greatest distance of a point from its neuron, in the same unit. Farther points are
-        dropped: they belong to a part of the object that the graph does not cover.
+    max_distance : of a point from its neuron, in the same unit. Farther points are dropped: they
+        belong to a part of the object that the graph does not cover.
 
     Returns
     -------
@@ -34,7 +34,7 @@ def assign(points: F4, x: F4, y: F4, z: F4, reach: float) -> tuple[F4, I4]:
     mask = np.int32(mask - 1)
     keep = np.int32(~mask)
     lane = np.arange(count).astype(np.int32)
-    limit = np.float32(reach * reach)
+    limit = np.float32(max_distance * max_distance)
     nearest = np.zeros(total, np.int32)
     starts = np.zeros(count + 1, np.int64)
     for k in range(total):
@@ -95,14 +95,14 @@ def fit_surfaces(
     count, total = x.size, points.shape[1]
     normals = np.zeros((3, count), np.float32)
     curvatures = np.zeros((2, count), np.float32)
-    reach = np.zeros(count, np.float32)
+    cell_radius = np.zeros(count, np.float32)
     for i in range(count):
         for k in range(starts[i], starts[i + 1]):
             dx, dy, dz = points[0, k] - x[i], points[1, k] - y[i], points[2, k] - z[i]
             squared = dx * dx + dy * dy + dz * dz
-            reach[i] = squared if squared > reach[i] else reach[i]
+            cell_radius[i] = squared if squared > cell_radius[i] else cell_radius[i]
     for i in range(count):
-        reach[i] = np.sqrt(reach[i])
+        cell_radius[i] = np.sqrt(cell_radius[i])
     u = np.zeros(total, np.float32)
     v = np.zeros(total, np.float32)
     w = np.zeros(total, np.float32)
@@ -110,22 +110,22 @@ def fit_surfaces(
     zero, one = np.uint64(0), np.uint64(1)
     for i in range(count):
         px, py, pz = x[i], y[i], z[i]
-        found = zero  # unsigned: no check for negative indices
+        written = zero  # unsigned: no check for negative indices
         for j in range(count):
-            if euclidean[i, j] >= radius + reach[j]:
+            if euclidean[i, j] >= radius + cell_radius[j]:
                 continue
             for k in range(np.uint64(starts[j]), np.uint64(starts[j + 1])):
                 du = (points[0, k] - px) * scale
                 dv = (points[1, k] - py) * scale
                 dw = (points[2, k] - pz) * scale
-                u[found], v[found], w[found] = du, dv, dw
-                found += one if du * du + dv * dv + dw * dw < np.float32(1) else zero
-        near = np.int64(found)
+                u[written], v[written], w[written] = du, dv, dw
+                written += one if du * du + dv * dv + dw * dw < np.float32(1) else zero
+        n = np.int64(written)
         ex, ey, ez = eye[0] - x[i], eye[1] - y[i], eye[2] - z[i]
-        a, b, c = _normal(u, v, w, near, ex, ey, ez)
+        a, b, c = _normal(u, v, w, n, ex, ey, ez)
         first, second = np.float32(0), np.float32(0)
-        if near >= 6:
-            first, second, a, b, c = _quadric(u, v, w, near, a, b, c)
+        if n >= 6:
+            first, second, a, b, c = _quadric(u, v, w, n, a, b, c)
         if a * ex + b * ey + c * ez < 0:
             a, b, c, first, second = -a, -b, -c, -second, -first
         normals[0, i], normals[1, i], normals[2, i] = a, b, c
@@ -135,11 +135,11 @@ def fit_surfaces(
 
 @kernel(fast=True, inline=True)
 def _normal(
-    u: F4, v: F4, w: F4, near: int, ex: float, ey: float, ez: float
+    u: F4, v: F4, w: F4, n_points: int, ex: float, ey: float, ez: float
 ) -> tuple[float, float, float]:
     """Return the direction of least variance; if there is none, that of (ex, ey, ez)."""
     su = sv = sw = suu = suv = suw = svv = svw = sww = np.float32(0)
-    for k in range(near):
+    for k in range(n_points):
         a, b, c = u[k], v[k], w[k]
         su += a
         sv += b
@@ -150,7 +150,7 @@ def _normal(
         svv += b * b
         svw += b * c
         sww += c * c
-    n = max(near, 1)
+    n = max(n_points, 1)
     xx, xy, xz = suu / n - su * su / n / n, suv / n - su * sv / n / n, suw / n - su * sw / n / n
     yy, yz, zz = svv / n - sv * sv / n / n, svw / n - sv * sw / n / n, sww / n - sw * sw / n / n
     # Smallest eigenvalue of a symmetric 3x3 matrix in closed form (Smith 1961).
@@ -164,9 +164,9 @@ def _normal(
             bx * (by * bz - cyz * cyz) - cxy * (cxy * bz - cyz * cxz) + cxz * (cxy * cyz - by * cxz)
         )
         half = min(1.0, max(-1.0, det / 2))
-        least = mean + 2 * p * np.cos(np.arccos(half) / 3 + 2 * np.pi / 3)
+        smallest = mean + 2 * p * np.cos(np.arccos(half) / 3 + 2 * np.pi / 3)
         # Its eigenvector is the longest cross product of two rows of (matrix - least).
-        xx, yy, zz = (xx - least) / p, (yy - least) / p, (zz - least) / p
+        xx, yy, zz = (xx - smallest) / p, (yy - smallest) / p, (zz - smallest) / p
         xy, xz, yz = cxy, cxz, cyz
         a1, b1, c1 = xy * yz - xz * yy, xz * xy - xx * yz, xx * yy - xy * xy
         a2, b2, c2 = xy * zz - xz * yz, xz * xz - xx * zz, xx * yz - xy * xz
@@ -199,7 +199,7 @@ def _normal(
 
 @kernel(fast=True, inline=True)
 def _quadric(
-    u: F4, v: F4, w: F4, near: int, a: float, b: float, c: float
+    u: F4, v: F4, w: F4, n_points: int, a: float, b: float, c: float
 ) -> tuple[float, float, float, float, float]:
     """Return the principal curvatures (largest first) and the normal at the origin.
 
@@ -215,7 +215,7 @@ def _quadric(
     m10 = m01 = m20 = m11 = m02 = m30 = m21 = m12 = m03 = np.float32(0)
     m40 = m31 = m22 = m13 = m04 = np.float32(0)
     h00 = h10 = h01 = h20 = h11 = h02 = np.float32(0)
-    for k in range(near):
+    for k in range(n_points):
         p = t1x * u[k] + t1y * v[k] + t1z * w[k]
         q = t2x * u[k] + t2y * v[k] + t2z * w[k]
         h = nx * u[k] + ny * v[k] + nz * w[k]
@@ -242,7 +242,7 @@ def _quadric(
         h02 += h * qq
     # Normal equations of h = c0 + c1 p + c2 q + c3 p^2 + c4 pq + c5 q^2. The ridge on c4 is half
     # the others, as c3^2 + c4^2/2 + c5^2 does not depend on the choice of tangents.
-    n = np.float64(near)
+    n = np.float64(n_points)
     ridge = _RIDGE * n
     A = np.zeros((6, 7))
     A[0, 0] = n + ridge

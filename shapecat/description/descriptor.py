@@ -225,12 +225,12 @@ def _height_range(z: F4) -> tuple[float, float]:
         bins[min(int((z[k] - low) * scale), 255)] += 1
     limit = z.size * 0.02
     first, last = 0, 255
-    seen = bins[0]
-    while seen <= limit:
+    cumulative = bins[0]
+    while cumulative <= limit:
         first += 1
-        seen += bins[first]
-    seen = bins[255]
-    while seen <= limit:
+        cumulative += bins[first]
+    cumulative = bins[255]
+    while cumulative <= limit:
         last -= 1
-        seen += bins[last]
+        cumulative += bins[last]
     return low + first / scale, low + (last + 1) / scale

@@ -23,15 +23,15 @@ def solve(A: F8, b: F8) -> None:
     """
     size = b.size
     for k in range(size):
-        own = A[k, k]
+        pivot = A[k, k]
         for j in range(k):
             A[k, j] = 0.0
-        if not own > 0.0:
+        if not pivot > 0.0:
             A[k, :] = 0.0
             b[k] = 0.0
             continue
         for i in range(k + 1, size):
-            factor = A[i, k] / own
+            factor = A[i, k] / pivot
             before = A[i, i]
             for j in range(k, size):
                 A[i, j] -= factor * A[k, j]

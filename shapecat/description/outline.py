@@ -87,23 +87,23 @@ def _widths(
     """Write width and offset of each slice; return the relative length, and the filled share."""
     low, high = inner_range(along)
     length = max(high - low, 1e-6)
-    least, most = np.zeros(OUTLINE_SLICES), np.zeros(OUTLINE_SLICES)
-    least[:], most[:] = np.inf, -np.inf
+    left, right = np.zeros(OUTLINE_SLICES), np.zeros(OUTLINE_SLICES)
+    left[:], right[:] = np.inf, -np.inf
     for i in range(along.size):
         k = min(max(int((along[i] - low) / length * OUTLINE_SLICES), 0), OUTLINE_SLICES - 1)
-        least[k], most[k] = min(least[k], across[i]), max(most[k], across[i])
+        left[k], right[k] = min(left[k], across[i]), max(right[k], across[i])
     widest, middle, total, lean = 1e-6, 0.0, 0.0, 0.0
     for k in range(OUTLINE_SLICES):
-        width = max(most[k] - least[k], 0.0)
+        width = max(right[k] - left[k], 0.0)
         if width > 0:
             widest = max(widest, width)
-            middle += width * (most[k] + least[k]) / 2
+            middle += width * (right[k] + left[k]) / 2
             total += width
             lean += width * (k - 0.5 * (OUTLINE_SLICES - 1))
     middle /= max(total, 1e-6)
     for k in range(OUTLINE_SLICES):
         source = OUTLINE_SLICES - 1 - k if to_narrow and lean > 0 else k
-        if most[source] > least[source]:
-            out[2 * k] = (most[source] - least[source]) / widest
-            out[2 * k + 1] = abs((most[source] + least[source]) / 2 - middle) / widest
+        if right[source] > left[source]:
+            out[2 * k] = (right[source] - left[source]) / widest
+            out[2 * k + 1] = abs((right[source] + left[source]) / 2 - middle) / widest
     return length / (length + widest), total / OUTLINE_SLICES / widest

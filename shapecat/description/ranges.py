@@ -27,16 +27,16 @@ def inner_range(values: F4) -> tuple[float, float]:
         bins[int((values[k] - low) * scale)] += 1
     limit = _OUTSIDE * values.size
     first, last = 0, _BINS - 1
-    seen = bins[0]
-    while seen < limit:
+    cumulative = bins[0]
+    while cumulative < limit:
         first += 1
-        seen += bins[first]
-    below = first + 1 - (seen - limit) / bins[first]
-    seen = bins[last]
-    while seen < limit:
+        cumulative += bins[first]
+    below = first + 1 - (cumulative - limit) / bins[first]
+    cumulative = bins[last]
+    while cumulative < limit:
         last -= 1
-        seen += bins[last]
-    above = last + (seen - limit) / bins[last]
+        cumulative += bins[last]
+    above = last + (cumulative - limit) / bins[last]
     return low + below / scale, low + above / scale
 
 

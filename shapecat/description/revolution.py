@@ -71,10 +71,10 @@ def revolution(surface: Surface, normals: F4, axis: F8, point: F8, foot: F8, out
     facing = (axis[0] * eye[0] + axis[1] * eye[1] + axis[2] * eye[2]) / max(distance, 1e-6)
     out[6] = -facing if lean > 0 else facing
     for k in range(REVOLUTION_SLICES):
-        own = REVOLUTION_SLICES - 1 - k if lean > 0 else k
+        slice_id = REVOLUTION_SLICES - 1 - k if lean > 0 else k
         at = 7 + 4 * k
-        out[at], out[at + 1] = slices[own, 0], slices[own, 1] / widest
-        out[at + 2], out[at + 3] = min(slices[own, 2] / widest, 2.0), slices[own, 3]
+        out[at], out[at + 1] = slices[slice_id, 0], slices[slice_id, 1] / widest
+        out[at + 2], out[at + 3] = min(slices[slice_id, 2] / widest, 2.0), slices[slice_id, 3]
 
 
 @kernel
@@ -122,8 +122,8 @@ def _place(
     the fourth power of the sine of the angle between normal and axis.
     """
     rows = np.zeros((5, cloud.shape[1]))
-    reach = np.zeros(2)
-    reach[0], reach[1] = np.inf, -np.inf
+    extent = np.zeros(2)
+    extent[0], extent[1] = np.inf, -np.inf
     for i in range(cloud.shape[1]):
         x, y, z = cloud[0, i] - point[0], cloud[1, i] - point[1], cloud[2, i] - point[2]
         along = x * axis[0] + y * axis[1] + z * axis[2]
@@ -135,13 +135,13 @@ def _place(
         o = owner[i]
         cosine = normals[0, o] * axis[0] + normals[1, o] * axis[1] + normals[2, o] * axis[2]
         rows[4, i] = max(1.0 - cosine * cosine, 0.0) ** 2
-        reach[0], reach[1] = min(reach[0], along), max(reach[1], along)
-    return rows, reach
+        extent[0], extent[1] = min(extent[0], along), max(extent[1], along)
+    return rows, extent
 
 
 @kernel
-def _slice(along: float, reach: F8) -> int:
-    share = (along - reach[0]) / max(reach[1] - reach[0], 1e-6)
+def _slice(along: float, extent: F8) -> int:
+    share = (along - extent[0]) / max(extent[1] - extent[0], 1e-6)
     return min(int(share * REVOLUTION_SLICES), REVOLUTION_SLICES - 1)
 
 
@@ -152,14 +152,14 @@ def _improve(
     """Move the axis by one Gauss-Newton step; return the root mean square residual before it."""
     first, second = _across(axis)
     owner = np.arange(neurons.shape[1])
-    rows, reach = _place(neurons, owner, normals, axis, point, first, second)
+    rows, extent = _place(neurons, owner, normals, axis, point, first, second)
     for i in range(owner.size):
         rows[4, i] *= weight[i]
     means = np.zeros((REVOLUTION_SLICES, 6))  # weight, radius, derivatives
     row = np.zeros(6)
     for i in range(rows.shape[1]):
         _derivatives(rows, i, row)
-        k = _slice(rows[0, i], reach)
+        k = _slice(rows[0, i], extent)
         for j in range(6):
             means[k, j] += rows[4, i] * row[j]
     for k in range(REVOLUTION_SLICES):
@@ -169,22 +169,22 @@ def _improve(
     total = cost = size = 0.0
     for i in range(rows.shape[1]):
         _derivatives(rows, i, row)
-        own = _slice(rows[0, i], reach)
-        residual = row[1] - means[own, 1]
-        heed = rows[4, i]
+        slice_id = _slice(rows[0, i], extent)
+        residual = row[1] - means[slice_id, 1]
+        point_weight = rows[4, i]
         if abs(residual) > limit:
-            heed *= limit / abs(residual)
+            point_weight *= limit / abs(residual)
         total += rows[4, i]
         size += rows[4, i] * row[1]
-        cost += heed * residual * residual
+        cost += point_weight * residual * residual
         for j in range(free):
-            slope = row[2 + j] - means[own, 2 + j]
-            b[j] -= heed * slope * residual
+            slope = row[2 + j] - means[slice_id, 2 + j]
+            b[j] -= point_weight * slope * residual
             for k in range(free):
-                A[j, k] += heed * slope * (row[2 + k] - means[own, 2 + k])
-    pull = 0.5 * _DAMPING * (A[0, 0] + A[1, 1]) + 1e-6
+                A[j, k] += point_weight * slope * (row[2 + k] - means[slice_id, 2 + k])
+    damping = 0.5 * _DAMPING * (A[0, 0] + A[1, 1]) + 1e-6
     for j in range(free):
-        A[j, j] += pull if j < 2 else pull * (reach[1] - reach[0]) ** 2 / 12
+        A[j, j] += damping if j < 2 else damping * (extent[1] - extent[0]) ** 2 / 12
     solve(A, b)
     _move(axis, point, first, second, b, 0.5 * size / max(total, 1e-6))
     return float(np.sqrt(cost / max(total, 1e-6)))
@@ -227,12 +227,12 @@ def _measure(
     and the mean radius.
     """
     first, second = _across(axis)
-    rows, reach = _place(cloud, owner, normals, axis, point, first, second)
+    rows, extent = _place(cloud, owner, normals, axis, point, first, second)
     count = rows.shape[1]
     slices[:] = 0.0
     weights = np.zeros(REVOLUTION_SLICES)
     for i in range(count):
-        k = _slice(rows[0, i], reach)
+        k = _slice(rows[0, i], extent)
         weights[k] += rows[4, i]
         slices[k, 0] += 1.0
         slices[k, 1] += rows[4, i] * rows[1, i]
@@ -246,7 +246,7 @@ def _measure(
         slices[k, 1] = slices[k, 1] / weights[k] if weights[k] > enough else 0.0
     cost = 0.0
     for i in range(count):
-        k = _slice(rows[0, i], reach)
+        k = _slice(rows[0, i], extent)
         off = (rows[1, i] - slices[k, 1]) ** 2 * rows[4, i]
         if weights[k] > enough:
             slices[k, 2] += off / weights[k]
@@ -260,4 +260,4 @@ def _measure(
         slices[k, 2] = np.sqrt(slices[k, 2])
         slices[k, 3] /= max(slices[k, 0], 1.0)
         slices[k, 0] /= count
-    return np.sqrt(cost), reach[1] - reach[0], max(radius, 1e-3)
+    return np.sqrt(cost), extent[1] - extent[0], max(radius, 1e-3)

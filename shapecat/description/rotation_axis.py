@@ -52,17 +52,17 @@ def rotation_axis(x: F4, y: F4, z: F4, weight: F4, normals: F4) -> tuple[F8, F8,
             for k in range(3):
                 C[i, j] += B[k, i] * moment[k, j]
     values, vectors = principal_axes(C)
-    axis, foot, rest = np.zeros(3), np.zeros(3), np.zeros(3)
+    axis, foot, deviations = np.zeros(3), np.zeros(3), np.zeros(3)
     for i in range(3):
         axis[i] = vectors[i, 0]
         for j in range(3):
             foot[i] += moment[i, j] * vectors[j, 0]
-        rest[i] = np.sqrt(max(values[i], 0.0))
+        deviations[i] = np.sqrt(max(values[i], 0.0))
     point = np.zeros(3)
     for i in range(3):
         j, k = (i + 1) % 3, (i + 2) % 3
         point[i] = axis[j] * foot[k] - axis[k] * foot[j]
-    return axis, point, rest
+    return axis, point, deviations
 
 
 @kernel(inline=True)

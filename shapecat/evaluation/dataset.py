@@ -114,7 +114,7 @@ def read_view(path: Path) -> View:
     ------
     RecordingError : the file is unreadable, or its points are not one object in metres.
     """
-    points, said = _READERS[path.suffix.lower()](path)
+    points, stated_eye = _READERS[path.suffix.lower()](path)
     if points.ndim != 2 or points.shape[1] != 3:
         msg = f"{path}: points have shape {points.shape}, expected (n, 3)"
         raise RecordingError(msg)
@@ -129,7 +129,7 @@ def read_view(path: Path) -> View:
     if extent > _LARGEST_M:
         msg = f"{path}: the points extend over {extent:.0f} m; they must show one object, in metres"
         raise RecordingError(msg)
-    eye = _valid_eye(said)
+    eye = _valid_eye(stated_eye)
     if eye is None:
         eye = find_viewpoint(points)
     return View(points, eye, path.parent.parent.name, path.parent.name)

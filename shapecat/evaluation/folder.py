@@ -45,10 +45,10 @@ def evaluate_folder(
     dataset = read_dataset(root)
     require_category_names(root, dataset.categories, categorizer.categories)
     require_categories(dataset.categories, categorizer)
-    wanted = baselines is not None
+    with_baselines = baselines is not None
     if baselines is not None and baselines.resolve() != root.resolve():
         _require_other_views(dataset, root, baselines)
-    views = _described(dataset, "evaluate", observe, with_functions=wanted)
+    views = _described(dataset, "evaluate", observe, with_functions=with_baselines)
     report = evaluate(views, categorizer)
     if baselines is None:
         return report

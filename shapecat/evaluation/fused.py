@@ -50,8 +50,8 @@ def fuse_views(truth: I4, posteriors: F4, objects: np.ndarray) -> tuple[Fused, .
         ]
         if groups:
             fused = np.array([fuse(posteriors[group], "product") for group in groups])
-            own = truth[[group[0] for group in groups]]
-            right = metrics.accuracy(own, fused.argmax(axis=1))
-            ece = metrics.expected_calibration_error(own, fused)
+            true_codes = truth[[group[0] for group in groups]]
+            right = metrics.accuracy(true_codes, fused.argmax(axis=1))
+            ece = metrics.expected_calibration_error(true_codes, fused)
             result.append(Fused(count, len(groups), right, ece))
     return tuple(result)

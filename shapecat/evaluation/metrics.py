@@ -79,9 +79,9 @@ def calibration_curve(truth: I4, posteriors: F4) -> tuple[Bin, ...]:
     right = np.asarray(posteriors).argmax(axis=1) == truth if len(truth) else np.zeros(0, bool)
     place = np.minimum((confidence * _BINS).astype(np.int64), _BINS - 1)
     return tuple(
-        Bin(int(mine.sum()), float(confidence[mine].mean()), float(right[mine].mean()))
-        for mine in (place == k for k in range(_BINS))
-        if mine.any()
+        Bin(int(in_bin.sum()), float(confidence[in_bin].mean()), float(right[in_bin].mean()))
+        for in_bin in (place == k for k in range(_BINS))
+        if in_bin.any()
     )
 
 

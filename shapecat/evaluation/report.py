@@ -204,11 +204,11 @@ def _accuracy_over(values: np.ndarray, right: I4, edges: Sequence[float], unit: 
     """Return (range, views, accuracy) for each range between ``edges`` that has views."""
     rows = []
     for low, high in itertools.pairwise(edges):
-        mine = (values >= low) & (values < high)
-        if mine.any():
+        in_range = (values >= low) & (values < high)
+        if in_range.any():
             name = f"{low:g}-{high:g}{unit}" if math.isfinite(high) else f"{low:g}{unit} or more"
             name = name if math.isfinite(low) else f"below {high:g}{unit}"
-            rows.append((name, int(mine.sum()), float(right[mine].mean())))
+            rows.append((name, int(in_range.sum()), float(right[in_range].mean())))
     return tuple(rows)
 
 

@@ -94,7 +94,7 @@ def describe_views(
     phase : name of the phase, for ``observe``.
     with_functions : whether to compute shape distributions too.
     """
-    found: list[tuple[DescribedView, str, str, float, float]] = []
+    described_views: list[tuple[DescribedView, str, str, float, float]] = []
     functions: list[F4] = []
     count = 0
     for count, view in enumerate(views, start=1):
@@ -105,21 +105,21 @@ def describe_views(
             x, y, z = (view.eye - view.points.mean(axis=0)).tolist()
             distance, elevation = math.hypot(x, y, z), math.degrees(math.atan2(z, math.hypot(x, y)))
             name = f"{view.category}/{view.instance}"
-            found.append((described, view.category, name, distance, elevation))
+            described_views.append((described, view.category, name, distance, elevation))
             if with_functions:
                 rng = np.random.default_rng((settings.seed, count, 1))
                 functions.append(shape_functions(view.points, rng))
         observe(phase, count, total)
     return DescribedViews(
-        descriptors=np.array([item[0].descriptor for item in found], np.float32).reshape(
-            len(found), len(DESCRIPTOR_NAMES)
+        descriptors=np.array([item[0].descriptor for item in described_views], np.float32).reshape(
+            len(described_views), len(DESCRIPTOR_NAMES)
         ),
-        labels=np.array([item[1] for item in found], str),
-        instances=np.array([item[2] for item in found], str),
-        points=np.array([item[0].points for item in found], np.int64),
-        distances=np.array([item[3] for item in found]),
-        seconds=np.array([item[0].seconds for item in found]),
-        skipped=count - len(found),
-        elevations=np.array([item[4] for item in found]),
+        labels=np.array([item[1] for item in described_views], str),
+        instances=np.array([item[2] for item in described_views], str),
+        points=np.array([item[0].points for item in described_views], np.int64),
+        distances=np.array([item[3] for item in described_views]),
+        seconds=np.array([item[0].seconds for item in described_views]),
+        skipped=count - len(described_views),
+        elevations=np.array([item[4] for item in described_views]),
         functions=np.array(functions, np.float32) if with_functions else _NOT_ASKED,
     )

@@ -51,9 +51,9 @@ def fit_temperature(logits: F8, labels: I4, objects: int) -> float:
     def loss(log_temperature: float) -> float:
         scaled = logits / np.exp(log_temperature)
         scaled = scaled - scaled.max(axis=1, keepdims=True)
-        own = (targets * scaled).sum(axis=1)
-        return float(np.mean(np.log(np.exp(scaled).sum(axis=1)) - own))
+        true_logit = (targets * scaled).sum(axis=1)
+        return float(np.mean(np.log(np.exp(scaled).sum(axis=1)) - true_logit))
 
     bounds = (np.log(0.05), np.log(20.0))
-    found = minimize_scalar(loss, bounds=bounds, method="bounded", options={"xatol": 1e-6})
-    return float(np.exp(found.x))
+    result = minimize_scalar(loss, bounds=bounds, method="bounded", options={"xatol": 1e-6})
+    return float(np.exp(result.x))

@@ -134,9 +134,11 @@ def write_features(
         for b in range(blocks):
             first, last = spans[b, 0], spans[b, 1]
             _squared_distances(z[first:last], kernels[:, first:last], exponents)
-            own = np.float32(1e-4 * (last - first))
+            own_distance = np.float32(1e-4 * (last - first))
             for c in range(starts.size - 1):
-                value = _log_density(exponents[starts[c] : starts[c + 1]], own, bandwidth[b])
+                value = _log_density(
+                    exponents[starts[c] : starts[c + 1]], own_distance, bandwidth[b]
+                )
                 value = (value - level[b]) / spread[b]
                 value = -clip if value < -clip else (clip if value > clip else value)
                 result[i, width + c * blocks + b] = value
@@ -153,26 +155,26 @@ def _squared_distances(z: F4, kernels: F4, result: F4) -> None:
 
 
 @kernel
-def _log_density(squared: F4, own: float, bandwidth: float) -> float:
+def _log_density(squared: F4, own_distance: float, bandwidth: float) -> float:
     """Return the log of the mean Gaussian over kernels at squared distances (k,).
 
     The factor that is the same for every category is left out; -1e9 if no kernel counts.
 
-    differs: a kernel within the squared distance ``own`` is taken for the view itself, met in
-    training, and does not count; otherwise the densities of training views would be far too high.
+    differs: a kernel within the squared distance ``own_distance`` is taken for the view itself, met
+    in training, and does not count; otherwise the densities of training views would be too high.
     """
     scale = -0.5 / (bandwidth * bandwidth)
     nearest = np.inf
     count = 0
     for value in squared:
-        if value > own:
+        if value > own_distance:
             count += 1
             nearest = value if value < nearest else nearest
     if count == 0:
         return -1e9
     total = 0.0
     for value in squared:
-        if value > own:
+        if value > own_distance:
             exponent = scale * (value - nearest)
             if exponent > -20.0:
                 total += np.exp(exponent)
@@ -193,12 +195,12 @@ def log_density_levels(
     bandwidth : standard deviation of the Gaussians, in standardised units.
     """
     first, last = span
-    own = np.float32(1e-4 * (last - first))
+    own_distance = np.float32(1e-4 * (last - first))
     distances = np.zeros(len(kernels), np.float32)
     result = np.zeros(len(z))
     block = np.ascontiguousarray(kernels[:, first:last], np.float32)
     for i, (row, label) in enumerate(zip(z, labels, strict=True)):
         _squared_distances(np.ascontiguousarray(row[first:last]), block, distances)
-        mine = distances[bank_starts[label] : bank_starts[label + 1]]
-        result[i] = _log_density(mine, own, bandwidth)
+        own_block = distances[bank_starts[label] : bank_starts[label + 1]]
+        result[i] = _log_density(own_block, own_distance, bandwidth)
     return result

@@ -176,8 +176,8 @@ def _width(inputs: _Inputs) -> int:
 
 def _logits(inputs: _Inputs, weights: F8) -> F8:
     width = inputs.features.shape[1]
-    own = np.einsum("nf,cf->nc", inputs.features, np.ascontiguousarray(weights[:width].T))
-    return np.asarray(own + inputs.words @ weights[width:-1] + weights[-1])
+    linear_part = np.einsum("nf,cf->nc", inputs.features, np.ascontiguousarray(weights[:width].T))
+    return np.asarray(linear_part + inputs.words @ weights[width:-1] + weights[-1])
 
 
 def _fit_new(inputs: _Inputs, old: F8, truth: I4, start: F8, ridge: float, steps: int) -> F8:
@@ -199,20 +199,20 @@ def _fit_new(inputs: _Inputs, old: F8, truth: I4, start: F8, ridge: float, steps
         weights = flat.reshape(start.shape)
         new = _logits(inputs, weights)
         total = np.logaddexp.reduce(np.concatenate([offset, new], axis=1), axis=1)
-        own = np.where(truth < first, own_old, (new * target).sum(axis=1))
+        chosen = np.where(truth < first, own_old, (new * target).sum(axis=1))
         residual = share[:, None] * (np.exp(new - total[:, None]) - target)
         own_slope = np.einsum("nf,nc->cf", inputs.features, residual).T
         slope = np.concatenate([own_slope, inputs.words.T @ residual, residual.sum(axis=0)[None]])
         slope[:-1] += ridge * weights[:-1]
-        value = float(share @ (total - own)) + 0.5 * ridge * float((weights[:-1] ** 2).sum())
+        value = float(share @ (total - chosen)) + 0.5 * ridge * float((weights[:-1] ** 2).sum())
         return value, slope.reshape(-1)
 
     # For such short sums, threads spend most of the time waiting for each other.
     with threadpool_limits(1):
-        found = minimize(
+        result = minimize(
             loss, start.reshape(-1), jac=True, method="L-BFGS-B", options={"maxiter": steps}
         )
-    return np.asarray(found.x.reshape(start.shape))
+    return np.asarray(result.x.reshape(start.shape))
 
 
 def _shift(
@@ -225,10 +225,10 @@ def _shift(
     fold = rng.permutation(len(truth)) % _FOLDS
     new = np.zeros((len(truth), learned.shape[1]))
     for k in range(_FOLDS):
-        held = fold == k
-        fitted = _fit_new(inputs.where(~held), old[~held], truth[~held], learned, ridge, _FEW_STEPS)
-        new[held] = _logits(inputs.where(held), fitted)
+        test = fold == k
+        fitted = _fit_new(inputs.where(~test), old[~test], truth[~test], learned, ridge, _FEW_STEPS)
+        new[test] = _logits(inputs.where(test), fitted)
     right = old.argmax(axis=1) == truth
     margin = (old.max(axis=1) - new.max(axis=1))[right]
-    most = float(np.quantile(margin, _LOST)) if margin.size else 0.0
-    return float(np.clip(most, 0.0, _LARGEST_SHIFT))
+    quantile = float(np.quantile(margin, _LOST)) if margin.size else 0.0
+    return float(np.clip(quantile, 0.0, _LARGEST_SHIFT))

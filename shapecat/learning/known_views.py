@@ -21,6 +21,6 @@ def choose_evenly(codes: I4, count: int, rng: np.random.Generator) -> I4:
     order = order[codes[order] >= 0]
     rank = np.zeros(len(order), np.int64)
     for code in np.unique(codes[order]):
-        mine = codes[order] == code
-        rank[mine] = np.arange(np.count_nonzero(mine))
+        of_code = codes[order] == code
+        rank[of_code] = np.arange(np.count_nonzero(of_code))
     return np.sort(order[np.argsort(rank, kind="stable")][:count])

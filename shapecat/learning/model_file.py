@@ -181,11 +181,11 @@ def _parse_array(data: bytes) -> np.ndarray:
     except (SyntaxError, tokenize.TokenError) as error:
         msg = "the header of an array is damaged"
         raise _NotAModelError(msg) from error
-    rest = data[stream.tell() :]
-    if fortran or dtype.kind not in "fiu" or math.prod(shape) * dtype.itemsize != len(rest):
+    body = data[stream.tell() :]
+    if fortran or dtype.kind not in "fiu" or math.prod(shape) * dtype.itemsize != len(body):
         msg = "the size of an array differs from its header"
         raise _NotAModelError(msg)
-    return np.frombuffer(rest, dtype).reshape(shape)
+    return np.frombuffer(body, dtype).reshape(shape)
 
 
 def _assemble(kind: type[_Record], parts: Mapping[str, Any], prefix: str) -> _Record:

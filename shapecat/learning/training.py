@@ -173,14 +173,14 @@ def calibrate(categorizer: Categorizer, held_out: Examples, *, rejected: float) 
     rejected : fraction of the views that the novelty threshold rejects.
     """
     codes = encode(held_out.labels, categorizer.categories)
-    known = codes >= 0
-    views, codes = held_out.descriptors[known], codes[known]
+    labelled = codes >= 0
+    views, codes = held_out.descriptors[labelled], codes[labelled]
     if codes.size == 0:
         return categorizer
     fitted = replace(categorizer, temperature=1.0)
     if can_calibrate(held_out.labels.tolist(), categorizer.categories):
         posteriors = fitted.predict(views).posteriors.astype(np.float64)
-        objects = np.unique(held_out.instances[known]).size
+        objects = np.unique(held_out.instances[labelled]).size
         temperature = fit_temperature(np.log(np.maximum(posteriors, 1e-30)), codes, objects)
         fitted = replace(fitted, temperature=temperature)
     return fit_threshold(fitted, held_out, rejected=rejected)

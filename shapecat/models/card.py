@@ -93,13 +93,13 @@ def write_card(
         (name, *map(str, row))
         for name, row in zip(confusion.categories, confusion.confusion, strict=True)
     )
-    taken = Table(
+    confusion_table = Table(
         "Confusion on the test tables (true category in rows)", ("", *confusion.categories), rows
     )
-    chosen = Table(
+    settings_table = Table(
         "Settings",
         ("setting", "value"),
         tuple((name, str(value)) for name, value in settings.items()),
     )
-    parts = [head, *map(format_table, (*tables, taken, chosen))]
+    parts = [head, *map(format_table, (*tables, confusion_table, settings_table))]
     path.write_text("\n".join(parts), "utf-8")

@@ -30,10 +30,14 @@ def cut_fragment(view: View, rng: np.random.Generator) -> View | None:
     low = height < height.min() + _LOW * np.ptp(height)
     for _ in range(_TRIES):
         kind = rng.choice(3, p=[0.55, 0.25, 0.2])
-        kept = (_beside_edge, _around_bar, _outside_corner)[kind](across, rng)
-        share = kept.mean()
-        if _KEPT[0] <= share <= _KEPT[1] and kept.sum() >= _FEWEST_POINTS and np.any(kept & low):
-            return replace(view, points=view.points[kept])
+        inside = (_beside_edge, _around_bar, _outside_corner)[kind](across, rng)
+        share = inside.mean()
+        if (
+            _KEPT[0] <= share <= _KEPT[1]
+            and inside.sum() >= _FEWEST_POINTS
+            and np.any(inside & low)
+        ):
+            return replace(view, points=view.points[inside])
     return None
 
 
@@ -44,8 +48,8 @@ def remove_base(view: View, rng: np.random.Generator) -> View:
     """
     distance = float(np.linalg.norm(view.eye - view.points.mean(axis=0)))
     cut = rng.uniform(0.003, 0.006) + 0.003 * distance**2 * rng.uniform(0.3, 1.0)
-    kept = view.points[:, 2] > cut
-    return replace(view, points=view.points[kept]) if kept.any() else view
+    inside = view.points[:, 2] > cut
+    return replace(view, points=view.points[inside]) if inside.any() else view
 
 
 def image_plane_points(view: View) -> F8:

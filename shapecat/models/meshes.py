@@ -35,10 +35,10 @@ def mesh_views(
         label = path.parent.name
         rng = np.random.default_rng((seed, number))
         mesh = uprighted(load_mesh(path), label)
-        found = upright_poses(mesh, label)
+        poses = upright_poses(mesh, label)
         for resting_pose, share in _PLACEMENTS.items():
-            wanted = "upright" if label in _NEVER_LIE else resting_pose
-            fitting = [stable for stable in found if stable.name == wanted] or list(found)
+            pose_name = "upright" if label in _NEVER_LIE else resting_pose
+            fitting = [stable for stable in poses if stable.name == pose_name] or list(poses)
             for k in range(share * placements):
                 stable = fitting[int(rng.integers(len(fitting)))]
                 name = f"{label}/{path.stem}/{resting_pose}_{k}"

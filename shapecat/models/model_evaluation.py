@@ -126,9 +126,9 @@ def _parts(views: SimulatedViews, model: Categorizer) -> list[tuple[str, Report]
         "all": np.ones_like(clear),
     }
     return [
-        (name, evaluate(views.views.where(mine), model))
-        for name, mine in parts.items()
-        if mine.any()
+        (name, evaluate(views.views.where(selected), model))
+        for name, selected in parts.items()
+        if selected.any()
     ]
 
 
@@ -158,11 +158,11 @@ def _counts(sets: dict[str, SimulatedViews]) -> list[tuple[str, ...]]:
     return [
         (
             name,
-            str(len(held.views.labels)),
-            str(len(np.unique(held.views.instances))),
-            str(int(np.sum(held.views.labels == UNKNOWN))),
+            str(len(views.views.labels)),
+            str(len(np.unique(views.views.instances))),
+            str(int(np.sum(views.views.labels == UNKNOWN))),
         )
-        for name, held in sets.items()
+        for name, views in sets.items()
     ]
 
 
@@ -180,8 +180,8 @@ def _fused_table(tracks: dict[str, SimulatedViews], model: Categorizer) -> Table
     for name, views in tracks.items():
         clear = views.where(clear_views(views))
         for which in ("any but upside down", "upright", "lying"):
-            mine = clear.where((clear.resting_pose == which) | (which not in _RESTING_POSES))
-            report = evaluate(mine.views, model)
+            selected = clear.where((clear.resting_pose == which) | (which not in _RESTING_POSES))
+            report = evaluate(selected.views, model)
             singles = (name, which, "1", str(report.n), _text(report.accuracy), _text(report.ece))
             rows.append(singles)
             rows += [

@@ -106,7 +106,7 @@ def collect(scenes: Sequence[Series], jobs: int) -> Pairs:
 
 
 def _collect(series: Series) -> Pairs:
-    found: list[tuple[F4, bool]] = []
+    pairs: list[tuple[F4, bool]] = []
     for seed in range(series.first, series.first + series.scenes):
         rng = np.random.default_rng(seed)
         world = make_scene(series.kind, rng, frames=1, categories=series.categories)
@@ -116,9 +116,9 @@ def _collect(series: Series) -> Pairs:
             view = random_viewpoint(world, sensor, rng) if k % 2 else 0
             frame, pixel_labels = render_frame(world, view, rng=rng, sensor=sensor)
             if frame.depth is not None and frame.camera is not None:
-                found += _pairs(frame.depth, frame.camera, pixel_labels, object_labels, rng)
-    features = np.array([features for features, _ in found], np.float32).reshape(-1, FEATURES)
-    return Pairs(features, np.array([same for _, same in found], bool))
+                pairs += _pairs(frame.depth, frame.camera, pixel_labels, object_labels, rng)
+    features = np.array([features for features, _ in pairs], np.float32).reshape(-1, FEATURES)
+    return Pairs(features, np.array([same for _, same in pairs], bool))
 
 
 def _pairs(
@@ -136,13 +136,13 @@ def _pairs(
     grid = downsample(depth, camera, range_m=settings.max_range_m)
     if grid is None:
         return
-    found = oversegment(grid, Task(settings, rng))
-    if found is None:
+    oversegmented = oversegment(grid, Task(settings, rng))
+    if oversegmented is None:
         return
-    ground, (graph, labels, segments) = found
+    ground, (graph, labels, segments) = oversegmented
     merge_across_occluder(segments, grid, graph.normal, labels)
     counts = count_labels(pixel_labels, labels, grid)
-    view_geometry, seen = ViewGeometry(grid.intrinsics.fx, float(ground.up[2])), set()
+    view_geometry, yielded = ViewGeometry(grid.intrinsics.fx, float(ground.up[2])), set()
     while True:
         rows, object_of = _segment_objects(segments, counts, object_labels)
         todo = []
@@ -150,8 +150,8 @@ def _pairs(
             same = bool(object_of[p] == object_of[q] and object_of[p] > 0)
             if same:
                 todo.append((p, q))
-            if (p, q, rows[p], rows[q]) not in seen:
-                seen.add((p, q, rows[p], rows[q]))
+            if (p, q, rows[p], rows[q]) not in yielded:
+                yielded.add((p, q, rows[p], rows[q]))
                 named = np.zeros(1, PAIR_FEATURES)
                 pair_features(segments, p, q, view_geometry, named[0])
                 yield named.view(np.float32), same
@@ -169,9 +169,9 @@ def count_labels(pixel_labels: U1, labels: I4, grid: DepthGrid) -> I4:
     labels : (rows, columns) segment of each cell of the grid.
     """
     middle, (rows, columns) = grid.factor // 2, labels.shape
-    seen = pixel_labels[middle :: grid.factor, middle :: grid.factor][:rows, :columns]
+    sampled = pixel_labels[middle :: grid.factor, middle :: grid.factor][:rows, :columns]
     counts = np.zeros((labels.max() + 1, pixel_labels.max() + 1), np.int64)
-    np.add.at(counts, (labels.ravel(), seen.ravel()), 1)
+    np.add.at(counts, (labels.ravel(), sampled.ravel()), 1)
     return counts
 
 

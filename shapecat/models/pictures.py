@@ -31,17 +31,17 @@ def worst_mistakes(
 ) -> list[Mistake]:
     """Return up to ``count`` mistakes on different objects, most confident first."""
     answer = model.predict(np.array([view.descriptor for view in views]))
-    found = []
+    mistakes = []
     for view, posterior, novelty in zip(views, answer.posteriors, answer.novelty, strict=True):
         is_unknown = novelty > 1
         predicted = UNKNOWN if is_unknown else model.categories[int(posterior.argmax())]
-        known = 1 - float(novelty) / 2
-        confidence = 1 - known if is_unknown else known * float(posterior.max())
+        familiarity = 1 - float(novelty) / 2
+        confidence = 1 - familiarity if is_unknown else familiarity * float(posterior.max())
         if predicted != view.label and view.view is not None:
-            found.append(Mistake(view, view.view, predicted, confidence))
-    found.sort(key=lambda mistake: -mistake.confidence)
+            mistakes.append(Mistake(view, view.view, predicted, confidence))
+    mistakes.sort(key=lambda mistake: -mistake.confidence)
     worst: dict[str, Mistake] = {}
-    for mistake in found:
+    for mistake in mistakes:
         worst.setdefault(mistake.simulated.instance, mistake)
     return list(worst.values())[:count]
 

@@ -62,10 +62,10 @@ def detected_views(folder: Path) -> Iterator[View]:
         for item in truth["objects"]:
             if item.get("ambiguous", False):
                 continue
-            found = _nearest(scene, item) if image is None else _best_overlap(scene, image, item)
-            if found is None:
+            match = _nearest(scene, item) if image is None else _best_overlap(scene, image, item)
+            if match is None:
                 continue
-            candidate = scene.candidates[found]
+            candidate = scene.candidates[match]
             points = _valid_points(frame, candidate.indices)
             support = scene.support_offset(candidate)
             name = f"{truth['scene']}_{item.get('label', 0)}"
@@ -100,14 +100,14 @@ def _table(frame: Frame, image: np.ndarray) -> tuple[F8, float]:
     points = _valid_points(frame, np.flatnonzero(image == counts.argmax())).astype(np.float64)
     rng = np.random.default_rng(0)
     sample = points[rng.integers(0, len(points), 4000)]
-    best, most = sample[:3], -1
+    best, best_count = sample[:3], -1
     for _ in range(200):
         three = points[rng.integers(0, len(points), 3)]
         normal = np.cross(three[1] - three[0], three[2] - three[0])
         normal /= np.linalg.norm(normal) + 1e-12
-        near = np.abs((sample - three[0]) @ normal) < 0.006
-        if near.sum() > most:
-            best, most = sample[near], int(near.sum())
+        inliers = np.abs((sample - three[0]) @ normal) < 0.006
+        if inliers.sum() > best_count:
+            best, best_count = sample[inliers], int(inliers.sum())
     centre = best.mean(axis=0)
     normal = np.linalg.svd(best - centre, full_matrices=False)[2][2]
     normal = normal * -np.sign(normal @ centre)  # the sensor is above the table
@@ -116,9 +116,9 @@ def _table(frame: Frame, image: np.ndarray) -> tuple[F8, float]:
 
 def _best_overlap(scene: Scene, image: np.ndarray, item: dict[str, Any]) -> int | None:
     """Return the index of the candidate with the best IoU; None if it is too small."""
-    mine = np.isin(image, item["parts"])
+    of_object = np.isin(image, item["parts"])
     shares = [
-        mine[c.indices].sum() / (mine.sum() + np.count_nonzero(~mine[c.indices]))
+        of_object[c.indices].sum() / (of_object.sum() + np.count_nonzero(~of_object[c.indices]))
         for c in scene.candidates
     ]
     return int(np.argmax(shares)) if shares and max(shares) >= _OVERLAP else None

@@ -131,8 +131,10 @@ def _visible_fractions(
     )
     result = np.zeros(count)
     for k in range(count):
-        mine = geometry.mesh_ids == k
-        alone = Geometry(geometry.vertices, geometry.triangles[mine], geometry.mesh_ids[mine])
+        of_object = geometry.mesh_ids == k
+        alone = Geometry(
+            geometry.vertices, geometry.triangles[of_object], geometry.mesh_ids[of_object]
+        )
         total = int((render(alone, wide, pose).mesh_ids >= 0).sum()) * _COARSE**2
         if seen_pixels[k] >= _FEWEST_PIXELS:
             result[k] = min(1.0, seen_pixels[k] / max(total, 1))

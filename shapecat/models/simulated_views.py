@@ -197,9 +197,9 @@ def _views_of(
     rng: np.random.Generator,
 ) -> list[SimulatedView]:
     """Return a view of an object, segmented by truth or detection, and sometimes a partial view."""
-    found = _segment_by_detection(image, scene, k)
-    if found is not None and rng.random() < _DETECTED:
-        (view, overlap), source = found, "detected"
+    detected = _segment_by_detection(image, scene, k)
+    if detected is not None and rng.random() < _DETECTED:
+        (view, overlap), source = detected, "detected"
     else:
         view, overlap = remove_base(_segment_by_truth(image, k, item, rng), rng), 1.0
         source = "truth"
@@ -220,8 +220,8 @@ def _background(image: RenderedView, scene: Scene, objects: int, name: str) -> l
     mesh_ids = image.mesh_ids.reshape(-1)
     views = []
     for candidate in scene.candidates:
-        mine = mesh_ids[candidate.indices]
-        if np.mean((mine >= 0) & (mine < objects)) <= _BACKGROUND:
+        ids = mesh_ids[candidate.indices]
+        if np.mean((ids >= 0) & (ids < objects)) <= _BACKGROUND:
             view = replace(_view_of(image, scene, candidate), category=UNKNOWN, instance=name)
             conditions = _Conditions(UNKNOWN, "upright", image.sensor, visible=1.0, overlap=1.0)
             views.append(_described(view, "background", conditions))

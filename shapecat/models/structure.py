@@ -180,14 +180,16 @@ def grow_rejection_trees(samples: Sequence[Samples], seed: int) -> RejectionTree
     objects = [part.objects for part in samples]
     context: dict[int, tuple[F4, Bool]] = {}
     for fold in range(_FOLDS):
-        rest = [k for k in range(len(samples)) if k % _FOLDS != fold]
-        grown = _grow([rows[k] for k in rest], [objects[k] for k in rest], seed)
+        training = [k for k in range(len(samples)) if k % _FOLDS != fold]
+        grown = _grow([rows[k] for k in training], [objects[k] for k in training], seed)
         for k in range(fold, len(samples), _FOLDS):
             logits = logits_of(rows[k], grown)
             unsure = is_uncertain(logits)
             context[k] = _in_context(samples[k], logits)[unsure], objects[k][unsure]
-    again = [context[k] for k in range(len(samples))]
-    in_context = _grow([features for features, _ in again], [known for _, known in again], seed)
+    contexts = [context[k] for k in range(len(samples))]
+    in_context = _grow(
+        [features for features, _ in contexts], [is_object for _, is_object in contexts], seed
+    )
     return RejectionTrees(_grow(rows, objects, seed), in_context)
 
 
@@ -264,10 +266,10 @@ def label_objects(frame: Frame, pixel_labels: U1, object_labels: I4) -> Iterator
         return
     grid = downsample(frame.depth, frame.camera, range_m=settings.max_range_m)
     task = Task(settings, np.random.default_rng(0))
-    found = None if grid is None else oversegment(grid, task)
-    if grid is None or found is None:
+    oversegmented = None if grid is None else oversegment(grid, task)
+    if grid is None or oversegmented is None:
         return
-    model, oversegmentation = found
+    model, oversegmentation = oversegmented
     merge_segments(grid, model, oversegmentation)
     features = measure_object_features(grid, model, oversegmentation, settings.max_range_m)
     _, labels, segments = oversegmentation

@@ -33,13 +33,13 @@ def agreement(
     by which ``other`` sees these points nearer; (0, 0) if too few points have depth there.
     """
     turn, shift = other_from_one.rotation, other_from_one.translation
-    known, agreeing, total = _compare(
+    compared, agreeing, total = _compare(
         pixels, depth, _numbers(camera), other, _numbers(other_camera), turn, shift
     )
-    asked = -(-len(pixels) // _step(len(pixels)))
-    if not agreeing or known < _KNOWN * asked:
+    sampled = -(-len(pixels) // _step(len(pixels)))
+    if not agreeing or compared < _KNOWN * sampled:
         return 0.0, 0.0
-    return agreeing / known, total / agreeing
+    return agreeing / compared, total / agreeing
 
 
 def _numbers(camera: Camera) -> tuple[float, float, float, float]:
@@ -71,7 +71,7 @@ def _compare(
     fx, fy, cx, cy = camera
     gx, gy, ax, ay = other_camera
     width = depth.shape[1]
-    known, agreeing, total = 0, 0, 0.0
+    compared, agreeing, total = 0, 0, 0.0
     for k in range(0, len(pixels), _step(len(pixels))):
         v, u = int(pixels[k]) // width, int(pixels[k]) % width
         z = depth[v, u]
@@ -82,17 +82,17 @@ def _compare(
         b = turn[1, 0] * x + turn[1, 1] * y + turn[1, 2] * z + shift[1]
         c = turn[2, 0] * x + turn[2, 1] * y + turn[2, 2] * z + shift[2]
         if c < NEAREST_M:
-            known += 1
+            compared += 1
             continue
-        found, difference = _nearest_reading(
+        has_depth, difference = _nearest_reading(
             other, int(np.floor(gy * b / c + ay + 0.5)), int(np.floor(gx * a / c + ax + 0.5)), 1 / c
         )
-        if found:
-            known += 1
+        if has_depth:
+            compared += 1
             if abs(difference) <= AGREE:
                 agreeing += 1
                 total += difference
-    return known, agreeing, total
+    return compared, agreeing, total
 
 
 @kernel(inline=True)
@@ -105,13 +105,13 @@ def _nearest_reading(depth: F4, row: int, column: int, expected: float) -> tuple
     height, width = depth.shape
     if not (0 <= row < height and 0 <= column < width):
         return True, np.inf
-    found, least = False, np.inf
+    has_depth, difference = False, np.inf
     if depth[row, column] > 0:
-        found, least = True, 1 / depth[row, column] - expected
-        if abs(least) <= AGREE:
-            return found, least
+        has_depth, difference = True, 1 / depth[row, column] - expected
+        if abs(difference) <= AGREE:
+            return has_depth, difference
     for v in range(max(row - 1, 0), min(row + 2, height)):
         for u in range(max(column - 1, 0), min(column + 2, width)):
-            if depth[v, u] > 0 and abs(1 / depth[v, u] - expected) < abs(least):
-                found, least = True, 1 / depth[v, u] - expected
-    return found, least
+            if depth[v, u] > 0 and abs(1 / depth[v, u] - expected) < abs(difference):
+                has_depth, difference = True, 1 / depth[v, u] - expected
+    return has_depth, difference

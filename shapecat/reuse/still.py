@@ -19,46 +19,46 @@ than the smallest object has. Noise at outlines makes only thin lines."""
 
 
 def shows_the_same(
-    now: Frame, pose: Pose | None, then: Frame, then_pose: Pose | None, *, range_m: float
+    frame: Frame, pose: Pose | None, key_frame: Frame, key_pose: Pose | None, *, range_m: float
 ) -> bool:
     """Return whether nothing within range has moved, appeared or disappeared between two frames.
 
     Parameters
     ----------
-    now, then : the frames to compare.
-    pose, then_pose : ``fixed_from_sensor`` of each; None where there is no fixed frame.
+    frame, key_frame : the frames to compare.
+    pose, key_pose : ``fixed_from_sensor`` of each; None where there is no fixed frame.
     range_m : metres; depths farther away in both frames are not compared.
 
     Notes
     -----
     Point clouds are never the same: their points do not correspond one to one.
     """
-    if now.depth is None or then.depth is None or now.camera != then.camera:
+    if frame.depth is None or key_frame.depth is None or frame.camera != key_frame.camera:
         return False
-    if now.frame_id != then.frame_id or not _at_rest(pose, then_pose):
+    if frame.frame_id != key_frame.frame_id or not _at_rest(pose, key_pose):
         return False
-    return not _changed(now.depth, then.depth, np.float32(range_m))
+    return not _changed(frame.depth, key_frame.depth, np.float32(range_m))
 
 
-def _at_rest(pose: Pose | None, then: Pose | None) -> bool:
-    if pose is None or then is None:
-        return pose is then
-    moved = compose(inverse(then), pose)
+def _at_rest(pose: Pose | None, other: Pose | None) -> bool:
+    if pose is None or other is None:
+        return pose is other
+    moved = compose(inverse(other), pose)
     turned = np.arccos(np.clip((np.trace(moved.rotation) - 1) / 2, -1, 1))
     return bool(np.linalg.norm(moved.translation) <= _MOVED_M and turned <= np.radians(_TURNED_DEG))
 
 
 @kernel
-def _changed(now: F4, then: F4, range_m: float) -> bool:
+def _changed(depth: F4, key_depth: F4, range_m: float) -> bool:
     """Return whether there is a square of pixels whose depths all differ."""
-    height, width = now.shape
+    height, width = depth.shape
     rows = np.zeros(width, np.int64)  # consecutive rows with a long enough run that ends here
     differs = np.zeros(width, np.bool_)
     for v in range(0, height, _STRIDE):
-        _mark(now[v], then[v], range_m, differs)
+        _mark(depth[v], key_depth[v], range_m, differs)
         run = 0
         for u in range(0, width, _STRIDE):
-            run = run + 1 if differs[u] and _alone(now, then, v, u) else 0
+            run = run + 1 if differs[u] and _alone(depth, key_depth, v, u) else 0
             rows[u] = rows[u] + 1 if run >= _SQUARE else 0
             if rows[u] == _SQUARE:
                 return True
@@ -66,23 +66,23 @@ def _changed(now: F4, then: F4, range_m: float) -> bool:
 
 
 @kernel(inline=True)
-def _mark(now: F4, then: F4, range_m: float, differs: Bool) -> None:
+def _mark(depth: F4, key_depth: F4, range_m: float, differs: Bool) -> None:
     """Mark the depths of a row that differ, unless both are out of range."""
-    for u in range(len(now)):
-        a, b = now[u], then[u]
-        near = (a <= range_m) | (b <= range_m)
-        differs[u] = near & (abs(a - b) > np.float32(AGREE) * a * b)
+    for u in range(len(depth)):
+        a, b = depth[u], key_depth[u]
+        in_range = (a <= range_m) | (b <= range_m)
+        differs[u] = in_range & (abs(a - b) > np.float32(AGREE) * a * b)
 
 
 @kernel(inline=True)
-def _alone(now: F4, then: F4, row: int, column: int) -> bool:
+def _alone(depth: F4, key_depth: F4, row: int, column: int) -> bool:
     """Return whether neither depth of a pixel occurs in the other image, there or beside it.
 
     Two missing depths are equal.
     """
-    a, b = now[row, column], then[row, column]
+    a, b = depth[row, column], key_depth[row, column]
     return a != b and not (
-        (a > 0 and _finds(then, row, column, a)) or (b > 0 and _finds(now, row, column, b))
+        (a > 0 and _finds(key_depth, row, column, a)) or (b > 0 and _finds(depth, row, column, b))
     )
 
 

@@ -123,15 +123,15 @@ def find_repeats(views: Sequence[ObjectView], keys: Sequence[KeyView]) -> list[R
     """
     if not keys or not views:
         return [None] * len(views)
-    now = np.array([view.summary for view in views])
-    then = np.array([key.view.summary for key in keys])
-    alike, moves = _similar(now[:, None], then[None]), dict[int, Move]()
-    found: list[Repeat | None] = []
+    summaries = np.array([view.summary for view in views])
+    key_summaries = np.array([key.view.summary for key in keys])
+    alike, moves = _similar(summaries[:, None], key_summaries[None]), dict[int, Move]()
+    repeats: list[Repeat | None] = []
     for view, row in zip(views, alike, strict=True):
         newest_first = np.flatnonzero(row)[::-1].tolist()
         tries = (_repeat(view, keys[k], moves) for k in newest_first[:_TRIES])
-        found.append(next((repeat for repeat in tries if repeat is not None), None))
-    return found
+        repeats.append(next((repeat for repeat in tries if repeat is not None), None))
+    return repeats
 
 
 def _repeat(view: ObjectView, key: KeyView, moves: dict[int, Move]) -> Repeat | None:
@@ -140,8 +140,8 @@ def _repeat(view: ObjectView, key: KeyView, moves: dict[int, Move]) -> Repeat | 
     if earlier not in moves:
         moves[earlier] = _between(key.view, view)
     move = moves[earlier]
-    same = _agree(key.view, view, move.pose) and _agree(view, key.view, move.back)
-    return Repeat(key, move) if same else None
+    agrees = _agree(key.view, view, move.pose) and _agree(view, key.view, move.back)
+    return Repeat(key, move) if agrees else None
 
 
 def reused(repeat: Repeat, view: ObjectView) -> Detection:
@@ -175,21 +175,21 @@ def _moved_box(move: Move, box: FullBox | None) -> FullBox | None:
     return replace(box, center=transform(move.pose, box.center), orientation=turned)
 
 
-def _similar(now: F8, then: F8) -> Bool:
+def _similar(views: F8, keys: F8) -> Bool:
     """Return which pairs of `ObjectView.summary` (..., 15) are alike: (...) bool."""
-    far, before = (np.linalg.norm(each[..., _RAY], axis=-1) for each in (now, then))
-    area = now[..., _PIXELS] * far**2 / (then[..., _PIXELS] * before**2)
-    turned = (now[..., _RAY] * then[..., _RAY]).sum(axis=-1) / (far * before)
-    tilted = (now[..., _UP] * then[..., _UP]).sum(axis=-1)
+    distance, key_distance = (np.linalg.norm(each[..., _RAY], axis=-1) for each in (views, keys))
+    area = views[..., _PIXELS] * distance**2 / (keys[..., _PIXELS] * key_distance**2)
+    turned = (views[..., _RAY] * keys[..., _RAY]).sum(axis=-1) / (distance * key_distance)
+    tilted = (views[..., _UP] * keys[..., _UP]).sum(axis=-1)
     return np.asarray(
-        (now[..., _KIND] == then[..., _KIND])
-        & (((now - then)[..., _PLACE] ** 2).sum(axis=-1) <= _PLACE_M**2)
+        (views[..., _KIND] == keys[..., _KIND])
+        & (((views - keys)[..., _PLACE] ** 2).sum(axis=-1) <= _PLACE_M**2)
         & (turned >= np.cos(np.radians(_TURN_DEG)))
         & (tilted >= np.cos(np.radians(_UP_DEG)))
-        & (np.abs(far / before - 1) <= _FARTHER)
+        & (np.abs(distance / key_distance - 1) <= _FARTHER)
         & (np.abs(area - 1) <= _AREA)
-        & (np.abs(now - then)[..., _SIZE].max(axis=-1) <= _SIZE_M)
-        & (np.abs(now - then)[..., _HEIGHT] <= _HEIGHT_M)
+        & (np.abs(views - keys)[..., _SIZE].max(axis=-1) <= _SIZE_M)
+        & (np.abs(views - keys)[..., _HEIGHT] <= _HEIGHT_M)
     )
 
 

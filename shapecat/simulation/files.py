@@ -43,9 +43,9 @@ def completed(paths: Sequence[Path], *, obsolete: Sequence[Path]) -> Iterator[li
         _require_replaceable(out)
         out.parent.mkdir(parents=True, exist_ok=True)
         with tempfile.TemporaryDirectory(dir=out.parent, prefix=".simulated-") as hidden:
-            made = [Path(hidden) / path.name for path in paths]
-            yield made
-            for file, path in zip(made, paths, strict=True):
+            hidden_paths = [Path(hidden) / path.name for path in paths]
+            yield hidden_paths
+            for file, path in zip(hidden_paths, paths, strict=True):
                 _move(file, path)
             for path in obsolete:
                 path.unlink(missing_ok=True)
@@ -69,7 +69,7 @@ def _require_replaceable(path: Path) -> list[Path]:
     return files
 
 
-def _move(made: Path, path: Path) -> None:
+def _move(hidden_path: Path, path: Path) -> None:
     """Move a finished file or folder to its path, replacing a file or a recorded folder.
 
     Raises
@@ -80,8 +80,8 @@ def _move(made: Path, path: Path) -> None:
         file.unlink()
     if path.is_dir() and not path.is_symlink():
         path.rmdir()
-    flush(made)
-    made.replace(path)
+    flush(hidden_path)
+    hidden_path.replace(path)
 
 
 class LabelFile:

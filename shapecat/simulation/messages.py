@@ -141,8 +141,8 @@ class MessageFactory:
         return self._make(_TF, transforms=stamped)
 
     def _header(self, stamp_ns: int, frame_id: str) -> Any:
-        seconds, rest = divmod(stamp_ns, 1_000_000_000)
-        stamp = self._make("builtin_interfaces/msg/Time", sec=seconds, nanosec=rest)
+        seconds, nanoseconds = divmod(stamp_ns, 1_000_000_000)
+        stamp = self._make("builtin_interfaces/msg/Time", sec=seconds, nanosec=nanoseconds)
         sequence = {"seq": 0} if self.ros_version == 1 else {}
         return self._make("std_msgs/msg/Header", **sequence, stamp=stamp, frame_id=frame_id)
 

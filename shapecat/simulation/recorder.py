@@ -120,7 +120,7 @@ def record(
         raise ValueError(msg)
     paths = written_paths(out, format, color=color)
     every = written_paths(out, format, color=True)
-    found = []
+    truths = []
     with (
         completed(paths, obsolete=every[len(paths) :]) as (recording, truth, *labels),
         CONTAINERS[format].open(recording) as writer,
@@ -140,9 +140,9 @@ def record(
             files[0].append(image)
             if color:
                 files[1].append(_write_colour(writer, world, frame))
-            found.append(_truth(world, frame, image, sensor.camera, seed))
+            truths.append(_truth(world, frame, image, sensor.camera, seed))
             observe("simulate", index + 1, len(world))
-        truth.write_text("[" + ",\n".join(map(json.dumps, found)) + "]\n", "utf-8")
+        truth.write_text("[" + ",\n".join(map(json.dumps, truths)) + "]\n", "utf-8")
     return paths[0]
 
 

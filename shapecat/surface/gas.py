@@ -154,8 +154,8 @@ def _in_metres(gas: Gas, count: int, frame: F8) -> F4:
 
 @kernel(inner=True)
 def _target_size(cloud: Cloud, neurons: int) -> int:
-    most = max(_FEWEST_NEURONS, int(_NEURONS_PER_POINT * cloud.x.size))
-    return max(3, min(neurons, most))
+    max_neurons = max(_FEWEST_NEURONS, int(_NEURONS_PER_POINT * cloud.x.size))
+    return max(3, min(neurons, max_neurons))
 
 
 @kernel
@@ -174,7 +174,7 @@ def _spacing(cloud: Cloud) -> float:
     x, y, z = cloud.x, cloud.y, cloud.z
     step = max(1, x.size // _SPACING_SAMPLES)
     total = 0.0
-    taken = 0
+    samples = 0
     for i in range(0, x.size, step):
         best = FAR
         for k in range(x.size):
@@ -183,5 +183,5 @@ def _spacing(cloud: Cloud) -> float:
             squared = squared if k != i else FAR
             best = squared if squared < best else best
         total += np.sqrt(best)
-        taken += 1
-    return total / taken
+        samples += 1
+    return total / samples

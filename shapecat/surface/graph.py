@@ -54,15 +54,15 @@ def finish_graph(cloud: Cloud, gas: Gas, count: int, share: float) -> Bool:
     stays = np.zeros(count, np.bool_)
     for i in range(count):
         stays[i] = members[i] > 0
-    kept = _compact(gas, adjacent, members, stays, count)
-    if kept < 3:
+    n = _compact(gas, adjacent, members, stays, count)
+    if n < 3:
         return adjacent[:0, :0]
-    if kept < count:
-        _three_nearest(cloud, gas, kept, nearest)
+    if n < count:
+        _three_nearest(cloud, gas, n, nearest)
     # 2.
-    _move_to_means(cloud, gas, kept, nearest)
+    _move_to_means(cloud, gas, n, nearest)
     # 3.
-    limit = (_LONGEST * _GRID_SPACING * _mean_spacing(gas, kept)) ** 2
+    limit = (_LONGEST * _GRID_SPACING * _mean_spacing(gas, n)) ** 2
     for k in range(cloud.x.size):
         a, b, c = np.int64(nearest[k, 0]), np.int64(nearest[k, 1]), np.int64(nearest[k, 2])
         adjacent[a, b] = adjacent[b, a] = True
@@ -71,24 +71,24 @@ def finish_graph(cloud: Cloud, gas: Gas, count: int, share: float) -> Bool:
         if not adjacent[b, c] and _squared_distance(gas, b, c) < limit:
             adjacent[b, c] = adjacent[c, b] = True
     # 4.
-    part = np.zeros(kept, np.int64)
-    parts = _components(adjacent, kept, part)
+    part = np.zeros(n, np.int64)
+    parts = _components(adjacent, n, part)
     if parts > 1:
         weight = np.zeros(parts, np.int64)
-        for i in range(kept):
+        for i in range(n):
             weight[part[i]] += members[i]
         heaviest = 0
         for k in range(1, parts):
             heaviest = k if weight[k] > weight[heaviest] else heaviest
-        for i in range(kept):
+        for i in range(n):
             stays[i] = part[i] == heaviest or weight[part[i]] >= share * cloud.x.size
-        kept = _compact(gas, adjacent, members, stays, kept)
-        if kept < 3:
+        n = _compact(gas, adjacent, members, stays, n)
+        if n < 3:
             return adjacent[:0, :0]
         # 5.
-        while _components(adjacent, kept, part) > 1:
-            _bridge(gas, adjacent, kept, part)
-    return adjacent[:kept, :kept]
+        while _components(adjacent, n, part) > 1:
+            _bridge(gas, adjacent, n, part)
+    return adjacent[:n, :n]
 
 
 @kernel(inner=True)
@@ -96,12 +96,12 @@ def edge_list(adjacent: Bool) -> U2:
     """Return the (m, 2) pairs i < j that are adjacent, in lexicographic order."""
     count = adjacent.shape[0]
     edges = np.zeros((count * count // 2 + 1, 2), np.uint16)
-    found = 0
+    n = 0
     for i in range(count):
         for j in range(i + 1, count):
-            edges[found, 0], edges[found, 1] = i, j  # overwritten unless adjacent: no branch
-            found += adjacent[i, j]
-    return edges[:found].copy()
+            edges[n, 0], edges[n, 1] = i, j  # overwritten unless adjacent: no branch
+            n += adjacent[i, j]
+    return edges[:n].copy()
 
 
 @kernel(inner=True)
@@ -159,32 +159,32 @@ def _squared_distance(gas: Gas, i: int, j: int) -> float:
 @kernel(inner=True)
 def _compact(gas: Gas, adjacent: Bool, members: I4, stays: Bool, count: int) -> int:
     """Move the neurons that stay to the front; return their number."""
-    kept = 0
+    n = 0
     for i in range(count):
         if not stays[i]:
             continue
-        if kept < i:
-            gas.x[kept], gas.y[kept], gas.z[kept] = gas.x[i], gas.y[i], gas.z[i]
-            members[kept] = members[i]
+        if n < i:
+            gas.x[n], gas.y[n], gas.z[n] = gas.x[i], gas.y[i], gas.z[i]
+            members[n] = members[i]
             for j in range(count):
-                adjacent[kept, j] = adjacent[i, j]
+                adjacent[n, j] = adjacent[i, j]
             for j in range(count):
-                adjacent[j, kept] = adjacent[j, i]
-        kept += 1
-    gas.x[kept:count] = FAR
-    gas.y[kept:count] = FAR
-    gas.z[kept:count] = FAR
-    return kept
+                adjacent[j, n] = adjacent[j, i]
+        n += 1
+    gas.x[n:count] = FAR
+    gas.y[n:count] = FAR
+    gas.z[n:count] = FAR
+    return n
 
 
 @kernel(inner=True)
 def _components(adjacent: Bool, count: int, part: I4) -> int:
     """Label connected components, from 0 in order of their first neuron; return their number."""
     part[:count] = -1
-    others = np.zeros(count, np.int64)  # neurons that may have no label yet
+    unlabelled = np.zeros(count, np.int64)  # neurons that may have no label yet
     for i in range(count):
-        others[i] = i
-    left = count
+        unlabelled[i] = i
+    remaining = count
     stack = np.zeros(count, np.int64)
     parts = 0
     for first in range(count):
@@ -196,17 +196,17 @@ def _components(adjacent: Bool, count: int, part: I4) -> int:
         while size > 0:
             size -= 1
             i = stack[size]
-            stay = 0
-            for k in range(left):
-                j = others[k]
+            kept = 0
+            for k in range(remaining):
+                j = unlabelled[k]
                 if adjacent[i, j] and part[j] < 0:
                     part[j] = parts
                     stack[size] = j
                     size += 1
                 elif part[j] < 0:
-                    others[stay] = j
-                    stay += 1
-            left = stay
+                    unlabelled[kept] = j
+                    kept += 1
+            remaining = kept
         parts += 1
     return parts
 

@@ -156,10 +156,10 @@ def grow_fritzke(
         k = order[cursor]
         cursor += 1
         # 5. to 10. differs: the rates fall to a tenth, so that the gas comes to rest.
-        rest = 1.0 - fall * signal
+        cooling = 1.0 - fall * signal
         a, age = _adapt_to_signal(
             x, y, z, error, degree, wins, edge_birth, count, mask, px[k], py[k], pz[k],
-            gain, rates.winner * rest, rates.neighbour * rest,
+            gain, rates.winner * cooling, rates.neighbour * cooling,
         )  # fmt: skip
         # 10. remove edges that are too old
         if age > rates.oldest:
@@ -218,7 +218,7 @@ def grow_thesis(
     order = np.arange(points)
     before = np.zeros(gas.x.size, np.int32)
     fall = 0.9 / (epochs * points)
-    rest = 1.0
+    cooling = 1.0
     for epoch in range(epochs):
         # differs: errors restart with each epoch; summed over all epochs they exceed any limit
         # and the gas grows without bound.
@@ -229,12 +229,12 @@ def grow_thesis(
         for k in order:
             a, age = _adapt_to_signal(
                 x, y, z, error, degree, wins, edge_birth, count, mask, px[k], py[k], pz[k],
-                1.0, rates.winner * rest, rates.neighbour * rest,
+                1.0, rates.winner * cooling, rates.neighbour * cooling,
             )  # fmt: skip
             # 10. remove edges that are too old
             if age > rates.oldest:
                 _drop_old_edges(degree, wins, edge_birth, count, a, rates.oldest)
-            rest -= fall
+            cooling -= fall
             # 12. differs: at most once in four signals, and the errors of all three neurons are
             # reset; as published, the gas is full after the first epoch.
             pause -= 1

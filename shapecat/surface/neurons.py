@@ -94,9 +94,9 @@ def refresh(degree: I4, wins: I4, edge_birth: I4, i: int, j: int) -> None:
     if edge_birth[i * degree.size + j] == ABSENT:
         degree[i] += 1
         degree[j] += 1
-    now = wins[i] + wins[j]
-    edge_birth[i * degree.size + j] = now
-    edge_birth[j * degree.size + i] = now
+    birth = wins[i] + wins[j]
+    edge_birth[i * degree.size + j] = birth
+    edge_birth[j * degree.size + i] = birth
 
 
 @kernel(inner=True)

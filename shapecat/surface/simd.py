@@ -105,8 +105,8 @@ def _constant(value: int) -> _Value:
     return ir.Constant(_INTS, [value] * LANES)
 
 
-def _nearest(wanted: int) -> Callable[..., Any]:
-    """Return an intrinsic that finds the ``wanted`` neurons nearest to a point."""
+def _nearest(count: int) -> Callable[..., Any]:
+    """Return an intrinsic that finds the ``count`` neurons nearest to a point."""
 
     def emit(context: Any, builder: Any, signature: Any, args: Any) -> _Value:
         """Emit the instructions of ``search``, below."""
@@ -115,7 +115,7 @@ def _nearest(wanted: int) -> Callable[..., Any]:
         padded, place, mask = args[3], [v.splat(value, _FLOATS) for value in args[4:7]], args[7]
         keep = build.not_(v.splat(mask, _INTS))
         # In each lane the smallest keys so far, in order.
-        best = [v.variable(_constant(_LARGEST)) for _ in range(wanted)]
+        best = [v.variable(_constant(_LARGEST)) for _ in range(count)]
         with v.blocks(padded) as (i, index):
             squared = ir.Constant(_FLOATS, [0.0] * LANES)
             for array, value in zip(arrays, place, strict=True):
@@ -127,24 +127,24 @@ def _nearest(wanted: int) -> Callable[..., Any]:
                 build.store(v.least(old, key), slot)
                 key = v.most(old, key)
         lists = [build.load(slot) for slot in best]
-        found = []
-        for _ in range(wanted):
-            least = v.reduce_least(lists[0])
-            found.append(build.zext(build.and_(least, mask), _I64))
+        winners = []
+        for _ in range(count):
+            minimum = v.reduce_least(lists[0])
+            winners.append(build.zext(build.and_(minimum, mask), _I64))
             # The lane with the minimum moves its list up.
-            had = build.icmp_signed("==", lists[0], v.splat(least, _INTS))
+            had = build.icmp_signed("==", lists[0], v.splat(minimum, _INTS))
             after = [*lists[1:], _constant(_LARGEST)]
             lists = [build.select(had, b, a) for a, b in zip(lists, after, strict=True)]
-        return context.make_tuple(builder, signature.return_type, found)
+        return context.make_tuple(builder, signature.return_type, winners)
 
     def search(
         _typing: Any, x: Any, y: Any, z: Any, padded: Any, sx: Any, sy: Any, sz: Any, mask: Any
     ) -> Any:
-        real, whole = types.float32, types.int64
-        result = types.UniTuple(whole, wanted)
-        return result(x, y, z, whole, real, real, real, types.int32), emit
+        real, integer = types.float32, types.int64
+        result = types.UniTuple(integer, count)
+        return result(x, y, z, integer, real, real, real, types.int32), emit
 
-    search.__doc__ = f"""Return the {wanted} neurons nearest to a point, nearest first.
+    search.__doc__ = f"""Return the {count} neurons nearest to a point, nearest first.
 
     The search minimises keys: squared distances whose lowest bits are replaced by the index.
     Positive floats and their bits as integers have the same order. Distances that differ by less
@@ -194,10 +194,10 @@ def adapt(
     winner : index of the winner.
     rate_winner, rate_neighbour : share of the distance to move.
     """
-    real, whole = types.float32, types.int64
-    places = (x, y, z, whole, real, real, real)
+    real, integer = types.float32, types.int64
+    places = (x, y, z, integer, real, real, real)
     return types.int32(
-        *places, edge_birth, whole, types.int32, wins, whole, real, real
+        *places, edge_birth, integer, types.int32, wins, integer, real, real
     ), _emit_adapt
 
 

@@ -102,33 +102,33 @@ def _smooth(points: F4, radius: float, cells: I4, size: I4, order: I4) -> F4:
     count = points.shape[0]
     keys = cells[order]
     moved = np.zeros((count, 3), np.float32)
-    near = np.zeros((count, 4))  # neighbours from the point on, in radii, and their weights
-    kept = 0
+    offsets = np.zeros((count, 4))  # neighbours from the point on, in radii, and their weights
+    n = 0
     for i in range(count):
-        found = _neighbours(points, i, radius, cells[i], size, keys, order, near)
-        if found < _FEWEST_PLANE:
+        k = _neighbours(points, i, radius, cells[i], size, keys, order, offsets)
+        if k < _FEWEST_PLANE:
             continue
         # 1.
-        normal, height = _plane(near, found)
+        normal, height = _plane(offsets, k)
         # 2.
-        bend = _quadric(near, found, normal, height) if found >= _FEWEST_QUADRIC else 0.0
+        bend = _quadric(offsets, k, normal, height) if k >= _FEWEST_QUADRIC else 0.0
         # 3. differs: a fit that leaves the neighbourhood is ignored
         height += bend if abs(bend) < 1.0 else 0.0
         for axis in range(3):
-            moved[kept, axis] = points[i, axis] + height * radius * normal[axis]
-        kept += 1
-    return moved[:kept].copy()
+            moved[n, axis] = points[i, axis] + height * radius * normal[axis]
+        n += 1
+    return moved[:n].copy()
 
 
 @kernel(inline=True)
 def _neighbours(
-    points: F4, i: int, radius: float, cell: int, size: I4, keys: I4, order: I4, near: F8
+    points: F4, i: int, radius: float, cell: int, size: I4, keys: I4, order: I4, offsets: F8
 ) -> int:
-    """Write the offsets from point i, in radii, and the weights of its neighbours to ``near``.
+    """Write offsets from point i, in radii, and weights of its neighbours to ``offsets``.
 
     Returns their number.
     """
-    found = 0
+    n = 0
     for side in range(9):
         middle = cell + ((side // 3 - 1) * size[1] + side % 3 - 1) * size[2]
         at = np.searchsorted(keys, middle - 1)
@@ -136,28 +136,30 @@ def _neighbours(
             square = 0.0
             for axis in range(3):
                 step = (np.float64(points[order[at], axis]) - points[i, axis]) / radius
-                near[found, axis] = step
+                offsets[n, axis] = step
                 square += step * step
-            near[found, 3] = np.exp(-4.0 * square)
-            found += 1 if square < 1.0 else 0
+            offsets[n, 3] = np.exp(-4.0 * square)
+            n += 1 if square < 1.0 else 0
             at += 1
-    return found
+    return n
 
 
 @kernel(inline=True)
-def _plane(near: F8, found: int) -> tuple[F8, float]:
+def _plane(offsets: F8, n: int) -> tuple[F8, float]:
     """Return the normal of the plane of weighted points, and its height above the origin."""
     mean, spread = np.zeros(3), np.zeros((3, 3))
     total = 0.0
-    for k in range(found):
-        total += near[k, 3]
+    for k in range(n):
+        total += offsets[k, 3]
         for a in range(3):
-            mean[a] += near[k, 3] * near[k, a]
+            mean[a] += offsets[k, 3] * offsets[k, a]
     mean /= total
-    for k in range(found):
+    for k in range(n):
         for a in range(3):
             for b in range(3):
-                spread[a, b] += near[k, 3] * (near[k, a] - mean[a]) * (near[k, b] - mean[b])
+                spread[a, b] += (
+                    offsets[k, 3] * (offsets[k, a] - mean[a]) * (offsets[k, b] - mean[b])
+                )
     normal = _least_direction(spread / total)
     return normal, normal[0] * mean[0] + normal[1] * mean[1] + normal[2] * mean[2]
 
@@ -192,7 +194,7 @@ def _least_direction(spread: F8) -> F8:
 
 
 @kernel(inline=True)
-def _quadric(near: F8, found: int, normal: F8, height: float) -> float:
+def _quadric(offsets: F8, n: int, normal: F8, height: float) -> float:
     """Return the height of the fitted quadric over the plane, at the projection of the origin."""
     small = 0
     for axis in range(1, 3):
@@ -203,8 +205,8 @@ def _quadric(near: F8, found: int, normal: F8, height: float) -> float:
     second = cross(normal, first)
     A, row = np.zeros((6, 7)), np.ones(7)
     total = 0.0
-    for k in range(found):
-        x, y, z, weight = near[k]
+    for k in range(n):
+        x, y, z, weight = offsets[k]
         u = first[0] * x + first[1] * y + first[2] * z
         v = second[0] * x + second[1] * y + second[2] * z
         row[1], row[2], row[3], row[4], row[5] = u, v, u * u, u * v, v * v

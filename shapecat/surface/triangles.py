@@ -36,16 +36,16 @@ def triangles_of(edges: U2, nodes: int) -> U2:
 @kernel(inner=True)
 def _walk(edges: U2, begin: I4, result: U2) -> int:
     """Write the triangles while there is room, and return their total number."""
-    found = 0
+    n = 0
     for edge in range(len(edges)):
         i, j = edges[edge, 0], edges[edge, 1]
         a, b = edge + 1, begin[j]  # the neighbours of i after j, and those of j
         while a < begin[i + 1] and b < begin[j + 1]:
             u, v = edges[a, 1], edges[b, 1]
             if u == v:
-                if found < len(result):
-                    result[found, 0], result[found, 1], result[found, 2] = i, j, u
-                found += 1
+                if n < len(result):
+                    result[n, 0], result[n, 1], result[n, 2] = i, j, u
+                n += 1
             a += u <= v
             b += v <= u
-    return found
+    return n

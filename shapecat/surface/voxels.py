@@ -104,7 +104,7 @@ def _voxelize(points: F4, voxel: float) -> tuple[F4, bool]:
         sums[runs - 1, 3] += 1
     order = _radix_order(keys[:runs], (high[0] - low[0] + 1) * size_y * size_z)
     result = np.zeros((runs, 3), np.float32)
-    found = 0
+    n = 0
     i = 0
     while i < runs:
         key = keys[order[i]]
@@ -116,18 +116,18 @@ def _voxelize(points: F4, voxel: float) -> tuple[F4, bool]:
             total_z += sums[run, 2]
             members += sums[run, 3]
             i += 1
-        result[found, 0] = total_x / members / scale
-        result[found, 1] = total_y / members / scale
-        result[found, 2] = total_z / members / scale
-        found += 1
-    return result[:found].copy(), True
+        result[n, 0] = total_x / members / scale
+        result[n, 1] = total_y / members / scale
+        result[n, 2] = total_z / members / scale
+        n += 1
+    return result[:n].copy(), True
 
 
 @kernel(inline=True)
 def _radix_order(keys: np.ndarray, bound: int) -> np.ndarray:
     """Return the stable order that sorts ``keys``, which are >= 0 and below ``bound``."""
     order = np.arange(keys.size)
-    other = np.zeros(keys.size, np.int64)
+    buffer = np.zeros(keys.size, np.int64)
     shift = 0
     while (bound - 1) >> shift > 0:
         starts = np.zeros((1 << _RADIX_BITS) + 1, np.int64)
@@ -137,8 +137,8 @@ def _radix_order(keys: np.ndarray, bound: int) -> np.ndarray:
             starts[digit + 1] += starts[digit]
         for i in range(keys.size):
             digit = (keys[order[i]] >> shift) & ((1 << _RADIX_BITS) - 1)
-            other[starts[digit]] = order[i]
+            buffer[starts[digit]] = order[i]
             starts[digit] += 1
-        order, other = other, order
+        order, buffer = buffer, order
         shift += _RADIX_BITS
     return order

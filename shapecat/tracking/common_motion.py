@@ -136,19 +136,21 @@ def _between_neighbours(plane: C16, rows: I4, owner: I4, count: int) -> tuple[C1
     return total / np.abs(total), np.cumsum(before * shift)
 
 
-def _fit(seen: C16, still: C16, rows: I4, weights: F8, turn: C16, shift: C16) -> tuple[C16, C16]:
+def _fit(
+    observed: C16, reference: C16, rows: I4, weights: F8, turn: C16, shift: C16
+) -> tuple[C16, C16]:
     """Fit a rotation and a translation to each frame; keep the given ones with fewer than 2 points.
 
     Points and translations in the plane are complex numbers; a rotation is one of modulus 1.
     """
     count = len(turn)
-    mean_seen = _means(seen, rows, weights, count)
-    mean_still = _means(still, rows, weights, count)
-    cross = (still - mean_still[rows]) * np.conj(seen - mean_seen[rows]) * weights
+    mean_observed = _means(observed, rows, weights, count)
+    mean_reference = _means(reference, rows, weights, count)
+    cross = (reference - mean_reference[rows]) * np.conj(observed - mean_observed[rows]) * weights
     total = _sums(cross, rows, count)
     enough = (np.bincount(rows, minlength=count) >= 2) & (np.abs(total) > 0)
     turn = np.where(enough, total / np.maximum(np.abs(total), 1e-300), turn)
-    shift = np.where(enough, mean_still - turn * mean_seen, shift)
+    shift = np.where(enough, mean_reference - turn * mean_observed, shift)
     return turn, shift
 
 

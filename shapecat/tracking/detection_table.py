@@ -68,10 +68,10 @@ class DetectionTable:
 
     def axes(self, which: I4 | slice) -> F8:
         """Return the axes (k, 3, 3) of the boxes of ``which``, as columns; none if unknown."""
-        some = None if self.orientations is None else self.orientations[which]
-        if some is None or len(some) == 0:
+        quaternions = None if self.orientations is None else self.orientations[which]
+        if quaternions is None or len(quaternions) == 0:
             return np.zeros((0, 3, 3))
-        return np.asarray(Rotation.from_quat(some).as_matrix())
+        return np.asarray(Rotation.from_quat(quaternions).as_matrix())
 
     def blocks(self) -> Iterator[slice]:
         """Yield slices of detections that cover all frames in order, never dividing a frame."""
@@ -123,9 +123,9 @@ class DetectionTable:
             return np.zeros((0, 3))
         # Use only detections near these frames, as long tracks are queried for many short spans.
         before, after = np.searchsorted(track, self.first[[rows.min() + 1, rows.max()]])
-        near = track[max(before - 1, 0) : after + 1]
-        last = np.maximum(np.searchsorted(self.rows[near], rows, side="right") - 1, 0)
-        a, b = near[last], near[np.minimum(last + 1, len(near) - 1)]
+        nearest = track[max(before - 1, 0) : after + 1]
+        last = np.maximum(np.searchsorted(self.rows[nearest], rows, side="right") - 1, 0)
+        a, b = nearest[last], nearest[np.minimum(last + 1, len(nearest) - 1)]
         start, stop = self.stamps(a), self.stamps(b)
         share = np.clip((self.stamps_ns[rows] - start) / np.maximum(stop - start, 1), 0, 1)
         step = self.centers[b] - self.centers[a]
@@ -138,20 +138,22 @@ class DetectionTable:
 
         Gaps longer than ``max_gap_s`` are left out, and so are topics that never see it.
         """
-        seen = self.rows[track]
-        gap_s = np.diff(self.stamps_ns[seen]) * 1e-9
-        lengths = np.append(np.where(gap_s <= max_gap_s, np.diff(seen), 1), 1)
-        rows = np.repeat(seen - (np.cumsum(lengths) - lengths), lengths) + np.arange(lengths.sum())
+        frames = self.rows[track]
+        gap_s = np.diff(self.stamps_ns[frames]) * 1e-9
+        lengths = np.append(np.where(gap_s <= max_gap_s, np.diff(frames), 1), 1)
+        rows = np.repeat(frames - (np.cumsum(lengths) - lengths), lengths) + np.arange(
+            lengths.sum()
+        )
         rows = rows[self.sees(track, rows)]
-        return rows, np.isin(rows, seen)
+        return rows, np.isin(rows, frames)
 
     def sees(self, track: I4, rows: I4) -> Bool:
         """Return the mask (n,) of frames ``rows`` (n,) whose topics have detections of a track."""
         return np.isin(self.topics[rows], self.topics[self.rows[track]])
 
-    def seen_with(self, track: I4, other: I4) -> I4:
-        """Return the detections ``other`` whose topics also have detections of a track."""
-        return other if len(self.names) == 1 else other[self.sees(track, self.rows[other])]
+    def seen_with(self, track: I4, which: I4) -> I4:
+        """Return those of the detections ``which`` whose topics also have detections of a track."""
+        return which if len(self.names) == 1 else which[self.sees(track, self.rows[which])]
 
 
 def gather(
@@ -180,9 +182,9 @@ class _Gathered:
         count, categories = frame.posteriors.shape
         topic = self._names.setdefault(frame.topic, len(self._names))
         self._counts.append(count)
-        own = {"topics": topic, "frames": frame.frame, "stamps_ns": frame.stamp_ns}
+        frame_values = {"topics": topic, "frames": frame.frame, "stamps_ns": frame.stamp_ns}
         for name, kind in _OF_FRAMES.items():
-            self._bytes[name] += np.array(own[name], kind).tobytes()
+            self._bytes[name] += np.array(frame_values[name], kind).tobytes()
         if count == 0:
             return
         self._categories = categories
@@ -207,8 +209,8 @@ class _Gathered:
         for name, (kind, shape) in _OF_DETECTIONS.items():
             values = self._taken(name, kind)
             widths = tuple(self._categories if width == "c" else width for width in shape)
-            whole = values.size == total * int(np.prod(widths))
-            columns[name] = values.reshape(total, *widths)[which] if whole else None
+            complete = values.size == total * int(np.prod(widths))
+            columns[name] = values.reshape(total, *widths)[which] if complete else None
         return {"names": tuple(self._names), **columns}
 
     def _taken(self, name: str, kind: str) -> Any:

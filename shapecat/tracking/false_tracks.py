@@ -24,14 +24,14 @@ def without_duplicates(table: DetectionTable, tracks: Sequence[I4]) -> list[I4]:
     first = np.array([table.rows[track[0]] for track in tracks])
     last = np.array([table.rows[track[-1]] for track in tracks])
     radius = cache(lambda k: 0.6 * float(np.median(table.sizes[tracks[k]], axis=0).min()))
-    kept = []
+    result = []
     for track in tracks:
         low, high = table.rows[track[0]], table.rows[track[-1]]
         hosts = (_LONGER * len(track) <= lengths) & (first <= high) & (last >= low)
         places = np.flatnonzero(hosts).tolist()
         if not any(_inside(table, track, tracks[k], radius(k)) for k in places):
-            kept.append(track)
-    return kept
+            result.append(track)
+    return result
 
 
 def _inside(table: DetectionTable, track: I4, host: I4, radius: float) -> bool:
@@ -60,9 +60,9 @@ def without_pieces(table: DetectionTable, tracks: Sequence[I4], max_gap_s: float
 
 def _covered(table: DetectionTable, track: I4, max_gap_s: float) -> int:
     """Count the frames between a track's detections in which it lies in another detection's box."""
-    rows, seen = table.frame_span(track, max_gap_s)
-    others, which = table.of_frames(rows[~seen])
-    place = table.positions(track, rows[~seen])[which]
+    rows, detected = table.frame_span(track, max_gap_s)
+    others, which = table.of_frames(rows[~detected])
+    place = table.positions(track, rows[~detected])[which]
     return len(np.unique(which[_in_box(table, others, place)]))
 
 
@@ -74,17 +74,17 @@ def _covered_beside(table: DetectionTable, k: int, tracks: Sequence[I4], owner: 
     a bowl, or pushed against another object and merged with it from then on.
     """
     track, counts = tracks[k], list[int]()
-    most = len(track) // 2
-    for end, way in ((0, -1), (-1, 1)):
+    span = len(track) // 2
+    for end, direction in ((0, -1), (-1, 1)):
         beside, _ = table.of_frames(table.rows[track[[end]]])
-        found = [0]
-        for other in beside[(owner[beside] >= 0) & (owner[beside] != k)].tolist():
-            host = table.seen_with(track, tracks[owner[other]])
-            i = int(np.searchsorted(host, other))
-            then = host[max(i - most, 0) : i] if way < 0 else host[i + 1 : i + 1 + most]
-            place = table.centers[track[end]] + table.centers[then] - table.centers[other]
-            found.append(int(_in_box(table, then, place).sum()))
-        counts.append(max(found))
+        covered = [0]
+        for neighbour in beside[(owner[beside] >= 0) & (owner[beside] != k)].tolist():
+            host = table.seen_with(track, tracks[owner[neighbour]])
+            i = int(np.searchsorted(host, neighbour))
+            window = host[max(i - span, 0) : i] if direction < 0 else host[i + 1 : i + 1 + span]
+            place = table.centers[track[end]] + table.centers[window] - table.centers[neighbour]
+            covered.append(int(_in_box(table, window, place).sum()))
+        counts.append(max(covered))
     return sum(counts) if all(counts) else 0
 
 

@@ -80,12 +80,12 @@ def _running(posteriors: ArrayLike, method: Method, weights: ArrayLike | None) -
     weight = np.ones(len(views)) if weights is None else np.asarray(weights, np.float64)
     total, sofar = np.zeros(views.shape[1]), np.cumsum(weight)[:, None]
     for first in range(0, len(views), _BLOCK):
-        some = slice(first, first + _BLOCK)
-        evidence = _evidence(views[some].astype(np.float64), method) * weight[some, None]
+        block = slice(first, first + _BLOCK)
+        evidence = _evidence(views[block].astype(np.float64), method) * weight[block, None]
         evidence[0] += total
         summed = np.cumsum(evidence, axis=0)
         total = summed[-1]
-        running = summed / sofar[some]
+        running = summed / sofar[block]
         if method == "product":
             running = np.exp(running - running.max(axis=1, keepdims=True))
         yield running / running.sum(axis=1, keepdims=True)

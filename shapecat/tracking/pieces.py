@@ -88,8 +88,8 @@ class _WholeSizes:
         passing = (share <= _PASSING)[which] & table.partial[pairs].all(axis=1)
         sizes[passing, :, 1] = sizes[passing, :, 0]
         for k in _where(share <= _CHANGING):
-            own = which == k
-            sizes[own] = np.maximum(sizes[own], self._in_one(*track_pairs[k].tolist()))
+            group = which == k
+            sizes[group] = np.maximum(sizes[group], self._in_one(*track_pairs[k].tolist()))
         return np.asarray(sizes)
 
 
@@ -98,11 +98,11 @@ def _seen_in_one(table: DetectionTable, tracks: Sequence[I4], a: int, b: int) ->
 
     Only frames while both tracks last count; 0 if there are none.
     """
-    both = np.concatenate([tracks[a], tracks[b]])
+    detections = np.concatenate([tracks[a], tracks[b]])
     start = max(table.rows[tracks[k][0]] for k in (a, b))
     stop = min(table.rows[tracks[k][-1]] for k in (a, b))
-    rows, at, counts = np.unique(table.rows[both], return_index=True, return_counts=True)
-    alone = both[at[(counts == 1) & (rows > start) & (rows < stop)]]
+    rows, at, counts = np.unique(table.rows[detections], return_index=True, return_counts=True)
+    alone = detections[at[(counts == 1) & (rows > start) & (rows < stop)]]
     return np.asarray(sorted_sides(table.sizes[alone]).max(axis=0, initial=0))
 
 
@@ -129,9 +129,9 @@ def _whole(table: DetectionTable, track: I4) -> F8:
 def _neighbours(table: DetectionTable, owner: I4, block: slice) -> I4:
     """Return the pairs (p, 2) of tracked detections in the same frame that are near each other."""
     tracked = block.start + np.flatnonzero(owner[block] >= 0)
-    places = np.column_stack([table.centers[tracked], table.rows[tracked]])
-    found = cKDTree(places).query_pairs(_NEAR_M, output_type="ndarray")
-    pairs = tracked[found]
+    positions = np.column_stack([table.centers[tracked], table.rows[tracked]])
+    near = cKDTree(positions).query_pairs(_NEAR_M, output_type="ndarray")
+    pairs = tracked[near]
     return np.asarray(pairs[np.lexsort(pairs.T)])
 
 
@@ -165,12 +165,12 @@ def _fit(table: DetectionTable, pairs: I4, wholes: F8) -> Bool:
 def _joint(table: DetectionTable, pairs: I4) -> F8:
     """Return the lengths (p, 3) of the box around each pair, along the first box's axes, metres."""
     i, j = pairs.T
-    own_axes, others = table.axes(i), table.axes(j)
-    offset = np.einsum("pji,pj->pi", own_axes, table.centers[j] - table.centers[i])
-    turned = np.abs(np.einsum("pji,pjk->pik", own_axes, others))
-    reach = 0.5 * np.einsum("pik,pk->pi", turned, table.sizes[j])
-    own = 0.5 * table.sizes[i].astype(np.float64)
-    return sorted_sides(np.maximum(own, offset + reach) - np.minimum(-own, offset - reach))
+    axes_i, axes_j = table.axes(i), table.axes(j)
+    offset = np.einsum("pji,pj->pi", axes_i, table.centers[j] - table.centers[i])
+    turned = np.abs(np.einsum("pji,pjk->pik", axes_i, axes_j))
+    half_j = 0.5 * np.einsum("pik,pk->pi", turned, table.sizes[j])
+    half_i = 0.5 * table.sizes[i].astype(np.float64)
+    return sorted_sides(np.maximum(half_i, offset + half_j) - np.minimum(-half_i, offset - half_j))
 
 
 def _largest(table: DetectionTable, track: I4) -> I4:

@@ -52,9 +52,9 @@ def track_recording(
     Time and memory grow linearly with the number of detections, memory by some 100 bytes each.
     """
     streams = [_track_stream(table, settings) for table in gather(frames, together)]
-    found = [(stream, track) for stream in streams for track in stream.tracks]
-    found.sort(key=lambda item: item[0].born_ns(item[1]))  # stable: then stream, then birth
-    return (_build_track(k, *item, settings) for k, item in enumerate(found, 1))
+    tracks = [(stream, track) for stream in streams for track in stream.tracks]
+    tracks.sort(key=lambda item: item[0].born_ns(item[1]))  # stable: then stream, then birth
+    return (_build_track(k, *item, settings) for k, item in enumerate(tracks, 1))
 
 
 @dataclass(frozen=True)
@@ -103,13 +103,13 @@ def _associate(table: DetectionTable, cuts: Bool, settings: TrackingSettings) ->
     for row, (stamp_ns, cut) in enumerate(frames):
         if cut:
             tracker.reset()
-        here = table.of_frame(row)
-        ids[here] = tracker.step(
+        detections = table.of_frame(row)
+        ids[detections] = tracker.step(
             stamp_ns,
-            table.centers[here],
-            table.sizes[here],
-            table.posteriors[here],
-            partial=table.partial[here],
+            table.centers[detections],
+            table.sizes[detections],
+            table.posteriors[detections],
+            partial=table.partial[detections],
         )
     return ids
 
@@ -164,29 +164,29 @@ def _fused(table: DetectionTable, track: I4) -> tuple[F8, float]:
 
 def _extent(table: DetectionTable, track: I4) -> F8:
     """Return the median lengths (3,) of whole views, or else the largest ones of partial views."""
-    whole = track[~table.partial[track]]
-    if len(whole):
-        return np.asarray(np.median(table.sizes[whole].astype(np.float64), axis=0))
+    complete = track[~table.partial[track]]
+    if len(complete):
+        return np.asarray(np.median(table.sizes[complete].astype(np.float64), axis=0))
     return np.asarray(table.sizes[track].max(axis=0))
 
 
 def _rest(table: DetectionTable, track: I4) -> F8:
     """Return the median position (3,) of the whole views; NaN if they move or are too few."""
-    whole = table.centers[track[~table.partial[track]]]
+    complete = table.centers[track[~table.partial[track]]]
     if (
-        len(whole) < _LINE
-        or np.ptp(np.quantile(whole, [0.1, 0.9], axis=0), axis=0).max() > _STILL_M
+        len(complete) < _LINE
+        or np.ptp(np.quantile(complete, [0.1, 0.9], axis=0), axis=0).max() > _STILL_M
     ):
         return np.full(3, np.nan)
-    return np.asarray(np.median(whole, axis=0))
+    return np.asarray(np.median(complete, axis=0))
 
 
-def _line(table: DetectionTable, some: I4, at: int) -> tuple[F8, F8]:
+def _line(table: DetectionTable, detections: I4, at: int) -> tuple[F8, F8]:
     """Fit a constant velocity to detections; return position at ``at``, metres, and velocity, m/s.
 
     A prior for standing still keeps the velocity of a few noisy points small.
     """
-    stamps, centers = table.stamps(some), table.centers[some]
+    stamps, centers = table.stamps(detections), table.centers[detections]
     t = (stamps - stamps[at]) * 1e-9
     middle, mean = t.mean(), centers.mean(axis=0)
     velocity = (t - middle) @ (centers - mean) / (((t - middle) ** 2).sum() + 0.1)
@@ -198,15 +198,15 @@ def _needed(table: DetectionTable, scenes: I4, row: int, min_hits: int) -> int:
 
     Frames of other topics do not count, as their sensors may not see the object.
     """
-    near, stamps, topics = 1, table.stamps_ns, table.topics
+    frames_near, stamps, topics = 1, table.stamps_ns, table.topics
     for direction in (1, -1):
-        left, k = min_hits - 1, row + direction
-        while left and 0 <= k < len(stamps) and scenes[k] == scenes[row]:
+        missing, k = min_hits - 1, row + direction
+        while missing and 0 <= k < len(stamps) and scenes[k] == scenes[row]:
             if abs(stamps[k] - stamps[row]) > _BURST_NS:
                 break
-            own = bool(topics[k] == topics[row])
-            near, left, k = near + own, left - own, k + direction
-    return min(min_hits, near)
+            same_topic = bool(topics[k] == topics[row])
+            frames_near, missing, k = frames_near + same_topic, missing - same_topic, k + direction
+    return min(min_hits, frames_near)
 
 
 def _build_track(number: int, stream: _Followed, track: I4, settings: TrackingSettings) -> Track:

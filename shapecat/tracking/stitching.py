@@ -90,34 +90,34 @@ def _links(fragments: Fragments, settings: TrackingSettings) -> list[tuple[int, 
     limit = gate_radius(keys, settings.gate_m)
     # One side disappears behind an occluder, the other emerges.
     hidden = 2 * gate_radius(keys, np.inf)
-    known = fragments.whole >= _KNOWN
+    size_known = fragments.whole >= _KNOWN
     vague = (fragments.whole == 0) | (fragments.novelties > 1)  # the posterior is meaningless
-    found = []
+    links = []
     for i, after in enumerate(_successors(fragments, limit, settings)):
         within = np.where(fragments.cut[i, 1] & fragments.cut[after, 0], hidden[i], limit[i])
         distance = _distances(fragments, i, after, settings) / np.maximum(within, 1e-9)
-        size = _contradiction(keys[i], keys[after], known[i], known[after])
+        size = _contradiction(keys[i], keys[after], size_known[i], size_known[after])
         posterior = posterior_difference(
             fragments.posteriors[i : i + 1], fragments.posteriors[after]
         )[0]
         gap_s = (fragments.first_ns[after] - fragments.last_ns[i]) * 1e-9
         cost = distance + size / _SAME_SIZE + posterior + gap_s / (gap_s + 10)
         alike = (distance <= 1) & (size <= _SAME_SIZE)
-        agreement = (1 - distance) * (1 - size / _SAME_SIZE) * ~(known[i] & known[after])
+        agreement = (1 - distance) * (1 - size / _SAME_SIZE) * ~(size_known[i] & size_known[after])
         similar = posterior <= _SAME_POSTERIOR + _TRUSTED * agreement
         alike &= vague[i] | vague[after] | similar
-        found += [(float(c), i, int(j)) for c, j in zip(cost[alike], after[alike], strict=True)]
-    return [(i, j) for _, i, j in sorted(found)]
+        links += [(float(c), i, int(j)) for c, j in zip(cost[alike], after[alike], strict=True)]
+    return [(i, j) for _, i, j in sorted(links)]
 
 
-def _contradiction(keys: F8, others: F8, known: Bool, others_known: Bool) -> F8:
+def _contradiction(keys: F8, other_keys: F8, size_known: Bool, other_size_known: Bool) -> F8:
     """Return the contradictions (...) between `size_key` results (..., 3), which are broadcast.
 
     An object of unknown size may be larger than seen so far, so only lengths beyond a known size
-    count. ``known`` and ``others_known`` (...) say which sizes are known.
+    count. ``size_known`` and ``other_size_known`` (...) say which sizes are known.
     """
-    excess = keys - others
-    counts = np.where(excess > 0, others_known[..., None], known[..., None])
+    excess = keys - other_keys
+    counts = np.where(excess > 0, other_size_known[..., None], size_known[..., None])
     return np.asarray((np.abs(excess) * counts).mean(axis=-1))
 
 
@@ -150,13 +150,13 @@ def _distances(fragments: Fragments, i: int, after: I4, settings: TrackingSettin
     only partly visible there. Over a short gap, both ends are also extrapolated with their
     velocities to the middle of the gap. The smallest distance counts.
     """
-    ways = (
+    steps = (
         fragments.start[after] - fragments.end[i],
         fragments.start[after] - fragments.rest[i],
         fragments.rest[after] - fragments.end[i],
         fragments.rest[after] - fragments.rest[i],
     )
-    resting = np.min(np.nan_to_num(np.linalg.norm(ways, axis=2), nan=np.inf), axis=0)
+    resting = np.min(np.nan_to_num(np.linalg.norm(steps, axis=2), nan=np.inf), axis=0)
     gap_s = (fragments.first_ns[after] - fragments.last_ns[i])[:, None] * 1e-9
     meeting = (fragments.start[after] - 0.5 * gap_s * fragments.start_velocity[after]) - (
         fragments.end[i] + 0.5 * gap_s * fragments.end_velocity[i]
@@ -189,8 +189,8 @@ def scene_cuts(table: DetectionTable, settings: TrackingSettings) -> Bool:
             pairs.append((last, later))
         if older >= 0 and not result[last]:
             pairs.append((older, k))
-        same = (_continues(table, i, j, slow=slow, settings=settings) for i, j in pairs)
-        result[k] |= not any(same)
+        continues = (_continues(table, i, j, slow=slow, settings=settings) for i, j in pairs)
+        result[k] |= not any(continues)
     return np.asarray(result)
 
 
@@ -202,12 +202,12 @@ def _with_neighbours(
     These are the previous frame with detections, the previous frame, the second previous and the
     next one with detections, -1 if there is none. ``filled`` (k,) are all frames with detections.
     """
-    own, seen = np.flatnonzero(table.topics == topic), filled[table.topics[filled] == topic]
-    before = own[np.searchsorted(own, seen) - 1]
-    for n in range(1, len(seen)):
-        older = int(seen[n - 2]) if n > 1 else -1
-        later = int(seen[n + 1]) if n + 1 < len(seen) else -1
-        yield int(seen[n]), int(seen[n - 1]), int(before[n]), older, later
+    frames, nonempty = np.flatnonzero(table.topics == topic), filled[table.topics[filled] == topic]
+    before = frames[np.searchsorted(frames, nonempty) - 1]
+    for n in range(1, len(nonempty)):
+        older = int(nonempty[n - 2]) if n > 1 else -1
+        later = int(nonempty[n + 1]) if n + 1 < len(nonempty) else -1
+        yield int(nonempty[n]), int(nonempty[n - 1]), int(before[n]), older, later
 
 
 def _continues(
@@ -220,18 +220,18 @@ def _continues(
     """
     a, b = table.of_frame(i), table.of_frame(j)
     distance = np.linalg.norm(table.centers[a][:, None] - table.centers[b][None], axis=2)
-    near = distance < _NEIGHBOURHOOD_M
-    comparable = min(int(near.any(axis=1).sum()), int(near.any(axis=0).sum()))
+    nearby = distance < _NEIGHBOURHOOD_M
+    comparable = min(int(nearby.any(axis=1).sum()), int(nearby.any(axis=0).sum()))
     if comparable == 0:
         return True
     keys_a, keys_b = size_key(table.sizes[a]), size_key(table.sizes[b])
     whole_a, whole_b = ~table.partial[a][:, None], ~table.partial[b][None]
     size = _contradiction(keys_a[:, None], keys_b[None], whole_a, whole_b)
-    same = (distance <= settings.gate_m) & (size <= _SAME_SIZE)
+    matches = (distance <= settings.gate_m) & (size <= _SAME_SIZE)
     if slow:
         slack = np.where(whole_a & whole_b, 1.0, _PARTIAL_SLACK)
-        other = posterior_difference(table.posteriors[a], table.posteriors[b])
-        same &= distance <= slack * _SLOW_REACH * gate_radius(keys_a, settings.gate_m)[:, None]
-        same &= other <= slack * _SAME_POSTERIOR
-    found = min(int(same.any(axis=1).sum()), int(same.any(axis=0).sum()))
-    return 2 * found >= comparable
+        posterior_gap = posterior_difference(table.posteriors[a], table.posteriors[b])
+        matches &= distance <= slack * _SLOW_REACH * gate_radius(keys_a, settings.gate_m)[:, None]
+        matches &= posterior_gap <= slack * _SAME_POSTERIOR
+    n_matches = min(int(matches.any(axis=1).sum()), int(matches.any(axis=0).sum()))
+    return 2 * n_matches >= comparable

@@ -125,30 +125,30 @@ class Tracker:
         if len(points) == 0 and self._active is not None:
             beliefs = self._active.posterior[:0]  # an empty frame may lack the categories
         order = np.lexsort(np.column_stack([points, lengths, beliefs, cut]).T[::-1])
-        found = _seed(points[order], size_key(lengths[order]), beliefs[order])
+        detections = _seed(points[order], size_key(lengths[order]), beliefs[order])
         result = np.zeros(len(points), np.int32)
-        result[order] = self._advance(stamp_ns, found, cut[order])
+        result[order] = self._advance(stamp_ns, detections, cut[order])
         return result
 
-    def _advance(self, stamp_ns: int, found: _Active, partial: Bool) -> I4:
+    def _advance(self, stamp_ns: int, detections: _Active, partial: Bool) -> I4:
         elapsed_s = self._tick(stamp_ns)
-        found.born_ns[:] = found.seen_ns[:] = self._clock_ns
+        detections.born_ns[:] = detections.seen_ns[:] = self._clock_ns
         if self._active is None or not len(self._active.ids):
-            self._active = found.rows(np.zeros(len(found.ids), bool))
+            self._active = detections.rows(np.zeros(len(detections.ids), bool))
         active = _predict(self._active, elapsed_s)
         pairs = assign(
-            _costs(active, found, self._clock_ns, self._settings),
+            _costs(active, detections, self._clock_ns, self._settings),
             _LIMIT,
             self._settings.association,
         )
-        _correct(active, found, pairs, partial)
-        new = np.ones(len(found.ids), bool)
+        _correct(active, detections, pairs, partial)
+        new = np.ones(len(detections.ids), bool)
         new[pairs[:, 1]] = False
-        found.ids[new] = self._born + 1 + np.arange(int(new.sum()))
+        detections.ids[new] = self._born + 1 + np.arange(int(new.sum()))
         self._born += int(new.sum())
-        found.ids[pairs[:, 1]] = active.ids[pairs[:, 0]]
-        self._active = self._survivors(active).joined(found.rows(new))
-        return found.ids
+        detections.ids[pairs[:, 1]] = active.ids[pairs[:, 0]]
+        self._active = self._survivors(active).joined(detections.rows(new))
+        return detections.ids
 
     def _tick(self, stamp_ns: int) -> float:
         """Advance the clock, never backwards; return the elapsed seconds."""
@@ -212,41 +212,41 @@ def _predict(tracks: _Active, elapsed_s: float) -> _Active:
     )
 
 
-def _costs(tracks: _Active, found: _Active, clock_ns: int, settings: TrackingSettings) -> F8:
+def _costs(tracks: _Active, detections: _Active, clock_ns: int, settings: TrackingSettings) -> F8:
     """Return the costs (m, n) of pairs: distance relative to the gate, plus size and posterior.
 
     Tracks that are not confirmed cost more; pairs beyond the gate cost infinity.
     """
-    distance = np.linalg.norm(tracks.position[:, None] - found.position[None], axis=2)
+    distance = np.linalg.norm(tracks.position[:, None] - detections.position[None], axis=2)
     unseen_s = np.minimum((clock_ns - tracks.seen_ns) * 1e-9, 0.2)
     gate = np.minimum(
         gate_radius(tracks.size, settings.gate_m) + _SURPRISE_M_S * unseen_s, settings.gate_m
     )[:, None]
     costs = (
         (distance / np.maximum(gate, 1e-9)) ** 2
-        + _SIZE_WEIGHT * size_difference(tracks.size, found.size)
-        + _POSTERIOR_WEIGHT * posterior_difference(tracks.posterior, found.posterior)
+        + _SIZE_WEIGHT * size_difference(tracks.size, detections.size)
+        + _POSTERIOR_WEIGHT * posterior_difference(tracks.posterior, detections.posterior)
         + _TENTATIVE_COST * (tracks.hits < settings.min_hits)[:, None]
     )
     return np.where(distance <= gate, costs, np.inf)
 
 
-def _correct(tracks: _Active, found: _Active, pairs: I4, partial: Bool) -> None:
+def _correct(tracks: _Active, detections: _Active, pairs: I4, partial: Bool) -> None:
     """Update tracks in place with their detections; the others have missed one more frame."""
     i, j = pairs.T
     tracks.missed += 1
     tracks.missed[i] = 0
-    tracks.seen_ns[i] = found.seen_ns[j]
+    tracks.seen_ns[i] = detections.seen_ns[j]
     tracks.hits[i] += 1
     # A view of another size shows another part of the object, so its centre is less reliable.
-    odd = np.abs(tracks.size[i] - found.size[j]).mean(axis=1)
-    noise = _NOISE_M**2 * (1 + 10 * odd + 3 * partial[j])
+    size_change = np.abs(tracks.size[i] - detections.size[j]).mean(axis=1)
+    noise = _NOISE_M**2 * (1 + 10 * size_change + 3 * partial[j])
     pp, pv, vv = tracks.variance[i].T
     gain_p, gain_v = pp / (pp + noise), pv / (pp + noise)
-    surprise = found.position[j] - tracks.position[i]
-    tracks.position[i] += gain_p[:, None] * surprise
-    tracks.velocity[i] += gain_v[:, None] * surprise
+    innovation = detections.position[j] - tracks.position[i]
+    tracks.position[i] += gain_p[:, None] * innovation
+    tracks.velocity[i] += gain_v[:, None] * innovation
     tracks.variance[i] = np.column_stack([(1 - gain_p) * pp, (1 - gain_p) * pv, vv - gain_v * pv])
     rate = np.where(partial[j], 0.25, 1.0) / np.minimum(tracks.hits[i], _MEMORY_HITS)
-    tracks.size[i] += rate[:, None] * (found.size[j] - tracks.size[i])
-    tracks.posterior[i] += rate[:, None] * (found.posterior[j] - tracks.posterior[i])
+    tracks.size[i] += rate[:, None] * (detections.size[j] - tracks.size[i])
+    tracks.posterior[i] += rate[:, None] * (detections.posterior[j] - tracks.posterior[i])

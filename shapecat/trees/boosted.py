@@ -52,10 +52,10 @@ def _names(features: np.dtype[Any]) -> Iterator[str]:
 
 
 @kernel
-def logit_of(ensemble: BoostedTrees, features: F4, least: float, most: float) -> float:
+def logit_of(ensemble: BoostedTrees, features: F4, lower: float, upper: float) -> float:
     """Return the logit of features (f,): the sum of the values of the leaves they reach.
 
-    The sum stops early, `LANES` trees at a time, once it is below ``least`` or above ``most``.
+    The sum stops early, `LANES` trees at a time, once it is below ``lower`` or above ``upper``.
     """
     (roots, feature, threshold, left), value = ensemble
     leaves, logit = np.zeros(LANES, np.int32), 0.0
@@ -63,6 +63,6 @@ def logit_of(ensemble: BoostedTrees, features: F4, least: float, most: float) ->
         count = find_leaves(features, roots, feature, threshold, left, first, leaves)
         for lane in range(count):
             logit += value[leaves[lane]]
-        if not least <= logit <= most:
+        if not lower <= logit <= upper:
             break
     return float(logit)

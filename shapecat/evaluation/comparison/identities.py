@@ -76,12 +76,12 @@ def judge_identities(frames: Iterable[SeenTogether], *, threshold: float = 0.5) 
     """
     frames = list(frames)
     counts = _clear_mot(frames, threshold)
-    seen = _occurrences(frames)
-    hota, detection, association = _hota(seen)
+    occurrences = _occurrences(frames)
+    hota, detection, association = _hota(occurrences)
     errors = counts["misses"] + counts["false_positives"] + counts["switches"]
     objects = counts["objects"]
     return Identities(
-        idf1=_idf1(seen, threshold),
+        idf1=_idf1(occurrences, threshold),
         mota=1 - errors / objects if objects else float("nan"),
         hota=hota,
         detection_accuracy=detection,
@@ -144,41 +144,41 @@ def _occurrences(frames: Iterable[SeenTogether]) -> _Occurrences:
     return _Occurrences(counts[0], counts[1], numbered)
 
 
-def _idf1(seen: _Occurrences, threshold: float) -> float:
+def _idf1(occurrences: _Occurrences, threshold: float) -> float:
     """Return IDF1, the F1 of the best one-to-one assignment of tracks to objects."""
-    together = np.zeros((seen.true.size, seen.found.size))
-    for true, found, similarity in seen.frames:
+    together = np.zeros((occurrences.true.size, occurrences.found.size))
+    for true, found, similarity in occurrences.frames:
         together[np.ix_(true, found)] += similarity >= threshold
-    kept = together[linear_sum_assignment(-together)].sum()
-    total = seen.true.sum() + seen.found.sum()
-    return float(2 * kept / total) if total else float("nan")
+    matched = together[linear_sum_assignment(-together)].sum()
+    total = occurrences.true.sum() + occurrences.found.sum()
+    return float(2 * matched / total) if total else float("nan")
 
 
-def _hota(seen: _Occurrences) -> tuple[float, float, float]:
+def _hota(occurrences: _Occurrences) -> tuple[float, float, float]:
     """Return HOTA, detection accuracy and association accuracy, averaged over thresholds."""
-    if not (seen.true.sum() and seen.found.sum()):
-        return (0.0, 0.0, 0.0) if seen.true.sum() else (float("nan"),) * 3
-    alignment = _alignment(seen)
+    if not (occurrences.true.sum() and occurrences.found.sum()):
+        return (0.0, 0.0, 0.0) if occurrences.true.sum() else (float("nan"),) * 3
+    alignment = _alignment(occurrences)
     matches = np.zeros((_ALPHAS.size, *alignment.shape))
-    for true, found, similarity in seen.frames:
+    for true, found, similarity in occurrences.frames:
         score = alignment[np.ix_(true, found)] * similarity
         rows, columns = linear_sum_assignment(-score)
-        same = similarity[rows, columns] >= _ALPHAS[:, None] - 1e-9
-        matches[:, true[rows], found[columns]] += same
-    total = seen.true.sum() + seen.found.sum()
+        matched = similarity[rows, columns] >= _ALPHAS[:, None] - 1e-9
+        matches[:, true[rows], found[columns]] += matched
+    total = occurrences.true.sum() + occurrences.found.sum()
     hits = matches.sum(axis=(1, 2))
-    ever = seen.true[:, None] + seen.found - matches
+    ever = occurrences.true[:, None] + occurrences.found - matches
     association = (matches * matches / np.maximum(ever, 1)).sum(axis=(1, 2)) / np.maximum(hits, 1)
     detection = hits / (total - hits)
     hota = np.sqrt(detection * association)
     return float(hota.mean()), float(detection.mean()), float(association.mean())
 
 
-def _alignment(seen: _Occurrences) -> F8:
+def _alignment(occurrences: _Occurrences) -> F8:
     """Return the fraction of two identities' frames in which they coincide, (true, found)."""
-    together = np.zeros((seen.true.size, seen.found.size))
-    for true, found, similarity in seen.frames:
+    together = np.zeros((occurrences.true.size, occurrences.found.size))
+    for true, found, similarity in occurrences.frames:
         beside = similarity.sum(axis=0) + similarity.sum(axis=1)[:, None] - similarity
         share = np.where(beside > 1e-9, similarity / np.maximum(beside, 1e-9), 0)
         together[np.ix_(true, found)] += share
-    return np.asarray(together / (seen.true[:, None] + seen.found - together))
+    return np.asarray(together / (occurrences.true[:, None] + occurrences.found - together))

@@ -109,12 +109,12 @@ def seen_together(
     for i, item in enumerate(found):
         if item.track is None:
             continue
-        now = best.setdefault(item.track, i)
-        if matched.similarity[i].max(initial=0) > matched.similarity[now].max(initial=0):
+        best_so_far = best.setdefault(item.track, i)
+        if matched.similarity[i].max(initial=0) > matched.similarity[best_so_far].max(initial=0):
             best[item.track] = i
-    asked = {item.track: j for j, item in enumerate(true) if item.track is not None}
-    similarity = matched.similarity[np.ix_(list(best.values()), list(asked.values()))].T
-    return SeenTogether(list(asked), list(best), similarity)
+    true_tracks = {item.track: j for j, item in enumerate(true) if item.track is not None}
+    similarity = matched.similarity[np.ix_(list(best.values()), list(true_tracks.values()))].T
+    return SeenTogether(list(true_tracks), list(best), similarity)
 
 
 def labelled_part(found: Labelling, true: Labelling) -> Labelling:

@@ -123,12 +123,15 @@ def figure_rows(found: Comparison) -> list[_Row]:
 
 
 def _category_rows(category: dict[str, Any]) -> list[_Row]:
-    most = ", ".join(f"{k['true']} as {k['label']} {k['n']}×" for k in category["taken_for"][:3])
+    most_frequent = ", ".join(
+        f"{k['true']} as {k['label']} {k['n']}×" for k in category["taken_for"][:3]
+    )
     return [
         (
             "category right",
             _percent(category["accuracy"]),
-            f"of {plural(category['n'], 'matched object')}" + (f"; {most}" if most else ""),
+            f"of {plural(category['n'], 'matched object')}"
+            + (f"; {most_frequent}" if most_frequent else ""),
         ),
         ("  single views", _percent(category["view_accuracy"]), "before fusion over the track"),
         ("calibration error", f"{category['ece']:.3f}", "ECE of single views; 0 is perfect"),

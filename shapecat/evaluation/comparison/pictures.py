@@ -107,9 +107,11 @@ def _states(
             if item.pixels is not None:
                 state[item.pixels] = number
     for i, j in pairs.items():
-        mine, theirs = found.items[i].pixels, true.items[j].pixels
-        if mine is not None and theirs is not None:
-            state[np.intersect1d(mine, theirs)] = 4 if rows[i].difference == "category" else 1
+        found_pixels, true_pixels = found.items[i].pixels, true.items[j].pixels
+        if found_pixels is not None and true_pixels is not None:
+            state[np.intersect1d(found_pixels, true_pixels)] = (
+                4 if rows[i].difference == "category" else 1
+            )
     return state
 
 
@@ -118,15 +120,15 @@ def _shades(frame: Frame | None, height: int, width: int) -> U1:
     if frame is None or frame.depth is None:
         return np.full(height * width, _SHADES * 3 // 4)
     depth = np.asarray(frame.depth, np.float64)
-    seen = depth > 0
-    z = np.where(seen, depth, np.nan)
-    near, far = np.nanpercentile(z, [2, 90]) if seen.any() else (0.0, 1.0)
-    distance = np.clip((z - near) / max(far - near, 1e-3), 0, 1)
+    measured = depth > 0
+    z = np.where(measured, depth, np.nan)
+    nearest, farthest = np.nanpercentile(z, [2, 90]) if measured.any() else (0.0, 1.0)
+    distance = np.clip((z - nearest) / max(farthest - nearest, 1e-3), 0, 1)
     slope = np.hypot(*np.gradient(z)) / z
     light = 1 / np.sqrt(1 + (slope * 250) ** 2)
     shade = (0.35 + 0.65 * light) * (1 - 0.5 * distance)
     level = np.nan_to_num(shade, nan=0.2) * (_SHADES - 1)
-    return np.where(seen, level, 2).astype(np.int64).reshape(-1)
+    return np.where(measured, level, 2).astype(np.int64).reshape(-1)
 
 
 def _palette() -> U1:

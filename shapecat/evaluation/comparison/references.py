@@ -259,23 +259,23 @@ def run_labellings(finished: FinishedRun) -> Iterator[tuple[Key, Mapping[str, An
     """
     folder = finished.folder
     deleted = _deleted(folder, finished.labels)
-    wanted = ("topic", "frame", "detection", "center", "size", "orientation", "indices")
-    columns = [*wanted, "posterior", "category", "confidence"]
+    names = ("topic", "frame", "detection", "center", "size", "orientation", "indices")
+    columns = [*names, "posterior", "category", "confidence"]
     tracks = LabelledTracks.read(folder, finished.labels)
     tables = {"frames": ["topic", "frame", "stamp_ns", "up"], "detections": columns}
     for frames, detections in read_together(folder, tables):
         by_frame = rows_by_frame(detections)
         for row in frames.to_pylist():
             key = (row["topic"], row["frame"])
-            rest = {r["detection"]: r for r in by_frame.get(key, [])}
+            remaining = {r["detection"]: r for r in by_frame.get(key, [])}
             items = {}
             for label, rows in tracks.objects(key).items():
-                if rows.keys() - rest.keys():
+                if rows.keys() - remaining.keys():
                     raise misfit(folder)
-                parts = [rest.pop(number) for number in rows]
+                parts = [remaining.pop(number) for number in rows]
                 full = [tracks.full_box(k) for k in rows.values()]
                 items[min(rows)] = _item(label, parts, full, row["up"])
-            for number, r in rest.items():
+            for number, r in remaining.items():
                 if (*key, number) not in deleted:
                     untracked = (None, r["category"], r["confidence"])
                     items[number] = _item(untracked, [r], [None], row["up"])
@@ -285,11 +285,11 @@ def run_labellings(finished: FinishedRun) -> Iterator[tuple[Key, Mapping[str, An
 def _deleted(folder: Path, labels: Container[int]) -> set[tuple[str, int, int]]:
     """Return topic, frame and detection of each detection whose track a person has deleted."""
     names = ("topic", "frame", "detection", "track")
-    found = set()
+    deleted = set()
     for group in read_row_groups(folder / "tracks.parquet", names):
         rows = zip(*(group[name].to_pylist() for name in names), strict=True)
-        found |= {row[:3] for row in rows if row[3] not in labels}
-    return found
+        deleted |= {row[:3] for row in rows if row[3] not in labels}
+    return deleted
 
 
 def _item(

@@ -98,8 +98,8 @@ class CocoLabels(Reference):
 
 
 def _track_of(item: Mapping[str, Any]) -> int | None:
-    own = item.get("track_id", item.get("attributes", {}).get("track_id"))
-    return None if own is None else int(own)
+    track_id = item.get("track_id", item.get("attributes", {}).get("track_id"))
+    return None if track_id is None else int(track_id)
 
 
 def _images_of(

@@ -75,9 +75,9 @@ def _distortion_map(lens: LensCamera) -> tuple[Camera, I4, I4]:
     cx, cy = -np.floor(low * (fx, fy)) + 2
     size = np.ceil(high * (fx, fy) + (cx, cy)).astype(int) + 3
     fine = Camera(int(size[0]), int(size[1]), fx, fy, float(cx), float(cy))
-    seen = np.rint(rays * (fx, fy) + (cx, cy)).astype(np.int32)
-    seen.flags.writeable = False
-    return fine, seen[..., 1], seen[..., 0]
+    pixels = np.rint(rays * (fx, fy) + (cx, cy)).astype(np.int32)
+    pixels.flags.writeable = False
+    return fine, pixels[..., 1], pixels[..., 0]
 
 
 def _paint(
@@ -109,9 +109,9 @@ def _texture(number: int, *, plain: bool) -> F8:
     """
     rng = np.random.default_rng(number + 71)
     tone = rng.uniform(90, 180, 3) if plain else rng.uniform(30, 235, 3)
-    other = tone + rng.uniform(-25, 25, 3) if plain else rng.uniform(30, 235, 3)
+    second_tone = tone + rng.uniform(-25, 25, 3) if plain else rng.uniform(30, 235, 3)
     direction, width = rng.normal(size=3), rng.uniform(0.03, 0.08)
-    return np.stack([tone, other, direction / np.sqrt((direction * direction).sum()) / width])
+    return np.stack([tone, second_tone, direction / np.sqrt((direction * direction).sum()) / width])
 
 
 @kernel

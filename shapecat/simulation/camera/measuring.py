@@ -172,9 +172,9 @@ def _sample_beside(
         for u in range(width):
             x, y = int(np.floor(u + across[v, u] + 0.5)), int(np.floor(v + down[v, u] + 0.5))
             x, y = min(max(x, 0), width - 1), min(max(y, 0), height - 1)
-            there, here = inverse[y, x], inverse[v, u]
+            neighbour, center = inverse[y, x], inverse[v, u]
             # Only edges move; on a surface, the pixel keeps its own true depth.
-            if abs(there - here) < _DISCONTINUITY and mesh_ids[y, x] == mesh_ids[v, u]:
+            if abs(neighbour - center) < _DISCONTINUITY and mesh_ids[y, x] == mesh_ids[v, u]:
                 x, y = u, v
             out[v, u] = inverse[y, x]
             ids_out[v, u] = mesh_ids[y, x]
@@ -266,14 +266,14 @@ def _blend(inverse: F8, radius: int, out: F8) -> None:
     height, width = inverse.shape
     for v in range(height):
         for u in range(width):
-            here = inverse[v, u]
-            out[v, u] = here
-            if not (radius <= u < width - radius and radius <= v < height - radius) or here <= 0:
+            center = inverse[v, u]
+            out[v, u] = center
+            if not (radius <= u < width - radius and radius <= v < height - radius) or center <= 0:
                 continue
             edge = False
             for k in range(1, radius + 1):
-                edge = edge or abs(inverse[v, u - k] - here) > _DISCONTINUITY
-                edge = edge or abs(inverse[v, u + k] - here) > _DISCONTINUITY
+                edge = edge or abs(inverse[v, u - k] - center) > _DISCONTINUITY
+                edge = edge or abs(inverse[v, u + k] - center) > _DISCONTINUITY
             if not edge:
                 continue
             total, count = 0.0, 0

@@ -108,11 +108,13 @@ def alone_pixels(scene: Geometry, mesh_id: int, camera: Camera, frame_from_camer
     The count is 0 if a vertex is behind the camera or nearer than `NEAR_M`. ``scene`` and
     ``frame_from_camera`` are as for `render`.
     """
-    mine = scene.triangles[scene.mesh_ids == mesh_id]
-    if len(mine) == 0:
+    triangles = scene.triangles[scene.mesh_ids == mesh_id]
+    if len(triangles) == 0:
         return 0
-    used, corners = np.unique(mine, return_inverse=True)
-    alone = Geometry(scene.vertices[used], corners.reshape(-1, 3), np.zeros(len(mine), np.int32))
+    used, corners = np.unique(triangles, return_inverse=True)
+    alone = Geometry(
+        scene.vertices[used], corners.reshape(-1, 3), np.zeros(len(triangles), np.int32)
+    )
     r, t = frame_from_camera.rotation, frame_from_camera.translation
     local = (alone.vertices - t) @ r
     if local[:, 2].min() <= NEAR_M:
@@ -208,9 +210,9 @@ def _rasterize(
                     high = -1.0
             if not low <= high:
                 continue
-            rest = (ny * y + nz) * scale - per_pixel * cx
+            constant = (ny * y + nz) * scale - per_pixel * cx
             for u in range(int(np.ceil(low)), int(np.floor(high)) + 1):
-                inverse_depth = per_pixel * u + rest
+                inverse_depth = per_pixel * u + constant
                 if inverse_depth > nearest[v, u]:
                     nearest[v, u] = inverse_depth
                     triangle_ids[v, u] = m

@@ -54,13 +54,13 @@ def make_own_arms(rng: Generator, camera: Pose, height: float) -> list[Mesh]:
     height : height of the support that they reach for, metres, world frame.
     """
     ahead = camera.rotation[:, 2]
-    far = (camera.translation[2] - height) / max(-float(ahead[2]), 0.3)
+    distance = (camera.translation[2] - height) / max(-float(ahead[2]), 0.3)
     below = 1 if rng.random() < 0.75 else -1  # else it looks back at its own body
     links: list[Mesh] = []
     for side in rng.permutation([-1, 1])[: int(rng.integers(1, 3))]:
         thick = rng.uniform(0.035, 0.09)
         base = [side * rng.uniform(0.1, 0.55), below * rng.uniform(0.2, 0.6), rng.uniform(0, 0.4)]
-        depth = far * rng.uniform(0.55, 0.95)
+        depth = distance * rng.uniform(0.55, 0.95)
         aside = side * depth * rng.uniform(-0.05, 0.45)
         tip_in_camera = [aside, below * depth * rng.uniform(-0.1, 0.4), depth]
         start, tip = (camera.rotation @ p + camera.translation for p in (base, tip_in_camera))

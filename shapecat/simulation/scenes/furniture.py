@@ -46,14 +46,14 @@ def make_counter(rng: Generator) -> Support:
     return _slab("table", TABLE, (2.4, depth, 0.04), (0, 0, height))
 
 
-def make_table(rng: Generator, least: tuple[float, float] | None = None) -> Support:
+def make_table(rng: Generator, min_size: tuple[float, float] | None = None) -> Support:
     """Return a random table top, one in five round.
 
-    ``least`` is the minimum size in x and y, metres; with it, the table is rectangular.
+    ``min_size`` is the minimum size in x and y, metres; with it, the table is rectangular.
     """
     height, thick = rng.uniform(0.6, 0.9), rng.uniform(0.018, 0.04)
-    if least is not None:
-        size = (rng.uniform(1, 1.2) * least[0], rng.uniform(1, 1.2) * least[1], thick)
+    if min_size is not None:
+        size = (rng.uniform(1, 1.2) * min_size[0], rng.uniform(1, 1.2) * min_size[1], thick)
         return _slab("table", TABLE, size, (0, 0, height))
     if rng.random() < 0.2:
         return round_table(rng.uniform(0.5, 0.7), height, thick)

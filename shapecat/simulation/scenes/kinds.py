@@ -50,8 +50,8 @@ class _SceneSpec:
     def draw_shuffled(self, rng: Generator) -> list[str]:
         """Return the categories of 4 to 18 objects in random order, one in six unknown."""
         count = int(rng.integers(4, 19))
-        wanted = self.draw(rng, count - count // 6, unknown=count // 6)
-        return [str(category) for category in rng.permutation(wanted)]
+        drawn = self.draw(rng, count - count // 6, unknown=count // 6)
+        return [str(category) for category in rng.permutation(drawn)]
 
 
 def make_scene(
@@ -98,9 +98,9 @@ def _clutter(rng: Generator, spec: _SceneSpec) -> World:
     room, table = make_room(rng, wall_chance=0.2), make_table(rng)
     layout = Layout(rng, gap=0.01)
     half = rng.uniform([0.2, 0.16], [0.32, 0.24])
-    wanted = spec.draw(rng, int(rng.integers(7, 13)), unknown=int(rng.integers(0, 3)))
-    wanted.sort(key=lambda category: category not in SUPPORTING)
-    for category in wanted:
+    categories = spec.draw(rng, int(rng.integers(7, 13)), unknown=int(rng.integers(0, 3)))
+    categories.sort(key=lambda category: category not in SUPPORTING)
+    for category in categories:
         layout.gap = float(rng.choice([0.002, 0.008, 0.02]))
         layout.put(category, table, half, stack=0.3, attempts=4)
     target = np.array([0, 0, table.height + 0.06])

@@ -53,10 +53,10 @@ def make_piece(category: str, rng: Generator, *, resting_pose: str | None = None
         kind, mesh = make_distractor(rng)
     else:
         kind, mesh = category, make_object(category, rng)
-    wanted = resting_pose or _draw_resting_pose(category, rng)
+    pose_name = resting_pose or _draw_resting_pose(category, rng)
     stable_pose = StablePose(IDENTITY, "upright")
-    if wanted != "upright" and category not in {"ball", "unknown"}:
-        stable_pose = choose_stable_pose(stable_poses(mesh), wanted, rng) or stable_pose
+    if pose_name != "upright" and category not in {"ball", "unknown"}:
+        stable_pose = choose_stable_pose(stable_poses(mesh), pose_name, rng) or stable_pose
     return Piece(category, kind, mesh, stable_pose)
 
 
@@ -121,9 +121,9 @@ class Layout:
         for _ in range(tries):
             spot = middle + self._rng.uniform(-half, half)
             turn = self._random_yaw_pose(np.array([*spot, support.height]))
-            here = resting.moved(turn)
-            if self._fits(here, support):
-                self._add(piece, turn, here, support, None)
+            placed = resting.moved(turn)
+            if self._fits(placed, support):
+                self._add(piece, turn, placed, support, None)
                 return True
         return False
 
@@ -141,9 +141,9 @@ class Layout:
         for _ in range(200):
             spot = np.round(middle + self._rng.uniform(-half, half), 6)
             place = np.array([*spot, item.pose.translation[2]])
-            here = first.moved(Pose(np.eye(3), place - item.pose.translation))
-            if self._fits(here, support):
-                self._places.append(here)
+            placed = first.moved(Pose(np.eye(3), place - item.pose.translation))
+            if self._fits(placed, support):
+                self._places.append(placed)
                 return place
         return None
 
@@ -158,9 +158,9 @@ class Layout:
             slack = 0.25 * np.ptp(below.top, axis=0)
             spot = [*below.top.mean(axis=0) + self._rng.uniform(-slack, slack), below.high]
             turn = self._random_yaw_pose(np.array(spot))
-            here = resting.moved(turn)
-            if _supports(below, here) and self._fits(here, self._base_supports[k]):
-                self._add(piece, turn, here, self._base_supports[k], self.objects[k].track)
+            placed = resting.moved(turn)
+            if _supports(below, placed) and self._fits(placed, self._base_supports[k]):
+                self._add(piece, turn, placed, self._base_supports[k], self.objects[k].track)
                 return True
         return False
 
@@ -169,17 +169,17 @@ class Layout:
         angle = self._rng.uniform(0, 2 * np.pi)
         return pose_from_yaw(angle, np.round(place, 6))
 
-    def _fits(self, here: Footprint, support: Support) -> bool:
-        on_board = here.low < support.height + 1e-4
+    def _fits(self, placed: Footprint, support: Support) -> bool:
+        on_board = placed.low < support.height + 1e-4
         edge = support.outline[:, :2]
-        if on_board and not inside(here.contact, edge, _EDGE_M):
+        if on_board and not inside(placed.contact, edge, _EDGE_M):
             return False
-        if self._enclosed and not inside(here.outline, edge, 0.003):
+        if self._enclosed and not inside(placed.outline, edge, 0.003):
             return False
-        if here.high > support.height + self._headroom:
+        if placed.high > support.height + self._headroom:
             return False
-        beside = [p for p in self._places if p.low < here.high and p.high > here.low + 1e-6]
-        return not any(overlap(here.outline, p.outline, self.gap) for p in beside)
+        beside = [p for p in self._places if p.low < placed.high and p.high > placed.low + 1e-6]
+        return not any(overlap(placed.outline, p.outline, self.gap) for p in beside)
 
     def _can_support(self, k: int) -> bool:
         top = self._places[k].top
@@ -187,7 +187,7 @@ class Layout:
         return flat and self.objects[k].category in SUPPORTING
 
     def _add(
-        self, piece: Piece, turn: Pose, here: Footprint, support: Support, on_track: int | None
+        self, piece: Piece, turn: Pose, placed: Footprint, support: Support, on_track: int | None
     ) -> None:
         # No pose of a box is its upright one.
         resting_pose = "upright" if piece.category == "box" else piece.stable_pose.name
@@ -203,7 +203,7 @@ class Layout:
             upside_down=resting_pose == "upside_down",
         )
         self.objects.append(item)
-        self._places.append(here)
+        self._places.append(placed)
         self._base_supports.append(support)
 
 

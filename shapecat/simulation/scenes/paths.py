@@ -69,16 +69,16 @@ def arc_orbit(
     azimuth = -np.pi / 2 + width * np.sin(speed / width * t + phase)
     slow = rng.uniform(0.1, 0.35, 3) * 2 * np.pi
     shift = rng.uniform(0, 2 * np.pi, 6)
-    far = distance * (1 + 0.1 * np.sin(slow[0] * t + shift[0]))
+    radius = distance * (1 + 0.1 * np.sin(slow[0] * t + shift[0]))
     up = np.radians(elevation + 4 * np.sin(slow[1] * t + shift[1]))
-    flat = far * np.cos(up)
+    flat = radius * np.cos(up)
     step = 2 * np.pi * 1.8  # steps per second
     bob = 0.006 * np.sin(step * t + shift[2])
     eye = np.stack(
         [
             target[0] + flat * np.cos(azimuth),
             target[1] + flat * np.sin(azimuth),
-            target[2] + far * np.sin(up) + bob,
+            target[2] + radius * np.sin(up) + bob,
         ],
         -1,
     )

@@ -168,8 +168,8 @@ def _rests_on(mesh: Mesh, landed: SettledPose, below: Support, highest_m: float)
     low, high = points.min(axis=0), points.max(axis=0)
     edge = below.outline[:, :2]
     middle = (low + high)[:2] / 2
-    held = ((edge.min(axis=0) < middle) & (middle < edge.max(axis=0))).all()
-    return bool(held and low[2] > below.height - _FALLEN_M and high[2] < below.height + highest_m)
+    inside = ((edge.min(axis=0) < middle) & (middle < edge.max(axis=0))).all()
+    return bool(inside and low[2] > below.height - _FALLEN_M and high[2] < below.height + highest_m)
 
 
 def _placed_object(

@@ -50,8 +50,8 @@ def room(
     objects = settled(items, drops, solid, table)
     target = np.array([0, 0, table.height + rng.uniform(0.0, 0.2)])
     path = arc_orbit(rng, target, filming, distance=(0.7, 2.2), elevation=(12, 60), sweep=(15, 60))
-    rest = [s for s in supports if s is not table]
-    everything = (*rest, *solid, *as_equipment("room", around))
+    other_supports = [s for s in supports if s is not table]
+    everything = (*other_supports, *solid, *as_equipment("room", around))
     return World("room", everything, objects, path)
 
 
@@ -65,8 +65,8 @@ def _walls(rng: Generator) -> Iterator[Support]:
     """Yield walls and cupboards beside the table."""
     for side in (-1, 1):
         if rng.random() < 0.35:
-            far = side * rng.uniform(1.0, 1.9)
-            yield make_wall(f"wall_{side}", (0.1, 6.0, 2.6), (far, 0.0))
+            distance = side * rng.uniform(1.0, 1.9)
+            yield make_wall(f"wall_{side}", (0.1, 6.0, 2.6), (distance, 0.0))
         elif rng.random() < 0.3:
             size = (rng.uniform(0.3, 0.8), rng.uniform(0.3, 0.6), rng.uniform(0.5, 1.9))
             place = (side * rng.uniform(1.1, 1.6), rng.uniform(0, 0.7))

@@ -146,8 +146,8 @@ class World(Record):
     @cached_property
     def _labels(self) -> U1:
         """(n + 1,) labels of the supports, then of the objects; the last is that of no mesh."""
-        found = [s.label for s in self.supports] + [t.label for t in self.objects]
-        return np.array([*found, 0], np.uint8)
+        labels = [s.label for s in self.supports] + [t.label for t in self.objects]
+        return np.array([*labels, 0], np.uint8)
 
     @cached_property
     def _shifts(self) -> dict[int, F8]:

@@ -200,8 +200,8 @@ def _pump(rng: Generator, radius: float, height: float) -> list[Mesh]:
     stem = rng.uniform(0.02, 0.045)
     thick = float(np.clip(0.35 * radius, 0.003, 0.006))
     z = height + stem
-    reach = rng.uniform(0.02, 0.04)
-    beak = [[-1.6 * thick, 0, z], [0.4 * reach, 0, z + 0.002], [reach, 0, z - 0.004]]
+    length = rng.uniform(0.02, 0.04)
+    beak = [[-1.6 * thick, 0, z], [0.4 * length, 0, z + 0.002], [length, 0, z - 0.004]]
     return [
         tube([[0, 0, height - 0.004], [0, 0, height + stem / 2], [0, 0, z]], thick, segments=8),
         tube(smooth_path(beak, 6), 1.5 * thick, segments=8),

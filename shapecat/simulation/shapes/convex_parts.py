@@ -68,12 +68,12 @@ def _samples(mesh: Mesh) -> F8:
     corners = np.asarray(mesh.vertices, np.float64)[mesh.triangles]
     longest = np.linalg.norm(corners - np.roll(corners, 1, axis=1), axis=2).max(axis=1)
     counts = np.ceil(longest / _PITCH_M).astype(int).clip(1, 100)
-    found = [np.asarray(mesh.vertices, np.float64)]
+    samples = [np.asarray(mesh.vertices, np.float64)]
     for n in np.unique(counts):
         i, j = np.triu_indices(n + 1)
         weights = np.stack([i, j - i, n - j], -1) / n
-        found.append((weights @ corners[counts == n]).reshape(-1, 3))
-    return np.concatenate(found)
+        samples.append((weights @ corners[counts == n]).reshape(-1, 3))
+    return np.concatenate(samples)
 
 
 def _blocks(points: F8) -> Iterator[F8]:

@@ -63,8 +63,8 @@ def _bag(rng: Generator) -> Mesh:
     crease = np.sin(outline @ waves.T + rng.uniform(0, 6, 5)).mean(axis=1)
     tall = np.sign(points[:, 2]) * np.abs(points[:, 2]) ** rng.uniform(0.8, 1.6) * full
     tall *= 1 + rng.uniform(0.05, 0.35) * crease
-    whole = Mesh(np.column_stack([outline, tall]), mesh.triangles)
-    return standing(placed(whole, about="x", degrees=float(rng.choice([0, 0, 80]))))
+    bag = Mesh(np.column_stack([outline, tall]), mesh.triangles)
+    return standing(placed(bag, about="x", degrees=float(rng.choice([0, 0, 80]))))
 
 
 def _gadget(rng: Generator) -> Mesh:

@@ -144,13 +144,13 @@ def _funnel(rng: Generator) -> Mesh:
 
 
 def _tap(rng: Generator) -> Mesh:
-    h, reach = rng.uniform(0.15, 0.25), rng.uniform(0.08, 0.15)
+    h, length = rng.uniform(0.15, 0.25), rng.uniform(0.08, 0.15)
     neck = [
         [0.0, 0, 0],
         [0, 0, 0.8 * h],
-        [0.3 * reach, 0, h],
-        [0.85 * reach, 0, 0.95 * h],
-        [reach, 0, 0.75 * h],
+        [0.3 * length, 0, h],
+        [0.85 * length, 0, 0.95 * h],
+        [length, 0, 0.75 * h],
     ]
     return join(
         [lathe([[0, 0], [0.035, 0], [0.03, 0.02], [0, 0.025]]), tube(smooth_path(neck, 18), 0.011)]

@@ -191,13 +191,13 @@ def _section(rng: Generator, *, oval: float, square: float, facets: float) -> di
 def _handle_shape(rng: Generator, diameter: float, height: float) -> tuple[F8, float, float]:
     """Draw a handle: its curve (k, 2) outward and up from mid-wall, its radius and flatness."""
     tall = height * rng.uniform(0.25, 0.4)
-    reach = diameter * rng.uniform(0.2, 0.42)
+    depth = diameter * rng.uniform(0.2, 0.42)
     curves = (
         [(-0.12, 1), (0.55, 1.0), (1, 0.55), (1, -0.5), (0.55, -0.95), (-0.12, -0.9)],  # D
         [(-0.1, 0.95), (0.7, 1.0), (1.05, 0.35), (0.75, -0.3), (-0.1, -0.9)],  # ear
         [(-0.1, 0.9), (0.95, 0.98), (1.0, -0.95), (-0.1, -0.9)],  # square
     )
-    curve = np.array(curves[int(rng.integers(len(curves)))]) * [reach, tall]
+    curve = np.array(curves[int(rng.integers(len(curves)))]) * [depth, tall]
     radius = float(np.clip(diameter * rng.uniform(0.045, 0.085), 0.003, 0.01))
     lifted = height * rng.uniform(-0.02, 0.08)
     curve[:, 1] += min(lifted, 0.43 * height - radius - curve[:, 1].max())
@@ -209,6 +209,6 @@ def _handle(outer: F8, shape: tuple[F8, float, float], wall: float, side: float)
     height = curve[:, 1] + outer[-1, 1] / 2
     ends = np.interp(height[[0, -1]], outer[:, 1], outer[:, 0]) - 0.5 * wall
     start = np.interp(np.linspace(0, 1, len(curve)), [0, 1], ends)
-    reach = start + np.maximum(curve[:, 0], 0)
-    points = np.stack([reach * np.cos(side), reach * np.sin(side), height], -1)
+    from_axis = start + np.maximum(curve[:, 0], 0)
+    points = np.stack([from_axis * np.cos(side), from_axis * np.sin(side), height], -1)
     return tube(points, radius, segments=8, flatness=flatness)

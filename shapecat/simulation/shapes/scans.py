@@ -84,12 +84,12 @@ def upright_poses(mesh: Mesh, category: str) -> tuple[StablePose, ...]:
     ------
     ValueError : no face of the convex hull is stable.
     """
-    found = stable_poses(uprighted(mesh, category))
-    if not found:
+    poses = stable_poses(uprighted(mesh, category))
+    if not poses:
         msg = f"a {category} that cannot stand or lie"
         raise ValueError(msg)
     order = {"upright": 0, "lying": 1, "upside_down": 2}
-    return tuple(sorted(found, key=lambda stable: order[stable.name]))
+    return tuple(sorted(poses, key=lambda stable: order[stable.name]))
 
 
 def _roundness(points: F8) -> float:
@@ -125,16 +125,16 @@ def _hollow(points: F8, mesh: Mesh) -> float:
     The depth is relative to the greatest distance from the z axis.
     """
     turned = Mesh(points, mesh.triangles)
-    far = 40 * float(np.abs(points).max())
+    distance = 40 * float(np.abs(points).max())
     span = float(np.abs(points[:, :2]).max())
-    camera = Camera(64, 64, 31 * far / span, 31 * far / span, 31.5, 31.5)
-    above = Pose(np.array([[1.0, 0, 0], [0, -1, 0], [0, 0, -1]]), np.array([0, 0, far]))
+    camera = Camera(64, 64, 31 * distance / span, 31 * distance / span, 31.5, 31.5)
+    above = Pose(np.array([[1.0, 0, 0], [0, -1, 0], [0, 0, -1]]), np.array([0, 0, distance]))
     image = render(geometry([(turned, IDENTITY)]), camera, above)
-    seen = image.mesh_ids >= 0
-    height = far - image.depth
-    middle = np.zeros_like(seen)
+    visible = image.mesh_ids >= 0
+    height = distance - image.depth
+    middle = np.zeros_like(visible)
     middle[20:44, 20:44] = True
-    inside = height[seen & middle]
+    inside = height[visible & middle]
     if inside.size == 0:
         return 0.0
     return float(points[:, 2].max() - np.median(inside)) / span

@@ -44,22 +44,22 @@ def stable_poses(mesh: Mesh) -> tuple[StablePose, ...]:
     foot = middle + height[:, None] * normals
     stable = _inside(corners, normals, foot)
     faces = np.unique(np.round(normals[stable], 6), axis=0)
-    found = []
+    poses = []
     for down in faces:
         rotation = np.round(gravity_rotation(-down), 9)
         z = points @ rotation[2]
         place = np.array([*-(rotation[:2] @ middle), -z.min()])
         tilt = rotation[2, 2]
         name = "upright" if tilt > 0.966 else "upside_down" if tilt < -0.966 else "lying"
-        found.append(StablePose(Pose(rotation, np.round(place, 9)), name))
-    return tuple(found)
+        poses.append(StablePose(Pose(rotation, np.round(place, 9)), name))
+    return tuple(poses)
 
 
 def choose_stable_pose(
-    found: tuple[StablePose, ...], name: str, rng: Generator
+    poses: tuple[StablePose, ...], name: str, rng: Generator
 ) -> StablePose | None:
     """Draw a random stable pose with this name; None if there is none."""
-    fitting = [stable for stable in found if stable.name == name]
+    fitting = [stable for stable in poses if stable.name == name]
     return fitting[int(rng.integers(len(fitting)))] if fitting else None
 
 

@@ -45,11 +45,11 @@ def _hand(rng: Generator) -> Mesh:
     parts = [placed(ellipsoid([0.045, 0.042, 0.018]), [0, 0, 0.03])]
     curl = rng.uniform(0.0, 0.03)
     for k, y in enumerate(np.linspace(-0.032, 0.032, 4)):
-        reach = rng.uniform(0.06, 0.085) * (1 - 0.1 * abs(k - 1.5))
+        length = rng.uniform(0.06, 0.085) * (1 - 0.1 * abs(k - 1.5))
         path = [
             [0.03, y, 0.03],
-            [0.035 + 0.5 * reach, 1.15 * y, 0.04 + 0.3 * curl],
-            [0.035 + reach, 1.2 * y, 0.03 - curl],
+            [0.035 + 0.5 * length, 1.15 * y, 0.04 + 0.3 * curl],
+            [0.035 + length, 1.2 * y, 0.03 - curl],
         ]
         parts.append(tube(smooth_path(path, 7), 0.009, segments=8))
     thumb = [[-0.01, 0.035, 0.03], [0.02, 0.065, 0.03], [0.05, 0.075, 0.028]]
