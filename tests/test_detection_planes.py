@@ -11,7 +11,7 @@ from shapecat.config import DetectionSettings, Settings
 from shapecat.detection import detect
 from shapecat.detection.depth_grid import DepthGrid, PinholeIntrinsics, downsample
 from shapecat.detection.planes import find_supporting_planes
-from shapecat.detection.planes.assumed import assume_plane, unexplained
+from shapecat.detection.planes.assumed import assume_plane, find_unexplained
 from shapecat.detection.planes.horizontal import find_horizontal_planes
 from shapecat.detection.planes.oriented_points import orient_points
 from shapecat.detection.planes.ransac import draw_trials
@@ -173,8 +173,8 @@ def test_no_plane_is_assumed_for_few_samples_or_above_camera() -> None:
     few = np.zeros((60, 80), np.int8)
     few[6:] = -1  # a tenth of the cells is above no plane
     up = np.array([0.0, 0.0, -1.0])
-    assert unexplained(grid, few) is None
-    rest = unexplained(grid, ~few)
+    assert find_unexplained(grid, few) is None
+    rest = find_unexplained(grid, ~few)
     assert rest is not None
     np.testing.assert_array_equal(rest, few == -1)
     assert assume_plane(grid, rest, -up, tallest_m=0.5) is None
@@ -184,7 +184,7 @@ def test_no_plane_is_assumed_for_few_samples_or_above_camera() -> None:
     for low in (0.0, 0.001, 0.008):  # less than a bin of the histogram
         assert assume_plane(grid, rest, up, tallest_m=low) is not None
     far = grid._replace(inverse_depth=np.where(few < 0, np.float32(0.4), grid.inverse_depth))
-    assert unexplained(far, ~few) is None  # background, 2.5 m away
+    assert find_unexplained(far, ~few) is None  # background, 2.5 m away
 
 
 @pytest.mark.parametrize("first", [3002, pytest.param(3005, marks=pytest.mark.many)])

@@ -42,7 +42,7 @@ from shapecat.detection.output.point_labels import label_points
 from shapecat.detection.output.scene import build_scene
 from shapecat.detection.output.settings import OUTPUT
 from shapecat.detection.planes import find_supporting_planes
-from shapecat.detection.planes.assumed import assume_plane, unexplained
+from shapecat.detection.planes.assumed import assume_plane, find_unexplained
 from shapecat.detection.planes.extent import SupportingPlane
 from shapecat.detection.planes.height_map import HeightMap, measure_heights, pack_planes
 from shapecat.detection.planes.ransac import draw_trials
@@ -201,12 +201,14 @@ def _find_assumed_plane(
     grid: DepthGrid, heights: HeightMap, up: F8, trials: F8, settings: DetectionSettings
 ) -> SupportingPlane | None:
     """Assume a plane below samples that neither planes nor walls explain; None if they are few."""
-    rest = unexplained(grid, heights.plane_id)
-    if rest is not None:
+    unexplained = find_unexplained(grid, heights.plane_id)
+    if unexplained is not None:
         plane_id = heights.plane_id.copy()  # low-profile objects are found before the final walls
         walls = remove_walls(grid, plane_id, up, settings.max_size_m, trials)
-        rest = unexplained(grid, plane_id.view(np.uint8) | walls)
-    return None if rest is None else assume_plane(grid, rest, up, settings.max_height_m)
+        unexplained = find_unexplained(grid, plane_id.view(np.uint8) | walls)
+    if unexplained is None:
+        return None
+    return assume_plane(grid, unexplained, up, settings.max_height_m)
 
 
 def _oversegment(grid: DepthGrid, model: PlaneModel) -> OverSegmentation:

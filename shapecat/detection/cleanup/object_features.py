@@ -21,7 +21,7 @@ from shapecat.detection.merging.segment_features import (
     write_segment_features,
 )
 from shapecat.detection.merging.segments import Records, Row, Segments, depth_of
-from shapecat.detection.planes.height_map import distance_outside, least_height_at
+from shapecat.detection.planes.height_map import distance_outside, min_height_at
 from shapecat.detection.records import OverSegmentation, PlaneModel
 from shapecat.geometry import DISCONTINUITY
 from shapecat.jit import kernel
@@ -167,7 +167,7 @@ def _measure_plane(cells: LabelledGrid, segments: Segments, rows: Records) -> No
                     rows[p].plane_noise += height[y, x] ** 2
     for p in range(1, len(rows)):
         if count[p] > 0:
-            row, least = rows[p], least_height_at(depth_of(segments, p))
+            row, least = rows[p], min_height_at(depth_of(segments, p))
             mean = row.plane_height / count[p]
             variance = max(row.plane_noise / count[p] - mean * mean, 0.0)
             row.plane_height, row.plane_noise = mean / least, math.sqrt(variance) / least
@@ -192,7 +192,7 @@ def _measure(grid: DepthGrid, planes: F8, segments: Segments, down: float, out: 
         around.depth_edge = share(around.depth_edge, shape.boundary)
         _measure_outside(grid, planes[segments.plane_id[p] - 1], segments.samples[p], around)
         seen.cells, seen.depth_m, seen.cell_m, seen.down = shape.count, depth, cell, down
-        seen.top_by_noise = shape.top / least_height_at(depth)
+        seen.top_by_noise = shape.top / min_height_at(depth)
         seen.slant = share(shape.area, shape.count * cell * depth / grid.intrinsics.fy)
         seen.ragged = share(shape.boundary * shape.boundary, shape.count)
 

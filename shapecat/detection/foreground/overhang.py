@@ -13,7 +13,7 @@ from shapecat.detection.connected_components import SIDES
 from shapecat.detection.depth_grid import DepthGrid, back_project, row_and_column
 from shapecat.detection.foreground.settings import OVERHANG
 from shapecat.detection.foreground.walls import CLEARED
-from shapecat.detection.planes.height_map import HeightMap, distance_outside, least_height_at
+from shapecat.detection.planes.height_map import HeightMap, distance_outside, min_height_at
 from shapecat.jit import kernel, unset
 
 __all__ = ["extend_overhang"]
@@ -144,7 +144,7 @@ def _height_beside(over: Overhang, i: int, j: int) -> float:
         return 0.0
     z = 1 / float(w)
     height = (w - (plane[0] * j + plane[1] * i + plane[2])) * z * plane[3]
-    if not (least_height_at(z) < height < over.highest_m):
+    if not (min_height_at(z) < height < over.highest_m):
         return 0.0
     x, y = back_project(k, i, j, z)
     return height if distance_outside(plane, x, y, z) <= OVERHANG.reach_m else 0.0

@@ -9,10 +9,10 @@ from shapecat.detection.depth_grid import BORDER_SHARE, DepthGrid, PinholeIntrin
 from shapecat.detection.foreground.settings import WALLS
 from shapecat.detection.planes.ransac import (
     DepthSamples,
-    off_plane,
     plane_normal,
     ransac_plane,
     sample_grid,
+    select_outliers,
 )
 from shapecat.detection.planes.settings import PLANES
 from shapecat.geometry import cross
@@ -58,7 +58,7 @@ def remove_walls(grid: DepthGrid, plane_id: I4, up: F8, largest_m: float, trials
         normal = plane_normal(plane, grid.intrinsics)
         if _is_wall(grid, samples, plane, normal, up, largest_m):
             _clear(grid, plane_id, plane, normal, walls)
-        samples = off_plane(samples, plane, 2 * PLANES.tolerance)
+        samples = select_outliers(samples, plane, 2 * PLANES.tolerance)
     return walls
 
 

@@ -9,7 +9,7 @@ from shapecat.detection.cleanup.settings import CLEANUP
 from shapecat.detection.connected_components import span_of
 from shapecat.detection.depth_grid import DepthGrid, row_and_column
 from shapecat.detection.output.pixel_runs import append_run, pixels_by_label, split_by_label
-from shapecat.detection.planes.height_map import HEIGHT_NOISE, MIN_HEIGHT_M, least_height_at
+from shapecat.detection.planes.height_map import HEIGHT_NOISE, MIN_HEIGHT_M, min_height_at
 from shapecat.detection.records import Segmentation
 from shapecat.geometry import NEAREST_M
 from shapecat.jit import kernel, unset
@@ -283,7 +283,7 @@ def settle_labels(grid_labels: GridLabels, cells: I4, places: F8, n: int, marks:
             continue
         k = plane_ids[label]
         h = (1 - (planes[k, 0] * u + planes[k, 1] * v + planes[k, 2]) * z) * planes[k, 3]
-        if filled[i, j] or h > CLEANUP.fringe * least_height_at(z):
+        if filled[i, j] or h > CLEANUP.fringe * min_height_at(z):
             marks[m] = label
 
 

@@ -13,7 +13,7 @@ from shapecat.detection.output.label_upsampling import (
 from shapecat.detection.output.occluded_points import label_occluded_points
 from shapecat.detection.output.pixel_runs import pixels_by_label, split_by_label
 from shapecat.detection.output.settings import OUTPUT
-from shapecat.detection.planes.height_map import distance_outside, least_height_at
+from shapecat.detection.planes.height_map import distance_outside, min_height_at
 from shapecat.detection.records import Segmentation
 from shapecat.detection.virtual_camera import VirtualImage
 from shapecat.jit import kernel
@@ -60,7 +60,7 @@ def _above(
             )
             h = (1 / z - level - plane[2]) * z * plane[3]
             result[k] = (
-                h > least_height_at(z) and h < highest_m and distance_outside(plane, x, y, z) <= 0
+                h > min_height_at(z) and h < highest_m and distance_outside(plane, x, y, z) <= 0
             )
     return result
 

@@ -37,13 +37,13 @@ def find_supporting_planes(
     no level surface is found.
     """
     points = orient_points(grid)
-    known = np.zeros(3) if hint is None else hint
-    up = estimate_up(points, grid.intrinsics, known, trials, UP.roll_penalty if upright else 0.0)
-    found = find_horizontal_planes(grid, points, up, trials)
-    if not found:
+    prior = np.zeros(3) if hint is None else hint
+    up = estimate_up(points, grid.intrinsics, prior, trials, UP.roll_penalty if upright else 0.0)
+    candidates = find_horizontal_planes(grid, points, up, trials)
+    if not candidates:
         return [], up
-    if may_have_strips(grid, points, found):
-        found = add_strip_planes(grid, found)
-    supports = supporting_planes(grid, found, tallest_m)
+    if may_have_strips(grid, points, candidates):
+        candidates = add_strip_planes(grid, candidates)
+    supports = supporting_planes(grid, candidates, tallest_m)
     largest = max(supports, key=lambda plane: plane.area_m2, default=None)
     return supports, up if largest is None else largest.up

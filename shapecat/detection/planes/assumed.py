@@ -12,24 +12,26 @@ from shapecat.detection.planes.extent import COS, SIN, SupportingPlane, level_co
 from shapecat.detection.planes.ransac import horizontal_plane
 from shapecat.detection.planes.settings import ASSUMED, PLANES, UP
 
-__all__ = ["assume_plane", "unexplained"]
+__all__ = ["assume_plane", "find_unexplained"]
 
 EVERY = 4
 """Step between the unexplained samples that place the plane."""
 
 
-def unexplained(grid: DepthGrid, explained: I4 | U1) -> Bool | None:
-    """Return the near samples where ``explained`` is 0, (rows, columns); None if they are few.
+def find_unexplained(grid: DepthGrid, explained: I4 | U1) -> Bool | None:
+    """Return the near samples where ``explained`` is 0, (rows, columns) bool; None if too few.
 
     ``explained`` (rows, columns) is not 0 on a plane, above one, or on a wall.
     """
-    seen = grid.inverse_depth > np.float32(1 / ASSUMED.near_m)
-    rest: Bool = (explained == 0) & seen
-    few = np.count_nonzero(rest) <= ASSUMED.unexplained * np.count_nonzero(seen)
-    return None if few else rest
+    in_range = grid.inverse_depth > np.float32(1 / ASSUMED.max_depth_m)
+    unexplained: Bool = (explained == 0) & in_range
+    too_few = np.count_nonzero(unexplained) <= ASSUMED.unexplained * np.count_nonzero(in_range)
+    return None if too_few else unexplained
 
 
-def assume_plane(grid: DepthGrid, rest: Bool, up: F8, tallest_m: float) -> SupportingPlane | None:
+def assume_plane(
+    grid: DepthGrid, unexplained: Bool, up: F8, tallest_m: float
+) -> SupportingPlane | None:
     """Return the level plane below most unexplained samples; None if it is above the camera.
 
     It is the plane with the most surface within the height of an object above it; near surface has
@@ -37,19 +39,19 @@ def assume_plane(grid: DepthGrid, rest: Bool, up: F8, tallest_m: float) -> Suppo
 
     Parameters
     ----------
-    rest : from `unexplained`.
+    unexplained : (rows, columns) from `find_unexplained`.
     up : (3,) unit normal of the plane, sensor frame.
     tallest_m : height of the tallest object, metres.
     """
-    some = np.zeros(rest.shape, np.bool_)
-    some.flat[np.flatnonzero(rest)[::EVERY]] = True
-    across, along, height = level_coordinates(grid, some, up)
-    z = 1 / grid.inverse_depth[some].astype(np.float64)
+    subset = np.zeros(unexplained.shape, np.bool_)
+    subset.flat[np.flatnonzero(unexplained)[::EVERY]] = True
+    across, along, height = level_coordinates(grid, subset, up)
+    z = 1 / grid.inverse_depth[subset].astype(np.float64)
     offset = _fullest_interval(height, 1 / (1 + (z / UP.half_weight_m) ** 2), tallest_m)
     if offset >= 0:  # its upper side is not visible
         return None
-    held = (height > offset) & (height < offset + tallest_m)
-    sides = COS[:, None] * across[held] + SIN[:, None] * along[held]
+    inside = (height > offset) & (height < offset + tallest_m)
+    sides = COS[:, None] * across[inside] + SIN[:, None] * along[inside]
     a, b, c = horizontal_plane(grid.intrinsics, up, offset)
     extent = sides.max(axis=1, initial=-np.inf) + PLANES.margin_m
     return SupportingPlane(a, b, c, up, offset, extent, 0.0)
@@ -64,5 +66,5 @@ def _fullest_interval(height: F8, weight: F8, tallest_m: float) -> float:
     inside = total[window:] - total[:-window]
     start = int(np.argmax(inside))
     above = np.cumsum(count[start:])
-    start += int(np.argmax(above > ASSUMED.few * inside[start]))
+    start += int(np.argmax(above > ASSUMED.noise_share * inside[start]))
     return low + start * PLANES.bin_m - PLANES.margin_m

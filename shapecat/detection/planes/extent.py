@@ -86,10 +86,10 @@ def area_of(samples: DepthSamples, plane: F8, distance: float) -> float:
     total = 0.0
     for k in range(inv_depth.size):
         level = plane[0] * j[k] + plane[1] * i[k] + plane[2]
-        near = (level > 0) & (abs(inv_depth[k] - level) < PLANES.tolerance)
+        inlier = (level > 0) & (abs(inv_depth[k] - level) < PLANES.tolerance)
         facing = level * distance  # the cosine between the normal and the ray
         area = 1 / (level * level * (facing if facing > 0.05 else 0.05))
-        total += area if near else 0.0
+        total += area if inlier else 0.0
     return float(samples.share * total)
 
 
@@ -132,14 +132,17 @@ def _extent_of(grid: DepthGrid, plane: F8, normal: F8, ends: I4) -> F8:
                 p = (across[0] * x + across[1] * y + across[2]) / level
                 q = (along[0] * x + along[1] * y + along[2]) / level
                 for k in range(DIRECTIONS):
-                    there = COS[k] * p + SIN[k] * q + PLANES.margin_m
-                    extent[k] = there if there > extent[k] else extent[k]
+                    support = COS[k] * p + SIN[k] * q + PLANES.margin_m
+                    extent[k] = support if support > extent[k] else extent[k]
     return extent
 
 
-def level_coordinates(grid: DepthGrid, chosen: Bool, up: F8) -> F8:
-    """Return the chosen samples (rows, columns) as (3, n) metres in the level frame of ``up``."""
-    i, j = np.nonzero(chosen)
+def level_coordinates(grid: DepthGrid, mask: Bool, up: F8) -> F8:
+    """Return masked samples as points (3, n) in the level frame of ``up``, metres.
+
+    ``mask`` is (rows, columns).
+    """
+    i, j = np.nonzero(mask)
     z = 1 / grid.inverse_depth[i, j].astype(np.float64)
     k = grid.intrinsics
     points = np.stack([(j - k.cx) / k.fx * z, (i - k.cy) / k.fy * z, z])

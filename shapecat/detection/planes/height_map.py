@@ -16,8 +16,8 @@ __all__ = [
     "OUTLINE",
     "HeightMap",
     "distance_outside",
-    "least_height_at",
     "measure_heights",
+    "min_height_at",
     "pack_planes",
 ]
 
@@ -87,7 +87,7 @@ def _assign(grid: DepthGrid, plane: F8, number: int, highest: float, heights: He
     inv_depth, intrinsics, (plane_id, height) = grid.inverse_depth, grid.intrinsics, heights
     rows, columns = inv_depth.shape
     a, scale, zero, one = np.float32(plane[0]), np.float32(plane[3]), np.float32(0), np.float32(1)
-    least, noise, below = np.float32(MIN_HEIGHT_M), np.float32(HEIGHT_NOISE), np.float32(OUT)
+    min_height, noise, outside = np.float32(MIN_HEIGHT_M), np.float32(HEIGHT_NOISE), np.float32(OUT)
     beyond, high = np.float32(BEYOND_M), np.float32(highest)
     above, surface = np.int8(number), np.int8(-number)
     x = np.arange(columns).astype(np.float32)
@@ -103,38 +103,41 @@ def _assign(grid: DepthGrid, plane: F8, number: int, highest: float, heights: He
             sides[k, 2] += part * (plane[6 + 3 * d] - p * intrinsics.cx - q * intrinsics.cy)
     for i in range(rows):
         base = np.float32(plane[1] * i + plane[2])
-        some = False
+        any_valid = False
         for j in range(np.uint64(columns)):
             v = inv_depth[i, j]
             z = one / v if v > zero else zero
             h = (v - (a * x[j] + base)) * z * scale
-            gate = least + noise * z * z
-            use = (v > zero) & (h > -gate) & (h < high) & (plane_id[i, j] == 0)
-            line[j] = h if use else below
+            gate = min_height + noise * z * z
+            valid = (v > zero) & (h > -gate) & (h < high) & (plane_id[i, j] == 0)
+            line[j] = h if valid else outside
             slack[j] = zero if h > gate else beyond * v
-            some |= use
-        if not some:
+            any_valid |= valid
+        if not any_valid:
             continue
-        left, right, farthest, nearest = _bounds(line, inv_depth, i)
+        left, right, min_inv_depth, max_inv_depth = _bounds(line, inv_depth, i)
         for k in range(DIRECTIONS // 2):
             step, first = np.float32(sides[k, 0]), np.float32(sides[k, 1] * i + sides[k, 2])
-            far = np.float32(plane[OUTLINE + k])
-            near = np.float32(plane[OUTLINE + k + DIRECTIONS // 2])
+            extent = np.float32(plane[OUTLINE + k])
+            opposite = np.float32(plane[OUTLINE + k + DIRECTIONS // 2])
             # Few rows reach beyond a side; bounds rule out most of the others.
             ends = step * left + first, step * right + first
-            scratch = min(far * farthest, far * nearest), min(near * farthest, near * nearest)
-            if max(ends[0], ends[1]) <= scratch[0] and -min(ends[0], ends[1]) <= scratch[1]:
+            limits = (
+                min(extent * min_inv_depth, extent * max_inv_depth),
+                min(opposite * min_inv_depth, opposite * max_inv_depth),
+            )
+            if max(ends[0], ends[1]) <= limits[0] and -min(ends[0], ends[1]) <= limits[1]:
                 continue
             for j in range(np.uint64(columns)):
-                v, more = inv_depth[i, j], slack[j]
+                v, margin = inv_depth[i, j], slack[j]
                 t = step * x[j] + first
-                within = (t <= far * v + more) & (-t <= near * v + more)
-                line[j] = line[j] if within else below
+                within = (t <= extent * v + margin) & (-t <= opposite * v + margin)
+                line[j] = line[j] if within else outside
         for j in range(np.uint64(columns)):
-            mine = above if slack[j] == zero else surface
-            plane_id[i, j] = mine if line[j] > below else plane_id[i, j]
+            assigned = above if slack[j] == zero else surface
+            plane_id[i, j] = assigned if line[j] > outside else plane_id[i, j]
         for j in range(np.uint64(columns)):
-            height[i, j] = line[j] if line[j] > below else height[i, j]
+            height[i, j] = line[j] if line[j] > outside else height[i, j]
 
 
 @kernel(inline=True)
@@ -149,17 +152,20 @@ def _bounds(
         right -= 1
     out, fine, one = np.float32(OUT), np.float32(FINE), np.float32(1)
     largest, smallest = np.int32(2**30), np.int32(0)
-    least, most = largest, smallest
+    minimum, maximum = largest, smallest
     for k in range(np.uint64(line.size)):  # integers, whose bounds vectorise
-        v, use = np.int32(inv_depth[i, k] * fine), line[k] > out
-        low, high = (v if use else largest), (v if use else smallest)
-        least, most = (low if low < least else least), (high if high > most else most)
-    farthest, nearest = np.float32(least) / fine, (np.float32(most) + one) / fine
-    return np.float32(left), np.float32(right), farthest, nearest
+        v, assigned = np.int32(inv_depth[i, k] * fine), line[k] > out
+        low, high = (v if assigned else largest), (v if assigned else smallest)
+        minimum, maximum = (
+            (low if low < minimum else minimum),
+            (high if high > maximum else maximum),
+        )
+    min_inv_depth, max_inv_depth = np.float32(minimum) / fine, (np.float32(maximum) + one) / fine
+    return np.float32(left), np.float32(right), min_inv_depth, max_inv_depth
 
 
 @kernel(inner=True)
-def least_height_at(depth_m: float) -> float:
+def min_height_at(depth_m: float) -> float:
     """Return the minimum height of an object's sample at a depth, metres."""
     return MIN_HEIGHT_M + HEIGHT_NOISE * depth_m * depth_m
 

@@ -26,18 +26,18 @@ from shapecat.detection.planes.ransac import (
     count_inliers,
     horizontal_plane,
     median_of,
-    off_plane,
     plane_normal,
     ransac_plane,
     refine,
+    select_outliers,
 )
 from shapecat.detection.planes.settings import PLANES
 from shapecat.jit import kernel
 
 __all__ = ["find_horizontal_planes"]
 
-MOST_PLANES = 10
-LEAST_SAMPLES = 44
+MAX_PLANES = 10
+MIN_SAMPLES = 44
 """Minimum number of points on a plane; noise alone gives a tenth of that."""
 
 
@@ -48,33 +48,40 @@ def find_horizontal_planes(
 
     ``up`` is a unit vector (3,), sensor frame; ``trials`` are from `draw_trials`.
     """
-    found = _fitted(grid, points, up, trials)
-    better = _common_up(found) if found else up
-    if better @ up < PLANES.turned_cos:
-        found = _fitted(grid, points, better, trials)
-        better = _common_up(found) if found else better
-    if len(found) > 1:
-        turned = [_refit_parallel(grid.intrinsics, one.samples, one.plane, better) for one in found]
-        found = _measured(grid, found[0].samples, turned)
-    return sorted(found, key=lambda one: one.plane.offset)
+    candidates = _fit_candidates(grid, points, up, trials)
+    common = _common_up(candidates) if candidates else up
+    if common @ up < PLANES.turned_cos:
+        candidates = _fit_candidates(grid, points, common, trials)
+        common = _common_up(candidates) if candidates else common
+    if len(candidates) > 1:
+        parallel = [
+            _refit_parallel(grid.intrinsics, samples, plane, common)
+            for plane, samples, _ in candidates
+        ]
+        candidates = _measure_candidates(grid, candidates[0].samples, parallel)
+    return sorted(candidates, key=lambda candidate: candidate.plane.offset)
 
 
-def _fitted(grid: DepthGrid, points: OrientedPoints, up: F8, trials: F8) -> list[PlaneCandidate]:
+def _fit_candidates(
+    grid: DepthGrid, points: OrientedPoints, up: F8, trials: F8
+) -> list[PlaneCandidate]:
     samples, heights = level_samples(points, up)
     planes = fit_horizontal_planes(samples, heights, grid.intrinsics, up, trials)
-    return _measured(grid, samples, planes)
+    return _measure_candidates(grid, samples, planes)
 
 
-def _measured(grid: DepthGrid, samples: DepthSamples, planes: Iterable[F8]) -> list[PlaneCandidate]:
-    found = (PlaneCandidate(measure_plane(grid, samples, plane), samples) for plane in planes)
-    return [one for one in found if one.plane.area_m2 >= PLANES.least_m2]
+def _measure_candidates(
+    grid: DepthGrid, samples: DepthSamples, planes: Iterable[F8]
+) -> list[PlaneCandidate]:
+    candidates = (PlaneCandidate(measure_plane(grid, samples, plane), samples) for plane in planes)
+    return [candidate for candidate in candidates if candidate.plane.area_m2 >= PLANES.min_area_m2]
 
 
-def _common_up(found: list[PlaneCandidate]) -> F8:
+def _common_up(candidates: list[PlaneCandidate]) -> F8:
     """Return the mean normal (3,), weighted by the precision of each: area times width squared."""
     half = DIRECTIONS // 2
     mean = np.zeros(3)
-    for plane, *_ in found:
+    for plane, *_ in candidates:
         width = (plane.extent[:half] + plane.extent[half:]).min()
         mean += plane.area_m2 * width * width * plane.up
     return np.asarray(mean / np.linalg.norm(mean))
@@ -89,45 +96,47 @@ def _refit_parallel(
     squares = products = 0.0
     for k in range(samples.inverse_depth.size):
         j, i, v = samples.j[k], samples.i[k], samples.inverse_depth[k]
-        near = abs(v - (plane.a * j + plane.b * i + plane.c)) < PLANES.tolerance
+        inlier = abs(v - (plane.a * j + plane.b * i + plane.c)) < PLANES.tolerance
         x, y = (j - intrinsics.cx) / intrinsics.fx, (i - intrinsics.cy) / intrinsics.fy
-        along = x * up[0] + y * up[1] + up[2] if near else 0.0
+        along = x * up[0] + y * up[1] + up[2] if inlier else 0.0
         squares += along * along
         products += along * v
-    turned: F8 = horizontal_plane(intrinsics, up, squares / products)
-    return turned
+    parallel: F8 = horizontal_plane(intrinsics, up, squares / products)
+    return parallel
 
 
 @kernel
 def fit_horizontal_planes(
-    rest: DepthSamples, height: F4, intrinsics: PinholeIntrinsics, up: F8, trials: F8
+    samples: DepthSamples, heights: F4, intrinsics: PinholeIntrinsics, up: F8, trials: F8
 ) -> F8:
     """Return the horizontal planes (n, 3), as coefficients a, b, c, most samples first.
 
     Parameters
     ----------
-    rest, height : the samples and their heights, from `level_samples`.
+    samples, heights : the samples and their heights, from `level_samples`.
     up : (3,) unit vector, sensor frame.
     trials : from `draw_trials`.
     """
-    found = np.zeros((MOST_PLANES, 3))
+    planes = np.zeros((MAX_PLANES, 3))
     n = 0
     # (3) one plane candidate for each peak in height
-    for _ in range(MOST_PLANES):
-        if height.size < LEAST_SAMPLES:
+    for _ in range(MAX_PLANES):
+        if heights.size < MIN_SAMPLES:
             break
-        peak = _histogram_peak(height)
-        near, near_height, rest, height = _split(rest, height, peak)
-        if near_height.size < LEAST_SAMPLES:
+        peak = _histogram_peak(heights)
+        peak_samples, peak_heights, samples, heights = _split(samples, heights, peak)
+        if peak_heights.size < MIN_SAMPLES:
             break
         # (4) refine the plane, and drop the samples on it
-        offset = np.float64(median_of(near_height))
-        if offset > -PLANES.margin_m or not _fit(near, intrinsics, up, trials, offset, found[n]):
+        offset = np.float64(median_of(peak_heights))
+        if offset > -PLANES.margin_m or not _fit(
+            peak_samples, intrinsics, up, trials, offset, planes[n]
+        ):
             continue
-        off = off_plane(rest, found[n], 3 * PLANES.tolerance)
-        rest, height = off, _heights(off, intrinsics, up)
+        outliers = select_outliers(samples, planes[n], 3 * PLANES.tolerance)
+        samples, heights = outliers, _heights(outliers, intrinsics, up)
         n += 1
-    return found[:n]
+    return planes[:n]
 
 
 @kernel(inline=True)
@@ -149,11 +158,11 @@ def _histogram_peak(height: F4) -> float:
     count = np.zeros(int((high - low) / PLANES.bin_m) + 3, np.int64)
     for h in height:
         count[int((h - low) / PLANES.bin_m) + 1] += 1
-    best, most = 0, -1
+    best, best_count = 0, -1
     for b in range(1, count.size - 1):
-        here = count[b - 1] + 2 * count[b] + count[b + 1]
-        if here > most:
-            best, most = b, here
+        smoothed = count[b - 1] + 2 * count[b] + count[b + 1]
+        if smoothed > best_count:
+            best, best_count = b, smoothed
     return low + (best - 0.5) * PLANES.bin_m
 
 
@@ -169,37 +178,42 @@ def _split(
         parts[p, 0, n[p]], parts[p, 1, n[p]] = samples.j[k], samples.i[k]
         parts[p, 2, n[p]], parts[p, 3, n[p]] = samples.inverse_depth[k], height[k]
         n[p] += 1
-    near, rest = parts[0], parts[1]
+    inside, outside = parts[0], parts[1]
     m, r = n[0], n[1]
     return (
-        DepthSamples(near[0][:m], near[1][:m], near[2][:m], samples.share),
-        near[3][:m],
-        DepthSamples(rest[0][:r], rest[1][:r], rest[2][:r], samples.share),
-        rest[3][:r],
+        DepthSamples(inside[0][:m], inside[1][:m], inside[2][:m], samples.share),
+        inside[3][:m],
+        DepthSamples(outside[0][:r], outside[1][:r], outside[2][:r], samples.share),
+        outside[3][:r],
     )
 
 
 @kernel(inline=True)
 def _fit(
-    near: DepthSamples, intrinsics: PinholeIntrinsics, up: F8, trials: F8, offset: float, plane: F8
+    samples: DepthSamples,
+    intrinsics: PinholeIntrinsics,
+    up: F8,
+    trials: F8,
+    offset: float,
+    plane: F8,
 ) -> bool:
     """Fit a plane to samples at about one height; return whether it is large enough."""
     level = horizontal_plane(intrinsics, up, offset)
     plane[0], plane[1], plane[2] = level
     count = 0
     for _ in range(3):
-        count = refine(near, 1.5 * PLANES.tolerance, plane)
-        if count < LEAST_SAMPLES:
+        count = refine(samples, 1.5 * PLANES.tolerance, plane)
+        if count < MIN_SAMPLES:
             return False
         if cosine(plane_normal(plane, intrinsics), up) < PLANES.steady_cos:
             plane[0], plane[1], plane[2] = level
             break
-    close = count_inliers(near, plane, PLANES.tolerance / 2)
+    close = count_inliers(samples, plane, PLANES.tolerance / 2)
     if close < PLANES.close_share * count:
         voted, votes = ransac_plane(
-            near, trials, intrinsics, up, (PLANES.steady_cos, 1.0), PLANES.tolerance / 2
+            samples, trials, intrinsics, up, (PLANES.steady_cos, 1.0), PLANES.tolerance / 2
         )
         if votes > close:
             plane[0], plane[1], plane[2] = voted
-    area = area_of(near, plane, abs(offset)) / (intrinsics.fx * intrinsics.fy)
-    return bool(area >= PLANES.least_m2)
+    area = area_of(samples, plane, abs(offset)) / (intrinsics.fx * intrinsics.fy)
+    return bool(area >= PLANES.min_area_m2)

@@ -80,12 +80,13 @@ def _orient_row(
     zero, one, two = np.float32(0), np.float32(1), np.float32(2)
     count = np.int32(0)
     across, down = np.float32(focal[0] / (2 * STRIDE)), np.float32(focal[1] / (2 * STRIDE))
-    above, here, below = coarse[r - 1], coarse[r], coarse[r + 1]
-    row = slice(r * here.size, (r + 1) * here.size)
-    nx, ny, nz = normals[0][row], normals[1][row], normals[2][row]
-    px, py, pz = positions[0][row], positions[1][row], positions[2][row]
-    for c in range(1, here.size - 1):
-        center, left, right, top, bottom = here[c], here[c - 1], here[c + 1], above[c], below[c]
+    row_above, row, row_below = coarse[r - 1], coarse[r], coarse[r + 1]
+    cells = slice(r * row.size, (r + 1) * row.size)
+    nx, ny, nz = normals[0][cells], normals[1][cells], normals[2][cells]
+    px, py, pz = positions[0][cells], positions[1][cells], positions[2][cells]
+    for c in range(1, row.size - 1):
+        center, left, right = row[c], row[c - 1], row[c + 1]
+        top, bottom = row_above[c], row_below[c]
         smooth = (center > 0) & (left > 0) & (right > 0) & (top > 0) & (bottom > 0)
         smooth &= abs(left + right - two * center) <= bend
         smooth &= abs(top + bottom - two * center) <= bend
@@ -109,15 +110,15 @@ def level_samples(points: OrientedPoints, up: F8) -> tuple[DepthSamples, F4]:
     coarse, normals, positions = points.inverse_depth, points.normals, points.positions
     rows, columns = coarse.shape
     x, y, z = np.float32(up[0]), np.float32(up[1]), np.float32(up[2])
-    found = np.zeros((4, points.smooth + 1), np.float32)
-    least, n = np.float32(PLANES.level_cos), 0
+    values = np.zeros((4, points.smooth + 1), np.float32)
+    min_cos, n = np.float32(PLANES.level_cos), 0
     for r in range(rows):
         for c in range(columns):
             k = r * columns + c
-            if normals[0, k] * x + normals[1, k] * y + normals[2, k] * z > least:
-                found[0, n], found[1, n] = c * STRIDE + FIRST, r * STRIDE + FIRST
-                found[2, n] = coarse[r, c]
-                found[3, n] = positions[0, k] * x + positions[1, k] * y + positions[2, k] * z
+            if normals[0, k] * x + normals[1, k] * y + normals[2, k] * z > min_cos:
+                values[0, n], values[1, n] = c * STRIDE + FIRST, r * STRIDE + FIRST
+                values[2, n] = coarse[r, c]
+                values[3, n] = positions[0, k] * x + positions[1, k] * y + positions[2, k] * z
                 n += 1
-    samples = DepthSamples(found[0][:n], found[1][:n], found[2][:n], STRIDE * STRIDE)
-    return samples, found[3][:n]
+    samples = DepthSamples(values[0][:n], values[1][:n], values[2][:n], STRIDE * STRIDE)
+    return samples, values[3][:n]

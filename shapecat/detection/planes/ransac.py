@@ -16,17 +16,17 @@ __all__ = [
     "draw_trials",
     "horizontal_plane",
     "median_of",
-    "off_plane",
     "plane_normal",
     "ransac_plane",
     "refine",
     "sample_grid",
+    "select_outliers",
 ]
 
 TRIALS, BLOCK = 240, 256
 """Number of planes tried: one with a seventh of the samples is missed with a probability of a half.
 Number of samples after which a plane that can no longer win is dropped."""
-LEAST_DOUBLE_AREA = 30.0
+MIN_DOUBLE_AREA = 30.0
 """Twice the minimum area of the triangle of three samples, in square cells: noise spoils smaller
 ones."""
 SAMPLE = 4800
@@ -50,8 +50,8 @@ class DepthSamples(NamedTuple):
 
 
 @kernel
-def sample_grid(inv_depth: F4, wanted: F4) -> DepthSamples:
-    """Return evenly spaced samples where ``wanted`` (rows, columns) is above 0."""
+def sample_grid(inv_depth: F4, mask: F4) -> DepthSamples:
+    """Return evenly spaced samples where ``mask`` (rows, columns) is above 0."""
     rows, columns = inv_depth.shape
     stride = max(1, round(math.sqrt(inv_depth.size / SAMPLE)))
     result = np.zeros((3, (rows // stride + 1) * (columns // stride + 1)), np.float32)
@@ -59,7 +59,7 @@ def sample_grid(inv_depth: F4, wanted: F4) -> DepthSamples:
     for i in range(stride // 2, rows, stride):
         for j in range(stride // 2, columns, stride):
             result[0, n], result[1, n], result[2, n] = j, i, inv_depth[i, j]
-            n += (inv_depth[i, j] > 0) & (wanted[i, j] > 0)
+            n += (inv_depth[i, j] > 0) & (mask[i, j] > 0)
     return DepthSamples(result[0][:n], result[1][:n], result[2][:n], stride * stride)
 
 
@@ -89,20 +89,20 @@ def median_of(values: F4) -> float:
 
 
 @kernel(inner=True)
-def off_plane(samples: DepthSamples, plane: F8, tolerance: float) -> DepthSamples:
+def select_outliers(samples: DepthSamples, plane: F8, tolerance: float) -> DepthSamples:
     """Return the samples whose inverse depth differs by more than ``tolerance``, 1/m, from a plane.
 
     Its inverse depth at column j and row i is ``a * j + b * i + c``, 1/m.
     """
     a, b, c = np.float32(plane[0]), np.float32(plane[1]), np.float32(plane[2])
     gate = np.float32(tolerance)
-    rest = np.zeros((3, samples.inverse_depth.size), np.float32)
+    outliers = np.zeros((3, samples.inverse_depth.size), np.float32)
     n = 0
     for k in range(samples.inverse_depth.size):
         j, i, v = samples.j[k], samples.i[k], samples.inverse_depth[k]
-        rest[0, n], rest[1, n], rest[2, n] = j, i, v
+        outliers[0, n], outliers[1, n], outliers[2, n] = j, i, v
         n += abs(v - (a * j + b * i + c)) > gate
-    return DepthSamples(rest[0][:n], rest[1][:n], rest[2][:n], samples.share)
+    return DepthSamples(outliers[0][:n], outliers[1][:n], outliers[2][:n], samples.share)
 
 
 @kernel(inner=True)
@@ -157,7 +157,7 @@ def ransac_plane(
     tolerance : largest distance of an inlier in inverse depth, 1/m.
     """
     plane, best = np.zeros(3), np.zeros(3)
-    most, n = 0, samples.inverse_depth.size
+    best_count, n = 0, samples.inverse_depth.size
     for t in range(len(trials) if n >= 3 else 0):
         # (1) three samples propose a plane
         if not _propose(samples, trials, t, plane):
@@ -171,16 +171,16 @@ def ransac_plane(
         # (2) count the inliers
         inliers = 0
         for start in range(0, n, BLOCK):
-            if inliers + n - start <= most:
+            if inliers + n - start <= best_count:
                 break
             inliers += _count_part(samples, plane, tolerance, start, min(start + BLOCK, n))
-        if inliers > most:
-            most = inliers
+        if inliers > best_count:
+            best_count = inliers
             best[0], best[1], best[2] = plane[0], plane[1], plane[2]
     # (3) the plane is refitted to its inliers
     for _ in range(4):
         refine(samples, tolerance, best)
-    return best, count_inliers(samples, best, tolerance) if most >= 3 else 0
+    return best, count_inliers(samples, best, tolerance) if best_count >= 3 else 0
 
 
 @kernel(inline=True)
@@ -191,10 +191,10 @@ def _propose(samples: DepthSamples, trials: F8, t: int, plane: F8) -> bool:
     j, i, w = samples.j[p], samples.i[p], samples.inverse_depth[p]
     j1, i1, w1 = samples.j[q] - j, samples.i[q] - i, float(samples.inverse_depth[q]) - w
     j2, i2, w2 = samples.j[r] - j, samples.i[r] - i, float(samples.inverse_depth[r]) - w
-    double = i1 * j2 - i2 * j1
-    plane[0], plane[1] = (i1 * w2 - i2 * w1) / double, (j2 * w1 - j1 * w2) / double
+    double_area = i1 * j2 - i2 * j1
+    plane[0], plane[1] = (i1 * w2 - i2 * w1) / double_area, (j2 * w1 - j1 * w2) / double_area
     plane[2] = w - plane[0] * j - plane[1] * i
-    return bool(abs(double) >= LEAST_DOUBLE_AREA)
+    return bool(abs(double_area) >= MIN_DOUBLE_AREA)
 
 
 @kernel(inner=True)
@@ -229,9 +229,9 @@ def refine(samples: DepthSamples, tolerance: float, plane: F8) -> int:
     n = mx = my = mw = xx = xy = yy = xw = yw = 0.0
     for k in range(inv_depth.size):
         # A sum of products with 0 or 1 vectorises.
-        near = 1.0 if abs(inv_depth[k] - (a * j[k] + b * i[k] + c)) < tolerance else 0.0
-        x, y, v = near * (j[k] - j0), near * (i[k] - i0), near * (inv_depth[k] - w0)
-        n += near
+        weight = 1.0 if abs(inv_depth[k] - (a * j[k] + b * i[k] + c)) < tolerance else 0.0
+        x, y, v = weight * (j[k] - j0), weight * (i[k] - i0), weight * (inv_depth[k] - w0)
+        n += weight
         mx += x
         my += y
         mw += v

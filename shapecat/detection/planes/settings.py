@@ -17,7 +17,7 @@ class UpSettings(NamedTuple):
     less."""
     corner_cos: float = 0.3
     """Directions with a smaller absolute cosine between them may be the normals of two walls."""
-    least_share: float = 0.04
+    min_share: float = 0.04
     """Minimum fraction of the surface that faces up: a table at the edge of the image."""
     trials: int = 120
     """Directions tried: one shared by 1 in 25 normals is missed with a probability below 1 %."""
@@ -48,7 +48,7 @@ class PlaneSettings(NamedTuple):
     """Normals within this angle of up belong to level surface: noise tilts them by less."""
     bin_m: float = 0.01
     """Height of a bin of level surface, metres: the noise at 1.5 m."""
-    least_m2: float = 0.02
+    min_area_m2: float = 0.02
     """Visible area of the smallest plane: the uncovered strip of a table."""
     margin_m: float = 0.01
     """A plane extends this far beyond its samples, metres: their spacing."""
@@ -65,21 +65,21 @@ class PlaneSettings(NamedTuple):
     """Larger planes are furniture if the space below their edge is not visible."""
     board_m2: float = 0.03
     """Smaller planes above another plane are not boards."""
-    least_drop_m: float = 0.06
+    min_drop_m: float = 0.06
     """A plane lower than this above another is the top of an object."""
     step_m: float = 0.01
     """Length of the steps in which the surroundings of an edge are searched, metres."""
     wall_m: float = 0.03
     """Samples within this distance behind an edge belong to the wall of a box, metres."""
-    closed: float = 0.5
+    wall_share: float = 0.5
     """A wall closes a box if more than this share of the samples below an edge is on the wall."""
     around_m: float = 0.03
     """Distance from a sample to the surroundings of its plane, metres."""
-    enclosed: float = 0.2
+    drop_ratio: float = 0.2
     """Upper bound of the ratio of drops to rises around the floor of a bin."""
     hidden_m: float = 0.2
     """Maximum width that objects hide of such a floor at one side, metres."""
-    borne_m: float = 0.4
+    max_object_m: float = 0.4
     """Maximum height of an object above the large plane it stands on, metres."""
 
 
@@ -91,9 +91,9 @@ class StripSettings(NamedTuple):
     grazing: float = 0.015
     """Change of inverse depth per row, 1/m, above which a plane is seen at a grazing angle: from
     one row to the next it exceeds the tolerance."""
-    least_slope: float = 0.03
+    min_slope: float = 0.03
     """Smallest downward slope of a ray (down / forward); flatter rays run along a surface."""
-    least_rise: float = 0.05
+    min_rise: float = 0.05
     """Smallest downward slope that is used to compute the area a cell covers."""
     below: int = 10
     """Number of bins below a plane that hold next to no surface."""
@@ -108,28 +108,28 @@ class StripSettings(NamedTuple):
     range."""
     dip: float = 0.6
     """Just above a plane, the area of level surface falls below this share of the plane's."""
-    least_m2: float = 0.001
+    min_area_m2: float = 0.001
     """Minimum visible area of a covered plane."""
-    least_points: int = 15
+    min_points: int = 15
     """Minimum number of points, of every third sample, at a height that may have strips."""
     same_m: float = 0.012
     """Planes whose heights differ by less are the same plane, metres."""
     tallest_m: float = 0.15
     """Height of the tallest objects that cover a plane, metres."""
-    most_seen: float = 0.45
+    max_visible: float = 0.45
     """Largest visible share of the outline of a covered plane; a lid is fully visible."""
 
 
 class AssumedSettings(NamedTuple):
     """Constants for a plane assumed below samples that no visible plane supports."""
 
-    near_m: float = 2.0
+    max_depth_m: float = 2.0
     """Depth up to which such samples may be objects that hide their support, metres; farther away
     they are background."""
     unexplained: float = 0.2
     """Share of unexplained samples above which a plane is assumed; plain tables have at most 0.06.
     """
-    few: float = 0.01
+    noise_share: float = 0.01
     """Share of the unexplained samples that may lie below the plane, as noise."""
 
 

@@ -35,128 +35,135 @@ BINS = 600
 """Number of bins of `StripSettings.bin_m`: no table is more than 3 m below the camera."""
 
 
-def may_have_strips(grid: DepthGrid, points: OrientedPoints, found: list[PlaneCandidate]) -> bool:
+def may_have_strips(
+    grid: DepthGrid, points: OrientedPoints, candidates: list[PlaneCandidate]
+) -> bool:
     """Return whether some height has many points with few below it, and so may have strips.
 
-    ``found`` are parallel planes, at least one.
+    ``candidates`` are parallel planes, at least one.
     """
-    count = _count_by_height(points, found[0].plane.up)
-    return any(_may_be_strips(grid, found, *peak) for peak in _peaks(count, STRIPS.least_points))
+    count = _count_by_height(points, candidates[0].plane.up)
+    return any(_may_be_strips(grid, candidates, *peak) for peak in _peaks(count, STRIPS.min_points))
 
 
 def _may_be_strips(
-    grid: DepthGrid, found: list[PlaneCandidate], height: float, above: float
+    grid: DepthGrid, candidates: list[PlaneCandidate], height: float, above: float
 ) -> bool:
     """Return whether a plane at a height is seen at a grazing angle, or covered by objects.
 
     ``above`` is the level area just above the plane, relative to its own area, from `_peaks`.
     """
-    large = [one.plane.offset for one in found if one.plane.area_m2 > PLANES.likely_m2]
-    up = found[0].plane.up
+    large = [plane.offset for plane, *_ in candidates if plane.area_m2 > PLANES.likely_m2]
+    up = candidates[0].plane.up
     if height > up[1] / (grid.intrinsics.fy * STRIPS.grazing):
         return all(abs(offset - height) > STRIPS.same_m for offset in large)
-    below = any(-STRIPS.same_m < height - offset < PLANES.borne_m for offset in large)
+    below = any(-STRIPS.same_m < height - offset < PLANES.max_object_m for offset in large)
     return above > STRIPS.covers and not below
 
 
-def add_strip_planes(grid: DepthGrid, found: list[PlaneCandidate]) -> list[PlaneCandidate]:
+def add_strip_planes(grid: DepthGrid, candidates: list[PlaneCandidate]) -> list[PlaneCandidate]:
     """Add the planes of which only narrow strips are visible.
 
     Hardly any surface lies below such a plane. A board shows some surface at its own height; a
-    covered table shows more just above, on the objects that cover it. ``found`` are parallel
-    planes, lowest first, at least one. The result has the same order, and planes of ``found`` may
+    covered table shows more just above, on the objects that cover it. ``candidates`` are parallel
+    planes, lowest first, at least one. The result has the same order; some of the given planes may
     have a larger extent in it.
     """
-    up = max(found, key=lambda one: one.plane.area_m2).plane.up
+    up = max(candidates, key=lambda candidate: candidate.plane.area_m2).plane.up
     strips, area = _level_strips(grid.inverse_depth, grid.intrinsics, up)
-    planes = list(found)
-    for height, above in _peaks(area, STRIPS.least_m2):
-        if not _may_be_strips(grid, found, height, above):
+    planes = list(candidates)
+    for height, above in _peaks(area, STRIPS.min_area_m2):
+        if not _may_be_strips(grid, candidates, height, above):
             continue
-        new = _plane_at(grid, strips, up, height)
-        if new.plane.area_m2 == 0 or _is_at_the_end(grid.inverse_depth, new.samples):
+        added = _plane_at(grid, strips, up, height)
+        if added.plane.area_m2 == 0 or _is_at_range_end(grid.inverse_depth, added.samples):
             continue
-        same = [k for k in planes if abs(k.plane.offset - new.plane.offset) < STRIPS.same_m]
+        duplicates = [k for k in planes if abs(k.plane.offset - added.plane.offset) < STRIPS.same_m]
         if above > STRIPS.covers:
-            new = _covered(new, strips, grid.intrinsics)
-        if new.covered_m2 > 0:
-            new = _widened(same[0], new) if same else new
-        elif new.plane.area_m2 < max([PLANES.least_m2, *(k.plane.area_m2 for k in same)]):
+            added = _covered(added, strips, grid.intrinsics)
+        if added.covered_m2 > 0:
+            added = _widened(duplicates[0], added) if duplicates else added
+        elif added.plane.area_m2 < max(
+            [PLANES.min_area_m2, *(k.plane.area_m2 for k in duplicates)]
+        ):
             continue
-        planes = [one for one in planes if not any(one is k for k in same)] + [new]
-    return sorted(planes, key=lambda one: one.plane.offset)
+        planes = [k for k in planes if not any(k is m for m in duplicates)] + [added]
+    return sorted(planes, key=lambda candidate: candidate.plane.offset)
 
 
-def _is_at_the_end(inv_depth: F4, strips: DepthSamples) -> bool:
+def _is_at_range_end(inv_depth: F4, strips: DepthSamples) -> bool:
     """Return whether strips lie at the end of the range, where nothing below them is visible.
 
     ``inv_depth`` is (rows, columns), 1/m.
     """
-    some = inv_depth[::4, ::4]  # enough to show where the range ends
-    seen = some[some > 0]
-    return bool(np.median(strips.inverse_depth) < STRIPS.end * seen.min(initial=np.inf))
+    subset = inv_depth[::4, ::4]  # enough to show where the range ends
+    valid = subset[subset > 0]
+    return bool(np.median(strips.inverse_depth) < STRIPS.end * valid.min(initial=np.inf))
 
 
-def _widened(known: PlaneCandidate, table: PlaneCandidate) -> PlaneCandidate:
-    extent = np.maximum(known.plane.extent, table.plane.extent)
-    return known._replace(plane=known.plane._replace(extent=extent), covered_m2=table.covered_m2)
+def _widened(candidate: PlaneCandidate, table: PlaneCandidate) -> PlaneCandidate:
+    extent = np.maximum(candidate.plane.extent, table.plane.extent)
+    plane = candidate.plane._replace(extent=extent)
+    return candidate._replace(plane=plane, covered_m2=table.covered_m2)
 
 
 def _plane_at(grid: DepthGrid, strips: F4, up: F8, height: float) -> PlaneCandidate:
     """Measure the level plane through the strips at a height."""
-    near = np.ascontiguousarray(strips[:, abs(strips[3] - height) < 1.5 * STRIPS.bin_m])
-    offset = float(np.median(near[3])) if near.size else height
-    samples = DepthSamples(near[0], near[1], near[2], APART)
+    inliers = np.ascontiguousarray(strips[:, abs(strips[3] - height) < 1.5 * STRIPS.bin_m])
+    offset = float(np.median(inliers[3])) if inliers.size else height
+    samples = DepthSamples(inliers[0], inliers[1], inliers[2], APART)
     plane = measure_plane(grid, samples, horizontal_plane(grid.intrinsics, up, offset))
     return PlaneCandidate(plane, samples)
 
 
-def _covered(seen: PlaneCandidate, strips: F4, intrinsics: PinholeIntrinsics) -> PlaneCandidate:
+def _covered(
+    candidate: PlaneCandidate, strips: F4, intrinsics: PinholeIntrinsics
+) -> PlaneCandidate:
     """Set the covered area of a plane: 0 if most of its outline is visible."""
-    plane = seen.plane
+    plane = candidate.plane
     corners = outline_corners(plane)
-    turned = np.cross(corners, np.roll(corners, -1, axis=0)).sum(axis=0)
-    outline_m2 = abs(float(turned @ plane.up)) / 2
+    area_vector = np.cross(corners, np.roll(corners, -1, axis=0)).sum(axis=0)
+    outline_m2 = abs(float(area_vector @ plane.up)) / 2
     borne_m2 = _area_over(strips, intrinsics, plane)
-    covers = plane.area_m2 < STRIPS.most_seen * outline_m2
-    covers &= borne_m2 >= max(PLANES.least_m2, plane.area_m2 / 2)
-    return seen._replace(covered_m2=borne_m2 + outline_m2 if covers else 0.0)
+    covers = plane.area_m2 < STRIPS.max_visible * outline_m2
+    covers &= borne_m2 >= max(PLANES.min_area_m2, plane.area_m2 / 2)
+    return candidate._replace(covered_m2=borne_m2 + outline_m2 if covers else 0.0)
 
 
 def _area_over(strips: F4, intrinsics: PinholeIntrinsics, plane: SupportingPlane) -> float:
     """Return the area of level surface just above the outline of a plane, m²."""
-    some = strips[:, ::SPARSE]
-    above = some[3] - plane.offset
-    near = some[:, (above > STRIPS.same_m) & (above < STRIPS.tallest_m)]
-    j, i, inv_depth, _ = near.astype(np.float64)
+    subset = strips[:, ::SPARSE]
+    above = subset[3] - plane.offset
+    tops = subset[:, (above > STRIPS.same_m) & (above < STRIPS.tallest_m)]
+    j, i, inv_depth, _ = tops.astype(np.float64)
     x, y = (j - intrinsics.cx) / intrinsics.fx, (i - intrinsics.cy) / intrinsics.fy
     level = gravity_rotation(plane.up) @ (np.stack([x, y, np.ones(j.size)]) / inv_depth)
     over = (COS[:, None] * level[0] + SIN[:, None] * level[1] < plane.extent[:, None]).all(axis=0)
-    facing = np.maximum(-level[2] * inv_depth, STRIPS.least_rise)
+    facing = np.maximum(-level[2] * inv_depth, STRIPS.min_rise)
     share = SPARSE * APART / (intrinsics.fx * intrinsics.fy)
     return float((share / (facing * inv_depth**2))[over].sum())
 
 
 @kernel
-def _peaks(amount: F8, least: float) -> F8:
+def _peaks(amount: F8, threshold: float) -> F8:
     """Find the heights of level surface with next to nothing below it.
 
     ``amount`` (BINS,) is level surface by height, the lowest first; a peak and the two bins beside
-    it hold more than ``least``. Returns (n, 2) the heights above the sensor, metres, ascending; and
-    the amount just above each, relative to that of the peak: the tops of objects that cover it.
+    it hold more than ``threshold``. Returns (n, 2) the heights above the sensor, metres, ascending;
+    and the amount just above each, relative to that of the peak: the tops of objects that cover it.
     """
     peaks, n, bins = np.zeros((BINS, 2)), 0, STRIPS.below - 2
     for k in range(STRIPS.below, BINS - 3):
-        here, own = amount[k], amount[k - 1] + amount[k] + amount[k + 1]
-        if own <= least or here < amount[k - 1] or here < amount[k + 1]:
+        centre, total = amount[k], amount[k - 1] + amount[k] + amount[k + 1]
+        if total <= threshold or centre < amount[k - 1] or centre < amount[k + 1]:
             continue
         lower = 0.0
         for m in range(k - STRIPS.below, k - 2):
             lower += 3 * amount[m] / bins
-        falls = min(amount[k + 1], amount[k + 2], amount[k + 3]) < STRIPS.dip * here
-        if falls and own > STRIPS.contrast * lower:
+        falls = min(amount[k + 1], amount[k + 2], amount[k + 3]) < STRIPS.dip * centre
+        if falls and total > STRIPS.contrast * lower:
             upper = amount[k + 3 : k + STRIPS.above].sum()
-            peaks[n, 0], peaks[n, 1] = (k + 0.5 - BINS) * STRIPS.bin_m, upper / own
+            peaks[n, 0], peaks[n, 1] = (k + 0.5 - BINS) * STRIPS.bin_m, upper / total
             n += 1
     return peaks[:n]
 
@@ -189,7 +196,7 @@ def _level_strips(inv_depth: F4, intrinsics: PinholeIntrinsics, up: F8) -> tuple
     across, down = np.float32(up[0] / intrinsics.fx), np.float32(up[1] / intrinsics.fy)
     ahead = up[2] - intrinsics.cx * across - intrinsics.cy * down
     level, area = np.zeros(columns, np.bool_), np.zeros(BINS)
-    found = unset((4, inv_depth.size // APART + rows), np.float32)
+    strips = unset((4, inv_depth.size // APART + rows), np.float32)
     n = 0
     for i in range(ARM, rows - ARM):
         start = np.float32(ahead + i * down)
@@ -197,11 +204,11 @@ def _level_strips(inv_depth: F4, intrinsics: PinholeIntrinsics, up: F8) -> tuple
         for j in range(ARM, columns - ARM, APART):
             if level[j]:
                 w, rise = inv_depth[i, j], start + across * np.float32(j)
-                found[0, n], found[1, n], found[2, n], found[3, n] = j, i, w, rise / w
-                facing = max(float(-rise), STRIPS.least_rise) * intrinsics.fx * intrinsics.fy
+                strips[0, n], strips[1, n], strips[2, n], strips[3, n] = j, i, w, rise / w
+                facing = max(float(-rise), STRIPS.min_rise) * intrinsics.fx * intrinsics.fy
                 area[BINS - 1 - int(-rise / w / STRIPS.bin_m)] += APART / (facing * w * w)
                 n += 1
-    return found[:, :n].copy(), area
+    return strips[:, :n].copy(), area
 
 
 @kernel(fast=True, inner=True)
@@ -210,16 +217,16 @@ def _find_level(inv_depth: F4, i: int, slope: tuple[float, float, float], level:
     start, across, down = slope
     steep = np.float32(0.5 * ARM) * np.sqrt(across * across + down * down)
     side, along = np.float32(ARM) * across, np.float32(ARM) * down
-    least, gate = np.float32(-STRIPS.least_slope), np.float32(-PLANES.tolerance / 2)
+    max_rise, gate = np.float32(-STRIPS.min_slope), np.float32(-PLANES.tolerance / 2)
     deepest = np.float32((1 - BINS) * STRIPS.bin_m)
-    here, above, below = inv_depth[i], inv_depth[i - ARM], inv_depth[i + ARM]
+    row, row_above, row_below = inv_depth[i], inv_depth[i - ARM], inv_depth[i + ARM]
     for j in range(ARM, level.size - ARM):
         # On a level surface w / rise is the same everywhere.
-        w, rise = here[j], start + across * np.float32(j)
+        w, rise = row[j], start + across * np.float32(j)
         straight, flat, product = steep * w, gate * rise, w * rise
         limit = straight if straight > flat else flat
-        near = np.uint8(abs(above[j] * rise - (product - w * along)) < limit)
-        near += np.uint8(abs(below[j] * rise - (product + w * along)) < limit)
-        near += np.uint8(abs(here[j - ARM] * rise - (product - w * side)) < limit)
-        near += np.uint8(abs(here[j + ARM] * rise - (product + w * side)) < limit)
-        level[j] = (near >= 3) & (rise < least) & (rise > deepest * w)
+        neighbours = np.uint8(abs(row_above[j] * rise - (product - w * along)) < limit)
+        neighbours += np.uint8(abs(row_below[j] * rise - (product + w * along)) < limit)
+        neighbours += np.uint8(abs(row[j - ARM] * rise - (product - w * side)) < limit)
+        neighbours += np.uint8(abs(row[j + ARM] * rise - (product + w * side)) < limit)
+        level[j] = (neighbours >= 3) & (rise < max_rise) & (rise > deepest * w)

@@ -24,12 +24,12 @@ __all__ = ["supporting_planes"]
 BESIDE, DOWN = 5, 20
 """Maximum number of steps from a sample towards the camera to the edge of its plane, and down from
 that edge."""
-LEAST_BELOW = 20
+MIN_BELOW = 20
 """Minimum number of samples below an edge that allow a decision."""
 
 
 def supporting_planes(
-    grid: DepthGrid, found: list[PlaneCandidate], tallest_m: float
+    grid: DepthGrid, candidates: list[PlaneCandidate], tallest_m: float
 ) -> list[SupportingPlane]:
     """Return the planes that are not the tops of objects, lowest first.
 
@@ -47,32 +47,32 @@ def supporting_planes(
 
     Parameters
     ----------
-    found : planes, lowest first; their covered area counts as visible.
+    candidates : planes, lowest first; their covered area counts as visible.
     tallest_m : height of the tallest object, metres.
     """
-    kept: list[SupportingPlane] = []
-    for plane, samples, covered_m2 in found:
+    supports: list[SupportingPlane] = []
+    for plane, samples, covered_m2 in candidates:
         area_m2 = plane.area_m2 + covered_m2
-        drops = [plane.offset - lower.offset for lower in kept if _overlaps(lower, plane)]
+        drops = [plane.offset - lower.offset for lower in supports if _overlaps(lower, plane)]
         drop = drops[-1] if drops else math.inf
         high = tallest_m < drop < math.inf
-        if drop < PLANES.least_drop_m:
+        if drop < PLANES.min_drop_m:
             continue
-        if kept and not high and area_m2 < PLANES.furniture_m2:
+        if supports and not high and area_m2 < PLANES.furniture_m2:
             if _is_enclosed(grid, samples, plane):
-                kept.append(_extend_to_walls(grid, plane))
+                supports.append(_extend_to_walls(grid, plane))
                 continue
             if area_m2 < PLANES.board_m2:
                 continue
         if drop > tallest_m or area_m2 >= PLANES.furniture_m2:
-            kept.append(plane)
+            supports.append(plane)
             continue
         on_wall, beyond = _count_below_edge(grid, samples, plane, drop)
-        enough = on_wall + beyond >= LEAST_BELOW
-        closed = enough and on_wall > PLANES.closed * (on_wall + beyond)
-        if not closed and (enough or area_m2 >= PLANES.likely_m2):
-            kept.append(plane)
-    return kept
+        decidable = on_wall + beyond >= MIN_BELOW
+        closed = decidable and on_wall > PLANES.wall_share * (on_wall + beyond)
+        if not closed and (decidable or area_m2 >= PLANES.likely_m2):
+            supports.append(plane)
+    return supports
 
 
 def _overlaps(lower: SupportingPlane, upper: SupportingPlane) -> bool:
@@ -89,10 +89,10 @@ def _extend_to_walls(grid: DepthGrid, plane: SupportingPlane) -> SupportingPlane
     level = level_coordinates(grid, grid.inverse_depth > 0, plane.up)
     above = level[2] - plane.offset
     sides = COS[:, None] * level[0] + SIN[:, None] * level[1]
-    held = (above > PLANES.margin_m) & (above < PLANES.borne_m)
-    held &= (sides < plane.extent[:, None] + PLANES.hidden_m).all(axis=0)
-    reached = sides[:, held].max(axis=1, initial=-np.inf)
-    return plane._replace(extent=np.maximum(plane.extent, reached))
+    inside = (above > PLANES.margin_m) & (above < PLANES.max_object_m)
+    inside &= (sides < plane.extent[:, None] + PLANES.hidden_m).all(axis=0)
+    extent = sides[:, inside].max(axis=1, initial=-np.inf)
+    return plane._replace(extent=np.maximum(plane.extent, extent))
 
 
 @kernel
@@ -108,14 +108,14 @@ def _is_enclosed(grid: DepthGrid, samples: DepthSamples, plane: SupportingPlane)
         level = plane.a * j + plane.b * i + plane.c
         if level <= 0 or abs(samples.inverse_depth[k] - level) >= PLANES.tolerance:
             continue
-        reach = max(2, int(PLANES.around_m * grid.intrinsics.fx * level))
-        for di, dj in ((-reach, 0), (reach, 0), (0, -reach), (0, reach)):
+        radius = max(2, int(PLANES.around_m * grid.intrinsics.fx * level))
+        for di, dj in ((-radius, 0), (radius, 0), (0, -radius), (0, radius)):
             v, u = i + di, j + dj
             if 0 <= v < inv_depth.shape[0] and 0 <= u < inv_depth.shape[1] and inv_depth[v, u] > 0:
                 ahead = inv_depth[v, u] - (plane.a * u + plane.b * v + plane.c)
                 rises += ahead > 2 * PLANES.tolerance
                 drops += ahead < -2 * PLANES.tolerance
-    return rises >= LEAST_BELOW and drops < PLANES.enclosed * rises
+    return rises >= MIN_BELOW and drops < PLANES.drop_ratio * rises
 
 
 @kernel
@@ -135,11 +135,11 @@ def _count_below_edge(
         for step in range(4, min(DOWN, int(drop / PLANES.step_m))):  # an edge is rounded
             s = PLANES.step_m * step
             dx, dy, dz = x - s * plane.up[0], y - s * plane.up[1], z - s * plane.up[2]
-            seen = _inverse_depth_at(grid.inverse_depth, grid.intrinsics, dx, dy, dz)
-            if seen < 0:
+            inv_depth = _inverse_depth_at(grid.inverse_depth, grid.intrinsics, dx, dy, dz)
+            if inv_depth < 0:
                 break
-            if seen > 0:
-                behind = 1 / seen - dz
+            if inv_depth > 0:
+                behind = 1 / inv_depth - dz
                 on_wall += abs(behind) < PLANES.wall_m
                 beyond += behind >= PLANES.wall_m
     return on_wall, beyond
@@ -157,11 +157,13 @@ def _front_edge(
     length = math.sqrt(tx * tx + ty * ty + tz * tz)
     step = PLANES.step_m / max(length, PLANES.step_m)
     for _ in range(BESIDE):
-        seen = _inverse_depth_at(grid.inverse_depth, k, x + step * tx, y + step * ty, z + step * tz)
-        ahead = seen - 1 / (z + step * tz)
-        if seen > 0 and ahead < -2 * PLANES.tolerance:
+        inv_depth = _inverse_depth_at(
+            grid.inverse_depth, k, x + step * tx, y + step * ty, z + step * tz
+        )
+        ahead = inv_depth - 1 / (z + step * tz)
+        if inv_depth > 0 and ahead < -2 * PLANES.tolerance:
             return x, y, z
-        if seen <= 0 or ahead > 2 * PLANES.tolerance:  # no depth, or an object on the plane
+        if inv_depth <= 0 or ahead > 2 * PLANES.tolerance:  # no depth, or an object on the plane
             break
         x, y, z = x + step * tx, y + step * ty, z + step * tz
     return 0.0, 0.0, 0.0

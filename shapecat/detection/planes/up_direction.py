@@ -14,7 +14,7 @@ from shapecat.jit import kernel
 
 __all__ = ["estimate_up"]
 
-MOST_DIRECTIONS = 4
+MAX_DIRECTIONS = 4
 """Maximum number of directions to find: level surface and the walls of a corner make three."""
 BLOCK = 512
 """Number of normals after which a direction that can no longer win is dropped."""
@@ -42,18 +42,18 @@ def estimate_up(
         `UpSettings.roll_penalty`, or 0 if the camera may be held in any way.
     """
     surface = _every_second(points)
-    normals, least = surface[:3], UP.least_share * surface.shape[1]
-    free = not (hint[0] != 0 or hint[1] != 0 or hint[2] != 0)
-    if not free:
+    normals, min_count = surface[:3], UP.min_share * surface.shape[1]
+    has_hint = hint[0] != 0 or hint[1] != 0 or hint[2] != 0
+    if has_hint:
         normals = _select(normals, hint, (UP.hint_cos, 2.0))
-    found = _directions(normals, least, trials)
-    if len(found) == 0:
+    directions = _directions(normals, min_count, trials)
+    if len(directions) == 0:
         return np.zeros(3)
-    hypotheses = _hypotheses(found, UP.corner_cos if free else 0.0)
-    best, most = 0, -1.0
+    hypotheses = _hypotheses(directions, 0.0 if has_hint else UP.corner_cos)
+    best, best_score = 0, -1.0
     for k in range(len(hypotheses)):
-        score = _score(surface, hypotheses[k], roll_penalty if free else 0.0)
-        best, most = (k, score) if score > most else (best, most)
+        score = _score(surface, hypotheses[k], 0.0 if has_hint else roll_penalty)
+        best, best_score = (k, score) if score > best_score else (best, best_score)
     up: F8 = _refined(points, surface, intrinsics, hypotheses[best])
     return up
 
@@ -62,69 +62,72 @@ def estimate_up(
 def _every_second(points: OrientedPoints) -> F4:
     """Return the normals, positions and weights (7, n) of every second point, for speed."""
     normals, positions = points.normals, points.positions
-    found = np.zeros((7, normals.shape[1] // 2 + 1), np.float32)
+    surface = np.zeros((7, normals.shape[1] // 2 + 1), np.float32)
     n = 0
     for k in range(0, normals.shape[1], 2):
         for d in range(3):
-            found[d, n], found[3 + d, n] = normals[d, k], positions[d, k]
-        found[6, n] = 1 / (1 + (positions[2, k] / UP.half_weight_m) ** 2)
+            surface[d, n], surface[3 + d, n] = normals[d, k], positions[d, k]
+        surface[6, n] = 1 / (1 + (positions[2, k] / UP.half_weight_m) ** 2)
         n += normals[2, k] != 0
-    return found[:, :n].copy()
+    return surface[:, :n].copy()
 
 
 @kernel(inline=True)
-def _directions(normals: F4, least: float, trials: F8) -> F8:
+def _directions(normals: F4, min_count: float, trials: F8) -> F8:
     """Return directions (n, 3) with many normals, most first, found one by one by RANSAC."""
-    found = np.zeros((MOST_DIRECTIONS, 3))
-    for k in range(MOST_DIRECTIONS):
-        if normals.shape[1] <= least or _ransac_direction(normals, trials, found[k]) < least:
-            return found[:k]
-        normals = _select(normals, found[k], (-2.0, UP.facing_cos))
-    return found
+    directions = np.zeros((MAX_DIRECTIONS, 3))
+    for k in range(MAX_DIRECTIONS):
+        if (
+            normals.shape[1] <= min_count
+            or _ransac_direction(normals, trials, directions[k]) < min_count
+        ):
+            return directions[:k]
+        normals = _select(normals, directions[k], (-2.0, UP.facing_cos))
+    return directions
 
 
 @kernel(inner=True)
 def _select(normals: F4, direction: F8, bounds: tuple[float, float]) -> F4:
     """Return the normals (3, n) whose cosine with a direction is within bounds."""
-    chosen = np.zeros(normals.shape, np.float32)
+    selected = np.zeros(normals.shape, np.float32)
     x, y, z = np.float32(direction[0]), np.float32(direction[1]), np.float32(direction[2])
     n = 0
     for k in range(normals.shape[1]):
         a, b, c = normals[0, k], normals[1, k], normals[2, k]
-        chosen[0, n], chosen[1, n], chosen[2, n] = a, b, c
+        selected[0, n], selected[1, n], selected[2, n] = a, b, c
         cos = a * x + b * y + c * z
         n += (cos > bounds[0]) & (cos <= bounds[1])
-    return chosen[:, :n].copy()
+    return selected[:, :n].copy()
 
 
 @kernel(inline=True)
 def _ransac_direction(normals: F4, trials: F8, best: F8) -> int:
     """Write the direction near which most normals (3, n) are; return their number."""
-    n, most = normals.shape[1], 0
-    one = np.zeros(3)
+    n, best_count = normals.shape[1], 0
+    direction = np.zeros(3)
     for t in range(UP.trials):
         k = int(trials[t, 0] * n)
-        one[0], one[1], one[2] = normals[0, k], normals[1, k], normals[2, k]
+        direction[0], direction[1], direction[2] = normals[0, k], normals[1, k], normals[2, k]
         inliers = 0
         for start in range(0, n, BLOCK):
-            if inliers + n - start <= most:
+            if inliers + n - start <= best_count:
                 break
-            inliers += _count_facing(normals, one, start, min(start + BLOCK, n))
-        if inliers > most:
-            most = inliers
-            best[0], best[1], best[2] = one[0], one[1], one[2]
+            inliers += _count_facing(normals, direction, start, min(start + BLOCK, n))
+        if inliers > best_count:
+            best_count = inliers
+            best[0], best[1], best[2] = direction[0], direction[1], direction[2]
     for _ in range(3):
-        most = _turn_to_mean(normals, best)
-    return most
+        best_count = _turn_to_mean(normals, best)
+    return best_count
 
 
 @kernel(fast=True, inner=True)
 def _count_facing(normals: F4, direction: F8, start: int, stop: int) -> int:
     xs, ys, zs = normals[0], normals[1], normals[2]  # unpacked they would not be contiguous
     x, y, z = np.float32(direction[0]), np.float32(direction[1]), np.float32(direction[2])
-    least, inliers = np.float32(UP.facing_cos), np.int32(0)
+    min_cos, inliers = np.float32(UP.facing_cos), np.int32(0)
     for k in range(np.uint64(start), np.uint64(stop)):  # unsigned: no check for negative indices
-        inliers += np.int32(xs[k] * x + ys[k] * y + zs[k] * z > least)
+        inliers += np.int32(xs[k] * x + ys[k] * y + zs[k] * z > min_cos)
     return int(inliers)
 
 
@@ -133,31 +136,31 @@ def _turn_to_mean(normals: F4, direction: F8) -> int:
     """Turn a direction to the mean of the normals near it; return their number."""
     xs, ys, zs = normals[0], normals[1], normals[2]
     x, y, z = np.float32(direction[0]), np.float32(direction[1]), np.float32(direction[2])
-    least, zero = np.float32(UP.facing_cos), np.float32(0)
+    min_cos, zero = np.float32(UP.facing_cos), np.float32(0)
     sx = sy = sz = np.float64(0)
     inliers = np.int32(0)
     for k in range(xs.size):
-        near = xs[k] * x + ys[k] * y + zs[k] * z > least
-        inliers += np.int32(near)
-        sx += xs[k] if near else zero
-        sy += ys[k] if near else zero
-        sz += zs[k] if near else zero
+        faces = xs[k] * x + ys[k] * y + zs[k] * z > min_cos
+        inliers += np.int32(faces)
+        sx += xs[k] if faces else zero
+        sy += ys[k] if faces else zero
+        sz += zs[k] if faces else zero
     norm = math.sqrt(sx * sx + sy * sy + sz * sz)
     direction[0], direction[1], direction[2] = sx / norm, sy / norm, sz / norm
     return int(inliers)
 
 
 @kernel(inline=True)
-def _hypotheses(found: F8, corner_cos: float) -> F8:
+def _hypotheses(directions: F8, corner_cos: float) -> F8:
     """Return candidates for up (n, 3): the directions found, and perpendiculars to two of them."""
-    n = len(found)
+    n = len(directions)
     result = np.zeros((n * n, 3))
-    for k in range(len(found)):
+    for k in range(len(directions)):
         for d in range(3):
-            result[k, d] = found[k, d]
+            result[k, d] = directions[k, d]
         for m in range(k):
-            if abs(cosine(found[k], found[m])) < corner_cos:
-                corner = cross(found[k], found[m])
+            if abs(cosine(directions[k], directions[m])) < corner_cos:
+                corner = cross(directions[k], directions[m])
                 norm = math.sqrt(cosine(corner, corner))
                 for d in range(3):
                     result[n, d], result[n + 1, d] = corner[d] / norm, -corner[d] / norm
@@ -169,7 +172,7 @@ def _hypotheses(found: F8, corner_cos: float) -> F8:
 def _score(surface: F4, direction: F8, roll_penalty: float) -> float:
     """Return the score of a direction: the weight of large levels, adjusted as in `estimate_up`."""
     count, facing, total = _count_levels(surface, direction)
-    level, squares = _large_levels(count, UP.least_share * total)
+    level, squares = _large_levels(count, UP.min_share * total)
     if level == 0:
         return 0.0
     # A shelf has several boards but one back. Objects in front of a wall add levels as well, but of
@@ -184,22 +187,24 @@ def _score(surface: F4, direction: F8, roll_penalty: float) -> float:
 
 
 @kernel(inline=True)
-def _large_levels(count: F8, least: float) -> tuple[float, float]:
-    """Return the sum of the weights of levels above ``least``, and the sum of their squares.
+def _large_levels(count: F8, min_weight: float) -> tuple[float, float]:
+    """Return the sum of the weights of levels above ``min_weight``, and the sum of their squares.
 
     A level fills two bins, and has more weight than its neighbours: slanted surface has no peaks.
     """
     weight = squares = 0.0
     last = count.size - 1
     for k in range(last):
-        here = count[k] + count[k + 1]
-        stands_out = here > least
+        level_weight = count[k] + count[k + 1]
+        stands_out = level_weight > min_weight
         for m in range(max(0, k - 2), min(last, k + 3)):
-            there = count[m] + count[m + 1]
-            stands_out &= here > there if m < k else here >= there
+            neighbour_weight = count[m] + count[m + 1]
+            stands_out &= (
+                level_weight > neighbour_weight if m < k else level_weight >= neighbour_weight
+            )
         if stands_out:
-            weight += here
-            squares += here * here
+            weight += level_weight
+            squares += level_weight * level_weight
     return weight, squares
 
 
@@ -213,11 +218,11 @@ def _count_levels(surface: F4, direction: F8) -> tuple[F8, float, float]:
     nx, ny, nz, weights = surface[0], surface[1], surface[2], surface[6]
     px, py, pz = surface[3], surface[4], surface[5]
     bins, scale = np.zeros(nx.size, np.int32), np.float32(-1 / UP.level_bin_m)
-    least, none = np.float32(UP.facing_cos), np.int32(BINS)
+    min_cos, other_bin = np.float32(UP.facing_cos), np.int32(BINS)
     for k in range(nx.size):  # this vectorises
         below = scale * (px[k] * x + py[k] * y + pz[k] * z)
-        faces = nx[k] * x + ny[k] * y + nz[k] * z > least
-        bins[k] = np.int32(below) if faces & (below >= 0) & (below < BINS) else none
+        faces = nx[k] * x + ny[k] * y + nz[k] * z > min_cos
+        bins[k] = np.int32(below) if faces & (below >= 0) & (below < BINS) else other_bin
     count = np.zeros(BINS + 1)  # the last bin is for the other points
     for k in range(nx.size):
         count[bins[k]] += weights[k]
