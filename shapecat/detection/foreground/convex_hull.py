@@ -24,7 +24,7 @@ def fill_hull(residual: F4, part: I4, stack: I4, count: int) -> int:
     """
     rows, columns = residual.shape
     parts = part.reshape(-1)
-    me = parts[stack[0]]
+    label = parts[stack[0]]
     left, right = np.full(rows, float(columns)), np.full(rows, -1.0)
     for t in range(count):
         i, j = row_and_column(stack[t], columns)
@@ -41,9 +41,9 @@ def fill_hull(residual: F4, part: I4, stack: I4, count: int) -> int:
     top = count
     for i in range(first, last + 1):
         for j in range(math.ceil(left[i] - 1e-6), math.floor(1e-6 - right[i]) + 1):
-            if part[i, j] != me and residual[i, j] != 0:
+            if part[i, j] != label and residual[i, j] != 0:
                 stack[top] = i * columns + j
-                part[i, j] = me
+                part[i, j] = label
                 top += 1
     return top
 

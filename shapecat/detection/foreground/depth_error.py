@@ -38,30 +38,30 @@ def measure_residual(inv_depth: F4, heights: HeightMap, plane: F8, number: int, 
     raw, mark = np.zeros((3, columns), np.float32), np.zeros((3, columns), np.float32)
     total, count = np.zeros(columns, np.float32), np.zeros(columns, np.float32)
     n = 0
-    some = False
+    any_low = False
     one, last = np.uint64(1), np.uint64(columns - 1)
     for j in range(np.uint64(columns)):
         out[0, j] = out[rows - 1, j] = zero
     for i in range(rows):
-        before = some
-        some = _find_low(inv_depth, heights, plane, number, i, raw, mark)
+        any_low_before = any_low
+        any_low = _find_low(inv_depth, heights, plane, number, i, raw, mark)
         if i < 2:
             continue
         for j in range(np.uint64(columns)):
             out[i - 1, j] = zero
-        if not before:
+        if not any_low_before:
             continue
-        here, above, below = (i - 1) % 3, (i - 2) % 3, i % 3
+        row, row_above, row_below = (i - 1) % 3, (i - 2) % 3, i % 3
         for j in range(np.uint64(columns)):
-            total[j] = raw[here, j] + raw[above, j] + raw[below, j]
+            total[j] = raw[row, j] + raw[row_above, j] + raw[row_below, j]
         for j in range(np.uint64(columns)):
-            count[j] = mark[here, j] + mark[above, j] + mark[below, j]
+            count[j] = mark[row, j] + mark[row_above, j] + mark[row_below, j]
         for j in range(one, last):
             sums = total[j - one] + total[j] + total[j + one]
             mean = sums / (count[j - one] + count[j] + count[j + one])
-            out[i - 1, j] = mean if mark[here, j] > zero else zero
+            out[i - 1, j] = mean if mark[row, j] > zero else zero
         for j in range(one, last):
-            n += int(mark[here, j])
+            n += int(mark[row, j])
     return n
 
 
@@ -78,15 +78,15 @@ def _find_low(
     zero, one, low = np.float32(0), np.float32(1), np.float32(LOW.low_m)
     slope, base = np.float32(plane[0]), np.float32(plane[1] * i + plane[2])
     above, on = np.int8(number), np.int8(-number)
-    some, row, columns = False, i % 3, np.uint64(inv_depth.shape[1])
+    any_low, row, columns = False, i % 3, np.uint64(inv_depth.shape[1])
     for j in range(columns):
-        mine = ((plane_id[i, j] == above) | (plane_id[i, j] == on)) & (height[i, j] < low)
-        mark[row, j] = one if mine else zero
-        some |= mine
+        is_low = ((plane_id[i, j] == above) | (plane_id[i, j] == on)) & (height[i, j] < low)
+        mark[row, j] = one if is_low else zero
+        any_low |= is_low
     for j in range(columns):
-        at = slope * np.float32(np.int32(j)) + base
-        raw[row, j] = mark[row, j] * (inv_depth[i, j] - at) if some else zero
-    return some
+        level = slope * np.float32(np.int32(j)) + base
+        raw[row, j] = mark[row, j] * (inv_depth[i, j] - level) if any_low else zero
+    return any_low
 
 
 @kernel
@@ -107,40 +107,40 @@ def clear_contact(
     stack, drop : (cells,) work space.
     """
     (rows, columns), (plane_id, height) = residual.shape, heights
-    top = 0
+    tail = 0
     high, edge = np.float32(LOW.low_m), np.zeros(columns, np.bool_)
-    one, me = np.uint64(1), np.int8(number)
+    one, above = np.uint64(1), np.int8(number)
     for i in range(1, rows - 1):
         # Few rows have high cells, and few of these are next to low ones; the tests vectorise.
-        some = False
+        any_high = False
         for j in range(np.uint64(columns)):
-            some |= (plane_id[i, j] == me) & (height[i, j] >= high)
-        if not some:
+            any_high |= (plane_id[i, j] == above) & (height[i, j] >= high)
+        if not any_high:
             continue
-        some = False
+        any_edge = False
         for j in range(one, np.uint64(columns - 1)):
             beside = (residual[i - 1, j] != 0) | (residual[i + 1, j] != 0)
             beside |= (residual[i, j - one] != 0) | (residual[i, j + one] != 0)
-            edge[j] = beside & (plane_id[i, j] == me) & (height[i, j] >= high)
-            some |= edge[j]
-        if not some:
+            edge[j] = beside & (plane_id[i, j] == above) & (height[i, j] >= high)
+            any_edge |= edge[j]
+        if not any_edge:
             continue
         for j in range(1, columns - 1):
             if edge[j]:
-                stack[top], drop[top] = i * columns + j, np.inf
-                top += 1
-    done = 0
-    while done < top:
-        i, j = stack[done] // columns, stack[done] % columns
-        here = drop[done]
-        done += 1
+                stack[tail], drop[tail] = i * columns + j, np.inf
+                tail += 1
+    head = 0
+    while head < tail:
+        i, j = stack[head] // columns, stack[head] % columns
+        level = drop[head]
+        head += 1
         for di, dj in SIDES:
             y, x = i + di, j + dj
-            falls = residual[y, x] != 0 and here - residual[y, x] > LOW.slope
+            falls = residual[y, x] != 0 and level - residual[y, x] > LOW.slope
             if falls and abs(inv_depth[y, x] - inv_depth[i, j]) < jump:
-                stack[top], drop[top] = y * columns + x, residual[y, x]
+                stack[tail], drop[tail] = y * columns + x, residual[y, x]
                 residual[y, x] = 0
-                top += 1
+                tail += 1
 
 
 @kernel
@@ -164,10 +164,10 @@ def filter_high_pass(residual: F4, high_pass: F4) -> None:
             _slide(residual, leaving, np.int32(-1), sums, counts)
         if i < 0:
             continue
-        some = False
+        any_low = False
         for j in range(np.uint64(columns)):
-            some |= residual[i, j] != zero
-        if some:
+            any_low |= residual[i, j] != zero
+        if any_low:
             _add_windows(sums, counts, total, count)
         for j in range(np.uint64(columns)):
             level = residual[i, j] - unit * np.float32(total[j]) / np.float32(count[j])
@@ -177,11 +177,11 @@ def filter_high_pass(residual: F4, high_pass: F4) -> None:
 @kernel(inner=True)
 def _slide(residual: F4, i: int, sign: int, sums: I4, counts: I4) -> None:
     """Add a row to the sums of the columns, or subtract it (``sign`` -1)."""
-    steps, most, least = np.float32(STEPS), np.float32(LOW.most), np.float32(-1)
+    steps, maximum, minimum = np.float32(STEPS), np.float32(LOW.max_value), np.float32(-1)
     margin = np.uint64(LOW.window + 1)
     for j in range(np.uint64(residual.shape[1])):
-        value = residual[i, j] if residual[i, j] < most else most
-        sums[j + margin] += sign * np.int32(steps * (value if value > least else least))
+        value = residual[i, j] if residual[i, j] < maximum else maximum
+        sums[j + margin] += sign * np.int32(steps * (value if value > minimum else minimum))
         counts[j + margin] += sign * np.int32(residual[i, j] != 0)
 
 
@@ -201,7 +201,7 @@ def _add_windows(sums: I4, counts: I4, total: I4, count: I4) -> None:
 
 @kernel
 def measure_noise(high_pass: F4, plane_id: I4, number: int) -> float:
-    """Return the median rise, 1/m, between cells of a plane that are `LOW.apart` cells apart.
+    """Return the median rise, 1/m, between cells of a plane that are `LOW.rise_cells` cells apart.
 
     ``high_pass`` (rows, columns), 1/m, is from `filter_high_pass`; ``number``, from 1, is that of
     the plane in ``plane_id`` (rows, columns), which is as in `HeightMap`.
@@ -209,14 +209,14 @@ def measure_noise(high_pass: F4, plane_id: I4, number: int) -> float:
     rows, columns = high_pass.shape
     histogram = np.zeros(BINS, np.int64)
     n = 0
-    for i in range(0, rows - LOW.apart, EVERY):
-        for j in range(0, columns - LOW.apart, EVERY):
-            here = high_pass[i, j]
-            if plane_id[i, j] != -number or here == 0:
+    for i in range(0, rows - LOW.rise_cells, EVERY):
+        for j in range(0, columns - LOW.rise_cells, EVERY):
+            value = high_pass[i, j]
+            if plane_id[i, j] != -number or value == 0:
                 continue
-            for y, x in ((i + LOW.apart, j), (i, j + LOW.apart)):
+            for y, x in ((i + LOW.rise_cells, j), (i, j + LOW.rise_cells)):
                 if plane_id[y, x] == -number and high_pass[y, x] != 0:
-                    rise = abs(high_pass[y, x] - here)
+                    rise = abs(high_pass[y, x] - value)
                     histogram[min(int(rise / BIN), BINS - 1)] += 1
                     n += 1
     below = bins = 0

@@ -36,12 +36,12 @@ class Scratch(NamedTuple):
 
     Attributes
     ----------
-    seen : (rows, columns) int32, the number of the last part that was flooded at each cell.
+    flooded : (rows, columns) int32, the number of the last part that was flooded at each cell.
     part : (rows, columns) int32, the number of the last part whose filled hull holds each cell.
     seeds, stack : (cells,) int32, lists of flat cells.
     """
 
-    seen: I4
+    flooded: I4
     part: I4
     seeds: I4
     stack: I4
@@ -82,12 +82,12 @@ def find_low_profile(
         values, plane_ids, marks = inv_depth[start:end], plane_id[start:end], low_profile[start:end]
         residual, high_pass = residuals[start:end], high_passes[start:end]
         above = HeightMap(plane_ids, height[start:end])
-        if measure_residual(values, above, plane, number, residual) < LOW.least_cells:
+        if measure_residual(values, above, plane, number, residual) < LOW.min_cells:
             continue
         clear_contact(values, above, number, 2 * jump, residual, scratch.seeds, drops)
         filter_high_pass(residual, high_pass)
-        clear = max(LOW.step, LOW.steady * measure_noise(high_pass, plane_ids, number))
-        step = max(clear, LOW.slip * math.hypot(plane[0], plane[1]))
+        clear = max(LOW.step, LOW.noise_factor * measure_noise(high_pass, plane_ids, number))
+        step = max(clear, LOW.slope_share * math.hypot(plane[0], plane[1]))
         limits = Limits(step, np.float32(min(clear, LOW.fine)), widest, jump)
         objects, parts = _mark_objects(
             values, high_pass, plane_ids, number, limits, marks, objects, parts, scratch
@@ -105,15 +105,17 @@ def _rows_of(plane_id: I4, number: int) -> tuple[int, int]:
     above, on = np.int8(number), np.int8(-number)
     start, end = rows, 0
     for i in range(rows):
-        some = False
+        occupied = False
         for j in range(plane_id.shape[1]):
-            some |= (plane_id[i, j] == above) | (plane_id[i, j] == on)
-        if some:
+            occupied |= (plane_id[i, j] == above) | (plane_id[i, j] == on)
+        if occupied:
             start, end = min(start, i), i + 1
     if end == 0:
         return 0, 0
-    start = max(start - LOW.apart, 0)
-    return start - start % EVERY, min(end + LOW.apart, rows)  # noise is measured on the same rows
+    start = max(start - LOW.rise_cells, 0)
+    return start - start % EVERY, min(
+        end + LOW.rise_cells, rows
+    )  # noise is measured on the same rows
 
 
 @kernel(inner=True)
@@ -134,10 +136,10 @@ def _mark_objects(
     last numbers are returned. ``high_pass`` (rows, columns) is from `filter_high_pass`.
     """
     flat, marks, plane_ids = high_pass.reshape(-1), low_profile.reshape(-1), plane_id.reshape(-1)
-    seen, part, seeds, stack = scratch
-    visited, part_of = seen.reshape(-1), part.reshape(-1)
+    flooded, part, seeds, stack = scratch
+    visited, part_of = flooded.reshape(-1), part.reshape(-1)
     n = _find_seeds(high_pass, limits.level * LOW.levels[-1], seeds)
-    merits = np.zeros(1 + objects + len(LOW.levels) * (flat.size // LOW.least_cells), np.float32)
+    merits = np.zeros(1 + objects + len(LOW.levels) * (flat.size // LOW.min_cells), np.float32)
     for multiple in LOW.levels:
         level = np.float32(limits.level * multiple)
         first = parts
@@ -145,24 +147,27 @@ def _mark_objects(
             if visited[s] > first or not flat[s] > level:
                 continue
             parts += 1
-            count = _flood(high_pass, level, s, parts, seen, stack)
-            if count < LOW.least_cells:
+            count = _flood(high_pass, level, s, parts, flooded, stack)
+            if count < LOW.min_cells:
                 continue
-            known, best = 0, 0.0
+            overlap, best_merit = 0, 0.0
             for p in stack[:count]:
                 part_of[p] = parts
-                known += marks[p] > 0
-                best = max(best, merits[marks[p]])
-            if known > LOW.same * count or width_of_part(inv_depth, stack, count) > limits.width:
+                overlap += marks[p] > 0
+                best_merit = max(best_merit, merits[marks[p]])
+            if (
+                overlap > LOW.max_overlap * count
+                or width_of_part(inv_depth, stack, count) > limits.width
+            ):
                 continue
             filled = fill_hull(high_pass, part, stack, count)
             outline = measure_outline(
                 inv_depth, high_pass, plane_id, part, stack, filled, number, limits
             )
             for p in stack[count:filled]:
-                best = max(best, merits[marks[p]])
+                best_merit = max(best_merit, merits[marks[p]])
             merit = outline.rise / outline.sides
-            if merit > LOW.grown * best and is_object(outline, filled):
+            if merit > LOW.grown * best_merit and is_object(outline, filled):
                 objects += 1
                 merits[objects] = merit
                 for p in stack[:filled]:
@@ -171,11 +176,11 @@ def _mark_objects(
 
 
 @kernel(inline=True)
-def _find_seeds(high_pass: F4, least: float, seeds: I4) -> int:
-    """List the cells above ``least`` that are higher than their left and upper neighbours.
+def _find_seeds(high_pass: F4, threshold: float, seeds: I4) -> int:
+    """List the cells above ``threshold`` that are higher than their left and upper neighbours.
 
     They include the first cell of every part above any level. Returns their number. Most cells are
-    below ``least``, so a vectorised test skips whole blocks.
+    below ``threshold``, so a vectorised test skips whole blocks.
     """
     rows, columns = high_pass.shape
     flat = high_pass.reshape(-1)
@@ -183,20 +188,22 @@ def _find_seeds(high_pass: F4, least: float, seeds: I4) -> int:
     for i in range(1, rows):
         for start in range(1, columns, BLOCK):
             # Unsigned indices instead of slices, each of which counts references.
-            here = np.uint64(i * columns + start)
-            before, above = here - np.uint64(1), np.uint64((i - 1) * columns + start)
+            cell = np.uint64(i * columns + start)
+            before, above = cell - np.uint64(1), np.uint64((i - 1) * columns + start)
             cells = np.uint64(min(BLOCK, columns - start))
-            some = False
+            any_above = False
             for k in range(cells):
-                value = flat[here + k]
-                some |= (value > least) & (value > flat[before + k]) & (value > flat[above + k])
-            if not some:
+                value = flat[cell + k]
+                any_above |= (
+                    (value > threshold) & (value > flat[before + k]) & (value > flat[above + k])
+                )
+            if not any_above:
                 continue
             for k in range(cells):
-                value = flat[here + k]
-                seeds[n] = here + k
+                value = flat[cell + k]
+                seeds[n] = cell + k
                 higher = (value > flat[before + k]) & (value > flat[above + k])
-                n += int((value > least) & higher)
+                n += int((value > threshold) & higher)
     return n
 
 
@@ -210,17 +217,17 @@ def _flood(residual: F4, level: float, start: int, n: int, part: I4, stack: I4) 
     flat, parts = residual.reshape(-1), part.reshape(-1)
     stack[0] = start
     parts[start] = n
-    done, top = 0, 1
-    while done < top:
-        p = stack[done]
-        done += 1
+    head, tail = 0, 1
+    while head < tail:
+        p = stack[head]
+        head += 1
         for step in (1, -1, columns, -columns):
             q = np.uint64(p + step)  # unsigned: no check for negative indices
             new = (parts[q] != n) & (flat[q] > level)
             parts[q] = n if new else parts[q]  # a branch would be unpredictable
-            stack[top] = q
-            top += int(new)
-    return top
+            stack[tail] = q
+            tail += int(new)
+    return tail
 
 
 @kernel(inner=True)
@@ -243,10 +250,10 @@ def _drop_error(
     above = np.zeros(residual.shape, np.float32)
     n = 0
     for i in range(rows):
-        some = False
+        any_low = False
         for j in range(columns):
-            some |= (plane_id[i, j] == number) & (residual[i, j] != 0)
-        if not some:
+            any_low |= (plane_id[i, j] == number) & (residual[i, j] != 0)
+        if not any_low:
             continue
         for j in range(columns):
             low = (plane_id[i, j] == number) & (residual[i, j] != 0) & (low_profile[i, j] == 0)
@@ -264,7 +271,7 @@ def _drop_error(
         if count < LOW.small_part:
             continue
         line = measure_outline(inv_depth, residual, plane_id, part, stack, count, number, limits)
-        if line.table >= LOW.beside * line.sides and line.rise < line.table:
+        if line.table >= LOW.facing_share * line.sides and line.rise < line.table:
             for t in range(count):
                 plane_ids[stack[t]] = -number
     return parts
@@ -274,11 +281,11 @@ def _drop_error(
 def _is_flat(residual: F4, i: int, j: int) -> bool:
     """Return whether a low cell is not on the side of an object."""
     rows, columns = residual.shape
-    here = residual[i, j]
+    value = residual[i, j]
     for di, dj in SIDES:
         y, x = i + 2 * di, j + 2 * dj
         if y < 0 or x < 0 or y >= rows or x >= columns:
             continue
-        if residual[y, x] == 0 or abs(residual[y, x] - here) > LOW.side:
+        if residual[y, x] == 0 or abs(residual[y, x] - value) > LOW.side:
             return False
     return True

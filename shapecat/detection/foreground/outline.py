@@ -36,7 +36,7 @@ class Outline(NamedTuple):
     ----------
     sides : all sides.
     table : sides that face the plane.
-    known : ``table`` sides, sides next to higher cells, and sides in front of a farther surface.
+    bounded : ``table`` sides, sides next to higher cells, and sides in front of a farther surface.
     hidden : sides next to a nearer surface or a cell without depth.
     rise : sum of the rises of the ``table`` sides, each divided by the minimum mean rise.
     steep : steep sides among the ``table`` sides.
@@ -44,7 +44,7 @@ class Outline(NamedTuple):
 
     sides: int
     table: int
-    known: int
+    bounded: int
     hidden: int
     rise: float
     steep: int
@@ -69,14 +69,14 @@ def width_of_part(inv_depth: F4, stack: I4, count: int) -> float:
 def is_object(outline: Outline, count: int) -> bool:
     """Return whether an outline around ``count`` cells is that of an object."""
     table, sides = outline.table, outline.sides
-    if table < OUTLINES.known * sides and sides * sides > OUTLINES.ragged * count:
+    if table < OUTLINES.bounded_share * sides and sides * sides > OUTLINES.ragged * count:
         return False
-    seen = sides - (outline.hidden if count > OUTLINES.broad * sides else 0)
-    least = max(OUTLINES.least_sides, OUTLINES.along * sides)
-    if table < least or outline.known < OUTLINES.known * seen:
+    visible = sides - (outline.hidden if count > OUTLINES.broad * sides else 0)
+    min_table = max(OUTLINES.min_sides, OUTLINES.table_share * sides)
+    if table < min_table or outline.bounded < OUTLINES.bounded_share * visible:
         return False
-    least_rise = max(table * (1 + OUTLINES.chance / sides), OUTLINES.all_around * sides)
-    return bool(outline.rise > least_rise and outline.steep > OUTLINES.steep_share * table)
+    min_rise = max(table * (1 + OUTLINES.chance / sides), OUTLINES.all_around * sides)
+    return bool(outline.rise > min_rise and outline.steep > OUTLINES.steep_share * table)
 
 
 @kernel(inner=True)
@@ -104,21 +104,21 @@ def measure_outline(
     rows, columns = residual.shape
     parts = part.reshape(-1)
     jump = limits.discontinuity
-    sides = table = known = hidden = steep = 0
-    rise, outward = 0.0, LOW.apart - OUTLINES.inward
-    me = parts[stack[0]]
+    sides = table = bounded = hidden = steep = 0
+    rise, outward = 0.0, LOW.rise_cells - OUTLINES.inward
+    label = parts[stack[0]]
     for t in range(count):
         p = stack[t]
-        beside = (parts[p - 1] == me) & (parts[p + 1] == me)
-        if beside & (parts[p - columns] == me) & (parts[p + columns] == me):
+        beside = (parts[p - 1] == label) & (parts[p + 1] == label)
+        if beside & (parts[p - columns] == label) & (parts[p + columns] == label):
             continue
         for di, dj in ((1, 0), (-1, 0), (0, 1), (0, -1)):  # another order rounds sums differently
-            if parts[p + di * columns + dj] == me:
+            if parts[p + di * columns + dj] == label:
                 continue
             i, j = row_and_column(p, columns)
             sides += 1
             y, x = i + di, j + dj
-            known += (
+            bounded += (
                 residual[y, x] == 0
                 and inv_depth[y, x] > 0
                 and abs(inv_depth[y, x] - inv_depth[i, j]) < jump
@@ -128,14 +128,14 @@ def measure_outline(
             v, u = i - OUTLINES.inward * di, j - OUTLINES.inward * dj
             if min(y, x) < 0 or min(v, u) < 0 or max(y, v) >= rows or max(x, u) >= columns:
                 continue
-            known += 0 < inv_depth[y, x] < inv_depth[i, j] - jump
+            bounded += 0 < inv_depth[y, x] < inv_depth[i, j] - jump
             if plane_id[y, x] != -number or residual[y, x] == 0 or abs(plane_id[v, u]) != number:
                 continue
             table += 1
-            known += 1
+            bounded += 1
             step = (residual[v, u] - residual[y, x]) / limits.rise
             if residual[v, u] == 0:  # the inside is not low
-                step = OUTLINES.most_steps
-            rise += min(step, OUTLINES.most_steps)
+                step = OUTLINES.max_rise
+            rise += min(step, OUTLINES.max_rise)
             steep += int(step > OUTLINES.steep)
-    return Outline(sides, table, known, hidden, rise, steep)
+    return Outline(sides, table, bounded, hidden, rise, steep)

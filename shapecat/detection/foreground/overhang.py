@@ -25,16 +25,16 @@ class Overhang(NamedTuple):
     Attributes
     ----------
     grid, heights, walls : as in `extend_overhang`.
-    me : number of the plane, from 1, as in `HeightMap.plane_id`.
+    number : number of the plane, from 1, as in `HeightMap.plane_id`.
     plane : its row of `pack_planes`.
     highest_m : greatest height of an object above it, metres.
-    visited : (rows, columns) int8, ``me`` in the cells already visited for this plane.
+    visited : (rows, columns) int8, ``number`` in the cells already visited for this plane.
     """
 
     grid: DepthGrid
     heights: HeightMap
     walls: U1
-    me: int
+    number: int
     plane: F8
     highest_m: float
     visited: I4
@@ -59,92 +59,96 @@ def extend_overhang(
     shape = grid.inverse_depth.shape
     visited, stack = np.zeros(shape, np.int8), unset(grid.inverse_depth.size, np.int32)
     border = np.zeros(shape[1], np.uint8)
-    for me in range(len(planes), 0, -1):
-        over = Overhang(grid, heights, walls, me, planes[me - 1], highest_m, visited)
+    for number in range(len(planes), 0, -1):
+        over = Overhang(grid, heights, walls, number, planes[number - 1], highest_m, visited)
         for i in range(shape[0]):
-            if not _find_border(heights.plane_id, me, i, border):
+            if not _find_border(heights.plane_id, number, i, border):
                 continue
             for j in range(shape[1]):
-                if border[j] and visited[i, j] != me and _goes_on(over, i, j):
+                if border[j] and visited[i, j] != number and _continues(over, i, j):
                     _extend(over, i, j, stack)
 
 
 @kernel(inline=True)
-def _find_border(plane_id: I4, me: int, i: int, border: U1) -> bool:
+def _find_border(plane_id: I4, number: int, i: int, border: U1) -> bool:
     """Mark the cells of row i above a plane that are next to cells of lower planes or of none.
 
     Returns whether there are any such cells.
     """
     rows, columns = plane_id.shape
-    above, below, one = max(i - 1, 0), min(i + 1, rows - 1), np.uint64(1)
-    mine = np.uint8(me)  # as unsigned numbers, cells on a surface are larger
+    row_above, row_below, one = max(i - 1, 0), min(i + 1, rows - 1), np.uint64(1)
+    plane = np.uint8(number)  # as unsigned numbers, cells on a surface are larger
     for j in range(np.uint64(columns)):
-        lower = (np.uint8(plane_id[above, j]) < mine) | (np.uint8(plane_id[below, j]) < mine)
-        border[j] = lower & (np.uint8(plane_id[i, j]) == mine)
+        lower = (np.uint8(plane_id[row_above, j]) < plane) | (
+            np.uint8(plane_id[row_below, j]) < plane
+        )
+        border[j] = lower & (np.uint8(plane_id[i, j]) == plane)
     for j in range(np.uint64(columns - 1)):
-        lower = np.uint8(plane_id[i, j + one]) < mine
-        border[j] |= (np.uint8(plane_id[i, j]) == mine) & lower
+        lower = np.uint8(plane_id[i, j + one]) < plane
+        border[j] |= (np.uint8(plane_id[i, j]) == plane) & lower
     for j in range(one, np.uint64(columns)):
-        lower = np.uint8(plane_id[i, j - one]) < mine
-        border[j] |= (np.uint8(plane_id[i, j]) == mine) & lower
-    some = np.uint8(0)
+        lower = np.uint8(plane_id[i, j - one]) < plane
+        border[j] |= (np.uint8(plane_id[i, j]) == plane) & lower
+    any_lower = np.uint8(0)
     for j in range(np.uint64(columns)):
-        some |= border[j]
-    return bool(some > 0)
+        any_lower |= border[j]
+    return bool(any_lower > 0)
 
 
 @kernel(inline=True)
-def _goes_on(over: Overhang, i: int, j: int) -> bool:
+def _continues(over: Overhang, i: int, j: int) -> bool:
     """Return whether the surface at a cell above the plane continues in a neighbour outside it."""
     rows, columns = over.visited.shape
-    some, here = False, over.grid.inverse_depth[i, j]
+    continues, w = False, over.grid.inverse_depth[i, j]
     for di, dj in SIDES:
         y, x = i + di, j + dj
-        if not (0 <= y < rows and 0 <= x < columns and 0 <= over.heights.plane_id[y, x] < over.me):
+        if not (
+            0 <= y < rows and 0 <= x < columns and 0 <= over.heights.plane_id[y, x] < over.number
+        ):
             continue
-        if abs(over.grid.inverse_depth[y, x] - here) < over.grid.discontinuity:
-            some |= _height_beside(over, y, x) > 0
-    return some
+        if abs(over.grid.inverse_depth[y, x] - w) < over.grid.discontinuity:
+            continues |= _height_beside(over, y, x) > 0
+    return continues
 
 
 @kernel(inline=True)
 def _extend(over: Overhang, i: int, j: int, stack: I4) -> None:
     """Assign the outside part of the object at cell (i, j) to its plane, unless it is too large."""
-    inv_depth, plane_id, me = over.grid.inverse_depth, over.heights.plane_id, over.me
+    inv_depth, plane_id, number = over.grid.inverse_depth, over.heights.plane_id, over.number
     rows, columns = inv_depth.shape
-    stack[0], over.visited[i, j] = i * columns + j, me
-    done, top, outside = 0, 1, 0
-    while done < top:
-        i, j = row_and_column(stack[done], columns)
-        done += 1
+    stack[0], over.visited[i, j] = i * columns + j, number
+    head, tail, outside = 0, 1, 0
+    while head < tail:
+        i, j = row_and_column(stack[head], columns)
+        head += 1
         for di, dj in SIDES:
             y, x = i + di, j + dj
-            if y < 0 or x < 0 or y >= rows or x >= columns or over.visited[y, x] == me:
+            if y < 0 or x < 0 or y >= rows or x >= columns or over.visited[y, x] == number:
                 continue
-            mine = plane_id[y, x] == me
+            inside = plane_id[y, x] == number
             if abs(inv_depth[y, x] - inv_depth[i, j]) >= over.grid.discontinuity:
                 continue
-            if mine or (0 <= plane_id[y, x] < me and _height_beside(over, y, x) > 0):
-                over.visited[y, x] = me
-                outside += not mine
-                stack[top] = y * columns + x
-                top += 1
-    if outside <= OVERHANG.beyond * (top - outside):
-        for p in stack[: top if outside else 0]:
+            if inside or (0 <= plane_id[y, x] < number and _height_beside(over, y, x) > 0):
+                over.visited[y, x] = number
+                outside += not inside
+                stack[tail] = y * columns + x
+                tail += 1
+    if outside <= OVERHANG.outside_ratio * (tail - outside):
+        for p in stack[: tail if outside else 0]:
             y, x = row_and_column(p, columns)
-            if plane_id[y, x] != me:
-                over.heights.height[y, x], plane_id[y, x] = _height_beside(over, y, x), me
+            if plane_id[y, x] != number:
+                over.heights.height[y, x], plane_id[y, x] = _height_beside(over, y, x), number
 
 
 @kernel(inner=True)
 def _height_beside(over: Overhang, i: int, j: int) -> float:
     """Return the height of a cell above the plane, metres; 0 if no object on it can be there."""
-    w, k, plane = over.grid.inverse_depth[i, j], over.grid.intrinsics, over.plane
-    if w <= 0 or over.walls[i, j] == CLEARED:
+    inv_depth, k, plane = over.grid.inverse_depth[i, j], over.grid.intrinsics, over.plane
+    if inv_depth <= 0 or over.walls[i, j] == CLEARED:
         return 0.0
-    z = 1 / float(w)
-    height = (w - (plane[0] * j + plane[1] * i + plane[2])) * z * plane[3]
+    z = 1 / float(inv_depth)
+    height = (inv_depth - (plane[0] * j + plane[1] * i + plane[2])) * z * plane[3]
     if not (min_height_at(z) < height < over.highest_m):
         return 0.0
     x, y = back_project(k, i, j, z)
-    return height if distance_outside(plane, x, y, z) <= OVERHANG.reach_m else 0.0
+    return height if distance_outside(plane, x, y, z) <= OVERHANG.max_distance_m else 0.0

@@ -15,9 +15,9 @@ class LowProfileSettings(NamedTuple):
     """Upper bound of that minimum rise, 1/m: more is not noise but a plane at a grazing angle."""
     step: float = 0.002
     """Minimum mean rise across the outline of an object, 1/m: less than a step of a Kinect."""
-    steady: float = 3.5
+    noise_factor: float = 3.5
     """Minimum rise as a multiple of the median rise between plane cells equally far apart."""
-    slip: float = 0.7
+    slope_share: float = 0.7
     """Minimum rise as a share of the plane's change per cell: at a grazing angle, slightly
     displaced samples seem to rise."""
     grown: float = 0.95
@@ -27,21 +27,21 @@ class LowProfileSettings(NamedTuple):
     """Minimum rise over two cells on the side of an object, 1/m."""
     slope: float = 0.0016
     """Minimum fall per cell on the side of an object, 1/m."""
-    same: float = 0.9
-    """A part with a larger share of its cells in known objects is not tested again."""
-    least_cells: int = 80
+    max_overlap: float = 0.9
+    """A part with a larger share of its cells in objects already marked is not tested again."""
+    min_cells: int = 80
     """Minimum number of cells of a low-profile object: smaller parts are noise."""
     small_part: int = 12
     """Minimum number of cells of a part whose outline can be judged."""
-    beside: float = 0.3
+    facing_share: float = 0.3
     """Minimum fraction of the outline of depth error that faces the plane."""
     low_m: float = 0.03
     """Cells higher than this belong to objects anyway, metres."""
     window: int = 20
     """Half the window of the mean, in cells: wider than a rim, narrower than a wave of error."""
-    most: float = 0.006
+    max_value: float = 0.006
     """Upper bound of a cell's value in the mean, 1/m: an object must not cause a pit around it."""
-    apart: int = 5
+    rise_cells: int = 5
     """Distance, in cells, over which rises are measured, both of noise and of outlines."""
 
 
@@ -52,7 +52,7 @@ class OutlineSettings(NamedTuple):
     """Minimum rise of a steep side, relative to the minimum mean rise: more than noise."""
     steep_share: float = 0.7
     """Minimum fraction of steep sides among those that face the plane."""
-    most_steps: float = 3
+    max_rise: float = 3
     """Upper bound of the rise of one side, relative to the minimum mean rise."""
     all_around: float = 0.75
     """Minimum sum of the rises over the number of sides, including those that do not face the
@@ -62,12 +62,12 @@ class OutlineSettings(NamedTuple):
     """Extra mean rise of an outline, times its number of sides: error seldom rises all around."""
     inward: int = 2
     """Distance from the outline, in cells, at which its inside is measured."""
-    least_sides: int = 30
+    min_sides: int = 30
     """Minimum number of sides that face the plane; fewer prove nothing."""
-    along: float = 0.4
+    table_share: float = 0.4
     """Minimum fraction of the sides that face the plane."""
-    known: float = 0.65
-    """Minimum fraction of known sides among those that are not hidden."""
+    bounded_share: float = 0.65
+    """Minimum fraction of bounded sides among those that are not hidden."""
     broad: float = 1.5
     """Cells per side above which a part may be partly hidden: strips beside objects have fewer."""
     ragged: float = 80
@@ -78,13 +78,13 @@ class OutlineSettings(NamedTuple):
 class WallSettings(NamedTuple):
     """Constants of the search for walls."""
 
-    most: int = 5
+    max_planes: int = 5
     """Maximum number of planes that are tested, which bounds the time."""
-    least_samples: int = 50
+    min_samples: int = 50
     """Minimum number of samples on a wall: about a hundredth of the image."""
     vertical_cos: float = 0.2
     """Largest cosine between up and the normal of a wall: shelves lean by a few degrees."""
-    least_m2: float = 0.05
+    min_area_m2: float = 0.05
     """Minimum area of a wall."""
     part_m2: float = 0.04
     """Minimum area of a connected part that is cleared: smaller ones may be objects."""
@@ -108,9 +108,9 @@ class WallSettings(NamedTuple):
 class OverhangSettings(NamedTuple):
     """Constants of the overhang: objects that extend beyond the outline of their plane."""
 
-    reach_m: float = 0.15
+    max_distance_m: float = 0.15
     """Greatest distance of an object's cell from the outline, metres."""
-    beyond: float = 5
+    outside_ratio: float = 5
     """Largest ratio of an object's cells outside to those inside."""
 
 

@@ -23,7 +23,7 @@ __all__ = ["CLEARED", "ON_WALL", "remove_walls"]
 ON_WALL, CLEARED = 1, 2
 """Marks of cells on a wall: in a small part, which may be an object in the plane of the wall; and
 in a large part, which is removed from the objects."""
-UNSEEN = 3
+UNMEASURED = 3
 """Mark of cells on a wall whose part is not measured yet."""
 
 STRIPS = 400
@@ -51,9 +51,9 @@ def remove_walls(grid: DepthGrid, plane_id: I4, up: F8, largest_m: float, trials
     walls = np.zeros(plane_id.shape, np.uint8)
     samples = sample_grid(grid.inverse_depth, plane_id)
     bounds = (-WALLS.vertical_cos, WALLS.vertical_cos)
-    for _ in range(WALLS.most):
+    for _ in range(WALLS.max_planes):
         plane, count = ransac_plane(samples, trials, grid.intrinsics, up, bounds, PLANES.tolerance)
-        if count < WALLS.least_samples:
+        if count < WALLS.min_samples:
             break
         normal = plane_normal(plane, grid.intrinsics)
         if _is_wall(grid, samples, plane, normal, up, largest_m):
@@ -73,7 +73,7 @@ def _is_wall(
     for k in range(STRIPS):  # a strip counts if the wall in it is longer than the strip is wide
         across += WALLS.strip_m * (strips[0, k] > WALLS.strip_m**2)
         along += WALLS.strip_m * (strips[1, k] > WALLS.strip_m**2)
-    if area <= WALLS.least_m2 or area <= WALLS.filled * across * along:
+    if area <= WALLS.min_area_m2 or area <= WALLS.filled * across * along:
         return False
     if max(across, along) > largest_m:
         return True
@@ -84,13 +84,13 @@ def _is_wall(
 @kernel(inline=True)
 def _is_cut_off(inv_depth: F4, samples: DepthSamples, plane: F8) -> bool:
     """Return whether the inliers of a plane reach two sides of the image or of its sampled part."""
-    own = _bounds(samples, plane, PLANES.tolerance)
-    seen = _bounds(sample_grid(inv_depth, inv_depth), plane, np.inf)
+    plane_bounds = _bounds(samples, plane, PLANES.tolerance)
+    sample_bounds = _bounds(sample_grid(inv_depth, inv_depth), plane, np.inf)
     sides, margin = 0, 1.5 * math.sqrt(samples.share)
     for d in range(2):
         last = inv_depth.shape[1 - d]
-        sides += own[d] < min(seen[d] + margin, BORDER_SHARE * last)
-        sides += own[2 + d] > max(seen[2 + d] - margin, (1 - BORDER_SHARE) * last)
+        sides += plane_bounds[d] < min(sample_bounds[d] + margin, BORDER_SHARE * last)
+        sides += plane_bounds[2 + d] > max(sample_bounds[2 + d] - margin, (1 - BORDER_SHARE) * last)
     return sides >= 2
 
 
@@ -134,20 +134,20 @@ def _clear(grid: DepthGrid, plane_id: I4, plane: F8, normal: F8, walls: U1) -> N
     """Clear the large connected parts of a wall; small parts may be objects in front of it."""
     inv_depth = grid.inverse_depth
     rows, columns = inv_depth.shape
-    stack, found = unset(inv_depth.size, np.int32), unset(inv_depth.shape, np.uint8)
-    _mark(grid, plane_id, plane, found)
+    stack, state = unset(inv_depth.size, np.int32), unset(inv_depth.shape, np.uint8)
+    _mark(grid, plane_id, plane, state)
     total = 0.0
     for i in range(rows):
         for j in range(columns):
-            if found[i, j] == UNSEEN:
-                top, area, off = _flood(grid, plane, normal, i, j, found, stack)
-                exact = area >= WALLS.patch_m2 and off < top * WALLS.exact**2
+            if state[i, j] == UNMEASURED:
+                count, area, squares = _flood(grid, plane, normal, i, j, state, stack)
+                exact = area >= WALLS.patch_m2 and squares < count * WALLS.exact**2
                 if area >= WALLS.part_m2 or exact:
                     total += area
-                    for p in stack[:top]:
-                        found[p // columns, p % columns] = CLEARED
+                    for p in stack[:count]:
+                        state[p // columns, p % columns] = CLEARED
     for i in range(rows if total >= WALLS.cleared_m2 else 0):
-        states, marks, plane_ids = found[i], walls[i], plane_id[i]
+        states, marks, plane_ids = state[i], walls[i], plane_id[i]
         for j in range(columns):
             marks[j] = max(marks[j], states[j])
             plane_ids[j] = 0 if states[j] == CLEARED else plane_ids[j]
@@ -155,7 +155,7 @@ def _clear(grid: DepthGrid, plane_id: I4, plane: F8, normal: F8, walls: U1) -> N
 
 @kernel(inline=True)
 def _flood(
-    grid: DepthGrid, plane: F8, normal: F8, i: int, j: int, found: U1, stack: I4
+    grid: DepthGrid, plane: F8, normal: F8, i: int, j: int, state: U1, stack: I4
 ) -> tuple[int, float, float]:
     """Collect the connected part of a wall at cell (i, j).
 
@@ -164,33 +164,33 @@ def _flood(
     """
     inv_depth, k = grid.inverse_depth, grid.intrinsics
     rows, columns = inv_depth.shape
-    stack[0], found[i, j] = i * columns + j, ON_WALL
-    done, top, area, off = 0, 1, 0.0, 0.0
-    while done < top:
-        i, j = stack[done] // columns, stack[done] % columns
-        done += 1
+    stack[0], state[i, j] = i * columns + j, ON_WALL
+    head, tail, area, squares = 0, 1, 0.0, 0.0
+    while head < tail:
+        i, j = stack[head] // columns, stack[head] % columns
+        head += 1
         x, y, w = (j - k.cx) / k.fx, (i - k.cy) / k.fy, inv_depth[i, j]
         facing = max(-(x * normal[0] + y * normal[1] + normal[2]), 0.1)
         area += 1 / (w * w * k.fx * k.fy * facing)
-        off += (w - (plane[0] * j + plane[1] * i + plane[2])) ** 2
+        squares += (w - (plane[0] * j + plane[1] * i + plane[2])) ** 2
         for di, dj in ((1, 0), (-1, 0), (0, 1), (0, -1)):  # another order rounds sums differently
             v, u = i + di, j + dj
-            if v < 0 or u < 0 or v >= rows or u >= columns or found[v, u] != UNSEEN:
+            if v < 0 or u < 0 or v >= rows or u >= columns or state[v, u] != UNMEASURED:
                 continue
-            stack[top], found[v, u] = v * columns + u, ON_WALL
-            top += 1
-    return top, area, off
+            stack[tail], state[v, u] = v * columns + u, ON_WALL
+            tail += 1
+    return tail, area, squares
 
 
 @kernel(inline=True)
-def _mark(grid: DepthGrid, plane_id: I4, plane: F8, found: U1) -> None:
-    """Mark the cells on a wall as `UNSEEN`, unless they are on a level plane; write 0 elsewhere."""
+def _mark(grid: DepthGrid, plane_id: I4, plane: F8, state: U1) -> None:
+    """Mark cells on a wall as `UNMEASURED`, unless they are on a level plane; write 0 elsewhere."""
     a, inv_depth = np.float32(plane[0]), grid.inverse_depth
     jump = np.float32(grid.discontinuity)
     for i in range(inv_depth.shape[0]):
-        values, plane_ids, states = inv_depth[i], plane_id[i], found[i]
+        values, plane_ids, states = inv_depth[i], plane_id[i], state[i]
         at_row = np.float32(plane[1] * i + plane[2])
         for j in range(inv_depth.shape[1]):
-            off = abs(values[j] - (a * np.float32(j) + at_row))
-            on = (plane_ids[j] >= 0) & (values[j] > 0) & (off < jump)
-            states[j] = UNSEEN if on else 0
+            distance = abs(values[j] - (a * np.float32(j) + at_row))
+            on_wall = (plane_ids[j] >= 0) & (values[j] > 0) & (distance < jump)
+            states[j] = UNMEASURED if on_wall else 0
