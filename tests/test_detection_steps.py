@@ -127,7 +127,7 @@ def test_crowded_image_keeps_its_largest_segments() -> None:
 
     labels, n = watershed(heights, SurfaceGraph(blank, blank, links, flat, spans_of(plane_id)))
 
-    assert n == SEGMENTATION.most_segments
+    assert n == SEGMENTATION.max_segments
     assert (labels[100:140, 100:140] == n).all()
     assert np.unique(labels).tolist() == [*range(n + 1)]
 

@@ -19,12 +19,12 @@ from shapecat.jit import kernel, unset
 __all__ = ["SurfaceGraph", "connect_surfaces"]
 
 BENT = 4
-"""Factor of a link's bits that marks temporarily that only a local plane supports the link."""
-LEAST_CHORD = 3e-4
+"""Factor of the bits of a link: a temporary mark that only a local plane supports the link."""
+MIN_CHORD = 3e-4
 """Squared distance between two unit normals at an angle of one degree."""
 
 BASE, BASE_DIAGONAL = SEGMENTATION.base, SEGMENTATION.base_diagonal
-REACH = SEGMENTATION.step_reach
+SLOPE_CELLS = SEGMENTATION.slope_cells
 
 
 class SurfaceGraph(NamedTuple):
@@ -95,10 +95,10 @@ def _link(grid: DepthGrid, plane_id: I4, spans: I4, local_plane: F4, links: U1) 
             continue
         cell, fit = i * columns + start, 3 * i * columns + start
         run, right = (cell, fit, end - 1 - start), (1, 1, columns)
-        _link_some(plane_ids, depths, planes, jump, run, right, RIGHT, bits)
+        _link_run(plane_ids, depths, planes, jump, run, right, RIGHT, bits)
         if i + 1 < rows:
             run, below = (cell, fit, end - start), (columns, 3 * columns, 2 * columns)
-            _link_some(plane_ids, depths, planes, jump, run, below, DOWN, bits)
+            _link_run(plane_ids, depths, planes, jump, run, below, DOWN, bits)
         _part_steps(grid, plane_id, i, start, end, links)
 
 
@@ -112,33 +112,33 @@ def _part_steps(grid: DepthGrid, plane_id: I4, i: int, start: int, end: int, lin
     the slope.
     """
     inv_depth, jump = grid.inverse_depth, grid.discontinuity
-    some = False
+    any_bent = False
     for j in range(np.uint64(start), np.uint64(end)):
-        some |= links[i, j] > (RIGHT | DOWN)  # few rows have any; this vectorises
-    if not some:
+        any_bent |= links[i, j] > (RIGHT | DOWN)  # few rows have any; this vectorises
+    if not any_bent:
         return
     for j in range(start, end):
         for bit in (RIGHT, DOWN):
             if not links[i, j] & BENT * bit:
                 continue
             di, dj = (0, 1) if bit == RIGHT else (1, 0)
-            i0, j0, i1, j1 = (i - REACH * di, j - REACH * dj, i + di, j + dj)
-            i2, j2 = i1 + REACH * di, j1 + REACH * dj
+            i0, j0, i1, j1 = (i - SLOPE_CELLS * di, j - SLOPE_CELLS * dj, i + di, j + dj)
+            i2, j2 = i1 + SLOPE_CELLS * di, j1 + SLOPE_CELLS * dj
             if i0 < 0 or j0 < 0 or i2 >= inv_depth.shape[0] or j2 >= inv_depth.shape[1]:
                 continue
             if plane_id[i0, j0] != plane_id[i, j] or plane_id[i2, j2] != plane_id[i, j]:
                 continue
             step = inv_depth[i1, j1] - inv_depth[i, j]
-            before = abs(step - (inv_depth[i, j] - inv_depth[i0, j0]) / REACH)
-            after = abs(step - (inv_depth[i2, j2] - inv_depth[i1, j1]) / REACH)
-            least, most = min(before, after), max(before, after)
-            if least >= SEGMENTATION.sure * jump and most >= jump:
+            before = abs(step - (inv_depth[i, j] - inv_depth[i0, j0]) / SLOPE_CELLS)
+            after = abs(step - (inv_depth[i2, j2] - inv_depth[i1, j1]) / SLOPE_CELLS)
+            smaller, larger = min(before, after), max(before, after)
+            if smaller >= SEGMENTATION.step_share * jump and larger >= jump:
                 links[i, j] &= ~bit
         links[i, j] &= RIGHT | DOWN
 
 
 @kernel(fast=True, inner=True)
-def _link_some(
+def _link_run(
     plane_id: I4,
     inv_depth: F4,
     planes: F4,
@@ -169,9 +169,9 @@ def _link_some(
         level_on = abs(v - v1) < jump
         bent = (t > zero) & (abs(t + planes[a + slope] - v1) < jump)
         bent |= (t1 > zero) & (abs(t1 - planes[b + slope] - v) < jump)
-        same = (plane_id[p] > 0) & (plane_id[p] == plane_id[q])
+        same_plane = (plane_id[p] > 0) & (plane_id[p] == plane_id[q])
         link = np.uint8(bit) if level_on else np.uint8(bit + BENT * bit) if bent else np.uint8(0)
-        links[p] |= link if same else np.uint8(0)
+        links[p] |= link if same_plane else np.uint8(0)
 
 
 @kernel
@@ -187,7 +187,7 @@ def _measure_concavity(grid: DepthGrid, graph: SurfaceGraph) -> None:
         start, end = graph.spans[i]
         if start == end:
             continue
-        worst[start:end] = LEAST_CHORD
+        worst[start:end] = MIN_CHORD
         for d in range(4):
             r = BASE if d < 2 else BASE_DIAGONAL
             di = 0 if d == 0 else r
@@ -236,7 +236,7 @@ def _raise_concavity(
     x2 = np.float32(first + dj - intrinsics.cx) * per_x
     x, y = np.float32(dj), np.float32(di)
     inv_depth, plane, normal = flat
-    n, here, to = np.uint64(last - first), np.uint64(i * columns + first), np.uint64(first)
+    n, cell, out = np.uint64(last - first), np.uint64(i * columns + first), np.uint64(first)
     # the indices of the inverse depth, and of its slopes per column and per row, on both sides
     a0 = np.uint64(3 * (i - di) * columns + first - dj)
     b0 = np.uint64(3 * (i + di) * columns + first + dj)
@@ -244,7 +244,7 @@ def _raise_concavity(
     a1, a2, b1, b2 = a0 + row, a0 + row + row, b0 + row, b0 + row + row
     # (1) the distances of both planes from the cell
     for k in range(n):
-        v1, v2, v = plane[a0 + k], plane[b0 + k], inv_depth[here + k]
+        v1, v2, v = plane[a0 + k], plane[b0 + k], inv_depth[cell + k]
         gap1 = abs(v1 + plane[a1 + k] * x + plane[a2 + k] * y - v)
         gap2 = abs(v2 - plane[b1 + k] * x - plane[b2 + k] * y - v)
         gap = gap1 if gap1 > gap2 else gap2
@@ -262,16 +262,16 @@ def _raise_concavity(
     # (3) the largest
     for k in range(n):
         chord = chords[k] if gaps[k] <= gate else zero
-        worst[to + k] = chord if chord > worst[to + k] else worst[to + k]
+        worst[out + k] = chord if chord > worst[out + k] else worst[out + k]
 
 
 @kernel(fast=True, inner=True)
 def _write_angles(level: F4, worst: F4, concavity: U1) -> None:
     """Write the angles of squared chords, in degrees; 0 for cells without a local plane."""
-    degrees, most = np.float32(180 / math.pi), np.float32(120)
+    degrees, max_angle = np.float32(180 / math.pi), np.float32(120)
     for k in range(concavity.size):
         half = np.sqrt(worst[k]) * np.float32(0.5)
         # arcsin by its series: 1 degree off at a right angle
         angle = 2 * degrees * (half + half * half * half * np.float32(0.18))
-        angle = angle if angle < most else most
+        angle = angle if angle < max_angle else max_angle
         concavity[k] = np.uint8(angle) if level[k] > np.float32(0) else np.uint8(0)

@@ -64,18 +64,18 @@ def padded(start: int, end: int) -> int:
 
 
 @kernel(inline=True)
-def _write(fits: F4, planes: F4, normals: F4, at: int, columns: int, n: int) -> None:
-    """Copy the fits of a run to the local planes and normals from index ``at`` on.
+def _write(fits: F4, planes: F4, normals: F4, start: int, columns: int, n: int) -> None:
+    """Copy the fits of a run to the local planes and normals from index ``start`` on.
 
     Slices and signed indices would be slower.
     """
     for d in range(3):
-        to, plane = np.uint64(at + d * columns), np.uint64(d * PITCH)
+        target, plane = np.uint64(start + d * columns), np.uint64(d * PITCH)
         unit = np.uint64((3 + d) * PITCH)
         for k in range(np.uint64(n)):
-            planes[to + k] = fits[plane + k]
+            planes[target + k] = fits[plane + k]
         for k in range(np.uint64(n)):
-            normals[to + k] = fits[unit + k]
+            normals[target + k] = fits[unit + k]
 
 
 @kernel(inline=True)
@@ -88,11 +88,11 @@ def _next_run(plane_ids: I4, row: int, j: int, last: int) -> tuple[int, int]:
     while plane_ids[row + j] <= 0:
         j += 1
     start = end = j
-    me, last = plane_ids[row + j], min(last, start + RUN)
+    plane, last = plane_ids[row + j], min(last, start + RUN)
     while j < min(last, end + SEGMENTATION.bridged) and (
-        plane_ids[row + j] <= 0 or plane_ids[row + j] == me
+        plane_ids[row + j] <= 0 or plane_ids[row + j] == plane
     ):
-        end = j + 1 if plane_ids[row + j] == me else end
+        end = j + 1 if plane_ids[row + j] == plane else end
         j += 1
     return start, end
 
@@ -107,17 +107,17 @@ def _copy_windows(
     """
     rows, columns = shape
     i, start, end = run
-    me, none = plane_ids[i * columns + start], np.float32(NONE)
+    plane, none = plane_ids[i * columns + start], np.float32(NONE)
     left, right = max(start - WINDOW, 0), min(end + WINDOW, columns)
     for d in range(SIDE):
         y, first = i + d - WINDOW, np.uint64(d * PITCH)
         for k in range(np.uint64(end - start + 2 * WINDOW)):
             values[first + k] = none
         if 0 <= y < rows:
-            to = np.uint64(d * PITCH + left - start + WINDOW)
-            at = np.uint64(y * columns + left)
+            target = np.uint64(d * PITCH + left - start + WINDOW)
+            source = np.uint64(y * columns + left)
             for k in range(np.uint64(right - left)):
-                values[to + k] = depths[at + k] if plane_ids[at + k] == me else none
+                values[target + k] = depths[source + k] if plane_ids[source + k] == plane else none
 
 
 @kernel(fast=True, inner=True)
@@ -132,7 +132,8 @@ def _fit_run(
     zero, one = np.float32(0), np.float32(1)
     g0, slope = wider * np.float32(SEGMENTATION.gate), wider * np.float32(SEGMENTATION.gate_slope)
     g1, g2, g3 = g0 + slope, g0 + np.float32(2) * slope, g0 + np.float32(3) * slope
-    least, spread = np.float32(SEGMENTATION.fewest_samples), np.float32(SEGMENTATION.least_spread)
+    min_count = np.float32(SEGMENTATION.min_samples)
+    min_spread = np.float32(SEGMENTATION.min_spread)
     fx, fy, y = np.float32(intrinsics.fx), np.float32(intrinsics.fy), np.float32(i - intrinsics.cy)
     for k in range(n):
         p = k + WINDOW
@@ -158,18 +159,18 @@ def _fit_run(
         yv = _times_row(v0, v1, v2, v4, v5, v6) * share - my * mv
         # (3) the plane, and its normal in the sensor frame
         determinant = xx * yy - xy * xy
-        sound = (center < np.float32(NONE)) & (count >= least) & (determinant >= spread)
-        scale = one / (determinant if sound else one)
+        valid = (center < np.float32(NONE)) & (count >= min_count) & (determinant >= min_spread)
+        scale = one / (determinant if valid else one)
         gx, gy = (xv * yy - yv * xy) * scale, (yv * xx - xv * xy) * scale
         level = center + mv - gx * mx - gy * my
         nx, ny = -fx * gx, -fy * gy
         nz = gx * np.float32(start + k - intrinsics.cx) + gy * y - level
-        sound &= level > zero
+        valid &= level > zero
         length = np.sqrt(nx * nx + ny * ny + nz * nz)
         unit = one / (length if length > zero else one)
-        fits[k] = level if sound else zero
-        fits[PITCH + k], fits[2 * PITCH + k] = gx if sound else zero, gy if sound else zero
-        unit = unit if sound else zero
+        fits[k] = level if valid else zero
+        fits[PITCH + k], fits[2 * PITCH + k] = gx if valid else zero, gy if valid else zero
+        unit = unit if valid else zero
         fits[3 * PITCH + k], fits[4 * PITCH + k] = nx * unit, ny * unit
         fits[5 * PITCH + k] = nz * unit
 
@@ -182,13 +183,13 @@ def _times_row(a: float, b: float, c: float, e: float, f: float, g: float) -> An
 
 @kernel(fast=True, inner=True)
 def _four(
-    values: F4, p: int, center: float, far: float, near: float
+    values: F4, p: int, center: float, outer_gate: float, inner_gate: float
 ) -> tuple[float, float, float, float, float]:
     """Return the sums over a row of a window sampled at -3, -1, 1 and 3 columns from ``p``."""
-    a, va = _sample(values, p - 3, center, far)
-    b, vb = _sample(values, p - 1, center, near)
-    c, vc = _sample(values, p + 1, center, near)
-    d, vd = _sample(values, p + 3, center, far)
+    a, va = _sample(values, p - 3, center, outer_gate)
+    b, vb = _sample(values, p - 1, center, inner_gate)
+    c, vc = _sample(values, p + 1, center, inner_gate)
+    d, vd = _sample(values, p + 3, center, outer_gate)
     three, nine = np.float32(3), np.float32(9)
     x, xx = three * (d - a) + (c - b), nine * (a + d) + (b + c)
     return a + b + c + d, x, xx, va + vb + vc + vd, three * (vd - va) + (vc - vb)
@@ -196,12 +197,12 @@ def _four(
 
 @kernel(fast=True, inner=True)
 def _three(
-    values: F4, p: int, center: float, far: float, near: float
+    values: F4, p: int, center: float, outer_gate: float, inner_gate: float
 ) -> tuple[float, float, float, float, float]:
     """Return the sums over a row of a window sampled at -2, 0 and 2 columns from ``p``."""
-    a, va = _sample(values, p - 2, center, far)
-    b, vb = _sample(values, p, center, near)
-    c, vc = _sample(values, p + 2, center, far)
+    a, va = _sample(values, p - 2, center, outer_gate)
+    b, vb = _sample(values, p, center, inner_gate)
+    c, vc = _sample(values, p + 2, center, outer_gate)
     two = np.float32(2)
     return a + b + c, two * (c - a), two * two * (a + c), va + vb + vc, two * (vc - va)
 

@@ -13,9 +13,9 @@ class SegmentationSettings(NamedTuple):
     two steps of a Kinect."""
     gate_slope: float = 0.008
     """Increase of that limit per cell from the centre, 1/m: surfaces slant."""
-    fewest_samples: int = 5
+    min_samples: int = 5
     """Minimum number of samples of a local plane: three define one, noise requires more."""
-    least_spread: float = 0.2
+    min_spread: float = 0.2
     """Minimum determinant of the covariance of their positions, cells to the fourth power: samples
     in a line define no plane."""
     bridged: int = 8
@@ -24,17 +24,17 @@ class SegmentationSettings(NamedTuple):
     """Cells between an edge and the surfaces that are compared: half a window of a local plane."""
     base_diagonal: int = 2
     """The same distance on a diagonal, in cells along each axis."""
-    step_reach: int = 2
+    slope_cells: int = 2
     """Cells on either side of a step over which the slope there is measured."""
-    sure: float = 0.5
+    step_share: float = 0.5
     """Minimum difference of a step from the slope on either side, relative to a discontinuity. On
     one side it is at least a whole discontinuity."""
     edge_deg: int = 18
     """Minimum concave angle that may separate two objects; a bowl of 7 cm turns by 16 degrees over
     the same cells."""
-    least_cells: int = 12
+    min_cells: int = 12
     """Minimum number of cells of a segment; smaller parts join the segments around them."""
-    most_segments: int = 250
+    max_segments: int = 250
     """Maximum number of segments, the largest ones: the time grows with its square."""
     bucket_deg: int = 4
     """Cells whose angles are in the same range of this width are flooded together: the angles are

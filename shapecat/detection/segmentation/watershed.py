@@ -35,40 +35,40 @@ def watershed(heights: HeightMap, graph: SurfaceGraph) -> tuple[I4, int]:
 def _label_parts(plane_id: I4, graph: SurfaceGraph, edge_deg: int, labels: I4, n: int) -> int:
     """Label connected cells with angles below ``edge_deg``, from ``n`` + 1 on; return the last."""
     inside: Bool = np.zeros(labels.shape, np.bool_)
-    concavity, spans, most = graph.concavity, graph.spans, np.uint8(edge_deg)
+    concavity, spans, threshold = graph.concavity, graph.spans, np.uint8(edge_deg)
     for i in range(len(spans)):
         for j in range(np.uint64(spans[i, 0]), np.uint64(spans[i, 1])):  # this vectorises
-            flat = concavity[i, j] < most
+            flat = concavity[i, j] < threshold
             inside[i, j] = (plane_id[i, j] > 0) & (labels[i, j] == 0) & flat
     spans, component = spans_of(inside.view(np.int8)), unset(labels.shape, np.int32)
     sizes = connected_components(inside, graph.links, spans, component)
-    names, (least, ties) = np.zeros(sizes.size, np.int16), _least_size(sizes, n)
+    new_labels, (min_size, ties) = np.zeros(sizes.size, np.int16), _min_size(sizes, n)
     for k in range(1, sizes.size):
-        tie = sizes[k] == least and ties > 0
-        if sizes[k] > least or tie:
+        tie = sizes[k] == min_size and ties > 0
+        if sizes[k] > min_size or tie:
             n, ties = n + 1, ties - tie
-            names[k] = n
+            new_labels[k] = n
     for i in range(len(spans)):
         for j in range(spans[i, 0], spans[i, 1]):
-            labels[i, j] |= names[component[i, j]]
+            labels[i, j] |= new_labels[component[i, j]]
     return n
 
 
 @kernel(inline=True)
-def _least_size(sizes: I4, n: int) -> tuple[int, int]:
+def _min_size(sizes: I4, n: int) -> tuple[int, int]:
     """Return the size of the smallest components to label, and how many of this size.
 
     The largest ones of ``sizes`` (k,) are labelled, as many as ``n`` segments leave room for.
     """
-    least, room = SEGMENTATION.least_cells - 1, SEGMENTATION.most_segments - n
+    min_size, room = SEGMENTATION.min_cells - 1, SEGMENTATION.max_segments - n
     while True:
         larger, smallest = 0, np.iinfo(np.int32).max
         for k in range(1, sizes.size):
-            if sizes[k] > least:
+            if sizes[k] > min_size:
                 larger, smallest = larger + 1, min(smallest, sizes[k])
         if larger <= room:
-            return least, room - larger if least >= SEGMENTATION.least_cells else 0
-        least = smallest
+            return min_size, room - larger if min_size >= SEGMENTATION.min_cells else 0
+        min_size = smallest
 
 
 @kernel
@@ -80,31 +80,31 @@ def _flood_labels(links: U1, concavity: U1, spans: I4, labels: I4) -> None:
     """
     columns, size = labels.shape[1], labels.size
     angle, flat = concavity.reshape(-1), labels.reshape(-1)
-    ways = unset(size, np.uint8)
-    _find_ways(links.reshape(-1), flat, spans, columns, ways)
+    directions = unset(size, np.uint8)
+    _find_directions(links.reshape(-1), flat, spans, columns, directions)
     following = unset(size + BUCKETS, np.int32)
     following[size:] = -1
     last = np.arange(size, size + BUCKETS)
     for i in range(len(spans)):
         for p in range(i * columns + spans[i, 0], i * columns + spans[i, 1]):
-            if ways[p] > 0 and flat[p] > 0:
+            if directions[p] > 0 and flat[p] > 0:
                 following[last[0]], last[0], following[p] = p, p, -1
     for bucket in range(BUCKETS):
         p = following[size + bucket]
         while p >= 0:
             for d in range(4):
-                if not ways[p] >> d & 1:
+                if not directions[p] >> d & 1:
                     continue
                 q = p + (columns if d & 1 else 1) * (1 if d < 2 else -1)
                 if flat[q] <= 0:
                     flat[q] = flat[p]
-                    at = max(bucket, angle[q] // SEGMENTATION.bucket_deg)
-                    following[last[at]], last[at], following[q] = q, q, -1
+                    queue = max(bucket, angle[q] // SEGMENTATION.bucket_deg)
+                    following[last[queue]], last[queue], following[q] = q, q, -1
             p = following[p]
 
 
 @kernel(inline=True)
-def _find_ways(links: U1, labels: I4, spans: I4, columns: int, ways: U1) -> None:
+def _find_directions(links: U1, labels: I4, spans: I4, columns: int, directions: U1) -> None:
     """Write bits for the directions in which each cell (n,) is linked with an unlabelled one.
 
     The loops vectorise, because unsigned indices need no check for negative values.
@@ -116,12 +116,14 @@ def _find_ways(links: U1, labels: I4, spans: I4, columns: int, ways: U1) -> None
         first, end = np.uint64(i * columns + spans[i, 0]), np.uint64(i * columns + spans[i, 1])
         if first == end:
             continue
-        ways[end - one] = none
+        directions[end - one] = none
         for p in range(first, end - one):
-            ways[p] = links[p] & right if labels[p + one] <= 0 else none
+            directions[p] = links[p] & right if labels[p + one] <= 0 else none
         for p in range(first + one, end):
-            ways[p] |= left if (links[p - one] & right > 0) & (labels[p - one] <= 0) else none
+            directions[p] |= left if (links[p - one] & right > 0) & (labels[p - one] <= 0) else none
         for p in range(first, end if i + 1 < len(spans) else first):
-            ways[p] |= links[p] & down if labels[p + below] <= 0 else none
+            directions[p] |= links[p] & down if labels[p + below] <= 0 else none
         for p in range(first, end if i > 0 else first):
-            ways[p] |= up if (links[p - below] & down > 0) & (labels[p - below] <= 0) else none
+            directions[p] |= (
+                up if (links[p - below] & down > 0) & (labels[p - below] <= 0) else none
+            )

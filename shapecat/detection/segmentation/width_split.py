@@ -29,12 +29,12 @@ class Outlines(NamedTuple):
     ----------
     ends : (2, n + 1, BANDS) float32 metres: the smallest position along `lateral_axis`, and minus
         the largest, so that both grow where a segment narrows; infinite in a band without cells.
-    at : (2, n + 1, BANDS) int32 flat indices of the cells at these ends.
+    cells : (2, n + 1, BANDS) int32 flat indices of the cells at these ends.
     counts : (n + 1, BANDS) int32 the number of cells.
     """
 
     ends: F4
-    at: I4
+    cells: I4
     counts: I4
 
 
@@ -54,27 +54,31 @@ def split_at_width_changes(
     """
     side = lateral_axis(up)
     outlines = _outlines_of(grid, heights.height, graph.spans, labels, n, side)
-    cuts, fresh = np.zeros(BANDS, np.bool_), n
+    cuts, last_label = np.zeros(BANDS, np.bool_), n
     for p in range(1, n + 1):
-        rest = p  # the label above the cuts so far
+        top_label = p  # the label above the cuts so far
         for band in range(BANDS if _find_cuts(grid, outlines, p, side, cuts) else 0):
             if cuts[band]:
-                fresh += 1
-                _relabel_above(labels, graph.spans, heights.height, rest, band * BAND_M, fresh)
-                rest = fresh
-    return fresh
+                last_label += 1
+                _relabel_above(
+                    labels, graph.spans, heights.height, top_label, band * BAND_M, last_label
+                )
+                top_label = last_label
+    return last_label
 
 
 @kernel(inline=True)
-def _relabel_above(labels: I4, spans: I4, height: F4, label: int, level: float, name: int) -> None:
-    """Change the label of the cells that are higher than ``level``, metres, to ``name``, in place.
+def _relabel_above(
+    labels: I4, spans: I4, height: F4, label: int, level: float, new_label: int
+) -> None:
+    """Give the cells of a label that are higher than ``level``, metres, a new label, in place.
 
     ``labels`` (rows, columns) are 0 outside ``spans``; ``height`` (rows, columns) is in metres.
     """
     for i in range(labels.shape[0]):
         for j in range(spans[i, 0], spans[i, 1]):
             if labels[i, j] == label and height[i, j] > level:
-                labels[i, j] = name
+                labels[i, j] = new_label
 
 
 @kernel(inline=True)
@@ -89,7 +93,7 @@ def _outlines_of(grid: DepthGrid, height: F4, spans: I4, labels: I4, n: int, sid
     )
     ends = np.zeros((2, n + 1, BANDS), np.float32)
     ends[:] = np.inf
-    at, count = np.zeros((2, n + 1, BANDS), np.int32), np.zeros((n + 1, BANDS), np.int32)
+    cells, count = np.zeros((2, n + 1, BANDS), np.int32), np.zeros((n + 1, BANDS), np.int32)
     for i in range(labels.shape[0]):
         for j in range(spans[i, 0], spans[i, 1]):
             p = labels[i, j]
@@ -99,24 +103,24 @@ def _outlines_of(grid: DepthGrid, height: F4, spans: I4, labels: I4, n: int, sid
             band = min(max(int(height[i, j] * per_band), 0), BANDS - 1)
             count[p, band] += 1
             if u < ends[0, p, band]:
-                ends[0, p, band], at[0, p, band] = u, i * columns + j
+                ends[0, p, band], cells[0, p, band] = u, i * columns + j
             if -u < ends[1, p, band]:
-                ends[1, p, band], at[1, p, band] = -u, i * columns + j
-    return Outlines(ends, at, count)
+                ends[1, p, band], cells[1, p, band] = -u, i * columns + j
+    return Outlines(ends, cells, count)
 
 
 @kernel(inline=True)
 def _find_cuts(grid: DepthGrid, outlines: Outlines, p: int, side: F8, cuts: Bool) -> bool:
     """Mark the bands (BANDS,) below which label ``p`` is cut; return whether there are any."""
-    first, last, seen, above = 0, 0, 0, 0
+    first, last, band_count, above = 0, 0, 0, 0
     for band in range(BANDS):
         cells = outlines.counts[p, band]
         if cells > 0:
-            first, last = (band if seen == 0 else first), band
-            seen, above = seen + 1, above + cells
-    if seen < 2 * BESIDE:
+            first, last = (band if band_count == 0 else first), band
+            band_count, above = band_count + 1, above + cells
+    if band_count < 2 * BESIDE:
         return False
-    steps, some = np.zeros(BANDS), False
+    steps, any_cut = np.zeros(BANDS), False
     cuts[:] = False
     for band in range(first + BESIDE, last - BESIDE + 2):
         steps[band] = _step_at(grid, outlines, p, band, side)
@@ -126,19 +130,19 @@ def _find_cuts(grid: DepthGrid, outlines: Outlines, p: int, side: F8, cuts: Bool
         for k in range(band - BESIDE if largest else 0, band + BESIDE + 1 if largest else 0):
             largest &= steps[band] >= steps[k]
         if largest and min(below, above) >= SEGMENTATION.part_cells:
-            cuts[band] = some = True
+            cuts[band] = any_cut = True
             below = 0
         below += outlines.counts[p, band]
         above -= outlines.counts[p, band]
-    return some
+    return any_cut
 
 
 @kernel(inline=True)
 def _step_at(grid: DepthGrid, outlines: Outlines, p: int, band: int, side: F8) -> float:
     """Return the sum of the steps of both sides below a band, metres; 0 if both are small."""
-    both = most = 0.0
+    total = largest = 0.0
     for k in range(2):
-        end, at = outlines.ends[k, p], outlines.at[k, p]
+        end, cells = outlines.ends[k, p], outlines.cells[k, p]
         low, high = band - BESIDE, band + 1
         after = before = np.float32(0)
         for k4 in range(BESIDE - 1):
@@ -147,23 +151,25 @@ def _step_at(grid: DepthGrid, outlines: Outlines, p: int, band: int, side: F8) -
         change = after - before
         if not abs(change) < np.inf:
             continue
-        way = np.float32(1 if change > 0 else -1)
+        sign = np.float32(1 if change > 0 else -1)
         # A slope continues from one of the two sides.
-        slope = max(way * _slope_of(end, low), way * _slope_of(end, high), 0.0)
-        step = -_second(end, high, -way) - _second(end, low, way) - BESIDE * slope
+        slope = max(sign * _slope_of(end, low), sign * _slope_of(end, high), 0.0)
+        step = -_second(end, high, -sign) - _second(end, low, sign) - BESIDE * slope
         if step < SEGMENTATION.side_step_m / 2:
             continue
-        narrow = band + 1 if way > 0 else band - 3
-        sign = -1.0 if k == 0 else 1.0
-        if _is_free(grid, at[narrow], sign, side) and _is_free(grid, at[narrow + 1], sign, side):
-            both, most = both + step, max(most, step)
-    return both if most >= SEGMENTATION.side_step_m else 0.0
+        narrow = band + 1 if sign > 0 else band - 3
+        outward = -1.0 if k == 0 else 1.0
+        if _is_free(grid, cells[narrow], outward, side) and _is_free(
+            grid, cells[narrow + 1], outward, side
+        ):
+            total, largest = total + step, max(largest, step)
+    return total if largest >= SEGMENTATION.side_step_m else 0.0
 
 
 @kernel(inner=True)
-def _second(end: F4, k: int, way: float) -> float:
-    """Return the second largest of four values times ``way``: spurs one band high are noise."""
-    a, b, c, d = way * end[k], way * end[k + 1], way * end[k + 2], way * end[k + 3]
+def _second(end: F4, k: int, sign: float) -> float:
+    """Return the second largest of four values times ``sign``: spurs one band high are noise."""
+    a, b, c, d = sign * end[k], sign * end[k + 1], sign * end[k + 2], sign * end[k + 3]
     return float(max(min(max(a, b), max(c, d)), min(a, b), min(c, d)))
 
 
@@ -174,11 +180,11 @@ def _slope_of(end: F4, k: int) -> float:
 
 
 @kernel(inner=True)
-def _is_free(grid: DepthGrid, at: int, sign: float, side: F8) -> bool:
+def _is_free(grid: DepthGrid, cell: int, sign: float, side: F8) -> bool:
     """Return whether no nearer surface is beside a cell, to the left (-1) or right (1)."""
     inv_depth = grid.inverse_depth
     rows, columns = inv_depth.shape
-    i, j = at // columns, at % columns
+    i, j = cell // columns, cell % columns
     across = max(math.hypot(side[0], side[1]), 1e-6)
     for step in range(1, SEGMENTATION.shadow_cells + 1):
         y = i + round(sign * step * side[1] / across)
