@@ -23,17 +23,17 @@ def merge_across_occluder(segments: Segments, grid: DepthGrid, normal: F4, label
     n = segments.parent.size
     scores, changed = np.zeros((n, n)), np.ones(n, np.bool_)
     while True:
-        behind_one = _find_behind_one(segments)
+        same_occluder = _find_shared_occluder(segments)
         for p in range(1, n):
             for q in range(p + 1, n):
                 if not (changed[p] or changed[q]):
                     continue
                 scores[p, q] = 0
-                if behind_one[p, q]:
+                if same_occluder[p, q]:
                     a = _local_planes(segments.samples[p], grid, normal)
                     b = _local_planes(segments.samples[q], grid, normal)
                     share, lines = _find_partners(a, b)
-                    if share >= MERGING.partners and _is_hidden(
+                    if share >= MERGING.partner_share and _is_hidden(
                         segments, p, q, grid, labels, lines
                     ):
                         scores[p, q] = share
@@ -47,23 +47,23 @@ def merge_across_occluder(segments: Segments, grid: DepthGrid, normal: F4, label
 
 
 @kernel(inline=True)
-def _find_behind_one(segments: Segments) -> Bool:
+def _find_shared_occluder(segments: Segments) -> Bool:
     """Return which segments p < q share an occluder and a supporting plane, (n + 1, n + 1) bool."""
     pairs, parent, plane_id = segments.pairs, segments.parent, segments.plane_id
     n = parent.size
-    found = np.zeros((n, n), np.bool_)
+    same_occluder = np.zeros((n, n), np.bool_)
     behind = np.zeros(n, np.int32)
     for k in range(1, n):
         count = 0
         for p in range(1, n):
-            if parent[p] == p and pairs[k, p].in_front >= MERGING.few:
+            if parent[p] == p and pairs[k, p].in_front >= MERGING.min_links:
                 behind[count] = p
                 count += 1
         for a in range(count):
             for b in range(a + 1, count):
                 p, q = behind[a], behind[b]
-                found[p, q] |= plane_id[p] == plane_id[q]
-    return found
+                same_occluder[p, q] |= plane_id[p] == plane_id[q]
+    return same_occluder
 
 
 @kernel(inner=True)
@@ -94,27 +94,27 @@ def _find_partners(a: F8, b: F8) -> tuple[float, F8]:
     with_a, with_b = np.zeros(a.shape[1], np.bool_), np.zeros(b.shape[1], np.bool_)
     pairs = np.zeros((SAMPLES * SAMPLES, 2), np.uint8)
     n = in_a = in_b = 0
-    if min(with_a.size, with_b.size) < MERGING.fewest_samples:
+    if min(with_a.size, with_b.size) < MERGING.min_samples:
         return 0.0, np.zeros((0, 2, 3))
     for s in range(with_a.size):
         for t in range(with_b.size):
-            alike = distance = off_a = off_b = 0.0
+            cos = distance = offset_a = offset_b = 0.0
             for d in range(3):
                 step = b[0, t, d] - a[0, s, d]
-                alike += a[1, s, d] * b[1, t, d]
+                cos += a[1, s, d] * b[1, t, d]
                 distance += step * step
-                off_a += step * a[1, s, d]
-                off_b += step * b[1, t, d]
+                offset_a += step * a[1, s, d]
+                offset_b += step * b[1, t, d]
             limit = MERGING.coplanar_m + MERGING.coplanar_slope * math.sqrt(distance)
-            if alike >= MERGING.coplanar_cos and abs(off_a) <= limit and abs(off_b) <= limit:
+            if cos >= MERGING.coplanar_cos and abs(offset_a) <= limit and abs(offset_b) <= limit:
                 in_a, in_b = in_a + (not with_a[s]), in_b + (not with_b[t])
                 with_a[s] = with_b[t] = True
                 pairs[n, 0], pairs[n, 1] = s, t
                 n += 1
-    every = max(1, n // MERGING.most_lines)
-    lines = np.zeros(((n + every - 1) // every, 2, 3))
+    stride = max(1, n // MERGING.max_lines)
+    lines = np.zeros(((n + stride - 1) // stride, 2, 3))
     for k in range(len(lines)):
-        s, t = pairs[k * every]
+        s, t = pairs[k * stride]
         for d in range(3):
             lines[k, 0, d], lines[k, 1, d] = a[0, s, d], b[0, t, d]
     return min(in_a / with_a.size, in_b / with_b.size), lines
@@ -124,7 +124,7 @@ def _find_partners(a: F8, b: F8) -> tuple[float, F8]:
 def _is_hidden(segments: Segments, p: int, q: int, grid: DepthGrid, labels: I4, lines: F8) -> bool:
     """Return whether lines (n, 2, 3) between two segments are hidden, not in free space."""
     inv_depth, intrinsics = grid.inverse_depth, grid.intrinsics
-    free = hidden = looked = 0
+    free = hidden = measured = 0
     for k in range(len(lines)):
         for step in range(1, MERGING.line_steps):
             u, a, b = step / MERGING.line_steps, lines[k, 0], lines[k, 1]
@@ -133,9 +133,9 @@ def _is_hidden(segments: Segments, p: int, q: int, grid: DepthGrid, labels: I4, 
             if i < 0 or j < 0 or i >= inv_depth.shape[0] or j >= inv_depth.shape[1]:
                 continue
             owner = segments.parent[labels[i, j]]
-            looked += inv_depth[i, j] > 0
+            measured += inv_depth[i, j] > 0
             if inv_depth[i, j] > 0 and owner not in (p, q):
-                before = inv_depth[i, j] - 1 / z > grid.discontinuity
-                hidden += before
-                free += not before
-    return free <= MERGING.free_share * looked and hidden >= MERGING.hidden_share * looked
+                occluded = inv_depth[i, j] - 1 / z > grid.discontinuity
+                hidden += occluded
+                free += not occluded
+    return free <= MERGING.free_share * measured and hidden >= MERGING.hidden_share * measured

@@ -28,7 +28,7 @@ def measure_adjacency(
     inv_depth = grid.inverse_depth
     rows, columns = inv_depth.shape
     plane_id, links, statistics = heights.plane_id, graph.links, segments.statistics
-    change, met = np.zeros(columns, np.uint8), np.zeros((2 * columns, 6), np.int32)
+    change, border = np.zeros(columns, np.uint8), np.zeros((2 * columns, 6), np.int32)
     for i in range(rows):
         if not _find_changes(links[i], labels[i], labels[min(i + 1, rows - 1)], change):
             continue
@@ -57,27 +57,27 @@ def measure_adjacency(
                     continue
                 statistics[q].boundary += (q > 0) & ends
                 if p != q:
-                    met[n, 0], met[n, 1], met[n, 2], met[n, 3] = j, y, x, down
-                    met[n, 4], met[n, 5] = gap, 0 if gap > 0 else link
+                    border[n, 0], border[n, 1], border[n, 2], border[n, 3] = j, y, x, down
+                    border[n, 4], border[n, 5] = gap, 0 if gap > 0 else link
                     n += 1
-        _count(grid, heights, graph, labels, up, i, met[:n], segments)
+        _count(grid, heights, graph, labels, up, i, border[:n], segments)
     _choose_samples(graph, labels, segments)
 
 
 @kernel(inline=True)
-def _find_changes(links: U1, here: I4, below: I4, change: U1) -> bool:
+def _find_changes(links: U1, row: I4, row_below: I4, change: U1) -> bool:
     """Mark the cells of a row from which a segment does not continue both to the right and down.
 
     Returns whether there are any such cells.
     """
-    for j in range(here.size):
-        change[j] = (here[j] != below[j]) | ((here[j] > 0) & (links[j] != RIGHT | DOWN))
-    for j in range(here.size - 1):
-        change[j] |= here[j] != here[j + 1]
-    some = False
-    for j in range(here.size):
-        some |= change[j] != 0
-    return some
+    for j in range(row.size):
+        change[j] = (row[j] != row_below[j]) | ((row[j] > 0) & (links[j] != RIGHT | DOWN))
+    for j in range(row.size - 1):
+        change[j] |= row[j] != row[j + 1]
+    any_changed = False
+    for j in range(row.size):
+        any_changed |= change[j] != 0
+    return any_changed
 
 
 @kernel(inline=True)
@@ -88,12 +88,12 @@ def _count(
     labels: I4,
     up: F8,
     row: int,
-    met: I4,
+    border: I4,
     segments: Segments,
 ) -> None:
     """Add pairs of cells on a boundary to the counts of the segments on both sides.
 
-    The first cells are in row ``row``. ``met`` (n, 6) holds their column; row and column of the
+    The first cells are in row ``row``. ``border`` (n, 6) holds their column; row and column of the
     second; 1 if the second is below the first, 0 if it is to the right; the number of cells without
     a depth between them; and not 0 if the surface continues.
     """
@@ -102,12 +102,12 @@ def _count(
     normal, concavity = graph.normal, graph.concavity
     statistics, pairs = segments.statistics, segments.pairs
     steep = MERGING.down_cos * math.hypot(up[0], up[1])
-    for m in range(2 * met.shape[0]):
-        i, j, y, x = row, met[m // 2, 0], met[m // 2, 1], met[m // 2, 2]
-        fall = -up[met[m // 2, 3]]  # above 0 if (y, x) is lower, however the image is turned
-        gap, link = met[m // 2, 4], met[m // 2, 5]
+    for m in range(2 * border.shape[0]):
+        i, j, y, x = row, border[m // 2, 0], border[m // 2, 1], border[m // 2, 2]
+        fall = -up[border[m // 2, 3]]  # above 0 if (y, x) is lower, however the image is turned
+        gap, link = border[m // 2, 4], border[m // 2, 5]
         if m % 2 == 1:
-            i, j, y, x, fall = y, x, row, met[m // 2, 0], -fall
+            i, j, y, x, fall = y, x, row, border[m // 2, 0], -fall
         p, q = labels[i, j], labels[y, x]
         if p == 0:
             continue
@@ -146,16 +146,16 @@ def _choose_samples(graph: SurfaceGraph, labels: I4, segments: Segments) -> None
     rows, columns = labels.shape
     spans, local_plane, concavity = graph.spans, graph.local_plane, graph.concavity
     n = segments.parent.size
-    stride, wait, taken = np.zeros(n, np.int32), np.zeros(n, np.int32), np.zeros(n, np.int32)
+    stride, countdown, counts = np.zeros(n, np.int32), np.zeros(n, np.int32), np.zeros(n, np.int32)
     for p in range(n):
-        stride[p] = wait[p] = max(int(segments.statistics[p].count) // SAMPLES, 1)
+        stride[p] = countdown[p] = max(int(segments.statistics[p].count) // SAMPLES, 1)
     for i in range(rows):
         for j in range(spans[i, 0], spans[i, 1]):
             p = labels[i, j]
             if p == 0 or concavity[i, j] > MERGING.flat_deg or not local_plane[i, 0, j] > 0:
                 continue
-            wait[p] -= 1
-            if wait[p] == 0 and taken[p] < SAMPLES:
-                segments.samples[p, taken[p]] = i * columns + j
-                taken[p] += 1
-                wait[p] = stride[p]
+            countdown[p] -= 1
+            if countdown[p] == 0 and counts[p] < SAMPLES:
+                segments.samples[p, counts[p]] = i * columns + j
+                counts[p] += 1
+                countdown[p] = stride[p]

@@ -31,9 +31,9 @@ def hull_area(a: F4, b: F4) -> float:
     turn, half = 2 * math.pi / DIRECTIONS, np.float32(0.5)  # cells are squares, not points
     twice, total = 2 * math.cos(turn), 0.0
     before = max(a[DIRECTIONS - 2], b[DIRECTIONS - 2]) + half
-    here = max(a[DIRECTIONS - 1], b[DIRECTIONS - 1]) + half
+    extent = max(a[DIRECTIONS - 1], b[DIRECTIONS - 1]) + half
     for d in range(DIRECTIONS):
         after = max(a[d], b[d]) + half
-        total += here * (before + after - twice * here)
-        before, here = here, after
+        total += extent * (before + after - twice * extent)
+        before, extent = extent, after
     return float(total / (2 * math.sin(turn)))

@@ -51,7 +51,7 @@ def merge_learned(segments: Segments, view_geometry: ViewGeometry, ensemble: Boo
     while True:
         best = np.argmax(logits)
         p, q = int(best // n), int(best % n)
-        if logits[p, q] < MERGING.likely:
+        if logits[p, q] < MERGING.merge_logit:
             return
         merge(segments, p, q)
         write_segment_features(segments, p, features[p])  # those of other segments do not change
@@ -75,10 +75,10 @@ def _rate(
 
     ``pair`` (1,) is work space for the features of a pair, which the trees read as numbers.
     """
-    adjacent, numbers = find_adjacent(segments, p), pair.view(np.float32)
+    adjacent, values = find_adjacent(segments, p), pair.view(np.float32)
     for q in range(first, adjacent.size):
         low, high = min(p, q), max(p, q)
         logits[low, high] = -np.inf
         if adjacent[q]:
             write_pair_features(segments, features, low, high, view_geometry, pair[0])
-            logits[low, high] = logit_of(ensemble, numbers, MERGING.hopeless, np.inf)
+            logits[low, high] = logit_of(ensemble, values, MERGING.stop_logit, np.inf)

@@ -117,20 +117,22 @@ def find_adjacent(segments: Segments, p: int) -> Bool:
     adjacent = np.zeros(parent.size, np.bool_)
     for q in range(1, parent.size if parent[p] == p else 1):
         if q != p and parent[q] == q and plane_id[q] == plane_id[p]:
-            met = pairs[p, q].contact + pairs[p, q].near + pairs[p, q].in_front
-            met += pairs[q, p].in_front
-            adjacent[q] = met >= MERGING.few or _face(statistics[p], statistics[q])
+            border = pairs[p, q].contact + pairs[p, q].near + pairs[p, q].in_front
+            border += pairs[q, p].in_front
+            adjacent[q] = border >= MERGING.min_links or _face(statistics[p], statistics[q])
     return adjacent
 
 
 @kernel(inline=True)
 def _face(a: Row, b: Row) -> bool:
     """Return whether two segments may be the near and the far wall of a pot, which do not touch."""
-    narrow, wide = min(width_of(a), width_of(b)), max(width_of(a), width_of(b))
+    min_width, max_width = min(width_of(a), width_of(b)), max(width_of(a), width_of(b))
     common = min(a.right, b.right) - max(a.left, b.left)
     level = abs(a.top - b.top) < MERGING.facing_m
     return bool(
-        level and common > MERGING.facing_share * narrow and abs(depth_difference(a, b)) < wide
+        level
+        and common > MERGING.facing_share * min_width
+        and abs(depth_difference(a, b)) < max_width
     )
 
 
@@ -162,60 +164,60 @@ def write_pair_features(
     out.first, out.second = features[p], features[q]
     relation = out.relation
     _write_relation(a, b, relation)
-    own, other = segments.hulls[p], segments.hulls[q]
-    first, second = hull_area(own, own), hull_area(other, other)
-    hull = hull_area(own, other)
-    relation.first_convexity = share(a.count, first)
-    relation.second_convexity = share(b.count, second)
+    hull_p, hull_q = segments.hulls[p], segments.hulls[q]
+    area_first, area_second = hull_area(hull_p, hull_p), hull_area(hull_q, hull_q)
+    hull = hull_area(hull_p, hull_q)
+    relation.first_convexity = share(a.count, area_first)
+    relation.second_convexity = share(b.count, area_second)
     relation.both_convexity = share(a.count + b.count, hull)
-    relation.hull_growth = share(hull, first + second)
-    both = np.zeros(2, SEGMENT)
-    both[0], both[1] = a, b
-    add_statistics(both, 0, 1)
-    relation.lateral_curvature = lateral_curvature(both[0])
-    relation.normal_position_correlation = normal_position_correlation(both[0])
+    relation.hull_growth = share(hull, area_first + area_second)
+    merged = np.zeros(2, SEGMENT)
+    merged[0], merged[1] = a, b
+    add_statistics(merged, 0, 1)
+    relation.lateral_curvature = lateral_curvature(merged[0])
+    relation.normal_position_correlation = normal_position_correlation(merged[0])
     relation.cells, relation.cell_m, relation.down = a.count, cell, view_geometry.down
 
 
 @kernel(inline=True)
 def _write_adjacency(segments: Segments, p: int, q: int, cell: float, out: Row) -> None:
-    pair, back = segments.pairs[p, q], segments.pairs[q, p]
-    met = pair.contact + pair.near + pair.in_front + back.in_front
+    pair, reverse = segments.pairs[p, q], segments.pairs[q, p]
+    border = pair.contact + pair.near + pair.in_front + reverse.in_front
     surface = pair.contact + pair.near
     out.contact_m = pair.contact * cell
-    out.contact = share(pair.contact, met)
-    out.first_in_front = share(pair.in_front, met)
-    out.second_in_front = share(back.in_front, met)
+    out.contact = share(pair.contact, border)
+    out.first_in_front = share(pair.in_front, border)
+    out.second_in_front = share(reverse.in_front, border)
     out.along_first = share(surface, segments.statistics[p].boundary)
     out.along_second = share(surface, segments.statistics[q].boundary)
     out.second_faces_up = share(pair.rests_on, pair.contact)
-    out.first_faces_up = share(back.rests_on, pair.contact)
+    out.first_faces_up = share(reverse.rests_on, pair.contact)
     out.above_second_m = _above_top(segments, p, q)
     out.above_first_m = _above_top(segments, q, p)
-    out.border_m = met * cell
+    out.border_m = border * cell
     out.concavity_deg = share(pair.concavity, pair.contact)
 
 
 @kernel(inner=True)
 def _above_top(segments: Segments, p: int, q: int) -> float:
     """Return the mean height at which ``p`` rests on ``q``, above the top of ``q``, metres."""
-    onto = segments.pairs[p, q].rests_on
-    if onto == 0:
-        return MERGING.nowhere_m
-    return float(segments.pairs[p, q].rests_on_height / onto - segments.statistics[q].top)
+    contact = segments.pairs[p, q].rests_on
+    if contact == 0:
+        return MERGING.no_contact_m
+    return float(segments.pairs[p, q].rests_on_height / contact - segments.statistics[q].top)
 
 
 @kernel(inline=True)
 def _write_relation(a: Row, b: Row, out: Row) -> None:
-    narrow, wide = width_of(a), width_of(b)
-    most = max(narrow, wide)
+    width_a, width_b = width_of(a), width_of(b)
+    max_width = max(width_a, width_b)
     left, right = b.left - a.left, a.right - b.right
     common = min(a.right, b.right) - max(a.left, b.left)
-    out.area_ratio, out.width_ratio = share(a.area, b.area), share(narrow, wide)
-    out.lateral_distance = share(abs(a.left + a.right - b.left - b.right) / 2, most)
+    out.area_ratio, out.width_ratio = share(a.area, b.area), share(width_a, width_b)
+    out.lateral_distance = share(abs(a.left + a.right - b.left - b.right) / 2, max_width)
     out.depth_difference_m = depth_difference(a, b)
-    out.depth_difference = share(depth_difference(a, b), most)
-    out.overlap = share(common, min(narrow, wide))
+    out.depth_difference = share(depth_difference(a, b), max_width)
+    out.overlap = share(common, min(width_a, width_b))
     out.top_over_top_m = a.top - b.top
     out.bottom_over_top_m = a.bottom - b.top
     out.other_bottom_over_top_m = b.bottom - a.top

@@ -60,8 +60,8 @@ def lateral_curvature(row: Row) -> float:
 
     It is 2 for a whole cylinder seen from outside, -2 from inside, and 0 for a plane.
     """
-    spread, _, both = _moments(row)
-    return float(both / max(spread, 1e-9) * width_of(row))
+    spread, _, product = _moments(row)
+    return float(product / max(spread, 1e-9) * width_of(row))
 
 
 @kernel(inner=True)
@@ -71,8 +71,8 @@ def normal_position_correlation(row: Row) -> float:
     It is 1 for a solid of revolution with an upright axis, and less for the faces of a box and for
     level tops, whose normals do not turn steadily.
     """
-    spread, turning, both = _moments(row)
-    return float(both / math.sqrt(max(spread * turning, 1e-12)))
+    spread, turning, product = _moments(row)
+    return float(product / math.sqrt(max(spread * turning, 1e-12)))
 
 
 @kernel(inner=True)
@@ -88,31 +88,31 @@ def _moments(row: Row) -> tuple[float, float, float]:
 def write_segment_features(segments: Segments, p: int, out: Row) -> None:
     """Write the `SEGMENT_FEATURES` of segment ``p`` to the record ``out``."""
     row = segments.statistics[p]
-    around = row.boundary
-    front = back = touch = up = closed = 0.0
+    boundary = row.boundary
+    in_front = behind = touching = facing_up = top_area = 0.0
     for k in range(segments.parent.size):
-        front += segments.pairs[p, k].in_front
-        back += segments.pairs[k, p].in_front
-        touch += segments.pairs[p, k].contact
+        in_front += segments.pairs[p, k].in_front
+        behind += segments.pairs[k, p].in_front
+        touching += segments.pairs[p, k].contact
     top = min(int(row.top / BAND_M), BANDS - 1)
     for band in range(top + 1):
-        up += segments.top_area[p, band]
-        closed += segments.top_area[p, band] if band >= top - MERGING.top_bands else 0.0
-    wide, tall = width_of(row), row.top - row.bottom
-    out.width_m, out.top_m, out.bottom_m, out.height_m = wide, row.top, row.bottom, tall
+        facing_up += segments.top_area[p, band]
+        top_area += segments.top_area[p, band] if band >= top - MERGING.top_bands else 0.0
+    width, height = width_of(row), row.top - row.bottom
+    out.width_m, out.top_m, out.bottom_m, out.height_m = width, row.top, row.bottom, height
     out.lateral_curvature = lateral_curvature(row)
     out.normal_position_correlation = normal_position_correlation(row)
-    out.plane_contact = share(row.plane_contact, around)
-    out.hidden = share(row.hidden, around)
-    out.shelf_edge = share(row.shelf_edge, around)
-    out.upper_silhouette = share(row.upper_silhouette, around)
-    out.touching = share(touch, around)
-    out.in_front = share(front, around)
-    out.behind = share(back, around)
-    out.top_area = closed / max(wide**2, 1e-9)
-    out.facing_up = share(up, row.area)
+    out.plane_contact = share(row.plane_contact, boundary)
+    out.hidden = share(row.hidden, boundary)
+    out.shelf_edge = share(row.shelf_edge, boundary)
+    out.upper_silhouette = share(row.upper_silhouette, boundary)
+    out.touching = share(touching, boundary)
+    out.in_front = share(in_front, boundary)
+    out.behind = share(behind, boundary)
+    out.top_area = top_area / max(width**2, 1e-9)
+    out.facing_up = share(facing_up, row.area)
     out.area_m2 = row.area
-    out.filled = share(row.area, wide * tall)
+    out.filled = share(row.area, width * height)
 
 
 @kernel(inner=True)

@@ -152,7 +152,7 @@ def _measure(
     inv_depth, intrinsics, side = grid.inverse_depth, grid.intrinsics, lateral_axis(up)
     plane_ids, top_area = segments.plane_id, segments.top_area
     plane_id, height = heights.plane_id, heights.height
-    zero, one, far_off = np.float32(0), np.float32(1), np.float32(np.inf)
+    zero, one, inf = np.float32(0), np.float32(1), np.float32(np.inf)
     per_x, per_y = np.float32(1 / intrinsics.fx), np.float32(1 / intrinsics.fy)
     cx, cy = np.float32(intrinsics.cx), np.float32(intrinsics.cy)
     edge_on = np.float32(MERGING.edge_on_cos)
@@ -167,15 +167,15 @@ def _measure(
                 j += 1
                 continue
             # Sums over a run of cells of one segment.
-            far = fitted = sides = sides2 = turns = turns2 = both = areas = zero
+            depths = fitted = sides = sides2 = turns = turns2 = products = areas = zero
             px = py = pz = nxs = nys = nzs = zero
-            left, right, bottom, top = far_off, -far_off, far_off, -far_off
+            left, right, bottom, top = inf, -inf, inf, -inf
             while j < end and labels[i, j] == p:
                 z = one / inv_depth[i, j]
                 x, y = (np.float32(j) - cx) * per_x * z, (np.float32(i) - cy) * per_y * z
                 along = x * sx + y * sy + z * sz
                 h = height[i, j]
-                far += z
+                depths += z
                 left, right = min(left, along), max(right, along)
                 bottom, top = min(bottom, h), max(top, h)
                 if local_plane[i, 0, j] > 0:
@@ -192,7 +192,7 @@ def _measure(
                     sides2 += along * along
                     turns += turn
                     turns2 += turn * turn
-                    both += along * turn
+                    products += along * turn
                     facing = -(nx * x + ny * y + nz * z) / math.sqrt(x * x + y * y + z * z)
                     area = z * z * per_x * per_y / max(facing, edge_on)
                     areas += area
@@ -204,7 +204,7 @@ def _measure(
             plane_ids[p] = plane_id[i, first]
             row = segments.statistics[p]
             row.count += j - first
-            row.depth_sum += far
+            row.depth_sum += depths
             row.left, row.right = min(row.left, left), max(row.right, right)
             row.top, row.bottom = max(row.top, top), min(row.bottom, bottom)
             row.fitted += fitted
@@ -218,7 +218,7 @@ def _measure(
             row.xx_sum += sides2
             row.normal_x_sum += turns
             row.normal_xx_sum += turns2
-            row.x_normal_x_sum += both
+            row.x_normal_x_sum += products
             row.area += areas
 
 
@@ -242,12 +242,12 @@ def merge(segments: Segments, p: int, q: int) -> None:
         hulls[p, d] = max(hulls[p, d], hulls[q, d])
     add_statistics(segments.statistics, p, q)
     # Half of the samples from each side.
-    samples, first, mixed = segments.samples, segments.samples[p].copy(), 0
+    samples, first, count = segments.samples, segments.samples[p].copy(), 0
     for k in range(2 * SAMPLES):
         cell = samples[q, k // 2] if k % 2 else first[k // 2]
-        if cell >= 0 and mixed < SAMPLES:
-            samples[p, mixed] = cell
-            mixed += 1
+        if cell >= 0 and count < SAMPLES:
+            samples[p, count] = cell
+            count += 1
     for k in range(n):
         if segments.parent[k] == q:
             segments.parent[k] = p
@@ -262,8 +262,8 @@ def add_statistics(statistics: Records, p: int, q: int) -> None:
     values = statistics.view(np.float32)
     for f in range(_FIELDS):
         a, b = values[p * _FIELDS + f], values[q * _FIELDS + f]
-        joined = min(a, b) if f < _MINIMA else max(a, b) if f < _MAXIMA else a + b
-        values[p * _FIELDS + f] = joined
+        combined = min(a, b) if f < _MINIMA else max(a, b) if f < _MAXIMA else a + b
+        values[p * _FIELDS + f] = combined
 
 
 @kernel(inner=True)

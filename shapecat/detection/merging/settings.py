@@ -8,7 +8,7 @@ __all__ = ["MERGING", "MergingSettings"]
 class MergingSettings(NamedTuple):
     """Constants of the measuring, comparing and merging of segments."""
 
-    few: int = 3
+    min_links: int = 3
     """Minimum number of links between two segments that are a contact, not noise."""
     up_cos: float = 0.8
     """Minimum cosine to up of a normal that faces up: noise turns normals by up to 35 degrees."""
@@ -31,13 +31,13 @@ class MergingSettings(NamedTuple):
     """Largest height difference between the tops of two walls of a pot, metres."""
     facing_share: float = 0.5
     """Minimum overlap of the lateral ranges of two walls of a pot, relative to the narrower one."""
-    nowhere_m: float = -1.0
+    no_contact_m: float = -1.0
     """Value of the feature for the height of a contact with upward-facing surface, if there is no
     contact, metres."""
-    likely: float = 0.3
+    merge_logit: float = 0.3
     """Minimum logit of a pair that is merged, for a probability of 0.57: a wrong merge loses two
     objects, a missing merge seldom one."""
-    hopeless: float = -3.0
+    stop_logit: float = -3.0
     """Partial logit below which evaluation stops: with -2.5, none of 500 scenes would differ."""
     coplanar_m: float = 0.006
     """Largest distance of a sample from the local plane of another: two steps of a Kinect."""
@@ -45,12 +45,12 @@ class MergingSettings(NamedTuple):
     """Increase of that limit per metre between the samples: local planes are 3 degrees off."""
     coplanar_cos: float = 0.966
     """Minimum cosine between the normals of the samples, for 15 degrees."""
-    partners: float = 0.45
-    """Minimum fraction of the samples of either segment that continue the other; half on round
-    ones."""
-    fewest_samples: int = 4
+    partner_share: float = 0.45
+    """Minimum fraction of the samples of either segment that continue the other; on round objects,
+    half of them do."""
+    min_samples: int = 4
     """Minimum number of samples that describe the surface of a segment."""
-    most_lines: int = 300
+    max_lines: int = 300
     """Maximum number of lines between partners that are followed; this bounds the time."""
     line_steps: int = 8
     """Steps on each line: an occluder is wider than an eighth of the gap."""

@@ -77,7 +77,7 @@ def measure_objects(
     at_limit = _count_at_range_limit(grid.inverse_depth, labels, representatives.size, range_m)
     for k in range(count):
         p = representatives[k + 1]
-        measured.at_range_limit[k] = at_limit[k + 1] >= MERGING.few
+        measured.at_range_limit[k] = at_limit[k + 1] >= MERGING.min_links
         measured.least_cells[k] = smallest_object_at(grid, depth_of(segments, p))
         below = _objects_below(measured, up, k)
         measured.supported_by[k], measured.support_m[k] = _supporting_object(
@@ -163,10 +163,10 @@ def _supporting_object(
         more = pairs[representatives[k]].rests_on > pairs[representatives[best]].rests_on
         best = k if more and below[k] else best
     met = pairs[representatives[best]].rests_on
-    if met >= MERGING.few and met > own.plane_contact:
+    if met >= MERGING.min_links and met > own.plane_contact:
         height = float(pairs[representatives[best]].rests_on_height / met)
         return (0, 0.0) if own.bottom < height - OUTPUT.sunk_m else (best, height)
-    if own.bottom > OUTPUT.lifted_m and own.plane_contact < MERGING.few:
+    if own.bottom > OUTPUT.lifted_m and own.plane_contact < MERGING.min_links:
         best = _hidden_support(segments, representatives, p, below)
         return best, float(statistics[representatives[best]].top) if best else 0.0
     return 0, 0.0
@@ -190,7 +190,7 @@ def _hidden_support(segments: Segments, representatives: I4, p: int, below: Bool
         beside = statistics[q].left < middle < statistics[q].right
         if q != p and below[k] and lower and beside and met > most:
             best, most = k, met
-    return best if most >= MERGING.few else 0
+    return best if most >= MERGING.min_links else 0
 
 
 @kernel(inline=True)
