@@ -50,7 +50,7 @@ def found(frame: Frame, *, low_profile: bool = True) -> Scene:
 @pytest.fixture
 def unrejected(monkeypatch: pytest.MonkeyPatch) -> None:
     """Keep the segments that structure rejection would remove."""
-    lenient = CLEANUP._replace(least_logit=-9.0, least_far_logit=-9.0)
+    lenient = CLEANUP._replace(min_logit=-9.0, min_far_logit=-9.0)
     monkeypatch.setattr("shapecat.detection.cleanup.structure.CLEANUP", lenient)
 
 

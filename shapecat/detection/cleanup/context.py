@@ -33,8 +33,8 @@ def measure_borders(segments: Segments) -> tuple[I4, F4]:
     second is behind the first, the second is in front of it, and they are near but not connected.
     """
     roots = np.flatnonzero(segments.parent == np.arange(segments.parent.size))[1:]
-    both = np.ix_(roots, roots)
-    contact, in_front, near = (segments.pairs[n][both] for n in ("contact", "in_front", "near"))
+    index = np.ix_(roots, roots)
+    contact, in_front, near = (segments.pairs[n][index] for n in ("contact", "in_front", "near"))
     weights = np.stack([contact + contact.T, in_front, in_front.T, near + near.T])
     weights[:, np.arange(len(roots)), np.arange(len(roots))] = 0
     return roots, weights
@@ -49,10 +49,10 @@ def add_context(features: Records, logits: F4, weights: F4) -> Records:
     logits : (r,) that each is an object, judged by itself.
     weights : (4, r, r) from `measure_borders`.
     """
-    judged = np.zeros(len(features), CONTEXT_FEATURES)
-    judged["object"], judged["logit"] = features, logits
+    records = np.zeros(len(features), CONTEXT_FEATURES)
+    records["object"], records["logit"] = features, logits
     verdicts = np.tanh(logits / CLEANUP.sure_logit)
     means = weights @ verdicts / np.maximum(weights.sum(axis=2), 1)
     for name, mean in zip(_NEIGHBOURS, means, strict=True):
-        judged[name] = mean
-    return judged
+        records[name] = mean
+    return records

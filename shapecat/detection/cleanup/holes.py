@@ -17,7 +17,7 @@ from shapecat.jit import kernel, unset
 
 __all__ = ["fill_contact_boundary", "fill_holes"]
 
-BOUNDARY, IN_FRONT, GOES_ON = range(3)
+BOUNDARY, IN_FRONT, CONTINUOUS = range(3)
 """Indices of the counts of a hole's sides with a label: all, those where the label is in front of
 the hole, and those where the surface continues."""
 
@@ -30,26 +30,26 @@ def fill_contact_boundary(grid: DepthGrid, heights: HeightMap, labels: I4) -> No
     """
     inv_depth, (plane_id, height) = grid.inverse_depth, heights
     rows, columns = labels.shape
-    before, low = labels.copy(), np.zeros(columns, np.bool_)
-    least = np.float32(CLEANUP.fringe * MIN_HEIGHT_M)
+    original, low = labels.copy(), np.zeros(columns, np.bool_)
+    min_height = np.float32(CLEANUP.fringe * MIN_HEIGHT_M)
     noise = np.float32(CLEANUP.fringe * HEIGHT_NOISE)
     for i in range(rows):
-        some = False
+        any_low = False
         for j in range(np.uint64(columns)):  # few rows have any, and this vectorises
             v = inv_depth[i, j]
-            low[j] = height[i, j] * v * v > least * v * v + noise
-            low[j] &= (plane_id[i, j] < 0) & (before[i, j] == 0)
-            some |= low[j]
-        for j in range(columns if some else 0):
+            low[j] = height[i, j] * v * v > min_height * v * v + noise
+            low[j] &= (plane_id[i, j] < 0) & (original[i, j] == 0)
+            any_low |= low[j]
+        for j in range(columns if any_low else 0):
             if not low[j]:
                 continue
             for di, dj in SIDES:
                 y, x = i + di, j + dj
-                if y < 0 or x < 0 or y >= rows or x >= columns or before[y, x] <= 0:
+                if y < 0 or x < 0 or y >= rows or x >= columns or original[y, x] <= 0:
                     continue
-                near = abs(inv_depth[y, x] - inv_depth[i, j]) < grid.discontinuity
-                if near and abs(plane_id[y, x]) == -plane_id[i, j]:
-                    labels[i, j] = before[y, x]
+                same_surface = abs(inv_depth[y, x] - inv_depth[i, j]) < grid.discontinuity
+                if same_surface and abs(plane_id[y, x]) == -plane_id[i, j]:
+                    labels[i, j] = original[y, x]
 
 
 @kernel
@@ -117,14 +117,14 @@ def _count_sides(
         for j in range(spans[i, 0], spans[i, 1]):
             if not inside[i, j]:
                 continue
-            p, here = component[i, j], inv_depth[i, j]
+            p, w = component[i, j], inv_depth[i, j]
             for di, dj in SIDES:
-                label, there = labels[i + di, j + dj], inv_depth[i + di, j + dj]
+                label, neighbour_w = labels[i + di, j + dj], inv_depth[i + di, j + dj]
                 if label > 0:
                     sides[p, label, BOUNDARY] += 1
-                    sides[p, label, IN_FRONT] += there > here + jump
-                    sides[p, label, GOES_ON] += abs(there - here) < jump
-                if label > 0 or there <= 0:
+                    sides[p, label, IN_FRONT] += neighbour_w > w + jump
+                    sides[p, label, CONTINUOUS] += abs(neighbour_w - w) < jump
+                if label > 0 or neighbour_w <= 0:
                     total[p] += 1
                 elif not inside[i + di, j + dj]:
                     total[p] += labels.size
@@ -138,7 +138,7 @@ def _owner_of(sides: I4, total: int) -> int:
         best = k if sides[k, BOUNDARY] > sides[best, BOUNDARY] else best
     if (
         sides[best, BOUNDARY] <= CLEANUP.enclosed_share * total
-        or sides[best, GOES_ON] <= CLEANUP.goes_on_share * total
+        or sides[best, CONTINUOUS] <= CLEANUP.continuous_share * total
     ):
         return 0
     for k in range(1, len(sides)):

@@ -95,9 +95,9 @@ def measure_object_features(
     graph, labels, segments = oversegmentation
     features = np.zeros(segments.parent.size, OBJECT_FEATURES)
     rows = features["surroundings"]
-    seen = grid.inverse_depth, grid.discontinuity, model.planes, *model.heights
+    geometry = grid.inverse_depth, grid.discontinuity, model.planes, *model.heights
     marks = model.low_profile, model.walls
-    cells = LabelledGrid(*seen, *marks, labels, graph.spans, segments.parent)
+    cells = LabelledGrid(*geometry, *marks, labels, graph.spans, segments.parent)
     _count_by_segment(cells, _border_lines(grid), 1 / range_m + DISCONTINUITY / 2, rows)
     _measure_plane(cells, segments, rows)
     _measure(grid, model.planes, segments, model.up[2], features)
@@ -133,15 +133,15 @@ def _count_by_segment(
         for j in range(spans[i, 0], spans[i, 1]):
             if labels[i, j] == 0:
                 continue
-            row, here = rows[owner[labels[i, j]]], inv_depth[i, j]
+            row, w = rows[owner[labels[i, j]]], inv_depth[i, j]
             row.image_border += (i == top) | (i == bottom) | (j == left) | (j == right)
-            row.range_limit += here < last
+            row.range_limit += w < last
             row.on_wall += walls[i, j] == ON_WALL
             row.low_profile += low[i, j] > 0
             for di, dj in SIDES:
                 y, x = min(max(i + di, 0), last_row), min(max(j + dj, 0), last_column)
-                row.depth_edge += 0 < inv_depth[y, x] <= here - jump
-                if plane_id[y, x] != 0 or abs(inv_depth[y, x] - here) >= jump:
+                row.depth_edge += 0 < inv_depth[y, x] <= w - jump
+                if plane_id[y, x] != 0 or abs(inv_depth[y, x] - w) >= jump:
                     continue
                 k = plane_id[i, j] - 1
                 if inv_depth[y, x] > max(planes[k, 0] * x + planes[k, 1] * y + planes[k, 2], 0):
@@ -167,10 +167,10 @@ def _measure_plane(cells: LabelledGrid, segments: Segments, rows: Records) -> No
                     rows[p].plane_noise += height[y, x] ** 2
     for p in range(1, len(rows)):
         if count[p] > 0:
-            row, least = rows[p], min_height_at(depth_of(segments, p))
+            row, min_height = rows[p], min_height_at(depth_of(segments, p))
             mean = row.plane_height / count[p]
             variance = max(row.plane_noise / count[p] - mean * mean, 0.0)
-            row.plane_height, row.plane_noise = mean / least, math.sqrt(variance) / least
+            row.plane_height, row.plane_noise = mean / min_height, math.sqrt(variance) / min_height
 
 
 @kernel
@@ -179,22 +179,22 @@ def _measure(grid: DepthGrid, planes: F8, segments: Segments, down: float, out: 
     for p in range(1, segments.parent.size):
         if segments.parent[p] != p:
             continue
-        shape, around, seen = segments.statistics[p], out[p].surroundings, out[p].visibility
+        segment, around, view = segments.statistics[p], out[p].surroundings, out[p].visibility
         depth = depth_of(segments, p)
         cell = depth / grid.intrinsics.fx
         write_segment_features(segments, p, out[p].segment)
-        around.image_border = share(around.image_border, 4 * math.sqrt(shape.count))
-        around.range_limit = share(around.range_limit, shape.count)
-        around.on_wall = share(around.on_wall, shape.count)
-        around.low_profile = share(around.low_profile, shape.count)
-        around.beyond = share(around.beyond, shape.boundary)
-        around.into_wall = share(around.into_wall, shape.boundary)
-        around.depth_edge = share(around.depth_edge, shape.boundary)
+        around.image_border = share(around.image_border, 4 * math.sqrt(segment.count))
+        around.range_limit = share(around.range_limit, segment.count)
+        around.on_wall = share(around.on_wall, segment.count)
+        around.low_profile = share(around.low_profile, segment.count)
+        around.beyond = share(around.beyond, segment.boundary)
+        around.into_wall = share(around.into_wall, segment.boundary)
+        around.depth_edge = share(around.depth_edge, segment.boundary)
         _measure_outside(grid, planes[segments.plane_id[p] - 1], segments.samples[p], around)
-        seen.cells, seen.depth_m, seen.cell_m, seen.down = shape.count, depth, cell, down
-        seen.top_by_noise = shape.top / min_height_at(depth)
-        seen.slant = share(shape.area, shape.count * cell * depth / grid.intrinsics.fy)
-        seen.ragged = share(shape.boundary * shape.boundary, shape.count)
+        view.cells, view.depth_m, view.cell_m, view.down = segment.count, depth, cell, down
+        view.top_by_noise = segment.top / min_height_at(depth)
+        view.slant = share(segment.area, segment.count * cell * depth / grid.intrinsics.fy)
+        view.ragged = share(segment.boundary * segment.boundary, segment.count)
 
 
 @kernel(inline=True)

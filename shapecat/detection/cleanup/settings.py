@@ -8,14 +8,14 @@ __all__ = ["CLEANUP", "CleanupSettings"]
 class CleanupSettings(NamedTuple):
     """Constants of the rejection of structure and the completion of labels."""
 
-    least_logit: float = 0.0
+    min_logit: float = 0.0
     """Minimum logit of an object, which is then more likely than structure. Of the segments between
     -1 and 0 that cover less than `large_share` of the image, a fifth are objects."""
-    least_large_logit: float = -1.0
+    min_large_logit: float = -1.0
     """Minimum logit of a larger object; between -1 and 0, two thirds of them are objects."""
     far_m: float = 2.0
     """Depth beyond which most segments are background, metres."""
-    least_far_logit: float = 1.0
+    min_far_logit: float = 1.0
     """Minimum logit of an object that is far. In 160 simulated rooms, it rejects 60 of the 73 false
     objects that a range of 3 m adds to one of 2 m, and 2 of the 57 true ones."""
     certain_logit: float = 4.0
@@ -27,8 +27,8 @@ class CleanupSettings(NamedTuple):
     sure_logit: float = 4.0
     """Logit at which a verdict on a neighbour counts as nearly certain: three quarters of one."""
     tiny_share: float = 0.5
-    """A segment with a smaller fraction of the cells of the smallest object would be dropped at the
-    end, but before that prevent the filling of the hole around it."""
+    """Segments with a smaller fraction of the cells of the smallest object are rejected here.
+    Dropped only at the end, they would prevent the filling of the holes around them."""
     border_share: float = 0.08
     """Maximum fraction of the image that sensors leave blank at a border."""
     around_cells: int = 4
@@ -42,13 +42,13 @@ class CleanupSettings(NamedTuple):
     """Minimum fraction of the perimeter of such structure, taken for a square, at the image
     border."""
     fringe: float = 0.6
-    """Minimum height at which a sample next to an object belongs to it, relative to the least
-    height elsewhere. That one is safe against noise: away from objects, samples as low as this are
-    as often the plane."""
+    """Minimum height at which a sample next to an object belongs to it, relative to the
+    minimum elsewhere, which excludes noise: away from objects, samples this low belong to the plane
+    as often as to an object."""
     enclosed_share: float = 0.6
     """Minimum fraction of the boundary of a hole with the label around it: a ring seen from the
     side has this much, the gap between two objects half."""
-    goes_on_share: float = 0.15
+    continuous_share: float = 0.15
     """Minimum fraction of the boundary of a hole where the surface continues; less in a handle."""
 
 

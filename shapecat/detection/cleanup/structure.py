@@ -49,8 +49,10 @@ FILES = {"structure.npz": OBJECT_FEATURES, "structure_in_context.npz": CONTEXT_F
 def load_trees() -> RejectionTrees:
     """Load shapecat's trees for rejecting structure."""
     folder = files("shapecat.detection.cleanup")
-    both = (read_trees(folder.joinpath(name).read_bytes(), use) for name, use in FILES.items())
-    return RejectionTrees(*both)
+    trees = (
+        read_trees(folder.joinpath(name).read_bytes(), features) for name, features in FILES.items()
+    )
+    return RejectionTrees(*trees)
 
 
 def find_background(
@@ -68,20 +70,20 @@ def find_background(
     roots, weights = measure_borders(segments)
     merged = features[roots]
     alone = logits_of(as_rows(merged), trees.alone)
-    again = is_uncertain(alone)
-    context = add_context(merged, alone, weights)[again]
+    uncertain = is_uncertain(alone)
+    context = add_context(merged, alone, weights)[uncertain]
     logits = alone.copy()
-    logits[again] = logits_of(as_rows(context), trees.in_context)
+    logits[uncertain] = logits_of(as_rows(context), trees.in_context)
     segment, cells = features["segment"], features["visibility"]["cells"]
     depths = merged["visibility"]["depth_m"]
     large = cells > CLEANUP.large_share * grid.inverse_depth.size
     rejected[roots] = logits < np.select(
         [depths > CLEANUP.far_m, large[roots]],
-        [CLEANUP.least_far_logit, CLEANUP.least_large_logit],
-        CLEANUP.least_logit,
+        [CLEANUP.min_far_logit, CLEANUP.min_large_logit],
+        CLEANUP.min_logit,
     )
-    enough = np.array([smallest_object_at(grid, z) for z in depths.tolist()])
-    rejected[roots] |= cells[roots] < CLEANUP.tiny_share * enough
+    min_cells = np.array([smallest_object_at(grid, z) for z in depths.tolist()])
+    rejected[roots] |= cells[roots] < CLEANUP.tiny_share * min_cells
     rejected |= segment["width_m"] > settings.max_size_m
     rejected |= segment["top_m"] > settings.max_height_m - CLEANUP.cut_off_m
     # Large and mostly outside the image: furniture, which the trees were not shown.
@@ -96,8 +98,8 @@ def as_rows(features: Records) -> F4:
 
 def is_uncertain(logits: F4) -> Bool:
     """Return which segments, with these ``logits`` (n,) alone, to judge again in context, (n,)."""
-    again: Bool = np.abs(logits) < CLEANUP.uncertain_logit
-    return again
+    uncertain: Bool = np.abs(logits) < CLEANUP.uncertain_logit
+    return uncertain
 
 
 @kernel
