@@ -16,10 +16,10 @@ from shapecat.jit import kernel, unset
 
 __all__ = [
     "GridLabels",
-    "find_near",
+    "assign_labels",
+    "dilate_row",
     "grid_labels_of",
     "label_pixels",
-    "settle_labels",
 ]
 
 UNSURE, BARE = -1, -2
@@ -39,7 +39,9 @@ class GridLabels(NamedTuple):
     discontinuity: float
 
 
-def label_pixels(depth: F4, grid: DepthGrid, found: Segmentation, *, range_m: float) -> list[U4]:
+def label_pixels(
+    depth: F4, grid: DepthGrid, segmentation: Segmentation, *, range_m: float
+) -> list[U4]:
     """Return the pixels of each label 1, 2, ...: ascending flat indices (k,) uint32.
 
     A pixel takes the label of its cell if their depths agree, else that of the neighbouring cell
@@ -50,36 +52,36 @@ def label_pixels(depth: F4, grid: DepthGrid, found: Segmentation, *, range_m: fl
     depth : (height, width) metres, 0 where depth is missing.
     range_m : depths farther away have no label, metres.
     """
-    grid_labels = grid_labels_of(grid, found)
+    grid_labels = grid_labels_of(grid, segmentation)
     return split_by_label(
-        *_list_pixels(depth, grid_labels, grid.factor, range_m, found.plane_ids.size)
+        *_list_pixels(depth, grid_labels, grid.factor, range_m, segmentation.plane_ids.size)
     )
 
 
-def grid_labels_of(grid: DepthGrid, found: Segmentation) -> GridLabels:
+def grid_labels_of(grid: DepthGrid, segmentation: Segmentation) -> GridLabels:
     """Collect the fields that the kernels here read."""
     return GridLabels(
         grid.inverse_depth,
-        found.labels,
-        found.filled,
-        found.model.planes,
-        found.plane_ids,
+        segmentation.labels,
+        segmentation.filled,
+        segmentation.model.planes,
+        segmentation.plane_ids,
         grid.discontinuity,
     )
 
 
 @kernel(inner=True)
-def find_near(labels: I4, i: int, scratch: I4, near: I4) -> None:
-    """Mark in ``near`` the cells of row ``i`` that have a label or a neighbour with one.
+def dilate_row(labels: I4, i: int, scratch: I4, dilated: I4) -> None:
+    """Mark in ``dilated`` the cells of row ``i`` that have a label or a neighbour with one.
 
-    ``labels`` and ``near`` are (rows, columns); ``scratch`` (columns + 2,) is 0 at both ends.
+    ``labels`` and ``dilated`` are (rows, columns); ``scratch`` (columns + 2,) is 0 at both ends.
     """
     rows, columns = labels.shape
-    above, below, one = max(i - 1, 0), min(i + 1, rows - 1), np.uint64(1)
+    row_above, row_below, one = max(i - 1, 0), min(i + 1, rows - 1), np.uint64(1)
     for j in range(np.uint64(columns)):
-        scratch[j + one] = labels[above, j] | labels[i, j] | labels[below, j]
+        scratch[j + one] = labels[row_above, j] | labels[i, j] | labels[row_below, j]
     for j in range(np.uint64(columns)):
-        near[i, j] = (scratch[j] | scratch[j + one] | scratch[j + one + one]) != 0
+        dilated[i, j] = (scratch[j] | scratch[j + one] | scratch[j + one + one]) != 0
 
 
 @kernel
@@ -92,10 +94,10 @@ def _list_pixels(
     # The cells of a row at full resolution, and the marks of its pixels.
     wide_code, wide_w = np.zeros(width, np.int16), np.zeros(width, np.float32)
     line, marks = np.zeros(width, np.int16), np.zeros(width, np.int16)
-    cells, places = np.zeros((2, width), np.int64), np.zeros((3, width))
+    cells, positions = np.zeros((2, width), np.int64), np.zeros((3, width))
     runs, n = np.zeros((4 * width, 3), np.int32), 0
     code, spans = _code_cells(grid_labels)
-    far, shift, scale = np.float32(range_m), (factor - 1) * 0.5, 1.0 / factor
+    max_depth, shift, scale = np.float32(range_m), (factor - 1) * 0.5, 1.0 / factor
     jump = np.float32(grid_labels.discontinuity)
     for i in range(rows):
         if spans[i, 0] == spans[i, 1]:
@@ -105,14 +107,14 @@ def _list_pixels(
         for y in range(i * factor, (i + 1) * factor if i + 1 < rows else height):
             if n + width > len(runs):
                 runs = np.concatenate((runs, np.zeros_like(runs)))
-            _mark(depth, wide_w, wide_code, (y, x0, x1), far, jump, line)
+            _mark(depth, wide_w, wide_code, (y, x0, x1), max_depth, jump, line)
             unsure = _find_unsure(line, x0, x1, cells)
             for m in range(unsure):
                 x = cells[1, m]
                 cells[0, m], cells[1, m] = i, min(row_and_column(x, factor)[0], columns - 1)
-                places[0, m], places[1, m] = (x - shift) * scale, (y - shift) * scale
-                places[2, m] = depth[y, x]
-            settle_labels(grid_labels, cells, places, unsure, marks)
+                positions[0, m], positions[1, m] = (x - shift) * scale, (y - shift) * scale
+                positions[2, m] = depth[y, x]
+            assign_labels(grid_labels, cells, positions, unsure, marks)
             unsure, label, x, start, first = 0, 0, x0, x0, y * width
             while x < x1:
                 mark = line[x]
@@ -124,8 +126,8 @@ def _list_pixels(
                     label, start = mark, x
                 x = _end_of(line, x + 1, x1, label)
             n = append_run(label, first + start, first + x1, runs, n)
-    listed: tuple[U4, I4] = pixels_by_label(runs[:n], labels)
-    return listed
+    pixels: tuple[U4, I4] = pixels_by_label(runs[:n], labels)
+    return pixels
 
 
 @kernel(inline=True)
@@ -133,10 +135,10 @@ def _find_unsure(line: I4, start: int, end: int, cells: I4) -> int:
     """Write the columns of `UNSURE` pixels to ``cells[1]``; return their number."""
     n = 0
     for x in range(start, end, BLOCK):
-        last, some = min(x + BLOCK, end), False
+        last, any_unsure = min(x + BLOCK, end), False
         for k in range(np.uint64(x), np.uint64(last)):
-            some |= line[k] == UNSURE  # few blocks have any, and this vectorises
-        for k in range(x, last if some else x):
+            any_unsure |= line[k] == UNSURE  # few blocks have any, and this vectorises
+        for k in range(x, last if any_unsure else x):
             cells[1, n] = k
             n += line[k] == UNSURE
     return n
@@ -146,10 +148,10 @@ def _find_unsure(line: I4, start: int, end: int, cells: I4) -> int:
 def _end_of(line: I4, x: int, end: int, mark: int) -> int:
     """Return the first column from ``x`` to ``end`` with another mark; ``end`` if there is none."""
     while x + BLOCK <= end:
-        same = True
+        all_equal = True
         for k in range(np.uint64(x), np.uint64(x + BLOCK)):
-            same &= line[k] == mark  # this vectorises
-        if not same:
+            all_equal &= line[k] == mark  # this vectorises
+        if not all_equal:
             break
         x += BLOCK
     while x < end and line[x] == mark:
@@ -169,15 +171,15 @@ def _code_cells(grid_labels: GridLabels) -> tuple[I4, I4]:
     scratch = np.zeros(labels.shape[1] + 2, np.int16)
     high = np.zeros((len(planes), labels.shape[1]), np.uint8)
     for i in range(len(labels)):
-        find_near(labels, i, scratch, code)
+        dilate_row(labels, i, scratch, code)
         spans[i, 0], spans[i, 1] = span_of(code[i])
         _find_high(planes, inv_depth, np.float32(jump), i, spans[i], high)
         for j in range(np.uint64(spans[i, 0]), np.uint64(spans[i, 1])):
             label = labels[i, j]
             sure = filled[i, j] | high[np.uint32(plane_ids[np.uint16(label)]), j]
-            what = label if sure else np.int16(UNSURE)
-            what = what if label > 0 else np.int16(BARE)
-            code[i, j] = what if code[i, j] != 0 else np.int16(0)
+            cell_code = label if sure else np.int16(UNSURE)
+            cell_code = cell_code if label > 0 else np.int16(BARE)
+            code[i, j] = cell_code if code[i, j] != 0 else np.int16(0)
     return code, spans
 
 
@@ -187,20 +189,20 @@ def _find_high(planes: F8, inv_depth: F4, jump: float, i: int, span: I4, high: U
 
     A pixel fits within ``jump``, 1/m.
     """
-    zero, nowhere = np.float32(0), np.float32(1e-3)
+    zero, floor = np.float32(0), np.float32(1e-3)
     base = np.float32(CLEANUP.fringe * HEIGHT_NOISE)
     slope = np.float32(CLEANUP.fringe * MIN_HEIGHT_M)
     for k in range(len(planes)):
         a, above = np.float32(planes[k, 0]), np.float32(planes[k, 3])
         # The farthest pixel of a cell is 1.5 cells away.
-        farthest = 1.5 * (abs(planes[k, 0]) + abs(planes[k, 1]))
-        level = np.float32(planes[k, 1] * i + planes[k, 2] + farthest)
+        margin = 1.5 * (abs(planes[k, 0]) + abs(planes[k, 1]))
+        level = np.float32(planes[k, 1] * i + planes[k, 2] + margin)
         for j in range(np.uint64(span[0]), np.uint64(span[1])):
-            least = inv_depth[i, j] - jump if inv_depth[i, j] - jump > nowhere else nowhere
+            min_w = inv_depth[i, j] - jump if inv_depth[i, j] - jump > floor else floor
             ground = level + a * np.float32(np.int32(j))
             ground = ground if ground > zero else zero
-            # Heights at the depth 1 / least, times the square of least.
-            high[k, j] = (least - ground) * least * above > slope * least * least + base
+            # Heights at the depth 1 / min_w, times the square of min_w.
+            high[k, j] = (min_w - ground) * min_w * above > slope * min_w * min_w + base
 
 
 @kernel(inline=True)
@@ -238,24 +240,25 @@ def _mark(
     those of the cells, by column of the pixels; a pixel fits a cell within ``jump``, 1/m. This
     vectorises.
     """
-    least, zero, unsure, bare = np.float32(NEAREST_M), np.int16(0), np.int16(UNSURE), np.int16(BARE)
+    min_depth, zero = np.float32(NEAREST_M), np.int16(0)
+    unsure, bare = np.int16(UNSURE), np.int16(BARE)
     y, start, end = run
     for x in range(np.uint64(start), np.uint64(end)):
         z = depth[y, x]
         fitting = code[x] if code[x] != bare else zero
-        other = unsure if code[x] != zero else zero
-        mark = fitting if _fits(inv_depth[x], z, jump) else other
-        marks[x] = mark if (z >= least) & (z <= range_m) else zero
+        fallback = unsure if code[x] != zero else zero
+        mark = fitting if _fits(inv_depth[x], z, jump) else fallback
+        marks[x] = mark if (z >= min_depth) & (z <= range_m) else zero
 
 
 @kernel(inner=True)
-def settle_labels(grid_labels: GridLabels, cells: I4, places: F8, n: int, marks: I4) -> None:
-    """Find the labels of the first ``n`` of m depths.
+def assign_labels(grid_labels: GridLabels, cells: I4, positions: F8, n: int, marks: I4) -> None:
+    """Write the labels of the first ``n`` of m depths to ``marks``.
 
     Parameters
     ----------
     cells : (2, m) row and column of the cell of each depth.
-    places : (3, m) column and row of each depth in units of cells, and the depth, metres.
+    positions : (3, m) column and row of each depth in units of cells, and the depth, metres.
     marks : (m,) the labels are written here, 0 where there is none.
     """
     inv_depth, labels, filled = grid_labels.inverse_depth, grid_labels.labels, grid_labels.filled
@@ -264,7 +267,7 @@ def settle_labels(grid_labels: GridLabels, cells: I4, places: F8, n: int, marks:
     jump = np.float32(grid_labels.discontinuity)
     for m in range(n):
         i, j = cells[0, m], cells[1, m]
-        u, v, z = places[0, m], places[1, m], np.float32(places[2, m])
+        u, v, z = positions[0, m], positions[1, m], np.float32(positions[2, m])
         marks[m] = 0
         if not abs(inv_depth[i, j] * z - np.float32(1)) < jump * z:
             # The neighbour whose depth fits best, if any is within two discontinuities.
@@ -272,9 +275,9 @@ def settle_labels(grid_labels: GridLabels, cells: I4, places: F8, n: int, marks:
             for y in range(max(i - 1, 0), min(i + 2, rows)):
                 for x in range(max(j - 1, 0), min(j + 2, columns)):
                     gap = abs(inv_depth[y, x] * z - np.float32(1))
-                    better = gap < nearest  # a selection: a branch would be unpredictable
-                    nearest = gap if better else nearest
-                    row, column = y if better else row, x if better else column
+                    closer = gap < nearest  # a selection: a branch would be unpredictable
+                    nearest = gap if closer else nearest
+                    row, column = y if closer else row, x if closer else column
             if row < 0:
                 continue
             i, j = row, column

@@ -28,7 +28,7 @@ class ObjectMeasurements(NamedTuple):
     support_m : (n,) the height of that support above the plane.
     occluded : (n,) whether a nearer surface hides part of it.
     at_range_limit : (n,) whether the range limit cuts it off.
-    least_cells : (n,) float32, number of cells of the smallest object at its depth.
+    min_cells : (n,) float32, number of cells of the smallest object at its depth.
     """
 
     center: F8
@@ -40,7 +40,7 @@ class ObjectMeasurements(NamedTuple):
     support_m: F8
     occluded: Bool
     at_range_limit: Bool
-    least_cells: F4
+    min_cells: F4
 
 
 @kernel
@@ -78,7 +78,7 @@ def measure_objects(
     for k in range(count):
         p = representatives[k + 1]
         measured.at_range_limit[k] = at_limit[k + 1] >= MERGING.min_links
-        measured.least_cells[k] = smallest_object_at(grid, depth_of(segments, p))
+        measured.min_cells[k] = smallest_object_at(grid, depth_of(segments, p))
         below = _objects_below(measured, up, k)
         measured.supported_by[k], measured.support_m[k] = _supporting_object(
             segments, representatives, p, below
@@ -86,8 +86,8 @@ def measure_objects(
         hidden = segments.statistics[p].hidden
         for q in range(segments.parent.size):
             hidden += segments.pairs[q, p].in_front
-        around = max(segments.statistics[p].boundary, np.float32(1))
-        measured.occluded[k] = hidden > np.float32(OUTPUT.occluded_share) * around
+        boundary = max(segments.statistics[p].boundary, np.float32(1))
+        measured.occluded[k] = hidden > np.float32(OUTPUT.occluded_share) * boundary
     _break_cycles(measured)
     return measured
 
@@ -100,16 +100,16 @@ def _count_at_range_limit(inv_depth: F4, labels: I4, size: int, range_m: float) 
     below ``size``.
     """
     count = np.zeros(size, np.int64)
-    most = np.float32(1 / range_m + DISCONTINUITY / 2)
+    limit = np.float32(1 / range_m + DISCONTINUITY / 2)
     for i in range(inv_depth.shape[0]):
-        some = False
+        any_at_limit = False
         for j in range(inv_depth.shape[1]):
             # Most rows have none, and this vectorises.
-            some |= (labels[i, j] > 0) & (inv_depth[i, j] < most)
-        if not some:
+            any_at_limit |= (labels[i, j] > 0) & (inv_depth[i, j] < limit)
+        if not any_at_limit:
             continue
         for j in range(inv_depth.shape[1]):
-            if labels[i, j] > 0 and inv_depth[i, j] < most:
+            if labels[i, j] > 0 and inv_depth[i, j] < limit:
                 count[labels[i, j]] += 1
     return count
 
@@ -157,16 +157,16 @@ def _supporting_object(
     segments: Segments, representatives: I4, p: int, below: Bool
 ) -> tuple[int, float]:
     """Return the label below a segment, 0 for its plane, and the height of this support, metres."""
-    pairs, statistics, own = segments.pairs[p], segments.statistics, segments.statistics[p]
+    pairs, statistics, segment = segments.pairs[p], segments.statistics, segments.statistics[p]
     best = 0
     for k in range(1, representatives.size):
-        more = pairs[representatives[k]].rests_on > pairs[representatives[best]].rests_on
-        best = k if more and below[k] else best
-    met = pairs[representatives[best]].rests_on
-    if met >= MERGING.min_links and met > own.plane_contact:
-        height = float(pairs[representatives[best]].rests_on_height / met)
-        return (0, 0.0) if own.bottom < height - OUTPUT.sunk_m else (best, height)
-    if own.bottom > OUTPUT.lifted_m and own.plane_contact < MERGING.min_links:
+        larger = pairs[representatives[k]].rests_on > pairs[representatives[best]].rests_on
+        best = k if larger and below[k] else best
+    contact = pairs[representatives[best]].rests_on
+    if contact >= MERGING.min_links and contact > segment.plane_contact:
+        height = float(pairs[representatives[best]].rests_on_height / contact)
+        return (0, 0.0) if segment.bottom < height - OUTPUT.sunk_m else (best, height)
+    if segment.bottom > OUTPUT.lifted_m and segment.plane_contact < MERGING.min_links:
         best = _hidden_support(segments, representatives, p, below)
         return best, float(statistics[representatives[best]].top) if best else 0.0
     return 0, 0.0
@@ -179,18 +179,20 @@ def _hidden_support(segments: Segments, representatives: I4, p: int, below: Bool
     A segment that lies mostly below the top of another one is not on it, but behind it.
     """
     statistics, pairs = segments.statistics, segments.pairs
-    most_overlap = min(OUTPUT.overlap_m, (statistics[p].top - statistics[p].bottom) / 2)
+    max_overlap = min(OUTPUT.overlap_m, (statistics[p].top - statistics[p].bottom) / 2)
     middle = (statistics[p].left + statistics[p].right) / 2
-    best, most = 0, 0.0
+    best, best_border = 0, 0.0
     for k in range(1, representatives.size):
         q = representatives[k]
-        met = pairs[p, q].contact + pairs[p, q].near + pairs[p, q].in_front + pairs[q, p].in_front
+        border = (
+            pairs[p, q].contact + pairs[p, q].near + pairs[p, q].in_front + pairs[q, p].in_front
+        )
         overlap = statistics[q].top - statistics[p].bottom
-        lower = -OUTPUT.gap_m < overlap < most_overlap
+        lower = -OUTPUT.gap_m < overlap < max_overlap
         beside = statistics[q].left < middle < statistics[q].right
-        if q != p and below[k] and lower and beside and met > most:
-            best, most = k, met
-    return best if most >= MERGING.min_links else 0
+        if q != p and below[k] and lower and beside and border > best_border:
+            best, best_border = k, border
+    return best if best_border >= MERGING.min_links else 0
 
 
 @kernel(inline=True)
@@ -198,10 +200,10 @@ def _break_cycles(measured: ObjectMeasurements) -> None:
     """Put objects on their plane if they would otherwise stand, through others, on themselves."""
     supported_by = measured.supported_by
     for k in range(supported_by.size):
-        at = supported_by[k]
+        support = supported_by[k]
         for _ in range(supported_by.size):
-            at = supported_by[at - 1] if at > 0 else 0
-        if at > 0:
+            support = supported_by[support - 1] if support > 0 else 0
+        if support > 0:
             supported_by[k], measured.support_m[k] = 0, 0.0
 
 
@@ -210,9 +212,9 @@ def _measure_boxes(grid: DepthGrid, labels: I4, level: F8, measured: ObjectMeasu
     points, start = _outer_points(grid, labels, level, measured)
     for k in range(start.size - 1):
         if start[k] < start[k + 1]:
-            center, size, turned = level_box(points[:, start[k] : start[k + 1]], level)
+            center, size, orientation = level_box(points[:, start[k] : start[k + 1]], level)
             for d in range(4):  # assigning whole rows would compile a check of their sizes
-                measured.orientation[k, d] = turned[d]
+                measured.orientation[k, d] = orientation[d]
             for d in range(3):
                 measured.center[k, d], measured.size[k, d] = center[d], size[d]
 
@@ -233,7 +235,7 @@ def _outer_points(
     cells = n = 0
     for i in range(rows):
         cells += spans[i, 1] - spans[i, 0]
-    chosen = np.zeros((cells, 2), np.int32)
+    selected = np.zeros((cells, 2), np.int32)
     start = np.zeros(low.shape[0] + 1, np.int64)
     for i in range(rows):
         first, end = spans[i, 0], spans[i, 1]
@@ -246,19 +248,19 @@ def _outer_points(
                 start[k + 1] += 1
                 low[k, 1] = min(low[k, 1], j)
                 high[k, 0], high[k, 1] = i, max(high[k, 1], j)
-                chosen[n, 0], chosen[n, 1] = i, j
+                selected[n, 0], selected[n, 1] = i, j
                 n += 1
     for k in range(1, start.size):
         start[k] += start[k - 1]
-    place, points = start.copy(), np.zeros((3, n), np.float32)
+    offset, points = start.copy(), np.zeros((3, n), np.float32)
     for m in range(n):
-        i, j = chosen[m, 0], chosen[m, 1]
+        i, j = selected[m, 0], selected[m, 1]
         k = labels[i, j] - 1
         z = 1 / inv_depth[i, j]
         x, y = (j - intrinsics.cx) / intrinsics.fx * z, (i - intrinsics.cy) / intrinsics.fy * z
         for d in range(3):
-            points[d, place[k]] = level[d, 0] * x + level[d, 1] * y + level[d, 2] * z
-        place[k] += 1
+            points[d, offset[k]] = level[d, 0] * x + level[d, 1] * y + level[d, 2] * z
+        offset[k] += 1
     return points, start
 
 
@@ -271,12 +273,12 @@ def _find_outer(labels: I4, i: int, first: int, end: int, outer: Bool) -> None:
             outer[j] = labels[i, j] > 0
         return
     a, b = max(first, 1), min(end, columns - 1)
-    here, above, below = labels[i, a:b], labels[i - 1, a:b], labels[i + 1, a:b]
+    row, row_above, row_below = labels[i, a:b], labels[i - 1, a:b], labels[i + 1, a:b]
     left, right, out = labels[i, a - 1 : b - 1], labels[i, a + 1 : b + 1], outer[a:b]
-    for j in range(here.size):
-        edge = (above[j] != here[j]) | (below[j] != here[j])
-        edge |= (left[j] != here[j]) | (right[j] != here[j])
-        out[j] = edge & (here[j] > 0)
+    for j in range(row.size):
+        edge = (row_above[j] != row[j]) | (row_below[j] != row[j])
+        edge |= (left[j] != row[j]) | (right[j] != row[j])
+        out[j] = edge & (row[j] > 0)
     outer[0], outer[columns - 1] = labels[i, 0] > 0, labels[i, columns - 1] > 0
     if i % 4 == 0:
         for j in range(first + -first % 4, end, 4):

@@ -22,8 +22,8 @@ def label_occluded_points(points: F4, labels: I4, first_new: int) -> I4:
     Parameters
     ----------
     points : (n, 3) metres, any frame.
-    labels : (n,) the known labels, from 1; 0 where unknown.
-    first_new : the label of the first cluster that touches no known object; further clusters get
+    labels : (n,) labels from 1; 0 where there is none.
+    first_new : the label of the first cluster that touches no labelled object; further clusters get
         the numbers after it.
 
     Returns
@@ -33,41 +33,41 @@ def label_occluded_points(points: F4, labels: I4, first_new: int) -> I4:
     cell = np.floor((points - points.min(axis=0)) / OUTPUT.voxel_m).astype(np.int64) + 1
     _, ny, nz = cell.max(axis=0) + 2
     keys, voxel = np.unique((cell[:, 0] * ny + cell[:, 1]) * nz + cell[:, 2], return_inverse=True)
-    known = np.zeros(keys.size, np.int64)
-    np.maximum.at(known, voxel, labels)
-    _spread(keys, int(ny), int(nz), known, first_new)
-    return np.where(labels > 0, labels, known[voxel])
+    voxel_labels = np.zeros(keys.size, np.int64)
+    np.maximum.at(voxel_labels, voxel, labels)
+    _spread(keys, int(ny), int(nz), voxel_labels, first_new)
+    return np.where(labels > 0, labels, voxel_labels[voxel])
 
 
 @kernel
-def _spread(keys: I4, ny: int, nz: int, known: I4, fresh: int) -> None:
+def _spread(keys: I4, ny: int, nz: int, labels: I4, new_label: int) -> None:
     queue = np.zeros(keys.size, np.int64)
-    done = top = 0
+    head = tail = 0
     for k in range(keys.size):
-        if known[k] > 0:
-            queue[top] = k
-            top += 1
+        if labels[k] > 0:
+            queue[tail] = k
+            tail += 1
     seed = 0
     while True:
-        while done < top:
-            k = queue[done]
-            done += 1
+        while head < tail:
+            k = queue[head]
+            head += 1
             for dx in range(-1, 2):
                 for dy in range(-1, 2):
                     # The three voxels of a column are neighbours in the sorted keys.
-                    at = keys[k] + (dx * ny + dy) * nz - 1
-                    q = np.searchsorted(keys, at)
-                    while q < keys.size and keys[q] <= at + 2:
-                        if known[q] == 0:
-                            known[q] = known[k]
-                            queue[top] = q
-                            top += 1
+                    key = keys[k] + (dx * ny + dy) * nz - 1
+                    q = np.searchsorted(keys, key)
+                    while q < keys.size and keys[q] <= key + 2:
+                        if labels[q] == 0:
+                            labels[q] = labels[k]
+                            queue[tail] = q
+                            tail += 1
                         q += 1
-        while seed < keys.size and known[seed] > 0:
+        while seed < keys.size and labels[seed] > 0:
             seed += 1
         if seed == keys.size:
             return
-        known[seed] = fresh
-        fresh += 1
-        queue[top] = seed
-        top += 1
+        labels[seed] = new_label
+        new_label += 1
+        queue[tail] = seed
+        tail += 1

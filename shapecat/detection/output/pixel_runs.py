@@ -29,19 +29,19 @@ def pixels_by_label(runs: I4, labels: int) -> tuple[U4, I4]:
     ``runs`` is (r, 3): label, first pixel, and one after the last. Label 0 has no pixels: its end
     is 0.
     """
-    place, total = np.zeros(labels, np.int64), 0  # where the next pixel of each label goes
+    offset, total = np.zeros(labels, np.int64), 0  # where the next pixel of each label goes
     for r in range(len(runs)):
-        place[runs[r, 0]] += runs[r, 2] - runs[r, 1]
+        offset[runs[r, 0]] += runs[r, 2] - runs[r, 1]
     for label in range(labels):
-        place[label], total = total, total + place[label]
+        offset[label], total = total, total + offset[label]
     order = np.zeros(total, np.uint32)
     for r in range(len(runs)):
         label, first, size = runs[r, 0], runs[r, 1], runs[r, 2] - runs[r, 1]
-        start = np.uint64(place[label])
+        start = np.uint64(offset[label])
         for k in range(np.uint64(size)):
             order[start + k] = first + k
-        place[label] += size
-    return order, place
+        offset[label] += size
+    return order, offset
 
 
 def split_by_label(order: U4, ends: I4) -> list[U4]:

@@ -6,9 +6,9 @@ from shapecat.arrays import F4, F8, I4, U1, U4, Bool
 from shapecat.detection.depth_grid import PinholeIntrinsics
 from shapecat.detection.output.label_upsampling import (
     GridLabels,
-    find_near,
+    assign_labels,
+    dilate_row,
     grid_labels_of,
-    settle_labels,
 )
 from shapecat.detection.output.occluded_points import label_occluded_points
 from shapecat.detection.output.pixel_runs import pixels_by_label, split_by_label
@@ -22,24 +22,24 @@ __all__ = ["label_points"]
 
 
 def label_points(
-    view: VirtualImage, found: Segmentation, *, fused: bool, highest_m: float
+    view: VirtualImage, segmentation: Segmentation, *, fused: bool, highest_m: float
 ) -> list[U4]:
     """Return the points of each label 1, 2, ...: ascending indices (k,) uint32.
 
     If ``fused``, points behind the visible surface, at most ``highest_m`` above a plane, join the
     objects they touch. Lists beyond the labels are clusters that touch no visible object.
     """
-    points, grid, labels = view.points, view.grid, found.plane_ids.size
+    points, grid, labels = view.points, view.grid, segmentation.plane_ids.size
     marks = np.zeros(len(points), np.int16)
-    _mark_points(points, view.cell, grid.intrinsics, grid_labels_of(grid, found), marks)
+    _mark_points(points, view.cell, grid.intrinsics, grid_labels_of(grid, segmentation), marks)
     if fused:
         above = marks > 0
-        for plane in found.model.planes:
+        for plane in segmentation.model.planes:
             above |= _above(points, view.cell, grid.intrinsics, plane, highest_m)
-        loose = np.flatnonzero(above)
-        if loose.size:
-            spread = label_occluded_points(points[loose], marks[loose].astype(np.int64), labels)
-            marks[loose] = np.where(spread <= OUTPUT.most_labels, spread, 0)
+        indices = np.flatnonzero(above)
+        if indices.size:
+            spread = label_occluded_points(points[indices], marks[indices].astype(np.int64), labels)
+            marks[indices] = np.where(spread <= OUTPUT.max_label, spread, 0)
             labels = max(labels, int(marks.max()) + 1)
     edges = np.flatnonzero(np.diff(marks, prepend=0, append=0)).astype(np.int32)
     runs = np.stack([marks[edges[:-1]], edges[:-1], edges[1:]], 1, dtype=np.int32)
@@ -66,13 +66,13 @@ def _above(
 
 
 @kernel(inline=True)
-def _mark_near(labels: I4) -> U1:
+def _dilate(labels: I4) -> U1:
     """Return 1 for the cells that have a label or a neighbour with one, (rows, columns)."""
-    near = np.zeros(labels.shape, np.uint8)
+    dilated = np.zeros(labels.shape, np.uint8)
     scratch = np.zeros(labels.shape[1] + 2, np.int16)
     for i in range(labels.shape[0]):
-        find_near(labels, i, scratch, near)
-    return near
+        dilate_row(labels, i, scratch, dilated)
+    return dilated
 
 
 @kernel
@@ -84,21 +84,21 @@ def _mark_points(
     ``cell`` (n,) is the flat cell of each point; -1 out of view.
     """
     columns = grid_labels.inverse_depth.shape[1]
-    near = _mark_near(grid_labels.labels).reshape(-1)
+    dilated = _dilate(grid_labels.labels).reshape(-1)
     count = points.shape[0]
-    cells, places = np.zeros((2, count), np.int64), np.zeros((3, count))
-    chosen, found = np.zeros(count, np.int64), np.zeros(count, np.int16)
+    cells, positions = np.zeros((2, count), np.int64), np.zeros((3, count))
+    indices, labels = np.zeros(count, np.int64), np.zeros(count, np.int16)
     n = 0
     for k in range(count):
         p = cell[k]
-        if p < 0 or not near[p]:
+        if p < 0 or not dilated[p]:
             continue
         x, y, z = points[k, 0], points[k, 1], points[k, 2]
-        cells[0, n], cells[1, n], chosen[n] = p // columns, p % columns, k
-        places[0, n] = intrinsics.fx * x / z + intrinsics.cx
-        places[1, n] = intrinsics.fy * y / z + intrinsics.cy
-        places[2, n] = z
+        cells[0, n], cells[1, n], indices[n] = p // columns, p % columns, k
+        positions[0, n] = intrinsics.fx * x / z + intrinsics.cx
+        positions[1, n] = intrinsics.fy * y / z + intrinsics.cy
+        positions[2, n] = z
         n += 1
-    settle_labels(grid_labels, cells, places, n, found)
+    assign_labels(grid_labels, cells, positions, n, labels)
     for m in range(n):
-        marks[chosen[m]] = found[m]
+        marks[indices[m]] = labels[m]

@@ -28,7 +28,7 @@ __all__ = ["build_scene"]
 
 def build_scene(
     grid: DepthGrid,
-    found: Segmentation,
+    segmentation: Segmentation,
     indices: Sequence[U4],
     sensor_from_view: Pose,
     *,
@@ -45,39 +45,43 @@ def build_scene(
     points : (n, 3) metres, view frame, for the boxes of objects that the view does not show; None
         for an image.
     """
-    measured, seen = found.measured, found.plane_ids.size - 1
-    numbers = _number_visible(found.model.supports)
-    plane_id = [numbers[k] for k in found.plane_ids[1:].tolist()]
+    measured, visible_count = segmentation.measured, segmentation.plane_ids.size - 1
+    numbers = _number_visible(segmentation.model.supports)
+    plane_id = [numbers[k] for k in segmentation.plane_ids[1:].tolist()]
     supported_by, occluded = measured.supported_by.tolist(), measured.occluded.tolist()
     at_border = _at_image_border if points is None else _at_view_border
-    cut = at_border(grid, found, sensor_from_view)
-    cut |= measured.at_range_limit
-    kept = _kept(grid, measured, indices, settings.min_points, image=points is None)
-    boxes = _boxes(found, indices, points, sensor_from_view)
+    truncated = at_border(grid, segmentation, sensor_from_view)
+    truncated |= measured.at_range_limit
+    selected = _select_objects(grid, measured, indices, settings.min_points, image=points is None)
+    boxes = _boxes(segmentation, indices, points, sensor_from_view)
     # Without a visible plane below it, an object cut off by the border is probably furniture.
-    kept = [
+    selected = [
         k
-        for k in kept
-        if (_fits(boxes[k], settings) if k >= seen else plane_id[k] is not None or not cut[k])
+        for k in selected
+        if (
+            plane_id[k] is not None or not truncated[k]
+            if k < visible_count
+            else _fits(boxes[k], settings)
+        )
     ]
-    position = {k + 1: n for n, k in enumerate(kept)}
+    position = {k + 1: n for n, k in enumerate(selected)}
     candidates = []
-    for k in kept:
-        on = position.get(supported_by[k]) if k < seen else None
+    for k in selected:
+        support = position.get(supported_by[k]) if k < visible_count else None
         candidates.append(
             Candidate(
                 indices=indices[k],
                 box=boxes[k],
-                plane=plane_id[k] if k < seen else None,
-                on_candidate=on,
-                support_m=0.0 if on is None else float(measured.support_m[k]),
-                touches_border=k < seen and bool(cut[k]),
-                occluded=k < seen and occluded[k],
+                plane=plane_id[k] if k < visible_count else None,
+                on_candidate=support,
+                support_m=0.0 if support is None else float(measured.support_m[k]),
+                touches_border=k < visible_count and bool(truncated[k]),
+                occluded=k < visible_count and occluded[k],
             )
         )
-    seen_planes = [s for s in found.model.supports if s.area_m2 > 0]
-    planes = tuple(_plane(s, seen_planes[0].offset, sensor_from_view) for s in seen_planes)
-    return Scene(sensor_from_view.rotation @ found.model.up, planes, tuple(candidates))
+    visible_planes = [s for s in segmentation.model.supports if s.area_m2 > 0]
+    planes = tuple(_plane(s, visible_planes[0].offset, sensor_from_view) for s in visible_planes)
+    return Scene(sensor_from_view.rotation @ segmentation.model.up, planes, tuple(candidates))
 
 
 def _number_visible(supports: Sequence[SupportingPlane]) -> list[int | None]:
@@ -86,15 +90,20 @@ def _number_visible(supports: Sequence[SupportingPlane]) -> list[int | None]:
     return [next(numbers) if support.area_m2 > 0 else None for support in supports]
 
 
-def _kept(
-    grid: DepthGrid, measured: ObjectMeasurements, indices: Sequence[U4], least: int, *, image: bool
+def _select_objects(
+    grid: DepthGrid,
+    measured: ObjectMeasurements,
+    indices: Sequence[U4],
+    min_points: int,
+    *,
+    image: bool,
 ) -> list[int]:
     """Return the lists with enough points for an object, in the order of their first points."""
-    limits = [float(least)] * len(indices)
+    limits = [float(min_points)] * len(indices)
     if image:
-        limits = [max(least, n * grid.factor**2) for n in measured.least_cells.tolist()]
-    enough = (k for k, limit in enumerate(limits) if indices[k].size >= limit)
-    return sorted(enough, key=lambda k: int(indices[k][0]))
+        limits = [max(min_points, n * grid.factor**2) for n in measured.min_cells.tolist()]
+    selected = (k for k, limit in enumerate(limits) if indices[k].size >= limit)
+    return sorted(selected, key=lambda k: int(indices[k][0]))
 
 
 def _fits(box: Box, settings: DetectionSettings) -> bool:
@@ -105,43 +114,43 @@ def _fits(box: Box, settings: DetectionSettings) -> bool:
 
 
 def _boxes(
-    found: Segmentation, indices: Sequence[U4], points: F4 | None, sensor_from_view: Pose
+    segmentation: Segmentation, indices: Sequence[U4], points: F4 | None, sensor_from_view: Pose
 ) -> list[Box]:
     """Return the boxes of all lists: measured on cells, or on points for hidden objects."""
-    measured = found.measured
+    measured = segmentation.measured
     sizes = [measured.center, measured.size, measured.orientation]
     if sensor_from_view is IDENTITY:  # rows of a frozen array are frozen
         sizes = [freeze(rows, "n k", "f4") for rows in sizes]
     boxes = [Box(*row) for row in zip(*sizes, strict=True)]
     if points is not None:
-        extra = indices[found.plane_ids.size - 1 :]
-        boxes += [upright_box(points[index], found.model.up) for index in extra]
+        extra = indices[segmentation.plane_ids.size - 1 :]
+        boxes += [upright_box(points[index], segmentation.model.up) for index in extra]
     return [_transform_box(sensor_from_view, box) for box in boxes]
 
 
-def _at_image_border(grid: DepthGrid, found: Segmentation, _: Pose) -> Bool:
+def _at_image_border(grid: DepthGrid, segmentation: Segmentation, _: Pose) -> Bool:
     """Return whether each object reaches the border of the image, or a blank strip along it."""
-    measured, near = found.measured, max(1, round(2 / grid.factor))
+    measured, band = segmentation.measured, max(1, round(2 / grid.factor))
     shape = grid.inverse_depth.shape
-    cut = np.zeros(len(measured.low), bool)
-    for side, (blank, extent) in enumerate(find_borders(grid.inverse_depth, near).tolist()):
+    truncated = np.zeros(len(measured.low), bool)
+    for side, (blank, extent) in enumerate(find_borders(grid.inverse_depth, band).tolist()):
         axis = side // 2
         # The top of a tall object with nothing behind it is no border.
-        first = near + (blank if extent > OUTPUT.straight_share * shape[1 - axis] else 0)
+        first = band + (blank if extent > OUTPUT.straight_share * shape[1 - axis] else 0)
         if side % 2 == 0:
-            cut |= measured.low[:, axis] < first
+            truncated |= measured.low[:, axis] < first
         else:
-            cut |= measured.high[:, axis] > shape[axis] - 1 - first
-    return cut
+            truncated |= measured.high[:, axis] > shape[axis] - 1 - first
+    return truncated
 
 
-def _at_view_border(grid: DepthGrid, found: Segmentation, sensor_from_view: Pose) -> Bool:
+def _at_view_border(grid: DepthGrid, segmentation: Segmentation, sensor_from_view: Pose) -> Bool:
     """Return whether each object reaches the border of the sensor's view, for a point cloud.
 
     Such a border is a long straight side of the cloud as seen from the sensor. A cloud fused from
     several views has none.
     """
-    result = np.zeros(found.plane_ids.size, bool)
+    result = np.zeros(segmentation.plane_ids.size, bool)
     valid = grid.inverse_depth > 0
     if np.linalg.norm(sensor_from_view.translation) > NEAREST_M or not valid.any():
         return result[1:]
@@ -152,15 +161,15 @@ def _at_view_border(grid: DepthGrid, found: Segmentation, sensor_from_view: Pose
     intrinsics = grid.intrinsics
     x, y = (j - intrinsics.cx) / intrinsics.fx, (i - intrinsics.cy) / intrinsics.fy
     ray = np.stack([x, y, np.ones(i.size)], 1)
-    seen = ray @ sensor_from_view.rotation.T
-    ray = seen if (seen[:, 2] > OUTPUT.forward_cos).all() else ray  # else no optical frame
-    place = ray[:, :2] / ray[:, 2:]
-    spans = np.ptp(place, axis=0)
+    rotated = ray @ sensor_from_view.rotation.T
+    ray = rotated if (rotated[:, 2] > OUTPUT.forward_cos).all() else ray  # else no optical frame
+    slopes = ray[:, :2] / ray[:, 2:]
+    spans = np.ptp(slopes, axis=0)
     for axis in range(2):
-        for along in (place[:, axis], -place[:, axis]):
-            near = along > along.max() - OUTPUT.border_cells / intrinsics.fx
-            if np.ptp(place[near, 1 - axis]) > OUTPUT.straight_share * spans[1 - axis]:
-                result[found.labels[i[near], j[near]]] = True
+        for along in (slopes[:, axis], -slopes[:, axis]):
+            at_border = along > along.max() - OUTPUT.border_cells / intrinsics.fx
+            if np.ptp(slopes[at_border, 1 - axis]) > OUTPUT.straight_share * spans[1 - axis]:
+                result[segmentation.labels[i[at_border], j[at_border]]] = True
     return result[1:]
 
 

@@ -25,7 +25,7 @@ class OutputSettings(NamedTuple):
     """An object that extends this far below a surface, metres, does not stand on it."""
     voxel_m: float = 0.01
     """Edge of the voxels in which occluded points are connected, metres."""
-    most_labels: int = 1000
+    max_label: int = 1000
     """Largest label of a cluster of occluded points; this bounds the time."""
     border_cells: float = 2.5
     """Width of the border of a cloud, in cells."""
