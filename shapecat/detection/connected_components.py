@@ -33,35 +33,35 @@ def connected_components(inside: Bool, links: U1, spans: I4, component: I4) -> I
     (n + 1,) the number of cells with each label; 0 for label 0.
     """
     rows, columns = inside.shape
-    within, ways, numbers = inside.reshape(-1), links.reshape(-1), component.reshape(-1)
-    most = 1
+    within, bits, labels = inside.reshape(-1), links.reshape(-1), component.reshape(-1)
+    capacity = 1
     for i in range(rows):
-        most += spans[i, 1] - spans[i, 0]
-    parent = unset(most, np.int32)
-    size = unset(most, np.int32)
+        capacity += spans[i, 1] - spans[i, 0]
+    parent = unset(capacity, np.int32)
+    size = unset(capacity, np.int32)
     count = 0
     # (1) provisional labels, and which of them are connected
     for i in range(rows):
         before = 0
         for p in range(i * columns + spans[i, 0], i * columns + spans[i, 1]):
-            me, before = before, 0
+            label, before = before, 0
             if not within[p]:
-                numbers[p] = 0
+                labels[p] = 0
                 continue
-            me = me if me > 0 and ways[p - 1] & RIGHT else 0
+            label = label if label > 0 and bits[p - 1] & RIGHT else 0
             up = p - columns
-            above = numbers[up] if up >= 0 and within[up] and ways[up] & DOWN else 0
-            if me == 0 and above == 0:
+            above = labels[up] if up >= 0 and within[up] and bits[up] & DOWN else 0
+            if label == 0 and above == 0:
                 count += 1
-                parent[count] = me = count
+                parent[count] = label = count
                 size[count] = 0
-            elif me == 0:
-                me = above
-            elif above > 0 and above != me:
-                a, b = _root(parent, me), _root(parent, above)
-                parent[max(a, b)] = me = min(a, b)
-            numbers[p] = before = me
-            size[me] += 1
+            elif label == 0:
+                label = above
+            elif above > 0 and above != label:
+                a, b = _root(parent, label), _root(parent, above)
+                parent[max(a, b)] = label = min(a, b)
+            labels[p] = before = label
+            size[label] += 1
     # (2) final labels
     for k in range(count, 0, -1):
         if parent[k] != k:
@@ -77,7 +77,7 @@ def connected_components(inside: Bool, links: U1, spans: I4, component: I4) -> I
     size[0] = 0
     for i in range(rows):
         for p in range(i * columns + spans[i, 0], i * columns + spans[i, 1]):
-            numbers[p] = size[numbers[p]]
+            labels[p] = size[labels[p]]
     return sizes[: n + 1]
 
 
@@ -103,10 +103,10 @@ def span_of(row: I4) -> tuple[int, int]:
 
     Both are 0 if there is none.
     """
-    some = False
+    any_inside = False
     for j in range(row.size):
-        some |= row[j] > 0  # many rows have none, and this vectorises
-    if not some:
+        any_inside |= row[j] > 0  # many rows have none, and this vectorises
+    if not any_inside:
         return 0, 0
     start, end = 0, row.size
     while row[start] <= 0:

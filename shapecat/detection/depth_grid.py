@@ -32,7 +32,7 @@ CELL_M = 0.0035
 """Target size of a cell, metres: small against the smallest object, larger than the noise."""
 SMALL_M2 = 9e-4
 """Visible area of the smallest object, m²."""
-FEWEST_CELLS, ENOUGH_CELLS = 20.0, 60.0
+MIN_CELLS, ENOUGH_CELLS = 20.0, 60.0
 """Fewer cells may be noise; this many are an object, however small it is."""
 BORDER_SHARE = 0.12
 """Maximum fraction of the image in a blank border; a registered Kinect leaves a tenth."""
@@ -40,7 +40,7 @@ LARGEST_FACTOR = 16
 STEP_M = 0.004
 """Smallest step between two surfaces, metres. Near the camera, a slanted surface changes from cell
 to cell by more than a `DISCONTINUITY`."""
-MOST_CELLS = 100_000
+MAX_CELLS = 100_000
 """Maximum number of cells, to bound the time per frame; cells become larger than `CELL_M`."""
 
 
@@ -87,8 +87,10 @@ def downsample(depth: F4, camera: Camera, *, range_m: float) -> DepthGrid | None
     # The upper median; `numpy.median` takes twice as long.
     depth_m = float(np.partition(sample, sample.size // 2)[sample.size // 2])
     pixel_m = depth_m / max(abs(camera.fx), 1e-6)
-    least = math.sqrt(depth.size / MOST_CELLS)
-    factor = round(min(max(CELL_M / max(pixel_m, 1e-9), least, 1.0), LARGEST_FACTOR, *depth.shape))
+    min_factor = math.sqrt(depth.size / MAX_CELLS)
+    factor = round(
+        min(max(CELL_M / max(pixel_m, 1e-9), min_factor, 1.0), LARGEST_FACTOR, *depth.shape)
+    )
     shift = (factor - 1) / 2
     intrinsics = PinholeIntrinsics(
         camera.fx / factor,
@@ -113,12 +115,12 @@ def _sampled(depth: F4, step: int, range_m: float) -> F4:
     """Return the depths in range of every ``step``-th pixel, (n,) metres."""
     rows, columns = depth.shape
     result = np.zeros((rows // step + 1) * (columns // step + 1), np.float32)
-    n, one, least = np.uint64(0), np.uint64(1), np.float32(NEAREST_M)
+    n, one, min_depth = np.uint64(0), np.uint64(1), np.float32(NEAREST_M)
     for i in range(step // 2, rows, step):
         for j in range(np.uint64(step // 2), np.uint64(columns), np.uint64(step)):
             z = depth[i, j]
             result[n] = z
-            n += one if (z >= least) & (z <= range_m) else np.uint64(0)
+            n += one if (z >= min_depth) & (z <= range_m) else np.uint64(0)
     return result[:n]
 
 
@@ -145,17 +147,17 @@ def project(k: PinholeIntrinsics, x: float, y: float, z: float) -> tuple[int, in
 def smallest_object_at(grid: DepthGrid, depth_m: float) -> float:
     """Return the number of cells that the smallest object, of `SMALL_M2`, covers at a depth."""
     covered = SMALL_M2 * grid.intrinsics.fx**2 / depth_m**2
-    return float(min(max(covered, FEWEST_CELLS), ENOUGH_CELLS))
+    return float(min(max(covered, MIN_CELLS), ENOUGH_CELLS))
 
 
 @kernel
-def find_borders(inv_depth: F4, near: int) -> I4:
+def find_borders(inv_depth: F4, band: int) -> I4:
     """Measure the blank border on each side of the image, and the samples next to it.
 
     Parameters
     ----------
     inv_depth : (rows, columns) 1/m.
-    near : number of lines, from the first with a sample, in which the extent is measured.
+    band : number of lines, from the first with a sample, in which the extent is measured.
 
     Returns
     -------
@@ -168,7 +170,7 @@ def find_borders(inv_depth: F4, near: int) -> I4:
         lines, length = inv_depth.shape[axis], inv_depth.shape[1 - axis]
         first, low, high = math.ceil(BORDER_SHARE * lines), length, -1
         for k in range(lines):
-            if k >= first + (near if high >= 0 else 0):
+            if k >= first + (band if high >= 0 else 0):
                 break
             line = lines - 1 - k if back else k
             for n in range(length):
@@ -188,32 +190,32 @@ def _average(depth: F4, factor: int, range_m: float, jump: float, inv_depth: F4)
         return
     rows, columns = inv_depth.shape
     zero, one, half = np.float32(0), np.float32(1), np.float32(0.5)
-    far, least = np.float32(1e9), np.float32(NEAREST_M)
+    no_depth, min_depth = np.float32(1e9), np.float32(NEAREST_M)
     # The pixels of a row of cells, sorted by their position in the cell, so that loops vectorise.
     parts = np.zeros((factor * factor, columns), np.float32)
     scratch = np.zeros((4, columns), np.float32)
     nearest, limit, total, count = scratch[0], scratch[1], scratch[2], scratch[3]
     for i in range(rows):
-        nearest[:] = far
+        nearest[:] = no_depth
         for k in range(factor * factor):
             x, part = k % factor, parts[k]
             line = depth[i * factor + k // factor]
             for j in range(columns):
                 z = line[x + factor * j]
-                part[j] = z if (z >= least) & (z <= range_m) else far
+                part[j] = z if (z >= min_depth) & (z <= range_m) else no_depth
                 nearest[j] = part[j] if part[j] < nearest[j] else nearest[j]
         for j in range(columns):
             # The depth that is one discontinuity, in inverse depth, behind the nearest.
             slope = jump * nearest[j]
             behind = nearest[j] / (one - (slope if slope < half else half))
-            limit[j] = behind if nearest[j] < far else zero
+            limit[j] = behind if nearest[j] < no_depth else zero
         total[:], count[:] = zero, zero
         for k in range(factor * factor):
             part = parts[k]
             for j in range(columns):
-                use = part[j] <= limit[j]
-                total[j] += part[j] if use else zero
-                count[j] += one if use else zero
+                inlier = part[j] <= limit[j]
+                total[j] += part[j] if inlier else zero
+                count[j] += one if inlier else zero
         out = inv_depth[i]
         for j in range(columns):
             out[j] = count[j] / total[j] if count[j] > zero else zero
@@ -223,22 +225,22 @@ def _average(depth: F4, factor: int, range_m: float, jump: float, inv_depth: F4)
 def _average_two(depth: F4, range_m: float, jump: float, inv_depth: F4) -> None:
     rows, columns = inv_depth.shape
     zero, one, half = np.float32(0), np.float32(1), np.float32(0.5)
-    far, least = np.float32(1e9), np.float32(NEAREST_M)
+    no_depth, min_depth = np.float32(1e9), np.float32(NEAREST_M)
     for i in range(rows):
         top, bottom, out = depth[2 * i], depth[2 * i + 1], inv_depth[i]
         for j in range(columns):
             a, b, c, d = top[2 * j], top[2 * j + 1], bottom[2 * j], bottom[2 * j + 1]
-            a = a if (a >= least) & (a <= range_m) else far
-            b = b if (b >= least) & (b <= range_m) else far
-            c = c if (c >= least) & (c <= range_m) else far
-            d = d if (d >= least) & (d <= range_m) else far
+            a = a if (a >= min_depth) & (a <= range_m) else no_depth
+            b = b if (b >= min_depth) & (b <= range_m) else no_depth
+            c = c if (c >= min_depth) & (c <= range_m) else no_depth
+            d = d if (d >= min_depth) & (d <= range_m) else no_depth
             ab, cd = (a if a < b else b), (c if c < d else d)
             nearest = ab if ab < cd else cd
             slope = jump * nearest
             limit = nearest / (one - (slope if slope < half else half))
-            limit = limit if nearest < far else zero
+            limit = limit if nearest < no_depth else zero
             total = (a if a <= limit else zero) + (b if b <= limit else zero)
             total += (c if c <= limit else zero) + (d if d <= limit else zero)
             count = (one if a <= limit else zero) + (one if b <= limit else zero)
             count += (one if c <= limit else zero) + (one if d <= limit else zero)
-            out[j] = count / total if nearest < far else zero
+            out[j] = count / total if nearest < no_depth else zero

@@ -112,30 +112,32 @@ def detect(
 def _detect_in_image(depth: F4, camera: Camera, hint: F8 | None, task: Task) -> Scene | None:
     range_m = task.settings.max_range_m
     grid = downsample(depth, camera, range_m=range_m)
-    found = None if grid is None else _segment(grid, hint, task)
-    if grid is None or found is None:
+    segmentation = None if grid is None else _segment(grid, hint, task)
+    if grid is None or segmentation is None:
         return None
-    indices = label_pixels(depth, grid, found, range_m=range_m)
-    return build_scene(grid, found, indices, IDENTITY, settings=task.settings)
+    indices = label_pixels(depth, grid, segmentation, range_m=range_m)
+    return build_scene(grid, segmentation, indices, IDENTITY, settings=task.settings)
 
 
 def _detect_in_cloud(points: F4, hint: F8 | None, task: Task) -> Scene | None:
     view = virtual_image(points, range_m=task.settings.max_range_m)
-    found = None if view is None else _segment_view(view, hint, task)
-    if found is None:
+    segmentation = None if view is None else _segment_view(view, hint, task)
+    if segmentation is None:
         view = top_view(points, hint, range_m=task.settings.max_range_m, rng=task.rng)
-        found = None if view is None else _segment_view(view, hint, task)
-    if view is None or found is None:
+        segmentation = None if view is None else _segment_view(view, hint, task)
+    if view is None or segmentation is None:
         return None
     fused, highest_m = view.crowded > OUTPUT.crowded, task.settings.max_height_m
-    indices = label_points(view, found, fused=fused, highest_m=highest_m)
+    indices = label_points(view, segmentation, fused=fused, highest_m=highest_m)
     pose = inverse(view.view_from_sensor)
-    return build_scene(view.grid, found, indices, pose, settings=task.settings, points=view.points)
+    return build_scene(
+        view.grid, segmentation, indices, pose, settings=task.settings, points=view.points
+    )
 
 
 def _segment_view(view: VirtualImage, hint: F8 | None, task: Task) -> Segmentation | None:
-    turned = None if hint is None else view.view_from_sensor.rotation @ hint
-    return _segment(view.grid, turned, task, upright=False)
+    view_hint = None if hint is None else view.view_from_sensor.rotation @ hint
+    return _segment(view.grid, view_hint, task, upright=False)
 
 
 def _segment(
@@ -164,10 +166,10 @@ def _model_planes(
 ) -> PlaneModel | None:
     """Find the planes and what is above them, steps 2 and 3; None without a supporting plane."""
     trials, settings = draw_trials(task.rng), task.settings
-    found = _find_planes(grid, hint, trials, settings, upright=upright)
-    if found is None:
+    result = _find_planes(grid, hint, trials, settings, upright=upright)
+    if result is None:
         return None
-    up, supports, planes, heights = found
+    up, supports, planes, heights = result
     low_profile = np.zeros(grid.inverse_depth.shape, np.int16)
     find_low_profile(grid, heights, planes, low_profile, settings.max_size_m)
     walls = remove_walls(grid, heights.plane_id, up, settings.max_size_m, trials)

@@ -48,7 +48,7 @@ class Hierarchy:
     @cached_property
     def edges(self) -> tuple[tuple[Node, Node], ...]:
         """Pairs (lower, upper) of nodes; the upper stands directly on the lower."""
-        found = [
+        pairs = [
             (parent, Node("object", k))
             for k, candidate in enumerate(self.scene.candidates)
             for parent in self._parents_of_object(candidate)
@@ -56,8 +56,8 @@ class Hierarchy:
         for k in range(len(self.scene.planes)):
             lower = self._below_plane(k)
             if lower is not None:
-                found.append((lower, Node("plane", k)))
-        return tuple(sorted(set(found)))
+                pairs.append((lower, Node("plane", k)))
+        return tuple(sorted(set(pairs)))
 
     @property
     def roots(self) -> tuple[Node, ...]:
@@ -85,8 +85,8 @@ class Hierarchy:
         for n, candidate in enumerate(self.scene.candidates):
             if candidate.plane != k and abs(self._top(n) - self._height(middle)) < ON_TOP_M:
                 level = gravity_rotation(self.scene.up)[:2]
-                apart = np.linalg.norm(level @ (candidate.box.center - middle))
-                if apart < 0.5 * min(candidate.box.size[:2]):
+                distance = np.linalg.norm(level @ (candidate.box.center - middle))
+                if distance < 0.5 * min(candidate.box.size[:2]):
                     return Node("object", n)
         for lower in reversed(range(k)):
             if _covers(planes[lower], middle):
@@ -125,8 +125,8 @@ def format_tree(scene: Scene, describe: Callable[[Node], str]) -> str:
     printed: set[Node] = set()
 
     def add(node: Node, depth: int) -> None:
-        again = "= " if node in printed else ""
-        lines.append("  " * depth + again + describe(node))
+        prefix = "= " if node in printed else ""
+        lines.append("  " * depth + prefix + describe(node))
         if node not in printed:
             printed.add(node)
             for child in hierarchy.children(node):

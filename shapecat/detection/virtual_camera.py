@@ -17,9 +17,9 @@ WIDEST_SLOPE = 1.5
 """Largest slope x / z or y / z of a point in view."""
 OUTSIDE = 9.0
 """Placeholder for the slope of a point that is not in view."""
-MOST_CELLS = 400_000
-MOST_ROWS = 2000
-LEAST_POINTS = 100
+MAX_CELLS = 400_000
+MAX_ROWS = 2000
+MIN_POINTS = 100
 POINTS_PER_CELL = 1.8
 """Minimum number of points per occupied cell, on average; with fewer, surfaces have holes."""
 
@@ -57,7 +57,7 @@ def virtual_image(points: F4, *, range_m: float, origin: F8 | None = None) -> Vi
     """
     origin = np.zeros(3) if origin is None else origin
     axis, n = _sum_of_directions(points, origin, range_m)
-    if n < LEAST_POINTS or np.linalg.norm(axis) < 0.3 * n:  # few, or all around the sensor
+    if n < MIN_POINTS or np.linalg.norm(axis) < 0.3 * n:  # few, or all around the sensor
         return None
     rotation = _rotation_to(axis)
     pose = Pose(rotation, -rotation @ origin)
@@ -65,7 +65,7 @@ def virtual_image(points: F4, *, range_m: float, origin: F8 | None = None) -> Vi
     slopes = np.zeros((len(points), 2), np.float32)
     bounds = np.array([np.inf, np.inf, -np.inf, -np.inf])
     n = _to_view(points, pose.rotation, pose.translation, range_m, in_view, slopes, bounds)
-    return _render(in_view, slopes, bounds, n, pose) if n >= LEAST_POINTS else None
+    return _render(in_view, slopes, bounds, n, pose) if n >= MIN_POINTS else None
 
 
 def top_view(
@@ -87,22 +87,22 @@ def top_view(
 
     Returns
     -------
-    The image; None if there are fewer than `LEAST_POINTS` points or no plane.
+    The image; None if there are fewer than `MIN_POINTS` points or no plane.
     """
-    near: Bool = np.asarray((np.abs(points) <= range_m).all(axis=1))  # never so for NaN
-    near[near] = np.linalg.norm(points[near], axis=1) <= range_m
-    used = points[near]
-    if len(used) < LEAST_POINTS:
+    in_range: Bool = np.asarray((np.abs(points) <= range_m).all(axis=1))  # never so for NaN
+    in_range[in_range] = np.linalg.norm(points[in_range], axis=1) <= range_m
+    valid = points[in_range]
+    if len(valid) < MIN_POINTS:
         return None
-    sample = used[rng.choice(len(used), min(len(used), 4000), replace=False)].astype(np.float64)
+    sample = valid[rng.choice(len(valid), min(len(valid), 4000), replace=False)].astype(np.float64)
     up = _dominant_plane(sample, hint, rng)
     if up is None:
         return None
     middle = np.median(sample, axis=0)
     side = gravity_rotation(up)[1]
     origin = middle + math.sqrt(0.5) * (up - side)
-    seen = np.where(near[:, None], points, np.float32(np.nan))
-    return virtual_image(seen, range_m=max(range_m, 2.0), origin=origin)
+    cropped = np.where(in_range[:, None], points, np.float32(np.nan))
+    return virtual_image(cropped, range_m=max(range_m, 2.0), origin=origin)
 
 
 def _dominant_plane(sample: F8, hint: F8 | None, rng: np.random.Generator) -> F8 | None:
@@ -199,8 +199,8 @@ def _render(in_view: F4, slopes: F4, bounds: F8, n: int, pose: Pose) -> VirtualI
     pitch = max(
         CELL_M / depth,
         _spacing(slopes, bounds, n),
-        math.sqrt(width * height / MOST_CELLS),
-        max(width, height) / MOST_ROWS,
+        math.sqrt(width * height / MAX_CELLS),
+        max(width, height) / MAX_ROWS,
         1e-6,
     )
     intrinsics = PinholeIntrinsics(1 / pitch, 1 / pitch, -left / pitch, -top / pitch)
@@ -232,15 +232,15 @@ def _spacing(slopes: F4, bounds: F8, n: int) -> float:
 
 @kernel
 def _count_occupied(slopes: F4, left: float, top: float, scale: float, side: int) -> int:
-    seen = np.zeros((side, side), np.uint8)
+    occupied = np.zeros((side, side), np.uint8)
     n = 0
     for k in range(slopes.shape[0]):
         if slopes[k, 0] < OUTSIDE:
             # Single precision may round a slope beyond its bounds, where these are close together.
             j = min(max(int((slopes[k, 0] - left) * scale), 0), side - 1)
             i = min(max(int((slopes[k, 1] - top) * scale), 0), side - 1)
-            n += 1 - seen[i, j]
-            seen[i, j] = 1
+            n += 1 - occupied[i, j]
+            occupied[i, j] = 1
     return n
 
 
