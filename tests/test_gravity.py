@@ -320,6 +320,18 @@ def test_frames_of_a_robot_may_have_its_name_in_front(tmp_path: Path) -> None:
     assert upright.failed == 1  # the second robot is not in the map of the first
 
 
+def test_map_of_all_robots_comes_before_that_of_one(tmp_path: Path) -> None:
+    """Where robots share a map, each has the same up direction as the others."""
+    links = ("map", "r1/map"), ("r1/map", "r1/camera")
+    with open_recording(in_frames(tmp_path / "a.mcap", *links)) as recording:
+        upright = Upright.of(recording, up="tf", fixed_frame=None)
+        found = upright.orient(replace(frame(EPOCH), frame_id="r1/camera"))
+
+    assert found.source == "transforms, z of map"
+    assert found.up is not None
+    np.testing.assert_allclose(found.up, (TURN @ TURN)[2])
+
+
 def test_wanted_fixed_frame_may_begin_with_a_slash(tmp_path: Path) -> None:
     """ROS 1 wrote frame ids so, and the transforms are stored without it."""
     with open_recording(in_frames(tmp_path / "a.mcap", ("/map", "/camera"))) as recording:
@@ -359,6 +371,19 @@ def test_map_that_is_known_too_late_is_not_the_fixed_frame(
         upright.orient(frame(EPOCH))
 
     assert upright.fixed_frame == chosen
+
+
+def test_fixed_frame_is_chosen_by_stamps_of_another_clock(tmp_path: Path) -> None:
+    """In simulated time, no transform has the log time of the middle of the recording."""
+    items = []
+    for k in range(11):
+        links = [("odom", "camera", IDENTITY)] + [("map", "odom", IDENTITY)] * (k >= 6)
+        items.append(("/tf", EPOCH + k * SECOND, MAKE.transforms(links, (3 + k) * SECOND)))
+    with open_recording(write(tmp_path / "a.mcap", items)) as recording:
+        upright = Upright.of(recording, up="auto", fixed_frame=None)
+        upright.orient(replace(frame(EPOCH), stamp_ns=3 * SECOND))
+
+    assert upright.fixed_frame == "odom"
 
 
 def test_loop_of_other_frames_is_reported_and_ignored(tmp_path: Path) -> None:

@@ -211,6 +211,14 @@ def test_compressed_images_are_kept_unchanged(tmp_path: Path, encode: Any, close
     assert not warnings
 
 
+@pytest.mark.parametrize(("shrink", "size"), [(1, (48, 64)), (2, (24, 32)), (4, (12, 16))])
+def test_jpeg_is_decoded_at_a_fraction_of_its_size(shrink: int, size: tuple[int, int]) -> None:
+    """The review needs few pixels; decoding all of them takes several times as long."""
+    image = ColourImage("/c", 1, 2, "c", "jpeg", 64, 48, 0, jpeg(gradient()))
+
+    assert pixels_of(image, shrink=shrink).shape == (*size, 3)
+
+
 def test_compressed_colour_stream_is_preferred(tmp_path: Path) -> None:
     """The wrong one of five streams of a camera must not be chosen."""
     items = depth_items(EPOCH)
@@ -240,6 +248,19 @@ def test_compressed_colour_stream_is_preferred(tmp_path: Path) -> None:
             choose_colour(recording, stream, "/cam/depth/image_raw")
     uses = {t["name"]: t["use"] for t in describe_recording(path)["topics"]}
     assert uses["/cam/color/image_raw/compressed"] == "colour of /cam/depth/image_raw"
+
+
+def test_grey_images_are_used_only_on_request(tmp_path: Path) -> None:
+    """A grey camera is no colour camera, but masks can be drawn on its images."""
+    grey = raw(EPOCH, gradient()[..., 0], "mono8", "camera")
+    path = write(tmp_path / "a.mcap", [*depth_items(EPOCH), ("/cam/left/image_raw", EPOCH, grey)])
+
+    with open_recording(path) as recording:
+        (stream,) = choose_streams(recording)
+        assert choose_colour(recording, stream) is None
+    ((_, view),), _ = read(path, "/cam/left/image_raw")
+    assert view is not None
+    assert (pixels_of(view.image) == gradient()[..., :1]).all()
 
 
 def test_frames_pair_with_nearest_image_within_half_a_period(tmp_path: Path) -> None:

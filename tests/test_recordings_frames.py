@@ -101,8 +101,12 @@ def test_needed_frames_equal_those_of_full_read(tmp_path: Path, chunk_size: int)
     all_frames, _, _ = read(path)
     times = {all_frames[k].log_time_ns for k in (0, 5, 6, 11)}
 
-    needed_frames, _, _ = read(path, needed=lambda _, log_time_ns: log_time_ns in times)
+    needed_frames, skipped, warnings = read(
+        path, needed=lambda _, log_time_ns: log_time_ns in times
+    )
 
+    assert not skipped  # a resumed run would count the frames it leaves out as unreadable
+    assert not warnings
     assert len(all_frames) == 12
     assert [frame.index for frame in needed_frames] == [0, 5, 6, 11]
     for frame in needed_frames:
@@ -260,6 +264,13 @@ def test_cloud_layout_does_not_change_coordinates(data: st.DataObject) -> None:
         cloud_points(message)
 
 
+def test_cloud_with_row_step_zero_is_read() -> None:
+    """Drivers leave it out, as the step of images: the rows then follow each other."""
+    points = np.random.default_rng(2).normal(size=(2, 3, 3)).astype(np.float32)
+
+    np.testing.assert_array_equal(cloud_points(cloud(0, points, row_step=0)), points)
+
+
 @pytest.mark.parametrize(
     ("changes", "reason"),
     [
@@ -368,6 +379,44 @@ def test_step_shorter_than_a_row_is_named(tmp_path: Path) -> None:
     _, skipped, _ = read(write(tmp_path / "a.mcap", items))
 
     assert dict(skipped) == {"image of 64 pixels in 16UC1 per row with a step of 64 bytes": 1}
+
+
+def test_camera_of_distorted_images_is_fitted_to_their_rays(tmp_path: Path) -> None:
+    """The matrix of the calibration alone would be off by pixels at the border."""
+    calibration = ("/depth/camera_info", 0, info(EPOCH, d=(0.12, 0, 0, 0, 0)))
+    items = [calibration, ("/depth/image", 1, image(EPOCH, wavy_depth()))]
+
+    (frame,), _, _ = read(write(tmp_path / "a.mcap", items))
+
+    own = frame.camera
+    assert own is not None
+    u, v = np.meshgrid(np.arange(64), np.arange(48))
+    x, y = (u - own.cx) / own.fx, (v - own.cy) / own.fy
+    radial = 1 + 0.12 * (x * x + y * y)  # distorting a ray again must lead back to its pixel
+    off_u = x * radial * CAMERA.fx + CAMERA.cx - u
+    off_v = y * radial * CAMERA.fy + CAMERA.cy - v
+    assert np.percentile(np.hypot(off_u, off_v), 95) < 0.6
+
+
+@pytest.mark.parametrize(
+    ("height", "kept", "reason"),
+    [
+        (48, 6143, "image of 64 x 48 pixels needs 6144 bytes and has 6143"),
+        (0, 6144, "image of 64 x 0 pixels needs 0 bytes and has 6144"),
+    ],
+)
+def test_truncated_or_empty_depth_image_is_counted_with_its_size(
+    tmp_path: Path, height: int, kept: int, reason: str
+) -> None:
+    """The size tells a driver's mistake from a cut message."""
+    message = image(EPOCH, wavy_depth())
+    message.height, message.data = height, message.data[:kept]
+    items = [("/depth/camera_info", 0, info(EPOCH)), ("/depth/image", 1, message)]
+
+    found, skipped, _ = read(write(tmp_path / "a.mcap", items))
+
+    assert not found
+    assert dict(skipped) == {reason: 1}
 
 
 def test_invalid_points_of_cloud_are_nan(tmp_path: Path) -> None:

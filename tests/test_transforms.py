@@ -119,6 +119,8 @@ def test_lookup_errors_name_missing_link() -> None:
     buffer = TransformBuffer()
     buffer.add("a", "b", 0, IDENTITY, static=True)
     buffer.add("c", "d", 0, IDENTITY, static=True)
+    buffer.add("b", "g", 0, IDENTITY, static=True)
+    buffer.add("d", "h", 0, IDENTITY, static=True)
     buffer.add("f", "e", 0, IDENTITY, static=True)
     buffer.add("e", "f", 0, IDENTITY, static=True)
 
@@ -126,6 +128,8 @@ def test_lookup_errors_name_missing_link() -> None:
         buffer.lookup("a", "x", 0)
     with pytest.raises(DisconnectedError, match="between b and d: their roots are a and c"):
         buffer.lookup("b", "d", 0)
+    with pytest.raises(DisconnectedError, match="between g and h: their roots are a and c"):
+        buffer.lookup("g", "h", 0)
     with pytest.raises(TransformLoopError, match="loop"):
         buffer.lookup("e", "a", 0)
     assert fixed_frame(buffer, "e") is None
