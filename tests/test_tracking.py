@@ -240,6 +240,16 @@ def test_one_bad_frame_is_no_scene_cut() -> None:
     assert [track.hits for track in track_recording(frames, SETTINGS)] == [19, 19]
 
 
+def test_takes_joined_without_a_pause_are_a_scene_cut() -> None:
+    """Between two frames at full rate, all objects are exchanged for others."""
+    before, after = [[0, 0, 0], [0.4, 0, 0]], [[0.05, 0.02, 0], [0.43, -0.04, 0]]
+    frames = [frame(k, before) for k in range(10)]
+    frames += [frame(k, after, size=(0.3, 0.2, 0.04), posterior=BOX) for k in range(10, 20)]
+
+    assert np.flatnonzero(scene_cuts(next(gather(frames)), SETTINGS)).tolist() == [10]
+    assert [track.hits for track in track_recording(frames, SETTINGS)] == [10, 10, 10, 10]
+
+
 def test_short_gap_is_interpolated_and_long_gap_is_left_out() -> None:
     places = {k: [0.01 * min(k, 14), 0, 0] for k in [*range(10), 14, *range(101, 110)]}
     (track,) = track_recording([frame(k, places.get(k, [])) for k in range(110)], SETTINGS)
@@ -295,6 +305,14 @@ def test_repeatedly_hidden_object_is_one_track() -> None:
         ({"posteriors": [[1, 0], [0, 1]], "whole": [0, 20]}, True),  # partial views vary
         ({"posteriors": [[1, 0], [0, 1]], "novelties": [0.5, 1.2]}, True),  # so do unknowns
         ({"posteriors": [[1, 0], [0.3, 0.7]], "whole": [20, 3]}, True),  # at the same position
+        (  # somewhat larger than it
+            {
+                "posteriors": [[1, 0], [0.3, 0.7]],
+                "whole": [20, 3],
+                "sizes": [[0.1, 0.1, 0.1], [0.16, 0.1, 0.1]],
+            },
+            False,
+        ),
         ({"posteriors": [[1, 0], [0.3, 0.7]]}, False),
         (
             {
@@ -685,6 +703,16 @@ def test_partial_view_changes_its_track_less() -> None:
         before = size_key(np.full((1, 3), 0.1)) if name == "size" else CUP[None]
         moved = [np.abs(getattr(tracks, name) - before).max() for tracks in (whole, cut)]
         assert moved[1] == pytest.approx(0.25 * moved[0], rel=1e-5)
+
+
+def test_posterior_after_each_view_uses_fusion_of_settings() -> None:
+    """The last one is that of the track, in the report and in the table."""
+    views = [np.array(view) for view in ((0.9, 0.1), (0.4, 0.6), (0.45, 0.55))]
+    frames = [frame(k, [0, 0, 0], posterior=view) for k, view in enumerate(views)]
+    (track,) = track_recording(frames, replace(SETTINGS, fusion="vote"))
+
+    np.testing.assert_allclose(track.causal, [[1.0, 0.0], [0.5, 0.5], [1 / 3, 2 / 3]])
+    np.testing.assert_allclose(track.posterior, [1 / 3, 2 / 3])
 
 
 def test_track_posterior_uses_view_weights() -> None:

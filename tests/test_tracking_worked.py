@@ -193,12 +193,16 @@ def test_needed_detections_depend_on_nearby_frames() -> None:
     """Nearby means within half a second on both sides and in the same scene."""
     stamps = np.array([0.0, 0.3, 0.45, 0.9, 2.0, 2.4, 2.6])
     frames = [frame(k, [], stamp_ns=round(s * 1e9)) for k, s in enumerate(stamps)]
-    scenes = np.array([0, 0, 0, 0, 1, 1, 1])
+    scenes = np.array([0, 0, 0, 1, 1, 1, 1])
 
     hits = next(gather(frames))
-    needed = [_needed(hits, scenes, row, 9) for row in range(len(frames))]
+    one, two = (
+        [_needed(hits, of_frames, row, 9) for row in range(len(frames))]
+        for of_frames in (np.zeros_like(scenes), scenes)
+    )
 
-    assert needed == [3, 3, 4, 2, 2, 3, 2]
+    assert one == [3, 3, 4, 2, 2, 3, 2]
+    assert two == [3, 3, 3, 1, 2, 3, 2]
     assert _needed(hits, scenes, 2, 3) == 3
     assert _needed(hits, scenes, 1, 2) == 2
 
