@@ -261,6 +261,22 @@ def test_objects_that_swap_places_are_distinguished_by_time(tmp_path: Path) -> N
     assert labels_of(target) == {5: "tin", 6: "mug"}
 
 
+@pytest.mark.parametrize(
+    ("size", "other", "matched"),
+    [(0.1, 0.1, False), (0.1, 0.21, True), (0.21, 0.1, True)],
+)
+def test_large_objects_are_matched_farther_at_once(
+    tmp_path: Path, size: float, other: float, *, matched: bool
+) -> None:
+    """Other settings see another part of a box; half of the mean width is within it."""
+    source = make_run(tmp_path / "source", {1: static(CUP)}, labels={1: "mug"}, size=size)
+    target = make_run(tmp_path / "target", {5: static(shifted(CUP, y=0.07))}, size=other)
+
+    transfer_labels(source, target)
+
+    assert labels_of(target) == {5: "mug" if matched else ""}
+
+
 def test_skipped_frames_do_not_count_against_a_match(tmp_path: Path) -> None:
     """The source has half of the frames: no label would have a majority of all frames."""
     every_2nd = range(0, FRAMES_EACH, 2)

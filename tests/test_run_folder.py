@@ -163,6 +163,19 @@ def test_recovery_removes_old_folder_but_keeps_user_files(tmp_path: Path) -> Non
     assert contents(folder) == {"tracks.csv": "new", "notes.txt": "mine"}
 
 
+def test_recovery_keeps_old_results_beside_a_foreign_folder(tmp_path: Path) -> None:
+    """After a kill a person may have made a folder of that name; the results exist only once."""
+    folder = tmp_path / "lab"
+    make_run(previous_path(folder), tracks_csv="old")
+    folder.mkdir()
+    (folder / "photo.jpg").write_text("mine")
+
+    recover(folder)
+
+    assert contents(folder) == {"photo.jpg": "mine"}
+    assert contents(previous_path(folder)) == {"tracks.csv": "old"}
+
+
 def test_resumable_work_stays_after_error(tmp_path: Path) -> None:
     folder = tmp_path / "out" / "lab"
     with (
