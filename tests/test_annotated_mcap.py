@@ -188,7 +188,8 @@ def test_original_channels_keep_their_ids(tmp_path: Path, *, markers: bool) -> N
             schema = writer.register_schema(STRING, "ros2msg", text + bytes(k))
             channel = writer.register_channel(topic, "cdr", schema)
             if topic != "/gone":
-                writer.add_message(channel, EPOCH + k, string(topic), EPOCH, k)
+                # Before and after all annotations: the times of the file are its own.
+                writer.add_message(channel, EPOCH + (k - 1) * SECOND, string(topic), EPOCH, k)
         for kind in ("channels", "schemas"):  # the library itself leaves nothing out
             vars(writer)[f"_Writer__{kind}"].pop(2)
     annotate(source, target, markers=markers)
@@ -313,6 +314,23 @@ def test_truncated_recording_is_rewritten(tmp_path: Path) -> None:
     with target.open("rb") as file:
         assert {m.name for m in make_reader(file).iter_metadata()} == {"robot", "shapecat"}
     assert len(read_ros(target, "/shapecat/scene")) == 3
+
+
+def test_ros1_messages_of_unfinished_mcap_stay_byte_for_byte(tmp_path: Path) -> None:
+    """Only those of bags are converted: the other channels of the file may need ROS 1."""
+    source, target = tmp_path / "a.mcap", tmp_path / "out.mcap"
+    data = b"\x05\0\0\0hello"
+    with mcap_writer(source, "ros1", finish=False) as writer:
+        schema = writer.register_schema("std_msgs/String", "ros1msg", b"string data")
+        channel = writer.register_channel("/note", "ros1", schema)
+        writer.add_message(channel, EPOCH, data, EPOCH)
+
+    annotate(source, target)
+
+    with target.open("rb") as file:
+        ((schema, channel, message),) = make_reader(file).iter_messages(["/note"])
+    assert (channel.message_encoding, message.data) == ("ros1", data)
+    assert (schema.name, schema.encoding) == ("std_msgs/String", "ros1msg")
 
 
 def test_both_definitions_of_a_type_are_kept(tmp_path: Path) -> None:

@@ -24,7 +24,7 @@ from shapecat.outputs.review.columns import Columns
 from shapecat.outputs.review.images import Images, Picture
 from shapecat.outputs.review.layout import Eye, TrackView, _track_tabs, stepped_back
 from shapecat.outputs.review.scenes import ReviewFrame, choose_scenes
-from shapecat.outputs.review.shapes import _fan, markdown, short_label
+from shapecat.outputs.review.shapes import SKETCH, _fan, markdown, short_label, sketch
 from shapecat.runs.labels.meaning import TrackLabel
 from shapecat.types import Box, Camera, Frame, LabelledFrame, LabelledObject, NeuralGas, Plane, Pose
 from tests.test_executors import alive
@@ -393,6 +393,19 @@ def test_two_sensors_may_share_their_colour_camera() -> None:
         images.add(topic, (0, 0), Picture("/colour", b"", "image/png", b"", empty, []))
 
     assert list(images.entities.values()) == ["/colour", "/colour"]
+
+
+def test_caption_is_above_the_top_of_a_turned_box() -> None:
+    """In the frame of a tilted camera, up is along no axis."""
+    turn = Rotation.from_euler("xyz", (0.4, -0.7, 1.1))
+    box = Box(np.array([0.3, -0.2, 1.1]), np.array([0.12, 0.07, 0.19]), turn.as_quat())
+    labelled, _ = scene(0, [dataclasses.replace(labelled_object(7), box=box)])
+
+    columns = SKETCH["objects/captions"].columns([sketch(labelled)])
+    place, *_ = (column.as_arrow_array().to_pylist() for column in columns)
+
+    above = np.array([0.3, -0.2, 1.1]) + turn.apply([0, 0, 0.19 / 2 + 0.02])
+    np.testing.assert_allclose(place, [[above]], atol=1e-6)
 
 
 def test_label_has_only_low_confidences() -> None:
