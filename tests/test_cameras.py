@@ -82,10 +82,11 @@ def test_rectified_image_without_p_uses_k() -> None:
 @pytest.mark.parametrize("k", [np.zeros((3, 3)), np.eye(3)])
 def test_image_without_k_uses_p(k: Any) -> None:
     """Drivers of rectified depth may fill in P alone; a focal length of 1 px spoils all shapes."""
-    camera, distorted = camera_of_info(calibration(k=k.ravel()), rectified=False)
+    given = calibration(k=k.ravel(), d=np.array([0.1, 0, 0, 0, 0]))
+    camera, distorted = camera_of_info(given, rectified=False)
 
     assert camera == Camera(*SIZE, 498.4, 503.2, 317.6, 239.3)
-    assert not distorted
+    assert not distorted  # D belongs to K
 
 
 def test_identity_is_no_calibration() -> None:

@@ -279,6 +279,19 @@ def test_frames_pair_with_nearest_image_within_half_a_period(tmp_path: Path) -> 
     assert any("(1×): no colour image near the time of the frame" in w for w in warnings)
 
 
+def test_frame_pairs_with_the_image_of_its_time_not_of_its_arrival(tmp_path: Path) -> None:
+    """Of two images that jitter puts near a frame, the farther one may arrive with it."""
+    colours = [
+        ("/cam/color/image_raw", EPOCH + arrival * MS, raw(EPOCH + t * MS, gradient(), "rgb8"))
+        for t, arrival in ((0, 10), (100, 110), (200, 210), (300, 345), (340, 350), (440, 450))
+    ]
+    items = [(topic, EPOCH + 352 * MS, one) for topic, _, one in depth_items(EPOCH + 310 * MS)]
+    ((_, view),), _ = read(write(tmp_path / "a.mcap", in_order([*items, *colours])))
+
+    assert view is not None
+    assert view.image.stamp_ns == EPOCH + 300 * MS
+
+
 @pytest.mark.parametrize("early", [False, True])
 def test_pairing_keeps_to_its_side_of_a_clock_step(tmp_path: Path, early: bool) -> None:
     """After a clock was set back by 0.2 s, images from before had the same stamps: wrong masks."""
