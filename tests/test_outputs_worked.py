@@ -114,6 +114,21 @@ def test_records_print_in_one_short_line() -> None:
     assert repr(masks).endswith("boxes={}, counts={3: uint32 (999,)})")
 
 
+def test_object_has_its_own_mask_though_other_detections_have_no_track() -> None:
+    """Masks are in the order of the objects, which lack the detections without a track."""
+    objects = [labelled_object(k, detections=(k,)) for k in (2, 5)]
+    masks = (Mask(1, 0, np.ones((2, 3), np.bool_)), Mask(4, 1, np.ones((1, 2), np.bool_)))
+    image = ColourImage("/c", 5, 6, "c", "rgb8", 7, 3, 21, bytes(63))
+    depth = Frame("/depth", 0, 0, 0, "cam", np.ones((4, 6)), Camera(6, 4, 5, 5, 3, 2))
+    frame = RunFrame(labelled_frame(0, *objects), depth, Coloured(ColourView(image), masks))
+
+    found = [frame.color_mask(item) for item in objects]
+
+    assert [mask is not None and mask.sum() for mask in found] == [6, 2]
+    assert found[1] is not None
+    assert np.argwhere(found[1]).tolist() == [[1, 4], [1, 5]]
+
+
 # ---- annotations: lifetime and deletion
 
 
@@ -777,24 +792,26 @@ def test_scene_node_text_has_track_size_and_flags() -> None:
     ]
 
 
-def test_scene_shows_merged_objects_once_and_no_deleted_ones() -> None:
+@pytest.mark.parametrize("up", [(0.0, 0.0, 1.0), (0.48, -0.6, -0.64)])
+def test_scene_shows_merged_objects_once_and_no_deleted_ones(up: Any) -> None:
     """A mug found in three parts stands on a deleted plate, and a ball on the upper part.
 
     Its first part was thought to stand on the can beside it.
     """
-    plane = Plane(np.array([0, 0, 1.0]), 0.0, np.zeros((3, 3)), 0.5, 0.7)
+    up = np.array(up)
+    plane = Plane(up, 0.0, np.zeros((3, 3)), 0.5, 0.7)
     heights = {"rim": 0.12, "ball": 0.2, "plate": 0.01, "handle": 0.09, "body": 0.05, "can": 0.3}
     number = {name: k for k, name in enumerate(heights)}
     below = {"rim": "can", "ball": "rim", "handle": "body", "body": "plate", "can": "plate"}
     candidates = [
         Candidate(
-            np.array([k]), box_at((0, 0, height), (0.01, 0.01, 0.01)), 0,
+            np.array([k]), box_at(height * up, (0.01, 0.01, 0.01)), 0,
             number.get(below.get(name, "")), 0.1 if name in below else 0.0, False, name == "body",
         )
         for k, (name, height) in enumerate(heights.items())
     ]  # fmt: skip
-    scene = Scene(np.array([0, 0, 1.0]), (plane,), tuple(candidates))
-    box = box_at((0, 0, 0.085), (0.08, 0.1, 0.14))
+    scene = Scene(up, (plane,), tuple(candidates))
+    box = box_at(0.085 * up, (0.08, 0.1, 0.14))
     mug = labelled_object(8, [0, 3, 4], box=box, category="mug", detections=(0, 3, 4))
     ball = labelled_object(1, [1], category="ball", detections=(1,))
     mug = replace(mug, occluded=True)

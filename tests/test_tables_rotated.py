@@ -91,14 +91,21 @@ def run(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return write_run(tmp_path_factory.mktemp("turned"), np.zeros(3))
 
 
-def write_run(folder: Path, origin: Any) -> Path:
-    """Write the tables, with all objects and the sensor moved by ``origin``, metres."""
+def write_run(folder: Path, origin: Any, *, vague: int | None = None) -> Path:
+    """Write the tables, with all objects and the sensor moved by ``origin``, metres.
+
+    The whole size of the object ``vague`` is unknown.
+    """
     with PerceptionTables(folder, categories=CATEGORIES, model_id="m") as tables:
         for k in range(FRAMES):
             up = ROTATIONS[k].inv().apply(UP)
             planes = (Plane(up, -0.5, OUTLINE, 0.7, 0.0), Plane(up, -0.2, OUTLINE + 1, 0.4, 0.3))
             scene = Scene(up, planes, ())
-            found = tuple(detection_of(k, item) for item in range(3))
+            objects = [detection_of(k, item) for item in range(3)]
+            found = tuple(
+                replace(one, full=None) if item == vague else one
+                for item, one in enumerate(objects)
+            )
             stamp = EPOCH + k * SECOND // 10
             perception = Perception("/depth", k, stamp, "cam", scene, found, {"detect": 0.01})
             pose = Pose(ROTATIONS[k].as_matrix(), POSITIONS[k] + origin)
@@ -391,6 +398,16 @@ def test_labelled_frames_and_annotations_have_same_boxes(run: Path, *, merged: b
             assert_allclose(item.center, same.full.center, atol=1e-6)
             assert_allclose(item.size, same.full.size, atol=1e-6)
             assert_allclose(item.orientation, same.full.orientation, atol=1e-6)
+
+
+def test_annotation_of_unknown_whole_is_the_visible_part(tmp_path: Path) -> None:
+    """One such object must not cost the others of the frame their whole boxes."""
+    folder = write_run(tmp_path, np.zeros(3), vague=1)
+    labels = read_labels(folder / "tracks.csv", CATEGORIES)
+
+    for frame in read_annotation_frames(folder, labels):
+        sizes = sorted(one.size[0] for one in frame.objects)
+        assert sizes == pytest.approx([SIZE[0], SIZE[0] + 0.01, SIZE[0] + 0.01], abs=1e-6)
 
 
 def test_times_count_from_earliest_stamp_not_first_message(tmp_path: Path) -> None:
