@@ -539,6 +539,17 @@ def test_manifest_in_bucket_has_lines_of_all_writers() -> None:
     assert RemoteManifest(url, "1-of-4").entries == {}
 
 
+@pytest.mark.parametrize("last", ["failed", "complete"])
+def test_later_of_two_writers_decides(last: str) -> None:
+    """Their parts are read by name, whoever wrote last."""
+    url, times = f"memory://later-{last}", {last: "2026-01-01T12:00:05", "planned": "2026-01-01T12"}
+    for writer, (state, time) in zip("ab", times.items(), strict=True):
+        line = {"folder": "lab", "recording": "lab.mcap", "state": state, "time": time}
+        (Location(url) / ".manifest/all" / f"{writer}.jsonl").write(json.dumps(line).encode())
+
+    assert RemoteManifest(url).entries["lab"].state == last
+
+
 def test_manifest_parts_stay_small(monkeypatch: pytest.MonkeyPatch) -> None:
     """Sent whole with each line, the manifest of a large batch would outweigh its results."""
     monkeypatch.setattr("shapecat.batch.manifest._PART_BYTES", 2000)
