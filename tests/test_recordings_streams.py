@@ -158,6 +158,17 @@ def test_confidence_map_is_not_taken_for_depth(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize(
+    "other", ["amplitude", "intensity/image_raw", "snr/image", "statemap", "texture"]
+)
+def test_other_measurements_are_not_taken_for_depth(tmp_path: Path, other: str) -> None:
+    """Drivers of ifm, SICK, Zivid and Photoneo encode them like the depth beside them."""
+    items = [*depth_in(f"/cam/{other}", "camera"), *depth_in("/cam/z", "camera")]
+
+    with open_recording(write(tmp_path / "a.mcap", items)) as recording:
+        assert [stream.topic for stream in choose_streams(recording)] == ["/cam/z"]
+
+
+@pytest.mark.parametrize(
     "topic",
     [
         "/thermal_mast/camera/image_raw",

@@ -37,7 +37,10 @@ _PEEK = 5
 _WARNINGS = 3
 """Warnings about a recording that an error repeats."""
 _UNREADABLE = "no readable messages"
-_OTHER_WORDS = ("confidence", "disparity", "thermal", "mask")
+_OTHER_WORDS = (
+    *("amplitude", "confidence", "disparity", "intensity", "mask", "snr", "statemap", "texture"),
+    "thermal",
+)
 """Images on topics with these words, encoded like depth, are something else."""
 
 
@@ -45,7 +48,7 @@ def depth_streams(recording: Recording, wanted: Sequence[str] = ()) -> tuple[Str
     """Find the clouds and depth images of a recording, sorted by topic.
 
     The encoding of the first images, of which some may be blank, distinguishes depth from colour.
-    Topics named after confidence, disparity, thermal images or masks are left out unless they are
+    Topics named after other images, as of confidence or disparity, are left out unless they are
     ``wanted``, with or without a leading slash. A depth image is paired with the calibration in its
     own namespace (``depth/image_raw`` with ``depth/camera_info``), or with the only calibration in
     the recording.
