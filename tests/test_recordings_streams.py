@@ -168,6 +168,22 @@ def test_other_measurements_are_not_taken_for_depth(tmp_path: Path, other: str) 
         assert [stream.topic for stream in choose_streams(recording)] == ["/cam/z"]
 
 
+@pytest.mark.parametrize("others", [(), ("/cam/points/xyz",)])
+def test_cloud_without_coordinates_is_chosen_last(tmp_path: Path, others: tuple[str, ...]) -> None:
+    """Zivid publishes normals alone, whose topic is the first by alphabet: no frame was usable."""
+    normals = cloud(EPOCH, organized_points(wavy_depth()))
+    for field in normals.fields:
+        field.name = f"normal_{field.name}"
+    items = [("/cam/normals/xyz", EPOCH, normals)]
+    items += [(topic, EPOCH, cloud(EPOCH, organized_points(wavy_depth()))) for topic in others]
+
+    with open_recording(write(tmp_path / "a.mcap", items)) as recording:
+        (chosen,) = choose_streams(recording)
+        assert chosen.topic == (*others, "/cam/normals/xyz")[0]
+        assert [w for w in recording.warnings if "no fields x, y, z" in w] == recording.warnings
+        assert bool(recording.warnings) == (not others)
+
+
 @pytest.mark.parametrize(
     "topic",
     [

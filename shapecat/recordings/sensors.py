@@ -23,7 +23,7 @@ class Stream:
 
     ``info_topic`` is the topic of a depth image's calibration, None if there is none; ``count`` is
     the number of messages, None if unknown; ``frame_id`` is from the first message; ``doubt`` says
-    why the calibration may be that of another camera, and is empty if nothing suggests so.
+    why its frames may be wrong, as with the calibration of another camera; empty without a doubt.
     """
 
     topic: str

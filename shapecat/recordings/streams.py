@@ -42,6 +42,7 @@ _OTHER_WORDS = (
     "thermal",
 )
 """Images on topics with these words, encoded like depth, are something else."""
+_AXES = {"x", "y", "z"}
 
 
 def depth_streams(recording: Recording, wanted: Sequence[str] = ()) -> tuple[Stream, ...]:
@@ -71,10 +72,10 @@ def choose_streams(recording: Recording, wanted: Sequence[str] = ()) -> tuple[St
     """Choose the streams to process: the wanted ones, or the best one of the only sensor.
 
     `by_sensor` says which streams belong to the same sensor. Within a sensor the preference is, in
-    this order: no calibration of another camera; depth images, since a cloud holds the same data in
-    eight times the bytes; images on a topic named after depth; images not aligned to another
-    camera; more messages; the alphabetical order. A chosen stream whose calibration may be of
-    another camera causes a warning.
+    this order: no doubt about content or calibration; depth images, since a cloud holds the same
+    data in eight times the bytes; images on a topic named after depth; images not aligned to
+    another camera; more messages; the alphabetical order. A doubt about a chosen stream causes a
+    warning.
 
     Parameters
     ----------
@@ -219,7 +220,11 @@ def first_messages(recording: Recording, topic: str, kind: str | None = None) ->
 
 
 def _probe_cloud(topic: Topic, first: Any, _recording: Recording) -> Stream:
-    return Stream(topic.name, topic.type, "points", None, topic.count, first.header.frame_id)
+    names, frame_id = {field.name for field in first.fields}, first.header.frame_id
+    doubt = ""
+    if names and not names >= _AXES:  # empty clouds may have no fields at all
+        doubt = f"{topic.name}: its clouds have no fields x, y, z"
+    return Stream(topic.name, topic.type, "points", None, topic.count, frame_id, doubt)
 
 
 def _probe_image(topic: Topic, first: Any, recording: Recording) -> Stream | None:
