@@ -185,6 +185,21 @@ def test_cloud_without_coordinates_is_chosen_last(tmp_path: Path, others: tuple[
 
 
 @pytest.mark.parametrize(
+    ("topic", "radial"), [("distance", True), ("distance_to_image_plane", False)]
+)
+def test_distances_along_rays_are_chosen_last(tmp_path: Path, topic: str, *, radial: bool) -> None:
+    """Taken for depth they bend planes; ifm publishes a cloud of the same points beside them."""
+    items = depth_in(f"/cam/{topic}", "camera")
+    points = ("/cam/points", EPOCH, cloud(EPOCH, organized_points(wavy_depth())))
+
+    with open_recording(write(tmp_path / "a.mcap", [*items, points])) as recording:
+        assert choose_streams(recording)[0].kind == ("points" if radial else "depth")
+    with open_recording(write(tmp_path / "b.mcap", items)) as recording:
+        assert choose_streams(recording)[0].topic == f"/cam/{topic}"
+        assert radial == any("along the rays" in warning for warning in recording.warnings)
+
+
+@pytest.mark.parametrize(
     "topic",
     [
         "/thermal_mast/camera/image_raw",

@@ -198,6 +198,12 @@ def _is_infrared(topic: str) -> bool:
     return "infra" in name or "/ir/" in name or "ir" in re.split("[/_]", _own_name(name))
 
 
+def _is_radial(topic: str) -> bool:
+    """Return whether images are named after distances, but not those to the image plane."""
+    own = _own_name(topic)
+    return "distance" in own and "plane" not in own
+
+
 def _own_name(topic: str) -> str:
     """Return the end of an image topic: the part after ``depth``, without robot and camera."""
     return "/".join(_image_name(topic).split("/")[-2:]).rpartition("depth")[2]
@@ -255,7 +261,12 @@ def _depth_stream(topic: Topic, first: Any, recording: Recording) -> Stream:
     frame_id = first.header.frame_id
     info = info_topic_of(topic.name, recording, frame_id)
     doubt = ""
-    if info is not None and frame_id and _nearest(topic.name, [info]) is None:
+    if _is_radial(topic.name):
+        doubt = (
+            f"{topic.name}: is named after distances, which may be along the rays of pixels and "
+            "not along the optical axis: flat surfaces are then bent"
+        )
+    elif info is not None and frame_id and _nearest(topic.name, [info]) is None:
         other = _frame_of(recording, info)
         if other and other.strip("/") != frame_id.strip("/"):
             doubt = (
