@@ -197,6 +197,25 @@ def test_fixed_frame_follows_naming_convention(chain: list[str], expected: str |
     assert fixed_frame(buffer, "stranger") is None
 
 
+@pytest.mark.parametrize(
+    ("root", "sensor", "expected"),
+    [
+        ("world", "r1/camera", "r1/odom"),
+        ("world", "r2/camera", "r2/odom"),
+        ("world", "r3/camera", "world"),
+        ("map", "r2/camera", "map"),
+    ],
+)
+def test_fixed_frame_is_not_that_of_another_robot(root: str, sensor: str, expected: str) -> None:
+    """Its corrections would move the tracks of this robot."""
+    buffer = TransformBuffer()
+    for robot, odom in (("r1", "odom"), ("r2", "odom"), ("r3", "base_link")):
+        buffer.add(root, f"{robot}/{odom}", 0, IDENTITY, static=True)
+        buffer.add(f"{robot}/{odom}", f"{robot}/camera", 0, IDENTITY, static=True)
+
+    assert fixed_frame(buffer, sensor) == expected
+
+
 def transform(store: Any, parent: str, child: str, stamp: int, x: float) -> Any:
     types = store.types
     time = types["builtin_interfaces/msg/Time"](*divmod(stamp, SECOND))

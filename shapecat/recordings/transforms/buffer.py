@@ -241,16 +241,17 @@ def fixed_frame(buffer: TransformBuffer, frame_id: str, at_ns: int | None = None
     The frame id; None if ``frame_id`` is in no transform, if it is the root itself, or if it is in
     a loop of frames.
     """
+    sensor = frame_id.lstrip("/")
     try:
-        root = buffer.root_of(frame_id)
+        root = buffer.root_of(sensor)
     except TransformError:
         return None
     connected = [name for name in buffer.frames if _is_below(buffer, name, root)]
     found = [n for wanted in _FIXED for n in connected if n.rsplit("/", 1)[-1] == wanted]
-    found += [root] if root != frame_id.lstrip("/") else []
-    known = [
-        name for name in found if at_ns is None or _can_transform(buffer, name, frame_id, at_ns)
-    ]
+    found += [root] if root != sensor else []
+    if "/" in sensor:  # for r2/camera, the frames of another robot, as r1/odom, come last
+        found.sort(key=lambda name: not sensor.startswith(name[: name.rfind("/") + 1]))
+    known = [n for n in found if at_ns is None or _can_transform(buffer, n, sensor, at_ns)]
     return next(iter(known or found), None)
 
 
