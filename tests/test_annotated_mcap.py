@@ -466,6 +466,23 @@ def test_ros1_type_that_ros2_has_extended_keeps_its_definition(tmp_path: Path) -
     assert (read.lifetime.nanosec, read.points[0].z, read.colors[0].b) == (4, 0.3, 0.75)
 
 
+def test_names_of_ros1_fields_are_allowed_in_ros2(tmp_path: Path) -> None:
+    """Strict readers refuse the whole file otherwise; drivers of Franka robots write O_T_EE."""
+    source, target = tmp_path / "a.bag", tmp_path / "out.mcap"
+    kind, store = "lab/msg/State", get_typestore(Stores.ROS1_NOETIC)
+    text = "float64[2] O_T_EE\nint8 isOn\nint8 a\nint8 A\nint8 b2C_\nint8 TYPE=5"
+    store.register(get_types_from_msg(text, kind))
+    state = store.types[kind](np.array([0.5, 0.25]), 1, 2, 4, 6)
+    with BagWriter(source) as writer:
+        connection = writer.add_connection("/state", kind, typestore=store)
+        writer.write(connection, EPOCH, store.serialize_ros1(state, kind))
+
+    annotate(source, target)
+
+    ((_, read),) = read_ros(target, "/state")
+    assert (list(read.o_t_ee), read.is_on, read.a, read.a_2, read.b2_c) == ([0.5, 0.25], 1, 2, 4, 6)
+
+
 def test_unconvertible_message_is_wrapped(tmp_path: Path) -> None:
     """Two encodings in one file would make it unreadable for ROS tools."""
     source, target = tmp_path / "a.bag", tmp_path / "out.mcap"

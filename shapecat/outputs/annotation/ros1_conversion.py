@@ -1,8 +1,10 @@
 """Convert ROS 1 messages to ROS 2 messages: same fields, other encoding."""
 
+import re
 from collections.abc import Callable
 from functools import cache
 from importlib.resources import files
+from itertools import chain, count
 from typing import Any
 
 import numpy as np
@@ -41,6 +43,8 @@ _LATCHED = Qos(
 )
 """The quality of service that corresponds to a latched ROS 1 topic."""
 _HEADER = "std_msgs/msg/Header"
+_FIELD = re.compile("[a-z](_?[a-z0-9])*")
+"""Names of fields that ROS 2 allows."""
 
 ConvertedChannel = tuple[AnnotationChannel, Callable[[bytes | memoryview], memoryview]]
 
@@ -49,8 +53,9 @@ def convert_channel(channel: Channel) -> ConvertedChannel | None:
     """Convert a ROS 1 channel to ROS 2.
 
     Types that exist in ROS 2 with the same layout get the ROS 2 definition, in which some field
-    names differ (``K`` became ``k``). All others keep the definition in the bag. Only the sequence
-    number of headers is lost, since ROS 2 has none.
+    names differ (``K`` became ``k``). All others keep the definition in the bag, with names that
+    ROS 2 allows (``O_T_EE`` becomes ``o_t_ee``). Only the sequence number of headers is lost, since
+    ROS 2 has none.
 
     Returns
     -------
@@ -65,6 +70,7 @@ def convert_channel(channel: Channel) -> ConvertedChannel | None:
         modern = get_typestore(Stores.ROS2_HUMBLE)
         store = get_typestore(Stores.EMPTY)
         types[_HEADER] = modern.fielddefs[_HEADER]
+        types = {kind: _renamed(*definition) for kind, definition in types.items()}
         known = name in modern.fielddefs and _same_layout(name, types, modern.fielddefs)
         store.register({**types, **(_reachable(name, modern) if known else {})})
         text, _ = store.generate_msgdef(name, ros_version=2)
@@ -75,6 +81,22 @@ def convert_channel(channel: Channel) -> ConvertedChannel | None:
     quality = (("offered_qos_profiles", dump_qos_v8([_LATCHED])),) if latched else ()
     described = AnnotationChannel(channel.topic, "cdr", name, "ros2msg", text.encode(), quality)
     return described, lambda data: store.ros1_to_cdr(data, name)
+
+
+def _renamed(constants: Any, fields: Any) -> Any:
+    """Rename the fields of a definition whose names ROS 2 does not allow.
+
+    Strict readers would refuse the whole file.
+    """
+    names: list[str] = []
+    for name, _ in fields:
+        words = [name]
+        if not _FIELD.fullmatch(name):
+            words = re.sub("(?<=[a-z0-9])(?=[A-Z])", "_", name).lower().split("_")
+        plain = "_".join(filter(None, words))
+        numbered = (f"{plain}_{k}" for k in count(2))
+        names.append(next(n for n in chain([plain], numbered) if n not in names))
+    return constants, [(name, kind) for name, (_, kind) in zip(names, fields, strict=True)]
 
 
 def _same_layout(name: str, old: Any, new: Any) -> bool:
