@@ -102,6 +102,24 @@ def test_static_transform_is_valid_at_all_times() -> None:
     assert buffer.lookup("/base", "/camera", 0).translation[0] == 2.0
 
 
+@pytest.mark.parametrize("first", ["static", "moving"])
+def test_static_transform_does_not_hide_a_moving_one(first: str) -> None:
+    """Localization replaces the placeholder of a launch file, as in tf2."""
+    buffer = TransformBuffer()
+    for kind in (first, "static", "moving"):
+        if kind == "static":
+            buffer.add("map", "odom", 0, moved(9.0), static=True)
+        else:
+            for k in (1, 2):
+                buffer.add("world", "odom", k * SECOND, moved(float(k)), static=False)
+    buffer.add("odom", "camera", 0, IDENTITY, static=True)
+
+    assert buffer.root_of("camera") == "world"
+    assert buffer.lookup("world", "camera", SECOND * 3 // 2).translation[0] == 1.5
+    assert buffer.lookup("map", "camera", 0).translation[0] == 9.0
+    assert buffer.lookup("map", "camera", 9 * SECOND).translation[0] == 9.0
+
+
 def test_extrapolation_beyond_tolerance_is_an_error() -> None:
     buffer = TransformBuffer(tolerance_ns=10)
     buffer.add("map", "base", 100, moved(1.0), static=False)

@@ -63,7 +63,7 @@ class TransformLoopError(TransformError):
 
 
 class TransformBuffer:
-    """Transforms between frames; static ones are valid for all times.
+    """Transforms between frames; static ones are valid at all times without another one.
 
     Parameters
     ----------
@@ -74,13 +74,12 @@ class TransformBuffer:
     def __init__(self, *, tolerance_ns: int = 100_000_000) -> None:
         """Make an empty buffer."""
         self.tolerance_ns = tolerance_ns
-        self._static: dict[str, TransformSample] = {}
-        self._moving: dict[str, TransformTrack] = {}
+        self._tracks: dict[str, TransformTrack] = {}
         self._frames: set[str] = set()
 
     def forget(self, stamp_ns: int) -> None:
         """Remove the transforms before a time, except the last one of each frame before it."""
-        for track in self._moving.values():
+        for track in self._tracks.values():
             track.forget(stamp_ns)
 
     @property
@@ -103,7 +102,7 @@ class TransformBuffer:
         Parameters
         ----------
         parent_from_child : translation (x, y, z) in metres and quaternion (x, y, z, w).
-        static : whether it is valid for all times; then ``stamp_ns`` is ignored.
+        static : whether it is valid at all times without another one; ``stamp_ns`` is then ignored.
         held : whether it is valid until the next one, however late that is.
 
         Returns
@@ -123,10 +122,10 @@ class TransformBuffer:
             parent, tuple(translation.tolist()), tuple((quaternion / norm).tolist())
         )
         self._frames |= {parent, child}
+        track = self._tracks.setdefault(child, TransformTrack())
         if static:
-            self._static[child] = sample
+            track.still = sample
         else:
-            track = self._moving.setdefault(child, TransformTrack())
             track.held |= held
             track.add(stamp_ns, sample)
         return True
@@ -188,12 +187,14 @@ class TransformBuffer:
         return chain
 
     def _parent(self, frame_id: str, stamp_ns: int | None) -> str | None:
-        if frame_id in self._static:
-            return self._static[frame_id].parent
-        track = self._moving.get(frame_id)
+        track = self._tracks.get(frame_id)
         if track is None:
             return None
-        at = len(track.stamps) if stamp_ns is None else bisect_right(track.stamps, stamp_ns)
+        stamps = track.stamps
+        known = stamps if stamp_ns is None else max(track.gaps_ns(stamp_ns)) <= self.tolerance_ns
+        if track.still is not None and not known:
+            return track.still.parent
+        at = len(stamps) if stamp_ns is None else bisect_right(stamps, stamp_ns)
         return track[max(0, at - 1)].parent
 
     def _chain(self, frames: list[str], stamp_ns: int) -> Pose:
@@ -204,13 +205,12 @@ class TransformBuffer:
         return pose
 
     def _to_parent(self, frame_id: str, stamp_ns: int) -> Pose:
-        if frame_id in self._static:
-            return pose_of(self._static[frame_id])
-        track = self._moving[frame_id]
+        track = self._tracks[frame_id]
         stamps = track.stamps
-        late = 0 if track.held else stamp_ns - stamps[-1]
-        early = stamps[0] - stamp_ns
+        late, early = track.gaps_ns(stamp_ns)
         if max(late, early) > self.tolerance_ns:
+            if track.still is not None:
+                return pose_of(track.still)
             side = (
                 f"{late * 1e-9:.3f} s after the last"
                 if late > 0

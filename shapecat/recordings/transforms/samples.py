@@ -13,6 +13,9 @@ from shapecat.types import Pose
 __all__ = ["TransformSample", "TransformTrack", "interpolated", "pose_of"]
 
 
+_NEVER_NS = 2**63
+
+
 class TransformSample(NamedTuple):
     """A transform to the parent frame: metres, and a unit quaternion x, y, z, w."""
 
@@ -27,11 +30,13 @@ class TransformTrack:
     Attributes
     ----------
     held : whether the last one remains valid.
+    still : the static transform, which is valid where no other one is; None without any.
     """
 
     def __init__(self) -> None:
         """Start without samples."""
         self.held = False
+        self.still: TransformSample | None = None
         self.stamps = array("q")
         self._parents: list[str] = []
         self._numbers = array("d")  # seven per sample
@@ -40,6 +45,12 @@ class TransformTrack:
         """Return sample `k`, counted from 0."""
         x, y, z, *quaternion = self._numbers[7 * k : 7 * k + 7]
         return TransformSample(self._parents[k], (x, y, z), tuple(quaternion))
+
+    def gaps_ns(self, stamp: int) -> tuple[int, int]:
+        """Return how long a time is after the last sample and before the first; negative within."""
+        if not self.stamps:
+            return _NEVER_NS, _NEVER_NS
+        return 0 if self.held else stamp - self.stamps[-1], self.stamps[0] - stamp
 
     def add(self, stamp: int, sample: TransformSample) -> None:
         """Insert a sample by time; of three equal samples in a row, drop the middle one."""
