@@ -225,6 +225,24 @@ def test_transforms_of_optical_data_in_another_frame_are_corrected(
     assert "optical frame" in warning
 
 
+@pytest.mark.parametrize(("pitch_deg", "corrected"), [(2, True), (12, False)])
+def test_map_with_z_forward_does_not_correct_transforms(
+    monkeypatch: pytest.MonkeyPatch, pitch_deg: float, *, corrected: bool
+) -> None:
+    """Visual SLAM names the first pose of its camera the map: tracks drifted as it moved."""
+    pitch = np.radians(pitch_deg)
+    upright = Upright(TransformWindow(TransformBuffer()), None, None, ("tf", "imu"))
+    planes = np.array([0.0, -np.cos(pitch), -np.sin(pitch)])
+    monkeypatch.setattr(perceiving, "find_up", lambda *_: planes)
+    given = Orientation("transforms, z of map", np.array([0.0, 0.0, 1.0]), None)
+    oriented = ((frame(EPOCH + k), None, given) for k in range(4))
+
+    list(perceiving._UpTrial(upright, Settings()).before(oriented))
+
+    assert bool(upright.misnamed) is corrected
+    assert bool(upright.dropped) is not corrected
+
+
 @pytest.mark.parametrize(
     ("turn", "how"),
     [(LINK_FROM_OPTICAL.rotation, "x forward"), (np.diag([1.0, -1.0, -1.0]), "OpenGL")],

@@ -44,6 +44,9 @@ _MANY = 100
 """With at least this many frames, other processes are started before anything is read."""
 _CONFIRMS_DEG = 15.0
 """A plane confirms an up direction within this angle, as in `detect`."""
+_MISNAMED_DEG = 5.0
+"""A plane confirms other axes within this angle: the transforms of simulators are exact, but those
+of visual SLAM, whose map has z forward, fit other axes up to the pitch of its camera."""
 _DOUBTS, _LOOKS = 3, 10
 """Frames with a plane that must contradict the up direction, and frames that are checked."""
 _MOST_HELD = 64
@@ -255,7 +258,7 @@ class _UpTrial:
         if not enough or min(off) <= _CONFIRMS_DEG:
             return
         source = self._sources[topic]
-        fits = [n for n in MISNAMED if max(self._misnamed_off_deg[topic, n]) <= _CONFIRMS_DEG]
+        fits = [n for n in MISNAMED if max(self._misnamed_off_deg[topic, n]) <= _MISNAMED_DEG]
         if source.startswith("transforms") and fits:
             self._upright.assume_misnamed(topic, fits[0])
         else:
