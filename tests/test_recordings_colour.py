@@ -321,6 +321,17 @@ def test_pairing_waits_for_image_logged_late(tmp_path: Path) -> None:
     assert [v and v.image.stamp_ns for _, v in pairs] == stamps
 
 
+def test_image_is_kept_for_depth_logged_late(tmp_path: Path) -> None:
+    """Stereo matching takes time, while a colour camera of 60 Hz goes on: no frame had colour."""
+    stamps = [EPOCH + 100 * k * MS for k in range(3)]
+    items = [(t, time + 600 * MS, message) for t, time, message in depth_items(*stamps)]
+    times = [EPOCH + round(k * 1000 / 60 * MS) for k in range(50)]
+    items += [("/cam/color/image_raw", t, raw(t, gradient(), "rgb8")) for t in times]
+    pairs, _ = read(write(tmp_path / "a.mcap", in_order(items)))
+
+    assert [v and v.image.stamp_ns for _, v in pairs] == [times[k] for k in (0, 6, 12)]
+
+
 @pytest.mark.parametrize("bare", [0, 2])
 def test_missing_stamps_are_estimated_in_simulated_time(tmp_path: Path, bare: int) -> None:
     """The log time, decades later, would double all tracks; a simulation may begin at 0."""

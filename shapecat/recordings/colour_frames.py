@@ -29,8 +29,9 @@ __all__ = ["KnownImages", "frames_with_colour"]
 
 _HELD_FRAMES = 8
 """At most this many frames wait for a later colour image."""
-_KEPT_IMAGES, _KEPT_BYTES = 16, 96 << 20
-"""Limits on the colour images kept for later frames; two are always kept."""
+_KEPT_IMAGES, _KEPT_BYTES = 64, 96 << 20
+"""Limits on the colour images kept for later frames, which may be logged up to a second after an
+image of 60 Hz; two are always kept."""
 _STAMP_BYTES = 12
 """The first bytes of a ROS message hold its stamp, which a comparison of calibrations ignores."""
 _PATIENCE_NS = 500_000_000
