@@ -43,6 +43,7 @@ from shapecat.runs.labels.corrections import adopt_labels, read_labels
 from shapecat.runs.labels.replaced import forget_old_labels, keep_labels
 from shapecat.runs.labels.transfer import Transfer, transfer_labels
 from shapecat.runs.perceive.clocks import explain_clocks
+from shapecat.runs.perceive.misplacement import explain_misplacement
 from shapecat.runs.perceive.missing_planes import explain_missing_planes
 from shapecat.runs.perceive.phases import Work, perceive_all, revise
 from shapecat.runs.perceive.pose_jumps import explain_jumps
@@ -143,6 +144,7 @@ def _revise_and_warn(work: Work) -> None:
     work.run["warnings"] += [
         *explain_missing_planes(work.recording, work.folder, work.run, range_m),
         *explain_jumps(work.folder, work.run["fixed_frame"]),
+        *explain_misplacement(work.folder, work.run["fixed_frame"]),
         *explain_clocks(work.folder, work.run["fixed_frame"]),
     ]
 

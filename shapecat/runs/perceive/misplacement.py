@@ -1,0 +1,81 @@
+"""Warn if the poses of a sensor are worse than none, as with a wrong mount in the transforms."""
+
+from collections.abc import Iterator
+from pathlib import Path
+from typing import NamedTuple
+
+import numpy as np
+
+from shapecat.arrays import F8
+from shapecat.runs.tables.reading import frame_rows, keys_of, numbers, numbers_or_nan, read_together
+
+__all__ = ["explain_misplacement"]
+
+_APART_S, _GAP_S = 0.3, 2.0
+"""Time between the frames that are compared: a slow camera must have moved, but sees the same."""
+_MOVED_M = 0.03
+"""The camera has moved if objects have moved farther than this relative to it."""
+_WORSE = 1.5
+"""Poses are worse than none if objects move this many times as far as relative to the camera."""
+_FEWEST, _MOST = 5, 0.7
+
+
+class _Seen(NamedTuple):
+    """The centres (n, 3) of a frame's objects, relative to the sensor and in the fixed frame."""
+
+    stamp_ns: int
+    own: F8
+    fixed: F8
+
+
+def explain_misplacement(folder: Path, fixed_frame: str | None) -> Iterator[str]:
+    """Yield a warning for each topic whose objects rest less in the fixed frame than without it.
+
+    Parameters
+    ----------
+    folder : with the tables of frames and detections.
+    """
+    if fixed_frame is None:
+        return
+    for topic, worse in _compare(folder).items():
+        if len(worse) >= _FEWEST and np.mean(worse) > _MOST:
+            yield (
+                f"{topic}: as the camera moves, its objects move farther in {fixed_frame} than "
+                "relative to it, and may get no tracks: the transforms of its frame are wrong; to "
+                "ignore them, give the frame of its messages to --fixed-frame"
+            )
+
+
+def _compare(folder: Path) -> dict[str, list[bool]]:
+    """Return, for each topic and each motion of its camera, whether poses are worse than none."""
+    before: dict[str, _Seen] = {}
+    worse: dict[str, list[bool]] = {}
+    columns = ["topic", "frame"]
+    wanted = {
+        "frames": [*columns, "stamp_ns"],
+        "detections": [*columns, "center", "center_fixed"],
+    }
+    for frames, detections in read_together(folder, wanted):
+        rows = frame_rows(detections)
+        own, fixed = (numbers_or_nan(detections[name]) for name in wanted["detections"][2:])
+        for key, stamp in zip(keys_of(frames), numbers(frames["stamp_ns"]).tolist(), strict=True):
+            of = rows.get(key, slice(0, 0))
+            now = _Seen(stamp, own[of], fixed[of])
+            if not len(now.fixed) or np.isnan(now.fixed).any():
+                continue
+            last = before.setdefault(key[0], now)
+            seconds = abs(stamp - last.stamp_ns) * 1e-9
+            if seconds < _APART_S:
+                continue
+            before[key[0]] = now
+            moved = _moved_m(last.own, now.own)
+            if seconds < _GAP_S and moved > _MOVED_M:
+                further = _moved_m(last.fixed, now.fixed) > _WORSE * moved
+                worse.setdefault(key[0], []).append(further)
+    return worse
+
+
+def _moved_m(before: F8, now: F8) -> float:
+    """Return the median distance of objects (n, 3) from the nearest ones (m, 3) before, metres."""
+    distances = np.linalg.norm(now[:, None] - before, axis=2)
+    return float(np.median(distances.min(axis=1)))

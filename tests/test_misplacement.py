@@ -1,0 +1,62 @@
+"""Tests of the warning about poses of the sensor that are worse than none."""
+
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pyarrow as pa
+import pyarrow.parquet as pq
+import pytest
+
+from shapecat.arrays import F8
+from shapecat.runs.perceive.misplacement import explain_misplacement
+from shapecat.runs.tables.schemas import DETECTIONS, FRAMES
+from tests.messages import EPOCH, SECOND
+
+OBJECTS = np.array([[1.9, 0.3, 0.1], [2.1, -0.4, 0.2], [2.4, 0.1, 0.15]])
+TURN = np.array([[0.0, 0.8, 0.6], [-1.0, 0.0, 0.0], [0.0, -0.6, 0.8]])
+"""Rotation of a camera that looks along x and down, in the map."""
+
+
+def write_run(folder: Path, speed_m_s: float, axes: F8, carried_m_s: float = 0) -> None:
+    """Write the frames of a camera that drives along x, whose frame has other ``axes`` (3, 3)."""
+    rows: dict[str, list[Any]] = {"center": [], "center_fixed": [], "frame": []}
+    frames = range(40)
+    for k in frames:
+        place = np.array([0.1 * k * speed_m_s, -0.2, 1.3])
+        own = (OBJECTS + np.array([0.1 * k * carried_m_s, 0, 0]) - place) @ TURN
+        rows["center"] += own.tolist()
+        rows["center_fixed"] += (own @ axes @ TURN.T + place).tolist()
+        rows["frame"] += [k] * len(own)
+    rows["topic"] = ["/depth"] * len(rows["frame"])
+    stamps = [EPOCH + k * SECOND // 10 for k in frames]
+    seen: dict[str, list[Any]] = {"topic": ["/depth"] * len(frames), "stamp_ns": stamps}
+    seen["frame"] = list(frames)
+    for name, schema, columns in (("frames", FRAMES, seen), ("detections", DETECTIONS, rows)):
+        nulls = [None] * len(columns["frame"])
+        filled = {field.name: columns.get(field.name, nulls) for field in schema}
+        pq.write_table(pa.table(filled, schema), folder / f"{name}.parquet")
+
+
+OPENGL = np.diag([1.0, -1.0, -1.0])
+
+
+@pytest.mark.parametrize(
+    ("speed_m_s", "axes", "carried_m_s", "warns"),
+    [
+        (0.2, OPENGL, 0, True),
+        (0.2, np.eye(3), 0, False),
+        (0, OPENGL, 0, False),  # nothing shows that they are wrong
+        (0, np.eye(3), 0.2, False),
+        (0.2, np.eye(3), 0.2, False),  # on a tray of the robot
+    ],
+)
+def test_poses_that_are_worse_than_none_are_reported(
+    tmp_path: Path, speed_m_s: float, axes: F8, carried_m_s: float, *, warns: bool
+) -> None:
+    """In a map with y up, the axes of a frame are not known to be wrong: tracks drift, or end."""
+    write_run(tmp_path, speed_m_s, axes, carried_m_s)
+
+    warnings = list(explain_misplacement(tmp_path, "map"))
+    assert [w.split(":")[0] for w in warnings] == ["/depth"] * warns
+    assert list(explain_misplacement(tmp_path, None)) == []
