@@ -323,6 +323,16 @@ def test_transforms_of_other_robots_are_left_out(
         assert len(recording.warnings) == (warned != "")
 
 
+def test_mixed_up_poses_of_two_robots_are_reported(tmp_path: Path) -> None:
+    """Objects of both robots were placed by the poses of one; the warning did not say so."""
+    items = [(f"/r{k}/tf", EPOCH + k, stamped("odom", "base", k, EPOCH)) for k in (1, 2)]
+    with open_recording(write(tmp_path / "a.mcap", items)) as recording:
+        read_transforms(recording, near=["/r1/camera/image", "/r2/camera/image"])
+        (warning,) = recording.warnings
+
+    assert "of one robot are used for the other: process one at a time" in warning
+
+
 def test_transforms_without_stamps_use_log_times(tmp_path: Path) -> None:
     """Images and accelerations without stamps do as well, and would find no transform."""
     items = [("/tf", EPOCH + k * SECOND, stamped("odom", "base", float(k), 0)) for k in range(3)]

@@ -62,7 +62,10 @@ def _of_other_robots(
             left.add(topic)
             continue
         if others:
-            recording.warn(f"transforms on {others[0]} and {topic} have frames of the same name")
+            recording.warn(
+                f"transforms on {others[0]} and {topic} have frames of the same name, and those of "
+                "one robot are used for the other: process one at a time, with --topic"
+            )
         known |= {frame: topic for frame in frames if frame not in known}
     return left
 
