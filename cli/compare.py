@@ -1,7 +1,9 @@
 """``shapecat compare``."""
 
+from collections import Counter
+from collections.abc import Sequence
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING
 
 import click
 
@@ -9,6 +11,9 @@ from shapecat.outputs.counts import plural
 
 from .options import ANY_PATH, json_option, recording_option
 from .render import print_json, print_table, progress_bars
+
+if TYPE_CHECKING:
+    from shapecat.evaluation.comparison import Comparison
 
 
 @click.command()
@@ -40,29 +45,28 @@ def compare(
     if out is not None:
         require_new(out)
     with progress_bars() as bars:
-        found = compare_run(run, truth, recording=recording, observe=bars)
+        comparison = compare_run(run, truth, recording=recording, observe=bars)
     if out is not None:
-        write_comparison(out, found)
+        write_comparison(out, comparison)
     if as_json:
-        print_json(found.as_dict())
+        print_json(comparison.as_dict())
         return
-    _print(found, figure_rows(found))
+    _print(comparison, figure_rows(comparison))
     if out is not None:
         click.echo(f"\n{out / 'comparison.html'}")
 
 
-def _print(found: Any, rows: Any) -> None:
+def _print(comparison: "Comparison", rows: Sequence[Sequence[str]]) -> None:
     """Print the metrics, then the number of differences of each kind."""
-    click.echo(f"{found.run} compared with {found.reference} ({found.kind})\n")
+    click.echo(f"{comparison.run} compared with {comparison.reference} ({comparison.kind})\n")
     print_table(("metric", "value", "meaning"), rows)
-    kinds = found.as_dict()["differences"]
-    click.echo(f"\n{_words(kinds)}")
-    for note in found.notes:
+    click.echo(f"\n{_describe_differences(comparison.as_dict()['differences'])}")
+    for note in comparison.notes:
         click.echo(note, err=True)
 
 
-def _words(kinds: dict[str, int]) -> str:
-    if not kinds:
+def _describe_differences(counts: dict[str, int]) -> str:
+    if not counts:
         return "no differences"
-    parts = [f"{count} {name}" for name, count in sorted(kinds.items(), key=lambda i: -i[1])]
-    return f"{plural(sum(kinds.values()), 'difference')}: {', '.join(parts)}"
+    parts = [f"{count} {kind}" for kind, count in Counter(counts).most_common()]
+    return f"{plural(sum(counts.values()), 'difference')}: {', '.join(parts)}"

@@ -5,7 +5,7 @@ from typing import Any
 
 import click
 
-from shapecat.errors import ShapecatError
+from shapecat.errors import ShapecatError, common_exit_code
 
 from .options import ANY_PATH, array_option
 from .render import print_json, print_table
@@ -26,7 +26,7 @@ def info(ctx: click.Context, /, *, recordings: tuple[Path, ...], as_json: bool) 
     """
     from shapecat.batch.finding import find_recordings
 
-    paths = [Path(source.path) for source in find_recordings(list(map(str, recordings))).kept]
+    paths = [Path(source.path) for source in find_recordings(list(map(str, recordings))).sources]
     overviews, codes = [], []
     for path in paths:
         overview, code = _describe(path)
@@ -37,7 +37,7 @@ def info(ctx: click.Context, /, *, recordings: tuple[Path, ...], as_json: bool) 
                 _show(overview)
     if as_json:
         print_json(overviews)
-    ctx.exit(codes[0] if len(set(codes)) == 1 else 1)
+    ctx.exit(common_exit_code(codes))
 
 
 def _describe(path: Path) -> tuple[dict[str, Any] | None, int]:

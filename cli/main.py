@@ -20,6 +20,7 @@ from .info import info
 from .learn import learn
 from .options import verbose_option
 from .process import process
+from .render import discard_stdout
 from .report import report
 from .scene import scene
 from .simulate import simulate
@@ -38,9 +39,9 @@ class _Commands(click.Group):
             click.echo(f"Error: {error}", err=True)
             ctx.exit(error.exit_code)
         except Stopped as stopped:
-            kept = ctx.invoked_subcommand == "process"
-            how = "finished work is kept; run the same command again to continue" if kept else ""
-            click.echo("; ".join(filter(None, ("stopped", how))), err=True)
+            resumable = ctx.invoked_subcommand == "process"
+            hint = "; finished work is kept; run the same command again to continue"
+            click.echo(f"stopped{hint if resumable else ''}", err=True)
             ctx.exit(stopped.exit_code)
 
     def main(self, *args: Any, **extra: Any) -> Any:
@@ -50,7 +51,7 @@ class _Commands(click.Group):
             if error.errno != errno.ENOSPC or error.filename is not None:
                 raise
             click.echo(f"Error: cannot write the output: {error.strerror}", err=True)
-            os.dup2(os.open(os.devnull, os.O_WRONLY), 1)  # for what is still in the buffer
+            discard_stdout()
             sys.exit(1)
 
     def list_commands(self, ctx: click.Context) -> list[str]:  # noqa: ARG002  click's signature

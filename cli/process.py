@@ -4,7 +4,7 @@ import os
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager, suppress
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import click
 
@@ -24,6 +24,12 @@ from .options import (
 )
 from .progress import KINDS, Progress, describe_plan, open_progress
 from .render import for_any_reader, missed_words, print_json, print_table
+
+if TYPE_CHECKING:
+    from shapecat.batch.ledger import Outcome
+    from shapecat.batch.plans import Batch, Task
+    from shapecat.executors import WorkerExecutor
+    from shapecat.runs.jobs import Job, Summary
 
 _MOST_ROWS = 100
 
@@ -147,9 +153,9 @@ def process(
     shapecat process /data/recordings --out results --shard 2/16
     """
     # Load these heavy libraries only when there is work, so that --help stays fast.
-    from shapecat.batch import exit_code
     from shapecat.batch.plans import plan_batch
     from shapecat.config import load_settings
+    from shapecat.errors import common_exit_code
     from shapecat.runs.jobs import Job
     from shapecat.system.files import FSYNC
 
@@ -166,28 +172,29 @@ def process(
         recordings, out = tuple(map(_absolute, recordings)), _absolute(out)
         if choices["model"] is not None:
             choices["model"] = choices["model"].absolute()
-    chosen = [f"outputs.boxes={boxes}"] if boxes else []
+    if boxes is not None:
+        overrides = (*overrides, f"outputs.boxes={boxes}")
     job = Job(
         source=Path(),
         folder=Path(),
-        settings=load_settings(config, (*overrides, *chosen)),
+        settings=load_settings(config, overrides),
         color="" if no_color else color,
         mcap=not no_mcap,
         rrd=not no_rrd,
         **choices,
     )
     with plan_batch(job, recordings, out, shard=shard) as batch:
-        watcher = open_progress(progress, batch.tasks)
+        display = open_progress(progress, batch.tasks)
         tally = _Tally(keep_all=as_json)
-        for outcome in _run(batch, watcher, jobs, executor, scheduler):
-            watcher.ended(outcome)
+        for outcome in _process(batch, display, jobs, executor, scheduler):
+            display.ended(outcome)
             tally.add(outcome)
     with for_any_reader():
         if as_json:
-            print_json([_plain(outcome) for outcome in tally.kept])
+            print_json([_summary_as_dict(*each) for each in tally.kept])
         else:
             _print_closing(batch.tasks, tally)
-    ctx.exit(exit_code(list(tally.of_each_code.values())))
+    ctx.exit(common_exit_code(tally.codes))
 
 
 def _absolute(place: str) -> str:
@@ -204,32 +211,32 @@ def _require_range(start_s: float | None, end_s: float | None) -> None:
         raise click.UsageError(msg)
 
 
-def _run(
-    batch: Any, watcher: Progress, jobs: int | None, name: str, scheduler: str | None
-) -> Iterator[Any]:
-    """Process a batch in this process if one is enough, otherwise on an executor."""
-    from shapecat.batch import process_here, process_on
+def _process(
+    batch: "Batch", display: Progress, jobs: int | None, name: str, scheduler: str | None
+) -> Iterator["Outcome"]:
+    """Process a batch in this process if one is enough, otherwise on the executor ``name``."""
+    from shapecat.batch.runs import process_here, process_on
     from shapecat.executors import open_executor, share_cores
 
-    report = watcher.progress
-    workers, cores = share_cores(jobs, sum(task.status != "complete" for task in batch.tasks))
-    if len(batch.tasks) > 1:
-        watcher.plan(describe_plan(batch.tasks, batch.left_out, workers, cores))
-    if not batch.tasks:
-        watcher.plan("no recordings in this shard")
+    tasks, manifest = batch.tasks, batch.manifest
+    workers, cores = share_cores(jobs, sum(task.status != "complete" for task in tasks))
+    if len(tasks) > 1:
+        display.plan(describe_plan(tasks, batch.skipped, workers, cores))
+    if not tasks:
+        display.plan("no recordings in this shard")
     if name == "local" and scheduler is None and workers <= 1:
-        with watcher:
-            yield from process_here(batch.tasks, report, cores=cores, manifest=batch.manifest)
+        with display:
+            yield from process_here(tasks, display.progress, cores=cores, manifest=manifest)
         return
     started = open_executor(name, workers=workers, address=scheduler)
-    with _closing(started) as executor, watcher:
+    with _shutting_down(started) as executor, display:
         if executor.lacks_workers():
-            watcher.note("the scheduler has no worker yet: waiting for one")
-        yield from process_on(executor, batch.tasks, report, cores=cores, manifest=batch.manifest)
+            display.note("the scheduler has no worker yet: waiting for one")
+        yield from process_on(executor, tasks, display.progress, cores=cores, manifest=manifest)
 
 
 @contextmanager
-def _closing(executor: Any) -> Iterator[Any]:
+def _shutting_down(executor: "WorkerExecutor") -> Iterator["WorkerExecutor"]:
     """Shut the workers down after the work; after a signal, let them stop and save results."""
     try:
         yield executor
@@ -243,76 +250,80 @@ def _closing(executor: Any) -> Iterator[Any]:
 
 
 class _Tally:
-    """Counts of a batch's outcomes, and its first 100 outcomes, or all if ``keep_all``."""
+    """Counts of the outcomes of a batch, and the complete recordings to print.
+
+    These are the first 100, or all if ``keep_all``, and all those with labels of replaced results.
+    """
 
     def __init__(self, *, keep_all: bool) -> None:
         self.complete = self.failed = self.frames = 0
-        self.of_each_code: dict[int, Any] = {}
-        self.kept: list[Any] = []
-        self._most = None if keep_all else _MOST_ROWS
+        self.codes: set[int] = set()
+        self.kept: list[tuple[Job, Summary]] = []
+        self._keep_all = keep_all
 
-    def add(self, outcome: Any) -> None:
+    def add(self, outcome: "Outcome") -> None:
         """Count an outcome."""
-        self.of_each_code.setdefault(outcome.code, outcome)
-        if outcome.summary is None:
+        self.codes.add(outcome.code)
+        summary = outcome.summary
+        if summary is None:
             self.failed += 1
             return
         self.complete += 1
-        self.frames += outcome.summary.counts["frames"]
-        few = self._most is None or self.complete <= self._most
-        if few or outcome.summary.corrections is not None:
-            self.kept.append(outcome)
+        self.frames += summary.counts["frames"]
+        if self._keep_all or self.complete <= _MOST_ROWS or summary.corrections is not None:
+            self.kept.append((outcome.job, summary))
 
 
-def _print_closing(tasks: Sequence[Any], tally: _Tally) -> None:
+def _print_closing(tasks: Sequence["Task"], tally: _Tally) -> None:
     """Print the complete recordings in the order of the plan, if they are few, and totals."""
-    ended = {outcome.job.folder.name: outcome for outcome in tally.kept}
-    complete = [ended[task.name] for task in tasks if task.name in ended]
+    by_folder = {job.folder.name: (job, summary) for job, summary in tally.kept}
+    complete = [by_folder[task.name] for task in tasks if task.name in by_folder]
     if 0 < tally.complete <= _MOST_ROWS:
         columns = ("recording", "frames", "seconds", "tracks", "results")
-        print_table(columns, [_row(outcome) for outcome in complete])
-    for outcome in complete:
-        if outcome.summary.corrections is not None:
-            _print_corrections(outcome)
+        print_table(columns, [_row(*each) for each in complete])
+    for job, summary in complete:
+        _print_corrections(job, summary)
     if len(tasks) > 1:
         click.echo(f"{tally.complete} complete, {tally.failed} failed, {tally.frames:,} frames")
 
 
-def _plain(outcome: Any) -> dict[str, Any]:
+def _summary_as_dict(job: "Job", summary: "Summary") -> dict[str, Any]:
     """Return the summary of a complete recording as plain values.
 
-    The manifest, which tells what was complete before, has no warnings and not all counts.
+    That of a recording that was complete before may come from the manifest, which has neither
+    warnings nor all counts: it is read from its run folder.
     """
     from shapecat.errors import OutputError
     from shapecat.runs.folder import read_run
     from shapecat.runs.jobs import summarize
 
-    summary, job = outcome.summary, outcome.job
     if not summary.processed and not job.target:
         with suppress(OutputError):  # it was removed meanwhile
             summary = summarize(job, read_run(job.folder), processed=False)
-    plain: dict[str, Any] = summary.as_dict()
-    return plain
+    return summary.as_dict()
 
 
-def _print_corrections(outcome: Any) -> None:
-    """Report the transfer of corrected labels from the replaced results."""
-    found = outcome.summary.corrections
-    done, missed = len(found["transferred"]), found["not_transferred"]
-    name = outcome.job.name.rpartition("/")[2]
-    where = outcome.job.target or outcome.summary.folder
-    kept = f"; the others are in {where}/tracks.previous.csv" if missed else ""
-    text = f"{name}: transferred {done} of {done + len(missed)} corrected labels{kept}"
+def _print_corrections(job: "Job", summary: "Summary") -> None:
+    """Report the transfer of corrected labels from the replaced results, if there were any."""
+    if summary.corrections is None:
+        return
+    done, missed = (summary.corrections[name] for name in ("transferred", "not_transferred"))
+    where = job.target or summary.folder
+    rest = f"; the others are in {where}/tracks.previous.csv" if missed else ""
+    counts = f"{len(done)} of {len(done) + len(missed)}"
+    text = f"{_short_name(job)}: transferred {counts} corrected labels{rest}"
     click.echo("\n".join((text, *map(missed_words, missed))), err=True)
 
 
-def _row(outcome: Any) -> tuple[Any, ...]:
-    summary = outcome.summary
-    counts = summary.counts
+def _row(job: "Job", summary: "Summary") -> tuple[Any, ...]:
     return (
-        outcome.job.name.rpartition("/")[2],
-        counts["frames"],
+        _short_name(job),
+        summary.counts["frames"],
         round(summary.seconds, 1) if summary.processed else "already complete",
-        count_words(counts["tracks"]),
-        outcome.job.target or summary.folder,
+        count_words(summary.counts["tracks"]),
+        job.target or summary.folder,
     )
+
+
+def _short_name(job: "Job") -> str:
+    return job.name.rpartition("/")[2]

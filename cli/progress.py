@@ -7,19 +7,24 @@ from collections import Counter
 from collections.abc import Sequence
 from contextlib import ExitStack
 from threading import Lock
-from typing import Any, Self
+from typing import TYPE_CHECKING, Any, Self
 
 import click
 
 from shapecat.outputs.counts import plural
 
-from .render import COMPILING, PHASES, rich_progress
+from .render import PHASES, rich_progress
+
+if TYPE_CHECKING:
+    from shapecat.batch.ledger import Outcome
+    from shapecat.batch.plans import Status, Task
 
 _LINE_S = 5.0
 _EVENT_S = 0.5
-_WARNINGS = 3
+_MOST_WARNINGS = 3
 """At most this many warnings about a recording are printed."""
-WORDS = {
+_COMPILING = "compiling kernels, once per installation: about a minute"
+_STATUS_WORDS: "dict[Status, str]" = {
     "complete": "already complete",
     "resume": "to resume",
     "retry": "to retry",
@@ -35,36 +40,41 @@ _SHARES = {
 """Roughly where in the work on a recording each phase begins and ends."""
 
 
-def describe_plan(tasks: Sequence[Any], left_out: int, workers: int, cores: int) -> str:
+def describe_plan(tasks: Sequence["Task"], skipped: int, workers: int, cores: int) -> str:
     """Return a one-line summary of the plan.
 
     Parameters
     ----------
-    left_out : number of skipped files.
+    skipped : number of files that are not recordings.
     workers, cores : recordings processed at once, and frames of each processed at once.
     """
     counts = Counter(task.status for task in tasks)
-    parts = [f"{counts[status]} {words}" for status, words in WORDS.items() if counts[status]]
-    todo = sum(task.bytes for task in tasks if task.status != "complete")
-    size = f"; {todo / 1e6:,.1f} MB" if todo else ""
-    hands = f"; {plural(workers * cores, 'process')}" if todo else ""
-    aside = f"; skipped {plural(left_out, 'file')} of other formats" if left_out else ""
-    return f"{plural(len(tasks), 'recording')}: {', '.join(parts)}{size}{hands}{aside}"
+    words = _STATUS_WORDS.items()
+    parts = [", ".join(f"{counts[status]} {text}" for status, text in words if counts[status])]
+    if remaining := _remaining_bytes(tasks):
+        parts += [f"{remaining / 1e6:,.1f} MB", plural(workers * cores, "process")]
+    if skipped:
+        parts.append(f"skipped {plural(skipped, 'file')} of other formats")
+    return f"{plural(len(tasks), 'recording')}: {'; '.join(parts)}"
+
+
+def _remaining_bytes(tasks: Sequence["Task"]) -> int:
+    return sum(task.bytes for task in tasks if task.status != "complete")
 
 
 class Progress:
     """Counts finished recordings and prints notes and errors; subclasses show more."""
 
-    def __init__(self, tasks: Sequence[Any]) -> None:
+    def __init__(self, tasks: Sequence["Task"]) -> None:
         """Begin with the planned tasks."""
         self.lock = Lock()
         self.begun = time.monotonic()
         self.tasks = {task.name: task for task in tasks}
-        self.todo: int = sum(task.bytes for task in tasks if task.status != "complete")
-        self.read = 0
+        self.total_bytes = _remaining_bytes(tasks)
+        self.done_bytes = 0  # of recordings that have ended
         self.running: dict[str, tuple[str, int, int | None]] = {}
         self.complete = self.failed = 0
-        self._told = False
+        self._announced = False  # that kernels are compiled
         self._first: tuple[float, float] | None = None  # time and bytes of the first progress
 
     def __enter__(self) -> Self:
@@ -80,9 +90,9 @@ class Progress:
         """Receive the progress of the recording with this run folder; total is None if unknown."""
         with self.lock:
             if phase == "compile":
-                if not self._told:
-                    self._told = True
-                    self.note(COMPILING)
+                if not self._announced:
+                    self._announced = True
+                    self.note(_COMPILING)
                 return
             if folder in self.tasks:
                 self.running[folder] = (phase, done, total)
@@ -90,7 +100,7 @@ class Progress:
                     self._first = time.monotonic(), self._bytes_done()
                 self.show(folder)
 
-    def ended(self, outcome: Any) -> None:
+    def ended(self, outcome: "Outcome") -> None:
         """Receive the outcome of a recording."""
         with self.lock:
             name = outcome.job.folder.name
@@ -101,7 +111,7 @@ class Progress:
                 self.complete += 1
             task = self.tasks.get(name)
             if task is not None and (outcome.summary is None or outcome.summary.processed):
-                self.read += task.bytes
+                self.done_bytes += task.bytes
             self.show_ended(outcome)
 
     def remaining_s(self) -> float | None:
@@ -111,11 +121,13 @@ class Progress:
         """
         begun, before = self._first or (self.begun, 0.0)
         now, done = time.monotonic(), self._bytes_done()
-        return (now - begun) * (self.todo - done) / (done - before) if done > before else None
+        return (
+            (now - begun) * (self.total_bytes - done) / (done - before) if done > before else None
+        )
 
     def _bytes_done(self) -> float:
         running = (self.tasks[name].bytes * _share(*state) for name, state in self.running.items())
-        return float(self.read + sum(running))
+        return float(self.done_bytes + sum(running))
 
     def note(self, text: str) -> None:
         """Show a line."""
@@ -124,15 +136,15 @@ class Progress:
     def show(self, folder: str) -> None:
         """Show the progress of a recording."""
 
-    def show_ended(self, outcome: Any) -> None:
+    def show_ended(self, outcome: "Outcome") -> None:
         """Show the error of a recording, or the warnings about its new results."""
         if outcome.message:
             self.note(f"Error: {outcome.message}")
         if outcome.summary is not None and outcome.summary.processed:
             name, warnings = outcome.job.folder.name, outcome.summary.warnings
-            for text in warnings[:_WARNINGS]:
+            for text in warnings[:_MOST_WARNINGS]:
                 self.note(f"Warning: {name}: {text}")
-            if rest := warnings[_WARNINGS:]:
+            if rest := warnings[_MOST_WARNINGS:]:
                 self.note(f"Warning: {name}: {plural(len(rest), 'more warning')} in run.json")
 
 
@@ -182,12 +194,12 @@ def _duration(seconds: float) -> str:
 class JsonProgress(Progress):
     """Prints one JSON object per line, for programs."""
 
-    def __init__(self, tasks: Sequence[Any]) -> None:
+    def __init__(self, tasks: Sequence["Task"]) -> None:
         """Begin with the planned tasks and write the plan."""
         super().__init__(tasks)
         self._last: dict[str, tuple[str, float]] = {}
         statuses = Counter(task.status for task in tasks)
-        _event("plan", recordings=len(tasks), bytes=self.todo, status=dict(statuses))
+        _event("plan", recordings=len(tasks), bytes=self.total_bytes, status=dict(statuses))
 
     def note(self, text: str) -> None:
         """Write a line of text as an event."""
@@ -202,19 +214,19 @@ class JsonProgress(Progress):
             recording = self.tasks[folder].recording
             _event("progress", recording=recording, phase=phase, done=done, total=total)
 
-    def show_ended(self, outcome: Any) -> None:
+    def show_ended(self, outcome: "Outcome") -> None:
         """Write the outcome of a recording."""
-        known = outcome.summary
+        summary = outcome.summary
         _event(
             "ended",
             recording=outcome.job.name,
             folder=str(outcome.job.folder),
-            state="failed" if known is None else "complete",
-            seconds=None if known is None else round(known.seconds, 3),
-            processed=None if known is None else known.processed,
+            state="failed" if summary is None else "complete",
+            seconds=None if summary is None else round(summary.seconds, 3),
+            processed=None if summary is None else summary.processed,
             exit_code=outcome.code,
             message=outcome.message or None,
-            warnings=None if known is None else list(known.warnings) or None,
+            warnings=None if summary is None else list(summary.warnings) or None,
             complete=self.complete,
             failed=self.failed,
             of=len(self.tasks),
@@ -222,20 +234,21 @@ class JsonProgress(Progress):
 
 
 def _event(event: str, **values: Any) -> None:
-    known = {name: value for name, value in values.items() if value is not None}
-    click.echo(json.dumps({"event": event, **known}), err=True)
+    """Write an event with those of its values that are not None."""
+    present = {name: value for name, value in values.items() if value is not None}
+    click.echo(json.dumps({"event": event, **present}), err=True)
 
 
 class LiveProgress(Progress):
     """Bars on a terminal: one for the batch, one for each running recording."""
 
-    def __init__(self, tasks: Sequence[Any]) -> None:
+    def __init__(self, tasks: Sequence["Task"]) -> None:
         """Prepare the bars."""
         super().__init__(tasks)
         self._bars: dict[str, Any] = {}
         self._rich = rich_progress()
         self._stack = ExitStack()
-        self._whole = (
+        self._batch_bar = (
             self._rich.add_task("recordings", total=len(tasks)) if len(tasks) > 1 else None
         )
 
@@ -259,19 +272,19 @@ class LiveProgress(Progress):
         """Move the bar of a recording, which starts again in each phase."""
         phase, done, total = self.running[folder]
         words = PHASES.get(phase, phase)
-        text = words if self._whole is None else f"{folder}: {words}"
+        text = words if self._batch_bar is None else f"{folder}: {words}"
         bar = self._bars.get(folder)
         if bar is None:
             bar = self._bars[folder] = self._rich.add_task(text, total=total)
         self._rich.update(bar, description=text, completed=done, total=total)
 
-    def show_ended(self, outcome: Any) -> None:
+    def show_ended(self, outcome: "Outcome") -> None:
         """Remove the bar of a recording; print its error if it failed."""
         bar = self._bars.pop(outcome.job.folder.name, None)
         if bar is not None:
             self._rich.remove_task(bar)
-        if self._whole is not None:
-            self._rich.update(self._whole, completed=self.complete + self.failed)
+        if self._batch_bar is not None:
+            self._rich.update(self._batch_bar, completed=self.complete + self.failed)
         super().show_ended(outcome)
 
 
@@ -283,7 +296,7 @@ KINDS: dict[str, type[Progress]] = {
 }
 
 
-def open_progress(kind: str, tasks: Sequence[Any]) -> Progress:
+def open_progress(kind: str, tasks: Sequence["Task"]) -> Progress:
     """Return a progress display; ``auto`` is bars on a terminal and plain lines elsewhere."""
     if kind == "auto":
         kind = "rich" if sys.stderr.isatty() else "plain"

@@ -24,7 +24,6 @@ PHASES = {
     "evaluate": "evaluating",
     "compare": "comparing",
 }
-COMPILING = "compiling kernels, once per installation: about a minute"
 
 
 class Bars:
@@ -33,16 +32,10 @@ class Bars:
     def __init__(self, progress: Any) -> None:
         self._progress = progress
         self._tasks: dict[str, Any] = {}
-        self._told = False
 
     def __call__(self, phase: str, done: int, total: int | None) -> None:
         """Show the progress of a phase; raise `Stopped` after a signal."""
         stopping.check()
-        if phase == "compile":
-            if not self._told:
-                self._told = True
-                click.echo(COMPILING, err=True)
-            return
         if phase not in self._tasks:
             name = PHASES.get(phase, phase)
             self._tasks[phase] = self._progress.add_task(name, total=total)
@@ -102,7 +95,12 @@ def for_any_reader() -> Iterator[None]:
         yield
         sys.stdout.flush()
     except BrokenPipeError:
-        os.dup2(os.open(os.devnull, os.O_WRONLY), 1)  # for what is still in the buffer
+        discard_stdout()
+
+
+def discard_stdout() -> None:
+    """Discard what is still in the buffer of stdout, which cannot be written."""
+    os.dup2(os.open(os.devnull, os.O_WRONLY), 1)
 
 
 def note_skipped(learned: Mapping[str, Any]) -> None:

@@ -1,12 +1,16 @@
 """``shapecat simulate``."""
 
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING
 
 import click
 
 from .options import ANY_PATH, choice_option, seed_option
 from .render import progress_bars
+
+if TYPE_CHECKING:
+    from shapecat.simulation.containers import FormatName
+    from shapecat.simulation.scenes.kinds import SceneKind
 
 _SCENES = ("tabletop", "shelf", "clutter", "pile", "bin", "shelf_bin", "room", "turntable",
            "walking", "crossing", "rearranged")  # fmt: skip
@@ -22,6 +26,7 @@ _SENSORS = (
     "l515",
     "phone",
 )
+_SUFFIXES: "dict[FormatName, str]" = {"mcap": ".mcap", "ros1": ".bag", "ros2": ""}
 """Repeated here so that ``--help`` does not load the simulator."""
 
 
@@ -52,9 +57,9 @@ _SENSORS = (
 def simulate(
     *,
     out: Path,
-    scene: Any,
-    container: Any,
-    sensor: Any,
+    scene: "SceneKind",
+    container: "FormatName | None",
+    sensor: str,
     frames: int,
     clouds: bool,
     color: bool,
@@ -107,10 +112,7 @@ def simulate(
     click.echo(path)
 
 
-_SUFFIXES = {"mcap": ".mcap", "ros1": ".bag", "ros2": ""}
-
-
-def _format_of(out: Path, wanted: str | None) -> Any:
+def _format_of(out: Path, wanted: "FormatName | None") -> "FormatName":
     """Return the format that the suffix or the option names; reject a contradiction."""
     if out.name in {"", ".."}:
         msg = f"{out} is a folder: name a recording in it, such as demo.mcap"
@@ -120,7 +122,7 @@ def _format_of(out: Path, wanted: str | None) -> Any:
         stem = out.with_suffix("").name
         msg = f"{out.name}: name it {stem}.mcap, {stem}.bag, or {stem} for a ROS 2 folder"
         raise click.UsageError(msg)
-    if wanted in {None, named} or not out.suffix:
+    if wanted is None or wanted == named or not out.suffix:
         return wanted or named
     right = out.with_suffix(_SUFFIXES[wanted]).name
     kind = "a folder" if wanted == "ros2" else "a file"

@@ -279,7 +279,7 @@ def _path(given: str | Path) -> Path:
 def _one_recording(path: Path) -> Path:
     """Return a path; refuse a folder of recordings, whose files would be read as parts of one."""
     if path.is_dir():
-        found = [source.path for source in find_recordings([str(path)]).kept]
+        found = [source.path for source in find_recordings([str(path)]).sources]
         if len(found) > 1:
             names = ", ".join(str(Path(name).relative_to(path)) for name in found[:3])
             more = ", ..." if len(found) > 3 else ""

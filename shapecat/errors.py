@@ -1,6 +1,6 @@
 """Errors shown to the user. Each message names the problem, the place, and what to try."""
 
-from collections.abc import Iterator
+from collections.abc import Collection, Iterator
 from contextlib import contextmanager
 
 __all__ = [
@@ -10,6 +10,7 @@ __all__ = [
     "OutputError",
     "RecordingError",
     "ShapecatError",
+    "common_exit_code",
     "explained",
 ]
 
@@ -56,3 +57,9 @@ def explained(what: str, kind: type[ShapecatError]) -> Iterator[None]:
     except OSError as error:
         msg = f"{what}: {error.strerror or error}"
         raise kind(msg) from error
+
+
+def common_exit_code(codes: Collection[int]) -> int:
+    """Return the exit code that all recordings share, 0 for none, and 1 if they differ."""
+    different = set(codes) or {0}
+    return different.pop() if len(different) == 1 else 1

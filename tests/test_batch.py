@@ -19,11 +19,13 @@ import pyarrow.parquet as pq
 import pytest
 from click.testing import Result
 
-from shapecat.batch import Batch, Outcome, exit_code, plan_batch, process_here, process_on
 from shapecat.batch.finding import find_recordings
+from shapecat.batch.ledger import Outcome
 from shapecat.batch.manifest import Manifest
+from shapecat.batch.plans import Batch, plan_batch
+from shapecat.batch.runs import process_here, process_on
 from shapecat.config import Settings
-from shapecat.errors import RecordingError
+from shapecat.errors import RecordingError, common_exit_code
 from shapecat.executors import LocalExecutor, WorkerLostError, open_executor
 from shapecat.learning import load_model, save_model
 from shapecat.runs.jobs import Job
@@ -230,7 +232,7 @@ def test_takes_are_not_mixed_in_one_run(tmp_path: Path, gap_s: float, found: int
         items = [("/x", EPOCH + begin + at, make("std_msgs/msg/String", "x")) for at in (0, SECOND)]
         write(tmp_path / "lab" / f"take_{k}.mcap", items)
 
-    assert len(find_recordings([str(tmp_path)]).kept) == found
+    assert len(find_recordings([str(tmp_path)]).sources) == found
 
 
 def test_metadata_of_a_data_set_makes_no_bag(tmp_path: Path) -> None:
@@ -241,7 +243,7 @@ def test_metadata_of_a_data_set_makes_no_bag(tmp_path: Path) -> None:
         take.touch()
     (tmp_path / "metadata.yaml").write_text("robot: stretch\nlicense: CC0\n")
 
-    assert {Path(source.path) for source in find_recordings([str(tmp_path)]).kept} == takes
+    assert {Path(source.path) for source in find_recordings([str(tmp_path)]).sources} == takes
 
 
 def test_folders_are_searched_and_bags_stay_whole(tmp_path: Path) -> None:
@@ -270,10 +272,10 @@ def test_folders_are_searched_and_bags_stay_whole(tmp_path: Path) -> None:
 
     for sources in ([tmp_path], sorted(tmp_path.rglob("[!.]*")), [tmp_path, *tmp_path.iterdir()]):
         found = find_recordings([str(path) for path in sources])
-        kept = [str(Path(s.path).relative_to(tmp_path)) for s in found.kept]
+        kept = [str(Path(s.path).relative_to(tmp_path)) for s in found.sources]
         assert sorted(kept) == sorted(expected)
     alone = find_recordings([str(tmp_path / "notes.txt")])
-    assert [source.stem for source in alone.kept] == ["notes"]
+    assert [source.stem for source in alone.sources] == ["notes"]
     (tmp_path / "none").mkdir()
     with pytest.raises(RecordingError, match="no recording found"):
         find_recordings([str(tmp_path / "none")])
@@ -488,7 +490,7 @@ def test_dask_gives_same_tables_after_killed_worker(
         outcomes = drain(batch, executor, Watcher(kill_once))
 
     assert killed
-    assert exit_code(outcomes) == 1
+    assert common_exit_code({outcome.code for outcome in outcomes}) == 1
     assert len(outcomes) == 4
     assert_same(one_by_one, tmp_path)
 

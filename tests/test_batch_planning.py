@@ -19,10 +19,10 @@ from shapecat.batch.manifest import Entry, Manifest, RemoteManifest, State
 from shapecat.batch.naming import known_names, name_folders
 from shapecat.batch.plans import Shard, plan_batch
 from shapecat.batch.remote import Ticket
-from shapecat.batch.runs import _reporter, exit_code, process_here, process_on
+from shapecat.batch.runs import _reporter, process_here, process_on
 from shapecat.batch.storage import Location, content_key
 from shapecat.config import Settings, with_overrides
-from shapecat.errors import OutputError
+from shapecat.errors import OutputError, common_exit_code
 from shapecat.executors import WorkerLostError
 from shapecat.recordings.files import input_size
 from shapecat.runs.folder import read_run, write_run
@@ -78,8 +78,8 @@ def test_unreadable_file_is_not_skipped(source: Path, monkeypatch: pytest.Monkey
     monkeypatch.setattr(Path, "open", refuse)
     found = find_recordings([str(source), str(secret), str(note)])
 
-    assert [kept.stem for kept in found.kept] == ["lab", "secret"]
-    assert found.left_out == 1
+    assert [kept.stem for kept in found.sources] == ["lab", "secret"]
+    assert found.skipped == 1
 
 
 def test_unreadable_folder_does_not_end_search(
@@ -97,7 +97,7 @@ def test_unreadable_folder_does_not_end_search(
 
     monkeypatch.setattr(Path, "iterdir", refuse)
 
-    assert [kept.stem for kept in find_recordings([str(tmp_path)]).kept] == ["z"]
+    assert [kept.stem for kept in find_recordings([str(tmp_path)]).sources] == ["z"]
     assert caplog.messages == [f"{tmp_path / 'lost+found'}: skipped: Permission denied"]
 
 
@@ -110,7 +110,7 @@ def test_compressed_recordings_in_a_folder_are_named(
 
     found = find_recordings([str(tmp_path)])
 
-    assert [kept.stem for kept in found.kept] == ["a"]
+    assert [kept.stem for kept in found.sources] == ["a"]
     assert [text.partition(": ")[0] for text in caplog.messages] == [
         str(tmp_path / name) for name in ("b.mcap.zstd", "c.bag.gz")
     ]
@@ -125,7 +125,10 @@ def test_compressed_recordings_in_storage_are_named(caplog: pytest.LogCaptureFix
 
     found = find_recordings(["memory://packed/"])
 
-    assert [kept.url for kept in found.kept] == ["memory:///packed/a.mcap", "memory:///packed/bag"]
+    assert [kept.url for kept in found.sources] == [
+        "memory:///packed/a.mcap",
+        "memory:///packed/bag",
+    ]
     assert [text.partition(": ")[0] for text in caplog.messages] == [
         "memory:///packed/b.mcap.zstd", "memory:///packed/c.bag.gz"
     ]  # fmt: skip
@@ -140,8 +143,8 @@ def test_files_of_a_bag_are_not_counted_as_skipped(tmp_path: Path) -> None:
         file.write_bytes(b"no recording by itself")
     found = find_recordings([str(path) for path in (bag, *files)])
 
-    assert [kept.path for kept in found.kept] == [str(bag)]
-    assert found.left_out == 1
+    assert [kept.path for kept in found.sources] == [str(bag)]
+    assert found.skipped == 1
 
 
 CHANGES: Mapping[str, Mapping[str, Any]] = {
@@ -330,7 +333,7 @@ def test_bag_is_the_same_recording_through_links_and_within(
     monkeypatch.chdir(bag)
 
     for named in (bag, tmp_path / "links", Path()):
-        (source,) = find_recordings([str(named)]).kept
+        (source,) = find_recordings([str(named)]).sources
         assert (source.stem, source.parent, Path(source.path).resolve()) == ("walk", "data", bag)
 
 
@@ -342,7 +345,7 @@ def test_looping_links_are_followed_once(tmp_path: Path) -> None:
     for link, target in (("again", "."), ("first", "z"), ("self.mcap", "self.mcap")):
         (tmp_path / link).symlink_to(target)
 
-    found = [source.path for source in find_recordings([str(tmp_path)]).kept]
+    found = [source.path for source in find_recordings([str(tmp_path)]).sources]
 
     assert [str(Path(path).relative_to(tmp_path)) for path in found] == [
         "lab.mcap",
@@ -360,7 +363,7 @@ def test_recording_found_under_several_names_is_processed_once(tmp_path: Path) -
     (other / "linked.mcap").symlink_to(data / "b.mcap")
     named = [data, data / "a.mcap", data / ".." / "data" / "a.mcap", other]
 
-    found = [Path(source.path) for source in find_recordings(list(map(str, named))).kept]
+    found = [Path(source.path) for source in find_recordings(list(map(str, named))).sources]
 
     assert sorted(path.resolve() for path in found) == [
         data / "a.mcap", data / "b.mcap", other / "a.mcap"
@@ -821,9 +824,7 @@ def test_lost_recording_counts_as_tried_if_it_had_started(
 )
 def test_batch_exit_code_combines_outcomes(codes: tuple[int, ...], expected: int) -> None:
     """Different failures give 1, not the code of one of them."""
-    outcomes = [Outcome(Job(Path("a"), Path("b")), code=code) for code in codes]
-
-    assert exit_code(outcomes) == expected
+    assert common_exit_code(codes) == expected
 
 
 def test_shards_are_disjoint_in_any_order_of_recordings() -> None:
@@ -955,7 +956,7 @@ def test_copy_of_run_keeps_its_name(tmp_path: Path) -> None:
     for day in ("monday", "tuesday"):
         (tmp_path / day).mkdir()
         (tmp_path / day / "lab.mcap").write_bytes(day.encode())
-    sources = find_recordings([str(tmp_path / day) for day in ("monday", "tuesday")]).kept
+    sources = find_recordings([str(tmp_path / day) for day in ("monday", "tuesday")]).sources
 
     assert known_names(sources, str(tmp_path / "out"), {"a copy of monday_lab", "monday_lab"}) == {
         0: "monday_lab"
@@ -970,7 +971,7 @@ def test_recording_of_a_batch_keeps_its_name_alone(tmp_path: Path) -> None:
     path = (tmp_path / "monday" / "lab.mcap").resolve()
     (out / name).mkdir(parents=True)
     write_run(out / name, run_info(input={"path": str(path)}))
-    sources = find_recordings([str(path)]).kept
+    sources = find_recordings([str(path)]).sources
 
     assert known_names(sources, str(out), {name}) == {0: name}
     assert known_names(sources, str(out), {name, "lab"}) == {}

@@ -518,19 +518,13 @@ def test_web_viewer_listens_only_on_localhost(tmp_path: Path) -> None:
     wait_for(lambda: not any(Path(f"/proc/{pid}").exists() for pid in processes))
 
 
-@pytest.mark.parametrize("kind", ["plain", "rich", "none", "bars"])
+@pytest.mark.parametrize("kind", ["plain", "rich", "none"])
 def test_compile_notice_appears_once(capsys: pytest.CaptureFixture[str], kind: str) -> None:
     """Otherwise each recording and each worker would announce the compilation."""
     open_progress = import_module("shapecat.cli.progress").open_progress
-    progress_bars = import_module("shapecat.cli.render").progress_bars
-    if kind == "bars":
-        with progress_bars() as bars:
-            for _ in range(3):
-                bars("compile", 0, None)
-    else:
-        with open_progress(kind, []) as progress:
-            for name in ("a", "b", "c"):
-                progress.progress(name, "compile", 0, None)
+    with open_progress(kind, []) as progress:
+        for name in ("a", "b", "c"):
+            progress.progress(name, "compile", 0, None)
 
     assert capsys.readouterr().err.count("compiling kernels") == 1
 

@@ -514,7 +514,7 @@ def test_process_reports_where_untransferred_labels_are(
         corrections = {"transferred": [{}] * 5, "not_transferred": left}
         summary = SimpleNamespace(corrections=corrections, folder=Path("out/lab"))
         job = SimpleNamespace(name="in/lab", target=target)
-        PROCESS._print_corrections(SimpleNamespace(job=job, summary=summary))
+        PROCESS._print_corrections(job, summary)
 
     message = "lab: transferred 5 of 6 corrected labels; the others are in"
     assert capsys.readouterr().err.splitlines() == [

@@ -171,8 +171,8 @@ def test_patterns_and_folders_of_storage_are_expanded(served: Path) -> None:
     url = f"file://{served}"
     both = {f"{url}/a.mcap", f"{url}/broken.mcap"}
 
-    assert {source.url for source in find_recordings([f"{url}/*.mcap"]).kept} == both
-    every = {source.url for source in find_recordings([f"{url}/"]).kept}
+    assert {source.url for source in find_recordings([f"{url}/*.mcap"]).sources} == both
+    every = {source.url for source in find_recordings([f"{url}/"]).sources}
     assert every == {*both, f"{url}/b.bag"}
     assert stat_url(f"{url}/a.mcap")[1] == (served / "a.mcap").stat().st_size
     assert stat_url(f"{url}/none.mcap") == ("", 0)
@@ -194,7 +194,7 @@ def test_names_with_brackets_are_not_patterns(
     assert shapecat(*command).exit_code == 0
     assert {"take[1]/run.json", "bag[2]/run.json"} <= files(out)
     assert shapecat(*command).stdout.count("already complete") == 2
-    assert [source.url for source in find_recordings([f"{lab}/{names[0]}"]).kept]
+    assert [source.url for source in find_recordings([f"{lab}/{names[0]}"]).sources]
     Location(f"{lab}/bag[2]").download(tmp_path / "copy")
     assert {path.name for path in (tmp_path / "copy").iterdir()} == {"one.mcap", "metadata.yaml"}
 
@@ -216,7 +216,7 @@ def test_storage_is_searched_like_a_folder(place: str) -> None:
         *("half/x/frames.parquet", "out/.x.old/annotated.mcap", "notes.txt"),
     ):
         (root / name).write(name.encode())
-    kept = find_recordings([f"{place}/"]).kept
+    kept = find_recordings([f"{place}/"]).sources
     found = {source.url.replace(":///", "://"): source for source in kept}
 
     assert set(found) == {f"{place}/{name}" for name in ("x.mcap", "d/y.bag", "bag")}
@@ -231,7 +231,7 @@ def test_storage_is_searched_like_a_folder(place: str) -> None:
 
 
 def only_key(pattern: str) -> str:
-    (source,) = find_recordings([pattern]).kept
+    (source,) = find_recordings([pattern]).sources
     return source.key
 
 
@@ -303,7 +303,7 @@ def test_listings_are_read_in_pages(bucket: Path, monkeypatch: pytest.MonkeyPatc
     (Location("s3://lab/pages-beside") / "x.mcap").write(b"x")  # not in the folder
 
     assert Location("s3://lab/pages").names() == set("0123456789")
-    assert len(find_recordings(["s3://lab/pages/"]).kept) == 10
+    assert len(find_recordings(["s3://lab/pages/"]).sources) == 10
     assert len(requests(bucket, "GET", "/lab")) >= 8
 
 

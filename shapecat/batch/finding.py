@@ -16,7 +16,7 @@ from shapecat.errors import RecordingError
 from shapecat.recordings import open_recording
 from shapecat.recordings.files import is_of_bag
 
-__all__ = ["Found", "Source", "find_recordings", "stat_url"]
+__all__ = ["SearchResult", "Source", "find_recordings", "stat_url"]
 
 _log = logging.getLogger(__name__)
 
@@ -48,33 +48,32 @@ class Source:
 
 
 @dataclass(frozen=True)
-class Found:
+class SearchResult:
     """The recordings without duplicates, and the number of files skipped."""
 
-    kept: list[Source]
-    left_out: int
+    sources: list[Source]
+    skipped: int
 
 
-def find_recordings(sources: Sequence[str]) -> Found:
+def find_recordings(sources: Sequence[str]) -> SearchResult:
     """Return the recordings among files, folders and URLs.
 
     Folders are searched recursively, except hidden files and folders and run folders; a ROS 2 bag
     counts as one recording. A single file is always kept. Among several, files with neither the
-    suffix nor the first bytes of a recording are skipped and counted in ``left_out``, so that
-    ``folder/*`` works.
+    suffix nor the first bytes of a recording are skipped and counted, so that ``folder/*`` works.
 
     Raises
     ------
     RecordingError : no recording was found.
     """
     remote = {found.url: found for source in sources if is_url(source) for found in _at(source)}
-    paths, left_out = _find_paths([Path(source) for source in sources if not is_url(source)])
-    kept = [_of_path(path) for path in paths] + list(remote.values())
-    if not kept:
+    paths, skipped = _find_paths([Path(source) for source in sources if not is_url(source)])
+    found = [_of_path(path) for path in paths] + list(remote.values())
+    if not found:
         named = " ".join(sources[:3])
         msg = f"{named}: no recording found; expected .mcap, .bag or .db3 files, or a ROS 2 bag"
         raise RecordingError(msg)
-    return Found(kept, left_out)
+    return SearchResult(found, skipped)
 
 
 def _of_path(path: Path) -> Source:

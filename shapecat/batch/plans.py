@@ -27,6 +27,7 @@ from shapecat.system.files import partial_path
 __all__ = [
     "Batch",
     "Shard",
+    "Status",
     "Task",
     "plan_batch",
 ]
@@ -144,7 +145,7 @@ class Batch:
 
     tasks: list[Task]
     manifest: Manifest | None
-    left_out: int
+    skipped: int
 
 
 @contextmanager
@@ -169,13 +170,13 @@ def plan_batch(
     part = Shard.parse(shard) if shard is not None else None
     found = find_recordings(sources)
     there = Location(out, OutputError).names() if is_url(out) else _names_in(Path(out))
-    known = known_names(found.kept, out, there)
-    names = name_folders([s.stem for s in found.kept], [s.parent for s in found.kept], known)
-    named = list(zip(names, found.kept, strict=True))
+    known = known_names(found.sources, out, there)
+    names = name_folders([s.stem for s in found.sources], [s.parent for s in found.sources], known)
+    named = list(zip(names, found.sources, strict=True))
     with open_manifest(out, shard=shard) if len(named) > 1 else nullcontext() as manifest:
         planner = _Planner(job, out, there, manifest)
         chosen = part.of(named) if part is not None else named
-        yield Batch(planner.tasks(chosen), manifest, found.left_out)
+        yield Batch(planner.tasks(chosen), manifest, found.skipped)
 
 
 class _Planner:

@@ -21,7 +21,7 @@ from shapecat.runs.jobs import Job
 from shapecat.system import stopping
 from shapecat.system.progress import Observer
 
-__all__ = ["Outcome", "attempt", "exit_code", "process_here", "process_on"]
+__all__ = ["attempt", "process_here", "process_on"]
 
 _log = logging.getLogger(__name__)
 
@@ -193,9 +193,3 @@ def attempt(job: Job, observe: Observer, *, cores: int = 1, ticket: Ticket) -> O
     except Exception as error:  # noqa: BLE001  one bad recording must not stop the others
         _log.exception("%s: this is a bug in shapecat", job.name)
         return Outcome(job, message=f"{job.name}: {type(error).__name__}: {error}", code=1)
-
-
-def exit_code(outcomes: Sequence[Outcome]) -> int:
-    """Return the code that all outcomes share, 0 for none, and 1 if they differ."""
-    codes = {outcome.code for outcome in outcomes} or {0}
-    return codes.pop() if len(codes) == 1 else 1
