@@ -17,7 +17,7 @@ import numpy as np
 import pytest
 from click.testing import CliRunner, Result
 
-from shapecat.executors.order import Processes
+from shapecat.executors.ordered_pool import OrderedPool
 from shapecat.system.files import FSYNC, holding
 from shapecat.system.garbage import collect_seldom
 from tests.browser import Browser
@@ -110,14 +110,14 @@ def all_awake(monkeypatch: pytest.MonkeyPatch) -> None:
 
     Otherwise the first would process a short recording before the others have loaded.
     """
-    begin = Processes.start
+    begin = OrderedPool.start
 
-    def begin_and_wait(self: Processes[Any, Any]) -> None:
+    def begin_and_wait(self: OrderedPool[Any, Any]) -> None:
         begin(self)
-        wait(self._waking)
+        wait(self._warming_up)
 
-    monkeypatch.setattr("shapecat.executors.order._ALONE", 0)
-    monkeypatch.setattr(Processes, "start", begin_and_wait)
+    monkeypatch.setattr("shapecat.executors.ordered_pool._ITEMS_BEFORE_START", 0)
+    monkeypatch.setattr(OrderedPool, "start", begin_and_wait)
 
 
 class LateAnswer(Future[Any]):
@@ -157,8 +157,8 @@ class LateExecutor(Executor):
 @pytest.fixture
 def late_answers(monkeypatch: pytest.MonkeyPatch) -> None:
     """Send frames to another process from the first frame on, as many as it may hold."""
-    monkeypatch.setattr("shapecat.executors.order._ALONE", 0)
-    monkeypatch.setattr("shapecat.executors.order.LocalExecutor", LateExecutor)
+    monkeypatch.setattr("shapecat.executors.ordered_pool._ITEMS_BEFORE_START", 0)
+    monkeypatch.setattr("shapecat.executors.ordered_pool.LocalExecutor", LateExecutor)
 
 
 class Guesser:

@@ -892,7 +892,7 @@ def test_worker_reports_progress_at_intervals_and_at_end(
 ) -> None:
     """Without the last frame, a recording would look unfinished while its outputs are written."""
     sent, clock = list[Any](), [10.0]
-    monkeypatch.setattr("shapecat.batch.runs.post", lambda *words: sent.append(words))
+    monkeypatch.setattr("shapecat.batch.runs.send_progress", lambda *words: sent.append(words))
     monkeypatch.setattr("shapecat.batch.runs.time", SimpleNamespace(monotonic=lambda: clock[0]))
     observe = _reporter("lab", "here")
     for clock[0], phase, done in (

@@ -20,16 +20,16 @@ import pytest
 from shapecat.errors import ConfigError
 from shapecat.executors import (
     LocalExecutor,
-    Mailbox,
+    ProgressReceiver,
     WorkerLostError,
     is_lost,
     open_executor,
-    post,
+    send_progress,
     share_cores,
     single_threaded,
 )
 from shapecat.executors.dask import _DaskExecutor
-from shapecat.executors.order import Processes
+from shapecat.executors.ordered_pool import OrderedPool
 from shapecat.system import stopping
 from shapecat.types import Camera, Frame
 from tests.tasks import (
@@ -181,13 +181,13 @@ def test_workers_end_when_their_parent_is_killed(tmp_path: Path) -> None:
     wait_for(lambda: not alive(worker), 5)
 
 
-def test_mailbox_delivers_messages_and_ignores_missing_listeners(tmp_path: Path) -> None:
+def test_progress_arrives_and_missing_receivers_are_ignored(tmp_path: Path) -> None:
     received: SimpleQueue[Any] = SimpleQueue()
-    with Mailbox(received.put) as mailbox:
-        post(mailbox.address, ["kitchen", 3])
+    with ProgressReceiver(received.put) as receiver:
+        send_progress(receiver.address, ["kitchen", 3])
         assert received.get(timeout=5) == ["kitchen", 3]
-    post(mailbox.address, "nobody listens")
-    post(str(tmp_path / "no such place"), "nor here")
+    send_progress(receiver.address, "nobody listens")
+    send_progress(str(tmp_path / "no such place"), "nor here")
 
 
 @pytest.mark.parametrize("places", ["long", "none"])
@@ -199,14 +199,14 @@ def test_long_temporary_folder_costs_at_most_the_reports(
     long.mkdir()
     monkeypatch.setattr("tempfile.tempdir", str(long))
     if places == "none":
-        monkeypatch.setattr("shapecat.executors.mailbox._SHORT", str(long))
+        monkeypatch.setattr("shapecat.executors.progress_receiver._SHORT_FOLDER", str(long))
     received: SimpleQueue[Any] = SimpleQueue()
-    with Mailbox(received.put) as mailbox:
-        post(mailbox.address, ["kitchen", 3])
+    with ProgressReceiver(received.put) as receiver:
+        send_progress(receiver.address, ["kitchen", 3])
         if places == "long":
             assert received.get(timeout=5) == ["kitchen", 3]
     assert not [*long.iterdir()]
-    assert not mailbox.address or not Path(mailbox.address).parent.exists()
+    assert not receiver.address or not Path(receiver.address).parent.exists()
 
 
 @pytest.mark.parametrize(
@@ -282,8 +282,8 @@ def test_processes_keep_order_and_hold_few_items() -> None:
             if more == 0 or time.monotonic() > deadline:
                 return
 
-    with Processes(slow_at_times, 3) as processes:
-        for kept, (result, worker) in processes.in_order(items()):
+    with OrderedPool(slow_at_times, 3) as pool:
+        for kept, (result, worker) in pool.in_order(items()):
             used.append((kept, result))
             workers.add(worker)
     assert used == [(k, -k) for k in range(len(used))]
@@ -305,10 +305,10 @@ def test_killed_process_loses_no_item(caplog: pytest.LogCaptureFixture) -> None:
             if k % 50 == 30 and (killed() or time.monotonic() > deadline):
                 return
 
-    with Processes(frail, 2) as processes:
-        processes.start()
-        wait_for(lambda: all(future.done() for future in processes._waking))
-        results = list(processes.in_order(items()))
+    with OrderedPool(frail, 2) as pool:
+        pool.start()
+        wait_for(lambda: all(future.done() for future in pool._warming_up))
+        results = list(pool.in_order(items()))
     assert results == [(k, -k) for k in range(len(results))]
     assert killed()
 
@@ -321,10 +321,10 @@ def one_by_one() -> Iterator[tuple[int, float]]:
 
 def test_last_items_do_not_wait_for_slow_process() -> None:
     """Items that were not sent yet are processed here."""
-    with Processes(slow_elsewhere, 2) as processes:
-        processes.start()
-        wait_for(lambda: all(future.done() for future in processes._waking))
-        workers = [worker for _, worker in processes.in_order(one_by_one())]
+    with OrderedPool(slow_elsewhere, 2) as pool:
+        pool.start()
+        wait_for(lambda: all(future.done() for future in pool._warming_up))
+        workers = [worker for _, worker in pool.in_order(one_by_one())]
     assert workers[0] == workers[1] != os.getpid()
     assert workers[2] == os.getpid()
 
@@ -342,8 +342,8 @@ def test_results_are_freed_without_garbage_collection() -> None:
 
     gc.disable()
     try:
-        with Processes(process_and_ones, 2) as processes:
-            for _, (process, ones) in processes.in_order(items()):
+        with OrderedPool(process_and_ones, 2) as pool:
+            for _, (process, ones) in pool.in_order(items()):
                 if process != os.getpid():
                     received.append(weakref.ref(ones))
                 del ones
@@ -355,8 +355,8 @@ def test_results_are_freed_without_garbage_collection() -> None:
 
 
 def test_errors_are_raised_in_order() -> None:
-    with Processes(inverse_of_rest, 2) as processes:
-        results = processes.in_order((k, k) for k in range(20))
+    with OrderedPool(inverse_of_rest, 2) as pool:
+        results = pool.in_order((k, k) for k in range(20))
         assert [next(results)[1] for _ in range(12)] == [0] * 11 + [1]
         with pytest.raises(ZeroDivisionError):
             next(results)

@@ -15,7 +15,7 @@ from click.testing import Result
 
 from shapecat import perception
 from shapecat.config import Settings
-from shapecat.executors.order import _HELD
+from shapecat.executors.ordered_pool import _MOST_PENDING
 from shapecat.pipeline import process
 from shapecat.runs.folder import read_run
 from shapecat.runs.jobs import Job
@@ -245,7 +245,7 @@ def test_frames_in_progress_are_finished(
 
     partial = tmp_path / ".table.partial" / "segments"
     kept = [read_segment(segment, "frames").num_rows for segment in list_segments(partial)]
-    assert sum(kept) == 3 + _HELD
+    assert sum(kept) == 3 + _MOST_PENDING
 
 
 def test_recording_changed_during_processing_gives_no_results(tmp_path: Path) -> None:

@@ -15,7 +15,7 @@ from shapecat.batch.manifest import Manifest
 from shapecat.batch.plans import Task
 from shapecat.batch.remote import Ticket, process_remote
 from shapecat.errors import ShapecatError
-from shapecat.executors import Mailbox, is_lost, post
+from shapecat.executors import ProgressReceiver, is_lost, send_progress
 from shapecat.pipeline import process
 from shapecat.runs.jobs import Job
 from shapecat.system import stopping
@@ -101,8 +101,8 @@ def process_on(
         ledger.running(name)
         report(name, phase, done, total)
 
-    with Mailbox(receive) as mailbox:
-        yield from _outcomes(executor, tasks, ledger, mailbox.address, cores)
+    with ProgressReceiver(receive) as receiver:
+        yield from _outcomes(executor, tasks, ledger, receiver.address, cores)
 
 
 def _outcomes(
@@ -166,7 +166,7 @@ def _attempt_elsewhere(job: Job, address: str, cores: int, ticket: Ticket, versi
 
 
 def _reporter(name: str, address: str) -> Observer:
-    """Return an observer that sends progress to the mailbox at ``address``, now and then."""
+    """Return an observer that sends progress to ``address``, a few times a second."""
     last = ("", 0.0)
 
     def observe(phase: str, done: int, total: int | None) -> None:
@@ -174,7 +174,7 @@ def _reporter(name: str, address: str) -> Observer:
         now = time.monotonic()
         if phase != last[0] or now - last[1] >= _REPORT_S or done == total:
             last = (phase, now)
-            post(address, (name, phase, done, total))
+            send_progress(address, (name, phase, done, total))
 
     return observe
 

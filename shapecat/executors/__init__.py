@@ -4,24 +4,22 @@ Executors do not depend on the tasks. `local` needs no other package; `dask` and
 are thin adapters for libraries in the extras ``cluster`` and ``ray``.
 """
 
-from collections.abc import Callable
-
 from shapecat.errors import ConfigError
 from shapecat.executors.cores import share_cores, single_threaded, usable_cores
 from shapecat.executors.interface import WorkerExecutor
 from shapecat.executors.local import LocalExecutor
-from shapecat.executors.mailbox import Mailbox, post
+from shapecat.executors.progress_receiver import ProgressReceiver, send_progress
 from shapecat.executors.worker import WorkerLostError
 
 __all__ = [
     "LocalExecutor",
-    "Mailbox",
+    "ProgressReceiver",
     "WorkerExecutor",
     "WorkerLostError",
     "is_dropped",
     "is_lost",
     "open_executor",
-    "post",
+    "send_progress",
     "share_cores",
     "single_threaded",
     "usable_cores",
@@ -49,29 +47,18 @@ def open_executor(name: str, *, workers: int, address: str | None = None) -> Wor
     ------
     ConfigError : the library is not installed, or nothing answers at the address.
     """
-    if name == "local" and address is not None:
+    if name == "dask":
+        from shapecat.executors.dask import open_dask  # noqa: PLC0415  an extra
+
+        return open_dask(workers, address)
+    if name == "ray":
+        from shapecat.executors.ray import RayExecutor  # noqa: PLC0415  an extra
+
+        return RayExecutor(workers, address)
+    if address is not None:
         msg = "--scheduler needs --executor dask or ray"
         raise ConfigError(msg)
-    return _OPENERS[name](workers, address)
-
-
-def _dask(workers: int, address: str | None) -> WorkerExecutor:
-    from shapecat.executors.dask import open_dask  # noqa: PLC0415  an extra
-
-    return open_dask(workers, address)
-
-
-def _ray(workers: int, address: str | None) -> WorkerExecutor:
-    from shapecat.executors.ray import RayExecutor  # noqa: PLC0415  an extra
-
-    return RayExecutor(workers, address)
-
-
-_OPENERS: dict[str, Callable[[int, str | None], WorkerExecutor]] = {
-    "local": lambda workers, _: LocalExecutor(workers),
-    "dask": _dask,
-    "ray": _ray,
-}
+    return LocalExecutor(workers)
 
 
 def is_lost(error: BaseException) -> bool:

@@ -45,11 +45,11 @@ class LocalExecutor(WorkerExecutor):
         self._closed = False
         self._workers: dict[int, Worker] = {}
         self._lock = threading.Lock()
-        self._attendants = [
-            threading.Thread(target=self._attend, args=(k,), daemon=True) for k in range(workers)
+        self._dispatchers = [
+            threading.Thread(target=self._dispatch, args=(k,), daemon=True) for k in range(workers)
         ]
-        for attendant in self._attendants:
-            attendant.start()
+        for dispatcher in self._dispatchers:
+            dispatcher.start()
         atexit.register(self.terminate)
 
     def submit(self, fn: Callable[..., Any], /, *args: Any, **kwargs: Any) -> Future[Any]:
@@ -72,11 +72,11 @@ class LocalExecutor(WorkerExecutor):
         atexit.unregister(self.terminate)
         if cancel_futures:
             self._cancel_waiting()
-        for _ in self._attendants:
+        for _ in self._dispatchers:
             self._tasks.put(None)
         if wait:
-            for attendant in self._attendants:
-                attendant.join()
+            for dispatcher in self._dispatchers:
+                dispatcher.join()
 
     def stop(self) -> None:
         """Ask running tasks to stop, as a signal would, and wait until they have."""
@@ -86,14 +86,14 @@ class LocalExecutor(WorkerExecutor):
         """Kill the workers in the middle of their tasks."""
         self._end(lambda worker: worker.process.kill(), timeout_s=1)
 
-    def _end(self, each: Callable[[Worker], object], *, timeout_s: float | None = None) -> None:
-        """Drop waiting tasks, call ``each`` for all workers, and wait for their threads."""
+    def _end(self, end: Callable[[Worker], object], *, timeout_s: float | None = None) -> None:
+        """Cancel waiting tasks, call ``end`` for all workers, and wait for their dispatchers."""
         self.shutdown(wait=False, cancel_futures=True)
         with self._lock:
             for worker in self._workers.values():
-                each(worker)
-        for attendant in self._attendants:
-            attendant.join(timeout_s)
+                end(worker)
+        for dispatcher in self._dispatchers:
+            dispatcher.join(timeout_s)
 
     def _cancel_waiting(self) -> None:
         with suppress(Empty):
@@ -101,48 +101,48 @@ class LocalExecutor(WorkerExecutor):
                 if task := self._tasks.get_nowait():
                     task.future.cancel()
 
-    def _attend(self, seat: int) -> None:
-        """Send tasks to the worker in a seat of the pool, or its successors, until shutdown."""
+    def _dispatch(self, slot: int) -> None:
+        """Send tasks to the worker in a slot of the pool, or its successors, until shutdown."""
         resource_tracker.ensure_running()  # starting it later would unblock the signals
         signal.pthread_sigmask(signal.SIG_BLOCK, _SIGNALS)  # the workers inherit it
-        room = threading.Semaphore(1 + self._ahead)
-        while room.acquire() and (task := self._tasks.get()):
+        capacity = threading.Semaphore(1 + self._ahead)
+        while capacity.acquire() and (task := self._tasks.get()):
             try:
                 if task.future.set_running_or_notify_cancel():
-                    self._worker(seat, room).send(task)
+                    self._worker(slot, capacity).send(task)
                 else:
-                    room.release()
+                    capacity.release()
             except Exception as error:  # noqa: BLE001  a call that cannot be sent fails alone
                 task.future.set_exception(error)
-                room.release()
-        self._dismiss(seat)
+                capacity.release()
+        self._retire(slot)
 
-    def _worker(self, seat: int, room: threading.Semaphore) -> Worker:
-        """Return the worker of a seat; start one if there is none or it has died.
+    def _worker(self, slot: int, capacity: threading.Semaphore) -> Worker:
+        """Return the worker in a slot; start one if there is none or it has died.
 
         Raises
         ------
         WorkerLostError : the executor is shut down, or no process can be started.
         """
-        worker = self._workers.get(seat)
+        worker = self._workers.get(slot)
         if worker is not None and worker.lost:
-            self._dismiss(seat)
+            self._retire(slot)
         with self._lock:
-            if seat not in self._workers:
+            if slot not in self._workers:
                 if self._closed:
                     msg = "the worker process died before its task was sent"
                     raise WorkerLostError(msg)
                 try:
-                    self._workers[seat] = Worker(room)
+                    self._workers[slot] = Worker(capacity)
                 except OSError as error:
                     msg = f"no worker process can be started: {error}"
                     raise WorkerLostError(msg) from error
-            return self._workers[seat]
+            return self._workers[slot]
 
-    def _dismiss(self, seat: int) -> None:
-        """Wait for the outstanding answers of a worker, and for its end."""
-        worker = self._workers.get(seat)
+    def _retire(self, slot: int) -> None:
+        """Wait for the outstanding results of a worker, and for its end."""
+        worker = self._workers.get(slot)
         if worker is not None:
             worker.end()
             with self._lock:
-                del self._workers[seat]
+                del self._workers[slot]

@@ -38,77 +38,78 @@ class Task(NamedTuple):
 
 
 class Worker:
-    """A process, the socket to it, and a thread that receives its answers.
+    """A process, the socket to it, and a thread that receives its results.
 
     Attributes
     ----------
     lost : whether the process has died.
     """
 
-    def __init__(self, room: threading.Semaphore) -> None:
-        """Start a process; each answer releases ``room``."""
+    def __init__(self, capacity: threading.Semaphore) -> None:
+        """Start a process; each result releases ``capacity``."""
         self.lost = False
-        self._socket, far = socket.socketpair()
-        asked, self._ask = _SPAWN.Pipe(duplex=False)
+        self._socket, child_socket = socket.socketpair()
+        stop_pipe, self._stop_pipe = _SPAWN.Pipe(duplex=False)
         # Not daemonic, since those may not start processes; `_watch_parent` ends it instead.
-        self.process = _SPAWN.Process(target=_serve, args=(far, asked), daemon=False)
+        self.process = _SPAWN.Process(target=_serve, args=(child_socket, stop_pipe), daemon=False)
         with single_threaded():
             self.process.start()
-        far.close()
-        asked.close()
+        child_socket.close()
+        stop_pipe.close()
         self._sent: SimpleQueue[Task | None] = SimpleQueue()
-        self._listener = threading.Thread(target=self._listen, args=(room,), daemon=True)
+        self._listener = threading.Thread(target=self._listen, args=(capacity,), daemon=True)
         self._listener.start()
 
     def ask_to_stop(self) -> None:
         """Make `stopping.asked` return True in the process."""
-        self._ask.close()
+        self._stop_pipe.close()
 
     def send(self, task: Task) -> None:
         """Send a call, which waits while another one runs; the receiving thread sets its future."""
-        parts = _packed(task.call)
+        parts = _pickled(task.call)
         self._sent.put(task)
         with suppress(OSError):  # the listener gets the same error
             _send(self._socket, parts)
 
     def end(self) -> None:
-        """Wait for the outstanding answers, then for the end of the process."""
+        """Wait for the outstanding results, then for the end of the process."""
         self._sent.put(None)
         self._listener.join()
         self._socket.close()
         self.process.join()
 
-    def _listen(self, room: threading.Semaphore) -> None:
+    def _listen(self, capacity: threading.Semaphore) -> None:
         while task := self._sent.get():
             try:
-                done, value = _receive(self._socket)
+                succeeded, value = _receive(self._socket)
             except (EOFError, OSError):
-                done, value = False, self._loss()
-            except Exception as error:  # noqa: BLE001  an answer that cannot be read fails alone
-                done, value = False, error
-            if done:
+                succeeded, value = False, self._lost_error()
+            except Exception as error:  # noqa: BLE001  a result that cannot be read fails alone
+                succeeded, value = False, error
+            if succeeded:
                 task.future.set_result(value)
             else:
                 task.future.set_exception(value)
-            room.release()
+            capacity.release()
 
-    def _loss(self) -> WorkerLostError:
+    def _lost_error(self) -> WorkerLostError:
         self.lost = True
         self.process.join(timeout=5)
-        return WorkerLostError(f"the worker process died ({_words(self.process.exitcode)})")
+        reason = _exit_reason(self.process.exitcode)
+        return WorkerLostError(f"the worker process died ({reason})")
 
 
-def _words(code: int | None) -> str:
+def _exit_reason(code: int | None) -> str:
     if code is not None and code < 0:
         return f"signal {signal.Signals(-code).name}"
     return f"exit code {code}"
 
 
-def _packed(value: object) -> list[memoryview]:
+def _pickled(value: object) -> list[memoryview]:
     """Pickle a value; return the pickle and the arrays in it, which are not copied."""
-    written, buffers = io.BytesIO(), list[Any]()
-    ForkingPickler(written, 5, True, buffers.append).dump(value)  # noqa: FBT003  by position alone
-    return [written.getbuffer(), *(buffer.raw() for buffer in buffers)]
+    pickle, arrays = io.BytesIO(), list[Any]()
+    ForkingPickler(pickle, 5, True, arrays.append).dump(value)  # noqa: FBT003  by position alone
+    return [pickle.getbuffer(), *(array.raw() for array in arrays)]
 
 
 def _send(connection: socket.socket, parts: Sequence[memoryview]) -> None:
@@ -119,7 +120,7 @@ def _send(connection: socket.socket, parts: Sequence[memoryview]) -> None:
 
 
 def _receive(connection: socket.socket) -> Any:
-    """Receive a value that `_packed` and `_send` sent.
+    """Receive a value that `_pickled` and `_send` sent.
 
     Raises
     ------
@@ -127,8 +128,8 @@ def _receive(connection: socket.socket) -> Any:
     """
     (count,) = struct.unpack("<Q", _read(connection, 8))
     sizes = struct.unpack(f"<{count}Q", _read(connection, 8 * count))
-    written, *arrays = [_read(connection, size) for size in sizes]
-    return ForkingPickler.loads(written, buffers=arrays)
+    pickle, *arrays = [_read(connection, size) for size in sizes]
+    return ForkingPickler.loads(pickle, buffers=arrays)
 
 
 def _read(connection: socket.socket, size: int) -> bytearray:
@@ -143,26 +144,26 @@ def _read(connection: socket.socket, size: int) -> bytearray:
     return content
 
 
-def _serve(connection: socket.socket, asked: Connection) -> None:
-    """Answer calls until the parent closes the socket or dies.
+def _serve(connection: socket.socket, stop_pipe: Connection) -> None:
+    """Execute calls until the parent closes the socket or dies.
 
-    Threads receive the next call and send the previous answer during the current call.
+    Threads receive the next call and send the previous result during the current call.
     """
     collect_seldom()
     block_unused()
-    threading.Thread(target=_watch_parent, args=(asked,), daemon=True).start()
+    threading.Thread(target=_watch_parent, args=(stop_pipe,), daemon=True).start()
     calls: SimpleQueue[Any] = SimpleQueue()
-    answers: SimpleQueue[Any] = SimpleQueue()
-    threading.Thread(target=_read_calls, args=(connection, calls), daemon=True).start()
-    writer = threading.Thread(target=_write_answers, args=(connection, answers), daemon=True)
-    writer.start()
+    results: SimpleQueue[Any] = SimpleQueue()
+    threading.Thread(target=_receive_calls, args=(connection, calls), daemon=True).start()
+    sender = threading.Thread(target=_send_results, args=(connection, results), daemon=True)
+    sender.start()
     while call := calls.get():
-        answers.put(_packed(_answer(*call)))
-    answers.put(None)
-    writer.join()
+        results.put(_pickled(_execute(*call)))
+    results.put(None)
+    sender.join()
 
 
-def _read_calls(connection: socket.socket, calls: SimpleQueue[Any]) -> None:
+def _receive_calls(connection: socket.socket, calls: SimpleQueue[Any]) -> None:
     try:
         with suppress(EOFError, OSError):
             while True:
@@ -171,13 +172,13 @@ def _read_calls(connection: socket.socket, calls: SimpleQueue[Any]) -> None:
         calls.put(None)
 
 
-def _write_answers(connection: socket.socket, answers: SimpleQueue[Any]) -> None:
+def _send_results(connection: socket.socket, results: SimpleQueue[Any]) -> None:
     with suppress(OSError):
-        while parts := answers.get():
+        while parts := results.get():
             _send(connection, parts)
 
 
-def _answer(
+def _execute(
     function: Callable[..., Any], arguments: tuple[Any, ...], options: dict[str, Any]
 ) -> tuple[bool, Any]:
     try:
@@ -186,12 +187,12 @@ def _answer(
         return False, error
 
 
-def _watch_parent(asked: Connection) -> None:
+def _watch_parent(stop_pipe: Connection) -> None:
     """Request a stop when the parent asks for it; end the process when the parent is gone."""
     parent = parent_process()
     if parent is None:
         return
-    if parent.sentinel not in wait([parent.sentinel, asked]):
+    if parent.sentinel not in wait([parent.sentinel, stop_pipe]):
         stopping.request()
         wait([parent.sentinel])
     os._exit(1)

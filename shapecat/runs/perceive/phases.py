@@ -19,7 +19,7 @@ from shapecat.cameras.colour import ColourView
 from shapecat.config import Settings
 from shapecat.depth_fusion import RecentFrames
 from shapecat.errors import NoStreamError, RecordingError, explained
-from shapecat.executors.order import Processes
+from shapecat.executors.ordered_pool import OrderedPool
 from shapecat.learning import Categorizer
 from shapecat.perception import Perceiver, PerceptionInput, find_up
 from shapecat.recordings import Recording, Stream
@@ -154,7 +154,7 @@ def _perceiving(
     job, categorizer = work.job, work.categorizer
     perceiver = Perceiver(categorizer, job.settings, job.model)
     with (
-        Processes(perceiver, work.cores, rehearse) as processes,
+        OrderedPool(perceiver, work.cores, rehearse) as pool,
         PerceptionTables(
             work.folder,
             categories=categorizer.categories,
@@ -164,14 +164,14 @@ def _perceiving(
         ) as tables,
     ):
         if (total or 0) - tables.done >= _MANY:
-            processes.start()
+            pool.start()
 
         def perceive(views: Iterator[_Item]) -> tuple[int, int]:
             count = 0
             for count, _ in enumerate(stopping.until_asked(islice(views, tables.done)), start=1):
                 if not again:  # the frames of a second look are few
                     work.observe(phase, count, total)
-            for rows, perceptions in processes.in_order(_blocks(views, job.settings.reuse_frames)):
+            for rows, perceptions in pool.in_order(_blocks(views, job.settings.reuse_frames)):
                 tables.write(perceptions, rows)
                 for _ in rows:
                     count += 1

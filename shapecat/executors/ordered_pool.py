@@ -1,4 +1,4 @@
-"""Process items in several processes, and yield the results in order."""
+"""A pool of processes that yields the results in order."""
 
 import logging
 import sys
@@ -13,27 +13,27 @@ from typing import Generic, Self, TypeVar
 
 from shapecat.executors.local import LocalExecutor
 
-__all__ = ["Processes"]
+__all__ = ["OrderedPool"]
 
 _log = logging.getLogger(__name__)
 
-_Kept = TypeVar("_Kept")
+_Context = TypeVar("_Context")
 _Item = TypeVar("_Item")
 _Result = TypeVar("_Result")
 
-_ALONE = 1
+_ITEMS_BEFORE_START = 1
 """Items processed here before other processes are started: a short run needs none."""
-_AHEAD, _AWAY = 1, 3
+_SENT_AHEAD, _MOST_PER_PROCESS = 1, 3
 """Items sent to a busy process in advance; and all that a process is given: the one it works on,
 one sent in advance, and one that waits here. A thread sends the waiting one as soon as the process
 finishes another, even while this process works."""
-_HELD = 8
+_MOST_PENDING = 8
 """At most this many items are in progress, or wait for the result of an earlier one."""
 _SWITCH_S = 5e-4
 """A thread that returns from a kernel waits no longer than this for the interpreter lock."""
 
 
-class Processes(Generic[_Item, _Result]):
+class OrderedPool(Generic[_Item, _Result]):
     """Several processes, including this one, that share the items of one job.
 
     This process works on items while the others start, and whenever all of them are busy. It also
@@ -41,8 +41,8 @@ class Processes(Generic[_Item, _Result]):
 
     Examples
     --------
-    >>> with Processes(abs, 1) as processes:
-    ...     list(processes.in_order([("a", -2), ("b", 1)]))
+    >>> with OrderedPool(abs, 1) as pool:
+    ...     list(pool.in_order([("a", -2), ("b", 1)]))
     [('a', 2), ('b', 1)]
     """
 
@@ -63,7 +63,7 @@ class Processes(Generic[_Item, _Result]):
         self._work, self._warm_up = work, warm_up
         self._others = 0 if current_process().daemon else max(0, count - 1)
         self._executor: LocalExecutor | None = None
-        self._waking: list[Future[None]] = []
+        self._warming_up: list[Future[None]] = []
 
     def __enter__(self) -> Self:
         return self
@@ -76,12 +76,14 @@ class Processes(Generic[_Item, _Result]):
     def start(self) -> None:
         """Start the other processes now instead of with the first item: starting takes seconds."""
         if self._others and self._executor is None:
-            self._executor = LocalExecutor(self._others, ahead=_AHEAD)
+            self._executor = LocalExecutor(self._others, ahead=_SENT_AHEAD)
             for _ in range(self._others):
-                self._waking.append(self._executor.submit(_wake, self._work, self._warm_up))
+                self._warming_up.append(self._executor.submit(_warm_up, self._work, self._warm_up))
 
-    def in_order(self, items: Iterable[tuple[_Kept, _Item]]) -> Iterator[tuple[_Kept, _Result]]:
-        """Yield ``(kept, work(item))`` for each pair ``(kept, item)``, in order.
+    def in_order(
+        self, items: Iterable[tuple[_Context, _Item]]
+    ) -> Iterator[tuple[_Context, _Result]]:
+        """Yield ``(context, work(item))`` for each pair ``(context, item)``, in order.
 
         Parameters
         ----------
@@ -89,31 +91,32 @@ class Processes(Generic[_Item, _Result]):
         """
         source = iter(items)
         if self._executor is None:
-            for kept, item in islice(source, _ALONE if self._others else None):
-                yield kept, self._work(item)
+            for context, item in islice(source, _ITEMS_BEFORE_START if self._others else None):
+                yield context, self._work(item)
             self.start()
-        pending: deque[tuple[_Kept, _Turn[_Item, _Result]]] = deque()
-        with _switching():
-            for kept, item in source:
-                pending.append((kept, self._begin(item, [turn for _, turn in pending])))
-                while pending and (pending[0][1].done() or len(pending) > _HELD):
-                    first, turn = pending.popleft()
-                    yield first, turn.result()
-            for _, turn in reversed(pending):
-                turn.recall()
-            for first, turn in pending:
-                yield first, turn.result()
+        pending: deque[tuple[_Context, _Pending[_Item, _Result]]] = deque()
+        with _frequent_thread_switches():
+            for context, item in source:
+                pending.append((context, self._begin(item, [each for _, each in pending])))
+                while pending and (pending[0][1].done() or len(pending) > _MOST_PENDING):
+                    first_context, first = pending.popleft()
+                    yield first_context, first.result()
+            for _, each in reversed(pending):
+                each.recall()
+            for context, each in pending:
+                yield context, each.result()
 
     def _begin(
-        self, item: _Item, turns: Sequence["_Turn[_Item, _Result]"]
-    ) -> "_Turn[_Item, _Result]":
+        self, item: _Item, pending: Sequence["_Pending[_Item, _Result]"]
+    ) -> "_Pending[_Item, _Result]":
         """Send an item to another process if one has started and has room, else work on it here."""
-        awake = sum(future.done() for future in self._waking)
-        away = sum(not turn.done() for turn in turns)
-        return _Turn(self._work, item, self._executor if away < _AWAY * awake else None)
+        started = sum(future.done() for future in self._warming_up)
+        unfinished = sum(not each.done() for each in pending)
+        has_room = unfinished < _MOST_PER_PROCESS * started
+        return _Pending(self._work, item, self._executor if has_room else None)
 
 
-class _Turn(Generic[_Item, _Result]):
+class _Pending(Generic[_Item, _Result]):
     """The work on one item, in another process or in this one."""
 
     def __init__(
@@ -128,7 +131,7 @@ class _Turn(Generic[_Item, _Result]):
         else:
             self._item.append(item)
             self._future = executor.submit(work, item)
-            # Futures keep their callbacks: one that knew this turn would keep the result for ever.
+            # Futures keep their callbacks: a bound method would keep the result for ever.
             self._future.add_done_callback(partial(_drop_finished, self._item))
 
     def done(self) -> bool:
@@ -156,7 +159,7 @@ def _drop_finished(item: list[_Item], future: Future[_Result]) -> None:
         item.clear()
 
 
-def _wake(_work: object, warm_up: Callable[[], object]) -> None:
+def _warm_up(_work: object, warm_up: Callable[[], object]) -> None:
     """Warm up; unpickling the work has already imported its modules."""
     warm_up()
 
@@ -165,13 +168,13 @@ def _done(work: Callable[[_Item], _Result], item: _Item) -> Future[_Result]:
     result: Future[_Result] = Future()
     try:
         result.set_result(work(item))
-    except Exception as error:  # noqa: BLE001  raised when its turn comes
+    except Exception as error:  # noqa: BLE001  raised by `result`
         result.set_exception(error)
     return result
 
 
 @contextmanager
-def _switching() -> Iterator[None]:
+def _frequent_thread_switches() -> Iterator[None]:
     """Let threads switch more often than every 5 ms, since most kernels take less time."""
     before = sys.getswitchinterval()
     sys.setswitchinterval(_SWITCH_S)

@@ -1,4 +1,4 @@
-"""Progress reports from workers on this machine: datagrams, dropped rather than waited for."""
+"""Progress from workers on this machine: datagrams, dropped rather than waited for."""
 
 import json
 import socket
@@ -9,26 +9,25 @@ from pathlib import Path
 from threading import Thread
 from typing import Any, Self
 
-__all__ = ["Mailbox", "post"]
+__all__ = ["ProgressReceiver", "send_progress"]
 
 _MOST_BYTES = 4096
-_SHORT = "/tmp"  # noqa: S108  the folder in it is private
+_SHORT_FOLDER = "/tmp"  # noqa: S108  the folder in it is private
 
 
-class Mailbox:
-    """Passes the reports that workers `post` to a function, in a thread of its own.
+class ProgressReceiver:
+    """Passes what workers send with `send_progress` to a function, in a thread of its own.
 
-    A worker that dies while it posts blocks nobody, since there is no lock and no stream. The
+    A worker that dies while it sends blocks nobody, since there is no lock and no stream. The
     socket is in a folder that only this user may enter.
 
     Attributes
     ----------
-    address : path of the socket, the address for `post`; empty if no socket can be made, and then
-        no report arrives.
+    address : path of the socket; empty if no socket can be made, and then nothing arrives.
     """
 
     def __init__(self, receive: Callable[[Any], None]) -> None:
-        """Call ``receive`` with each report."""
+        """Call ``receive`` with each message."""
         self._receive = receive
         self._folder = ExitStack()
         self._socket = socket.socket(socket.AF_UNIX, socket.SOCK_DGRAM)
@@ -43,22 +42,22 @@ class Mailbox:
     def __exit__(self, *error: object) -> None:
         """Stop listening."""
         if self.address:
-            with suppress(OSError), socket.socket(socket.AF_UNIX, socket.SOCK_DGRAM) as end:
-                end.sendto(b"", self.address)
+            with suppress(OSError), socket.socket(socket.AF_UNIX, socket.SOCK_DGRAM) as sender:
+                sender.sendto(b"", self.address)  # ends the thread
             self._thread.join(timeout=1)
         self._socket.close()
         self._folder.close()
 
     def _bind(self) -> str:
         """Bind the socket in the temporary folder, or in /tmp if its path is too long."""
-        for place in (None, _SHORT):
-            with suppress(OSError), ExitStack() as folder:
-                made = tempfile.TemporaryDirectory(
-                    prefix="shapecat-", dir=place, ignore_cleanup_errors=True
+        for parent in (None, _SHORT_FOLDER):
+            with suppress(OSError), ExitStack() as stack:
+                folder = tempfile.TemporaryDirectory(
+                    prefix="shapecat-", dir=parent, ignore_cleanup_errors=True
                 )
-                address = str(Path(folder.enter_context(made)) / "mailbox")
+                address = str(Path(stack.enter_context(folder)) / "progress")
                 self._socket.bind(address)
-                self._folder = folder.pop_all()
+                self._folder = stack.pop_all()
                 return address
         return ""
 
@@ -69,8 +68,8 @@ class Mailbox:
                     self._receive(json.loads(content))
 
 
-def post(address: str, report: Any) -> None:
-    """Send a report without waiting; drop it if that fails, for example on another machine."""
+def send_progress(address: str, message: Any) -> None:
+    """Send a message without waiting; drop it if that fails, for example on another machine."""
     with suppress(OSError), socket.socket(socket.AF_UNIX, socket.SOCK_DGRAM) as sender:
         sender.setblocking(False)  # noqa: FBT003  positional by definition
-        sender.sendto(json.dumps(report).encode(), address)
+        sender.sendto(json.dumps(message).encode(), address)
