@@ -246,7 +246,7 @@ def limits(count: int) -> tuple[str, ...]:
     tasks = _Planner(job, out, set(), manifest).tasks(named)
     spent.append(time.process_time())
     ledger = Ledger(manifest)
-    ledger.plan(tasks)
+    ledger.record_planned(tasks)
     for some in range(0, count, 1000):
         entries = [task.entry() for task in tasks[some : some + 1000]]
         manifest.record(

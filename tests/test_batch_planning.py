@@ -13,12 +13,12 @@ from typing import Any, get_args
 import fsspec
 import pytest
 
-from shapecat.batch.finding import Source, _key_of_all, find_recordings
+from shapecat.batch.finding import Source, _combined_key, find_recordings
 from shapecat.batch.ledger import Ledger, Outcome
 from shapecat.batch.manifest import Entry, Manifest, RemoteManifest, State
-from shapecat.batch.naming import known_names, name_folders
+from shapecat.batch.naming import existing_names, name_folders
 from shapecat.batch.plans import Shard, plan_batch
-from shapecat.batch.remote import Ticket
+from shapecat.batch.remote import TaskKey
 from shapecat.batch.runs import _reporter, process_here, process_on
 from shapecat.batch.storage import Location, content_key
 from shapecat.config import Settings, with_overrides
@@ -315,10 +315,10 @@ def test_results_at_url_must_match_input_and_work(
     source: Path, known: tuple[str, str], asked: tuple[str, str], *, made: bool
 ) -> None:
     run = planned(source)
-    assert not Ticket("b", *asked).made(run)
+    assert not TaskKey("b", *asked).matches(run)
     run["origin"] = {"input": known[0], "work": known[1]}
 
-    assert Ticket("b", *asked).made(run) is made
+    assert TaskKey("b", *asked).matches(run) is made
 
 
 def test_bag_is_the_same_recording_through_links_and_within(
@@ -739,12 +739,14 @@ def test_entries_of_other_work_are_replaced(source: Path, monkeypatch: pytest.Mo
         assert manifest is not None
         ledger = Ledger(manifest)
         manifest.record([Entry("lab", "lab.mcap", "planned", task.input, "old work")])
-        ledger.plan([task])
+        ledger.record_planned([task])
         assert manifest.entries["lab"].work == task.work
         manifest.record([Entry("lab", "lab.mcap", "complete", "old input", task.work)])
         ledger.begin(task)
         counts = {"frames": 3, "tracks": {"cup": 2}}
-        ledger.ended(task, Outcome(task.job, Summary("lab.mcap", Path("lab"), counts, 1.5, ())))
+        ledger.record_outcome(
+            task, Outcome(task.job, Summary("lab.mcap", Path("lab"), counts, 1.5, ()))
+        )
 
     assert manifest.entries["lab"].input == task.input
     assert manifest.entries["lab"].state == "complete"
@@ -778,7 +780,7 @@ def test_content_key_changes_with_content_at_url(
 
 def test_key_of_bag_at_url_covers_all_its_files() -> None:
     """The storage may list them in any order."""
-    keys = [_key_of_all(keys) for keys in ("ab", "ac", "db", "ba")]
+    keys = [_combined_key(keys) for keys in ("ab", "ac", "db", "ba")]
 
     assert len(set(keys)) == 3
     assert keys[3] == keys[0]
@@ -803,16 +805,16 @@ def test_lost_recording_counts_as_tried_if_it_had_started(
     with plan_batch(Job(Path(), Path()), [str(source.parent)], out) as batch:
         (task,) = (task for task in batch.tasks if task.name == "lab")
         ledger = Ledger(batch.manifest)
-        ledger.plan(batch.tasks)
+        ledger.record_planned(batch.tasks)
         ledger.begin(task)
         if begun:
-            ledger.running("lab")
-        assert ledger.lost(task, error, most=2)
+            ledger.record_running("lab")
+        assert ledger.record_lost(task, error)
         ledger.begin(task)
-        ledger.running("lab")
+        ledger.record_running("lab")
         if tries == 2:
-            assert not ledger.lost(task, error, most=2)
-        ledger.ended(task, Outcome(task.job, message="gave up", code=1))
+            assert not ledger.record_lost(task, error)
+        ledger.record_outcome(task, Outcome(task.job, message="gave up", code=1))
     entry = Manifest(Path(out) / "manifest.jsonl").entries["lab"]
 
     assert (entry.state, entry.tries, entry.message) == ("failed", tries, "gave up")
@@ -958,9 +960,9 @@ def test_copy_of_run_keeps_its_name(tmp_path: Path) -> None:
         (tmp_path / day / "lab.mcap").write_bytes(day.encode())
     sources = find_recordings([str(tmp_path / day) for day in ("monday", "tuesday")]).sources
 
-    assert known_names(sources, str(tmp_path / "out"), {"a copy of monday_lab", "monday_lab"}) == {
-        0: "monday_lab"
-    }
+    assert existing_names(
+        sources, str(tmp_path / "out"), {"a copy of monday_lab", "monday_lab"}
+    ) == {0: "monday_lab"}
 
 
 def test_recording_of_a_batch_keeps_its_name_alone(tmp_path: Path) -> None:
@@ -973,10 +975,10 @@ def test_recording_of_a_batch_keeps_its_name_alone(tmp_path: Path) -> None:
     write_run(out / name, run_info(input={"path": str(path)}))
     sources = find_recordings([str(path)]).sources
 
-    assert known_names(sources, str(out), {name}) == {0: name}
-    assert known_names(sources, str(out), {name, "lab"}) == {}
+    assert existing_names(sources, str(out), {name}) == {0: name}
+    assert existing_names(sources, str(out), {name, "lab"}) == {}
     write_run(out / name, run_info(input={"path": "/another/monday/lab.mcap"}))
-    assert known_names(sources, str(out), {name}) == {}
+    assert existing_names(sources, str(out), {name}) == {}
 
 
 @pytest.mark.parametrize("known_from", ["all", "1-of-2", "relative path", "run.json"])

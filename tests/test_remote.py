@@ -25,7 +25,7 @@ from shapecat.batch import claims, storage
 from shapecat.batch.claims import claimed
 from shapecat.batch.finding import find_recordings, stat_url
 from shapecat.batch.manifest import Entry, RemoteManifest
-from shapecat.batch.remote import Ticket, _download, process_remote, upload
+from shapecat.batch.remote import TaskKey, _download, process_remote, upload
 from shapecat.batch.storage import Location
 from shapecat.errors import OutputError, RecordingError
 from shapecat.runs.folder import RUN_FILES
@@ -85,8 +85,8 @@ def own_scratch(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[Pat
 def short_waits(monkeypatch: pytest.MonkeyPatch) -> None:
     """Shorten all waits for the storage and for claims."""
     monkeypatch.setattr(storage, "_WAITS_S", (0.01, 0.02))
-    monkeypatch.setattr(claims, "_BEAT_S", 0.2)
-    monkeypatch.setattr(claims, "_LOOK_S", 0.1)
+    monkeypatch.setattr(claims, "_HEARTBEAT_S", 0.2)
+    monkeypatch.setattr(claims, "_POLL_S", 0.1)
     monkeypatch.setattr(claims, "_STALE_S", 1.0)
 
 
@@ -312,7 +312,7 @@ def made(served: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
     """Return a run folder, made as a worker makes one in scratch."""
     folder = tmp_path_factory.mktemp("made") / "run"
     process_remote(
-        Job(served / "a.mcap", folder, rrd=False), lambda *_: None, cores=1, ticket=Ticket("")
+        Job(served / "a.mcap", folder, rrd=False), lambda *_: None, cores=1, key=TaskKey("")
     )
     return folder
 
@@ -432,7 +432,7 @@ def test_summary_names_run_folder_not_scratch(
 
     monkeypatch.setattr("shapecat.batch.remote.process", process)
     job = Job(Path("a.mcap"), Path("lab"), target="memory://named/lab")
-    summary = process_remote(job, lambda *_: None, cores=1, ticket=Ticket("one"))
+    summary = process_remote(job, lambda *_: None, cores=1, key=TaskKey("one"))
 
     assert (summary.folder, summary.seconds) == (Path("lab"), 1.5)
 
@@ -472,7 +472,7 @@ def test_claim_of_dead_process_is_taken_over(made: Path, bucket: Path) -> None:
         upload(made, url, second)
         (left,) = system.list_multipart_uploads("lab")
         assert left["Key"] == "late/run10/annotated.mcap"
-        assert not first.beat()
+        assert not first.renew()
         with pytest.raises(OutputError, match="taken over"):
             upload(made, url, first)
     first.release()

@@ -22,11 +22,11 @@ from shapecat.system import stopping
 
 __all__ = ["Claim", "claim_name", "claimed"]
 
-_BEAT_S = 10.0
+_HEARTBEAT_S = 10.0
 """Time between two rewrites of a claim."""
 _STALE_S = 45.0
 """The owner of a claim that stays unchanged for this time is presumed dead."""
-_LOOK_S = 1.0
+_POLL_S = 1.0
 
 
 def claim_name(folder: str) -> str:
@@ -57,7 +57,7 @@ class Claim:
         parent, _, name = url.rstrip("/").rpartition("/")
         self._url = url
         self._object = Location(parent, OutputError) / claim_name(name)
-        self._known: dict[str, Any] = {
+        self._fields: dict[str, Any] = {
             "owner": uuid4().hex,
             "batch": batch,
             "host": socket.gethostname(),
@@ -72,16 +72,16 @@ class Claim:
             content = self._object.read()
             if content is None:
                 continue
-            held = _parse(content)
-            if held.get("owner") == self._known["owner"]:
+            other = _parse(content)
+            if other.get("owner") == self._fields["owner"]:
                 return True  # it was created, but the answer was lost
-            if held.get("batch") == self._known["batch"] or self._is_stale(content, held):
+            if other.get("batch") == self._fields["batch"] or self._is_stale(content, other):
                 self._object.write(self._content())
                 return False
         return True
 
-    def _is_stale(self, content: bytes, held: dict[str, Any]) -> bool:
-        """Return whether a claim stays unchanged; False if it disappears.
+    def _is_stale(self, content: bytes, other: dict[str, Any]) -> bool:
+        """Return whether another claim stays unchanged; False if it disappears.
 
         Raises
         ------
@@ -90,22 +90,22 @@ class Claim:
         waited = 0.0
         while waited < _STALE_S:
             stopping.check()
-            Event().wait(_LOOK_S)
-            waited += _LOOK_S
+            Event().wait(_POLL_S)
+            waited += _POLL_S
             now = self._object.read()
             if now is None:
                 return False
             if now != content:
-                owner = f"process {held.get('process')} on {held.get('host')}"
+                owner = f"process {other.get('process')} on {other.get('host')}"
                 msg = f"{self._url}: another run is writing there: {owner}"
                 raise OutputError(msg)
         return True
 
     def _content(self) -> bytes:
-        return json.dumps(self._known).encode()
+        return json.dumps(self._fields).encode()
 
     def _is_held(self) -> bool:
-        return bool(_parse(self._object.read() or b"").get("owner") == self._known["owner"])
+        return bool(_parse(self._object.read() or b"").get("owner") == self._fields["owner"])
 
     def require(self) -> None:
         """Check that no other process has taken over the folder.
@@ -118,12 +118,12 @@ class Claim:
             msg = f"{self._url}: another run has taken over, since this one did not renew its claim"
             raise OutputError(msg)
 
-    def beat(self) -> bool:
+    def renew(self) -> bool:
         """Rewrite the claim; return False if another process has taken it over."""
-        with suppress(ShapecatError):  # the next beat may reach the storage
+        with suppress(ShapecatError):  # the next heartbeat may reach the storage
             if not self._is_held():
                 return False
-            self._known["beat"] += 1
+            self._fields["beat"] += 1
             self._object.write(self._content())
         return True
 
@@ -148,11 +148,11 @@ def claimed(url: str, batch: str) -> Iterator[Claim]:
     """
     claim, ended = Claim(url, batch), Event()
 
-    def beat() -> None:
-        while not ended.wait(_BEAT_S) and claim.beat():
+    def renew() -> None:
+        while not ended.wait(_HEARTBEAT_S) and claim.renew():
             pass
 
-    thread = Thread(target=beat, daemon=True)
+    thread = Thread(target=renew, daemon=True)
     thread.start()
     try:
         yield claim
@@ -164,6 +164,6 @@ def claimed(url: str, batch: str) -> Iterator[Claim]:
 
 def _parse(content: bytes) -> dict[str, Any]:
     with suppress(ValueError):
-        known = json.loads(content)
-        return known if isinstance(known, dict) else {}
+        fields = json.loads(content)
+        return fields if isinstance(fields, dict) else {}
     return {}

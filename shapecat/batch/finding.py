@@ -20,11 +20,11 @@ __all__ = ["SearchResult", "Source", "find_recordings", "stat_url"]
 
 _log = logging.getLogger(__name__)
 
-SUFFIXES = {".mcap", ".bag", ".db3"}
+_SUFFIXES = {".mcap", ".bag", ".db3"}
 _GAP_NS = 10**10
 """The longest time between the parts of a bag; takes are farther apart, or overlap."""
-_PACKED = {".zst", ".zstd", ".gz", ".bz2", ".xz", ".lz4", ".zip"}
-_UNPACK = "skipped: a compressed file, unpack it first"
+_COMPRESSED = {".zst", ".zstd", ".gz", ".bz2", ".xz", ".lz4", ".zip"}
+_COMPRESSED_HINT = "skipped: a compressed file, unpack it first"
 _MAGIC = (b"\x89MCAP", b"#ROSBAG", b"SQLite format 3")
 _BAG_KEY = b"rosbag2_bagfile_information:"
 """The first line of a bag's metadata.yaml; data sets have files of this name, too."""
@@ -66,9 +66,11 @@ def find_recordings(sources: Sequence[str]) -> SearchResult:
     ------
     RecordingError : no recording was found.
     """
-    remote = {found.url: found for source in sources if is_url(source) for found in _at(source)}
-    paths, skipped = _find_paths([Path(source) for source in sources if not is_url(source)])
-    found = [_of_path(path) for path in paths] + list(remote.values())
+    remote = {
+        found.url: found for source in sources if is_url(source) for found in _search_url(source)
+    }
+    local, skipped = _search_paths([Path(source) for source in sources if not is_url(source)])
+    found = [_of_path(path, real) for real, path in local.items()] + list(remote.values())
     if not found:
         named = " ".join(sources[:3])
         msg = f"{named}: no recording found; expected .mcap, .bag or .db3 files, or a ROS 2 bag"
@@ -76,18 +78,17 @@ def find_recordings(sources: Sequence[str]) -> SearchResult:
     return SearchResult(found, skipped)
 
 
-def _of_path(path: Path) -> Source:
-    whole = _whole(path)
-    return Source(str(path), "", whole.name if path.is_dir() else path.stem, whole.parent.name)
+def _of_path(path: Path, real: Path) -> Source:
+    return Source(str(path), "", real.name if path.is_dir() else path.stem, real.parent.name)
 
 
 def _of_url(url: str, key: str = "", size: int = 0) -> Source:
     pure = PurePosixPath(url.partition("://")[2].partition("?")[0])
-    stem = pure.stem if _named_like_one(pure.name) else pure.name
+    stem = pure.stem if _has_recording_suffix(pure.name) else pure.name
     return Source("", url, stem, pure.parent.name, key, size)
 
 
-def _at(url: str) -> list[Source]:
+def _search_url(url: str) -> list[Source]:
     """Return the recordings that match a URL pattern or are below a folder, or the URL itself.
 
     Raises
@@ -99,12 +100,12 @@ def _at(url: str) -> list[Source]:
         found = [
             _of_url(name, content_key(info), _size(info))
             for name, info in location.matches()
-            if _named_like_one(name)
+            if _has_recording_suffix(name)
         ]
         if found or location.info() is None:  # otherwise a name with brackets
             return sorted(found, key=attrgetter("url"))
     if url.endswith("/"):
-        return sorted(_search_remote(location), key=attrgetter("url"))
+        return sorted(_search_remote_folder(location), key=attrgetter("url"))
     return [_of_url(url)]
 
 
@@ -114,14 +115,14 @@ def stat_url(url: str) -> tuple[str, int]:
     with suppress(RecordingError):  # reported when it is downloaded
         info = location.info()
         if info is not None and info.get("type") == "directory":
-            files = [(content_key(known), _size(known)) for _, known in location.walk()]
-            return _key_of_all(key for key, _ in files), sum(size for _, size in files)
+            files = [(content_key(file), _size(file)) for _, file in location.walk()]
+            return _combined_key(key for key, _ in files), sum(size for _, size in files)
         if info is not None:
             return content_key(info), _size(info)
     return "", 0
 
 
-def _key_of_all(keys: Iterable[str]) -> str:
+def _combined_key(keys: Iterable[str]) -> str:
     return sha256("".join(sorted(keys)).encode()).hexdigest()[:16]
 
 
@@ -129,7 +130,7 @@ def _size(info: Mapping[str, Any]) -> int:
     return int(info.get("size") or 0)
 
 
-def _search_remote(location: Location) -> Iterator[Source]:
+def _search_remote_folder(location: Location) -> Iterator[Source]:
     """Yield the recordings and ROS 2 bag folders below a folder."""
     files: list[Source] = []
     bags, runs = set(), set()
@@ -139,40 +140,38 @@ def _search_remote(location: Location) -> Iterator[Source]:
             bags.add(parent)
         elif name in {"run.json", "frames.parquet"}:
             runs.add(parent)
-        elif (_named_like_one(name) or _is_packed(name)) and "/." not in url:
+        elif (_has_recording_suffix(name) or _is_compressed(name)) and "/." not in url:
             files.append(_of_url(url, content_key(info), _size(info)))
     parts: dict[str, list[Source]] = {bag: [] for bag in bags}
     for file in files:
         parent = file.url.rpartition("/")[0]
         if parent in bags:
             parts[parent].append(file)
-        elif parent not in runs and _is_packed(file.url):
-            _log.error("%s: %s", file.url, _UNPACK)
+        elif parent not in runs and _is_compressed(file.url):
+            _log.error("%s: %s", file.url, _COMPRESSED_HINT)
         elif parent not in runs:
             yield file
     for bag, found in parts.items():
         if found:
-            yield _of_url(bag, _key_of_all(f.key for f in found), sum(f.bytes for f in found))
+            yield _of_url(bag, _combined_key(f.key for f in found), sum(f.bytes for f in found))
 
 
-def _find_paths(sources: Sequence[Path]) -> tuple[list[Path], int]:
-    if len(sources) == 1 and not _searchable(sources[0]):
-        return list(sources), 0
+def _search_paths(sources: Sequence[Path]) -> tuple[dict[Path, Path], int]:
+    """Return the recordings, by path without links, and the number of files skipped."""
+    folders = {source for source in sources if source.is_dir() and not _is_bag(source)}
+    if len(sources) == 1 and not folders:
+        return {_real_path(sources[0]): sources[0]}, 0
     found: dict[Path, Path] = {}
-    left: set[Path] = set()
+    skipped: set[Path] = set()
     for source in sources:
-        for path in _search(source, set()) if _searchable(source) else [source]:
-            if path.is_file() and not _looks_like_one(path):
-                left.add(_whole(path))
+        for path in _search(source, set()) if source in folders else [source]:
+            if path.is_file() and not _may_be_recording(path):
+                skipped.add(_real_path(path))
             else:
-                found.setdefault(_whole(path), path)
-    bags = {whole for whole, path in found.items() if path.is_dir()}
-    kept = [path for whole, path in found.items() if whole.parent not in bags]
-    return kept, sum(path.parent not in bags for path in left)
-
-
-def _searchable(path: Path) -> bool:
-    return path.is_dir() and not _is_bag(path)
+                found.setdefault(_real_path(path), path)
+    bags = {real for real, path in found.items() if path.is_dir()}
+    kept = {real: path for real, path in found.items() if real.parent not in bags}
+    return kept, sum(real.parent not in bags for real in skipped)
 
 
 def _is_bag(folder: Path) -> bool:
@@ -190,7 +189,7 @@ def _is_bag(folder: Path) -> bool:
     except OSError:  # reported by the search
         return False
     names = {path.name.removesuffix(".zstd") for path in paths if path.is_file()}
-    parts = {name for name in names if PurePosixPath(name).suffix in SUFFIXES}
+    parts = {name for name in names if PurePosixPath(name).suffix in _SUFFIXES}
     first = PurePosixPath(min(parts, default=""))
     if len(parts) == 1 and first.suffix == ".db3":
         return True
@@ -200,9 +199,9 @@ def _is_bag(folder: Path) -> bool:
         return False
     compressed = any(path.suffix == ".zstd" for path in paths)
     return (
-        base == _whole(folder).name
+        base == _real_path(folder).name
         or compressed
-        or _adjoin([folder / name for name in in_sequence])
+        or _follow_in_time([folder / name for name in in_sequence])
     )
 
 
@@ -214,7 +213,7 @@ def _has_bag_metadata(folder: Path) -> bool:
         return False
 
 
-def _adjoin(paths: Sequence[Path]) -> bool:
+def _follow_in_time(paths: Sequence[Path]) -> bool:
     """Return whether recordings follow each other in time without a gap."""
     spans = []
     for path in paths:
@@ -230,10 +229,10 @@ def _search(folder: Path, searched: set[Path]) -> Iterator[Path]:
     No folder is searched twice, so links may form loops. A folder that may not be read, such as
     ``lost+found``, is skipped, and reported.
     """
-    whole = _whole(folder)
-    if whole in searched:
+    real = _real_path(folder)
+    if real in searched:
         return
-    searched.add(whole)
+    searched.add(real)
     try:
         paths = [] if (folder / "run.json").exists() else list(folder.iterdir())
         paths.sort(key=lambda path: (path.is_symlink(), path))
@@ -244,30 +243,30 @@ def _search(folder: Path, searched: set[Path]) -> Iterator[Path]:
     for path, is_folder in found:
         if is_folder and not _is_bag(path):
             yield from _search(path, searched)
-        elif is_folder or _named_like_one(path.name):
+        elif is_folder or _has_recording_suffix(path.name):
             yield path
-        elif _is_packed(path.name):
-            _log.error("%s: %s", path, _UNPACK)
+        elif _is_compressed(path.name):
+            _log.error("%s: %s", path, _COMPRESSED_HINT)
 
 
-def _is_packed(name: str) -> bool:
+def _is_compressed(name: str) -> bool:
     """Return whether a path or URL ends like a compressed recording."""
     path = PurePosixPath(name)
-    return path.suffix.lower() in _PACKED and _named_like_one(path.stem)
+    return path.suffix.lower() in _COMPRESSED and _has_recording_suffix(path.stem)
 
 
-def _whole(path: Path) -> Path:
+def _real_path(path: Path) -> Path:
     """Return the absolute path without links; a link to itself, which `resolve` refuses, stays."""
     return Path(os.path.realpath(path))
 
 
-def _named_like_one(name: str) -> bool:
+def _has_recording_suffix(name: str) -> bool:
     """Return whether a file has the suffix of a recording, or of one whose recorder was killed."""
-    return name.endswith(".bag.active") or PurePosixPath(name).suffix.lower() in SUFFIXES
+    return name.endswith(".bag.active") or PurePosixPath(name).suffix.lower() in _SUFFIXES
 
 
-def _looks_like_one(path: Path) -> bool:
-    if _named_like_one(path.name):
+def _may_be_recording(path: Path) -> bool:
+    if _has_recording_suffix(path.name):
         return True
     try:
         with path.open("rb") as file:

@@ -17,11 +17,13 @@ from shapecat.runs.folder import read_run
 from shapecat.runs.jobs import Job, Summary, summarize
 from shapecat.runs.run_info import RunInfo
 
-__all__ = ["Ledger", "Outcome"]
+__all__ = ["MOST_TRIES", "Ledger", "Outcome"]
 
 _log = logging.getLogger(__name__)
 
-_LINES = 1000
+MOST_TRIES = 2
+"""Attempts at a recording whose workers die, before it is reported as failed."""
+_MOST_LINES = 1000
 """Lines of the manifest written at a time."""
 
 
@@ -41,24 +43,24 @@ class Ledger:
     def __init__(self, manifest: Manifest | None) -> None:
         self._manifest = manifest
         self._lock = Lock()
-        self._open: dict[str, Entry] = {}
+        self._in_progress: dict[str, Entry] = {}
 
-    def plan(self, tasks: Iterable[Task]) -> None:
+    def record_planned(self, tasks: Iterable[Task]) -> None:
         """List the recordings to process in the manifest, except those already listed."""
         entries = (task.entry() for task in tasks if task.status != "complete")
-        new = (entry for entry in entries if not self._has(entry, "planned"))
-        while some := list(islice(new, _LINES)):
+        new = (entry for entry in entries if not self._is_recorded(entry, "planned"))
+        while some := list(islice(new, _MOST_LINES)):
             self._write(some)
 
     def _last_entry(self, folder: str) -> Entry | None:
         return None if self._manifest is None else self._manifest.entries.get(folder)
 
-    def _has(self, entry: Entry, state: State) -> bool:
+    def _is_recorded(self, entry: Entry, state: State) -> bool:
         """Return whether the manifest has the same work of the same command in this state."""
-        known = self._last_entry(entry.folder)
-        return known is not None and known.state == state and known.same_command(entry)
+        last = self._last_entry(entry.folder)
+        return last is not None and last.state == state and last.same_command(entry)
 
-    def known(self, task: Task) -> Outcome:
+    def earlier_outcome(self, task: Task) -> Outcome:
         """Return the outcome of a task that was complete before."""
         job = task.job
         entry = self._last_entry(task.name)
@@ -74,52 +76,48 @@ class Ledger:
             return Outcome(job, message=str(error), code=error.exit_code)
 
     def begin(self, task: Task) -> None:
-        """Note that a recording has been submitted to a worker."""
+        """Follow the attempts at a recording from now on."""
         with self._lock:
-            self._open.setdefault(task.name, replace(task.entry(), tries=1))
+            self._in_progress.setdefault(task.name, replace(task.entry(), tries=1))
 
-    def running(self, name: str) -> None:
+    def record_running(self, name: str) -> None:
         """Record the start of a recording, once per attempt."""
         with self._lock:
-            entry = self._open.get(name)
+            entry = self._in_progress.get(name)
             if entry is not None and entry.state != "running":
-                self._note(entry, state="running")
+                self._record(entry, state="running")
 
-    def lost(self, task: Task, error: BaseException, *, most: int) -> bool:
+    def record_lost(self, task: Task, error: BaseException) -> bool:
         """Record a lost worker; return whether the recording is to be tried again.
 
         An attempt that had not begun when the scheduler was lost does not count.
-
-        Parameters
-        ----------
-        most : largest number of attempts.
         """
         with self._lock:
-            entry = self._open[task.name]
+            entry = self._in_progress[task.name]
             if is_dropped(error) and entry.state != "running":
                 return True
-            if entry.tries < most:
-                self._note(entry, state="planned", tries=entry.tries + 1)
-            return entry.tries < most
+            if entry.tries < MOST_TRIES:
+                self._record(entry, state="planned", tries=entry.tries + 1)
+            return entry.tries < MOST_TRIES
 
-    def ended(self, task: Task, outcome: Outcome) -> None:
+    def record_outcome(self, task: Task, outcome: Outcome) -> None:
         """Record the outcome of a recording."""
         with self._lock:
-            entry, summary = self._open[task.name], outcome.summary
+            entry, summary = self._in_progress[task.name], outcome.summary
             if summary is None:
-                self._note(entry, state="failed", exit_code=outcome.code, message=outcome.message)
-            elif not self._has(entry, "complete"):
-                self._note(
+                self._record(entry, state="failed", exit_code=outcome.code, message=outcome.message)
+            elif not self._is_recorded(entry, "complete"):
+                self._record(
                     entry,
                     state="complete",
                     seconds=round(summary.seconds, 3),
                     frames=summary.counts["frames"],
                     tracks=summary.counts["tracks"],
                 )
-            del self._open[task.name]
+            del self._in_progress[task.name]
 
-    def _note(self, entry: Entry, **changes: Any) -> None:
-        new = self._open[entry.folder] = replace(entry, **changes)
+    def _record(self, entry: Entry, **changes: Any) -> None:
+        new = self._in_progress[entry.folder] = replace(entry, **changes)
         self._write([new])
 
     def _write(self, entries: Sequence[Entry]) -> None:

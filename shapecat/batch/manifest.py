@@ -36,9 +36,9 @@ MANIFEST = "manifest.jsonl"
 
 _log = logging.getLogger(__name__)
 
-_PARTS = ".manifest"
+_PART_FOLDER = ".manifest"
 _PART_BYTES = 2**20
-_MOST_BYTES = 8 * 2**20
+_MOST_WAITING_BYTES = 8 * 2**20
 """Lines are sent at once when more than this are waiting."""
 _SEND_S = 5.0
 """Time between two transmissions of lines."""
@@ -90,7 +90,7 @@ class Manifest:
         self.path = path
         self.entries: dict[str, Entry] = {}
         with suppress(OSError), path.open("rb") as file:  # reported when it is written to
-            self._take(file)
+            self._merge(file)
 
     def __enter__(self) -> Self:
         return self
@@ -98,7 +98,7 @@ class Manifest:
     def __exit__(self, *error: object) -> None:
         """Finish writing."""
 
-    def _take(self, lines: Iterable[bytes]) -> None:
+    def _merge(self, lines: Iterable[bytes]) -> None:
         for entry in filter(None, map(_parse, lines)):
             self.entries[entry.folder] = entry
 
@@ -142,14 +142,14 @@ class RemoteManifest(Manifest):
         """
         self.entries = {}
         place = Location(url, OutputError)
-        self._whole = place / (f"manifest-{shard}.jsonl" if shard else MANIFEST)
-        self._parts = place / _PARTS / (shard or "all")
-        self._writer, self._count = f"{datetime.now(UTC):%Y%m%dT%H%M%S}-{uuid4().hex[:8]}", 0
-        self._part, self._sent = bytearray(), 0
+        self._summary = place / (f"manifest-{shard}.jsonl" if shard else MANIFEST)
+        self._parts = place / _PART_FOLDER / (shard or "all")
+        self._writer, self._part_number = f"{datetime.now(UTC):%Y%m%dT%H%M%S}-{uuid4().hex[:8]}", 0
+        self._part, self._sent_bytes = bytearray(), 0
         self._lock, self._sending, self._ended = Lock(), Lock(), Event()
-        self._seen: dict[str, str] = {}
+        self._part_keys: dict[str, str] = {}
         self._read_parts()
-        self._thread = Thread(target=self._send_now_and_then, daemon=True)
+        self._thread = Thread(target=self._send_periodically, daemon=True)
 
     def __enter__(self) -> Self:
         self._thread.start()
@@ -161,9 +161,9 @@ class RemoteManifest(Manifest):
         self._thread.join()
         try:
             self.send()
-            if self._count or self._part:
+            if self._part_number or self._part:
                 self._read_parts()
-                self._whole.write(b"".join(map(_line, self.entries.values())))
+                self._summary.write(b"".join(map(_line, self.entries.values())))
         except ShapecatError as failure:
             _log.error("%s", failure)
 
@@ -171,22 +171,22 @@ class RemoteManifest(Manifest):
         """Read parts of other writers that are new or have changed."""
         for url, info in self._parts.walk(deep=False):
             name, key = url.rpartition("/")[2], content_key(info)
-            if not name.startswith(self._writer) and self._seen.get(name) != key:
-                self._seen[name] = key
-                self._take(((self._parts / name).read() or b"").splitlines())
+            if not name.startswith(self._writer) and self._part_keys.get(name) != key:
+                self._part_keys[name] = key
+                self._merge(((self._parts / name).read() or b"").splitlines())
 
-    def _take(self, lines: Iterable[bytes]) -> None:
+    def _merge(self, lines: Iterable[bytes]) -> None:
         """Keep the later of two entries, since several writers may work at the same time."""
         for entry in filter(None, map(_parse, lines)):
-            known = self.entries.get(entry.folder)
-            if known is None or known.time <= entry.time:
+            last = self.entries.get(entry.folder)
+            if last is None or last.time <= entry.time:
                 self.entries[entry.folder] = entry
 
     def _append(self, lines: bytes) -> None:
         with self._lock:
             self._part += lines
-            much = len(self._part) > _MOST_BYTES
-        if much:
+            is_large = len(self._part) > _MOST_WAITING_BYTES
+        if is_large:
             self.send()
 
     def send(self) -> None:
@@ -199,17 +199,17 @@ class RemoteManifest(Manifest):
         with self._sending:
             with self._lock:
                 content = bytes(self._part)
-            if len(content) == self._sent:
+            if len(content) == self._sent_bytes:
                 return
-            (self._parts / f"{self._writer}-{self._count:06}.jsonl").write(content)
-            self._sent = len(content)
-            if self._sent >= _PART_BYTES:
+            (self._parts / f"{self._writer}-{self._part_number:06}.jsonl").write(content)
+            self._sent_bytes = len(content)
+            if self._sent_bytes >= _PART_BYTES:
                 with self._lock:
-                    del self._part[: self._sent]
-                self._count += 1
-                self._sent = 0
+                    del self._part[: self._sent_bytes]
+                self._part_number += 1
+                self._sent_bytes = 0
 
-    def _send_now_and_then(self) -> None:
+    def _send_periodically(self) -> None:
         while not self._ended.wait(_SEND_S):
             with suppress(ShapecatError):  # reported at the end if it persists
                 self.send()
@@ -239,35 +239,32 @@ def entries_at(url: str) -> dict[str, Entry]:
     OutputError : the storage cannot be read.
     """
     entries: dict[str, Entry] = {}
-    for shard in sorted((Location(url, OutputError) / _PARTS).names()):
+    for shard in sorted((Location(url, OutputError) / _PART_FOLDER).names()):
         entries |= RemoteManifest(url, shard).entries
     return entries
 
 
 def _line(entry: Entry) -> bytes:
     values = ((name, getattr(entry, name)) for name in _NAMES)
-    known = {name: value for name, value in values if value is not None and value != ""}
-    return json.dumps(known, ensure_ascii=False).encode("utf-8", "surrogatepass") + b"\n"
+    present = {name: value for name, value in values if value is not None and value != ""}
+    return json.dumps(present, ensure_ascii=False).encode("utf-8", "surrogatepass") + b"\n"
 
 
 def _parse(line: bytes) -> Entry | None:
     """Return the entry of a line, or None if the line is incomplete or not an entry."""
     try:
         values = json.loads(line)
-        entry = Entry(**{name: _shared(name, value) for name, value in values.items()})
+        entry = Entry(**{name: _interned(name, value) for name, value in values.items()})
     except (ValueError, TypeError, AttributeError, RecursionError):
         return None
-    known = isinstance(values["folder"], str) and entry.state in get_args(State)
-    return entry if known else None
+    is_valid = isinstance(values["folder"], str) and entry.state in get_args(State)
+    return entry if is_valid else None
 
 
-def _shared(name: str, value: Any) -> Any:
+def _interned(name: str, value: Any) -> Any:
     """Intern a value that many entries have in common, to save memory."""
-    return (
-        sys.intern(value)
-        if name in {"state", "work", "command"} and isinstance(value, str)
-        else value
-    )
+    is_shared = name in {"state", "work", "command"} and isinstance(value, str)
+    return sys.intern(value) if is_shared else value
 
 
 @contextmanager

@@ -16,21 +16,23 @@ from shapecat.batch.storage import Location, is_url
 from shapecat.errors import ShapecatError
 from shapecat.runs.folder import read_run
 
-__all__ = ["known_names", "name_folders"]
+__all__ = ["existing_names", "name_folders"]
 
 _NUMBER = re.compile(r"_\d+$")
 
 
 def name_folders(
-    names: Sequence[str], parents: Sequence[str], known: Mapping[int, str] = MappingProxyType({})
+    names: Sequence[str],
+    parents: Sequence[str],
+    existing: Mapping[int, str] = MappingProxyType({}),
 ) -> list[str]:
-    """Return a unique run folder name for each recording: its own name without suffix.
+    """Return a unique run folder name for each recording: its file name without suffix.
 
     Recordings with the same name get the name of their parent folder in front, then a number.
 
     Parameters
     ----------
-    known : the names that some recordings, by index, already have.
+    existing : the names that some recordings, by index, already have.
 
     Examples
     --------
@@ -40,11 +42,11 @@ def name_folders(
     ['x', 'b_x', 'y']
     """
     counts = Counter(names)
-    taken = set(known.values())
+    taken = set(existing.values())
     folders = []
     for k, (name, parent) in enumerate(zip(names, parents, strict=True)):
-        if k in known:
-            folders.append(known[k])
+        if k in existing:
+            folders.append(existing[k])
             continue
         unique = name if counts[name] == 1 else f"{parent}_{name}"
         numbered = (f"{unique}_{number}" for number in count(k + 1))
@@ -54,41 +56,41 @@ def name_folders(
     return folders
 
 
-def known_names(sources: Sequence[Source], out: str, there: set[str]) -> dict[int, str]:
+def existing_names(sources: Sequence[Source], out: str, listing: set[str]) -> dict[int, str]:
     """Return the names of the run folders that recordings, by index, already have in ``out``.
 
-    A recording that comes to a batch later, or is processed alone, must not rename a run. Those
-    whose own name no other recording shares, and is in ``out``, are left out.
+    A recording that comes to a batch later, or is processed alone, must not rename a run. Left out
+    are recordings whose name is in ``out`` and shared by no other recording.
 
     Parameters
     ----------
-    there : the names in ``out``.
+    listing : the names in ``out``.
     """
     counts = Counter(source.stem for source in sources)
-    unsure = {
+    ambiguous = {
         source.url or os.path.realpath(source.path): k
         for k, source in enumerate(sources)
-        if counts[source.stem] > 1 or source.stem not in there
+        if counts[source.stem] > 1 or source.stem not in listing
     }
-    named = [sources[k] for k in unsure.values()]
-    own = {name for source in named for name in (source.stem, f"{source.parent}_{source.stem}")}
-    found = sorted(name for name in there if name in own or _NUMBER.sub("", name) in own)
-    entries = entries_at(out) if found and is_url(out) else {}
-    known: dict[int, str] = {}
-    for name in found:
-        k = unsure.get(_recording_of(out, name, entries.get(name)))
+    some = [sources[k] for k in ambiguous.values()]
+    possible = {name for s in some for name in (s.stem, f"{s.parent}_{s.stem}")}
+    folders = sorted(n for n in listing if n in possible or _NUMBER.sub("", n) in possible)
+    entries = entries_at(out) if folders and is_url(out) else {}
+    existing: dict[int, str] = {}
+    for folder in folders:
+        k = ambiguous.get(_recording_of(out, folder, entries.get(folder)))
         if k is not None:
-            known.setdefault(k, name)
-    return known
+            existing.setdefault(k, folder)
+    return existing
 
 
 def _recording_of(out: str, name: str, entry: Entry | None) -> str:
     """Return the path or URL of the recording of a run; empty if there is no readable run."""
-    noted = entry.recording if entry is not None else ""
-    if is_url(noted):
-        return noted
-    if Path(noted).is_absolute():  # other paths depend on the current folder
-        return os.path.realpath(noted)
+    recording = entry.recording if entry is not None else ""
+    if is_url(recording):
+        return recording
+    if Path(recording).is_absolute():  # other paths depend on the current folder
+        return os.path.realpath(recording)
     with suppress(ShapecatError, ValueError, LookupError, TypeError):
         if not is_url(out):
             return read_run(Path(out, name))["input"]["path"]

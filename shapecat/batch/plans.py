@@ -15,7 +15,7 @@ from uuid import uuid4
 from shapecat.batch.claims import claim_name
 from shapecat.batch.finding import Source, find_recordings, stat_url
 from shapecat.batch.manifest import Entry, Manifest, open_manifest
-from shapecat.batch.naming import known_names, name_folders
+from shapecat.batch.naming import existing_names, name_folders
 from shapecat.batch.storage import Location, is_url
 from shapecat.errors import ConfigError, OutputError
 from shapecat.learning import load_model
@@ -32,7 +32,7 @@ __all__ = [
     "plan_batch",
 ]
 
-_Named = tuple[str, Source]
+_NamedSource = tuple[str, Source]
 
 _THREADS = 16
 """Threads that check files: on a network disk each check is a round trip."""
@@ -48,7 +48,7 @@ class Task:
 
     Attributes
     ----------
-    like : a job with the options that all tasks share.
+    template : a job with the options that all tasks share.
     out : folder or URL of the batch; ``name`` is the run folder in it.
     path, url : the recording; one of them is empty.
     status : ``complete`` according to the manifest; ``resume`` if a run was interrupted; ``retry``
@@ -59,7 +59,7 @@ class Task:
     command : identifies a command that overwrites; empty for others.
     """
 
-    like: Job
+    template: Job
     out: str
     name: str
     path: str
@@ -80,7 +80,7 @@ class Task:
         """The job that processes the recording."""
         at_url = is_url(self.out)
         return dataclasses.replace(
-            self.like,
+            self.template,
             source=Path(self.path),
             folder=Path(self.name) if at_url else Path(self.out, self.name),
             origin=self.url,
@@ -124,7 +124,7 @@ class Shard:
             raise ConfigError(msg)
         return cls(index % count, count)
 
-    def of(self, named: Sequence[_Named]) -> list[_Named]:
+    def of(self, named: Sequence[_NamedSource]) -> list[_NamedSource]:
         """Return the recordings of this shard; all shards are disjoint and cover the list.
 
         Examples
@@ -169,12 +169,12 @@ def plan_batch(
     """
     part = Shard.parse(shard) if shard is not None else None
     found = find_recordings(sources)
-    there = Location(out, OutputError).names() if is_url(out) else _names_in(Path(out))
-    known = known_names(found.sources, out, there)
-    names = name_folders([s.stem for s in found.sources], [s.parent for s in found.sources], known)
+    listing = Location(out, OutputError).names() if is_url(out) else _names_in(Path(out))
+    stems, parents = [s.stem for s in found.sources], [s.parent for s in found.sources]
+    names = name_folders(stems, parents, existing_names(found.sources, out, listing))
     named = list(zip(names, found.sources, strict=True))
     with open_manifest(out, shard=shard) if len(named) > 1 else nullcontext() as manifest:
-        planner = _Planner(job, out, there, manifest)
+        planner = _Planner(job, out, listing, manifest)
         chosen = part.of(named) if part is not None else named
         yield Batch(planner.tasks(chosen), manifest, found.skipped)
 
@@ -182,15 +182,15 @@ def plan_batch(
 class _Planner:
     """Determines the status of each recording, given the names in the folder of results."""
 
-    def __init__(self, job: Job, out: str, there: set[str], manifest: Manifest | None) -> None:
-        self._out, self._there, self._manifest = out, there, manifest
-        asked = manifest is not None or job.model is not None
-        self._model_id = load_model(job.model).model_id if asked else ""
+    def __init__(self, job: Job, out: str, listing: set[str], manifest: Manifest | None) -> None:
+        self._out, self._listing, self._manifest = out, listing, manifest
+        has_model_id = manifest is not None or job.model is not None
+        self._model_id = load_model(job.model).model_id if has_model_id else ""
         self._job = dataclasses.replace(job, model_id=self._model_id)
         self._work = _hash([job.settings.as_dict(), job.selection(), self._model_id])
         self._command = ""
 
-    def tasks(self, named: Sequence[_Named]) -> list[Task]:
+    def tasks(self, named: Sequence[_NamedSource]) -> list[Task]:
         """Return the task of each recording."""
         if self._job.overwrite:
             self._command = _command(
@@ -206,7 +206,7 @@ class _Planner:
         if not key:
             key, size = stat_url(source.url) if source.url else _input_key(Path(source.path))
         task = Task(
-            like=self._job,
+            template=self._job,
             out=self._out,
             name=name,
             path=source.path,
@@ -224,15 +224,15 @@ class _Planner:
 
     def _status(self, task: Task) -> Status:
         entry, overwrite = self._entry(task.name), self._job.overwrite
-        there = task.name in self._there
-        if there and entry is not None and entry.state == "complete":
+        exists = task.name in self._listing
+        if exists and entry is not None and entry.state == "complete":
             same = entry.same_command if overwrite else entry.same_work
             if same(task.entry()) and _is_wanted_run(task, self._model_id):
                 return "complete"
         in_progress = {partial_path(Path(task.name)).name, claim_name(task.name)}
-        if (overwrite or not there) and not self._there.isdisjoint(in_progress):
+        if (overwrite or not exists) and not self._listing.isdisjoint(in_progress):
             return "resume"
-        if there and not overwrite:
+        if exists and not overwrite:
             return "check"
         return "retry" if entry is not None and entry.state == "failed" else "new"
 
@@ -243,14 +243,14 @@ def _command(job: Job, work: str, entries: Iterable[Entry | None]) -> str:
     ``entries`` are those of its recordings.
     """
     kind = "discard-labels" if job.discard_labels else "overwrite"
-    begun = [
+    unfinished = [
         entry
         for entry in entries
         if entry is not None
         and (entry.work, entry.command.partition(":")[0]) == (work, kind)
         and entry.state in {"planned", "running"}
     ]
-    last = max(begun, key=lambda entry: entry.time, default=None)
+    last = max(unfinished, key=lambda entry: entry.time, default=None)
     return f"{kind}:{uuid4().hex[:8]}" if last is None else last.command
 
 
@@ -276,13 +276,13 @@ def _is_wanted_run(task: Task, model_id: str) -> bool:
         return False
     outputs = [name for option, name in OUTPUT_OPTIONS.items() if getattr(job, option)]
     topics = [topic.strip("/") for topic in run["options"]["topics"]]  # those that were chosen
-    others = {"topics", *OUTPUT_OPTIONS}
-    given = {name: value for name, value in job.selection().items() if name not in others}
+    compared_apart = {"topics", *OUTPUT_OPTIONS}
+    options = {name: value for name, value in job.selection().items() if name not in compared_apart}
     return (
         all(name in run["seconds"] and (job.folder / name).exists() for name in outputs)
         and run["settings"] == job.settings.as_dict()
         and run["model"]["id"] == model_id
-        and given.items() <= run["options"].items()
+        and options.items() <= run["options"].items()
         and (not job.topics or topics == [topic.strip("/") for topic in job.topics])
     )
 
@@ -290,10 +290,10 @@ def _is_wanted_run(task: Task, model_id: str) -> bool:
 def _input_key(source: Path) -> tuple[str, int]:
     """Return a key of a recording's files, from names, sizes and times, and their total bytes."""
     try:
-        known = file_stats(source)
+        stats = file_stats(source)
     except OSError:
         return "", 0
-    return _hash(known), sum(size for _, size, *_ in known)
+    return _hash(stats), sum(size for _, size, *_ in stats)
 
 
 def _hash(value: object) -> str:

@@ -21,14 +21,14 @@ from shapecat.runs.run_info import OriginInfo, RunInfo
 from shapecat.system.files import scratch_folder
 from shapecat.system.progress import Observer
 
-__all__ = ["Ticket", "process_remote", "upload"]
+__all__ = ["TaskKey", "process_remote", "upload"]
 
 _PREVIOUS = tuple(name for name in RUN_FILES if name not in {*OUTPUTS, "report.html"})
 """Files of the previous run from which labels are transferred to a new run; run.json last."""
 
 
 @dataclass(frozen=True)
-class Ticket:
+class TaskKey:
     """Identifies the work of a task, so that it is not done twice.
 
     ``batch`` identifies the command that sent the task. ``input`` changes with the content of the
@@ -39,12 +39,12 @@ class Ticket:
     input: str = ""
     work: str = ""
 
-    def made(self, run: RunInfo) -> bool:
+    def matches(self, run: RunInfo) -> bool:
         """Return whether a run was made from the same input and work."""
         return bool(self.input and self.work) and run.get("origin") == self._origin()
 
-    def note(self, folder: Path) -> None:
-        """Add input and work to run.json as its ``origin``.
+    def write_to(self, folder: Path) -> None:
+        """Add input and work to the run.json in a folder, as its ``origin``.
 
         Raises
         ------
@@ -58,7 +58,7 @@ class Ticket:
         return {"input": self.input, "work": self.work}
 
 
-def process_remote(job: Job, observe: Observer, *, cores: int, ticket: Ticket) -> Summary:
+def process_remote(job: Job, observe: Observer, *, cores: int, key: TaskKey) -> Summary:
     """Download the recording of a job, process it, and upload the results.
 
     Raises
@@ -66,22 +66,22 @@ def process_remote(job: Job, observe: Observer, *, cores: int, ticket: Ticket) -
     RecordingError, NoStreamError, ModelError : as for `process`.
     OutputError : the storage is not writable, or another process works on the run folder.
     """
-    claim = claimed(job.target, ticket.batch) if job.target else nullcontext()
-    with scratch_folder() as folder, claim as held:
+    claiming = claimed(job.target, key.batch) if job.target else nullcontext()
+    with scratch_folder() as folder, claiming as claim:
         local = job
         if job.target:
             local, run = _fetch_run(
                 dataclasses.replace(job, folder=folder / "output" / job.folder.name)
             )
-            if run is not None and not local.overwrite and ticket.made(run):
+            if run is not None and not local.overwrite and key.matches(run):
                 return summarize(job, run, processed=False)
         if job.origin:
             (folder / "input").mkdir()
             local = dataclasses.replace(local, source=_download(job.origin, folder / "input"))
         summary = _process(job, local, observe, cores)
-        if held is not None and summary.processed:
-            ticket.note(local.folder)
-            upload(local.folder, job.target, held)
+        if claim is not None and summary.processed:
+            key.write_to(local.folder)
+            upload(local.folder, job.target, claim)
     return dataclasses.replace(summary, folder=job.folder)
 
 
@@ -99,10 +99,10 @@ def _download(url: str, folder: Path) -> Path:
     target = folder / PurePosixPath(url.partition("?")[0].rstrip("/")).name
     Location(url).download(target)
     if target.suffix.lower() == ".db3" and target.is_file() and "?" not in url:
-        log, there = Location(f"{url}-wal"), None  # of a recorder that was killed
+        log, info = Location(f"{url}-wal"), None  # of a recorder that was killed
         with suppress(RecordingError):  # where listing is forbidden, so is asking for a missing one
-            there = log.info()
-        if there is not None:
+            info = log.info()
+        if info is not None:
             log.download(target.with_name(f"{target.name}-wal"))
     return target
 
@@ -120,22 +120,21 @@ def _fetch_run(job: Job) -> tuple[Job, RunInfo | None]:
     OutputError : the target holds files that shapecat did not write.
     """
     place = Location(job.target, OutputError)
-    if "run.json" not in _require_ours(place):
-        place, job = _replaced(place), dataclasses.replace(job, overwrite=True)
+    if "run.json" not in _require_run_folder(place):
+        place, job = _previous_location(place), dataclasses.replace(job, overwrite=True)
     content = (place / "run.json").read()
     if content is None:
         return job, None
     job.folder.mkdir(parents=True)
     (job.folder / "run.json").write_bytes(content)
     for name in _PREVIOUS[:-1] if job.overwrite else ():
-        previous = (place / name).read()
-        if previous is not None:
-            (job.folder / name).write_bytes(previous)
+        if (labels := (place / name).read()) is not None:
+            (job.folder / name).write_bytes(labels)
     require_ours(job.folder)
     return job, read_run(job.folder)
 
 
-def _require_ours(place: Location) -> set[str]:
+def _require_run_folder(place: Location) -> set[str]:
     """Return the names in a run folder.
 
     Raises
@@ -153,7 +152,7 @@ def _is_of_run(name: str) -> bool:
     return name in RUN_FILES or fnmatchcase(name, LOST)
 
 
-def _replaced(place: Location) -> Location:
+def _previous_location(place: Location) -> Location:
     """Return where a run is kept while a new one replaces it."""
     parent, _, name = place.url.rstrip("/").rpartition("/")
     return Location(f"{parent}/.{name}.old", OutputError)
@@ -162,7 +161,7 @@ def _replaced(place: Location) -> Location:
 def upload(folder: Path, url: str, claim: Claim) -> None:
     """Upload a run folder, frames.parquet first and run.json last.
 
-    One of them shows a search for recordings that annotated.mcap is none.
+    So a search for recordings always sees one of them, and does not take annotated.mcap for one.
 
     Raises
     ------
@@ -170,22 +169,22 @@ def upload(folder: Path, url: str, claim: Claim) -> None:
         another process has taken it over.
     """
     place = Location(url, OutputError)
-    old = _replaced(place)
-    names = _require_ours(place)
+    previous = _previous_location(place)
+    names = _require_run_folder(place)
     if claim.inherited:
         place.abort_uploads()
     claim.require()
     if "run.json" in names:
         for name in _PREVIOUS:
             if name in names:
-                (place / name).copy(old / name)
+                (place / name).copy(previous / name)
         (place / "run.json").remove()
-    sent = sorted(path.name for path in folder.iterdir() if _is_of_run(path.name))
-    for name in sorted(sent, key=lambda name: (name == "run.json", name != "frames.parquet")):
+    sent = {path.name for path in folder.iterdir() if _is_of_run(path.name)}
+    for name in sorted(sent, key=lambda name: (name == "run.json", name != "frames.parquet", name)):
         if name == "run.json":
             claim.require()
         (place / name).upload(folder / name)
-    for name in (set(RUN_FILES) - set(sent)) & names:
+    for name in (set(RUN_FILES) - sent) & names:
         (place / name).remove()
-    for name in old.names():
-        (old / name).remove()
+    for name in previous.names():
+        (previous / name).remove()

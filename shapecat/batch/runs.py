@@ -10,10 +10,10 @@ from typing import Any
 from uuid import uuid4
 
 from shapecat import __version__
-from shapecat.batch.ledger import Ledger, Outcome
+from shapecat.batch.ledger import MOST_TRIES, Ledger, Outcome
 from shapecat.batch.manifest import Manifest
 from shapecat.batch.plans import Task
-from shapecat.batch.remote import Ticket, process_remote
+from shapecat.batch.remote import TaskKey, process_remote
 from shapecat.errors import ShapecatError
 from shapecat.executors import ProgressReceiver, is_lost, send_progress
 from shapecat.pipeline import process
@@ -25,17 +25,14 @@ __all__ = ["attempt", "process_here", "process_on"]
 
 _log = logging.getLogger(__name__)
 
-_TRIES = 2
-"""Attempts at a recording whose workers die, before it is reported as failed."""
-_AHEAD = 1000
+_MOST_SUBMITTED = 1000
 """Recordings submitted to an executor at a time, so that a scheduler need not hold them all."""
 _REPORT_S = 0.2
 """Shortest time between progress reports of a worker in one phase."""
-_HEED_S = 0.1
+_POLL_S = 0.1
 """Time between two checks for signals while waiting for workers."""
 
-
-_Ended = tuple[Task, Future[Outcome]]
+_Finished = tuple[Task, Future[Outcome]]
 _Report = Callable[[str, str, int, int | None], None]
 """Called with the run folder of a recording, its phase, the frames done, and the total (None if
 unknown), possibly from several threads."""
@@ -57,7 +54,7 @@ def process_here(
     Stopped : a signal asked the process to stop.
     """
     ledger, batch = Ledger(manifest), uuid4().hex
-    ledger.plan(tasks)
+    ledger.record_planned(tasks)
     for task in tasks:
         stopping.check()
 
@@ -65,12 +62,12 @@ def process_here(
             report(name, phase, done, total)
 
         if task.status == "complete":
-            outcome = ledger.known(task)
+            outcome = ledger.earlier_outcome(task)
         else:
             ledger.begin(task)
-            ledger.running(task.name)
-            outcome = attempt(task.job, observe, cores=cores, ticket=_ticket(task, batch))
-            ledger.ended(task, outcome)
+            ledger.record_running(task.name)
+            outcome = attempt(task.job, observe, cores=cores, key=_key(task, batch))
+            ledger.record_outcome(task, outcome)
         yield outcome
 
 
@@ -94,11 +91,11 @@ def process_on(
     Stopped : a signal asked the process to stop; running tasks go on until the executor is stopped.
     """
     ledger = Ledger(manifest)
-    ledger.plan(tasks)
+    ledger.record_planned(tasks)
 
     def receive(progress: Any) -> None:
         name, phase, done, total = progress
-        ledger.running(name)
+        ledger.record_running(name)
         report(name, phase, done, total)
 
     with ProgressReceiver(receive) as receiver:
@@ -108,61 +105,64 @@ def process_on(
 def _outcomes(
     executor: Executor, tasks: Sequence[Task], ledger: Ledger, address: str, cores: int
 ) -> Iterator[Outcome]:
-    ended: SimpleQueue[_Ended] = SimpleQueue()
+    finished: SimpleQueue[_Finished] = SimpleQueue()
     batch = uuid4().hex
 
-    def begin(task: Task) -> None:
+    def submit(task: Task) -> None:
         ledger.begin(task)
-        ticket = _ticket(task, batch)
-        future = executor.submit(_attempt_elsewhere, task.job, address, cores, ticket, __version__)
-        future.add_done_callback(lambda done: ended.put((task, done)))
+        key = _key(task, batch)
+        future = executor.submit(_attempt_on_worker, task.job, address, cores, key, __version__)
+        future.add_done_callback(lambda done: finished.put((task, done)))
 
-    yield from (ledger.known(task) for task in tasks if task.status == "complete")
+    yield from (ledger.earlier_outcome(task) for task in tasks if task.status == "complete")
     waiting = [task for task in tasks if task.status != "complete"]
     waiting.sort(key=lambda task: task.bytes)
     running = 0
     while waiting or running:
-        while waiting and running < _AHEAD:
-            begin(waiting.pop())
+        while waiting and running < _MOST_SUBMITTED:
+            submit(waiting.pop())
             running += 1
-        task, future = _next(ended)
+        task, future = _wait_for_next(finished)
         error = CancelledError() if future.cancelled() else future.exception()
-        if error is not None and is_lost(error) and ledger.lost(task, error, most=_TRIES):
-            begin(task)
+        if error is not None and is_lost(error) and ledger.record_lost(task, error):
+            submit(task)
             continue
         running -= 1
-        outcome = future.result() if error is None else _unknown(task.job, error)
-        ledger.ended(task, outcome)
+        outcome = future.result() if error is None else _give_up(task.job, error)
+        ledger.record_outcome(task, outcome)
         yield outcome
 
 
-def _ticket(task: Task, batch: str) -> Ticket:
-    return Ticket(batch, task.input, task.work)
+def _key(task: Task, batch: str) -> TaskKey:
+    return TaskKey(batch, task.input, task.work)
 
 
-def _next(ended: SimpleQueue[_Ended]) -> _Ended:
+def _wait_for_next(finished: SimpleQueue[_Finished]) -> _Finished:
     """Wait for the next finished task; raise `Stopped` at a signal."""
     while True:
         stopping.check()
         with suppress(Empty):
-            return ended.get(timeout=_HEED_S)
+            return finished.get(timeout=_POLL_S)
 
 
-def _unknown(job: Job, error: BaseException) -> Outcome:
+def _failed(job: Job, reason: str) -> Outcome:
+    return Outcome(job, message=f"{job.name}: {reason}", code=1)
+
+
+def _give_up(job: Job, error: BaseException) -> Outcome:
+    kind = type(error).__name__
     if is_lost(error):
-        reason = str(error) or type(error).__name__
-        msg = f"{job.name}: gave up after {_TRIES} tries: {reason}"
-        return Outcome(job, message=msg, code=1)
-    return Outcome(job, message=f"{job.name}: {type(error).__name__}: {error}", code=1)
+        return _failed(job, f"gave up after {MOST_TRIES} tries: {str(error) or kind}")
+    return _failed(job, f"{kind}: {error}")
 
 
-def _attempt_elsewhere(job: Job, address: str, cores: int, ticket: Ticket, version: str) -> Outcome:
+def _attempt_on_worker(job: Job, address: str, cores: int, key: TaskKey, version: str) -> Outcome:
     """Process one job in a worker; refuse a command of another version of shapecat."""
     if version != __version__:
-        what = f"a worker has shapecat {__version__}, this command {version}"
-        return Outcome(job, message=f"{job.name}: {what}; install one version", code=1)
+        versions = f"a worker has shapecat {__version__}, this command {version}"
+        return _failed(job, f"{versions}; install one version")
     logging.basicConfig(level=logging.ERROR, format="%(levelname)s %(message)s")
-    return attempt(job, _reporter(job.folder.name, address), cores=cores, ticket=ticket)
+    return attempt(job, _reporter(job.folder.name, address), cores=cores, key=key)
 
 
 def _reporter(name: str, address: str) -> Observer:
@@ -179,17 +179,17 @@ def _reporter(name: str, address: str) -> Observer:
     return observe
 
 
-def attempt(job: Job, observe: Observer, *, cores: int = 1, ticket: Ticket) -> Outcome:
+def attempt(job: Job, observe: Observer, *, cores: int = 1, key: TaskKey) -> Outcome:
     """Process one job; an error becomes its outcome, and an unexpected one is logged in full.
 
-    ``cores`` is the number of processes that perceive frames; only a job with URLs uses ``ticket``.
+    ``cores`` is the number of processes that perceive frames; only a job with URLs uses ``key``.
     """
     try:
         if job.origin or job.target:
-            return Outcome(job, process_remote(job, observe, cores=cores, ticket=ticket))
+            return Outcome(job, process_remote(job, observe, cores=cores, key=key))
         return Outcome(job, process(job, observe, cores=cores))
     except ShapecatError as error:
         return Outcome(job, message=str(error), code=error.exit_code)
     except Exception as error:  # noqa: BLE001  one bad recording must not stop the others
         _log.exception("%s: this is a bug in shapecat", job.name)
-        return Outcome(job, message=f"{job.name}: {type(error).__name__}: {error}", code=1)
+        return _failed(job, f"{type(error).__name__}: {error}")

@@ -58,9 +58,9 @@ def content_key(info: Mapping[str, Any]) -> str:
     """Return a key that changes with a file's content, from its size and its digest or times."""
     names = _DIGESTS if any(name in info for name in _DIGESTS) else _TIMES
     values = [info[name] for name in names if name in info]
-    known = [v.isoformat() if isinstance(v, datetime) else str(v) for v in values]
-    marks = [info.get("size"), *known]
-    return sha256(repr(marks).encode()).hexdigest()[:16]
+    texts = [v.isoformat() if isinstance(v, datetime) else str(v) for v in values]
+    content = [info.get("size"), *texts]
+    return sha256(repr(content).encode()).hexdigest()[:16]
 
 
 class Location:
@@ -84,12 +84,12 @@ class Location:
     def __truediv__(self, name: str) -> "Location":
         return Location(f"{self.url.rstrip('/')}/{name}", self._error)
 
-    def _retry(self, done: str, call: Callable[[], _T]) -> _T:
+    def _retry(self, participle: str, call: Callable[[], _T]) -> _T:
         """Return the result of a call; repeat the call while it may still succeed.
 
         Raises
         ------
-        ShapecatError : the call failed; ``done`` is the participle for the message ("read").
+        ShapecatError : the call failed; ``participle`` is for the message ("read").
         FileNotFoundError, FileExistsError : raised by the storage.
         """
         for wait_s in (*_WAITS_S, 0.0):
@@ -99,19 +99,19 @@ class Location:
                 raise
             except Exception as error:  # every storage has errors of its own
                 if not wait_s or not _is_transient(error):
-                    raise self._as_error(done, error) from error
+                    raise self._as_error(participle, error) from error
             time.sleep(wait_s * random.uniform(0.5, 1.5))  # noqa: S311  no secret
         raise AssertionError
 
-    def _as_error(self, done: str, error: Exception) -> ShapecatError:
+    def _as_error(self, participle: str, error: Exception) -> ShapecatError:
         reason = " ".join((str(error) or type(error).__name__).split())
-        return self._error(f"{self.url}: cannot be {done}: {reason}")
+        return self._error(f"{self.url}: cannot be {participle}: {reason}")
 
     def info(self) -> Mapping[str, Any] | None:
         """Return size, times and digest of a file, as fsspec names them; None if it is missing."""
         with suppress(FileNotFoundError):
-            known: Mapping[str, Any] = self._retry("read", lambda: self._system.info(self._path))
-            return known
+            info: Mapping[str, Any] = self._retry("read", lambda: self._system.info(self._path))
+            return info
         return None
 
     def read(self) -> bytes | None:
@@ -145,14 +145,14 @@ class Location:
         part = max(_PART_BYTES, -(-size // _MOST_PARTS))
         return {"chunksize": part, "max_concurrency": 2} if self._is_s3() else {}
 
-    def _put(self, done: str, call: Callable[[], Any]) -> None:
+    def _put(self, participle: str, call: Callable[[], Any]) -> None:
         if not self._is_s3():  # S3 would create a bucket with a misspelt name
             parent = self._path.rstrip("/").rpartition("/")[0]
-            self._retry(done, lambda: self._system.makedirs(parent, exist_ok=True))
+            self._retry(participle, lambda: self._system.makedirs(parent, exist_ok=True))
         try:
-            self._retry(done, call)
+            self._retry(participle, call)
         except FileNotFoundError as error:
-            raise self._as_error(done, error) from error
+            raise self._as_error(participle, error) from error
 
     def download(self, target: Path) -> None:
         """Download a file, or a folder with its content.
@@ -207,8 +207,8 @@ class Location:
 
     def matches(self) -> Iterator[tuple[str, Mapping[str, Any]]]:
         """Yield URL and info of the files that match this URL, which is a pattern."""
-        found = self._retry("listed", lambda: self._system.glob(self._path, detail=True))
-        for info in found.values():
+        infos = self._retry("listed", lambda: self._system.glob(self._path, detail=True))
+        for info in infos.values():
             yield self._url_of(info), info
 
     def _url_of(self, info: Mapping[str, Any]) -> str:
@@ -234,7 +234,7 @@ class Location:
             try:
                 page = self._retry("listed", lambda: call("list_objects_v2", **options))
             except FileNotFoundError as error:  # no such bucket; a missing folder is an empty one
-                raise self._as_error(done="listed", error=error) from error
+                raise self._as_error(participle="listed", error=error) from error
             for item in page.get("Contents", ()):
                 yield {**item, "name": f"{bucket}/{item['Key']}", "size": item["Size"]}
             for item in page.get("CommonPrefixes", ()):
@@ -252,9 +252,9 @@ class Location:
         options = {"Bucket": bucket, "Prefix": f"{key}/"}
         begun = self._retry("listed", lambda: call("list_multipart_uploads", **options))
         for upload in begun.get("Uploads", ()):
-            known = {"Bucket": bucket, "Key": upload["Key"], "UploadId": upload["UploadId"]}
+            ids = {"Bucket": bucket, "Key": upload["Key"], "UploadId": upload["UploadId"]}
             with suppress(FileNotFoundError):
-                self._retry("removed", partial(call, "abort_multipart_upload", **known))
+                self._retry("removed", partial(call, "abort_multipart_upload", **ids))
 
     def _is_s3(self) -> bool:
         return "s3" in self._system.protocol
@@ -284,8 +284,8 @@ def _is_transient(error: Exception) -> bool:
     status = getattr(error, "status", None)
     if isinstance(status, int):
         return status == 429 or status >= 500
-    known = (
+    return (
         isinstance(error, TimeoutError | ConnectionError)
         or type(error).__name__ in _TRANSIENT_NAMES
+        or getattr(error, "errno", None) in _TRANSIENT
     )
-    return known or getattr(error, "errno", None) in _TRANSIENT
