@@ -56,7 +56,6 @@ from shapecat.system.progress import Observer, ignore, observed
 
 __all__ = ["annotate", "annotate_again", "process", "track"]
 
-
 _log = logging.getLogger(__name__)
 
 
@@ -100,28 +99,42 @@ def process(job: Job, observe: Observer = ignore, *, cores: int = 1) -> Summary:
             if "perceive" not in run["seconds"]:
                 run = take_over_frames(job.folder, folder, run, job.source, content.result)
             run["color"] = {topic: colour.topic for topic, colour in colours.items()}
-            compiling_s = compile_all(
-                lambda: observe("compile", 0, None), cores=cores, colour=bool(colours)
+            _run_phases(
+                Work(recording, streams, colours, folder, run, job, categorizer, observe, cores),
+                content,
+                begun,
             )
-            content.start()
-            # A kill after the last phase leaves a total.
-            earlier = run["seconds"].pop("total", None) or sum(run["seconds"].values())
-            work = Work(recording, streams, colours, folder, run, job, categorizer, observe, cores)
-            _once("perceive", folder, run, lambda: perceive_all(work))
-            _once("revise", folder, run, lambda: _revise_and_warn(work))
-            identify(run, content)
-            write_run(folder, run)
-            discard_segments(folder)
-            _once("track", folder, run, lambda: track(folder, run, job))
-            for _ in range(2):  # labels may be given while the outputs are written
-                forget_old_labels(folder, run, job)
-                _once("labels", folder, run, lambda: keep_labels(folder, run, job))
-                annotate(folder, recording, run, observe)
-            require_unchanged(folder, run, job.source)
-            run["seconds"]["compile"] = compiling_s
-            run["seconds"]["total"] = earlier + time.perf_counter() - begun
-            write_run(folder, run)
     return summarize(job, run)
+
+
+def _run_phases(work: Work, content: ContentDigest, begun: float) -> None:
+    """Run the phases that an interrupted run has not finished.
+
+    Parameters
+    ----------
+    begun : `time.perf_counter` when the work on the recording began.
+    """
+    folder, run, job, observe = work.folder, work.run, work.job, work.observe
+    compiling_s = compile_all(
+        lambda: observe("compile", 0, None), cores=work.cores, colour=bool(work.colours)
+    )
+    content.start()
+    # A kill after the last phase leaves a total.
+    earlier_s = run["seconds"].pop("total", None) or sum(run["seconds"].values())
+    _once("perceive", folder, run, lambda: perceive_all(work))
+    _once("revise", folder, run, lambda: _revise_and_warn(work))
+    identify(run, content)
+    write_run(folder, run)
+    discard_segments(folder)
+    _once("track", folder, run, lambda: track(folder, run, job))
+    for _ in range(2):  # labels may be given while the outputs are written
+        forget_old_labels(folder, run, job)
+        _once("labels", folder, run, lambda: keep_labels(folder, run, job))
+        annotate(folder, work.recording, run, observe)
+    require_unchanged(folder, run, job.source)
+    run["seconds"]["compile"] = compiling_s
+    run["seconds"]["total"] = earlier_s + time.perf_counter() - begun
+    write_run(folder, run)
 
 
 def _require_begun(job: Job, recording: Recording) -> None:
@@ -150,7 +163,7 @@ def _revise_and_warn(work: Work) -> None:
 
 
 def _once(phase: str, folder: Path, run: RunInfo, work: Callable[[], object]) -> None:
-    """Run a phase unless it is done, and write its duration to run.json."""
+    """Do the work of a phase unless it is done, and write its duration to run.json."""
     if phase in run["seconds"]:
         _log.info("%s: %s is already done", folder, phase)
         return
@@ -178,10 +191,10 @@ def _add_outputs(
     """
     run = read_run(job.folder)
     for option, output in OUTPUT_OPTIONS.items() if not job.target else ():  # at a URL: no tables
-        there = (job.folder / output).exists()
-        planned["options"][option] |= there
+        exists = (job.folder / output).exists()
+        planned["options"][option] |= exists
         run["options"][option] = planned["options"][option]
-        if not there:
+        if not exists:
             run["seconds"].pop(output, None)
     differing = differences(run, planned)
     if not same_content(run["input"], job.source, content.result):
