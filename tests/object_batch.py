@@ -8,9 +8,6 @@ administrator would do. `Report` holds the outcome.
 """
 
 import json
-import os
-import signal
-import socket
 import subprocess
 import sys
 import tempfile
@@ -22,9 +19,9 @@ from pathlib import Path
 from typing import Any
 
 from tests.object_storage import object_storage, requests
+from tests.processes import DaskCluster, free_address
 from tests.scenes import record
 
-QUIET: Any = {"stdout": subprocess.DEVNULL, "stderr": subprocess.DEVNULL}
 IN, OUT = "s3://lab/in", "s3://lab/out"
 FRAMES = 3
 
@@ -45,54 +42,6 @@ class Report:
     made: Counter[str]
     left: list[str]
     refused: int
-
-
-class DaskCluster:
-    """A scheduler and workers, each in its own folder, so that they share no disk."""
-
-    def __init__(self, address: str, folder: Path, workers: int = 2) -> None:
-        """Start the scheduler and the workers."""
-        host = ("--host", "127.0.0.1", "--dashboard-address", "127.0.0.1:0")
-        port = address.rpartition(":")[2]
-        self._processes = [self._start(folder, "scheduler", "--port", port, *host)]
-        self._processes += [
-            self._start(folder / f"worker{k}", "worker", address, "--nthreads", "1", *host)
-            for k in range(workers)
-        ]
-
-    @staticmethod
-    def _start(folder: Path, *arguments: str) -> subprocess.Popen[bytes]:
-        folder.mkdir(parents=True, exist_ok=True)
-        command = [sys.executable, "-m", "dask", *arguments]
-        environment = {**os.environ, "TMPDIR": str(folder), "PYTHONPATH": str(Path.cwd())}
-        return subprocess.Popen(
-            command, cwd=folder, env=environment, start_new_session=True, **QUIET
-        )
-
-    def kill_a_worker(self) -> None:
-        """Kill the process that computes; its nanny starts another."""
-        nanny = self._processes[1].pid
-        for child in children(nanny):
-            if b"spawn_main" in Path(f"/proc/{child}/cmdline").read_bytes():
-                os.kill(child, signal.SIGKILL)
-
-    def kill(self) -> None:
-        """Kill the scheduler and all workers."""
-        for process in self._processes:
-            os.killpg(process.pid, signal.SIGKILL)
-            process.wait()
-
-
-def children(process: int) -> list[int]:
-    """Return the child processes of a process."""
-    threads = Path(f"/proc/{process}/task").glob("*/children")
-    return [int(pid) for thread in threads for pid in thread.read_text().split()]
-
-
-def free_address() -> str:
-    """Return an address that a scheduler can listen at."""
-    with socket.create_server(("127.0.0.1", 0)) as server:
-        return f"tcp://127.0.0.1:{server.getsockname()[1]}"
 
 
 def fill(count: int, folder: Path) -> None:

@@ -6,7 +6,6 @@ import re
 import resource
 import shutil
 import signal
-import socket
 import subprocess
 import sys
 from collections.abc import Callable, Sequence
@@ -15,7 +14,6 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
-import pyarrow.parquet as pq
 import pytest
 from click.testing import Result
 
@@ -30,15 +28,22 @@ from shapecat.executors import LocalExecutor, WorkerLostError, open_executor
 from shapecat.learning import load_model, save_model
 from shapecat.runs.jobs import Job
 from tests.messages import EPOCH, SECOND, make, write
+from tests.processes import (
+    DaskCluster,
+    alive,
+    children,
+    free_address,
+    obey_interrupts_at_low_priority,
+    wait_for,
+)
 from tests.scenes import record
 from tests.test_crash import assert_same_tables
-from tests.test_executors import alive, wait_for
+from tests.track_tables import untimed_table
 
 Run = Callable[..., Result]
 TABLES = ("frames", "detections", "planes", "tracks")
 NAMES = ("bag", "folder", "log")
 FRAMES = 16
-QUIET: Any = {"stdout": subprocess.DEVNULL, "stderr": subprocess.DEVNULL}
 
 
 class Watcher:
@@ -90,9 +95,8 @@ def assert_same(expected: Path, actual: Path, names: Sequence[str] = NAMES) -> N
     assert found == {*names, "manifest.jsonl"}
     for folder in names:
         for name in TABLES:
-            a, b = (pq.read_table(out / folder / f"{name}.parquet") for out in (expected, actual))
-            timed = [column for column in a.column_names if column == "seconds"]
-            assert a.drop_columns(timed).equals(b.drop_columns(timed)), (folder, name)
+            a, b = (untimed_table(out / folder, name) for out in (expected, actual))
+            assert a.equals(b), (folder, name)
         tracks = [(out / folder / "tracks.csv").read_bytes() for out in (expected, actual)]
         assert tracks[0] == tracks[1]
 
@@ -426,17 +430,6 @@ def test_full_disk_fails_only_large_recording(shapecat: Run, tmp_path: Path) -> 
     assert set(states(tmp_path / "out").values()) == {"complete"}
 
 
-def heed_interrupts() -> None:
-    """Obey interrupts even if the shell lets its background jobs ignore them."""
-    signal.signal(signal.SIGINT, signal.SIG_DFL)
-
-
-def heed_interrupts_at_low_priority() -> None:
-    """Yield to the sender of the signal: on a busy machine, the command might end first."""
-    heed_interrupts()
-    os.nice(10)
-
-
 def test_interrupted_batch_ends_and_can_be_resumed(
     shapecat: Run, recordings: Path, one_by_one: Path, tmp_path: Path
 ) -> None:
@@ -449,7 +442,7 @@ def test_interrupted_batch_ends_and_can_be_resumed(
         [sys.executable, "-m", "shapecat", *words, "2", "--progress", "jsonl"],
         stderr=subprocess.PIPE,
         stdout=subprocess.DEVNULL,
-        preexec_fn=heed_interrupts_at_low_priority,  # noqa: PLW1509  there is no other way
+        preexec_fn=obey_interrupts_at_low_priority,  # noqa: PLW1509  there is no other way
     )
     assert running.stderr is not None
     events, reported = [], set[str]()
@@ -458,8 +451,7 @@ def test_interrupted_batch_ends_and_can_be_resumed(
         reported = {event["recording"] for event in events if event["event"] == "progress"}
     assert (events[0]["event"], events[0]["recordings"]) == ("plan", 4)
     assert {Path(name).stem for name in reported} < set(NAMES)
-    children = Path(f"/proc/{running.pid}/task").glob("*/children")
-    workers = {int(pid) for thread in children for pid in thread.read_text().split()}
+    workers = children(running.pid)
 
     running.send_signal(signal.SIGINT)
     _, errors = running.communicate(timeout=60)
@@ -497,13 +489,12 @@ def test_dask_gives_same_tables_after_killed_worker(
 
 @pytest.mark.many
 def test_dask_batch_survives_restart_of_scheduler(
-    recordings: Path, one_by_one: Path, tmp_path: Path
+    recordings: Path, one_by_one: Path, tmp_path: Path, tmp_path_factory: pytest.TempPathFactory
 ) -> None:
     """A dead scheduler loses its state and its workers; both are started again."""
     pytest.importorskip("distributed")
-    with socket.create_server(("127.0.0.1", 0)) as server:
-        address = f"tcp://127.0.0.1:{server.getsockname()[1]}"
-    first = DaskCluster(address)
+    address = free_address()
+    first = DaskCluster(address, tmp_path_factory.mktemp("dask"))
     command = [
         *(sys.executable, "-m", "shapecat", "process", str(recordings), "--out", str(tmp_path)),
         *("--executor", "dask", "--scheduler", address, "--no-rrd"),
@@ -511,7 +502,7 @@ def test_dask_batch_survives_restart_of_scheduler(
     running = subprocess.Popen(command, stderr=subprocess.PIPE, stdout=subprocess.DEVNULL)
     wait_for(lambda: "running" in states(tmp_path).values(), 60)
     first.kill()
-    second = DaskCluster(address)
+    second = DaskCluster(address, tmp_path_factory.mktemp("dask"))
     try:
         _, errors = running.communicate(timeout=120)
     finally:
@@ -521,27 +512,6 @@ def test_dask_batch_survives_restart_of_scheduler(
     assert running.returncode == 1, errors
     assert_same(one_by_one, tmp_path)
     assert states(tmp_path) == ALL_DONE
-
-
-class DaskCluster:
-    """A scheduler and two workers, in their own processes."""
-
-    def __init__(self, address: str) -> None:
-        dask = (sys.executable, "-m", "dask")
-        host = ("--host", "127.0.0.1", "--dashboard-address", "127.0.0.1:0")
-        self._processes = [
-            subprocess.Popen([*dask, *arguments, *host], start_new_session=True, **QUIET)
-            for arguments in (
-                ("scheduler", "--port", address.rpartition(":")[2]),
-                ("worker", address, "--nworkers", "2", "--nthreads", "1"),
-            )
-        ]
-
-    def kill(self) -> None:
-        """Kill the scheduler and the workers."""
-        for process in self._processes:
-            os.killpg(process.pid, signal.SIGKILL)
-            process.wait()
 
 
 @pytest.mark.many

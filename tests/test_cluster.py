@@ -9,11 +9,12 @@ from pathlib import Path
 from typing import Any
 
 import fsspec
-import pyarrow.parquet as pq
 import pytest
 
-from tests.object_batch import IN, OUT, Report, children, fill, made, run, wait_until
+from tests.object_batch import IN, OUT, Report, fill, made, run, wait_until
 from tests.object_storage import object_storage
+from tests.processes import descendants
+from tests.track_tables import untimed_table
 
 TABLES = ("frames", "detections", "planes", "tracks")
 PROCESS = [sys.executable, "-m", "shapecat", "process", f"{IN}/", "--out", OUT, "--no-rrd"]
@@ -47,14 +48,8 @@ def test_dask_batch_survives_killed_worker_and_scheduler(tmp_path: Path) -> None
 
 def ray_workers(driver: int) -> list[int]:
     """Return Ray's worker processes, below the process that started Ray."""
-    found, below = [], [driver]
-    while below:
-        process = below.pop()
-        below += children(process)
-        name = Path(f"/proc/{process}/cmdline").read_bytes()
-        if name.startswith(b"ray::") and b"IDLE" not in name:
-            found.append(process)
-    return found
+    names = {pid: Path(f"/proc/{pid}/cmdline").read_bytes() for pid in descendants(driver)}
+    return [pid for pid, name in names.items() if name.startswith(b"ray::") and b"IDLE" not in name]
 
 
 def test_ray_batch_survives_killed_worker(bucket: Path, tmp_path: Path) -> None:
@@ -81,12 +76,10 @@ def assert_same_tables(folder: Path) -> None:
     for k in range(2):
         here = folder / "here" / f"run_{k:04}"
         process(Job(folder / f"{k}.mcap", here, rrd=False))
+        there = folder / "there" / f"run_{k:04}"
+        system.get(f"{OUT}/run_{k:04}/", f"{there}/", recursive=True)
         for name in TABLES:
-            with system.open(f"{OUT}/run_{k:04}/{name}.parquet") as file:
-                there = pq.read_table(file)
-            expected = pq.read_table(here / f"{name}.parquet")
-            timed = [column for column in there.column_names if column == "seconds"]
-            assert expected.drop_columns(timed).equals(there.drop_columns(timed)), name
+            assert untimed_table(here, name).equals(untimed_table(there, name)), name
 
 
 def test_killed_batch_resumes_when_started_twice_at_once(bucket: Path, tmp_path: Path) -> None:

@@ -25,8 +25,8 @@ from shapecat.api import open_recording
 from shapecat.errors import RecordingError
 from shapecat.runs.folder import read_run
 from shapecat.system.stderr import forgive_stderr
+from tests.processes import descendants, wait_for
 from tests.scenes import record
-from tests.test_executors import wait_for
 
 Run = Callable[..., Result]
 
@@ -478,14 +478,6 @@ def listening_addresses(pid: int) -> set[str]:
             _, local, _, state, *rest = line.split()
             if state == "0A" and f"socket:[{rest[5]}]" in inodes:
                 found.add(local.partition(":")[0])
-    return found
-
-
-def descendants(pid: int) -> list[int]:
-    found = []
-    for path in Path(f"/proc/{pid}/task").glob("*/children"):
-        for child in map(int, path.read_text().split()):
-            found += [child, *descendants(child)]
     return found
 
 

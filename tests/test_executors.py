@@ -32,6 +32,7 @@ from shapecat.executors.dask import _DaskExecutor
 from shapecat.executors.ordered_pool import OrderedPool
 from shapecat.system import stopping
 from shapecat.types import Camera, Frame
+from tests.processes import alive, wait_for
 from tests.tasks import (
     Unreadable,
     frail,
@@ -46,21 +47,6 @@ from tests.tasks import (
     work_until_asked,
     write_and_sleep,
 )
-
-
-def alive(process: int) -> bool:
-    try:
-        state = Path(f"/proc/{process}/stat").read_text("utf-8").rpartition(")")[2].split()[0]
-    except FileNotFoundError:
-        return False
-    return state != "Z"
-
-
-def wait_for(condition: Any, seconds: float = 20) -> None:
-    deadline = time.monotonic() + seconds
-    while not condition():
-        assert time.monotonic() < deadline, "condition not met in time"
-        time.sleep(0.02)
 
 
 @pytest.fixture(scope="module")

@@ -17,6 +17,7 @@ from shapecat.runs.jobs import Job
 from shapecat.runs.labels.track_table import read_track_table
 from shapecat.system.files import partial_path
 from tests.conftest import Guesser
+from tests.track_tables import untimed_table
 
 TABLES = ("frames", "detections", "planes", "masks", "tracks")
 
@@ -47,11 +48,6 @@ def changed(*overrides: str) -> Settings:
     return with_overrides(Settings(), overrides)
 
 
-def table(folder: Path, name: str) -> Any:
-    found = pq.read_table(folder / f"{name}.parquet")
-    return found.drop_columns([c for c in found.column_names if c == "seconds"])
-
-
 @pytest.mark.usefixtures("perceiving_fails")
 def test_changed_tracking_settings_give_tables_of_new_run(
     job: Job, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
@@ -60,7 +56,7 @@ def test_changed_tracking_settings_give_tables_of_new_run(
     before = read_run(job.folder)
     write_run(job.folder, {**before, "warnings": ["frames 2 and 3 are tilted"]})
     job = replace(job, settings=changed("tracking.gate_m=0.001", "outputs.boxes=visible"))
-    tracked = table(job.folder, "tracks")
+    tracked = untimed_table(job.folder, "tracks")
 
     pipeline.process(job)
 
@@ -69,8 +65,8 @@ def test_changed_tracking_settings_give_tables_of_new_run(
     monkeypatch.setattr(pipeline, "load_model", lambda _path: Guesser())
     pipeline.process(replace(job, folder=tmp_path / "new"))
     for name in TABLES:
-        assert table(job.folder, name).equals(table(tmp_path / "new", name)), name
-    assert not table(job.folder, "tracks").equals(tracked)
+        assert untimed_table(job.folder, name).equals(untimed_table(tmp_path / "new", name)), name
+    assert not untimed_table(job.folder, "tracks").equals(tracked)
     new = read_run(tmp_path / "new")
     assert new["counts"] | {"resumed": 4} == run["counts"]
     assert run["id"] != before["id"]
@@ -136,7 +132,7 @@ def test_replaced_run_stays_complete_if_new_run_fails(
     job: Job, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """Its tables are hard links in the new folder, and must not be truncated there."""
-    before = {name: table(job.folder, name) for name in TABLES}
+    before = {name: untimed_table(job.folder, name) for name in TABLES}
 
     def fail(*_args: Any, **_options: Any) -> None:
         msg = "full disk"
@@ -145,7 +141,7 @@ def test_replaced_run_stays_complete_if_new_run_fails(
     monkeypatch.setattr(pipeline, "annotate", fail)
     with pytest.raises(OutputError, match="full disk"):
         pipeline.process(replace(job, settings=changed("tracking.gate_m=0.1")))
-    assert all(table(job.folder, name).equals(before[name]) for name in TABLES)
+    assert all(untimed_table(job.folder, name).equals(before[name]) for name in TABLES)
 
 
 @pytest.mark.usefixtures("perceiving_fails")

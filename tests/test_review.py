@@ -27,7 +27,7 @@ from shapecat.outputs.review.scenes import ReviewFrame, choose_scenes
 from shapecat.outputs.review.shapes import SKETCH, _fan, markdown, short_label, sketch
 from shapecat.runs.labels.meaning import TrackLabel
 from shapecat.types import Box, Camera, Frame, LabelledFrame, LabelledObject, NeuralGas, Plane, Pose
-from tests.test_executors import alive
+from tests.processes import alive
 
 CATEGORIES = ("cup", "can")
 TOPIC = "/camera/depth"

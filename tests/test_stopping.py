@@ -21,8 +21,8 @@ from shapecat.runs.folder import read_run
 from shapecat.runs.jobs import Job
 from shapecat.runs.tables.segments import list_segments, read_segment
 from shapecat.system import stopping
+from tests.processes import obey_interrupts, obey_interrupts_at_low_priority
 from tests.scenes import record
-from tests.test_batch import heed_interrupts, heed_interrupts_at_low_priority
 from tests.test_crash import assert_same_tables, contents
 
 FRAMES = 60
@@ -46,7 +46,7 @@ class Command:
             stderr=subprocess.PIPE,
             text=True,
             start_new_session=True,
-            preexec_fn=heed_interrupts_at_low_priority,  # noqa: PLW1509  there is no other way
+            preexec_fn=obey_interrupts_at_low_priority,  # noqa: PLW1509  there is no other way
         )
 
     def wait_for_frames(self, count: int) -> None:
@@ -216,7 +216,7 @@ def test_signal_during_imports_ends_command_without_traceback() -> None:
         [sys.executable, "-c", code],
         check=False,
         capture_output=True,
-        preexec_fn=heed_interrupts,
+        preexec_fn=obey_interrupts,
     )
 
     assert (done.returncode, done.stderr) == (130, b"")

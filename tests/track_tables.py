@@ -1,15 +1,16 @@
-"""Builder of track tables for synthetic runs, and reader of tables."""
+"""Builder of track tables for synthetic runs, and readers of tables."""
 
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
+import pyarrow as pa
 import pyarrow.parquet as pq
 
 from shapecat.runs.tables.schemas import TRACKS
 from shapecat.runs.tables.writing import write_table
 
-__all__ = ["rows", "write_tracks"]
+__all__ = ["rows", "untimed_table", "write_tracks"]
 
 
 def write_tracks(
@@ -37,3 +38,9 @@ def rows(folder: Path, table: str, *columns: str) -> list[dict[str, Any]]:
     """Return the rows of a table of a run, with all columns unless some are named."""
     found = pq.read_table(folder / f"{table}.parquet", columns=list(columns) or None)
     return list(found.to_pylist())
+
+
+def untimed_table(folder: Path, name: str) -> pa.Table:
+    """Read a table of a run without its measured times, which differ from run to run."""
+    table = pq.read_table(folder / f"{name}.parquet")
+    return table.drop_columns([c for c in table.column_names if c == "seconds"])

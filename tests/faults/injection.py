@@ -14,6 +14,7 @@ from dataclasses import dataclass, field
 from pathlib import Path
 
 from shapecat.system.files import FSYNC
+from tests.processes import obey_interrupts
 
 SIGNALS = {
     "interrupt": signal.SIGINT,
@@ -56,11 +57,6 @@ class Ended:
         return found
 
 
-def _heed_interrupts() -> None:
-    """Obey interrupts even if the shell lets its background jobs ignore them."""
-    signal.signal(signal.SIGINT, signal.SIG_DFL)
-
-
 class Running:
     """A command in its own session, whose stderr is read as it is written."""
 
@@ -74,7 +70,7 @@ class Running:
             text=True,
             errors="replace",
             start_new_session=True,
-            preexec_fn=_heed_interrupts,  # noqa: PLW1509  there is no other way
+            preexec_fn=obey_interrupts,  # noqa: PLW1509  there is no other way
             env={**os.environ, FSYNC: "1", **(environment or {})},
         )
         self._reader = threading.Thread(target=self._read, daemon=True)

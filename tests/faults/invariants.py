@@ -14,6 +14,7 @@ from mcap.stream_reader import StreamReader
 
 from tests.faults.injection import Ended
 from tests.faults.scenarios import Scenario
+from tests.track_tables import untimed_table
 
 TABLES = ("frames", "detections", "planes", "tracks")
 FILES = ("run.json", *(f"{name}.parquet" for name in TABLES), "tracks.csv")
@@ -188,18 +189,13 @@ def same_results(runs: Iterable[str], out: Path, reference: Path) -> Iterator[st
     for run in runs:
         try:
             for name in TABLES:
-                if not table(out / run, name).equals(table(reference / run, name)):
+                expected = untimed_table(reference / run, name)
+                if not untimed_table(out / run, name).equals(expected):
                     yield f"{run}: {name}.parquet differs from an undisturbed run"
             if tracks(out / run) != tracks(reference / run):
                 yield f"{run}: tracks.csv differs from an undisturbed run"
         except (OSError, pa.ArrowException) as error:
             yield f"{run}: {type(error).__name__}: {error}"
-
-
-def table(run: Path, name: str) -> pa.Table:
-    """Read a table without its measured times."""
-    found = pq.read_table(run / f"{name}.parquet")
-    return found.drop_columns([c for c in found.column_names if c == "seconds"])
 
 
 def tracks(run: Path) -> list[list[str]]:
