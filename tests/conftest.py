@@ -137,7 +137,7 @@ class LateAnswer(Future[Any]):
 
 
 class LateExecutor(Executor):
-    """Replaces other processes: starts at once, and knows only what it is sent."""
+    """Replaces other processes: starts at once, and gets copies of what it is sent."""
 
     def __init__(self, _workers: int, **_options: int) -> None:
         self._awake = False
@@ -229,19 +229,19 @@ def snapped_once() -> Iterator[None]:
     """Move the outlines of the same masks on the same image only once, for all exports."""
     from shapecat.colour.snapping import snapped
 
-    known: dict[str, Any] = {}
+    cache: dict[str, Any] = {}
 
-    def recall(masks: Any, pixels: Any, scale: float) -> Any:
+    def look_up(masks: Any, pixels: Any, scale: float) -> Any:
         digest = hashlib.sha256(repr((pixels.shape, scale)).encode())
         for part in (pixels, *(part for mask in masks for part in (mask.box, mask.pixels))):
             digest.update(np.ascontiguousarray(part).tobytes())
         key = digest.hexdigest()
-        if key not in known:
-            known[key] = snapped(masks, pixels, scale)
-        return known[key]
+        if key not in cache:
+            cache[key] = snapped(masks, pixels, scale)
+        return cache[key]
 
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr("shapecat.outputs.exports.dataset_frames.snapped", recall)
+        patch.setattr("shapecat.outputs.exports.dataset_frames.snapped", look_up)
         yield
 
 

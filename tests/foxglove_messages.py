@@ -87,10 +87,10 @@ LAYOUT = {
 
 def descriptors() -> bytes:
     """Return the FileDescriptorSet of all messages of `LAYOUT`, a file for each package."""
-    found = FileDescriptorSet()
+    protos = FileDescriptorSet()
     files = {}
     for package in ("google.protobuf", "foxglove"):
-        files[package] = found.file.add(name=f"{package}.proto", package=package, syntax="proto3")
+        files[package] = protos.file.add(name=f"{package}.proto", package=package, syntax="proto3")
     files["foxglove"].dependency.append("google.protobuf.proto")
     files["foxglove"].enum_type.add(name="NumericType").value.add(name="UNKNOWN", number=0)
     for name, fields in LAYOUT.items():
@@ -102,7 +102,7 @@ def descriptors() -> bytes:
             )
             if one.message or one.kind == ENUM:
                 added.type_name = f".{one.message or 'foxglove.NumericType'}"
-    data: bytes = found.SerializeToString(deterministic=True)
+    data: bytes = protos.SerializeToString(deterministic=True)
     return data
 
 
@@ -136,8 +136,8 @@ def write(path: Path, encoding: str, items: list[tuple[str, str, dict[str, Any]]
             text = descriptors() if encoding == "protobuf" else b"{}"
             schema = writer.register_schema(kind, schema_encoding, text)
             channel = writer.register_channel(topic, encoding, schema)
-            own = {} if kind == "foxglove.FrameTransform" else {"frame_id": "camera"}
-            filled = {"timestamp": time(EPOCH, encoding)} | own | values
+            frame = {} if kind == "foxglove.FrameTransform" else {"frame_id": "camera"}
+            filled = {"timestamp": time(EPOCH, encoding)} | frame | values
             data = encode(filled, kind) if encoding == "protobuf" else json.dumps(filled).encode()
             writer.add_message(channel, EPOCH + k, data, EPOCH + k)
     return path

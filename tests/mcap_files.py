@@ -32,19 +32,19 @@ class McapChannels:
 
     def __init__(self, writer: Writer, types: Typestore, version: int = 2) -> None:
         self._writer, self._types, self._version = writer, types, version
-        self._known: dict[tuple[str, str], int] = {}
+        self._channels: dict[tuple[str, str], int] = {}
 
     def declare(self, topic: str, kind: str) -> int:
         """Return the channel, after registering it if it is new."""
-        if (topic, kind) not in self._known:
+        if (topic, kind) not in self._channels:
             text = self._types.generate_msgdef(kind, ros_version=self._version)[0].encode()
             name, encodings = kind, ("ros2msg", "cdr")
             if self._version == 1:
                 name, encodings = kind.replace("/msg/", "/"), ("ros1msg", "ros1")
             schema = self._writer.register_schema(name, encodings[0], text)
             channel = self._writer.register_channel(topic, encodings[1], schema)
-            self._known[topic, kind] = channel
-        return self._known[topic, kind]
+            self._channels[topic, kind] = channel
+        return self._channels[topic, kind]
 
     def write(self, topic: str, kind: str, time: int, data: bytes) -> None:
         """Write a message."""

@@ -100,7 +100,7 @@ def _report(code: int, errors: str, seconds: float, log: Path) -> Report:
     lines = system.cat_file(f"{bucket}/manifest.jsonl").splitlines()
     entries = [json.loads(line) for line in lines]
     places = {path.removeprefix(f"{bucket}/").split("/")[0] for path in system.find(bucket)}
-    known = {entry["folder"] for entry in entries}
+    runs = {entry["folder"] for entry in entries}
     unfinished = [upload["Key"] for upload in system.list_multipart_uploads("lab")]
     return Report(
         code=code,
@@ -109,7 +109,7 @@ def _report(code: int, errors: str, seconds: float, log: Path) -> Report:
         states=Counter(entry["state"] for entry in entries),
         tries=Counter(entry["tries"] for entry in entries),
         made=Counter(made(log)),
-        left=sorted(places - known - {"manifest.jsonl", ".manifest"}) + unfinished,
+        left=sorted(places - runs - {"manifest.jsonl", ".manifest"}) + unfinished,
         refused=sum(line.endswith(" 503") for line in log.read_text("utf-8").splitlines()),
     )
 

@@ -40,12 +40,12 @@ class Case(NamedTuple):
 
 def write_all(writer: Any, items: Iterable[tuple[str, str, int, bytes]], types: Any) -> None:
     """Write serialized messages with a writer of rosbags."""
-    known: dict[str, Any] = {}
+    connections: dict[str, Any] = {}
     with writer:
         for topic, kind, time, data in items:
-            if topic not in known:
-                known[topic] = writer.add_connection(topic, kind, typestore=types)
-            writer.write(known[topic], time, data)
+            if topic not in connections:
+                connections[topic] = writer.add_connection(topic, kind, typestore=types)
+            writer.write(connections[topic], time, data)
 
 
 def mcap(path: Path, *, finish: bool = True, cut: int = 0, **options: Any) -> Path:
@@ -72,13 +72,13 @@ def bag(path: Path, compression: Any = None) -> Path:
 
 def active_bag(path: Path) -> Path:
     """Write the file that a killed rosbag leaves, which has no index."""
-    found = bag(path)
-    data = found.read_bytes().replace(b"index_pos=", b"index_pos=\0\0\0\0\0\0\0\0*", 1)
+    finished = bag(path)
+    data = finished.read_bytes().replace(b"index_pos=", b"index_pos=\0\0\0\0\0\0\0\0*", 1)
     at = data.index(b"index_pos=") + 10
     data = data[: at + 8] + data[at + 17 :]
     # The connections and chunk information after the last chunk are missing.
-    found.write_bytes(data[: data.rindex(b"op=\x05") + 60_000])
-    return found.rename(path / "a.bag.active")
+    finished.write_bytes(data[: data.rindex(b"op=\x05") + 60_000])
+    return finished.rename(path / "a.bag.active")
 
 
 def unsorted_bag(path: Path) -> Path:
@@ -105,13 +105,13 @@ def folder(
 
 def database(path: Path, *, definitions: bool) -> Path:
     """Write the database of a ROS 2 folder, without its folder's metadata."""
-    found = folder(path, StoragePlugin.SQLITE3) / "a.db3"
+    file = folder(path, StoragePlugin.SQLITE3) / "a.db3"
     if not definitions:
-        base = sqlite3.connect(found)
-        base.execute("DELETE FROM message_definitions")
-        base.commit()
-        base.close()
-    return found
+        connection = sqlite3.connect(file)
+        connection.execute("DELETE FROM message_definitions")
+        connection.commit()
+        connection.close()
+    return file
 
 
 def splits(path: Path) -> Path:
@@ -264,8 +264,8 @@ def distorted(path: Path, *, strong: bool) -> Path:
 
 def foreign(path: Path) -> Path:
     """Add channels of other programs: a service event, and unknown encodings and schemas."""
-    found = path / "a.mcap"
-    with mcap_writer(found) as writer:
+    path /= "a.mcap"
+    with mcap_writer(path) as writer:
         broken = writer.register_schema("my/srv/Do_Event", "ros2msg", b"service_msgs/Nothing info")
         channels = [
             writer.register_channel("/do/_service_event", "cdr", broken),
@@ -273,12 +273,12 @@ def foreign(path: Path) -> Path:
             writer.register_channel("/no_schema", "cdr", 0),
             writer.register_channel("/tf", "cdr", broken),
         ]
-        own = McapChannels(writer, FACTORY.typestore)
+        ours = McapChannels(writer, FACTORY.typestore)
         for item in serialized(stream(FACTORY, FRAMES), FACTORY):
             for channel in channels:
                 writer.add_message(channel, item[2], b"\x00\x01\x00\x00\xff\xff\xff\xff", item[2])
-            own.write(*item)
-    return found
+            ours.write(*item)
+    return path
 
 
 def clocks(path: Path, kind: str) -> Path:

@@ -9,7 +9,7 @@ from collections.abc import Iterator, Mapping
 from html import escape
 from pathlib import Path
 
-from tests.test_architecture import FILES, FLOOR, imported_rooms, room
+from tests.test_architecture import FILES, LAYER, imported_subpackages, subpackage_of
 
 __all__ = ["PICTURE", "draw"]
 
@@ -49,7 +49,8 @@ def imports() -> dict[str, set[str]]:
     """Return the imports of each subpackage."""
     found: dict[str, set[str]] = {}
     for path in FILES:
-        found.setdefault(room(path), set()).update(imported_rooms(path) - {room(path)})
+        name = subpackage_of(path)
+        found.setdefault(name, set()).update(imported_subpackages(path) - {name})
     return {name: others - HIDDEN for name, others in found.items() if name not in HIDDEN}
 
 
@@ -63,11 +64,11 @@ def reduced(graph: Mapping[str, set[str]]) -> dict[str, set[str]]:
     return {name: others - reachable[name] for name, others in graph.items()}
 
 
-def box_positions(rooms: set[str]) -> dict[str, _Position]:
+def box_positions(subpackages: set[str]) -> dict[str, _Position]:
     """Return left edge, top and width of the box of each subpackage."""
     found: dict[str, _Position] = {}
     for row, level in enumerate(LAYERS):
-        names = sorted((name for name in rooms if FLOOR[name] == level), key=_rank)
+        names = sorted((name for name in subpackages if LAYER[name] == level), key=_rank)
         widths = [7.8 * len(name) + 12 for name in names]
         left = 120 + (WIDTH - 134 - sum(widths) - GAP * (len(names) - 1)) / 2
         for name, width in zip(names, widths, strict=True):
@@ -117,7 +118,7 @@ def _bands() -> Iterator[str]:
 
 def _arrows(graph: Mapping[str, set[str]], boxes: Mapping[str, _Position]) -> Iterator[str]:
     for name, other in sorted((n, o) for n, others in graph.items() for o in others):
-        if FLOOR[other] < 2 or FLOOR[other] == FLOOR[name]:
+        if LAYER[other] < 2 or LAYER[other] == LAYER[name]:
             continue
         (x1, y1, w1), (x2, y2, w2) = boxes[name], boxes[other]
         start, end = (x1 + w1 / 2, y1 + BOX_H), (x2 + w2 / 2, y2)

@@ -32,6 +32,6 @@ def run_info(**entries: Any) -> Any:
         "warnings": [],
     }
     for name, value in entries.items():
-        known = complete.get(name)
-        complete[name] = known | value if isinstance(known, dict) else value
+        default = complete.get(name)
+        complete[name] = default | value if isinstance(default, dict) else value
     return complete

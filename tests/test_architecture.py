@@ -22,7 +22,7 @@ STAGES = {
     "tracking",
 }
 BASE = {"arrays", "errors", "jit", "system", "types"}
-FLOOR = {
+LAYER = {
     **dict.fromkeys(BASE | {"py"}, 0),
     **dict.fromkeys(("cameras", "config", "executors", "geometry", "trees"), 1),
     **dict.fromkeys(
@@ -53,12 +53,12 @@ def nodes(path: Path) -> tuple[ast.AST, ...]:
     return tuple(ast.walk(ast.parse(path.read_text("utf-8"))))
 
 
-def room(path: Path) -> str:
+def subpackage_of(path: Path) -> str:
     parts = path.relative_to(ROOT).with_suffix("").parts
     return "cli" if parts[0] == "cli" else parts[1]
 
 
-def imported_rooms(path: Path) -> set[str]:
+def imported_subpackages(path: Path) -> set[str]:
     found = set()
     for node in nodes(path):
         if isinstance(node, ast.Import):
@@ -75,19 +75,19 @@ def imported_rooms(path: Path) -> set[str]:
 
 def wrong_import(here: str, other: str) -> str:
     """Return the problem with an import from one subpackage into another, or an empty string."""
-    if other not in FLOOR:
-        return "has no floor: add it to the table above"
-    if FLOOR[other] > FLOOR[here]:
+    if other not in LAYER:
+        return "has no layer: add it to the table above"
+    if LAYER[other] > LAYER[here]:
         return "is above it"
-    return "is a stage as it is" if {here, other} <= STAGES else ""
+    return "is a stage, too" if {here, other} <= STAGES else ""
 
 
 def test_no_import_goes_up_or_across_stages() -> None:
     wrong = [
         f"{path.relative_to(ROOT)} imports {other}, which {reason}"
         for path in FILES
-        for other in imported_rooms(path) - {room(path)}
-        if (reason := wrong_import(room(path), other))
+        for other in imported_subpackages(path) - {subpackage_of(path)}
+        if (reason := wrong_import(subpackage_of(path), other))
     ]
     assert wrong == []
 

@@ -24,11 +24,11 @@ GROUPS = {
 def main(words: list[str] | None = None) -> int:
     """Run the cases; return 1 if an invariant failed."""
     options = _parse(words)
-    known = tuple(s for s in SCENARIOS if options.jobs in {None, s.jobs} or s.name == "single")
+    scenarios = tuple(s for s in SCENARIOS if options.jobs in {None, s.jobs} or s.name == "single")
     with tempfile.TemporaryDirectory(prefix="shapecat-faults-") as store:
         until = time.monotonic() + 60 * options.minutes
-        laboratory = Laboratory(Path(store), known)
-        print(f"undisturbed runs done, {len(known)} scenarios", flush=True)
+        laboratory = Laboratory(Path(store), scenarios)
+        print(f"undisturbed runs done, {len(scenarios)} scenarios", flush=True)
         with ThreadPoolExecutor(options.at_once) as pool:
             judged = pool.map(lambda case: _judge(laboratory, case, until), _cases(options))
             verdicts = [*judged]

@@ -93,12 +93,12 @@ class Laboratory:
         )
 
     def _disturbed(self, kind: str, rng: random.Random, scenario: Scenario, case: Path) -> Ended:
-        known, command = self.references[scenario.name], scenario.command(case)
+        reference, command = self.references[scenario.name], scenario.command(case)
         if kind in COUNTERS:
             if self.shim is None:
                 msg = "no C compiler"
                 raise SkippedError(msg)
-            nth = rng.randint(1, max(1, known.calls[COUNTERS[kind]]))
+            nth = rng.randint(1, max(1, reference.calls[COUNTERS[kind]]))
             return Running(command, injection.shimmed(self.shim, kind, nth, case)).end()
         if kind == "tmpfs":
             if not injection.mount(case / "out", rng.randint(1, 20)):
@@ -108,8 +108,8 @@ class Laboratory:
         if kind == "replace":
             path = case / "in" / scenario.recordings[0]
             other = self.store / "other.mcap"
-            return injection.replace_input(rng, command, known.seconds, path, other)
-        return injection.disturb(kind, rng, command, known.seconds)
+            return injection.replace_input(rng, command, reference.seconds, path, other)
+        return injection.disturb(kind, rng, command, reference.seconds)
 
     def _after_fault(self, kind: str, scenario: Scenario, ended: Ended, case: Path) -> list[str]:
         wrong = [*invariants.ended_well(kind, ended)]

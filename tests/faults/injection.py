@@ -158,15 +158,15 @@ def replace_input(
     """Run a command and replace its recording: by a rename, in place, or by its first half."""
     moment, way = rng.uniform(0.3, max(0.4, seconds)), rng.choice(["rename", "rewrite", "cut"])
     content = path.read_bytes() if way == "cut" else other.read_bytes()
-    own = path.with_suffix(".own")
-    shutil.copyfile(path, own)
-    own.replace(path)  # a copy, as other cases have hard links to the recording
+    copy = path.with_suffix(".copy")
+    shutil.copyfile(path, copy)
+    copy.replace(path)  # other cases have hard links to the recording
     running = Running(command)
     if not running.wait_until(moment):
         return running.end()
     if way == "rename":
-        own.write_bytes(content)
-        own.replace(path)
+        copy.write_bytes(content)
+        copy.replace(path)
     else:
         path.write_bytes(content[: len(content) // 2] if way == "cut" else content)
     return running.end(moment)

@@ -56,7 +56,8 @@ def ended_well(kind: str, ended: Ended) -> Iterator[str]:
     lines += [str(event["message"]) for _, event in ended.events() if event.get("message")]
     if 0 < ended.code < 5 and not lines:
         yield "no error line"
-    yield from (f"said twice: {line}" for line in sorted({s for s in lines if lines.count(s) > 1}))
+    for line in sorted({line for line in lines if lines.count(line) > 1}):
+        yield f"printed twice: {line}"
 
 
 def complete_outputs(scenario: Scenario, out: Path) -> Iterator[str]:

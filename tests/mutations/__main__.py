@@ -4,7 +4,7 @@
 
 The seed draws from all mutants, so that every machine gets the same ones, and a change of one
 module leaves those of the others. No file is changed: a mutant exists only in a forked process,
-which imports it. The test files in `KNOWN_BY` judge a module. They first run without a mutant to
+which imports it. The test files in `JUDGED_BY` judge a module. They first run without a mutant to
 find the tests that reach each line, and files with such tests judge the mutants of a line. A mutant
 is killed if a test fails, or if the tests take far longer than without it; a mutant that no test
 reaches has survived.
@@ -29,7 +29,7 @@ LIBRARIES = ("numba", "scipy.spatial.transform", "pyarrow.parquet", "rosbags.typ
 """Loaded once, before processes are forked."""
 PACKAGES = ("batch", "cameras", "cli", "colour", "evaluation", "executors", "outputs", "recordings",
          "runs", "system", "tracking")  # fmt: skip
-KNOWN_BY: dict[str, Sequence[str]] = {
+JUDGED_BY: dict[str, Sequence[str]] = {
     "shapecat.batch": ("test_batch_planning",),
     "shapecat.batch.ledger": ("test_batch_planning", "test_batch"),
     "shapecat.batch.runs": ("test_batch_planning", "test_batch"),
@@ -104,7 +104,6 @@ KNOWN_BY: dict[str, Sequence[str]] = {
     "shapecat.system": ("test_run_folder", "test_batch_planning"),
     "shapecat.tracking": ("test_tracking_worked", "test_tracking", "test_tables_rotated",
                           "test_changes", "test_reuse"),
-    "shapecat.tracking.full_boxes": ("test_completion", "test_tables_rotated"),
 }  # fmt: skip
 """Test files by prefix of a module's name; the longest prefix counts."""
 SLOW = (
@@ -157,20 +156,20 @@ def _rank(seed: int, mutant: Mutant) -> bytes:
 
 def tests_of(mutant: Mutant) -> list[Path]:
     """Return the test files that judge a mutant, and its module if it has examples."""
-    fitting = max((name for name in KNOWN_BY if mutant.module.startswith(name)), key=len)
-    files = [ROOT / "tests" / f"{name}.py" for name in KNOWN_BY[fitting]]
+    fitting = max((name for name in JUDGED_BY if mutant.module.startswith(name)), key=len)
+    files = [ROOT / "tests" / f"{name}.py" for name in JUDGED_BY[fitting]]
     return [mutant.file, *files] if "\n    >>> " in mutant.file.read_text("utf-8") else files
 
 
 def judge(mutant: Mutant, reached: Mapping[Path, Reached | None]) -> tuple[Mutant, str]:
     """Run the tests that reach a mutant, then the other tests of their files."""
-    known = {file: reached[file] for file in tests_of(mutant)}
-    found = {file: result for file, result in known.items() if result and result.by(mutant)}
-    if not found:
-        return mutant, "not judged" if None in known.values() else "survived"
-    first = [test for result in found.values() for test in result.by(mutant)]
-    allowed_s = 20 + 4 * sum(result.seconds for result in found.values())
-    return mutant, attempt(mutant, list(found), first, allowed_s)
+    judges = {file: reached[file] for file in tests_of(mutant)}
+    reaching = {file: result for file, result in judges.items() if result and result.by(mutant)}
+    if not reaching:
+        return mutant, "not judged" if None in judges.values() else "survived"
+    first = [test for result in reaching.values() for test in result.by(mutant)]
+    allowed_s = 20 + 4 * sum(result.seconds for result in reaching.values())
+    return mutant, attempt(mutant, list(reaching), first, allowed_s)
 
 
 def main() -> int:
