@@ -47,9 +47,9 @@ def test_dask_batch_survives_killed_worker_and_scheduler(tmp_path: Path) -> None
 
 
 def ray_workers(driver: int) -> list[int]:
-    """Return Ray's worker processes, below the process that started Ray."""
+    """Return Ray's processes that work on a recording, below the process that started Ray."""
     names = {pid: Path(f"/proc/{pid}/cmdline").read_bytes() for pid in descendants(driver)}
-    return [pid for pid, name in names.items() if name.startswith(b"ray::") and b"IDLE" not in name]
+    return [pid for pid, name in names.items() if name.startswith(b"ray::_attempt_on_worker")]
 
 
 def test_ray_batch_survives_killed_worker(bucket: Path, tmp_path: Path) -> None:
