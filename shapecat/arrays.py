@@ -67,9 +67,9 @@ def _freeze(
     result = np.asarray(value, dtype)
     # A shape without named axes is compared at once.
     if result.shape != axes and not _agree(axes, result.shape, sizes):
-        known = f" with {sizes}" if sizes else ""
+        given = f" with {sizes}" if sizes else ""
         names = ", ".join(map(str, axes))
-        msg = f"expected shape ({names}){known}, got {result.shape}"
+        msg = f"expected shape ({names}){given}, got {result.shape}"
         raise ValueError(msg)
     if result.flags.writeable:
         result = result.view()

@@ -171,7 +171,7 @@ def with_settings(settings: Settings, tree: Mapping[str, Any]) -> Settings:
     ------
     ConfigError : a setting does not exist, or a value has the wrong type or is out of range.
     """
-    changed: Settings = _build(settings, tree, "")
+    changed: Settings = _replace(settings, tree, "")
     return changed
 
 
@@ -196,7 +196,7 @@ def with_overrides(settings: Settings, overrides: Sequence[str]) -> Settings:
         tree: Any = _parse_value(value)
         for part in reversed(name.strip().split(".")):
             tree = {part: tree}
-        settings = _build(settings, tree, "")
+        settings = _replace(settings, tree, "")
     return settings
 
 
@@ -219,28 +219,30 @@ def _parse_value(text: str) -> Any:
         return text.strip()
 
 
-def _build(base: Any, tree: Mapping[str, Any], path: str) -> Any:
-    hints = get_type_hints(type(base))
+def _replace(group: Any, tree: Mapping[str, Any], prefix: str) -> Any:
+    """Return a group of settings with some values replaced; ``prefix`` precedes their names."""
+    hints = get_type_hints(type(group))
     changes = {}
     for key, value in tree.items():
-        name = f"{path}{key}"
+        name = f"{prefix}{key}"
         if key not in hints:
             near = difflib.get_close_matches(key, hints, 1)
-            hint = f"; did you mean {path}{near[0]}?" if near else f"; known: {', '.join(hints)}"
+            hint = f"; did you mean {prefix}{near[0]}?" if near else f"; known: {', '.join(hints)}"
             msg = f"unknown setting {name}{hint}"
             raise ConfigError(msg)
-        current = getattr(base, key)
+        current = getattr(group, key)
         if dataclasses.is_dataclass(current):
             if not isinstance(value, Mapping):
                 msg = f"{name} is a group of settings, got {value!r}"
                 raise ConfigError(msg)
-            changes[key] = _build(current, value, f"{name}.")
+            changes[key] = _replace(current, value, f"{name}.")
         else:
             changes[key] = _checked(name, value, hints[key])
-    return dataclasses.replace(base, **changes)
+    return dataclasses.replace(group, **changes)
 
 
 def _checked(name: str, value: Any, kind: Any) -> Any:
+    """Return a value converted to the type of a setting; raise ConfigError if it does not fit."""
     if get_origin(kind) is Literal:
         if value not in get_args(kind):
             msg = f"{name} must be one of {', '.join(map(str, get_args(kind)))}, got {value!r}"
@@ -251,7 +253,7 @@ def _checked(name: str, value: Any, kind: Any) -> Any:
     if isinstance(value, int) and abs(value) > sys.float_info.max:
         msg = f"{name} is too large"
         raise ConfigError(msg)
-    if kind is float and isinstance(value, int) and not isinstance(value, bool):
+    if kind is float and type(value) is int:
         value = float(value)
     if type(value) is not kind:
         expected = "true or false" if kind is bool else f"of type {kind.__name__}"

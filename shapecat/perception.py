@@ -26,21 +26,20 @@ from shapecat.geometry import inverse, level_from_sensor, transform
 from shapecat.learning import Categorizer, load_model
 from shapecat.reuse import KeyView, find_repeats, reused, shows_the_same, view_object
 from shapecat.surface import reconstruct, thin
-from shapecat.types import (
-    Candidate,
-    Detection,
-    Frame,
-    NeuralGas,
-    Perception,
-    Pose,
-    Scene,
-)
+from shapecat.types import Candidate, Detection, Frame, NeuralGas, Perception, Pose, Scene
 
 __all__ = ["Perceiver", "PerceptionInput", "find_up", "perceive"]
 
+_ENOUGH_M2 = 0.1
+"""Planes with a smaller total area give no up direction: they may be the face of an object."""
+_UNDECIDED = 2.0
+"""Novelty of an object with too few points for a surface: above the threshold, so unknown."""
+_SAME_UP = float(np.cos(np.radians(1.0)))
+"""Cosine of 1 degree: closer up directions are treated as equal."""
+
 
 class PerceptionInput(NamedTuple):
-    """A frame to perceive, with what is known about it.
+    """A frame to perceive, with its context.
 
     Attributes
     ----------
@@ -276,12 +275,12 @@ def _describe(
     cloud = thin(transform(level, points).astype(np.float32), settings=settings.surface)
     gas = reconstruct(cloud, settings=settings.surface, rng=rng)
     if gas is None:
-        nothing = NeuralGas(np.zeros((0, 3)), np.zeros((0, 2)))
-        empty = np.zeros(len(DESCRIPTOR_NAMES), np.float32)
-        return _Shape(nothing, empty, time.perf_counter() - begun)
-    descriptor = describe(cloud, gas, eye=level.translation)
-    in_sensor = NeuralGas(transform(inverse(level), gas.neurons), gas.edges)
-    return _Shape(in_sensor, descriptor, time.perf_counter() - begun)
+        gas = NeuralGas(np.zeros((0, 3)), np.zeros((0, 2)))
+        descriptor = np.zeros(len(DESCRIPTOR_NAMES), np.float32)
+    else:
+        descriptor = describe(cloud, gas, eye=level.translation)
+        gas = NeuralGas(transform(inverse(level), gas.neurons), gas.edges)  # sensor frame
+    return _Shape(gas, descriptor, time.perf_counter() - begun)
 
 
 def _add_full_box(
@@ -289,9 +288,9 @@ def _add_full_box(
 ) -> Detection:
     """Add the estimated box of the whole object to a detection."""
     candidate = detection.candidate
-    some = candidate.indices[:: max(1, -(-len(candidate.indices) // ENOUGH_POINTS))]
+    sampled = candidate.indices[:: max(1, -(-len(candidate.indices) // ENOUGH_POINTS))]
     offset = scene.support_offset(candidate)
-    full = complete(frame.xyz(some), scene.up, offset, detection.posterior, categories)
+    full = complete(frame.xyz(sampled), scene.up, offset, detection.posterior, categories)
     return replace(detection, full=full)
 
 
@@ -303,25 +302,17 @@ def _categorize(
         return []
     begun = time.perf_counter()
     prediction = categorizer.predict(np.stack([shape.descriptor for shape in shapes]))
-    each = (time.perf_counter() - begun) / len(shapes)
-    known = [len(shape.gas.neurons) > 0 for shape in shapes]
+    seconds = (time.perf_counter() - begun) / len(shapes)
+    has_surface = [len(shape.gas.neurons) > 0 for shape in shapes]
     uniform = np.full(len(categorizer.categories), 1 / len(categorizer.categories))
     return [
         Detection(
             candidate=candidate,
             gas=shape.gas,
             descriptor=shape.descriptor,
-            posterior=prediction.posteriors[k] if known[k] else uniform,
-            novelty=float(prediction.novelty[k]) if known[k] else _UNDECIDED,
-            seconds=shape.seconds + each,
+            posterior=prediction.posteriors[k] if has_surface[k] else uniform,
+            novelty=float(prediction.novelty[k]) if has_surface[k] else _UNDECIDED,
+            seconds=shape.seconds + seconds,
         )
         for k, (candidate, shape) in enumerate(zip(candidates, shapes, strict=True))
     ]
-
-
-_ENOUGH_M2 = 0.1
-"""Planes with a smaller total area give no up direction: they may be the face of an object."""
-_UNDECIDED = 2.0
-"""Novelty of an object with too few points for a surface: above the threshold, so unknown."""
-_SAME_UP = float(np.cos(np.radians(1.0)))
-"""Cosine of 1 degree: closer up directions are treated as equal."""
