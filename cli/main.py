@@ -10,7 +10,7 @@ import click
 
 from shapecat import __version__
 from shapecat.errors import ShapecatError
-from shapecat.system.stopping import Stopped, heeding_signals
+from shapecat.system.stopping import Stopped, handling_signals
 
 from .annotate import annotate
 from .compare import compare
@@ -33,7 +33,7 @@ class _Commands(click.Group):
 
     def invoke(self, ctx: click.Context) -> Any:
         try:
-            with heeding_signals():
+            with handling_signals():
                 return super().invoke(ctx)
         except ShapecatError as error:
             click.echo(f"Error: {error}", err=True)

@@ -66,7 +66,8 @@ def _serve(reports: "Reports", port: int) -> None:
     """Serve until a signal arrives, then write the pages again with the corrections."""
     from shapecat.outputs.report.serving import serve_reports
 
-    with serve_reports(reports, port=port) as address, stopping.noticing("stopping the server"):
+    message = stopping.stop_message("stopping the server")
+    with serve_reports(reports, port=port) as address, message:
         click.echo(address)
         click.echo(
             "corrections are written to tracks.csv as you make them; Ctrl+C stops the server",

@@ -54,8 +54,8 @@ def _serve(review: Path) -> None:
     """Serve until the viewer ends or a signal arrives."""
     from shapecat.outputs.review.viewer import serve_viewer
 
-    stops = stopping.noticing("stopping the viewer")
-    with serve_viewer(review) as (address, viewer), stops:
+    message = stopping.stop_message("stopping the viewer")
+    with serve_viewer(review) as (address, viewer), message:
         click.echo(address)
         while viewer.poll() is None and not stopping.asked():
             with suppress(subprocess.TimeoutExpired):

@@ -264,7 +264,7 @@ def test_interrupted_second_look_resumes_where_it_stopped(source: Path, tmp_path
         if (phase, done) == ("revise", 5):
             stopping.request()
 
-    with stopping.heeding_signals(), pytest.raises(stopping.Stopped):
+    with stopping.handling_signals(), pytest.raises(stopping.Stopped):
         process(job, stop)
     assert (tmp_path / ".table.partial" / "revisions" / "000000").exists()
 

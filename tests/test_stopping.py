@@ -225,7 +225,7 @@ def test_signal_during_imports_ends_command_without_traceback() -> None:
 @pytest.fixture
 def request_stop() -> Iterator[Callable[[], None]]:
     """Provide a function that pretends a signal has arrived; reset it afterwards."""
-    with stopping.heeding_signals():
+    with stopping.handling_signals():
         yield stopping.request
 
 

@@ -34,8 +34,8 @@ __all__ = [
 FSYNC = "SHAPECAT_FSYNC"
 """The environment variable that disables flushing; worker processes inherit it."""
 _SCRATCH = "shapecat-scratch-"
-_NEW_S = 60
-"""Age up to which a temporary folder may not be locked yet."""
+_UNLOCKED_S = 60
+"""A temporary folder younger than this may not be locked yet."""
 
 
 def partial_path(path: Path) -> Path:
@@ -114,14 +114,14 @@ def flush(path: Path) -> None:
     """
     if os.environ.get(FSYNC) == "0":
         return
-    number = os.open(path, os.O_RDONLY)
+    descriptor = os.open(path, os.O_RDONLY)
     try:
-        os.fsync(number)
+        os.fsync(descriptor)
     except OSError as error:
         if error.errno not in {errno.EINVAL, errno.ENOTSUP}:
             raise
     finally:
-        os.close(number)
+        os.close(descriptor)
 
 
 def lock(folder: Path) -> int | None:
@@ -132,15 +132,15 @@ def lock(folder: Path) -> int | None:
     The file descriptor; None if another process holds the lock, which cannot be detected on a file
     system without locks.
     """
-    held = os.open(folder, os.O_RDONLY)
+    descriptor = os.open(folder, os.O_RDONLY)
     try:
-        fcntl.flock(held, fcntl.LOCK_EX | fcntl.LOCK_NB)
+        fcntl.flock(descriptor, fcntl.LOCK_EX | fcntl.LOCK_NB)
     except BlockingIOError:
-        os.close(held)
+        os.close(descriptor)
         return None
     except OSError:
         pass
-    return held
+    return descriptor
 
 
 @contextmanager
@@ -152,13 +152,13 @@ def holding(folder: Path) -> Iterator[None]:
     OutputError : the folder does not exist or cannot be opened.
     """
     with explained(str(folder), OutputError):
-        held = os.open(folder, os.O_RDONLY)
+        descriptor = os.open(folder, os.O_RDONLY)
     try:
         with suppress(OSError):  # a file system without locks
-            fcntl.flock(held, fcntl.LOCK_EX)
+            fcntl.flock(descriptor, fcntl.LOCK_EX)
         yield
     finally:
-        os.close(held)
+        os.close(descriptor)
 
 
 @contextmanager
@@ -168,12 +168,12 @@ def scratch_folder() -> Iterator[Path]:
     Only those of this machine are removed, since NFS does not tell other machines of locks on
     folders, and only where there are locks: others may be in use.
     """
-    own = f"{_SCRATCH}{socket.gethostname()}-"
-    for left in Path(gettempdir()).glob(f"{glob.escape(own)}*"):
+    prefix = f"{_SCRATCH}{socket.gethostname()}-"
+    for earlier in Path(gettempdir()).glob(f"{glob.escape(prefix)}*"):
         with suppress(OSError):
-            if time.time() - left.stat().st_mtime > _NEW_S:
-                _remove_unused(left)
-    temporary = TemporaryDirectory(prefix=own, ignore_cleanup_errors=True)
+            if time.time() - earlier.stat().st_mtime > _UNLOCKED_S:
+                _remove_unused(earlier)
+    temporary = TemporaryDirectory(prefix=prefix, ignore_cleanup_errors=True)
     with temporary as folder, holding(Path(folder)):
         yield Path(folder)
 
@@ -185,9 +185,9 @@ def _remove_unused(folder: Path) -> None:
     ------
     OSError : another process holds its lock, or the file system has no locks.
     """
-    held = os.open(folder, os.O_RDONLY)
+    descriptor = os.open(folder, os.O_RDONLY)
     try:
-        fcntl.flock(held, fcntl.LOCK_EX | fcntl.LOCK_NB)
+        fcntl.flock(descriptor, fcntl.LOCK_EX | fcntl.LOCK_NB)
         shutil.rmtree(folder, ignore_errors=True)
     finally:
-        os.close(held)
+        os.close(descriptor)

@@ -4,11 +4,11 @@ import gc
 
 __all__ = ["collect_seldom"]
 
-_MADE = 100_000
+_ALLOCATIONS = 100_000
 """Allocations between two collections. The libraries alone hold 230,000 objects, and with Python's
 default of 700, walking them takes 3 % of a run."""
 
 
 def collect_seldom() -> None:
     """Collect garbage rarely: frames leave hardly any reference cycles."""
-    gc.set_threshold(_MADE)
+    gc.set_threshold(_ALLOCATIONS)

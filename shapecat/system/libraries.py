@@ -7,7 +7,7 @@ from typing import Any
 
 __all__ = ["block_unused"]
 
-_ASKS = {"scipy.linalg": "numba.np.linalg", "coverage": "numba.misc.coverage_support"}
+_BLOCKED_FOR = {"scipy.linalg": "numba.np.linalg", "coverage": "numba.misc.coverage_support"}
 """Modules that are blocked for one module of numba only."""
 
 
@@ -19,12 +19,14 @@ class _Blocker(MetaPathFinder):
 
     def find_spec(self, fullname: str, *_: Any) -> None:
         """Raise ModuleNotFoundError for blocked modules; leave others to other finders."""
-        if fullname == "pandas" or (fullname in _ASKS and _calls(_ASKS[fullname])):
+        if fullname == "pandas" or (
+            fullname in _BLOCKED_FOR and _is_caller(_BLOCKED_FOR[fullname])
+        ):
             msg = f"this process does without {fullname}"
             raise ModuleNotFoundError(msg, name=fullname)
 
 
-def _calls(module: str) -> bool:
+def _is_caller(module: str) -> bool:
     """Return whether a module is among the callers."""
     frame: FrameType | None = sys._getframe()  # noqa: SLF001  inspect takes longer
     while frame is not None and frame.f_globals.get("__name__") != module:

@@ -17,15 +17,15 @@ __all__ = [
     "Stopped",
     "asked",
     "check",
-    "heeding_signals",
-    "leave",
-    "noticing",
+    "exit_at_once",
+    "handling_signals",
     "request",
+    "stop_message",
     "until_asked",
 ]
 
 _SIGNALS = (signal.SIGINT, signal.SIGTERM)
-_notices = [b"stopping after the frames in work; interrupt again to leave at once\n"]
+_messages = [b"stopping after the frames in work; interrupt again to leave at once\n"]
 """The last one is printed at the first signal."""
 _SHOW_CURSOR = b"\x1b[?25h"
 
@@ -72,39 +72,39 @@ def until_asked(items: Iterable[_Item]) -> Iterator[_Item]:
         yield item
 
 
-def leave(signum: int, _frame: FrameType | None = None) -> None:
+def exit_at_once(signum: int, _frame: FrameType | None = None) -> None:
     """End this process at once (a signal handler); its workers notice and end too."""
     if os.isatty(2):
-        _say(_SHOW_CURSOR)
+        _write_stderr(_SHOW_CURSOR)
     os._exit(128 + signum)
 
 
-def _say(text: bytes) -> None:
+def _write_stderr(text: bytes) -> None:
     """Write to stderr past its buffer, since the signal may have interrupted a buffered write."""
     with suppress(OSError):
         os.write(2, text)
 
 
-def _note(signum: int, frame: FrameType | None) -> None:
+def _handle(signum: int, frame: FrameType | None) -> None:
     """Store the first signal; end the process at the second (a signal handler)."""
     if asked():
-        leave(signum, frame)
+        exit_at_once(signum, frame)
     request(signum)
-    _say(_notices[-1])
+    _write_stderr(_messages[-1])
 
 
 @contextmanager
-def noticing(text: str) -> Iterator[None]:
-    """Print a text of the block's own at the first signal."""
-    _notices.append(f"{text}\n".encode())
+def stop_message(text: str) -> Iterator[None]:
+    """Print another message at the first signal that arrives during the block."""
+    _messages.append(f"{text}\n".encode())
     try:
         yield
     finally:
-        _notices.pop()
+        _messages.pop()
 
 
 @contextmanager
-def heeding_signals() -> Iterator[None]:
+def handling_signals() -> Iterator[None]:
     """Store SIGINT and SIGTERM during the block instead of raising.
 
     Ignored signals, such as SIGINT in a background job, stay ignored. Outside the main thread,
@@ -115,7 +115,7 @@ def heeding_signals() -> Iterator[None]:
         handlers = {signum: signal.getsignal(signum) for signum in _SIGNALS}
         before = {n: h for n, h in handlers.items() if h not in {None, signal.SIG_IGN}}
     for signum in before:
-        signal.signal(signum, _note)
+        signal.signal(signum, _handle)
     try:
         yield
     finally:
