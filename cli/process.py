@@ -191,7 +191,7 @@ def process(
             tally.add(outcome)
     with for_any_reader():
         if as_json:
-            print_json([_summary_as_dict(*each) for each in tally.kept])
+            print_json([_summary_as_dict(*each) for each in tally.in_order(batch.tasks)])
         else:
             _print_closing(batch.tasks, tally)
     ctx.exit(common_exit_code(tally.codes))
@@ -258,7 +258,7 @@ class _Tally:
     def __init__(self, *, keep_all: bool) -> None:
         self.complete = self.failed = self.frames = 0
         self.codes: set[int] = set()
-        self.kept: list[tuple[Job, Summary]] = []
+        self._kept: list[tuple[Job, Summary]] = []
         self._keep_all = keep_all
 
     def add(self, outcome: "Outcome") -> None:
@@ -271,13 +271,17 @@ class _Tally:
         self.complete += 1
         self.frames += summary.counts["frames"]
         if self._keep_all or self.complete <= _MOST_ROWS or summary.corrections is not None:
-            self.kept.append((outcome.job, summary))
+            self._kept.append((outcome.job, summary))
+
+    def in_order(self, tasks: Sequence["Task"]) -> list[tuple["Job", "Summary"]]:
+        """Return the complete recordings to print, in the order of the plan."""
+        by_folder = {job.folder.name: (job, summary) for job, summary in self._kept}
+        return [by_folder[task.name] for task in tasks if task.name in by_folder]
 
 
 def _print_closing(tasks: Sequence["Task"], tally: _Tally) -> None:
     """Print the complete recordings in the order of the plan, if they are few, and totals."""
-    by_folder = {job.folder.name: (job, summary) for job, summary in tally.kept}
-    complete = [by_folder[task.name] for task in tasks if task.name in by_folder]
+    complete = tally.in_order(tasks)
     if 0 < tally.complete <= _MOST_ROWS:
         columns = ("recording", "frames", "seconds", "tracks", "results")
         print_table(columns, [_row(*each) for each in complete])

@@ -12,11 +12,13 @@ from typing import Any
 import pytest
 from click.testing import Result
 
+from shapecat.batch.ledger import Outcome
 from shapecat.executors import WorkerExecutor
 from shapecat.learning import load_model, save_model
 from shapecat.outputs.counts import count_words
 from shapecat.outputs.exports.dataset_frames import Selection
 from shapecat.outputs.exports.formats import Exported
+from shapecat.runs.jobs import Summary
 from shapecat.runs.labels.transfer import TABLE_ALONE
 from tests.scenes import record
 
@@ -103,6 +105,24 @@ def test_closing_table_follows_order_of_plan(capsys: pytest.CaptureFixture[str])
     assert ["already complete" in row for row in rows] == [True, False]
     assert "1.3" in rows[1]
     assert closing == "2 complete, 1 failed, 23 frames"
+
+
+def test_json_follows_order_of_plan(
+    shapecat: Run, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """The same command must print the same array, whichever recording ends first."""
+    for name in "ab":
+        (tmp_path / f"{name}.mcap").write_bytes(b"\x89MCAP")
+
+    def last_first(tasks: Any, *_: Any, **__: Any) -> Any:
+        for task in reversed(tasks):
+            counts = {"frames": 3, "tracks": {}}
+            yield Outcome(task.job, Summary(task.path, task.job.folder, counts, 1.0, ()))
+
+    monkeypatch.setattr("shapecat.batch.runs.process_here", last_first)
+    done = shapecat("process", tmp_path, "--out", tmp_path / "out", "--json")
+
+    assert [Path(run["folder"]).name for run in json.loads(done.stdout)] == ["a", "b"]
 
 
 @pytest.mark.parametrize(("count", "listed"), [(1, 1), (100, 100), (101, 0)])
