@@ -233,7 +233,8 @@ def _replace(group: Any, tree: Mapping[str, Any], prefix: str) -> Any:
         current = getattr(group, key)
         if dataclasses.is_dataclass(current):
             if not isinstance(value, Mapping):
-                msg = f"{name} is a group of settings, got {value!r}"
+                first = dataclasses.fields(current)[0].name
+                msg = f"{name} is a group of settings, such as {name}.{first}; got {value!r}"
                 raise ConfigError(msg)
             changes[key] = _replace(current, value, f"{name}.")
         else:

@@ -12,6 +12,7 @@ from copy import deepcopy
 from itertools import count
 from pathlib import Path
 from queue import SimpleQueue
+from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
@@ -228,6 +229,22 @@ def test_missing_or_invalid_executors_are_refused(monkeypatch: pytest.MonkeyPatc
         open_executor("local", workers=1, address="tcp://127.0.0.1:1")
     with pytest.raises(ValueError, match="at least 1"):
         LocalExecutor(0)
+
+
+def test_ray_that_does_not_start_is_not_blamed_on_a_scheduler(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    """Users who gave no address would look for ``--scheduler None``."""
+
+    def fail(**_: Any) -> None:
+        msg = "no space in /dev/shm"
+        raise RuntimeError(msg)
+
+    monkeypatch.setitem(sys.modules, "ray", SimpleNamespace(init=fail))
+    with pytest.raises(ConfigError, match="Ray does not start: no space"):
+        open_executor("ray", workers=1)
+    with pytest.raises(ConfigError, match=r"ray://a:1: no Ray cluster answers: no space"):
+        open_executor("ray", workers=1, address="ray://a:1")
 
 
 def test_dask_runs_equal_calls_separately() -> None:

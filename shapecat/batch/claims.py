@@ -97,7 +97,7 @@ class Claim:
                 return False
             if now != content:
                 owner = f"process {other.get('process')} on {other.get('host')}"
-                msg = f"{self._url}: another run is writing there: {owner}"
+                msg = f"{self._url}: another run is writing there: {owner}; wait for it, or stop it"
                 raise OutputError(msg)
         return True
 

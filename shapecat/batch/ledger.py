@@ -142,6 +142,6 @@ def _run_of(job: Job) -> RunInfo:
     try:
         run: RunInfo = json.loads((Location(job.target, OutputError) / "run.json").read() or b"")
     except ValueError as error:
-        msg = f"{job.target}: no run.json, although the manifest lists it as complete"
+        msg = f"{job.target}: its run.json is missing or damaged; process it again with --overwrite"
         raise OutputError(msg) from error
     return run

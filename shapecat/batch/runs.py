@@ -152,7 +152,8 @@ def _failed(job: Job, reason: str) -> Outcome:
 def _give_up(job: Job, error: BaseException) -> Outcome:
     kind = type(error).__name__
     if is_lost(error):
-        return _failed(job, f"gave up after {MOST_TRIES} tries: {str(error) or kind}")
+        hint = "if memory is short, use fewer --jobs"
+        return _failed(job, f"gave up after {MOST_TRIES} tries: {str(error) or kind}; {hint}")
     return _failed(job, f"{kind}: {error}")
 
 

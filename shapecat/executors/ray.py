@@ -32,16 +32,17 @@ class RayExecutor(WorkerExecutor):
             raise ConfigError(msg) from error
         self._ray = ray
         variables = dict.fromkeys(THREAD_LIMITS, "1")
-        alone = {
+        local_cluster = {
             "num_cpus": workers,
             "include_dashboard": False,
             "object_store_memory": _STORE_BYTES,
         }
-        started = {"address": address} if address else alone
+        cluster = {"address": address} if address else local_cluster
         try:
-            ray.init(**started, runtime_env={"env_vars": variables}, log_to_driver=False)
+            ray.init(**cluster, runtime_env={"env_vars": variables}, log_to_driver=False)
         except (ConnectionError, RuntimeError, ValueError) as error:
-            msg = f"--scheduler {address}: no Ray cluster answers: {error}"
+            problem = f"--scheduler {address}: no Ray cluster answers"
+            msg = f"{problem if address else '--executor ray: Ray does not start'}: {error}"
             raise ConfigError(msg) from error
         self._running: set[Any] = set()
 
