@@ -108,9 +108,9 @@ def export(
         msg = f"--recording is for a single run, not for {len(runs)}"
         raise click.UsageError(msg)
     if kind == "crops":
-        _require_own_frames(runs)
+        _require_distinct_frames(runs)
     elif kind not in _DATASETS:
-        _require_own_names(runs)
+        _require_distinct_names(runs)
     if boxes is not None and kind not in _WITH_BOXES:
         msg = f"--boxes is for --format {' and '.join(_WITH_BOXES)}, not {kind}"
         raise click.UsageError(msg)
@@ -146,20 +146,20 @@ def _export_dataset(
 
     with progress_bars() as bars:
         selection = Selection(**chosen)
-        found = export_dataset(runs, kind, out, selection, recording=recording, observe=bars)
-    click.echo(f"{plural(len(runs), 'run')}: {plural(found.objects, 'labelled view')} in {out}")
-    train, val = (found.images.get(split, 0) for split in ("train", "val"))
+        exported = export_dataset(runs, kind, out, selection, recording=recording, observe=bars)
+    click.echo(f"{plural(len(runs), 'run')}: {plural(exported.objects, 'labelled view')} in {out}")
+    train, val = (exported.images.get(split, 0) for split in ("train", "val"))
     hint = "" if val or not selection.val else ": all frames of a recording go to the same split"
     click.echo(f"{plural(train, 'image')} in train, {val:,} in val{hint}")
-    if kind == "yolo" and found.uncertain:
+    if kind == "yolo" and exported.uncertain:
         click.echo(
-            f"Warning: a model will learn {plural(found.uncertain, 'visible object')} without a "
+            f"Warning: a model will learn {plural(exported.uncertain, 'visible object')} without a "
             "reliable label as background; the format coco marks such objects as ignored",
             err=True,
         )
 
 
-def _require_own_names(runs: Sequence[Path]) -> None:
+def _require_distinct_names(runs: Sequence[Path]) -> None:
     """Refuse runs with the same name: their exports would collide."""
     from shapecat.errors import OutputError
 
@@ -167,12 +167,12 @@ def _require_own_names(runs: Sequence[Path]) -> None:
     for run in runs:
         other = names.setdefault(run.resolve().name, run)
         if other is not run:
-            todo = "export them to different folders (--out)"
-            msg = f"{other} and {run} have the same name; {todo}"
+            hint = "export them to different folders (--out)"
+            msg = f"{other} and {run} have the same name; {hint}"
             raise OutputError(msg)
 
 
-def _require_own_frames(runs: Sequence[Path]) -> None:
+def _require_distinct_frames(runs: Sequence[Path]) -> None:
     """Refuse runs of the same frames: each object would count as two."""
     from shapecat.errors import OutputError
     from shapecat.outputs.exports.crops import Origin

@@ -119,14 +119,14 @@ def missed_words(missed: Mapping[str, Any]) -> str:
 def changed_labels(before: Mapping[int, str], after: Mapping[int, str]) -> str:
     """Describe how the labels of tracks changed: ``2 labels set, 1 label cleared (#3 bowl)``."""
     changed = [k for k in after if after[k] != before.get(k, "")]
-    found = {
+    tracks_by_change = {
         "set": [k for k in changed if not before.get(k)],
         "replaced": [k for k in changed if before.get(k) and after[k]],
         "cleared": [k for k in before if before[k] and not after.get(k)],
     }
     parts = []
-    for what, tracks in found.items():
+    for change, tracks in tracks_by_change.items():
         lost = ", ".join(f"#{k} {before[k]}" for k in tracks if before.get(k))
         if tracks:
-            parts.append(f"{plural(len(tracks), 'label')} {what}{f' ({lost})' if lost else ''}")
+            parts.append(f"{plural(len(tracks), 'label')} {change}{f' ({lost})' if lost else ''}")
     return ", ".join(parts)

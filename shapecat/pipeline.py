@@ -121,15 +121,15 @@ def _run_phases(work: Work, content: ContentDigest, begun: float) -> None:
     content.start()
     # A kill after the last phase leaves a total.
     earlier_s = run["seconds"].pop("total", None) or sum(run["seconds"].values())
-    _once("perceive", folder, run, lambda: perceive_all(work))
-    _once("revise", folder, run, lambda: _revise_and_warn(work))
+    _run_once("perceive", folder, run, lambda: perceive_all(work))
+    _run_once("revise", folder, run, lambda: _revise_and_warn(work))
     identify(run, content)
     write_run(folder, run)
     discard_segments(folder)
-    _once("track", folder, run, lambda: track(folder, run, job))
+    _run_once("track", folder, run, lambda: track(folder, run, job))
     for _ in range(2):  # labels may be given while the outputs are written
         forget_old_labels(folder, run, job)
-        _once("labels", folder, run, lambda: keep_labels(folder, run, job))
+        _run_once("labels", folder, run, lambda: keep_labels(folder, run, job))
         annotate(folder, work.recording, run, observe)
     require_unchanged(folder, run, job.source)
     run["seconds"]["compile"] = compiling_s
@@ -162,7 +162,7 @@ def _revise_and_warn(work: Work) -> None:
     ]
 
 
-def _once(phase: str, folder: Path, run: RunInfo, work: Callable[[], object]) -> None:
+def _run_once(phase: str, folder: Path, run: RunInfo, work: Callable[[], object]) -> None:
     """Do the work of a phase unless it is done, and write its duration to run.json."""
     if phase in run["seconds"]:
         _log.info("%s: %s is already done", folder, phase)
@@ -237,10 +237,12 @@ def annotate(folder: Path, recording: Recording, run: RunInfo, observe: Observer
             "annotated.mcap has the annotations of an earlier run besides those of this one"
         )
     if run["options"]["rrd"]:
-        _once("review.rrd", folder, run, lambda: _write_review(folder, recording, run, observe))
+        _run_once("review.rrd", folder, run, lambda: _write_review(folder, recording, run, observe))
     run["warnings"] = list(dict.fromkeys([*run["warnings"], *recording.warnings]))
     if run["options"]["mcap"]:
-        _once("annotated.mcap", folder, run, lambda: _write_mcap(folder, recording, run, observe))
+        _run_once(
+            "annotated.mcap", folder, run, lambda: _write_mcap(folder, recording, run, observe)
+        )
 
 
 def _write_review(folder: Path, recording: Recording, run: RunInfo, observe: Observer) -> None:
@@ -309,7 +311,7 @@ def annotate_again(
     from shapecat.runs.finished import open_source  # noqa: PLC0415  on first use
 
     with open_source(read_run(folder), recording) as source, writing_outputs(folder):
-        transfer = _adopt(labels, folder, by_place=by_place)
+        transfer = _apply_labels(labels, folder, by_place=by_place)
         run = read_run(folder)
         run["input"] |= {"path": str(source.path.resolve()), "files": file_stats(source.path)}
         run |= {"boxes": boxes} if boxes else {}
@@ -321,7 +323,7 @@ def annotate_again(
     return transfer
 
 
-def _adopt(labels: Path | None, folder: Path, *, by_place: bool) -> Transfer | None:
+def _apply_labels(labels: Path | None, folder: Path, *, by_place: bool) -> Transfer | None:
     """Apply a table of labels to a run; return the outcome of a transfer by place, else None."""
     if by_place and labels is not None:
         with holding(folder):

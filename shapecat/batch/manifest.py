@@ -144,8 +144,9 @@ class RemoteManifest(Manifest):
         place = Location(url, OutputError)
         self._summary = place / (f"manifest-{shard}.jsonl" if shard else MANIFEST)
         self._parts = place / _PART_FOLDER / (shard or "all")
-        self._writer, self._part_number = f"{datetime.now(UTC):%Y%m%dT%H%M%S}-{uuid4().hex[:8]}", 0
-        self._part, self._sent_bytes = bytearray(), 0
+        self._writer = f"{datetime.now(UTC):%Y%m%dT%H%M%S}-{uuid4().hex[:8]}"
+        self._part_number = self._sent_bytes = 0
+        self._part = bytearray()
         self._lock, self._sending, self._ended = Lock(), Lock(), Event()
         self._part_keys: dict[str, str] = {}
         self._read_parts()
