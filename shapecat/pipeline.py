@@ -99,21 +99,13 @@ def process(job: Job, observe: Observer = ignore, *, cores: int = 1) -> Summary:
             if "perceive" not in run["seconds"]:
                 run = take_over_frames(job.folder, folder, run, job.source, content.result)
             run["color"] = {topic: colour.topic for topic, colour in colours.items()}
-            _run_phases(
-                Work(recording, streams, colours, folder, run, job, categorizer, observe, cores),
-                content,
-                begun,
-            )
+            work = Work(recording, streams, colours, folder, run, job, categorizer, observe, cores)
+            _run_phases(work, content, begun)
     return summarize(job, run)
 
 
 def _run_phases(work: Work, content: ContentDigest, begun: float) -> None:
-    """Run the phases that an interrupted run has not finished.
-
-    Parameters
-    ----------
-    begun : `time.perf_counter` when the work on the recording began.
-    """
+    """Run the phases that are not done; ``begun`` is when the work began, on `perf_counter`."""
     folder, run, job, observe = work.folder, work.run, work.job, work.observe
     compiling_s = compile_all(
         lambda: observe("compile", 0, None), cores=work.cores, colour=bool(work.colours)

@@ -24,7 +24,7 @@ from tests.scenes import record
 
 Run = Callable[..., Result]
 
-PROCESS: Any = import_module("shapecat.cli.process")
+OUTCOMES: Any = import_module("shapecat.cli.outcomes")
 PROGRESS: Any = import_module("shapecat.cli.progress")
 RENDER: Any = import_module("shapecat.cli.render")
 
@@ -89,7 +89,7 @@ def test_time_left_has_hours_minutes_and_seconds() -> None:
 
 def test_closing_table_follows_order_of_plan(capsys: pytest.CaptureFixture[str]) -> None:
     """Recordings finish in any order; users compare the table with their list."""
-    tally = PROCESS._Tally(keep_all=False)
+    tally = OUTCOMES.Tally(keep_all=False)
     for name, frames in (("b", 20), ("c", None), ("a", 3)):
         counts = {"frames": frames, "tracks": {"cup": 2}}
         summary = SimpleNamespace(
@@ -98,7 +98,7 @@ def test_closing_table_follows_order_of_plan(capsys: pytest.CaptureFixture[str])
         job = SimpleNamespace(name=f"x/{name}", folder=Path("out", name), target="")
         done = None if frames is None else summary
         tally.add(SimpleNamespace(job=job, summary=done, code=0 if done else 3))
-    PROCESS._print_closing([task("a"), task("b"), task("c")], tally)
+    OUTCOMES.print_closing([task("a"), task("b"), task("c")], tally)
     _, *rows, closing = capsys.readouterr().out.splitlines()
 
     assert [row.split()[:2] for row in rows] == [["a", "3"], ["b", "20"]]
@@ -131,7 +131,7 @@ def test_closing_table_lists_a_hundred_recordings_or_none(
 ) -> None:
     """Users would take an incomplete table for a complete one."""
     names = [f"r{k}" for k in range(count)]
-    tally = PROCESS._Tally(keep_all=False)
+    tally = OUTCOMES.Tally(keep_all=False)
     for name in names:
         summary = SimpleNamespace(
             counts={"frames": 30, "tracks": {}}, seconds=1.0, processed=True,
@@ -139,7 +139,7 @@ def test_closing_table_lists_a_hundred_recordings_or_none(
         )  # fmt: skip
         job = SimpleNamespace(name=name, folder=Path("out", name), target="")
         tally.add(SimpleNamespace(job=job, summary=summary, code=0))
-    PROCESS._print_closing([task(name) for name in names], tally)
+    OUTCOMES.print_closing([task(name) for name in names], tally)
     out = capsys.readouterr().out
 
     assert [line.split()[0] for line in out.splitlines() if " 30 " in line] == names[:listed]
@@ -534,7 +534,7 @@ def test_process_reports_where_untransferred_labels_are(
         corrections = {"transferred": [{}] * 5, "not_transferred": left}
         summary = SimpleNamespace(corrections=corrections, folder=Path("out/lab"))
         job = SimpleNamespace(name="in/lab", target=target)
-        PROCESS._print_corrections(job, summary)
+        OUTCOMES._print_corrections(job, summary)
 
     message = "lab: transferred 5 of 6 corrected labels; the others are in"
     assert capsys.readouterr().err.splitlines() == [

@@ -41,6 +41,7 @@ JUDGED_BY: dict[str, Sequence[str]] = {
                      "test_exports_readback", "test_boxes_in_outputs"),
     "shapecat.cli.compare": ("test_compare",),
     "shapecat.cli.evaluate": ("test_evaluation", "test_command_line"),
+    "shapecat.cli.outcomes": ("test_commands_worked", "test_batch"),
     "shapecat.cli.process": ("test_commands_worked", "test_command_line", "test_pipeline",
                              "test_batch", "test_colour_outputs"),
     "shapecat.cli.progress": ("test_commands_worked", "test_command_line", "test_batch"),

@@ -1,0 +1,102 @@
+"""Outcomes of ``process``: counts, the table at the end, and transferred labels."""
+
+from collections.abc import Sequence
+from contextlib import suppress
+from typing import TYPE_CHECKING, Any
+
+import click
+
+from shapecat.outputs.counts import count_words
+
+from .render import missed_words, print_table
+
+if TYPE_CHECKING:
+    from shapecat.batch.ledger import Outcome
+    from shapecat.batch.plans import Task
+    from shapecat.runs.jobs import Job, Summary
+
+_MOST_ROWS = 100
+
+
+class Tally:
+    """Counts of the outcomes of a batch, and the complete recordings to print.
+
+    These are the first 100, or all if ``keep_all``, and all those with labels of replaced results.
+    """
+
+    def __init__(self, *, keep_all: bool) -> None:
+        self.complete = self.failed = self.frames = 0
+        self.codes: set[int] = set()
+        self._kept: list[tuple[Job, Summary]] = []
+        self._keep_all = keep_all
+
+    def add(self, outcome: "Outcome") -> None:
+        """Count an outcome."""
+        self.codes.add(outcome.code)
+        summary = outcome.summary
+        if summary is None:
+            self.failed += 1
+            return
+        self.complete += 1
+        self.frames += summary.counts["frames"]
+        if self._keep_all or self.complete <= _MOST_ROWS or summary.corrections is not None:
+            self._kept.append((outcome.job, summary))
+
+    def in_order(self, tasks: Sequence["Task"]) -> list[tuple["Job", "Summary"]]:
+        """Return the complete recordings to print, in the order of the plan."""
+        by_folder = {job.folder.name: (job, summary) for job, summary in self._kept}
+        return [by_folder[task.name] for task in tasks if task.name in by_folder]
+
+
+def print_closing(tasks: Sequence["Task"], tally: Tally) -> None:
+    """Print the complete recordings in the order of the plan, if they are few, and totals."""
+    complete = tally.in_order(tasks)
+    if 0 < tally.complete <= _MOST_ROWS:
+        columns = ("recording", "frames", "seconds", "tracks", "results")
+        print_table(columns, [_row(*each) for each in complete])
+    for job, summary in complete:
+        _print_corrections(job, summary)
+    if len(tasks) > 1:
+        click.echo(f"{tally.complete} complete, {tally.failed} failed, {tally.frames:,} frames")
+
+
+def summary_as_dict(job: "Job", summary: "Summary") -> dict[str, Any]:
+    """Return the summary of a complete recording as plain values.
+
+    That of a recording that was complete before may come from the manifest, which has neither
+    warnings nor all counts: it is read from its run folder.
+    """
+    from shapecat.errors import OutputError
+    from shapecat.runs.folder import read_run
+    from shapecat.runs.jobs import summarize
+
+    if not summary.processed and not job.target:
+        with suppress(OutputError):  # it was removed meanwhile
+            summary = summarize(job, read_run(job.folder), processed=False)
+    return summary.as_dict()
+
+
+def _print_corrections(job: "Job", summary: "Summary") -> None:
+    """Report the transfer of corrected labels from the replaced results, if there were any."""
+    if summary.corrections is None:
+        return
+    done, missed = (summary.corrections[name] for name in ("transferred", "not_transferred"))
+    where = job.target or summary.folder
+    rest = f"; the others are in {where}/tracks.previous.csv" if missed else ""
+    counts = f"{len(done)} of {len(done) + len(missed)}"
+    text = f"{_short_name(job)}: transferred {counts} corrected labels{rest}"
+    click.echo("\n".join((text, *map(missed_words, missed))), err=True)
+
+
+def _row(job: "Job", summary: "Summary") -> tuple[Any, ...]:
+    return (
+        _short_name(job),
+        summary.counts["frames"],
+        round(summary.seconds, 1) if summary.processed else "already complete",
+        count_words(summary.counts["tracks"]),
+        job.target or summary.folder,
+    )
+
+
+def _short_name(job: "Job") -> str:
+    return job.name.rpartition("/")[2]
