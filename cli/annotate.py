@@ -12,10 +12,7 @@ from .render import changed_labels, missed_words, progress_bars
 @click.command()
 @click.argument("run", type=ANY_PATH)
 @click.option(
-    "--labels",
-    type=ANY_PATH,
-    metavar="LABELS",
-    help="Corrected table; by default RUN/tracks.csv.",
+    "--labels", type=ANY_PATH, metavar="LABELS", help="Corrected table; by default RUN/tracks.csv."
 )
 @click.option(
     "--by-place",
@@ -26,12 +23,7 @@ from .render import changed_labels, missed_words, progress_bars
 @boxes_option("In annotated.mcap, {}; if not given, boxes are not changed.")
 @recording_option
 def annotate(
-    *,
-    run: Path,
-    labels: Path | None,
-    by_place: bool,
-    boxes: str | None,
-    recording: Path | None,
+    *, run: Path, labels: Path | None, by_place: bool, boxes: str | None, recording: Path | None
 ) -> None:
     """Write corrected labels into annotated.mcap and review.rrd.
 

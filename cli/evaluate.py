@@ -14,10 +14,7 @@ from .render import print_json, progress_bars
 @click.argument("dataset", type=ANY_PATH)
 @model_option
 @click.option(
-    "--report",
-    "page",
-    type=ANY_PATH,
-    help="Write a report with pictures, as .html or .md.",
+    "--report", "page", type=ANY_PATH, help="Write a report with pictures, as .html or .md."
 )
 @click.option(
     "--baselines",

@@ -26,12 +26,7 @@ _FORMATS = (*_DATASETS, "crops", *_WITH_BOXES, "point-labels")
     required=True,
     help="Format of the export, listed above.",
 )
-@click.option(
-    "--out",
-    type=ANY_PATH,
-    required=True,
-    help="Folder for the export.",
-)
+@click.option("--out", type=ANY_PATH, required=True, help="Folder for the export.")
 @click.option(
     "--every", type=click.IntRange(1), default=1, metavar="N", help="Keep only every Nth frame."
 )

@@ -36,8 +36,7 @@ def train(*, dataset: Path, out: Path, seed: int, as_json: bool) -> None:
     note_skipped(result)
     if not result["calibrated"]:
         click.echo(
-            "the confidence is not calibrated: most categories have only one object",
-            err=True,
+            "the confidence is not calibrated: most categories have only one object", err=True
         )
     if as_json:
         print_json(result)

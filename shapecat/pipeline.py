@@ -169,11 +169,7 @@ def _run_once(phase: str, folder: Path, run: RunInfo, work: Callable[[], object]
 
 
 def _add_outputs(
-    job: Job,
-    recording: Recording,
-    planned: RunInfo,
-    content: ContentDigest,
-    observe: Observer,
+    job: Job, recording: Recording, planned: RunInfo, content: ContentDigest, observe: Observer
 ) -> Summary:
     """Return the summary of a complete folder, after writing the wanted outputs that it lacks.
 

@@ -22,9 +22,7 @@ _NUMBER = re.compile(r"_\d+$")
 
 
 def name_folders(
-    names: Sequence[str],
-    parents: Sequence[str],
-    existing: Mapping[int, str] = MappingProxyType({}),
+    names: Sequence[str], parents: Sequence[str], existing: Mapping[int, str] = MappingProxyType({})
 ) -> list[str]:
     """Return a unique run folder name for each recording: its file name without suffix.
 

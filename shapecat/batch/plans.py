@@ -24,13 +24,7 @@ from shapecat.runs.identity import file_stats
 from shapecat.runs.jobs import Job
 from shapecat.system.files import partial_path
 
-__all__ = [
-    "Batch",
-    "Shard",
-    "Status",
-    "Task",
-    "plan_batch",
-]
+__all__ = ["Batch", "Shard", "Status", "Task", "plan_batch"]
 
 _NamedSource = tuple[str, Source]
 

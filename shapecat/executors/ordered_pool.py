@@ -47,10 +47,7 @@ class OrderedPool(Generic[_Item, _Result]):
     """
 
     def __init__(
-        self,
-        work: Callable[[_Item], _Result],
-        count: int,
-        warm_up: Callable[[], object] = object,
+        self, work: Callable[[_Item], _Result], count: int, warm_up: Callable[[], object] = object
     ) -> None:
         """Prepare ``count`` processes, including this one; the others end with the block.
 

@@ -14,11 +14,7 @@ from tests.faults.cases import Laboratory, SkippedError, Verdict
 from tests.faults.injection import KINDS
 from tests.faults.scenarios import SCENARIOS
 
-GROUPS = {
-    "disk": ("enospc", "tmpfs", "erofs"),
-    "io": ("eio", "eioread", "short"),
-    "all": KINDS,
-}
+GROUPS = {"disk": ("enospc", "tmpfs", "erofs"), "io": ("eio", "eioread", "short"), "all": KINDS}
 
 
 def main(words: list[str] | None = None) -> int:
