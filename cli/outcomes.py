@@ -21,7 +21,7 @@ _MOST_ROWS = 100
 class Tally:
     """Counts of the outcomes of a batch, and the complete recordings to print.
 
-    These are the first 100, or all if ``keep_all``, and all those with labels of replaced results.
+    Printed are the first 100, or all if ``keep_all``, and all that got labels of replaced results.
     """
 
     def __init__(self, *, keep_all: bool) -> None:
