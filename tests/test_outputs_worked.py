@@ -585,6 +585,32 @@ def test_export_of_other_topics_is_not_replaced(tmp_path: Path) -> None:
     _require_own(tmp_path, right)
 
 
+@pytest.mark.parametrize(
+    ("earlier", "later", "kept"),
+    [
+        ((None, 5.0), (5.0, None), True),
+        ((None, None), (None, 5.0), True),
+        ((2.0, 5.0), (3.0, 9.0), True),
+        ((2.0, 5.0), (2.0, 5.0), False),
+        ((2.0, 5.0), (None, 5.5), False),
+        ((2.0, None), (None, None), False),
+    ],
+)
+def test_export_of_other_time_range_is_not_replaced(
+    tmp_path: Path, earlier: Any, later: Any, kept: bool
+) -> None:
+    """Two runs of one recording, one for each part, may have the same name."""
+    before, after = ({**KITTI, "range_s": list(part)} for part in (earlier, later))
+    mark = tmp_path / "export.json"
+    mark.write_text(json.dumps({**before, "made": [], "objects": 3}))
+
+    refused = pytest.raises(OutputError, match="of another time range; choose another --out")
+    with refused if kept else nullcontext():
+        _require_own(tmp_path, after)
+    mark.write_text(json.dumps({**KITTI, "made": [], "objects": 3}))  # by an earlier version
+    _require_own(tmp_path, after)
+
+
 def test_file_moved_into_export_is_not_deleted_with_it(tmp_path: Path) -> None:
     """It keeps its time, which may be before that of the export."""
     out, mine = tmp_path / "out", tmp_path / "mine.png"

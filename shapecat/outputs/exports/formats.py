@@ -1,6 +1,7 @@
 """Export the labels of runs in the formats of other tools."""
 
 import json
+import math
 from collections import Counter
 from collections.abc import Callable, Collection, Iterable, Iterator, Mapping, Sequence
 from contextlib import suppress
@@ -117,6 +118,7 @@ def export_run(
             "run": finished.run["id"],
             "input": finished.run["input"],
             "topics": finished.run["options"]["topics"],
+            "range_s": [finished.run["options"][name] for name in ("start_s", "end_s")],
         }
         write = FORMATS[format]
         return _staged(out / finished.name, about, lambda hidden: write(hidden, pairs, finished))
@@ -275,12 +277,25 @@ def _require_own(target: Path, about: Mapping[str, Any]) -> None:
     if earlier.get("topics", about.get("topics")) != about.get("topics"):
         msg = f"{target}: holds the {format} export of other topics; choose another --out"
         raise OutputError(msg)
+    if not _covers(about.get("range_s"), earlier.get("range_s")):
+        msg = f"{target}: holds the {format} export of another time range; choose another --out"
+        raise OutputError(msg)
     exported = (target / _MARK).stat().st_mtime_ns
     later = [path for path in target.rglob("*") if path.lstat().st_mtime_ns > exported]
     if later:
         changed = min(later, key=lambda path: (path.is_dir(), path))
         msg = f"{changed}: was changed after the export; choose another --out, or move it away"
         raise OutputError(msg)
+
+
+def _covers(new: Any, old: Any) -> bool:
+    """Return whether a time range includes an earlier one; None if there is none or no limit."""
+    if new is None or old is None:
+        return True
+    (start, end), (old_start, old_end) = (
+        (first or 0, math.inf if last is None else last) for first, last in (new, old)
+    )
+    return start <= old_start and old_end <= end
 
 
 def _recording_of(about: Mapping[str, Any]) -> Any:
