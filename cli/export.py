@@ -96,12 +96,14 @@ def export(
     shapecat export results --format coco --out coco --min-confidence 0.8
     """
     from shapecat.outputs.exports.formats import common_categories, export_run
-    from shapecat.runs.finished import find_runs
+    from shapecat.runs.finished import find_runs, require_recordings
 
     runs = find_runs(folders)
     if recording is not None and len(runs) > 1:
         msg = f"--recording is for a single run, not for {len(runs)}"
         raise click.UsageError(msg)
+    if len(runs) > 1:
+        require_recordings(runs)
     if kind == "crops":
         _require_distinct_frames(runs)
     elif kind not in _DATASETS:

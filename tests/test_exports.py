@@ -432,6 +432,26 @@ def test_missing_or_changed_recording_is_refused(run: Path, tmp_path: Path) -> N
     assert not (tmp_path / "crops").exists()
 
 
+def test_all_missing_recordings_are_named_before_export(
+    shapecat: Run, run: Path, tmp_path: Path
+) -> None:
+    """An export of many runs ended after hours at the first recording that had been moved."""
+    for name in ("a", "b", "c"):
+        shutil.copytree(run, tmp_path / "results" / name)
+    for name in ("b", "c"):
+        place = tmp_path / "results" / name / "run.json"
+        info = json.loads(place.read_text())
+        info["input"]["path"] = f"/moved/{name}.mcap"
+        place.write_text(json.dumps(info))
+    out = tmp_path / "out"
+    result = shapecat("export", tmp_path / "results", "--format", "kitti", "--out", out)
+
+    assert result.exit_code == 3
+    assert "/moved/b.mcap of" in result.stderr
+    assert "/moved/c.mcap of" in result.stderr
+    assert not out.exists()
+
+
 def test_export_command_reports_views_and_errors(shapecat: Run, run: Path, tmp_path: Path) -> None:
     result = shapecat("export", run, "--format", "crops", "--out", tmp_path / "c", "--every", 6)
 

@@ -1,6 +1,6 @@
 """Read a finished run, and open the recording from which it was made."""
 
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -15,7 +15,7 @@ from shapecat.runs.labels.meaning import TrackLabel
 from shapecat.runs.run_info import RunInfo
 from shapecat.types import LabelledFrame
 
-__all__ = ["FinishedRun", "find_runs", "open_source", "read_finished"]
+__all__ = ["FinishedRun", "find_runs", "open_source", "read_finished", "require_recordings"]
 
 
 @dataclass(frozen=True)
@@ -87,6 +87,21 @@ def _runs_in(folder: Path) -> list[Path]:
         msg = f"{folder}: no run.json there or one level below; expected runs of `process`"
         raise OutputError(msg)
     return runs
+
+
+def require_recordings(folders: Iterable[Path]) -> None:
+    """Check that the recordings of several runs are where they were processed.
+
+    Raises
+    ------
+    RecordingError : some are missing; the message lists all of them.
+    """
+    sources = {folder: Path(read_run(folder)["input"]["path"]) for folder in folders}
+    missing = [f"{path} of {run}" for run, path in sources.items() if not path.exists()]
+    if missing:
+        listed = "\n  ".join(missing)
+        msg = f"missing recordings; treat their runs alone, with --recording PATH:\n  {listed}"
+        raise RecordingError(msg)
 
 
 @contextmanager
