@@ -104,9 +104,9 @@ def export(
         raise click.UsageError(msg)
     if len(runs) > 1:
         require_recordings(runs)
-    if kind == "crops":
+    if kind in {*_DATASETS, "crops"}:
         _require_distinct_frames(runs)
-    elif kind not in _DATASETS:
+    else:
         _require_distinct_names(runs)
     if boxes is not None and kind not in _WITH_BOXES:
         msg = f"--boxes is for --format {' and '.join(_WITH_BOXES)}, not {kind}"
@@ -170,7 +170,7 @@ def _require_distinct_names(runs: Sequence[Path]) -> None:
 
 
 def _require_distinct_frames(runs: Sequence[Path]) -> None:
-    """Refuse runs of the same frames: each object would count as two."""
+    """Refuse runs of the same frames: they would be in the data set twice."""
     from shapecat.errors import OutputError
     from shapecat.outputs.exports.crops import Origin
     from shapecat.runs.finished import read_finished

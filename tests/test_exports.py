@@ -126,6 +126,7 @@ def test_crops_are_upright_at_height_zero_with_viewpoint(run: Path, tmp_path: Pa
     [
         ("crops", "lab", "hold the same frames of a recording; export only one"),
         ("crops", "lab2", "hold the same frames of a recording; export only one"),
+        ("coco", "lab2", "hold the same frames of a recording; export only one"),
         ("kitti", "lab", "have the same name; export them to different folders"),
     ],
 )
