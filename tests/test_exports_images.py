@@ -241,12 +241,21 @@ def test_depth_images_are_millimetres_with_their_own_masks(run: Path, tmp_path: 
     assert all(row["segmentation"]["size"] == [480, 640] for row in data["annotations"])
 
 
-def test_run_without_colour_suggests_depth_option(
-    guessed_run: Path, tmp_path: Path, shapecat: Run
+def test_all_runs_without_colour_are_named_before_export(
+    run: Path, guessed_run: Path, tmp_path: Path, shapecat: Run, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    result = shapecat("export", guessed_run, "--format", "coco", "--out", tmp_path / "out")
+    """An export of many runs ended after hours at the first recording without colour."""
+    monkeypatch.delattr("shapecat.outputs.exports.formats.images_of")
+    other = tmp_path / "other"
+    shutil.copytree(guessed_run, other)
+    info = json.loads((other / "run.json").read_text())
+    info["input"]["digest"] = "xxh3-128:another"
+    (other / "run.json").write_text(json.dumps(info))
+    words = ("export", run, guessed_run, other, "--format", "coco", "--out", tmp_path / "out")
+    result = shapecat(*words)
     assert result.exit_code == 1
-    assert "no colour images; --depth exports depth images" in result.stderr
+    problem = "no colour images; --depth exports depth images"
+    assert f"Error: {guessed_run}, {other}: {problem}\n" in result.stderr
     assert not (tmp_path / "out").exists()
 
 

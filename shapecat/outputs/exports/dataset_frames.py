@@ -13,7 +13,6 @@ import xxhash
 from shapecat.arrays import F8, U1
 from shapecat.colour.masks import Mask, dense_masks
 from shapecat.colour.snapping import snapped
-from shapecat.errors import OutputError
 from shapecat.outputs.colouring import Coloured, with_colour
 from shapecat.outputs.exports.points import depth_in_mm
 from shapecat.outputs.png import png
@@ -129,13 +128,9 @@ def images_of(
 
     Raises
     ------
-    OutputError : the run has no colour images and ``selection.depth`` is False, or the content of
-        the recording has changed.
+    OutputError : the content of the recording has changed.
     RecordingError : the recording is missing or unreadable.
     """
-    if not selection.depth and not finished.run.get("color"):
-        msg = f"{finished.folder}: no colour images; --depth exports depth images"
-        raise OutputError(msg)
     labels = read_track_table(finished.folder / "tracks.csv").labels
     corrected = {track for track, label in labels.items() if label}
     chosen = _chosen(finished, selection, corrected)

@@ -162,6 +162,10 @@ def export_dataset(
 
     def images() -> Iterator[tuple[str, FinishedRun, DatasetImage]]:
         nonlocal uncertain
+        gray = [str(run.folder) for run in runs if not (selection.depth or run.run.get("color"))]
+        if gray:
+            msg = f"{', '.join(gray)}: no colour images; --depth exports depth images"
+            raise OutputError(msg)
         splits = split_runs(runs, selection.val)
         for split, stems, run in zip(splits, image_stems(runs), runs, strict=True):
             for image in images_of(run, selection, recording, stems=stems, left_out=left_out):
