@@ -2,6 +2,7 @@
 
 import dataclasses
 import json
+import math
 from contextlib import suppress
 from importlib.resources import files
 from pathlib import Path
@@ -98,16 +99,28 @@ def test_settings_outside_schema_are_refused() -> None:
     for group, part in schema["$defs"]["settings"]["properties"].items():
         for name, field in part.get("properties", {"": part}).items():
             whole, setting = field.get("type") == "integer", ".".join(filter(None, (group, name)))
-            step = 1 if whole else 0.5
-            outside = [field[key] - step for key in ("minimum",) if key in field]
-            outside += [field[key] + step for key in ("maximum",) if key in field]
-            outside += [field[key] for key in ("exclusiveMinimum",) if key in field]
+            outside = [
+                field[key] + side if whole else math.nextafter(field[key], side * math.inf)
+                for key, side in (("minimum", -1), ("maximum", 1))
+                if key in field
+            ]
             for value in outside:
                 with suppress(ConfigError):
                     with_overrides(Settings(), [f"{setting}={value}"])
                     accepted.append(f"{setting}={value}")
 
     assert accepted == []
+
+
+def test_limits_of_schema_are_accepted() -> None:
+    """The schema documents the limits; other programs check settings by it."""
+    schema = json.loads(files("shapecat.schemas").joinpath("run.json").read_text("utf-8"))
+    for group, part in schema["$defs"]["settings"]["properties"].items():
+        for name, field in part.get("properties", {"": part}).items():
+            if field.get("type") in {"integer", "number"}:
+                setting = ".".join(filter(None, (group, name)))
+                for value in (field["minimum"], field.get("maximum", 10**12)):
+                    with_overrides(Settings(), [f"{setting}={value}"])
 
 
 def test_as_dict_has_every_field() -> None:
