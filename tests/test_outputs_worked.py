@@ -572,6 +572,19 @@ def test_export_of_another_recording_is_not_replaced(tmp_path: Path) -> None:
         _require_own(tmp_path, tuesday)
 
 
+def test_data_set_with_other_recordings_is_not_replaced(tmp_path: Path) -> None:
+    """Crops are added to a data set; those who expect it of images too would lose the first."""
+    monday, tuesday, both = (
+        {"format": "coco", "recordings": list(names)} for names in ("a", "b", "ab")
+    )
+    (tmp_path / "export.json").write_text(json.dumps({**monday, "made": [], "objects": 3}))
+
+    _require_own(tmp_path, monday)
+    _require_own(tmp_path, both)
+    with pytest.raises(OutputError, match="of another recording; choose another --out"):
+        _require_own(tmp_path, tuesday)
+
+
 def test_export_of_other_topics_is_not_replaced(tmp_path: Path) -> None:
     """Two runs of one recording, one for each camera, may have the same name."""
     left, right = ({**KITTI, "topics": [name]} for name in ("/left", "/right"))

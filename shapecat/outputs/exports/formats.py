@@ -180,7 +180,11 @@ def export_dataset(
 
     names = different_names([run.name for run in runs])
     ids = {name: run.run["id"] for name, run in zip(names, runs, strict=True)}
-    about = {"format": format, "runs": ids}
+    about = {
+        "format": format,
+        "runs": ids,
+        "recordings": sorted({run.run["input"]["digest"] for run in runs}),
+    }
     objects = _staged(out, about, lambda hidden: DATASETS[format](hidden, images(), categories))
     return Exported(objects, uncertain, counts)
 
@@ -275,8 +279,10 @@ def _require_own(target: Path, about: Mapping[str, Any]) -> None:
         made = earlier.get("format", "something else")
         msg = f"{target}: holds {made}, not an earlier {format} export; choose another --out"
         raise OutputError(msg)
-    if _recording_of(earlier) != _recording_of(about):
-        msg = f"{target}: holds the {format} export of another recording; choose another --out"
+    if not _recordings_of(earlier) <= _recordings_of(about):
+        hint = ", or export all runs together" if format in DATASETS else ""
+        made = f"{target}: holds the {format} export of another recording"
+        msg = f"{made}; choose another --out{hint}"
         raise OutputError(msg)
     if earlier.get("topics", about.get("topics")) != about.get("topics"):
         msg = f"{target}: holds the {format} export of other topics; choose another --out"
@@ -302,7 +308,8 @@ def _covers(new: Any, old: Any) -> bool:
     return start <= old_start and old_end <= end
 
 
-def _recording_of(about: Mapping[str, Any]) -> Any:
-    """Return the digest of the recording that was exported; None for data sets of several runs."""
+def _recordings_of(about: Mapping[str, Any]) -> set[str]:
+    """Return the digests of the recordings that were exported."""
     source = about.get("input")
-    return source.get("digest") if isinstance(source, dict) else None
+    single = [source.get("digest")] if isinstance(source, dict) else []
+    return {str(digest) for digest in (*about.get("recordings", ()), *single)}
