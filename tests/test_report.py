@@ -32,7 +32,7 @@ from shapecat.outputs.report.tracks import Timeline, read_timelines
 from shapecat.outputs.report.writing import Reports, RunReport
 from shapecat.outputs.wording import caption, confidence_text, time_span
 from shapecat.runs.finished import FinishedRun, read_finished
-from shapecat.runs.labels.corrections import read_labels, relabel
+from shapecat.runs.labels.corrections import adopt_labels, read_labels, relabel
 from shapecat.runs.labels.meaning import find_misread
 from shapecat.runs.labels.track_table import (
     TrackRow,
@@ -527,6 +527,27 @@ def test_new_page_keeps_corrections_not_downloaded(
 
     assert changes(browser) == {a: "→ delete", b: "→ teapot"}
     assert browser.complaints() == []
+
+
+def test_label_that_is_cleared_after_download_is_cleared_in_run(
+    browser: Browser, reported_run: Path, tmp_path: Path
+) -> None:
+    """The table seemed not to change the label that the first table had brought to the run."""
+    run = tmp_path / "table"
+    shutil.copytree(reported_run, run)
+    page = run / "report.html"
+    a, b = (row.track for row in read_track_table(run / "tracks.csv").rows[:2])
+    browser.open(page)
+    for expected in ("delete", ""):
+        for track in (a, b):
+            browser.click(f"#track-{track} button[data-label='delete']")  # the second clears it
+            browser.open(page)
+        for _ in range(2):  # a table may also be lost
+            browser.click("#download")
+            table = browser.downloaded().rename(tmp_path / "corrected.csv")
+        adopt_labels(table, run)
+        labels = read_track_table(run / "tracks.csv").labels
+        assert (labels[a], labels[b]) == (expected, expected)
 
 
 def test_two_tabs_keep_corrections_of_both(browser: Browser, reported_run: Path) -> None:

@@ -170,6 +170,26 @@ def test_page_reports_corrections_lost_by_killed_server(
     assert [track for track, label in downloaded.items() if label] == sorted(order[:13])
 
 
+def test_label_cleared_after_server_has_stopped_is_in_table(
+    browser: Browser, long_run: Path
+) -> None:
+    """The page offers the table to keep the correction, so the table must make it."""
+    with serving(long_run) as (address, _):
+        browser.open(address)
+        track = order_of(browser)[0]
+        browser.press("d")
+        browser.wait(SAVED)
+        assert labels_on_disk(long_run)[track] == "delete"
+    browser.press("Backspace")
+    browser.wait("return !document.getElementById('download').hidden")
+    browser.click("#download")
+    table = browser.downloaded()
+    adopt_labels(table, long_run)
+    table.unlink()
+
+    assert labels_on_disk(long_run)[track] == ""
+
+
 LOADED = "return performance.getEntriesByType('resource').some((got) => /labels$/.test(got.name))"
 """A page requests the labels when it gets the focus."""
 TROUBLE = {

@@ -118,9 +118,9 @@ function confusion(checked) {
 
 function csv() {
   const quote = (cell) => (/[",\r\n]/.test(cell) ? `"${cell.replaceAll('"', '""')}"` : cell);
-  // With the labels as this page was made, so that it does not undo labels given elsewhere since.
+  // With the labels that it replaces, so that it does not undo labels given elsewhere since.
   const lines = data.rows.map((row) => [...data.columns.map((name, k) =>
-    quote(name === "label" ? labels.get(row.track) : row.cells[k])), quote(row.label)].join(","));
+    quote(name === "label" ? labels.get(row.track) : row.cells[k])), quote(replaced(row.track))].join(","));
   const text = [[...data.columns, "label_seen"].map(quote).join(","), ...lines, ""].join("\n");
   // Excel takes the letters of a table without a byte order mark for others.
   return /^[\x00-\x7f]*$/.test(text) ? text : `\ufeff${text}`;
@@ -158,5 +158,6 @@ byId("download").addEventListener("click", () => {
   const command = byId("command");
   command.textContent = `${command.dataset.annotate} --labels ~/Downloads/${link.download}`;
   link.click();
+  noteDownload();
   setTimeout(() => URL.revokeObjectURL(link.href), 10000);
 });

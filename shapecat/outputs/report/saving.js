@@ -1,6 +1,7 @@
 // Where labels go: to tracks.csv by the server, or into this browser until they are downloaded.
 const storage = `shapecat:${data.key}`;
 const onDisk = new Map(labels);
+const given = new Map();  // corrections in downloaded tables: they may be in tracks.csv by now
 const sending = new Set();
 let lost = "", before = Promise.resolve();
 
@@ -12,7 +13,7 @@ function save(track) {
 function keep(track) {
   try {
     const all = kept(), [label, seen] = [labels.get(track), onDisk.get(track)];
-    if (label === seen) delete all[track]; else all[track] = [label, seen];
+    if (label === seen && !given.has(track)) delete all[track]; else all[track] = [label, seen, given.get(track)];
     localStorage.setItem(storage, JSON.stringify(all));
   } catch { /* a browser that keeps nothing for files still downloads */ }
 }
@@ -25,8 +26,9 @@ function kept() {
 
 function recall() {
   try {
-    for (const [track, [label]] of Object.entries(kept())) {
+    for (const [track, [label, , told]] of Object.entries(kept())) {
       labels.set(track, label);
+      if (typeof told === "string") given.set(track, told);
       learn(label);
     }
   } catch { /* the same */ }
@@ -34,6 +36,19 @@ function recall() {
 
 function unsaved() {
   return data.rows.map((row) => row.track).filter((track) => labels.get(track) !== onDisk.get(track));
+}
+
+// The label that a downloaded table replaces.
+function replaced(track) {
+  const seen = onDisk.get(track);
+  return labels.get(track) === seen && given.has(track) ? given.get(track) : seen;
+}
+
+function noteDownload() {
+  for (const track of unsaved()) {
+    given.set(track, labels.get(track));
+    if (!data.served) keep(track);
+  }
 }
 
 // Take over what other tabs and programs wrote, where this page has nothing newer.

@@ -27,7 +27,7 @@ __all__ = [
 ORIGINAL = "tracks.original.csv"
 """The table as the run wrote it, beside tracks.csv, which a person may edit."""
 LABEL_SEEN = "label_seen"
-"""The column of the table of a report page that holds the labels as the page was made."""
+"""The column of the table of a report page that holds the labels which the table may replace."""
 _COLUMNS = ("track", "category", "confidence", "label")
 _LARGEST_TABLE = 64 << 20
 
