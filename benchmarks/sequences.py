@@ -21,7 +21,7 @@ from scipy.optimize import linear_sum_assignment
 
 from benchmarks.measure import markdown
 from shapecat.arrays import F8, U1
-from shapecat.evaluation.comparison.identities import SeenTogether, judge_identities
+from shapecat.evaluation.comparison.identities import FrameIdentities, judge_identities
 from shapecat.evaluation.metrics import expected_calibration_error
 from shapecat.pipeline import process
 from shapecat.runs.jobs import Job
@@ -114,7 +114,7 @@ def _object(item: dict[str, Any], *, listed: bool) -> Object:
     )
 
 
-def seen_together(folder: Path, truth: Sequence[Sequence[Object]]) -> Iterator[SeenTogether]:
+def frame_identities(folder: Path, truth: Sequence[Sequence[Object]]) -> Iterator[FrameIdentities]:
     """Yield the objects and tracks of each frame with their similarity.
 
     Tracks that match a spared object are ignored. The similarity falls with the distance, from 1
@@ -135,7 +135,7 @@ def seen_together(folder: Path, truth: Sequence[Sequence[Object]]) -> Iterator[S
         drop = {int(j) for i, j in pairs if spared[i] and similarity[i, j] > 0}
         keep = [j for j in range(len(rows)) if j not in drop]
         asked = np.flatnonzero(~spared).tolist()
-        yield SeenTogether(
+        yield FrameIdentities(
             [(sequence, objects[i].track) for i in asked],
             [(sequence, rows[j]["track"]) for j in keep],
             similarity[asked][:, keep],
@@ -195,7 +195,7 @@ def _seen(
     return best if own[label] >= SAME * union else None
 
 
-def identities(seen: dict[str, list[SeenTogether]]) -> dict[str, dict[str, float]]:
+def identities(seen: dict[str, list[FrameIdentities]]) -> dict[str, dict[str, float]]:
     """Return the tracking metrics of each kind of sequence over all its frames."""
     names = ("idf1", "mota", "hota", "switches", "misses", "false_positives", "objects")
     result = {}
@@ -245,13 +245,13 @@ def calibration(views: Iterable[View]) -> dict[int, dict[str, float]]:
 
 def evaluate(folder: Path, seeds: Iterable[int]) -> dict[str, Any]:
     """Make, process and evaluate sequences of all kinds."""
-    seen: dict[str, list[SeenTogether]] = {}
+    seen: dict[str, list[FrameIdentities]] = {}
     views: list[View] = []
     for seed in seeds:
         for kind in KINDS:
             place = folder / kind / str(seed)
             make_sequence(place, kind, seed)
-            seen.setdefault(kind, []).extend(seen_together(place, read_truth(place)))
+            seen.setdefault(kind, []).extend(frame_identities(place, read_truth(place)))
             views += read_views(place, kind, seed)
             click.echo(f"{kind} {seed}", err=True)
     decidable = [view for view in views if not view.undecidable]

@@ -243,7 +243,7 @@ def test_views_of_both_sensors_count() -> None:
 
     assert (hits.weights(np.arange(4)) > 0).all()
     first = np.flatnonzero(hits.topics[hits.rows] == 0)  # a track that one sensor saw
-    assert hits.seen_with(first, np.arange(4)).tolist() == first.tolist()
+    assert hits.on_topics_of(first, np.arange(4)).tolist() == first.tolist()
 
 
 def test_each_topic_has_its_own_poses(tmp_path: Path) -> None:

@@ -42,9 +42,9 @@ from shapecat.evaluation.comparison.labellings import (
 from shapecat.evaluation.comparison.matching import (
     Difference,
     Matched,
+    frame_identities,
     labelled_part,
     match_objects,
-    seen_together,
 )
 from shapecat.evaluation.comparison.overlap import Overlap, box_iou
 from shapecat.evaluation.comparison.page import (
@@ -847,7 +847,9 @@ def test_track_with_two_detections_uses_the_better_one(overlaps: tuple[float, fl
     """Otherwise a fragment could change the identity of a found object."""
     detections = [LabelledItem(5, "cup"), LabelledItem(None, "cup"), LabelledItem(5, "cup")]
     similarity = np.array([[overlaps[0]], [0.9], [overlaps[1]]])
-    frame = seen_together(detections, [LabelledItem(1, "cup")], Matched({}, similarity, None, None))
+    frame = frame_identities(
+        detections, [LabelledItem(1, "cup")], Matched({}, similarity, None, None)
+    )
 
     assert (frame.true, frame.found, frame.similarity.tolist()) == ([1], [5], [[0.8]])
 

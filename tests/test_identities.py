@@ -8,13 +8,13 @@ import motmetrics
 import numpy as np
 import pytest
 
-from shapecat.evaluation.comparison.identities import SeenTogether, judge_identities
+from shapecat.evaluation.comparison.identities import FrameIdentities, judge_identities
 from shapecat.evaluation.comparison.overlap import box_iou, match_masks
 from shapecat.geometry import quaternion_from_rotation, rotation_from_quaternion
 from shapecat.types import Box
 
 
-def crowd(seed: int, frames: int = 40) -> Iterator[SeenTogether]:
+def crowd(seed: int, frames: int = 40) -> Iterator[FrameIdentities]:
     """Yield frames in which objects come and go, and tracks are lost, swapped and invented."""
     rng = np.random.default_rng(seed)
     names = {k: 100 + k for k in range(5)}
@@ -30,10 +30,10 @@ def crowd(seed: int, frames: int = 40) -> Iterator[SeenTogether]:
         similarity = rng.uniform(0, 0.65, (len(true), len(found)))
         for j, i in enumerate(detected):
             similarity[true.index(i), j] = rng.uniform(0.4, 1)
-        yield SeenTogether(true, found, np.where(similarity < 0.1, 0, similarity))
+        yield FrameIdentities(true, found, np.where(similarity < 0.1, 0, similarity))
 
 
-def oracle(frames: list[SeenTogether], threshold: float) -> Any:
+def oracle(frames: list[FrameIdentities], threshold: float) -> Any:
     accumulator = motmetrics.MOTAccumulator(auto_id=True)
     for true, found, similarity in frames:
         gaps = np.where(similarity >= threshold, 1 - similarity, np.nan)
@@ -68,10 +68,10 @@ def test_hota_matches_a_worked_example() -> None:
     none = np.zeros((1, 0))
     hit = np.array([[0.72]])
     frames = [
-        SeenTogether(["a"], [1], hit),
-        SeenTogether(["a"], [2], hit),
-        SeenTogether(["a"], [], none),
-        SeenTogether(["a"], [2], hit),
+        FrameIdentities(["a"], [1], hit),
+        FrameIdentities(["a"], [2], hit),
+        FrameIdentities(["a"], [], none),
+        FrameIdentities(["a"], [2], hit),
     ]
     figures = judge_identities(frames)
 
@@ -83,7 +83,7 @@ def test_hota_matches_a_worked_example() -> None:
 
 
 def test_metrics_of_empty_frames_are_nan() -> None:
-    empty = judge_identities([SeenTogether([], [], np.zeros((0, 0)))])
+    empty = judge_identities([FrameIdentities([], [], np.zeros((0, 0)))])
 
     assert np.isnan([empty.mota, empty.idf1, empty.hota]).all()
 

@@ -18,7 +18,7 @@ from shapecat.pipeline import annotate_again
 from shapecat.runs.finished import FinishedRun
 from shapecat.runs.labelled_frames import read_labelled_frames
 from shapecat.runs.labelled_tracks import _ended
-from shapecat.runs.labels.corrections import _given, adopt_labels, read_labels, relabel
+from shapecat.runs.labels.corrections import _valid_labels, adopt_labels, read_labels, relabel
 from shapecat.runs.labels.meaning import TrackLabel
 from shapecat.runs.labels.track_table import read_track_table
 from shapecat.runs.perceive.perceived import FrameRow, PerceptionTables
@@ -157,7 +157,7 @@ def test_merge_into_deleted_track_is_refused(run: Path) -> None:
     rows = read_track_table(run / "tracks.csv").rows
     first, second = sorted(row.track for row in rows)[:2]
     labels = {first: f"merge with {second}", second: "delete"}
-    kept, refused = _given(rows, labels, (), one_frame=True)
+    kept, refused = _valid_labels(rows, labels, (), one_frame=True)
 
     label_of = {row.track: row.label for row in kept}
     assert (label_of[first], label_of[second]) == ("", "delete")

@@ -24,7 +24,14 @@ from shapecat.outputs.counts import plural
 from shapecat.outputs.report import read_reports
 from shapecat.outputs.report.cards import Card
 from shapecat.outputs.report.choosing import choose_frames
-from shapecat.outputs.report.images import Crop, SeenFrame, crop_of, encode, look, worth_of
+from shapecat.outputs.report.images import (
+    Crop,
+    FramePicture,
+    crop_of,
+    encode,
+    picture_frame,
+    worth_of,
+)
 from shapecat.outputs.report.page import run_page
 from shapecat.outputs.report.pictures import TrackPictures
 from shapecat.outputs.report.surfaces import SIDE, Snapshot, draw
@@ -288,7 +295,7 @@ def view(blur: float = 0, left: int = 60, top: int = 50, hidden: float = 0, side
     photo = ndimage.gaussian_filter(np.tile(stripes, (180, 1)), blur)
     mask = Mask(left, top, np.ones((side, side), bool))
     colour = np.repeat(photo[..., None], 3, axis=2).astype(np.uint8)
-    return SeenFrame((mask,), np.array([hidden]), depth_frame(np.ones((180, 240))), colour)
+    return FramePicture((mask,), np.array([hidden]), depth_frame(np.ones((180, 240))), colour)
 
 
 @pytest.mark.parametrize(
@@ -338,7 +345,7 @@ def test_only_nearer_objects_occlude() -> None:
     depth[40:80, 80:120] = 0.8  # in front of the right side of the first
     number = np.arange(depth.size).reshape(depth.shape)
     both = labelled(number[40:80, 40:80].ravel(), number[40:80, 80:120].ravel())
-    found = look(both, depth_frame(depth), None)
+    found = picture_frame(both, depth_frame(depth), None)
 
     assert found is not None
     assert found.hidden == pytest.approx([0.25, 0])
@@ -350,7 +357,7 @@ def test_depth_is_drawn_as_shaded_relief() -> None:
     v, u = np.mgrid[:120, :160]
     depth = 1 / (1 / 1.5 + 0.002 * np.hypot(u - 80, v - 60).clip(20, 40))
     depth[:, 150:] = 0
-    found = look(labelled(), depth_frame(depth.astype(np.float32)), None)
+    found = picture_frame(labelled(), depth_frame(depth.astype(np.float32)), None)
 
     assert found is not None
     image = found.pixels()
@@ -376,7 +383,7 @@ def test_unorganised_cloud_is_drawn_upright(
     points = (wall @ np.array([right, down, away])).astype(np.float32)
     up = [-value for value in down]
     frame = Frame("/d", 0, 0, 0, "lidar", points=points)
-    found = look(labelled(np.flatnonzero(pole), up=up), frame, None)
+    found = picture_frame(labelled(np.flatnonzero(pole), up=up), frame, None)
 
     assert found is not None
     left, _, width, height = found.masks[0].box

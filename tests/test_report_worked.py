@@ -16,15 +16,15 @@ from shapecat.colour.masks import Mask
 from shapecat.outputs.report import choosing
 from shapecat.outputs.report.cards import Card, _few, card_html
 from shapecat.outputs.report.choosing import Choice, _areas, choose_frames
-from shapecat.outputs.report.images import Crop, SeenFrame, _border_share, _hidden_share, encode
+from shapecat.outputs.report.images import Crop, FramePicture, _border_share, _hidden_share, encode
 from shapecat.outputs.report.page import Listed, _strip, index_page, run_page
 from shapecat.outputs.report.pictures import (
     Pictures,
     StripFrame,
     TrackPictures,
+    _Collector,
     _points,
     _strip_frame,
-    _Taken,
 )
 from shapecat.outputs.report.surfaces import Snapshot, SurfaceDrawing, draw
 from shapecat.outputs.report.tracks import Timeline, read_timelines
@@ -463,7 +463,7 @@ def test_only_pixels_with_depth_are_drawn() -> None:
 def test_card_without_recording_shows_view_with_most_points() -> None:
     gas = NeuralGas(np.zeros((0, 3)), np.zeros((0, 2)))
     box = Box(np.array([0, 0, 1]), np.full(3, 0.1), np.array([0, 0, 0, 1]))
-    taken = _Taken(Choice({("/d", k): frozenset({5}) for k in range(4)}, {}))
+    taken = _Collector(Choice({("/d", k): frozenset({5}) for k in range(4)}, {}))
     for k, points in enumerate((5, 9, 7)):
         item = LabelledObject(5, "cup", 0.9, box, np.arange(points), gas, np.ones(1), np.ones(1))
         other = replace(item, track=6, indices=np.arange(99))  # not wanted from this frame
@@ -516,7 +516,7 @@ def test_strip_boxes_scale_with_their_images() -> None:
     item = LabelledObject(5, "cup", 0.9, box, np.arange(3), gas, np.ones(1), np.ones(1))
     labelled = LabelledFrame("/d", 0, 0, 0, "camera", None, (), (item,), (), {})
     photo = np.zeros((900, 1200, 3), np.uint8)
-    view = SeenFrame((Mask(300, 90, np.ones((180, 240), bool)),), np.zeros(1), frame, photo)
+    view = FramePicture((Mask(300, 90, np.ones((180, 240), bool)),), np.zeros(1), frame, photo)
     picture = _strip_frame(labelled, view, 0.0)
     _, width, height = encode(photo)
 

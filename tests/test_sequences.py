@@ -40,7 +40,7 @@ def figures_of(folder: Path, objects: list[dict[str, Any]], tracks: list[list[fl
     pq.write_table(pa.Table.from_pylist(rows), folder / "run" / "tracks.parquet")
     poses = [{"frame": k, "fixed_translation": [0.0, 0.0, 0.0]} for k in range(10)]
     pq.write_table(pa.Table.from_pylist(poses), folder / "run" / "frames.parquet")
-    pairs = list(sequences.seen_together(folder, sequences.read_truth(folder)))
+    pairs = list(sequences.frame_identities(folder, sequences.read_truth(folder)))
     return sequences.identities({"a": pairs})["a"]
 
 

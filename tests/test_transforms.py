@@ -316,7 +316,7 @@ def test_transforms_of_other_robots_are_left_out(
     ]
     items.append(("/mocap/tf", EPOCH, stamped("map", "odom", 10.0, EPOCH)))
     with open_recording(write(tmp_path / "a.mcap", items)) as recording:
-        buffer = read_transforms(recording, near=[near])
+        buffer = read_transforms(recording, sensor_topics=[near])
 
         assert buffer.lookup("map", "base", EPOCH).translation[0] == 10 + expected
         assert warned in "".join(recording.warnings)
@@ -327,7 +327,7 @@ def test_mixed_up_poses_of_two_robots_are_reported(tmp_path: Path) -> None:
     """Objects of both robots were placed by the poses of one; the warning did not say so."""
     items = [(f"/r{k}/tf", EPOCH + k, stamped("odom", "base", k, EPOCH)) for k in (1, 2)]
     with open_recording(write(tmp_path / "a.mcap", items)) as recording:
-        read_transforms(recording, near=["/r1/camera/image", "/r2/camera/image"])
+        read_transforms(recording, sensor_topics=["/r1/camera/image", "/r2/camera/image"])
         (warning,) = recording.warnings
 
     assert "of one robot are used for the other: process one at a time" in warning

@@ -58,7 +58,7 @@ def with_colour(
         run["options"],
         skipped=Counter(),
         needed=awaited.needs,
-        known=awaited.image_of,
+        same_images=awaited.image_of,
     )
     for label in awaited:
         for frame, view in read:

@@ -43,10 +43,10 @@ def frame_of(reading: ArrayLike, intrinsics: ArrayLike | None = None) -> Frame:
             msg = f"expected points (n, 3), or a depth image with intrinsics, got {values.shape}"
             raise ConfigError(msg)
         points = values.reshape(-1, 3).astype(np.float32, order="C")
-        known = np.isfinite(points).all(axis=1) & ~masked.reshape(-1, 3).any(axis=1)
-        points[~known] = np.nan
-        some = points[known][:: 1 + len(points) // 10_000]  # enough for their median
-        if some.size and np.median(np.abs(some).max(axis=1)) > _FARTHEST_M:
+        finite = np.isfinite(points).all(axis=1) & ~masked.reshape(-1, 3).any(axis=1)
+        points[~finite] = np.nan
+        sample = points[finite][:: 1 + len(points) // 10_000]  # enough for their median
+        if sample.size and np.median(np.abs(sample).max(axis=1)) > _FARTHEST_M:
             msg = "expected points in metres, near the sensor; divide millimetres by 1000"
             raise ConfigError(msg)
         return frame(points=points)
@@ -64,11 +64,11 @@ def frame_of(reading: ArrayLike, intrinsics: ArrayLike | None = None) -> Frame:
 def _camera(intrinsics: ArrayLike, height: int, width: int) -> Camera:
     """Return the camera of an image; its centre is at most twice the image's size away from it."""
     with suppress(TypeError, ValueError):  # not numbers, or rows of different lengths
-        given = np.asarray(intrinsics, np.float64)
-        if given.shape == (3, 3) and (given[_FIXED] == np.eye(3)[_FIXED]).all():
-            given = given[[0, 1, 0, 1], [0, 1, 2, 2]]
-        if given.shape == (4,) and np.isfinite(given).all():
-            fx, fy, cx, cy = given.tolist()
+        values = np.asarray(intrinsics, np.float64)
+        if values.shape == (3, 3) and (values[_FIXED] == np.eye(3)[_FIXED]).all():
+            values = values[[0, 1, 0, 1], [0, 1, 2, 2]]
+        if values.shape == (4,) and np.isfinite(values).all():
+            fx, fy, cx, cy = values.tolist()
             if min(fx, fy) > 0 and abs(cx) <= 3 * width and abs(cy) <= 3 * height:
                 return Camera(width, height, fx, fy, cx, cy)
     msg = (
@@ -96,10 +96,10 @@ def perceive_alone(
     except (TypeError, ValueError) as error:
         msg = f"up: {error}"
         raise ConfigError(msg) from None
-    seen = perceive(frame, up=hint, categorizer=categorizer, settings=settings)
+    perceived = perceive(frame, up=hint, categorizer=categorizer, settings=settings)
     objects = tuple(
-        _labelled(number, detection, seen.scene, categorizer.categories)
-        for number, detection in enumerate(seen.detections, start=1)
+        _labelled(number, detection, perceived.scene, categorizer.categories)
+        for number, detection in enumerate(perceived.detections, start=1)
     )
     labelled = LabelledFrame(
         topic=frame.topic,
@@ -108,11 +108,11 @@ def perceive_alone(
         log_time_ns=frame.log_time_ns,
         frame_id=frame.frame_id,
         fixed_from_sensor=None,
-        planes=seen.scene.planes,
+        planes=perceived.scene.planes,
         objects=objects,
         ended=(),
-        seconds=seen.seconds,
-        up=seen.scene.up,
+        seconds=perceived.seconds,
+        up=perceived.scene.up,
     )
     return RunFrame(labelled, frame)
 

@@ -48,14 +48,14 @@ class Table:
         ------
         OutputError : the table is unreadable, or has no such column.
         """
-        wanted = [columns] if isinstance(columns, str) else columns
+        names = [columns] if isinstance(columns, str) else columns
         try:
-            known = self.columns
-            if missing := [name for name in wanted or () if name not in known]:
-                msg = f"{self.path}: no column {missing[0]}; known: {', '.join(known)}"
+            available = self.columns
+            if missing := [name for name in names or () if name not in available]:
+                msg = f"{self.path}: no column {missing[0]}; known: {', '.join(available)}"
                 raise OutputError(msg)
             with pq.ParquetFile(self.path) as file:
-                table = file.read(columns=None if wanted is None else list(wanted))
+                table = file.read(columns=None if names is None else list(names))
             return with_fixed_lists(table)
         except (OSError, pa.ArrowException) as error:
             msg = f"{self.path}: not a readable table of a run ({error})"

@@ -88,12 +88,12 @@ def _candidate(row: dict[str, Any], planes: Sequence[Plane]) -> Candidate:
 def _rows(
     folder: Path, table: str, topic: str, frame: int, columns: Sequence[str] | None = None
 ) -> list[dict[str, Any]]:
-    found = []
+    rows = []
     for group in read_row_groups(folder / f"{table}.parquet", columns):
         keys = enumerate(keys_of(group))
         chosen = pa.array([k for k, key in keys if key == (topic, frame)], pa.int64())
-        found += group.take(chosen).to_pylist()
-    return found
+        rows += group.take(chosen).to_pylist()
+    return rows
 
 
 def _topic(folder: Path, frame: int, topic: str | None) -> str:
@@ -115,8 +115,8 @@ def _topic(folder: Path, frame: int, topic: str | None) -> str:
     if having:
         msg = f"{folder}: frame {frame} is on {', '.join(having)}; choose one with --topic"
         raise OutputError(msg)
-    there = "; ".join(f"{name}: {n[0]} to {n[-1]}" for name, n in frames.items()) or "none"
-    msg = f"{folder}: no frame {frame}{f' on {topic}' if topic else ''}; there are {there}"
+    available = "; ".join(f"{name}: {n[0]} to {n[-1]}" for name, n in frames.items()) or "none"
+    msg = f"{folder}: no frame {frame}{f' on {topic}' if topic else ''}; there are {available}"
     raise OutputError(msg)
 
 
@@ -138,8 +138,8 @@ def _apply_labels(
     """
     owner = {part: item for item in objects for part in item.detections}
     parts = {n: owner[n].detections if n in owner else (n,) for n in range(len(scene.candidates))}
-    kept = [n for n, own in parts.items() if n == own[0] and n not in deleted]
-    index = {part: k for k, n in enumerate(kept) for part in parts[n]}
+    shown = [n for n, group_of in parts.items() if n == group_of[0] and n not in deleted]
+    index = {part: k for k, n in enumerate(shown) for part in parts[n]}
 
     def bottom(n: int) -> float:
         """Return the height of the lower end of a candidate along up, metres."""
@@ -159,7 +159,7 @@ def _apply_labels(
             support_m=base.support_m,
         )
 
-    candidates = tuple(changed(n) for n in kept)
+    candidates = tuple(changed(n) for n in shown)
     return replace(scene, candidates=candidates), {index[part]: owner[part] for part in owner}
 
 
@@ -169,9 +169,9 @@ def _described(scene: Scene, node: Node, objects: Mapping[int, LabelledObject]) 
         return f"plane {node.index}: {plane.height_m:.2f} m high, {plane.area_m2:.2f} m2"
     item = objects.get(node.index)
     name = "object in no track" if item is None else f"{item.category} #{item.track}"
-    seen = item or scene.candidates[node.index]
-    box = seen.box if item is None else item.full or item.box
+    shown_item = item or scene.candidates[node.index]
+    box = shown_item.box if item is None else item.full or item.box
     x, y, z = (100 * float(side) for side in box.size)
-    border = ", cut by the border" if seen.touches_border else ""
-    occluded = ", occluded" if seen.occluded else ""
+    border = ", cut by the border" if shown_item.touches_border else ""
+    occluded = ", occluded" if shown_item.occluded else ""
     return f"{name}: {x:.0f} x {y:.0f} x {z:.0f} cm{border}{occluded}"

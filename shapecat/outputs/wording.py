@@ -67,8 +67,8 @@ def safe_name(text: str) -> str:
     >>> safe_name("../wine glass")
     '_wine glass'
     """
-    kept = (c if _SAFE.match(c) or unicodedata.category(c)[0] == "M" else "_" for c in text)
-    return "".join(kept).strip(". ").encode()[:_LONGEST_BYTES].decode(errors="ignore") or "_"
+    safe = (c if _SAFE.match(c) or unicodedata.category(c)[0] == "M" else "_" for c in text)
+    return "".join(safe).strip(". ").encode()[:_LONGEST_BYTES].decode(errors="ignore") or "_"
 
 
 def different_names(texts: Sequence[str]) -> list[str]:
@@ -79,8 +79,8 @@ def different_names(texts: Sequence[str]) -> list[str]:
     >>> different_names(["/left/depth", "/left_depth"])
     ['_left_depth', '_left_depth-2']
     """
-    found: list[str] = []
+    names_so_far: list[str] = []
     for name in map(safe_name, texts):
         numbered = (f"{name}-{k}" for k in count(2))
-        found.append(next(n for n in chain([name], numbered) if n not in found))
-    return found
+        names_so_far.append(next(n for n in chain([name], numbered) if n not in names_so_far))
+    return names_so_far

@@ -29,7 +29,7 @@ __all__ = ["KnownImages", "frames_with_colour"]
 
 _HELD_FRAMES = 8
 """At most this many frames wait for a later colour image."""
-_KEPT_IMAGES, _KEPT_BYTES = 64, 96 << 20
+_KEPT_IMAGES, _BUFFERED_BYTES = 64, 96 << 20
 """Limits on the colour images kept for later frames, which may be logged up to a second after an
 image of 60 Hz; two are always kept."""
 _STAMP_BYTES = 12
@@ -54,7 +54,7 @@ def frames_with_colour(
     colours: Mapping[str, ColourStream],
     *,
     skipped: Counter[str],
-    known: KnownImages = None,
+    same_images: KnownImages = None,
     **chosen: Any,
 ) -> Iterator[tuple[Frame, ColourView | None]]:
     """Read frames as `shapecat.recordings.frames` does, each with its colour image.
@@ -63,7 +63,7 @@ def frames_with_colour(
     ----------
     colours : the colour stream of each depth topic that has one.
     skipped : as for `frames`.
-    known : the images that the frames had when all were read; by default those nearest in time.
+    same_images : the images of the frames when all were read; by default those nearest in time.
     chosen : ``start_s``, ``end_s``, ``every`` and ``needed`` as for `frames`; ``needed`` is also
         called for colour images.
 
@@ -74,12 +74,12 @@ def frames_with_colour(
     recording count the missing images.
     """
     partners = {
-        stream.topic: _Partner(recording, stream, colours[stream.topic], known)
+        stream.topic: _Partner(recording, stream, colours[stream.topic], same_images)
         for stream in streams
         if stream.topic in colours
     }
     waiting: deque[Frame] = deque()
-    for frame in frames(recording, streams, skipped=skipped, heard=_heard(partners), **chosen):
+    for frame in frames(recording, streams, skipped=skipped, callbacks=_heard(partners), **chosen):
         waiting.append(frame)
         if frame.topic in partners:
             partners[frame.topic].notice(frame)
@@ -122,7 +122,7 @@ def _paired(frame: Frame, partners: Mapping[str, "_Partner"]) -> tuple[Frame, Co
     return frame, None if partner is None else partner.view(frame)
 
 
-class _KeptImage(NamedTuple):
+class _BufferedImage(NamedTuple):
     """A decoded image message, and how often the clock had been set back before it."""
 
     stamp_ns: int
@@ -138,10 +138,10 @@ class _Partner:
         self, recording: Recording, depth: Stream, colour: ColourStream, known: KnownImages
     ) -> None:
         self.stream = colour
-        self._known = known
+        self._same_images = known
         self._recording = recording
         self._clock = Clock(recording, colour.topic)
-        self._images: deque[_KeptImage] = deque()
+        self._images: deque[_BufferedImage] = deque()
         self._setbacks, self._latest = 0, 0
         self._calibration = b""
         self._lens: LensCamera | None = None
@@ -164,7 +164,7 @@ class _Partner:
             self._steps.append(stamp - self._newest)
         self._setbacks += stamp < (self._newest or 0)
         self._newest = stamp
-        self._images.append(_KeptImage(stamp, message.log_time_ns, image, self._setbacks))
+        self._images.append(_BufferedImage(stamp, message.log_time_ns, image, self._setbacks))
         while len(self._images) > _KEPT_IMAGES or self._too_much():
             self._images.popleft()
 
@@ -190,25 +190,27 @@ class _Partner:
 
         If the image of the frame is known, return whether it was read.
         """
-        if self._known is not None:
-            return self._known(frame.topic, frame.index) is None or bool(self._candidates(frame))
+        if self._same_images is not None:
+            return self._same_images(frame.topic, frame.index) is None or bool(
+                self._candidates(frame)
+            )
         return self._newest is not None and self._newest >= frame.stamp_ns
 
-    def _candidates(self, frame: Frame) -> list[_KeptImage]:
+    def _candidates(self, frame: Frame) -> list[_BufferedImage]:
         """Return the images that may be that of a frame."""
-        if self._known is not None:
-            logged = self._known(frame.topic, frame.index)
+        if self._same_images is not None:
+            logged = self._same_images(frame.topic, frame.index)
             return [one for one in self._images if one.log_time_ns == logged]
         period = self._period()
-        near = [one for one in self._images if 2 * abs(one.stamp_ns - frame.stamp_ns) <= period]
+        close = [one for one in self._images if 2 * abs(one.stamp_ns - frame.stamp_ns) <= period]
         # If the clock was set back, images from before may have the same stamps.
-        closest = min(near, key=lambda one: abs(one.log_time_ns - frame.log_time_ns), default=None)
-        return [one for one in near if closest is None or one.setbacks == closest.setbacks]
+        closest = min(close, key=lambda one: abs(one.log_time_ns - frame.log_time_ns), default=None)
+        return [one for one in close if closest is None or one.setbacks == closest.setbacks]
 
     def view(self, frame: Frame) -> ColourView | None:
         """Return the colour image nearest to a frame in time; None if none is usable."""
-        near = self._candidates(frame)
-        nearest = min(near, key=lambda one: abs(one.stamp_ns - frame.stamp_ns), default=None)
+        candidates = self._candidates(frame)
+        nearest = min(candidates, key=lambda one: abs(one.stamp_ns - frame.stamp_ns), default=None)
         if nearest is None:
             self._left_out["no colour image near the time of the frame"] += 1
             return None
@@ -224,8 +226,8 @@ class _Partner:
             self._recording.warn(f"{self.stream.topic}: frames without colour ({count}×): {reason}")
 
     def _too_much(self) -> bool:
-        kept = sum(len(image.decoded.data) for image in self._images)
-        return kept > _KEPT_BYTES and len(self._images) > 2
+        stored_bytes = sum(len(image.decoded.data) for image in self._images)
+        return stored_bytes > _BUFFERED_BYTES and len(self._images) > 2
 
     def _period(self) -> int:
         if self._steps:
@@ -233,8 +235,8 @@ class _Partner:
         count, span = self.stream.count or 0, self._recording.end_ns - self._recording.start_ns
         return span // (count - 1) if count > 1 and span > 0 else _USUAL_PERIOD_NS
 
-    def _view(self, frame: Frame, kept: _KeptImage) -> ColourView:
-        image = IMAGES[self.stream.kind](self.stream.topic, *kept[:3])
+    def _view(self, frame: Frame, stored: _BufferedImage) -> ColourView:
+        image = IMAGES[self.stream.kind](self.stream.topic, *stored[:3])
         shape = (image.height, image.width)
         if self.stream.kind == "cloud":
             return ColourView(image, _lens(frame.camera))
@@ -261,8 +263,8 @@ class _Partner:
             frame.frame_id, image.frame_id, frame.log_time_ns, frame.stamp_ns
         )
         if pose is not None:
-            own = frame.frame_from_sensor
-            return ColourView(image, lens, pose if own is None else compose(pose, own))
+            offset = frame.frame_from_sensor
+            return ColourView(image, lens, pose if offset is None else compose(pose, offset))
         # Two cameras are never calibrated to the same numbers.
         if same_shape and _alike(lens, frame.camera, _EQUAL):
             return ColourView(image, lens, None if straight else IDENTITY)
@@ -298,8 +300,8 @@ def _alike(lens: LensCamera, camera: Camera | None, share: float) -> bool:
     """Return whether two cameras' intrinsics differ by less than `share` of the image width."""
     if camera is None:
         return False
-    own, other = ((c.fx, c.fy, c.cx, c.cy) for c in (lens.pinhole, camera))
-    return bool(np.abs(np.subtract(own, other)).max() < share * camera.width)
+    intrinsics, camera_intrinsics = ((c.fx, c.fy, c.cx, c.cy) for c in (lens.pinhole, camera))
+    return bool(np.abs(np.subtract(intrinsics, camera_intrinsics)).max() < share * camera.width)
 
 
 @lru_cache(maxsize=8)
@@ -307,9 +309,12 @@ def _bend_px(lens: LensCamera, camera: Camera | None) -> float:
     """Return the largest distance (px) from a pixel of `camera` to where `lens` sees its ray."""
     if camera is None or not lens.model:
         return 0.0
-    own = lens.pinhole
+    pinhole = lens.pinhole
     steps = np.linspace(0, 1, _STEPS)
     pixels = np.stack(np.meshgrid(steps * (camera.width - 1), steps * (camera.height - 1)), -1)
     rays = (pixels - (camera.cx, camera.cy)) / (camera.fx, camera.fy)
-    seen = distort(rays, lens.model, lens.coefficients) * (own.fx, own.fy) + (own.cx, own.cy)
-    return float(np.abs(seen - pixels).max())
+    distorted = distort(rays, lens.model, lens.coefficients) * (pinhole.fx, pinhole.fy) + (
+        pinhole.cx,
+        pinhole.cy,
+    )
+    return float(np.abs(distorted - pixels).max())

@@ -58,22 +58,22 @@ class ColourStream:
 
 def colour_streams(recording: Recording) -> tuple[ColourStream, ...]:
     """Find the colour images and coloured clouds of a recording, sorted by topic."""
-    found = (
+    streams = (
         _probe(topic, kind, recording)
         for topic in recording.topics
         if topic.count != 0 and (kind := _KINDS.get(ros_counterpart(topic.type)))
     )
-    return tuple(stream for stream in found if stream is not None)
+    return tuple(stream for stream in streams if stream is not None)
 
 
 def pair_colours(
-    recording: Recording, streams: Sequence[Stream], wanted: str | None
+    recording: Recording, streams: Sequence[Stream], requested: str | None
 ) -> dict[str, ColourStream]:
     """Choose the colour streams of depth streams.
 
     Parameters
     ----------
-    wanted : the topic for all depth streams; None to choose one for each, empty for none.
+    requested : the topic for all depth streams; None to choose one for each, empty for none.
 
     Returns
     -------
@@ -83,14 +83,14 @@ def pair_colours(
     ------
     NoStreamError : the wanted topic does not exist or holds no colour images.
     """
-    if wanted == "":
+    if requested == "":
         return {}
-    found = {stream.topic: choose_colour(recording, stream, wanted) for stream in streams}
+    found = {stream.topic: choose_colour(recording, stream, requested) for stream in streams}
     return {topic: colour for topic, colour in found.items() if colour is not None}
 
 
 def choose_colour(
-    recording: Recording, stream: Stream, wanted: str | None = None
+    recording: Recording, stream: Stream, requested: str | None = None
 ) -> ColourStream | None:
     """Choose the colour stream of a depth stream.
 
@@ -104,7 +104,7 @@ def choose_colour(
 
     Parameters
     ----------
-    wanted : the topic to return instead; it may hold grey images or a cloud.
+    requested : the topic to return instead; it may hold grey images or a cloud.
 
     Returns
     -------
@@ -116,8 +116,8 @@ def choose_colour(
     NoStreamError : the wanted topic does not exist or holds no colour images.
     """
     streams = colour_streams(recording)
-    if wanted is not None:
-        chosen: ColourStream | None = _wanted(recording, streams, wanted)
+    if requested is not None:
+        chosen: ColourStream | None = _select(recording, streams, requested)
     else:
         own = [one for one in streams if one.kind == "cloud" and one.topic == stream.topic]
         images = [one for one in streams if one.kind != "cloud" and not one.grey]
@@ -153,19 +153,21 @@ def _belongs(one: ColourStream, stream: Stream, sensors: Sequence[Sequence[Strea
     """Return whether images are those of a depth stream's sensor, see `choose_colour`."""
     if one.frame_id == stream.frame_id:
         return True
-    others = (other for sensor in sensors if stream not in sensor for other in sensor)
-    shared = [_shared(one, other) for other in others if other.kind == stream.kind]
+    other_streams = (other for sensor in sensors if stream not in sensor for other in sensor)
+    shared = [_shared(one, other) for other in other_streams if other.kind == stream.kind]
     return _shared(one, stream) > 0 and max(shared, default=0) <= _shared(one, stream)
 
 
-def _wanted(recording: Recording, streams: tuple[ColourStream, ...], wanted: str) -> ColourStream:
+def _select(
+    recording: Recording, streams: tuple[ColourStream, ...], requested: str
+) -> ColourStream:
     for one in streams:
-        if one.topic.strip("/") == wanted.strip("/"):
+        if one.topic.strip("/") == requested.strip("/"):
             return one
-    known = ", ".join(one.topic for one in streams) or "none"
-    there = any(topic.name.strip("/") == wanted.strip("/") for topic in recording.topics)
-    state = "holds no colour images" if there else "does not exist"
-    msg = f"{recording.path}: topic {wanted} {state}; colour images: {known}"
+    available = ", ".join(one.topic for one in streams) or "none"
+    exists = any(topic.name.strip("/") == requested.strip("/") for topic in recording.topics)
+    state = "holds no colour images" if exists else "does not exist"
+    msg = f"{recording.path}: topic {requested} {state}; colour images: {available}"
     raise NoStreamError(msg)
 
 
@@ -184,8 +186,8 @@ def _rank(one: ColourStream, stream: Stream) -> tuple[bool, int, bool, bool, int
 def _shared(one: ColourStream, stream: Stream) -> int:
     """Return the number of leading namespace components that two topics share."""
     a, b = (PurePosixPath(name.strip("/")).parts[:-1] for name in (one.topic, stream.topic))
-    same = [x == y for x, y in zip(a, b, strict=False)]
-    return same.index(False) if False in same else len(same)
+    equal = [x == y for x, y in zip(a, b, strict=False)]
+    return equal.index(False) if False in equal else len(equal)
 
 
 def _probe(

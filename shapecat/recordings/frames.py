@@ -23,7 +23,7 @@ def frames(
     end_s: float | None = None,
     every: int = 1,
     skipped: Counter[str],
-    heard: Mapping[str, Callable[[Message], None]] | None = None,
+    callbacks: Mapping[str, Callable[[Message], None]] | None = None,
     needed: Needed = None,
 ) -> Iterator[Frame]:
     """Read the frames of depth streams in constant memory.
@@ -36,9 +36,9 @@ def frames(
     start_s, end_s : log time from the start of the recording, seconds; None for no limit.
     every : keep every n-th message of a stream.
     skipped : receives the number of unreadable frames by reason; they raise no error.
-    heard : callbacks for the messages of other topics, so that the file is read only once.
+    callbacks : callbacks for the messages of other topics, so that the file is read only once.
     needed : function of topic and log time (ns) that returns whether that frame, or message for
-        ``heard``, is needed; from an indexed file, the rest may be left out.
+        ``callbacks``, is needed; from an indexed file, the rest may be left out.
 
     Yields
     ------
@@ -60,16 +60,16 @@ def frames(
             infos.setdefault(source.info_topic, []).append(source)
     offsets = [None if s is None else round(min(s * 1e9, _FAR_NS)) for s in (start_s, end_s)]
     limits = [None if offset is None else recording.start_ns + offset for offset in offsets]
-    heard = heard or {}
+    callbacks = callbacks or {}
 
     def is_needed(topic: str, log_time_ns: int) -> bool:
         return needed is None or topic in infos or needed(topic, log_time_ns)
 
-    topics = {*sources, *infos, *heard}
+    topics = {*sources, *infos, *callbacks}
     for message in recording.messages(topics, limits[0], limits[1], is_needed):
         unread = not message.data and not is_needed(message.topic, message.log_time_ns)
-        if message.topic in heard and not unread:
-            heard[message.topic](message)
+        if message.topic in callbacks and not unread:
+            callbacks[message.topic](message)
         for depth in infos.get(message.topic, ()):
             yield from depth.calibrate(message, skipped)
         chosen = sources.get(message.topic)

@@ -60,7 +60,7 @@ class LookAhead:
         self.whole = True
         self._read_until(None)
 
-    def reach(self, log_time_ns: int, stamp_ns: int) -> None:
+    def advance(self, log_time_ns: int, stamp_ns: int) -> None:
         """Hand over the messages around a frame, given its log time and stamp in nanoseconds."""
         if self.whole:
             return

@@ -137,5 +137,5 @@ def ros_type(name: str) -> str:
     >>> ros_type("foxglove.PointCloud")
     'foxglove.PointCloud'
     """
-    package, slash, rest = name.partition("/")
-    return f"{package}/msg/{rest}" if slash and "/" not in rest else name
+    package, slash, name_in_package = name.partition("/")
+    return f"{package}/msg/{name_in_package}" if slash and "/" not in name_in_package else name

@@ -58,8 +58,8 @@ def _uses(recording: Recording, streams: Mapping[str, Stream]) -> dict[str, str]
         if colour.kind == "cloud":
             uses[topic] += " with colours"
             continue
-        known = uses.get(colour.topic, "")
-        uses[colour.topic] = f"{known}, {topic}" if known else f"colour of {topic}"
+        use = uses.get(colour.topic, "")
+        uses[colour.topic] = f"{use}, {topic}" if use else f"colour of {topic}"
         if colour.info_topic:
             uses.setdefault(colour.info_topic, "camera")
     return uses

@@ -104,10 +104,10 @@ def _errors(camera: Camera, sample: tuple[F8, F8, F8, F8]) -> tuple[float, float
 
 def _sample(points: F4) -> tuple[F8, F8, F8, F8] | None:
     """Return u, v, x / z and y / z, each (n,), of points spread over the image; None if few."""
-    found = sample_pixels(points, lambda flat: flat[:, 2] > 0)
-    if found is None:
+    sampled = sample_pixels(points, lambda flat: flat[:, 2] > 0)
+    if sampled is None:
         return None
-    u, v, chosen = found
+    u, v, chosen = sampled
     return u, v, chosen[:, 0] / chosen[:, 2], chosen[:, 1] / chosen[:, 2]
 
 

@@ -64,15 +64,17 @@ def by_sensor(streams: Sequence[Stream]) -> list[list[Stream]]:
     }
 
     def are_same(a: Stream, b: Stream) -> bool:
-        one, other = places[a.topic], places[b.topic]
+        first, second = places[a.topic], places[b.topic]
         one_frame = a.frame_id != "" and a.frame_id == b.frame_id
-        return _share_namespace(one, other) or (one_frame and (one.space, other.space) not in twins)
+        return _share_namespace(first, second) or (
+            one_frame and (first.space, second.space) not in twins
+        )
 
     groups: list[list[Stream]] = []
     for stream in streams:
-        same = [group for group in groups if any(are_same(stream, other) for other in group)]
-        groups = [group for group in groups if group not in same]
-        groups.append([*(other for group in same for other in group), stream])
+        joined = [group for group in groups if any(are_same(stream, second) for second in group)]
+        groups = [group for group in groups if group not in joined]
+        groups.append([*(second for group in joined for second in group), stream])
     return groups
 
 
@@ -99,10 +101,10 @@ def _are_twins(a: Stream, b: Stream) -> bool:
     within another, as of throttled topics, holds a copy. Clouds have no calibration, so the last
     two parts of their topics are compared.
     """
-    one, other = _place(a.topic), _place(b.topic)
-    short, long = sorted((one.space, other.space), key=len)
-    copied = one.space[:1] == other.space[:1] or long[len(long) - len(short) :] == short
-    if one.rest != other.rest or copied:
+    first, second = _place(a.topic), _place(b.topic)
+    short, long = sorted((first.space, second.space), key=len)
+    copied = first.space[:1] == second.space[:1] or long[len(long) - len(short) :] == short
+    if first.rest != second.rest or copied:
         return False
     if a.kind == "depth":
         return a.info_topic != b.info_topic

@@ -114,11 +114,11 @@ class PointsSource(Source):
         """
         image = points if self.pose is None else seen_from(self.pose, points)
         if self.fit is None or not still_fits(self.fit, image):
-            own = fit_pinhole(points)
-            found = find_viewpoint(points, self.fit) if own is None else (own, None, points)
-            if found is None:
+            fit = fit_pinhole(points)
+            viewpoint = find_viewpoint(points, self.fit) if fit is None else (fit, None, points)
+            if viewpoint is None:
                 return None
-            self.fit, self.pose, image = found
+            self.fit, self.pose, image = viewpoint
         return {**organized(image, self.fit.camera), "frame_from_sensor": self.pose}
 
 
@@ -152,11 +152,11 @@ class DepthSource(Source):
         if self._waiting is None:
             self._info, self._info_stamp = info, stamp
             return
-        wanted = stamp_ns(self._waiting[2].header)
+        image_ns = stamp_ns(self._waiting[2].header)
         # A later calibration means that the image's own is missing: use the last one before it.
-        if stamp <= wanted or self._info is None:
+        if stamp <= image_ns or self._info is None:
             self._info, self._info_stamp = info, stamp
-        if stamp >= wanted:
+        if stamp >= image_ns:
             yield from self.finish(skipped)
             self._info, self._info_stamp = info, stamp
 
@@ -167,11 +167,11 @@ class DepthSource(Source):
             image = self.recording.decode(message)
             stamp_ns(image.header)
             self._waiting = (message, self.index - 1, image)
-        if self._wanted is not None and self._wanted == self._info_stamp:
+        if self._awaited_ns is not None and self._awaited_ns == self._info_stamp:
             yield from self.finish(skipped)
 
     @property
-    def _wanted(self) -> int | None:
+    def _awaited_ns(self) -> int | None:
         """The stamp (ns) of the image that is held back; None if there is none."""
         return None if self._waiting is None else stamp_ns(self._waiting[2].header)
 
@@ -222,11 +222,11 @@ class DepthSource(Source):
 def _depth_units(recording: Recording, topic: str) -> float | None:
     """Return the depth units per metre that the RealSense viewer recorded; None if it did not."""
     sensor = "/".join(topic.split("/")[:3])
-    for other in recording.topics:
-        name = other.name.replace(" ", "_")
+    for candidate in recording.topics:
+        name = candidate.name.replace(" ", "_")
         if name.startswith(f"{sensor}/") and name.endswith("/option/Depth_Units/value"):
             with suppress(*MALFORMED):
-                metres = float(first_message(recording, other.name).data)
+                metres = float(first_message(recording, candidate.name).data)
                 return 1 / metres if 1e-6 < metres < 1 else None
     return None
 

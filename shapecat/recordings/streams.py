@@ -45,17 +45,17 @@ _OTHER_WORDS = (
 _AXES = {"x", "y", "z"}
 
 
-def depth_streams(recording: Recording, wanted: Sequence[str] = ()) -> tuple[Stream, ...]:
+def depth_streams(recording: Recording, requested: Sequence[str] = ()) -> tuple[Stream, ...]:
     """Find the clouds and depth images of a recording, sorted by topic.
 
     The encoding of the first images, of which some may be blank, distinguishes depth from colour.
     Topics named after other images, as of confidence or disparity, are left out unless they are
-    ``wanted``, with or without a leading slash. A depth image is paired with the calibration in its
-    own namespace (``depth/image_raw`` with ``depth/camera_info``), or with the only calibration in
-    the recording.
+    ``requested``, with or without a leading slash. A depth image is paired with the calibration in
+    its own namespace (``depth/image_raw`` with ``depth/camera_info``), or with the only one in the
+    recording.
     """
     streams = []
-    named = {name.strip("/") for name in wanted}
+    named = {name.strip("/") for name in requested}
     for topic in recording.topics:
         if _is_other(topic) and topic.name.strip("/") not in named:
             continue
@@ -63,12 +63,12 @@ def depth_streams(recording: Recording, wanted: Sequence[str] = ()) -> tuple[Str
         if probe is not None and topic.count != 0:
             with suppress(AttributeError):  # a definition without the fields of its type
                 first = first_messages(recording, topic.name, topic.type)
-                found = (probe(topic, message, recording) for message in first)
-                streams.append(next((stream for stream in found if stream is not None), None))
+                probed = (probe(topic, message, recording) for message in first)
+                streams.append(next((stream for stream in probed if stream is not None), None))
     return tuple(stream for stream in streams if stream is not None)
 
 
-def choose_streams(recording: Recording, wanted: Sequence[str] = ()) -> tuple[Stream, ...]:
+def choose_streams(recording: Recording, requested: Sequence[str] = ()) -> tuple[Stream, ...]:
     """Choose the streams to process: the wanted ones, or the best one of the only sensor.
 
     `by_sensor` says which streams belong to the same sensor. Within a sensor the preference is, in
@@ -79,15 +79,15 @@ def choose_streams(recording: Recording, wanted: Sequence[str] = ()) -> tuple[St
 
     Parameters
     ----------
-    wanted : topics, with or without a leading slash.
+    requested : topics, with or without a leading slash.
 
     Raises
     ------
     NoStreamError : no stream can be processed, a wanted one is missing or lacks a calibration, or
         nothing is wanted and there are several sensors.
     """
-    streams = depth_streams(recording, wanted)
-    chosen = _wanted(recording, streams, wanted) if wanted else (_best(recording, streams),)
+    streams = depth_streams(recording, requested)
+    chosen = _select(recording, streams, requested) if requested else (_best(recording, streams),)
     for stream in chosen:
         if stream.doubt:
             recording.warn(stream.doubt)
@@ -106,12 +106,12 @@ def _best(recording: Recording, streams: tuple[Stream, ...]) -> Stream:
     return min(sensors[0], key=_rank)
 
 
-def _wanted(
-    recording: Recording, streams: tuple[Stream, ...], wanted: Sequence[str]
+def _select(
+    recording: Recording, streams: tuple[Stream, ...], requested: Sequence[str]
 ) -> tuple[Stream, ...]:
     by_topic = {stream.topic.strip("/"): stream for stream in streams}
     chosen = []
-    for name in dict.fromkeys(wanted):
+    for name in dict.fromkeys(requested):
         stream = by_topic.get(name.strip("/"))
         if stream is None:
             raise NoStreamError(_why_unusable(recording, streams, name))
@@ -124,31 +124,31 @@ def _wanted(
 
 def _why_unusable(recording: Recording, streams: tuple[Stream, ...], name: str) -> str:
     """Return the error for a wanted topic that is missing or holds no depth."""
-    known = ", ".join(stream.topic for stream in streams) or "none"
-    there = [t for t in recording.topics if t.name.strip("/") == name.strip("/")]
-    details = [detail for topic in there if (detail := _encoding_or_error(recording, topic))]
-    state = "holds no clouds or depth images" if there else "does not exist"
+    usable = ", ".join(stream.topic for stream in streams) or "none"
+    topics = [t for t in recording.topics if t.name.strip("/") == name.strip("/")]
+    details = [detail for topic in topics if (detail := _encoding_or_error(recording, topic))]
+    state = "holds no clouds or depth images" if topics else "does not exist"
     unreadable = [detail for detail in details if detail.startswith(_UNREADABLE)]
     if unreadable:
         state = f"has {unreadable[0]}"
     elif details:
         state = f"{state} ({', '.join(details)})"
-    return f"{recording.path}: topic {name} {state}; usable topics: {known}{_warnings(recording)}"
+    return f"{recording.path}: topic {name} {state}; usable topics: {usable}{_warnings(recording)}"
 
 
 def _why_none(recording: Recording, streams: tuple[Stream, ...]) -> str:
     if streams:
         names = ", ".join(stream.topic for stream in streams)
-        what = f"depth images without a sensor_msgs/CameraInfo: {names}"
-        return f"{recording.path}: {what}{_warnings(recording)}"
+        problem = f"depth images without a sensor_msgs/CameraInfo: {names}"
+        return f"{recording.path}: {problem}{_warnings(recording)}"
     details = ((topic, _encoding_or_error(recording, topic)) for topic in recording.topics)
-    found = [f"{t.name} ({', '.join(filter(None, (t.type or t.encoding, d)))})" for t, d in details]
-    shown = ", ".join(found[:12]) + (", …" if len(found) > 12 else "")
+    lines = [f"{t.name} ({', '.join(filter(None, (t.type or t.encoding, d)))})" for t, d in details]
+    listed_topics = ", ".join(lines[:12]) + (", …" if len(lines) > 12 else "")
     images = any(t.type.endswith("Image") for t in recording.topics)
     kinds = f" ({', '.join(DEPTH_ENCODINGS)})" if images else ""
     return (
         f"{recording.path}: no point clouds or depth images{kinds}; "
-        f"topics found: {shown or 'none, the recording is empty'}{_warnings(recording)}"
+        f"topics found: {listed_topics or 'none, the recording is empty'}{_warnings(recording)}"
     )
 
 
@@ -189,8 +189,8 @@ def _image_name(topic: str) -> str:
 
 def _is_other(topic: Topic) -> bool:
     """Return whether an image topic is named after something other than depth."""
-    own = _own_name(topic.name)
-    return ros_counterpart(topic.type) != CLOUD and any(word in own for word in _OTHER_WORDS)
+    name = _own_name(topic.name)
+    return ros_counterpart(topic.type) != CLOUD and any(word in name for word in _OTHER_WORDS)
 
 
 def _is_infrared(topic: str) -> bool:
@@ -200,8 +200,8 @@ def _is_infrared(topic: str) -> bool:
 
 def _is_radial(topic: str) -> bool:
     """Return whether images are named after distances, but not those to the image plane."""
-    own = _own_name(topic)
-    return "distance" in own and "plane" not in own
+    name = _own_name(topic)
+    return "distance" in name and "plane" not in name
 
 
 def _own_name(topic: str) -> str:
@@ -219,8 +219,8 @@ def first_messages(recording: Recording, topic: str, kind: str | None = None) ->
 
     With ``kind``, messages of other types are left out.
     """
-    same = (m for m in recording.messages([topic]) if kind is None or m.type == kind)
-    for message in islice(same, _PEEK):
+    of_type = (m for m in recording.messages([topic]) if kind is None or m.type == kind)
+    for message in islice(of_type, _PEEK):
         with suppress(MessageError):
             yield recording.decode(message)
 
@@ -267,11 +267,11 @@ def _depth_stream(topic: Topic, first: Any, recording: Recording) -> Stream:
             "not along the optical axis: flat surfaces are then bent"
         )
     elif info is not None and frame_id and _nearest(topic.name, [info]) is None:
-        other = _frame_of(recording, info)
-        if other and other.strip("/") != frame_id.strip("/"):
+        info_frame = _frame_of(recording, info)
+        if info_frame and info_frame.strip("/") != frame_id.strip("/"):
             doubt = (
                 f"{topic.name}: the frame of its images is {frame_id}, but the only calibration, "
-                f"{info}, is of {other}: are these the intrinsics of another camera?"
+                f"{info}, is of {info_frame}: are these the intrinsics of another camera?"
             )
     return Stream(topic.name, topic.type, "depth", info, topic.count, frame_id, doubt)
 
@@ -289,12 +289,12 @@ def info_topic_of(image: str, recording: Recording, frame_id: str) -> str | None
         for topic in recording.topics
         if ros_counterpart(topic.type) == INFO and topic.count != 0
     ]
-    found = _nearest(image, infos)
-    if found is not None or len(infos) < 2:
-        return found or next(iter(infos), None)
+    nearest = _nearest(image, infos)
+    if nearest is not None or len(infos) < 2:
+        return nearest or next(iter(infos), None)
     frame = frame_id.strip("/")
-    same = [name for name in infos if frame and _frame_of(recording, name).strip("/") == frame]
-    return same[0] if len(same) == 1 else None
+    matches = [name for name in infos if frame and _frame_of(recording, name).strip("/") == frame]
+    return matches[0] if len(matches) == 1 else None
 
 
 def _nearest(image: str, infos: Sequence[str]) -> str | None:
@@ -302,9 +302,9 @@ def _nearest(image: str, infos: Sequence[str]) -> str | None:
     parts = image.split("/")
     outermost = 2 if image.startswith("/") else 1  # the first part of /depth/image is empty
     for length in range(len(parts), min(len(parts) - 1, outermost) - 1, -1):
-        rest = re.sub("[^/]*_to_", "", "/".join(parts[length:]))  # depth_to_color is as color
-        own = (f"{word}_camera_info" for word in re.split("[/_]", rest))
-        for name in (*own, *_INFO_NAMES):
+        suffix = re.sub("[^/]*_to_", "", "/".join(parts[length:]))  # depth_to_color is as color
+        own_names = (f"{word}_camera_info" for word in re.split("[/_]", suffix))
+        for name in (*own_names, *_INFO_NAMES):
             sibling = "/".join([*parts[:length], name])
             if sibling in infos:
                 return sibling

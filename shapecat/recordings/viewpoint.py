@@ -17,7 +17,7 @@ of a single plane, any of many cameras fits, and both are equal."""
 _ROUNDS = 3
 
 
-def find_viewpoint(points: F4, known: PinholeFit | None) -> tuple[PinholeFit, Pose, F4] | None:
+def find_viewpoint(points: F4, previous: PinholeFit | None) -> tuple[PinholeFit, Pose, F4] | None:
     """Find the pinhole camera that took an organized cloud, and its pose in the cloud's frame.
 
     The method is the direct linear transform (Hartley and Zisserman 2004, 7.1) with normalized
@@ -26,7 +26,7 @@ def find_viewpoint(points: F4, known: PinholeFit | None) -> tuple[PinholeFit, Po
     Parameters
     ----------
     points : (h, w, 3) metres, not finite or zero where depth is missing.
-    known : the camera of an earlier cloud, which is kept if it fits.
+    previous : the camera of an earlier cloud, which is kept if it fits.
 
     Returns
     -------
@@ -45,8 +45,8 @@ def find_viewpoint(points: F4, known: PinholeFit | None) -> tuple[PinholeFit, Po
     for _ in range(_ROUNDS):
         matrix, unclear = _projection_matrix(places[keep], pixels[keep])
         with np.errstate(divide="ignore", invalid="ignore"):
-            seen = places @ matrix.T
-            error = np.linalg.norm(seen[:, :2] / seen[:, 2:] - pixels, axis=1)
+            projected = places @ matrix.T
+            error = np.linalg.norm(projected[:, :2] / projected[:, 2:] - pixels, axis=1)
         error[np.isnan(error)] = np.inf
         keep = error <= max(3 * float(np.median(error)), 1e-3 / width)
     linear = matrix[:, :3] * np.sign(np.linalg.det(matrix[:, :3]))
@@ -55,7 +55,7 @@ def find_viewpoint(points: F4, known: PinholeFit | None) -> tuple[PinholeFit, Po
     center = middle - scale * np.linalg.solve(matrix[:, :3], matrix[:, 3])
     pose = Pose(_rq_rotation(linear).T, center)
     image = seen_from(pose, points)
-    fit = known if known is not None and still_fits(known, image) else fit_pinhole(image)
+    fit = previous if previous is not None and still_fits(previous, image) else fit_pinhole(image)
     return None if fit is None or fit.camera.fx > _LONGEST * width else (fit, pose, image)
 
 
@@ -66,9 +66,9 @@ def seen_from(pose: Pose, points: F4) -> F4:
     """
     with np.errstate(over="ignore", invalid="ignore"):
         image = (points - pose.translation.astype(np.float32)) @ pose.rotation.astype(np.float32)
-        given = np.einsum("ijk,ijk->ij", points, points) > 0
+        has_point = np.einsum("ijk,ijk->ij", points, points) > 0
     depth = image[..., 2]
-    depth[~(given & (depth > NEAREST_M))] = np.nan
+    depth[~(has_point & (depth > NEAREST_M))] = np.nan
     return np.asarray(image)
 
 

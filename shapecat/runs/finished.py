@@ -39,9 +39,9 @@ class FinishedRun:
     @property
     def categories(self) -> tuple[str, ...]:
         """The common categories; then those of the model, and those that a person added."""
-        known = dict.fromkeys((*self.common, *self.run["model"]["categories"]))
-        added = {label.category for label in self.labels.values()} - {*known, "unknown"}
-        return (*known, *sorted(added))
+        of_model = dict.fromkeys((*self.common, *self.run["model"]["categories"]))
+        added = {label.category for label in self.labels.values()} - {*of_model, "unknown"}
+        return (*of_model, *sorted(added))
 
     def frames(self) -> Iterator[LabelledFrame]:
         """Read the labelled frames."""

@@ -117,14 +117,14 @@ def staged(
         msg = f"{folder}: another run is writing there"
         raise OutputError(msg) from error
     except Exception as error:
-        kept = worth_keeping(hidden)
-        if not kept:
+        resumable = worth_keeping(hidden)
+        if not resumable:
             _discard(hidden, created)
         if not isinstance(error, OSError | OutputError):
             raise
         reason = f"{folder}: cannot write the results: {getattr(error, 'strerror', '') or error}"
         text = str(error) if isinstance(error, OutputError) else reason
-        more = "; finished work is kept, and the same command resumes it" if kept else ""
+        more = "; finished work is kept, and the same command resumes it" if resumable else ""
         raise OutputError(text + more) from error
 
 
@@ -227,13 +227,13 @@ class _BusyError(Exception):
 
 @contextmanager
 def _locked(folder: Path) -> Iterator[None]:
-    held = lock(folder)
-    if held is None:
+    lock_file = lock(folder)
+    if lock_file is None:
         raise _BusyError
     try:
         yield
     finally:
-        os.close(held)
+        os.close(lock_file)
 
 
 @contextmanager
@@ -245,14 +245,14 @@ def writing_outputs(folder: Path) -> Iterator[None]:
     OutputError : another process is writing them, or the folder is not a finished run.
     """
     with explained(str(folder), OutputError):
-        held = lock(folder / _OF_OUTPUTS)
-    if held is None:
+        lock_file = lock(folder / _OF_OUTPUTS)
+    if lock_file is None:
         msg = f"{folder}: another command is writing its outputs; wait for it and run this again"
         raise OutputError(msg)
     try:
         yield
     finally:
-        os.close(held)
+        os.close(lock_file)
 
 
 def _discard(hidden: Path, created: list[Path]) -> None:
@@ -287,7 +287,7 @@ def read_run(folder: Path) -> RunInfo:
         raise OutputError(msg) from error
     wrong = wrong_entry(run)
     if wrong is not None:
-        what = f": {wrong} is missing or wrong" if wrong else ""
-        msg = f"{folder / 'run.json'}: not a description of a run{what}"
+        detail = f": {wrong} is missing or wrong" if wrong else ""
+        msg = f"{folder / 'run.json'}: not a description of a run{detail}"
         raise OutputError(msg)
     return run

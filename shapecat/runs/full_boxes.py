@@ -74,8 +74,8 @@ class FullBoxes:
         """Read the frames of a run; the topics ``placed`` are tracked in the fixed frame."""
         frames, first = PlacedFrames(placed), 0
         tables = {"frames": PlacedFrames.COLUMNS, "detections": ("topic", "frame")}
-        for seen, detections in read_together(folder, tables):
-            frames.add(seen, detections, first)
+        for frame_tables, detections in read_together(folder, tables):
+            frames.add(frame_tables, detections, first)
             first += detections.num_rows
         return cls(folder / "detections.parquet", frames)
 
@@ -90,61 +90,65 @@ class FullBoxes:
         ------
         OutputError : the table of detections is unreadable.
         """
-        seen = self._seen(tracks)
-        chosen = [_spread(len(one.rows)) for one in seen]
-        rows = [one.rows[some] for one, some in zip(seen, chosen, strict=True)]
+        sightings = self._sightings(tracks)
+        chosen = [_spread(len(sighting.rows)) for sighting in sightings]
+        rows = [sighting.rows[picked] for sighting, picked in zip(sightings, chosen, strict=True)]
         details = self._read(np.concatenate([_NO_ROWS, *rows]), _DETAILS)
         stops = list(accumulate(len(track.frames) for track in tracks))
         result = np.full((stops[-1] if stops else 0, _WIDTH), np.nan, np.float32)
         ends = accumulate(map(len, chosen))
-        for track, one, some, stop, end in zip(tracks, seen, chosen, stops, ends, strict=True):
-            if len(some):
-                views = self._views(one, some, details[end - len(some) : end])
+        for track, sighting, picked, stop, end in zip(
+            tracks, sightings, chosen, stops, ends, strict=True
+        ):
+            if len(picked):
+                views = self._views(sighting, picked, details[end - len(picked) : end])
                 fused = fuse_boxes(
-                    views, view_weights(one.partial[some]), track.posterior, categories
+                    views, view_weights(sighting.partial[picked]), track.posterior, categories
                 )
-                self._show(fused, one, result[stop - len(track.frames) : stop])
+                self._show(fused, sighting, result[stop - len(track.frames) : stop])
         return result
 
-    def _seen(self, tracks: Sequence[Track]) -> "list[_Seen]":
+    def _sightings(self, tracks: Sequence[Track]) -> "list[_Sighting]":
         """Return the detections of each track that have a full box."""
-        shown = [np.flatnonzero(np.asarray(track.detections) >= 0) for track in tracks]
+        detected = [np.flatnonzero(np.asarray(track.detections) >= 0) for track in tracks]
         frames = [
             self.frames.find([track.topics[k] for k in at], track.frames[at])
-            for track, at in zip(tracks, shown, strict=True)
+            for track, at in zip(tracks, detected, strict=True)
         ]
         rows = [
-            self.frames.first[found] + track.detections[at]
-            for track, at, found in zip(tracks, shown, frames, strict=True)
+            self.frames.first[frame_rows] + track.detections[at]
+            for track, at, frame_rows in zip(tracks, detected, frames, strict=True)
         ]
         boxes = self._read(np.concatenate([_NO_ROWS, *rows]), _BOXES)
         result = []
-        for at, own, found, end in zip(
-            shown, rows, frames, accumulate(map(len, rows)), strict=True
+        for at, track_rows, frame_rows, end in zip(
+            detected, rows, frames, accumulate(map(len, rows)), strict=True
         ):
-            here = boxes[end - len(own) : end]
-            known = ~np.isnan(here[:, 0])
-            here, partial = here[known, :BOX_WIDTH], here[known, BOX_WIDTH] > 0
-            result.append(_Seen(at[known], own[known], found[known], here, partial))
+            here = boxes[end - len(track_rows) : end]
+            has_box = ~np.isnan(here[:, 0])
+            here, partial = here[has_box, :BOX_WIDTH], here[has_box, BOX_WIDTH] > 0
+            result.append(
+                _Sighting(at[has_box], track_rows[has_box], frame_rows[has_box], here, partial)
+            )
         return result
 
-    def _views(self, seen: "_Seen", some: I4, details: F4) -> BoxViews:
+    def _views(self, sighting: "_Sighting", picked: I4, details: F4) -> BoxViews:
         """Return the boxes of some views of a track in the fixed frame; see `_DETAILS`."""
-        boxes, poses = seen.boxes[some], self.frames.poses[seen.frames[some]]
+        boxes, poses = sighting.boxes[picked], self.frames.poses[sighting.frames[picked]]
         centers, axes = _placed(boxes, poses)
         sizes, stds = boxes[:, 3:6].astype(np.float64), details[:, :3].astype(np.float64)
         return BoxViews(centers, axes, sizes, stds, details[:, 3:], poses[:, :, 3])
 
-    def _show(self, fused: FusedBox, seen: "_Seen", result: F4) -> None:
+    def _show(self, fused: FusedBox, sighting: "_Sighting", result: F4) -> None:
         """Write the fused box to ``result``, in the sensor frame of each view."""
-        for first in range(0, len(seen.rows), _BLOCK):
+        for first in range(0, len(sighting.rows), _BLOCK):
             block = slice(first, first + _BLOCK)
-            boxes, poses = seen.boxes[block], self.frames.poses[seen.frames[block]]
-            shown = fused.in_views(*_placed(boxes, poses), boxes[:, 3:6])
+            boxes, poses = sighting.boxes[block], self.frames.poses[sighting.frames[block]]
+            in_view = fused.in_views(*_placed(boxes, poses), boxes[:, 3:6])
             turns, places = poses[:, :, :3], poses[:, :, 3]
-            back = np.einsum("kji,kj->ki", turns, shown.centers - places)
-            own = Rotation.from_matrix(np.swapaxes(turns, 1, 2) @ shown.axes).as_quat()
-            result[seen.at[block]] = np.hstack([back, shown.sizes, own, shown.stds])
+            back = np.einsum("kji,kj->ki", turns, in_view.centers - places)
+            quaternions = Rotation.from_matrix(np.swapaxes(turns, 1, 2) @ in_view.axes).as_quat()
+            result[sighting.at[block]] = np.hstack([back, in_view.sizes, quaternions, in_view.stds])
 
     def _read(self, rows: I4, values: _Selection) -> F4:
         """Return the values (n, k) of some rows of the table."""
@@ -155,7 +159,7 @@ class FullBoxes:
         return result
 
 
-class _Seen(NamedTuple):
+class _Sighting(NamedTuple):
     """The views of a track that have a full box.
 
     Attributes

@@ -148,11 +148,11 @@ class ContentDigest:
         return self._digest
 
 
-def same_content(known: InputInfo, path: Path, digest: Callable[[], str]) -> bool:
+def same_content(recorded: InputInfo, path: Path, digest: Callable[[], str]) -> bool:
     """Return whether a recording has the content of the ``input`` in a run.json.
 
     ``digest`` is called only if the names, sizes or times of the files differ.
     """
-    if _of_input(known["files"], path) == file_stats(path):
+    if _of_input(recorded["files"], path) == file_stats(path):
         return True
-    return bool(known["digest"]) and known["digest"] == digest()
+    return bool(recorded["digest"]) and recorded["digest"] == digest()

@@ -152,11 +152,11 @@ def describe_run(job: Job, categorizer: Categorizer) -> RunInfo:
 
 def differences(run: RunInfo, planned: RunInfo) -> list[str]:
     """Return the settings, options and model in which two runs differ, with both values."""
-    here, wanted = (_entries(each) for each in (run, planned))
+    entries, planned_entries = (_entries(each) for each in (run, planned))
     return [
-        f"{name}: {_words(here.get(name))} there, {_words(wanted.get(name))} wanted"
-        for name in dict.fromkeys((*here, *wanted))
-        if here.get(name) != wanted.get(name)
+        f"{name}: {_words(entries.get(name))} there, {_words(planned_entries.get(name))} wanted"
+        for name in dict.fromkeys((*entries, *planned_entries))
+        if entries.get(name) != planned_entries.get(name)
     ]
 
 
@@ -227,8 +227,8 @@ def require_utf8(job: Job) -> None:
     try:
         f"{job.source}{job.folder}".encode()
     except UnicodeEncodeError as error:
-        shown = job.name.encode(errors="surrogateescape").decode(errors="replace")
-        msg = f"{shown}: the name is not valid UTF-8; rename it"
+        printable = job.name.encode(errors="surrogateescape").decode(errors="replace")
+        msg = f"{printable}: the name is not valid UTF-8; rename it"
         raise RecordingError(msg) from error
 
 

@@ -65,10 +65,10 @@ def read_labelled_frames(folder: Path, labels: Mapping[int, TrackLabel]) -> Iter
         supports = rows_by_frame(planes)
         for row in frames.to_pylist():
             key = (row["topic"], row["frame"])
-            found = {row["detection"]: row for row in objects.get(key, [])}
-            if any(rows.keys() - found.keys() for rows in tracks.objects(key).values()):
+            detected_rows = {row["detection"]: row for row in objects.get(key, [])}
+            if any(rows.keys() - detected_rows.keys() for rows in tracks.objects(key).values()):
                 raise misfit(folder)
-            frame = _labelled_frame(row, found, supports.get(key, []), tracks)
+            frame = _labelled_frame(row, detected_rows, supports.get(key, []), tracks)
             yield replace(frame, masks=masks.of(key))
 
 
@@ -83,8 +83,8 @@ class _MasksByFrame:
         """Return the masks of a frame; None if it has none."""
         if self._next is None or self._next[0] != key:
             return None
-        found, self._next = self._next[1], next(self._rows, None)
-        return found
+        row, self._next = self._next[1], next(self._rows, None)
+        return row
 
 
 def rows_by_frame(table: pa.Table) -> dict[tuple[str, int], list[dict[str, Any]]]:
@@ -111,7 +111,7 @@ def _values(column: pa.ChunkedArray) -> Sequence[Any]:
 
 def _labelled_frame(
     row: Mapping[str, Any],
-    found: Mapping[int, Mapping[str, Any]],
+    detections: Mapping[int, Mapping[str, Any]],
     planes: Sequence[Mapping[str, Any]],
     tracks: LabelledTracks,
 ) -> LabelledFrame:
@@ -121,7 +121,7 @@ def _labelled_frame(
         pose = Pose(np.reshape(row["fixed_rotation"], (3, 3)), row["fixed_translation"])
     objects = [
         [
-            _labelled_object(found[number], label, tracks.causal[row], tracks.full_box(row))
+            _labelled_object(detections[number], label, tracks.causal[row], tracks.full_box(row))
             for number, row in rows.items()
         ]
         for label, rows in tracks.objects(key).items()

@@ -99,11 +99,11 @@ class LabelledTracks:
         order of their first detections.
         """
         rows = self.frames.get(key, _NO_ROWS)
-        found: dict[TrackLabel, dict[int, int]] = {}
+        rows_by_label: dict[TrackLabel, dict[int, int]] = {}
         pairs = zip(self.detections[rows].tolist(), self.tracks[rows].tolist(), strict=True)
         for row, (number, track) in enumerate(pairs, rows.start):
-            found.setdefault(self.labels[track], {})[number] = row
-        return found
+            rows_by_label.setdefault(self.labels[track], {})[number] = row
+        return rows_by_label
 
     def full_box(self, row: int) -> Box | None:
         """Return the full box of a row; None if unknown."""
@@ -127,9 +127,9 @@ def read_annotation_frames(
     tracks = LabelledTracks.read(folder, labels)
     plain_columns = ("topic", "frame", "stamp_ns", "log_time_ns", "frame_id")
     pose_columns = ("frame_translation", "frame_rotation")
-    wanted = (*plain_columns, "up", *pose_columns)
-    found = ("topic", "frame", "detection", "center", "size", "orientation")
-    tables = {"frames": wanted, "detections": found}
+    frame_columns = (*plain_columns, "up", *pose_columns)
+    detection_columns = ("topic", "frame", "detection", "center", "size", "orientation")
+    tables = {"frames": frame_columns, "detections": detection_columns}
     for frames, detections in read_together(folder, tables, at_once=_AT_ONCE):
         plain = [frames[name].to_pylist() for name in plain_columns]
         keys = list(zip(*plain[:2], strict=True))
@@ -165,8 +165,8 @@ def _boxes(
     counts = [span.stop - span.start for span in spans]
     numbered = np.concatenate([tracks.detections[span] for span in spans])
     rows = np.repeat(firsts, counts) + numbered  # detections are numbered by their rows
-    known = numbers(detections["detection"])
-    if np.any(rows >= np.repeat(ends, counts)) or np.any(known[rows] != numbered):
+    detection_numbers = numbers(detections["detection"])
+    if np.any(rows >= np.repeat(ends, counts)) or np.any(detection_numbers[rows] != numbered):
         raise misfit(folder)
     places = places[rows]
     if not visible:
@@ -196,21 +196,21 @@ def _box(label: TrackLabel, row: Sequence[float]) -> AnnotationBox:
 
 def _causal(file: pq.ParquetFile, rows: I4) -> F4:
     """Return the causal posteriors (n, k) of some rows."""
-    found = _NONE
+    posteriors = _NONE
     for at, table in read_rows(file, ["posterior"], rows):
         values = np.reshape(numbers(table["posterior"]), (len(table), -1))
-        if not len(found):
-            found = np.zeros((len(rows), values.shape[1]), np.float32)
-        found[at] = values
-    return found
+        if not len(posteriors):
+            posteriors = np.zeros((len(rows), values.shape[1]), np.float32)
+        posteriors[at] = values
+    return posteriors
 
 
 def _full(file: pq.ParquetFile, rows: I4) -> F4:
     """Return the full boxes (n, 10) of some rows; NaN if unknown."""
-    found = np.zeros((len(rows), BOX_WIDTH), np.float32)
+    boxes = np.zeros((len(rows), BOX_WIDTH), np.float32)
     for at, table in read_rows(file, FULL_BOX, rows):
-        found[at] = full_boxes_of(table)
-    return found
+        boxes[at] = full_boxes_of(table)
+    return boxes
 
 
 def _places(table: pa.Table) -> F8:
@@ -260,14 +260,14 @@ def _ended(
     return {key: tuple(gone) for key, gone in ended.items()}
 
 
-def _next_of_topic(folder: Path, wanted: Container[Key]) -> dict[Key, Key]:
-    """Return the next frame of the same topic after each of the ``wanted`` frames."""
+def _next_of_topic(folder: Path, keys: Container[Key]) -> dict[Key, Key]:
+    """Return the next frame of the same topic after each of the ``keys`` frames."""
     following: dict[Key, Key] = {}
     latest: dict[str, Key] = {}
     for group in read_row_groups(folder / "frames.parquet", ["topic", "frame"], at_once=64):
         for key in keys_of(group):
             before = latest.get(key[0])
-            if before is not None and before in wanted:
+            if before is not None and before in keys:
                 following[before] = key
             latest[key[0]] = key
     return following

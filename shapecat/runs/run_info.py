@@ -123,11 +123,13 @@ def wrong_entry(content: Any, kind: Any = RunInfo, name: str = "") -> str | None
     within: list[tuple[str, Any, Any]] = []
     if is_typeddict(kind):
         hints = _hints_of(kind)
-        known = [key for key in hints if key in content or key in kind.__required_keys__]
-        within = [(f"{name}.{key}".strip("."), content.get(key, ...), hints[key]) for key in known]
+        expected = [key for key in hints if key in content or key in kind.__required_keys__]
+        within = [
+            (f"{name}.{key}".strip("."), content.get(key, ...), hints[key]) for key in expected
+        ]
     elif origin is dict:
         within = [(f"{name}.{key}", value, parts[1]) for key, value in content.items()]
     elif origin is list:
         within = [(name, item, parts[0]) for item in content]
-    found = (wrong_entry(value, part, place) for place, value, part in within)
-    return next((wrong for wrong in found if wrong is not None), None)
+    errors = (wrong_entry(value, part, place) for place, value, part in within)
+    return next((wrong for wrong in errors if wrong is not None), None)

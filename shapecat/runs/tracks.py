@@ -92,10 +92,10 @@ def track_run(
         release_memory()
         full = FullBoxes.read(folder, placed)
         release_memory()
-        for some in _batches(tracks):
-            _write(writer, some, full, categories)
-            lines += [_line(track, categories, start_ns, work) for track in some]
-            some.clear()  # the next batch may be as long
+        for batch in _batches(tracks):
+            _write(writer, batch, full, categories)
+            lines += [_line(track, categories, start_ns, work) for track in batch]
+            batch.clear()  # the next batch may be as long
             release_memory()
     for name in (ORIGINAL, "tracks.csv"):
         with replacing(folder / name) as path:
@@ -104,37 +104,37 @@ def track_run(
 
 
 def _write(
-    writer: pq.ParquetWriter, some: list[Track], full: FullBoxes, categories: Sequence[str]
+    writer: pq.ParquetWriter, tracks: list[Track], full: FullBoxes, categories: Sequence[str]
 ) -> None:
     """Write some tracks with their full boxes."""
-    boxes = full.of_tracks(some, categories)
-    for parts, rows in _parts(some):
+    boxes = full.of_tracks(tracks, categories)
+    for parts, rows in _parts(tracks):
         writer.write_table(arrow_table(_columns(parts, boxes[rows], categories), TRACKS))
 
 
 def _batches(tracks: Iterable[Track]) -> Iterator[list[Track]]:
     """Yield batches of tracks: one long track, or several short ones."""
-    some: list[Track] = []
+    batch: list[Track] = []
     for track in tracks:
-        if len(track.frames) > _BATCH and some:
-            yield some
-            some = []
-        some.append(track)
+        if len(track.frames) > _BATCH and batch:
+            yield batch
+            batch = []
+        batch.append(track)
         del track
-        if sum(len(one.frames) for one in some) > _BATCH:
-            yield some
-            some = []
-    yield some
+        if sum(len(one.frames) for one in batch) > _BATCH:
+            yield batch
+            batch = []
+    yield batch
 
 
-def _parts(some: list[Track]) -> Iterator[tuple[list[Track], slice]]:
+def _parts(tracks: list[Track]) -> Iterator[tuple[list[Track], slice]]:
     """Yield the tracks to write at a time, and their rows in the batch."""
-    if len(some) != 1:
-        yield some, slice(None)
+    if len(tracks) != 1:
+        yield tracks, slice(None)
         return
-    for first in range(0, len(some[0].frames), _BATCH):
+    for first in range(0, len(tracks[0].frames), _BATCH):
         rows = slice(first, first + _BATCH)
-        yield [some[0].part(rows)], rows
+        yield [tracks[0].part(rows)], rows
 
 
 def _read_frames(folder: Path, categories: int, fixed: set[str]) -> Iterator[FrameDetections]:
@@ -142,33 +142,35 @@ def _read_frames(folder: Path, categories: int, fixed: set[str]) -> Iterator[Fra
 
     They are in the fixed frame for the topics in ``fixed``, else in the sensor frame.
     """
-    wanted = ["topic", "frame", "stamp_ns", "fixed_rotation"]
-    for frames, detections in read_together(folder, {"frames": wanted, "detections": _COLUMNS}):
+    frame_columns = ["topic", "frame", "stamp_ns", "fixed_rotation"]
+    for frames, detections in read_together(
+        folder, {"frames": frame_columns, "detections": _COLUMNS}
+    ):
         rows, columns = frame_rows(detections), _columns_of(detections, categories)
-        seen = frames.to_pylist()
+        rows_of_frames = frames.to_pylist()
         turns = np.tile(_NO_TURN, (detections.num_rows, 1))
-        for frame in seen:
+        for frame in rows_of_frames:
             if frame["topic"] in fixed and frame["fixed_rotation"]:
                 turns[_rows_of(frame, rows)] = frame["fixed_rotation"]
         columns["orientation"] = _turned(columns["orientation"], turns.reshape(-1, 3, 3))
-        for frame in seen:
+        for frame in rows_of_frames:
             of_frame = _rows_of(frame, rows)
-            here = {name: values[of_frame] for name, values in columns.items()}
+            values_of_frame = {name: values[of_frame] for name, values in columns.items()}
             if frame["topic"] in fixed:
-                placed = ~np.isnan(here["center_fixed"][:, 0])
-                here = {name: values[placed] for name, values in here.items()}
+                placed = ~np.isnan(values_of_frame["center_fixed"][:, 0])
+                values_of_frame = {name: values[placed] for name, values in values_of_frame.items()}
             yield FrameDetections(
                 topic=frame["topic"],
                 frame=frame["frame"],
                 stamp_ns=frame["stamp_ns"],
-                detections=here["detection"],
-                centers=here["center_fixed" if frame["topic"] in fixed else "center"],
-                sizes=here["size"],
-                posteriors=here["posterior"],
-                partial=here["partial"],
-                novelties=here["novelty"],
-                orientations=here["orientation"],
-                described=here["described"],
+                detections=values_of_frame["detection"],
+                centers=values_of_frame["center_fixed" if frame["topic"] in fixed else "center"],
+                sizes=values_of_frame["size"],
+                posteriors=values_of_frame["posterior"],
+                partial=values_of_frame["partial"],
+                novelties=values_of_frame["novelty"],
+                orientations=values_of_frame["orientation"],
+                described=values_of_frame["described"],
             )
 
 

@@ -151,7 +151,7 @@ class DetectionTable:
         """Return the mask (n,) of frames ``rows`` (n,) whose topics have detections of a track."""
         return np.isin(self.topics[rows], self.topics[self.rows[track]])
 
-    def seen_with(self, track: I4, which: I4) -> I4:
+    def on_topics_of(self, track: I4, which: I4) -> I4:
         """Return those of the detections ``which`` whose topics also have detections of a track."""
         return which if len(self.names) == 1 else which[self.sees(track, self.rows[which])]
 
@@ -194,7 +194,7 @@ class _Gathered:
     def columns(self) -> dict[str, Any]:
         """Return the columns of `DetectionTable`, and free the bytes they were made from."""
         counts = np.array(self._counts, np.int32)
-        of_frames = {name: self._taken(name, kind) for name, kind in _OF_FRAMES.items()}
+        of_frames = {name: self._pop_column(name, kind) for name, kind in _OF_FRAMES.items()}
         which: Any = slice(None)
         frames: Any = slice(None)
         if len(self._names) > 1:
@@ -207,13 +207,13 @@ class _Gathered:
         columns["rows"] = np.repeat(np.arange(len(counts), dtype=np.int32), counts)
         total = len(columns["rows"])
         for name, (kind, shape) in _OF_DETECTIONS.items():
-            values = self._taken(name, kind)
+            values = self._pop_column(name, kind)
             widths = tuple(self._categories if width == "c" else width for width in shape)
             complete = values.size == total * int(np.prod(widths))
             columns[name] = values.reshape(total, *widths)[which] if complete else None
         return {"names": tuple(self._names), **columns}
 
-    def _taken(self, name: str, kind: str) -> Any:
+    def _pop_column(self, name: str, kind: str) -> Any:
         return np.frombuffer(self._bytes.pop(name), kind)
 
 

@@ -79,7 +79,7 @@ def _covered_beside(table: DetectionTable, k: int, tracks: Sequence[I4], owner: 
         beside, _ = table.of_frames(table.rows[track[[end]]])
         covered = [0]
         for neighbour in beside[(owner[beside] >= 0) & (owner[beside] != k)].tolist():
-            host = table.seen_with(track, tracks[owner[neighbour]])
+            host = table.on_topics_of(track, tracks[owner[neighbour]])
             i = int(np.searchsorted(host, neighbour))
             window = host[max(i - span, 0) : i] if direction < 0 else host[i + 1 : i + 1 + span]
             place = table.centers[track[end]] + table.centers[window] - table.centers[neighbour]

@@ -144,7 +144,7 @@ def _describe(table: DetectionTable, fragments: Sequence[I4], scenes: I4) -> Fra
         end_velocity=np.reshape([velocity for _, velocity in ends], (n, 3)),
         sizes=np.reshape([_extent(table, f) for f in fragments], (n, 3)),
         whole=np.array([np.sum(~table.partial[f]) for f in fragments], np.int32),
-        rest=np.reshape([_rest(table, f) for f in fragments], (n, 3)),
+        rest=np.reshape([_resting_position(table, f) for f in fragments], (n, 3)),
         cut=np.reshape([table.partial[f[[0, -1]]] for f in fragments], (n, 2)),
         posteriors=np.reshape([posterior for posterior, _ in fused], (n, -1 if n else 0)),
         novelties=np.array([novelty for _, novelty in fused]),
@@ -170,7 +170,7 @@ def _extent(table: DetectionTable, track: I4) -> F8:
     return np.asarray(table.sizes[track].max(axis=0))
 
 
-def _rest(table: DetectionTable, track: I4) -> F8:
+def _resting_position(table: DetectionTable, track: I4) -> F8:
     """Return the median position (3,) of the whole views; NaN if they move or are too few."""
     complete = table.centers[track[~table.partial[track]]]
     if (

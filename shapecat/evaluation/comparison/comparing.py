@@ -11,7 +11,7 @@ import numpy as np
 
 from shapecat.errors import OutputError, RecordingError
 from shapecat.evaluation.comparison.figures import Pairs, figures_of
-from shapecat.evaluation.comparison.identities import SeenTogether
+from shapecat.evaluation.comparison.identities import FrameIdentities
 from shapecat.evaluation.comparison.labellings import (
     LabelledItem,
     Labelling,
@@ -23,10 +23,10 @@ from shapecat.evaluation.comparison.matching import (
     SAME_MASK,
     Difference,
     Matched,
+    frame_identities,
     item_box_iou,
     labelled_part,
     match_objects,
-    seen_together,
 )
 from shapecat.evaluation.comparison.overlap import MATCHED_F, Overlap
 from shapecat.evaluation.comparison.pictures import DifferenceImage, draw_frame
@@ -86,7 +86,7 @@ class _Tally:
 
     overlap: Overlap = field(default_factory=Overlap)
     pairs: Pairs = field(default_factory=Pairs)
-    seen: list[SeenTogether] = field(default_factory=list)
+    seen: list[FrameIdentities] = field(default_factory=list)
     rows: list[Difference] = field(default_factory=list)
     last: dict[int, int] = field(default_factory=dict)
     pictures: dict[int, DifferenceImage] = field(default_factory=dict)
@@ -208,7 +208,7 @@ def _compare_frame(
     rows = list(_differences(tally, key, row["stamp_ns"], found.items, true.items, matched))
     tally.rows += rows
     tally.pairs.add(found.items, true.items, matched)
-    tally.seen.append(seen_together(found.items, true.items, matched))
+    tally.seen.append(frame_identities(found.items, true.items, matched))
     differing = [item for item in rows if item.difference]
     severity = len(differing) + 1 - float(np.mean([item.iou or 0 for item in rows] or [1]))
     best = tally.pictures.get(part)

@@ -7,7 +7,7 @@ from typing import Any
 
 import numpy as np
 
-from shapecat.evaluation.comparison.identities import SeenTogether, judge_identities
+from shapecat.evaluation.comparison.identities import FrameIdentities, judge_identities
 from shapecat.evaluation.comparison.labellings import LabelledItem
 from shapecat.evaluation.comparison.matching import Difference, Matched
 from shapecat.evaluation.comparison.overlap import Overlap
@@ -50,7 +50,7 @@ def figures_of(
     pairs: Pairs,
     *,
     overlap: Overlap | None,
-    seen: Sequence[SeenTogether] | None,
+    seen: Sequence[FrameIdentities] | None,
     rows: Sequence[Difference],
     categories: Sequence[str],
     threshold: float,
@@ -122,7 +122,7 @@ def _balanced(truth: Sequence[str], said: Sequence[str], known: Sequence[int]) -
     return _mean([value for value in recalls if value is not None])
 
 
-def _tracking(seen: Sequence[SeenTogether], threshold: float) -> dict[str, Any]:
+def _tracking(seen: Sequence[FrameIdentities], threshold: float) -> dict[str, Any]:
     figures = judge_identities(seen, threshold=threshold).as_dict()
     return {
         name: None if value != value else round(value, 4)  # noqa: PLR0124  NaN

@@ -10,13 +10,13 @@ from scipy.optimize import linear_sum_assignment
 
 from shapecat.arrays import F8, I4, Bool
 
-__all__ = ["Identities", "SeenTogether", "judge_identities"]
+__all__ = ["FrameIdentities", "Identities", "judge_identities"]
 
 _ALPHAS = np.arange(0.05, 0.99, 0.05)
 _FORBIDDEN = 1e6
 
 
-class SeenTogether(NamedTuple):
+class FrameIdentities(NamedTuple):
     """The true and the found objects of a frame, and their similarity.
 
     Attributes
@@ -63,7 +63,7 @@ class _Occurrences(NamedTuple):
     frames: list[tuple[I4, I4, F8]]
 
 
-def judge_identities(frames: Iterable[SeenTogether], *, threshold: float = 0.5) -> Identities:
+def judge_identities(frames: Iterable[FrameIdentities], *, threshold: float = 0.5) -> Identities:
     """Compute tracking metrics.
 
     Source: Bernardin 2008 (MOTA), Ristani 2016 (IDF1), Luiten 2020 (HOTA).
@@ -93,7 +93,7 @@ def judge_identities(frames: Iterable[SeenTogether], *, threshold: float = 0.5) 
     )
 
 
-def _clear_mot(frames: Iterable[SeenTogether], threshold: float) -> Counter[str]:
+def _clear_mot(frames: Iterable[FrameIdentities], threshold: float) -> Counter[str]:
     """Count misses, false positives and switches; a matched pair is kept as long as possible."""
     last: dict[Hashable, Hashable] = {}
     counts: Counter[str] = Counter()
@@ -110,7 +110,7 @@ def _clear_mot(frames: Iterable[SeenTogether], threshold: float) -> Counter[str]
 
 
 def _pairs(
-    frame: SeenTogether, allowed: Bool, last: Mapping[Hashable, Hashable]
+    frame: FrameIdentities, allowed: Bool, last: Mapping[Hashable, Hashable]
 ) -> list[tuple[int, int]]:
     """Match a frame: first the previous pairs that are still allowed, then the most similar."""
     true, found, similarity = frame
@@ -128,7 +128,7 @@ def _pairs(
     return [*pairs.items(), *new]
 
 
-def _occurrences(frames: Iterable[SeenTogether]) -> _Occurrences:
+def _occurrences(frames: Iterable[FrameIdentities]) -> _Occurrences:
     numbers: tuple[dict[Hashable, int], dict[Hashable, int]] = ({}, {})
     numbered = []
     for true, found, similarity in frames:

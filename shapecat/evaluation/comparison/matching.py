@@ -8,7 +8,7 @@ import numpy as np
 from scipy.optimize import linear_sum_assignment
 
 from shapecat.arrays import Bool
-from shapecat.evaluation.comparison.identities import SeenTogether
+from shapecat.evaluation.comparison.identities import FrameIdentities
 from shapecat.evaluation.comparison.labellings import LabelledItem, Labelling
 from shapecat.evaluation.comparison.overlap import Overlap, box_iou, match_masks
 
@@ -17,10 +17,10 @@ __all__ = [
     "SAME_MASK",
     "Difference",
     "Matched",
+    "frame_identities",
     "item_box_iou",
     "labelled_part",
     "match_objects",
-    "seen_together",
 ]
 
 SAME_MASK = 0.5
@@ -101,9 +101,9 @@ def item_box_iou(a: LabelledItem, b: LabelledItem) -> float | None:
     return None if a.box is None or b.box is None else box_iou(a.box, b.box)
 
 
-def seen_together(
+def frame_identities(
     found: Sequence[LabelledItem], true: Sequence[LabelledItem], matched: Matched
-) -> SeenTogether:
+) -> FrameIdentities:
     """Return the identities of a frame; a track with several detections keeps the most similar."""
     best: dict[int, int] = {}
     for i, item in enumerate(found):
@@ -114,7 +114,7 @@ def seen_together(
             best[item.track] = i
     true_tracks = {item.track: j for j, item in enumerate(true) if item.track is not None}
     similarity = matched.similarity[np.ix_(list(best.values()), list(true_tracks.values()))].T
-    return SeenTogether(list(true_tracks), list(best), similarity)
+    return FrameIdentities(list(true_tracks), list(best), similarity)
 
 
 def labelled_part(found: Labelling, true: Labelling) -> Labelling:

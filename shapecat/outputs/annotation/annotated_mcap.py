@@ -128,8 +128,8 @@ def _encoded(
     encoding = _encoding(recording, first)
     kinds = encoder_for(encoding, markers=markers)
     channels = [channel for channel, _ in kinds]
-    known = chain([first] if first else [], annotations)
-    items = chain.from_iterable(_messages(one, kinds, 0) for one in known)
+    all_annotations = chain([first] if first else [], annotations)
+    items = chain.from_iterable(_messages(one, kinds, 0) for one in all_annotations)
     drawn, starts = image_encoders_for(encoding, image_topics), dict[str, int]()
     for topic, encoders in drawn.items():
         starts[topic] = len(channels)
@@ -168,12 +168,12 @@ def _append(
 
 def _annotations(frames: Iterable[AnnotationFrame]) -> Iterator[Annotation]:
     """Add lifetimes, from the time of the next frame, and tracks to delete, from earlier frames."""
-    shown: dict[str, set[int]] = {}
+    visible: dict[str, set[int]] = {}
     for frame, period in _with_periods(frames):
-        here = {box.track for box in frame.objects}
-        gone = (shown.get(frame.topic, set()) | set(frame.ended)) - here
-        shown[frame.topic] = here
-        gone -= set().union(*shown.values())  # unless another sensor still sees it
+        current = {box.track for box in frame.objects}
+        gone = (visible.get(frame.topic, set()) | set(frame.ended)) - current
+        visible[frame.topic] = current
+        gone -= set().union(*visible.values())  # unless another sensor still sees it
         lifetime = round(_LIFETIME * min(period, _LONGEST_NS))
         yield Annotation(frame, lifetime, tuple(sorted(gone)))
 
@@ -215,6 +215,6 @@ def _encoding(recording: Recording, first: Annotation | None) -> str:
     if recording.kind == "ros1":
         return "cdr"
     topics = [topic for topic in recording.topics if topic.encoding in ENCODERS]
-    own = [topic.encoding for topic in topics if first and topic.name == first.frame.topic]
+    encodings = [topic.encoding for topic in topics if first and topic.name == first.frame.topic]
     common = Counter(topic.encoding for topic in topics).most_common(1)
-    return own[0] if own else common[0][0] if common else "json"
+    return encodings[0] if encodings else common[0][0] if common else "json"

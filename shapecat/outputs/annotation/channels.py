@@ -29,8 +29,10 @@ def encoder_for(encoding: str, *, markers: bool) -> Encoders[Annotation]:
 
     An unknown encoding is replaced by JSON. ``markers`` adds a channel for RViz, for ROS only.
     """
-    found = ENCODERS.get(encoding, ENCODERS["json"])()
-    return [(channel, encode) for channel, encode in found if markers or channel.topic != MARKERS]
+    encoders = ENCODERS.get(encoding, ENCODERS["json"])()
+    return [
+        (channel, encode) for channel, encode in encoders if markers or channel.topic != MARKERS
+    ]
 
 
 def _ros(*, ros1: bool) -> Encoders[Annotation]:

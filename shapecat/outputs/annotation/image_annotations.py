@@ -83,10 +83,10 @@ def image_encoders_for(encoding: str, topics: Iterable[str]) -> dict[str, Encode
 
 
 def _ros(of_topic: str, *, ros1: bool) -> Encoders[ImageFrame]:
-    ros, found = RosMessages(ros1=ros1), "vision_msgs/msg/Detection2DArray"
+    ros, array_type = RosMessages(ros1=ros1), "vision_msgs/msg/Detection2DArray"
     drawn = "foxglove_msgs/msg/ImageAnnotations"
     return [
-        ros.encoder(DETECTIONS_2D + of_topic, found, partial(_detections, ros)),
+        ros.encoder(DETECTIONS_2D + of_topic, array_type, partial(_detections, ros)),
         ros.encoder(DRAWN + of_topic, drawn, partial(_drawn, ros)),
     ]
 
@@ -130,15 +130,15 @@ def _plain(frame: ImageFrame, parts: tuple[str, str]) -> dict[str, Any]:
 def _detections(ros: RosMessages, frame: ImageFrame) -> Any:
     """Make a vision_msgs/Detection2DArray."""
     header = ros.make("Header", frame)
-    found = []
+    detections = []
     for one in frame.boxes:
         left, top, width, height = (float(value) for value in one.box)
         hypothesis = ros.make("ObjectHypothesis", one.category, float(one.confidence))
         result = ros.make("ObjectHypothesisWithPose", hypothesis, ros.no_pose)
         middle = ros.make("Point2D", left + width / 2, top + height / 2)
         bounds = ros.make("BoundingBox2D", ros.make("Pose2D", middle, 0.0), width, height)
-        found.append(ros.make("Detection2D", header, [result], bounds, str(one.track)))
-    return ros.make("Detection2DArray", header, found)
+        detections.append(ros.make("Detection2D", header, [result], bounds, str(one.track)))
+    return ros.make("Detection2DArray", header, detections)
 
 
 def _drawn(ros: RosMessages, frame: ImageFrame) -> Any:

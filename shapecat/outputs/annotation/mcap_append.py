@@ -65,20 +65,20 @@ def copy_bytes(source: Path, target: Path, length: int) -> None:
     """
     with source.open("rb") as file, target.open("r+b") as copy:
         _reserve(copy, length)
-        done = 0
+        total = 0
         try:
-            while done < length:
-                copied = os.copy_file_range(file.fileno(), copy.fileno(), length - done)
+            while total < length:
+                copied = os.copy_file_range(file.fileno(), copy.fileno(), length - total)
                 if copied == 0:
                     break
-                done += copied
+                total += copied
         except OSError:
-            if done:
+            if total:
                 raise
-        if done == 0:
-            while block := file.read(min(1 << 20, length - done)):
-                done += copy.write(block)
-        if done < length:  # what is missing would be zeros
+        if total == 0:
+            while block := file.read(min(1 << 20, length - total)):
+                total += copy.write(block)
+        if total < length:  # what is missing would be zeros
             raise OSError(errno.EIO, "the recording became shorter while it was copied")
 
 

@@ -71,8 +71,8 @@ def convert_channel(channel: Channel) -> ConvertedChannel | None:
         store = get_typestore(Stores.EMPTY)
         types[_HEADER] = modern.fielddefs[_HEADER]
         types = {kind: _renamed(*definition) for kind, definition in types.items()}
-        known = name in modern.fielddefs and _same_layout(name, types, modern.fielddefs)
-        store.register({**types, **(_reachable(name, modern) if known else {})})
+        same_layout = name in modern.fielddefs and _same_layout(name, types, modern.fielddefs)
+        store.register({**types, **(_reachable(name, modern) if same_layout else {})})
         text, _ = store.generate_msgdef(name, ros_version=2)
         store.get_msgdef(name)
     except LIBRARY_ERRORS:
@@ -116,18 +116,18 @@ def _same_layout(name: str, old: Any, new: Any) -> bool:
 
 def _reachable(name: str, store: Typestore) -> dict[str, Any]:
     """Return the definitions of a type and of the types it contains."""
-    found: dict[str, Any] = {}
+    definitions: dict[str, Any] = {}
     waiting = [name]
     while waiting:
         current = waiting.pop()
-        if current in found:
+        if current in definitions:
             continue
-        found[current] = store.fielddefs[current]
+        definitions[current] = store.fielddefs[current]
         for _, field in store.fielddefs[current][1]:
             inner: Any = field[1][0] if field[0] in {Nodetype.ARRAY, Nodetype.SEQUENCE} else field
             if inner[0] == Nodetype.NAME:
                 waiting.append(str(inner[1]))
-    return found
+    return definitions
 
 
 def raw_channel(topic: str) -> AnnotationChannel:

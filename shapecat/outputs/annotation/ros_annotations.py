@@ -71,8 +71,8 @@ class RosMessages:
 
     def detections(self, annotation: Annotation) -> Any:
         """Make a vision_msgs/Detection3DArray."""
-        found = [self._detection(annotation, box) for box in annotation.frame.objects]
-        return self._types["Detection3DArray"](self._header(annotation.frame), found)
+        items = [self._detection(annotation, box) for box in annotation.frame.objects]
+        return self._types["Detection3DArray"](self._header(annotation.frame), items)
 
     def _detection(self, annotation: Annotation, box: AnnotationBox) -> Any:
         t, pose = self._types, self._pose(box)
@@ -122,24 +122,24 @@ class RosMessages:
             for track in annotation.gone
             for kind in ("box", "text")
         ]
-        shown = [
+        cubes_and_texts = [
             make(annotation, box)
             for box in annotation.frame.objects
             for make in (self._cube_marker, self._text_marker)
         ]
-        return self._types["MarkerArray"](gone + shown)
+        return self._types["MarkerArray"](gone + cubes_and_texts)
 
     def _cube_marker(self, annotation: Annotation, box: AnnotationBox) -> Any:
-        given = {"pose": self._pose(box), "scale": self._size(box)}
+        geometry = {"pose": self._pose(box), "scale": self._size(box)}
         colour = self.colour("ColorRGBA", box.category, 0.5)
-        return self._marker(annotation, "box", box.track, color=colour, **given)
+        return self._marker(annotation, "box", box.track, color=colour, **geometry)
 
     def _text_marker(self, annotation: Annotation, box: AnnotationBox) -> Any:
-        given = {"pose": self._text_pose(box), "scale": self._types["Vector3"](0.0, 0.0, 0.03)}
+        geometry = {"pose": self._text_pose(box), "scale": self._types["Vector3"](0.0, 0.0, 0.03)}
         colour = self.colour("ColorRGBA", box.category, 1.0)
-        return self._marker(annotation, "text", box.track, color=colour, text=text(box), **given)
+        return self._marker(annotation, "text", box.track, color=colour, text=text(box), **geometry)
 
-    def _marker(self, annotation: Annotation, kind: str, number: int, **given: Any) -> Any:
+    def _marker(self, annotation: Annotation, kind: str, number: int, **changes: Any) -> Any:
         t, header = self._types, self._header(annotation.frame)
         values = {
             "header": header,
@@ -163,7 +163,7 @@ class RosMessages:
             mesh = t["MeshFile"]("", self._no_bytes)
             values |= {"texture_resource": "", "texture": empty, "uv_coordinates": []}
             values |= {"mesh_file": mesh}
-        return t["Marker"](**values | given)
+        return t["Marker"](**values | changes)
 
     def _time(self, stamp_ns: int) -> Any:
         seconds, nanoseconds = divmod(stamp_ns, 10**9)
@@ -197,12 +197,12 @@ def _typestore(ros1: bool) -> Typestore:  # noqa: FBT001  # a cache key
         "Detection2DArray": "vision_msgs/msg/Detection2DArray",
         "ImageAnnotations": "foxglove_msgs/msg/ImageAnnotations",
     }
-    known = dict(get_typestore(Stores.ROS1_NOETIC).fielddefs) if ros1 else {}
+    ros1_types = dict(get_typestore(Stores.ROS1_NOETIC).fielddefs) if ros1 else {}
     for file, name in names.items():
         definition = files("shapecat.schemas").joinpath(f"{file}.msg").read_text("utf-8")
         types = get_types_from_msg(definition, name)
         # ROS 1 has a sequence number in its headers, and simpler markers.
-        types = {key: known.get(key, value) for key, value in types.items()}
+        types = {key: ros1_types.get(key, value) for key, value in types.items()}
         store.register({key: value for key, value in types.items() if key not in store.fielddefs})
     return store
 

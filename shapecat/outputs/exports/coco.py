@@ -64,9 +64,9 @@ def write_coco(out: Path, images: Images, categories: Sequence[str]) -> int:
     named = [{"id": k, "name": name, "supercategory": ""} for k, name in enumerate(categories, 1)]
     (out / "annotations").mkdir(exist_ok=True)
     for split, part in splits.items():
-        whole = {"info": {"description": "shapecat"}, "licenses": [], "categories": named, **part}
+        content = {"info": {"description": "shapecat"}, "licenses": [], "categories": named, **part}
         path = out / "annotations" / f"instances_{split}.json"
-        path.write_text(json.dumps(whole), "utf-8")
+        path.write_text(json.dumps(content), "utf-8")
     return count
 
 

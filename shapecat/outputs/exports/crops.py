@@ -48,8 +48,8 @@ class Origin(NamedTuple):
     @classmethod
     def read(cls, instance: str) -> "Origin | None":
         """Return the origin in the name of an instance; None if no run made it."""
-        if found := _INSTANCE.fullmatch(instance):
-            return cls(found[1], float(found[2] or 0), float(found[3] or "inf"))
+        if match := _INSTANCE.fullmatch(instance):
+            return cls(match[1], float(match[2] or 0), float(match[3] or "inf"))
         return None
 
     def shares_frames(self, other: "Origin") -> bool:
@@ -58,8 +58,8 @@ class Origin(NamedTuple):
         return self.source == other.source and begin < end
 
     def __str__(self) -> str:
-        whole = (self.start_s, self.end_s) == (0, math.inf)
-        return self.source if whole else f"{self.source}.{self.start_s:.3f}-{self.end_s:.3f}"
+        is_whole = (self.start_s, self.end_s) == (0, math.inf)
+        return self.source if is_whole else f"{self.source}.{self.start_s:.3f}-{self.end_s:.3f}"
 
 
 def write_crops(out: Path, frames: Iterable[ExportedFrame], finished: FinishedRun) -> int:

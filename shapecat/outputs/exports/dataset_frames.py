@@ -89,8 +89,8 @@ def split_runs(runs: Sequence[FinishedRun], val: float) -> list[str]:
     if not 0 <= val < 1:
         msg = f"val must be at least 0 and less than 1, got {val}"
         raise ValueError(msg)
-    known = {run.run["input"]["digest"] or run.name for run in runs}
-    order = sorted(known, key=lambda digest: xxhash.xxh3_64_hexdigest(digest.encode()))
+    digests = {run.run["input"]["digest"] or run.name for run in runs}
+    order = sorted(digests, key=lambda digest: xxhash.xxh3_64_hexdigest(digest.encode()))
     chosen = set(order[: min(round(val * len(order)), len(order) - 1)])
     return ["val" if (r.run["input"]["digest"] or r.name) in chosen else "train" for r in runs]
 
@@ -100,12 +100,12 @@ def image_stems(runs: Sequence[FinishedRun]) -> list[dict[str, str]]:
     names = different_names([run.name for run in runs])
     topics = [run.run["options"]["topics"] for run in runs]
     stems = [
-        f"{name}_{topic}" if len(own) > 1 else name
-        for name, own in zip(names, topics, strict=True)
-        for topic in own
+        f"{name}_{topic}" if len(run_topics) > 1 else name
+        for name, run_topics in zip(names, topics, strict=True)
+        for topic in run_topics
     ]
     different = iter(different_names(stems))
-    return [{topic: next(different) for topic in own} for own in topics]
+    return [{topic: next(different) for topic in run_topics} for run_topics in topics]
 
 
 def images_of(
@@ -169,19 +169,21 @@ def _image(
     corrected: set[int],
 ) -> DatasetImage | None:
     """Return the image of a frame; None if it has none."""
-    found = _depth_file(labelled, frame) if selection.depth else _colour_file(frame, coloured)
-    if found is None:
+    image = _depth_file(labelled, frame) if selection.depth else _colour_file(frame, coloured)
+    if image is None:
         return None
-    suffix, contents, (height, width), masks = found
-    kept = [
+    suffix, contents, (height, width), masks = image
+    visible = [
         (item, mask, _is_sure(item, selection, corrected))
         for item, mask in zip(labelled.objects, masks, strict=True)
         if mask.pixels.size and item.category != UNKNOWN
     ]
-    objects, seen, sure = (
-        (tuple(column) for column in zip(*kept, strict=True)) if kept else [()] * 3
+    objects, masks_of_objects, sure = (
+        (tuple(column) for column in zip(*visible, strict=True)) if visible else [()] * 3
     )
-    return DatasetImage(f"{name}{suffix}", contents, width, height, labelled, objects, seen, sure)
+    return DatasetImage(
+        f"{name}{suffix}", contents, width, height, labelled, objects, masks_of_objects, sure
+    )
 
 
 _File = tuple[str, bytes, tuple[int, int], tuple[Mask, ...]]
@@ -221,32 +223,34 @@ def _chosen(
 
     Of the frames with the same colour image, only the one nearest to it in time is selected.
     """
-    seen: Counter[str] = Counter()
+    counts: Counter[str] = Counter()
     keys: list[tuple[str, int]] = []
     views: dict[int, list[tuple[int, Any]]] = {}
     nearest: dict[tuple[str, int], tuple[int, int]] = {}
     left_out: set[int] = set()
     for labelled in finished.frames():
-        number = seen[labelled.topic]
-        seen[labelled.topic] += 1
+        number = counts[labelled.topic]
+        counts[labelled.topic] += 1
         if number % selection.every:
             continue
         if (image := labelled.masks) is not None and not selection.depth:
-            here = abs(labelled.stamp_ns - image.stamp_ns), len(keys)
+            candidate = abs(labelled.stamp_ns - image.stamp_ns), len(keys)
             place = (image.topic, image.stamp_ns)
-            other = nearest.setdefault(place, here)
-            nearest[place] = min(here, other)
-            left_out |= {k for _, k in (here, other)} - {nearest[place][1]}
+            earlier = nearest.setdefault(place, candidate)
+            nearest[place] = min(candidate, earlier)
+            left_out |= {k for _, k in (candidate, earlier)} - {nearest[place][1]}
         for item in labelled.objects if selection.per_track else ():
             if _is_sure(item, selection, corrected):
                 views.setdefault(item.track, []).append((len(keys), _view(labelled, item)))
         keys.append((labelled.topic, labelled.index))
     if not selection.per_track:
         return {key for k, key in enumerate(keys) if k not in left_out}
-    kept = {track: [row for row in rows if row[0] not in left_out] for track, rows in views.items()}
+    kept_rows = {
+        track: [row for row in rows if row[0] not in left_out] for track, rows in views.items()
+    }
     return {
         keys[rows[k][0]]
-        for rows in kept.values()
+        for rows in kept_rows.values()
         if rows
         for k in _different(np.array([view for _, view in rows]), selection.per_track)
     }

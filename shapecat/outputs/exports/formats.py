@@ -230,9 +230,9 @@ def _staged(
 
 def _mark(folder: Path, about: Mapping[str, Any]) -> None:
     """Write the marker of an export: its source, and the names that it made."""
-    made = sorted(path.name for path in folder.iterdir() if path.name != _MARK)
+    names = sorted(path.name for path in folder.iterdir() if path.name != _MARK)
     with replacing(folder / _MARK) as path:
-        path.write_text(json.dumps({**about, "made": made}, indent=1) + "\n", "utf-8")
+        path.write_text(json.dumps({**about, "made": names}, indent=1) + "\n", "utf-8")
 
 
 def _read_mark(folder: Path) -> dict[str, Any]:
@@ -257,11 +257,11 @@ def _made_by_export(folder: Path) -> Collection[str] | None:
 
 
 def _thinned(frames: Iterable[LabelledFrame], every: int) -> Iterator[LabelledFrame]:
-    seen: Counter[str] = Counter()
+    counts: Counter[str] = Counter()
     for frame in frames:
-        if seen[frame.topic] % every == 0:
+        if counts[frame.topic] % every == 0:
             yield frame
-        seen[frame.topic] += 1
+        counts[frame.topic] += 1
 
 
 def _require_own(target: Path, about: Mapping[str, Any]) -> None:
@@ -276,13 +276,13 @@ def _require_own(target: Path, about: Mapping[str, Any]) -> None:
         return
     earlier, format = _read_mark(target), about["format"]  # noqa: A001  # the word users know
     if earlier.get("format") != format:
-        made = earlier.get("format", "something else")
-        msg = f"{target}: holds {made}, not an earlier {format} export; choose another --out"
+        previous = earlier.get("format", "something else")
+        msg = f"{target}: holds {previous}, not an earlier {format} export; choose another --out"
         raise OutputError(msg)
     if not _recordings_of(earlier) <= _recordings_of(about):
         hint = ", or export all runs together" if format in DATASETS else ""
-        made = f"{target}: holds the {format} export of another recording"
-        msg = f"{made}; choose another --out{hint}"
+        previous = f"{target}: holds the {format} export of another recording"
+        msg = f"{previous}; choose another --out{hint}"
         raise OutputError(msg)
     if earlier.get("topics", about.get("topics")) != about.get("topics"):
         msg = f"{target}: holds the {format} export of other topics; choose another --out"

@@ -48,13 +48,13 @@ def write_kitti(out: Path, frames: Iterable[ExportedFrame], _finished: FinishedR
         index = csv.writer(file, lineterminator="\n")
         index.writerow(("number", "topic", "frame", "stamp_ns"))
         for number, (labelled, frame, coloured) in enumerate(frames):
-            seen = _write_image(out, number, frame, coloured)
+            view = _write_image(out, number, frame, coloured)
             index.writerow((f"{number:06d}", labelled.topic, labelled.index, labelled.stamp_ns))
             up = upward(labelled)
             turn = rectified_from_sensor(up, optical=frame.organized or bool(up[1] < -0.7))
-            lines = [_label(item, frame, turn, seen) for item in labelled.objects]
+            lines = [_label(item, frame, turn, view) for item in labelled.objects]
             (out / "label_2" / f"{number:06d}.txt").write_text("".join(lines), "utf-8")
-            (out / "calib" / f"{number:06d}.txt").write_text(_calibration(seen, turn), "utf-8")
+            (out / "calib" / f"{number:06d}.txt").write_text(_calibration(view, turn), "utf-8")
             points = finite_points(frame) @ (_VELO_FROM_RECTIFIED @ turn).T
             rows = np.concatenate([points, np.zeros((len(points), 1))], axis=1)
             rows.astype("<f4").tofile(out / "velodyne" / f"{number:06d}.bin")
@@ -80,7 +80,7 @@ def rectified_from_sensor(up: F8, *, optical: bool) -> F8:
     return np.stack([np.cross(-up, forward), -up, forward])
 
 
-class _Seen(NamedTuple):
+class _View(NamedTuple):
     """The camera for 2D boxes and P2; None for clouds.
 
     ``pose`` is ``camera_from_sensor``; ``image`` is whether a colour image was written.
@@ -91,25 +91,25 @@ class _Seen(NamedTuple):
     image: bool
 
 
-def _write_image(out: Path, number: int, frame: Frame, coloured: Coloured | None) -> _Seen:
+def _write_image(out: Path, number: int, frame: Frame, coloured: Coloured | None) -> _View:
     """Write the colour image of a frame and return its camera; without one, the depth camera."""
-    own = _Seen(frame.camera, IDENTITY, image=False)
+    depth_view = _View(frame.camera, IDENTITY, image=False)
     if coloured is None or coloured.view.image.height <= 1:
-        return own
+        return depth_view
     view = coloured.view
     lens = view.lens
     if view.registered and frame.camera is not None:
         lens = LensCamera(frame.camera)
     if lens is None:
-        return own
+        return depth_view
     try:
         pixels = rectified(pixels_of(view.image), lens)
     except MessageError as error:
         _log.warning("image_2/%06d.png is missing: %s", number, error)
-        return own
+        return depth_view
     (out / "image_2").mkdir(exist_ok=True)
     Image.fromarray(pixels).save(out / "image_2" / f"{number:06d}.png", compress_level=4)
-    return _Seen(lens.pinhole, view.colour_from_depth or IDENTITY, image=True)
+    return _View(lens.pinhole, view.colour_from_depth or IDENTITY, image=True)
 
 
 def kitti_type(category: str) -> str:
@@ -117,7 +117,7 @@ def kitti_type(category: str) -> str:
     return category.replace(" ", "_")
 
 
-def _label(item: LabelledObject, frame: Frame, turn: F8, seen: _Seen) -> str:
+def _label(item: LabelledObject, frame: Frame, turn: F8, view: _View) -> str:
     """Return a line of 15 values: type truncated occluded alpha bbox(4) h w l x y z rotation_y."""
     length, width, height = map(float, item.box.size)
     x, y, z = turn @ item.box.center
@@ -127,18 +127,18 @@ def _label(item: LabelledObject, frame: Frame, turn: F8, seen: _Seen) -> str:
     numbers = (
         float(item.touches_border),
         int(item.occluded),
-        *(f"{value:.5f}" for value in (alpha, *_pixels(item, frame, seen))),
+        *(f"{value:.5f}" for value in (alpha, *_pixels(item, frame, view))),
         *(f"{value:.5f}" for value in (height, width, length, x, y + height / 2, z, yaw)),
     )
     return " ".join([kitti_type(item.category), *map(str, numbers)]) + "\n"
 
 
-def _pixels(item: LabelledObject, frame: Frame, seen: _Seen) -> tuple[float, ...]:
+def _pixels(item: LabelledObject, frame: Frame, view: _View) -> tuple[float, ...]:
     """Return left, top, right and bottom of an object, pixels; all -1 if it is not visible."""
-    camera, nowhere = seen.camera, (-1.0, -1.0, -1.0, -1.0)
+    camera, nowhere = view.camera, (-1.0, -1.0, -1.0, -1.0)
     if camera is None or not item.indices.size:
         return nowhere
-    u, v, _ = project(frame.xyz(item.indices), LensCamera(camera), seen.pose).astype(np.float64).T
+    u, v, _ = project(frame.xyz(item.indices), LensCamera(camera), view.pose).astype(np.float64).T
     inside = (u > -0.5) & (u < camera.width - 0.5) & (v > -0.5) & (v < camera.height - 0.5)
     if not inside.any():
         return nowhere
@@ -146,14 +146,14 @@ def _pixels(item: LabelledObject, frame: Frame, seen: _Seen) -> tuple[float, ...
     return (float(u.min()), float(v.min()), float(u.max()), float(v.max()))
 
 
-def _calibration(seen: _Seen, turn: F8) -> str:
-    camera = seen.camera
+def _calibration(view: _View, turn: F8) -> str:
+    camera = view.camera
     intrinsic = np.eye(3)
     if camera is not None:
         intrinsic = np.array(
             [[camera.fx, 0, camera.cx], [0, camera.fy, camera.cy], [0, 0, 1]], np.float64
         )
-    rotation, translation = seen.pose.rotation @ turn.T, seen.pose.translation[:, None]
+    rotation, translation = view.pose.rotation @ turn.T, view.pose.translation[:, None]
     projection = intrinsic @ np.concatenate([rotation, translation], axis=1)
     still = np.zeros((3, 1))
     rows = {

@@ -110,10 +110,10 @@ def _side(picture: SurfaceDrawing) -> str:
 
 def _facts(card: Card) -> list[str]:
     line, cells = card.timeline, card.row.cells
-    seen = line.seconds[line.seen]
-    facts = [plural(len(seen), "view")]
-    if len(seen):
-        facts.append(time_span(float(seen[0]), float(seen[-1])))
+    view_seconds = line.seconds[line.seen]
+    facts = [plural(len(view_seconds), "view")]
+    if len(view_seconds):
+        facts.append(time_span(float(view_seconds[0]), float(view_seconds[-1])))
     if card.pictures:
         facts.append(" × ".join(f"{100 * side:.0f}" for side in card.pictures.size) + " cm")
     if cells.get("novelty"):
@@ -165,7 +165,7 @@ def _time_line(line: Timeline, categories: Sequence[str], end: float) -> str:
         y = np.round(33 - 31 * line.causal[chosen, k], 1)
         dots = " ".join(f"{a:g},{b:g}" for a, b in zip(x.tolist(), y.tolist(), strict=True))
         lines.append(f'<polyline points="{dots}" stroke="{hex_colour(categories[k])}"/>')
-    seen = "".join(
+    bars = "".join(
         f'<rect class="seen" x="{a:.1f}" y="38" width="{max(b - a, 1.5):.1f}" height="3" rx="1"/>'
         for a, b in _spans(line.seconds, line.seen, 300 / end)
     )
@@ -173,7 +173,7 @@ def _time_line(line: Timeline, categories: Sequence[str], end: float) -> str:
         '<svg class="line" viewBox="0 0 300 44" preserveAspectRatio="none" role="img" '
         'aria-label="posterior over time"><title>posterior over time; the bar below shows when '
         "the object was seen"
-        f'</title><path class="grid" d="M0 2H300M0 33H300"/>{"".join(lines)}{seen}</svg>'
+        f'</title><path class="grid" d="M0 2H300M0 33H300"/>{"".join(lines)}{bars}</svg>'
     )
 
 
@@ -182,16 +182,16 @@ def _few(count: int) -> I4:
     return np.unique(np.linspace(0, count - 1, min(count, _MOST_STEPS)).round().astype(int))
 
 
-def _spans(seconds: F8, seen: Bool, scale: float) -> list[tuple[float, float]]:
+def _spans(seconds: F8, visible: Bool, scale: float) -> list[tuple[float, float]]:
     """Return start and end of each interval in which the track was detected without a gap."""
     spans: list[tuple[float, float]] = []
     before = False
-    for at, here in zip((seconds * scale).tolist(), seen.tolist(), strict=True):
-        if here and before:
+    for at, is_visible in zip((seconds * scale).tolist(), visible.tolist(), strict=True):
+        if is_visible and before:
             spans[-1] = (spans[-1][0], at)
-        elif here:
+        elif is_visible:
             spans.append((at, at))
-        before = here
+        before = is_visible
     return spans
 
 

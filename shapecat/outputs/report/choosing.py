@@ -59,11 +59,11 @@ def choose_frames(folder: Path, timelines: Mapping[int, Timeline]) -> Choice:
     for track, views in _views(folder, owner).items():
         for view in _best_of_parts(views):
             candidates.setdefault(view.key, set()).add(track)
-    shown: dict[Key, set[int]] = {}
+    tracks_of: dict[Key, set[int]] = {}
     for (topic, frame, _), track in owner.items():
-        shown.setdefault((topic, frame), set()).add(track)
+        tracks_of.setdefault((topic, frame), set()).add(track)
     stamps = sorted((stamp_ns, key) for key, stamp_ns in read_stamps(folder))
-    strip = _strip(stamps, shown)
+    strip = _strip(stamps, tracks_of)
     return Choice({key: frozenset(tracks) for key, tracks in candidates.items()}, strip)
 
 
@@ -79,22 +79,22 @@ def _views(folder: Path, owner: Mapping[Detected, int]) -> dict[int, list[_View]
             if key not in owner:
                 continue
             area, cut = masks.get(key, (_COLOURLESS * points, False))
-            whole = not (border or occluded or cut)
-            found = views.setdefault(owner[key], [])
-            worth = area * (1.0 if whole else _PARTIAL)
-            found.append(_View(len(found), (topic, frame), worth))
+            complete = not (border or occluded or cut)
+            track_views = views.setdefault(owner[key], [])
+            worth = area * (1.0 if complete else _PARTIAL)
+            track_views.append(_View(len(track_views), (topic, frame), worth))
     return views
 
 
 def _areas(masks: Iterator[tuple[Key, ImageMasks]]) -> dict[Detected, tuple[float, bool]]:
     """Return the area of each mask in pixels, and whether it touches the image border."""
-    found = {}
+    areas = {}
     for key, frame in masks:
         for number, (left, top, width, height) in frame.boxes.items():
             right, bottom = frame.width - left - width, frame.height - top - height
             area = float(np.sum(frame.counts[number][1::2]))
-            found[*key, number] = (area, min(left, top, right, bottom) <= 0)
-    return found
+            areas[*key, number] = (area, min(left, top, right, bottom) <= 0)
+    return areas
 
 
 def _best_of_parts(views: Sequence[_View]) -> list[_View]:
@@ -104,7 +104,9 @@ def _best_of_parts(views: Sequence[_View]) -> list[_View]:
     return [max(part, key=lambda view: (view.worth, -view.place)) for part in parts]
 
 
-def _strip(stamps: Sequence[tuple[int, Key]], shown: Mapping[Key, set[int]]) -> dict[Key, float]:
+def _strip(
+    stamps: Sequence[tuple[int, Key]], tracks_of: Mapping[Key, set[int]]
+) -> dict[Key, float]:
     """Return one frame of each part of a run, with its seconds since the first frame.
 
     ``stamps`` are the stamp (ns) and the key of each frame, sorted by time.
@@ -115,15 +117,15 @@ def _strip(stamps: Sequence[tuple[int, Key]], shown: Mapping[Key, set[int]]) -> 
     covered: set[tuple[str, int]] = set()
     strip = {}
     for part in np.array_split(np.arange(len(stamps)), min(_STRIP, len(stamps)) or 1):
-        best, most = None, (-1, -1, 0.0)
+        best, best_worth = None, (-1, -1, 0.0)
         for k in part.tolist():
             key = stamps[k][1]
-            tracks = {(key[0], track) for track in shown.get(key, ())}
+            tracks = {(key[0], track) for track in tracks_of.get(key, ())}
             worth = (len(tracks - covered), len(tracks), -abs(k - float(part.mean())))
-            if worth > most or best is None:
-                best, most = k, worth
+            if worth > best_worth or best is None:
+                best, best_worth = k, worth
         if best is not None:
             stamp, key = stamps[best]
             strip[key] = (stamp - stamps[0][0]) * 1e-9
-            covered |= {(key[0], track) for track in shown.get(key, ())}
+            covered |= {(key[0], track) for track in tracks_of.get(key, ())}
     return strip

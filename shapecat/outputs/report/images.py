@@ -20,7 +20,7 @@ from shapecat.recordings.decoding.colour_image import pixels_of
 from shapecat.recordings.messages import MessageError
 from shapecat.types import Camera, Frame, LabelledFrame
 
-__all__ = ["CROP_PX", "Crop", "SeenFrame", "crop_of", "encode", "look", "worth_of"]
+__all__ = ["CROP_PX", "Crop", "FramePicture", "crop_of", "encode", "picture_frame", "worth_of"]
 
 CROP_PX = 256
 """Longest side of the picture of an object."""
@@ -50,7 +50,7 @@ Window = tuple[int, int, int, int]
 """Left, top, right and bottom, pixels."""
 
 
-class SeenFrame(Record):
+class FramePicture(Record):
     """A frame with all data for its pictures.
 
     Attributes
@@ -91,19 +91,21 @@ class Crop(NamedTuple):
     outline: str
 
 
-def look(labelled: LabelledFrame, frame: Frame, coloured: Coloured | None) -> SeenFrame | None:
+def picture_frame(
+    labelled: LabelledFrame, frame: Frame, coloured: Coloured | None
+) -> FramePicture | None:
     """Return a frame prepared for pictures; None for a cloud that no virtual camera can show."""
-    found = _organized(labelled, frame)
-    if found is None:
+    organized = _organized(labelled, frame)
+    if organized is None:
         return None
-    image_frame, objects = found
+    image_frame, objects = organized
     hidden = np.array([_hidden_share(image_frame.depth, pixels) for pixels in objects])
     if coloured is not None and frame.organized and coloured.view.image.height > 1:
         try:
-            return SeenFrame(coloured.masks, hidden, image_frame, pixels_of(coloured.view.image))
+            return FramePicture(coloured.masks, hidden, image_frame, pixels_of(coloured.view.image))
         except MessageError:
             pass  # damaged image: show depth instead
-    return SeenFrame(dense_masks(image_frame, objects), hidden, image_frame)
+    return FramePicture(dense_masks(image_frame, objects), hidden, image_frame)
 
 
 def _organized(labelled: LabelledFrame, frame: Frame) -> tuple[Frame, list[U4]] | None:
@@ -124,18 +126,18 @@ def _organized(labelled: LabelledFrame, frame: Frame) -> tuple[Frame, list[U4]] 
     depth = np.divide(1, inverse, out=np.zeros_like(inverse), where=inverse > 0)
     camera = Camera(depth.shape[1], depth.shape[0], *view.grid.intrinsics)
     cells = [np.unique(view.cell[pixels]) for pixels in indices]
-    seen = Frame(
+    organized_frame = Frame(
         frame.topic, frame.index, frame.stamp_ns, frame.log_time_ns, frame.frame_id, depth, camera
     )
-    return seen, [cell[cell >= 0].astype(np.uint32) for cell in cells]
+    return organized_frame, [cell[cell >= 0].astype(np.uint32) for cell in cells]
 
 
 def _upright(points: F4, up: F4 | None) -> F8:
     """Return the rotation (3, 3) from the sensor to a level optical frame that faces a cloud."""
     level = gravity_rotation((0.0, -1.0, 0.0) if up is None else up)
     x, y, _ = np.nan_to_num(np.nanmean(points @ level.T, axis=0)) if len(points) else (1.0, 0, 0)
-    far = np.hypot(x, y)
-    x, y = (x / far, y / far) if far > 1e-6 else (1.0, 0.0)
+    norm = np.hypot(x, y)
+    x, y = (x / norm, y / norm) if norm > 1e-6 else (1.0, 0.0)
     return np.asarray(np.array([[y, -x, 0], [0, 0, -1], [x, y, 0]]) @ level)
 
 
@@ -150,13 +152,13 @@ def _hidden_share(depth: F4 | None, pixels: U4) -> float:
     inside = np.zeros((int(np.ptp(v)) + 3, int(np.ptp(u)) + 3), bool)
     inside[v - v.min() + 1, u - u.min() + 1] = True
     padded = np.pad(depth, 1)
-    near = padded[v.min() : v.max() + 3, u.min() : u.max() + 3]
+    window = padded[v.min() : v.max() + 3, u.min() : u.max() + 3]
     outline = hidden = 0
     for axis, step in ((0, 1), (0, -1), (1, 1), (1, -1)):
         outside = inside & ~np.roll(inside, step, axis)
-        beyond = np.roll(near, step, axis)[outside]
+        beyond = np.roll(window, step, axis)[outside]
         outline += int(np.count_nonzero(outside))
-        limit = near[outside] * (1 - _NEARER) - _NEARER
+        limit = window[outside] * (1 - _NEARER) - _NEARER
         hidden += int(np.count_nonzero((beyond > 0) & (beyond < limit)))
     return hidden / max(outline, 1)
 
@@ -178,8 +180,8 @@ def _shaded(frame: Frame, window: Window) -> U1:
     normal = -np.stack([across * camera.fx, along * camera.fy, towards], axis=-1)
     normal /= np.maximum(np.linalg.norm(normal, axis=-1, keepdims=True), 1e-9)
     light = 0.3 + 0.7 * np.clip(normal @ (_LIGHT / np.linalg.norm(_LIGHT)), 0, 1)
-    near, far = np.percentile(depth[valid], [2, 98])
-    share = np.clip((depth - near) / max(far - near, 0.05), 0, 1)[..., None]
+    nearest, farthest = np.percentile(depth[valid], [2, 98])
+    share = np.clip((depth - nearest) / max(farthest - nearest, 0.05), 0, 1)[..., None]
     tone = light[..., None] * (_NEAR_TONE * (1 - share) + _FAR_TONE * share)
     return np.where(valid[..., None], tone, _BLANK).astype(np.uint8)
 
@@ -191,10 +193,10 @@ def _smooth(inverse: F4, passes: int = 6) -> F4:
         total, weight, limit = inverse.copy(), np.ones_like(inverse), _SAME_SURFACE * inverse
         for before, after in (((behind,), (ahead,)), ((..., behind), (..., ahead))):
             apart = np.abs(inverse[after] - inverse[before])
-            for here, there in ((before, after), (after, before)):
-                same = apart < limit[here]
-                total[here] += same * inverse[there]
-                weight[here] += same
+            for at, beside in ((before, after), (after, before)):
+                same_surface = apart < limit[at]
+                total[at] += same_surface * inverse[beside]
+                weight[at] += same_surface
         inverse = total / weight
     return inverse
 
@@ -221,9 +223,9 @@ def encode(pixels: U1, *, quality: int = 72) -> tuple[str, int, int]:
     return f"data:image/webp;base64,{text}", image.width, image.height
 
 
-def _window(seen: SeenFrame, mask: Mask) -> Window:
+def _window(image: FramePicture, mask: Mask) -> Window:
     """Return left, top, right and bottom of a square around an object, within the image."""
-    height, width = seen.shape
+    height, width = image.shape
     x, y, w, h = mask.box
     side = round(max(_MARGIN * max(w, h), _LEAST_PX))
     left = round(min(max(x + (w - side) / 2, 0), max(width - side, 0)))
@@ -231,14 +233,14 @@ def _window(seen: SeenFrame, mask: Mask) -> Window:
     return left, top, min(left + side, width), min(top + side, height)
 
 
-def _cut(seen: SeenFrame, window: Window) -> Image.Image:
-    image = Image.fromarray(seen.pixels(window))
+def _cut(frame_image: FramePicture, window: Window) -> Image.Image:
+    image = Image.fromarray(frame_image.pixels(window))
     scale = CROP_PX / max(image.size)
     size = (max(1, round(image.width * scale)), max(1, round(image.height * scale)))
     return image.resize(size, Image.Resampling.BICUBIC if scale > 1 else Image.Resampling.BOX)
 
 
-def worth_of(seen: SeenFrame, number: int) -> float:
+def worth_of(image: FramePicture, number: int) -> float:
     """Return a score, from 0 to 1, for the view of an object in a frame.
 
     The score is the product of four factors: the size (square root of the mask area, saturating at
@@ -249,14 +251,14 @@ def worth_of(seen: SeenFrame, number: int) -> float:
     ----------
     number : index of the object in the frame, from 0.
     """
-    mask = seen.masks[number]
+    mask = image.masks[number]
     if not mask.pixels.size:
         return 0.0
     size = min(1.0, float(np.sqrt(mask.area)) / _GOOD_PX)
-    free = 1 - _border_share(mask, *seen.shape)
-    detail = _GOOD_DETAIL if seen.colour is None else _detail(seen, mask)
+    free = 1 - _border_share(mask, *image.shape)
+    detail = _GOOD_DETAIL if image.colour is None else _detail(image, mask)
     sharp = detail / (detail + _GOOD_DETAIL)
-    return size * free**2 * (1 - float(seen.hidden[number])) ** 2 * sharp
+    return size * free**2 * (1 - float(image.hidden[number])) ** 2 * sharp
 
 
 def _border_share(mask: Mask, height: int, width: int) -> float:
@@ -274,30 +276,30 @@ def _border_share(mask: Mask, height: int, width: int) -> float:
         (left + w >= width, mask.pixels[:, -1]),
         (top + h >= height, mask.pixels[-1]),
     )
-    return sum(int(side.sum()) for there, side in sides if there) / max(outline, 1)
+    return sum(int(side.sum()) for touches, side in sides if touches) / max(outline, 1)
 
 
-def _detail(seen: SeenFrame, mask: Mask) -> float:
+def _detail(image: FramePicture, mask: Mask) -> float:
     """Return the standard deviation of the Laplacian on an object's crop, grey levels."""
-    window = _window(seen, mask)
-    grey = np.asarray(_cut(seen, window).convert("L"), np.float32)
-    inside = _inside(mask.full(*seen.shape), window, grey.shape)
+    window = _window(image, mask)
+    grey = np.asarray(_cut(image, window).convert("L"), np.float32)
+    inside = _inside(mask.full(*image.shape), window, grey.shape)
     return float(ndimage.laplace(grey)[inside].std()) if inside.any() else 0.0
 
 
 def _inside(mask: Bool, window: Window, shape: Sequence[int]) -> Bool:
     """Return a mask (h, w) cut to a crop, and eroded, since the outline adds contrast."""
     left, top, right, bottom = window
-    whole = Image.fromarray(mask[top:bottom, left:right])
-    small = whole.resize((shape[1], shape[0]), Image.Resampling.NEAREST)
+    mask_image = Image.fromarray(mask[top:bottom, left:right])
+    small = mask_image.resize((shape[1], shape[0]), Image.Resampling.NEAREST)
     return np.asarray(ndimage.binary_erosion(np.asarray(small), iterations=3))
 
 
-def crop_of(seen: SeenFrame, number: int) -> Crop:
+def crop_of(image: FramePicture, number: int) -> Crop:
     """Return the picture of an object in a frame; ``number`` is its index, from 0."""
-    mask = seen.masks[number]
-    window = _window(seen, mask)
-    uri, width, height = encode(np.asarray(_cut(seen, window)), quality=82)
+    mask = image.masks[number]
+    window = _window(image, mask)
+    uri, width, height = encode(np.asarray(_cut(image, window)), quality=82)
     scale = np.array([width / (window[2] - window[0]), height / (window[3] - window[1])])
     rings = [(ring - window[:2]) * scale for ring in outlines(mask)]
     return Crop(uri, width, height, "".join(map(_path, rings)))

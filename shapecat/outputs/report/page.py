@@ -76,7 +76,7 @@ def run_page(
     counts = Counter(card.row.category for card in cards)
     names = (UNKNOWN, *finished.categories)
     end = max((float(c.timeline.seconds[-1]) for c in cards if len(c.timeline.seconds)), default=0)
-    shown = [name for name in names if name in counts] + sorted(counts.keys() - set(names))
+    ordered = [name for name in names if name in counts] + sorted(counts.keys() - set(names))
     connect = "'self'" if served else "'none'"
     return template("page.html").substitute(
         title=escape(finished.name),
@@ -95,7 +95,7 @@ def run_page(
         ),
         warnings=_warnings([*run["warnings"], *notes]),
         strip=_strip(frames, cards),
-        chips="".join(_chip(name, counts[name]) for name in shown),
+        chips="".join(_chip(name, counts[name]) for name in ordered),
         cards="".join(card_html(card, run["model"]["categories"], names, end) for card in cards),
         next=_next_step(finished, served=served),
         timings=_timings(run["seconds"], stages),
@@ -238,7 +238,7 @@ def _data(names: Sequence[str], run: Mapping[str, Any], table: TrackTable, *, se
         "key": _key(run, table),
     }
     text = json.dumps(content, ensure_ascii=False, separators=(",", ":"))
-    return re.sub(r"[<>&\u2028\u2029]", lambda found: f"\\u{ord(found[0]):04x}", text)
+    return re.sub(r"[<>&\u2028\u2029]", lambda match: f"\\u{ord(match[0]):04x}", text)
 
 
 def _key(run: Mapping[str, Any], table: TrackTable) -> str:

@@ -13,7 +13,14 @@ from shapecat.outputs.colouring import Coloured, with_colour
 from shapecat.outputs.colours import colour_of
 from shapecat.outputs.level_clouds import finite_points, support_offset
 from shapecat.outputs.report.choosing import Choice
-from shapecat.outputs.report.images import Crop, SeenFrame, crop_of, encode, look, worth_of
+from shapecat.outputs.report.images import (
+    Crop,
+    FramePicture,
+    crop_of,
+    encode,
+    picture_frame,
+    worth_of,
+)
 from shapecat.outputs.report.surfaces import MOST_POINTS, Snapshot, SurfaceDrawing, draw
 from shapecat.runs.finished import FinishedRun, open_source
 from shapecat.runs.labelled_frames import read_labelled_frames
@@ -74,7 +81,7 @@ class _Best(NamedTuple):
 
 
 @dataclass
-class _Taken:
+class _Collector:
     """The pictures so far: the best view of each track, and the strip."""
 
     choice: Choice
@@ -86,19 +93,19 @@ class _Taken:
         key = (labelled.topic, labelled.index)
         if frame is not None:
             _require_unchanged(labelled, frame)
-        seen = None if frame is None else look(labelled, frame, coloured)
-        wanted = self.choice.candidates.get(key, frozenset())
+        image = None if frame is None else picture_frame(labelled, frame, coloured)
+        candidate_tracks = self.choice.candidates.get(key, frozenset())
         for number, item in enumerate(labelled.objects):
-            if item.track not in wanted:
+            if item.track not in candidate_tracks:
                 continue
-            worth = 1e-9 * item.indices.size if seen is None else worth_of(seen, number)
+            worth = 1e-9 * item.indices.size if image is None else worth_of(image, number)
             if item.track not in self.best or worth > self.best[item.track].worth:
-                shown = seen is not None and seen.masks[number].pixels.size > 0
-                crop = crop_of(seen, number) if seen is not None and shown else None
+                visible = image is not None and image.masks[number].pixels.size > 0
+                crop = crop_of(image, number) if image is not None and visible else None
                 shot = _snapshot(labelled, frame, item)
                 self.best[item.track] = _Best(worth, crop, shot, item)
-        if seen is not None and key in self.choice.strip:
-            self.frames.append(_strip_frame(labelled, seen, self.choice.strip[key]))
+        if image is not None and key in self.choice.strip:
+            self.frames.append(_strip_frame(labelled, image, self.choice.strip[key]))
 
     def pictures(self, reason: str = "") -> Pictures:
         """Draw the surfaces and return all pictures."""
@@ -114,18 +121,18 @@ def take_pictures(finished: FinishedRun, rows: Sequence[TrackRow], choice: Choic
 
     If the recording cannot be read, a track has only drawings of its mesh.
     """
-    taken = _Taken(choice)
+    collector = _Collector(choice)
     try:
         with open_source(finished.run) as recording:
             frames = _frames(finished, rows, choice)
             for item in with_colour(frames, recording, finished.run):
-                taken.add(*item)
+                collector.add(*item)
     except ShapecatError as error:
-        taken = _Taken(choice)
+        collector = _Collector(choice)
         for labelled in _frames(finished, rows, choice):
-            taken.add(labelled, None, None)
-        return taken.pictures(str(error))
-    return taken.pictures()
+            collector.add(labelled, None, None)
+        return collector.pictures(str(error))
+    return collector.pictures()
 
 
 def _frames(
@@ -142,12 +149,12 @@ def _frames(
             return
 
 
-def _strip_frame(labelled: LabelledFrame, seen: SeenFrame, seconds: float) -> StripFrame:
-    uri, width, height = encode(seen.pixels())
-    scale = width / seen.shape[1]
+def _strip_frame(labelled: LabelledFrame, image: FramePicture, seconds: float) -> StripFrame:
+    uri, width, height = encode(image.pixels())
+    scale = width / image.shape[1]
     boxes = {
         item.track: (scale * mask.left, scale * mask.top, scale * mask.box[2], scale * mask.box[3])
-        for item, mask in zip(labelled.objects, seen.masks, strict=True)
+        for item, mask in zip(labelled.objects, image.masks, strict=True)
         if mask.pixels.size
     }
     return StripFrame(uri, width, height, seconds, labelled.topic, boxes)

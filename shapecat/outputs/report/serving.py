@@ -88,11 +88,11 @@ class _Site:
         report, name = self._find(address)
         if report is None or name != _LABELS:
             return _Answer(HTTPStatus.NOT_FOUND, "no such page")
-        wanted = _correction(body)
-        if wanted is None:
+        correction = _correction(body)
+        if correction is None:
             return _Answer(HTTPStatus.BAD_REQUEST, "expected track, label and seen")
-        track, label, seen = wanted
-        problem = correct_label(report.folder, track, label, seen=seen, work=report.work)
+        track, label, previous = correction
+        problem = correct_label(report.folder, track, label, previous=previous, work=report.work)
         status = HTTPStatus.CONFLICT if problem else HTTPStatus.OK
         return _Answer(status, {"labels": _labels(report), "problem": problem})
 
@@ -112,12 +112,12 @@ def _labels(report: RunReport) -> dict[int, str]:
 def _correction(body: bytes) -> tuple[int, str, str] | None:
     """Return track, label and the label seen before; None if the body is malformed."""
     try:
-        found = json.loads(body)
-        track, label, seen = found["track"], found["label"], found["seen"]
+        correction = json.loads(body)
+        track, label, previous = correction["track"], correction["label"], correction["seen"]
     except (ValueError, KeyError, TypeError, RecursionError):
         return None
-    right = type(track) is int and isinstance(label, str) and isinstance(seen, str)
-    return (track, " ".join(label.split()), seen) if right else None
+    right = type(track) is int and isinstance(label, str) and isinstance(previous, str)
+    return (track, " ".join(label.split()), previous) if right else None
 
 
 def _names_this_machine(host: str) -> bool:
@@ -159,8 +159,8 @@ class _Handler(BaseHTTPRequestHandler):
         site = self.server.site
         path, _, _ = self.path.partition("?")
         token, _, address = path.removeprefix("/").partition("/")
-        known = secrets.compare_digest(token.encode(), site.token.encode())
-        if not (known and self._from_here()):
+        authorized = secrets.compare_digest(token.encode(), site.token.encode())
+        if not (authorized and self._from_here()):
             self._send(_Answer(HTTPStatus.FORBIDDEN, "use the address that shapecat printed"))
             return
         try:

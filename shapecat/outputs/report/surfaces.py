@@ -54,7 +54,7 @@ def draw(shot: Snapshot, colour: tuple[int, int, int]) -> tuple[SurfaceDrawing, 
         everything = points = np.zeros((1, 3))
     low, high = np.percentile(everything, [0.5, 99.5], axis=0)
     middle = (low + high) / 2
-    reach = max(float(np.percentile(np.linalg.norm(everything - middle, axis=1), 99.5)), 1e-3)
+    radius = max(float(np.percentile(np.linalg.norm(everything - middle, axis=1), 99.5)), 1e-3)
     x, y, z = shot.eye - middle
     azimuth = float(np.arctan2(y, x))
     elevation = float(np.clip(np.arctan2(z, np.hypot(x, y)), np.radians(12), np.radians(65)))
@@ -66,7 +66,7 @@ def draw(shot: Snapshot, colour: tuple[int, int, int]) -> tuple[SurfaceDrawing, 
         ("from above", 0.0, np.pi / 2),
     ):
         view = _view(azimuth + turn, rise)
-        scale = 0.46 * SIDE / reach
+        scale = 0.46 * SIDE / radius
         spots = _project(points - middle, view, scale)
         image = png(_shade(spots), palette, alpha)
         encoded = base64.b64encode(image).decode("ascii")
@@ -104,8 +104,8 @@ def _view(azimuth: float, elevation: float) -> F8:
 
 def _project(points: F8, view: F8, scale: float) -> F8:
     """Return column, row and nearness to the viewer (n, 3), pixels."""
-    right, up, near = (np.asarray(points, np.float64) @ view.T * scale).T
-    return np.stack([SIDE / 2 + right, SIDE / 2 - up, near], axis=1)
+    right, up, toward_viewer = (np.asarray(points, np.float64) @ view.T * scale).T
+    return np.stack([SIDE / 2 + right, SIDE / 2 - up, toward_viewer], axis=1)
 
 
 def _shade(spots: F8) -> U1:
@@ -114,9 +114,9 @@ def _shade(spots: F8) -> U1:
     Points are drawn as discs, the nearest in front. The surface is lit from above left, with
     normals from the slopes of its smoothed nearness.
     """
-    near = _closed(_nearest(spots))
-    bare = ~np.isfinite(near)
-    smooth = _smoothed(near, bare)
+    heights = _closed(_nearest(spots))
+    bare = ~np.isfinite(heights)
+    smooth = _smoothed(heights, bare)
     down, right = np.gradient(smooth)
     normal = np.stack([-right, down, np.ones_like(right)], axis=-1)
     normal /= np.linalg.norm(normal, axis=-1, keepdims=True)
@@ -128,34 +128,34 @@ def _shade(spots: F8) -> U1:
 
 def _nearest(spots: F8) -> F8:
     """Return the nearness (h, w) of the nearest disc at each pixel, -inf without a disc."""
-    near = np.full((SIDE, SIDE), -np.inf)
+    heights = np.full((SIDE, SIDE), -np.inf)
     area = float(np.prod(np.ptp(spots[:, :2], axis=0) + 1))
     radius = float(np.clip(0.9 * np.sqrt(area / len(spots)), 1.0, 4.5))
-    reach = int(np.ceil(radius))
+    half_width = int(np.ceil(radius))
     columns, rows = np.round(spots[:, :2].T).astype(int)
-    for dy in range(-reach, reach + 1):
-        for dx in range(-reach, reach + 1):
+    for dy in range(-half_width, half_width + 1):
+        for dx in range(-half_width, half_width + 1):
             if dx * dx + dy * dy > radius * radius:
                 continue
             u, v = columns + dx, rows + dy
             inside = (u >= 0) & (u < SIDE) & (v >= 0) & (v < SIDE)
-            np.maximum.at(near, (v[inside], u[inside]), spots[inside, 2])
-    return near
+            np.maximum.at(heights, (v[inside], u[inside]), spots[inside, 2])
+    return heights
 
 
-def _closed(near: F8) -> F8:
-    """Fill empty pixels of ``near`` (h, w) that are mostly surrounded by the object."""
+def _closed(heights: F8) -> F8:
+    """Fill empty pixels of ``heights`` (h, w) that are mostly surrounded by the object."""
     for _ in range(_PASSES):
-        solid = np.isfinite(near)
+        solid = np.isfinite(heights)
         share = _blurred(solid.astype(np.float64))
-        mean = _blurred(np.where(solid, near, 0.0)) / np.maximum(share, 1e-9)
-        near = np.where(~solid & (share > 0.5), mean, near)
-    return near
+        mean = _blurred(np.where(solid, heights, 0.0)) / np.maximum(share, 1e-9)
+        heights = np.where(~solid & (share > 0.5), mean, heights)
+    return heights
 
 
-def _smoothed(near: F8, bare: Bool) -> F8:
+def _smoothed(heights: F8, bare: Bool) -> F8:
     """Average each pixel (h, w), even if empty, with its neighbours on the object."""
-    weight, value = (~bare).astype(np.float64), np.where(bare, 0.0, near)
+    weight, value = (~bare).astype(np.float64), np.where(bare, 0.0, heights)
     for _ in range(_PASSES):
         value, weight = _blurred(value * weight), _blurred(weight)
         value = np.divide(value, weight, out=np.zeros_like(value), where=weight > 0)

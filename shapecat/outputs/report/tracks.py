@@ -52,9 +52,9 @@ def read_timelines(folder: Path) -> dict[int, Timeline]:
 
 def read_stage_seconds(folder: Path) -> dict[str, F8]:
     """Return the duration of each stage in the frames of a run, (frames,) seconds."""
-    found: dict[str, list[float]] = {}
+    seconds_by_stage: dict[str, list[float]] = {}
     for group in read_row_groups(folder / "frames.parquet", ["stages", "seconds"]):
         for row in group.to_pylist():
             for stage, seconds in zip(row["stages"], row["seconds"], strict=True):
-                found.setdefault(stage, []).append(seconds)
-    return {stage: np.array(values) for stage, values in found.items()}
+                seconds_by_stage.setdefault(stage, []).append(seconds)
+    return {stage: np.array(values) for stage, values in seconds_by_stage.items()}

@@ -18,7 +18,7 @@ from shapecat.outputs.report.pictures import Pictures, take_pictures
 from shapecat.outputs.report.tracks import Timeline, read_stage_seconds, read_timelines
 from shapecat.runs.finished import find_runs, read_finished
 from shapecat.runs.folder import require_work
-from shapecat.runs.labels.corrections import read_own_table
+from shapecat.runs.labels.corrections import read_original_table
 from shapecat.runs.labels.track_table import TrackTable
 from shapecat.system.files import replacing
 from shapecat.system.progress import Observer, ignore
@@ -92,7 +92,7 @@ class RunReport:
 
     @property
     def _table(self) -> TrackTable:
-        return read_own_table(self.folder / "tracks.csv")[0]
+        return read_original_table(self.folder / "tracks.csv")[0]
 
     def _cards(self, table: TrackTable) -> list[Card]:
         return [
@@ -129,11 +129,11 @@ class Reports:
 
         A run that is gone or has an invalid table is left out; its own page says why.
         """
-        listed = []
+        cards = []
         for report in self.runs:
             with suppress(OutputError):
-                listed.append(report.listed(self.link(report)))
-        return index_page(self.above.resolve().name, listed)
+                cards.append(report.listed(self.link(report)))
+        return index_page(self.above.resolve().name, cards)
 
     def write(self) -> list[Path]:
         """Write all pages, the index last, and return their paths.
@@ -196,7 +196,7 @@ def read_report(folder: Path, *, index: str | None = None) -> RunReport:
     OutputError : the folder is not a finished run, or its tracks.csv is invalid.
     """
     finished = read_finished(folder)
-    rows = read_own_table(folder / "tracks.csv")[0].rows
+    rows = read_original_table(folder / "tracks.csv")[0].rows
     timelines = read_timelines(folder)
     pictures = take_pictures(finished, rows, choose_frames(folder, timelines))
     work = finished.run["work"]
@@ -217,8 +217,8 @@ def _above(runs: Sequence[Path]) -> Path:
 
 def _place(run: Path) -> Path:
     """Return the absolute path of a run; a run that is a link is where the link is."""
-    whole = Path(os.path.abspath(run))  # noqa: PTH100  `resolve` would follow the link
-    return whole.parent.resolve() / whole.name
+    absolute = Path(os.path.abspath(run))  # noqa: PTH100  `resolve` would follow the link
+    return absolute.parent.resolve() / absolute.name
 
 
 def _link(start: Path, target: Path) -> str:
@@ -229,8 +229,8 @@ def _faces(cards: Sequence[Card]) -> tuple[str, ...]:
     """Return pictures of the most certain track of each category, then of other tracks."""
     drawn = [(card.row, card.pictures.surfaces[0].image) for card in cards if card.pictures]
     first: dict[str, str] = {}
-    rest = []
+    repeated = []
     for row, image in sorted(drawn, key=lambda face: -face[0].confidence):
         if first.setdefault(row.category, image) is not image:
-            rest.append(image)
-    return (*first.values(), *rest)[:_FACES]
+            repeated.append(image)
+    return (*first.values(), *repeated)[:_FACES]

@@ -55,19 +55,19 @@ def paint(
     MessageError : the colour image is damaged.
     """
     owner = _owners(frame, objects)
-    fine, near = _thin(frame, owner, limit // 2)
-    coarse, far = _grid(frame, max(limit - near.size, 1) if limit else 0)
-    near, far = _measured(frame, near), _measured(frame, far[owner[far] == 0])
-    own = np.array([colour_of(o.category) for o in objects], np.uint8).reshape(-1, 3)
-    palette = np.concatenate([_GROUND[None], own, _PLANES])
-    pixels = np.concatenate([far, near])
+    fine, dense = _thin(frame, owner, limit // 2)
+    coarse, sparse = _grid(frame, max(limit - dense.size, 1) if limit else 0)
+    dense, sparse = _measured(frame, dense), _measured(frame, sparse[owner[sparse] == 0])
+    object_colours = np.array([colour_of(o.category) for o in objects], np.uint8).reshape(-1, 3)
+    palette = np.concatenate([_GROUND[None], object_colours, _PLANES])
+    pixels = np.concatenate([sparse, dense])
     points, tones = frame.xyz(pixels), owner[pixels]
     colours = np.zeros(pixels.size, np.uint32)
     if view is not None:
         colours = true_colours(frame, view, points, pixels, fine, palette, tones)
-    rest = np.flatnonzero(colours == 0)
-    colours[rest] = _shaded(frame, pixels[rest], points[rest], tones[rest], palette, planes)
-    n = far.size
+    bare = np.flatnonzero(colours == 0)
+    colours[bare] = _shaded(frame, pixels[bare], points[bare], tones[bare], palette, planes)
+    n = sparse.size
     return (
         PaintedCloud(points[:n], colours[:n], _radius(frame, points[:n], coarse)),
         PaintedCloud(points[n:], colours[n:], _radius(frame, points[n:], fine)),
@@ -147,8 +147,8 @@ def _plane_rows(planes: Sequence[Plane]) -> F4:
     rows = []
     for plane in planes:
         middle = plane.outline.mean(axis=0) if len(plane.outline) else np.zeros(3)
-        reach = ((plane.outline - middle) ** 2).sum(axis=1).max(initial=0.0)
-        rows.append([*plane.normal, plane.offset, *middle, reach])
+        radius_squared = ((plane.outline - middle) ** 2).sum(axis=1).max(initial=0.0)
+        rows.append([*plane.normal, plane.offset, *middle, radius_squared])
     return np.array(rows, np.float32).reshape(-1, 8)
 
 
@@ -170,8 +170,8 @@ def _colours(points: F4, light: F4, tones: U2, palette: U1, planes: F4, plane_to
         if tone == 0:
             x, y, z = points[i, 0], points[i, 1], points[i, 2]
             for k in range(len(planes)):
-                a, b, c, offset, u, v, w, reach = planes[k]
-                inside = (x - u) ** 2 + (y - v) ** 2 + (z - w) ** 2 <= reach
+                a, b, c, offset, u, v, w, radius_squared = planes[k]
+                inside = (x - u) ** 2 + (y - v) ** 2 + (z - w) ** 2 <= radius_squared
                 if inside and abs(a * x + b * y + c * z - offset) < _PLANE_M:
                     tone = len(palette) - plane_tones + k % plane_tones
         packed = np.uint32(0)
@@ -194,18 +194,18 @@ def _light(depth: F4, pixels: I4, fx: float, fy: float) -> F4:
     """
     height, width = depth.shape
     result = np.ones(pixels.size, np.float32)
-    reach = 3  # pixels: beyond the quantisation of the depth
+    step = 3  # pixels: beyond the quantisation of the depth
     for k in range(pixels.size):
         v, u = pixels[k] // width, pixels[k] % width
         z = depth[v, u]
-        near = 0.05 * z  # a larger difference is an edge, not a slope
+        edge_m = 0.05 * z  # a larger difference is an edge, not a slope
         slope_x = slope_y = np.float32(0)
-        left, right = depth[v, max(u - reach, 0)], depth[v, min(u + reach, width - 1)]
-        if abs(left - z) < near and abs(right - z) < near:
-            slope_x = (right - left) * fx / (2 * reach * z)
-        above, below = depth[max(v - reach, 0), u], depth[min(v + reach, height - 1), u]
-        if abs(above - z) < near and abs(below - z) < near:
-            slope_y = (below - above) * fy / (2 * reach * z)
+        left, right = depth[v, max(u - step, 0)], depth[v, min(u + step, width - 1)]
+        if abs(left - z) < edge_m and abs(right - z) < edge_m:
+            slope_x = (right - left) * fx / (2 * step * z)
+        above, below = depth[max(v - step, 0), u], depth[min(v + step, height - 1), u]
+        if abs(above - z) < edge_m and abs(below - z) < edge_m:
+            slope_y = (below - above) * fy / (2 * step * z)
         # The normal is (slope_x, slope_y, -1); the light comes from (-0.4, -0.7, -0.6).
         facing = (-0.4 * slope_x - 0.7 * slope_y + 0.6) / np.sqrt(1 + slope_x**2 + slope_y**2)
         result[k] = 0.55 + 0.65 * max(facing, 0.0)

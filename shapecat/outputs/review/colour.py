@@ -39,36 +39,36 @@ def true_colours(
     image, result = view.image, np.zeros(pixels.size, np.uint32)
     if not frame.organized and view.registered:
         colours = pixels_of(image).reshape(-1, 1, 3)
-        seen = np.stack([np.zeros(pixels.size), pixels], axis=1)
-        _take(colours, (len(colours), 1), seen, palette, tones, result)
+        pixels_in_image = np.stack([np.zeros(pixels.size), pixels], axis=1)
+        _take(colours, (len(colours), 1), pixels_in_image, palette, tones, result)
         return result
     finer = image.width / frame.camera.width if frame.camera is not None else 1.0
     apart = 1.5 * pitch * finer
     shrink = next((k for k in (4, 2) if k <= apart), 1)  # still finer than the points
     if view.colour_from_depth is None or view.lens is None:
-        seen = np.stack(np.divmod(pixels, image.width)[::-1], axis=1).astype(np.float32)
+        pixels_in_image = np.stack(np.divmod(pixels, image.width)[::-1], axis=1).astype(np.float32)
     else:
-        seen = project(points, view.lens, view.colour_from_depth)
-        _hide(seen, (image.height, image.width), max(4.0, apart), 1 - _HIDDEN)
+        pixels_in_image = project(points, view.lens, view.colour_from_depth)
+        _hide(pixels_in_image, (image.height, image.width), max(4.0, apart), 1 - _HIDDEN)
     colours = pixels_of(image, shrink=shrink)
-    _take(colours, (image.height, image.width), seen, palette, tones, result)
+    _take(colours, (image.height, image.width), pixels_in_image, palette, tones, result)
     return result
 
 
 @kernel
-def _hide(seen: F4, shape: tuple[int, int], cell: float, share: float) -> None:
+def _hide(projected: F4, shape: tuple[int, int], cell: float, share: float) -> None:
     """Set the column of points to NaN if they are outside of the image or occluded.
 
     Parameters
     ----------
-    seen : (n, 3) column and row in pixels, and depth in metres; changed in place.
+    projected : (n, 3) column and row in pixels, and depth in metres; changed in place.
     shape : height and width of the image.
     cell : size of the cells in which the nearest point is found, pixels.
     share : a point is occluded if the nearest depth is less than this share of its own.
     """
     cells = np.zeros((int(shape[0] / cell) + 2, int(shape[1] / cell) + 2), np.float32)
-    for i in range(seen.shape[0]):
-        u, v, z = seen[i, 0], seen[i, 1], seen[i, 2]
+    for i in range(projected.shape[0]):
+        u, v, z = projected[i, 0], projected[i, 1], projected[i, 2]
         if -0.5 < u < shape[1] - 0.5 and -0.5 < v < shape[0] - 0.5 and z > 0:
             # In the four cells around it, since neighbours may be more than a cell apart.
             x, y = int(u / cell + 0.5), int(v / cell + 0.5)
@@ -76,32 +76,34 @@ def _hide(seen: F4, shape: tuple[int, int], cell: float, share: float) -> None:
                 for column in (max(x - 1, 0), x):
                     cells[row, column] = max(cells[row, column], 1 / z)
         else:
-            seen[i, 0] = np.nan
-    for i in range(seen.shape[0]):
-        if seen[i, 0] > -1:
-            front = cells[int(max(seen[i, 1], 0) / cell), int(max(seen[i, 0], 0) / cell)]
-            if front * seen[i, 2] * share > 1:
-                seen[i, 0] = np.nan
+            projected[i, 0] = np.nan
+    for i in range(projected.shape[0]):
+        if projected[i, 0] > -1:
+            front = cells[int(max(projected[i, 1], 0) / cell), int(max(projected[i, 0], 0) / cell)]
+            if front * projected[i, 2] * share > 1:
+                projected[i, 0] = np.nan
 
 
 @kernel
-def _take(image: U1, shape: tuple[int, int], seen: F4, palette: U1, tones: U2, colours: U4) -> None:
+def _take(
+    image: U1, shape: tuple[int, int], projected: F4, palette: U1, tones: U2, colours: U4
+) -> None:
     """Write the colours of visible points, 0xRRGGBBAA, into ``colours`` (n,).
 
     Parameters
     ----------
     image : (h, w, 3) red, green, blue; may be smaller than the recorded image.
     shape : height and width of the recorded image.
-    seen : (n, 2) or (n, 3), first column and row in the recorded image; NaN if not visible.
+    projected : (n, 2) or (n, 3), first column and row in the recorded image; NaN if not visible.
     palette, tones : as for `true_colours`.
     """
     height, width, _ = image.shape
     tall, wide = height / shape[0], width / shape[1]
-    for i in range(seen.shape[0]):
-        if not seen[i, 0] > -0.5:
+    for i in range(projected.shape[0]):
+        if not projected[i, 0] > -0.5:
             continue
-        v = min(int((seen[i, 1] + 0.5) * tall), height - 1)
-        u = min(int((seen[i, 0] + 0.5) * wide), width - 1)
+        v = min(int((projected[i, 1] + 0.5) * tall), height - 1)
+        u = min(int((projected[i, 0] + 0.5) * wide), width - 1)
         packed = np.uint32(0)
         for channel in range(3):
             value = np.float32(image[v, u, channel])

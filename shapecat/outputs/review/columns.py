@@ -23,7 +23,7 @@ _Draw = Callable[[Sequence[Any]], Iterable[rr.ComponentColumn]]
 
 
 @dataclass
-class _Held:
+class _Buffer:
     """The rows of an entity that are not written yet."""
 
     draw: _Draw
@@ -38,7 +38,7 @@ class Columns:
     def __init__(self, stream: rr.RecordingStream) -> None:
         """Start without rows."""
         self._stream = stream
-        self._held: dict[str, _Held] = {}
+        self._buffers: dict[str, _Buffer] = {}
 
     def add(self, entity: str, at: At, row: Any, draw: _Draw, *, size: int = 1) -> None:
         """Add a row of an entity.
@@ -48,23 +48,23 @@ class Columns:
         draw : converts the rows of this entity to columns.
         size : number of values that the row keeps in memory.
         """
-        held = self._held.setdefault(entity, _Held(draw))
-        held.at.append(at)
-        held.rows.append(row)
-        held.size += size
-        if len(held.rows) >= _ROWS or held.size >= _NUMBERS:
+        buffer = self._buffers.setdefault(entity, _Buffer(draw))
+        buffer.at.append(at)
+        buffer.rows.append(row)
+        buffer.size += size
+        if len(buffer.rows) >= _ROWS or buffer.size >= _NUMBERS:
             self._send(entity)
 
     def send(self) -> None:
         """Write all rows that are held back."""
-        for entity in self._held:
+        for entity in self._buffers:
             self._send(entity)
 
     def _send(self, entity: str) -> None:
-        held = self._held[entity]
-        if held.rows:
-            self._stream.send_columns(entity, _times_of(held.at), held.draw(held.rows))
-            self._held[entity] = _Held(held.draw)
+        buffer = self._buffers[entity]
+        if buffer.rows:
+            self._stream.send_columns(entity, _times_of(buffer.at), buffer.draw(buffer.rows))
+            self._buffers[entity] = _Buffer(buffer.draw)
 
 
 def curve(rows: Sequence[Sequence[float]]) -> Iterable[rr.ComponentColumn]:

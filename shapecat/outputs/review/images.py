@@ -69,26 +69,26 @@ def picture_of(labelled: LabelledFrame, coloured: Coloured) -> Picture | None:
     image = coloured.view.image
     if image.height <= 1:
         return None
-    shown = [
+    visible = [
         (item, mask)
         for item, mask in zip(labelled.objects, coloured.masks, strict=True)
         if mask.pixels.size
     ]
-    objects = [item for item, _ in shown]
-    boxes = np.array([mask.box for _, mask in shown], np.float32).reshape(-1, 4)
-    layer = _layer(shown, image.height, image.width)
+    objects = [item for item, _ in visible]
+    boxes = np.array([mask.box for _, mask in visible], np.float32).reshape(-1, 4)
+    layer = _layer(visible, image.height, image.width)
     return Picture(image.topic, *as_file(image), layer, boxes, objects)
 
 
-def _layer(shown: Sequence[tuple[LabelledObject, Mask]], height: int, width: int) -> bytes:
+def _layer(visible: Sequence[tuple[LabelledObject, Mask]], height: int, width: int) -> bytes:
     """Return masks as a translucent PNG; Rerun would not compress a segmentation image.
 
     Two pixels per byte take half the time. This allows 15 colours; further categories share the
     last one.
     """
-    colours = {colour: k for k, colour in enumerate(dict.fromkeys(map(_tone, shown)), start=1)}
+    colours = {colour: k for k, colour in enumerate(dict.fromkeys(map(_tone, visible)), start=1)}
     packed = np.zeros((height, (width + 1) // 2), np.uint8)
-    for one in shown:
+    for one in visible:
         mask = one[1]
         _pack(mask.pixels, mask.left, mask.top, min(colours[_tone(one)], _COLOURS - 1), packed)
     palette = np.array([(0, 0, 0), *colours], np.uint8)[:_COLOURS]
@@ -96,8 +96,8 @@ def _layer(shown: Sequence[tuple[LabelledObject, Mask]], height: int, width: int
     return png(packed, palette, alpha, level=1, width=width)
 
 
-def _tone(shown: tuple[LabelledObject, Mask]) -> tuple[int, int, int]:
-    return colour_of(shown[0].category)
+def _tone(visible: tuple[LabelledObject, Mask]) -> tuple[int, int, int]:
+    return colour_of(visible[0].category)
 
 
 @kernel

@@ -164,8 +164,8 @@ def _scene_view(entity: str, title: str, eye: Eye) -> rrb.Spatial3DView:
 def _track_tabs(tracks: Sequence[TrackView]) -> rrb.Tabs:
     """Return a tab for each of the longest tracks, since stacked plots are too low to read."""
     longest = sorted(tracks, key=lambda track: -track.frames)[:_MOST_TRACKS]
-    shown = [_track_view(track) for track in tracks if track in longest]
-    return rrb.Tabs(*shown, name="Posterior so far")
+    views = [_track_view(track) for track in tracks if track in longest]
+    return rrb.Tabs(*views, name="Posterior so far")
 
 
 def _track_view(track: TrackView) -> rrb.TimeSeriesView:

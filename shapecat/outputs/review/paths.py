@@ -45,26 +45,26 @@ class Paths:
         self._paths: dict[str, dict[int, _Path]] = {}
 
     def add(
-        self, entity: str, at: At, seen: Mapping[int, tuple[str, F8]], ended: Iterable[int]
+        self, entity: str, at: At, positions: Mapping[int, tuple[str, F8]], ended: Iterable[int]
     ) -> None:
         """Add the category and position of each track in a frame; remove tracks that have ended.
 
         Another entity may have a part of their path, from another sensor.
         """
-        gone, known = set(ended), self._paths.setdefault(entity, {})
+        gone, entity_paths = set(ended), self._paths.setdefault(entity, {})
         changed = set()
-        for other, own in self._paths.items():
-            removed = [own.pop(number) for number in gone & own.keys()]
+        for other_entity, other_paths in self._paths.items():
+            removed = [other_paths.pop(number) for number in gone & other_paths.keys()]
             if any(path.drawn for path in removed):
-                changed.add(other)
-        for number, (category, place) in seen.items():
-            if known.setdefault(number, _Path(category)).grow(place):
+                changed.add(other_entity)
+        for number, (category, place) in positions.items():
+            if entity_paths.setdefault(number, _Path(category)).grow(place):
                 changed.add(entity)
-        for other in sorted(changed):
-            self._write(other, at)
+        for other_entity in sorted(changed):
+            self._write(other_entity, at)
 
     def _write(self, entity: str, at: At) -> None:
-        known = self._paths[entity].values()
-        ways = [(path.category, np.array(path.places)) for path in known if path.drawn]
-        size = sum(places.size for _, places in ways)
-        self._columns.add(entity, at, ways, paths, size=size)
+        entity_paths = self._paths[entity].values()
+        strips = [(path.category, np.array(path.places)) for path in entity_paths if path.drawn]
+        size = sum(places.size for _, places in strips)
+        self._columns.add(entity, at, strips, paths, size=size)

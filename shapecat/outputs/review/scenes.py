@@ -80,8 +80,10 @@ def _is_due(labelled: LabelledFrame, before: LabelledFrame, *, fixed: bool) -> b
         return False
     if not 0 <= passed_ns < _LATE_NS:
         return True
-    now, then = (_places(each, fixed=fixed) for each in (labelled, before))
-    return now.keys() != then.keys() or any(math.dist(now[k], then[k]) > _STILL_M for k in now)
+    places, earlier = (_places(each, fixed=fixed) for each in (labelled, before))
+    return places.keys() != earlier.keys() or any(
+        math.dist(places[k], earlier[k]) > _STILL_M for k in places
+    )
 
 
 def _first_seen(labelled: LabelledFrame) -> int:

@@ -134,18 +134,18 @@ def _captions(rows: Sequence[Sequence[Sketch]]) -> _Columns:
 
 
 def _points(clouds: Sequence[PaintedCloud]) -> _Columns:
-    shown = rr.Points3D.columns(
+    columns = rr.Points3D.columns(
         positions=np.concatenate([cloud.points for cloud in clouds]),
         colors=np.concatenate([cloud.colours for cloud in clouds]),
     )
-    yield from shown.partition([len(cloud.points) for cloud in clouds])
+    yield from columns.partition([len(cloud.points) for cloud in clouds])
     yield from rr.Points3D.columns(radii=[cloud.radius_m for cloud in clouds])
 
 
 def _dashes(scenes: Sequence[DrawnScene]) -> _Columns:
     """Return the edges of the full boxes, dashed."""
-    known = [[o for o in m.objects if o.full is not None] for m in scenes]
-    objects = list(chain.from_iterable(known))
+    with_full = [[o for o in m.objects if o.full is not None] for m in scenes]
+    objects = list(chain.from_iterable(with_full))
     corners = np.reshape([box_corners(o.full) for o in objects if o.full is not None], (-1, 8, 3))
     starts, ends = corners[:, BOX_EDGES[:, 0]], corners[:, BOX_EDGES[:, 1]]
     pairs = starts[:, :, None, None] + _DASHES * (ends - starts)[:, :, None, None]
@@ -153,7 +153,7 @@ def _dashes(scenes: Sequence[DrawnScene]) -> _Columns:
     yield from rr.LineStrips3D.columns(
         strips=_segments(pairs.reshape(-1, 2, 3)),
         colors=np.repeat(_packed(objects, white=0.45), dashes),
-    ).partition([dashes * len(each) for each in known])
+    ).partition([dashes * len(each) for each in with_full])
 
 
 def _graphs(scenes: Sequence[DrawnScene]) -> _Columns:
@@ -177,14 +177,14 @@ def _segments(pairs: F4) -> pa.Array:
 
 def _surfaces(scenes: Sequence[DrawnScene]) -> _Columns:
     """Return the triangles of the graphs, one translucent mesh per frame."""
-    shown = [[(o, faces) for o in m.objects if len(faces := _triangles(o))] for m in scenes]
-    objects = [o for each in shown for o, _ in each]
+    meshes = [[(o, faces) for o in m.objects if len(faces := _triangles(o))] for m in scenes]
+    objects = [o for each in meshes for o, _ in each]
     sizes = [len(o.gas.neurons) for o in objects]
     colours = np.repeat(_packed(objects, alpha=70), sizes)
     yield from rr.Mesh3D.columns(
         vertex_positions=_stacked([o.gas.neurons for o in objects], 3), vertex_colors=colours
-    ).partition([sum(len(o.gas.neurons) for o, _ in each) for each in shown])
-    yield _faces([_mesh([(len(o.gas.neurons), faces) for o, faces in each]) for each in shown])
+    ).partition([sum(len(o.gas.neurons) for o, _ in each) for each in meshes])
+    yield _faces([_mesh([(len(o.gas.neurons), faces) for o, faces in each]) for each in meshes])
 
 
 def _triangles(surface: Surface) -> U4:
@@ -193,18 +193,18 @@ def _triangles(surface: Surface) -> U4:
 
 def _outlines(scenes: Sequence[DrawnScene]) -> _Columns:
     """Return the closed outlines of the planes."""
-    shown = [[p.outline for p in m.planes if len(p.outline)] for m in scenes]
-    strips = [np.concatenate([o, o[:1]]) for o in chain.from_iterable(shown)]
-    yield from rr.LineStrips3D.columns(strips=strips).partition([len(each) for each in shown])
+    outlines = [[p.outline for p in m.planes if len(p.outline)] for m in scenes]
+    strips = [np.concatenate([o, o[:1]]) for o in chain.from_iterable(outlines)]
+    yield from rr.LineStrips3D.columns(strips=strips).partition([len(each) for each in outlines])
 
 
 def _fills(scenes: Sequence[DrawnScene]) -> _Columns:
     """Return the planes as triangle fans, since outlines are convex."""
-    shown = [[p.outline for p in m.planes if len(p.outline) >= 3] for m in scenes]
-    corners = _stacked(list(chain.from_iterable(shown)), 3)
-    counts = [sum(map(len, outlines)) for outlines in shown]
+    scene_outlines = [[p.outline for p in m.planes if len(p.outline) >= 3] for m in scenes]
+    corners = _stacked(list(chain.from_iterable(scene_outlines)), 3)
+    counts = [sum(map(len, outlines)) for outlines in scene_outlines]
     yield from rr.Mesh3D.columns(vertex_positions=corners).partition(counts)
-    yield _faces([_mesh([(len(o), _fan(len(o))) for o in outlines]) for outlines in shown])
+    yield _faces([_mesh([(len(o), _fan(len(o))) for o in outlines]) for outlines in scene_outlines])
 
 
 def _fan(corners: int) -> U4:
@@ -246,9 +246,10 @@ SKETCH: Mapping[str, Drawing] = {
 
 def paths(snapshots: Sequence[Sequence[Way]]) -> _Columns:
     """Return the columns of the paths in several frames."""
-    ways = [way for snapshot in snapshots for way in snapshot]
+    strips = [way for snapshot in snapshots for way in snapshot]
     yield from rr.LineStrips3D.columns(
-        strips=[places for _, places in ways], colors=[_tint(category, 0.2) for category, _ in ways]
+        strips=[places for _, places in strips],
+        colors=[_tint(category, 0.2) for category, _ in strips],
     ).partition([len(snapshot) for snapshot in snapshots])
 
 

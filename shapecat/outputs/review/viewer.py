@@ -39,11 +39,11 @@ def open_viewer(path: Path) -> None:
     if sys.platform == "linux" and not any(os.environ.get(name) for name in _DISPLAYS):
         msg = "no display to open a window on; use --web for a browser, or --screenshot FILE.png"
         raise OutputError(msg)
-    with tempfile.TemporaryFile() as said:
-        viewer = _start(("--port", "auto", str(path.absolute())), said)
+    with tempfile.TemporaryFile() as log:
+        viewer = _start(("--port", "auto", str(path.absolute())), log)
         with suppress(subprocess.TimeoutExpired):
             if viewer.wait(_OPEN_S) != 0:
-                raise OutputError(_why(said))
+                raise OutputError(_why(log))
 
 
 @contextmanager
@@ -61,20 +61,20 @@ def serve_viewer(path: Path) -> Iterator[tuple[str, subprocess.Popen[bytes]]]:
     _require_file(path)
     web, data = _free_port(), _free_port()
     options = ("--serve-web", "--web-viewer-port", str(web), "--port", str(data))
-    with tempfile.TemporaryFile() as said:
-        viewer = _start((*options, str(path.absolute())), said)
+    with tempfile.TemporaryFile() as log:
+        viewer = _start((*options, str(path.absolute())), log)
         try:
-            _wait_for(viewer, web, said)
+            _wait_for(viewer, web, log)
             source = quote(f"rerun+http://{_HERE}:{data}/proxy", safe="")
             yield f"http://{_HERE}:{web}/?url={source}", viewer
         finally:
             _end(viewer)
 
 
-def _start(options: Sequence[str], said: IO[bytes]) -> subprocess.Popen[bytes]:
+def _start(options: Sequence[str], log: IO[bytes]) -> subprocess.Popen[bytes]:
     """Start the viewer in a process group of its own, reachable only from this machine."""
     command = [_viewer(), "--bind", _HERE, *options]
-    return subprocess.Popen(command, stdout=said, stderr=said, start_new_session=True)
+    return subprocess.Popen(command, stdout=log, stderr=log, start_new_session=True)
 
 
 def _end(viewer: subprocess.Popen[bytes]) -> None:
@@ -104,17 +104,17 @@ def take_screenshot(
     port = _free_port()
     options = ("--port", str(port), "--hide-welcome-screen")
     window = ("--headless", "--window-size", f"{size[0]}x{size[1]}")
-    with tempfile.TemporaryFile() as said:
-        viewer = _start((*options, *window), said)
+    with tempfile.TemporaryFile() as log:
+        viewer = _start((*options, *window), log)
         try:
-            _wait_for(viewer, port, said)
+            _wait_for(viewer, port, log)
             client = ViewerClient(f"rerun+http://{_HERE}:{port}/proxy")
             _show(client, path, stamp_ns)
             client.save_screenshot(str(png.absolute()))
             _wait_until(png.exists)
         except (RuntimeError, OSError) as error:
             ended = _has_ended(viewer)
-            msg = _why(said) if ended else f"{path}: the viewer cannot draw it: {error}"
+            msg = _why(log) if ended else f"{path}: the viewer cannot draw it: {error}"
             raise OutputError(msg) from error
         finally:
             _end(viewer)
@@ -169,7 +169,7 @@ def _free_port() -> int:
         return int(probe.getsockname()[1])
 
 
-def _wait_for(viewer: subprocess.Popen[bytes], port: int, said: IO[bytes]) -> None:
+def _wait_for(viewer: subprocess.Popen[bytes], port: int, log: IO[bytes]) -> None:
     """Wait until the viewer answers.
 
     Raises
@@ -180,7 +180,7 @@ def _wait_for(viewer: subprocess.Popen[bytes], port: int, said: IO[bytes]) -> No
 
     def answers() -> bool:
         if viewer.poll() is not None:
-            raise OutputError(_why(said))
+            raise OutputError(_why(log))
         with socket.socket() as probe:
             return probe.connect_ex((_HERE, port)) == 0
 
@@ -194,9 +194,9 @@ def _has_ended(viewer: subprocess.Popen[bytes]) -> bool:
     return viewer.poll() is not None
 
 
-def _why(said: IO[bytes]) -> str:
-    said.seek(0)
-    text = said.read().decode("utf-8", "replace")
+def _why(log: IO[bytes]) -> str:
+    log.seek(0)
+    text = log.read().decode("utf-8", "replace")
     if any(word in text for word in ("adapter", "Vulkan", "render context")):
         return (
             "the viewer found no graphics device; without a graphics card install a software "

@@ -227,18 +227,21 @@ class _Review:
     def _trace(self, entity: str, labelled: LabelledFrame) -> None:
         """Extend the paths of the tracks, unless the pose in the fixed frame is unknown."""
         pose = self._pose(labelled)
-        seen = {}
+        positions = {}
         if pose is not None or self._fixed_frame is None:
             for item in labelled.objects:
                 place = np.asarray((item.full or item.box).center, np.float64)
-                seen[item.track] = item.category, place if pose is None else transform(pose, place)
+                positions[item.track] = (
+                    item.category,
+                    place if pose is None else transform(pose, place),
+                )
         if self._fixed_frame is not None:
             entity = "world"
-            for _, place in seen.values():
+            for _, place in positions.values():
                 self._low = np.minimum(self._low, place)
                 self._high = np.maximum(self._high, place)
         where = f"{entity}/paths/{rr.escape_entity_path_part(labelled.topic)}"
-        self._paths.add(where, (labelled.stamp_ns, labelled.index), seen, labelled.ended)
+        self._paths.add(where, (labelled.stamp_ns, labelled.index), positions, labelled.ended)
 
     def _log_events(self, labelled: LabelledFrame) -> None:
         for text in self._warnings:

@@ -78,13 +78,13 @@ class McapRecording(Recording):
         try:
             self._size = self._file.seek(0, 2)
             self.profile = self._read_profile()
-            found = read_summary(self._file, self._size, self.warn)
-            self.indexed = found is not None
-            self.summary = found or Summary()
+            summary = read_summary(self._file, self._size, self.warn)
+            self.indexed = summary is not None
+            self.summary = summary or Summary()
             self._counts: Counter[int] | None = None
             self._checked: set[int] = set()  # offsets of chunks with a verified checksum
             self._times: list[int] = []
-            if found is None:
+            if summary is None:
                 self._scan()
             else:
                 self._describe()
@@ -103,8 +103,8 @@ class McapRecording(Recording):
         self._file.close()
 
     def _read(self, selection: Selection) -> Iterator[Message]:
-        wanted = {n for n, c in self._channels.items() if selection.has_topic(c.topic)}
-        raw = self._by_time(wanted, selection) if self.indexed else self._in_file(wanted)
+        channel_ids = {n for n, c in self._channels.items() if selection.has_topic(c.topic)}
+        raw = self._by_time(channel_ids, selection) if self.indexed else self._in_file(channel_ids)
         for message in raw:
             if not selection.has_time(message.log_time):
                 continue
@@ -180,11 +180,11 @@ class McapRecording(Recording):
                 + (f", and what was readable in the last {lost} bytes" if lost else "")
             )
 
-    def _in_file(self, wanted: set[int]) -> Iterator[RawMessage]:
+    def _in_file(self, channel_ids: set[int]) -> Iterator[RawMessage]:
         for record in self._records():
             if record.opcode in {Opcode.DATA_END, Opcode.FOOTER}:
                 return
-            yield from (m for m in self._expand(record) if m.channel_id in wanted)
+            yield from (m for m in self._expand(record) if m.channel_id in channel_ids)
 
     def _records(self) -> Iterator[Record]:
         """Yield the records of the file; a truncated last chunk is cut to its readable part."""
@@ -243,22 +243,22 @@ class McapRecording(Recording):
             channel = parse(records.Channel.read, content)
             self.summary.channels.setdefault(channel.id, channel)
 
-    def _by_time(self, wanted: set[int], selection: Selection) -> Iterator[RawMessage]:
+    def _by_time(self, channel_ids: set[int], selection: Selection) -> Iterator[RawMessage]:
         """Yield the messages of all chunks by log time, in file order if times are equal."""
         chunks = [
             (c.message_start_time, c.chunk_start_offset, c)
             for c in self.summary.chunks
-            if overlaps(c, wanted, selection.start_ns, selection.stop_ns)
+            if overlaps(c, channel_ids, selection.start_ns, selection.stop_ns)
         ]
 
         def is_needed(message: IndexedMessage) -> bool:
-            if selection.needed is None or message.channel_id not in wanted:
-                return message.channel_id in wanted
+            if selection.needed is None or message.channel_id not in channel_ids:
+                return message.channel_id in channel_ids
             return selection.needed(self._channels[message.channel_id].topic, message.log_time)
 
         def read(chunk: records.ChunkIndex) -> Iterator[tuple[Timed, RawMessage]]:
             for message in self._indexed_chunk(chunk, is_needed):
-                if message.channel_id in wanted:
+                if message.channel_id in channel_ids:
                     yield Timed(message.log_time, len(message.data)), message
 
         yield from in_time_order(chunks, read)

@@ -29,7 +29,7 @@ class IndexedMessage(NamedTuple):
 
 
 def overlaps(
-    chunk: records.ChunkIndex, wanted: set[int], start_ns: int | None, stop_ns: int | None
+    chunk: records.ChunkIndex, channel_ids: set[int], start_ns: int | None, stop_ns: int | None
 ) -> bool:
     """Return whether a chunk may hold messages of wanted channels in ``[start_ns, stop_ns)``."""
     if start_ns is not None and chunk.message_end_time < start_ns:
@@ -37,23 +37,25 @@ def overlaps(
     if stop_ns is not None and chunk.message_start_time >= stop_ns:
         return False
     # Without message indexes any chunk may hold any channel.
-    return not chunk.message_index_offsets or not wanted.isdisjoint(chunk.message_index_offsets)
+    return not chunk.message_index_offsets or not channel_ids.isdisjoint(
+        chunk.message_index_offsets
+    )
 
 
 def read_message_index(file: BinaryIO, chunk: records.ChunkIndex) -> list[IndexedMessage]:
     """Return the index entries of a chunk; none if an entry is damaged or a channel is missing."""
     begin = chunk.chunk_start_offset + chunk.chunk_length
-    found: dict[int, list[IndexedMessage]] = {}
+    entries_of: dict[int, list[IndexedMessage]] = {}
     try:
         for record in walk(file, begin, begin + chunk.message_index_length):
             content = read_content(file, record)
             channel, length = _HEAD.unpack_from(content)
             entries = _ENTRY.iter_unpack(content[_HEAD.size :][:length])
-            found[channel] = [IndexedMessage(channel, time, place) for time, place in entries]
+            entries_of[channel] = [IndexedMessage(channel, time, place) for time, place in entries]
     except (TruncatedError, struct.error):
         return []
-    complete = found.keys() == chunk.message_index_offsets.keys()
-    return list(chain(*found.values())) if complete else []
+    complete = entries_of.keys() == chunk.message_index_offsets.keys()
+    return list(chain(*entries_of.values())) if complete else []
 
 
 def unread(message: IndexedMessage) -> RawMessage:

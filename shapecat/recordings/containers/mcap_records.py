@@ -105,8 +105,8 @@ def walk(file: BinaryIO, offset: int, end: int) -> Iterator[Record]:
         content = offset + _HEAD.size
         if length > end - content:
             msg = f"truncated in the record at byte {offset}"
-            there = Record(opcode, content, end - content, whole=False)
-            raise TruncatedError(msg, there if len(head) == _HEAD.size else None)
+            partial_record = Record(opcode, content, end - content, whole=False)
+            raise TruncatedError(msg, partial_record if len(head) == _HEAD.size else None)
         yield Record(opcode, content, length)
         offset = content + length
 

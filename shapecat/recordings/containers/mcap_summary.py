@@ -85,13 +85,13 @@ def _agrees(file: BinaryIO, size: int, summary: Summary) -> bool:
             for opcode, content in split_chunk(read_chunk(read_content(file, record))):
                 if opcode == Opcode.SCHEMA:
                     schema = parse(records.Schema.read, content)
-                    same = summary.schemas.get(schema.id) == schema
+                    equal = summary.schemas.get(schema.id) == schema
                 elif opcode == Opcode.CHANNEL:
                     channel = parse(records.Channel.read, content)
-                    same = summary.channels.get(channel.id) == channel
+                    equal = summary.channels.get(channel.id) == channel
                 else:
-                    same = True
-                if not same:
+                    equal = True
+                if not equal:
                     return False
     return True
 

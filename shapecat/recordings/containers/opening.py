@@ -73,6 +73,6 @@ def _sniff(path: Path) -> str:
     if begin.startswith(_PACKED):
         msg = f"a compressed file: unpack it first; {_EXPECTED}"
         raise RecordingError(msg)
-    found = f"begins with {begin[:8]!r}" if begin else "is empty"
-    msg = f"not a recording: {found}; {_EXPECTED}"
+    description = f"begins with {begin[:8]!r}" if begin else "is empty"
+    msg = f"not a recording: {description}; {_EXPECTED}"
     raise RecordingError(msg)

@@ -88,22 +88,22 @@ class BagRecording(Recording):
         self._file.close()
 
     def _read(self, selection: Selection) -> Iterator[Message]:
-        wanted = {n for n, c in self._channels.items() if selection.has_topic(c.topic)}
-        for number, time, data in self._raw(wanted, selection.start_ns, selection.stop_ns):
+        connections = {n for n, c in self._channels.items() if selection.has_topic(c.topic)}
+        for number, time, data in self._raw(connections, selection.start_ns, selection.stop_ns):
             if selection.has_time(time):
                 yield Message(self._channels[number], time, time, 0, detached(data))
 
     def _raw(
-        self, wanted: set[int], start_ns: int | None, stop_ns: int | None
+        self, connections: set[int], start_ns: int | None, stop_ns: int | None
     ) -> Iterator[tuple[int, int, memoryview]]:
         if self._chunks is None:
             for record in self._records():
-                yield from (m for m in self._expand(record) if m[0] in wanted)
+                yield from (m for m in self._expand(record) if m[0] in connections)
             return
         due = [
             (chunk.start, chunk.position, chunk.position)
             for chunk in self._chunks
-            if not wanted.isdisjoint(chunk.counts)
+            if not connections.isdisjoint(chunk.counts)
             and (start_ns is None or chunk.end >= start_ns)
             and (stop_ns is None or chunk.start < stop_ns)
         ]
@@ -111,7 +111,7 @@ class BagRecording(Recording):
         def read(position: int) -> Iterator[tuple[Timed, tuple[int, int, memoryview]]]:
             chunk = next(walk(self._file, position, self._size))
             for message in self._expand(chunk):
-                if message[0] in wanted:
+                if message[0] in connections:
                     yield Timed(message[1], len(message[2])), message
 
         yield from in_time_order(due, read)
@@ -229,10 +229,10 @@ class BagRecording(Recording):
             plain, problem = expand(record, data)
             count = 0
             for fields, content in split(plain):
-                found = self._take(fields, content)
-                if found is not None:
+                message = self._take(fields, content)
+                if message is not None:
                     count += 1
-                    yield found
+                    yield message
             if self._chunks is not None and count != self._promised[record.start]:
                 problem = problem or f"the index does not list its {count} messages"
         except BagError as error:

@@ -120,8 +120,8 @@ def time_of(fields: dict[str, bytes], name: str = "time") -> int:
     ------
     BagError : the field is missing or has another size.
     """
-    seconds, rest = _unpack(_TIME, fields, name)
-    return int(seconds) * 10**9 + int(rest)
+    seconds, nanoseconds = _unpack(_TIME, fields, name)
+    return int(seconds) * 10**9 + int(nanoseconds)
 
 
 def _unpack(layout: struct.Struct, fields: dict[str, bytes], name: str) -> tuple[Any, ...]:

@@ -102,12 +102,12 @@ class DatabaseRecording(Recording):
         return link
 
     def _read(self, selection: Selection) -> Iterator[Message]:
-        wanted = [c for c in self._reader.connections if selection.has_topic(c.topic)]
-        if not wanted:
+        connections = [c for c in self._reader.connections if selection.has_topic(c.topic)]
+        if not connections:
             return
         limits = selection.start_ns, selection.stop_ns
         times = [None if limit is None else min(limit, _LAST_NS) for limit in limits]
-        raw: Iterator[Any] = self._reader.messages(wanted, *times)  # data of any type
+        raw: Iterator[Any] = self._reader.messages(connections, *times)  # data of any type
         while True:
             try:
                 connection, time, data = next(raw)

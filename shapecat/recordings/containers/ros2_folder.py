@@ -88,21 +88,21 @@ class FolderRecording(Recording):
     def _list_files(self) -> list[Path]:
         """Return the files that belong to the bag."""
         present = [file for file in sorted(self.path.iterdir()) if _suffix(file) in _PARTS]
-        listed = self._listed_names()
+        in_metadata = self._listed_names()
         names = {file.name for file in present}
-        missing = sorted(listed - names)
+        missing = sorted(in_metadata - names)
         if missing:
             self.warn(f"parts named in metadata.yaml are missing: {', '.join(missing)}")
-        whole = [f for f in present if f.suffix != ".zstd" or f.stem not in names]  # no copies
-        chosen = [file for file in present if file.name in listed] or whole
+        originals = [f for f in present if f.suffix != ".zstd" or f.stem not in names]  # no copies
+        chosen = [file for file in present if file.name in in_metadata] or originals
         used = {file.name.removesuffix(".zstd") for file in chosen}
-        others = [file.name for file in present if file.name.removesuffix(".zstd") not in used]
-        if others:
-            self.warn(f"files that metadata.yaml does not name are not read: {', '.join(others)}")
+        unnamed = [file.name for file in present if file.name.removesuffix(".zstd") not in used]
+        if unnamed:
+            self.warn(f"files that metadata.yaml does not name are not read: {', '.join(unnamed)}")
         if not chosen:
             msg = "a folder without .mcap or .db3 files"
             raise RecordingError(msg)
-        if not listed:
+        if not in_metadata:
             self.warn("no metadata.yaml that names the parts: all files of the folder are read")
         return chosen
 

@@ -167,10 +167,10 @@ def _expand_rvl(words: Any, out: U2) -> bool:
         if at < 0 or zeros > out.size - filled:
             return False
         filled += zeros
-        others, at = _number(words, at)  # (2) number of values after it
-        if at < 0 or others > out.size - filled or zeros + others == 0:
+        values, at = _number(words, at)  # (2) number of values after it
+        if at < 0 or values > out.size - filled or zeros + values == 0:
             return False
-        for _ in range(others):  # (3) each value: its zigzag-coded difference from the previous
+        for _ in range(values):  # (3) each value: its zigzag-coded difference from the previous
             value, at = _number(words, at)
             if at < 0:
                 return False

@@ -46,8 +46,8 @@ _MAX_UNROLLED = 4096
 _SEPARATOR = "=" * 80 + "\n"
 
 
-def decode(message: Message, known: dict[tuple[str, str, bytes], Decoder]) -> Any:
-    """Decode a message; ``known`` caches one decoder per definition.
+def decode(message: Message, decoders: dict[tuple[str, str, bytes], Decoder]) -> Any:
+    """Decode a message; ``decoders`` caches one decoder per definition.
 
     Raises
     ------
@@ -56,9 +56,9 @@ def decode(message: Message, known: dict[tuple[str, str, bytes], Decoder]) -> An
     channel = message.channel
     key = (channel.type, channel.encoding, channel.schema)
     try:
-        if key not in known:
-            known[key] = _DECODERS[channel.encoding](channel)
-        return as_ros(channel.type, known[key](message.data))
+        if key not in decoders:
+            decoders[key] = _DECODERS[channel.encoding](channel)
+        return as_ros(channel.type, decoders[key](message.data))
     except LIBRARY_ERRORS as error:
         reason = " ".join(str(error).split())[:120] or type(error).__name__
         if channel.encoding not in _DECODERS:

@@ -21,14 +21,14 @@ def as_ros(kind: str, message: Any) -> Any:
 
     Messages of other types are returned unchanged. Byte fields may be base64 text, as in JSON.
     """
-    known = _COUNTERPARTS.get(_plain(kind))
-    return message if known is None else known[1](message)
+    counterpart = _COUNTERPARTS.get(_plain(kind))
+    return message if counterpart is None else counterpart[1](message)
 
 
 def ros_counterpart(kind: str) -> str:
     """Return the ROS type that corresponds to a Foxglove type; any other type unchanged."""
-    known = _COUNTERPARTS.get(_plain(kind))
-    return kind if known is None else known[0]
+    counterpart = _COUNTERPARTS.get(_plain(kind))
+    return kind if counterpart is None else counterpart[0]
 
 
 def _plain(kind: str) -> str:
@@ -42,11 +42,11 @@ def _header(message: Any) -> Any:
 
 def _stamp(time: Any) -> Any:
     """Read a time from JSON, ROS or protobuf; an absent one is 0."""
-    seconds, rest = 0, 0
+    seconds, nanoseconds = 0, 0
     for names in (("sec", "nsec"), ("sec", "nanosec"), ("seconds", "nanos")):
         seconds = int(getattr(time, names[0], seconds))
-        rest = int(getattr(time, names[1], rest))
-    return SimpleNamespace(sec=seconds, nanosec=rest)
+        nanoseconds = int(getattr(time, names[1], nanoseconds))
+    return SimpleNamespace(sec=seconds, nanosec=nanoseconds)
 
 
 def _vector(value: Any, names: str, default: Sequence[float]) -> Any:
@@ -89,8 +89,12 @@ def _pose(pose: Any) -> Pose | None:
     p = _vector(pose.position, "xyz", (0, 0, 0))
     q = _vector(pose.orientation, "xyzw", (0, 0, 0, 1))
     quaternion = (q.x, q.y, q.z, q.w) if any((q.x, q.y, q.z, q.w)) else (0, 0, 0, 1)
-    own = Pose(rotation_from_quaternion(quaternion), np.array([p.x, p.y, p.z]))
-    return own if own.translation.any() or not np.array_equal(own.rotation, np.eye(3)) else None
+    result = Pose(rotation_from_quaternion(quaternion), np.array([p.x, p.y, p.z]))
+    return (
+        result
+        if result.translation.any() or not np.array_equal(result.rotation, np.eye(3))
+        else None
+    )
 
 
 def _image(message: Any) -> Any:

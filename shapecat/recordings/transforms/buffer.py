@@ -23,7 +23,7 @@ from shapecat.recordings.transforms.samples import (
     interpolated,
     pose_of,
 )
-from shapecat.recordings.transforms.topics import TF_TYPES, is_held, transform_topics
+from shapecat.recordings.transforms.topics import TF_TYPES, is_latched, transform_topics
 from shapecat.types import Pose
 
 __all__ = [
@@ -95,7 +95,7 @@ class TransformBuffer:
         parent_from_child: tuple[Any, Any],
         *,
         static: bool,
-        held: bool = False,
+        latched: bool = False,
     ) -> bool:
         """Add a transform, unless it is invalid.
 
@@ -103,7 +103,7 @@ class TransformBuffer:
         ----------
         parent_from_child : translation (x, y, z) in metres and quaternion (x, y, z, w).
         static : whether it is valid at all times without another one; ``stamp_ns`` is then ignored.
-        held : whether it is valid until the next one, however late that is.
+        latched : whether it is valid until the next one, however late that is.
 
         Returns
         -------
@@ -126,7 +126,7 @@ class TransformBuffer:
         if static:
             track.still = sample
         else:
-            track.held |= held
+            track.latched |= latched
             track.add(stamp_ns, sample)
         return True
 
@@ -137,7 +137,7 @@ class TransformBuffer:
         ------
         UnknownFrameError, TransformLoopError
         """
-        return self._ancestors(self._known(frame_id))[-1]
+        return self._ancestors(self._require_frame(frame_id))[-1]
 
     def find_loop(self) -> str:
         """Return the error of a loop in the latest transforms; empty if there is none."""
@@ -157,7 +157,7 @@ class TransformBuffer:
         ------
         UnknownFrameError, DisconnectedError, ExtrapolationError, TransformLoopError
         """
-        target, source = self._known(target), self._known(source)
+        target, source = self._require_frame(target), self._require_frame(source)
         up, down = self._ancestors(source, stamp_ns), self._ancestors(target, stamp_ns)
         shared = next((frame for frame in up if frame in set(down)), None)
         if shared is None:
@@ -168,11 +168,11 @@ class TransformBuffer:
         shared_from_target = self._chain(down[: down.index(shared)], stamp_ns)
         return compose(inverse(shared_from_target), shared_from_source)
 
-    def _known(self, frame_id: str) -> str:
+    def _require_frame(self, frame_id: str) -> str:
         name = frame_id.lstrip("/")
         if name not in self._frames:
-            some = ", ".join(self.frames[:12]) or "none"
-            msg = f"no transform names the frame {name!r}; known frames: {some}"
+            examples = ", ".join(self.frames[:12]) or "none"
+            msg = f"no transform names the frame {name!r}; known frames: {examples}"
             raise UnknownFrameError(msg)
         return name
 
@@ -247,12 +247,12 @@ def fixed_frame(buffer: TransformBuffer, frame_id: str, at_ns: int | None = None
     except TransformError:
         return None
     connected = [name for name in buffer.frames if _is_below(buffer, name, root)]
-    found = [n for wanted in _FIXED for n in connected if n.rsplit("/", 1)[-1] == wanted]
-    found += [root] if root != sensor else []
+    names = [n for usual in _FIXED for n in connected if n.rsplit("/", 1)[-1] == usual]
+    names += [root] if root != sensor else []
     if "/" in sensor:  # for r2/camera, the frames of another robot, as r1/odom, come last
-        found.sort(key=lambda name: not sensor.startswith(name[: name.rfind("/") + 1]))
-    known = [n for n in found if at_ns is None or _can_transform(buffer, n, sensor, at_ns)]
-    return next(iter(known or found), None)
+        names.sort(key=lambda name: not sensor.startswith(name[: name.rfind("/") + 1]))
+    placed = [n for n in names if at_ns is None or _can_transform(buffer, n, sensor, at_ns)]
+    return next(iter(placed or names), None)
 
 
 def _can_transform(buffer: TransformBuffer, target: str, source: str, stamp_ns: int) -> bool:
@@ -270,17 +270,17 @@ def _is_below(buffer: TransformBuffer, name: str, root: str) -> bool:
 
 
 def read_transforms(
-    recording: Recording, *, static_only: bool = False, near: Sequence[str] = ()
+    recording: Recording, *, static_only: bool = False, sensor_topics: Sequence[str] = ()
 ) -> TransformBuffer:
     """Read all transforms of a recording in one pass.
 
     Parameters
     ----------
-    near : topics of the sensors, which decide between robots, see `transform_topics`.
+    sensor_topics : topics of the sensors, which decide between robots, see `transform_topics`.
     static_only : read only static transforms, which are few: their topics end in ``tf_static``.
     """
     reader = TransformReader(recording, TransformBuffer())
-    static, moving = transform_topics(recording, near)
+    static, moving = transform_topics(recording, sensor_topics)
     topics = static if static_only else static | moving
     for message in recording.messages(topics) if topics else ():
         reader.take(message)
@@ -306,18 +306,18 @@ class TransformReader:
         if ros_counterpart(message.type) not in TF_TYPES:
             return
         static = message.topic.endswith("tf_static")
-        held = is_held(message.type)
+        latched = is_latched(message.type)
         try:
             for transform in self._recording.decode(message).transforms:
                 stamp = stamp_ns(transform.header) or message.log_time_ns
-                if not self._add(transform, stamp, static=static, held=held):
+                if not self._add(transform, stamp, static=static, latched=latched):
                     self._recording.warn("skipped invalid transforms (NaN, no name)")
                 if not static:
                     self.lag_ns = max(self.lag_ns, abs(stamp - message.log_time_ns))
         except (AttributeError, TypeError, ValueError, RecordingError) as error:
             self._recording.warn(f"skipped transforms: {error}")
 
-    def _add(self, transform: Any, stamp: int, *, static: bool, held: bool) -> bool:
+    def _add(self, transform: Any, stamp: int, *, static: bool, latched: bool) -> bool:
         """Add a decoded geometry_msgs/TransformStamped; return False if it is invalid."""
         move, turn = transform.transform.translation, transform.transform.rotation
         return self.buffer.add(
@@ -326,5 +326,5 @@ class TransformReader:
             stamp,
             ((move.x, move.y, move.z), (turn.x, turn.y, turn.z, turn.w)),
             static=static,
-            held=held,
+            latched=latched,
         )

@@ -41,7 +41,7 @@ class Extrinsics:
 
     @cached_property
     def _still(self) -> TransformBuffer:
-        return read_transforms(self._recording, static_only=True, near=[self._depth.topic])
+        return read_transforms(self._recording, static_only=True, sensor_topics=[self._depth.topic])
 
     @cached_property
     def _moving(self) -> TransformWindow:

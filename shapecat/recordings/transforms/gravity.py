@@ -112,27 +112,27 @@ class Upright:
         vector = None if sources else _parse_vector(up)
         transforms = TransformWindow.of(recording, [stream.topic for stream in streams])
         known_frames = transforms.tree.frames
-        wanted = None if fixed_frame is None else fixed_frame.lstrip("/")
-        if wanted is not None and wanted not in known_frames:
-            known = ", ".join(known_frames) or "none, it has no transforms"
-            msg = f"--fixed-frame {fixed_frame}: not in {recording.path}; its frames: {known}"
+        requested = None if fixed_frame is None else fixed_frame.lstrip("/")
+        if requested is not None and requested not in known_frames:
+            frame_list = ", ".join(known_frames) or "none, it has no transforms"
+            msg = f"--fixed-frame {fixed_frame}: not in {recording.path}; its frames: {frame_list}"
             raise ConfigError(msg)
         if up == "tf" and not _level_frames(known_frames, ""):
             msg = (
                 f"--up tf: {recording.path} has no transforms to any of {', '.join(_LEVEL_FRAMES)}"
             )
             raise ConfigError(msg)
-        found = Accelerometers(recording) if "imu" in sources else None
-        if up == "imu" and not (found and found.measure_anything()):
+        accelerometers = Accelerometers(recording) if "imu" in sources else None
+        if up == "imu" and not (accelerometers and accelerometers.measure_anything()):
             msg = f"--up imu: {recording.path} has no sensor_msgs/Imu with accelerations"
             raise ConfigError(msg)
         loop = transforms.tree.find_loop()
         return cls(
             transforms=transforms,
-            fixed_frame=wanted,
+            fixed_frame=requested,
             vector=vector,
             sources=sources,
-            accelerometers=found,
+            accelerometers=accelerometers,
             warnings=[f"transforms: {loop}"] if loop else [],
             sensors=tuple(stream.frame_id for stream in streams),
             middle_ns=(recording.start_ns + recording.end_ns) // 2,
@@ -157,12 +157,12 @@ class Upright:
         frames must have a pose for their objects to be tracked there.
         """
         halfway_ns = first.stamp_ns + max(0, self.middle_ns - first.log_time_ns)
-        found = [
+        candidates = [
             fixed_frame(self.transforms.tree, name, halfway_ns)
             for name in (first.frame_id, *self.sensors)
         ]
-        own = None if first.frame_from_sensor is None else first.frame_id.lstrip("/")
-        return min((name for name in found if name is not None), key=_rank, default=own)
+        own_frame = None if first.frame_from_sensor is None else first.frame_id.lstrip("/")
+        return min((name for name in candidates if name is not None), key=_rank, default=own_frame)
 
     def corrected(self, topic: str, orientation: Orientation) -> Orientation:
         """Return an orientation of the data on a topic, given that of the frame they name."""
@@ -216,8 +216,8 @@ class Upright:
 
     def _from_transforms(self, frame: Frame) -> tuple[str, F4 | None]:
         name = frame.frame_id.lstrip("/")
-        own = () if frame.frame_from_sensor is None else (name,)
-        for level in _level_frames((*self.transforms.tree.frames, *own), name):
+        own_frames = () if frame.frame_from_sensor is None else (name,)
+        for level in _level_frames((*self.transforms.tree.frames, *own_frames), name):
             pose = self._lookup(level, frame)
             if pose is not None:
                 return f"transforms, z of {level}", np.asarray(pose.rotation[2], np.float32)
@@ -239,12 +239,12 @@ class Upright:
     def _lookup(self, target: str, frame: Frame) -> Pose | None:
         """Return the pose of the sensor in a frame; None if it is unknown."""
         transforms = self.transforms.around(frame.log_time_ns, frame.stamp_ns)
-        own = frame.frame_from_sensor
-        if own is not None and target == frame.frame_id.lstrip("/"):  # it may be in no transform
-            return own
+        offset = frame.frame_from_sensor
+        if offset is not None and target == frame.frame_id.lstrip("/"):  # it may be in no transform
+            return offset
         try:
             pose = transforms.lookup(target, frame.frame_id, frame.stamp_ns)
-            return pose if own is None else compose(pose, own)
+            return pose if offset is None else compose(pose, offset)
         except TransformError as error:
             self.failed += 1
             self.first_failure = self.first_failure or str(error)

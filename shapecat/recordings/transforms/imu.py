@@ -42,8 +42,8 @@ class Accelerometer:
         It averages half a second before and after; None if nothing was measured then.
         """
         at = stamp // _BIN_NS
-        near = [self._sums[k] for k in range(at - _WINDOW, at + _WINDOW + 1) if k in self._sums]
-        total = np.sum(near, axis=0) if near else np.zeros(3)
+        windows = [self._sums[k] for k in range(at - _WINDOW, at + _WINDOW + 1) if k in self._sums]
+        total = np.sum(windows, axis=0) if windows else np.zeros(3)
         norm = float(np.linalg.norm(total))
         return total / norm if norm > 1e-9 else None
 
@@ -68,7 +68,7 @@ class Accelerometers:
 
     def around(self, log_time_ns: int, stamp_ns: int) -> list[Accelerometer]:
         """Return the accelerometers, sorted by topic, for a frame with this log time and stamp."""
-        self._ahead.reach(log_time_ns, stamp_ns)
+        self._ahead.advance(log_time_ns, stamp_ns)
         return [self._found[topic] for topic in sorted(self._found)]
 
     @cached_property
@@ -90,8 +90,8 @@ class Accelerometers:
         size = float(np.abs(acceleration).max())
         if not absent and 1e-3 < size < 1e4:
             name = str(imu.header.frame_id)
-            found = self._found.setdefault(message.topic, Accelerometer(message.topic, name))
-            found.add(stamp, acceleration)
+            sensor = self._found.setdefault(message.topic, Accelerometer(message.topic, name))
+            sensor.add(stamp, acceleration)
 
     def _forget(self, stamp: int) -> None:
         for one in self._found.values():

@@ -29,13 +29,13 @@ class TransformTrack:
 
     Attributes
     ----------
-    held : whether the last one remains valid.
+    latched : whether the last one remains valid.
     still : the static transform, which is valid where no other one is; None without any.
     """
 
     def __init__(self) -> None:
         """Start without samples."""
-        self.held = False
+        self.latched = False
         self.still: TransformSample | None = None
         self.stamps = array("q")
         self._parents: list[str] = []
@@ -50,7 +50,7 @@ class TransformTrack:
         """Return how long a time is after the last sample and before the first; negative within."""
         if not self.stamps:
             return _NEVER_NS, _NEVER_NS
-        return 0 if self.held else stamp - self.stamps[-1], self.stamps[0] - stamp
+        return 0 if self.latched else stamp - self.stamps[-1], self.stamps[0] - stamp
 
     def add(self, stamp: int, sample: TransformSample) -> None:
         """Insert a sample by time; of three equal samples in a row, drop the middle one."""

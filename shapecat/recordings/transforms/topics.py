@@ -9,7 +9,7 @@ from shapecat.recordings.messages import MALFORMED
 from shapecat.recordings.recording import Recording
 from shapecat.recordings.streams import first_messages
 
-__all__ = ["TF_TYPES", "TransformTopics", "is_held", "transform_topics"]
+__all__ = ["TF_TYPES", "TransformTopics", "is_latched", "transform_topics"]
 
 TF_TYPES = ("tf2_msgs/msg/TFMessage", "tf/msg/tfMessage")
 
@@ -21,52 +21,52 @@ class TransformTopics(NamedTuple):
     moving: set[str]
 
 
-def transform_topics(recording: Recording, near: Sequence[str] = ()) -> TransformTopics:
+def transform_topics(recording: Recording, sensor_topics: Sequence[str] = ()) -> TransformTopics:
     """Return the topics of a recording that hold transforms.
 
     If frames of the same name are on ``/r1/tf`` and ``/r2/tf``, the namespace around the topics in
-    ``near`` counts, and the topic of the other robot is left out. ``/tf`` always counts.
+    ``sensor_topics`` counts, and the topic of the other robot is left out. ``/tf`` always counts.
     """
     topics = {t.name for t in recording.topics if ros_counterpart(t.type) in TF_TYPES}
     spaces = {topic: topic.strip("/").rpartition("/")[0] for topic in sorted(topics)}
     spaces = {topic: space for topic, space in spaces.items() if space}
     if len(set(spaces.values())) > 1:
-        topics -= _of_other_robots(recording, spaces, near)
+        topics -= _of_other_robots(recording, spaces, sensor_topics)
     static = {name for name in topics if name.endswith("tf_static")}
     return TransformTopics(static, topics - static)
 
 
-def is_held(kind: str) -> bool:
+def is_latched(kind: str) -> bool:
     """Return whether transforms in messages of a type are valid until the next: Foxglove's are."""
     return ros_counterpart(kind) in TF_TYPES and kind not in TF_TYPES
 
 
 def _of_other_robots(
-    recording: Recording, spaces: Mapping[str, str], near: Sequence[str]
+    recording: Recording, spaces: Mapping[str, str], sensor_topics: Sequence[str]
 ) -> set[str]:
     """Return the topics to leave out, given the namespace of each."""
     around = {
         max(
             (s for s in spaces.values() if name.strip("/").startswith(f"{s}/")), key=len, default=""
         )
-        for name in near
+        for name in sensor_topics
     }
     left: set[str] = set()
-    known: dict[str, str] = {}  # a topic by frame
+    owner: dict[str, str] = {}  # a topic by frame
     for topic in sorted(spaces, key=lambda topic: spaces[topic] not in around):
         frames = _frames(recording, topic)
-        others = [known[f] for f in frames if f in known and spaces[known[f]] != spaces[topic]]
-        nearer = [other for other in others if spaces[other] in around]
+        rivals = [owner[f] for f in frames if f in owner and spaces[owner[f]] != spaces[topic]]
+        nearer = [other for other in rivals if spaces[other] in around]
         if nearer and spaces[topic] not in around:
             recording.warn(f"transforms on {topic} are ignored: those on {nearer[0]} are nearer")
             left.add(topic)
             continue
-        if others:
+        if rivals:
             recording.warn(
-                f"transforms on {others[0]} and {topic} have frames of the same name, and those of "
+                f"transforms on {rivals[0]} and {topic} have frames of the same name, and those of "
                 "one robot are used for the other: process one at a time, with --topic"
             )
-        known |= {frame: topic for frame in frames if frame not in known}
+        owner |= {frame: topic for frame in frames if frame not in owner}
     return left
 
 

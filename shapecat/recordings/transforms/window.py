@@ -10,7 +10,7 @@ from shapecat.recordings.transforms.buffer import (
     TransformReader,
     read_transforms,
 )
-from shapecat.recordings.transforms.topics import is_held, transform_topics
+from shapecat.recordings.transforms.topics import is_latched, transform_topics
 
 __all__ = ["TransformWindow"]
 
@@ -31,42 +31,42 @@ class TransformWindow:
 
     def __init__(
         self,
-        known: TransformBuffer,
+        buffer: TransformBuffer,
         tree: TransformBuffer | None = None,
         ahead: LookAhead | None = None,
     ) -> None:
-        """Use ``known``, which ``ahead`` keeps filled; without it, these are all transforms."""
-        self.tree = known if tree is None else tree
-        self._known, self._ahead = known, ahead
+        """Use ``buffer``, which ``ahead`` keeps filled; without it, these are all transforms."""
+        self.tree = buffer if tree is None else tree
+        self._known, self._ahead = buffer, ahead
 
     @classmethod
-    def of(cls, recording: Recording, near: Sequence[str] = ()) -> "TransformWindow":
+    def of(cls, recording: Recording, sensor_topics: Sequence[str] = ()) -> "TransformWindow":
         """Read the static transforms of a recording, and the first, middle and last of the others.
 
-        The topics in ``near`` decide between robots, see `transform_topics`.
+        The topics in ``sensor_topics`` decide between robots, see `transform_topics`.
         """
-        topics = transform_topics(recording, near).moving
-        whole = is_read_at_once(recording)
-        known = read_transforms(recording, static_only=not whole, near=near)
-        if whole or not topics:
-            return cls(known)
-        reader = TransformReader(recording, known)
+        topics = transform_topics(recording, sensor_topics).moving
+        at_once = is_read_at_once(recording)
+        buffer = read_transforms(recording, static_only=not at_once, sensor_topics=sensor_topics)
+        if at_once or not topics:
+            return cls(buffer)
+        reader = TransformReader(recording, buffer)
         kinds = {topic.type for topic in recording.topics if topic.name in topics}
-        skips = not any(map(is_held, kinds))
-        ahead = LookAhead(recording, topics, reader.take, known.forget, skips=skips)
-        end = TransformReader(recording, deepcopy(known))
+        skips = not any(map(is_latched, kinds))
+        ahead = LookAhead(recording, topics, reader.take, buffer.forget, skips=skips)
+        end = TransformReader(recording, deepcopy(buffer))
         middle_ns, end_ns = (recording.start_ns + recording.end_ns) // 2, recording.end_ns
         spans = (middle_ns - _NEAR_NS, middle_ns + _NEAR_NS), (end_ns - AROUND_NS, None)
         for start_ns, stop_ns in spans:
             for message in recording.messages(topics, start_ns, stop_ns):
                 end.take(message)
         if max(reader.lag_ns, end.lag_ns) <= _LAG_NS:
-            return cls(known, end.buffer, ahead)
+            return cls(buffer, end.buffer, ahead)
         ahead.read_all()
-        return cls(known)
+        return cls(buffer)
 
     def around(self, log_time_ns: int, stamp_ns: int) -> TransformBuffer:
         """Return the transforms for a frame, given its log time and stamp in nanoseconds."""
         if self._ahead is not None:
-            self._ahead.reach(log_time_ns, stamp_ns)
+            self._ahead.advance(log_time_ns, stamp_ns)
         return self._known

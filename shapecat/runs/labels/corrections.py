@@ -34,7 +34,7 @@ __all__ = [
     "correct_label",
     "has_labels",
     "read_labels",
-    "read_own_table",
+    "read_original_table",
     "relabel",
 ]
 
@@ -60,13 +60,13 @@ def read_labels(path: Path, categories: Iterable[str] = ()) -> dict[int, TrackLa
     OutputError : the table is unreadable, belongs to another run, or has invalid lines, which the
         error message lists.
     """
-    table, problems = read_own_table(path)
+    table, problems = read_original_table(path)
     labels, misread = resolve_labels(table.rows, categories, one_frame=_one_frame(path.parent))
     _refuse(path, [*problems, *_lines(table.rows, misread)])
     return labels
 
 
-def read_own_table(path: Path) -> tuple[TrackTable, list[str]]:
+def read_original_table(path: Path) -> tuple[TrackTable, list[str]]:
     """Read the labels and added columns in the tracks.csv of a run, and the problems of its lines.
 
     Other cells and the order are those of tracks.original.csv; missing tracks are a problem.
@@ -79,10 +79,10 @@ def read_own_table(path: Path) -> tuple[TrackTable, list[str]]:
     _require_same_run(path, table, path.parent)
     if not path.with_name(ORIGINAL).exists():  # of a run by an earlier version
         return table, list(table.problems)
-    own = read_track_table(path.with_name(ORIGINAL))
-    given = {row.track: row for row in table.rows}
-    missing = [f"#{row.track}" for row in own.rows if row.track not in given]
-    problems = [*table.problems, *_contradictions(table, own)]
+    original = read_track_table(path.with_name(ORIGINAL))
+    edited = {row.track: row for row in table.rows}
+    missing = [f"#{row.track}" for row in original.rows if row.track not in edited]
+    problems = [*table.problems, *_contradictions(table, original)]
     if missing:
         more = f" and {len(missing) - _LISTED} more" if len(missing) > _LISTED else ""
         problems.append(
@@ -90,26 +90,28 @@ def read_own_table(path: Path) -> tuple[TrackTable, list[str]]:
             f"write `{DELETE}` in the column label to remove objects"
         )
     rows = tuple(
-        replace(row, cells={**given[row.track].cells, **row.cells})
-        for row in own.rows
-        if row.track in given
+        replace(row, cells={**edited[row.track].cells, **row.cells})
+        for row in original.rows
+        if row.track in edited
     )
     # Only in the table that a page writes does it tell which labels are new.
-    columns = tuple(n for n in dict.fromkeys((*own.columns, *table.columns)) if n != LABEL_SEEN)
+    columns = tuple(
+        n for n in dict.fromkeys((*original.columns, *table.columns)) if n != LABEL_SEEN
+    )
     restored = _relabelled(TrackTable(columns, rows, ()), table.rows)
     return restored, problems
 
 
-def _contradictions(table: TrackTable, own: TrackTable) -> list[str]:
+def _contradictions(table: TrackTable, original: TrackTable) -> list[str]:
     """Return the problems of lines that contradict a run's own table."""
-    known = {row.track: row.category for row in own.rows}
+    stored = {row.track: row.category for row in original.rows}
     problems = []
     for row in table.rows:
-        if row.track not in known:
+        if row.track not in stored:
             problems.append(f"line {row.line}: there is no track {row.track}")
-        elif row.category.lower() != known[row.track].lower():
+        elif row.category.lower() != stored[row.track].lower():
             problems.append(
-                f"line {row.line}: the category of track {row.track} is {known[row.track]!r}, not "
+                f"line {row.line}: the category of track {row.track} is {stored[row.track]!r}, not "
                 f"{row.category!r}; write corrections into the column label"
             )
     return problems
@@ -135,20 +137,23 @@ def adopt_labels(corrected: Path, folder: Path) -> None:
 
 def _adopt(corrected: Path, folder: Path) -> None:
     current = folder / "tracks.csv"
-    own, problems = read_own_table(current)
-    result = own
+    original, problems = read_original_table(current)
+    result = original
     if not (corrected.exists() and corrected.samefile(current)):
         _refuse(current, problems)
         table = read_track_table(corrected)
         _require_same_run(corrected, table, folder, known=False)
-        given = (row for row in table.rows if row.cells.get(LABEL_SEEN) != row.label)
-        result, problems = _relabelled(own, given), [*table.problems, *_contradictions(table, own)]
+        changed = (row for row in table.rows if row.cells.get(LABEL_SEEN) != row.label)
+        result, problems = (
+            _relabelled(original, changed),
+            [*table.problems, *_contradictions(table, original)],
+        )
     known_categories = read_run(folder)["model"]["categories"]
     _, misread = resolve_labels(result.rows, known_categories, one_frame=_one_frame(folder))
     _refuse(corrected, problems + _lines(result.rows, misread))
-    if any(a.label not in {"", b.label} for a, b in zip(own.rows, result.rows, strict=True)):
+    if any(a.label not in {"", b.label} for a, b in zip(original.rows, result.rows, strict=True)):
         with replacing(folder / PREVIOUS) as path:
-            write_track_table(path, own)
+            write_track_table(path, original)
     with replacing(current.resolve()) as path:  # it may be a symbolic link
         write_track_table(path, result)
 
@@ -165,22 +170,22 @@ def relabel(folder: Path, labels: Mapping[int, str]) -> dict[int, str]:
     OutputError : the run's table is unreadable, invalid or another run's, or cannot be written.
     """
     current = folder / "tracks.csv"
-    base, problems = read_own_table(current)
+    base, problems = read_original_table(current)
     categories, one_frame = read_run(folder)["model"]["categories"], _one_frame(folder)
     before = find_misread(base.rows, categories, one_frame=one_frame)
     _refuse(current, [*problems, *_lines(base.rows, before)])
-    rows, refused = _given(base.rows, labels, categories, one_frame=one_frame)
+    rows, refused = _valid_labels(base.rows, labels, categories, one_frame=one_frame)
     with replacing(current.resolve()) as path:
         write_track_table(path, replace(base, rows=rows))
     return refused
 
 
-def correct_label(folder: Path, track: int, label: str, *, seen: str, work: str) -> str:
+def correct_label(folder: Path, track: int, label: str, *, previous: str, work: str) -> str:
     """Set the label of a track of a run, unless it has changed since the caller read it.
 
     Parameters
     ----------
-    seen : the label that the caller read.
+    previous : the label that the caller read.
     work : the value in the run.json that the caller read.
 
     Returns
@@ -196,12 +201,12 @@ def correct_label(folder: Path, track: int, label: str, *, seen: str, work: str)
         labels = read_track_table(folder / "tracks.csv").labels
         if track not in labels:
             return f"there is no track #{track}"
-        if labels[track] != seen:
+        if labels[track] != previous:
             return f"its label is now {labels[track]!r}"
         return relabel(folder, {track: label}).get(track, "")
 
 
-def _given(
+def _valid_labels(
     rows: tuple[TrackRow, ...],
     labels: Mapping[int, str],
     categories: Iterable[str],
@@ -212,16 +217,16 @@ def _given(
 
     If the labels are not valid together, they are set one by one, merges last.
     """
-    given = _labelled(rows, labels)
-    if not find_misread(given, categories, one_frame=one_frame):
-        return given, {}
+    labelled = _labelled(rows, labels)
+    if not find_misread(labelled, categories, one_frame=one_frame):
+        return labelled, {}
     refused = {}
     for track in sorted(labels, key=lambda track: merged_with(labels[track]) is not None):
-        given = _labelled(rows, {track: labels[track]})
-        if misread := find_misread(given, categories, one_frame=one_frame):
+        labelled = _labelled(rows, {track: labels[track]})
+        if misread := find_misread(labelled, categories, one_frame=one_frame):
             refused[track] = misread.get(track) or next(iter(misread.values()))
         else:
-            rows = given
+            rows = labelled
     return rows, refused
 
 
@@ -251,19 +256,19 @@ def _require_same_run(path: Path, table: TrackTable, folder: Path, *, known: boo
     ------
     OutputError : the table belongs to another run or to several, or has other positions.
     """
-    own = read_run(folder)["work"] if (folder / "run.json").exists() else ""
-    if not own or set(table.runs) == {own}:
+    work_id = read_run(folder)["work"] if (folder / "run.json").exists() else ""
+    if not work_id or set(table.runs) == {work_id}:
         return
     if not table.runs and (known or _places_agree(table, folder)):
         return
     if len(table.runs) > 1:
-        found = f"holds tracks of several runs ({', '.join(table.runs)})"
+        description = f"holds tracks of several runs ({', '.join(table.runs)})"
     elif table.runs:
-        found = f"holds the tracks of {_described(path.parent, table.run)}"
+        description = f"holds the tracks of {_described(path.parent, table.run)}"
     else:
-        found = "has tracks at other positions (and no column `run`)"
+        description = "has tracks at other positions (and no column `run`)"
     msg = (
-        f"{path}: {found}, not those of {_described(folder, own)}; to match objects by "
+        f"{path}: {description}, not those of {_described(folder, work_id)}; to match objects by "
         "place, use --by-place"
     )
     raise OutputError(msg)
@@ -271,11 +276,11 @@ def _require_same_run(path: Path, table: TrackTable, folder: Path, *, known: boo
 
 def _places_agree(table: TrackTable, folder: Path) -> bool:
     """Return whether the tracks of a table have no positions, or the same as in the run."""
-    own = {row.track: row for row in read_track_table(folder / "tracks.csv").rows}
+    original = {row.track: row for row in read_track_table(folder / "tracks.csv").rows}
     return all(
-        _number(row.cells.get(axis)) in {None, _number(own[row.track].cells.get(axis))}
+        _number(row.cells.get(axis)) in {None, _number(original[row.track].cells.get(axis))}
         for row in table.rows
-        if row.track in own
+        if row.track in original
         for axis in "xyz"
     )
 
@@ -298,10 +303,10 @@ def _described(folder: Path, work: str) -> str:
 
 def _relabelled(base: TrackTable, rows: Iterable[TrackRow]) -> TrackTable:
     """Return a table with the labels and line numbers of other rows."""
-    given = {row.track: row for row in rows}
+    edited = {row.track: row for row in rows}
     changed = [
-        replace(with_label(row, given[row.track].label), line=given[row.track].line)
-        if row.track in given
+        replace(with_label(row, edited[row.track].label), line=edited[row.track].line)
+        if row.track in edited
         else row
         for row in base.rows
     ]
@@ -310,8 +315,8 @@ def _relabelled(base: TrackTable, rows: Iterable[TrackRow]) -> TrackTable:
 
 def _refuse(path: Path, problems: Sequence[str]) -> None:
     if problems:
-        listed = "\n  ".join(sorted(problems, key=_line_of))
-        msg = f"{path}: nothing was written:\n  {listed}"
+        lines = "\n  ".join(sorted(problems, key=_line_of))
+        msg = f"{path}: nothing was written:\n  {lines}"
         raise OutputError(msg)
 
 

@@ -105,12 +105,12 @@ def resolve_labels(
     The final labels, and the problems of invalid labels, both by track number. Deleted tracks have
     neither.
     """
-    known = {n.lower(): n for n in (UNKNOWN, *CATEGORIES, *categories, *(r.category for r in rows))}
+    names = {n.lower(): n for n in (UNKNOWN, *CATEGORIES, *categories, *(r.category for r in rows))}
     verdicts: dict[int, _Verdict] = {}
     misread = {}
     for row in sorted(rows, key=lambda row: _NEW.fullmatch(row.label) is None):  # new names first
         try:
-            verdicts[row.track] = _understand(row.label, known) if row.label else row.category
+            verdicts[row.track] = _understand(row.label, names) if row.label else row.category
         except ValueError as error:
             misread[row.track] = str(error)
             verdicts[row.track] = row.category
@@ -118,17 +118,17 @@ def resolve_labels(
     labels = {}
     for row in rows:
         try:
-            shown = by_track[_follow(row.track, verdicts)]
-            if not (one_frame or _share_a_topic(shown, row)):
-                msg = f"track {shown.track} belongs to another topic, {shown.topic or 'none'}"
+            target = by_track[_follow(row.track, verdicts)]
+            if not (one_frame or _share_a_topic(target, row)):
+                msg = f"track {target.track} belongs to another topic, {target.topic or 'none'}"
                 raise ValueError(msg)  # noqa: TRY301  collected with those of the calls
         except ValueError as error:
             misread[row.track] = f"{row.label!r}: {error}"
             continue
-        category = verdicts[shown.track]
+        category = verdicts[target.track]
         if isinstance(category, str):
-            confidence = 1.0 if shown.label else shown.confidence
-            labels[row.track] = TrackLabel(shown.track, category, confidence)
+            confidence = 1.0 if target.label else target.confidence
+            labels[row.track] = TrackLabel(target.track, category, confidence)
     return labels, misread
 
 
@@ -143,31 +143,31 @@ def _follow(track: int, verdicts: Mapping[int, _Verdict]) -> int:
     ------
     ValueError : a track in the chain is missing or deleted, or the chain is a loop.
     """
-    seen = [track]
-    while isinstance(target := verdicts[seen[-1]], int):
+    chain = [track]
+    while isinstance(target := verdicts[chain[-1]], int):
         if target not in verdicts:
             msg = f"there is no track {target}"
             raise ValueError(msg)
-        if target in seen:
-            msg = f"forms a loop: {' -> '.join(map(str, [*seen, target]))}"
+        if target in chain:
+            msg = f"forms a loop: {' -> '.join(map(str, [*chain, target]))}"
             raise ValueError(msg)
-        seen.append(target)
+        chain.append(target)
         if verdicts[target] is None:
             msg = f"track {target} is deleted"
             raise ValueError(msg)
-    return seen[-1]
+    return chain[-1]
 
 
-def _understand(label: str, known: dict[str, str]) -> _Verdict:
-    """Interpret a label; add a new category to ``known``.
+def _understand(label: str, names: dict[str, str]) -> _Verdict:
+    """Interpret a label; add a new category to ``names``.
 
     Raises
     ------
     ValueError : the label is malformed, or likely a misspelt known name.
     """
     label = unicodedata.normalize("NFC", label)
-    if label.lower() in known:
-        return known[label.lower()]
+    if label.lower() in names:
+        return names[label.lower()]
     if label.lower() == DELETE:
         return None
     merge = merged_with(label)
@@ -178,12 +178,12 @@ def _understand(label: str, known: dict[str, str]) -> _Verdict:
     if not is_category_name(name):
         msg = f"{label!r} is not a category, `{DELETE}` or `merge with N`"
         raise ValueError(msg)
-    near = _nearest(name.lower(), [*known, DELETE])
-    if near and not new:
-        meant = known.get(near, near)
-        msg = f"{label!r}: did you mean {meant}? For a new category write `new {name}`"
+    nearest = _nearest(name.lower(), [*names, DELETE])
+    if nearest and not new:
+        suggestion = names.get(nearest, nearest)
+        msg = f"{label!r}: did you mean {suggestion}? For a new category write `new {name}`"
         raise ValueError(msg)
-    return known.setdefault(name.lower(), name)
+    return names.setdefault(name.lower(), name)
 
 
 def is_category_name(name: str) -> bool:
@@ -200,8 +200,8 @@ def is_category_name(name: str) -> bool:
 
 def order_categories(labels: Iterable[str]) -> tuple[str, ...]:
     """Return the categories among labels: first the default model's, then the others by name."""
-    found = {str(label) for label in labels} - {UNKNOWN}
-    return (*(name for name in CATEGORIES if name in found), *sorted(found - set(CATEGORIES)))
+    names = {str(label) for label in labels} - {UNKNOWN}
+    return (*(name for name in CATEGORIES if name in names), *sorted(names - set(CATEGORIES)))
 
 
 def _without_marks(text: str) -> str:
@@ -209,11 +209,11 @@ def _without_marks(text: str) -> str:
     return "".join(c for c in text if not unicodedata.category(c).startswith("M"))
 
 
-def _nearest(name: str, known: Sequence[str]) -> str | None:
+def _nearest(name: str, names: Sequence[str]) -> str | None:
     """Return the nearest known name within one edit (short names) or two; None if there is none."""
-    distances = [(_slips(name, other), other) for other in known]
-    slips, other = min(distances)
-    return other if slips <= (1 if min(len(name), len(other)) < 5 else 2) else None
+    distances = [(_slips(name, candidate), candidate) for candidate in names]
+    slips, candidate = min(distances)
+    return candidate if slips <= (1 if min(len(name), len(candidate)) < 5 else 2) else None
 
 
 def _slips(a: str, b: str) -> int:

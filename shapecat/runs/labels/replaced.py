@@ -52,8 +52,8 @@ def forget_old_labels(folder: Path, run: RunInfo, job: Job) -> None:
     OutputError : as for `keep_labels`.
     """
     previous = folder / PREVIOUS
-    kept = previous.read_bytes() if previous.exists() else b""
-    if "labels" not in run["seconds"] or kept == _labelled_table(job):
+    previous_table = previous.read_bytes() if previous.exists() else b""
+    if "labels" not in run["seconds"] or previous_table == _labelled_table(job):
         return
     with replacing(folder / "tracks.csv") as path:
         path.write_bytes((folder / ORIGINAL).read_bytes())

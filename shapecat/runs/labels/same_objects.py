@@ -16,7 +16,7 @@ import numpy as np
 from shapecat.arrays import F8
 from shapecat.errors import OutputError
 from shapecat.runs.folder import read_run
-from shapecat.runs.labels.seen_tracks import SeenTracks, extents_of, read_seen_tracks
+from shapecat.runs.labels.track_detections import TrackDetections, extents_of, read_track_detections
 from shapecat.runs.labels.track_table import TrackRow, parse_number
 
 __all__ = ["Group", "Match", "Matches", "match_in_place", "match_in_time"]
@@ -64,39 +64,39 @@ def match_in_time(source: Path, target: Path, group: Group) -> Matches | None:
     source, target : run folders of the same recording.
     group : maps merged tracks of the source to the same number; they are one object.
     """
-    old, new = read_seen_tracks(source), read_seen_tracks(target)
+    old, new = read_track_detections(source), read_track_detections(target)
     common = sorted(old.keys.keys() & new.keys.keys())
     if not common and old.keys and new.keys:
         return None
     old_widths, new_widths = _widths(source, old), _widths(target, new)
     votes: Counter[tuple[int, int]] = Counter()
     apart: defaultdict[tuple[int, int], float] = defaultdict(float)
-    seen: Counter[int] = Counter()
+    counts: Counter[int] = Counter()
     for key in common:
         here, there = old.keys[key], new.keys[key]
-        seen.update(new.tracks[there].tolist())
-        reach = _reach_at_once(old_widths[here], new_widths[there])
-        for a, b, distance in _mutual_nearest(old.centers[here], new.centers[there], reach):
+        counts.update(new.tracks[there].tolist())
+        max_distance = _max_distance_at_once(old_widths[here], new_widths[there])
+        for a, b, distance in _mutual_nearest(old.centers[here], new.centers[there], max_distance):
             pair = int(old.tracks[here][a]), int(new.tracks[there][b])
             votes[pair] += 1
             apart[pair] += distance
-    return _by_majority(votes, apart, seen, group)
+    return _by_majority(votes, apart, counts, group)
 
 
 def _by_majority(
     votes: Mapping[tuple[int, int], int],
     apart: Mapping[tuple[int, int], float],
-    seen: Counter[int],
+    counts: Counter[int],
     group: Group,
 ) -> Matches:
     """Match each track of the target with the object of the source that most frames agree on."""
-    found: dict[int, list[Match]] = {}
+    matches_of: dict[int, list[Match]] = {}
     reasons: dict[int, str] = {}
     claims: dict[int, dict[int, list[int]]] = {}
     for old, new in sorted(votes):
         claims.setdefault(new, {}).setdefault(group(old), []).append(old)
     for new, objects in claims.items():
-        shares = {k: sum(votes[old, new] for old in o) / seen[new] for k, o in objects.items()}
+        shares = {k: sum(votes[old, new] for old in o) / counts[new] for k, o in objects.items()}
         best, *others = sorted(shares, key=lambda k: (-shares[k], k))
         rivals = [k for k in others if shares[k] >= _RIVAL]
         if shares[best] < _MAJORITY or rivals:
@@ -105,34 +105,34 @@ def _by_majority(
             continue
         for old in objects[best]:
             mean = apart[old, new] / votes[old, new]
-            found.setdefault(old, []).append(Match(new, round(mean, 4)))
-    return Matches(found, reasons)
+            matches_of.setdefault(old, []).append(Match(new, round(mean, 4)))
+    return Matches(matches_of, reasons)
 
 
-def _widths(folder: Path, seen: SeenTracks) -> F8:
+def _widths(folder: Path, tracks: TrackDetections) -> F8:
     """Return the width of each row's track (n,), metres."""
-    extents = extents_of(folder, seen)
-    return np.array([extents[track][0] for track in seen.tracks.tolist()])
+    extents = extents_of(folder, tracks)
+    return np.array([extents[track][0] for track in tracks.tracks.tolist()])
 
 
-def _reach_at_once(a: F8, b: F8) -> F8:
+def _max_distance_at_once(a: F8, b: F8) -> F8:
     """Return the largest distance (n, m) between detections of one object, given their widths.
 
     Two objects side by side are farther apart than half of their mean width.
     """
-    mean = (a[:, None] + b[None]) / 2
-    return np.clip(_REACH * mean, _LEAST_REACH_M, _MOST_REACH_M)
+    mean_width = (a[:, None] + b[None]) / 2
+    return np.clip(_REACH * mean_width, _LEAST_REACH_M, _MOST_REACH_M)
 
 
-def _mutual_nearest(a: F8, b: F8, reach: F8) -> Iterator[tuple[int, int, float]]:
+def _mutual_nearest(a: F8, b: F8, max_distance: F8) -> Iterator[tuple[int, int, float]]:
     """Yield index pairs and distances of mutual nearest neighbours of points (n, 3) and (m, 3).
 
-    ``reach`` (n, m) is the largest distance of each pair, metres.
+    ``max_distance`` (n, m) is the largest distance of each pair, metres.
     """
     apart = np.linalg.norm(a[:, None] - b[None], axis=2)
     nearest = apart.argmin(axis=1)
     for k, j in enumerate(nearest.tolist()):
-        if apart[k, j] <= reach[k, j] and int(apart[:, j].argmin()) == k:
+        if apart[k, j] <= max_distance[k, j] and int(apart[:, j].argmin()) == k:
             yield k, j, float(apart[k, j])
 
 
@@ -169,19 +169,19 @@ def match_in_place(
     else:
         old, gone = _standing(source)
         reasons = dict.fromkeys(gone, "it was moved, so it cannot be found by its place")
-    found: dict[int, list[Match]] = {}
-    taken: dict[int, int] = {}
+    matches_of: dict[int, list[Match]] = {}
+    owner: dict[int, int] = {}
     for item in old:
-        others = [other for other in old if group(other.track) != group(item.track)]
-        match, reason = _nearest_there(item, others, new)
+        other_objects = [other for other in old if group(other.track) != group(item.track)]
+        match, reason = _nearest_there(item, other_objects, new)
         if match is None:
             reasons[item.track] = reason
-        elif group(taken.get(match.track, item.track)) != group(item.track):
-            reasons[item.track] = f"track {match.track} could also be track {taken[match.track]}"
+        elif group(owner.get(match.track, item.track)) != group(item.track):
+            reasons[item.track] = f"track {match.track} could also be track {owner[match.track]}"
         else:
-            taken[match.track] = item.track
-            found[item.track] = [match]
-    return Matches(found, reasons)
+            owner[match.track] = item.track
+            matches_of[item.track] = [match]
+    return Matches(matches_of, reasons)
 
 
 def _nearest_there(
@@ -191,21 +191,21 @@ def _nearest_there(
 
     ``old`` are the other objects of the source, ``new`` the objects of the target.
     """
-    near = sorted((_apart(item, other), k) for k, other in enumerate(new))
-    reached = [(d, k) for d, k in near if d <= _match_radius(item, new[k])]
+    by_distance = sorted((_apart(item, other), k) for k, other in enumerate(new))
+    reached = [(d, k) for d, k in by_distance if d <= _match_radius(item, new[k])]
     if not reached:
         return None, "nothing was found there"
     (distance, first), *others = reached
-    here = new[first]
+    nearest = new[first]
     if others and others[0][0] - distance < _CLEAR_M:
-        return None, f"tracks {here.track} and {new[others[0][1]].track} are both there"
-    rivals = [other.track for other in old if _apart(other, here) < distance + _CLEAR_M]
+        return None, f"tracks {nearest.track} and {new[others[0][1]].track} are both there"
+    rivals = [other.track for other in old if _apart(other, nearest) < distance + _CLEAR_M]
     if rivals:
-        return None, f"track {here.track} could also be track {rivals[0]}"
-    ratio = max(item.extent_m, here.extent_m) / min(item.extent_m, here.extent_m)
+        return None, f"track {nearest.track} could also be track {rivals[0]}"
+    ratio = max(item.extent_m, nearest.extent_m) / min(item.extent_m, nearest.extent_m)
     if ratio > _SIZE_RATIO:
-        return None, f"track {here.track} is there, but has another size"
-    return Match(here.track, round(distance, 4)), ""
+        return None, f"track {nearest.track} is there, but has another size"
+    return Match(nearest.track, round(distance, 4)), ""
 
 
 def _apart(a: _Standing, b: _Standing) -> float:
@@ -225,8 +225,8 @@ def _require_one_frame(source: Path | None, target: Path) -> None:
     """
     names = [_fixed_frame(folder) for folder in (source, target) if folder is not None]
     if len(set(names)) > 1:
-        found = " and ".join(names)
-        msg = f"{target}: the fixed frames differ ({found}); process with --fixed-frame"
+        frame_names = " and ".join(names)
+        msg = f"{target}: the fixed frames differ ({frame_names}); process with --fixed-frame"
         raise OutputError(msg)
 
 
@@ -255,11 +255,11 @@ def _place_of(row: TrackRow) -> F8:
 
 def _standing(folder: Path) -> tuple[list[_Standing], list[int]]:
     """Return the tracks of a run that are at rest, and the numbers of those that moved."""
-    seen = read_seen_tracks(folder)
-    extents = extents_of(folder, seen)
+    tracks = read_track_detections(folder)
+    extents = extents_of(folder, tracks)
     still, moved = [], []
-    for track in np.unique(seen.tracks).tolist():
-        centers = seen.centers[seen.tracks == track]
+    for track in np.unique(tracks.tracks).tolist():
+        centers = tracks.centers[tracks.tracks == track]
         middle = np.median(centers, axis=0)
         spread = float(np.median(np.linalg.norm(centers - middle, axis=1)))
         width, extent = extents.get(track, (np.nan, np.nan))

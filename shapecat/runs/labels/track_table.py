@@ -139,8 +139,10 @@ def _separator(text: str) -> str:
 
 def _header(path: Path, cells: Sequence[str]) -> tuple[str, ...]:
     """Return the names of the columns; if several have the same or none, later ones get numbers."""
-    given = [cell.strip().lower() for cell in cells]
-    names = tuple(n if n not in given[:k] else f"{n} {k + 1}".strip() for k, n in enumerate(given))
+    header = [cell.strip().lower() for cell in cells]
+    names = tuple(
+        n if n not in header[:k] else f"{n} {k + 1}".strip() for k, n in enumerate(header)
+    )
     missing = [name for name in _COLUMNS if name not in names]
     if missing:
         msg = f"{path}: no column {', '.join(missing)}; expected a table like a run's tracks.csv"

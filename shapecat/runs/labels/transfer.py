@@ -113,11 +113,12 @@ def _labelled_otherwise(transfer: Transfer, target: Path, run: RunInfo) -> dict[
     earlier = {
         (item["track"], item["label"]) for item in run.get("corrections", {}).get("transferred", ())
     }
-    own = read_track_table(target / "tracks.csv").labels
+    current = read_track_table(target / "tracks.csv").labels
     return {
-        item.track: f"track {item.track} already has the label {own[item.track]}"
+        item.track: f"track {item.track} already has the label {current[item.track]}"
         for item in transfer.transferred
-        if own[item.track] not in ("", item.label) and (item.track, own[item.track]) not in earlier
+        if current[item.track] not in ("", item.label)
+        and (item.track, current[item.track]) not in earlier
     }
 
 
@@ -136,13 +137,13 @@ def _with_new_categories(transfer: Transfer, tracks: Container[int]) -> Transfer
 
 def _without(transfer: Transfer, reasons: Mapping[int, str]) -> Transfer:
     """Return a transfer in which the labels of the given tracks are missed for these reasons."""
-    kept = tuple(item for item in transfer.transferred if item.track not in reasons)
+    remaining = tuple(item for item in transfer.transferred if item.track not in reasons)
     missed = (
         Missed(item.old_track, item.label, reasons[item.track])
         for item in transfer.transferred
         if item.track in reasons
     )
-    return replace(transfer, transferred=kept, missed=(*transfer.missed, *missed))
+    return replace(transfer, transferred=remaining, missed=(*transfer.missed, *missed))
 
 
 def match_labels(source: Path, target: Path) -> Transfer:
@@ -154,7 +155,7 @@ def match_labels(source: Path, target: Path) -> Transfer:
     """
     path = source / "tracks.csv" if source.is_dir() else source
     table = read_track_table(path)
-    _require_whole(path, table)
+    _require_complete(path, table)
     folder = path.parent if _is_in_its_run(path, table) else None
     categories = read_run(folder or target)["model"]["categories"]
     misread = find_misread(table.rows, categories)
@@ -175,7 +176,7 @@ def match_labels(source: Path, target: Path) -> Transfer:
     return Transfer(table.run, transferred, (*wrong, *missed), by)
 
 
-def _require_whole(path: Path, table: TrackTable) -> None:
+def _require_complete(path: Path, table: TrackTable) -> None:
     """Check that a table has only valid lines, all from one run.
 
     Raises
@@ -207,9 +208,9 @@ def _groups(labelled: Sequence[TrackRow]) -> Group:
     partners = {row.track: merged_with(row.label) for row in labelled}
 
     def root(track: int) -> int:
-        seen = {track}
-        while (partner := partners.get(track)) is not None and partner not in seen:
-            seen.add(partner)
+        group = {track}
+        while (partner := partners.get(track)) is not None and partner not in group:
+            group.add(partner)
             track = partner
         return track
 
@@ -230,25 +231,25 @@ def _translate(
     A *whole* is a track that others were merged with. Its label is copied to its matches. Matches
     of the other tracks are merged with the first match of the whole.
     """
-    given: dict[int, Transferred] = {}
+    transferred: dict[int, Transferred] = {}
     missed = []
     for row in sorted(labelled, key=lambda row: group(row.track) != row.track):
         whole = group(row.track)
-        there = matches.found.get(row.track, ())
+        direct = matches.found.get(row.track, ())
         if whole not in matches.found:
             missed.append(Missed(row.track, row.label, _why(row.track, whole, matches)))
         elif whole == row.track:
-            given |= {
-                m.track: Transferred(row.track, m.track, row.label, m.distance_m) for m in there
+            transferred |= {
+                m.track: Transferred(row.track, m.track, row.label, m.distance_m) for m in direct
             }
         else:
             first, *others = (match.track for match in matches.found[whole])
-            for match in there:  # empty if the part has no match of its own
+            for match in direct:  # empty if the part has no match of its own
                 if match.track not in (first, *others):
                     label = merging_with(first)
                     item = Transferred(row.track, match.track, label, match.distance_m)
-                    given.setdefault(match.track, item)
-    return tuple(given.values()), tuple(missed)
+                    transferred.setdefault(match.track, item)
+    return tuple(transferred.values()), tuple(missed)
 
 
 def _why(track: int, whole: int, matches: Matches) -> str:

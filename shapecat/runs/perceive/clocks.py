@@ -43,10 +43,10 @@ def explain_clocks(folder: Path, fixed_frame: str | None) -> Iterator[str]:
 
 def _read_delays(folder: Path) -> dict[str, list[I4]]:
     """Read the log times minus the stamps (n,) of each topic, ns, in parts."""
-    found: dict[str, list[I4]] = {}
+    delays_of: dict[str, list[I4]] = {}
     for group in read_row_groups(folder / "frames.parquet", ["topic", "stamp_ns", "log_time_ns"]):
         topics, codes = topic_codes(group)
         delays = numbers(group["log_time_ns"]) - numbers(group["stamp_ns"])
         for code, topic in enumerate(topics):
-            found.setdefault(topic, []).append(delays[codes == code])
-    return found
+            delays_of.setdefault(topic, []).append(delays[codes == code])
+    return delays_of

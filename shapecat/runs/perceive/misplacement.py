@@ -17,14 +17,14 @@ _MOVED_M = 0.03
 """The camera has moved if objects have moved farther than this relative to it."""
 _WORSE = 1.5
 """Poses are worse than none if objects move this many times as far as relative to the camera."""
-_FEWEST, _MOST = 5, 0.7
+_MIN_MOTIONS, _WORSE_SHARE = 5, 0.7
 
 
-class _Seen(NamedTuple):
+class _Centers(NamedTuple):
     """The centres (n, 3) of a frame's objects, relative to the sensor and in the fixed frame."""
 
     stamp_ns: int
-    own: F8
+    sensor: F8
     fixed: F8
 
 
@@ -38,7 +38,7 @@ def explain_misplacement(folder: Path, fixed_frame: str | None) -> Iterator[str]
     if fixed_frame is None:
         return
     for topic, worse in _compare(folder).items():
-        if len(worse) >= _FEWEST and np.mean(worse) > _MOST:
+        if len(worse) >= _MIN_MOTIONS and np.mean(worse) > _WORSE_SHARE:
             yield (
                 f"{topic}: as the camera moves, its objects move farther in {fixed_frame} than "
                 "relative to it, and may get no tracks: the transforms of its frame are wrong; to "
@@ -48,34 +48,36 @@ def explain_misplacement(folder: Path, fixed_frame: str | None) -> Iterator[str]
 
 def _compare(folder: Path) -> dict[str, list[bool]]:
     """Return, for each topic and each motion of its camera, whether poses are worse than none."""
-    before: dict[str, _Seen] = {}
+    latest: dict[str, _Centers] = {}
     worse: dict[str, list[bool]] = {}
     columns = ["topic", "frame"]
-    wanted = {
+    selected = {
         "frames": [*columns, "stamp_ns"],
         "detections": [*columns, "center", "center_fixed"],
     }
-    for frames, detections in read_together(folder, wanted):
+    for frames, detections in read_together(folder, selected):
         rows = frame_rows(detections)
-        own, fixed = (numbers_or_nan(detections[name]) for name in wanted["detections"][2:])
+        in_sensor, in_fixed = (
+            numbers_or_nan(detections[name]) for name in selected["detections"][2:]
+        )
         for key, stamp in zip(keys_of(frames), numbers(frames["stamp_ns"]).tolist(), strict=True):
-            of = rows.get(key, slice(0, 0))
-            now = _Seen(stamp, own[of], fixed[of])
-            if not len(now.fixed) or np.isnan(now.fixed).any():
+            span = rows.get(key, slice(0, 0))
+            centers = _Centers(stamp, in_sensor[span], in_fixed[span])
+            if not len(centers.fixed) or np.isnan(centers.fixed).any():
                 continue
-            last = before.setdefault(key[0], now)
-            seconds = abs(stamp - last.stamp_ns) * 1e-9
+            previous = latest.setdefault(key[0], centers)
+            seconds = abs(stamp - previous.stamp_ns) * 1e-9
             if seconds < _APART_S:
                 continue
-            before[key[0]] = now
-            moved = _moved_m(last.own, now.own)
+            latest[key[0]] = centers
+            moved = _moved_m(previous.sensor, centers.sensor)
             if seconds < _GAP_S and moved > _MOVED_M:
-                further = _moved_m(last.fixed, now.fixed) > _WORSE * moved
-                worse.setdefault(key[0], []).append(further)
+                farther = _moved_m(previous.fixed, centers.fixed) > _WORSE * moved
+                worse.setdefault(key[0], []).append(farther)
     return worse
 
 
-def _moved_m(before: F8, now: F8) -> float:
+def _moved_m(previous: F8, current: F8) -> float:
     """Return the median distance of objects (n, 3) from the nearest ones (m, 3) before, metres."""
-    distances = np.linalg.norm(now[:, None] - before, axis=2)
+    distances = np.linalg.norm(current[:, None] - previous, axis=2)
     return float(np.median(distances.min(axis=1)))

@@ -37,20 +37,20 @@ def explain_missing_planes(
     if 2 * bare <= frames:
         return []
     text = f"no supporting plane in {bare} of {frames} frames"
-    readings = far = 0
+    readings = beyond_range = 0
     typical: list[float] = []
     pairs = read_frames(recording, run["options"], skipped=Counter())
     chosen = (frame for frame, _ in pairs if (frame.topic, frame.index) in first)
     for frame in islice(chosen, len(first)):
         distance = _distances(frame)
         readings += distance.size
-        far += int(np.count_nonzero(distance > range_m))
+        beyond_range += int(np.count_nonzero(distance > range_m))
         if distance.size:
             typical.append(float(np.median(distance)))
     if not readings:
         return [f"{text}: they have no valid depth"]
-    if 2 * far > readings:
-        share, setting = far / readings, f"detection.max_range_m, {range_m:g} m"
+    if 2 * beyond_range > readings:
+        share, setting = beyond_range / readings, f"detection.max_range_m, {range_m:g} m"
         unit = "16UC1 is in millimetres, 32FC1 and clouds in metres"
         middle = float(np.median(typical))
         hint = f"the median is {middle:.0f} m: is the unit right? {unit}"
@@ -73,8 +73,8 @@ def _count(folder: Path) -> tuple[int, int, set[Key]]:
     count, bare, first = 0, 0, list[Key]()
     tables = dict.fromkeys(("frames", "planes", "detections"), ("topic", "frame"))
     for frames, planes, detections in read_together(folder, tables):
-        found = {*keys_of(planes), *keys_of(detections)}
-        without = [key for key in keys_of(frames) if key not in found]
+        with_planes_or_objects = {*keys_of(planes), *keys_of(detections)}
+        without = [key for key in keys_of(frames) if key not in with_planes_or_objects]
         count, bare = count + frames.num_rows, bare + len(without)
         first += without[: _FRAMES - len(first)]
     return count, bare, set(first)

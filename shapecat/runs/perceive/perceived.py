@@ -174,8 +174,8 @@ def _detection_columns(
     rows: Sequence[tuple[Perception, FrameRow]], categories: Sequence[str]
 ) -> dict[str, Any]:
     objects = [(p, row, k, d) for p, row in rows for k, d in enumerate(p.detections)]
-    found = [d for _, _, _, d in objects]
-    candidates = [d.candidate for d in found]
+    detections = [d for _, _, _, d in objects]
+    candidates = [d.candidate for d in detections]
     return {
         "topic": [p.topic for p, *_ in objects],
         "frame": [p.index for p, *_ in objects],
@@ -189,11 +189,11 @@ def _detection_columns(
         "center": [c.box.center for c in candidates],
         "size": [c.box.size for c in candidates],
         "orientation": [c.box.orientation for c in candidates],
-        "center_full": [d.full and d.full.center for d in found],
-        "size_full": [d.full and d.full.size for d in found],
-        "orientation_full": [d.full and d.full.orientation for d in found],
-        "size_full_std": [d.full and d.full.size_std for d in found],
-        "outline_full": lists([d.full.outline if d.full else () for d in found], pa.float32()),
+        "center_full": [d.full and d.full.center for d in detections],
+        "size_full": [d.full and d.full.size for d in detections],
+        "orientation_full": [d.full and d.full.orientation for d in detections],
+        "size_full_std": [d.full and d.full.size_std for d in detections],
+        "outline_full": lists([d.full.outline if d.full else () for d in detections], pa.float32()),
         "center_fixed": [
             row.fixed_from_sensor and transform(row.fixed_from_sensor, d.candidate.box.center)
             for _, row, _, d in objects
@@ -204,15 +204,15 @@ def _detection_columns(
         ],
         "points": [c.indices.size for c in candidates],
         "indices": lists([c.indices for c in candidates], pa.uint32()),
-        "posterior": lists([d.posterior for d in found], pa.float32()),
-        "category": [d.category(categories) for d in found],
-        "confidence": [float(d.posterior.max()) for d in found],
-        "novelty": [d.novelty for d in found],
-        "reused_from": [d.reused_from for d in found],
-        "descriptor": lists([d.descriptor for d in found], pa.float32()),
-        "neurons": lists([d.gas.neurons for d in found], pa.float32()),
-        "edges": lists([d.gas.edges for d in found], pa.uint16()),
-        "seconds": [d.seconds for d in found],
+        "posterior": lists([d.posterior for d in detections], pa.float32()),
+        "category": [d.category(categories) for d in detections],
+        "confidence": [float(d.posterior.max()) for d in detections],
+        "novelty": [d.novelty for d in detections],
+        "reused_from": [d.reused_from for d in detections],
+        "descriptor": lists([d.descriptor for d in detections], pa.float32()),
+        "neurons": lists([d.gas.neurons for d in detections], pa.float32()),
+        "edges": lists([d.gas.edges for d in detections], pa.uint16()),
+        "seconds": [d.seconds for d in detections],
     }
 
 

@@ -98,8 +98,8 @@ def perceive_all(work: Work) -> None:
         reasons = ", ".join(f"{n} {reason}" for reason, n in skipped.items()) or "none in range"
         msg = f"{job.source}: no usable frame on {', '.join(run['options']['topics'])} ({reasons})"
         raise NoStreamError(msg)
-    found = count_rows(folder, "detections")
-    run["counts"] = {"frames": count, "skipped": dict(skipped), "detections": found}
+    detections = count_rows(folder, "detections")
+    run["counts"] = {"frames": count, "skipped": dict(skipped), "detections": detections}
     if run.get("color"):
         run["counts"]["color"] = count_rows(folder, "masks")
     if resumed:
@@ -133,9 +133,13 @@ def _views_again(work: Work, chosen: dict[Key, Revision]) -> Iterator[_Item]:
         earlier = recent.before(frame, pose)
         revision = chosen.get((frame.topic, frame.index))
         if revision is not None:
-            own = frame.frame_from_sensor
+            sensor_pose = frame.frame_from_sensor
             row = FrameRow(
-                frame.log_time_ns, pose, revision.up_given, again=True, frame_from_sensor=own
+                frame.log_time_ns,
+                pose,
+                revision.up_given,
+                again=True,
+                frame_from_sensor=sensor_pose,
             )
             yield row, PerceptionInput(frame, revision.up, earlier, pose, colour)
 
@@ -187,8 +191,8 @@ def _blocks(
 ) -> Iterator[tuple[tuple[FrameRow, ...], tuple[PerceptionInput, ...]]]:
     """Yield blocks of ``size`` frames, the same in every run, until asked to stop."""
     while not stopping.asked() and (block := tuple(islice(views, size))):
-        rows, seen = zip(*block, strict=True)
-        yield rows, seen
+        rows, perceptions = zip(*block, strict=True)
+        yield rows, perceptions
 
 
 class _UpTrial:
@@ -207,37 +211,37 @@ class _UpTrial:
 
         Only topics with a given up direction are waited for.
         """
-        held: list[_Oriented] = []
+        pending: list[_Oriented] = []
         for reading in source:
             frame, _, orientation = reading
-            held.append(reading)
+            pending.append(reading)
             if frame.topic not in self._decided:
                 self._look(frame, orientation)
-            if len(held) == _MOST_HELD:
+            if len(pending) == _MOST_HELD:
                 self._decide_all()
             if self._off_deg.keys() <= self._decided:
-                yield from held
-                held.clear()
+                yield from pending
+                pending.clear()
         self._decide_all()
-        yield from held
+        yield from pending
 
     def _look(self, frame: Frame, orientation: Orientation) -> None:
         self._looks[frame.topic] += 1
-        given, off = orientation.up, self._off_deg.get(frame.topic, [])
+        hint, off = orientation.up, self._off_deg.get(frame.topic, [])
         elsewhere = frame.points is not None and has_z_up(frame.frame_id)
         if elsewhere and self._looks[frame.topic] == 1:
             self._upright.warnings.append(
                 f"{frame.topic}: its clouds are in {frame.frame_id}, which is not the frame of a "
                 "camera: without its viewpoint, objects may be missed or fall apart"
             )
-        if given is not None:
+        if hint is not None:
             off = self._off_deg.setdefault(frame.topic, off)
-            found = find_up(frame, self._settings)
-            if found is not None:
-                angle = _angle_deg(given, found)
+            estimate = find_up(frame, self._settings)
+            if estimate is not None:
+                angle = _angle_deg(hint, estimate)
                 for how, turn in MISNAMED.items():
-                    others = self._misnamed_off_deg.setdefault((frame.topic, how), [])
-                    others.append(_angle_deg(turned(given, turn), found))
+                    misnamed_off = self._misnamed_off_deg.setdefault((frame.topic, how), [])
+                    misnamed_off.append(_angle_deg(turned(hint, turn), estimate))
                 if elsewhere:  # from the base of a robot, a table seems to be seen from below
                     angle = min(angle, 180 - angle)
                 off.append(angle)

@@ -46,7 +46,7 @@ def explain_jumps(folder: Path, fixed_frame: str | None) -> Iterator[str]:
 
 def _read_places(folder: Path) -> dict[str, tuple[F8, I4]]:
     """Read, for each topic, the points (n, 3) 1 m before the sensor, metres, and their stamps."""
-    found: dict[str, list[tuple[F8, I4]]] = {}
+    places_of: dict[str, list[tuple[F8, I4]]] = {}
     columns = ["topic", "stamp_ns", "fixed_translation", "fixed_rotation"]
     for group in read_row_groups(folder / "frames.parquet", columns):
         topics, codes = topic_codes(group)
@@ -54,10 +54,10 @@ def _read_places(folder: Path) -> dict[str, tuple[F8, I4]]:
         places = numbers_or_nan(group["fixed_translation"]) + turns[:, :, 2]
         for code, topic in enumerate(topics):
             rows = (codes == code) & ~np.isnan(places[:, 0])
-            found.setdefault(topic, []).append((places[rows], numbers(group["stamp_ns"])[rows]))
+            places_of.setdefault(topic, []).append((places[rows], numbers(group["stamp_ns"])[rows]))
     return {
         topic: (np.concatenate([p for p, _ in parts]), np.concatenate([s for _, s in parts]))
-        for topic, parts in found.items()
+        for topic, parts in places_of.items()
     }
 
 
@@ -69,5 +69,5 @@ def _jumps(places: F8, stamps_ns: I4) -> tuple[I4, F8]:
     padded = np.pad(speeds, 1)
     usual = np.maximum(padded[:-2], padded[2:])
     sudden = speeds > np.maximum(_SUDDEN * usual, _JUMP_M_S)
-    found = np.flatnonzero((steps > _JUMP_M) & sudden)
-    return found, steps[found]
+    jumps = np.flatnonzero((steps > _JUMP_M) & sudden)
+    return jumps, steps[jumps]

@@ -13,7 +13,7 @@ from shapecat.runs.jobs import differences
 from shapecat.runs.run_info import RunInfo
 from shapecat.runs.tables.reading import count_rows
 from shapecat.runs.tables.schemas import PERCEIVED, TABLES
-from shapecat.runs.tables.segments import count_segments, require_whole
+from shapecat.runs.tables.segments import count_segments, require_complete
 
 __all__ = ["has_work", "resume", "take_over_frames"]
 
@@ -42,7 +42,7 @@ def resume(folder: Path, planned: RunInfo, source: Path, digest: Callable[[], st
         if not differences(run, planned) and _same_recording_and_versions(
             run, planned, source, digest
         ):
-            _require_whole(folder)
+            _require_complete(folder)
             if "perceive" in run["seconds"]:
                 run["counts"]["resumed"] = run["counts"]["frames"]
             return {**run, "input": planned["input"]}
@@ -99,14 +99,14 @@ def has_work(folder: Path) -> bool:
     return False
 
 
-def _require_whole(folder: Path) -> None:
+def _require_complete(folder: Path) -> None:
     """Check that all segments and tables can be opened: a power cut may have truncated them.
 
     Raises
     ------
     OutputError : a file is unreadable.
     """
-    require_whole(folder)
+    require_complete(folder)
     for table in TABLES:
         if (folder / f"{table}.parquet").exists():
             count_rows(folder, table)
@@ -125,8 +125,8 @@ def _same_recording_and_versions(
     """Return whether a run was made by the same versions from the same recording."""
     if run["versions"] != planned["versions"]:
         return False
-    known = run["input"]
-    return unchanged(known["files"], source) or same_content(known, source, digest)
+    recorded = run["input"]
+    return unchanged(recorded["files"], source) or same_content(recorded, source, digest)
 
 
 def _is_complete(folder: Path, run: RunInfo) -> bool:

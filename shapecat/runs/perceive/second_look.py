@@ -90,7 +90,7 @@ def frames_to_revise(tables: Iterable[tuple[pa.Table, pa.Table]]) -> dict[Key, R
     -----
     Memory holds a few numbers per frame.
     """
-    found: dict[Key, Revision] = {}
+    revisions: dict[Key, Revision] = {}
     for topic, stream in _streams(tables).items():
         posed = np.isfinite(stream.rotation[:, 0, 0])
         expected = _fixed_up(stream, posed) if 2 * posed.sum() > len(posed) else _still_up(stream)
@@ -98,10 +98,10 @@ def frames_to_revise(tables: Iterable[tuple[pa.Table, pa.Table]]) -> dict[Key, R
         off |= ~posed & _other_support(stream, off)
         agrees = _cosine(stream.given, expected) > _cos(_AGREES_DEG)
         for k in np.flatnonzero(np.isfinite(expected[:, 0]) & off & ~agrees):
-            given = stream.given[k].astype(np.float32) if np.isfinite(stream.given[k, 0]) else None
+            hint = stream.given[k].astype(np.float32) if np.isfinite(stream.given[k, 0]) else None
             key = (topic, int(stream.frames[k]))
-            found[key] = Revision(expected[k].astype(np.float32), given)
-    return found
+            revisions[key] = Revision(expected[k].astype(np.float32), hint)
+    return revisions
 
 
 def _fixed_up(stream: _Stream, posed: Bool) -> F8:
@@ -115,16 +115,16 @@ def _still_up(stream: _Stream) -> F8:
     """Return the up directions (n, 3) of nearby frames if the camera was at rest; else NaN."""
     level, expected = stream.level, np.full(stream.up.shape, np.nan)
     for k in range(len(expected)):
-        near = _around(stream, k)
-        expected[k] = _agreed(stream.up[near][level[near]], _STILL_DEG, _STILL_SHARE)
+        neighbours = _around(stream, k)
+        expected[k] = _agreed(stream.up[neighbours][level[neighbours]], _STILL_DEG, _STILL_SHARE)
     return expected
 
 
 def _around(stream: _Stream, k: int) -> I4:
     """Return the indices of the frames near frame ``k``, without ``k``."""
-    near = np.arange(max(0, k - _AROUND), min(len(stream.frames), k + _AROUND + 1))
-    soon = np.abs(stream.stamps_ns[near] - stream.stamps_ns[k]) <= _AROUND_NS
-    return np.asarray(near[soon & (near != k)])
+    rows = np.arange(max(0, k - _AROUND), min(len(stream.frames), k + _AROUND + 1))
+    soon = np.abs(stream.stamps_ns[rows] - stream.stamps_ns[k]) <= _AROUND_NS
+    return np.asarray(rows[soon & (rows != k)])
 
 
 def _other_support(stream: _Stream, off: Bool) -> Bool:
@@ -132,26 +132,26 @@ def _other_support(stream: _Stream, off: Bool) -> Bool:
 
     ``off`` (n,) marks the frames that are not compared; the result is (n,) too.
     """
-    found = np.zeros(len(off), np.bool_)
+    is_other = np.zeros(len(off), np.bool_)
     for k in np.flatnonzero(~off):
-        near = _around(stream, int(k))
-        lowest = np.array([stream.offsets[m][0] for m in near[~off[near]]])
+        neighbours = _around(stream, int(k))
+        lowest = np.array([stream.offsets[m][0] for m in neighbours[~off[neighbours]]])
         if len(lowest) < _FEWEST:
             continue
         usual = np.median(lowest)
         still = np.mean(np.abs(lowest - usual) < _STILL_M) > _STILL_SHARE
-        found[k] = still and np.min(np.abs(stream.offsets[k] - usual)) > _OFF_M
-    return found
+        is_other[k] = still and np.min(np.abs(stream.offsets[k] - usual)) > _OFF_M
+    return is_other
 
 
 def _agreed(up: F8, within_deg: float, share: float) -> F8:
     """Return the direction (3,) on which more than `share` of ``up`` (n, 3) agree; NaN if none."""
     if len(up) < _FEWEST:
         return np.full(3, np.nan)
-    near = _cosine(up, np.median(up, axis=0)) > _cos(within_deg)
-    if near.mean() <= share:
+    inliers = _cosine(up, np.median(up, axis=0)) > _cos(within_deg)
+    if inliers.mean() <= share:
         return np.full(3, np.nan)
-    mean = up[near].mean(axis=0)
+    mean = up[inliers].mean(axis=0)
     return np.asarray(mean / np.linalg.norm(mean))
 
 

@@ -22,7 +22,7 @@ def read_frames(
     streams: Sequence[Stream] | None = None,
     colours: Mapping[str, ColourStream] | None = None,
     needed: Needed = None,
-    known: KnownImages = None,
+    same_images: KnownImages = None,
 ) -> Iterator[tuple[Frame, ColourView | None]]:
     """Read the selected frames, each with its colour image, or None.
 
@@ -30,7 +30,7 @@ def read_frames(
     ----------
     streams, colours : the selected streams, and the colour stream of each; looked for by default.
     skipped, needed : as for `shapecat.recordings.frames`.
-    known : as for `frames_with_colour`.
+    same_images : as for `frames_with_colour`.
 
     Raises
     ------
@@ -49,7 +49,7 @@ def read_frames(
         every=options["every"],
         skipped=skipped,
         needed=needed,
-        known=known,
+        same_images=same_images,
     )
 
 

@@ -29,13 +29,13 @@ def report_up(upright: Upright, folder: Path) -> dict[str, Any]:
             f"failed transform look-ups: {upright.failed}, the first: {upright.first_failure}"
         )
         upright.warnings += _missing_poses(folder, upright.fixed_frame)
-    given = upright.given
-    report: dict[str, Any] = {"source": max(given, key=lambda name: given[name], default="planes")}
+    uses = upright.given
+    report: dict[str, Any] = {"source": max(uses, key=lambda name: uses[name], default="planes")}
     if upright.dropped:
         report["dropped"] = dict(upright.dropped)
-    if len(given) > 1:
-        report["frames"] = dict(given)
-    if set(given) - {"planes"}:
+    if len(uses) > 1:
+        report["frames"] = dict(uses)
+    if set(uses) - {"planes"}:
         angles, bare = _angles_to_planes(folder)
         typical = round(float(np.median(angles)), 1) if angles else None
         report |= {"planes_differ_deg": typical, "frames_without_plane": bare}
@@ -48,12 +48,12 @@ def _missing_poses(folder: Path, fixed_frame: str | None) -> Iterator[str]:
     """Yield a warning for each topic of which frames have no pose in the fixed frame."""
     if fixed_frame is None:  # all tracks are in the sensor frame
         return
-    for topic, (known, count) in count_poses(folder).items():
+    for topic, (with_pose, count) in count_poses(folder).items():
         loss = ", whose objects are not tracked"
-        if 2 * known <= count:
+        if 2 * with_pose <= count:
             loss = ": its tracks are in the frame of the sensor"
-        if known < count:
-            frames = f"{count - known} of {count} frames"
+        if with_pose < count:
+            frames = f"{count - with_pose} of {count} frames"
             yield f"{topic}: its pose in {fixed_frame} is unknown in {frames}{loss}"
 
 
@@ -67,9 +67,9 @@ def _angles_to_planes(folder: Path) -> tuple[list[float], int]:
     """
     angles, bare = [], 0
     rows = ["topic", "frame"]
-    wanted = {"frames": [*rows, "up", "up_given"], "planes": rows, "detections": rows}
-    for frames, *found in read_together(folder, wanted):
-        planes, objects = (set(keys_of(table)) for table in found)
+    columns = {"frames": [*rows, "up", "up_given"], "planes": rows, "detections": rows}
+    for frames, *plane_tables in read_together(folder, columns):
+        planes, objects = (set(keys_of(table)) for table in plane_tables)
         for row in frames.to_pylist():
             key = (row["topic"], row["frame"])
             if row["up_given"] is None:

@@ -63,7 +63,7 @@ def read_nearest_masks(folder: Path) -> Iterator[tuple[Key, ImageMasks]]:
     best: dict[str, tuple[int, Key, ImageMasks]] = {}
     stamps = read_stamps(folder)
     for key, masks in read_masks(folder, boxes_only=True):
-        stamp = next(stamp for other, stamp in stamps if other == key)
+        stamp = next(stamp for candidate, stamp in stamps if candidate == key)
         apart, before = abs(stamp - masks.stamp_ns), best.get(masks.topic)
         if before is not None and before[2].stamp_ns != masks.stamp_ns:
             yield before[1:]

@@ -36,8 +36,8 @@ class PlacedFrames:
     def add(self, frames: pa.Table, detections: pa.Table, count: int) -> None:
         """Append a row group; ``count`` is the number of detections in earlier ones."""
         topics, codes = topic_codes(frames)
-        known = [self._codes.setdefault(topic, len(self._codes)) for topic in topics]
-        keys = _keys(np.array(known, np.int64)[codes], numbers(frames["frame"]))
+        codes_of_topics = [self._codes.setdefault(topic, len(self._codes)) for topic in topics]
+        keys = _keys(np.array(codes_of_topics, np.int64)[codes], numbers(frames["frame"]))
         starts = {key: count + rows.start for key, rows in frame_rows(detections).items()}
         first = np.array([starts.get(key, -1) for key in keys_of(frames)], np.int64)
         self._keys += keys.tobytes()
@@ -64,8 +64,8 @@ class PlacedFrames:
         """Return the row (n,) of each frame, given the topics and frame numbers (n,)."""
         codes = np.fromiter(map(self._codes.__getitem__, topics), np.int64, len(topics))
         keys = np.frombuffer(self._keys, np.int64)
-        found = np.searchsorted(keys, _keys(codes, frames), sorter=self._order)
-        return np.asarray(self._order[found])
+        positions = np.searchsorted(keys, _keys(codes, frames), sorter=self._order)
+        return np.asarray(self._order[positions])
 
 
 def _keys(codes: I4, frames: I4) -> I4:
@@ -75,9 +75,9 @@ def _keys(codes: I4, frames: I4) -> I4:
 def _poses(frames: pa.Table, placed: Bool) -> F8:
     result = np.tile(np.eye(3, 4), (frames.num_rows, 1, 1))
     turns = numbers_or_nan(frames["fixed_rotation"]).reshape(-1, 3, 3)
-    known = placed & ~np.isnan(turns[:, 0, 0])
-    result[known, :, :3] = turns[known]
-    result[known, :, 3] = numbers_or_nan(frames["fixed_translation"])[known]
+    has_pose = placed & ~np.isnan(turns[:, 0, 0])
+    result[has_pose, :, :3] = turns[has_pose]
+    result[has_pose, :, 3] = numbers_or_nan(frames["fixed_translation"])[has_pose]
     return result
 
 
@@ -91,11 +91,11 @@ def streams_with_poses(folder: Path) -> set[str]:
 
 def count_poses(folder: Path) -> dict[str, tuple[int, int]]:
     """Return, for each topic, the numbers of frames with a known sensor pose, and of all frames."""
-    known: Counter[str] = Counter()
+    with_pose: Counter[str] = Counter()
     count: Counter[str] = Counter()
     for group in read_row_groups(folder / "frames.parquet", ["topic", "fixed_translation"]):
         has_pose = group["fixed_translation"].is_valid().to_pylist()
         topics = group["topic"].to_pylist()
-        known.update(compress(topics, has_pose))
+        with_pose.update(compress(topics, has_pose))
         count.update(topics)
-    return {topic: (known[topic], count[topic]) for topic in count}
+    return {topic: (with_pose[topic], count[topic]) for topic in count}

@@ -107,11 +107,11 @@ def read_rows(
     bounds = np.searchsorted(rows[order], starts)
     groups = np.flatnonzero(np.diff(bounds))
     for k in range(0, len(groups), at_once):
-        some = groups[k : k + at_once]
-        at = np.concatenate([order[bounds[g] : bounds[g + 1]] for g in some])
-        skipped = starts[some] - np.cumsum([0, *np.diff(starts)[some[:-1]]])
-        table = _validated(file.read_row_groups(some.tolist(), list(columns), use_threads=False))
-        yield at, table.take(pa.array(rows[at] - np.repeat(skipped, np.diff(bounds)[some])))
+        batch = groups[k : k + at_once]
+        at = np.concatenate([order[bounds[g] : bounds[g + 1]] for g in batch])
+        skipped = starts[batch] - np.cumsum([0, *np.diff(starts)[batch[:-1]]])
+        table = _validated(file.read_row_groups(batch.tolist(), list(columns), use_threads=False))
+        yield at, table.take(pa.array(rows[at] - np.repeat(skipped, np.diff(bounds)[batch])))
 
 
 def read_together(
@@ -182,9 +182,9 @@ def numbers_or_nan(column: pa.ChunkedArray) -> Any:
     """Return a column of lists of fixed size as an array (rows, size); null becomes NaN."""
     width, kind = column.type.list_size, column.type.value_type.to_pandas_dtype()
     result = np.full((len(column), width), np.nan, kind)
-    known = column.is_valid().to_numpy()
-    if known.any():
-        result[known] = numbers(column.drop_null()).reshape(-1, width)
+    valid = column.is_valid().to_numpy()
+    if valid.any():
+        result[valid] = numbers(column.drop_null()).reshape(-1, width)
     return result
 
 
@@ -265,14 +265,14 @@ def _open_parquet(path: Path, read_dictionary: Sequence[str]) -> pq.ParquetFile:
         raise pa.ArrowInvalid(msg) from error
 
 
-def _wrong_column(found: pa.Schema, wanted: pa.Schema) -> str:
+def _wrong_column(schema: pa.Schema, expected: pa.Schema) -> str:
     """Describe the first column that another version, or another program, wrote otherwise."""
-    for field in wanted:
-        if field.name not in found.names:
+    for field in expected:
+        if field.name not in schema.names:
             if field.name in ADDED:
                 continue
             return f"no column {field.name}"
-        kind = found.field(field.name).type
+        kind = schema.field(field.name).type
         if (kind.value_type if pa.types.is_dictionary(kind) else kind) not in _file_types(
             field.type
         ):

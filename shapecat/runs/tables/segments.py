@@ -27,7 +27,7 @@ __all__ = [
     "list_segments",
     "read_segment",
     "read_segments",
-    "require_whole",
+    "require_complete",
     "row_groups",
     "write_segment",
 ]
@@ -94,8 +94,8 @@ def _latest(folder: Path) -> Iterator[_Tables]:
 
 def _revised(frames: pa.Table) -> Iterator[Key]:
     """Yield the frames in which a second look found a plane or a detection."""
-    kept = numbers(frames["revised"].cast(pa.int8()))
-    return (key for key, revised in zip(frame_rows(frames), kept, strict=True) if revised)
+    is_revised = numbers(frames["revised"].cast(pa.int8()))
+    return (key for key, revised in zip(frame_rows(frames), is_revised, strict=True) if revised)
 
 
 def _picked(name: str, keys: Sequence[Key], sources: Sequence[_Tables]) -> pa.Table:
@@ -119,14 +119,16 @@ def group_frames(frames: int) -> int:
 
 def row_groups(folder: Path, length: int) -> Iterator[_Tables]:
     """Yield the tables of ``length`` frames at a time, whatever the length of the segments."""
-    held: _Tables = {}
+    pending: _Tables = {}
     for new in _latest(folder):
-        held = {name: pa.concat_tables([held[name], new[name]]) for name in new} if held else new
-        while held["frames"].num_rows >= length:
-            group, held = _cut(held, length)
+        pending = (
+            {name: pa.concat_tables([pending[name], new[name]]) for name in new} if pending else new
+        )
+        while pending["frames"].num_rows >= length:
+            group, pending = _cut(pending, length)
             yield group
-    if held and held["frames"].num_rows:
-        yield held
+    if pending and pending["frames"].num_rows:
+        yield pending
 
 
 def _cut(tables: _Tables, count: int) -> tuple[_Tables, _Tables]:
@@ -162,7 +164,7 @@ def read_segment(segment: Path, name: str) -> pa.Table:
         return reader.read_all()
 
 
-def require_whole(folder: Path) -> None:
+def require_complete(folder: Path) -> None:
     """Check that all segments of an interrupted run can be opened; their rows are not read.
 
     Raises

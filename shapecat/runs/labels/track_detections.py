@@ -12,7 +12,7 @@ import pyarrow as pa
 from shapecat.arrays import F4, F8, I4
 from shapecat.runs.tables.reading import frame_rows, numbers, opened, read_row_groups
 
-__all__ = ["SeenTracks", "extents_of", "read_seen_tracks"]
+__all__ = ["TrackDetections", "extents_of", "read_track_detections"]
 
 _SAMPLES = 40
 """About this many detections of each track are read for its size."""
@@ -21,7 +21,7 @@ _Moment = tuple[str, int, int]
 """A frame: its topic, its stamp (ns), and its place, from 0, among the frames of this stamp."""
 
 
-class SeenTracks(NamedTuple):
+class TrackDetections(NamedTuple):
     """All detections of the tracks of a run, sorted by moment.
 
     Attributes
@@ -40,7 +40,7 @@ class SeenTracks(NamedTuple):
     keys: dict[_Moment, slice]
 
 
-def read_seen_tracks(folder: Path) -> SeenTracks:
+def read_track_detections(folder: Path) -> TrackDetections:
     """Read the detections of the tracks of a run."""
     columns = ["track", "topic", "frame", "stamp_ns", "detection", "center_fixed"]
     with opened(folder / "tracks.parquet") as file:
@@ -51,7 +51,7 @@ def read_seen_tracks(folder: Path) -> SeenTracks:
     table = table.filter(seen)
     starts = [k for k, key in enumerate(keys) if not k or key != keys[k - 1]]
     rows = map(slice, starts, [*starts[1:], len(keys)])
-    return SeenTracks(
+    return TrackDetections(
         numbers(table["track"]),
         keys,
         numbers(table["frame"]),
@@ -70,19 +70,19 @@ def _moments(table: pa.Table) -> Iterator[_Moment]:
             yield topic, stamp, places.setdefault(frame, len(places))
 
 
-def extents_of(folder: Path, seen: SeenTracks) -> dict[int, tuple[float, float]]:
+def extents_of(folder: Path, tracks: TrackDetections) -> dict[int, tuple[float, float]]:
     """Return the width and largest extent of each track, metres: medians of some views."""
-    wanted: dict[tuple[str, int], list[int]] = {}
-    for track in np.unique(seen.tracks):
-        rows = np.flatnonzero(seen.tracks == track)
+    rows_of: dict[tuple[str, int], list[int]] = {}
+    for track in np.unique(tracks.tracks):
+        rows = np.flatnonzero(tracks.tracks == track)
         for row in rows[:: max(1, len(rows) // _SAMPLES)].tolist():
-            wanted.setdefault((seen.frames[row][0], int(seen.numbers[row])), []).append(row)
+            rows_of.setdefault((tracks.frames[row][0], int(tracks.numbers[row])), []).append(row)
     sizes: dict[int, list[F4]] = {}
     for group in read_row_groups(folder / "detections.parquet", ["topic", "frame", "size"]):
         size = numbers(group["size"]).reshape(-1, 3)
         for key, span in frame_rows(group).items():
-            for row in wanted.get(key, ()):
-                found = size[span][seen.detections[row]]
-                sizes.setdefault(int(seen.tracks[row]), []).append(found)
-    middles = {track: np.median(np.stack(found), axis=0) for track, found in sizes.items()}
+            for row in rows_of.get(key, ()):
+                extent = size[span][tracks.detections[row]]
+                sizes.setdefault(int(tracks.tracks[row]), []).append(extent)
+    middles = {track: np.median(np.stack(extent), axis=0) for track, extent in sizes.items()}
     return {t: (float(max(m[:2])), float(max(m))) for t, m in middles.items()}
