@@ -9,14 +9,14 @@ from numpy.typing import ArrayLike, DTypeLike, NDArray
 
 __all__ = ["F4", "F8", "I4", "U1", "U2", "U4", "Bool", "Record", "array", "freeze"]
 
-F4: TypeAlias = NDArray[Any]
-F8: TypeAlias = NDArray[Any]
-I4: TypeAlias = NDArray[Any]
-U1: TypeAlias = NDArray[Any]
-U2: TypeAlias = NDArray[Any]
-U4: TypeAlias = NDArray[Any]
-Bool: TypeAlias = NDArray[Any]
-# The aliases name the element type for the reader; `freeze` enforces it when a record is made.
+F4: TypeAlias = NDArray[np.floating[Any]]
+F8: TypeAlias = NDArray[np.floating[Any]]
+I4: TypeAlias = NDArray[np.integer[Any]]
+U1: TypeAlias = NDArray[np.integer[Any]]
+U2: TypeAlias = NDArray[np.integer[Any]]
+U4: TypeAlias = NDArray[np.integer[Any]]
+Bool: TypeAlias = NDArray[np.bool_]
+# mypy tells floats, integers and Booleans apart; `freeze` enforces the size when a record is made.
 
 
 def freeze(

@@ -275,7 +275,7 @@ def _describe(
     cloud = thin(transform(level, points).astype(np.float32), settings=settings.surface)
     gas = reconstruct(cloud, settings=settings.surface, rng=rng)
     if gas is None:
-        gas = NeuralGas(np.zeros((0, 3)), np.zeros((0, 2)))
+        gas = NeuralGas(np.zeros((0, 3)), np.zeros((0, 2), int))
         descriptor = np.zeros(len(DESCRIPTOR_NAMES), np.float32)
     else:
         descriptor = describe(cloud, gas, eye=level.translation)

@@ -92,7 +92,7 @@ def _detect(frame: Frame) -> Scene:
 
 
 def _undescribed(candidate: Candidate) -> Detection:
-    nothing = NeuralGas(np.zeros((0, 3)), np.zeros((0, 2)))
+    nothing = NeuralGas(np.zeros((0, 3)), np.zeros((0, 2), int))
     return Detection(candidate, nothing, np.zeros(0), np.zeros(0), 0.0, 0.0)
 
 

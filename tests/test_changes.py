@@ -232,7 +232,7 @@ def test_views_of_both_sensors_count() -> None:
         replace(
             FrameDetections(
                 *("", k, k, np.arange(1), np.array([[0.0, 0.0, 1.0]]), np.ones((1, 3))),
-                *(np.array([[0.8, 0.2]]), np.zeros(1), np.zeros(1), np.eye(4)[3:]),
+                *(np.array([[0.8, 0.2]]), np.zeros(1, bool), np.zeros(1), np.eye(4)[3:]),
             ),
             topic=topic,
         )

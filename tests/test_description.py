@@ -219,7 +219,7 @@ def test_features_of_degenerate_points_are_finite(
     chosen = points[:: max(1, len(points) // 12)]
     chosen = np.concatenate([chosen, chosen])[: max(2, len(chosen))]
     chain = np.array([[i, i + 1] for i in range(len(chosen) - 1)])
-    for edges in (chain, chain[:1], np.zeros((0, 2))):
+    for edges in (chain, chain[:1], chain[:0]):
         found = describe(points, NeuralGas(chosen, edges), np.array(eye, np.float32))
         assert np.isfinite(found).all()
         assert np.abs(np.delete(found, METRIC)).max() < 1e4
@@ -262,7 +262,7 @@ def test_invalid_input_is_rejected(wrong: str) -> None:
         eye = eye[:2]
     gas = NeuralGas(neurons, view.gas.edges)
     if wrong == "few":
-        gas = NeuralGas(neurons[:1], np.zeros((0, 2)))
+        gas = NeuralGas(neurons[:1], np.zeros((0, 2), int))
     with pytest.raises(ValueError, match=r"finite|expected|at least"):
         describe(points, gas, eye)
 

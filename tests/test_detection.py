@@ -11,6 +11,7 @@ from hypothesis import strategies as st
 from numpy.typing import NDArray
 
 from benchmarks.ablation import STEPS, without
+from shapecat.arrays import I4
 from shapecat.config import DetectionSettings
 from shapecat.detection import Hierarchy, Node, detect, format_tree
 from shapecat.detection.depth_grid import row_and_column
@@ -160,7 +161,7 @@ def found(frame: Frame, up: tuple[float, float, float] | None = None) -> Scene:
     return detect(frame, up=up, settings=DEFAULTS, rng=np.random.default_rng(0))
 
 
-def overlaps(scene: Scene, labels: NDArray[np.int64], objects: list[int]) -> list[float]:
+def overlaps(scene: Scene, labels: I4, objects: list[int]) -> list[float]:
     """Return the largest IoU of each true object with any candidate."""
     best = []
     for k in objects:

@@ -29,8 +29,10 @@ from shapecat.geometry import DISCONTINUITY
 from shapecat.trees import BoostedTrees, Trees
 from tests.test_detection import Array, Shape, box, frame_of, render, table
 
-_NODE = (np.zeros(1, dtype) for dtype in (np.int32, np.int16, np.float32, np.int32))
-_LEAF = BoostedTrees(Trees(*_NODE), np.ones(1, np.float32))
+_NODE = Trees(
+    *(np.zeros(1, kind) for kind in ("i4", "i2")), *(np.zeros(1, kind) for kind in ("f4", "i4"))
+)
+_LEAF = BoostedTrees(_NODE, np.ones(1, np.float32))
 ALWAYS = RejectionTrees(_LEAF, _LEAF)
 """Trees that accept everything as an object."""
 INTRINSICS = PinholeIntrinsics(262.5, 262.5, 19.5, 19.5)

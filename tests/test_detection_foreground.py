@@ -2,9 +2,8 @@
 
 import numpy as np
 import pytest
-from numpy.typing import NDArray
 
-from shapecat.arrays import F4
+from shapecat.arrays import F4, F8
 from shapecat.detection.depth_grid import DepthGrid
 from shapecat.detection.foreground.depth_error import filter_high_pass, measure_noise
 from shapecat.detection.foreground.low_profile import find_low_profile
@@ -43,7 +42,7 @@ def plane_of(grid: DepthGrid, below_m: float) -> SupportingPlane:
     return plane
 
 
-def heights_of(grid: DepthGrid, plane: SupportingPlane) -> tuple[HeightMap, NDArray[np.float64]]:
+def heights_of(grid: DepthGrid, plane: SupportingPlane) -> tuple[HeightMap, F8]:
     planes = pack_planes([plane])
     return measure_heights(grid, planes, 0.5), planes
 

@@ -371,7 +371,7 @@ def test_unorganised_clouds_get_semantic_kitti_labels(tmp_path: Path) -> None:
         confidence=1.0,
         box=Box(np.zeros(3), np.ones(3), np.array([0, 0, 0, 1])),
         indices=np.array([1, 2]),
-        gas=NeuralGas(np.zeros((0, 3)), np.zeros((0, 2))),
+        gas=NeuralGas(np.zeros((0, 3)), np.zeros((0, 2), int)),
         posterior=np.ones(1),
         causal=np.ones(1),
     )

@@ -51,7 +51,7 @@ def labelled(*, cut: bool, hidden: bool) -> LabelledFrame:
     box = Box(rotation.apply(CENTER), SIZE, Rotation.from_matrix(axes).as_quat())
     indices = np.array(sorted(v * CAMERA.width + u for u, v in PIXELS), np.uint32)
     item = LabelledObject(
-        4, "bowl", 0.9, box, indices, NeuralGas(np.zeros((0, 3)), np.zeros((0, 2))),
+        4, "bowl", 0.9, box, indices, NeuralGas(np.zeros((0, 3)), np.zeros((0, 2), int)),
         np.array([1.0]), np.array([1.0]), touches_border=cut, occluded=hidden,
     )  # fmt: skip
     return LabelledFrame("/depth", 0, 5, 6, "optical", None, (), (item,), (), {}, UP)

@@ -400,10 +400,10 @@ def test_learning_stores_a_limited_number_of_views(
 @pytest.mark.parametrize("left", [[1, 1, 0], [1, 0], [2, 0, 0], [1, 2, 3, 0, 0]])
 def test_cyclic_trees_are_rejected(left: list[int]) -> None:
     """So are branches that meet again, whose paths double with every level."""
-    nothing = np.zeros(len(left))
+    zeros = np.zeros(len(left), int)
 
     with pytest.raises(ValueError, match="damaged"):
-        FlatForest(np.array([0]), nothing, nothing, np.array(left))
+        FlatForest(np.array([0]), zeros, zeros.astype(float), np.array(left))
 
 
 @pytest.mark.parametrize("rejected", [0.05, 0.2])

@@ -76,7 +76,7 @@ from shapecat.types import (
 from tests.test_exports_worked import UP
 
 MS = 1_000_000
-NO_GAS = NeuralGas(np.zeros((0, 3)), np.zeros((0, 2)))
+NO_GAS = NeuralGas(np.zeros((0, 3)), np.zeros((0, 2), int))
 UPRIGHT = (0.0, 0.0, 0.0, 1.0)
 
 

@@ -278,7 +278,7 @@ def test_ball_is_drawn_round_and_lit_from_above() -> None:
 
 @pytest.mark.parametrize("count", [0, 1, 2, 5])
 def test_objects_with_few_points_are_drawn(count: int) -> None:
-    gas = NeuralGas(np.zeros((0, 3)), np.zeros((0, 2)))
+    gas = NeuralGas(np.zeros((0, 3)), np.zeros((0, 2), int))
 
     assert len(draw(Snapshot(ball(5)[:count], gas, np.ones(3)), (1, 2, 3))) == 3
 
@@ -328,7 +328,7 @@ def test_crop_shows_object_and_outline(left: int, top: int) -> None:
 
 
 def labelled(*indices: np.ndarray, up: Sequence[int] = (0, -1, 0)) -> LabelledFrame:
-    gas = NeuralGas(np.zeros((0, 3)), np.zeros((0, 2)))
+    gas = NeuralGas(np.zeros((0, 3)), np.zeros((0, 2), int))
     box = Box(np.array([0, 0, 1]), np.full(3, 0.1), np.array([0, 0, 0, 1]))
     items = [
         LabelledObject(k, "cup", 0.9, box, pixels.astype(np.uint32), gas, np.ones(1), np.ones(1))

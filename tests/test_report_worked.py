@@ -452,7 +452,7 @@ def test_only_pixels_with_depth_are_drawn() -> None:
     camera = Camera(3, 2, 2.0, 2.0, 1.0, 0.5)
     depth = np.array([[1.5, 0, 1.5], [2.5, 2.5, 0]], np.float32)
     frame = Frame("/d", 0, 0, 0, "camera", depth=depth, camera=camera)
-    gas = NeuralGas(np.zeros((0, 3)), np.zeros((0, 2)))
+    gas = NeuralGas(np.zeros((0, 3)), np.zeros((0, 2), int))
     box = Box(np.array([0, 0, 1]), np.full(3, 0.1), np.array([0, 0, 0, 1]))
     item = LabelledObject(5, "cup", 0.9, box, np.arange(1, 5), gas, np.ones(1), np.ones(1))
 
@@ -461,7 +461,7 @@ def test_only_pixels_with_depth_are_drawn() -> None:
 
 
 def test_card_without_recording_shows_view_with_most_points() -> None:
-    gas = NeuralGas(np.zeros((0, 3)), np.zeros((0, 2)))
+    gas = NeuralGas(np.zeros((0, 3)), np.zeros((0, 2), int))
     box = Box(np.array([0, 0, 1]), np.full(3, 0.1), np.array([0, 0, 0, 1]))
     taken = _Collector(Choice({("/d", k): frozenset({5}) for k in range(4)}, {}))
     for k, points in enumerate((5, 9, 7)):
@@ -511,7 +511,7 @@ def test_strip_boxes_scale_with_their_images() -> None:
     """A wide image is reduced for the page, and its boxes with it."""
     camera = Camera(1200, 900, 800.0, 800.0, 600.0, 450.0)
     frame = Frame("/d", 0, 0, 0, "camera", depth=np.ones((900, 1200)), camera=camera)
-    gas = NeuralGas(np.zeros((0, 3)), np.zeros((0, 2)))
+    gas = NeuralGas(np.zeros((0, 3)), np.zeros((0, 2), int))
     box = Box(np.array([0, 0, 1]), np.full(3, 0.1), np.array([0, 0, 0, 1]))
     item = LabelledObject(5, "cup", 0.9, box, np.arange(3), gas, np.ones(1), np.ones(1))
     labelled = LabelledFrame("/d", 0, 0, 0, "camera", None, (), (item,), (), {})

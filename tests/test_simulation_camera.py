@@ -143,7 +143,7 @@ def test_alone_pixels_include_occluded_ones() -> None:
 
 
 def test_empty_geometry_gives_empty_image() -> None:
-    nothing = Geometry(np.zeros((0, 3)), np.zeros((0, 3)), np.zeros(0))
+    nothing = Geometry(np.zeros((0, 3)), np.zeros((0, 3), int), np.zeros(0, int))
 
     assert (render(nothing, CAMERA, HERE).mesh_ids == -1).all()
 

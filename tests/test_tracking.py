@@ -53,7 +53,7 @@ def frame(
         points,
         np.broadcast_to(size, (n, 3)),
         np.broadcast_to(posterior, (n, 2)),
-        np.zeros(n),
+        np.zeros(n, bool),
         np.full(n, 0.5),
         np.broadcast_to((0, 0, 0, 1), (n, 4)),
     )
@@ -171,7 +171,7 @@ def test_recording_of_unrelated_frames_keeps_every_detection() -> None:
             np.column_stack([np.arange(4) * 0.12 + random.normal(0, 0.03, 4), np.zeros((4, 2))]),
             random.uniform(0.03, 0.25, (4, 3)),
             random.dirichlet(np.full(7, 0.2), 4),
-            np.zeros(4),
+            np.zeros(4, bool),
             np.zeros(4),
         )
         for k in range(30)
@@ -199,7 +199,7 @@ def cameras(count: int, *, frames: int, apart: float) -> list[FrameDetections]:
             sizes = np.array([[0.05, 0.05, 0.1], [0.2, 0.2, 0.05]]) * (1 + camera)
             posteriors = np.eye(7)[[(2 * camera) % 7, (2 * camera + 1) % 7]] * 0.9 + 0.1 / 7
             noisy = places + random.normal(0, 0.002, places.shape)
-            columns = (np.arange(2), noisy, sizes, posteriors, np.zeros(2), np.zeros(2))
+            columns = (np.arange(2), noisy, sizes, posteriors, np.zeros(2, bool), np.zeros(2))
             found.append(FrameDetections(f"/cam{camera}", k, stamp, *columns))
             stamp += SECOND // 60
     return found

@@ -94,7 +94,7 @@ def detections_at(
     objects: Sequence[Object], sensor: Sensor, t: float, random: np.random.Generator
 ) -> tuple[list[tuple[int, F8, F8, F8]], Truth]:
     """Return (category, centre, size, posterior) of the detections, and the truth."""
-    found = []
+    found: list[tuple[int, F8, F8]] = []
     places, eye = truth_at(objects, sensor, t), sensor.eye(t)
     shares = {k: hidden_share(k, places, objects, eye) for k in places}
     for k, place in places.items():
@@ -114,7 +114,9 @@ def detections_at(
     for _ in range(random.poisson(sensor.false)):
         place = random.uniform([-0.4, -0.4, 0.03], [0.4, 0.4, 0.1]) + sensor.looks_at(t) * [1, 1, 0]
         found.append((int(random.integers(CATEGORIES)), place, random.uniform(0.03, 0.15, 3)))
-    reported = [(c, p + random.normal(0, 0.01, 3), s, view_of(c, random)) for c, p, s in found]
+    reported: list[tuple[int, F8, F8, F8]] = [
+        (c, p + random.normal(0, 0.01, 3), s, view_of(c, random)) for c, p, s in found
+    ]
     return reported, Truth(places, {k for k, share in shares.items() if share > HIDDEN})
 
 
@@ -151,7 +153,7 @@ def frame_of(
         np.reshape([f[1] for f in found], (n, 3)),
         np.reshape([f[2] for f in found], (n, 3)),
         np.reshape([f[3] for f in found], (n, CATEGORIES)),
-        np.zeros(n),
+        np.zeros(n, bool),
         np.zeros(n),
     )
 

@@ -36,7 +36,7 @@ def frame(k: int, centers: Any, **changes: Any) -> FrameDetections:
         *("/depth", k, k * SECOND // 10, np.arange(n), places),
         np.broadcast_to((0.13, 0.09, 0.07), (n, 3)),
         np.broadcast_to((0.8, 0.2), (n, 2)),
-        np.zeros(n),
+        np.zeros(n, bool),
         np.full(n, 0.5),
         np.broadcast_to((0, 0, 0, 1), (n, 4)),
     )

@@ -86,7 +86,7 @@ def dense_masks(
         msg = "masks need a depth image"
         raise ValueError(msg)
     if colour_from_depth is None or lens is None:
-        labels = np.where(frame.depth > 0, 0, -1).astype(np.int32)
+        labels: I4 = np.where(frame.depth > 0, 0, -1).astype(np.int32)
         for number, indices in enumerate(objects, start=1):
             labels.reshape(-1)[indices] = number
         return labelled_masks(labels, label_boxes(labels, len(objects)))

@@ -58,7 +58,7 @@ def joined(rings: Sequence[F8]) -> F8:
     return joined_ring
 
 
-def _area(ring: F8) -> float:
+def _area(ring: I4) -> float:
     """Return the area inside corners (n, 2) in clockwise order on the image; holes are negative."""
     x, y = ring.T
     return float((x * np.roll(y, -1) - np.roll(x, -1) * y).sum()) / 2

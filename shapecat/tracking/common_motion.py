@@ -20,7 +20,7 @@ _TOGETHER_M = 0.03  # largest distance of a detection that fits the common motio
 _NOISE_M = 0.01  # residual at which the weight of a detection is one half
 _ROUNDS = 10
 
-C16 = NDArray[Any]
+C16 = NDArray[np.complexfloating[Any, Any]]
 
 
 @dataclass(frozen=True)
@@ -131,7 +131,7 @@ def _between_neighbours(plane: C16, rows: I4, owner: I4, count: int) -> tuple[C1
         turn, shift = _fit(plane[b], plane[a], rows[b], weights, turn, shift)
         gap = np.abs(turn[rows[b]] * plane[b] + shift[rows[b]] - plane[a])
         weights = 1 / (1 + (gap / _NOISE_M) ** 2)
-    total = np.cumprod(turn)
+    total = np.cumprod(turn, dtype=complex)
     before = np.concatenate([[1.0], total[:-1]])
     return total / np.abs(total), np.cumsum(before * shift)
 

@@ -82,7 +82,7 @@ def _track_stream(table: DetectionTable, settings: TrackingSettings) -> _Followe
 def _follow(table: DetectionTable, settings: TrackingSettings) -> list[I4]:
     """Return the detections (k,) of each object of a stream, ascending."""
     cuts = scene_cuts(table, settings)
-    scenes = np.cumsum(cuts)
+    scenes: I4 = np.cumsum(cuts, dtype=np.int64)
     fragments = [
         group
         for track in _groups(_associate(table, cuts, settings))

@@ -130,7 +130,7 @@ def _pairs(
 
 def _occurrences(frames: Iterable[FrameIdentities]) -> _Occurrences:
     numbers: tuple[dict[Hashable, int], dict[Hashable, int]] = ({}, {})
-    numbered = []
+    numbered: list[tuple[I4, I4, F8]] = []
     for true, found, similarity in frames:
         places = [
             np.array([known.setdefault(name, len(known)) for name in names], np.int64)

@@ -8,7 +8,7 @@ import numpy as np
 from scipy.optimize import linear_sum_assignment
 from scipy.spatial import ConvexHull, QhullError
 
-from shapecat.arrays import F8, U4
+from shapecat.arrays import F8, I4, U4
 from shapecat.geometry import BOX_EDGES, box_corners, rotation_from_quaternion
 from shapecat.types import Box
 
@@ -101,7 +101,7 @@ def match_masks(found: Sequence[U4], true: Sequence[U4]) -> MaskMatches:
     return MaskMatches(f, iou, tuple(zip(rows.tolist(), columns.tolist(), strict=True)), overlap)
 
 
-def _common(found: Sequence[U4], true: Sequence[U4]) -> F8:
+def _common(found: Sequence[U4], true: Sequence[U4]) -> I4:
     """Return the number of pixels that each pair of masks has in common, (found, true)."""
     size = max((int(mask.max()) + 1 for mask in (*found, *true) if len(mask)), default=0)
     common = np.zeros((len(found), len(true)), np.int64)

@@ -155,7 +155,8 @@ def _closed(heights: F8) -> F8:
 
 def _smoothed(heights: F8, bare: Bool) -> F8:
     """Average each pixel (h, w), even if empty, with its neighbours on the object."""
-    weight, value = (~bare).astype(np.float64), np.where(bare, 0.0, heights)
+    weight: F8 = (~bare).astype(np.float64)
+    value: F8 = np.where(bare, 0.0, heights)
     for _ in range(_PASSES):
         value, weight = _blurred(value * weight), _blurred(weight)
         value = np.divide(value, weight, out=np.zeros_like(value), where=weight > 0)

@@ -62,7 +62,7 @@ def paint(
     palette = np.concatenate([_GROUND[None], object_colours, _PLANES])
     pixels = np.concatenate([sparse, dense])
     points, tones = frame.xyz(pixels), owner[pixels]
-    colours = np.zeros(pixels.size, np.uint32)
+    colours: U4 = np.zeros(pixels.size, np.uint32)
     if view is not None:
         colours = true_colours(frame, view, points, pixels, fine, palette, tones)
     bare = np.flatnonzero(colours == 0)

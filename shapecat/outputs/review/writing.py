@@ -43,6 +43,7 @@ from typing import Any
 import numpy as np
 import rerun as rr
 
+from shapecat.arrays import F8
 from shapecat.geometry import IDENTITY, transform
 from shapecat.outputs.colours import colour_of
 from shapecat.outputs.review import shapes
@@ -227,10 +228,10 @@ class _Review:
     def _trace(self, entity: str, labelled: LabelledFrame) -> None:
         """Extend the paths of the tracks, unless the pose in the fixed frame is unknown."""
         pose = self._pose(labelled)
-        positions = {}
+        positions: dict[int, tuple[str, F8]] = {}
         if pose is not None or self._fixed_frame is None:
             for item in labelled.objects:
-                place = np.asarray((item.full or item.box).center, np.float64)
+                place: F8 = np.asarray((item.full or item.box).center, np.float64)
                 positions[item.track] = (
                     item.category,
                     place if pose is None else transform(pose, place),

@@ -4,7 +4,7 @@ from typing import Any
 
 import numpy as np
 
-from shapecat.arrays import F4
+from shapecat.arrays import F4, U2
 from shapecat.recordings.messages import MessageError
 
 __all__ = ["DEPTH_ENCODINGS", "clean_depth", "depth_of_image"]
@@ -47,7 +47,7 @@ def depth_of_image(message: Any, units: float | None = None) -> F4:
     return clean_depth(values, units or default)
 
 
-def clean_depth(values: F4, units: float = 1) -> F4:
+def clean_depth(values: F4 | U2, units: float = 1) -> F4:
     """Convert depth values (h, w) to metres; negative, infinite and NaN values become 0.
 
     ``units`` is the number of units per metre; floating-point values are already metres.

@@ -150,7 +150,8 @@ def frame_rows(table: pa.Table) -> dict[Key, slice]:
 def topic_codes(table: pa.Table) -> tuple[list[str], I4]:
     """Return the topics in a table, and the index of each row's topic, (rows,)."""
     column = table["topic"].combine_chunks().dictionary_encode()
-    return column.dictionary.to_pylist(), np.from_dlpack(column.indices)
+    codes: I4 = column.indices.to_numpy()
+    return column.dictionary.to_pylist(), codes
 
 
 def rows_of(topics: Sequence[str], codes: I4, frames: I4) -> dict[Key, slice]:

@@ -121,7 +121,7 @@ def _resting_arm(rng: Generator, start: F8, end: F8) -> list[Mesh]:
     if kind < 0.6:
         links = _links([elbow, wrist], [thick])
         return [*links, *_gripper(rng, _above(wrist, thick), _above(end, gap))]
-    ahead = (end - start) / max(np.linalg.norm(end - start), 1e-6)
+    ahead = (end - start) / max(float(np.linalg.norm(end - start)), 1e-6)
     heading = float(np.degrees(np.arctan2(ahead[1], ahead[0]))) + rng.uniform(-20, 20)
     size = [rng.uniform(0.12, 0.25), rng.uniform(0.07, 0.16), rng.uniform(0.06, 0.16)]
     hand = rounded_box(size, radius=rng.uniform(0.005, 0.03))

@@ -168,7 +168,7 @@ class World(Record):
         return geometry([(support.mesh, IDENTITY) for support in self.supports] + objects)
 
 
-_NOTHING = Mesh(np.zeros((0, 3)), np.zeros((0, 3)))
+_NOTHING = Mesh(np.zeros((0, 3)), np.zeros((0, 3), int))
 
 
 def pose_from_yaw(angle: float, place: ArrayLike = (0, 0, 0)) -> Pose:

@@ -5,6 +5,7 @@ from collections.abc import Callable
 import numpy as np
 from numpy.random import Generator
 
+from shapecat.arrays import F8
 from shapecat.simulation.shapes.everyday import EVERYDAY
 from shapecat.simulation.shapes.mesh import Mesh, join, moved, standing
 from shapecat.simulation.shapes.parts import ellipsoid, rod
@@ -59,7 +60,7 @@ def _slab(rng: Generator) -> Mesh:
     corners = int(rng.choice([3, 5, 6, 7, 8, 9, 11, 13]))
     angle = np.sort(rng.uniform(0, 2 * np.pi, corners)) + rng.uniform(0, 6)
     radius = log_uniform(rng, 0.03, 0.1) * rng.uniform(0.25, 1.0, corners)
-    outline = np.stack([np.cos(angle), np.sin(angle)], -1) * radius[:, None]
+    outline: F8 = np.stack([np.cos(angle), np.sin(angle)], -1) * radius[:, None]
     if rng.random() < 0.5:
         outline = smooth_path(np.concatenate([outline, outline[:1]]), 40)[:-1]
     return extrude(outline * [1, rng.uniform(0.4, 1.0)], log_uniform(rng, 0.008, 0.09))
