@@ -2,7 +2,6 @@
 
 import re
 from collections.abc import Iterable, Mapping, Sequence
-from contextlib import suppress
 from dataclasses import replace
 from pathlib import Path
 
@@ -15,12 +14,12 @@ from shapecat.runs.labels.meaning import (
     merged_with,
     resolve_labels,
 )
+from shapecat.runs.labels.same_run import require_same_run
 from shapecat.runs.labels.track_table import (
     LABEL_SEEN,
     ORIGINAL,
     TrackRow,
     TrackTable,
-    parse_number,
     read_track_table,
     with_label,
     write_track_table,
@@ -76,7 +75,7 @@ def read_original_table(path: Path) -> tuple[TrackTable, list[str]]:
     OutputError : the table is unreadable, or belongs to another run.
     """
     table = read_track_table(path)
-    _require_same_run(path, table, path.parent)
+    require_same_run(path, table, path.parent)
     if not path.with_name(ORIGINAL).exists():  # of a run by an earlier version
         return table, list(table.problems)
     original = read_track_table(path.with_name(ORIGINAL))
@@ -142,7 +141,7 @@ def _adopt(corrected: Path, folder: Path) -> None:
     if not (corrected.exists() and corrected.samefile(current)):
         _refuse(current, problems)
         table = read_track_table(corrected)
-        _require_same_run(corrected, table, folder, known=False)
+        require_same_run(corrected, table, folder, own=False)
         changed = (row for row in table.rows if row.cells.get(LABEL_SEEN) != row.label)
         result, problems = (
             _relabelled(original, changed),
@@ -242,63 +241,6 @@ def has_labels(path: Path) -> bool:
     OutputError : the table is unreadable.
     """
     return path.exists() and any(read_track_table(path).labels.values())
-
-
-def _require_same_run(path: Path, table: TrackTable, folder: Path, *, known: bool = True) -> None:
-    """Check that a table belongs to the run in ``folder``.
-
-    Parameters
-    ----------
-    known : whether the table is in the folder itself, so that it needs no column ``run``. Any
-        other table without this column must have its tracks at the same positions.
-
-    Raises
-    ------
-    OutputError : the table belongs to another run or to several, or has other positions.
-    """
-    work_id = read_run(folder)["work"] if (folder / "run.json").exists() else ""
-    if not work_id or set(table.runs) == {work_id}:
-        return
-    if not table.runs and (known or _places_agree(table, folder)):
-        return
-    if len(table.runs) > 1:
-        description = f"holds tracks of several runs ({', '.join(table.runs)})"
-    elif table.runs:
-        description = f"holds the tracks of {_described(path.parent, table.run)}"
-    else:
-        description = "has tracks at other positions (and no column `run`)"
-    msg = (
-        f"{path}: {description}, not those of {_described(folder, work_id)}; to match objects by "
-        "place, use --by-place"
-    )
-    raise OutputError(msg)
-
-
-def _places_agree(table: TrackTable, folder: Path) -> bool:
-    """Return whether the tracks of a table have no positions, or the same as in the run."""
-    original = {row.track: row for row in read_track_table(folder / "tracks.csv").rows}
-    return all(
-        _number(row.cells.get(axis)) in {None, _number(original[row.track].cells.get(axis))}
-        for row in table.rows
-        if row.track in original
-        for axis in "xyz"
-    )
-
-
-def _number(cell: str | None) -> float | None:
-    """Return the number in a cell; None if it is not a number."""
-    with suppress(ValueError):
-        return parse_number(cell or "")
-    return None
-
-
-def _described(folder: Path, work: str) -> str:
-    """Return a description of a run, with its folder and recording if the folder holds it."""
-    with suppress(OutputError, KeyError):
-        run = read_run(folder)
-        if run["work"] == work:
-            return f"run {work} ({folder}, of {run['input']['path']})"
-    return f"run {work}"
 
 
 def _relabelled(base: TrackTable, rows: Iterable[TrackRow]) -> TrackTable:
