@@ -115,6 +115,7 @@ def _run_phases(work: Work, content: ContentDigest, begun: float) -> None:
     earlier_s = run["seconds"].pop("total", None) or sum(run["seconds"].values())
     _run_once("perceive", folder, run, lambda: perceive_all(work))
     _run_once("revise", folder, run, lambda: _revise_and_warn(work))
+    require_unchanged(folder, run, job.source)  # or frames of two recordings could be resumed
     identify(run, content)
     write_run(folder, run)
     discard_segments(folder)

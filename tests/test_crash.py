@@ -246,6 +246,28 @@ def test_recording_still_being_written_gives_no_results(recording: Path, tmp_pat
     assert not out.exists()
 
 
+def test_frames_of_changed_recording_are_not_kept(
+    recording: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Once the recording is restored, the same command would resume frames of both contents."""
+    source, out = tmp_path / "live.mcap", tmp_path / "out"
+    shutil.copy(recording, source)
+
+    def change(phase: str, done: int, _total: int | None) -> None:
+        if (phase, done) == ("perceive", 2):
+            os.utime(source, ns=(1, 1))
+
+    def refuse(*_: object) -> None:
+        msg = "disk full"
+        raise OutputError(msg)
+
+    monkeypatch.setattr("shapecat.pipeline.annotate", refuse)
+    with pytest.raises(RecordingError, match="changed while it was processed"):
+        process(Job(source, out / "live", end_s=0.1), change)
+
+    assert not out.exists()
+
+
 def test_unwritable_folder_is_reported_in_one_line(
     shapecat: Callable[..., Result], recording: Path, tmp_path: Path
 ) -> None:
