@@ -170,7 +170,7 @@ def test_seconds_of_killed_run_count_once(
     def kill(*_args: Any) -> None:
         raise KeyboardInterrupt
 
-    monkeypatch.setattr(pipeline, "require_unchanged", kill)
+    monkeypatch.setattr(pipeline, "annotate", kill)
     with pytest.raises(KeyboardInterrupt):
         pipeline.process(job)
     hidden = partial_path(job.folder)
@@ -212,7 +212,7 @@ def test_labels_given_after_an_interruption_are_transferred(
     job = replace(job, settings=changed("tracking.gate_m=0.1"), rrd=False, mcap=False)
     give_label(job.folder, "vase")
     with monkeypatch.context() as patch, pytest.raises(KeyboardInterrupt):
-        patch.setattr(pipeline, "require_unchanged", interrupt)
+        patch.setattr(pipeline, "annotate", interrupt)
         pipeline.process(job)
     assert labels(job.folder) == labels(partial_path(job.folder)) == {"vase"}
     give_label(job.folder, later)

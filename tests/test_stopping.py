@@ -137,7 +137,7 @@ def test_termination_keeps_finished_frames(
     [
         ("track", {"perceive": 1000.0}, 1000),
         # The total is written before the folder is renamed; it is not another phase.
-        ("require_unchanged", {"perceive": 1000.0, "compile": 7.0, "total": 1100.0}, 1100),
+        ("annotate", {"perceive": 1000.0, "compile": 7.0, "total": 1100.0}, 1100),
     ],
 )
 def test_time_before_interruption_counts_once(
