@@ -29,7 +29,7 @@ from shapecat.outputs.report.images import (
     FramePicture,
     crop_of,
     encode,
-    picture_frame,
+    prepare_picture,
     worth_of,
 )
 from shapecat.outputs.report.page import run_page
@@ -345,7 +345,7 @@ def test_only_nearer_objects_occlude() -> None:
     depth[40:80, 80:120] = 0.8  # in front of the right side of the first
     number = np.arange(depth.size).reshape(depth.shape)
     both = labelled(number[40:80, 40:80].ravel(), number[40:80, 80:120].ravel())
-    found = picture_frame(both, depth_frame(depth), None)
+    found = prepare_picture(both, depth_frame(depth), None)
 
     assert found is not None
     assert found.hidden == pytest.approx([0.25, 0])
@@ -357,7 +357,7 @@ def test_depth_is_drawn_as_shaded_relief() -> None:
     v, u = np.mgrid[:120, :160]
     depth = 1 / (1 / 1.5 + 0.002 * np.hypot(u - 80, v - 60).clip(20, 40))
     depth[:, 150:] = 0
-    found = picture_frame(labelled(), depth_frame(depth.astype(np.float32)), None)
+    found = prepare_picture(labelled(), depth_frame(depth.astype(np.float32)), None)
 
     assert found is not None
     image = found.pixels()
@@ -383,7 +383,7 @@ def test_unorganised_cloud_is_drawn_upright(
     points = (wall @ np.array([right, down, away])).astype(np.float32)
     up = [-value for value in down]
     frame = Frame("/d", 0, 0, 0, "lidar", points=points)
-    found = picture_frame(labelled(np.flatnonzero(pole), up=up), frame, None)
+    found = prepare_picture(labelled(np.flatnonzero(pole), up=up), frame, None)
 
     assert found is not None
     left, _, width, height = found.masks[0].box

@@ -20,7 +20,7 @@ from shapecat.recordings.decoding.colour_image import pixels_of
 from shapecat.recordings.messages import MessageError
 from shapecat.types import Camera, Frame, LabelledFrame
 
-__all__ = ["CROP_PX", "Crop", "FramePicture", "crop_of", "encode", "picture_frame", "worth_of"]
+__all__ = ["CROP_PX", "Crop", "FramePicture", "crop_of", "encode", "prepare_picture", "worth_of"]
 
 CROP_PX = 256
 """Longest side of the picture of an object."""
@@ -91,7 +91,7 @@ class Crop(NamedTuple):
     outline: str
 
 
-def picture_frame(
+def prepare_picture(
     labelled: LabelledFrame, frame: Frame, coloured: Coloured | None
 ) -> FramePicture | None:
     """Return a frame prepared for pictures; None for a cloud that no virtual camera can show."""

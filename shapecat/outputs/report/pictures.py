@@ -18,7 +18,7 @@ from shapecat.outputs.report.images import (
     FramePicture,
     crop_of,
     encode,
-    picture_frame,
+    prepare_picture,
     worth_of,
 )
 from shapecat.outputs.report.surfaces import MOST_POINTS, Snapshot, SurfaceDrawing, draw
@@ -93,7 +93,7 @@ class _Collector:
         key = (labelled.topic, labelled.index)
         if frame is not None:
             _require_unchanged(labelled, frame)
-        image = None if frame is None else picture_frame(labelled, frame, coloured)
+        image = None if frame is None else prepare_picture(labelled, frame, coloured)
         candidate_tracks = self.choice.candidates.get(key, frozenset())
         for number, item in enumerate(labelled.objects):
             if item.track not in candidate_tracks:

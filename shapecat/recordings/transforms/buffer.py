@@ -124,7 +124,7 @@ class TransformBuffer:
         self._frames |= {parent, child}
         track = self._tracks.setdefault(child, TransformTrack())
         if static:
-            track.still = sample
+            track.static = sample
         else:
             track.latched |= latched
             track.add(stamp_ns, sample)
@@ -192,8 +192,8 @@ class TransformBuffer:
             return None
         stamps = track.stamps
         known = stamps if stamp_ns is None else max(track.gaps_ns(stamp_ns)) <= self.tolerance_ns
-        if track.still is not None and not known:
-            return track.still.parent
+        if track.static is not None and not known:
+            return track.static.parent
         at = len(stamps) if stamp_ns is None else bisect_right(stamps, stamp_ns)
         return track[max(0, at - 1)].parent
 
@@ -209,8 +209,8 @@ class TransformBuffer:
         stamps = track.stamps
         late, early = track.gaps_ns(stamp_ns)
         if max(late, early) > self.tolerance_ns:
-            if track.still is not None:
-                return pose_of(track.still)
+            if track.static is not None:
+                return pose_of(track.static)
             side = (
                 f"{late * 1e-9:.3f} s after the last"
                 if late > 0

@@ -30,13 +30,13 @@ class TransformTrack:
     Attributes
     ----------
     latched : whether the last one remains valid.
-    still : the static transform, which is valid where no other one is; None without any.
+    static : the static transform, which is valid where no other one is; None without any.
     """
 
     def __init__(self) -> None:
         """Start without samples."""
         self.latched = False
-        self.still: TransformSample | None = None
+        self.static: TransformSample | None = None
         self.stamps = array("q")
         self._parents: list[str] = []
         self._numbers = array("d")  # seven per sample

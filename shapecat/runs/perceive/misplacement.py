@@ -34,6 +34,7 @@ def explain_misplacement(folder: Path, fixed_frame: str | None) -> Iterator[str]
     Parameters
     ----------
     folder : with the tables of frames and detections.
+    fixed_frame : name of the frame of ``center_fixed``; None if the run has none.
     """
     if fixed_frame is None:
         return
