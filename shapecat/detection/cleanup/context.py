@@ -21,7 +21,8 @@ CONTEXT_FEATURES = np.dtype(
         ("object", OBJECT_FEATURES),
         ("logit", "f4"),  # by itself; then the mean verdicts from -1, background, to 1, object,
         *((name, "f4") for name in _NEIGHBOURS),  # on its neighbours of each kind; 0 without any
-    ]
+    ],
+    align=True,
 )
 """The features of a segment among others."""
 

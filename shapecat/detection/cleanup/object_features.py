@@ -42,7 +42,8 @@ _SURROUNDINGS = np.dtype(
         ("depth_edge", "f4"),  # share of the boundary in front of what is farther away
         ("plane_height", "f4"),  # heights of the plane around it, over the least of an object's
         ("plane_noise", "f4"),  # sample: their mean, and their standard deviation
-    ]
+    ],
+    align=True,
 )
 """Where a segment ends, where its surface continues, and how level the plane is around it."""
 _VISIBILITY = np.dtype(
@@ -54,11 +55,13 @@ _VISIBILITY = np.dtype(
         ("top_by_noise", "f4"),  # top over the least height of an object's sample at that depth
         ("slant", "f4"),  # area over that of its cells if they faced the camera
         ("ragged", "f4"),  # squared boundary over cells: 16 for a square
-    ]
+    ],
+    align=True,
 )
 """The visibility of a segment."""
 OBJECT_FEATURES = np.dtype(
-    [("segment", SEGMENT_FEATURES), ("surroundings", _SURROUNDINGS), ("visibility", _VISIBILITY)]
+    [("segment", SEGMENT_FEATURES), ("surroundings", _SURROUNDINGS), ("visibility", _VISIBILITY)],
+    align=True,
 )
 """The features of a segment that may be an object; all are float32, lengths in metres or ratios.
 The trees index them in this order."""

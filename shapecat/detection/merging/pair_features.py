@@ -47,7 +47,8 @@ _ADJACENCY = np.dtype(
         ("above_first_m", "f4"),
         ("border_m", "f4"),
         ("concavity_deg", "f4"),  # mean concave angle of the contact
-    ]
+    ],
+    align=True,
 )
 """Features of the border between two segments."""
 _RELATION = np.dtype(
@@ -76,7 +77,8 @@ _RELATION = np.dtype(
         ("cells", "f4"),  # of the first
         ("cell_m", "f4"),
         ("down", "f4"),  # as in `ViewGeometry`
-    ]
+    ],
+    align=True,
 )
 """The relative position of two segments, and how well they are visible."""
 PAIR_FEATURES = np.dtype(
@@ -85,7 +87,8 @@ PAIR_FEATURES = np.dtype(
         ("first", SEGMENT_FEATURES),
         ("second", SEGMENT_FEATURES),
         ("relation", _RELATION),
-    ]
+    ],
+    align=True,
 )
 """The features of two segments, the smaller one first; all are float32, lengths in metres or
 ratios. The trees index them in this order."""

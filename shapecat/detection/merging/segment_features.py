@@ -37,7 +37,8 @@ SEGMENT_FEATURES = np.dtype(
         ("facing_up", "f4"),  # share of the area
         ("area_m2", "f4"),
         ("filled", "f4"),  # area over width times height
-    ]
+    ],
+    align=True,
 )
 """Features of one segment: its size, shape and faces, and the composition of its boundary."""
 

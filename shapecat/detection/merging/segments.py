@@ -57,7 +57,8 @@ SEGMENT = np.dtype(
         ("hidden", "f4"),  # boundary behind a surface of no segment
         ("shelf_edge", "f4"),  # boundary with another plane
         ("upper_silhouette", "f4"),  # lower boundary in front of a farther surface
-    ]
+    ],
+    align=True,
 )
 """The statistics of a segment."""
 _MINIMA, _MAXIMA, _FIELDS = 2, 4, SEGMENT.itemsize // 4
@@ -70,7 +71,8 @@ PAIR = np.dtype(
         ("near", "f4"),  # neighbours at the same depth that are not linked
         ("rests_on", "f4"),  # links beyond which the second faces up
         ("rests_on_height", "f4"),  # the sum of the heights there
-    ]
+    ],
+    align=True,
 )
 """The statistics of an ordered pair of segments: counts along their common border."""
 Records: TypeAlias = NDArray[np.void]
