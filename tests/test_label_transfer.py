@@ -78,6 +78,7 @@ def make_run(
     digest: str = "xxh3-128:one",
     fixed_frame: str | None = "map",
     size: float | tuple[float, float, float] = 0.08,
+    first_size: tuple[float, float, float] | None = None,
     labels: Mapping[int, str] | None = None,
     alike: int = 1,
 ) -> Path:
@@ -118,7 +119,8 @@ def make_run(
     found = {name: [columns[name][k] for k in order] for name in ("topic", "frame", "stamp_ns")}
     empty = {field.name: [None] * len(rows) for field in DETECTIONS}
     sides = size if isinstance(size, tuple) else (size, size, 1.3 * size)
-    found = {**empty, **found, "size": [list(sides)] * len(rows)}
+    sizes = [list(first_size or sides), *[list(sides)] * (len(rows) - 1)]
+    found = {**empty, **found, "size": sizes}
     write_table(folder / "detections.parquet", found, DETECTIONS)
     write_table(folder / "frames.parquet", {f.name: [] for f in FRAMES}, FRAMES)
     write_csv(folder / "tracks.csv", objects, work, labels or {})
@@ -598,6 +600,16 @@ def test_object_of_another_size_does_not_match(tmp_path: Path) -> None:
     (missed,) = transfer_labels(source, target).missed
 
     assert "another size" in missed.reason
+
+
+def test_size_of_an_object_is_not_that_of_one_view(tmp_path: Path) -> None:
+    """In the first view it may be joined with its neighbour."""
+    source = make_run(tmp_path / "source", {1: static(CUP)}, labels={1: "mug"})
+    target = second(tmp_path / "target", {1: static(CUP)}, first_size=(0.4, 0.1, 0.1))
+
+    transfer_labels(source, target)
+
+    assert labels_of(target) == {1: "mug"}
 
 
 @pytest.mark.parametrize("frame", [None, "odom"])

@@ -14,7 +14,7 @@ from rosbags.typesys import Stores, get_types_from_msg, get_typestore
 from shapecat.cameras.colour import ColourImage, ColourView
 from shapecat.errors import NoStreamError
 from shapecat.geometry import rotation_from_quaternion
-from shapecat.recordings import choose_streams, open_recording
+from shapecat.recordings import choose_streams, colour_frames, open_recording
 from shapecat.recordings.colour_frames import frames_with_colour
 from shapecat.recordings.colour_streams import ColourStream, choose_colour
 from shapecat.recordings.decoding.colour_image import cloud_colours, pixels_of
@@ -330,6 +330,19 @@ def test_image_is_kept_for_depth_logged_late(tmp_path: Path) -> None:
     pairs, _ = read(write(tmp_path / "a.mcap", in_order(items)))
 
     assert [v and v.image.stamp_ns for _, v in pairs] == [times[k] for k in (0, 6, 12)]
+
+
+def test_images_kept_for_late_depth_are_limited_in_bytes(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Waiting for depth, 64 raw images of 12 megapixels would take 2 GB."""
+    monkeypatch.setattr(colour_frames, "_BUFFERED_BYTES", 3 * gradient().nbytes)
+    times = [EPOCH + 20 * k * MS for k in range(10)]
+    items = [(t, times[-1] + MS, message) for t, _, message in depth_items(times[5], times[8])]
+    items += [("/cam/color/image_raw", t, raw(t, gradient(), "rgb8")) for t in times]
+    pairs, _ = read(write(tmp_path / "a.mcap", in_order(items)))
+
+    assert [v and v.image.stamp_ns for _, v in pairs] == [None, times[8]]
 
 
 @pytest.mark.parametrize("bare", [0, 2])

@@ -1,5 +1,6 @@
 import errno
 import os
+from contextlib import nullcontext
 from pathlib import Path
 from threading import Thread
 from typing import Any
@@ -309,3 +310,21 @@ def test_file_is_flushed_before_and_after_renaming(
         hidden.write_text("more")
 
     assert len(flushed) == 2
+
+
+@pytest.mark.parametrize(("code", "raised"), [(errno.EIO, True), (errno.EINVAL, False)])
+def test_failing_disk_is_an_error_but_a_disk_without_flush_is_not(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, code: int, raised: bool
+) -> None:
+    """A file that was not stored would be taken for complete; some network disks cannot flush."""
+
+    def fsync(_number: int) -> None:
+        raise OSError(code, os.strerror(code))
+
+    monkeypatch.setattr(os, "fsync", fsync)
+    monkeypatch.delenv("SHAPECAT_FSYNC")
+    outcome = pytest.raises(OutputError, match="cannot be written") if raised else nullcontext()
+    with outcome, replacing(tmp_path / "f") as hidden:
+        hidden.write_text("all")
+
+    assert (tmp_path / "f").exists() is not raised

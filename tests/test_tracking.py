@@ -331,6 +331,14 @@ def test_repeatedly_hidden_object_is_one_track() -> None:
             },
             True,
         ),
+        (  # farther than its size
+            {
+                "start": [[0, 0, 0], [0.25, 0, 0]],
+                "first_ns": [0, 3 * SECOND],
+                "cut": [[False, True], [True, False]],
+            },
+            False,
+        ),
         ({"start": [[0, 0, 0], [0.3, 0, 0]], "rest": [[0.3, 0, 0], [np.nan] * 3]}, True),
         ({"first_ns": [0, SECOND]}, False),  # the first one lasts until 2 s: they overlap
     ],

@@ -97,6 +97,7 @@ JUDGED_BY: dict[str, Sequence[str]] = {
     "shapecat.runs.labels.same_objects": ("test_label_transfer",),
     "shapecat.runs.labels.track_table": ("test_labels", "test_label_transfer"),
     "shapecat.runs.labels.transfer": ("test_label_transfer",),
+    "shapecat.runs.perceive.missing_planes": ("test_missing_planes",),
     "shapecat.runs.perceive.phases": ("test_pipeline", "test_crash"),
     "shapecat.runs.perceive.second_look": ("test_second_look",),
     "shapecat.runs.perceive.up_report": ("test_gravity",),
