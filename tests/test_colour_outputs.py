@@ -165,6 +165,23 @@ def _rows(run: Path, entity: str) -> list[dict[str, Any]]:
     return [row for row in rows(run / "review.rrd", entity) if len(row) > 2]
 
 
+def test_mask_of_merged_tracks_covers_all_parts(run: Path) -> None:
+    """Exports, review and report would show half of an object that a person put together."""
+    finished = read_finished(run)
+    first = next(iter(finished.frames()))
+    masks = first.masks
+    assert masks is not None
+    one, other = [item for item in first.objects if item.detections[0] in masks.boxes][:2]
+    whole = replace(one, detections=(*one.detections, *other.detections))
+    with open_source(finished.run) as source:
+        ((_, _, coloured),) = with_colour([replace(first, objects=(whole,))], source, finished.run)
+
+    assert coloured is not None
+    shape = masks.height, masks.width
+    parts = [mask_of(masks, item.detections).full(*shape) for item in (one, other)]
+    np.testing.assert_array_equal(coloured.masks[0].full(*shape), parts[0] | parts[1])
+
+
 def test_image_annotations_have_stamp_and_frame_of_image(run: Path) -> None:
     """Foxglove draws only annotations with exactly the timestamp of the image."""
     images = read_ros(run / "annotated.mcap", IMAGES)
