@@ -403,6 +403,21 @@ def test_messages_compressed_one_by_one_in_mcap_are_read(tmp_path: Path) -> None
         assert recording.warnings == ["/a: skipped a damaged compressed message"]
 
 
+def test_damage_found_while_a_folder_is_read_is_reported(tmp_path: Path) -> None:
+    """The frames of a damaged part would be missing without a word."""
+    path = tmp_path / "bag"
+    path.mkdir()
+    part = write_mcap(path / "bag_0.mcap", list(range(20)))
+    data = bytearray(part.read_bytes())
+    at = data.index(b"message 9")
+    data[at : at + 9] = b"massage 9"
+    part.write_bytes(data)
+
+    with open_recording(path) as recording:
+        assert 0 < len(list(recording.messages())) < 20
+        assert any(text.startswith("bag_0.mcap: skipped the chunk") for text in recording.warnings)
+
+
 def test_file_not_listed_in_metadata_is_not_read(tmp_path: Path) -> None:
     """Guards against another recording, or a repaired copy of a part, beside the parts."""
     path = write_folder(tmp_path / "bag", StoragePlugin.MCAP)

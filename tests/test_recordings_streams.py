@@ -122,6 +122,17 @@ def test_only_calibration_of_another_frame_causes_warning(tmp_path: Path) -> Non
     assert "intrinsics of another camera?" in warning
 
 
+def test_slash_before_a_frame_does_not_make_it_another(tmp_path: Path) -> None:
+    """In ROS 1, some drivers write /camera in one topic and camera in the other."""
+    items = depth_and_info("/cam/depth/image_raw", "/cam/depth/info")
+    in_frame(items[:1], "camera")
+    in_frame(items[1:], "/camera")
+
+    with open_recording(write(tmp_path / "a.mcap", items)) as recording:
+        assert choose_streams(recording)[0].info_topic == "/cam/depth/info"
+        assert not recording.warnings
+
+
 @pytest.mark.parametrize("other", ["aligned_depth_to_color/image_raw", "depth/color/points"])
 def test_stream_with_calibration_of_another_camera_is_chosen_last(
     tmp_path: Path, other: str
