@@ -20,7 +20,9 @@ from shapecat.errors import OutputError, RecordingError
 from shapecat.pipeline import annotate_again, process
 from shapecat.runs.folder import read_run, writing_outputs
 from shapecat.runs.jobs import Job
+from tests.mcap_files import read_ros
 from tests.scenes import record
+from tests.test_exports import relabel
 from tests.track_tables import untimed_table
 
 FRAMES = 50
@@ -200,6 +202,26 @@ def test_interrupted_annotation_is_finished(
     process(job)
 
     assert contents(folder) == before
+
+
+def test_outputs_show_new_labels_after_an_interrupted_annotation(
+    recording: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """The next command would take the old outputs for complete."""
+    folder = tmp_path / "table"
+    job = Job(recording, folder, end_s=0.3, rrd=False)
+    process(job)
+    relabel(folder, {1: "wine glass"})
+    with monkeypatch.context() as patch:
+        patch.setattr("shapecat.outputs.annotation.annotated_mcap.write_annotated", interrupt)
+        with pytest.raises(KeyboardInterrupt):
+            annotate_again(folder, None)
+
+    process(job)
+
+    arrays = [m for _, m in read_ros(folder / "annotated.mcap", "/shapecat/detections")]
+    shown = {(d.id, d.results[0].hypothesis.class_id) for a in arrays for d in a.detections}
+    assert ("1", "wine glass") in shown
 
 
 def test_two_commands_cannot_write_same_outputs(recording: Path, tmp_path: Path) -> None:

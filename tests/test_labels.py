@@ -604,14 +604,14 @@ def test_merged_parts_of_one_frame_become_one_object(tmp_path: Path) -> None:
 def test_new_categories_come_last(tmp_path: Path) -> None:
     """A new name before the others would renumber the classes of a data set."""
     run = run_info(model={"categories": ["cup", "can"]})
-    names = ("vase", "can", "unknown", "amphora", "cup")
+    names = ("vase", "can", "unknown", "pan", "amphora", "jar", "cup", "urn")
     labels = {k: TrackLabel(k, name, 1.0) for k, name in enumerate(names, 1)}
 
     alone = FinishedRun(tmp_path, run, labels)
     beside = FinishedRun(tmp_path, run, labels, common=("can", "jug"))
 
-    assert alone.categories == ("cup", "can", "amphora", "vase")
-    assert beside.categories == ("can", "jug", "cup", "amphora", "vase")
+    assert alone.categories == ("cup", "can", "amphora", "jar", "pan", "urn", "vase")
+    assert beside.categories == ("can", "jug", "cup", "amphora", "jar", "pan", "urn", "vase")
 
 
 def test_deleted_track_is_not_shown(tmp_path: Path) -> None:
