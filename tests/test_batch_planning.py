@@ -752,6 +752,23 @@ def test_entries_of_other_work_are_replaced(source: Path, monkeypatch: pytest.Mo
     assert manifest.entries["lab"].state == "complete"
 
 
+@pytest.mark.parametrize(
+    "option", [{"topics": ("/front",)}, {"start_s": 1.5}, {"end_s": 2.5}, {"every": 3}]
+)
+def test_other_frames_are_other_work(
+    source: Path, monkeypatch: pytest.MonkeyPatch, option: dict[str, Any]
+) -> None:
+    """Results at a URL are told apart by this key alone: those of other frames would be kept."""
+    monkeypatch.setattr("shapecat.batch.plans.load_model", lambda _path: MODEL)
+    out = f"memory://work-{next(iter(option))}"
+    keys = set()
+    for job in (Job(Path(), Path()), Job(Path(), Path(), **option)):
+        with plan_batch(job, [str(source)], out) as batch:
+            keys |= {task.work for task in batch.tasks}
+
+    assert len(keys) == 2
+
+
 INFO: Mapping[str, Any] = {"size": 7, "ETag": "e1", "mtime": 1.5}
 
 

@@ -146,6 +146,24 @@ def test_closing_table_lists_a_hundred_recordings_or_none(
     assert count == 1 or f"{count} complete, 0 failed, {30 * count:,} frames" in out
 
 
+def test_lost_labels_are_reported_in_a_batch_of_any_size(
+    capsys: pytest.CaptureFixture[str],
+) -> None:
+    """After the hundredth recording, nobody would learn which labels were not transferred."""
+    tally, names = OUTCOMES.Tally(keep_all=False), [f"r{k}" for k in range(102)]
+    for name in names:
+        lost = {"transferred": [{}], "not_transferred": []} if name == "r101" else None
+        summary = SimpleNamespace(
+            counts={"frames": 30, "tracks": {}}, seconds=1.0, processed=True,
+            corrections=lost, folder=Path(name),
+        )  # fmt: skip
+        job = SimpleNamespace(name=name, folder=Path("out", name), target="")
+        tally.add(SimpleNamespace(job=job, summary=summary, code=0))
+    OUTCOMES.print_closing([task(name) for name in names], tally)
+
+    assert capsys.readouterr().err == "r101: transferred 1 of 1 corrected labels\n"
+
+
 @pytest.mark.parametrize("name", ["a.mcap", "a.truth.json", "a.labels.npz", "a.color_labels.npz"])
 @pytest.mark.parametrize("options", [(), ("--color",)])
 def test_simulate_replaces_no_file_without_overwrite(

@@ -11,14 +11,19 @@ import numpy as np
 import pyarrow as pa
 import pytest
 
-from shapecat.config import Settings
+from shapecat.config import DetectionSettings, Settings
 from shapecat.geometry import IDENTITY, LINK_FROM_OPTICAL
 from shapecat.pipeline import process
 from shapecat.recordings.transforms.gravity import Orientation
 from shapecat.runs.folder import read_run
 from shapecat.runs.jobs import Job
 from shapecat.runs.perceive import phases as perceiving
-from shapecat.runs.perceive.second_look import _around, _streams, frames_to_revise
+from shapecat.runs.perceive.second_look import (
+    Revision,
+    _around,
+    _streams,
+    frames_to_revise,
+)
 from shapecat.runs.tables.schemas import FRAMES, PLANES
 from shapecat.simulation import IDEAL, make_scene, render_frame
 from shapecat.simulation.messages import MessageFactory
@@ -458,3 +463,22 @@ def test_frame_with_same_given_up_is_not_revised() -> None:
     before = chosen["/d", 12].up_given
     assert before is not None
     np.testing.assert_allclose(before, given[12], atol=1e-6)
+
+
+def test_revised_frame_is_fused_with_the_frames_before_it(monkeypatch: pytest.MonkeyPatch) -> None:
+    """With other revised frames only, it would be noisier than the frames beside it."""
+    camera, depth = Camera(8, 6, 7.0, 7.0, 3.5, 2.5), np.ones((6, 8), np.float32)
+    stamps = [EPOCH + k * PERIOD for k in range(6)]
+    read = [Frame(TOPIC, k, at, at, "optical", depth, camera) for k, at in enumerate(stamps)]
+    given: Any = [(frame, None, (None, None, IDENTITY)) for frame in read]
+    monkeypatch.setattr(perceiving, "_oriented", lambda *_: iter(given))
+    monkeypatch.setattr(perceiving, "_upright", lambda *_: None)
+    settings = Settings(detection=DetectionSettings(fuse_frames=3))
+    work: Any = SimpleNamespace(run={"fixed_frame": None}, job=SimpleNamespace(settings=settings))
+    up = np.array([0, -1, 0], np.float32)
+    chosen = {(TOPIC, k): Revision(up, None) for k in (1, 4)}
+
+    inputs = [one for _, one in perceiving._views_again(work, chosen)]
+
+    assert [one.frame.index for one in inputs] == [1, 4]
+    assert [[each.frame.index for each in one.earlier] for one in inputs] == [[0], [3, 2]]
