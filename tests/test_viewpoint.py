@@ -202,7 +202,8 @@ def test_cloud_in_the_map_needs_no_transforms(tmp_path: Path) -> None:
 def test_colour_camera_is_placed_beside_the_camera_of_a_moved_cloud(tmp_path: Path) -> None:
     """Transforms relate it to the frame that the cloud names: masks would lie elsewhere."""
     pose = Pose(rotation_from_quaternion((0.3, -0.6, 0.4, 0.5)), np.array([0.3, -1.2, 0.8]))
-    links = [("base_link", "color", pose)]  # where the depth camera is, too
+    beside = Pose(rotation_from_quaternion((0.1, 0.2, -0.1, 0.9)), np.array([0.05, -0.02, 0.01]))
+    links = [("base_link", "color", compose(pose, beside))]
     points = posed(organized_points(wavy_depth()))
     items = [
         ("/tf_static", EPOCH, MAKE.transforms(links, EPOCH)),
@@ -217,8 +218,9 @@ def test_colour_camera_is_placed_beside_the_camera_of_a_moved_cloud(tmp_path: Pa
 
     assert view is not None
     assert view.colour_from_depth is not None
-    np.testing.assert_allclose(view.colour_from_depth.rotation, np.eye(3), atol=1e-4)
-    np.testing.assert_allclose(view.colour_from_depth.translation, 0, atol=1e-4)
+    expected = inverse(beside)
+    np.testing.assert_allclose(view.colour_from_depth.rotation, expected.rotation, atol=1e-4)
+    np.testing.assert_allclose(view.colour_from_depth.translation, expected.translation, atol=1e-4)
 
 
 def read(path: Path) -> list[Frame]:
