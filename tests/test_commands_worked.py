@@ -4,6 +4,8 @@ import json
 import re
 from collections.abc import Callable
 from concurrent.futures import Future
+from contextlib import nullcontext
+from functools import partial
 from importlib import import_module
 from pathlib import Path
 from types import SimpleNamespace
@@ -20,11 +22,13 @@ from shapecat.outputs.exports.dataset_frames import Selection
 from shapecat.outputs.exports.formats import Exported
 from shapecat.runs.jobs import Summary
 from shapecat.runs.labels.transfer import TABLE_ALONE
+from shapecat.system.stopping import Stopped
 from tests.scenes import record
 
 Run = Callable[..., Result]
 
 OUTCOMES: Any = import_module("shapecat.cli.outcomes")
+PROCESS: Any = import_module("shapecat.cli.process")
 PROGRESS: Any = import_module("shapecat.cli.progress")
 RENDER: Any = import_module("shapecat.cli.render")
 
@@ -85,6 +89,24 @@ def test_time_left_has_hours_minutes_and_seconds() -> None:
     words = [PROGRESS._duration(seconds) for seconds in (3903.4, 36_000, 125, 59.6, -2)]
 
     assert words == ["1:05:03", "10:00:00", "2:05", "1:00", "0:00"]
+
+
+@pytest.mark.parametrize(
+    ("error", "ended"),
+    [(None, "shutdown"), (Stopped(2), "stop"), (KeyError("bug"), "terminate")],
+)
+def test_workers_save_their_frames_after_a_signal_only(error: Any, ended: str) -> None:
+    """Killed by Ctrl+C, they would lose frames, and leave claims and temporary folders behind."""
+    calls: list[str] = []
+    executor = SimpleNamespace(
+        **{name: partial(calls.append, name) for name in ("shutdown", "stop", "terminate")}
+    )
+    leave = nullcontext() if error is None else pytest.raises(type(error))
+    with leave, PROCESS._shutting_down(executor):
+        if error is not None:
+            raise error
+
+    assert calls == [ended]
 
 
 def test_closing_table_follows_order_of_plan(capsys: pytest.CaptureFixture[str]) -> None:
@@ -152,7 +174,7 @@ def test_lost_labels_are_reported_in_a_batch_of_any_size(
     """After the hundredth recording, nobody would learn which labels were not transferred."""
     tally, names = OUTCOMES.Tally(keep_all=False), [f"r{k}" for k in range(102)]
     for name in names:
-        lost = {"transferred": [{}], "not_transferred": []} if name == "r101" else None
+        lost: Any = {"transferred": [{}], "not_transferred": []} if name == "r101" else None
         summary = SimpleNamespace(
             counts={"frames": 30, "tracks": {}}, seconds=1.0, processed=True,
             corrections=lost, folder=Path(name),
