@@ -1,6 +1,7 @@
 """Tests of executors: workers fail alone, end with their parent, and keep the order of items."""
 
 import gc
+import logging
 import os
 import subprocess
 import sys
@@ -248,6 +249,23 @@ def test_ray_that_does_not_start_is_not_blamed_on_a_scheduler(
         open_executor("ray", workers=1)
     with pytest.raises(ConfigError, match=r"ray://a:1: no Ray cluster answers: no space"):
         open_executor("ray", workers=1, address="ray://a:1")
+
+
+def test_dask_logs_no_steps(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Dask's log of what it does hid the progress of the command."""
+    distributed = pytest.importorskip("distributed")
+
+    def fail(*_args: object, **_options: object) -> None:
+        raise OSError
+
+    monkeypatch.setattr(distributed, "Client", fail)
+    logging.getLogger("distributed").setLevel(logging.INFO)  # as when it is imported
+    with pytest.raises(ConfigError, match="no Dask scheduler answers"):
+        open_executor("dask", workers=1, address="tcp://127.0.0.1:1")
+
+    scheduler = logging.getLogger("distributed.scheduler")
+    assert not scheduler.isEnabledFor(logging.INFO)
+    assert scheduler.isEnabledFor(logging.WARNING)
 
 
 def test_dask_runs_equal_calls_separately() -> None:

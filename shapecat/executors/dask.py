@@ -1,5 +1,6 @@
 """Adapter for Dask, whose client already has the interface of `concurrent.futures`."""
 
+import logging
 from concurrent.futures import Future
 from contextlib import suppress
 from typing import Any
@@ -60,6 +61,7 @@ def open_dask(workers: int, address: str | None) -> WorkerExecutor:
     except ImportError as error:
         msg = "--executor dask needs Dask: in a clone of shapecat, pip install '.[cluster]'"
         raise ConfigError(msg) from error
+    logging.getLogger("distributed").setLevel(logging.WARNING)  # its steps would hide our progress
     if address is None:
         with single_threaded():
             cluster = LocalCluster(
