@@ -5,7 +5,7 @@ from collections.abc import Iterable
 from pathlib import Path
 
 from shapecat.errors import RecordingError
-from shapecat.runs.labels.meaning import is_category_name
+from shapecat.runs.labels.meaning import NAME_RULE, is_category_name
 from shapecat.types import UNKNOWN
 
 __all__ = ["require_category_names"]
@@ -36,7 +36,7 @@ def require_category_names(root: Path, names: Iterable[str], known: Iterable[str
             if spelled[name.lower()] not in known:
                 problem = f"there is also a folder {spelled[name.lower()]}"
         elif not is_category_name(name):
-            problem = "reserved, or not a letter and up to 59 letters, digits and .+&'()-_"
+            problem = f"reserved, or not {NAME_RULE}"
         else:
             spelled[name.lower()] = name
             continue

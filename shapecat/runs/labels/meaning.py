@@ -13,6 +13,7 @@ from shapecat.types import CATEGORIES, UNKNOWN
 
 __all__ = [
     "DELETE",
+    "NAME_RULE",
     "TrackLabel",
     "find_misread",
     "is_category_name",
@@ -31,6 +32,8 @@ _NEW = re.compile(r"new +(.+)", re.IGNORECASE)
 _RESERVED = ("none", "dontcare", "na", "nan", "null")
 """Names that mean "no object" in exported formats, or "no value" to readers of tables."""
 _NAME = re.compile(r"[^\W\d_][\w .+&'()-]{0,58}[\w)]|[^\W\d_]")
+NAME_RULE = "a letter followed by letters, digits, spaces and - _ . + & ' ( ), at most 60 in all"
+"""What the name of a category is, in words."""
 
 
 class TrackLabel(NamedTuple):
@@ -176,7 +179,8 @@ def _understand(label: str, names: dict[str, str]) -> _Verdict:
     new = _NEW.fullmatch(label)
     name = new[1] if new else label
     if not is_category_name(name):
-        msg = f"{label!r} is not a category, `{DELETE}` or `merge with N`"
+        hint = "" if _NAME.fullmatch(_without_marks(name)) else f"; a category is {NAME_RULE}"
+        msg = f"{label!r} is not a category, `{DELETE}` or `merge with N`{hint}"
         raise ValueError(msg)
     nearest = _nearest(name.lower(), [*names, DELETE])
     if nearest and not new:
