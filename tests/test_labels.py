@@ -108,7 +108,7 @@ def test_category_names_are_normalised(run: Path, label: str, meant: str) -> Non
         ("merge with 4", "forms a loop: 4 -> 4"),
         ("7", "is not a category"),
         ("../../etc", "is not a category"),
-        ("a/b", "is not a category"),
+        ("a/b", "a category is a letter followed by letters, digits, spaces and - _ . + & ' ( )"),
         ("merge", "is not a category"),
         ("del", "is not a category"),
         (".", "is not a category"),
@@ -132,7 +132,7 @@ def test_confidence_outside_0_to_1_is_refused(run: Path, confidence: str) -> Non
     changed = ",".join({**cells, "confidence": confidence}.values())
     (run / "tracks.csv").write_text("\n".join([header, changed, *rest]))
 
-    with pytest.raises(OutputError, match=f"one from 0 to 1, got .*'{confidence}'"):
+    with pytest.raises(OutputError, match=f"a confidence from 0 to 1, got .*'{confidence}'"):
         read_labels(run / "tracks.csv")
 
 
@@ -252,7 +252,7 @@ def test_line_deleted_from_own_table_is_refused(run: Path) -> None:
     (run / "tracks.csv").write_text(header + "".join(others))
     (run.parent / "mine.csv").write_text(labelled(t2="plate"))
 
-    missing = r"  missing: #4, #2; restore the lines from tracks\.original\.csv"
+    missing = r"  missing tracks: #4, #2; restore the lines from tracks\.original\.csv"
     with pytest.raises(OutputError, match=missing):
         read_labels(run / "tracks.csv")
     for corrected in (run / "tracks.csv", run.parent / "mine.csv"):
@@ -267,7 +267,7 @@ def test_error_lists_few_of_many_missing_tracks(run: Path, monkeypatch: pytest.M
     monkeypatch.setattr("shapecat.runs.labels.corrections._LISTED", 2)
     (run / "tracks.csv").write_text(HEADER)
 
-    with pytest.raises(OutputError, match="missing: #4, #2 and 2 more; restore"):
+    with pytest.raises(OutputError, match="missing tracks: #4, #2 and 2 more; restore"):
         read_labels(run / "tracks.csv")
 
 

@@ -85,8 +85,8 @@ def read_original_table(path: Path) -> tuple[TrackTable, list[str]]:
     if missing:
         more = f" and {len(missing) - _LISTED} more" if len(missing) > _LISTED else ""
         problems.append(
-            f"missing: {', '.join(missing[:_LISTED])}{more}; restore the lines from {ORIGINAL}, or "
-            f"write `{DELETE}` in the column label to remove objects"
+            f"missing tracks: {', '.join(missing[:_LISTED])}{more}; restore the lines from "
+            f"{ORIGINAL}, or write `{DELETE}` in the column label to remove objects"
         )
     rows = tuple(
         replace(row, cells={**edited[row.track].cells, **row.cells})

@@ -159,7 +159,7 @@ def _row(line: int, cells: Mapping[str, str]) -> TrackRow | str:
             raise ValueError  # noqa: TRY301  the same message for all that is not such a number
     except (KeyError, ValueError, OverflowError):
         text = f"track {cells.get('track', '')!r}, confidence {cells.get('confidence', '')!r}"
-        return f"line {line}: expected a whole number and one from 0 to 1, got {text}"
+        return f"line {line}: expected a track number and a confidence from 0 to 1, got {text}"
     return TrackRow(
         line=line,
         track=int(track),
