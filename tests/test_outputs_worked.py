@@ -822,7 +822,7 @@ def test_scene_node_text_has_track_size_and_flags() -> None:
     whole = replace(found[0].box, size=np.array([0.14, 0.08, 0.21]))
     texts.append(_described(scene, Node("object", 0), {0: replace(item, full=whole)}))
 
-    assert _described(scene, Node("plane", 0), {}) == "plane 0: 0.73 m high, 0.57 m2"
+    assert _described(scene, Node("plane", 0), {}) == "plane 0: 0.73 m high, 0.57 m²"
     assert texts == [
         "cup #6: 12 x 7 x 20 cm",
         "cup #6: 12 x 7 x 20 cm, cut by the border, occluded",
@@ -899,9 +899,9 @@ def test_missing_frame_error_lists_existing_frames(tmp_path: Path) -> None:
 
     assert _topic(tmp_path, 6, None) == "/a"
     for frame, topic, message in (
-        (2, "/a", "no frame 2 on /a; there are /a: 3 to 9"),
-        (4, None, "no frame 4; there are /a: 3 to 9; /b: 0 to 2"),
-        (6, "/c", "no frame 6 on /c; there are none"),
+        (2, "/a", "no frame 2 on /a; its frames: 3 to 9 of /a"),
+        (4, None, "no frame 4; its frames: 3 to 9 of /a, 0 to 2 of /b"),
+        (6, "/c", "no frame 6 on /c; its frames: none"),
     ):
         with pytest.raises(OutputError) as error:
             _topic(tmp_path, frame, topic)

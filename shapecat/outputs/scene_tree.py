@@ -115,8 +115,8 @@ def _topic(folder: Path, frame: int, topic: str | None) -> str:
     if having:
         msg = f"{folder}: frame {frame} is on {', '.join(having)}; choose one with --topic"
         raise OutputError(msg)
-    available = "; ".join(f"{name}: {n[0]} to {n[-1]}" for name, n in frames.items()) or "none"
-    msg = f"{folder}: no frame {frame}{f' on {topic}' if topic else ''}; there are {available}"
+    available = ", ".join(f"{n[0]} to {n[-1]} of {name}" for name, n in frames.items()) or "none"
+    msg = f"{folder}: no frame {frame}{f' on {topic}' if topic else ''}; its frames: {available}"
     raise OutputError(msg)
 
 
@@ -166,7 +166,7 @@ def _apply_labels(
 def _described(scene: Scene, node: Node, objects: Mapping[int, LabelledObject]) -> str:
     if node.kind == "plane":
         plane = scene.planes[node.index]
-        return f"plane {node.index}: {plane.height_m:.2f} m high, {plane.area_m2:.2f} m2"
+        return f"plane {node.index}: {plane.height_m:.2f} m high, {plane.area_m2:.2f} m²"
     item = objects.get(node.index)
     name = "object in no track" if item is None else f"{item.category} #{item.track}"
     shown_item = item or scene.candidates[node.index]
