@@ -323,4 +323,4 @@ def test_frames_that_cannot_be_fused_are_reported(job: Job, tmp_path: Path) -> N
     process(replace(job, source=source))
 
     (warning,) = read_run(job.folder)["warnings"]
-    assert "the pose of the sensor is unknown in 4 frames" in warning
+    assert "the pose of the sensor is unknown (frames: 4)" in warning

@@ -799,7 +799,7 @@ def test_baselines_need_two_objects_of_each_category(trained: Path, tmp_path: Pa
     write_dataset(tmp_path / "data", ("box",), instances=2)
     dataset = write_dataset(tmp_path / "data", ("ball",), instances=1)
 
-    with pytest.raises(RecordingError, match="of each category; only one of ball"):
+    with pytest.raises(RecordingError, match="of each category; with one only: ball"):
         evaluate_folder(dataset, trained, baselines=dataset)
 
 

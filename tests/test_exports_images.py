@@ -254,7 +254,7 @@ def test_all_runs_without_colour_are_named_before_export(
     words = ("export", run, guessed_run, other, "--format", "coco", "--out", tmp_path / "out")
     result = shapecat(*words)
     assert result.exit_code == 1
-    problem = "no colour images; --depth exports depth images"
+    problem = "no colour images; leave them out, or export depth images (--depth)"
     assert f"Error: {guessed_run}, {other}: {problem}\n" in result.stderr
     assert not (tmp_path / "out").exists()
 

@@ -58,8 +58,8 @@ class RecentFrames:
             f"{topic}: clouds are not fused, only depth images (frames: {n})"
             for topic, n in self._loose.items()
         ] + [
-            f"{topic}: the pose of the sensor is unknown in {n} frames: "
-            "they are fused as if it had not moved, where their depths agree"
+            f"{topic}: the pose of the sensor is unknown (frames: {n}): "
+            "these are fused as if it had not moved, where their depths agree"
             for topic, n in self._unplaced.items()
             if n
         ]

@@ -55,7 +55,7 @@ def compare_learners(
         only one instance.
     """
     if train is None and (ones := ", ".join(_single(test))):
-        msg = f"{root}: cross-validation needs two objects of each category; only one of {ones}"
+        msg = f"{root}: cross-validation needs two objects of each category; with one only: {ones}"
         raise RecordingError(msg)
     splits = list(_folds(test)) if train is None else [(train, test)]
     if any(len(_known(part.labels)) < 2 for part, _ in splits):

@@ -263,8 +263,8 @@ def _depth_stream(topic: Topic, first: Any, recording: Recording) -> Stream:
     doubt = ""
     if _is_radial(topic.name):
         doubt = (
-            f"{topic.name}: is named after distances, which may be along the rays of pixels and "
-            "not along the optical axis: flat surfaces are then bent"
+            f"{topic.name}: is named after distances; if these are along the rays of the pixels, "
+            "not along the optical axis, flat surfaces are bent: use the clouds of the camera"
         )
     elif info is not None and frame_id and _nearest(topic.name, [info]) is None:
         info_frame = _frame_of(recording, info)

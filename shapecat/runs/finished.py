@@ -100,7 +100,8 @@ def require_recordings(folders: Iterable[Path]) -> None:
     missing = [f"{path} of {run}" for run, path in sources.items() if not path.exists()]
     if missing:
         listed = "\n  ".join(missing)
-        msg = f"missing recordings; treat their runs alone, with --recording PATH:\n  {listed}"
+        hint = "run the command on each of these runs alone, with --recording PATH"
+        msg = f"missing recordings; {hint}:\n  {listed}"
         raise RecordingError(msg)
 
 

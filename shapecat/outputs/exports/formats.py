@@ -164,7 +164,8 @@ def export_dataset(
         nonlocal uncertain
         gray = [str(run.folder) for run in runs if not (selection.depth or run.run.get("color"))]
         if gray:
-            msg = f"{', '.join(gray)}: no colour images; --depth exports depth images"
+            hint = "leave them out, or export depth images (--depth)"
+            msg = f"{', '.join(gray)}: no colour images; {hint}"
             raise OutputError(msg)
         splits = split_runs(runs, selection.val)
         for split, stems, run in zip(splits, image_stems(runs), runs, strict=True):

@@ -41,9 +41,9 @@ def explain_misplacement(folder: Path, fixed_frame: str | None) -> Iterator[str]
     for topic, worse in _compare(folder).items():
         if len(worse) >= _MIN_MOTIONS and np.mean(worse) > _WORSE_SHARE:
             yield (
-                f"{topic}: as the camera moves, its objects move farther in {fixed_frame} than "
-                "relative to it, and may get no tracks: the transforms of its frame are wrong; to "
-                "ignore them, give the frame of its messages to --fixed-frame"
+                f"{topic}: as the camera moves, objects move farther in {fixed_frame} than "
+                "relative to the camera, and may get no tracks: the transforms of its frame are "
+                "wrong; to ignore them, give the frame of its messages to --fixed-frame"
             )
 
 

@@ -232,7 +232,7 @@ class _UpTrial:
         if elsewhere and self._looks[frame.topic] == 1:
             self._upright.warnings.append(
                 f"{frame.topic}: its clouds are in {frame.frame_id}, which is not the frame of a "
-                "camera: without its viewpoint, objects may be missed or fall apart"
+                "camera: objects may be missed or fall apart; use its depth images, if recorded"
             )
         if hint is not None:
             off = self._off_deg.setdefault(frame.topic, off)
