@@ -68,8 +68,10 @@ def write_page(path: Path, report: Report, *, title: str) -> None:
 
 
 _CALIBRATION = (
-    "Accuracy by confidence. On the diagonal, 80 % of the views with a confidence of 0.8 are right."
+    "Accuracy by confidence. On the diagonal, 80 % of the views with a confidence of 0.8 are "
+    "right. The area of a dot shows its number of views."
 )
+_BARS = "The thicker a bar, the more views."
 
 
 def format_page(report: Report, *, title: str) -> str:
@@ -83,7 +85,7 @@ def format_page(report: Report, *, title: str) -> str:
         calibration_svg(report.calibration),
     ]
     for name, rows in report.breakdowns:
-        parts += [f"<h2>Accuracy by {name}</h2>", accuracy_svg(rows)]
+        parts += [f"<h2>Accuracy by {name}</h2><p>{_BARS}</p>", accuracy_svg(rows)]
         parts.append(html_table(*breakdown_table(name, rows)))
     parts += [
         f"<h2>{name}</h2>" + html_table(head, rows)
@@ -110,7 +112,8 @@ def format_markdown(report: Report, *, title: str, pictures: Mapping[str, str]) 
     ]
     for name, rows in report.breakdowns:
         picture = f"![Accuracy by {name}]({pictures[name]})"
-        parts += [f"## Accuracy by {name}", picture, _markdown(*breakdown_table(name, rows))]
+        table = _markdown(*breakdown_table(name, rows))
+        parts += [f"## Accuracy by {name}\n\n{_BARS}", picture, table]
     parts += [
         f"## {name}\n\n" + _markdown(head, rows) for name, head, rows in comparison_tables(report)
     ]
