@@ -108,7 +108,7 @@ def labelled_masks(
         Its gaps are filled in place.
     boxes : (n + 1, 4) the bounding box of each label, from `label_boxes`.
     scale : pixels of the colour image per pixel of the depth image.
-    corner : column and row, in the image, of the first pixel of ``seen``.
+    corner : column and row, in the image, of the first pixel of ``labels``.
     """
     narrow, wide = max(1, round(_NARROW_PX * scale)), max(1, round(_WIDE_PX * scale))
     for box in boxes[boxes[:, 2] > 0].tolist():

@@ -62,8 +62,8 @@ def profile(
     """Write the radial profile about the vertical axis, named by `PROFILE_NAMES`.
 
     The features of each of 8 horizontal slices are its share of the points, the mean radius and its
-    deviation (relative to the largest mean radius), the share of the points that faces the axis,
-    the mean of the normals' z, and the mean curvature.
+    standard deviation (relative to the largest mean radius), the share of the points that faces the
+    axis, the mean of the normals' z, and the mean curvature.
 
     Parameters
     ----------

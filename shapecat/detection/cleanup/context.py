@@ -47,7 +47,7 @@ def add_context(features: Records, logits: F4, weights: F4) -> Records:
     Parameters
     ----------
     features : (r,) `OBJECT_FEATURES`.
-    logits : (r,) that each is an object, judged by itself.
+    logits : (r,) log-odds that a segment is an object, each judged alone.
     weights : (4, r, r) from `measure_borders`.
     """
     records = np.zeros(len(features), CONTEXT_FEATURES)
