@@ -21,7 +21,7 @@ _MOST_ROWS = 100
 class Tally:
     """Counts of the outcomes of a batch, and the complete recordings to print.
 
-    Printed are the first 100, or all if ``keep_all``, and all that got labels of replaced results.
+    It keeps the first 100, or all if ``keep_all``, and those that got labels of replaced results.
     """
 
     def __init__(self, *, keep_all: bool) -> None:

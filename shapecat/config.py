@@ -27,7 +27,7 @@ __all__ = [
 
 @dataclass(frozen=True)
 class DetectionSettings:
-    """Planes and object candidates (thesis ch. 4). Lengths in metres, angles in degrees."""
+    """Planes and object candidates (thesis ch. 4). Lengths in metres."""
 
     max_range_m: float = 3.0
     """Points farther from the sensor than this are ignored (thesis 4.2); in a cloud, farther from

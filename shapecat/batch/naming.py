@@ -57,8 +57,8 @@ def name_folders(
 def existing_names(sources: Sequence[Source], out: str, listing: set[str]) -> dict[int, str]:
     """Return the names of the run folders that recordings, by index, already have in ``out``.
 
-    A recording that comes to a batch later, or is processed alone, must not rename a run. Left out
-    are recordings whose name is in ``out`` and shared by no other recording.
+    A recording that comes to a batch later, or is processed alone, must not rename a run.
+    Recordings whose name is in ``out`` and shared by no other recording are left out.
 
     Parameters
     ----------

@@ -71,7 +71,7 @@ class Counts(TypedDict):
 
 
 class OriginInfo(TypedDict):
-    """Keys of the recording and of the work in a run folder at a URL; see `Ticket`."""
+    """Keys of the recording and of the work in a run folder at a URL; see `TaskKey`."""
 
     input: str
     work: str

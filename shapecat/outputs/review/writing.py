@@ -11,7 +11,7 @@ Entities
     │   └── objects
     │       ├── boxes          labelled "#track category confidence"
     │       └── captions       shorter, drawn above the boxes
-    └── seen/<topic>           the scene, four to ten times a second if it changes, with the sensor
+    └── seen/<topic>           the scene, up to eleven times a second if it changes, with the sensor
         ├── scene              pose of its frame (below <topic> without a fixed frame)
         ├── planes             outlines;  planes/fill  translucent
         └── objects
