@@ -169,7 +169,9 @@ def test_names_are_escaped_in_page(run: Path) -> None:
     rows = read_track_table(run / "tracks.csv")
     finished = FinishedRun(run, info, {})
 
-    text = run_page(finished, rows, [Card(r, timelines[r.track], None) for r in rows.rows], [], {})
+    text = run_page(
+        finished, rows, [Card(r, timelines[r.track], None) for r in rows.rows], [], {}, length_s=1.0
+    )
 
     assert "<img src=x" not in text
     assert text.count("</script>") == 2
@@ -458,7 +460,9 @@ def many_tracks(folder: Path, count: int) -> str:
     table = TrackTable(
         ("track", "category", "confidence", "label"), tuple(c.row for c in cards), ()
     )
-    return run_page(FinishedRun(folder, read_finished(folder).run, {}), table, cards, [], {})
+    return run_page(
+        FinishedRun(folder, read_finished(folder).run, {}), table, cards, [], {}, length_s=1.0
+    )
 
 
 def test_corrections_made_in_browser_are_adopted(

@@ -28,7 +28,7 @@ from shapecat.outputs.report.pictures import (
 )
 from shapecat.outputs.report.surfaces import Snapshot, SurfaceDrawing, draw
 from shapecat.outputs.report.tracks import Timeline, read_timelines
-from shapecat.outputs.report.writing import RunReport, _faces
+from shapecat.outputs.report.writing import RunReport, _faces, read_report
 from shapecat.runs.finished import FinishedRun, read_finished
 from shapecat.runs.labels.meaning import TrackLabel
 from shapecat.runs.labels.track_table import TrackRow, TrackTable, read_track_table
@@ -157,8 +157,9 @@ def test_run_page_has_right_values(*, served: bool) -> None:
     table = TrackTable(("track", "label"), (row,), ())
     stages = {"detect": np.array([0.0021, 0.0042, 0.1044]), "rest": np.array([])}
     text = run_page(
-        lab, table, [worked_card()], [], stages, notes=["a note"], index="../i.html", served=served
-    )
+        lab, table, [worked_card()], [], stages,
+        length_s=4.3, notes=["a note"], index="../i.html", served=served,
+    )  # fmt: skip
     facts = dict(re.findall(r"<dt>(.*?)</dt><dd>(.*?)</dd>", text.partition("Glossary")[0]))
     (times,) = re.findall(r"<h2>Time</h2><table>(.*?)</table>", text)
     cells = [
@@ -170,7 +171,7 @@ def test_run_page_has_right_values(*, served: bool) -> None:
     option = "" if served else " --labels ~/Downloads/tracks-….csv"
 
     assert facts == {
-        "frames": "61", "length": "3.2 s", "detections": "143", "tracks": "1", "uncertain": "1",
+        "frames": "61", "length": "4.3 s", "detections": "143", "tracks": "1", "uncertain": "1",
         "model": "m-7", "categories": "cup, can, box", "fixed frame": "map", "up": "imu",
         "colour images": "/rgb", "skipped frames": "5 too few points", "shapecat": "1.2",
         "python": "3.13", "input digest": "xxh3-128:77",
@@ -203,10 +204,20 @@ def test_stages_are_in_milliseconds_and_phases_in_seconds(run: Path) -> None:
     finished = read_finished(run)
     finished.run["seconds"] = {"perceive": 12.34}
     table = read_track_table(run / "tracks.csv")
-    text = run_page(finished, table, [], [], {"detect": np.array([0.002, 0.004, 0.104])})
+    text = run_page(
+        finished, table, [], [], {"detect": np.array([0.002, 0.004, 0.104])}, length_s=1.0
+    )
 
     assert "<td>detect</td><td>4.0</td><td>94.0</td></tr>" in text
     assert "<td>perceive</td><td>12.3</td><td></td></tr>" in text
+
+
+def test_page_without_tracks_does_not_blame_the_filter(run: Path) -> None:
+    table = read_track_table(run / "tracks.csv")
+    text = run_page(read_finished(run), table, [], [], {}, length_s=1.0)
+
+    assert "No objects were found." in text
+    assert "filter." not in text.partition("<script")[0]
 
 
 def test_timelines_end_with_the_last_track(run: Path) -> None:
@@ -223,10 +234,9 @@ def test_timelines_end_with_the_last_track(run: Path) -> None:
         for track, at in ends.items()
     ]
     table = read_track_table(run / "tracks.csv")
-    text = run_page(read_finished(run), table, cards, [], {})
+    text = run_page(read_finished(run), table, cards, [], {}, length_s=9.0)
     lines = re.findall(r'<polyline points="([^"]+)"', text)
 
-    assert "<dt>length</dt><dd>6.2 s</dd>" in text
     assert [line.split()[0].split(",")[0] for line in lines[::3]] == ["48", "24", "144"]
     assert [line.split()[-1].split(",")[0] for line in lines[::3]] == ["120", "300", "144"]
 
@@ -294,7 +304,7 @@ def test_index_counts_tracks_left_to_check(run: Path) -> None:
     for file in ("tracks.original.csv", "tracks.csv"):
         (run / file).write_text("\n".join(table) + "\n")
 
-    listed = RunReport(run, "", read_timelines(run), Pictures({}, []), {}).listed("x")
+    listed = RunReport(run, "", read_timelines(run), Pictures({}, []), {}, 0.0).listed("x")
     assert (listed.unsure, listed.checked) == (2, 2)
     assert listed.categories == {"can": len(rows) - 2, "cup": 2}
 
@@ -309,7 +319,7 @@ def test_merged_tracks_count_once_in_index(run: Path) -> None:
         cells = rows[k].split(",")
         rows[k] = ",".join([*cells[:at], label, *cells[at + 1 :]])
     (run / "tracks.csv").write_text("\n".join(rows) + "\n")
-    listed = RunReport(run, "", read_timelines(run), Pictures({}, []), {}).listed("x")
+    listed = RunReport(run, "", read_timelines(run), Pictures({}, []), {}, 0.0).listed("x")
 
     assert listed.categories["mug"] == 1
     assert listed.categories.total() == len(names) - 3
@@ -348,6 +358,17 @@ def test_track_times_count_from_first_frame_of_run(tmp_path: Path) -> None:
     assert (lines[4].seen.tolist(), lines[9].seen.tolist()) == ([True, False], [True])
     np.testing.assert_allclose(lines[4].causal, [[0.6, 0.4], [0.8, 0.2]])
     assert lines[4].keys == (("/d", 1, 0), ("/d", 3, -1))
+
+
+def test_length_is_that_of_the_run(run: Path) -> None:
+    """The last object may leave long before the end, and there may be none."""
+    table = pq.read_table(run / "frames.parquet")
+    times = pa.array([7_000_000_000 + 1_500_000_000 * k for k in range(table.num_rows)])
+    column = table.schema.get_field_index("log_time_ns")
+    pq.write_table(table.set_column(column, "log_time_ns", times), run / "frames.parquet")
+
+    length_s = 1.5 * (table.num_rows - 1)
+    assert f"<dt>length</dt><dd>{length_s:.1f} s</dd>" in read_report(run).page()
 
 
 def test_strip_is_sorted_by_time(run: Path) -> None:

@@ -57,6 +57,7 @@ def run_page(
     frames: Sequence[StripFrame],
     stages: Mapping[str, F8],
     *,
+    length_s: float,
     notes: Sequence[str] = (),
     index: str | None = None,
     served: bool = False,
@@ -68,6 +69,7 @@ def run_page(
     cards : the tracks, in the order of ``table``.
     frames : the frames of the strip.
     stages : (frames,) seconds of each stage.
+    length_s : time from the first to the last frame, seconds.
     notes : warnings in addition to those of the run.
     index : link to the index of several runs; None if there is none.
     served : whether corrections are sent to a server, instead of to a table to download.
@@ -87,7 +89,7 @@ def run_page(
         tiles=_tiles(
             {
                 "frames": run["counts"]["frames"],
-                "length": f"{end:.1f} s",
+                "length": f"{length_s:.1f} s",
                 "detections": run["counts"]["detections"],
                 "tracks": len(cards),
                 "uncertain": sum(is_unsure(card.row) for card in cards),
@@ -97,6 +99,7 @@ def run_page(
         strip=_strip(frames, cards),
         chips="".join(_chip(name, counts[name]) for name in ordered),
         cards="".join(card_html(card, run["model"]["categories"], names, end) for card in cards),
+        empty="No track fits this filter." if cards else "No objects were found.",
         next=_next_step(finished, served=served),
         timings=_timings(run["seconds"], stages),
         facts=_facts(run),

@@ -7,7 +7,7 @@ import numpy as np
 from shapecat.arrays import F4, F8, Bool, Record, array
 from shapecat.runs.tables.reading import first_stamp, opened, read_row_groups
 
-__all__ = ["Detected", "Timeline", "read_stage_seconds", "read_timelines"]
+__all__ = ["Detected", "Timeline", "read_length", "read_stage_seconds", "read_timelines"]
 
 Detected = tuple[str, int, int]
 """Topic, frame number, and detection number; the last is -1 while the track coasts."""
@@ -58,3 +58,10 @@ def read_stage_seconds(folder: Path) -> dict[str, F8]:
             for stage, seconds in zip(row["stages"], row["seconds"], strict=True):
                 seconds_by_stage.setdefault(stage, []).append(seconds)
     return {stage: np.array(values) for stage, values in seconds_by_stage.items()}
+
+
+def read_length(folder: Path) -> float:
+    """Return the log time from the first to the last frame of a run, seconds; 0 without frames."""
+    groups = read_row_groups(folder / "frames.parquet", ["log_time_ns"])
+    times = [time for group in groups for time in group["log_time_ns"].to_pylist()]
+    return (max(times) - min(times)) * 1e-9 if times else 0.0

@@ -15,7 +15,7 @@ from shapecat.outputs.report.cards import Card, is_unsure
 from shapecat.outputs.report.choosing import choose_frames
 from shapecat.outputs.report.page import Listed, index_page, run_page
 from shapecat.outputs.report.pictures import Pictures, take_pictures
-from shapecat.outputs.report.tracks import Timeline, read_stage_seconds, read_timelines
+from shapecat.outputs.report.tracks import Timeline, read_length, read_stage_seconds, read_timelines
 from shapecat.runs.finished import find_runs, read_finished
 from shapecat.runs.folder import require_work
 from shapecat.runs.labels.corrections import read_original_table
@@ -35,8 +35,9 @@ _FACES = 6
 class RunReport:
     """The content of a run's page, except the labels, which are read when the page is made.
 
-    ``work`` is that of run.json, ``stages`` has the seconds (frames,) of each stage, and ``index``
-    is the link to the index of several runs, None if there is none.
+    ``work`` is that of run.json, ``stages`` has the seconds (frames,) of each stage, ``length_s``
+    is the time from the first to the last frame, seconds, and ``index`` is the link to the index of
+    several runs, None if there is none.
     """
 
     folder: Path
@@ -44,6 +45,7 @@ class RunReport:
     timelines: Mapping[int, Timeline]
     pictures: Pictures
     stages: Mapping[str, F8]
+    length_s: float
     index: str | None = None
 
     def page(self, *, served: bool = False) -> str:
@@ -66,6 +68,7 @@ class RunReport:
             self._cards(table),
             self.pictures.frames,
             self.stages,
+            length_s=self.length_s,
             notes=notes if reason else [],
             index=self.index,
             served=served,
@@ -199,8 +202,8 @@ def read_report(folder: Path, *, index: str | None = None) -> RunReport:
     rows = read_original_table(folder / "tracks.csv")[0].rows
     timelines = read_timelines(folder)
     pictures = take_pictures(finished, rows, choose_frames(folder, timelines))
-    work = finished.run["work"]
-    return RunReport(folder, work, timelines, pictures, read_stage_seconds(folder), index)
+    work, stages = finished.run["work"], read_stage_seconds(folder)
+    return RunReport(folder, work, timelines, pictures, stages, read_length(folder), index)
 
 
 def _require_ours(index: Path) -> None:
