@@ -583,7 +583,8 @@ def test_html_and_markdown_have_each_number_in_its_place() -> None:
     tables[-1] = [tables[-1][0], [*tables[-1][1], "–"]]
     heads = [
         "Confusion", "Calibration", "Accuracy by distance", "Accuracy by elevation",
-        "Accuracy by points", "Several views of one object", "Comparison with baselines",
+        "Accuracy by points", "Several views of one object",
+        "Classifiers trained on the same views",
     ]  # fmt: skip
 
     found = [

@@ -299,5 +299,5 @@ def comparison_tables(report: Report, missing: str = "–") -> list[tuple[str, R
             (learner, str(learned), *map(text, figures))
             for learner, learned, *figures in report.baselines
         ]
-        tables.append(("Comparison with baselines", head, rows))
+        tables.append(("Classifiers trained on the same views", head, rows))
     return tables
