@@ -11,7 +11,7 @@ from numbers import Integral, Real
 from pathlib import Path
 from typing import Any, Literal, get_args, get_origin, get_type_hints
 
-from shapecat.errors import ConfigError
+from shapecat.errors import ConfigError, explained
 
 __all__ = [
     "DetectionSettings",
@@ -153,8 +153,9 @@ def load_settings(path: Path | None = None, overrides: Sequence[str] = ()) -> Se
     tree: Mapping[str, Any] = {}
     if path is not None:
         try:
-            tree = tomllib.loads(path.read_text("utf-8-sig"))
-        except (OSError, ValueError) as error:
+            with explained(f"{path}: cannot be read", ConfigError):
+                tree = tomllib.loads(path.read_text("utf-8-sig"))
+        except ValueError as error:
             msg = f"{path}: not a readable TOML file: {error}"
             raise ConfigError(msg) from error
     return with_overrides(with_settings(Settings(), tree), overrides)
@@ -242,6 +243,9 @@ def _replace(group: Any, tree: Mapping[str, Any], prefix: str) -> Any:
     return dataclasses.replace(group, **changes)
 
 
+_KINDS = {bool: "true or false", int: "an integer", float: "a number"}
+
+
 def _checked(name: str, value: Any, kind: Any) -> Any:
     """Return a value converted to the type of a setting; raise ConfigError if it does not fit."""
     if get_origin(kind) is Literal:
@@ -257,8 +261,7 @@ def _checked(name: str, value: Any, kind: Any) -> Any:
     if kind is float and type(value) is int:
         value = float(value)
     if type(value) is not kind:
-        expected = "true or false" if kind is bool else f"of type {kind.__name__}"
-        msg = f"{name} must be {expected}, got {value!r}"
+        msg = f"{name} must be {_KINDS[kind]}, got {value!r}"
         raise ConfigError(msg)
     if isinstance(value, float) and not abs(value) < float("inf"):
         msg = f"{name} must be finite, got {value!r}"

@@ -141,7 +141,7 @@ def test_warning_states_lost_bytes_of_unfinished_mcap(tmp_path: Path, rest: byte
     with open_recording(path) as recording:
         (warning,) = recording.warnings
 
-    lost = ", and what was readable in the last 12 bytes" if rest else ""
+    lost = "; the last 12 bytes are truncated, and read where possible" if rest else ""
     assert warning.startswith("the recording was not finished; messages recovered: ")
     assert warning.partition("recovered: ")[2].lstrip("0123456789") == lost
 

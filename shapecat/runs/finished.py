@@ -124,7 +124,9 @@ def open_source(run: RunInfo, moved_to: Path | None = None) -> Iterator[Recordin
         raise RecordingError(msg)
     with open_recording(path) as recording:
         if not same_content(run["input"], path, lambda: content_digest(path)):
-            hint = "is another recording" if moved_to else "has changed since it was processed"
-            msg = f"{path}: {hint}; process it again"
+            msg = f"{path}: has changed since it was processed; process it again"
+            if moved_to is not None:
+                origin = run["input"]["path"]
+                msg = f"{path}: another recording than that of the run, {origin}, or changed since"
             raise OutputError(msg)
         yield recording

@@ -177,7 +177,11 @@ class McapRecording(Recording):
             lost = self._size - end
             self.warn(
                 f"the recording was not finished; messages recovered: {self._counts.total()}"
-                + (f", and what was readable in the last {lost} bytes" if lost else "")
+                + (
+                    f"; the last {lost} bytes are truncated, and read where possible"
+                    if lost
+                    else ""
+                )
             )
 
     def _in_file(self, channel_ids: set[int]) -> Iterator[RawMessage]:
