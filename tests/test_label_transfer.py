@@ -475,7 +475,7 @@ def test_category_unknown_to_target_is_transferred_as_new(tmp_path: Path) -> Non
 @pytest.mark.parametrize(
     ("found", "broken", "told"),
     [
-        ("\n2,", "\nx,", "line 3: expected a whole number"),
+        ("\n2,", "\nx,", "line 3: expected a track number"),
         ("wsource\r\n2,", "wb\r\n2,", "several runs"),
     ],
 )
