@@ -194,9 +194,10 @@ def _add_outputs(
             f"({'; '.join(differing)}); choose another --out, or --overwrite it"
         )
         raise OutputError(msg)
-    with writing_outputs(job.folder):
-        sweep(job.folder)
-        annotate(job.folder, recording, run, observe)
+    if not job.target:
+        with writing_outputs(job.folder):
+            sweep(job.folder)
+            annotate(job.folder, recording, run, observe)
     return summarize(job, run, processed=False)
 
 

@@ -317,6 +317,26 @@ def made(served: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
     return folder
 
 
+def test_copy_of_recording_finds_its_results_at_the_url(
+    shapecat: Run, made: Path, served: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """A copy has another key than its original: the command failed, since no tables were there.
+
+    To find out costs a download, which must not be repeated.
+    """
+    url = "memory://copied/a"
+    with claimed(url, "one") as claim:
+        upload(made, url, claim)
+    command = ("process", served / "a.mcap", "--out", "memory://copied", *OPTIONS)
+
+    done = shapecat(*command)
+
+    assert done.exit_code == 0, done.output
+    assert "already complete" in done.stdout
+    monkeypatch.setattr("shapecat.batch.remote.process", None)
+    assert shapecat(*command).exit_code == 0
+
+
 PLACES = ["memory://half/run", pytest.param("s3://lab/half/run", marks=pytest.mark.many)]
 
 

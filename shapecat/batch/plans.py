@@ -178,7 +178,7 @@ class _Planner:
 
     def __init__(self, job: Job, out: str, listing: set[str], manifest: Manifest | None) -> None:
         self._out, self._listing, self._manifest = out, listing, manifest
-        has_model_id = manifest is not None or job.model is not None
+        has_model_id = manifest is not None or job.model is not None or is_url(out)
         self._model_id = load_model(job.model).model_id if has_model_id else ""
         self._job = dataclasses.replace(job, model_id=self._model_id)
         self._work = _hash([job.settings.as_dict(), job.selection(), self._model_id])

@@ -39,9 +39,14 @@ class TaskKey:
     input: str = ""
     work: str = ""
 
+    @property
+    def is_known(self) -> bool:
+        """Whether both keys are known."""
+        return bool(self.input and self.work)
+
     def matches(self, run: RunInfo) -> bool:
         """Return whether a run was made from the same input and work."""
-        return bool(self.input and self.work) and run.get("origin") == self._origin()
+        return self.is_known and run.get("origin") == self._origin()
 
     def write_to(self, folder: Path) -> None:
         """Add input and work to the run.json in a folder, as its ``origin``.
@@ -82,6 +87,10 @@ def process_remote(job: Job, observe: Observer, *, cores: int, key: TaskKey) -> 
         if claim is not None and summary.processed:
             key.write_to(local.folder)
             upload(local.folder, job.target, claim)
+        elif claim is not None and key.is_known:  # of a copy: so it is not downloaded again
+            key.write_to(local.folder)
+            claim.require()
+            (Location(job.target, OutputError) / "run.json").upload(local.folder / "run.json")
     return dataclasses.replace(summary, folder=job.folder)
 
 
