@@ -577,6 +577,35 @@ def test_batch_notices_run_that_was_replaced_alone(
     assert status_of(job, source, out) == ("complete" if name is None else "check")
 
 
+@pytest.mark.parametrize(
+    ("there", "status"),
+    [
+        (lambda origin: run_info(origin=origin), "complete"),
+        (lambda origin: run_info(origin={**origin, "work": "other"}), "check"),
+        (lambda origin: {"origin": origin}, "check"),  # not a description of a run
+        (None, "check"),  # the files of an interrupted run
+    ],
+)
+def test_batch_notices_run_at_url_that_was_replaced(
+    source: Path, monkeypatch: pytest.MonkeyPatch, there: Callable[..., Any] | None, status: str
+) -> None:
+    """A command for one recording writes no manifest there, and one with shards another one."""
+    (source.parent / "other.mcap").write_bytes(b"another")
+    out, job = f"memory://replaced-{id(there)}", Job(Path(), Path())
+    monkeypatch.setattr("shapecat.batch.plans.load_model", lambda _path: MODEL)
+    (Location(out) / "lab" / "frames.parquet").write(b"table")
+    with plan_batch(job, [str(source.parent)], out) as batch:
+        assert batch.manifest is not None
+        (task,) = (task for task in batch.tasks if task.name == "lab")
+        batch.manifest.record([replace(task.entry(), state="complete")])
+    if there is not None:
+        run = there({"input": task.input, "work": task.work})
+        (Location(out) / "lab" / "run.json").write(json.dumps(run).encode())
+
+    with plan_batch(job, [str(source.parent)], out) as batch:
+        assert {task.name: task.status for task in batch.tasks}["lab"] == status
+
+
 def ignore(*_: object) -> None:
     """Ignore progress."""
 

@@ -1,6 +1,5 @@
 """The outcome of each recording of a batch, and its lines in the manifest."""
 
-import json
 import logging
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, replace
@@ -9,13 +8,10 @@ from threading import Lock
 from typing import Any
 
 from shapecat.batch.manifest import Entry, Manifest, State
-from shapecat.batch.plans import Task
-from shapecat.batch.storage import Location
+from shapecat.batch.plans import Task, run_of
 from shapecat.errors import OutputError
 from shapecat.executors import is_dropped
-from shapecat.runs.folder import read_run
 from shapecat.runs.jobs import Job, Summary, summarize
-from shapecat.runs.run_info import RunInfo
 
 __all__ = ["MOST_TRIES", "Ledger", "Outcome"]
 
@@ -71,7 +67,7 @@ class Ledger:
             )
             return Outcome(job, summary)
         try:
-            return Outcome(job, summarize(job, _run_of(job), processed=False))
+            return Outcome(job, summarize(job, run_of(job), processed=False))
         except OutputError as error:
             return Outcome(job, message=str(error), code=error.exit_code)
 
@@ -128,20 +124,3 @@ class Ledger:
         except OutputError as error:
             _log.error("%s", error)
             self._manifest = None
-
-
-def _run_of(job: Job) -> RunInfo:
-    """Return the content of run.json of a complete run.
-
-    Raises
-    ------
-    OutputError : the file is missing or unreadable.
-    """
-    if not job.target:
-        return read_run(job.folder)
-    try:
-        run: RunInfo = json.loads((Location(job.target, OutputError) / "run.json").read() or b"")
-    except ValueError as error:
-        msg = f"{job.target}: its run.json is missing or damaged; process it again with --overwrite"
-        raise OutputError(msg) from error
-    return run

@@ -19,12 +19,13 @@ from shapecat.batch.naming import existing_names, name_folders
 from shapecat.batch.storage import Location, is_url
 from shapecat.errors import ConfigError, OutputError
 from shapecat.learning import load_model
-from shapecat.runs.folder import OUTPUT_OPTIONS, read_run
+from shapecat.runs.folder import OUTPUT_OPTIONS, parse_run, read_run
 from shapecat.runs.identity import file_stats
 from shapecat.runs.jobs import Job
+from shapecat.runs.run_info import RunInfo
 from shapecat.system.files import partial_path
 
-__all__ = ["Batch", "Shard", "Status", "Task", "plan_batch"]
+__all__ = ["Batch", "Shard", "Status", "Task", "plan_batch", "run_of"]
 
 _NamedSource = tuple[str, Source]
 
@@ -45,8 +46,9 @@ class Task:
     template : a job with the options that all tasks share.
     out : folder or URL of the batch; ``name`` is the run folder in it.
     path, url : the recording; one of them is empty.
-    status : ``complete`` according to the manifest; ``resume`` if a run was interrupted; ``retry``
-        if the last attempt failed; ``check`` if there are results of unknown origin; else ``new``.
+    status : ``complete`` according to manifest and run.json; ``resume`` if a run was interrupted;
+        ``retry`` if the last attempt failed; ``check`` if there are results of unknown origin; else
+        ``new``.
     bytes : size of the recording, 0 if unknown.
     input, work : keys; ``input`` changes with the content of the recording, ``work`` with the
         options, settings and model.
@@ -258,16 +260,16 @@ def _names_in(folder: Path) -> set[str]:
 def _is_wanted_run(task: Task, model_id: str) -> bool:
     """Return whether a run that the manifest lists as complete is the one wanted, with its outputs.
 
-    A command for this recording alone may have replaced it, and an interrupted `annotate` leaves
-    outputs missing.
+    A command for this recording alone, or with other shards, may have replaced it, and an
+    interrupted `annotate` leaves outputs missing.
     """
     job = task.job
-    if job.target:
-        return True  # complete if the manifest says so
     try:
-        run = read_run(job.folder)
+        run = run_of(job)
     except OutputError:
         return False
+    if job.target:
+        return run.get("origin") == {"input": task.input, "work": task.work}
     outputs = [name for option, name in OUTPUT_OPTIONS.items() if getattr(job, option)]
     topics = [topic.strip("/") for topic in run["options"]["topics"]]  # those that were chosen
     compared_apart = {"topics", *OUTPUT_OPTIONS}
@@ -279,6 +281,18 @@ def _is_wanted_run(task: Task, model_id: str) -> bool:
         and options.items() <= run["options"].items()
         and (not job.topics or topics == [topic.strip("/") for topic in job.topics])
     )
+
+
+def run_of(job: Job) -> RunInfo:
+    """Return the content of run.json of a complete run.
+
+    Raises
+    ------
+    OutputError : the file is missing or unreadable.
+    """
+    if not job.target:
+        return read_run(job.folder)
+    return parse_run((Location(job.target, OutputError) / "run.json").read() or b"", job.target)
 
 
 def _input_key(source: Path) -> tuple[str, int]:

@@ -23,6 +23,7 @@ __all__ = [
     "Marker",
     "clear",
     "made_by_run",
+    "parse_run",
     "previous_path",
     "read_run",
     "recover",
@@ -280,14 +281,27 @@ def read_run(folder: Path) -> RunInfo:
     ------
     OutputError : the folder has no run.json, or one with missing or wrong entries.
     """
+    content = b""
+    with suppress(OSError):
+        content = (folder / "run.json").read_bytes()
+    return parse_run(content, str(folder))
+
+
+def parse_run(content: bytes, folder: str) -> RunInfo:
+    """Return the content of the run.json of a folder, or of a URL; it is empty if missing.
+
+    Raises
+    ------
+    OutputError : there is none, or it has missing or wrong entries.
+    """
     try:
-        run: RunInfo = json.loads((folder / "run.json").read_text("utf-8"))
-    except (OSError, UnicodeDecodeError, json.JSONDecodeError) as error:
+        run: RunInfo = json.loads(content.decode())
+    except (UnicodeDecodeError, json.JSONDecodeError) as error:
         msg = f"{folder}: no run.json there; expected a folder made by `shapecat process`"
         raise OutputError(msg) from error
     wrong = wrong_entry(run)
     if wrong is not None:
         detail = f": {wrong} is missing or wrong" if wrong else ""
-        msg = f"{folder / 'run.json'}: not a description of a run{detail}"
+        msg = f"{folder}/run.json: not a description of a run{detail}"
         raise OutputError(msg)
     return run
