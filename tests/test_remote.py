@@ -442,6 +442,17 @@ def test_labels_that_were_not_transferred_stay_at_the_url(made: Path, tmp_path: 
     assert (place / copy).read() == b"labels"
 
 
+@pytest.mark.parametrize("content", [b"{}", b'{"id": "0', b""])
+def test_unusable_run_at_url_is_named(shapecat: Run, served: Path, content: bytes) -> None:
+    """The message named a folder in scratch space, which is gone."""
+    (Location("memory://unusable/a") / "run.json").write(content)
+
+    done = shapecat("process", served / "a.mcap", "--out", "memory://unusable", *OPTIONS)
+
+    assert done.exit_code == 1
+    assert only_error(done).startswith("Error: memory://unusable/a/run.json: not a description of")
+
+
 def test_summary_names_run_folder_not_scratch(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:

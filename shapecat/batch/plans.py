@@ -292,7 +292,8 @@ def run_of(job: Job) -> RunInfo:
     """
     if not job.target:
         return read_run(job.folder)
-    return parse_run((Location(job.target, OutputError) / "run.json").read() or b"", job.target)
+    content = (Location(job.target, OutputError) / "run.json").read()
+    return parse_run(content or b"", job.target)
 
 
 def _input_key(source: Path) -> tuple[str, int]:

@@ -14,7 +14,7 @@ from shapecat.batch.claims import Claim, claimed
 from shapecat.batch.storage import Location
 from shapecat.errors import OutputError, RecordingError, ShapecatError
 from shapecat.pipeline import process
-from shapecat.runs.folder import OUTPUTS, RUN_FILES, read_run, require_ours, write_run
+from shapecat.runs.folder import OUTPUTS, RUN_FILES, parse_run, read_run, write_run
 from shapecat.runs.jobs import Job, Summary, summarize
 from shapecat.runs.labels.corrections import LOST
 from shapecat.runs.run_info import OriginInfo, RunInfo
@@ -126,7 +126,7 @@ def _fetch_run(job: Job) -> tuple[Job, RunInfo | None]:
 
     Raises
     ------
-    OutputError : the target holds files that shapecat did not write.
+    OutputError : the target holds files that shapecat did not write, or an unusable run.json.
     """
     place = Location(job.target, OutputError)
     if "run.json" not in _require_run_folder(place):
@@ -134,13 +134,13 @@ def _fetch_run(job: Job) -> tuple[Job, RunInfo | None]:
     content = (place / "run.json").read()
     if content is None:
         return job, None
+    run = parse_run(content, place.url)
     job.folder.mkdir(parents=True)
     (job.folder / "run.json").write_bytes(content)
     for name in _PREVIOUS[:-1] if job.overwrite else ():
         if (labels := (place / name).read()) is not None:
             (job.folder / name).write_bytes(labels)
-    require_ours(job.folder)
-    return job, read_run(job.folder)
+    return job, run
 
 
 def _require_run_folder(place: Location) -> set[str]:

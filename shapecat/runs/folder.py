@@ -10,7 +10,7 @@ import shutil
 from collections.abc import Callable, Collection, Iterator, Mapping
 from contextlib import contextmanager, nullcontext, suppress
 from pathlib import Path
-from typing import Literal
+from typing import Any, Literal, cast
 
 from shapecat.errors import OutputError, explained
 from shapecat.runs.run_info import RunInfo, wrong_entry
@@ -281,27 +281,27 @@ def read_run(folder: Path) -> RunInfo:
     ------
     OutputError : the folder has no run.json, or one with missing or wrong entries.
     """
-    content = b""
-    with suppress(OSError):
+    try:
         content = (folder / "run.json").read_bytes()
+    except OSError as error:
+        msg = f"{folder}: no run.json there; expected a folder made by `shapecat process`"
+        raise OutputError(msg) from error
     return parse_run(content, str(folder))
 
 
 def parse_run(content: bytes, folder: str) -> RunInfo:
-    """Return the content of the run.json of a folder, or of a URL; it is empty if missing.
+    """Return the content of the run.json of a folder or URL.
 
     Raises
     ------
-    OutputError : there is none, or it has missing or wrong entries.
+    OutputError : it is damaged, or has missing or wrong entries.
     """
-    try:
-        run: RunInfo = json.loads(content.decode())
-    except (UnicodeDecodeError, json.JSONDecodeError) as error:
-        msg = f"{folder}: no run.json there; expected a folder made by `shapecat process`"
-        raise OutputError(msg) from error
+    run: Any = None
+    with suppress(ValueError, RecursionError):
+        run = json.loads(content)
     wrong = wrong_entry(run)
     if wrong is not None:
         detail = f": {wrong} is missing or wrong" if wrong else ""
         msg = f"{folder}/run.json: not a description of a run{detail}"
         raise OutputError(msg)
-    return run
+    return cast("RunInfo", run)
