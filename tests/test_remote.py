@@ -271,6 +271,22 @@ def test_bag_in_bucket_is_processed(shapecat: Run, bucket: Path, tmp_path: Path)
     assert requests(bucket, "GET", "metadata.yaml")
 
 
+@pytest.mark.usefixtures("bucket")
+def test_empty_objects_that_stand_for_folders_are_ignored(made: Path, tmp_path: Path) -> None:
+    """The web console of S3 makes them: a bag could not be downloaded, and a run not uploaded."""
+    system: Any = fsspec.filesystem("s3")
+    for key in ("marked/bag/", "marked/bag/sub/", "marked/out/run/"):
+        system.call_s3("put_object", Bucket="lab", Key=key, Body=b"")
+    (Location("s3://lab/marked/bag") / "bag_0.mcap").write(b"part")
+
+    Location("s3://lab/marked/bag").download(tmp_path / "bag")
+    with claimed("s3://lab/marked/out/run", "one") as claim:
+        upload(made, "s3://lab/marked/out/run", claim)
+
+    assert [path.name for path in (tmp_path / "bag").iterdir()] == ["bag_0.mcap"]
+    assert Location("s3://lab/marked").names() == {"bag", "out"}
+
+
 def answer(status: int) -> Exception:
     error = Exception("the storage says so")
     error.status = status  # type: ignore[attr-defined]  # as aiohttp's have

@@ -236,7 +236,8 @@ class Location:
             except FileNotFoundError as error:  # no such bucket; a missing folder is an empty one
                 raise self._as_error(participle="listed", error=error) from error
             for item in page.get("Contents", ()):
-                yield {**item, "name": f"{bucket}/{item['Key']}", "size": item["Size"]}
+                if not item["Key"].endswith("/"):  # an empty object that stands for a folder
+                    yield {**item, "name": f"{bucket}/{item['Key']}", "size": item["Size"]}
             for item in page.get("CommonPrefixes", ()):
                 yield {"name": f"{bucket}/{item['Prefix']}", "size": 0}
             if not page.get("IsTruncated"):
