@@ -121,7 +121,7 @@ def test_compressed_recordings_in_storage_are_named(caplog: pytest.LogCaptureFix
     names = ("a.mcap", "b.mcap.zstd", "c.bag.gz", "bag/metadata.yaml", "bag/bag_0.db3.zstd")
     for name in names:
         with fsspec.open(f"memory://packed/{name}", "wb") as file:
-            file.write(b"x")
+            file.write(b"rosbag2_bagfile_information:\n")
 
     found = find_recordings(["memory://packed/"])
 

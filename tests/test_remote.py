@@ -187,7 +187,7 @@ def test_names_with_brackets_are_not_patterns(
     names = ("take[1].mcap", "bag[2]/one.mcap", "bag[2]/metadata.yaml")
     for name in names[:2]:
         (Location(lab) / name).upload(served / "a.mcap")
-    (Location(lab) / names[2]).write(b"relative_file_paths:\n  - one.mcap\n")
+    (Location(lab) / names[2]).write(b"rosbag2_bagfile_information:\n  version: 5\n")
     out = f"{lab}/out[3]"
     command = ("process", f"{lab}/", "--out", out, *OPTIONS)
 
@@ -216,6 +216,7 @@ def test_storage_is_searched_like_a_folder(place: str) -> None:
         *("half/x/frames.parquet", "out/.x.old/annotated.mcap", "notes.txt"),
     ):
         (root / name).write(name.encode())
+    (root / "bag/metadata.yaml").write(b"rosbag2_bagfile_information:\n")
     kept = find_recordings([f"{place}/"]).sources
     found = {source.url.replace(":///", "://"): source for source in kept}
 
@@ -228,6 +229,21 @@ def test_storage_is_searched_like_a_folder(place: str) -> None:
         assert before == stat_url(f"{place}/x.mcap")[0]
     (root / "x.mcap").write(b"other content")
     assert only_key(f"{place}/*.mcap") != before
+
+
+def test_metadata_of_a_data_set_in_storage_makes_no_bag() -> None:
+    """As in a folder of this machine: its takes were mixed in one run."""
+    names = {"set/walk.mcap", "set/run.mcap", "set/bag"}
+    for name in ("set/walk.mcap", "set/run.mcap", "set/bag/bag_0.mcap"):
+        (Location("memory://takes") / name).write(name.encode())
+    (Location("memory://takes/set") / "metadata.yaml").write(b"license: MIT\n")
+    (Location("memory://takes/set/bag") / "metadata.yaml").write(b"rosbag2_bagfile_information:\n")
+
+    found = find_recordings(["memory://takes/"]).sources
+
+    assert {source.url.replace(":///", "://") for source in found} == {
+        f"memory://takes/{name}" for name in names
+    }
 
 
 def only_key(pattern: str) -> str:

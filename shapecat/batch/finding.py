@@ -3,10 +3,11 @@
 import logging
 import os
 from collections.abc import Iterable, Iterator, Mapping, Sequence
+from concurrent.futures import ThreadPoolExecutor
 from contextlib import suppress
 from dataclasses import dataclass
 from hashlib import sha256
-from itertools import pairwise
+from itertools import compress, pairwise
 from operator import attrgetter
 from pathlib import Path, PurePosixPath
 from typing import Any
@@ -28,6 +29,9 @@ _COMPRESSED_HINT = "skipped: a compressed file, unpack it first"
 _MAGIC = (b"\x89MCAP", b"#ROSBAG", b"SQLite format 3")
 _BAG_KEY = b"rosbag2_bagfile_information:"
 """The first line of a bag's metadata.yaml; data sets have files of this name, too."""
+_METADATA_BYTES = 1 << 12
+_THREADS = 16
+"""Threads that read metadata at URLs: each request is a round trip."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -133,27 +137,38 @@ def _size(info: Mapping[str, Any]) -> int:
 def _search_remote_folder(location: Location) -> Iterator[Source]:
     """Yield the recordings and ROS 2 bag folders below a folder."""
     files: list[Source] = []
-    bags, runs = set(), set()
+    described, runs = set(), set()
     for url, info in location.walk():
         parent, _, name = url.rpartition("/")
         if name == "metadata.yaml":
-            bags.add(parent)
+            described.add(parent)
         elif name in {"run.json", "frames.parquet"}:
             runs.add(parent)
         elif (_has_recording_suffix(name) or _is_compressed(name)) and "/." not in url:
             files.append(_of_url(url, content_key(info), _size(info)))
-    parts: dict[str, list[Source]] = {bag: [] for bag in bags}
+    holding = {file.url.rpartition("/")[0] for file in files}
+    parts: dict[str, list[Source]] = {bag: [] for bag in _bags_among(described & holding)}
     for file in files:
         parent = file.url.rpartition("/")[0]
-        if parent in bags:
+        if parent in parts:
             parts[parent].append(file)
         elif parent not in runs and _is_compressed(file.url):
             _log.error("%s: %s", file.url, _COMPRESSED_HINT)
         elif parent not in runs:
             yield file
     for bag, found in parts.items():
-        if found:
-            yield _of_url(bag, _combined_key(f.key for f in found), sum(f.bytes for f in found))
+        yield _of_url(bag, _combined_key(f.key for f in found), sum(f.bytes for f in found))
+
+
+def _bags_among(folders: Iterable[str]) -> list[str]:
+    """Return the folders, by URL, whose metadata.yaml is that of a bag."""
+
+    def is_bag(folder: str) -> bool:
+        return _BAG_KEY in ((Location(folder) / "metadata.yaml").read() or b"")[:_METADATA_BYTES]
+
+    ordered = sorted(folders)
+    with ThreadPoolExecutor(_THREADS) as pool:
+        return list(compress(ordered, pool.map(is_bag, ordered)))
 
 
 def _search_paths(sources: Sequence[Path]) -> tuple[dict[Path, Path], int]:
@@ -208,7 +223,7 @@ def _is_bag(folder: Path) -> bool:
 def _has_bag_metadata(folder: Path) -> bool:
     try:
         with (folder / "metadata.yaml").open("rb") as file:
-            return _BAG_KEY in file.read(1 << 12)
+            return _BAG_KEY in file.read(_METADATA_BYTES)
     except FileNotFoundError:
         return False
 
