@@ -246,6 +246,24 @@ def test_metadata_of_a_data_set_in_storage_makes_no_bag() -> None:
     }
 
 
+@pytest.mark.parametrize("place", ["memory://unslashed", "s3://lab/unslashed"])
+@pytest.mark.usefixtures("bucket")
+def test_folder_at_url_is_searched_without_slash(place: str) -> None:
+    """It was downloaded whole, and its takes were mixed in one run."""
+    bag = f"{place}/in/bag"  # of a killed recorder: without metadata
+    for name in ("a.mcap", "b.mcap", "bag/bag_0.mcap", "bag/bag_1.mcap", "old[1]/c.mcap"):
+        (Location(f"{place}/in") / name).write(name.encode())
+    (Location(place) / "noted").write(b"a file")
+
+    def stems(*sources: str) -> set[str]:
+        return {source.stem for source in find_recordings(sources).sources}
+
+    assert stems(f"{place}/in") == {"a", "b", "bag", "c"}
+    assert stems(bag) == {"bag"}
+    assert stems(f"{place}/in/old[1]") == {"c"}
+    assert stems(f"{place}/noted", f"{place}/missing") == {"noted", "missing"}
+
+
 def only_key(pattern: str) -> str:
     (source,) = find_recordings([pattern]).sources
     return source.key

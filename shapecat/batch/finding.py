@@ -2,7 +2,7 @@
 
 import logging
 import os
-from collections.abc import Iterable, Iterator, Mapping, Sequence
+from collections.abc import Collection, Iterable, Iterator, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import suppress
 from dataclasses import dataclass
@@ -108,9 +108,18 @@ def _search_url(url: str) -> list[Source]:
         ]
         if found or location.info() is None:  # otherwise a name with brackets
             return sorted(found, key=attrgetter("url"))
-    if url.endswith("/"):
+    if url.endswith("/") or _is_remote_folder(location):
         return sorted(_search_remote_folder(location), key=attrgetter("url"))
     return [_of_url(url)]
+
+
+def _is_remote_folder(location: Location) -> bool:
+    """Return whether a URL is that of a folder; one with the suffix of a recording is not asked."""
+    if _has_recording_suffix(location.url.partition("?")[0]):
+        return False
+    with suppress(RecordingError):  # reported when it is downloaded
+        return (location.info() or {}).get("type") == "directory"
+    return False
 
 
 def stat_url(url: str) -> tuple[str, int]:
@@ -146,8 +155,13 @@ def _search_remote_folder(location: Location) -> Iterator[Source]:
             runs.add(parent)
         elif (_has_recording_suffix(name) or _is_compressed(name)) and "/." not in url:
             files.append(_of_url(url, content_key(info), _size(info)))
-    holding = {file.url.rpartition("/")[0] for file in files}
-    parts: dict[str, list[Source]] = {bag: [] for bag in _bags_among(described & holding)}
+    names: dict[str, list[str]] = {}
+    for file in files:
+        parent, _, name = file.url.rpartition("/")
+        names.setdefault(parent, []).append(name)
+    bags = {url for url, held in names.items() if _is_named_as_bag(PurePosixPath(url).name, held)}
+    bags |= set(_bags_among((described & names.keys()) - bags))
+    parts: dict[str, list[Source]] = {bag: [] for bag in bags}
     for file in files:
         parent = file.url.rpartition("/")[0]
         if parent in parts:
@@ -203,21 +217,35 @@ def _is_bag(folder: Path) -> bool:
             return False
     except OSError:  # reported by the search
         return False
-    names = {path.name.removesuffix(".zstd") for path in paths if path.is_file()}
-    parts = {name for name in names if PurePosixPath(name).suffix in _SUFFIXES}
-    first = PurePosixPath(min(parts, default=""))
-    if len(parts) == 1 and first.suffix == ".db3":
+    names = {path.name for path in paths if path.is_file()}
+    recordings, parts = _recordings_among(names), _parts_among(names)
+    if len(recordings) == 1 and recordings.pop().endswith(".db3"):
         return True
-    base = first.stem.rpartition("_")[0]
-    in_sequence = [f"{base}_{k}{first.suffix}" for k in range(len(parts))]
-    if not is_of_bag(first.name) or parts != set(in_sequence):
-        return False
-    compressed = any(path.suffix == ".zstd" for path in paths)
-    return (
-        base == _real_path(folder).name
-        or compressed
-        or _follow_in_time([folder / name for name in in_sequence])
+    return _is_named_as_bag(_real_path(folder).name, names) or _follow_in_time(
+        [folder / name for name in parts]
     )
+
+
+def _is_named_as_bag(folder: str, names: Collection[str]) -> bool:
+    """Return whether a folder with files of these names is a bag, whenever they were recorded."""
+    parts = _parts_among(names)
+    is_compressed = any(name.endswith(".zstd") for name in names)
+    return bool(parts) and (is_compressed or parts[0].rpartition("_")[0] == folder)
+
+
+def _recordings_among(names: Iterable[str]) -> set[str]:
+    """Return the names of recordings, uncompressed."""
+    uncompressed = {name.removesuffix(".zstd") for name in names}
+    return {name for name in uncompressed if PurePosixPath(name).suffix in _SUFFIXES}
+
+
+def _parts_among(names: Iterable[str]) -> list[str]:
+    """Return the names of recordings if they are a_0.mcap, a_1.mcap, ..., in this order."""
+    recordings = _recordings_among(names)
+    first = PurePosixPath(min(recordings, default=""))
+    base = first.stem.rpartition("_")[0]
+    parts = [f"{base}_{k}{first.suffix}" for k in range(len(recordings))]
+    return parts if is_of_bag(first.name) and recordings == set(parts) else []
 
 
 def _has_bag_metadata(folder: Path) -> bool:
