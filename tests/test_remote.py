@@ -264,6 +264,15 @@ def test_folder_at_url_is_searched_without_slash(place: str) -> None:
     assert stems(f"{place}/noted", f"{place}/missing") == {"noted", "missing"}
 
 
+def test_folder_below_hidden_folder_is_searched() -> None:
+    """Only hidden folders within the given one are left out."""
+    root = Location("memory://lab/.staged/in")
+    for name in ("a.mcap", ".trash/b.mcap", ".c.mcap"):
+        (root / name).write(b"recording")
+
+    assert [s.stem for s in find_recordings(["memory://lab/.staged/in/"]).sources] == ["a"]
+
+
 def only_key(pattern: str) -> str:
     (source,) = find_recordings([pattern]).sources
     return source.key

@@ -147,13 +147,16 @@ def _search_remote_folder(location: Location) -> Iterator[Source]:
     """Yield the recordings and ROS 2 bag folders below a folder."""
     files: list[Source] = []
     described, runs = set(), set()
+    root = location.root
     for url, info in location.walk():
         parent, _, name = url.rpartition("/")
         if name == "metadata.yaml":
             described.add(parent)
         elif name in {"run.json", "frames.parquet"}:
             runs.add(parent)
-        elif (_has_recording_suffix(name) or _is_compressed(name)) and "/." not in url:
+        elif "/." in url.removeprefix(root):
+            continue
+        elif _has_recording_suffix(name) or _is_compressed(name):
             files.append(_of_url(url, content_key(info), _size(info)))
     names: dict[str, list[str]] = {}
     for file in files:

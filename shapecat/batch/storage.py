@@ -84,6 +84,11 @@ class Location:
     def __truediv__(self, name: str) -> "Location":
         return Location(f"{self.url.rstrip('/')}/{name}", self._error)
 
+    @property
+    def root(self) -> str:
+        """The URL, spelt as at the start of the URLs of `walk`."""
+        return self._url_of({"name": self._path})
+
     def _retry(self, participle: str, call: Callable[[], _T]) -> _T:
         """Return the result of a call; repeat the call while it may still succeed.
 
