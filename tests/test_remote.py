@@ -264,6 +264,23 @@ def test_folder_at_url_is_searched_without_slash(place: str) -> None:
     assert stems(f"{place}/noted", f"{place}/missing") == {"noted", "missing"}
 
 
+@pytest.mark.parametrize("place", ["memory://typo", "s3://lab/typo"])
+@pytest.mark.usefixtures("bucket")
+def test_url_without_recordings_is_named_beside_others(
+    caplog: pytest.LogCaptureFixture, place: str
+) -> None:
+    """As a missing file does, a misspelt one must fail: its recordings were just left out."""
+    for name in ("in/a.mcap", "notes/n.txt"):
+        (Location(place) / name).write(b"something")
+    missing = [f"{place}/on/", f"{place}/on/*.mcap"]
+
+    found = find_recordings([f"{place}/in/", *missing, f"{place}/notes/"]).sources
+
+    assert [source.url for source in found][1:] == missing
+    messages = [text for text in caplog.messages if place in text]
+    assert messages == [f"{place}/notes/: no recording found"]
+
+
 def test_folder_below_hidden_folder_is_searched() -> None:
     """Only hidden folders within the given one are left out."""
     root = Location("memory://lab/.staged/in")

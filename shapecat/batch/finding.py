@@ -2,6 +2,7 @@
 
 import logging
 import os
+from collections import defaultdict
 from collections.abc import Collection, Iterable, Iterator, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import suppress
@@ -70,9 +71,8 @@ def find_recordings(sources: Sequence[str]) -> SearchResult:
     ------
     RecordingError : no recording was found.
     """
-    remote = {
-        found.url: found for source in sources if is_url(source) for found in _search_url(source)
-    }
+    search = _search_url if len(sources) == 1 else _search_url_beside_others
+    remote = {found.url: found for source in sources if is_url(source) for found in search(source)}
     local, skipped = _search_paths([Path(source) for source in sources if not is_url(source)])
     found = [_of_path(path, real) for real, path in local.items()] + list(remote.values())
     if not found:
@@ -113,6 +113,16 @@ def _search_url(url: str) -> list[Source]:
     return [_of_url(url)]
 
 
+def _search_url_beside_others(url: str) -> list[Source]:
+    """Search a URL; a missing one is a recording, which fails as a missing file does."""
+    found = _search_url(url)
+    if not found and next(Location(url).walk(deep=False), None) is None:
+        return [_of_url(url)]
+    if not found:
+        _log.error("%s: no recording found", url)
+    return found
+
+
 def _is_remote_folder(location: Location) -> bool:
     """Return whether a URL is that of a folder; one with the suffix of a recording is not asked."""
     if _has_recording_suffix(location.url.partition("?")[0]):
@@ -147,21 +157,19 @@ def _search_remote_folder(location: Location) -> Iterator[Source]:
     """Yield the recordings and ROS 2 bag folders below a folder."""
     files: list[Source] = []
     described, runs = set(), set()
-    root = location.root
     for url, info in location.walk():
         parent, _, name = url.rpartition("/")
         if name == "metadata.yaml":
             described.add(parent)
         elif name in {"run.json", "frames.parquet"}:
             runs.add(parent)
-        elif "/." in url.removeprefix(root):
+        elif "/." in url.removeprefix(location.root):
             continue
         elif _has_recording_suffix(name) or _is_compressed(name):
             files.append(_of_url(url, content_key(info), _size(info)))
-    names: dict[str, list[str]] = {}
-    for file in files:
-        parent, _, name = file.url.rpartition("/")
-        names.setdefault(parent, []).append(name)
+    names = defaultdict[str, list[str]](list)
+    for parent, _, name in (file.url.rpartition("/") for file in files):
+        names[parent].append(name)
     bags = {url for url, held in names.items() if _is_named_as_bag(PurePosixPath(url).name, held)}
     bags |= set(_bags_among((described & names.keys()) - bags))
     parts: dict[str, list[Source]] = {bag: [] for bag in bags}
