@@ -824,6 +824,31 @@ def test_content_key_changes_with_content_at_url(
     assert (before != after) is other
 
 
+@pytest.mark.parametrize("name", ["Last-Modified", "Content-MD5", "Digest"])
+def test_content_key_changes_with_headers_of_a_web_server(name: str) -> None:
+    """Many send no ETag: a recording replaced by one of the same size had complete results."""
+    assert content_key({"size": 7, name: "one"}) != content_key({"size": 7, name: "two"})
+
+
+def test_content_of_same_size_is_not_trusted(
+    source: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """A web server may tell the size of a recording alone, and nothing at all to a signed URL."""
+    (source.parent / "other.mcap").write_bytes(b"another")
+    out, job = tmp_path / "out", Job(Path(), Path(), mcap=False, rrd=False)
+    (out / "lab").mkdir(parents=True)
+    write_run(out / "lab", planned(source))
+    monkeypatch.setattr("shapecat.batch.plans.load_model", lambda _path: MODEL)
+    key = content_key({"size": 7, "name": "lab.mcap"})
+    monkeypatch.setattr("shapecat.batch.plans._input_key", lambda _path: (key, 7))
+    with plan_batch(job, [str(source.parent)], str(out)) as batch:
+        assert batch.manifest is not None
+        batch.manifest.record([replace(task.entry(), state="complete") for task in batch.tasks])
+
+    assert status_of(job, source, out) == "check"
+    assert _combined_key(["a", key]) == ""
+
+
 def test_key_of_bag_at_url_covers_all_its_files() -> None:
     """The storage may list them in any order."""
     keys = [_combined_key(keys) for keys in ("ab", "ac", "db", "ba")]

@@ -116,11 +116,10 @@ def _search_url(url: str) -> list[Source]:
 def _search_url_beside_others(url: str) -> list[Source]:
     """Search a URL; a missing one is a recording, which fails as a missing file does."""
     found = _search_url(url)
-    if not found and next(Location(url).walk(deep=False), None) is None:
-        return [_of_url(url)]
-    if not found:
-        _log.error("%s: no recording found", url)
-    return found
+    if found or next(Location(url).walk(deep=False), None) is None:
+        return found or [_of_url(url)]
+    _log.error("%s: no recording found", url)
+    return []
 
 
 def _is_remote_folder(location: Location) -> bool:
@@ -146,7 +145,8 @@ def stat_url(url: str) -> tuple[str, int]:
 
 
 def _combined_key(keys: Iterable[str]) -> str:
-    return sha256("".join(sorted(keys)).encode()).hexdigest()[:16]
+    ordered = sorted(keys)
+    return sha256("".join(ordered).encode()).hexdigest()[:16] if all(ordered) else ""
 
 
 def _size(info: Mapping[str, Any]) -> int:

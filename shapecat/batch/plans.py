@@ -221,7 +221,7 @@ class _Planner:
     def _status(self, task: Task) -> Status:
         entry, overwrite = self._entry(task.name), self._job.overwrite
         exists = task.name in self._listing
-        if exists and entry is not None and entry.state == "complete":
+        if exists and task.input and entry is not None and entry.state == "complete":
             same = entry.same_command if overwrite else entry.same_work
             if same(task.entry()) and _is_wanted_run(task, self._model_id):
                 return "complete"

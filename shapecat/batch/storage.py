@@ -22,8 +22,8 @@ _T = TypeVar("_T")
 
 _WAITS_S = (0.5, 1.0, 2.0, 4.0, 8.0)
 """Waits between attempts, randomized by half, so that refused workers do not return together."""
-_DIGESTS = ("ETag", "etag", "md5Hash", "content_md5")
-_TIMES = ("mtime", "LastModified", "last_modified", "created")
+_DIGESTS = ("ETag", "etag", "md5Hash", "content_md5", "Content-MD5", "Digest")
+_TIMES = ("mtime", "LastModified", "last_modified", "Last-Modified", "created")
 """Entries of a file's info that change with its content, or with the time it was written."""
 _TRANSIENT = {
     errno.EAGAIN,
@@ -55,9 +55,14 @@ def is_url(text: str) -> bool:
 
 
 def content_key(info: Mapping[str, Any]) -> str:
-    """Return a key that changes with a file's content, from its size and its digest or times."""
-    names = _DIGESTS if any(name in info for name in _DIGESTS) else _TIMES
-    values = [info[name] for name in names if name in info]
+    """Return a key that changes with a file's content, from its size and its digest or times.
+
+    It is empty if neither is known.
+    """
+    names = _DIGESTS if any(info.get(name) for name in _DIGESTS) else _TIMES
+    values = [info[name] for name in names if info.get(name) is not None]
+    if not values:
+        return ""
     texts = [v.isoformat() if isinstance(v, datetime) else str(v) for v in values]
     content = [info.get("size"), *texts]
     return sha256(repr(content).encode()).hexdigest()[:16]
