@@ -179,7 +179,10 @@ def _add_outputs(
     OutputError : the folder holds the results of another input, model or settings.
     """
     run = read_run(job.folder)
-    for option, output in OUTPUT_OPTIONS.items() if not job.target else ():  # at a URL: no tables
+    for option, output in OUTPUT_OPTIONS.items():
+        if job.target:  # without its tables, nothing can be added
+            planned["options"][option] |= run["options"][option]
+            continue
         exists = (job.folder / output).exists()
         planned["options"][option] |= exists
         run["options"][option] = planned["options"][option]

@@ -413,6 +413,19 @@ def test_copy_of_recording_finds_its_results_at_the_url(
     assert shapecat(*command).exit_code == 0
 
 
+def test_run_at_url_may_have_more_outputs_than_wanted(
+    shapecat: Run, made: Path, served: Path
+) -> None:
+    """As in a folder of this machine, where `--no-mcap` keeps a complete run."""
+    with claimed("memory://more/a", "one") as claim:
+        upload(made, "memory://more/a", claim)
+
+    done = shapecat("process", served / "a.mcap", "--out", "memory://more", *OPTIONS, "--no-mcap")
+
+    assert done.exit_code == 0, done.output
+    assert "already complete" in done.stdout
+
+
 PLACES = ["memory://half/run", pytest.param("s3://lab/half/run", marks=pytest.mark.many)]
 
 
