@@ -1,6 +1,7 @@
 """Outcomes of ``process``: counts, the table at the end, and transferred labels."""
 
 from collections.abc import Sequence
+from concurrent.futures import ThreadPoolExecutor
 from contextlib import suppress
 from typing import TYPE_CHECKING, Any
 
@@ -16,6 +17,8 @@ if TYPE_CHECKING:
     from shapecat.runs.jobs import Job, Summary
 
 _MOST_ROWS = 100
+_THREADS = 16
+"""Threads that read complete runs: at a URL, each is a round trip."""
 
 
 class Tally:
@@ -60,20 +63,24 @@ def print_closing(tasks: Sequence["Task"], tally: Tally) -> None:
         click.echo(f"{tally.complete} complete, {tally.failed} failed, {tally.frames:,} frames")
 
 
-def summary_as_dict(job: "Job", summary: "Summary") -> dict[str, Any]:
-    """Return the summary of a complete recording as plain values.
+def summaries_as_dicts(complete: Sequence[tuple["Job", "Summary"]]) -> list[dict[str, Any]]:
+    """Return the summaries of complete recordings as plain values.
 
     That of a recording that was complete before may come from the manifest, which has neither
     warnings nor all counts: it is read from its run folder.
     """
+    from shapecat.batch.plans import run_of
     from shapecat.errors import OutputError
-    from shapecat.runs.folder import read_run
     from shapecat.runs.jobs import summarize
 
-    if not summary.processed and not job.target:
-        with suppress(OutputError):  # it was removed meanwhile
-            summary = summarize(job, read_run(job.folder), processed=False)
-    return summary.as_dict()
+    def as_dict(job: "Job", summary: "Summary") -> dict[str, Any]:
+        if not summary.processed:
+            with suppress(OutputError):  # it was removed meanwhile
+                summary = summarize(job, run_of(job), processed=False)
+        return {**summary.as_dict(), "folder": job.place}
+
+    with ThreadPoolExecutor(_THREADS) as pool:
+        return list(pool.map(lambda each: as_dict(*each), complete))
 
 
 def _print_corrections(job: "Job", summary: "Summary") -> None:
@@ -81,8 +88,7 @@ def _print_corrections(job: "Job", summary: "Summary") -> None:
     if summary.corrections is None:
         return
     done, missed = (summary.corrections[name] for name in ("transferred", "not_transferred"))
-    where = job.target or summary.folder
-    rest = f"; the others are in {where}/tracks.previous.csv" if missed else ""
+    rest = f"; the others are in {job.place}/tracks.previous.csv" if missed else ""
     counts = f"{len(done)} of {len(done) + len(missed)}"
     text = f"{_short_name(job)}: transferred {counts} corrected labels{rest}"
     click.echo("\n".join((text, *map(missed_words, missed))), err=True)
@@ -94,7 +100,7 @@ def _row(job: "Job", summary: "Summary") -> tuple[Any, ...]:
         summary.counts["frames"],
         round(summary.seconds, 1) if summary.processed else "already complete",
         count_words(summary.counts["tracks"]),
-        job.target or summary.folder,
+        job.place,
     )
 
 

@@ -21,7 +21,7 @@ from .options import (
     set_option,
     verbose_option,
 )
-from .outcomes import Tally, print_closing, summary_as_dict
+from .outcomes import Tally, print_closing, summaries_as_dicts
 from .progress import KINDS, Progress, describe_plan, open_progress
 from .render import for_any_reader, print_json
 
@@ -186,7 +186,7 @@ def process(
             tally.add(outcome)
     with for_any_reader():
         if as_json:
-            print_json([summary_as_dict(*each) for each in tally.in_order(batch.tasks)])
+            print_json(summaries_as_dicts(tally.in_order(batch.tasks)))
         else:
             print_closing(batch.tasks, tally)
     ctx.exit(common_exit_code(tally.codes))

@@ -220,7 +220,7 @@ class JsonProgress(Progress):
         _event(
             "ended",
             recording=outcome.job.name,
-            folder=str(outcome.job.folder),
+            folder=outcome.job.place,
             state="failed" if summary is None else "complete",
             seconds=None if summary is None else round(summary.seconds, 3),
             processed=None if summary is None else summary.processed,

@@ -20,7 +20,7 @@ from shapecat.learning import load_model, save_model
 from shapecat.outputs.counts import count_words
 from shapecat.outputs.exports.dataset_frames import Selection
 from shapecat.outputs.exports.formats import Exported
-from shapecat.runs.jobs import Summary
+from shapecat.runs.jobs import Job, Summary
 from shapecat.runs.labels.transfer import TABLE_ALONE
 from shapecat.system.stopping import Stopped
 from tests.scenes import record
@@ -41,7 +41,7 @@ def ended(name: str, *, processed: bool | None, warnings: tuple[str, ...] = ()) 
     """Return the outcome of a recording; without ``processed`` it failed."""
     known = SimpleNamespace(processed=processed, warnings=warnings)
     summary = None if processed is None else known
-    job = SimpleNamespace(folder=Path("out", name))
+    job = SimpleNamespace(folder=Path("out", name), place=f"out/{name}")
     return SimpleNamespace(job=job, summary=summary, message="")
 
 
@@ -117,7 +117,7 @@ def test_closing_table_follows_order_of_plan(capsys: pytest.CaptureFixture[str])
         summary = SimpleNamespace(
             counts=counts, seconds=1.26, processed=name == "b", corrections=None, folder=name
         )
-        job = SimpleNamespace(name=f"x/{name}", folder=Path("out", name), target="")
+        job = Job(Path("x", name), Path("out", name))
         done = None if frames is None else summary
         tally.add(SimpleNamespace(job=job, summary=done, code=0 if done else 3))
     OUTCOMES.print_closing([task("a"), task("b"), task("c")], tally)
@@ -159,7 +159,7 @@ def test_closing_table_lists_a_hundred_recordings_or_none(
             counts={"frames": 30, "tracks": {}}, seconds=1.0, processed=True,
             corrections=None, folder=name,
         )  # fmt: skip
-        job = SimpleNamespace(name=name, folder=Path("out", name), target="")
+        job = Job(Path(name), Path("out", name))
         tally.add(SimpleNamespace(job=job, summary=summary, code=0))
     OUTCOMES.print_closing([task(name) for name in names], tally)
     out = capsys.readouterr().out
@@ -574,8 +574,8 @@ def test_process_reports_where_untransferred_labels_are(
     missed = [{"old_track": 17, "label": "tea pot", "reason": "no object there"}]
     for target, left in (("", missed), ("s3://b/lab", missed), ("", [])):
         corrections = {"transferred": [{}] * 5, "not_transferred": left}
-        summary = SimpleNamespace(corrections=corrections, folder=Path("out/lab"))
-        job = SimpleNamespace(name="in/lab", target=target)
+        summary = SimpleNamespace(corrections=corrections)
+        job = Job(Path("in/lab"), Path("out/lab"), target=target)
         OUTCOMES._print_corrections(job, summary)
 
     message = "lab: transferred 5 of 6 corrected labels; the others are in"

@@ -531,6 +531,19 @@ def test_labels_that_were_not_transferred_stay_at_the_url(made: Path, tmp_path: 
     assert (place / copy).read() == b"labels"
 
 
+def test_json_names_the_run_at_its_url(shapecat: Run, served: Path) -> None:
+    """It was the name alone, and without warnings if the run was complete before."""
+    out = ("--out", "memory://named", *OPTIONS, "--json", "--progress", "jsonl")
+    command = ("process", served / "a.mcap", served / "b.bag", *out)
+    first, again = shapecat(*command), shapecat(*command)
+    runs = json.loads(first.stdout)
+
+    assert [run["folder"] for run in runs] == ["memory://named/a", "memory://named/b"]
+    assert json.loads(again.stdout) == [{**run, "processed": False} for run in runs]
+    events = [json.loads(line) for line in first.stderr.splitlines()]
+    assert {e["folder"] for e in events if e["event"] == "ended"} == {run["folder"] for run in runs}
+
+
 @pytest.mark.parametrize("content", [b"{}", b'{"id": "0', b""])
 def test_unusable_run_at_url_is_named(shapecat: Run, served: Path, content: bytes) -> None:
     """The message named a folder in scratch space, which is gone."""

@@ -84,6 +84,11 @@ class Job:
         """The path or URL of the recording."""
         return self.origin or str(self.source)
 
+    @property
+    def place(self) -> str:
+        """The folder or URL of the results."""
+        return self.target or str(self.folder)
+
     def selection(self) -> Options:
         """Return the options that affect the results, as stored in run.json."""
         return {
