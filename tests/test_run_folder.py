@@ -7,7 +7,8 @@ from typing import Any
 
 import pytest
 
-from shapecat.errors import OutputError
+from shapecat.errors import OutputError, RecordingError
+from shapecat.runs.finished import open_source, require_recordings
 from shapecat.runs.folder import (
     previous_path,
     read_run,
@@ -220,6 +221,20 @@ def test_run_json_round_trips_and_is_validated(tmp_path: Path) -> None:
         read_run(tmp_path)
     with pytest.raises(OutputError, match=r"no run\.json"):
         read_run(tmp_path / "nowhere")
+
+
+def test_recording_at_url_is_missing_under_its_url(tmp_path: Path) -> None:
+    """It lost a slash. Several runs cannot be given their recordings in one command."""
+    url = "s3://lab/in/a.mcap"
+    write_run(tmp_path, run_info(input={"path": url}))
+
+    with (
+        pytest.raises(RecordingError, match=f"^{url}: the recording is at a URL"),
+        open_source(read_run(tmp_path)),
+    ):
+        pytest.fail("it is not on this machine")
+    with pytest.raises(RecordingError, match=rf"annotate RUN --recording PATH`:\n  {url} of "):
+        require_recordings([tmp_path])
 
 
 @pytest.mark.parametrize("length", [249, 253, 300])

@@ -96,11 +96,11 @@ def require_recordings(folders: Iterable[Path]) -> None:
     ------
     RecordingError : some are missing; the message lists all of them.
     """
-    sources = {folder: Path(read_run(folder)["input"]["path"]) for folder in folders}
-    missing = [f"{path} of {run}" for run, path in sources.items() if not path.exists()]
+    sources = {folder: read_run(folder)["input"]["path"] for folder in folders}
+    missing = [f"{path} of {run}" for run, path in sources.items() if not Path(path).exists()]
     if missing:
         listed = "\n  ".join(missing)
-        hint = "run the command on each of these runs alone, with --recording PATH"
+        hint = "store where each is, with `shapecat annotate RUN --recording PATH`"
         msg = f"missing recordings; {hint}:\n  {listed}"
         raise RecordingError(msg)
 
@@ -120,7 +120,9 @@ def open_source(run: RunInfo, moved_to: Path | None = None) -> Iterator[Recordin
     """
     path = moved_to or Path(run["input"]["path"])
     if moved_to is None and not path.exists():
-        msg = f"{path}: the recording is missing; if it was moved, give --recording PATH"
+        named = run["input"]["path"]  # a path would lose a slash of a URL
+        state = "is at a URL; download it and" if "://" in named else "is missing; if it was moved,"
+        msg = f"{named}: the recording {state} give --recording PATH"
         raise RecordingError(msg)
     with open_recording(path) as recording:
         if not same_content(run["input"], path, lambda: content_digest(path)):
