@@ -13,6 +13,7 @@ from shapecat.runs.folder import (
     previous_path,
     read_run,
     recover,
+    require_ours,
     staged,
     write_run,
     writing_outputs,
@@ -97,6 +98,14 @@ def test_foreign_folder_is_not_touched(tmp_path: Path, name: str, file: str) -> 
 
     assert {path.name: path.read_text() for path in (tmp_path / name).iterdir()} == {file: "{}"}
     assert [path.name for path in tmp_path.iterdir()] == [name]
+
+
+@pytest.mark.parametrize("content", ['{"id": "0', '{"id": "0123456789abcdef"}'])
+def test_run_with_unusable_description_is_called_so(tmp_path: Path, content: str) -> None:
+    """The message said that shapecat did not make a folder which it made."""
+    (tmp_path / "run.json").write_text(content)
+    with pytest.raises(OutputError, match=r"its run\.json is damaged or of another version"):
+        require_ours(tmp_path)
 
 
 def test_file_or_link_at_target_is_not_touched(tmp_path: Path) -> None:

@@ -142,7 +142,9 @@ def require_ours(folder: Path, marker: Marker = made_by_run) -> None:
             return
     elif not os.path.lexists(folder):  # a link may lead to a disk that is not mounted
         return
-    msg = f"{folder}: shapecat did not make this; choose another --out, or move it away"
+    is_unusable = (folder / "run.json").is_file() and made_by_run(folder) is None
+    doubt = ", or its run.json is damaged or of another version" if is_unusable else ""
+    msg = f"{folder}: shapecat did not make this{doubt}; choose another --out, or move it away"
     raise OutputError(msg)
 
 
