@@ -612,6 +612,17 @@ def test_unreadable_file_gives_one_line_error(
     assert "\n" not in str(caught.value)
 
 
+@pytest.mark.parametrize("name", ["lab%41.db3", "run#1.db3", "what?.db3", "a%20#b/c.db3"])
+def test_database_may_have_signs_of_urls_in_its_path(tmp_path: Path, name: str) -> None:
+    """SQLite took them for those of a URL: it found no such file, or read another one."""
+    whole = write_folder(tmp_path / "bag", StoragePlugin.SQLITE3) / "bag.db3"
+    (tmp_path / name).parent.mkdir(exist_ok=True)
+    whole.rename(tmp_path / name)
+    (tmp_path / "labA.db3").write_bytes(b"another")
+
+    assert len(times_read(tmp_path / name)) == 5
+
+
 def test_format_is_detected_from_content_not_suffix(tmp_path: Path) -> None:
     path = write_mcap(tmp_path / "a.bag", [1])
     database = write_folder(tmp_path / "bag", StoragePlugin.SQLITE3) / "bag.db3"

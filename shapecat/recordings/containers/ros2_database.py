@@ -30,6 +30,8 @@ __all__ = ["DatabaseRecording"]
 
 _LAST_NS = 2**63 - 1
 """The largest time that SQLite can hold."""
+_OF_URLS = frozenset("%?#")
+"""In a path, the reader takes these for the signs of a URL."""
 _SCHEMAS = {MessageDefinitionFormat.MSG: "ros2msg", MessageDefinitionFormat.IDL: "ros2idl"}
 
 
@@ -77,7 +79,7 @@ class DatabaseRecording(Recording):
         """
         log = write_ahead_log(self.path)
         if log is None:
-            return self.path if self.path.suffix == ".db3" else self._renamed()
+            return self._renamed()
         try:
             folder = self._cleanup.enter_context(scratch_folder())
             copy = folder / "a.db3"
@@ -91,12 +93,14 @@ class DatabaseRecording(Recording):
                 base.execute("PRAGMA wal_checkpoint(TRUNCATE)").fetchall()
         except (OSError, apsw.Error) as error:
             self.warn(f"not finished; the last messages, in {log.name}, are not read: {error}")
-            return self.path
+            return self._renamed()
         self.warn(f"not finished; messages recovered from {log.name}")
         return copy
 
     def _renamed(self) -> Path:
-        """Return a link to the database with the only suffix that its reader accepts."""
+        """Return the database, or a link with a name that the reader accepts."""
+        if self.path.suffix == ".db3" and _OF_URLS.isdisjoint(str(self.path)):
+            return self.path
         link = self._cleanup.enter_context(scratch_folder()) / "a.db3"
         link.symlink_to(self.path.resolve())
         return link
