@@ -26,9 +26,9 @@ from shapecat.batch.claims import claimed
 from shapecat.batch.finding import find_recordings, stat_url
 from shapecat.batch.manifest import Entry, RemoteManifest
 from shapecat.batch.remote import TaskKey, _download, process_remote, upload
-from shapecat.batch.storage import Location
+from shapecat.batch.storage import Location, names_in
 from shapecat.errors import OutputError, RecordingError
-from shapecat.runs.folder import RUN_FILES
+from shapecat.runs.folder import RUN_FILES, read_run
 from shapecat.runs.jobs import Job, Summary
 from shapecat.system.files import scratch_folder
 from tests.object_storage import object_storage, requests
@@ -120,6 +120,25 @@ def test_recordings_of_server_are_processed_into_folder(
     assert tables[0].read_bytes() == tables[1].read_bytes()
     again = shapecat("process", *urls[:2], "--out", tmp_path / "out", *OPTIONS)
     assert again.stdout.count("already complete") == 2
+
+
+def test_names_on_server_are_decoded(
+    shapecat: Run, address: str, served: Path, tmp_path: Path
+) -> None:
+    """Results were named ``my%20lab``, and a bag did not have the parts that its metadata names."""
+    (served / "my lab.mcap").symlink_to(served / "a.mcap")
+    bag = record(served / "\xfc 1", FRAMES, container="ros2")
+    urls = [f"{address}/my%20lab.mcap", f"{address}/%C3%BC%201"]
+    done = shapecat("process", *urls, "--out", tmp_path / "out", *OPTIONS)
+    (served / "my lab.mcap").unlink()
+    shutil.rmtree(bag)
+
+    assert done.exit_code == 0, done.output
+    assert "Warning" not in done.stderr
+    runs = [read_run(tmp_path / "out" / name) for name in ("my lab", "\xfc 1")]
+    assert [run["input"]["path"] for run in runs] == urls
+    for hostile in ("%2e%2e", "a%2fb", "a%00", "a%ff"):
+        assert names_in(f"http://host/{hostile}/{hostile}") == (hostile, hostile)
 
 
 @pytest.mark.parametrize(

@@ -13,7 +13,7 @@ from operator import attrgetter
 from pathlib import Path, PurePosixPath
 from typing import Any
 
-from shapecat.batch.storage import Location, content_key, is_url
+from shapecat.batch.storage import Location, content_key, is_url, names_in
 from shapecat.errors import RecordingError
 from shapecat.recordings import open_recording
 from shapecat.recordings.files import is_of_bag
@@ -87,9 +87,9 @@ def _of_path(path: Path, real: Path) -> Source:
 
 
 def _of_url(url: str, key: str = "", size: int = 0) -> Source:
-    pure = PurePosixPath(url.partition("://")[2].partition("?")[0])
-    stem = pure.stem if _has_recording_suffix(pure.name) else pure.name
-    return Source("", url, stem, pure.parent.name, key, size)
+    parent, name = names_in(url)
+    stem = PurePosixPath(name).stem if _has_recording_suffix(name) else name
+    return Source("", url, stem, parent, key, size)
 
 
 def _search_url(url: str) -> list[Source]:

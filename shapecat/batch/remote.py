@@ -8,10 +8,10 @@ import dataclasses
 from contextlib import nullcontext, suppress
 from dataclasses import dataclass
 from fnmatch import fnmatchcase
-from pathlib import Path, PurePosixPath
+from pathlib import Path
 
 from shapecat.batch.claims import Claim, claimed
-from shapecat.batch.storage import Location
+from shapecat.batch.storage import Location, names_in
 from shapecat.errors import OutputError, RecordingError, ShapecatError
 from shapecat.pipeline import process
 from shapecat.runs.folder import OUTPUTS, RUN_FILES, parse_run, read_run, write_run
@@ -105,7 +105,7 @@ def _process(job: Job, local: Job, observe: Observer, cores: int) -> Summary:
 
 
 def _download(url: str, folder: Path) -> Path:
-    target = folder / PurePosixPath(url.partition("?")[0].rstrip("/")).name
+    target = folder / names_in(url)[1]
     Location(url).download(target)
     if target.suffix.lower() == ".db3" and target.is_file() and "?" not in url:
         log, info = Location(f"{url}-wal"), None  # of a recorder that was killed

@@ -13,10 +13,11 @@ from functools import partial
 from hashlib import sha256
 from pathlib import Path, PurePosixPath
 from typing import Any, TypeVar
+from urllib.parse import unquote
 
 from shapecat.errors import ConfigError, RecordingError, ShapecatError
 
-__all__ = ["Location", "content_key", "is_url"]
+__all__ = ["Location", "content_key", "is_url", "names_in"]
 
 _T = TypeVar("_T")
 
@@ -52,6 +53,27 @@ def is_url(text: str) -> bool:
     (True, False)
     """
     return "://" in text
+
+
+def names_in(url: str) -> tuple[str, str]:
+    """Return the names of the folder and of the file at a URL, without query.
+
+    A name that would be hidden or lead out of a folder stays encoded.
+
+    Examples
+    --------
+    >>> names_in("http://host/my%20day/lab.mcap?key=1"), names_in("s3://lab/100%25/b.bag")
+    (('my day', 'lab.mcap'), ('100%25', 'b.bag'))
+    """
+    protocol, _, path = url.partition("://")
+    pure = PurePosixPath(path.partition("?")[0])
+    decode = _decoded if protocol in {"http", "https"} else str
+    return decode(pure.parent.name), decode(pure.name)
+
+
+def _decoded(name: str) -> str:
+    plain = unquote(name)
+    return name if plain.startswith(".") or not {"/", "\0", "\ufffd"}.isdisjoint(plain) else plain
 
 
 def content_key(info: Mapping[str, Any]) -> str:
@@ -185,7 +207,8 @@ class Location:
                 if ".." in name.parts:
                     msg = f"{self.url}: the name {str(name)!r} leads out of the folder"
                     raise self._error(msg)
-                file = target / name
+                is_encoded = "http" in self._system.protocol
+                file = target.joinpath(*map(_decoded, name.parts) if is_encoded else name.parts)
                 self._retry("downloaded", partial(get, info["name"], file))
         if not target.exists():
             msg = f"{self.url}: does not exist"
