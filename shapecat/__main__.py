@@ -6,13 +6,14 @@ from typing import Any
 
 from shapecat.system.garbage import collect_seldom
 from shapecat.system.libraries import block_unused
-from shapecat.system.stderr import forgive_stderr
+from shapecat.system.stderr import forgive_stderr, require_stdout
 from shapecat.system.stopping import exit_at_once
 
 
 def run() -> None:
     """Run the command line. Until it handles signals itself, a signal ends the process."""
     _handle(exit_at_once)
+    require_stdout()
     forgive_stderr()
     collect_seldom()
     block_unused()

@@ -579,6 +579,16 @@ sys.exit(5)
     assert (done.returncode, done.stderr) == (5, b"")
 
 
+def test_closed_stdout_does_not_change_the_exit_code(tmp_path: Path) -> None:
+    """Without it, `process` crashed after the work, and files got its number."""
+    words = ["process", str(tmp_path / "missing.mcap"), "--out", str(tmp_path / "out")]
+    command = ["sh", "-c", 'exec "$@" >&-', "sh", sys.executable, "-m", "shapecat", *words]
+    done = subprocess.run(command, stderr=subprocess.PIPE, text=True, check=False)
+
+    assert done.returncode == 3
+    assert done.stderr.count("\n") == 1, done.stderr
+
+
 @contextmanager
 def unwritable_stderr(how: str) -> Iterator[None]:
     """Close stderr during the block, or let it lead to a full disk or to a reader that left."""

@@ -1,10 +1,10 @@
-"""Keep a command at work when nobody can read its messages."""
+"""Keep a command at work when nobody can read its messages or its output."""
 
 import io
 import os
 import sys
 
-__all__ = ["forgive_stderr"]
+__all__ = ["forgive_stderr", "require_stdout"]
 
 
 class _Forgiving(io.TextIOWrapper):
@@ -26,6 +26,17 @@ class _Forgiving(io.TextIOWrapper):
             super().flush()
         except OSError:
             pass
+
+
+def require_stdout() -> None:
+    """Make stdout the null device if it was closed before the start, as a daemon's may be.
+
+    Otherwise the next file that is opened would get its number, also in worker processes.
+    """
+    if sys.stdout is None:
+        os.dup2(os.open(os.devnull, os.O_WRONLY), 1)
+        os.set_inheritable(1, True)  # noqa: FBT003  it has no name
+        sys.stdout = os.fdopen(1, "w", encoding="utf-8", closefd=False)
 
 
 def forgive_stderr() -> None:
