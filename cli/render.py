@@ -25,6 +25,9 @@ PHASES = {
     "compare": "comparing",
 }
 
+_WIDEST = 100_000
+"""Characters: a table for a file or another program is never folded."""
+
 
 class Bars:
     """One progress bar per phase; silent when stderr is not a terminal."""
@@ -60,7 +63,7 @@ def rich_progress() -> Any:
 def progress_bars() -> Iterator[Bars]:
     """Show progress bars on stderr, if it is a terminal, while the block runs."""
     progress = rich_progress()
-    progress.disable = not progress.console.is_terminal
+    progress.disable = not sys.stderr.isatty()  # Rich would obey FORCE_COLOR
     with progress:
         yield Bars(progress)
 
@@ -71,7 +74,10 @@ def print_json(value: Any) -> None:
 
 
 def print_table(columns: Sequence[str], rows: Sequence[Sequence[Any]]) -> None:
-    """Print a table with right-aligned columns of numbers; names are printed as they are."""
+    """Print a table with right-aligned columns of numbers; names are printed as they are.
+
+    Only on a terminal, it is folded to the width.
+    """
     from rich.console import Console
     from rich.table import Table
 
@@ -81,7 +87,7 @@ def print_table(columns: Sequence[str], rows: Sequence[Sequence[Any]]) -> None:
         table.add_column(name, justify="right" if numeric else "left", overflow="fold")
     for row in rows:
         table.add_row(*map(str, row))
-    width = None if Console().is_terminal else 200
+    width = None if sys.stdout.isatty() else _WIDEST  # Rich would obey FORCE_COLOR
     console = Console(width=width, markup=False, emoji=False)
     with console.capture() as printed:  # Rich would end the process if nobody reads
         console.print(table)

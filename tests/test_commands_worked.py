@@ -513,6 +513,21 @@ def test_workers_of_a_cluster_get_absolute_paths(
 ODD = ("/cam[left]/depth", "k [/night].mcap", "box :car:")
 
 
+def test_pipe_is_no_terminal_with_forced_colours(
+    capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """CI servers set it: names were broken into lines, and bars filled the log."""
+    monkeypatch.setenv("FORCE_COLOR", "1")
+    topics = [f"/{'left' * 60}/{name}" for name in ("image_raw", "points")]
+    RENDER.print_table(("topic", "type"), [[topic, "std_msgs/msg/" * 3] for topic in topics])
+    with RENDER.progress_bars() as bars:
+        bars("export", 1, 2)
+    printed = capsys.readouterr()
+
+    assert [line.split()[0] for line in printed.out.splitlines()] == ["topic", *topics]
+    assert printed.err == ""
+
+
 def test_tables_and_bars_show_names_as_they_are(
     capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
 ) -> None:
