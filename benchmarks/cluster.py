@@ -25,10 +25,10 @@ import numpy as np
 
 from benchmarks.batch import process
 from benchmarks.measure import markdown, save
-from shapecat.batch.finding import Source
 from shapecat.batch.ledger import Ledger
 from shapecat.batch.manifest import Entry, Manifest, RemoteManifest
 from shapecat.batch.plans import _Planner, plan_batch
+from shapecat.batch.sources import Source
 from shapecat.batch.storage import Location
 from shapecat.executors import open_executor
 from shapecat.runs.jobs import Job

@@ -13,13 +13,15 @@ from typing import Any, get_args
 import fsspec
 import pytest
 
-from shapecat.batch.finding import Source, _combined_key, find_recordings
+from shapecat.batch.finding import find_recordings
+from shapecat.batch.finding_urls import _combined_key
 from shapecat.batch.ledger import Ledger, Outcome
 from shapecat.batch.manifest import Entry, Manifest, RemoteManifest, State
 from shapecat.batch.naming import existing_names, name_folders
 from shapecat.batch.plans import Shard, plan_batch
 from shapecat.batch.remote import TaskKey
 from shapecat.batch.runs import _reporter, process_here, process_on
+from shapecat.batch.sources import Source
 from shapecat.batch.storage import Location, content_key
 from shapecat.config import Settings, with_overrides
 from shapecat.errors import OutputError, common_exit_code

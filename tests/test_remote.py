@@ -23,7 +23,8 @@ from click.testing import Result
 
 from shapecat.batch import claims, storage
 from shapecat.batch.claims import claimed
-from shapecat.batch.finding import find_recordings, stat_url
+from shapecat.batch.finding import find_recordings
+from shapecat.batch.finding_urls import stat_url
 from shapecat.batch.manifest import Entry, RemoteManifest
 from shapecat.batch.remote import TaskKey, _download, process_remote, upload
 from shapecat.batch.storage import Location, names_in

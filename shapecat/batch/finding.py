@@ -2,54 +2,35 @@
 
 import logging
 import os
-from collections import defaultdict
-from collections.abc import Collection, Iterable, Iterator, Mapping, Sequence
-from concurrent.futures import ThreadPoolExecutor
+from collections.abc import Iterator, Sequence
 from contextlib import suppress
 from dataclasses import dataclass
-from hashlib import sha256
-from itertools import compress, pairwise
-from operator import attrgetter
-from pathlib import Path, PurePosixPath
-from typing import Any
+from itertools import pairwise
+from pathlib import Path
 
-from shapecat.batch.storage import Location, content_key, is_url, names_in
+from shapecat.batch.finding_urls import search_url, search_url_beside_others
+from shapecat.batch.sources import (
+    BAG_KEY,
+    COMPRESSED_HINT,
+    METADATA_BYTES,
+    Source,
+    has_recording_suffix,
+    is_compressed,
+    is_named_as_bag,
+    parts_among,
+    recordings_among,
+)
+from shapecat.batch.storage import is_url
 from shapecat.errors import RecordingError
 from shapecat.recordings import open_recording
-from shapecat.recordings.files import is_of_bag
 
-__all__ = ["SearchResult", "Source", "find_recordings", "stat_url"]
+__all__ = ["SearchResult", "find_recordings"]
 
 _log = logging.getLogger(__name__)
 
-_SUFFIXES = {".mcap", ".bag", ".db3"}
 _GAP_NS = 10**10
 """The longest time between the parts of a bag; takes are farther apart, or overlap."""
-_COMPRESSED = {".zst", ".zstd", ".gz", ".bz2", ".xz", ".lz4", ".zip"}
-_COMPRESSED_HINT = "skipped: a compressed file, unpack it first"
 _MAGIC = (b"\x89MCAP", b"#ROSBAG", b"SQLite format 3")
-_BAG_KEY = b"rosbag2_bagfile_information:"
-"""The first line of a bag's metadata.yaml; data sets have files of this name, too."""
-_METADATA_BYTES = 1 << 12
-_THREADS = 16
-"""Threads that read metadata at URLs: each request is a round trip."""
-
-
-@dataclass(frozen=True, slots=True)
-class Source:
-    """A recording at a path or a URL; the field that does not apply is empty.
-
-    ``stem`` is its name without suffix and ``parent`` the name of its folder; both serve to name
-    the run folder. ``key`` changes with the content at a URL, and ``bytes`` is its size; they are
-    empty and 0 for a path.
-    """
-
-    path: str
-    url: str
-    stem: str
-    parent: str
-    key: str = ""
-    bytes: int = 0
 
 
 @dataclass(frozen=True)
@@ -71,7 +52,7 @@ def find_recordings(sources: Sequence[str]) -> SearchResult:
     ------
     RecordingError : no recording was found.
     """
-    search = _search_url if len(sources) == 1 else _search_url_beside_others
+    search = search_url if len(sources) == 1 else search_url_beside_others
     remote = {found.url: found for source in sources if is_url(source) for found in search(source)}
     local, skipped = _search_paths([Path(source) for source in sources if not is_url(source)])
     found = [_of_path(path, real) for real, path in local.items()] + list(remote.values())
@@ -84,116 +65,6 @@ def find_recordings(sources: Sequence[str]) -> SearchResult:
 
 def _of_path(path: Path, real: Path) -> Source:
     return Source(str(path), "", real.name if path.is_dir() else path.stem, real.parent.name)
-
-
-def _of_url(url: str, key: str = "", size: int = 0) -> Source:
-    parent, name = names_in(url)
-    stem = PurePosixPath(name).stem if _has_recording_suffix(name) else name
-    return Source("", url, stem, parent, key, size)
-
-
-def _search_url(url: str) -> list[Source]:
-    """Return the recordings that match a URL pattern or are below a folder, or the URL itself.
-
-    Raises
-    ------
-    RecordingError : the storage cannot be reached.
-    """
-    location = Location(url)
-    if any(character in url.partition("?")[0] for character in "*["):  # signed URLs have queries
-        found = [
-            _of_url(name, content_key(info), _size(info))
-            for name, info in location.matches()
-            if _has_recording_suffix(name)
-        ]
-        if found or location.info() is None:  # otherwise a name with brackets
-            return sorted(found, key=attrgetter("url"))
-    if url.endswith("/") or _is_remote_folder(location):
-        return sorted(_search_remote_folder(location), key=attrgetter("url"))
-    return [_of_url(url)]
-
-
-def _search_url_beside_others(url: str) -> list[Source]:
-    """Search a URL; a missing one is a recording, which fails as a missing file does."""
-    found = _search_url(url)
-    if found or next(Location(url).walk(deep=False), None) is None:
-        return found or [_of_url(url)]
-    _log.error("%s: no recording found", url)
-    return []
-
-
-def _is_remote_folder(location: Location) -> bool:
-    """Return whether a URL is that of a folder; one with the suffix of a recording is not asked."""
-    if _has_recording_suffix(location.url.partition("?")[0]):
-        return False
-    with suppress(RecordingError):  # reported when it is downloaded
-        return (location.info() or {}).get("type") == "directory"
-    return False
-
-
-def stat_url(url: str) -> tuple[str, int]:
-    """Return a key of the content at a URL and its size in bytes; empty and 0 if unknown."""
-    location = Location(url)
-    with suppress(RecordingError):  # reported when it is downloaded
-        info = location.info()
-        if info is not None and info.get("type") == "directory":
-            files = [(content_key(file), _size(file)) for _, file in location.walk()]
-            return _combined_key(key for key, _ in files), sum(size for _, size in files)
-        if info is not None:
-            return content_key(info), _size(info)
-    return "", 0
-
-
-def _combined_key(keys: Iterable[str]) -> str:
-    ordered = sorted(keys)
-    return sha256("".join(ordered).encode()).hexdigest()[:16] if all(ordered) else ""
-
-
-def _size(info: Mapping[str, Any]) -> int:
-    return int(info.get("size") or 0)
-
-
-def _search_remote_folder(location: Location) -> Iterator[Source]:
-    """Yield the recordings and ROS 2 bag folders below a folder."""
-    files: list[Source] = []
-    described, runs = set(), set()
-    for url, info in location.walk():
-        parent, _, name = url.rpartition("/")
-        if name == "metadata.yaml":
-            described.add(parent)
-        elif name in {"run.json", "frames.parquet"}:
-            runs.add(parent)
-        elif "/." in url.removeprefix(location.root):
-            continue
-        elif _has_recording_suffix(name) or _is_compressed(name):
-            files.append(_of_url(url, content_key(info), _size(info)))
-    names = defaultdict[str, list[str]](list)
-    for parent, _, name in (file.url.rpartition("/") for file in files):
-        names[parent].append(name)
-    bags = {url for url, held in names.items() if _is_named_as_bag(PurePosixPath(url).name, held)}
-    bags |= set(_bags_among((described & names.keys()) - bags))
-    parts: dict[str, list[Source]] = {bag: [] for bag in bags}
-    for file in files:
-        parent = file.url.rpartition("/")[0]
-        if parent in parts:
-            parts[parent].append(file)
-        elif parent not in runs and _is_compressed(file.url):
-            _log.error("%s: %s", file.url, _COMPRESSED_HINT)
-        elif parent not in runs:
-            yield file
-    for bag, found in parts.items():
-        yield _of_url(bag, _combined_key(f.key for f in found), sum(f.bytes for f in found))
-
-
-def _bags_among(folders: Iterable[str]) -> list[str]:
-    """Return the folders, by URL, whose metadata.yaml is that of a bag."""
-
-    def is_bag(folder: str) -> bool:
-        return _BAG_KEY in ((Location(folder) / "metadata.yaml").read() or b"")[:_METADATA_BYTES]
-
-    ordered = sorted(folders)
-    with ThreadPoolExecutor(_THREADS) as pool:
-        return list(compress(ordered, pool.map(is_bag, ordered)))
 
 
 def _search_paths(sources: Sequence[Path]) -> tuple[dict[Path, Path], int]:
@@ -229,40 +100,18 @@ def _is_bag(folder: Path) -> bool:
     except OSError:  # reported by the search
         return False
     names = {path.name for path in paths if path.is_file()}
-    recordings, parts = _recordings_among(names), _parts_among(names)
+    recordings, parts = recordings_among(names), parts_among(names)
     if len(recordings) == 1 and recordings.pop().endswith(".db3"):
         return True
-    return _is_named_as_bag(_real_path(folder).name, names) or _follow_in_time(
+    return is_named_as_bag(_real_path(folder).name, names) or _follow_in_time(
         [folder / name for name in parts]
     )
-
-
-def _is_named_as_bag(folder: str, names: Collection[str]) -> bool:
-    """Return whether a folder with files of these names is a bag, whenever they were recorded."""
-    parts = _parts_among(names)
-    is_compressed = any(name.endswith(".zstd") for name in names)
-    return bool(parts) and (is_compressed or parts[0].rpartition("_")[0] == folder)
-
-
-def _recordings_among(names: Iterable[str]) -> set[str]:
-    """Return the names of recordings, uncompressed."""
-    uncompressed = {name.removesuffix(".zstd") for name in names}
-    return {name for name in uncompressed if PurePosixPath(name).suffix in _SUFFIXES}
-
-
-def _parts_among(names: Iterable[str]) -> list[str]:
-    """Return the names of recordings if they are a_0.mcap, a_1.mcap, ..., in this order."""
-    recordings = _recordings_among(names)
-    first = PurePosixPath(min(recordings, default=""))
-    base = first.stem.rpartition("_")[0]
-    parts = [f"{base}_{k}{first.suffix}" for k in range(len(recordings))]
-    return parts if is_of_bag(first.name) and recordings == set(parts) else []
 
 
 def _has_bag_metadata(folder: Path) -> bool:
     try:
         with (folder / "metadata.yaml").open("rb") as file:
-            return _BAG_KEY in file.read(_METADATA_BYTES)
+            return BAG_KEY in file.read(METADATA_BYTES)
     except FileNotFoundError:
         return False
 
@@ -297,16 +146,10 @@ def _search(folder: Path, searched: set[Path]) -> Iterator[Path]:
     for path, is_folder in found:
         if is_folder and not _is_bag(path):
             yield from _search(path, searched)
-        elif is_folder or _has_recording_suffix(path.name):
+        elif is_folder or has_recording_suffix(path.name):
             yield path
-        elif _is_compressed(path.name):
-            _log.error("%s: %s", path, _COMPRESSED_HINT)
-
-
-def _is_compressed(name: str) -> bool:
-    """Return whether a path or URL ends like a compressed recording."""
-    path = PurePosixPath(name)
-    return path.suffix.lower() in _COMPRESSED and _has_recording_suffix(path.stem)
+        elif is_compressed(path.name):
+            _log.error("%s: %s", path, COMPRESSED_HINT)
 
 
 def _real_path(path: Path) -> Path:
@@ -314,13 +157,8 @@ def _real_path(path: Path) -> Path:
     return Path(os.path.realpath(path))
 
 
-def _has_recording_suffix(name: str) -> bool:
-    """Return whether a file has the suffix of a recording, or of one whose recorder was killed."""
-    return name.endswith(".bag.active") or PurePosixPath(name).suffix.lower() in _SUFFIXES
-
-
 def _may_be_recording(path: Path) -> bool:
-    if _has_recording_suffix(path.name):
+    if has_recording_suffix(path.name):
         return True
     try:
         with path.open("rb") as file:

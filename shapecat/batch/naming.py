@@ -10,8 +10,8 @@ from itertools import chain, count
 from pathlib import Path
 from types import MappingProxyType
 
-from shapecat.batch.finding import Source
 from shapecat.batch.manifest import Entry, entries_at
+from shapecat.batch.sources import Source
 from shapecat.batch.storage import Location, is_url
 from shapecat.errors import ShapecatError
 from shapecat.runs.folder import read_run

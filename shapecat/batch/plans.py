@@ -13,9 +13,11 @@ from typing import Literal
 from uuid import uuid4
 
 from shapecat.batch.claims import claim_name
-from shapecat.batch.finding import Source, find_recordings, stat_url
+from shapecat.batch.finding import find_recordings
+from shapecat.batch.finding_urls import stat_url
 from shapecat.batch.manifest import Entry, Manifest, open_manifest
 from shapecat.batch.naming import existing_names, name_folders
+from shapecat.batch.sources import Source
 from shapecat.batch.storage import Location, is_url
 from shapecat.errors import ConfigError, OutputError
 from shapecat.learning import load_model

@@ -35,6 +35,7 @@ JUDGED_BY: dict[str, Sequence[str]] = {
     "shapecat.batch.runs": ("test_batch_planning", "test_batch"),
     "shapecat.batch.claims": ("test_remote",),
     "shapecat.batch.remote": ("test_remote",),
+    "shapecat.batch.finding_urls": ("test_remote", "test_batch_planning"),
     "shapecat.batch.storage": ("test_remote",),
     "shapecat.cameras": ("test_cameras", "test_colour", "test_recordings_colour"),
     "shapecat.cli": ("test_commands_worked", "test_command_line", "test_pipeline",

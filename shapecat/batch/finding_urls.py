@@ -1,0 +1,141 @@
+"""Find the recordings at a URL: in folders, by patterns, and by name."""
+
+import logging
+from collections import defaultdict
+from collections.abc import Iterable, Iterator, Mapping
+from concurrent.futures import ThreadPoolExecutor
+from contextlib import suppress
+from hashlib import sha256
+from itertools import compress
+from operator import attrgetter
+from pathlib import PurePosixPath
+from typing import Any
+
+from shapecat.batch.sources import (
+    BAG_KEY,
+    COMPRESSED_HINT,
+    METADATA_BYTES,
+    Source,
+    has_recording_suffix,
+    is_compressed,
+    is_named_as_bag,
+)
+from shapecat.batch.storage import Location, content_key, names_in
+from shapecat.errors import RecordingError
+
+__all__ = ["search_url", "search_url_beside_others", "stat_url"]
+
+_log = logging.getLogger(__name__)
+
+_THREADS = 16
+"""Threads that read metadata: each request is a round trip."""
+
+
+def _of_url(url: str, key: str = "", size: int = 0) -> Source:
+    parent, name = names_in(url)
+    stem = PurePosixPath(name).stem if has_recording_suffix(name) else name
+    return Source("", url, stem, parent, key, size)
+
+
+def search_url(url: str) -> list[Source]:
+    """Return the recordings that match a URL pattern or are below a folder, or the URL itself.
+
+    Raises
+    ------
+    RecordingError : the storage cannot be reached.
+    """
+    location = Location(url)
+    if any(character in url.partition("?")[0] for character in "*["):  # signed URLs have queries
+        found = [
+            _of_url(name, content_key(info), _size(info))
+            for name, info in location.matches()
+            if has_recording_suffix(name)
+        ]
+        if found or location.info() is None:  # otherwise a name with brackets
+            return sorted(found, key=attrgetter("url"))
+    if url.endswith("/") or _is_remote_folder(location):
+        return sorted(_search_remote_folder(location), key=attrgetter("url"))
+    return [_of_url(url)]
+
+
+def search_url_beside_others(url: str) -> list[Source]:
+    """Search a URL; a missing one is a recording, which fails as a missing file does."""
+    found = search_url(url)
+    if found or next(Location(url).walk(deep=False), None) is None:
+        return found or [_of_url(url)]
+    _log.error("%s: no recording found", url)
+    return []
+
+
+def _is_remote_folder(location: Location) -> bool:
+    """Return whether a URL is that of a folder; one with the suffix of a recording is not asked."""
+    if has_recording_suffix(location.url.partition("?")[0]):
+        return False
+    with suppress(RecordingError):  # reported when it is downloaded
+        return (location.info() or {}).get("type") == "directory"
+    return False
+
+
+def stat_url(url: str) -> tuple[str, int]:
+    """Return a key of the content at a URL and its size in bytes; empty and 0 if unknown."""
+    location = Location(url)
+    with suppress(RecordingError):  # reported when it is downloaded
+        info = location.info()
+        if info is not None and info.get("type") == "directory":
+            files = [(content_key(file), _size(file)) for _, file in location.walk()]
+            return _combined_key(key for key, _ in files), sum(size for _, size in files)
+        if info is not None:
+            return content_key(info), _size(info)
+    return "", 0
+
+
+def _combined_key(keys: Iterable[str]) -> str:
+    ordered = sorted(keys)
+    return sha256("".join(ordered).encode()).hexdigest()[:16] if all(ordered) else ""
+
+
+def _size(info: Mapping[str, Any]) -> int:
+    return int(info.get("size") or 0)
+
+
+def _search_remote_folder(location: Location) -> Iterator[Source]:
+    """Yield the recordings and ROS 2 bag folders below a folder."""
+    files: list[Source] = []
+    described, runs = set(), set()
+    for url, info in location.walk():
+        parent, _, name = url.rpartition("/")
+        if name == "metadata.yaml":
+            described.add(parent)
+        elif name in {"run.json", "frames.parquet"}:
+            runs.add(parent)
+        elif "/." in url.removeprefix(location.root):
+            continue
+        elif has_recording_suffix(name) or is_compressed(name):
+            files.append(_of_url(url, content_key(info), _size(info)))
+    names = defaultdict[str, list[str]](list)
+    for parent, _, name in (file.url.rpartition("/") for file in files):
+        names[parent].append(name)
+    bags = {url for url, held in names.items() if is_named_as_bag(PurePosixPath(url).name, held)}
+    bags |= set(_bags_among((described & names.keys()) - bags))
+    parts: dict[str, list[Source]] = {bag: [] for bag in bags}
+    for file in files:
+        parent = file.url.rpartition("/")[0]
+        if parent in parts:
+            parts[parent].append(file)
+        elif parent not in runs and is_compressed(file.url):
+            _log.error("%s: %s", file.url, COMPRESSED_HINT)
+        elif parent not in runs:
+            yield file
+    for bag, found in parts.items():
+        yield _of_url(bag, _combined_key(f.key for f in found), sum(f.bytes for f in found))
+
+
+def _bags_among(folders: Iterable[str]) -> list[str]:
+    """Return the folders, by URL, whose metadata.yaml is that of a bag."""
+
+    def is_bag(folder: str) -> bool:
+        return BAG_KEY in ((Location(folder) / "metadata.yaml").read() or b"")[:METADATA_BYTES]
+
+    ordered = sorted(folders)
+    with ThreadPoolExecutor(_THREADS) as pool:
+        return list(compress(ordered, pool.map(is_bag, ordered)))

@@ -1,0 +1,76 @@
+"""What names of files and folders tell: whether they are recordings, or the parts of a bag."""
+
+from collections.abc import Collection, Iterable
+from dataclasses import dataclass
+from pathlib import PurePosixPath
+
+from shapecat.recordings.files import is_of_bag
+
+__all__ = [
+    "BAG_KEY",
+    "COMPRESSED_HINT",
+    "METADATA_BYTES",
+    "Source",
+    "has_recording_suffix",
+    "is_compressed",
+    "is_named_as_bag",
+    "parts_among",
+    "recordings_among",
+]
+
+_SUFFIXES = {".mcap", ".bag", ".db3"}
+_COMPRESSED = {".zst", ".zstd", ".gz", ".bz2", ".xz", ".lz4", ".zip"}
+COMPRESSED_HINT = "skipped: a compressed file, unpack it first"
+BAG_KEY = b"rosbag2_bagfile_information:"
+"""The first line of a bag's metadata.yaml; data sets have files of this name, too."""
+METADATA_BYTES = 1 << 12
+
+
+@dataclass(frozen=True, slots=True)
+class Source:
+    """A recording at a path or a URL; the field that does not apply is empty.
+
+    ``stem`` is its name without suffix and ``parent`` the name of its folder; both serve to name
+    the run folder. ``key`` changes with the content at a URL, and ``bytes`` is its size; they are
+    empty and 0 for a path.
+    """
+
+    path: str
+    url: str
+    stem: str
+    parent: str
+    key: str = ""
+    bytes: int = 0
+
+
+def has_recording_suffix(name: str) -> bool:
+    """Return whether a file has the suffix of a recording, or of one whose recorder was killed."""
+    return name.endswith(".bag.active") or PurePosixPath(name).suffix.lower() in _SUFFIXES
+
+
+def is_compressed(name: str) -> bool:
+    """Return whether a path or URL ends like a compressed recording."""
+    path = PurePosixPath(name)
+    return path.suffix.lower() in _COMPRESSED and has_recording_suffix(path.stem)
+
+
+def is_named_as_bag(folder: str, names: Collection[str]) -> bool:
+    """Return whether a folder with files of these names is a bag, whenever they were recorded."""
+    parts = parts_among(names)
+    is_compressed = any(name.endswith(".zstd") for name in names)
+    return bool(parts) and (is_compressed or parts[0].rpartition("_")[0] == folder)
+
+
+def recordings_among(names: Iterable[str]) -> set[str]:
+    """Return the names of recordings, uncompressed."""
+    uncompressed = {name.removesuffix(".zstd") for name in names}
+    return {name for name in uncompressed if PurePosixPath(name).suffix in _SUFFIXES}
+
+
+def parts_among(names: Iterable[str]) -> list[str]:
+    """Return the names of recordings if they are a_0.mcap, a_1.mcap, ..., in this order."""
+    recordings = recordings_among(names)
+    first = PurePosixPath(min(recordings, default=""))
+    base = first.stem.rpartition("_")[0]
+    parts = [f"{base}_{k}{first.suffix}" for k in range(len(recordings))]
+    return parts if is_of_bag(first.name) and recordings == set(parts) else []
