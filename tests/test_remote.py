@@ -301,6 +301,27 @@ def test_url_without_recordings_is_named_beside_others(
     assert messages == [f"{place}/notes/: no recording found"]
 
 
+@pytest.mark.parametrize("place", ["memory://globbed", "s3://lab/globbed"])
+@pytest.mark.usefixtures("bucket")
+def test_pattern_at_url_finds_folders_as_a_shell_does(place: str) -> None:
+    """Bags that matched beside files were left out without a word."""
+    for name in (
+        *("in/a.mcap", "in/bag/bag_0.mcap", "in/bag/bag_1.mcap", "in/day[1]/b.bag", "in/n.txt"),
+        *("in/done/annotated.mcap", "in/done/run.json", "in/.trash/c.mcap"),
+    ):
+        (Location(place) / name).write(name.encode())
+
+    def found(pattern: str) -> list[str]:
+        sources = find_recordings([f"{place}/{pattern}"]).sources
+        return [source.url.replace(":///", "://").removeprefix(f"{place}/") for source in sources]
+
+    every = ["in/a.mcap", "in/bag", "in/day[1]/b.bag"]
+    assert found("in/*") == found("in*/") == every
+    assert found("in/b*g") == ["in/bag"]
+    assert found("in/*/*_0.mcap") == ["in/bag/bag_0.mcap"]
+    assert found("**") == every
+
+
 def test_folder_below_hidden_folder_is_searched() -> None:
     """Only hidden folders within the given one are left out."""
     root = Location("memory://lab/.staged/in")

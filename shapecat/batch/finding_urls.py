@@ -6,7 +6,7 @@ from collections.abc import Iterable, Iterator, Mapping
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import suppress
 from hashlib import sha256
-from itertools import compress
+from itertools import accumulate, compress
 from operator import attrgetter
 from pathlib import PurePosixPath
 from typing import Any
@@ -46,16 +46,25 @@ def search_url(url: str) -> list[Source]:
     """
     location = Location(url)
     if any(character in url.partition("?")[0] for character in "*["):  # signed URLs have queries
-        found = [
-            _of_url(name, content_key(info), _size(info))
-            for name, info in location.matches()
-            if has_recording_suffix(name)
-        ]
+        found = list(_search_matches(location))
         if found or location.info() is None:  # otherwise a name with brackets
             return sorted(found, key=attrgetter("url"))
     if url.endswith("/") or _is_remote_folder(location):
         return sorted(_search_remote_folder(location), key=attrgetter("url"))
     return [_of_url(url)]
+
+
+def _search_matches(pattern: Location) -> Iterator[Source]:
+    """Yield the recordings that match a pattern, and those below folders that do."""
+    matches = dict(pattern.matches())
+    folders = {url for url, info in matches.items() if info.get("type") == "directory"}
+    for url, info in matches.items():
+        if not folders.isdisjoint(accumulate(url.split("/")[:-1], "{}/{}".format)):
+            continue  # the search of that folder finds it
+        if url not in folders and has_recording_suffix(url):
+            yield _of_url(url, content_key(info), _size(info))
+        elif url in folders and not PurePosixPath(url).name.startswith("."):
+            yield from _search_remote_folder(Location(url))
 
 
 def search_url_beside_others(url: str) -> list[Source]:
