@@ -10,7 +10,7 @@ from click.core import ParameterSource
 from shapecat.outputs.counts import plural
 
 from .options import ANY_PATH, boxes_option, recording_option
-from .render import progress_bars
+from .render import for_any_reader, progress_bars
 
 _DATASETS = ("coco", "yolo")
 _WITH_BOXES = ("kitti", "labelcloud")
@@ -131,7 +131,8 @@ def export(
                 recording=recording,
                 observe=bars,
             )
-        click.echo(f"{run}: {plural(count, 'labelled view')} in {out}")
+        with for_any_reader():
+            click.echo(f"{run}: {plural(count, 'labelled view')} in {out}")
 
 
 def _export_dataset(

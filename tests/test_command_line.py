@@ -579,6 +579,32 @@ sys.exit(5)
     assert (done.returncode, done.stderr) == (5, b"")
 
 
+EXPORT = """
+import sys
+from importlib import import_module
+from shapecat.outputs.exports import formats
+from shapecat.runs import finished
+
+finished.find_runs, finished.require_recordings = list, list
+formats.common_categories = lambda _: ()
+formats.export_run = lambda run, *_, **__: print(run, file=sys.stderr) or 1
+command = import_module("shapecat.cli.main").main
+command(["export", "a", "b", "c", "--format", "kitti", "--out", "out"])
+"""
+
+
+def test_reader_that_leaves_early_does_not_end_an_export() -> None:
+    """With `export ... | head -1`, the other runs were not exported."""
+    reader, pipe = os.pipe()
+    os.close(reader)
+    done = subprocess.run(
+        [sys.executable, "-c", EXPORT], stdout=pipe, stderr=subprocess.PIPE, text=True, check=False
+    )
+    os.close(pipe)
+
+    assert (done.returncode, done.stderr.split()) == (0, ["a", "b", "c"])
+
+
 def test_closed_stdout_does_not_change_the_exit_code(tmp_path: Path) -> None:
     """Without it, `process` crashed after the work, and files got its number."""
     words = ["process", str(tmp_path / "missing.mcap"), "--out", str(tmp_path / "out")]
