@@ -1,4 +1,4 @@
-"""What names of files and folders tell: whether they are recordings, or the parts of a bag."""
+"""Names of files and folders: which are recordings, and which are the parts of a bag."""
 
 from collections.abc import Collection, Iterable
 from dataclasses import dataclass
