@@ -7,6 +7,7 @@ import shutil
 import subprocess
 import sys
 from collections.abc import Callable
+from copy import deepcopy
 from dataclasses import replace
 from pathlib import Path
 from types import SimpleNamespace
@@ -116,6 +117,19 @@ def test_colour_masks_cover_their_objects(page_folder: Path) -> None:
     assert np.median(shares) > 0.9
     assert len({track for track, _ in owners}) == len(owners)  # one object per track
     assert len({label for _, label in owners}) == len(owners)  # and one track per object
+
+
+def test_frame_with_colour_can_be_sent_to_another_process(page_folder: Path) -> None:
+    """A pool of processes refused frames with colour: their images are views of other memory."""
+    run = shapecat.open_run(page_folder / "results" / "demo")
+    frame = next(run.frames(recording=page_folder / "demo.mcap"))
+
+    sent = deepcopy(frame)  # as if it was pickled
+
+    assert frame.color is not None
+    assert sent.color is not None
+    assert np.array_equal(sent.color, frame.color)
+    assert np.array_equal(sent.labels, frame.labels)
 
 
 FIXTURE = Path(__file__).parents[1] / "fixtures" / "tabletop.mcap"

@@ -1,6 +1,7 @@
 """The records of colour cameras: an image as recorded, and its camera."""
 
 from dataclasses import dataclass
+from typing import Any
 
 from shapecat.arrays import Record
 from shapecat.types import Camera, Pose
@@ -46,6 +47,10 @@ class ColourImage(Record):
     height: int
     step: int
     data: bytes | memoryview
+
+    def __getstate__(self) -> dict[str, Any]:
+        """Return the content to pickle, with a copy of the data: a view cannot be pickled."""
+        return vars(self) | {"data": bytes(self.data)}
 
 
 class ColourView(Record):
