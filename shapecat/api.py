@@ -59,6 +59,7 @@ class OpenRecording:
 
     def __init__(self, recording: Recording) -> None:
         self.recording = recording
+        self._closed = False
 
     def __enter__(self) -> Self:
         return self
@@ -68,6 +69,7 @@ class OpenRecording:
 
     def close(self) -> None:
         """Close the files of the recording."""
+        self._closed = True
         self.recording.close()
 
     @property
@@ -91,11 +93,13 @@ class OpenRecording:
         ------
         ConfigError : ``start_s``, ``end_s`` or ``every`` is invalid.
         NoStreamError : a topic is missing or not usable, or none is given and none can be chosen.
+        RecordingError : the recording is closed, perhaps while its frames are read.
         """
         _require_selection(start_s, end_s, every)
+        self._require_open()
         chosen = (topics,) if isinstance(topics, str) else topics
         streams = choose_streams(self.recording, chosen)
-        return frames(
+        found = frames(
             self.recording,
             streams,
             start_s=start_s,
@@ -103,6 +107,19 @@ class OpenRecording:
             every=int(every),
             skipped=Counter(),
         )
+        return self._while_open(found)
+
+    def _while_open(self, found: Iterator[Frame]) -> Iterator[Frame]:
+        """Yield frames; readers of some formats would end silently once they are closed."""
+        self._require_open()
+        for frame in found:
+            yield frame
+            self._require_open()
+
+    def _require_open(self) -> None:
+        if self._closed:
+            msg = f"{self.recording.path}: is closed; read its frames before"
+            raise RecordingError(msg)
 
 
 def open_recording(path: str | Path) -> OpenRecording:

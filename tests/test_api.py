@@ -32,6 +32,7 @@ from tests.conftest import Guesser
 from tests.loading import loaded_by
 from tests.mcap_files import mcap_writer
 from tests.messages import EPOCH
+from tests.scenes import record
 from tests.test_docs_run import run_here
 
 PAGE = Path(__file__).parents[1] / "docs" / "python.md"
@@ -316,6 +317,22 @@ def test_frames_of_one_topic_are_read(page_folder: Path) -> None:
         frame = next(iter(recording.frames("/camera/depth/image_raw")))
 
     assert frame.topic == "/camera/depth/image_raw"
+
+
+@pytest.mark.parametrize("container", ["mcap", "ros1", "ros2"])
+@pytest.mark.parametrize("read", [0, 1])
+def test_frames_of_closed_recording_are_refused(tmp_path: Path, container: str, read: int) -> None:
+    """Those of a ROS 2 bag ended early, as if the bag had no more; others gave tracebacks."""
+    path = record(tmp_path / "a", 5, container=container)
+    with shapecat.open_recording(path) as recording:
+        frames = recording.frames()
+        for _ in range(read):
+            next(frames)
+
+    with pytest.raises(RecordingError, match=r"closed; read its frames before"):
+        next(frames)
+    with pytest.raises(RecordingError, match=r"closed; read its frames before"):
+        recording.frames()
 
 
 def test_topic_of_several_publishers_is_listed_once(tmp_path: Path) -> None:
