@@ -461,6 +461,18 @@ def test_arrays_of_run_without_objects_join_those_of_others(
     assert empty.detections.numpy("indices").shape == (0,)
 
 
+def test_lists_of_different_lengths_keep_their_type(tmp_path: Path) -> None:
+    """An object without edges had a list of floats, which is no index into its neurons."""
+    edges = pa.array([[0, 1, 1, 2], [], [0, 3]], pa.list_(pa.uint16()))
+    neurons = pa.array([[0.5, 1.5, 2.5], [], [3.5]], pa.list_(pa.float32()))
+    pq.write_table(pa.table({"edges": edges, "neurons": neurons}), tmp_path / "t.parquet")
+
+    for name, column, kind in (("edges", edges, np.uint16), ("neurons", neurons, np.float32)):
+        rows = Table(tmp_path / "t.parquet").numpy(name)
+        assert [row.dtype for row in rows] == [kind] * 3
+        assert [row.tolist() for row in rows] == column.to_pylist()
+
+
 def test_null_list_becomes_row_of_nan(tmp_path: Path) -> None:
     """Arrow may or may not store values behind a null; later rows must not shift."""
     kind = pa.list_(pa.float32(), 2)

@@ -4,6 +4,7 @@ import os
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from functools import cached_property
+from itertools import pairwise
 from pathlib import Path
 from typing import Any
 
@@ -82,8 +83,11 @@ class Table:
             return np.zeros((0, self.widths[column]), values.type.value_type.to_pandas_dtype())
         if len(lengths) == 1 and None not in lengths:
             return values.flatten().to_numpy(zero_copy_only=False).reshape(len(values), -1)
+        flat = values.flatten().to_numpy(zero_copy_only=False)
+        stops = np.cumsum(values.value_lengths().fill_null(0).to_numpy())
         ragged = np.zeros(len(values), object)
-        ragged[:] = [np.asarray(row) for row in values.to_pylist()]
+        for k, (start, stop) in enumerate(pairwise([0, *stops.tolist()])):
+            ragged[k] = flat[start:stop]
         return ragged
 
 
