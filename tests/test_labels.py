@@ -131,9 +131,21 @@ def test_confidence_outside_0_to_1_is_refused(run: Path, confidence: str) -> Non
     cells = dict(zip(header.split(","), first.split(","), strict=True))
     changed = ",".join({**cells, "confidence": confidence}.values())
     (run / "tracks.csv").write_text("\n".join([header, changed, *rest]))
+    (run / "tracks.original.csv").unlink()  # as in a run by an earlier version
 
     with pytest.raises(OutputError, match=f"a confidence from 0 to 1, got .*'{confidence}'"):
         read_labels(run / "tracks.csv")
+
+
+@pytest.mark.parametrize("own", [True, False])
+def test_labels_in_table_with_other_decimal_point_are_adopted(run: Path, *, own: bool) -> None:
+    """German spreadsheets save 0.500 as 500; nobody could apply labels of such a table."""
+    corrected = (run if own else run.parent) / "tracks.csv"
+    corrected.write_text(labelled(t4="bowl").replace("0.", "").replace(",", ";"))
+    adopt_labels(corrected, run)
+
+    assert (run / "tracks.csv").read_text() == labelled(t4="bowl")
+    assert read_labels(run / "tracks.csv")[2] == TrackLabel(2, "can", 0.5)
 
 
 def test_chains_of_merges_end_in_one_track(run: Path) -> None:

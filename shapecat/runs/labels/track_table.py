@@ -6,7 +6,9 @@ encodings than Unicode if the labels are ASCII.
 
 import csv
 import io
+import math
 from collections.abc import Iterable, Mapping, Sequence
+from contextlib import suppress
 from dataclasses import dataclass, replace
 from pathlib import Path
 
@@ -34,7 +36,10 @@ _LARGEST_TABLE = 64 << 20
 
 @dataclass(frozen=True)
 class TrackRow:
-    """A line of tracks.csv; ``line`` counts from 1, ``cells`` holds all columns as text."""
+    """A line of tracks.csv; ``line`` counts from 1, ``cells`` holds all columns as text.
+
+    ``confidence`` is NaN if its cell holds no number from 0 to 1.
+    """
 
     line: int
     track: int
@@ -57,6 +62,12 @@ class TrackTable:
     def labels(self) -> dict[int, str]:
         """The label of each track, empty without one."""
         return {row.track: row.label for row in self.rows}
+
+    @property
+    def wrong_numbers(self) -> tuple[str, ...]:
+        """The problems of lines with a wrong confidence: a spreadsheet may turn 0.495 into 495."""
+        wrong = (row for row in self.rows if math.isnan(row.confidence))
+        return tuple(_wrong_numbers(row.line, row.cells) for row in wrong)
 
     @property
     def run(self) -> str:
@@ -152,23 +163,30 @@ def _header(path: Path, cells: Sequence[str]) -> tuple[str, ...]:
 
 def _row(line: int, cells: Mapping[str, str]) -> TrackRow | str:
     """Return a row, or the problem of an invalid line."""
-    try:
-        track = parse_number(cells["track"])
-        confidence = parse_number(cells["confidence"])
-        if track != int(track) or not 0 <= confidence <= 1:
-            raise ValueError  # noqa: TRY301  the same message for all that is not such a number
-    except (KeyError, ValueError, OverflowError):
-        text = f"track {cells.get('track', '')!r}, confidence {cells.get('confidence', '')!r}"
-        return f"line {line}: expected a track number and a confidence from 0 to 1, got {text}"
+    track, confidence = (_number(cells.get(name, "")) for name in ("track", "confidence"))
+    if not track.is_integer():
+        return _wrong_numbers(line, cells)
     return TrackRow(
         line=line,
         track=int(track),
         category=cells.get("category", "").strip(),
-        confidence=confidence,
+        confidence=confidence if 0 <= confidence <= 1 else math.nan,
         label=" ".join(cells.get("label", "").split()),
         topic=cells.get("topic", "").strip(),
         cells=cells,
     )
+
+
+def _wrong_numbers(line: int, cells: Mapping[str, str]) -> str:
+    text = f"track {cells.get('track', '')!r}, confidence {cells.get('confidence', '')!r}"
+    return f"line {line}: expected a track number and a confidence from 0 to 1, got {text}"
+
+
+def _number(cell: str) -> float:
+    """Return the number in a cell; NaN if it holds none."""
+    with suppress(ValueError):
+        return parse_number(cell)
+    return math.nan
 
 
 def parse_number(cell: str) -> float:

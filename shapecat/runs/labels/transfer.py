@@ -155,8 +155,8 @@ def match_labels(source: Path, target: Path) -> Transfer:
     """
     path = source / "tracks.csv" if source.is_dir() else source
     table = read_track_table(path)
-    _require_complete(path, table)
     folder = path.parent if _is_in_its_run(path, table) else None
+    _require_complete(path, table, alone=folder is None)
     categories = read_run(folder or target)["model"]["categories"]
     misread = find_misread(table.rows, categories)
     labelled = [row for row in table.rows if row.label and row.track not in misread]
@@ -176,15 +176,17 @@ def match_labels(source: Path, target: Path) -> Transfer:
     return Transfer(table.run, transferred, (*wrong, *missed), by)
 
 
-def _require_complete(path: Path, table: TrackTable) -> None:
+def _require_complete(path: Path, table: TrackTable, *, alone: bool) -> None:
     """Check that a table has only valid lines, all from one run.
+
+    The numbers of a table ``alone`` are needed: with a wrong confidence, positions are wrong, too.
 
     Raises
     ------
     OutputError : a line is invalid, or the table holds tracks of several runs.
     """
-    if table.problems:
-        msg = f"{path}: {table.problems[0]}"
+    if problems := [*table.problems, *(table.wrong_numbers if alone else ())]:
+        msg = f"{path}: {problems[0]}"
         raise OutputError(msg)
     if len(table.runs) > 1:
         msg = (
