@@ -119,7 +119,8 @@ def note_skipped(learned: Mapping[str, Any]) -> None:
 
 def missed_words(missed: Mapping[str, Any]) -> str:
     """Describe a label that was not transferred, with the reason."""
-    return f"  track {missed['old_track']}, {missed['label']}: {missed['reason']}"
+    what = f"track {missed['old_track']}, {missed['label']}: " if missed["old_track"] else ""
+    return f"  {what}{missed['reason']}"
 
 
 def changed_labels(before: Mapping[int, str], after: Mapping[int, str]) -> str:

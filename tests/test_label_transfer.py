@@ -695,6 +695,28 @@ def test_table_is_kept_for_good_if_any_label_is_lost(
     assert [labels_in(table) for table in old.glob("tracks.previous-*.csv")] == copies
 
 
+@pytest.mark.parametrize(
+    ("found", "broken", "lost"),
+    [("\n4,cup,0.9,", "\nx,cup,0.9,", (0, "")), ("mug", "Größe", (4, "Größe"))],
+)
+def test_table_with_labels_on_invalid_lines_is_kept(
+    tmp_path: Path, found: str, broken: str, lost: tuple[int, str]
+) -> None:
+    """It counted as a table without labels, so that the new run replaced it silently."""
+    old = make_run(tmp_path / "lab", {4: static(CUP)}, labels={4: "mug"})
+    table = (old / "tracks.csv").read_bytes().decode().replace(found, broken).encode("cp1252")
+    (old / "tracks.csv").write_bytes(table)
+    new = make_run(tmp_path / "new", {1: static(CUP)})
+    run = read_run(new)
+    keep_labels(new, run, Job(tmp_path / "lab.mcap", old))
+
+    (copy,) = old.glob("tracks.previous-*.csv")
+    assert copy.read_bytes() == (new / "tracks.previous.csv").read_bytes() == table
+    (missed,) = run["corrections"]["not_transferred"]
+    assert (missed["old_track"], missed["label"]) == lost
+    assert "tracks.csv: line 2: " in missed["reason"]
+
+
 # ---- the real command
 
 

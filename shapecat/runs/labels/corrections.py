@@ -234,13 +234,16 @@ def _labelled(rows: Iterable[TrackRow], labels: Mapping[int, str]) -> tuple[Trac
 
 
 def has_labels(path: Path) -> bool:
-    """Return whether a table exists and has labels.
+    """Return whether a table exists and has labels, or invalid lines, which may have some.
 
     Raises
     ------
     OutputError : the table is unreadable.
     """
-    return path.exists() and any(read_track_table(path).labels.values())
+    if not path.exists():
+        return False
+    table = read_track_table(path)
+    return bool(table.problems) or any(table.labels.values())
 
 
 def _relabelled(base: TrackTable, rows: Iterable[TrackRow]) -> TrackTable:

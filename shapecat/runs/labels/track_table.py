@@ -52,7 +52,7 @@ class TrackRow:
 
 @dataclass(frozen=True)
 class TrackTable:
-    """The rows of a tracks.csv, and the problems of invalid lines."""
+    """The rows of a tracks.csv, and the problems of lines that are invalid or may be misread."""
 
     columns: tuple[str, ...]
     rows: tuple[TrackRow, ...]
@@ -103,15 +103,14 @@ def read_track_table(path: Path) -> TrackTable:
             row = _row(lines.line_num, dict(zip(columns, cells, strict=False)))
             if isinstance(row, str):
                 problems.append(row)
-            elif row.track in rows:
-                problems.append(f"line {row.line}: track {row.track} is listed twice")
-            elif not (unicode or row.label.isascii()):
+                continue
+            if not (unicode or row.label.isascii()):
                 problems.append(
                     f"line {row.line}: the label {row.label!r} may be misread; save the table as "
                     "CSV UTF-8"
                 )
-            else:
-                rows[row.track] = row
+            if rows.setdefault(row.track, row) is not row:
+                problems.append(f"line {row.line}: track {row.track} is listed twice")
     except csv.Error as error:
         problems.append(f"line {lines.line_num}: {error}")
     if not columns:

@@ -38,7 +38,7 @@ class Transferred(NamedTuple):
 
 
 class Missed(NamedTuple):
-    """A label that could not be transferred, and the reason."""
+    """A label that could not be transferred, and the reason; track 0 stands for invalid lines."""
 
     old_track: int
     label: str
@@ -76,8 +76,8 @@ def lost_labels(source: Path, reason: str) -> Transfer:
     OutputError : the tracks.csv of ``source`` is unreadable.
     """
     table = read_track_table(source / "tracks.csv")
-    missed = (Missed(row.track, row.label, reason) for row in table.rows if row.label)
-    return Transfer(table.run, (), tuple(missed))
+    missed = [Missed(row.track, row.label, reason) for row in table.rows if row.label]
+    return Transfer(table.run, (), tuple(missed or [Missed(0, "", reason)]))
 
 
 def transfer_labels(source: Path, target: Path) -> Transfer:
