@@ -179,6 +179,7 @@ def test_names_are_escaped_in_page(run: Path) -> None:
 
 
 def test_surfaces_are_drawn_from_meshes_without_recording(run: Path) -> None:
+    """The page told the reader to give an option that `report` does not have."""
     info = json.loads((run / "run.json").read_text())
     info["input"]["path"] = str(run / "gone.mcap")
     (run / "run.json").write_text(json.dumps(info))
@@ -188,6 +189,7 @@ def test_surfaces_are_drawn_from_meshes_without_recording(run: Path) -> None:
 
     assert "surfaces are drawn from their meshes" in text
     assert "gone.mcap" in text
+    assert "if it was moved, run `shapecat annotate` with --recording PATH first" in text
     assert text.count('class="side"') == 3 * len(read_track_table(run / "tracks.csv").rows)
     assert 'class="crop"' not in text
     assert 'id="strip"' not in text

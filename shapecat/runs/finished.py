@@ -106,12 +106,15 @@ def require_recordings(folders: Iterable[Path]) -> None:
 
 
 @contextmanager
-def open_source(run: RunInfo, moved_to: Path | None = None) -> Iterator[Recording]:
+def open_source(
+    run: RunInfo, moved_to: Path | None = None, *, advice: str = "give --recording PATH"
+) -> Iterator[Recording]:
     """Open the recording from which a run was made.
 
     Parameters
     ----------
     moved_to : path of the recording; by default where it was processed.
+    advice : what to do if it was moved, for the error message.
 
     Raises
     ------
@@ -122,7 +125,7 @@ def open_source(run: RunInfo, moved_to: Path | None = None) -> Iterator[Recordin
     if moved_to is None and not path.exists():
         named = run["input"]["path"]  # a path would lose a slash of a URL
         state = "is at a URL; download it and" if "://" in named else "is missing; if it was moved,"
-        msg = f"{named}: the recording {state} give --recording PATH"
+        msg = f"{named}: the recording {state} {advice}"
         raise RecordingError(msg)
     with open_recording(path) as recording:
         if not same_content(run["input"], path, lambda: content_digest(path)):

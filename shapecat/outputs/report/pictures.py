@@ -122,8 +122,9 @@ def take_pictures(finished: FinishedRun, rows: Sequence[TrackRow], choice: Choic
     If the recording cannot be read, a track has only drawings of its mesh.
     """
     collector = _Collector(choice)
+    advice = "run `shapecat annotate` with --recording PATH first"
     try:
-        with open_source(finished.run) as recording:
+        with open_source(finished.run, advice=advice) as recording:
             frames = _frames(finished, rows, choice)
             for item in with_colour(frames, recording, finished.run):
                 collector.add(*item)
