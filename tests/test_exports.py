@@ -9,6 +9,9 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+import pyarrow as pa
+import pyarrow.compute as pc
+import pyarrow.parquet as pq
 import pytest
 from click.testing import Result
 from numpy.testing import assert_allclose
@@ -361,6 +364,24 @@ def test_point_labels_match_pixels_of_each_object(run: Path, tmp_path: Path) -> 
         assert legend["instances"][str(track)] == labels[track].category
         assert 300 < np.median(depth[row["indices"]]) < 2500
         assert ((instance > 0) == (semantic > 0)).all()
+
+
+@pytest.mark.parametrize("format", ["kitti", "point-labels"])
+def test_frames_without_pose_are_left_out(run: Path, tmp_path: Path, format: str) -> None:  # noqa: A002  the word users know
+    """Their objects have no tracks; without labels, a model learns that they are background."""
+    lost = shutil.copytree(run, tmp_path / "lost")
+    table = pq.read_table(lost / "frames.parquet")
+    for name in ("fixed_translation", "fixed_rotation"):
+        column = pa.array([None, *table[name].to_pylist()[1:]], table[name].type)
+        table = table.set_column(table.column_names.index(name), name, column)
+    pq.write_table(table, lost / "frames.parquet")
+    tracks = pq.read_table(lost / "tracks.parquet")
+    pq.write_table(tracks.filter(pc.greater(tracks["frame"], 0)), lost / "tracks.parquet")
+    export_run(lost, format, tmp_path / "out")
+
+    with (tmp_path / "out" / "lost" / "frames.csv").open() as file:
+        frames = [int(row["frame"]) for row in csv.DictReader(file)]
+    assert frames == list(range(1, len(table)))
 
 
 def test_unorganised_clouds_get_semantic_kitti_labels(tmp_path: Path) -> None:

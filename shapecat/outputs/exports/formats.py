@@ -27,6 +27,7 @@ from shapecat.outputs.wording import different_names
 from shapecat.runs.finished import FinishedRun, open_source, read_finished
 from shapecat.runs.folder import clear, recover, staged
 from shapecat.runs.labels.meaning import order_categories
+from shapecat.runs.tables.placed_frames import streams_with_poses
 from shapecat.system.files import flush, replacing
 from shapecat.system.progress import Observer, ignore, observed
 from shapecat.types import LabelledFrame
@@ -76,7 +77,8 @@ def export_run(
     """Export the labels of a finished run with their points.
 
     Crops are added to the data set ``out``. The other formats are written to ``out/NAME``, where
-    NAME is the name of the run folder; only an earlier export is replaced.
+    NAME is the name of the run folder; only an earlier export is replaced. Frames at an unknown
+    place in the fixed frame are left out: their objects have no tracks, and so no labels.
 
     Parameters
     ----------
@@ -109,7 +111,8 @@ def export_run(
     with open_source(finished.run, recording) as source:
         full = format in _WITH_BOXES and not visible_boxes
         labelled = finished.frames_with_full_boxes() if full else finished.frames()
-        triples = with_colour(_thinned(labelled, every), source, finished.run)
+        wanted = _tracked(_thinned(labelled, every), streams_with_poses(folder))
+        triples = with_colour(wanted, source, finished.run)
         pairs = observed(triples, "export", total, observe)
         if format == "crops":
             return FORMATS[format](out, pairs, finished)
@@ -263,6 +266,11 @@ def _thinned(frames: Iterable[LabelledFrame], every: int) -> Iterator[LabelledFr
         if counts[frame.topic] % every == 0:
             yield frame
         counts[frame.topic] += 1
+
+
+def _tracked(frames: Iterable[LabelledFrame], placed: Collection[str]) -> Iterator[LabelledFrame]:
+    """Leave out frames without pose of topics that are tracked in the fixed frame, ``placed``."""
+    return (f for f in frames if f.fixed_from_sensor is not None or f.topic not in placed)
 
 
 def _require_own(target: Path, about: Mapping[str, Any]) -> None:
