@@ -558,6 +558,24 @@ def test_viewer_without_graphics_names_missing_package(
         review_viewer.take_screenshot(fake, tmp_path / "r.png")
 
 
+def test_viewer_that_panics_is_not_taken_for_one_without_graphics(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Without a window it has no font for a Japanese category; no package would have helped."""
+    fake = tmp_path / "rerun"
+    (tmp_path / "log").write_text(
+        "INFO re_renderer::context: wgpu adapter backend: Vulkan\n"
+        "thread 'main' panicked at 'No glyph for 「コ」 in Proportional.'\n"
+        "   6: core::panicking::panic_fmt\n",
+        "utf-8",
+    )
+    fake.write_text(f"#!/bin/sh\ncat '{tmp_path / 'log'}' >&2\nexit 1\n")
+    fake.chmod(0o755)
+    monkeypatch.setattr(review_viewer, "_viewer", lambda: str(fake))
+    with pytest.raises(OutputError, match=r"the viewer ended: No glyph for 「コ」 in Proportional"):
+        review_viewer.take_screenshot(fake, tmp_path / "r.png")
+
+
 def test_screenshot_ends_viewer_process(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """The program `rerun` is a script; killing it alone would leave its child process."""
     fake = tmp_path / "rerun"

@@ -1,6 +1,7 @@
 """Open a review in the Rerun viewer: in a window, in a browser, or as a screenshot."""
 
 import os
+import re
 import shutil
 import signal
 import socket
@@ -197,6 +198,8 @@ def _has_ended(viewer: subprocess.Popen[bytes]) -> bool:
 def _why(log: IO[bytes]) -> str:
     log.seek(0)
     text = log.read().decode("utf-8", "replace")
+    if panic := re.search(r" panicked at '(.*)'$", text, re.MULTILINE):
+        text = panic[1]  # lines before it name the adapter in use, lines after it the stack
     if any(word in text for word in ("adapter", "Vulkan", "render context")):
         return (
             "the viewer found no graphics device; without a graphics card install a software "
