@@ -7,7 +7,7 @@ import difflib
 import math
 import os
 from collections import Counter
-from collections.abc import Collection, Iterator, Sequence
+from collections.abc import Collection, Iterable, Iterator, Sequence
 from functools import lru_cache
 from pathlib import Path
 from typing import Any, Self
@@ -79,7 +79,7 @@ class OpenRecording:
 
     def frames(
         self,
-        topics: str | Sequence[str] = (),
+        topics: str | Iterable[str] = (),
         *,
         start_s: float | None = None,
         end_s: float | None = None,
@@ -97,7 +97,7 @@ class OpenRecording:
         """
         _require_selection(start_s, end_s, every)
         self._require_open()
-        chosen = (topics,) if isinstance(topics, str) else topics
+        chosen = (topics,) if isinstance(topics, str) else tuple(topics)
         streams = choose_streams(self.recording, chosen)
         found = frames(
             self.recording,
@@ -137,7 +137,7 @@ def process(
     recording: str | Path,
     out: str | Path,
     *,
-    topics: str | Sequence[str] = (),
+    topics: str | Iterable[str] = (),
     up: str | Sequence[float] = "auto",
     fixed_frame: str | None = None,
     start_s: float | None = None,

@@ -432,6 +432,19 @@ def test_name_of_one_column_is_no_list_of_letters(tmp_path: Path) -> None:
         table.arrow("area")
 
 
+def test_names_may_come_from_a_generator(tmp_path: Path) -> None:
+    """They were read twice, so that tables had no columns, and recordings no frames."""
+    pq.write_table(pa.table({"area_m2": [0.5], "plane": [0]}), tmp_path / "t.parquet")
+    path = record(tmp_path / "a.mcap", 3)
+
+    table = Table(tmp_path / "t.parquet").arrow(iter(["plane", "area_m2"]))
+    with shapecat.open_recording(path) as recording:
+        frames = list(recording.frames(iter(["/camera/depth/image_raw"])))
+
+    assert table.to_pydict() == {"area_m2": [0.5], "plane": [0]}
+    assert len(frames) == 3
+
+
 def test_lists_of_text_become_an_array(tmp_path: Path) -> None:
     """The stages of frames.parquet are text; reading them ended in a traceback."""
     table = pa.table({"stages": [["detect", "masks"], ["detect", "track"]]})

@@ -1,7 +1,7 @@
 """A finished run in Python: tables as arrays, frames with points."""
 
 import os
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping
 from dataclasses import dataclass, field
 from functools import cached_property
 from itertools import pairwise
@@ -42,27 +42,28 @@ class Table:
         """Names of the columns."""
         return tuple(pq.read_schema(self.path).names)
 
-    def arrow(self, columns: str | Sequence[str] | None = None) -> pa.Table:
+    def arrow(self, columns: str | Iterable[str] | None = None) -> pa.Table:
         """Read the table, or some columns, as an Arrow table; a name alone is one column.
 
         Raises
         ------
         OutputError : the table is unreadable, or has no such column.
         """
-        names = [columns] if isinstance(columns, str) else columns
         try:
             available = self.columns
-            if missing := [name for name in names or () if name not in available]:
+            wanted = available if columns is None else columns
+            names = [wanted] if isinstance(wanted, str) else list(wanted)
+            if missing := [name for name in names if name not in available]:
                 msg = f"{self.path}: no column {missing[0]}; known: {', '.join(available)}"
                 raise OutputError(msg)
             with pq.ParquetFile(self.path) as file:
-                table = file.read(columns=None if names is None else list(names))
+                table = file.read(columns=names)
             return with_fixed_lists(table)
         except (OSError, pa.ArrowException) as error:
             msg = f"{self.path}: not a readable table of a run ({error})"
             raise OutputError(msg) from error
 
-    def pandas(self, columns: str | Sequence[str] | None = None) -> Any:
+    def pandas(self, columns: str | Iterable[str] | None = None) -> Any:
         """Read the table, or some columns, as a pandas data frame; pandas must be installed."""
         return self.arrow(columns).to_pandas()
 
