@@ -219,6 +219,17 @@ def test_index_lists_runs_and_links_to_them(
 
 
 @pytest.mark.usefixtures("without_pictures")
+def test_index_tells_runs_of_the_same_name_apart(run: Path, tmp_path: Path) -> None:
+    """Runs of one recording with other settings have its name, in other folders."""
+    runs = [tmp_path / name for name in ("first/lab", "#2/lab", "#2/shelf")]
+    for folder in runs:
+        shutil.copytree(run, folder)
+
+    names = re.findall(r"<h3>(.*?)</h3>", read_reports(runs).index())
+    assert names == ["first/lab", "#2/lab", "shelf"]
+
+
+@pytest.mark.usefixtures("without_pictures")
 def test_damaged_run_does_not_prevent_pages_of_others(shapecat: Run, run: Path) -> None:
     """One bad label among many runs left all of them without a page."""
     bad, broken = (run.with_name(name) for name in ("another", "broken"))

@@ -4,10 +4,10 @@ import os
 from collections import Counter
 from collections.abc import Callable, Mapping, Sequence
 from contextlib import suppress
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from functools import cached_property
 from pathlib import Path
-from urllib.parse import quote
+from urllib.parse import quote, unquote
 
 from shapecat.arrays import F8
 from shapecat.errors import OutputError, explained
@@ -130,13 +130,17 @@ class Reports:
     def index(self) -> str:
         """Return the page that lists the runs, with their current labels.
 
-        A run that is gone or has an invalid table is left out; its own page says why.
+        A run that is gone or has an invalid table is left out; its own page says why. Runs of the
+        same name are listed with their folders.
         """
         cards = []
         for report in self.runs:
             with suppress(OutputError):
                 cards.append(report.listed(self.link(report)))
-        return index_page(self.above.resolve().name, cards)
+        count = Counter(card.name for card in cards)
+        names = (str(Path(unquote(c.link)).parent) if count[c.name] > 1 else c.name for c in cards)
+        listed = [replace(card, name=name) for card, name in zip(cards, names, strict=True)]
+        return index_page(self.above.resolve().name, listed)
 
     def write(self) -> list[Path]:
         """Write all pages, the index last, and return their paths.
