@@ -32,8 +32,10 @@ _NEW = re.compile(r"new +(.+)", re.IGNORECASE)
 _RESERVED = ("none", "dontcare", "na", "nan", "null")
 """Names that mean "no object" in exported formats, or "no value" to readers of tables."""
 _NAME = re.compile(r"[^\W\d_][\w .+&'()-]{0,58}[\w)]|[^\W\d_]")
-NAME_RULE = "a letter followed by letters, digits, spaces and - _ . + & ' ( ), at most 60 in all"
-"""What the name of a category is, in words."""
+NAME_RULE = (
+    "a letter followed by letters, digits, spaces and - _ . + & ' ( ), at most 60 characters"
+)
+"""The form of a category's name, in words."""
 
 
 class TrackLabel(NamedTuple):
