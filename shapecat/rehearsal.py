@@ -31,7 +31,7 @@ from shapecat.description import describe
 from shapecat.detection import detect
 from shapecat.executors.local import LocalExecutor
 from shapecat.executors.worker import WorkerLostError
-from shapecat.geometry import level_from_sensor
+from shapecat.geometry import IDENTITY, level_from_sensor
 from shapecat.jit import code_folder
 from shapecat.learning import load_model
 from shapecat.reuse import KeyView, find_repeats, shows_the_same, view_object
@@ -73,13 +73,9 @@ def find_ball() -> int:
     board = 0.05 / np.maximum(rays[..., 1], 0.03)  # seen at a grazing angle
     _detect(_frame_of(np.where(abs(rays[..., 0] * board) < _BOARD_M, board, 2.5)))
     same = shows_the_same(frame, None, frame, None, range_m=2.0)
-    # A moving sensor: the inverse of its pose is in another order, for another version of a kernel.
-    now, before = (
-        [view_object(frame, pose, ball, scene.up, _RADIUS_M) for ball in scene.candidates]
-        for pose in (Pose(np.eye(3), np.zeros(3)), Pose(np.eye(3), np.full(3, 1e-4)))
-    )
-    keys = [KeyView(view, _undescribed(view.candidate)) for view in before]
-    return sum(repeat is not None for repeat in find_repeats(now, keys)) if same else 0
+    views = [view_object(frame, IDENTITY, ball, scene.up, _RADIUS_M) for ball in scene.candidates]
+    keys = [KeyView(view, _undescribed(view.candidate)) for view in views]
+    return sum(repeat is not None for repeat in find_repeats(views, keys)) if same else 0
 
 
 def _frame_of(depth: F4) -> Frame:
