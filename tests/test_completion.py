@@ -242,6 +242,16 @@ def test_view_of_moved_object_keeps_its_pose() -> None:
     assert_allclose(fused.stds[:, 2], 0.01 * np.sqrt(0.5 + 0.5 / 5))
 
 
+def test_box_of_object_at_rest_does_not_turn_with_the_noise_of_its_yaw() -> None:
+    """Seen from two sides, the yaw of a box may be off by eight degrees each way."""
+    yaws = np.radians(np.where(np.arange(24) < 12, 30.0 - 8, 30.0 + 8))
+    axes, sizes = np.stack([about_z(yaw) for yaw in yaws]), np.tile([0.2, 0.1, 0.3], (24, 1))
+    views = views_of(np.zeros((24, 3)), axes, sizes)
+    fused = fused_in(views, np.ones(24), one_hot("box"), CATEGORIES)
+
+    assert_allclose(fused.axes, np.tile(fused.axes[0], (24, 1, 1)), atol=1e-12)
+
+
 @pytest.mark.parametrize("turn", [40, 90])
 def test_box_of_object_turned_in_place_turns_with_it(turn: float) -> None:
     """A person may turn a box to show another side; a mean of both yaws is neither."""

@@ -19,6 +19,7 @@ from numpy.testing import assert_allclose
 from shapecat.errors import OutputError, RecordingError
 from shapecat.evaluation.dataset import read_dataset
 from shapecat.geometry import rotation_from_quaternion
+from shapecat.outputs.exports.crops import Origin
 from shapecat.outputs.exports.formats import common_categories, export_run
 from shapecat.outputs.exports.kitti import rectified_from_sensor
 from shapecat.outputs.exports.points import write_point_labels
@@ -518,3 +519,11 @@ def test_scene_follows_corrections(shapecat: Run, run: Path, tmp_path: Path) -> 
 
     assert len(after) == len(before) - 2
     assert sorted(line.split("#")[1].split(":")[0] for line in after if "#" in line) == sorted(rest)
+
+
+def test_crops_of_ranges_within_a_second_are_told_apart() -> None:
+    """Those of 0 to 1.4 s would replace those of 1.4 to 2.4 s, rounded to whole seconds."""
+    first, second = Origin("0123456789ab", 0.0, 1.4), Origin("0123456789ab", 1.4, 2.4)
+
+    assert Origin.read(f"lab.{second}.track-3") == second
+    assert not first.shares_frames(second)

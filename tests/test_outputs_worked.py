@@ -214,7 +214,7 @@ def test_image_has_masks_of_the_frame_nearest_in_time(monkeypatch: pytest.Monkey
     """Colour images are often rarer: the boxes were those of the first frame, half a period ago."""
     stamps = [20, 40, 55, 90, 150, 160]
     masks = [
-        (("/d", k), ImageMasks("/l", image, image + 1, "c", 40, 30, {}, {}))
+        (("/d", k), ImageMasks("/l", image, image + 60, "c", 40, 30, {}, {}))  # logged late
         for k, image in enumerate([50, 50, 50, 150, 150, 150])
     ]
     patch_masks(monkeypatch, masks, stamps)

@@ -211,6 +211,24 @@ def test_organized_cloud_that_fits_no_camera_stays_points(points: Any, tmp_path:
     np.testing.assert_array_equal(frame.points, points.reshape(-1, 3))
 
 
+@pytest.mark.parametrize("kind", ["16UC1", "32FC1"])
+def test_padding_behind_the_rows_of_a_depth_image_is_skipped(tmp_path: Path, kind: str) -> None:
+    """Drivers that align rows to 64 bytes would give sheared objects."""
+    depth = np.arange(500, 500 + 5 * 7, dtype=np.uint16).reshape(5, 7)
+    values = depth if kind == "16UC1" else (depth / 1000).astype(np.float32)
+    packed = image(EPOCH, values, kind)
+    padded = np.full((5, 64), 7, np.uint8)
+    padded[:, : values[0].nbytes] = values.view(np.uint8)
+    packed.step, packed.data = 64, padded.ravel()
+    items = [("/camera/camera_info", EPOCH, info(EPOCH, Camera(7, 5, 9, 9, 3, 2)))]
+    items += [("/camera/image_raw", EPOCH, packed)]
+
+    (frame,), _, _ = read(write(tmp_path / "a.mcap", items))
+
+    assert frame.depth is not None
+    np.testing.assert_allclose(frame.depth, depth.astype(np.float32) / 1000)
+
+
 def test_image_with_step_zero_is_read_and_frames_are_counted(tmp_path: Path) -> None:
     """A step of 0 means contiguous rows; the number of frames in a window is unknown."""
     depth = np.arange(500, 500 + 5 * 7, dtype=np.uint16).reshape(5, 7)

@@ -15,6 +15,7 @@ from shapecat.errors import OutputError
 from shapecat.runs.folder import read_run, write_run
 from shapecat.runs.jobs import Job
 from shapecat.runs.labels.track_table import read_track_table
+from shapecat.runs.tables.segments import list_segments
 from shapecat.system.files import partial_path
 from tests.conftest import Guesser
 from tests.track_tables import untimed_table
@@ -247,3 +248,15 @@ def test_labels_given_while_outputs_are_written_are_transferred(
 
     assert written == [set(), {"vase"}]
     assert labels(job.folder) == {"vase"}
+
+
+def test_segments_are_in_the_order_of_the_recording_on_any_disk(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Some file systems list names by their digests: frames would go back and forth in time."""
+    for name in ("000032", "000000", "000016"):
+        (tmp_path / name).mkdir()
+    glob = Path.glob
+    monkeypatch.setattr(Path, "glob", lambda *given: sorted(glob(*given), reverse=True))
+
+    assert [segment.name for segment in list_segments(tmp_path)] == ["000000", "000016", "000032"]
