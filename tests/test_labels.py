@@ -15,7 +15,7 @@ from hypothesis import strategies as st
 from shapecat.errors import OutputError
 from shapecat.outputs.wording import safe_name
 from shapecat.pipeline import annotate_again
-from shapecat.runs.finished import FinishedRun
+from shapecat.runs.finished import FinishedRun, find_runs
 from shapecat.runs.labelled_frames import read_labelled_frames
 from shapecat.runs.labelled_tracks import _ended
 from shapecat.runs.labels.corrections import _valid_labels, adopt_labels, read_labels, relabel
@@ -720,3 +720,15 @@ def test_annotate_names_only_written_files(
 
     assert not (folder / "review.rrd").exists()
     assert done.output.splitlines()[-1] == f"{folder}: wrote annotated.mcap"
+
+
+def test_pattern_for_a_batch_folder_also_gives_its_files(tmp_path: Path) -> None:
+    """`shapecat report results/*` stopped at the manifest of the batch."""
+    for name in ("b", "a"):
+        (tmp_path / name).mkdir()
+        (tmp_path / name / "run.json").touch()
+    (tmp_path / "manifest.jsonl").touch()
+
+    assert find_runs(sorted(tmp_path.iterdir())) == [tmp_path / "a", tmp_path / "b"]
+    with pytest.raises(OutputError, match=r"manifest\.jsonl: no run\.json there"):
+        find_runs([tmp_path / "manifest.jsonl"])

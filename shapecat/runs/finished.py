@@ -68,13 +68,15 @@ def read_finished(folder: Path) -> FinishedRun:
 def find_runs(folders: Sequence[Path]) -> list[Path]:
     """Return the run folders among ``folders`` and directly below them, each once.
 
-    The runs below a folder are sorted by name.
+    The runs below a folder are sorted by name. Files beside folders are left out: the pattern
+    ``results/*`` also gives the manifest of a batch.
 
     Raises
     ------
     OutputError : a folder is not a run and holds none.
     """
-    runs = [run for folder in folders for run in _runs_in(folder)]
+    chosen = [folder for folder in folders if not folder.is_file()] or folders
+    runs = [run for folder in chosen for run in _runs_in(folder)]
     return list({run.resolve(): run for run in runs}.values())
 
 
