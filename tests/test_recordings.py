@@ -715,3 +715,83 @@ def test_log_of_killed_recorder_is_read(
     assert ("not read: not enough space" in warning) is (free == 1000)
     assert [file.read_bytes() for file in sorted(path.parent.iterdir())] == before
     assert list(temporary.iterdir()) == []
+
+
+IDL = """\
+================================================================================
+IDL: lab_msgs/msg/Grip
+// generated from rosidl_adapter/resource/msg.idl.em
+
+#include "builtin_interfaces/msg/Time.idl"
+
+module lab_msgs {
+  module msg {
+    struct Grip {
+      builtin_interfaces::msg::Time at;
+
+      @verbatim (language="comment", text=
+        "Newton")
+      double force;
+
+      sequence<int16> counts;
+    };
+  };
+};
+
+================================================================================
+IDL: builtin_interfaces/msg/Time
+// generated from rosidl_adapter/resource/msg.idl.em
+
+module builtin_interfaces {
+  module msg {
+    struct Time {
+      int32 sec;
+
+      uint32 nanosec;
+    };
+  };
+};
+"""
+
+
+def test_messages_defined_in_idl_are_decoded(tmp_path: Path) -> None:
+    """``ros2 bag record`` stores IDL, with its includes, of packages without .msg files."""
+    data = b"\0\1\0\0" + struct.pack("<iIdI3h", 17, 250, 4.5, 3, 2, -3, 5)
+    with mcap_writer(tmp_path / "a.mcap") as writer:
+        one = IDL.rpartition("IDL: ")[2].partition("\n")[2]
+        for kind, idl, size in (
+            ("lab_msgs/msg/Grip", IDL, len(data)),
+            ("builtin_interfaces/msg/Time", one, 12),
+        ):
+            schema = writer.register_schema(kind, "ros2idl", idl.encode())
+            channel = writer.register_channel(kind, "cdr", schema)
+            writer.add_message(channel, 1, data[:size], 1)
+
+    with open_recording(tmp_path / "a.mcap") as recording:
+        grip, time = (recording.decode(message) for message in recording.messages())
+
+    assert (grip.at.sec, grip.at.nanosec, grip.force) == (17, 250, 4.5)
+    assert list(grip.counts) == [2, -3, 5]
+    assert (time.sec, time.nanosec) == (17, 250)
+
+
+@pytest.mark.parametrize(
+    ("encoding", "definition", "reason"),
+    [
+        ("cbor", b"string data", "encoding 'cbor' is not supported"),
+        ("cdr", b"# " + b"x" * (1 << 20) + b"\nstring data", "the definition is too long, 104859"),
+    ],
+)
+def test_reason_why_messages_cannot_be_decoded_is_given(
+    tmp_path: Path, encoding: str, definition: bytes, reason: str
+) -> None:
+    """A KeyError of the encoding alone says nothing; a long definition takes minutes to parse."""
+    with mcap_writer(tmp_path / "a.mcap") as writer:
+        schema = writer.register_schema("a/msg/Text", "ros2msg", definition)
+        channel = writer.register_channel("/a", encoding, schema)
+        writer.add_message(channel, 1, text("x"), 1)
+
+    with open_recording(tmp_path / "a.mcap") as recording:
+        (message,) = recording.messages()
+        with pytest.raises(MessageError, match=f"^/a: cannot decode a/msg/Text: {reason}"):
+            recording.decode(message)

@@ -1,6 +1,7 @@
 """Decode messages with the definitions stored in their recording."""
 
 import json
+import re
 import struct
 from collections.abc import Callable, Iterator
 from functools import cache, lru_cache
@@ -101,6 +102,7 @@ def _defined(kind: str, encoding: str, schema: bytes) -> Typestore:
 
 
 def _idl_parts(text: str) -> Iterator[str]:
+    text = re.sub(r"^[ \t]*#.*", "", text, flags=re.MULTILINE)  # rosbags refuses #include
     if not text.startswith(f"{_SEPARATOR}IDL: "):
         yield text
         return
