@@ -1,5 +1,6 @@
 """Tests of colour streams: choice, decoding, pairing in time, and registration to the depth."""
 
+import io
 from collections import Counter
 from collections.abc import Sequence
 from pathlib import Path
@@ -8,6 +9,7 @@ from typing import Any
 
 import numpy as np
 import pytest
+from PIL import Image
 from rosbags.rosbag1 import Writer as Bag
 from rosbags.typesys import Stores, get_types_from_msg, get_typestore
 
@@ -17,7 +19,7 @@ from shapecat.geometry import rotation_from_quaternion
 from shapecat.recordings import choose_streams, colour_frames, open_recording
 from shapecat.recordings.colour_frames import frames_with_colour
 from shapecat.recordings.colour_streams import ColourStream, choose_colour
-from shapecat.recordings.decoding.colour_image import cloud_colours, pixels_of
+from shapecat.recordings.decoding.colour_image import cloud_colours, encoded, pixels_of
 from shapecat.recordings.messages import MessageError, Topic
 from shapecat.recordings.overview import describe_recording
 from shapecat.recordings.streams import Stream
@@ -27,6 +29,7 @@ from shapecat.types import Camera, Frame
 from tests.colour_messages import gradient, jpeg, packed, png, raw
 from tests.messages import (
     EPOCH,
+    IMAGE,
     SECOND,
     STORE,
     cloud,
@@ -598,3 +601,61 @@ def test_simulated_colour_camera_is_equal_in_all_containers(tmp_path: Path, cont
         np.testing.assert_allclose(position, COLOUR.depth_from_colour.translation, atol=1e-8)
         assert view.lens == COLOUR.lens
         assert pixels_of(view.image).shape == (720, 960, 3)
+
+
+def test_unreadable_colour_messages_are_skipped_and_reported(tmp_path: Path) -> None:
+    """One truncated message must not end the run; one of another type is no image at all."""
+    stamps = [EPOCH + k * 33 * MS for k in range(8)]
+    messages: list[Any] = [raw(s, gradient(), "rgb8") for s in stamps]
+    messages[5] = make("std_msgs/msg/String", "calibrating")
+    messages[6] = (IMAGE, b"\0\1\0\0" + bytes(9))
+    messages[7].encoding = "nv21"
+    topic = "/cam/color/image_raw"
+    colours = [(topic, s, m) for s, m in zip(stamps, messages, strict=True)]
+    pairs, warnings = read(write(tmp_path / "a.mcap", in_order([*depth_items(*stamps), *colours])))
+
+    assert [view is not None for _, view in pairs] == [True] * 5 + [False] * 3
+    reasons = [w.removeprefix(f"{topic}: frames without colour ")[:40] for w in warnings]
+    assert sorted(reasons) == [
+        "(1×): cannot decode sensor_msgs/msg/Image"[:40],
+        "(1×): image encoding 'nv21' is not colour"[:40],
+        "(2×): no colour image near the time of the frame"[:40],
+    ]
+
+
+def test_image_in_unknown_encoding_is_message_error() -> None:
+    """Its bytes would be taken for those of another encoding."""
+    with pytest.raises(MessageError, match="encoding '32FC1' is not colour"):
+        pixels_of(ColourImage("", 0, 0, "", "32FC1", 4, 3, 16, bytes(48)))
+
+
+def test_clouds_that_lose_their_colours_are_reported(tmp_path: Path) -> None:
+    """Their objects would have the colours of earlier clouds, or none without a reason."""
+    points = organized_points(wavy_depth())
+    data = np.zeros(48 * 64, [("xyz", "<f4", 3), ("rgb", "<u4")])
+    data["xyz"], data["rgb"] = points.reshape(-1, 3), 0x0A141E
+    changes = {"point_step": 16, "row_step": 16 * 64, "data": data.view(np.uint8).ravel()}
+    full = cloud(EPOCH, points, **changes)
+    full.fields.append(make("sensor_msgs/msg/PointField", "rgb", 12, 6, 1))
+    bare = cloud(EPOCH + 33 * MS, points)
+
+    pairs, warnings = read(
+        write(tmp_path / "a.mcap", [("/c", EPOCH, full), ("/c", EPOCH + 33 * MS, bare)])
+    )
+
+    (_, view), (_, none) = pairs
+    assert view is not None
+    assert pixels_of(view.image)[0, 0].tolist() == [10, 20, 30]
+    assert none is None
+    assert any("cloud without colours" in text for text in warnings)
+
+
+def test_raw_image_is_exported_as_png_with_the_same_pixels() -> None:
+    """An image with red and blue swapped would train wrong colours."""
+    colours = gradient()
+    raw_image = ColourImage("", 0, 0, "", "bgr8", 64, 48, 192, colours[..., ::-1].tobytes())
+
+    suffix, content = encoded(raw_image, pixels_of(raw_image))
+
+    assert suffix == ".png"
+    np.testing.assert_array_equal(np.asarray(Image.open(io.BytesIO(content))), colours)

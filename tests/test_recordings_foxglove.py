@@ -7,6 +7,7 @@ from types import SimpleNamespace
 
 import numpy as np
 import pytest
+from google.protobuf.descriptor_pb2 import FileDescriptorProto, FileDescriptorSet
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from rosbags.typesys import Stores, get_types_from_msg, get_typestore
@@ -274,3 +275,27 @@ def test_random_bytes_raise_only_known_errors(data: bytes) -> None:
             run()
         except LIBRARY_ERRORS:
             continue
+
+
+def test_descriptors_in_any_order_and_maps_are_decoded() -> None:
+    """Only some writers put a file behind those it imports; a map is no list of messages."""
+    inner = FileDescriptorProto(name="inner.proto", package="lab", syntax="proto3")
+    inner.message_type.add(name="Size").field.add(name="height", number=1, type=5, label=1)
+    outer = FileDescriptorProto(name="outer.proto", package="lab", syntax="proto3")
+    outer.dependency.append("inner.proto")
+    item = outer.message_type.add(name="Item")
+    item.field.add(name="size", number=1, type=11, label=1, type_name=".lab.Size")
+    item.field.add(name="parts", number=2, type=11, label=3, type_name=".lab.Item.PartsEntry")
+    entry = item.nested_type.add(name="PartsEntry")
+    entry.field.add(name="key", number=1, type=9, label=1)
+    entry.field.add(name="value", number=2, type=5, label=1)
+    entry.options.map_entry = True
+    descriptors = FileDescriptorSet(file=[outer, inner]).SerializeToString()
+
+    # Field 1 {height: 7}, field 2 {"lid": 3} in the wire format.
+    read_back = message_decoder(descriptors, "lab.Item")(
+        b"\x0a\x02\x08\x07\x12\x07\x0a\x03lid\x10\x03"
+    )
+
+    assert read_back.size.height == 7
+    assert read_back.parts == {"lid": 3}

@@ -1,5 +1,6 @@
 """Tests of frames: every layout of a cloud or depth image gives the same, correct coordinates."""
 
+import struct
 from collections import Counter
 from collections.abc import Sequence
 from dataclasses import replace
@@ -842,3 +843,38 @@ def test_image_is_returned_as_soon_as_its_calibration_arrives(tmp_path: Path) ->
             returned.append([frame.stamp_ns for frame in take(message, skipped)])
 
     assert returned == [[], [EPOCH], [], [EPOCH + 5]]
+
+
+@pytest.mark.parametrize(
+    ("body", "kind", "reason"),
+    [
+        (b"", "32FC1", "compressed depth in 32FC1 without its parameters"),
+        (struct.pack(">II", 0, 7), "16UC1", "compressed depth of 0 x 7 pixels"),
+        (struct.pack(">II", 3, 6), "16UC1", "compressed depth is truncated"),
+    ],
+)
+def test_compressed_depth_that_cannot_be_right_is_refused(
+    body: bytes, kind: str, reason: str
+) -> None:
+    """It would be depth at wrong distances, or rows of another image."""
+    whole = png(np.arange(500, 515, dtype=np.uint16).reshape(5, 3))
+    at = whole.index(b"IHDR") + 4
+    message = compressed(0, b"", kind)
+    message.data = np.frombuffer(whole[:at] + body + whole[at + len(body) :], np.uint8)
+
+    with pytest.raises(MessageError, match=f"^{reason}$"):
+        depth_of_compressed(message)
+
+
+def test_image_that_turns_into_colour_is_not_read_as_depth(tmp_path: Path) -> None:
+    """A driver restarted with another profile publishes infrared images on the topic of depth."""
+    depth = np.arange(500, 500 + 48 * 64, dtype=np.uint16).reshape(48, 64)
+    items = [("/camera/camera_info", EPOCH, info(EPOCH))]
+    for k, kind in enumerate(("16UC1", "mono8", "16UC1")):
+        values = depth if kind == "16UC1" else depth.astype(np.uint8)
+        items.append(("/camera/image_raw", EPOCH + k, image(EPOCH + k, values, kind)))
+
+    frames, skipped, _ = read(write(tmp_path / "a.mcap", items))
+
+    assert [frame.stamp_ns for frame in frames] == [EPOCH, EPOCH + 2]
+    assert dict(skipped) == {"image encoding 'mono8' is not depth": 1}
