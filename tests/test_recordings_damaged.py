@@ -1,0 +1,278 @@
+"""Damaged containers: what is still read, and the warning or error that says what is missing."""
+
+import sqlite3
+import struct
+from contextlib import closing
+from pathlib import Path
+from types import SimpleNamespace
+
+import pytest
+import zstandard
+from mcap.writer import CompressionType
+from rosbags.rosbag2 import CompressionMode, StoragePlugin
+
+from shapecat.errors import RecordingError
+from shapecat.recordings import open_recording
+from shapecat.recordings.containers import ros1_records
+from tests.mcap_files import mcap_writer
+from tests.test_recordings import (
+    SECOND,
+    STRING,
+    text,
+    times_read,
+    write_folder,
+    write_mcap,
+)
+from tests.test_recordings_worked import bag_of
+
+
+def read(path: Path) -> tuple[list[int], list[str]]:
+    """Return the log times of all messages, and the warnings."""
+    with open_recording(path) as recording:
+        return [message.log_time_ns for message in recording.messages()], recording.warnings
+
+
+def replace(path: Path, old: bytes, new: bytes, nth: int = 0) -> None:
+    """Replace an occurrence of some bytes in a file."""
+    data = path.read_bytes()
+    at = -1
+    for _ in range(nth + 1):
+        at = data.index(old, at + 1)
+    path.write_bytes(data[:at] + new + data[at + len(old) :])
+
+
+# ---- MCAP
+
+
+@pytest.mark.parametrize(
+    ("old", "new", "nth", "reason"),  # of the second chunk: the first one holds the channel
+    [
+        (b"\4\0\0\0zstd", b"\4\0\0\0zst9", 1, "chunk compression 'zst9' is not supported"),
+        (struct.pack("<Q", 83), struct.pack("<Q", 82), 0, "83 bytes where the header says 82"),
+    ],
+)
+def test_chunk_that_is_not_what_it_claims_is_skipped(
+    tmp_path: Path, old: bytes, new: bytes, nth: int, reason: str
+) -> None:
+    """Its messages would be missing without a word, or of any length."""
+    path = tmp_path / "a.mcap"
+    with mcap_writer(path, compression=CompressionType.ZSTD, chunk_size=60) as writer:
+        channel = writer.register_channel("/a", "x-text", 0)
+        for time in (3, 5, 8):
+            writer.add_message(channel, time, b"m" * 52, time)
+    replace(path, old, new, nth)
+
+    times, (warning,) = read(path)
+
+    assert times == [3, 8]
+    assert warning.startswith("skipped the chunk at byte ")
+    assert warning.endswith(reason)
+
+
+def test_messages_that_cannot_be_assigned_are_reported(tmp_path: Path) -> None:
+    """A recorder that lost its channels, or was killed, loses messages without a word."""
+    path = tmp_path / "a.mcap"
+    with mcap_writer(path, finish=False, use_chunking=False) as writer:
+        channel = writer.register_channel("/a", "x-text", 0)
+        writer.add_message(channel, 3, b"first", 3)
+    record = struct.Struct("<HIQQ")
+    with path.open("ab") as file:
+        file.write(struct.pack("<BQ", 5, 22 + 4) + record.pack(9, 0, 5, 5) + b"lost")
+        short = file.tell() + 9
+        file.write(struct.pack("<BQ", 5, 10) + bytes(10))
+        file.write(struct.pack("<BQ", 5, 22 + 4) + record.pack(channel, 0, 8, 8) + b"last")
+
+    times, warnings = read(path)
+
+    assert times == [3, 8]
+    assert "skipped messages of channel 9, which is not described" in warnings
+    assert f"skipped a record at byte {short}: message record of 10 bytes" in warnings
+
+
+def test_message_that_claims_to_be_huge_is_not_unpacked(tmp_path: Path) -> None:
+    """One damaged byte would take all memory."""
+    claim = b"\x28\xb5\x2f\xfd\xc0\x00" + struct.pack("<Q", (1 << 30) + 1)
+    with mcap_writer(tmp_path / "a.mcap") as writer:
+        schema = writer.register_schema(STRING, "ros2msg", b"string data")
+        channel = writer.register_channel("/a", "cdr", schema)
+        writer.add_message(channel, 3, claim + bytes(20), 3)
+        writer.add_message(channel, 5, text("small"), 5)
+
+    assert read(tmp_path / "a.mcap") == (
+        [5],
+        ["/a: skipped a message that claims more than 1 GiB"],
+    )
+
+
+# ---- ROS 1
+
+
+def test_encrypted_bag_is_refused_with_its_method(tmp_path: Path) -> None:
+    """Its chunks look like damaged ones."""
+    path = bag_of(tmp_path / "a.bag")
+    data, begin = path.read_bytes(), len(b"#ROSBAG V2.0\n")
+    (size,) = struct.unpack_from("<I", data, begin)
+    field = b"encryptor=rosbag/AesCbcEncryptor"
+    header = data[begin + 4 : begin + 4 + size] + struct.pack("<I", len(field)) + field
+    rest = data[begin + 4 + size :]
+    path.write_bytes(data[:begin] + struct.pack("<I", len(header)) + header + rest)
+
+    with pytest.raises(RecordingError, match="encrypted with 'rosbag/AesCbcEncryptor'"):
+        open_recording(path)
+
+
+def test_bag_chunk_of_unknown_compression_is_reported(tmp_path: Path) -> None:
+    path = bag_of(tmp_path / "a.bag")
+    whole = times_read(path)
+    replace(path, b"compression=none", b"compression=zstd", 1)
+
+    times, (warning,) = read(path)
+
+    assert 0 < len(times) < len(whole)
+    assert set(times) < set(whole)
+    assert warning.endswith(": compression 'zstd' is not supported")
+
+
+def test_bag_chunk_that_unpacks_to_too_much_is_skipped(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Memory must depend on the content of the file, not on its claims."""
+    import bz2  # noqa: PLC0415  only used here
+
+    monkeypatch.setattr(ros1_records, "_FREELY", 5000)
+    monkeypatch.setattr(ros1_records, "_RATIO", 1)
+    record = ros1_records.Record({"compression": b"bz2"}, 0, 0, 0)
+    small, large = bz2.compress(bytes(4999)), bz2.compress(bytes(9000))
+
+    found = [ros1_records.expand(record, data) for data in (small, large)]
+
+    assert [len(plain) for plain, _ in found] == [4999, 0]
+    assert [problem for _, problem in found] == ["", f"{len(large)} bytes hold more than 5000"]
+
+
+@pytest.mark.parametrize("broken", ["place", "connection"])
+def test_bag_with_a_wrong_index_is_read_without_it(tmp_path: Path, broken: str) -> None:
+    """Tools that cut bags leave the index of the whole bag; its messages would be missing."""
+    path = bag_of(tmp_path / "a.bag")
+    whole = times_read(path)
+    data = path.read_bytes()
+    header = data.index(b"op=\x06")  # of the first chunk info
+    at = data.rindex(b"chunk_pos=", 0, header + 60) + len(b"chunk_pos=")
+    if broken == "place":
+        (start,) = struct.unpack_from("<Q", data, at)
+        (size,) = struct.unpack_from("<I", data, start)
+        (length,) = struct.unpack_from("<I", data, start + 4 + size)
+        new = struct.pack("<Q", start + 8 + size + length)  # the next record, an index
+        path.write_bytes(data[:at] + new + data[at + 8 :])
+    else:
+        pairs = data.index(b"count=", header - 40)
+        (count,) = struct.unpack_from("<I", data, pairs + 6)
+        end = data.index(struct.pack("<I", 8 * count), pairs + 10)
+        path.write_bytes(data[: end + 4] + struct.pack("<I", 9) + data[end + 8 :])
+
+    times, warnings = read(path)
+
+    assert sorted(times) == whole
+    assert warnings == ["no index, or a damaged one; messages recovered: 12"]
+
+
+def test_bag_messages_of_an_unknown_connection_are_reported(tmp_path: Path) -> None:
+    """They cannot be decoded."""
+    path = bag_of(tmp_path / "a.bag")
+    data = path.read_bytes()
+    at = data.index(b"op=\x02")
+    conn = data.rfind(b"conn=", 0, at)
+    if at - conn > 40:
+        conn = data.index(b"conn=", at)
+    path.write_bytes(data[: conn + 5] + struct.pack("<I", 7) + data[conn + 9 :])
+
+    times, warnings = read(path)
+
+    assert len(times) == 11
+    assert "skipped messages of connection 7, which is not described" in warnings
+
+
+# ---- ROS 2
+
+
+def test_database_message_without_bytes_is_skipped_and_reported(tmp_path: Path) -> None:
+    """Scripts that edit bags with SQL leave such rows."""
+    path = write_folder(tmp_path / "bag", StoragePlugin.SQLITE3) / "bag.db3"
+    with closing(sqlite3.connect(path)) as base:
+        base.execute("UPDATE messages SET data = 'a text' WHERE timestamp = ?", (2 * SECOND,))
+        base.commit()
+
+    times, warnings = read(path)
+
+    assert times == [0, SECOND, 3 * SECOND, 4 * SECOND]
+    assert warnings == ["/a: skipped a message without bytes"]
+
+
+def test_database_is_read_up_to_its_damage(tmp_path: Path) -> None:
+    """The first hour of a bag on a failing disk is still of use, if one knows what is missing."""
+    path = write_folder(tmp_path / "bag", StoragePlugin.SQLITE3) / "bag.db3"
+    with closing(sqlite3.connect(path)) as base:
+        rows = [(10 * SECOND + k, text("x" * 12_000 + str(k))) for k in range(9)]
+        base.executemany("INSERT INTO messages (topic_id, timestamp, data) VALUES (1, ?, ?)", rows)
+        base.commit()
+        (size,) = base.execute("PRAGMA page_size").fetchone()
+    data = bytearray(path.read_bytes())
+    last = data.index(b"x4\0") // size  # the last page of a message, to which another one points
+    pages = range(0, len(data), size)
+    (before,) = (at for at in pages if data[at : at + 4] == struct.pack(">I", last + 1))
+    data[before : before + 4] = b"\xff" * 4
+    path.write_bytes(data)
+
+    times, (warning,) = read(path)
+
+    assert times == [*(k * SECOND for k in range(5)), *(10 * SECOND + k for k in range(4))]
+    assert warning.startswith("damaged: nothing after this was read: ")
+
+
+@pytest.mark.parametrize(
+    ("name", "content", "reason"),
+    [
+        ("notes.txt", b"x", "a folder without .mcap or .db3 files"),
+        ("a.db3", b"SQLite format 3\0" + bytes(200), "a.db3: not a readable ROS 2 bag"),
+        ("a.db3.zstd", b"\x28\xb5\x2f\xfd" + b"\xff" * 40, "a.db3.zstd: damaged: "),
+        ("a.db3.zstd", zstandard.compress(b"x" * 600), "a.db3.zstd: not enough space in the temp"),
+    ],
+)
+def test_folder_without_readable_part_is_refused_with_the_reason(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, name: str, content: bytes, reason: str
+) -> None:
+    """Nothing may remain of the parts that were unpacked."""
+    (tmp_path / "bag").mkdir()
+    (tmp_path / "bag" / "metadata.yaml").write_text("")
+    (tmp_path / "bag" / name).write_bytes(content)
+    (tmp_path / "tmp").mkdir()
+    monkeypatch.setattr("tempfile.tempdir", str(tmp_path / "tmp"))
+    monkeypatch.setattr("shutil.disk_usage", lambda _: SimpleNamespace(free=1000))
+
+    with pytest.raises(RecordingError, match=reason):
+        open_recording(tmp_path / "bag")
+
+    assert list((tmp_path / "tmp").iterdir()) == []
+
+
+def test_damaged_part_of_a_folder_is_skipped_and_reported(tmp_path: Path) -> None:
+    """Minutes in the middle would be missing without a word; two parts share their folder."""
+    path = write_folder(tmp_path / "bag", StoragePlugin.SQLITE3, CompressionMode.FILE)
+    (part,) = path.glob("*.zstd")
+    (path / "metadata.yaml").unlink()
+    (path / "later.mcap").write_bytes(write_mcap(tmp_path / "b.mcap", [7 * SECOND]).read_bytes())
+    (path / "broken.mcap.zstd").write_bytes(part.read_bytes()[:-9])
+
+    times, warnings = read(path)
+
+    assert times == [*(k * SECOND for k in range(5)), 7 * SECOND]
+    assert any(text.startswith("skipped broken.mcap.zstd: ") for text in warnings)
+
+
+def test_folder_without_messages_has_no_times(tmp_path: Path) -> None:
+    """A recorder stopped at once leaves such a bag; its start was that of the epoch or missing."""
+    (tmp_path / "bag").mkdir()
+    write_mcap(tmp_path / "bag" / "bag_0.mcap", [])
+
+    with open_recording(tmp_path / "bag") as recording:
+        assert (recording.start_ns, recording.end_ns) == (0, 0)
+        assert [(topic.name, topic.count) for topic in recording.topics] == [("/a", 0), ("/b", 0)]
+        assert list(recording.messages()) == []
