@@ -468,3 +468,47 @@ def test_frame_with_objects_does_not_count_as_without_plane(tmp_path: Path) -> N
 
     report = report_up(upright, tmp_path)
     assert (report["planes_differ_deg"], report["frames_without_plane"]) == (5.7, 2)
+
+
+@pytest.mark.parametrize(
+    ("links", "listed"),
+    [((("map", "base"),), "base, map"), ((), "none, it has no transforms")],
+)
+def test_unknown_fixed_frame_is_an_error_that_lists_the_known_ones(
+    tmp_path: Path, links: Any, listed: str
+) -> None:
+    """A misspelled name would leave all objects without a track in the room."""
+    path = in_frames(tmp_path / "a.mcap", *links)
+    with open_recording(path) as recording, pytest.raises(ConfigError) as error:
+        Upright.of(recording, up="auto", fixed_frame="/mpa")
+
+    assert str(error.value) == f"--fixed-frame /mpa: not in {path}; its frames: {listed}"
+
+
+@pytest.mark.parametrize("up", ["gravity", "0,-1", "0,0,0", "0,nan,1", "0,-1,0,"])
+def test_malformed_up_is_an_error(tmp_path: Path, up: str) -> None:
+    """Not a traceback after the recording was opened."""
+    with (
+        open_recording(in_frames(tmp_path / "a.mcap", ("map", "camera"))) as recording,
+        pytest.raises(ConfigError, match=f"--up {up}: expected auto, tf, imu, or a vector"),
+    ):
+        Upright.of(recording, up=up, fixed_frame=None)
+
+
+def test_damaged_imu_message_is_skipped_and_reported(tmp_path: Path) -> None:
+    """One such message must not end the run, and another type on the topic is no IMU."""
+    kind = "sensor_msgs/msg/Imu"
+    items = [
+        ("/imu", EPOCH, imu(EPOCH, (0, -9.7, 0), "camera")),
+        ("/imu", EPOCH + 1, (kind, b"\0\1\0\0" + bytes(7))),
+        ("/imu", EPOCH + 2, make("std_msgs/msg/String", "reset")),
+        ("/imu", EPOCH + 3, imu(EPOCH + 3, (0, np.nan, 0), "camera")),
+    ]
+    with open_recording(write(tmp_path / "a.mcap", items)) as recording:
+        found = Upright.of(recording, up="imu", fixed_frame=None).orient(frame(EPOCH))
+        warnings = recording.warnings
+
+    assert found.up is not None
+    assert found.up.tolist() == [0, -1, 0]
+    assert len(warnings) == 1
+    assert warnings[0].startswith(f"skipped an IMU message: /imu: cannot decode {kind}")

@@ -659,3 +659,22 @@ def test_raw_image_is_exported_as_png_with_the_same_pixels() -> None:
 
     assert suffix == ".png"
     np.testing.assert_array_equal(np.asarray(Image.open(io.BytesIO(content))), colours)
+
+
+def test_colour_camera_without_transform_at_some_frames_is_reported(tmp_path: Path) -> None:
+    """A pan-tilt unit that starts late: the first frames would have no colour without a reason."""
+    items = [
+        *depth_items(EPOCH, EPOCH + 2 * SECOND),
+        ("/cam/color/camera_info", EPOCH, info(EPOCH, WIDE)),
+    ]
+    for stamp in (EPOCH, EPOCH + 2 * SECOND):
+        colours = raw(stamp, gradient(60, 80), "rgb8", "color_optical")
+        items.append(("/cam/color/image_raw", stamp + 1, colours))
+    late = EPOCH + 2 * SECOND
+    moved = static("camera", "color_optical", (0.07, 0.0, 0.0), (0.0, 0.0, 0.0, 1.0), late)
+    items.append(("/tf", late, moved))
+    pairs, warnings = read(write(tmp_path / "a.mcap", in_order(items)))
+
+    assert [view is not None for _, view in pairs] == [False, True]
+    reason = "no transform from camera to color_optical at the time of some frames"
+    assert f"/cam/color/image_raw: {reason}" in warnings

@@ -340,3 +340,17 @@ def test_transforms_without_stamps_use_log_times(tmp_path: Path) -> None:
         buffer = read_transforms(recording)
 
     assert buffer.lookup("odom", "base", EPOCH + SECOND // 2).translation[0] == 0.5
+
+
+def test_invalid_transforms_are_skipped_and_reported(tmp_path: Path) -> None:
+    """A driver without a fix publishes NaN; the pose before it stays valid."""
+    items = [
+        ("/tf", EPOCH, stamped("odom", "base", 1.5, EPOCH)),
+        ("/tf", EPOCH + 1, stamped("odom", "base", np.nan, EPOCH + 1)),
+        ("/tf", EPOCH + 2, stamped("odom", "", 2.5, EPOCH + 2)),
+    ]
+    with open_recording(write(tmp_path / "a.mcap", items)) as recording:
+        buffer = read_transforms(recording)
+
+        assert recording.warnings == ["skipped invalid transforms (NaN, no name)"]
+    assert buffer.lookup("odom", "base", EPOCH).translation[0] == 1.5
