@@ -61,9 +61,15 @@ from shapecat.evaluation.comparison.pictures import (
     _shades,
     draw_frame,
 )
-from shapecat.evaluation.comparison.references import open_reference, read_complete, run_labellings
+from shapecat.evaluation.comparison.references import (
+    _LabelImages,
+    open_reference,
+    read_complete,
+    run_labellings,
+)
 from shapecat.evaluation.comparison.references_coco import CocoLabels, decode_rle, filled_polygon
 from shapecat.evaluation.comparison.references_kitti import KittiLabels
+from shapecat.runs.tables.reading import read_stamps
 from shapecat.runs.tables.schemas import DETECTIONS, FRAMES, TRACKS
 from shapecat.types import Box, Camera, Frame
 from tests.run_info import run_info
@@ -1296,3 +1302,107 @@ def test_tint_of_object_shows_its_own_difference() -> None:
     wrong, right = (pixels[k] - pixels[50] for k in (20, 75))
     assert wrong.argmax() == np.argmax(COLOURS["category"])
     assert right.argmax() == np.argmax(COLOURS["both"])
+
+
+COCO: dict[str, Any] = {
+    "categories": [{"id": 4, "name": "cup"}],
+    "images": [
+        {"id": 2, "file_name": "17.png", "height": 3, "width": 5},
+        {"id": 3, "file_name": "9.png", "height": 3, "width": 5},
+    ],
+    "annotations": [
+        {"id": 8, "image_id": 2, "category_id": 4, "segmentation": {"size": [3, 5], "counts": [15]}}
+    ],
+}
+
+
+@pytest.mark.parametrize(
+    ("part", "change", "reason"),
+    [
+        ("images", {"height": 0}, "a.json: image 2 is 5×0"),
+        ("images", {"width": 10**8}, "a.json: image 2 is 100000000×3"),
+        (
+            "images",
+            {"width": 7},
+            "a.json: annotation 8 has no readable mask (ValueError('size [3, 5]",
+        ),
+        (
+            "images",
+            {"file_name": "first.png"},
+            "the name 'first.png' holds neither a timestamp nor",
+        ),
+    ],
+)
+def test_coco_image_that_fits_no_frame_or_mask_is_refused(
+    part: str, change: dict[str, Any], reason: str
+) -> None:
+    """Masks of another size would be compared with the wrong pixels."""
+    changed = {**COCO, part: [COCO[part][0] | change, *COCO[part][1:]]}
+
+    with pytest.raises((RecordingError, ValueError)) as error:
+        CocoLabels(Path("a.json"), changed).at(("/d", 17), START)
+
+    assert str(error.value).startswith(reason)
+
+
+def test_labels_of_other_frames_are_described_by_their_range(tmp_path: Path) -> None:
+    """The error about labels of another recording names what they hold."""
+    (tmp_path / "label_2").mkdir()
+    assert CocoLabels(Path("a.json"), COCO).describe_frames() == "images 9 to 17"
+    assert CocoLabels(Path("a.json"), COCO | {"images": []}).describe_frames() == "no images"
+    assert KittiLabels(tmp_path).describe_frames() == "no frames"
+    for name in ("000031", "000007"):
+        (tmp_path / "label_2" / f"{name}.txt").write_text("")
+    assert KittiLabels(tmp_path).describe_frames() == "frames 7 to 31"
+
+
+@pytest.mark.parametrize(
+    ("file", "content", "reason"),
+    [
+        ("label_2/first.txt", "", "not a folder of KITTI labels (invalid literal for int()"),
+        ("frames.csv", "number,topic\n000007,/d\n", "not a folder of KITTI labels ('stamp_ns')"),
+        ("label_2/000007.txt", "cup 0 0 0\n", "000007.txt: not a KITTI label file (not enough"),
+        ("calib/000007.txt", "Tr_rect_to_sensor: 1 0 0\n", "000007.txt: not a KITTI label file ("),
+    ],
+)
+def test_damaged_kitti_labels_are_refused_with_the_file(
+    tmp_path: Path, file: str, content: str, reason: str
+) -> None:
+    """They are often edited by hand or by scripts."""
+    for folder in ("label_2", "calib"):
+        (tmp_path / folder).mkdir()
+    (tmp_path / "label_2" / "000007.txt").write_text("")
+    (tmp_path / file).write_text(content)
+
+    with pytest.raises(RecordingError) as error:
+        KittiLabels(tmp_path).at(("/d", 7), START)
+
+    assert reason in str(error.value)
+    assert str(error.value).startswith(str(tmp_path))
+
+
+def test_label_images_that_end_early_or_are_no_images_are_refused(tmp_path: Path) -> None:
+    """Frames without their labels would count as frames without objects."""
+    images = np.arange(2 * 3 * 5, dtype=np.uint8).reshape(2, 3, 5)
+    np.savez(tmp_path / "a.npz", labels=images)
+    np.savez(tmp_path / "b.npz", labels=images.astype(np.int16))
+    file = _LabelImages(tmp_path / "a.npz")
+
+    np.testing.assert_array_equal(file.read(1), images[1])
+    with pytest.raises(RecordingError, match=r"a.npz: ends before image 2; simulate the rec"):
+        file.read(2)
+    with pytest.raises(RecordingError, match=r"expected images of uint8, got \(2, 3, 5\) int16"):
+        _LabelImages(tmp_path / "b.npz")
+
+
+def test_run_with_frames_in_another_order_is_refused(run: Path) -> None:
+    """Its later frames would count as frames without objects."""
+    other = open_reference(run)
+    stamps = read_stamps(run)
+    frames = sorted((key, stamp) for key, stamp in stamps)
+
+    (last_key, last), (first_key, first) = frames[-1], frames[0]
+    assert other.at(last_key, last) is not None
+    with pytest.raises(OutputError, match="its frames are in a different order; process it again"):
+        other.at(first_key, first)
+    assert other.describe_frames() == f"frames of {first_key[0]}, stamps {first} to {last}"
