@@ -170,16 +170,12 @@ def match_in_place(
         old, gone = _standing(source)
         reasons = dict.fromkeys(gone, "it was moved, so it cannot be found by its place")
     matches_of: dict[int, list[Match]] = {}
-    owner: dict[int, int] = {}
     for item in old:
         other_objects = [other for other in old if group(other.track) != group(item.track)]
         match, reason = _nearest_there(item, other_objects, new)
         if match is None:
             reasons[item.track] = reason
-        elif group(owner.get(match.track, item.track)) != group(item.track):
-            reasons[item.track] = f"track {match.track} could also be track {owner[match.track]}"
-        else:
-            owner[match.track] = item.track
+        else:  # no other object has this match: each would be a rival of the other
             matches_of[item.track] = [match]
     return Matches(matches_of, reasons)
 
