@@ -13,6 +13,7 @@ from typing import Any, get_args
 import fsspec
 import pytest
 
+from shapecat.batch import claims
 from shapecat.batch.finding import find_recordings
 from shapecat.batch.finding_urls import _combined_key
 from shapecat.batch.ledger import Ledger, Outcome
@@ -24,7 +25,7 @@ from shapecat.batch.runs import _reporter, process_here, process_on
 from shapecat.batch.sources import Source
 from shapecat.batch.storage import Location, content_key
 from shapecat.config import Settings, with_overrides
-from shapecat.errors import OutputError, common_exit_code
+from shapecat.errors import ConfigError, OutputError, common_exit_code
 from shapecat.executors import WorkerLostError
 from shapecat.recordings.files import input_size
 from shapecat.runs.folder import read_run, write_run
@@ -1086,3 +1087,59 @@ def test_numbered_folder_name_may_already_be_taken() -> None:
     folders = name_folders(["a_x_3", "x", "x", "a_x_4", "x"], ["b", "a", "a", "b", "a"])
 
     assert folders == ["a_x_3", "a_x", "a_x_4", "a_x_4_4", "a_x_5"]
+
+
+@pytest.mark.parametrize(
+    ("text", "told"),
+    [
+        ("2", "expected I/N, for example 2/4"),
+        ("-1/4", "expected I/N, for example 2/4"),
+        ("1/x", "expected I/N, for example 2/4"),
+        ("5/4", "expected I from 0 to 3 or from 1 to 4"),
+        ("1/0", "expected I/N, for example 2/4"),
+    ],
+)
+def test_wrong_shard_is_refused(text: str, told: str) -> None:
+    """Machines would process nothing, or the same recordings twice."""
+    with pytest.raises(ConfigError) as error:
+        Shard.parse(text)
+
+    assert str(error.value) == f"--shard {text}: {told}"
+
+
+class _Answers:
+    """A claim in a storage that gives these answers, in order, whether the claim was created."""
+
+    def __init__(self, created: list[bool], contents: list[bytes | None]) -> None:
+        self.created, self.contents, self.written = created, contents, list[bytes]()
+
+    def __truediv__(self, _: str) -> "_Answers":
+        return self
+
+    def create(self, content: bytes) -> bool:
+        self.written.append(content)
+        return self.created.pop(0)
+
+    def read(self) -> bytes | None:
+        return self.written[0] if self.contents[0] == b"own" else self.contents.pop(0)
+
+
+@pytest.mark.parametrize(
+    ("created", "contents"),
+    [
+        ([False], [b"own"]),  # it was created, but the answer was lost
+        ([False, True], [None]),  # it was given up meanwhile
+        ([False, True], [b'{"owner": "x", "batch": "two"}', None]),  # it is given up later
+    ],
+    ids=["lost", "free", "freed"],
+)
+def test_claim_that_nobody_holds_is_not_taken_from_a_dead_process(
+    monkeypatch: pytest.MonkeyPatch, created: list[bool], contents: list[bytes | None]
+) -> None:
+    """The files of the run would be taken for those of a worker that died."""
+    storage = _Answers(created, contents)
+    monkeypatch.setattr(claims, "Location", lambda *_: storage)
+    monkeypatch.setattr(claims, "_POLL_S", 0.001)
+
+    assert not claims.Claim("memory://lab/run", "one").inherited
+    assert not created

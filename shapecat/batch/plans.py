@@ -113,11 +113,11 @@ class Shard:
         ConfigError : the text is not of that form, N is 0, or I is larger than N.
         """
         first, slash, last = text.partition("/")
-        if not slash or not (first.isdecimal() and last.isdecimal()):
+        if not slash or not (first.isdecimal() and last.isdecimal() and int(last)):
             msg = f"--shard {text}: expected I/N, for example 2/4"
             raise ConfigError(msg)
         index, count = int(first), int(last)
-        if count < 1 or index > count:
+        if index > count:
             msg = f"--shard {text}: expected I from 0 to {count - 1} or from 1 to {count}"
             raise ConfigError(msg)
         return cls(index % count, count)
