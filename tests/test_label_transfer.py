@@ -824,3 +824,51 @@ def test_by_place_transfers_labels_of_another_run(
     assert done.exit_code == 0, done.stderr
     assert "1 of 1 labels transferred" in done.stdout
     assert "teapot" in annotated_classes(two)
+
+
+@pytest.mark.parametrize(("found", "place"), [("x,y,z", "u,v,w"), ("0.34,", ",")])
+def test_table_alone_without_positions_is_refused(tmp_path: Path, found: str, place: str) -> None:
+    """Its labels would go to whatever is nearest to nowhere."""
+    table = tmp_path / "table.csv"
+    write_csv(table, {4: static(CUP), 5: static(CAN)}, "wfar", {4: "mug"})
+    text = table.read_text()
+    assert found in text
+    table.write_text(text.replace(found, place))
+    target = second(tmp_path / "target", {1: static(CAN), 2: static(CUP)})
+
+    line, track = (2, 4) if place == "u,v,w" else (3, 5)
+    with pytest.raises(OutputError, match=f"line {line}: no position x, y, z of track {track}"):
+        transfer_labels(table, target)
+    assert labels_of(target) == {1: "", 2: ""}
+
+
+def test_table_with_misspelt_labels_only_reports_each(tmp_path: Path) -> None:
+    """They would be lost without a word."""
+    source = make_run(tmp_path / "source", {1: static(CUP), 2: static(CAN)}, labels={2: "cupp"})
+    target = make_run(tmp_path / "target", {5: static(CUP), 6: static(CAN)})
+
+    transfer = transfer_labels(source, target)
+
+    assert not transfer.transferred
+    assert [(one.old_track, one.label) for one in transfer.missed] == [(2, "cupp")]
+    assert "cup" in transfer.missed[0].reason
+    assert labels_of(target) == {5: "", 6: ""}
+
+
+def test_object_between_two_old_ones_is_that_of_neither(tmp_path: Path) -> None:
+    """In whatever order the tracks are, it must not get the label of the first."""
+    places = {1: static(CUP), 2: static(shifted(CUP, x=0.03))}
+    for order in ((1, 2), (2, 1)):
+        name = f"source{order[0]}"
+        labels = {1: "mug", 2: "tin"}
+        source = make_run(tmp_path / name, {k: places[k] for k in order}, labels=labels)
+        between = {7: static(shifted(CUP, x=0.014))}
+        target = second(tmp_path / f"target{order[0]}", between)
+
+        transfer = transfer_labels(source, target)
+
+        assert labels_of(target) == {7: ""}
+        assert {one.old_track: one.reason for one in transfer.missed} == {
+            1: "track 7 could also be track 2",
+            2: "track 7 could also be track 1",
+        }

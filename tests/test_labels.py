@@ -732,3 +732,13 @@ def test_pattern_for_a_batch_folder_also_gives_its_files(tmp_path: Path) -> None
     assert find_runs(sorted(tmp_path.iterdir())) == [tmp_path / "a", tmp_path / "b"]
     with pytest.raises(OutputError, match=r"manifest\.jsonl: no run\.json there"):
         find_runs([tmp_path / "manifest.jsonl"])
+
+
+def test_table_with_an_endless_cell_is_refused(run: Path) -> None:
+    """A quotation mark that is never closed swallows the lines after it, and their labels."""
+    text = (run / "tracks.csv").read_text()
+    lines = text.splitlines()
+    (run / "tracks.csv").write_text("\n".join([*lines[:2], '2,"' + "x" * 140_000]))
+
+    with pytest.raises(OutputError, match=r"line 3: field larger than field limit"):
+        read_labels(run / "tracks.csv")
