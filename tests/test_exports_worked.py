@@ -21,7 +21,7 @@ from shapecat.evaluation.comparison.references_kitti import KittiLabels
 from shapecat.geometry import IDENTITY
 from shapecat.outputs.colouring import Coloured
 from shapecat.outputs.exports.coco import write_coco, write_yolo
-from shapecat.outputs.exports.crops import write_crops
+from shapecat.outputs.exports.crops import Origin, write_crops
 from shapecat.outputs.exports.dataset_frames import DatasetImage
 from shapecat.outputs.exports.kitti import rectified_from_sensor, write_kitti
 from shapecat.outputs.exports.labelcloud import _described, write_labelcloud
@@ -571,3 +571,38 @@ def test_kitti_lists_frame_of_each_number(tmp_path: Path) -> None:
         "number,topic,frame,stamp_ns\n000000,/depth,0,5\n000001,/left,17,12345\n"
     )
     assert (tmp_path / "label_2" / "000001.txt").read_text() == ""
+
+
+@pytest.mark.parametrize("without", ["lens", "data", "view"])
+def test_kitti_2d_box_is_that_of_the_image_that_is_written(
+    tmp_path: Path, caplog: pytest.LogCaptureFixture, without: str
+) -> None:
+    """Without a usable image, boxes and P2 are those of the depth camera."""
+    image = ColourImage("/color", 5, 6, "color", "rgb8", 40, 30, 120, bytes(3600))
+    lens = LensCamera(replace(CAMERA, width=40, height=30, cx=20.0, cy=15.0))
+    pose = Pose(np.eye(3), np.array([0.0, 9.0, 0.0] if without == "view" else [0.0, 0.0, 0.0]))
+    if without == "data":
+        image = replace(image, data=bytes(99))
+    view = ColourView(image, None if without == "lens" else lens, pose)
+    folders = tmp_path / "with", tmp_path / "alone"
+    for folder, coloured in zip(folders, (Coloured(view, ()), None), strict=True):
+        views: Any = [(labelled(cut=False, hidden=False), frame(), coloured)]
+        unused: Any = SimpleNamespace()
+        folder.mkdir()
+        write_kitti(folder, views, unused)
+    words, alone = ((one / "label_2" / "000000.txt").read_text().split() for one in folders)
+
+    if without == "view":  # the colour camera does not see it
+        assert list(map(float, words[4:8])) == [-1, -1, -1, -1]
+        assert float(alone[6]) > 0
+        return
+    assert words == alone
+    assert read_kitti(folders[0])[0].tolist() == read_kitti(folders[1])[0].tolist()
+    assert not (folders[0] / "image_2").exists()
+    assert ("image_2/000000.png is missing" in caplog.text) is (without == "data")
+
+
+def test_instances_of_other_tools_are_not_those_of_a_run() -> None:
+    """Crops that someone added by hand must not be replaced by a later export."""
+    assert Origin.read("mug_3") is None
+    assert Origin.read("lab.0123456789ab.track-3") is not None

@@ -24,7 +24,7 @@ from scipy.spatial.transform import Rotation
 from shapecat.cameras.colour import ColourImage, ColourView, LensCamera
 from shapecat.colour.masks import Mask
 from shapecat.detection.scene_graph import Node, format_tree
-from shapecat.errors import OutputError
+from shapecat.errors import OutputError, RecordingError
 from shapecat.geometry import IDENTITY
 from shapecat.outputs.annotation.annotated_mcap import _annotations, _encoding
 from shapecat.outputs.annotation.channels import encoder_for
@@ -35,6 +35,7 @@ from shapecat.outputs.colours import colour_of
 from shapecat.outputs.exports.dataset_frames import (
     Selection,
     _chosen,
+    _colour_file,
     _depth_file,
     _different,
     _view,
@@ -48,6 +49,9 @@ from shapecat.outputs.exports.points import write_point_labels
 from shapecat.outputs.level_clouds import support_offset, upright_cloud
 from shapecat.outputs.opened_run import RunFrame
 from shapecat.outputs.png import png
+from shapecat.outputs.report.cards import _guess
+from shapecat.outputs.report.pictures import _require_unchanged
+from shapecat.outputs.review.colour import true_colours
 from shapecat.outputs.review.images import picture_of
 from shapecat.outputs.review.paths import Paths
 from shapecat.outputs.review.scenes import choose_scenes, with_clouds
@@ -947,3 +951,92 @@ def test_png_of_masks_reads_back(rows: tuple[int, int]) -> None:
     zlib.decompress(data[at + 4 : at + 4 + int.from_bytes(data[at - 4 : at], "big")])
     with Image.open(io.BytesIO(data)) as file:
         np.testing.assert_array_equal(np.asarray(file), entries)
+
+
+def test_export_of_recording_that_lost_frames_is_refused(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Frames would be missing from the export without a word."""
+    labelled = [labelled_frame(k) for k in (1, 4)]
+    read: Any = [(SimpleNamespace(topic="/depth", index=k), None) for k in (0, 1, 2, 3)]
+    monkeypatch.setattr("shapecat.outputs.colouring.read_frames", lambda *_, **__: iter(read))
+    run: Any = {"options": {"topics": ["/depth"]}}
+    recording: Any = SimpleNamespace(path="a.mcap")
+    paired = with_colour(labelled, recording, run)
+
+    label, frame, _ = next(paired)
+    assert (label.index, frame.index) == (1, 1)
+    with pytest.raises(OutputError, match=r"^a\.mcap: has changed since it was processed"):
+        next(paired)
+
+
+def test_frame_of_two_topics_needs_a_topic(tmp_path: Path) -> None:
+    """Otherwise the scene of one of the cameras would be shown, whichever came first."""
+    keys = [("/a", 3), ("/b", 3), ("/b", 4)]
+    rows = [{"topic": topic, "frame": frame} for topic, frame in keys]
+    pq.write_table(pa.Table.from_pylist(rows, FRAMES), tmp_path / "frames.parquet")
+
+    with pytest.raises(OutputError) as error:
+        _topic(tmp_path, 3, None)
+    assert str(error.value) == f"{tmp_path}: frame 3 is on /a, /b; choose one with --topic"
+    assert (_topic(tmp_path, 3, "/b"), _topic(tmp_path, 4, None)) == ("/b", "/b")
+
+
+def test_points_of_coloured_cloud_have_their_own_colours() -> None:
+    """The colours of a cloud are one per point, in order, not an image of its width."""
+    rgb = np.array([[8, 16, 24], [32, 40, 48], [64, 72, 80], [96, 104, 112], [128, 136, 144]])
+    image = ColourImage("/c", 5, 6, "laser", "rgb8", 5, 1, 15, rgb.astype(np.uint8).tobytes())
+    cloud = Frame("/c", 0, 5, 6, "laser", points=np.zeros((5, 3), np.float32))
+    chosen = np.array([4, 1, 2], np.int32)
+    palette, tones = np.full((1, 3), 255, np.uint8), np.zeros(3, np.uint16)
+
+    found = true_colours(
+        cloud, ColourView(image), np.zeros((3, 3), np.float32), chosen, 1, palette, tones
+    )
+
+    channels = np.stack([found >> 24, found >> 16 & 255, found >> 8 & 255], axis=1).astype(int)
+    assert_allclose(channels, rgb[chosen], atol=8)
+    assert (found & 255).tolist() == [255] * 3
+
+
+def test_report_does_not_draw_objects_on_another_recording() -> None:
+    """A smaller image in place of the recording has no such pixels."""
+    depth = np.ones((4, 6), np.float32)
+    frame = Frame("/depth", 7, 5, 6, "cam", depth, Camera(6, 4, 5, 5, 3, 2))
+    inside, outside = labelled_object(1, [3, 23]), labelled_object(2, [3, 24])
+
+    _require_unchanged(labelled_frame(7, inside), frame)
+    with pytest.raises(RecordingError, match="frame 7 of /depth has changed since it was"):
+        _require_unchanged(labelled_frame(7, inside, outside), frame)
+
+
+@pytest.mark.parametrize(
+    ("category", "guess", "text"),
+    [
+        ("unknown", "tea <pot>", '<span class="guess">perhaps tea &lt;pot&gt;</span>'),
+        ("unknown", "", ""),
+        ("cup", "can", ""),
+    ],
+)
+def test_card_names_the_guess_of_an_unknown_object_only(
+    category: str, guess: str, text: str
+) -> None:
+    """A guess beside a decided category would contradict it."""
+    row: Any = SimpleNamespace(category=category, cells={"guess": guess})
+
+    assert _guess(row) == text
+
+
+@pytest.mark.parametrize("kind", ["cloud", "image"])
+def test_clouds_have_no_image_in_a_data_set(kind: str) -> None:
+    """Colours of points are no picture: it would be one row high."""
+    height = 1 if kind == "cloud" else 4
+    image = ColourImage("/c", 5, 6, "l", "rgb8", 6, height, 18, bytes(18 * height))
+    depth = None if kind == "cloud" else np.ones((4, 6), np.float32)
+    points = np.zeros((6, 3), np.float32) if kind == "cloud" else None
+    frame = Frame("/c", 0, 5, 6, "l", depth, Camera(6, 4, 5, 5, 3, 2), points=points)
+    coloured = Coloured(ColourView(image), ())
+
+    found = _colour_file(frame, coloured), _depth_file(labelled_frame(0), frame)
+
+    assert [one is not None and one[2] for one in found] == [
+        (4, 6) if kind == "image" else False
+    ] * 2
