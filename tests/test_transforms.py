@@ -349,6 +349,10 @@ def test_invalid_transforms_are_skipped_and_reported(tmp_path: Path) -> None:
         ("/tf", EPOCH + 1, stamped("odom", "base", np.nan, EPOCH + 1)),
         ("/tf", EPOCH + 2, stamped("odom", "", 2.5, EPOCH + 2)),
     ]
+    with open_recording(write(tmp_path / "valid.mcap", items[:1])) as recording:
+        read_transforms(recording)
+
+        assert recording.warnings == []
     with open_recording(write(tmp_path / "a.mcap", items)) as recording:
         buffer = read_transforms(recording)
 
