@@ -639,3 +639,15 @@ def test_several_cores_require_main_guard_in_script(tmp_path: Path) -> None:
     last = done.stderr.splitlines()[-1]
     assert last.endswith('cores=3 starts processes: a script needs `if __name__ == "__main__":`')
     assert [path.name for path in tmp_path.iterdir()] == ["script.py"]
+
+
+@pytest.mark.parametrize("content", [None, b"", b"PAR1" + bytes(20)])
+def test_unreadable_table_is_named(tmp_path: Path, content: bytes | None) -> None:
+    """Scripts over many runs must be able to skip one whose copy was cut short."""
+    path = tmp_path / "tracks.parquet"
+    if content is not None:
+        path.write_bytes(content)
+
+    with pytest.raises(OutputError) as error:
+        Table(path).arrow("track")
+    assert str(error.value).startswith(f"{path}: not a readable table of a run (")

@@ -25,7 +25,7 @@ from shapecat.batch.runs import _reporter, process_here, process_on
 from shapecat.batch.sources import Source
 from shapecat.batch.storage import Location, content_key
 from shapecat.config import Settings, with_overrides
-from shapecat.errors import ConfigError, OutputError, common_exit_code
+from shapecat.errors import ConfigError, OutputError, RecordingError, common_exit_code
 from shapecat.executors import WorkerLostError
 from shapecat.recordings.files import input_size
 from shapecat.runs.folder import read_run, write_run
@@ -1143,3 +1143,12 @@ def test_claim_that_nobody_holds_is_not_taken_from_a_dead_process(
 
     assert not claims.Claim("memory://lab/run", "one").inherited
     assert not created
+
+
+def test_recording_that_vanishes_while_it_is_processed_is_named(tmp_path: Path) -> None:
+    """A drive may be unplugged; a digest of nothing would be that of any other recording."""
+    with (
+        ContentDigest(tmp_path / "gone.mcap") as content,
+        pytest.raises(RecordingError, match=r"gone\.mcap: cannot be read: No such file"),
+    ):
+        content.result()
