@@ -981,20 +981,20 @@ def test_frame_of_two_topics_needs_a_topic(tmp_path: Path) -> None:
 
 
 def test_points_of_coloured_cloud_have_their_own_colours() -> None:
-    """The colours of a cloud are one per point, in order, not an image of its width."""
-    rgb = np.array([[8, 16, 24], [32, 40, 48], [64, 72, 80], [96, 104, 112], [128, 136, 144]])
-    image = ColourImage("/c", 5, 6, "laser", "rgb8", 5, 1, 15, rgb.astype(np.uint8).tobytes())
-    cloud = Frame("/c", 0, 5, 6, "laser", points=np.zeros((5, 3), np.float32))
-    chosen = np.array([4, 1, 2], np.int32)
-    palette, tones = np.full((1, 3), 255, np.uint8), np.zeros(3, np.uint16)
+    """The colours of a cloud are one per point, row by row."""
+    rgb = np.arange(8, 8 + 8 * 18, 8).reshape(6, 3)
+    image = ColourImage("/c", 5, 6, "laser", "rgb8", 3, 2, 9, rgb.astype(np.uint8).tobytes())
+    cloud = Frame("/c", 0, 5, 6, "laser", points=np.zeros((6, 3), np.float32))
+    chosen = np.array([5, 1, 2, 3], np.int32)
+    palette, tones = np.full((1, 3), 255, np.uint8), np.zeros(4, np.uint16)
 
     found = true_colours(
-        cloud, ColourView(image), np.zeros((3, 3), np.float32), chosen, 1, palette, tones
+        cloud, ColourView(image), np.zeros((4, 3), np.float32), chosen, 8, palette, tones
     )
 
     channels = np.stack([found >> 24, found >> 16 & 255, found >> 8 & 255], axis=1).astype(int)
-    assert_allclose(channels, rgb[chosen], atol=8)
-    assert (found & 255).tolist() == [255] * 3
+    assert_allclose(channels, rgb[chosen] + 4)
+    assert (found & 255).tolist() == [255] * 4
 
 
 def test_report_does_not_draw_objects_on_another_recording() -> None:

@@ -37,11 +37,6 @@ def true_colours(
     MessageError : the image is damaged.
     """
     image, result = view.image, np.zeros(pixels.size, np.uint32)
-    if not frame.organized and view.registered:
-        colours = pixels_of(image).reshape(-1, 1, 3)
-        pixels_in_image = np.stack([np.zeros(pixels.size), pixels], axis=1)
-        _take(colours, (len(colours), 1), pixels_in_image, palette, tones, result)
-        return result
     finer = image.width / frame.camera.width if frame.camera is not None else 1.0
     apart = 1.5 * pitch * finer
     shrink = next((k for k in (4, 2) if k <= apart), 1)  # still finer than the points
