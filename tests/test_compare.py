@@ -1263,6 +1263,12 @@ def test_errors_are_one_line_with_reason_and_exit_code(
         assert text in refused(shapecat, *words)[1]
 
 
+@pytest.mark.parametrize("place", [".", "/"])
+def test_folder_without_a_name_is_no_reference(shapecat: Run, run: Path, place: str) -> None:
+    """A person in a folder of labels that shapecat cannot read gets a reason, no traceback."""
+    assert refused(shapecat, run, place)[0] == 3
+
+
 def test_split_object_is_visible_in_the_picture() -> None:
     """With unions of masks, an object in two halves would look correct."""
     true = Labelling((LabelledItem(1, "cup", np.arange(0, 60)),), None, (10, 10))

@@ -57,7 +57,7 @@ def open_reference(path: Path, categories: Sequence[str] = (), run: str = "") ->
         return OtherRun(path)
     if (path / "label_2").is_dir():
         return KittiLabels(path, categories)
-    beside = path.with_name(f"{path.stem}.truth.json")
+    beside = path.parent / f"{path.stem}.truth.json"
     if path.suffix != ".json" and beside.is_file():
         path = beside
     if path.suffix != ".json" or not path.is_file():
