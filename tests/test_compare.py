@@ -51,6 +51,7 @@ from shapecat.evaluation.comparison.page import (
     figure_rows,
     format_page,
     place_captions,
+    require_new,
     write_comparison,
 )
 from shapecat.evaluation.comparison.pictures import (
@@ -1267,6 +1268,16 @@ def test_errors_are_one_line_with_reason_and_exit_code(
 def test_folder_without_a_name_is_no_reference(shapecat: Run, run: Path, place: str) -> None:
     """A person in a folder of labels that shapecat cannot read gets a reason, no traceback."""
     assert refused(shapecat, run, place)[0] == 3
+
+
+def test_current_folder_as_output_is_refused_before_the_work(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Minutes of comparing must not be lost because the output cannot be written."""
+    monkeypatch.chdir(tmp_path)
+
+    with pytest.raises(OutputError, match="name a file or folder in it"):
+        require_new(Path())
 
 
 def test_split_object_is_visible_in_the_picture() -> None:
