@@ -69,7 +69,7 @@ class SurfaceSettings:
     them."""
     smooth_radius_m: float = 0.0
     """Radius of moving least squares smoothing, applied to the averages of the voxels, for example
-    0.015 (thesis 4.2); 0 turns it off."""
+    0.015 (thesis 4.2), at least 1.5 times `surface.voxel_m`; 0 turns it off."""
 
     def __post_init__(self) -> None:
         """Reject numbers and lengths that are out of range."""
@@ -80,6 +80,13 @@ class SurfaceSettings:
         _check_range("surface.voxel_m", self.voxel_m, 0.0001, 1.0)
         if self.smooth_radius_m != 0:
             _check_range("surface.smooth_radius_m, if not 0,", self.smooth_radius_m, 0.0001, 1.0)
+            # A fit needs neighbours, which are about one voxel apart.
+            if self.smooth_radius_m / self.voxel_m < 1.5 - 1e-9:
+                msg = (
+                    "surface.smooth_radius_m, if not 0, must be at least 1.5 times "
+                    f"surface.voxel_m, got {self.smooth_radius_m} and {self.voxel_m}"
+                )
+                raise ConfigError(msg)
 
 
 @dataclass(frozen=True)
@@ -177,7 +184,9 @@ def with_settings(settings: Settings, tree: Mapping[str, Any]) -> Settings:
 
 
 def with_overrides(settings: Settings, overrides: Sequence[str]) -> Settings:
-    """Return settings with overrides such as ``detection.max_range_m=1.5`` applied, in order.
+    """Return settings with overrides such as ``detection.max_range_m=1.5`` applied together.
+
+    Of several values of a setting, the last one counts.
 
     Raises
     ------
@@ -189,6 +198,7 @@ def with_overrides(settings: Settings, overrides: Sequence[str]) -> Settings:
     >>> with_overrides(Settings(), ["tracking.gate_m=0.2"]).tracking.gate_m
     0.2
     """
+    changes: dict[str, Any] = {}
     for text in overrides:
         name, equals, value = text.partition("=")
         if not equals:
@@ -197,8 +207,17 @@ def with_overrides(settings: Settings, overrides: Sequence[str]) -> Settings:
         tree: Any = _parse_value(value)
         for part in reversed(name.strip().split(".")):
             tree = {part: tree}
-        settings = _replace(settings, tree, "")
-    return settings
+        _merge(changes, tree)
+    return with_settings(settings, changes)
+
+
+def _merge(tree: dict[str, Any], more: Mapping[str, Any]) -> None:
+    """Add the values of ``more`` to a tree, in place."""
+    for key, value in more.items():
+        if isinstance(value, Mapping) and isinstance(tree.get(key), dict):
+            _merge(tree[key], value)
+        else:
+            tree[key] = value
 
 
 def _check_least(name: str, value: float, least: float) -> None:

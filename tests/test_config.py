@@ -74,6 +74,21 @@ def test_error_names_invalid_setting(override: str, message: str) -> None:
         with_overrides(Settings(), [override])
 
 
+def test_smoothing_within_voxels_is_refused() -> None:
+    """Hardly any voxel has neighbours that near: all points were dropped, all objects unknown."""
+    with pytest.raises(ConfigError, match=r"at least 1\.5 times surface\.voxel_m, got 0\.003"):
+        with_overrides(Settings(), ["surface.smooth_radius_m=0.003"])
+
+
+def test_settings_that_fit_together_may_be_given_in_any_order() -> None:
+    overrides = ["surface.smooth_radius_m=0.0045", "surface.voxel_m=0.003"]  # just in the range
+
+    settings = with_overrides(Settings(), overrides)
+
+    assert settings == with_overrides(Settings(), overrides[::-1])
+    assert (settings.surface.smooth_radius_m, settings.surface.voxel_m) == (0.0045, 0.003)
+
+
 def test_file_may_begin_with_byte_order_mark(tmp_path: Path) -> None:
     """Editors on Windows write one."""
     path = tmp_path / "s.toml"
@@ -142,5 +157,5 @@ def changed(settings: Any) -> Any:
         elif kind is bool:
             values[name] = not value
         else:
-            values[name] = value + (1 if kind is int else 0.01)
+            values[name] = value + 1 if kind is int else 2 * value or 0.1
     return dataclasses.replace(settings, **values)
