@@ -98,6 +98,7 @@ JUDGED_BY: dict[str, Sequence[str]] = {
     "shapecat.runs.labels.same_objects": ("test_label_transfer",),
     "shapecat.runs.labels.track_table": ("test_labels", "test_label_transfer"),
     "shapecat.runs.labels.transfer": ("test_label_transfer",),
+    "shapecat.runs.perceive.misplacement": ("test_misplacement",),
     "shapecat.runs.perceive.missing_planes": ("test_missing_planes",),
     "shapecat.runs.perceive.phases": ("test_pipeline", "test_crash"),
     "shapecat.runs.perceive.second_look": ("test_second_look",),
@@ -112,6 +113,7 @@ JUDGED_BY: dict[str, Sequence[str]] = {
 """Test files by prefix of a module's name; the longest prefix counts."""
 SLOW = (
     "shapecat.batch.claims",
+    "shapecat.batch.finding_urls",
     "shapecat.batch.ledger",
     "shapecat.batch.remote",
     "shapecat.batch.runs",
