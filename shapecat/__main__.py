@@ -6,7 +6,7 @@ from typing import Any
 
 from shapecat.system.garbage import collect_seldom
 from shapecat.system.libraries import block_unused
-from shapecat.system.stderr import forgive_stderr, require_stdout
+from shapecat.system.standard_streams import forgive_stderr, require_stdout
 from shapecat.system.stopping import exit_at_once
 
 

@@ -24,7 +24,7 @@ from click.testing import Result
 from shapecat.api import open_recording
 from shapecat.errors import RecordingError
 from shapecat.runs.folder import read_run
-from shapecat.system.stderr import forgive_stderr
+from shapecat.system.standard_streams import forgive_stderr
 from tests.processes import descendants, wait_for
 from tests.scenes import record
 
@@ -674,7 +674,7 @@ def test_stderr_can_be_flushed_when_python_ends(monkeypatch: pytest.MonkeyPatch)
     """Python 3.13 flushes it after all names of its module are None, and prints errors of that."""
     monkeypatch.setattr(sys, "stderr", sys.__stderr__)
     forgive_stderr()
-    module = import_module("shapecat.system.stderr")
+    module = import_module("shapecat.system.standard_streams")
     for name in [name for name in vars(module) if not name.startswith("__")]:
         monkeypatch.setattr(module, name, None)
     sys.stderr.write("")
