@@ -471,7 +471,7 @@ def status_of(job: Job, source: Path, out: Path) -> str:
 def test_batch_checks_results_of_other_model_settings_or_content(
     source: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """The plan relies on the manifest alone, without opening a file."""
+    """The plan opens no recording: it relies on the manifest and run.json."""
     (source.parent / "other.mcap").write_bytes(b"another")
     out, job = tmp_path / "out", Job(Path(), Path(), mcap=False, rrd=False)
     (out / "lab").mkdir(parents=True)

@@ -24,6 +24,7 @@ COMPRESSED_HINT = "skipped: a compressed file, unpack it first"
 BAG_KEY = b"rosbag2_bagfile_information:"
 """The first line of a bag's metadata.yaml; data sets have files of this name, too."""
 METADATA_BYTES = 1 << 12
+"""The start of a metadata.yaml that is searched for this line."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -57,8 +58,8 @@ def is_compressed(name: str) -> bool:
 def is_named_as_bag(folder: str, names: Collection[str]) -> bool:
     """Return whether a folder with files of these names is a bag, whenever they were recorded."""
     parts = parts_among(names)
-    is_compressed = any(name.endswith(".zstd") for name in names)
-    return bool(parts) and (is_compressed or parts[0].rpartition("_")[0] == folder)
+    any_compressed = any(name.endswith(".zstd") for name in names)
+    return bool(parts) and (any_compressed or parts[0].rpartition("_")[0] == folder)
 
 
 def recordings_among(names: Iterable[str]) -> set[str]:

@@ -32,7 +32,7 @@ def agreement(
     The share of the compared points that agree with ``other``, and the mean inverse depth, in 1/m,
     by which ``other`` sees these points nearer; (0, 0) if too few points have depth there.
     """
-    turn = np.array(other_from_one.rotation, order="C")  # one version: never read-only, row by row
+    turn = np.array(other_from_one.rotation, order="C")  # writable, in C order: one version
     shift = other_from_one.translation
     compared, agreeing, total = _compare(
         pixels, depth, _numbers(camera), other, _numbers(other_camera), turn, shift

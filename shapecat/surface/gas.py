@@ -90,7 +90,7 @@ def _by_fritzke(points: F4, seed: int, neurons: int, signals: int, share: float)
     interval = int(_GROWTH * signals) // target
     _link_two_points(cloud, gas, state)
     count = grow_fritzke(cloud, state, gas, target, signals, max(interval, 1), _RATES)
-    adjacent = finish_graph(cloud, gas, int(count), share)  # int: not a version for 2 as well
+    adjacent = finish_graph(cloud, gas, int(count), share)  # int: else also for a literal 2
     return _in_metres(gas, adjacent.shape[0], frame), edge_list(adjacent)
 
 
@@ -112,7 +112,7 @@ def _by_thesis(points: F4, seed: int, neurons: int, share: float) -> tuple[F4, U
         _ERROR_LIMIT * each * square / 6, _DISTANCE_LIMIT * spacing,
         _RATES,
     )  # fmt: skip
-    adjacent = finish_graph(cloud, gas, int(count), share)  # int: not a version for 2 as well
+    adjacent = finish_graph(cloud, gas, int(count), share)  # int: else also for a literal 2
     return _in_metres(gas, adjacent.shape[0], frame), edge_list(adjacent)
 
 

@@ -60,7 +60,7 @@ def require_new(folder: Path) -> None:
     ------
     OutputError : the folder is not empty, has no name, or cannot be created.
     """
-    partial_path(folder)  # says if it has no name
+    partial_path(folder)  # raises if it has no name
     with explained(f"{folder}: cannot be written", OutputError):
         taken = folder.exists() and (not folder.is_dir() or any(folder.iterdir()))
         folder.parent.mkdir(parents=True, exist_ok=True)
