@@ -105,6 +105,16 @@ def test_error_shows_the_focal_length_that_is_wrong() -> None:
         camera_of_info(calibration(k=k), rectified=False)
 
 
+@pytest.mark.parametrize("place", [0, 2, 4, 5])
+def test_intrinsics_that_fit_no_camera_are_refused(place: int) -> None:
+    """A damaged calibration of the colour camera ended the run with a traceback."""
+    k = calibration().k.copy()
+    k[place] = 1e30
+
+    with pytest.raises(MessageError, match="fits no camera"):
+        camera_of_info(calibration(k=k), rectified=False)
+
+
 def test_region_of_interest_shifts_principal_point() -> None:
     """Cutting 80 columns and 30 rows moves it from (322.3, 243.9) to (242.3, 213.9)."""
     camera, _ = camera_of_info(calibration(roi=region(80, 30, 400, 300)), rectified=False)

@@ -31,6 +31,8 @@ _OFF_CENTER = 0.12
 images of 848 x 480 have 0.123."""
 _UNIT = 1
 """Focal length in a matrix that is the identity since the driver left it out."""
+_LARGEST_PX = 1e5
+"""Largest intrinsic parameter: a view of half a degree. Damaged calibrations exceed it."""
 _SAMPLES = 4096
 _FEWEST = 100
 _SPREAD = 0.1
@@ -162,7 +164,8 @@ def camera_of_info(info: Any, *, rectified: bool) -> tuple[Camera, bool]:
 
     Raises
     ------
-    MessageError : a focal length is at most one pixel, or a value is not finite.
+    MessageError : a focal length is at most one pixel or beyond any camera's, or a value is not
+        finite.
     """
     k, p, d = (_field(info, name) for name in "kpd")
     use_p = p.size == 12 and p[0] > _UNIT and (rectified or k.size < 9 or k[0] in {0, _UNIT})
@@ -176,6 +179,9 @@ def camera_of_info(info: Any, *, rectified: bool) -> tuple[Camera, bool]:
     values = (fx / bin_x, fy / bin_y, cx / bin_x, cy / bin_y)
     if not (np.isfinite(values).all() and fx > _UNIT and fy > _UNIT):
         msg = f"camera info without a calibration (focal length {min(fx, fy):g})"
+        raise MessageError(msg)
+    if np.abs(values).max() > _LARGEST_PX:
+        msg = f"camera info that fits no camera (fx {fx:g}, fy {fy:g}, cx {cx:g}, cy {cy:g})"
         raise MessageError(msg)
     camera = Camera(width // bin_x, height // bin_y, *(float(value) for value in values))
     return camera, bool(not (rectified or use_p) and np.any(d != 0))
