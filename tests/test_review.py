@@ -228,6 +228,31 @@ def test_same_run_gives_same_content(tmp_path: Path) -> None:
     assert compared.returncode == 0, compared.stderr
 
 
+def test_reviews_in_one_process_leave_no_threads(tmp_path: Path) -> None:
+    """Rerun kept four threads and 3 MB of each: a batch of thousands ran out of both."""
+    threads = []
+    for k in range(4):
+        write(tmp_path / f"{k}.rrd", [scene(0, [labelled_object(1)])], name=f"lab{k}")
+        threads.append(len(list(Path("/proc/self/task").iterdir())))
+
+    assert threads[3] == threads[1], threads
+
+
+def test_recording_of_the_calling_program_stays_active(tmp_path: Path) -> None:
+    """It was ended without a word, so that what the program logged later was lost."""
+    rr.init("program")
+    rr.save(tmp_path / "program.rrd")
+    try:
+        write(tmp_path / "review.rrd", [scene(0)])
+        rr.set_time("frame", sequence=0)
+        rr.log("later", rr.Scalars(1.0))
+    finally:
+        rr.disconnect()
+        rr.set_global_data_recording(None)
+
+    assert scalars(tmp_path / "program.rrd", "/later") == [[1.0]]
+
+
 def stores(path: Path, kind: str) -> list[tuple[str, str]]:
     """Return application and id of the recordings or blueprints in a file."""
     from rerun.chunk import RrdReader  # noqa: PLC0415  heavy

@@ -15,7 +15,7 @@ import rerun as rr
 
 from shapecat.system.files import replacing
 
-__all__ = ["ReviewFile", "open_review"]
+__all__ = ["ReviewFile", "forget_reviews", "open_review"]
 
 _BLOCK = 1 << 20
 _PATIENCE_S = 60.0
@@ -82,3 +82,14 @@ def open_review(path: Path, stream: rr.RecordingStream) -> Iterator[ReviewFile]:
         finally:
             review.close()
         review.check()
+
+
+def forget_reviews() -> None:
+    """End the threads of earlier reviews and free their memory, which Rerun keeps until then.
+
+    Active recordings of the program that calls shapecat stay active.
+    """
+    shared, own = rr.get_global_data_recording(), rr.get_thread_local_data_recording()
+    rr.init("shapecat", init_logging=False)  # makes no recording, and ends those without reference
+    rr.set_global_data_recording(shared)
+    rr.set_thread_local_data_recording(own)

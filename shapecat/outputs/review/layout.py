@@ -5,6 +5,7 @@ from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
+import rerun as rr
 import rerun.blueprint as rrb
 
 from shapecat.arrays import F8
@@ -12,7 +13,7 @@ from shapecat.geometry import IDENTITY, transform
 from shapecat.outputs.level_clouds import finite_points
 from shapecat.types import Frame, LabelledFrame, Pose
 
-__all__ = ["Eye", "TrackView", "choose_eye", "lay_out", "stepped_back"]
+__all__ = ["Eye", "TrackView", "choose_eye", "lay_out", "send_layout", "stepped_back"]
 
 _BACKGROUND = (16, 18, 23)
 _TIME = rrb.TimeAxis(link=rrb.components.LinkAxis.LinkToGlobal)  # all plots show the same times
@@ -36,6 +37,16 @@ class TrackView:
     entity: str
     title: str
     frames: int = 0
+
+
+class _Layout(rrb.Blueprint):  # type: ignore[misc]  # Rerun is untyped
+    """A blueprint that keeps the stream in which Rerun writes it down, to be closed afterwards."""
+
+    stream: rr.RecordingStream | None = None
+
+    def _log_to_stream(self, stream: rr.RecordingStream) -> None:
+        self.stream = stream
+        super()._log_to_stream(stream)
 
 
 def choose_eye(labelled: LabelledFrame, frame: Frame, *, fixed: bool) -> Eye:
@@ -98,7 +109,7 @@ def lay_out(
     scenes: Sequence[tuple[str, str, Eye]],
     tracks: Sequence[TrackView],
     images: Mapping[str, str] | None = None,
-) -> rrb.Blueprint:
+) -> _Layout:
     """Return the blueprint: 3D and colour views on the left; tracks, plots, texts on the right.
 
     Parameters
@@ -114,7 +125,7 @@ def lay_out(
             for entity, title in images.items()
         ]
         left = rrb.Vertical(left, _one_of(pictures), row_shares=[5, 4])
-    return rrb.Blueprint(
+    return _Layout(
         rrb.Horizontal(
             left,
             rrb.Vertical(
@@ -143,6 +154,13 @@ def lay_out(
         auto_views=False,
         auto_layout=False,
     )
+
+
+def send_layout(stream: rr.RecordingStream, layout: _Layout) -> None:
+    """Write a layout; then close its own stream, which would keep two threads for ever."""
+    stream.send_blueprint(layout)
+    if layout.stream is not None:
+        layout.stream.disconnect()
 
 
 def _one_of(views: Sequence[Any]) -> Any:

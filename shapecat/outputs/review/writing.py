@@ -48,9 +48,16 @@ from shapecat.geometry import IDENTITY, transform
 from shapecat.outputs.colours import colour_of
 from shapecat.outputs.review import shapes
 from shapecat.outputs.review.columns import At, Columns, curve
-from shapecat.outputs.review.file import open_review
+from shapecat.outputs.review.file import forget_reviews, open_review
 from shapecat.outputs.review.images import Images
-from shapecat.outputs.review.layout import Eye, TrackView, choose_eye, lay_out, stepped_back
+from shapecat.outputs.review.layout import (
+    Eye,
+    TrackView,
+    choose_eye,
+    lay_out,
+    send_layout,
+    stepped_back,
+)
 from shapecat.outputs.review.paths import Paths
 from shapecat.outputs.review.scenes import PaintedFrame, ReviewFrame, paint_frame
 from shapecat.outputs.review.shapes import SCENE, SKETCH, Drawing, DrawnScene
@@ -90,6 +97,7 @@ def write_review(
     The content depends only on the arguments. Memory does not grow with the number of frames,
     except for some numbers per track.
     """
+    forget_reviews()
     stream = _stream(name, run, labels)
     with open_review(path, stream) as file:
         stream.send_recording_name(name)
@@ -185,7 +193,7 @@ class _Review:
             if track.frames == 1:  # a line with one point is invisible
                 self._log(f"{track.entity}/posterior", dots, static=True)
         images = self._images.entities
-        self._stream.send_blueprint(lay_out(scenes or [nothing], tracks, images))
+        send_layout(self._stream, lay_out(scenes or [nothing], tracks, images))
 
     def _draw(self, entity: str, painted: PaintedFrame) -> None:
         """Write the sensor pose and the boxes, and the scene if it is drawn."""
