@@ -295,6 +295,15 @@ def test_moved_recording_may_be_in_home_folder(
     assert next(run.frames(recording="~/demo.mcap")).labelled.index == 0
 
 
+def test_model_may_be_in_home_folder(
+    page_folder: Path, monkeypatch: pytest.MonkeyPatch, tmp_path: Path
+) -> None:
+    monkeypatch.setenv("HOME", str(page_folder))
+
+    with pytest.raises(ModelError, match=str(page_folder / "none.npz")):
+        shapecat.process("~/demo.mcap", tmp_path, model="~/none.npz")
+
+
 def test_merged_tracks_are_described_as_one(guessed_run: Path, tmp_path: Path) -> None:
     """Its frames show one object, so that the description of the run counted one too many."""
     folder = tmp_path / "run"

@@ -248,6 +248,27 @@ def test_plan_describes_remaining_work() -> None:
     assert PROGRESS.describe_plan(tasks[:1], 0, 2, 3) == "1 recording: 1 already complete"
 
 
+def test_cores_are_shared_by_remaining_recordings(monkeypatch: pytest.MonkeyPatch) -> None:
+    """With one recording left of many, it had one core, and the others were idle."""
+    counted: list[tuple[int | None, int]] = []
+
+    def share(jobs: int | None, recordings: int) -> tuple[int, int]:
+        counted.append((jobs, recordings))
+        raise Stopped
+
+    monkeypatch.setattr("shapecat.executors.share_cores", share)
+    tasks = [task("a", "complete"), task("b", "retry"), task("c", "complete")]
+    display: Any = None
+    with pytest.raises(Stopped):
+        next(
+            PROCESS._process(
+                SimpleNamespace(tasks=tasks, manifest=None, skipped=0), display, 4, "local", None
+            )
+        )
+
+    assert counted == [(4, 1)]
+
+
 def test_category_counts_are_sorted_by_frequency() -> None:
     """Equal counts are in alphabetical order."""
     assert count_words({"can": 3, "plate": 12, "ball": 3}) == "plate 12, ball 3, can 3"

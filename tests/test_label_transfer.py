@@ -824,6 +824,8 @@ def test_by_place_transfers_labels_of_another_run(
     assert done.exit_code == 0, done.stderr
     assert "1 of 1 labels transferred" in done.stdout
     assert "teapot" in annotated_classes(two)
+    # Without it, corrected labels could not be transferred once more.
+    assert [item["label"] for item in read_run(two)["corrections"]["transferred"]] == ["teapot"]
 
 
 @pytest.mark.parametrize(("found", "place"), [("x,y,z", "u,v,w"), ("0.34,", ",")])

@@ -19,7 +19,13 @@ from shapecat.runs.folder import (
     writing_outputs,
 )
 from shapecat.runs.identity import content_digest, file_stats, new_id, same_content
-from shapecat.system.files import holding, partial_path, replacing, require_writable
+from shapecat.system.files import (
+    complete_folder,
+    holding,
+    partial_path,
+    replacing,
+    require_writable,
+)
 from tests.run_info import run_info
 
 
@@ -352,3 +358,15 @@ def test_failing_disk_is_an_error_but_a_disk_without_flush_is_not(
         hidden.write_text("all")
 
     assert (tmp_path / "f").exists() is not raised
+
+
+def test_remains_of_a_killed_process_are_no_part_of_a_folder(tmp_path: Path) -> None:
+    """A run that was killed while it wrote a segment could not be resumed."""
+    folder = tmp_path / "0001"
+    partial_path(folder).mkdir()
+    (partial_path(folder) / "half.parquet").touch()
+
+    with complete_folder(folder) as hidden:
+        (hidden / "frames.parquet").touch()
+
+    assert [path.name for path in folder.iterdir()] == ["frames.parquet"]

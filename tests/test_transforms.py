@@ -296,6 +296,15 @@ def stamped(parent: str, child: str, x: float, stamp: int) -> Any:
     return MessageFactory(2).transforms([(parent, child, pose)], stamp)
 
 
+def test_static_transforms_of_a_namespace_hold_at_all_times(tmp_path: Path) -> None:
+    """As moving ones, they would end when the next message is missing: no frame had a pose."""
+    items = [("/robot1/tf_static", EPOCH, stamped("base", "camera", 0.3, EPOCH))]
+    with open_recording(write(tmp_path / "a.mcap", items)) as recording:
+        buffer = read_transforms(recording)
+
+    assert buffer.lookup("base", "camera", EPOCH + 60 * SECOND).translation[0] == 0.3
+
+
 @pytest.mark.parametrize(
     ("moving", "near", "expected", "warned"),
     [
