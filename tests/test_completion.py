@@ -252,6 +252,18 @@ def test_box_of_object_at_rest_does_not_turn_with_the_noise_of_its_yaw() -> None
     assert_allclose(fused.axes, np.tile(fused.axes[0], (24, 1, 1)), atol=1e-12)
 
 
+def test_box_of_round_object_at_rest_does_not_turn() -> None:
+    """The yaw of a can is chance, and views that reuse a description repeat it."""
+    yaws = np.repeat(np.radians([10, 55, 85, 30, 60]), 6)
+    axes, sizes = np.stack([about_z(yaw) for yaw in yaws]), np.tile([0.08, 0.08, 0.1], (30, 1))
+    views = views_of(RNG.normal(0, 0.003, (30, 3)), axes, sizes)
+    views = views._replace(outlines=np.full((30, DIRECTIONS), 0.04))
+    fused = fused_in(views, np.ones(30), one_hot("can"), CATEGORIES)
+
+    assert_allclose(fused.axes, np.tile(fused.axes[0], (30, 1, 1)), atol=1e-12)
+    assert_allclose(fused.centers, np.tile(fused.centers[0], (30, 1)), atol=1e-12)
+
+
 @pytest.mark.parametrize("turn", [40, 90])
 def test_box_of_object_turned_in_place_turns_with_it(turn: float) -> None:
     """A person may turn a box to show another side; a mean of both yaws is neither."""

@@ -65,6 +65,7 @@ class FusedBox(NamedTuple):
     ----------
     place : (3,) metres, the box centre of the most central view.
     center, axes, size, std : (3,), (3, 3), (3,), (3,) the fused box, as in `BoxViews`.
+    round : whether the footprint is about a circle, whose yaw is chance.
     """
 
     place: F8
@@ -72,14 +73,17 @@ class FusedBox(NamedTuple):
     axes: F8
     size: F8
     std: F8
+    round: bool
 
     def in_views(self, centers: F8, axes: F8, sizes: F8) -> FusedBoxes:
         """Return the box in views (k,) of the object, given their boxes as in `BoxViews`.
 
         A view that shows the object elsewhere, or turned, keeps its own centre and yaw.
         """
-        elongation = float(_elongation(self.size[None])[0])
-        still = _near(centers, self.place) & ~_turned_from(self.axes, elongation, axes, sizes)
+        still = _near(centers, self.place)
+        if not self.round:
+            elongation = float(_elongation(self.size[None])[0])
+            still &= ~_turned_from(self.axes, elongation, axes, sizes)
         return FusedBoxes(
             np.where(still[:, None], self.center, centers),
             np.where(still[:, None, None], self.axes, _alike(axes, sizes, self.size)),
@@ -110,13 +114,15 @@ def fuse_boxes(views: BoxViews, weights: F8, posterior: F8, categories: Sequence
     positions = (selected.centers - origin) @ base
     height = float(_median(selected.sizes[:, 2:], selected_weights)[0])
     bottom = float(_median(positions[:, 2:] - selected.sizes[:, 2:] / 2, selected_weights)[0])
+    size = np.array([*plan.size, height])
     std = np.array([*plan.std, _median(selected.stds[:, 2:], selected_weights)[0]])
     return FusedBox(
         origin,
         origin + base @ (*plan.center, bottom + height / 2),
         base @ _about_z(plan.side * 2 * np.pi / DIRECTIONS),
-        np.array([*plan.size, height]),
+        size,
         std * np.sqrt(_COMMON + (1 - _COMMON) / len(selected_weights)),
+        plan.oval and abs(float(_elongation(size[None])[0])) < _ROUND,
     )
 
 

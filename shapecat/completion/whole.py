@@ -79,12 +79,14 @@ class Footprint(NamedTuple):
     center : (2,) metres, along the directions 0 and `QUARTER` of the outline.
     size, std : (2,) metres, length and width, and their standard deviations.
     side : index of the direction of the length.
+    oval : whether the footprint is an oval, not the visible outline.
     """
 
     center: F8
     size: F8
     std: F8
     side: int
+    oval: bool
 
 
 def complete(
@@ -166,6 +168,7 @@ def footprint(outline: F8, facing: F8, posterior: F8, categories: Sequence[str])
         np.maximum(size, _THINNEST_M),
         np.hypot(_NOISE_M, np.hypot(_GUESS * guessed, doubt)),
         side,
+        chosen is not outline,
     )
 
 
