@@ -546,9 +546,14 @@ def fail(*_: object, **__: object) -> None:
     raise OutputError(msg)
 
 
-def test_upload_removes_files_of_replaced_run(made: Path) -> None:
-    """Masks or a report of earlier settings would contradict the new tables."""
-    url, names = "memory://renewed/run", {path.name for path in made.iterdir()}
+@pytest.mark.parametrize("folder", ["memory://renewed", "file://{}/renewed"])
+def test_upload_removes_files_of_replaced_run(made: Path, tmp_path: Path, folder: str) -> None:
+    """Masks or a report of earlier settings would contradict the new tables.
+
+    On a disk, the folder that keeps the replaced tables meanwhile must be made first.
+    """
+    folder = folder.format(tmp_path)
+    url, names = f"{folder}/run", {path.name for path in made.iterdir()}
     assert "review.rrd" not in names
     for name in RUN_FILES:
         (Location(url) / name).write(b"{}")
@@ -556,7 +561,7 @@ def test_upload_removes_files_of_replaced_run(made: Path) -> None:
     with claimed(url, "one") as claim:
         upload(made, url, claim)
 
-    assert files("memory://renewed") == {f"run/{name}" for name in names}
+    assert files(folder) == {f"run/{name}" for name in names}
 
 
 def test_labels_that_were_not_transferred_stay_at_the_url(made: Path, tmp_path: Path) -> None:

@@ -216,7 +216,7 @@ class Location:
 
     def copy(self, other: "Location") -> None:
         """Copy a file within the storage."""
-        self._put("copied", lambda: self._system.cp_file(self._path, other._path))  # noqa: SLF001  of this class
+        other._put("written", lambda: self._system.cp_file(self._path, other._path))  # noqa: SLF001  of this class
 
     def remove(self) -> None:
         """Remove a file, if it exists."""
