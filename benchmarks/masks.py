@@ -54,7 +54,8 @@ class Judged(NamedTuple):
 def main(*, first: int, count: int) -> None:
     """Evaluate recordings and print a table."""
     judged = [item for number in range(count) for item in _judge(number, first + number)]
-    rows = [_row(sensor, [item for item in judged if item.sensor == sensor]) for sensor in SENSORS]
+    by_sensor = {name: [item for item in judged if item.sensor == name] for name in SENSORS}
+    rows = [_row(name, some) for name, some in by_sensor.items() if some]
     rows.append(_row("both", judged))
     print(markdown(f"Masks, seeds {first} to {first + count - 1}", COLUMNS, rows))
 
