@@ -138,8 +138,9 @@ def process(
     Each RECORDING is an MCAP file, a ROS 1 bag, a ROS 2 bag (file or folder), a folder with
     recordings, or a URL. The results of lab.mcap go to OUT/lab: tables, annotated.mcap for
     Foxglove, and review.rrd for Rerun. If recordings have the same name, the names of their
-    folders are prepended: OUT/monday_lab. For several recordings, OUT/manifest.jsonl records the
-    state of each. To resume after an interruption, run the same command again.
+    folders are prepended: OUT/monday_lab, and a number is appended if these are equal, too. For
+    several recordings, OUT/manifest.jsonl records the state of each. To resume after an
+    interruption, run the same command again.
 
     \b
     shapecat process lab.mcap kitchen.bag --out results
