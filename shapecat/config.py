@@ -30,8 +30,8 @@ class DetectionSettings:
     """Planes and object candidates (thesis ch. 4). Lengths in metres."""
 
     max_range_m: float = 3.0
-    """Points farther from the sensor than this are ignored (thesis 4.2); in a cloud, farther from
-    the origin of its frame."""
+    """Points at a larger depth than this, along the optical axis, are ignored (thesis 4.2). The
+    axis of an unorganized cloud points from the origin of its frame to its middle."""
     fuse_frames: int = 1
     """Number of consecutive depth images that are fused before detection, including the current one
     (thesis 4.2); 1 turns fusion off."""
@@ -94,8 +94,8 @@ class TrackingSettings:
     """Nearest-centroid tracker and fusion (thesis 7.5.2)."""
 
     association: Literal["hungarian", "greedy"] = "hungarian"
-    """Assignment of detections to tracks: `hungarian` minimises the total distance, `greedy`
-    takes the nearest pair first."""
+    """Assignment of detections to tracks: `hungarian` minimises the total cost (distance and
+    change of size and category), `greedy` takes the pair with the least cost first."""
     gate_m: float = 0.12
     """Largest distance between a track and the centroid of its next detection; smaller for
     small objects."""
