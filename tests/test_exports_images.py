@@ -9,6 +9,8 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+import pyarrow as pa
+import pyarrow.parquet as pq
 import pytest
 from click.testing import Result
 from PIL import Image, ImageDraw
@@ -354,6 +356,21 @@ def test_frames_are_selected_by_interval_and_by_track(run: Path, tmp_path: Path)
         if item.track == 2  # the only corrected one
     }
     assert image["frame"] == max(pixels, key=lambda frame: pixels[frame])
+
+
+def test_images_with_equal_stamps_are_all_exported(coloured_run: Path, tmp_path: Path) -> None:
+    """After a reset of a simulator, images repeat the stamps of earlier ones: half were lost."""
+    folder = tmp_path / "table"
+    shutil.copytree(coloured_run, folder)
+    masks = pq.read_table(folder / "masks.parquet")
+    at, half = masks.schema.get_field_index("color_stamp_ns"), masks.num_rows // 2
+    stamps = masks["color_stamp_ns"].to_pylist()[:half] * 2
+    masks = masks.set_column(at, masks.schema.field(at), pa.array(stamps, pa.int64()))
+    pq.write_table(masks, folder / "masks.parquet")
+
+    export_dataset([folder], "coco", tmp_path / "out", Selection())
+
+    assert [i["frame"] for i in read_coco(tmp_path / "out")["images"]] == list(range(2 * half))
 
 
 def test_no_frames_are_kept_for_views_that_are_not_labelled(

@@ -227,6 +227,20 @@ def test_image_has_masks_of_the_frame_nearest_in_time(monkeypatch: pytest.Monkey
     assert found == [(("/d", 2), 50), (("/d", 4), 150)]
 
 
+def test_successive_images_with_equal_stamps_are_all_annotated(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    """A clock that was set back by one period gives the next image the same stamp."""
+    masks = [
+        (("/d", k), ImageMasks("/l", 50, logged, "c", 40, 30, {}, {}))
+        for k, logged in enumerate([60, 60, 160])
+    ]
+    patch_masks(monkeypatch, masks, [50, 50, 50])
+
+    found = [(key, image.log_time_ns) for key, image in read_nearest_masks(Path())]
+    assert found == [(("/d", 0), 60), (("/d", 2), 160)]
+
+
 def test_simultaneous_images_of_two_cameras_are_annotated(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:

@@ -226,7 +226,7 @@ def _chosen(
     counts: Counter[str] = Counter()
     keys: list[tuple[str, int]] = []
     views: dict[int, list[tuple[int, Any]]] = {}
-    nearest: dict[tuple[str, int], tuple[int, int]] = {}
+    nearest: dict[tuple[str, int, int], tuple[int, int]] = {}
     left_out: set[int] = set()
     for labelled in finished.frames():
         number = counts[labelled.topic]
@@ -235,7 +235,8 @@ def _chosen(
             continue
         if (image := labelled.masks) is not None and not selection.depth:
             candidate = abs(labelled.stamp_ns - image.stamp_ns), len(keys)
-            place = (image.topic, image.stamp_ns)
+            # Stamps alone repeat after a clock was set back.
+            place = (image.topic, image.stamp_ns, image.log_time_ns)
             earlier = nearest.setdefault(place, candidate)
             nearest[place] = min(candidate, earlier)
             left_out |= {k for _, k in (candidate, earlier)} - {nearest[place][1]}

@@ -65,13 +65,18 @@ def read_nearest_masks(folder: Path) -> Iterator[tuple[Key, ImageMasks]]:
     for key, masks in read_masks(folder, boxes_only=True):
         stamp = next(stamp for candidate, stamp in stamps if candidate == key)
         apart, before = abs(stamp - masks.stamp_ns), best.get(masks.topic)
-        if before is not None and before[2].stamp_ns != masks.stamp_ns:
+        if before is not None and _times_ns(before[2]) != _times_ns(masks):
             yield before[1:]
             before = None
         if before is None or apart < before[0]:
             best[masks.topic] = apart, key, masks
     for _, key, masks in best.values():
         yield key, masks
+
+
+def _times_ns(masks: ImageMasks) -> tuple[int, int]:
+    """Return stamp and log time of an image; stamps alone repeat after a clock was set back."""
+    return masks.stamp_ns, masks.log_time_ns
 
 
 def _run_lengths(column: pa.ChunkedArray) -> Iterator[U4]:
