@@ -252,6 +252,8 @@ DEPTH = Camera(64, 48, 60.0, 61.0, 31.2, 23.7)
     [
         # One frame: nearly the same calibration is the same camera.
         (Camera(64, 48, 60.6, 61.0, 31.2, 23.7), "camera", True),
+        (Camera(64, 48, 60.6, 61.0, 31.2, 23.7), "/camera", True),  # as of ROS 1
+        (WIDE, "/camera", False),
         (Camera(64, 48, 60.0, 61.0, 31.2, 24.4), "camera", False),
         # Another frame without a transform: only equal numbers are the same camera.
         (DEPTH, "color", True),
@@ -264,7 +266,8 @@ def test_colour_is_registered_only_if_cameras_are_equal(
     """``registered`` is None if there is no colour at all."""
     items = depth_items(EPOCH)
     items.append(("/cam/color/camera_info", EPOCH, info(EPOCH, camera)))
-    items.append(("/cam/color/image_raw", EPOCH + 1, raw(EPOCH, gradient(), "rgb8", frame_id)))
+    colours = gradient(camera.height, camera.width)
+    items.append(("/cam/color/image_raw", EPOCH + 1, raw(EPOCH, colours, "rgb8", frame_id)))
     ((_, view),), _ = read(record(tmp_path / "a.mcap", in_order(items)))
 
     assert (None if view is None else view.registered) == registered

@@ -14,7 +14,7 @@ from shapecat.recordings.decoding.foxglove import ros_counterpart
 from shapecat.recordings.messages import Topic
 from shapecat.recordings.pinhole import is_rectified
 from shapecat.recordings.recording import Recording
-from shapecat.recordings.sensors import by_sensor
+from shapecat.recordings.sensors import by_sensor, same_frame
 from shapecat.recordings.streams import (
     CLOUD,
     COMPRESSED,
@@ -151,7 +151,7 @@ def _warn_about_unread(recording: Recording) -> None:
 
 def _belongs(one: ColourStream, stream: Stream, sensors: Sequence[Sequence[Stream]]) -> bool:
     """Return whether images are those of a depth stream's sensor, see `choose_colour`."""
-    if one.frame_id == stream.frame_id:
+    if same_frame(one.frame_id, stream.frame_id):
         return True
     other_streams = (other for sensor in sensors if stream not in sensor for other in sensor)
     shared = [_shared(one, other) for other in other_streams if other.kind == stream.kind]
@@ -173,7 +173,7 @@ def _select(
 
 def _rank(one: ColourStream, stream: Stream) -> tuple[bool, int, bool, bool, int, bool, str]:
     return (
-        not (one.frame_id and one.frame_id == stream.frame_id),
+        not (one.frame_id and same_frame(one.frame_id, stream.frame_id)),
         -_shared(one, stream),
         not any(word in one.topic.lower() for word in _COLOUR_WORDS),
         not is_rectified(one.topic),

@@ -6,7 +6,7 @@ from dataclasses import dataclass
 from itertools import permutations
 from typing import Literal, NamedTuple
 
-__all__ = ["Stream", "by_sensor"]
+__all__ = ["Stream", "by_sensor", "same_frame"]
 
 _KINDS = ("depth", "points", "cloud", "image", "aligned")
 """The first part of a topic with one of these words ends the namespace of the sensor."""
@@ -48,6 +48,11 @@ class _Place(NamedTuple):
     camera: frozenset[str]
 
 
+def same_frame(a: str, b: str) -> bool:
+    """Return whether two frame ids name the same frame; ROS 1 may put a slash before either."""
+    return a.lstrip("/") == b.lstrip("/")
+
+
 def by_sensor(streams: Sequence[Stream]) -> list[list[Stream]]:
     """Group streams by sensor.
 
@@ -65,7 +70,7 @@ def by_sensor(streams: Sequence[Stream]) -> list[list[Stream]]:
 
     def are_same(a: Stream, b: Stream) -> bool:
         first, second = places[a.topic], places[b.topic]
-        one_frame = a.frame_id != "" and a.frame_id == b.frame_id
+        one_frame = a.frame_id != "" and same_frame(a.frame_id, b.frame_id)
         return _share_namespace(first, second) or (
             one_frame and (first.space, second.space) not in twins
         )

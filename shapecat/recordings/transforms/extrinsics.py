@@ -11,6 +11,7 @@ from shapecat.geometry import IDENTITY, compose, inverse, rotation_from_quaterni
 from shapecat.recordings.colour_streams import ColourStream
 from shapecat.recordings.messages import MALFORMED
 from shapecat.recordings.recording import Recording
+from shapecat.recordings.sensors import same_frame
 from shapecat.recordings.streams import Stream, first_message
 from shapecat.recordings.transforms.buffer import (
     ExtrapolationError,
@@ -59,7 +60,7 @@ class Extrinsics:
             the recording.
         """
         recorder = self._depth.topic.startswith("/device_")  # whose frame ids are numbers
-        if depth_frame == colour_frame and not recorder:
+        if same_frame(depth_frame, colour_frame) and not recorder:
             return IDENTITY if depth_frame else self._realsense  # two cameras may have no name
         frames = depth_frame, colour_frame
         if frames in self._static:

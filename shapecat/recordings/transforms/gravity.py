@@ -10,6 +10,7 @@ from shapecat.arrays import F4, F8
 from shapecat.errors import ConfigError
 from shapecat.geometry import LINK_FROM_OPTICAL, compose, unit_direction
 from shapecat.recordings.recording import Recording
+from shapecat.recordings.sensors import same_frame
 from shapecat.recordings.streams import Stream
 from shapecat.recordings.transforms.buffer import TransformError, fixed_frame
 from shapecat.recordings.transforms.imu import Accelerometers
@@ -229,7 +230,8 @@ class Upright:
         for sensor in self.accelerometers.around(frame.log_time_ns, frame.stamp_ns):
             up = sensor.up(frame.stamp_ns)
             pose = None
-            if sensor.frame_id != frame.frame_id or frame.frame_from_sensor is not None:
+            own_frame = same_frame(sensor.frame_id, frame.frame_id)
+            if not own_frame or frame.frame_from_sensor is not None:
                 pose = self._lookup(sensor.frame_id, frame)
                 up = None if pose is None or up is None else up @ pose.rotation
             if up is not None:
