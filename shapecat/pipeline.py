@@ -11,7 +11,7 @@ from collections.abc import Callable
 from pathlib import Path
 
 from shapecat.description import DESCRIPTOR_NAMES
-from shapecat.errors import NoStreamError, OutputError
+from shapecat.errors import NoStreamError, OutputError, RecordingError
 from shapecat.learning import load_model
 from shapecat.recordings import Recording, choose_streams, open_recording
 from shapecat.recordings.colour_streams import pair_colours
@@ -36,7 +36,6 @@ from shapecat.runs.jobs import (
     identify,
     require_model,
     require_unchanged,
-    require_utf8,
     summarize,
 )
 from shapecat.runs.labels.corrections import adopt_labels, read_labels
@@ -50,7 +49,7 @@ from shapecat.runs.perceive.pose_jumps import explain_jumps
 from shapecat.runs.perceive.resuming import has_work, resume, take_over_frames
 from shapecat.runs.run_info import RunInfo
 from shapecat.runs.tables.segments import discard_segments
-from shapecat.system.files import holding
+from shapecat.system.files import holding, require_utf8
 from shapecat.system.memory import release_memory
 from shapecat.system.progress import Observer, ignore, observed
 
@@ -78,7 +77,8 @@ def process(job: Job, observe: Observer = ignore, *, cores: int = 1) -> Summary:
     Stopped : a signal asked the process to stop; frames in progress are finished and kept.
     """
     begun = time.perf_counter()
-    require_utf8(job)
+    require_utf8(job.source, RecordingError)
+    require_utf8(job.folder)
     with open_recording(job.source) as recording, ContentDigest(job.source) as content:
         categorizer = load_model(job.model)
         categorizer.require_descriptor(DESCRIPTOR_NAMES)

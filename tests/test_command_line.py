@@ -721,3 +721,38 @@ def test_scene_of_damaged_table_is_refused(
 
     assert done.exit_code != 0
     assert "has objects on nothing; process the recording again" in " ".join(done.stderr.split())
+
+
+@pytest.mark.parametrize(
+    "words",
+    [
+        ("report", "bad"),
+        ("export", "bad", "--format", "crops", "--out", "good/crops"),
+        ("annotate", "bad"),
+        ("annotate", "good", "--recording", "bad.mcap"),
+        ("compare", "good", "bad"),
+        ("compare", "good", "good", "--out", "bad"),
+        ("scene", "bad", "--frame", "0"),
+        ("view", "bad", "--screenshot", "good.png"),
+        ("view", "good", "--screenshot", "bad.png"),
+    ],
+    ids=" ".join,
+)
+def test_path_that_is_not_utf8_is_refused_in_one_line(
+    shapecat: Run, guessed_run: Path, tmp_path: Path, words: tuple[str, ...]
+) -> None:
+    """Arrow and Rerun cannot open it, and end with a traceback."""
+    strange = tmp_path / os.fsdecode(b"k\xfcche")
+    for parent in (tmp_path, strange):
+        shutil.copytree(guessed_run, parent / "run")
+        (parent / "run" / "review.rrd").touch()
+    shutil.copy(read_run(guessed_run)["input"]["path"], strange / "r.mcap")
+    places = {"good": tmp_path / "run", "bad": strange / "run", "bad.mcap": strange / "r.mcap"}
+    places |= {"good.png": tmp_path / "x.png", "bad.png": strange / "x.png"}
+
+    done = shapecat(*(places.get(word, word) for word in words))
+
+    assert done.exit_code == (3 if "bad.mcap" in words else 1)
+    assert "k\ufffdche/" in done.stderr
+    assert done.stderr.endswith(": the path is not valid UTF-8; rename it\n")
+    assert done.stderr.count("\n") == 1

@@ -13,6 +13,7 @@ from shapecat.runs.labelled_frames import read_labelled_frames
 from shapecat.runs.labels.corrections import read_labels
 from shapecat.runs.labels.meaning import TrackLabel
 from shapecat.runs.run_info import RunInfo
+from shapecat.system.files import require_utf8
 from shapecat.types import LabelledFrame
 
 __all__ = ["FinishedRun", "find_runs", "open_source", "read_finished", "require_recordings"]
@@ -120,7 +121,7 @@ def open_source(
 
     Raises
     ------
-    RecordingError : the recording is missing or unreadable.
+    RecordingError : the recording is missing or unreadable, or its path is not valid UTF-8.
     OutputError : the content of the recording has changed since it was processed.
     """
     path = moved_to or Path(run["input"]["path"])
@@ -129,6 +130,7 @@ def open_source(
         state = "is at a URL; download it and" if "://" in named else "is missing; if it was moved,"
         msg = f"{named}: the recording {state} {advice}"
         raise RecordingError(msg)
+    require_utf8(path, RecordingError)
     with open_recording(path) as recording:
         if not same_content(run["input"], path, lambda: content_digest(path)):
             msg = f"{path}: has changed since it was processed; process it again"

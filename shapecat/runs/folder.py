@@ -14,7 +14,7 @@ from typing import Any, Literal, cast
 
 from shapecat.errors import OutputError, explained
 from shapecat.runs.run_info import RunInfo, wrong_entry
-from shapecat.system.files import flush, holding, lock, partial_path, replacing
+from shapecat.system.files import flush, holding, lock, partial_path, replacing, require_utf8
 
 __all__ = [
     "OUTPUTS",
@@ -281,8 +281,10 @@ def read_run(folder: Path) -> RunInfo:
 
     Raises
     ------
-    OutputError : the folder has no run.json, or one with missing or wrong entries.
+    OutputError : the folder has no run.json, or one with missing or wrong entries, or its path is
+        not valid UTF-8.
     """
+    require_utf8(folder)
     try:
         content = (folder / "run.json").read_bytes()
     except OSError as error:

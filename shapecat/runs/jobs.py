@@ -31,7 +31,6 @@ __all__ = [
     "identify",
     "require_model",
     "require_unchanged",
-    "require_utf8",
     "summarize",
 ]
 
@@ -220,21 +219,6 @@ def require_unchanged(folder: Path, run: RunInfo, source: Path) -> None:
         clear(folder)
         msg = f"{source}: changed while it was processed; run the same command again"
         raise RecordingError(msg)
-
-
-def require_utf8(job: Job) -> None:
-    """Check that Arrow and Rerun can write the names of the recording and of its run folder.
-
-    Raises
-    ------
-    RecordingError : they are not valid UTF-8.
-    """
-    try:
-        f"{job.source}{job.folder}".encode()
-    except UnicodeEncodeError as error:
-        printable = job.name.encode(errors="surrogateescape").decode(errors="replace")
-        msg = f"{printable}: the name is not valid UTF-8; rename it"
-        raise RecordingError(msg) from error
 
 
 def summarize(job: Job, run: RunInfo, *, processed: bool = True) -> Summary:

@@ -17,7 +17,7 @@ from contextlib import contextmanager, suppress
 from pathlib import Path
 from tempfile import TemporaryDirectory, gettempdir
 
-from shapecat.errors import OutputError, explained
+from shapecat.errors import OutputError, ShapecatError, explained
 
 __all__ = [
     "FSYNC",
@@ -27,6 +27,7 @@ __all__ = [
     "lock",
     "partial_path",
     "replacing",
+    "require_utf8",
     "require_writable",
     "scratch_folder",
 ]
@@ -86,6 +87,22 @@ def require_writable(path: Path) -> None:
     if path.is_dir():
         msg = f"{path}: cannot be written: is a folder"
         raise OutputError(msg)
+
+
+def require_utf8(path: Path, kind: type[ShapecatError] = OutputError) -> None:
+    """Check that Arrow and Rerun can open a path, which they need as UTF-8.
+
+    Raises
+    ------
+    ShapecatError : it is not valid UTF-8; of the given kind.
+    """
+    absolute = path.absolute()
+    try:
+        str(absolute).encode()
+    except UnicodeEncodeError as error:
+        printable = os.fsencode(absolute).decode(errors="replace")
+        msg = f"{printable}: the path is not valid UTF-8; rename it"
+        raise kind(msg) from error
 
 
 @contextmanager

@@ -18,7 +18,7 @@ from shapecat.outputs.counts import plural
 from shapecat.outputs.wording import confidence_text
 from shapecat.runs.tables.schemas import FRAME_COLUMNS
 from shapecat.runs.tables.writing import write_table
-from shapecat.system.files import complete_folder, partial_path
+from shapecat.system.files import complete_folder, partial_path, require_utf8
 from shapecat.types import UNKNOWN
 
 __all__ = [
@@ -58,9 +58,10 @@ def require_new(folder: Path) -> None:
 
     Raises
     ------
-    OutputError : the folder is not empty, has no name, or cannot be created.
+    OutputError : the folder is not empty, has no name that Arrow can write, or cannot be created.
     """
     partial_path(folder)  # raises if it has no name
+    require_utf8(folder)
     with explained(f"{folder}: cannot be written", OutputError):
         taken = folder.exists() and (not folder.is_dir() or any(folder.iterdir()))
         folder.parent.mkdir(parents=True, exist_ok=True)

@@ -18,6 +18,7 @@ from urllib.parse import quote
 import numpy as np
 
 from shapecat.errors import OutputError
+from shapecat.system.files import require_utf8
 
 __all__ = ["open_viewer", "serve_viewer", "take_screenshot"]
 
@@ -102,6 +103,7 @@ def take_screenshot(
     from rerun.experimental import ViewerClient  # noqa: PLC0415  only a screenshot needs it
 
     _require_file(path)
+    require_utf8(png)
     port = _free_port()
     options = ("--port", str(port), "--hide-welcome-screen")
     window = ("--headless", "--window-size", f"{size[0]}x{size[1]}")
@@ -144,6 +146,7 @@ def _last_stamp(client: Any) -> int | None:
 
 
 def _require_file(path: Path) -> None:
+    require_utf8(path)
     if not path.is_file():
         msg = f"{path}: no review there; process the recording without --no-rrd"
         raise OutputError(msg)
