@@ -69,8 +69,9 @@ def progress_bars() -> Iterator[Bars]:
 
 
 def print_json(value: Any) -> None:
-    """Print one JSON value."""
-    click.echo(json.dumps(value, indent=1, ensure_ascii=False))
+    """Print one JSON value; stdout would escape in its own way what is not in its encoding."""
+    as_it_is = sys.stdout.encoding.lower() == "utf-8"
+    click.echo(json.dumps(value, indent=1, ensure_ascii=not as_it_is))
 
 
 def print_table(columns: Sequence[str], rows: Sequence[Sequence[Any]]) -> None:

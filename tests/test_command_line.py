@@ -1,5 +1,6 @@
 """Tests of the command line: invalid input is refused before work begins, and nothing is lost."""
 
+import io
 import json
 import logging
 import os
@@ -24,7 +25,7 @@ from click.testing import Result
 from shapecat.api import open_recording
 from shapecat.errors import RecordingError
 from shapecat.runs.folder import read_run
-from shapecat.system.standard_streams import forgive_stderr
+from shapecat.system.standard_streams import forgive_stderr, require_stdout
 from tests.processes import descendants, wait_for
 from tests.scenes import record
 
@@ -692,6 +693,25 @@ def main(**_):
 entry.import_module = lambda _: types.SimpleNamespace(main=main)
 entry.run()
 """
+
+
+def test_names_that_the_terminal_cannot_show_are_escaped(
+    monkeypatch: pytest.MonkeyPatch, recording: Path, tmp_path: Path
+) -> None:
+    """A name in another script must not end a command, nor make its JSON invalid."""
+    path = shutil.copy(recording, tmp_path / "é机.mcap")
+    printed = []
+    for words in (["info", str(path)], ["info", str(path), "--json"]):
+        output = io.BytesIO()
+        monkeypatch.setattr(sys, "stdout", io.TextIOWrapper(output, "latin-1"))
+        require_stdout()
+        with pytest.raises(SystemExit):
+            import_module("shapecat.cli.main").main(words, prog_name="shapecat")
+        printed.append(output.getvalue().decode("latin-1"))
+
+    assert "é\\u673a.mcap" in printed[0]
+    assert Path(json.loads(printed[1].encode())[0]["path"]) == path
+    assert printed[1].isascii()
 
 
 @needs_full_device

@@ -32,11 +32,14 @@ def require_stdout() -> None:
     """Make stdout the null device if it was closed before the start, as a daemon's may be.
 
     Otherwise the next file that is opened would get its number, also in worker processes.
+    Characters that a terminal cannot show are escaped, as in names of another script.
     """
     if sys.stdout is None:
         os.dup2(os.open(os.devnull, os.O_WRONLY), 1)
         os.set_inheritable(1, True)  # noqa: FBT003  it has no name
         sys.stdout = os.fdopen(1, "w", encoding="utf-8", closefd=False)
+    if sys.stdout.errors == "strict" and isinstance(sys.stdout, io.TextIOWrapper):
+        sys.stdout.reconfigure(errors="backslashreplace")
 
 
 def forgive_stderr() -> None:
