@@ -73,13 +73,15 @@ class SurfaceSettings:
 
     def __post_init__(self) -> None:
         """Reject numbers and lengths that are out of range."""
+        # With coarser surfaces, most objects would be unknown.
+        # Coarser surfaces make most objects unknown.
         # When distances are compared, the index of a neuron replaces their 10 lowest bits.
-        _check_range("surface.neurons", self.neurons, 3, 512)
-        _check_least("surface.signals", self.signals, 1)
+        _check_range("surface.neurons", self.neurons, 20, 512)
+        _check_least("surface.signals", self.signals, 100)
         _check_range("surface.component_share", self.component_share, 0.0, 1.0)
-        _check_range("surface.voxel_m", self.voxel_m, 0.0001, 1.0)
+        _check_range("surface.voxel_m", self.voxel_m, 0.0001, 0.02)
         if self.smooth_radius_m != 0:
-            _check_range("surface.smooth_radius_m, if not 0,", self.smooth_radius_m, 0.0001, 1.0)
+            _check_range("surface.smooth_radius_m, if not 0,", self.smooth_radius_m, 0.0001, 0.1)
             # A fit needs neighbours, which are about one voxel apart.
             if self.smooth_radius_m / self.voxel_m < 1.5 - 1e-9:
                 msg = (
