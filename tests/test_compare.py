@@ -1212,6 +1212,24 @@ def test_images_of_other_recordings_are_left_out(run: Path) -> None:
     assert {row.true_category for row in renamed.rows} == {None, "last"}
 
 
+def test_recordings_of_runs_with_equal_names_are_told_apart(run: Path) -> None:
+    """Two batches may each have a run ``lab``; frames of the other one are no frames of this."""
+    head = {"recording": "lab", "topic": "/d", "frame": 0, "width": 10, "height": 10}
+    content = {
+        "categories": [],
+        "images": [
+            {**head, "id": k, "stamp_ns": START, "digest": digest}
+            for k, digest in enumerate(("two", "one"))
+        ],
+        "annotations": [],
+    }
+    (run.parent / "coco.json").write_text(json.dumps(content))
+
+    frames = compare(run, run.parent / "coco.json").figures["frames"]
+
+    assert (frames["compared"], frames["only_in_reference"]) == (1, 0)
+
+
 def test_labels_of_single_topic_fit_a_renamed_topic(tmp_path: Path) -> None:
     """An equal stamp is enough, an equal frame number is not."""
     (tmp_path / "label_2").mkdir()

@@ -418,8 +418,9 @@ def dataset_image() -> DatasetImage:
     return DatasetImage("a.jpg", b"jpeg", 40, 20, view, (first, uncertain), masks, (True, False))
 
 
-def finished() -> Any:
-    return SimpleNamespace(folder=Path("runs/lab"), name="lab")
+def finished(path: str = "runs/lab", digest: str = "l") -> Any:
+    run = {"input": {"digest": digest}}
+    return SimpleNamespace(folder=Path(path), name=Path(path).name, run=run)
 
 
 def test_coco_entries_have_right_values(tmp_path: Path) -> None:
@@ -444,7 +445,7 @@ def test_coco_entries_have_right_values(tmp_path: Path) -> None:
 
 def test_tracks_of_runs_with_equal_names_have_different_ids(tmp_path: Path) -> None:
     """Two batches may each have a run ``lab``; their tracks 4 must not be one object."""
-    runs = [SimpleNamespace(folder=Path(day, "lab"), name="lab") for day in ("monday", "tuesday")]
+    runs = [finished("monday/lab"), finished("tuesday/lab")]
     images: Any = [("train", run, dataset_image()) for run in runs]
     write_coco(tmp_path, images, ("cup", "can", "bowl"))
     data = json.loads((tmp_path / "annotations" / "instances_train.json").read_text())
@@ -484,7 +485,7 @@ def test_data_set_files_have_frames_runs_and_categories(tmp_path: Path) -> None:
     """
     view = replace(labelled(cut=False, hidden=False), topic="/left", index=17, stamp_ns=12_345)
     second = replace(dataset_image(), name="b.jpg", labelled=view)
-    other = SimpleNamespace(folder=Path("runs/hall"), name="hall")
+    other = finished("runs/hall", "h")
     images: Any = [
         ("train", finished(), dataset_image()), ("train", other, second), ("val", other, second)
     ]  # fmt: skip
@@ -497,11 +498,11 @@ def test_data_set_files_have_frames_runs_and_categories(tmp_path: Path) -> None:
     )
 
     size = {"width": 40, "height": 20}
-    b = {"file_name": "b.jpg", **size, "recording": "hall", "topic": "/left", "frame": 17,
-         "stamp_ns": 12_345}  # fmt: skip
+    b = {"file_name": "b.jpg", **size, "recording": "hall", "digest": "h", "topic": "/left",
+         "frame": 17, "stamp_ns": 12_345}  # fmt: skip
     assert train["images"] == [
-        {"id": 1, "file_name": "a.jpg", **size, "recording": "lab", "topic": "/depth", "frame": 0,
-         "stamp_ns": 5},
+        {"id": 1, "file_name": "a.jpg", **size, "recording": "lab", "digest": "l",
+         "topic": "/depth", "frame": 0, "stamp_ns": 5},
         {"id": 2, **b},
     ]  # fmt: skip
     assert val["images"] == [{"id": 1, **b}]

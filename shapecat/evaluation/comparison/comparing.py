@@ -115,7 +115,8 @@ def compare(
     RecordingError : the reference cannot be read, or has no frame in common with the run.
     """
     finished = read_complete(folder)
-    other = open_reference(reference, finished.categories, finished.name)
+    digest = finished.run["input"]["digest"]
+    other = open_reference(reference, finished.categories, finished.name, digest)
     if isinstance(other, OtherRun):
         _require_same_recording(finished, other)
     tally, repeated = _Tally(), repeated_stamps(folder)

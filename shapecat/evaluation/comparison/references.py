@@ -39,7 +39,9 @@ __all__ = [
 ]
 
 
-def open_reference(path: Path, categories: Sequence[str] = (), run: str = "") -> Reference:
+def open_reference(
+    path: Path, categories: Sequence[str] = (), run: str = "", digest: str = ""
+) -> Reference:
     """Open a reference.
 
     Parameters
@@ -47,7 +49,8 @@ def open_reference(path: Path, categories: Sequence[str] = (), run: str = "") ->
     path : a run folder; a KITTI folder, which has a folder ``label_2``; a JSON file of `shapecat
         simulate` or COCO; or a simulated recording with its ground truth beside it.
     categories : those of the run to compare; they show which ``_`` in a KITTI type are spaces.
-    run : name of the run to compare; it shows which images of several recordings are used.
+    run, digest : name of the run to compare, and digest of its recording; they show which images of
+        several recordings are used.
 
     Raises
     ------
@@ -70,7 +73,7 @@ def open_reference(path: Path, categories: Sequence[str] = (), run: str = "") ->
         content = json.loads(path.read_text("utf-8"))
         if isinstance(content, list):
             return SimulatedTruth(path, content)
-        return CocoLabels(path, content, run)
+        return CocoLabels(path, content, run, digest)
     except (OSError, ValueError, KeyError, TypeError, AttributeError) as error:
         reason = f"it lacks {error}" if isinstance(error, KeyError) else error
         msg = f"{path}: neither ground truth of `shapecat simulate` nor COCO labels ({reason})"

@@ -42,18 +42,23 @@ class CocoLabels(Reference):
     An image names its frame by ``stamp_ns`` (with ``frame`` where stamps repeat), by ``frame``, or
     by a number in its ``file_name``: a timestamp in nanoseconds, else the last number, which is
     the frame number. An image without ``topic`` matches any topic. If several recordings are named
-    by ``recording``, the images of the one with the name of the ``run`` are used.
+    by ``recording``, the images of the one with the name of the ``run`` are used; of those with
+    equal names, the one with the ``digest`` of its recording.
     """
 
     kind = "COCO labels"
 
-    def __init__(self, path: Path, content: Mapping[str, Any], run: str = "") -> None:
+    def __init__(
+        self, path: Path, content: Mapping[str, Any], run: str = "", digest: str = ""
+    ) -> None:
         self._path = path
         names = {item["id"]: str(item["name"]) for item in content["categories"]}
         self._labels = defaultdict(list)
         for item in content["annotations"]:
             self._labels[item["image_id"]].append({**item, "name": names[item["category_id"]]})
         images = _images_of(run, path, content["images"])
+        same = [image for image in images if image.get("digest") == digest]
+        images = same or images
         sized = (_Image(image["id"], int(image["height"]), int(image["width"])) for image in images)
         self._images = index_frames(path, zip(map(_place_of, images), sized, strict=True))
         self.frames = len(images)
