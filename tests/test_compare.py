@@ -634,14 +634,19 @@ def test_damaged_label_images_are_reported_in_one_line(tmp_path: Path, place: in
 
 @pytest.mark.parametrize(("side", "depth"), [(30, True), (5, True), (5, False)])
 def test_labels_of_images_with_another_size_are_refused(side: int, depth: bool) -> None:
-    """A colour image has other pixels than the depth image: its labels would match nothing."""
+    """A colour image has other pixels than the depth image: its labels would match nothing.
+
+    Truth of another simulated recording has another size, too, and no export changes that.
+    """
     camera = Camera(SIDE, SIDE, 20, 20, 5, 5)
     frame = Frame("/d", 0, START, START, "cam", np.ones((SIDE, SIDE), np.float32), camera)
     found = Labelling((LabelledItem(1, "cup", np.array(CUP)),))
     true = Labelling((LabelledItem(2, "cup", np.arange(side)),), None, (side, side))
     frames = iter([frame] if depth else [])
 
-    with pytest.raises(RecordingError, match=rf"{side} x {side} pixels.*--depth"):
+    with pytest.raises(
+        RecordingError, match=rf"{side} x {side} pixels.*another recording.*--depth"
+    ):
         _compare_frame(_Tally(), ("/d", 0), {"stamp_ns": START}, found, true, frames, 0)
 
 

@@ -241,7 +241,8 @@ def _require_same_size(found: Labelling, true: Labelling, frame: Frame | None, k
         return
     msg = (
         f"frame {key[1]} of {key[0]}: the labels are of an image of {width} x {height} pixels, but "
-        f"{other}; export labels of depth images (--format coco --depth)"
+        f"{other}: is it of another recording? COCO labels must be of its depth images (--format "
+        "coco --depth)"
     )
     raise RecordingError(msg)
 
