@@ -657,6 +657,7 @@ def test_unreadable_table_is_named(tmp_path: Path, content: bytes | None) -> Non
     if content is not None:
         path.write_bytes(content)
 
-    with pytest.raises(OutputError) as error:
-        Table(path).arrow("track")
-    assert str(error.value).startswith(f"{path}: not a readable table of a run (")
+    for read in (lambda: Table(path).arrow("track"), lambda: Table(path).columns):
+        with pytest.raises(OutputError) as error:
+            read()
+        assert str(error.value).startswith(f"{path}: not a readable table of a run (")

@@ -2,6 +2,7 @@
 
 import os
 from collections.abc import Iterable, Iterator, Mapping
+from contextlib import contextmanager
 from dataclasses import dataclass, field
 from functools import cached_property
 from itertools import pairwise
@@ -39,8 +40,14 @@ class Table:
 
     @property
     def columns(self) -> tuple[str, ...]:
-        """Names of the columns."""
-        return tuple(pq.read_schema(self.path).names)
+        """Names of the columns.
+
+        Raises
+        ------
+        OutputError : the table is unreadable.
+        """
+        with self._reading():
+            return tuple(pq.read_schema(self.path).names)
 
     def arrow(self, columns: str | Iterable[str] | None = None) -> pa.Table:
         """Read the table, or some columns, as an Arrow table; a name alone is one column.
@@ -49,16 +56,19 @@ class Table:
         ------
         OutputError : the table is unreadable, or has no such column.
         """
+        available = self.columns
+        wanted = available if columns is None else columns
+        names = [wanted] if isinstance(wanted, str) else list(wanted)
+        if missing := [name for name in names if name not in available]:
+            msg = f"{self.path}: no column {missing[0]}; known: {', '.join(available)}"
+            raise OutputError(msg)
+        with self._reading(), pq.ParquetFile(self.path) as file:
+            return with_fixed_lists(file.read(columns=names))
+
+    @contextmanager
+    def _reading(self) -> Iterator[None]:
         try:
-            available = self.columns
-            wanted = available if columns is None else columns
-            names = [wanted] if isinstance(wanted, str) else list(wanted)
-            if missing := [name for name in names if name not in available]:
-                msg = f"{self.path}: no column {missing[0]}; known: {', '.join(available)}"
-                raise OutputError(msg)
-            with pq.ParquetFile(self.path) as file:
-                table = file.read(columns=names)
-            return with_fixed_lists(table)
+            yield
         except (OSError, pa.ArrowException) as error:
             msg = f"{self.path}: not a readable table of a run ({error})"
             raise OutputError(msg) from error
