@@ -228,6 +228,14 @@ def test_perceive_uses_categories_of_model(image: Any, monkeypatch: pytest.Monke
 IMAGE = np.ones((4, 6), np.float32)
 
 
+class OnGpu:
+    """An array that NumPy cannot read, as a tensor on a GPU."""
+
+    def __array__(self, *_: Any, **__: Any) -> Any:
+        msg = "can't convert cuda:0 device type tensor to numpy; use Tensor.cpu()"
+        raise TypeError(msg)
+
+
 @pytest.mark.parametrize(
     ("reading", "options", "problem"),
     [
@@ -252,6 +260,9 @@ IMAGE = np.ones((4, 6), np.float32)
         (np.full((9, 3), [-300, 90, np.nan]), {"up": (0, 0)}, "up: expected a direction"),
         ([[-300, 90, 0], [np.nan, 0, 1], [20, -900, 40]], {}, "points in metres"),
         (np.ones((4, 6, 3)), {"intrinsics": (5, 5, 3, 2)}, r"depth image \(h, w\)"),
+        ([[1, 2], [3]], {"intrinsics": (5, 5, 3, 2)}, "not an array of numbers: .*inhomogeneous"),
+        ([[1, 2, 3], [3]], {}, "not an array of numbers: .*inhomogeneous"),
+        (OnGpu(), {}, r"not an array of numbers: .*cpu\(\)"),
         (np.array([["a"]]), {"intrinsics": (5, 5, 3, 2)}, "depth image"),
         (np.ones((9, 3)), {"up": (0, 0, 0)}, "up: expected a direction"),
         (np.ones((9, 3)), {"up": (0, 1)}, "up: expected a direction"),

@@ -35,7 +35,11 @@ def frame_of(reading: ArrayLike, intrinsics: ArrayLike | None = None) -> Frame:
     ------
     ConfigError : the shape, the type or a number is wrong, or the unit is not metres.
     """
-    values = np.asarray(reading)
+    try:
+        values = np.asarray(reading)
+    except (TypeError, ValueError) as error:  # rows of different lengths, or a tensor on a GPU
+        msg = f"not an array of numbers: {error}"
+        raise ConfigError(msg) from error
     masked = np.ma.getmaskarray(reading if isinstance(reading, np.ma.MaskedArray) else values)
     frame = partial(Frame, topic="", index=0, stamp_ns=0, log_time_ns=0, frame_id="")
     if intrinsics is None:
