@@ -314,6 +314,24 @@ def test_several_runs_make_one_data_set_split_by_recording(
     assert both[0]["categories"] == both[1]["categories"]
 
 
+@pytest.mark.parametrize("format_", ["coco", "point-labels"])
+def test_progress_counts_frames_that_are_left_out(run: Path, tmp_path: Path, format_: str) -> None:
+    """Otherwise it ends far below its total, and promises a time that is several times too long."""
+    events: list[tuple[str, int, int | None]] = []
+
+    def observe(*event: Any) -> None:
+        events.append(event)
+
+    if format_ == "coco":
+        chosen = Selection(depth=True, every=3)
+        export_dataset([run], format_, tmp_path / "out", chosen, observe=observe)
+    else:
+        export_run(run, format_, tmp_path / "out", every=3, observe=observe)
+
+    total = read_finished(run).run["counts"]["frames"]
+    assert events == [("export", k, total) for k in range(1, total + 1)]
+
+
 def test_runs_with_equal_names_keep_their_images(coloured_run: Path, tmp_path: Path) -> None:
     """The images of one run would replace those of the other."""
     for day in ("monday", "tuesday"):

@@ -2,7 +2,7 @@
 
 import logging
 from collections import Counter
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -21,6 +21,7 @@ from shapecat.recordings import MessageError
 from shapecat.recordings.decoding.colour_image import encoded, pixels_of
 from shapecat.runs.finished import FinishedRun, open_source
 from shapecat.runs.labels.track_table import read_track_table
+from shapecat.system.progress import observed
 from shapecat.types import UNKNOWN, Frame, LabelledFrame, LabelledObject
 
 __all__ = [
@@ -115,6 +116,7 @@ def images_of(
     *,
     stems: Mapping[str, str],
     left_out: Counter[str],
+    tick: Callable[[], None],
 ) -> Iterator[DatasetImage]:
     """Yield the images of a run with at least one object to train on; log damaged images.
 
@@ -125,6 +127,7 @@ def images_of(
     recording : path of the recording; by default where it was processed.
     stems : how the names of the images of each topic begin.
     left_out : counts the other frames by reason.
+    tick : called after each frame of the run, also those that are left out.
 
     Raises
     ------
@@ -135,7 +138,8 @@ def images_of(
     corrected = {track for track, label in labels.items() if label}
     chosen = _chosen(finished, selection, corrected)
     with open_source(finished.run, recording) as source:
-        frames = (f for f in finished.frames() if (f.topic, f.index) in chosen)
+        ticking = observed(finished.frames(), "export", None, lambda *_: tick())
+        frames = (f for f in ticking if (f.topic, f.index) in chosen)
         for labelled, frame, coloured in with_colour(frames, source, finished.run):
             name = f"{stems[labelled.topic]}_{labelled.index:06d}"
             try:

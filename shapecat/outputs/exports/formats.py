@@ -107,13 +107,13 @@ def export_run(
         msg = f"{out}: is a run; choose another --out"
         raise OutputError(msg)
     finished = replace(read_finished(folder), common=tuple(categories))
-    total = -(-int(finished.run["counts"]["frames"]) // every)
+    total = int(finished.run["counts"]["frames"])
     with open_source(finished.run, recording) as source:
         full = format in _WITH_BOXES and not visible_boxes
-        labelled = finished.frames_with_full_boxes() if full else finished.frames()
+        frames = finished.frames_with_full_boxes() if full else finished.frames()
+        labelled = observed(frames, "export", total, observe)
         wanted = _tracked(_thinned(labelled, every), streams_with_poses(folder))
-        triples = with_colour(wanted, source, finished.run)
-        pairs = observed(triples, "export", total, observe)
+        pairs = with_colour(wanted, source, finished.run)
         if format == "crops":
             return FORMATS[format](out, pairs, finished)
         about = {
@@ -144,7 +144,7 @@ def export_dataset(
     ----------
     format : ``coco`` or ``yolo``.
     recording : path of the recording of a single run; by default where it was processed.
-    observe : called with the phase, the number of images done, and the number of frames.
+    observe : called with the phase, the number of frames done, and the total.
 
     Raises
     ------
@@ -161,7 +161,12 @@ def export_dataset(
     total = sum(int(run.run["counts"]["frames"]) for run in runs)
 
     counts, left_out = Counter[str](), Counter[str]()
-    uncertain = 0
+    uncertain = done = 0
+
+    def tick() -> None:
+        nonlocal done
+        done += 1
+        observe("export", done, total)
 
     def images() -> Iterator[tuple[str, FinishedRun, DatasetImage]]:
         nonlocal uncertain
@@ -172,10 +177,10 @@ def export_dataset(
             raise OutputError(msg)
         splits = split_runs(runs, selection.val)
         for split, stems, run in zip(splits, image_stems(runs), runs, strict=True):
-            for image in images_of(run, selection, recording, stems=stems, left_out=left_out):
+            own = images_of(run, selection, recording, stems=stems, left_out=left_out, tick=tick)
+            for image in own:
                 counts[split] += 1
                 uncertain += image.sure.count(False)
-                observe("export", counts.total(), total)
                 yield split, run, image
         if not counts:
             reasons = ", ".join(f"{reason} ({count}×)" for reason, count in left_out.items())
