@@ -6,6 +6,7 @@ from typing import Any
 import click
 
 from shapecat.errors import ShapecatError, common_exit_code
+from shapecat.outputs.counts import size_words
 
 from .options import ANY_PATH, array_option
 from .render import print_json, print_table
@@ -53,7 +54,7 @@ def _describe(path: Path) -> tuple[dict[str, Any] | None, int]:
 
 def _show(overview: dict[str, Any]) -> None:
     click.echo(
-        f"{overview['path']}: {overview['kind']}, {overview['bytes'] / 1e6:.1f} MB, "
+        f"{overview['path']}: {overview['kind']}, {size_words(overview['bytes'])}, "
         f"{overview['seconds']:.1f} s long"
     )
     rows = [

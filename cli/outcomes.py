@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, Any
 
 import click
 
-from shapecat.outputs.counts import count_words
+from shapecat.outputs.counts import count_words, plural
 
 from .render import missed_words, print_table
 
@@ -60,7 +60,9 @@ def print_closing(tasks: Sequence["Task"], tally: Tally) -> None:
     for job, summary in complete:
         _print_corrections(job, summary)
     if len(tasks) > 1:
-        click.echo(f"{tally.complete} complete, {tally.failed} failed, {tally.frames:,} frames")
+        click.echo(
+            f"{tally.complete} complete, {tally.failed} failed, {plural(tally.frames, 'frame')}"
+        )
 
 
 def summaries_as_dicts(complete: Sequence[tuple["Job", "Summary"]]) -> list[dict[str, Any]]:

@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, Any, Self
 
 import click
 
-from shapecat.outputs.counts import plural
+from shapecat.outputs.counts import plural, size_words
 
 from .render import PHASES, rich_progress
 
@@ -52,7 +52,7 @@ def describe_plan(tasks: Sequence["Task"], skipped: int, workers: int, cores: in
     words = _STATUS_WORDS.items()
     parts = [", ".join(f"{counts[status]} {text}" for status, text in words if counts[status])]
     if remaining := _remaining_bytes(tasks):
-        parts += [f"{remaining / 1e6:,.1f} MB", plural(workers * cores, "process")]
+        parts += [size_words(remaining), plural(workers * cores, "process")]
     if skipped:
         parts.append(f"skipped {plural(skipped, 'file')} of other formats")
     return f"{plural(len(tasks), 'recording')}: {'; '.join(parts)}"

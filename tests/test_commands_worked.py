@@ -128,6 +128,11 @@ def test_closing_table_follows_order_of_plan(capsys: pytest.CaptureFixture[str])
     assert "1.3" in rows[1]
     assert closing == "2 complete, 1 failed, 23 frames"
 
+    tally = OUTCOMES.Tally(keep_all=False)
+    tally.failed, tally.frames = 2, 1
+    OUTCOMES.print_closing([task("a"), task("b")], tally)
+    assert capsys.readouterr().out == "0 complete, 2 failed, 1 frame\n"
+
 
 def test_json_follows_order_of_plan(
     shapecat: Run, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
@@ -245,6 +250,8 @@ def test_plan_describes_remaining_work() -> None:
         "3 recordings: 1 already complete, 1 to retry, 1 new; 1.5 MB; 6 processes; "
         "skipped 1 file of other formats"
     )
+    small = PROGRESS.describe_plan([task("a", size=31_000)], 0, 1, 1)
+    assert small == "1 recording: 1 new; 31.0 kB; 1 process"  # not 0.0 MB
     assert PROGRESS.describe_plan(tasks[:1], 0, 2, 3) == "1 recording: 1 already complete"
 
 

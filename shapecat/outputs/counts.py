@@ -2,7 +2,7 @@
 
 from collections.abc import Mapping
 
-__all__ = ["by_count", "count_words", "plural"]
+__all__ = ["by_count", "count_words", "plural", "size_words"]
 
 
 def plural(count: int, noun: str) -> str:
@@ -37,3 +37,14 @@ def count_words(counts: Mapping[str, int], none: str = "none") -> str:
     ('cup 3, can 2', 'none')
     """
     return ", ".join(f"{name} {count}" for name, count in by_count(counts)) or none
+
+
+def size_words(count: int) -> str:
+    """Return a number of bytes as text.
+
+    Examples
+    --------
+    >>> size_words(640), size_words(98_760_000), size_words(5_000_000_000)
+    ('0.6 kB', '98.8 MB', '5,000.0 MB')
+    """
+    return f"{count / 1e3:.1f} kB" if count < 100_000 else f"{count / 1e6:,.1f} MB"

@@ -14,7 +14,7 @@ import numpy as np
 
 from shapecat.arrays import F8
 from shapecat.outputs.colours import hex_colour
-from shapecat.outputs.counts import by_count, count_words, plural
+from shapecat.outputs.counts import by_count, count_words, plural, size_words
 from shapecat.outputs.report.cards import (
     Card,
     asset,
@@ -138,7 +138,7 @@ def _head(title: str, scripts: str = "") -> str:
 
 def _subtitle(run: Mapping[str, Any]) -> str:
     topics = ", ".join(run["options"]["topics"])
-    return f"{run['input']['path']} · {run['input']['bytes'] / 1e6:.1f} MB · {topics}"
+    return f"{run['input']['path']} · {size_words(run['input']['bytes'])} · {topics}"
 
 
 def _tiles(values: Mapping[str, Any]) -> str:
