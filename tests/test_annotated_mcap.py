@@ -442,7 +442,10 @@ def test_ros1_bag_is_converted_to_ros2(tmp_path: Path) -> None:
 
 
 def test_ros1_type_that_ros2_has_extended_keeps_its_definition(tmp_path: Path) -> None:
-    """Markers have textures in ROS 2: read as such, the end of a recorded one is missing."""
+    """Markers have textures in ROS 2: read as such, the end of a recorded one is missing.
+
+    An array of them has the same fields in both.
+    """
     source, target = tmp_path / "a.bag", tmp_path / "out.mcap"
     kind, types = "visualization_msgs/msg/Marker", STORE1.types
     header = types["std_msgs/msg/Header"](7, types["builtin_interfaces/msg/Time"](1, 2), "map")
@@ -455,15 +458,19 @@ def test_ros1_type_that_ros2_has_extended_keeps_its_definition(tmp_path: Path) -
     lifetime = types["builtin_interfaces/msg/Duration"](3, 4)
     rest = (lifetime, True, [place], [colour], "words", "package://mesh", True)
     marker = types[kind](header, "shapes", 5, 1, 0, pose, scale, colour, *rest)
+    several = types[f"{kind}Array"]([marker, marker])
     with BagWriter(source) as writer:
-        connection = writer.add_connection("/marker", kind, typestore=STORE1)
-        writer.write(connection, EPOCH, STORE1.serialize_ros1(marker, kind))
+        for topic, name, item in (("/one", kind, marker), ("/all", f"{kind}Array", several)):
+            connection = writer.add_connection(topic, name, typestore=STORE1)
+            writer.write(connection, EPOCH, STORE1.serialize_ros1(item, name))
 
     annotate(source, target)
 
-    ((_, read),) = read_ros(target, "/marker")
-    assert (read.id, read.scale.y, read.text, read.mesh_resource) == (5, 0.9, "words", rest[5])
-    assert (read.lifetime.nanosec, read.points[0].z, read.colors[0].b) == (4, 0.3, 0.75)
+    ((_, one),), ((_, both),) = (read_ros(target, topic) for topic in ("/one", "/all"))
+    assert len(both.markers) == 2
+    for read in (one, *both.markers):
+        assert (read.id, read.scale.y, read.text, read.mesh_resource) == (5, 0.9, "words", rest[5])
+        assert (read.lifetime.nanosec, read.points[0].z, read.colors[0].b) == (4, 0.3, 0.75)
 
 
 def test_names_of_ros1_fields_are_allowed_in_ros2(tmp_path: Path) -> None:

@@ -19,10 +19,13 @@ TURN = np.array([[0.0, 0.8, 0.6], [-1.0, 0.0, 0.0], [0.0, -0.6, 0.8]])
 
 
 def write_run(folder: Path, speed_m_s: float, axes: F8, carried_m_s: float = 0) -> None:
-    """Write the frames of a camera that drives along x, whose frame has other ``axes`` (3, 3)."""
+    """Write the frames of a camera that drives along x, whose frame has other ``axes`` (3, 3).
+
+    Some frames are without objects.
+    """
     rows: dict[str, list[Any]] = {"center": [], "center_fixed": [], "frame": []}
     frames = range(40)
-    for k in frames:
+    for k in (k for k in frames if k % 7 != 2):
         place = np.array([0.1 * k * speed_m_s, -0.2, 1.3])
         own = (OBJECTS + np.array([0.1 * k * carried_m_s, 0, 0]) - place) @ TURN
         rows["center"] += own.tolist()
