@@ -44,6 +44,24 @@ def replace(path: Path, old: bytes, new: bytes, nth: int = 0) -> None:
 # ---- MCAP
 
 
+@pytest.mark.parametrize("damaged", ["", "std/String", "/topic"])
+def test_index_without_checksum_is_compared_with_the_chunks(tmp_path: Path, damaged: str) -> None:
+    """Messages would be read under a name or type that was not recorded."""
+    path = tmp_path / "a.mcap"
+    with mcap_writer(path, enable_crcs=False, compression=CompressionType.NONE) as writer:
+        schema = writer.register_schema("std/String", "ros1msg", b"string data")
+        channel = writer.register_channel("/topic", "ros1", schema)
+        writer.add_message(channel, 5, text("a"), 5)
+    if damaged:
+        before, _, after = path.read_bytes().rpartition(damaged.encode())
+        path.write_bytes(before + damaged.upper().encode() + after)
+
+    with open_recording(path) as recording:
+        (topic,) = recording.topics
+        assert (topic.name, topic.type, topic.count) == ("/topic", "std/msg/String", 1)
+        assert len(recording.warnings) == (1 if damaged else 0)
+
+
 @pytest.mark.parametrize(
     ("old", "new", "nth", "reason"),  # of the second chunk: the first one holds the channel
     [
