@@ -106,6 +106,7 @@ JUDGED_BY: dict[str, Sequence[str]] = {
     "shapecat.runs.perceive.phases": ("test_pipeline", "test_crash"),
     "shapecat.runs.perceive.resuming": ("test_resuming", "test_batch_planning"),
     "shapecat.runs.perceive.second_look": ("test_second_look",),
+    "shapecat.runs.perceive.selection": ("test_recordings_frames", "test_pipeline"),
     "shapecat.runs.perceive.up_report": ("test_gravity",),
     "shapecat.runs.tables.masks": ("test_colour_outputs", "test_exports_images"),
     "shapecat.runs.tables.placed_frames": ("test_changes", "test_tables_rotated"),
