@@ -9,7 +9,6 @@ from typing import Any
 
 import numpy as np
 from rosbags.interfaces import (
-    Nodetype,
     Qos,
     QosDurability,
     QosHistory,
@@ -52,10 +51,9 @@ ConvertedChannel = tuple[AnnotationChannel, Callable[[bytes | memoryview], memor
 def convert_channel(channel: Channel) -> ConvertedChannel | None:
     """Convert a ROS 1 channel to ROS 2.
 
-    Types that exist in ROS 2 with the same layout get the ROS 2 definition, in which some field
-    names differ (``K`` became ``k``). All others keep the definition in the bag, with names that
-    ROS 2 allows (``O_T_EE`` becomes ``o_t_ee``). Only the sequence number of headers is lost, since
-    ROS 2 has none.
+    Types keep the definition in the bag, with names that ROS 2 allows (``O_T_EE`` becomes
+    ``o_t_ee``), which are those of its own types (``K`` of CameraInfo is ``k``). Only the sequence
+    number of headers is lost, since ROS 2 has none.
 
     Returns
     -------
@@ -67,12 +65,10 @@ def convert_channel(channel: Channel) -> ConvertedChannel | None:
         types = dict(typestore_of(channel).fielddefs)
         if name != channel.type:
             types[name] = types.pop(channel.type)
-        modern = get_typestore(Stores.ROS2_HUMBLE)
         store = get_typestore(Stores.EMPTY)
-        types[_HEADER] = modern.fielddefs[_HEADER]
+        types[_HEADER] = get_typestore(Stores.ROS2_HUMBLE).fielddefs[_HEADER]
         types = {kind: _renamed(*definition) for kind, definition in types.items()}
-        same_layout = name in modern.fielddefs and _same_layout(name, types, modern.fielddefs)
-        store.register({**types, **(_reachable(name, modern) if same_layout else {})})
+        store.register(types)
         text, _ = store.generate_msgdef(name, ros_version=2)
         store.get_msgdef(name)
     except LIBRARY_ERRORS:
@@ -97,37 +93,6 @@ def _renamed(constants: Any, fields: Any) -> Any:
         numbered = (f"{plain}_{k}" for k in count(2))
         names.append(next(n for n in chain([plain], numbered) if n not in names))
     return constants, [(name, kind) for name, (_, kind) in zip(names, fields, strict=True)]
-
-
-def _same_layout(name: str, old: Any, new: Any) -> bool:
-    """Return whether two definitions have fields of the same types in order, with any names."""
-    if name == _HEADER:
-        return True
-    if name not in old or name not in new or len(old[name][1]) != len(new[name][1]):
-        return False
-    for (_, a), (_, b) in zip(old[name][1], new[name][1], strict=True):
-        if a != b:
-            return False
-        inner = a[1][0] if a[0] in {Nodetype.ARRAY, Nodetype.SEQUENCE} else a
-        if inner[0] == Nodetype.NAME and not _same_layout(inner[1], old, new):
-            return False
-    return True
-
-
-def _reachable(name: str, store: Typestore) -> dict[str, Any]:
-    """Return the definitions of a type and of the types it contains."""
-    definitions: dict[str, Any] = {}
-    waiting = [name]
-    while waiting:
-        current = waiting.pop()
-        if current in definitions:
-            continue
-        definitions[current] = store.fielddefs[current]
-        for _, field in store.fielddefs[current][1]:
-            inner: Any = field[1][0] if field[0] in {Nodetype.ARRAY, Nodetype.SEQUENCE} else field
-            if inner[0] == Nodetype.NAME:
-                waiting.append(str(inner[1]))
-    return definitions
 
 
 def raw_channel(topic: str) -> AnnotationChannel:
