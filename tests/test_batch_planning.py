@@ -784,6 +784,20 @@ def test_entries_of_other_work_are_replaced(source: Path, monkeypatch: pytest.Mo
     assert manifest.entries["lab"].state == "complete"
 
 
+def test_earlier_outcome_is_known_without_a_manifest(tmp_path: Path) -> None:
+    """After its disk is full, the manifest is given up, but complete runs are still complete."""
+    job = Job(Path("lab.mcap"), tmp_path / "lab")
+    task: Any = SimpleNamespace(name="lab", job=job)
+    missing = Ledger(None).earlier_outcome(task)
+    job.folder.mkdir()
+    write_run(job.folder, run_info(counts={"frames": 3, "tracks": {"cup": 2}}, seconds={}))
+    found = Ledger(None).earlier_outcome(task)
+
+    assert (missing.code, "no run.json there" in missing.message) == (1, True)
+    assert found.summary is not None
+    assert (found.summary.counts["frames"], found.summary.processed) == (3, False)
+
+
 @pytest.mark.parametrize(
     "option", [{"topics": ("/front",)}, {"start_s": 1.5}, {"end_s": 2.5}, {"every": 3}]
 )
@@ -1080,6 +1094,20 @@ def test_run_at_url_keeps_folder_when_recording_of_same_name_is_added(
         with plan_batch(Job(Path(), Path()), days, out, shard=shard) as batch:
             names += [(task.name, task.path) for task in batch.tasks]
     assert dict(names) == {"lab": path, "tuesday_lab": days[0]}
+
+
+def test_recording_at_url_keeps_the_folder_of_its_run() -> None:
+    """Its results would be made again in another folder, and its own would be overwritten."""
+    place, out = "memory://named-recordings", "memory://named-results"
+    for day in ("monday", "tuesday"):
+        (Location(place) / day / "lab.mcap").write(day.encode())
+    sources = find_recordings([f"{place}/monday", f"{place}/tuesday"]).sources
+    with RemoteManifest(out) as manifest:
+        manifest.record([Entry("lab", sources[1].url, "complete")])
+
+    assert existing_names(sources, out, {"lab"}) == {1: "lab"}
+    (Location(out) / "monday_lab" / "run.json").write(b"[")  # a run that cannot be read
+    assert existing_names(sources, out, {"lab", "monday_lab"}) == {1: "lab"}
 
 
 def test_numbered_folder_name_may_already_be_taken() -> None:

@@ -2,7 +2,7 @@
 
 from collections.abc import Callable, Iterable
 from pathlib import Path
-from typing import Any
+from typing import Any, cast
 
 import numpy as np
 import pyarrow.parquet as pq
@@ -10,8 +10,10 @@ from click.testing import Result
 
 from shapecat.config import DetectionSettings, Settings
 from shapecat.pipeline import process
+from shapecat.recordings import open_recording
 from shapecat.runs.folder import read_run
 from shapecat.runs.jobs import Job
+from shapecat.runs.perceive.missing_planes import explain_missing_planes
 from shapecat.simulation.messages import MessageFactory
 from tests.messages import CAMERA, EPOCH, SECOND, write
 from tests.scenes import record
@@ -70,6 +72,11 @@ def test_warning_distinguishes_missing_depth_wrong_up_and_noise(tmp_path: Path) 
     noise = np.random.default_rng(1).uniform(0.4, 1.9, (3, CAMERA.height, CAMERA.width))
     only_noise = warnings_of(walls(tmp_path / "noise.mcap", noise), tmp_path)
 
+    with open_recording(wall) as recording:
+        run = {**read_run(tmp_path / "near"), "up": {"source": "imu"}}
+        (from_imu,) = explain_missing_planes(recording, tmp_path / "near", cast("Any", run), 2.0)
+
+    assert from_imu.endswith("4 of 4 frames: is up (imu) right? Try another --up")
     assert without_depth == ["no supporting plane in 3 of 3 frames: they have no valid depth"]
     assert wall_in_range[-1] == (
         "no supporting plane in 4 of 4 frames: "

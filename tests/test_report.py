@@ -19,7 +19,9 @@ from PIL import Image
 from scipy import ndimage
 
 from shapecat.api import open_run
+from shapecat.cameras.colour import ColourImage, ColourView
 from shapecat.colour.masks import Mask
+from shapecat.outputs.colouring import Coloured
 from shapecat.outputs.counts import plural
 from shapecat.outputs.report import read_reports
 from shapecat.outputs.report.cards import Card
@@ -380,6 +382,19 @@ def test_depth_is_drawn_as_shaded_relief() -> None:
     assert image[:, 150:].max() < 30
     up, down = image[25:38, 75:85].mean(), image[82:95, 75:85].mean()
     assert abs(up - down) > 20
+
+
+def test_damaged_colour_image_is_replaced_by_depth() -> None:
+    """One image that was not written completely must not cost the whole report."""
+    depth = np.full((48, 64), 1.2, np.float32)
+    image = ColourImage("/color", 0, 0, "camera", "png", 64, 48, 0, b"\x89PNG\r\n")
+    coloured = Coloured(ColourView(image), (Mask(3, 4, np.ones((5, 6), bool)),))
+    pixels = np.arange(depth.size).reshape(depth.shape)[10:20, 30:44].ravel()
+    found = prepare_picture(labelled(pixels), depth_frame(depth), coloured)
+
+    assert found is not None
+    assert [mask.box for mask in found.masks] == [(30, 10, 14, 10)]
+    assert found.pixels().shape == (48, 64, 3)
 
 
 @pytest.mark.parametrize(

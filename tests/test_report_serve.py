@@ -319,6 +319,7 @@ def test_owner_is_served_under_both_host_names(site: tuple[Path, str, str]) -> N
             assert ask(address, headers={"Host": host, **origin})[0] == 200
     assert json.loads(ask(address, path=labels)[1])["labels"]
     assert ask(address, path=labels + "x")[0] == 404
+    assert ask(address, "POST", labels + "x", correction(1, "bowl"))[0] == 404
     assert ask(address, path=labels.replace("labels", "tracks.csv"))[0] == 404
     assert ask(address, path=labels.replace("labels", "../../run.json"))[0] == 404
 

@@ -22,7 +22,7 @@ from shapecat.outputs.review import writing as review
 from shapecat.outputs.review.clouds import paint
 from shapecat.outputs.review.columns import Columns
 from shapecat.outputs.review.images import Images, Picture
-from shapecat.outputs.review.layout import Eye, TrackView, _track_tabs, stepped_back
+from shapecat.outputs.review.layout import Eye, TrackView, _track_tabs, choose_eye, stepped_back
 from shapecat.outputs.review.scenes import ReviewFrame, choose_scenes
 from shapecat.outputs.review.shapes import SKETCH, _fan, markdown, short_label, sketch
 from shapecat.runs.labels.meaning import TrackLabel
@@ -651,3 +651,23 @@ def test_eye_steps_back_to_show_all_objects_if_near() -> None:
     assert np.linalg.norm(away) > np.linalg.norm(high - low)
     assert stepped_back(eye, low * 10, high * 10) is eye
     assert stepped_back(eye, np.full(3, np.inf), np.full(3, -np.inf)) is eye  # without objects
+
+
+@pytest.mark.parametrize("kind", ["planes", "image", "cloud", "nothing"])
+def test_view_of_a_frame_without_objects_shows_what_there_is(kind: str) -> None:
+    """A run without objects is opened to see why; its view must not be empty or upside down."""
+    labelled, frame = scene(0)
+    if kind != "planes":
+        labelled = dataclasses.replace(labelled, planes=())
+    if kind in {"cloud", "nothing"}:
+        points = np.full((9, 3), np.nan if kind == "nothing" else 3.0, np.float32)
+        points[:4, 0] -= 1
+        frame = Frame(TOPIC, 0, stamp(0), stamp(0), "lidar", points=points)
+
+    eye = choose_eye(labelled, frame, fixed=False)
+
+    targets = {"planes": [0, 0.4, 1.25], "cloud": [2.5, 3, 3], "nothing": [0, 0, 0]}
+    assert eye.target == pytest.approx(targets.get(kind, eye.target))
+    assert np.array_equal(eye.up, [0, -1, 0] if kind in {"planes", "image"} else [0, 0, 1])
+    assert (eye.position - eye.target) @ eye.up > 0.3
+    assert kind != "image" or 0.9 < eye.target[2] < 1.1
