@@ -73,7 +73,6 @@ class SurfaceSettings:
 
     def __post_init__(self) -> None:
         """Reject numbers and lengths that are out of range."""
-        # With coarser surfaces, most objects would be unknown.
         # Coarser surfaces make most objects unknown.
         # When distances are compared, the index of a neuron replaces their 10 lowest bits.
         _check_range("surface.neurons", self.neurons, 20, 512)
