@@ -190,6 +190,16 @@ def test_masked_values_are_missing(image: Any) -> None:
     assert np.isfinite(np.delete(points.points, 6, axis=0)).all()
 
 
+def test_points_of_the_caller_are_not_changed() -> None:
+    """Incomplete rows become NaN, in a copy: those of the caller may be used again."""
+    points = np.ones((5, 3), np.float32)
+    points[2, 1] = np.inf
+    points.flags.writeable = False
+
+    assert np.isnan(shapecat.perceive(points).points[2]).all()
+    assert points[2].tolist() == [1, np.inf, 1]
+
+
 def test_perceiving_points_finds_same_objects_as_depth_image(image: Any) -> None:
     """Invalid rows stay in place, so that masks fit the caller's points."""
     from_points = shapecat.perceive(image.xyz(), up=(0, -6.2, -7.8))

@@ -175,13 +175,21 @@ def test_calibration_may_lack_the_fields_of_a_lens(tmp_path: Path) -> None:
     assert frame.camera == CAMERA
 
 
-@both_encodings
-def test_transforms_are_read(tmp_path: Path, encoding: str) -> None:
+NO_TURN = {"rotation": {"x": 0.0, "y": 0.0, "z": 0.0, "w": 1.0}}
+
+
+@pytest.mark.parametrize(
+    ("encoding", "turn"), [("json", NO_TURN), ("protobuf", NO_TURN), ("protobuf", {})]
+)
+def test_transforms_are_read(
+    tmp_path: Path, encoding: str, turn: dict[str, dict[str, float]]
+) -> None:
+    """Protobuf writers may leave out the rotation of a pure translation."""
     values = {
         "parent_frame_id": "map",
         "child_frame_id": "camera",
         "translation": {"x": 1.0, "y": 2.0, "z": 3.0},
-        "rotation": {"x": 0.0, "y": 0.0, "z": 0.0, "w": 1.0},
+        **turn,
     }
     path = write(tmp_path / "a.mcap", encoding, [("/tf", "foxglove.FrameTransform", values)])
 
@@ -190,9 +198,9 @@ def test_transforms_are_read(tmp_path: Path, encoding: str) -> None:
 
     # Foxglove has no static transforms: each one is valid until the next.
     for stamp in (EPOCH, EPOCH + 60 * SECOND):
-        np.testing.assert_array_equal(
-            transforms.lookup("map", "camera", stamp).translation, [1, 2, 3]
-        )
+        pose = transforms.lookup("map", "camera", stamp)
+        np.testing.assert_array_equal(pose.translation, [1, 2, 3])
+        np.testing.assert_array_equal(pose.rotation, np.eye(3))
 
 
 def test_transform_long_before_first_frame_is_known(tmp_path: Path) -> None:
