@@ -240,6 +240,14 @@ def test_one_bad_frame_is_no_scene_cut() -> None:
     assert [track.hits for track in track_recording(frames, SETTINGS)] == [19, 19]
 
 
+def test_one_of_two_objects_moved_is_no_scene_cut() -> None:
+    """At one image per second, the one that stayed would get a new track."""
+    places = [[[0, 0, 0], [0.4, 0, 0]]] * 5 + [[[0, 0, 0], [0.4, 0.2, 0]]] * 5
+    frames = [frame(k, both, stamp_ns=k * SECOND) for k, both in enumerate(places)]
+
+    assert not scene_cuts(next(gather(frames)), SETTINGS).any()
+
+
 def test_takes_joined_without_a_pause_are_a_scene_cut() -> None:
     """Between two frames at full rate, all objects are exchanged for others."""
     before, after = [[0, 0, 0], [0.4, 0, 0]], [[0.05, 0.02, 0], [0.43, -0.04, 0]]
