@@ -348,6 +348,17 @@ def test_outdated_page_undoes_no_labels(run: Path) -> None:
     assert (run / "tracks.previous.csv").read_text() == labelled(t4="bowl", t1="box")
 
 
+def test_added_label_leaves_table_of_replaced_labels(run: Path) -> None:
+    """The labels that were replaced before would be lost."""
+    corrected = run.parent / "mine.csv"
+    for labels in ({"t4": "bowl"}, {"t4": "plate"}, {"t4": "plate", "t1": "can"}):
+        corrected.write_text(labelled(**labels))
+        adopt_labels(corrected, run)
+
+    assert (run / "tracks.csv").read_text() == labelled(t4="plate", t1="can")
+    assert (run / "tracks.previous.csv").read_text() == labelled(t4="bowl")
+
+
 def test_page_table_in_place_of_own_table_clears_labels_later(run: Path) -> None:
     """Its column of labels that were seen would keep a label that is cleared in a copy of it."""
     header, *lines = labelled(t4="mug").splitlines()
