@@ -1,6 +1,7 @@
 """Tests of labels of another run: refused by number, and transferred by place and time."""
 
 import csv
+import json
 from collections import Counter
 from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
@@ -8,6 +9,7 @@ from typing import Any
 
 import numpy as np
 import pyarrow as pa
+import pyarrow.parquet as pq
 import pytest
 from click.testing import Result
 
@@ -677,6 +679,43 @@ def test_labels_without_match_survive_later_runs(tmp_path: Path) -> None:
 
     kept = {label for table in folder.glob("tracks.*csv") for label in labels_in(table)}
     assert kept == {"teapot", "vase"}
+
+
+def make_earlier(folder: Path) -> None:
+    """Turn a run into one of a version without colour, full boxes and positions in double."""
+    run = json.loads((folder / "run.json").read_text())
+    del run["options"]["color"]
+    (folder / "run.json").write_text(json.dumps(run))
+    for name in ("tracks", "detections"):
+        table = pq.read_table(folder / f"{name}.parquet")
+        table = table.drop_columns([c for c in table.column_names if "_full" in c])
+        place = table.schema.get_field_index("center_fixed")
+        single = table["center_fixed"].cast(pa.list_(pa.float32(), 3))
+        table = table.set_column(place, "center_fixed", single)
+        pq.write_table(table, folder / f"{name}.parquet")
+
+
+@pytest.mark.parametrize("fixed_frame", ["map", None])
+def test_labels_of_an_earlier_version_are_transferred(
+    tmp_path: Path, fixed_frame: str | None
+) -> None:
+    """Its folder could not be replaced, and its labels reached no other run."""
+    objects = {4: static(CUP), 5: static(BOWL)}
+    old = make_run(tmp_path / "lab", objects, labels={4: "mug"}, fixed_frame=fixed_frame)
+    make_earlier(old)
+    objects = {1: static(BOWL), 2: static(CUP)}
+    with pytest.raises(OutputError, match=r"options\.color is .* another version .* --overwrite"):
+        read_run(old)
+    with staged(old) as hidden:
+        new = make_run(hidden / "new", objects, fixed_frame=fixed_frame)
+        run = read_run(new)
+        keep_labels(new, run, Job(tmp_path / "lab.mcap", old))
+        labels = labels_of(new)
+
+    assert labels == {1: "", 2: "mug"}
+    assert run["corrections"]["by"] == "frames in common"
+    assert not run["corrections"]["not_transferred"]
+    assert [path.name for path in old.iterdir()] == ["new"]
 
 
 @pytest.mark.parametrize(("there", "copies"), [([CUP, BOWL], []), ([CUP], [{"mug", "vase"}])])

@@ -1,6 +1,7 @@
 """Tests of recordings and results at URLs: no partial results, and no scratch files left."""
 
 import csv
+import dataclasses
 import errno
 import filecmp
 import functools
@@ -26,13 +27,14 @@ from shapecat.batch.claims import claimed
 from shapecat.batch.finding import find_recordings
 from shapecat.batch.finding_urls import stat_url
 from shapecat.batch.manifest import Entry, RemoteManifest
-from shapecat.batch.remote import TaskKey, _download, process_remote, upload
+from shapecat.batch.remote import TaskKey, _download, _fetch_run, process_remote, upload
 from shapecat.batch.storage import Location, names_in
 from shapecat.errors import OutputError, RecordingError
-from shapecat.runs.folder import RUN_FILES, read_run
+from shapecat.runs.folder import RUN_FILES, made_by_run, read_run
 from shapecat.runs.jobs import Job, Summary
 from shapecat.system.files import scratch_folder
 from tests.object_storage import object_storage, requests
+from tests.run_info import run_info
 from tests.scenes import record
 
 Run = Callable[..., Result]
@@ -599,6 +601,21 @@ def test_unusable_run_at_url_is_named(shapecat: Run, served: Path, content: byte
 
     assert done.exit_code == 1
     assert only_error(done).startswith("Error: memory://unusable/a/run.json: not a description of")
+
+
+def test_run_of_an_earlier_version_at_url_can_be_overwritten(tmp_path: Path) -> None:
+    """Its labels could not be transferred, as it was refused even with --overwrite."""
+    url = "memory://earlier/run"
+    run = run_info()
+    del run["options"]["color"]
+    (Location(url) / "run.json").write(json.dumps(run).encode())
+    job = Job(Path("a.mcap"), tmp_path / "run", target=url)
+
+    with pytest.raises(OutputError, match="another version"):
+        _fetch_run(job)
+    job = dataclasses.replace(job, folder=tmp_path / "again", overwrite=True)
+    assert _fetch_run(job) == (job, None)
+    assert made_by_run(job.folder) is not None
 
 
 def test_summary_names_run_folder_not_scratch(

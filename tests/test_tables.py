@@ -381,6 +381,20 @@ def test_run_of_an_earlier_version_is_annotated(guessed_run: Path, tmp_path: Pat
     assert list(read_annotation_frames(run, labels)) == now
 
 
+def test_positions_of_an_earlier_version_are_read(tmp_path: Path) -> None:
+    """It wrote them in single precision, and its runs and their corrections were refused."""
+    field = DETECTIONS.field("center_fixed")
+    single = pa.list_(pa.float32(), 3)
+    places = pa.array([[0.5, -1.25, 2.0], None], single)
+    columns = {f.name: pa.nulls(2, f.type) for f in DETECTIONS} | {field.name: places}
+    pq.write_table(pa.table(columns), tmp_path / "detections.parquet")
+
+    (table,) = read_row_groups(tmp_path / "detections.parquet", [field.name])
+
+    assert table.schema.field(field.name).type == field.type
+    assert table[field.name].to_pylist() == [[0.5, -1.25, 2.0], None]
+
+
 @pytest.mark.parametrize("table", TABLES)
 def test_table_with_other_columns_is_rejected(tmp_path: Path, table: str) -> None:
     """One of another version, or rewritten by a data frame library, gave a traceback later."""

@@ -14,7 +14,7 @@ from shapecat.batch.manifest import Entry, entries_at
 from shapecat.batch.sources import Source
 from shapecat.batch.storage import Location, is_url
 from shapecat.errors import ShapecatError
-from shapecat.runs.folder import read_run
+from shapecat.runs.folder import read_identity
 
 __all__ = ["existing_names", "name_folders"]
 
@@ -91,7 +91,7 @@ def _recording_of(out: str, name: str, entry: Entry | None) -> str:
         return os.path.realpath(recording)
     with suppress(ShapecatError, ValueError, LookupError, TypeError):
         if not is_url(out):
-            return read_run(Path(out, name))["input"]["path"]
+            return read_identity(Path(out, name))["input"]["path"]
         content = (Location(out) / name / "run.json").read() or b"{}"
         return str(json.loads(content)["input"]["path"])
     return ""

@@ -21,10 +21,10 @@ from shapecat.batch.sources import Source
 from shapecat.batch.storage import Location, is_url
 from shapecat.errors import ConfigError, OutputError
 from shapecat.learning import load_model
-from shapecat.runs.folder import OUTPUT_OPTIONS, parse_run, read_run
+from shapecat.runs.folder import OUTPUT_OPTIONS, read_run
 from shapecat.runs.identity import file_stats
 from shapecat.runs.jobs import Job
-from shapecat.runs.run_info import RunInfo
+from shapecat.runs.run_info import RunInfo, parse_run
 from shapecat.system.files import partial_path
 
 __all__ = ["Batch", "Shard", "Status", "Task", "plan_batch", "run_of"]

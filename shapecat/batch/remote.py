@@ -14,10 +14,10 @@ from shapecat.batch.claims import Claim, claimed
 from shapecat.batch.storage import Location, names_in
 from shapecat.errors import OutputError, RecordingError, ShapecatError
 from shapecat.pipeline import process
-from shapecat.runs.folder import OUTPUTS, RUN_FILES, parse_run, read_run, write_run
+from shapecat.runs.folder import OUTPUTS, RUN_FILES, read_run, write_run
 from shapecat.runs.jobs import Job, Summary, summarize
 from shapecat.runs.labels.corrections import LOST
-from shapecat.runs.run_info import OriginInfo, RunInfo
+from shapecat.runs.run_info import OriginInfo, RunInfo, parse_run
 from shapecat.system.files import scratch_folder
 from shapecat.system.progress import Observer
 
@@ -78,7 +78,7 @@ def process_remote(job: Job, observe: Observer, *, cores: int, key: TaskKey) -> 
             local, run = _fetch_run(
                 dataclasses.replace(job, folder=folder / "output" / job.folder.name)
             )
-            if run is not None and not local.overwrite and key.matches(run):
+            if run is not None and key.matches(run):
                 return summarize(job, run, processed=False)
         if job.origin:
             (folder / "input").mkdir()
@@ -121,8 +121,8 @@ def _fetch_run(job: Job) -> tuple[Job, RunInfo | None]:
 
     Returns
     -------
-    The job, and the content of run.json, None if there is no run. The job overwrites a run whose
-    replacement was interrupted.
+    The job, and the content of run.json, None without a run or if it is overwritten. The job
+    overwrites a run whose replacement was interrupted.
 
     Raises
     ------
@@ -134,7 +134,7 @@ def _fetch_run(job: Job) -> tuple[Job, RunInfo | None]:
     content = (place / "run.json").read()
     if content is None:
         return job, None
-    run = parse_run(content, place.url)
+    run = None if job.overwrite else parse_run(content, place.url)
     job.folder.mkdir(parents=True)
     (job.folder / "run.json").write_bytes(content)
     for name in _PREVIOUS[:-1] if job.overwrite else ():

@@ -10,10 +10,10 @@ import shutil
 from collections.abc import Callable, Collection, Iterator, Mapping
 from contextlib import contextmanager, nullcontext, suppress
 from pathlib import Path
-from typing import Any, Literal, cast
+from typing import Literal
 
 from shapecat.errors import OutputError, explained
-from shapecat.runs.run_info import RunInfo, wrong_entry
+from shapecat.runs.run_info import RunIdentity, RunInfo, parse_identity, parse_run
 from shapecat.system.files import flush, holding, lock, partial_path, replacing, require_utf8
 
 __all__ = [
@@ -23,8 +23,8 @@ __all__ = [
     "Marker",
     "clear",
     "made_by_run",
-    "parse_run",
     "previous_path",
+    "read_identity",
     "read_run",
     "recover",
     "require_ours",
@@ -69,7 +69,7 @@ marker."""
 def made_by_run(folder: Path) -> Collection[str] | None:
     """Return the names that a run makes in its folder; None if the folder holds no run."""
     with suppress(OutputError):
-        if read_run(folder)["id"]:
+        if read_identity(folder)["id"]:
             return _MADE
     return None
 
@@ -285,27 +285,22 @@ def read_run(folder: Path) -> RunInfo:
         not valid UTF-8.
     """
     require_utf8(folder)
-    try:
-        content = (folder / "run.json").read_bytes()
-    except OSError as error:
-        msg = f"{folder}: no run.json there; expected a folder made by `shapecat process`"
-        raise OutputError(msg) from error
-    return parse_run(content, str(folder))
+    return parse_run(_content_of(folder), str(folder))
 
 
-def parse_run(content: bytes, folder: str) -> RunInfo:
-    """Return the content of the run.json of a folder or URL.
+def read_identity(folder: Path) -> RunIdentity:
+    """Read the entries of run.json that every version writes.
 
     Raises
     ------
-    OutputError : it is damaged, or has missing or wrong entries.
+    OutputError : as for `read_run`, for these entries.
     """
-    run: Any = None
-    with suppress(ValueError, RecursionError):
-        run = json.loads(content)
-    wrong = wrong_entry(run)
-    if wrong is not None:
-        detail = f": {wrong} is missing or wrong" if wrong else ""
-        msg = f"{folder}/run.json: not a description of a run{detail}"
-        raise OutputError(msg)
-    return cast("RunInfo", run)
+    return parse_identity(_content_of(folder), str(folder))
+
+
+def _content_of(folder: Path) -> bytes:
+    try:
+        return (folder / "run.json").read_bytes()
+    except OSError as error:
+        msg = f"{folder}: no run.json there; expected a folder made by `shapecat process`"
+        raise OutputError(msg) from error

@@ -1,17 +1,22 @@
 """The contents of run.json, which describes a run; `schemas/run.json` documents each entry."""
 
+import json
 import math
+from contextlib import suppress
 from functools import cache
 from types import UnionType
 from typing import (
     Any,
     NotRequired,
     TypedDict,
+    cast,
     get_args,
     get_origin,
     get_type_hints,
     is_typeddict,
 )
+
+from shapecat.errors import OutputError
 
 __all__ = [
     "Counts",
@@ -19,7 +24,10 @@ __all__ = [
     "ModelInfo",
     "Options",
     "OriginInfo",
+    "RunIdentity",
     "RunInfo",
+    "parse_identity",
+    "parse_run",
     "wrong_entry",
 ]
 
@@ -77,21 +85,26 @@ class OriginInfo(TypedDict):
     work: str
 
 
-class RunInfo(TypedDict):
-    """The contents of run.json.
+class RunIdentity(TypedDict):
+    """The entries of run.json that every version of shapecat writes.
 
     ``id`` is random and belongs to one folder; ``work`` identifies the recording and how it was
-    processed. ``seconds`` has the duration of each finished phase.
+    processed.
     """
 
     id: str
     work: str
     input: InputInfo
     versions: dict[str, str]
-    settings: dict[str, Any]
-    options: Options
     model: ModelInfo
     fixed_frame: str | None
+
+
+class RunInfo(RunIdentity):
+    """The contents of run.json; ``seconds`` has the duration of each finished phase."""
+
+    settings: dict[str, Any]
+    options: Options
     up: dict[str, Any]
     counts: Counts
     seconds: dict[str, float]
@@ -133,3 +146,39 @@ def wrong_entry(content: Any, kind: Any = RunInfo, name: str = "") -> str | None
         within = [(name, item, parts[0]) for item in content]
     errors = (wrong_entry(value, part, place) for place, value, part in within)
     return next((wrong for wrong in errors if wrong is not None), None)
+
+
+def parse_run(content: bytes, folder: str) -> RunInfo:
+    """Return the content of the run.json of a folder or URL.
+
+    Raises
+    ------
+    OutputError : it is damaged, or has missing or wrong entries.
+    """
+    run = parse_identity(content, folder)
+    if (wrong := wrong_entry(run)) is not None:
+        msg = (
+            f"{folder}/run.json: not a description of a run: {wrong} is missing or wrong; if "
+            "another version made it, process the recording again with --overwrite, which keeps "
+            "labels"
+        )
+        raise OutputError(msg)
+    return cast("RunInfo", run)
+
+
+def parse_identity(content: bytes, folder: str) -> RunIdentity:
+    """Return the content of the run.json of a folder or URL; only some entries are checked.
+
+    Raises
+    ------
+    OutputError : it is damaged, or an entry that every version writes is missing or wrong.
+    """
+    run: Any = None
+    with suppress(ValueError, RecursionError):
+        run = json.loads(content)
+    wrong = wrong_entry(run, RunIdentity)
+    if wrong is not None:
+        detail = f": {wrong} is missing or wrong" if wrong else ""
+        msg = f"{folder}/run.json: not a description of a run{detail}"
+        raise OutputError(msg)
+    return cast("RunIdentity", run)

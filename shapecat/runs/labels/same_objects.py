@@ -15,7 +15,7 @@ import numpy as np
 
 from shapecat.arrays import F8
 from shapecat.errors import OutputError
-from shapecat.runs.folder import read_run
+from shapecat.runs.folder import read_identity
 from shapecat.runs.labels.track_detections import TrackDetections, extents_of, read_track_detections
 from shapecat.runs.labels.track_table import TrackRow, parse_number
 
@@ -227,7 +227,7 @@ def _require_one_frame(source: Path | None, target: Path) -> None:
 
 
 def _fixed_frame(folder: Path) -> str:
-    name = read_run(folder)["fixed_frame"]
+    name = read_identity(folder)["fixed_frame"]
     if name is None:
         msg = f"{folder}: has no fixed frame, which is needed to find objects by place"
         raise OutputError(msg)

@@ -43,7 +43,7 @@ class TrackDetections(NamedTuple):
 def read_track_detections(folder: Path) -> TrackDetections:
     """Read the detections of the tracks of a run."""
     columns = ["track", "topic", "frame", "stamp_ns", "detection", "center_fixed"]
-    with opened(folder / "tracks.parquet") as file:
+    with opened(folder / "tracks.parquet", columns=columns) as file:
         table = file.read(columns=columns)
     table = table.sort_by([(name, "ascending") for name in ("topic", "stamp_ns", "frame")])
     seen = table["detection"].is_valid()

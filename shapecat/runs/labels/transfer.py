@@ -6,12 +6,12 @@ from pathlib import Path
 from typing import Any, NamedTuple
 
 from shapecat.errors import OutputError
-from shapecat.runs.folder import read_run, write_run
+from shapecat.runs.folder import read_identity, read_run, write_run
 from shapecat.runs.labels.corrections import relabel
 from shapecat.runs.labels.meaning import find_misread, marked_as_new, merged_with, merging_with
 from shapecat.runs.labels.same_objects import Group, Matches, match_in_place, match_in_time
 from shapecat.runs.labels.track_table import TrackRow, TrackTable, read_track_table
-from shapecat.runs.run_info import RunInfo
+from shapecat.runs.run_info import RunIdentity, RunInfo
 
 __all__ = [
     "TABLE_ALONE",
@@ -157,7 +157,7 @@ def match_labels(source: Path, target: Path) -> Transfer:
     table = read_track_table(path)
     folder = path.parent if _is_in_its_run(path, table) else None
     _require_complete(path, table, alone=folder is None)
-    categories = read_run(folder or target)["model"]["categories"]
+    categories = read_identity(folder or target)["model"]["categories"]
     misread = find_misread(table.rows, categories)
     labelled = [row for row in table.rows if row.label and row.track not in misread]
     wrong = tuple(
@@ -167,7 +167,7 @@ def match_labels(source: Path, target: Path) -> Transfer:
         return Transfer(table.run, (), wrong)
     group = _groups(labelled)
     by, matches = IN_TIME, None
-    if folder is not None and _same_recording(read_run(folder), read_run(target)):
+    if folder is not None and _same_recording(read_identity(folder), read_run(target)):
         matches = match_in_time(folder, target, group)
     if matches is None:
         by = TABLE_ALONE if folder is None else IN_PLACE
@@ -202,7 +202,7 @@ def _is_in_its_run(path: Path, table: TrackTable) -> bool:
         return False
     if not table.run:
         return path.name == "tracks.csv"
-    return table.run == read_run(folder)["work"]
+    return table.run == read_identity(folder)["work"]
 
 
 def _groups(labelled: Sequence[TrackRow]) -> Group:
@@ -219,7 +219,7 @@ def _groups(labelled: Sequence[TrackRow]) -> Group:
     return root
 
 
-def _same_recording(a: RunInfo, b: RunInfo) -> bool:
+def _same_recording(a: RunIdentity, b: RunIdentity) -> bool:
     digest = a["input"]["digest"]
     same = bool(digest) and digest == b["input"]["digest"]
     return same and a["fixed_frame"] == b["fixed_frame"]

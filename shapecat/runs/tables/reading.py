@@ -80,7 +80,7 @@ def read_row_groups(
     ------
     OutputError : the table is missing or unreadable, or holds values that no run writes.
     """
-    with opened(path) as file:
+    with opened(path, columns=columns) as file:
         count = file.num_row_groups
         for first in range(0, count, at_once):
             groups = range(first, min(first + at_once, count))
@@ -195,17 +195,24 @@ def full_boxes_of(table: pa.Table) -> F4:
 
 
 @contextmanager
-def opened(path: Path, *, read_dictionary: Sequence[str] = ()) -> Iterator[pq.ParquetFile]:
-    """Open a table of a run folder; the columns ``read_dictionary`` are read as dictionaries.
+def opened(
+    path: Path, *, columns: Sequence[str] | None = None, read_dictionary: Sequence[str] = ()
+) -> Iterator[pq.ParquetFile]:
+    """Open a table of a run folder.
+
+    Parameters
+    ----------
+    columns : the columns to check; by default all of the table's schema.
+    read_dictionary : columns to read as dictionaries.
 
     Raises
     ------
-    OutputError : the table is missing or unreadable, or lacks a column of its schema that is not
-        in `ADDED`.
+    OutputError : the table is missing or unreadable, or lacks one of the columns that is not in
+        `ADDED`.
     """
     try:
         with _open_parquet(path, read_dictionary) as file:
-            if wrong := _wrong_column(file.schema_arrow, TABLES[path.stem]):
+            if wrong := _wrong_column(file.schema_arrow, TABLES[path.stem], columns):
                 msg = f"{path}: {wrong}; process the recording again"
                 raise OutputError(msg)
             yield file
@@ -266,9 +273,9 @@ def _open_parquet(path: Path, read_dictionary: Sequence[str]) -> pq.ParquetFile:
         raise pa.ArrowInvalid(msg) from error
 
 
-def _wrong_column(schema: pa.Schema, expected: pa.Schema) -> str:
+def _wrong_column(schema: pa.Schema, expected: pa.Schema, columns: Sequence[str] | None) -> str:
     """Describe the first column that another version, or another program, wrote otherwise."""
-    for field in expected:
+    for field in (field for field in expected if columns is None or field.name in columns):
         if field.name not in schema.names:
             if field.name in ADDED:
                 continue
@@ -282,5 +289,8 @@ def _wrong_column(schema: pa.Schema, expected: pa.Schema) -> str:
 
 
 def _file_types(kind: pa.DataType) -> tuple[pa.DataType, ...]:
-    """Return the types that a column may have in a file; earlier versions wrote no plain lists."""
-    return (kind, pa.list_(kind.value_type)) if pa.types.is_fixed_size_list(kind) else (kind,)
+    """Return the types that a column may have in a file: earlier versions wrote other lists."""
+    if not pa.types.is_fixed_size_list(kind):
+        return (kind,)
+    single = pa.list_(pa.float32(), kind.list_size)  # positions in the fixed frame
+    return (kind, pa.list_(kind.value_type), single)
