@@ -8,6 +8,8 @@ as in numpy.
 import hashlib
 import os
 import shutil
+import stat
+import tempfile
 from collections.abc import Callable
 from contextlib import suppress
 from functools import cache
@@ -67,25 +69,38 @@ def code_folder(stage: Path) -> Path | None:
 
     Its name holds a digest of all source files that the machine code can come from: numba checks
     only the file of the outermost kernel, not those of the kernels it calls. Folders of older
-    sources are removed; a process that still uses one creates it again.
+    sources are removed; a process that still uses one creates it again. A new folder begins as a
+    copy of one that is only readable, as in an image or on a shared disk.
 
     Parameters
     ----------
     stage : the folder with the source files of the stage.
     """
-    name = f"kernels-{_digest(stage)}"
+    name, readable = f"kernels-{_digest(stage)}", None
     for place in _places(stage):
         folder = place / name
         known = folder.is_dir()
+        if readable is not None and not known:
+            _copy(readable, folder)
         with suppress(OSError):
             folder.mkdir(parents=True, exist_ok=True)  # or another process has just made it
         if not (folder.is_dir() and os.access(folder, os.W_OK)):
+            readable = folder if known else readable
             continue
         for other in () if known else place.glob("kernels-*"):
             if other.name != name:
                 shutil.rmtree(other, ignore_errors=True)
         return folder
     return None
+
+
+def _copy(source: Path, target: Path) -> None:
+    """Copy a folder at once, or not at all."""
+    with suppress(OSError):
+        target.parent.mkdir(parents=True, exist_ok=True)
+        with tempfile.TemporaryDirectory(prefix="copy-", dir=target.parent) as hidden:
+            copied = shutil.copytree(source, Path(hidden, target.name))
+            copied.rename(target)  # fails if another process has made it
 
 
 def _stage_of(file: Path) -> Path:
@@ -108,7 +123,10 @@ def _digest(stage: Path) -> str:
 
 
 def _places(stage: Path) -> tuple[Path, ...]:
-    """Return the folders to try: numba's if set; else beside the files, then the user's cache."""
+    """Return the folders to try: numba's if set.
+
+    Else beside the files, then the user's cache, then a temporary folder of the user.
+    """
     mine = f"{stage.name}-{hashlib.sha256(str(stage).encode()).hexdigest()[:16]}"
     if config.CACHE_DIR:
         return (Path(config.CACHE_DIR, mine),)
@@ -116,7 +134,20 @@ def _places(stage: Path) -> tuple[Path, ...]:
     with suppress(RuntimeError):  # the user has no home
         cache = os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache"
         places.append(Path(cache, "shapecat", mine))
+    if (own := _temporary_folder()) is not None:
+        places.append(own / mine)
     return tuple(places)
+
+
+def _temporary_folder() -> Path | None:
+    """Return a folder that nobody else can write to, since machine code is loaded from it."""
+    with suppress(OSError):
+        folder = Path(tempfile.gettempdir(), f"shapecat-{os.getuid()}")
+        folder.mkdir(mode=0o700, exist_ok=True)
+        found = folder.lstat()
+        if stat.S_ISDIR(found.st_mode) and found.st_uid == os.getuid() and not found.st_mode & 0o22:
+            return folder
+    return None
 
 
 def _keep_freed_memory() -> None:

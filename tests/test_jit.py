@@ -129,12 +129,52 @@ def test_cache_folder_is_writable_or_configured(
     assert [*configured.glob("stage-*/kernels-*/**/*.nbc")]
 
 
-def test_kernel_is_compiled_without_any_cache_folder(
-    stage: Path, run: Run, monkeypatch: pytest.MonkeyPatch
+@pytest.fixture
+def no_home(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> Path:
+    """Leave only the folder of temporary files, which is returned."""
+    monkeypatch.setenv("XDG_CACHE_HOME", "/dev/null")
+    temporary = tmp_path / "tmp"
+    temporary.mkdir()
+    monkeypatch.setattr("tempfile.tempdir", str(temporary))
+    return temporary
+
+
+def test_user_who_can_write_nowhere_uses_compiled_kernels(
+    run: Run, no_home: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
+    """A container run as any user compiled for a minute at each start."""
+    assert run() == "7 0"
+    access = os.access
+    monkeypatch.setattr(
+        os, "access", lambda path, mode: str(no_home) in str(path) and access(path, mode)
+    )
+    assert run() == "7 1"
+    (own,) = no_home.iterdir()
+    assert own.stat().st_mode & 0o777 == 0o700
+    assert [*own.glob("stage-*/kernels-*")]
+    assert not [*own.glob("stage-*/copy-*")]
+
+
+@pytest.mark.usefixtures("no_home")
+def test_kernels_are_cached_for_the_next_start_without_home(stage: Path, run: Run) -> None:
+    stage.joinpath("__pycache__").write_text("")
+    assert run() == "7 0"
+    assert run() == "7 1"
+
+
+def test_machine_code_of_others_is_not_loaded(stage: Path, run: Run, no_home: Path) -> None:
+    """Any user can make a folder of this name, and put code into it."""
+    stage.joinpath("__pycache__").write_text("")
+    (no_home / f"shapecat-{os.getuid()}").mkdir()
+    (no_home / f"shapecat-{os.getuid()}").chmod(0o777)
+    assert run() == "7 0"
+    assert run() == "7 0"
+
+
+def test_kernel_is_compiled_without_any_cache_folder(stage: Path, run: Run, no_home: Path) -> None:
     """Slow is better than an error."""
     stage.joinpath("__pycache__").write_text("")
-    monkeypatch.setenv("XDG_CACHE_HOME", "/dev/null")
+    no_home.rmdir()
     assert run() == "7 0"
 
 
