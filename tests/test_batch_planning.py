@@ -2,6 +2,7 @@
 
 import json
 import os
+import time
 from collections.abc import Callable, Mapping
 from concurrent.futures import CancelledError, Executor, Future
 from dataclasses import replace
@@ -647,6 +648,20 @@ def test_interrupted_overwriting_continues(
     assert overwritten(source.parent, out, most=0, every=2)["lab"] == "new"
     assert overwritten(source.parent, out, every=2) == {"lab": "new", "other": "new"}
     assert overwritten(source.parent, out, every=2) == {"lab": "new", "other": "new"}
+
+
+def test_times_of_manifest_are_in_utc(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Machines in different zones write one manifest, of which the latest entry counts."""
+    monkeypatch.setenv("TZ", "Asia/Kathmandu")
+    time.tzset()
+    try:
+        manifest = Manifest(tmp_path / "manifest.jsonl")
+        manifest.record([Entry("a", "a.mcap", "complete")])
+    finally:
+        monkeypatch.undo()
+        time.tzset()
+
+    assert manifest.entries["a"].time.endswith("+00:00")
 
 
 def test_full_disk_leaves_no_partial_line(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

@@ -183,9 +183,12 @@ def test_coco_crowd_has_undecidable_category() -> None:
     assert pixels.tolist() == [1, 2, 5, 6]
 
 
-@pytest.mark.parametrize("own", [{"track_id": 7}, {"attributes": {"track_id": 7, "x": 3}}])
-def test_coco_tracks_are_read_from_field_or_attribute(own: dict[str, Any]) -> None:
-    """CVAT writes them as an attribute. If one object has none, identities are not compared."""
+@pytest.mark.parametrize("track", [0, 7])
+@pytest.mark.parametrize("attribute", [False, True])
+def test_coco_tracks_are_read_from_field_or_attribute(track: int, attribute: bool) -> None:
+    """CVAT writes them as an attribute, from 0. If an object has none, none are compared."""
+    own: dict[str, Any] = {"track_id": track}
+    own = {"attributes": {**own, "x": 3}} if attribute else own
     item = {"id": 1, "image_id": 2, "category_id": 4, "segmentation": [[1, 0, 3, 0, 3, 2, 1, 2]]}
     images = [{"id": 2, "frame": 5, "width": 4, "height": 3}]
     content = {"categories": [{"id": 4, "name": "cup"}], "images": images}
@@ -194,7 +197,7 @@ def test_coco_tracks_are_read_from_field_or_attribute(own: dict[str, Any]) -> No
     found = labels.at(("/d", 5), 0)
 
     assert found is not None
-    assert [known.track for known in found.items] == [7]
+    assert [known.track for known in found.items] == [track]
     assert (labels.tracked, mixed.tracked) == (True, False)
 
 
