@@ -24,7 +24,6 @@ from shapecat.tracking import (
 from shapecat.tracking.association import assign, size_key
 from shapecat.tracking.common_motion import find_common_motion
 from shapecat.tracking.detection_table import gather
-from shapecat.tracking.false_tracks import without_duplicates
 from shapecat.tracking.fusion import fuse_novelty, view_weights
 from shapecat.tracking.recording import _without_gaps
 
@@ -496,10 +495,12 @@ def test_objects_merged_by_one_sensor_stay_two_tracks() -> None:
     assert min(track.hits for track in tracks) >= 20
 
 
-def test_object_put_into_bowl_gets_own_track() -> None:
+@pytest.mark.parametrize("count", [4, 8])
+def test_object_put_into_bowl_gets_own_track(count: int) -> None:
+    """Also if it is put there just before the end of the recording."""
     bowl, filled = [(0.0, 0.2)], [(0.0, 0.2), (0.1, 0.16)]
-    tracks = tuple(track_recording(boxed([bowl] * 30 + [filled] * 8), SETTINGS))
-    assert sorted(track.hits for track in tracks) == [8, 38]
+    tracks = tuple(track_recording(boxed([bowl] * 30 + [filled] * count), SETTINGS))
+    assert sorted(track.hits for track in tracks) == [count, 30 + count]
 
 
 def test_object_in_bowl_keeps_its_track_if_it_is_missed_once() -> None:
@@ -783,34 +784,6 @@ def test_confirmed_track_ends_by_elapsed_time_alone(hits: int, alive: int) -> No
 
     assert tracker._active is not None
     assert len(tracker._active.ids) == alive
-
-
-@pytest.mark.parametrize(
-    ("begin", "x", "kept"),
-    [
-        (10, 0.01, False),  # inside the host, during its frames
-        (10, 0.2, True),  # beside the host
-        (25, 0.01, False),  # outlasts the host by a frame
-        (2, 0.01, False),  # begins a frame before the host
-        (27, 0.01, True),  # at the same place, after the host
-        (0, 0.01, True),  # and before it
-    ],
-)
-def test_short_track_inside_longer_one_is_removed(begin: int, x: float, *, kept: bool) -> None:
-    host, duplicate = range(3, 27), range(begin, begin + 3)
-    members: tuple[list[int], list[int]] = ([], [])
-    frames, count = [], 0
-    for k in range(30):
-        places = [[0.0, 0, 0]] * (k in host) + [[x, 0.0, 0]] * (k in duplicate)
-        frames.append(frame(k, places))
-        for index, present in enumerate((k in host, k in duplicate)):
-            members[index].extend([count] * present)
-            count += present
-    tracks = [np.array(member) for member in members]
-
-    found = without_duplicates(next(gather(frames)), tracks)
-
-    assert [len(member) for member in found] == ([24, 3] if kept else [24])
 
 
 def test_cup_shown_briefly_beside_tall_bottle_keeps_its_track() -> None:

@@ -1,43 +1,15 @@
 """Removal of false tracks: pieces of objects that were split in some frames."""
 
 from collections.abc import Sequence
-from functools import cache
 
 import numpy as np
 
 from shapecat.arrays import F8, I4, Bool
 from shapecat.tracking.detection_table import DetectionTable
 
-__all__ = ["without_duplicates", "without_pieces"]
+__all__ = ["without_pieces"]
 
-_LONGER = 5  # a track is removed only inside one that has this many times as many detections
 _COVERED = 0.5  # ratio of covered frames to detections above which a track is a piece
-
-
-def without_duplicates(table: DetectionTable, tracks: Sequence[I4]) -> list[I4]:
-    """Remove short tracks near the centre of much longer ones: pieces of a briefly split object.
-
-    A real object is rarely that close to another one's centre. ``tracks`` are the indices
-    (k,) of the detections of each track, ascending.
-    """
-    lengths = np.array([len(track) for track in tracks])
-    first = np.array([table.rows[track[0]] for track in tracks])
-    last = np.array([table.rows[track[-1]] for track in tracks])
-    radius = cache(lambda k: 0.6 * float(np.median(table.sizes[tracks[k]], axis=0).min()))
-    result = []
-    for track in tracks:
-        low, high = table.rows[track[0]], table.rows[track[-1]]
-        hosts = (_LONGER * len(track) <= lengths) & (first <= high) & (last >= low)
-        places = np.flatnonzero(hosts).tolist()
-        if not any(_inside(table, track, tracks[k], radius(k)) for k in places):
-            result.append(track)
-    return result
-
-
-def _inside(table: DetectionTable, track: I4, host: I4, radius: float) -> bool:
-    place = table.positions(host, table.rows[track])
-    distance = np.linalg.norm(table.centers[track] - place, axis=1)
-    return bool(np.median(distance) <= radius)
 
 
 def without_pieces(table: DetectionTable, tracks: Sequence[I4], max_gap_s: float) -> list[I4]:

@@ -9,7 +9,7 @@ from shapecat.arrays import F8, I4, Bool
 from shapecat.config import TrackingSettings
 from shapecat.tracking.common_motion import CommonMotion, find_common_motion
 from shapecat.tracking.detection_table import DetectionTable, gather
-from shapecat.tracking.false_tracks import without_duplicates, without_pieces
+from shapecat.tracking.false_tracks import without_pieces
 from shapecat.tracking.fusion import causal, fuse, fuse_novelty
 from shapecat.tracking.pieces import join_pieces
 from shapecat.tracking.records import FrameDetections, Track
@@ -92,8 +92,7 @@ def _follow(table: DetectionTable, settings: TrackingSettings) -> list[I4]:
     ]
     chains = _groups(merge_fragments(_describe(table, fragments, scenes), settings))
     tracks = [np.sort(np.concatenate([fragments[k] for k in c])) for c in chains if len(c)]
-    tracks = join_pieces(table, tracks)
-    return without_pieces(table, without_duplicates(table, tracks), settings.max_missed_s)
+    return without_pieces(table, join_pieces(table, tracks), settings.max_missed_s)
 
 
 def _associate(table: DetectionTable, cuts: Bool, settings: TrackingSettings) -> I4:
