@@ -346,7 +346,6 @@ def test_repeatedly_hidden_object_is_one_track() -> None:
             },
             False,
         ),
-        ({"start": [[0, 0, 0], [0.3, 0, 0]], "rest": [[0.3, 0, 0], [np.nan] * 3]}, True),
         ({"first_ns": [0, SECOND]}, False),  # the first one lasts until 2 s: they overlap
     ],
 )
@@ -360,7 +359,6 @@ def test_contradicting_fragments_are_not_joined(options: dict[str, Any], joined:
         "end_velocity": np.zeros((2, 3)),
         "sizes": np.full((2, 3), 0.1),
         "whole": [20, 20],
-        "rest": np.full((2, 3), np.nan),
         "posteriors": [[0.8, 0.2], [0.7, 0.3]],
         "cut": [[False, False], [False, False]],
         "novelties": [0.5, 0.5],
@@ -807,7 +805,6 @@ def test_fragment_is_joined_to_only_one_of_two_predecessors() -> None:
         "end_velocity": np.zeros((3, 3)),
         "sizes": np.full((3, 3), 0.1),
         "whole": [20, 20, 20],
-        "rest": np.full((3, 3), np.nan),
         "posteriors": [[0.8, 0.2]] * 3,
         "cut": [[False, False]] * 3,
         "novelties": [0.5] * 3,

@@ -238,7 +238,6 @@ def fragments(**changes: Any) -> Fragments:
         "end_velocity": np.array([[0.1, 0.14, -0.04], [0, 0, 0], [0, 0, 0]]),
         "sizes": np.full((3, 3), 0.1),
         "whole": np.array([3, 9, 9]),
-        "rest": np.array([[0.8, -0.3, 0.4], [np.nan] * 3, [0.5, 0.1, 0.1]]),
         "cut": np.zeros((3, 2), bool),
         "posteriors": np.full((3, 2), 0.5),
         "novelties": np.zeros(3),
@@ -247,16 +246,14 @@ def fragments(**changes: Any) -> Fragments:
     return Fragments(*(columns | changes).values())
 
 
-def test_distance_of_fragments_is_shortest_of_five() -> None:
-    """From its end or rest to their start or rest, or halfway along both motions."""
+def test_distance_of_fragments_is_shorter_of_two() -> None:
+    """From end to start, or halfway along both motions."""
     found = _distances(fragments(), 0, np.array([1, 2]), SETTINGS)
 
     # Halfway through the second between them: (.45, .17, .08) and (.44, .17, .09).
     assert found[0] == pytest.approx(np.hypot(0.01, 0.01))
-    assert found[1] == pytest.approx(0.1)  # its rest is as near to the end of the first one
-    moving = fragments(rest=np.full((3, 3), np.nan))
-    far = _distances(moving, 0, np.array([2]), SETTINGS)  # after 28 s a velocity means nothing
-    assert far == pytest.approx(np.linalg.norm([0.5, -0.4, 0.3]))
+    # After 28 s a velocity means nothing.
+    assert found[1] == pytest.approx(np.linalg.norm([0.5, -0.4, 0.3]))
 
 
 @pytest.mark.parametrize(

@@ -21,7 +21,6 @@ __all__ = ["track_recording"]
 _BURST_NS = 500_000_000
 """Frames this near to a track's first one decide how many detections confirm it."""
 
-_STILL_M = 0.05  # a track's centres spread less than this while its object stands still
 _GAP_S, _GAP_FRAMES = 0.7, 5  # after a longer gap, the next detection begins a new fragment
 _LINE = 10  # detections at either end of a track from which its motion is estimated
 
@@ -143,7 +142,6 @@ def _describe(table: DetectionTable, fragments: Sequence[I4], scenes: I4) -> Fra
         end_velocity=np.reshape([velocity for _, velocity in ends], (n, 3)),
         sizes=np.reshape([_extent(table, f) for f in fragments], (n, 3)),
         whole=np.array([np.sum(~table.partial[f]) for f in fragments], np.int32),
-        rest=np.reshape([_resting_position(table, f) for f in fragments], (n, 3)),
         cut=np.reshape([table.partial[f[[0, -1]]] for f in fragments], (n, 2)),
         posteriors=np.reshape([posterior for posterior, _ in fused], (n, -1 if n else 0)),
         novelties=np.array([novelty for _, novelty in fused]),
@@ -167,17 +165,6 @@ def _extent(table: DetectionTable, track: I4) -> F8:
     if len(complete):
         return np.asarray(np.median(table.sizes[complete].astype(np.float64), axis=0))
     return np.asarray(table.sizes[track].max(axis=0))
-
-
-def _resting_position(table: DetectionTable, track: I4) -> F8:
-    """Return the median position (3,) of the whole views; NaN if they move or are too few."""
-    complete = table.centers[track[~table.partial[track]]]
-    if (
-        len(complete) < _LINE
-        or np.ptp(np.quantile(complete, [0.1, 0.9], axis=0), axis=0).max() > _STILL_M
-    ):
-        return np.full(3, np.nan)
-    return np.asarray(np.median(complete, axis=0))
 
 
 def _line(table: DetectionTable, detections: I4, at: int) -> tuple[F8, F8]:

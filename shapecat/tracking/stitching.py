@@ -35,7 +35,6 @@ class Fragments(Record):
     start_velocity, end_velocity : (f, 3) velocities at these times, m/s.
     sizes : (f, 3) typical box lengths, metres.
     whole : (f,) number of views that seem to show the whole object.
-    rest : (f, 3) position in these views, metres; NaN if the object moves.
     cut : (f, 2) whether the first and the last view are partial.
     posteriors : (f, c) fused posteriors.
     novelties : (f,) fused novelties; above 1, the posterior is meaningless.
@@ -50,7 +49,6 @@ class Fragments(Record):
     end_velocity: F8 = array("f 3", "f8")
     sizes: F8 = array("f 3", "f8")
     whole: I4 = array("f", "i4")
-    rest: F8 = array("f 3", "f8")
     cut: Bool = array("f 2", "?")
     posteriors: F8 = array("f c", "f8")
     novelties: F8 = array("f", "f8")
@@ -125,18 +123,15 @@ def _successors(fragments: Fragments, limit: F8, settings: TrackingSettings) -> 
     """Yield, for each fragment, later ones that start near its position or soon after its end."""
     if len(limit) == 0:
         return
-    rests = np.isfinite(fragments.rest)
-    starts = (fragments.start, np.where(rests, fragments.rest, fragments.start))
-    ends = (fragments.end, np.where(rests, fragments.rest, fragments.end))
-    trees = [cKDTree(places) for places in starts]
+    tree = cKDTree(fragments.start)
     order = np.argsort(fragments.first_ns, kind="stable")
     first = fragments.first_ns[order]
     window = int(min(settings.max_missed_s * 1e9, 2**62))
     for i, end in enumerate(fragments.last_ns):
         # One by one, as all together would be lists of millions of numbers after some hours.
-        places = [tree.query_ball_point(e[i], limit[i]) for tree in trees for e in ends]
+        near = tree.query_ball_point(fragments.end[i], limit[i], return_sorted=True)
+        for_place = np.array(near, np.int64)
         low, high = np.searchsorted(first, [end, end + window], side="right")
-        for_place = np.unique(np.concatenate([np.array(p, np.int64) for p in places]))
         for_place = for_place[fragments.first_ns[for_place] > end]
         for_place = for_place[np.argsort(fragments.first_ns[for_place], kind="stable")]
         after = np.union1d(for_place[:_LOOKAHEAD], order[low:high][: 4 * _LOOKAHEAD])
@@ -146,17 +141,10 @@ def _successors(fragments: Fragments, limit: F8, settings: TrackingSettings) -> 
 def _distances(fragments: Fragments, i: int, after: I4, settings: TrackingSettings) -> F8:
     """Return the distances (k,), metres, between the end of fragment i and the starts of ``after``.
 
-    Resting positions count like ends and starts, since objects that enter or leave the view are
-    only partly visible there. Over a short gap, both ends are also extrapolated with their
-    velocities to the middle of the gap. The smallest distance counts.
+    Over a short gap, both are also extrapolated with their velocities to the middle of the gap; the
+    smaller distance counts.
     """
-    steps = (
-        fragments.start[after] - fragments.end[i],
-        fragments.start[after] - fragments.rest[i],
-        fragments.rest[after] - fragments.end[i],
-        fragments.rest[after] - fragments.rest[i],
-    )
-    resting = np.min(np.nan_to_num(np.linalg.norm(steps, axis=2), nan=np.inf), axis=0)
+    resting = np.linalg.norm(fragments.start[after] - fragments.end[i], axis=1)
     gap_s = (fragments.first_ns[after] - fragments.last_ns[i])[:, None] * 1e-9
     meeting = (fragments.start[after] - 0.5 * gap_s * fragments.start_velocity[after]) - (
         fragments.end[i] + 0.5 * gap_s * fragments.end_velocity[i]
