@@ -517,6 +517,13 @@ def test_object_put_onto_plate_on_tray_gets_own_track() -> None:
 
 
 def test_object_entering_view_in_fragments_is_one_track() -> None:
+def test_object_in_bowl_whose_size_varies_keeps_its_track() -> None:
+    """In every other frame the far rim is missing, so that the bowl is smaller than it was."""
+    small, bowl, inside = (0.0, 0.18), (0.0, 0.2), (0.1, 0.16)
+    tracks = track_recording(boxed([[small, inside], [bowl, inside]] * 15), SETTINGS)
+    assert [track.hits for track in tracks] == [30, 30]
+
+
     """Only its later size shows that they are fragments."""
     whole, split = [(0.0, 0.2)], [(0.0, 0.08), (0.08, 0.2)]
     tracks = tuple(track_recording(boxed([split] * 12 + [whole] * 30), SETTINGS))

@@ -15,8 +15,8 @@ __all__ = ["join_pieces"]
 
 _NEAR_M = 0.35  # largest distance between the centres of pieces
 _SLACK, _SLACK_M = 1.1, 0.01  # factor and length by which the pieces may exceed the whole object
-_LACKING = 0.95  # some length of a piece is less than this fraction of the whole object's
-_MOSTLY = 0.34  # fraction of the common frames in which two tracks must be pieces
+_LACKING = 0.95  # some length of both pieces is less than this fraction of their joint box's
+_MOSTLY = 0.5  # fraction of the common frames in which two tracks must be pieces
 _PASSING = 0.25  # largest overlap in time of two tracks while an object passes an occluder
 _CHANGING = 0.5  # the same, if one detection sometimes covers both sides of the occluder
 
@@ -151,15 +151,15 @@ def _fit(table: DetectionTable, pairs: I4, wholes: F8) -> Bool:
     """Return the mask (p,) of pairs of detections (p, 2) that are pieces of one object.
 
     ``wholes`` (p, 2, 3) are the lengths of the whole object from either track. The joint box of two
-    pieces is no larger than the whole object, and neither piece is as large as the whole object, as
-    a bowl with an object in it would be.
+    pieces is no larger than the whole object, and neither piece fills the joint box, as a bowl with
+    an object in it would.
     """
     joint = np.minimum(_joint(table, pairs), _joint(table, pairs[:, ::-1]))
     lengths = sorted_sides(table.sizes[pairs.ravel()]).reshape(-1, 2, 3)
     room = wholes * _SLACK + _SLACK_M
-    lacking = np.any(lengths.max(axis=1)[:, None] < _LACKING * wholes, axis=2)
+    lacking = np.any(lengths.max(axis=1) < _LACKING * joint, axis=1)
     fitting = np.all(joint[:, None] <= room, axis=2)
-    return np.asarray(np.any(fitting & lacking, axis=1))
+    return np.asarray(lacking & np.any(fitting, axis=1))
 
 
 def _joint(table: DetectionTable, pairs: I4) -> F8:
