@@ -474,6 +474,14 @@ def test_burst_of_splits_gets_no_track() -> None:
     assert [track.hits for track in tracks] == [46]
 
 
+@pytest.mark.parametrize("before", [20, 2])
+def test_piece_that_stands_out_of_its_object_gets_no_track(before: int) -> None:
+    """Both pieces together are too large for the object, which encloses the piece's centre."""
+    whole, split = [(0.0, 0.2)], [(0.0, 0.2), (0.13, 0.25)]
+    frames = boxed([whole] * before + [split] * 6 + [whole] * 20)
+    assert [track.hits for track in track_recording(frames, SETTINGS)] == [before + 26]
+
+
 def test_neighbours_merged_in_some_frames_stay_two_tracks() -> None:
     one, two = [(0.0, 0.2)], [(0.0, 0.1), (0.1, 0.2)]
     tracks = tuple(track_recording(boxed(([two] * 9 + [one]) * 4), SETTINGS))
@@ -509,6 +517,13 @@ def test_object_in_bowl_keeps_its_track_if_it_is_missed_once() -> None:
     assert sorted(track.hits for track in tracks) == [8, 39]
 
 
+def test_object_in_bowl_whose_size_varies_keeps_its_track() -> None:
+    """In every other frame the far rim is missing, so that the bowl is smaller than it was."""
+    small, bowl, inside = (0.0, 0.18), (0.0, 0.2), (0.1, 0.16)
+    tracks = track_recording(boxed([[small, inside], [bowl, inside]] * 15), SETTINGS)
+    assert [track.hits for track in tracks] == [30, 30]
+
+
 def test_object_put_onto_plate_on_tray_gets_own_track() -> None:
     """Plate and tray both enclose its place before, which is evidence from one side only."""
     empty = [(0.0, 0.4), (0.08, 0.26)]
@@ -517,13 +532,6 @@ def test_object_put_onto_plate_on_tray_gets_own_track() -> None:
 
 
 def test_object_entering_view_in_fragments_is_one_track() -> None:
-def test_object_in_bowl_whose_size_varies_keeps_its_track() -> None:
-    """In every other frame the far rim is missing, so that the bowl is smaller than it was."""
-    small, bowl, inside = (0.0, 0.18), (0.0, 0.2), (0.1, 0.16)
-    tracks = track_recording(boxed([[small, inside], [bowl, inside]] * 15), SETTINGS)
-    assert [track.hits for track in tracks] == [30, 30]
-
-
     """Only its later size shows that they are fragments."""
     whole, split = [(0.0, 0.2)], [(0.0, 0.08), (0.08, 0.2)]
     tracks = tuple(track_recording(boxed([split] * 12 + [whole] * 30), SETTINGS))
