@@ -5,12 +5,14 @@ import logging
 import os
 import subprocess
 import sys
+import threading
 import time
 import weakref
 from collections.abc import Iterator
 from concurrent.futures import Executor
 from copy import deepcopy
 from itertools import count
+from multiprocessing import active_children
 from pathlib import Path
 from queue import SimpleQueue
 from types import SimpleNamespace
@@ -136,6 +138,49 @@ def test_terminate_kills_running_tasks(tmp_path: Path) -> None:
     assert not alive(int((tmp_path / "pid").read_text()))
     with pytest.raises(RuntimeError):
         one.submit(abs, -1)
+
+
+def _refuse_threads(monkeypatch: pytest.MonkeyPatch, target: str, *, after: int = 0) -> None:
+    """Refuse further threads that run a method, as a limit of processes does."""
+    start, started = threading.Thread.start, count()
+
+    def limited(thread: threading.Thread) -> None:
+        if target in repr(getattr(thread, "_target", "")) and next(started) >= after:
+            msg = "can't start new thread"
+            raise RuntimeError(msg)
+        start(thread)
+
+    monkeypatch.setattr(threading.Thread, "start", limited)
+
+
+def test_worker_without_listener_does_not_survive(monkeypatch: pytest.MonkeyPatch) -> None:
+    """At the limit of processes, the command would wait at its end for the idle worker."""
+    others = {*active_children()}
+    _refuse_threads(monkeypatch, "Worker._listen")
+
+    with LocalExecutor(1) as executor:
+        error = executor.submit(abs, -1).exception()
+
+        assert isinstance(error, WorkerLostError)
+        assert "no worker process can be started: can't start new thread" in str(error)
+        assert {*active_children()} <= others
+
+
+def test_fewer_threads_than_workers_do_all_tasks(monkeypatch: pytest.MonkeyPatch) -> None:
+    """At the limit of processes, a batch would end with a traceback."""
+    _refuse_threads(monkeypatch, "LocalExecutor._dispatch", after=1)
+
+    with LocalExecutor(2) as executor:
+        assert list(executor.map(abs, [-1, -2])) == [1, 2]
+
+
+def test_pool_without_threads_works_alone(monkeypatch: pytest.MonkeyPatch) -> None:
+    """At the limit of processes, a recording would fail although this process can read it."""
+    _refuse_threads(monkeypatch, "LocalExecutor._dispatch")
+
+    alone: OrderedPool[int, int] = OrderedPool(abs, 2)
+    with alone as pool:
+        assert list(pool.in_order(enumerate([-5, -6, -7]))) == [(0, 5), (1, 6), (2, 7)]
 
 
 def test_stopping_executor_interrupts_tasks(tmp_path: Path) -> None:

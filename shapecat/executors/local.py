@@ -16,6 +16,7 @@ from shapecat.executors.worker import Task, Worker, WorkerLostError
 __all__ = ["LocalExecutor"]
 
 _SIGNALS = {signal.SIGINT, signal.SIGTERM}
+_NOT_STARTED = "no worker process can be started"
 
 
 class LocalExecutor(WorkerExecutor):
@@ -45,15 +46,18 @@ class LocalExecutor(WorkerExecutor):
         self._closed = False
         self._workers: dict[int, Worker] = {}
         self._lock = threading.Lock()
-        self._dispatchers = [
-            threading.Thread(target=self._dispatch, args=(k,), daemon=True) for k in range(workers)
-        ]
-        for dispatcher in self._dispatchers:
-            dispatcher.start()
+        self._dispatchers: list[threading.Thread] = []
+        for k in range(workers):
+            dispatcher = threading.Thread(target=self._dispatch, args=(k,), daemon=True)
+            try:
+                dispatcher.start()
+            except RuntimeError:  # the limit of processes is reached: those that started share
+                break
+            self._dispatchers.append(dispatcher)
         atexit.register(self.terminate)
 
     def submit(self, fn: Callable[..., Any], /, *args: Any, **kwargs: Any) -> Future[Any]:
-        """Queue a call; its future raises `WorkerLostError` if the worker dies.
+        """Queue a call; its future raises `WorkerLostError` if no worker starts, or it dies.
 
         Raises
         ------
@@ -63,7 +67,10 @@ class LocalExecutor(WorkerExecutor):
             msg = "cannot submit after shutdown"
             raise RuntimeError(msg)
         task = Task(Future(), (fn, args, kwargs))
-        self._tasks.put(task)
+        if self._dispatchers:
+            self._tasks.put(task)
+        else:
+            task.future.set_exception(WorkerLostError(f"{_NOT_STARTED}: too many threads"))
         return task.future
 
     def shutdown(self, wait: bool = True, *, cancel_futures: bool = False) -> None:  # noqa: FBT001, FBT002  as in the base class
@@ -134,8 +141,8 @@ class LocalExecutor(WorkerExecutor):
                     raise WorkerLostError(msg)
                 try:
                     self._workers[slot] = Worker(capacity)
-                except OSError as error:
-                    msg = f"no worker process can be started: {error}"
+                except (OSError, RuntimeError) as error:  # of processes, and of threads
+                    msg = f"{_NOT_STARTED}: {error}"
                     raise WorkerLostError(msg) from error
             return self._workers[slot]
 

@@ -46,7 +46,12 @@ class Worker:
     """
 
     def __init__(self, capacity: threading.Semaphore) -> None:
-        """Start a process; each result releases ``capacity``."""
+        """Start a process; each result releases ``capacity``.
+
+        Raises
+        ------
+        OSError, RuntimeError : the process, or the thread, cannot be started.
+        """
         self.lost = False
         self._socket, child_socket = socket.socketpair()
         stop_pipe, self._stop_pipe = _SPAWN.Pipe(duplex=False)
@@ -58,7 +63,13 @@ class Worker:
         stop_pipe.close()
         self._sent: SimpleQueue[Task | None] = SimpleQueue()
         self._listener = threading.Thread(target=self._listen, args=(capacity,), daemon=True)
-        self._listener.start()
+        try:
+            self._listener.start()
+        except RuntimeError:  # at exit, this process would wait for the idle one
+            self.process.kill()
+            self.process.join()
+            self._socket.close()
+            raise
 
     def ask_to_stop(self) -> None:
         """Make `stopping.asked` return True in the process."""
