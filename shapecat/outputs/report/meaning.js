@@ -35,8 +35,8 @@ function misread(label, names) {
     return "A name begins with a letter, and has at most 60 letters, digits, spaces and - _ . + & ' ( )";
   }
   const allowed = (other) => (Math.min(name.length, other.length) < 5 ? 1 : 2);
-  const near = [...names, "delete"].find((other) => slips(name, other) <= allowed(other));
-  if (near && !NEW.test(label)) return `Did you mean ${near}? For a new category write: new ${label}`;
+  const near = !NEW.test(label) && [...names, "delete"].find((other) => slips(name, other) <= allowed(other));
+  if (near) return `Did you mean ${near}? For a new category write: new ${label}`;
   names.add(name);
   return "";
 }

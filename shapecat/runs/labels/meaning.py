@@ -184,8 +184,8 @@ def _understand(label: str, names: dict[str, str]) -> _Verdict:
         hint = "" if _NAME.fullmatch(_without_marks(name)) else f"; a category is {NAME_RULE}"
         msg = f"{label!r} is not a category, `{DELETE}` or `merge with N`{hint}"
         raise ValueError(msg)
-    nearest = _nearest(name.lower(), [*names, DELETE])
-    if nearest and not new:
+    nearest = None if new else _nearest(name.lower(), [*names, DELETE])
+    if nearest:
         suggestion = names.get(nearest, nearest)
         msg = f"{label!r}: did you mean {suggestion}? For a new category write `new {name}`"
         raise ValueError(msg)
