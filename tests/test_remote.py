@@ -29,7 +29,7 @@ from shapecat.batch.finding_urls import stat_url
 from shapecat.batch.manifest import Entry, RemoteManifest
 from shapecat.batch.remote import TaskKey, _download, _fetch_run, process_remote, upload
 from shapecat.batch.storage import Location, names_in
-from shapecat.errors import OutputError, RecordingError
+from shapecat.errors import OutputError, RecordingError, explained
 from shapecat.runs.folder import RUN_FILES, made_by_run, read_run
 from shapecat.runs.jobs import Job, Summary
 from shapecat.system.files import scratch_folder
@@ -616,6 +616,24 @@ def test_run_of_an_earlier_version_at_url_can_be_overwritten(tmp_path: Path) -> 
     job = dataclasses.replace(job, folder=tmp_path / "again", overwrite=True)
     assert _fetch_run(job) == (job, None)
     assert made_by_run(job.folder) is not None
+
+
+def test_full_scratch_is_not_blamed_on_the_url(
+    own_scratch: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """A user of a bucket was told that it has no space left."""
+
+    def process(job: Job, *_: object, **__: object) -> None:
+        with explained(f"{job.folder}: cannot write the results", OutputError):
+            raise OSError(errno.ENOSPC, "No space left on device")
+
+    monkeypatch.setattr("shapecat.batch.remote.process", process)
+    job = Job(Path("a.mcap"), Path("lab"), target="memory://full/lab")
+
+    with pytest.raises(OutputError, match=r"No space left on device.*TMPDIR") as raised:
+        process_remote(job, lambda *_: None, cores=1, key=TaskKey("one"))
+
+    assert str(own_scratch) in str(raised.value)
 
 
 def test_summary_names_run_folder_not_scratch(

@@ -5,10 +5,12 @@ uploaded last; without run.json, its files do not count as a run.
 """
 
 import dataclasses
+import errno
 from contextlib import nullcontext, suppress
 from dataclasses import dataclass
 from fnmatch import fnmatchcase
 from pathlib import Path
+from tempfile import gettempdir
 
 from shapecat.batch.claims import Claim, claimed
 from shapecat.batch.storage import Location, names_in
@@ -101,7 +103,18 @@ def _process(job: Job, local: Job, observe: Observer, cores: int) -> Summary:
     except ShapecatError as error:
         text = str(error).replace(str(local.source), job.name)
         text = text.replace(str(local.folder), job.target or str(local.folder))
+        if job.target and _is_disk_full(error):
+            text += f"; it is the scratch space {gettempdir()} that is full: set TMPDIR"
         raise type(error)(text) from error
+
+
+def _is_disk_full(error: BaseException | None) -> bool:
+    """Return whether an error, or one that caused it, tells of a full disk."""
+    while error is not None:
+        if isinstance(error, OSError) and error.errno in {errno.ENOSPC, errno.EDQUOT}:
+            return True
+        error = error.__cause__
+    return False
 
 
 def _download(url: str, folder: Path) -> Path:
