@@ -8,6 +8,7 @@ from typing import Any
 import pytest
 
 from shapecat.errors import OutputError, RecordingError
+from shapecat.recordings.files import input_files
 from shapecat.runs.finished import open_source, require_recordings
 from shapecat.runs.folder import (
     previous_path,
@@ -260,6 +261,14 @@ def test_name_too_long_for_hidden_folder_is_explained(tmp_path: Path, length: in
         recover(folder)
         with staged(folder):
             pytest.fail("there is no such folder")
+
+
+def test_longest_name_of_a_recording_is_read(tmp_path: Path) -> None:
+    """The name of its write-ahead log would be too long; asking for that was a traceback."""
+    path = tmp_path / ("n" * 250 + ".mcap")
+    path.write_bytes(b"abc")
+
+    assert input_files(path) == [path]
 
 
 def test_digest_covers_whole_file(tmp_path: Path) -> None:

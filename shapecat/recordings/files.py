@@ -1,5 +1,6 @@
 """The files of a recording: a single file, or those of a ROS 2 bag in a folder."""
 
+import os
 from pathlib import Path
 
 __all__ = ["input_files", "input_size", "is_of_bag", "write_ahead_log"]
@@ -17,7 +18,8 @@ def is_of_bag(name: str) -> bool:
 def write_ahead_log(database: Path) -> Path | None:
     """Return the log beside a database with messages that are not in it; None without any."""
     log = database.with_name(f"{database.name}{_LOG}")
-    return log if log.is_file() and log.stat().st_size else None
+    there = os.path.isfile(log)  # noqa: PTH113  the other raises if its name is too long
+    return log if there and log.stat().st_size else None
 
 
 def input_files(path: Path) -> list[Path]:
