@@ -100,6 +100,8 @@ def _copy(source: Path, target: Path) -> None:
         target.parent.mkdir(parents=True, exist_ok=True)
         with tempfile.TemporaryDirectory(prefix="copy-", dir=target.parent) as hidden:
             copied = shutil.copytree(source, Path(hidden, target.name))
+            for folder, *_ in os.walk(copied):
+                Path(folder).chmod(0o700)  # installations may be read-only for their owner, too
             copied.rename(target)  # fails if another process has made it
 
 
