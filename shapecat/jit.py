@@ -10,7 +10,7 @@ import os
 import shutil
 import stat
 import tempfile
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from contextlib import suppress
 from functools import cache
 from pathlib import Path
@@ -124,21 +124,25 @@ def _digest(stage: Path) -> str:
     return digest.hexdigest()[:16]
 
 
-def _places(stage: Path) -> tuple[Path, ...]:
-    """Return the folders to try: numba's if set.
+def _places(stage: Path) -> Iterator[Path]:
+    """Yield the folders to try: numba's alone if set.
 
-    Else beside the files, then the user's cache, then a temporary folder of the user.
+    Else beside the files, then the user's cache, then a temporary folder of the user, which is made
+    only if it is needed.
     """
     mine = f"{stage.name}-{hashlib.sha256(str(stage).encode()).hexdigest()[:16]}"
     if config.CACHE_DIR:
-        return (Path(config.CACHE_DIR, mine),)
-    places = [stage / "__pycache__"]
-    with suppress(RuntimeError):  # the user has no home
-        cache = os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache"
-        places.append(Path(cache, "shapecat", mine))
+        yield Path(config.CACHE_DIR, mine)
+        return
+    yield stage / "__pycache__"
+    cache: str | Path | None = os.environ.get("XDG_CACHE_HOME")
+    if not cache:
+        with suppress(RuntimeError):  # the user has no home
+            cache = Path.home() / ".cache"
+    if cache:
+        yield Path(cache, "shapecat", mine)
     if (own := _temporary_folder()) is not None:
-        places.append(own / mine)
-    return tuple(places)
+        yield own / mine
 
 
 def _temporary_folder() -> Path | None:

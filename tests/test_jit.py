@@ -144,6 +144,7 @@ def test_user_who_can_write_nowhere_uses_compiled_kernels(
 ) -> None:
     """A container run as any user compiled for a minute at each start."""
     assert run() == "7 0"
+    assert not [*no_home.iterdir()], "nothing was needed there"
     for folder, *_ in os.walk(stage / "__pycache__", topdown=False):
         Path(folder).chmod(0o555)
     access = os.access

@@ -507,7 +507,7 @@ def test_images_without_certain_objects_are_omitted(monkeypatch: pytest.MonkeyPa
 
     left_out = Counter[str]()
     stems = {"/depth": "lab"}
-    found = images_of(finished, Selection(), stems=stems, left_out=left_out, tick=lambda: None)
+    found = images_of(finished, Selection(), stems=stems, left_out=left_out)
 
     assert list(found) == [images[1], images[4]]
     assert left_out == {"no image": 1, "no object with a reliable label": 2}

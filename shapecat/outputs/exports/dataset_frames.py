@@ -2,7 +2,7 @@
 
 import logging
 from collections import Counter
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -21,7 +21,7 @@ from shapecat.recordings import MessageError
 from shapecat.recordings.decoding.colour_image import encoded, pixels_of
 from shapecat.runs.finished import FinishedRun, open_source
 from shapecat.runs.labels.track_table import read_track_table
-from shapecat.system.progress import observed
+from shapecat.system.progress import Observer, ignore, observed
 from shapecat.types import UNKNOWN, Frame, LabelledFrame, LabelledObject
 
 __all__ = [
@@ -116,7 +116,7 @@ def images_of(
     *,
     stems: Mapping[str, str],
     left_out: Counter[str],
-    tick: Callable[[], None],
+    observe: Observer = ignore,
 ) -> Iterator[DatasetImage]:
     """Yield the images of a run with at least one object to train on; log damaged images.
 
@@ -127,7 +127,7 @@ def images_of(
     recording : path of the recording; by default where it was processed.
     stems : how the names of the images of each topic begin.
     left_out : counts the other frames by reason.
-    tick : called after each frame of the run, also those that are left out.
+    observe : called after each frame of the run, also those that are left out.
 
     Raises
     ------
@@ -138,8 +138,8 @@ def images_of(
     corrected = {track for track, label in labels.items() if label}
     chosen = _chosen(finished, selection, corrected)
     with open_source(finished.run, recording) as source:
-        ticking = observed(finished.frames(), "export", None, lambda *_: tick())
-        frames = (f for f in ticking if (f.topic, f.index) in chosen)
+        every = observed(finished.frames(), "export", None, observe)
+        frames = (f for f in every if (f.topic, f.index) in chosen)
         for labelled, frame, coloured in with_colour(frames, source, finished.run):
             name = f"{stems[labelled.topic]}_{labelled.index:06d}"
             try:

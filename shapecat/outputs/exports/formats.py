@@ -1,5 +1,6 @@
 """Export the labels of runs in the formats of other tools."""
 
+import itertools
 import json
 import math
 from collections import Counter
@@ -161,12 +162,10 @@ def export_dataset(
     total = sum(int(run.run["counts"]["frames"]) for run in runs)
 
     counts, left_out = Counter[str](), Counter[str]()
-    uncertain = done = 0
+    uncertain, done = 0, itertools.count(1)
 
-    def tick() -> None:
-        nonlocal done
-        done += 1
-        observe("export", done, total)
+    def tell(*_: object) -> None:
+        observe("export", next(done), total)
 
     def images() -> Iterator[tuple[str, FinishedRun, DatasetImage]]:
         nonlocal uncertain
@@ -177,8 +176,9 @@ def export_dataset(
             raise OutputError(msg)
         splits = split_runs(runs, selection.val)
         for split, stems, run in zip(splits, image_stems(runs), runs, strict=True):
-            own = images_of(run, selection, recording, stems=stems, left_out=left_out, tick=tick)
-            for image in own:
+            for image in images_of(
+                run, selection, recording, stems=stems, left_out=left_out, observe=tell
+            ):
                 counts[split] += 1
                 uncertain += image.sure.count(False)
                 yield split, run, image
