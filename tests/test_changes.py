@@ -24,8 +24,7 @@ from shapecat.recordings.transforms.window import TransformWindow
 from shapecat.reuse import KeyView, find_repeats, view_object
 from shapecat.reuse.agreement import agreement
 from shapecat.runs.perceive.perceived import FrameRow, PerceptionTables
-from shapecat.runs.tables.placed_frames import PlacedFrames, streams_with_poses
-from shapecat.runs.tables.reading import read_row_groups
+from shapecat.runs.tables.placed_frames import DetectedFrames, streams_with_poses
 from shapecat.tracking.detection_table import gather
 from shapecat.tracking.records import FrameDetections
 from shapecat.types import Camera, Frame, Pose
@@ -254,18 +253,12 @@ def test_each_topic_has_its_own_poses(tmp_path: Path) -> None:
         for topic, k in order:
             pose = None if (topic, k) == ("/hand", 1) else moved
             tables.write([replace(perception(k, 1), topic=topic)], [FrameRow(k, pose)])
-    (frame_rows,), (found,) = (
-        read_row_groups(tmp_path / f"{n}.parquet") for n in ("frames", "detections")
-    )
-    placed = PlacedFrames({"/head"})
-    for part in (slice(0, 2), slice(2, 5)):
-        placed.add(frame_rows[part], found[part], part.start)
+    frames = DetectedFrames.read(tmp_path, {"/head"})
+    rows = np.arange(5)  # of one detection in each frame
 
     assert streams_with_poses(tmp_path) == {"/head"}
-    rows = placed.find([topic for topic, _ in order], np.array([k for _, k in order]))
-    assert rows.tolist() == list(range(5))
-    assert placed.first[rows].tolist() == list(range(5))  # of one detection in each frame
-    assert placed.poses[rows, 0, 3].tolist() == [float(topic == "/head") for topic, _ in order]
+    assert frames.numbers_of(rows).tolist() == [0] * 5
+    assert frames.poses_of(rows)[:, 0, 3].tolist() == [float(t == "/head") for t, _ in order]
 
 
 def test_ros_messages_use_colour_of_category() -> None:

@@ -1,8 +1,7 @@
 """Full boxes of tracks, fused from the full boxes of their detections."""
 
-from collections.abc import Callable, Collection, Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
-from itertools import accumulate
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -12,8 +11,8 @@ from scipy.spatial.transform import Rotation
 
 from shapecat.arrays import F4, F8, I4, Bool
 from shapecat.completion import DIRECTIONS, BoxViews, FusedBox, fuse_boxes
-from shapecat.runs.tables.placed_frames import PlacedFrames
-from shapecat.runs.tables.reading import full_boxes_of, numbers, opened, read_rows, read_together
+from shapecat.runs.tables.placed_frames import DetectedFrames
+from shapecat.runs.tables.reading import full_boxes_of, numbers, opened, read_rows
 from shapecat.runs.tables.schemas import BOX_WIDTH, FULL_BOX, FULL_WIDTHS
 from shapecat.tracking import Track, view_weights
 
@@ -58,29 +57,23 @@ _DETAILS = _Selection(["size_full_std", "outline_full"], 3 + DIRECTIONS, _detail
 class FullBoxes:
     """The full boxes of all detections of a run, estimated from single views.
 
-    Only where each frame is in the table is kept; boxes are read when they are needed.
+    Boxes are read when they are needed.
 
     Attributes
     ----------
     table : path of the detections table.
-    frames : the frames of the run.
+    frames : the frames of the run that have detections.
     """
 
     table: Path
-    frames: PlacedFrames
-
-    @classmethod
-    def read(cls, folder: Path, placed: Collection[str]) -> "FullBoxes":
-        """Read the frames of a run; the topics ``placed`` are tracked in the fixed frame."""
-        frames, first = PlacedFrames(placed), 0
-        tables = {"frames": PlacedFrames.COLUMNS, "detections": ("topic", "frame")}
-        for frame_tables, detections in read_together(folder, tables):
-            frames.add(frame_tables, detections, first)
-            first += detections.num_rows
-        return cls(folder / "detections.parquet", frames)
+    frames: DetectedFrames
 
     def of_tracks(self, tracks: Sequence[Track], categories: Sequence[str]) -> F4:
         """Return the fused boxes of some tracks in each of their frames, track after track.
+
+        Parameters
+        ----------
+        tracks : their ``detections`` are rows of the table.
 
         Returns
         -------
@@ -93,48 +86,38 @@ class FullBoxes:
         sightings = self._sightings(tracks)
         chosen = [_spread(len(sighting.rows)) for sighting in sightings]
         rows = [sighting.rows[picked] for sighting, picked in zip(sightings, chosen, strict=True)]
-        details = self._read(np.concatenate([_NO_ROWS, *rows]), _DETAILS)
-        stops = list(accumulate(len(track.frames) for track in tracks))
-        result = np.full((stops[-1] if stops else 0, _WIDTH), np.nan, np.float32)
-        ends = accumulate(map(len, chosen))
-        for track, sighting, picked, stop, end in zip(
-            tracks, sightings, chosen, stops, ends, strict=True
+        lengths = [len(track.frames) for track in tracks]
+        result = np.full((sum(lengths), _WIDTH), np.nan, np.float32)
+        for track, sighting, picked, details, part in zip(
+            tracks,
+            sightings,
+            chosen,
+            self._read(rows, _DETAILS),
+            _split(result, lengths),
+            strict=True,
         ):
             if len(picked):
-                views = self._views(sighting, picked, details[end - len(picked) : end])
+                views = self._views(sighting, picked, details)
                 fused = fuse_boxes(
                     views, view_weights(sighting.partial[picked]), track.posterior, categories
                 )
-                self._show(fused, sighting, result[stop - len(track.frames) : stop])
+                self._show(fused, sighting, part)
         return result
 
     def _sightings(self, tracks: Sequence[Track]) -> "list[_Sighting]":
         """Return the detections of each track that have a full box."""
-        detected = [np.flatnonzero(np.asarray(track.detections) >= 0) for track in tracks]
-        frames = [
-            self.frames.find([track.topics[k] for k in at], track.frames[at])
-            for track, at in zip(tracks, detected, strict=True)
-        ]
-        rows = [
-            self.frames.first[frame_rows] + track.detections[at]
-            for track, at, frame_rows in zip(tracks, detected, frames, strict=True)
-        ]
-        boxes = self._read(np.concatenate([_NO_ROWS, *rows]), _BOXES)
+        detected = [np.flatnonzero(track.detections >= 0) for track in tracks]
+        rows = [track.detections[at] for track, at in zip(tracks, detected, strict=True)]
         result = []
-        for at, track_rows, frame_rows, end in zip(
-            detected, rows, frames, accumulate(map(len, rows)), strict=True
-        ):
-            here = boxes[end - len(track_rows) : end]
-            has_box = ~np.isnan(here[:, 0])
-            here, partial = here[has_box, :BOX_WIDTH], here[has_box, BOX_WIDTH] > 0
-            result.append(
-                _Sighting(at[has_box], track_rows[has_box], frame_rows[has_box], here, partial)
-            )
+        for at, of_track, boxes in zip(detected, rows, self._read(rows, _BOXES), strict=True):
+            known = ~np.isnan(boxes[:, 0])
+            partial = boxes[known, BOX_WIDTH] > 0
+            result.append(_Sighting(at[known], of_track[known], boxes[known, :BOX_WIDTH], partial))
         return result
 
     def _views(self, sighting: "_Sighting", picked: I4, details: F4) -> BoxViews:
         """Return the boxes of some views of a track in the fixed frame; see `_DETAILS`."""
-        boxes, poses = sighting.boxes[picked], self.frames.poses[sighting.frames[picked]]
+        boxes, poses = sighting.boxes[picked], self.frames.poses_of(sighting.rows[picked])
         centers, axes = _placed(boxes, poses)
         sizes, stds = boxes[:, 3:6].astype(np.float64), details[:, :3].astype(np.float64)
         return BoxViews(centers, axes, sizes, stds, details[:, 3:], poses[:, :, 3])
@@ -143,20 +126,21 @@ class FullBoxes:
         """Write the fused box to ``result``, in the sensor frame of each view."""
         for first in range(0, len(sighting.rows), _BLOCK):
             block = slice(first, first + _BLOCK)
-            boxes, poses = sighting.boxes[block], self.frames.poses[sighting.frames[block]]
+            boxes, poses = sighting.boxes[block], self.frames.poses_of(sighting.rows[block])
             in_view = fused.in_views(*_placed(boxes, poses), boxes[:, 3:6])
             turns, places = poses[:, :, :3], poses[:, :, 3]
             back = np.einsum("kji,kj->ki", turns, in_view.centers - places)
             quaternions = Rotation.from_matrix(np.swapaxes(turns, 1, 2) @ in_view.axes).as_quat()
             result[sighting.at[block]] = np.hstack([back, in_view.sizes, quaternions, in_view.stds])
 
-    def _read(self, rows: I4, values: _Selection) -> F4:
-        """Return the values (n, k) of some rows of the table."""
-        result = np.zeros((len(rows), values.width), np.float32)
+    def _read(self, rows: Sequence[I4], values: _Selection) -> list[F4]:
+        """Return the values (n, k) of the rows (n,) of the table that each track has."""
+        together = np.concatenate([_NO_ROWS, *rows])
+        result = np.zeros((len(together), values.width), np.float32)
         with opened(self.table) as file:
-            for at, table in read_rows(file, values.columns, rows, at_once=_AT_ONCE):
+            for at, table in read_rows(file, values.columns, together, at_once=_AT_ONCE):
                 result[at] = values.of(table)
-        return result
+        return _split(result, list(map(len, rows)))
 
 
 class _Sighting(NamedTuple):
@@ -164,16 +148,20 @@ class _Sighting(NamedTuple):
 
     Attributes
     ----------
-    at, rows, frames : (k,) indices in the track, in the detections and in the frames.
+    at, rows : (k,) indices in the track and in the detections.
     boxes : (k, 10) float32 centre and size (metres) and orientation (x y z w) in the sensor frame.
     partial : (k,) whether the object is occluded or cut off by the image border.
     """
 
     at: I4
     rows: I4
-    frames: I4
     boxes: F4
     partial: Bool
+
+
+def _split(values: F4, lengths: Sequence[int]) -> list[F4]:
+    """Return consecutive parts of an array, which have these lengths."""
+    return np.split(values, np.cumsum(lengths, dtype=np.int64))[:-1]
 
 
 def _spread(count: int) -> I4:

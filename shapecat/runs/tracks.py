@@ -14,7 +14,7 @@ from shapecat.arrays import F4, F8
 from shapecat.config import TrackingSettings
 from shapecat.runs.full_boxes import FullBoxes, full_columns
 from shapecat.runs.labels.track_table import ORIGINAL, write_csv
-from shapecat.runs.tables.placed_frames import streams_with_poses
+from shapecat.runs.tables.placed_frames import DetectedFrames, streams_with_poses
 from shapecat.runs.tables.reading import (
     Key,
     first_stamp,
@@ -54,7 +54,6 @@ _CSV = {
 _COLUMNS = (
     "topic",
     "frame",
-    "detection",
     "center",
     "size",
     "orientation",
@@ -90,7 +89,7 @@ def track_run(
     lines, start_ns = [], first_stamp(folder)
     with replacing(folder / "tracks.parquet") as path, open_writer(path, TRACKS) as writer:
         release_memory()
-        full = FullBoxes.read(folder, placed)
+        full = FullBoxes(folder / "detections.parquet", DetectedFrames.read(folder, placed))
         release_memory()
         for batch in _batches(tracks):
             _write(writer, batch, full, categories)
@@ -109,7 +108,8 @@ def _write(
     """Write some tracks with their full boxes."""
     boxes = full.of_tracks(tracks, categories)
     for parts, rows in _parts(tracks):
-        writer.write_table(arrow_table(_columns(parts, boxes[rows], categories), TRACKS))
+        columns = _columns(parts, full.frames, boxes[rows], categories)
+        writer.write_table(arrow_table(columns, TRACKS))
 
 
 def _batches(tracks: Iterable[Track]) -> Iterator[list[Track]]:
@@ -138,15 +138,17 @@ def _parts(tracks: list[Track]) -> Iterator[tuple[list[Track], slice]]:
 
 
 def _read_frames(folder: Path, categories: int, fixed: set[str]) -> Iterator[FrameDetections]:
-    """Yield the detections of each frame.
+    """Yield the detections of each frame, numbered by their rows in the table.
 
     They are in the fixed frame for the topics in ``fixed``, else in the sensor frame.
     """
-    frame_columns = ["topic", "frame", "stamp_ns", "fixed_rotation"]
+    frame_columns, count = ["topic", "frame", "stamp_ns", "fixed_rotation"], 0
     for frames, detections in read_together(
         folder, {"frames": frame_columns, "detections": _COLUMNS}
     ):
         rows, columns = frame_rows(detections), _columns_of(detections, categories)
+        columns["row"] = np.arange(count, count + detections.num_rows)
+        count += detections.num_rows
         rows_of_frames = frames.to_pylist()
         turns = np.tile(_NO_TURN, (detections.num_rows, 1))
         for frame in rows_of_frames:
@@ -163,7 +165,7 @@ def _read_frames(folder: Path, categories: int, fixed: set[str]) -> Iterator[Fra
                 topic=frame["topic"],
                 frame=frame["frame"],
                 stamp_ns=frame["stamp_ns"],
-                detections=values_of_frame["detection"],
+                detections=values_of_frame["row"],
                 centers=values_of_frame["center_fixed" if frame["topic"] in fixed else "center"],
                 sizes=values_of_frame["size"],
                 posteriors=values_of_frame["posterior"],
@@ -176,7 +178,7 @@ def _read_frames(folder: Path, categories: int, fixed: set[str]) -> Iterator[Fra
 
 def _columns_of(table: pa.Table, categories: int) -> dict[str, Any]:
     """Return the columns for the tracker as arrays; ``center_fixed`` is NaN if unknown."""
-    columns = {name: table[name].to_numpy() for name in ("detection", "novelty")}
+    columns = {"novelty": table["novelty"].to_numpy()}
     widths = {"center": 3, "size": 3, "orientation": 4, "posterior": categories}
     for name, width in widths.items():
         columns[name] = numbers(table[name]).reshape(-1, width)
@@ -201,7 +203,9 @@ def _turned(orientations: F4, turns: F8) -> F8:
     return np.asarray((Rotation.from_matrix(turns) * Rotation.from_quat(orientations)).as_quat())
 
 
-def _columns(tracks: Sequence[Track], boxes: F4, categories: Sequence[str]) -> dict[str, Any]:
+def _columns(
+    tracks: Sequence[Track], frames: DetectedFrames, boxes: F4, categories: Sequence[str]
+) -> dict[str, Any]:
     """Return the table columns of some tracks and their full boxes (n, 13), track after track."""
 
     def column(name: str, kind: str, *width: int) -> Any:
@@ -209,13 +213,13 @@ def _columns(tracks: Sequence[Track], boxes: F4, categories: Sequence[str]) -> d
         values = [np.asarray(getattr(track, name), kind) for track in tracks]
         return np.concatenate([np.zeros((0, *width), kind), *values])
 
-    detections = column("detections", "i4")
+    rows = column("detections", "i4")
     return {
         "track": np.repeat([track.id for track in tracks], [len(track.frames) for track in tracks]),
         "topic": [topic for track in tracks for topic in track.topics],
         "frame": column("frames", "i4"),
         "stamp_ns": column("stamps_ns", "i8"),
-        "detection": pa.array(detections, mask=detections < 0),
+        "detection": pa.array(frames.numbers_of(rows).astype(np.int32), mask=rows < 0),
         "center_fixed": pa.FixedSizeListArray.from_arrays(column("centers", "f8", 3).ravel(), 3),
         **full_columns(boxes),
         "posterior": rows_as_lists(column("causal", "f4", len(categories))),

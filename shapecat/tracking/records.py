@@ -15,7 +15,7 @@ class FrameDetections(Record):
     topic : the stream.
     frame : number of the frame in its stream.
     stamp_ns : time of the measurement.
-    detections : (n,) numbers of the detections.
+    detections : (n,) numbers of the detections, by which tracks name them.
     centers : (n, 3) centres of the boxes, metres, in the fixed frame; in the sensor frame if the
         recording has no fixed frame. All frames of a stream use the same coordinate frame.
     sizes : (n, 3) lengths of the boxes, metres; the third one is along the up direction.
@@ -54,7 +54,7 @@ class Track(Record):
     hits : number of rows with a detection.
     frames : (k,) numbers of the frames in their streams, in temporal order.
     stamps_ns : (k,) times of the frames.
-    detections : (k,) number of the detection within its frame, -1 where the track coasts.
+    detections : (k,) number of the detection in `FrameDetections`, -1 where the track coasts.
     centers : (k, 3) metres, in the coordinate frame of `FrameDetections.centers`.
     causal : (k, c) fused posterior of the views up to each row, over the c categories.
     posterior : (c,) fused posterior of all views.

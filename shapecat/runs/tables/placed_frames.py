@@ -1,81 +1,74 @@
-"""The sensor pose and the first detection of each frame of a run."""
+"""The sensor poses of the frames of a run, and the rows of their detections."""
 
 from collections import Counter
-from collections.abc import Collection, Sequence
-from functools import cached_property
+from collections.abc import Collection
+from dataclasses import dataclass
 from itertools import compress
 from pathlib import Path
 
 import numpy as np
 import pyarrow as pa
 
-from shapecat.arrays import F8, I4, Bool
+from shapecat.arrays import F8, I4
 from shapecat.runs.tables.reading import (
     frame_rows,
     keys_of,
-    numbers,
     numbers_or_nan,
     read_row_groups,
+    read_together,
     topic_codes,
 )
 
-__all__ = ["PlacedFrames", "count_poses", "streams_with_poses"]
+__all__ = ["DetectedFrames", "count_poses", "streams_with_poses"]
 
 
-class PlacedFrames:
-    """The frames of a run as columns in table order, with a look-up by topic and number."""
+@dataclass(frozen=True)
+class DetectedFrames:
+    """The frames of a run that have detections, in the order of the table of detections.
 
-    COLUMNS = ("topic", "frame", "fixed_translation", "fixed_rotation")
+    Attributes
+    ----------
+    first : (f,) row of the first detection of each frame, ascending.
+    poses : (f, 3, 4) ``fixed_from_sensor``, metres; the identity if not known or not used.
+    """
 
-    def __init__(self, placed: Collection[str]) -> None:
-        """Start without frames; the topics ``placed`` are tracked in the fixed frame."""
-        self._placed = placed
-        self._codes: dict[str, int] = {}
-        self._keys, self._first, self._poses = bytearray(), bytearray(), bytearray()
+    first: I4
+    poses: F8
 
-    def add(self, frames: pa.Table, detections: pa.Table, count: int) -> None:
-        """Append a row group; ``count`` is the number of detections in earlier ones."""
-        topics, codes = topic_codes(frames)
-        codes_of_topics = [self._codes.setdefault(topic, len(self._codes)) for topic in topics]
-        keys = _keys(np.array(codes_of_topics, np.int64)[codes], numbers(frames["frame"]))
-        starts = {key: count + rows.start for key, rows in frame_rows(detections).items()}
-        first = np.array([starts.get(key, -1) for key in keys_of(frames)], np.int64)
-        self._keys += keys.tobytes()
-        self._first += first.tobytes()
-        self._poses += _poses(
-            frames, np.isin(np.array(topics), list(self._placed))[codes]
-        ).tobytes()
+    @classmethod
+    def read(cls, folder: Path, placed: Collection[str]) -> "DetectedFrames":
+        """Read the frames of a run; the topics ``placed`` are tracked in the fixed frame."""
+        columns = ("topic", "frame", "fixed_translation", "fixed_rotation")
+        tables = {"frames": columns, "detections": ("topic", "frame")}
+        first: list[I4] = [np.zeros(0, np.int64)]
+        poses: list[F8] = [np.zeros((0, 3, 4))]
+        count = 0
+        for frames, detections in read_together(folder, tables):
+            at = {key: k for k, key in enumerate(keys_of(frames))}
+            rows = {key: rows for key, rows in frame_rows(detections).items() if key in at}
+            first.append(np.array([count + span.start for span in rows.values()], np.int64))
+            poses.append(_poses(frames, placed)[[at[key] for key in rows]])
+            count += detections.num_rows
+        return cls(np.concatenate(first), np.concatenate(poses))
 
-    @cached_property
-    def first(self) -> I4:
-        """Return the row (f,) of each frame's first detection; -1 if it has none."""
-        return np.frombuffer(self._first, np.int64)
+    def poses_of(self, rows: I4) -> F8:
+        """Return the pose (n, 3, 4) of the sensor for each of some rows (n,) of detections."""
+        return np.asarray(self.poses[self._find(rows)])
 
-    @cached_property
-    def poses(self) -> F8:
-        """Return ``fixed_from_sensor`` (f, 3, 4), metres; the identity if not known or not used."""
-        return np.frombuffer(self._poses, np.float64).reshape(-1, 3, 4)
+    def numbers_of(self, rows: I4) -> I4:
+        """Return the number in its frame of each of some rows (n,) of detections."""
+        return np.asarray(rows - self.first[self._find(rows)])
 
-    @cached_property
-    def _order(self) -> I4:
-        return np.argsort(np.frombuffer(self._keys, np.int64), kind="stable")
-
-    def find(self, topics: Sequence[str], frames: I4) -> I4:
-        """Return the row (n,) of each frame, given the topics and frame numbers (n,)."""
-        codes = np.fromiter(map(self._codes.__getitem__, topics), np.int64, len(topics))
-        keys = np.frombuffer(self._keys, np.int64)
-        positions = np.searchsorted(keys, _keys(codes, frames), sorter=self._order)
-        return np.asarray(self._order[positions])
+    def _find(self, rows: I4) -> I4:
+        return np.asarray(np.searchsorted(self.first, rows, side="right") - 1)
 
 
-def _keys(codes: I4, frames: I4) -> I4:
-    return np.asarray((codes << 32) + frames)
-
-
-def _poses(frames: pa.Table, placed: Bool) -> F8:
+def _poses(frames: pa.Table, placed: Collection[str]) -> F8:
     result = np.tile(np.eye(3, 4), (frames.num_rows, 1, 1))
     turns = numbers_or_nan(frames["fixed_rotation"]).reshape(-1, 3, 3)
-    has_pose = placed & ~np.isnan(turns[:, 0, 0])
+    topics, codes = topic_codes(frames)
+    is_placed = np.array([topic in placed for topic in topics], np.bool_)[codes]
+    has_pose = is_placed & ~np.isnan(turns[:, 0, 0])
     result[has_pose, :, :3] = turns[has_pose]
     result[has_pose, :, 3] = numbers_or_nan(frames["fixed_translation"])[has_pose]
     return result
