@@ -5,8 +5,7 @@ from pathlib import Path
 
 import numpy as np
 
-from shapecat.arrays import I4
-from shapecat.runs.tables.reading import numbers, read_row_groups, topic_codes
+from shapecat.runs.tables.reading import numbers, read_by_topic
 
 __all__ = ["explain_clocks"]
 
@@ -27,10 +26,12 @@ def explain_clocks(folder: Path, fixed_frame: str | None) -> Iterator[str]:
     """
     if fixed_frame is None:
         return
-    delays_s = {
-        topic: float(np.median(np.concatenate(parts))) * 1e-9
-        for topic, parts in _read_delays(folder).items()
-    }
+    delays = read_by_topic(
+        folder,
+        ["stamp_ns", "log_time_ns"],
+        lambda frames: numbers(frames["log_time_ns"]) - numbers(frames["stamp_ns"]),
+    )
+    delays_s = {topic: float(np.median(delay)) * 1e-9 for topic, delay in delays.items()}
     first, last = min(delays_s, key=delays_s.__getitem__), max(delays_s, key=delays_s.__getitem__)
     ahead_s = delays_s[last] - delays_s[first]
     if ahead_s > _DIFFERENT_S:
@@ -39,14 +40,3 @@ def explain_clocks(folder: Path, fixed_frame: str | None) -> Iterator[str]:
             "poses of a moving sensor are wrong, and a moving object gets two tracks; synchronize "
             "the clocks of the computers"
         )
-
-
-def _read_delays(folder: Path) -> dict[str, list[I4]]:
-    """Read the log times minus the stamps (n,) of each topic, ns, in parts."""
-    delays_of: dict[str, list[I4]] = {}
-    for group in read_row_groups(folder / "frames.parquet", ["topic", "stamp_ns", "log_time_ns"]):
-        topics, codes = topic_codes(group)
-        delays = numbers(group["log_time_ns"]) - numbers(group["stamp_ns"])
-        for code, topic in enumerate(topics):
-            delays_of.setdefault(topic, []).append(delays[codes == code])
-    return delays_of

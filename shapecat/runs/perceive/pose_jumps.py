@@ -4,15 +4,10 @@ from collections.abc import Iterator
 from pathlib import Path
 
 import numpy as np
+import pyarrow as pa
 
 from shapecat.arrays import F8, I4
-from shapecat.runs.tables.reading import (
-    first_stamp,
-    numbers,
-    numbers_or_nan,
-    read_row_groups,
-    topic_codes,
-)
+from shapecat.runs.tables.reading import first_stamp, numbers, numbers_or_nan, read_by_topic
 
 __all__ = ["explain_jumps"]
 
@@ -32,7 +27,11 @@ def explain_jumps(folder: Path, fixed_frame: str | None) -> Iterator[str]:
     """
     if fixed_frame is None:
         return
-    for topic, (places, stamps_ns) in _read_places(folder).items():
+    stamps = read_by_topic(folder, ["stamp_ns"], lambda frames: numbers(frames["stamp_ns"]))
+    poses = read_by_topic(folder, ["fixed_translation", "fixed_rotation"], _places)
+    for topic, all_places in poses.items():
+        known = ~np.isnan(all_places[:, 0])
+        places, stamps_ns = all_places[known], stamps[topic][known]
         jumps, steps = _jumps(places, stamps_ns)
         if len(jumps):
             seconds = (stamps_ns[jumps[0] + 1] - first_stamp(folder)) * 1e-9
@@ -44,21 +43,10 @@ def explain_jumps(folder: Path, fixed_frame: str | None) -> Iterator[str]:
             )
 
 
-def _read_places(folder: Path) -> dict[str, tuple[F8, I4]]:
-    """Read, for each topic, the points (n, 3) 1 m before the sensor, metres, and their stamps."""
-    places_of: dict[str, list[tuple[F8, I4]]] = {}
-    columns = ["topic", "stamp_ns", "fixed_translation", "fixed_rotation"]
-    for group in read_row_groups(folder / "frames.parquet", columns):
-        topics, codes = topic_codes(group)
-        turns = numbers_or_nan(group["fixed_rotation"]).reshape(-1, 3, 3)
-        places = numbers_or_nan(group["fixed_translation"]) + turns[:, :, 2]
-        for code, topic in enumerate(topics):
-            rows = (codes == code) & ~np.isnan(places[:, 0])
-            places_of.setdefault(topic, []).append((places[rows], numbers(group["stamp_ns"])[rows]))
-    return {
-        topic: (np.concatenate([p for p, _ in parts]), np.concatenate([s for _, s in parts]))
-        for topic, parts in places_of.items()
-    }
+def _places(frames: pa.Table) -> F8:
+    """Return the points (n, 3) 1 m before the sensor, metres; NaN without a pose."""
+    turns = numbers_or_nan(frames["fixed_rotation"]).reshape(-1, 3, 3)
+    return np.asarray(numbers_or_nan(frames["fixed_translation"]) + turns[:, :, 2])
 
 
 def _jumps(places: F8, stamps_ns: I4) -> tuple[I4, F8]:

@@ -1,9 +1,7 @@
 """The sensor poses of the frames of a run, and the rows of their detections."""
 
-from collections import Counter
 from collections.abc import Collection
 from dataclasses import dataclass
-from itertools import compress
 from pathlib import Path
 
 import numpy as np
@@ -14,7 +12,7 @@ from shapecat.runs.tables.reading import (
     frame_rows,
     keys_of,
     numbers_or_nan,
-    read_row_groups,
+    read_by_topic,
     read_together,
     topic_codes,
 )
@@ -84,11 +82,9 @@ def streams_with_poses(folder: Path) -> set[str]:
 
 def count_poses(folder: Path) -> dict[str, tuple[int, int]]:
     """Return, for each topic, the numbers of frames with a known sensor pose, and of all frames."""
-    with_pose: Counter[str] = Counter()
-    count: Counter[str] = Counter()
-    for group in read_row_groups(folder / "frames.parquet", ["topic", "fixed_translation"]):
-        has_pose = group["fixed_translation"].is_valid().to_pylist()
-        topics = group["topic"].to_pylist()
-        with_pose.update(compress(topics, has_pose))
-        count.update(topics)
-    return {topic: (with_pose[topic], count[topic]) for topic in count}
+    has_pose = read_by_topic(
+        folder,
+        ["fixed_translation"],
+        lambda frames: frames["fixed_translation"].is_valid().to_numpy(),
+    )
+    return {topic: (int(known.sum()), len(known)) for topic, known in has_pose.items()}

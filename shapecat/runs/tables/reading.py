@@ -4,7 +4,7 @@ Row groups of all tables but ``tracks`` cover the same frames, so that they can 
 in constant memory.
 """
 
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
@@ -27,6 +27,7 @@ __all__ = [
     "numbers",
     "numbers_or_nan",
     "opened",
+    "read_by_topic",
     "read_row_groups",
     "read_rows",
     "read_stamps",
@@ -69,6 +70,24 @@ def read_stamps(folder: Path) -> Iterator[tuple[Key, int]]:
     """Yield each frame of a run and its stamp in nanoseconds, in the order of the frames table."""
     for group in read_row_groups(folder / "frames.parquet", ["topic", "frame", "stamp_ns"]):
         yield from zip(keys_of(group), numbers(group["stamp_ns"]).tolist(), strict=True)
+
+
+def read_by_topic(
+    folder: Path, columns: Sequence[str], values: Callable[[pa.Table], Any]
+) -> dict[str, Any]:
+    """Return values of the frames of each topic, in their order.
+
+    Parameters
+    ----------
+    values : returns an array with a row for each row of these columns of the frames table.
+    """
+    parts: dict[str, list[Any]] = {}
+    for group in read_row_groups(folder / "frames.parquet", ["topic", *columns]):
+        topics, codes = topic_codes(group)
+        rows = values(group)
+        for code, topic in enumerate(topics):
+            parts.setdefault(topic, []).append(rows[codes == code])
+    return {topic: np.concatenate(arrays) for topic, arrays in parts.items()}
 
 
 def read_row_groups(
