@@ -6,7 +6,7 @@ from collections.abc import Mapping
 from dataclasses import dataclass, field
 from importlib.metadata import version
 from pathlib import Path
-from typing import Any
+from typing import Any, cast
 
 from shapecat import __version__
 from shapecat.config import Settings
@@ -90,17 +90,8 @@ class Job:
 
     def selection(self) -> Options:
         """Return the options that affect the results, as stored in run.json."""
-        return {
-            "topics": list(self.topics),
-            "up": self.up,
-            "fixed_frame": self.fixed_frame,
-            "start_s": self.start_s,
-            "end_s": self.end_s,
-            "every": self.every,
-            "color": self.color,
-            "mcap": self.mcap,
-            "rrd": self.rrd,
-        }
+        values = {name: getattr(self, name) for name in Options.__annotations__}
+        return cast("Options", values | {"topics": list(self.topics)})
 
 
 @dataclass(frozen=True)
