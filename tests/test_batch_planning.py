@@ -283,16 +283,6 @@ def test_write_ahead_log_is_content_of_its_database(tmp_path: Path, *, whole: bo
     assert input_size(source) == 21
 
 
-def test_run_of_earlier_version_fits_bag_without_its_other_files(tmp_path: Path) -> None:
-    """They were part of the digest and of the files in run.json."""
-    (tmp_path / "bag_0.mcap").write_bytes(b"recording")
-    files = [[".DS_Store", 6, 1, 1], *file_stats(tmp_path)]
-    known: Any = {"files": files, "digest": "xxh3-128:0123"}
-
-    assert unchanged(files, tmp_path)
-    assert same_content(known, tmp_path, lambda: "")
-
-
 def test_unneeded_digest_is_stopped(source: Path) -> None:
     """Stopping is no error before the thread starts, and ends it afterwards."""
     with ContentDigest(source) as content:

@@ -16,7 +16,7 @@ from typing import Any, Self
 import xxhash
 
 from shapecat.errors import RecordingError
-from shapecat.recordings.files import input_files, is_of_bag
+from shapecat.recordings.files import input_files
 from shapecat.runs.run_info import InputInfo, RunInfo
 
 __all__ = [
@@ -66,14 +66,9 @@ def unchanged(before: Sequence[Sequence[Any]], path: Path) -> bool:
     ``before`` is from `file_stats`.
     """
     try:
-        return [s[:3] for s in _of_input(before, path)] == [s[:3] for s in file_stats(path)]
+        return [list(s[:3]) for s in before] == [s[:3] for s in file_stats(path)]
     except OSError:
         return False
-
-
-def _of_input(stats: Sequence[Sequence[Any]], path: Path) -> Stats:
-    """Leave out other files in the folder of a bag, which earlier versions stored too."""
-    return [list(s) for s in stats if not path.is_dir() or is_of_bag(s[0])]
 
 
 def content_digest(path: Path, *, cancelled: Event | None = None) -> str:
@@ -153,6 +148,6 @@ def same_content(recorded: InputInfo, path: Path, digest: Callable[[], str]) -> 
 
     ``digest`` is called only if the names, sizes or times of the files differ.
     """
-    if _of_input(recorded["files"], path) == file_stats(path):
+    if recorded["files"] == file_stats(path):
         return True
     return bool(recorded["digest"]) and recorded["digest"] == digest()
