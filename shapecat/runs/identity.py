@@ -9,13 +9,15 @@ import json
 import os
 import secrets
 from collections.abc import Callable, Sequence
+from concurrent.futures import Future, ThreadPoolExecutor
+from functools import cached_property
 from pathlib import Path
-from threading import Event, Thread
+from threading import Event
 from typing import Any, Self
 
 import xxhash
 
-from shapecat.errors import RecordingError
+from shapecat.errors import RecordingError, explained
 from shapecat.recordings.files import input_files
 from shapecat.runs.run_info import InputInfo, RunInfo
 
@@ -104,9 +106,7 @@ class ContentDigest:
         """Prepare the digest of a file or folder."""
         self._path = path
         self._cancelled = Event()
-        self._digest = ""
-        self._error: OSError | None = None
-        self._thread = Thread(target=self._work, daemon=True)
+        self._thread = ThreadPoolExecutor(1)
 
     def __enter__(self) -> Self:
         return self
@@ -114,19 +114,15 @@ class ContentDigest:
     def __exit__(self, *_: object) -> None:
         """Stop reading."""
         self._cancelled.set()
-        if self._thread.ident is not None:
-            self._thread.join()
+        self._thread.shutdown()
+
+    @cached_property
+    def _digest(self) -> Future[str]:
+        return self._thread.submit(content_digest, self._path, cancelled=self._cancelled)
 
     def start(self) -> None:
         """Start reading."""
-        if self._thread.ident is None:
-            self._thread.start()
-
-    def _work(self) -> None:
-        try:
-            self._digest = content_digest(self._path, cancelled=self._cancelled)
-        except OSError as error:
-            self._error = error
+        _ = self._digest
 
     def result(self) -> str:
         """Wait for the digest.
@@ -135,12 +131,8 @@ class ContentDigest:
         ------
         RecordingError : the recording cannot be read.
         """
-        self.start()
-        self._thread.join()
-        if self._error is not None:
-            msg = f"{self._path}: cannot be read: {self._error.strerror or self._error}"
-            raise RecordingError(msg) from self._error
-        return self._digest
+        with explained(f"{self._path}: cannot be read", RecordingError):
+            return self._digest.result()
 
 
 def same_content(recorded: InputInfo, path: Path, digest: Callable[[], str]) -> bool:
