@@ -14,7 +14,7 @@ from typing import Literal
 
 from shapecat.errors import OutputError, explained
 from shapecat.runs.run_info import RunIdentity, RunInfo, parse_identity, parse_run
-from shapecat.system.files import flush, holding, lock, partial_path, replacing, require_utf8
+from shapecat.system.files import BusyError, flush, holding, partial_path, replacing, require_utf8
 
 __all__ = [
     "OUTPUTS",
@@ -111,10 +111,10 @@ def staged(
     created = [parent for parent in folder.parents if not parent.exists()]
     try:
         hidden.mkdir(parents=True, exist_ok=True)
-        with _locked(hidden):
+        with holding(hidden, wait=False):
             yield hidden
             _replace(folder, hidden, marker)
-    except _BusyError as error:
+    except BusyError as error:
         msg = f"{folder}: another run is writing there"
         raise OutputError(msg) from error
     except Exception as error:
@@ -200,8 +200,8 @@ def recover(folder: Path, marker: Marker = made_by_run) -> None:
         if not previous.is_dir():
             return
         with (
-            suppress(_BusyError),  # the other run does it
-            _locked(hidden if hidden.is_dir() else previous),
+            suppress(BusyError),  # the other run does it
+            holding(hidden if hidden.is_dir() else previous, wait=False),
         ):
             if not folder.exists() and marker(previous) is not None:
                 previous.rename(folder)
@@ -224,21 +224,6 @@ def sweep(folder: Path) -> None:
         clear(folder, [partial_path(Path(name)).name for name in RUN_FILES])
 
 
-class _BusyError(Exception):
-    """Another process has locked the folder."""
-
-
-@contextmanager
-def _locked(folder: Path) -> Iterator[None]:
-    lock_file = lock(folder)
-    if lock_file is None:
-        raise _BusyError
-    try:
-        yield
-    finally:
-        os.close(lock_file)
-
-
 @contextmanager
 def writing_outputs(folder: Path) -> Iterator[None]:
     """Let only this process write the outputs of a finished run during the block.
@@ -247,15 +232,12 @@ def writing_outputs(folder: Path) -> Iterator[None]:
     ------
     OutputError : another process is writing them, or the folder is not a finished run.
     """
-    with explained(str(folder), OutputError):
-        lock_file = lock(folder / _OF_OUTPUTS)
-    if lock_file is None:
-        msg = f"{folder}: another command is writing its outputs; wait for it and run this again"
-        raise OutputError(msg)
     try:
-        yield
-    finally:
-        os.close(lock_file)
+        with holding(folder / _OF_OUTPUTS, wait=False):
+            yield
+    except BusyError as error:
+        msg = f"{folder}: another command is writing its outputs; wait for it and run this again"
+        raise OutputError(msg) from error
 
 
 def _discard(hidden: Path, created: list[Path]) -> None:

@@ -21,6 +21,7 @@ from shapecat.errors import OutputError, ShapecatError, explained
 
 __all__ = [
     "FSYNC",
+    "BusyError",
     "complete_folder",
     "flush",
     "holding",
@@ -141,17 +142,21 @@ def flush(path: Path) -> None:
         os.close(descriptor)
 
 
-def lock(folder: Path) -> int | None:
-    """Lock a folder until this process ends or the returned file descriptor is closed.
+class BusyError(Exception):
+    """Another thread or process holds a lock."""
+
+
+def lock(path: Path, *, wait: bool = False) -> int | None:
+    """Lock a file or folder until this process ends or the returned file descriptor is closed.
 
     Returns
     -------
     The file descriptor; None if another process holds the lock, which cannot be detected on a file
     system without locks.
     """
-    descriptor = os.open(folder, os.O_RDONLY)
+    descriptor = os.open(path, os.O_RDONLY)
     try:
-        fcntl.flock(descriptor, fcntl.LOCK_EX | fcntl.LOCK_NB)
+        fcntl.flock(descriptor, fcntl.LOCK_EX | (0 if wait else fcntl.LOCK_NB))
     except BlockingIOError:
         os.close(descriptor)
         return None
@@ -161,18 +166,23 @@ def lock(folder: Path) -> int | None:
 
 
 @contextmanager
-def holding(folder: Path) -> Iterator[None]:
-    """Hold the lock of a folder during the block; wait while another thread or process holds it.
+def holding(path: Path, *, wait: bool = True) -> Iterator[None]:
+    """Hold the lock of a file or folder during the block.
+
+    Parameters
+    ----------
+    wait : whether to wait while another thread or process holds it.
 
     Raises
     ------
-    OutputError : the folder does not exist or cannot be opened.
+    OutputError : the path does not exist or cannot be opened.
+    BusyError : another thread or process holds the lock; only without ``wait``.
     """
-    with explained(str(folder), OutputError):
-        descriptor = os.open(folder, os.O_RDONLY)
+    with explained(str(path), OutputError):
+        descriptor = lock(path, wait=wait)
+    if descriptor is None:
+        raise BusyError
     try:
-        with suppress(OSError):  # a file system without locks
-            fcntl.flock(descriptor, fcntl.LOCK_EX)
         yield
     finally:
         os.close(descriptor)
