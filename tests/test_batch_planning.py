@@ -21,7 +21,7 @@ from shapecat.batch.finding_urls import _combined_key
 from shapecat.batch.ledger import Ledger, Outcome
 from shapecat.batch.manifest import Entry, Manifest, RemoteManifest, State
 from shapecat.batch.naming import existing_names, name_folders
-from shapecat.batch.plans import Shard, plan_batch
+from shapecat.batch.plans import parse_shard, part_of, plan_batch
 from shapecat.batch.remote import TaskKey
 from shapecat.batch.runs import _reporter, process_here, process_on
 from shapecat.batch.sources import Source
@@ -927,7 +927,7 @@ def test_batch_exit_code_combines_outcomes(codes: tuple[int, ...], expected: int
 def test_shards_are_disjoint_in_any_order_of_recordings() -> None:
     """Machines may list a folder in different orders."""
     named = [(name, Source(f"{name}.mcap", "", name, "")) for name in "dbeac"]
-    first, second = Shard(0, 2).of(named), Shard(1, 2).of(named[::-1])
+    first, second = part_of(named, 0, 2), part_of(named[::-1], 1, 2)
 
     assert [name for name, _ in first] == ["a", "c", "e"]
     assert [name for name, _ in second] == ["b", "d"]
@@ -1137,7 +1137,7 @@ def test_numbered_folder_name_may_already_be_taken() -> None:
 def test_wrong_shard_is_refused(text: str, told: str) -> None:
     """Machines would process nothing, or the same recordings twice."""
     with pytest.raises(ConfigError) as error:
-        Shard.parse(text)
+        parse_shard(text)
 
     assert str(error.value) == f"--shard {text}: {told}"
 

@@ -27,7 +27,7 @@ from shapecat.runs.jobs import Job
 from shapecat.runs.run_info import RunInfo, parse_run
 from shapecat.system.files import partial_path
 
-__all__ = ["Batch", "Shard", "Status", "Task", "plan_batch", "run_of"]
+__all__ = ["Batch", "Status", "Task", "parse_shard", "part_of", "plan_batch", "run_of"]
 
 _NamedSource = tuple[str, Source]
 
@@ -97,41 +97,32 @@ class Task:
         )
 
 
-@dataclass(frozen=True)
-class Shard:
-    """Part ``index`` of ``count`` parts of a batch, counted from 0."""
+def parse_shard(text: str) -> tuple[int, int]:
+    """Read ``I/N``, I from 0 to N; N/N is the same as 0/N, for jobs counted from 1.
 
-    index: int
-    count: int
+    Raises
+    ------
+    ConfigError : the text is not of that form, N is 0, or I is larger than N.
 
-    @classmethod
-    def parse(cls, text: str) -> "Shard":
-        """Read ``I/N``, I from 0 to N; N/N is the same as 0/N, for jobs counted from 1.
+    Examples
+    --------
+    >>> [parse_shard(f"{k}/3") for k in (0, 1, 2, 3)]
+    [(0, 3), (1, 3), (2, 3), (0, 3)]
+    """
+    first, slash, last = text.partition("/")
+    if not slash or not (first.isdecimal() and last.isdecimal() and int(last)):
+        msg = f"--shard {text}: expected I/N, for example 2/4"
+        raise ConfigError(msg)
+    index, count = int(first), int(last)
+    if index > count:
+        msg = f"--shard {text}: expected I from 0 to {count - 1} or from 1 to {count}"
+        raise ConfigError(msg)
+    return index % count, count
 
-        Raises
-        ------
-        ConfigError : the text is not of that form, N is 0, or I is larger than N.
-        """
-        first, slash, last = text.partition("/")
-        if not slash or not (first.isdecimal() and last.isdecimal() and int(last)):
-            msg = f"--shard {text}: expected I/N, for example 2/4"
-            raise ConfigError(msg)
-        index, count = int(first), int(last)
-        if index > count:
-            msg = f"--shard {text}: expected I from 0 to {count - 1} or from 1 to {count}"
-            raise ConfigError(msg)
-        return cls(index % count, count)
 
-    def of(self, named: Sequence[_NamedSource]) -> list[_NamedSource]:
-        """Return the recordings of this shard; all shards are disjoint and cover the list.
-
-        Examples
-        --------
-        >>> [Shard.parse(f"{k}/3").index for k in (0, 1, 2, 3)]
-        [0, 1, 2, 0]
-        """
-        ordered = sorted(named, key=lambda pair: pair[0])
-        return ordered[self.index :: self.count]
+def part_of(named: Sequence[_NamedSource], index: int, count: int) -> list[_NamedSource]:
+    """Return a shard of the recordings; all shards are disjoint and cover the list."""
+    return sorted(named, key=lambda pair: pair[0])[index::count]
 
 
 @dataclass(frozen=True)
@@ -165,7 +156,7 @@ def plan_batch(
     RecordingError : no recording was found, or a URL cannot be reached.
     OutputError : the URL for the results cannot be reached.
     """
-    part = Shard.parse(shard) if shard is not None else None
+    part = parse_shard(shard) if shard is not None else None
     found = find_recordings(sources)
     listing = Location(out, OutputError).names() if is_url(out) else _names_in(Path(out))
     stems, parents = [s.stem for s in found.sources], [s.parent for s in found.sources]
@@ -173,7 +164,7 @@ def plan_batch(
     named = list(zip(names, found.sources, strict=True))
     with open_manifest(out, shard=shard) if len(named) > 1 else nullcontext() as manifest:
         planner = _Planner(job, out, listing, manifest)
-        chosen = part.of(named) if part is not None else named
+        chosen = part_of(named, *part) if part is not None else named
         yield Batch(planner.tasks(chosen), manifest, found.skipped)
 
 
