@@ -13,6 +13,7 @@ __all__ = ["ProgressReceiver", "send_progress"]
 
 _MOST_BYTES = 4096
 _SHORT_FOLDER = "/tmp"  # noqa: S108  the folder in it is private
+"""The path of a socket has at most 107 bytes; that of the temporary folder may be longer."""
 
 
 class ProgressReceiver:
@@ -49,16 +50,15 @@ class ProgressReceiver:
         self._folder.close()
 
     def _bind(self) -> str:
-        """Bind the socket in the temporary folder, or in /tmp if its path is too long."""
-        for parent in (None, _SHORT_FOLDER):
-            with suppress(OSError), ExitStack() as stack:
-                folder = tempfile.TemporaryDirectory(
-                    prefix="shapecat-", dir=parent, ignore_cleanup_errors=True
-                )
-                address = str(Path(stack.enter_context(folder)) / "progress")
-                self._socket.bind(address)
-                self._folder = stack.pop_all()
-                return address
+        """Bind the socket in a folder of its own; return its path, empty if that fails."""
+        with suppress(OSError), ExitStack() as stack:
+            folder = tempfile.TemporaryDirectory(
+                prefix="shapecat-", dir=_SHORT_FOLDER, ignore_cleanup_errors=True
+            )
+            address = str(Path(stack.enter_context(folder)) / "progress")
+            self._socket.bind(address)
+            self._folder = stack.pop_all()
+            return address
         return ""
 
     def _listen(self) -> None:
