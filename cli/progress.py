@@ -5,7 +5,6 @@ import sys
 import time
 from collections import Counter
 from collections.abc import Sequence
-from contextlib import ExitStack
 from threading import Lock
 from typing import TYPE_CHECKING, Any, Self
 
@@ -247,18 +246,17 @@ class LiveProgress(Progress):
         super().__init__(tasks)
         self._bars: dict[str, Any] = {}
         self._rich = rich_progress()
-        self._stack = ExitStack()
         self._batch_bar = (
             self._rich.add_task("recordings", total=len(tasks)) if len(tasks) > 1 else None
         )
 
     def __enter__(self) -> Self:
-        self._stack.enter_context(self._rich)
+        self._rich.start()
         return self
 
     def __exit__(self, *error: object) -> None:
         """Remove the bars."""
-        self._stack.close()
+        self._rich.stop()
 
     def plan(self, text: str) -> None:
         """Show the plan above the bars."""

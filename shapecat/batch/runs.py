@@ -5,6 +5,7 @@ import time
 from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import CancelledError, Executor, Future
 from contextlib import suppress
+from functools import partial
 from queue import Empty, SimpleQueue
 from typing import Any
 from uuid import uuid4
@@ -57,15 +58,12 @@ def process_here(
     ledger.record_planned(tasks)
     for task in tasks:
         stopping.check()
-
-        def observe(phase: str, done: int, total: int | None, name: str = task.name) -> None:
-            report(name, phase, done, total)
-
         if task.status == "complete":
             outcome = ledger.earlier_outcome(task)
         else:
             ledger.begin(task)
             ledger.record_running(task.name)
+            observe = partial(report, task.name)
             outcome = attempt(task.job, observe, cores=cores, key=_key(task, batch))
             ledger.record_outcome(task, outcome)
         yield outcome
