@@ -20,7 +20,7 @@ from shapecat.outputs.opened_run import Table
 from shapecat.runs import labelled_tracks
 from shapecat.runs.folder import read_run
 from shapecat.runs.labelled_frames import read_labelled_frames
-from shapecat.runs.labelled_tracks import _next_of_topic, read_annotation_frames
+from shapecat.runs.labelled_tracks import LabelledTracks, read_annotation_frames
 from shapecat.runs.labels.corrections import read_labels
 from shapecat.runs.labels.meaning import TrackLabel
 from shapecat.runs.perceive.perceived import _SEGMENT_FRAMES, FrameRow, PerceptionTables
@@ -34,7 +34,7 @@ from shapecat.runs.tables.reading import (
     with_fixed_lists,
 )
 from shapecat.runs.tables.schemas import ADDED, DETECTIONS, FRAMES, PLANES, TABLES, TRACKS
-from shapecat.runs.tables.segments import count_segments
+from shapecat.runs.tables.segments import SEGMENTS, list_segments
 from shapecat.runs.tables.writing import arrow_table, lists, open_writer, write_table
 from shapecat.types import (
     Box,
@@ -145,7 +145,7 @@ def test_segments_are_written_when_full_or_old(
         for index in range(_SEGMENT_FRAMES + 3):
             clock[0] += {_SEGMENT_FRAMES + 1: 1.9, _SEGMENT_FRAMES + 2: 0.2}.get(index, 0)
             tables.write([perception(index, 1)], [FrameRow(2000 + index, None)])
-            stored.append(count_segments(tmp_path))
+            stored.append(len(list_segments(tmp_path / SEGMENTS)))
 
     assert stored == [0] * (_SEGMENT_FRAMES - 1) + [1] * 3 + [2]
 
@@ -226,15 +226,25 @@ def test_labelled_frames_join_tracks_and_labels(tmp_path: Path) -> None:
     assert_allclose(frames[0].fixed_from_sensor.translation, [1, 2, 3])
 
 
-def test_ended_tracks_are_reported_in_next_frame_of_sensor(tmp_path: Path) -> None:
+def test_ended_tracks_are_reported_in_next_frame_of_sensor() -> None:
     """A viewer would not look for the end of a track in a frame of another sensor."""
-    names = ("/a", "/b", "/b", "/a", "/b")
-    with PerceptionTables(tmp_path, categories=CATEGORIES, model_id="m1") as tables:
-        for k, name in enumerate(names):
-            tables.write([replace(perception(10 * k, 1), topic=name)], [FrameRow(2000 + k, None)])
+    no_rows, last_in = (
+        np.zeros(0, np.int64),
+        {("/a", 0): (1, 4), ("/a", 30): (2,), ("/b", 20): (3,)},
+    )
+    tracks = LabelledTracks(
+        {},
+        no_rows,
+        no_rows,
+        {},
+        last_in,
+        np.zeros((0, 0), np.float32),
+        np.zeros((0, 10), np.float32),
+    )
+    ended = tracks.endings()
 
-    wanted = {("/a", 0), ("/a", 30), ("/b", 20)}
-    assert _next_of_topic(tmp_path, wanted) == {("/a", 0): ("/a", 30), ("/b", 20): ("/b", 40)}
+    frames = [("/a", 0), ("/b", 10), ("/b", 20), ("/a", 30), ("/b", 40)]
+    assert [ended(key) for key in frames] == [(), (), (), (1, 4), (3,)]
 
 
 def test_detections_keep_tracks_when_rows_are_read_in_parts(tmp_path: Path) -> None:

@@ -58,7 +58,7 @@ def read_labelled_frames(folder: Path, labels: Mapping[int, TrackLabel]) -> Iter
     """
     tracks = LabelledTracks.read(folder, labels, causal=True)
     release_memory()  # of the table of tracks
-    masks = _MasksByFrame(read_masks(folder))
+    masks, ended = _MasksByFrame(read_masks(folder)), tracks.endings()
     tables = {"frames": None, "detections": _OBJECT, "planes": None}
     for frames, detections, planes in read_together(folder, tables):
         objects = rows_by_frame(detections)
@@ -68,7 +68,8 @@ def read_labelled_frames(folder: Path, labels: Mapping[int, TrackLabel]) -> Iter
             detected_rows = {row["detection"]: row for row in objects.get(key, [])}
             if any(rows.keys() - detected_rows.keys() for rows in tracks.objects(key).values()):
                 raise misfit(folder)
-            frame = _labelled_frame(row, detected_rows, supports.get(key, []), tracks)
+            planes_of_frame = supports.get(key, [])
+            frame = _labelled_frame(row, detected_rows, planes_of_frame, tracks, ended(key))
             yield replace(frame, masks=masks.of(key))
 
 
@@ -114,6 +115,7 @@ def _labelled_frame(
     detections: Mapping[int, Mapping[str, Any]],
     planes: Sequence[Mapping[str, Any]],
     tracks: LabelledTracks,
+    ended: tuple[int, ...],
 ) -> LabelledFrame:
     key = (row["topic"], row["frame"])
     pose = None
@@ -135,7 +137,7 @@ def _labelled_frame(
         fixed_from_sensor=pose,
         planes=tuple(plane_of(plane) for plane in planes),
         objects=tuple(_join(parts, row["up"]) for parts in objects),
-        ended=tracks.ended.get(key, ()),
+        ended=ended,
         seconds=dict(zip(row["stages"], row["seconds"], strict=True)),
         up=row["up"],
         reused_from=row["reused_from"],

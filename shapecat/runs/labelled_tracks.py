@@ -1,6 +1,6 @@
 """The tracks of a run with their final labels, and the boxes to annotate."""
 
-from collections.abc import Container, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from itertools import accumulate
 from pathlib import Path
@@ -23,10 +23,8 @@ from shapecat.runs.tables.reading import (
     Key,
     frame_rows,
     full_boxes_of,
-    keys_of,
     numbers,
     opened,
-    read_row_groups,
     read_rows,
     read_together,
     rows_of,
@@ -51,7 +49,7 @@ class LabelledTracks:
     frames : the rows of the arrays below, for each frame.
     detections, tracks : (rows,) numbers of the detections in their frames, and of their tracks.
     labels : the label of each track.
-    ended : for each frame, the tracks whose last frame was the previous one of the topic.
+    last_in : for each frame, the tracks whose last frame it is; frames without any are missing.
     causal : (rows, categories) causal posteriors; empty unless requested.
     full : (rows, 10) centre, size (metres) and orientation of the full boxes in the sensor frame;
         NaN if unknown.
@@ -61,7 +59,7 @@ class LabelledTracks:
     detections: I4
     tracks: I4
     labels: Mapping[int, TrackLabel]
-    ended: dict[Key, tuple[int, ...]]
+    last_in: dict[Key, tuple[int, ...]]
     causal: F4
     full: F4
 
@@ -87,7 +85,7 @@ class LabelledTracks:
                 detections[order],
                 tracks,
                 labels,
-                _ended(folder, of_frames, final, numbers(table["stamp_ns"])[rows]),
+                _last_in(of_frames, final, numbers(table["stamp_ns"])[rows]),
                 _causal(file, rows) if causal else _NONE,
                 _full(file, rows),
             )
@@ -104,6 +102,19 @@ class LabelledTracks:
         for row, (number, track) in enumerate(pairs, rows.start):
             rows_by_label.setdefault(self.labels[track], {})[number] = row
         return rows_by_label
+
+    def endings(self) -> Callable[[Key], tuple[int, ...]]:
+        """Return a function to call with each frame in turn.
+
+        It returns the tracks whose last frame was the one before, of the same topic.
+        """
+        latest: dict[str, Key] = {}
+
+        def ended(key: Key) -> tuple[int, ...]:
+            before, latest[key[0]] = latest.get(key[0]), key
+            return self.last_in.get(before, ()) if before else ()
+
+        return ended
 
     def full_box(self, row: int) -> Box | None:
         """Return the full box of a row; None if unknown."""
@@ -125,6 +136,7 @@ def read_annotation_frames(
     OutputError : a table is unreadable, or tracks and detections do not fit together.
     """
     tracks = LabelledTracks.read(folder, labels)
+    ended = tracks.endings()
     plain_columns = ("topic", "frame", "stamp_ns", "log_time_ns", "frame_id")
     pose_columns = ("frame_translation", "frame_rotation")
     frame_columns = (*plain_columns, "up", *pose_columns)
@@ -138,8 +150,7 @@ def read_annotation_frames(
         if frames["frame_rotation"].null_count < len(frames):
             poses = (frames[name].to_pylist() for name in pose_columns)
             boxes = map(_in_named_frame, boxes, *poses)
-        ended = (tracks.ended.get(key, ()) for key in keys)
-        yield from map(AnnotationFrame, *plain, boxes, ended)
+        yield from map(AnnotationFrame, *plain, boxes, map(ended, keys))
 
 
 def misfit(folder: Path) -> OutputError:
@@ -237,10 +248,8 @@ def _in_named_frame(
     )
 
 
-def _ended(
-    folder: Path, frames: Mapping[Key, slice], tracks: I4, stamps_ns: I4
-) -> dict[Key, tuple[int, ...]]:
-    """Return the tracks that end in each frame: those whose last frame is the one before it.
+def _last_in(frames: Mapping[Key, slice], tracks: I4, stamps_ns: I4) -> dict[Key, tuple[int, ...]]:
+    """Return the tracks whose last frame each frame is.
 
     Of the last frames of a track in several topics, the latest counts. Within a topic, numbers of
     frames decide, as a clock may be set back.
@@ -252,22 +261,7 @@ def _ended(
     at = len(tracks) - 1 - np.unique(by_topic[::-1], return_index=True)[1]
     at = at[np.argsort(stamps_ns[at], kind="stable")]
     last = {t: names[k] for t, k in zip(tracks[at].tolist(), keys[at].tolist(), strict=True)}
-    following = _next_of_topic(folder, set(last.values()))
-    ended: dict[Key, list[int]] = {}
+    tracks_of: dict[Key, tuple[int, ...]] = {}
     for track, frame in last.items():
-        if frame in following:
-            ended.setdefault(following[frame], []).append(track)
-    return {key: tuple(gone) for key, gone in ended.items()}
-
-
-def _next_of_topic(folder: Path, keys: Container[Key]) -> dict[Key, Key]:
-    """Return the next frame of the same topic after each of the ``keys`` frames."""
-    following: dict[Key, Key] = {}
-    latest: dict[str, Key] = {}
-    for group in read_row_groups(folder / "frames.parquet", ["topic", "frame"], at_once=64):
-        for key in keys_of(group):
-            before = latest.get(key[0])
-            if before is not None and before in keys:
-                following[before] = key
-            latest[key[0]] = key
-    return following
+        tracks_of[frame] = (*tracks_of.get(frame, ()), track)
+    return tracks_of
