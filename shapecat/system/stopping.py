@@ -8,10 +8,9 @@ the work checks for it where it can be interrupted: `asked` ends a loop, `check`
 import os
 import signal
 import threading
-from collections.abc import Iterable, Iterator
+from collections.abc import Iterator
 from contextlib import contextmanager, suppress
 from types import FrameType
-from typing import TypeVar
 
 __all__ = [
     "Stopped",
@@ -21,7 +20,6 @@ __all__ = [
     "handling_signals",
     "request",
     "stop_message",
-    "until_asked",
 ]
 
 _SIGNALS = (signal.SIGINT, signal.SIGTERM)
@@ -29,7 +27,6 @@ _messages = [b"stopping after the frames in work; interrupt again to leave at on
 """The last one is printed at the first signal."""
 _SHOW_CURSOR = b"\x1b[?25h"
 
-_Item = TypeVar("_Item")
 _received: list[int] = []
 
 
@@ -56,20 +53,6 @@ def check() -> None:
     """Raise `Stopped` if this process was asked to stop."""
     if _received:
         raise Stopped(_received[0])
-
-
-def until_asked(items: Iterable[_Item]) -> Iterator[_Item]:
-    """Yield the items until this process is asked to stop.
-
-    Examples
-    --------
-    >>> list(until_asked("ab"))
-    ['a', 'b']
-    """
-    for item in items:
-        if asked():
-            return
-        yield item
 
 
 def exit_at_once(signum: int, _frame: FrameType | None = None) -> None:

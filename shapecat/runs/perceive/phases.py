@@ -172,7 +172,8 @@ def _perceiving(
 
         def perceive(views: Iterator[_Item]) -> tuple[int, int]:
             count = 0
-            for count, _ in enumerate(stopping.until_asked(islice(views, tables.done)), start=1):
+            for count, _ in enumerate(islice(views, tables.done), start=1):
+                stopping.check()
                 if not again:  # the frames of a second look are few
                     work.observe(phase, count, total)
             for rows, perceptions in pool.in_order(_blocks(views, job.settings.reuse_frames)):

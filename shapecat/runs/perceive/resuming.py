@@ -13,7 +13,7 @@ from shapecat.runs.jobs import differences
 from shapecat.runs.run_info import RunInfo
 from shapecat.runs.tables.reading import count_rows
 from shapecat.runs.tables.schemas import PERCEIVED, TABLES
-from shapecat.runs.tables.segments import count_segments, require_complete
+from shapecat.runs.tables.segments import SEGMENTS, list_segments, require_complete
 
 __all__ = ["has_work", "resume", "take_over_frames"]
 
@@ -95,7 +95,7 @@ def take_over_frames(
 def has_work(folder: Path) -> bool:
     """Return whether an interrupted run has anything to resume."""
     with suppress(OutputError):
-        return count_segments(folder) > 0 or "perceive" in read_run(folder)["seconds"]
+        return bool(list_segments(folder / SEGMENTS)) or "perceive" in read_run(folder)["seconds"]
     return False
 
 

@@ -21,7 +21,6 @@ __all__ = [
     "GROUP_FRAMES",
     "REVISIONS",
     "SEGMENTS",
-    "count_segments",
     "discard_segments",
     "group_frames",
     "list_segments",
@@ -37,11 +36,6 @@ GROUP_FRAMES = 32
 _BALANCE = 4096
 """Number of frames above which row groups grow with its square root."""
 SEGMENTS, REVISIONS = "segments", "revisions"
-
-
-def count_segments(folder: Path) -> int:
-    """Return the number of segments of an interrupted run."""
-    return len(list_segments(folder / SEGMENTS))
 
 
 def discard_segments(folder: Path) -> None:
