@@ -27,7 +27,7 @@ from shapecat.batch.claims import claimed
 from shapecat.batch.finding import find_recordings
 from shapecat.batch.finding_urls import stat_url
 from shapecat.batch.manifest import Entry, RemoteManifest
-from shapecat.batch.remote import TaskKey, _download, _fetch_run, process_remote, upload
+from shapecat.batch.remote import _download, _fetch_run, process_remote, upload
 from shapecat.batch.storage import Location, names_in
 from shapecat.errors import OutputError, RecordingError, explained
 from shapecat.runs.folder import RUN_FILES, made_by_run, read_run
@@ -430,9 +430,7 @@ def test_listings_are_read_in_pages(bucket: Path, monkeypatch: pytest.MonkeyPatc
 def made(served: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
     """Return a run folder, made as a worker makes one in scratch."""
     folder = tmp_path_factory.mktemp("made") / "run"
-    process_remote(
-        Job(served / "a.mcap", folder, rrd=False), lambda *_: None, cores=1, key=TaskKey("")
-    )
+    process_remote(Job(served / "a.mcap", folder, rrd=False), lambda *_: None, cores=1, batch="")
     return folder
 
 
@@ -631,7 +629,7 @@ def test_full_scratch_is_not_blamed_on_the_url(
     job = Job(Path("a.mcap"), Path("lab"), target="memory://full/lab")
 
     with pytest.raises(OutputError, match=r"No space left on device.*TMPDIR") as raised:
-        process_remote(job, lambda *_: None, cores=1, key=TaskKey("one"))
+        process_remote(job, lambda *_: None, cores=1, batch="one")
 
     assert str(own_scratch) in str(raised.value)
 
@@ -646,7 +644,7 @@ def test_summary_names_run_folder_not_scratch(
 
     monkeypatch.setattr("shapecat.batch.remote.process", process)
     job = Job(Path("a.mcap"), Path("lab"), target="memory://named/lab")
-    summary = process_remote(job, lambda *_: None, cores=1, key=TaskKey("one"))
+    summary = process_remote(job, lambda *_: None, cores=1, batch="one")
 
     assert (summary.folder, summary.seconds) == (Path("lab"), 1.5)
 

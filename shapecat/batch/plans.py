@@ -83,6 +83,8 @@ class Task:
             folder=Path(self.name) if at_url else Path(self.out, self.name),
             origin=self.url,
             target=f"{self.out.rstrip('/')}/{self.name}" if at_url else "",
+            input_key=self.input,
+            work_key=self.work,
         )
 
     def entry(self) -> Entry:
@@ -262,7 +264,7 @@ def _is_wanted_run(task: Task, model_id: str) -> bool:
     except OutputError:
         return False
     if job.target:
-        return run.get("origin") == {"input": task.input, "work": task.work}
+        return job.made(run)
     outputs = [name for option, name in OUTPUT_OPTIONS.items() if getattr(job, option)]
     topics = [topic.strip("/") for topic in run["options"]["topics"]]  # those that were chosen
     compared_apart = {"topics", *OUTPUT_OPTIONS}

@@ -7,7 +7,6 @@ uploaded last; without run.json, its files do not count as a run.
 import dataclasses
 import errno
 from contextlib import nullcontext, suppress
-from dataclasses import dataclass
 from fnmatch import fnmatchcase
 from pathlib import Path
 from tempfile import gettempdir
@@ -19,81 +18,62 @@ from shapecat.pipeline import process
 from shapecat.runs.folder import OUTPUTS, RUN_FILES, read_run, write_run
 from shapecat.runs.jobs import Job, Summary, summarize
 from shapecat.runs.labels.corrections import LOST
-from shapecat.runs.run_info import OriginInfo, RunInfo, parse_run
+from shapecat.runs.run_info import RunInfo, parse_run
 from shapecat.system.files import scratch_folder
 from shapecat.system.progress import Observer
 
-__all__ = ["TaskKey", "process_remote", "upload"]
+__all__ = ["process_remote", "upload"]
 
 _PREVIOUS = tuple(name for name in RUN_FILES if name not in {*OUTPUTS, "report.html"})
 """Files of the previous run from which labels are transferred to a new run; run.json last."""
 
 
-@dataclass(frozen=True)
-class TaskKey:
-    """Identifies the work of a task, so that it is not done twice.
-
-    ``batch`` identifies the command that sent the task. ``input`` changes with the content of the
-    recording, ``work`` with the options, settings and model.
-    """
-
-    batch: str
-    input: str = ""
-    work: str = ""
-
-    @property
-    def is_known(self) -> bool:
-        """Whether both keys are known."""
-        return bool(self.input and self.work)
-
-    def matches(self, run: RunInfo) -> bool:
-        """Return whether a run was made from the same input and work."""
-        return self.is_known and run.get("origin") == self._origin()
-
-    def write_to(self, folder: Path) -> None:
-        """Add input and work to the run.json in a folder, as its ``origin``.
-
-        Raises
-        ------
-        OutputError : run.json is unreadable, or cannot be written.
-        """
-        run = read_run(folder)
-        run["origin"] = self._origin()
-        write_run(folder, run)
-
-    def _origin(self) -> OriginInfo:
-        return {"input": self.input, "work": self.work}
-
-
-def process_remote(job: Job, observe: Observer, *, cores: int, key: TaskKey) -> Summary:
+def process_remote(job: Job, observe: Observer, *, cores: int, batch: str) -> Summary:
     """Download the recording of a job, process it, and upload the results.
+
+    ``batch`` identifies the command that sent the job. With the keys of the job, the same work is
+    not done twice.
 
     Raises
     ------
     RecordingError, NoStreamError, ModelError : as for `process`.
     OutputError : the storage is not writable, or another process works on the run folder.
     """
-    claiming = claimed(job.target, key.batch) if job.target else nullcontext()
+    claiming = claimed(job.target, batch) if job.target else nullcontext()
     with scratch_folder() as folder, claiming as claim:
         local = job
         if job.target:
             local, run = _fetch_run(
                 dataclasses.replace(job, folder=folder / "output" / job.folder.name)
             )
-            if run is not None and key.matches(run):
+            if run is not None and job.made(run):
                 return summarize(job, run, processed=False)
         if job.origin:
             (folder / "input").mkdir()
             local = dataclasses.replace(local, source=_download(job.origin, folder / "input"))
         summary = _process(job, local, observe, cores)
         if claim is not None and summary.processed:
-            key.write_to(local.folder)
+            _write_keys(job, local.folder)
             upload(local.folder, job.target, claim)
-        elif claim is not None and key.is_known:  # of a copy: so it is not downloaded again
-            key.write_to(local.folder)
+        elif claim is not None and all(
+            job.keys.values()
+        ):  # of a copy: so it is not downloaded again
+            _write_keys(job, local.folder)
             claim.require()
             (Location(job.target, OutputError) / "run.json").upload(local.folder / "run.json")
     return dataclasses.replace(summary, folder=job.folder)
+
+
+def _write_keys(job: Job, folder: Path) -> None:
+    """Add the keys of a job to the run.json in a folder, as its ``origin``.
+
+    Raises
+    ------
+    OutputError : run.json is unreadable, or cannot be written.
+    """
+    run = read_run(folder)
+    run["origin"] = job.keys
+    write_run(folder, run)
 
 
 def _process(job: Job, local: Job, observe: Observer, cores: int) -> Summary:

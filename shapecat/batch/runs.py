@@ -14,7 +14,7 @@ from shapecat import __version__
 from shapecat.batch.ledger import MOST_TRIES, Ledger, Outcome
 from shapecat.batch.manifest import Manifest
 from shapecat.batch.plans import Task
-from shapecat.batch.remote import TaskKey, process_remote
+from shapecat.batch.remote import process_remote
 from shapecat.errors import ShapecatError
 from shapecat.executors import ProgressReceiver, is_lost, send_progress
 from shapecat.pipeline import process
@@ -64,7 +64,7 @@ def process_here(
             ledger.begin(task)
             ledger.record_running(task.name)
             observe = partial(report, task.name)
-            outcome = attempt(task.job, observe, cores=cores, key=_key(task, batch))
+            outcome = attempt(task.job, observe, cores=cores, batch=batch)
             ledger.record_outcome(task, outcome)
         yield outcome
 
@@ -108,8 +108,7 @@ def _outcomes(
 
     def submit(task: Task) -> None:
         ledger.begin(task)
-        key = _key(task, batch)
-        future = executor.submit(_attempt_on_worker, task.job, address, cores, key, __version__)
+        future = executor.submit(_attempt_on_worker, task.job, address, cores, batch, __version__)
         future.add_done_callback(lambda done: finished.put((task, done)))
 
     yield from (ledger.earlier_outcome(task) for task in tasks if task.status == "complete")
@@ -129,10 +128,6 @@ def _outcomes(
         outcome = future.result() if error is None else _give_up(task.job, error)
         ledger.record_outcome(task, outcome)
         yield outcome
-
-
-def _key(task: Task, batch: str) -> TaskKey:
-    return TaskKey(batch, task.input, task.work)
 
 
 def _wait_for_next(finished: SimpleQueue[_Finished]) -> _Finished:
@@ -155,13 +150,13 @@ def _give_up(job: Job, error: BaseException) -> Outcome:
     return _failed(job, f"{kind}: {error}")
 
 
-def _attempt_on_worker(job: Job, address: str, cores: int, key: TaskKey, version: str) -> Outcome:
+def _attempt_on_worker(job: Job, address: str, cores: int, batch: str, version: str) -> Outcome:
     """Process one job in a worker; refuse a command of another version of shapecat."""
     if version != __version__:
         versions = f"a worker has shapecat {__version__}, this command {version}"
         return _failed(job, f"{versions}; install one version")
     logging.basicConfig(level=logging.ERROR, format="%(levelname)s %(message)s")
-    return attempt(job, _reporter(job.folder.name, address), cores=cores, key=key)
+    return attempt(job, _reporter(job.folder.name, address), cores=cores, batch=batch)
 
 
 def _reporter(name: str, address: str) -> Observer:
@@ -178,14 +173,15 @@ def _reporter(name: str, address: str) -> Observer:
     return observe
 
 
-def attempt(job: Job, observe: Observer, *, cores: int = 1, key: TaskKey) -> Outcome:
+def attempt(job: Job, observe: Observer, *, cores: int = 1, batch: str) -> Outcome:
     """Process one job; an error becomes its outcome, and an unexpected one is logged in full.
 
-    ``cores`` is the number of processes that perceive frames; only a job with URLs uses ``key``.
+    ``cores`` is the number of processes that perceive frames; ``batch`` identifies the
+    command; only a job with URLs uses it.
     """
     try:
         if job.origin or job.target:
-            return Outcome(job, process_remote(job, observe, cores=cores, key=key))
+            return Outcome(job, process_remote(job, observe, cores=cores, batch=batch))
         return Outcome(job, process(job, observe, cores=cores))
     except ShapecatError as error:
         return Outcome(job, message=str(error), code=error.exit_code)

@@ -21,7 +21,7 @@ from shapecat.runs.identity import (
     unchanged,
     work_id,
 )
-from shapecat.runs.run_info import Options, RunInfo
+from shapecat.runs.run_info import Options, OriginInfo, RunInfo
 
 __all__ = [
     "Job",
@@ -57,6 +57,8 @@ class Job:
     discard_labels : whether to discard the labels of the replaced results.
     origin : URL from which ``source`` was downloaded; empty if none.
     target : URL to which the results are uploaded; empty if none.
+    input_key, work_key : empty if unknown; the first changes with the content of the recording, the
+        second with the options, settings and model.
     """
 
     source: Path
@@ -77,6 +79,8 @@ class Job:
     discard_labels: bool = False
     origin: str = ""
     target: str = ""
+    input_key: str = ""
+    work_key: str = ""
 
     @property
     def name(self) -> str:
@@ -87,6 +91,15 @@ class Job:
     def place(self) -> str:
         """The folder or URL of the results."""
         return self.target or str(self.folder)
+
+    @property
+    def keys(self) -> OriginInfo:
+        """The keys of input and work, as stored in run.json at a URL."""
+        return {"input": self.input_key, "work": self.work_key}
+
+    def made(self, run: RunInfo) -> bool:
+        """Return whether a run at a URL has the same keys, and they are known."""
+        return bool(self.input_key and self.work_key) and run.get("origin") == self.keys
 
     def selection(self) -> Options:
         """Return the options that affect the results, as stored in run.json."""

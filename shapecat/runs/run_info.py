@@ -79,7 +79,7 @@ class Counts(TypedDict):
 
 
 class OriginInfo(TypedDict):
-    """Keys of the recording and of the work in a run folder at a URL; see `TaskKey`."""
+    """Keys of the recording and of the work in a run folder at a URL; see `Job`."""
 
     input: str
     work: str
