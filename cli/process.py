@@ -2,13 +2,10 @@
 
 import os
 from collections.abc import Iterator
-from contextlib import contextmanager
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import click
-
-from shapecat.system.stopping import Stopped
 
 from .options import (
     PATH_OR_URL,
@@ -28,7 +25,6 @@ from .render import for_any_reader, print_json
 if TYPE_CHECKING:
     from shapecat.batch.ledger import Outcome
     from shapecat.batch.plans import Batch
-    from shapecat.executors import WorkerExecutor
 
 
 @click.command()
@@ -224,22 +220,7 @@ def _process(
         with display:
             yield from process_here(tasks, display.progress, cores=cores, manifest=manifest)
         return
-    started = open_executor(name, workers=workers, address=scheduler)
-    with _shutting_down(started) as executor, display:
+    with open_executor(name, workers=workers, address=scheduler) as executor, display:
         if executor.lacks_workers():
             display.note("the scheduler has no worker yet: waiting for one")
         yield from process_on(executor, tasks, display.progress, cores=cores, manifest=manifest)
-
-
-@contextmanager
-def _shutting_down(executor: "WorkerExecutor") -> Iterator["WorkerExecutor"]:
-    """Shut the workers down after the work; after a signal, let them stop and save results."""
-    try:
-        yield executor
-    except Stopped:
-        executor.stop()
-        raise
-    except BaseException:
-        executor.terminate()
-        raise
-    executor.shutdown()

@@ -5,7 +5,6 @@ import re
 from collections.abc import Callable
 from concurrent.futures import Future
 from contextlib import nullcontext
-from functools import partial
 from importlib import import_module
 from pathlib import Path
 from types import SimpleNamespace
@@ -98,11 +97,12 @@ def test_time_left_has_hours_minutes_and_seconds() -> None:
 def test_workers_save_their_frames_after_a_signal_only(error: Any, ended: str) -> None:
     """Killed by Ctrl+C, they would lose frames, and leave claims and temporary folders behind."""
     calls: list[str] = []
-    executor = SimpleNamespace(
-        **{name: partial(calls.append, name) for name in ("shutdown", "stop", "terminate")}
-    )
+    endings = {
+        name: lambda *_, n=name: calls.append(n) for name in ("shutdown", "stop", "terminate")
+    }
+    executor = type("Ending", (WorkerExecutor,), endings)()
     leave = nullcontext() if error is None else pytest.raises(type(error))
-    with leave, PROCESS._shutting_down(executor):
+    with leave, executor:
         if error is not None:
             raise error
 

@@ -2,12 +2,32 @@
 
 from abc import abstractmethod
 from concurrent.futures import Executor
+from types import TracebackType
+
+from shapecat.system.stopping import Stopped
 
 __all__ = ["WorkerExecutor"]
 
 
 class WorkerExecutor(Executor):
-    """An executor as in `concurrent.futures`, which can also be ended early."""
+    """An executor as in `concurrent.futures`, which can also be ended early.
+
+    At the end of a block it waits for the tasks; after a signal it lets them stop and save results,
+    and after another error it ends them.
+    """
+
+    def __exit__(
+        self,
+        kind: type[BaseException] | None,
+        error: BaseException | None,
+        traceback: TracebackType | None,
+    ) -> None:
+        if error is None:
+            self.shutdown()
+        elif isinstance(error, Stopped):
+            self.stop()
+        else:
+            self.terminate()
 
     @abstractmethod
     def terminate(self) -> None:
