@@ -146,13 +146,13 @@ def _require_begun(job: Job, recording: Recording) -> None:
 def _revise_and_warn(work: Work) -> None:
     """Perceive again the frames that disagree with the rest; warn of what will cost tracks."""
     revise(work)
+    folder, run = work.folder, work.run
     range_m = work.job.settings.detection.max_range_m
-    work.run["warnings"] += [
-        *explain_missing_planes(work.recording, work.folder, work.run, range_m),
-        *explain_jumps(work.folder, work.run["fixed_frame"]),
-        *explain_misplacement(work.folder, work.run["fixed_frame"]),
-        *explain_clocks(work.folder, work.run["fixed_frame"]),
-    ]
+    run["warnings"] += explain_missing_planes(work.recording, folder, run, range_m)
+    if run["fixed_frame"] is not None:
+        run["warnings"] += explain_jumps(folder, run["fixed_frame"])
+        run["warnings"] += explain_misplacement(folder, run["fixed_frame"])
+        run["warnings"] += explain_clocks(folder)
 
 
 def _run_once(phase: str, folder: Path, run: RunInfo, work: Callable[[], object]) -> None:

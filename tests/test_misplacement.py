@@ -62,4 +62,3 @@ def test_poses_that_are_worse_than_none_are_reported(
 
     warnings = list(explain_misplacement(tmp_path, "map"))
     assert [w.split(":")[0] for w in warnings] == ["/depth"] * warns
-    assert list(explain_misplacement(tmp_path, None)) == []

@@ -13,19 +13,16 @@ _DIFFERENT_S = 0.3
 """Smallest difference of two clocks; how long drivers take to log an image differs by less."""
 
 
-def explain_clocks(folder: Path, fixed_frame: str | None) -> Iterator[str]:
+def explain_clocks(folder: Path) -> Iterator[str]:
     """Yield a warning if the sensors of a run have different clocks.
 
     The recorder has one clock: the time from the stamp of an image to its log time is the same for
-    all sensors but for their clocks.
+    all sensors but for their clocks. These matter only to sensors that are tracked together.
 
     Parameters
     ----------
     folder : with the table of frames.
-    fixed_frame : None if the sensors are tracked apart; then their clocks do not matter.
     """
-    if fixed_frame is None:
-        return
     delays = read_by_topic(
         folder,
         ["stamp_ns", "log_time_ns"],

@@ -28,16 +28,14 @@ class _Centers(NamedTuple):
     fixed: F8
 
 
-def explain_misplacement(folder: Path, fixed_frame: str | None) -> Iterator[str]:
+def explain_misplacement(folder: Path, fixed_frame: str) -> Iterator[str]:
     """Yield a warning for each topic whose objects rest less in the fixed frame than without it.
 
     Parameters
     ----------
     folder : with the tables of frames and detections.
-    fixed_frame : name of the frame of ``center_fixed``; None if the run has none.
+    fixed_frame : name of the frame of ``center_fixed``.
     """
-    if fixed_frame is None:
-        return
     for topic, worse in _compare(folder).items():
         if len(worse) >= _MIN_MOTIONS and np.mean(worse) > _WORSE_SHARE:
             yield (

@@ -18,15 +18,13 @@ _SUDDEN = 5
 """A jump is this many times as fast as the motion before and after it."""
 
 
-def explain_jumps(folder: Path, fixed_frame: str | None) -> Iterator[str]:
+def explain_jumps(folder: Path, fixed_frame: str) -> Iterator[str]:
     """Yield a warning for each topic whose sensor jumps in the fixed frame.
 
     Parameters
     ----------
     folder : with the table of frames.
     """
-    if fixed_frame is None:
-        return
     stamps = read_by_topic(folder, ["stamp_ns"], lambda frames: numbers(frames["stamp_ns"]))
     poses = read_by_topic(folder, ["fixed_translation", "fixed_rotation"], _places)
     for topic, all_places in poses.items():
