@@ -19,7 +19,7 @@ from shapecat.batch.finding import find_recordings
 from shapecat.batch.storage import is_url
 from shapecat.config import Settings, load_settings, with_settings
 from shapecat.description import DESCRIPTOR_NAMES
-from shapecat.errors import ConfigError, ModelError, RecordingError, explained
+from shapecat.errors import ConfigError, ModelError, RecordingError, explained, listed
 from shapecat.learning import Categorizer, load_model
 from shapecat.outputs.in_memory import frame_of, perceive_alone
 from shapecat.outputs.opened_run import Run, RunFrame, Table
@@ -298,8 +298,7 @@ def _one_recording(path: Path) -> Path:
     if path.is_dir():
         found = [source.path for source in find_recordings([str(path)]).sources]
         if len(found) > 1:
-            names = ", ".join(str(Path(name).relative_to(path)) for name in found[:3])
-            more = ", ..." if len(found) > 3 else ""
-            msg = f"{path}: a folder of {len(found)} recordings; name one of them: {names}{more}"
+            names = listed([str(Path(name).relative_to(path)) for name in found])
+            msg = f"{path}: a folder of {len(found)} recordings; name one of them: {names}"
             raise RecordingError(msg)
     return path

@@ -1,6 +1,6 @@
 """Errors shown to the user. Each message names the problem, the place, and what to try."""
 
-from collections.abc import Collection, Iterator
+from collections.abc import Collection, Iterator, Sequence
 from contextlib import contextmanager
 
 __all__ = [
@@ -12,6 +12,7 @@ __all__ = [
     "ShapecatError",
     "common_exit_code",
     "explained",
+    "listed",
 ]
 
 
@@ -63,3 +64,9 @@ def common_exit_code(codes: Collection[int]) -> int:
     """Return the exit code that all recordings share, 0 for none, and 1 if they differ."""
     different = set(codes) or {0}
     return different.pop() if len(different) == 1 else 1
+
+
+def listed(names: Sequence[str], most: int = 12) -> str:
+    """Return names as a message shows them: the first ones, and how many more there are."""
+    more = f" and {len(names) - most} more" if len(names) > most else ""
+    return ", ".join(names[:most]) + more

@@ -496,14 +496,14 @@ def overlaps(path: Path) -> list[float]:
     """Return the intersection over union of the mask of each object with its true mask."""
     from shapecat.recordings import choose_streams, open_recording  # noqa: PLC0415  slow to load
     from shapecat.recordings.colour_frames import frames_with_colour  # noqa: PLC0415  the same
-    from shapecat.recordings.colour_streams import choose_colour  # noqa: PLC0415  the same
+    from shapecat.recordings.colour_streams import pair_colours  # noqa: PLC0415  the same
 
     labels = np.load(path.with_suffix(".labels.npz"))["labels"]
     truth = np.load(path.with_suffix(".color_labels.npz"))["labels"]
     scores = []
     with open_recording(path) as recording:
         (stream,) = choose_streams(recording)
-        colour = choose_colour(recording, stream)
+        colour = pair_colours(recording, [stream]).get(stream.topic)
         assert colour is not None
         colours = {stream.topic: colour}
         for frame, view in frames_with_colour(recording, [stream], colours, skipped=Counter()):

@@ -18,7 +18,7 @@ from shapecat.errors import NoStreamError
 from shapecat.geometry import rotation_from_quaternion
 from shapecat.recordings import choose_streams, colour_frames, open_recording
 from shapecat.recordings.colour_frames import frames_with_colour
-from shapecat.recordings.colour_streams import ColourStream, choose_colour
+from shapecat.recordings.colour_streams import ColourStream, pair_colours
 from shapecat.recordings.decoding.colour_image import cloud_colours, encoded, pixels_of
 from shapecat.recordings.messages import MessageError, Topic
 from shapecat.recordings.overview import describe_recording
@@ -50,8 +50,7 @@ Pairs = list[tuple[Frame, ColourView | None]]
 def read(path: Path, wanted: str | None = None, **chosen: Any) -> tuple[Pairs, list[str]]:
     with open_recording(path) as recording:
         streams = choose_streams(recording)
-        found = {s.topic: choose_colour(recording, s, wanted) for s in streams}
-        colours = {topic: one for topic, one in found.items() if one is not None}
+        colours = pair_colours(recording, streams, wanted)
         pairs = list(frames_with_colour(recording, streams, colours, skipped=Counter(), **chosen))
         return pairs, recording.warnings
 
@@ -237,18 +236,18 @@ def test_compressed_colour_stream_is_preferred(tmp_path: Path) -> None:
 
     with open_recording(path) as recording:
         (stream,) = choose_streams(recording)
-        chosen = choose_colour(recording, stream)
+        chosen = pair_colours(recording, [stream]).get(stream.topic)
         assert chosen is not None
         assert chosen.topic == "/cam/color/image_raw/compressed"
-        other = choose_colour(recording, stream, "other/color/image_raw")
+        other = pair_colours(recording, [stream], "other/color/image_raw").get(stream.topic)
         assert other is not None
         assert other.topic == "/other/color/image_raw"
         with pytest.raises(
             NoStreamError, match="/nowhere does not exist; colour images: /cam/color"
         ):
-            choose_colour(recording, stream, "/nowhere")
+            pair_colours(recording, [stream], "/nowhere")
         with pytest.raises(NoStreamError, match="holds no colour images"):
-            choose_colour(recording, stream, "/cam/depth/image_raw")
+            pair_colours(recording, [stream], "/cam/depth/image_raw")
     uses = {t["name"]: t["use"] for t in describe_recording(path)["topics"]}
     assert uses["/cam/color/image_raw/compressed"] == "colour of /cam/depth/image_raw"
 
@@ -260,7 +259,7 @@ def test_grey_images_are_used_only_on_request(tmp_path: Path) -> None:
 
     with open_recording(path) as recording:
         (stream,) = choose_streams(recording)
-        assert choose_colour(recording, stream) is None
+        assert not pair_colours(recording, [stream])
     ((_, view),), _ = read(path, "/cam/left/image_raw")
     assert view is not None
     assert (pixels_of(view.image) == gradient()[..., :1]).all()
@@ -380,9 +379,7 @@ def test_unread_colour_is_reported(tmp_path: Path, kind: str) -> None:
     with open_recording(path) as recording:
         if kind.startswith("foxglove"):
             recording.topics += (Topic("/cam/color/image_raw", kind, "protobuf", 1),)
-        assert (
-            choose_colour(recording, choose_streams(recording, ["/cam/depth/image_raw"])[0]) is None
-        )
+        assert not pair_colours(recording, choose_streams(recording, ["/cam/depth/image_raw"]))
         (warning,) = recording.warnings
 
     assert warning == f"/cam/color/image_raw: there is no colour, since {kind} cannot be read"

@@ -9,8 +9,10 @@ import pytest
 
 from shapecat.errors import NoStreamError
 from shapecat.recordings import choose_streams, depth_streams, frames, open_recording
-from shapecat.recordings.colour_streams import choose_colour
+from shapecat.recordings.colour_streams import pair_colours
 from shapecat.recordings.decoding.depth_image import DEPTH_ENCODINGS
+from shapecat.recordings.overview import describe_recording
+from shapecat.recordings.recording import Recording
 from shapecat.recordings.sensors import by_sensor
 from tests.colour_messages import gradient, packed, raw
 from tests.depth_encodings import png
@@ -57,7 +59,7 @@ def test_calibration_below_the_topic_of_its_images_is_found(tmp_path: Path) -> N
 
     with open_recording(write(tmp_path / "a.mcap", items)) as recording:
         (depth,) = choose_streams(recording)
-        colour = choose_colour(recording, depth)
+        colour = pair_colours(recording, [depth]).get(depth.topic)
     assert depth.info_topic == "/sim/front/DepthPlanar/camera_info"
     assert colour is not None
     assert colour.info_topic == "/sim/front/Scene/camera_info"
@@ -74,7 +76,7 @@ def test_calibration_with_the_word_of_its_images_is_found(tmp_path: Path, colour
 
     with open_recording(write(tmp_path / "a.mcap", items)) as recording:
         aligned, depth = depth_streams(recording)
-        colour = choose_colour(recording, depth)
+        colour = pair_colours(recording, [depth]).get(depth.topic)
     assert depth.info_topic == "/head/depth_camera_info"
     assert aligned.info_topic == f"/head/{colour_info}"
     assert colour is not None
@@ -103,7 +105,7 @@ def test_calibrations_of_any_name_are_found_by_their_frames(tmp_path: Path) -> N
 
     with open_recording(write(tmp_path / "a.mcap", items)) as recording:
         (depth,) = choose_streams(recording)
-        colour = choose_colour(recording, depth)
+        colour = pair_colours(recording, [depth]).get(depth.topic)
     assert colour is not None
     assert depth.info_topic == "/cam/depth/intrinsics"
     assert colour.info_topic == "/cam/color/intrinsics"
@@ -262,7 +264,7 @@ def test_blank_first_image_does_not_hide_its_topic(tmp_path: Path) -> None:
 
     with open_recording(write(tmp_path / "a.mcap", items)) as recording:
         (depth,) = choose_streams(recording)
-        colour = choose_colour(recording, depth)
+        colour = pair_colours(recording, [depth]).get(depth.topic)
     assert (depth.topic, depth.frame_id) == ("/cam/depth/image", "camera")
     assert colour is not None
     assert (colour.topic, colour.frame_id) == ("/cam/color/image", "color")
@@ -279,7 +281,7 @@ def test_depth_compressed_as_png_is_not_colour(tmp_path: Path, kind: str) -> Non
     ]
 
     with open_recording(write(tmp_path / "a.mcap", items)) as recording:
-        colour = choose_colour(recording, choose_streams(recording)[0])
+        (colour,) = pair_colours(recording, choose_streams(recording)).values()
     assert colour is not None
     assert colour.topic == "/cam/color/image"
 
@@ -343,6 +345,43 @@ def test_cameras_with_similar_topics_are_several_sensors(
     with (
         open_recording(write(tmp_path / "a.mcap", items)) as recording,
         pytest.raises(NoStreamError, match="several sensors"),
+    ):
+        choose_streams(recording)
+
+
+def test_many_sensors_cost_a_few_messages_each_and_one_line(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Looking for the colour of each sensor on every topic would take minutes for 300 topics."""
+    read = Counter[str]()
+    messages = Recording.messages
+
+    def counted(self: Recording, topics: Any = None, *window: Any) -> Any:
+        read.update(topics)
+        return messages(self, topics, *window)
+
+    monkeypatch.setattr(Recording, "messages", counted)
+    items: list[Item] = []
+    for k in range(15):
+        items += depth_in(f"/robot{k}/camera/depth/image_raw", f"camera{k}")
+        items.append(
+            (
+                f"/robot{k}/camera/color/image_raw",
+                EPOCH,
+                raw(EPOCH, gradient(), "rgb8", f"color{k}"),
+            )
+        )
+    path = write(tmp_path / "a.mcap", items)
+
+    uses = {topic["name"]: topic["use"] for topic in describe_recording(path)["topics"]}
+
+    for k in range(15):
+        depth = f"/robot{k}/camera/depth/image_raw"
+        assert uses[f"/robot{k}/camera/color/image_raw"] == f"colour of {depth}"
+        assert read[depth] <= 4
+    with (
+        open_recording(path) as recording,
+        pytest.raises(NoStreamError, match=r"several sensors: /robot0/.* and 3 more; choose"),
     ):
         choose_streams(recording)
 

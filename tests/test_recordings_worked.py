@@ -20,7 +20,7 @@ from shapecat.cameras.colour import ColourImage
 from shapecat.errors import NoStreamError
 from shapecat.geometry import IDENTITY
 from shapecat.recordings import choose_streams, open_recording
-from shapecat.recordings.colour_streams import choose_colour, pair_colours
+from shapecat.recordings.colour_streams import pair_colours
 from shapecat.recordings.containers import time_order
 from shapecat.recordings.containers.mcap_records import Opcode, TruncatedError, walk
 from shapecat.recordings.containers.ros1_records import BagError, split
@@ -148,7 +148,7 @@ def test_criteria_for_colour_stream_apply_in_order(tmp_path: Path, better: Any, 
     path = record(tmp_path / "a.mcap", in_order([*depth_items(EPOCH), *worse, *better]))
     with open_recording(path) as recording:
         (stream,) = choose_streams(recording)
-        chosen = choose_colour(recording, stream)
+        chosen = pair_colours(recording, [stream]).get(stream.topic)
 
     assert chosen is not None
     assert chosen.topic == better[0][0]
@@ -167,7 +167,7 @@ def test_unrelated_colour_camera_is_used_only_if_single(tmp_path: Path) -> None:
         file = record(tmp_path / f"{k}.mcap", in_order(items))
         with open_recording(file) as recording:
             (stream,) = choose_streams(recording)
-            chosen = choose_colour(recording, stream)
+            chosen = pair_colours(recording, [stream]).get(stream.topic)
         assert (None if chosen is None else chosen.topic) == wanted
 
 
@@ -359,7 +359,7 @@ def test_librealsense_recording_gives_colour_pose(tmp_path: Path) -> None:
     path = record(tmp_path / "a.mcap", in_order(items))
     with open_recording(path) as recording:
         (stream,) = choose_streams(recording)
-        found = choose_colour(recording, stream)
+        found = pair_colours(recording, [stream]).get(stream.topic)
         assert found is not None
         pose = Extrinsics(recording, stream, found).colour_from_depth("0", "0", EPOCH, EPOCH)
 

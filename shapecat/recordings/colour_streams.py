@@ -3,10 +3,11 @@
 from collections.abc import Sequence
 from contextlib import suppress
 from dataclasses import dataclass, replace
+from functools import partial
 from pathlib import PurePosixPath
 from typing import Any, Literal
 
-from shapecat.errors import NoStreamError
+from shapecat.errors import NoStreamError, listed
 from shapecat.recordings.decoding.colour_image import COLOUR_ENCODINGS, compressed_kind
 from shapecat.recordings.decoding.compressed_depth import is_grey_png16
 from shapecat.recordings.decoding.depth_image import DEPTH_ENCODINGS
@@ -25,7 +26,7 @@ from shapecat.recordings.streams import (
     info_topic_of,
 )
 
-__all__ = ["ColourStream", "choose_colour", "colour_streams", "pair_colours"]
+__all__ = ["ColourStream", "colour_streams", "pair_colours"]
 
 _COLOUR_WORDS = ("color", "colour", "rgb")
 _VIDEO = ("CompressedVideo", "FFMPEGPacket")
@@ -67,32 +68,9 @@ def colour_streams(recording: Recording) -> tuple[ColourStream, ...]:
 
 
 def pair_colours(
-    recording: Recording, streams: Sequence[Stream], requested: str | None
+    recording: Recording, streams: Sequence[Stream], requested: str | None = None
 ) -> dict[str, ColourStream]:
     """Choose the colour streams of depth streams.
-
-    Parameters
-    ----------
-    requested : the topic for all depth streams; None to choose one for each, empty for none.
-
-    Returns
-    -------
-    The colour stream of each depth topic that has one.
-
-    Raises
-    ------
-    NoStreamError : the wanted topic does not exist or holds no colour images.
-    """
-    if requested == "":
-        return {}
-    found = {stream.topic: choose_colour(recording, stream, requested) for stream in streams}
-    return {topic: colour for topic, colour in found.items() if colour is not None}
-
-
-def choose_colour(
-    recording: Recording, stream: Stream, requested: str | None = None
-) -> ColourStream | None:
-    """Choose the colour stream of a depth stream.
 
     A cloud with colours is its own colour stream. Colour images belong to a depth stream if they
     have the same frame or if the topic names begin with the same namespace
@@ -104,33 +82,49 @@ def choose_colour(
 
     Parameters
     ----------
-    requested : the topic to return instead; it may hold grey images or a cloud.
+    requested : the topic for all depth streams, which may hold grey images or clouds; None to
+        choose one for each, empty for none.
 
     Returns
     -------
-    The colour stream; None if none belongs to the depth stream. ``info_topic`` is None where the
-    only calibration nearby is the depth stream's.
+    The colour stream of each depth topic that has one. ``info_topic`` is None where the only
+    calibration nearby is the depth stream's.
 
     Raises
     ------
     NoStreamError : the wanted topic does not exist or holds no colour images.
     """
-    streams = colour_streams(recording)
+    if requested == "":
+        return {}
+    found = colour_streams(recording)
     if requested is not None:
-        chosen: ColourStream | None = _select(recording, streams, requested)
+        chosen = dict.fromkeys((one.topic for one in streams), _select(recording, found, requested))
     else:
-        own = [one for one in streams if one.kind == "cloud" and one.topic == stream.topic]
-        images = [one for one in streams if one.kind != "cloud" and not one.grey]
-        sensors = by_sensor(depth_streams(recording)) if images else []
-        found = own or [one for one in images if _belongs(one, stream, sensors)]
-        single = len({one.topic.removesuffix("/compressed") for one in images}) == 1
-        if not found and single and len(sensors) == 1:
-            found = images
-        chosen = min(found, key=lambda one: _rank(one, stream), default=None)
-        if not streams:
+        chosen = _choose(recording, streams, found)
+        if not found:
             _warn_about_unread(recording)
-    if chosen is not None and chosen.info_topic == stream.info_topic:
-        return replace(chosen, info_topic=None)  # the calibration of the other camera
+    infos = {stream.topic: stream.info_topic for stream in streams}
+    return {
+        topic: replace(one, info_topic=None) if one.info_topic == infos[topic] else one
+        for topic, one in chosen.items()
+    }
+
+
+def _choose(
+    recording: Recording, streams: Sequence[Stream], found: Sequence[ColourStream]
+) -> dict[str, ColourStream]:
+    """Return the best of the colour streams that were found for each depth stream."""
+    images = [one for one in found if one.kind != "cloud" and not one.grey]
+    sensors = by_sensor(depth_streams(recording)) if images else []
+    single = len({one.topic.removesuffix("/compressed") for one in images}) == 1
+    chosen = {}
+    for stream in streams:
+        own = [one for one in found if one.kind == "cloud" and one.topic == stream.topic]
+        fitting = own or [one for one in images if _belongs(one, stream, sensors)]
+        if not fitting and single and len(sensors) == 1:
+            fitting = images
+        if fitting:
+            chosen[stream.topic] = min(fitting, key=partial(_rank, stream=stream))
     return chosen
 
 
@@ -150,7 +144,7 @@ def _warn_about_unread(recording: Recording) -> None:
 
 
 def _belongs(one: ColourStream, stream: Stream, sensors: Sequence[Sequence[Stream]]) -> bool:
-    """Return whether images are those of a depth stream's sensor, see `choose_colour`."""
+    """Return whether images are those of a depth stream's sensor, see `pair_colours`."""
     if same_frame(one.frame_id, stream.frame_id):
         return True
     other_streams = (other for sensor in sensors if stream not in sensor for other in sensor)
@@ -164,7 +158,7 @@ def _select(
     for one in streams:
         if one.topic.strip("/") == requested.strip("/"):
             return one
-    available = ", ".join(one.topic for one in streams) or "none"
+    available = listed([one.topic for one in streams]) or "none"
     exists = any(topic.name.strip("/") == requested.strip("/") for topic in recording.topics)
     state = "holds no colour images" if exists else "does not exist"
     msg = f"{recording.path}: topic {requested} {state}; colour images: {available}"

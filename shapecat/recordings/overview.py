@@ -4,7 +4,7 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
-from shapecat.recordings.colour_streams import choose_colour
+from shapecat.recordings.colour_streams import pair_colours
 from shapecat.recordings.containers.opening import open_recording
 from shapecat.recordings.files import input_size
 from shapecat.recordings.recording import Recording
@@ -50,9 +50,10 @@ def describe_recording(path: Path) -> dict[str, Any]:
 def _uses(recording: Recording, streams: Mapping[str, Stream]) -> dict[str, str]:
     """Return the use of each topic, in words; unused topics are absent."""
     uses = {stream.info_topic: "camera" for stream in streams.values() if stream.info_topic}
+    colours = pair_colours(recording, list(streams.values()))
     for topic, stream in streams.items():
         uses[topic] = f"{stream.kind} stream{'' if stream.usable else ' without CameraInfo'}"
-        colour = choose_colour(recording, stream)
+        colour = colours.get(topic)
         if colour is None:
             continue
         if colour.kind == "cloud":

@@ -6,7 +6,7 @@ from contextlib import suppress
 from itertools import islice
 from typing import Any
 
-from shapecat.errors import NoStreamError
+from shapecat.errors import NoStreamError, listed
 from shapecat.recordings.decoding.compressed_depth import is_grey_png16
 from shapecat.recordings.decoding.depth_image import DEPTH_ENCODINGS
 from shapecat.recordings.decoding.foxglove import ros_counterpart
@@ -100,7 +100,7 @@ def _best(recording: Recording, streams: tuple[Stream, ...]) -> Stream:
         raise NoStreamError(_why_none(recording, streams))
     sensors = by_sensor(usable)
     if len(sensors) > 1:
-        names = ", ".join(f"{s.topic} ({s.kind})" for s in usable)
+        names = listed([f"{s.topic} ({s.kind})" for s in usable])
         msg = f"{recording.path}: several sensors: {names}; choose with --topic"
         raise NoStreamError(msg)
     return min(sensors[0], key=_rank)
@@ -124,7 +124,7 @@ def _select(
 
 def _why_unusable(recording: Recording, streams: tuple[Stream, ...], name: str) -> str:
     """Return the error for a wanted topic that is missing or holds no depth."""
-    usable = ", ".join(stream.topic for stream in streams) or "none"
+    usable = listed([stream.topic for stream in streams]) or "none"
     topics = [t for t in recording.topics if t.name.strip("/") == name.strip("/")]
     details = [detail for topic in topics if (detail := _encoding_or_error(recording, topic))]
     state = "holds no clouds or depth images" if topics else "does not exist"
@@ -138,17 +138,16 @@ def _why_unusable(recording: Recording, streams: tuple[Stream, ...], name: str) 
 
 def _why_none(recording: Recording, streams: tuple[Stream, ...]) -> str:
     if streams:
-        names = ", ".join(stream.topic for stream in streams)
+        names = listed([stream.topic for stream in streams])
         problem = f"depth images without a sensor_msgs/CameraInfo: {names}"
         return f"{recording.path}: {problem}{_warnings(recording)}"
     details = ((topic, _encoding_or_error(recording, topic)) for topic in recording.topics)
     lines = [f"{t.name} ({', '.join(filter(None, (t.type or t.encoding, d)))})" for t, d in details]
-    listed_topics = ", ".join(lines[:12]) + (", …" if len(lines) > 12 else "")
     images = any(t.type.endswith("Image") for t in recording.topics)
     kinds = f" ({', '.join(DEPTH_ENCODINGS)})" if images else ""
     return (
         f"{recording.path}: no point clouds or depth images{kinds}; "
-        f"topics found: {listed_topics or 'none, the recording is empty'}{_warnings(recording)}"
+        f"topics found: {listed(lines) or 'none, the recording is empty'}{_warnings(recording)}"
     )
 
 

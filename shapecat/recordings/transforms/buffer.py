@@ -11,7 +11,7 @@ from typing import Any
 
 import numpy as np
 
-from shapecat.errors import RecordingError, ShapecatError
+from shapecat.errors import RecordingError, ShapecatError, listed
 from shapecat.geometry import IDENTITY, compose, inverse
 from shapecat.recordings.decoding.foxglove import ros_counterpart
 from shapecat.recordings.messages import Message
@@ -171,7 +171,7 @@ class TransformBuffer:
     def _require_frame(self, frame_id: str) -> str:
         name = frame_id.lstrip("/")
         if name not in self._frames:
-            examples = ", ".join(self.frames[:12]) or "none"
+            examples = listed(self.frames) or "none"
             msg = f"no transform names the frame {name!r}; known frames: {examples}"
             raise UnknownFrameError(msg)
         return name

@@ -5,7 +5,7 @@ from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
 
-from shapecat.errors import OutputError
+from shapecat.errors import OutputError, listed
 from shapecat.runs.folder import read_run, require_work
 from shapecat.runs.labels.meaning import (
     DELETE,
@@ -40,8 +40,6 @@ __all__ = [
 PREVIOUS = "tracks.previous.csv"
 LOST = "tracks.previous-*.csv"
 """Names of replaced tables of which labels could not be transferred; nothing replaces these."""
-_LISTED = 10
-"""Maximum number of missing tracks that an error lists."""
 
 
 def read_labels(path: Path, categories: Iterable[str] = ()) -> dict[int, TrackLabel]:
@@ -83,9 +81,8 @@ def read_original_table(path: Path) -> tuple[TrackTable, list[str]]:
     missing = [f"#{row.track}" for row in original.rows if row.track not in edited]
     problems = [*table.problems, *_contradictions(table, original)]
     if missing:
-        more = f" and {len(missing) - _LISTED} more" if len(missing) > _LISTED else ""
         problems.append(
-            f"missing tracks: {', '.join(missing[:_LISTED])}{more}; restore the lines from "
+            f"missing tracks: {listed(missing)}; restore the lines from "
             f"{ORIGINAL}, or write `{DELETE}` in the column label to remove objects"
         )
     rows = tuple(
