@@ -313,6 +313,14 @@ def test_plate_behind_pot_is_not_merged_with_its_floor(tilt_deg: float, x: float
     check(shapes, [1, 2], tilt_deg=tilt_deg)
 
 
+@pytest.mark.parametrize("tilt_deg", [50, 70, 89])
+def test_equal_objects_in_rows_stay_apart(tilt_deg: float) -> None:
+    """Seen from above, they look as distant and as high as the near and the far wall of a pot."""
+    places = [(x, y) for y in (-0.17, -0.085, 0.0, 0.085, 0.17) for x in (-0.21, -0.07, 0.07, 0.21)]
+    shapes = [box((x, y, 0), (0.038, 0.034, 0.05)) for x, y in places]
+    check([table(1, 1), *shapes], list(range(1, 21)), tilt_deg=tilt_deg)
+
+
 def union(*shapes: Shape) -> Shape:
     """Return a body that consists of several shapes."""
     return lambda origin, rays: np.min([shape(origin, rays) for shape in shapes], axis=0)

@@ -132,11 +132,14 @@ def _face(a: Row, b: Row) -> bool:
     min_width, max_width = min(width_of(a), width_of(b)), max(width_of(a), width_of(b))
     common = min(a.right, b.right) - max(a.left, b.left)
     level = abs(a.top - b.top) < MERGING.facing_m
-    return bool(
-        level
-        and common > MERGING.facing_share * min_width
-        and abs(depth_difference(a, b)) < max_width
-    )
+    return bool(level and common > MERGING.facing_share * min_width and _distance(a, b) < max_width)
+
+
+@kernel(inner=True)
+def _distance(a: Row, b: Row) -> float:
+    """Return the distance between the mean positions of two segments, metres."""
+    (x, y, z), (u, v, w) = _mean_position(a), _mean_position(b)
+    return math.sqrt((x - u) ** 2 + (y - v) ** 2 + (z - w) ** 2)
 
 
 @kernel
