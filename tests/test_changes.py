@@ -11,8 +11,6 @@ import pytest
 from shapecat.cameras.colour import LensCamera
 from shapecat.colour.projection import rectified
 from shapecat.geometry import IDENTITY
-from shapecat.outputs.annotation.ros_annotations import RosMessages
-from shapecat.outputs.colours import colour_of
 from shapecat.recordings import choose_streams, frames, open_recording
 from shapecat.recordings.colour_frames import frames_with_colour
 from shapecat.recordings.colour_streams import pair_colours
@@ -259,13 +257,3 @@ def test_each_topic_has_its_own_poses(tmp_path: Path) -> None:
     assert streams_with_poses(tmp_path) == {"/head"}
     assert frames.numbers_of(rows).tolist() == [0] * 5
     assert frames.poses_of(rows)[:, 0, 3].tolist() == [float(t == "/head") for t, _ in order]
-
-
-def test_ros_messages_use_colour_of_category() -> None:
-    ros = RosMessages(ros1=False)
-    for alpha in (0.5, 1.0):
-        for category in ("cup", "can", "unknown"):
-            colour = ros.colour("Color", category, alpha)
-            rgb = [255 * part for part in (colour.r, colour.g, colour.b)]
-            assert rgb == pytest.approx(colour_of(category))
-            assert colour.a == alpha

@@ -14,7 +14,7 @@ from rosbags.typesys import Stores, get_types_from_msg, get_typestore
 from scipy.spatial.transform import Rotation
 
 from shapecat.outputs.annotation.annotated_mcap import write_annotated
-from shapecat.outputs.annotation.foxglove_encoders import descriptors_of, encode_foxglove
+from shapecat.outputs.annotation.encoders import MessageKind, encoders_of
 from shapecat.recordings import choose_streams, frames, open_recording, read_transforms
 from shapecat.recordings.decoding.decoders import LIBRARY_ERRORS
 from shapecat.recordings.decoding.protobuf import message_decoder
@@ -235,7 +235,9 @@ def test_protobuf_scene_is_decoded_by_embedded_descriptors() -> None:
     }
 
     name = "foxglove.SceneUpdate"
-    read_back = message_decoder(descriptors_of(name), name)(encode_foxglove(scene, name))
+    kind = MessageKind[None]("/scene", name, lambda *_: scene)
+    ((channel, encode),) = encoders_of("protobuf", [kind])
+    read_back = message_decoder(channel.schema, name)(encode(None))
 
     assert read_back.deletions[0].timestamp.seconds == 5
     assert (read_back.deletions[0].type, read_back.deletions[0].id) == (1, "a")

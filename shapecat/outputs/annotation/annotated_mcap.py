@@ -17,13 +17,14 @@ from operator import attrgetter
 from pathlib import Path
 from typing import BinaryIO, TypeVar
 
-from shapecat.outputs.annotation.channels import ENCODERS, encoder_for
+from shapecat.outputs.annotation.channels import encoder_for
 from shapecat.outputs.annotation.content import (
     Annotation,
     AnnotationChannel,
     EncodedMessage,
     Encoders,
 )
+from shapecat.outputs.annotation.encoders import ENCODINGS
 from shapecat.outputs.annotation.image_annotations import ImageFrame, image_encoders_for
 from shapecat.outputs.annotation.mcap_append import Appender, copy_bytes
 from shapecat.recordings import Recording
@@ -214,7 +215,7 @@ def _encoding(recording: Recording, first: Annotation | None) -> str:
     """Return the encoding for annotations: that of the annotated topic, else the most common."""
     if recording.kind == "ros1":
         return "cdr"
-    topics = [topic for topic in recording.topics if topic.encoding in ENCODERS]
+    topics = [topic for topic in recording.topics if topic.encoding in ENCODINGS]
     encodings = [topic.encoding for topic in topics if first and topic.name == first.frame.topic]
     common = Counter(topic.encoding for topic in topics).most_common(1)
     return encodings[0] if encodings else common[0][0] if common else "json"

@@ -1,7 +1,5 @@
-"""Annotation channels for each message encoding."""
+"""The boxes of a frame as messages: detections, a scene, and markers."""
 
-from collections.abc import Callable, Sequence
-from functools import partial
 from typing import Any
 
 from shapecat.outputs.annotation.content import (
@@ -12,16 +10,11 @@ from shapecat.outputs.annotation.content import (
     text,
     text_position,
 )
-from shapecat.outputs.annotation.foxglove_encoders import json_encoder, protobuf_encoder
-from shapecat.outputs.annotation.ros_annotations import RosMessages
+from shapecat.outputs.annotation.encoders import MessageKind, Types, encoders_of
 from shapecat.outputs.colours import colour_of
-from shapecat.types import AnnotationBox, AnnotationFrame
+from shapecat.types import AnnotationBox
 
-__all__ = ["ENCODERS", "encoder_for"]
-
-DETECTIONS = "/shapecat/detections"
-SCENE = "/shapecat/scene"
-MARKERS = "/shapecat/markers"
+__all__ = ["encoder_for"]
 
 
 def encoder_for(encoding: str, *, markers: bool) -> Encoders[Annotation]:
@@ -29,90 +22,125 @@ def encoder_for(encoding: str, *, markers: bool) -> Encoders[Annotation]:
 
     An unknown encoding is replaced by JSON. ``markers`` adds a channel for RViz, for ROS only.
     """
-    encoders = ENCODERS.get(encoding, ENCODERS["json"])()
-    return [
-        (channel, encode) for channel, encode in encoders if markers or channel.topic != MARKERS
+    kinds = [
+        MessageKind("/shapecat/detections", "vision_msgs/msg/Detection3DArray", _detections),
+        MessageKind("/shapecat/scene", "foxglove.SceneUpdate", _scene),
     ]
+    if markers:
+        kinds.append(
+            MessageKind("/shapecat/markers", "visualization_msgs/msg/MarkerArray", _markers)
+        )
+    return encoders_of(encoding, kinds)
 
 
-def _ros(*, ros1: bool) -> Encoders[Annotation]:
-    ros = RosMessages(ros1=ros1)
-    return [
-        ros.encoder(DETECTIONS, "vision_msgs/msg/Detection3DArray", ros.detections),
-        ros.encoder(SCENE, "foxglove_msgs/msg/SceneUpdate", ros.scene),
-        ros.encoder(MARKERS, "visualization_msgs/msg/MarkerArray", ros.markers),
+def _detections(annotation: Annotation, t: Types) -> Any:
+    header = _header(annotation, t)
+    detections = []
+    for box in annotation.frame.objects:
+        pose = _pose(box, t)
+        label = t["ObjectHypothesis"](class_id=box.category, score=float(box.confidence))
+        place = t["PoseWithCovariance"](pose=pose)
+        result = t["ObjectHypothesisWithPose"](hypothesis=label, pose=place)
+        bounds = t["BoundingBox3D"](center=pose, size=_size(box, t))
+        detections.append(
+            t["Detection3D"](header=header, results=[result], bbox=bounds, id=str(box.track))
+        )
+    return t["Detection3DArray"](header=header, detections=detections)
+
+
+def _scene(annotation: Annotation, t: Types) -> Any:
+    frame, time = annotation.frame, t["Time"](annotation.frame.stamp_ns)
+    deletions = [
+        t["SceneEntityDeletion"](timestamp=time, type=0, id=entity_id(track))
+        for track in annotation.gone
     ]
+    lifetime = t["Time"](annotation.lifetime_ns)
+    shared = {"timestamp": time, "frame_id": frame.frame_id, "lifetime": lifetime}
+    entities = [
+        t["SceneEntity"](
+            **shared,
+            id=entity_id(box.track),
+            frame_locked=False,
+            metadata=[t["KeyValuePair"](key=k, value=v) for k, v in properties(box).items()],
+            arrows=[],
+            cubes=[_cube(box, t)],
+            spheres=[],
+            cylinders=[],
+            lines=[],
+            triangles=[],
+            texts=[_words(box, t)],
+            models=[],
+        )
+        for box in frame.objects
+    ]
+    return t["SceneUpdate"](deletions=deletions, entities=entities)
 
 
-def _plain_scene(annotation: Annotation, parts: tuple[str, str]) -> dict[str, Any]:
-    """Return a foxglove.SceneUpdate as plain values; ``parts`` names the fields of a time."""
-    frame = annotation.frame
-    time, lifetime = (
-        dict(zip(parts, divmod(value, 10**9), strict=True))
-        for value in (frame.stamp_ns, annotation.lifetime_ns)
+def _cube(box: AnnotationBox, t: Types) -> Any:
+    colour = _colour("Color", box, 0.5, t)
+    return t["CubePrimitive"](pose=_pose(box, t), size=_size(box, t), color=colour)
+
+
+def _words(box: AnnotationBox, t: Types) -> Any:
+    return t["TextPrimitive"](
+        pose=_text_pose(box, t),
+        billboard=True,
+        font_size=0.03,
+        scale_invariant=False,
+        color=_colour("Color", box, 1.0, t),
+        text=text(box),
     )
-    return {
-        "deletions": [
-            {"timestamp": time, "type": 0, "id": entity_id(track)} for track in annotation.gone
-        ],
-        "entities": [_plain_entity(box, frame, time, lifetime) for box in frame.objects],
-    }
 
 
-def _plain_entity(
-    box: AnnotationBox, frame: AnnotationFrame, time: Any, lifetime: Any
-) -> dict[str, Any]:
-    pose = {
-        "position": _plain("xyz", box.center),
-        "orientation": _plain("xyzw", box.orientation),
-    }
-    text_pose = {
-        "position": _plain("xyz", text_position(box)),
-        "orientation": _plain("xyzw", (0.0, 0.0, 0.0, 1.0)),
-    }
-    colour = [part / 255 for part in colour_of(box.category)]
-    return {
-        "timestamp": time,
-        "frame_id": frame.frame_id,
-        "id": entity_id(box.track),
-        "lifetime": lifetime,
-        "frame_locked": False,
-        "metadata": [{"key": key, "value": value} for key, value in properties(box).items()],
-        "arrows": [],
-        "cubes": [
-            {
-                "pose": pose,
-                "size": _plain("xyz", box.size),
-                "color": _plain("rgba", (*colour, 0.5)),
-            }
-        ],
-        "spheres": [],
-        "cylinders": [],
-        "lines": [],
-        "triangles": [],
-        "texts": [
-            {
-                "pose": text_pose,
-                "billboard": True,
-                "font_size": 0.03,
-                "scale_invariant": False,
-                "color": _plain("rgba", (*colour, 1.0)),
-                "text": text(box),
-            }
-        ],
-        "models": [],
-    }
+def _markers(annotation: Annotation, t: Types) -> Any:
+    """Make a cube and a text for each object."""
+    header, lifetime = _header(annotation, t), t["Time"](annotation.lifetime_ns)
+
+    def marker(kind: str, track: int, **fields: Any) -> Any:
+        name, number = f"shapecat/{kind}", 1 if kind == "box" else 9
+        place = {"header": header, "ns": name, "id": track, "type": number}
+        return t["Marker"](**place, lifetime=lifetime, **fields)
+
+    nowhere = t["Pose"](position=t["Point"](x=0.0, y=0.0, z=0.0), orientation=_upright(t))
+    markers = [
+        marker(kind, track, action=2, pose=nowhere)
+        for track in annotation.gone
+        for kind in ("box", "text")
+    ]
+    height = t["Vector3"](x=0.0, y=0.0, z=0.03)
+    for box in annotation.frame.objects:
+        pale, full = (_colour("ColorRGBA", box, alpha, t) for alpha in (0.5, 1.0))
+        cube = {"pose": _pose(box, t), "scale": _size(box, t), "color": pale}
+        words = {"pose": _text_pose(box, t), "scale": height, "color": full, "text": text(box)}
+        markers += [marker("box", box.track, **cube), marker("text", box.track, **words)]
+    return t["MarkerArray"](markers=markers)
 
 
-def _plain(names: str, values: Sequence[float]) -> dict[str, float]:
-    return dict(zip(names, values, strict=True))
+def _header(annotation: Annotation, t: Types) -> Any:
+    frame = annotation.frame
+    return t["Header"](stamp=t["Time"](frame.stamp_ns), frame_id=frame.frame_id)
 
 
-_SCENE = (SCENE, "foxglove.SceneUpdate", _plain_scene)
-ENCODERS: dict[str, Callable[[], Encoders[Annotation]]] = {
-    "cdr": partial(_ros, ros1=False),
-    "ros1": partial(_ros, ros1=True),
-    "json": partial(json_encoder, *_SCENE),
-    "protobuf": partial(protobuf_encoder, *_SCENE),
-}
-"""Annotation channels by the encoding of the source: files with mixed encodings break ROS tools."""
+def _pose(box: AnnotationBox, t: Types) -> Any:
+    (x, y, z), (qx, qy, qz, qw) = box.center, box.orientation
+    orientation = t["Quaternion"](x=qx, y=qy, z=qz, w=qw)
+    return t["Pose"](position=t["Point"](x=x, y=y, z=z), orientation=orientation)
+
+
+def _text_pose(box: AnnotationBox, t: Types) -> Any:
+    x, y, z = text_position(box)
+    return t["Pose"](position=t["Point"](x=x, y=y, z=z), orientation=_upright(t))
+
+
+def _upright(t: Types) -> Any:
+    return t["Quaternion"](x=0.0, y=0.0, z=0.0, w=1.0)
+
+
+def _size(box: AnnotationBox, t: Types) -> Any:
+    x, y, z = box.size
+    return t["Vector3"](x=x, y=y, z=z)
+
+
+def _colour(kind: str, box: AnnotationBox, alpha: float, t: Types) -> Any:
+    red, green, blue = colour_of(box.category)
+    return t[kind](r=red / 255, g=green / 255, b=blue / 255, a=alpha)

@@ -1,14 +1,12 @@
 """Annotations of colour images, for each message encoding."""
 
-from collections.abc import Callable, Iterable, Iterator, Mapping
-from functools import partial
+from collections.abc import Iterable, Iterator, Mapping
 from pathlib import Path
 from typing import Any, NamedTuple
 
 from shapecat.colour.image_masks import box_of
 from shapecat.outputs.annotation.content import Encoders
-from shapecat.outputs.annotation.foxglove_encoders import json_encoder, protobuf_encoder
-from shapecat.outputs.annotation.ros_annotations import RosMessages
+from shapecat.outputs.annotation.encoders import MessageKind, Types, encoders_of
 from shapecat.outputs.colours import colour_of
 from shapecat.outputs.wording import caption
 from shapecat.runs.labelled_tracks import LabelledTracks
@@ -17,8 +15,6 @@ from shapecat.runs.tables.masks import read_nearest_masks
 
 __all__ = ["ImageBox", "ImageFrame", "image_encoders_for", "read_image_frames"]
 
-DETECTIONS_2D = "/shapecat/detections_2d"
-DRAWN = "/shapecat/image_annotations"
 _LINE_LOOP = 2
 
 
@@ -77,89 +73,73 @@ def image_encoders_for(encoding: str, topics: Iterable[str]) -> dict[str, Encode
     Channels of several topics are named after these, since viewers draw all messages of a channel
     on an image. An unknown encoding is replaced by JSON.
     """
-    encoders, names = _ENCODERS.get(encoding, _ENCODERS["json"]), list(topics)
-    several = len(names) > 1
-    return {name: encoders(f"/{name.strip('/')}" if several else "") for name in names}
-
-
-def _ros(of_topic: str, *, ros1: bool) -> Encoders[ImageFrame]:
-    ros, array_type = RosMessages(ros1=ros1), "vision_msgs/msg/Detection2DArray"
-    drawn = "foxglove_msgs/msg/ImageAnnotations"
-    return [
-        ros.encoder(DETECTIONS_2D + of_topic, array_type, partial(_detections, ros)),
-        ros.encoder(DRAWN + of_topic, drawn, partial(_drawn, ros)),
-    ]
-
-
-def _font_size(box: ImageBox) -> float:
-    return float(min(max(box.box[3] / 6, 10), 18))
-
-
-def _plain(frame: ImageFrame, parts: tuple[str, str]) -> dict[str, Any]:
-    """Return a foxglove.ImageAnnotations as plain values; ``parts`` names the fields of a time."""
-    time = dict(zip(parts, divmod(frame.stamp_ns, 10**9), strict=True))
-    points, texts = [], []
-    for box in frame.boxes:
-        red, green, blue = (part / 255 for part in colour_of(box.category))
-        colour = {"r": red, "g": green, "b": blue, "a": 1.0}
-        corners = [{"x": x, "y": y} for x, y in box.corners]
-        points.append(
-            {
-                "timestamp": time,
-                "type": _LINE_LOOP,
-                "points": corners,
-                "outline_color": colour,
-                "outline_colors": [],
-                "fill_color": colour | {"a": 0.15},
-                "thickness": 2.0,
-            }
+    names = list(topics)
+    suffixes = {name: f"/{name.strip('/')}" if len(names) > 1 else "" for name in names}
+    return {
+        name: encoders_of(
+            encoding,
+            [
+                MessageKind(
+                    f"/shapecat/detections_2d{suffix}",
+                    "vision_msgs/msg/Detection2DArray",
+                    _detections,
+                ),
+                MessageKind(
+                    f"/shapecat/image_annotations{suffix}", "foxglove.ImageAnnotations", _drawn
+                ),
+            ],
         )
-        texts.append(
-            {
-                "timestamp": time,
-                "position": corners[0],
-                "text": box.text,
-                "font_size": _font_size(box),
-                "text_color": {"r": 1.0, "g": 1.0, "b": 1.0, "a": 1.0},
-                "background_color": colour | {"a": 0.7},
-            }
-        )
-    return {"circles": [], "points": points, "texts": texts}
+        for name, suffix in suffixes.items()
+    }
 
 
-def _detections(ros: RosMessages, frame: ImageFrame) -> Any:
-    """Make a vision_msgs/Detection2DArray."""
-    header = ros.make("Header", frame)
+def _detections(frame: ImageFrame, t: Types) -> Any:
+    header = t["Header"](stamp=t["Time"](frame.stamp_ns), frame_id=frame.frame_id)
+    turn = t["Quaternion"](x=0.0, y=0.0, z=0.0, w=1.0)
+    nowhere = t["Pose"](position=t["Point"](x=0.0, y=0.0, z=0.0), orientation=turn)
+    no_pose = t["PoseWithCovariance"](pose=nowhere)
     detections = []
     for one in frame.boxes:
         left, top, width, height = (float(value) for value in one.box)
-        hypothesis = ros.make("ObjectHypothesis", one.category, float(one.confidence))
-        result = ros.make("ObjectHypothesisWithPose", hypothesis, ros.no_pose)
-        middle = ros.make("Point2D", left + width / 2, top + height / 2)
-        bounds = ros.make("BoundingBox2D", ros.make("Pose2D", middle, 0.0), width, height)
-        detections.append(ros.make("Detection2D", header, [result], bounds, str(one.track)))
-    return ros.make("Detection2DArray", header, detections)
-
-
-def _drawn(ros: RosMessages, frame: ImageFrame) -> Any:
-    """Make a foxglove_msgs/ImageAnnotations."""
-    time = ros.make("Header", frame).stamp
-    points, texts, white = [], [], ros.make("Color", 1.0, 1.0, 1.0, 1.0)
-    for box in frame.boxes:
-        line, fill, behind = (
-            ros.colour("Color", box.category, alpha) for alpha in (1.0, 0.15, 0.7)
+        label = t["ObjectHypothesis"](class_id=one.category, score=float(one.confidence))
+        result = t["ObjectHypothesisWithPose"](hypothesis=label, pose=no_pose)
+        middle = t["Pose2D"](position=t["Point2D"](x=left + width / 2, y=top + height / 2))
+        bounds = t["BoundingBox2D"](center=middle, size_x=width, size_y=height)
+        detections.append(
+            t["Detection2D"](header=header, results=[result], bbox=bounds, id=str(one.track))
         )
-        corners = [ros.make("Point2", x, y) for x, y in box.corners]
-        points.append(ros.make("PointsAnnotation", time, _LINE_LOOP, corners, line, [], fill, 2.0))
-        written = (corners[0], box.text, _font_size(box), white, behind)
-        texts.append(ros.make("TextAnnotation", time, *written))
-    return ros.make("ImageAnnotations", [], points, texts)
+    return t["Detection2DArray"](header=header, detections=detections)
 
 
-_NAME = "foxglove.ImageAnnotations"
-_ENCODERS: dict[str, Callable[[str], Encoders[ImageFrame]]] = {
-    "cdr": partial(_ros, ros1=False),
-    "ros1": partial(_ros, ros1=True),
-    "json": lambda of_topic: json_encoder(DRAWN + of_topic, _NAME, _plain),
-    "protobuf": lambda of_topic: protobuf_encoder(DRAWN + of_topic, _NAME, _plain),
-}
+def _drawn(frame: ImageFrame, t: Types) -> Any:
+    time = t["Time"](frame.stamp_ns)
+    white = t["Color"](r=1.0, g=1.0, b=1.0, a=1.0)
+    points, texts = [], []
+    for box in frame.boxes:
+        red, green, blue = (part / 255 for part in colour_of(box.category))
+        line, fill, behind = (
+            t["Color"](r=red, g=green, b=blue, a=alpha) for alpha in (1.0, 0.15, 0.7)
+        )
+        corners = [t["Point2"](x=x, y=y) for x, y in box.corners]
+        points.append(
+            t["PointsAnnotation"](
+                timestamp=time,
+                type=_LINE_LOOP,
+                points=corners,
+                outline_color=line,
+                outline_colors=[],
+                fill_color=fill,
+                thickness=2.0,
+            )
+        )
+        texts.append(
+            t["TextAnnotation"](
+                timestamp=time,
+                position=corners[0],
+                text=box.text,
+                font_size=float(min(max(box.box[3] / 6, 10), 18)),
+                text_color=white,
+                background_color=behind,
+            )
+        )
+    return t["ImageAnnotations"](circles=[], points=points, texts=texts)
