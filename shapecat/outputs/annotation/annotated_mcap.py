@@ -10,9 +10,8 @@ from collections import Counter, deque
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import contextmanager
-from dataclasses import dataclass
 from heapq import merge
-from itertools import chain
+from itertools import chain, islice
 from operator import attrgetter
 from pathlib import Path
 from typing import BinaryIO, TypeVar
@@ -44,7 +43,7 @@ _PERIOD_NS = 1_000_000_000
 _LONGEST_NS = 3600 * 10**9
 """Longest frame period: a clock that is set during a recording jumps by decades."""
 _AHEAD = 64
-"""Frames that wait until the next frame of their topic is known, if others come first."""
+"""Frames among which the next one of a topic is found."""
 _F = TypeVar("_F", Annotation, ImageFrame)
 
 
@@ -179,30 +178,21 @@ def _annotations(frames: Iterable[AnnotationFrame]) -> Iterator[Annotation]:
         yield Annotation(frame, lifetime, tuple(sorted(gone)))
 
 
-@dataclass(slots=True)
-class _WaitingFrame:
-    """A frame, and the time to the next frame of its topic, ns: that before until it is known."""
-
-    frame: AnnotationFrame
-    period: int = _PERIOD_NS
-    known: bool = False
-
-
 def _with_periods(frames: Iterable[AnnotationFrame]) -> Iterator[tuple[AnnotationFrame, int]]:
     """Yield frames with the time, ns, to the next frame of their topic, else from the last one."""
-    waiting: deque[_WaitingFrame] = deque()
-    last: dict[str, _WaitingFrame] = {}
-    for frame in frames:
-        one = _WaitingFrame(frame)
-        if before := last.get(frame.topic):
-            before.period, before.known = _period(before.frame, frame), True
-            one.period = before.period
-        last[frame.topic] = one
-        waiting.append(one)
-        while waiting[0].known or len(waiting) > _AHEAD:
-            first = waiting.popleft()
-            yield first.frame, first.period
-    yield from ((one.frame, one.period) for one in waiting)
+    source = iter(frames)
+    following = deque(islice(source, _AHEAD))
+    last: dict[str, AnnotationFrame] = {}
+    while following:
+        frame = following.popleft()
+        following.extend(islice(source, 1))
+        after = next((other for other in following if other.topic == frame.topic), None)
+        before = last.get(frame.topic)
+        last[frame.topic] = frame
+        if after is not None:
+            yield frame, _period(frame, after)
+        else:
+            yield frame, _PERIOD_NS if before is None else _period(before, frame)
 
 
 def _period(frame: AnnotationFrame, following: AnnotationFrame) -> int:
