@@ -1,7 +1,7 @@
 """Rewrite a recording as MCAP, with the annotations among its messages by time."""
 
 from collections import Counter
-from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from heapq import merge
 from operator import attrgetter
 from typing import BinaryIO
@@ -37,15 +37,15 @@ def rewrite(
     writer = Writer(file, compression=CompressionType.LZ4)
     parts = [part for part in recording.parts() if isinstance(part, McapRecording)]
     writer.start(parts[0].profile if parts else "ros2", "shapecat")
-    source = _Source(writer, convert=recording.kind == "ros1")
+    target = _Target(writer, convert=recording.kind == "ros1")
     for channel in recording.channels():
-        source.number(channel)
-    numbers = [_register(writer, channel) for channel in channels]
+        target.number(channel)
+    numbers = [target.register(channel) for channel in channels]
     sequences: Counter[int] = Counter()
     streams: list[Iterable[Message | EncodedMessage]] = [recording.messages(), items]
     for item in merge(*streams, key=attrgetter("log_time_ns")):
         if isinstance(item, Message):
-            source.write(item)
+            target.write(item)
             continue
         position, time = item.channel, item.log_time_ns
         writer.add_message(numbers[position], time, item.data, time, sequences[position])
@@ -56,8 +56,8 @@ def rewrite(
     writer.finish()
 
 
-class _Source:
-    """Writes the original messages, and registers their channels as they appear."""
+class _Target:
+    """Writes the original messages, and registers channels as they appear."""
 
     def __init__(self, writer: Writer, *, convert: bool) -> None:
         self.writer = writer
@@ -84,57 +84,39 @@ class _Source:
             self.known[channel] = self._register(channel)
         return self.known[channel]
 
+    def register(self, channel: AnnotationChannel) -> int:
+        """Register a channel and its schema; return the number of the channel."""
+        key = (channel.schema_name, channel.schema_encoding, channel.schema)
+        if key not in self.schemas:
+            self.schemas[key] = self.writer.register_schema(*key) if channel.schema_name else 0
+        about = channel.topic, channel.encoding, self.schemas[key], dict(channel.metadata)
+        return int(self.writer.register_channel(*about))
+
     def _register(self, channel: Channel) -> _Registered:
         if not (self.convert and channel.encoding == "ros1"):
-            described = AnnotationChannel(
-                channel.topic, channel.encoding, *schema_of(channel), channel.metadata
-            )
-            return _register(self.writer, described, self.schemas), None
+            about = channel.topic, channel.encoding, *schema_of(channel), channel.metadata
+            return self.register(AnnotationChannel(*about)), None
         converted = convert_channel(channel)
         if converted is None:
             return self._raw_number(channel), lambda data: wrap_raw(channel, data)
-        return _register(self.writer, converted[0], self.schemas), converted[1]
+        return self.register(converted[0]), converted[1]
 
     def _raw_number(self, channel: Channel) -> int:
         if channel.topic not in self.raw:
-            described = raw_channel(channel.topic)
-            self.raw[channel.topic] = _register(self.writer, described, self.schemas)
+            self.raw[channel.topic] = self.register(raw_channel(channel.topic))
         return self.raw[channel.topic]
 
 
-def _register(
-    writer: Writer,
-    channel: AnnotationChannel,
-    schemas: dict[tuple[str, str, bytes], int] | None = None,
-) -> int:
-    key = (channel.schema_name, channel.schema_encoding, channel.schema)
-    schemas = {} if schemas is None else schemas
-    if key not in schemas:
-        schemas[key] = writer.register_schema(*key) if channel.schema_name else 0
-    metadata = dict(channel.metadata)
-    return int(writer.register_channel(channel.topic, channel.encoding, schemas[key], metadata))
-
-
 def _copy_extras(recording: McapRecording, writer: Writer) -> None:
-    """Copy attachments and metadata to the writer."""
-    for item in _extras(recording):
-        if isinstance(item, records.Attachment):
-            writer.add_attachment(
-                item.create_time, item.log_time, item.name, item.media_type, item.data
-            )
-        else:
-            writer.add_metadata(item.name, item.metadata)
-
-
-def _extras(recording: McapRecording) -> Iterator[records.Attachment | records.Metadata]:
-    readers = {
-        Opcode.ATTACHMENT: records.Attachment.read,
-        Opcode.METADATA: records.Metadata.read,
-    }
+    """Copy attachments and metadata to the writer; warn of those that are damaged."""
     for record in recording.top_level():
-        read = readers.get(record.opcode)
-        if read is not None:
-            try:
-                yield parse(read, recording.content(record))
-            except ChunkError as error:
-                recording.warn(f"skipped a record at byte {record.offset}: {error}")
+        try:
+            if record.opcode == Opcode.ATTACHMENT:
+                file = parse(records.Attachment.read, recording.content(record))
+                times = file.create_time, file.log_time
+                writer.add_attachment(*times, file.name, file.media_type, file.data)
+            elif record.opcode == Opcode.METADATA:
+                entry = parse(records.Metadata.read, recording.content(record))
+                writer.add_metadata(entry.name, entry.metadata)
+        except ChunkError as error:
+            recording.warn(f"skipped a record at byte {record.offset}: {error}")
