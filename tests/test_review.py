@@ -413,7 +413,7 @@ def test_counts_of_two_sensors_are_separate_lines(tmp_path: Path) -> None:
 
 def test_two_sensors_may_share_their_colour_camera() -> None:
     stream = rr.RecordingStream("test")
-    images = Images(stream, Columns(stream))
+    images = Images(Columns(stream))
     for topic in ("/left", "/right"):
         empty = np.zeros((0, 4), np.float32)
         images.add(topic, (0, 0), Picture("/colour", b"", "image/png", b"", empty, []))

@@ -6,12 +6,12 @@ written when enough rows, or enough numbers, are held back.
 
 from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass, field
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 import rerun as rr
 
-__all__ = ["At", "Columns", "curve"]
+__all__ = ["At", "Columns", "Drawing", "curve"]
 
 At = tuple[int, int]
 """Stamp in nanoseconds, and frame number."""
@@ -19,14 +19,19 @@ At = tuple[int, int]
 _ROWS, _NUMBERS = 256, 1 << 17
 """An entity is written when it holds this many rows, or this many numbers in them."""
 
-_Draw = Callable[[Sequence[Any]], Iterable[rr.ComponentColumn]]
+
+class Drawing(NamedTuple):
+    """How an entity is drawn: the function from its rows to columns, and its static style."""
+
+    columns: Callable[[Sequence[Any]], Iterable[rr.ComponentColumn]]
+    style: rr.AsComponents | None = None
 
 
 @dataclass
 class _Buffer:
     """The rows of an entity that are not written yet."""
 
-    draw: _Draw
+    drawing: Drawing
     at: list[At] = field(default_factory=list)
     rows: list[Any] = field(default_factory=list)
     size: int = 0
@@ -40,15 +45,19 @@ class Columns:
         self._stream = stream
         self._buffers: dict[str, _Buffer] = {}
 
-    def add(self, entity: str, at: At, row: Any, draw: _Draw, *, size: int = 1) -> None:
-        """Add a row of an entity.
+    def add(self, entity: str, at: At, row: Any, drawing: Drawing, *, size: int = 1) -> None:
+        """Add a row of an entity; the first one also writes its style.
 
         Parameters
         ----------
-        draw : converts the rows of this entity to columns.
+        drawing : the same for all rows of this entity.
         size : number of values that the row keeps in memory.
         """
-        buffer = self._buffers.setdefault(entity, _Buffer(draw))
+        if entity not in self._buffers:
+            self._buffers[entity] = _Buffer(drawing)
+            if drawing.style is not None:
+                self._stream.log(entity, drawing.style, static=True)
+        buffer = self._buffers[entity]
         buffer.at.append(at)
         buffer.rows.append(row)
         buffer.size += size
@@ -63,8 +72,9 @@ class Columns:
     def _send(self, entity: str) -> None:
         buffer = self._buffers[entity]
         if buffer.rows:
-            self._stream.send_columns(entity, _times_of(buffer.at), buffer.draw(buffer.rows))
-            self._buffers[entity] = _Buffer(buffer.draw)
+            columns = buffer.drawing.columns(buffer.rows)
+            self._stream.send_columns(entity, _times_of(buffer.at), columns)
+            self._buffers[entity] = _Buffer(buffer.drawing)
 
 
 def curve(rows: Sequence[Sequence[float]]) -> Iterable[rr.ComponentColumn]:

@@ -14,7 +14,7 @@ from shapecat.jit import kernel
 from shapecat.outputs.colouring import Coloured
 from shapecat.outputs.colours import colour_of
 from shapecat.outputs.png import png
-from shapecat.outputs.review.columns import At, Columns
+from shapecat.outputs.review.columns import At, Columns, Drawing
 from shapecat.outputs.review.shapes import short_label
 from shapecat.recordings.decoding.colour_image import pixels_of
 from shapecat.types import LabelledFrame, LabelledObject
@@ -123,33 +123,23 @@ _Boxes = tuple[F4, list[tuple[int, int, int]], list[str]]
 class Images:
     """Writes the colour images of the frames; ``entities`` maps entities to their titles."""
 
-    def __init__(self, stream: rr.RecordingStream, columns: Columns) -> None:
+    def __init__(self, columns: Columns) -> None:
         """Start without images."""
-        self._stream, self._columns = stream, columns
+        self._columns = columns
         self.entities: dict[str, str] = {}
 
     def add(self, topic: str, at: At, picture: Picture) -> None:
         """Add the picture of a frame on a topic."""
         entity = rr.new_entity_path(["images", topic])
-        if entity not in self.entities:
-            self.entities[entity] = picture.topic
-            for name, style in _STYLES.items():
-                self._stream.log(f"{entity}/{name}", style, static=True)
-        files = {"": (picture.contents, picture.media_type), "/masks": (picture.masks, "image/png")}
-        for name, file in files.items():
+        self.entities.setdefault(entity, picture.topic)
+        image, masks = (picture.contents, picture.media_type), (picture.masks, "image/png")
+        for name, file, drawing in (("", image, _IMAGE), ("/masks", masks, _MASKS)):
             size = len(file[0]) // _BYTES_PER_NUMBER
-            self._columns.add(f"{entity}{name}", at, file, _files, size=size)
+            self._columns.add(f"{entity}{name}", at, file, drawing, size=size)
         tones = [colour_of(item.category) for item in picture.objects]
         boxes = (picture.boxes, tones, [short_label(item) for item in picture.objects])
-        for name, draw in (("boxes", _boxes), ("captions", _captions)):
-            self._columns.add(f"{entity}/{name}", at, boxes, draw, size=len(picture.boxes))
-
-
-_STYLES = {
-    "masks": rr.EncodedImage.from_fields(draw_order=1.0),
-    "boxes": rr.Boxes2D.from_fields(draw_order=2.0),
-    "captions": rr.Points2D.from_fields(radii=0.5, show_labels=True, draw_order=3.0),
-}
+        for name, drawing in (("boxes", _BOXES), ("captions", _CAPTIONS)):
+            self._columns.add(f"{entity}/{name}", at, boxes, drawing, size=len(picture.boxes))
 
 
 def _files(rows: Sequence[tuple[bytes, str]]) -> Iterable[rr.ComponentColumn]:
@@ -180,3 +170,9 @@ def _joined(rows: Sequence[_Boxes]) -> tuple[F4, U1, list[int]]:
     boxes = np.concatenate([boxes for boxes, _, _ in rows])
     counts = [len(texts) for _, _, texts in rows]
     return boxes, np.array(tones, np.uint8).reshape(-1, 3), counts
+
+
+_IMAGE = Drawing(_files)
+_MASKS = Drawing(_files, rr.EncodedImage.from_fields(draw_order=1.0))
+_BOXES = Drawing(_boxes, rr.Boxes2D.from_fields(draw_order=2.0))
+_CAPTIONS = Drawing(_captions, rr.Points2D.from_fields(radii=0.5, show_labels=True, draw_order=3.0))

@@ -7,7 +7,7 @@ import numpy as np
 
 from shapecat.arrays import F8
 from shapecat.outputs.review.columns import At, Columns
-from shapecat.outputs.review.shapes import paths
+from shapecat.outputs.review.shapes import PATHS
 
 __all__ = ["Paths"]
 
@@ -67,4 +67,4 @@ class Paths:
         entity_paths = self._paths[entity].values()
         strips = [(path.category, np.array(path.places)) for path in entity_paths if path.drawn]
         size = sum(places.size for _, places in strips)
-        self._columns.add(entity, at, strips, paths, size=size)
+        self._columns.add(entity, at, strips, PATHS, size=size)

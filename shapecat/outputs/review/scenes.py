@@ -1,4 +1,4 @@
-"""Choose the frames of a review whose scene is drawn, and paint them."""
+"""Choose the frames of a review whose scene is drawn."""
 
 import math
 from collections.abc import Collection, Iterable, Iterator
@@ -8,13 +8,11 @@ from typing import NamedTuple
 from shapecat.arrays import F8
 from shapecat.geometry import IDENTITY, transform
 from shapecat.outputs.colouring import Coloured, with_colour
-from shapecat.outputs.review.clouds import PaintedCloud, paint
-from shapecat.outputs.review.images import Picture, picture_of
-from shapecat.recordings import MessageError, Recording
+from shapecat.recordings import Recording
 from shapecat.runs.run_info import RunInfo
 from shapecat.types import Frame, LabelledFrame
 
-__all__ = ["PaintedFrame", "ReviewFrame", "choose_scenes", "paint_frame", "with_clouds"]
+__all__ = ["ReviewFrame", "choose_scenes", "with_clouds"]
 
 _SOON_NS, _LATE_NS = 90_000_000, 240_000_000
 """Shortest time between two drawn scenes, and longest time between scenes that differ."""
@@ -96,35 +94,3 @@ def _places(labelled: LabelledFrame, *, fixed: bool) -> dict[int, F8]:
     return {
         o.track: transform(pose or IDENTITY, (o.full or o.box).center) for o in labelled.objects
     }
-
-
-class PaintedFrame(NamedTuple):
-    """A frame ready to write.
-
-    ``clouds`` are the points on no object and on objects, None if the scene is not drawn;
-    ``picture`` is None without a colour image; ``damage`` says why that is unreadable, or is empty.
-    """
-
-    labelled: LabelledFrame
-    frame: Frame | None
-    clouds: tuple[PaintedCloud, PaintedCloud] | None
-    picture: Picture | None
-    damage: str
-
-
-def paint_frame(chosen: ReviewFrame, *, limit: int) -> PaintedFrame:
-    """Paint the clouds and masks of a frame, without colour if its image is damaged.
-
-    ``limit`` is the approximate number of points to keep, 0 for all.
-    """
-    labelled, frame, coloured = chosen
-    damage, parts = "", (labelled.planes, labelled.objects)
-    if frame is None:
-        return PaintedFrame(labelled, None, None, None, "")
-    if coloured is not None:
-        try:
-            clouds = paint(frame, *parts, limit=limit, view=coloured.view)
-            return PaintedFrame(labelled, frame, clouds, picture_of(labelled, coloured), "")
-        except MessageError as error:
-            damage = f"{coloured.view.image.topic}: {error}"
-    return PaintedFrame(labelled, frame, paint(frame, *parts, limit=limit), None, damage)

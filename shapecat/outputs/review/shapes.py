@@ -3,9 +3,9 @@
 Several frames are converted at a time, to columns: a call for each costs ten times as much.
 """
 
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from itertools import chain
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 import pyarrow as pa
@@ -20,21 +20,21 @@ from shapecat.geometry import (
 )
 from shapecat.outputs.colours import colour_of
 from shapecat.outputs.review.clouds import PaintedCloud
+from shapecat.outputs.review.columns import Drawing
 from shapecat.outputs.wording import caption
 from shapecat.surface.triangles import triangles_of
 from shapecat.types import Box, Camera, LabelledFrame, LabelledObject, NeuralGas, Plane, Pose
 
 __all__ = [
+    "PATHS",
+    "PLACES",
     "SCENE",
     "SKETCH",
-    "Drawing",
     "DrawnScene",
     "Way",
     "label",
     "markdown",
-    "paths",
     "pinhole",
-    "places",
     "short_label",
     "sketch",
 ]
@@ -87,13 +87,6 @@ class Sketch(NamedTuple):
     category: str
     label: str
     caption: str
-
-
-class Drawing(NamedTuple):
-    """How an entity is drawn: its static style, and the function from rows to columns."""
-
-    style: rr.AsComponents | None
-    columns: Callable[[Sequence[Any]], _Columns]
 
 
 def label(item: LabelledObject) -> str:
@@ -227,25 +220,24 @@ def _faces(meshes: Sequence[U4]) -> rr.ComponentColumn:
 # The colours of points are shaded already.
 _FLAT = rr.Points3D.from_fields(point_shading=rr.components.PointShading.Flat)
 SCENE: Mapping[str, Drawing] = {
-    "scene": Drawing(_FLAT, lambda scenes: _points([moment.scene for moment in scenes])),
-    "objects/points": Drawing(_FLAT, lambda scenes: _points([moment.points for moment in scenes])),
-    "planes": Drawing(rr.LineStrips3D.from_fields(colors=_PLANE, radii=0.001), _outlines),
-    "planes/fill": Drawing(rr.Mesh3D.from_fields(albedo_factor=(*_PLANE, 28)), _fills),
-    "objects/full": Drawing(rr.LineStrips3D.from_fields(radii=0.0008), _dashes),
-    "objects/graphs": Drawing(rr.LineStrips3D.from_fields(radii=0.0008), _graphs),
-    "objects/surfaces": Drawing(None, _surfaces),
+    "scene": Drawing(lambda scenes: _points([moment.scene for moment in scenes]), _FLAT),
+    "objects/points": Drawing(lambda scenes: _points([moment.points for moment in scenes]), _FLAT),
+    "planes": Drawing(_outlines, rr.LineStrips3D.from_fields(colors=_PLANE, radii=0.001)),
+    "planes/fill": Drawing(_fills, rr.Mesh3D.from_fields(albedo_factor=(*_PLANE, 28))),
+    "objects/full": Drawing(_dashes, rr.LineStrips3D.from_fields(radii=0.0008)),
+    "objects/graphs": Drawing(_graphs, rr.LineStrips3D.from_fields(radii=0.0008)),
+    "objects/surfaces": Drawing(_surfaces),
 }
 """The `Drawing` of each entity below the scene, made from a `DrawnScene` a few times a second."""
 SKETCH: Mapping[str, Drawing] = {
     # Labels of boxes would cover the objects.
-    "objects/boxes": Drawing(rr.Boxes3D.from_fields(radii=0.001, show_labels=False), _boxes),
-    "objects/captions": Drawing(rr.Points3D.from_fields(radii=0.0005, show_labels=True), _captions),
+    "objects/boxes": Drawing(_boxes, rr.Boxes3D.from_fields(radii=0.001, show_labels=False)),
+    "objects/captions": Drawing(_captions, rr.Points3D.from_fields(radii=0.0005, show_labels=True)),
 }
 """The `Drawing` of each entity below the sensor, made from the objects' `Sketch` in every frame."""
 
 
-def paths(snapshots: Sequence[Sequence[Way]]) -> _Columns:
-    """Return the columns of the paths in several frames."""
+def _paths(snapshots: Sequence[Sequence[Way]]) -> _Columns:
     strips = [way for snapshot in snapshots for way in snapshot]
     yield from rr.LineStrips3D.columns(
         strips=[places for _, places in strips],
@@ -253,12 +245,15 @@ def paths(snapshots: Sequence[Sequence[Way]]) -> _Columns:
     ).partition([len(snapshot) for snapshot in snapshots])
 
 
-def places(poses: Sequence[Pose]) -> _Columns:
-    """Return the columns of poses ``parent_from_child``."""
+def _places(poses: Sequence[Pose]) -> _Columns:
     yield from rr.Transform3D.columns(
         translation=[pose.translation for pose in poses],
         quaternion=[quaternion_from_rotation(pose.rotation) for pose in poses],
     )
+
+
+PATHS, PLACES = Drawing(_paths), Drawing(_places)
+"""The `Drawing` of the paths of tracks, and of poses ``parent_from_child``."""
 
 
 def pinhole(camera: Camera) -> rr.Pinhole:

@@ -35,10 +35,9 @@ Timelines: ``sensor_time`` (the stamp) and ``frame``.
 import json
 import uuid
 from collections import Counter
-from collections.abc import Callable, Iterable, Mapping
-from functools import partial
+from collections.abc import Iterable, Mapping
+from functools import cache
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 import rerun as rr
@@ -47,9 +46,10 @@ from shapecat.arrays import F8
 from shapecat.geometry import IDENTITY, transform
 from shapecat.outputs.colours import colour_of
 from shapecat.outputs.review import shapes
-from shapecat.outputs.review.columns import At, Columns, curve
+from shapecat.outputs.review.clouds import PaintedCloud, paint
+from shapecat.outputs.review.columns import Columns, Drawing, curve
 from shapecat.outputs.review.file import forget_reviews, open_review
-from shapecat.outputs.review.images import Images
+from shapecat.outputs.review.images import Images, picture_of
 from shapecat.outputs.review.layout import (
     Eye,
     TrackView,
@@ -59,11 +59,12 @@ from shapecat.outputs.review.layout import (
     stepped_back,
 )
 from shapecat.outputs.review.paths import Paths
-from shapecat.outputs.review.scenes import PaintedFrame, ReviewFrame, paint_frame
-from shapecat.outputs.review.shapes import SCENE, SKETCH, Drawing, DrawnScene
+from shapecat.outputs.review.scenes import ReviewFrame
+from shapecat.outputs.review.shapes import PLACES, SCENE, SKETCH, DrawnScene
+from shapecat.recordings import MessageError
 from shapecat.runs.labels.meaning import TrackLabel
 from shapecat.runs.run_info import RunInfo
-from shapecat.types import Camera, Frame, LabelledFrame, LabelledObject, Pose
+from shapecat.types import Camera, Frame, LabelledFrame, Pose
 
 __all__ = ["write_review"]
 
@@ -101,10 +102,10 @@ def write_review(
     stream = _stream(name, run, labels)
     with open_review(path, stream) as file:
         stream.send_recording_name(name)
-        review, limit = _Review(stream, run), run["settings"]["outputs"]["cloud_points"]
+        review = _Review(stream, run)
         for k, frame in enumerate(frames):
             file.check()
-            review.add(paint_frame(frame, limit=limit))
+            review.add(frame)
             if k % _FLUSH_FRAMES == _FLUSH_FRAMES - 1:
                 file.flush()
         review.end()
@@ -131,11 +132,13 @@ class _Review:
         """Write what does not change over time."""
         self._stream, self._columns = stream, Columns(stream)
         self._log = stream.log
+        self._limit = run["settings"]["outputs"]["cloud_points"]
         categories = run["model"]["categories"]
-        self._curves: dict[str, Any] = {
-            "names": categories,
-            "colors": [colour_of(category) for category in categories],
-        }
+        colours = [colour_of(category) for category in categories]
+        widths, sizes = [1.5] * len(categories), [4.0] * len(categories)
+        lines = rr.SeriesLines(names=categories, colors=colours, widths=widths)
+        self._posterior = Drawing(curve, lines)
+        self._dots = rr.SeriesPoints(names=categories, colors=colours, marker_sizes=sizes)
         self._fixed_frame = run["fixed_frame"]
         self._eyes: dict[str, Eye] = {}
         # Bounds of objects in the fixed frame.
@@ -144,8 +147,7 @@ class _Review:
         self._tracks: dict[int, TrackView] = {}
         self._aimed: set[str] = set()  # topics whose eye was chosen with an object in view
         self._paths = Paths(self._columns)
-        self._images = Images(stream, self._columns)
-        self._styled: set[str] = set()  # entities whose style is written
+        self._images = Images(self._columns)
         self._counted: dict[str, dict[str, None]] = {}  # categories so far of each topic, in order
         self._several = len(run["options"]["topics"]) > 1
         self._warnings = run["warnings"]
@@ -154,23 +156,44 @@ class _Review:
         if self._fixed_frame is not None:
             self._log("world", rr.ViewCoordinates.RIGHT_HAND_Z_UP, static=True)
 
-    def add(self, painted: PaintedFrame) -> None:
+    def add(self, chosen: ReviewFrame) -> None:
         """Write one frame."""
-        labelled, frame = painted.labelled, painted.frame
+        labelled, frame, _ = chosen
         entity = rr.new_entity_path(["world", labelled.topic])
         self._stream.set_time("sensor_time", timestamp=np.datetime64(labelled.stamp_ns, "ns"))
         self._stream.set_time("frame", sequence=labelled.index)
         if frame is not None:
             self._place_sensor(entity, labelled, frame)
-        self._draw(entity, painted)
-        if painted.picture is not None:
-            at = (labelled.stamp_ns, labelled.index)
-            self._images.add(labelled.topic, at, painted.picture)
-        if painted.damage:
-            self._log("log", rr.TextLog(painted.damage, level="WARN"))
+            self._draw_scene(entity, labelled, *self._paint(chosen, frame))
+        at, pose = (labelled.stamp_ns, labelled.index), self._pose(labelled)
+        if pose is not None:
+            self._columns.add(entity, at, pose, PLACES)
+        for name, drawing in SKETCH.items():
+            self._columns.add(f"{entity}/{name}", at, shapes.sketch(labelled), drawing, size=64)
         self._trace(entity, labelled)
         self._log_events(labelled)
         self._plot(labelled)
+
+    def _paint(self, chosen: ReviewFrame, frame: Frame) -> tuple[PaintedCloud, PaintedCloud]:
+        """Write the colour image; return the points on no object and those on objects.
+
+        If the image is damaged, a warning is written, and the points have no true colours.
+        """
+        labelled, coloured = chosen.labelled, chosen.coloured
+        parts = (labelled.planes, labelled.objects)
+        if coloured is not None:
+            try:
+                clouds = paint(frame, *parts, limit=self._limit, view=coloured.view)
+                picture = picture_of(labelled, coloured)
+            except MessageError as error:
+                text = f"{coloured.view.image.topic}: {error}"
+                self._log("log", rr.TextLog(text, level="WARN"))
+            else:
+                if picture is not None:
+                    at = (labelled.stamp_ns, labelled.index)
+                    self._images.add(labelled.topic, at, picture)
+                return clouds
+        return paint(frame, *parts, limit=self._limit)
 
     def end(self) -> None:
         """Write the remaining rows and the layout."""
@@ -188,35 +211,22 @@ class _Review:
             ]
         nothing = (world, "no frame", Eye(np.ones(3), np.zeros(3), np.array([0.0, 0.0, 1.0])))
         tracks = [self._tracks[number] for number in sorted(self._tracks)]
-        dots = rr.SeriesPoints(**self._curves, marker_sizes=[4.0] * len(self._curves["names"]))
         for track in tracks:
             if track.frames == 1:  # a line with one point is invisible
-                self._log(f"{track.entity}/posterior", dots, static=True)
+                self._log(f"{track.entity}/posterior", self._dots, static=True)
         images = self._images.entities
         send_layout(self._stream, lay_out(scenes or [nothing], tracks, images))
 
-    def _draw(self, entity: str, painted: PaintedFrame) -> None:
-        """Write the sensor pose and the boxes, and the scene if it is drawn."""
-        labelled = painted.labelled
-        at, pose = (labelled.stamp_ns, labelled.index), self._pose(labelled)
-        if pose is not None:
-            self._columns.add(entity, at, pose, shapes.places)
-        for name, drawing in SKETCH.items():
-            self._add(f"{entity}/{name}", drawing, at, shapes.sketch(labelled), 64)
-        if painted.clouds is None:
-            return
+    def _draw_scene(
+        self, entity: str, labelled: LabelledFrame, rest: PaintedCloud, points: PaintedCloud
+    ) -> None:
+        at = (labelled.stamp_ns, labelled.index)
         if self._fixed_frame is not None:
             entity = rr.new_entity_path(["world", "seen", labelled.topic])
-            self._columns.add(entity, at, pose or IDENTITY, shapes.places)
-        scene = DrawnScene.of(labelled, *painted.clouds)
+            self._columns.add(entity, at, self._pose(labelled) or IDENTITY, PLACES)
+        scene = DrawnScene.of(labelled, rest, points)
         for name, drawing in SCENE.items():
-            self._add(f"{entity}/{name}", drawing, at, scene, scene.size)
-
-    def _add(self, entity: str, drawing: Drawing, at: At, row: Any, size: int) -> None:
-        if drawing.style is not None and entity not in self._styled:
-            self._styled.add(entity)
-            self._log(entity, drawing.style, static=True)
-        self._columns.add(entity, at, row, drawing.columns, size=size)
+            self._columns.add(f"{entity}/{name}", at, scene, drawing, size=scene.size)
 
     def _place_sensor(self, entity: str, labelled: LabelledFrame, frame: Frame) -> None:
         """Write the axes and the frustum of the sensor if they are new."""
@@ -258,55 +268,49 @@ class _Review:
         self._warnings = []
         for item in labelled.objects:
             if item.track not in self._tracks:
-                self._add_track(item)
+                track = TrackView(f"/tracks/{item.track}", shapes.label(item))
+                self._tracks[item.track] = track
                 self._log("log", rr.TextLog(f"{shapes.label(item)} appears", level="INFO"))
         for number in labelled.ended:
             title = self._tracks[number].title if number in self._tracks else f"#{number}"
             self._log("log", rr.TextLog(f"{title} disappears", level="INFO"))
 
-    def _add_track(self, item: LabelledObject) -> None:
-        entity = f"/tracks/{item.track}"
-        self._tracks[item.track] = TrackView(entity, shapes.label(item))
-        lines = rr.SeriesLines(**self._curves, widths=[1.5] * len(self._curves["names"]))
-        self._log(f"{entity}/posterior", lines, static=True)
-
     def _plot(self, labelled: LabelledFrame) -> None:
         at = (labelled.stamp_ns, labelled.index)
         for item in labelled.objects:
-            self._tracks[item.track].frames += 1
-            self._columns.add(f"/tracks/{item.track}/posterior", at, item.causal, curve)
+            track = self._tracks[item.track]
+            track.frames += 1
+            self._columns.add(f"{track.entity}/posterior", at, item.causal, self._posterior)
         counts = Counter(item.category for item in labelled.objects)
         counted = self._counted.setdefault(labelled.topic, {})
         counted.update(dict.fromkeys(counts))
-        group, sensor = "objects", ""
+        group, sensor = "/plots/objects", ""
         if self._several:
             sensor = f" {labelled.topic}"
             group += f"/{rr.escape_entity_path_part(labelled.topic)}"
         for category in counted:
-            style = partial(_steps, category, sensor)
-            self._plot_line(group, category, style, at, counts[category])
+            entity = f"{group}/{rr.escape_entity_path_part(category)}"
+            self._columns.add(entity, at, [counts[category]], _count(category, sensor))
         for stage, seconds in labelled.seconds.items():
-            style = partial(rr.SeriesLines, names=stage, widths=2)
-            self._plot_line("seconds", stage, style, at, seconds)
-
-    def _plot_line(
-        self, group: str, name: str, style: Callable[[], rr.SeriesLines], at: At, value: float
-    ) -> None:
-        entity = f"/plots/{group}/{rr.escape_entity_path_part(name)}"
-        if entity not in self._styled:
-            self._styled.add(entity)
-            self._log(entity, style(), static=True)
-        self._columns.add(entity, at, [value], curve)
+            entity = f"/plots/seconds/{rr.escape_entity_path_part(stage)}"
+            self._columns.add(entity, at, [seconds], _seconds(stage))
 
 
-def _steps(category: str, sensor: str) -> rr.SeriesLines:
-    """Return the style of a count, which changes in steps."""
-    return rr.SeriesLines(
+@cache
+def _count(category: str, sensor: str) -> Drawing:
+    """Return the drawing of a count, which changes in steps."""
+    style = rr.SeriesLines(
         names=category + sensor,
         colors=colour_of(category),
         widths=2,
         interpolation_mode=rr.components.InterpolationMode.StepAfter,
     )
+    return Drawing(curve, style)
+
+
+@cache
+def _seconds(stage: str) -> Drawing:
+    return Drawing(curve, rr.SeriesLines(names=stage, widths=2))
 
 
 def _axes(frame: Frame, eye: Eye) -> rr.ViewCoordinates:
