@@ -1,10 +1,11 @@
 """The clouds of the review: choose points and colour them."""
 
+import math
 from collections.abc import Sequence
 
 import numpy as np
 
-from shapecat.arrays import F4, I4, U1, U2, U4, Record, array
+from shapecat.arrays import F4, I4, U1, U2, U4, Bool, Record, array
 from shapecat.cameras.colour import ColourView
 from shapecat.jit import kernel
 from shapecat.outputs.colours import colour_of
@@ -54,14 +55,20 @@ def paint(
     ------
     MessageError : the colour image is damaged.
     """
-    owner = _owners(frame, objects)
-    fine, dense = _thin(frame, owner, limit // 2)
-    coarse, sparse = _grid(frame, max(limit - dense.size, 1) if limit else 0)
-    dense, sparse = _measured(frame, dense), _measured(frame, sparse[owner[sparse] == 0])
+    if frame.depth is not None:
+        measured = frame.depth > 0
+    else:
+        x, y, z = frame.xyz().T
+        measured = np.isfinite(x) & np.isfinite(y) & np.isfinite(z)
+    owner = np.zeros(measured.shape, np.uint16)  # number of the object, from 1
+    for number, item in enumerate(objects, 1):
+        owner.reshape(-1)[item.indices] = number
+    fine, dense = _thin(measured & (owner > 0), limit // 2)
+    coarse, sparse = _thin(measured & (owner == 0), max(limit - dense.size, 1) if limit else 0)
     object_colours = np.array([colour_of(o.category) for o in objects], np.uint8).reshape(-1, 3)
     palette = np.concatenate([_GROUND[None], object_colours, _PLANES])
     pixels = np.concatenate([sparse, dense])
-    points, tones = frame.xyz(pixels), owner[pixels]
+    points, tones = frame.xyz(pixels), owner.reshape(-1)[pixels]
     colours: U4 = np.zeros(pixels.size, np.uint32)
     if view is not None:
         colours = true_colours(frame, view, points, pixels, fine, palette, tones)
@@ -93,53 +100,19 @@ def _radius(frame: Frame, points: F4, step: int) -> float:
     return 0.55 * step * middle / frame.camera.fx
 
 
-def _owners(frame: Frame, objects: Sequence[LabelledObject]) -> U2:
-    """Return the number of each pixel's or point's object (n,), from 1; 0 without an object."""
-    source = frame.depth if frame.depth is not None else frame.points
-    size = 0 if source is None else source.size if frame.organized else len(source)
-    owner = np.zeros(size, np.uint16)
-    for number, item in enumerate(objects, 1):
-        owner[item.indices] = number
-    return owner
+def _thin(wanted: Bool, limit: int) -> tuple[int, I4]:
+    """Return a step, and the flat indices of about ``limit`` of the wanted pixels or points.
 
-
-def _grid(frame: Frame, limit: int) -> tuple[int, I4]:
-    """Return the step of a pixel grid, and the flat indices of about ``limit`` pixels on it.
-
-    For a cloud, these are k and the indices of every k-th point. A limit of 0 means all.
+    The step is that of a grid of pixels in an image (h, w), and every k-th of the points in a cloud
+    (n,). A limit of 0 means all.
     """
-    if frame.depth is None:
-        n = 0 if frame.points is None else len(frame.points)
-        step = -(-n // limit) if limit and n else 1
-        return step, np.arange(0, n, step)
-    height, width = frame.depth.shape
-    readings = 64 * int(np.count_nonzero(frame.depth[::8, ::8]))  # an estimate is enough
-    step = _step(readings, limit)
-    rows, columns = np.arange(step // 2, height, step), np.arange(step // 2, width, step)
-    return step, (rows[:, None] * width + columns).ravel()
-
-
-def _thin(frame: Frame, owner: U2, limit: int) -> tuple[int, I4]:
-    """Return step and indices as `_grid` does, but only of pixels or points on objects."""
-    if frame.depth is None:
-        pixels = np.flatnonzero(owner != 0)
-        step = -(-pixels.size // limit) if limit and pixels.size else 1
-        return step, pixels[::step]
-    width = frame.depth.shape[1]
-    step = _step(int(np.count_nonzero(owner)), limit)
-    rows, columns = np.nonzero(owner.reshape(frame.depth.shape)[::step, ::step] != 0)
-    return step, (rows * width + columns) * step
-
-
-def _step(size: int, limit: int) -> int:
-    return int(np.ceil(np.sqrt(size / limit))) if limit and size > limit else 1
-
-
-def _measured(frame: Frame, pixels: I4) -> I4:
-    """Return the indices of the pixels or points that have depth."""
-    if frame.depth is not None:
-        return np.asarray(pixels[frame.depth.reshape(-1)[pixels] > 0])
-    return np.asarray(pixels[np.isfinite(frame.xyz(pixels)).all(axis=1)])
+    share = np.count_nonzero(wanted) / limit if limit else 1.0
+    if wanted.ndim == 1:
+        step = max(1, math.ceil(share))
+        return step, np.flatnonzero(wanted)[::step]
+    step = max(1, math.ceil(math.sqrt(share)))
+    rows, columns = np.nonzero(wanted[::step, ::step])
+    return step, (rows * wanted.shape[1] + columns) * step
 
 
 def _plane_rows(planes: Sequence[Plane]) -> F4:
