@@ -4,6 +4,7 @@ import base64
 from typing import NamedTuple
 
 import numpy as np
+from scipy import ndimage
 
 from shapecat.arrays import F4, F8, U1, U2, Bool, Record, array
 from shapecat.outputs.png import png
@@ -128,19 +129,16 @@ def _shade(spots: F8) -> U1:
 
 def _nearest(spots: F8) -> F8:
     """Return the nearness (h, w) of the nearest disc at each pixel, -inf without a disc."""
-    heights = np.full((SIDE, SIDE), -np.inf)
     area = float(np.prod(np.ptp(spots[:, :2], axis=0) + 1))
     radius = float(np.clip(0.9 * np.sqrt(area / len(spots)), 1.0, 4.5))
-    half_width = int(np.ceil(radius))
     columns, rows = np.round(spots[:, :2].T).astype(int)
-    for dy in range(-half_width, half_width + 1):
-        for dx in range(-half_width, half_width + 1):
-            if dx * dx + dy * dy > radius * radius:
-                continue
-            u, v = columns + dx, rows + dy
-            inside = (u >= 0) & (u < SIDE) & (v >= 0) & (v < SIDE)
-            np.maximum.at(heights, (v[inside], u[inside]), spots[inside, 2])
-    return heights
+    inside = (columns >= 0) & (columns < SIDE) & (rows >= 0) & (rows < SIDE)
+    heights = np.full((SIDE, SIDE), -np.inf)
+    np.maximum.at(heights, (rows[inside], columns[inside]), spots[inside, 2])
+    steps = np.arange(-int(radius) - 1, int(radius) + 2)
+    disc = np.hypot(steps[:, None], steps) <= radius
+    widened = ndimage.maximum_filter(heights, footprint=disc, mode="constant", cval=-np.inf)
+    return np.asarray(widened)
 
 
 def _closed(heights: F8) -> F8:
@@ -165,9 +163,7 @@ def _smoothed(heights: F8, bare: Bool) -> F8:
 
 
 def _blurred(image: F8) -> F8:
-    padded = np.pad(image, 1)
-    rows = padded[:-2] + padded[1:-1] + padded[2:]
-    return np.asarray((rows[:, :-2] + rows[:, 1:-1] + rows[:, 2:]) / 9)
+    return np.asarray(ndimage.uniform_filter(image, 3, mode="constant"))
 
 
 def _palette(colour: tuple[int, int, int]) -> tuple[U1, U2]:
