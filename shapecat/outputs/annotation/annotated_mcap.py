@@ -4,7 +4,6 @@ A finished MCAP file is copied byte for byte and extended; any other recording i
 MCAP. Annotations use the encoding of the source.
 """
 
-import gc
 import json
 from collections import Counter, deque
 from collections.abc import Iterable, Iterator, Mapping, Sequence
@@ -79,7 +78,7 @@ def write_annotated(
     OutputError : the file cannot be written.
     """
     metadata = {"run.json": json.dumps(run)}
-    with _uncollected(), replacing(path) as hidden, hidden.open("wb", buffering=_BUFFER) as file:
+    with replacing(path) as hidden, hidden.open("wb", buffering=_BUFFER) as file:
         if isinstance(recording, McapRecording) and recording.indexed:
             with _copying(recording, hidden, file):
                 channels, items = _encoded(recording, frames, images, image_topics, markers=markers)
@@ -89,18 +88,6 @@ def write_annotated(
 
             channels, items = _encoded(recording, frames, images, image_topics, markers=markers)
             rewrite(recording, file, channels, items, metadata)
-
-
-@contextmanager
-def _uncollected() -> Iterator[None]:
-    """Pause the garbage collector in the block, which makes no reference cycles."""
-    enabled = gc.isenabled()
-    gc.disable()
-    try:
-        yield
-    finally:
-        if enabled:
-            gc.enable()
 
 
 @contextmanager
