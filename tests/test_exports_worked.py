@@ -22,7 +22,7 @@ from shapecat.geometry import IDENTITY
 from shapecat.outputs.colouring import Coloured
 from shapecat.outputs.exports.coco import write_coco, write_yolo
 from shapecat.outputs.exports.crops import Origin, write_crops
-from shapecat.outputs.exports.dataset_frames import DatasetImage
+from shapecat.outputs.exports.dataset_frames import DatasetImage, DatasetObject
 from shapecat.outputs.exports.kitti import rectified_from_sensor, write_kitti
 from shapecat.outputs.exports.labelcloud import _described, write_labelcloud
 from shapecat.types import Box, Camera, Frame, LabelledFrame, LabelledObject, NeuralGas, Pose
@@ -429,7 +429,8 @@ def dataset_image() -> DatasetImage:
     masks = (Mask(20, 5, corner), Mask(1, 2, np.ones((3, 4), bool)))
     uncertain = replace(second.objects[0], track=9, category="cup", confidence=0.4)
     view = labelled(cut=False, hidden=False)
-    return DatasetImage("a.jpg", b"jpeg", 40, 20, view, (first, uncertain), masks, (True, False))
+    objects = tuple(map(DatasetObject, (first, uncertain), masks, (True, False)))
+    return DatasetImage("a.jpg", b"jpeg", 40, 20, view, objects)
 
 
 def finished(path: str = "runs/lab", digest: str = "l") -> Any:

@@ -43,8 +43,9 @@ from shapecat.outputs.exports.dataset_frames import (
     images_of,
     snapped_masks,
     split_runs,
+    thinned,
 )
-from shapecat.outputs.exports.formats import _made_by_export, _require_own, _staged, _thinned
+from shapecat.outputs.exports.formats import _made_by_export, _require_own, _staged
 from shapecat.outputs.exports.points import write_point_labels
 from shapecat.outputs.level_clouds import support_offset, upright_cloud
 from shapecat.outputs.opened_run import RunFrame
@@ -429,7 +430,7 @@ def test_frames_are_thinned_per_topic() -> None:
     topics = ["/a", "/b", "/a", "/a", "/b", "/a", "/b"]
     frames = [labelled_frame(k, topic=topic) for k, topic in enumerate(topics)]
 
-    assert [f.index for f in _thinned(frames, 2)] == [0, 1, 3, 6]
+    assert [f.index for f in thinned(frames, 2)] == [0, 1, 3, 6]
     chosen = _chosen(finished(frames), Selection(every=2), set())
     assert chosen == {("/a", 0), ("/b", 1), ("/a", 3), ("/b", 6)}
 
@@ -487,7 +488,10 @@ def test_images_without_certain_objects_are_omitted(monkeypatch: pytest.MonkeyPa
     """A detector would learn that an image with only uncertain objects is empty."""
     images = [
         None,
-        *(SimpleNamespace(sure=sure) for sure in ((False, True), (False,), (), (True,))),
+        *(
+            SimpleNamespace(objects=[SimpleNamespace(sure=one) for one in sure])
+            for sure in ((False, True), (False,), (), (True,))
+        ),
     ]
     place = "shapecat.outputs.exports.dataset_frames"
     labelled = [labelled_frame(k) for k in range(len(images))]

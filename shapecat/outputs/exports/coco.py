@@ -38,7 +38,7 @@ def write_coco(out: Path, images: Images, categories: Sequence[str]) -> int:
         (folder / image.name).write_bytes(image.contents)
         number = len(part["images"]) + 1
         part["images"].append(_coco_image(number, finished, image))
-        for item, mask, sure in zip(image.objects, image.masks, image.sure, strict=True):
+        for item, mask, sure in image.objects:
             track = tracks.setdefault((str(finished.folder), item.track), len(tracks) + 1)
             size = [image.height, image.width]
             part["annotations"].append(
@@ -98,7 +98,7 @@ def write_yolo(out: Path, images: Images, categories: Sequence[str]) -> int:
             folder.mkdir(parents=True, exist_ok=True)
         (out / "images" / split / image.name).write_bytes(image.contents)
         lines = []
-        for item, mask, sure in zip(image.objects, image.masks, image.sure, strict=True):
+        for item, mask, sure in image.objects:
             if sure:
                 polygon = joined(outlines(mask)) / (image.width, image.height)
                 numbers = " ".join(f"{value:.6f}" for value in polygon.ravel())

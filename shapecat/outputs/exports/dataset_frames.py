@@ -2,10 +2,10 @@
 
 import logging
 from collections import Counter
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import NamedTuple
 
 import numpy as np
 import xxhash
@@ -26,11 +26,13 @@ from shapecat.types import UNKNOWN, Frame, LabelledFrame, LabelledObject
 
 __all__ = [
     "DatasetImage",
+    "DatasetObject",
     "Selection",
     "image_stems",
     "images_of",
     "snapped_masks",
     "split_runs",
+    "thinned",
 ]
 
 _log = logging.getLogger(__name__)
@@ -63,8 +65,7 @@ class Selection:
 class DatasetImage:
     """An image of a data set, and the objects on it.
 
-    ``name`` is the file name with suffix, ``contents`` its bytes. ``masks`` and ``sure`` are per
-    object: its mask, and whether its label is certain enough for training.
+    ``name`` is the file name with suffix, ``contents`` its bytes.
     """
 
     name: str
@@ -72,9 +73,15 @@ class DatasetImage:
     width: int
     height: int
     labelled: LabelledFrame
-    objects: tuple[LabelledObject, ...]
-    masks: tuple[Mask, ...]
-    sure: tuple[bool, ...]
+    objects: tuple["DatasetObject", ...]
+
+
+class DatasetObject(NamedTuple):
+    """An object, its mask, and whether its label is certain enough for training."""
+
+    item: LabelledObject
+    mask: Mask
+    sure: bool
 
 
 def split_runs(runs: Sequence[FinishedRun], val: float) -> list[str]:
@@ -150,7 +157,7 @@ def images_of(
                 continue
             if image is None:
                 left_out["no image"] += 1
-            elif not any(image.sure):
+            elif not any(one.sure for one in image.objects):
                 left_out["no object with a reliable label"] += 1
             else:
                 yield image
@@ -177,17 +184,12 @@ def _image(
     if image is None:
         return None
     suffix, contents, (height, width), masks = image
-    visible = [
-        (item, mask, _is_sure(item, selection, corrected))
+    objects = tuple(
+        DatasetObject(item, mask, _is_sure(item, selection, corrected))
         for item, mask in zip(labelled.objects, masks, strict=True)
         if mask.pixels.size and item.category != UNKNOWN
-    ]
-    objects, masks_of_objects, sure = (
-        (tuple(column) for column in zip(*visible, strict=True)) if visible else [()] * 3
     )
-    return DatasetImage(
-        f"{name}{suffix}", contents, width, height, labelled, objects, masks_of_objects, sure
-    )
+    return DatasetImage(f"{name}{suffix}", contents, width, height, labelled, objects)
 
 
 _File = tuple[str, bytes, tuple[int, int], tuple[Mask, ...]]
@@ -227,38 +229,39 @@ def _chosen(
 
     Of the frames with the same colour image, only the one nearest to it in time is selected.
     """
-    counts: Counter[str] = Counter()
-    keys: list[tuple[str, int]] = []
-    views: dict[int, list[tuple[int, Any]]] = {}
-    nearest: dict[tuple[str, int, int], tuple[int, int]] = {}
-    left_out: set[int] = set()
-    for labelled in finished.frames():
-        number = counts[labelled.topic]
-        counts[labelled.topic] += 1
-        if number % selection.every:
-            continue
-        if (image := labelled.masks) is not None and not selection.depth:
-            candidate = abs(labelled.stamp_ns - image.stamp_ns), len(keys)
+    best: dict[tuple[str, int, int], tuple[int, tuple[str, int], list[tuple[int, F8]]]] = {}
+    for labelled in thinned(finished.frames(), selection.every):
+        image = None if selection.depth else labelled.masks
+        key = (labelled.topic, labelled.index)
+        place, apart = (*key, 0), 0
+        if image is not None:
             # Stamps alone repeat after a clock was set back.
             place = (image.topic, image.stamp_ns, image.log_time_ns)
-            earlier = nearest.setdefault(place, candidate)
-            nearest[place] = min(candidate, earlier)
-            left_out |= {k for _, k in (candidate, earlier)} - {nearest[place][1]}
-        for item in labelled.objects if selection.per_track else ():
-            if _is_sure(item, selection, corrected):
-                views.setdefault(item.track, []).append((len(keys), _view(labelled, item)))
-        keys.append((labelled.topic, labelled.index))
+            apart = abs(labelled.stamp_ns - image.stamp_ns)
+        if place not in best or apart < best[place][0]:
+            sure = (o for o in labelled.objects if _is_sure(o, selection, corrected))
+            views = [(o.track, _view(labelled, o)) for o in sure] if selection.per_track else []
+            best[place] = apart, key, views
     if not selection.per_track:
-        return {key for k, key in enumerate(keys) if k not in left_out}
-    kept_rows = {
-        track: [row for row in rows if row[0] not in left_out] for track, rows in views.items()
-    }
+        return {key for _, key, _ in best.values()}
+    tracks: dict[int, list[tuple[tuple[str, int], F8]]] = {}
+    for _, key, views in best.values():
+        for track, view in views:
+            tracks.setdefault(track, []).append((key, view))
     return {
-        keys[rows[k][0]]
-        for rows in kept_rows.values()
-        if rows
+        rows[k][0]
+        for rows in tracks.values()
         for k in _different(np.array([view for _, view in rows]), selection.per_track)
     }
+
+
+def thinned(frames: Iterable[LabelledFrame], every: int) -> Iterator[LabelledFrame]:
+    """Yield every n-th frame of each topic."""
+    counts: Counter[str] = Counter()
+    for frame in frames:
+        if counts[frame.topic] % every == 0:
+            yield frame
+        counts[frame.topic] += 1
 
 
 def _view(labelled: LabelledFrame, item: LabelledObject) -> F8:

@@ -20,6 +20,7 @@ from shapecat.outputs.exports.dataset_frames import (
     image_stems,
     images_of,
     split_runs,
+    thinned,
 )
 from shapecat.outputs.exports.kitti import write_kitti
 from shapecat.outputs.exports.labelcloud import write_labelcloud
@@ -113,7 +114,7 @@ def export_run(
         full = format in _WITH_BOXES and not visible_boxes
         frames = finished.frames_with_full_boxes() if full else finished.frames()
         labelled = observed(frames, "export", total, observe)
-        wanted = _tracked(_thinned(labelled, every), streams_with_poses(folder))
+        wanted = _tracked(thinned(labelled, every), streams_with_poses(folder))
         pairs = with_colour(wanted, source, finished.run)
         if format == "crops":
             return FORMATS[format](out, pairs, finished)
@@ -180,7 +181,7 @@ def export_dataset(
                 run, selection, recording, stems=stems, left_out=left_out, observe=tell
             ):
                 counts[split] += 1
-                uncertain += image.sure.count(False)
+                uncertain += sum(not one.sure for one in image.objects)
                 yield split, run, image
         if not counts:
             reasons = ", ".join(f"{reason} ({count}×)" for reason, count in left_out.items())
@@ -263,14 +264,6 @@ def _made_by_export(folder: Path) -> Collection[str] | None:
         return None
     names = about["made"] if "objects" in about else [path.name for path in folder.iterdir()]
     return [*(Path(str(name)).name for name in names if name != _MARK), _MARK]
-
-
-def _thinned(frames: Iterable[LabelledFrame], every: int) -> Iterator[LabelledFrame]:
-    counts: Counter[str] = Counter()
-    for frame in frames:
-        if counts[frame.topic] % every == 0:
-            yield frame
-        counts[frame.topic] += 1
 
 
 def _tracked(frames: Iterable[LabelledFrame], placed: Collection[str]) -> Iterator[LabelledFrame]:
