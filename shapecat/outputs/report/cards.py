@@ -184,15 +184,9 @@ def _few(count: int) -> I4:
 
 def _spans(seconds: F8, visible: Bool, scale: float) -> list[tuple[float, float]]:
     """Return start and end of each interval in which the track was detected without a gap."""
-    spans: list[tuple[float, float]] = []
-    before = False
-    for at, is_visible in zip((seconds * scale).tolist(), visible.tolist(), strict=True):
-        if is_visible and before:
-            spans[-1] = (spans[-1][0], at)
-        elif is_visible:
-            spans.append((at, at))
-        before = is_visible
-    return spans
+    changes = np.diff(visible.astype(int), prepend=0, append=0)
+    starts, ends = np.flatnonzero(changes == 1), np.flatnonzero(changes == -1) - 1
+    return [(seconds[a] * scale, seconds[b] * scale) for a, b in zip(starts, ends, strict=True)]
 
 
 def frame_html(frame: StripFrame, categories: Mapping[int, str], *, several: bool) -> str:

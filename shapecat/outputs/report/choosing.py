@@ -47,7 +47,6 @@ class Choice:
 
 
 class _View(NamedTuple):
-    place: int
     key: Key
     worth: float
 
@@ -80,9 +79,8 @@ def _views(folder: Path, owner: Mapping[Detected, int]) -> dict[int, list[_View]
                 continue
             area, cut = masks.get(key, (_COLOURLESS * points, False))
             complete = not (border or occluded or cut)
-            track_views = views.setdefault(owner[key], [])
-            worth = area * (1.0 if complete else _PARTIAL)
-            track_views.append(_View(len(track_views), (topic, frame), worth))
+            view = _View((topic, frame), area * (1.0 if complete else _PARTIAL))
+            views.setdefault(owner[key], []).append(view)
     return views
 
 
@@ -98,10 +96,9 @@ def _areas(masks: Iterator[tuple[Key, ImageMasks]]) -> dict[Detected, tuple[floa
 
 
 def _best_of_parts(views: Sequence[_View]) -> list[_View]:
-    """Return the best view in each of `_CANDIDATES` parts of a track."""
+    """Return the best view, the first of equal ones, in each of `_CANDIDATES` parts of a track."""
     ends = np.linspace(0, len(views), min(_CANDIDATES, len(views)) + 1).astype(int)
-    parts = [views[a:b] for a, b in pairwise(ends)]
-    return [max(part, key=lambda view: (view.worth, -view.place)) for part in parts]
+    return [max(views[a:b], key=lambda view: view.worth) for a, b in pairwise(ends)]
 
 
 def _strip(

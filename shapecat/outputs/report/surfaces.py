@@ -168,13 +168,10 @@ def _blurred(image: F8) -> F8:
 
 def _palette(colour: tuple[int, int, int]) -> tuple[U1, U2]:
     """Return a palette (k, 3) and its opacity: a transparent entry, then shades, darkest first."""
-    light = np.linspace(0, 1, _SHADES)[:, None]
-    base = np.array(colour, np.float64)
-    dark, bright = 0.32 * base, base + 0.45 * (255 - base)
-    shades = np.where(
-        light < 0.75,
-        dark + (base - dark) * light / 0.75,
-        base + (bright - base) * (light - 0.75) * 4,
-    )
-    palette = np.concatenate([np.zeros((1, 3)), shades])
+    light = np.linspace(0, 1, _SHADES)
+    shades = [
+        np.interp(light, (0, 0.75, 1), (0.32 * part, part, part + 0.45 * (255 - part)))
+        for part in colour
+    ]
+    palette = np.concatenate([np.zeros((1, 3)), np.stack(shades, axis=1)])
     return np.round(palette).astype(np.uint8), np.zeros(1, np.uint8)
