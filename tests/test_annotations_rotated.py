@@ -15,8 +15,8 @@ from rosbags.typesys import Stores, get_types_from_msg, get_typestore
 from scipy.spatial.transform import Rotation
 
 from shapecat.outputs.annotation.annotated_mcap import write_annotated
-from shapecat.outputs.annotation.channels import encoder_for
-from shapecat.outputs.annotation.content import Annotation, AnnotationChannel, text_position
+from shapecat.outputs.annotation.channels import encoder_for, text_position
+from shapecat.outputs.annotation.content import Annotation, AnnotationChannel
 from shapecat.outputs.annotation.image_annotations import ImageBox, ImageFrame, image_encoders_for
 from shapecat.outputs.colours import colour_of
 from shapecat.outputs.review.shapes import _above

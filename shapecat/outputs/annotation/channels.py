@@ -2,19 +2,13 @@
 
 from typing import Any
 
-from shapecat.outputs.annotation.content import (
-    Annotation,
-    Encoders,
-    entity_id,
-    properties,
-    text,
-    text_position,
-)
+from shapecat.outputs.annotation.content import Annotation, Encoders
 from shapecat.outputs.annotation.encoders import MessageKind, Types, encoders_of
 from shapecat.outputs.colours import colour_of
+from shapecat.outputs.wording import caption
 from shapecat.types import AnnotationBox
 
-__all__ = ["encoder_for"]
+__all__ = ["encoder_for", "text_position"]
 
 
 def encoder_for(encoding: str, *, markers: bool) -> Encoders[Annotation]:
@@ -51,7 +45,7 @@ def _detections(annotation: Annotation, t: Types) -> Any:
 def _scene(annotation: Annotation, t: Types) -> Any:
     frame, time = annotation.frame, t["Time"](annotation.frame.stamp_ns)
     deletions = [
-        t["SceneEntityDeletion"](timestamp=time, type=0, id=entity_id(track))
+        t["SceneEntityDeletion"](timestamp=time, type=0, id=_entity_id(track))
         for track in annotation.gone
     ]
     lifetime = t["Time"](annotation.lifetime_ns)
@@ -59,9 +53,9 @@ def _scene(annotation: Annotation, t: Types) -> Any:
     entities = [
         t["SceneEntity"](
             **shared,
-            id=entity_id(box.track),
+            id=_entity_id(box.track),
             frame_locked=False,
-            metadata=[t["KeyValuePair"](key=k, value=v) for k, v in properties(box).items()],
+            metadata=_properties(box, t),
             arrows=[],
             cubes=[_cube(box, t)],
             spheres=[],
@@ -76,6 +70,23 @@ def _scene(annotation: Annotation, t: Types) -> Any:
     return t["SceneUpdate"](deletions=deletions, entities=entities)
 
 
+def _entity_id(track: int) -> str:
+    return f"track-{track}"
+
+
+def _properties(box: AnnotationBox, t: Types) -> list[Any]:
+    values = {
+        "category": box.category,
+        "confidence": f"{box.confidence:.4f}",
+        "track": str(box.track),
+    }
+    return [t["KeyValuePair"](key=key, value=value) for key, value in values.items()]
+
+
+def _caption(box: AnnotationBox) -> str:
+    return caption(box.track, box.category, box.confidence)
+
+
 def _cube(box: AnnotationBox, t: Types) -> Any:
     colour = _colour("Color", box, 0.5, t)
     return t["CubePrimitive"](pose=_pose(box, t), size=_size(box, t), color=colour)
@@ -88,7 +99,7 @@ def _words(box: AnnotationBox, t: Types) -> Any:
         font_size=0.03,
         scale_invariant=False,
         color=_colour("Color", box, 1.0, t),
-        text=text(box),
+        text=_caption(box),
     )
 
 
@@ -111,7 +122,7 @@ def _markers(annotation: Annotation, t: Types) -> Any:
     for box in annotation.frame.objects:
         pale, full = (_colour("ColorRGBA", box, alpha, t) for alpha in (0.5, 1.0))
         cube = {"pose": _pose(box, t), "scale": _size(box, t), "color": pale}
-        words = {"pose": _text_pose(box, t), "scale": height, "color": full, "text": text(box)}
+        words = {"pose": _text_pose(box, t), "scale": height, "color": full, "text": _caption(box)}
         markers += [marker("box", box.track, **cube), marker("text", box.track, **words)]
     return t["MarkerArray"](markers=markers)
 
@@ -144,3 +155,13 @@ def _size(box: AnnotationBox, t: Types) -> Any:
 def _colour(kind: str, box: AnnotationBox, alpha: float, t: Types) -> Any:
     red, green, blue = colour_of(box.category)
     return t[kind](r=red / 255, g=green / 255, b=blue / 255, a=alpha)
+
+
+def text_position(box: AnnotationBox) -> tuple[float, float, float]:
+    """Return the position (x, y, z) of the text just above a box, metres, sensor frame."""
+    x, y, z = box.center
+    qx, qy, qz, qw = box.orientation
+    rise = box.size[2] / 2 + 0.03
+    # The third column of the rotation.
+    up = (2 * (qx * qz + qw * qy), 2 * (qy * qz - qw * qx), 1 - 2 * (qx * qx + qy * qy))
+    return x + rise * up[0], y + rise * up[1], z + rise * up[2]

@@ -3,18 +3,13 @@
 from collections.abc import Callable
 from typing import NamedTuple, TypeVar
 
-from shapecat.outputs.wording import caption
-from shapecat.types import AnnotationBox, AnnotationFrame
+from shapecat.types import AnnotationFrame
 
 __all__ = [
     "Annotation",
     "AnnotationChannel",
     "EncodedMessage",
     "Encoders",
-    "entity_id",
-    "properties",
-    "text",
-    "text_position",
 ]
 
 
@@ -55,32 +50,3 @@ class EncodedMessage(NamedTuple):
     channel: int
     log_time_ns: int
     data: bytes
-
-
-def entity_id(track: int) -> str:
-    """Return the entity id of a track."""
-    return f"track-{track}"
-
-
-def text(box: AnnotationBox) -> str:
-    """Return the text above a box."""
-    return caption(box.track, box.category, box.confidence)
-
-
-def properties(box: AnnotationBox) -> dict[str, str]:
-    """Return the properties of a box for viewers."""
-    return {
-        "category": box.category,
-        "confidence": f"{box.confidence:.4f}",
-        "track": str(box.track),
-    }
-
-
-def text_position(box: AnnotationBox) -> tuple[float, float, float]:
-    """Return the position (x, y, z) of the text just above a box, metres, sensor frame."""
-    x, y, z = box.center
-    qx, qy, qz, qw = box.orientation
-    rise = box.size[2] / 2 + 0.03
-    # The third column of the rotation.
-    up = (2 * (qx * qz + qw * qy), 2 * (qy * qz - qw * qx), 1 - 2 * (qx * qx + qy * qy))
-    return x + rise * up[0], y + rise * up[1], z + rise * up[2]
