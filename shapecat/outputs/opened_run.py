@@ -5,7 +5,6 @@ from collections.abc import Iterable, Iterator, Mapping
 from contextlib import contextmanager
 from dataclasses import dataclass, field
 from functools import cached_property
-from itertools import pairwise
 from pathlib import Path
 from typing import Any
 
@@ -87,19 +86,14 @@ class Table:
         if pa.types.is_fixed_size_list(chunks.type):
             return numbers_or_nan(chunks)
         values = chunks.combine_chunks()
-        if not pa.types.is_list(values.type):
-            return values.to_numpy(zero_copy_only=False)
-        lengths = set(values.value_lengths().to_pylist())
-        if not lengths and column in self.widths:
-            return np.zeros((0, self.widths[column]), values.type.value_type.to_pandas_dtype())
-        if len(lengths) == 1 and None not in lengths:
-            return values.flatten().to_numpy(zero_copy_only=False).reshape(len(values), -1)
-        flat = values.flatten().to_numpy(zero_copy_only=False)
-        stops = np.cumsum(values.value_lengths().fill_null(0).to_numpy())
-        ragged = np.zeros(len(values), object)
-        for k, (start, stop) in enumerate(pairwise([0, *stops.tolist()])):
-            ragged[k] = flat[start:stop]
-        return ragged
+        if pa.types.is_list(values.type):
+            lengths = set(values.value_lengths().to_pylist())
+            if not lengths and column in self.widths:
+                return np.zeros((0, self.widths[column]), values.type.value_type.to_pandas_dtype())
+            if len(lengths) == 1 and None not in lengths:
+                flat = values.flatten().to_numpy(zero_copy_only=False)
+                return flat.reshape(len(values), -1)
+        return values.to_numpy(zero_copy_only=False)
 
 
 @dataclass(frozen=True)
