@@ -18,7 +18,6 @@ def png(
     alpha: U1 | None = None,
     *,
     level: int = 9,
-    width: int | None = None,
 ) -> bytes:
     """Encode an image as PNG.
 
@@ -28,15 +27,13 @@ def png(
     palette : (k, 3) red, green, blue.
     alpha : (a,) opacity of the first entries of the palette.
     level : compression from 1 (fast, for images with long runs, such as masks) to 9 (small).
-    width : if given, ``image`` is already packed two 4-bit pixels per byte, left pixel in the high
-        nibble, and this is the image width in pixels.
     """
-    packed, height, width = width is not None, len(image), width or image.shape[1]
+    height, width = image.shape
     wide = image.dtype == np.uint16
     rows = np.ascontiguousarray(image, ">u2" if wide else "u1").view(np.uint8).reshape(height, -1)
     unfiltered = np.zeros((height, 1), np.uint8)  # filter type of each row: none
     kind = _COLOUR_TYPES["grey" if palette is None else "palette"]
-    depth = 16 if wide else 4 if packed else 8
+    depth = 16 if wide else 8
     header = struct.pack(">IIBBBBB", width, height, depth, kind, 0, 0, 0)
     parts = [(b"IHDR", header)]
     if palette is not None:

@@ -7,10 +7,9 @@ from typing import NamedTuple
 import numpy as np
 import rerun as rr
 
-from shapecat.arrays import F4, U1, Bool
+from shapecat.arrays import F4, U1
 from shapecat.cameras.colour import COMPRESSED_FORMATS, ColourImage
 from shapecat.colour.masks import Mask
-from shapecat.jit import kernel
 from shapecat.outputs.colouring import Coloured
 from shapecat.outputs.colours import colour_of
 from shapecat.outputs.png import png
@@ -23,7 +22,6 @@ __all__ = ["Images", "Picture", "as_file", "picture_of"]
 
 _QUALITY = 85
 _OPACITY = 110
-_COLOURS = 16
 _BYTES_PER_NUMBER = 4
 
 
@@ -81,39 +79,15 @@ def picture_of(labelled: LabelledFrame, coloured: Coloured) -> Picture | None:
 
 
 def _layer(visible: Sequence[tuple[LabelledObject, Mask]], height: int, width: int) -> bytes:
-    """Return masks as a translucent PNG; Rerun would not compress a segmentation image.
-
-    Two pixels per byte take half the time. This allows 15 colours; further categories share the
-    last one.
-    """
-    colours = {colour: k for k, colour in enumerate(dict.fromkeys(map(_tone, visible)), start=1)}
-    packed = np.zeros((height, (width + 1) // 2), np.uint8)
-    for one in visible:
-        mask = one[1]
-        _pack(mask.pixels, mask.left, mask.top, min(colours[_tone(one)], _COLOURS - 1), packed)
-    palette = np.array([(0, 0, 0), *colours], np.uint8)[:_COLOURS]
-    alpha = np.array([0, *[_OPACITY] * (len(palette) - 1)], np.uint8)
-    return png(packed, palette, alpha, level=1, width=width)
-
-
-def _tone(visible: tuple[LabelledObject, Mask]) -> tuple[int, int, int]:
-    return colour_of(visible[0].category)
-
-
-@kernel
-def _pack(pixels: Bool, left: int, top: int, number: int, packed: U1) -> None:
-    """Write a number, at most 15, to the pixels of a mask in an image of two pixels per byte.
-
-    Parameters
-    ----------
-    pixels : (h, w) the mask, with its top left pixel at row `top` and column `left`.
-    packed : (rows, columns / 2), left pixel in the high nibble; changed in place.
-    """
-    for v in range(pixels.shape[0]):
-        for u in range(pixels.shape[1]):
-            if pixels[v, u]:
-                at, shift = (left + u) >> 1, 0 if (left + u) & 1 else 4
-                packed[top + v, at] = packed[top + v, at] & (0xF0 >> shift) | (number << shift)
+    """Return masks as a translucent PNG; Rerun would not compress a segmentation image."""
+    categories = list(dict.fromkeys(item.category for item, _ in visible))
+    layer = np.zeros((height, width), np.uint8)
+    for item, mask in visible:
+        left, top, wide, high = mask.box
+        number = 1 + categories.index(item.category)
+        layer[top : top + high, left : left + wide][mask.pixels] = min(number, 255)
+    palette = np.array([(0, 0, 0), *map(colour_of, categories)], np.uint8)[:256]
+    return png(layer, palette, np.array([0, *[_OPACITY] * (len(palette) - 1)], np.uint8), level=1)
 
 
 _Boxes = tuple[F4, list[tuple[int, int, int]], list[str]]
