@@ -23,7 +23,7 @@ from shapecat.outputs.review.clouds import PaintedCloud
 from shapecat.outputs.review.columns import Drawing
 from shapecat.outputs.wording import caption
 from shapecat.surface.triangles import triangles_of
-from shapecat.types import Box, Camera, LabelledFrame, LabelledObject, NeuralGas, Plane, Pose
+from shapecat.types import Box, Camera, LabelledFrame, LabelledObject, Pose
 
 __all__ = [
     "PATHS",
@@ -52,32 +52,18 @@ Way = tuple[str, F8]
 """The category of a track and its path (n, 3), metres."""
 
 
-class Surface(NamedTuple):
-    """An object of a scene to draw, without its pixels, to save memory."""
-
-    category: str
-    full: Box | None
-    gas: NeuralGas
-
-
 class DrawnScene(NamedTuple):
-    """A scene to draw: objects, planes, the points on no object, and the points on objects."""
+    """A frame to draw with its points: those on no object, and those on objects."""
 
-    objects: tuple[Surface, ...]
-    planes: tuple[Plane, ...]
+    labelled: LabelledFrame
     scene: PaintedCloud
     points: PaintedCloud
 
-    @classmethod
-    def of(cls, labelled: LabelledFrame, scene: PaintedCloud, points: PaintedCloud) -> "DrawnScene":
-        """Return a labelled frame as a scene to draw, with its painted points."""
-        objects = tuple(Surface(o.category, o.full, o.gas) for o in labelled.objects)
-        return cls(objects, labelled.planes, scene, points)
-
     @property
     def size(self) -> int:
-        """The number of points, on objects and elsewhere."""
-        return len(self.scene.points) + len(self.points.points)
+        """The number of points, and of pixels that objects list."""
+        pixels = sum(o.indices.size for o in self.labelled.objects)
+        return len(self.scene.points) + len(self.points.points) + pixels
 
 
 class Sketch(NamedTuple):
@@ -137,7 +123,7 @@ def _points(clouds: Sequence[PaintedCloud]) -> _Columns:
 
 def _dashes(scenes: Sequence[DrawnScene]) -> _Columns:
     """Return the edges of the full boxes, dashed."""
-    with_full = [[o for o in m.objects if o.full is not None] for m in scenes]
+    with_full = [[o for o in m.labelled.objects if o.full is not None] for m in scenes]
     objects = list(chain.from_iterable(with_full))
     corners = np.reshape([box_corners(o.full) for o in objects if o.full is not None], (-1, 8, 3))
     starts, ends = corners[:, BOX_EDGES[:, 0]], corners[:, BOX_EDGES[:, 1]]
@@ -151,11 +137,11 @@ def _dashes(scenes: Sequence[DrawnScene]) -> _Columns:
 
 def _graphs(scenes: Sequence[DrawnScene]) -> _Columns:
     """Return the edges of the graphs."""
-    objects = [o for m in scenes for o in m.objects]
+    objects = [o for m in scenes for o in m.labelled.objects]
     lines = [o.gas.neurons[o.gas.edges] for o in objects]
     pairs = np.concatenate(lines) if lines else np.zeros((0, 2, 3), np.float32)
     colours = np.repeat(_packed(objects, white=0.65), [len(each) for each in lines])
-    counts = [sum(len(o.gas.edges) for o in m.objects) for m in scenes]
+    counts = [sum(len(o.gas.edges) for o in m.labelled.objects) for m in scenes]
     yield from rr.LineStrips3D.columns(strips=_segments(pairs), colors=colours).partition(counts)
 
 
@@ -170,7 +156,9 @@ def _segments(pairs: F4) -> pa.Array:
 
 def _surfaces(scenes: Sequence[DrawnScene]) -> _Columns:
     """Return the triangles of the graphs, one translucent mesh per frame."""
-    meshes = [[(o, faces) for o in m.objects if len(faces := _triangles(o))] for m in scenes]
+    meshes = [
+        [(o, faces) for o in m.labelled.objects if len(faces := _triangles(o))] for m in scenes
+    ]
     objects = [o for each in meshes for o, _ in each]
     sizes = [len(o.gas.neurons) for o in objects]
     colours = np.repeat(_packed(objects, alpha=70), sizes)
@@ -180,20 +168,20 @@ def _surfaces(scenes: Sequence[DrawnScene]) -> _Columns:
     yield _faces([_mesh([(len(o.gas.neurons), faces) for o, faces in each]) for each in meshes])
 
 
-def _triangles(surface: Surface) -> U4:
-    return np.asarray(triangles_of(surface.gas.edges, len(surface.gas.neurons)))
+def _triangles(item: LabelledObject) -> U4:
+    return np.asarray(triangles_of(item.gas.edges, len(item.gas.neurons)))
 
 
 def _outlines(scenes: Sequence[DrawnScene]) -> _Columns:
     """Return the closed outlines of the planes."""
-    outlines = [[p.outline for p in m.planes if len(p.outline)] for m in scenes]
+    outlines = [[p.outline for p in m.labelled.planes if len(p.outline)] for m in scenes]
     strips = [np.concatenate([o, o[:1]]) for o in chain.from_iterable(outlines)]
     yield from rr.LineStrips3D.columns(strips=strips).partition([len(each) for each in outlines])
 
 
 def _fills(scenes: Sequence[DrawnScene]) -> _Columns:
     """Return the planes as triangle fans, since outlines are convex."""
-    scene_outlines = [[p.outline for p in m.planes if len(p.outline) >= 3] for m in scenes]
+    scene_outlines = [[p.outline for p in m.labelled.planes if len(p.outline) >= 3] for m in scenes]
     corners = _stacked(list(chain.from_iterable(scene_outlines)), 3)
     counts = [sum(map(len, outlines)) for outlines in scene_outlines]
     yield from rr.Mesh3D.columns(vertex_positions=corners).partition(counts)
@@ -300,7 +288,9 @@ def _tint(category: str, white: float) -> tuple[int, int, int]:
     return red, green, blue
 
 
-def _packed(objects: Sequence[Surface | Sketch], *, alpha: int = 255, white: float = 0.0) -> U4:
+def _packed(
+    objects: Sequence[LabelledObject | Sketch], *, alpha: int = 255, white: float = 0.0
+) -> U4:
     """Return the colours (n,) of objects, 0xRRGGBBAA, by category and mixed with white."""
     tints = {category: _tint(category, white) for category in {o.category for o in objects}}
     numbers = {

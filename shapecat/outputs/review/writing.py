@@ -168,8 +168,9 @@ class _Review:
         at, pose = (labelled.stamp_ns, labelled.index), self._pose(labelled)
         if pose is not None:
             self._columns.add(entity, at, pose, PLACES)
+        sketch = shapes.sketch(labelled)
         for name, drawing in SKETCH.items():
-            self._columns.add(f"{entity}/{name}", at, shapes.sketch(labelled), drawing, size=64)
+            self._columns.add(f"{entity}/{name}", at, sketch, drawing, size=64)
         self._trace(entity, labelled)
         self._log_events(labelled)
         self._plot(labelled)
@@ -224,7 +225,7 @@ class _Review:
         if self._fixed_frame is not None:
             entity = rr.new_entity_path(["world", "seen", labelled.topic])
             self._columns.add(entity, at, self._pose(labelled) or IDENTITY, PLACES)
-        scene = DrawnScene.of(labelled, rest, points)
+        scene = DrawnScene(labelled, rest, points)
         for name, drawing in SCENE.items():
             self._columns.add(f"{entity}/{name}", at, scene, drawing, size=scene.size)
 
