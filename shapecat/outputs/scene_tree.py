@@ -9,10 +9,10 @@ import pyarrow as pa
 
 from shapecat.detection.scene_graph import Node, format_tree
 from shapecat.errors import OutputError
+from shapecat.outputs.level_clouds import upward
 from shapecat.runs.finished import read_finished
-from shapecat.runs.labelled_frames import plane_of
 from shapecat.runs.tables.reading import keys_of, read_row_groups
-from shapecat.types import Box, Candidate, LabelledObject, Plane, Scene
+from shapecat.types import Box, Candidate, LabelledFrame, LabelledObject, Plane, Scene
 
 __all__ = ["describe_scene"]
 
@@ -36,20 +36,19 @@ def describe_scene(folder: Path, frame: int, *, topic: str | None = None) -> str
     labelled = next(f for f in finished.frames() if (f.topic, f.index) == (topic, frame))
     rows = _rows(folder, "tracks", topic, frame, ["topic", "frame", "detection", "track"])
     deleted = {row["detection"] for row in rows if row["track"] not in finished.labels}
-    scene = _read_scene(folder, topic, frame)
+    scene = _read_scene(folder, labelled)
     scene, objects = _apply_labels(scene, labelled.objects, deleted)
     return format_tree(scene, lambda node: _described(scene, node, objects))
 
 
-def _read_scene(folder: Path, topic: str, frame: int) -> Scene:
+def _read_scene(folder: Path, labelled: LabelledFrame) -> Scene:
     """Return the planes and objects of a frame as detection found them.
 
     Raises
     ------
     OutputError : an object stands on a plane or an object that the frame lacks, or on itself.
     """
-    up = _rows(folder, "frames", topic, frame, ["topic", "frame", "up"])[0]["up"]
-    planes = [plane_of(row) for row in _rows(folder, "planes", topic, frame)]
+    topic, frame, planes = labelled.topic, labelled.index, labelled.planes
     rows = _rows(folder, "detections", topic, frame)
     if not _are_supported([row["on_detection"] for row in rows]) or any(
         row["plane"] not in (None, *range(len(planes))) for row in rows
@@ -58,7 +57,7 @@ def _read_scene(folder: Path, topic: str, frame: int) -> Scene:
         msg = f"{folder}: {damage}; process the recording again"
         raise OutputError(msg)
     objects = [_candidate(row, planes) for row in rows]
-    return Scene(up, tuple(planes), tuple(objects))
+    return Scene(upward(labelled), planes, tuple(objects))
 
 
 def _are_supported(below: Sequence[int | None]) -> bool:
