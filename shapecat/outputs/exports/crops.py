@@ -8,7 +8,6 @@ import math
 import re
 import shutil
 from collections.abc import Iterable
-from contextlib import suppress
 from pathlib import Path
 from typing import NamedTuple
 
@@ -81,7 +80,7 @@ def write_crops(out: Path, frames: Iterable[ExportedFrame], finished: FinishedRu
     hidden = out / f".{prefix}.partial"
     topics = finished.run["options"]["topics"]
     names = dict(zip(topics, different_names(topics), strict=True))
-    count, new = 0, not out.exists()
+    count = 0
     try:
         with explained(f"{out}: cannot be written", OutputError):
             shutil.rmtree(hidden, ignore_errors=True)
@@ -99,9 +98,6 @@ def write_crops(out: Path, frames: Iterable[ExportedFrame], finished: FinishedRu
             _replace(out, origin, hidden)
     finally:
         shutil.rmtree(hidden, ignore_errors=True)
-        if new:
-            with suppress(OSError):  # not empty, unless writing has failed
-                out.rmdir()
     return count
 
 
