@@ -116,8 +116,9 @@ def export_run(
         labelled = observed(frames, "export", total, observe)
         wanted = _tracked(thinned(labelled, every), streams_with_poses(folder))
         pairs = with_colour(wanted, source, finished.run)
+        write = FORMATS[format]
         if format == "crops":
-            return FORMATS[format](out, pairs, finished)
+            return write(out, pairs, finished)
         about = {
             "format": format,
             "run": finished.run["id"],
@@ -125,7 +126,6 @@ def export_run(
             "topics": finished.run["options"]["topics"],
             "range_s": [finished.run["options"][name] for name in ("start_s", "end_s")],
         }
-        write = FORMATS[format]
         return _staged(out / finished.name, about, lambda hidden: write(hidden, pairs, finished))
 
 

@@ -81,19 +81,15 @@ def rectified_from_sensor(up: F8, *, optical: bool) -> F8:
 
 
 class _View(NamedTuple):
-    """The camera for 2D boxes and P2; None for clouds.
-
-    ``pose`` is ``camera_from_sensor``; ``image`` is whether a colour image was written.
-    """
+    """The camera for 2D boxes and P2, None for clouds; ``pose`` is ``camera_from_sensor``."""
 
     camera: Camera | None
     pose: Pose
-    image: bool
 
 
 def _write_image(out: Path, number: int, frame: Frame, coloured: Coloured | None) -> _View:
     """Write the colour image of a frame and return its camera; without one, the depth camera."""
-    depth_view = _View(frame.camera, IDENTITY, image=False)
+    depth_view = _View(frame.camera, IDENTITY)
     if coloured is None or coloured.view.image.height <= 1:
         return depth_view
     view = coloured.view
@@ -109,7 +105,7 @@ def _write_image(out: Path, number: int, frame: Frame, coloured: Coloured | None
         return depth_view
     (out / "image_2").mkdir(exist_ok=True)
     Image.fromarray(pixels).save(out / "image_2" / f"{number:06d}.png", compress_level=4)
-    return _View(lens.pinhole, view.colour_from_depth or IDENTITY, image=True)
+    return _View(lens.pinhole, view.colour_from_depth or IDENTITY)
 
 
 def kitti_type(category: str) -> str:
