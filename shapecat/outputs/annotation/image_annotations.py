@@ -73,24 +73,16 @@ def image_encoders_for(encoding: str, topics: Iterable[str]) -> dict[str, Encode
     Channels of several topics are named after these, since viewers draw all messages of a channel
     on an image. An unknown encoding is replaced by JSON.
     """
-    names = list(topics)
-    suffixes = {name: f"/{name.strip('/')}" if len(names) > 1 else "" for name in names}
-    return {
-        name: encoders_of(
-            encoding,
-            [
-                MessageKind(
-                    f"/shapecat/detections_2d{suffix}",
-                    "vision_msgs/msg/Detection2DArray",
-                    _detections,
-                ),
-                MessageKind(
-                    f"/shapecat/image_annotations{suffix}", "foxglove.ImageAnnotations", _drawn
-                ),
-            ],
-        )
-        for name, suffix in suffixes.items()
-    }
+    names, found = list(topics), {}
+    for name in names:
+        suffix = f"/{name.strip('/')}" if len(names) > 1 else ""
+        boxes, drawn = f"/shapecat/detections_2d{suffix}", f"/shapecat/image_annotations{suffix}"
+        kinds = [
+            MessageKind(boxes, "vision_msgs/msg/Detection2DArray", _detections),
+            MessageKind(drawn, "foxglove.ImageAnnotations", _drawn),
+        ]
+        found[name] = encoders_of(encoding, kinds)
+    return found
 
 
 def _detections(frame: ImageFrame, t: Types) -> Any:
