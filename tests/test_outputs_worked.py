@@ -53,7 +53,7 @@ from shapecat.outputs.png import png
 from shapecat.outputs.report.cards import _guess
 from shapecat.outputs.report.pictures import _require_unchanged
 from shapecat.outputs.review.colour import true_colours
-from shapecat.outputs.review.images import picture_of
+from shapecat.outputs.review.images import layer_of
 from shapecat.outputs.review.paths import Paths
 from shapecat.outputs.review.scenes import choose_scenes, with_clouds
 from shapecat.outputs.scene_tree import _apply_labels, _candidate, _described, _topic
@@ -897,11 +897,8 @@ def test_overlay_with_many_categories_shows_all_masks_in_their_colours() -> None
     names = [f"kind {'abcdefghijklmnopqrst'[k]}" for k in range(20)]
     objects = [labelled_object(k, [k], category=name) for k, name in enumerate(names)]
     masks = tuple(Mask(k + 1, 1, np.ones((1, 1), bool)) for k in range(len(names)))
-    image = ColourImage("/c", 5, 6, "c", "mono8", 23, 3, 23, bytes(3 * 23))
-    coloured = Coloured(ColourView(image, None, None), masks)
-    picture = picture_of(labelled_frame(0, *objects), coloured)
-    assert picture is not None
-    overlay = np.asarray(Image.open(io.BytesIO(picture.masks)).convert("RGBA"))
+    layer = layer_of(list(zip(objects, masks, strict=True)), 3, 23)
+    overlay = np.asarray(Image.open(io.BytesIO(layer)).convert("RGBA"))
 
     assert np.argwhere(overlay[..., 3]).tolist() == [[1, k + 1] for k in range(len(names))]
     assert overlay[1, 1:21, :3].tolist() == [list(colour_of(name)) for name in names]

@@ -14,14 +14,16 @@ import pytest
 import rerun as rr
 from scipy.spatial.transform import Rotation
 
+from shapecat.cameras.colour import ColourImage, ColourView
 from shapecat.errors import OutputError
+from shapecat.outputs.colouring import Coloured
 from shapecat.outputs.colours import colour_of
 from shapecat.outputs.review import layout as review_layout
 from shapecat.outputs.review import viewer as review_viewer
 from shapecat.outputs.review import writing as review
 from shapecat.outputs.review.clouds import paint
 from shapecat.outputs.review.columns import Columns
-from shapecat.outputs.review.images import Images, Picture
+from shapecat.outputs.review.images import Images
 from shapecat.outputs.review.layout import Eye, TrackView, _track_tabs, choose_eye, stepped_back
 from shapecat.outputs.review.scenes import ReviewFrame, choose_scenes
 from shapecat.outputs.review.shapes import SKETCH, _fan, markdown, short_label, sketch
@@ -415,8 +417,9 @@ def test_two_sensors_may_share_their_colour_camera() -> None:
     stream = rr.RecordingStream("test")
     images = Images(Columns(stream))
     for topic in ("/left", "/right"):
-        empty = np.zeros((0, 4), np.float32)
-        images.add(topic, (0, 0), Picture("/colour", b"", "image/png", b"", empty, []))
+        photo = ColourImage("/colour", 0, 0, "camera", "png", 64, 48, 0, b"")
+        labelled = dataclasses.replace(scene(0)[0], topic=topic)
+        images.add(labelled, Coloured(ColourView(photo), ()))
 
     assert list(images.entities.values()) == ["/colour", "/colour"]
 

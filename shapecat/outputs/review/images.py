@@ -2,7 +2,6 @@
 
 import io
 from collections.abc import Iterable, Sequence
-from typing import NamedTuple
 
 import numpy as np
 import rerun as rr
@@ -13,19 +12,19 @@ from shapecat.colour.masks import Mask
 from shapecat.outputs.colouring import Coloured
 from shapecat.outputs.colours import colour_of
 from shapecat.outputs.png import png
-from shapecat.outputs.review.columns import At, Columns, Drawing
+from shapecat.outputs.review.columns import Columns, Drawing
 from shapecat.outputs.review.shapes import short_label
 from shapecat.recordings.decoding.colour_image import pixels_of
 from shapecat.types import LabelledFrame, LabelledObject
 
-__all__ = ["Images", "Picture", "as_file", "picture_of"]
+__all__ = ["Images", "layer_of"]
 
 _QUALITY = 85
 _OPACITY = 110
 _BYTES_PER_NUMBER = 4
 
 
-def as_file(image: ColourImage) -> tuple[bytes, str]:
+def _file_of(image: ColourImage) -> tuple[bytes, str]:
     """Return an image file and its media type: the recorded file, or raw pixels as JPEG.
 
     Raises
@@ -41,44 +40,7 @@ def as_file(image: ColourImage) -> tuple[bytes, str]:
     return file.getvalue(), "image/jpeg"
 
 
-class Picture(NamedTuple):
-    """A colour image to show, with its objects.
-
-    ``contents`` is the image file. ``masks`` is a PNG overlay of the masks, translucent, in the
-    colours of the categories. Row k of ``boxes`` (n, 4), left, top, width and height in pixels,
-    belongs to ``objects[k]``; objects without a mask are left out.
-    """
-
-    topic: str
-    contents: bytes
-    media_type: str
-    masks: bytes
-    boxes: F4
-    objects: list[LabelledObject]
-
-
-def picture_of(labelled: LabelledFrame, coloured: Coloured) -> Picture | None:
-    """Return the picture of a frame; None if the colours are those of an unorganized cloud.
-
-    Raises
-    ------
-    MessageError : the image is damaged.
-    """
-    image = coloured.view.image
-    if image.height <= 1:
-        return None
-    visible = [
-        (item, mask)
-        for item, mask in zip(labelled.objects, coloured.masks, strict=True)
-        if mask.pixels.size
-    ]
-    objects = [item for item, _ in visible]
-    boxes = np.array([mask.box for _, mask in visible], np.float32).reshape(-1, 4)
-    layer = _layer(visible, image.height, image.width)
-    return Picture(image.topic, *as_file(image), layer, boxes, objects)
-
-
-def _layer(visible: Sequence[tuple[LabelledObject, Mask]], height: int, width: int) -> bytes:
+def layer_of(visible: Sequence[tuple[LabelledObject, Mask]], height: int, width: int) -> bytes:
     """Return masks as a translucent PNG; Rerun would not compress a segmentation image."""
     categories = list(dict.fromkeys(item.category for item, _ in visible))
     layer = np.zeros((height, width), np.uint8)
@@ -102,18 +64,34 @@ class Images:
         self._columns = columns
         self.entities: dict[str, str] = {}
 
-    def add(self, topic: str, at: At, picture: Picture) -> None:
-        """Add the picture of a frame on a topic."""
-        entity = rr.new_entity_path(["images", topic])
-        self.entities.setdefault(entity, picture.topic)
-        image, masks = (picture.contents, picture.media_type), (picture.masks, "image/png")
-        for name, file, drawing in (("", image, _IMAGE), ("/masks", masks, _MASKS)):
+    def add(self, labelled: LabelledFrame, coloured: Coloured) -> None:
+        """Add the image of a frame; nothing if the colours are those of an unorganized cloud.
+
+        Raises
+        ------
+        MessageError : the image is damaged; then nothing is added.
+        """
+        image, at = coloured.view.image, (labelled.stamp_ns, labelled.index)
+        if image.height <= 1:
+            return
+        visible = [
+            (item, mask)
+            for item, mask in zip(labelled.objects, coloured.masks, strict=True)
+            if mask.pixels.size
+        ]
+        masks = layer_of(visible, image.height, image.width), "image/png"
+        entity = rr.new_entity_path(["images", labelled.topic])
+        for name, file, drawing in (("", _file_of(image), _IMAGE), ("/masks", masks, _MASKS)):
             size = len(file[0]) // _BYTES_PER_NUMBER
             self._columns.add(f"{entity}{name}", at, file, drawing, size=size)
-        tones = [colour_of(item.category) for item in picture.objects]
-        boxes = (picture.boxes, tones, [short_label(item) for item in picture.objects])
+        boxes = (
+            np.array([mask.box for _, mask in visible], np.float32).reshape(-1, 4),
+            [colour_of(item.category) for item, _ in visible],
+            [short_label(item) for item, _ in visible],
+        )
         for name, drawing in (("boxes", _BOXES), ("captions", _CAPTIONS)):
-            self._columns.add(f"{entity}/{name}", at, boxes, drawing, size=len(picture.boxes))
+            self._columns.add(f"{entity}/{name}", at, boxes, drawing, size=len(visible))
+        self.entities.setdefault(entity, image.topic)
 
 
 def _files(rows: Sequence[tuple[bytes, str]]) -> Iterable[rr.ComponentColumn]:

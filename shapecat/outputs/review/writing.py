@@ -49,7 +49,7 @@ from shapecat.outputs.review import shapes
 from shapecat.outputs.review.clouds import PaintedCloud, paint
 from shapecat.outputs.review.columns import Columns, Drawing, curve
 from shapecat.outputs.review.file import forget_reviews, open_review
-from shapecat.outputs.review.images import Images, picture_of
+from shapecat.outputs.review.images import Images
 from shapecat.outputs.review.layout import (
     Eye,
     TrackView,
@@ -185,14 +185,11 @@ class _Review:
         if coloured is not None:
             try:
                 clouds = paint(frame, *parts, limit=self._limit, view=coloured.view)
-                picture = picture_of(labelled, coloured)
+                self._images.add(labelled, coloured)
             except MessageError as error:
                 text = f"{coloured.view.image.topic}: {error}"
                 self._log("log", rr.TextLog(text, level="WARN"))
             else:
-                if picture is not None:
-                    at = (labelled.stamp_ns, labelled.index)
-                    self._images.add(labelled.topic, at, picture)
                 return clouds
         return paint(frame, *parts, limit=self._limit)
 
