@@ -57,10 +57,7 @@ def _show(overview: dict[str, Any]) -> None:
         f"{overview['path']}: {overview['kind']}, {size_words(overview['bytes'])}, "
         f"{overview['seconds']:.1f} s long"
     )
-    rows = [
-        (t["name"], t["type"], t["encoding"], "?" if t["count"] is None else t["count"], t["use"])
-        for t in overview["topics"]
-    ]
+    rows = [(t["name"], t["type"], t["encoding"], t["count"], t["use"]) for t in overview["topics"]]
     print_table(("topic", "type", "encoding", "messages", "use"), rows)
     for warning in overview["warnings"]:
         click.echo(f"Warning: {warning}")

@@ -393,7 +393,7 @@ CASES: dict[str, Case] = {
         lambda p: mcap(p, repeat_channels=False, repeat_schemas=False), reported="no index"
     ),
     "mcap without statistics": Case(
-        lambda p: mcap(p, use_statistics=False, use_summary_offsets=False)
+        lambda p: mcap(p, use_statistics=False, use_summary_offsets=False), reported="no index"
     ),
     "mcap unfinished": Case(lambda p: mcap(p, finish=False), reported=_CUT),
     "mcap cut": Case(

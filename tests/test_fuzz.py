@@ -107,7 +107,7 @@ def chunk_ends(path: Path) -> list[tuple[int, int]]:
         elif path.suffix == ".bag":
             with BagRecording(path) as recording:
                 ends = [
-                    (record.end, max(time for _, time, _ in recording._expand(record)))
+                    (record.end, max(m.log_time for m in recording._expand(record)))
                     for record in recording._records()
                     if record.op == 5
                 ]

@@ -665,7 +665,7 @@ def test_odd_file_is_read_or_refused(path: Path) -> None:
                 open_recording(path)
         return
     with open_recording(path) as recording:
-        counts = {(t.name, t.type): t.count for t in recording.topics if t.count is not None}
+        counts = {(t.name, t.type): t.count for t in recording.topics}
         read: dict[tuple[str, str], int] = dict.fromkeys(counts, 0)
         for message in recording.messages():
             if (message.topic, message.type) in counts:

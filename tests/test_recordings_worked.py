@@ -21,10 +21,10 @@ from shapecat.errors import NoStreamError
 from shapecat.geometry import IDENTITY
 from shapecat.recordings import choose_streams, open_recording
 from shapecat.recordings.colour_streams import pair_colours
-from shapecat.recordings.containers import time_order
+from shapecat.recordings.containers import chunked
+from shapecat.recordings.containers.chunked import Chunk, RawMessage, in_time_order
 from shapecat.recordings.containers.mcap_records import Opcode, TruncatedError, walk
 from shapecat.recordings.containers.ros1_records import BagError, split
-from shapecat.recordings.containers.time_order import Timed, in_time_order
 from shapecat.recordings.decoding.colour_image import cloud_colours, compressed_size, pixels_of
 from shapecat.recordings.messages import MessageError, Topic
 from shapecat.recordings.overview import describe_recording
@@ -540,19 +540,20 @@ def test_overlapping_chunks_are_merged_in_bounded_memory(monkeypatch: pytest.Mon
     chunks = {0: [50, 60], 1: [20, 30, 40], 2: [10, 30, 50], 3: [15, 70]}
     opened: list[int] = []
 
-    def open_chunk(number: int) -> Any:
-        opened.append(number)
-        return iter([(Timed(t, 100), (t, number)) for t in chunks[number]])
+    def open_chunk(chunk: Chunk) -> Any:
+        opened.append(chunk.entry)
+        data = memoryview(bytes(100))
+        return (RawMessage(chunk.entry, 0, t, t, data) for t in chunks[chunk.entry])
 
     def merged() -> list[tuple[int, int]]:
         opened.clear()
-        due = [(times[0], 7 * number, number) for number, times in chunks.items()]
-        return list(in_time_order(due, open_chunk))
+        due = [Chunk(times[0], 0, 7 * number, (), number) for number, times in chunks.items()]
+        return [(m.log_time, m.channel_id) for m in in_time_order(due, open_chunk)]
 
     everything = sorted((t, n) for n, times in chunks.items() for t in times)
     assert merged() == everything
     assert opened == [2, 3, 1, 0]
-    monkeypatch.setattr(time_order, "_PENDING", 100)  # bytes: the next chunk waits for room
+    monkeypatch.setattr(chunked, "_PENDING", 100)  # bytes: the next chunk waits for room
     assert [n for _, n in merged()] == [2, 2, 2, 3, 3, 1, 1, 1, 0, 0]
 
 

@@ -233,7 +233,7 @@ class _Partner:
     def _period(self) -> int:
         if self._steps:
             return int(median(self._steps))
-        count, span = self.stream.count or 0, self._recording.end_ns - self._recording.start_ns
+        count, span = self.stream.count, self._recording.end_ns - self._recording.start_ns
         return span // (count - 1) if count > 1 and span > 0 else _USUAL_PERIOD_NS
 
     def _view(self, frame: Frame, stored: _BufferedImage) -> ColourView:

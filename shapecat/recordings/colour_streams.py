@@ -40,14 +40,14 @@ class ColourStream:
     """A topic of colour images, or of clouds with a packed ``rgb`` field.
 
     ``info_topic`` is the topic of the calibration, None if there is none; ``count`` is the number
-    of messages, None if unknown; ``frame_id`` and ``encoding`` are from the first image.
+    of messages; ``frame_id`` and ``encoding`` are from the first image.
     """
 
     topic: str
     type: str
     kind: Literal["raw", "compressed", "cloud"]
     info_topic: str | None
-    count: int | None
+    count: int
     frame_id: str
     encoding: str
 
@@ -171,7 +171,7 @@ def _rank(one: ColourStream, stream: Stream) -> tuple[bool, int, bool, bool, int
         -_shared(one, stream),
         not any(word in one.topic.lower() for word in _COLOUR_WORDS),
         not is_rectified(one.topic),
-        -(one.count or 0),
+        -one.count,
         one.kind != "compressed",
         one.topic,
     )

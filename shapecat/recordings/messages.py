@@ -1,5 +1,6 @@
 """Channels, messages and topics of a recording, and which messages to read."""
 
+from collections import Counter
 from collections.abc import Callable, Collection, Iterable
 from dataclasses import dataclass
 from typing import NamedTuple, TypeAlias
@@ -104,12 +105,12 @@ class Message(NamedTuple):
 
 @dataclass(frozen=True)
 class Topic:
-    """A topic with one type; ``count`` is the number of messages, None if unknown."""
+    """A topic with one type; ``count`` is the number of messages."""
 
     name: str
     type: str
     encoding: str
-    count: int | None
+    count: int
 
 
 def detached(data: bytes | memoryview) -> bytes | memoryview:
@@ -118,12 +119,10 @@ def detached(data: bytes | memoryview) -> bytes | memoryview:
 
 
 def sum_topics(topics: Iterable[Topic]) -> tuple[Topic, ...]:
-    """Return topics sorted, with equal ones as one; its count is None if one of theirs is."""
-    counts: dict[tuple[str, str, str], int | None] = {}
+    """Return topics sorted, with equal ones as one that has the messages of all."""
+    counts: Counter[tuple[str, str, str]] = Counter()
     for topic in topics:
-        key = (topic.name, topic.type, topic.encoding)
-        before, more = counts.get(key, 0), topic.count
-        counts[key] = None if before is None or more is None else before + more
+        counts[topic.name, topic.type, topic.encoding] += topic.count
     return tuple(Topic(*key, counts[key]) for key in sorted(counts))
 
 

@@ -22,7 +22,7 @@ class Stream:
     """A topic of depth images or clouds.
 
     ``info_topic`` is the topic of a depth image's calibration, None if there is none; ``count`` is
-    the number of messages, None if unknown; ``frame_id`` is from the first message; ``doubt`` says
+    the number of messages; ``frame_id`` is from the first message; ``doubt`` says
     why its frames may be wrong, as with the calibration of another camera; empty without a doubt.
     """
 
@@ -30,7 +30,7 @@ class Stream:
     type: str
     kind: Literal["depth", "points"]
     info_topic: str | None
-    count: int | None
+    count: int
     frame_id: str
     doubt: str = ""
 

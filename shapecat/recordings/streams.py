@@ -178,7 +178,7 @@ def _rank(stream: Stream) -> tuple[bool, bool, bool, bool, int, str]:
     aligned = any(word in stream.topic for word in ("aligned", "registered", "depth_to_"))
     unnamed = stream.kind == "depth" and "depth" not in _image_name(stream.topic)
     kind = stream.kind != "depth"
-    return (stream.doubt != "", kind, unnamed, aligned, -(stream.count or 0), stream.topic)
+    return (stream.doubt != "", kind, unnamed, aligned, -stream.count, stream.topic)
 
 
 def _image_name(topic: str) -> str:

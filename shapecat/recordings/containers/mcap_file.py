@@ -4,17 +4,16 @@ Damage does not stop reading: a truncated file is read as far as possible, a dam
 skipped, and a warning reports either.
 """
 
-from collections import Counter
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from pathlib import Path
 from typing import ClassVar
 
 from mcap import records
 
 from shapecat.errors import RecordingError
+from shapecat.recordings.containers.chunked import Chunk, ChunkedRecording, RawMessage
 from shapecat.recordings.containers.mcap_index import (
     IndexedMessage,
-    overlaps,
     read_message_index,
     unread,
 )
@@ -22,7 +21,6 @@ from shapecat.recordings.containers.mcap_records import (
     MAGIC,
     ChunkError,
     Opcode,
-    RawMessage,
     Record,
     TruncatedError,
     parse,
@@ -34,18 +32,7 @@ from shapecat.recordings.containers.mcap_records import (
     walk,
 )
 from shapecat.recordings.containers.mcap_summary import Summary, read_summary
-from shapecat.recordings.containers.message_compression import decompressed
-from shapecat.recordings.containers.time_order import Timed, in_time_order
-from shapecat.recordings.messages import (
-    Channel,
-    Message,
-    Selection,
-    Topic,
-    detached,
-    ros_type,
-    sum_topics,
-)
-from shapecat.recordings.recording import Recording
+from shapecat.recordings.messages import Channel, Selection, ros_type
 
 __all__ = ["McapRecording"]
 
@@ -53,7 +40,7 @@ _PART = 0.9
 """If more than this share of a chunk is needed, the whole chunk is decompressed and verified."""
 
 
-class McapRecording(Recording):
+class McapRecording(ChunkedRecording):
     """An MCAP file.
 
     Attributes
@@ -73,65 +60,40 @@ class McapRecording(Recording):
         RecordingError : the file is not MCAP.
         OSError : the file cannot be read.
         """
+        self._checked: set[int] = set()  # offsets of chunks with a verified checksum
         super().__init__(path)
-        self._file = path.open("rb")
-        try:
-            self._size = self._file.seek(0, 2)
-            self.profile = self._read_profile()
-            summary = read_summary(self._file, self._size, self.warn)
-            self.indexed = summary is not None
-            self.summary = summary or Summary()
-            self._counts: Counter[int] | None = None
-            self._checked: set[int] = set()  # offsets of chunks with a verified checksum
-            self._times: list[int] = []
-            if summary is None:
-                self._scan()
-            else:
-                self._describe()
-        except BaseException:
-            self._file.close()
-            raise
-        self._channels = {
-            number: self._channel(channel) for number, channel in self.summary.channels.items()
-        }
-        self.topics = self._list_topics()
-        if self._times:
-            self.start_ns, self.end_ns = min(self._times), max(self._times)
-
-    def close(self) -> None:
-        """Close the file."""
-        self._file.close()
-
-    def _read(self, selection: Selection) -> Iterator[Message]:
-        channel_ids = {n for n, c in self._channels.items() if selection.has_topic(c.topic)}
-        raw = self._by_time(channel_ids, selection) if self.indexed else self._in_file(channel_ids)
-        for message in raw:
-            if not selection.has_time(message.log_time):
-                continue
-            channel = self._channels[message.channel_id]
-            data: bytes | memoryview | None
-            if selection.needed and not selection.needed(channel.topic, message.log_time):
-                data = b""
-            else:
-                data = decompressed(self, channel, message.data)
-                if data is None:
-                    continue
-                data = detached(data)
-            yield Message(channel, message.log_time, message.publish_time, message.sequence, data)
 
     def top_level(self) -> Iterator[Record]:
         """Yield the complete records of the data section, without their content."""
-        try:
-            for record in walk(self._file, len(MAGIC), self._size):
-                if record.opcode in {Opcode.DATA_END, Opcode.FOOTER}:
-                    return
-                yield record
-        except TruncatedError:
-            return
+        return (one for one in self._records() if one.whole and one.opcode not in _END)
 
     def content(self, record: Record) -> bytes:
         """Read the content of a record from `top_level`."""
         return read_content(self._file, record)
+
+    def _read_index(self) -> bool:
+        self.profile = self._read_profile()
+        summary = read_summary(self._file, self._size, self.warn)
+        if summary is None or summary.statistics is None:
+            self.summary = Summary()
+            return False
+        self.summary = summary
+        self._counts.update(summary.statistics.channel_message_counts)
+        self._channels = {
+            number: self._channel(channel) for number, channel in summary.channels.items()
+        }
+        self._chunks = [
+            Chunk(
+                c.message_start_time,
+                c.message_end_time,
+                c.chunk_start_offset,
+                c.message_index_offsets,
+                c,
+            )
+            for c in summary.chunks
+            if c.message_end_time or c.message_index_offsets  # else it has no messages
+        ]
+        return True
 
     def _read_profile(self) -> str:
         self._file.seek(0)
@@ -145,55 +107,27 @@ class McapRecording(Recording):
             self.warn("the header is damaged")
             return ""
 
-    def _describe(self) -> None:
-        """Take counts and times from the index."""
-        statistics = self.summary.statistics
-        if statistics is not None:
-            self._counts = Counter(statistics.channel_message_counts)
-        for chunk in self.summary.chunks:
-            if chunk.message_end_time or chunk.message_index_offsets:  # else it has no messages
-                self._times += [chunk.message_start_time, chunk.message_end_time]
-
-    def _scan(self) -> None:
-        """Read the whole file to find its channels, counts and times."""
-        self._counts = Counter()
-        end, finished = len(MAGIC), False
-        low = high = None
-        for record in self._records():
-            finished = record.opcode in {Opcode.DATA_END, Opcode.FOOTER}
-            if finished:
-                break
-            for message in self._expand(record):
-                self._counts[message.channel_id] += 1
-                time = message.log_time
-                low = time if low is None else min(low, time)
-                high = time if high is None else max(high, time)
-            end = record.offset + record.length if record.whole else end
-        if low is not None and high is not None:
-            self._times = [low, high]
-        if finished:
+    def _scan(self) -> Record | None:
+        last: Record | None = super()._scan()
+        if last is not None and last.opcode in _END:
             self.warn("no index: messages are read in file order")
-        else:
-            lost = self._size - end
-            self.warn(
-                f"the recording was not finished; messages recovered: {self._counts.total()}"
-                + (
-                    f"; the last {lost} bytes are truncated, and read where possible"
-                    if lost
-                    else ""
-                )
-            )
-
-    def _in_file(self, channel_ids: set[int]) -> Iterator[RawMessage]:
-        for record in self._records():
-            if record.opcode in {Opcode.DATA_END, Opcode.FOOTER}:
-                return
-            yield from (m for m in self._expand(record) if m.channel_id in channel_ids)
+            return last
+        end = len(MAGIC)  # of the last whole record
+        if last is not None:
+            end = last.offset + last.length if last.whole else last.offset - 9
+        text = f"the recording was not finished; messages recovered: {self._counts.total()}"
+        if end < self._size:
+            text += f"; the last {self._size - end} bytes are truncated, and read where possible"
+        self.warn(text)
+        return last
 
     def _records(self) -> Iterator[Record]:
-        """Yield the records of the file; a truncated last chunk is cut to its readable part."""
+        """Yield the records up to the end of the data; a truncated chunk is cut."""
         try:
-            yield from walk(self._file, len(MAGIC), self._size)
+            for record in walk(self._file, len(MAGIC), self._size):
+                yield record
+                if record.opcode in _END:
+                    return
         except TruncatedError as error:
             if error.record is not None and error.record.opcode == Opcode.CHUNK:
                 yield error.record
@@ -201,14 +135,14 @@ class McapRecording(Recording):
     def _expand(self, record: Record) -> Iterator[RawMessage]:
         """Yield the messages of a top-level record; store its schemas and channels."""
         if record.opcode == Opcode.CHUNK:
-            yield from self._chunk(record)
+            yield from self._split(record)
         elif record.opcode in _DEFINING or record.opcode not in _KNOWN:
             try:
                 yield from self._take(record.opcode, memoryview(self.content(record)))
             except ChunkError as error:
                 self.warn(f"skipped a record at byte {record.offset}: {error}")
 
-    def _chunk(self, record: Record, end: int | None = None) -> Iterator[RawMessage]:
+    def _split(self, record: Record, end: int | None = None) -> Iterator[RawMessage]:
         """Yield the messages of a chunk up to its end, its truncation, or the byte ``end``."""
         try:
             for opcode, content in split_chunk(self._plain(record, end)):
@@ -230,7 +164,7 @@ class McapRecording(Recording):
     def _take(self, opcode: int, content: memoryview) -> Iterator[RawMessage]:
         if opcode == Opcode.MESSAGE:
             message = split_message(content)
-            if message.channel_id in self.summary.channels:
+            if message.channel_id in self._channels:
                 yield message
             else:
                 self.warn(
@@ -245,53 +179,39 @@ class McapRecording(Recording):
             self.summary.schemas.setdefault(schema.id, schema)
         elif opcode == Opcode.CHANNEL:
             channel = parse(records.Channel.read, content)
-            self.summary.channels.setdefault(channel.id, channel)
+            self._channels.setdefault(channel.id, self._channel(channel))
 
-    def _by_time(self, channel_ids: set[int], selection: Selection) -> Iterator[RawMessage]:
-        """Yield the messages of all chunks by log time, in file order if times are equal."""
-        chunks = [
-            (c.message_start_time, c.chunk_start_offset, c)
-            for c in self.summary.chunks
-            if overlaps(c, channel_ids, selection.start_ns, selection.stop_ns)
-        ]
+    def _read_chunk(
+        self, chunk: Chunk, channel_ids: set[int], selection: Selection
+    ) -> Iterator[RawMessage]:
+        """Yield the messages of a chunk; those after the last needed one have no data.
+
+        Reading only transforms, or few images of many, then decompresses little.
+        """
 
         def is_needed(message: IndexedMessage) -> bool:
             if selection.needed is None or message.channel_id not in channel_ids:
                 return message.channel_id in channel_ids
             return selection.needed(self._channels[message.channel_id].topic, message.log_time)
 
-        def read(chunk: records.ChunkIndex) -> Iterator[tuple[Timed, RawMessage]]:
-            for message in self._indexed_chunk(chunk, is_needed):
-                if message.channel_id in channel_ids:
-                    yield Timed(message.log_time, len(message.data)), message
-
-        yield from in_time_order(chunks, read)
-
-    def _indexed_chunk(
-        self, chunk: records.ChunkIndex, needed: Callable[[IndexedMessage], bool]
-    ) -> Iterator[RawMessage]:
-        """Yield the messages of a chunk; those after the last needed one have no data.
-
-        Reading only transforms, or few images of many, then decompresses little.
-        """
-        indexed = read_message_index(self._file, chunk)
-        last = max((m.place for m in indexed if needed(m)), default=-1)
-        end = min((m.place for m in indexed if m.place > last), default=chunk.uncompressed_size)
-        if end > _PART * chunk.uncompressed_size:
-            end = chunk.uncompressed_size
+        indexed, size = read_message_index(self._file, chunk.entry), chunk.entry.uncompressed_size
+        last = max((m.place for m in indexed if is_needed(m)), default=-1)
+        end = min((m.place for m in indexed if m.place > last), default=size)
+        if end > _PART * size:
+            end = size
         if last >= 0 or not indexed:
-            yield from self._chunk_at(chunk, end)
+            yield from self._split_at(chunk.position, end if end < size else None)
         yield from (unread(message) for message in indexed if message.place >= end)
 
-    def _chunk_at(self, chunk: records.ChunkIndex, end: int) -> Iterator[RawMessage]:
+    def _split_at(self, position: int, end: int | None) -> Iterator[RawMessage]:
         try:
-            record = next(walk(self._file, chunk.chunk_start_offset, self._size))
+            record = next(walk(self._file, position, self._size))
         except (TruncatedError, StopIteration):
             record = None
         if record is None or record.opcode != Opcode.CHUNK:
-            self.warn(f"no chunk at byte {chunk.chunk_start_offset}, where the index has one")
+            self.warn(f"no chunk at byte {position}, where the index has one")
             return
-        yield from self._chunk(record, end if end < chunk.uncompressed_size else None)
+        yield from self._split(record, end)
 
     def _channel(self, channel: records.Channel) -> Channel:
         schema = self.summary.schemas.get(channel.schema_id)
@@ -307,15 +227,9 @@ class McapRecording(Recording):
             tuple(channel.metadata.items()),
         )
 
-    def _list_topics(self) -> tuple[Topic, ...]:
-        counts = self._counts
-        return sum_topics(
-            Topic(c.topic, c.type, c.encoding, None if counts is None else counts[number])
-            for number, c in self._channels.items()
-        )
-
 
 _NONE = ("", "", b"")
 _KNOWN = {int(opcode) for opcode in Opcode} | set(range(128, 256))
 """Opcodes that cause no warning; 128 to 255 are for private use."""
+_END = (Opcode.DATA_END, Opcode.FOOTER)
 _DEFINING = (Opcode.SCHEMA, Opcode.CHANNEL, Opcode.MESSAGE)

@@ -6,14 +6,10 @@ from typing import BinaryIO, NamedTuple
 
 from mcap import records
 
-from shapecat.recordings.containers.mcap_records import (
-    RawMessage,
-    TruncatedError,
-    read_content,
-    walk,
-)
+from shapecat.recordings.containers.chunked import RawMessage
+from shapecat.recordings.containers.mcap_records import TruncatedError, read_content, walk
 
-__all__ = ["IndexedMessage", "overlaps", "read_message_index", "unread"]
+__all__ = ["IndexedMessage", "read_message_index", "unread"]
 
 _HEAD = struct.Struct("<HI")
 _ENTRY = struct.Struct("<QQ")
@@ -26,20 +22,6 @@ class IndexedMessage(NamedTuple):
     channel_id: int
     log_time: int
     place: int
-
-
-def overlaps(
-    chunk: records.ChunkIndex, channel_ids: set[int], start_ns: int | None, stop_ns: int | None
-) -> bool:
-    """Return whether a chunk may hold messages of wanted channels in ``[start_ns, stop_ns)``."""
-    if start_ns is not None and chunk.message_end_time < start_ns:
-        return False
-    if stop_ns is not None and chunk.message_start_time >= stop_ns:
-        return False
-    # Without message indexes any chunk may hold any channel.
-    return not chunk.message_index_offsets or not channel_ids.isdisjoint(
-        chunk.message_index_offsets
-    )
 
 
 def read_message_index(file: BinaryIO, chunk: records.ChunkIndex) -> list[IndexedMessage]:

@@ -18,12 +18,12 @@ from mcap.exceptions import McapError
 from mcap.opcode import Opcode
 
 from shapecat.errors import RecordingError
+from shapecat.recordings.containers.chunked import RawMessage
 
 __all__ = [
     "MAGIC",
     "ChunkError",
     "Opcode",
-    "RawMessage",
     "Record",
     "TruncatedError",
     "parse",
@@ -79,16 +79,6 @@ class Record(NamedTuple):
     offset: int
     length: int
     whole: bool = True
-
-
-class RawMessage(NamedTuple):
-    """A message record; ``data`` is a view into its chunk, times are nanoseconds."""
-
-    channel_id: int
-    sequence: int
-    log_time: int
-    publish_time: int
-    data: memoryview
 
 
 def walk(file: BinaryIO, offset: int, end: int) -> Iterator[Record]:

@@ -140,12 +140,13 @@ def _find_data_end(file: BinaryIO, summary: Summary, summary_start: int) -> int:
 
 
 def _is_complete(summary: Summary) -> bool:
-    """Return whether the summary alone locates every message."""
-    numbers = {number for c in summary.chunks for number in c.message_index_offsets}
+    """Return whether the summary alone locates and counts every message."""
     statistics = summary.statistics
-    if statistics is not None:
-        numbers |= {n for n, count in statistics.channel_message_counts.items() if count}
+    if statistics is None:
+        return False
+    numbers = {number for c in summary.chunks for number in c.message_index_offsets}
+    numbers |= {n for n, count in statistics.channel_message_counts.items() if count}
     schemas = {channel.schema_id for channel in summary.channels.values()} - {0}
     named = numbers <= summary.channels.keys() and schemas <= summary.schemas.keys()
-    empty = statistics is not None and statistics.message_count == 0
+    empty = statistics.message_count == 0
     return named and bool(summary.channels or empty) and bool(summary.chunks or empty)

@@ -5,13 +5,12 @@ Libraries reject the bags that a robot leaves when its power is cut: without an 
 """
 
 import struct
-from collections import Counter
 from collections.abc import Iterator
 from contextlib import suppress
-from pathlib import Path
-from typing import ClassVar, NamedTuple
+from typing import ClassVar
 
 from shapecat.errors import RecordingError
+from shapecat.recordings.containers.chunked import Chunk, ChunkedRecording, RawMessage
 from shapecat.recordings.containers.ros1_records import (
     BAG_HEADER,
     CHUNK,
@@ -29,95 +28,27 @@ from shapecat.recordings.containers.ros1_records import (
     u8,
     walk,
 )
-from shapecat.recordings.containers.time_order import Timed, in_time_order
-from shapecat.recordings.messages import (
-    Channel,
-    Message,
-    Selection,
-    Topic,
-    detached,
-    ros_type,
-    sum_topics,
-)
-from shapecat.recordings.recording import Recording
+from shapecat.recordings.messages import Channel, Selection, ros_type
 
 __all__ = ["BagRecording"]
 
 
-class _ChunkInfo(NamedTuple):
-    position: int
-    start: int
-    end: int
-    counts: dict[int, int]
+class BagRecording(ChunkedRecording):
+    """A ROS 1 bag; the log time of a message is when it was recorded.
 
-
-class BagRecording(Recording):
-    """A ROS 1 bag; the log time of a message is when it was recorded."""
+    Raises `RecordingError` if the file is not of version 2.0, is encrypted, or holds no topics.
+    """
 
     kind: ClassVar[str] = "ros1"
 
-    def __init__(self, path: Path) -> None:
-        """Open the bag and read its index, or scan it without one.
-
-        Raises
-        ------
-        RecordingError : the file is not a bag of version 2.0, is encrypted, or holds no topics.
-        OSError : the file cannot be read.
-        """
-        super().__init__(path)
-        self._chunks: list[_ChunkInfo] | None = None
-        self._promised: dict[int, int] = {}
-        self._file = path.open("rb")
-        try:
-            self._size = self._file.seek(0, 2)
-            self._first = len(MAGIC)
-            counts = self._read_index(self._read_header())
-            self.indexed = counts is not None
-            if counts is None:
-                counts = self._scan()
-        except BaseException:
-            self._file.close()
-            raise
-        self.topics = sum_topics(
-            Topic(channel.topic, channel.type, channel.encoding, counts[number])
-            for number, channel in self._channels.items()
-        )
-
-    def close(self) -> None:
-        """Close the bag."""
-        self._file.close()
-
-    def _read(self, selection: Selection) -> Iterator[Message]:
-        connections = {n for n, c in self._channels.items() if selection.has_topic(c.topic)}
-        for number, time, data in self._raw(connections, selection.start_ns, selection.stop_ns):
-            if selection.has_time(time):
-                yield Message(self._channels[number], time, time, 0, detached(data))
-
-    def _raw(
-        self, connections: set[int], start_ns: int | None, stop_ns: int | None
-    ) -> Iterator[tuple[int, int, memoryview]]:
-        if self._chunks is None:
-            for record in self._records():
-                yield from (m for m in self._expand(record) if m[0] in connections)
-            return
-        due = [
-            (chunk.start, chunk.position, chunk.position)
-            for chunk in self._chunks
-            if not connections.isdisjoint(chunk.counts)
-            and (start_ns is None or chunk.end >= start_ns)
-            and (stop_ns is None or chunk.start < stop_ns)
-        ]
-
-        def read(position: int) -> Iterator[tuple[Timed, tuple[int, int, memoryview]]]:
-            chunk = next(walk(self._file, position, self._size))
-            for message in self._expand(chunk):
-                if message[0] in connections:
-                    yield Timed(message[1], len(message[2])), message
-
-        yield from in_time_order(due, read)
+    def _read_chunk(
+        self, chunk: Chunk, _channel_ids: set[int], _selection: Selection
+    ) -> Iterator[RawMessage]:
+        return self._expand(next(walk(self._file, chunk.position, self._size)))
 
     def _read_header(self) -> dict[str, bytes]:
         """Return the fields of the bag header; empty if it is damaged."""
+        self._first = len(MAGIC)
         self._file.seek(0)
         if self._file.read(len(MAGIC)) != MAGIC:
             msg = "not a readable ROS 1 bag: not of version 2.0"
@@ -133,47 +64,43 @@ class BagRecording(Recording):
             raise RecordingError(msg)
         return record.fields
 
-    def _read_index(self, header: dict[str, bytes]) -> Counter[int] | None:
-        """Read the index; return the message count per connection, None if it is unusable."""
-        counts: Counter[int] = Counter()
+    def _read_index(self) -> bool:
+        header = self._read_header()
         chunks = []
         try:
             connections, number = u4(header, "conn_count"), u4(header, "chunk_count")
             position = u8(header, "index_pos")
             if position == 0:
-                return None
+                return False
             for record in walk(self._file, position, self._size):
                 if record.op == CONNECTION:
                     self._connect(record.fields, self._data(record))
                 elif record.op == CHUNK_INFO:
                     chunks.append(self._chunk_info(record))
-                    counts.update(chunks[-1].counts)
             for chunk in chunks:
                 if next(walk(self._file, chunk.position, self._size)).op != CHUNK:
-                    return None
+                    return False
         except (BagError, StopIteration, struct.error):
-            return None
+            return False
         if (len(self._channels), len(chunks)) != (connections, number):
-            return None
-        if not counts.keys() <= self._channels.keys():
-            return None
+            return False
+        filled = [chunk for chunk in chunks if chunk.entry]
+        if not all(chunk.entry.keys() <= self._channels.keys() for chunk in filled):
+            return False
         if not self._agrees(chunks):
-            return None
-        self._chunks = chunks
-        self._promised = {chunk.position: sum(chunk.counts.values()) for chunk in chunks}
-        filled = [chunk for chunk in chunks if chunk.counts]
-        if filled:
-            self.start_ns = min(chunk.start for chunk in filled)
-            self.end_ns = max(chunk.end for chunk in filled)
-        return counts
+            return False
+        self._chunks = filled
+        for chunk in filled:
+            self._counts.update(chunk.entry)
+        return True
 
-    def _agrees(self, chunks: list[_ChunkInfo]) -> bool:
+    def _agrees(self, chunks: list[Chunk]) -> bool:
         """Return whether the index agrees with the connections in the chunks."""
         unseen = set(self._channels)
-        for chunk in sorted(chunks):
-            if unseen.isdisjoint(chunk.counts):
+        for chunk in sorted(chunks, key=lambda chunk: chunk.position):
+            if unseen.isdisjoint(chunk.entry):
                 continue
-            unseen -= chunk.counts.keys()
+            unseen -= chunk.entry.keys()
             record = next(walk(self._file, chunk.position, self._size))
             with suppress(BagError):  # damage is reported when the chunk is read
                 for fields, data in split(expand(record, self._data(record))[0]):
@@ -183,27 +110,19 @@ class BagRecording(Recording):
                             return False
         return True
 
-    def _chunk_info(self, record: Record) -> _ChunkInfo:
-        pairs = struct.iter_unpack("<II", self._data(record))
+    def _chunk_info(self, record: Record) -> Chunk:
+        """Return a chunk whose entry is its number of messages on each connection."""
+        counts = dict(struct.iter_unpack("<II", self._data(record)))
         start, end = (time_of(record.fields, name) for name in ("start_time", "end_time"))
-        return _ChunkInfo(u8(record.fields, "chunk_pos"), start, end, dict(pairs))
+        return Chunk(start, end, u8(record.fields, "chunk_pos"), counts.keys(), counts)
 
-    def _scan(self) -> Counter[int]:
-        """Read the whole bag to find its connections, counts and times."""
-        self._channels.clear()
-        counts: Counter[int] = Counter()
-        low = high = None
-        for record in self._records():
-            for number, time, _ in self._expand(record):
-                counts[number] += 1
-                low = time if low is None else min(low, time)
-                high = time if high is None else max(high, time)
-        self.start_ns, self.end_ns = low or 0, high or 0
-        self.warn(f"no index, or a damaged one; messages recovered: {counts.total()}")
+    def _scan(self) -> Record | None:
+        last: Record | None = super()._scan()
+        self.warn(f"no index, or a damaged one; messages recovered: {self._counts.total()}")
         if not self._channels:
             msg = "not a readable ROS 1 bag: no index and no messages in it"
             raise RecordingError(msg)
-        return counts
+        return last
 
     def _records(self) -> Iterator[Record]:
         """Yield the records in file order; a truncated last one is cut to its readable part."""
@@ -214,8 +133,8 @@ class BagRecording(Recording):
             if error.record is not None:
                 yield error.record
 
-    def _expand(self, record: Record) -> Iterator[tuple[int, int, memoryview]]:
-        """Yield connection, time (ns) and data of the messages of a record; store new connections.
+    def _expand(self, record: Record) -> Iterator[RawMessage]:
+        """Yield the messages of a record; store new connections.
 
         A damaged chunk is read up to the damage.
         """
@@ -224,34 +143,26 @@ class BagRecording(Recording):
         problem, data = "", self._data(record)
         try:
             if record.op == CONNECTION:
-                self._take(record.fields, memoryview(data))
+                yield from self._take(record.fields, memoryview(data))
                 return
             plain, problem = expand(record, data)
-            count = 0
             for fields, content in split(plain):
-                message = self._take(fields, content)
-                if message is not None:
-                    count += 1
-                    yield message
-            if self._chunks is not None and count != self._promised[record.start]:
-                problem = problem or f"the index does not list its {count} messages"
+                yield from self._take(fields, content)
         except BagError as error:
             problem = problem or str(error)
         if problem:
             self.warn(f"skipped the rest of the record at byte {record.start}: {problem}")
 
-    def _take(
-        self, fields: dict[str, bytes], data: memoryview
-    ) -> tuple[int, int, memoryview] | None:
+    def _take(self, fields: dict[str, bytes], data: memoryview) -> Iterator[RawMessage]:
         kind = fields.get("op", b"")
         if kind == bytes([MESSAGE]):
             number, time = u4(fields, "conn"), time_of(fields)
             if number in self._channels:
-                return number, time, data
-            self.warn(f"skipped messages of connection {number}, which is not described")
-        elif kind == bytes([CONNECTION]) and self._chunks is None:
+                yield RawMessage(number, 0, time, time, data)
+            else:
+                self.warn(f"skipped messages of connection {number}, which is not described")
+        elif kind == bytes([CONNECTION]) and not self.indexed:
             self._connect(fields, data)
-        return None
 
     def _connect(self, fields: dict[str, bytes], data: bytes | memoryview) -> None:
         """Store the channel of a connection record."""
