@@ -13,10 +13,6 @@ from typing import Any
 
 import numpy as np
 import pytest
-from hypothesis import given, settings
-from hypothesis import strategies as st
-from mcap import records
-from mcap.data_stream import RecordBuilder
 from mcap.reader import NonSeekingReader, make_reader
 from mcap.writer import CompressionType
 from mcap_ros2.decoder import DecoderFactory
@@ -32,11 +28,6 @@ from shapecat.outputs.annotation.annotated_mcap import write_annotated
 from shapecat.outputs.annotation.mcap_append import Appender, copy_bytes
 from shapecat.outputs.colours import CATEGORY_COLOURS, colour_of
 from shapecat.recordings import open_recording
-from shapecat.recordings.containers.mcap_records import (
-    ChunkError,
-    read_chunk_index,
-    write_chunk_index,
-)
 from shapecat.types import CATEGORIES, AnnotationBox, AnnotationFrame
 from tests.mcap_files import mcap_writer, read_ros, summary_of
 from tests.test_recordings import QOS
@@ -596,31 +587,3 @@ def test_every_category_has_its_own_colour() -> None:
     assert {*CATEGORIES, "unknown"} <= CATEGORY_COLOURS.keys()
     assert len(set(CATEGORY_COLOURS.values())) == len(CATEGORY_COLOURS)
     assert colour_of("teapot") == colour_of("teapot") != colour_of("kettle")
-
-
-_U64 = st.integers(0, 2**64 - 1)
-
-
-@given(
-    numbers=st.lists(_U64, min_size=7, max_size=7),
-    offsets=st.dictionaries(st.integers(0, 2**16 - 1), _U64, max_size=5),
-    compression=st.sampled_from(["", "lz4", "zstd", "größer"]),
-)
-@settings(max_examples=40, deadline=None)
-def test_chunk_indexes_match_mcap_library(
-    numbers: list[int], offsets: dict[int, int], compression: str
-) -> None:
-    """Readers would find no messages at a wrong offset."""
-    length, start, size, end, index_length, begin, plain = numbers
-    index = records.ChunkIndex(
-        length, start, compression, size, end, index_length, offsets, begin, plain
-    )
-    builder = RecordBuilder()
-    index.write(builder)
-    encoded = builder.end()
-
-    assert write_chunk_index(index) == encoded
-    assert read_chunk_index(encoded[9:]) == index
-    for cut in range(len(encoded) - 9):
-        with pytest.raises(ChunkError):
-            read_chunk_index(encoded[9 : 9 + cut])

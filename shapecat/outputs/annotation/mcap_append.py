@@ -20,7 +20,7 @@ from mcap.data_stream import RecordBuilder
 from mcap.opcode import Opcode
 
 from shapecat.outputs.annotation.content import AnnotationChannel
-from shapecat.recordings.containers.mcap_records import MAGIC, write_chunk_index
+from shapecat.recordings.containers.mcap_records import MAGIC
 from shapecat.recordings.containers.mcap_summary import Summary
 
 __all__ = ["Appender", "copy_bytes"]
@@ -199,7 +199,7 @@ class Appender:
             (Opcode.SCHEMA, _encoded(self._schemas.values())),
             (Opcode.CHANNEL, _encoded(self._channels.values())),
             (Opcode.STATISTICS, _encoded(map(self._statistics, original))),
-            (Opcode.CHUNK_INDEX, b"".join(map(write_chunk_index, self._chunks))),
+            (Opcode.CHUNK_INDEX, _encoded(self._chunks)),
             (Opcode.ATTACHMENT_INDEX, _encoded(self._attachments)),
             (Opcode.METADATA_INDEX, _encoded(self._metadata)),
         ]

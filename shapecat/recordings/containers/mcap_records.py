@@ -12,7 +12,6 @@ from typing import BinaryIO, NamedTuple, TypeVar
 
 import lz4.frame  # type: ignore[import-untyped]  # ships no types
 import zstandard
-from mcap import records
 from mcap.data_stream import ReadDataStream
 from mcap.exceptions import McapError
 from mcap.opcode import Opcode
@@ -28,13 +27,11 @@ __all__ = [
     "TruncatedError",
     "parse",
     "read_chunk",
-    "read_chunk_index",
     "read_content",
     "read_cut_chunk",
     "split_chunk",
     "split_message",
     "walk",
-    "write_chunk_index",
 ]
 
 MAGIC = b"\x89MCAP0\r\n"
@@ -42,12 +39,6 @@ MAGIC = b"\x89MCAP0\r\n"
 _HEAD = struct.Struct("<BQ")
 _CHUNK = struct.Struct("<QQQII")
 _MESSAGE = struct.Struct("<HIQQ")
-_INDEX = struct.Struct("<QQQQI")
-_ENTRY = struct.Struct("<HQ")
-_NAMED = struct.Struct("<QI")
-_SIZES = struct.Struct("<QQ")
-"""Parts of a chunk index: times, offset, length, and bytes of entries; an entry; bytes of the
-message indexes and of the compression's name; compressed and decompressed size."""
 _FREELY = 256 << 20
 """A chunk may always claim this decompressed size, bytes."""
 _RATIO = 1000
@@ -119,46 +110,6 @@ def parse(read: Callable[[ReadDataStream], _T], content: bytes | memoryview) -> 
     except (McapError, struct.error, ValueError) as error:
         msg = f"damaged record: {str(error) or type(error).__name__}"
         raise ChunkError(msg) from error
-
-
-def read_chunk_index(content: bytes) -> records.ChunkIndex:
-    """Parse a chunk index faster than the library: a recording has thousands of them.
-
-    Raises
-    ------
-    ChunkError : the record is damaged.
-    """
-    try:
-        start, end, offset, length, entries = _INDEX.unpack_from(content)
-        if entries % _ENTRY.size or _INDEX.size + entries > len(content):
-            msg = "damaged record: index entries do not match"
-            raise ChunkError(msg)
-        at = _INDEX.size + entries
-        offsets = dict(_ENTRY.iter_unpack(content[_INDEX.size : at]))
-        index_length, name = _NAMED.unpack_from(content, at)
-        at += _NAMED.size
-        compression = content[at : at + name].decode()
-        compressed, size = _SIZES.unpack_from(content, at + name)
-    except (struct.error, UnicodeDecodeError) as error:
-        msg = f"damaged record: {error}"
-        raise ChunkError(msg) from error
-    return records.ChunkIndex(
-        length, offset, compression, compressed, end, index_length, offsets, start, size
-    )
-
-
-def write_chunk_index(index: records.ChunkIndex) -> bytes:
-    """Encode a chunk index as a record, including its head."""
-    entries = b"".join(_ENTRY.pack(*item) for item in index.message_index_offsets.items())
-    name = index.compression.encode()
-    times = (index.message_start_time, index.message_end_time)
-    place = (index.chunk_start_offset, index.chunk_length)
-    content = (
-        _INDEX.pack(*times, *place, len(entries)) + entries,
-        _NAMED.pack(index.message_index_length, len(name)) + name,
-        _SIZES.pack(index.compressed_size, index.uncompressed_size),
-    )
-    return _HEAD.pack(Opcode.CHUNK_INDEX, sum(map(len, content))) + b"".join(content)
 
 
 def read_chunk(content: bytes, *, end: int | None = None, checked: bool = False) -> memoryview:

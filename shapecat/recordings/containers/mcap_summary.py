@@ -16,7 +16,6 @@ from shapecat.recordings.containers.mcap_records import (
     TruncatedError,
     parse,
     read_chunk,
-    read_chunk_index,
     read_content,
     split_chunk,
     walk,
@@ -118,7 +117,7 @@ def _collect(file: BinaryIO, start: int, end: int) -> Summary:
                 channel = parse(records.Channel.read, content)
                 summary.channels[channel.id] = channel
             case Opcode.CHUNK_INDEX:
-                summary.chunks.append(read_chunk_index(content))
+                summary.chunks.append(parse(records.ChunkIndex.read, content))
             case Opcode.ATTACHMENT_INDEX:
                 summary.attachments.append(parse(records.AttachmentIndex.read, content))
             case Opcode.METADATA_INDEX:
