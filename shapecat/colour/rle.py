@@ -2,9 +2,8 @@
 
 import numpy as np
 
-from shapecat.arrays import I4, U4, Bool
+from shapecat.arrays import U4
 from shapecat.colour.masks import EMPTY_MASK, Mask
-from shapecat.jit import kernel
 
 __all__ = ["rle_counts", "rle_mask", "rle_text"]
 
@@ -21,11 +20,11 @@ def rle_counts(mask: Mask, height: int, width: int) -> U4:
     array([3, 2, 1, 1, 5], dtype=uint32)
     """
     left, top, w, h = mask.box
-    if w * h == 0:
-        return np.array([height * width], np.uint32)
-    runs = np.zeros(2 * (h // 2 + 2) * w + 2, np.uint32)
-    count = _encode(np.ascontiguousarray(mask.pixels), left, top, height, width, runs)
-    return runs[:count]
+    columns = np.zeros(w * height + 2, bool)  # with a pixel outside at each end
+    columns[1:-1].reshape(w, height)[:, top : top + h] = mask.pixels.T
+    changes = np.flatnonzero(columns[1:] != columns[:-1]) + left * height
+    ends = np.union1d(changes, height * width)
+    return np.diff(ends, prepend=0).astype(np.uint32)
 
 
 def rle_mask(counts: U4, height: int, width: int) -> Mask:
@@ -46,7 +45,8 @@ def rle_mask(counts: U4, height: int, width: int) -> Mask:
         return EMPTY_MASK
     left, right = int(starts[0] // height), int((stops[-1] - 1) // height) + 1
     columns = np.zeros((right - left) * height, bool)
-    _decode(starts - left * height, stops - left * height, columns)
+    for start, stop in zip(starts - left * height, stops - left * height, strict=True):
+        columns[start:stop] = True
     pixels = columns.reshape(right - left, height).T
     rows = np.flatnonzero(pixels.any(axis=1))
     top, bottom = int(rows[0]), int(rows[-1]) + 1
@@ -76,34 +76,3 @@ def rle_text(counts: U4) -> str:
             more = remainder != (-1 if part & 16 else 0)
             letters.append(chr(part + (32 if more else 0) + 48))
     return "".join(letters)
-
-
-@kernel
-def _encode(pixels: Bool, left: int, top: int, height: int, width: int, runs: U4) -> int:
-    """Write the run lengths of a mask to ``runs`` and return their number."""
-    count, length, inside = 0, left * height, False
-    for u in range(pixels.shape[1]):
-        if inside and top > 0:
-            runs[count], count, inside, length = length, count + 1, False, 0
-        length += top
-        for v in range(pixels.shape[0]):
-            if pixels[v, u] != inside:
-                runs[count], count, inside = length, count + 1, not inside
-                length = 0
-            length += 1
-        below = height - top - pixels.shape[0]
-        if inside and below > 0:
-            runs[count], count, inside, length = length, count + 1, False, 0
-        length += below
-    trailing = (width - left - pixels.shape[1]) * height
-    if inside and trailing > 0:
-        runs[count], count, length = length, count + 1, 0
-    runs[count] = length + trailing
-    return count + 1
-
-
-@kernel
-def _decode(starts: I4, stops: I4, columns: Bool) -> None:
-    for k in range(starts.size):
-        for i in range(starts[k], stops[k]):
-            columns[i] = True
