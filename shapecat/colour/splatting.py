@@ -5,7 +5,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from shapecat.arrays import F4, I4, U4, Bool
+from shapecat.arrays import F4, I4, U4
 from shapecat.cameras.colour import LensCamera
 from shapecat.colour.projection import Lens, kernel_lens, project_in_place
 from shapecat.jit import kernel
@@ -20,7 +20,7 @@ _HIDDEN = 0.02
 _SPARSE = 4
 """Outside objects, only every fourth row and column of the depth image is used."""
 _BESIDE_PX = 30
-"""Margin around the objects, in depth pixels, within which the other pixels are used."""
+"""Margin around the objects in the colour image, in depth pixels."""
 
 
 class SplattedLabels(NamedTuple):
@@ -60,18 +60,16 @@ def splat_depth(
 
     Notes
     -----
-    Time grows with the pixels of the objects and the pixels that they cover.
+    Time grows with the pixels of the objects, the pixels that they cover, and a sixteenth of the
+    depth image.
     """
     target = lens.pinhole
     scale = max(target.fx / camera.fx, target.fy / camera.fy)
     pixels = np.concatenate([[], *objects], dtype=np.uint32, casting="unsafe")
     labels = np.repeat(np.arange(1, len(objects) + 1, dtype=np.int32), list(map(len, objects)))
     rays, size = _rays(camera, colour_from_depth), (target.width, target.height)
-    parallax = max(camera.fx, camera.fy) * float(np.linalg.norm(colour_from_depth.translation))
     boxes = np.zeros((len(objects) + 1, 4), np.int64)
-    left, top, splat = _splat(
-        depth, pixels, labels, rays, parallax, kernel_lens(lens), scale, size, boxes
-    )
+    left, top, splat = _splat(depth, pixels, labels, rays, kernel_lens(lens), scale, size, boxes)
     return SplattedLabels(left, top, splat, boxes)
 
 
@@ -94,7 +92,6 @@ def _splat(
     pixels: U4,
     labels: I4,
     rays: tuple[F4, F4, F4],
-    parallax: float,
     lens: Lens,
     scale: float,
     size: tuple[int, int],
@@ -102,11 +99,10 @@ def _splat(
 ) -> tuple[int, int, I4]:
     """Return left, top and labels of the `SplattedLabels`, and write their boxes to ``boxes``.
 
-    ``pixels`` and ``labels`` (n,) are flat depth pixels and their objects; ``parallax`` is in
-    pixels per 1/m; ``scale`` is the colour pixels per depth pixel at equal distance; ``size`` is
-    width and height of the colour image.
+    ``pixels`` and ``labels`` (n,) are flat depth pixels and their objects; ``scale`` is the colour
+    pixels per depth pixel at equal distance; ``size`` is width and height of the colour image.
     """
-    beside = _list_beside(depth, pixels, parallax)
+    beside = _list_beside(depth, pixels)
     projections = _project_pixels(depth, pixels, rays, lens)
     around = _project_pixels(depth, beside, rays, lens)
     squares = _cover(projections, labels, np.float32(scale / 2), size, boxes)
@@ -126,24 +122,20 @@ def _splat(
 
 
 @kernel(inner=True)
-def _list_beside(depth: F4, pixels: U4, parallax: float) -> U4:
-    """Return the sparse pixels outside objects that may hide an object or lie beside one.
-
-    A near and a far point in the same pixel of one camera are separated in the other by the
-    parallax: focal length times baseline times the difference of the inverse depths.
-    """
+def _list_beside(depth: F4, pixels: U4) -> U4:
+    """Return the sparse pixels outside objects, which may hide an object or lie beside one."""
     rows, columns = (depth.shape[0] - 1) // _SPARSE + 1, (depth.shape[1] - 1) // _SPARSE + 1
-    on_object = np.zeros((rows, columns), np.bool_)
-    top, bottom, left, right, min_depth, max_depth = _extent(depth, pixels, on_object)
-    pixels_beside, count = np.zeros(on_object.size, np.uint32), 0
-    if not min_depth < np.inf or bottom < top:
-        return pixels_beside[:0]
-    margin = int(parallax * max(0.0, 1 / min_depth - 1 / max_depth)) + _BESIDE_PX
-    first, last = max(0, left - margin) // _SPARSE, (right + margin) // _SPARSE
-    for j in range(max(0, top - margin) // _SPARSE, min((bottom + margin) // _SPARSE + 1, rows)):
-        for i in range(first, min(last + 1, columns)):
-            if depth[j * _SPARSE, i * _SPARSE] > 0 and not on_object[j, i]:
-                pixels_beside[count] = (j * depth.shape[1] + i) * _SPARSE
+    outside = np.ones((rows, columns), np.bool_)
+    v, width = 0, depth.shape[1]
+    for pixel in pixels:
+        v, u = _row_and_column(pixel, v, width)
+        if (v | u) % _SPARSE == 0:  # a power of 2, so that this tests both
+            outside[v // _SPARSE, u // _SPARSE] = False
+    pixels_beside, count = np.zeros(outside.size, np.uint32), 0
+    for j in range(rows):
+        for i in range(columns):
+            if outside[j, i] and depth[j * _SPARSE, i * _SPARSE] > 0:
+                pixels_beside[count] = (j * width + i) * _SPARSE
                 count += 1
     return pixels_beside[:count]
 
@@ -156,33 +148,6 @@ def _row_and_column(pixel: int, row: int, width: int) -> tuple[int, int]:
         row = pixel // width
         column = pixel - row * width
     return row, column
-
-
-@kernel(inner=True)
-def _extent(depth: F4, pixels: U4, on_object: Bool) -> tuple[int, int, int, int, float, float]:
-    """Return the extent of some pixels in the image and in depth.
-
-    The result is first and last row, first and last column, the smallest depth of all sparse pixels
-    of the image, and the largest depth of the given pixels. ``on_object`` is set to True at those
-    that are sparse pixels.
-    """
-    top, bottom, left, right = depth.shape[0], -1, depth.shape[1], -1
-    min_depth, max_depth = np.float32(np.inf), np.float32(0)
-    v, width = 0, depth.shape[1]
-    for pixel in pixels:
-        v, u = _row_and_column(pixel, v, width)
-        z = depth[v, u]
-        if z > 0:
-            max_depth = max(max_depth, z)
-            top, bottom, left, right = min(top, v), max(bottom, v), min(left, u), max(right, u)
-            if (v | u) % _SPARSE == 0:  # a power of 2, so that this tests both
-                on_object[v // _SPARSE, u // _SPARSE] = True
-    for j in range(on_object.shape[0]):
-        for i in range(on_object.shape[1]):
-            z = depth[j * _SPARSE, i * _SPARSE]
-            if z > 0:
-                min_depth = min(min_depth, z)
-    return top, bottom, left, right, float(min_depth), float(max_depth)
 
 
 @kernel(inner=True)
