@@ -26,7 +26,9 @@ def png(values: Any) -> bytes:
     packed = zlib.compress(data)
     half = len(packed) // 2
     chunks = [(b"IHDR", head), (b"IDAT", packed[:half]), (b"IDAT", packed[half:]), (b"IEND", b"")]
-    body = b"".join(struct.pack(">I", len(d)) + n + d + bytes(4) for n, d in chunks)
+    body = b"".join(
+        struct.pack(">I", len(d)) + n + d + struct.pack(">I", zlib.crc32(n + d)) for n, d in chunks
+    )
     return b"\x89PNG\r\n\x1a\n" + body
 
 

@@ -849,8 +849,8 @@ def test_image_is_returned_as_soon_as_its_calibration_arrives(tmp_path: Path) ->
     ("body", "kind", "reason"),
     [
         (b"", "32FC1", "compressed depth in 32FC1 without its parameters"),
-        (struct.pack(">II", 0, 7), "16UC1", "compressed depth of 0 x 7 pixels"),
-        (struct.pack(">II", 3, 6), "16UC1", "compressed depth is truncated"),
+        (struct.pack(">II", 0, 7), "16UC1", "image of 0 x 7 pixels"),
+        (struct.pack(">II", 3, 6), "16UC1", "compressed depth is damaged"),
     ],
 )
 def test_compressed_depth_that_cannot_be_right_is_refused(

@@ -1,14 +1,18 @@
 """Compressed depth images: 16-bit PNG, or what compressed_depth_image_transport writes."""
 
+import io
 import struct
-import zlib
 from typing import Any
 
 import numpy as np
 
-from shapecat.arrays import F4, U1, U2
+from shapecat.arrays import F4, U2
 from shapecat.jit import kernel
-from shapecat.recordings.decoding.colour_image import MOST_PIXELS, compressed_kind
+from shapecat.recordings.decoding.colour_image import (
+    MOST_PIXELS,
+    compressed_kind,
+    compressed_size,
+)
 from shapecat.recordings.decoding.depth_image import clean_depth
 from shapecat.recordings.messages import MessageError
 
@@ -60,70 +64,19 @@ def depth_of_compressed(message: Any) -> F4:
 
 
 def _read_png(data: bytes) -> U2:
-    """Read a 16-bit grey PNG (h, w) without interlacing, as the transport writes it."""
-    offset, packed, shape = 8, b"", (0, 0)  # after the first bytes, which mark a PNG file
-    while offset + 8 <= len(data):
-        length, name = struct.unpack_from(">I4s", data, offset)
-        content = data[offset + 8 : offset + 8 + length]
-        if name == b"IHDR" and len(content) == 13:
-            width, height, *kind = struct.unpack(">IIBBBBB", content)
-            if kind[0] != 16 or kind[1] != 0 or kind[4] != 0:
-                msg = "compressed depth is not a 16-bit grey PNG"
-                raise MessageError(msg)
-            shape = (height, width)
-        elif name == b"IDAT":
-            packed += content
-        offset += 12 + length
-    height, width = shape
-    need = height * (1 + 2 * width)
-    if not 0 < height * width <= MOST_PIXELS:
-        msg = f"compressed depth of {width} x {height} pixels"
+    """Read a 16-bit grey PNG (h, w)."""
+    from PIL import Image  # noqa: PLC0415  # loaded where depth is in PNG
+
+    compressed_size(data)  # raises if the image is truncated or very large
+    if not is_grey_png16(data):
+        msg = "compressed depth is not a 16-bit grey PNG"
         raise MessageError(msg)
     try:
-        plain = zlib.decompressobj().decompress(packed, need)
-    except zlib.error as error:
-        msg = f"compressed depth is damaged: {error}"
+        with Image.open(io.BytesIO(data), formats=["png"]) as file:
+            return np.asarray(file, np.uint16)
+    except (OSError, SyntaxError, ValueError, struct.error) as error:
+        msg = "compressed depth is damaged"
         raise MessageError(msg) from error
-    if len(plain) != need:
-        msg = "compressed depth is truncated"
-        raise MessageError(msg)
-    rows = np.frombuffer(plain, np.uint8).reshape(height, 1 + 2 * width)
-    return np.asarray(_unfilter(rows).view(">u2").astype(np.uint16))
-
-
-@kernel
-def _unfilter(rows: U1) -> U1:
-    """Undo the row filters of a 16-bit grey PNG (ISO/IEC 15948, 9.2).
-
-    Parameters
-    ----------
-    rows : (h, 1 + 2 w) bytes; each row begins with its filter type.
-
-    Returns
-    -------
-    (h, 2 w) bytes.
-    """
-    height, width = rows.shape[0], rows.shape[1] - 1
-    out = np.zeros((height, width), np.uint8)
-    for y in range(height):
-        method = rows[y, 0]
-        for x in range(width):
-            left = int(out[y, x - 2]) if x >= 2 else 0
-            up = int(out[y - 1, x]) if y > 0 else 0
-            corner = int(out[y - 1, x - 2]) if y > 0 and x >= 2 else 0
-            guess = 0
-            if method == 1:
-                guess = left
-            elif method == 2:
-                guess = up
-            elif method == 3:
-                guess = (left + up) // 2
-            elif method == 4:
-                p = left + up - corner
-                dl, du, dc = abs(p - left), abs(p - up), abs(p - corner)
-                guess = left if dl <= du and dl <= dc else (up if du <= dc else corner)
-            out[y, x] = (rows[y, x + 1] + guess) & 255
-    return out
 
 
 def _read_rvl(data: bytes) -> U2:
