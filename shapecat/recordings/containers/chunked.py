@@ -67,6 +67,7 @@ class ChunkedRecording(Recording):
         super().__init__(path)
         self._chunks: list[Chunk] = []
         self._counts: Counter[int] = Counter()
+        self.indexed = False  # while the index is read
         self._file = path.open("rb")
         try:
             self._size = self._file.seek(0, 2)
@@ -93,6 +94,10 @@ class ChunkedRecording(Recording):
         """Read channels, counts, and chunks with messages; return False without a usable index."""
 
     @abstractmethod
+    def _record_at(self, position: int) -> Any:
+        """Return the record at a byte offset, None if there is no whole one."""
+
+    @abstractmethod
     def _records(self) -> Iterator[Any]:
         """Yield the records in file order; a truncated last one is cut to its readable part."""
 
@@ -106,9 +111,27 @@ class ChunkedRecording(Recording):
     ) -> Iterator[RawMessage]:
         """Yield at least the selected messages of these channels in an indexed chunk."""
 
+    def _forget_channels(self) -> None:
+        self._channels = {}
+
+    def _agrees(self) -> bool:
+        """Return whether the index describes the channels as the chunks do."""
+        indexed, warnings = self._channels, list(self.warnings)
+        self._forget_channels()
+        unseen = set(indexed)
+        for chunk in sorted(self._chunks, key=lambda chunk: chunk.position):
+            if not unseen.isdisjoint(chunk.channel_ids):
+                unseen.difference_update(chunk.channel_ids)
+                for _ in self._expand(self._record_at(chunk.position)):
+                    pass  # this stores the channels
+        found, self._channels = self._channels, indexed
+        self.warnings = warnings  # damage is reported when the chunk is read
+        return all(indexed.get(number) == channel for number, channel in found.items())
+
     def _scan(self) -> Any:
         """Read the whole file to find its channels, counts and times; return the last record."""
-        self._channels.clear()
+        self._forget_channels()
+        self._counts.clear()
         record = None
         for record in self._records():
             for message in self._expand(record):

@@ -5,6 +5,7 @@ skipped, and a warning reports either.
 """
 
 from collections.abc import Iterator
+from contextlib import suppress
 from pathlib import Path
 from typing import ClassVar
 
@@ -46,7 +47,7 @@ class McapRecording(ChunkedRecording):
     Attributes
     ----------
     indexed : the file is finished, and its index is complete.
-    summary : schemas, channels and indexes.
+    summary : schemas, channels and indexes, of a file that is ``indexed``.
     profile : ``ros2``, ``ros1`` or empty.
     """
 
@@ -60,6 +61,8 @@ class McapRecording(ChunkedRecording):
         RecordingError : the file is not MCAP.
         OSError : the file cannot be read.
         """
+        self.summary = Summary()
+        self._schemas: dict[int, records.Schema] = {}
         self._checked: set[int] = set()  # offsets of chunks with a verified checksum
         super().__init__(path)
 
@@ -75,9 +78,8 @@ class McapRecording(ChunkedRecording):
         self.profile = self._read_profile()
         summary = read_summary(self._file, self._size, self.warn)
         if summary is None or summary.statistics is None:
-            self.summary = Summary()
             return False
-        self.summary = summary
+        self.summary, self._schemas = summary, summary.schemas
         self._counts.update(summary.statistics.channel_message_counts)
         self._channels = {
             number: self._channel(channel) for number, channel in summary.channels.items()
@@ -93,7 +95,16 @@ class McapRecording(ChunkedRecording):
             for c in summary.chunks
             if c.message_end_time or c.message_index_offsets  # else it has no messages
         ]
-        return True
+        return summary.checked or self._agrees()
+
+    def _forget_channels(self) -> None:
+        super()._forget_channels()
+        self._schemas = {}
+
+    def _record_at(self, position: int) -> Record | None:
+        with suppress(TruncatedError):
+            return next(walk(self._file, position, self._size), None)
+        return None
 
     def _read_profile(self) -> str:
         self._file.seek(0)
@@ -132,8 +143,10 @@ class McapRecording(ChunkedRecording):
             if error.record is not None and error.record.opcode == Opcode.CHUNK:
                 yield error.record
 
-    def _expand(self, record: Record) -> Iterator[RawMessage]:
+    def _expand(self, record: Record | None) -> Iterator[RawMessage]:
         """Yield the messages of a top-level record; store its schemas and channels."""
+        if record is None:
+            return
         if record.opcode == Opcode.CHUNK:
             yield from self._split(record)
         elif record.opcode in _DEFINING or record.opcode not in _KNOWN:
@@ -176,7 +189,7 @@ class McapRecording(ChunkedRecording):
             return
         elif opcode == Opcode.SCHEMA:
             schema = parse(records.Schema.read, content)
-            self.summary.schemas.setdefault(schema.id, schema)
+            self._schemas.setdefault(schema.id, schema)
         elif opcode == Opcode.CHANNEL:
             channel = parse(records.Channel.read, content)
             self._channels.setdefault(channel.id, self._channel(channel))
@@ -204,17 +217,14 @@ class McapRecording(ChunkedRecording):
         yield from (unread(message) for message in indexed if message.place >= end)
 
     def _split_at(self, position: int, end: int | None) -> Iterator[RawMessage]:
-        try:
-            record = next(walk(self._file, position, self._size))
-        except (TruncatedError, StopIteration):
-            record = None
+        record = self._record_at(position)
         if record is None or record.opcode != Opcode.CHUNK:
             self.warn(f"no chunk at byte {position}, where the index has one")
             return
         yield from self._split(record, end)
 
     def _channel(self, channel: records.Channel) -> Channel:
-        schema = self.summary.schemas.get(channel.schema_id)
+        schema = self._schemas.get(channel.schema_id)
         name, encoding, text = (schema.name, schema.encoding, schema.data) if schema else _NONE
         ros = channel.message_encoding in {"cdr", "ros1"}
         return Channel(

@@ -2,7 +2,6 @@
 
 import zlib
 from collections.abc import Callable
-from contextlib import suppress
 from dataclasses import dataclass, field
 from typing import BinaryIO
 
@@ -11,13 +10,10 @@ from mcap import records
 from shapecat.errors import RecordingError
 from shapecat.recordings.containers.mcap_records import (
     MAGIC,
-    ChunkError,
     Opcode,
     TruncatedError,
     parse,
-    read_chunk,
     read_content,
-    split_chunk,
     walk,
 )
 
@@ -28,7 +24,7 @@ _FOOTER = 9 + 20
 
 @dataclass
 class Summary:
-    """The summary of a file, read or made by a full scan; ``data_end`` is a byte offset."""
+    """The summary of a file; ``data_end`` is a byte offset, ``checked`` by its checksum."""
 
     schemas: dict[int, records.Schema] = field(default_factory=dict)
     channels: dict[int, records.Channel] = field(default_factory=dict)
@@ -37,6 +33,7 @@ class Summary:
     metadata: list[records.MetadataIndex] = field(default_factory=list)
     statistics: records.Statistics | None = None
     data_end: int = 0
+    checked: bool = False
 
 
 def read_summary(file: BinaryIO, size: int, warn: Callable[[str], None]) -> Summary | None:
@@ -64,35 +61,11 @@ def read_summary(file: BinaryIO, size: int, warn: Callable[[str], None]) -> Summ
             return None
         summary = _collect(file, start, footer_at)
         summary.data_end = _find_data_end(file, summary, start)
-        if not footer.summary_crc and not _agrees(file, size, summary):
-            return None
+        summary.checked = footer.summary_crc != 0
     except RecordingError:
         warn("the index is damaged: reading the file from beginning to end instead")
         return None
     return summary if _is_complete(summary) else None
-
-
-def _agrees(file: BinaryIO, size: int, summary: Summary) -> bool:
-    """Return whether the summary agrees with the channels in the chunks."""
-    unseen = set(summary.channels)
-    for chunk in sorted(summary.chunks, key=lambda chunk: chunk.chunk_start_offset):
-        if unseen.isdisjoint(chunk.message_index_offsets):
-            continue
-        unseen -= chunk.message_index_offsets.keys()
-        record = next(walk(file, chunk.chunk_start_offset, size))
-        with suppress(ChunkError):  # damage is reported when the chunk is read
-            for opcode, content in split_chunk(read_chunk(read_content(file, record))):
-                if opcode == Opcode.SCHEMA:
-                    schema = parse(records.Schema.read, content)
-                    equal = summary.schemas.get(schema.id) == schema
-                elif opcode == Opcode.CHANNEL:
-                    channel = parse(records.Channel.read, content)
-                    equal = summary.channels.get(channel.id) == channel
-                else:
-                    equal = True
-                if not equal:
-                    return False
-    return True
 
 
 def _checksum(file: BinaryIO, size: int, start: int) -> int:

@@ -44,7 +44,7 @@ class BagRecording(ChunkedRecording):
     def _read_chunk(
         self, chunk: Chunk, _channel_ids: set[int], _selection: Selection
     ) -> Iterator[RawMessage]:
-        return self._expand(next(walk(self._file, chunk.position, self._size)))
+        return self._expand(self._record_at(chunk.position))
 
     def _read_header(self) -> dict[str, bytes]:
         """Return the fields of the bag header; empty if it is damaged."""
@@ -77,38 +77,25 @@ class BagRecording(ChunkedRecording):
                     self._connect(record.fields, self._data(record))
                 elif record.op == CHUNK_INFO:
                     chunks.append(self._chunk_info(record))
-            for chunk in chunks:
-                if next(walk(self._file, chunk.position, self._size)).op != CHUNK:
-                    return False
-        except (BagError, StopIteration, struct.error):
+        except (BagError, struct.error):
+            return False
+        records = [self._record_at(chunk.position) for chunk in chunks]
+        if any(record is None or record.op != CHUNK for record in records):
             return False
         if (len(self._channels), len(chunks)) != (connections, number):
             return False
         filled = [chunk for chunk in chunks if chunk.entry]
         if not all(chunk.entry.keys() <= self._channels.keys() for chunk in filled):
             return False
-        if not self._agrees(chunks):
-            return False
         self._chunks = filled
         for chunk in filled:
             self._counts.update(chunk.entry)
-        return True
+        return self._agrees()
 
-    def _agrees(self, chunks: list[Chunk]) -> bool:
-        """Return whether the index agrees with the connections in the chunks."""
-        unseen = set(self._channels)
-        for chunk in sorted(chunks, key=lambda chunk: chunk.position):
-            if unseen.isdisjoint(chunk.entry):
-                continue
-            unseen -= chunk.entry.keys()
-            record = next(walk(self._file, chunk.position, self._size))
-            with suppress(BagError):  # damage is reported when the chunk is read
-                for fields, data in split(expand(record, self._data(record))[0]):
-                    if fields.get("op") == bytes([CONNECTION]):
-                        number = u4(fields, "conn")
-                        if self._channels.get(number) != _channel(fields, data):
-                            return False
-        return True
+    def _record_at(self, position: int) -> Record | None:
+        with suppress(BagError):
+            return next(walk(self._file, position, self._size), None)
+        return None
 
     def _chunk_info(self, record: Record) -> Chunk:
         """Return a chunk whose entry is its number of messages on each connection."""
@@ -133,12 +120,12 @@ class BagRecording(ChunkedRecording):
             if error.record is not None:
                 yield error.record
 
-    def _expand(self, record: Record) -> Iterator[RawMessage]:
+    def _expand(self, record: Record | None) -> Iterator[RawMessage]:
         """Yield the messages of a record; store new connections.
 
         A damaged chunk is read up to the damage.
         """
-        if record.op not in {CHUNK, CONNECTION}:
+        if record is None or record.op not in {CHUNK, CONNECTION}:
             return
         problem, data = "", self._data(record)
         try:
