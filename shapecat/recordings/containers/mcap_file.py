@@ -4,6 +4,7 @@ Damage does not stop reading: a truncated file is read as far as possible, a dam
 skipped, and a warning reports either.
 """
 
+import sys
 from collections.abc import Iterator
 from contextlib import suppress
 from pathlib import Path
@@ -27,7 +28,6 @@ from shapecat.recordings.containers.mcap_records import (
     parse,
     read_chunk,
     read_content,
-    read_cut_chunk,
     split_chunk,
     split_message,
     walk,
@@ -166,10 +166,8 @@ class McapRecording(ChunkedRecording):
 
     def _plain(self, record: Record, end: int | None) -> memoryview:
         """Return the decompressed records of a chunk; verify its checksum the first time."""
-        if not record.whole:
-            return read_cut_chunk(self.content(record))
-        if end is not None:
-            return read_chunk(self.content(record), end=end)
+        if end is not None or not record.whole:
+            return read_chunk(self.content(record), end=sys.maxsize if end is None else end)
         plain = read_chunk(self.content(record), checked=record.offset in self._checked)
         self._checked.add(record.offset)
         return plain

@@ -28,7 +28,6 @@ __all__ = [
     "parse",
     "read_chunk",
     "read_content",
-    "read_cut_chunk",
     "split_chunk",
     "split_message",
     "walk",
@@ -117,39 +116,14 @@ def read_chunk(content: bytes, *, end: int | None = None, checked: bool = False)
 
     Parameters
     ----------
-    end : number of decompressed bytes to return, without verifying the checksum; None for all.
+    end : number of decompressed bytes to return, or as many as there are, without verifying that
+        the chunk is whole; None for a whole chunk.
     checked : whether the checksum has been verified before.
 
     Raises
     ------
-    ChunkError : the chunk is damaged, or its compression is unknown.
+    ChunkError : the chunk is damaged, its sizes are not plausible, or its compression is unknown.
     """
-    compression, size, crc, length, data = _open_chunk(content)
-    if len(data) != length:
-        msg = f"chunk claims {length} bytes and has {len(data)}"
-        raise ChunkError(msg)
-    if end is not None:
-        return _decompress(_DECOMPRESS_PART[compression], data, min(end, size))[:end]
-    plain = _decompress(_DECOMPRESS[compression], data, size)
-    if len(plain) != size or (crc and not checked and zlib.crc32(plain) != crc):
-        msg = "damaged chunk: its checksum does not match"
-        raise ChunkError(msg)
-    return plain
-
-
-def read_cut_chunk(content: bytes) -> memoryview:
-    """Return the part of a truncated chunk that can be decompressed.
-
-    Raises
-    ------
-    ChunkError : the chunk is damaged, its header is incomplete, or its compression is unknown.
-    """
-    compression, size, _, _, data = _open_chunk(content)
-    return _decompress(_DECOMPRESS_PART[compression], data, size)
-
-
-def _open_chunk(content: bytes) -> tuple[str, int, int, int, memoryview]:
-    """Return compression, decompressed size, checksum, claimed length and data of a chunk."""
     try:
         _, _, size, crc, name_length = _CHUNK.unpack_from(content)
         name_end = _CHUNK.size + name_length
@@ -165,7 +139,16 @@ def _open_chunk(content: bytes) -> tuple[str, int, int, int, memoryview]:
     if compression not in _DECOMPRESS:
         msg = f"chunk compression {compression!r} is not supported"
         raise ChunkError(msg)
-    return compression, size, crc, length, data
+    if end is not None:
+        return _decompress(_DECOMPRESS_PART[compression], data, min(end, size))[:end]
+    if len(data) != length:
+        msg = f"chunk claims {length} bytes and has {len(data)}"
+        raise ChunkError(msg)
+    plain = _decompress(_DECOMPRESS[compression], data, size)
+    if len(plain) != size or (crc and not checked and zlib.crc32(plain) != crc):
+        msg = "damaged chunk: its checksum does not match"
+        raise ChunkError(msg)
+    return plain
 
 
 def _decompress(
