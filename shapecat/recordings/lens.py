@@ -1,7 +1,8 @@
 """Depth images from a lens with distortion."""
 
-from collections.abc import Sequence
-from typing import Any
+from collections.abc import Callable, Sequence
+from functools import lru_cache
+from typing import Any, NamedTuple
 
 import numpy as np
 
@@ -9,59 +10,53 @@ from shapecat.arrays import F4, F8
 from shapecat.cameras.lenses import LENS_MODELS, undistorted_rays
 from shapecat.recordings.decoding.pointcloud2 import unorganized
 from shapecat.recordings.pinhole import PinholeFit, distortion_of, fit_pinhole
-from shapecat.recordings.recording import Recording
 from shapecat.types import Camera
 
-__all__ = ["Lens", "distortion_problem"]
+__all__ = ["distortion_problem", "lens_content"]
 
 
-class Lens:
-    """The lens of unrectified depth images; recomputed when the calibration changes."""
+def lens_content(
+    info: Any, camera: Camera, depth: F4, warn: Callable[[str], None]
+) -> dict[str, Any]:
+    """Return the content of a `Frame`: depth and pinhole camera, or points if no camera fits.
 
-    def __init__(self, recording: Recording, topic: str) -> None:
-        """Start without a calibration."""
-        self._recording = recording
-        self._topic = topic
-        self._key: tuple[Camera, str, tuple[float, ...]] | None = None
-        self._rays: F8 | None = None
-        self._fit: PinholeFit | None = None
+    Parameters
+    ----------
+    info : a decoded CameraInfo, with its ``camera`` as `camera_of_info` returns it.
+    depth : (h, w) metres.
+    warn : receives warnings for the user.
+    """
+    model = str(info.distortion_model)
+    coefficients = distortion_of(info)
+    lens = _lens_of(camera, model, coefficients)
+    if lens is None:
+        problem = distortion_problem(model, coefficients)
+        problem = problem or f"lens distortion {model!r} that cannot be inverted"
+        warn(f"{problem} is ignored")
+        return {"depth": depth, "camera": camera}
+    if lens.blind > 0:
+        warn(f"{lens.blind:.0%} of its pixels, which the lens model leaves out, are ignored")
+    if lens.fit is not None:
+        return {"depth": depth, "camera": lens.fit.camera}
+    warn("not rectified: converted to points along the undistorted rays")
+    return unorganized(_points_along(lens.rays, depth))
 
-    def content(self, info: Any, camera: Camera, depth: F4) -> dict[str, Any]:
-        """Return the content of a `Frame`: depth and pinhole camera, or points if no camera fits.
 
-        Parameters
-        ----------
-        info : a decoded CameraInfo, with its ``camera`` as `camera_of_info` returns it.
-        depth : (h, w) metres.
-        """
-        model = str(info.distortion_model)
-        coefficients = distortion_of(info)
-        self._calibrate((camera, model, coefficients), depth)
-        if self._rays is None:
-            problem = distortion_problem(model, coefficients)
-            problem = problem or f"lens distortion {model!r} that cannot be inverted"
-            self._warn(f"{problem} is ignored")
-            return {"depth": depth, "camera": camera}
-        if self._fit is not None:
-            return {"depth": depth, "camera": self._fit.camera}
-        self._warn("not rectified: converted to points along the undistorted rays")
-        return unorganized(_points_along(self._rays, depth))
+class _Lens(NamedTuple):
+    """The rays (h, w, 2) of pixels, the share of pixels without one, and the camera that fits."""
 
-    def _calibrate(self, key: tuple[Camera, str, tuple[float, ...]], depth: F4) -> None:
-        if key == self._key:
-            return
-        self._key, self._fit = key, None
-        self._rays = undistorted_rays(*key)
-        if self._rays is not None:
-            blind = float(np.isnan(self._rays[..., 0]).mean())
-            if blind > 0:
-                self._warn(
-                    f"{blind:.0%} of its pixels, which the lens model leaves out, are ignored"
-                )
-            self._fit = fit_pinhole(_points_along(self._rays, np.ones(depth.shape, np.float32)))
+    rays: F8
+    blind: float
+    fit: PinholeFit | None
 
-    def _warn(self, text: str) -> None:
-        self._recording.warn(f"{self._topic}: {text}")
+
+@lru_cache(maxsize=4)  # the calibration of a camera hardly ever changes
+def _lens_of(camera: Camera, model: str, coefficients: tuple[float, ...]) -> _Lens | None:
+    rays = undistorted_rays(camera, model, coefficients)
+    if rays is None:
+        return None
+    fit = fit_pinhole(_points_along(rays, np.ones(rays.shape[:2], np.float32)))
+    return _Lens(rays, float(np.isnan(rays[..., 0]).mean()), fit)
 
 
 def distortion_problem(model: str, coefficients: Sequence[float]) -> str:

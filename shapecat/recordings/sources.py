@@ -15,7 +15,7 @@ from shapecat.recordings.decoding.compressed_depth import depth_of_compressed
 from shapecat.recordings.decoding.depth_image import depth_of_image
 from shapecat.recordings.decoding.foxglove import ros_counterpart
 from shapecat.recordings.decoding.pointcloud2 import cloud_points, organized, unorganized
-from shapecat.recordings.lens import Lens
+from shapecat.recordings.lens import lens_content
 from shapecat.recordings.messages import MALFORMED, Message, MessageError, reason_of
 from shapecat.recordings.pinhole import (
     PinholeFit,
@@ -136,7 +136,6 @@ class DepthSource(Source):
         self.info_topic = stream.info_topic or ""
         self.rectified = is_rectified(stream.topic)
         self.units = _depth_units(recording, stream.topic)
-        self.lens = Lens(recording, stream.topic)
         self._waiting: tuple[Message, int, Any] | None = None
         self._info: Any = None
         self._info_stamp: int | None = None
@@ -186,6 +185,9 @@ class DepthSource(Source):
         if frame is not None:
             yield frame
 
+    def _warn(self, text: str) -> None:
+        self.recording.warn(f"{self.stream.topic}: {text}")
+
     @cached_property
     def _first_info(self) -> Any:
         """The first calibration in the recording, for images before it; None if there is none."""
@@ -215,7 +217,7 @@ class DepthSource(Source):
                 "intrinsics of another resolution?"
             )
         if distorted:
-            return self.lens.content(self._info, camera, depth)
+            return lens_content(self._info, camera, depth, self._warn)
         return {"depth": depth, "camera": camera}
 
 
