@@ -4,7 +4,7 @@ from functools import lru_cache
 
 import numpy as np
 
-from shapecat.arrays import F4, F8, I4, U1, Bool
+from shapecat.arrays import F4, F8, U1
 from shapecat.cameras.colour import LensCamera
 from shapecat.cameras.lenses import FISHEYE_MODELS, LENS_MODELS, distort
 from shapecat.jit import kernel
@@ -81,33 +81,27 @@ def rectified(pixels: U1, lens: LensCamera) -> U1:
     """
     if not lens.model:
         return pixels
-    left, top, a, b, inside = _sources(lens)
-    upper = pixels[top, left] * (1 - a) + pixels[top, left + 1] * a
-    lower = pixels[top + 1, left] * (1 - a) + pixels[top + 1, left + 1] * a
-    mixed = upper * (1 - b) + lower * b
-    return np.asarray(np.rint(mixed * inside), np.uint8)
+    from scipy import ndimage  # noqa: PLC0415  # only exports need it
+
+    source = _sources(lens)
+    channels = [
+        ndimage.map_coordinates(pixels[..., k], source, np.float64, order=1) for k in range(3)
+    ]
+    return np.asarray(np.rint(np.stack(channels, axis=-1)), np.uint8)
 
 
 @lru_cache(maxsize=2)  # a recording has one lens
-def _sources(lens: LensCamera) -> tuple[I4, I4, F8, F8, Bool]:
-    """Return where the lens shows each ray of the pinhole camera.
+def _sources(lens: LensCamera) -> F8:
+    """Return row and column (2, h, w) where the lens shows each ray of the pinhole camera.
 
-    These are column and row (h, w) of the pixel above left, the shares (h, w, 1) of its neighbours
-    on the right and below, and whether it is within the image (h, w, 1).
+    They are -1 where it shows none, and may be outside the image.
     """
     camera = lens.pinhole
     v, u = np.mgrid[: camera.height, : camera.width]
     rays = np.stack([(u - camera.cx) / camera.fx, (v - camera.cy) / camera.fy], axis=-1)
     x, y = distort(rays, lens.model, lens.coefficients).transpose(2, 0, 1)
-    x, y = x * camera.fx + camera.cx, y * camera.fy + camera.cy
-    inside = (x >= 0) & (x <= camera.width - 1) & (y >= 0) & (y <= camera.height - 1)
-    inside &= (rays**2).sum(axis=-1) < _monotonic_up_to(lens) ** 2
-    x, y = np.where(inside, x, 0), np.where(inside, y, 0)
-    left, top = (
-        np.minimum(x.astype(int), camera.width - 2),
-        np.minimum(y.astype(int), camera.height - 2),
-    )
-    return left, top, (x - left)[..., None], (y - top)[..., None], inside[..., None]
+    seen = (rays**2).sum(axis=-1) < _monotonic_up_to(lens) ** 2
+    return np.where(seen, (y * camera.fy + camera.cy, x * camera.fx + camera.cx), -1)
 
 
 @lru_cache(maxsize=16)
