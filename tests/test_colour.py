@@ -13,7 +13,7 @@ from shapecat.arrays import freeze
 from shapecat.cameras.colour import ColourImage, ColourView, LensCamera
 from shapecat.cameras.lenses import distort, undistorted_rays
 from shapecat.colour.image_masks import box_of, find_masks, mask_of
-from shapecat.colour.masks import EMPTY_MASK, Mask, dense_masks, label_boxes, labelled_masks, union
+from shapecat.colour.masks import EMPTY_MASK, Mask, dense_masks, union
 from shapecat.colour.projection import project, rectified
 from shapecat.colour.snapping import snapped
 from shapecat.colour.splatting import splat_depth
@@ -332,13 +332,20 @@ def test_masks_keep_only_holes_of_the_object() -> None:
     assert not solid[55:65, 65:85].any()
 
 
+def masks_of_labels(labels: Any) -> tuple[Mask, ...]:
+    """Return the masks of objects 1 and 2 in a registered image; depth is missing at -1."""
+    depth, camera = np.where(labels < 0, 0, 1).astype(np.float32), Camera(40, 20, 50, 50, 20, 10)
+    frame = Frame("", 0, 0, 0, "", depth=depth, camera=camera)
+    return dense_masks(frame, [np.flatnonzero(labels == number) for number in (1, 2)])
+
+
 def test_masks_of_two_objects_do_not_overlap() -> None:
     """Closing gaps must not join neighbouring objects, nor objects across the table."""
     labels = np.zeros((20, 40), np.int32)
     labels[5:15, 5:15], labels[5:15, 17:27] = 1, 2
     labels[9, 10] = labels[10, 20] = 0  # a pixel each
     labels[:, 30:] = -1
-    one, two = labelled_masks(labels, label_boxes(labels, 2))
+    one, two = masks_of_labels(labels)
     assert (one.box, two.box) == ((5, 5, 10, 10), (17, 5, 10, 10))
     assert one.area == two.area == 88  # of squares, whose corners are rounded
 
@@ -346,7 +353,7 @@ def test_masks_of_two_objects_do_not_overlap() -> None:
 def test_masks_of_a_merged_track_are_united() -> None:
     labels = np.zeros((20, 40), np.int32)
     labels[2:6, 3:9], labels[10:13, 20:31] = 1, 2
-    one, two = labelled_masks(labels, label_boxes(labels, 2))
+    one, two = masks_of_labels(labels)
     both = union((one, EMPTY_MASK, two))
     np.testing.assert_array_equal(both.full(20, 40), one.full(20, 40) | two.full(20, 40))
     assert both.box == (4, 2, 25, 11)

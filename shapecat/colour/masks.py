@@ -10,7 +10,7 @@ from shapecat.colour.splatting import splat_depth
 from shapecat.jit import kernel
 from shapecat.types import Frame, Pose
 
-__all__ = ["EMPTY_MASK", "Mask", "dense_masks", "label_boxes", "labelled_masks", "union"]
+__all__ = ["EMPTY_MASK", "Mask", "dense_masks", "union"]
 
 _NARROW_PX = 4.0
 """Widest gap in an object that is filled, in pixels of the depth image."""
@@ -87,17 +87,22 @@ def dense_masks(
         raise ValueError(msg)
     if colour_from_depth is None or lens is None:
         labels: I4 = np.where(frame.depth > 0, 0, -1).astype(np.int32)
+        boxes: I4 = np.zeros((len(objects) + 1, 4), np.int64)
         for number, indices in enumerate(objects, start=1):
-            labels.reshape(-1)[indices] = number
-        return labelled_masks(labels, label_boxes(labels, len(objects)))
+            if len(indices):
+                labels.reshape(-1)[indices] = number
+                rows, columns = np.divmod(indices, labels.shape[1])
+                boxes[number, :2] = columns.min(), rows.min()
+                boxes[number, 2:] = columns.max() + 1, rows.max() + 1
+        return _labelled_masks(labels, boxes)
     scale = lens.pinhole.fx / frame.camera.fx
     left, top, labels, boxes = splat_depth(
         frame.depth, frame.camera, objects, lens, colour_from_depth
     )
-    return labelled_masks(labels, boxes, scale, corner=(left, top))
+    return _labelled_masks(labels, boxes, scale, corner=(left, top))
 
 
-def labelled_masks(
+def _labelled_masks(
     labels: I4, boxes: I4, scale: float = 1.0, *, corner: tuple[int, int] = (0, 0)
 ) -> tuple[Mask, ...]:
     """Return the dense mask of each label, from 1 to n.
@@ -106,7 +111,8 @@ def labelled_masks(
     ----------
     labels : (h, w) labels of the objects, from 1; 0 for other surfaces, -1 where nothing is known.
         Its gaps are filled in place.
-    boxes : (n + 1, 4) the bounding box of each label, from `label_boxes`.
+    boxes : (n + 1, 4) the bounding box of each label: left, top, right + 1, bottom + 1; zeros in
+        row 0, and for labels that do not occur.
     scale : pixels of the colour image per pixel of the depth image.
     corner : column and row, in the image, of the first pixel of ``labels``.
     """
@@ -148,37 +154,6 @@ def union(masks: Sequence[Mask]) -> Mask:
         x, y, width, height = mask.left - left, mask.top - top, *mask.box[2:]
         pixels[y : y + height, x : x + width] |= mask.pixels
     return Mask(left, top, pixels)
-
-
-@kernel
-def label_boxes(labels: I4, count: int) -> I4:
-    """Return the bounding box of each label: (count + 1, 4) left, top, right + 1, bottom + 1.
-
-    Row 0, and the rows of labels that do not occur, are zeros.
-
-    Parameters
-    ----------
-    labels : (h, w) labels, from 1 to ``count``; others are ignored.
-    """
-    boxes = np.zeros((count + 1, 4), np.int64)
-    boxes[:, 0], boxes[:, 1] = labels.shape[1], labels.shape[0]
-    for v in range(labels.shape[0]):
-        row, last = labels[v], 0
-        for u in range(row.size):
-            label = row[u]
-            if label != last:  # where a run of pixels begins or ends
-                if last > 0:
-                    boxes[last, 2] = max(boxes[last, 2], u)
-                if label > 0:
-                    box = boxes[label]
-                    box[0], box[1], box[3] = min(box[0], u), min(box[1], v), max(box[3], v + 1)
-                last = label
-        if last > 0:
-            boxes[last, 2] = row.size
-    for label in range(boxes.shape[0]):
-        if boxes[label, 2] == 0:
-            boxes[label] = 0
-    return boxes
 
 
 @kernel(inner=True)
