@@ -501,7 +501,6 @@ def test_packed_colours_must_reach_last_point() -> None:
         at = 2 * row + 10 + 5
         expected = [at + 1, at + 2, at + 3] if big else [at + 2, at + 1, at]
         found = cloud_colours(cloud(EPOCH, points, data=data[:need], **layout))
-        assert found is not None
         assert found[2, 1].tolist() == expected
         with pytest.raises(MessageError, match="do not fit"):
             cloud_colours(cloud(EPOCH, points, data=data[: need - 1], **layout))

@@ -14,7 +14,7 @@ from shapecat.cameras.lenses import distort
 from shapecat.errors import RecordingError
 from shapecat.geometry import IDENTITY, compose
 from shapecat.recordings.colour_streams import ColourStream
-from shapecat.recordings.decoding.colour_image import IMAGES
+from shapecat.recordings.decoding.colour_image import colour_image
 from shapecat.recordings.frames import frames
 from shapecat.recordings.lens import distortion_problem
 from shapecat.recordings.messages import MALFORMED, Message, MessageError, reason_of
@@ -237,7 +237,7 @@ class _Partner:
         return span // (count - 1) if count > 1 and span > 0 else _USUAL_PERIOD_NS
 
     def _view(self, frame: Frame, stored: _BufferedImage) -> ColourView:
-        image = IMAGES[self.stream.kind](self.stream.topic, *stored[:3])
+        image = colour_image(self.stream.kind, self.stream.topic, *stored[:3])
         shape = (image.height, image.width)
         if self.stream.kind == "cloud":
             return ColourView(image, _lens(frame.camera))

@@ -12,10 +12,10 @@ from shapecat.recordings.messages import MessageError
 
 __all__ = [
     "COLOUR_ENCODINGS",
-    "IMAGES",
     "MOST_PIXELS",
     "bytes_per_row",
     "cloud_colours",
+    "colour_image",
     "compressed_kind",
     "compressed_size",
     "encoded",
@@ -232,20 +232,22 @@ def _from_bayer(mosaic: U1, red: int) -> U1:
     return result
 
 
-def cloud_colours(message: Any) -> U1 | None:
+def cloud_colours(message: Any) -> U1:
     """Read the packed ``rgb`` or ``rgba`` field of a decoded PointCloud2.
 
     Returns
     -------
-    (h, w, 3) uint8 red, green, blue; None if the cloud has no such field.
+    (h, w, 3) uint8 red, green, blue.
 
     Raises
     ------
-    MessageError : the cloud is empty, the field does not fit into a point, or data is missing.
+    MessageError : the cloud is empty, the field is missing or does not fit into a point, or data is
+        missing.
     """
     field = next((f for f in message.fields if f.name in {"rgb", "rgba"}), None)
     if field is None:
-        return None
+        msg = "cloud without colours"
+        raise MessageError(msg)
     height, width, step = int(message.height), int(message.width), int(message.point_step)
     row, offset = int(message.row_step) or width * step, int(field.offset)
     data = np.frombuffer(message.data, np.uint8)
@@ -258,38 +260,36 @@ def cloud_colours(message: Any) -> U1 | None:
     return np.ascontiguousarray(packed[..., order])
 
 
-def _bytes(data: Any) -> memoryview:
-    return memoryview(data).cast("B") if len(data) else memoryview(b"")
+def colour_image(
+    kind: str, topic: str, stamp_ns: int, log_time_ns: int, decoded: Any
+) -> ColourImage:
+    """Return the colour image in a decoded message, whose pixels are decoded only in a cloud.
 
+    Parameters
+    ----------
+    kind : ``raw``, ``compressed`` or ``cloud``.
+    stamp_ns, log_time_ns : those of the message, nanoseconds.
 
-def _raw(topic: str, stamp: int, log_time_ns: int, decoded: Any) -> ColourImage:
-    width, height, step = int(decoded.width), int(decoded.height), int(decoded.step)
-    image = ColourImage(
-        topic, stamp, log_time_ns, str(decoded.header.frame_id), str(decoded.encoding),
-        width, height, step, _bytes(decoded.data),
-    )  # fmt: skip
-    bytes_per_row(image)  # raises if the image is truncated
+    Raises
+    ------
+    MessageError : the image is truncated, too large, or not in colour.
+    """
+    content: tuple[str, int, int, int, bytes | memoryview]
+    if kind == "cloud":
+        colours = cloud_colours(decoded)
+        height, width, _ = colours.shape
+        content = ("rgb8", width, height, 3 * width, colours.tobytes())
+    elif kind == "compressed":
+        data = _bytes(decoded.data)
+        content = (*compressed_size(data), 0, data)
+    else:
+        sizes = int(decoded.width), int(decoded.height), int(decoded.step)
+        content = (str(decoded.encoding), *sizes, _bytes(decoded.data))
+    image = ColourImage(topic, stamp_ns, log_time_ns, str(decoded.header.frame_id), *content)
+    if kind == "raw":
+        bytes_per_row(image)  # raises if the image is truncated
     return image
 
 
-def _compressed(topic: str, stamp: int, log_time_ns: int, decoded: Any) -> ColourImage:
-    data = _bytes(decoded.data)
-    kind, width, height = compressed_size(data)
-    frame_id = str(decoded.header.frame_id)
-    return ColourImage(topic, stamp, log_time_ns, frame_id, kind, width, height, 0, data)
-
-
-def _cloud(topic: str, stamp: int, log_time_ns: int, decoded: Any) -> ColourImage:
-    colours = cloud_colours(decoded)
-    if colours is None:
-        msg = "cloud without colours"
-        raise MessageError(msg)
-    height, width, _ = colours.shape
-    frame_id = str(decoded.header.frame_id)
-    return ColourImage(
-        topic, stamp, log_time_ns, frame_id, "rgb8", width, height, 3 * width, colours.tobytes()
-    )
-
-
-IMAGES = {"raw": _raw, "compressed": _compressed, "cloud": _cloud}
-"""Functions that make a `ColourImage` from topic, stamp, log time (ns) and decoded message."""
+def _bytes(data: Any) -> memoryview:
+    return memoryview(data).cast("B") if len(data) else memoryview(b"")
