@@ -27,13 +27,11 @@ from shapecat.recordings.transforms.topics import TF_TYPES, is_latched, transfor
 from shapecat.types import Pose
 
 __all__ = [
-    "DisconnectedError",
     "ExtrapolationError",
     "TransformBuffer",
     "TransformError",
     "TransformLoopError",
     "TransformReader",
-    "UnknownFrameError",
     "fixed_frame",
     "read_transforms",
 ]
@@ -44,14 +42,6 @@ _FIXED = ("map", "odom", "world")
 
 class TransformError(ShapecatError):
     """A transform cannot be determined from the recording."""
-
-
-class UnknownFrameError(TransformError):
-    """A frame does not occur in any transform."""
-
-
-class DisconnectedError(TransformError):
-    """No chain of transforms connects two frames."""
 
 
 class ExtrapolationError(TransformError):
@@ -135,7 +125,7 @@ class TransformBuffer:
 
         Raises
         ------
-        UnknownFrameError, TransformLoopError
+        TransformError : no transform names the frame, or it is in a loop.
         """
         return self._ancestors(self._require_frame(frame_id))[-1]
 
@@ -155,7 +145,8 @@ class TransformBuffer:
 
         Raises
         ------
-        UnknownFrameError, DisconnectedError, ExtrapolationError, TransformLoopError
+        TransformError : no transform names a frame, or no chain of them connects the two; it is an
+            ExtrapolationError or a TransformLoopError if this is the reason.
         """
         target, source = self._require_frame(target), self._require_frame(source)
         up, down = self._ancestors(source, stamp_ns), self._ancestors(target, stamp_ns)
@@ -163,7 +154,7 @@ class TransformBuffer:
         if shared is None:
             roots = f"{down[-1]} and {up[-1]}"
             msg = f"no transform between {target} and {source}: their roots are {roots}"
-            raise DisconnectedError(msg)
+            raise TransformError(msg)
         shared_from_source = self._chain(up[: up.index(shared)], stamp_ns)
         shared_from_target = self._chain(down[: down.index(shared)], stamp_ns)
         return compose(inverse(shared_from_target), shared_from_source)
@@ -173,7 +164,7 @@ class TransformBuffer:
         if name not in self._frames:
             examples = listed(self.frames) or "none"
             msg = f"no transform names the frame {name!r}; known frames: {examples}"
-            raise UnknownFrameError(msg)
+            raise TransformError(msg)
         return name
 
     def _ancestors(self, frame_id: str, stamp_ns: int | None = None) -> list[str]:
