@@ -5,6 +5,7 @@ from pathlib import Path
 
 from shapecat.errors import RecordingError, explained
 from shapecat.recordings.containers.mcap_file import McapRecording
+from shapecat.recordings.containers.ros1_bag import BagRecording
 from shapecat.recordings.recording import Recording
 
 __all__ = ["open_recording"]
@@ -28,29 +29,19 @@ def open_recording(path: Path) -> Recording:
             raise RecordingError(msg) from error
 
 
-def _bag(path: Path) -> Recording:
-    from shapecat.recordings.containers.ros1_bag import BagRecording  # noqa: PLC0415  # loads rosbags
+def _ros2(path: Path) -> Recording:
+    # These load rosbags.
+    from shapecat.recordings.containers.ros2_database import DatabaseRecording  # noqa: PLC0415
+    from shapecat.recordings.containers.ros2_folder import FolderRecording  # noqa: PLC0415
 
-    return BagRecording(path)
-
-
-def _database(path: Path) -> Recording:
-    from shapecat.recordings.containers.ros2_database import DatabaseRecording  # noqa: PLC0415  # the same
-
-    return DatabaseRecording(path)
-
-
-def _folder(path: Path) -> Recording:
-    from shapecat.recordings.containers.ros2_folder import FolderRecording  # noqa: PLC0415  # the same
-
-    return FolderRecording(path)
+    return FolderRecording(path) if path.is_dir() else DatabaseRecording(path)
 
 
 _READERS: dict[str, Callable[[Path], Recording]] = {
     "\x89MCAP": McapRecording,
-    "#ROSBAG": _bag,
-    "SQLite format 3": _database,
-    "folder": _folder,
+    "#ROSBAG": BagRecording,
+    "SQLite format 3": _ros2,
+    "folder": _ros2,
 }
 """Readers by the first bytes of a file; ``folder`` for folders."""
 

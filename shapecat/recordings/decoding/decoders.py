@@ -128,14 +128,10 @@ def _builtin(encoding: str) -> Typestore:
     return get_typestore(Stores.ROS1_NOETIC if encoding == "ros1" else Stores.ROS2_HUMBLE)
 
 
-def _cdr(channel: Channel) -> Decoder:
+def _ros(channel: Channel) -> Decoder:
     store = typestore_of(channel)
-    return lambda data: store.deserialize_cdr(data, channel.type)
-
-
-def _ros1(channel: Channel) -> Decoder:
-    store = typestore_of(channel)
-    return lambda data: store.deserialize_ros1(data, channel.type)
+    read = store.deserialize_ros1 if channel.encoding == "ros1" else store.deserialize_cdr
+    return lambda data: read(data, channel.type)
 
 
 def _json(_channel: Channel) -> Decoder:
@@ -149,8 +145,8 @@ def _protobuf(channel: Channel) -> Decoder:
 
 
 _DECODERS: dict[str, Callable[[Channel], Decoder]] = {
-    "cdr": _cdr,
-    "ros1": _ros1,
+    "cdr": _ros,
+    "ros1": _ros,
     "json": _json,
     "protobuf": _protobuf,
 }
