@@ -38,7 +38,6 @@ class Extrinsics:
         """Store the streams; transforms are read on first use."""
         self._recording = recording
         self._depth, self._colour = depth, colour
-        self._static: dict[tuple[str, str], Pose] = {}
 
     @cached_property
     def _still(self) -> TransformBuffer:
@@ -62,19 +61,13 @@ class Extrinsics:
         recorder = self._depth.topic.startswith("/device_")  # whose frame ids are numbers
         if same_frame(depth_frame, colour_frame) and not recorder:
             return IDENTITY if depth_frame else self._realsense  # two cameras may have no name
-        frames = depth_frame, colour_frame
-        if frames in self._static:
-            return self._static[frames]
-        if not recorder:
-            pose = self._lookup(self._still, depth_frame, colour_frame, stamp_ns)
-            if pose is not None:
-                self._static[frames] = pose
-                return pose
+        if recorder:
+            return self._realsense
+        pose = self._lookup(self._still, depth_frame, colour_frame, stamp_ns)
+        if pose is None:
             moving = self._moving.around(log_time_ns, stamp_ns)
             pose = self._lookup(moving, depth_frame, colour_frame, stamp_ns)
-            if pose is not None:
-                return pose
-        return self._realsense
+        return self._realsense if pose is None else pose
 
     def _lookup(
         self, buffer: TransformBuffer, depth_frame: str, colour_frame: str, stamp_ns: int
