@@ -92,13 +92,10 @@ class PointsSource(Source):
 
     def read(self, message: Message, skipped: Counter[str]) -> Iterator[Frame]:
         """Yield the frame of a cloud, or none if it is unreadable."""
-        frame = None
         with _counting(skipped, self.stream.topic):
             cloud = self.recording.decode(message)
             points = _placed(cloud_points(cloud), getattr(cloud, "pose", None))
-            frame = self.frame(message, self.index - 1, cloud.header, self._content(points))
-        if frame is not None:
-            yield frame
+            yield self.frame(message, self.index - 1, cloud.header, self._content(points))
 
     def _content(self, points: F4) -> dict[str, Any]:
         if points.size == 0:
@@ -179,11 +176,8 @@ class DepthSource(Source):
         if self._waiting is None:
             return
         (message, index, image), self._waiting = self._waiting, None
-        frame = None
         with _counting(skipped, self.stream.topic):
-            frame = self.frame(message, index, image.header, self._content(image))
-        if frame is not None:
-            yield frame
+            yield self.frame(message, index, image.header, self._content(image))
 
     def _warn(self, text: str) -> None:
         self.recording.warn(f"{self.stream.topic}: {text}")
