@@ -155,15 +155,16 @@ def _encoding_or_error(recording: Recording, topic: Topic) -> str:
     """Return the encoding of a topic's images, or why none of its messages can be decoded."""
     if ros_counterpart(topic.type) not in _PROBES:
         return ""
-    first = first_message(recording, topic.name, topic.type) if topic.count != 0 else None
-    if first is None:
-        for message in islice(recording.messages([topic.name]), 1):
-            try:
-                recording.decode(message)
-            except MessageError as error:
-                return f"{_UNREADABLE}: {reason_of(error, topic.name)}"
-        return _UNREADABLE
-    return str(getattr(first, "encoding", getattr(first, "format", ""))).strip()
+    reason = ""
+    of_type = (m for m in recording.messages([topic.name]) if m.type == topic.type)
+    for message in islice(of_type, _PEEK):
+        try:
+            first = recording.decode(message)
+        except MessageError as error:
+            reason = reason or f": {reason_of(error, topic.name)}"
+        else:
+            return str(getattr(first, "encoding", getattr(first, "format", ""))).strip()
+    return _UNREADABLE + reason
 
 
 def _warnings(recording: Recording) -> str:
