@@ -1,6 +1,6 @@
 """Find the colour streams of a recording, and the one that belongs to a depth stream."""
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from contextlib import suppress
 from dataclasses import dataclass, replace
 from functools import partial
@@ -60,9 +60,9 @@ class ColourStream:
 def colour_streams(recording: Recording) -> tuple[ColourStream, ...]:
     """Find the colour images and coloured clouds of a recording, sorted by topic."""
     streams = (
-        _probe(topic, kind, recording)
+        _probe(topic, recording)
         for topic in recording.topics
-        if topic.count != 0 and (kind := _KINDS.get(ros_counterpart(topic.type)))
+        if topic.count != 0 and ros_counterpart(topic.type) in _PROBES
     )
     return tuple(stream for stream in streams if stream is not None)
 
@@ -184,14 +184,11 @@ def _shared(one: ColourStream, stream: Stream) -> int:
     return equal.index(False) if False in equal else len(equal)
 
 
-def _probe(
-    topic: Topic,
-    kind: Literal["raw", "compressed", "cloud"],
-    recording: Recording,
-) -> ColourStream | None:
+def _probe(topic: Topic, recording: Recording) -> ColourStream | None:
+    kind, encoding_of = _PROBES[ros_counterpart(topic.type)]
     with suppress(AttributeError, TypeError):  # a definition without the fields of its type
         for first in first_messages(recording, topic.name, topic.type):  # some may be blank
-            encoding = _ENCODINGS[kind](first)
+            encoding = encoding_of(first)
             if not encoding:
                 continue
             if encoding == "mono8" and any(w in f"/{topic.name.lower()}" for w in _OTHER_WORDS):
@@ -223,13 +220,9 @@ def _cloud_encoding(first: Any) -> str:
     return "rgb8" if any(field.name in {"rgb", "rgba"} for field in first.fields) else ""
 
 
-_KINDS: dict[str, Literal["raw", "compressed", "cloud"]] = {
-    IMAGE: "raw",
-    COMPRESSED: "compressed",
-    CLOUD: "cloud",
+_PROBES: dict[str, tuple[Literal["raw", "compressed", "cloud"], Callable[[Any], str]]] = {
+    IMAGE: ("raw", _raw_encoding),
+    COMPRESSED: ("compressed", _compressed_encoding),
+    CLOUD: ("cloud", _cloud_encoding),
 }
-_ENCODINGS = {
-    "raw": _raw_encoding,
-    "compressed": _compressed_encoding,
-    "cloud": _cloud_encoding,
-}
+"""The kind of a stream, and what returns the encoding of a message, empty if it has no colours."""
