@@ -123,7 +123,7 @@ class BagRecording(ChunkedRecording):
     def _expand(self, record: Record | None) -> Iterator[RawMessage]:
         """Yield the messages of a record; store new connections.
 
-        A damaged chunk is read up to the damage.
+        A truncated chunk is read as far as possible.
         """
         if record is None or record.op not in {CHUNK, CONNECTION}:
             return

@@ -38,7 +38,6 @@ _LENGTH = struct.Struct("<I")
 _LONG = struct.Struct("<Q")
 _TIME = struct.Struct("<II")
 _LONGEST_HEADER = 1 << 20
-_STEP = 1 << 16
 _FREELY = 256 << 20
 """A chunk may always have this decompressed size, bytes."""
 _RATIO = 1000
@@ -180,7 +179,7 @@ def split(chunk: memoryview) -> Iterator[tuple[dict[str, bytes], memoryview]]:
 
 
 def expand(record: Record, data: bytes) -> tuple[memoryview, str]:
-    """Decompress as much of a chunk as possible.
+    """Decompress a chunk: a truncated one as far as possible, a damaged one not at all.
 
     Returns
     -------
@@ -191,18 +190,14 @@ def expand(record: Record, data: bytes) -> tuple[memoryview, str]:
         return memoryview(data), ""
     if method not in _DECOMPRESSORS:
         return memoryview(b""), f"compression {method!r} is not supported"
-    worker, plain = _DECOMPRESSORS[method](), bytearray()
-    limit = max(_FREELY, _RATIO * len(data))
+    worker, limit = _DECOMPRESSORS[method](), max(_FREELY, _RATIO * len(data))
     try:
-        for at in range(0, len(data), _STEP):
-            if worker.eof:
-                break
-            plain += worker.decompress(data[at : at + _STEP], max_length=limit - len(plain))
-            if len(plain) >= limit:
-                return memoryview(b""), f"{len(data)} bytes hold more than {limit}"
+        plain = memoryview(worker.decompress(data, max_length=limit))
     except (OSError, RuntimeError, ValueError, EOFError) as error:
-        return memoryview(bytes(plain)), f"damaged: {error}"
-    return memoryview(bytes(plain)), "" if worker.eof else "truncated"
+        return memoryview(b""), f"damaged: {error}"
+    if len(plain) >= limit:
+        return memoryview(b""), f"{len(data)} bytes hold more than {limit}"
+    return plain, "" if worker.eof else "truncated"
 
 
 _DECOMPRESSORS: dict[str, Callable[[], Any]] = {
