@@ -17,7 +17,6 @@ from shapecat.recordings.containers.chunked import Chunk, ChunkedRecording, RawM
 from shapecat.recordings.containers.mcap_index import (
     IndexedMessage,
     read_message_index,
-    unread,
 )
 from shapecat.recordings.containers.mcap_records import (
     MAGIC,
@@ -211,15 +210,14 @@ class McapRecording(ChunkedRecording):
         if end > _PART * size:
             end = size
         if last >= 0 or not indexed:
-            yield from self._split_at(chunk.position, end if end < size else None)
-        yield from (unread(message) for message in indexed if message.place >= end)
-
-    def _split_at(self, position: int, end: int | None) -> Iterator[RawMessage]:
-        record = self._record_at(position)
-        if record is None or record.opcode != Opcode.CHUNK:
-            self.warn(f"no chunk at byte {position}, where the index has one")
-            return
-        yield from self._split(record, end)
+            record = self._record_at(chunk.position)
+            if record is None or record.opcode != Opcode.CHUNK:
+                self.warn(f"no chunk at byte {chunk.position}, where the index has one")
+            else:
+                yield from self._split(record, end if end < size else None)
+        for number, time, place in indexed:
+            if place >= end:
+                yield RawMessage(number, 0, time, time, memoryview(b""))
 
     def _channel(self, channel: records.Channel) -> Channel:
         schema = self._schemas.get(channel.schema_id)

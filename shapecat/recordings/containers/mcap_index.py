@@ -6,10 +6,9 @@ from typing import BinaryIO, NamedTuple
 
 from mcap import records
 
-from shapecat.recordings.containers.chunked import RawMessage
 from shapecat.recordings.containers.mcap_records import TruncatedError, read_content, walk
 
-__all__ = ["IndexedMessage", "read_message_index", "unread"]
+__all__ = ["IndexedMessage", "read_message_index"]
 
 _HEAD = struct.Struct("<HI")
 _ENTRY = struct.Struct("<QQ")
@@ -38,8 +37,3 @@ def read_message_index(file: BinaryIO, chunk: records.ChunkIndex) -> list[Indexe
         return []
     complete = entries_of.keys() == chunk.message_index_offsets.keys()
     return list(chain(*entries_of.values())) if complete else []
-
-
-def unread(message: IndexedMessage) -> RawMessage:
-    """Return an indexed message with empty data."""
-    return RawMessage(message.channel_id, 0, message.log_time, message.log_time, memoryview(b""))
