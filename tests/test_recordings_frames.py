@@ -849,8 +849,8 @@ def test_image_is_returned_as_soon_as_its_calibration_arrives(tmp_path: Path) ->
     ("body", "kind", "reason"),
     [
         (b"", "32FC1", "compressed depth in 32FC1 without its parameters"),
-        (struct.pack(">II", 0, 7), "16UC1", "image of 0 x 7 pixels"),
-        (struct.pack(">II", 3, 6), "16UC1", "compressed depth is damaged"),
+        (struct.pack(">II", 0, 7), "16UC1", "png image without a size, or of too many pixels"),
+        (struct.pack(">II", 3, 6), "16UC1", "png image without a size, or of too many pixels"),
     ],
 )
 def test_compressed_depth_that_cannot_be_right_is_refused(
@@ -864,6 +864,15 @@ def test_compressed_depth_that_cannot_be_right_is_refused(
 
     with pytest.raises(MessageError, match=f"^{reason}$"):
         depth_of_compressed(message)
+
+
+def test_damaged_pixels_of_compressed_depth_are_refused() -> None:
+    """The pixels after the damage would be depth at any distance."""
+    body = bytearray(png(wavy_depth()))
+    body[body.index(b"IDAT") + 100] ^= 16
+
+    with pytest.raises(MessageError, match="compressed depth is damaged"):
+        depth_of_compressed(compressed(0, bytes(body)))
 
 
 def test_image_that_turns_into_colour_is_not_read_as_depth(tmp_path: Path) -> None:

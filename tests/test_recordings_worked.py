@@ -435,23 +435,6 @@ def test_camera_still_fits_points_within_its_fit_error() -> None:
 # ---- pixels
 
 
-def test_jpeg_size_is_found_behind_padding_and_segments() -> None:
-    """Restart markers have no length, 0xFF is padding, and any frame header has the size."""
-    begin, app = b"\xff\xd8", b"\xff\xe1\x00\x06abcd"
-    tables = b"\xff\xc4\x00\x05xyz"  # not a frame, though its marker is among theirs
-    for marker in (0xC0, 0xC2, 0xCF):
-        frame = bytes([0xFF, marker]) + struct.pack(">HBHHB", 8, 8, 123, 457, 3)
-        body = begin + app + b"\xff\x01\xff\xd0\xff\xff" + tables + frame + b"\xff\xd9"
-        assert compressed_size(body) == ("jpeg", 457, 123)
-    with pytest.raises(MessageError, match="without a size"):
-        compressed_size(begin + app + tables + b"\xff\xd9")
-    with pytest.raises(MessageError, match="without a size"):
-        compressed_size(begin + app + b"\x00" + frame + b"\xff\xd9")
-    huge = bytes([0xFF, 0xC0]) + struct.pack(">HBHHB", 8, 8, 65535, 65535, 3)
-    with pytest.raises(MessageError, match="65535 x 65535"):
-        compressed_size(begin + huge + b"\xff\xd9")
-
-
 def test_compressed_image_may_have_short_padding_at_end() -> None:
     """An end marker far before the end is one of a preview."""
     for body in (jpeg(gradient()), png(gradient())):

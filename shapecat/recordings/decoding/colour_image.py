@@ -53,9 +53,6 @@ _PIXEL_BYTES = {
 COLOUR_ENCODINGS = frozenset(_PIXEL_BYTES)
 """Encodings of sensor_msgs/Image that can be decoded to RGB; mono8 becomes grey."""
 
-_SOF = {*range(0xC0, 0xD0)} - {0xC4, 0xC8, 0xCC}
-"""Start-of-frame markers of JPEG: the image size follows them."""
-
 _PNG = b"\x89PNG\r\n\x1a\n"
 
 
@@ -72,17 +69,24 @@ def compressed_size(data: bytes | memoryview) -> tuple[str, int, int]:
     ------
     MessageError : the data is neither JPEG nor PNG, is truncated, or has too many pixels.
     """
+    from PIL import Image  # noqa: PLC0415  # loaded where there is colour
+
     kind, view = compressed_kind(data), memoryview(data)
     if not kind:
         msg = f"compressed image is neither JPEG nor PNG: begins with {bytes(view[:4])!r}"
         raise MessageError(msg)
-    width, height = _jpeg_size(view) if kind == "jpeg" else _png_size(view)
-    if not 0 < width * height <= MOST_PIXELS:
-        msg = f"image of {width} x {height} pixels"
-        raise MessageError(msg)
     end = b"\xff\xd9" if kind == "jpeg" else b"IEND"
     if end not in bytes(view[max(0, len(view) - 4096) :]):
         msg = f"{kind} image is truncated"
+        raise MessageError(msg)
+    try:
+        with Image.open(io.BytesIO(view), formats=[kind]) as file:
+            width, height = file.size
+    except (OSError, SyntaxError, ValueError, Image.DecompressionBombError) as error:
+        msg = f"{kind} image without a size, or of too many pixels"
+        raise MessageError(msg) from error
+    if not 0 < width * height <= MOST_PIXELS:
+        msg = f"image of {width} x {height} pixels"
         raise MessageError(msg)
     return kind, width, height
 
@@ -106,32 +110,6 @@ def bytes_per_row(image: ColourImage) -> int:
         msg = f"image of {width} x {height} pixels needs {need} bytes and has {size}"
         raise MessageError(msg)
     return row
-
-
-def _png_size(data: memoryview) -> tuple[int, int]:
-    if len(data) < 24:
-        msg = "png image is truncated"
-        raise MessageError(msg)
-    width, height = struct.unpack_from(">II", data, 16)
-    return int(width), int(height)
-
-
-def _jpeg_size(data: memoryview) -> tuple[int, int]:
-    """Return width and height of a JPEG file, from its start-of-frame segment."""
-    at = 2
-    while at + 9 <= len(data):
-        if data[at] != 0xFF:
-            break
-        marker = data[at + 1]
-        if marker == 0xFF or 0xD0 <= marker <= 0xD9 or marker == 1:  # padding, or without content
-            at += 1 if marker == 0xFF else 2
-            continue
-        if marker in _SOF:
-            height, width = struct.unpack_from(">HH", data, at + 5)
-            return int(width), int(height)
-        at += 2 + int.from_bytes(data[at + 2 : at + 4], "big")
-    msg = "jpeg image without a size"
-    raise MessageError(msg)
 
 
 def pixels_of(image: ColourImage, *, shrink: int = 1) -> U1:
