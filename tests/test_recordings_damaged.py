@@ -208,6 +208,19 @@ def test_bag_messages_of_an_unknown_connection_are_reported(tmp_path: Path) -> N
     assert "skipped messages of connection 7, which is not described" in warnings
 
 
+def test_message_lost_in_a_bag_chunk_is_reported(tmp_path: Path) -> None:
+    """A damaged opcode hides a message; only the count in the index tells."""
+    path = bag_of(tmp_path / "a.bag")
+    data = path.read_bytes()
+    at = data.index(b"op=\x02") + len(b"op=")
+    path.write_bytes(data[:at] + b"\x09" + data[at + 1 :])
+
+    times, warnings = read(path)
+
+    assert len(times) == 11
+    assert [text for text in warnings if "the index does not list its" in text]
+
+
 # ---- ROS 2
 
 

@@ -44,7 +44,7 @@ class BagRecording(ChunkedRecording):
     def _read_chunk(
         self, chunk: Chunk, _channel_ids: set[int], _selection: Selection
     ) -> Iterator[RawMessage]:
-        return self._expand(self._record_at(chunk.position))
+        return self._expand(self._record_at(chunk.position), sum(chunk.entry.values()))
 
     def _read_header(self) -> dict[str, bytes]:
         """Return the fields of the bag header; empty if it is damaged."""
@@ -120,10 +120,11 @@ class BagRecording(ChunkedRecording):
             if error.record is not None:
                 yield error.record
 
-    def _expand(self, record: Record | None) -> Iterator[RawMessage]:
+    def _expand(self, record: Record | None, listed: int | None = None) -> Iterator[RawMessage]:
         """Yield the messages of a record; store new connections.
 
-        A truncated chunk is read as far as possible.
+        A truncated chunk is read as far as possible. A chunk with another number of messages than
+        are ``listed`` in the index causes a warning.
         """
         if record is None or record.op not in {CHUNK, CONNECTION}:
             return
@@ -133,8 +134,13 @@ class BagRecording(ChunkedRecording):
                 yield from self._take(record.fields, memoryview(data))
                 return
             plain, problem = expand(record, data)
+            count = 0
             for fields, content in split(plain):
-                yield from self._take(fields, content)
+                for message in self._take(fields, content):
+                    count += 1
+                    yield message
+            if listed not in {None, count}:
+                problem = problem or f"the index does not list its {count} messages"
         except BagError as error:
             problem = problem or str(error)
         if problem:
