@@ -1,12 +1,12 @@
 """3D overlap of estimated and true boxes, by category, from simulated recordings to tables.
 
-    python -m benchmarks.boxes --first 1000 --count 20 [--json]
+    python -m benchmarks.boxes --first 1000 --count 20
 
 Recordings of a camera that moves past a table or a pile are processed as by `shapecat process`. In
 every frame, three boxes of each found object with at least `SEEN_PIXELS` depth pixels are compared
 with the true box: the visible box, the full box of the single view, and the full box of the track.
-The overlap is the exact IoU of upright boxes. Objects that are round about the vertical have no
-yaw; their true boxes take the yaw of the estimated box.
+Objects that are round about the vertical have no yaw; their true boxes take the orientation of the
+estimated box.
 """
 
 import json
@@ -22,11 +22,12 @@ from scipy.optimize import linear_sum_assignment
 
 from benchmarks.measure import markdown
 from benchmarks.scenes import SEEN_PIXELS, Array
-from shapecat.geometry import gravity_rotation, rotation_from_quaternion
+from shapecat.evaluation.comparison.overlap import box_iou
 from shapecat.pipeline import process
 from shapecat.runs.jobs import Job
 from shapecat.simulation import simulate
 from shapecat.simulation.scenes.kinds import SceneKind
+from shapecat.types import Box
 
 SAME = 0.5
 """IoU of masks from which a detection matches an object."""
@@ -40,14 +41,6 @@ GROUPS = ("tabletop, upright", "tabletop, lying", "pile, upright", "pile, tilted
 _HOW: dict[SceneKind, str] = {"tabletop": "lying", "pile": "tilted"}
 FRAMES, RATE_HZ = 24, 8.0
 COLUMNS = ("objects", "views", "visible", "full, single view", "full, track")
-
-
-class Upright(NamedTuple):
-    """A box in a level frame: centre (3,) and size (3,) in metres, yaw in radians."""
-
-    center: Array
-    size: Array
-    yaw: float
 
 
 class Judged(NamedTuple):
@@ -66,14 +59,10 @@ class Judged(NamedTuple):
 @click.command(help=__doc__)
 @click.option("--first", default=1000, show_default=True, help="Seed of the first scene.")
 @click.option("--count", default=20, show_default=True, help="Scenes of each kind.")
-@click.option("--json", "as_json", is_flag=True, help="Print the means as JSON.")
-def main(*, first: int, count: int, as_json: bool) -> None:
+def main(*, first: int, count: int) -> None:
     """Evaluate scenes and print a table."""
     found = [item for kind in KINDS for item in _judge_kind(kind, first, count)]
     rows = [row for group in GROUPS for row in _rows(found, group)]
-    if as_json:
-        print(json.dumps({row[0]: dict(zip(COLUMNS, row[1:], strict=True)) for row in rows}))
-        return
     print(markdown(f"3D overlap, seeds {first} to {first + count - 1}", ("", *COLUMNS), rows))
 
 
@@ -112,24 +101,16 @@ def _judge_run(folder: Path, seed: int) -> Iterator[Judged]:
         for rows in by_frame(folder / "run" / "tracks.parquet").values()
         for row in rows
     }
-    ups = {
-        row["frame"]: row["up"] for row in pq.read_table(folder / "run/frames.parquet").to_pylist()
-    }
     for frame in truth:
         number = frame["frame"]
-        level = gravity_rotation(ups[number])
         for item, row in matches(frame["objects"], detections.get(number, []), labels[number]):
             track = tracked.get((number, row["detection"]))
-            boxes = (
-                _upright(row, "", level),
-                _upright(row, "_full", level),
-                _upright(track, "_full", level) if track else None,
-            )
+            boxes = (_box(row, ""), _box(row, "_full"), _box(track, "_full") if track else None)
             yield Judged(
                 "tilted" if item["tilted"] or item["lying"] else "",
                 item["category"],
                 (seed, item["track"]),
-                np.array([_overlap(item, box, level) for box in boxes]),
+                np.array([_overlap(item, box) for box in boxes]),
             )
 
 
@@ -159,59 +140,19 @@ def matches(
             yield objects[i], rows[j]
 
 
-def _upright(row: dict[str, Any], which: str, level: Array) -> Upright:
-    heading = level @ rotation_from_quaternion(row[f"orientation{which}"])[:, 0]
-    return Upright(
-        level @ np.array(row[f"center{which}"]),
-        np.array(row[f"size{which}"]),
-        float(np.arctan2(heading[1], heading[0])),
-    )
+def _box(row: dict[str, Any], which: str) -> Box:
+    return Box(*(row[f"{name}{which}"] for name in ("center", "size", "orientation")))
 
 
-def _overlap(item: dict[str, Any], box: Upright | None, level: Array) -> float:
+def _overlap(item: dict[str, Any], box: Box | None) -> float:
     if box is None:
         return float("nan")
-    true = _upright(item["box"], "", level)
+    true = Box(**item["box"])
     square = abs(true.size[0] - true.size[1]) < ALIKE * true.size[:2].max()
     if item["category"] in ROUND and square and not (item["tilted"] or item["lying"]):
         across = float(true.size[:2].mean())
-        true = Upright(true.center, np.array([across, across, true.size[2]]), box.yaw)
-    return overlap(true, box)
-
-
-def overlap(a: Upright, b: Upright) -> float:
-    """Return the intersection over union of two upright boxes."""
-    top = min(a.center[2] + a.size[2] / 2, b.center[2] + b.size[2] / 2)
-    bottom = max(a.center[2] - a.size[2] / 2, b.center[2] - b.size[2] / 2)
-    corners = np.array([[-1, -1], [1, -1], [1, 1], [-1, 1]]) * b.size[:2] / 2
-    seen = (corners @ _turn(b.yaw).T + b.center[:2] - a.center[:2]) @ _turn(a.yaw)
-    common = _area(_clipped(seen, a.size[:2] / 2)) * max(top - bottom, 0.0)
-    return float(common / (a.size.prod() + b.size.prod() - common))
-
-
-def _turn(yaw: float) -> Array:
-    return np.array([[np.cos(yaw), -np.sin(yaw)], [np.sin(yaw), np.cos(yaw)]])
-
-
-def _clipped(polygon: Array, half: Array) -> Array:
-    """Clip a polygon (k, 2) to a centred rectangle, edge by edge (Sutherland and Hodgman 1974)."""
-    for axis, sign in ((0, 1), (0, -1), (1, 1), (1, -1)):
-        inside = half[axis] - sign * polygon[:, axis]
-        kept = []
-        for k in range(len(polygon)):
-            n = (k + 1) % len(polygon)
-            if inside[k] >= 0:
-                kept.append(polygon[k])
-            if inside[k] * inside[n] < 0:
-                share = inside[k] / (inside[k] - inside[n])
-                kept.append(polygon[k] + share * (polygon[n] - polygon[k]))
-        polygon = np.reshape(kept, (-1, 2))
-    return polygon
-
-
-def _area(polygon: Array) -> float:
-    x, y = polygon.T
-    return float(abs(x @ np.roll(y, -1) - y @ np.roll(x, -1)) / 2)
+        true = Box(true.center, np.array([across, across, true.size[2]]), box.orientation)
+    return box_iou(true, box)
 
 
 if __name__ == "__main__":

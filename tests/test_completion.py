@@ -9,11 +9,15 @@ import pytest
 from numpy.testing import assert_allclose
 from scipy.spatial.transform import Rotation
 
-from benchmarks.boxes import Upright, overlap
 from shapecat.completion import DIRECTIONS, BoxViews, FusedBoxes, complete, fuse_boxes
-from shapecat.geometry import gravity_rotation, rotation_from_quaternion
+from shapecat.evaluation.comparison.overlap import box_iou
+from shapecat.geometry import (
+    gravity_rotation,
+    quaternion_from_rotation,
+    rotation_from_quaternion,
+)
 from shapecat.runs.full_boxes import _spread
-from shapecat.types import CATEGORIES, FullBox
+from shapecat.types import CATEGORIES, Box, FullBox
 
 TILT = np.radians(37)
 UP = np.array([0, -np.cos(TILT), -np.sin(TILT)])
@@ -199,10 +203,9 @@ def test_fused_size_is_independent_of_quarter_turns() -> None:
 
     assert (fused.sizes == fused.sizes[0]).all()
     for k in range(9):
-        true = Upright(PLACE, size, yaw)
-        heading = fused.axes[k][:, 0]
-        box = Upright(fused.centers[k], fused.sizes[k], float(np.arctan2(heading[1], heading[0])))
-        assert overlap(true, box) > 0.9
+        true = Box(PLACE, size, quaternion_from_rotation(about_z(yaw)))
+        turn = quaternion_from_rotation(fused.axes[k])
+        assert box_iou(true, Box(fused.centers[k], fused.sizes[k], turn)) > 0.9
 
 
 def test_partial_views_do_not_shrink_fused_box() -> None:
@@ -335,18 +338,6 @@ def test_full_box_includes_handle_of_cup() -> None:
     assert (abs(inside) < box.size / 2).all()
     assert (LEVEL @ box.center)[0] < PLACE[0] - 0.005
     assert box.size[:2].max() < 0.12
-
-
-def test_overlap_of_rotated_boxes_is_exact() -> None:
-    """Two equal squares, one rotated by 45 degrees, have an octagon in common."""
-    a = Upright(np.zeros(3), np.array([2.0, 2.0, 2.0]), 0.2)
-    b = Upright(np.array([0, 0, 0.5]), np.array([2.0, 2.0, 2.0]), 0.2 + np.pi / 4)
-    octagon = 8 * (np.sqrt(2) - 1)
-    common = octagon * 1.5
-
-    assert overlap(a, b) == pytest.approx(common / (16 - common))
-    assert overlap(a, a) == pytest.approx(1)
-    assert overlap(a, b._replace(center=np.array([0, 3.0, 0]))) == 0
 
 
 def test_track_has_one_full_size(guessed_run: Path) -> None:
