@@ -6,7 +6,6 @@
 One frame of each simulated scene of twelve objects, by a Kinect and a RealSense or by all sensors.
 """
 
-from collections.abc import Iterator
 from pathlib import Path
 from typing import NamedTuple
 
@@ -16,7 +15,7 @@ import numpy as np
 from benchmarks.measure import markdown
 from benchmarks.scenes import SEEN_PIXELS, Array
 from shapecat.config import Settings
-from shapecat.evaluation.comparison.overlap import MATCHED_F, match_masks
+from shapecat.evaluation.comparison.overlap import MATCHED_F, Overlap, match_masks
 from shapecat.evaluation.metrics import auroc, expected_calibration_error
 from shapecat.learning import Categorizer, load_model
 from shapecat.perception import perceive
@@ -32,35 +31,18 @@ OBJECTS, UNKNOWN = 12, 1 / 6
 
 
 class Judged(NamedTuple):
-    """A visible object and the detection matched to it, None if missed.
-
-    ``shared`` is the number of their common pixels, ``overlap`` their overlap F.
-    """
+    """A found object and its detection."""
 
     placed: PlacedObject
-    shared: int
-    overlap: float
-    detection: Detection | None
-
-
-class Scores(NamedTuple):
-    """The judged objects of several scenes.
-
-    ``found`` and ``true`` are numbers of pixels, ``detections`` the number of detections.
-    """
-
-    objects: list[Judged]
-    found: int
-    true: int
-    detections: int
+    detection: Detection
 
 
 def judge(
     kind: str, sensor: str, first: int, count: int, model: Categorizer, settings: Settings
-) -> Scores:
-    """Perceive one frame of each scene, and match its detections with the true objects."""
-    objects: list[Judged] = []
-    found = true = detections = 0
+) -> tuple[list[Judged], Overlap]:
+    """Perceive one frame of each scene; return the found objects and the overlap of all."""
+    found: list[Judged] = []
+    overlap = Overlap()
     for seed in range(first, first + count):
         rng = np.random.default_rng(seed)
         names = np.where(rng.random(OBJECTS) < UNKNOWN, "unknown", rng.choice(CATEGORIES, OBJECTS))
@@ -68,44 +50,29 @@ def judge(
         frame, labels = render_frame(world, 0, rng=rng, sensor=PRESETS[sensor])
         seen = perceive(frame, up=None, categorizer=model, settings=settings).detections
         flat = labels.reshape(-1)
-        objects += _matched(world.objects, flat, seen)
-        found += sum(int(np.count_nonzero(flat[d.candidate.indices] > 0)) for d in seen)
-        shown = [t.label for t in world.objects if np.count_nonzero(flat == t.label) >= SEEN_PIXELS]
-        true += int(np.isin(flat, shown).sum())
-        detections += len(seen)
-    return Scores(objects, found, true, detections)
+        masks = [(item, np.flatnonzero(flat == item.label)) for item in world.objects]
+        masks = [(item, mask) for item, mask in masks if len(mask) >= SEEN_PIXELS]
+        lists = [d.candidate.indices[flat[d.candidate.indices] > 0] for d in seen]
+        matches = match_masks(lists, [mask for _, mask in masks])
+        overlap += matches.overlap
+        found += [
+            Judged(masks[k][0], seen[row])
+            for row, k in matches.pairs
+            if matches.f[row, k] >= MATCHED_F
+        ]
+    return found, overlap
 
 
-def _matched(
-    objects: tuple[PlacedObject, ...], labels: Array, seen: tuple[Detection, ...]
-) -> Iterator[Judged]:
-    """Match objects and detections one to one by overlap F."""
-    masks = {t.track: np.flatnonzero(labels == t.label) for t in objects}
-    objects = tuple(t for t in objects if len(masks[t.track]) >= SEEN_PIXELS)
-    lists = [d.candidate.indices[labels[d.candidate.indices] > 0] for d in seen]
-    matches = match_masks(lists, [masks[t.track] for t in objects])
-    pairs = {column: row for row, column in matches.pairs}
-    for k, item in enumerate(objects):
-        row = pairs.get(k)
-        if row is None:
-            yield Judged(item, 0, 0.0, None)
-        else:
-            shared = np.intersect1d(lists[row], masks[item.track]).size
-            yield Judged(item, shared, float(matches.f[row, k]), seen[row])
-
-
-def figures(scores: Scores, model: Categorizer) -> dict[str, float]:
+def figures(found: list[Judged], overlap: Overlap, model: Categorizer) -> dict[str, float]:
     """Return F, the fraction of objects found, and metrics of their categories."""
-    objects = scores.objects
-    well = [o for o in objects if o.overlap >= MATCHED_F and o.detection is not None]
-    known = [o for o in well if o.placed.category != "unknown" and not o.placed.indistinct]
-    strange = [o for o in well if o.placed.category == "unknown"]
+    known = [o for o in found if o.placed.category != "unknown" and not o.placed.indistinct]
+    strange = [o for o in found if o.placed.category == "unknown"]
     tilted = [o for o in known if o.placed.tilted]
     return {
-        "objects": len(objects),
-        "F": 2 * sum(o.shared for o in objects) / max(scores.found + scores.true, 1),
-        "found": len(well) / max(len(objects), 1),
-        "detections": scores.detections,
+        "objects": overlap.objects,
+        "F": overlap.f,
+        "found": overlap.share_found,
+        "detections": overlap.detections,
         "category": _right(known, model),
         "upright or lying": _right([o for o in known if not o.placed.tilted], model),
         "tilted": _right(tilted, model),
@@ -122,19 +89,18 @@ def _right(objects: list[Judged], model: Categorizer) -> float:
 
 
 def _category(judged: Judged, model: Categorizer) -> str:
-    assert judged.detection is not None
     if judged.detection.novelty > 1:
         return "unknown"
     return str(model.categories[int(np.argmax(judged.detection.posterior))])
 
 
 def _novelty(objects: list[Judged]) -> Array:
-    return np.array([o.detection.novelty for o in objects if o.detection is not None], np.float32)
+    return np.array([o.detection.novelty for o in objects], np.float32)
 
 
 def _calibration(objects: list[Judged], model: Categorizer) -> float:
     truth = np.array([model.categories.index(o.placed.category) for o in objects], np.int64)
-    posteriors = np.array([o.detection.posterior for o in objects if o.detection], np.float32)
+    posteriors = np.array([o.detection.posterior for o in objects], np.float32)
     return expected_calibration_error(truth, posteriors) if len(objects) else float("nan")
 
 
@@ -163,7 +129,8 @@ def main(
     rows = []
     for kind in kinds or SCENES:
         for sensor in PRESETS if "all" in sensors else sensors:
-            found = figures(judge(kind, sensor, first, count, categorizer, settings), categorizer)
+            judged = judge(kind, sensor, first, count, categorizer, settings)
+            found = figures(*judged, categorizer)
             cells = (f"{v:.3f}" if v % 1 else f"{v:g}" for v in found.values())
             rows.append((f"{kind}, {sensor}", *cells))
     click.echo(markdown("Physics", ("scenes", *found), rows))
