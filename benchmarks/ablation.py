@@ -7,14 +7,13 @@ The frames are simulated clutter and, if available, real tables.
 
 from collections.abc import Iterator
 from contextlib import ExitStack, contextmanager
-from pathlib import Path
 from typing import Any
 from unittest.mock import patch
 
 import click
 import numpy as np
 
-from benchmarks.measure import markdown, save
+from benchmarks.measure import markdown
 from benchmarks.open3d_clusters import cluster_above_plane
 from benchmarks.overlap import Finder, labelled_sets, objects_in, score
 from benchmarks.scenes import Array, detected
@@ -48,18 +47,16 @@ def without(*steps: str) -> Iterator[None]:
         yield
 
 
-def run(count: int, first_seed: int = 500) -> tuple[str, dict[str, Any]]:
-    """Score every set of steps on the same frames; return a Markdown table and the metrics."""
+def run(count: int, first_seed: int = 500) -> str:
+    """Score every set of steps on the same frames; return a Markdown table."""
     sets = labelled_sets(count, first_seed)
-    figures: dict[str, Any] = {}
     rows = []
     for method, finder, left_out in _methods():
         with without(*left_out):
-            scores = {name: score(frames, finder) for name, frames in sets.items()}
-        figures[method] = scores
-        rows.append((method, *(v for s in scores.values() for v in (s["F"], s["obj75"]))))
+            scores = [score(frames, finder) for frames in sets.values()]
+        rows.append((method, *(v for s in scores for v in (s["F"], s["obj75"]))))
     columns = ("steps", *(f"{name}, {what}" for name in sets for what in ("F", "obj75")))
-    return markdown("Detection, overlap with the truth", columns, rows), figures
+    return markdown("Detection, overlap with the truth", columns, rows)
 
 
 def _methods() -> Iterator[tuple[str, Finder, list[str]]]:
@@ -93,10 +90,8 @@ def _clusters(frame: Frame) -> list[Array]:
 @click.option("--first", default=500, show_default=True, help="Seed of the first scene.")
 @click.option("--count", default=30, show_default=True, help="Number of simulated scenes.")
 def main(*, first: int, count: int) -> None:
-    """Print a table and write ``build/benchmarks_ablation.json``."""
-    table, figures = run(count, first)
-    print(table)
-    save(Path("build/benchmarks_ablation.json"), figures)
+    """Print a table."""
+    print(run(count, first))
 
 
 if __name__ == "__main__":

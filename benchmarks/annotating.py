@@ -15,7 +15,7 @@ from typing import Any
 
 import click
 
-from benchmarks.measure import markdown, save
+from benchmarks.measure import markdown
 from benchmarks.whole import tabletop, write
 from shapecat.pipeline import annotate, process
 from shapecat.recordings import open_recording
@@ -39,8 +39,8 @@ def again(folder: Path, recording: Path) -> None:
         annotate(folder, opened, run)
 
 
-def measure(folder: Path, frames: int, turns: int) -> dict[str, Any]:
-    """Return the median times to annotate and to copy a recording, measured alternately."""
+def measure(folder: Path, frames: int, turns: int) -> tuple[Any, ...]:
+    """Return frames, size (MB), median times to annotate and to copy (s), and their ratio."""
     recording = write(folder / f"frames{frames}.mcap", tabletop(min(frames, 60))[0], frames)
     run = folder / f"run{frames}"
     process(Job(recording, run, rrd=False))
@@ -49,8 +49,10 @@ def measure(folder: Path, frames: int, turns: int) -> dict[str, Any]:
     for _ in range(turns):
         seconds["annotate"].append(timed(lambda: again(run, recording)))
         seconds["cp"].append(timed(lambda: subprocess.run(copy, check=True)))
-    figures = {name: round(median(values), 4) for name, values in seconds.items()}
-    return {"mb": round(recording.stat().st_size / 1e6), **figures}
+    annotating, copying = map(median, seconds.values())
+    megabytes = round(recording.stat().st_size / 1e6)
+    ratio = f"{annotating / copying:.2f}"
+    return frames, megabytes, round(annotating, 4), round(copying, 4), ratio
 
 
 @click.command()
@@ -63,17 +65,10 @@ def measure(folder: Path, frames: int, turns: int) -> dict[str, Any]:
 )
 @click.option("--turns", default=9, help="Number of repetitions.")
 def main(*, frames: tuple[int, ...], turns: int) -> None:
-    """Print a table and write ``build/benchmarks_annotating.json``."""
-    figures = {}
+    """Print a table."""
     with tempfile.TemporaryDirectory() as folder:
-        for count in frames:
-            figures[str(count)] = measure(Path(folder), count, turns)
-    rows = [
-        (count, f["mb"], f["annotate"], f["cp"], f"{f['annotate'] / f['cp']:.2f}")
-        for count, f in figures.items()
-    ]
+        rows = [measure(Path(folder), count, turns) for count in frames]
     print(markdown("Annotating again", ("frames", "MB", "annotate s", "cp s", "ratio"), rows))
-    save(Path("build/benchmarks_annotating.json"), figures)
 
 
 if __name__ == "__main__":

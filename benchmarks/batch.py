@@ -16,7 +16,7 @@ from pathlib import Path
 
 import click
 
-from benchmarks.measure import markdown, save
+from benchmarks.measure import markdown
 from benchmarks.whole import tabletop, write
 from shapecat.batch.manifest import Manifest
 from tests.faults.invariants import same_results
@@ -65,8 +65,8 @@ def ways() -> dict[str, Sequence[Sequence[str]]]:
 @click.option("--broken", default=4, help="How many of them are broken.")
 @click.option("--frames", default=60, help="Frames of each recording.")
 def main(*, recordings: int, broken: int, frames: int) -> None:
-    """Process a batch in every way, print a table and write ``build/benchmarks_batch.json``."""
-    rows, figures = [], {}
+    """Process a batch in every way and print a table."""
+    rows = []
     with tempfile.TemporaryDirectory() as folder:
         root = Path(folder)
         made = make(root / "in", recordings=recordings, broken=broken, frames=frames)
@@ -85,14 +85,12 @@ def main(*, recordings: int, broken: int, frames: int) -> None:
             codes = sorted({code for code, _ in spent})
             rows.append((way, *counts.values(), codes, f"{wall_s:.0f}", f"{wall_s / first:.2f}",
                          "yes" if agree else "NO"))  # fmt: skip
-            figures[way] = {"seconds": round(wall_s, 1), "same": agree, **counts}
             if not agree or counts != {"complete": recordings - broken, "failed": broken}:
                 for entry in entries:
                     print(entry.state, entry.folder, entry.message)
                 raise SystemExit(1)
     columns = ("", "complete", "failed", "exit code", "s", "of --jobs 1", "same tables")
     print(markdown(f"{recordings} recordings of {frames} frames", columns, rows))
-    save(Path("build/benchmarks_batch.json"), figures)
 
 
 if __name__ == "__main__":

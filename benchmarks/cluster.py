@@ -25,7 +25,7 @@ import click
 import numpy as np
 
 from benchmarks.batch import process
-from benchmarks.measure import markdown, save
+from benchmarks.measure import markdown
 from shapecat.batch.ledger import Ledger
 from shapecat.batch.manifest import Entry, Manifest, RemoteManifest
 from shapecat.batch.plans import _Planner, plan_batch
@@ -287,7 +287,7 @@ def peak_mb() -> float:
 def main(
     *, frame_ms: float, recordings: int, plot: Path, only_check: bool, count: int | None
 ) -> None:
-    """Simulate, print tables, draw a plot and write ``build/benchmarks_cluster.json``."""
+    """Simulate, print tables and draw a plot."""
     if only_check:
         with tempfile.TemporaryDirectory() as folder:
             rows = check(Path(folder), recordings=16, frames=60)
@@ -321,8 +321,6 @@ def study(given: Assumed, frame_s: float, plot: Path) -> None:
     print(markdown("a recorded hour at 30 Hz", costs_of_it, per_hour(costs, given)))
     print(json.dumps(asdict(costs)))
     draw(plot, results)
-    figures = {"assumed": asdict(given), "measured": asdict(costs), "results": results}
-    save(ROOT / "build" / "benchmarks_cluster.json", figures)
 
 
 if __name__ == "__main__":

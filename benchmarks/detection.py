@@ -24,13 +24,13 @@ RANGE_M = 2.0
 """Range of all methods, metres."""
 
 
-def run(count: int) -> tuple[str, dict[str, Any]]:
-    """Time every method on every frame; return a Markdown table and the times."""
+def run(count: int) -> str:
+    """Time every method on every frame; return a Markdown table."""
     sets = {
         "simulated clutter": list(simulated_clutter(count)),
         "real tables": list(real_tables(every=max(1, 45 // count))),
     }
-    rows, figures = [], {}
+    rows = []
     with tempfile.TemporaryDirectory() as folder:
         program = _build_pcl(Path(folder))
         for name, frames in sets.items():
@@ -38,13 +38,12 @@ def run(count: int) -> tuple[str, dict[str, Any]]:
                 continue
             timed = _time_all(frames, program)
             own = timed["shapecat"]["median"]
-            figures[name] = timed
             rows += [
                 (name, method, len(frames), t["median"], t["p95"], f"{t['median'] / own:.1f}")
                 for method, t in timed.items()
             ]
     columns = ("frames", "method", "n", "ms, median", "ms, p95", "ratio")
-    return markdown("Detection, CPU time per 640×480 frame", columns, rows), figures
+    return markdown("Detection, CPU time per 640×480 frame", columns, rows)
 
 
 def _time_all(frames: list[Frame], program: Path | None) -> dict[str, dict[str, float]]:

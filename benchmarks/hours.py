@@ -7,7 +7,6 @@ Eight objects stand on a table in front of a moving camera. Each is missed in so
 removed for a while every few minutes; false detections appear for a few frames.
 """
 
-import json
 import os
 import tempfile
 import time
@@ -21,7 +20,7 @@ import click
 import numpy as np
 import pyarrow as pa
 
-from benchmarks.measure import markdown, save
+from benchmarks.measure import markdown
 from shapecat.completion import DIRECTIONS
 from shapecat.config import TrackingSettings
 from shapecat.runs.tables.schemas import DETECTIONS, FRAMES
@@ -137,14 +136,12 @@ def measure(frames: int) -> dict[str, Any]:
 
 @click.command()
 @click.option("--hours", default=1.0, show_default=True, help="Hours of recording, at 28 Hz.")
-@click.option("--json", "as_json", is_flag=True, help="Print one JSON object.")
-def main(*, hours: float, as_json: bool) -> None:
-    """Measure the track phase, print a table and write ``build/benchmarks_hours.json``."""
+def main(*, hours: float) -> None:
+    """Measure the track phase and print a table."""
     figures = measure(round(hours * PER_HOUR))
-    save(Path("build/benchmarks_hours.json"), figures)
     rows = [(f"{hours:g}", *(round(value, 1) for value in figures.values()))]
     columns = ("hours", "frames", "seconds", "peak MB", "tracks")
-    click.echo(json.dumps(figures) if as_json else markdown("The track phase", columns, rows))
+    click.echo(markdown("The track phase", columns, rows))
 
 
 if __name__ == "__main__":

@@ -1,6 +1,5 @@
 """Measuring and printing: process CPU time on one thread, the best of several runs."""
 
-import json
 import platform
 import time
 from collections.abc import Callable, Sequence
@@ -37,7 +36,7 @@ def markdown(title: str, columns: Sequence[str], rows: Sequence[Sequence[Any]]) 
     return "\n".join([*lines, ""])
 
 
-def machine() -> dict[str, str]:
+def machine() -> str:
     """Return the processor and the Python version of this machine."""
     model = next(
         (
@@ -47,10 +46,4 @@ def machine() -> dict[str, str]:
         ),
         platform.processor(),
     )
-    return {"processor": model, "python": platform.python_version()}
-
-
-def save(path: Path, results: dict[str, Any]) -> None:
-    """Write results and the description of the machine as JSON."""
-    path.parent.mkdir(parents=True, exist_ok=True)
-    path.write_text(json.dumps({"machine": machine(), **results}, indent=1) + "\n", "utf-8")
+    return f"{model}, Python {platform.python_version()}"

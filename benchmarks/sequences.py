@@ -1,6 +1,6 @@
 """Tracking of whole simulated sequences: identities, labels, calibration.
 
-    python -m benchmarks.sequences --seeds 10 --json
+    python -m benchmarks.sequences --seeds 10
 
 Each sequence is written as a recording and processed as by `shapecat process`; its tables are
 compared with the ground truth.
@@ -8,7 +8,6 @@ compared with the ground truth.
 
 import json
 import tempfile
-from collections import Counter
 from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -258,8 +257,6 @@ def evaluate(folder: Path, seeds: Iterable[int]) -> dict[str, Any]:
     per_kind = {
         kind: label_errors(v for v in decidable if v.track[0] == kind) for kind in sorted(seen)
     }
-    final = {view.track: (view.truth, view.final) for view in views}
-    wrong = Counter(f"{t} taken for {f}" for t, f in final.values() if t != f)
     return {
         "identities": identities(seen),
         "labels": {
@@ -267,7 +264,6 @@ def evaluate(folder: Path, seeds: Iterable[int]) -> dict[str, Any]:
             "all": label_errors(decidable),
             "undecidable": label_errors(view for view in views if view.undecidable),
         },
-        "tracks": {"n": len(final), "wrong": dict(wrong.most_common())},
         "calibration": calibration(decidable),
     }
 
@@ -289,12 +285,11 @@ def format_tables(figures: dict[str, Any]) -> str:
 @click.option("--seeds", default=10, show_default=True, help="Sequences of each kind.")
 @click.option("--first", default=100, show_default=True, help="The first seed.")
 @click.option("--keep", type=click.Path(path_type=Path), help="Keep recordings and runs here.")
-@click.option("--json", "as_json", is_flag=True, help="Print one JSON object.")
-def main(*, seeds: int, first: int, keep: Path | None, as_json: bool) -> None:
+def main(*, seeds: int, first: int, keep: Path | None) -> None:
     """Evaluate tracking on simulated sequences: turntable, moving camera, moving objects."""
     with tempfile.TemporaryDirectory() as temporary:
         figures = evaluate(keep or Path(temporary), range(first, first + seeds))
-    click.echo(json.dumps(figures, indent=1) if as_json else format_tables(figures))
+    click.echo(format_tables(figures))
 
 
 if __name__ == "__main__":

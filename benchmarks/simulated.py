@@ -1,12 +1,11 @@
 """Detection on simulated scenes compared with the truth: objects, planes, support relations.
 
-    python -m benchmarks.simulated shelf empty --first 0 --count 24 [--json]
+    python -m benchmarks.simulated shelf empty --first 0 --count 24
 
 One Kinect frame of each scene. Only objects with at least `SEEN_PIXELS` depth pixels are expected
 to be found; detections of other objects are ignored.
 """
 
-import json
 from collections import Counter
 from collections.abc import Iterator
 from typing import NamedTuple, get_args
@@ -48,14 +47,9 @@ class View(NamedTuple):
 @click.argument("kinds", nargs=-1, required=True, type=click.Choice(get_args(SceneKind)))
 @click.option("--first", default=0, show_default=True, help="Seed of the first scene.")
 @click.option("--count", default=24, show_default=True, help="Scenes of each kind.")
-@click.option("--json", "as_json", is_flag=True, help="Print the counts as JSON.")
-def main(*, kinds: tuple[SceneKind, ...], first: int, count: int, as_json: bool) -> None:
-    """Score scenes of each kind and print a table, or the counts."""
-    counts = {kind: score(kind, first, count) for kind in kinds}
-    if as_json:
-        print(json.dumps(counts))
-        return
-    rows = [(kind, *_figures(c)) for kind, c in counts.items()]
+def main(*, kinds: tuple[SceneKind, ...], first: int, count: int) -> None:
+    """Score scenes of each kind and print a table."""
+    rows = [(kind, *_figures(score(kind, first, count))) for kind in kinds]
     title = f"Detection, simulated scenes {first} to {first + count - 1}"
     print(markdown(title, ("scenes", *COLUMNS), rows))
 

@@ -21,7 +21,7 @@ from typing import Any, NamedTuple
 import click
 import numpy as np
 
-from benchmarks.measure import markdown, save
+from benchmarks.measure import markdown
 from shapecat.geometry import LINK_FROM_OPTICAL
 from shapecat.simulation import KINECT, make_scene, render_frame
 from shapecat.simulation.containers import CONTAINERS
@@ -127,32 +127,32 @@ def spend(
     return Spent(wall_s - compiling, cpu_s - compiling, usage.ru_maxrss / 1024, run)
 
 
-def speed(
-    folder: Path, frames: int, repeats: int, against: Path | None
-) -> tuple[str, dict[str, Any]]:
+def speed(folder: Path, frames: int, repeats: int, against: Path | None) -> str:
     """Measure the frames per second with all outputs, on one core and on two."""
     views, objects = tabletop(60)
     rows: list[tuple[Any, ...]] = []
-    figures: dict[str, Any] = {"objects": objects, "frames": frames}
     for camera, seen in (("walking", views), ("still", standing(60))):
         recording = write(folder / f"{camera}.mcap", seen, frames)
         for count in (1, 2):
             cores = set(sorted(os.sched_getaffinity(0))[:count])
             if len(cores) == count:
                 rates = _measure(recording, folder, cores, repeats, against)
-                figures[f"{camera}, {count} cores"] = rates
-                rows.append((camera, count, *rates.values()))
+                rows.append((camera, count, *rates))
         recording.unlink()
     ratios = ("ratio", "CPU ratio") if against else ()
     columns = ("camera", "cores", "frames/s", "CPU ms/frame", "start-up s", "peak MB", *ratios)
     title = f"End to end, {objects} objects, 640×480, all outputs, {frames} frames"
-    return markdown(title, columns, rows) + f"\n{THESIS}.\n", figures
+    return markdown(title, columns, rows) + f"\n{THESIS}.\n"
 
 
 def _measure(
     recording: Path, folder: Path, cores: set[int], repeats: int, against: Path | None
-) -> dict[str, Any]:
-    """Measure a recording, alternating with another checkout, as the machine may be shared."""
+) -> list[float]:
+    """Measure a recording, alternating with another checkout, as the machine may be shared.
+
+    Return the frames per second, CPU time per frame (ms), start-up time (s) and peak memory (MB);
+    with another checkout, also the ratios of speed and of CPU time.
+    """
     rates: dict[Path | None, list[tuple[float, ...]]] = {}
     for _ in range(repeats):
         for checkout in (None, against) if against else (None,):
@@ -164,23 +164,18 @@ def _measure(
             measured = (fps, cpu_ms, few.wall_s, whole.peak_mb)
             rates.setdefault(checkout, []).append(measured)
     fps, cpu_ms, startup_s, peak_mb = max(rates[None])
-    found: dict[str, Any] = {
-        "fps": round(fps, 1),
-        "cpu_ms": round(cpu_ms, 2),
-        "startup_s": round(startup_s, 2),
-        "peak_mb": round(peak_mb),
-    }
+    found = [round(fps, 1), round(cpu_ms, 2), round(startup_s, 2), round(peak_mb)]
     if against:
         other, other_cpu_ms, *_ = max(rates[against])
-        found |= {"ratio": round(fps / other, 2), "cpu_ratio": round(other_cpu_ms / cpu_ms, 2)}
+        found += [round(fps / other, 2), round(other_cpu_ms / cpu_ms, 2)]
     return found
 
 
-def growth(folder: Path, counts: list[int]) -> tuple[str, dict[str, Any]]:
+def growth(folder: Path, counts: list[int]) -> str:
     """Measure cost per additional frame and peak memory over the number of frames, on one core."""
     views, _ = tabletop(60)
     cores = set(sorted(os.sched_getaffinity(0))[:1])
-    rows, figures = [], {}
+    rows = []
     done, cpu_s = 0, 0.0
     for frames in counts:
         recording = write(folder / "long.mcap", views, frames)
@@ -192,11 +187,10 @@ def growth(folder: Path, counts: list[int]) -> tuple[str, dict[str, Any]]:
         least = min(spent.cpu_s for spent in runs)
         each, peak = 1e3 * (least - cpu_s) / (frames - done), round(runs[0].peak_mb)
         done, cpu_s = frames, least
-        figures[str(frames)] = {"cpu_ms": round(each, 2), "peak_mb": peak}
         rows.append((frames, f"{each:.1f}", peak))
         recording.unlink()
     columns = ("frames", "CPU ms per frame since the row before", "peak MB")
-    return markdown("Growth", columns, rows), figures
+    return markdown("Growth", columns, rows)
 
 
 @click.command()
@@ -209,14 +203,10 @@ def growth(folder: Path, counts: list[int]) -> tuple[str, dict[str, Any]]:
     help="Another checkout to compare with, with its .venv installed.",
 )
 def main(*, full: bool, frames: int, repeats: int, against: Path | None) -> None:
-    """Measure whole recordings, print tables and write ``build/benchmarks_whole.json``."""
+    """Measure whole recordings and print tables."""
     with tempfile.TemporaryDirectory() as folder:
-        table, figures = speed(Path(folder), frames, repeats, against and against.resolve())
-        print(table)
-        counts = [100, 1000, 10_000] if full else [50, 200]
-        grown, by_count = growth(Path(folder), counts)
-        print(grown)
-    save(Path("build/benchmarks_whole.json"), {"speed": figures, "growth": by_count})
+        print(speed(Path(folder), frames, repeats, against and against.resolve()))
+        print(growth(Path(folder), [100, 1000, 10_000] if full else [50, 200]))
 
 
 if __name__ == "__main__":

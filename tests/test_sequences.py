@@ -92,4 +92,3 @@ def test_short_sequence_is_evaluated_from_recording_to_figures(
     assert figures["labels"]["all"]["final"] < 0.05
     assert np.isfinite([row["ece"] for row in figures["calibration"].values()]).any()
     assert "| rearranged |" in sequences.format_tables(figures)
-    json.dumps(figures)
