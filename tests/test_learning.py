@@ -12,24 +12,22 @@ from scipy import sparse
 from sklearn.linear_model import LogisticRegression
 
 from shapecat.arrays import F4
-from shapecat.evaluation.baseline_classifiers import make_baselines
+from shapecat.evaluation.baseline_classifiers import Densities, make_baselines
 from shapecat.evaluation.shape_functions import shape_functions
 from shapecat.learning import Categorizer
 from shapecat.learning.boosted import Dictionary, grow_dictionary
 from shapecat.learning.boosting import Tree, grow_tree
 from shapecat.learning.calibration import fit_temperature, softmax
-from shapecat.learning.features import FeatureBank
+from shapecat.learning.features import fit_standardisation
 from shapecat.learning.forest import FlatForest
 from shapecat.learning.incremental import _STEPS, _fit_new, _Inputs, _shift, add_categories
 from shapecat.learning.known_views import choose_evenly
-from shapecat.learning.pnn import fit_bank
 from shapecat.learning.training import (
     Examples,
     LearningSettings,
     calibrate,
     encode,
     fit_categorizer,
-    fit_chain,
 )
 from shapecat.system import stopping
 from shapecat.types import UNKNOWN
@@ -73,11 +71,6 @@ def grow(x: F4, labels: np.ndarray, **options: Any) -> Dictionary:
     return grow_dictionary(x, labels, rng=np.random.default_rng(0), **chosen)
 
 
-def densities(x: F4, labels: np.ndarray, kernels: int) -> FeatureBank:
-    codes, blocks = encode(labels, CATEGORIES), tuple(BLOCKS.values())
-    return fit_bank(x, codes, blocks, kernels=kernels, rng=np.random.default_rng(0))
-
-
 def logits_of(dictionary: Dictionary, x: F4) -> Any:
     return dictionary.votes[dictionary.forest.apply(x)].sum(axis=1) + dictionary.bias
 
@@ -100,18 +93,14 @@ def test_trees_are_evaluated_to_the_leaf() -> None:
             assert leaves[leaf_id] == node
 
 
-@pytest.mark.parametrize("kernels", [0, 20])
-def test_prediction_matches_fitted_chain(kernels: int) -> None:
+def test_prediction_matches_fitted_chain() -> None:
     """The compiled kernel is a second implementation and must give the same results.
 
     Its trees are checked by `test_trees_are_evaluated_to_the_leaf`.
     """
-    chosen = replace(SMALL, kernels=kernels)
-    train, test = blobs(60, 1, (*CATEGORIES, UNKNOWN)), blobs(50, 9)
-    codes = encode(train.labels, CATEGORIES)
-    bank, dictionary = fit_chain(train.descriptors, codes, BLOCKS, chosen, seed=0)
-    model = fit(chosen)
-    logits = logits_of(dictionary, bank.features(test.descriptors))
+    test, model = blobs(50, 9), fit()
+    words = model.forest.apply(model.bank.standardise(test.descriptors))
+    logits = model.votes.astype(float)[words].sum(axis=1) + model.bias
 
     prediction = model.predict(test.descriptors)
 
@@ -239,28 +228,28 @@ def test_densities_match_their_formula() -> None:
     """Distances, blocks and categories are easily mixed up in flat arrays."""
     rng = np.random.default_rng(1)
     x, y = rng.normal(size=(30, 5)).astype(np.float32), np.arange(30) % 2
-    bank = fit_bank(x, y, (slice(0, 2), slice(2, 5)), kernels=15, rng=np.random.default_rng(0))
+    blocks = (slice(0, 2), slice(2, 5))
+    fitted = Densities(x, y, blocks, 15)
     new = rng.normal(size=(4, 5)).astype(np.float32)
-    features = bank.features(new)
-    z, kernels = bank.standardise(new).astype(float), bank.kernels.astype(float)
+    found, z = fitted.log_densities(new), fitted.standardise(new)
+    np.testing.assert_allclose(z, (new - x.mean(axis=0)) / x.std(axis=0), atol=1e-4)
     for c in range(2):
-        own = kernels[bank.starts[c] : bank.starts[c + 1]]
-        for b, (first, last) in enumerate(bank.spans):
-            squared = ((z[:, None, first:last] - own[:, first:last]) ** 2).sum(axis=2)
-            density = np.exp(-squared / (2 * float(bank.bandwidth[b]) ** 2)).mean(axis=1)
-            expected = (np.log(density) - bank.level[b]) / bank.spread[b]
-            np.testing.assert_allclose(
-                features[:, 5 + c * 2 + b], np.clip(expected, -8, 8), atol=2e-3
-            )
+        own = fitted.standardise(x[y == c])  # as many as kernels
+        for b, block in enumerate(blocks):
+            squared = ((z[:, None, block] - own[:, block]) ** 2).sum(axis=2)
+            density = np.exp(-squared / (2 * fitted.widths[b] ** 2)).mean(axis=1)
+            expected = (np.log(density) - fitted.mean[b]) / fitted.deviation[b]
+            np.testing.assert_allclose(found[:, c, b], np.clip(expected, -8, 8), atol=1e-9)
 
 
 def test_density_of_training_view_leaves_out_the_view_itself() -> None:
     """Otherwise densities would be much higher in training than in use."""
     data = blobs(60, 1)
-    bank = densities(data.descriptors, data.labels, kernels=60)
-    own, new = (bank.features(x)[:, 8:] for x in (data.descriptors, blobs(60, 2).descriptors))
+    fitted = Densities(data.descriptors, data.labels, tuple(BLOCKS.values()), 60)
+    views = (data.descriptors, blobs(60, 2).descriptors)
+    own, new = (fitted.log_densities(x).max(axis=1).mean() for x in views)
 
-    assert abs(own.max(axis=1).mean() - new.max(axis=1).mean()) < 0.3
+    assert abs(own - new) < 0.3
 
 
 def test_constant_features_become_zero() -> None:
@@ -268,10 +257,12 @@ def test_constant_features_become_zero() -> None:
     data = blobs(30, 1)
     x = data.descriptors.copy()
     x[:, 2] = 7.0
-    features = densities(x, data.labels, kernels=100).features(x)
+    blocks = tuple(BLOCKS.values())
+    z = fit_standardisation(x, blocks, len(CATEGORIES)).standardise(x)
 
-    assert np.all(np.isfinite(features))
-    assert np.all(features[:, 2] == 0)
+    assert np.all(np.isfinite(z))
+    assert np.all(z[:, 2] == 0)
+    assert np.all(np.isfinite(Densities(x, data.labels, blocks, 100).log_densities(x)))
 
 
 @settings(deadline=None, max_examples=20)

@@ -14,7 +14,7 @@ import pytest
 from shapecat.errors import ModelError, OutputError
 from shapecat.learning import Categorizer, load_model, model_file, save_model
 from shapecat.learning.categorizer import parts_of
-from shapecat.learning.features import FeatureBank
+from shapecat.learning.features import Standardisation
 from shapecat.learning.forest import FlatForest
 
 
@@ -26,16 +26,12 @@ def tiny() -> Categorizer:
         np.array([0.5, 0, 0, -1, 0, 0]),
         np.array([1, 0, 0, 4, 0, 0]),
     )
-    bank = FeatureBank(
+    bank = Standardisation(
         columns=np.arange(3),
         mean=np.zeros(3),
         inverse_scale=np.ones(3),
-        spans=np.array([[0, 3]]),
-        bandwidth=np.array([1.0]),
-        level=np.array([0.0]),
-        spread=np.array([1.0]),
-        starts=np.array([0, 1, 2]),
-        kernels=np.array([[0, 0, 0], [0, 1, 0]]),
+        starts=np.zeros(3, np.int32),
+        kernels=np.zeros((0, 3)),
     )
     return Categorizer(
         categories=("cup", "can"),
@@ -43,7 +39,7 @@ def tiny() -> Categorizer:
         bank=bank,
         forest=forest,
         votes=np.array([[1, 0], [0, 1], [0.5, 0], [0, 0.5]]),
-        linear=np.zeros((2, 5)),
+        linear=np.zeros((2, 3)),
         bias=np.array([0.0, 0.1]),
         temperature=0.7,
         threshold=-1.5,
@@ -192,10 +188,8 @@ _HOSTILE = {
     "no trees": (put("forest.roots", [], "u4"), "damaged"),
     "a feature too many": (put("forest.feature", [9, 0, 0, 2, 0, 0], "u2"), "features"),
     "a component too many": (put("bank.columns", [0, 1, 9], "u2"), "descriptor"),
-    "a block behind the end": (put("bank.spans", [[0, 4]], "u2"), "do not fit"),
-    "kernels behind the end": (put("bank.starts", [0, 1, 9], "i4"), "do not fit"),
-    "kernels backwards": (put("bank.starts", [0, 3, 2], "i4"), "do not fit"),
-    "no bandwidth": (put("bank.bandwidth", [0.0], "f4"), "do not fit"),
+    "densities": (put("bank.kernels", [[0, 0, 0], [0, 1, 0]], "f2"), "Parzen densities"),
+    "a mean of NaN": (put("bank.mean", [0, np.nan, 0], "f4"), "not finite"),
     "no threshold": (edit_header(threshold=float("inf")), "numbers"),
     "two learners too many": (put("bias", [0.0, 0.1, 0.2, 0.3], "f8"), "not a usable"),
     "infinite votes": (put("votes", np.full((4, 2), np.inf), "f2"), "numbers"),

@@ -4,18 +4,24 @@ from collections.abc import Callable, Sequence
 from typing import Any, Self
 
 import numpy as np
+from scipy.spatial.distance import cdist
+from scipy.special import logsumexp
 from sklearn.ensemble import RandomForestClassifier
 from sklearn.linear_model import LogisticRegression
 from sklearn.pipeline import make_pipeline
 from sklearn.preprocessing import OneHotEncoder, StandardScaler
-from sklearn.utils import check_random_state
 
 from shapecat.arrays import F4, F8
 from shapecat.learning.calibration import softmax
-from shapecat.learning.features import FeatureBank
-from shapecat.learning.pnn import fit_bank
 
-__all__ = ["make_baselines"]
+__all__ = ["Densities", "make_baselines"]
+
+_MULTIPLES = np.exp2(np.arange(-2.0, 2.6, 0.5))
+"""Bandwidths to choose from, relative to the typical distance of kernels."""
+_JUDGES = 60
+"""Number of views per category on which a bandwidth is fitted."""
+_CLIP = 8.0
+"""Standardised values and densities are clipped to this many standard deviations."""
 
 
 def make_baselines(blocks: Sequence[slice]) -> dict[str, Callable[[], Any]]:
@@ -44,10 +50,89 @@ def _forest(trees: int) -> RandomForestClassifier:
     )
 
 
-def _fit_densities(x: F4, y: np.ndarray, blocks: Sequence[slice], kernels: int) -> FeatureBank:
-    codes = np.unique(y, return_inverse=True)[1]
-    rng = np.random.default_rng(check_random_state(0).randint(2**31))
-    return fit_bank(x, codes, blocks, kernels=kernels, rng=rng)
+class Densities:
+    """Parzen densities of each category in each block of a descriptor, in standardised units.
+
+    Parameters
+    ----------
+    x : (n, d) descriptors.
+    y : (n,) categories.
+    blocks : range of each block in the descriptor.
+    kernels : Gaussians per category, around views drawn at random.
+
+    Notes
+    -----
+    The bandwidth of a block is a multiple of the typical distance between nearest kernels: the one
+    that maximises the likelihood of views under their own category, each view left out.
+
+    Source: Specht 1990, eq. 12; differs: Specht keeps every training view.
+    """
+
+    def __init__(self, x: F4, y: np.ndarray, blocks: Sequence[slice], kernels: int) -> None:
+        rng = np.random.default_rng(0)
+        self._scaler = StandardScaler().fit(x)
+        self._blocks = blocks
+        z = self.standardise(x)
+        of_category = [rng.permutation(z[y == name]) for name in np.unique(y)]
+        self._kernels = [views[:kernels] for views in of_category]
+        judges = [rng.permutation(views)[:_JUDGES] for views in of_category]
+        self.widths = [self._fit_width(judges, block) for block in blocks]
+        own = [self._own_densities(judges, *pair) for pair in zip(blocks, self.widths, strict=True)]
+        self.mean = np.array([values.mean() for values in own])
+        self.deviation = np.array([max(values.std(), 1e-3) for values in own])
+
+    def standardise(self, x: F4) -> F8:
+        """Return the standardised descriptors (n, d)."""
+        return np.asarray(np.clip(self._scaler.transform(np.asarray(x, np.float64)), -_CLIP, _CLIP))
+
+    def log_densities(self, x: F4) -> F8:
+        """Return the log densities (n, categories, blocks) of descriptors (n, d).
+
+        They are relative to the densities of views under their own category.
+        """
+        z = self.standardise(x)
+        densities = [
+            [_log_density(z[:, block], kernels[:, block], width) for kernels in self._kernels]
+            for block, width in zip(self._blocks, self.widths, strict=True)
+        ]
+        values = (np.transpose(densities) - self.mean) / self.deviation
+        return np.asarray(np.clip(values, -_CLIP, _CLIP))
+
+    def _own_densities(self, judges: Sequence[F8], block: slice, width: float) -> F8:
+        pairs = zip(judges, self._kernels, strict=True)
+        values = [_log_density(z[:, block], own[:, block], width) for z, own in pairs]
+        found = np.concatenate(values)
+        found = found[np.isfinite(found)]
+        return found if found.size else np.zeros(1)  # each category has a single view
+
+    def _fit_width(self, judges: Sequence[F8], block: slice) -> float:
+        """Return the bandwidth with the greatest likelihood of views (n, d) of each category."""
+        nearest = []
+        for kernels in self._kernels:
+            distances = cdist(kernels[:, block], kernels[:, block])
+            np.fill_diagonal(distances, np.inf)
+            nearest.append(distances.min(axis=1))
+        dimensions, gaps = block.stop - block.start, np.concatenate(nearest)
+        typical = max(float(np.median(gaps)) / np.sqrt(dimensions), 1e-2)
+        typical = typical if np.isfinite(typical) else 1.0  # most categories have a single view
+        likelihoods = [
+            self._own_densities(judges, block, width).mean() - dimensions * np.log(width)
+            for width in typical * _MULTIPLES
+        ]
+        return float(typical * _MULTIPLES[int(np.argmax(likelihoods))])
+
+
+def _log_density(z: F8, kernels: F8, width: float) -> F8:
+    """Return the log (n,) of the mean Gaussian around kernels (k, d) at views (n, d).
+
+    The factor that is the same for every category is left out. A kernel at a view is taken for the
+    view itself, met in training, and does not count; otherwise the densities of training views
+    would be too high. The result is -inf if no kernel counts.
+    """
+    squared = cdist(z, kernels, "sqeuclidean")
+    other = squared > 1e-4 * z.shape[1]
+    exponents = np.where(other, -0.5 * squared / width**2, -np.inf)
+    return np.asarray(logsumexp(exponents, axis=1) - np.log(np.maximum(other.sum(axis=1), 1)))
 
 
 class _DensityProduct:
@@ -58,15 +143,11 @@ class _DensityProduct:
 
     def fit(self, x: F4, y: np.ndarray) -> Self:
         self.classes_ = np.unique(y)
-        self._bank = _fit_densities(x, y, self._blocks, 300)
+        self._densities = Densities(x, y, self._blocks, 300)
         return self
 
     def predict_proba(self, x: F4) -> F8:
-        bank = self._bank
-        densities = bank.features(x)[:, bank.mean.size :].reshape(
-            len(x), bank.categories, bank.bandwidth.size
-        )
-        return softmax(densities.astype(np.float64) @ bank.spread.astype(np.float64))
+        return softmax(self._densities.log_densities(x) @ self._densities.deviation)
 
 
 class _ForestWords:
@@ -78,8 +159,8 @@ class _ForestWords:
 
     def fit(self, x: F4, y: np.ndarray) -> Self:
         self.classes_ = np.unique(y)
-        self._bank = _fit_densities(x, y, self._blocks, 50)
-        features = self._bank.features(x)
+        self._densities = Densities(x, y, self._blocks, 50)
+        features = self._features(x)
         words = self._encoder.fit_transform(self._forest.fit(features, y).apply(features))
         self._learners = [
             LogisticRegression(C=0.03, class_weight="balanced", max_iter=1000).fit(words, y == name)
@@ -88,6 +169,10 @@ class _ForestWords:
         return self
 
     def predict_proba(self, x: F4) -> F8:
-        words = self._encoder.transform(self._forest.apply(self._bank.features(x)))
+        words = self._encoder.transform(self._forest.apply(self._features(x)))
         logits = [learner.decision_function(words) for learner in self._learners]
         return softmax(np.stack(logits, axis=1))
+
+    def _features(self, x: F4) -> F8:
+        densities = self._densities.log_densities(x).reshape(len(x), -1)
+        return np.hstack([self._densities.standardise(x), densities])

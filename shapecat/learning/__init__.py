@@ -1,8 +1,8 @@
 """Learning shape categories (thesis ch. 7).
 
-`features` standardises a descriptor and may add Parzen densities. `forest` maps these features to
-words, the leaves of a dictionary of trees. `categorizer` turns the words into a calibrated
-posterior and a novelty. These modules predict; `pnn`, `boosted` and `training` train.
+`features` standardises a descriptor. `forest` maps these features to words, the leaves of a
+dictionary of trees. `categorizer` turns the words into a calibrated posterior and a novelty. These
+modules predict; `boosted` and `training` train.
 """
 
 from shapecat.learning.categorizer import Categorizer, Prediction

@@ -12,7 +12,7 @@ import numpy as np
 from shapecat.arrays import F4, F8, U1, Record, array
 from shapecat.errors import ModelError
 from shapecat.jit import kernel
-from shapecat.learning.features import FeatureBank, write_features
+from shapecat.learning.features import Standardisation
 from shapecat.learning.forest import FlatForest, apply
 from shapecat.types import UNKNOWN
 
@@ -45,7 +45,7 @@ class Categorizer(Record):
     ----------
     categories : names of the columns of the posterior.
     descriptor_names : names of the descriptor's components, in order.
-    bank : computes features from a descriptor.
+    bank : standardises a descriptor, which gives the features.
     forest : the dictionary; each leaf is a word.
     votes : (w, k) the value that each word adds to each logit. k is c, the number of categories,
         or c + 1 if the model was trained with unknown shapes, whose logit comes last.
@@ -65,7 +65,7 @@ class Categorizer(Record):
 
     categories: tuple[str, ...]
     descriptor_names: tuple[str, ...]
-    bank: FeatureBank
+    bank: Standardisation
     forest: FlatForest
     votes: F4 = array("w k", "f2")
     linear: F4 = array("k f", "f4")
@@ -82,13 +82,13 @@ class Categorizer(Record):
         sizes = {
             "descriptor": len(self.descriptor_names) > self.bank.columns.max(initial=0),
             "categories": self.bias.size - len(self.categories) in {0, 1}
-            and self.bank.categories == len(self.categories),
+            and self.bank.starts.size == len(self.categories) + 1,
             "category names": len(set(self.categories)) == len(self.categories)
             and 0 < len(self.categories) <= MOST_CATEGORIES
             and all(name and name.isprintable() and name != UNKNOWN for name in self.categories),
             "words": self.forest.words == len(self.votes),
             "features": self.linear.shape[1]
-            == self.bank.width
+            == self.bank.mean.size
             > self.forest.feature.max(initial=0),
             "known views": self.known_descriptors.shape[1] == self.bank.mean.size
             and bool(np.all(self.known_category < self.bias.size)),
@@ -153,13 +153,12 @@ class Categorizer(Record):
             raise ValueError(msg)
         posteriors = np.zeros((len(x), len(self.categories)), np.float32)
         novelty = np.zeros(len(x), np.float32)
-        _predict(x, *self._parameters, posteriors, novelty)
+        _predict(self.bank.standardise(x), *self._parameters, posteriors, novelty)
         return Prediction(posteriors, novelty)
 
     @cached_property
     def _parameters(self) -> tuple[Any, ...]:
         return (
-            self.bank.parameters,
             self.forest.parameters,
             np.ascontiguousarray(self.votes, np.float32),
             self.linear,
@@ -182,8 +181,7 @@ def parts_of(record: Record, prefix: str = "") -> dict[str, Any]:
 
 @kernel
 def _predict(
-    x: F4,
-    bank: Any,
+    features: F4,
     forest: Any,
     votes: F4,
     linear: F4,
@@ -194,21 +192,15 @@ def _predict(
     posteriors: F4,
     novelty: F4,
 ) -> None:
-    """Write posteriors (n, c) and novelty (n,) of descriptors x (n, d)."""
-    columns, mean, scale, spans, bandwidth, level, spread, kernel_starts, kernels = bank
+    """Write posteriors (n, c) and novelty (n,) of standardised descriptors (n, f)."""
     trees, word = forest
     categories = posteriors.shape[1]
-    features = np.zeros((x.shape[0], linear.shape[1]), np.float32)
-    # (1) Features: the standardised descriptor, and a density per block and category.
-    write_features(
-        x, columns, mean, scale, spans, bandwidth, level, spread, kernel_starts, kernels, features
-    )
     words = np.zeros(trees.roots.size, np.int64)
     logits = np.zeros(bias.size)
-    for i in range(x.shape[0]):
-        # (2) Dictionary: the leaf of each tree.
+    for i in range(features.shape[0]):
+        # (1) Dictionary: the leaf of each tree.
         apply(features[i], trees, word, words)
-        # (3) Logits of the categories.
+        # (2) Logits of the categories.
         for c in range(bias.size):
             logits[c] = bias[c]
         for w in words:
@@ -228,7 +220,7 @@ def _predict(
             total += np.exp(logits[c] - best)
         for c in range(categories):
             posteriors[i, c] = np.exp(logits[c] - best) / total
-        # (4) Novelty: the odds of being unknown, or else of not being the best category.
+        # (3) Novelty: the odds of being unknown, or else of not being the best category.
         if bias.size > categories:
             odds = logits[categories] - best - np.log(total)
         else:

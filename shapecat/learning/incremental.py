@@ -12,13 +12,10 @@ from threadpoolctl import threadpool_limits  # type: ignore[import-untyped]  # h
 from shapecat.arrays import F4, F8, I4, Bool
 from shapecat.errors import ModelError
 from shapecat.learning.categorizer import Categorizer
-from shapecat.learning.features import FeatureBank
 from shapecat.learning.known_views import KNOWN_VIEWS, choose_evenly
 
 __all__ = ["add_categories"]
 
-_KERNELS = 100
-"""Parzen kernels of a new category."""
 _RIDGE = 1e-2
 """Strength of the L2 regularisation, per view."""
 _FOLDS = 4
@@ -48,10 +45,9 @@ def add_categories(
 ) -> Categorizer:
     """Add new categories to a model from a few views of each.
 
-    Each new category gets its own densities, if the model has any, and its own linear classifier on
-    the words, the densities and the descriptor. The dictionary, the classifiers and the temperature
-    of the old categories do not change. The known views stored in the model are the negative
-    examples.
+    Each new category gets its own linear classifier on the words and the descriptor. The
+    dictionary, the classifiers and the temperature of the old categories do not change. The known
+    views stored in the model are the negative examples.
 
     Parameters
     ----------
@@ -83,30 +79,28 @@ def add_categories(
     known = _known_views(categorizer)
     categories = (*categorizer.categories, *added)
     codes = np.array([categories.index(name) for name in names])
-    bank = _extend_bank(categorizer.bank, descriptors, codes, rng)
-    z = np.concatenate([known, bank.standardise(descriptors)])
+    for name in added:  # as in earlier versions, so that a seed still gives the same model
+        rng.permutation(np.count_nonzero(names == name))
+    z = np.concatenate([known, categorizer.bank.standardise(descriptors)])
     # During the fit, the new logits come last, after the one for unknown shapes.
     count, old_count = len(added), len(categorizer.categories)
     order = _order(old_count, count, unknown=categorizer.knows_unknown)
     truth = np.concatenate([categorizer.known_category.astype(np.int64), order[codes]])
-    features = _features_of_standardised(bank, z)
-    words = categorizer.forest.apply(features)
-    inputs = _Inputs(features.astype(np.float64), _bag_of_words(words, categorizer.forest.words))
+    words = categorizer.forest.apply(z)
+    inputs = _Inputs(z.astype(np.float64), _bag_of_words(words, categorizer.forest.words))
     old = _old_logits(categorizer, inputs)
     cold = old / categorizer.temperature
     learned = _fit_new(inputs, cold, truth, np.zeros((_width(inputs), count)), _RIDGE, _STEPS)
     learned[-1] += _shift(inputs, cold, truth, learned, _RIDGE, rng)
     learned *= categorizer.temperature
-    linear = np.zeros((old.shape[1] + count, bank.width), np.float32)
-    linear[: old.shape[1], : categorizer.linear.shape[1]] = categorizer.linear
-    linear[old.shape[1] :] = learned[: bank.width].T
-    votes = np.concatenate([categorizer.votes, learned[bank.width : -1]], axis=1)
+    linear = np.concatenate([categorizer.linear, learned[: z.shape[1]].T])
+    votes = np.concatenate([categorizer.votes, learned[z.shape[1] : -1]], axis=1)
     columns = np.argsort(order)[truth]
     stored = choose_evenly(columns, KNOWN_VIEWS, rng)
     return replace(
         categorizer,
         categories=categories,
-        bank=bank,
+        bank=replace(categorizer.bank, starts=np.zeros(len(categories) + 1, np.int32)),
         votes=votes[:, order],
         linear=linear[order],
         bias=np.concatenate([categorizer.bias, learned[-1]])[order],
@@ -129,32 +123,6 @@ def _known_views(categorizer: Categorizer) -> F4:
     return categorizer.known_descriptors.astype(np.float32)
 
 
-def _extend_bank(bank: FeatureBank, x: F4, codes: I4, rng: np.random.Generator) -> FeatureBank:
-    """Add the kernels of the new categories, with the bandwidths of the old ones."""
-    z = bank.standardise(x)
-    new = [
-        np.sort(rng.permutation(np.flatnonzero(codes == code))[:_KERNELS])
-        for code in range(bank.categories, int(codes.max()) + 1)
-    ]
-    if bank.bandwidth.size == 0:
-        new = [rows[:0] for rows in new]
-    ends = bank.starts[-1] + np.cumsum([len(rows) for rows in new])
-    return replace(
-        bank,
-        starts=np.concatenate([bank.starts, ends]),
-        kernels=np.concatenate([bank.kernels, *(z[rows].astype(np.float16) for rows in new)]),
-    )
-
-
-def _features_of_standardised(bank: FeatureBank, z: F4) -> F4:
-    """Return the features (n, width) of standardised descriptors (n, d)."""
-    width = z.shape[1]
-    plain = replace(
-        bank, columns=np.arange(width), mean=np.zeros(width), inverse_scale=np.ones(width)
-    )
-    return plain.features(z)
-
-
 def _bag_of_words(words: I4, vocabulary: int) -> sparse.csr_array:
     """Return sparse rows (n, vocabulary), one per view: 1 at its words (n, t), 0 elsewhere."""
     views, trees = words.shape
@@ -165,7 +133,7 @@ def _bag_of_words(words: I4, vocabulary: int) -> sparse.csr_array:
 
 def _old_logits(categorizer: Categorizer, inputs: _Inputs) -> F8:
     votes = inputs.words @ categorizer.votes.astype(np.float64)
-    linear = inputs.features[:, : categorizer.linear.shape[1]] @ categorizer.linear.T
+    linear = inputs.features @ categorizer.linear.T
     return np.asarray(votes + linear + categorizer.bias)
 
 

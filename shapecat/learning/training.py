@@ -7,12 +7,11 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from shapecat.arrays import F4, I4
-from shapecat.learning.boosted import Dictionary, grow_dictionary
+from shapecat.learning.boosted import grow_dictionary
 from shapecat.learning.calibration import can_calibrate, fit_temperature
 from shapecat.learning.categorizer import Categorizer
-from shapecat.learning.features import FeatureBank
+from shapecat.learning.features import fit_standardisation
 from shapecat.learning.known_views import KNOWN_VIEWS, choose_evenly
-from shapecat.learning.pnn import fit_bank
 
 __all__ = [
     "Examples",
@@ -20,7 +19,6 @@ __all__ = [
     "calibrate",
     "encode",
     "fit_categorizer",
-    "fit_chain",
     "fit_threshold",
 ]
 
@@ -31,8 +29,6 @@ class LearningSettings:
 
     blocks: tuple[str, ...] = ()
     """Blocks of the descriptor to use; all if empty."""
-    kernels: int = 0
-    """Parzen kernels per category in the probabilistic neural network; 0 leaves it out."""
     rounds: int = 500
     """Boosting rounds; each grows one tree per category."""
     leaves: int = 16
@@ -99,8 +95,19 @@ def fit_categorizer(
         msg = f"a classifier needs at least 2 categories, got {len(categories)}"
         raise ValueError(msg)
     codes = encode(train.labels, categories)
-    bank, dictionary = fit_chain(train.descriptors, codes, blocks, settings, seed=seed)
     codes[codes < 0] = len(categories)  # the column of the learner of unknown shapes
+    used = [blocks[name] for name in settings.blocks or blocks]
+    bank = fit_standardisation(train.descriptors, used, len(categories))
+    number = np.random.RandomState(seed).randint(2**31)  # the draw of the default model
+    dictionary = grow_dictionary(
+        bank.standardise(train.descriptors),
+        codes,
+        rounds=settings.rounds,
+        leaves=settings.leaves,
+        rate=settings.rate,
+        jobs=settings.jobs,
+        rng=np.random.default_rng(number),
+    )
     chosen = choose_evenly(codes, settings.known_views, np.random.default_rng(seed))
     categorizer = Categorizer(
         categories=tuple(categories),
@@ -108,7 +115,7 @@ def fit_categorizer(
         bank=bank,
         forest=dictionary.forest,
         votes=dictionary.votes,
-        linear=np.zeros((dictionary.bias.size, bank.width)),
+        linear=np.zeros((dictionary.bias.size, bank.mean.size)),
         bias=dictionary.bias,
         temperature=1.0,
         threshold=0.0,
@@ -119,46 +126,10 @@ def fit_categorizer(
     return calibrate(categorizer, held_out, rejected=settings.rejected)
 
 
-def fit_chain(
-    descriptors: F4,
-    codes: I4,
-    blocks: Mapping[str, slice],
-    settings: LearningSettings,
-    *,
-    seed: int,
-) -> tuple[FeatureBank, Dictionary]:
-    """Fit the features with densities, then grow the boosted dictionary on them.
-
-    Parameters
-    ----------
-    descriptors : (n, d).
-    codes : (n,) from `encode`; -1, unknown shapes, gets its own trees and logit, after
-        those of the categories.
-    blocks : range of each block in the descriptor, by name.
-    """
-    number = np.random.RandomState(seed).randint(2**31)  # the draw of the default model
-    bank = fit_bank(
-        descriptors,
-        codes,
-        [blocks[name] for name in settings.blocks or blocks],
-        kernels=settings.kernels,
-        rng=np.random.default_rng(number),
-    )
-    dictionary = grow_dictionary(
-        bank.features(descriptors),
-        np.where(codes < 0, codes.max() + 1, codes),
-        rounds=settings.rounds,
-        leaves=settings.leaves,
-        rate=settings.rate,
-        jobs=settings.jobs,
-        rng=np.random.default_rng(number),
-    )
-    return bank, dictionary
-
-
 def _notes_of(settings: LearningSettings) -> dict[str, Any]:
     """Return the settings that affect the model: all except the number of jobs."""
-    return {name: value for name, value in asdict(settings).items() if name != "jobs"}
+    notes = {name: value for name, value in asdict(settings).items() if name != "jobs"}
+    return notes | {"kernels": 0}  # of Parzen densities, which are gone; the model's id covers it
 
 
 def calibrate(categorizer: Categorizer, held_out: Examples, *, rejected: float) -> Categorizer:
