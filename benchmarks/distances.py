@@ -38,7 +38,7 @@ def judge(world: World, sensor: Sensor, range_m: tuple[float, float], seed: int)
     seen = object_masks(labels)
     matches = match_masks([c.indices for c in scene.candidates], seen)
     best = np.zeros(len(seen))
-    for found, k in matches.pairs:
+    for found, k in matches.pairs.items():
         best[k] = matches.f[found, k]
     best = best[[len(mask) >= SEEN_PIXELS for mask in seen]]
     off = [np.mean(labels[c.indices] >= FIRST_OBJECT_LABEL) <= 0.5 for c in scene.candidates]

@@ -57,7 +57,7 @@ def judge(
         overlap += matches.overlap
         found += [
             Judged(masks[k][0], seen[row])
-            for row, k in matches.pairs
+            for row, k in matches.pairs.items()
             if matches.f[row, k] >= MATCHED_F
         ]
     return found, overlap

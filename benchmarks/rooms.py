@@ -66,9 +66,11 @@ def count(detections: list[Array], labels: Array) -> Counts:
     on_objects = [float(np.mean(labels[d] >= FIRST_OBJECT_LABEL)) > 0.5 for d in detections]
     seen = object_masks(labels)
     matches = match_masks(detections, seen)
-    kept = {row for row, _ in matches.pairs if on_objects[row]}
+    kept = {row for row in matches.pairs if on_objects[row]}
     listed = [k for k, mask in enumerate(seen) if len(mask) >= SEEN_PIXELS]
-    found = [k for row, k in matches.pairs if k in listed and matches.f[row, k] >= MATCHED_F]
+    found = [
+        k for row, k in matches.pairs.items() if k in listed and matches.f[row, k] >= MATCHED_F
+    ]
     pieces = sum(on_objects) - len(kept)
     elsewhere = len(detections) - sum(on_objects)
     return Counts(1, len(detections), elsewhere, pieces, len(listed), len(found))

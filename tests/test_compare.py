@@ -29,10 +29,9 @@ from shapecat.evaluation.comparison.comparing import (
     Comparison,
     _compare_frame,
     _kind,
-    _Tally,
     compare,
 )
-from shapecat.evaluation.comparison.figures import Pairs, figures_of
+from shapecat.evaluation.comparison.figures import Tally, figures_of
 from shapecat.evaluation.comparison.labellings import (
     LabelledItem,
     Labelling,
@@ -41,12 +40,11 @@ from shapecat.evaluation.comparison.labellings import (
 )
 from shapecat.evaluation.comparison.matching import (
     Difference,
-    Matched,
     frame_identities,
     labelled_part,
     match_objects,
 )
-from shapecat.evaluation.comparison.overlap import Overlap, box_iou
+from shapecat.evaluation.comparison.overlap import Matched, Overlap, box_iou
 from shapecat.evaluation.comparison.page import (
     figure_rows,
     format_page,
@@ -315,7 +313,7 @@ def test_table_lists_every_difference_once(shapecat: Run, run: Path, truth: Path
 
 def test_identity_switch_is_counted_once() -> None:
     """After the frame of the switch, the new track counts as the object's own."""
-    tally, cup = _Tally(), LabelledItem(11, "cup")
+    tally, cup = Tally(), LabelledItem(11, "cup")
     kinds = [_kind(tally, LabelledItem(track, "cup"), cup, 0.9) for track in (5, 5, 6, 6, 6, 5, 5)]
 
     assert kinds == [None, None, "identity", None, None, "identity", None]
@@ -650,13 +648,13 @@ def test_labels_of_images_with_another_size_are_refused(side: int, depth: bool) 
     with pytest.raises(
         RecordingError, match=rf"{side} x {side} pixels.*another recording.*--depth"
     ):
-        _compare_frame(_Tally(), ("/d", 0), {"stamp_ns": START}, found, true, frames, 0)
+        _compare_frame(Tally(), ("/d", 0), {"stamp_ns": START}, found, true, frames, 0)
 
 
 def test_picture_of_each_part_shows_its_worst_frame() -> None:
     """Of the frames in a twelfth of the run, the one with most differences is shown."""
     masks = np.arange(0, 20), np.arange(40, 90)
-    tally = _Tally()
+    tally = Tally()
     for k, names in enumerate((("can", "cup"), ("can", "can"), ("cup", "can"))):
         true = tuple(LabelledItem(j, "cup", mask) for j, mask in enumerate(masks))
         found = tuple(LabelledItem(j, name, masks[j]) for j, name in enumerate(names))
@@ -791,7 +789,7 @@ def test_boxes_are_matched_from_iou_of_a_quarter(shift: float, iou: float | None
     matched = match_objects(found, true)
 
     assert matched.pairs == ({} if iou is None else {0: 1})
-    assert (matched.f, matched.overlap) == (None, None)
+    assert (matched.f, matched.overlap) == (None, Overlap())
     assert iou is None or matched.similarity.tolist()[0] == pytest.approx([0, iou])
 
 
@@ -814,9 +812,7 @@ def test_object_with_wrong_category_counts_as_found() -> None:
     rows = [
         Difference("/d", 0, START, kind, box_iou=iou) for kind, iou in zip(kinds, ious, strict=True)
     ]
-    figures = figures_of(
-        {}, Pairs(), overlap=None, seen=None, rows=rows, categories=NAMES, threshold=0.25
-    )
+    figures = figures_of(Tally(masks=False, rows=rows), NAMES, tracked=False)
 
     assert figures["objects"] == {"true": 6, "detections": 5, "found": 3, "share_found": 0.5}
     assert figures["box_iou"] == {"n": 2, "mean": 0.25}
@@ -824,10 +820,8 @@ def test_object_with_wrong_category_counts_as_found() -> None:
 
 def test_frames_without_objects_have_no_overlap() -> None:
     """An overlap of 0 would say that two empty tables have nothing in common."""
-    options: Any = {"seen": None, "rows": [], "categories": NAMES, "threshold": 0.25}
     for pixels, found in ((0, False), (4, True)):
-        overlap = Overlap(found=pixels)
-        figures = figures_of({}, Pairs(), overlap=overlap, **options)
+        figures = figures_of(Tally(overlap=Overlap(found=pixels)), NAMES, tracked=False)
         assert (figures["overlap"] is not None) == found
 
 
@@ -863,7 +857,7 @@ def test_track_with_two_detections_uses_the_better_one(overlaps: tuple[float, fl
     detections = [LabelledItem(5, "cup"), LabelledItem(None, "cup"), LabelledItem(5, "cup")]
     similarity = np.array([[overlaps[0]], [0.9], [overlaps[1]]])
     frame = frame_identities(
-        detections, [LabelledItem(1, "cup")], Matched({}, similarity, None, None)
+        detections, [LabelledItem(1, "cup")], Matched({}, similarity, None, Overlap())
     )
 
     assert (frame.true, frame.found, frame.similarity.tolist()) == ([1], [5], [[0.8]])

@@ -136,9 +136,9 @@ def test_mask_matching_maximizes_total_overlap() -> None:
     found = [np.arange(4, 14), np.arange(0, 4), np.array([30, 31])]
     matches = match_masks(found, true)
 
-    assert sorted(matches.pairs) == [(0, 1), (1, 0)]
+    assert sorted(matches.pairs.items()) == [(0, 1), (1, 0)]
     assert matches.f[0, 1] == pytest.approx(2 * 4 / (10 + 6))
-    assert matches.iou[1, 0] == pytest.approx(4 / 10)
+    assert matches.similarity[1, 0] == pytest.approx(4 / 10)
     assert matches.overlap.precision == pytest.approx(8 / 16)
     assert matches.overlap.recall == pytest.approx(8 / 16)
     assert (matches.overlap.hits, matches.overlap.objects, matches.overlap.detections) == (0, 2, 3)

@@ -3,15 +3,14 @@
 from collections import Counter
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import ExitStack
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
 from shapecat.errors import OutputError, RecordingError
-from shapecat.evaluation.comparison.figures import Pairs, figures_of
-from shapecat.evaluation.comparison.identities import FrameIdentities
+from shapecat.evaluation.comparison.figures import Tally, figures_of
 from shapecat.evaluation.comparison.labellings import (
     LabelledItem,
     Labelling,
@@ -19,16 +18,12 @@ from shapecat.evaluation.comparison.labellings import (
     numbering_notes,
 )
 from shapecat.evaluation.comparison.matching import (
-    SAME_BOX,
-    SAME_MASK,
     Difference,
-    Matched,
-    frame_identities,
     item_box_iou,
     labelled_part,
     match_objects,
 )
-from shapecat.evaluation.comparison.overlap import MATCHED_F, Overlap
+from shapecat.evaluation.comparison.overlap import MATCHED_F, Matched
 from shapecat.evaluation.comparison.pictures import DifferenceImage, draw_frame
 from shapecat.evaluation.comparison.references import (
     OtherRun,
@@ -80,21 +75,6 @@ class Comparison:
         return {**head, **self.figures, "differences": dict(kinds), "notes": list(self.notes)}
 
 
-@dataclass
-class _Tally:
-    """Counts over all frames."""
-
-    overlap: Overlap = field(default_factory=Overlap)
-    pairs: Pairs = field(default_factory=Pairs)
-    seen: list[FrameIdentities] = field(default_factory=list)
-    rows: list[Difference] = field(default_factory=list)
-    last: dict[int, int] = field(default_factory=dict)
-    pictures: dict[int, DifferenceImage] = field(default_factory=dict)
-    compared: int = 0
-    only_run: int = 0
-    masks: bool = True
-
-
 def compare(
     folder: Path,
     reference: Path,
@@ -119,7 +99,7 @@ def compare(
     other = open_reference(reference, finished.categories, finished.name, digest)
     if isinstance(other, OtherRun):
         _require_same_recording(finished, other)
-    tally, repeated = _Tally(), repeated_stamps(folder)
+    tally, repeated = Tally(), repeated_stamps(folder)
     with ExitStack() as stack:
         clouds, notes = _clouds(finished, recording, stack)
         notes += numbering_notes(other, finished.run["options"]["start_s"])
@@ -134,7 +114,7 @@ def compare(
                     tally, key, row, found, true, clouds, (done - 1) * _PICTURES // total
                 )
             observe("compare", done, total)
-    if not tally.compared:
+    if not tally.frames:
         raise RecordingError(_nothing_in_common(finished, reference, other))
     if _hardly_matches(tally.rows):
         notes.append(
@@ -145,7 +125,14 @@ def compare(
         run=str(folder),
         reference=str(reference),
         kind=other.kind,
-        figures=_figures(tally, other, finished),
+        figures={
+            "frames": {
+                "compared": tally.frames,
+                "only_in_run": tally.only_run,
+                "only_in_reference": max(other.frames - tally.frames, 0),
+            },
+            **figures_of(tally, finished.run["model"]["categories"], tracked=other.tracked),
+        },
         rows=tuple(tally.rows),
         pictures=tuple(tally.pictures[k] for k in sorted(tally.pictures)),
         notes=tuple(notes),
@@ -190,7 +177,7 @@ def _clouds(
 
 
 def _compare_frame(
-    tally: _Tally,
+    tally: Tally,
     key: Key,
     row: Mapping[str, Any],
     found: Labelling,
@@ -199,17 +186,12 @@ def _compare_frame(
     part: int,
 ) -> None:
     """Match the objects of a frame and count agreements and differences."""
-    tally.compared += 1
     frame = next((f for f in clouds if (f.topic, f.index) == key), None)
     _require_same_size(found, true, frame, key)
     found = labelled_part(found, true)
     matched = match_objects(found.items, true.items)
-    tally.masks &= matched.overlap is not None
-    tally.overlap += matched.overlap or Overlap()
     rows = list(_differences(tally, key, row["stamp_ns"], found.items, true.items, matched))
-    tally.rows += rows
-    tally.pairs.add(found.items, true.items, matched)
-    tally.seen.append(frame_identities(found.items, true.items, matched))
+    tally.add(found.items, true.items, matched, rows)
     differing = [item for item in rows if item.difference]
     severity = len(differing) + 1 - float(np.mean([item.iou or 0 for item in rows] or [1]))
     best = tally.pictures.get(part)
@@ -248,7 +230,7 @@ def _require_same_size(found: Labelling, true: Labelling, frame: Frame | None, k
 
 
 def _differences(
-    tally: _Tally,
+    tally: Tally,
     key: Key,
     stamp_ns: int,
     found: Sequence[LabelledItem],
@@ -284,31 +266,14 @@ def _differences(
             yield Difference(*head, "missed", true_track=b.track, true_category=b.category)
 
 
-def _kind(tally: _Tally, a: LabelledItem, b: LabelledItem, f: float | None) -> str | None:
+def _kind(tally: Tally, a: LabelledItem, b: LabelledItem, f: float | None) -> str | None:
     """Return the most serious difference of a pair."""
     switched = False
     if a.track is not None and b.track is not None:
-        switched = tally.last.get(b.track, a.track) != a.track
-        tally.last[b.track] = a.track
+        switched = tally.last_tracks.get(b.track, a.track) != a.track
+        tally.last_tracks[b.track] = a.track
     if b.decidable and a.category != b.category:
         return "category"
     if switched:
         return "identity"
     return "outline" if f is not None and f < MATCHED_F else None
-
-
-def _figures(tally: _Tally, other: Reference, finished: FinishedRun) -> dict[str, Any]:
-    frames = {
-        "compared": tally.compared,
-        "only_in_run": tally.only_run,
-        "only_in_reference": max(other.frames - tally.compared, 0),
-    }
-    return figures_of(
-        frames,
-        tally.pairs,
-        overlap=tally.overlap if tally.masks else None,
-        seen=tally.seen if other.tracked else None,
-        rows=tally.rows,
-        categories=tuple(finished.run["model"]["categories"]),
-        threshold=SAME_MASK if tally.masks else SAME_BOX,
-    )

@@ -1,82 +1,102 @@
-"""Metrics of a comparison, from the counts over its frames."""
+"""What a comparison counts over its frames, and the metrics from these counts."""
 
 from collections import Counter
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, field
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 
 from shapecat.evaluation.comparison.identities import FrameIdentities, judge_identities
 from shapecat.evaluation.comparison.labellings import LabelledItem
-from shapecat.evaluation.comparison.matching import Difference, Matched
-from shapecat.evaluation.comparison.overlap import Overlap
+from shapecat.evaluation.comparison.matching import (
+    SAME_BOX,
+    SAME_MASK,
+    Difference,
+    frame_identities,
+)
+from shapecat.evaluation.comparison.overlap import Matched, Overlap
+from shapecat.evaluation.comparison.pictures import DifferenceImage
 from shapecat.evaluation.metrics import expected_calibration_error
 
-__all__ = ["Pairs", "figures_of"]
+__all__ = ["Tally", "figures_of"]
+
+
+class Pair(NamedTuple):
+    """A matched pair: its true category, the final one, and category and posterior of the view."""
+
+    truth: str
+    label: str
+    view: str
+    posterior: Any
 
 
 @dataclass
-class Pairs:
-    """True and predicted categories of matched objects; ambiguous objects are left out.
+class Tally:
+    """Counts over all compared frames.
 
     Attributes
     ----------
-    truth : true categories.
-    labels : final categories of the tracks.
-    views : categories of the single views.
-    posteriors : posteriors (c,) of the single views.
+    frames : number of frames.
+    masks : whether all objects of all frames have masks.
+    pairs : the matched objects, without ambiguous ones.
+    last_tracks : track that was last matched with each true track.
+    pictures : the frame that differs most in each part of the run, by number.
+    only_run : number of frames that the reference lacks.
     """
 
-    truth: list[str] = field(default_factory=list)
-    labels: list[str] = field(default_factory=list)
-    views: list[str] = field(default_factory=list)
-    posteriors: list[Any] = field(default_factory=list)
+    frames: int = 0
+    masks: bool = True
+    overlap: Overlap = field(default_factory=Overlap)
+    pairs: list[Pair] = field(default_factory=list)
+    identities: list[FrameIdentities] = field(default_factory=list)
+    rows: list[Difference] = field(default_factory=list)
+    last_tracks: dict[int, int] = field(default_factory=dict)
+    pictures: dict[int, DifferenceImage] = field(default_factory=dict)
+    only_run: int = 0
 
     def add(
-        self, found: Sequence[LabelledItem], true: Sequence[LabelledItem], matched: Matched
+        self,
+        found: Sequence[LabelledItem],
+        true: Sequence[LabelledItem],
+        matched: Matched,
+        rows: Sequence[Difference],
     ) -> None:
-        """Add the matched pairs of a frame."""
-        for i, j in matched.pairs.items():
-            if true[j].decidable:
-                self.truth.append(true[j].category)
-                self.labels.append(found[i].category)
-                self.views.append(found[i].view_category)
-                self.posteriors.append(found[i].posterior)
+        """Add a frame."""
+        self.frames += 1
+        self.masks &= matched.f is not None
+        self.overlap += matched.overlap
+        self.identities.append(frame_identities(found, true, matched))
+        self.rows += rows
+        self.pairs += [
+            Pair(true[j].category, found[i].category, found[i].view_category, found[i].posterior)
+            for i, j in matched.pairs.items()
+            if true[j].decidable
+        ]
 
 
-def figures_of(
-    frames: Mapping[str, int],
-    pairs: Pairs,
-    *,
-    overlap: Overlap | None,
-    seen: Sequence[FrameIdentities] | None,
-    rows: Sequence[Difference],
-    categories: Sequence[str],
-    threshold: float,
-) -> dict[str, Any]:
+def figures_of(tally: Tally, categories: Sequence[str], *, tracked: bool) -> dict[str, Any]:
     """Return all metrics by name, as plain values; None if they cannot be computed.
 
     Parameters
     ----------
-    frames : numbers of frames, by name.
-    overlap : overlap of the masks; None without masks.
-    seen : identities of each frame; None without identities.
-    rows : the differences of all frames.
     categories : categories of the model; metrics of categories ignore true objects of any other
-        category.
-    threshold : lowest similarity of a pair that counts as the same object in the tracking metrics.
+        category, such as unknown ones of another run.
+    tracked : whether the true objects have identities over time.
     """
-    boxes = [row.box_iou for row in rows if row.box_iou is not None]
+    overlap = tally.overlap if tally.masks else None
+    boxes = [row.box_iou for row in tally.rows if row.box_iou is not None]
+    threshold = SAME_MASK if tally.masks else SAME_BOX
     return {
-        "frames": dict(frames),
-        "objects": _objects(rows, overlap),
+        "objects": _objects(tally.rows, overlap),
         "overlap": None
         if overlap is None or not overlap.found + overlap.true
         else {name: round(getattr(overlap, name), 4) for name in ("f", "precision", "recall")},
-        "category": _category(pairs, categories),
+        "category": _category(
+            [pair for pair in tally.pairs if pair.truth in categories], categories
+        ),
         "box_iou": {"n": len(boxes), "mean": _mean(boxes)},
-        "tracking": None if seen is None else _tracking(seen, threshold),
+        "tracking": _tracking(tally.identities, threshold) if tracked else None,
     }
 
 
@@ -89,36 +109,33 @@ def _objects(rows: Sequence[Difference], overlap: Overlap | None) -> dict[str, A
     return {"true": true, "detections": detections, "found": hits, "share_found": share}
 
 
-def _category(pairs: Pairs, categories: Sequence[str]) -> dict[str, Any]:
-    """Return the accuracies of final labels and single views, and the views' calibration error.
-
-    True objects outside the model's categories are left out, such as unknown ones of another run.
-    """
-    known = [k for k, name in enumerate(pairs.truth) if name in categories]
-    truth = np.array([categories.index(pairs.truth[k]) for k in known], np.int64)
-    wrong = Counter((pairs.truth[k], pairs.labels[k]) for k in known)
-    names = [(a, b, count) for (a, b), count in wrong.most_common() if a != b]
-    posteriors = np.array([pairs.posteriors[k] for k in known])
-    error = expected_calibration_error(truth, posteriors) if known else None
+def _category(pairs: Sequence[Pair], categories: Sequence[str]) -> dict[str, Any]:
+    """Return the accuracies of final labels and single views, and the views' calibration error."""
+    wrong = Counter((pair.truth, pair.label) for pair in pairs if pair.truth != pair.label)
+    truth = np.array([categories.index(pair.truth) for pair in pairs], np.int64)
+    posteriors = np.array([pair.posterior for pair in pairs])
+    error = expected_calibration_error(truth, posteriors) if pairs else None
+    of_labels = [(pair.truth, pair.label) for pair in pairs]
+    of_views = [(pair.truth, pair.view) for pair in pairs]
     return {
-        "n": len(known),
-        "accuracy": _agreement(pairs.truth, pairs.labels, known),
-        "balanced": _balanced(pairs.truth, pairs.labels, known),
-        "view_accuracy": _agreement(pairs.truth, pairs.views, known),
-        "view_balanced": _balanced(pairs.truth, pairs.views, known),
+        "n": len(pairs),
+        "accuracy": _accuracy(of_labels),
+        "balanced": _balanced(of_labels),
+        "view_accuracy": _accuracy(of_views),
+        "view_balanced": _balanced(of_views),
         "ece": None if error is None else round(error, 4),
-        "taken_for": [{"true": a, "label": b, "n": count} for a, b, count in names],
+        "taken_for": [{"true": a, "label": b, "n": n} for (a, b), n in wrong.most_common()],
     }
 
 
-def _agreement(truth: Sequence[str], said: Sequence[str], known: Sequence[int]) -> float | None:
-    return _mean([truth[k] == said[k] for k in known])
+def _accuracy(pairs: Sequence[tuple[str, str]]) -> float | None:
+    return _mean([true == said for true, said in pairs])
 
 
-def _balanced(truth: Sequence[str], said: Sequence[str], known: Sequence[int]) -> float | None:
+def _balanced(pairs: Sequence[tuple[str, str]]) -> float | None:
     """Return the mean recall over the categories."""
-    names = sorted({truth[k] for k in known})
-    recalls = [_agreement(truth, said, [k for k in known if truth[k] == name]) for name in names]
+    names = sorted({true for true, _ in pairs})
+    recalls = [_accuracy([pair for pair in pairs if pair[0] == name]) for name in names]
     return _mean([value for value in recalls if value is not None])
 
 

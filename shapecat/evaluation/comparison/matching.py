@@ -10,13 +10,12 @@ from scipy.optimize import linear_sum_assignment
 from shapecat.arrays import Bool
 from shapecat.evaluation.comparison.identities import FrameIdentities
 from shapecat.evaluation.comparison.labellings import LabelledItem, Labelling
-from shapecat.evaluation.comparison.overlap import Overlap, box_iou, match_masks
+from shapecat.evaluation.comparison.overlap import Matched, Overlap, box_iou, match_masks
 
 __all__ = [
     "SAME_BOX",
     "SAME_MASK",
     "Difference",
-    "Matched",
     "frame_identities",
     "item_box_iou",
     "labelled_part",
@@ -57,23 +56,6 @@ class Difference(NamedTuple):
     box_iou: float | None = None
 
 
-class Matched(NamedTuple):
-    """Matched objects of a frame.
-
-    Attributes
-    ----------
-    pairs : index of the true object for each matched found object.
-    similarity : (found, true) IoU of the masks, or of the 3D boxes if matched by boxes.
-    f : (found, true) overlap F of the masks; None if matched by boxes.
-    overlap : counts of the masks' pixels; None if matched by boxes.
-    """
-
-    pairs: dict[int, int]
-    similarity: Any
-    f: Any
-    overlap: Overlap | None
-
-
 def match_objects(found: Sequence[LabelledItem], true: Sequence[LabelledItem]) -> Matched:
     """Match the objects of a frame one to one.
 
@@ -84,11 +66,13 @@ def match_objects(found: Sequence[LabelledItem], true: Sequence[LabelledItem]) -
     masks = [[i.pixels for i in items if i.pixels is not None] for items in (found, true)]
     if len(masks[0]) == len(found) and len(masks[1]) == len(true):
         by_mask = match_masks(masks[0], masks[1])
-        same = {i: j for i, j in by_mask.pairs if by_mask.iou[i, j] >= SAME_MASK}
-        return Matched(same, by_mask.iou, by_mask.f, by_mask.overlap)
+        pairs = by_mask.pairs.items()
+        return by_mask._replace(
+            pairs={i: j for i, j in pairs if by_mask.similarity[i, j] >= SAME_MASK}
+        )
     iou = np.array([[item_box_iou(a, b) or 0.0 for b in true] for a in found])
     iou = iou.reshape(len(found), len(true))
-    return Matched(_best(iou), iou, None, None)
+    return Matched(_best(iou), iou, None, Overlap())
 
 
 def _best(iou: Any) -> dict[int, int]:

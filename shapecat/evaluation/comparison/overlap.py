@@ -3,6 +3,7 @@
 from collections.abc import Sequence
 from dataclasses import astuple, dataclass
 from operator import add
+from typing import Any, NamedTuple
 
 import numpy as np
 from scipy.optimize import linear_sum_assignment
@@ -12,7 +13,7 @@ from shapecat.arrays import F8, I4, U4
 from shapecat.geometry import BOX_EDGES, box_corners, rotation_from_quaternion
 from shapecat.types import Box
 
-__all__ = ["MATCHED_F", "MaskMatches", "Overlap", "box_iou", "match_masks"]
+__all__ = ["MATCHED_F", "Matched", "Overlap", "box_iou", "match_masks"]
 
 MATCHED_F = 0.75
 """Lowest overlap F of an object that counts as found."""
@@ -62,24 +63,24 @@ class Overlap:
         return self.hits / max(self.objects, 1)
 
 
-@dataclass(frozen=True)
-class MaskMatches:
-    """Matches of the masks of a frame.
+class Matched(NamedTuple):
+    """Matched objects of a frame.
 
     Attributes
     ----------
-    f, iou : (found, true) overlap of each pair of masks.
-    pairs : (found, true) indices, matched one to one.
-    overlap : counts of the frame.
+    pairs : index of the true object for each matched found object.
+    similarity : (found, true) IoU of the masks, or of the 3D boxes if matched by boxes.
+    f : (found, true) overlap F of the masks; None if matched by boxes.
+    overlap : counts of the masks' pixels; nothing if matched by boxes.
     """
 
-    f: F8
-    iou: F8
-    pairs: tuple[tuple[int, int], ...]
+    pairs: dict[int, int]
+    similarity: Any
+    f: Any
     overlap: Overlap
 
 
-def match_masks(found: Sequence[U4], true: Sequence[U4]) -> MaskMatches:
+def match_masks(found: Sequence[U4], true: Sequence[U4]) -> Matched:
     """Match found and true masks, flat pixel indices (n,), maximising the sum of overlap F.
 
     Source: Xie et al. 2020 (overlap F of unseen objects), after Ochs et al. 2014.
@@ -98,7 +99,7 @@ def match_masks(found: Sequence[U4], true: Sequence[U4]) -> MaskMatches:
         objects=len(true),
         detections=len(found),
     )
-    return MaskMatches(f, iou, tuple(zip(rows.tolist(), columns.tolist(), strict=True)), overlap)
+    return Matched(dict(zip(rows.tolist(), columns.tolist(), strict=True)), iou, f, overlap)
 
 
 def _common(found: Sequence[U4], true: Sequence[U4]) -> I4:
