@@ -6,7 +6,8 @@ from pathlib import Path
 import numpy as np
 
 from shapecat.models.simulated_views import SimulatedView, simulate_mesh
-from shapecat.simulation.shapes.scans import load_mesh, upright_poses, uprighted
+from shapecat.simulation.shapes.scans import load_mesh, uprighted
+from shapecat.simulation.shapes.stable_poses import stable_poses
 
 __all__ = ["mesh_views"]
 
@@ -35,10 +36,10 @@ def mesh_views(
         label = path.parent.name
         rng = np.random.default_rng((seed, number))
         mesh = uprighted(load_mesh(path), label)
-        poses = upright_poses(mesh, label)
+        poses = stable_poses(mesh)
         for resting_pose, share in _PLACEMENTS.items():
             pose_name = "upright" if label in _NEVER_LIE else resting_pose
-            fitting = [stable for stable in poses if stable.name == pose_name] or list(poses)
+            fitting = [stable for stable in poses if stable.name == pose_name] or poses
             for k in range(share * placements):
                 stable = fitting[int(rng.integers(len(fitting)))]
                 name = f"{label}/{path.stem}/{resting_pose}_{k}"

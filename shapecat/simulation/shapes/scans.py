@@ -11,10 +11,9 @@ from shapecat.errors import ConfigError, RecordingError
 from shapecat.geometry import IDENTITY
 from shapecat.simulation.camera.render import geometry, render
 from shapecat.simulation.shapes.mesh import Mesh, moved, standing
-from shapecat.simulation.shapes.stable_poses import StablePose, stable_poses
 from shapecat.types import Camera, Pose
 
-__all__ = ["load_mesh", "upright_poses", "uprighted"]
+__all__ = ["load_mesh", "uprighted"]
 
 _AXES = np.array(
     [
@@ -75,21 +74,6 @@ def uprighted(mesh: Mesh, category: str) -> Mesh:
     else:
         best = int(np.argmax([_hollow(points @ r.T, mesh) for r in _AXES]))
     return standing(moved(mesh, Pose(_AXES[best], np.zeros(3))))
-
-
-def upright_poses(mesh: Mesh, category: str) -> tuple[StablePose, ...]:
-    """Return the stable poses of a mesh turned by `uprighted`, upright ones first.
-
-    Raises
-    ------
-    ValueError : no face of the convex hull is stable.
-    """
-    poses = stable_poses(uprighted(mesh, category))
-    if not poses:
-        msg = f"a {category} that cannot stand or lie"
-        raise ValueError(msg)
-    order = {"upright": 0, "lying": 1, "upside_down": 2}
-    return tuple(sorted(poses, key=lambda stable: order[stable.name]))
 
 
 def _roundness(points: F8) -> float:
