@@ -233,11 +233,12 @@ def test_halo_is_cut_only_from_below() -> None:
 @pytest.mark.skipif(not (DATA / "osd_learn").exists(), reason="no shared data")
 def test_real_objects_are_recognised(model: Categorizer) -> None:
     """Neither training nor the choice of parameters used these Kinect and RealSense images."""
-    from shapecat.models.recorded import detected_views, labelled_views  # noqa: PLC0415
+    from shapecat.models.recorded import detected_views  # noqa: PLC0415
 
-    by_hand = describe_views(labelled_views(DATA / "osd_learn"), settings=Settings())
-    detected = describe_views(detected_views(DATA / "realsense_single"), settings=Settings())
-    kinect, realsense = evaluate(by_hand, model), evaluate(detected, model)
+    kinect, realsense = (
+        evaluate(describe_views(detected_views(DATA / name), settings=Settings()), model)
+        for name in ("osd_learn", "realsense_single")
+    )
 
     assert kinect.n == 89
     assert kinect.accuracy is not None

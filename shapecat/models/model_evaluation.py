@@ -18,7 +18,7 @@ from shapecat.models.arrangements import ArrangementOptions
 from shapecat.models.card import PICTURE, Table, format_table, write_card
 from shapecat.models.meshes import mesh_views
 from shapecat.models.pictures import draw, worst_mistakes
-from shapecat.models.recorded import detected_views, labelled_views
+from shapecat.models.recorded import detected_views
 from shapecat.models.sets import (
     MOSTLY_VISIBLE,
     WELL_SEGMENTED_IOU,
@@ -74,7 +74,8 @@ def evaluate_model(
             mesh_views(meshes, seed=seed + 1, placements=1, cameras=max(FUSED))
         )
     for folder in recorded:
-        rows += _recorded_rows(folder, model)
+        views = describe_views(detected_views(folder), settings=Settings())
+        rows.append(_figures(f"{folder.name}, as detected", evaluate(views, model)))
     tables = [
         Table("Views", ("set", "views", "objects", "unknown"), tuple(_counts(sets))),
         Table("Accuracy on unseen objects, single views", _HEAD, tuple(rows)),
@@ -130,15 +131,6 @@ def _parts(views: SimulatedViews, model: Categorizer) -> list[tuple[str, Report]
         for name, selected in parts.items()
         if selected.any()
     ]
-
-
-def _recorded_rows(folder: Path, model: Categorizer) -> list[tuple[str, ...]]:
-    rows = []
-    if (folder / "labels.npz").exists():
-        views = describe_views(labelled_views(folder), settings=Settings())
-        rows.append(_figures(f"{folder.name}, segmented by hand", evaluate(views, model)))
-    views = describe_views(detected_views(folder), settings=Settings())
-    return [*rows, _figures(f"{folder.name}, as detected", evaluate(views, model))]
 
 
 def _figures(name: str, report: Report) -> tuple[str, ...]:

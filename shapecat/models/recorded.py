@@ -14,7 +14,6 @@ from typing import Any
 
 import numpy as np
 
-from shapecat.arrays import F4, F8
 from shapecat.config import DetectionSettings
 from shapecat.detection import detect
 from shapecat.evaluation import View
@@ -22,29 +21,10 @@ from shapecat.geometry import level_from_sensor, transform
 from shapecat.recordings import choose_streams, frames, open_recording
 from shapecat.types import Frame, Scene
 
-__all__ = ["detected_views", "labelled_views"]
+__all__ = ["detected_views"]
 
 _OVERLAP = 0.5
 """Minimum IoU of the masks of a detection and its object."""
-_STACKED_M = 0.025
-"""Height of an object's lowest points above the table from which it stands on another object."""
-
-
-def labelled_views(folder: Path) -> Iterator[View]:
-    """Yield the unambiguous objects of a folder, segmented by its label images."""
-    labels = np.load(folder / "labels.npz", allow_pickle=False)
-    images = labels[labels.files[0]]
-    for number, (frame, truth) in enumerate(_frames(folder)):
-        image = images[number].reshape(-1)
-        up, offset = _table(frame, image)
-        for item in truth["objects"]:
-            if item["ambiguous"]:
-                continue
-            points = _valid_points(frame, np.flatnonzero(np.isin(image, item["parts"])))
-            lowest = float(np.quantile(points @ up - offset, 0.02))
-            support = offset + (lowest if lowest > _STACKED_M else 0.0)
-            name = f"{truth['scene']}_{item['label']}"
-            yield _view(points, up, support, item["category"], name)
 
 
 def detected_views(folder: Path) -> Iterator[View]:
@@ -66,10 +46,11 @@ def detected_views(folder: Path) -> Iterator[View]:
             if match is None:
                 continue
             candidate = scene.candidates[match]
-            points = _valid_points(frame, candidate.indices)
-            support = scene.support_offset(candidate)
+            points = frame.xyz(candidate.indices)
+            points = points[np.isfinite(points[:, 0])]
+            level = level_from_sensor(scene.up, scene.support_offset(candidate), points)
             name = f"{truth['scene']}_{item.get('label', 0)}"
-            yield _view(points, scene.up, support, item["category"], name)
+            yield View(transform(level, points), level.translation, item["category"], name)
 
 
 def _frames(folder: Path) -> Iterator[tuple[Frame, dict[str, Any]]]:
@@ -79,39 +60,6 @@ def _frames(folder: Path) -> Iterator[tuple[Frame, dict[str, Any]]]:
     with open_recording(folder / "depth.mcap") as recording:
         for frame in frames(recording, choose_streams(recording, ()), skipped=skipped):
             yield frame, by_stamp[frame.stamp_ns]
-
-
-def _valid_points(frame: Frame, indices: np.ndarray) -> F4:
-    points = frame.xyz(indices)
-    return points[np.isfinite(points[:, 0])]
-
-
-def _view(points: F4, up: F8, support: float, category: str, instance: str) -> View:
-    level = level_from_sensor(up, support, points)
-    return View(transform(level, points), level.translation, category, instance)
-
-
-def _table(frame: Frame, image: np.ndarray) -> tuple[F8, float]:
-    """Return the up direction (3,) and the offset, metres, of the table's plane.
-
-    Both are in the sensor frame. The plane is fitted by RANSAC, then by least squares.
-    """
-    counts = np.bincount(image[(image > 0) & (image < 10)], minlength=10)
-    points = _valid_points(frame, np.flatnonzero(image == counts.argmax())).astype(np.float64)
-    rng = np.random.default_rng(0)
-    sample = points[rng.integers(0, len(points), 4000)]
-    best, best_count = sample[:3], -1
-    for _ in range(200):
-        three = points[rng.integers(0, len(points), 3)]
-        normal = np.cross(three[1] - three[0], three[2] - three[0])
-        normal /= np.linalg.norm(normal) + 1e-12
-        inliers = np.abs((sample - three[0]) @ normal) < 0.006
-        if inliers.sum() > best_count:
-            best, best_count = sample[inliers], int(inliers.sum())
-    centre = best.mean(axis=0)
-    normal = np.linalg.svd(best - centre, full_matrices=False)[2][2]
-    normal = normal * -np.sign(normal @ centre)  # the sensor is above the table
-    return normal, float(normal @ centre)
 
 
 def _best_overlap(scene: Scene, image: np.ndarray, item: dict[str, Any]) -> int | None:
