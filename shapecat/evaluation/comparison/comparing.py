@@ -146,7 +146,7 @@ def _require_same_recording(finished: FinishedRun, other: OtherRun) -> None:
         raise OutputError(msg)
 
 
-def _nothing_in_common(finished: FinishedRun, reference: Path, other: Reference) -> str:
+def _nothing_in_common(finished: FinishedRun, reference: Path, other: Reference[Any]) -> str:
     stamps = [row["stamp_ns"] for _, row, _ in run_labellings(finished)]
     own = f"stamps {min(stamps)} to {max(stamps)}" if stamps else "none"
     return (

@@ -5,7 +5,7 @@ from collections import Counter
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TypeVar
+from typing import Any, Generic, TypeVar
 
 from shapecat.arrays import F4, U4, Bool
 from shapecat.errors import RecordingError
@@ -69,32 +69,59 @@ class Labelling:
     ignored: Bool | None = None
 
 
-class Reference(ABC):
-    """A reference for comparisons; frames are requested in recording order."""
+class Reference(ABC, Generic[_Frame]):
+    """A reference for comparisons; frames are requested in recording order.
+
+    Parameters
+    ----------
+    path : of the reference, for messages.
+    frames : entries of the frames, as for `index_frames`.
+
+    Raises
+    ------
+    RecordingError : two entries are of the same frame.
+    """
 
     kind: str
     """Kind of the reference, in words."""
-    frames: int
-    """Number of frames."""
+    unit = "frames"
+    """What timestamps or numbers count."""
     tracked: bool = False
     """Whether objects have identities over time."""
     numbered: bool = False
     """Whether frames are named by their numbers alone."""
 
-    @abstractmethod
+    def __init__(self, path: Path, frames: Iterable[tuple[Place, _Frame]]) -> None:
+        entries = list(frames)
+        self.path = path
+        self.frames = len(entries)
+        """Number of frames."""
+        self._index = index_frames(path, entries)
+
     def at(self, key: Key, stamp_ns: int, *, repeated: bool = False) -> Labelling | None:
         """Return the objects of a frame; None if the reference lacks this frame.
 
         ``key`` is the topic and the number of the frame, ``stamp_ns`` its timestamp; ``repeated``
         is whether other frames of its topic have the same timestamp.
+
+        Raises
+        ------
+        RecordingError, OutputError : the labels of the frame are damaged.
         """
+        entry = find_frame(self._index, key, stamp_ns, repeated=repeated)
+        return None if entry is None else self.labelling(entry)
 
     @abstractmethod
+    def labelling(self, entry: _Frame) -> Labelling:
+        """Return the objects of a frame; raise as `at`."""
+
     def describe_frames(self) -> str:
         """Describe the range of frames in a few words."""
+        numbers = [number for _, number, _ in self._index]
+        return f"{self.unit} {min(numbers)} to {max(numbers)}" if numbers else f"no {self.unit}"
 
 
-def numbering_notes(other: Reference, start_s: float | None) -> list[str]:
+def numbering_notes(other: Reference[Any], start_s: float | None) -> list[str]:
     """Return a remark if the numbers of frames may count from another frame than the run's.
 
     ``start_s`` is where the run began in its recording, None for the beginning.

@@ -15,8 +15,6 @@ from shapecat.evaluation.comparison.labellings import (
     LabelledItem,
     Labelling,
     Reference,
-    find_frame,
-    index_frames,
 )
 from shapecat.evaluation.comparison.references_coco import CocoLabels
 from shapecat.evaluation.comparison.references_kitti import KittiLabels
@@ -41,7 +39,7 @@ __all__ = [
 
 def open_reference(
     path: Path, categories: Sequence[str] = (), run: str = "", digest: str = ""
-) -> Reference:
+) -> Reference[Any]:
     """Open a reference.
 
     Parameters
@@ -80,50 +78,34 @@ def open_reference(
         raise RecordingError(msg) from error
 
 
-class SimulatedTruth(Reference):
+class SimulatedTruth(Reference[dict[str, Any]]):
     """Ground truth of `shapecat simulate`: NAME.truth.json and NAME.labels.npz.
 
     Objects of which too few pixels are visible are ignored.
     """
 
-    kind = "ground truth of each pixel"
+    kind, unit = "ground truth of each pixel", "stamps"
 
     def __init__(self, path: Path, content: list[dict[str, Any]]) -> None:
-        self._path = path
-        self._by_stamp = {int(entry["stamp_ns"]): entry for entry in content}
-        self.frames = len(content)
+        super().__init__(path, (((None, int(entry["stamp_ns"]), None), entry) for entry in content))
         objects = [item for entry in content for item in entry["objects"]]
         self.tracked = bool(objects) and all("track" in item for item in objects)
         labels = path.with_name(f"{path.name.removesuffix('truth.json')}labels.npz")
         self._labels = _LabelImages(labels)
 
-    def at(
-        self,
-        key: Key,  # noqa: ARG002  stamps are enough
-        stamp_ns: int,
-        *,
-        repeated: bool = False,  # noqa: ARG002  the simulator repeats none
-    ) -> Labelling | None:
-        """Return the objects of a frame; None if the ground truth lacks this frame.
+    def labelling(self, entry: dict[str, Any]) -> Labelling:
+        """Return the objects of an entry.
 
         Raises
         ------
         RecordingError : an object lacks a field or has a wrong one, or its image is damaged.
         """
-        entry = self._by_stamp.get(stamp_ns)
-        if entry is None:
-            return None
         try:
             return _true_labelling(entry, self._labels.read(int(entry["frame"])))
         except (KeyError, TypeError, ValueError, AttributeError) as error:
             reason = f"lacks {error}" if isinstance(error, KeyError) else f"is damaged ({error})"
-            msg = f"{self._path}: the frame with stamp {stamp_ns} {reason}"
+            msg = f"{self.path}: the frame with stamp {entry['stamp_ns']} {reason}"
             raise RecordingError(msg) from error
-
-    def describe_frames(self) -> str:
-        """Return the range of timestamps."""
-        stamps = list(self._by_stamp)
-        return f"stamps {min(stamps)} to {max(stamps)}" if stamps else "no frames"
 
 
 def _true_labelling(entry: Mapping[str, Any], image: U1) -> Labelling:
@@ -196,41 +178,35 @@ def _image_shape(file: IO[bytes]) -> tuple[int, int, int]:
     return shape[0], shape[1], shape[2]
 
 
-class OtherRun(Reference):
+class OtherRun(Reference[Key]):
     """Another run of the same recording, whose final labels count as the truth."""
 
-    kind, tracked = "another run", True
+    kind, unit, tracked = "another run", "stamps", True
 
     def __init__(self, folder: Path) -> None:
         self.finished = read_complete(folder)
-        frames = list(read_stamps(folder))
-        self._stamps = [stamp for _, stamp in frames]
-        self._keys = index_frames(folder, (((key[0], stamp, key[1]), key) for key, stamp in frames))
-        self.frames = len(frames)
+        super().__init__(
+            folder, (((key[0], stamp, key[1]), key) for key, stamp in read_stamps(folder))
+        )
         self._rest = run_labellings(self.finished)
 
-    def at(self, key: Key, stamp_ns: int, *, repeated: bool = False) -> Labelling | None:
-        """Return the objects of a frame; None if the other run lacks this frame.
+    def labelling(self, entry: Key) -> Labelling:
+        """Return the objects of a frame of the other run.
 
         Raises
         ------
         OutputError : the two runs list their frames in different orders.
         """
-        wanted = find_frame(self._keys, key, stamp_ns, repeated=repeated)
-        if wanted is None:
-            return None
         for other, _, labelling in self._rest:
-            if other == wanted:
+            if other == entry:
                 return labelling
         msg = f"{self.finished.folder}: its frames are in a different order; process it again"
         raise OutputError(msg)
 
     def describe_frames(self) -> str:
         """Return the topics and the range of timestamps."""
-        topics = sorted({topic for topic, *_ in self._keys if topic is not None})
-        if not topics:
-            return "no frames"
-        return f"frames of {', '.join(topics)}, stamps {min(self._stamps)} to {max(self._stamps)}"
+        topics = ", ".join(sorted({str(topic) for topic, *_ in self._index}))
+        return f"frames of {topics}, {super().describe_frames()}" if topics else "no frames"
 
 
 def repeated_stamps(folder: Path) -> set[tuple[str, int]]:

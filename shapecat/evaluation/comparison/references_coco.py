@@ -15,10 +15,7 @@ from shapecat.evaluation.comparison.labellings import (
     Labelling,
     Place,
     Reference,
-    find_frame,
-    index_frames,
 )
-from shapecat.runs.tables.reading import Key
 
 __all__ = ["CocoLabels", "decode_rle", "filled_polygon"]
 
@@ -36,7 +33,7 @@ class _Image(NamedTuple):
     width: int
 
 
-class CocoLabels(Reference):
+class CocoLabels(Reference[_Image]):
     """Masks of a COCO file, as polygons or run lengths.
 
     An image names its frame by ``stamp_ns`` (with ``frame`` where stamps repeat), by ``frame``, or
@@ -46,12 +43,11 @@ class CocoLabels(Reference):
     equal names, the one with the ``digest`` of its recording.
     """
 
-    kind = "COCO labels"
+    kind, unit = "COCO labels", "images"
 
     def __init__(
         self, path: Path, content: Mapping[str, Any], run: str = "", digest: str = ""
     ) -> None:
-        self._path = path
         names = {item["id"]: str(item["name"]) for item in content["categories"]}
         self._labels = defaultdict(list)
         for item in content["annotations"]:
@@ -60,25 +56,21 @@ class CocoLabels(Reference):
         same = [image for image in images if image.get("digest") == digest]
         images = same or images
         sized = (_Image(image["id"], int(image["height"]), int(image["width"])) for image in images)
-        self._images = index_frames(path, zip(map(_place_of, images), sized, strict=True))
-        self.frames = len(images)
+        super().__init__(path, zip(map(_place_of, images), sized, strict=True))
         self.numbered = any(map(_is_numbered, images))
         items = [item for some in self._labels.values() for item in some]
         self.tracked = bool(items) and all(_track_of(item) is not None for item in items)
 
-    def at(self, key: Key, stamp_ns: int, *, repeated: bool = False) -> Labelling | None:
-        """Return the objects of a frame; None if the labels lack this frame.
+    def labelling(self, entry: _Image) -> Labelling:
+        """Return the objects of an image.
 
         Raises
         ------
         RecordingError : the image size or a mask is invalid.
         """
-        image = find_frame(self._images, key, stamp_ns, repeated=repeated)
-        if image is None:
-            return None
-        name, height, width = image
+        name, height, width = entry
         if not 0 < height * width <= _MOST_PIXELS:
-            msg = f"{self._path}: image {name} is {width}×{height}"
+            msg = f"{self.path}: image {name} is {width}×{height}"
             raise RecordingError(msg)
         items = (self._item(item, height, width) for item in self._labels[name])
         return Labelling(tuple(items), None, (height, width))
@@ -87,7 +79,7 @@ class CocoLabels(Reference):
         try:
             mask = _mask(item["segmentation"], height, width)
         except (KeyError, ValueError, TypeError, IndexError) as error:
-            msg = f"{self._path}: annotation {item.get('id')} has no readable mask ({error!r})"
+            msg = f"{self.path}: annotation {item.get('id')} has no readable mask ({error!r})"
             raise RecordingError(msg) from error
         return LabelledItem(
             track=_track_of(item),
@@ -95,11 +87,6 @@ class CocoLabels(Reference):
             pixels=np.flatnonzero(mask),
             decidable=not item.get("iscrowd"),
         )
-
-    def describe_frames(self) -> str:
-        """Return the range of timestamps or frame numbers."""
-        numbers = [number for _, number, _ in self._images]
-        return f"images {min(numbers)} to {max(numbers)}" if numbers else "no images"
 
 
 def _track_of(item: Mapping[str, Any]) -> int | None:

@@ -13,18 +13,15 @@ from shapecat.evaluation.comparison.labellings import (
     Labelling,
     Place,
     Reference,
-    find_frame,
-    index_frames,
 )
 from shapecat.geometry import quaternion_from_rotation
 from shapecat.outputs.exports.kitti import kitti_type
-from shapecat.runs.tables.reading import Key
 from shapecat.types import Box
 
 __all__ = ["KittiLabels"]
 
 
-class KittiLabels(Reference):
+class KittiLabels(Reference[str]):
     """Boxes of KITTI labels, without masks and identities.
 
     ``frames.csv`` gives the timestamp of each label file, its frame number where timestamps
@@ -40,7 +37,6 @@ class KittiLabels(Reference):
     kind = "KITTI labels"
 
     def __init__(self, folder: Path, categories: Sequence[str] = ()) -> None:
-        self._folder = folder
         self._categories = {kitti_type(name): name for name in reversed(categories)}
         numbers = sorted(path.stem for path in (folder / "label_2").glob("*.txt"))
         try:
@@ -50,22 +46,18 @@ class KittiLabels(Reference):
         except (OSError, ValueError, KeyError) as error:
             msg = f"{folder}: not a folder of KITTI labels ({error})"
             raise RecordingError(msg) from error
-        self._names = index_frames(folder, names)
-        self.frames = len(names)
+        super().__init__(folder, names)
 
-    def at(self, key: Key, stamp_ns: int, *, repeated: bool = False) -> Labelling | None:
-        """Return the objects of a frame; None if the labels lack this frame.
+    def labelling(self, entry: str) -> Labelling:
+        """Return the objects of the label file with this name.
 
         Raises
         ------
         RecordingError : a label or calibration file is missing or damaged.
         """
-        name = find_frame(self._names, key, stamp_ns, repeated=repeated)
-        if name is None:
-            return None
-        path = self._folder / "label_2" / f"{name}.txt"
+        path = self.path / "label_2" / f"{entry}.txt"
         try:
-            turn = _sensor_from_rectified(self._folder / "calib" / f"{name}.txt")
+            turn = _sensor_from_rectified(self.path / "calib" / f"{entry}.txt")
             lines = path.read_text("utf-8").splitlines()
             items = [self._item(line.split(), turn) for line in lines if line.strip()]
         except (OSError, ValueError, IndexError, np.linalg.LinAlgError) as error:
@@ -76,11 +68,6 @@ class KittiLabels(Reference):
     def _item(self, words: list[str], turn: F8) -> LabelledItem:
         category = self._categories.get(words[0], words[0].replace("_", " "))
         return LabelledItem(track=None, category=category, box=_box(words, turn))
-
-    def describe_frames(self) -> str:
-        """Return the range of timestamps or frame numbers."""
-        known = [number for _, number, _ in self._names]
-        return f"frames {min(known)} to {max(known)}" if known else "no frames"
 
 
 def _listed(path: Path) -> list[tuple[Place, str]]:
