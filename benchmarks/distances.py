@@ -14,13 +14,12 @@ import click
 import numpy as np
 
 from benchmarks.measure import markdown
-from benchmarks.scenes import SEEN_PIXELS, detected, object_masks
-from shapecat.evaluation.comparison.overlap import MATCHED_F, match_masks
+from benchmarks.rooms import Counts, count
+from benchmarks.scenes import detected
 from shapecat.models.viewpoints import random_viewpoint
 from shapecat.simulation import Sensor, World, make_scene, render_frame
 from shapecat.simulation.camera.presets import PRESETS
 from shapecat.simulation.scenes.kinds import SceneKind
-from shapecat.simulation.scenes.worlds import FIRST_OBJECT_LABEL
 
 KINDS: tuple[SceneKind, ...] = ("tabletop", "clutter", "pile")
 RANGES_M = ((0.3, 0.45), (0.45, 0.7), (0.7, 1.1), (1.1, 1.7), (1.7, 2.6))
@@ -29,34 +28,25 @@ MARGIN_M = 0.05
 HEAD = ("distance, m", "frames", "objects", "found", "mean F", "surplus a frame")
 
 
-def judge(world: World, sensor: Sensor, range_m: tuple[float, float], seed: int) -> np.ndarray:
-    """Return the number of objects, of those found, the sum of their F, and the surplus."""
+def judge(world: World, sensor: Sensor, range_m: tuple[float, float], seed: int) -> Counts:
+    """Detect objects from a random direction and count them."""
     rng = np.random.default_rng(seed)
     view = random_viewpoint(world, sensor, rng, distance_m=range_m)
     frame, labels = render_frame(world, view, rng=rng, sensor=sensor)
-    scene, labels = detected(frame), labels.reshape(-1)
-    seen = object_masks(labels)
-    matches = match_masks([c.indices for c in scene.candidates], seen)
-    best = np.zeros(len(seen))
-    for found, k in matches.pairs.items():
-        best[k] = matches.f[found, k]
-    best = best[[len(mask) >= SEEN_PIXELS for mask in seen]]
-    off = [np.mean(labels[c.indices] >= FIRST_OBJECT_LABEL) <= 0.5 for c in scene.candidates]
-    return np.array([best.size, (best >= MATCHED_F).sum(), best.sum(), sum(off)])
+    return count([c.indices for c in detected(frame).candidates], labels.reshape(-1))
 
 
 def row(worlds: Sequence[World], first: int, range_m: tuple[float, float]) -> tuple[Any, ...]:
     """Return the row of the table for a range of distances, metres."""
     sensors = [s for s in PRESETS.values() if s.nearest_m < range_m[1] - MARGIN_M]
-    total, count = np.zeros(4), len(worlds)
+    total = Counts(0, 0, 0, 0, 0, 0, 0.0)
     for k, world in enumerate(worlds):
         sensor = sensors[k // len(KINDS) % len(sensors)]
         total += judge(world, sensor, range_m, first + k)
-    objects, found, overlap, surplus = total
-    share, mean = found / max(objects, 1), overlap / max(objects, 1)
+    share, mean = (value / max(total.objects, 1) for value in (total.found, total.f))
     low, high = range_m
-    figures = (f"{share:.3f}", f"{mean:.3f}", f"{surplus / max(count, 1):.2f}")
-    return (f"{low} to {high}", count, int(objects), *figures)
+    figures = (f"{share:.3f}", f"{mean:.3f}", f"{total.elsewhere / max(total.frames, 1):.2f}")
+    return (f"{low} to {high}", total.frames, total.objects, *figures)
 
 
 @click.command()

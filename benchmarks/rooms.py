@@ -33,6 +33,7 @@ class Counts(NamedTuple):
     elsewhere : detections on no object.
     pieces : detections of an object in addition to the best one.
     objects, found : number of true objects, and of those found.
+    f : sum of the overlap F of all objects, 0 for missed ones.
     """
 
     frames: int
@@ -41,10 +42,11 @@ class Counts(NamedTuple):
     pieces: int
     objects: int
     found: int
+    f: float
 
     def __add__(self, other: Any) -> "Counts":
         """Return the sums."""
-        return Counts(*(int(a) + int(b) for a, b in zip(self, other, strict=True)))
+        return Counts(*(a + b for a, b in zip(self, other, strict=True)))
 
     def row(self, name: str) -> tuple[Any, ...]:
         """Return a row of the table."""
@@ -68,12 +70,11 @@ def count(detections: list[Array], labels: Array) -> Counts:
     matches = match_masks(detections, seen)
     kept = {row for row in matches.pairs if on_objects[row]}
     listed = [k for k, mask in enumerate(seen) if len(mask) >= SEEN_PIXELS]
-    found = [
-        k for row, k in matches.pairs.items() if k in listed and matches.f[row, k] >= MATCHED_F
-    ]
+    f = [float(matches.f[row, k]) for row, k in matches.pairs.items() if k in listed]
+    found = sum(value >= MATCHED_F for value in f)
     pieces = sum(on_objects) - len(kept)
     elsewhere = len(detections) - sum(on_objects)
-    return Counts(1, len(detections), elsewhere, pieces, len(listed), len(found))
+    return Counts(1, len(detections), elsewhere, pieces, len(listed), found, sum(f))
 
 
 @click.command()
@@ -85,7 +86,7 @@ def count(detections: list[Array], labels: Array) -> Counts:
 def main(first: int, rooms: int, model: Path | None) -> None:
     """Count surplus detections in rooms, and print a table."""
     categorizer, settings = load_model(model), Settings()
-    found = {name: Counts(0, 0, 0, 0, 0, 0) for name in PRESETS}
+    found = {name: Counts(0, 0, 0, 0, 0, 0, 0.0) for name in PRESETS}
     for k in range(rooms):
         name = list(PRESETS)[k % len(PRESETS)]
         found[name] += judge(name, first + k, categorizer, settings)
