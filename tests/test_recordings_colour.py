@@ -584,7 +584,10 @@ def test_extrinsics_are_those_of_the_same_camera(
 @pytest.mark.parametrize("container", ["mcap", "ros1", "ros2"])
 def test_simulated_colour_camera_is_equal_in_all_containers(tmp_path: Path, container: Any) -> None:
     from shapecat.simulation import simulate  # noqa: PLC0415  slow to load
-    from shapecat.simulation.camera.colour_camera import COLOUR  # noqa: PLC0415  the same
+    from shapecat.simulation.camera.colour_camera import (  # noqa: PLC0415  the same
+        COLOUR_LENS,
+        DEPTH_FROM_COLOUR,
+    )
 
     path = simulate(tmp_path / "s", format=container, frames=2, seed=4, color=True)
     pairs, warnings = read(path)
@@ -595,8 +598,8 @@ def test_simulated_colour_camera_is_equal_in_all_containers(tmp_path: Path, cont
         assert view.image.stamp_ns == frame.stamp_ns
         assert view.colour_from_depth is not None
         position = -view.colour_from_depth.rotation.T @ view.colour_from_depth.translation
-        np.testing.assert_allclose(position, COLOUR.depth_from_colour.translation, atol=1e-8)
-        assert view.lens == COLOUR.lens
+        np.testing.assert_allclose(position, DEPTH_FROM_COLOUR.translation, atol=1e-8)
+        assert view.lens == COLOUR_LENS
         assert pixels_of(view.image).shape == (720, 960, 3)
 
 

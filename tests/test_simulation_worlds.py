@@ -47,13 +47,15 @@ def test_category_is_ambiguous_if_little_of_object_is_visible(
     """Few pixels are enough, and so is a small share of the side that faces the camera."""
     world = make_scene("tabletop", np.random.default_rng(11), frames=1)
     _, labels = render_frame(world, 0, rng=np.random.default_rng(0), sensor=KINECT)
-    clear = [t for t in frame_truth(world, 0, labels, KINECT.camera).objects if not t["ambiguous"]]
+    clear = [
+        t for t in frame_truth(world, 0, labels, KINECT.camera)["objects"] if not t["ambiguous"]
+    ]
     largest = max(clear, key=lambda one: one["pixels"])
 
     def judged(shown: float) -> dict[str, Any]:
         cut, own = labels.copy(), np.flatnonzero(labels == largest["label"])
         cut.reshape(-1)[own[round(shown * len(own)) :]] = world.supports[0].label
-        found = frame_truth(world, 0, cut, KINECT.camera).objects
+        found = frame_truth(world, 0, cut, KINECT.camera)["objects"]
         return next(one for one in found if one["label"] == largest["label"])
 
     less = judged(0.3)

@@ -11,7 +11,12 @@ import numpy as np
 
 from shapecat.arrays import U1
 from shapecat.geometry import LINK_FROM_OPTICAL, compose, inverse
-from shapecat.simulation.camera.colour_camera import COLOUR, jpeg, render_colour
+from shapecat.simulation.camera.colour_camera import (
+    COLOUR_LENS,
+    DEPTH_FROM_COLOUR,
+    jpeg,
+    render_colour,
+)
 from shapecat.simulation.camera.presets import SENSORS
 from shapecat.simulation.camera.sensors import Sensor
 from shapecat.simulation.camera.views import render_frame
@@ -126,7 +131,7 @@ def record(
         CONTAINERS[format].open(recording) as writer,
         ExitStack() as stack,
     ):
-        cameras = (sensor.camera, COLOUR.lens.pinhole)
+        cameras = (sensor.camera, COLOUR_LENS.pinhole)
         files = [
             stack.enter_context(LabelFile(path, len(world), camera))
             for path, camera in zip(labels, cameras, strict=False)
@@ -155,7 +160,7 @@ def _write_frame(
         raise ValueError(msg)
     if frame.index == 0:
         still = [("camera_link", _OPTICAL, LINK_FROM_OPTICAL)]
-        still += [(_OPTICAL, _COLOUR_OPTICAL, COLOUR.depth_from_colour)] if color else []
+        still += [(_OPTICAL, _COLOUR_OPTICAL, DEPTH_FROM_COLOUR)] if color else []
         writer.write("/tf_static", make.transforms(still, stamp), stamp)
     links = robot_links(world.path[frame.index])
     writer.write("/tf", make.transforms(links, stamp), stamp + _LATENCY_NS // 4)
@@ -175,7 +180,7 @@ def _write_colour(writer: Container, world: World, frame: Frame) -> U1:
     """Write the colour image of a frame; return its pixel labels (h, w)."""
     make, stamp = writer.messages, frame.stamp_ns
     colours, labels = render_colour(world, frame.index)
-    lens, logged = COLOUR.lens, stamp + _LATENCY_NS + _LATENCY_NS // 2
+    lens, logged = COLOUR_LENS, stamp + _LATENCY_NS + _LATENCY_NS // 2
     info = make.camera_info(lens.pinhole, stamp, _COLOUR_OPTICAL, lens.coefficients)
     writer.write("/camera/color/camera_info", info, logged)
     image = make.compressed(jpeg(colours), stamp, _COLOUR_OPTICAL)
@@ -189,7 +194,7 @@ def _truth(world: World, frame: Frame, labels: U1, camera: Camera, seed: int) ->
         "scene": f"sim{seed}",
         "kind": world.kind,
         "stamp_ns": frame.stamp_ns,
-        **vars(frame_truth(world, frame.index, labels, camera)),
+        **frame_truth(world, frame.index, labels, camera),
     }
 
 

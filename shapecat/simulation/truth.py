@@ -1,6 +1,5 @@
 """Ground truth of a frame."""
 
-from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
@@ -11,7 +10,7 @@ from shapecat.simulation.camera.render import alone_pixels
 from shapecat.simulation.scenes.worlds import PlacedObject, Support, World
 from shapecat.types import Camera, Pose
 
-__all__ = ["AMBIGUOUS_PIXELS", "AMBIGUOUS_SHARE", "LISTED_PIXELS", "Truth", "frame_truth"]
+__all__ = ["AMBIGUOUS_PIXELS", "AMBIGUOUS_SHARE", "LISTED_PIXELS", "frame_truth"]
 
 LISTED_PIXELS = 100
 """Objects with fewer visible depth pixels than this are listed as hidden."""
@@ -22,17 +21,8 @@ AMBIGUOUS_SHARE = 0.4
 visible."""
 
 
-@dataclass(frozen=True)
-class Truth:
-    """The ground truth of one frame, as JSON values."""
-
-    objects: list[dict[str, Any]]
-    hidden: list[dict[str, Any]]
-    planes: list[dict[str, Any]]
-
-
-def frame_truth(world: World, frame: int, labels: U1, camera: Camera) -> Truth:
-    """Return the ground truth of a frame.
+def frame_truth(world: World, frame: int, labels: U1, camera: Camera) -> dict[str, Any]:
+    """Return the ``objects``, ``hidden`` objects and ``planes`` of a frame, as JSON values.
 
     Parameters
     ----------
@@ -56,7 +46,7 @@ def frame_truth(world: World, frame: int, labels: U1, camera: Camera) -> Truth:
         for support in world.supports
         if support.holds_objects
     ]
-    return Truth(objects, hidden, planes)
+    return {"objects": objects, "hidden": hidden, "planes": planes}
 
 
 def _object_truth(

@@ -1,8 +1,7 @@
 """A colour camera beside the depth camera, with its own resolution and lens; textured scenes."""
 
 import io
-from dataclasses import dataclass
-from functools import lru_cache
+from functools import cache
 
 import numpy as np
 
@@ -15,24 +14,16 @@ from shapecat.simulation.camera.render import Image, render
 from shapecat.simulation.scenes.worlds import World
 from shapecat.types import Camera, Pose
 
-__all__ = ["COLOUR", "ColourCamera", "jpeg", "render_colour"]
+__all__ = ["COLOUR_LENS", "DEPTH_FROM_COLOUR", "jpeg", "render_colour"]
 
 
-@dataclass(frozen=True)
-class ColourCamera:
-    """A colour camera beside the depth camera, at ``depth_from_colour`` in its optical frame."""
-
-    lens: LensCamera
-    depth_from_colour: Pose
-
-
-COLOUR = ColourCamera(
-    LensCamera(
-        Camera(960, 720, 706.0, 704.0, 483.5, 355.2),
-        "plumb_bob",
-        (0.11, -0.24, 0.0007, -0.0004, 0.08),
-    ),
-    Pose(rotation_from_quaternion((0.004, -0.009, 0.006, 1.0)), np.array([0.05, 0.0015, -0.002])),
+COLOUR_LENS = LensCamera(
+    Camera(960, 720, 706.0, 704.0, 483.5, 355.2),
+    "plumb_bob",
+    (0.11, -0.24, 0.0007, -0.0004, 0.08),
+)
+DEPTH_FROM_COLOUR = Pose(
+    rotation_from_quaternion((0.004, -0.009, 0.006, 1.0)), np.array([0.05, 0.0015, -0.002])
 )
 """Like the colour camera of a RealSense: 5 cm to the right, rotated by a degree, wider."""
 
@@ -48,28 +39,25 @@ _FINE = 2
 
 
 def render_colour(world: World, frame: int) -> tuple[U1, U1]:
-    """Render a frame of a world with the camera `COLOUR` beside the depth camera.
+    """Render a frame of a world with the colour camera beside the depth camera.
 
     Returns
     -------
     The image (h, w, 3), uint8 red, green, blue; and its pixel labels (h, w), uint8, 0 without
     surface.
     """
-    pose = compose(world.path[frame], COLOUR.depth_from_colour)
-    fine, rows, columns = _distortion_map(COLOUR.lens)
+    pose = compose(world.path[frame], DEPTH_FROM_COLOUR)
+    fine, rows, columns = _distortion_map()
     image = render(world.geometry(frame), fine, pose)
     colours = _paint(world, frame, pose, fine, image, rows, columns)
     return colours, world.labels_of(image.mesh_ids[rows, columns])
 
 
-@lru_cache(maxsize=4)  # a recording has one lens
-def _distortion_map(lens: LensCamera) -> tuple[Camera, I4, I4]:
+@cache
+def _distortion_map() -> tuple[Camera, I4, I4]:
     """Return a finer pinhole camera, and its row and column (h, w) for each pixel of the lens."""
-    camera = lens.pinhole
-    rays = undistorted_rays(camera, lens.model, lens.coefficients)
-    if rays is None or np.isnan(rays).any():
-        msg = f"lens {lens} cannot be simulated"
-        raise ValueError(msg)
+    camera = COLOUR_LENS.pinhole
+    rays = np.asarray(undistorted_rays(camera, COLOUR_LENS.model, COLOUR_LENS.coefficients))
     fx, fy = _FINE * camera.fx, _FINE * camera.fy
     low, high = rays.min(axis=(0, 1)), rays.max(axis=(0, 1))
     cx, cy = -np.floor(low * (fx, fy)) + 2
