@@ -14,6 +14,7 @@ import os
 import sys
 import tempfile
 import time
+from dataclasses import replace
 from itertools import cycle, islice
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -22,14 +23,12 @@ import click
 import numpy as np
 
 from benchmarks.measure import markdown
-from shapecat.geometry import LINK_FROM_OPTICAL
 from shapecat.simulation import KINECT, make_scene, render_frame
 from shapecat.simulation.containers import CONTAINERS
-from shapecat.simulation.recorder import robot_links
+from shapecat.simulation.recorder import write_frame
 from shapecat.simulation.scenes.worlds import World
 from shapecat.types import Frame, Pose
 
-OPTICAL = "camera_depth_optical_frame"
 EPOCH_NS, PERIOD_NS = 1_700_000_000_000_000_000, 33_333_333
 SEED = 11
 FEW_S = 0.1  # seconds of recording in the run that measures start-up
@@ -75,19 +74,8 @@ def write(path: Path, views: list[View], frames: int, *, container: str = "mcap"
     path = path.with_name(path.name.removesuffix(suffix) + suffix)
     to_and_fro = cycle([*views, *views[-2:0:-1]])
     with kind(path) as writer:
-        make = writer.messages
-        still = [("camera_link", OPTICAL, LINK_FROM_OPTICAL)]
-        writer.write("/tf_static", make.transforms(still, EPOCH_NS), EPOCH_NS)
         for k, (frame, pose) in enumerate(islice(to_and_fro, frames)):
-            now = EPOCH_NS + k * PERIOD_NS
-            depth = np.round(np.asarray(frame.depth) * 1000) / np.float32(1000)
-            camera = frame.camera
-            if camera is None:
-                raise ValueError
-            writer.write("/tf", make.transforms(robot_links(pose), now), now)
-            info = make.camera_info(camera, now, OPTICAL)
-            writer.write("/camera/depth/camera_info", info, now)
-            writer.write("/camera/depth/image_raw", make.image(depth, now, OPTICAL), now)
+            write_frame(writer, replace(frame, index=k, stamp_ns=EPOCH_NS + k * PERIOD_NS), pose)
     return path
 
 

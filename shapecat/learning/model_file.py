@@ -214,8 +214,6 @@ def _checked(key: str, value: Any, hint: Any, dtype: str | None) -> Any:
     elif hint is float:
         good = isinstance(value, int | float) and not isinstance(value, bool)
         value = float(value) if good else value
-    elif hint is int:
-        good = isinstance(value, int) and not isinstance(value, bool)
     else:
         good = isinstance(value, dict)
     if not good:

@@ -28,7 +28,7 @@ from shapecat.simulation.truth import frame_truth
 from shapecat.system.progress import Observer, ignore
 from shapecat.types import Camera, Frame, Pose
 
-__all__ = ["EPOCH_NS", "record", "robot_links", "simulate"]
+__all__ = ["EPOCH_NS", "record", "robot_links", "simulate", "write_frame"]
 
 EPOCH_NS = 1_700_200_000_000_000_000
 """Timestamp of the first frame."""
@@ -141,7 +141,7 @@ def record(
             frame, image = render_frame(
                 world, index, rng=rng, sensor=sensor, rate_hz=rate_hz, start_ns=EPOCH_NS
             )
-            _write_frame(writer, world, frame, clouds=clouds, color=color)
+            write_frame(writer, frame, world.path[index], clouds=clouds, color=color)
             files[0].append(image)
             if color:
                 files[1].append(_write_colour(writer, world, frame))
@@ -151,9 +151,18 @@ def record(
     return paths[0]
 
 
-def _write_frame(
-    writer: Container, world: World, frame: Frame, *, clouds: bool, color: bool
+def write_frame(
+    writer: Container,
+    frame: Frame,
+    world_from_camera: Pose,
+    *,
+    clouds: bool = False,
+    color: bool = False,
 ) -> None:
+    """Write a depth image and its transforms; those of the first frame hold the static ones, too.
+
+    ``clouds`` and ``color`` are as for `simulate`; the colour image is not written.
+    """
     make, stamp, depth, camera = writer.messages, frame.stamp_ns, frame.depth, frame.camera
     if depth is None or camera is None:
         msg = "a simulated frame is a depth image"
@@ -162,7 +171,7 @@ def _write_frame(
         still = [("camera_link", _OPTICAL, LINK_FROM_OPTICAL)]
         still += [(_OPTICAL, _COLOUR_OPTICAL, DEPTH_FROM_COLOUR)] if color else []
         writer.write("/tf_static", make.transforms(still, stamp), stamp)
-    links = robot_links(world.path[frame.index])
+    links = robot_links(world_from_camera)
     writer.write("/tf", make.transforms(links, stamp), stamp + _LATENCY_NS // 4)
     logged = stamp + _LATENCY_NS
     info = make.camera_info(camera, stamp, _OPTICAL)
