@@ -37,7 +37,6 @@ __all__ = ["evaluate_model"]
 _TRACK_SEED, _TRACK_TABLES = 100_006, 24
 _DRAWN = 20
 """Number of test tables among which to find the worst mistakes."""
-_RESTING_POSES = ("upright", "lying")
 _HEAD = ("", "views", "accuracy", "balanced", "ECE", "known rejected", "unknown rejected", "AUROC")
 _text = partial(figure_text, missing="")
 
@@ -170,24 +169,13 @@ def _fused_table(tracks: dict[str, SimulatedViews], model: Categorizer) -> Table
     """Return a table of the accuracy of several fused views of one placement of an object."""
     rows = []
     for name, views in tracks.items():
-        clear = views.where(clear_views(views))
-        for which in ("any but upside down", "upright", "lying"):
-            selected = clear.where((clear.resting_pose == which) | (which not in _RESTING_POSES))
-            report = evaluate(selected.views, model)
-            singles = (name, which, "1", str(report.n), _text(report.accuracy), _text(report.ece))
-            rows.append(singles)
-            rows += [
-                (
-                    name,
-                    which,
-                    str(item.views),
-                    str(item.groups),
-                    _text(item.accuracy),
-                    _text(item.ece),
-                )
-                for item in report.fused
-            ]
-    head = ("data", "objects", "views fused", "groups", "accuracy", "ECE")
+        report = evaluate(views.where(clear_views(views)).views, model)
+        rows.append((name, "1", str(report.n), _text(report.accuracy), _text(report.ece)))
+        rows += [
+            (name, str(item.views), str(item.groups), _text(item.accuracy), _text(item.ece))
+            for item in report.fused
+        ]
+    head = ("data", "views fused", "groups", "accuracy", "ECE")
     return Table(
         "Several fused views of one placement of an object, fused as in tracks", head, tuple(rows)
     )
