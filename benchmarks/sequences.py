@@ -83,12 +83,11 @@ class View:
 
 
 def make_sequence(folder: Path, kind: SceneKind, seed: int) -> None:
-    """Write a recording, its ground truth, and the tables of its run, unless they exist."""
-    if not (folder / "run").exists():
-        source = simulate(
-            folder / "recording.mcap", scene=kind, frames=FRAMES, seed=seed, rate_hz=RATE_HZ
-        )
-        process(Job(source, folder / "run", mcap=False, rrd=False))
+    """Write a recording, its ground truth, and the tables of its run."""
+    source = simulate(
+        folder / "recording.mcap", scene=kind, frames=FRAMES, seed=seed, rate_hz=RATE_HZ
+    )
+    process(Job(source, folder / "run", mcap=False, rrd=False))
 
 
 def read_truth(folder: Path) -> list[list[Object]]:
@@ -284,11 +283,10 @@ def format_tables(figures: dict[str, Any]) -> str:
 @click.command()
 @click.option("--seeds", default=10, show_default=True, help="Sequences of each kind.")
 @click.option("--first", default=100, show_default=True, help="The first seed.")
-@click.option("--keep", type=click.Path(path_type=Path), help="Keep recordings and runs here.")
-def main(*, seeds: int, first: int, keep: Path | None) -> None:
+def main(*, seeds: int, first: int) -> None:
     """Evaluate tracking on simulated sequences: turntable, moving camera, moving objects."""
     with tempfile.TemporaryDirectory() as temporary:
-        figures = evaluate(keep or Path(temporary), range(first, first + seeds))
+        figures = evaluate(Path(temporary), range(first, first + seeds))
     click.echo(format_tables(figures))
 
 
