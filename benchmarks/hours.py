@@ -10,9 +10,9 @@ removed for a while every few minutes; false detections appear for a few frames.
 import os
 import tempfile
 import time
+from concurrent.futures import ProcessPoolExecutor
 from contextlib import ExitStack
 from multiprocessing import get_context
-from multiprocessing.connection import Connection
 from pathlib import Path
 from typing import Any
 
@@ -107,39 +107,31 @@ def _filled(columns: dict[str, Any], schema: pa.Schema) -> dict[str, Any]:
     return {f.name: columns.get(f.name, pa.nulls(n, f.type)) for f in schema}
 
 
-def _track(folder: Path, answer: Connection) -> None:
-    """Track in this process; send the seconds, the peak memory and the number of tracks."""
+def _track(folder: Path) -> tuple[float, float, int]:
+    """Track in this process; return the seconds, the peak memory (MB) and the number of tracks."""
     begun = time.perf_counter()
     counts = track_run(folder, TrackingSettings(), CATEGORIES)
     seconds = time.perf_counter() - begun
     status = Path("/proc/self/status").read_text("utf-8")
     peak_kb = next(line.split()[1] for line in status.splitlines() if line.startswith("VmHWM"))
-    answer.send(
-        {"seconds": seconds, "peak_mb": int(peak_kb) / 1024, "tracks": sum(counts.values())}
-    )
+    return seconds, int(peak_kb) / 1024, sum(counts.values())
 
 
-def measure(frames: int) -> dict[str, Any]:
-    """Track a synthetic run in a process of its own; return time, memory and number of tracks."""
+def measure(frames: int) -> tuple[float, float, int]:
+    """Track a synthetic run in a process of its own; return as `_track`."""
     with tempfile.TemporaryDirectory() as name:
         make_tables(Path(name), frames)
         os.environ.setdefault("ARROW_DEFAULT_MEMORY_POOL", "system")  # as the command does
-        context = get_context("spawn")
-        here, there = context.Pipe()
-        process = context.Process(target=_track, args=(Path(name), there))
-        process.start()
-        there.close()
-        found: dict[str, Any] = here.recv()
-        process.join()
-    return {"frames": frames, **found}
+        with ProcessPoolExecutor(1, mp_context=get_context("spawn")) as pool:
+            return pool.submit(_track, Path(name)).result()
 
 
 @click.command()
 @click.option("--hours", default=1.0, show_default=True, help="Hours of recording, at 28 Hz.")
 def main(*, hours: float) -> None:
     """Measure the track phase and print a table."""
-    figures = measure(round(hours * PER_HOUR))
-    rows = [(f"{hours:g}", *(round(value, 1) for value in figures.values()))]
+    frames = round(hours * PER_HOUR)
+    rows = [(f"{hours:g}", frames, *(round(value, 1) for value in measure(frames)))]
     columns = ("hours", "frames", "seconds", "peak MB", "tracks")
     click.echo(markdown("The track phase", columns, rows))
 
