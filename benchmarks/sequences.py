@@ -198,7 +198,7 @@ def identities(seen: dict[str, list[FrameIdentities]]) -> dict[str, dict[str, fl
     names = ("idf1", "mota", "hota", "switches", "misses", "false_positives", "objects")
     result = {}
     for kind, frames in seen.items():
-        figures = judge_identities(frames, threshold=SAME).as_dict()
+        figures = judge_identities(frames, threshold=SAME)._asdict()
         result[kind] = {name: round(float(figures[name]), 4) for name in names}
     return result
 

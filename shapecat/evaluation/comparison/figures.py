@@ -140,7 +140,7 @@ def _balanced(pairs: Sequence[tuple[str, str]]) -> float | None:
 
 
 def _tracking(seen: Sequence[FrameIdentities], threshold: float) -> dict[str, Any]:
-    figures = judge_identities(seen, threshold=threshold).as_dict()
+    figures = judge_identities(seen, threshold=threshold)._asdict()
     return {
         name: None if value != value else round(value, 4)  # noqa: PLR0124  NaN
         for name, value in figures.items()

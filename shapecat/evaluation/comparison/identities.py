@@ -2,8 +2,7 @@
 
 from collections import Counter
 from collections.abc import Hashable, Iterable, Mapping, Sequence
-from dataclasses import asdict, dataclass
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 from scipy.optimize import linear_sum_assignment
@@ -30,8 +29,7 @@ class FrameIdentities(NamedTuple):
     similarity: F8
 
 
-@dataclass(frozen=True)
-class Identities:
+class Identities(NamedTuple):
     """Tracking metrics over all frames; NaN if they are undefined."""
 
     idf1: float
@@ -43,10 +41,6 @@ class Identities:
     misses: int
     false_positives: int
     objects: int
-
-    def as_dict(self) -> dict[str, Any]:
-        """Return the metrics by name."""
-        return asdict(self)
 
 
 class _Occurrences(NamedTuple):
