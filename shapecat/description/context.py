@@ -3,7 +3,7 @@
 import numpy as np
 
 from shapecat.arrays import F4, F8
-from shapecat.description.linear import principal_axes
+from shapecat.description.linear import principal_axes, solve
 from shapecat.description.profile import vertical_axis
 from shapecat.description.surface import Surface
 from shapecat.jit import kernel
@@ -74,7 +74,7 @@ def _width(px: F4, py: F4, c: float, s: float) -> float:
 @kernel(inline=True)
 def _sphere(x: F4, y: F4, z: F4, weight: F4) -> tuple[float, float, float]:
     """Fit a sphere, |p|^2 = 2 c.p + k; return residual / radius, radius and z of the centre."""
-    A = np.zeros((4, 5))
+    A, solution = np.zeros((4, 4)), np.zeros(4)
     for i in range(x.size):
         w = weight[i]
         squared = x[i] * x[i] + y[i] * y[i] + z[i] * z[i]
@@ -82,20 +82,11 @@ def _sphere(x: F4, y: F4, z: F4, weight: F4) -> tuple[float, float, float]:
         for a in range(4):
             for b in range(4):
                 A[a, b] += w * row[a] * row[b]
-            A[a, 4] += w * row[a] * squared
+            solution[a] += w * row[a] * squared
     for a in range(4):
         A[a, a] += 1e-4
-    # Gaussian elimination: A is positive definite and needs no pivots
-    for a in range(4):
-        for b in range(a + 1, 4):
-            f = A[b, a] / A[a, a]
-            for c in range(a, 5):
-                A[b, c] -= f * A[a, c]
-    for a in range(3, -1, -1):
-        for c in range(a + 1, 4):
-            A[a, 4] -= A[a, c] * A[c, 4]
-        A[a, 4] /= A[a, a]
-    cx, cy, cz = A[0, 4], A[1, 4], A[2, 4]
+    solve(A, solution)
+    cx, cy, cz = solution[0], solution[1], solution[2]
     mean = second = 0.0
     for i in range(x.size):
         d = np.sqrt((x[i] - cx) ** 2 + (y[i] - cy) ** 2 + (z[i] - cz) ** 2)

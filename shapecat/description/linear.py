@@ -52,7 +52,9 @@ def principal_axes(A: F8) -> tuple[F8, F8]:
 
     Source: Golub and Van Loan 2013, 8.5 (Jacobi rotations).
     """
-    vectors = np.eye(3)
+    vectors = np.zeros((3, 3))
+    for k in range(3):
+        vectors[k, k] = 1.0
     for _ in range(_SWEEPS):
         for p in range(2):
             for q in range(p + 1, 3):
@@ -76,5 +78,6 @@ def principal_axes(A: F8) -> tuple[F8, F8]:
         for j in range(3):
             rank += A[j, j] < A[k, k] or (A[j, j] == A[k, k] and j < k)
         values[rank] = A[k, k]
-        axes[:, rank] = vectors[:, k]
+        for j in range(3):  # assigning columns would compile a check of their sizes, for 2 s
+            axes[j, rank] = vectors[j, k]
     return values, axes
