@@ -86,12 +86,14 @@ def _extend_to_walls(grid: DepthGrid, plane: SupportingPlane) -> SupportingPlane
 
     The extent grows to the samples above the floor that are within 0.2 m of its visible part.
     """
-    level = level_coordinates(grid, grid.inverse_depth > 0, plane.up)
-    above = level[2] - plane.offset
-    sides = COS[:, None] * level[0] + SIN[:, None] * level[1]
-    inside = (above > PLANES.margin_m) & (above < PLANES.max_object_m)
-    inside &= (sides < plane.extent[:, None] + PLANES.hidden_m).all(axis=0)
-    extent = sides[:, inside].max(axis=1, initial=-np.inf)
+    across, along, height = level_coordinates(grid, grid.inverse_depth > 0, plane.up)
+    above = height - plane.offset
+    near = np.flatnonzero((above > PLANES.margin_m) & (above < PLANES.max_object_m))
+    for k in range(DIRECTIONS):
+        side = COS[k] * across[near] + SIN[k] * along[near]
+        near = near[side < plane.extent[k] + PLANES.hidden_m]
+    sides = COS[:, None] * across[near] + SIN[:, None] * along[near]
+    extent = sides.max(axis=1, initial=-np.inf)
     return plane._replace(extent=np.maximum(plane.extent, extent))
 
 
