@@ -18,7 +18,6 @@ from shapecat.detection.planes.height_map import HeightMap, measure_heights, pac
 from shapecat.detection.planes.ransac import (
     draw_trials,
     horizontal_plane,
-    median_of,
     plane_normal,
     ransac_plane,
     sample_grid,
@@ -49,12 +48,6 @@ def test_two_samples_give_no_plane() -> None:
     samples = sample_grid(inv_depth, inv_depth)
     trials = draw_trials(np.random.default_rng(0))
     assert ransac_plane(samples, trials, INTRINSICS, UP, (0.9, 1.0), 0.01)[1] == 0
-
-
-@pytest.mark.parametrize("size", [1, 2, 7, 100])
-def test_median_equals_that_of_the_sorted_values(size: int) -> None:
-    values = np.random.default_rng(size).permutation(size).astype(np.float32)
-    assert median_of(values) == size // 2
 
 
 def test_samples_beyond_the_edge_of_a_plane_have_no_height() -> None:

@@ -25,11 +25,9 @@ from shapecat.detection.planes.ransac import (
     cosine,
     count_inliers,
     horizontal_plane,
-    median_of,
     plane_normal,
     ransac_plane,
     refine,
-    select_outliers,
 )
 from shapecat.detection.planes.settings import PLANES
 from shapecat.jit import kernel
@@ -39,6 +37,8 @@ __all__ = ["find_horizontal_planes"]
 MAX_PLANES = 10
 MIN_SAMPLES = 44
 """Minimum number of points on a plane; noise alone gives a tenth of that."""
+PEAK_BINS = 5
+"""Number of bins of heights around a peak that may belong to one plane."""
 
 
 def find_horizontal_planes(
@@ -105,11 +105,10 @@ def _refit_parallel(
     return parallel
 
 
-@kernel
 def fit_horizontal_planes(
     samples: DepthSamples, heights: F4, intrinsics: PinholeIntrinsics, up: F8, trials: F8
-) -> F8:
-    """Return the horizontal planes (n, 3), as coefficients a, b, c, most samples first.
+) -> list[F8]:
+    """Return the horizontal planes, as coefficients a, b, c (3,), most samples first.
 
     Parameters
     ----------
@@ -117,94 +116,53 @@ def fit_horizontal_planes(
     up : (3,) unit vector, sensor frame.
     trials : from `draw_trials`.
     """
-    planes = np.zeros((MAX_PLANES, 3))
-    n = 0
+    planes: list[F8] = []
+    rest = np.stack([samples.j, samples.i, samples.inverse_depth, heights])
     # (3) one plane candidate for each peak in height
     for _ in range(MAX_PLANES):
-        if heights.size < MIN_SAMPLES:
+        if rest.shape[1] < MIN_SAMPLES:
             break
-        peak = _histogram_peak(heights)
-        peak_samples, peak_heights, samples, heights = _split(samples, heights, peak)
-        if peak_heights.size < MIN_SAMPLES:
+        off_peak = abs(rest[3] - _histogram_peak(rest[3])) > PEAK_BINS / 2 * PLANES.bin_m
+        j, i, inv_depth, at_peak = np.compress(~off_peak, rest, axis=1)
+        rest = np.compress(off_peak, rest, axis=1)
+        size = at_peak.size
+        if size < MIN_SAMPLES:
             break
         # (4) refine the plane, and drop the samples on it
-        offset = np.float64(median_of(peak_heights))
-        if offset > -PLANES.margin_m or not _fit(
-            peak_samples, intrinsics, up, trials, offset, planes[n]
-        ):
+        offset = float(np.partition(at_peak, size // 2)[size // 2])
+        if offset > -PLANES.margin_m:
             continue
-        outliers = select_outliers(samples, planes[n], 3 * PLANES.tolerance)
-        samples, heights = outliers, _heights(outliers, intrinsics, up)
-        n += 1
-    return planes[:n]
+        peak = DepthSamples(j, i, inv_depth, samples.share)
+        plane, is_large = _fit(peak, intrinsics, up, trials, offset)
+        if is_large:
+            a, b, c = plane.astype(np.float32)
+            distance = abs(rest[2] - (a * rest[0] + b * rest[1] + c))
+            rest = np.compress(distance > np.float32(3 * PLANES.tolerance), rest, axis=1)
+            planes.append(plane)
+    return planes
 
 
-@kernel(inline=True)
-def _heights(samples: DepthSamples, intrinsics: PinholeIntrinsics, up: F8) -> F4:
-    heights = np.zeros(samples.inverse_depth.size, np.float32)
-    for k in range(heights.size):
-        x = (samples.j[k] - intrinsics.cx) / intrinsics.fx
-        y = (samples.i[k] - intrinsics.cy) / intrinsics.fy
-        heights[k] = (x * up[0] + y * up[1] + up[2]) / samples.inverse_depth[k]
-    return heights
-
-
-@kernel(inline=True)
-def _histogram_peak(height: F4) -> float:
+def _histogram_peak(heights: F4) -> np.float64:
     """Return the middle of the bin that, with its neighbours, holds the most heights."""
-    low = high = float(height[0])
-    for h in height:
-        low, high = min(low, h), max(high, h)
-    count = np.zeros(int((high - low) / PLANES.bin_m) + 3, np.int64)
-    for h in height:
-        count[int((h - low) / PLANES.bin_m) + 1] += 1
-    best, best_count = 0, -1
-    for b in range(1, count.size - 1):
-        smoothed = count[b - 1] + 2 * count[b] + count[b + 1]
-        if smoothed > best_count:
-            best, best_count = b, smoothed
-    return low + (best - 0.5) * PLANES.bin_m
+    low = heights.min().astype(np.float64)
+    bins = ((heights - low) / PLANES.bin_m).astype(np.int64)
+    count = np.concatenate([[0], np.bincount(bins), [0]])
+    best = np.argmax(count[:-2] + 2 * count[1:-1] + count[2:])
+    return np.float64(low + (best + 0.5) * PLANES.bin_m)
 
 
-@kernel(inline=True)
-def _split(
-    samples: DepthSamples, height: F4, peak: float
-) -> tuple[DepthSamples, F4, DepthSamples, F4]:
-    """Split samples and their heights into those within five bins around a height and the rest."""
-    parts = np.zeros((2, 4, height.size), np.float32)
-    n = np.zeros(2, np.int64)
-    for k in range(height.size):
-        p = int(abs(height[k] - peak) > 2.5 * PLANES.bin_m)
-        parts[p, 0, n[p]], parts[p, 1, n[p]] = samples.j[k], samples.i[k]
-        parts[p, 2, n[p]], parts[p, 3, n[p]] = samples.inverse_depth[k], height[k]
-        n[p] += 1
-    inside, outside = parts[0], parts[1]
-    m, r = n[0], n[1]
-    return (
-        DepthSamples(inside[0][:m], inside[1][:m], inside[2][:m], samples.share),
-        inside[3][:m],
-        DepthSamples(outside[0][:r], outside[1][:r], outside[2][:r], samples.share),
-        outside[3][:r],
-    )
-
-
-@kernel(inline=True)
+@kernel
 def _fit(
-    samples: DepthSamples,
-    intrinsics: PinholeIntrinsics,
-    up: F8,
-    trials: F8,
-    offset: float,
-    plane: F8,
-) -> bool:
-    """Fit a plane to samples at about one height; return whether it is large enough."""
+    samples: DepthSamples, intrinsics: PinholeIntrinsics, up: F8, trials: F8, offset: float
+) -> tuple[F8, bool]:
+    """Fit a plane (3,) to samples at about one height; return it, and whether it is large."""
     level = horizontal_plane(intrinsics, up, offset)
-    plane[0], plane[1], plane[2] = level
+    plane = level.copy()
     count = 0
     for _ in range(3):
         count = refine(samples, 1.5 * PLANES.tolerance, plane)
         if count < MIN_SAMPLES:
-            return False
+            return plane, False
         if cosine(plane_normal(plane, intrinsics), up) < PLANES.steady_cos:
             plane[0], plane[1], plane[2] = level
             break
@@ -216,4 +174,4 @@ def _fit(
         if votes > close:
             plane[0], plane[1], plane[2] = voted
     area = area_of(samples, plane, abs(offset)) / (intrinsics.fx * intrinsics.fy)
-    return bool(area >= PLANES.min_area_m2)
+    return plane, bool(area >= PLANES.min_area_m2)

@@ -15,7 +15,6 @@ __all__ = [
     "count_inliers",
     "draw_trials",
     "horizontal_plane",
-    "median_of",
     "plane_normal",
     "ransac_plane",
     "refine",
@@ -61,31 +60,6 @@ def sample_grid(inv_depth: F4, mask: F4) -> DepthSamples:
             result[0, n], result[1, n], result[2, n] = j, i, inv_depth[i, j]
             n += (inv_depth[i, j] > 0) & (mask[i, j] > 0)
     return DepthSamples(result[0][:n], result[1][:n], result[2][:n], stride * stride)
-
-
-@kernel(inline=True)
-def median_of(values: F4) -> float:
-    """Return the upper median of ``values`` (n,), n >= 1.
-
-    Source: Hoare 1961, Algorithm 65. A kernel with `numpy.partition` takes 15 ms to load.
-    """
-    sample = values.copy()
-    middle, low, high = sample.size // 2, 0, sample.size - 1
-    while low < high:
-        pivot, i, j = sample[middle], low, high
-        while i <= j:
-            while sample[i] < pivot:
-                i += 1
-            while sample[j] > pivot:
-                j -= 1
-            if i <= j:
-                sample[i], sample[j] = sample[j], sample[i]
-                i, j = i + 1, j - 1
-        if j < middle:
-            low = i
-        if i > middle:
-            high = j
-    return float(sample[middle])
 
 
 @kernel(inner=True)

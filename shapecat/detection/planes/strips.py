@@ -5,6 +5,8 @@ it, and a board just below the camera that fills a few rows of the image. But th
 samples agree to millimetres, so if up is known, only the height has to be found.
 """
 
+from collections.abc import Iterator
+
 import numpy as np
 
 from shapecat.arrays import F4, F8, Bool
@@ -144,28 +146,23 @@ def _area_over(strips: F4, intrinsics: PinholeIntrinsics, plane: SupportingPlane
     return float((share / (facing * inv_depth**2))[over].sum())
 
 
-@kernel
-def _peaks(amount: F8, threshold: float) -> F8:
+def _peaks(amount: F8, threshold: float) -> Iterator[tuple[float, float]]:
     """Find the heights of level surface with next to nothing below it.
 
     ``amount`` (BINS,) is level surface by height, the lowest first; a peak and the two bins beside
-    it hold more than ``threshold``. Returns (n, 2) the heights above the sensor, metres, ascending;
-    and the amount just above each, relative to that of the peak: the tops of objects that cover it.
+    it hold more than ``threshold``. Yields the heights above the sensor, metres, ascending; and the
+    amount just above each, relative to that of the peak: the tops of objects that cover it.
     """
-    peaks, n, bins = np.zeros((BINS, 2)), 0, STRIPS.below - 2
-    for k in range(STRIPS.below, BINS - 3):
-        centre, total = amount[k], amount[k - 1] + amount[k] + amount[k + 1]
-        if total <= threshold or centre < amount[k - 1] or centre < amount[k + 1]:
-            continue
-        lower = 0.0
-        for m in range(k - STRIPS.below, k - 2):
-            lower += 3 * amount[m] / bins
-        falls = min(amount[k + 1], amount[k + 2], amount[k + 3]) < STRIPS.dip * centre
-        if falls and total > STRIPS.contrast * lower:
-            upper = amount[k + 3 : k + STRIPS.above].sum()
-            peaks[n, 0], peaks[n, 1] = (k + 0.5 - BINS) * STRIPS.bin_m, upper / total
-            n += 1
-    return peaks[:n]
+    total = amount[:-2] + amount[1:-1] + amount[2:]
+    peaks = (total > threshold) & (amount[1:-1] >= amount[:-2]) & (amount[1:-1] >= amount[2:])
+    first = STRIPS.below - 1
+    for k in (np.flatnonzero(peaks[first:-2]) + STRIPS.below).tolist():
+        below = amount[k - STRIPS.below : k - 2]
+        lower = sum((3 * below / below.size).tolist())
+        falls = amount[k + 1 : k + 4].min() < STRIPS.dip * amount[k]
+        if falls and total[k - 1] > STRIPS.contrast * lower:
+            upper = sum(amount[k + 3 : k + STRIPS.above].tolist())
+            yield (k + 0.5 - BINS) * STRIPS.bin_m, upper / float(total[k - 1])
 
 
 @kernel
