@@ -8,9 +8,10 @@ from shapecat.detection.cleanup.context import add_context, measure_borders
 from shapecat.detection.cleanup.holes import fill_contact_boundary, fill_holes
 from shapecat.detection.cleanup.object_features import (
     OBJECT_FEATURES,
-    LabelledGrid,
+    Limits,
+    Surroundings,
     _border_lines,
-    _measure_plane,
+    _measure,
     measure_object_features,
 )
 from shapecat.detection.cleanup.structure import (
@@ -25,7 +26,6 @@ from shapecat.detection.merging.segments import _blank
 from shapecat.detection.pipeline import Task, merge_segments, oversegment
 from shapecat.detection.planes.extent import DIRECTIONS
 from shapecat.detection.planes.height_map import OUTLINE, HeightMap
-from shapecat.geometry import DISCONTINUITY
 from shapecat.trees import BoostedTrees, Trees
 from tests.test_detection import Array, Shape, box, frame_of, render, table
 
@@ -78,15 +78,17 @@ def test_height_and_noise_of_plane_around_segment_are_measured() -> None:
     plane_id[:, 10] = plane_id[1] = plane_id[9] = 0  # no plane above and below, nor at the border
     height = np.full((11, 11), 0.9, np.float32)
     height[5, 1], height[5, 9] = -0.001, 0.003
-    segments, rows = _blank(2), np.zeros(2, OBJECT_FEATURES)["surroundings"]
+    segments, features = _blank(2), np.zeros(2, OBJECT_FEATURES)
     segments.statistics["count"], segments.statistics["depth_sum"] = 1, 2.0
-    inv_depth, owner = np.full((11, 11), 0.5, np.float32), np.arange(2, dtype=np.int16)
+    segments.plane_id[:] = 1
+    grid = DepthGrid(np.full((11, 11), 0.5, np.float32), INTRINSICS, 1)
     walls, spans = np.zeros((11, 11), np.uint8), np.tile(np.array([0, 11], np.int32), (11, 1))
     planes = np.zeros((1, OUTLINE + DIRECTIONS))
     low_profile = np.zeros((11, 11), np.int16)
-    seen = inv_depth, DISCONTINUITY, planes, plane_id, height, low_profile, walls
-    field = LabelledGrid(*seen, labels, spans, owner)
-    _measure_plane(field, segments, rows)
+    heights = HeightMap(plane_id, height)
+    seen = Surroundings(planes, heights, low_profile, walls, labels, spans)
+    _measure(grid, seen, Limits(-1, -1, -1, -1, 0.25), segments, 0.7, features)
+    rows = features["surroundings"]
     least = 0.004 + 0.0025 * 2.0**2
     assert rows["plane_height"][1] == pytest.approx(0.001 / least)
     assert rows["plane_noise"][1] == pytest.approx(0.002 / least)

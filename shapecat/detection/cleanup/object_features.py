@@ -10,7 +10,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from shapecat.arrays import F4, F8, I4, U1
+from shapecat.arrays import F8, I4, U1
 from shapecat.detection.cleanup.settings import CLEANUP
 from shapecat.detection.connected_components import SIDES
 from shapecat.detection.depth_grid import DepthGrid, back_project, find_borders, row_and_column
@@ -21,7 +21,7 @@ from shapecat.detection.merging.segment_features import (
     write_segment_features,
 )
 from shapecat.detection.merging.segments import Records, Row, Segments, depth_of
-from shapecat.detection.planes.height_map import distance_outside, min_height_at
+from shapecat.detection.planes.height_map import HeightMap, distance_outside, min_height_at
 from shapecat.detection.records import OverSegmentation, PlaneModel
 from shapecat.geometry import DISCONTINUITY
 from shapecat.jit import kernel
@@ -67,24 +67,6 @@ OBJECT_FEATURES = np.dtype(
 The trees index them in this order."""
 
 
-class LabelledGrid(NamedTuple):
-    """Fields of `DepthGrid`, `PlaneModel` and `OverSegmentation` that kernels read together.
-
-    ``owner`` (n + 1,) is the segment that each label has been merged into.
-    """
-
-    inverse_depth: F4
-    discontinuity: float
-    planes: F8
-    plane_id: I4
-    height: F4
-    low_profile: I4
-    walls: U1
-    labels: I4
-    spans: I4
-    owner: I4
-
-
 def measure_object_features(
     grid: DepthGrid,
     model: PlaneModel,
@@ -97,14 +79,40 @@ def measure_object_features(
     """
     graph, labels, segments = oversegmentation
     features = np.zeros(segments.parent.size, OBJECT_FEATURES)
-    rows = features["surroundings"]
-    geometry = grid.inverse_depth, grid.discontinuity, model.planes, *model.heights
-    marks = model.low_profile, model.walls
-    cells = LabelledGrid(*geometry, *marks, labels, graph.spans, segments.parent)
-    _count_by_segment(cells, _border_lines(grid), 1 / range_m + DISCONTINUITY / 2, rows)
-    _measure_plane(cells, segments, rows)
-    _measure(grid, model.planes, segments, model.up[2], features)
+    seen = Surroundings(
+        model.planes, model.heights, model.low_profile, model.walls, labels, graph.spans
+    )
+    limits = Limits(*_border_lines(grid), 1 / range_m + DISCONTINUITY / 2)
+    _measure(grid, seen, limits, segments, model.up[2], features)
     return features
+
+
+class Surroundings(NamedTuple):
+    """Fields of `PlaneModel` and `OverSegmentation` that the kernels read."""
+
+    planes: F8
+    heights: HeightMap
+    low_profile: I4
+    walls: U1
+    labels: I4
+    spans: I4
+
+
+class Limits(NamedTuple):
+    """Where the view ends.
+
+    Attributes
+    ----------
+    top, bottom, left, right : first and last row and column with samples; -1 if not at the border
+        of the image.
+    inverse_depth : a cell with less is at the range limit, 1/m.
+    """
+
+    top: int
+    bottom: int
+    left: int
+    right: int
+    inverse_depth: float
 
 
 def _border_lines(grid: DepthGrid) -> tuple[int, int, int, int]:
@@ -121,70 +129,22 @@ def _border_lines(grid: DepthGrid) -> tuple[int, int, int, int]:
 
 
 @kernel
-def _count_by_segment(
-    cells: LabelledGrid, border: tuple[int, int, int, int], last: float, rows: Records
+def _measure(
+    grid: DepthGrid,
+    seen: Surroundings,
+    limits: Limits,
+    segments: Segments,
+    down: float,
+    out: Records,
 ) -> None:
-    """Count the cells of each segment at borders and on walls, and where its surface continues.
-
-    ``last`` is the inverse depth below which a cell is at the range limit, 1/m; ``rows`` (n + 1,)
-    are records of `_SURROUNDINGS`.
-    """
-    inv_depth, jump, planes, plane_id, _, low, walls, labels, spans, owner = cells
-    last_row, last_column = labels.shape[0] - 1, labels.shape[1] - 1
-    top, bottom, left, right = border
-    for i in range(labels.shape[0]):
-        for j in range(spans[i, 0], spans[i, 1]):
-            if labels[i, j] == 0:
-                continue
-            row, w = rows[owner[labels[i, j]]], inv_depth[i, j]
-            row.image_border += (i == top) | (i == bottom) | (j == left) | (j == right)
-            row.range_limit += w < last
-            row.on_wall += walls[i, j] == ON_WALL
-            row.low_profile += low[i, j] > 0
-            for di, dj in SIDES:
-                y, x = min(max(i + di, 0), last_row), min(max(j + dj, 0), last_column)
-                row.depth_edge += 0 < inv_depth[y, x] <= w - jump
-                if plane_id[y, x] != 0 or abs(inv_depth[y, x] - w) >= jump:
-                    continue
-                k = plane_id[i, j] - 1
-                if inv_depth[y, x] > max(planes[k, 0] * x + planes[k, 1] * y + planes[k, 2], 0):
-                    row.into_wall += walls[y, x] == CLEARED
-                    row.beyond += walls[y, x] != CLEARED
-
-
-@kernel
-def _measure_plane(cells: LabelledGrid, segments: Segments, rows: Records) -> None:
-    """Write mean and standard deviation of the heights of plane samples near each segment."""
-    plane_id, height = cells.plane_id, cells.height
-    count, (lines, columns) = np.zeros(len(rows)), plane_id.shape
-    for i in range(lines):
-        for j in range(cells.spans[i, 0], cells.spans[i, 1]):
-            if cells.labels[i, j] == 0:
-                continue
-            p = cells.owner[cells.labels[i, j]]
-            for di, dj in SIDES:
-                y, x = i + CLEANUP.around_cells * di, j + CLEANUP.around_cells * dj
-                if 0 <= y < lines and 0 <= x < columns and plane_id[y, x] < 0:
-                    count[p] += 1
-                    rows[p].plane_height += height[y, x]
-                    rows[p].plane_noise += height[y, x] ** 2
-    for p in range(1, len(rows)):
-        if count[p] > 0:
-            row, min_height = rows[p], min_height_at(depth_of(segments, p))
-            mean = row.plane_height / count[p]
-            variance = max(row.plane_noise / count[p] - mean * mean, 0.0)
-            row.plane_height, row.plane_noise = mean / min_height, math.sqrt(variance) / min_height
-
-
-@kernel
-def _measure(grid: DepthGrid, planes: F8, segments: Segments, down: float, out: Records) -> None:
-    """Write the features of merged segments, given the counts of `_count_by_segment`."""
+    """Write the features of merged segments."""
+    near_plane = _count_by_segment(grid, seen, limits, segments.parent, out)
     for p in range(1, segments.parent.size):
         if segments.parent[p] != p:
             continue
         segment, around, view = segments.statistics[p], out[p].surroundings, out[p].visibility
         depth = depth_of(segments, p)
-        cell = depth / grid.intrinsics.fx
+        cell, min_height = depth / grid.intrinsics.fx, min_height_at(depth)
         write_segment_features(segments, p, out[p].segment)
         around.image_border = share(around.image_border, 4 * math.sqrt(segment.count))
         around.range_limit = share(around.range_limit, segment.count)
@@ -193,11 +153,63 @@ def _measure(grid: DepthGrid, planes: F8, segments: Segments, down: float, out: 
         around.beyond = share(around.beyond, segment.boundary)
         around.into_wall = share(around.into_wall, segment.boundary)
         around.depth_edge = share(around.depth_edge, segment.boundary)
-        _measure_outside(grid, planes[segments.plane_id[p] - 1], segments.samples[p], around)
+        if near_plane[p] > 0:
+            mean = around.plane_height / near_plane[p]
+            variance = max(around.plane_noise / near_plane[p] - mean * mean, 0.0)
+            around.plane_height = mean / min_height
+            around.plane_noise = math.sqrt(variance) / min_height
+        plane = seen.planes[segments.plane_id[p] - 1]
+        _measure_outside(grid, plane, segments.samples[p], around)
         view.cells, view.depth_m, view.cell_m, view.down = segment.count, depth, cell, down
-        view.top_by_noise = segment.top / min_height_at(depth)
+        view.top_by_noise = segment.top / min_height
         view.slant = share(segment.area, segment.count * cell * depth / grid.intrinsics.fy)
         view.ragged = share(segment.boundary * segment.boundary, segment.count)
+
+
+@kernel(inline=True)
+def _count_by_segment(
+    grid: DepthGrid, seen: Surroundings, limits: Limits, owner: I4, out: Records
+) -> F8:
+    """Count the cells of each segment at borders and on walls, and where its surface continues.
+
+    ``owner`` (n + 1,) is the segment that each label has been merged into. Also sums the heights of
+    the samples of planes near each segment, and their squares; returns their number, (n + 1,).
+    """
+    inv_depth, jump = grid.inverse_depth, grid.discontinuity
+    planes, (plane_id, height), low, walls, labels, spans = seen
+    (lines, columns), near_plane = labels.shape, np.zeros(len(out))
+    top, bottom, left, right, last = limits
+    for i in range(lines):
+        for j in range(spans[i, 0], spans[i, 1]):
+            if labels[i, j] == 0:
+                continue
+            p, w = owner[labels[i, j]], inv_depth[i, j]
+            row = out[p].surroundings
+            # Most of these are rare: a branch is faster than to add 0.
+            if i in (top, bottom) or j in (left, right):
+                row.image_border += 1
+            if w < last:
+                row.range_limit += 1
+            if walls[i, j] == ON_WALL:
+                row.on_wall += 1
+            if low[i, j] > 0:
+                row.low_profile += 1
+            for di, dj in SIDES:
+                y, x = i + CLEANUP.around_cells * di, j + CLEANUP.around_cells * dj
+                if 0 <= y < lines and 0 <= x < columns and plane_id[y, x] < 0:
+                    near_plane[p] += 1
+                    row.plane_height += height[y, x]
+                    row.plane_noise += height[y, x] ** 2
+                y, x = min(max(i + di, 0), lines - 1), min(max(j + dj, 0), columns - 1)
+                if 0 < inv_depth[y, x] <= w - jump:
+                    row.depth_edge += 1
+                if plane_id[y, x] != 0 or abs(inv_depth[y, x] - w) >= jump:
+                    continue
+                k = plane_id[i, j] - 1
+                if inv_depth[y, x] > max(planes[k, 0] * x + planes[k, 1] * y + planes[k, 2], 0):
+                    row.into_wall += walls[y, x] == CLEARED
+                    row.beyond += walls[y, x] != CLEARED
+    return near_plane
 
 
 @kernel(inline=True)
