@@ -22,7 +22,7 @@ from shapecat.detection.cleanup.structure import (
     number_objects,
 )
 from shapecat.detection.depth_grid import DepthGrid, PinholeIntrinsics, downsample
-from shapecat.detection.merging.segments import _blank
+from shapecat.detection.merging.segments import _blank, roots_of
 from shapecat.detection.pipeline import Task, merge_segments, oversegment
 from shapecat.detection.planes.extent import DIRECTIONS
 from shapecat.detection.planes.height_map import OUTLINE, HeightMap
@@ -181,8 +181,9 @@ def test_context_weights_neighbours_by_border_length() -> None:
     segments.pairs["contact"][1, 2], segments.pairs["contact"][2, 4] = 6, 2
     segments.pairs["contact"][2, 2] = 9  # within a merged segment
     segments.pairs["in_front"][4, 1], segments.pairs["near"][4, 2] = 3, 1
-    roots, weights = measure_borders(segments)
+    roots = roots_of(segments)
     assert roots.tolist() == [1, 2, 4]
+    weights = measure_borders(segments, roots)
     features = np.zeros(3, OBJECT_FEATURES)
     features["segment"]["width_m"] = [0.1, 0.2, 0.3]
     found = add_context(features, np.array([8.0, -1.0, -4.0], np.float32), weights)

@@ -143,11 +143,10 @@ def project(k: PinholeIntrinsics, x: float, y: float, z: float) -> tuple[int, in
     return int(k.cy + k.fy * y / z + 0.5), int(k.cx + k.fx * x / z + 0.5)
 
 
-@kernel
-def smallest_object_at(grid: DepthGrid, depth_m: float) -> float:
-    """Return the number of cells that the smallest object, of `SMALL_M2`, covers at a depth."""
-    covered = SMALL_M2 * grid.intrinsics.fx**2 / depth_m**2
-    return float(min(max(covered, MIN_CELLS), ENOUGH_CELLS))
+def smallest_object_at(grid: DepthGrid, depth_m: F4) -> F4:
+    """Return the number of cells that the smallest object, of `SMALL_M2`, covers at depths (n,)."""
+    covered = SMALL_M2 * grid.intrinsics.fx**2 / depth_m.astype(np.float64) ** 2
+    return np.clip(covered, MIN_CELLS, ENOUGH_CELLS).astype(np.float32)
 
 
 @kernel

@@ -251,6 +251,5 @@ def _clean_up(
         filled |= (model.low_profile > 0) & (labels > 0)
     plane_ids = segments.plane_id[representatives].astype(np.int64) - 1
     plane_ids[0] = 0
-    range_m = settings.max_range_m
-    measured = measure_objects(grid, labels, segments, representatives, model.up, range_m)
+    measured = measure_objects(grid, labels, segments, representatives, features, model.up)
     return Segmentation(model, labels, filled, plane_ids, measured)

@@ -27,7 +27,7 @@ from shapecat.detection.cleanup.structure import (
     logits_of,
 )
 from shapecat.detection.depth_grid import downsample
-from shapecat.detection.merging.segments import Records
+from shapecat.detection.merging.segments import Records, roots_of
 from shapecat.detection.pipeline import Task, merge_segments, oversegment
 from shapecat.models.growing import Growth, collect_chunks, grow, growing_options
 from shapecat.models.parts import count_labels
@@ -280,7 +280,8 @@ def label_objects(frame: Frame, pixel_labels: U1, object_labels: I4) -> Iterator
     shares = merged[:, object_labels[object_labels < merged.shape[1]]].sum(axis=1) / np.maximum(
         known_cells, 1
     )
-    roots, weights = measure_borders(segments)
+    roots = roots_of(segments)
+    weights = measure_borders(segments, roots)
     yield Samples(features[roots], shares[roots] > _OBJECT, (weights,))
 
 

@@ -27,18 +27,17 @@ CONTEXT_FEATURES = np.dtype(
 """The features of a segment among others."""
 
 
-def measure_borders(segments: Segments) -> tuple[I4, F4]:
-    """Return the merged segments (r,), and the lengths of the borders between them.
+def measure_borders(segments: Segments, roots: I4) -> F4:
+    """Return the lengths of the borders between the merged segments ``roots`` (r,).
 
     The lengths (4, r, r), in cells, are those of four kinds of border: the two are connected, the
     second is behind the first, the second is in front of it, and they are near but not connected.
     """
-    roots = np.flatnonzero(segments.parent == np.arange(segments.parent.size))[1:]
     index = np.ix_(roots, roots)
     contact, in_front, near = (segments.pairs[n][index] for n in ("contact", "in_front", "near"))
     weights = np.stack([contact + contact.T, in_front, in_front.T, near + near.T])
     weights[:, np.arange(len(roots)), np.arange(len(roots))] = 0
-    return roots, weights
+    return weights
 
 
 def add_context(features: Records, logits: F4, weights: F4) -> Records:

@@ -18,7 +18,7 @@ from shapecat.detection.cleanup.context import CONTEXT_FEATURES, add_context, me
 from shapecat.detection.cleanup.object_features import OBJECT_FEATURES
 from shapecat.detection.cleanup.settings import CLEANUP
 from shapecat.detection.depth_grid import DepthGrid, smallest_object_at
-from shapecat.detection.merging.segments import Records, Segments
+from shapecat.detection.merging.segments import Records, Segments, roots_of
 from shapecat.jit import kernel
 from shapecat.trees import BoostedTrees, logit_of, read_trees
 
@@ -66,28 +66,26 @@ def find_background(
 
     ``features`` (n + 1,) are from `measure_object_features`.
     """
-    rejected = np.zeros(len(features), np.bool_)
-    roots, weights = measure_borders(segments)
+    roots = roots_of(segments)
     merged = features[roots]
-    alone = logits_of(as_rows(merged), trees.alone)
-    uncertain = is_uncertain(alone)
-    context = add_context(merged, alone, weights)[uncertain]
-    logits = alone.copy()
-    logits[uncertain] = logits_of(as_rows(context), trees.in_context)
-    segment, cells = features["segment"], features["visibility"]["cells"]
+    logits = logits_of(as_rows(merged), trees.alone)
+    uncertain = is_uncertain(logits)
+    if uncertain.any():
+        context = add_context(merged, logits, measure_borders(segments, roots))[uncertain]
+        logits[uncertain] = logits_of(as_rows(context), trees.in_context)
+    segment, cells = merged["segment"], merged["visibility"]["cells"]
     depths = merged["visibility"]["depth_m"]
     large = cells > CLEANUP.large_share * grid.inverse_depth.size
-    rejected[roots] = logits < np.select(
-        [depths > CLEANUP.far_m, large[roots]],
-        [CLEANUP.min_far_logit, CLEANUP.min_large_logit],
-        CLEANUP.min_logit,
-    )
-    min_cells = np.array([smallest_object_at(grid, z) for z in depths.tolist()])
-    rejected[roots] |= cells[roots] < CLEANUP.tiny_share * min_cells
-    rejected |= segment["width_m"] > settings.max_size_m
-    rejected |= segment["top_m"] > settings.max_height_m - CLEANUP.cut_off_m
+    min_logits = np.where(large, CLEANUP.min_large_logit, CLEANUP.min_logit)
+    min_logits[depths > CLEANUP.far_m] = CLEANUP.min_far_logit
+    background = logits < min_logits
+    background |= cells < CLEANUP.tiny_share * smallest_object_at(grid, depths)
+    background |= segment["width_m"] > settings.max_size_m
+    background |= segment["top_m"] > settings.max_height_m - CLEANUP.cut_off_m
     # Large and mostly outside the image: furniture, which the trees were not shown.
-    rejected |= large & (features["surroundings"]["image_border"] > CLEANUP.cut_share)
+    background |= large & (merged["surroundings"]["image_border"] > CLEANUP.cut_share)
+    rejected = np.zeros(len(features), np.bool_)
+    rejected[roots] = background
     return rejected
 
 

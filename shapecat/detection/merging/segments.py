@@ -29,6 +29,7 @@ __all__ = [
     "lateral_axis",
     "measure_segments",
     "merge",
+    "roots_of",
 ]
 
 SEGMENT = np.dtype(
@@ -135,6 +136,11 @@ def _blank(size: int) -> Segments:
     for low, high in (("left", "right"), ("bottom", "top")):
         segments.statistics[low], segments.statistics[high] = 1e9, -1e9
     return segments
+
+
+def roots_of(segments: Segments) -> I4:
+    """Return the segments that have not been merged into another, (r,), ascending."""
+    return np.flatnonzero(segments.parent == np.arange(segments.parent.size))[1:]
 
 
 @kernel

@@ -7,13 +7,28 @@ import numpy as np
 from shapecat.arrays import F4, F8, I4, Bool
 from shapecat.detection.connected_components import spans_of
 from shapecat.detection.depth_grid import DepthGrid, smallest_object_at
-from shapecat.detection.merging.segments import Segments, depth_of
+from shapecat.detection.merging.segments import Records, Segments
 from shapecat.detection.merging.settings import MERGING
 from shapecat.detection.output.settings import OUTPUT
-from shapecat.geometry import DISCONTINUITY, level_axes, level_box
+from shapecat.geometry import gravity_rotation, level_box
 from shapecat.jit import kernel
 
 __all__ = ["ObjectMeasurements", "measure_objects"]
+
+
+class Boxes(NamedTuple):
+    """The boxes of the objects 1..n, in 3D and in the image; fields as in `ObjectMeasurements`."""
+
+    center: F8
+    size: F8
+    orientation: F8
+    low: I4
+    high: I4
+
+
+def _blank_boxes(count: int) -> Boxes:
+    low, high = np.zeros((2, count, 2), np.int64)
+    return Boxes(np.zeros((count, 3)), np.zeros((count, 3)), np.zeros((count, 4)), low, high)
 
 
 class ObjectMeasurements(NamedTuple):
@@ -43,97 +58,81 @@ class ObjectMeasurements(NamedTuple):
     min_cells: F4
 
 
-@kernel
 def measure_objects(
-    grid: DepthGrid, labels: I4, segments: Segments, representatives: I4, up: F8, range_m: float
+    grid: DepthGrid,
+    labels: I4,
+    segments: Segments,
+    representatives: I4,
+    features: Records,
+    up: F8,
 ) -> ObjectMeasurements:
     """Measure the objects.
 
-    The box is a `shapecat.geometry.upright_box` around the outermost cells. An object stands on
-    another if it is over it, and has more contact with the other's upward-facing surface than with
-    the plane. If the contact is hidden, its bottom must be at the top of the other one.
+    The box is a `shapecat.geometry.upright_box` around the outermost cells.
 
     Parameters
     ----------
     labels : (rows, columns) objects 1..n, 0 elsewhere.
     representatives : (n + 1,) from `number_objects`.
+    features : (n + 1,) of the segments, from `measure_object_features`.
     up : (3,) unit vector, view frame.
-    range_m : the range limit, metres.
+    """
+    roots = representatives[1:]
+    boxes = _blank_boxes(roots.size)
+    _measure_boxes(grid, labels, gravity_rotation(up), boxes)
+    supported_by, support_m = _find_supports(segments, representatives, boxes, up)
+    objects = features[roots]
+    segment, visibility = objects["segment"], objects["visibility"]
+    cells_at_limit = np.rint(objects["surroundings"]["range_limit"] * visibility["cells"])
+    return ObjectMeasurements(
+        *boxes,
+        supported_by,
+        support_m,
+        segment["hidden"] + segment["behind"] > OUTPUT.occluded_share,
+        cells_at_limit >= MERGING.min_links,
+        smallest_object_at(grid, visibility["depth_m"]),
+    )
+
+
+@kernel
+def _find_supports(segments: Segments, representatives: I4, boxes: Boxes, up: F8) -> tuple[I4, F8]:
+    """Return the label below each object (n,), 0 for its plane; and the height there, metres.
+
+    An object stands on another if it is over it, and has more contact with the other's
+    upward-facing surface than with the plane. If the contact is hidden, its bottom must be at the
+    top of the other one.
     """
     count = representatives.size - 1
-    measured = ObjectMeasurements(
-        np.zeros((count, 3)),
-        np.zeros((count, 3)),
-        np.zeros((count, 4)),
-        np.zeros((count, 2), np.int64),
-        np.zeros((count, 2), np.int64),
-        np.zeros(count, np.int64),
-        np.zeros(count),
-        np.zeros(count, np.bool_),
-        np.zeros(count, np.bool_),
-        np.zeros(count, np.float32),
-    )
-    _measure_boxes(grid, labels, np.array(level_axes(up[0], up[1], up[2])), measured)
-    at_limit = _count_at_range_limit(grid.inverse_depth, labels, representatives.size, range_m)
+    supported_by, support_m = np.zeros(count, np.int64), np.zeros(count)
     for k in range(count):
-        p = representatives[k + 1]
-        measured.at_range_limit[k] = at_limit[k + 1] >= MERGING.min_links
-        measured.min_cells[k] = smallest_object_at(grid, depth_of(segments, p))
-        below = _objects_below(measured, up, k)
-        measured.supported_by[k], measured.support_m[k] = _supporting_object(
-            segments, representatives, p, below
+        below = _objects_below(boxes, up, k)
+        supported_by[k], support_m[k] = _supporting_object(
+            segments, representatives, representatives[k + 1], below
         )
-        hidden = segments.statistics[p].hidden
-        for q in range(segments.parent.size):
-            hidden += segments.pairs[q, p].in_front
-        boundary = max(segments.statistics[p].boundary, np.float32(1))
-        measured.occluded[k] = hidden > np.float32(OUTPUT.occluded_share) * boundary
-    _break_cycles(measured)
-    return measured
+    _break_cycles(supported_by, support_m)
+    return supported_by, support_m
 
 
 @kernel(inline=True)
-def _count_at_range_limit(inv_depth: F4, labels: I4, size: int, range_m: float) -> I4:
-    """Return the number of samples at the range limit of each label, (size,); 0 for label 0.
-
-    ``inv_depth`` (rows, columns) is in 1/m, ``range_m`` in metres; ``labels`` (rows, columns) are
-    below ``size``.
-    """
-    count = np.zeros(size, np.int64)
-    limit = np.float32(1 / range_m + DISCONTINUITY / 2)
-    for i in range(inv_depth.shape[0]):
-        any_at_limit = False
-        for j in range(inv_depth.shape[1]):
-            # Most rows have none, and this vectorises.
-            any_at_limit |= (labels[i, j] > 0) & (inv_depth[i, j] < limit)
-        if not any_at_limit:
-            continue
-        for j in range(inv_depth.shape[1]):
-            if labels[i, j] > 0 and inv_depth[i, j] < limit:
-                count[labels[i, j]] += 1
-    return count
-
-
-@kernel(inline=True)
-def _objects_below(measured: ObjectMeasurements, up: F8, k: int) -> Bool:
+def _objects_below(boxes: Boxes, up: F8, k: int) -> Bool:
     """Return which labels, (n + 1,), have the middle of object ``k`` above them, seen from above.
 
     What hides behind the visible part of an object may be a bit of it. An object whose middle is
     farther behind stands behind it, even if its visible part begins at the top of the other.
     """
-    count = measured.center.shape[0]
+    count = boxes.center.shape[0]
     below = np.zeros(count + 1, np.bool_)
     for q in range(count):
-        x, y, z, w = measured.orientation[q]
+        x, y, z, w = boxes.orientation[q]
         axis = (1 - 2 * (y * y + z * z), 2 * (x * y + z * w), 2 * (x * z - y * w))
         height = rise = 0.0
         for d in range(3):
-            height += measured.center[q, d] * up[d]
-            rise += (measured.center[k, d] - measured.center[q, d]) * up[d]
+            height += boxes.center[q, d] * up[d]
+            rise += (boxes.center[k, d] - boxes.center[q, d]) * up[d]
         distance2 = behind = apart2 = turn = 0.0
         for d in range(3):
-            away = measured.center[q, d] - height * up[d]
-            shift = measured.center[k, d] - measured.center[q, d] - rise * up[d]
+            away = boxes.center[q, d] - height * up[d]
+            shift = boxes.center[k, d] - boxes.center[q, d] - rise * up[d]
             distance2 += away * away
             behind += shift * away
             apart2 += shift * shift
@@ -143,8 +142,8 @@ def _objects_below(measured: ObjectMeasurements, up: F8, k: int) -> Bool:
         beside = np.sqrt(max(apart2 - behind * behind, 0.0))
         c = min(abs(turn) / distance, 1.0)
         s = np.sqrt(1 - c * c)
-        depth = (c * measured.size[q, 0] + s * measured.size[q, 1]) / 2
-        width = (s * measured.size[q, 0] + c * measured.size[q, 1]) / 2
+        depth = (c * boxes.size[q, 0] + s * boxes.size[q, 1]) / 2
+        width = (s * boxes.size[q, 0] + c * boxes.size[q, 1]) / 2
         below[q + 1] = (
             beside < width + OUTPUT.beside_m
             and -depth - OUTPUT.beside_m < behind < depth + OUTPUT.behind_m
@@ -196,41 +195,39 @@ def _hidden_support(segments: Segments, representatives: I4, p: int, below: Bool
 
 
 @kernel(inline=True)
-def _break_cycles(measured: ObjectMeasurements) -> None:
+def _break_cycles(supported_by: I4, support_m: F8) -> None:
     """Put objects on their plane if they would otherwise stand, through others, on themselves."""
-    supported_by = measured.supported_by
     for k in range(supported_by.size):
         support = supported_by[k]
         for _ in range(supported_by.size):
             support = supported_by[support - 1] if support > 0 else 0
         if support > 0:
-            supported_by[k], measured.support_m[k] = 0, 0.0
+            supported_by[k], support_m[k] = 0, 0.0
 
 
-@kernel(fast=True, inner=True)
-def _measure_boxes(grid: DepthGrid, labels: I4, level: F8, measured: ObjectMeasurements) -> None:
-    points, start = _outer_points(grid, labels, level, measured)
+@kernel(fast=True)
+def _measure_boxes(grid: DepthGrid, labels: I4, level: F8, boxes: Boxes) -> None:
+    """Write the boxes; ``level`` (3, 3) is the level frame in the view frame, row by row."""
+    points, start = _outer_points(grid, labels, level, boxes)
     for k in range(start.size - 1):
         if start[k] < start[k + 1]:
             center, size, orientation = level_box(points[:, start[k] : start[k + 1]], level)
             for d in range(4):  # assigning whole rows would compile a check of their sizes
-                measured.orientation[k, d] = orientation[d]
+                boxes.orientation[k, d] = orientation[d]
             for d in range(3):
-                measured.center[k, d], measured.size[k, d] = center[d], size[d]
+                boxes.center[k, d], boxes.size[k, d] = center[d], size[d]
 
 
 @kernel(fast=True, inline=True)
-def _outer_points(
-    grid: DepthGrid, labels: I4, level: F8, measured: ObjectMeasurements
-) -> tuple[F4, I4]:
+def _outer_points(grid: DepthGrid, labels: I4, level: F8, boxes: Boxes) -> tuple[F4, I4]:
     """Return points of each object in the level frame (3, n), and the index where each begins.
 
     The points are the outermost cells, and every 4th cell inside, since the nearest point of a ball
-    is inside its outline. Also writes ``low`` and ``high`` of the measurements.
+    is inside its outline. Also writes ``low`` and ``high``.
     """
     rows, columns = labels.shape
     inv_depth, intrinsics = grid.inverse_depth, grid.intrinsics
-    low, high = measured.low, measured.high
+    low, high = boxes.low, boxes.high
     spans, outer = spans_of(labels), np.zeros(columns, np.bool_)
     cells = n = 0
     for i in range(rows):
