@@ -114,6 +114,22 @@ def annotate(source: Path, target: Path, **options: Any) -> None:
         write_annotated(recording, target, iter(FRAMES), run=RUN, **options)
 
 
+def test_recording_that_cannot_be_copied_gives_no_file(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """A thread copies it; zeros in place of its messages would look like a complete file."""
+
+    def fill_disk(*_: object) -> None:
+        raise OSError(errno.ENOSPC, "No space left on device")
+
+    monkeypatch.setattr("shapecat.outputs.annotation.annotated_mcap.copy_bytes", fill_disk)
+    source = write_mcap(tmp_path / "in.mcap")
+
+    with pytest.raises(OutputError, match="No space left on device"):
+        annotate(source, tmp_path / "out.mcap")
+    assert list(tmp_path.iterdir()) == [source]
+
+
 def digest(path: Path) -> Counter[tuple[Any, ...]]:
     with path.open("rb") as file:
         return Counter(

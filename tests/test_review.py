@@ -5,7 +5,7 @@ import resource
 import subprocess
 import sys
 import time
-from collections.abc import Iterable, Iterator
+from collections.abc import Iterable, Iterator, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -22,7 +22,7 @@ from shapecat.outputs.review import layout as review_layout
 from shapecat.outputs.review import viewer as review_viewer
 from shapecat.outputs.review import writing as review
 from shapecat.outputs.review.clouds import paint
-from shapecat.outputs.review.columns import Columns
+from shapecat.outputs.review.columns import Columns, Drawing, curve
 from shapecat.outputs.review.images import Images
 from shapecat.outputs.review.layout import Eye, TrackView, _track_tabs, choose_eye, stepped_back
 from shapecat.outputs.review.scenes import ReviewFrame, choose_scenes
@@ -422,6 +422,21 @@ def test_two_sensors_may_share_their_colour_camera() -> None:
         images.add(labelled, Coloured(ColourView(photo), ()))
 
     assert list(images.entities.values()) == ["/colour", "/colour"]
+
+
+@pytest.mark.parametrize(("rows", "size"), [(256, 1), (3, 50_000)])
+def test_few_rows_or_numbers_are_held_back(rows: int, size: int) -> None:
+    """256 images would take hundreds of megabytes, and small rows must not wait for the end."""
+    sent: list[int] = []
+
+    def draw(held: Sequence[Any]) -> Iterable[rr.ComponentColumn]:
+        sent.append(len(held))
+        return curve(held)
+
+    columns = Columns(rr.RecordingStream("test"))
+    for k in range(2 * rows):
+        columns.add("plot", (k, k), [0.5], Drawing(draw), size=size)
+        assert sum(sent) == (k + 1) // rows * rows
 
 
 def test_caption_is_above_the_top_of_a_turned_box() -> None:
