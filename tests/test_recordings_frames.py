@@ -88,16 +88,22 @@ def test_messages_of_another_type_on_the_topic_are_no_frames(tmp_path: Path) -> 
     assert not skipped
 
 
+@pytest.mark.parametrize("latched", [False, True])
 @pytest.mark.parametrize("chunk_size", [1 << 20, 25_000])  # one chunk, or one for each 5 images
-def test_needed_frames_equal_those_of_full_read(tmp_path: Path, chunk_size: int) -> None:
-    """In an indexed file the others are skipped, but still counted."""
+def test_needed_frames_equal_those_of_full_read(
+    tmp_path: Path, chunk_size: int, *, latched: bool
+) -> None:
+    """In an indexed file the others are skipped, but still counted.
+
+    The last image waits for a calibration, which may come only once.
+    """
     items = []
     for k in range(12):
         stamp = EPOCH + k * SECOND
-        items += [
-            ("/depth/camera_info", stamp, info(stamp)),
-            ("/depth/image_rect", stamp + 1, image(stamp, wavy_depth() + np.float32(0.1 * k))),
-        ]
+        if k == 0 or not latched:
+            items.append(("/depth/camera_info", stamp, info(stamp)))
+        depth = wavy_depth() + np.float32(0.1 * k)
+        items.append(("/depth/image_rect", stamp + 1, image(stamp, depth)))
     path = write(tmp_path / "a.mcap", items, chunk_size=chunk_size)
     all_frames, _, _ = read(path)
     times = {all_frames[k].log_time_ns for k in (0, 5, 6, 11)}

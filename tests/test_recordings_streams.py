@@ -334,6 +334,7 @@ def depth_in(topic: str, frame_id: str) -> list[Item]:
         [("/r1/camera/depth/image_raw", "optical"), ("/r2/camera/depth/image_raw", "optical")],
         [("/cam1/image_raw", "camera"), ("/cam2/image_raw", "camera")],
         [("/depth_left/image", "left"), ("/depth_right/image", "right")],
+        [("/front/depth/image_raw", ""), ("/rear/depth/image_rect", "")],
     ],
 )
 def test_cameras_with_similar_topics_are_several_sensors(
