@@ -805,13 +805,18 @@ def test_earlier_outcome_is_known_without_a_manifest(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize(
-    "option", [{"topics": ("/front",)}, {"start_s": 1.5}, {"end_s": 2.5}, {"every": 3}]
+    "option",
+    [
+        *({"topics": ("/front",)}, {"start_s": 1.5}, {"end_s": 2.5}, {"every": 3}),
+        *({"model": Path("mine.npz")}, {"settings": Settings(seed=3)}),
+    ],
 )
-def test_other_frames_are_other_work(
+def test_other_frames_model_or_settings_are_other_work(
     source: Path, monkeypatch: pytest.MonkeyPatch, option: dict[str, Any]
 ) -> None:
-    """Results at a URL are told apart by this key alone: those of other frames would be kept."""
-    monkeypatch.setattr("shapecat.batch.plans.load_model", lambda _path: MODEL)
+    """Results at a URL are told apart by this key alone: other ones would be kept."""
+    model = SimpleNamespace(model_id="mine")
+    monkeypatch.setattr("shapecat.batch.plans.load_model", lambda path: model if path else MODEL)
     out = f"memory://work-{next(iter(option))}"
     keys = set()
     for job in (Job(Path(), Path()), Job(Path(), Path(), **option)):

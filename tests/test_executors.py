@@ -31,6 +31,7 @@ from shapecat.executors import (
     send_progress,
     share_cores,
     single_threaded,
+    usable_cores,
 )
 from shapecat.executors.dask import _DaskExecutor
 from shapecat.executors.ordered_pool import OrderedPool
@@ -265,6 +266,14 @@ def test_cores_are_shared_between_recordings_and_their_frames(
     monkeypatch.setattr("shapecat.executors.cores.usable_cores", lambda: 8)
 
     assert share_cores(jobs, recordings) == expected
+
+
+def test_only_cores_of_this_job_are_used(monkeypatch: pytest.MonkeyPatch) -> None:
+    """In a Slurm job with 3 of 64 cores, 64 processes would fill its memory."""
+    monkeypatch.setattr("os.cpu_count", lambda: 64)
+    monkeypatch.setattr("os.sched_getaffinity", lambda _: {2, 5, 11}, raising=False)
+
+    assert usable_cores() == 3
 
 
 def test_missing_or_invalid_executors_are_refused(monkeypatch: pytest.MonkeyPatch) -> None:
