@@ -474,6 +474,15 @@ def test_burst_of_splits_gets_no_track() -> None:
     assert [track.hits for track in tracks] == [46]
 
 
+def test_pieces_are_joined_after_hours(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Detections are compared in blocks; those of later ones must not be taken for the first."""
+    monkeypatch.setattr("shapecat.tracking.detection_table._BLOCK", 8)
+    other = (1.0, 1.1)
+    whole, split = [(0.0, 0.2), other], [(0.0, 0.08), (0.08, 0.2), other]
+    frames = boxed([[other]] * 20 + [split] * 12 + [whole] * 30)
+    assert sorted(track.hits for track in track_recording(frames, SETTINGS)) == [42, 62]
+
+
 @pytest.mark.parametrize("before", [20, 2])
 def test_piece_that_stands_out_of_its_object_gets_no_track(before: int) -> None:
     """Both pieces together are too large for the object, which encloses the piece's centre."""
