@@ -247,6 +247,37 @@ def test_one_of_two_objects_moved_is_no_scene_cut() -> None:
     assert not scene_cuts(next(gather(frames)), SETTINGS).any()
 
 
+@pytest.mark.parametrize("step_m", [0.06, 0.09])
+def test_objects_that_move_together_are_no_scene_cut(step_m: float) -> None:
+    """On a belt, at two images per second, each object would get a new track in each image."""
+    random = np.random.default_rng(6)
+    frames = []
+    for k in range(12):
+        along = np.arange(-12, 12) * 0.25 + k * step_m
+        places = np.column_stack([along, np.zeros((24, 2))])[np.abs(along) < 0.6]
+        noise = random.normal(0, 0.004, places.shape)
+        frames.append(frame(k, places + noise, stamp_ns=k * SECOND // 2))
+
+    assert not scene_cuts(next(gather(frames)), SETTINGS).any()
+    places_of_tracks = [
+        track.centers[:, 0] - step_m / 0.5 * track.stamps_ns / SECOND
+        for track in track_recording(frames, SETTINGS)
+    ]
+    assert max(np.ptp(places) for places in places_of_tracks) < 0.05
+    assert len(places_of_tracks) >= 6
+
+
+def test_unrelated_images_of_equal_objects_are_scene_cuts() -> None:
+    """Among many alike, some always seem to have moved together."""
+    random = np.random.default_rng(6)
+    grid = np.array([[x, y, 0.0] for x in (0.0, 0.22, 0.44) for y in (0.0, 0.22)])
+    frames = [
+        frame(k, grid + random.uniform(-0.1, 0.1, (6, 3)) * [1, 1, 0], stamp_ns=k * SECOND)
+        for k in range(20)
+    ]
+    assert scene_cuts(next(gather(frames)), SETTINGS)[1:].mean() > 0.8
+
+
 def test_takes_joined_without_a_pause_are_a_scene_cut() -> None:
     """Between two frames at full rate, all objects are exchanged for others."""
     before, after = [[0, 0, 0], [0.4, 0, 0]], [[0.05, 0.02, 0], [0.43, -0.04, 0]]

@@ -20,6 +20,8 @@ _KNOWN = 8  # whole views needed to know the size, as some views only seem whole
 _SAME_SIZE = 0.25  # largest difference of size keys of the same object
 _SAME_POSTERIOR = 0.5  # largest total variation distance of posteriors of the same object
 _SLOW_REACH = 0.5  # share of the gate radius that an object at rest may seem to move
+_TOGETHER_M = 0.03  # largest difference of the displacements of objects that moved together
+_MOST = 2 / 3  # fraction of the comparable objects that must have moved together
 _PARTIAL_SLACK = 1.5  # factor of the last two limits for pairs with a partial view
 _TRUSTED = 0.4  # added to that if few views are whole, for the same position and size
 _LOOKAHEAD = 8  # later fragments at the same position that are considered
@@ -204,12 +206,14 @@ def _continues(
     """Return whether frames i and j may show the same scene: at least half of the objects match.
 
     A partial view may be smaller than its object. With ``slow``, positions and posteriors must
-    agree better, as the frames are not expected to show motion; those of partial views less so.
+    agree better; those of partial views less so. Instead, most objects, and at least two, may have
+    moved together, on a belt or before a moving sensor: unrelated images rarely look like that.
     """
     a, b = table.of_frame(i), table.of_frame(j)
-    distance = np.linalg.norm(table.centers[a][:, None] - table.centers[b][None], axis=2)
+    offsets = table.centers[b][None] - table.centers[a][:, None]
+    distance = np.linalg.norm(offsets, axis=2)
     nearby = distance < _NEIGHBOURHOOD_M
-    comparable = min(int(nearby.any(axis=1).sum()), int(nearby.any(axis=0).sum()))
+    comparable = _pairs(nearby)
     if comparable == 0:
         return True
     keys_a, keys_b = size_key(table.sizes[a]), size_key(table.sizes[b])
@@ -219,7 +223,26 @@ def _continues(
     if slow:
         slack = np.where(whole_a & whole_b, 1.0, _PARTIAL_SLACK)
         posterior_gap = posterior_difference(table.posteriors[a], table.posteriors[b])
-        matches &= distance <= slack * _SLOW_REACH * gate_radius(keys_a, settings.gate_m)[:, None]
-        matches &= posterior_gap <= slack * _SAME_POSTERIOR
-    n_matches = min(int(matches.any(axis=1).sum()), int(matches.any(axis=0).sum()))
-    return 2 * n_matches >= comparable
+        alike = matches & (posterior_gap <= slack * _SAME_POSTERIOR)
+        reach = slack * _SLOW_REACH * gate_radius(keys_a, settings.gate_m)[:, None]
+        matches = alike & (distance <= reach)
+        if _moved_together(offsets, alike) >= max(2, _MOST * comparable):
+            return True
+    return 2 * _pairs(matches) >= comparable
+
+
+def _moved_together(offsets: F8, alike: Bool) -> int:
+    """Return how many of the ``alike`` pairs (m, n) of objects share a displacement.
+
+    ``offsets`` (m, n, 3) are the displacements, metres; each object's shortest one is tried.
+    """
+    distance = np.where(alike, np.linalg.norm(offsets, axis=2), np.inf)
+    rows = np.flatnonzero(alike.any(axis=1))
+    shortest = offsets[rows, distance[rows].argmin(axis=1)]
+    differences = (np.linalg.norm(offsets - d, axis=2) for d in shortest)
+    return max((_pairs(alike & (d <= _TOGETHER_M)) for d in differences), default=0)
+
+
+def _pairs(matches: Bool) -> int:
+    """Return the smaller one of the numbers of rows and of columns with a match."""
+    return min(int(matches.any(axis=1).sum()), int(matches.any(axis=0).sum()))
