@@ -216,6 +216,18 @@ def test_cameras_that_see_different_objects_are_no_scene_cuts(count: int) -> Non
     assert [track.hits for track in tracks] == [30] * (2 * count)
 
 
+def test_frames_of_fast_camera_do_not_end_tracks_of_slow_one() -> None:
+    """Each odd view of the camera with one image per second would get its own track."""
+    fast = [frame(k, [0, 0, 0], topic="/fast") for k in range(200)]
+    slow = [
+        frame(k, [1, 0, 0], stamp_ns=k * SECOND + 7, posterior=BOX if k % 4 == 2 else CUP)
+        for k in range(20)
+    ]
+    tracks = track_recording([*fast, *slow], SETTINGS, together={"/fast", "/depth"})
+
+    assert [track.hits for track in tracks] == [200, 20]
+
+
 @pytest.mark.parametrize("frames", [1, 2])
 def test_single_images_of_several_cameras_keep_every_detection(frames: int) -> None:
     """Images of other cameras are no chance to see an object again."""

@@ -56,6 +56,7 @@ def two_tracks(**changes: Any) -> tracker._Active:
         born_ns=np.array([0, 3 * SECOND]),
         seen_ns=np.array([4 * SECOND, 4 * SECOND + 70_000_000]),
         missed=np.array([0, 1]),
+        topics=np.array([0, 0]),
     )
     return replace(found, **changes)
 
@@ -89,7 +90,7 @@ def test_correction_is_kalman_update_with_running_means() -> None:
         np.log([[0.5, 0.4, 0.3], [0.17, 0.09, 0.11]]),
         np.array([[0.5, 0.5], [0.4, 0.6]]),
     )
-    found.seen_ns[:] = 5 * SECOND
+    found.seen_ns[:], found.topics[:] = 5 * SECOND, 3
     size_difference = np.abs(before.size[0] - found.size[1]).mean()
     tracker._correct(tracks, found, np.array([[0, 1]]), np.array([False, True]))
 
@@ -107,7 +108,8 @@ def test_correction_is_kalman_update_with_running_means() -> None:
     assert_allclose(tracks.size[0], size)
     assert_allclose(tracks.posterior[0], [0.7 - rate * 0.3, 0.3 + rate * 0.3])
     assert tracks.hits.tolist() == [6, 2]
-    assert tracks.missed.tolist() == [0, 2]
+    assert tracks.missed.tolist() == [0, 1]
+    assert tracks.topics.tolist() == [3, 0]
     assert tracks.seen_ns.tolist() == [5 * SECOND, before.seen_ns[1]]
     assert_allclose(tracks.position[1], before.position[1])
 

@@ -108,6 +108,7 @@ def _associate(table: DetectionTable, cuts: Bool, settings: TrackingSettings) ->
             table.sizes[detections],
             table.posteriors[detections],
             partial=table.partial[detections],
+            topic=int(table.topics[row]),
         )
     return ids
 
@@ -122,8 +123,9 @@ def _without_gaps(table: DetectionTable, track: I4) -> list[I4]:
     """Split a track at long gaps; `merge_fragments` may join the parts again."""
     if len(track) == 0:
         return []
-    gap_s = np.diff(table.stamps(track)) * 1e-9
-    long = (gap_s > _GAP_S) & (np.diff(table.rows[track]) > _GAP_FRAMES)
+    gap_s, rows = np.diff(table.stamps(track)) * 1e-9, table.rows[track]
+    frames = table.sees(track, np.arange(rows[0], rows[-1] + 1)).cumsum()
+    long = (gap_s > _GAP_S) & (np.diff(frames[rows - rows[0]]) > _GAP_FRAMES)
     return np.split(track, np.flatnonzero(long) + 1)
 
 

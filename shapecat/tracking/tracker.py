@@ -46,6 +46,7 @@ class _Active:
     born_ns: I4
     seen_ns: I4
     missed: I4
+    topics: I4  # the sensor that saw it last
 
     def rows(self, which: Bool) -> Self:
         """Return the tracks selected by a mask."""
@@ -94,6 +95,7 @@ class Tracker:
         posteriors: ArrayLike,
         *,
         partial: ArrayLike | None = None,
+        topic: int = 0,
     ) -> I4:
         """Associate the detections of the next frame.
 
@@ -105,6 +107,7 @@ class Tracker:
         sizes : (n, 3) metres; the third length is along the up direction.
         posteriors : (n, c) posteriors of the single views.
         partial : (n,) whether the image border or an occluder cuts the object; none by default.
+        topic : number of the sensor. Only frames of the sensor that saw an object last can miss it.
 
         Returns
         -------
@@ -127,12 +130,13 @@ class Tracker:
         order = np.lexsort(np.column_stack([points, lengths, beliefs, cut]).T[::-1])
         detections = _seed(points[order], size_key(lengths[order]), beliefs[order])
         result = np.zeros(len(points), np.int32)
-        result[order] = self._advance(stamp_ns, detections, cut[order])
+        result[order] = self._advance(stamp_ns, detections, cut[order], topic)
         return result
 
-    def _advance(self, stamp_ns: int, detections: _Active, partial: Bool) -> I4:
+    def _advance(self, stamp_ns: int, detections: _Active, partial: Bool, topic: int) -> I4:
         elapsed_s = self._tick(stamp_ns)
         detections.born_ns[:] = detections.seen_ns[:] = self._clock_ns
+        detections.topics[:] = topic
         if self._active is None or not len(self._active.ids):
             self._active = detections.rows(np.zeros(len(detections.ids), bool))
         active = _predict(self._active, elapsed_s)
@@ -141,6 +145,7 @@ class Tracker:
             _LIMIT,
             self._settings.association,
         )
+        active.missed[active.topics == topic] += 1
         _correct(active, detections, pairs, partial)
         new = np.ones(len(detections.ids), bool)
         new[pairs[:, 1]] = False
@@ -188,6 +193,7 @@ def _seed(centers: F8, size_keys: F8, posteriors: F8) -> _Active:
         born_ns=np.zeros(n, np.int64),
         seen_ns=np.zeros(n, np.int64),
         missed=np.zeros(n, np.int64),
+        topics=np.zeros(n, np.int64),
     )
 
 
@@ -232,10 +238,9 @@ def _costs(tracks: _Active, detections: _Active, clock_ns: int, settings: Tracki
 
 
 def _correct(tracks: _Active, detections: _Active, pairs: I4, partial: Bool) -> None:
-    """Update tracks in place with their detections; the others have missed one more frame."""
+    """Update tracks in place with their detections."""
     i, j = pairs.T
-    tracks.missed += 1
-    tracks.missed[i] = 0
+    tracks.missed[i], tracks.topics[i] = 0, detections.topics[j]
     tracks.seen_ns[i] = detections.seen_ns[j]
     tracks.hits[i] += 1
     # A view of another size shows another part of the object, so its centre is less reliable.
