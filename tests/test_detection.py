@@ -793,10 +793,12 @@ def test_overhang_belongs_to_box_at_table_edge() -> None:
     check([table(0.5, 0.3), box((0, -0.28, 0), (0.1, 0.12, 0.1))], [1], least=0.93)
 
 
-def test_row_of_boxes_is_no_wall() -> None:
-    """Their fronts lie in one upright plane, 0.75 m wide."""
-    row = [box((0.16 * k - 0.32, 0, 0), (0.11, 0.08, 0.16)) for k in range(5)]
-    check([table(0.6, 0.4), *row], [1, 2, 3, 4, 5], tilt_deg=25, distance=1.2)
+@pytest.mark.parametrize(("n", "width", "gap"), [(5, 0.11, 0.05), (6, 0.12, 0.02), (4, 0.2, 0.04)])
+def test_row_of_boxes_is_no_wall(n: int, width: float, gap: float) -> None:
+    """Their fronts lie in one upright plane, at least 0.75 m wide, and some are large."""
+    pitch = width + gap
+    row = [box(((k - (n - 1) / 2) * pitch, 0, 0), (width, 0.08, 0.16)) for k in range(n)]
+    check([table(0.6, 0.4), *row], list(range(1, n + 1)), tilt_deg=25, distance=1.2)
 
 
 @pytest.mark.parametrize("width", [0.4, 0.45])

@@ -94,6 +94,9 @@ class WallSettings(NamedTuple):
     """Minimum area of a part that is cleared because it lies exactly in the wall."""
     exact: float = 0.0045
     """Largest standard deviation of such a part from the wall, 1/m: that of a wall's samples."""
+    free_share: float = 0.25
+    """Minimum fraction of the left and right ends of a part in front of farther surface, for the
+    front of an object; it has half if one flank is visible too."""
     cut_off: float = 0.75
     """Minimum diagonal of a wall that is cut off by two sides of the image, relative to the largest
     object.

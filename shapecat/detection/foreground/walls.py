@@ -57,7 +57,8 @@ def remove_walls(grid: DepthGrid, plane_id: I4, up: F8, largest_m: float, trials
             break
         normal = plane_normal(plane, grid.intrinsics)
         if _is_wall(grid, samples, plane, normal, up, largest_m):
-            _clear(grid, plane_id, plane, normal, walls)
+            axes = np.stack((normal, cross(normal, up), up))
+            _clear(grid, plane_id, plane, axes, largest_m, walls)
         samples = select_outliers(samples, plane, 2 * PLANES.tolerance)
     return walls
 
@@ -130,8 +131,11 @@ def _measure(
 
 
 @kernel(inline=True)
-def _clear(grid: DepthGrid, plane_id: I4, plane: F8, normal: F8, walls: U1) -> None:
-    """Clear the large connected parts of a wall; small parts may be objects in front of it."""
+def _clear(grid: DepthGrid, plane_id: I4, plane: F8, axes: F8, largest_m: float, walls: U1) -> None:
+    """Clear the large connected parts of a wall; other parts may be objects in front of it.
+
+    ``axes`` (3, 3) are its normal, the horizontal direction along it, and up.
+    """
     inv_depth = grid.inverse_depth
     rows, columns = inv_depth.shape
     stack, state = unset(inv_depth.size, np.int32), unset(inv_depth.shape, np.uint8)
@@ -140,9 +144,10 @@ def _clear(grid: DepthGrid, plane_id: I4, plane: F8, normal: F8, walls: U1) -> N
     for i in range(rows):
         for j in range(columns):
             if state[i, j] == UNMEASURED:
-                count, area, squares = _flood(grid, plane, normal, i, j, state, stack)
+                count, area, squares = _flood(grid, plane, axes[0], i, j, state, stack)
                 exact = area >= WALLS.patch_m2 and squares < count * WALLS.exact**2
-                if area >= WALLS.part_m2 or exact:
+                large = area >= WALLS.part_m2 or exact
+                if large and not _is_free_standing(grid, axes, largest_m, state, stack[:count]):
                     total += area
                     for p in stack[:count]:
                         state[p // columns, p % columns] = CLEARED
@@ -151,6 +156,37 @@ def _clear(grid: DepthGrid, plane_id: I4, plane: F8, normal: F8, walls: U1) -> N
         for j in range(columns):
             marks[j] = max(marks[j], states[j])
             plane_ids[j] = 0 if states[j] == CLEARED else plane_ids[j]
+
+
+@kernel(inline=True)
+def _is_free_standing(grid: DepthGrid, axes: F8, largest_m: float, state: U1, cells: I4) -> bool:
+    """Return whether a connected part of a wall is the front of one of several objects in a row.
+
+    It is no larger than an object, and ends to the left and right in front of farther surface. A
+    wall ends behind a nearer surface or in a corner.
+    """
+    inv_depth, k = grid.inverse_depth, grid.intrinsics
+    (rows, columns), (_, side, up) = inv_depth.shape, axes
+    farther = nearer = ends = 0
+    low, high = np.full(2, np.inf), np.full(2, -np.inf)
+    for p in cells:
+        i, j = p // columns, p % columns
+        w = inv_depth[i, j]
+        x, y = (j - k.cx) / k.fx, (i - k.cy) / k.fy
+        for d in range(2):
+            along = (axes[1 + d, 0] * x + axes[1 + d, 1] * y + axes[1 + d, 2]) / w
+            low[d], high[d] = min(low[d], along), max(high[d], along)
+        for di, dj in ((1, 0), (-1, 0), (0, 1), (0, -1)):
+            v, u = i + di, j + dj
+            if v < 0 or u < 0 or v >= rows or u >= columns or state[v, u] != 0:
+                continue
+            if abs(di * side[1] + dj * side[0]) < abs(di * up[1] + dj * up[0]):
+                continue  # above or below
+            ends += 1
+            farther += 0 < inv_depth[v, u] < w - grid.discontinuity
+            nearer += inv_depth[v, u] > w + grid.discontinuity
+    fits = max(high[0] - low[0], high[1] - low[1]) <= largest_m
+    return bool(fits and farther > nearer and farther > WALLS.free_share * ends)
 
 
 @kernel(inline=True)
