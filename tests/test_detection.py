@@ -801,6 +801,14 @@ def test_row_of_boxes_is_no_wall(n: int, width: float, gap: float) -> None:
     check([table(0.6, 0.4), *row], list(range(1, n + 1)), tilt_deg=25, distance=1.2)
 
 
+def test_tops_of_equal_boxes_are_no_plane() -> None:
+    """Together they are as large as a table, but there is floor between them."""
+    places = [(x, y) for y in (-0.3, -0.1, 0.1, 0.3) for x in (-0.4, -0.2, 0.0, 0.2, 0.4)]
+    shapes = [box((x, y, 0), (0.15, 0.15, 0.12)) for x, y in places]
+    depth, _ = render([table(3, 3), *shapes], tilt_deg=50, distance=1.7)
+    assert len(found(frame_of(depth)).planes) == 1
+
+
 @pytest.mark.parametrize("width", [0.4, 0.45])
 @pytest.mark.parametrize("y", [0.1, -0.2])
 def test_large_box_before_empty_background_is_no_wall(width: float, y: float) -> None:

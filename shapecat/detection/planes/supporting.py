@@ -5,7 +5,13 @@ import math
 import numpy as np
 
 from shapecat.arrays import F4
-from shapecat.detection.depth_grid import DepthGrid, PinholeIntrinsics, back_project, project
+from shapecat.detection.depth_grid import (
+    DepthGrid,
+    PinholeIntrinsics,
+    back_project,
+    project,
+    row_and_column,
+)
 from shapecat.detection.planes.extent import (
     COS,
     DIRECTIONS,
@@ -17,7 +23,7 @@ from shapecat.detection.planes.extent import (
 from shapecat.detection.planes.ransac import DepthSamples
 from shapecat.detection.planes.settings import PLANES
 from shapecat.geometry import NEAREST_M
-from shapecat.jit import kernel
+from shapecat.jit import kernel, unset
 
 __all__ = ["supporting_planes"]
 
@@ -45,6 +51,9 @@ def supporting_planes(
     7. Drop a plane of less than 0.1 m2 if little is visible below its front edge.
     8. Keep all others.
 
+    Above another plane, the largest connected part of a plane counts: the tops of equal boxes are
+    many small parts.
+
     Parameters
     ----------
     candidates : planes, lowest first; their covered area counts as visible.
@@ -58,6 +67,8 @@ def supporting_planes(
         high = tallest_m < drop < math.inf
         if drop < PLANES.min_drop_m:
             continue
+        if supports and not high and area_m2 >= PLANES.board_m2:
+            area_m2 = _largest_part(grid, samples, plane) + covered_m2
         if supports and not high and area_m2 < PLANES.furniture_m2:
             if _is_enclosed(grid, samples, plane):
                 supports.append(_extend_to_walls(grid, plane))
@@ -95,6 +106,44 @@ def _extend_to_walls(grid: DepthGrid, plane: SupportingPlane) -> SupportingPlane
     sides = COS[:, None] * across[near] + SIN[:, None] * along[near]
     extent = sides.max(axis=1, initial=-np.inf)
     return plane._replace(extent=np.maximum(plane.extent, extent))
+
+
+@kernel
+def _largest_part(grid: DepthGrid, samples: DepthSamples, plane: SupportingPlane) -> float:
+    """Return the area of the largest connected part of a plane, m2.
+
+    Objects on a plane hide parts of it, so nearer surface and missing depth connect parts. Farther
+    surface, which is seen past an edge, separates them.
+    """
+    inv_depth = grid.inverse_depth
+    rows, columns = inv_depth.shape
+    part, stack = np.zeros(inv_depth.size, np.int32), unset(inv_depth.size, np.int32)
+    areas = np.zeros(samples.inverse_depth.size + 1)
+    parts = 0
+    for k in range(samples.inverse_depth.size):
+        i, j = int(samples.i[k]), int(samples.j[k])
+        level = plane.a * j + plane.b * i + plane.c
+        if level <= 0 or abs(samples.inverse_depth[k] - level) >= PLANES.tolerance:
+            continue
+        start = i * columns + j
+        if part[start] == 0:
+            parts += 1
+            stack[0], part[start], head, tail = start, parts, 0, 1
+            while head < tail:
+                y, x = row_and_column(stack[head], columns)
+                head += 1
+                for dy, dx in ((0, 1), (0, -1), (1, 0), (-1, 0)):
+                    v, u = y + dy, x + dx
+                    if v < 0 or u < 0 or v >= rows or u >= columns or part[v * columns + u] > 0:
+                        continue
+                    at = plane.a * u + plane.b * v + plane.c
+                    value = inv_depth[v, u]
+                    if at > 0 and (value <= 0 or value > at - 2 * PLANES.tolerance):
+                        stack[tail], part[v * columns + u] = v * columns + u, parts
+                        tail += 1
+        facing = max(-level * plane.offset, 0.05)
+        areas[part[start]] += samples.share / (level * level * facing)
+    return float(areas.max() / (grid.intrinsics.fx * grid.intrinsics.fy))
 
 
 @kernel
