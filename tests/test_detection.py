@@ -306,6 +306,20 @@ def test_pot_is_one_object(tilt_deg: float, radius: float, height: float, floor:
     check([table(1, 1), pot(0, -0.1, radius, height, floor)], [1], tilt_deg=tilt_deg)
 
 
+def test_cup_off_the_axis_is_one_object_from_above() -> None:
+    """Its walls face each other along the line of sight; its floor is hardly above the table."""
+    shape = pot(0, 0, 0.035, 0.08, 0.006)
+    shapes = [table(1, 1), lambda origin, rays: shape(origin - [0.25, 0.1, 0], rays)]
+    check(shapes, [1], tilt_deg=85, least=0.7)
+
+
+def test_tall_boxes_beside_each_other_stay_apart_from_above() -> None:
+    """To the left and right, the flank of one is in line with the top of the next."""
+    places = [(x, y) for y in (-0.15, -0.05, 0.05, 0.15) for x in (-0.22, -0.11, 0.0, 0.11, 0.22)]
+    shapes = [box((x, y, 0), (0.05, 0.04, 0.12)) for x, y in places]
+    check([table(1, 1), *shapes], list(range(1, 21)), tilt_deg=89)
+
+
 @pytest.mark.parametrize(("tilt_deg", "x", "y"), [(50, -0.12, 0.15), (60, 0.05, 0.15)])
 def test_plate_behind_pot_is_not_merged_with_its_floor(tilt_deg: float, x: float, y: float) -> None:
     """Both may have the same height; the wall of the pot hides the gap between them."""

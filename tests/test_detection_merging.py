@@ -25,6 +25,7 @@ from tests.test_detection import Array
 INTRINSICS = PinholeIntrinsics(250.0, 250.0, 99.5, 74.5)
 UP = np.array([0.0, -1.0, 0.0])
 """A camera that looks straight ahead."""
+VIEW = ViewGeometry(INTRINSICS.fx, UP)
 
 
 def measured(depth: Array, labels: Array) -> tuple[Segments, SurfaceGraph, DepthGrid]:
@@ -59,7 +60,7 @@ def test_touching_boxes_are_adjacent() -> None:
     assert first["area"] == pytest.approx(0.16**2, rel=0.05)
     assert segments.pairs[1, 2]["contact"] == segments.pairs[2, 1]["contact"] == 50
     assert segments.pairs[1, 2]["in_front"] == segments.pairs[2, 1]["in_front"] == 0
-    assert find_adjacent(segments, 1)[2]
+    assert find_adjacent(segments, 1, VIEW)[2]
 
 
 def test_an_occluding_box_is_adjacent_to_the_box_behind_it() -> None:
@@ -72,7 +73,7 @@ def test_an_occluding_box_is_adjacent_to_the_box_behind_it() -> None:
 def test_features_of_two_boxes() -> None:
     segments, _, _ = measured(*two_boxes(0))
     out = np.zeros(1, PAIR_FEATURES)
-    pair_features(segments, 2, 1, ViewGeometry(250.0, 0.0), out[0])
+    pair_features(segments, 2, 1, VIEW, out[0])
     assert out["adjacency"]["contact"] == 1
     assert out["adjacency"]["contact_m"] == pytest.approx(50 / 250 * 0.8, rel=1e-3)
     assert out["relation"]["top_over_top_m"] == pytest.approx(0.032, rel=1e-3)  # smaller first
@@ -99,7 +100,7 @@ def test_features_of_two_planes_that_meet_in_a_corner() -> None:
     labels[50:100, 50:100], labels[50:100, 100:150] = 1, 2
     segments, _, _ = measured(depth, labels)
     out = np.zeros(1, PAIR_FEATURES)
-    pair_features(segments, 1, 2, ViewGeometry(250.0, 0.0), out[0])
+    pair_features(segments, 1, 2, VIEW, out[0])
     relation = out["relation"][0]
     assert relation["normal_cos"] == pytest.approx(0, abs=0.1)
     middle = (across * depth[75])[100:150].mean()  # and as far in front of the other's plane
@@ -114,7 +115,7 @@ def test_merging_adds_up_the_statistics() -> None:
     assert segments.parent.tolist() == [0, 1, 1]
     assert segments.statistics[1]["count"] == 50 * 50 + 60 * 40
     assert not segments.pairs[1, 1]["contact"]
-    assert not find_adjacent(segments, 1)[2]
+    assert not find_adjacent(segments, 1, VIEW)[2]
     assert (segments.samples[1] >= 0).all()
 
 

@@ -75,13 +75,16 @@ def test_pair_features_do_not_depend_on_the_order_of_the_pair() -> None:
     found = oversegment(grid, Task(DetectionSettings(), rng))
     assert found is not None
     ground, (_, _, segments) = found
-    view_geometry = ViewGeometry(grid.intrinsics.fx, float(ground.up[2]))
+    view_geometry = ViewGeometry(grid.intrinsics.fx, ground.up)
     there, back = np.zeros((2, 1), PAIR_FEATURES)
     seen = 0
     for p in range(1, segments.parent.size):
         for q in range(1, p):
-            assert find_adjacent(segments, p)[q] == find_adjacent(segments, q)[p]
-            if find_adjacent(segments, p)[q]:
+            assert (
+                find_adjacent(segments, p, view_geometry)[q]
+                == find_adjacent(segments, q, view_geometry)[p]
+            )
+            if find_adjacent(segments, p, view_geometry)[q]:
                 pair_features(segments, p, q, view_geometry, there[0])
                 pair_features(segments, q, p, view_geometry, back[0])
                 assert np.array_equal(there, back)

@@ -227,7 +227,7 @@ def _oversegment(grid: DepthGrid, model: PlaneModel) -> OverSegmentation:
 def merge_segments(grid: DepthGrid, model: PlaneModel, oversegmentation: OverSegmentation) -> None:
     """Merge the segments of each object, in place."""
     graph, labels, segments = oversegmentation
-    view_geometry = ViewGeometry(grid.intrinsics.fx, model.up[2])
+    view_geometry = ViewGeometry(grid.intrinsics.fx, model.up)
     learned.merge_learned(segments, view_geometry, learned.load_trees())
     merge_across_occluder(segments, grid, graph.normal, labels)
 

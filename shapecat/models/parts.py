@@ -142,11 +142,11 @@ def _pairs(
     ground, (graph, labels, segments) = oversegmented
     merge_across_occluder(segments, grid, graph.normal, labels)
     counts = count_labels(pixel_labels, labels, grid)
-    view_geometry, yielded = ViewGeometry(grid.intrinsics.fx, float(ground.up[2])), set()
+    view_geometry, yielded = ViewGeometry(grid.intrinsics.fx, ground.up), set()
     while True:
         rows, object_of = _segment_objects(segments, counts, object_labels)
         todo = []
-        for p, q in _adjacent_pairs(segments, object_of):
+        for p, q in _adjacent_pairs(segments, object_of, view_geometry):
             same = bool(object_of[p] == object_of[q] and object_of[p] > 0)
             if same:
                 todo.append((p, q))
@@ -188,11 +188,13 @@ def _segment_objects(segments: Segments, counts: I4, object_labels: I4) -> tuple
     return sizes, np.where(pure, np.where(np.isin(best, object_labels), best, 0), -1)
 
 
-def _adjacent_pairs(segments: Segments, object_of: I4) -> Iterator[tuple[int, int]]:
+def _adjacent_pairs(
+    segments: Segments, object_of: I4, view_geometry: ViewGeometry
+) -> Iterator[tuple[int, int]]:
     """Yield adjacent pairs of unmixed segments, of which at least one belongs to an object."""
     n = segments.parent.size
     for p in range(1, n):
-        adjacent = find_adjacent(segments, p)
+        adjacent = find_adjacent(segments, p, view_geometry)
         for q in range(p + 1, n):
             known = min(object_of[p], object_of[q]) >= 0 and max(object_of[p], object_of[q]) > 0
             if known and adjacent[q]:

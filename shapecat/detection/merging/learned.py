@@ -75,7 +75,7 @@ def _rate(
 
     ``pair`` (1,) is work space for the features of a pair, which the trees read as numbers.
     """
-    adjacent, values = find_adjacent(segments, p), pair.view(np.float32)
+    adjacent, values = find_adjacent(segments, p, view_geometry), pair.view(np.float32)
     for q in range(first, adjacent.size):
         low, high = min(p, q), max(p, q)
         logits[low, high] = -np.inf

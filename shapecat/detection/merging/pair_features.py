@@ -9,7 +9,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from shapecat.arrays import Bool
+from shapecat.arrays import F8, Bool
 from shapecat.detection.merging.image_hull import hull_area
 from shapecat.detection.merging.segment_features import (
     SEGMENT_FEATURES,
@@ -22,6 +22,8 @@ from shapecat.detection.merging.segment_features import (
 )
 from shapecat.detection.merging.segments import SEGMENT, Records, Row, Segments, add_statistics
 from shapecat.detection.merging.settings import MERGING
+from shapecat.detection.planes.extent import DIRECTIONS
+from shapecat.geometry import NEAREST_M
 from shapecat.jit import kernel
 
 __all__ = [
@@ -76,7 +78,7 @@ _RELATION = np.dtype(
         ("hull_growth", "f4"),  # convex hull of both over those of each
         ("cells", "f4"),  # of the first
         ("cell_m", "f4"),
-        ("down", "f4"),  # as in `ViewGeometry`
+        ("down", "f4"),  # cosine between the optical axis and up
     ],
     align=True,
 )
@@ -102,37 +104,53 @@ class ViewGeometry(NamedTuple):
     Attributes
     ----------
     focal : focal length in cells.
-    down : cosine between the optical axis and up, the third component of up.
+    up : (3,) unit vector, sensor frame.
     """
 
     focal: float
-    down: float
+    up: F8
 
 
 @kernel
-def find_adjacent(segments: Segments, p: int) -> Bool:
+def find_adjacent(segments: Segments, p: int, view_geometry: ViewGeometry) -> Bool:
     """Return which segments may be one object with segment ``p``: (n + 1,) bool.
 
     They are above the same plane as ``p``, and touch it, hide it, are hidden by it, or face it.
     """
-    statistics, pairs, parent = segments.statistics, segments.pairs, segments.parent
-    plane_id = segments.plane_id
+    pairs, parent, plane_id = segments.pairs, segments.parent, segments.plane_id
     adjacent = np.zeros(parent.size, np.bool_)
     for q in range(1, parent.size if parent[p] == p else 1):
         if q != p and parent[q] == q and plane_id[q] == plane_id[p]:
             border = pairs[p, q].contact + pairs[p, q].near + pairs[p, q].in_front
             border += pairs[q, p].in_front
-            adjacent[q] = border >= MERGING.min_links or _face(statistics[p], statistics[q])
+            adjacent[q] = border >= MERGING.min_links or _face(segments, p, q, view_geometry)
     return adjacent
 
 
 @kernel(inline=True)
-def _face(a: Row, b: Row) -> bool:
-    """Return whether two segments may be the near and the far wall of a pot, which do not touch."""
-    min_width, max_width = min(width_of(a), width_of(b)), max(width_of(a), width_of(b))
-    common = min(a.right, b.right) - max(a.left, b.left)
-    level = abs(a.top - b.top) < MERGING.facing_m
-    return bool(level and common > MERGING.facing_share * min_width and _distance(a, b) < max_width)
+def _face(segments: Segments, p: int, q: int, view_geometry: ViewGeometry) -> bool:
+    """Return whether two segments may be the near and the far wall of a pot, which do not touch.
+
+    They are one behind the other along their line of sight, which is not the optical axis: seen
+    from above, the walls of a pot at the left of the image are to the left and right.
+    """
+    a, b = segments.statistics[p], segments.statistics[q]
+    if abs(a.top - b.top) >= MERGING.facing_m:
+        return False
+    (x, y, z), (u, v, w) = _mean_position(a), _mean_position(b)
+    x, y, z = (x + u) / 2, (y + v) / 2, max((z + w) / 2, NEAREST_M)
+    # the horizontal direction across the line of sight, in the image
+    up = view_geometry.up
+    sx, sy, sz = up[1] * z - up[2] * y, up[2] * x - up[0] * z, up[0] * y - up[1] * x
+    angle = math.atan2(sy - sz * y / z, sx - sz * x / z)
+    d = round(angle * DIRECTIONS / (2 * math.pi)) % DIRECTIONS
+    opposite = (d + DIRECTIONS // 2) % DIRECTIONS
+    hull, other = segments.hulls[p], segments.hulls[q]
+    width, other_width = hull[d] + hull[opposite], other[d] + other[opposite]
+    common = min(hull[d], other[d]) + min(hull[opposite], other[opposite])
+    max_width = max(width, other_width) * z / view_geometry.focal
+    overlap = common > MERGING.facing_share * min(width, other_width)
+    return bool(overlap and _distance(a, b) < max_width)
 
 
 @kernel(inner=True)
@@ -182,7 +200,7 @@ def write_pair_features(
     add_statistics(merged, 0, 1)
     relation.lateral_curvature = lateral_curvature(merged[0])
     relation.normal_position_correlation = normal_position_correlation(merged[0])
-    relation.cells, relation.cell_m, relation.down = a.count, cell, view_geometry.down
+    relation.cells, relation.cell_m, relation.down = a.count, cell, view_geometry.up[2]
 
 
 @kernel(inline=True)
