@@ -2,22 +2,32 @@
 
 from collections import Counter
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
 import pytest
 
 from shapecat.errors import NoStreamError
-from shapecat.recordings import choose_streams, depth_streams, frames, open_recording
-from shapecat.recordings.colour_streams import pair_colours
+from shapecat.recordings import (
+    choose_streams,
+    colour_streams,
+    depth_streams,
+    frames,
+    open_recording,
+    sensors,
+    streams,
+)
+from shapecat.recordings.colour_streams import ColourStream, pair_colours
 from shapecat.recordings.decoding.depth_image import DEPTH_ENCODINGS
 from shapecat.recordings.overview import describe_recording
 from shapecat.recordings.recording import Recording
-from shapecat.recordings.sensors import by_sensor
+from shapecat.recordings.sensors import Stream, by_sensor
 from tests.colour_messages import gradient, packed, raw
 from tests.depth_encodings import png
 from tests.messages import (
     EPOCH,
+    IMAGE,
     cloud,
     compressed,
     image,
@@ -313,6 +323,77 @@ def test_depth_may_be_a_png_file(tmp_path: Path, topic: str, kind: str, *, known
     for frame in found:
         assert frame.depth is not None
         np.testing.assert_array_equal(frame.depth, wavy_depth() / np.float32(1000))
+
+
+def counting(monkeypatch: pytest.MonkeyPatch, module: Any, name: str) -> Counter[str]:
+    """Count the calls of a function under its name."""
+    calls = Counter[str]()
+    function = getattr(module, name)
+
+    def counted(*args: Any) -> Any:
+        calls[name] += 1
+        return function(*args)
+
+    monkeypatch.setattr(module, name, counted)
+    return calls
+
+
+def test_streams_are_compared_in_pairs_only(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Comparing every colour with every two of 200 depth streams took minutes."""
+    count = 12
+    streams = [
+        Stream(f"/robot/cam{k}/depth/image", IMAGE, "depth", f"/info{k}", 1, f"depth{k}")
+        for k in range(count)
+    ]
+    colours = tuple(
+        ColourStream(f"/robot/cam{k}/color/image", IMAGE, "raw", None, 1, f"color{k}", "rgb8")
+        for k in range(count)
+    )
+    monkeypatch.setattr(colour_streams, "colour_streams", lambda _: colours)
+    monkeypatch.setattr(colour_streams, "depth_streams", lambda _: tuple(streams))
+    compared = counting(monkeypatch, colour_streams, "_shared")
+    parsed = counting(monkeypatch, sensors, "_place")
+
+    pairs = pair_colours(SimpleNamespace(topics=()), streams)  # type: ignore[arg-type]  # unread
+
+    assert pairs == dict(zip([stream.topic for stream in streams], colours, strict=True))
+    assert compared["_shared"] <= 3 * count**2
+    assert parsed["_place"] == count
+
+
+def test_sensor_that_shares_more_keeps_its_colour() -> None:
+    """The sensor of a stream may be the nearest or the second nearest to the images."""
+    left, right, far = (
+        Stream(topic, IMAGE, "depth", "/info", 1, topic)
+        for topic in ("/r/left/depth/image", "/r/right/depth/image", "/q/depth/image")
+    )
+    one = ColourStream("/r/left/color/image", IMAGE, "raw", None, 1, "color", "rgb8")
+
+    nearest = colour_streams._nearest_sensors(one, [[far], [right], [left]])
+
+    assert [near.shared for near in nearest["depth"]] == [2, 1]
+    assert [colour_streams._belongs(one, s, nearest) for s in (left, right, far)] == [
+        True,
+        False,
+        False,
+    ]
+
+
+def test_calibrations_of_any_name_are_read_once(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Reading all of them again for each image took minutes for 200 cameras."""
+    items: list[Item] = []
+    for k in range(10):
+        items += in_frame(depth_and_info(f"/images{k}", f"/calibration{k}"), f"camera{k}")
+    path = write(tmp_path / "a.mcap", items)
+    read = counting(monkeypatch, streams, "first_message")
+
+    with open_recording(path) as recording:
+        found = depth_streams(recording)
+
+    assert [one.info_topic for one in found] == [f"/calibration{k}" for k in range(10)]
+    assert read["first_message"] == 10
 
 
 def in_frame(items: list[Item], frame_id: str) -> list[Item]:

@@ -1,11 +1,12 @@
 """Find the colour streams of a recording, and the one that belongs to a depth stream."""
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from contextlib import suppress
 from dataclasses import dataclass, replace
-from functools import partial
+from functools import lru_cache, partial
+from heapq import nlargest
 from pathlib import PurePosixPath
-from typing import Any, Literal
+from typing import Any, Literal, NamedTuple
 
 from shapecat.errors import NoStreamError, listed
 from shapecat.recordings.decoding.colour_image import COLOUR_ENCODINGS, compressed_kind
@@ -116,11 +117,12 @@ def _choose(
     """Return the best of the colour streams that were found for each depth stream."""
     images = [one for one in found if one.kind != "cloud" and not one.grey]
     sensors = by_sensor(depth_streams(recording)) if images else []
+    nearest = {one.topic: _nearest_sensors(one, sensors) for one in images}
     single = len({one.topic.removesuffix("/compressed") for one in images}) == 1
     chosen = {}
     for stream in streams:
         own = [one for one in found if one.kind == "cloud" and one.topic == stream.topic]
-        fitting = own or [one for one in images if _belongs(one, stream, sensors)]
+        fitting = own or [one for one in images if _belongs(one, stream, nearest[one.topic])]
         if not fitting and single and len(sensors) == 1:
             fitting = images
         if fitting:
@@ -143,13 +145,40 @@ def _warn_about_unread(recording: Recording) -> None:
             recording.warn(f"{topic.name}: there is no colour, since {name} cannot be read")
 
 
-def _belongs(one: ColourStream, stream: Stream, sensors: Sequence[Sequence[Stream]]) -> bool:
+class _NearSensor(NamedTuple):
+    """The streams of a sensor, and how much of their namespace some images share at most."""
+
+    shared: int
+    streams: Sequence[Stream]
+
+
+def _nearest_sensors(
+    one: ColourStream, sensors: Sequence[Sequence[Stream]]
+) -> dict[str, list[_NearSensor]]:
+    """Return the two sensors that share most of the namespace of images, for each kind of stream.
+
+    Two are enough to compare any sensor with the nearest other one.
+    """
+    nearest: dict[str, list[_NearSensor]] = {}
+    for kind in ("depth", "points"):
+        most = (
+            max((_shared(one, s) for s in sensor if s.kind == kind), default=0)
+            for sensor in sensors
+        )
+        near = map(_NearSensor, most, sensors)
+        nearest[kind] = nlargest(2, near, key=lambda sensor: sensor.shared)
+    return nearest
+
+
+def _belongs(
+    one: ColourStream, stream: Stream, nearest: Mapping[str, Sequence[_NearSensor]]
+) -> bool:
     """Return whether images are those of a depth stream's sensor, see `pair_colours`."""
     if same_frame(one.frame_id, stream.frame_id):
         return True
-    other_streams = (other for sensor in sensors if stream not in sensor for other in sensor)
-    shared = [_shared(one, other) for other in other_streams if other.kind == stream.kind]
-    return _shared(one, stream) > 0 and max(shared, default=0) <= _shared(one, stream)
+    shared = _shared(one, stream)
+    others = (near.shared for near in nearest[stream.kind] if stream not in near.streams)
+    return shared > 0 and next(others, 0) <= shared
 
 
 def _select(
@@ -179,9 +208,15 @@ def _rank(one: ColourStream, stream: Stream) -> tuple[bool, int, bool, bool, int
 
 def _shared(one: ColourStream, stream: Stream) -> int:
     """Return the number of leading namespace components that two topics share."""
-    a, b = (PurePosixPath(name.strip("/")).parts[:-1] for name in (one.topic, stream.topic))
+    a, b = _namespace(one.topic), _namespace(stream.topic)
     equal = [x == y for x, y in zip(a, b, strict=False)]
     return equal.index(False) if False in equal else len(equal)
+
+
+@lru_cache(maxsize=4096)
+def _namespace(topic: str) -> tuple[str, ...]:
+    """Return the components of a topic before its own name."""
+    return PurePosixPath(topic.strip("/")).parts[:-1]
 
 
 def _probe(topic: Topic, recording: Recording) -> ColourStream | None:

@@ -30,6 +30,7 @@ class Recording(ABC):
     start_ns, end_ns : log times of the first and last message; 0 if there is none.
     indexed : whether messages are found by topic and time, without reading the rest.
     warnings : problems found in the recording, for the user.
+    frame_ids : the frame id of the first message of each topic of which one was asked for.
     """
 
     kind: ClassVar[str]
@@ -43,6 +44,7 @@ class Recording(ABC):
         self.end_ns = 0
         self.indexed = True
         self.warnings: list[str] = []
+        self.frame_ids: dict[str, str] = {}
         self._channels: dict[int, Channel] = {}
         self._decoders: dict[tuple[str, str, bytes], Callable[[bytes | memoryview], Any]] = {}
 

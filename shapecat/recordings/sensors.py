@@ -65,7 +65,7 @@ def by_sensor(streams: Sequence[Stream]) -> list[list[Stream]]:
     twins = {
         (places[a.topic].space, places[b.topic].space)
         for a, b in permutations(streams, 2)
-        if _are_twins(a, b)
+        if _are_twins(a, b, places[a.topic], places[b.topic])
     }
 
     def are_same(a: Stream, b: Stream) -> bool:
@@ -99,14 +99,13 @@ def _share_namespace(a: _Place, b: _Place) -> bool:
     return a.space != () or all("depth" in "/".join(one.rest[:-1]) for one in (a, b))
 
 
-def _are_twins(a: Stream, b: Stream) -> bool:
+def _are_twins(a: Stream, b: Stream, first: _Place, second: _Place) -> bool:
     """Return whether the same topic of a driver is in two namespaces, each with its calibration.
 
     Namespaces that begin equally (``/kinect2/hd``, ``/kinect2/qhd``) belong to one driver, and one
     within another, as of throttled topics, holds a copy. Clouds have no calibration, so the last
     two parts of their topics are compared.
     """
-    first, second = _place(a.topic), _place(b.topic)
     short, long = sorted((first.space, second.space), key=len)
     copied = first.space[:1] == second.space[:1] or long[len(long) - len(short) :] == short
     if first.rest != second.rest or copied:

@@ -312,10 +312,12 @@ def _nearest(image: str, infos: Sequence[str]) -> str | None:
 
 
 def _frame_of(recording: Recording, topic: str) -> str:
-    """Return the frame id of a topic's first message; empty if it has none."""
-    with suppress(AttributeError):
-        return str(first_message(recording, topic).header.frame_id)
-    return ""
+    """Return the frame id of a topic's first message, read once; empty if it has none."""
+    if topic not in recording.frame_ids:
+        recording.frame_ids[topic] = ""
+        with suppress(AttributeError):
+            recording.frame_ids[topic] = str(first_message(recording, topic).header.frame_id)
+    return recording.frame_ids[topic]
 
 
 _INFO_NAMES = ("camera_info", "info/camera_info", "calibration")
