@@ -1,5 +1,6 @@
 """Tests of tracking metrics against motmetrics, and of box overlaps against exact volumes."""
 
+import tracemalloc
 import warnings
 from collections.abc import Iterator
 from typing import Any
@@ -142,3 +143,18 @@ def test_mask_matching_maximizes_total_overlap() -> None:
     assert matches.overlap.precision == pytest.approx(8 / 16)
     assert matches.overlap.recall == pytest.approx(8 / 16)
     assert (matches.overlap.hits, matches.overlap.objects, matches.overlap.detections) == (0, 2, 3)
+
+
+def test_memory_of_hota_grows_with_pairs_that_match() -> None:
+    """Counting the matches of all pairs of 2,300 tracks took 3.5 GB."""
+    count = 400
+    frames = [FrameIdentities([k], [k], np.ones((1, 1))) for k in range(count)]
+    tracemalloc.start()
+    try:
+        hota = judge_identities(frames).hota
+        _, peak = tracemalloc.get_traced_memory()
+    finally:
+        tracemalloc.stop()
+
+    assert hota == pytest.approx(1)
+    assert peak < 8 * 8 * count**2  # the thresholds alone are 19

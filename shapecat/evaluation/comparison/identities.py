@@ -153,19 +153,45 @@ def _hota(occurrences: _Occurrences) -> tuple[float, float, float]:
     if not (occurrences.true.sum() and occurrences.found.sum()):
         return (0.0, 0.0, 0.0) if occurrences.true.sum() else (float("nan"),) * 3
     alignment = _alignment(occurrences)
-    matches = np.zeros((_ALPHAS.size, *alignment.shape))
+    pairs, similar = [], []  # few of all pairs of identities ever match
     for true, found, similarity in occurrences.frames:
         score = alignment[np.ix_(true, found)] * similarity
         rows, columns = linear_sum_assignment(-score)
-        matched = similarity[rows, columns] >= _ALPHAS[:, None] - 1e-9
-        matches[:, true[rows], found[columns]] += matched
+        pairs.append(true[rows] * occurrences.found.size + found[columns])
+        similar.append(similarity[rows, columns])
+    matches, trues, founds = _count_matches(pairs, similar, occurrences.found.size)
     total = occurrences.true.sum() + occurrences.found.sum()
-    hits = matches.sum(axis=(1, 2))
-    ever = occurrences.true[:, None] + occurrences.found - matches
-    association = (matches * matches / np.maximum(ever, 1)).sum(axis=(1, 2)) / np.maximum(hits, 1)
+    hits = matches.sum(axis=1)
+    ever = occurrences.true[trues] + occurrences.found[founds] - matches
+    association = (matches * matches / np.maximum(ever, 1)).sum(axis=1) / np.maximum(hits, 1)
     detection = hits / (total - hits)
     hota = np.sqrt(detection * association)
     return float(hota.mean()), float(detection.mean()), float(association.mean())
+
+
+def _count_matches(
+    pairs: Sequence[I4], similar: Sequence[F8], found_count: int
+) -> tuple[F8, I4, I4]:
+    """Count the matches of each pair of identities that occurs, at each threshold of HOTA.
+
+    Parameters
+    ----------
+    pairs : for each frame, index of the true identity times ``found_count``, plus that of the
+        found one.
+    similar : for each frame, the similarity of each pair.
+
+    Returns
+    -------
+    The matches (thresholds, pairs), and the index of the true and of the found identity of each
+    pair (pairs,).
+    """
+    distinct, places = np.unique(np.concatenate(pairs), return_inverse=True)
+    similarity = np.concatenate(similar)
+    matches = [
+        np.bincount(places, similarity >= alpha - 1e-9, minlength=distinct.size)
+        for alpha in _ALPHAS
+    ]
+    return np.array(matches), *np.divmod(distinct, found_count)
 
 
 def _alignment(occurrences: _Occurrences) -> F8:
