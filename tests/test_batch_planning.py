@@ -804,6 +804,13 @@ def test_earlier_outcome_is_known_without_a_manifest(tmp_path: Path) -> None:
     assert (found.summary.counts["frames"], found.summary.processed) == (3, False)
 
 
+def test_run_stores_absolute_path(source: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """It is annotated and exported from another current folder."""
+    monkeypatch.chdir(source.parent)
+
+    assert planned(Path(source.name))["input"]["path"] == str(source.resolve())
+
+
 @pytest.mark.parametrize(
     "option",
     [

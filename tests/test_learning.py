@@ -376,16 +376,19 @@ def test_learning_stores_a_limited_number_of_views(
     categorizer: Categorizer, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """With all views of large data sets, the model file would be too large to be read."""
-    monkeypatch.setattr("shapecat.learning.incremental.KNOWN_VIEWS", 100)
-    cone = blobs(90, 7, ("cone",))
+    monkeypatch.setattr("shapecat.learning.incremental.KNOWN_VIEWS", 120)
+    new = blobs(90, 7, ("cone", "spoon"))
     model = add_categories(
-        categorizer, cone.descriptors, cone.labels.tolist(), rng=np.random.default_rng(0)
+        categorizer, new.descriptors, new.labels.tolist(), rng=np.random.default_rng(0)
     )
 
-    assert np.bincount(model.known_category).tolist() == [20] * 5
-    z = categorizer.bank.standardise(cone.descriptors).astype(np.float16)
-    stored = model.known_descriptors[model.known_category == 3]
-    assert all(np.any(np.all(row == z, axis=1)) for row in stored)
+    assert np.bincount(categorizer.known_category).tolist() == [50] * 4  # the last are unknown
+    assert np.bincount(model.known_category).tolist() == [20] * 6
+    z = categorizer.bank.standardise(new.descriptors).astype(np.float16)
+    before = categorizer.known_descriptors[categorizer.known_category == 3]
+    for code, views in ((3, z[new.labels == "cone"]), (4, z[new.labels == "spoon"]), (5, before)):
+        stored = model.known_descriptors[model.known_category == code]
+        assert all(np.any(np.all(row == views, axis=1)) for row in stored)
 
 
 @pytest.mark.parametrize("left", [[1, 1, 0], [1, 0], [2, 0, 0], [1, 2, 3, 0, 0]])
