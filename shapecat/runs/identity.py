@@ -106,7 +106,7 @@ class ContentDigest:
         """Prepare the digest of a file or folder."""
         self._path = path
         self._cancelled = Event()
-        self._thread = ThreadPoolExecutor(1)
+        self._pool = ThreadPoolExecutor(1)
 
     def __enter__(self) -> Self:
         return self
@@ -114,11 +114,11 @@ class ContentDigest:
     def __exit__(self, *_: object) -> None:
         """Stop reading."""
         self._cancelled.set()
-        self._thread.shutdown()
+        self._pool.shutdown()
 
     @cached_property
     def _digest(self) -> Future[str]:
-        return self._thread.submit(content_digest, self._path, cancelled=self._cancelled)
+        return self._pool.submit(content_digest, self._path, cancelled=self._cancelled)
 
     def start(self) -> None:
         """Start reading."""

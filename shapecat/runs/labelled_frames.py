@@ -25,7 +25,7 @@ from shapecat.types import (
     Pose,
 )
 
-__all__ = ["plane_of", "read_labelled_frames", "rows_by_frame"]
+__all__ = ["read_labelled_frames", "rows_by_frame"]
 
 
 _OBJECT = (
@@ -135,7 +135,7 @@ def _labelled_frame(
         log_time_ns=row["log_time_ns"],
         frame_id=row["frame_id"],
         fixed_from_sensor=pose,
-        planes=tuple(plane_of(plane) for plane in planes),
+        planes=tuple(_plane_of(plane) for plane in planes),
         objects=tuple(_join(parts, row["up"]) for parts in objects),
         ended=ended,
         seconds=dict(zip(row["stages"], row["seconds"], strict=True)),
@@ -144,7 +144,7 @@ def _labelled_frame(
     )
 
 
-def plane_of(row: Mapping[str, Any]) -> Plane:
+def _plane_of(row: Mapping[str, Any]) -> Plane:
     """Return the plane of a row of planes.parquet."""
     return Plane(
         normal=row["normal"],

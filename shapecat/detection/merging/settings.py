@@ -30,7 +30,7 @@ class MergingSettings(NamedTuple):
     facing_m: float = 0.015
     """Largest height difference between the tops of two walls of a pot, metres."""
     facing_share: float = 0.5
-    """Minimum overlap of the lateral ranges of two walls of a pot, relative to the narrower one."""
+    """Minimum overlap of two walls of a pot across their line of sight, relative to the smaller."""
     no_contact_m: float = -1.0
     """Value of the feature for the height of a contact with upward-facing surface, if there is no
     contact, metres."""

@@ -37,7 +37,7 @@ __all__ = ["find_horizontal_planes"]
 MAX_PLANES = 10
 MIN_SAMPLES = 44
 """Minimum number of points on a plane; noise alone gives a tenth of that."""
-PEAK_BINS = 5
+_PEAK_BINS = 5
 """Number of bins of heights around a peak that may belong to one plane."""
 
 
@@ -122,7 +122,7 @@ def fit_horizontal_planes(
     for _ in range(MAX_PLANES):
         if rest.shape[1] < MIN_SAMPLES:
             break
-        off_peak = abs(rest[3] - _histogram_peak(rest[3])) > PEAK_BINS / 2 * PLANES.bin_m
+        off_peak = abs(rest[3] - _histogram_peak(rest[3])) > _PEAK_BINS / 2 * PLANES.bin_m
         j, i, inv_depth, at_peak = np.compress(~off_peak, rest, axis=1)
         rest = np.compress(off_peak, rest, axis=1)
         size = at_peak.size
