@@ -38,7 +38,7 @@ class DetectionSettings:
     max_height_m: float = 0.6
     """Points higher than this above a plane do not belong to an object on it."""
     max_size_m: float = 0.6
-    """Segments larger than this are taken for walls or furniture."""
+    """Segments larger than this are treated as walls or furniture."""
     min_points: int = 60
     """Candidates with fewer points than this, at full resolution, are dropped."""
 
@@ -96,7 +96,7 @@ class TrackingSettings:
 
     association: Literal["hungarian", "greedy"] = "hungarian"
     """Assignment of detections to tracks: `hungarian` minimises the total cost (distance and
-    change of size and category), `greedy` takes the pair with the least cost first."""
+    change of size and category), `greedy` takes the pair with the lowest cost first."""
     gate_m: float = 0.12
     """Largest distance between a track and the centroid of its next detection; smaller for
     small objects."""
