@@ -1,4 +1,4 @@
-"""Ablation of the detection: overlap with the truth as steps are added and removed one by one.
+"""Ablation of detection: overlap with the truth as steps are added and removed one by one.
 
     python -m benchmarks.ablation --first 500 --count 30
 

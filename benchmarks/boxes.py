@@ -43,7 +43,7 @@ FRAMES, RATE_HZ = 24, 8.0
 COLUMNS = ("objects", "views", "visible", "full, single view", "full, track")
 
 
-class Judged(NamedTuple):
+class ScoredObject(NamedTuple):
     """The IoU of three boxes of an object in one frame.
 
     ``overlaps`` (3,) belong to the visible box, the full box of the view, and the full box of the
@@ -61,12 +61,12 @@ class Judged(NamedTuple):
 @click.option("--count", default=20, show_default=True, help="Scenes of each kind.")
 def main(*, first: int, count: int) -> None:
     """Evaluate scenes and print a table."""
-    found = [item for kind in KINDS for item in _judge_kind(kind, first, count)]
+    found = [item for kind in KINDS for item in _evaluate_kind(kind, first, count)]
     rows = [row for group in GROUPS for row in _rows(found, group)]
     print(markdown(f"3D overlap, seeds {first} to {first + count - 1}", ("", *COLUMNS), rows))
 
 
-def _rows(found: Sequence[Judged], group: str) -> Iterator[list[Any]]:
+def _rows(found: Sequence[ScoredObject], group: str) -> Iterator[list[Any]]:
     """Yield the mean overlaps of each category, and of the categories in `JUDGED` together."""
     some = [item for item in found if item.group == group]
     for category in sorted({item.category for item in some}):
@@ -74,13 +74,13 @@ def _rows(found: Sequence[Judged], group: str) -> Iterator[list[Any]]:
     yield _row(f"{group}, {', '.join(JUDGED)}", [item for item in some if item.category in JUDGED])
 
 
-def _row(name: str, some: Sequence[Judged]) -> list[Any]:
+def _row(name: str, some: Sequence[ScoredObject]) -> list[Any]:
     overlaps = np.reshape([item.overlaps for item in some], (-1, 3))
     means = [round(float(np.nanmean(column)), 3) if len(some) else None for column in overlaps.T]
     return [name, len({item.object_id for item in some}), len(some), *means]
 
 
-def _judge_kind(kind: SceneKind, first: int, count: int) -> Iterator[Judged]:
+def _evaluate_kind(kind: SceneKind, first: int, count: int) -> Iterator[ScoredObject]:
     for seed in range(first, first + count):
         with tempfile.TemporaryDirectory() as name:
             folder = Path(name)
@@ -88,11 +88,11 @@ def _judge_kind(kind: SceneKind, first: int, count: int) -> Iterator[Judged]:
                 folder / "recording.mcap", scene=kind, frames=FRAMES, seed=seed, rate_hz=RATE_HZ
             )
             process(Job(source, folder / "run", mcap=False, rrd=False))
-            for item in _judge_run(folder, seed):
+            for item in _evaluate_run(folder, seed):
                 yield item._replace(group=f"{kind}, {_HOW[kind] if item.group else 'upright'}")
 
 
-def _judge_run(folder: Path, seed: int) -> Iterator[Judged]:
+def _evaluate_run(folder: Path, seed: int) -> Iterator[ScoredObject]:
     truth = json.loads((folder / "recording.truth.json").read_text("utf-8"))
     labels = np.load(folder / "recording.labels.npz")["labels"]
     detections = by_frame(folder / "run" / "detections.parquet")
@@ -106,7 +106,7 @@ def _judge_run(folder: Path, seed: int) -> Iterator[Judged]:
         for item, row in matches(frame["objects"], detections.get(number, []), labels[number]):
             track = tracked.get((number, row["detection"]))
             boxes = (_box(row, ""), _box(row, "_full"), _box(track, "_full") if track else None)
-            yield Judged(
+            yield ScoredObject(
                 "tilted" if item["tilted"] or item["lying"] else "",
                 item["category"],
                 (seed, item["track"]),

@@ -1,4 +1,4 @@
-"""Speed of the detection compared with Open3D and PCL on the same frames."""
+"""Speed of detection compared with Open3D and PCL on the same frames."""
 
 import shutil
 import subprocess

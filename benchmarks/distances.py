@@ -28,7 +28,7 @@ MARGIN_M = 0.05
 HEAD = ("distance, m", "frames", "objects", "found", "mean F", "surplus a frame")
 
 
-def judge(world: World, sensor: Sensor, range_m: tuple[float, float], seed: int) -> Counts:
+def evaluate(world: World, sensor: Sensor, range_m: tuple[float, float], seed: int) -> Counts:
     """Detect objects from a random direction and count them."""
     rng = np.random.default_rng(seed)
     view = random_viewpoint(world, sensor, rng, distance_m=range_m)
@@ -42,7 +42,7 @@ def row(worlds: Sequence[World], first: int, range_m: tuple[float, float]) -> tu
     total = Counts(0, 0, 0, 0, 0, 0, 0.0)
     for k, world in enumerate(worlds):
         sensor = sensors[k // len(KINDS) % len(sensors)]
-        total += judge(world, sensor, range_m, first + k)
+        total += evaluate(world, sensor, range_m, first + k)
     share, mean = (value / max(total.objects, 1) for value in (total.found, total.f))
     low, high = range_m
     figures = (f"{share:.3f}", f"{mean:.3f}", f"{total.elsewhere / max(total.frames, 1):.2f}")

@@ -1,4 +1,4 @@
-"""Loss of the detection's overlap with the truth on disturbed frames.
+"""Loss of detection's overlap with the truth on disturbed frames.
 
     python -m benchmarks.disturbances --first 500 --count 30
 

@@ -40,7 +40,7 @@ FRAMES, RATE_HZ = 2, 4.0
 COLUMNS = ("", "objects", "found", "of depth", "exported", "exported, missed ones are 0")
 
 
-class Judged(NamedTuple):
+class ScoredObject(NamedTuple):
     """The IoU of an object's two masks in one frame: from depth, and as exported; 0 if missed."""
 
     sensor: str
@@ -53,21 +53,21 @@ class Judged(NamedTuple):
 @click.option("--count", default=20, show_default=True, help="Number of recordings.")
 def main(*, first: int, count: int) -> None:
     """Evaluate recordings and print a table."""
-    judged = [item for number in range(count) for item in _judge(number, first + number)]
-    by_sensor = {name: [item for item in judged if item.sensor == name] for name in SENSORS}
+    scored = [item for number in range(count) for item in _evaluate(number, first + number)]
+    by_sensor = {name: [item for item in scored if item.sensor == name] for name in SENSORS}
     rows = [_row(name, some) for name, some in by_sensor.items() if some]
-    rows.append(_row("both", judged))
+    rows.append(_row("both", scored))
     print(markdown(f"Masks, seeds {first} to {first + count - 1}", COLUMNS, rows))
 
 
-def _row(name: str, some: list[Judged]) -> list[Any]:
+def _row(name: str, some: list[ScoredObject]) -> list[Any]:
     of_found = np.mean([item.overlaps for item in some if item.found], axis=0)
     of_all = np.mean([item.overlaps[1] for item in some])
     shares = (round(float(share), 3) for share in (*of_found, of_all))
     return [name, len(some), sum(item.found for item in some), *shares]
 
 
-def _judge(number: int, seed: int) -> Iterator[Judged]:
+def _evaluate(number: int, seed: int) -> Iterator[ScoredObject]:
     kind, sensor = KINDS[number % 2], SENSORS[number // 2 % 2]
     with tempfile.TemporaryDirectory() as name:
         folder = Path(name)
@@ -81,11 +81,11 @@ def _judge(number: int, seed: int) -> Iterator[Judged]:
             rate_hz=RATE_HZ,
         )
         process(Job(source, folder / "run", mcap=False, rrd=False))
-        for found, overlaps in _judge_run(folder):
-            yield Judged(sensor, found, overlaps)
+        for found, overlaps in _evaluate_run(folder):
+            yield ScoredObject(sensor, found, overlaps)
 
 
-def _judge_run(folder: Path) -> Iterator[tuple[bool, tuple[float, float]]]:
+def _evaluate_run(folder: Path) -> Iterator[tuple[bool, tuple[float, float]]]:
     truth = {
         frame["frame"]: frame["objects"]
         for frame in json.loads((folder / "recording.truth.json").read_text("utf-8"))

@@ -30,18 +30,18 @@ OBJECTS, UNKNOWN = 12, 1 / 6
 """Number of dropped objects, and the fraction of them outside the categories."""
 
 
-class Judged(NamedTuple):
+class ScoredObject(NamedTuple):
     """A found object and its detection."""
 
     placed: PlacedObject
     detection: Detection
 
 
-def judge(
+def evaluate(
     kind: str, sensor: str, first: int, count: int, model: Categorizer, settings: Settings
-) -> tuple[list[Judged], Overlap]:
+) -> tuple[list[ScoredObject], Overlap]:
     """Perceive one frame of each scene; return the found objects and the overlap of all."""
-    found: list[Judged] = []
+    found: list[ScoredObject] = []
     overlap = Overlap()
     for seed in range(first, first + count):
         rng = np.random.default_rng(seed)
@@ -56,14 +56,14 @@ def judge(
         matches = match_masks(lists, [mask for _, mask in masks])
         overlap += matches.overlap
         found += [
-            Judged(masks[k][0], seen[row])
+            ScoredObject(masks[k][0], seen[row])
             for row, k in matches.pairs.items()
             if matches.f[row, k] >= MATCHED_F
         ]
     return found, overlap
 
 
-def figures(found: list[Judged], overlap: Overlap, model: Categorizer) -> dict[str, float]:
+def figures(found: list[ScoredObject], overlap: Overlap, model: Categorizer) -> dict[str, float]:
     """Return F, the fraction of objects found, and metrics of their categories."""
     known = [o for o in found if o.placed.category != "unknown" and not o.placed.indistinct]
     strange = [o for o in found if o.placed.category == "unknown"]
@@ -82,23 +82,23 @@ def figures(found: list[Judged], overlap: Overlap, model: Categorizer) -> dict[s
     }
 
 
-def _right(objects: list[Judged], model: Categorizer) -> float:
+def _right(objects: list[ScoredObject], model: Categorizer) -> float:
     """Return the fraction of objects with the right category; *unknown* counts as wrong."""
     right = [_category(o, model) == o.placed.category for o in objects]
     return float(np.mean(right)) if right else float("nan")
 
 
-def _category(judged: Judged, model: Categorizer) -> str:
-    if judged.detection.novelty > 1:
+def _category(scored: ScoredObject, model: Categorizer) -> str:
+    if scored.detection.novelty > 1:
         return "unknown"
-    return str(model.categories[int(np.argmax(judged.detection.posterior))])
+    return str(model.categories[int(np.argmax(scored.detection.posterior))])
 
 
-def _novelty(objects: list[Judged]) -> Array:
+def _novelty(objects: list[ScoredObject]) -> Array:
     return np.array([o.detection.novelty for o in objects], np.float32)
 
 
-def _calibration(objects: list[Judged], model: Categorizer) -> float:
+def _calibration(objects: list[ScoredObject], model: Categorizer) -> float:
     truth = np.array([model.categories.index(o.placed.category) for o in objects], np.int64)
     posteriors = np.array([o.detection.posterior for o in objects], np.float32)
     return expected_calibration_error(truth, posteriors) if len(objects) else float("nan")
@@ -129,8 +129,8 @@ def main(
     rows = []
     for kind in kinds or SCENES:
         for sensor in PRESETS if "all" in sensors else sensors:
-            judged = judge(kind, sensor, first, count, categorizer, settings)
-            found = figures(*judged, categorizer)
+            scored = evaluate(kind, sensor, first, count, categorizer, settings)
+            found = figures(*scored, categorizer)
             cells = (f"{v:.3f}" if v % 1 else f"{v:g}" for v in found.values())
             rows.append((f"{kind}, {sensor}", *cells))
     click.echo(markdown("Physics", ("scenes", *found), rows))

@@ -56,7 +56,7 @@ class Counts(NamedTuple):
         return (name, self.frames, self.detections, surplus, self.pieces, found, share)
 
 
-def judge(sensor: str, seed: int, model: Categorizer, settings: Settings) -> Counts:
+def evaluate(sensor: str, seed: int, model: Categorizer, settings: Settings) -> Counts:
     """Perceive a frame of a room and count its detections."""
     _, frame, labels = simulated_frame("room", seed, PRESETS[sensor])
     seen = perceive(frame, up=None, categorizer=model, settings=settings).detections
@@ -89,7 +89,7 @@ def main(first: int, rooms: int, model: Path | None) -> None:
     found = {name: Counts(0, 0, 0, 0, 0, 0, 0.0) for name in PRESETS}
     for k in range(rooms):
         name = list(PRESETS)[k % len(PRESETS)]
-        found[name] += judge(name, first + k, categorizer, settings)
+        found[name] += evaluate(name, first + k, categorizer, settings)
     total = Counts(*(sum(column) for column in zip(*found.values(), strict=True)))
     rows = [counts.row(name) for name, counts in found.items() if counts.frames]
     click.echo(markdown("Rooms", HEAD, [*rows, total.row("all")]))

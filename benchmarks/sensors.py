@@ -25,7 +25,7 @@ WINDOWS = {"roughness": 16, "warp": 96}
 """Width of the windows, pixels of an image 640 pixels wide: the small one shows noise, the large
 one the warping of planes."""
 QUIETEST = 0.25
-"""Quantile of the windows that is taken for planes; noisier windows contain objects."""
+"""Quantile of the windows that are treated as planes; noisier windows contain objects."""
 JUMP_M, EDGE_PX = 0.06, 12
 """Edges are depth steps of at least this height within this number of pixels."""
 HEAD = ("sensor", "frames", "distance, m", "roughness, 1/m", "warp, 1/m", "edge, px", "holes")

@@ -20,7 +20,7 @@ from scipy.optimize import linear_sum_assignment
 
 from benchmarks.measure import markdown
 from shapecat.arrays import F8, U1
-from shapecat.evaluation.comparison.identities import FrameIdentities, judge_identities
+from shapecat.evaluation.comparison.identities import FrameIdentities, compute_tracking_metrics
 from shapecat.evaluation.metrics import expected_calibration_error
 from shapecat.pipeline import process
 from shapecat.runs.jobs import Job
@@ -198,7 +198,7 @@ def identities(seen: dict[str, list[FrameIdentities]]) -> dict[str, dict[str, fl
     names = ("idf1", "mota", "hota", "switches", "misses", "false_positives", "objects")
     result = {}
     for kind, frames in seen.items():
-        figures = judge_identities(frames, threshold=SAME)._asdict()
+        figures = compute_tracking_metrics(frames, threshold=SAME)._asdict()
         result[kind] = {name: round(float(figures[name]), 4) for name in names}
     return result
 

@@ -28,7 +28,7 @@ SEEN_PLANE_PIXELS = 3000
 """Planes with fewer depth pixels on their upper face are not expected to be found."""
 SAME_HEIGHT_M = 0.03
 FACE_M = 0.004
-"""Points this near to the height of a board are taken for its upper face."""
+"""Points this near to the height of a board count as its upper face."""
 COLUMNS = (
     "objects", "recall", "precision", "planes, scenes", "relations", "empty scenes with objects"
 )  # fmt: skip
@@ -59,8 +59,8 @@ def score(kind: SceneKind, first: int, count: int) -> Counter[str]:
     total: Counter[str] = Counter()
     for view in _views(kind, first, count):
         matches = _matches(view, total)
-        _judge_planes(view, total)
-        _judge_relations(view, matches, total)
+        _score_planes(view, total)
+        _score_relations(view, matches, total)
         total["scenes"] += 1
         total["empty scenes with objects"] += not view.world.objects and bool(view.found.candidates)
     return total
@@ -111,7 +111,7 @@ def _heights(view: View) -> Array:
     return np.array([plane.offset + camera for plane in view.found.planes])
 
 
-def _judge_planes(view: View, total: Counter[str]) -> None:
+def _score_planes(view: View, total: Counter[str]) -> None:
     """Count the scene if all well visible planes were found, and no false ones."""
     up = inverse(view.world.path[0]).rotation[:, 2]
     points = view.frame.xyz()
@@ -129,7 +129,7 @@ def _judge_planes(view: View, total: Counter[str]) -> None:
         total["scenes with all planes"] += 1
 
 
-def _judge_relations(view: View, matches: dict[int, int], total: Counter[str]) -> None:
+def _score_relations(view: View, matches: dict[int, int], total: Counter[str]) -> None:
     """Count the objects with the right support, if object and support were found."""
     by_track = {t.track: t for t in view.world.objects}
     heights = {s.name: s.height for s in view.world.supports if s.holds_objects}

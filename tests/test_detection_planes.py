@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from benchmarks.piles import judge
+from benchmarks.piles import evaluate
 from benchmarks.planes import keeps_table, view_of
 from benchmarks.simulated import score
 from shapecat.arrays import freeze
@@ -191,7 +191,7 @@ def test_objects_are_found_on_hardly_visible_boards(first: int) -> None:
     """Without a plane below them, all objects in these compartments are lost."""
     found = total = 0
     for seed in range(first, first + 2):
-        _, overlap = judge("shelf bin", "kinect", seed, 1, load_model(None), Settings())
+        _, overlap = evaluate("shelf bin", "kinect", seed, 1, load_model(None), Settings())
         found += overlap.hits
         total += overlap.objects
     assert total > 12

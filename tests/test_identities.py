@@ -9,7 +9,7 @@ import motmetrics
 import numpy as np
 import pytest
 
-from shapecat.evaluation.comparison.identities import FrameIdentities, judge_identities
+from shapecat.evaluation.comparison.identities import FrameIdentities, compute_tracking_metrics
 from shapecat.evaluation.comparison.overlap import box_iou, match_masks
 from shapecat.geometry import quaternion_from_rotation, rotation_from_quaternion
 from shapecat.types import Box
@@ -50,7 +50,10 @@ def oracle(frames: list[FrameIdentities], threshold: float) -> Any:
 def test_mota_and_idf1_match_motmetrics(seed: int, threshold: float) -> None:
     """Another choice in a tie, or a dropped pair, would shift published figures."""
     frames = list(crowd(seed))
-    expected, figures = oracle(frames, threshold), judge_identities(frames, threshold=threshold)
+    expected, figures = (
+        oracle(frames, threshold),
+        compute_tracking_metrics(frames, threshold=threshold),
+    )
 
     assert figures.switches == expected["num_switches"] > 0
     assert figures.misses == expected["num_misses"] > 0
@@ -74,7 +77,7 @@ def test_hota_matches_a_worked_example() -> None:
         FrameIdentities(["a"], [], none),
         FrameIdentities(["a"], [2], hit),
     ]
-    figures = judge_identities(frames)
+    figures = compute_tracking_metrics(frames)
 
     assert figures.hota == pytest.approx(14 / 19 * (3 / 4 * 5 / 12) ** 0.5)
     assert figures.detection_accuracy == pytest.approx(14 / 19 * 3 / 4)
@@ -84,7 +87,7 @@ def test_hota_matches_a_worked_example() -> None:
 
 
 def test_metrics_of_empty_frames_are_nan() -> None:
-    empty = judge_identities([FrameIdentities([], [], np.zeros((0, 0)))])
+    empty = compute_tracking_metrics([FrameIdentities([], [], np.zeros((0, 0)))])
 
     assert np.isnan([empty.mota, empty.idf1, empty.hota]).all()
 
@@ -151,7 +154,7 @@ def test_memory_of_hota_grows_with_pairs_that_match() -> None:
     frames = [FrameIdentities([k], [k], np.ones((1, 1))) for k in range(count)]
     tracemalloc.start()
     try:
-        hota = judge_identities(frames).hota
+        hota = compute_tracking_metrics(frames).hota
         _, peak = tracemalloc.get_traced_memory()
     finally:
         tracemalloc.stop()

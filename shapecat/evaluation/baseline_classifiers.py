@@ -18,7 +18,7 @@ __all__ = ["Densities", "make_baselines"]
 
 _MULTIPLES = np.exp2(np.arange(-2.0, 2.6, 0.5))
 """Bandwidths to choose from, relative to the typical distance of kernels."""
-_JUDGES = 60
+_VALIDATION_VIEWS = 60
 """Number of views per category on which a bandwidth is fitted."""
 _CLIP = 8.0
 """Standardised values and densities are clipped to this many standard deviations."""
@@ -29,7 +29,7 @@ def make_baselines(blocks: Sequence[slice]) -> dict[str, Callable[[], Any]]:
 
     ``forest`` is a random forest; ``linear`` is logistic regression on the standardised descriptor;
     ``pnn`` multiplies the Parzen densities of the blocks; ``forest words`` is the method of the
-    thesis: linear one-versus-rest classifiers on the leaves of a forest that is grown on the
+    thesis: linear one-versus-rest classifiers on the leaves of a forest that is trained on the
     descriptor and its densities.
 
     ``blocks`` is the range of each block in the descriptor.
@@ -75,9 +75,9 @@ class Densities:
         z = self.standardise(x)
         of_category = [rng.permutation(z[y == name]) for name in np.unique(y)]
         self._kernels = [views[:kernels] for views in of_category]
-        judges = [rng.permutation(views)[:_JUDGES] for views in of_category]
-        self.widths = [self._fit_width(judges, block) for block in blocks]
-        own = [self._own_densities(judges, *pair) for pair in zip(blocks, self.widths, strict=True)]
+        chosen = [rng.permutation(views)[:_VALIDATION_VIEWS] for views in of_category]
+        self.widths = [self._fit_width(chosen, block) for block in blocks]
+        own = [self._own_densities(chosen, *pair) for pair in zip(blocks, self.widths, strict=True)]
         self.mean = np.array([values.mean() for values in own])
         self.deviation = np.array([max(values.std(), 1e-3) for values in own])
 
@@ -98,15 +98,15 @@ class Densities:
         values = (np.transpose(densities) - self.mean) / self.deviation
         return np.asarray(np.clip(values, -_CLIP, _CLIP))
 
-    def _own_densities(self, judges: Sequence[F8], block: slice, width: float) -> F8:
-        pairs = zip(judges, self._kernels, strict=True)
+    def _own_densities(self, views: Sequence[F8], block: slice, width: float) -> F8:
+        pairs = zip(views, self._kernels, strict=True)
         values = [_log_density(z[:, block], own[:, block], width) for z, own in pairs]
         found = np.concatenate(values)
         found = found[np.isfinite(found)]
         return found if found.size else np.zeros(1)  # each category has a single view
 
-    def _fit_width(self, judges: Sequence[F8], block: slice) -> float:
-        """Return the bandwidth with the greatest likelihood of views (n, d) of each category."""
+    def _fit_width(self, views: Sequence[F8], block: slice) -> float:
+        """Return the bandwidth with the highest likelihood of views (n, d) of each category."""
         nearest = []
         for kernels in self._kernels:
             distances = cdist(kernels[:, block], kernels[:, block])
@@ -116,7 +116,7 @@ class Densities:
         typical = max(float(np.median(gaps)) / np.sqrt(dimensions), 1e-2)
         typical = typical if np.isfinite(typical) else 1.0  # most categories have a single view
         likelihoods = [
-            self._own_densities(judges, block, width).mean() - dimensions * np.log(width)
+            self._own_densities(views, block, width).mean() - dimensions * np.log(width)
             for width in typical * _MULTIPLES
         ]
         return float(typical * _MULTIPLES[int(np.argmax(likelihoods))])
@@ -125,9 +125,9 @@ class Densities:
 def _log_density(z: F8, kernels: F8, width: float) -> F8:
     """Return the log (n,) of the mean Gaussian around kernels (k, d) at views (n, d).
 
-    The factor that is the same for every category is left out. A kernel at a view is taken for the
-    view itself, met in training, and does not count; otherwise the densities of training views
-    would be too high. The result is -inf if no kernel counts.
+    The factor that is the same for every category is left out. A kernel at a view does not count,
+    since it is probably this view itself, from the training set: otherwise the densities of
+    training views would be too high. The result is -inf if no kernel counts.
     """
     squared = cdist(z, kernels, "sqeuclidean")
     other = squared > 1e-4 * z.shape[1]

@@ -64,7 +64,7 @@ def compare_learners(
     learners = _learners()
     rows = []
     for k, (name, learner) in enumerate(learners.items(), start=1):
-        truth, posteriors = _judged(learner, splits, categories)
+        truth, posteriors = _predict_all(learner, splits, categories)
         learned = _mean_views(splits, with_unknown=learner is _chain)
         rows.append(_compared(name, learned, truth, posteriors))
         observe("baselines", k, len(learners))
@@ -106,7 +106,7 @@ def _known(labels: np.ndarray) -> list[str]:
     return sorted(set(labels.tolist()) - {UNKNOWN})
 
 
-def _judged(
+def _predict_all(
     learner: _Learner,
     splits: list[tuple[DescribedViews, DescribedViews]],
     categories: tuple[str, ...],

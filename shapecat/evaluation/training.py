@@ -63,12 +63,12 @@ def train_on_folder(
         msg = f"{root}: a model needs at least two categories with usable views, found: {found}"
         raise RecordingError(msg)
     held_out = split_instances(views.labels, views.instances, np.random.default_rng(seed))
-    judges = views.where(held_out)
-    judged = fit_views(views.where(~held_out), judges, seed=seed)
-    report = evaluate(judges, judged)
+    validation = views.where(held_out)
+    first = fit_views(views.where(~held_out), validation, seed=seed)
+    report = evaluate(validation, first)
     model = replace(
         fit_views(views, views.where(held_out & False), seed=seed),
-        temperature=judged.temperature,
+        temperature=first.temperature,
     )
     if not model.forest.left.any():
         msg = (
@@ -76,9 +76,9 @@ def train_on_folder(
             "add views of more objects"
         )
         raise RecordingError(msg)
-    model = replace(model, threshold=judged.threshold)
+    model = replace(model, threshold=first.threshold)
     save_model(out, model)
-    calibrated = can_calibrate(judges.labels.tolist(), categories)
+    calibrated = can_calibrate(validation.labels.tolist(), categories)
     return _summary(views, lost, model) | {"calibrated": calibrated, "held_out": report.as_dict()}
 
 
@@ -95,7 +95,7 @@ def learn_on_folder(
 
     Returns
     -------
-    Plain values as of `train_on_folder`, with ``added``, the new categories, but without
+    Plain values like those of `train_on_folder`, with ``added``, the new categories, but without
     calibration.
 
     Raises

@@ -7,7 +7,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from shapecat.evaluation.comparison.identities import FrameIdentities, judge_identities
+from shapecat.evaluation.comparison.identities import FrameIdentities, compute_tracking_metrics
 from shapecat.evaluation.comparison.labellings import LabelledItem
 from shapecat.evaluation.comparison.matching import (
     SAME_BOX,
@@ -140,7 +140,7 @@ def _balanced(pairs: Sequence[tuple[str, str]]) -> float | None:
 
 
 def _tracking(seen: Sequence[FrameIdentities], threshold: float) -> dict[str, Any]:
-    figures = judge_identities(seen, threshold=threshold)._asdict()
+    figures = compute_tracking_metrics(seen, threshold=threshold)._asdict()
     return {
         name: None if value != value else round(value, 4)  # noqa: PLR0124  NaN
         for name, value in figures.items()

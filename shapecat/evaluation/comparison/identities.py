@@ -9,7 +9,7 @@ from scipy.optimize import linear_sum_assignment
 
 from shapecat.arrays import F8, I4, Bool
 
-__all__ = ["FrameIdentities", "Identities", "judge_identities"]
+__all__ = ["FrameIdentities", "Identities", "compute_tracking_metrics"]
 
 _ALPHAS = np.arange(0.05, 0.99, 0.05)
 _FORBIDDEN = 1e6
@@ -57,7 +57,9 @@ class _Occurrences(NamedTuple):
     frames: list[tuple[I4, I4, F8]]
 
 
-def judge_identities(frames: Iterable[FrameIdentities], *, threshold: float = 0.5) -> Identities:
+def compute_tracking_metrics(
+    frames: Iterable[FrameIdentities], *, threshold: float = 0.5
+) -> Identities:
     """Compute tracking metrics.
 
     Source: Bernardin 2008 (MOTA), Ristani 2016 (IDF1), Luiten 2020 (HOTA).
