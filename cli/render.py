@@ -97,7 +97,7 @@ def print_table(columns: Sequence[str], rows: Sequence[Sequence[Any]]) -> None:
 
 @contextmanager
 def for_any_reader() -> Iterator[None]:
-    """Print on stdout during the block; a reader that leaves early, such as `head`, is no error."""
+    """Print on stdout in the block; a reader that ends early, such as `head`, causes no error."""
     try:
         yield
         sys.stdout.flush()
@@ -113,7 +113,7 @@ def discard_stdout() -> None:
 def note_skipped(learned: Mapping[str, Any]) -> None:
     """Print to stderr how many views `train` or `learn` skipped, and the categories without any."""
     if learned["skipped"]:
-        none = f"; no view is left of {', '.join(learned['lost'])}" if learned["lost"] else ""
+        none = f"; no views remain of {', '.join(learned['lost'])}" if learned["lost"] else ""
         views = plural(learned["skipped"], "view")
         click.echo(f"skipped {views} with too few points for a surface{none}", err=True)
 

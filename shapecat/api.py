@@ -236,7 +236,7 @@ def perceive(
     Raises
     ------
     ConfigError : an argument has the wrong shape or value, or a setting does not exist.
-    ModelError : the model cannot be read, or was trained on another descriptor.
+    ModelError : the model cannot be read, or was trained on a different descriptor.
     """
     _require_known(settings, perceive.__annotations__)
     chosen = with_settings(load_settings(None if config is None else _path(config)), settings)

@@ -342,7 +342,7 @@ def test_merged_tracks_are_described_as_one(guessed_run: Path, tmp_path: Path) -
 
 
 def test_frames_of_one_topic_are_read(page_folder: Path) -> None:
-    """A name alone is taken for one topic, as `process` takes it."""
+    """A name alone is read as one topic, as `process` takes it."""
     with shapecat.open_recording(page_folder / "demo.mcap") as recording:
         frame = next(iter(recording.frames("/camera/depth/image_raw")))
 
@@ -423,7 +423,7 @@ def test_model_of_another_version_is_refused(tmp_path: Path) -> None:
     reordered = (*model.descriptor_names[1:], model.descriptor_names[0])
     save_model(tmp_path / "old.npz", replace(model, descriptor_names=reordered))
 
-    with pytest.raises(ModelError, match="was trained on another descriptor"):
+    with pytest.raises(ModelError, match="was trained on a different descriptor"):
         shapecat.perceive(np.zeros((48, 64)), (60, 60, 32, 24), model=tmp_path / "old.npz")
 
 
@@ -616,7 +616,7 @@ def test_run_of_the_current_folder_has_its_name(
 
 
 def test_process_accepts_single_topic_and_up_vector(page_folder: Path, tmp_path: Path) -> None:
-    """A topic was taken for a list of letters, and a list of numbers ended in a traceback."""
+    """A topic was read as a list of letters, and a list of numbers ended in a traceback."""
     plain: Any = {"every": 8, "mcap": False, "rrd": False}
     topic, up = "/camera/depth/image_raw", (0, -0.75, -0.5)
 

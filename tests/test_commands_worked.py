@@ -206,7 +206,7 @@ def test_simulate_replaces_no_file_without_overwrite(
 
 
 def test_simulate_leaves_no_colour_labels_of_another_scene(shapecat: Run, tmp_path: Path) -> None:
-    """They would be taken for the truth of the new recording."""
+    """They would be mistaken for the truth of the new recording."""
     (tmp_path / "a.color_labels.npz").write_text("old")
     done = shapecat("simulate", tmp_path / "a.mcap", "--overwrite", "--frames", 1)
 
@@ -486,7 +486,7 @@ def test_options_are_passed_on_and_results_printed(
         ({"skipped": 1}, "skipped 1 view with too few points for a surface\n"),
         (
             {"skipped": 9, "lost": ["pen", "key"]},
-            "skipped 9 views .*; no view is left of pen, key\n",
+            "skipped 9 views .*; no views remain of pen, key\n",
         ),
     ],
 )
@@ -557,7 +557,7 @@ def test_pipe_is_no_terminal_with_forced_colours(
 def test_tables_and_bars_show_names_as_they_are(
     capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """Topics and files may contain what Rich takes for markup and emoji."""
+    """Topics and files may contain what Rich treats as markup and emoji."""
     RENDER.print_table(("name",), [[name] for name in ODD])
     assert [line.rstrip() for line in capsys.readouterr().out.splitlines()] == ["name", *ODD]
 

@@ -305,7 +305,8 @@ def test_table_lists_every_difference_once(shapecat: Run, run: Path, truth: Path
     assert json.loads(shapecat("compare", run, truth, "--json").stdout) == figures
     page = (out / "comparison.html").read_text()
     assert page.count("<figure>") == 3
-    for words in ("box taken for can #2", "missed box", "surplus cup", "cup now #4", "data:image"):
+    captions = ("box mistaken for can #2", "missed box", "surplus cup", "cup now #4")
+    for words in (*captions, "data:image"):
         assert words in page
     assert "6 differences: 3 category" in result.stdout
     assert "the recording is missing" in result.stderr
@@ -337,7 +338,7 @@ def test_page_has_each_metric_in_its_place(run: Path, truth: Path) -> None:
     assert values["IDF1"][0] == "0.824"
     assert listed["0", "missed box"] == ["box", "", "", "", "", ""]
     assert listed["2", "cup now #4"] == ["cup", "cup", "#4", "0.90", "1.00", ""]
-    assert listed["1", "box taken for can #2"] == ["box", "can", "#2", "0.90", "0.86", ""]
+    assert listed["1", "box mistaken for can #2"] == ["box", "can", "#2", "0.90", "0.86", ""]
 
 
 @pytest.mark.parametrize(("category", "text"), [("can", "0.99"), ("unknown", "")])
@@ -469,7 +470,7 @@ def test_page_shows_all_content_in_its_place() -> None:
         ["6", "missed can", "can", "", "", "", "", ""],
         ["7", "surplus bowl #22", "", "bowl", "#22", "0.52", "", ""],
         ["8", "surplus jar #24", "", "jar", "#24", "0.43", "", ""],
-        ["9", "cup taken for can #25", "cup", "can", "#25", "0.84", "0.89", "0.74"],
+        ["9", "cup mistaken for can #25", "cup", "can", "#25", "0.84", "0.89", "0.74"],
         ["9", "surplus pot #26", "", "pot", "#26", "0.35", "", ""],
         ["9", "missed a &amp; b", "a &amp; b", "", "", "", "", ""],
         ["9", "ball now #27", "ball", "ball", "#27", "0.76", "0.95", "0.88"],
@@ -487,7 +488,7 @@ def test_page_shows_all_content_in_its_place() -> None:
         ("290", "7", "high"), ("144", "60", "in"), ("20", "150", "left"),
     ]  # fmt: skip
     assert page.count(
-        "cup taken for can #25; surplus pot #26; missed a &amp; b; ball now #27"
+        "cup mistaken for can #25; surplus pot #26; missed a &amp; b; ball now #27"
     ) == 2  # fmt: skip
 
 
@@ -797,12 +798,12 @@ def test_truth_that_matches_no_detection_gives_a_warning(
     shapecat: Run, run: Path, truth: Path
 ) -> None:
     """Simulated recordings have equal stamps, so a wrong file would give meaningless metrics."""
-    assert "of the same recording?" not in shapecat("compare", run, truth).output
+    assert "from the same recording?" not in shapecat("compare", run, truth).output
 
     image = np.full(SIDE * SIDE, 3, np.uint8)
     image[block(6, 4, 3, 2)] = 7  # where the run has no detection
     np.savez(truth.with_name("lab.labels.npz"), labels=np.stack([image.reshape(10, 10)] * 3))
-    assert f"is {truth} of the same recording?" in shapecat("compare", run, truth).output
+    assert f"is {truth} from the same recording?" in shapecat("compare", run, truth).output
 
 
 def test_object_with_wrong_category_counts_as_found() -> None:

@@ -601,7 +601,7 @@ def test_object_of_another_size_does_not_match(tmp_path: Path) -> None:
 
     (missed,) = transfer_labels(source, target).missed
 
-    assert "another size" in missed.reason
+    assert "a different size" in missed.reason
 
 
 def test_size_of_an_object_is_not_that_of_one_view(tmp_path: Path) -> None:

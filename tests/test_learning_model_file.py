@@ -265,7 +265,7 @@ def test_pickles_are_never_loaded(saved: Path) -> None:
 
 
 def test_descriptor_of_other_version_is_rejected() -> None:
-    with pytest.raises(ModelError, match="another descriptor"):
+    with pytest.raises(ModelError, match="a different descriptor"):
         tiny().require_descriptor(("a", "b", "d"))
     tiny().require_descriptor(("a", "b", "c"))
 

@@ -557,7 +557,7 @@ def test_intrinsics_of_another_resolution_cause_warning(
     found, _, warnings = read(write(tmp_path / "a.mcap", items))
 
     assert len(found) == 1
-    assert any("intrinsics of another resolution?" in text for text in warnings) == warned
+    assert any("intrinsics for a different resolution?" in text for text in warnings) == warned
 
 
 def test_slight_distortion_is_ignored_and_strong_is_corrected(

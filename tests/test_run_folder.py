@@ -111,7 +111,7 @@ def test_foreign_folder_is_not_touched(tmp_path: Path, name: str, file: str) -> 
 def test_run_with_unusable_description_is_called_so(tmp_path: Path, content: str) -> None:
     """The message said that shapecat did not make a folder which it made."""
     (tmp_path / "run.json").write_text(content)
-    with pytest.raises(OutputError, match=r"its run\.json is damaged or of another version"):
+    with pytest.raises(OutputError, match=r"its run\.json is damaged or from another version"):
         require_ours(tmp_path)
 
 
@@ -355,7 +355,7 @@ def test_file_is_flushed_before_and_after_renaming(
 def test_failing_disk_is_an_error_but_a_disk_without_flush_is_not(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, code: int, raised: bool
 ) -> None:
-    """A file that was not stored would be taken for complete; some network disks cannot flush."""
+    """A file that was not stored would count as complete; some network disks cannot flush."""
 
     def fsync(_number: int) -> None:
         raise OSError(code, os.strerror(code))

@@ -190,7 +190,7 @@ def test_run_completes_if_progress_reader_leaves(recording: Path, tmp_path: Path
 def test_second_signal_ends_command(
     recording: Path, undisturbed: Path, tmp_path: Path, jobs: str
 ) -> None:
-    """At once: a command that finishes the frames in work says how to continue."""
+    """At once: a command that finishes the frames in progress says how to continue."""
     command = Command(recording, tmp_path, "--jobs", jobs)
     command.wait_for_frames(BEGUN)
     command.signal_group(signal.SIGINT, signal.SIGTERM)

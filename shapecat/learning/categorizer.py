@@ -19,7 +19,7 @@ from shapecat.types import UNKNOWN
 __all__ = ["MOST_CATEGORIES", "Categorizer", "Prediction", "parts_of"]
 
 MOST_CATEGORIES = 254
-"""Most categories of a model."""
+"""Maximum number of categories of a model."""
 
 _LARGEST = 1e6
 """Bound on the weights of a model: far above real ones, and their sums stay finite."""
@@ -131,7 +131,7 @@ class Categorizer(Record):
         """
         if tuple(names) != self.descriptor_names:
             msg = (
-                f"model {self.model_id} was trained on another descriptor "
+                f"model {self.model_id} was trained on a different descriptor "
                 f"({len(self.descriptor_names)} components, this version computes {len(names)}); "
                 "train it again with this version"
             )

@@ -20,7 +20,7 @@ slightly optimistic.
 It distinguishes {categories} by shape, seen by a depth camera from 0.25 to 3 m away and 5 to
 90 degrees above the horizontal. Objects may stand, lie, or rest in any pose in piles, bins, shelves
 and rooms. All other shapes should be *unknown* (novelty above 1), and so should noise and thin
-remains of tables that detection takes for objects. The threshold rejects 14 % of the simulated
+remains of tables that detection mistakes for objects. The threshold rejects 14 % of the simulated
 partial views of known categories.
 
 ## Known confusions

@@ -208,7 +208,7 @@ class DepthSource(Source):
             self.recording.warn(
                 f"{self.info_topic}: the principal point ({camera.cx:.0f}, {camera.cy:.0f}) is far "
                 f"from the center of images of {camera.width} x {camera.height}: are these the "
-                "intrinsics of another resolution?"
+                "intrinsics for a different resolution?"
             )
         if distorted:
             return lens_content(self._info, camera, depth, self._warn)

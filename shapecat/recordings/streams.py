@@ -49,7 +49,7 @@ def depth_streams(recording: Recording, requested: Sequence[str] = ()) -> tuple[
     """Find the clouds and depth images of a recording, sorted by topic.
 
     The encoding of the first images, of which some may be blank, distinguishes depth from colour.
-    Topics named after other images, as of confidence or disparity, are left out unless they are
+    Topics named after other images, such as confidence or disparity, are left out unless they are
     ``requested``, with or without a leading slash. A depth image is paired with the calibration in
     its own namespace (``depth/image_raw`` with ``depth/camera_info``), or with the only one in the
     recording.
@@ -264,14 +264,14 @@ def _depth_stream(topic: Topic, first: Any, recording: Recording) -> Stream:
     if _is_radial(topic.name):
         doubt = (
             f"{topic.name}: is named after distances; if these are along the rays of the pixels, "
-            "not along the optical axis, flat surfaces are bent: use the clouds of the camera"
+            "not along the optical axis, flat surfaces look curved: use the clouds of the camera"
         )
     elif info is not None and frame_id and _nearest(topic.name, [info]) is None:
         info_frame = _frame_of(recording, info)
         if info_frame and info_frame.strip("/") != frame_id.strip("/"):
             doubt = (
                 f"{topic.name}: the frame of its images is {frame_id}, but the only calibration, "
-                f"{info}, is of {info_frame}: are these the intrinsics of another camera?"
+                f"{info}, is for {info_frame}: are these the intrinsics of another camera?"
             )
     return Stream(topic.name, topic.type, "depth", info, topic.count, frame_id, doubt)
 
@@ -279,7 +279,7 @@ def _depth_stream(topic: Topic, first: Any, recording: Recording) -> Stream:
 def info_topic_of(image: str, recording: Recording, frame_id: str) -> str | None:
     """Return the calibration topic that shares the longest namespace with an image topic.
 
-    That may be the image topic itself (``depth`` with ``depth/camera_info``), as of AirSim. Within
+    That may be the image topic itself (``depth`` with ``depth/camera_info``), as in AirSim. Within
     a namespace, one with a word of the image topic (``depth_image`` with ``depth_camera_info``)
     comes first. Without a common namespace it is the only calibration of the images' frame
     ``frame_id``, or the only one in the recording; otherwise None.

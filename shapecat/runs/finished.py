@@ -136,6 +136,6 @@ def open_source(
             msg = f"{path}: has changed since it was processed; process it again"
             if moved_to is not None:
                 origin = run["input"]["path"]
-                msg = f"{path}: another recording than that of the run, {origin}, or changed since"
+                msg = f"{path}: another recording, not that of the run ({origin}), or changed since"
             raise OutputError(msg)
         yield recording

@@ -62,7 +62,7 @@ _BEGUN = (".run.json.partial", ".export.json.partial")
 """Files that a kill may leave in a folder without a marker."""
 
 Marker = Callable[[Path], Collection[str] | None]
-"""A function of a folder: the names that shapecat makes in it, the marker last; None without a
+"""A function of a folder: the names that shapecat makes in it, the marker last; None if there is no
 marker."""
 
 
@@ -143,7 +143,7 @@ def require_ours(folder: Path, marker: Marker = made_by_run) -> None:
     elif not os.path.lexists(folder):  # a link may lead to a disk that is not mounted
         return
     is_unusable = (folder / "run.json").is_file() and made_by_run(folder) is None
-    doubt = ", or its run.json is damaged or of another version" if is_unusable else ""
+    doubt = ", or its run.json is damaged or from another version" if is_unusable else ""
     msg = f"{folder}: shapecat did not make this{doubt}; choose another --out, or move it away"
     raise OutputError(msg)
 
@@ -156,7 +156,7 @@ def _strangers(folder: Path, names: Collection[str]) -> Iterator[Path]:
 def _replace(folder: Path, hidden: Path, marker: Marker) -> None:
     """Rename the complete hidden folder; at any moment the old or the new folder is complete.
 
-    If a command writes the outputs of the old folder, wait for it: it would go on in the new one.
+    If a command writes the outputs of the old folder, wait for it: it would continue in the new.
     """
     flush(hidden)
     if folder.exists():

@@ -23,7 +23,7 @@ __all__ = [
 ]
 
 _SIGNALS = (signal.SIGINT, signal.SIGTERM)
-_messages = [b"stopping after the frames in work; interrupt again to leave at once\n"]
+_messages = [b"stopping after the frames in progress; interrupt again to stop immediately\n"]
 """The last one is printed at the first signal."""
 _SHOW_CURSOR = b"\x1b[?25h"
 
@@ -56,7 +56,7 @@ def check() -> None:
 
 
 def exit_at_once(signum: int, _frame: FrameType | None = None) -> None:
-    """End this process at once (a signal handler); its workers notice and end too."""
+    """End this process immediately (a signal handler); its workers notice and end too."""
     if os.isatty(2):
         _write_stderr(_SHOW_CURSOR)
     os._exit(128 + signum)

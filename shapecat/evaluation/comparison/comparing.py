@@ -43,7 +43,7 @@ __all__ = ["Comparison", "compare"]
 
 _PICTURES = 12
 _DOUBTFUL = 0.1
-"""With a smaller fraction of the objects matched, the reference may be of another recording."""
+"""With a smaller fraction of the objects matched, the reference may be from another recording."""
 
 
 @dataclass(frozen=True)
@@ -118,7 +118,7 @@ def compare(
         raise RecordingError(_nothing_in_common(finished, reference, other))
     if _hardly_matches(tally.rows):
         notes.append(
-            f"Hardly any object matches: is {reference} of the same recording? Labels of images "
+            f"Hardly any object matches: is {reference} from the same recording? Labels of images "
             "must be of its depth images (--format coco --depth)."
         )
     return Comparison(
@@ -151,7 +151,7 @@ def _nothing_in_common(finished: FinishedRun, reference: Path, other: Reference[
     own = f"stamps {min(stamps)} to {max(stamps)}" if stamps else "none"
     return (
         f"{reference}: no frame in common with {finished.folder}: it has "
-        f"{other.describe_frames()}, the run {own}; is it of another recording?"
+        f"{other.describe_frames()}, the run {own}; is it from another recording?"
     )
 
 
@@ -202,9 +202,9 @@ def _compare_frame(
 
 
 def _require_same_size(found: Labelling, true: Labelling, frame: Frame | None, key: Key) -> None:
-    """Check that the labels are of images with the size of the depth image.
+    """Check that the labelled images have the size of the depth image.
 
-    Without the recording (``frame`` is None), only too small images are noticed.
+    Without the recording (``frame`` is None), only images that are too small are noticed.
 
     Raises
     ------
@@ -222,9 +222,9 @@ def _require_same_size(found: Labelling, true: Labelling, frame: Frame | None, k
     else:
         return
     msg = (
-        f"frame {key[1]} of {key[0]}: the labels are of an image of {width} x {height} pixels, but "
-        f"{other}: is it of another recording? COCO labels must be of its depth images (--format "
-        "coco --depth)"
+        f"frame {key[1]} of {key[0]}: the labels are for an image of {width} x {height} pixels, "
+        f"but {other}: are they from another recording? COCO labels must be of its depth images "
+        "(--format coco --depth)"
     )
     raise RecordingError(msg)
 

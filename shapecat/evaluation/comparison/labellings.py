@@ -79,7 +79,7 @@ class Reference(ABC, Generic[_Frame]):
 
     Raises
     ------
-    RecordingError : two entries are of the same frame.
+    RecordingError : two entries describe the same frame.
     """
 
     kind: str
@@ -122,7 +122,7 @@ class Reference(ABC, Generic[_Frame]):
 
 
 def numbering_notes(other: Reference[Any], start_s: float | None) -> list[str]:
-    """Return a remark if the numbers of frames may count from another frame than the run's.
+    """Return a note if the reference may number frames from a different one than the run does.
 
     ``start_s`` is where the run began in its recording, None for the beginning.
     """
@@ -130,7 +130,7 @@ def numbering_notes(other: Reference[Any], start_s: float | None) -> list[str]:
         return []
     note = (
         f"Frames are matched by number, which the run counts from --start {start_s:g}: labels "
-        "numbered from the start of the recording are of other frames, and need timestamps."
+        "numbered from the start of the recording belong to other frames, and need timestamps."
     )
     return [note]
 
@@ -148,7 +148,7 @@ def index_frames(path: Path, frames: Iterable[tuple[Place, _Frame]]) -> dict[Pla
 
     Raises
     ------
-    RecordingError : two entries are of the same frame.
+    RecordingError : two entries describe the same frame.
     """
     index: dict[Place, _Frame] = {}
     for place, entry in frames:

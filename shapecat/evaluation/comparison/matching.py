@@ -35,7 +35,7 @@ class Difference(NamedTuple):
     Attributes
     ----------
     difference : ``missed``, ``surplus``, ``outline`` (``f`` below 0.75), ``category``, ``identity``
-        (another track than before), or None if both agree.
+        (a different track from before), or None if both agree.
     true_track, true_category : from the reference; None without a true object.
     track, category, confidence : from the run; None without a detection.
     f, iou : overlap of the masks; None without masks.

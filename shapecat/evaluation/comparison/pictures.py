@@ -161,7 +161,7 @@ def words_of(row: Difference) -> str:
     return {
         "missed": f"missed {row.true_category}",
         "surplus": f"surplus {row.category}{track}",
-        "category": f"{row.true_category} taken for {row.category}{track}",
+        "category": f"{row.true_category} mistaken for {row.category}{track}",
         "identity": f"{row.true_category} now{track}",
         "outline": f"{row.category}{track}: outline differs",
     }[str(row.difference)]

@@ -178,8 +178,8 @@ def decode_rle(counts: str | Sequence[int], height: int, width: int) -> Bool:
 def _uncompressed(text: str) -> list[int]:
     """Return the run lengths of a compressed string.
 
-    Each character holds five bits; from the fourth run on, values are differences from the run two
-    before.
+    Each character holds five bits; the values of the fourth run and later ones are differences from
+    the run two before.
     """
     lengths: list[int] = []
     value = shift = 0

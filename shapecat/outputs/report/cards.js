@@ -118,11 +118,11 @@ function confusion(checked) {
 
 function csv() {
   const quote = (cell) => (/[",\r\n]/.test(cell) ? `"${cell.replaceAll('"', '""')}"` : cell);
-  // With the labels that it replaces, so that it does not undo labels given elsewhere since.
+  // Add the labels that it replaces, so that it does not undo labels given elsewhere since.
   const lines = data.rows.map((row) => [...data.columns.map((name, k) =>
     quote(name === "label" ? labels.get(row.track) : row.cells[k])), quote(replaced(row.track))].join(","));
   const text = [[...data.columns, "label_seen"].map(quote).join(","), ...lines, ""].join("\n");
-  // Excel takes the letters of a table without a byte order mark for others.
+  // Without a byte order mark, Excel would misread letters other than a to z.
   return /^[\x00-\x7f]*$/.test(text) ? text : `\ufeff${text}`;
 }
 

@@ -35,10 +35,10 @@ _GOOD_PX = 160
 _GOOD_DETAIL = 12.0
 """Standard deviation of the Laplacian at which sharpness is 0.5, grey levels."""
 _NEARER = 0.015
-"""A pixel occludes its neighbour if it is nearer by this many metres plus this share."""
+"""A pixel occludes its neighbour if it is nearer by this many metres plus this fraction."""
 _FAR_M = 6.0
 _SAME_SURFACE = 0.02
-"""Neighbours whose inverse depths differ by less than this share are on the same surface."""
+"""Neighbours whose inverse depths differ by less than this fraction are on the same surface."""
 _NEAR_TONE, _FAR_TONE = np.array([[255, 238, 205], [92, 112, 168]], np.float32)
 _BLANK = 24
 """Grey level of pixels without depth."""
@@ -56,7 +56,7 @@ class FramePicture(Record):
     Attributes
     ----------
     masks : the mask of each object of the frame, in order.
-    hidden : (n,) share of each object's outline along which something nearer occludes it.
+    hidden : (n,) fraction of each object's outline along which something nearer occludes it.
     image_frame : the frame as a depth image, for a cloud from a virtual camera.
     colour : (h, w, 3) red, green, blue; None if the depth image is shown.
     """
@@ -142,7 +142,7 @@ def _upright(points: F4, up: F4 | None) -> F8:
 
 
 def _hidden_share(depth: F4 | None, pixels: U4) -> float:
-    """Return the share of an object's outline along which something outside it is nearer.
+    """Return the fraction of an object's outline along which something outside it is nearer.
 
     ``depth`` is (h, w) in metres, ``pixels`` (n,) are flat indices of the object.
     """
@@ -262,7 +262,7 @@ def worth_of(image: FramePicture, number: int) -> float:
 
 
 def _border_share(mask: Mask, height: int, width: int) -> float:
-    """Return the share of the outline of a mask that lies on the border of the image."""
+    """Return the fraction of the outline of a mask that lies on the border of the image."""
     inside = np.pad(mask.pixels, 1)
     outline = sum(
         int(np.count_nonzero(inside & ~np.roll(inside, step, axis)))

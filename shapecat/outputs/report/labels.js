@@ -10,7 +10,7 @@ function known(label) {
   return found === undefined ? label : found;
 }
 
-// What a label says: the category itself, also for `new pan`.
+// What a label says: the category itself, even for `new pan`.
 function labelOf(track) { return known(labels.get(track).replace(NEW, "$1")); }
 
 function say(text, bad = false) {

@@ -186,7 +186,7 @@ def _require_unchanged(labelled: LabelledFrame, frame: Frame) -> None:
     ------
     RecordingError : the frame is smaller than when it was processed.
     """
-    readings = frame.depth.size if frame.depth is not None else len(frame.xyz())
-    if any(item.indices.size and item.indices.max() >= readings for item in labelled.objects):
+    samples = frame.depth.size if frame.depth is not None else len(frame.xyz())
+    if any(item.indices.size and item.indices.max() >= samples for item in labelled.objects):
         msg = f"frame {frame.index} of {frame.topic} has changed since it was processed"
         raise RecordingError(msg)

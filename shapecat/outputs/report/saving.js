@@ -61,7 +61,7 @@ function adopt(disk) {
   }
 }
 
-// Send one request at a time: an answer that overtook a later one would undo what that told.
+// Send one request at a time: an answer that arrives late would undo what a newer one reported.
 function ask(options) {
   const turn = before.then(() => request(options));
   before = turn.catch(() => {});

@@ -36,7 +36,7 @@ __all__ = ["BagRecording"]
 class BagRecording(ChunkedRecording):
     """A ROS 1 bag; the log time of a message is when it was recorded.
 
-    Raises `RecordingError` if the file is not of version 2.0, is encrypted, or holds no topics.
+    Raises `RecordingError` if the file is not version 2.0, is encrypted, or holds no topics.
     """
 
     kind: ClassVar[str] = "ros1"
@@ -51,7 +51,7 @@ class BagRecording(ChunkedRecording):
         self._first = len(MAGIC)
         self._file.seek(0)
         if self._file.read(len(MAGIC)) != MAGIC:
-            msg = "not a readable ROS 1 bag: not of version 2.0"
+            msg = "not a readable ROS 1 bag: not version 2.0"
             raise RecordingError(msg)
         try:
             record = next(walk(self._file, len(MAGIC), self._size))
@@ -123,8 +123,8 @@ class BagRecording(ChunkedRecording):
     def _expand(self, record: Record | None, listed: int | None = None) -> Iterator[RawMessage]:
         """Yield the messages of a record; store new connections.
 
-        A truncated chunk is read as far as possible. A chunk with another number of messages than
-        are ``listed`` in the index causes a warning.
+        A truncated chunk is read as far as possible. A chunk causes a warning if its number of
+        messages differs from that ``listed`` in the index.
         """
         if record is None or record.op not in {CHUNK, CONNECTION}:
             return

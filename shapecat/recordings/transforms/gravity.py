@@ -20,7 +20,7 @@ from shapecat.types import Frame, Pose
 __all__ = ["MISNAMED", "Orientation", "Upright", "has_z_up", "turned"]
 
 _LEVEL_FRAMES = ("map", "odom", "world", "earth", "base_footprint", "base_link")
-"""Frames whose z axis is up by convention (REP 105, REP 103), also after the name of a robot."""
+"""Frames whose z axis is up by convention (REP 105, REP 103), even after the name of a robot."""
 MISNAMED = {
     "its data are in an optical frame (z forward), although the frame they name has x forward": (
         LINK_FROM_OPTICAL.rotation
@@ -28,7 +28,7 @@ MISNAMED = {
     "its points have x forward, although the frame they name is an optical one (z forward)": (
         LINK_FROM_OPTICAL.rotation.T
     ),
-    "its data and the frame they name differ as the conventions of ROS and OpenGL (z backward)": (
+    "its data and the frame they name differ like the ROS and OpenGL conventions (z backward)": (
         np.diag([1.0, -1.0, -1.0])
     ),
 }
@@ -176,7 +176,7 @@ class Upright:
         return Orientation(source, None if up is None else turned(up, turn), pose)
 
     def assume_misnamed(self, topic: str, how: str) -> None:
-        """Take the data on a topic for misnamed in one of the ways of `MISNAMED` from now on."""
+        """Treat the data on a topic as misnamed, in one of the ways of `MISNAMED`, from now on."""
         self.misnamed[topic] = MISNAMED[how]
         self.warnings.append(f"{topic}: {how}; its transforms are corrected")
 
@@ -274,7 +274,7 @@ def has_z_up(frame_id: str) -> bool:
 
 
 def _rank(name: str) -> int:
-    """Return the place of a frame among the level ones, whatever its robot; after all if none."""
+    """Return the rank of a frame among the level ones, without its robot's name; else the last."""
     plain = name.rpartition("/")[2]
     return _LEVEL_FRAMES.index(plain) if plain in _LEVEL_FRAMES else len(_LEVEL_FRAMES)
 

@@ -24,9 +24,9 @@ __all__ = ["Group", "Match", "Matches", "match_in_place", "match_in_time"]
 _MOST_REACH_M = 0.10
 """Largest distance between two detections of one object in one frame, however segmented."""
 _MAJORITY = 0.6
-"""Smallest share of common frames in which matching tracks are mutual nearest neighbours."""
+"""Smallest fraction of common frames in which matching tracks are mutual nearest neighbours."""
 _RIVAL = 0.25
-"""Another track with at least this share makes a match ambiguous."""
+"""Another track with at least this fraction makes a match ambiguous."""
 _STILL_M = 0.04
 """Largest scatter of the centres of an object at rest, seen from several places."""
 _REACH = 0.5
@@ -57,7 +57,9 @@ class Matches:
 
 
 def match_in_time(source: Path, target: Path, group: Group) -> Matches | None:
-    """Match tracks that are mutual nearest neighbours in most common frames; None without any.
+    """Match tracks that are mutual nearest neighbours in most of the frames that both runs have.
+
+    Returns None if the runs have no frames in common.
 
     Parameters
     ----------
@@ -200,7 +202,7 @@ def _nearest_there(
         return None, f"track {nearest.track} could also be track {rivals[0]}"
     ratio = max(item.extent_m, nearest.extent_m) / min(item.extent_m, nearest.extent_m)
     if ratio > _SIZE_RATIO:
-        return None, f"track {nearest.track} is there, but has another size"
+        return None, f"track {nearest.track} is there, but has a different size"
     return Match(nearest.track, round(distance, 4)), ""
 
 

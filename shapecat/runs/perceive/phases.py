@@ -213,9 +213,9 @@ class _UpTrial:
         Only topics with a given up direction are waited for.
         """
         pending: list[_Oriented] = []
-        for reading in source:
-            frame, _, orientation = reading
-            pending.append(reading)
+        for oriented in source:
+            frame, _, orientation = oriented
+            pending.append(oriented)
             if frame.topic not in self._decided:
                 self._look(frame, orientation)
             if len(pending) == _MOST_HELD:
@@ -233,7 +233,7 @@ class _UpTrial:
         if elsewhere and self._looks[frame.topic] == 1:
             self._upright.warnings.append(
                 f"{frame.topic}: its clouds are in {frame.frame_id}, which is not the frame of a "
-                "camera: objects may be missed or fall apart; use its depth images, if recorded"
+                "camera: objects may be missed or split; use its depth images, if recorded"
             )
         if hint is not None:
             off = self._off_deg.setdefault(frame.topic, off)
