@@ -18,10 +18,11 @@ LENS_MODELS = ("plumb_bob", "rational_polynomial", *FISHEYE_MODELS)
 """The supported lens models of OpenCV's calibration."""
 
 _ROUNDS, _ENOUGH_PX = 30, 1e-4
-"""Most iterations, which lenses of 120 degrees need near the edge, and the error that ends them."""
+"""Maximum number of iterations, needed near the edge of lenses of 120 degrees, and the error that
+ends them."""
 _WRONG_PX, _LEAST_SHARE = 0.1, 0.3
 """Pixels with a larger error see no ray: they are outside the round image of a wide lens. If fewer
-pixels than this share see one, the coefficients are not those of a lens."""
+pixels than this fraction see one, the coefficients are not those of a lens."""
 
 
 def distort(rays: F8, model: str, coefficients: Sequence[float]) -> F8:

@@ -15,7 +15,7 @@ __all__ = ["EMPTY_MASK", "Mask", "dense_masks", "union"]
 _NARROW_PX = 4.0
 """Widest gap in an object that is filled, in pixels of the depth image."""
 _WIDE_PX = 24.0
-"""Greatest distance, in pixels of the depth image, of an object that unknown pixels may join."""
+"""Largest distance, in pixels of the depth image, of an object that unknown pixels may join."""
 _RAGGED_PX = 5.0
 """Width, in pixels of the depth image, of the window that smooths the ragged outlines of depth."""
 
@@ -160,8 +160,8 @@ def union(masks: Sequence[Mask]) -> Mask:
 def _step(label: int, packed: int) -> int:
     """Return ``packed`` updated with the label of the next pixel.
 
-    ``packed`` describes the last object met: its label in the upper 16 bits, and below them 4
-    times its distance in pixels, plus 1 if a pixel of label 0 lies between.
+    ``packed`` describes the last object encountered: its label in the upper 16 bits, and below them
+    4 times its distance in pixels, plus 1 if a pixel of label 0 lies between.
     """
     return label << 16 if label > 0 else (packed + 4) | (label == 0)
 

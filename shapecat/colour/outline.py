@@ -21,7 +21,7 @@ def outlines(mask: Mask, tolerance_px: float = _TOLERANCE_PX) -> list[F8]:
 
     Parameters
     ----------
-    tolerance_px : greatest distance between an outline and the border of the pixels.
+    tolerance_px : largest distance between an outline and the border of the pixels.
 
     Returns
     -------

@@ -18,7 +18,7 @@ from shapecat.jit import kernel
 __all__ = ["snapped"]
 
 _BAND_PX = 3.0
-"""Greatest distance an outline moves. Like the next three, in pixels of the depth image."""
+"""Largest distance an outline moves. Like the next three, in pixels of the depth image."""
 _CORE_PX = 1.5
 """Pixels farther than this from the outline are samples of the colours on their side."""
 _WINDOW_PX = 6.0
@@ -30,7 +30,7 @@ _FEWEST = 4
 _NOISE = 64.0
 """Variance that noise adds to each channel, in squared grey levels."""
 _CERTAIN = 3.0
-"""Greatest influence of the colour of a pixel, as a log-likelihood ratio."""
+"""Largest influence of the colour of a pixel, as a log-likelihood ratio."""
 
 
 def snapped(masks: Sequence[Mask], pixels: U1, scale: float = 1.0) -> tuple[Mask, ...]:
@@ -59,7 +59,7 @@ def snapped(masks: Sequence[Mask], pixels: U1, scale: float = 1.0) -> tuple[Mask
         _match(mask, number, owners, pixels, scale) if mask.pixels.size else None
         for number, mask in enumerate(masks, start=1)
     ]
-    # What all masks give up is free for any of them, whatever their order.
+    # Pixels that any mask gives up are free for every other, whatever the order of the masks.
     for number, one in enumerate(matches, start=1):
         if one is not None:
             part = owners[one.window]

@@ -16,7 +16,7 @@ __all__ = ["SplattedLabels", "splat_depth"]
 _FOOTPRINT_PX = 0.05
 """Margin on each side of a splatted depth pixel, in colour pixels, to leave no gaps."""
 _HIDDEN = 0.02
-"""An object is hidden where something else is nearer by more than this share of its distance."""
+"""An object is hidden where something else is nearer by more than this fraction of its distance."""
 _SPARSE = 4
 """Outside objects, only every fourth row and column of the depth image is used."""
 _BESIDE_PX = 30
@@ -242,7 +242,7 @@ def _paint(
 
 @kernel(inner=True)
 def _nearest_surface(around: F4, corner: tuple[int, int], cell: int, shape: tuple[int, int]) -> F4:
-    """Return the greatest inverse depth of points in each cell of a window.
+    """Return the largest inverse depth of points in each cell of a window.
 
     ``around`` is from `_project_pixels`; cells are squares of ``cell`` pixels.
     """

@@ -19,13 +19,13 @@ of the mean of unit vectors that agree."""
 _NEIGHBOURS, _TRIED = 2, 16
 """Views before and after a view that must show the same yaw; yaws that are tried."""
 _NARROWEST = 0.5
-"""Least width of the overlaid outline, as a share of the narrowest view."""
+"""Minimum width of the overlaid outline, as a fraction of the narrowest view."""
 _UNSEEN = 0.05
 """Weight of an outline in directions that do not face the sensor; in those that do it is 1."""
 _SQUARE = 0.2
 """Weight of the yaw of a square footprint; the elongation of a footprint adds to it."""
 _COMMON = 0.5
-"""Share of a view's variance that all views have in common, as they see the same side."""
+"""Fraction of a view's variance that all views have in common, as they see the same side."""
 
 
 class BoxViews(NamedTuple):
@@ -146,7 +146,7 @@ def _near(centers: F8, place: F8) -> Bool:
 
 
 def _not_turned(axes: F8, sizes: F8, weights: F8) -> Bool:
-    """Return in which views (k,) an object that stands in one place has its most usual yaw."""
+    """Return in which views (k,) an object that stands in one place has its most common yaw."""
     result = np.ones(len(axes), np.bool_)
     best_weight, elongation = 0.0, _elongation(sizes)
     for k in np.unique(np.linspace(0, len(axes) - 1, _TRIED).astype(np.int64)).tolist():
@@ -205,9 +205,10 @@ def _mean_axes(axes: F8, sizes: F8, weights: F8) -> F8:
 
 
 def _overlaid(views: BoxViews, weights: F8, origin: F8, base: F8) -> tuple[F8, F8]:
-    """Return the median outline about ``origin``, and the share of views that see each direction.
+    """Return the median outline about ``origin``, and how many views see each direction.
 
-    Both are (96,), from the first of the axes ``base`` to the second.
+    The second is a fraction of the views. Both are (96,), from the first of the axes ``base`` to
+    the second.
     """
     around = _turned(views.outlines, _yaws(base, views.axes))
     positions = (views.centers - origin) @ base

@@ -29,7 +29,7 @@ COSINES, SINES = np.cos(_ANGLES), np.sin(_ANGLES)
 QUARTER, _HALF = DIRECTIONS // 4, DIRECTIONS // 2
 _ROUNDS = 5
 _OUTLIER = 0.03
-"""Huber threshold of the fit, as a share of the radius: handles deviate more."""
+"""Huber threshold of the fit, as a fraction of the radius: handles deviate more."""
 
 
 @kernel

@@ -34,9 +34,9 @@ _HANDLE = 0.06
 _EDGEWISE = -0.2
 """Cosine of the angle to the sensor above which an outline is visible: just past edge-on."""
 _THINNEST_M = 0.005
-"""Least length of a box: a face that the sensor sees straight on shows no thickness."""
+"""Minimum length of a box: a face that the sensor sees straight on shows no thickness."""
 _NOISE_M, _GUESS = 0.006, 0.35
-"""Standard deviation of a visible length; that of the guessed part, as a share of it."""
+"""Standard deviation of a visible length; that of the guessed part, as a fraction of it."""
 _ANGULAR, _HANDLED = "box", "cup"
 _CIRCULAR = 1e3
 
@@ -46,12 +46,12 @@ class _OutlinePrior(NamedTuple):
 
     Attributes
     ----------
-    stray : share of the points that noise and mixed pixels put outside the outline: less where
+    stray : fraction of the points that noise and mixed pixels put outside the outline: less where
         the surface curves away than where many points lie on the outline, as on a wall.
     noise : metres, the spread of the depths on a flat side.
     roundness : weight of the prior for a circle, as a number of directions: one side says little
         about the depth.
-    fits : largest deviation of the visible side from an accepted oval, as a share of its radius.
+    fits : largest deviation of the visible side from an accepted oval, as a fraction of its radius.
     """
 
     stray: float = 0.016
@@ -61,7 +61,7 @@ class _OutlinePrior(NamedTuple):
 
 
 _PRIORS = {
-    # A handle would be taken for the long side of an oval.
+    # A handle would be mistaken for the long side of an oval.
     "cup": _OutlinePrior(roundness=_CIRCULAR),
     "box": _OutlinePrior(noise=0.006),
     "bottle": _OutlinePrior(roundness=1.0, fits=0.1),  # many are oval

@@ -37,7 +37,7 @@ def fuse(frame: Frame, earlier: Sequence[Earlier], *, range_m: float) -> Frame:
        larger limit would smear low objects that move). Where they disagree, something has moved or
        was hidden, and the current depth stays.
     3. A hole gets the mean of the earlier depths that continue a surface beside it in the current
-       image. Readings of an object that has since moved away are not used.
+       image. Depths of an object that has since moved away are not used.
 
     differs: the thesis merges the clouds and subsamples them.
 
@@ -130,7 +130,7 @@ def _expected_depth(depth: F4, range_m: float) -> F4:
 
 @kernel
 def _agreeing_share(expected: F4, earlier: F4, homography: F4, shift: F4) -> float:
-    """Return the share of depths, among those in both images, that show the same surface."""
+    """Return the fraction of depths, among those in both images, that show the same surface."""
     columns = expected.shape[1]
     places = np.zeros((3, columns), np.float32)
     x, y, z = places[0], places[1], places[2]

@@ -109,7 +109,7 @@ def context(
 
     Returns
     -------
-    The greatest horizontal width, and the horizontal widths across and along the line of sight.
+    The largest horizontal width, and the horizontal widths across and along the line of sight.
     """
     weight, base = surface.weight, -surface.center[2] / surface.unit
     x, y, z = surface.neurons[0], surface.neurons[1], surface.neurons[2]
@@ -202,7 +202,7 @@ def _harmonics(weight: F4, normals: F4, out: F4) -> None:
 
 @kernel(inline=True)
 def _facing(level: F8, weight: F4, normals: F4, out: F4) -> None:
-    """Write the shares of the surface that face up, sideways and down."""
+    """Write the fractions of the surface that face up, sideways and down."""
     for i in range(level.size):
         w, up = weight[i], normals[2, i]
         out[0] += w * (up > 0.8)
@@ -247,7 +247,7 @@ def _axis(x: F4, y: F4, level: F8, height: float, weight: F4, normals: F4, out: 
 
 @kernel(inline=True)
 def _heights(level: F8, weight: F4, curvatures: F4, out: F4) -> None:
-    """Write mean, deviation and skew of the height, and the convex share of the surface."""
+    """Write mean, deviation and skew of the height, and the convex fraction of the surface."""
     mean = second = third = 0.0
     for i in range(level.size):
         mean += weight[i] * level[i]

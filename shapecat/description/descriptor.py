@@ -101,10 +101,10 @@ def _describe(points: F4, neurons: F4, edges: U2, eye: F4, out: F4) -> None:
     profile(surface, normals, curvatures, low, high, out[_PROFILE:_REVOLUTION])
     cx, cy, _ = vertical_axis(x, y, normals, weight)
     axis, point, _ = rotation_axis(x, y, z, weight, normals)
-    turned, foot = out[_REVOLUTION:_SOLIDS], np.array((cx, cy, 0.0))
-    revolution(surface, normals, axis, point, foot, turned)
+    revolved, foot = out[_REVOLUTION:_SOLIDS], np.array((cx, cy, 0.0))
+    revolution(surface, normals, axis, point, foot, revolved)
     solids(
-        cloud, surface.nearest, x, y, normals, surface.eye, low, high, turned,
+        cloud, surface.nearest, x, y, normals, surface.eye, low, high, revolved,
         out[_SOLIDS:_OUTLINE],
     )  # fmt: skip
     outline(cloud, surface.eye, out[_OUTLINE:_METRIC])
@@ -203,7 +203,7 @@ def _own_units(neurons: F4) -> tuple[F4, F4, F8, float]:
     unit = unit if unit > 0 else 1.0
     rows = np.zeros((3, count), np.float32)
     euclidean = np.zeros((count, count), np.float32)
-    for _ in range(2):  # first by the greatest coordinate, so that squares stay finite
+    for _ in range(2):  # first by the largest coordinate, so that squares stay finite
         for i in range(count):
             for axis in range(3):
                 rows[axis, i] = (neurons[i, axis] - center[axis]) / unit

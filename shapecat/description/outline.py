@@ -84,7 +84,7 @@ def _widths(
     to_narrow: bool,  # noqa: FBT001  compiled kernels take their arguments by position
     out: F4,
 ) -> tuple[float, float]:
-    """Write width and offset of each slice; return the relative length, and the filled share."""
+    """Write width and offset of each slice; return the relative length, and the filled fraction."""
     low, high = inner_range(along)
     length = max(high - low, 1e-6)
     left, right = np.zeros(OUTLINE_SLICES), np.zeros(OUTLINE_SLICES)

@@ -26,7 +26,7 @@ def vertical_axis(x: F4, y: F4, normals: F4, weight: F4) -> tuple[float, float, 
     ----------
     x, y : (n,) positions of the neurons, in any unit of length.
     normals : (3, n) unit vectors.
-    weight : (n,) each neuron's share of the points.
+    weight : (n,) each neuron's fraction of the points.
 
     Returns
     -------
@@ -61,9 +61,9 @@ def profile(
 ) -> None:
     """Write the radial profile about the vertical axis, named by `PROFILE_NAMES`.
 
-    The features of each of 8 horizontal slices are its share of the points, the mean radius and its
-    standard deviation (relative to the largest mean radius), the share of the points that faces the
-    axis, the mean of the normals' z, and the mean curvature.
+    The features of each of 8 horizontal slices are its fraction of the points, the mean radius and
+    its standard deviation (relative to the largest mean radius), the fraction of the points that
+    face the axis, the mean of the normals' z, and the mean curvature.
 
     Parameters
     ----------

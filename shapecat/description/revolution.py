@@ -35,8 +35,8 @@ def revolution(surface: Surface, normals: F4, axis: F8, point: F8, foot: F8, out
 
     Two solids of revolution are fitted to the neurons and measured on the points: one with a
     vertical axis, and one whose axis may tilt. The second is cut into slices, from its wide to its
-    narrow end. The features of a slice are its share of the points, the mean radius (relative to
-    the largest), the deviation from that radius, and the share of the points that face the axis.
+    narrow end. The features of a slice are its fraction of the points, the mean radius (relative to
+    the largest), the deviation from that radius, and the fraction of the points that face the axis.
 
     Parameters
     ----------
@@ -87,7 +87,7 @@ def fit_axis(neurons: F4, weight: F4, normals: F4, axis: F8, point: F8, free: in
     Parameters
     ----------
     neurons, normals : (3, k) positions, in any unit of length, and unit vectors.
-    weight : (k,) each neuron's share of the points.
+    weight : (k,) each neuron's fraction of the points.
     axis, point : (3,) direction and point of the first guess, overwritten by the result.
     free : 2 to shift the axis, 4 to tilt it as well.
     """
@@ -222,8 +222,8 @@ def _measure(
 ) -> tuple[float, float, float]:
     """Write the profile of all points about an axis, one row of ``slices`` per slice.
 
-    A row is the share of the points, the mean radius, the deviation from it, and the share of the
-    points that face the axis. Returns the root mean square residual, the length along the axis,
+    A row is the fraction of the points, the mean radius, the deviation from it, and the fraction of
+    the points that face the axis. Returns the root mean square residual, the length along the axis,
     and the mean radius.
     """
     first, second = _across(axis)

@@ -20,7 +20,7 @@ def rotation_axis(x: F4, y: F4, z: F4, weight: F4, normals: F4) -> tuple[F8, F8,
     Parameters
     ----------
     x, y, z : (n,) positions of the neurons, in any unit of length.
-    weight : (n,) each neuron's share of the points.
+    weight : (n,) each neuron's fraction of the points.
     normals : (3, n) unit vectors.
 
     Returns

@@ -43,7 +43,7 @@ def solids(
     eye: F4,
     low: float,
     high: float,
-    turned: F4,
+    revolved: F4,
     out: F4,
 ) -> None:
     """Write the features named by `SOLID_NAMES`.
@@ -58,13 +58,13 @@ def solids(
     normals : (3, k) unit vectors.
     eye : (3,) position of the sensor.
     low, high : heights of the lowest and highest point.
-    turned : the block ``revolution``, already written.
+    revolved : the block ``revolution``, already written.
     out : the block ``solids``, written in place.
     """
     u, v = _box_frame(cloud, x, y, normals, eye)
     _box(u, v, cloud[2], owner, normals, low, high, out[:13])
-    out[13] = _log_ratio(out[1], turned[2])
-    out[14] = _log_ratio(out[0], turned[0])
+    out[13] = _log_ratio(out[1], revolved[2])
+    out[14] = _log_ratio(out[0], revolved[0])
     _ball(cloud, low, high, out[15:18])
     out[18] = _log_ratio(out[15], out[1])
 

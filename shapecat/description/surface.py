@@ -19,7 +19,7 @@ class Surface(NamedTuple):
     nearest : (n,) the neuron of each point.
     neurons : (3, k).
     euclidean, geodesic : (k, k) distances between neurons, straight and along edges.
-    weight : (k,) each neuron's share of the points.
+    weight : (k,) each neuron's fraction of the points.
     spacing : mean distance from a neuron to the nearest other one.
     eye : (3,) position of the sensor.
     eye_distance_m : its distance, metres.

@@ -25,7 +25,7 @@ def connected_components(inside: Bool, links: U1, spans: I4, component: I4) -> I
     inside : (rows, columns) bool, the cells to label; none is outside ``spans``.
     links : (rows, columns) uint8, the bits `RIGHT` and `DOWN`; links to cells that are not inside
         are ignored.
-    spans : (rows, 2) for each row, the first column that may be inside, and one after the last.
+    spans : (rows, 2) for each row, the first column that may be inside, and one past the last.
     component : (rows, columns) int32, written within the spans: the labels, 0 where not inside.
 
     Returns
@@ -99,7 +99,7 @@ def spans_of(plane_id: I4) -> I4:
 
 @kernel
 def span_of(row: I4) -> tuple[int, int]:
-    """Return the first column of a row (n,) with a value above 0, and one after the last.
+    """Return the first column of a row (n,) with a value above 0, and one past the last.
 
     Both are 0 if there is none.
     """

@@ -1,4 +1,4 @@
-"""The records that the steps of the detection pass on."""
+"""The records that the steps of detection pass on."""
 
 from typing import NamedTuple
 

@@ -33,7 +33,7 @@ class VirtualImage(NamedTuple):
     points : (n, 3) float32 metres, in the frame of the virtual camera; 0 for points out of view.
     cell : (n,) int32 flat index of each point's cell; -1 for points out of view.
     view_from_sensor : pose of the sensor in the frame of the virtual camera.
-    crowded : share of the points that lie well behind another point in their cell.
+    crowded : fraction of the points that lie well behind another point in their cell.
     """
 
     grid: DepthGrid

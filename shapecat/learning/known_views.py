@@ -7,7 +7,7 @@ from shapecat.arrays import I4
 __all__ = ["KNOWN_VIEWS", "choose_evenly"]
 
 KNOWN_VIEWS = 3000
-"""Most views that a model stores."""
+"""Maximum number of views that a model stores."""
 
 
 def choose_evenly(codes: I4, count: int, rng: np.random.Generator) -> I4:

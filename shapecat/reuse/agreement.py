@@ -29,8 +29,8 @@ def agreement(
 
     Returns
     -------
-    The share of the compared points that agree with ``other``, and the mean inverse depth, in 1/m,
-    by which ``other`` sees these points nearer; (0, 0) if too few points have depth there.
+    The fraction of the compared points that agree with ``other``, and the mean inverse depth, in
+    1/m, by which ``other`` sees these points nearer; (0, 0) if too few points have depth there.
     """
     turn = np.array(other_from_one.rotation, order="C")  # writable, in C order: one version
     shift = other_from_one.translation

@@ -23,11 +23,11 @@ _SPACING_SAMPLES = 64
 """Approximate number of points whose distance to the nearest one is averaged."""
 _RATES = Rates(winner=0.1, neighbour=0.006, oldest=30)
 _GROWTH = 0.6
-"""Share of the signals within which all neurons are inserted."""
+"""Fraction of the signals within which all neurons are inserted."""
 _EPOCHS = 8
 """Maximum number of epochs of the thesis's rule, which rarely reaches its distance limit sooner."""
 _ERROR_LIMIT = 3.0
-"""t_gamma, relative to the error per epoch of a neuron with its share of the surface."""
+"""t_gamma, relative to the error per epoch of a neuron with an equal part of the surface."""
 _DISTANCE_LIMIT = 0.7
 """t_alpha, relative to the spacing of the points: smaller distances are noise."""
 
@@ -100,7 +100,8 @@ def _by_thesis(points: F4, seed: int, neurons: int, share: float) -> tuple[F4, U
     cloud, frame = _normalise(points)
     target = _target_size(cloud, neurons)
     # differs: a bound on the neurons, for memory; and thresholds relative to the object. A neuron
-    # with its share of the surface, a square of side h, has a mean squared distance of h**2 / 6.
+    # with an equal part of the surface, a square of side h, has a mean squared distance of
+    # h**2 / 6.
     gas = empty_gas(2 * target)
     state = np.uint64(seed)
     _link_two_points(cloud, gas, state)

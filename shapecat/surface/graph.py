@@ -27,7 +27,7 @@ def finish_graph(cloud: Cloud, gas: Gas, count: int, share: float) -> Bool:
        (competitive Hebbian learning, Martinetz and Schulten 1994), or if they are among the three
        nearest to some point and not far apart. With the links of the gas alone, a third of the
        neurons are in no triangle.
-    4. Remove components with less than a share of the points, but never the largest.
+    4. Remove components with less than a minimum fraction of the points, but never the largest.
     5. Connect the remaining components where they are nearest to each other.
 
     Parameters

@@ -80,7 +80,7 @@ def _adapt_to_signal(
 ) -> tuple[int, int]:
     """Do steps 5 to 9 of thesis Algorithm 3 for one signal.
 
-    Returns the winner, and the greatest age of its edges.
+    Returns the winner, and the largest age of its edges.
 
     The arrays of a `Gas` are passed one by one: unpacking it takes as long as a step. Step 10 is
     the caller's: with a conditional call in here, numba counts references to the arrays for each

@@ -192,7 +192,7 @@ def adapt(
     absent : ``edge_birth`` is at least this where there is no edge.
     wins : the int32 array of `Gas`.
     winner : index of the winner.
-    rate_winner, rate_neighbour : share of the distance to move.
+    rate_winner, rate_neighbour : fraction of the distance to move.
     """
     real, integer = types.float32, types.int64
     places = (x, y, z, integer, real, real, real)

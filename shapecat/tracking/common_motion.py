@@ -1,4 +1,4 @@
-"""The common motion of all objects, on a turntable or before a sensor whose pose is unknown."""
+"""The common motion of all objects, on a turntable or relative to a sensor of unknown pose."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace

@@ -34,7 +34,7 @@ _OF_DETECTIONS: dict[str, tuple[str, tuple[Any, ...]]] = {
 class DetectionTable:
     """All detections of a stream, in the order of the frames.
 
-    A detection takes only about 100 bytes, as those of many hours are kept at once.
+    A detection takes only about 100 bytes, because those of many hours are kept at once.
 
     Attributes
     ----------
@@ -240,9 +240,9 @@ def _by_time(topics: I4, stamps_ns: I4) -> Any:
 
 
 def _times_set_back(stamps_ns: I4) -> I4:
-    """Return how often a clock had been set back at each frame (f,); an odd stamp is no such time.
+    """Return how often a clock had been set back at each frame (f,), ignoring single odd stamps.
 
-    So the two frames before are compared with two from there on.
+    To ignore these, the two frames before are compared with this one and the next.
     """
     stamps = np.pad(stamps_ns, 2, mode="edge")
     before = np.minimum(stamps[:-4], stamps[1:-3])

@@ -19,7 +19,7 @@ _SLOW_S = 0.3  # beyond this interval between frames, motion does not explain a 
 _KNOWN = 8  # whole views needed to know the size, as some views only seem whole
 _SAME_SIZE = 0.25  # largest difference of size keys of the same object
 _SAME_POSTERIOR = 0.5  # largest total variation distance of posteriors of the same object
-_SLOW_REACH = 0.5  # share of the gate radius that an object at rest may seem to move
+_SLOW_REACH = 0.5  # fraction of the gate radius that an object at rest may seem to move
 _TOGETHER_M = 0.03  # largest difference of the displacements of objects that moved together
 _MOST = 2 / 3  # fraction of the comparable objects that must have moved together
 _PARTIAL_SLACK = 1.5  # factor of the last two limits for pairs with a partial view
@@ -160,10 +160,10 @@ def scene_cuts(table: DetectionTable, settings: TrackingSettings) -> Bool:
 
     Recordings of single images can show different objects at the same position from one frame to
     the next. Two frames disagree if fewer than half of the objects that have a neighbour in the
-    other frame are found again. A single odd frame is no cut: the frames on both sides of it must
-    disagree too. Only frames of one topic are compared, as other sensors may see other objects.
-    Frames without detections are ignored. A clock that jumps back by more than ``max_missed_s``
-    also begins a new scene.
+    other frame are found again. A single odd frame is not a cut: the frames on both sides of it
+    must disagree too. Only frames of one topic are compared, as other sensors may see other
+    objects. Frames without detections are ignored. A clock that jumps back by more than
+    ``max_missed_s`` also begins a new scene.
     """
     stamps, filled = table.stamps_ns, np.unique(table.rows)
     result = np.diff(stamps, prepend=stamps[:1]) < -settings.max_missed_s * 1e9
@@ -187,7 +187,7 @@ def scene_cuts(table: DetectionTable, settings: TrackingSettings) -> Bool:
 def _with_neighbours(
     table: DetectionTable, filled: I4, topic: int
 ) -> Iterator[tuple[int, int, int, int, int]]:
-    """Yield the frames of a topic with detections from the second on, each with four others.
+    """Yield the frames of a topic with detections, except the first, each with four others.
 
     These are the previous frame with detections, the previous frame, the second previous and the
     next one with detections, -1 if there is none. ``filled`` (k,) are all frames with detections.
@@ -207,7 +207,7 @@ def _continues(
 
     A partial view may be smaller than its object. With ``slow``, positions and posteriors must
     agree better; those of partial views less so. Instead, most objects, and at least two, may have
-    moved together, on a belt or before a moving sensor: unrelated images rarely look like that.
+    moved together, on a belt or as seen by a moving sensor: unrelated images rarely look like that.
     """
     a, b = table.of_frame(i), table.of_frame(j)
     offsets = table.centers[b][None] - table.centers[a][:, None]

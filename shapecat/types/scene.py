@@ -96,7 +96,7 @@ class Candidate(Record):
 
 
 class Scene(Record):
-    """The result of the detection in one frame.
+    """The result of detection in one frame.
 
     ``up`` is a (3,) unit vector in the sensor frame; ``planes`` are in order of height.
     """

@@ -1,7 +1,7 @@
-"""Context: the verdicts on the segments beside a segment.
+"""Context: the verdicts on the neighbours of a segment.
 
-A finger of a gripper looks like an object, but it is connected to an arm. So trees that judge each
-segment by itself are followed by others, which also see the verdicts on its neighbours.
+A finger of a gripper looks like an object, but it is connected to an arm. So trees that classify
+each segment by itself are followed by others, which also see the verdicts on its neighbours.
 
 Source: auto-context (Tu 2008).
 """
@@ -46,7 +46,7 @@ def add_context(features: Records, logits: F4, weights: F4) -> Records:
     Parameters
     ----------
     features : (r,) `OBJECT_FEATURES`.
-    logits : (r,) log-odds that a segment is an object, each judged alone.
+    logits : (r,) log-odds that a segment is an object, each classified alone.
     weights : (4, r, r) from `measure_borders`.
     """
     records = np.zeros(len(features), CONTEXT_FEATURES)

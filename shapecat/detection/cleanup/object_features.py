@@ -31,16 +31,16 @@ __all__ = ["OBJECT_FEATURES", "measure_object_features"]
 _SURROUNDINGS = np.dtype(
     [
         ("image_border", "f4"),  # cells at the border, over the perimeter of a square of equal area
-        ("range_limit", "f4"),  # shares of the cells: at the range limit,
+        ("range_limit", "f4"),  # fractions of the cells: at the range limit,
         ("on_wall", "f4"),  # and on walls
-        ("beyond", "f4"),  # shares of the boundary: where the surface continues beyond all planes,
+        ("beyond", "f4"),  # fraction of the boundary where the surface continues beyond all planes
         ("into_wall", "f4"),  # and into a wall
         ("least_outside_m", "f4"),  # distance of the samples outside the outline of the plane
         ("mean_outside_m", "f4"),
         ("most_outside_m", "f4"),
-        ("low_profile", "f4"),  # share of the cells on low-profile objects
-        ("depth_edge", "f4"),  # share of the boundary in front of what is farther away
-        ("plane_height", "f4"),  # heights of the plane around it, over the least of an object's
+        ("low_profile", "f4"),  # fraction of the cells on low-profile objects
+        ("depth_edge", "f4"),  # fraction of the boundary in front of what is farther away
+        ("plane_height", "f4"),  # heights of the plane around it, over the minimum of an object's
         ("plane_noise", "f4"),  # sample: their mean, and their standard deviation
     ],
     align=True,
@@ -52,7 +52,7 @@ _VISIBILITY = np.dtype(
         ("depth_m", "f4"),
         ("cell_m", "f4"),
         ("down", "f4"),  # cosine between the optical axis and up
-        ("top_by_noise", "f4"),  # top over the least height of an object's sample at that depth
+        ("top_by_noise", "f4"),  # top over the minimum height of an object's sample at that depth
         ("slant", "f4"),  # area over that of its cells if they faced the camera
         ("ragged", "f4"),  # squared boundary over cells: 16 for a square
     ],

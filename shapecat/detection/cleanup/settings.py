@@ -19,11 +19,11 @@ class CleanupSettings(NamedTuple):
     """Minimum logit of an object that is far. In 160 simulated rooms, it rejects 60 of the 73 false
     objects that a range of 3 m adds to one of 2 m, and 2 of the 57 true ones."""
     certain_logit: float = 4.0
-    """Partial logit beyond which evaluation stops, on either side of 0: of 1,742 segments, the
-    remaining trees would change no verdict."""
+    """Absolute partial logit beyond which evaluation stops: of 1,742 segments, the remaining trees
+    would change no verdict."""
     uncertain_logit: float = 3.0
-    """Logit below which a segment is judged again in its context, on either side of 0. If all of
-    98,747 segments were, the numbers of lost objects and of false ones would change by 0.3 %."""
+    """Absolute logit below which a segment is classified again in its context. If all of 98,747
+    segments were, the numbers of lost objects and of false ones would change by 0.3 %."""
     sure_logit: float = 4.0
     """Logit at which a verdict on a neighbour counts as nearly certain: three quarters of one."""
     tiny_share: float = 0.5
@@ -32,14 +32,14 @@ class CleanupSettings(NamedTuple):
     border_share: float = 0.08
     """Maximum fraction of the image that sensors leave blank at a border."""
     around_cells: int = 4
-    """Cells from an object to where its plane shows how rough it is there."""
+    """Distance from an object, in cells, at which the roughness of its plane is measured."""
     cut_off_m: float = 0.02
-    """A segment that comes this near to the greatest height continues above it, metres."""
+    """A segment that comes this near to the maximum height continues above it, metres."""
     large_share: float = 0.02
     """Minimum fraction of the image covered by a large object, an arm, furniture or the bent end of
     a table."""
     cut_share: float = 0.4
-    """Minimum fraction of the perimeter of such structure, taken for a square, at the image
+    """Minimum fraction of the perimeter of such structure, assumed to be square, at the image
     border."""
     fringe: float = 0.6
     """Minimum height at which a sample next to an object belongs to it, relative to the

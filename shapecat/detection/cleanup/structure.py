@@ -1,9 +1,9 @@
 """Structure rejection: boosted trees separate objects from background structure and noise.
 
 Background structure is walls of bins, sides and edges of shelves, furniture, bent ends of tables
-and blobs of noise. No single feature separates it from objects, many weak ones together do. The
-trees are grown on simulated scenes (`shapecat.models.structure`), also of rooms with arms and
-people. They judge each segment alone, and then among the others (`context`).
+and blobs of noise. No single feature separates it from objects; many weak ones together do. The
+trees are trained on simulated scenes (`shapecat.models.structure`), including rooms with arms and
+people. They classify each segment alone, and then in the context of the others (`context`).
 """
 
 from functools import cache
@@ -35,7 +35,7 @@ __all__ = [
 
 
 class RejectionTrees(NamedTuple):
-    """Trees that judge a segment ``alone``, and then ``in_context``, among the others."""
+    """Trees that classify a segment ``alone``, and then ``in_context``, among the others."""
 
     alone: BoostedTrees
     in_context: BoostedTrees
@@ -95,7 +95,7 @@ def as_rows(features: Records) -> F4:
 
 
 def is_uncertain(logits: F4) -> Bool:
-    """Return which segments, with these ``logits`` (n,) alone, to judge again in context, (n,)."""
+    """Return which segments, given their ``logits`` (n,), to classify again in context, (n,)."""
     uncertain: Bool = np.abs(logits) < CLEANUP.uncertain_logit
     return uncertain
 

@@ -1,7 +1,7 @@
 """Low-profile objects: they rise from their plane in a step, unlike low-frequency depth error.
 
 Only an object has an edge. So low-frequency depth error is removed first (`depth_error`), and low
-parts are judged by their outline rather than by their height.
+parts are classified by their outline rather than by their height.
 """
 
 import math
@@ -97,7 +97,7 @@ def find_low_profile(
 
 @kernel(inline=True)
 def _rows_of(plane_id: I4, number: int) -> tuple[int, int]:
-    """Return the first row of the cells of a plane, and one after the last, with a margin.
+    """Return the first row of the cells of a plane, and one past the last, with a margin.
 
     They are equal if there is no cell. All neighbours that are read lie within the margin.
     """
@@ -132,8 +132,8 @@ def _mark_objects(
 ) -> tuple[int, int]:
     """Mark the parts above each level that have the outline of an object.
 
-    The objects are numbered from ``objects`` + 1 on, the tested parts from ``parts`` + 1 on; the
-    last numbers are returned. ``high_pass`` (rows, columns) is from `filter_high_pass`.
+    The objects are numbered from ``objects`` + 1, the tested parts from ``parts`` + 1; the last
+    numbers are returned. ``high_pass`` (rows, columns) is from `filter_high_pass`.
     """
     flat, marks, plane_ids = high_pass.reshape(-1), low_profile.reshape(-1), plane_id.reshape(-1)
     flooded, part, seeds, stack = scratch
@@ -243,7 +243,7 @@ def _drop_error(
 ) -> int:
     """Assign flat parts of low object cells to the plane if their outline is that of depth error.
 
-    The parts are numbered from ``parts`` + 1 on; the last number is returned.
+    The parts are numbered from ``parts`` + 1; the last number is returned.
     """
     rows, columns = residual.shape
     _, part, seeds, stack = scratch

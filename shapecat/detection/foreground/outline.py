@@ -19,7 +19,7 @@ class Limits(NamedTuple):
     ----------
     rise : minimum mean rise across the outline of an object, 1/m.
     level : unit of `LowProfileSettings.levels`, 1/m.
-    width : greatest width of an object, in cells at a depth of 1 m.
+    width : largest width of an object, in cells at a depth of 1 m.
     discontinuity : step that separates two surfaces, 1/m.
     """
 
@@ -112,7 +112,7 @@ def measure_outline(
         beside = (parts[p - 1] == label) & (parts[p + 1] == label)
         if beside & (parts[p - columns] == label) & (parts[p + columns] == label):
             continue
-        for di, dj in ((1, 0), (-1, 0), (0, 1), (0, -1)):  # another order rounds sums differently
+        for di, dj in ((1, 0), (-1, 0), (0, 1), (0, -1)):  # a different order rounds differently
             if parts[p + di * columns + dj] == label:
                 continue
             i, j = row_and_column(p, columns)

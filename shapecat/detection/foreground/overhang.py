@@ -27,7 +27,7 @@ class Overhang(NamedTuple):
     grid, heights, walls : as in `extend_overhang`.
     number : number of the plane, from 1, as in `HeightMap.plane_id`.
     plane : its row of `pack_planes`.
-    highest_m : greatest height of an object above it, metres.
+    highest_m : maximum height of an object above it, metres.
     visited : (rows, columns) int8, ``number`` in the cells already visited for this plane.
     """
 
@@ -54,7 +54,7 @@ def extend_overhang(
     heights : changed in place.
     planes : from `pack_planes`.
     walls : (rows, columns) from `remove_walls`; cleared cells are not assigned.
-    highest_m : greatest height of an object above its plane, metres.
+    highest_m : maximum height of an object above its plane, metres.
     """
     shape = grid.inverse_depth.shape
     visited, stack = np.zeros(shape, np.int8), unset(grid.inverse_depth.size, np.int32)

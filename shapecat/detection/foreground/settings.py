@@ -18,21 +18,21 @@ class LowProfileSettings(NamedTuple):
     noise_factor: float = 3.5
     """Minimum rise as a multiple of the median rise between plane cells equally far apart."""
     slope_share: float = 0.7
-    """Minimum rise as a share of the plane's change per cell: at a grazing angle, slightly
+    """Minimum rise as a fraction of the plane's change per cell: at a grazing angle, slightly
     displaced samples seem to rise."""
     grown: float = 0.95
-    """A part replaces the objects found within it if its rise per side exceeds this share of their
-    greatest one: an object together with depth error rises less."""
+    """A part replaces the objects found within it if its rise per side exceeds this fraction of the
+    largest of theirs: an object together with depth error rises less."""
     side: float = 0.004
     """Minimum rise over two cells on the side of an object, 1/m."""
     slope: float = 0.0016
     """Minimum fall per cell on the side of an object, 1/m."""
     max_overlap: float = 0.9
-    """A part with a larger share of its cells in objects already marked is not tested again."""
+    """A part with a larger fraction of its cells in objects already marked is not tested again."""
     min_cells: int = 80
     """Minimum number of cells of a low-profile object: smaller parts are noise."""
     small_part: int = 12
-    """Minimum number of cells of a part whose outline can be judged."""
+    """Minimum number of cells of a part whose outline is meaningful."""
     facing_share: float = 0.3
     """Minimum fraction of the outline of depth error that faces the plane."""
     low_m: float = 0.03
@@ -112,7 +112,7 @@ class OverhangSettings(NamedTuple):
     """Constants of the overhang: objects that extend beyond the outline of their plane."""
 
     max_distance_m: float = 0.15
-    """Greatest distance of an object's cell from the outline, metres."""
+    """Largest distance of an object's cell from the outline, metres."""
     outside_ratio: float = 5
     """Largest ratio of an object's cells outside to those inside."""
 

@@ -209,7 +209,7 @@ def _flood(
         facing = max(-(x * normal[0] + y * normal[1] + normal[2]), 0.1)
         area += 1 / (w * w * k.fx * k.fy * facing)
         squares += (w - (plane[0] * j + plane[1] * i + plane[2])) ** 2
-        for di, dj in ((1, 0), (-1, 0), (0, 1), (0, -1)):  # another order rounds sums differently
+        for di, dj in ((1, 0), (-1, 0), (0, 1), (0, -1)):  # a different order rounds differently
             v, u = i + di, j + dj
             if v < 0 or u < 0 or v >= rows or u >= columns or state[v, u] != UNMEASURED:
                 continue

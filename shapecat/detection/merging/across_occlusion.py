@@ -88,8 +88,8 @@ def _local_planes(samples: I4, grid: DepthGrid, normal: F4) -> F8:
 def _find_partners(a: F8, b: F8) -> tuple[float, F8]:
     """Find the pairs of samples of two segments that lie in each other's local planes.
 
-    Returns the smaller of the two segments' shares of samples with a partner, and the positions of
-    some of the pairs, (n, 2, 3). ``a`` and ``b`` are from `_local_planes`.
+    Returns the smaller of the two segments' fractions of samples with a partner, and the positions
+    of some of the pairs, (n, 2, 3). ``a`` and ``b`` are from `_local_planes`.
     """
     with_a, with_b = np.zeros(a.shape[1], np.bool_), np.zeros(b.shape[1], np.bool_)
     pairs = np.zeros((SAMPLES * SAMPLES, 2), np.uint8)

@@ -71,7 +71,7 @@ def _rate(
     pair: Records,
     logits: F8,
 ) -> None:
-    """Write the logits of ``p`` with segments from ``first`` on; the lower number is the row.
+    """Write the logits of ``p`` with segments ``first`` and above; the lower number is the row.
 
     ``pair`` (1,) is work space for the features of a pair, which the trees read as numbers.
     """

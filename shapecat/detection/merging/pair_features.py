@@ -38,12 +38,12 @@ __all__ = [
 _ADJACENCY = np.dtype(
     [
         ("contact_m", "f4"),  # length of the border where the surface continues
-        ("contact", "f4"),  # shares of the border: where the surface continues,
+        ("contact", "f4"),  # fractions of the border: where the surface continues,
         ("first_in_front", "f4"),  # and where one is in front
         ("second_in_front", "f4"),
-        ("along_first", "f4"),  # shares of the boundary of each that is in contact
+        ("along_first", "f4"),  # fractions of the boundary of each that is in contact
         ("along_second", "f4"),
-        ("second_faces_up", "f4"),  # shares of the contact beyond which the other faces up
+        ("second_faces_up", "f4"),  # fractions of the contact beyond which the other faces up
         ("first_faces_up", "f4"),
         ("above_second_m", "f4"),  # mean height of that contact above the other's top
         ("above_first_m", "f4"),

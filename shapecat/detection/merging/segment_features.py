@@ -26,7 +26,7 @@ SEGMENT_FEATURES = np.dtype(
         ("height_m", "f4"),
         ("lateral_curvature", "f4"),
         ("normal_position_correlation", "f4"),
-        ("plane_contact", "f4"),  # shares of the boundary
+        ("plane_contact", "f4"),  # fractions of the boundary
         ("hidden", "f4"),
         ("shelf_edge", "f4"),
         ("upper_silhouette", "f4"),
@@ -34,7 +34,7 @@ SEGMENT_FEATURES = np.dtype(
         ("in_front", "f4"),
         ("behind", "f4"),
         ("top_area", "f4"),  # over the squared width
-        ("facing_up", "f4"),  # share of the area
+        ("facing_up", "f4"),  # fraction of the area
         ("area_m2", "f4"),
         ("filled", "f4"),  # area over width times height
     ],

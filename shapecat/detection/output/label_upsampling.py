@@ -236,7 +236,7 @@ def _mark(
 ) -> None:
     """Write the labels of a run of pixels, `UNSURE` where a closer test is needed.
 
-    ``run`` is the row, the first column, and one after the last; ``inv_depth`` and ``code`` are
+    ``run`` is the row, the first column, and one past the last; ``inv_depth`` and ``code`` are
     those of the cells, by column of the pixels; a pixel fits a cell within ``jump``, 1/m. This
     vectorises.
     """

@@ -26,7 +26,7 @@ def append_run(label: int, first: int, end: int, runs: I4, n: int) -> int:
 def pixels_by_label(runs: I4, labels: int) -> tuple[U4, I4]:
     """Return the pixel indices (n,) of runs, sorted by label, and where each label ends (labels,).
 
-    ``runs`` is (r, 3): label, first pixel, and one after the last. Label 0 has no pixels: its end
+    ``runs`` is (r, 3): label, first pixel, and one past the last. Label 0 has no pixels: its end
     is 0.
     """
     offset, total = np.zeros(labels, np.int64), 0  # where the next pixel of each label goes

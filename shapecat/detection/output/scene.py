@@ -135,7 +135,7 @@ def _at_image_border(grid: DepthGrid, segmentation: Segmentation, _: Pose) -> Bo
     truncated = np.zeros(len(measured.low), bool)
     for side, (blank, extent) in enumerate(find_borders(grid.inverse_depth, band).tolist()):
         axis = side // 2
-        # The top of a tall object with nothing behind it is no border.
+        # The top of a tall object with nothing behind it is not a border.
         first = band + (blank if extent > OUTPUT.straight_share * shape[1 - axis] else 0)
         if side % 2 == 0:
             truncated |= measured.low[:, axis] < first

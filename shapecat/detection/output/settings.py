@@ -34,7 +34,7 @@ class OutputSettings(NamedTuple):
     forward_cos: float = 0.2
     """Approximate minimum cosine to the optical axis of a point in front of a camera."""
     crowded: float = 0.08
-    """Share of points behind others above which a cloud counts as fused from several views."""
+    """Fraction of points behind others above which a cloud counts as fused from several views."""
 
 
 OUTPUT = OutputSettings()

@@ -66,7 +66,7 @@ def pack_planes(supports: list[SupportingPlane]) -> F8:
 def measure_heights(grid: DepthGrid, planes: F8, highest_m: float) -> HeightMap:
     """Assign each sample to the highest plane below it.
 
-    ``planes`` are from `pack_planes`, lowest first; ``highest_m`` is the greatest height above the
+    ``planes`` are from `pack_planes`, lowest first; ``highest_m`` is the maximum height above the
     plane, metres.
     """
     shape = grid.inverse_depth.shape
@@ -80,7 +80,7 @@ def measure_heights(grid: DepthGrid, planes: F8, highest_m: float) -> HeightMap:
 def _assign(grid: DepthGrid, plane: F8, number: int, highest: float, heights: HeightMap) -> None:
     """Assign the free cells inside the outline of a plane to it; the loops over a row vectorise.
 
-    ``plane`` is a row of `pack_planes`, and ``highest`` the greatest height above it, metres.
+    ``plane`` is a row of `pack_planes`, and ``highest`` the maximum height above it, metres.
     Compiled without ``fast``: with it, the inlined copy would round heights differently in the
     process that compiles and in later ones.
     """

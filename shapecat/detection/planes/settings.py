@@ -30,7 +30,7 @@ class UpSettings(NamedTuple):
     """Exponent, in that score, of the fraction of the surface facing the direction that lies in
     large levels."""
     frontal_penalty: float = 0.6
-    """Share of the score that a direction along the optical axis loses: it is that of a wall."""
+    """Fraction of the score that a direction along the optical axis loses: it is that of a wall."""
     roll_penalty: float = 3.0
     """Penalty on directions that imply a camera on its side or upside down: a quarter remains."""
     frontal_sin2: float = 0.03
@@ -72,7 +72,7 @@ class PlaneSettings(NamedTuple):
     wall_m: float = 0.03
     """Samples within this distance behind an edge belong to the wall of a box, metres."""
     wall_share: float = 0.5
-    """A wall closes a box if more than this share of the samples below an edge is on the wall."""
+    """A wall closes a box if more than this fraction of the samples below an edge are on it."""
     around_m: float = 0.03
     """Distance from a sample to the surroundings of its plane, metres."""
     drop_ratio: float = 0.2
@@ -107,7 +107,7 @@ class StripSettings(NamedTuple):
     """Minimum inverse depth of strips, relative to that of the farthest sample: four fifths of the
     range."""
     dip: float = 0.6
-    """Just above a plane, the area of level surface falls below this share of the plane's."""
+    """Just above a plane, the area of level surface falls below this fraction of the plane's."""
     min_area_m2: float = 0.001
     """Minimum visible area of a covered plane."""
     min_points: int = 15
@@ -117,7 +117,7 @@ class StripSettings(NamedTuple):
     tallest_m: float = 0.15
     """Height of the tallest objects that cover a plane, metres."""
     max_visible: float = 0.45
-    """Largest visible share of the outline of a covered plane; a lid is fully visible."""
+    """Largest visible fraction of the outline of a covered plane; a lid is fully visible."""
 
 
 class AssumedSettings(NamedTuple):
@@ -127,10 +127,10 @@ class AssumedSettings(NamedTuple):
     """Depth up to which such samples may be objects that hide their support, metres; farther away
     they are background."""
     unexplained: float = 0.2
-    """Share of unexplained samples above which a plane is assumed; plain tables have at most 0.06.
-    """
+    """Fraction of unexplained samples above which a plane is assumed; plain tables have at most
+    0.06."""
     noise_share: float = 0.01
-    """Share of the unexplained samples that may lie below the plane, as noise."""
+    """Fraction of the unexplained samples that may lie below the plane, as noise."""
 
 
 UP, PLANES, STRIPS = UpSettings(), PlaneSettings(), StripSettings()

@@ -39,7 +39,7 @@ def supporting_planes(
 ) -> list[SupportingPlane]:
     """Return the planes that are not the tops of objects, lowest first.
 
-    Planes are judged from the lowest up; the height of a plane is measured from the highest kept
+    Planes are tested from the lowest up; the height of a plane is measured from the highest kept
     plane under its middle. The first rule that applies decides:
 
     1. Drop a plane less than 6 cm high.

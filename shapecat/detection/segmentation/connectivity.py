@@ -106,8 +106,8 @@ def _link(grid: DepthGrid, plane_id: I4, spans: I4, local_plane: F4, links: U1) 
 def _part_steps(grid: DepthGrid, plane_id: I4, i: int, start: int, end: int, links: U1) -> None:
     """Remove links that cross a step and are supported by a local plane only.
 
-    At a step the depths change more from one cell to the next than before and after it. The
-    window of a local plane spans the step and takes it for a slope, so that a plate would be linked
+    At a step the depths change more from one cell to the next than before and after it. A plane
+    fitted to a window that spans the step treats it as a slope, so that a plate would be linked
     with the can it stands on. At the edge of a surface seen at a grazing angle, only one side has
     the slope.
     """
@@ -217,7 +217,7 @@ def _raise_concavity(
     ----------
     flat : inverse depth, local planes and normals of all cells, flattened.
     gate : largest distance of both planes from the cell, 1/m.
-    cells : the row, the first column, one after the last, and the number of columns.
+    cells : the row, the first column, one past the last, and the number of columns.
     shift : offset, in rows and columns, from a cell to the normals that are compared, both ways.
     gaps, chords : (columns,) work space.
     worst : (columns,) squared chords of the row.

@@ -65,7 +65,7 @@ def padded(start: int, end: int) -> int:
 
 @kernel(inline=True)
 def _write(fits: F4, planes: F4, normals: F4, start: int, columns: int, n: int) -> None:
-    """Copy the fits of a run to the local planes and normals from index ``start`` on.
+    """Copy the fits of a run to the local planes and normals, beginning at index ``start``.
 
     Slices and signed indices would be slower.
     """
@@ -80,7 +80,7 @@ def _write(fits: F4, planes: F4, normals: F4, start: int, columns: int, n: int) 
 
 @kernel(inline=True)
 def _next_run(plane_ids: I4, row: int, j: int, last: int) -> tuple[int, int]:
-    """Return first column, and one after the last, of the next run of cells above one plane.
+    """Return the first column, and one past the last, of the next run of cells above one plane.
 
     The search begins at column ``j``. There must be an object cell before ``last``; ``row`` is the
     index of the first cell of the row.
@@ -124,7 +124,7 @@ def _copy_windows(
 def _fit_run(
     values: F4, intrinsics: PinholeIntrinsics, wider: float, i: int, start: int, n: int, fits: F4
 ) -> None:
-    """Fit planes to the windows of ``n`` cells from (i, ``start``) on.
+    """Fit planes to the windows of ``n`` cells, beginning at (i, ``start``).
 
     ``wider`` multiplies the gates of `SEGMENTATION`. The rows of ``fits`` are inverse depth, its
     change per column and per row, and the normal (3); 0 where there is no fit.

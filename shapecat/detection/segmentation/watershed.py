@@ -33,7 +33,7 @@ def watershed(heights: HeightMap, graph: SurfaceGraph) -> tuple[I4, int]:
 
 @kernel
 def _label_parts(plane_id: I4, graph: SurfaceGraph, edge_deg: int, labels: I4, n: int) -> int:
-    """Label connected cells with angles below ``edge_deg``, from ``n`` + 1 on; return the last."""
+    """Label connected cells with angles below ``edge_deg`` from ``n`` + 1; return the last."""
     inside: Bool = np.zeros(labels.shape, np.bool_)
     concavity, spans, threshold = graph.concavity, graph.spans, np.uint8(edge_deg)
     for i in range(len(spans)):
