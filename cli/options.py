@@ -11,9 +11,9 @@ import click
 
 
 class _NonEmptyPath(click.Path):
-    """A path that is not empty: an unset variable of a shell must not mean the current folder.
+    """A path that is not empty: an unset shell variable must not mean the current folder.
 
-    ``~`` is the home folder also where the shell leaves it, as Bash does in ``--out=~/results``.
+    ``~`` is the home folder even where the shell leaves it, as Bash does in ``--out=~/results``.
     """
 
     def convert(self, value: Any, param: click.Parameter | None, ctx: click.Context | None) -> Any:

@@ -65,7 +65,7 @@ def _freeze(
 ) -> NDArray[Any]:
     """Do the work of `freeze` with parsed arguments, for speed."""
     result = np.asarray(value, dtype)
-    # A shape without named axes is compared at once.
+    # A shape without named axes is compared directly.
     if result.shape != axes and not _agree(axes, result.shape, sizes):
         given = f" with {sizes}" if sizes else ""
         names = ", ".join(map(str, axes))
@@ -100,7 +100,7 @@ class _ShortRepr(reprlib.Repr):
         self.maxother = 200
 
     def repr_ndarray(self, value: NDArray[Any], _level: int) -> str:
-        """Return type and shape, also of an array in a collection."""
+        """Return type and shape, even of an array in a collection."""
         return f"{value.dtype} {value.shape}"
 
 

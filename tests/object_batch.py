@@ -2,7 +2,7 @@
 
     python -m tests.object_batch --count 2000        by hand; some minutes
 
-The storage refuses a share of the requests. One worker is killed when a third of the recordings
+The storage refuses a fraction of the requests. One worker is killed when a third of the recordings
 are done, the scheduler and all workers when two thirds are; both are restarted, as a cluster
 administrator would do. `Report` holds the outcome.
 """

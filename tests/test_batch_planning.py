@@ -284,7 +284,7 @@ def test_write_ahead_log_is_content_of_its_database(tmp_path: Path, *, whole: bo
 
 
 def test_unneeded_digest_is_stopped(source: Path) -> None:
-    """Stopping is no error before the thread starts, and ends it afterwards."""
+    """Stopping is not an error before the thread starts, and ends it afterwards."""
     before = threading.active_count()
     with ContentDigest(source):
         assert threading.active_count() == before
@@ -1182,7 +1182,7 @@ class _Answers:
 def test_claim_that_nobody_holds_is_not_taken_from_a_dead_process(
     monkeypatch: pytest.MonkeyPatch, created: list[bool], contents: list[bytes | None]
 ) -> None:
-    """The files of the run would be taken for those of a worker that died."""
+    """The files of the run would be mistaken for those of a worker that died."""
     storage = _Answers(created, contents)
     monkeypatch.setattr(claims, "Location", lambda *_: storage)
     monkeypatch.setattr(claims, "_POLL_S", 0.001)

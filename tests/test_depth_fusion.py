@@ -130,7 +130,7 @@ def test_fusion_compensates_for_camera_motion(
 
     result = fused(now, (before, moved(HOME, other)))
 
-    # Between pixels, the edge of the box may be taken for a slope of less than AGREE.
+    # Between pixels, the edge of the box may be mistaken for a slope of less than AGREE.
     assert np.abs(errors(result, now)).max() <= 0.55 * AGREE
     assert np.percentile(np.abs(errors(result, now)), 95) < 2e-4
 

@@ -417,7 +417,7 @@ def test_furniture_cut_by_image_border_is_rejected() -> None:
 
 
 def test_image_border_is_where_depth_begins() -> None:
-    """A registered Kinect image has an empty margin of 10 %; the top of a bottle is no border."""
+    """A registered Kinect image has an empty margin of 10 %; a bottle's top is not a border."""
     shapes = [table(1, 1), box((-0.63, 0, 0), (0.08, 0.08, 0.1)), can(0.1, 0.45, 0, 0.04, 0.4)]
     depth, labels = render(shapes, distance=1.2, tilt_deg=20)
     assert not any(candidate.touches_border for candidate in found(frame_of(depth)).candidates)
@@ -479,7 +479,7 @@ def test_object_cut_by_range_limit_is_flagged() -> None:
 
 
 def test_objects_are_detected_in_upside_down_image() -> None:
-    """The front of the large box must not be taken for the supporting plane."""
+    """The front of the large box must not be mistaken for the supporting plane."""
     depth, labels = render(
         [table(), box((0, 0, 0), (0.44, 0.1, 0.26)), can(0.32, 0, 0, 0.04, 0.14)]
     )

@@ -197,7 +197,7 @@ def test_context_weights_neighbours_by_border_length() -> None:
 
 
 def test_image_border_is_where_samples_begin() -> None:
-    """A sensor may leave a strip empty; a wider gap is no border."""
+    """A sensor may leave a strip empty; a wider gap is not a border."""
     inv_depth = np.zeros((100, 200), np.float32)
     inv_depth[3:60, 0:195] = 1
     grid = DepthGrid(inv_depth, INTRINSICS, 1)

@@ -1,4 +1,4 @@
-"""Tests of foreground and planes on small made-up images."""
+"""Tests of foreground and planes on small synthetic images."""
 
 import numpy as np
 import pytest

@@ -126,7 +126,7 @@ def test_plate_touching_a_box_is_kept() -> None:
 
 
 def test_half_occluded_plate_is_an_object() -> None:
-    """The occluded part of an outline is no evidence against an object."""
+    """The occluded part of an outline is not evidence against an object."""
     v, u = np.mgrid[:480, :640]
     disc, near = bump(45, 4), (u > 320) & (u < 410) & (v > 200)
     depth = np.where(near, 0.55, depth_of(0.005 * disc))

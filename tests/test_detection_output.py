@@ -1,4 +1,4 @@
-"""Tests of boxes, image borders and upsampled labels on made-up data."""
+"""Tests of boxes, image borders and upsampled labels on synthetic data."""
 
 import numpy as np
 import pytest

@@ -108,7 +108,7 @@ Scenery = Callable[[np.random.Generator], list[Shape]]
 
 @cache
 def rendered(scenery: Scenery) -> list[tuple[np.random.Generator, Array, Any, list[int]]]:
-    """Return ten made-up scenes: generator, depth, pixel labels and labels of the objects."""
+    """Return ten synthetic scenes: generator, depth, pixel labels and labels of the objects."""
     scenes = []
     for seed in range(10):
         rng = np.random.default_rng((7, seed))
@@ -119,7 +119,7 @@ def rendered(scenery: Scenery) -> list[tuple[np.random.Generator, Array, Any, li
 
 
 def share_found(scenery: Scenery, least: float) -> float:
-    """Return the fraction of made-up scenes in which the IoU of all objects exceeds a limit."""
+    """Return the fraction of synthetic scenes in which the IoU of all objects exceeds a limit."""
     good = []
     for rng, depth, labels, objects in rendered(scenery):
         generator = deepcopy(rng)

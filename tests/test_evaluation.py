@@ -362,7 +362,7 @@ def test_page_is_complete_and_escapes_names(trained: Path, tmp_path: Path) -> No
 
 
 def test_full_disk_leaves_the_former_page(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    """Half a page would be taken for a whole one."""
+    """Half a page would be mistaken for a whole one."""
     page = tmp_path / "page.html"
     page.write_text("former")
 
@@ -467,7 +467,7 @@ def test_sensor_pose_is_relative_to_centre_of_object(
 
 
 def test_confusion_picture_has_true_categories_in_rows() -> None:
-    """A transposed matrix would claim that cans are taken for cups."""
+    """A transposed matrix would claim that cans are mistaken for cups."""
     root = ET.fromstring(confusion_svg(("cup", "can"), [[4, 3], [0, 7]]))  # noqa: S314  we drew it
     texts = {e.text: e.attrib for e in root.iter() if e.tag.endswith("text")}
     heads = [e.attrib for e in root.iter() if e.text == "can"]  # of its row and its column
@@ -687,7 +687,7 @@ def test_markdown_page_has_its_pictures_beside_it(trained: Path, tmp_path: Path)
 def test_command_writes_the_page(
     trained: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, given: str
 ) -> None:
-    """Its title names the data set, also if that is the current folder."""
+    """Its title names the data set, even if that is the current folder."""
     dataset = write_dataset(tmp_path / "data", ("box", "ball"), instances=2)
     monkeypatch.chdir(dataset if given == "." else tmp_path)
     page = tmp_path / "page.html"

@@ -96,7 +96,7 @@ def test_damaged_file_is_noticed(out: Path, name: str, damage: Callable[[Path], 
 
 
 def test_stray_files_and_torn_lines_are_noticed(out: Path) -> None:
-    """Half a manifest line, a file that is no run, and a hidden folder after the end."""
+    """Half a manifest line, a file that is not a run, and a hidden folder after the end."""
     (out / "manifest.jsonl").write_text('{"folder": "table"}\n{"fold')
     (out / "table.partial").write_text("")
     (out / ".table.partial").mkdir()

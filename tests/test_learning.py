@@ -446,7 +446,7 @@ def test_shift_of_new_categories_uses_correct_held_out_views(
     margins = 1.0 + rows[:, 0] / count
     truth = np.zeros(count, np.int64)
     old = np.stack([margins, np.zeros(count)], axis=1)
-    old[::2] = [0.0, 0.01]  # every other view is taken for another category
+    old[::2] = [0.0, 0.01]  # every other view is mistaken for another category
     fitted_on: list[set[float]] = []
 
     def fit_new(some: _Inputs, *_: object) -> Any:

@@ -34,7 +34,7 @@ def seen(label: str, instance: str, cup: float, novelty: float) -> SimulatedView
 
 def test_worst_mistakes_are_most_confident_and_one_per_object(tmp_path: Path) -> None:
     views = [
-        seen("box", "a", 0.7, 0.2),  # taken for a cup
+        seen("box", "a", 0.7, 0.2),  # mistaken for a cup
         seen("box", "a", 0.9, 0.2),  # the same object, more confident
         seen("cup", "b", 0.9, 1.96),  # called unknown
         seen("cup", "c", 0.9, 0.1),  # right

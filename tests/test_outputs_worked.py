@@ -681,7 +681,7 @@ def test_link_in_export_counts_by_its_own_time(tmp_path: Path) -> None:
 
 
 def test_export_excludes_files_of_interrupted_export(tmp_path: Path) -> None:
-    """Images of other options would have no labels, and be taken for background."""
+    """Images of other options would have no labels, and be mistaken for background."""
     out = tmp_path / "out"
 
     def interrupted(hidden: Path) -> int:

@@ -604,7 +604,7 @@ def test_simulated_colour_camera_is_equal_in_all_containers(tmp_path: Path, cont
 
 
 def test_unreadable_colour_messages_are_skipped_and_reported(tmp_path: Path) -> None:
-    """One truncated message must not end the run; one of another type is no image at all."""
+    """One truncated message must not end the run; one of another type is not an image at all."""
     stamps = [EPOCH + k * 33 * MS for k in range(8)]
     messages: list[Any] = [raw(s, gradient(), "rgb8") for s in stamps]
     messages[5] = make("std_msgs/msg/String", "calibrating")
@@ -624,7 +624,7 @@ def test_unreadable_colour_messages_are_skipped_and_reported(tmp_path: Path) -> 
 
 
 def test_image_in_unknown_encoding_is_message_error() -> None:
-    """Its bytes would be taken for those of another encoding."""
+    """Its bytes would be mistaken for those of another encoding."""
     with pytest.raises(MessageError, match="encoding '32FC1' is not colour"):
         pixels_of(ColourImage("", 0, 0, "", "32FC1", 4, 3, 16, bytes(48)))
 

@@ -204,7 +204,7 @@ def test_transforms_are_read(
 
 
 def test_transform_long_before_first_frame_is_known(tmp_path: Path) -> None:
-    """With --start, an earlier pose would be taken for the present one."""
+    """With --start, an earlier pose would be mistaken for the present one."""
     path = tmp_path / "a.mcap"
     with mcap_writer(path, "", chunk_size=100) as writer:
         kind = writer.register_schema("foxglove.FrameTransform", "jsonschema", b"{}")
@@ -288,7 +288,7 @@ def test_random_bytes_raise_only_known_errors(data: bytes) -> None:
 
 
 def test_descriptors_in_any_order_and_maps_are_decoded() -> None:
-    """Only some writers put a file behind those it imports; a map is no list of messages."""
+    """Only some writers put a file behind those it imports; a map is not a list of messages."""
     inner = FileDescriptorProto(name="inner.proto", package="lab", syntax="proto3")
     inner.message_type.add(name="Size").field.add(name="height", number=1, type=5, label=1)
     outer = FileDescriptorProto(name="outer.proto", package="lab", syntax="proto3")

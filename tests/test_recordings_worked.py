@@ -252,7 +252,7 @@ DEPTH = Camera(64, 48, 60.0, 61.0, 31.2, 23.7)
     [
         # One frame: nearly the same calibration is the same camera.
         (Camera(64, 48, 60.6, 61.0, 31.2, 23.7), "camera", True),
-        (Camera(64, 48, 60.6, 61.0, 31.2, 23.7), "/camera", True),  # as of ROS 1
+        (Camera(64, 48, 60.6, 61.0, 31.2, 23.7), "/camera", True),  # as in ROS 1
         (WIDE, "/camera", False),
         (Camera(64, 48, 60.0, 61.0, 31.2, 24.4), "camera", False),
         # Another frame without a transform: only equal numbers are the same camera.

@@ -699,7 +699,7 @@ LABELS = (
     *("Merged into #{b}", "merge with {b}.0", "merge with 0{b}", "merge with {b}x"),
     *("merge with {a}", "merge with {b}", "merge with {c}", "merge with {d}", "merge with {e}"),
 )
-"""Labels for track a: b has a new name, c is deleted, d merges with a, e is of another topic."""
+"""Labels for track a: b has a new name, c is deleted, d merges with a, e has another topic."""
 
 
 def test_page_and_annotate_accept_the_same_labels(

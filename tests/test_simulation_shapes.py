@@ -26,7 +26,7 @@ def meshes_of(category: str) -> list[Mesh]:
 
 
 def width_at(mesh: Mesh, low: float, high: float) -> float:
-    """Return the greatest width between two heights, given as fractions of the total."""
+    """Return the largest width between two heights, given as fractions of the total."""
     z = mesh.vertices[:, 2] / mesh.extents[2]
     flat = mesh.vertices[(z >= low) & (z <= high), :2]
     angle = np.arange(24) * (np.pi / 24)

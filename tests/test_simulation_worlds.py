@@ -44,7 +44,7 @@ WORLDS = [
 def test_category_is_ambiguous_if_little_of_object_is_visible(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
-    """Few pixels are enough, and so is a small share of the side that faces the camera."""
+    """Few pixels are enough, and so is a small fraction of the side that faces the camera."""
     world = make_scene("tabletop", np.random.default_rng(11), frames=1)
     _, labels = render_frame(world, 0, rng=np.random.default_rng(0), sensor=KINECT)
     clear = [

@@ -518,7 +518,7 @@ def test_burst_of_splits_gets_no_track() -> None:
 
 
 def test_pieces_are_joined_after_hours(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Detections are compared in blocks; those of later ones must not be taken for the first."""
+    """Detections are compared in blocks; those of later ones must not be mistaken for the first."""
     monkeypatch.setattr("shapecat.tracking.detection_table._BLOCK", 8)
     other = (1.0, 1.1)
     whole, split = [(0.0, 0.2), other], [(0.0, 0.08), (0.08, 0.2), other]

@@ -95,7 +95,7 @@ def lidar_rings() -> F4:
 
 
 def height_map() -> F4:
-    """Return an organized cloud whose points lie above a regular grid, as those of a fused map."""
+    """Return an organized cloud of points above a regular grid, like those of a fused map."""
     v, u = np.mgrid[1:49, 1:65] / 50.0
     return np.stack([u, v, 0.1 * np.sin(9 * u) * np.cos(7 * v)], axis=-1).astype(np.float32)
 
@@ -142,7 +142,7 @@ def test_viewpoint_is_found_again_after_it_moved(tmp_path: Path) -> None:
 
 @pytest.mark.parametrize("mount", [*MOUNTS, LINK])
 def test_cloud_in_other_frame_gives_the_results_of_its_camera(mount: str, tmp_path: Path) -> None:
-    """Transformed on the robot, its objects fell apart: the origin was taken for the camera."""
+    """Transformed on the robot, its objects were split: the origin was mistaken for the camera."""
     map_from_mounts = [
         MOUNTS.get(mount) or compose(view.pose, inverse(LINK_FROM_OPTICAL)) for view in views(2)
     ]

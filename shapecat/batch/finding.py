@@ -68,7 +68,7 @@ def _of_path(path: Path, real: Path) -> Source:
 
 
 def _search_paths(sources: Sequence[Path]) -> tuple[dict[Path, Path], int]:
-    """Return the recordings, by path without links, and the number of files skipped."""
+    """Return the recordings, by resolved path, and the number of files skipped."""
     folders = {source for source in sources if source.is_dir() and not _is_bag(source)}
     if len(sources) == 1 and not folders:
         return {_real_path(sources[0]): sources[0]}, 0
@@ -88,7 +88,7 @@ def _search_paths(sources: Sequence[Path]) -> tuple[dict[Path, Path], int]:
 def _is_bag(folder: Path) -> bool:
     """Return whether a folder is a ROS 2 bag: it has metadata, or its files are parts of one.
 
-    ROS 2 names the parts of a bag a/a_0.mcap, a/a_1.mcap, ... In a folder of another name, such
+    ROS 2 names the parts of a bag a/a_0.mcap, a/a_1.mcap, ... In a folder with another name, such
     files may be different takes, unless they follow each other in time, or one is compressed.
     """
     try:
@@ -153,7 +153,7 @@ def _search(folder: Path, searched: set[Path]) -> Iterator[Path]:
 
 
 def _real_path(path: Path) -> Path:
-    """Return the absolute path without links; a link to itself, which `resolve` refuses, stays."""
+    """Resolve all symbolic links in a path; a link to itself, which `resolve` refuses, stays."""
     return Path(os.path.realpath(path))
 
 

@@ -39,7 +39,7 @@ _log = logging.getLogger(__name__)
 _PART_FOLDER = ".manifest"
 _PART_BYTES = 2**20
 _MOST_WAITING_BYTES = 8 * 2**20
-"""Lines are sent at once when more than this are waiting."""
+"""Lines are sent immediately when more bytes than this are waiting."""
 _SEND_S = 5.0
 """Time between two transmissions of lines."""
 

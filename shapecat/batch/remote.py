@@ -88,7 +88,7 @@ def _process(job: Job, local: Job, observe: Observer, cores: int) -> Summary:
 
 
 def _is_disk_full(error: BaseException | None) -> bool:
-    """Return whether an error, or one that caused it, tells of a full disk."""
+    """Return whether an error, or one that caused it, reports a full disk."""
     while error is not None:
         if isinstance(error, OSError) and error.errno in {errno.ENOSPC, errno.EDQUOT}:
             return True
@@ -113,7 +113,7 @@ def _fetch_run(job: Job) -> tuple[Job, RunInfo | None]:
 
     Returns
     -------
-    The job, and the content of run.json, None without a run or if it is overwritten. The job
+    The job, and the content of run.json, None if there is no run or it is overwritten. The job
     overwrites a run whose replacement was interrupted.
 
     Raises
@@ -162,7 +162,8 @@ def _previous_location(place: Location) -> Location:
 def upload(folder: Path, url: str, claim: Claim) -> None:
     """Upload a run folder, frames.parquet first and run.json last.
 
-    So a search for recordings always sees one of them, and does not take annotated.mcap for one.
+    A search for recordings then always sees one of the two, and does not mistake annotated.mcap
+    for a recording.
 
     Raises
     ------

@@ -86,7 +86,7 @@ def process_on(
 
     Raises
     ------
-    Stopped : a signal asked the process to stop; running tasks go on until the executor is stopped.
+    Stopped : a signal asked the process to stop; running tasks continue until the executor stops.
     """
     ledger = Ledger(manifest)
     ledger.record_planned(tasks)
@@ -151,7 +151,7 @@ def _give_up(job: Job, error: BaseException) -> Outcome:
 
 
 def _attempt_on_worker(job: Job, address: str, cores: int, batch: str, version: str) -> Outcome:
-    """Process one job in a worker; refuse a command of another version of shapecat."""
+    """Process one job in a worker; refuse a command from a different version of shapecat."""
     if version != __version__:
         versions = f"a worker has shapecat {__version__}, this command {version}"
         return _failed(job, f"{versions}; install one version")

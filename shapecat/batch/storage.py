@@ -195,7 +195,7 @@ class Location:
             out of the folder.
         """
 
-        def get(source: str, file: Path) -> None:  # `get` would take some names for patterns
+        def get(source: str, file: Path) -> None:  # `get` treats some names as patterns
             file.parent.mkdir(parents=True, exist_ok=True)
             self._system.get_file(source, str(file), **self._in_parts())
 

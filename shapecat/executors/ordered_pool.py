@@ -128,7 +128,7 @@ class _Pending(Generic[_Item, _Result]):
         else:
             self._item.append(item)
             self._future = executor.submit(work, item)
-            # Futures keep their callbacks: a bound method would keep the result for ever.
+            # Futures keep their callbacks: a bound method would keep the result forever.
             self._future.add_done_callback(partial(_drop_finished, self._item))
 
     def done(self) -> bool:

@@ -1,1 +1,1 @@
-"""The default model, the decision trees of the detection, and the programs that train them."""
+"""The default model, the decision trees of detection, and the programs that train them."""

@@ -1,4 +1,4 @@
-"""Training of boosted trees as binary classifiers for the detection."""
+"""Training of boosted trees as binary classifiers for detection."""
 
 from collections.abc import Callable, Iterable
 from concurrent.futures import ProcessPoolExecutor
@@ -19,7 +19,7 @@ _T = TypeVar("_T")
 
 _L2, _MIN_HESSIAN = 1.0, 2.0
 _ROWS = 0.7
-"""Fraction of the samples that each tree is grown on."""
+"""Fraction of the samples that each tree is trained on."""
 
 
 class Growth(NamedTuple):

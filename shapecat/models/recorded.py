@@ -28,7 +28,7 @@ _OVERLAP = 0.5
 
 
 def detected_views(folder: Path) -> Iterator[View]:
-    """Yield the unambiguous objects of a folder, segmented by shapecat's detection.
+    """Yield the unambiguous objects of a folder, as shapecat segments them.
 
     Missed objects, and those merged with others, are left out.
     """

@@ -95,7 +95,7 @@ def collect(views: Iterable[SimulatedView]) -> SimulatedViews:
 def clear_views(views: SimulatedViews) -> Bool:
     """Return the mask (n,) of whole, mostly visible, well segmented views that are not upside down.
 
-    If detection merges an object with others, no category is right. The evaluation of the detection
+    If detection merges an object with others, no category is right. The evaluation of detection
     covers this case; the model card lists badly segmented views in their own row.
     """
     return np.asarray(~partial_views(views) & (views.resting_pose != "upside_down"))

@@ -46,7 +46,7 @@ __all__ = ["Samples", "Series", "collect", "grow_rejection_trees", "label_object
 
 _GROWTH = Growth(500, 64, 0.06)
 _FOLDS = 3
-"""Parts of the samples, each judged by trees grown on the others."""
+"""Parts of the samples, each classified by trees trained on the others."""
 _OBJECT = 0.5
 """A merged segment is an object if more than this fraction of its labelled cells shows objects."""
 _CHUNK = 10
@@ -58,10 +58,10 @@ class Series(NamedTuple):
     Attributes
     ----------
     first, scenes : the first seed and the number of scenes.
-    sensors : they take turns.
+    sensors : used in turn.
     scale : factor of all sizes and distances.
     view : the camera is on the ``path`` of the scene, or ``anywhere``: near or far, low or straight
-        above; for ``floor`` the table is taken away.
+        above; for ``floor`` the table is removed.
     changed : turns a bin into a tote, or a shelf into a rack.
     arms : of the robot with the camera, or of a person, ``reaching`` for the objects or ``resting``
         at the image border.
@@ -128,7 +128,7 @@ _SERIES = (
     Series("clutter", 665_500, 90, scale=1.8, view="anywhere"),
     Series("tabletop", 666_000, 90, scale=1.8, view="anywhere"),
 )
-"""The merging trees were not grown on these seeds. The scaled scenes add large objects, which are
+"""The merging trees were not trained on these seeds. The scaled scenes add large objects, which are
 too rare otherwise; rooms add arms and furniture, floors objects where furniture usually is."""
 _VIEWS = {"path": 2, "anywhere": 6, "floor": 6}
 """Views of each scene, with one sensor after the other; on the path, from a single place."""
@@ -141,7 +141,7 @@ class Samples(NamedTuple):
     ----------
     features : (n,) `OBJECT_FEATURES`.
     objects : (n,) whether each is an object.
-    weights : for each frame, those of its segments as from `measure_borders`.
+    weights : for each frame, those of its segments, from `measure_borders`.
     """
 
     features: Records
@@ -171,9 +171,9 @@ def collect(scenes: tuple[Series, ...], jobs: int) -> list[Samples]:
 
 
 def grow_rejection_trees(samples: Sequence[Samples], seed: int) -> RejectionTrees:
-    """Grow the trees that judge segments alone, and those that judge them in their context.
+    """Grow the trees that classify segments alone, and those that classify them in context.
 
-    The second ones learn from the uncertain segments, with logits of trees that were grown on the
+    The second ones learn from the uncertain segments, with logits of trees that were trained on the
     other parts of the samples.
     """
     rows = [as_rows(part.features) for part in samples]
@@ -198,7 +198,7 @@ def _grow(rows: Sequence[F4], objects: Sequence[Bool], seed: int) -> BoostedTree
 
 
 def _in_context(samples: Samples, logits: F4) -> F4:
-    """Return the features of segments, judged alone with ``logits`` (n,), in their context."""
+    """Return the features in context of segments that alone have these ``logits`` (n,)."""
     stops = np.cumsum([0, *(weights.shape[1] for weights in samples.weights)])
     frames = [
         add_context(samples.features[a:b], logits[a:b], weights)

@@ -1,4 +1,4 @@
-"""Viewpoints of the scenes that the trees of the detection are grown on."""
+"""Viewpoints of the scenes that the trees of detection are trained on."""
 
 from dataclasses import replace
 
@@ -15,7 +15,7 @@ __all__ = ["move_to_floor", "random_viewpoint"]
 _DISTANCE_M, _ELEVATION_DEG, _SWEEP_DEG = (0.35, 2.6), (12.0, 84.0), (20.0, 150.0)
 """Ranges of the position of the camera, relative to its target."""
 _CLOSER_M = 0.08
-"""Least distance of the target beyond the sensor's near limit."""
+"""Minimum distance of the target beyond the sensor's near limit."""
 
 
 def random_viewpoint(

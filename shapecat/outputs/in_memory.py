@@ -19,7 +19,7 @@ from shapecat.types import Camera, Detection, Frame, LabelledFrame, LabelledObje
 __all__ = ["frame_of", "perceive_alone"]
 
 _FARTHEST_M = 100.0
-"""A reading whose median depth, or coordinate, is larger is not in metres."""
+"""Values whose median depth, or coordinate, is larger are not in metres."""
 _FIXED = ([0, 1, 2, 2, 2], [1, 0, 0, 1, 2])
 """The elements of a camera matrix that are the same for all cameras, without skew."""
 

@@ -43,7 +43,7 @@ _NEAR, _EQUAL = 0.01, 1e-6
 """Intrinsics that differ by less than these fractions of the image width are similar, or equal."""
 _STRAIGHT_PX, _STEPS = 2.0, 9
 """A lens that moves no pixel of a grid farther than this leaves an image registered. Depth images
-with less distortion are taken for those of a pinhole camera as well."""
+with less distortion are likewise treated as those of a pinhole camera."""
 
 KnownImages: TypeAlias = Callable[[str, int], int | None] | None
 """The log time (ns) of the colour image of a frame, given by topic and number, if it has one."""

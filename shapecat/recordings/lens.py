@@ -43,7 +43,7 @@ def lens_content(
 
 
 class _Lens(NamedTuple):
-    """The rays (h, w, 2) of pixels, the share of pixels without one, and the camera that fits."""
+    """The rays (h, w, 2) of pixels, the fraction of pixels without one, and a camera that fits."""
 
     rays: F8
     blind: float

@@ -27,16 +27,16 @@ LARGEST_ERROR_PX = 0.6
 """A camera fits an organized cloud if 95 % of its points are reprojected within this distance."""
 
 _OFF_CENTER = 0.12
-"""Share of the width or height. Depth cameras stay below 0.05; intrinsics for 640 x 480 pixels with
-images of 848 x 480 have 0.123."""
+"""Fraction of the width or height. Depth cameras stay below 0.05; intrinsics for 640 x 480 pixels
+with images of 848 x 480 have 0.123."""
 _UNIT = 1
-"""Focal length in a matrix that is the identity since the driver left it out."""
+"""Focal length in a matrix that is the identity because the driver left it out."""
 _LARGEST_PX = 1e5
 """Largest intrinsic parameter: a view of half a degree. Damaged calibrations exceed it."""
 _SAMPLES = 4096
 _FEWEST = 100
 _SPREAD = 0.1
-"""The samples must span this share of the width and height, or the fit is ill-conditioned."""
+"""The samples must span this fraction of the width and height, or the fit is ill-conditioned."""
 
 
 @dataclass(frozen=True)

@@ -10,9 +10,9 @@ from shapecat.types import Pose
 __all__ = ["find_viewpoint", "seen_from"]
 
 _LONGEST = 10
-"""Focal length in image widths; that of a height map, which no point sees, is greater."""
+"""Maximum focal length in image widths; that of a height map, which no camera sees, is larger."""
 _CLEAR = 1e-4
-"""The squared residual is at most this share of the next singular value, squared. For the points
+"""The squared residual is at most this fraction of the next singular value, squared. For the points
 of a single plane, any of many cameras fits, and both are equal."""
 _ROUNDS = 3
 
@@ -31,7 +31,7 @@ def find_viewpoint(points: F4, previous: PinholeFit | None) -> tuple[PinholeFit,
     Returns
     -------
     The camera, ``frame_from_camera``, and the points (h, w, 3) in the frame of the camera; None if
-    no camera fits, or if the points do not determine one, as those of a single plane.
+    no camera fits, or if the points do not determine one, like those of a single plane.
     """
     sample = sample_pixels(points, lambda flat: np.asarray(flat.any(axis=1)))
     if sample is None:

@@ -111,7 +111,8 @@ class Job:
 class Summary:
     """A summary of a run; ``processed`` is False if it was already complete.
 
-    ``corrections`` is the outcome of transferring labels from the replaced run; None without any.
+    ``corrections`` is the outcome of transferring labels from the replaced run; None if there were
+    no labels.
     """
 
     source: str

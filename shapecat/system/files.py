@@ -45,7 +45,7 @@ def partial_path(path: Path) -> Path:
 
     Raises
     ------
-    OutputError : the path has no name, as that of the current folder or of the root.
+    OutputError : the path has no name, like that of the current folder or of the root.
     """
     if not path.name:
         msg = f"{path}: name a file or folder in it"

@@ -31,8 +31,8 @@ class _Forgiving(io.TextIOWrapper):
 def require_stdout() -> None:
     """Make stdout the null device if it was closed before the start, as a daemon's may be.
 
-    Otherwise the next file that is opened would get its number, also in worker processes.
-    Characters that a terminal cannot show are escaped, as in names of another script.
+    Otherwise the next file that is opened would get its number, here and in worker processes.
+    Characters that a terminal cannot show, such as those of another script, are escaped.
     """
     if sys.stdout is None:
         os.dup2(os.open(os.devnull, os.O_WRONLY), 1)

@@ -40,7 +40,7 @@ _WAITING = 8
 def _reserve(file: BinaryIO, length: int) -> None:
     """Reserve disk space for ``length`` bytes, and some for annotations.
 
-    A full disk is then noticed at once. Without reserved space, ext4 would write out the whole file
+    A full disk is then noticed early. Without reserved space, ext4 would write out the whole file
     when it is renamed over an older one, which takes as long as the copy.
     """
     if not hasattr(os, "posix_fallocate"):

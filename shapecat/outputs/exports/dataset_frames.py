@@ -50,7 +50,7 @@ class Selection:
     min_confidence : objects with a lower confidence are not used for training.
     corrected_only : only objects with a label from a person are used for training.
     depth : the images are depth images in millimetres, not colour images.
-    val : share of the recordings for the validation split, from 0 to below 1.
+    val : fraction of the recordings for the validation split, from 0 to below 1.
     """
 
     every: int = 1
@@ -134,7 +134,7 @@ def images_of(
     recording : path of the recording; by default where it was processed.
     stems : how the names of the images of each topic begin.
     left_out : counts the other frames by reason.
-    observe : called after each frame of the run, also those that are left out.
+    observe : called after each frame of the run, even if it is left out.
 
     Raises
     ------
@@ -164,7 +164,7 @@ def images_of(
 
 
 def _is_sure(item: LabelledObject, selection: Selection, corrected: set[int]) -> bool:
-    """Return whether an object has a label to train on; *unknown* is none, also if by hand."""
+    """Return whether an object has a label to train on; *unknown* is none, even if set by hand."""
     if item.category == UNKNOWN:
         return False
     certain = item.confidence >= selection.min_confidence and not selection.corrected_only

@@ -65,7 +65,7 @@ def _described(item: LabelledObject, level: F8, kind: str) -> dict[str, Any]:
     if kind == "vertices":
         corners = box_corners(item.box) @ level.T
         for face in (corners[:4], corners[4:]):
-            face[:, 2] = face[:, 2].mean()  # labelCloud would take rounding errors for a tilt
+            face[:, 2] = face[:, 2].mean()  # labelCloud would read rounding errors as a tilt
         return {"name": item.category, "vertices": _rounded(corners)}
     heading = level @ rotation_from_quaternion(item.box.orientation)[:, 0]
     yaw = float(np.arctan2(heading[1], heading[0]))

@@ -1,6 +1,6 @@
 """Point labels: masks for depth images, SemanticKITTI labels for unorganized clouds.
 
-A label is a class and an instance (the track number); 0 is no object. ``labels.json`` lists the
+A label is a class and an instance (the track number); 0 means no object. ``labels.json`` lists the
 classes and the category of each instance. Source of the binary format: the description of
 SemanticKITTI (Behley 2019), uint32 with the class in the lower 16 bits, the instance above.
 """

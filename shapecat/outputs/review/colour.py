@@ -12,9 +12,9 @@ from shapecat.types import Frame
 __all__ = ["true_colours"]
 
 _TINT = 0.35
-"""Share of the category's colour in the colour of an object."""
+"""Fraction of the category's colour in the colour of an object."""
 _HIDDEN = 0.05
-"""A point is occluded if another one is nearer by more than this share of its depth."""
+"""A point is occluded if another one is nearer by more than this fraction of its depth."""
 
 
 def true_colours(
@@ -59,7 +59,7 @@ def _hide(projected: F4, shape: tuple[int, int], cell: float, share: float) -> N
     projected : (n, 3) column and row in pixels, and depth in metres; changed in place.
     shape : height and width of the image.
     cell : size of the cells in which the nearest point is found, pixels.
-    share : a point is occluded if the nearest depth is less than this share of its own.
+    share : a point is occluded if the nearest depth is less than this fraction of its own.
     """
     cells = np.zeros((int(shape[0] / cell) + 2, int(shape[1] / cell) + 2), np.float32)
     for i in range(projected.shape[0]):

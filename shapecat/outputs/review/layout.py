@@ -157,7 +157,7 @@ def lay_out(
 
 
 def send_layout(stream: rr.RecordingStream, layout: _Layout) -> None:
-    """Write a layout; then close its own stream, which would keep two threads for ever."""
+    """Write a layout; then close its own stream, which would keep two threads forever."""
     stream.send_blueprint(layout)
     if layout.stream is not None:
         layout.stream.disconnect()

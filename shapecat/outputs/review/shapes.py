@@ -45,7 +45,7 @@ _SURE = 0.9
 """A caption omits a confidence of at least this."""
 
 _DASHES = (np.arange(5)[:, None] + [0.0, 0.5])[..., None] / 4.5
-"""Start and end (5, 2, 1) of the dashes of an edge, as shares of its length, from 0 to 1."""
+"""Start and end (5, 2, 1) of the dashes of an edge, as fractions of its length, from 0 to 1."""
 
 _Columns = Iterable[rr.ComponentColumn]
 Way = tuple[str, F8]

@@ -58,7 +58,7 @@ def serve_viewer(path: Path) -> Iterator[tuple[str, subprocess.Popen[bytes]]]:
 
     Raises
     ------
-    OutputError : the file or the viewer is missing, or the viewer ends at once.
+    OutputError : the file or the viewer is missing, or the viewer ends immediately.
     """
     _require_file(path)
     web, data = _free_port(), _free_port()

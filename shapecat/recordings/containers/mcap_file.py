@@ -37,7 +37,7 @@ from shapecat.recordings.messages import Channel, Selection, ros_type
 __all__ = ["McapRecording"]
 
 _PART = 0.9
-"""If more than this share of a chunk is needed, the whole chunk is decompressed and verified."""
+"""If more than this fraction of a chunk is needed, the whole chunk is decompressed and verified."""
 
 
 class McapRecording(ChunkedRecording):

@@ -97,7 +97,7 @@ def u4(fields: dict[str, bytes], name: str) -> int:
 
     Raises
     ------
-    BagError : the field is missing or has another size.
+    BagError : the field is missing or has the wrong size.
     """
     return int(_unpack(_LENGTH, fields, name)[0])
 
@@ -107,7 +107,7 @@ def u8(fields: dict[str, bytes], name: str) -> int:
 
     Raises
     ------
-    BagError : the field is missing or has another size.
+    BagError : the field is missing or has the wrong size.
     """
     return int(_unpack(_LONG, fields, name)[0])
 
@@ -117,7 +117,7 @@ def time_of(fields: dict[str, bytes], name: str = "time") -> int:
 
     Raises
     ------
-    BagError : the field is missing or has another size.
+    BagError : the field is missing or has the wrong size.
     """
     seconds, nanoseconds = _unpack(_TIME, fields, name)
     return int(seconds) * 10**9 + int(nanoseconds)

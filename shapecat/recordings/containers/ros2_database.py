@@ -31,7 +31,7 @@ __all__ = ["DatabaseRecording"]
 _LAST_NS = 2**63 - 1
 """The largest time that SQLite can hold."""
 _OF_URLS = frozenset("%?#")
-"""In a path, the reader takes these for the signs of a URL."""
+"""In a path, the reader interprets these characters as those of a URL."""
 _SCHEMAS = {MessageDefinitionFormat.MSG: "ros2msg", MessageDefinitionFormat.IDL: "ros2idl"}
 
 

@@ -52,7 +52,7 @@ class Accelerometers:
     """The accelerometers of a recording, with their measurements around its frames.
 
     Messages without an acceleration are left out: their first covariance is -1 (sensor_msgs/Imu),
-    or all values are zero, as from a gyroscope alone.
+    or all values are zero, as in messages of a gyroscope alone.
     """
 
     def __init__(self, recording: Recording) -> None:

@@ -30,7 +30,7 @@ class TransformTrack:
     Attributes
     ----------
     latched : whether the last one remains valid.
-    static : the static transform, which is valid where no other one is; None without any.
+    static : the static transform, which is valid where no other one is; None if there is none.
     """
 
     def __init__(self) -> None:

@@ -212,7 +212,7 @@ def write_track_table(path: Path, table: TrackTable) -> None:
 def write_csv(path: Path, lines: Iterable[Iterable[str]]) -> None:
     """Write lines of cells, with a byte order mark unless they are ASCII.
 
-    Without the mark, Excel would read and save other letters as those of another encoding.
+    Without the mark, Excel would read and save other letters in the wrong encoding.
     """
     file = io.StringIO(newline="")
     csv.writer(file, lineterminator="\n").writerows(lines)

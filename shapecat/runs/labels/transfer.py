@@ -84,7 +84,7 @@ def transfer_labels(source: Path, target: Path) -> Transfer:
     """Transfer the labels of another run to the same objects in a run.
 
     The labels are written to tracks.csv of ``target``, the outcome to its run.json. If a person
-    gave a track of ``target`` another label, that label is kept.
+    gave a track of ``target`` a different label, that label is kept.
 
     Parameters
     ----------
@@ -109,7 +109,7 @@ def transfer_labels(source: Path, target: Path) -> Transfer:
 
 
 def _labelled_otherwise(transfer: Transfer, target: Path, run: RunInfo) -> dict[int, str]:
-    """Return messages for tracks that have another label, unless it is from a transfer."""
+    """Return messages for tracks that have a different label, unless it is from a transfer."""
     earlier = {
         (item["track"], item["label"]) for item in run.get("corrections", {}).get("transferred", ())
     }

@@ -1,4 +1,4 @@
-"""Warn if the poses of a sensor are worse than none, as with a wrong mount in the transforms."""
+"""Warn if the poses of a sensor are worse than none, for example if its mount is wrong."""
 
 from collections.abc import Iterator
 from pathlib import Path

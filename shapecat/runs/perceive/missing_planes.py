@@ -37,20 +37,20 @@ def explain_missing_planes(
     if 2 * bare <= frames:
         return []
     text = f"no supporting plane in {bare} of {frames} frames"
-    readings = beyond_range = 0
+    samples = beyond_range = 0
     typical: list[float] = []
     pairs = read_frames(recording, run["options"], skipped=Counter())
     chosen = (frame for frame, _ in pairs if (frame.topic, frame.index) in first)
     for frame in islice(chosen, len(first)):
         distance = _distances(frame)
-        readings += distance.size
+        samples += distance.size
         beyond_range += int(np.count_nonzero(distance > range_m))
         if distance.size:
             typical.append(float(np.median(distance)))
-    if not readings:
+    if not samples:
         return [f"{text}: they have no valid depth"]
-    if 2 * beyond_range > readings:
-        share, setting = beyond_range / readings, f"detection.max_range_m, {range_m:g} m"
+    if 2 * beyond_range > samples:
+        share, setting = beyond_range / samples, f"detection.max_range_m, {range_m:g} m"
         unit = "16UC1 is in millimetres, 32FC1 and clouds in metres"
         middle = float(np.median(typical))
         hint = f"the median is {middle:.0f} m: is the unit right? {unit}"

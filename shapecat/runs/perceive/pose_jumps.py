@@ -42,7 +42,7 @@ def explain_jumps(folder: Path, fixed_frame: str) -> Iterator[str]:
 
 
 def _places(frames: pa.Table) -> F8:
-    """Return the points (n, 3) 1 m before the sensor, metres; NaN without a pose."""
+    """Return the points (n, 3) 1 m in front of the sensor, metres; NaN without a pose."""
     turns = numbers_or_nan(frames["fixed_rotation"]).reshape(-1, 3, 3)
     return np.asarray(numbers_or_nan(frames["fixed_translation"]) + turns[:, :, 2])
 

@@ -29,9 +29,9 @@ _OFF_DEG = 10.0
 _AGREES_DEG = 5.0
 """A frame is not revised if the given up direction differs by less from the recording's."""
 _STILL_DEG, _STILL_SHARE = 3.0, 0.6
-"""The camera is at rest if more than this share of the nearby frames agree to this angle."""
+"""The camera is at rest if more than this fraction of the nearby frames agree to this angle."""
 _FIXED_SHARE = 0.5
-"""Up is known in the fixed frame if more than this share of the frames agree to `_OFF_DEG`."""
+"""Up is known in the fixed frame if more than this fraction of the frames agree to `_OFF_DEG`."""
 _AROUND, _AROUND_NS = 30, 3_000_000_000
 """Nearby frames: at most this many before and after, and at most this far in time."""
 _FEWEST = 4

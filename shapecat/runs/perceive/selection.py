@@ -28,7 +28,7 @@ def read_frames(
 
     Parameters
     ----------
-    streams, colours : the selected streams, and the colour stream of each; looked for by default.
+    streams, colours : the selected streams, and the colour stream of each; found by default.
     skipped, needed : as for `shapecat.recordings.frames`.
     same_images : as for `frames_with_colour`.
 

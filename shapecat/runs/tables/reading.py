@@ -276,7 +276,7 @@ def with_fixed_lists(table: pa.Table) -> pa.Table:
 
     Raises
     ------
-    pa.ArrowInvalid : a list has another length.
+    pa.ArrowInvalid : a list has a different length.
     """
     for k, field in enumerate(table.schema):
         if (kind := FIXED_LISTS.get(field.name, field.type)) != field.type:

@@ -75,7 +75,7 @@ FRAMES = pa.schema(
         ("seconds", _FLOATS),
     ]
 )
-"""One row per frame read, also without detections. ``up`` is the up direction that detection used;
+"""One row per frame read, even without detections. ``up`` is the up direction that detection used;
 ``up_given`` is from transforms, an IMU or an option, null without these. ``revised`` is true if
 the result is from a second look, with the up direction of the whole recording. ``reused_from`` is
 the earlier frame whose scene this one repeats, null if none. ``fixed_*`` is ``fixed_from_sensor``

@@ -38,7 +38,7 @@ class Sensor:
     stereo_margin_px : width of the margins around nearer surfaces in which stereo matching fails,
         pixels.
     holes : approximate fraction of the pixels in random holes.
-    hole_px : approximate width of the largest holes, also of those on oblique surfaces, pixels.
+    hole_px : approximate width of the largest holes, even of those on oblique surfaces, pixels.
     blend_px : window that mixes near and far at depth edges (flying pixels), pixels; 0 is none.
     smoothing_px : window that rounds edges and corners within a surface (multipath, smoothing
         windows), pixels; 0 is none.

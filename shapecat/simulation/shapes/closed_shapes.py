@@ -188,7 +188,7 @@ def _flattened(mesh: Mesh, stretch: float, low: float, high: float, neck: float)
 
 
 def _bent(mesh: Mesh, shift: float, low: float, high: float) -> Mesh:
-    """Shift the neck to one side, as on detergent bottles."""
+    """Shift the neck to one side, as on a detergent bottle."""
     points = np.array(mesh.vertices, np.float64)
     t = np.clip((points[:, 2] - low) / (high - low), 0, 1)
     points[:, 0] += shift * t * t * (3 - 2 * t)

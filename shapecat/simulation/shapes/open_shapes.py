@@ -123,7 +123,7 @@ def make_plate(rng: Generator) -> Mesh:
 def _wall(shares: ArrayLike, radius: float, height: float, *, power: float) -> F8:
     """Return the outer profile (radius, z) from bottom to top.
 
-    ``shares`` (k,) are radii relative to the greatest one, which is ``radius``.
+    ``shares`` (k,) are radii relative to the largest one, which is ``radius``.
     """
     shares = np.asarray(shares, np.float64)
     heights = np.linspace(0, 1, len(shares)) ** power

@@ -77,7 +77,7 @@ def uprighted(mesh: Mesh, category: str) -> Mesh:
 
 
 def _roundness(points: F8) -> float:
-    """Return the smallest width of the outline seen along z divided by the greatest."""
+    """Return the smallest width of the outline seen along z divided by the largest."""
     angle = np.arange(16) * (np.pi / 16)
     flat = points[:, :2] @ [np.cos(angle), np.sin(angle)]
     widths = np.ptp(flat, axis=0)
@@ -106,7 +106,7 @@ def _slice_area(corners: F8, z: float) -> float:
 def _hollow(points: F8, mesh: Mesh) -> float:
     """Return the median depth, below the top, of the central surface as seen from above.
 
-    The depth is relative to the greatest distance from the z axis.
+    The depth is relative to the largest distance from the z axis.
     """
     turned = Mesh(points, mesh.triangles)
     distance = 40 * float(np.abs(points).max())
