@@ -15,7 +15,7 @@ from shapecat.system import stopping
 PHASES = {
     "simulate": "simulating",
     "perceive": "finding and categorizing objects",
-    "revise": "revising doubtful frames",
+    "revise": "revising uncertain frames",
     "annotate": "writing annotated.mcap",
     "review": "writing review.rrd",
     "report": "drawing reports",
@@ -26,7 +26,7 @@ PHASES = {
 }
 
 _WIDEST = 100_000
-"""Characters: a table for a file or another program is never folded."""
+"""Width in characters of a table for a file or another program, which is never folded."""
 
 
 class Bars:

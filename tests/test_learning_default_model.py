@@ -68,7 +68,7 @@ def test_model_card_matches_its_template(tmp_path: Path) -> None:
     report: Any = SimpleNamespace(categories=CATEGORIES, confusion=np.zeros((7, 7), int).tolist())
     write_card(tmp_path / "card.md", model=load_model().model_id, categories=CATEGORIES,
                tables=(), confusion=report, settings={})  # fmt: skip
-    text, end = (tmp_path / "card.md").read_text("utf-8"), "\n## Confusion on the test tables"
+    text, end = (tmp_path / "card.md").read_text("utf-8"), "\n## Confusion on clear views"
 
     assert card.startswith(text[: text.index(end)])
     glossary = (Path(__file__).parents[1] / "docs/glossary.md").read_text("utf-8")

@@ -43,7 +43,7 @@ Ranges: TypeAlias = tuple[tuple[str, int, float], ...]
 _ELEVATIONS = (-math.inf, 15.0, 30.0, 45.0, 60.0, math.inf)
 _DISTANCES_M = (0.0, 0.8, 1.1, 1.4, 1.7, math.inf)
 _WIDEST = 1_000_000
-"""Characters: enough for the longest names of most categories."""
+"""Width of a table in characters: enough for the maximum number of categories with long names."""
 _POINTS = (0, 60, 120, 250, 500, 1000, math.inf)
 
 

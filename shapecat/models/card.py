@@ -94,7 +94,9 @@ def write_card(
         for name, row in zip(confusion.categories, confusion.confusion, strict=True)
     )
     confusion_table = Table(
-        "Confusion on the test tables (true category in rows)", ("", *confusion.categories), rows
+        "Confusion on clear views of the test set (true category in rows)",
+        ("", *confusion.categories),
+        rows,
     )
     settings_table = Table(
         "Settings",

@@ -36,7 +36,7 @@ __all__ = ["evaluate_model"]
 
 _TRACK_SEED, _TRACK_TABLES = 100_006, 24
 _DRAWN = 20
-"""Number of test tables among which to find the worst mistakes."""
+"""Number of test arrangements among which to find the worst mistakes."""
 _HEAD = ("", "views", "accuracy", "balanced", "ECE", "known rejected", "unknown rejected", "AUROC")
 _text = partial(figure_text, missing="")
 
@@ -99,7 +99,7 @@ def evaluate_model(
 
 
 def _test_views() -> list[SimulatedView]:
-    """Return the clear views of a few test tables, with their points."""
+    """Return the clear views of a few test arrangements, with their points."""
     options = replace(options_of("test"), keep=True)
     views = [view for number in range(_DRAWN) for view in simulate_arrangement(options, number)]
     return [view for view, clear in zip(views, clear_views(collect(views)), strict=True) if clear]

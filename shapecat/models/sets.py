@@ -30,7 +30,8 @@ __all__ = [
 ]
 
 SETS = {"training": (1, 100_000), "calibration": (2, 160), "test": (100_003, 100)}
-"""Seed and maximum number of tables of each set; seeds from 100000 up are for evaluation only."""
+"""Seed and maximum number of arrangements of each set; seeds from 100000 up are for evaluation
+only."""
 _SHARES: dict[str, dict[str, Any]] = {
     "training": {"unknown": 0.3, "lying": 0.35, "leaning": 0.05, "settled": 0.5, "cameras": 10},
     "calibration": {"unknown": 0.17, "settled": 0.5},
@@ -72,7 +73,7 @@ def simulate(name: str, worlds: int, jobs: int) -> SimulatedViews:
     """Simulate up to ``worlds`` arrangements of a set in `SETS`."""
     numbers = range(min(worlds, SETS[name][1]))
     views = simulate_views(options_of(name), numbers, jobs=jobs)
-    click.echo(f"simulating {len(numbers)} tables of the {name} set", err=True)
+    click.echo(f"simulating {len(numbers)} arrangements of the {name} set", err=True)
     return collect(views)
 
 

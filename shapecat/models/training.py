@@ -28,7 +28,7 @@ training takes the same time."""
 
 
 @click.command()
-@click.option("--worlds", default=6800, show_default=True, help="Number of training scenes.")
+@click.option("--worlds", default=6800, show_default=True, help="Number of training arrangements.")
 @growing_options(Path(__file__).parent)
 @click.option("--meshes", type=click.Path(path_type=Path), help="Folder of meshes for evaluation.")
 @click.option(

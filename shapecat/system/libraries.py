@@ -12,7 +12,7 @@ _BLOCKED_FOR = {"scipy.linalg": "numba.np.linalg", "coverage": "numba.misc.cover
 
 
 class _Blocker(MetaPathFinder):
-    """Raises for pandas, and for what numba looks for without need, even if they are installed.
+    """Blocks pandas, and modules that numba looks for but does not need, even if installed.
 
     None in `sys.modules` would do the same, but scikit-learn looks for a module there.
     """
@@ -22,7 +22,7 @@ class _Blocker(MetaPathFinder):
         if fullname == "pandas" or (
             fullname in _BLOCKED_FOR and _is_caller(_BLOCKED_FOR[fullname])
         ):
-            msg = f"this process does without {fullname}"
+            msg = f"{fullname} is blocked in this process"
             raise ModuleNotFoundError(msg, name=fullname)
 
 
@@ -35,7 +35,7 @@ def _is_caller(module: str) -> bool:
 
 
 def block_unused() -> None:
-    """Keep this process from importing what no command uses; for processes of shapecat alone.
+    """Keep this process from importing what no command uses; only for shapecat's own processes.
 
     With its first array, Arrow loads pandas where it is installed, in order to recognise data
     frames: 0.4 s in each process. With its first kernel, numba loads SciPy's linear algebra, which

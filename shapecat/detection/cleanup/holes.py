@@ -110,7 +110,7 @@ def _count_sides(
     """Count the sides of holes by label, (n, labels, 3), and in ``total`` (n,).
 
     The total includes sides next to cells without depth. If a hole is not enclosed, the total
-    is so large that no label has a sufficient share.
+    is so large that no label has a sufficient fraction.
     """
     inv_depth, jump = grid.inverse_depth, grid.discontinuity
     for i in range(len(spans)):

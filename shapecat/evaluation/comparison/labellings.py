@@ -24,7 +24,8 @@ __all__ = [
 
 _Frame = TypeVar("_Frame")
 Place = tuple[str | None, int, int | None]
-"""Topic, None for any; timestamp (ns) or frame number; and frame number besides a timestamp."""
+"""Topic, None for any; timestamp (ns) or frame number; and the frame number in addition to a
+timestamp, None if unknown."""
 
 
 @dataclass(frozen=True)
@@ -144,7 +145,7 @@ def index_frames(path: Path, frames: Iterable[tuple[Place, _Frame]]) -> dict[Pla
     ----------
     path : of the reference, for the message.
     frames : entries with their topic, None for any topic; their timestamp (ns) or frame number;
-        and the frame number besides a timestamp, None if unknown.
+        and the frame number in addition to a timestamp, None if unknown.
 
     Raises
     ------

@@ -36,7 +36,7 @@ __all__ = ["write_annotated"]
 _LIFETIME = 1.5
 """Lifetime of scene entities, as a multiple of the frame period."""
 _BUFFER = 4 << 20
-"""Two threads that write to the same file wait for each other, so each writes much at a time."""
+"""Two threads that write to the same file wait for each other, so each writes a lot at a time."""
 _PERIOD_NS = 1_000_000_000
 """Frame period assumed for a stream with a single frame."""
 _LONGEST_NS = 3600 * 10**9

@@ -28,7 +28,7 @@ class RawMessage(NamedTuple):
 
 
 class Chunk(NamedTuple):
-    """What the index says of a chunk.
+    """What the index says about a chunk.
 
     Attributes
     ----------

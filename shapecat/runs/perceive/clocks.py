@@ -10,14 +10,15 @@ from shapecat.runs.tables.reading import numbers, read_by_topic
 __all__ = ["explain_clocks"]
 
 _DIFFERENT_S = 0.3
-"""Smallest difference of two clocks; how long drivers take to log an image differs by less."""
+"""Smallest difference of two clocks; the time that drivers take to log an image differs less."""
 
 
 def explain_clocks(folder: Path) -> Iterator[str]:
     """Yield a warning if the sensors of a run have different clocks.
 
-    The recorder has one clock: the time from the stamp of an image to its log time is the same for
-    all sensors but for their clocks. These matter only to sensors that are tracked together.
+    The recorder has one clock, so if the clocks of the sensors agree, the delay from the stamp of
+    an image to its log time is about the same for all of them. The difference matters only to
+    sensors that are tracked together.
 
     Parameters
     ----------

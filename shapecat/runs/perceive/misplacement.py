@@ -29,7 +29,7 @@ class _Centers(NamedTuple):
 
 
 def explain_misplacement(folder: Path, fixed_frame: str) -> Iterator[str]:
-    """Yield a warning for each topic whose objects rest less in the fixed frame than without it.
+    """Yield a warning for each topic whose objects move more in the fixed frame than without it.
 
     Parameters
     ----------

@@ -16,7 +16,7 @@ from shapecat.types import Frame
 __all__ = ["explain_missing_planes"]
 
 _NO_ROOM_M = 10.0
-"""A median depth that no camera indoors measures; the unit is wrong rather than the range."""
+"""A median depth that no indoor camera measures: the unit is wrong, not the range."""
 
 _FRAMES = 3
 """Number of frames without a plane whose depths are examined."""
