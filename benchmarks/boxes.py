@@ -35,7 +35,7 @@ ROUND = ("cup", "can", "bottle", "bowl", "plate", "ball")
 """Solids of revolution, most of which have nearly equal length and width."""
 ALIKE = 0.05
 """Largest relative difference of length and width of a round object; others have a yaw."""
-JUDGED = ("cup", "can", "box", "bottle", "bowl", "ball")
+SCORED = ("cup", "can", "box", "bottle", "bowl", "ball")
 KINDS: tuple[SceneKind, ...] = ("tabletop", "pile")
 GROUPS = ("tabletop, upright", "tabletop, lying", "pile, upright", "pile, tilted")
 _HOW: dict[SceneKind, str] = {"tabletop": "lying", "pile": "tilted"}
@@ -67,11 +67,11 @@ def main(*, first: int, count: int) -> None:
 
 
 def _rows(found: Sequence[ScoredObject], group: str) -> Iterator[list[Any]]:
-    """Yield the mean overlaps of each category, and of the categories in `JUDGED` together."""
+    """Yield the mean overlaps of each category, and of the categories in `SCORED` together."""
     some = [item for item in found if item.group == group]
     for category in sorted({item.category for item in some}):
         yield _row(f"{group}, {category}", [item for item in some if item.category == category])
-    yield _row(f"{group}, {', '.join(JUDGED)}", [item for item in some if item.category in JUDGED])
+    yield _row(f"{group}, {', '.join(SCORED)}", [item for item in some if item.category in SCORED])
 
 
 def _row(name: str, some: Sequence[ScoredObject]) -> list[Any]:

@@ -3,7 +3,7 @@
     python -m benchmarks.distances --first 1168000 --count 60
 
 Each scene (a table, clutter, a pile) is seen once at a random distance in each range, from a random
-direction; the sensors take turns. Sensors that do not measure so near are left out.
+direction. The sensors alternate; those that cannot measure at this distance are left out.
 """
 
 from collections.abc import Sequence

@@ -239,7 +239,7 @@ IMAGE = np.ones((4, 6), np.float32)
 
 
 class OnGpu:
-    """An array that NumPy cannot read, as a tensor on a GPU."""
+    """An array that NumPy cannot read, such as a tensor on a GPU."""
 
     def __array__(self, *_: Any, **__: Any) -> Any:
         msg = "can't convert cuda:0 device type tensor to numpy; use Tensor.cpu()"

@@ -75,7 +75,7 @@ def lookup_at(window: TransformWindow, second: float) -> Any:
 def test_windowed_transforms_equal_those_of_full_read(
     tmp_path: Path, write: Callable[[Path], Path]
 ) -> None:
-    """Also if other messages of the file are read in between, as frames are."""
+    """Even if other messages of the file are read in between, as frames are."""
     with open_recording(write(tmp_path)) as recording:
         whole = TransformWindow(read_transforms(recording))
         window = TransformWindow.of(recording)
@@ -116,7 +116,7 @@ def decoded(monkeypatch: pytest.MonkeyPatch) -> Counter[str]:
 def test_first_frame_reads_only_seconds_of_transforms(
     tmp_path: Path, decoded: Counter[str]
 ) -> None:
-    """Also if the frames begin in the middle, as with --start."""
+    """Even if the frames begin in the middle, as with --start."""
     around = AROUND_NS // SECOND
     with open_recording(in_mcap(tmp_path)) as recording:
         window = TransformWindow.of(recording)

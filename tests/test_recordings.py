@@ -308,7 +308,7 @@ def test_bag_with_two_types_on_one_topic_is_read(tmp_path: Path, compression: An
 
 
 def test_bag_truncated_anywhere_gives_first_messages(tmp_path: Path) -> None:
-    """Also without an index, as if the recorder was killed."""
+    """Even without an index, as if the recorder was killed."""
     whole = write_bag(tmp_path / "a.bag")
     data = whole.read_bytes()
     path = tmp_path / "cut.bag"

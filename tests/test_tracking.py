@@ -555,7 +555,7 @@ def test_objects_merged_by_one_sensor_stay_two_tracks() -> None:
 
 @pytest.mark.parametrize("count", [4, 8])
 def test_object_put_into_bowl_gets_own_track(count: int) -> None:
-    """Also if it is put there just before the end of the recording."""
+    """Even if it is put there just before the end of the recording."""
     bowl, filled = [(0.0, 0.2)], [(0.0, 0.2), (0.1, 0.16)]
     tracks = tuple(track_recording(boxed([bowl] * 30 + [filled] * count), SETTINGS))
     assert sorted(track.hits for track in tracks) == [count, 30 + count]
@@ -702,7 +702,7 @@ def test_late_messages_of_one_sensor_do_not_put_it_behind_the_other() -> None:
 
 @pytest.mark.parametrize("single", [False, True])
 def test_two_sensors_share_tracks_despite_clock_jump(single: bool) -> None:
-    """Also after a single wrong stamp, neither sensor may lag behind."""
+    """Even after a single wrong stamp, neither sensor may lag behind."""
     frames = []
     for k in range(40):
         for topic, delay_ns in (("/a", 0), ("/b", SECOND // 30)):

@@ -141,7 +141,7 @@ def _resting(centers: F8, weights: F8) -> int:
 
 
 def _near(centers: F8, place: F8) -> Bool:
-    """Return which centres (k, 3) are so near a place (3,) that the object stands still: (k,)."""
+    """Return which centres (k, 3) are near enough to a place (3,) for a still object: (k,)."""
     return np.asarray(np.linalg.norm(centers - place, axis=1) < _STILL_M)
 
 
