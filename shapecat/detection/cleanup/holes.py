@@ -70,10 +70,11 @@ def fill_holes(grid: DepthGrid, labels: I4, count: int, filled: U1) -> None:
     links = np.full(labels.shape, RIGHT | DOWN, np.uint8)
     n = connected_components(inside, links, spans, component).size
     sides, total = np.zeros((n, count + 1, 3), np.int32), np.zeros(n, np.int64)
-    owner = np.zeros(n, np.int16)
-    _count_sides(grid, labels, inside, spans, component, sides, total)
+    owner, area = np.zeros(n, np.int16), np.zeros(n, np.int64)
+    _count_sides(grid, labels, inside, spans, component, sides, total, area)
+    label_area = _label_areas(labels, count, spans)
     for p in range(1, n):
-        owner[p] = _owner_of(sides[p], total[p])
+        owner[p] = _owner_of(sides[p], total[p], area[p], label_area)
     for i in range(len(spans)):
         for j in range(spans[i, 0], spans[i, 1]):
             if owner[component[i, j]] > 0:
@@ -105,12 +106,19 @@ def _between_labels(inv_depth: F4, labels: I4) -> tuple[Bool, I4]:
 
 @kernel(inline=True)
 def _count_sides(
-    grid: DepthGrid, labels: I4, inside: Bool, spans: I4, component: I4, sides: I4, total: I4
+    grid: DepthGrid,
+    labels: I4,
+    inside: Bool,
+    spans: I4,
+    component: I4,
+    sides: I4,
+    total: I4,
+    area: I4,
 ) -> None:
-    """Count the sides of holes by label, (n, labels, 3), and in ``total`` (n,).
+    """Count the sides of holes by label, (n, labels, 3), and in ``total`` (n,); ``area`` in cells.
 
-    The total includes sides next to cells without depth. If a hole is not enclosed, the total
-    is so large that no label has a sufficient fraction.
+    A side next to cells without depth counts for the label beyond them, and they to the area. If a
+    hole is not enclosed, its total is so large that no label has a sufficient fraction.
     """
     inv_depth, jump = grid.inverse_depth, grid.discontinuity
     for i in range(len(spans)):
@@ -118,27 +126,46 @@ def _count_sides(
             if not inside[i, j]:
                 continue
             p, w = component[i, j], inv_depth[i, j]
+            area[p] += 1
             for di, dj in SIDES:
-                label, neighbour_w = labels[i + di, j + dj], inv_depth[i + di, j + dj]
+                y, x = i + di, j + dj
+                missing = inv_depth[y, x] <= 0 and labels[y, x] == 0
+                while inv_depth[y, x] <= 0 and labels[y, x] == 0:  # there is a label at the end
+                    y, x = y + di, x + dj
+                    area[p] += 1
+                label, neighbour_w = labels[y, x], inv_depth[y, x]
                 if label > 0:
                     sides[p, label, BOUNDARY] += 1
                     sides[p, label, IN_FRONT] += neighbour_w > w + jump
                     sides[p, label, CONTINUOUS] += abs(neighbour_w - w) < jump
-                if label > 0 or neighbour_w <= 0:
+                if label > 0 or missing:
                     total[p] += 1
-                elif not inside[i + di, j + dj]:
+                elif not inside[y, x]:
                     total[p] += labels.size
 
 
 @kernel(inline=True)
-def _owner_of(sides: I4, total: int) -> int:
+def _label_areas(labels: I4, count: int, spans: I4) -> I4:
+    """Return the numbers of cells of the labels (count + 1,)."""
+    areas = np.zeros(count + 1, np.int64)
+    for i in range(len(spans)):
+        for j in range(spans[i, 0], spans[i, 1]):
+            areas[labels[i, j]] += 1
+    return areas
+
+
+@kernel(inline=True)
+def _owner_of(sides: I4, total: int, area: int, label_area: I4) -> int:
     """Return the label that a hole belongs to; 0 if there is none."""
     best = 0
     for k in range(1, len(sides)):
         best = k if sides[k, BOUNDARY] > sides[best, BOUNDARY] else best
+    if sides[best, BOUNDARY] <= CLEANUP.enclosed_share * total:
+        return 0
+    # Of a cup seen from above, the inner wall is hidden, but its mouth is large.
     if (
-        sides[best, BOUNDARY] <= CLEANUP.enclosed_share * total
-        or sides[best, CONTINUOUS] <= CLEANUP.continuous_share * total
+        sides[best, CONTINUOUS] <= CLEANUP.continuous_share * total
+        and area <= CLEANUP.mouth_share * label_area[best]
     ):
         return 0
     for k in range(1, len(sides)):

@@ -50,6 +50,9 @@ class CleanupSettings(NamedTuple):
     side has this much, the gap between two objects half."""
     continuous_share: float = 0.15
     """Minimum fraction of the boundary of a hole where the surface continues; less in a handle."""
+    mouth_share: float = 0.5
+    """Minimum area of a hole without a continuous surface, relative to the object around it: more
+    in the mouth of a cup seen from above, less in a handle."""
 
 
 CLEANUP = CleanupSettings()
