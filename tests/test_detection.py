@@ -715,6 +715,26 @@ def test_objects_are_detected_from_directly_above() -> None:
           tilt_deg=89.9)  # fmt: skip
 
 
+@pytest.mark.parametrize("yaw", [0.3, 0.8, 1.3])
+@pytest.mark.parametrize("tilt_deg", [30, 60, 80])
+def test_top_of_distant_carton_is_no_table(tilt_deg: float, yaw: float) -> None:
+    """At 1.6 m, the side of a box is hardly behind its top where it begins."""
+    check([table(0.7, 0.5), box((0, 0, 0), (0.3, 0.2, 0.15), yaw=yaw)], [1],
+          tilt_deg=tilt_deg, distance=1.6)  # fmt: skip
+
+
+@pytest.mark.parametrize("distance", [0.9, 1.4])
+def test_carton_right_below_the_camera_is_no_table(distance: float) -> None:
+    """Its top is larger than a small table, and hides its sides."""
+    check([table(0.7, 0.5), box((0, 0, 0), (0.4, 0.3, 0.25))], [1], tilt_deg=87, distance=distance)
+
+
+def test_platform_right_below_the_camera_supports_objects() -> None:
+    shapes = [table(0.7, 0.5), box((0, 0, 0), (0.4, 0.4, 0.15)),
+              box((-0.09, 0, 0.15), (0.1, 0.1, 0.1)), can(0.1, 0, 0.15, 0.04, 0.1)]  # fmt: skip
+    check(shapes, [2, 3], tilt_deg=87)
+
+
 def test_can_flush_with_box_below_is_separated() -> None:
     """Only the top face of the box beside the can separates them."""
     shapes = [table(), box((0, 0, 0), (0.2, 0.1, 0.1)), can(0, -0.005, 0.1, 0.045, 0.09)]

@@ -242,6 +242,21 @@ def test_gap_between_two_boxes_is_no_hole() -> None:
     assert not filled.any()
 
 
+@pytest.mark.parametrize(("width", "torn", "filled"), [(20, 0, True), (20, 3, True), (5, 0, False)])
+def test_mouth_of_cup_seen_from_above_is_filled(width: int, torn: int, filled: bool) -> None:
+    """The rim is in front of the floor; in a handle, the hole is small. Edges may lack depth."""
+    inv_depth = np.full((40, 40), 1.25, np.float32)
+    labels, cells = np.zeros((40, 40), np.int16), np.zeros((40, 40), np.uint8)
+    hole = slice(20 - width // 2, 20 - width // 2 + width)
+    labels[7:33, 7:33] = 1
+    labels[hole, hole], inv_depth[hole, hole] = 0, 0
+    floor = slice(hole.start + torn, hole.stop - torn)
+    inv_depth[floor, floor] = 1.1
+    fill_holes(DepthGrid(inv_depth, INTRINSICS, 1), labels, 1, cells)
+    assert (labels[floor, floor] == filled).all()
+    assert cells.sum() == filled * (width - 2 * torn) ** 2
+
+
 def test_background_of_large_image_is_no_hole() -> None:
     """Its open sides (six gaps of a rack) times the number of cells exceed 32 bits."""
     inv_depth = np.full((632, 632), 0.5, np.float32)

@@ -73,6 +73,8 @@ class PlaneSettings(NamedTuple):
     """Samples within this distance behind an edge belong to the wall of a box, metres."""
     wall_share: float = 0.5
     """A wall closes a box if more than this fraction of the samples below an edge are on it."""
+    bare_share: float = 0.02
+    """Maximum fraction of the samples over a bare plane that are higher than `wall_m` above it."""
     around_m: float = 0.03
     """Distance from a sample to the surroundings of its plane, metres."""
     drop_ratio: float = 0.2

@@ -30,6 +30,8 @@ __all__ = ["supporting_planes"]
 BESIDE, DOWN = 5, 20
 """Maximum number of steps from a sample towards the camera to the edge of its plane, and down from
 that edge."""
+EDGE_CELLS = 2
+"""Number of cells in which an edge is blurred."""
 MIN_BELOW = 20
 """Minimum number of samples below an edge that allow a decision."""
 
@@ -48,7 +50,8 @@ def supporting_planes(
     4. Drop a plane of less than 0.03 m2.
     5. Keep a plane with no other below it.
     6. Drop a plane with a wall below its front edge, as below the top of a box.
-    7. Drop a plane of less than 0.1 m2 if little is visible below its front edge.
+    7. If little is visible below its front edge, drop a plane of less than 0.1 m2, or one right
+       below the camera that bears nothing, as the top of a carton.
     8. Keep all others.
 
     Above another plane, the largest connected part of a plane counts: the tops of equal boxes are
@@ -79,9 +82,11 @@ def supporting_planes(
             supports.append(plane)
             continue
         on_wall, beyond = _count_below_edge(grid, samples, plane, drop)
-        decidable = on_wall + beyond >= MIN_BELOW
-        closed = decidable and on_wall > PLANES.wall_share * (on_wall + beyond)
-        if not closed and (decidable or area_m2 >= PLANES.likely_m2):
+        if on_wall + beyond >= MIN_BELOW:
+            is_top = on_wall > PLANES.wall_share * (on_wall + beyond)
+        else:
+            is_top = area_m2 < PLANES.likely_m2 or _is_bare_from_above(grid, plane)
+        if not is_top:
             supports.append(plane)
     return supports
 
@@ -106,6 +111,16 @@ def _extend_to_walls(grid: DepthGrid, plane: SupportingPlane) -> SupportingPlane
     sides = COS[:, None] * across[near] + SIN[:, None] * along[near]
     extent = sides.max(axis=1, initial=-np.inf)
     return plane._replace(extent=np.maximum(plane.extent, extent))
+
+
+def _is_bare_from_above(grid: DepthGrid, plane: SupportingPlane) -> bool:
+    """Return whether a plane is right below the camera, which hides its sides, and bare."""
+    if plane.extent.min() <= 0:
+        return False
+    across, along, height = level_coordinates(grid, grid.inverse_depth > 0, plane.up)
+    inside = np.all(COS[:, None] * across + SIN[:, None] * along < plane.extent[:, None], axis=0)
+    rise = height[inside] - plane.offset
+    return bool(np.mean((rise > PLANES.wall_m) & (rise < PLANES.max_object_m)) < PLANES.bare_share)
 
 
 @kernel
@@ -183,7 +198,8 @@ def _count_below_edge(
         x, y, z = _front_edge(grid, plane, i, j, 1 / level)
         if z == 0:
             continue
-        for step in range(4, min(DOWN, int(drop / PLANES.step_m))):  # an edge is rounded
+        first = max(4, _blurred_steps(grid.intrinsics.fx, plane, x, y, z))  # an edge is rounded
+        for step in range(first, min(DOWN, int(drop / PLANES.step_m))):
             s = PLANES.step_m * step
             dx, dy, dz = x - s * plane.up[0], y - s * plane.up[1], z - s * plane.up[2]
             inv_depth = _inverse_depth_at(grid.inverse_depth, grid.intrinsics, dx, dy, dz)
@@ -197,6 +213,18 @@ def _count_below_edge(
 
 
 @kernel(inline=True)
+def _blurred_steps(fx: float, plane: SupportingPlane, x: float, y: float, z: float) -> int:
+    """Return the number of steps below an edge that the cells next to it may not show.
+
+    From above, these cells show what is beyond the edge instead.
+    """
+    up, distance2 = plane.up, x * x + y * y + z * z
+    height = x * up[0] + y * up[1] + z * up[2]
+    level = math.sqrt(max(distance2 - height * height, PLANES.step_m**2))
+    return int(EDGE_CELLS * distance2 / (fx * level * PLANES.step_m)) + 1
+
+
+@kernel(inline=True)
 def _front_edge(
     grid: DepthGrid, plane: SupportingPlane, i: float, j: float, z: float
 ) -> tuple[float, float, float]:
@@ -207,16 +235,17 @@ def _front_edge(
     tx, ty, tz = h * up[0] - x, h * up[1] - y, h * up[2] - z
     length = math.sqrt(tx * tx + ty * ty + tz * tz)
     step = PLANES.step_m / max(length, PLANES.step_m)
+    edge = x, y, z
     for _ in range(BESIDE):
-        inv_depth = _inverse_depth_at(
-            grid.inverse_depth, k, x + step * tx, y + step * ty, z + step * tz
-        )
-        ahead = inv_depth - 1 / (z + step * tz)
+        x, y, z = x + step * tx, y + step * ty, z + step * tz
+        inv_depth = _inverse_depth_at(grid.inverse_depth, k, x, y, z)
+        ahead = inv_depth - 1 / z
         if inv_depth > 0 and ahead < -2 * PLANES.tolerance:
-            return x, y, z
+            return edge
         if inv_depth <= 0 or ahead > 2 * PLANES.tolerance:  # no depth, or an object on the plane
             break
-        x, y, z = x + step * tx, y + step * ty, z + step * tz
+        if ahead > -PLANES.tolerance:  # not yet the side of a box, just below its top
+            edge = x, y, z
     return 0.0, 0.0, 0.0
 
 
