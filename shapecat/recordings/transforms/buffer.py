@@ -3,13 +3,12 @@
 Stamps are integer nanoseconds: today's time as a float in seconds has a resolution of 238 ns.
 """
 
+import math
 import sys
 from bisect import bisect_right
 from collections.abc import Sequence
 from contextlib import suppress
 from typing import Any
-
-import numpy as np
 
 from shapecat.errors import RecordingError, ShapecatError, listed
 from shapecat.geometry import IDENTITY, compose, inverse
@@ -101,18 +100,19 @@ class TransformBuffer:
         parent, a number is not finite, or the quaternion is zero.
         """
         parent, child = parent.strip().lstrip("/"), child.strip().lstrip("/")
-        translation, quaternion = (np.asarray(part, np.float64) for part in parent_from_child)
-        with np.errstate(over="ignore", invalid="ignore"):
-            norm = float(np.linalg.norm(quaternion))
-        fine = np.isfinite(translation).all() and np.isfinite(norm) and norm > 1e-6
+        # Numpy would take most of the time of reading: joints publish a thousand times a second.
+        x, y, z = map(float, parent_from_child[0])
+        quaternion = tuple(map(float, parent_from_child[1]))
+        norm = math.hypot(*quaternion)
+        fine = all(map(math.isfinite, (x, y, z, norm))) and norm > 1e-6
         if not (fine and parent and child and parent != child):
             return False
         parent = sys.intern(parent)  # one for all samples
-        sample = TransformSample(
-            parent, tuple(translation.tolist()), tuple((quaternion / norm).tolist())
-        )
+        sample = TransformSample(parent, (x, y, z), tuple(part / norm for part in quaternion))
+        if child not in self._tracks:
+            self._tracks[child] = TransformTrack()
         self._frames |= {parent, child}
-        track = self._tracks.setdefault(child, TransformTrack())
+        track = self._tracks[child]
         if static:
             track.static = sample
         else:

@@ -57,7 +57,7 @@ class TransformTrack:
         at, count = bisect_right(self.stamps, stamp), len(self.stamps)
         if at and self.stamps[at - 1] == stamp:
             self._set(slice(at - 1, at), stamp, sample)
-        elif at == count >= 2 and self[count - 1] == self[count - 2] == sample:
+        elif at == count >= 2 and sample == self[count - 1] == self[count - 2]:
             self.stamps[-1] = stamp
         else:
             self._set(slice(at, at), stamp, sample)
