@@ -24,10 +24,12 @@ from rosbags.rosbag2.metadata import parse_qos
 from rosbags.typesys import Stores, get_types_from_msg, get_typestore
 
 from shapecat.errors import OutputError
+from shapecat.outputs.annotation import ros1_conversion
 from shapecat.outputs.annotation.annotated_mcap import write_annotated
 from shapecat.outputs.annotation.mcap_append import Appender, copy_bytes
 from shapecat.outputs.colours import CATEGORY_COLOURS, colour_of
-from shapecat.recordings import open_recording
+from shapecat.recordings import Channel, open_recording
+from shapecat.recordings.decoding.decoders import typestore_of
 from shapecat.types import CATEGORIES, AnnotationBox, AnnotationFrame
 from tests.mcap_files import mcap_writer, read_ros, summary_of
 from tests.test_recordings import QOS
@@ -495,6 +497,30 @@ def test_names_of_ros1_fields_are_allowed_in_ros2(tmp_path: Path) -> None:
 
     ((_, read),) = read_ros(target, "/state")
     assert (list(read.o_t_ee), read.is_on, read.a, read.a_2, read.b2_c) == ([0.5, 0.25], 1, 2, 4, 6)
+
+
+def test_topics_of_one_type_share_its_conversion(monkeypatch: pytest.MonkeyPatch) -> None:
+    """A robot may have thousands of topics, and a definition takes milliseconds."""
+    asked: list[Channel] = []
+
+    def counted(channel: Channel) -> Any:
+        asked.append(channel)
+        return typestore_of(channel)
+
+    monkeypatch.setattr(ros1_conversion, "typestore_of", counted)
+    text = b"string data  # shared"
+    latched = (("latching", "1"),)
+    channels = [
+        Channel(topic, STRING, "ros1", schema=text, metadata=about)
+        for topic, about in (("/a", ()), ("/b", latched), ("/c", ()))
+    ]
+
+    found = [ros1_conversion.convert_channel(channel) for channel in channels]
+
+    described = [converted[0] for converted in found if converted]
+    assert [channel.topic for channel in described] == ["/a", "/b", "/c"]
+    assert [bool(channel.metadata) for channel in described] == [False, True, False]
+    assert len(asked) == 1
 
 
 def test_unconvertible_message_is_wrapped(tmp_path: Path) -> None:

@@ -2,7 +2,7 @@
 
 import re
 from collections.abc import Callable
-from functools import cache
+from functools import cache, lru_cache
 from importlib.resources import files
 from itertools import chain, count
 from typing import Any
@@ -45,6 +45,9 @@ _HEADER = "std_msgs/msg/Header"
 _FIELD = re.compile("[a-z](_?[a-z0-9])*")
 """Names of fields that ROS 2 allows."""
 
+_KEPT = 64
+"""Number of definitions for which types are kept: thousands of topics may share one."""
+
 ConvertedChannel = tuple[AnnotationChannel, Callable[[bytes | memoryview], memoryview]]
 
 
@@ -62,21 +65,28 @@ def convert_channel(channel: Channel) -> ConvertedChannel | None:
     """
     name = _RENAMED.get(channel.type, channel.type)
     try:
-        types = dict(typestore_of(channel).fielddefs)
-        if name != channel.type:
-            types[name] = types.pop(channel.type)
-        store = get_typestore(Stores.EMPTY)
-        types[_HEADER] = get_typestore(Stores.ROS2_HUMBLE).fielddefs[_HEADER]
-        types = {kind: _renamed(*definition) for kind, definition in types.items()}
-        store.register(types)
-        text, _ = store.generate_msgdef(name, ros_version=2)
-        store.get_msgdef(name)
+        store, text = _store_of(channel._replace(topic="", metadata=()), name)
     except LIBRARY_ERRORS:
         return None
     latched = dict(channel.metadata).get("latching") == "1"
     quality = (("offered_qos_profiles", dump_qos_v8([_LATCHED])),) if latched else ()
-    described = AnnotationChannel(channel.topic, "cdr", name, "ros2msg", text.encode(), quality)
+    described = AnnotationChannel(channel.topic, "cdr", name, "ros2msg", text, quality)
     return described, lambda data: store.ros1_to_cdr(data, name)
+
+
+@lru_cache(_KEPT)
+def _store_of(channel: Channel, name: str) -> tuple[Typestore, bytes]:
+    """Return the types that convert a channel's messages, and their ROS 2 definition."""
+    types = dict(typestore_of(channel).fielddefs)
+    if name != channel.type:
+        types[name] = types.pop(channel.type)
+    store = get_typestore(Stores.EMPTY)
+    types[_HEADER] = get_typestore(Stores.ROS2_HUMBLE).fielddefs[_HEADER]
+    types = {kind: _renamed(*definition) for kind, definition in types.items()}
+    store.register(types)
+    text, _ = store.generate_msgdef(name, ros_version=2)
+    store.get_msgdef(name)
+    return store, text.encode()
 
 
 def _renamed(constants: Any, fields: Any) -> Any:
