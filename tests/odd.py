@@ -36,12 +36,8 @@ def examine(path: Path, out: Path, *options: str) -> Verdict:
         return Verdict(result.exit_code, 0, 0, result.stderr.strip().removeprefix("Error: "))
     (folder,) = out.iterdir()
     run = json.loads((folder / "run.json").read_text())
-    skipped = run["counts"]["skipped"]
-    messages = [
-        *run["warnings"],
-        *(f"{count} frames: {reason}" for reason, count in skipped.items()),
-    ]
-    return Verdict(0, run["counts"]["frames"], sum(skipped.values()), "; ".join(messages))
+    skipped = sum(run["counts"]["skipped"].values())
+    return Verdict(0, run["counts"]["frames"], skipped, "; ".join(run["warnings"]))
 
 
 def recordings(folder: Path) -> Iterator[Path]:

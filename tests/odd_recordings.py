@@ -282,12 +282,12 @@ def foreign(path: Path) -> Path:
 
 
 def clocks(path: Path, kind: str) -> Path:
-    """Write stamps that count from power-on, are missing, or jump."""
+    """Write stamps that count from power-on, are missing, stay the same, or jump."""
 
     def stamps() -> Iterator[tuple[str, int, Any]]:
         for number, (topic, time, message) in enumerate(stream(FACTORY, FRAMES)):
             if hasattr(message, "header"):
-                stamp = time - EPOCH + SECOND if kind == "uptime" else 0
+                stamp = {"uptime": time - EPOCH + SECOND, "stuck": EPOCH}.get(kind, 0)
                 if kind == "jump":
                     stamp = time + (3600 * SECOND if number > 6 else 0)
                 stamp_of = message.header.stamp
@@ -446,6 +446,7 @@ CASES: dict[str, Case] = {
     "foreign channels": Case(foreign),
     "clock from power-on": Case(lambda p: clocks(p, "uptime"), reported="does not count from 1970"),
     "clock missing": Case(lambda p: clocks(p, "zero"), reported="stamp is 0"),
+    "clock stuck": Case(lambda p: clocks(p, "stuck"), reported="stamp is that of the message"),
     "clock jump": Case(lambda p: clocks(p, "jump"), reported="jumps"),
     "static transforms last": Case(late_transforms, reported="form a loop"),
     "every image too short": Case(bad_frames, 4, 0, "no usable frame"),

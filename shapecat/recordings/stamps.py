@@ -62,6 +62,7 @@ class Clock:
             self.counts["zero"] += 1
             return max(log_time - self._delay_ns, 0)
         self.counts["epoch"] += stamp < _EPOCH_NS <= log_time
+        self.counts["same"] += stamp == self.last
         self.counts["back"] += self.last is not None and stamp < self.last
         delay = log_time - stamp
         self.counts["jump"] += self.delay is not None and abs(delay - self.delay) > _JUMP_NS
@@ -82,6 +83,7 @@ class Clock:
 _TEXTS = {
     "zero": "header.stamp is 0 ({}×): it is estimated from the log time",
     "epoch": "header.stamp does not count from 1970 ({}×): transforms may not match",
+    "same": "header.stamp is that of the message before ({}×): poses and tracks may be wrong",
     "back": "header.stamp goes backwards ({}×)",
     "jump": "header.stamp jumps relative to the log time ({}×)",
 }

@@ -105,7 +105,8 @@ def perceive_all(work: Work) -> None:
     if resumed:
         run["counts"]["resumed"] = resumed
     run["fixed_frame"], run["up"] = upright.fixed_frame, report_up(upright, folder)
-    run["warnings"] = [*recording.warnings, *upright.warnings, *recent.warnings()]
+    lost = [f"skipped frames ({n}×): {reason}" for reason, n in skipped.most_common(3)]
+    run["warnings"] = [*lost, *recording.warnings, *upright.warnings, *recent.warnings()]
 
 
 def revise(work: Work) -> None:
