@@ -612,6 +612,17 @@ def test_unreadable_file_gives_one_line_error(
     assert "\n" not in str(caught.value)
 
 
+def test_pipe_in_a_folder_is_no_recording(tmp_path: Path) -> None:
+    """Opening it would wait for its writer, and so would all other recordings."""
+    os.mkfifo(tmp_path / "pipe.mcap")
+    writer = os.open(tmp_path / "pipe.mcap", os.O_RDWR)  # so that a failing test ends
+    os.write(writer, bytes(16))
+
+    with pytest.raises(RecordingError, match="is a pipe or a device"):
+        open_recording(tmp_path / "pipe.mcap")
+    os.close(writer)
+
+
 @pytest.mark.parametrize("name", ["lab%41.db3", "run#1.db3", "what?.db3", "a%20#b/c.db3"])
 def test_database_may_have_signs_of_urls_in_its_path(tmp_path: Path, name: str) -> None:
     """SQLite took them for those of a URL: it found no such file, or read another one."""

@@ -56,6 +56,9 @@ def _sniff(path: Path) -> str:
     if not path.exists():
         msg = f"does not exist; {_EXPECTED}"
         raise RecordingError(msg)
+    if not path.is_file():  # a named pipe: opening it would wait for its writer
+        msg = f"is a pipe or a device; {_EXPECTED}"
+        raise RecordingError(msg)
     with path.open("rb") as file:
         begin = file.read(16).decode("latin-1")
     for magic in _READERS:
