@@ -126,6 +126,20 @@ def test_unknown_label_is_refused_with_suggestion(run: Path, label: str, message
     assert message in str(raised.value)
 
 
+def test_message_about_a_wrong_table_is_short(run: Path) -> None:
+    """The table of another program has thousands of lines, and whole texts in its cells."""
+    others = "".join(f"{track},0.000,cup,0.500,,/depth\n" for track in range(1000, 2000))
+    (run / "tracks.csv").write_text(labelled(t4="9" * 5000) + others)
+
+    with pytest.raises(OutputError) as caught:
+        read_labels(run / "tracks.csv")
+
+    _, first, *rest = str(caught.value).splitlines()
+    assert first.startswith(f"  line 2: '{'9' * 80}…' is not a category")
+    assert rest[0] == "  line 6: there is no track 1000"
+    assert (len(rest), rest[-1]) == (20, "  and 981 more problems")
+
+
 @pytest.mark.parametrize("confidence", ["nan", "inf", "-0.1", "1.01", "495"])
 def test_confidence_outside_0_to_1_is_refused(run: Path, confidence: str) -> None:
     """A spreadsheet may turn 0.495 into 495."""

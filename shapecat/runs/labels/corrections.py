@@ -40,6 +40,8 @@ __all__ = [
 PREVIOUS = "tracks.previous.csv"
 LOST = "tracks.previous-*.csv"
 """Names of replaced tables of which labels could not be transferred; nothing replaces these."""
+_MOST_PROBLEMS = 20
+"""At most this many problems of a table are named."""
 
 
 def read_labels(path: Path, categories: Iterable[str] = ()) -> dict[int, TrackLabel]:
@@ -257,8 +259,10 @@ def _relabelled(base: TrackTable, rows: Iterable[TrackRow]) -> TrackTable:
 
 def _refuse(path: Path, problems: Sequence[str]) -> None:
     if problems:
-        lines = "\n  ".join(sorted(problems, key=_line_of))
-        msg = f"{path}: nothing was written:\n  {lines}"
+        lines = sorted(problems, key=_line_of)
+        if len(lines) > _MOST_PROBLEMS:
+            lines[_MOST_PROBLEMS:] = [f"and {len(lines) - _MOST_PROBLEMS} more problems"]
+        msg = "\n  ".join((f"{path}: nothing was written:", *lines))
         raise OutputError(msg)
 
 

@@ -36,6 +36,8 @@ NAME_RULE = (
     "a letter followed by letters, digits, spaces and - _ . + & ' ( ), at most 60 characters"
 )
 """The form of a category's name, in words."""
+_SHOWN = 80
+"""Letters of an invalid label that a message shows."""
 
 
 class TrackLabel(NamedTuple):
@@ -182,7 +184,8 @@ def _understand(label: str, names: dict[str, str]) -> _Verdict:
     name = new[1] if new else label
     if not is_category_name(name):
         hint = "" if _NAME.fullmatch(_without_marks(name)) else f"; a category is {NAME_RULE}"
-        msg = f"{label!r} is not a category, `{DELETE}` or `merge with N`{hint}"
+        shown = label if len(label) <= _SHOWN else f"{label[:_SHOWN]}…"
+        msg = f"{shown!r} is not a category, `{DELETE}` or `merge with N`{hint}"
         raise ValueError(msg)
     nearest = None if new else _nearest(name.lower(), [*names, DELETE])
     if nearest:
