@@ -27,12 +27,18 @@ def turned(yaws: F8) -> F8:
     return np.stack([np.stack(row, 1) for row in ((s, o, c), (-c, o, s), (o, o - 1, o))], 1)
 
 
-def write_frames(folder: Path, places: F8, yaws: F8, numbers: I4, rate_hz: float) -> None:
-    """Write the table of frames of two topics, of which the second has no pose."""
+def write_frames(
+    folder: Path, places: F8, yaws: F8, numbers: I4, rate_hz: float, *, hand_s: int = 1
+) -> None:
+    """Write the table of frames of two topics, of which the second has no pose.
+
+    The first one has none where its place is NaN. The second begins ``hand_s`` later.
+    """
     with PerceptionTables(folder, categories=("can",), model_id="m") as tables:
         for number, place, turn in zip(numbers, places, turned(yaws), strict=True):
-            for topic, pose in (("/head", Pose(turn, place)), ("/hand", None)):
-                stamp = EPOCH + int(number * SECOND / rate_hz) + SECOND * (pose is None)
+            head = None if np.isnan(place).any() else Pose(turn, place)
+            for topic, pose, later in (("/head", head, 0), ("/hand", None, hand_s)):
+                stamp = EPOCH + int(number * SECOND / rate_hz) + later * SECOND
                 perception = Perception(topic, int(number), stamp, "cam", SCENE, (), {})
                 tables.write([perception], [FrameRow(stamp, pose)])
 
@@ -62,6 +68,17 @@ def test_correction_of_the_heading_is_reported(tmp_path: Path) -> None:
     (warning,) = explain_jumps(tmp_path, "odom")
 
     assert "jumps once, at 1.0 s, by up to 0.17 m" in warning
+
+
+def test_time_of_jump_counts_from_first_frame_of_run(tmp_path: Path) -> None:
+    """Users look there in the recording: poses may begin late, and another camera earlier."""
+    places = driven(40, 5)
+    places[:11], places[17] = np.nan, np.nan
+    places[23:] += [0.5, 0.3, 0]
+    write_frames(tmp_path, places, np.full(40, 0.7), np.arange(40), 5, hand_s=-2)
+    (warning,) = explain_jumps(tmp_path, "map")
+
+    assert "jumps once, at 6.6 s, by up to 0.58 m" in warning  # 2 s, and 23 frames at 5 Hz
 
 
 @pytest.mark.parametrize("rate_hz", [1, 5, 30])
