@@ -149,6 +149,44 @@ def test_exports_of_two_runs_do_not_collide(
     assert not (tmp_path / "out").exists()
 
 
+def test_run_given_by_several_paths_is_exported_once(
+    run: Path, tmp_path: Path, shapecat: Run, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """It was refused as another run with the same frames, or would be in the data set twice."""
+    monkeypatch.chdir(run.parent)
+    (tmp_path / "way").symlink_to(run)
+    options = ("--format", "crops", "--every", 4)
+    once = shapecat("export", run.name, *options, "--out", tmp_path / "once")
+    paths = (".", run, tmp_path / "way")
+    result = shapecat("export", *paths, *options, "--out", tmp_path / "several")
+
+    assert result.exit_code == 0, result.output
+    assert result.output.count("labelled views") == once.output.count("labelled views") == 1
+    made, expected = (
+        sorted(path.relative_to(out).as_posix() for path in out.rglob("*.pcd"))
+        for out in (tmp_path / "several", tmp_path / "once")
+    )
+    assert made == expected != []
+
+
+def test_linked_runs_are_exported_by_their_own_names(
+    run: Path, tmp_path: Path, shapecat: Run
+) -> None:
+    """Otherwise the folder of an export would depend on the path by which a run was given."""
+    links = []
+    for name in ("left", "right"):
+        shutil.copytree(run, tmp_path / name / "lab")
+        links.append(tmp_path / f"to {name}")
+        links[-1].symlink_to(tmp_path / name / "lab")
+    options = ("--format", "point-labels", "--every", 4, "--out", tmp_path / "out")
+    both = shapecat("export", *links, *options)
+
+    assert both.exit_code == 1
+    assert "have the same name; export them to different folders" in both.output
+    assert shapecat("export", links[0], *options).exit_code == 0
+    assert [path.name for path in (tmp_path / "out").iterdir()] == ["lab"]
+
+
 def test_exporting_again_removes_views_with_earlier_labels(run: Path, tmp_path: Path) -> None:
     """A stale view teaches the model the mistake that was corrected."""
     folder = tmp_path / "table"
