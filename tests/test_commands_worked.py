@@ -137,8 +137,12 @@ def test_closing_table_follows_order_of_plan(capsys: pytest.CaptureFixture[str])
 def test_json_follows_order_of_plan(
     shapecat: Run, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """The same command must print the same array, whichever recording ends first."""
-    for name in "ab":
+    """The same command must print the same array, whichever recording ends first.
+
+    It holds all recordings, even if the closing table would be too long.
+    """
+    names = [f"r{k:03}" for k in range(101)]
+    for name in names:
         (tmp_path / f"{name}.mcap").write_bytes(b"\x89MCAP")
 
     def last_first(tasks: Any, *_: Any, **__: Any) -> Any:
@@ -149,7 +153,7 @@ def test_json_follows_order_of_plan(
     monkeypatch.setattr("shapecat.batch.runs.process_here", last_first)
     done = shapecat("process", tmp_path, "--out", tmp_path / "out", "--json")
 
-    assert [Path(run["folder"]).name for run in json.loads(done.stdout)] == ["a", "b"]
+    assert [Path(run["folder"]).name for run in json.loads(done.stdout)] == names
 
 
 @pytest.mark.parametrize(("count", "listed"), [(1, 1), (100, 100), (101, 0)])
