@@ -406,7 +406,9 @@ def test_level_frame_is_upright_and_right_handed() -> None:
 
 
 def test_rotation_in_plane_is_rotation_about_up() -> None:
-    """It must move points in the plane and keep their heights."""
+    """It must move points in the plane, keep their heights, and turn boxes along with them."""
+    tilts = np.random.default_rng(6).normal(size=(7, 3))
+    tilted = Rotation.from_rotvec(tilts)
     turned = Rotation.from_matrix(TURNED[None]).as_quat()
     level = _level(next(gather([frame(0, [0.1, 0.2, 0.9], orientations=turned)])))
     turn, shift = np.exp(1j * np.array([0.4, -1.1])), np.array([0.3 - 0.2j, 0.05 + 0.7j])
@@ -420,9 +422,10 @@ def test_rotation_in_plane_is_rotation_about_up() -> None:
         assert_allclose(still, expected, atol=1e-12)
         assert_allclose(motion.moved(np.full(7, k), still), points, atol=1e-12)
         alone = CommonMotion(motion.rotations[k : k + 1], motion.translations[k : k + 1])
-        back = alone.stabilised(next(gather([frame(0, points)])))
+        boxes = frame(0, points, orientations=tilted.as_quat())
+        back = alone.stabilised(next(gather([boxes])))
         assert_allclose(back.centers, expected, atol=1e-6)  # kept in single precision
-        turns = np.broadcast_to(motion.rotations[k], (7, 3, 3))
+        turns = (Rotation.from_matrix(motion.rotations[k]) * tilted).as_matrix()
         assert_allclose(back.axes(slice(None)), turns, atol=1e-6)
 
 
