@@ -17,7 +17,7 @@ from shapecat.errors import ConfigError
 from shapecat.geometry import IDENTITY, transform
 from shapecat.perception import Perceiver, PerceptionInput
 from shapecat.reuse import shows_the_same
-from shapecat.reuse.views import _similar, view_object
+from shapecat.reuse.views import KeyView, _similar, find_repeats, view_object
 from shapecat.runs.jobs import Job
 from shapecat.simulation import KINECT, make_scene, render_frame
 from shapecat.simulation.recorder import record
@@ -231,6 +231,25 @@ def test_nearer_view_with_flipped_yaw_is_alike_up_to_noise(pixels: int, *, alike
         sights.append(view_object(rendered(), pose, found, np.array([0, 0, 1.0]), 0.15).summary)
 
     assert _similar(sights[1], sights[0]) == alike
+
+
+@pytest.mark.parametrize(("before", "now"), [(40, 46), (46, 40), (40, 40)])
+def test_object_with_a_part_more_or_less_is_described_again(before: int, now: int) -> None:
+    """A handle that comes into view, or leaves it, is another shape in a box as large as before."""
+    sights = []
+    for k, width in enumerate((before, now)):
+        mask = np.zeros((480, 640), np.bool_)
+        mask[200:240, 300 : 300 + width] = True
+        depth = np.where(mask, 1.0, 1.3).astype(np.float32)
+        box = Box(np.array([0, 0, 1.0]), np.array([0.1, 0.07, 0.05]), np.array([0, 0, 0, 1.0]))
+        found = Candidate(np.flatnonzero(mask), box, 0, None, 0.0, False, False)
+        frame = replace(blank(k), depth=depth)
+        sights.append(view_object(frame, IDENTITY, found, np.array([0, -1.0, 0]), 0.03))
+    assert _similar(sights[1].summary, sights[0].summary)
+    described: Any = None
+    (repeat,) = find_repeats(sights[1:], [KeyView(sights[0], described)])
+
+    assert (repeat is not None) == (before == now)
 
 
 def test_wrong_pose_prevents_reuse() -> None:
