@@ -436,6 +436,18 @@ def test_unknown_shapes_do_not_affect_calibration(categorizer: Categorizer) -> N
     assert one.temperature == other.temperature
 
 
+def test_unknown_shapes_do_not_raise_confidence(categorizer: Categorizer) -> None:
+    """If all views are right, it follows the number of objects; these say nothing about it."""
+    mixed = blobs(4, 2, (*CATEGORIES, UNKNOWN))
+    truth = encode(mixed.labels, categorizer.categories)
+    right = categorizer.predict(mixed.descriptors).posteriors.argmax(axis=1) == truth
+    known, mixed = mixed.where(right), mixed.where(right | (truth < 0))
+    assert len(np.unique(mixed.instances)) > len(np.unique(known.instances))
+    one, other = (calibrate(categorizer, views, rejected=0.05) for views in (known, mixed))
+
+    assert one.temperature == other.temperature
+
+
 def test_shift_of_new_categories_uses_correct_held_out_views(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
