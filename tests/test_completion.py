@@ -222,13 +222,14 @@ def test_partial_views_do_not_shrink_fused_box() -> None:
 
 def test_thin_object_that_moved_has_no_negative_size() -> None:
     """One side is seen before it moves, the other afterwards: between them is less than nothing."""
-    sizes = np.tile([0.01, 0.2, 0.3], (6, 1))
+    sizes = np.tile([0.02, 0.2, 0.3], (6, 1))
     centers = np.array([[0.02, 0, 0]] * 3 + [[-0.02, 0, 0]] * 3)
     views = views_of(centers, np.tile(np.eye(3), (6, 1, 1)), sizes)
     sensors = np.array([[-1.0, 0, 0]] * 3 + [[1.0, 0, 0]] * 3)
     fused = fused_in(views._replace(sensors=sensors), np.ones(6), one_hot("box"), CATEGORIES)
 
-    assert_allclose(np.sort(fused.sizes[0]), [0.005, 0.2, 0.3], atol=0.002)
+    # Half as thick as in a single view, and not as thin as an object can be.
+    assert_allclose(np.sort(fused.sizes[0]), [0.01, 0.2, 0.3], atol=0.002)
 
 
 def test_view_of_moved_object_keeps_its_pose() -> None:
@@ -253,6 +254,8 @@ def test_box_of_object_at_rest_does_not_turn_with_the_noise_of_its_yaw() -> None
     fused = fused_in(views, np.ones(24), one_hot("box"), CATEGORIES)
 
     assert_allclose(fused.axes, np.tile(fused.axes[0], (24, 1, 1)), atol=1e-12)
+    turned = about_z(np.radians(30)).T @ fused.axes[0]
+    assert np.abs(turned[0, :2]).max() > np.cos(np.radians(9))
 
 
 def test_box_of_round_object_at_rest_does_not_turn() -> None:
@@ -283,6 +286,18 @@ def test_box_of_object_turned_in_place_turns_with_it(turn: float) -> None:
     assert np.delete(same, [13, 14]).all()  # single views may err: their neighbours must agree
 
 
+def test_square_box_turned_in_place_turns_with_it() -> None:
+    """Only the yaw of a round object is chance, not that of every object with equal sides."""
+    yaws = np.radians(np.repeat([10, 50], [13, 11]))
+    axes, sizes = np.stack([about_z(yaw) for yaw in yaws]), np.tile([0.1, 0.1, 0.3], (24, 1))
+    views = views_of(np.zeros((24, 3)), axes, sizes)
+    fused = fused_in(views, np.ones(24), one_hot("box"), CATEGORIES)
+
+    for k in (0, -1):
+        turned = axes[k].T @ fused.axes[k]
+        assert np.abs(turned[0, :2]).max() > np.cos(np.radians(3))
+
+
 def test_box_of_carried_object_is_that_of_its_longest_rest() -> None:
     """The median of its places is on the way, where its box reaches down to the table."""
     there, on_the_way = np.array([0.8, 0.5, 0]), np.linspace(0.1, 0.9, 14)[:, None]
@@ -296,6 +311,30 @@ def test_box_of_carried_object_is_that_of_its_longest_rest() -> None:
 
     assert_allclose(fused.sizes[0], [0.2, 0.1, 0.3], atol=0.005)
     assert_allclose(fused.centers[[0, -1]], [0 * there, there], atol=0.005)
+
+
+def test_partial_views_do_not_decide_where_an_object_rests() -> None:
+    """Behind an occluder it is seen longer, but the outlines show only a part of it."""
+    there, on_the_way = np.array([0.8, 0.5, 0]), np.linspace(0.1, 0.9, 8)[:, None]
+    centers = np.concatenate([np.zeros((6, 3)), on_the_way * there, np.tile(there, (10, 1))])
+    sizes, weights = np.tile([0.2, 0.1, 0.3], (24, 1)), np.ones(24)
+    sizes[14:, 0], weights[14:] = 0.12, 0.25
+    views = views_of(centers, np.tile(np.eye(3), (24, 1, 1)), sizes)
+    fused = fused_in(views, weights, one_hot("box"), CATEGORIES)
+
+    assert_allclose(fused.sizes[-1], [0.2, 0.1, 0.3], atol=0.005)
+
+
+def test_partial_views_do_not_decide_yaw_of_object_at_rest() -> None:
+    """The visible part of an object behind an occluder has another yaw, in however many views."""
+    yaws = np.radians([10.0] * 6 + [50.0] * 12)
+    axes, sizes = np.stack([about_z(yaw) for yaw in yaws]), np.tile([0.2, 0.1, 0.3], (18, 1))
+    weights = np.repeat([1.0, 0.25], [6, 12])
+    fused = fused_in(views_of(np.zeros((18, 3)), axes, sizes), weights, one_hot("box"), CATEGORIES)
+
+    turns = fused.axes[:6, :, 0] @ about_z(np.radians(10))[:, :2]
+    assert_allclose(np.abs(turns).max(axis=1), 1, atol=0.005)
+    assert_allclose(np.sort(fused.sizes[0]), [0.1, 0.2, 0.3], atol=0.005)
 
 
 def test_fused_views_give_true_size_of_oval_bottle() -> None:
