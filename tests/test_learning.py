@@ -451,7 +451,10 @@ def test_unknown_shapes_do_not_raise_confidence(categorizer: Categorizer) -> Non
 def test_shift_of_new_categories_uses_correct_held_out_views(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
-    """Wrong views cannot be lost, and the views of the fit would be too optimistic."""
+    """Wrong views cannot be lost, and the views of the fit would be too optimistic.
+
+    Of fits on few views, it would be that of a worse classifier than the final one.
+    """
     count = 200
     rows = np.arange(count, dtype=np.float64)[:, None]
     inputs = _Inputs(rows, sparse.csr_array((count, 1)))
@@ -474,6 +477,7 @@ def test_shift_of_new_categories_uses_correct_held_out_views(
     shift = _shift(inputs, old, truth, np.zeros((3, 1)), 0.1, np.random.default_rng(0))
 
     assert len(fitted_on) > 1
+    assert sum(map(len, fitted_on)) == (len(fitted_on) - 1) * count  # all but one part each
     assert shift == pytest.approx(float(np.quantile(margins[1::2], 0.006)))
 
 
