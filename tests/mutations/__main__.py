@@ -27,8 +27,8 @@ from tests.mutations.flips import flips_of
 LIBRARIES = ("numba", "scipy.spatial.transform", "pyarrow.parquet", "rosbags.typesys",
              "mcap.reader", "mcap_ros2.decoder", "click.testing", "scipy.optimize")  # fmt: skip
 """Loaded once, before processes are forked."""
-PACKAGES = ("batch", "cameras", "cli", "colour", "evaluation", "executors", "outputs", "recordings",
-         "runs", "system", "tracking")  # fmt: skip
+PACKAGES = ("batch", "cameras", "cli", "colour", "completion", "evaluation", "executors",
+            "learning", "outputs", "recordings", "reuse", "runs", "system", "tracking")  # fmt: skip
 JUDGED_BY: dict[str, Sequence[str]] = {
     "shapecat.batch": ("test_batch_planning",),
     "shapecat.batch.ledger": ("test_batch_planning", "test_batch"),
@@ -44,17 +44,19 @@ JUDGED_BY: dict[str, Sequence[str]] = {
     "shapecat.cli.compare": ("test_compare",),
     "shapecat.cli.evaluate": ("test_evaluation", "test_command_line"),
     "shapecat.cli.export": ("test_exports", "test_exports_readback", "test_command_line"),
-    "shapecat.cli.outcomes": ("test_commands_worked", "test_batch"),
+    "shapecat.cli.outcomes": ("test_commands_worked", "test_batch", "test_pipeline"),
     "shapecat.cli.process": ("test_commands_worked", "test_command_line", "test_pipeline",
                              "test_batch", "test_colour_outputs"),
     "shapecat.cli.progress": ("test_commands_worked", "test_command_line", "test_batch"),
     "shapecat.cli.report": ("test_report", "test_report_serve"),
     "shapecat.colour": ("test_colour", "test_colour_outputs", "test_exports_images"),
+    "shapecat.completion": ("test_completion", "test_tables_rotated"),
     "shapecat.evaluation": ("test_evaluation", "test_evaluation_dataset"),
     "shapecat.evaluation.comparison": ("test_compare",),
     "shapecat.evaluation.comparison.identities": ("test_identities", "test_compare"),
     "shapecat.evaluation.comparison.overlap": ("test_compare", "test_identities"),
     "shapecat.executors": ("test_executors", "test_batch"),
+    "shapecat.learning": ("test_learning", "test_learning_model_file"),
     "shapecat.outputs": ("test_outputs_worked", "test_annotations_rotated",
                          "test_annotated_mcap", "test_exports_worked"),
     "shapecat.outputs.annotation.image_annotations": ("test_outputs_worked", "test_colour_outputs",
@@ -96,6 +98,7 @@ JUDGED_BY: dict[str, Sequence[str]] = {
     "shapecat.recordings.transforms.gravity": ("test_cameras", "test_gravity", "test_changes"),
     "shapecat.recordings.transforms.imu": ("test_gravity", "test_look_ahead"),
     "shapecat.recordings.viewpoint": ("test_viewpoint",),
+    "shapecat.reuse": ("test_reuse",),
     "shapecat.runs": ("test_tables_rotated", "test_tables", "test_batch_planning", "test_labels"),
     "shapecat.runs.finished": ("test_tables_truth", "test_exports", "test_report"),
     "shapecat.runs.folder": ("test_run_folder", "test_batch_planning"),
