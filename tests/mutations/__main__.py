@@ -100,7 +100,7 @@ JUDGED_BY: dict[str, Sequence[str]] = {
     "shapecat.recordings.viewpoint": ("test_viewpoint",),
     "shapecat.reuse": ("test_reuse",),
     "shapecat.runs": ("test_tables_rotated", "test_tables", "test_batch_planning", "test_labels"),
-    "shapecat.runs.finished": ("test_tables_truth", "test_exports", "test_report"),
+    "shapecat.runs.finished": ("test_tables_truth", "test_exports", "test_report", "test_labels"),
     "shapecat.runs.folder": ("test_run_folder", "test_batch_planning"),
     "shapecat.runs.full_boxes": ("test_tables_rotated", "test_completion"),
     "shapecat.runs.labels": ("test_outputs_worked", "test_labels", "test_label_transfer"),
