@@ -454,8 +454,8 @@ def test_parts_unpacked_by_killed_process_are_removed(
 ) -> None:
     path = write_folder(tmp_path / "bag", StoragePlugin.SQLITE3, CompressionMode.FILE)
     temporary = tmp_path / "tmp"
-    name = f"shapecat-scratch-{socket.gethostname()}"
-    old, other = temporary / f"{name}-old", temporary / f"{name}-other"
+    name = f"shapecat-scratch-{socket.gethostname()}+"
+    old, other = temporary / f"{name}old", temporary / f"{name}other"
     for folder in (old, other):
         folder.mkdir(parents=True)
         os.utime(folder, (0, 0))

@@ -11,7 +11,6 @@ import json
 import os
 import resource
 import shutil
-import socket
 import tempfile
 import threading
 from collections.abc import Callable, Iterator
@@ -32,7 +31,6 @@ from shapecat.batch.storage import Location, names_in
 from shapecat.errors import OutputError, RecordingError, explained
 from shapecat.runs.folder import RUN_FILES, made_by_run, read_run
 from shapecat.runs.jobs import Job, Summary
-from shapecat.system.files import scratch_folder
 from tests.object_storage import object_storage, requests
 from tests.run_info import run_info
 from tests.scenes import record
@@ -774,46 +772,6 @@ def test_manifest_parts_stay_small(monkeypatch: pytest.MonkeyPatch) -> None:
     assert max(sizes) < 2500
     assert len(sizes) > 5
     assert len(RemoteManifest("memory://parts").entries) == 100
-
-
-@pytest.mark.parametrize("case", ["no locks", "another machine"])
-def test_scratch_that_may_be_in_use_is_not_removed(
-    own_scratch: Path, monkeypatch: pytest.MonkeyPatch, case: str
-) -> None:
-    """The recording would vanish while another command reads it.
-
-    On NFS, a lock on a folder is known to its own machine only.
-    """
-
-    def no_locks(*_: object) -> None:
-        raise OSError(errno.ENOLCK, "No locks available")
-
-    if case == "no locks":
-        monkeypatch.setattr("fcntl.flock", no_locks)
-    with scratch_folder() as mine:
-        os.utime(mine, (0, 0))
-        if case == "another machine":
-            monkeypatch.setattr("socket.gethostname", lambda: "robot2")
-            monkeypatch.setattr("fcntl.flock", lambda *_: None)
-        with scratch_folder():
-            assert mine.exists()
-    assert not list(own_scratch.iterdir())
-
-
-def test_scratch_of_killed_processes_is_removed(own_scratch: Path) -> None:
-    name = f"shapecat-scratch-{socket.gethostname()}"
-    old, new = own_scratch / f"{name}-old", own_scratch / f"{name}-new"
-    for left in (old, new):
-        left.mkdir()
-    os.utime(old, (0, 0))
-    with scratch_folder() as mine:
-        os.utime(mine, (0, 0))
-        with scratch_folder() as other:
-            assert mine.exists()
-            assert other.exists()
-        assert not old.exists()
-        assert new.exists()  # its process may not have locked it yet
-        new.rmdir()
 
 
 def test_unreachable_server_is_reported(tmp_path: Path) -> None:

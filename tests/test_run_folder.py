@@ -1,5 +1,6 @@
 import errno
 import os
+import socket
 from contextlib import nullcontext
 from pathlib import Path
 from threading import Thread
@@ -26,6 +27,7 @@ from shapecat.system.files import (
     partial_path,
     replacing,
     require_writable,
+    scratch_folder,
 )
 from tests.run_info import run_info
 
@@ -379,3 +381,53 @@ def test_remains_of_a_killed_process_are_no_part_of_a_folder(tmp_path: Path) -> 
         (hidden / "frames.parquet").touch()
 
     assert [path.name for path in folder.iterdir()] == ["frames.parquet"]
+
+
+@pytest.fixture
+def temporary(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
+    """Return the folder in which temporary folders are made."""
+    folder = tmp_path / "tmp"
+    folder.mkdir()
+    monkeypatch.setattr("tempfile.tempdir", str(folder))
+    return folder
+
+
+@pytest.mark.parametrize("case", ["no locks", "robot2", "robot", "robot1"])
+def test_scratch_that_may_be_in_use_is_not_removed(
+    temporary: Path, monkeypatch: pytest.MonkeyPatch, case: str
+) -> None:
+    """The recording would vanish while another command reads it.
+
+    On NFS, a lock on a folder is known to its own machine only; and the name of a machine may begin
+    with that of another.
+    """
+
+    def no_locks(*_: object) -> None:
+        raise OSError(errno.ENOLCK, "No locks available")
+
+    monkeypatch.setattr("socket.gethostname", lambda: "robot1-2")
+    if case == "no locks":
+        monkeypatch.setattr("fcntl.flock", no_locks)
+    with scratch_folder() as mine:
+        os.utime(mine, (0, 0))
+        if case != "no locks":
+            monkeypatch.setattr("socket.gethostname", lambda: case)
+            monkeypatch.setattr("fcntl.flock", lambda *_: None)
+        with scratch_folder():
+            assert mine.exists()
+    assert not list(temporary.iterdir())
+
+
+def test_scratch_of_killed_processes_is_removed(temporary: Path) -> None:
+    name = f"shapecat-scratch-{socket.gethostname()}+"
+    old, new = temporary / f"{name}old", temporary / f"{name}new"
+    for left in (old, new):
+        left.mkdir()
+    os.utime(old, (0, 0))
+    with scratch_folder() as mine:
+        os.utime(mine, (0, 0))
+        with scratch_folder() as other:
+            assert mine.exists()
+            assert other.exists()
+        assert not old.exists()
+    assert [*temporary.iterdir()] == [new]  # its process may not have locked it yet

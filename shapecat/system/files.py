@@ -195,7 +195,7 @@ def scratch_folder() -> Iterator[Path]:
     Only those of this machine are removed, since NFS does not tell other machines of locks on
     folders, and only where there are locks: others may be in use.
     """
-    prefix = f"{_SCRATCH}{socket.gethostname()}-"
+    prefix = f"{_SCRATCH}{socket.gethostname()}+"  # in no host name, unlike "-"
     for earlier in Path(gettempdir()).glob(f"{glob.escape(prefix)}*"):
         with suppress(OSError):
             if time.time() - earlier.stat().st_mtime > _UNLOCKED_S:
