@@ -641,6 +641,31 @@ def test_interrupted_overwriting_continues(
     assert overwritten(source.parent, out, every=2) == {"lab": "new", "other": "new"}
 
 
+def test_overwriting_again_after_a_failure_replaces_all(
+    source: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """A damaged recording does not interrupt a command: the next one must not skip its runs."""
+    (source.parent / "broken.mcap").write_bytes(b"damaged")
+    monkeypatch.setattr("shapecat.batch.plans.load_model", lambda _path: MODEL)
+    begun: list[str] = []
+
+    def attempt(job: Job, *_: object, **__: object) -> Outcome:
+        begun.append(job.source.stem)
+        if job.source.stem == "broken":
+            return Outcome(job, message="broken.mcap: no recording", code=3)
+        job.folder.mkdir(parents=True, exist_ok=True)
+        write_run(job.folder, planned(job.source))
+        counts = {"frames": 3, "tracks": {"cup": 2}}
+        return Outcome(job, Summary(job.name, job.folder, counts, 1.5, ()))
+
+    monkeypatch.setattr("shapecat.batch.runs.attempt", attempt)
+    out = tmp_path / "out"
+    statuses = [overwritten(source.parent, out) for _ in range(3)]
+
+    assert statuses == [{"lab": "new", "broken": "new"}] + 2 * [{"lab": "new", "broken": "retry"}]
+    assert sorted(begun) == 3 * ["broken"] + 3 * ["lab"]
+
+
 def test_times_of_manifest_are_in_utc(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """Machines in different zones write one manifest, of which the latest entry counts."""
     monkeypatch.setenv("TZ", "Asia/Kathmandu")

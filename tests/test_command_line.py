@@ -289,13 +289,18 @@ def test_simulate_requires_overwrite_option(shapecat: Run, tmp_path: Path, there
     assert (tmp_path / "x.mcap").read_bytes().startswith(b"\x89MCAP")
 
 
-def test_simulate_never_removes_foreign_folder(shapecat: Run, tmp_path: Path) -> None:
-    (tmp_path / "x").mkdir()
-    (tmp_path / "x" / "thesis.txt").write_text("mine")
+@pytest.mark.parametrize("name", ["thesis.txt", "lab.mcap", "lab.bag", "bag/lab_0.db3"])
+def test_simulate_never_removes_foreign_folder(shapecat: Run, tmp_path: Path, name: str) -> None:
+    """A folder of recordings is no recording: all of them would be deleted."""
+    mine = tmp_path / "x" / name
+    mine.parent.mkdir(parents=True)
+    mine.write_text("mine")
     result = shapecat("simulate", tmp_path / "x", "--frames", 1, "--overwrite")
 
     assert result.exit_code == 1
-    assert (tmp_path / "x" / "thesis.txt").read_text() == "mine"
+    assert "a folder that is not a recording" in " ".join(result.stderr.split())
+    assert mine.read_text() == "mine"
+    assert list(tmp_path.iterdir()) == [tmp_path / "x"]
 
 
 def test_export_accepts_folders_but_refuses_equal_run_names(

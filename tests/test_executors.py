@@ -397,14 +397,15 @@ def one_by_one() -> Iterator[tuple[int, float]]:
         yield k, 0.4
 
 
-def test_last_items_do_not_wait_for_slow_process() -> None:
-    """Items that were not sent yet are processed here."""
+def test_last_items_do_not_wait_for_slow_process(caplog: pytest.LogCaptureFixture) -> None:
+    """Items that were not sent yet are processed here, without a traceback on the terminal."""
     with OrderedPool(slow_elsewhere, 2) as pool:
         pool.start()
         wait_for(lambda: all(future.done() for future in pool._warming_up))
         workers = [worker for _, worker in pool.in_order(one_by_one())]
     assert workers[0] == workers[1] != os.getpid()
     assert workers[2] == os.getpid()
+    assert caplog.messages == []
 
 
 def test_results_are_freed_without_garbage_collection() -> None:
