@@ -403,18 +403,25 @@ def test_messages_compressed_one_by_one_in_mcap_are_read(tmp_path: Path) -> None
         assert recording.warnings == ["/a: skipped a damaged compressed message"]
 
 
-def test_damage_found_while_a_folder_is_read_is_reported(tmp_path: Path) -> None:
-    """The frames of a damaged part would be missing without a word."""
+@pytest.mark.parametrize("start", [None, 30, 10])
+def test_damage_found_while_a_folder_is_read_is_reported(tmp_path: Path, start: int | None) -> None:
+    """The frames of a damaged part would be missing without a word.
+
+    The next part starts after it, or while it is still written.
+    """
     path = tmp_path / "bag"
     path.mkdir()
     part = write_mcap(path / "bag_0.mcap", list(range(20)))
+    later = [] if start is None else list(range(start, start + 20))
+    if later:
+        write_mcap(path / "bag_1.mcap", later)
     data = bytearray(part.read_bytes())
     at = data.index(b"message 9")
     data[at : at + 9] = b"massage 9"
     part.write_bytes(data)
 
     with open_recording(path) as recording:
-        assert 0 < len(list(recording.messages())) < 20
+        assert 0 < len(list(recording.messages())) - len(later) < 20
         assert any(text.startswith("bag_0.mcap: skipped the chunk") for text in recording.warnings)
 
 
@@ -472,11 +479,25 @@ def test_parts_unpacked_by_killed_process_are_removed(
     os.close(held)
 
 
-def test_overlapping_splits_are_merged(tmp_path: Path) -> None:
-    write_mcap(tmp_path / "b_0.mcap", [0, 20, 40, 60])
-    write_mcap(tmp_path / "b_1.mcap", [30, 50, 70, 90])
+@pytest.mark.parametrize("before", [[], [3, 8]])
+@pytest.mark.parametrize("after", [[], [101, 107]])
+def test_overlapping_splits_are_merged(tmp_path: Path, before: list[int], after: list[int]) -> None:
+    """Also if other splits follow each other: frames would go back in time."""
+    for k, times in enumerate((before, [10, 20, 40, 60], [30, 50, 70, 90], after)):
+        if times:
+            write_mcap(tmp_path / f"b_{k}.mcap", times)
 
-    assert times_read(tmp_path) == [0, 20, 30, 40, 50, 60, 70, 90]
+    assert times_read(tmp_path) == [*before, 10, 20, 30, 40, 50, 60, 70, 90, *after]
+
+
+def test_unfinished_split_is_reported_before_messages_are_read(tmp_path: Path) -> None:
+    """The command `info` reads few messages, and none to the end."""
+    write_mcap(tmp_path / "b_0.mcap", [3, 8])
+    write_mcap(tmp_path / "b_1.mcap", [10, 20], finish=False)
+
+    with open_recording(tmp_path) as recording:
+        expected = "b_1.mcap: the recording was not finished; messages recovered: 2"
+        assert expected in recording.warnings
 
 
 QOS = Qos(
