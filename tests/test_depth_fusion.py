@@ -135,6 +135,20 @@ def test_fusion_compensates_for_camera_motion(
     assert np.percentile(np.abs(errors(result, now)), 95) < 2e-4
 
 
+@pytest.mark.parametrize("axis", [0, 1, 2])
+@pytest.mark.parametrize("slide", [0.004, -0.004])
+def test_sliding_camera_is_not_taken_for_still(axis: int, slide: float) -> None:
+    """On a linear axis it does not turn; in one direction, surfaces would be biased and smeared."""
+    other = home(0.0, 0.0, 0.0, roll=0.6)  # no surface is parallel to an axis of the camera
+    pose = Pose(other.rotation, other.translation + slide * other.rotation[:, axis])
+    now, before = render_depth(pose), render_depth(other)
+
+    result = fused(now, (before, moved(pose, other)))
+
+    assert np.percentile(np.abs(errors(before, now)), 50) > 5e-4  # or there was nothing to notice
+    assert np.percentile(np.abs(errors(result, now)), 95) < 2e-4
+
+
 def test_noise_falls_while_camera_moves() -> None:
     """Fusing nothing would pass the other tests."""
     rng = np.random.default_rng(2)

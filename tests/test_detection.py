@@ -9,6 +9,7 @@ import pytest
 from hypothesis import example, given, settings
 from hypothesis import strategies as st
 from numpy.typing import NDArray
+from scipy.spatial.transform import Rotation
 
 from benchmarks.ablation import STEPS, without
 from shapecat.arrays import I4
@@ -16,13 +17,15 @@ from shapecat.config import DetectionSettings
 from shapecat.detection import Hierarchy, Node, detect, format_tree
 from shapecat.detection.depth_grid import row_and_column
 from shapecat.detection.virtual_camera import _count_occupied
-from shapecat.types import Camera, Frame, Scene
+from shapecat.types import Box, Camera, Candidate, Frame, Plane, Scene
 
 Array = NDArray[Any]
 Shape = Callable[[Array, Array], Array]
 
 CAMERA = Camera(640, 480, 525.0, 525.0, 319.5, 239.5)
 DEFAULTS = DetectionSettings()
+SQUARE = [(-0.5, -0.5), (0.5, -0.5), (0.5, 0.5), (-0.5, 0.5)]
+"""Corners of a square in order."""
 
 
 def squared(vectors: Array) -> Array:
@@ -623,6 +626,58 @@ def test_hierarchy_of_bare_table_has_only_its_plane() -> None:
     hierarchy = Hierarchy(found(frame_of(depth)))
     assert hierarchy.roots == hierarchy.nodes == (Node("plane", 0),)
     assert hierarchy.children(Node("plane", 0)) == ()
+
+
+@pytest.mark.parametrize("turn", [1, -1])
+def test_hierarchy_puts_each_board_on_the_one_below(turn: int) -> None:
+    """In a tree of a shelf, all boards would seem to stand on the lowest one.
+
+    The up direction is tilted; the corners of the boards go round either way.
+    """
+    axes = np.array([[0.6, 0.64, 0.48], [0.8, -0.48, -0.36], [0, 0.6, -0.8]])  # right, away, up
+
+    def plane(place: tuple[float, float, float], size: tuple[float, float]) -> Plane:
+        corners = [np.add(place, (i * size[0], j * size[1], 0)) for i, j in SQUARE[::turn]]
+        return Plane(axes[2], place[2], np.array(corners) @ axes, size[0] * size[1], place[2] + 0.7)
+
+    def thing(
+        place: tuple[float, float, float], size: tuple[float, float, float], on: int
+    ) -> Candidate:
+        turned = Rotation.from_matrix(axes.T).as_quat()
+        box = Box(np.array(place) @ axes, np.array(size), turned)
+        return Candidate(np.arange(60), box, on, None, 0.0, touches_border=False, occluded=False)
+
+    planes = (
+        plane((0.0, 0.0, -0.7), (3.0, 2.0)),  # a floor
+        plane((-0.9, 0.2, -0.42), (0.3, 0.3)),  # the top of a stool
+        plane((0.2, 0.1, -0.3), (0.9, 0.35)),
+        plane((1.2, 0.1, -0.1), (0.4, 0.6)),  # a table beside the shelf
+        plane((0.25, 0.12, 0.05), (0.8, 0.3)),
+        plane((0.3, 0.05, 0.4), (0.7, 0.25)),
+    )
+    things = (
+        thing((0.25, 0.12, 0.06), (0.1, 0.2, 0.02), 4),  # flat, in the middle of its board
+        thing((-0.5, 0.2, -0.56), (0.3, 0.3, 0.28), 0),  # as high as the stool, beside it
+        thing((-0.9, 0.2, -0.555), (0.32, 0.32, 0.29), 0),  # the stool
+        thing((-0.9, 0.2, -0.35), (0.08, 0.06, 0.14), 1),
+        thing((0.2, 0.1, -0.62), (0.2, 0.25, 0.16), 0),  # below a board
+    )
+
+    tree = format_tree(Scene(axes[2], planes, things), lambda node: f"{node.kind} {node.index}")
+
+    assert tree.splitlines() == [
+        "plane 0",
+        "  plane 2",
+        "    plane 4",
+        "      plane 5",
+        "      object 0",
+        "  plane 3",
+        "  object 1",
+        "  object 2",
+        "    plane 1",
+        "      object 3",
+        "  object 4",
+    ]
 
 
 def test_can_is_supported_by_microwave_oven() -> None:
