@@ -10,6 +10,8 @@ import pyarrow.parquet as pq
 import pytest
 from click.testing import Result
 
+from shapecat.runs.folder import read_run
+from tests.conftest import Guesser
 from tests.mcap_files import read_ros
 
 Sizes = dict[tuple[int, str], list[float]]
@@ -61,6 +63,31 @@ def test_annotations_have_requested_boxes(
     if options == ("--boxes", "visible"):  # annotating again without the option keeps them
         assert shapecat("annotate", folder).exit_code == 0
         assert annotated(folder) == found
+
+
+def test_boxes_chosen_for_process_are_kept_until_others_are_chosen(
+    guessed_run: Path,
+    tmp_path: Path,
+    shapecat: Callable[..., Result],
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    """Correcting labels must change no boxes; asking for other boxes must."""
+    monkeypatch.setattr("shapecat.pipeline.load_model", lambda _path: Guesser())
+    folder = tmp_path / "table"
+    shutil.copytree(guessed_run, folder)
+    source = read_run(folder)["input"]["path"]
+    options = ("--out", tmp_path, "--overwrite", "--boxes", "visible", "--no-rrd")
+    result = shapecat("process", source, *options)
+    assert result.exit_code == 0, result.output
+    visible = annotated(folder)
+
+    found = []
+    for chosen in ((), ("--boxes", "full"), ()):
+        assert shapecat("annotate", folder, *chosen).exit_code == 0
+        found.append(annotated(folder))
+
+    assert found == [visible, annotated(guessed_run), annotated(guessed_run)]
+    assert visible != annotated(guessed_run)
 
 
 @pytest.mark.parametrize("options", [(), ("--boxes", "visible")])
