@@ -348,6 +348,18 @@ def test_frames_of_a_robot_may_have_its_name_in_front(tmp_path: Path) -> None:
     assert upright.failed == 1  # the second robot is not in the map of the first
 
 
+@pytest.mark.parametrize("robot", ["r1", "r10"])
+def test_up_is_that_of_the_robot_of_the_sensor(tmp_path: Path, robot: str) -> None:
+    """In one tree of transforms; a robot's name may begin with that of another."""
+    links = [("hall", f"{name}/map") for name in ("r1", "r10")]
+    links += [(f"{name}/map", f"{name}/camera") for name in ("r1", "r10")]
+    with open_recording(in_frames(tmp_path / "a.mcap", *links)) as recording:
+        upright = Upright.of(recording, up="tf", fixed_frame=None)
+        found = upright.orient(replace(frame(EPOCH), frame_id=f"{robot}/camera"))
+
+    assert found.source == f"transforms, z of {robot}/map"
+
+
 def test_map_of_all_robots_comes_before_that_of_one(tmp_path: Path) -> None:
     """Where robots share a map, each has the same up direction as the others."""
     links = ("map", "r1/map"), ("r1/map", "r1/camera")

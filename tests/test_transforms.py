@@ -311,6 +311,7 @@ def test_static_transforms_of_a_namespace_hold_at_all_times(tmp_path: Path) -> N
         ({"/r1": 1.0, "/r2": 2.0}, "r2/camera/image", 2.0, "/r1/tf are ignored"),
         ({"/r1": 1.0, "/r11": 2.0}, "/r11/camera/image", 2.0, "/r1/tf are ignored"),
         ({"/r1": 1.0, "/r2": 1.0}, "/camera/image", 1.0, "on /r1/tf and /r2/tf have frames of"),
+        ({"/r1": 1.0, "/r2": 1.0}, "/r11/camera/image", 1.0, "on /r1/tf and /r2/tf have frames of"),
         ({"": 1.0, "/r2": 1.0}, "/r2/camera/image", 1.0, ""),
     ],
 )
