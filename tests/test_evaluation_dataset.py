@@ -233,6 +233,7 @@ def test_hidden_files_are_no_views(tmp_path: Path) -> None:
         (np.full((5, 3), np.nan), "no points"),
         (np.zeros((0, 3)), "no points"),
         (np.full((5, 3), 500.0), "must be in metres"),
+        (np.full((5, 3), -500.0), "is 500 m away; points must be in metres"),
         (np.eye(3) * 80.0, "extend over 80 m"),  # a cup in millimetres
         (np.zeros((5, 2)), "shape"),
         (np.zeros(5), "shape"),

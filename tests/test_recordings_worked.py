@@ -255,9 +255,11 @@ DEPTH = Camera(64, 48, 60.0, 61.0, 31.2, 23.7)
         (Camera(64, 48, 60.6, 61.0, 31.2, 23.7), "/camera", True),  # as in ROS 1
         (WIDE, "/camera", False),
         (Camera(64, 48, 60.0, 61.0, 31.2, 24.4), "camera", False),
+        (Camera(64, 48, 60.0, 61.0, 30.5, 23.7), "camera", False),
         # Another frame without a transform: only equal numbers are the same camera.
         (DEPTH, "color", True),
         (Camera(64, 48, 60.001, 61.0, 31.2, 23.7), "color", None),
+        (Camera(64, 48, 60.0, 60.999, 31.2, 23.7), "color", None),
     ],
 )
 def test_colour_is_registered_only_if_cameras_are_equal(
