@@ -1,6 +1,7 @@
 """Tests of the whole pipeline, on simulated recordings and on real data if present."""
 
 import json
+import shutil
 from collections import Counter
 from collections.abc import Callable
 from pathlib import Path
@@ -13,9 +14,13 @@ from click.testing import Result
 from mcap.reader import make_reader
 from numpy.testing import assert_allclose
 
-from shapecat.pipeline import annotate
+from shapecat.pipeline import annotate, process
+from shapecat.runs.folder import read_run
+from shapecat.runs.jobs import Job
 from shapecat.simulation import simulate
+from tests.conftest import Guesser
 from tests.mcap_files import read_ros
+from tests.scenes import record
 from tests.track_tables import rows, untimed_table
 
 Run = Callable[..., Result]
@@ -108,6 +113,27 @@ def final_labels(folder: Path) -> dict[int, str]:
     header = lines[0].split(",")
     table = [dict(zip(header, line.split(","), strict=True)) for line in lines[1:]]
     return {int(row["track"]): row["category"] for row in table}
+
+
+def test_objects_without_surface_are_unknown(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Of too few points nothing is described: a category would be that of an empty description."""
+
+    class Sure(Guesser):
+        def predict(self, descriptors: Any) -> Any:
+            """Guess something of an empty description, too."""
+            return super().predict(descriptors + 1)
+
+    monkeypatch.setattr("shapecat.pipeline.load_model", lambda _path: Sure())
+    monkeypatch.setattr("shapecat.perception.reconstruct", lambda *_, **__: None)
+    process(Job(record(tmp_path / "lab.mcap", 3), tmp_path / "out", mcap=False, rrd=False))
+
+    found = rows(tmp_path / "out", "detections")
+    assert len(found) > 6
+    assert {row["category"] for row in found} == {"unknown"}
+    assert_allclose([row["posterior"] for row in found], 1 / len(Guesser.categories), rtol=1e-6)
+    assert {*final_labels(tmp_path / "out").values()} == {"unknown"}
 
 
 def test_camera_motion_is_compensated(run_folder: Path) -> None:
@@ -335,3 +361,26 @@ def test_real_clouds_give_same_objects_as_depth_images(
     assert set(have) <= set(depth_image_centres)
     for stamp, found in have.items():
         assert_allclose(found, depth_image_centres[stamp], atol=2e-3)
+
+
+def test_output_added_later_leaves_others_to_be_annotated(
+    shapecat: Run, guessed_run: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """A run that forgot its annotated.mcap would keep the labels from before a correction there."""
+    monkeypatch.setattr("shapecat.pipeline.load_model", lambda _path: Guesser())
+    folder = shutil.copytree(guessed_run, tmp_path / "table")
+    source = read_run(folder)["input"]["path"]
+    added = shapecat("process", source, "--out", tmp_path, "--no-mcap")
+    assert added.exit_code == 0, added.output
+    assert (folder / "review.rrd").exists()
+
+    categories = final_labels(folder)
+    lines = [f"{track},{name},0.5,mug" for track, name in categories.items()]
+    text = "\n".join(["track,category,confidence,label", *lines])
+    (tmp_path / "labels.csv").write_text(text)
+    done = shapecat("annotate", folder, "--labels", tmp_path / "labels.csv")
+    assert done.exit_code == 0, done.output
+
+    found = read_ros(folder / "annotated.mcap", "/shapecat/detections")
+    names = {d.results[0].hypothesis.class_id for _, message in found for d in message.detections}
+    assert names == {"mug"}

@@ -297,7 +297,7 @@ def test_nothing_is_reused_across_topics_or_up_directions() -> None:
     up = np.asarray(still_world(1).path[0].rotation[2], np.float32)
     tilted = up + np.float32(0.04) * np.array([1, 0, 0], np.float32)
     tilted /= np.linalg.norm(tilted)
-    ups = {"/left": (up, tilted, None), "/right": (up,)}
+    ups = {"/left": (up, tilted, None, up), "/right": (up,)}
     views = [
         PerceptionInput(replace(frame, topic=topic), up)
         for topic, given in ups.items()
@@ -306,9 +306,9 @@ def test_nothing_is_reused_across_topics_or_up_directions() -> None:
     guesser: Any = Guesser()
     perceptions = Perceiver(guesser, Settings(), None)(views)
 
-    assert [perception.topic for perception in perceptions] == [*["/left"] * 3, "/right"]
+    assert [perception.topic for perception in perceptions] == [*["/left"] * 4, "/right"]
     assert all(perception.reused_from is None for perception in perceptions)
-    assert {d.reused_from for d in perceptions[3].detections} == {None}
+    assert {d.reused_from for d in perceptions[4].detections} == {None}
 
 
 def test_change_of_smallest_object_size_is_noticed() -> None:
