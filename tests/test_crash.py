@@ -254,13 +254,16 @@ def test_two_runs_cannot_write_same_folder(recording: Path, tmp_path: Path) -> N
     assert [path.name for path in tmp_path.iterdir()] == ["table"]
 
 
-def test_recording_still_being_written_gives_no_results(recording: Path, tmp_path: Path) -> None:
+@pytest.mark.parametrize("when", ["perceive", "annotate"])
+def test_recording_still_being_written_gives_no_results(
+    recording: Path, tmp_path: Path, when: str
+) -> None:
     """Its tables would describe an earlier state of the recording than its outputs."""
     source, out = tmp_path / "live.mcap", tmp_path / "out"
     shutil.copy(recording, source)
 
     def write(phase: str, done: int, _total: int | None) -> None:
-        if (phase, done) == ("perceive", 2):
+        if (phase, done) == (when, 2):
             os.utime(source, ns=(1, 1))
 
     with pytest.raises(RecordingError, match="changed while it was processed"):
