@@ -790,6 +790,14 @@ def test_platform_right_below_the_camera_supports_objects() -> None:
     check(shapes, [2, 3], tilt_deg=87)
 
 
+@pytest.mark.parametrize("tilt_deg", [20, 35, 50])
+def test_wall_behind_a_counter_is_no_table(tilt_deg: float) -> None:
+    """It covers several times as much of the image as the counter."""
+    counter = [table(0.9, 0.2), box((0, 0.21, -0.05), (1.8, 0.02, 0.9))]
+    objects = [box((-0.2, -0.05, 0), (0.1, 0.1, 0.1)), can(0.05, 0, 0, 0.04, 0.12)]
+    check([*counter, *objects], [2, 3], tilt_deg=tilt_deg)
+
+
 def test_can_flush_with_box_below_is_separated() -> None:
     """Only the top face of the box beside the can separates them."""
     shapes = [table(), box((0, 0, 0), (0.2, 0.1, 0.1)), can(0, -0.005, 0.1, 0.045, 0.09)]

@@ -23,16 +23,18 @@ class UpSettings(NamedTuple):
     """Directions tried: one shared by 1 in 25 normals is missed with a probability below 1 %."""
     level_bin_m: float = 0.04
     """Height of a bin, metres: more than the noise at 2 m, less than the gap between boards."""
-    levels_exponent: float = 1.5
-    """Exponent of the number of levels in the score of an up direction: a shelf has several levels,
-    the wall behind it one."""
+    level_exponent: float = 0.7
+    """Exponent of the surface in large levels, in the score of an up direction: a camera sees more
+    of the wall behind a counter than of the counter."""
+    enough_m2: float = 0.25
+    """Area beyond which a larger level does not score more: as much as `PLANES.furniture_m2`; the
+    front of an object has less."""
     purity_exponent: float = 2.0
-    """Exponent, in that score, of the fraction of the surface facing the direction that lies in
-    large levels."""
+    """Exponent of the fraction of the surface facing the direction that lies in large levels."""
     frontal_penalty: float = 0.6
     """Fraction of the score that a direction along the optical axis loses: it is that of a wall."""
-    roll_penalty: float = 3.0
-    """Penalty on directions that imply a camera on its side or upside down: a quarter remains."""
+    roll_penalty: float = 4.0
+    """Penalty on directions that imply a camera on its side or upside down: a fifth remains."""
     frontal_sin2: float = 0.03
     """Squared sine of the angle to the optical axis below which a direction implies no roll."""
     half_weight_m: float = 1.5

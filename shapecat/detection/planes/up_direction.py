@@ -6,7 +6,7 @@ import numpy as np
 
 from shapecat.arrays import F4, F8
 from shapecat.detection.depth_grid import PinholeIntrinsics
-from shapecat.detection.planes.oriented_points import OrientedPoints, level_samples
+from shapecat.detection.planes.oriented_points import STRIDE, OrientedPoints, level_samples
 from shapecat.detection.planes.ransac import cosine, horizontal_plane, plane_normal, refine
 from shapecat.detection.planes.settings import PLANES, UP
 from shapecat.geometry import cross
@@ -18,6 +18,9 @@ MAX_DIRECTIONS = 4
 """Maximum number of directions to find: level surface and the walls of a corner make three."""
 BLOCK = 512
 """Number of normals after which a direction that can no longer win is dropped."""
+GRAZING = 0.1
+"""Lower bound of the cosine between a normal and a ray, in areas: at smaller angles, noise decides.
+"""
 BINS = 80
 """Number of bins of `UpSettings.level_bin_m`: the floor is no more than 3 m below the camera."""
 
@@ -29,9 +32,9 @@ def estimate_up(
     """Return the unit normal (3,) of the dominant supporting plane; zeros if there is none.
 
     Without a hint, the candidates are the normals of the largest planes and the directions
-    perpendicular to two walls. The candidate with the most surface in large levels wins. Candidates
-    along the line of sight score less, so that the boards of a shelf beat its back, and distant
-    surface has less weight.
+    perpendicular to two walls. The candidate with the most surface in large levels wins; a level
+    much smaller than a table scores less. So do candidates along the line of sight, so that the
+    boards of a shelf beat its back, and distant surface has less weight.
 
     Parameters
     ----------
@@ -41,7 +44,7 @@ def estimate_up(
     roll_penalty : penalty on directions that imply a camera on its side or upside down:
         `UpSettings.roll_penalty`, or 0 if the camera may be held in any way.
     """
-    surface = _every_second(points)
+    surface = _every_second(points, intrinsics)
     normals, min_count = surface[:3], UP.min_share * surface.shape[1]
     has_hint = hint[0] != 0 or hint[1] != 0 or hint[2] != 0
     if has_hint:
@@ -59,15 +62,19 @@ def estimate_up(
 
 
 @kernel(inline=True)
-def _every_second(points: OrientedPoints) -> F4:
-    """Return the normals, positions and weights (7, n) of every second point, for speed."""
+def _every_second(points: OrientedPoints, intrinsics: PinholeIntrinsics) -> F4:
+    """Return the normals, positions, weights and areas (8, n) of every second point, for speed."""
     normals, positions = points.normals, points.positions
-    surface = np.zeros((7, normals.shape[1] // 2 + 1), np.float32)
+    surface = np.zeros((8, normals.shape[1] // 2 + 1), np.float32)
+    cell = 2 * STRIDE * STRIDE / (intrinsics.fx * intrinsics.fy)
     n = 0
     for k in range(0, normals.shape[1], 2):
         for d in range(3):
             surface[d, n], surface[3 + d, n] = normals[d, k], positions[d, k]
         surface[6, n] = 1 / (1 + (positions[2, k] / UP.half_weight_m) ** 2)
+        x, y, z = positions[0, k], positions[1, k], positions[2, k]
+        distance = -(normals[0, k] * x + normals[1, k] * y + normals[2, k] * z)  # of the plane
+        surface[7, n] = cell * z**3 / max(distance, GRAZING * z, 1e-9)
         n += normals[2, k] != 0
     return surface[:, :n].copy()
 
@@ -171,8 +178,8 @@ def _hypotheses(directions: F8, corner_cos: float) -> F8:
 @kernel(inline=True)
 def _score(surface: F4, direction: F8, roll_penalty: float) -> float:
     """Return the score of a direction: the weight of large levels, adjusted as in `estimate_up`."""
-    count, facing, total = _count_levels(surface, direction)
-    level, squares = _large_levels(count, UP.min_share * total)
+    count, areas, facing, total = _count_levels(surface, direction)
+    level, squares, area = _large_levels(count, areas, UP.min_share * total)
     if level == 0:
         return 0.0
     # A shelf has several boards but one back. Objects in front of a wall add levels as well, but of
@@ -182,17 +189,18 @@ def _score(surface: F4, direction: F8, roll_penalty: float) -> float:
     frontal = 1 - UP.frontal_penalty * direction[2] ** 2
     across, down = direction[0] ** 2, max(direction[1], 0.0) ** 2
     roll = (across + down) / (across + direction[1] ** 2 + UP.frontal_sin2)
-    several, pure = levels**UP.levels_exponent, purity**UP.purity_exponent
-    return float(level * several * pure * frontal / (1 + roll_penalty * roll))
+    size = level**UP.level_exponent * min(area / UP.enough_m2, 1.0)
+    pure = purity**UP.purity_exponent
+    return float(size * levels * pure * frontal / (1 + roll_penalty * roll))
 
 
 @kernel(inline=True)
-def _large_levels(count: F8, min_weight: float) -> tuple[float, float]:
+def _large_levels(count: F8, areas: F8, min_weight: float) -> tuple[float, float, float]:
     """Return the sum of the weights of levels above ``min_weight``, and the sum of their squares.
 
     A level fills two bins, and has more weight than its neighbours: slanted surface has no peaks.
     """
-    weight = squares = 0.0
+    weight = squares = area = 0.0
     last = count.size - 1
     for k in range(last):
         level_weight = count[k] + count[k + 1]
@@ -205,11 +213,12 @@ def _large_levels(count: F8, min_weight: float) -> tuple[float, float]:
         if stands_out:
             weight += level_weight
             squares += level_weight * level_weight
-    return weight, squares
+            area += areas[k] + areas[k + 1]
+    return weight, squares, area
 
 
 @kernel(inner=True)
-def _count_levels(surface: F4, direction: F8) -> tuple[F8, float, float]:
+def _count_levels(surface: F4, direction: F8) -> tuple[F8, F8, float, float]:
     """Sum the weights of the points that face a direction, by their height below the sensor.
 
     Returns the weight in each bin, (BINS,), the sum over the bins, and the weight of all points.
@@ -223,11 +232,12 @@ def _count_levels(surface: F4, direction: F8) -> tuple[F8, float, float]:
         below = scale * (px[k] * x + py[k] * y + pz[k] * z)
         faces = nx[k] * x + ny[k] * y + nz[k] * z > min_cos
         bins[k] = np.int32(below) if faces & (below >= 0) & (below < BINS) else other_bin
-    count = np.zeros(BINS + 1)  # the last bin is for the other points
+    count, areas = np.zeros(BINS + 1), np.zeros(BINS + 1)  # the last bin is for the other points
     for k in range(nx.size):
         count[bins[k]] += weights[k]
+        areas[bins[k]] += surface[7, k]
     facing = np.sum(count[:BINS])
-    return count[:BINS], facing, facing + count[BINS]
+    return count[:BINS], areas[:BINS], facing, facing + count[BINS]
 
 
 @kernel(inline=True)
@@ -235,7 +245,7 @@ def _refined(
     points: OrientedPoints, surface: F4, intrinsics: PinholeIntrinsics, direction: F8
 ) -> F8:
     """Return the refined normal (3,) of the largest plane that faces ``direction``."""
-    count, _, _ = _count_levels(surface, direction)
+    count, _, _, _ = _count_levels(surface, direction)
     plane = horizontal_plane(intrinsics, direction, -(np.argmax(count) + 0.5) * UP.level_bin_m)
     samples, _ = level_samples(points, direction)
     for multiple in (4, 3, 2, 1, 1):
