@@ -46,8 +46,8 @@ __all__ = ["compile_all", "find_ball", "find_mask", "main", "recognize_ball", "r
 
 _RADIUS_M, _TOP_M = 0.05, 0.11
 """Radii of the ball, and of the plate and the top of the block."""
-_TABLE_M, _BOARD_M = 0.4, 0.05
-"""Half the widths of the table and of a board."""
+_TABLE_M = 0.4
+"""Half the width of the table and of a board."""
 
 
 def find_ball() -> int:
@@ -71,7 +71,7 @@ def find_ball() -> int:
     frame = _frame_of(depth)
     scene = _detect(frame)
     board = 0.05 / np.maximum(rays[..., 1], 0.03)  # seen at a grazing angle
-    _detect(_frame_of(np.where(abs(rays[..., 0] * board) < _BOARD_M, board, 2.5)))
+    _detect(_frame_of(np.where(abs(rays[..., 0] * board) < _TABLE_M, board, 2.5)))
     same = shows_the_same(frame, None, frame, None, range_m=2.0)
     views = [view_object(frame, IDENTITY, ball, scene.up, _RADIUS_M) for ball in scene.candidates]
     keys = [KeyView(view, _undescribed(view.candidate)) for view in views]

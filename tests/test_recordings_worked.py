@@ -516,7 +516,7 @@ def test_clock_counts_each_kind_of_fault() -> None:
     found = [clock.check(stamp, log_time) for stamp, log_time in times]
 
     assert found == [stamp or 77 for stamp, _ in times]
-    assert clock.counts == {"zero": 1, "epoch": 1, "back": 3, "jump": 2}
+    assert clock.counts == {"zero": 1, "epoch": 1, "same": 1, "back": 3, "jump": 2}
 
 
 def test_overlapping_chunks_are_merged_in_bounded_memory(monkeypatch: pytest.MonkeyPatch) -> None:
