@@ -4,7 +4,7 @@
 
 One frame of each simulated table, without a given up direction. Four fifths of the table are
 covered with flat boxes, or it fills only a fifth of the image, or the camera looks down by 8 to 85
-degrees.
+degrees, or the table is a counter before a wall, above a cupboard.
 """
 
 from collections.abc import Callable, Iterator
@@ -19,10 +19,12 @@ from benchmarks.scenes import Array, detected
 from shapecat.geometry import inverse
 from shapecat.simulation import KINECT, PlacedObject, Support, World, make_scene, render_frame
 from shapecat.simulation.camera.render import render
-from shapecat.simulation.scenes.furniture import make_room, make_table
+from shapecat.simulation.scenes.furniture import WALL, make_room, make_table
 from shapecat.simulation.scenes.paths import looking_at
+from shapecat.simulation.shapes.categories import make_object
+from shapecat.simulation.shapes.mesh import moved
 from shapecat.simulation.shapes.primitives import rounded_box
-from shapecat.types import Camera, Frame, Pose, Scene
+from shapecat.types import CATEGORIES, Camera, Frame, Pose, Scene
 
 HEIGHT_M, TILT_COS = 0.02, float(np.cos(np.radians(4)))
 """Largest distance and tilt of a found plane from the table."""
@@ -106,6 +108,27 @@ def tilted(rng: Generator) -> World:
     return replace(world, path=(pose,))
 
 
+def counter(rng: Generator) -> World:
+    """Look at a kitchen counter with objects; more of the wall behind it is visible than of it."""
+    table = make_table(rng, (rng.uniform(1.1, 2.0), rng.uniform(0.28, 0.55)))
+    half, height = table.outline[:, :2].max(axis=0), table.height
+    wall = rounded_box([2 * half[0], 0.02, height + 0.8], fine=10)
+    front = rounded_box([2 * half[0], 0.02, height - 0.05], fine=10)
+    supports = (
+        table,
+        Support("wall", WALL, moved(wall, Pose(np.eye(3), np.array([0, half[1] + 0.01, 0])))),
+        Support("front", WALL, moved(front, Pose(np.eye(3), np.array([0, 0.03 - half[1], 0])))),
+    )
+    objects = []
+    for k, x in enumerate(rng.permutation(np.linspace(-0.4, 0.4, 5))[: rng.integers(2, 6)]):
+        category = str(rng.choice(CATEGORIES))
+        pose = Pose(np.eye(3), np.round([x, rng.uniform(-0.3, 0.3) * half[1], height], 6))
+        mesh = make_object(category, rng)
+        objects.append(PlacedObject(k, category, category, mesh, pose, table.name, None))
+    path = (_view(rng, table, rng.uniform(15, 60), rng.uniform(0.6, 1.3)),)
+    return World("counter", supports, tuple(objects), path)
+
+
 def _view(rng: Generator, table: Support, elevation: float, distance: float) -> Pose:
     up, side = np.radians(elevation), rng.uniform(-2.1, -1.0)
     target = np.array([*rng.uniform(-0.05, 0.05, 2), table.height])
@@ -118,6 +141,7 @@ SCENES: dict[str, Callable[[Generator], World]] = {
     "covered to four fifths": covered,
     "cut to a fifth": cut,
     "8 to 85 degrees": tilted,
+    "counter before a wall": counter,
 }
 
 

@@ -76,6 +76,7 @@ def supports(meshes: list[Mesh]) -> list[float]:
         *(("covered to four fifths", seed) for seed in (3, 12, 21, 24, 731005, 731047)),
         *(("cut to a fifth", seed) for seed in (3, 1015, 1028)),
         *(("8 to 85 degrees", seed) for seed in (1, 5)),
+        *(("counter before a wall", seed) for seed in (9798000, 9798037, 9798060)),
     ],
 )
 def test_table_is_found_without_given_up(kind: str, seed: int) -> None:
