@@ -640,7 +640,7 @@ def test_hierarchy_puts_each_board_on_the_one_below(turn: int) -> None:
         corners = [np.add(place, (i * size[0], j * size[1], 0)) for i, j in SQUARE[::turn]]
         return Plane(axes[2], place[2], np.array(corners) @ axes, size[0] * size[1], place[2] + 0.7)
 
-    def thing(
+    def candidate(
         place: tuple[float, float, float], size: tuple[float, float, float], on: int
     ) -> Candidate:
         turned = Rotation.from_matrix(axes.T).as_quat()
@@ -655,15 +655,15 @@ def test_hierarchy_puts_each_board_on_the_one_below(turn: int) -> None:
         plane((0.25, 0.12, 0.05), (0.8, 0.3)),
         plane((0.3, 0.05, 0.4), (0.7, 0.25)),
     )
-    things = (
-        thing((0.25, 0.12, 0.06), (0.1, 0.2, 0.02), 4),  # flat, in the middle of its board
-        thing((-0.5, 0.2, -0.56), (0.3, 0.3, 0.28), 0),  # as high as the stool, beside it
-        thing((-0.9, 0.2, -0.555), (0.32, 0.32, 0.29), 0),  # the stool
-        thing((-0.9, 0.2, -0.35), (0.08, 0.06, 0.14), 1),
-        thing((0.2, 0.1, -0.62), (0.2, 0.25, 0.16), 0),  # below a board
+    candidates = (
+        candidate((0.25, 0.12, 0.06), (0.1, 0.2, 0.02), 4),  # flat, in the middle of its board
+        candidate((-0.5, 0.2, -0.56), (0.3, 0.3, 0.28), 0),  # as high as the stool, beside it
+        candidate((-0.9, 0.2, -0.555), (0.32, 0.32, 0.29), 0),  # the stool
+        candidate((-0.9, 0.2, -0.35), (0.08, 0.06, 0.14), 1),
+        candidate((0.2, 0.1, -0.62), (0.2, 0.25, 0.16), 0),  # below a board
     )
 
-    tree = format_tree(Scene(axes[2], planes, things), lambda node: f"{node.kind} {node.index}")
+    tree = format_tree(Scene(axes[2], planes, candidates), lambda node: f"{node.kind} {node.index}")
 
     assert tree.splitlines() == [
         "plane 0",

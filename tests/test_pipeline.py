@@ -120,12 +120,12 @@ def test_objects_without_surface_are_unknown(
 ) -> None:
     """Of too few points nothing is described: a category would be that of an empty description."""
 
-    class Sure(Guesser):
+    class CertainGuesser(Guesser):
         def predict(self, descriptors: Any) -> Any:
             """Guess something of an empty description, too."""
             return super().predict(descriptors + 1)
 
-    monkeypatch.setattr("shapecat.pipeline.load_model", lambda _path: Sure())
+    monkeypatch.setattr("shapecat.pipeline.load_model", lambda _path: CertainGuesser())
     monkeypatch.setattr("shapecat.perception.reconstruct", lambda *_, **__: None)
     process(Job(record(tmp_path / "lab.mcap", 3), tmp_path / "out", mcap=False, rrd=False))
 

@@ -72,7 +72,9 @@ def fill_holes(grid: DepthGrid, labels: I4, count: int, filled: U1) -> None:
     sides, total = np.zeros((n, count + 1, 3), np.int32), np.zeros(n, np.int64)
     owner, area = np.zeros(n, np.int16), np.zeros(n, np.int64)
     _count_sides(grid, labels, inside, spans, component, sides, total, area)
-    label_area = _label_areas(labels, count, spans)
+    label_area = np.zeros(count + 1, np.int64)
+    if n > 1:
+        _count_label_cells(labels, spans, label_area)
     for p in range(1, n):
         owner[p] = _owner_of(sides[p], total[p], area[p], label_area)
     for i in range(len(spans)):
@@ -115,10 +117,11 @@ def _count_sides(
     total: I4,
     area: I4,
 ) -> None:
-    """Count the sides of holes by label, (n, labels, 3), and in ``total`` (n,); ``area`` in cells.
+    """Count the sides of holes by label, (n, labels, 3), and in ``total`` (n,), and their cells.
 
-    A side next to cells without depth counts for the label beyond them, and they to the area. If a
-    hole is not enclosed, its total is so large that no label has a sufficient fraction.
+    A side next to cells without depth counts for the label beyond them, and these cells add to
+    ``area`` (n,). If a hole is not enclosed, its total is so large that no label has a sufficient
+    fraction.
     """
     inv_depth, jump = grid.inverse_depth, grid.discontinuity
     for i in range(len(spans)):
@@ -145,18 +148,20 @@ def _count_sides(
 
 
 @kernel(inline=True)
-def _label_areas(labels: I4, count: int, spans: I4) -> I4:
-    """Return the numbers of cells of the labels (count + 1,)."""
-    areas = np.zeros(count + 1, np.int64)
+def _count_label_cells(labels: I4, spans: I4, area: I4) -> None:
+    """Count the cells of each label, in ``area`` (labels,)."""
     for i in range(len(spans)):
         for j in range(spans[i, 0], spans[i, 1]):
-            areas[labels[i, j]] += 1
-    return areas
+            area[labels[i, j]] += 1
 
 
 @kernel(inline=True)
 def _owner_of(sides: I4, total: int, area: int, label_area: I4) -> int:
-    """Return the label that a hole belongs to; 0 if there is none."""
+    """Return the label that a hole belongs to; 0 if there is none.
+
+    ``sides`` (labels, 3), ``total`` and ``area`` are the hole's, from `_count_sides`;
+    ``label_area`` (labels,) are numbers of cells.
+    """
     best = 0
     for k in range(1, len(sides)):
         best = k if sides[k, BOUNDARY] > sides[best, BOUNDARY] else best

@@ -26,9 +26,6 @@ class UpSettings(NamedTuple):
     level_exponent: float = 0.7
     """Exponent of the surface in large levels, in the score of an up direction: a camera sees more
     of the wall behind a counter than of the counter."""
-    enough_m2: float = 0.25
-    """Area beyond which a larger level does not score more: as much as `PLANES.furniture_m2`; the
-    front of an object has less."""
     purity_exponent: float = 2.0
     """Exponent of the fraction of the surface facing the direction that lies in large levels."""
     frontal_penalty: float = 0.6

@@ -51,7 +51,7 @@ def supporting_planes(
     5. Keep a plane with no other below it.
     6. Drop a plane with a wall below its front edge, as below the top of a box.
     7. If little is visible below its front edge, drop a plane of less than 0.1 m2, or one right
-       below the camera that bears nothing, as the top of a carton.
+       below the camera with nothing on it, such as the top of a carton.
     8. Keep all others.
 
     Above another plane, the largest connected part of a plane counts: the tops of equal boxes are
@@ -114,7 +114,10 @@ def _extend_to_walls(grid: DepthGrid, plane: SupportingPlane) -> SupportingPlane
 
 
 def _is_bare_from_above(grid: DepthGrid, plane: SupportingPlane) -> bool:
-    """Return whether a plane is right below the camera, which hides its sides, and bare."""
+    """Return whether a plane is right below the camera, and nothing is on it.
+
+    From there, the sides below its edge are hidden.
+    """
     if plane.extent.min() <= 0:
         return False
     across, along, height = level_coordinates(grid, grid.inverse_depth > 0, plane.up)
@@ -214,14 +217,15 @@ def _count_below_edge(
 
 @kernel(inline=True)
 def _blurred_steps(fx: float, plane: SupportingPlane, x: float, y: float, z: float) -> int:
-    """Return the number of steps below an edge that the cells next to it may not show.
+    """Return the number of steps below an edge that cannot be told from what is beyond it.
 
-    From above, these cells show what is beyond the edge instead.
+    ``x``, ``y``, ``z`` are a point of the edge, metres, sensor frame; ``fx`` is in cells. Seen
+    from above, the side below an edge covers few cells, and the edge is blurred.
     """
     up, distance2 = plane.up, x * x + y * y + z * z
     height = x * up[0] + y * up[1] + z * up[2]
-    level = math.sqrt(max(distance2 - height * height, PLANES.step_m**2))
-    return int(EDGE_CELLS * distance2 / (fx * level * PLANES.step_m)) + 1
+    horizontal = math.sqrt(max(distance2 - height * height, PLANES.step_m**2))
+    return int(EDGE_CELLS * distance2 / (fx * horizontal * PLANES.step_m)) + 1
 
 
 @kernel(inline=True)

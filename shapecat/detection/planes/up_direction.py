@@ -18,9 +18,9 @@ MAX_DIRECTIONS = 4
 """Maximum number of directions to find: level surface and the walls of a corner make three."""
 BLOCK = 512
 """Number of normals after which a direction that can no longer win is dropped."""
-GRAZING = 0.1
-"""Lower bound of the cosine between a normal and a ray, in areas: at smaller angles, noise decides.
-"""
+GRAZING_COS = 0.1
+"""Lower bound of the cosine between a normal and a ray where an area is measured: at more grazing
+angles, noise decides."""
 BINS = 80
 """Number of bins of `UpSettings.level_bin_m`: the floor is no more than 3 m below the camera."""
 
@@ -63,7 +63,10 @@ def estimate_up(
 
 @kernel(inline=True)
 def _every_second(points: OrientedPoints, intrinsics: PinholeIntrinsics) -> F4:
-    """Return the normals, positions, weights and areas (8, n) of every second point, for speed."""
+    """Return normals, positions, weights and areas (8, n) of every second point, for speed.
+
+    Positions are in metres, areas in m2.
+    """
     normals, positions = points.normals, points.positions
     surface = np.zeros((8, normals.shape[1] // 2 + 1), np.float32)
     cell = 2 * STRIDE * STRIDE / (intrinsics.fx * intrinsics.fy)
@@ -74,7 +77,7 @@ def _every_second(points: OrientedPoints, intrinsics: PinholeIntrinsics) -> F4:
         surface[6, n] = 1 / (1 + (positions[2, k] / UP.half_weight_m) ** 2)
         x, y, z = positions[0, k], positions[1, k], positions[2, k]
         distance = -(normals[0, k] * x + normals[1, k] * y + normals[2, k] * z)  # of the plane
-        surface[7, n] = cell * z**3 / max(distance, GRAZING * z, 1e-9)
+        surface[7, n] = cell * z**3 / max(distance, GRAZING_COS * z, 1e-9)
         n += normals[2, k] != 0
     return surface[:, :n].copy()
 
@@ -189,15 +192,16 @@ def _score(surface: F4, direction: F8, roll_penalty: float) -> float:
     frontal = 1 - UP.frontal_penalty * direction[2] ** 2
     across, down = direction[0] ** 2, max(direction[1], 0.0) ** 2
     roll = (across + down) / (across + direction[1] ** 2 + UP.frontal_sin2)
-    size = level**UP.level_exponent * min(area / UP.enough_m2, 1.0)
+    size = level**UP.level_exponent * min(area / PLANES.furniture_m2, 1.0)
     pure = purity**UP.purity_exponent
     return float(size * levels * pure * frontal / (1 + roll_penalty * roll))
 
 
 @kernel(inline=True)
 def _large_levels(count: F8, areas: F8, min_weight: float) -> tuple[float, float, float]:
-    """Return the sum of the weights of levels above ``min_weight``, and the sum of their squares.
+    """Sum the weights of levels above ``min_weight``, the squares of these, and the areas.
 
+    ``count`` and ``areas`` (bins,) are the weights and the areas, m2, by height.
     A level fills two bins, and has more weight than its neighbours: slanted surface has no peaks.
     """
     weight = squares = area = 0.0
@@ -221,7 +225,8 @@ def _large_levels(count: F8, areas: F8, min_weight: float) -> tuple[float, float
 def _count_levels(surface: F4, direction: F8) -> tuple[F8, F8, float, float]:
     """Sum the weights of the points that face a direction, by their height below the sensor.
 
-    Returns the weight in each bin, (BINS,), the sum over the bins, and the weight of all points.
+    Returns the weight and the area, m2, in each bin, (BINS,) each, the sum of the weights over the
+    bins, and the weight of all points.
     """
     x, y, z = np.float32(direction[0]), np.float32(direction[1]), np.float32(direction[2])
     nx, ny, nz, weights = surface[0], surface[1], surface[2], surface[6]

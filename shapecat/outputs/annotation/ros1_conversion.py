@@ -65,7 +65,7 @@ def convert_channel(channel: Channel) -> ConvertedChannel | None:
     """
     name = _RENAMED.get(channel.type, channel.type)
     try:
-        store, text = _store_of(channel._replace(topic="", metadata=()), name)
+        store, text = _ros2_types(channel._replace(topic="", metadata=()), name)
     except LIBRARY_ERRORS:
         return None
     latched = dict(channel.metadata).get("latching") == "1"
@@ -75,8 +75,8 @@ def convert_channel(channel: Channel) -> ConvertedChannel | None:
 
 
 @lru_cache(_KEPT)
-def _store_of(channel: Channel, name: str) -> tuple[Typestore, bytes]:
-    """Return the types that convert a channel's messages, and their ROS 2 definition."""
+def _ros2_types(channel: Channel, name: str) -> tuple[Typestore, bytes]:
+    """Return the types that convert a channel's messages, and the ROS 2 definition of ``name``."""
     types = dict(typestore_of(channel).fielddefs)
     if name != channel.type:
         types[name] = types.pop(channel.type)
