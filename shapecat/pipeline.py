@@ -31,6 +31,7 @@ from shapecat.runs.identity import ContentDigest, file_stats, same_content
 from shapecat.runs.jobs import (
     Job,
     Summary,
+    add_warnings,
     describe_run,
     differences,
     identify,
@@ -231,7 +232,7 @@ def annotate(folder: Path, recording: Recording, run: RunInfo, observe: Observer
         )
     if run["options"]["rrd"]:
         _run_once("review.rrd", folder, run, lambda: _write_review(folder, recording, run, observe))
-    run["warnings"] = list(dict.fromkeys([*run["warnings"], *recording.warnings]))
+    add_warnings(run, recording.warnings)
     if run["options"]["mcap"]:
         _run_once(
             "annotated.mcap", folder, run, lambda: _write_mcap(folder, recording, run, observe)
@@ -270,6 +271,7 @@ def _write_mcap(folder: Path, recording: Recording, run: RunInfo, observe: Obser
         images=read_image_frames(folder, labels) if topics else (),
         image_topics=topics,
     )
+    add_warnings(run, recording.warnings)  # a recording that is rewritten is read as a whole
 
 
 def annotate_again(

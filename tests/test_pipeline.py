@@ -276,6 +276,25 @@ def test_repeated_warning_is_stored_once(tmp_path: Path) -> None:
     assert run["warnings"] == ["skipped 3", "tilted", "no index"]
 
 
+def test_damage_found_while_recording_is_rewritten_is_reported(
+    guessed_run: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """If annotated.mcap is added to a finished run, only then are all messages read."""
+    folder = shutil.copytree(guessed_run, tmp_path / "table")
+    run = read_run(folder)
+    del run["seconds"]["annotated.mcap"]
+    run["options"] |= {"mcap": True, "rrd": False}
+    recording: Any = SimpleNamespace(warnings=["no index"], topics=())
+    monkeypatch.setattr(
+        "shapecat.outputs.annotation.annotated_mcap.write_annotated",
+        lambda source, *_, **__: source.warnings.append("skipped the chunk at byte 7"),
+    )
+    annotate(folder, recording, run)
+
+    assert run["warnings"][-2:] == ["no index", "skipped the chunk at byte 7"]
+    assert read_run(folder)["warnings"] == run["warnings"]
+
+
 def test_bad_recording_does_not_stop_the_others(
     shapecat: Run, recording: Path, tmp_path: Path
 ) -> None:

@@ -2,7 +2,7 @@
 
 import dataclasses
 import platform
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, field
 from importlib.metadata import version
 from pathlib import Path
@@ -26,6 +26,7 @@ from shapecat.runs.run_info import Options, OriginInfo, RunInfo
 __all__ = [
     "Job",
     "Summary",
+    "add_warnings",
     "describe_run",
     "differences",
     "identify",
@@ -183,6 +184,11 @@ def _words(value: Any) -> str:
     """Return the value of an entry as text."""
     text = ", ".join(map(str, value)) if isinstance(value, list) else str(value)
     return "default" if value is None else text or "none"
+
+
+def add_warnings(run: RunInfo, warnings: Iterable[str]) -> None:
+    """Add warnings to a run, each once."""
+    run["warnings"] = list(dict.fromkeys([*run["warnings"], *warnings]))
 
 
 def identify(run: RunInfo, content: ContentDigest) -> None:
