@@ -17,14 +17,14 @@ from shapecat.errors import ConfigError
 from shapecat.geometry import IDENTITY, transform
 from shapecat.perception import Perceiver, PerceptionInput
 from shapecat.reuse import shows_the_same
-from shapecat.reuse.views import KeyView, _similar, find_repeats, view_object
+from shapecat.reuse.views import KeyView, _similar, find_repeats, reused, view_object
 from shapecat.runs.jobs import Job
 from shapecat.simulation import KINECT, make_scene, render_frame
 from shapecat.simulation.recorder import record
 from shapecat.simulation.scenes.worlds import Motion, World
 from shapecat.tracking.detection_table import gather
 from shapecat.tracking.records import FrameDetections
-from shapecat.types import Box, Candidate, Detection, Frame, FullBox, Perception, Pose
+from shapecat.types import Box, Candidate, Detection, Frame, FullBox, NeuralGas, Perception, Pose
 from tests.conftest import Guesser
 
 FRAMES, CHANGE = 6, 3
@@ -250,6 +250,54 @@ def test_object_with_a_part_more_or_less_is_described_again(before: int, now: in
     (repeat,) = find_repeats(sights[1:], [KeyView(sights[0], described)])
 
     assert (repeat is not None) == (before == now)
+
+
+ASIDE = 4 / KINECT.camera.fx
+"""A shift in metres, or a turn in radians, by which a thing 1 m away moves by 4 pixels."""
+
+
+@pytest.mark.parametrize(
+    ("pose", "moved_px"),
+    [
+        (Pose(np.eye(3), np.array([ASIDE, 0, 0])), 4),
+        (Pose(Rotation.from_rotvec([0, ASIDE, 0]).as_matrix(), np.zeros(3)), 4),
+        (IDENTITY, 0),
+    ],
+)
+def test_reused_surface_and_box_follow_a_shift_or_turn_alone(pose: Pose, moved_px: int) -> None:
+    """A camera on a rail never turns, and one that pans never moves: both change its view."""
+    sights = []
+    for k, (placed_at, left) in enumerate(((IDENTITY, 300), (pose, 300 - moved_px))):
+        mask = np.zeros((480, 640), np.bool_)
+        mask[200:240, left : left + 40] = True
+        depth = np.where(mask, 1.0, 1.3).astype(np.float32)
+        center = np.array([-moved_px * k / KINECT.camera.fx, -0.04, 1.0])
+        box = Box(center, np.array([0.1, 0.07, 0.05]), np.array([0, 0, 0, 1.0]))
+        found = Candidate(np.flatnonzero(mask), box, 0, None, 0.0, False, False)
+        frame = replace(blank(k), depth=depth)
+        sights.append(view_object(frame, placed_at, found, np.array([0, -1.0, 0]), 0.03))
+    neurons = np.array([[0.01, -0.05, 1.0], [-0.02, -0.03, 1.02]])
+    turn = Rotation.from_euler("xyz", [0.3, -0.2, 0.5]).as_quat()
+    full = FullBox(np.array([0.01, -0.04, 1.05]), np.ones(3), turn, np.ones(3), np.ones(96))
+    known = Detection(
+        sights[0].candidate,
+        NeuralGas(neurons, np.array([[0, 1]])),
+        np.zeros(3),
+        np.array([0.3, 0.7]),
+        0.5,
+        0.0,
+        full,
+    )
+    (repeat,) = find_repeats(sights[1:], [KeyView(sights[0], known)])
+
+    assert repeat is not None
+    again = reused(repeat, sights[1])
+    assert again.candidate is sights[1].candidate
+    np.testing.assert_allclose(transform(pose, again.gas.neurons), neurons, atol=1e-6)
+    assert again.full is not None
+    place, now = placed(pose, again.full)
+    np.testing.assert_allclose(place, full.center, atol=1e-6)
+    assert (now.inv() * Rotation.from_quat(turn)).magnitude() < 1e-6
 
 
 def test_wrong_pose_prevents_reuse() -> None:
