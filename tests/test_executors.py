@@ -88,6 +88,18 @@ def test_unpicklable_task_fails_alone() -> None:
     one.shutdown()
 
 
+def test_cancelled_task_leaves_its_worker_free() -> None:
+    """A worker that counts it as sent gets no further task, and the command never ends."""
+    one = LocalExecutor(1)
+    try:
+        held = one.submit(time.sleep, 0.2)
+        assert all(one.submit(abs, -k).cancel() for k in range(3))
+        assert one.submit(abs, -7).result(20) == 7
+        assert held.done()
+    finally:
+        one.terminate()
+
+
 def test_busy_worker_receives_next_task() -> None:
     """Otherwise the worker would be idle while 20 MB of frames arrive."""
     one = LocalExecutor(1, ahead=1)
