@@ -539,6 +539,8 @@ def test_overlapping_chunks_are_merged_in_bounded_memory(monkeypatch: pytest.Mon
     assert opened == [2, 3, 1, 0]
     monkeypatch.setattr(chunked, "_PENDING", 100)  # bytes: the next chunk waits for room
     assert [n for _, n in merged()] == [2, 2, 2, 3, 3, 1, 1, 1, 0, 0]
+    monkeypatch.setattr(chunked, "_PENDING", 350)  # each message that is handed out makes room
+    assert merged() == everything
 
 
 def test_slerp_agrees_with_scipy() -> None:
