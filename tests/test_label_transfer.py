@@ -122,7 +122,7 @@ def make_run(
     empty = {field.name: [None] * len(rows) for field in DETECTIONS}
     sides = size if isinstance(size, tuple) else (size, size, 1.3 * size)
     sizes = [list(first_size or sides), *[list(sides)] * (len(rows) - 1)]
-    found = {**empty, **found, "size": sizes}
+    found = {**empty, **found, "size": sizes[: len(rows)]}
     write_table(folder / "detections.parquet", found, DETECTIONS)
     write_table(folder / "frames.parquet", {f.name: [] for f in FRAMES}, FRAMES)
     write_csv(folder / "tracks.csv", objects, work, labels or {})
@@ -301,6 +301,25 @@ def test_frames_with_equal_stamps_are_told_apart(tmp_path: Path) -> None:
     transfer_labels(source, target)
 
     assert labels_of(target) == {1: "mug", 2: "tin"}
+
+
+def test_run_without_objects_misses_each_label(tmp_path: Path) -> None:
+    """An error about fixed frames, which one recording does not need, would hide the reason."""
+    labels = {1: "mug", 2: "merge with 1"}
+    objects = {1: static(CUP), 2: static(CAN)}
+    source = make_run(tmp_path / "source", objects, labels=labels, fixed_frame=None)
+    target = make_run(tmp_path / "target", {}, fixed_frame=None)
+
+    transfer = transfer_labels(source, target)
+
+    assert not transfer.transferred
+    assert {(item.old_track, item.label): item.reason for item in transfer.missed} == {
+        (1, "mug"): "nothing was found there",
+        (2, "merge with 1"): "track 1, which it is merged with: nothing was found there",
+    }
+    listed = read_run(target)["corrections"]
+    assert (listed["by"], listed["transferred"]) == ("frames in common", [])
+    assert len(listed["not_transferred"]) == 2
 
 
 def test_both_parts_of_split_track_are_labelled(tmp_path: Path) -> None:
