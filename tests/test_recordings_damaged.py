@@ -62,6 +62,26 @@ def test_index_without_checksum_is_compared_with_the_chunks(tmp_path: Path, dama
         assert len(recording.warnings) == (1 if damaged else 0)
 
 
+def test_damage_is_reported_once_and_only_where_it_is_read(tmp_path: Path) -> None:
+    """Comparing an index with the chunks reads all of them; a run of other topics lacks nothing."""
+    path = tmp_path / "a.mcap"
+    with mcap_writer(path, enable_crcs=False, chunk_size=60) as writer:
+        for name, time in (("/a", 3), ("/b", 5)):
+            channel = writer.register_channel(name, "x-text", 0)
+            writer.add_message(channel, time, b"m" * 52, time)
+    replace(path, b"\4\0\0\0zstd", b"\4\0\0\0zst9", 1)
+
+    with open_recording(path) as recording:
+        assert recording.indexed
+        assert recording.warnings == []
+        assert [message.log_time_ns for message in recording.messages(["/a"])] == [3]
+        assert recording.warnings == []
+        for _ in range(2):
+            assert [message.log_time_ns for message in recording.messages()] == [3]
+            (warning,) = recording.warnings
+    assert warning.endswith("chunk compression 'zst9' is not supported")
+
+
 @pytest.mark.parametrize(
     ("old", "new", "nth", "reason"),  # of the second chunk: the first one holds the channel
     [
