@@ -62,6 +62,32 @@ def test_index_without_checksum_is_compared_with_the_chunks(tmp_path: Path, dama
         assert len(recording.warnings) == (1 if damaged else 0)
 
 
+@pytest.mark.parametrize(
+    ("needed", "full", "without_data"),
+    [
+        (None, [3, 4, 8, 9], []),  # a copy of the recording must not get empty messages
+        ({3, 4, 5, 6, 8, 9}, [3, 4, 8, 9], [5, 6]),
+        ({9}, [9], [3, 4, 5, 6, 8]),
+    ],
+)
+def test_destroyed_messages_count_where_messages_are_chosen(
+    tmp_path: Path, needed: set[int] | None, full: list[int], without_data: list[int]
+) -> None:
+    """A frame of a run is found again by its number, whether its neighbours are read or not."""
+    path = tmp_path / "a.mcap"
+    with mcap_writer(path, chunk_size=120) as writer:
+        channel = writer.register_channel("/a", "x-text", 0)
+        for time in (3, 4, 5, 6, 8, 9):
+            writer.add_message(channel, time, b"m" * 52, time)
+    replace(path, b"\4\0\0\0zstd", b"\4\0\0\0zst9", 1)
+
+    with open_recording(path) as recording:
+        chosen = None if needed is None else lambda _topic, time: time in needed
+        messages = list(recording.messages(needed=chosen))
+    assert [m.log_time_ns for m in messages if m.data] == full
+    assert [m.log_time_ns for m in messages if not m.data] == without_data
+
+
 def test_damage_is_reported_once_and_only_where_it_is_read(tmp_path: Path) -> None:
     """Comparing an index with the chunks reads all of them; a run of other topics lacks nothing."""
     path = tmp_path / "a.mcap"

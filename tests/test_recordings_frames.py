@@ -11,6 +11,7 @@ import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from mcap.reader import make_reader
 
 from shapecat.errors import NoStreamError
 from shapecat.recordings import (
@@ -120,6 +121,50 @@ def test_needed_frames_equal_those_of_full_read(
         same = all_frames[frame.index]
         assert (frame.stamp_ns, frame.camera) == (same.stamp_ns, same.camera)
         np.testing.assert_array_equal(frame.depth, same.depth)
+
+
+@pytest.mark.parametrize("latched", [False, True])
+@pytest.mark.parametrize("damage", ["chunk", "message"])
+def test_frames_after_damage_have_the_numbers_of_full_read(
+    tmp_path: Path, damage: str, *, latched: bool
+) -> None:
+    """What damage has destroyed is counted by the index alone, where it need not be read.
+
+    Otherwise a review, a report or every n-th frame of a run showed frames that were others.
+    """
+    items: list[tuple[str, int, Any]] = []
+    for k in range(20):
+        stamp = EPOCH + k * SECOND
+        if k == 0 or not latched:
+            items.append(("/depth/camera_info", stamp, info(stamp)))
+        depth: Any = image(stamp, wavy_depth() + np.float32(0.1 * k))
+        if damage == "message" and k in {6, 7}:
+            depth = (IMAGE, b"\x28\xb5\x2f\xfd" + bytes(9))  # compressed by rosbag2, and cut
+        items.append(("/depth/image_rect", stamp + 1, depth))
+    path = write(tmp_path / "a.mcap", items, chunk_size=25_000)
+    if damage == "chunk":
+        with path.open("rb") as file:
+            summary = make_reader(file).get_summary()
+        assert summary is not None
+        second = sorted(summary.chunk_indexes, key=lambda chunk: chunk.message_start_time)[1]
+        data = bytearray(path.read_bytes())
+        data[second.chunk_start_offset + second.chunk_length // 2] ^= 0xFF
+        path.write_bytes(data)
+
+    every_2nd, skipped, warnings = read(path, every=2)
+    times = {frame.log_time_ns for frame in every_2nd[-4::3]}
+    again, *_ = read(path, every=2, needed=lambda _, log_time_ns: log_time_ns in times)
+
+    numbers = [(frame.index, (frame.log_time_ns - EPOCH) // SECOND) for frame in every_2nd]
+    assert all(number == second for number, second in numbers)
+    lost = set(range(0, 20, 2)) - {number for number, _ in numbers}
+    assert lost
+    assert max(lost) < every_2nd[-4].index
+    assert skipped == {"cannot decode sensor_msgs/msg/Image: it has no data": len(lost)}
+    assert any("damaged" in warning for warning in warnings)
+    assert [(frame.index, frame.stamp_ns) for frame in again] == [
+        (frame.index, frame.stamp_ns) for frame in every_2nd[-4::3]
+    ]
 
 
 def test_depth_image_and_organized_cloud_give_same_frame(tmp_path: Path) -> None:

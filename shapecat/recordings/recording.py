@@ -70,7 +70,7 @@ class Recording(ABC):
         topics : names to read; all by default.
         start_ns, stop_ns : messages with ``start_ns <= log time < stop_ns`` are read.
         needed : returns whether the data of a message is needed. Other messages from an indexed
-            file may have empty data.
+            file may have empty data, and those that damage has destroyed have: all are counted.
 
         Yields
         ------

@@ -150,6 +150,8 @@ class ChunkedRecording(Recording):
                 continue
             unneeded = selection.needed and not selection.needed(channel.topic, raw.log_time)
             data = b"" if unneeded else decompressed(self, channel, raw.data)
+            if data is None and selection.needed:
+                data = b""  # it counts, as it does where it is not needed
             if data is not None:
                 times = raw.log_time, raw.publish_time
                 yield Message(channel, *times, raw.sequence, detached(data))

@@ -7,6 +7,7 @@ skipped, and a warning reports either.
 import sys
 from collections.abc import Iterator
 from contextlib import suppress
+from operator import attrgetter
 from pathlib import Path
 from typing import ClassVar
 
@@ -196,7 +197,9 @@ class McapRecording(ChunkedRecording):
     ) -> Iterator[RawMessage]:
         """Yield the messages of a chunk; those after the last needed one have no data.
 
-        Reading only transforms, or few images of many, then decompresses little.
+        Reading only transforms, or few images of many, then decompresses little. If messages are
+        chosen by ``needed``, those that damage has destroyed have no data either: a frame has the
+        same number whether the chunk was read or not.
         """
 
         def is_needed(message: IndexedMessage) -> bool:
@@ -209,14 +212,18 @@ class McapRecording(ChunkedRecording):
         end = min((m.place for m in indexed if m.place > last), default=size)
         if end > _PART * size:
             end = size
+        count = 0
         if last >= 0 or not indexed:
             record = self._record_at(chunk.position)
             if record is None or record.opcode != Opcode.CHUNK:
                 self.warn(f"no chunk at byte {chunk.position}, where the index has one")
             else:
-                yield from self._split(record, end if end < size else None)
-        for number, time, place in indexed:
-            if place >= end:
+                for message in self._split(record, end if end < size else None):
+                    count += 1
+                    yield message
+        if selection.needed is not None:
+            described = [m for m in indexed if m.channel_id in self._channels]
+            for number, time, _ in sorted(described, key=attrgetter("place"))[count:]:
                 yield RawMessage(number, 0, time, time, memoryview(b""))
 
     def _channel(self, channel: records.Channel) -> Channel:

@@ -62,6 +62,8 @@ def decode(message: Message, decoders: dict[tuple[str, str, bytes], Decoder]) ->
         return as_ros(channel.type, decoders[key](message.data))
     except LIBRARY_ERRORS as error:
         reason = " ".join(str(error).split())[:120] or type(error).__name__
+        if not message.data:
+            reason = "it has no data"
         if channel.encoding not in _DECODERS:
             reason = f"encoding {channel.encoding!r} is not supported"
         msg = f"{channel.topic}: cannot decode {channel.type}: {reason}"
