@@ -34,7 +34,7 @@ from shapecat.executors import (
     usable_cores,
 )
 from shapecat.executors.dask import _DaskExecutor
-from shapecat.executors.ordered_pool import OrderedPool
+from shapecat.executors.ordered_pool import _MOST_PENDING, OrderedPool
 from shapecat.system import stopping
 from shapecat.types import Camera, Frame
 from tests.processes import alive, wait_for
@@ -78,6 +78,19 @@ def test_results_errors_and_deaths_reach_their_futures(executor: Executor) -> No
 def test_workers_do_not_load_pandas(executor: Executor) -> None:
     """Arrow loads it with its first array, which takes half a second in each worker."""
     assert not executor.submit(loads_pandas).result()
+
+
+def test_replaced_workers_leave_nothing_open() -> None:
+    """In a batch of thousands of recordings, each that kills its worker would cost a file."""
+
+    def kill() -> tuple[int, int]:
+        assert isinstance(one.submit(kill_self).exception(), WorkerLostError)
+        assert one.submit(abs, -3).result() == 3
+        return len(os.listdir("/dev/fd")), threading.active_count()  # noqa: PTH208  no paths
+
+    with LocalExecutor(1) as one:
+        first = kill()
+        wait_for(lambda: kill() == first, seconds=20)
 
 
 def test_unpicklable_task_fails_alone() -> None:
@@ -366,7 +379,7 @@ def test_processes_keep_order_and_hold_few_items() -> None:
     def items() -> Iterator[tuple[int, int]]:
         more = 100
         for k in count():
-            assert k - len(used) <= 65
+            assert k - len(used) <= _MOST_PENDING
             yield k, k
             more -= len(workers) == 3  # others take a while to come up
             if more == 0 or time.monotonic() > deadline:
