@@ -279,6 +279,19 @@ def test_memory_does_not_grow_with_recording(tmp_path: Path) -> None:
     assert peak < 8 << 20
 
 
+def test_kept_small_message_does_not_keep_its_chunk(tmp_path: Path) -> None:
+    """Transforms are kept by the thousand, each from a chunk of megabytes."""
+    path = tmp_path / "a.mcap"
+    with mcap_writer(path, "") as writer:
+        channel = writer.register_channel("/blob", "raw", 0)
+        for time, size in ((3, 10), (5, 1 << 20), (8, 70)):
+            writer.add_message(channel, time, bytes(size), time)
+    with open_recording(path) as recording:
+        kept = [memoryview(message.data).obj for message in recording.messages()]
+
+    assert [memoryview(buffer).nbytes for buffer in kept[::2]] == [10, 70]
+
+
 def write_bag(path: Path, compression: Any = None) -> Path:
     writer = BagWriter(path)
     if compression is not None:

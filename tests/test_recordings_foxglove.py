@@ -203,8 +203,12 @@ def test_transforms_are_read(
         np.testing.assert_array_equal(pose.rotation, np.eye(3))
 
 
-def test_transform_long_before_first_frame_is_known(tmp_path: Path) -> None:
-    """With --start, an earlier pose would be mistaken for the present one."""
+@pytest.mark.parametrize("beside_ros", [False, True])
+def test_transform_long_before_first_frame_is_known(tmp_path: Path, *, beside_ros: bool) -> None:
+    """With --start, an earlier pose would be mistaken for the present one.
+
+    A recording may hold transforms of ROS as well, which do not remain valid.
+    """
     path = tmp_path / "a.mcap"
     with mcap_writer(path, "", chunk_size=100) as writer:
         kind = writer.register_schema("foxglove.FrameTransform", "jsonschema", b"{}")
@@ -219,6 +223,10 @@ def test_transform_long_before_first_frame_is_known(tmp_path: Path) -> None:
             }
             stamp = EPOCH + second * SECOND
             writer.add_message(channel, stamp, json.dumps(values).encode(), stamp)
+            if beside_ros:
+                kind = writer.register_schema("tf2_msgs/msg/TFMessage", "jsonschema", b"{}")
+                other = writer.register_channel("/wheels", "json", kind)
+                writer.add_message(other, stamp, b'{"transforms": []}', stamp)
 
     stamp = EPOCH + 45 * SECOND
     with open_recording(path) as recording:
