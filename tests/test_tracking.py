@@ -290,6 +290,20 @@ def test_unrelated_images_of_equal_objects_are_scene_cuts() -> None:
     assert scene_cuts(next(gather(frames)), SETTINGS)[1:].mean() > 0.8
 
 
+def test_scene_cut_seen_by_two_cameras_is_one() -> None:
+    """The first image after it would be a scene of its own, in which each object is confirmed."""
+    frames = []
+    for k in range(8):
+        look: Any = {"posterior": CUP} if k < 4 else {"size": (0.3, 0.2, 0.04), "posterior": BOX}
+        for topic, y, late in (("/left", 0.0, 0), ("/right", 1.0, SECOND // 20)):
+            stamp = k * SECOND // 10 + late
+            places = [[0.04 * (k > 3), y, 0], [0.4 + 0.03 * (k > 3), y, 0]]
+            frames.append(frame(k, places, stamp_ns=stamp, topic=topic, **look))
+    (hits,) = gather(frames, {"/left", "/right"})
+
+    assert np.flatnonzero(scene_cuts(hits, SETTINGS)).tolist() == [8]
+
+
 def test_takes_joined_without_a_pause_are_a_scene_cut() -> None:
     """Between two frames at full rate, all objects are exchanged for others."""
     before, after = [[0, 0, 0], [0.4, 0, 0]], [[0.05, 0.02, 0], [0.43, -0.04, 0]]
