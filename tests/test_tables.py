@@ -142,12 +142,12 @@ def test_segments_are_written_when_full_or_old(
     monkeypatch.setattr(f"{place}.time", SimpleNamespace(monotonic=lambda: clock[0]))
     stored = []
     with PerceptionTables(tmp_path, categories=CATEGORIES, model_id="m1") as tables:
-        for index in range(_SEGMENT_FRAMES + 3):
-            clock[0] += {_SEGMENT_FRAMES + 1: 1.9, _SEGMENT_FRAMES + 2: 0.2}.get(index, 0)
+        for index in range(_SEGMENT_FRAMES + 6):
+            clock[0] += {1: 1.9, 2: 0.2}.get(index - _SEGMENT_FRAMES, 0)
             tables.write([perception(index, 1)], [FrameRow(2000 + index, None)])
             stored.append(len(list_segments(tmp_path / SEGMENTS)))
 
-    assert stored == [0] * (_SEGMENT_FRAMES - 1) + [1] * 3 + [2]
+    assert stored == [0] * (_SEGMENT_FRAMES - 1) + [1] * 3 + [2] * 4  # the next one begins
 
 
 def test_second_look_without_result_does_not_replace_frame(
