@@ -523,6 +523,22 @@ def test_topics_of_one_type_share_its_conversion(monkeypatch: pytest.MonkeyPatch
     assert len(asked) == 1
 
 
+def test_topics_without_messages_are_kept(tmp_path: Path) -> None:
+    """They show that a camera was there, although it sent nothing."""
+    source, target = tmp_path / "a.bag", tmp_path / "out.mcap"
+    with BagWriter(source) as writer:
+        connection = writer.add_connection("/text", STRING, typestore=STORE1)
+        writer.add_connection("/silent", "sensor_msgs/msg/Image", typestore=STORE1)
+        writer.write(connection, EPOCH, STORE1.serialize_ros1(STORE1.types[STRING]("fine"), STRING))
+
+    annotate(source, target)
+
+    with open_recording(target) as recording:
+        counts = {topic.name: (topic.type, topic.count) for topic in recording.topics}
+    assert counts["/silent"] == ("sensor_msgs/msg/Image", 0)
+    assert counts["/text"] == (STRING, 1)
+
+
 def test_unconvertible_message_is_wrapped(tmp_path: Path) -> None:
     """Two encodings in one file would make it unreadable for ROS tools."""
     source, target = tmp_path / "a.bag", tmp_path / "out.mcap"
