@@ -18,23 +18,28 @@ TURN = np.array([[0.0, 0.8, 0.6], [-1.0, 0.0, 0.0], [0.0, -0.6, 0.8]])
 """Rotation of a camera that looks along x and down, in the map."""
 
 
-def write_run(folder: Path, speed_m_s: float, axes: F8, carried_m_s: float = 0) -> None:
+def write_run(
+    folder: Path, speed_m_s: float, axes: F8, carried_m_s: float = 0, *, cells: int = 1
+) -> None:
     """Write the frames of a camera that drives along x, whose frame has other ``axes`` (3, 3).
 
-    Some frames are without objects.
+    Some frames are without objects. In each of ``cells`` equal rooms there is such a camera.
     """
-    rows: dict[str, list[Any]] = {"center": [], "center_fixed": [], "frame": []}
+    rows: dict[str, list[Any]] = {"topic": [], "center": [], "center_fixed": [], "frame": []}
     frames = range(40)
     for k in (k for k in frames if k % 7 != 2):
         place = np.array([0.1 * k * speed_m_s, -0.2, 1.3])
         own = (OBJECTS + np.array([0.1 * k * carried_m_s, 0, 0]) - place) @ TURN
-        rows["center"] += own.tolist()
-        rows["center_fixed"] += (own @ axes @ TURN.T + place).tolist()
-        rows["frame"] += [k] * len(own)
-    rows["topic"] = ["/depth"] * len(rows["frame"])
-    stamps = [EPOCH + k * SECOND // 10 for k in frames]
-    seen: dict[str, list[Any]] = {"topic": ["/depth"] * len(frames), "stamp_ns": stamps}
-    seen["frame"] = list(frames)
+        for cell in range(cells):
+            rows["center"] += own.tolist()
+            rows["center_fixed"] += (own @ axes @ TURN.T + place + [0, 3.0 * cell, 0]).tolist()
+            rows["frame"] += [k] * len(own)
+            rows["topic"] += [f"/depth{cell or ''}"] * len(own)
+    seen: dict[str, list[Any]] = {
+        "topic": [f"/depth{cell or ''}" for _ in frames for cell in range(cells)],
+        "stamp_ns": [EPOCH + k * SECOND // 10 for k in frames for _ in range(cells)],
+        "frame": [k for k in frames for _ in range(cells)],
+    }
     for name, schema, columns in (("frames", FRAMES, seen), ("detections", DETECTIONS, rows)):
         nulls = [None] * len(columns["frame"])
         filled = {field.name: columns.get(field.name, nulls) for field in schema}
@@ -62,3 +67,13 @@ def test_poses_that_are_worse_than_none_are_reported(
 
     warnings = list(explain_misplacement(tmp_path, "map"))
     assert [w.split(":")[0] for w in warnings] == ["/depth"] * warns
+
+
+@pytest.mark.parametrize(("axes", "topics"), [(np.eye(3), []), (OPENGL, ["/depth", "/depth1"])])
+def test_sensors_are_not_compared_with_each_other(
+    tmp_path: Path, axes: F8, topics: list[str]
+) -> None:
+    """Two robots in equal cells see the same, at places far from each other."""
+    write_run(tmp_path, 0.2, axes, cells=2)
+
+    assert [w.split(":")[0] for w in explain_misplacement(tmp_path, "map")] == topics

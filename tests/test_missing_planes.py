@@ -1,11 +1,12 @@
 """Tests of the warning about missing planes: its reason, in run.json and on screen."""
 
-from collections.abc import Callable, Iterable
+from collections.abc import Callable, Iterable, Iterator
 from pathlib import Path
 from typing import Any, cast
 
 import numpy as np
 import pyarrow.parquet as pq
+import pytest
 from click.testing import Result
 
 from shapecat.config import DetectionSettings, Settings
@@ -14,7 +15,10 @@ from shapecat.recordings import open_recording
 from shapecat.runs.folder import read_run
 from shapecat.runs.jobs import Job
 from shapecat.runs.perceive.missing_planes import explain_missing_planes
+from shapecat.runs.perceive.perceived import FrameRow, PerceptionTables
+from shapecat.runs.tables.segments import GROUP_FRAMES
 from shapecat.simulation.messages import MessageFactory
+from shapecat.types import Frame, Perception, Scene
 from tests.messages import CAMERA, EPOCH, SECOND, write
 from tests.scenes import record
 from tests.test_detection import ball, frame_of, render
@@ -86,6 +90,31 @@ def test_warning_distinguishes_missing_depth_wrong_up_and_noise(tmp_path: Path) 
         "no supporting plane in 3 of 3 frames: "
         "try --up X,Y,Z, or another range with --set detection.max_range_m=M"
     )
+
+
+def test_only_first_frames_without_plane_are_read_again(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Reading hours of depth images would take as long as perceiving them."""
+    scene, asked = Scene(np.array([0, -1, 0], np.float32), (), ()), list[int]()
+    with PerceptionTables(tmp_path, categories=("can",), model_id="m") as tables:
+        for k in range(3 * GROUP_FRAMES):
+            perception = Perception("/depth", k, EPOCH + k, "camera", scene, (), {})
+            tables.write([perception], [FrameRow(EPOCH + k, None)])
+
+    def read(*_: Any, **__: Any) -> Iterator[tuple[Frame, None]]:
+        for k in range(3 * GROUP_FRAMES):
+            asked.append(k)
+            depth = np.full((CAMERA.height, CAMERA.width), 3.5 if k < 3 else 1, np.float32)
+            yield Frame("/depth", k, EPOCH + k, EPOCH + k, "camera", depth, CAMERA), None
+
+    monkeypatch.setattr("shapecat.runs.perceive.missing_planes.read_frames", read)
+    run: Any = {"options": {}, "up": {"source": "planes"}}
+    recording: Any = None
+    (warning,) = explain_missing_planes(recording, tmp_path, run, 2.0)
+
+    assert asked == [0, 1, 2]
+    assert "no supporting plane in 96 of 96 frames: 100% of their depth is beyond" in warning
 
 
 def test_no_warning_if_objects_stand_on_assumed_plane(tmp_path: Path) -> None:
