@@ -58,6 +58,7 @@ from shapecat.outputs.review.paths import Paths
 from shapecat.outputs.review.scenes import choose_scenes, with_clouds
 from shapecat.outputs.scene_tree import _apply_labels, _candidate, _described, _topic
 from shapecat.recordings.messages import Topic
+from shapecat.runs.labelled_frames import _join
 from shapecat.runs.labelled_tracks import LabelledTracks
 from shapecat.runs.labels.meaning import TrackLabel, _slips
 from shapecat.runs.tables.masks import read_nearest_masks
@@ -259,6 +260,22 @@ def test_simultaneous_images_of_two_cameras_are_annotated(
 
     assert [frame.stamp_ns for frame in frames] == [5, 5, 9]
     assert {frame.boxes for frame in frames} == {(ImageBox(6, "cup", 0.8, (3, 4, 7, 9)),)}
+
+
+def test_full_box_of_merged_object_holds_part_without_one() -> None:
+    """The box would end where the full box of the other part ends."""
+    left, right = (labelled_object(6, box=box_at((x, 0.1, 1), (0.1, 0.2, 0.3))) for x in (0, 0.3))
+    wide = box_at((-0.05, 0.1, 1.0), (0.2, 0.2, 0.4))
+
+    whole = _join([replace(left, full=wide), right], [0.0, 0.0, 1.0])
+    visible = _join([left, right], [0.0, 0.0, 1.0])
+
+    assert whole.full is not None
+    ends = whole.full.center[0] - whole.full.size[0] / 2, whole.full.center[0]
+    assert np.allclose(ends, (-0.15, 0.1))
+    assert np.allclose(np.sort(whole.full.size), [0.2, 0.4, 0.5])
+    assert np.allclose(np.sort(whole.box.size), [0.2, 0.3, 0.4])
+    assert visible.full is None
 
 
 def test_merged_track_has_one_box_on_image(

@@ -276,6 +276,30 @@ def test_repeated_warning_is_stored_once(tmp_path: Path) -> None:
     assert run["warnings"] == ["skipped 3", "tilted", "no index"]
 
 
+def test_review_is_told_which_scenes_need_a_place(
+    guessed_run: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Otherwise scenes without a pose are drawn at the origin of the fixed frame."""
+    folder = shutil.copytree(guessed_run, tmp_path / "table")
+    run = read_run(folder)
+    run["seconds"].pop("review.rrd", None)
+    run["options"] |= {"mcap": False, "rrd": True}
+    asked: list[Any] = []
+
+    def draw(*given: Any) -> tuple[Any, ...]:
+        asked.append(given)
+        return ()
+
+    monkeypatch.setattr("shapecat.outputs.review.scenes.with_clouds", draw)
+    monkeypatch.setattr("shapecat.outputs.review.writing.write_review", lambda *_, **__: None)
+    recording: Any = SimpleNamespace(path=tmp_path / "table.mcap", warnings=[])
+    annotate(folder, recording, run)
+
+    ((_, source, about, placed),) = asked
+    assert (source, about) == (recording, run)
+    assert set(placed) == set(run["options"]["topics"])
+
+
 def test_damage_found_while_recording_is_rewritten_is_reported(
     guessed_run: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
