@@ -23,6 +23,7 @@ from shapecat.outputs.review import viewer as review_viewer
 from shapecat.outputs.review import writing as review
 from shapecat.outputs.review.clouds import paint
 from shapecat.outputs.review.columns import Columns, Drawing, curve
+from shapecat.outputs.review.file import ReviewFile
 from shapecat.outputs.review.images import Images
 from shapecat.outputs.review.layout import Eye, TrackView, _track_tabs, choose_eye, stepped_back
 from shapecat.outputs.review.scenes import ReviewFrame, choose_scenes
@@ -101,6 +102,26 @@ def write_frames(path: Path, frames: Iterable[ReviewFrame], **options: Any) -> P
     run |= options.pop("run", {})
     review.write_review(path, frames, **({"name": "lab", "run": run, "labels": {}} | options))
     return path
+
+
+def test_few_frames_are_held_back(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """What is not flushed stays in memory: the frames of hours would fill it."""
+    held, flush = [0], ReviewFile.flush
+
+    def flushed(file: ReviewFile) -> None:
+        held[0] = 0
+        flush(file)
+
+    def frames() -> Iterator[ReviewFrame]:
+        for k in range(70):
+            assert held[0] < 32
+            held[0] += 1
+            yield ReviewFrame(scene(k, [labelled_object(1)])[0])
+
+    monkeypatch.setattr(ReviewFile, "flush", flushed)
+    write_frames(tmp_path / "review.rrd", frames())
+
+    assert held == [0]
 
 
 def as_rows(batch: Any) -> list[dict[str, Any]]:

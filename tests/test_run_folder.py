@@ -12,6 +12,8 @@ from shapecat.errors import OutputError, RecordingError
 from shapecat.recordings.files import input_files
 from shapecat.runs.finished import open_source, require_recordings
 from shapecat.runs.folder import (
+    RUN_FILES,
+    clear,
     previous_path,
     read_run,
     recover,
@@ -40,6 +42,27 @@ def test_staged_folder_appears_complete(tmp_path: Path) -> None:
 
     assert (folder / "a").read_text() == "1"
     assert [p.name for p in folder.parent.iterdir()] == ["lab"]
+
+
+def test_marker_of_a_cleared_folder_is_removed_last(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """After a kill in between, shapecat would take the rest for files of someone else."""
+    for name in (*RUN_FILES, ".tracks.csv.partial", "notes.txt"):
+        (tmp_path / name).write_text("")
+    (tmp_path / "segments" / "000000").mkdir(parents=True)
+    left: list[set[str]] = []
+    unlink = Path.unlink
+
+    def remove(path: Path, *, missing_ok: bool = False) -> None:
+        unlink(path, missing_ok=missing_ok)
+        left.append({item.name for item in tmp_path.iterdir()})
+
+    monkeypatch.setattr(Path, "unlink", remove)
+    clear(tmp_path)
+
+    assert left[-1] == {"notes.txt"}
+    assert left[-2] == {"notes.txt", "run.json"}
 
 
 def test_error_leaves_nothing(tmp_path: Path) -> None:
