@@ -9,7 +9,7 @@ import threading
 import time
 import weakref
 from collections.abc import Iterator
-from concurrent.futures import Executor
+from concurrent.futures import Executor, Future
 from copy import deepcopy
 from itertools import count
 from multiprocessing import active_children
@@ -35,6 +35,7 @@ from shapecat.executors import (
 )
 from shapecat.executors.dask import _DaskExecutor
 from shapecat.executors.ordered_pool import _MOST_PENDING, OrderedPool
+from shapecat.executors.ray import RayExecutor
 from shapecat.system import stopping
 from shapecat.types import Camera, Frame
 from tests.processes import alive, wait_for
@@ -328,6 +329,43 @@ def test_ray_that_does_not_start_is_not_blamed_on_a_scheduler(
         open_executor("ray", workers=1)
     with pytest.raises(ConfigError, match=r"ray://a:1: no Ray cluster answers: no space"):
         open_executor("ray", workers=1, address="ray://a:1")
+
+
+def test_ray_keeps_no_result_of_a_finished_call(monkeypatch: pytest.MonkeyPatch) -> None:
+    """A batch may have millions of recordings, and the end would wait for each again."""
+
+    class Reference:
+        def __init__(self, *_: Any) -> None:
+            self.done: Future[int] = Future()
+
+        def future(self) -> Future[int]:
+            return self.done
+
+    made: list[weakref.ref[Reference]] = []
+
+    def remote(*arguments: Any) -> Reference:
+        reference = Reference(*arguments)
+        made.append(weakref.ref(reference))
+        return reference
+
+    waited: list[int] = []
+    ray = SimpleNamespace(
+        init=lambda **_: None,
+        remote=lambda **_: lambda _: SimpleNamespace(remote=remote),
+        wait=lambda references, **_: waited.append(len(references)),
+        shutdown=lambda: None,
+    )
+    monkeypatch.setitem(sys.modules, "ray", ray)
+    executor = RayExecutor(2, None)
+    first, second = executor.submit(abs, -3), executor.submit(abs, -5)
+    first.set_result(3)
+    del first
+    gc.collect()
+
+    assert [reference() is not None for reference in made] == [False, True]
+    executor.shutdown()
+    assert waited == [1]
+    assert not second.done()
 
 
 def test_dask_logs_no_steps(monkeypatch: pytest.MonkeyPatch) -> None:
