@@ -67,10 +67,11 @@ def frames(
 
     topics = {*sources, *infos, *callbacks}
     for message in recording.messages(topics, limits[0], limits[1], is_needed):
+        # Messages that are not needed have no data, and neither have those that damage destroyed.
         unread = not message.data and not is_needed(message.topic, message.log_time_ns)
-        if message.topic in callbacks and not unread:
+        if message.topic in callbacks and message.data:
             callbacks[message.topic](message)
-        for depth in infos.get(message.topic, ()):
+        for depth in infos.get(message.topic, ()) if message.data else ():
             yield from depth.calibrate(message, skipped)
         chosen = sources.get(message.topic)
         if chosen is not None and message.type == chosen.stream.type:
