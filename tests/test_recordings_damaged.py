@@ -88,6 +88,19 @@ def test_destroyed_messages_count_where_messages_are_chosen(
     assert [m.log_time_ns for m in messages if not m.data] == without_data
 
 
+def test_messages_out_of_order_count_once_in_a_chunk_read_in_part(tmp_path: Path) -> None:
+    """Recorders with several threads do not sort: one would count twice, and another not at all."""
+    path = tmp_path / "a.mcap"
+    with mcap_writer(path) as writer:
+        channel = writer.register_channel("/a", "x-text", 0)
+        for time in (9, 3, 8, 5):
+            writer.add_message(channel, time, b"m" * 52, time)
+
+    with open_recording(path) as recording:
+        messages = list(recording.messages(needed=lambda _topic, time: time in {3, 9}))
+    assert [(m.log_time_ns, len(m.data)) for m in messages] == [(3, 52), (5, 0), (8, 0), (9, 52)]
+
+
 def test_damage_is_reported_once_and_only_where_it_is_read(tmp_path: Path) -> None:
     """Comparing an index with the chunks reads all of them; a run of other topics lacks nothing."""
     path = tmp_path / "a.mcap"
