@@ -454,6 +454,7 @@ def test_failed_transform_look_ups_are_counted(tmp_path: Path) -> None:
     ("begins", "loss"),
     [
         (1, "unknown in 1 of 4 frames, whose objects are not tracked"),
+        (2, "unknown in 2 of 4 frames: its tracks are in the frame of the sensor"),
         (3, "unknown in 3 of 4 frames: its tracks are in the frame of the sensor"),
     ],
 )

@@ -12,7 +12,7 @@ import pytest
 from shapecat import pipeline
 from shapecat.config import Settings, with_overrides
 from shapecat.errors import OutputError
-from shapecat.runs.folder import read_run, write_run
+from shapecat.runs.folder import previous_path, read_run, write_run
 from shapecat.runs.jobs import Job
 from shapecat.runs.labels.track_table import read_track_table
 from shapecat.runs.tables.segments import list_segments
@@ -159,6 +159,19 @@ def test_removed_output_is_written_again(job: Job) -> None:
 
     assert mcap.read_bytes().endswith(b"\x89MCAP0\r\n")
     assert tracks.stat().st_mtime_ns == known
+
+
+@pytest.mark.usefixtures("perceiving_fails")
+def test_finished_run_that_a_kill_moved_away_is_complete(job: Job) -> None:
+    """It waits under a hidden name while it is replaced: hours of work would be done again."""
+    known = read_run(job.folder)["id"]
+    job.folder.rename(previous_path(job.folder))
+
+    summary = pipeline.process(replace(job, overwrite=False, rrd=False))
+
+    assert not summary.processed
+    assert read_run(job.folder)["id"] == known
+    assert not previous_path(job.folder).exists()
 
 
 @pytest.mark.parametrize("total", [None, 950.0])
