@@ -37,12 +37,12 @@ def block(x: float, y: float, z: float, size: tuple[float, float, float]) -> Mes
     return moved(rounded_box(size, fine=1), Pose(np.eye(3), np.array([x, y, z])))
 
 
-def grid_of(meshes: list[Mesh]) -> DepthGrid:
-    """Look down at the origin at 45 degrees from a metre away, without noise."""
-    pose = looking_at(np.array([0, -np.sqrt(0.5), np.sqrt(0.5)]), np.zeros(3))
+def grid_of(meshes: list[Mesh], distance_m: float = 1.0) -> DepthGrid:
+    """Look down at the origin at 45 degrees, without noise."""
+    pose = looking_at(distance_m * np.array([0, -np.sqrt(0.5), np.sqrt(0.5)]), np.zeros(3))
     here = Pose(np.eye(3), np.zeros(3))
     depth = render(geometry([(mesh, here) for mesh in meshes]), CAMERA, pose).depth
-    grid = downsample(freeze(depth, "v u", "f4"), CAMERA, range_m=2.0)
+    grid = downsample(freeze(depth, "v u", "f4"), CAMERA, range_m=2 * distance_m)
     assert grid is not None
     return grid
 
@@ -62,12 +62,12 @@ def heights(meshes: list[Mesh]) -> tuple[list[float], list[float]]:
     return [one.plane.offset + np.sqrt(0.5) for one in planes], [one.covered_m2 for one in planes]
 
 
-def supports(meshes: list[Mesh]) -> list[float]:
+def supports(meshes: list[Mesh], distance_m: float = 1.0) -> list[float]:
     """Return the heights of the supporting planes."""
-    trials = draw_trials(np.random.default_rng(0))
-    planes, up = find_supporting_planes(grid_of(meshes), None, trials, tallest_m=0.6, upright=True)
+    grid, trials = grid_of(meshes, distance_m), draw_trials(np.random.default_rng(0))
+    planes, up = find_supporting_planes(grid, None, trials, tallest_m=0.6, upright=True)
     assert up @ UP > np.cos(np.radians(2))
-    return [plane.offset + np.sqrt(0.5) for plane in planes]
+    return [plane.offset + distance_m * np.sqrt(0.5) for plane in planes]
 
 
 @pytest.mark.parametrize(
@@ -117,6 +117,27 @@ def test_floor_of_raised_bin_is_a_plane_unlike_box_top() -> None:
     ]
     assert supports([ground, body]) == pytest.approx([-0.5], abs=0.01)
     assert supports([ground, body, *sides]) == pytest.approx([-0.5, 0], abs=0.01)
+
+
+def test_layer_of_boxes_is_no_plane_unlike_low_cupboard() -> None:
+    """From 1.5 m, gaps of 1 cm are hardly visible. Objects stand on a cupboard."""
+    ground, cup = block(0, 0, -0.25, (3.0, 3.0, 0.05)), block(0.1, 0.05, 0, (0.06, 0.06, 0.08))
+    cupboard, book = block(0, 0, -0.2, (0.8, 0.6, 0.2)), block(0.1, 0.05, 0, (0.15, 0.1, 0.03))
+    assert supports([ground, *layer(0.01)], 1.5) == pytest.approx([-0.2], abs=0.01)
+    for thing in (cup, book):
+        assert supports([ground, cupboard, thing], 1.5) == pytest.approx([-0.2, 0], abs=0.01)
+
+
+def test_layer_of_boxes_with_another_box_on_it_is_no_plane() -> None:
+    """The camera sees only a few centimetres into the gaps, but farther than the plane."""
+    ground, upper = block(0, 0, -0.25, (3.0, 3.0, 0.05)), block(0.3, 0.14, 0, (0.28, 0.26, 0.1))
+    assert supports([ground, *layer(0.0125), upper], 1.5) == pytest.approx([-0.2], abs=0.01)
+
+
+def layer(gap_m: float) -> list[Mesh]:
+    """Return 3 x 2 boxes with gaps; their tops are at a height of 0."""
+    x, y = (np.arange(3) - 1) * (0.28 + gap_m), (np.arange(2) - 0.5) * (0.26 + gap_m)
+    return [block(a, b, -0.2, (0.28, 0.26, 0.2)) for a in x for b in y]
 
 
 def test_upside_down_camera_is_accepted_for_bare_table() -> None:

@@ -20,9 +20,10 @@ from shapecat.detection.planes.extent import (
     SupportingPlane,
     level_coordinates,
 )
+from shapecat.detection.planes.height_map import min_height_at
 from shapecat.detection.planes.ransac import DepthSamples
 from shapecat.detection.planes.settings import PLANES
-from shapecat.geometry import NEAREST_M
+from shapecat.geometry import NEAREST_M, level_axes
 from shapecat.jit import kernel, unset
 
 __all__ = ["supporting_planes"]
@@ -34,6 +35,10 @@ EDGE_CELLS = 2
 """Number of cells in which an edge is blurred."""
 MIN_BELOW = 20
 """Minimum number of samples below an edge that allow a decision."""
+SPARSE = 2
+"""Step between the rows and columns of the samples that show whether something is on a plane."""
+MIN_ABOVE = 20 // SPARSE**2
+"""Minimum number of these on something on a plane; a small object has more."""
 
 
 def supporting_planes(
@@ -45,11 +50,13 @@ def supporting_planes(
     plane under its middle. The first rule that applies decides:
 
     1. Drop a plane less than 6 cm high.
-    2. Keep the lowest plane, a plane higher than the tallest object, or one of at least 0.25 m2.
-    3. Keep a plane around which the surface rises, as around the floor of a bin.
+    2. Keep the lowest plane, one with no other below it, or one higher than the tallest object.
+    3. Keep a plane around which the surface rises, as around the floor of a bin, unless it is
+       larger than 0.25 m2.
     4. Drop a plane of less than 0.03 m2.
-    5. Keep a plane with no other below it.
-    6. Drop a plane with a wall below its front edge, as below the top of a box.
+    5. Drop a plane with a wall below its front edge, as below the top of a box; but keep one of at
+       least 0.25 m2 with something on it. Bare, it is the tops of boxes with narrow gaps.
+    6. Keep any other plane of at least 0.25 m2.
     7. If little is visible below its front edge, drop a plane of less than 0.1 m2, or one right
        below the camera with nothing on it, such as the top of a carton.
     8. Keep all others.
@@ -78,17 +85,25 @@ def supporting_planes(
                 continue
             if area_m2 < PLANES.board_m2:
                 continue
-        if drop > tallest_m or area_m2 >= PLANES.furniture_m2:
-            supports.append(plane)
-            continue
-        on_wall, beyond = _count_below_edge(grid, samples, plane, drop)
-        if on_wall + beyond >= MIN_BELOW:
-            is_top = on_wall > PLANES.wall_share * (on_wall + beyond)
-        else:
-            is_top = area_m2 < PLANES.likely_m2 or _is_bare_from_above(grid, plane)
-        if not is_top:
+        if drop > tallest_m or not _is_top(grid, samples, plane, drop, area_m2):
             supports.append(plane)
     return supports
+
+
+def _is_top(
+    grid: DepthGrid, samples: DepthSamples, plane: SupportingPlane, drop: float, area_m2: float
+) -> bool:
+    """Return whether a plane is the top of an object or of several, by rules 5 to 8."""
+    furniture = area_m2 >= PLANES.furniture_m2
+    on_wall, beyond = _count_below_edge(grid, samples, plane, drop)
+    if on_wall + beyond >= MIN_BELOW:
+        walled = on_wall > PLANES.wall_share * (on_wall + beyond)
+        return walled and not (furniture and _count_above(grid, plane)[0] >= MIN_ABOVE)
+    below_camera = plane.extent.min() > 0  # from there, the sides below its edge are hidden
+    if furniture or area_m2 < PLANES.likely_m2 or not below_camera:
+        return area_m2 < PLANES.likely_m2
+    above, inside = _count_above(grid, plane)
+    return bool(above < PLANES.bare_share * inside)
 
 
 def _overlaps(lower: SupportingPlane, upper: SupportingPlane) -> bool:
@@ -113,17 +128,32 @@ def _extend_to_walls(grid: DepthGrid, plane: SupportingPlane) -> SupportingPlane
     return plane._replace(extent=np.maximum(plane.extent, extent))
 
 
-def _is_bare_from_above(grid: DepthGrid, plane: SupportingPlane) -> bool:
-    """Return whether a plane is right below the camera, and nothing is on it.
+@kernel
+def _count_above(grid: DepthGrid, plane: SupportingPlane) -> tuple[int, int]:
+    """Count the samples of objects inside the outline of a plane, and all samples inside it.
 
-    From there, the sides below its edge are hidden.
+    Only samples of every second row and column are counted.
     """
-    if plane.extent.min() <= 0:
-        return False
-    across, along, height = level_coordinates(grid, grid.inverse_depth > 0, plane.up)
-    inside = np.all(COS[:, None] * across + SIN[:, None] * along < plane.extent[:, None], axis=0)
-    rise = height[inside] - plane.offset
-    return bool(np.mean((rise > PLANES.wall_m) & (rise < PLANES.max_object_m)) < PLANES.bare_share)
+    inv_depth, up, k = grid.inverse_depth, plane.up, grid.intrinsics
+    across, along, _ = level_axes(up[0], up[1], up[2])
+    above = inside = 0
+    for i in range(0, inv_depth.shape[0], SPARSE):
+        y = (i - k.cy) / k.fy
+        for j in range(0, inv_depth.shape[1], SPARSE):
+            w = inv_depth[i, j]
+            if w <= 0:
+                continue
+            x = (j - k.cx) / k.fx
+            p = (across[0] * x + across[1] * y + across[2]) / w
+            q = (along[0] * x + along[1] * y + along[2]) / w
+            d = 0
+            while d < DIRECTIONS and COS[d] * p + SIN[d] * q < plane.extent[d]:
+                d += 1
+            if d == DIRECTIONS:
+                rise = (up[0] * x + up[1] * y + up[2]) / w - plane.offset
+                inside += 1
+                above += 2 * min_height_at(1 / w) < rise < PLANES.max_object_m
+    return above, inside
 
 
 @kernel
@@ -156,7 +186,7 @@ def _largest_part(grid: DepthGrid, samples: DepthSamples, plane: SupportingPlane
                         continue
                     at = plane.a * u + plane.b * v + plane.c
                     value = inv_depth[v, u]
-                    if at > 0 and (value <= 0 or value > at - 2 * PLANES.tolerance):
+                    if at > 0 and (value <= 0 or value > at - PLANES.tolerance):
                         stack[tail], part[v * columns + u] = v * columns + u, parts
                         tail += 1
         facing = max(-level * plane.offset, 0.05)
