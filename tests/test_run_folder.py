@@ -24,6 +24,7 @@ from shapecat.runs.folder import (
 )
 from shapecat.runs.identity import content_digest, file_stats, new_id, same_content
 from shapecat.system.files import (
+    BusyError,
     complete_folder,
     holding,
     partial_path,
@@ -439,6 +440,31 @@ def test_scratch_that_may_be_in_use_is_not_removed(
         with scratch_folder():
             assert mine.exists()
     assert not list(temporary.iterdir())
+
+
+def test_locks_leave_no_open_file(temporary: Path) -> None:
+    """A session that is refused, or fails, again and again would run out of files.
+
+    One that fails would also keep the lock until its end.
+    """
+
+    def open_files() -> int:
+        return len(list(Path("/proc/self/fd").iterdir()))
+
+    used = temporary / f"shapecat-scratch-{socket.gethostname()}+used"
+    used.mkdir()
+    os.utime(used, (0, 0))
+    before = open_files()
+    with pytest.raises(OSError, match="no disk"), holding(used):
+        with pytest.raises(BusyError), holding(used, wait=False):
+            pass
+        with scratch_folder():  # would remove it if it were not locked
+            pass
+        assert open_files() == before + 1
+        raise OSError("no disk")  # noqa: EM101, TRY003  any error
+    assert open_files() == before
+    with holding(used, wait=False):
+        assert used.exists()
 
 
 def test_scratch_of_killed_processes_is_removed(temporary: Path) -> None:

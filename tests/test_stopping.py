@@ -6,6 +6,7 @@ import signal
 import subprocess
 import sys
 from collections.abc import Callable, Iterator
+from contextlib import suppress
 from itertools import count
 from pathlib import Path
 from typing import Any
@@ -220,6 +221,22 @@ def test_signal_during_imports_ends_command_without_traceback() -> None:
     )
 
     assert (done.returncode, done.stderr) == (130, b"")
+
+
+def test_message_of_a_failed_part_does_not_outlive_it(capfd: pytest.CaptureFixture[str]) -> None:
+    """The next part would be "stopping the server", and the next command would stop at once."""
+    with pytest.raises(OSError, match="no disk"), stopping.stop_message("stopping the server"):
+        with suppress(ValueError), stopping.stop_message("stopping the page"):
+            raise ValueError
+        with stopping.handling_signals():
+            signal.raise_signal(signal.SIGTERM)
+            assert stopping.asked()
+        raise OSError("no disk")  # noqa: EM101, TRY003  any error
+    assert capfd.readouterr().err == "stopping the server\n"
+    assert not stopping.asked()
+    with stopping.handling_signals():
+        signal.raise_signal(signal.SIGINT)
+    assert "after the frames in progress" in capfd.readouterr().err
 
 
 @pytest.fixture
