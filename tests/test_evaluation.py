@@ -309,6 +309,20 @@ def test_training_needs_two_categories(tmp_path: Path) -> None:
         train_on_folder(dataset, tmp_path / "m.npz")
 
 
+@pytest.mark.parametrize(("more", "calibrated"), [(("plate",), False), ((), True)])
+def test_model_is_called_calibrated_only_if_half_of_its_categories_were_held_out(
+    tmp_path: Path, more: tuple[str, ...], *, calibrated: bool
+) -> None:
+    """Users act on the confidence; of a single object, no view can be held out."""
+    dataset = write_dataset(tmp_path / "data", ("box",), instances=3)
+    write_dataset(dataset, ("ball", *more), instances=1)
+    done = train_on_folder(dataset, tmp_path / "m.npz")
+
+    assert done["calibrated"] is calibrated
+    assert (load_model(tmp_path / "m.npz").temperature != 1) is calibrated
+    assert done["held_out"]["n"] == 2
+
+
 @pytest.mark.usefixtures("few_trees")
 def test_too_few_views_give_no_model(tmp_path: Path) -> None:
     """Trees without a split give all objects the same posterior, and thus the same category."""

@@ -367,6 +367,8 @@ def test_categories_can_be_added_twice(categorizer: Categorizer) -> None:
     twice = add_categories(once, far, ["spoon"] * 20, rng=rng)
 
     assert twice.categories[-2:] == ("cone", "spoon")
+    assert twice.notes == {**categorizer.notes, "added": ["cone", "spoon"]}
+    assert once.notes["added"] == ["cone"]
     assert np.mean(twice.predict(far).posteriors.argmax(axis=1) == 4) > 0.9
     with pytest.raises(ValueError, match="no new category"):
         add_categories(twice, far, ["spoon"] * 20, rng=rng)
