@@ -482,6 +482,22 @@ def test_pixels_released_by_a_mask_go_to_its_neighbour(border: int) -> None:
     assert two[23:57, 50:67].all()
 
 
+def test_third_object_nearby_does_not_free_the_pixels_of_its_neighbours() -> None:
+    """Two boxes of one colour touch; the first of them would take the edge of the other."""
+    pixels, _ = image_of_a_box((170, 90, 60))
+    pixels[60:68, 44:56] = (60, 90, 170)
+    left, right = Mask(30, 20, np.ones((40, 20), bool)), Mask(50, 20, np.ones((40, 20), bool))
+    below = Mask(44, 60, np.ones((8, 12), bool))
+    for place in range(3):
+        masks = [left, right]
+        masks.insert(place, below)
+        snapped_masks = list(snapped(masks, pixels))
+        snapped_masks.pop(place)
+        one, two = (mask.full(80, 100) for mask in snapped_masks)
+        assert one[23:57, 33:50].all()
+        assert two[23:57, 50:67].all()
+
+
 @pytest.mark.slow
 @pytest.mark.parametrize("sensor", ["kinect", "realsense"])
 def test_masks_agree_with_simulated_colour_camera(

@@ -320,6 +320,25 @@ def test_identity_switch_is_counted_once() -> None:
     assert kinds == [None, None, "identity", None, None, "identity", None]
 
 
+@pytest.mark.parametrize("other", [(6, "can"), (None, "cup"), (None, "can")])
+def test_identity_switch_is_not_counted_beside_another_difference(
+    other: tuple[int | None, str],
+) -> None:
+    """A row has one difference: a switch in a row with a wrong category is in the figures alone.
+
+    A detection without a track is no other track.
+    """
+    tally, cup = Tally(), LabelledItem(11, "cup")
+    track, category = other
+    before = _kind(tally, LabelledItem(5, "cup"), cup, 0.9)
+    kind = _kind(tally, LabelledItem(track, category), cup, 0.9)
+    after = [_kind(tally, LabelledItem(track or 5, "cup"), cup, 0.9) for _ in range(2)]
+
+    assert before is None
+    assert kind == (None if category == "cup" else "category")
+    assert after == [None, None]
+
+
 def test_page_has_each_metric_in_its_place(run: Path, truth: Path) -> None:
     """The metrics are those above; the table has the tracks of the run, not of the truth."""
     found = compare(run, truth)
