@@ -149,7 +149,7 @@ def test_run_page_has_right_values(*, served: bool) -> None:
         "seconds": {"total": 15.67, "perceive": 12.34},
         "fixed_frame": "map",
         "up": {"source": "imu"},
-        "color": {"/d": "/rgb", "/e": None},
+        "color": {"/d": "/rgb", "/e": "/rgb", "/f": None},  # sensors may share a colour camera
         "versions": {"shapecat": "1.2", "python": "3.13"},
     }
     lab = FinishedRun(Path("out/my lab"), info, {17: TrackLabel(17, "mug", 1.0)})

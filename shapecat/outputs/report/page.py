@@ -203,12 +203,13 @@ def _line(kind: str, *cells: str) -> str:
 def _facts(run: Mapping[str, Any]) -> str:
     skipped = ", ".join(f"{n} {reason}" for reason, n in run["counts"]["skipped"].items())
     up = run["up"] or {}
+    colours = dict.fromkeys(filter(None, (run.get("color") or {}).values()))
     facts = {
         "model": run["model"]["id"],
         "categories": ", ".join(run["model"]["categories"]),
         "fixed frame": run["fixed_frame"] or "none: tracks are in the sensor frame",
         "up": str(up.get("source", "")),
-        "colour images": ", ".join(filter(None, (run.get("color") or {}).values())) or "none",
+        "colour images": ", ".join(colours) or "none",
         "skipped frames": skipped or "none",
         "shapecat": run["versions"]["shapecat"],
         "python": run["versions"].get("python", ""),
