@@ -32,6 +32,7 @@ from shapecat.outputs.annotation.content import Annotation
 from shapecat.outputs.annotation.image_annotations import ImageBox, read_image_frames
 from shapecat.outputs.colouring import Coloured, with_colour
 from shapecat.outputs.colours import colour_of
+from shapecat.outputs.exports.coco import DATASETS
 from shapecat.outputs.exports.dataset_frames import (
     Selection,
     _chosen,
@@ -45,7 +46,12 @@ from shapecat.outputs.exports.dataset_frames import (
     split_runs,
     thinned,
 )
-from shapecat.outputs.exports.formats import _made_by_export, _require_own, _staged
+from shapecat.outputs.exports.formats import (
+    _made_by_export,
+    _require_own,
+    _staged,
+    export_dataset,
+)
 from shapecat.outputs.exports.points import write_point_labels
 from shapecat.outputs.level_clouds import support_offset, upright_cloud
 from shapecat.outputs.opened_run import RunFrame
@@ -624,6 +630,31 @@ def test_data_set_with_other_recordings_is_not_replaced(tmp_path: Path) -> None:
     _require_own(tmp_path, both)
     with pytest.raises(OutputError, match="of another recording; choose another --out"):
         _require_own(tmp_path, tuesday)
+
+
+def test_data_set_of_several_recordings_is_not_replaced_by_one_of_them(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Whoever exports a corrected run again, without the others, would lose these."""
+
+    def read(folder: Path) -> Any:
+        name, info = folder.name, {"counts": {"frames": 1}, "input": {"digest": f"d-{folder.name}"}}
+        run = {"id": f"id-{name}", **info}
+        return SimpleNamespace(name=name, folder=folder, categories=("cup",), run=run)
+
+    monkeypatch.setattr("shapecat.outputs.exports.formats.read_finished", read)
+    monkeypatch.setitem(DATASETS, "coco", lambda *_: 3)
+    a, b, c = (tmp_path / name for name in "abc")
+    out = tmp_path / "out"
+    export_dataset([b, a], "coco", out, Selection())
+    for alone in (a, b):
+        with pytest.raises(OutputError, match=r"of another recording; .* export all runs together"):
+            export_dataset([alone], "coco", out, Selection())
+    export_dataset([c, b, a], "coco", out, Selection())
+
+    about = json.loads((out / "export.json").read_text())
+    assert about["recordings"] == ["d-a", "d-b", "d-c"]
+    assert about["runs"] == {"a": "id-a", "b": "id-b", "c": "id-c"}
 
 
 def test_export_of_other_topics_is_not_replaced(tmp_path: Path) -> None:

@@ -1,6 +1,7 @@
 """Tests of review.rrd, read back with Rerun's own reader."""
 
 import dataclasses
+import errno
 import resource
 import subprocess
 import sys
@@ -568,6 +569,24 @@ def test_full_disk_while_writing_raises_error(tmp_path: Path) -> None:
             write(tmp_path / "r.rrd", [scene(k) for k in range(300)])
     finally:
         resource.setrlimit(resource.RLIMIT_FSIZE, before)
+    assert not list(tmp_path.iterdir())
+
+
+def test_review_whose_end_cannot_be_written_does_not_appear(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """The last block is written after the last frame; the viewer would lack the layout."""
+    close, closed = ReviewFile.close, []
+
+    def close_on_full_disk(file: ReviewFile) -> None:
+        close(file)
+        closed.append(file._thread.is_alive())
+        file._error = OSError(errno.ENOSPC, "No space left on device")
+
+    monkeypatch.setattr(ReviewFile, "close", close_on_full_disk)
+    with pytest.raises(OutputError, match="No space left"):
+        write(tmp_path / "r.rrd", [scene(0)])
+    assert closed == [False]
     assert not list(tmp_path.iterdir())
 
 
