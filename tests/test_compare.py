@@ -1114,6 +1114,18 @@ def test_kitti_types_match_categories_of_run(run: Path) -> None:
     assert found.as_dict()["differences"] == {}
 
 
+def test_kitti_type_of_two_categories_stands_for_the_first(tmp_path: Path) -> None:
+    """The categories of the model come first; a person may add one with another spelling."""
+    (tmp_path / "label_2").mkdir()
+    names = ("tea_pot", "cup", "wine_glass")
+    lines = [f"{name} 0 0 0 0 0 0 0 0.2 0.3 0.1 0 0.1 1 0\n" for name in names]
+    (tmp_path / "label_2" / "000003.txt").write_text("".join(lines))
+    for first, second in (("tea pot", "tea_pot"), ("tea_pot", "tea pot")):
+        found = KittiLabels(tmp_path, (first, "cup", second)).at(("/d", 3), START)
+        assert found is not None
+        assert [item.category for item in found.items] == [first, "cup", "wine glass"]
+
+
 def test_labels_without_masks_may_end_with_an_empty_frame(run: Path) -> None:
     """Its detections have masks, but an overlap of this frame alone would be 0."""
     labels = run.parent / "kitti"

@@ -268,6 +268,23 @@ def test_topics_are_separate_and_lost_pose_drops_frames() -> None:
     assert kept(list(zip(ticks, (IDENTITY, None, None, IDENTITY), strict=True))) == [0, 0, 1, 0]
 
 
+@pytest.mark.parametrize("count", [1, 3])
+def test_only_topics_with_a_problem_give_a_warning(count: int) -> None:
+    """Beside them, other sensors are fused as they should; without fusion, none is."""
+    recent, points = RecentFrames(count), np.ones((5, 3), np.float32)
+    for k, pose in enumerate((IDENTITY, None, None)):
+        depth = frame(render_depth(HOME), k * TICK)
+        recent.before(replace(depth, topic="/placed"), IDENTITY)
+        recent.before(replace(depth, topic="/lost"), pose)
+        recent.before(replace(depth, topic="/cloud", depth=None, camera=None, points=points), pose)
+
+    warnings = [text.partition("):")[0] for text in recent.warnings()]
+    assert warnings == [
+        "/cloud: clouds are not fused, only depth images (frames: 3)",
+        "/lost: the pose of the sensor is unknown (frames: 2",
+    ] * (count > 1)
+
+
 @pytest.mark.parametrize("count", [0, 31])
 def test_fuse_frames_out_of_bounds_is_refused(count: int) -> None:
     with pytest.raises(ConfigError, match=r"detection\.fuse_frames must be from 1 to 30"):

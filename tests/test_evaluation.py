@@ -207,7 +207,9 @@ def test_model_is_calibrated_on_held_out_instances(
 def test_new_category_is_learned_from_folder(trained: Path, tmp_path: Path) -> None:
     """Crops of unknown objects beside those of the new category are no category."""
     dataset = write_dataset(tmp_path / "new", ("plate", "unknown"))
-    learn_on_folder(trained, dataset, tmp_path / "m.npz")
+    done = learn_on_folder(trained, dataset, tmp_path / "m.npz")
+    assert (done["added"], done["categories"]) == (["plate"], ["box", "ball", "plate"])
+    assert done["model"] == load_model(tmp_path / "m.npz").model_id
     test = write_dataset(tmp_path / "test", ("box", "ball", "plate"), instances=3, seed=5)
 
     report = evaluate_folder(test, tmp_path / "m.npz")

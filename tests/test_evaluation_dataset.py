@@ -59,23 +59,25 @@ def test_any_kind_of_nan_is_read_without_a_warning(tmp_path: Path, encoding: str
     np.testing.assert_array_equal(read_pcd(path).points.astype(np.float32), expected)
 
 
-@pytest.mark.parametrize("encoding", ["ascii", "binary"])
+@pytest.mark.parametrize("encoding", ["ascii", "binary", "binary_compressed"])
 def test_fields_of_several_values_shift_later_fields(tmp_path: Path, encoding: str) -> None:
     """Some files have normals or histograms before x."""
     head = (
-        "FIELDS normal x i y z\nSIZE 4 4 2 4 4\nTYPE F F U F F\nCOUNT 3 1 2 1 1\n"
+        "FIELDS normal x i y z\nSIZE 4 4 1 8 4\nTYPE F F U F F\nCOUNT 3 1 3 1 1\n"
         f"WIDTH 2\nHEIGHT 1\nPOINTS 2\nDATA {encoding}\n"
     ).encode()
-    rows = [(0.1, 0.2, 0.3, 1.5, 7, 8, 2.5, 3.5), (0.4, 0.5, 0.6, 4.5, 9, 10, 5.5, 6.5)]
-    (tmp_path / "x.pcd").write_bytes(
-        head
-        + b"".join(
-            b"%g %g %g %g %d %d %g %g\n" % row
-            if encoding == "ascii"
-            else struct.pack("<4f2H2f", *row)
-            for row in rows
-        )
-    )
+    rows = [(0.1, 0.2, 0.3, 1.5, 7, 8, 9, 2.5, 3.5), (0.4, 0.5, 0.6, 4.5, 7, 8, 9, 5.5, 6.5)]
+    if encoding == "ascii":
+        body = b"".join(b"%g %g %g %g %d %d %d %g %g\n" % row for row in rows)
+    elif encoding == "binary":
+        body = b"".join(struct.pack("<4f3Bdf", *row) for row in rows)
+    else:  # field after field, in pieces of at most 32 bytes that are not packed
+        fields = (("<3f", 0, 3), ("<f", 3, 4), ("<3B", 4, 7), ("<d", 7, 8), ("<f", 8, 9))
+        flat = b"".join(struct.pack(kind, *row[a:b]) for kind, a, b in fields for row in rows)
+        parts = [flat[k : k + 32] for k in range(0, len(flat), 32)]
+        packed = b"".join(bytes([len(part) - 1]) + part for part in parts)
+        body = struct.pack("<II", len(packed), len(flat)) + packed
+    (tmp_path / "x.pcd").write_bytes(head + body)
 
     assert read_pcd(tmp_path / "x.pcd").points.tolist() == [[1.5, 2.5, 3.5], [4.5, 5.5, 6.5]]
 
