@@ -15,6 +15,10 @@ from shapecat.types import ImageMasks, Perception
 
 __all__ = ["mask_columns", "read_masks", "read_nearest_masks"]
 
+_Times = tuple[int, int]
+_HELD = 64
+"""Most images of a topic that are held back for the frames of a sensor that come later."""
+
 
 def mask_columns(perceptions: Iterable[Perception]) -> dict[str, Any]:
     """Return the columns of the table for some frames."""
@@ -58,23 +62,38 @@ def read_masks(folder: Path, *, boxes_only: bool = False) -> Iterator[tuple[Key,
 def read_nearest_masks(folder: Path) -> Iterator[tuple[Key, ImageMasks]]:
     """Yield each image once, with the boxes of the masks of the frame nearest to it in time.
 
-    Several frames have the same image if images are rarer. Run lengths are left out.
+    Several frames have the same image if images are rarer, or if several depth sensors share a
+    colour camera; the frames of one of these may come later. Run lengths are left out.
     """
-    best: dict[str, tuple[int, Key, ImageMasks]] = {}
+    last = _sensors(folder)  # the image of the last frame of each sensor
+    held: dict[str, dict[_Times, tuple[int, Key, ImageMasks]]] = {}
     stamps = read_stamps(folder)
     for key, masks in read_masks(folder, boxes_only=True):
         stamp = next(stamp for candidate, stamp in stamps if candidate == key)
-        apart, before = abs(stamp - masks.stamp_ns), best.get(masks.topic)
-        if before is not None and _times_ns(before[2]) != _times_ns(masks):
-            yield before[1:]
-            before = None
-        if before is None or apart < before[0]:
-            best[masks.topic] = apart, key, masks
-    for _, key, masks in best.values():
-        yield key, masks
+        apart, times = abs(stamp - masks.stamp_ns), _times_ns(masks)
+        images = held.setdefault(masks.topic, {})
+        if times not in images or apart < images[times][0]:
+            images[times] = apart, key, masks
+        last.setdefault(masks.topic, {})[key[0]] = times
+        awaited = {*last[masks.topic].values()}
+        while awaited.isdisjoint({None, first := next(iter(images))}) or len(images) > _HELD:
+            yield images.pop(first)[1:]
+    for images in held.values():
+        for _, key, masks in images.values():
+            yield key, masks
 
 
-def _times_ns(masks: ImageMasks) -> tuple[int, int]:
+def _sensors(folder: Path) -> dict[str, dict[str, _Times | None]]:
+    """Return None for each depth sensor that has images of a topic, by this topic."""
+    path, sensors = folder / "masks.parquet", dict[str, dict[str, _Times | None]]()
+    for group in read_row_groups(path, ["topic", "color_topic"]) if path.exists() else ():
+        pairs = zip(*(group[name].to_pylist() for name in ("topic", "color_topic")), strict=True)
+        for topic, images in pairs:
+            sensors.setdefault(images, {})[topic] = None
+    return sensors
+
+
+def _times_ns(masks: ImageMasks) -> _Times:
     """Return stamp and log time of an image; stamps alone repeat after a clock was set back."""
     return masks.stamp_ns, masks.log_time_ns
 
