@@ -481,7 +481,7 @@ def many_tracks(folder: Path, count: int) -> str:
     cards = []
     for track in range(1, count + 1):
         causal = rng.dirichlet(np.ones(7), 300)
-        line = Timeline(np.arange(300) / 10, rng.random(300) < 0.9, causal, ())
+        line = Timeline(np.arange(300) / 10, rng.random(300) < 0.9, causal, (), causal[-1])
         cells = {"track": str(track), "category": "cup", "confidence": ".5", "label": ""}
         row = TrackRow(track + 1, track, "cup", 0.5, "", "/d", cells)
         cards.append(Card(row, line, pictures))

@@ -50,7 +50,7 @@ def test_card_shows_views_times_and_sorted_posterior() -> None:
     """Frames without a detection are not views."""
     seen = np.array([True, True, False, False, True, False])
     causal = np.tile([0.2, 0.5, 0.3], (6, 1))
-    line = Timeline(np.array([1.0, 1.5, 2.0, 2.5, 3.2, 3.9]), seen, causal, ())
+    line = Timeline(np.array([1.0, 1.5, 2.0, 2.5, 3.2, 3.9]), seen, causal, (), causal[-1])
     row = TrackRow(2, 4, "can", 0.5, "", "/d", {"novelty": "0.31"})
     card = card_html(Card(row, line, None), NAMES, ("unknown", *NAMES), 4.0)
 
@@ -70,7 +70,9 @@ def worked_card() -> Card:
     """Return a card with a posterior that changes from cup to can, and no two equal numbers."""
     causal = [[0.7, 0.2, 0.1], [0.5, 0.3, 0.2], [0.5, 0.3, 0.2], [0.16, 0.58, 0.26]]
     seen = np.array([True, False, True, False])
-    line = Timeline(np.array([1.0, 1.5, 2.5, 3.2]), seen, np.array(causal), ())
+    line = Timeline(
+        np.array([1.0, 1.5, 2.5, 3.2]), seen, np.array(causal), (), np.array(causal[-1])
+    )
     sides = tuple(SurfaceDrawing(n, f"data:{n}", f"M{n}", f"N{n}") for n in ("front", "top"))
     pictures = TrackPictures(Crop("data:crop", 60, 40, "M1 2L3 4"), sides, (0.123, 0.071, 0.234))
     return Card(TrackRow(2, 17, "can", 0.644, "", "/d", {"novelty": "0.31"}), line, pictures)
@@ -227,7 +229,11 @@ def test_timelines_end_with_the_last_track(run: Path) -> None:
         Card(
             TrackRow(2, track, "can", 0.5, "", "/d", {}),
             Timeline(
-                np.array(at), np.ones(len(at), bool), np.tile([0.2, 0.5, 0.3], (len(at), 1)), ()
+                np.array(at),
+                np.ones(len(at), bool),
+                np.tile([0.2, 0.5, 0.3], (len(at), 1)),
+                (),
+                np.array([0.2, 0.5, 0.3]),
             ),
             None,
         )
@@ -244,7 +250,8 @@ def test_timelines_end_with_the_last_track(run: Path) -> None:
 def test_card_of_a_single_frame_has_no_timeline() -> None:
     """A plot over no time is an empty box."""
     card = worked_card()
-    line = Timeline(np.zeros(1), np.ones(1, bool), card.timeline.causal[:1], ())
+    causal = card.timeline.causal[:1]
+    line = Timeline(np.zeros(1), np.ones(1, bool), causal, (), causal[0])
     text = card_html(replace(card, timeline=line), NAMES, ("unknown", *NAMES), 0.0)
 
     assert 'class="line"' not in text
@@ -358,6 +365,26 @@ def test_track_times_count_from_first_frame_of_run(tmp_path: Path) -> None:
     assert (lines[4].seen.tolist(), lines[9].seen.tolist()) == ([True, False], [True])
     np.testing.assert_allclose(lines[4].causal, [[0.6, 0.4], [0.8, 0.2]])
     assert lines[4].keys == (("/d", 1, 0), ("/d", 3, -1))
+
+
+def test_bars_have_the_confidence_of_the_table_if_the_clock_was_set_back(tmp_path: Path) -> None:
+    """The latest stamp is then that of an earlier frame, with fewer views."""
+    stamps, shares = (0, 4, 8, 1, 2), (0.3, 0.4, 0.45, 0.6, 0.9)
+    for name, schema in (("frames", FRAMES), ("tracks", TRACKS)):
+        rows = [
+            dict.fromkeys(schema.names)
+            | {"topic": "/d", "frame": k, "stamp_ns": 10**9 * stamp}
+            | ({"track": 9, "detection": 0, "posterior": [p, 1 - p]} if name == "tracks" else {})
+            for k, (stamp, p) in enumerate(zip(stamps, shares, strict=True))
+        ]
+        pq.write_table(pa.Table.from_pylist(rows, schema), tmp_path / f"{name}.parquet")
+    line = read_timelines(tmp_path)[9]
+    row = TrackRow(2, 9, "cup", 0.9, "", "/d", {})
+    bars = re.findall(r"--w:([\d.]+%)", card_html(Card(row, line, None), ("cup", "can"), (), 8.0))
+
+    assert line.seconds.tolist() == [0, 1, 2, 4, 8]
+    np.testing.assert_allclose(line.causal[:, 0], [0.3, 0.6, 0.9, 0.4, 0.45])
+    assert bars == ["90.0%", "10.0%"]
 
 
 def test_length_is_that_of_the_run(run: Path) -> None:
@@ -517,7 +544,7 @@ def test_thumbnails_are_most_confident_of_each_category() -> None:
     """The most confident of the others follow, up to six."""
     found = [("cup", 0.6), ("can", 0.7), ("cup", 0.95), ("cup", 0.9), ("unknown", 0.3)]
     found += [("can", 0.8), ("cup", 0.5), ("cup", 0.4)]
-    line = Timeline(np.zeros(0), np.zeros(0, bool), np.zeros((0, 3)), ())
+    line = Timeline(np.zeros(0), np.zeros(0, bool), np.zeros((0, 3)), (), np.zeros(3))
     cards = []
     for k, (category, confidence) in enumerate(found):
         pictures = TrackPictures(None, (SurfaceDrawing("", str(k), "", ""),), (1.0, 1.0, 1.0))

@@ -123,8 +123,7 @@ def _facts(card: Card) -> list[str]:
 
 def _bars(line: Timeline, categories: Sequence[str], row: TrackRow, names: Sequence[str]) -> str:
     """Return the posterior of all views as bars, the most likely first; each bar is a button."""
-    last = line.causal[-1] if len(line.causal) else np.zeros(len(categories))
-    shares = dict(zip(categories, last.tolist(), strict=False))
+    shares = dict(zip(categories, line.fused.tolist(), strict=False))
     order = sorted(shares, key=lambda name: -shares[name])
     if row.category not in shares and row.category != UNKNOWN:
         order.append(row.category)

@@ -18,16 +18,19 @@ class Timeline(Record):
 
     Attributes
     ----------
-    seconds : (k,) time of each row since the first frame of the run.
+    seconds : (k,) time of each row since the first frame of the run, ascending.
     seen : (k,) whether the track was detected.
     causal : (k, c) posterior fused from the views so far.
     keys : the detection of each row.
+    fused : (c,) posterior fused from all views. It is not that of the latest row if the clock was
+        set back.
     """
 
     seconds: F8 = array("k", "f8")
     seen: Bool = array("k", "?")
     causal: F4 = array("k c", "f4")
     keys: tuple[Detected, ...]
+    fused: F4 = array("c", "f4")
 
 
 def read_timelines(folder: Path) -> dict[int, Timeline]:
@@ -46,7 +49,8 @@ def read_timelines(folder: Path) -> dict[int, Timeline]:
     names, starts = np.unique(tracks[order], return_index=True)
     for track, rows in zip(names.tolist(), np.split(order, starts[1:]), strict=False):
         keys = tuple((topics[k], frames[k], int(detections[k])) for k in rows.tolist())
-        timelines[track] = Timeline(seconds[rows], detections[rows] >= 0, causal[rows], keys)
+        seen, fused = detections[rows] >= 0, causal[rows.max()]  # a track's rows are as recorded
+        timelines[track] = Timeline(seconds[rows], seen, causal[rows], keys, fused)
     return timelines
 
 
