@@ -4,6 +4,7 @@ import json
 import shutil
 from collections import Counter
 from collections.abc import Callable
+from dataclasses import replace
 from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
@@ -14,12 +15,14 @@ from click.testing import Result
 from mcap.reader import make_reader
 from numpy.testing import assert_allclose
 
-from shapecat.pipeline import annotate, process
+from shapecat.config import Settings, with_overrides
+from shapecat.pipeline import annotate, annotate_again, process
 from shapecat.runs.folder import read_run
 from shapecat.runs.jobs import Job
 from shapecat.simulation import simulate
 from tests.conftest import Guesser
-from tests.mcap_files import read_ros
+from tests.mcap_files import read_ros, summary_of
+from tests.odd_recordings import mcap
 from tests.scenes import record
 from tests.track_tables import rows, untimed_table
 
@@ -317,6 +320,33 @@ def test_damage_found_while_recording_is_rewritten_is_reported(
 
     assert run["warnings"][-2:] == ["no index", "skipped the chunk at byte 7"]
     assert read_run(folder)["warnings"] == run["warnings"]
+
+
+def test_annotated_copy_of_damaged_recording_is_readable(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Other readers stop at a damaged chunk; only the first reading of the frames meets it."""
+    monkeypatch.setattr("shapecat.pipeline.load_model", lambda _path: Guesser())
+    source = mcap(tmp_path, chunk_size=20_000)
+    whole = messages(source)
+    chunk = sorted(c.chunk_start_offset for c in summary_of(source).chunk_indexes)[2]
+    data = bytearray(source.read_bytes())
+    data[chunk + 3000] ^= 0xFF
+    source.write_bytes(data)
+    job = Job(source=source, folder=tmp_path / "out" / "a", rrd=False)
+
+    def kept() -> int:
+        return (messages(job.folder / "annotated.mcap") & whole).total()
+
+    process(job)
+    readable = kept()
+    assert 0 < readable < whole.total()
+    annotate_again(job.folder, None)
+    assert kept() == readable
+    moved = with_overrides(Settings(), ["tracking.gate_m=0.1"])
+    process(replace(job, settings=moved, overwrite=True))
+    assert kept() == readable
+    assert read_run(job.folder)["counts"]["resumed"] == 3  # frames are not read again
 
 
 def test_bad_recording_does_not_stop_the_others(

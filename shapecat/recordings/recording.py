@@ -29,6 +29,7 @@ class Recording(ABC):
     topics : sorted by name; a topic with two types appears twice.
     start_ns, end_ns : log times of the first and last message; 0 if there is none.
     indexed : whether messages are found by topic and time, without reading the rest.
+    damaged : reading has found a damaged chunk, or the damaged index of one, in an MCAP file.
     warnings : problems found in the recording, for the user.
     frame_ids : the frame id of the first message of each topic of which one was asked for.
     """
@@ -43,6 +44,7 @@ class Recording(ABC):
         self.start_ns = 0
         self.end_ns = 0
         self.indexed = True
+        self.damaged = False
         self.warnings: list[str] = []
         self.frame_ids: dict[str, str] = {}
         self._channels: dict[int, Channel] = {}

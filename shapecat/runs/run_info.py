@@ -101,7 +101,10 @@ class RunIdentity(TypedDict):
 
 
 class RunInfo(RunIdentity):
-    """The contents of run.json; ``seconds`` has the duration of each finished phase."""
+    """The contents of run.json; ``seconds`` has the duration of each finished phase.
+
+    ``damaged`` is there if reading the frames met damage in an MCAP file: see `Recording.damaged`.
+    """
 
     settings: dict[str, Any]
     options: Options
@@ -109,6 +112,7 @@ class RunInfo(RunIdentity):
     counts: Counts
     seconds: dict[str, float]
     warnings: list[str]
+    damaged: NotRequired[bool]
     color: NotRequired[dict[str, str]]
     boxes: NotRequired[str]
     origin: NotRequired[OriginInfo]

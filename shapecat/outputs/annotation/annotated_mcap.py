@@ -1,7 +1,7 @@
 """The annotated recording: all original messages, and the labelled objects.
 
-A finished MCAP file is copied byte for byte and extended; any other recording is rewritten as
-MCAP. Annotations use the encoding of the source.
+A finished MCAP file is copied byte for byte and extended; any other recording, and one in which
+the run has found damage, is rewritten as MCAP. Annotations use the encoding of the source.
 """
 
 import json
@@ -79,7 +79,8 @@ def write_annotated(
     """
     metadata = {"run.json": json.dumps(run)}
     with replacing(path) as hidden, hidden.open("wb", buffering=_BUFFER) as file:
-        if isinstance(recording, McapRecording) and recording.indexed:
+        damaged = bool(run.get("damaged"))  # other readers stop at a damaged chunk
+        if isinstance(recording, McapRecording) and recording.indexed and not damaged:
             with _copying(recording, hidden, file):
                 channels, items = _encoded(recording, frames, images, image_topics, markers=markers)
                 _append(recording.summary, file, channels, items, metadata)

@@ -95,7 +95,9 @@ class McapRecording(ChunkedRecording):
             for c in summary.chunks
             if c.message_end_time or c.message_index_offsets  # else it has no messages
         ]
-        return summary.checked or self._agrees()
+        usable = summary.checked or self._agrees()
+        self.damaged = False  # damage is reported when the chunk is read
+        return usable
 
     def _forget_channels(self) -> None:
         super()._forget_channels()
@@ -161,6 +163,7 @@ class McapRecording(ChunkedRecording):
             for opcode, content in split_chunk(self._plain(record, end)):
                 yield from self._take(opcode, content)
         except ChunkError as error:
+            self.damaged = True
             part = "" if record.whole else "the rest of "
             self.warn(f"skipped {part}the chunk at byte {record.offset - 9}: {error}")
 
@@ -208,6 +211,7 @@ class McapRecording(ChunkedRecording):
             return selection.needed(self._channels[message.channel_id].topic, message.log_time)
 
         indexed, size = read_message_index(self._file, chunk.entry), chunk.entry.uncompressed_size
+        self.damaged |= bool(chunk.channel_ids and not indexed)
         last = max((m.place for m in indexed if is_needed(m)), default=-1)
         end = min((m.place for m in indexed if m.place > last), default=size)
         if end > _PART * size:
@@ -216,6 +220,7 @@ class McapRecording(ChunkedRecording):
         if last >= 0 or not indexed:
             record = self._record_at(chunk.position)
             if record is None or record.opcode != Opcode.CHUNK:
+                self.damaged = True
                 self.warn(f"no chunk at byte {chunk.position}, where the index has one")
             else:
                 for message in self._split(record, end if end < size else None):

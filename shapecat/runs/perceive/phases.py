@@ -107,6 +107,8 @@ def perceive_all(work: Work) -> None:
     run["fixed_frame"], run["up"] = upright.fixed_frame, report_up(upright, folder)
     lost = [f"skipped frames ({n}×): {reason}" for reason, n in skipped.most_common(3)]
     run["warnings"] = [*lost, *recording.warnings, *upright.warnings, *recent.warnings()]
+    if recording.damaged:
+        run["damaged"] = True
 
 
 def revise(work: Work) -> None:

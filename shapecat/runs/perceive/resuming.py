@@ -88,6 +88,8 @@ def take_over_frames(
     new["counts"].pop("tracks", None)
     new["seconds"] = {phase: run["seconds"][phase] for phase in ("perceive", "revise")}
     new["fixed_frame"], new["up"], new["warnings"] = run["fixed_frame"], run["up"], run["warnings"]
+    if run.get("damaged"):
+        new["damaged"] = True
     write_run(folder, new)
     return new
 
