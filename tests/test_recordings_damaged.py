@@ -101,6 +101,23 @@ def test_messages_out_of_order_count_once_in_a_chunk_read_in_part(tmp_path: Path
     assert [(m.log_time_ns, len(m.data)) for m in messages] == [(3, 52), (5, 0), (8, 0), (9, 52)]
 
 
+def test_damage_is_reported_once_in_whatever_part_of_a_chunk(tmp_path: Path) -> None:
+    """A checksum fails in the whole chunk, a length in its first part."""
+    path = tmp_path / "a.mcap"
+    with mcap_writer(path, compression=CompressionType.NONE) as writer:
+        channel = writer.register_channel("/a", "x-text", 0)
+        for time in (3, 5, 8):
+            writer.add_message(channel, time, b"m" * 52, time)
+    replace(path, struct.pack("<BQ", 5, 74), struct.pack("<BQ", 5, 7400))
+
+    with open_recording(path) as recording:
+        list(recording.messages(needed=lambda _, time: time == 3))
+        list(recording.messages(needed=lambda _, time: time == 8))
+        assert recording.damaged
+        (warning,) = recording.warnings
+    assert warning.startswith("skipped the chunk at byte ")
+
+
 def test_damage_is_reported_once_and_only_where_it_is_read(tmp_path: Path) -> None:
     """Comparing an index with the chunks reads all of them; a run of other topics lacks nothing."""
     path = tmp_path / "a.mcap"

@@ -64,6 +64,7 @@ class McapRecording(ChunkedRecording):
         self.summary = Summary()
         self._schemas: dict[int, records.Schema] = {}
         self._checked: set[int] = set()  # offsets of chunks with a verified checksum
+        self._reported: set[int] = set()  # offsets of damaged chunks with a warning
         super().__init__(path)
 
     def top_level(self) -> Iterator[Record]:
@@ -96,7 +97,8 @@ class McapRecording(ChunkedRecording):
             if c.message_end_time or c.message_index_offsets  # else it has no messages
         ]
         usable = summary.checked or self._agrees()
-        self.damaged = False  # damage is reported when the chunk is read
+        self._reported.clear()  # damage is reported when the chunk is read
+        self.damaged = False
         return usable
 
     def _forget_channels(self) -> None:
@@ -164,8 +166,10 @@ class McapRecording(ChunkedRecording):
                 yield from self._take(opcode, content)
         except ChunkError as error:
             self.damaged = True
-            part = "" if record.whole else "the rest of "
-            self.warn(f"skipped {part}the chunk at byte {record.offset - 9}: {error}")
+            if record.offset not in self._reported:  # a part of it may fail for another reason
+                part = "" if record.whole else "the rest of "
+                self.warn(f"skipped {part}the chunk at byte {record.offset - 9}: {error}")
+            self._reported.add(record.offset)
 
     def _plain(self, record: Record, end: int | None) -> memoryview:
         """Return the decompressed records of a chunk; verify its checksum the first time."""
