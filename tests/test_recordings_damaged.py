@@ -14,7 +14,7 @@ from rosbags.rosbag2 import CompressionMode, StoragePlugin
 from shapecat.errors import RecordingError
 from shapecat.recordings import open_recording
 from shapecat.recordings.containers import ros1_records
-from tests.mcap_files import mcap_writer
+from tests.mcap_files import mcap_writer, summary_of
 from tests.test_recordings import (
     SECOND,
     STRING,
@@ -161,6 +161,26 @@ def test_chunk_that_is_not_what_it_claims_is_skipped(
     assert times == [3, 8]
     assert warning.startswith("skipped the chunk at byte ")
     assert warning.endswith(reason)
+
+
+def test_finished_file_that_is_damaged_is_not_called_unfinished(tmp_path: Path) -> None:
+    """A copy that lost a block has both ends: recording again would not help, copying would."""
+    path = tmp_path / "a.mcap"
+    with mcap_writer(path, chunk_size=60) as writer:
+        channel = writer.register_channel("/a", "x-text", 0)
+        for time in (3, 5, 8):
+            writer.add_message(channel, time, b"m" * 52, time)
+    second = summary_of(path).chunk_indexes[1].chunk_start_offset
+    data = path.read_bytes()
+    path.write_bytes(data[: second + 2] + data[second + 9 :])
+
+    times, warnings = read(path)
+
+    assert times == [3]
+    assert warnings[-1] == (
+        "the recording is damaged; messages recovered: 1; the last "
+        f"{len(data) - 7 - second} bytes are damaged, and read where possible"
+    )
 
 
 def test_messages_that_cannot_be_assigned_are_reported(tmp_path: Path) -> None:

@@ -130,9 +130,13 @@ class McapRecording(ChunkedRecording):
         end = len(MAGIC)  # of the last whole record
         if last is not None:
             end = last.offset + last.length if last.whole else last.offset - 9
-        text = f"the recording was not finished; messages recovered: {self._counts.total()}"
+        self._file.seek(max(end, self._size - len(MAGIC)))
+        finished = self._file.read() == MAGIC
+        text = "the recording is damaged" if finished else "the recording was not finished"
+        text += f"; messages recovered: {self._counts.total()}"
         if end < self._size:
-            text += f"; the last {self._size - end} bytes are truncated, and read where possible"
+            state = "damaged" if finished else "truncated"
+            text += f"; the last {self._size - end} bytes are {state}, and read where possible"
         self.warn(text)
         return last
 
