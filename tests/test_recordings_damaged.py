@@ -14,6 +14,7 @@ from rosbags.rosbag2 import CompressionMode, StoragePlugin
 from shapecat.errors import RecordingError
 from shapecat.recordings import open_recording
 from shapecat.recordings.containers import ros1_records
+from shapecat.recordings.containers.mcap_index import read_message_index
 from tests.mcap_files import mcap_writer, summary_of
 from tests.test_recordings import (
     SECOND,
@@ -99,6 +100,27 @@ def test_messages_out_of_order_count_once_in_a_chunk_read_in_part(tmp_path: Path
     with open_recording(path) as recording:
         messages = list(recording.messages(needed=lambda _topic, time: time in {3, 9}))
     assert [(m.log_time_ns, len(m.data)) for m in messages] == [(3, 52), (5, 0), (8, 0), (9, 52)]
+
+
+@pytest.mark.parametrize(("damage", "wanted"), [("time", 5), ("place", 3)])
+def test_damaged_index_of_a_chunk_is_not_used(tmp_path: Path, damage: str, wanted: int) -> None:
+    """It has no checksum. A frame that it hides is in the tables, but not in the review."""
+    path = tmp_path / "a.mcap"
+    with mcap_writer(path, compression=CompressionType.NONE) as writer:
+        channel = writer.register_channel("/a", "x-text", 0)
+        for time in (3, 5, 8):
+            writer.add_message(channel, time, b"m" * 52, time)
+    with path.open("rb") as file:
+        ((_, middle, _),) = (read_message_index(file, c) for c in summary_of(path).chunk_indexes)
+    new = (0, middle.place) if damage == "time" else (middle.log_time, 1 << 40)
+    replace(path, struct.pack("<QQ", *middle[1:]), struct.pack("<QQ", *new))
+
+    with open_recording(path) as recording:
+        messages = recording.messages(needed=lambda _, time: time == wanted)
+        found = [(m.log_time_ns, len(m.data)) for m in messages]
+        assert found == [(time, 52 * (time == wanted)) for time in (3, 5, 8)]
+        assert recording.damaged
+        assert recording.warnings == []  # nothing is missing
 
 
 def test_damage_is_reported_once_in_whatever_part_of_a_chunk(tmp_path: Path) -> None:

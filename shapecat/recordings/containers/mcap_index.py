@@ -24,16 +24,23 @@ class IndexedMessage(NamedTuple):
 
 
 def read_message_index(file: BinaryIO, chunk: records.ChunkIndex) -> list[IndexedMessage]:
-    """Return the index entries of a chunk; none if an entry is damaged or a channel is missing."""
+    """Return the index entries of a chunk; none if one is damaged or a channel is missing.
+
+    The entries have no checksum: they must lie within the time and the size of the chunk.
+    """
     begin = chunk.chunk_start_offset + chunk.chunk_length
     entries_of: dict[int, list[IndexedMessage]] = {}
     try:
         for record in walk(file, begin, begin + chunk.message_index_length):
             content = read_content(file, record)
             channel, length = _HEAD.unpack_from(content)
-            entries = _ENTRY.iter_unpack(content[_HEAD.size :][:length])
-            entries_of[channel] = [IndexedMessage(channel, time, place) for time, place in entries]
+            pairs = _ENTRY.iter_unpack(content[_HEAD.size :][:length])
+            entries_of[channel] = [IndexedMessage(channel, time, place) for time, place in pairs]
     except (TruncatedError, struct.error):
         return []
+    entries = list(chain(*entries_of.values()))
+    start, end = chunk.message_start_time, chunk.message_end_time
+    size = chunk.uncompressed_size
+    plausible = all(start <= time <= end and place < size for _, time, place in entries)
     complete = entries_of.keys() == chunk.message_index_offsets.keys()
-    return list(chain(*entries_of.values())) if complete else []
+    return entries if complete and plausible else []
