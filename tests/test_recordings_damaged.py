@@ -8,6 +8,7 @@ from types import SimpleNamespace
 
 import pytest
 import zstandard
+from mcap.opcode import Opcode
 from mcap.writer import CompressionType
 from rosbags.rosbag2 import CompressionMode, StoragePlugin
 
@@ -100,6 +101,22 @@ def test_messages_out_of_order_count_once_in_a_chunk_read_in_part(tmp_path: Path
     with open_recording(path) as recording:
         messages = list(recording.messages(needed=lambda _topic, time: time in {3, 9}))
     assert [(m.log_time_ns, len(m.data)) for m in messages] == [(3, 52), (5, 0), (8, 0), (9, 52)]
+
+
+def test_index_that_lacks_a_chunk_is_not_used(tmp_path: Path) -> None:
+    """Without a checksum only the number of chunks tells; its messages would be missing."""
+    path = tmp_path / "a.mcap"
+    with mcap_writer(path, enable_crcs=False, chunk_size=60) as writer:
+        channel = writer.register_channel("/a", "x-text", 0)
+        for time in (3, 5, 8):
+            writer.add_message(channel, time, b"m" * 52, time)
+    entry = summary_of(path).chunk_indexes[1]
+    data = path.read_bytes()
+    at = data.index(struct.pack("<QQQ", 5, 5, entry.chunk_start_offset)) - 9
+    assert data[at] == Opcode.CHUNK_INDEX
+    path.write_bytes(data[:at] + b"\x90" + data[at + 1 :])  # an opcode for private use
+
+    assert read(path) == ([3, 5, 8], ["no index: messages are read in file order"])
 
 
 @pytest.mark.parametrize(("damage", "wanted"), [("time", 5), ("place", 3)])

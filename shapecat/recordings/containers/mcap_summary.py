@@ -121,4 +121,5 @@ def _is_complete(summary: Summary) -> bool:
     schemas = {channel.schema_id for channel in summary.channels.values()} - {0}
     named = numbers <= summary.channels.keys() and schemas <= summary.schemas.keys()
     empty = statistics.message_count == 0
-    return named and bool(summary.channels or empty) and bool(summary.chunks or empty)
+    listed = len(summary.chunks) >= max(statistics.chunk_count, not empty)
+    return named and bool(summary.channels or empty) and listed
