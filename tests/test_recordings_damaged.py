@@ -327,6 +327,20 @@ def test_bag_with_a_wrong_index_is_read_without_it(tmp_path: Path, broken: str) 
     assert warnings == ["no index, or a damaged one; messages recovered: 12"]
 
 
+def test_damaged_record_of_a_bag_is_reported_with_its_place(tmp_path: Path) -> None:
+    """All after it is lost, so its place says how much that is."""
+    path = bag_of(tmp_path / "a.bag")
+    data = path.read_bytes()
+    at = data.rindex(b"op=\x05")
+    start = at - 8  # the lengths of the header and of its first field
+    path.write_bytes(data[:at] + b"op_\x05" + data[at + 4 :])
+
+    times, warnings = read(path)
+
+    assert 0 < len(times) < 12
+    assert f"damaged record header at byte {start}: everything after it is lost" in warnings
+
+
 def test_bag_messages_of_an_unknown_connection_are_reported(tmp_path: Path) -> None:
     """They cannot be decoded."""
     path = bag_of(tmp_path / "a.bag")

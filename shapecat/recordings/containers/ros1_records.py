@@ -147,7 +147,12 @@ def walk(file: BinaryIO, start: int, end: int) -> Iterator[Record]:
             msg = f"truncated or damaged at byte {start}"
             raise BagError(msg)
         begin = start + 8 + size
-        record = Record(fields_of(header), start, begin, begin + length)
+        try:
+            fields = fields_of(header)
+        except BagError as error:
+            msg = f"{error} at byte {start}"
+            raise BagError(msg) from error
+        record = Record(fields, start, begin, begin + length)
         if record.end > end:
             msg = f"truncated in the record at byte {start}"
             raise BagError(msg, record._replace(end=end))
