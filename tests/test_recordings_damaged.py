@@ -407,6 +407,23 @@ def test_database_is_read_up_to_its_damage(tmp_path: Path) -> None:
     assert warning.startswith("damaged: nothing after this was read: ")
 
 
+def test_damaged_temporary_copy_is_not_named(tmp_path: Path) -> None:
+    """It is gone when the user reads the error, which names the recording anyway."""
+    path = write_folder(tmp_path / "bag", StoragePlugin.SQLITE3) / "bag.db3"
+    whole = path.read_bytes()
+    for data, reason in (
+        (whole[:5000], "database disk image is malformed"),
+        (whole.replace(b"messages", b"massages"), "Cannot open database or database missing tab"),
+    ):
+        path.unlink(missing_ok=True)
+        path.with_name("bag.db3.zstd").write_bytes(zstandard.compress(data))
+        with pytest.raises(RecordingError) as found:
+            open_recording(path.parent)
+        assert str(found.value).startswith(
+            f"{path.parent}: bag.db3.zstd: not a readable ROS 2 bag: {reason}"
+        )
+
+
 @pytest.mark.parametrize(
     ("name", "content", "reason"),
     [

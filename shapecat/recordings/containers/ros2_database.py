@@ -49,13 +49,16 @@ class DatabaseRecording(Recording):
         """
         super().__init__(path)
         self._cleanup = ExitStack()
-        self._reader = Reader(self._with_log())
+        file = self._with_log()
+        self._reader = Reader(file)
         try:
             self._reader.open()
             self._channels = {c.id: _channel(c) for c in self._reader.connections}
         except (ReaderError, apsw.Error, *LIBRARY_ERRORS) as error:
             self._cleanup.close()
-            msg = f"not a readable ROS 2 bag: {str(error) or type(error).__name__}"
+            # The library names the file, which may be a temporary copy, and its own cause.
+            reason = str(error.__cause__ or error).replace(f" {file}", "")
+            msg = f"not a readable ROS 2 bag: {reason or type(error).__name__}"
             raise RecordingError(msg) from error
         channels = ((self._channels[c.id], c.msgcount) for c in self._reader.connections)
         self.topics = sum_topics(
