@@ -18,6 +18,7 @@ from shapecat.outputs.annotation.encoders import MessageKind, encoders_of
 from shapecat.recordings import choose_streams, frames, open_recording, read_transforms
 from shapecat.recordings.decoding.decoders import LIBRARY_ERRORS
 from shapecat.recordings.decoding.protobuf import message_decoder
+from shapecat.recordings.messages import MessageError
 from shapecat.recordings.transforms.window import TransformWindow
 from shapecat.types import AnnotationFrame, Camera, Frame
 from tests.depth_encodings import png
@@ -266,6 +267,17 @@ def test_protobuf_source_gets_protobuf_annotations(tmp_path: Path) -> None:
         assert {topic.encoding for topic in recording.topics} == {"protobuf"}
         (message,) = recording.messages(["/shapecat/scene"])
         assert recording.decode(message).deletions[0].id == "track-7"
+
+
+def test_protobuf_message_without_data_is_not_one_of_default_values(tmp_path: Path) -> None:
+    """Damage that destroyed a message was reported as an image without an encoding."""
+    path = tmp_path / "a.mcap"
+    write(path, "protobuf", [("/p", "foxglove.RawImage", {})])
+
+    with open_recording(path) as recording:
+        (message,) = recording.messages()
+        with pytest.raises(MessageError, match=r"/p: cannot decode foxglove.RawImage: it has no"):
+            recording.decode(message._replace(data=b""))
 
 
 @given(

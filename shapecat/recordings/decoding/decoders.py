@@ -57,13 +57,14 @@ def decode(message: Message, decoders: dict[tuple[str, str, bytes], Decoder]) ->
     channel = message.channel
     key = (channel.type, channel.encoding, channel.schema)
     try:
+        if not message.data:  # in Protocol Buffers this would be a message of default values
+            msg = "it has no data"
+            raise ValueError(msg)
         if key not in decoders:
             decoders[key] = _DECODERS[channel.encoding](channel)
         return as_ros(channel.type, decoders[key](message.data))
     except LIBRARY_ERRORS as error:
         reason = " ".join(str(error).split())[:120] or type(error).__name__
-        if not message.data:
-            reason = "it has no data"
         if channel.encoding not in _DECODERS:
             reason = f"encoding {channel.encoding!r} is not supported"
         msg = f"{channel.topic}: cannot decode {channel.type}: {reason}"
