@@ -327,6 +327,25 @@ def test_bag_with_a_wrong_index_is_read_without_it(tmp_path: Path, broken: str) 
     assert warnings == ["no index, or a damaged one; messages recovered: 12"]
 
 
+@pytest.mark.parametrize("hole", ["length", "header"])
+def test_bag_is_read_on_after_a_hole(tmp_path: Path, hole: str) -> None:
+    """One bad sector would cost the rest of a day, although the index lists its chunks."""
+    path = bag_of(tmp_path / "a.bag")
+    data = path.read_bytes()
+    ops = [at for at in range(len(data)) if data.startswith(b"op=\x05", at)]
+    begin = ops[1] - 8
+    size = 4 if hole == "length" else 60
+    path.write_bytes(data[:begin] + bytes(size) + data[begin + size :])
+    whole, _ = read(bag_of(tmp_path / "b.bag"))
+
+    times, warnings = read(path)
+
+    assert len(times) == len(whole) - 2  # those of the second chunk
+    assert set(times) <= set(whole)
+    (lost,) = (text for text in warnings if text.endswith("is lost"))
+    assert lost.endswith(f": the rest up to byte {ops[2] - 8} is lost")
+
+
 def test_damaged_record_of_a_bag_is_reported_with_its_place(tmp_path: Path) -> None:
     """All after it is lost, so its place says how much that is."""
     path = bag_of(tmp_path / "a.bag")

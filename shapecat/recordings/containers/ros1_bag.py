@@ -7,6 +7,7 @@ Libraries reject the bags that a robot leaves when its power is cut: without an 
 import struct
 from collections.abc import Iterator
 from contextlib import suppress
+from itertools import pairwise
 from typing import ClassVar
 
 from shapecat.errors import RecordingError
@@ -66,7 +67,8 @@ class BagRecording(ChunkedRecording):
 
     def _read_index(self) -> bool:
         header = self._read_header()
-        chunks = []
+        chunks: list[Chunk] = []
+        self._places: list[int] = []  # of the chunks in the index
         try:
             connections, number = u4(header, "conn_count"), u4(header, "chunk_count")
             position = u8(header, "index_pos")
@@ -80,7 +82,8 @@ class BagRecording(ChunkedRecording):
         except (BagError, struct.error):
             return False
         records = [self._record_at(chunk.position) for chunk in chunks]
-        if any(record is None or record.op != CHUNK for record in records):
+        self._places = sorted(r.start for r in records if r is not None and r.op == CHUNK)
+        if len(self._places) < len(chunks):
             return False
         if (len(self._channels), len(chunks)) != (connections, number):
             return False
@@ -112,13 +115,18 @@ class BagRecording(ChunkedRecording):
         return last
 
     def _records(self) -> Iterator[Record]:
-        """Yield the records in file order; a truncated last one is cut to its readable part."""
-        try:
-            yield from walk(self._file, self._first, self._size)
-        except BagError as error:
-            self.warn(f"{error}: everything after it is lost")
-            if error.record is not None:
-                yield error.record
+        """Yield the records in file order; a truncated one is cut to its readable part.
+
+        After a damaged record, the next chunk in the index is read.
+        """
+        for start, end in pairwise([self._first, *self._places, self._size]):
+            try:
+                yield from walk(self._file, start, end)
+            except BagError as error:
+                lost = "everything after it" if end == self._size else f"the rest up to byte {end}"
+                self.warn(f"{error}: {lost} is lost")
+                if error.record is not None:
+                    yield error.record
 
     def _expand(self, record: Record | None, listed: int | None = None) -> Iterator[RawMessage]:
         """Yield the messages of a record; store new connections.
