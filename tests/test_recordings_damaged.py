@@ -103,6 +103,20 @@ def test_messages_out_of_order_count_once_in_a_chunk_read_in_part(tmp_path: Path
     assert [(m.log_time_ns, len(m.data)) for m in messages] == [(3, 52), (5, 0), (8, 0), (9, 52)]
 
 
+@pytest.mark.parametrize("checked", [False, True])
+def test_damaged_index_is_not_called_missing(tmp_path: Path, *, checked: bool) -> None:
+    """Two warnings contradicted each other, or the only one was wrong."""
+    path = tmp_path / "a.mcap"
+    with mcap_writer(path, enable_crcs=checked, compression=CompressionType.NONE) as writer:
+        channel = writer.register_channel("/topic", "x-text", 0)
+        writer.add_message(channel, 5, b"m", 5)
+    before, _, after = path.read_bytes().rpartition(b"/topic")
+    path.write_bytes(before + b"/tOpic" + after)
+
+    warning = "the index is damaged: reading the file from beginning to end instead"
+    assert read(path) == ([5], [warning])
+
+
 def test_index_that_lacks_a_chunk_is_not_used(tmp_path: Path) -> None:
     """Without a checksum only the number of chunks tells; its messages would be missing."""
     path = tmp_path / "a.mcap"

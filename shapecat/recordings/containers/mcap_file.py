@@ -32,7 +32,7 @@ from shapecat.recordings.containers.mcap_records import (
     split_message,
     walk,
 )
-from shapecat.recordings.containers.mcap_summary import Summary, read_summary
+from shapecat.recordings.containers.mcap_summary import DAMAGED_INDEX, Summary, read_summary
 from shapecat.recordings.messages import Channel, Selection, ros_type
 
 __all__ = ["McapRecording"]
@@ -97,6 +97,8 @@ class McapRecording(ChunkedRecording):
             if c.message_end_time or c.message_index_offsets  # else it has no messages
         ]
         usable = summary.checked or self._agrees()
+        if not usable:
+            self.warn(DAMAGED_INDEX)
         self._reported.clear()  # damage is reported when the chunk is read
         self.damaged = False
         return usable
@@ -125,7 +127,8 @@ class McapRecording(ChunkedRecording):
     def _scan(self) -> Record | None:
         last: Record | None = super()._scan()
         if last is not None and last.opcode in _END:
-            self.warn("no index: messages are read in file order")
+            if DAMAGED_INDEX not in self.warnings:
+                self.warn("no index: messages are read in file order")
             return last
         end = len(MAGIC)  # of the last whole record
         if last is not None:

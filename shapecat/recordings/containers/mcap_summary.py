@@ -17,7 +17,10 @@ from shapecat.recordings.containers.mcap_records import (
     walk,
 )
 
-__all__ = ["Summary", "read_summary"]
+__all__ = ["DAMAGED_INDEX", "Summary", "read_summary"]
+
+DAMAGED_INDEX = "the index is damaged: reading the file from beginning to end instead"
+"""A warning."""
 
 _FOOTER = 9 + 20
 
@@ -57,13 +60,13 @@ def read_summary(file: BinaryIO, size: int, warn: Callable[[str], None]) -> Summ
         if not len(MAGIC) < start <= footer_at:
             return None
         if footer.summary_crc and footer.summary_crc != _checksum(file, size, start):
-            warn("the index is damaged: reading the file from beginning to end instead")
+            warn(DAMAGED_INDEX)
             return None
         summary = _collect(file, start, footer_at)
         summary.data_end = _find_data_end(file, summary, start)
         summary.checked = footer.summary_crc != 0
     except RecordingError:
-        warn("the index is damaged: reading the file from beginning to end instead")
+        warn(DAMAGED_INDEX)
         return None
     return summary if _is_complete(summary) else None
 
