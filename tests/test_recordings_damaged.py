@@ -419,8 +419,9 @@ def test_database_message_without_bytes_is_skipped_and_reported(tmp_path: Path) 
     assert warnings == ["/a: skipped a message without bytes"]
 
 
-def test_database_is_read_up_to_its_damage(tmp_path: Path) -> None:
-    """The first hour of a bag on a failing disk is still of use, if one knows what is missing."""
+@pytest.mark.parametrize("counted", [False, True])
+def test_damaged_message_of_a_database_is_skipped(tmp_path: Path, *, counted: bool) -> None:
+    """One bad page would cost the rest of a bag; where frames are numbered, it counts."""
     path = write_folder(tmp_path / "bag", StoragePlugin.SQLITE3) / "bag.db3"
     with closing(sqlite3.connect(path)) as base:
         rows = [(10 * SECOND + k, text("x" * 12_000 + str(k))) for k in range(9)]
@@ -434,9 +435,36 @@ def test_database_is_read_up_to_its_damage(tmp_path: Path) -> None:
     data[before : before + 4] = b"\xff" * 4
     path.write_bytes(data)
 
-    times, (warning,) = read(path)
+    with open_recording(path) as recording:
+        messages = list(recording.messages(needed=(lambda *_: True) if counted else None))
+        assert recording.warnings == ["/a: skipped a damaged message"]
+        rest = list(recording.messages(start_ns=10 * SECOND, stop_ns=10 * SECOND + 7))
 
-    assert times == [*(k * SECOND for k in range(5)), *(10 * SECOND + k for k in range(4))]
+    times = [*(k * SECOND for k in range(5)), *(10 * SECOND + k for k in range(9))]
+    assert [m.log_time_ns for m in messages] == [
+        t for k, t in enumerate(times) if counted or k != 9
+    ]
+    assert [m.log_time_ns for m in messages if not m.data] == times[9:10] * counted
+    assert messages[-1].data == text("x" * 12_000 + "8")
+    assert [m.log_time_ns - 10 * SECOND for m in rest] == [0, 1, 2, 3, 5, 6]
+
+
+def test_database_is_read_up_to_where_it_ends_too_early(tmp_path: Path) -> None:
+    """The first hour of a bag on a failing disk is still of use, if one knows what is missing."""
+    path = write_folder(tmp_path / "bag", StoragePlugin.SQLITE3) / "bag.db3"
+    with closing(sqlite3.connect(path)) as base:  # more than the library keeps in memory
+        rows = [(10 * SECOND + k, text("x" * 3000)) for k in range(1500)]
+        base.executemany("INSERT INTO messages (topic_id, timestamp, data) VALUES (1, ?, ?)", rows)
+        base.commit()
+
+    with open_recording(path) as recording:
+        with path.open("r+b") as file:
+            file.truncate(path.stat().st_size // 2)
+        times = [message.log_time_ns for message in recording.messages()]
+        (warning,) = recording.warnings
+
+    assert times == [*(k * SECOND for k in range(5)), *(t for t, _ in rows)][: len(times)]
+    assert 500 < len(times) < 1000
     assert warning.startswith("damaged: nothing after this was read: ")
 
 

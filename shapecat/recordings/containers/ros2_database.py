@@ -2,7 +2,7 @@
 
 import shutil
 from collections.abc import Iterator
-from contextlib import ExitStack, closing
+from contextlib import ExitStack, closing, suppress
 from pathlib import Path
 from typing import Any, ClassVar
 
@@ -28,6 +28,7 @@ from shapecat.system.files import scratch_folder
 
 __all__ = ["DatabaseRecording"]
 
+_UNREADABLE = (ReaderError, apsw.Error, OSError, *LIBRARY_ERRORS)
 _LAST_NS = 2**63 - 1
 """The largest time that SQLite can hold."""
 _OF_URLS = frozenset("%?#")
@@ -49,15 +50,15 @@ class DatabaseRecording(Recording):
         """
         super().__init__(path)
         self._cleanup = ExitStack()
-        file = self._with_log()
-        self._reader = Reader(file)
+        self._file = self._with_log()
+        self._reader = Reader(self._file)
         try:
             self._reader.open()
             self._channels = {c.id: _channel(c) for c in self._reader.connections}
         except (ReaderError, apsw.Error, *LIBRARY_ERRORS) as error:
             self._cleanup.close()
             # The library names the file, which may be a temporary copy, and its own cause.
-            reason = str(error.__cause__ or error).replace(f" {file}", "")
+            reason = str(error.__cause__ or error).replace(f" {self._file}", "")
             msg = f"not a readable ROS 2 bag: {reason or type(error).__name__}"
             raise RecordingError(msg) from error
         channels = ((self._channels[c.id], c.msgcount) for c in self._reader.connections)
@@ -114,24 +115,57 @@ class DatabaseRecording(Recording):
             return
         limits = selection.start_ns, selection.stop_ns
         times = [None if limit is None else min(limit, _LAST_NS) for limit in limits]
-        raw: Iterator[Any] = self._reader.messages(connections, *times)  # data of any type
-        while True:
+        for number, time, data in self._rows(connections, times):
+            channel = self._channels[number]
+            if data is None:
+                self.warn(f"{channel.topic}: skipped a damaged message")
+            elif not isinstance(data, bytes | memoryview):
+                self.warn(f"{channel.topic}: skipped a message without bytes")
+                continue
+            plain = None if data is None else decompressed(self, channel, bytes(data))
+            if plain is None and selection.needed:
+                plain = b""  # it counts
+            if plain is not None:
+                yield Message(channel, time, time, 0, plain)
+
+    def _rows(
+        self, connections: list[Any], times: list[int | None]
+    ) -> Iterator[tuple[int, int, Any]]:
+        """Yield channel number, time and data of any type; the data is None if it is damaged."""
+        count = 0
+        try:
+            for connection, time, data in self._reader.messages(connections, *times):
+                count += 1
+                yield connection.id, time, data
+        except _UNREADABLE:
             try:
-                connection, time, data = next(raw)
-            except StopIteration:
-                return
-            except (ReaderError, apsw.Error, OSError, *LIBRARY_ERRORS) as error:
+                yield from self._single_rows([c.id for c in connections], times, count)
+            except _UNREADABLE as error:
                 self.warn(
                     f"damaged: nothing after this was read: {str(error) or type(error).__name__}"
                 )
-                return
-            channel = self._channels[connection.id]
-            if not isinstance(data, bytes | memoryview):
-                self.warn(f"{channel.topic}: skipped a message without bytes")
-                continue
-            plain = decompressed(self, channel, bytes(data))
-            if plain is not None:
-                yield Message(channel, time, time, 0, plain)
+
+    def _single_rows(
+        self, numbers: list[int], times: list[int | None], done: int
+    ) -> Iterator[tuple[int, int, Any]]:
+        """Read the data of one row after the other, from the row ``done`` of the same query."""
+        start, stop = times
+        given = ",".join("?" * len(numbers))
+        rows = (
+            "SELECT messages.id, topics.id, timestamp FROM messages JOIN topics "  # noqa: S608  no value is in it
+            f"ON messages.topic_id = topics.id WHERE topics.id IN ({given}) "
+            "AND timestamp BETWEEN ? AND ? ORDER BY timestamp LIMIT -1 OFFSET ?"
+        )
+        first = -_LAST_NS if start is None else start
+        last = _LAST_NS if stop is None else stop - 1
+        flags = apsw.SQLITE_OPEN_READONLY | apsw.SQLITE_OPEN_URI
+        with closing(apsw.Connection(f"file:{self._file}?immutable=1", flags=flags)) as base:
+            for row, number, time in base.execute(rows, (*numbers, first, last, done)):
+                data = None
+                with suppress(apsw.Error):
+                    found = base.execute("SELECT data FROM messages WHERE id = ?", (row,))
+                    data = next(found)[0]
+                yield number, time, data
 
 
 def _channel(connection: Any) -> Channel:
