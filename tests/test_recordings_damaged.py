@@ -1,5 +1,6 @@
 """Damaged containers: what is still read, and the warning or error that says what is missing."""
 
+import errno
 import sqlite3
 import struct
 from contextlib import closing
@@ -16,6 +17,7 @@ from shapecat.errors import RecordingError
 from shapecat.recordings import open_recording
 from shapecat.recordings.containers import ros1_records
 from shapecat.recordings.containers.mcap_index import read_message_index
+from shapecat.recordings.overview import describe_recording
 from tests.mcap_files import mcap_writer, summary_of
 from tests.test_recordings import (
     SECOND,
@@ -269,6 +271,27 @@ def test_message_that_claims_to_be_huge_is_not_unpacked(tmp_path: Path) -> None:
         [5],
         ["/a: skipped a message that claims more than 1 GiB"],
     )
+
+
+def test_error_of_the_disk_names_the_recording(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """It was a traceback of `info`, or blamed the file that an export was writing."""
+    path = tmp_path / "a.mcap"
+    write_mcap(path, [5])
+
+    def fail(*_: object) -> None:
+        raise OSError(errno.EIO, "Input/output error")
+
+    reason = f"{path}: cannot be read: Input/output error"
+    with monkeypatch.context() as patch:
+        patch.setattr("shapecat.recordings.overview.input_size", fail)
+        with pytest.raises(RecordingError, match=reason):
+            describe_recording(path)
+    with open_recording(path) as recording:
+        monkeypatch.setattr("shapecat.recordings.containers.mcap_file.read_content", fail)
+        with pytest.raises(RecordingError, match=reason):
+            list(recording.messages())
 
 
 # ---- ROS 1

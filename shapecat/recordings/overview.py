@@ -4,6 +4,7 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
+from shapecat.errors import RecordingError, explained
 from shapecat.recordings.colour_streams import pair_colours
 from shapecat.recordings.containers.opening import open_recording
 from shapecat.recordings.files import input_size
@@ -20,7 +21,8 @@ def describe_recording(path: Path) -> dict[str, Any]:
     ------
     RecordingError : the recording cannot be read.
     """
-    with open_recording(path) as recording:
+    unreadable = explained(f"{path}: cannot be read", RecordingError)
+    with unreadable, open_recording(path) as recording:
         streams = {stream.topic: stream for stream in depth_streams(recording)}
         uses = _uses(recording, streams)
         for stream in streams.values():

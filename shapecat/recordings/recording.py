@@ -5,6 +5,7 @@ from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any, ClassVar, Self
 
+from shapecat.errors import RecordingError, explained
 from shapecat.recordings.messages import (
     Channel,
     Message,
@@ -78,8 +79,13 @@ class Recording(ABC):
         ------
         Messages by log time, or in file order if the file has no index. Damaged parts are skipped
         and added to ``warnings``.
+
+        Raises
+        ------
+        RecordingError : the disk cannot read the file.
         """
-        return self._read(Selection(topics, start_ns, stop_ns, needed))
+        with explained(f"{self.path}: cannot be read", RecordingError):
+            yield from self._read(Selection(topics, start_ns, stop_ns, needed))
 
     @abstractmethod
     def _read(self, selection: Selection) -> Iterator[Message]:

@@ -18,7 +18,7 @@ from shapecat.arrays import F4
 from shapecat.cameras.colour import ColourView
 from shapecat.config import Settings
 from shapecat.depth_fusion import RecentFrames
-from shapecat.errors import NoStreamError, RecordingError, explained
+from shapecat.errors import NoStreamError
 from shapecat.executors.ordered_pool import OrderedPool
 from shapecat.learning import Categorizer
 from shapecat.perception import Perceiver, PerceptionInput, find_up
@@ -290,14 +290,13 @@ def _oriented(work: Work, upright: Upright, skipped: Counter[str]) -> Iterator[_
 
 
 def _readings(work: Work, skipped: Counter[str]) -> Iterator[tuple[Frame, ColourView | None]]:
-    """Yield the frames of a run; an OSError becomes a RecordingError."""
-    with explained(f"{work.job.source}: cannot be read", RecordingError):
-        for frame, colour in read_frames(
-            work.recording,
-            work.run["options"],
-            skipped=skipped,
-            streams=work.streams,
-            colours=work.colours,
-        ):
-            # Masks need no pixels, and frames are sent to other processes.
-            yield frame, colour and replace(colour, image=replace(colour.image, data=b""))
+    """Yield the frames of a run."""
+    for frame, colour in read_frames(
+        work.recording,
+        work.run["options"],
+        skipped=skipped,
+        streams=work.streams,
+        colours=work.colours,
+    ):
+        # Masks need no pixels, and frames are sent to other processes.
+        yield frame, colour and replace(colour, image=replace(colour.image, data=b""))
