@@ -491,6 +491,19 @@ def test_database_is_read_up_to_where_it_ends_too_early(tmp_path: Path) -> None:
     assert warning.startswith("damaged: nothing after this was read: ")
 
 
+@pytest.mark.parametrize("plugin", list(StoragePlugin))
+def test_folder_named_like_a_part_is_none(tmp_path: Path, plugin: StoragePlugin) -> None:
+    """The error was that it is a directory, or that a file does not exist."""
+    bag = write_folder(tmp_path / "bag", plugin)
+    (bag / "metadata.yaml").unlink()
+    (bag / f"old.{'mcap' if plugin == StoragePlugin.MCAP else 'db3'}").mkdir()
+
+    times, (warning,) = read(bag)
+
+    assert times == [k * SECOND for k in range(5)]
+    assert warning.startswith("no metadata.yaml")
+
+
 def test_damaged_temporary_copy_is_not_named(tmp_path: Path) -> None:
     """It is gone when the user reads the error, which names the recording anyway."""
     path = write_folder(tmp_path / "bag", StoragePlugin.SQLITE3) / "bag.db3"
@@ -512,6 +525,8 @@ def test_damaged_temporary_copy_is_not_named(tmp_path: Path) -> None:
     ("name", "content", "reason"),
     [
         ("notes.txt", b"x", "a folder without .mcap or .db3 files"),
+        ("a.db3", b"", "a.db3: is empty"),
+        ("a.mcap", b"", "a.mcap: is empty"),
         ("a.db3", b"SQLite format 3\0" + bytes(200), "a.db3: not a readable ROS 2 bag"),
         ("a.db3.zstd", b"\x28\xb5\x2f\xfd" + b"\xff" * 40, "a.db3.zstd: damaged: "),
         ("a.db3.zstd", zstandard.compress(b"x" * 600), "a.db3.zstd: not enough space in the temp"),

@@ -87,7 +87,8 @@ class FolderRecording(Recording):
 
     def _list_files(self) -> list[Path]:
         """Return the files that belong to the bag."""
-        present = [file for file in sorted(self.path.iterdir()) if _suffix(file) in _PARTS]
+        files = [file for file in sorted(self.path.iterdir()) if file.is_file()]
+        present = [file for file in files if _suffix(file) in _PARTS]
         in_metadata = self._listed_names()
         names = {file.name for file in present}
         missing = sorted(in_metadata - names)
@@ -124,6 +125,9 @@ class FolderRecording(Recording):
         reasons = []
         for file in files:
             try:
+                if not file.stat().st_size:  # a recorder on a full disk leaves it
+                    msg = "is empty"
+                    raise RecordingError(msg)  # noqa: TRY301  a reason like that of other parts
                 plain = self._decompressed(file) if file.suffix == ".zstd" else file
                 self._parts.append(_PARTS[_suffix(file)](plain))
             except RecordingError as error:
