@@ -429,6 +429,24 @@ def test_message_lost_in_a_bag_chunk_is_reported(tmp_path: Path) -> None:
 # ---- ROS 2
 
 
+@pytest.mark.parametrize("time", ["'a text'", "NULL", "-5"])
+def test_database_message_without_time_is_skipped_and_reported(tmp_path: Path, time: str) -> None:
+    """It cannot be sorted, or written to annotated.mcap."""
+    path = write_folder(tmp_path / "bag", StoragePlugin.SQLITE3) / "bag.db3"
+    with closing(sqlite3.connect(path)) as base:
+        (made,) = base.execute("SELECT sql FROM sqlite_master WHERE name = 'messages'").fetchone()
+        base.execute("ALTER TABLE messages RENAME TO strict")
+        base.execute(made.replace("timestamp INTEGER NOT NULL", "timestamp INTEGER"))
+        base.execute("INSERT INTO messages SELECT * FROM strict")
+        base.execute(f"UPDATE messages SET timestamp = {time} WHERE id = 3")  # noqa: S608  above
+        base.commit()
+
+    times, warnings = read(path)
+
+    assert times == [0, SECOND, 3 * SECOND, 4 * SECOND]
+    assert warnings == ["/a: skipped a message without a time"]
+
+
 def test_database_message_without_bytes_is_skipped_and_reported(tmp_path: Path) -> None:
     """Scripts that edit bags with SQL leave such rows."""
     path = write_folder(tmp_path / "bag", StoragePlugin.SQLITE3) / "bag.db3"

@@ -117,6 +117,9 @@ class DatabaseRecording(Recording):
         times = [None if limit is None else min(limit, _LAST_NS) for limit in limits]
         for number, time, data in self._rows(connections, times):
             channel = self._channels[number]
+            if not isinstance(time, int) or time < 0:
+                self.warn(f"{channel.topic}: skipped a message without a time")
+                continue
             if data is None:
                 self.warn(f"{channel.topic}: skipped a damaged message")
             elif not isinstance(data, bytes | memoryview):
@@ -130,7 +133,7 @@ class DatabaseRecording(Recording):
 
     def _rows(
         self, connections: list[Any], times: list[int | None]
-    ) -> Iterator[tuple[int, int, Any]]:
+    ) -> Iterator[tuple[int, Any, Any]]:
         """Yield channel number, time and data of any type; the data is None if it is damaged."""
         count = 0
         try:
