@@ -12,7 +12,7 @@ if TYPE_CHECKING:
     from shapecat.simulation.containers import FormatName
     from shapecat.simulation.scenes.kinds import SceneKind
 
-_SCENES = ("tabletop", "shelf", "clutter", "pile", "bin", "shelf_bin", "room", "turntable",
+_SCENES = ("tabletop", "shelf", "clutter", "pile", "bin", "shelf_bin", "room", "rows", "turntable",
            "walking", "crossing", "rearranged")  # fmt: skip
 _SENSORS = (
     "kinect",
@@ -80,6 +80,7 @@ def simulate(
     bin         objects dropped into a bin
     shelf_bin   objects in a compartment of a shelf, seen from the front
     room        a table among robot arms, people and furniture
+    rows        like objects in rows, grids and stacks on a table, on a shelf or in a bin
     turntable   a turntable in front of a fixed camera
     walking     a camera that moves along a counter and back
     crossing    two moving objects that occlude each other and others

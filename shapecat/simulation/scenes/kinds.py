@@ -13,6 +13,7 @@ from shapecat.simulation.scenes.moving import crossing, rearranged, walking
 from shapecat.simulation.scenes.paths import Filming, arc_orbit, static_view
 from shapecat.simulation.scenes.piles import bin_picking, pile, shelf_bin
 from shapecat.simulation.scenes.rooms import room
+from shapecat.simulation.scenes.rows import rows
 from shapecat.simulation.scenes.worlds import World
 from shapecat.types import CATEGORIES
 
@@ -26,6 +27,7 @@ SceneKind = Literal[
     "bin",
     "shelf_bin",
     "room",
+    "rows",
     "turntable",
     "walking",
     "crossing",
@@ -160,6 +162,7 @@ SCENES: dict[str, Callable[[Generator, _SceneSpec], World]] = {
     "bin": lambda rng, spec: bin_picking(rng, spec.draw_shuffled(rng), spec.filming),
     "shelf_bin": lambda rng, spec: shelf_bin(rng, spec.draw_shuffled(rng), spec.filming),
     "room": lambda rng, spec: room(rng, spec.draw(rng, 7), spec.filming),
+    "rows": lambda rng, spec: rows(rng, spec.draw(rng, 7), spec.filming),
     "turntable": _turntable,
     "walking": lambda rng, spec: walking(rng, spec.draw(rng, 11), spec.filming),
     "crossing": lambda rng, spec: crossing(rng, spec.draw(rng, 7), spec.filming),
