@@ -73,8 +73,8 @@ class PlaneSettings(NamedTuple):
     wall_share: float = 0.5
     """A wall closes a box if more than this fraction of the samples below an edge are on it."""
     bare_share: float = 0.02
-    """Maximum fraction of the samples over a bare plane that are twice the minimum height of an
-    object's sample above it."""
+    """Maximum fraction of the samples over a bare plane that are higher above it than twice the
+    minimum height of an object."""
     around_m: float = 0.03
     """Distance from a sample to the surroundings of its plane, metres."""
     drop_ratio: float = 0.2

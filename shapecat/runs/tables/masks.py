@@ -65,7 +65,7 @@ def read_nearest_masks(folder: Path) -> Iterator[tuple[Key, ImageMasks]]:
     Several frames have the same image if images are rarer, or if several depth sensors share a
     colour camera; the frames of one of these may come later. Run lengths are left out.
     """
-    last = _sensors(folder)  # the image of the last frame of each sensor
+    last = _sensors_of(folder)  # the image of the last frame of each sensor
     held: dict[str, dict[_Times, tuple[int, Key, ImageMasks]]] = {}
     stamps = read_stamps(folder)
     for key, masks in read_masks(folder, boxes_only=True):
@@ -75,16 +75,16 @@ def read_nearest_masks(folder: Path) -> Iterator[tuple[Key, ImageMasks]]:
         if times not in images or apart < images[times][0]:
             images[times] = apart, key, masks
         last.setdefault(masks.topic, {})[key[0]] = times
-        awaited = {*last[masks.topic].values()}
-        while awaited.isdisjoint({None, first := next(iter(images))}) or len(images) > _HELD:
-            yield images.pop(first)[1:]
+        latest = set(last[masks.topic].values())
+        while len(images) > _HELD or (None not in latest and next(iter(images)) not in latest):
+            yield images.pop(next(iter(images)))[1:]
     for images in held.values():
         for _, key, masks in images.values():
             yield key, masks
 
 
-def _sensors(folder: Path) -> dict[str, dict[str, _Times | None]]:
-    """Return None for each depth sensor that has images of a topic, by this topic."""
+def _sensors_of(folder: Path) -> dict[str, dict[str, _Times | None]]:
+    """Return, for each topic of images, the depth topics with masks in them, each with None."""
     path, sensors = folder / "masks.parquet", dict[str, dict[str, _Times | None]]()
     for group in read_row_groups(path, ["topic", "color_topic"]) if path.exists() else ():
         pairs = zip(*(group[name].to_pylist() for name in ("topic", "color_topic")), strict=True)

@@ -15,7 +15,7 @@ from shapecat.simulation.shapes.mesh import Mesh
 from shapecat.simulation.shapes.stable_poses import StablePose, choose_stable_pose, stable_poses
 from shapecat.types import Pose
 
-__all__ = ["SUPPORTING", "Layout", "Piece", "make_piece"]
+__all__ = ["SUPPORTING", "Layout", "Piece", "make_piece", "place_piece"]
 
 _LYING = {"can": 0.2, "bottle": 0.22, "cup": 0.12, "box": 0.7}
 """Probability that an object of a category lies; a box lies on any face."""
@@ -58,6 +58,32 @@ def make_piece(category: str, rng: Generator, *, resting_pose: str | None = None
     if pose_name != "upright" and category not in {"ball", "unknown"}:
         stable_pose = choose_stable_pose(stable_poses(mesh), pose_name, rng) or stable_pose
     return Piece(category, kind, mesh, stable_pose)
+
+
+def place_piece(
+    piece: Piece, track: int, pose: Pose, support: Support, on_track: int | None
+) -> PlacedObject:
+    """Return a piece as the object number ``track`` of a world.
+
+    Parameters
+    ----------
+    pose : ``world_from_mesh``, in its stable pose.
+    support : what it stands on, unless that is another object.
+    on_track : the object that it stands on, if any.
+    """
+    # No pose of a box is its upright one.
+    resting_pose = "upright" if piece.category == "box" else piece.stable_pose.name
+    return PlacedObject(
+        track,
+        piece.category,
+        piece.kind,
+        piece.mesh,
+        pose,
+        support.name if on_track is None else None,
+        on_track,
+        lying=resting_pose == "lying",
+        upside_down=resting_pose == "upside_down",
+    )
 
 
 def _draw_resting_pose(category: str, rng: Generator) -> str:
@@ -189,20 +215,8 @@ class Layout:
     def _add(
         self, piece: Piece, turn: Pose, placed: Footprint, support: Support, on_track: int | None
     ) -> None:
-        # No pose of a box is its upright one.
-        resting_pose = "upright" if piece.category == "box" else piece.stable_pose.name
-        item = PlacedObject(
-            len(self.objects),
-            piece.category,
-            piece.kind,
-            piece.mesh,
-            compose(turn, piece.stable_pose.pose),
-            support.name if on_track is None else None,
-            on_track,
-            lying=resting_pose == "lying",
-            upside_down=resting_pose == "upside_down",
-        )
-        self.objects.append(item)
+        pose = compose(turn, piece.stable_pose.pose)
+        self.objects.append(place_piece(piece, len(self.objects), pose, support, on_track))
         self._places.append(placed)
         self._base_supports.append(support)
 

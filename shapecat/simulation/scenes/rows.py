@@ -10,7 +10,7 @@ from shapecat.arrays import F8
 from shapecat.geometry import compose
 from shapecat.simulation.scenes.footprints import Footprint, footprint, inside, overlap
 from shapecat.simulation.scenes.furniture import make_bin, make_room, make_shelf, make_table
-from shapecat.simulation.scenes.layout import SUPPORTING, Piece, make_piece
+from shapecat.simulation.scenes.layout import SUPPORTING, Piece, make_piece, place_piece
 from shapecat.simulation.scenes.paths import Filming, arc_orbit
 from shapecat.simulation.scenes.worlds import PlacedObject, Support, World, pose_from_yaw
 from shapecat.simulation.shapes.randomness import log_uniform
@@ -142,11 +142,15 @@ class _Groups:
             moved = Pose(np.eye(3), np.round(corner + place.corner - low + shift, 6))
             pose = compose(turn, compose(moved, place.piece.stable_pose.pose))
             tracks[k] = len(self.objects)
-            self.objects.append(_placed(tracks[k], place, pose, support, tracks.get(place.below)))
+            below = tracks.get(place.below)
+            self.objects.append(place_piece(place.piece, tracks[k], pose, support, below))
 
 
 def _draw_group(category: str, rng: Generator, gap: float, room: F8) -> list[_Place]:
-    """Draw the objects of a group, layer by layer; none if they are larger than ``room`` (3,)."""
+    """Draw the objects of a group, layer by layer; none if one is larger than ``room``.
+
+    ``gap`` between objects and ``room`` (3,) are in metres.
+    """
     piece = make_piece(category, rng)
     size = footprint(piece.mesh, piece.stable_pose.pose)
     between = np.array([gap, gap, 0])
@@ -168,7 +172,10 @@ def _draw_group(category: str, rng: Generator, gap: float, room: F8) -> list[_Pl
 def _draw_row(
     category: str, rng: Generator, gap: float, count: int, headroom_m: float
 ) -> list[_Place]:
-    """Draw a row of objects of different sizes, aligned at the front, as books on a shelf."""
+    """Draw a row of objects of different sizes, aligned at the front, as books on a shelf.
+
+    ``gap`` and ``headroom_m`` are in metres; taller objects are left out.
+    """
     row, along = [], 0.0
     for _ in range(count):
         piece = make_piece(category, rng)
@@ -180,23 +187,5 @@ def _draw_row(
 
 
 def _extent(size: Footprint) -> F8:
+    """Return the size (3,) of the bounding box, metres."""
     return np.array([*np.ptp(size.outline, axis=0), size.high - size.low])
-
-
-def _placed(
-    track: int, place: _Place, pose: Pose, support: Support, on_track: int | None
-) -> PlacedObject:
-    piece = place.piece
-    # No pose of a box is its upright one.
-    resting_pose = "upright" if piece.category == "box" else piece.stable_pose.name
-    return PlacedObject(
-        track,
-        piece.category,
-        piece.kind,
-        piece.mesh,
-        pose,
-        support.name if on_track is None else None,
-        on_track,
-        lying=resting_pose == "lying",
-        upside_down=resting_pose == "upside_down",
-    )
