@@ -93,6 +93,15 @@ def test_settings_that_fit_together_may_be_given_in_any_order() -> None:
     assert (settings.surface.smooth_radius_m, settings.surface.voxel_m) == (0.0045, 0.003)
 
 
+def test_last_of_several_values_of_setting_counts() -> None:
+    """Scripts pass their defaults first, and then what their user gave."""
+    overrides = ["tracking.gate_m=0.2", "seed=1", "tracking.fusion=vote", "tracking.gate_m=0.3"]
+
+    settings = with_overrides(Settings(), overrides)
+
+    assert (settings.tracking.gate_m, settings.tracking.fusion) == (0.3, "vote")
+
+
 def test_file_may_begin_with_byte_order_mark(tmp_path: Path) -> None:
     """Editors on Windows write one."""
     path = tmp_path / "s.toml"

@@ -192,6 +192,14 @@ def test_view_keeps_viewpoint_and_drops_nan(tmp_path: Path) -> None:
     assert (view.category, view.instance) == ("cup", "mug")
 
 
+@pytest.mark.parametrize("eye", [[0, 0, 1.25], [-0.5, 0, 0.75]])
+def test_viewpoint_may_have_coordinates_of_zero(tmp_path: Path, eye: list[float]) -> None:
+    """Only (0, 0, 0) is the default of files that state none: a camera may be right above."""
+    view = read_view(save(tmp_path, POINTS, viewpoint=np.array(eye)))
+
+    assert view.eye.tolist() == eye
+
+
 def test_views_are_sorted_by_path(tmp_path: Path) -> None:
     """Models made from the same folder must not depend on the file system."""
     for name in ("b/2/1.pcd", "a/9/3.PCD", "a/10/0.pcd"):

@@ -484,6 +484,16 @@ def test_yolo_omits_uncertain_labels(tmp_path: Path) -> None:
     assert area == pytest.approx(28, abs=14)
 
 
+def test_labels_of_images_with_dots_in_their_names_stay_apart(tmp_path: Path) -> None:
+    """Recordings are often named after dates or versions; trainers pair files by their stems."""
+    names = ("2024.05.01_depth_0.jpg", "2024.05.01_depth_1.jpg")
+    images: Any = [("train", finished(), replace(dataset_image(), name=name)) for name in names]
+    write_yolo(tmp_path, images, ("cup", "can", "bowl"))
+
+    labels = sorted((tmp_path / "labels" / "train").iterdir())
+    assert [path.name for path in labels] == [f"{Path(name).stem}.txt" for name in names]
+
+
 def test_tiny_negative_yaw_is_not_written_as_360_degrees() -> None:
     """The remainder of a negative rounding error is 360 itself, which labelCloud cannot show."""
     item = labelled(cut=False, hidden=False).objects[0]
