@@ -1,5 +1,6 @@
 """Recordings of every format variant, damaged and unusual ones, with their expected outcomes."""
 
+import json
 import os
 import shutil
 import sqlite3
@@ -305,6 +306,33 @@ def late_transforms(path: Path) -> Path:
     return plain(path, [*others, loop, (first[0], others[-1][1] + 1, first[2])])
 
 
+def absurd_numbers(path: Path) -> Path:
+    """Add JSON messages whose numbers fit in no type, or stand where lists belong."""
+    huge = 10**400
+    time = {"sec": huge, "nanosec": 0}
+    zeros = dict.fromkeys("xyzw", 0)
+    header = {"stamp": time, "frame_id": "map"}
+    link = {"header": header, "child_frame_id": "b"}
+    link["transform"] = {"translation": zeros, "rotation": zeros}
+    texts = {
+        "/tf": ("tf2_msgs/msg/TFMessage", {"transforms": [link]}),
+        "/points": (ros.CLOUD, {"header": header, "fields": 1}),
+        "/image": (ros.IMAGE, {"header": header, "encoding": "16UC1"}),
+        "/colour": (ros.COMPRESSED, {"header": header, "format": "jpeg", "data": 1}),
+        "/camera/depth/camera_info": (ros.INFO, {"header": header}),
+    }
+    path /= "a.mcap"
+    with mcap_writer(path) as writer:
+        for topic, (kind, content) in texts.items():
+            schema = writer.register_schema(kind, "jsonschema", b"{}")
+            channel = writer.register_channel(topic, "json", schema)
+            writer.add_message(channel, EPOCH, json.dumps(content).encode(), EPOCH)
+        channels = McapChannels(writer, FACTORY.typestore)
+        for item in serialized(stream(FACTORY, FRAMES), FACTORY):
+            channels.write(*item)
+    return path
+
+
 def hostile_chunk(path: Path) -> Path:
     """Let the first chunk claim to hold 10^9 bytes."""
     found = mcap(path, compression=CompressionType.ZSTD, chunk_size=1)
@@ -444,6 +472,10 @@ CASES: dict[str, Case] = {
     "slight distortion": Case(lambda p: distorted(p, strong=False)),
     "strong distortion": Case(lambda p: distorted(p, strong=True), reported="undistorted rays"),
     "foreign channels": Case(foreign),
+    "absurd numbers": Case(
+        absurd_numbers,
+        reported="calibration: /camera/depth/camera_info: message does not match its type",
+    ),
     "clock from power-on": Case(lambda p: clocks(p, "uptime"), reported="does not count from 1970"),
     "clock missing": Case(lambda p: clocks(p, "zero"), reported="stamp is 0"),
     "clock stuck": Case(lambda p: clocks(p, "stuck"), reported="stamp is that of the message"),

@@ -1,5 +1,6 @@
 """Tests of the up direction: its sources and their reliability."""
 
+import json
 from collections.abc import Iterator
 from dataclasses import replace
 from pathlib import Path
@@ -28,6 +29,7 @@ from shapecat.runs.perceive.up_report import report_up
 from shapecat.runs.tables.schemas import DETECTIONS, FRAMES, PLANES
 from shapecat.simulation.messages import MessageFactory
 from shapecat.types import Frame, Pose
+from tests.mcap_files import mcap_writer
 from tests.messages import CAMERA, EPOCH, SECOND, header, make, write
 from tests.scenes import OPTICAL, stream, views
 
@@ -535,3 +537,38 @@ def test_damaged_imu_message_is_skipped_and_reported(tmp_path: Path) -> None:
     assert found.up.tolist() == [0, -1, 0]
     assert len(warnings) == 1
     assert warnings[0].startswith(f"skipped an IMU message: /imu: cannot decode {kind}")
+
+
+@pytest.mark.parametrize(
+    "changes",
+    [
+        {"header": {"stamp": {"sec": 10**400, "nanosec": 0}, "frame_id": "camera"}},
+        {"header": {"stamp": {"sec": 1, "nanosec": 0}}},
+        {"linear_acceleration": {"x": 10**400, "y": 0, "z": 0}},
+    ],
+)
+def test_absurd_imu_message_is_skipped_and_reported(tmp_path: Path, changes: Any) -> None:
+    """JSON has no types: an integer may have any size, and a field may be missing."""
+    name, good = (
+        "sensor_msgs/msg/Imu",
+        {
+            "header": {"stamp": {"sec": EPOCH // SECOND, "nanosec": 0}, "frame_id": "camera"},
+            "linear_acceleration": {"x": 0.0, "y": -9.7, "z": 0.0},
+            "linear_acceleration_covariance": [0.0] * 9,
+        },
+    )
+    path = tmp_path / "a.mcap"
+    with mcap_writer(path) as writer:
+        schema = writer.register_schema(name, "jsonschema", b"{}")
+        channel = writer.register_channel("/imu", "json", schema)
+        for k, content in enumerate((good, good | changes)):
+            writer.add_message(channel, EPOCH + k, json.dumps(content).encode(), EPOCH + k)
+
+    with open_recording(path) as recording:
+        found = Upright.of(recording, up="imu", fixed_frame=None).orient(frame(EPOCH))
+
+        assert recording.warnings == [
+            "skipped an IMU message: /imu: message does not match its type"
+        ]
+    assert found.up is not None
+    assert found.up.tolist() == [0, -1, 0]

@@ -13,7 +13,7 @@ from shapecat.recordings.decoding.colour_image import COLOUR_ENCODINGS, compress
 from shapecat.recordings.decoding.compressed_depth import is_grey_png16
 from shapecat.recordings.decoding.depth_image import DEPTH_ENCODINGS
 from shapecat.recordings.decoding.foxglove import ros_counterpart
-from shapecat.recordings.messages import Topic
+from shapecat.recordings.messages import MALFORMED, Topic
 from shapecat.recordings.pinhole import is_rectified
 from shapecat.recordings.recording import Recording
 from shapecat.recordings.sensors import by_sensor, same_frame
@@ -221,7 +221,7 @@ def _namespace(topic: str) -> tuple[str, ...]:
 
 def _probe(topic: Topic, recording: Recording) -> ColourStream | None:
     kind, encoding_of = _PROBES[ros_counterpart(topic.type)]
-    with suppress(AttributeError, TypeError):  # a definition without the fields of its type
+    with suppress(*MALFORMED):
         for first in first_messages(recording, topic.name, topic.type):  # some may be blank
             encoding = encoding_of(first)
             if not encoding:

@@ -34,7 +34,7 @@ Needed: TypeAlias = Callable[[str, int], bool] | None
 _SMALL = 1 << 16  # bytes
 
 MALFORMED = (ArithmeticError, AttributeError, LookupError, TypeError, ValueError)
-"""Raised by the use of a decoded message whose definition lacks fields of its type."""
+"""Raised by the use of a decoded message that lacks fields of its type, or has values of others."""
 
 
 class MessageError(RecordingError):

@@ -10,6 +10,7 @@ from typing import Any
 import numpy as np
 
 from shapecat.arrays import F4
+from shapecat.errors import RecordingError
 from shapecat.geometry import transform
 from shapecat.recordings.decoding.compressed_depth import depth_of_compressed
 from shapecat.recordings.decoding.depth_image import depth_of_image
@@ -142,8 +143,9 @@ class DepthSource(Source):
         try:
             info = self.recording.decode(message)
             stamp = stamp_ns(info.header)
-        except (MessageError, *MALFORMED) as error:
-            self.recording.warn(f"skipped a calibration: {error}")
+        except (RecordingError, *MALFORMED) as error:
+            reason = reason_of(error, message.topic)
+            self.recording.warn(f"skipped a calibration: {message.topic}: {reason}")
             return
         if self._waiting is None:
             self._info, self._info_stamp = info, stamp

@@ -10,7 +10,7 @@ from shapecat.errors import NoStreamError, listed
 from shapecat.recordings.decoding.compressed_depth import is_grey_png16
 from shapecat.recordings.decoding.depth_image import DEPTH_ENCODINGS
 from shapecat.recordings.decoding.foxglove import ros_counterpart
-from shapecat.recordings.messages import MessageError, Topic, reason_of
+from shapecat.recordings.messages import MALFORMED, MessageError, Topic, reason_of
 from shapecat.recordings.recording import Recording
 from shapecat.recordings.sensors import Stream, by_sensor
 
@@ -61,7 +61,7 @@ def depth_streams(recording: Recording, requested: Sequence[str] = ()) -> tuple[
             continue
         probe = _PROBES.get(ros_counterpart(topic.type))
         if probe is not None and topic.count != 0:
-            with suppress(AttributeError):  # a definition without the fields of its type
+            with suppress(*MALFORMED):
                 first = first_messages(recording, topic.name, topic.type)
                 probed = (probe(topic, message, recording) for message in first)
                 streams.append(next((stream for stream in probed if stream is not None), None))
@@ -315,7 +315,7 @@ def _frame_of(recording: Recording, topic: str) -> str:
     """Return the frame id of a topic's first message, read once; empty if it has none."""
     if topic not in recording.frame_ids:
         recording.frame_ids[topic] = ""
-        with suppress(AttributeError):
+        with suppress(*MALFORMED):  # or no message
             recording.frame_ids[topic] = str(first_message(recording, topic).header.frame_id)
     return recording.frame_ids[topic]
 

@@ -13,7 +13,7 @@ from typing import Any
 from shapecat.errors import RecordingError, ShapecatError, listed
 from shapecat.geometry import IDENTITY, compose, inverse
 from shapecat.recordings.decoding.foxglove import ros_counterpart
-from shapecat.recordings.messages import Message
+from shapecat.recordings.messages import MALFORMED, Message, reason_of
 from shapecat.recordings.recording import Recording
 from shapecat.recordings.stamps import stamp_ns
 from shapecat.recordings.transforms.samples import (
@@ -305,8 +305,9 @@ class TransformReader:
                     self._recording.warn("skipped invalid transforms (NaN, no name)")
                 if not static:
                     self.lag_ns = max(self.lag_ns, abs(stamp - message.log_time_ns))
-        except (AttributeError, TypeError, ValueError, RecordingError) as error:
-            self._recording.warn(f"skipped transforms: {error}")
+        except (RecordingError, *MALFORMED) as error:
+            reason = reason_of(error, message.topic)
+            self._recording.warn(f"skipped transforms: {message.topic}: {reason}")
 
     def _add(self, transform: Any, stamp: int, *, static: bool, latched: bool) -> bool:
         """Add a decoded geometry_msgs/TransformStamped; return False if it is invalid."""

@@ -6,8 +6,9 @@ from functools import cached_property
 import numpy as np
 
 from shapecat.arrays import F8
+from shapecat.errors import RecordingError
 from shapecat.recordings.look_ahead import LookAhead
-from shapecat.recordings.messages import Message, MessageError
+from shapecat.recordings.messages import MALFORMED, Message, reason_of
 from shapecat.recordings.recording import Recording
 from shapecat.recordings.stamps import stamp_ns
 
@@ -84,12 +85,13 @@ class Accelerometers:
             a, stamp = imu.linear_acceleration, stamp_ns(imu.header) or message.log_time_ns
             acceleration = np.array([a.x, a.y, a.z], np.float64)
             absent = float(imu.linear_acceleration_covariance[0]) == -1
-        except (MessageError, AttributeError, LookupError, TypeError, ValueError) as error:
-            self._recording.warn(f"skipped an IMU message: {error}")
+            name = str(imu.header.frame_id)
+        except (RecordingError, *MALFORMED) as error:
+            reason = reason_of(error, message.topic)
+            self._recording.warn(f"skipped an IMU message: {message.topic}: {reason}")
             return
         size = float(np.abs(acceleration).max())
         if not absent and 1e-3 < size < 1e4:
-            name = str(imu.header.frame_id)
             sensor = self._found.setdefault(message.topic, Accelerometer(message.topic, name))
             sensor.add(stamp, acceleration)
 
