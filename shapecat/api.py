@@ -59,7 +59,6 @@ class OpenRecording:
 
     def __init__(self, recording: Recording) -> None:
         self.recording = recording
-        self._closed = False
 
     def __enter__(self) -> Self:
         return self
@@ -69,7 +68,6 @@ class OpenRecording:
 
     def close(self) -> None:
         """Close the files of the recording."""
-        self._closed = True
         self.recording.close()
 
     @property
@@ -96,10 +94,9 @@ class OpenRecording:
         RecordingError : the recording is closed, perhaps while its frames are read.
         """
         _require_selection(start_s, end_s, every)
-        self._require_open()
         chosen = (topics,) if isinstance(topics, str) else tuple(topics)
         streams = choose_streams(self.recording, chosen)
-        found = frames(
+        return frames(
             self.recording,
             streams,
             start_s=start_s,
@@ -107,19 +104,6 @@ class OpenRecording:
             every=int(every),
             skipped=Counter(),
         )
-        return self._while_open(found)
-
-    def _while_open(self, found: Iterator[Frame]) -> Iterator[Frame]:
-        """Yield frames; readers of some formats would end silently once they are closed."""
-        self._require_open()
-        for frame in found:
-            yield frame
-            self._require_open()
-
-    def _require_open(self) -> None:
-        if self._closed:
-            msg = f"{self.recording.path}: is closed; read its frames before"
-            raise RecordingError(msg)
 
 
 def open_recording(path: str | Path) -> OpenRecording:

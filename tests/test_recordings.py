@@ -33,6 +33,7 @@ from shapecat.recordings import Channel, MessageError, Topic, open_recording
 from shapecat.recordings.decoding.decoders import typestore_of
 from shapecat.system.files import lock
 from tests.mcap_files import mcap_writer
+from tests.scenes import record
 
 STORE = get_typestore(Stores.ROS2_HUMBLE)
 STORE1 = get_typestore(Stores.ROS1_NOETIC)
@@ -60,6 +61,28 @@ def write_mcap(path: Path, times: list[int], **options: Any) -> Path:
 def times_read(path: Path, **options: Any) -> list[int]:
     with open_recording(path) as recording:
         return [message.log_time_ns for message in recording.messages(**options)]
+
+
+@pytest.mark.parametrize("container", ["mcap", "ros1", "ros2"])
+@pytest.mark.parametrize("read", [0, 1, 3])
+def test_messages_of_closed_recording_are_refused(
+    tmp_path: Path, container: str, read: int
+) -> None:
+    """Some readers ended as if there were no more messages, others raised what their library did.
+
+    Messages that are in memory when the recording is closed are refused as well.
+    """
+    path = record(tmp_path / "a", 5, container=container)
+    with open_recording(path) as recording:
+        messages = recording.messages(["/tf"])
+        for _ in range(read):
+            next(messages)
+
+    assert recording.closed
+    with pytest.raises(RecordingError, match=f"^{path}: is closed; read its frames before$"):
+        next(messages)
+    with pytest.raises(RecordingError, match="is closed"):
+        list(recording.messages())
 
 
 @pytest.mark.parametrize("compression", list(CompressionType))

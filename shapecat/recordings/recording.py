@@ -29,6 +29,7 @@ class Recording(ABC):
     path : the file or folder.
     topics : sorted by name; a topic with two types appears twice.
     start_ns, end_ns : log times of the first and last message; 0 if there is none.
+    closed : whether it was closed; then no messages can be read.
     indexed : whether messages are found by topic and time, without reading the rest.
     damaged : reading has found a damaged chunk, or the damaged index of one, in an MCAP file.
     warnings : problems found in the recording, for the user.
@@ -44,6 +45,7 @@ class Recording(ABC):
         self.topics: tuple[Topic, ...] = ()
         self.start_ns = 0
         self.end_ns = 0
+        self.closed = False
         self.indexed = True
         self.damaged = False
         self.warnings: list[str] = []
@@ -82,18 +84,32 @@ class Recording(ABC):
 
         Raises
         ------
-        RecordingError : the disk cannot read the file.
+        RecordingError : the disk cannot read the file, or the recording is closed, perhaps while
+            its messages are read.
         """
+        self._require_open()
         with explained(f"{self.path}: cannot be read", RecordingError):
-            yield from self._read(Selection(topics, start_ns, stop_ns, needed))
+            for message in self._read(Selection(topics, start_ns, stop_ns, needed)):
+                yield message
+                self._require_open()  # some libraries would end here as if there were no more
+
+    def _require_open(self) -> None:
+        if self.closed:
+            msg = f"{self.path}: is closed; read its frames before"
+            raise RecordingError(msg)
 
     @abstractmethod
     def _read(self, selection: Selection) -> Iterator[Message]:
         """Yield the selected messages."""
 
-    @abstractmethod
     def close(self) -> None:
-        """Release the file."""
+        """Release the files; messages cannot be read any more."""
+        self.closed = True
+        self._release()
+
+    @abstractmethod
+    def _release(self) -> None:
+        """Close the files, and remove temporary copies."""
 
     def decode(self, message: Message) -> Any:
         """Return a message as an object with the fields of its type as attributes.

@@ -85,8 +85,7 @@ class ChunkedRecording(Recording):
             for number, channel in self._channels.items()
         )
 
-    def close(self) -> None:
-        """Close the file."""
+    def _release(self) -> None:
         self._file.close()
 
     @abstractmethod

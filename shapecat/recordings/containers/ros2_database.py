@@ -71,8 +71,7 @@ class DatabaseRecording(Recording):
         if any(c.encoding == "cdr" and not c.schema for c in self._channels.values()):
             self.warn("no message definitions: those of ROS 2 Humble are assumed")
 
-    def close(self) -> None:
-        """Close the database, and remove its copy if there is one."""
+    def _release(self) -> None:
         self._reader.close()
         self._cleanup.close()
 

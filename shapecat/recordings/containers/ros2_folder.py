@@ -62,8 +62,7 @@ class FolderRecording(Recording):
         self.indexed = all(part.indexed for part in self._parts)
         self._note()
 
-    def close(self) -> None:
-        """Close all files and remove the decompressed copies."""
+    def _release(self) -> None:
         for part in self._parts:
             part.close()
         self._cleanup.close()
