@@ -1,5 +1,6 @@
 """Worked examples of calibrations and depth encodings, with distinct numbers."""
 
+from collections import Counter
 from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
@@ -70,7 +71,7 @@ def test_topic_name_decides_whether_image_is_rectified(topic: str, rectified: bo
     recording: Any = SimpleNamespace(topics=())
     stream = Stream(topic, IMAGE, "depth", "/info", 9, "optical")
 
-    assert DepthSource(recording, stream).rectified is rectified
+    assert DepthSource(recording, stream, Counter()).rectified is rectified
 
 
 def test_rectified_image_without_p_uses_k() -> None:

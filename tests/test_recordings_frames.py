@@ -889,13 +889,14 @@ def test_image_is_returned_as_soon_as_its_calibration_arrives(tmp_path: Path) ->
     ]
     with open_recording(write(tmp_path / "a.mcap", items)) as recording:
         (stream,) = choose_streams(recording)
-        source, skipped = DepthSource(recording, stream), Counter[str]()
+        source = DepthSource(recording, stream, Counter())
         returned = []
-        for message in recording.messages():
-            take = source.calibrate if message.topic.endswith("info") else source.read
-            returned.append([frame.stamp_ns for frame in take(message, skipped)])
+        for k, message in enumerate(recording.messages()):
+            is_info = message.topic.endswith("info")
+            found = source.calibrate(message) if is_info else source.read(message, k)
+            returned.append([(frame.index, frame.stamp_ns) for frame in found])
 
-    assert returned == [[], [EPOCH], [], [EPOCH + 5]]
+    assert returned == [[], [(0, EPOCH)], [], [(2, EPOCH + 5)]]
 
 
 @pytest.mark.parametrize(

@@ -52,7 +52,7 @@ def frames(
         msg = f"every must be at least 1, got {every}"
         raise ValueError(msg)
     sources: dict[str, Source] = {
-        stream.topic: SOURCES[stream.kind](recording, stream) for stream in streams
+        stream.topic: SOURCES[stream.kind](recording, stream, skipped) for stream in streams
     }
     infos: dict[str, list[DepthSource]] = {}
     for source in sources.values():
@@ -65,6 +65,7 @@ def frames(
     def is_needed(topic: str, log_time_ns: int) -> bool:
         return needed is None or topic in infos or needed(topic, log_time_ns)
 
+    counts: Counter[str] = Counter()  # messages of each stream so far
     topics = {*sources, *infos, *callbacks}
     for message in recording.messages(topics, limits[0], limits[1], is_needed):
         # Messages that are not needed have no data, and neither have those that damage destroyed.
@@ -72,13 +73,14 @@ def frames(
         if message.topic in callbacks and message.data:
             callbacks[message.topic](message)
         for depth in infos.get(message.topic, ()) if message.data else ():
-            yield from depth.calibrate(message, skipped)
+            yield from depth.calibrate(message)
         chosen = sources.get(message.topic)
         if chosen is not None and message.type == chosen.stream.type:
-            chosen.index += 1
-            if (chosen.index - 1) % every == 0 and not unread:
-                yield from chosen.read(message, skipped)
+            index = counts[message.topic]
+            counts[message.topic] += 1
+            if index % every == 0 and not unread:
+                yield from chosen.read(message, index)
     for source in sources.values():
-        yield from source.finish(skipped)
+        yield from source.finish()
         if needed is None:  # otherwise it has not seen every stamp
             source.clock.report()

@@ -1,7 +1,7 @@
 """Convert the messages of a depth stream to frames."""
 
 from collections import Counter
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from contextlib import contextmanager, suppress
 from dataclasses import replace
 from functools import cached_property
@@ -35,32 +35,31 @@ from shapecat.types import Frame, Pose
 __all__ = ["SOURCES", "DepthSource", "PointsSource", "Source"]
 
 
-@contextmanager
-def _counting(skipped: Counter[str], topic: str) -> Iterator[None]:
-    """Count unreadable messages of a topic by reason instead of raising."""
-    try:
-        yield
-    except (MessageError, *MALFORMED) as error:
-        skipped[reason_of(error, topic)] += 1
-
-
 class Source:
-    """A stream and its state between frames; ``index`` is the number of its messages so far."""
+    """A stream and its state between frames; ``skipped`` counts unreadable messages by reason."""
 
-    def __init__(self, recording: Recording, stream: Stream) -> None:
+    def __init__(self, recording: Recording, stream: Stream, skipped: Counter[str]) -> None:
         """Start before the first message."""
         self.recording = recording
         self.stream = stream
-        self.index = 0
+        self.skipped = skipped
         self.clock = Clock(recording, stream.topic)
 
-    def read(self, message: Message, skipped: Counter[str]) -> Iterator[Frame]:
-        """Yield the frames that a message completes: its own or an earlier one, or none."""
+    def read(self, message: Message, index: int) -> Iterator[Frame]:
+        """Yield the frames that message ``index`` completes: its own, an earlier one, or none."""
         raise NotImplementedError
 
-    def finish(self, _skipped: Counter[str]) -> Iterator[Frame]:
+    def finish(self) -> Iterator[Frame]:
         """Yield the frame that is held back, if any."""
         yield from ()
+
+    @contextmanager
+    def counting(self) -> Iterator[None]:
+        """Count an unreadable message by its reason instead of raising."""
+        try:
+            yield
+        except (MessageError, *MALFORMED) as error:
+            self.skipped[reason_of(error, self.stream.topic)] += 1
 
     def frame(self, message: Message, index: int, header: Any, content: dict[str, Any]) -> Frame:
         """Return a frame of ``content``: depth and camera, or points.
@@ -85,18 +84,18 @@ class Source:
 class PointsSource(Source):
     """A stream of clouds; organized ones become depth images if a pinhole camera fits."""
 
-    def __init__(self, recording: Recording, stream: Stream) -> None:
+    def __init__(self, recording: Recording, stream: Stream, skipped: Counter[str]) -> None:
         """Start without a camera."""
-        super().__init__(recording, stream)
+        super().__init__(recording, stream, skipped)
         self.fit: PinholeFit | None = None
         self.pose: Pose | None = None
 
-    def read(self, message: Message, skipped: Counter[str]) -> Iterator[Frame]:
+    def read(self, message: Message, index: int) -> Iterator[Frame]:
         """Yield the frame of a cloud, or none if it is unreadable."""
-        with _counting(skipped, self.stream.topic):
+        with self.counting():
             cloud = self.recording.decode(message)
             points = _placed(cloud_points(cloud), getattr(cloud, "pose", None))
-            yield self.frame(message, self.index - 1, cloud.header, self._content(points))
+            yield self.frame(message, index, cloud.header, self._content(points))
 
     def _content(self, points: F4) -> dict[str, Any]:
         if points.size == 0:
@@ -128,9 +127,9 @@ def _placed(points: F4, pose: Pose | None) -> F4:
 class DepthSource(Source):
     """A stream of depth images; each waits for the calibration with its stamp."""
 
-    def __init__(self, recording: Recording, stream: Stream) -> None:
+    def __init__(self, recording: Recording, stream: Stream, skipped: Counter[str]) -> None:
         """Start without a calibration."""
-        super().__init__(recording, stream)
+        super().__init__(recording, stream, skipped)
         self.info_topic = stream.info_topic or ""
         self.rectified = is_rectified(stream.topic)
         self.units = _depth_units(recording, stream.topic)
@@ -138,7 +137,7 @@ class DepthSource(Source):
         self._info: Any = None
         self._info_stamp: int | None = None
 
-    def calibrate(self, message: Message, skipped: Counter[str]) -> Iterator[Frame]:
+    def calibrate(self, message: Message) -> Iterator[Frame]:
         """Store a calibration; yield the frame of the image that waited for it, if any."""
         try:
             info = self.recording.decode(message)
@@ -155,30 +154,30 @@ class DepthSource(Source):
         if stamp <= image_ns or self._info is None:
             self._info, self._info_stamp = info, stamp
         if stamp >= image_ns:
-            yield from self.finish(skipped)
+            yield from self.finish()
             self._info, self._info_stamp = info, stamp
 
-    def read(self, message: Message, skipped: Counter[str]) -> Iterator[Frame]:
+    def read(self, message: Message, index: int) -> Iterator[Frame]:
         """Hold an image back until its calibration arrives; yield the frame of the previous one."""
-        yield from self.finish(skipped)
-        with _counting(skipped, self.stream.topic):
+        yield from self.finish()
+        with self.counting():
             image = self.recording.decode(message)
             stamp_ns(image.header)
-            self._waiting = (message, self.index - 1, image)
+            self._waiting = (message, index, image)
         if self._awaited_ns is not None and self._awaited_ns == self._info_stamp:
-            yield from self.finish(skipped)
+            yield from self.finish()
 
     @property
     def _awaited_ns(self) -> int | None:
         """The stamp (ns) of the image that is held back; None if there is none."""
         return None if self._waiting is None else stamp_ns(self._waiting[2].header)
 
-    def finish(self, skipped: Counter[str]) -> Iterator[Frame]:
+    def finish(self) -> Iterator[Frame]:
         """Yield the frame of the image that is held back, with the best calibration so far."""
         if self._waiting is None:
             return
         (message, index, image), self._waiting = self._waiting, None
-        with _counting(skipped, self.stream.topic):
+        with self.counting():
             yield self.frame(message, index, image.header, self._content(image))
 
     def _warn(self, text: str) -> None:
@@ -229,7 +228,7 @@ def _depth_units(recording: Recording, topic: str) -> float | None:
     return None
 
 
-SOURCES: dict[str, Callable[[Recording, Stream], Source]] = {
+SOURCES: dict[str, type[Source]] = {
     "points": PointsSource,
     "depth": DepthSource,
 }
