@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 
 from shapecat.config import DetectionSettings
 from shapecat.detection import detect
-from shapecat.recordings import choose_streams, frames, open_recording
+from shapecat.recordings import FrameRange, choose_streams, frames, open_recording
 from shapecat.simulation import KINECT, Sensor, World, make_scene, render_frame
 from shapecat.simulation.scenes.kinds import SceneKind
 from shapecat.simulation.scenes.worlds import FIRST_OBJECT_LABEL
@@ -61,7 +61,7 @@ def real_tables(every: int = 1) -> Iterator[Frame]:
     if path.exists():
         with open_recording(path) as recording:
             streams = choose_streams(recording, ())
-            yield from frames(recording, streams, every=every, skipped=Counter())
+            yield from frames(recording, streams, FrameRange(every=every), skipped=Counter())
 
 
 def labelled_clutter(count: int, first_seed: int = 500) -> Iterator[Labelled]:

@@ -25,6 +25,7 @@ from .render import for_any_reader, print_json
 if TYPE_CHECKING:
     from shapecat.batch.ledger import Outcome
     from shapecat.batch.plans import Batch
+    from shapecat.recordings import FrameRange
 
 
 @click.command()
@@ -113,6 +114,9 @@ def process(
     *,
     recordings: tuple[str, ...],
     out: str,
+    start_s: float | None,
+    end_s: float | None,
+    every: int,
     color: str | None,
     no_color: bool,
     no_mcap: bool,
@@ -157,7 +161,7 @@ def process(
     if choices["discard_labels"] and not choices["overwrite"]:
         msg = "--discard-labels needs --overwrite: without it, labels stay with their results"
         raise click.UsageError(msg)
-    _require_range(choices["start_s"], choices["end_s"])
+    frame_range = _frame_range(start_s, end_s, every)
     if no_fsync:
         os.environ[FSYNC] = "0"  # which worker processes inherit
     if executor != "local":  # its workers may have another current folder
@@ -170,6 +174,7 @@ def process(
         source=Path(),
         folder=Path(),
         settings=load_settings(config, overrides),
+        frame_range=frame_range,
         color="" if no_color else color,
         mcap=not no_mcap,
         rrd=not no_rrd,
@@ -196,11 +201,16 @@ def _absolute(place: str) -> str:
     return place if is_url(place) else str(Path(place).absolute())
 
 
-def _require_range(start_s: float | None, end_s: float | None) -> None:
-    """Reject an empty time range."""
-    if end_s is not None and end_s <= (start_s or 0):
+def _frame_range(start_s: float | None, end_s: float | None, every: int) -> "FrameRange":
+    """Return the frames to process; refuse an empty time range."""
+    from shapecat.errors import ConfigError
+    from shapecat.recordings import FrameRange
+
+    try:
+        return FrameRange(start_s, end_s, every)
+    except ConfigError:  # the options alone are valid
         msg = f"--end {end_s:g} is not after --start {start_s or 0:g}"
-        raise click.UsageError(msg)
+        raise click.UsageError(msg) from None
 
 
 def _process(

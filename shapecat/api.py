@@ -4,7 +4,6 @@
 """
 
 import difflib
-import math
 import os
 from collections import Counter
 from collections.abc import Collection, Iterable, Iterator, Sequence
@@ -23,7 +22,7 @@ from shapecat.errors import ConfigError, ModelError, RecordingError, explained, 
 from shapecat.learning import Categorizer, load_model
 from shapecat.outputs.in_memory import frame_of, perceive_alone
 from shapecat.outputs.opened_run import Run, RunFrame, Table
-from shapecat.recordings import Recording, choose_streams, frames
+from shapecat.recordings import FrameRange, Recording, choose_streams, frames
 from shapecat.recordings import open_recording as _open_recording
 from shapecat.rehearsal import compile_all
 from shapecat.runs.jobs import Job
@@ -93,17 +92,10 @@ class OpenRecording:
         NoStreamError : a topic is missing or not usable, or none is given and none can be chosen.
         RecordingError : the recording is closed, perhaps while its frames are read.
         """
-        _require_selection(start_s, end_s, every)
+        frame_range = FrameRange(start_s, end_s, every)
         chosen = (topics,) if isinstance(topics, str) else tuple(topics)
         streams = choose_streams(self.recording, chosen)
-        return frames(
-            self.recording,
-            streams,
-            start_s=start_s,
-            end_s=end_s,
-            every=int(every),
-            skipped=Counter(),
-        )
+        return frames(self.recording, streams, frame_range, skipped=Counter())
 
 
 def open_recording(path: str | Path) -> OpenRecording:
@@ -163,7 +155,7 @@ def process(
     NoStreamError, ModelError, OutputError : as for the command, which prints them.
     """
     _require_known(settings, process.__annotations__)
-    _require_selection(start_s, end_s, every)
+    frame_range = FrameRange(start_s, end_s, every)
     if cores > 1 and runs_again():
         msg = f'cores={cores} starts processes: a script needs `if __name__ == "__main__":`'
         raise ConfigError(msg)
@@ -175,9 +167,7 @@ def process(
         topics=(topics,) if isinstance(topics, str) else tuple(topics),
         up=up if isinstance(up, str) else ",".join(str(float(part)) for part in up),
         fixed_frame=fixed_frame,
-        start_s=None if start_s is None else float(start_s),
-        end_s=None if end_s is None else float(end_s),
-        every=int(every),
+        frame_range=frame_range,
         model=None if model is None else _path(model),
         mcap=mcap,
         rrd=rrd,
@@ -241,20 +231,6 @@ def _model_at(path: Path) -> Categorizer:
 @lru_cache(maxsize=1)
 def _unchanged_model(path: Path, _size: int, _mtime_ns: int) -> Categorizer:
     return load_model(path)
-
-
-def _require_selection(start_s: float | None, end_s: float | None, every: float) -> None:
-    """Refuse a time range or a step that the command refuses."""
-    if every < 1 or every % 1:
-        msg = f"every must be an integer of at least 1, got {every!r}"
-        raise ConfigError(msg)
-    for name, seconds in (("start_s", start_s), ("end_s", end_s)):
-        if seconds is not None and not 0 <= seconds < math.inf:
-            msg = f"{name} must be at least 0, got {seconds}"
-            raise ConfigError(msg)
-    if end_s is not None and end_s <= (start_s or 0):
-        msg = f"end_s {end_s:g} is not after start_s {start_s or 0:g}"
-        raise ConfigError(msg)
 
 
 def _require_known(settings: Collection[str], options: Collection[str]) -> None:

@@ -139,8 +139,9 @@ def _require_begun(job: Job, recording: Recording) -> None:
     NoStreamError : it begins after the end.
     """
     seconds = (recording.end_ns - recording.start_ns) * 1e-9
-    if recording.end_ns and job.start_s is not None and job.start_s > seconds:
-        msg = f"{job.source}: --start {job.start_s:g} is after the end at {seconds:.1f} s"
+    start_s = job.frame_range.start_s
+    if recording.end_ns and start_s is not None and start_s > seconds:
+        msg = f"{job.source}: --start {start_s:g} is after the end at {seconds:.1f} s"
         raise NoStreamError(msg)
 
 

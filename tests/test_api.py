@@ -8,7 +8,7 @@ import subprocess
 import sys
 from collections.abc import Callable
 from copy import deepcopy
-from dataclasses import replace
+from dataclasses import asdict, replace
 from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
@@ -586,15 +586,17 @@ def test_options_of_process_reach_the_run(tmp_path: Path, monkeypatch: pytest.Mo
     )
     monkeypatch.setattr(api, "runs_again", lambda: False)
     given: dict[str, Any] = {
-        "up": "imu", "fixed_frame": "odom", "start_s": 0.5, "end_s": 2.0, "every": 3,
-        "model": tmp_path / "mine.npz", "color": "/rgb", "mcap": False, "rrd": False,
-        "overwrite": True, "discard_labels": True,
+        "up": "imu", "fixed_frame": "odom", "model": tmp_path / "mine.npz", "color": "/rgb",
+        "mcap": False, "rrd": False, "overwrite": True, "discard_labels": True,
     }  # fmt: skip
+    times: dict[str, Any] = {"start_s": 0.5, "end_s": 2.0, "every": 3}
     with pytest.raises(OutputError, match=r"no run\.json"):
-        shapecat.process(FIXTURE, tmp_path, topics=["/b", "/a"], cores=2, seed=7, **given)
+        shapecat.process(FIXTURE, tmp_path, topics=["/b", "/a"], cores=2, seed=7, **given, **times)
 
     ((job, cores),) = jobs
     assert {name: getattr(job, name) for name in given} == given
+    assert asdict(job.frame_range) == times
+    assert times.items() <= job.selection().items()
     assert (job.topics, job.settings.seed, cores) == (("/b", "/a"), 7, 2)
     assert (job.source, job.folder) == (FIXTURE, tmp_path / "tabletop")
 

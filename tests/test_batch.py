@@ -26,6 +26,7 @@ from shapecat.config import Settings
 from shapecat.errors import RecordingError, common_exit_code
 from shapecat.executors import LocalExecutor, WorkerLostError, open_executor
 from shapecat.learning import load_model, save_model
+from shapecat.recordings import FrameRange
 from shapecat.runs.jobs import Job
 from tests.messages import EPOCH, SECOND, make, write
 from tests.processes import (
@@ -78,7 +79,7 @@ def recordings(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 def planned(recordings: Path, out: Path, *, end_s: float | None = None) -> Any:
-    job = Job(Path(), Path(), rrd=False, end_s=end_s)
+    job = Job(Path(), Path(), rrd=False, frame_range=FrameRange(end_s=end_s))
     return plan_batch(job, [str(recordings)], str(out))
 
 
@@ -169,7 +170,7 @@ def test_changed_work_is_not_complete(recordings: Path, one_by_one: Path) -> Non
 
     same = Job(Path(), Path(), rrd=False)
     assert status(same) == "complete"
-    assert status(Job(Path(), Path(), rrd=False, every=2)) == "check"
+    assert status(Job(Path(), Path(), rrd=False, frame_range=FrameRange(every=2))) == "check"
     assert status(replace(same, settings=Settings(seed=7))) == "check"
     assert status(Job(Path(), Path(), rrd=False, overwrite=True)) == "new"
     log = recordings / "monday" / "log.mcap"

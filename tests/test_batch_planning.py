@@ -28,6 +28,7 @@ from shapecat.batch.storage import Location, content_key
 from shapecat.config import Settings, with_overrides
 from shapecat.errors import ConfigError, OutputError, RecordingError, common_exit_code
 from shapecat.executors import WorkerLostError
+from shapecat.recordings import FrameRange
 from shapecat.recordings.files import input_size
 from shapecat.runs.folder import read_run, write_run
 from shapecat.runs.identity import (
@@ -153,9 +154,9 @@ def test_files_of_a_bag_are_not_counted_as_skipped(tmp_path: Path) -> None:
 
 CHANGES: Mapping[str, Mapping[str, Any]] = {
     "settings": {"settings": Settings(seed=8)},
-    "start": {"start_s": 0.5},
-    "end": {"end_s": 0.5},
-    "every": {"every": 3},
+    "start": {"frame_range": FrameRange(start_s=0.5)},
+    "end": {"frame_range": FrameRange(end_s=0.5)},
+    "every": {"frame_range": FrameRange(every=3)},
     "up": {"up": "imu"},
     "fixed frame": {"fixed_frame": "odom"},
     "topics": {"topics": ("/a",)},
@@ -622,23 +623,24 @@ def test_interrupted_overwriting_continues(
 
     def attempt(job: Job, *_: object, **__: object) -> Outcome:
         job.folder.mkdir(parents=True, exist_ok=True)
-        write_run(job.folder, planned(job.source, every=job.every))
+        write_run(job.folder, planned(job.source, frame_range=job.frame_range))
         counts = {"frames": 3, "tracks": {"cup": 2}}
         return Outcome(job, Summary(job.name, job.folder, counts, 1.5, ()))
 
     monkeypatch.setattr("shapecat.batch.runs.attempt", attempt)
     out = tmp_path / "out"
+    second = FrameRange(every=2)
     overwritten(source.parent, out)
     assert overwritten(source.parent, out, most=1) == {"lab": "new", "other": "new"}
 
     assert overwritten(source.parent, out, most=1, discard_labels=True)["lab"] == "new"
-    assert overwritten(source.parent, out, most=1, every=2)["lab"] == "new"
+    assert overwritten(source.parent, out, most=1, frame_range=second)["lab"] == "new"
     for _ in range(2):  # interrupted again, before the next is complete
-        assert overwritten(source.parent, out, most=1, every=2)["lab"] == "complete"
+        assert overwritten(source.parent, out, most=1, frame_range=second)["lab"] == "complete"
     (out / "lab" / "run.json").unlink()
-    assert overwritten(source.parent, out, most=0, every=2)["lab"] == "new"
-    assert overwritten(source.parent, out, every=2) == {"lab": "new", "other": "new"}
-    assert overwritten(source.parent, out, every=2) == {"lab": "new", "other": "new"}
+    assert overwritten(source.parent, out, most=0, frame_range=second)["lab"] == "new"
+    assert overwritten(source.parent, out, frame_range=second) == {"lab": "new", "other": "new"}
+    assert overwritten(source.parent, out, frame_range=second) == {"lab": "new", "other": "new"}
 
 
 def test_overwriting_again_after_a_failure_replaces_all(
@@ -839,7 +841,10 @@ def test_run_stores_absolute_path(source: Path, monkeypatch: pytest.MonkeyPatch)
 @pytest.mark.parametrize(
     "option",
     [
-        *({"topics": ("/front",)}, {"start_s": 1.5}, {"end_s": 2.5}, {"every": 3}),
+        {"topics": ("/front",)},
+        {"frame_range": FrameRange(start_s=1.5)},
+        {"frame_range": FrameRange(end_s=2.5)},
+        {"frame_range": FrameRange(every=3)},
         *({"model": Path("mine.npz")}, {"settings": Settings(seed=3)}),
     ],
 )

@@ -34,7 +34,7 @@ from shapecat.outputs.review.scenes import ReviewFrame
 from shapecat.outputs.review.writing import write_review
 from shapecat.perception import Perceiver
 from shapecat.pipeline import annotate_again, process
-from shapecat.recordings import open_recording
+from shapecat.recordings import FrameRange, open_recording
 from shapecat.recordings.decoding.protobuf import message_decoder
 from shapecat.runs.finished import open_source, read_finished
 from shapecat.runs.jobs import Job
@@ -246,7 +246,15 @@ def test_colour_can_be_disabled_and_wrong_topic_is_refused(
     """A topic without images must be refused before the work begins, not after."""
     monkeypatch.setattr("shapecat.pipeline.load_model", lambda _path: Guesser())
     source = run.parents[1] / "table.mcap"
-    process(Job(source=source, folder=tmp_path / "a", color="", rrd=False, end_s=0.04))
+    process(
+        Job(
+            source=source,
+            folder=tmp_path / "a",
+            color="",
+            rrd=False,
+            frame_range=FrameRange(end_s=0.04),
+        )
+    )
     assert not (tmp_path / "a" / "masks.parquet").exists()
     assert not read_ros(tmp_path / "a" / "annotated.mcap", "/shapecat/detections_2d")
     with pytest.raises(NoStreamError, match="/tf holds no colour images; colour images: /camera"):

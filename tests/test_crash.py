@@ -18,6 +18,7 @@ from click.testing import Result
 from shapecat.config import Settings
 from shapecat.errors import OutputError, RecordingError
 from shapecat.pipeline import annotate_again, process
+from shapecat.recordings import FrameRange
 from shapecat.runs.folder import read_run, writing_outputs
 from shapecat.runs.jobs import Job
 from tests.mcap_files import read_ros
@@ -164,7 +165,7 @@ def test_finished_phases_are_not_repeated(
     recording: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, phase: str
 ) -> None:
     """After an interrupt, the next run begins with the interrupted phase."""
-    job = Job(recording, tmp_path / "table", end_s=0.3, rrd=False)
+    job = Job(recording, tmp_path / "table", frame_range=FrameRange(end_s=0.3), rrd=False)
     target = {
         "track": "shapecat.runs.tracks.track_run",
         "annotated.mcap": "shapecat.outputs.annotation.annotated_mcap.write_annotated",
@@ -190,7 +191,7 @@ def test_interrupted_annotation_is_finished(
 ) -> None:
     """Otherwise the outputs would show labels that the table no longer has."""
     folder = tmp_path / "table"
-    job = Job(recording, folder, end_s=0.3, rrd=False)
+    job = Job(recording, folder, frame_range=FrameRange(end_s=0.3), rrd=False)
     process(job)
     before = contents(folder)
     with monkeypatch.context() as patch:
@@ -210,7 +211,7 @@ def test_outputs_show_new_labels_after_an_interrupted_annotation(
 ) -> None:
     """The next command would take the old outputs for complete."""
     folder = tmp_path / "table"
-    job = Job(recording, folder, end_s=0.3, rrd=False)
+    job = Job(recording, folder, frame_range=FrameRange(end_s=0.3), rrd=False)
     process(job)
     relabel(folder, {1: "wine glass"})
     with monkeypatch.context() as patch:
@@ -227,7 +228,7 @@ def test_outputs_show_new_labels_after_an_interrupted_annotation(
 
 def test_two_commands_cannot_write_same_outputs(recording: Path, tmp_path: Path) -> None:
     """They share hidden names: one would remove the file of the other, or undo its labels."""
-    job = Job(recording, tmp_path / "table", end_s=0.3, rrd=False)
+    job = Job(recording, tmp_path / "table", frame_range=FrameRange(end_s=0.3), rrd=False)
     process(job)
     (job.folder / "annotated.mcap").unlink()
     (job.folder / ".annotated.mcap.partial").write_bytes(b"half")
@@ -242,7 +243,7 @@ def test_two_commands_cannot_write_same_outputs(recording: Path, tmp_path: Path)
 
 
 def test_two_runs_cannot_write_same_folder(recording: Path, tmp_path: Path) -> None:
-    job = Job(recording, tmp_path / "table", end_s=0.3, rrd=False)
+    job = Job(recording, tmp_path / "table", frame_range=FrameRange(end_s=0.3), rrd=False)
 
     def start_second_run(phase: str, done: int, _total: int | None) -> None:
         if (phase, done) == ("perceive", 1):
@@ -267,7 +268,7 @@ def test_recording_still_being_written_gives_no_results(
             os.utime(source, ns=(1, 1))
 
     with pytest.raises(RecordingError, match="changed while it was processed"):
-        process(Job(source, out / "live", end_s=0.1, rrd=False), write)
+        process(Job(source, out / "live", frame_range=FrameRange(end_s=0.1), rrd=False), write)
 
     assert not out.exists()
 
@@ -289,7 +290,7 @@ def test_frames_of_changed_recording_are_not_kept(
 
     monkeypatch.setattr("shapecat.pipeline.annotate", refuse)
     with pytest.raises(RecordingError, match="changed while it was processed"):
-        process(Job(source, out / "live", end_s=0.1), change)
+        process(Job(source, out / "live", frame_range=FrameRange(end_s=0.1)), change)
 
     assert not out.exists()
 

@@ -16,7 +16,7 @@ from rosbags.typesys import Stores, get_types_from_msg, get_typestore
 from shapecat.cameras.colour import ColourImage, ColourView
 from shapecat.errors import NoStreamError
 from shapecat.geometry import rotation_from_quaternion
-from shapecat.recordings import choose_streams, colour_frames, open_recording
+from shapecat.recordings import FrameRange, choose_streams, colour_frames, open_recording
 from shapecat.recordings.colour_frames import frames_with_colour
 from shapecat.recordings.colour_streams import ColourStream, pair_colours
 from shapecat.recordings.decoding.colour_image import cloud_colours, encoded, pixels_of
@@ -47,12 +47,13 @@ WIDE = Camera(80, 60, 71.0, 72.0, 40.2, 29.1)
 Pairs = list[tuple[Frame, ColourView | None]]
 
 
-def read(path: Path, wanted: str | None = None, **chosen: Any) -> tuple[Pairs, list[str]]:
+def read(path: Path, wanted: str | None = None, **frame_range: Any) -> tuple[Pairs, list[str]]:
     with open_recording(path) as recording:
         streams = choose_streams(recording)
         colours = pair_colours(recording, streams, wanted)
-        pairs = list(frames_with_colour(recording, streams, colours, skipped=Counter(), **chosen))
-        return pairs, recording.warnings
+        chosen = FrameRange(**frame_range)
+        pairs = frames_with_colour(recording, streams, colours, chosen, skipped=Counter())
+        return list(pairs), recording.warnings
 
 
 def depth_items(*stamps: int, frame_id: str = "camera") -> list[tuple[str, int, Any]]:

@@ -12,6 +12,7 @@ import pytest
 from shapecat import pipeline
 from shapecat.config import Settings, with_overrides
 from shapecat.errors import OutputError
+from shapecat.recordings import FrameRange
 from shapecat.runs.folder import previous_path, read_run, write_run
 from shapecat.runs.jobs import Job
 from shapecat.runs.labels.track_table import read_track_table
@@ -83,7 +84,7 @@ def test_changed_tracking_settings_give_tables_of_new_run(
         {},
         {"settings": changed("detection.min_points=61", "tracking.gate_m=0.1")},
         {"settings": changed("seed=1")},
-        {"settings": changed("tracking.gate_m=0.1"), "every": 2},
+        {"settings": changed("tracking.gate_m=0.1"), "frame_range": FrameRange(every=2)},
         {"settings": changed("tracking.gate_m=0.1"), "color": ""},
         {"settings": changed("tracking.gate_m=0.1"), "up": "0,0,1"},
     ],

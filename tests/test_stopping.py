@@ -18,6 +18,7 @@ from shapecat import perception
 from shapecat.config import Settings
 from shapecat.executors.ordered_pool import _MOST_PENDING
 from shapecat.pipeline import process
+from shapecat.recordings import FrameRange
 from shapecat.runs.folder import read_run
 from shapecat.runs.jobs import Job
 from shapecat.runs.tables.segments import list_segments, read_segment
@@ -154,7 +155,7 @@ def test_time_before_interruption_counts_once(
     def fail(*_: object) -> None:
         raise stopping.Stopped(signal.SIGTERM)
 
-    job = Job(recording, tmp_path / "table", rrd=False, end_s=0.5)
+    job = Job(recording, tmp_path / "table", rrd=False, frame_range=FrameRange(end_s=0.5))
     with monkeypatch.context() as broken, pytest.raises(stopping.Stopped):
         broken.setattr(f"shapecat.pipeline.{stopped_in}", fail)
         process(job)

@@ -1,7 +1,7 @@
 """Read frames from robot recordings: containers, clouds, depth images, transforms."""
 
 from shapecat.recordings.containers.opening import open_recording
-from shapecat.recordings.frames import frames
+from shapecat.recordings.frames import FrameRange, frames
 from shapecat.recordings.messages import Channel, Message, MessageError, Topic
 from shapecat.recordings.recording import Recording
 from shapecat.recordings.streams import Stream, choose_streams, depth_streams
@@ -14,6 +14,7 @@ from shapecat.recordings.transforms.buffer import (
 
 __all__ = [
     "Channel",
+    "FrameRange",
     "Message",
     "MessageError",
     "Recording",

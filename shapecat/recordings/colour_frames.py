@@ -15,9 +15,9 @@ from shapecat.errors import RecordingError
 from shapecat.geometry import IDENTITY, compose
 from shapecat.recordings.colour_streams import ColourStream
 from shapecat.recordings.decoding.colour_image import colour_image
-from shapecat.recordings.frames import frames
+from shapecat.recordings.frames import ALL_FRAMES, FrameRange, frames
 from shapecat.recordings.lens import distortion_problem
-from shapecat.recordings.messages import MALFORMED, Message, MessageError, reason_of
+from shapecat.recordings.messages import MALFORMED, Message, MessageError, Needed, reason_of
 from shapecat.recordings.pinhole import camera_of_info, distortion_of, is_rectified
 from shapecat.recordings.recording import Recording
 from shapecat.recordings.sensors import same_frame
@@ -53,20 +53,20 @@ def frames_with_colour(
     recording: Recording,
     streams: Sequence[Stream],
     colours: Mapping[str, ColourStream],
+    frame_range: FrameRange = ALL_FRAMES,
     *,
     skipped: Counter[str],
+    needed: Needed = None,
     same_images: KnownImages = None,
-    **chosen: Any,
 ) -> Iterator[tuple[Frame, ColourView | None]]:
     """Read frames as `shapecat.recordings.frames` does, each with its colour image.
 
     Parameters
     ----------
     colours : the colour stream of each depth topic that has one.
-    skipped : as for `frames`.
+    frame_range, skipped : as for `frames`.
+    needed : as for `frames`; also called for colour images.
     same_images : the images of the frames when all were read; by default those nearest in time.
-    chosen : ``start_s``, ``end_s``, ``every`` and ``needed`` as for `frames`; ``needed`` is also
-        called for colour images.
 
     Yields
     ------
@@ -80,7 +80,15 @@ def frames_with_colour(
         if stream.topic in colours
     }
     waiting: deque[Frame] = deque()
-    for frame in frames(recording, streams, skipped=skipped, callbacks=_heard(partners), **chosen):
+    found = frames(
+        recording,
+        streams,
+        frame_range,
+        skipped=skipped,
+        callbacks=_heard(partners),
+        needed=needed,
+    )
+    for frame in found:
         waiting.append(frame)
         if frame.topic in partners:
             partners[frame.topic].notice(frame)
@@ -88,7 +96,7 @@ def frames_with_colour(
             yield _paired(waiting.popleft(), partners)
     while waiting:
         yield _paired(waiting.popleft(), partners)
-    for partner in partners.values() if chosen.get("needed") is None else ():
+    for partner in partners.values() if needed is None else ():
         partner.report()
 
 

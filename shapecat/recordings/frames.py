@@ -1,27 +1,77 @@
 """Read the frames of a recording in order."""
 
+import math
 from collections import Counter
 from collections.abc import Callable, Iterator, Mapping, Sequence
+from dataclasses import dataclass
 
+from shapecat.errors import ConfigError
 from shapecat.recordings.messages import Message, Needed
 from shapecat.recordings.recording import Recording
 from shapecat.recordings.sources import SOURCES, DepthSource, Source
 from shapecat.recordings.streams import Stream
 from shapecat.types import Frame
 
-__all__ = ["frames"]
+__all__ = ["ALL_FRAMES", "FrameRange", "frames"]
 
 _FAR_NS = 2**62
 """A century: later times would not fit into the integers of a database."""
 
 
+@dataclass(frozen=True)
+class FrameRange:
+    """Which frames of a recording are wanted.
+
+    Attributes
+    ----------
+    start_s, end_s : log time from the start of the recording, seconds; None for no limit.
+    every : keep every n-th message of a stream.
+
+    Raises
+    ------
+    ConfigError : ``every`` is not an integer of at least 1, a time is negative or not finite, or
+        the end is not after the start.
+    """
+
+    start_s: float | None = None
+    end_s: float | None = None
+    every: int = 1
+
+    def __post_init__(self) -> None:
+        """Check the numbers; those of NumPy become plain ones, which can be written as JSON."""
+        if self.every < 1 or self.every % 1:
+            msg = f"every must be an integer of at least 1, got {self.every!r}"
+            raise ConfigError(msg)
+        object.__setattr__(self, "every", int(self.every))
+        for name in ("start_s", "end_s"):
+            seconds = getattr(self, name)
+            if seconds is None:
+                continue
+            if not 0 <= seconds < math.inf:
+                msg = f"{name} must be at least 0, got {seconds}"
+                raise ConfigError(msg)
+            object.__setattr__(self, name, float(seconds))
+        if self.end_s is not None and self.end_s <= (self.start_s or 0):
+            msg = f"end_s {self.end_s:g} is not after start_s {self.start_s or 0:g}"
+            raise ConfigError(msg)
+
+    def limits_ns(self, begin_ns: int) -> tuple[int | None, int | None]:
+        """Return the log times (ns) of start and end in a recording that begins at ``begin_ns``."""
+        start, end = (
+            None if seconds is None else begin_ns + round(min(seconds * 1e9, _FAR_NS))
+            for seconds in (self.start_s, self.end_s)
+        )
+        return start, end
+
+
+ALL_FRAMES = FrameRange()
+
+
 def frames(
     recording: Recording,
     streams: Sequence[Stream],
+    frame_range: FrameRange = ALL_FRAMES,
     *,
-    start_s: float | None = None,
-    end_s: float | None = None,
-    every: int = 1,
     skipped: Counter[str],
     callbacks: Mapping[str, Callable[[Message], None]] | None = None,
     needed: Needed = None,
@@ -33,8 +83,6 @@ def frames(
 
     Parameters
     ----------
-    start_s, end_s : log time from the start of the recording, seconds; None for no limit.
-    every : keep every n-th message of a stream.
     skipped : receives the number of unreadable frames by reason; they raise no error.
     callbacks : callbacks for the messages of other topics, so that the file is read only once.
     needed : function of topic and log time (ns) that returns whether that frame, or message for
@@ -43,14 +91,7 @@ def frames(
     Yields
     ------
     Frames by log time. ``index`` counts the stream's messages from 0 at ``start_s``.
-
-    Raises
-    ------
-    ValueError : ``every`` is not positive.
     """
-    if every < 1:
-        msg = f"every must be at least 1, got {every}"
-        raise ValueError(msg)
     sources: dict[str, Source] = {
         stream.topic: SOURCES[stream.kind](recording, stream, skipped) for stream in streams
     }
@@ -58,8 +99,6 @@ def frames(
     for source in sources.values():
         if isinstance(source, DepthSource):
             infos.setdefault(source.info_topic, []).append(source)
-    offsets = [None if s is None else round(min(s * 1e9, _FAR_NS)) for s in (start_s, end_s)]
-    limits = [None if offset is None else recording.start_ns + offset for offset in offsets]
     callbacks = callbacks or {}
 
     def is_needed(topic: str, log_time_ns: int) -> bool:
@@ -67,7 +106,8 @@ def frames(
 
     counts: Counter[str] = Counter()  # messages of each stream so far
     topics = {*sources, *infos, *callbacks}
-    for message in recording.messages(topics, limits[0], limits[1], is_needed):
+    start_ns, end_ns = frame_range.limits_ns(recording.start_ns)
+    for message in recording.messages(topics, start_ns, end_ns, is_needed):
         # Messages that are not needed have no data, and neither have those that damage destroyed.
         unread = not message.data and not is_needed(message.topic, message.log_time_ns)
         if message.topic in callbacks and message.data:
@@ -78,7 +118,7 @@ def frames(
         if chosen is not None and message.type == chosen.stream.type:
             index = counts[message.topic]
             counts[message.topic] += 1
-            if index % every == 0 and not unread:
+            if index % frame_range.every == 0 and not unread:
                 yield from chosen.read(message, index)
     for source in sources.values():
         yield from source.finish()

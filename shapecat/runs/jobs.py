@@ -6,13 +6,14 @@ from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, field
 from importlib.metadata import version
 from pathlib import Path
-from typing import Any, cast
+from typing import Any
 
 from shapecat import __version__
 from shapecat.config import Settings
 from shapecat.errors import ModelError, RecordingError
 from shapecat.learning import Categorizer
 from shapecat.recordings.files import input_size
+from shapecat.recordings.frames import ALL_FRAMES, FrameRange
 from shapecat.runs.folder import clear
 from shapecat.runs.identity import (
     ContentDigest,
@@ -48,8 +49,7 @@ class Job:
     topics : depth topics; empty to choose one.
     up : ``auto``, ``tf``, ``imu``, or a vector ``X,Y,Z`` in the sensor frame.
     fixed_frame : None to choose one.
-    start_s, end_s : seconds from the start of the recording; None for no limit.
-    every : every n-th frame is processed.
+    frame_range : the frames to process.
     model : path of the model file; None for the default model.
     model_id : id that the model must have; empty for any.
     color : topic of the colour images; None to choose one, empty for none.
@@ -68,9 +68,7 @@ class Job:
     topics: tuple[str, ...] = ()
     up: str = "auto"
     fixed_frame: str | None = None
-    start_s: float | None = None
-    end_s: float | None = None
-    every: int = 1
+    frame_range: FrameRange = ALL_FRAMES
     model: Path | None = None
     model_id: str = ""
     color: str | None = None
@@ -104,8 +102,17 @@ class Job:
 
     def selection(self) -> Options:
         """Return the options that affect the results, as stored in run.json."""
-        values = {name: getattr(self, name) for name in Options.__annotations__}
-        return cast("Options", values | {"topics": list(self.topics)})
+        return {
+            "topics": list(self.topics),
+            "up": self.up,
+            "fixed_frame": self.fixed_frame,
+            "start_s": self.frame_range.start_s,
+            "end_s": self.frame_range.end_s,
+            "every": self.frame_range.every,
+            "color": self.color,
+            "mcap": self.mcap,
+            "rrd": self.rrd,
+        }
 
 
 @dataclass(frozen=True)

@@ -4,7 +4,7 @@ from collections import Counter
 from collections.abc import Iterator, Mapping, Sequence
 
 from shapecat.cameras.colour import ColourView
-from shapecat.recordings import Recording, Stream, choose_streams
+from shapecat.recordings import FrameRange, Recording, Stream, choose_streams
 from shapecat.recordings.colour_frames import KnownImages, frames_with_colour
 from shapecat.recordings.colour_streams import ColourStream, pair_colours
 from shapecat.recordings.messages import Needed
@@ -34,6 +34,7 @@ def read_frames(
 
     Raises
     ------
+    ConfigError : the options select no frames.
     NoStreamError : a topic is missing or not usable.
     """
     if streams is None:
@@ -44,9 +45,7 @@ def read_frames(
         recording,
         streams,
         colours,
-        start_s=options["start_s"],
-        end_s=options["end_s"],
-        every=options["every"],
+        FrameRange(options["start_s"], options["end_s"], options["every"]),
         skipped=skipped,
         needed=needed,
         same_images=same_images,
