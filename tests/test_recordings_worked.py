@@ -364,6 +364,7 @@ def test_librealsense_recording_gives_colour_pose(tmp_path: Path) -> None:
         found = pair_colours(recording, [stream]).get(stream.topic)
         assert found is not None
         pose = Extrinsics(recording, stream, found).colour_from_depth("0", "0", EPOCH, EPOCH)
+    ((_, view),), _ = read(path)  # whose frame ids are equal
 
     depth_turn, colour_turn = (Rotation.from_quat(turns[name]) for name in ("Depth_0", "Color_0"))
     assert pose is not None
@@ -371,6 +372,9 @@ def test_librealsense_recording_gives_colour_pose(tmp_path: Path) -> None:
     in_depth = depth_turn.apply(point) + moves["Depth_0"]
     in_colour = colour_turn.apply(point) + moves["Color_0"]
     assert_allclose(pose.rotation @ in_depth + pose.translation, in_colour, atol=1e-12)
+    assert view is not None
+    assert view.colour_from_depth is not None
+    assert_allclose(view.colour_from_depth.rotation, pose.rotation)
 
 
 # ---- calibrations of depth images

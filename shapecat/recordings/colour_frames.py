@@ -20,7 +20,7 @@ from shapecat.recordings.lens import distortion_problem
 from shapecat.recordings.messages import MALFORMED, Message, MessageError, Needed, reason_of
 from shapecat.recordings.pinhole import camera_of_info, distortion_of, is_rectified
 from shapecat.recordings.recording import Recording
-from shapecat.recordings.sensors import same_frame
+from shapecat.recordings.sensors import is_of_realsense_recorder, same_frame
 from shapecat.recordings.stamps import Clock, stamp_ns
 from shapecat.recordings.streams import Stream, first_message
 from shapecat.recordings.transforms.extrinsics import Extrinsics
@@ -259,8 +259,8 @@ class _Partner:
             size = f"{lens.pinhole.width} x {lens.pinhole.height}"
             msg = f"image of {shape[1]} x {shape[0]} pixels with camera info for {size}"
             raise MessageError(msg)
-        recorder = self.stream.topic.startswith("/device_")
-        one_frame = same_frame(image.frame_id, frame.frame_id) and not recorder
+        named = not is_of_realsense_recorder(self.stream.topic)
+        one_frame = named and same_frame(image.frame_id, frame.frame_id)
         straight = lens is None or _bend_px(lens, frame.camera) < _STRAIGHT_PX
         alike = lens is None or (straight and _alike(lens, frame.camera, _NEAR))
         if same_shape and one_frame and alike:

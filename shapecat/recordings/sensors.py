@@ -6,7 +6,7 @@ from dataclasses import dataclass
 from itertools import permutations
 from typing import Literal, NamedTuple
 
-__all__ = ["Stream", "by_sensor", "same_frame"]
+__all__ = ["Stream", "by_sensor", "is_of_realsense_recorder", "same_frame"]
 
 _KINDS = ("depth", "points", "cloud", "image", "aligned")
 """The first part of a topic with one of these words ends the namespace of the sensor."""
@@ -51,6 +51,11 @@ class _Place(NamedTuple):
 def same_frame(a: str, b: str) -> bool:
     """Return whether two frame ids name the same frame; ROS 1 may put a slash before either."""
     return a.lstrip("/") == b.lstrip("/")
+
+
+def is_of_realsense_recorder(topic: str) -> bool:
+    """Return whether librealsense recorded a topic itself: its frame ids are numbers, not names."""
+    return topic.startswith("/device_")
 
 
 def by_sensor(streams: Sequence[Stream]) -> list[list[Stream]]:

@@ -11,7 +11,7 @@ from shapecat.geometry import IDENTITY, compose, inverse, rotation_from_quaterni
 from shapecat.recordings.colour_streams import ColourStream
 from shapecat.recordings.messages import MALFORMED
 from shapecat.recordings.recording import Recording
-from shapecat.recordings.sensors import same_frame
+from shapecat.recordings.sensors import is_of_realsense_recorder, same_frame
 from shapecat.recordings.streams import Stream, first_message
 from shapecat.recordings.transforms.buffer import (
     ExtrapolationError,
@@ -58,11 +58,10 @@ class Extrinsics:
         log_time_ns, stamp_ns : those of the depth image, nanoseconds. Images come in the order of
             the recording.
         """
-        recorder = self._depth.topic.startswith("/device_")  # whose frame ids are numbers
-        if same_frame(depth_frame, colour_frame) and not recorder:
-            return IDENTITY if depth_frame else self._realsense  # two cameras may have no name
-        if recorder:
+        if is_of_realsense_recorder(self._depth.topic):
             return self._realsense
+        if same_frame(depth_frame, colour_frame):
+            return IDENTITY if depth_frame else self._realsense  # two cameras may have no name
         pose = self._lookup(self._still, depth_frame, colour_frame, stamp_ns)
         if pose is None:
             moving = self._moving.around(log_time_ns, stamp_ns)
