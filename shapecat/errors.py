@@ -15,6 +15,9 @@ __all__ = [
     "listed",
 ]
 
+_MOST_NAMES = 12
+"""Names that `listed` shows."""
+
 
 class ShapecatError(Exception):
     """A known problem: shown as one line, without a traceback."""
@@ -66,7 +69,7 @@ def common_exit_code(codes: Collection[int]) -> int:
     return different.pop() if len(different) == 1 else 1
 
 
-def listed(names: Sequence[str], most: int = 12) -> str:
+def listed(names: Sequence[str]) -> str:
     """Return names as a message shows them: the first ones, and how many more there are."""
-    more = f" and {len(names) - most} more" if len(names) > most else ""
-    return ", ".join(names[:most]) + more
+    left = len(names) - _MOST_NAMES
+    return ", ".join(names[:_MOST_NAMES]) + (f" and {left} more" if left > 0 else "")

@@ -44,7 +44,8 @@ class PerceptionInput(NamedTuple):
     Attributes
     ----------
     up : (3,) up direction in the sensor frame, a unit vector; None to estimate it from planes.
-    earlier : frames to fuse with this one.
+    earlier : frames to fuse with this one. Candidates contain only pixels that have depth in
+        ``frame`` itself.
     pose : ``fixed_from_sensor``, None if it is unknown.
     colour : the colour image nearest in time, for masks; its pixels are not used.
     """
@@ -104,7 +105,6 @@ def perceive(
     up: F4 | None,
     categorizer: Categorizer,
     settings: Settings,
-    earlier: Sequence[Earlier] = (),
 ) -> Perception:
     """Find, reconstruct, describe and categorize the objects of one frame (thesis ch. 4 to 7).
 
@@ -113,11 +113,8 @@ def perceive(
     Parameters
     ----------
     up : (3,) up direction in the sensor frame, a unit vector; None to estimate it from planes.
-    earlier : frames to fuse with this one. Candidates contain only pixels that have depth in
-        ``frame`` itself.
     """
-    given = PerceptionInput(frame, up, tuple(earlier))
-    perception, _ = _perceive(given, _NEW_BLOCK, Perceiver(categorizer, settings, None))
+    (perception,) = Perceiver(categorizer, settings, None)([PerceptionInput(frame, up)])
     return perception
 
 

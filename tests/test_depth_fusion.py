@@ -16,7 +16,7 @@ from shapecat.depth_fusion import Earlier, RecentFrames, fuse
 from shapecat.depth_fusion.fusion import REACH
 from shapecat.errors import ConfigError
 from shapecat.geometry import AGREE, IDENTITY
-from shapecat.perception import perceive
+from shapecat.perception import Perceiver, PerceptionInput
 from shapecat.pipeline import process
 from shapecat.runs.folder import read_run
 from shapecat.runs.jobs import Job
@@ -305,10 +305,11 @@ def with_missing_depth(count: int) -> Iterator[Frame]:
 def test_indices_refer_to_depth_of_the_frame_itself() -> None:
     """Exports look them up in the recording, where a filled hole is still a hole."""
     *others, now = with_missing_depth(3)
-    earlier = [Earlier(other, IDENTITY) for other in others]
+    earlier = tuple(Earlier(other, IDENTITY) for other in others)
     guesser: Any = Guesser()
 
-    perception = perceive(now, up=None, categorizer=guesser, settings=Settings(), earlier=earlier)
+    given = PerceptionInput(now, None, earlier)
+    (perception,) = Perceiver(guesser, Settings(), None)([given])
 
     assert len(perception.detections) >= 5
     for found, candidate in zip(perception.detections, perception.scene.candidates, strict=True):

@@ -196,11 +196,11 @@ def test_outlines_enclose_all_pixels() -> None:
     for _ in range(20):
         pixels = np.pad(rng.random((12, 17)) < 0.4, 2)
         pixels[0, :] = pixels[-1, :] = pixels[:, 0] = True
-        parts = outlines(Mask(30, 50, pixels), 0.0)
+        coarse = np.kron(pixels, np.ones((2, 2), bool))  # every corner sticks out by 1.4 pixels
         image = np.zeros((70, 60), bool)
-        for part in parts:
-            assert part.min(axis=0).tolist() >= [30, 50]
-            image |= drawing(part, 70, 60)
+        for part in outlines(Mask(60, 100, coarse)):
+            assert part.min(axis=0).tolist() >= [60, 100]
+            image |= drawing(part / 2, 70, 60)
         inside = image[50 : 50 + pixels.shape[0], 30 : 30 + pixels.shape[1]]
         assert (inside | ~pixels).all()  # holes are filled, no pixel is lost
         assert not np.delete(image, np.s_[50:66], axis=0).any()
@@ -219,7 +219,7 @@ def test_outlines_are_sorted_by_area_and_links_add_none() -> None:
     """The first part frames the crop of an object; COCO tools compute areas of polygons."""
     pixels = np.zeros((20, 40), bool)
     pixels[1:3, 30:34], pixels[4:19, 2:14], pixels[9:15, 20:27] = True, True, True
-    parts = outlines(Mask(100, 70, pixels), 0.0)
+    parts = outlines(Mask(100, 70, pixels))
 
     def area(ring: Any) -> float:
         (x, y), (next_x, next_y) = ring.T, np.roll(ring, -1, axis=0).T

@@ -4,7 +4,6 @@ import json
 import shutil
 import unicodedata
 from collections.abc import Callable
-from functools import partial
 from pathlib import Path
 
 import numpy as np
@@ -13,7 +12,7 @@ from click.testing import Result
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from shapecat.errors import OutputError, listed
+from shapecat.errors import OutputError
 from shapecat.outputs.wording import safe_name
 from shapecat.pipeline import annotate_again
 from shapecat.runs.finished import FinishedRun, find_runs
@@ -292,7 +291,7 @@ def test_line_deleted_from_own_table_is_refused(run: Path) -> None:
 
 
 def test_error_lists_few_of_many_missing_tracks(run: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("shapecat.runs.labels.corrections.listed", partial(listed, most=2))
+    monkeypatch.setattr("shapecat.errors._MOST_NAMES", 2)
     (run / "tracks.csv").write_text(HEADER)
 
     with pytest.raises(OutputError, match="missing tracks: #4, #2 and 2 more; restore"):

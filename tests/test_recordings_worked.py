@@ -561,27 +561,27 @@ def test_slerp_agrees_with_scipy() -> None:
 
 def test_transform_is_extrapolated_only_within_tolerance() -> None:
     """Of equal samples the middle one is dropped, which must not change a result."""
-    buffer = TransformBuffer(tolerance_ns=10)
-    for stamp, x in ((100, 1.0), (200, 2.0), (300, 2.0), (400, 2.0), (500, 5.0)):
-        assert buffer.add("map", "cup", stamp, ((x, 0, 0), (0, 0, 0, 1)), static=False)
-    expected = {90: 1.0, 100: 1.0, 130: 1.3, 250: 2.0, 400: 2.0, 440: 3.2, 500: 5.0, 510: 5.0}
-    for stamp, x in expected.items():
-        assert buffer.lookup("map", "cup", stamp).translation[0] == pytest.approx(x)
-    for stamp, message in ((89, "before the first"), (511, "after the last")):
+    buffer = TransformBuffer()
+    for ms, x in ((1000, 1.0), (2000, 2.0), (3000, 2.0), (4000, 2.0), (5000, 5.0)):
+        assert buffer.add("map", "cup", ms * MS, ((x, 0, 0), (0, 0, 0, 1)), static=False)
+    expected = {900: 1.0, 1000: 1.0, 1300: 1.3, 2500: 2.0, 4000: 2.0, 4400: 3.2, 5100: 5.0}
+    for ms, x in expected.items():
+        assert buffer.lookup("map", "cup", ms * MS).translation[0] == pytest.approx(x)
+    for stamp, message in ((900 * MS - 1, "before the first"), (5100 * MS + 1, "after the last")):
         with pytest.raises(Exception, match=message):
             buffer.lookup("map", "cup", stamp)
 
 
 def test_last_transform_before_the_limit_is_not_forgotten() -> None:
     """A frame between two distant transforms needs the one long before it."""
-    buffer = TransformBuffer(tolerance_ns=10)
-    for stamp in (100, 200, 900):
-        buffer.add("map", "cup", stamp, ((stamp, 0, 0), (0, 0, 0, 1)), static=False)
-    buffer.forget(500)
+    buffer = TransformBuffer()
+    for ms in (1000, 2000, 9000):
+        buffer.add("map", "cup", ms * MS, ((ms, 0, 0), (0, 0, 0, 1)), static=False)
+    buffer.forget(5000 * MS)
 
-    assert buffer.lookup("map", "cup", 550).translation[0] == pytest.approx(550)
+    assert buffer.lookup("map", "cup", 5500 * MS).translation[0] == pytest.approx(5500)
     with pytest.raises(ExtrapolationError, match="before the first"):
-        buffer.lookup("map", "cup", 150)
+        buffer.lookup("map", "cup", 1500 * MS)
 
 
 def test_accelerations_are_averaged_over_half_a_second_each_way() -> None:

@@ -681,17 +681,20 @@ def test_screenshot_ends_viewer_process(tmp_path: Path, monkeypatch: pytest.Monk
 @pytest.mark.skipif(
     not any(Path("/usr/share/vulkan").glob("icd.d/*.json")), reason="nothing to draw with"
 )
-def test_screenshot_shows_scene(
-    recording: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    """Views that fail to draw, or an eye that looks away, would give an empty picture."""
+def test_screenshot_shows_scene(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Views that fail to draw, or an eye that looks away, would give an empty picture.
+
+    The last frame is shown, which has the can.
+    """
     monkeypatch.setattr(review_viewer, "_SETTLE_S", 2.0)  # welcome messages may still be visible
     png = tmp_path / "r.png"
-    review_viewer.take_screenshot(recording, png, size=(640, 480), stamp_ns=stamp(0))
+    objects = [labelled_object(1), labelled_object(2, "can", 0.3)]
+    path = write(tmp_path / "r.rrd", [scene(0, objects[:1]), scene(1, objects)])
+    review_viewer.take_screenshot(path, png)
     image_module = pytest.importorskip("PIL.Image")
     with image_module.open(png) as picture:
-        assert picture.size == (640, 480)
-        pixels = np.asarray(picture.convert("RGB"), float)[:, :400].reshape(-1, 3)
+        assert picture.size == (1280, 800)
+        pixels = np.asarray(picture.convert("RGB"), float)[:, :800].reshape(-1, 3)
     green = np.array(colour_of("can"), float)  # no part of the viewer itself is so green
     similarity = pixels @ green / np.linalg.norm(green) / np.linalg.norm(pixels + 1, axis=1)
     assert np.count_nonzero((similarity > 0.98) & (pixels.max(axis=1) > 90)) > 100

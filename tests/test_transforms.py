@@ -120,16 +120,16 @@ def test_static_transform_does_not_hide_a_moving_one(first: str) -> None:
 
 
 def test_extrapolation_beyond_tolerance_is_an_error() -> None:
-    buffer = TransformBuffer(tolerance_ns=10)
-    buffer.add("map", "base", 100, moved(1.0), static=False)
-    buffer.add("map", "base", 200, moved(2.0), static=False)
+    buffer = TransformBuffer()
+    buffer.add("map", "base", 1_000_000_000, moved(1.0), static=False)
+    buffer.add("map", "base", 2_000_000_000, moved(2.0), static=False)
 
-    assert buffer.lookup("map", "base", 90).translation[0] == 1.0
-    assert buffer.lookup("map", "base", 210).translation[0] == 2.0
-    with pytest.raises(ExtrapolationError, match=r"base at 89 ns.* before the first"):
-        buffer.lookup("map", "base", 89)
+    assert buffer.lookup("map", "base", 900_000_000).translation[0] == 1.0
+    assert buffer.lookup("map", "base", 2_100_000_000).translation[0] == 2.0
+    with pytest.raises(ExtrapolationError, match=r"base at 899999999 ns.* before the first"):
+        buffer.lookup("map", "base", 899_999_999)
     with pytest.raises(ExtrapolationError, match="after the last"):
-        buffer.lookup("map", "base", 211)
+        buffer.lookup("map", "base", 2_100_000_001)
 
 
 def test_lookup_errors_name_missing_link() -> None:

@@ -14,14 +14,10 @@ _TOLERANCE_PX = 0.75
 """Corners that stick out less are dropped; the steps of a slanted edge stick out by 0.71."""
 
 
-def outlines(mask: Mask, tolerance_px: float = _TOLERANCE_PX) -> list[F8]:
+def outlines(mask: Mask) -> list[F8]:
     """Return the outer outline of each connected part of a mask, the largest first.
 
     Holes are ignored. Pixels that touch only at a corner are not connected.
-
-    Parameters
-    ----------
-    tolerance_px : largest distance between an outline and the border of the pixels.
 
     Returns
     -------
@@ -41,7 +37,7 @@ def outlines(mask: Mask, tolerance_px: float = _TOLERANCE_PX) -> list[F8]:
     valid = [ring for ring in rings if len(ring) and _area(ring) > 0]
     valid.sort(key=_area, reverse=True)
     offset = np.array([mask.left - 1, mask.top - 1])
-    return [_simplified(ring.astype(np.float64), tolerance_px) + offset for ring in valid]
+    return [_simplified(ring.astype(np.float64)) + offset for ring in valid]
 
 
 def joined(rings: Sequence[F8]) -> F8:
@@ -64,27 +60,27 @@ def _area(ring: I4) -> float:
     return float((x * np.roll(y, -1) - np.roll(x, -1) * y).sum()) / 2
 
 
-def _simplified(ring: F8, tolerance: float) -> F8:
+def _simplified(ring: F8) -> F8:
     """Drop corners of a closed line (Douglas and Peucker 1973)."""
     farthest = int(((ring - ring[0]) ** 2).sum(axis=1).argmax())
     closed = np.concatenate([ring, ring[:1]])
     keep = np.zeros(len(closed), np.bool_)
     keep[[0, farthest, -1]] = True
-    _keep_far(closed, 0, farthest, tolerance, keep)
-    _keep_far(closed, farthest, len(closed) - 1, tolerance, keep)
+    _keep_far(closed, 0, farthest, keep)
+    _keep_far(closed, farthest, len(closed) - 1, keep)
     simplified = closed[:-1][keep[:-1]]
     return simplified if len(simplified) >= 3 else ring
 
 
 @kernel
-def _keep_far(line: F8, first: int, last: int, tolerance: float, keep: Bool) -> None:
-    """Mark corners between two others that are off the simplified line by more than a tolerance."""
+def _keep_far(line: F8, first: int, last: int, keep: Bool) -> None:
+    """Mark corners between two others that are far from the simplified line."""
     stack = [(first, last)]
     while len(stack) > 0:
         a, b = stack.pop()
         dx, dy = line[b, 0] - line[a, 0], line[b, 1] - line[a, 1]
         length = np.sqrt(dx * dx + dy * dy)
-        worst, at = tolerance, -1
+        worst, at = _TOLERANCE_PX, -1
         for i in range(a + 1, b):
             ex, ey = line[i, 0] - line[a, 0], line[i, 1] - line[a, 1]
             apart = abs(dx * ey - dy * ex) / length if length > 0 else np.sqrt(ex * ex + ey * ey)

@@ -209,9 +209,9 @@ def _own_name(topic: str) -> str:
     return "/".join(_image_name(topic).split("/")[-2:]).rpartition("depth")[2]
 
 
-def first_message(recording: Recording, topic: str, kind: str | None = None) -> Any:
+def first_message(recording: Recording, topic: str) -> Any:
     """Return the first of `first_messages`; None if there is none."""
-    return next(first_messages(recording, topic, kind), None)
+    return next(first_messages(recording, topic), None)
 
 
 def first_messages(recording: Recording, topic: str, kind: str | None = None) -> Iterator[Any]:

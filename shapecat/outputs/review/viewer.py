@@ -26,6 +26,7 @@ _SETTLE_S = 7.0  # until the viewer's notices have faded; everything else is dra
 _LOAD_S = 30.0
 _OPEN_S = 2.0
 """A viewer that cannot open a window ends within this time."""
+_SCREENSHOT_SIZE = "1280x800"  # pixels
 _HERE = "127.0.0.1"
 _DISPLAYS = ("DISPLAY", "WAYLAND_DISPLAY", "WAYLAND_SOCKET")
 
@@ -85,16 +86,12 @@ def _end(viewer: subprocess.Popen[bytes]) -> None:
     viewer.wait()
 
 
-def take_screenshot(
-    path: Path, png: Path, *, size: tuple[int, int] = (1280, 800), stamp_ns: int | None = None
-) -> None:
-    """Draw a review to a PNG file without a window; software rendering is enough.
+def take_screenshot(path: Path, png: Path) -> None:
+    """Draw a review at its last time to a PNG file, without a window or a graphics card.
 
     Parameters
     ----------
     png : the file to write.
-    size : width and height in pixels.
-    stamp_ns : the time to show; by default the last time in the recording.
 
     Raises
     ------
@@ -106,13 +103,13 @@ def take_screenshot(
     require_utf8(png)
     port = _free_port()
     options = ("--port", str(port), "--hide-welcome-screen")
-    window = ("--headless", "--window-size", f"{size[0]}x{size[1]}")
+    window = ("--headless", "--window-size", _SCREENSHOT_SIZE)
     with tempfile.TemporaryFile() as log:
         viewer = _start((*options, *window), log)
         try:
             _wait_for(viewer, port, log)
             client = ViewerClient(f"rerun+http://{_HERE}:{port}/proxy")
-            _show(client, path, stamp_ns)
+            _show(client, path)
             client.save_screenshot(str(png.absolute()))
             _wait_until(png.exists)
         except (RuntimeError, OSError) as error:
@@ -123,12 +120,11 @@ def take_screenshot(
             _end(viewer)
 
 
-def _show(client: Any, path: Path, stamp_ns: int | None) -> None:
-    """Open the file at a time, and wait until it is drawn."""
+def _show(client: Any, path: Path) -> None:
+    """Open the file at its last time, and wait until it is drawn."""
     client.open(str(path.absolute()))
     _wait_until(lambda: not client.get_state().loading)
-    if stamp_ns is None:
-        stamp_ns = _last_stamp(client)
+    stamp_ns = _last_stamp(client)
     if stamp_ns is not None:
         at = np.datetime64(stamp_ns, "ns")
         client.set_time("sensor_time", timestamp=at, play_state="paused")

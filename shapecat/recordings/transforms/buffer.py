@@ -35,6 +35,8 @@ __all__ = [
     "read_transforms",
 ]
 
+_TOLERANCE_NS = 100_000_000
+"""Time before its first and after its last sample in which a transform is taken as constant."""
 _DEEPEST = 200
 _FIXED = ("map", "odom", "world")
 
@@ -52,17 +54,10 @@ class TransformLoopError(TransformError):
 
 
 class TransformBuffer:
-    """Transforms between frames; static ones are valid at all times without another one.
+    """Transforms between frames; static ones are valid at all times without another one."""
 
-    Parameters
-    ----------
-    tolerance_ns : time before its first and after its last sample during which a transform is
-        assumed to be constant, nanoseconds.
-    """
-
-    def __init__(self, *, tolerance_ns: int = 100_000_000) -> None:
+    def __init__(self) -> None:
         """Make an empty buffer."""
-        self.tolerance_ns = tolerance_ns
         self._tracks: dict[str, TransformTrack] = {}
         self._frames: set[str] = set()
 
@@ -182,7 +177,7 @@ class TransformBuffer:
         if track is None:
             return None
         stamps = track.stamps
-        known = stamps if stamp_ns is None else max(track.gaps_ns(stamp_ns)) <= self.tolerance_ns
+        known = stamps if stamp_ns is None else max(track.gaps_ns(stamp_ns)) <= _TOLERANCE_NS
         if track.static is not None and not known:
             return track.static.parent
         at = len(stamps) if stamp_ns is None else bisect_right(stamps, stamp_ns)
@@ -199,7 +194,7 @@ class TransformBuffer:
         track = self._tracks[frame_id]
         stamps = track.stamps
         late, early = track.gaps_ns(stamp_ns)
-        if max(late, early) > self.tolerance_ns:
+        if max(late, early) > _TOLERANCE_NS:
             if track.static is not None:
                 return pose_of(track.static)
             side = (
