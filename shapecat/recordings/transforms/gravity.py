@@ -17,24 +17,41 @@ from shapecat.recordings.transforms.imu import Accelerometers
 from shapecat.recordings.transforms.window import TransformWindow
 from shapecat.types import Frame, Pose
 
-__all__ = ["MISNAMED", "Orientation", "Upright", "has_z_up", "turned"]
+__all__ = ["MISNAMINGS", "Misnaming", "Orientation", "Upright", "has_z_up", "turned"]
 
 _LEVEL_FRAMES = ("map", "odom", "world", "earth", "base_footprint", "base_link")
 """Frames whose z axis is up by convention (REP 105, REP 103), even after the name of a robot."""
-MISNAMED = {
-    "its data are in an optical frame (z forward), although the frame they name has x forward": (
-        LINK_FROM_OPTICAL.rotation
-    ),
-    "its points have x forward, although the frame they name is an optical one (z forward)": (
-        LINK_FROM_OPTICAL.rotation.T
-    ),
-    "its data and the frame they name differ like the ROS and OpenGL conventions (z backward)": (
-        np.diag([1.0, -1.0, -1.0])
-    ),
-}
-"""Ways in which simulators name a frame that is not that of the data, the usual one first: the
-rotation from the frame of the data to the frame they name."""
 _SOURCES = {"auto": ("tf", "imu"), "tf": ("tf",), "imu": ("imu",)}
+
+
+class Misnaming(NamedTuple):
+    """A way in which data name a frame that is not their own.
+
+    Attributes
+    ----------
+    text : what is wrong, for the user, after the topic.
+    named_from_data : (3, 3) rotation from the frame of the data to the frame that they name.
+    """
+
+    text: str
+    named_from_data: F8
+
+
+MISNAMINGS = (
+    Misnaming(
+        "its data are in an optical frame (z forward), although the frame they name has x forward",
+        LINK_FROM_OPTICAL.rotation,
+    ),
+    Misnaming(
+        "its points have x forward, although the frame they name is an optical one (z forward)",
+        LINK_FROM_OPTICAL.rotation.T,
+    ),
+    Misnaming(
+        "its data and the frame they name differ like the ROS and OpenGL conventions (z backward)",
+        np.diag([1.0, -1.0, -1.0]),
+    ),
+)
+"""Ways in which simulators name a frame that is not that of the data, the usual one first."""
 
 
 class Orientation(NamedTuple):
@@ -67,7 +84,7 @@ class Upright:
     dropped : for each topic whose given up direction is ignored, the source of that direction.
     failed, first_failure : the number of failed look-ups, and the error of the first.
     given : the number of frames whose up direction is from each source.
-    misnamed : the rotation, of `MISNAMED`, of each topic whose data are not in the frame they name.
+    misnamed : ``named_from_data`` of each topic whose data are not in the frame they name.
     sensors : the frame ids of all sensors, as far as they are known.
     middle_ns : log time of the middle of the recording, nanoseconds.
     """
@@ -166,7 +183,7 @@ class Upright:
         return min((name for name in candidates if name is not None), key=_rank, default=own_frame)
 
     def corrected(self, topic: str, orientation: Orientation) -> Orientation:
-        """Return an orientation of the data on a topic, given that of the frame they name."""
+        """Return the orientation of the data on a topic, given that of the frame they name."""
         source, up, pose = orientation
         turn = self.misnamed.get(topic)
         if turn is None:
@@ -175,10 +192,10 @@ class Upright:
             pose = Pose(pose.rotation @ turn, pose.translation)
         return Orientation(source, None if up is None else turned(up, turn), pose)
 
-    def assume_misnamed(self, topic: str, how: str) -> None:
-        """Treat the data on a topic as misnamed, in one of the ways of `MISNAMED`, from now on."""
-        self.misnamed[topic] = MISNAMED[how]
-        self.warnings.append(f"{topic}: {how}; its transforms are corrected")
+    def assume_misnamed(self, topic: str, misnaming: Misnaming) -> None:
+        """Treat the data on a topic as misnamed from now on."""
+        self.misnamed[topic] = misnaming.named_from_data
+        self.warnings.append(f"{topic}: {misnaming.text}; its transforms are corrected")
 
     def accept(self, topic: str, orientation: Orientation) -> F4 | None:
         """Count where an up direction comes from, and return it; None if the topic's is dropped."""

@@ -24,7 +24,13 @@ from shapecat.learning import Categorizer
 from shapecat.perception import Perceiver, PerceptionInput, find_up
 from shapecat.recordings import Recording, Stream
 from shapecat.recordings.colour_streams import ColourStream
-from shapecat.recordings.transforms.gravity import MISNAMED, Orientation, Upright, has_z_up, turned
+from shapecat.recordings.transforms.gravity import (
+    MISNAMINGS,
+    Orientation,
+    Upright,
+    has_z_up,
+    turned,
+)
 from shapecat.rehearsal import rehearse
 from shapecat.runs.jobs import Job
 from shapecat.runs.perceive.perceived import FrameRow, PerceptionTables
@@ -205,7 +211,7 @@ class _UpTrial:
     def __init__(self, upright: Upright, settings: Settings) -> None:
         self._upright, self._settings = upright, settings
         self._off_deg: dict[str, list[float]] = {}
-        self._misnamed_off_deg: dict[tuple[str, str], list[float]] = {}
+        self._misnamed_off_deg: dict[str, list[list[float]]] = {}  # per frame and misnaming
         self._sources: dict[str, str] = {}
         self._looks: Counter[str] = Counter()
         self._decided: set[str] = set()
@@ -243,9 +249,10 @@ class _UpTrial:
             estimate = find_up(frame, self._settings)
             if estimate is not None:
                 angle = _angle_deg(hint, estimate)
-                for how, turn in MISNAMED.items():
-                    misnamed_off = self._misnamed_off_deg.setdefault((frame.topic, how), [])
-                    misnamed_off.append(_angle_deg(turned(hint, turn), estimate))
+                corrected = [turned(hint, misnaming.named_from_data) for misnaming in MISNAMINGS]
+                self._misnamed_off_deg.setdefault(frame.topic, []).append(
+                    [_angle_deg(up, estimate) for up in corrected]
+                )
                 if elsewhere:  # from the base of a robot, a table seems to be seen from below
                     angle = min(angle, 180 - angle)
                 off.append(angle)
@@ -266,7 +273,8 @@ class _UpTrial:
         if not enough or min(off) <= _CONFIRMS_DEG:
             return
         source = self._sources[topic]
-        fits = [n for n in MISNAMED if max(self._misnamed_off_deg[topic, n]) <= _MISNAMED_DEG]
+        worst = np.max(self._misnamed_off_deg[topic], axis=0)
+        fits = [m for m, off_deg in zip(MISNAMINGS, worst, strict=True) if off_deg <= _MISNAMED_DEG]
         if source.startswith("transforms") and fits:
             self._upright.assume_misnamed(topic, fits[0])
         else:
