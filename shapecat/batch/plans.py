@@ -143,7 +143,10 @@ class Batch:
 def plan_batch(
     job: Job, sources: Sequence[str], out: str, *, shard: str | None = None
 ) -> Iterator[Batch]:
-    """Plan a task for each recording, without opening any; keep the manifest open during the block.
+    """Plan a task for each recording; keep the manifest open during the block.
+
+    Only numbered files in a folder without metadata are opened: their times decide whether they are
+    parts of one bag or different takes.
 
     Parameters
     ----------
