@@ -46,7 +46,8 @@ _STRAIGHT_PX, _STEPS = 2.0, 9
 with less distortion are likewise treated as those of a pinhole camera."""
 
 KnownImages: TypeAlias = Callable[[str, int], int | None] | None
-"""The log time (ns) of the colour image of a frame, given by topic and number, if it has one."""
+"""Returns the log time (ns) of a frame's colour image, given the frame's topic and number; None if
+the frame has no image."""
 
 
 def frames_with_colour(

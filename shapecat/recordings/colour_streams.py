@@ -146,7 +146,10 @@ def _warn_about_unread(recording: Recording) -> None:
 
 
 class _NearSensor(NamedTuple):
-    """The streams of a sensor, and how much of their namespace some images share at most."""
+    """The streams of a sensor.
+
+    ``shared`` is the largest number of namespace components that one of them shares with an image.
+    """
 
     shared: int
     streams: Sequence[Stream]

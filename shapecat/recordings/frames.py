@@ -84,9 +84,9 @@ def frames(
     Parameters
     ----------
     skipped : receives the number of unreadable frames by reason; they raise no error.
-    callbacks : callbacks for the messages of other topics, so that the file is read only once.
-    needed : function of topic and log time (ns) that returns whether that frame, or message for
-        ``callbacks``, is needed; from an indexed file, the rest may be left out.
+    callbacks : called with the messages of other topics, so that the file is read only once.
+    needed : returns whether a frame, or a message for ``callbacks``, is needed, given its topic and
+        log time (ns). Others may be left out if the recording has an index.
 
     Yields
     ------

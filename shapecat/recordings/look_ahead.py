@@ -1,4 +1,4 @@
-"""Read messages that frames look up by time shortly before they are needed.
+"""Read the messages that frames look up by time, such as transforms, shortly before each frame.
 
 The transforms and accelerations of hours would fill the memory, and reading them all first would
 delay the first frame.
@@ -12,12 +12,12 @@ from shapecat.recordings.recording import Recording
 __all__ = ["AROUND_NS", "LookAhead", "is_read_at_once"]
 
 AROUND_NS = 10_000_000_000
-"""Messages are known from this long before a frame to this long after it. Drivers log a message at
-most seconds after its stamp, and a transform is published more often than this."""
+"""Messages are read this long before and after a frame. Drivers log a message at most seconds after
+its stamp, and publish transforms more often than this."""
 
 
 def is_read_at_once(recording: Recording) -> bool:
-    """Return whether a recording is short, or has no index to read a part without the rest."""
+    """Return whether all messages are read at first: the recording is short, or has no index."""
     return recording.end_ns - recording.start_ns <= 2 * AROUND_NS or not recording.indexed
 
 
@@ -43,10 +43,8 @@ class LookAhead:
         Parameters
         ----------
         take : called with each message, in the order of the recording.
-        forget : called with a stamp (ns): earlier messages are no longer needed, except the last
-            one before it.
-        skips : whether messages may be left out that are long before a frame and long after the
-            one before.
+        forget : called with a stamp (ns). Of the messages before it, only the last is still needed.
+        skips : whether messages in a long gap between two frames may be left out.
         """
         self._recording, self._topics = recording, topics
         self._take, self._forget, self._skips = take, forget, skips

@@ -31,9 +31,9 @@ class Recording(ABC):
     start_ns, end_ns : log times of the first and last message; 0 if there is none.
     closed : whether it was closed; then no messages can be read.
     indexed : whether messages are found by topic and time, without reading the rest.
-    damaged : reading has found a damaged chunk, or the damaged index of one, in an MCAP file.
+    damaged : whether a damaged chunk, or a damaged index of one, was found in an MCAP file so far.
     warnings : problems found in the recording, for the user.
-    frame_ids : the frame id of the first message of each topic of which one was asked for.
+    frame_ids : frame ids found so far, by topic: a cache for the search for streams.
     """
 
     kind: ClassVar[str]
@@ -74,8 +74,9 @@ class Recording(ABC):
         ----------
         topics : names to read; all by default.
         start_ns, stop_ns : messages with ``start_ns <= log time < stop_ns`` are read.
-        needed : returns whether the data of a message is needed. Other messages from an indexed
-            file may have empty data, and those that damage has destroyed have: all are counted.
+        needed : returns whether the data of a message is needed. Messages that are not needed may
+            come without data; destroyed ones always do. Both are yielded, so that frame numbers do
+            not depend on what is needed.
 
         Yields
         ------

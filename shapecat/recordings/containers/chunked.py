@@ -54,7 +54,10 @@ class Chunk(NamedTuple):
 
 
 class ChunkedRecording(Recording):
-    """A recording in one file of chunks, of records whose type ``Any`` is that of the format."""
+    """A recording in one file that consists of chunks.
+
+    Each format has its own type of records, which is ``Any`` here.
+    """
 
     def __init__(self, path: Path) -> None:
         """Open the file and read its index, or scan it without one.

@@ -116,8 +116,8 @@ def read_chunk(content: bytes, *, end: int | None = None, checked: bool = False)
 
     Parameters
     ----------
-    end : number of decompressed bytes to return, or as many as there are, without verifying that
-        the chunk is whole; None for a whole chunk.
+    end : decompress at most this many bytes, and do not verify the chunk; None to decompress and
+        verify all of it.
     checked : whether the checksum has been verified before.
 
     Raises

@@ -27,7 +27,11 @@ _FOOTER = 9 + 20
 
 @dataclass
 class Summary:
-    """The summary of a file; ``data_end`` is a byte offset, ``checked`` by its checksum."""
+    """The summary of a file.
+
+    ``data_end`` is the byte offset at which the data ends; ``checked`` says whether the summary has
+    a checksum, which was verified.
+    """
 
     schemas: dict[int, records.Schema] = field(default_factory=dict)
     channels: dict[int, records.Channel] = field(default_factory=dict)

@@ -54,7 +54,7 @@ class TransformLoopError(TransformError):
 
 
 class TransformBuffer:
-    """Transforms between frames; static ones are valid at all times without another one."""
+    """Transforms between frames; a static one is valid at all times at which there is no other."""
 
     def __init__(self) -> None:
         """Make an empty buffer."""
@@ -86,7 +86,7 @@ class TransformBuffer:
         Parameters
         ----------
         parent_from_child : translation (x, y, z) in metres and quaternion (x, y, z, w).
-        static : whether it is valid at all times without another one; ``stamp_ns`` is then ignored.
+        static : whether it is valid whenever there is no other one; ``stamp_ns`` is then ignored.
         latched : whether it is valid until the next one, however late that is.
 
         Returns

@@ -81,9 +81,9 @@ class Upright:
     vector : (3,) the up direction in the sensor frame that the user gave, or None.
     sources : ``tf`` and ``imu``, in the order in which they are tried; empty with a vector.
     warnings : for the user.
-    dropped : for each topic whose given up direction is ignored, the source of that direction.
+    dropped : the source of the up direction that is ignored, by topic.
     failed, first_failure : the number of failed look-ups, and the error of the first.
-    given : the number of frames whose up direction is from each source.
+    given : the number of frames by the source of their up direction.
     misnamed : ``named_from_data`` of each topic whose data are not in the frame they name.
     sensors : the frame ids of all sensors, as far as they are known.
     middle_ns : log time of the middle of the recording, nanoseconds.

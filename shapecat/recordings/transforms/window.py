@@ -35,7 +35,7 @@ class TransformWindow:
         tree: TransformBuffer | None = None,
         ahead: LookAhead | None = None,
     ) -> None:
-        """Use ``buffer``, which ``ahead`` keeps filled; without it, these are all transforms."""
+        """Use ``buffer``: ``ahead`` keeps it filled; without that, it holds all transforms."""
         self.tree = buffer if tree is None else tree
         self._known, self._ahead = buffer, ahead
 
