@@ -1,8 +1,4 @@
-"""The expensive phases: perceive every frame, then revise some with a better up direction.
-
-Before the first frame is perceived, the up direction that the recording gives is compared with the
-planes in the first frames: a fixed frame whose z axis is not up would spoil all of them.
-"""
+"""The expensive phases: perceive every frame, then revise some with a better up direction."""
 
 from collections import Counter
 from collections.abc import Callable, Iterator
@@ -12,31 +8,22 @@ from itertools import islice
 from pathlib import Path
 from typing import NamedTuple
 
-import numpy as np
-
-from shapecat.arrays import F4
 from shapecat.cameras.colour import ColourView
-from shapecat.config import Settings
 from shapecat.depth_fusion import RecentFrames
 from shapecat.errors import NoStreamError
 from shapecat.executors.ordered_pool import OrderedPool
 from shapecat.learning import Categorizer
-from shapecat.perception import Perceiver, PerceptionInput, find_up
+from shapecat.perception import Perceiver, PerceptionInput
 from shapecat.recordings import Recording, Stream
 from shapecat.recordings.colour_streams import ColourStream
-from shapecat.recordings.transforms.gravity import (
-    MISNAMINGS,
-    Orientation,
-    Upright,
-    has_z_up,
-    turned,
-)
+from shapecat.recordings.transforms.gravity import Upright
 from shapecat.rehearsal import rehearse
 from shapecat.runs.jobs import Job
 from shapecat.runs.perceive.perceived import FrameRow, PerceptionTables
 from shapecat.runs.perceive.second_look import Revision, frames_to_revise
 from shapecat.runs.perceive.selection import count_frames, read_frames
 from shapecat.runs.perceive.up_report import report_up
+from shapecat.runs.perceive.up_trial import Oriented, UpTrial
 from shapecat.runs.run_info import RunInfo
 from shapecat.runs.tables.reading import Key, count_rows, read_row_groups
 from shapecat.runs.tables.segments import read_segments
@@ -48,19 +35,7 @@ __all__ = ["Work", "perceive_all", "revise"]
 
 _MANY = 100
 """With at least this many frames, other processes are started before anything is read."""
-_CONFIRMS_DEG = 15.0
-"""A plane confirms an up direction within this angle, as in `detect`."""
-_MISNAMED_DEG = 5.0
-"""A plane confirms other axes within this angle: the transforms of simulators are exact, but those
-of visual SLAM, whose map has z forward, fit other axes up to the pitch of its camera."""
-_DOUBTS, _LOOKS = 3, 10
-"""Frames with a plane that must contradict the up direction, and frames that are checked."""
-_MOST_HELD = 64
-"""Frames that are held back at most: a topic may have few frames, or none for a long time."""
 
-
-_Oriented = tuple[Frame, ColourView | None, Orientation]
-"""A frame, its colour image, if it has one, and the up direction and pose of the sensor."""
 _Item = tuple[FrameRow, PerceptionInput]
 """A frame to perceive, and the values of its row that a `Perception` lacks."""
 
@@ -93,7 +68,7 @@ def perceive_all(work: Work) -> None:
     with _perceiving(work, "perceive", total) as perceive:
         upright = _upright(work, job.fixed_frame)
 
-        def view(oriented: _Oriented) -> _Item:
+        def view(oriented: Oriented) -> _Item:
             frame, colour, (_, _, pose) = oriented
             up = upright.accept(frame.topic, oriented[2])
             row = FrameRow(frame.log_time_ns, pose, up, frame_from_sensor=frame.frame_from_sensor)
@@ -205,95 +180,15 @@ def _blocks(
         yield rows, perceptions
 
 
-class _UpTrial:
-    """Compares the given up direction with the planes in the first frames of each topic."""
-
-    def __init__(self, upright: Upright, settings: Settings) -> None:
-        self._upright, self._settings = upright, settings
-        self._off_deg: dict[str, list[float]] = {}
-        self._misnamed_off_deg: dict[str, list[list[float]]] = {}  # per frame and misnaming
-        self._sources: dict[str, str] = {}
-        self._looks: Counter[str] = Counter()
-        self._decided: set[str] = set()
-
-    def before(self, source: Iterator[_Oriented]) -> Iterator[_Oriented]:
-        """Yield all frames, but hold the first ones back until the up directions are decided.
-
-        Only topics with a given up direction are waited for.
-        """
-        pending: list[_Oriented] = []
-        for oriented in source:
-            frame, _, orientation = oriented
-            pending.append(oriented)
-            if frame.topic not in self._decided:
-                self._look(frame, orientation)
-            if len(pending) == _MOST_HELD:
-                self._decide_all()
-            if self._off_deg.keys() <= self._decided:
-                yield from pending
-                pending.clear()
-        self._decide_all()
-        yield from pending
-
-    def _look(self, frame: Frame, orientation: Orientation) -> None:
-        self._looks[frame.topic] += 1
-        hint, off = orientation.up, self._off_deg.get(frame.topic, [])
-        elsewhere = frame.points is not None and has_z_up(frame.frame_id)
-        if elsewhere and self._looks[frame.topic] == 1:
-            self._upright.warnings.append(
-                f"{frame.topic}: its clouds are in {frame.frame_id}, which is not the frame of a "
-                "camera: objects may be missed or split; use its depth images, if recorded"
-            )
-        if hint is not None:
-            off = self._off_deg.setdefault(frame.topic, off)
-            estimate = find_up(frame, self._settings)
-            if estimate is not None:
-                angle = _angle_deg(hint, estimate)
-                corrected = [turned(hint, misnaming.named_from_data) for misnaming in MISNAMINGS]
-                self._misnamed_off_deg.setdefault(frame.topic, []).append(
-                    [_angle_deg(up, estimate) for up in corrected]
-                )
-                if elsewhere:  # from the base of a robot, a table seems to be seen from below
-                    angle = min(angle, 180 - angle)
-                off.append(angle)
-                self._sources[frame.topic] = orientation.source
-        enough = len(off) == _DOUBTS or self._looks[frame.topic] == _LOOKS
-        if enough or min(off, default=np.inf) <= _CONFIRMS_DEG:
-            self._decide(frame.topic)
-
-    def _decide_all(self) -> None:
-        for topic in sorted(self._off_deg.keys() - self._decided):
-            self._decide(topic)
-
-    def _decide(self, topic: str) -> None:
-        """Reject the up direction of a topic if no frame confirms it and enough contradict it."""
-        self._decided.add(topic)
-        off = self._off_deg.get(topic, [])
-        enough = len(off) >= min(_DOUBTS, self._looks[topic])
-        if not enough or min(off) <= _CONFIRMS_DEG:
-            return
-        source = self._sources[topic]
-        worst = np.max(self._misnamed_off_deg[topic], axis=0)
-        fits = [m for m, off_deg in zip(MISNAMINGS, worst, strict=True) if off_deg <= _MISNAMED_DEG]
-        if source.startswith("transforms") and fits:
-            self._upright.assume_misnamed(topic, fits[0])
-        else:
-            self._upright.contradict(topic, source, off)
-
-
-def _angle_deg(a: F4, b: F4) -> float:
-    return float(np.degrees(np.arccos(np.clip(a @ b, -1, 1))))
-
-
 def _upright(work: Work, fixed_frame: str | None) -> Upright:
     streams = work.streams
     return Upright.of(work.recording, up=work.job.up, fixed_frame=fixed_frame, streams=streams)
 
 
-def _oriented(work: Work, upright: Upright, skipped: Counter[str]) -> Iterator[_Oriented]:
+def _oriented(work: Work, upright: Upright, skipped: Counter[str]) -> Iterator[Oriented]:
     """Yield the frames of a run with their orientations, once the up directions are decided."""
     source = ((frame, colour, upright.orient(frame)) for frame, colour in _readings(work, skipped))
-    for frame, colour, orientation in _UpTrial(upright, work.job.settings).before(source):
+    for frame, colour, orientation in UpTrial(upright, work.job.settings).before(source):
         yield frame, colour, upright.corrected(frame.topic, orientation)
 
 

@@ -1,0 +1,117 @@
+"""Compare the up direction that a recording gives with the planes in its first frames.
+
+A fixed frame whose z axis is not up would spoil all frames.
+"""
+
+from collections import Counter
+from collections.abc import Iterator
+
+import numpy as np
+
+from shapecat.arrays import F4
+from shapecat.cameras.colour import ColourView
+from shapecat.config import Settings
+from shapecat.perception import find_up
+from shapecat.recordings.transforms.gravity import (
+    MISNAMINGS,
+    Orientation,
+    Upright,
+    has_z_up,
+    turned,
+)
+from shapecat.types import Frame
+
+__all__ = ["Oriented", "UpTrial"]
+
+_CONFIRMS_DEG = 15.0
+"""A plane confirms an up direction within this angle, as in `detect`."""
+_MISNAMED_DEG = 5.0
+"""A plane confirms other axes within this angle: the transforms of simulators are exact, but those
+of visual SLAM, whose map has z forward, fit other axes up to the pitch of its camera."""
+_DOUBTS, _LOOKS = 3, 10
+"""Frames with a plane that must contradict the up direction, and frames that are checked."""
+_MOST_HELD = 64
+"""Frames that are held back at most: a topic may have few frames, or none for a long time."""
+
+Oriented = tuple[Frame, ColourView | None, Orientation]
+"""A frame, its colour image, if it has one, and the up direction and pose of the sensor."""
+
+
+class UpTrial:
+    """Compares the given up direction with the planes in the first frames of each topic."""
+
+    def __init__(self, upright: Upright, settings: Settings) -> None:
+        self._upright, self._settings = upright, settings
+        self._off_deg: dict[str, list[float]] = {}
+        self._misnamed_off_deg: dict[str, list[list[float]]] = {}  # per frame and misnaming
+        self._sources: dict[str, str] = {}
+        self._looks: Counter[str] = Counter()
+        self._decided: set[str] = set()
+
+    def before(self, source: Iterator[Oriented]) -> Iterator[Oriented]:
+        """Yield all frames, but hold the first ones back until the up directions are decided.
+
+        Only topics with a given up direction are waited for.
+        """
+        pending: list[Oriented] = []
+        for oriented in source:
+            frame, _, orientation = oriented
+            pending.append(oriented)
+            if frame.topic not in self._decided:
+                self._look(frame, orientation)
+            if len(pending) == _MOST_HELD:
+                self._decide_all()
+            if self._off_deg.keys() <= self._decided:
+                yield from pending
+                pending.clear()
+        self._decide_all()
+        yield from pending
+
+    def _look(self, frame: Frame, orientation: Orientation) -> None:
+        self._looks[frame.topic] += 1
+        hint, off = orientation.up, self._off_deg.get(frame.topic, [])
+        elsewhere = frame.points is not None and has_z_up(frame.frame_id)
+        if elsewhere and self._looks[frame.topic] == 1:
+            self._upright.warnings.append(
+                f"{frame.topic}: its clouds are in {frame.frame_id}, which is not the frame of a "
+                "camera: objects may be missed or split; use its depth images, if recorded"
+            )
+        if hint is not None:
+            off = self._off_deg.setdefault(frame.topic, off)
+            estimate = find_up(frame, self._settings)
+            if estimate is not None:
+                angle = _angle_deg(hint, estimate)
+                corrected = [turned(hint, misnaming.named_from_data) for misnaming in MISNAMINGS]
+                self._misnamed_off_deg.setdefault(frame.topic, []).append(
+                    [_angle_deg(up, estimate) for up in corrected]
+                )
+                if elsewhere:  # from the base of a robot, a table seems to be seen from below
+                    angle = min(angle, 180 - angle)
+                off.append(angle)
+                self._sources[frame.topic] = orientation.source
+        enough = len(off) == _DOUBTS or self._looks[frame.topic] == _LOOKS
+        if enough or min(off, default=np.inf) <= _CONFIRMS_DEG:
+            self._decide(frame.topic)
+
+    def _decide_all(self) -> None:
+        for topic in sorted(self._off_deg.keys() - self._decided):
+            self._decide(topic)
+
+    def _decide(self, topic: str) -> None:
+        """Reject the up direction of a topic if no frame confirms it and enough contradict it."""
+        self._decided.add(topic)
+        off = self._off_deg.get(topic, [])
+        enough = len(off) >= min(_DOUBTS, self._looks[topic])
+        if not enough or min(off) <= _CONFIRMS_DEG:
+            return
+        source = self._sources[topic]
+        worst = np.max(self._misnamed_off_deg[topic], axis=0)
+        fits = [m for m, off_deg in zip(MISNAMINGS, worst, strict=True) if off_deg <= _MISNAMED_DEG]
+        if source.startswith("transforms") and fits:
+            self._upright.assume_misnamed(topic, fits[0])
+        else:
+            self._upright.contradict(topic, source, off)
+
+
+def _angle_deg(a: F4, b: F4) -> float:
+    return float(np.degrees(np.arccos(np.clip(a @ b, -1, 1))))
