@@ -42,11 +42,8 @@ from shapecat.runs.jobs import (
 from shapecat.runs.labels.corrections import adopt_labels, read_labels
 from shapecat.runs.labels.replaced import forget_old_labels, keep_labels
 from shapecat.runs.labels.transfer import Transfer, transfer_labels
-from shapecat.runs.perceive.clocks import explain_clocks
-from shapecat.runs.perceive.misplacement import explain_misplacement
-from shapecat.runs.perceive.missing_planes import explain_missing_planes
+from shapecat.runs.perceive.doubts import explain_doubts
 from shapecat.runs.perceive.phases import Work, perceive_all, revise
-from shapecat.runs.perceive.pose_jumps import explain_jumps
 from shapecat.runs.perceive.resuming import has_work, resume, take_over_frames
 from shapecat.runs.run_info import RunInfo
 from shapecat.runs.tables.segments import discard_segments
@@ -148,13 +145,7 @@ def _require_begun(job: Job, recording: Recording) -> None:
 def _revise_and_warn(work: Work) -> None:
     """Perceive again the frames that disagree with the rest; warn of what will cost tracks."""
     revise(work)
-    folder, run = work.folder, work.run
-    range_m = work.job.settings.detection.max_range_m
-    run["warnings"] += explain_missing_planes(work.recording, folder, run, range_m)
-    if run["fixed_frame"] is not None:
-        run["warnings"] += explain_jumps(folder, run["fixed_frame"])
-        run["warnings"] += explain_misplacement(folder, run["fixed_frame"])
-        run["warnings"] += explain_clocks(folder)
+    work.run["warnings"] += explain_doubts(work.recording, work.folder, work.run)
 
 
 def _run_once(phase: str, folder: Path, run: RunInfo, work: Callable[[], object]) -> None:

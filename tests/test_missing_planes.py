@@ -78,7 +78,7 @@ def test_warning_distinguishes_missing_depth_wrong_up_and_noise(tmp_path: Path) 
 
     with open_recording(wall) as recording:
         run = {**read_run(tmp_path / "near"), "up": {"source": "imu"}}
-        (from_imu,) = explain_missing_planes(recording, tmp_path / "near", cast("Any", run), 2.0)
+        (from_imu,) = explain_missing_planes(recording, tmp_path / "near", cast("Any", run))
 
     assert from_imu.endswith("4 of 4 frames: is up (imu) right? Try another --up")
     assert without_depth == ["no supporting plane in 3 of 3 frames: they have no valid depth"]
@@ -109,9 +109,10 @@ def test_only_first_frames_without_plane_are_read_again(
             yield Frame("/depth", k, EPOCH + k, EPOCH + k, "camera", depth, CAMERA), None
 
     monkeypatch.setattr("shapecat.runs.perceive.missing_planes.read_frames", read)
-    run: Any = {"options": {}, "up": {"source": "planes"}}
+    settings = {"detection": {"max_range_m": 2.0}}
+    run: Any = {"options": {}, "settings": settings, "up": {"source": "planes"}}
     recording: Any = None
-    (warning,) = explain_missing_planes(recording, tmp_path, run, 2.0)
+    (warning,) = explain_missing_planes(recording, tmp_path, run)
 
     assert asked == [0, 1, 2]
     assert "no supporting plane in 96 of 96 frames: 100% of their depth is beyond" in warning

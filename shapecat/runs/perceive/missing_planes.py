@@ -1,6 +1,7 @@
 """Explain why most frames of a run have no supporting plane, and so no objects."""
 
 from collections import Counter
+from collections.abc import Iterator, Sequence
 from itertools import islice
 from pathlib import Path
 
@@ -22,47 +23,46 @@ _FRAMES = 3
 """Number of frames without a plane whose depths are examined."""
 
 
-def explain_missing_planes(
-    recording: Recording, folder: Path, run: RunInfo, range_m: float
-) -> list[str]:
-    """Return a warning with the likely reason if most frames have no plane; else nothing.
+def explain_missing_planes(recording: Recording, folder: Path, run: RunInfo) -> Iterator[str]:
+    """Yield a warning with the likely reason if most frames have no plane; else nothing.
 
     Parameters
     ----------
     folder : with the tables of frames, planes and detections.
-    run : its options select the frames.
-    range_m : the range of detection, metres.
+    run : its options select the frames; its settings have the range of detection.
     """
+    range_m = run["settings"]["detection"]["max_range_m"]
     frames, bare, first = _count(folder)
     if 2 * bare <= frames:
-        return []
-    text = f"no supporting plane in {bare} of {frames} frames"
-    samples = beyond_range = 0
-    typical: list[float] = []
+        return
     pairs = read_frames(recording, run["options"], skipped=Counter())
     chosen = (frame for frame, _ in pairs if (frame.topic, frame.index) in first)
-    for frame in islice(chosen, len(first)):
-        distance = _distances(frame)
-        samples += distance.size
-        beyond_range += int(np.count_nonzero(distance > range_m))
-        if distance.size:
-            typical.append(float(np.median(distance)))
-    if not samples:
-        return [f"{text}: they have no valid depth"]
-    if 2 * beyond_range > samples:
-        share, setting = beyond_range / samples, f"detection.max_range_m, {range_m:g} m"
+    distances = [_distances(frame) for frame in islice(chosen, len(first))]
+    reason = _reason([each for each in distances if each.size], range_m, run["up"]["source"])
+    yield f"no supporting plane in {bare} of {frames} frames: {reason}"
+
+
+def _reason(distances: Sequence[F4], range_m: float, source: str) -> str:
+    """Return the likely reason why frames have no plane, given their distances (n,), metres.
+
+    ``source`` is that of the up direction.
+    """
+    if not distances:
+        return "they have no valid depth"
+    share = float(np.mean(np.concatenate(distances) > range_m))
+    if share > 1 / 2:
         unit = "16UC1 is in millimetres, 32FC1 and clouds in metres"
-        middle = float(np.median(typical))
+        middle = float(np.median([np.median(each) for each in distances]))
         hint = f"the median is {middle:.0f} m: is the unit right? {unit}"
         if middle <= _NO_ROOM_M:
             hint = f"try a larger one, if the median of {middle:.2g} m is right ({unit})"
-        return [f"{text}: {share:.0%} of their depth is beyond {setting}; {hint}"]
-    source = run["up"]["source"]
+        setting = f"detection.max_range_m, {range_m:g} m"
+        return f"{share:.0%} of their depth is beyond {setting}; {hint}"
     if source == "option":
-        return [f"{text}: is --up right? --up auto estimates up from the planes"]
+        return "is --up right? --up auto estimates up from the planes"
     if source == "planes":
-        return [f"{text}: try --up X,Y,Z, or another range with --set detection.max_range_m=M"]
-    return [f"{text}: is up ({source}) right? Try another --up"]
+        return "try --up X,Y,Z, or another range with --set detection.max_range_m=M"
+    return f"is up ({source}) right? Try another --up"
 
 
 def _count(folder: Path) -> tuple[int, int, set[Key]]:
