@@ -183,11 +183,12 @@ def _add_outputs(
             run["seconds"].pop(output, None)
     differing = differences(run, planned)
     if not same_content(run["input"], job.source, content.result):
-        differing.append(f"input: {run['input']['path']} there")
+        differing["input"] = f"{run['input']['path']} there"
     if differing:
+        listed = "; ".join(f"{name}: {text}" for name, text in differing.items())
         msg = (
             f"{job.folder}: has results of another input, model or settings "
-            f"({'; '.join(differing)}); choose another --out, or --overwrite it"
+            f"({listed}); choose another --out, or --overwrite it"
         )
         raise OutputError(msg)
     if not job.target:

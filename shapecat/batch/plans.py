@@ -9,7 +9,7 @@ from contextlib import contextmanager, nullcontext, suppress
 from dataclasses import dataclass
 from itertools import chain
 from pathlib import Path
-from typing import Literal
+from typing import Any, Literal
 from uuid import uuid4
 
 from shapecat.batch.claims import claim_name
@@ -23,7 +23,7 @@ from shapecat.errors import ConfigError, OutputError
 from shapecat.learning import load_model
 from shapecat.runs.folder import OUTPUT_OPTIONS, read_run
 from shapecat.runs.identity import file_stats
-from shapecat.runs.jobs import Job
+from shapecat.runs.jobs import Job, differences
 from shapecat.runs.run_info import RunInfo, parse_run
 from shapecat.system.files import partial_path
 
@@ -269,15 +269,19 @@ def _is_wanted_run(task: Task, model_id: str) -> bool:
     if job.target:
         return job.made(run)
     outputs = [name for option, name in OUTPUT_OPTIONS.items() if getattr(job, option)]
-    topics = [topic.strip("/") for topic in run["options"]["topics"]]  # those that were chosen
-    compared_apart = {"topics", *OUTPUT_OPTIONS}
-    options = {name: value for name, value in job.selection().items() if name not in compared_apart}
+    wanted: dict[str, Any] = {
+        "settings": job.settings.as_dict(),
+        "options": job.selection(),
+        "model": {"id": model_id},
+    }
+    differing = differences(run, wanted).keys() - {"topics", *OUTPUT_OPTIONS}
+    chosen, requested = (
+        [topic.strip("/") for topic in topics] for topics in (run["options"]["topics"], job.topics)
+    )
     return (
         all(name in run["seconds"] and (job.folder / name).exists() for name in outputs)
-        and run["settings"] == job.settings.as_dict()
-        and run["model"]["id"] == model_id
-        and options.items() <= run["options"].items()
-        and (not job.topics or topics == [topic.strip("/") for topic in job.topics])
+        and not differing
+        and requested in ([], chosen)
     )
 
 

@@ -167,17 +167,26 @@ def describe_run(job: Job, categorizer: Categorizer) -> RunInfo:
     }
 
 
-def differences(run: RunInfo, planned: RunInfo) -> list[str]:
-    """Return the settings, options and model in which two runs differ, with both values."""
+def differences(run: RunInfo, planned: Mapping[str, Any]) -> dict[str, str]:
+    """Return both values of each setting and option, and of the model, in which two runs differ.
+
+    Parameters
+    ----------
+    planned : run.json of the planned run, of which only these entries are needed.
+
+    Returns
+    -------
+    The text of the values by name; the names of settings are as in ``detection.max_range_m``.
+    """
     entries, planned_entries = (_entries(each) for each in (run, planned))
-    return [
-        f"{name}: {_words(entries.get(name))} there, {_words(planned_entries.get(name))} wanted"
+    return {
+        name: f"{_words(entries.get(name))} there, {_words(planned_entries.get(name))} wanted"
         for name in dict.fromkeys((*entries, *planned_entries))
         if entries.get(name) != planned_entries.get(name)
-    ]
+    }
 
 
-def _entries(run: RunInfo) -> dict[str, Any]:
+def _entries(run: Mapping[str, Any]) -> dict[str, Any]:
     """Return the settings, options and model of a run, each by its name."""
     tree: dict[str, Any] = {**run["settings"], **run["options"], "model": run["model"]["id"]}
     entries: dict[str, Any] = {}
