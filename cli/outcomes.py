@@ -3,6 +3,7 @@
 from collections.abc import Sequence
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import suppress
+from dataclasses import asdict
 from typing import TYPE_CHECKING, Any
 
 import click
@@ -68,8 +69,8 @@ def print_closing(tasks: Sequence["Task"], tally: Tally) -> None:
 def summaries_as_dicts(complete: Sequence[tuple["Job", "Summary"]]) -> list[dict[str, Any]]:
     """Return the summaries of complete recordings as plain values.
 
-    That of a recording that was complete before may come from the manifest, which has neither
-    warnings nor all counts: it is read from its run folder.
+    Those of recordings that were complete before are read from their run folders: the manifest has
+    neither their warnings nor all counts.
     """
     from shapecat.batch.plans import run_of
     from shapecat.errors import OutputError
@@ -78,8 +79,8 @@ def summaries_as_dicts(complete: Sequence[tuple["Job", "Summary"]]) -> list[dict
     def as_dict(job: "Job", summary: "Summary") -> dict[str, Any]:
         if not summary.processed:
             with suppress(OutputError):  # it was removed meanwhile
-                summary = summarize(job, run_of(job), processed=False)
-        return {**summary.as_dict(), "folder": job.place}
+                summary = summarize(run_of(job), processed=False)
+        return {"source": job.name, "folder": job.place, **asdict(summary)}
 
     with ThreadPoolExecutor(_THREADS) as pool:
         return list(pool.map(lambda each: as_dict(*each), complete))

@@ -99,7 +99,7 @@ def process(job: Job, observe: Observer = ignore, *, cores: int = 1) -> Summary:
             run["color"] = {topic: colour.topic for topic, colour in colours.items()}
             work = Work(recording, streams, colours, folder, run, job, categorizer, observe, cores)
             _run_phases(work, content, begun)
-    return summarize(job, run)
+    return summarize(run)
 
 
 def _run_phases(work: Work, content: ContentDigest, begun: float) -> None:
@@ -195,7 +195,7 @@ def _add_outputs(
         with writing_outputs(job.folder):
             sweep(job.folder)
             annotate(job.folder, recording, run, observe)
-    return summarize(job, run, processed=False)
+    return summarize(run, processed=False)
 
 
 def track(folder: Path, run: RunInfo, job: Job) -> None:

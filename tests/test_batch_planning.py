@@ -204,7 +204,7 @@ def test_summary_has_total_seconds(source: Path) -> None:
     run = planned(source)
     run["seconds"] = {"perceive": 3.5, "track": 1.25, "compile": 0.75, "total": 8.0}
     run["warnings"] = ["tilted"]
-    found = summarize(Job(source, source.parent / "lab"), run, processed=False)
+    found = summarize(run, processed=False)
 
     assert (found.seconds, found.warnings, found.processed) == (8.0, ("tilted",), False)
 
@@ -631,7 +631,7 @@ def test_interrupted_overwriting_continues(
         job.folder.mkdir(parents=True, exist_ok=True)
         write_run(job.folder, planned(job.source, frame_range=job.frame_range))
         counts = {"frames": 3, "tracks": {"cup": 2}}
-        return Outcome(job, Summary(job.name, job.folder, counts, 1.5, ()))
+        return Outcome(job, Summary(counts, 1.5, ()))
 
     monkeypatch.setattr("shapecat.batch.runs.attempt", attempt)
     out = tmp_path / "out"
@@ -664,7 +664,7 @@ def test_overwriting_again_after_a_failure_replaces_all(
         job.folder.mkdir(parents=True, exist_ok=True)
         write_run(job.folder, planned(job.source))
         counts = {"frames": 3, "tracks": {"cup": 2}}
-        return Outcome(job, Summary(job.name, job.folder, counts, 1.5, ()))
+        return Outcome(job, Summary(counts, 1.5, ()))
 
     monkeypatch.setattr("shapecat.batch.runs.attempt", attempt)
     out = tmp_path / "out"
@@ -815,9 +815,7 @@ def test_entries_of_other_work_are_replaced(source: Path, monkeypatch: pytest.Mo
         manifest.record([Entry("lab", "lab.mcap", "complete", "old input", task.work)])
         ledger.begin(task)
         counts = {"frames": 3, "tracks": {"cup": 2}}
-        ledger.record_outcome(
-            task, Outcome(task.job, Summary("lab.mcap", Path("lab"), counts, 1.5, ()))
-        )
+        ledger.record_outcome(task, Outcome(task.job, Summary(counts, 1.5, ())))
 
     assert manifest.entries["lab"].input == task.input
     assert manifest.entries["lab"].state == "complete"
@@ -1016,7 +1014,7 @@ def test_recording_is_complete_in_manifest_before_outcome_is_returned(
     counts = {"frames": 3, "tracks": {"cup": 2}}
 
     def attempt(job: Job, *_: object, **__: object) -> Outcome:
-        return Outcome(job, Summary(job.name, job.folder, counts, 1.5, ()))
+        return Outcome(job, Summary(counts, 1.5, ()))
 
     monkeypatch.setattr("shapecat.batch.runs.attempt", attempt)
     for name in ("a", "b"):

@@ -148,7 +148,7 @@ def test_json_follows_order_of_plan(
     def last_first(tasks: Any, *_: Any, **__: Any) -> Any:
         for task in reversed(tasks):
             counts = {"frames": 3, "tracks": {}}
-            yield Outcome(task.job, Summary(task.path, task.job.folder, counts, 1.0, ()))
+            yield Outcome(task.job, Summary(counts, 1.0, ()))
 
     monkeypatch.setattr("shapecat.batch.runs.process_here", last_first)
     done = shapecat("process", tmp_path, "--out", tmp_path / "out", "--json")

@@ -30,7 +30,7 @@ from shapecat.batch.remote import _download, _fetch_run, process_remote, upload
 from shapecat.batch.storage import Location, names_in
 from shapecat.errors import OutputError, RecordingError, explained
 from shapecat.runs.folder import RUN_FILES, made_by_run, read_run
-from shapecat.runs.jobs import Job, Summary
+from shapecat.runs.jobs import Job
 from tests.object_storage import object_storage, requests
 from tests.run_info import run_info
 from tests.scenes import record
@@ -630,21 +630,6 @@ def test_full_scratch_is_not_blamed_on_the_url(
         process_remote(job, lambda *_: None, cores=1, batch="one")
 
     assert str(own_scratch) in str(raised.value)
-
-
-def test_summary_names_run_folder_not_scratch(
-    monkeypatch: pytest.MonkeyPatch,
-) -> None:
-    """Scratch is removed before anyone reads the summary."""
-
-    def process(job: Job, *_: object, **__: object) -> Summary:
-        return Summary(job.name, job.folder, {"frames": 3, "tracks": {}}, 1.5, (), processed=False)
-
-    monkeypatch.setattr("shapecat.batch.remote.process", process)
-    job = Job(Path("a.mcap"), Path("lab"), target="memory://named/lab")
-    summary = process_remote(job, lambda *_: None, cores=1, batch="one")
-
-    assert (summary.folder, summary.seconds) == (Path("lab"), 1.5)
 
 
 def test_foreign_folder_is_not_touched(made: Path) -> None:

@@ -62,12 +62,9 @@ class Ledger:
         entry = self._last_entry(task.name)
         if entry is not None and entry.tracks is not None and entry.frames is not None:
             counts = {"frames": entry.frames, "tracks": entry.tracks}
-            summary = Summary(
-                job.name, job.folder, counts, entry.seconds or 0.0, (), processed=False
-            )
-            return Outcome(job, summary)
+            return Outcome(job, Summary(counts, entry.seconds or 0.0, (), processed=False))
         try:
-            return Outcome(job, summarize(job, run_of(job), processed=False))
+            return Outcome(job, summarize(run_of(job), processed=False))
         except OutputError as error:
             return Outcome(job, message=str(error), code=error.exit_code)
 

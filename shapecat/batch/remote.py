@@ -47,7 +47,7 @@ def process_remote(job: Job, observe: Observer, *, cores: int, batch: str) -> Su
                 dataclasses.replace(job, folder=folder / "output" / job.folder.name)
             )
             if run is not None and job.made(run):
-                return summarize(job, run, processed=False)
+                return summarize(run, processed=False)
         if job.origin:
             (folder / "input").mkdir()
             local = dataclasses.replace(local, source=_download(job.origin, folder / "input"))
@@ -60,7 +60,7 @@ def process_remote(job: Job, observe: Observer, *, cores: int, batch: str) -> Su
             _write_keys(job, local.folder)
             claim.require()
             (Location(job.target, OutputError) / "run.json").upload(local.folder / "run.json")
-    return dataclasses.replace(summary, folder=job.folder)
+    return summary
 
 
 def _write_keys(job: Job, folder: Path) -> None:

@@ -1,6 +1,5 @@
 """Jobs: recordings with their options. Runs: descriptions of results in run.json."""
 
-import dataclasses
 import platform
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, field
@@ -123,21 +122,11 @@ class Summary:
     no labels.
     """
 
-    source: str
-    folder: Path
     counts: Mapping[str, Any]
     seconds: float
     warnings: tuple[str, ...]
     processed: bool = True
     corrections: Mapping[str, Any] | None = None
-
-    def as_dict(self) -> dict[str, Any]:
-        """Return plain values for ``--json``."""
-        return {
-            **dataclasses.asdict(self),
-            "folder": str(self.folder),
-            "warnings": list(self.warnings),
-        }
 
 
 def describe_run(job: Job, categorizer: Categorizer) -> RunInfo:
@@ -248,7 +237,7 @@ def require_unchanged(folder: Path, run: RunInfo, source: Path) -> None:
         raise RecordingError(msg)
 
 
-def summarize(job: Job, run: RunInfo, *, processed: bool = True) -> Summary:
+def summarize(run: RunInfo, *, processed: bool = True) -> Summary:
     """Return the summary of a run.
 
     Parameters
@@ -256,8 +245,6 @@ def summarize(job: Job, run: RunInfo, *, processed: bool = True) -> Summary:
     processed : False if the run was complete before; then ``corrections`` is None.
     """
     return Summary(
-        source=job.name,
-        folder=job.folder,
         counts=run["counts"],
         seconds=run["seconds"].get("total", 0.0),
         warnings=tuple(run["warnings"]),
