@@ -126,8 +126,8 @@ def test_selected_frames_keep_their_own_image(run: Path, wanted: Sequence[int]) 
     finished = read_finished(run)
     of_frame = {frame: masks for (_, frame), masks in read_masks(run)}
     frames = (frame for frame in finished.frames() if frame.index in wanted)
-    with open_source(finished.run) as source:
-        for labelled, frame, coloured in with_colour(frames, source, finished.run):
+    with open_source(finished.info) as source:
+        for labelled, frame, coloured in with_colour(frames, source, finished.info):
             assert frame.index == labelled.index
             assert coloured is not None
             assert coloured.view.image.stamp_ns == of_frame[frame.index].stamp_ns
@@ -173,8 +173,8 @@ def test_mask_of_merged_tracks_covers_all_parts(run: Path) -> None:
     assert masks is not None
     one, other = [item for item in first.objects if item.detections[0] in masks.boxes][:2]
     whole = replace(one, detections=(*one.detections, *other.detections))
-    with open_source(finished.run) as source:
-        ((_, _, coloured),) = with_colour([replace(first, objects=(whole,))], source, finished.run)
+    with open_source(finished.info) as source:
+        ((_, _, coloured),) = with_colour([replace(first, objects=(whole,))], source, finished.info)
 
     assert coloured is not None
     shape = masks.height, masks.width

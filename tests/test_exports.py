@@ -105,7 +105,7 @@ def test_crops_are_upright_at_height_zero_with_viewpoint(run: Path, tmp_path: Pa
     """In any other frame, the descriptors would differ."""
     export_run(run, "crops", tmp_path)
     truth = json.loads(
-        (Path(read_finished(run).run["input"]["path"]).with_suffix(".truth.json")).read_text()
+        (Path(read_finished(run).info["input"]["path"]).with_suffix(".truth.json")).read_text()
     )
     camera_height = {}
     for frame in truth:
@@ -282,8 +282,8 @@ def test_kitti_points_project_to_their_pixels(run: Path, tmp_path: Path) -> None
 
 def intrinsics(run: Path) -> np.ndarray:
     finished = read_finished(run)
-    with open_source(finished.run) as recording:
-        camera = next(read_frames(recording, finished.run["options"], skipped=Counter()))[0].camera
+    with open_source(finished.info) as recording:
+        camera = next(read_frames(recording, finished.info["options"], skipped=Counter()))[0].camera
     assert camera is not None
     return np.array([[camera.fx, 0, camera.cx], [0, camera.fy, camera.cy], [0, 0, 1]])
 
@@ -451,7 +451,7 @@ def test_unorganised_clouds_get_semantic_kitti_labels(tmp_path: Path) -> None:
     assert [legend["classes"][str(k)] for k in (label & 0xFFFF)] == ["none", "can", "none"]
     assert '3: "can"' in (tmp_path / "semantic-kitti.yaml").read_text()
 
-    many = FinishedRun(tmp_path, finished.run, {70000: TrackLabel(70000, "can", 1.0)})
+    many = FinishedRun(tmp_path, finished.info, {70000: TrackLabel(70000, "can", 1.0)})
     with pytest.raises(OutputError, match="65535"):
         write_point_labels(tmp_path, [], many)
 

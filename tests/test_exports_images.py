@@ -77,7 +77,7 @@ def test_coco_has_original_images_and_masks_of_tracks(run: Path, tmp_path: Path)
     names = {c["id"]: c["name"] for c in data["categories"]}
     assert "wine glass" in names.values()
     assert min(names) == 1
-    source = Path(read_finished(run).run["input"]["path"])
+    source = Path(read_finished(run).info["input"]["path"])
     files = [tmp_path / "out/images/train" / image["file_name"] for image in data["images"]]
     assert [f.read_bytes() for f in files] == [bytes(m.data) for _, m in read_ros(source, IMAGES)]
     assert all(
@@ -235,7 +235,7 @@ def test_depth_images_are_millimetres_with_their_own_masks(run: Path, tmp_path: 
     """Recordings without colour give data sets too, and depth keeps its 16 bits."""
     export_dataset([run], "coco", tmp_path / "out", Selection(depth=True))
     data = read_coco(tmp_path / "out")
-    source = Path(read_finished(run).run["input"]["path"])
+    source = Path(read_finished(run).info["input"]["path"])
     (first, *_), messages = data["images"], read_ros(source, "/camera/depth/image_raw")
     pixels = np.asarray(Image.open(tmp_path / "out/images/train" / first["file_name"]))
     stored = np.frombuffer(bytes(messages[0][1].data), "<u2").reshape(480, 640)
@@ -328,7 +328,7 @@ def test_progress_counts_frames_that_are_left_out(run: Path, tmp_path: Path, for
     else:
         export_run(run, format_, tmp_path / "out", every=3, observe=observe)
 
-    total = read_finished(run).run["counts"]["frames"]
+    total = read_finished(run).info["counts"]["frames"]
     assert events == [("export", k, total) for k in range(1, total + 1)]
 
 
@@ -474,7 +474,7 @@ def test_kitti_boxes_project_onto_colour_image(run: Path, tmp_path: Path) -> Non
     folder = tmp_path / "table"
     with (folder / "frames.csv").open() as file:
         numbers = [row["number"] for row in csv.DictReader(file)]
-    source = Path(read_finished(run).run["input"]["path"])
+    source = Path(read_finished(run).info["input"]["path"])
     labels = np.load(source.with_suffix(".color_labels.npz"))["labels"]
     checked = 0
     for k, number in enumerate(numbers):

@@ -238,7 +238,7 @@ def test_kitti_2d_box_is_clipped_to_colour_image(
 
 def labelcloud(folder: Path) -> None:
     finished: Any = SimpleNamespace(
-        categories=("cup", "bowl"), run={"versions": {"shapecat": "0"}}, labels={}
+        categories=("cup", "bowl"), info={"versions": {"shapecat": "0"}}, labels={}
     )
     assert (
         write_labelcloud(folder, [(labelled(cut=False, hidden=False), frame(), None)], finished)
@@ -345,7 +345,7 @@ def test_lidar_looks_along_its_x_axis(up: Any, forward: Any) -> None:
 def crops_run(*topics: str, name: str = "lab", **options: float | None) -> Any:
     made = {"topics": list(topics), "start_s": None, "end_s": None, **options}
     run = {"input": {"digest": "xxh3-128:0123456789"}, "options": made}
-    return SimpleNamespace(name=name, run=run)
+    return SimpleNamespace(name=name, info=run)
 
 
 def crops_frames(*topics: str) -> list[Any]:
@@ -435,7 +435,7 @@ def dataset_image() -> DatasetImage:
 
 def finished(path: str = "runs/lab", digest: str = "l") -> Any:
     run = {"input": {"digest": digest}}
-    return SimpleNamespace(folder=Path(path), name=Path(path).name, run=run)
+    return SimpleNamespace(folder=Path(path), name=Path(path).name, info=run)
 
 
 def test_coco_entries_have_right_values(tmp_path: Path) -> None:

@@ -562,7 +562,7 @@ def test_images_without_certain_objects_are_omitted(monkeypatch: pytest.MonkeyPa
         monkeypatch.setattr(f"{place}.{name}", stub)
     run: Any = {"options": {"topics": ["/depth"]}, "color": {"/depth": "/color"}}
     finished: Any = SimpleNamespace(
-        folder=Path(), run=run, name="lab", frames=lambda: iter(labelled)
+        folder=Path(), info=run, name="lab", frames=lambda: iter(labelled)
     )
 
     left_out = Counter[str]()
@@ -577,7 +577,7 @@ def test_images_of_a_run_named_like_a_topic_keep_their_names() -> None:
     """Images of one would replace images of the other, under the labels of both."""
     named = [("a", ["/left", "/x/y", "/x_y"]), ("a__left", ["/left"]), ("a", ["/left"])]
     runs: Any = [
-        SimpleNamespace(name=name, run={"options": {"topics": topics}}) for name, topics in named
+        SimpleNamespace(name=name, info={"options": {"topics": topics}}) for name, topics in named
     ]
 
     assert [list(stems.values()) for stems in image_stems(runs)] == [
@@ -621,7 +621,7 @@ def test_depth_images_are_millimetres_without_overflow() -> None:
 def runs(count: int, same: int = 0) -> Any:
     digests = [f"xxh3:{max(k, same)}" for k in range(count)]
     return [
-        SimpleNamespace(name=str(k), run={"input": {"digest": d}}) for k, d in enumerate(digests)
+        SimpleNamespace(name=str(k), info={"input": {"digest": d}}) for k, d in enumerate(digests)
     ]
 
 
@@ -673,7 +673,7 @@ def test_data_set_of_several_recordings_is_not_replaced_by_one_of_them(
     def read(folder: Path) -> Any:
         name, info = folder.name, {"counts": {"frames": 1}, "input": {"digest": f"d-{folder.name}"}}
         run = {"id": f"id-{name}", **info}
-        return SimpleNamespace(name=name, folder=folder, categories=("cup",), run=run)
+        return SimpleNamespace(name=name, folder=folder, categories=("cup",), info=run)
 
     monkeypatch.setattr("shapecat.outputs.exports.formats.read_finished", read)
     monkeypatch.setitem(DATASETS, "coco", lambda *_: 3)

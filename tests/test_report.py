@@ -489,7 +489,7 @@ def many_tracks(folder: Path, count: int) -> str:
         ("track", "category", "confidence", "label"), tuple(c.row for c in cards), ()
     )
     return run_page(
-        FinishedRun(folder, read_finished(folder).run, {}), table, cards, [], {}, length_s=1.0
+        FinishedRun(folder, read_finished(folder).info, {}), table, cards, [], {}, length_s=1.0
     )
 
 

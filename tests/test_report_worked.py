@@ -204,7 +204,7 @@ def test_run_page_has_right_values(*, served: bool) -> None:
 
 def test_stages_are_in_milliseconds_and_phases_in_seconds(run: Path) -> None:
     finished = read_finished(run)
-    finished.run["seconds"] = {"perceive": 12.34}
+    finished.info["seconds"] = {"perceive": 12.34}
     table = read_track_table(run / "tracks.csv")
     text = run_page(
         finished, table, [], [], {"detect": np.array([0.002, 0.004, 0.104])}, length_s=1.0

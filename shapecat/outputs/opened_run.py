@@ -189,7 +189,7 @@ class Run:
     @property
     def info(self) -> RunInfo:
         """The content of run.json: input, settings, counts, seconds, warnings."""
-        return self._finished.run
+        return self._finished.info
 
     @property
     def categories(self) -> tuple[str, ...]:

@@ -21,14 +21,14 @@ __all__ = ["FinishedRun", "find_runs", "open_source", "read_finished", "require_
 
 @dataclass(frozen=True)
 class FinishedRun:
-    """A run folder, with run.json and the final label of each track.
+    """A run folder, with the content of run.json and the final label of each track.
 
     ``common`` holds the categories of all runs that are exported together, in the same order in
     each of them; empty if a run is on its own.
     """
 
     folder: Path
-    run: RunInfo
+    info: RunInfo
     labels: Mapping[int, TrackLabel]
     common: tuple[str, ...] = ()
 
@@ -40,7 +40,7 @@ class FinishedRun:
     @property
     def categories(self) -> tuple[str, ...]:
         """The common categories; then those of the model, and those that a person added."""
-        of_model = dict.fromkeys((*self.common, *self.run["model"]["categories"]))
+        of_model = dict.fromkeys((*self.common, *self.info["model"]["categories"]))
         added = {label.category for label in self.labels.values()} - {*of_model, "unknown"}
         return (*of_model, *sorted(added))
 
@@ -62,8 +62,9 @@ def read_finished(folder: Path) -> FinishedRun:
     ------
     OutputError : the folder is not a finished run, or its tracks.csv is invalid.
     """
-    run = read_run(folder)
-    return FinishedRun(folder, run, read_labels(folder / "tracks.csv", run["model"]["categories"]))
+    info = read_run(folder)
+    labels = read_labels(folder / "tracks.csv", info["model"]["categories"])
+    return FinishedRun(folder, info, labels)
 
 
 def find_runs(folders: Sequence[Path]) -> list[Path]:

@@ -95,15 +95,15 @@ def compare(
     RecordingError : the reference cannot be read, or has no frame in common with the run.
     """
     finished = read_complete(folder)
-    digest = finished.run["input"]["digest"]
+    digest = finished.info["input"]["digest"]
     other = open_reference(reference, finished.categories, finished.name, digest)
     if isinstance(other, OtherRun):
         _require_same_recording(finished, other)
     tally, repeated = Tally(), repeated_stamps(folder)
     with ExitStack() as stack:
         clouds, notes = _clouds(finished, recording, stack)
-        notes += numbering_notes(other, finished.run["options"]["start_s"])
-        total = int(finished.run["counts"]["frames"])
+        notes += numbering_notes(other, finished.info["options"]["start_s"])
+        total = int(finished.info["counts"]["frames"])
         for done, (key, row, found) in enumerate(run_labellings(finished), start=1):
             place = (row["topic"], row["stamp_ns"])
             true = other.at(key, row["stamp_ns"], repeated=place in repeated)
@@ -131,7 +131,7 @@ def compare(
                 "only_in_run": tally.only_run,
                 "only_in_reference": max(other.frames - tally.frames, 0),
             },
-            **figures_of(tally, finished.run["model"]["categories"], tracked=other.tracked),
+            **figures_of(tally, finished.info["model"]["categories"], tracked=other.tracked),
         },
         rows=tuple(tally.rows),
         pictures=tuple(tally.pictures[k] for k in sorted(tally.pictures)),
@@ -140,7 +140,7 @@ def compare(
 
 
 def _require_same_recording(finished: FinishedRun, other: OtherRun) -> None:
-    a, b = finished.run["input"], other.finished.run["input"]
+    a, b = finished.info["input"], other.finished.info["input"]
     if a["digest"] != b["digest"]:
         msg = f"{other.finished.folder}: a run of another recording, {b['path']}, not {a['path']}"
         raise OutputError(msg)
@@ -167,8 +167,8 @@ def _clouds(
 ) -> tuple[Iterator[Frame], list[str]]:
     """Return the frames of the recording; if it is missing, no frames and a note."""
     try:
-        source = stack.enter_context(open_source(finished.run, recording))
-        options: Options = {**finished.run["options"], "color": ""}
+        source = stack.enter_context(open_source(finished.info, recording))
+        options: Options = {**finished.info["options"], "color": ""}
         return (frame for frame, _ in read_frames(source, options, skipped=Counter())), []
     except (RecordingError, OutputError) as error:
         if recording is not None:

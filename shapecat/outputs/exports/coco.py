@@ -78,7 +78,7 @@ def _coco_image(number: int, finished: FinishedRun, image: DatasetImage) -> dict
         "width": image.width,
         "height": image.height,
         "recording": finished.name,
-        "digest": finished.run["input"]["digest"],
+        "digest": finished.info["input"]["digest"],
         "topic": labelled.topic,
         "frame": labelled.index,
         "stamp_ns": labelled.stamp_ns,

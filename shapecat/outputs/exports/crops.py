@@ -40,8 +40,8 @@ class Origin(NamedTuple):
     @classmethod
     def of(cls, finished: FinishedRun) -> "Origin":
         """Return the origin of the views of a run."""
-        options = finished.run["options"]
-        source = "\0".join([finished.run["input"]["digest"], *sorted(options["topics"])])
+        options = finished.info["options"]
+        source = "\0".join([finished.info["input"]["digest"], *sorted(options["topics"])])
         start, end = options.get("start_s"), options.get("end_s")
         digest = xxhash.xxh3_64_hexdigest(source.encode())[:12]
         return cls(digest, start or 0.0, math.inf if end is None else end)
@@ -78,7 +78,7 @@ def write_crops(out: Path, frames: Iterable[ExportedFrame], finished: FinishedRu
     origin = Origin.of(finished)
     prefix = f"{safe_name(finished.name)}.{origin}"
     hidden = out / f".{prefix}.partial"
-    topics = finished.run["options"]["topics"]
+    topics = finished.info["options"]["topics"]
     names = dict(zip(topics, different_names(topics), strict=True))
     count = 0
     try:

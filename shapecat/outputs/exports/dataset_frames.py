@@ -97,16 +97,16 @@ def split_runs(runs: Sequence[FinishedRun], val: float) -> list[str]:
     if not 0 <= val < 1:
         msg = f"val must be at least 0 and less than 1, got {val}"
         raise ValueError(msg)
-    digests = {run.run["input"]["digest"] or run.name for run in runs}
+    digests = {run.info["input"]["digest"] or run.name for run in runs}
     order = sorted(digests, key=lambda digest: xxhash.xxh3_64_hexdigest(digest.encode()))
     chosen = set(order[: min(round(val * len(order)), len(order) - 1)])
-    return ["val" if (r.run["input"]["digest"] or r.name) in chosen else "train" for r in runs]
+    return ["val" if (r.info["input"]["digest"] or r.name) in chosen else "train" for r in runs]
 
 
 def image_stems(runs: Sequence[FinishedRun]) -> list[dict[str, str]]:
     """Return for each run how the names of the images of each topic begin; all differ."""
     names = different_names([run.name for run in runs])
-    topics = [run.run["options"]["topics"] for run in runs]
+    topics = [run.info["options"]["topics"] for run in runs]
     stems = [
         f"{name}_{topic}" if len(run_topics) > 1 else name
         for name, run_topics in zip(names, topics, strict=True)
@@ -144,10 +144,10 @@ def images_of(
     labels = read_track_table(finished.folder / "tracks.csv").labels
     corrected = {track for track, label in labels.items() if label}
     chosen = _chosen(finished, selection, corrected)
-    with open_source(finished.run, recording) as source:
+    with open_source(finished.info, recording) as source:
         every = observed(finished.frames(), "export", None, observe)
         frames = (f for f in every if (f.topic, f.index) in chosen)
-        for labelled, frame, coloured in with_colour(frames, source, finished.run):
+        for labelled, frame, coloured in with_colour(frames, source, finished.info):
             name = f"{stems[labelled.topic]}_{labelled.index:06d}"
             try:
                 image = _image(name, labelled, frame, coloured, selection, corrected)

@@ -109,22 +109,22 @@ def export_run(
         msg = f"{out}: is a run; choose another --out"
         raise OutputError(msg)
     finished = replace(read_finished(folder), common=tuple(categories))
-    total = int(finished.run["counts"]["frames"])
-    with open_source(finished.run, recording) as source:
+    total = int(finished.info["counts"]["frames"])
+    with open_source(finished.info, recording) as source:
         full = format in _WITH_BOXES and not visible_boxes
         frames = finished.frames_with_full_boxes() if full else finished.frames()
         labelled = observed(frames, "export", total, observe)
         wanted = _tracked(thinned(labelled, every), streams_with_poses(folder))
-        pairs = with_colour(wanted, source, finished.run)
+        pairs = with_colour(wanted, source, finished.info)
         write = FORMATS[format]
         if format == "crops":
             return write(out, pairs, finished)
         about = {
             "format": format,
-            "run": finished.run["id"],
-            "input": finished.run["input"],
-            "topics": finished.run["options"]["topics"],
-            "range_s": [finished.run["options"][name] for name in ("start_s", "end_s")],
+            "run": finished.info["id"],
+            "input": finished.info["input"],
+            "topics": finished.info["options"]["topics"],
+            "range_s": [finished.info["options"][name] for name in ("start_s", "end_s")],
         }
         return _staged(out / finished.name, about, lambda hidden: write(hidden, pairs, finished))
 
@@ -160,7 +160,7 @@ def export_dataset(
         raise ValueError(msg)
     runs = [read_finished(folder) for folder in folders]
     categories = _common(runs)
-    total = sum(int(run.run["counts"]["frames"]) for run in runs)
+    total = sum(int(run.info["counts"]["frames"]) for run in runs)
 
     counts, left_out = Counter[str](), Counter[str]()
     uncertain, done = 0, itertools.count(1)
@@ -170,7 +170,7 @@ def export_dataset(
 
     def images() -> Iterator[tuple[str, FinishedRun, DatasetImage]]:
         nonlocal uncertain
-        gray = [str(run.folder) for run in runs if not (selection.depth or run.run.get("color"))]
+        gray = [str(run.folder) for run in runs if not (selection.depth or run.info.get("color"))]
         if gray:
             hint = "leave them out, or export depth images (--depth)"
             msg = f"{', '.join(gray)}: no colour images; {hint}"
@@ -189,11 +189,11 @@ def export_dataset(
             raise OutputError(msg)
 
     names = different_names([run.name for run in runs])
-    ids = {name: run.run["id"] for name, run in zip(names, runs, strict=True)}
+    ids = {name: run.info["id"] for name, run in zip(names, runs, strict=True)}
     about = {
         "format": format,
         "runs": ids,
-        "recordings": sorted({run.run["input"]["digest"] for run in runs}),
+        "recordings": sorted({run.info["input"]["digest"] for run in runs}),
     }
     objects = _staged(out, about, lambda hidden: DATASETS[format](hidden, images(), categories))
     return Exported(objects, uncertain, counts)

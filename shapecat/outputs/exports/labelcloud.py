@@ -56,7 +56,7 @@ def _folder(out: Path, kind: str) -> Path:
 def _classes(finished: FinishedRun, kind: str) -> str:
     names = ("unknown", *finished.categories)
     classes = [{"name": name, "id": k, "color": hex_colour(name)} for k, name in enumerate(names)]
-    made_by = {"name": "shapecat", "version": finished.run["versions"]["shapecat"]}
+    made_by = {"name": "shapecat", "version": finished.info["versions"]["shapecat"]}
     content = {"classes": classes, "default": 0, "type": "object_detection", "format": kind}
     return json.dumps({**content, "created_with": made_by}, indent=1)
 

@@ -43,7 +43,7 @@ class Listed:
 
     link: str
     name: str
-    run: Mapping[str, Any]
+    info: Mapping[str, Any]
     categories: Counter[str]
     unsure: int
     checked: int
@@ -74,7 +74,7 @@ def run_page(
     index : link to the index of several runs; None if there is none.
     served : whether corrections are sent to a server, instead of to a table to download.
     """
-    run = finished.run
+    run = finished.info
     counts = Counter(card.row.category for card in cards)
     names = (UNKNOWN, *finished.categories)
     end = max((float(c.timeline.seconds[-1]) for c in cards if len(c.timeline.seconds)), default=0)
@@ -114,7 +114,7 @@ def index_page(title: str, runs: Sequence[Listed]) -> str:
     total = sum((item.categories for item in runs), Counter[str]())
     tiles = {
         "recordings": len(runs),
-        "frames": sum(int(item.run["counts"]["frames"]) for item in runs),
+        "frames": sum(int(item.info["counts"]["frames"]) for item in runs),
         "tracks": total.total(),
         "uncertain": sum(item.unsure for item in runs),
         "checked": sum(item.checked for item in runs),
@@ -257,12 +257,12 @@ def _listed(item: Listed) -> str:
         for name, count in by_count(item.categories)
     )
     words = count_words(item.categories, "no tracks")
-    seconds = item.run["seconds"].get("total", 0.0)
-    notes = [plural(item.run["counts"]["frames"], "frame"), f"processed in {seconds:.1f} s"]
+    seconds = item.info["seconds"].get("total", 0.0)
+    notes = [plural(item.info["counts"]["frames"], "frame"), f"processed in {seconds:.1f} s"]
     notes += [f"{item.unsure} uncertain"] if item.unsure else []
     notes += [f"{item.checked} checked"] if item.checked else []
     faces = "".join(f'<img alt="" src="{face}">' for face in item.faces)
-    warnings = len(item.run["warnings"])
+    warnings = len(item.info["warnings"])
     warn = f' · <span class="warn">⚠ {plural(warnings, "warning")}</span>' if warnings else ""
     return (
         f'<a class="run" href="{escape(item.link)}"><div><h3>{escape(item.name)}</h3>'

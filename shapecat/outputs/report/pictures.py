@@ -124,9 +124,9 @@ def take_pictures(finished: FinishedRun, rows: Sequence[TrackRow], choice: Choic
     collector = _Collector(choice)
     advice = "run `shapecat annotate` with --recording PATH first"
     try:
-        with open_source(finished.run, advice=advice) as recording:
+        with open_source(finished.info, advice=advice) as recording:
             frames = _frames(finished, rows, choice)
-            for item in with_colour(frames, recording, finished.run):
+            for item in with_colour(frames, recording, finished.info):
                 collector.add(*item)
     except ShapecatError as error:
         collector = _Collector(choice)

@@ -86,7 +86,7 @@ class RunReport:
         return Listed(
             link=link,
             name=finished.name,
-            run=finished.run,
+            info=finished.info,
             categories=Counter(label.category for label in objects),
             unsure=sum(card.row.label == "" and is_unsure(card.row) for card in cards),
             checked=sum(card.row.label != "" for card in cards),
@@ -206,7 +206,7 @@ def read_report(folder: Path, *, index: str | None = None) -> RunReport:
     rows = read_original_table(folder / "tracks.csv")[0].rows
     timelines = read_timelines(folder)
     pictures = take_pictures(finished, rows, choose_frames(folder, timelines))
-    work, stages = finished.run["work"], read_stage_seconds(folder)
+    work, stages = finished.info["work"], read_stage_seconds(folder)
     return RunReport(folder, work, timelines, pictures, stages, read_length(folder), index)
 
 
