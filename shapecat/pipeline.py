@@ -252,7 +252,7 @@ def _write_mcap(folder: Path, recording: Recording, run: RunInfo, observe: Obser
 
     settings = run["settings"]["outputs"]
     labels = read_labels(folder / "tracks.csv", run["model"]["categories"])
-    topics = list(dict.fromkeys(run.get("color", {}).values()))
+    topics = list(dict.fromkeys(run["color"].values()))
     boxes = run.get("boxes", settings["boxes"])
     frames = read_annotation_frames(folder, labels, visible=boxes == "visible")
     write_annotated(

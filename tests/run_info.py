@@ -30,6 +30,7 @@ def run_info(**entries: Any) -> Any:
         "counts": {"frames": 0, "skipped": {}, "detections": 0},
         "seconds": {},
         "warnings": [],
+        "color": {},
     }
     for name, value in entries.items():
         default = complete.get(name)

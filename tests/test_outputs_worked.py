@@ -350,7 +350,7 @@ def test_colour_image_requires_masks(
     read: Any = [(SimpleNamespace(topic="/depth", index=k), "view" if k < 2 else None)
                  for k in range(4)]  # fmt: skip
     monkeypatch.setattr("shapecat.outputs.colouring.read_frames", lambda *_, **__: iter(read))
-    run: Any = {"options": {"topics": ["/depth"]}}
+    run: Any = {"options": {"topics": ["/depth"]}, "color": {}}
     recording: Any = SimpleNamespace(path="a.mcap")
     found = [coloured for *_, coloured in with_colour(labelled, recording, run)]
 
@@ -1051,7 +1051,7 @@ def test_export_of_recording_that_lost_frames_is_refused(monkeypatch: pytest.Mon
     labelled = [labelled_frame(k) for k in (1, 4)]
     read: Any = [(SimpleNamespace(topic="/depth", index=k), None) for k in (0, 1, 2, 3)]
     monkeypatch.setattr("shapecat.outputs.colouring.read_frames", lambda *_, **__: iter(read))
-    run: Any = {"options": {"topics": ["/depth"]}}
+    run: Any = {"options": {"topics": ["/depth"]}, "color": {}}
     recording: Any = SimpleNamespace(path="a.mcap")
     paired = with_colour(labelled, recording, run)
 

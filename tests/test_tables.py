@@ -24,7 +24,15 @@ from shapecat.runs.labelled_tracks import LabelledTracks, read_annotation_frames
 from shapecat.runs.labels.corrections import read_labels
 from shapecat.runs.labels.meaning import TrackLabel
 from shapecat.runs.perceive.perceived import _SEGMENT_FRAMES, FrameRow, PerceptionTables
-from shapecat.runs.run_info import Counts, InputInfo, ModelInfo, Options, OriginInfo, RunInfo
+from shapecat.runs.run_info import (
+    Counts,
+    InputInfo,
+    ModelInfo,
+    Options,
+    OriginInfo,
+    RunInfo,
+    parse_run,
+)
 from shapecat.runs.tables.masks import read_masks
 from shapecat.runs.tables.reading import (
     opened,
@@ -47,6 +55,7 @@ from shapecat.types import (
     Pose,
     Scene,
 )
+from tests.run_info import run_info
 from tests.track_tables import write_tracks
 
 CATEGORIES = ("cup", "can")
@@ -455,6 +464,15 @@ def test_schema_requires_what_the_reader_requires(entry: str, kind: Any) -> None
     part = schema["properties"][entry] if entry else schema
     assert set(part["required"]) == kind.__required_keys__
     assert part["properties"].keys() == get_type_hints(kind).keys()
+
+
+def test_run_of_earlier_version_has_no_colour_topics() -> None:
+    """Its run.json has no entry for them, which outputs read."""
+    content = {name: value for name, value in run_info().items() if name != "color"}
+
+    assert parse_run(json.dumps(content).encode(), "lab")["color"] == {}
+    of_topic = json.dumps(run_info(color={"/depth": "/rgb"})).encode()
+    assert parse_run(of_topic, "lab")["color"] == {"/depth": "/rgb"}
 
 
 @pytest.mark.parametrize(

@@ -74,8 +74,7 @@ class _Awaited:
     """The wanted frames; a few are known in advance, so that others need not be read."""
 
     def __init__(self, frames: Iterable[LabelledFrame], run: RunInfo) -> None:
-        colours = run.get("color") or {}
-        self._topics, self._colours = set(run["options"]["topics"]), {*colours.values()}
+        self._topics, self._colours = set(run["options"]["topics"]), {*run["color"].values()}
         self._source = iter(frames)
         self._next = deque(islice(self._source, _AHEAD))
 

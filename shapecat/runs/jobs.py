@@ -153,6 +153,7 @@ def describe_run(job: Job, categorizer: Categorizer) -> RunInfo:
         "counts": {"frames": 0, "skipped": {}, "detections": 0},
         "seconds": {},
         "warnings": [],
+        "color": {},
     }
 
 

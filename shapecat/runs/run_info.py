@@ -104,6 +104,7 @@ class RunInfo(RunIdentity):
     """The contents of run.json; ``seconds`` has the duration of each finished phase.
 
     ``damaged`` is there if reading the frames met damage in an MCAP file: see `Recording.damaged`.
+    ``color`` may be missing only in a file of an earlier version: `parse_run` adds it.
     """
 
     settings: dict[str, Any]
@@ -159,7 +160,8 @@ def parse_run(content: bytes, folder: str) -> RunInfo:
     ------
     OutputError : it is damaged, or has missing or wrong entries.
     """
-    run = parse_identity(content, folder)
+    run: dict[str, Any] = {**parse_identity(content, folder)}
+    run.setdefault("color", {})  # runs of earlier versions lack it
     if (wrong := wrong_entry(run)) is not None:
         msg = (
             f"{folder}/run.json: not a description of a run: {wrong} is missing or wrong; if "

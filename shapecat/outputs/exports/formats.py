@@ -170,7 +170,7 @@ def export_dataset(
 
     def images() -> Iterator[tuple[str, FinishedRun, DatasetImage]]:
         nonlocal uncertain
-        gray = [str(run.folder) for run in runs if not (selection.depth or run.info.get("color"))]
+        gray = [str(run.folder) for run in runs if not (selection.depth or run.info["color"])]
         if gray:
             hint = "leave them out, or export depth images (--depth)"
             msg = f"{', '.join(gray)}: no colour images; {hint}"

@@ -203,7 +203,7 @@ def _line(kind: str, *cells: str) -> str:
 def _facts(run: Mapping[str, Any]) -> str:
     skipped = ", ".join(f"{n} {reason}" for reason, n in run["counts"]["skipped"].items())
     up = run["up"] or {}
-    colours = dict.fromkeys(filter(None, (run.get("color") or {}).values()))
+    colours = dict.fromkeys(filter(None, run["color"].values()))
     facts = {
         "model": run["model"]["id"],
         "categories": ", ".join(run["model"]["categories"]),

@@ -81,7 +81,7 @@ def perceive_all(work: Work) -> None:
         raise NoStreamError(msg)
     detections = count_rows(folder, "detections")
     run["counts"] = {"frames": count, "skipped": dict(skipped), "detections": detections}
-    if run.get("color"):
+    if run["color"]:
         run["counts"]["color"] = count_rows(folder, "masks")
     if resumed:
         run["counts"]["resumed"] = resumed
@@ -147,7 +147,7 @@ def _perceiving(
             work.folder,
             categories=categorizer.categories,
             model_id=categorizer.model_id,
-            colour=bool(work.run.get("color")),
+            colour=bool(work.run["color"]),
             again=again,
         ) as tables,
     ):
