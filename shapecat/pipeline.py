@@ -248,20 +248,24 @@ def _write_review(folder: Path, recording: Recording, run: RunInfo, observe: Obs
 def _write_mcap(folder: Path, recording: Recording, run: RunInfo, observe: Observer) -> None:
     from shapecat.outputs.annotation.annotated_mcap import write_annotated  # noqa: PLC0415  on first use
     from shapecat.outputs.annotation.image_annotations import read_image_frames  # noqa: PLC0415  the same
-    from shapecat.runs.labelled_tracks import read_annotation_frames  # noqa: PLC0415  the same
+    from shapecat.runs.labelled_tracks import (  # noqa: PLC0415  the same
+        LabelledTracks,
+        read_annotation_frames,
+    )
 
     settings = run["settings"]["outputs"]
     labels = read_labels(folder / "tracks.csv", run["model"]["categories"])
+    tracks = LabelledTracks.read(folder, labels)
     topics = list(dict.fromkeys(run["color"].values()))
     boxes = run.get("boxes", settings["boxes"])
-    frames = read_annotation_frames(folder, labels, visible=boxes == "visible")
+    frames = read_annotation_frames(folder, tracks, visible=boxes == "visible")
     write_annotated(
         recording,
         folder / "annotated.mcap",
         observed(frames, "annotate", run["counts"]["frames"], observe),
         run=run,
         markers=settings["markers"],
-        images=read_image_frames(folder, labels) if topics else (),
+        images=read_image_frames(folder, tracks) if topics else (),
         image_topics=topics,
     )
     add_warnings(run, recording.warnings)  # a recording that is rewritten is read as a whole

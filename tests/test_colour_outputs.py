@@ -219,10 +219,9 @@ def test_colours_of_unorganized_cloud_are_not_annotated(
         for k, height in enumerate((1, 48))
     ]
     monkeypatch.setattr(image_annotations, "read_nearest_masks", lambda *_: iter(masks))
-    nothing = SimpleNamespace(read=lambda *_: SimpleNamespace(objects=lambda _: {}))
-    monkeypatch.setattr(image_annotations, "LabelledTracks", nothing)
+    tracks: Any = SimpleNamespace(objects=lambda _: {})
 
-    assert [frame.stamp_ns for frame in read_image_frames(Path(), {})] == [8]
+    assert [frame.stamp_ns for frame in read_image_frames(Path(), tracks)] == [8]
 
 
 def test_corrections_change_image_annotations(run: Path, tmp_path: Path) -> None:

@@ -292,10 +292,8 @@ def test_simultaneous_images_of_two_cameras_are_annotated(
         for k, (topic, stamp, height) in enumerate(images)
     ]
     patch_masks(monkeypatch, masks, [5] * len(masks))
-    tracks = SimpleNamespace(objects=lambda _key: {TrackLabel(6, "cup", 0.8): {0: 0}})
-    place = "shapecat.outputs.annotation.image_annotations.LabelledTracks.read"
-    monkeypatch.setattr(place, lambda _folder, _labels: tracks)
-    frames = list(read_image_frames(Path(), {}))
+    tracks: Any = SimpleNamespace(objects=lambda _key: {TrackLabel(6, "cup", 0.8): {0: 0}})
+    frames = list(read_image_frames(Path(), tracks))
 
     assert [frame.stamp_ns for frame in frames] == [5, 5, 9]
     assert {frame.boxes for frame in frames} == {(ImageBox(6, "cup", 0.8, (3, 4, 7, 9)),)}
@@ -332,8 +330,7 @@ def test_merged_track_has_one_box_on_image(
     tracks = LabelledTracks(
         {("/d", 0): slice(0, 4)}, numbers, np.array([11, 9, 6, 12]), labels, {}, none, none
     )
-    monkeypatch.setattr(f"{place}.LabelledTracks.read", lambda _folder, _labels: tracks)
-    (frame,) = read_image_frames(Path(), {})
+    (frame,) = read_image_frames(Path(), tracks)
 
     assert frame.boxes == (
         ImageBox(6, "cup", 0.8, (3, 4, 14, 13)),

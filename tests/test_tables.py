@@ -208,7 +208,10 @@ def test_frames_without_tracks_have_no_objects(tmp_path: Path, count: int) -> No
     write_run_tables(tmp_path, [count, 0])
     write_tracks(tmp_path, [])
 
-    assert [(f.index, tuple(f.objects)) for f in read_annotation_frames(tmp_path, {})] == [
+    assert [
+        (f.index, tuple(f.objects))
+        for f in read_annotation_frames(tmp_path, LabelledTracks.read(tmp_path, {}))
+    ] == [
         (0, ()),
         (1, ()),
     ]
@@ -291,7 +294,7 @@ def test_edited_detections_are_refused(tmp_path: Path, change: Callable[[Any], A
     labels = {5: TrackLabel(5, "cup", 0.7), 6: TrackLabel(6, "cup", 0.7)}
 
     with pytest.raises(OutputError, match="tracks do not fit its detections"):
-        list(read_annotation_frames(tmp_path, labels))
+        list(read_annotation_frames(tmp_path, LabelledTracks.read(tmp_path, labels)))
 
 
 def test_track_of_missing_detection_is_refused(tmp_path: Path) -> None:
@@ -299,9 +302,11 @@ def test_track_of_missing_detection_is_refused(tmp_path: Path) -> None:
     write_run_tables(tmp_path, [2])
     write_tracks(tmp_path, [(5, 0, 2)])
 
-    for read in (read_annotation_frames, read_labelled_frames):
+    labels = {5: TrackLabel(5, "cup", 0.7)}
+    boxes = read_annotation_frames(tmp_path, LabelledTracks.read(tmp_path, labels))
+    for frames in (boxes, read_labelled_frames(tmp_path, labels)):
         with pytest.raises(OutputError, match="tracks do not fit its detections"):
-            list(read(tmp_path, {5: TrackLabel(5, "cup", 0.7)}))
+            list(frames)
 
 
 def test_rewritten_table_with_other_row_groups_is_refused(tmp_path: Path) -> None:
@@ -392,12 +397,12 @@ def test_chosen_rows_are_read_from_all_row_groups(tmp_path: Path, at_once: int) 
 def test_run_of_an_earlier_version_is_annotated(guessed_run: Path, tmp_path: Path) -> None:
     """Columns that were added since must not cost the corrections of a finished run."""
     run = shutil.copytree(guessed_run, tmp_path / "run")
-    labels = read_labels(run / "tracks.csv")
-    now = list(read_annotation_frames(run, labels))
+    tracks = LabelledTracks.read(run, read_labels(run / "tracks.csv"))
+    now = list(read_annotation_frames(run, tracks))
     table = pq.read_table(run / "frames.parquet")
     assert set(table.column_names) >= ADDED
     pq.write_table(table.drop_columns(sorted(ADDED)), run / "frames.parquet")
-    assert list(read_annotation_frames(run, labels)) == now
+    assert list(read_annotation_frames(run, tracks)) == now
 
 
 def test_positions_of_an_earlier_version_are_read(tmp_path: Path) -> None:

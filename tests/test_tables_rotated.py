@@ -15,7 +15,7 @@ from shapecat.completion import DIRECTIONS
 from shapecat.config import TrackingSettings
 from shapecat.outputs.report.tracks import read_timelines
 from shapecat.runs.labelled_frames import _join, read_labelled_frames
-from shapecat.runs.labelled_tracks import read_annotation_frames
+from shapecat.runs.labelled_tracks import LabelledTracks, read_annotation_frames
 from shapecat.runs.labels.corrections import read_labels
 from shapecat.runs.perceive.perceived import FrameRow, PerceptionTables
 from shapecat.runs.tables.placed_frames import streams_with_poses
@@ -383,7 +383,7 @@ def test_labelled_frames_and_annotations_have_same_boxes(run: Path, *, merged: b
     labels = read_labels(run / "tracks.csv", CATEGORIES)
     if merged:
         labels[3] = labels[1]
-    shown = list(read_annotation_frames(run, labels))
+    shown = list(read_annotation_frames(run, LabelledTracks.read(run, labels)))
     labelled = list(read_labelled_frames(run, labels))
 
     assert [frame.index for frame in shown] == [frame.index for frame in labelled]
@@ -405,7 +405,7 @@ def test_annotation_of_unknown_whole_is_the_visible_part(tmp_path: Path) -> None
     folder = write_run(tmp_path, np.zeros(3), vague=1)
     labels = read_labels(folder / "tracks.csv", CATEGORIES)
 
-    for frame in read_annotation_frames(folder, labels):
+    for frame in read_annotation_frames(folder, LabelledTracks.read(folder, labels)):
         sizes = sorted(one.size[0] for one in frame.objects)
         assert sizes == pytest.approx([SIZE[0], SIZE[0] + 0.01, SIZE[0] + 0.01], abs=1e-6)
 
@@ -458,7 +458,8 @@ def test_merged_box_is_upright_in_named_frame(tmp_path: Path) -> None:
     labels = read_labels(tmp_path / "tracks.csv", CATEGORIES)
     labels[3] = labels[1]
 
-    for frame in read_annotation_frames(tmp_path, labels, visible=True):
+    tracks = LabelledTracks.read(tmp_path, labels)
+    for frame in read_annotation_frames(tmp_path, tracks, visible=True):
         (merged,) = (box for box in frame.objects if box.track == 1)
         axes = Rotation.from_quat(merged.orientation).as_matrix()
         up = robot.rotation @ ROTATIONS[frame.index].inv().apply(UP)

@@ -24,7 +24,7 @@ from shapecat.recordings.pinhole import fit_pinhole
 from shapecat.recordings.viewpoint import find_viewpoint
 from shapecat.runs.folder import read_run
 from shapecat.runs.jobs import Job
-from shapecat.runs.labelled_tracks import read_annotation_frames
+from shapecat.runs.labelled_tracks import LabelledTracks, read_annotation_frames
 from shapecat.runs.labels.meaning import TrackLabel
 from shapecat.simulation.messages import MessageFactory
 from shapecat.types import Frame, Pose
@@ -173,7 +173,7 @@ def test_cloud_in_other_frame_gives_the_results_of_its_camera(mount: str, tmp_pa
     np.testing.assert_allclose(places[1], places[0], atol=2e-4)
     # What viewers draw is in the frame that the messages name.
     labels = {n: TrackLabel(n, "cup", 1.0) for n in own["tracks"]["track"].to_pylist()}
-    shown = list(read_annotation_frames(out, labels, visible=True))
+    shown = list(read_annotation_frames(out, LabelledTracks.read(out, labels), visible=True))
     boxes = [
         (box, pose) for f, pose in zip(shown, map_from_mounts, strict=True) for box in f.objects
     ]

@@ -123,7 +123,7 @@ class LabelledTracks:
 
 
 def read_annotation_frames(
-    folder: Path, labels: Mapping[int, TrackLabel], *, visible: bool = False
+    folder: Path, tracks: LabelledTracks, *, visible: bool = False
 ) -> Iterator[AnnotationFrame]:
     """Yield the annotations of a run, frame by frame in reading order.
 
@@ -135,7 +135,6 @@ def read_annotation_frames(
     ------
     OutputError : a table is unreadable, or tracks and detections do not fit together.
     """
-    tracks = LabelledTracks.read(folder, labels)
     ended = tracks.endings()
     plain_columns = ("topic", "frame", "stamp_ns", "log_time_ns", "frame_id")
     pose_columns = ("frame_translation", "frame_rotation")

@@ -1,6 +1,6 @@
 """Annotations of colour images, for each message encoding."""
 
-from collections.abc import Iterable, Iterator, Mapping
+from collections.abc import Iterable, Iterator
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -10,7 +10,6 @@ from shapecat.outputs.annotation.encoders import MessageKind, Types, encoders_of
 from shapecat.outputs.colours import colour_of
 from shapecat.outputs.wording import caption
 from shapecat.runs.labelled_tracks import LabelledTracks
-from shapecat.runs.labels.meaning import TrackLabel
 from shapecat.runs.tables.masks import read_nearest_masks
 
 __all__ = ["ImageBox", "ImageFrame", "image_encoders_for", "read_image_frames"]
@@ -49,12 +48,11 @@ class ImageFrame(NamedTuple):
     boxes: tuple[ImageBox, ...]
 
 
-def read_image_frames(folder: Path, labels: Mapping[int, TrackLabel]) -> Iterator[ImageFrame]:
+def read_image_frames(folder: Path, tracks: LabelledTracks) -> Iterator[ImageFrame]:
     """Yield the annotations of the colour images of a run; see `read_nearest_masks`.
 
     Unorganized clouds have no colour image.
     """
-    tracks = LabelledTracks.read(folder, labels)
     for key, masks in read_nearest_masks(folder):
         if masks.height <= 1:
             continue
