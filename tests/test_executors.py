@@ -349,9 +349,21 @@ def test_ray_keeps_no_result_of_a_finished_call(monkeypatch: pytest.MonkeyPatch)
         return reference
 
     waited: list[int] = []
+    names: list[str] = []
+
+    def options(*, name: str) -> SimpleNamespace:
+        names.append(name)
+        return SimpleNamespace(remote=remote)
+
+    functions: list[Any] = []
+
+    def as_remote(function: Any) -> SimpleNamespace:
+        functions.append(function)
+        return SimpleNamespace(options=options)
+
     ray = SimpleNamespace(
         init=lambda **_: None,
-        remote=lambda **_: lambda _: SimpleNamespace(remote=remote),
+        remote=lambda **_: as_remote,
         wait=lambda references, **_: waited.append(len(references)),
         shutdown=lambda: None,
     )
@@ -363,6 +375,9 @@ def test_ray_keeps_no_result_of_a_finished_call(monkeypatch: pytest.MonkeyPatch)
     gc.collect()
 
     assert [reference() is not None for reference in made] == [False, True]
+    assert len(functions) == 1  # a cluster keeps the code of every remote function
+    assert functions[0](abs, -7) == 7
+    assert names == ["abs", "abs"]
     executor.shutdown()
     assert waited == [1]
     assert not second.done()

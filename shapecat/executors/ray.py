@@ -44,11 +44,12 @@ class RayExecutor(WorkerExecutor):
             problem = f"--scheduler {address}: no Ray cluster answers"
             msg = f"{problem if address else '--executor ray: Ray does not start'}: {error}"
             raise ConfigError(msg) from error
+        self._call = ray.remote(max_retries=0)(_call)  # once: the cluster keeps every one
         self._running: set[Any] = set()
 
     def submit(self, fn: Any, /, *args: Any, **kwargs: Any) -> Future[Any]:
         """Queue a call on the cluster; if its worker dies, the future raises without a retry."""
-        reference = self._ray.remote(max_retries=0)(fn).remote(*args, **kwargs)
+        reference = self._call.options(name=fn.__name__).remote(fn, *args, **kwargs)
         self._running.add(reference)
         future: Future[Any] = reference.future()
         future.add_done_callback(lambda _: self._running.discard(reference))
@@ -66,3 +67,8 @@ class RayExecutor(WorkerExecutor):
     def terminate(self) -> None:
         """Cancel running calls and disconnect."""
         self.shutdown(wait=False, cancel_futures=True)
+
+
+def _call(fn: Any, /, *args: Any, **kwargs: Any) -> Any:
+    """Call a function on a worker."""
+    return fn(*args, **kwargs)
