@@ -11,6 +11,7 @@ from collections.abc import Callable
 from dataclasses import replace
 from importlib import import_module
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
@@ -23,6 +24,7 @@ from scipy.optimize import linprog
 from scipy.spatial import ConvexHull, HalfspaceIntersection
 from scipy.spatial.transform import Rotation
 
+from shapecat.colour.rle import parse_rle_text, rle_mask
 from shapecat.errors import OutputError, RecordingError
 from shapecat.evaluation.comparison import comparing
 from shapecat.evaluation.comparison.comparing import (
@@ -66,7 +68,7 @@ from shapecat.evaluation.comparison.references import (
     read_complete,
     run_labellings,
 )
-from shapecat.evaluation.comparison.references_coco import CocoLabels, decode_rle, filled_polygon
+from shapecat.evaluation.comparison.references_coco import CocoLabels, filled_polygon
 from shapecat.evaluation.comparison.references_kitti import KittiLabels
 from shapecat.runs.tables.reading import read_stamps
 from shapecat.runs.tables.schemas import DETECTIONS, FRAMES, TRACKS
@@ -1066,12 +1068,33 @@ def compressed(counts: list[int]) -> str:
 def test_compressed_run_lengths_are_decoded() -> None:
     """Long, short and falling run lengths: differences of both signs, several letters."""
     counts = [3, 40, 1000, 5, 7, 900, 2, 1, 42]
-    expected = decode_rle(counts, 40, 50)
 
-    assert expected.sum() == 40 + 5 + 900 + 1
-    assert (decode_rle(compressed(counts), 40, 50) == expected).all()
-    with pytest.raises(ValueError, match="1999"):
-        decode_rle([1999], 40, 50)
+    assert rle_mask(counts, 40, 50).area == 40 + 5 + 900 + 1
+    assert parse_rle_text(compressed(counts)) == counts
+    with pytest.raises(ValueError, match="64 bits"):
+        parse_rle_text("P" * 10**6)  # such a number would take hours
+
+
+@pytest.mark.parametrize(
+    "counts",
+    [
+        [1999],
+        [],
+        [900, -100, 1200],
+        [2**63 - 1, 2**63 - 1, 2002],  # 2000 modulo 2 to the power of 64
+        [2**80, 2000 - 2**80],
+        ["many"],
+        [float("nan")],
+        [float("inf")],
+        7,
+    ],
+)
+def test_run_lengths_that_do_not_fill_the_image_are_refused(tmp_path: Path, counts: Any) -> None:
+    """Files of labels come from anywhere: a wrong sum would give a mask elsewhere, or a crash."""
+    segmentation = {"size": [40, 50], "counts": counts}
+    reference: Any = SimpleNamespace(path=tmp_path)
+    with pytest.raises(RecordingError, match="annotation 5 has no readable mask"):
+        CocoLabels._item(reference, {"id": 5, "name": "cup", "segmentation": segmentation}, 40, 50)
 
 
 def test_filled_polygon_has_its_area() -> None:

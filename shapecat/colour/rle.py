@@ -1,11 +1,13 @@
 """Run-length encoding of masks as in COCO data sets: column by column, zeros first."""
 
+from collections.abc import Sequence
+
 import numpy as np
 
 from shapecat.arrays import U4
 from shapecat.colour.masks import EMPTY_MASK, Mask
 
-__all__ = ["rle_counts", "rle_mask", "rle_text"]
+__all__ = ["parse_rle_text", "rle_counts", "rle_mask", "rle_text"]
 
 
 def rle_counts(mask: Mask, height: int, width: int) -> U4:
@@ -27,18 +29,26 @@ def rle_counts(mask: Mask, height: int, width: int) -> U4:
     return np.diff(ends, prepend=0).astype(np.uint32)
 
 
-def rle_mask(counts: U4, height: int, width: int) -> Mask:
+def rle_mask(counts: U4 | Sequence[int], height: int, width: int) -> Mask:
     """Return the mask with run lengths (n,): the inverse of `rle_counts`.
 
     Raises
     ------
-    ValueError : the run lengths do not add up to ``height * width``.
+    ValueError : a run length is negative, or they do not add up to ``height * width``.
+
+    Examples
+    --------
+    >>> rle_mask([1, 2, 1], 2, 2).pixels.astype(int)
+    array([[0, 1],
+           [1, 0]])
     """
-    runs = np.asarray(counts, np.int64)
-    if int(runs.sum()) != height * width:
-        msg = f"run lengths of {int(runs.sum())} pixels for an image of {width} x {height}"
+    runs, size = np.asarray(counts), height * width
+    # The sum of runs that are longer than the image may overflow, and be that of the image.
+    if runs.min(initial=0) < 0 or runs.max(initial=0) > size or runs.sum() != size:
+        total = sum(map(int, counts))
+        msg = f"run lengths of {total} pixels, or negative ones, for an image of {width} x {height}"
         raise ValueError(msg)
-    ends = np.cumsum(runs)
+    ends = np.cumsum(runs, dtype=np.int64)
     inside = runs[1::2] > 0
     starts, stops = ends[:-1:2][: inside.size][inside], ends[1::2][inside]
     if not starts.size:
@@ -76,3 +86,33 @@ def rle_text(counts: U4) -> str:
             more = remainder != (-1 if part & 16 else 0)
             letters.append(chr(part + (32 if more else 0) + 48))
     return "".join(letters)
+
+
+def parse_rle_text(text: str) -> list[int]:
+    """Return the run lengths in COCO's compressed text format: the inverse of `rle_text`.
+
+    Raises
+    ------
+    ValueError : the text is not ASCII, or a number in it has more than 64 bits.
+
+    Examples
+    --------
+    >>> parse_rle_text("61X13mN000`0")
+    [6, 1, 40, 4, 5, 4, 5, 4, 21]
+    """
+    counts: list[int] = []
+    value = shift = 0
+    for letter in text.encode("ascii"):
+        part = letter - 48
+        value |= (part & 31) << shift
+        shift += 5
+        if shift > 65:
+            msg = "a run length has more than 64 bits"
+            raise ValueError(msg)
+        if part & 32:
+            continue
+        if part & 16:
+            value -= 1 << shift
+        counts.append(value + (counts[-2] if len(counts) > 2 else 0))
+        value = shift = 0
+    return counts

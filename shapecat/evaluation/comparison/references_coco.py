@@ -9,6 +9,7 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from shapecat.arrays import I4, Bool
+from shapecat.colour.rle import parse_rle_text, rle_mask
 from shapecat.errors import RecordingError
 from shapecat.evaluation.comparison.labellings import (
     LabelledItem,
@@ -17,7 +18,7 @@ from shapecat.evaluation.comparison.labellings import (
     Reference,
 )
 
-__all__ = ["CocoLabels", "decode_rle", "filled_polygon"]
+__all__ = ["CocoLabels", "filled_polygon"]
 
 _MOST_PIXELS = 50_000_000
 _A_STAMP = 10**17
@@ -78,7 +79,7 @@ class CocoLabels(Reference[_Image]):
     def _item(self, item: Mapping[str, Any], height: int, width: int) -> LabelledItem:
         try:
             mask = _mask(item["segmentation"], height, width)
-        except (KeyError, ValueError, TypeError, IndexError) as error:
+        except (KeyError, ValueError, TypeError, IndexError, OverflowError) as error:
             msg = f"{self.path}: annotation {item.get('id')} has no readable mask ({error!r})"
             raise RecordingError(msg) from error
         return LabelledItem(
@@ -139,7 +140,9 @@ def _mask(segmentation: Any, height: int, width: int) -> Bool:
         if tuple(segmentation["size"]) != (height, width):
             msg = f"size {segmentation['size']}, the image is {[height, width]}"
             raise ValueError(msg)
-        return decode_rle(segmentation["counts"], height, width)
+        counts = segmentation["counts"]
+        runs = parse_rle_text(counts) if isinstance(counts, str) else list(map(int, counts))
+        return rle_mask(runs, height, width).full(height, width)
     if not segmentation:
         msg = "it has only a box"
         raise ValueError(msg)
@@ -147,53 +150,6 @@ def _mask(segmentation: Any, height: int, width: int) -> Bool:
     for polygon in segmentation:
         mask |= filled_polygon(np.reshape(polygon, (-1, 2)), height, width)
     return mask
-
-
-def decode_rle(counts: str | Sequence[int], height: int, width: int) -> Bool:
-    """Decode run lengths into a mask (h, w).
-
-    Parameters
-    ----------
-    counts : run lengths in column-major order, beginning with zeros; or COCO's compressed string.
-    height, width : size of the image, pixels.
-
-    Raises
-    ------
-    ValueError : the run lengths are negative or do not fill the image.
-
-    Examples
-    --------
-    >>> decode_rle([1, 2, 1], 2, 2).astype(int)
-    array([[0, 1],
-           [1, 0]])
-    """
-    lengths = _uncompressed(counts) if isinstance(counts, str) else list(map(int, counts))
-    if sum(lengths) != height * width or min(lengths, default=0) < 0:
-        msg = f"run lengths of {sum(lengths)} pixels for an image of {height * width}"
-        raise ValueError(msg)
-    values = np.arange(len(lengths)) % 2 == 1
-    return np.asarray(np.repeat(values, lengths).reshape(width, height).T)
-
-
-def _uncompressed(text: str) -> list[int]:
-    """Return the run lengths of a compressed string.
-
-    Each character holds five bits; the values of the fourth run and later ones are differences from
-    the run two before.
-    """
-    lengths: list[int] = []
-    value = shift = 0
-    for letter in text.encode("ascii"):
-        bits = letter - 48
-        value |= (bits & 0x1F) << shift
-        shift += 5
-        if bits & 0x20:
-            continue
-        if bits & 0x10:
-            value -= 1 << shift
-        lengths.append(value + (lengths[-2] if len(lengths) > 2 else 0))
-        value = shift = 0
-    return lengths
 
 
 def filled_polygon(corners: I4, height: int, width: int) -> Bool:
