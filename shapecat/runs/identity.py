@@ -1,8 +1,9 @@
 """Identify a recording by its content, and a run folder by a random id.
 
 A run has two ids. ``id`` is random and marks one folder as made by shapecat. ``work`` identifies
-the recording and how it was processed: runs with the same ``work`` have the same tables, and
-tracks.csv has it in each line.
+the recording and how it was processed: runs with the same ``work`` have the same frames,
+detections, planes and tracks, and tracks.csv has it in each line. Their masks differ if their
+colour topics do.
 """
 
 import json
@@ -46,8 +47,8 @@ def new_id() -> str:
 def work_id(run: RunInfo) -> str:
     """Return the id of the work that run.json describes, once the digest of the input is known.
 
-    It is a hash of content, settings, options, model and version, except what does not affect the
-    tables. The first letter keeps spreadsheets from reading a number.
+    It is a hash of content, settings, options, model and version, except what affects only masks
+    and outputs. The first letter keeps spreadsheets from reading a number.
     """
     settings = {name: value for name, value in run["settings"].items() if name != "outputs"}
     options = {name: value for name, value in run["options"].items() if name not in _OUTPUTS}
