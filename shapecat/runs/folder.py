@@ -75,7 +75,7 @@ def made_by_run(folder: Path) -> Collection[str] | None:
 
 
 def require_work(folder: Path, work: str) -> None:
-    """Check that a run has not been replaced since its run.json was read: its tracks are others.
+    """Check that a run with other tracks has not replaced the one with the id ``work``.
 
     Raises
     ------

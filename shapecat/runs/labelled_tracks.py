@@ -248,7 +248,7 @@ def _in_named_frame(
 
 
 def _last_in(frames: Mapping[Key, slice], tracks: I4, stamps_ns: I4) -> dict[Key, tuple[int, ...]]:
-    """Return the tracks whose last frame each frame is.
+    """Return the tracks that end in each frame.
 
     Of the last frames of a track in several topics, the latest counts. Within a topic, numbers of
     frames decide, as a clock may be set back.

@@ -123,7 +123,7 @@ class Reference(ABC, Generic[_Frame]):
 
 
 def numbering_notes(other: Reference[Any], start_s: float | None) -> list[str]:
-    """Return a note if the reference may number frames from a different one than the run does.
+    """Return a note if run and reference may begin to number frames at different ones.
 
     ``start_s`` is where the run began in its recording, None for the beginning.
     """

@@ -167,7 +167,10 @@ def _annotations(frames: Iterable[AnnotationFrame]) -> Iterator[Annotation]:
 
 
 def _with_periods(frames: Iterable[AnnotationFrame]) -> Iterator[tuple[AnnotationFrame, int]]:
-    """Yield frames with the time, ns, to the next frame of their topic, else from the last one."""
+    """Yield each frame with the time to the next one of its topic, ns.
+
+    The last one has the time since the one before.
+    """
     source = iter(frames)
     following = deque(islice(source, _AHEAD))
     last: dict[str, AnnotationFrame] = {}

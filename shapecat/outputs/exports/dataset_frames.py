@@ -104,7 +104,7 @@ def split_runs(runs: Sequence[FinishedRun], val: float) -> list[str]:
 
 
 def image_stems(runs: Sequence[FinishedRun]) -> list[dict[str, str]]:
-    """Return for each run how the names of the images of each topic begin; all differ."""
+    """Return the prefix of image names of each topic, for each run; no two are equal."""
     names = different_names([run.name for run in runs])
     topics = [run.info["options"]["topics"] for run in runs]
     stems = [
@@ -132,7 +132,7 @@ def images_of(
     Parameters
     ----------
     recording : path of the recording; by default where it was processed.
-    stems : how the names of the images of each topic begin.
+    stems : the prefix of image names of each topic.
     left_out : counts the other frames by reason.
     observe : called after each frame of the run, even if it is left out.
 
@@ -164,7 +164,7 @@ def images_of(
 
 
 def _is_sure(item: LabelledObject, selection: Selection, corrected: set[int]) -> bool:
-    """Return whether an object has a label to train on; *unknown* is none, even if set by hand."""
+    """Return whether an object has a label to train on, which *unknown* never is."""
     if item.category == UNKNOWN:
         return False
     certain = item.confidence >= selection.min_confidence and not selection.corrected_only

@@ -306,7 +306,10 @@ def _require_own(target: Path, about: Mapping[str, Any]) -> None:
 
 
 def _covers(new: Any, old: Any) -> bool:
-    """Return whether a time range includes an earlier one; None if there is none or no limit."""
+    """Return whether the time range ``new`` includes ``old``.
+
+    A range that is None is unknown, and fits; a limit that is None is that of the recording.
+    """
     if new is None or old is None:
         return True
     (start, end), (old_start, old_end) = (

@@ -22,8 +22,8 @@ class Timeline(Record):
     seen : (k,) whether the track was detected.
     causal : (k, c) posterior fused from the views so far.
     keys : the detection of each row.
-    fused : (c,) posterior fused from all views. It is not that of the latest row if the clock was
-        set back.
+    fused : (c,) posterior fused from all views. After a clock was set back, the last row of
+        ``causal`` differs from it.
     """
 
     seconds: F8 = array("k", "f8")

@@ -223,7 +223,7 @@ def _above(runs: Sequence[Path]) -> Path:
 
 
 def _place(run: Path) -> Path:
-    """Return the absolute path of a run; a run that is a link is where the link is."""
+    """Return the absolute path of a run folder; if it is a link, that of the link."""
     absolute = Path(os.path.abspath(run))  # noqa: PTH100  `resolve` would follow the link
     return absolute.parent.resolve() / absolute.name
 

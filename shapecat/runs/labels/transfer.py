@@ -179,7 +179,8 @@ def match_labels(source: Path, target: Path) -> Transfer:
 def _require_complete(path: Path, table: TrackTable, *, alone: bool) -> None:
     """Check that a table has only valid lines, all from one run.
 
-    The numbers of a table ``alone`` are needed: with a wrong confidence, positions are wrong, too.
+    Without the other tables of its run, if ``alone``, its positions are used. A wrong confidence
+    shows that a spreadsheet changed numbers, and so these, too.
 
     Raises
     ------

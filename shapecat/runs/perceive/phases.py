@@ -137,7 +137,7 @@ def _perceiving(
     Yields
     ------
     A function that perceives frames and writes them, except those that an interrupted run has
-    written. It returns the number of frames, and that of these exceptions.
+    written. It returns the number of all frames, and of those that were written before.
     """
     job, categorizer = work.job, work.categorizer
     perceiver = Perceiver(categorizer, job.settings, job.model)

@@ -45,7 +45,7 @@ def report_up(upright: Upright, folder: Path) -> dict[str, Any]:
 
 
 def _missing_poses(folder: Path, fixed_frame: str | None) -> Iterator[str]:
-    """Yield a warning for each topic of which frames have no pose in the fixed frame."""
+    """Yield a warning for each topic with frames whose pose in the fixed frame is unknown."""
     if fixed_frame is None:  # all tracks are in the sensor frame
         return
     for topic, (with_pose, count) in count_poses(folder).items():
