@@ -39,6 +39,7 @@ def write_run(
         "topic": [f"/depth{cell or ''}" for _ in frames for cell in range(cells)],
         "stamp_ns": [EPOCH + k * SECOND // 10 for k in frames for _ in range(cells)],
         "frame": [k for k in frames for _ in range(cells)],
+        "frame_id": [f"optical{cell}" for _ in frames for cell in range(cells)],
     }
     for name, schema, columns in (("frames", FRAMES, seen), ("detections", DETECTIONS, rows)):
         nulls = [None] * len(columns["frame"])
@@ -76,4 +77,9 @@ def test_sensors_are_not_compared_with_each_other(
     """Two robots in equal cells see the same, at places far from each other."""
     write_run(tmp_path, 0.2, axes, cells=2)
 
-    assert [w.split(":")[0] for w in explain_misplacement(tmp_path, "map")] == topics
+    warnings = list(explain_misplacement(tmp_path, "map"))
+    assert [w.split(":")[0] for w in warnings] == topics
+    # Another name would be a command that tracks in a wrong frame again.
+    assert [w.split("--fixed-frame ")[1] for w in warnings] == ["optical0", "optical1"][
+        : len(topics)
+    ]

@@ -7,7 +7,14 @@ from typing import NamedTuple
 import numpy as np
 
 from shapecat.arrays import F8
-from shapecat.runs.tables.reading import frame_rows, keys_of, numbers, numbers_or_nan, read_together
+from shapecat.runs.tables.reading import (
+    frame_rows,
+    keys_of,
+    numbers,
+    numbers_or_nan,
+    read_by_topic,
+    read_together,
+)
 
 __all__ = ["explain_misplacement"]
 
@@ -38,10 +45,13 @@ def explain_misplacement(folder: Path, fixed_frame: str) -> Iterator[str]:
     """
     for topic, worse in _compare(folder).items():
         if len(worse) >= _MIN_MOTIONS and np.mean(worse) > _WORSE_SHARE:
+            frame_ids = read_by_topic(
+                folder, ["frame_id"], lambda frames: np.array(frames["frame_id"].to_pylist())
+            )
             yield (
-                f"{topic}: as the camera moves, objects move farther in {fixed_frame} than "
-                "relative to the camera, and may get no tracks: the transforms of its frame are "
-                "wrong; to ignore them, give the frame of its messages to --fixed-frame"
+                f"{topic}: the transforms look wrong: while the camera moves, objects move farther "
+                f"in {fixed_frame} than relative to the camera, and may get no tracks; to ignore "
+                f"the transforms, pass --fixed-frame {frame_ids[topic][0]}"
             )
 
 
