@@ -23,10 +23,9 @@ from shapecat.reuse import KeyView, find_repeats, view_object
 from shapecat.reuse.agreement import agreement
 from shapecat.runs.perceive.perceived import FrameRow, PerceptionTables
 from shapecat.runs.tables.placed_frames import DetectedFrames, streams_with_poses
-from shapecat.tracking.detection_table import gather
-from shapecat.tracking.records import FrameDetections
 from shapecat.types import Camera, Frame, Pose
 from tests.colour_messages import gradient, raw
+from tests.frame_detections import FrameDetections, gather
 from tests.messages import CAMERA, EPOCH, image, info, wavy_depth, write
 from tests.test_recordings_colour import MS, WIDE, Pairs, depth_items, in_order, static
 from tests.test_recordings_colour import read as read_colour

@@ -22,10 +22,9 @@ from shapecat.runs.jobs import Job
 from shapecat.simulation import KINECT, make_scene, render_frame
 from shapecat.simulation.recorder import record
 from shapecat.simulation.scenes.worlds import Motion, World
-from shapecat.tracking.detection_table import gather
-from shapecat.tracking.records import FrameDetections
 from shapecat.types import Box, Candidate, Detection, Frame, FullBox, NeuralGas, Perception, Pose
 from tests.conftest import Guesser
+from tests.frame_detections import FrameDetections, gather
 
 FRAMES, CHANGE = 6, 3
 """Frames of a scene, and the first one in which something is different."""

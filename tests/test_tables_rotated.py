@@ -19,7 +19,8 @@ from shapecat.runs.labelled_tracks import LabelledTracks, read_annotation_frames
 from shapecat.runs.labels.corrections import read_labels
 from shapecat.runs.perceive.perceived import FrameRow, PerceptionTables
 from shapecat.runs.tables.placed_frames import streams_with_poses
-from shapecat.runs.tracks import _line, _read_frames, track_run
+from shapecat.runs.tables.segments import GROUP_FRAMES
+from shapecat.runs.tracks import _line, _read_streams, track_run
 from shapecat.tracking.records import Track
 from shapecat.types import (
     Box,
@@ -177,17 +178,54 @@ def test_detection_columns_have_right_values(run: Path) -> None:
 
 def test_tracker_reads_boxes_in_fixed_frame(run: Path) -> None:
     """With the inverse pose, boxes at rest would rotate."""
-    found = list(_read_frames(run, len(CATEGORIES), {"/depth"}))
+    (found,) = _read_streams(run, len(CATEGORIES), {"/depth"})
 
-    assert [frame.frame for frame in found] == list(range(FRAMES))
-    for k, frame in enumerate(found):
-        assert frame.orientations is not None
-        axes = Rotation.from_quat(frame.orientations).as_matrix()
-        assert_allclose(frame.centers, CENTERS, atol=1e-5)
-        assert_allclose(axes, np.tile(AXES.as_matrix(), (3, 1, 1)), atol=1e-5)
-        assert frame.partial.tolist() == [PARTIAL[k], False, False]
-        assert_allclose(frame.posteriors, POSTERIORS[k % 2], atol=1e-6)
-        assert_allclose(frame.novelties, NOVELTIES[k], rtol=1e-6)
+    assert found.frames.tolist() == list(range(FRAMES))
+    assert found.numbers.tolist() == list(range(3 * FRAMES))
+    for k in range(FRAMES):
+        of_frame = found.of_frame(k)
+        assert_allclose(found.centers[of_frame], CENTERS, atol=1e-5)
+        axes = np.tile(AXES.as_matrix(), (3, 1, 1))
+        assert_allclose(found.axes(of_frame), axes, atol=1e-5)
+        assert found.partial[of_frame].tolist() == [PARTIAL[k], False, False]
+        assert_allclose(found.posteriors[of_frame], POSTERIORS[k % 2], atol=1e-6)
+        assert_allclose(found.novelties[of_frame], NOVELTIES[k], rtol=1e-6)
+
+
+def test_tracker_reads_interleaved_topics_as_their_streams(tmp_path: Path) -> None:
+    """A detection in the frame of another topic, or row group, would be elsewhere."""
+    count = 2 * GROUP_FRAMES + 5
+    wanted: dict[str, list[tuple[int, int, list[float]]]] = {"": [], "/own": []}
+    with PerceptionTables(tmp_path, categories=CATEGORIES, model_id="m") as tables:
+        row = 0
+        for k in range(count):
+            topic, at = ("/own", "/a", "/b")[k % 3], k % FRAMES
+            found = [detection_of(at, item) for item in range(3)][: k % 4]
+            has_pose = topic != "/own" and k != 7
+            pose = Pose(ROTATIONS[at].as_matrix(), POSITIONS[at]) if has_pose else None
+            for item, one in enumerate(found):
+                if topic == "/own":
+                    center = one.candidate.box.center.tolist()
+                    wanted["/own"].append((EPOCH + k, row + item, center))
+                elif pose is not None:
+                    wanted[""].append((EPOCH + k, row + item, CENTERS[item].tolist()))
+            row += len(found)
+            scene = Scene(UP, (Plane(UP, -0.5, OUTLINE, 0.7, 0.0),), ())
+            perception = Perception(topic, k // 3, EPOCH + k, "cam", scene, tuple(found), {})
+            tables.write([perception], [FrameRow(EPOCH + k, pose)])
+    placed = streams_with_poses(tmp_path)
+    own, shared = _read_streams(tmp_path, len(CATEGORIES), placed)
+
+    assert placed == {"/a", "/b"}
+    assert (own.names, shared.names) == (("/own",), ("/a", "/b"))
+    for table, name in ((own, "/own"), (shared, "")):
+        frames = [k for k in range(count) if (k % 3 == 0) == bool(name)]
+        assert table.stamps_ns.tolist() == [EPOCH + k for k in frames]
+        assert table.frames.tolist() == [k // 3 for k in frames]
+        stamps, row_numbers, centers = zip(*wanted[name], strict=True)
+        assert table.stamps_ns[table.rows].tolist() == list(stamps)
+        assert table.numbers.tolist() == list(row_numbers)
+        assert_allclose(table.centers, centers, atol=1e-5)
 
 
 def test_tracker_reads_which_views_are_reused(tmp_path: Path) -> None:
@@ -200,9 +238,9 @@ def test_tracker_reads_which_views_are_reused(tmp_path: Path) -> None:
             perception = Perception("/depth", k, k, "cam", scene, found, {})
             tables.write([perception], [FrameRow(k, None)])
 
-    frames = list(_read_frames(tmp_path, len(CATEGORIES), set()))
+    (table,) = _read_streams(tmp_path, len(CATEGORIES), set())
 
-    assert [np.array(frame.described).tolist() for frame in frames] == [[0], [0], [0], [3]]
+    assert table.described.tolist() == [0, 0, 0, 3]
 
 
 @pytest.mark.parametrize("flag", ["touches_border", "occluded"])
@@ -332,8 +370,8 @@ def test_pose_missing_in_half_of_frames_is_not_used(tmp_path: Path, posed: int) 
     assert [row["frames"] for row in lines(tmp_path)] == [str(count)]
     placed = streams_with_poses(tmp_path)
     turn = (ROTATIONS[0] if placed else Rotation.identity()) * ROTATIONS[0].inv() * AXES
-    for frame in _read_frames(tmp_path, len(CATEGORIES), placed):
-        axes = Rotation.from_quat(frame.orientations).as_matrix()
+    for table in _read_streams(tmp_path, len(CATEGORIES), placed):
+        axes = table.axes(slice(None))
         assert_allclose(axes, np.tile(turn.as_matrix(), (len(axes), 1, 1)), atol=1e-5)
 
 

@@ -13,19 +13,17 @@ from shapecat.arrays import F8
 from shapecat.config import TrackingSettings
 from shapecat.tracking import (
     Fragments,
-    FrameDetections,
     Tracker,
     causal,
     fuse,
     merge_fragments,
     scene_cuts,
-    track_recording,
 )
 from shapecat.tracking.association import assign, size_key
 from shapecat.tracking.common_motion import find_common_motion
-from shapecat.tracking.detection_table import gather
 from shapecat.tracking.fusion import fuse_novelty, view_weights
 from shapecat.tracking.recording import _without_gaps
+from tests.frame_detections import FrameDetections, gather, track_frames
 
 SETTINGS = TrackingSettings()
 SECOND = 1_000_000_000
@@ -175,17 +173,17 @@ def test_recording_of_unrelated_frames_keeps_every_detection() -> None:
         )
         for k in range(30)
     ]
-    tracks = tuple(track_recording(frames, SETTINGS))
+    tracks = tuple(track_frames(frames, SETTINGS))
     assert sum(track.hits for track in tracks) == 120
     assert len(tracks) >= 115
     assert scene_cuts(next(gather(frames)), SETTINGS)[1:].mean() > 0.9
 
 
 def test_recording_may_have_one_frame_or_none() -> None:
-    tracks = track_recording([frame(0, [[0, 0, 0], [1, 0, 0]])], SETTINGS)
+    tracks = track_frames([frame(0, [[0, 0, 0], [1, 0, 0]])], SETTINGS)
     assert [track.id for track in tracks] == [1, 2]
-    assert list(track_recording([], SETTINGS)) == []
-    assert list(track_recording([frame(0, []), frame(1, [])], SETTINGS)) == []
+    assert list(track_frames([], SETTINGS)) == []
+    assert list(track_frames([frame(0, []), frame(1, [])], SETTINGS)) == []
 
 
 def cameras(count: int, *, frames: int, apart: float) -> list[FrameDetections]:
@@ -212,7 +210,7 @@ def test_cameras_that_see_different_objects_are_no_scene_cuts(count: int) -> Non
     (hits,) = gather(frames, together)
 
     assert not scene_cuts(hits, SETTINGS).any()
-    tracks = list(track_recording(frames, SETTINGS, together=together))
+    tracks = list(track_frames(frames, SETTINGS, together=together))
     assert [track.hits for track in tracks] == [30] * (2 * count)
 
 
@@ -223,7 +221,7 @@ def test_frames_of_fast_camera_do_not_end_tracks_of_slow_one() -> None:
         frame(k, [1, 0, 0], stamp_ns=k * SECOND + 7, posterior=BOX if k % 4 == 2 else CUP)
         for k in range(20)
     ]
-    tracks = track_recording([*fast, *slow], SETTINGS, together={"/fast", "/depth"})
+    tracks = track_frames([*fast, *slow], SETTINGS, together={"/fast", "/depth"})
 
     assert [track.hits for track in tracks] == [200, 20]
 
@@ -232,14 +230,14 @@ def test_frames_of_fast_camera_do_not_end_tracks_of_slow_one() -> None:
 def test_single_images_of_several_cameras_keep_every_detection(frames: int) -> None:
     """Images of other cameras are no chance to see an object again."""
     found = cameras(3, frames=frames, apart=0.6)
-    tracks = track_recording(found, SETTINGS, together={frame.topic for frame in found})
+    tracks = track_frames(found, SETTINGS, together={frame.topic for frame in found})
 
     assert sum(track.hits for track in tracks) == 6 * frames
 
 
 def test_false_detection_gets_no_track() -> None:
     frames = [frame(k, [[0, 0, 0], [0.5, 0, 0]] if k == 7 else [0, 0, 0]) for k in range(20)]
-    (track,) = track_recording(frames, SETTINGS)
+    (track,) = track_frames(frames, SETTINGS)
     assert track.hits == 20
 
 
@@ -248,7 +246,7 @@ def test_one_bad_frame_is_no_scene_cut() -> None:
     places = [[0, 0, 0], [0.3, 0, 0]]
     frames = [frame(k, [[0.1, 0.1, 0], [0.2, 0.1, 0]] if k == 9 else places) for k in range(20)]
     assert not scene_cuts(next(gather(frames)), SETTINGS).any()
-    assert [track.hits for track in track_recording(frames, SETTINGS)] == [19, 19]
+    assert [track.hits for track in track_frames(frames, SETTINGS)] == [19, 19]
 
 
 def test_one_of_two_objects_moved_is_no_scene_cut() -> None:
@@ -273,7 +271,7 @@ def test_objects_that_move_together_are_no_scene_cut(step_m: float) -> None:
     assert not scene_cuts(next(gather(frames)), SETTINGS).any()
     places_of_tracks = [
         track.centers[:, 0] - step_m / 0.5 * track.stamps_ns / SECOND
-        for track in track_recording(frames, SETTINGS)
+        for track in track_frames(frames, SETTINGS)
     ]
     assert max(np.ptp(places) for places in places_of_tracks) < 0.05
     assert len(places_of_tracks) >= 6
@@ -311,12 +309,12 @@ def test_takes_joined_without_a_pause_are_a_scene_cut() -> None:
     frames += [frame(k, after, size=(0.3, 0.2, 0.04), posterior=BOX) for k in range(10, 20)]
 
     assert np.flatnonzero(scene_cuts(next(gather(frames)), SETTINGS)).tolist() == [10]
-    assert [track.hits for track in track_recording(frames, SETTINGS)] == [10, 10, 10, 10]
+    assert [track.hits for track in track_frames(frames, SETTINGS)] == [10, 10, 10, 10]
 
 
 def test_short_gap_is_interpolated_and_long_gap_is_left_out() -> None:
     places = {k: [0.01 * min(k, 14), 0, 0] for k in [*range(10), 14, *range(101, 110)]}
-    (track,) = track_recording([frame(k, places.get(k, [])) for k in range(110)], SETTINGS)
+    (track,) = track_frames([frame(k, places.get(k, [])) for k in range(110)], SETTINGS)
     assert track.detections[9:15].tolist() == [0, -1, -1, -1, -1, 0]
     assert track.centers[12, 0] == pytest.approx(0.12)
     assert track.frames[14:17].tolist() == [14, 101, 102]
@@ -326,7 +324,7 @@ def test_short_gap_is_interpolated_and_long_gap_is_left_out() -> None:
 def test_track_ends_at_its_last_detection() -> None:
     """The last position, and those in a gap before it, must not be an earlier one."""
     frames = [frame(k, [] if 12 <= k < 15 else [[0.01 * k, 0, 0]]) for k in range(16)]
-    (track,) = track_recording(frames, SETTINGS)
+    (track,) = track_frames(frames, SETTINGS)
     assert track.detections[11:].tolist() == [0, -1, -1, -1, 0]
     assert track.centers[:, 0] == pytest.approx(0.01 * np.arange(16))
 
@@ -337,7 +335,7 @@ def test_causal_posterior_in_gap_ignores_later_views() -> None:
     frames = [
         frame(k, [[0, 0, 0]] if k in views else [], posterior=views.get(k, CUP)) for k in range(8)
     ]
-    (track,) = track_recording(frames, SETTINGS)
+    (track,) = track_frames(frames, SETTINGS)
     assert track.detections[3:6].tolist() == [-1, -1, -1]
     assert np.allclose(track.causal[2:6], CUP)
     assert track.causal[6, 0] < 0.9
@@ -346,14 +344,14 @@ def test_causal_posterior_in_gap_ignores_later_views() -> None:
 def test_object_returning_to_its_place_keeps_its_track() -> None:
     """It is out of view longer than any timeout; only stitching can join its tracks."""
     frames = [frame(k, [0, 0, 0] if k < 20 or k >= 200 else [2, 0, 0]) for k in range(220)]
-    tracks = tuple(track_recording(frames, SETTINGS))
+    tracks = tuple(track_frames(frames, SETTINGS))
     assert [track.hits for track in tracks] == [40, 180]
 
 
 def test_repeatedly_hidden_object_is_one_track() -> None:
     """Its four fragments are stitched in a chain."""
     frames = [frame(k, [] if k // 50 % 2 else [0, 0, 0]) for k in range(350)]
-    assert [track.hits for track in track_recording(frames, SETTINGS)] == [200]
+    assert [track.hits for track in track_frames(frames, SETTINGS)] == [200]
 
 
 @pytest.mark.parametrize(
@@ -433,13 +431,13 @@ def test_one_wrong_view_does_not_prevent_stitching() -> None:
     cut = [frame(k, [0, 0, 0], posterior=cup) for k in range(100, 103)]
     partial_views = [replace(seen, partial=np.ones(1, bool)) for seen in cut]
     whole = frame(103, [0, 0, 0], posterior=other)
-    tracks = tuple(track_recording([*before, *absent, *partial_views, whole], SETTINGS))
+    tracks = tuple(track_frames([*before, *absent, *partial_views, whole], SETTINGS))
     assert [track.hits for track in tracks] == [24]
 
 
 def test_streams_are_tracked_separately_and_numbered_together() -> None:
     frames = [frame(k, [0, 0, 0], topic=topic) for k in range(5) for topic in ("/a", "/b")]
-    tracks = tuple(track_recording(frames, SETTINGS))
+    tracks = tuple(track_frames(frames, SETTINGS))
     assert [(track.id, track.topic, track.hits) for track in tracks] == [(1, "/a", 5), (2, "/b", 5)]
 
 
@@ -448,7 +446,7 @@ def test_tracks_of_long_recording_stay_whole() -> None:
     random = np.random.default_rng(0)
     places = np.column_stack([np.arange(6) * 0.2, np.zeros((6, 2))])
     frames = [frame(k, places + random.normal(0, 0.01, (6, 3))) for k in range(1000)]
-    tracks = tuple(track_recording(frames, SETTINGS))
+    tracks = tuple(track_frames(frames, SETTINGS))
     assert [track.hits for track in tracks] == [1000] * 6
 
 
@@ -513,21 +511,21 @@ def boxed(frames: list[list[tuple[float, float]]]) -> list[FrameDetections]:
 
 def test_fragments_of_repeatedly_split_object_get_no_tracks() -> None:
     whole, split = [(0.0, 0.2)], [(0.0, 0.12), (0.12, 0.2)]
-    tracks = tuple(track_recording(boxed(([whole] * 3 + [split] * 3) * 6), SETTINGS))
+    tracks = tuple(track_frames(boxed(([whole] * 3 + [split] * 3) * 6), SETTINGS))
     assert [track.hits for track in tracks] == [36]
 
 
 def test_object_that_is_mostly_split_is_one_track() -> None:
     """Its size is known from the minority of frames that show it whole."""
     whole, split = [(0.0, 0.2)], [(0.0, 0.12), (0.12, 0.2)]
-    tracks = tuple(track_recording(boxed(([whole] * 3 + [split] * 7) * 4), SETTINGS))
+    tracks = tuple(track_frames(boxed(([whole] * 3 + [split] * 7) * 4), SETTINGS))
     assert [track.hits for track in tracks] == [40]
 
 
 def test_burst_of_splits_gets_no_track() -> None:
     """The fragment is never missed while the burst lasts; only other frames reveal it."""
     whole, split = [(0.0, 0.2)], [(0.0, 0.12), (0.12, 0.2)]
-    tracks = tuple(track_recording(boxed([whole] * 20 + [split] * 6 + [whole] * 20), SETTINGS))
+    tracks = tuple(track_frames(boxed([whole] * 20 + [split] * 6 + [whole] * 20), SETTINGS))
     assert [track.hits for track in tracks] == [46]
 
 
@@ -537,7 +535,7 @@ def test_pieces_are_joined_after_hours(monkeypatch: pytest.MonkeyPatch) -> None:
     other = (1.0, 1.1)
     whole, split = [(0.0, 0.2), other], [(0.0, 0.08), (0.08, 0.2), other]
     frames = boxed([[other]] * 20 + [split] * 12 + [whole] * 30)
-    assert sorted(track.hits for track in track_recording(frames, SETTINGS)) == [42, 62]
+    assert sorted(track.hits for track in track_frames(frames, SETTINGS)) == [42, 62]
 
 
 @pytest.mark.parametrize("before", [20, 2])
@@ -545,12 +543,12 @@ def test_piece_that_stands_out_of_its_object_gets_no_track(before: int) -> None:
     """Both pieces together are too large for the object, which encloses the piece's centre."""
     whole, split = [(0.0, 0.2)], [(0.0, 0.2), (0.13, 0.25)]
     frames = boxed([whole] * before + [split] * 6 + [whole] * 20)
-    assert [track.hits for track in track_recording(frames, SETTINGS)] == [before + 26]
+    assert [track.hits for track in track_frames(frames, SETTINGS)] == [before + 26]
 
 
 def test_neighbours_merged_in_some_frames_stay_two_tracks() -> None:
     one, two = [(0.0, 0.2)], [(0.0, 0.1), (0.1, 0.2)]
-    tracks = tuple(track_recording(boxed(([two] * 9 + [one]) * 4), SETTINGS))
+    tracks = tuple(track_frames(boxed(([two] * 9 + [one]) * 4), SETTINGS))
     assert [track.hits for track in tracks][1] >= 36
     assert len(tracks) == 2
 
@@ -562,7 +560,7 @@ def test_objects_merged_by_one_sensor_stay_two_tracks() -> None:
         for k in range(20)
         for topic, seen, delay_ns in (("/a", two, 0), ("/b", one, 5))
     ]
-    tracks = tuple(track_recording(frames, SETTINGS, together={"/a", "/b"}))
+    tracks = tuple(track_frames(frames, SETTINGS, together={"/a", "/b"}))
     assert len(tracks) == 2
     assert min(track.hits for track in tracks) >= 20
 
@@ -571,7 +569,7 @@ def test_objects_merged_by_one_sensor_stay_two_tracks() -> None:
 def test_object_put_into_bowl_gets_own_track(count: int) -> None:
     """Even if it is put there just before the end of the recording."""
     bowl, filled = [(0.0, 0.2)], [(0.0, 0.2), (0.1, 0.16)]
-    tracks = tuple(track_recording(boxed([bowl] * 30 + [filled] * count), SETTINGS))
+    tracks = tuple(track_frames(boxed([bowl] * 30 + [filled] * count), SETTINGS))
     assert sorted(track.hits for track in tracks) == [count, 30 + count]
 
 
@@ -579,28 +577,28 @@ def test_object_in_bowl_keeps_its_track_if_it_is_missed_once() -> None:
     """One frame more in which the bowl covers its place must not discard all of its detections."""
     bowl, filled = [(0.0, 0.2)], [(0.0, 0.2), (0.1, 0.16)]
     frames = [bowl] * 30 + [filled] * 4 + [bowl] + [filled] * 4
-    tracks = tuple(track_recording(boxed(frames), SETTINGS))
+    tracks = tuple(track_frames(boxed(frames), SETTINGS))
     assert sorted(track.hits for track in tracks) == [8, 39]
 
 
 def test_object_in_bowl_whose_size_varies_keeps_its_track() -> None:
     """In every other frame the far rim is missing, so that the bowl is smaller than it was."""
     small, bowl, inside = (0.0, 0.18), (0.0, 0.2), (0.1, 0.16)
-    tracks = track_recording(boxed([[small, inside], [bowl, inside]] * 15), SETTINGS)
+    tracks = track_frames(boxed([[small, inside], [bowl, inside]] * 15), SETTINGS)
     assert [track.hits for track in tracks] == [30, 30]
 
 
 def test_object_put_onto_plate_on_tray_gets_own_track() -> None:
     """Plate and tray both enclose its place before, which is evidence from one side only."""
     empty = [(0.0, 0.4), (0.08, 0.26)]
-    tracks = track_recording(boxed([empty] * 30 + [[*empty, (0.1, 0.16)]] * 8), SETTINGS)
+    tracks = track_frames(boxed([empty] * 30 + [[*empty, (0.1, 0.16)]] * 8), SETTINGS)
     assert sorted(track.hits for track in tracks) == [8, 38, 38]
 
 
 def test_object_entering_view_in_fragments_is_one_track() -> None:
     """Only its later size shows that they are fragments."""
     whole, split = [(0.0, 0.2)], [(0.0, 0.08), (0.08, 0.2)]
-    tracks = tuple(track_recording(boxed([split] * 12 + [whole] * 30), SETTINGS))
+    tracks = tuple(track_frames(boxed([split] * 12 + [whole] * 30), SETTINGS))
     assert [track.hits for track in tracks] == [42]
 
 
@@ -616,7 +614,7 @@ def test_object_passing_behind_post_is_one_track(partial: bool) -> None:
         )
         for k, places in enumerate(sides)
     ]
-    tracks = tuple(track_recording(frames, SETTINGS))
+    tracks = tuple(track_frames(frames, SETTINGS))
     assert [track.hits for track in tracks] == ([44] if partial else [24, 24])
 
 
@@ -626,7 +624,7 @@ def test_whole_view_joins_two_sides_of_object(in_one: bool) -> None:
     left, right = (0.0, 0.05), (0.1, 0.15)
     split, whole = [left, right], [(0.0, 0.15)]
     change = [split, whole if in_one else split, split, split, split, split]
-    tracks = tuple(track_recording(boxed([[left]] * 18 + change + [[right]] * 14), SETTINGS))
+    tracks = tuple(track_frames(boxed([[left]] * 18 + change + [[right]] * 14), SETTINGS))
     assert [track.hits for track in tracks] == ([38] if in_one else [24, 20])
 
 
@@ -635,7 +633,7 @@ def test_object_reappearing_after_gap_may_be_another() -> None:
     before = [frame(k, [0, 0, 0], posterior=CUP) for k in range(20)]
     after = [frame(k, [0.02, 0, 0], posterior=BOX, size=(0.14, 0.14, 0.1)) for k in range(28, 50)]
     tracks = tuple(
-        track_recording([*before, *(frame(k, []) for k in range(20, 28)), *after], SETTINGS)
+        track_frames([*before, *(frame(k, []) for k in range(20, 28)), *after], SETTINGS)
     )
     assert [track.hits for track in tracks] == [20, 22]
 
@@ -657,7 +655,7 @@ def turning(*, speed: float, hidden: range, frames: int = 80) -> list[FrameDetec
 def test_hidden_object_on_turntable_keeps_its_track() -> None:
     """The other objects show the rotation of the table: 1.2 rad, or 35 cm of its path."""
     frames = turning(speed=0.4, hidden=range(25, 55))
-    tracks = tuple(track_recording(frames, SETTINGS))
+    tracks = tuple(track_frames(frames, SETTINGS))
     assert sorted(track.hits for track in tracks) == [50, 80, 80, 80, 80]
     interrupted = next(track for track in tracks if track.hits == 50)
     radius = np.linalg.norm(interrupted.centers[:, :2], axis=1)
@@ -690,7 +688,7 @@ def test_backward_clock_jump_is_scene_cut() -> None:
     stamps = [*range(100, 105), *range(50, 55)]
     frames = [frame(k, [0, 0, 0], stamp_ns=s * SECOND // 5) for k, s in enumerate(stamps)]
     assert scene_cuts(next(gather(frames)), SETTINGS).tolist() == [k == 5 for k in range(10)]
-    assert [track.hits for track in track_recording(frames, SETTINGS)] == [5, 5]
+    assert [track.hits for track in track_frames(frames, SETTINGS)] == [5, 5]
 
 
 def test_late_message_is_no_scene_cut() -> None:
@@ -698,7 +696,7 @@ def test_late_message_is_no_scene_cut() -> None:
     stamps = [*range(20), 21, 20, *range(22, 40)]
     frames = [frame(k, [0, 0, 0], stamp_ns=s * SECOND // 10) for k, s in enumerate(stamps)]
     assert not scene_cuts(next(gather(frames)), SETTINGS).any()
-    assert [track.hits for track in track_recording(frames, SETTINGS)] == [40]
+    assert [track.hits for track in track_frames(frames, SETTINGS)] == [40]
 
 
 def test_late_messages_of_one_sensor_do_not_put_it_behind_the_other() -> None:
@@ -709,7 +707,7 @@ def test_late_messages_of_one_sensor_do_not_put_it_behind_the_other() -> None:
         for topic, stamps, half in (("/a", range(60), 0), ("/b", late, SECOND // 2))
         for k, s in enumerate(stamps)
     ]
-    (track,) = track_recording(frames, SETTINGS, together={"/a", "/b"})
+    (track,) = track_frames(frames, SETTINGS, together={"/a", "/b"})
     assert track.hits == 120
     assert np.diff(track.stamps_ns).min() >= -3 * SECOND // 10
 
@@ -723,7 +721,7 @@ def test_two_sensors_share_tracks_despite_clock_jump(single: bool) -> None:
             wrong = (k == 20 and topic == "/b") if single else k >= 20
             stamp = k * SECOND // 10 + delay_ns - (1000 * SECOND if wrong else 0)
             frames.append(frame(k, [0, 0, 0], stamp_ns=stamp, topic=topic))
-    tracks = tuple(track_recording(frames, SETTINGS, together={"/a", "/b"}))
+    tracks = tuple(track_frames(frames, SETTINGS, together={"/a", "/b"}))
     assert [track.hits for track in tracks] == [40, 40]
     assert all(track.topics.count("/b") == 20 for track in tracks)
 
@@ -742,7 +740,7 @@ def test_scraps_at_image_border_are_no_scene_cut(per_s: int) -> None:
         for k, size in enumerate(sizes)
     ]
     assert not scene_cuts(next(gather(frames)), SETTINGS).any()
-    assert [track.hits for track in track_recording(frames, SETTINGS)] == [22]
+    assert [track.hits for track in track_frames(frames, SETTINGS)] == [22]
 
 
 def test_slow_views_past_an_occluder_are_no_scene_cut() -> None:
@@ -767,7 +765,7 @@ def test_gap_is_interpolated_in_time_not_frames() -> None:
         frame(k, [] if s == 1.8 else [0.2 * s, 0.0, 0.1], stamp_ns=round(s * SECOND))
         for k, s in enumerate(seconds)
     ]
-    (track,) = track_recording(frames, SETTINGS)
+    (track,) = track_frames(frames, SETTINGS)
     assert track.detections[11] == -1
     np.testing.assert_allclose(track.centers[:, 0], 0.2 * np.array(seconds), atol=1e-6)
 
@@ -775,7 +773,7 @@ def test_gap_is_interpolated_in_time_not_frames() -> None:
 def test_unlimited_timeout_is_allowed() -> None:
     """A time beyond 64 bits of nanoseconds must not end in an error."""
     frames = [frame(k, [0, 0, 0] if k % 20 < 10 else []) for k in range(60)]
-    (track,) = track_recording(frames, replace(SETTINGS, max_missed_s=1e12))
+    (track,) = track_frames(frames, replace(SETTINGS, max_missed_s=1e12))
     assert track.hits == 30
 
 
@@ -805,7 +803,7 @@ def test_posterior_after_each_view_uses_fusion_of_settings() -> None:
     """The last one is that of the track, in the report and in the table."""
     views = [np.array(view) for view in ((0.9, 0.1), (0.4, 0.6), (0.45, 0.55))]
     frames = [frame(k, [0, 0, 0], posterior=view) for k, view in enumerate(views)]
-    (track,) = track_recording(frames, replace(SETTINGS, fusion="vote"))
+    (track,) = track_frames(frames, replace(SETTINGS, fusion="vote"))
 
     np.testing.assert_allclose(track.causal, [[1.0, 0.0], [0.5, 0.5], [1 / 3, 2 / 3]])
     np.testing.assert_allclose(track.posterior, [1 / 3, 2 / 3])
@@ -822,7 +820,7 @@ def test_track_posterior_uses_view_weights() -> None:
         )
         for k in range(6)
     ]
-    (track,) = track_recording(frames, SETTINGS)
+    (track,) = track_frames(frames, SETTINGS)
 
     share = (3 * np.log(CUP) + 0.75 * np.log(BOX)) / 3.75
     np.testing.assert_allclose(track.posterior, np.exp(share) / np.exp(share).sum(), atol=1e-9)
@@ -872,7 +870,7 @@ def test_cup_shown_briefly_beside_tall_bottle_keeps_its_track() -> None:
     for k in range(40):
         seen = [[0.0, 0, 0.155], [0.1, 0, 0.05]] if 20 <= k < 24 else [[0.0, 0, 0.155]]
         frames.append(frame(k, seen, size=[bottle, cup][: len(seen)]))
-    assert [track.hits for track in track_recording(frames, SETTINGS)] == [40, 4]
+    assert [track.hits for track in track_frames(frames, SETTINGS)] == [40, 4]
 
 
 def test_fragment_is_joined_to_only_one_of_two_predecessors() -> None:

@@ -11,7 +11,8 @@ from scipy.optimize import linear_sum_assignment
 
 from shapecat.arrays import F8
 from shapecat.config import TrackingSettings
-from shapecat.tracking import FrameDetections, Track, track_recording
+from shapecat.tracking import Track
+from tests.frame_detections import FrameDetections, track_frames
 
 SETTINGS = TrackingSettings()
 SEEDS = range(100, 106)
@@ -330,7 +331,7 @@ def test_identities_survive_noise_misses_splits_and_occlusions(
     scores = []
     for seed in SEEDS[:count]:
         rows, truth = recorded(scene, seed)
-        scores.append(score(tuple(track_recording(rows, settings)), truth))
+        scores.append(score(tuple(track_frames(rows, settings)), truth))
     assert np.mean([s.idf1 for s in scores]) >= idf1
     assert np.mean([s.mota for s in scores]) >= mota
     assert sum(s.switches for s in scores) <= switches * count / len(SEEDS)
@@ -340,7 +341,7 @@ def test_score_agrees_with_motmetrics() -> None:
     """Guards the metrics themselves."""
     motmetrics = pytest.importorskip("motmetrics")
     rows, truth = record(*turntable(7), 7)
-    tracks = tuple(track_recording(rows, SETTINGS))
+    tracks = tuple(track_frames(rows, SETTINGS))
     visible = [
         Truth({k: p for k, p in t.places.items() if k not in t.hidden}, set()) for t in truth
     ]

@@ -11,17 +11,17 @@ from scipy.spatial.transform import Rotation
 
 from shapecat.arrays import F8
 from shapecat.config import TrackingSettings
-from shapecat.tracking import track_recording, tracker
+from shapecat.tracking import tracker
 from shapecat.tracking.association import size_key
 from shapecat.tracking.common_motion import CommonMotion, _fit, _in_space, _level
-from shapecat.tracking.detection_table import DetectionTable, gather
+from shapecat.tracking.detection_table import DetectionTable
 from shapecat.tracking.false_tracks import _in_box
 from shapecat.tracking.pieces import _fit as fit_pieces
 from shapecat.tracking.pieces import _joint, _largest, _time_overlap
 from shapecat.tracking.recording import _describe, _line, _needed
-from shapecat.tracking.records import FrameDetections
 from shapecat.tracking.stitching import Fragments, _contradiction, _distances
 from shapecat.tracking.tracker import Tracker
+from tests.frame_detections import FrameDetections, gather, track_frames
 
 SETTINGS = TrackingSettings()
 SECOND = 1_000_000_000
@@ -301,7 +301,7 @@ def test_tracks_of_all_sensors_are_numbered_by_birth() -> None:
     """Users expect #1 to be the first object that appears."""
     late = [frame(k, [0.3, 0.1, 1.0], topic="/a") for k in range(5, 15)]
     early = [frame(k, [0.6, 0.2, 1.1], topic="/b") for k in range(10)]
-    found = list(track_recording([*late, *early], SETTINGS))
+    found = list(track_frames([*late, *early], SETTINGS))
 
     assert [(track.id, track.topic) for track in found] == [(1, "/b"), (2, "/a")]
     assert_allclose(found[0].centers[0], [0.6, 0.2, 1.1], atol=1e-6)

@@ -1,7 +1,7 @@
 """Track the detections of a run, and write the tables of tracks."""
 
 from collections import Counter
-from collections.abc import Iterable, Iterator, Sequence
+from collections.abc import Collection, Iterable, Iterator, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -16,9 +16,9 @@ from shapecat.runs.full_boxes import FullBoxes, full_columns
 from shapecat.runs.labels.track_table import ORIGINAL, write_csv
 from shapecat.runs.tables.placed_frames import DetectedFrames, streams_with_poses
 from shapecat.runs.tables.reading import (
-    Key,
     first_stamp,
     frame_rows,
+    keys_of,
     numbers,
     numbers_or_nan,
     read_together,
@@ -27,13 +27,12 @@ from shapecat.runs.tables.schemas import TRACKS
 from shapecat.runs.tables.writing import arrow_table, open_writer, rows_as_lists
 from shapecat.system.files import replacing
 from shapecat.system.memory import release_memory
-from shapecat.tracking import FrameDetections, Track, track_recording
+from shapecat.tracking import DetectionTable, TableBuilder, Track, track_recording
 from shapecat.types import UNKNOWN
 
 __all__ = ["track_run"]
 
 _BATCH = 2**17  # rows of tracks.parquet written at a time
-_NO_TURN = (1.0, 0.0, 0.0, 0.0, 1.0, 0.0, 0.0, 0.0, 1.0)
 _CSV = {
     "track": "",
     "first_s": ".3f",
@@ -64,6 +63,8 @@ _COLUMNS = (
     "touches_border",
     "occluded",
 )
+_UNMOVED = ("numbers", "sizes", "posteriors", "novelties", "partial", "described")
+"""Columns of `DetectionTable` that are the same in every coordinate frame."""
 
 
 def track_run(
@@ -84,8 +85,7 @@ def track_run(
     OutputError : a table of the run is unreadable, or a table cannot be written.
     """
     placed = streams_with_poses(folder)
-    frames = _read_frames(folder, len(categories), placed)
-    tracks = track_recording(frames, settings, together=placed)
+    tracks = track_recording(_read_streams(folder, len(categories), placed), settings)
     lines, start_ns = [], first_stamp(folder)
     with replacing(folder / "tracks.parquet") as path, open_writer(path, TRACKS) as writer:
         release_memory()
@@ -137,63 +137,65 @@ def _parts(tracks: list[Track]) -> Iterator[tuple[list[Track], slice]]:
         yield [tracks[0].part(rows)], rows
 
 
-def _read_frames(folder: Path, categories: int, fixed: set[str]) -> Iterator[FrameDetections]:
-    """Yield the detections of each frame, numbered by their rows in the table.
+def _read_streams(folder: Path, categories: int, placed: set[str]) -> Iterator[DetectionTable]:
+    """Yield the detections of each stream, numbered by their rows in the table.
 
-    They are in the fixed frame for the topics in ``fixed``, else in the sensor frame.
+    The topics ``placed`` are one stream, in the fixed frame; every other topic is one of its own,
+    in the sensor frame.
     """
-    frame_columns, count = ["topic", "frame", "stamp_ns", "fixed_rotation"], 0
-    for frames, detections in read_together(
-        folder, {"frames": frame_columns, "detections": _COLUMNS}
-    ):
-        rows, columns = frame_rows(detections), _columns_of(detections, categories)
-        columns["row"] = np.arange(count, count + detections.num_rows)
+    streams: dict[str, TableBuilder] = {}
+    count = 0
+    columns = {"frames": ("topic", "frame", "stamp_ns", "fixed_rotation"), "detections": _COLUMNS}
+    for frames, detections in read_together(folder, columns):
+        keys, rows_of_key = keys_of(frames), frame_rows(detections)
+        streams_of_frames = ["" if topic in placed else topic for topic, _ in keys]
+        values = _columns_of(detections, categories)
+        values["numbers"] = np.arange(count, count + detections.num_rows)
         count += detections.num_rows
-        rows_of_frames = frames.to_pylist()
-        turns = np.tile(_NO_TURN, (detections.num_rows, 1))
-        for frame in rows_of_frames:
-            if frame["topic"] in fixed and frame["fixed_rotation"]:
-                turns[_rows_of(frame, rows)] = frame["fixed_rotation"]
-        columns["orientation"] = _turned(columns["orientation"], turns.reshape(-1, 3, 3))
-        for frame in rows_of_frames:
-            of_frame = _rows_of(frame, rows)
-            values_of_frame = {name: values[of_frame] for name, values in columns.items()}
-            if frame["topic"] in fixed:
-                placed = ~np.isnan(values_of_frame["center_fixed"][:, 0])
-                values_of_frame = {name: values[placed] for name, values in values_of_frame.items()}
-            yield FrameDetections(
-                topic=frame["topic"],
-                frame=frame["frame"],
-                stamp_ns=frame["stamp_ns"],
-                detections=values_of_frame["row"],
-                centers=values_of_frame["center_fixed" if frame["topic"] in fixed else "center"],
-                sizes=values_of_frame["size"],
-                posteriors=values_of_frame["posterior"],
-                partial=values_of_frame["partial"],
-                novelties=values_of_frame["novelty"],
-                orientations=values_of_frame["orientation"],
-                described=values_of_frame["described"],
+        stamps_ns, turns = numbers(frames["stamp_ns"]), _turns_of(frames, placed)
+        for stream in dict.fromkeys(streams_of_frames):
+            own = [k for k, name in enumerate(streams_of_frames) if name == stream]
+            spans = [rows_of_key.get(keys[k], slice(0, 0)) for k in own]
+            rows = np.concatenate([np.arange(span.start, span.stop) for span in spans])
+            frame_of = np.repeat(own, [span.stop - span.start for span in spans])
+            centers = values["center" if stream else "center_fixed"][rows]
+            known = ~np.isnan(centers[:, 0])
+            rows, frame_of = rows[known], frame_of[known]
+            streams.setdefault(stream, TableBuilder(categories)).add(
+                [keys[k][0] for k in own],
+                frames=[keys[k][1] for k in own],
+                stamps_ns=stamps_ns[own],
+                counts=np.bincount(frame_of, minlength=len(keys))[own],
+                centers=centers[known],
+                orientations=_turned(values["orientation"][rows], turns[frame_of]),
+                **{name: values[name][rows] for name in _UNMOVED},
             )
+    while streams:  # free each stream as soon as possible
+        yield streams.pop(next(iter(streams))).table()
 
 
 def _columns_of(table: pa.Table, categories: int) -> dict[str, Any]:
     """Return the columns for the tracker as arrays; ``center_fixed`` is NaN if unknown."""
-    columns = {"novelty": table["novelty"].to_numpy()}
-    widths = {"center": 3, "size": 3, "orientation": 4, "posterior": categories}
-    for name, width in widths.items():
-        columns[name] = numbers(table[name]).reshape(-1, width)
     first = table["reused_from"].combine_chunks()
-    columns["described"] = np.where(first.is_null(), table["frame"], first.fill_null(0))
-    columns["center_fixed"] = numbers_or_nan(table["center_fixed"]).astype(np.float64)
-    columns["partial"] = np.logical_or(
-        *(table[n].to_numpy() for n in ("touches_border", "occluded"))
-    )
-    return columns
+    cut_off = (table[name].to_numpy() for name in ("touches_border", "occluded"))
+    return {
+        "center": numbers(table["center"]).reshape(-1, 3),
+        "center_fixed": numbers_or_nan(table["center_fixed"]),
+        "orientation": numbers(table["orientation"]).reshape(-1, 4),
+        "sizes": numbers(table["size"]).reshape(-1, 3),
+        "posteriors": numbers(table["posterior"]).reshape(-1, categories),
+        "novelties": table["novelty"].to_numpy(),
+        "partial": np.logical_or(*cut_off),
+        "described": np.where(first.is_null(), table["frame"], first.fill_null(0)),
+    }
 
 
-def _rows_of(frame: dict[str, Any], rows: dict[Key, slice]) -> slice:
-    """Return the rows of a frame's detections; none if it is not in ``rows``."""
-    return rows.get((frame["topic"], frame["frame"]), slice(0, 0))
+def _turns_of(frames: pa.Table, placed: Collection[str]) -> F8:
+    """Return the rotations (f, 3, 3) to the fixed frame; the identity for topics not ``placed``."""
+    turns = numbers_or_nan(frames["fixed_rotation"]).reshape(-1, 3, 3)
+    moved = np.array([topic in placed for topic in frames["topic"].to_pylist()])
+    moved = moved[:, None, None] & ~np.isnan(turns)
+    return np.where(moved, turns, np.eye(3))
 
 
 def _turned(orientations: F4, turns: F8) -> F8:

@@ -1,6 +1,6 @@
 """All detections of a stream in columns, with look-ups by frame and by track."""
 
-from collections.abc import Collection, Iterable, Iterator, Sequence
+from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass, replace
 from heapq import merge
 from typing import Any, Self
@@ -10,14 +10,13 @@ from scipy.spatial.transform import Rotation
 
 from shapecat.arrays import F4, F8, I4, Bool
 from shapecat.tracking.fusion import view_weights
-from shapecat.tracking.records import FrameDetections
 
-__all__ = ["DetectionTable", "gather"]
+__all__ = ["DetectionTable", "TableBuilder"]
 
 _BLOCK = 2**16  # detections processed at once
 _SET_BACK_NS = 1_000_000_000  # a clock was set back by more than this; late messages differ by less
 
-_OF_FRAMES = {"topics": "i4", "frames": "i4", "stamps_ns": "i8"}
+_OF_FRAMES = {"topics": "i4", "frames": "i4", "stamps_ns": "i8", "counts": "i4"}
 _OF_DETECTIONS: dict[str, tuple[str, tuple[Any, ...]]] = {
     "numbers": ("i4", ()),
     "centers": ("f8", (3,)),
@@ -42,9 +41,17 @@ class DetectionTable:
     topics, frames, stamps_ns : (f,) index into ``names``, number and time of each frame.
     first : (f + 1,) index of the first detection of each frame.
     rows : (n,) index of the frame of each detection, ascending.
-    numbers, centers, sizes, posteriors, partial, novelties, described : (n, ...) as ``detections``
-        and the other columns in `FrameDetections`.
-    orientations : (n, 4) quaternions (x, y, z, w) of the boxes; None if some detections have none.
+    numbers : (n,) numbers of the detections, by which tracks name them.
+    centers : (n, 3) centres of the boxes, metres, in the fixed frame; in the sensor frame if the
+        recording has no fixed frame. All frames of a stream use the same coordinate frame.
+    sizes : (n, 3) lengths of the boxes, metres; the third one is along the up direction.
+    posteriors : (n, c) posteriors of the single views; each sums to 1.
+    partial : (n,) whether the image border or an occluder cuts the object.
+    novelties : (n,) novelties of the single views.
+    orientations : (n, 4) unit quaternions (x, y, z, w) of the boxes, in the frame of the centres;
+        None if they are not needed.
+    described : (n,) number of the frame whose description each detection repeats, its own number
+        if it was described itself.
     """
 
     names: tuple[str, ...]
@@ -156,74 +163,56 @@ class DetectionTable:
         return which if len(self.names) == 1 else which[self.sees(track, self.rows[which])]
 
 
-def gather(
-    frames: Iterable[FrameDetections], together: Collection[str] = ()
-) -> Iterator[DetectionTable]:
-    """Yield the table of each stream; the topics ``together`` form one stream, sorted by time."""
-    streams: dict[str, _Gathered] = {}
-    for frame in frames:
-        name = "" if frame.topic in together else frame.topic
-        streams.setdefault(name, _Gathered()).add(frame)
-    while streams:  # free each stream as soon as possible
-        yield DetectionTable(**streams.pop(next(iter(streams))).columns())
+class TableBuilder:
+    """Joins the frames of a stream, as they are read, to its `DetectionTable`.
 
+    Columns are bytes that grow, since arrays in parts would be in memory twice when joined.
+    """
 
-class _Gathered:
-    """The columns of a stream while it is being read, as bytes that grow."""
-
-    def __init__(self) -> None:
+    def __init__(self, categories: int) -> None:
         self._names: dict[str, int] = {}
-        self._counts: list[int] = []
         self._bytes = {name: bytearray() for name in (*_OF_FRAMES, *_OF_DETECTIONS)}
-        self._categories = 0
-
-    def add(self, frame: FrameDetections) -> None:
-        """Append the detections of the next frame."""
-        count, categories = frame.posteriors.shape
-        topic = self._names.setdefault(frame.topic, len(self._names))
-        self._counts.append(count)
-        frame_values = {"topics": topic, "frames": frame.frame, "stamps_ns": frame.stamp_ns}
-        for name, kind in _OF_FRAMES.items():
-            self._bytes[name] += np.array(frame_values[name], kind).tobytes()
-        if count == 0:
-            return
         self._categories = categories
-        for name, (kind, _) in _OF_DETECTIONS.items():
-            self._bytes[name] += np.asarray(_column(frame, name), kind).tobytes()
 
-    def columns(self) -> dict[str, Any]:
-        """Return the columns of `DetectionTable`, and free the bytes they were made from."""
-        counts = np.array(self._counts, np.int32)
-        of_frames = {name: self._pop_column(name, kind) for name, kind in _OF_FRAMES.items()}
+    def add(self, topics: Iterable[str], **columns: Any) -> None:
+        """Append the next frames and their detections, each topic in recording order.
+
+        Parameters
+        ----------
+        topics : of each frame.
+        columns : ``frames``, ``stamps_ns`` and ``counts`` (f,), number, time and number of
+            detections of each frame; and all columns of its detections in `DetectionTable`.
+        """
+        names = self._names
+        columns["topics"] = [names.setdefault(topic, len(names)) for topic in topics]
+        for name, kind in _OF_FRAMES.items():
+            self._bytes[name] += np.asarray(columns[name], kind).tobytes()
+        for name, (kind, _) in _OF_DETECTIONS.items():
+            self._bytes[name] += np.asarray(columns[name], kind).tobytes()
+
+    def table(self) -> DetectionTable:
+        """Return the table of the stream, sorted by time; the builder is of no use afterwards."""
+        of_frames = {name: self._column(name, kind) for name, kind in _OF_FRAMES.items()}
+        counts = of_frames.pop("counts")
         which: Any = slice(None)
-        frames: Any = slice(None)
         if len(self._names) > 1:
             frames = _by_time(of_frames["topics"], of_frames["stamps_ns"])
             first = np.cumsum(counts) - counts
             which = np.concatenate([np.arange(first[k], first[k] + counts[k]) for k in frames])
-        counts = counts[frames]
-        columns = {name: values[frames] for name, values in of_frames.items()}
-        columns["first"] = np.concatenate([[0], np.cumsum(counts)])
-        columns["rows"] = np.repeat(np.arange(len(counts), dtype=np.int32), counts)
-        total = len(columns["rows"])
-        for name, (kind, shape) in _OF_DETECTIONS.items():
-            values = self._pop_column(name, kind)
-            widths = tuple(self._categories if width == "c" else width for width in shape)
-            complete = values.size == total * int(np.prod(widths))
-            columns[name] = values.reshape(total, *widths)[which] if complete else None
-        return {"names": tuple(self._names), **columns}
+            counts = counts[frames]
+            of_frames = {name: values[frames] for name, values in of_frames.items()}
+        return DetectionTable(
+            names=tuple(self._names),
+            **of_frames,
+            first=np.concatenate([[0], np.cumsum(counts)]),
+            rows=np.repeat(np.arange(len(counts), dtype=np.int32), counts),
+            **{name: self._column(name, *kind)[which] for name, kind in _OF_DETECTIONS.items()},
+        )
 
-    def _pop_column(self, name: str, kind: str) -> Any:
-        return np.frombuffer(self._bytes.pop(name), kind)
-
-
-def _column(frame: FrameDetections, name: str) -> Any:
-    if name == "numbers":
-        return frame.detections
-    if name == "described" and frame.described is None:
-        return np.full(len(frame.detections), frame.frame)
-    values = getattr(frame, name)
-    return () if values is None else values
+    def _column(self, name: str, kind: str, shape: tuple[Any, ...] = ()) -> Any:
+        """Return a column as an array over its bytes, which are given away."""
+        widths = (self._categories if width == "c" else width for width in shape)
+        return np.frombuffer(self._bytes.pop(name), kind).reshape(-1, *widths)
 
 
 def _by_time(topics: I4, stamps_ns: I4) -> Any:

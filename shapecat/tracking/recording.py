@@ -1,6 +1,6 @@
 """From the detections of a recording to its tracks, offline: later frames are known."""
 
-from collections.abc import Collection, Iterable, Iterator, Sequence
+from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -8,11 +8,11 @@ import numpy as np
 from shapecat.arrays import F8, I4, Bool
 from shapecat.config import TrackingSettings
 from shapecat.tracking.common_motion import CommonMotion, find_common_motion
-from shapecat.tracking.detection_table import DetectionTable, gather
+from shapecat.tracking.detection_table import DetectionTable
 from shapecat.tracking.false_tracks import without_pieces
 from shapecat.tracking.fusion import causal, fuse, fuse_novelty
 from shapecat.tracking.pieces import join_pieces
-from shapecat.tracking.records import FrameDetections, Track
+from shapecat.tracking.records import Track
 from shapecat.tracking.stitching import Fragments, merge_fragments, scene_cuts
 from shapecat.tracking.tracker import Tracker
 
@@ -26,18 +26,15 @@ _LINE = 10  # detections at either end of a track from which its motion is estim
 
 
 def track_recording(
-    frames: Iterable[FrameDetections],
-    settings: TrackingSettings,
-    *,
-    together: Collection[str] = (),
+    tables: Iterable[DetectionTable], settings: TrackingSettings
 ) -> Iterator[Track]:
     """Track the objects of a recording, stream by stream.
 
     Parameters
     ----------
-    frames : all frames, including those without detections, each stream in recording order.
-    together : topics whose centres are in the same coordinate frame; an object seen by several of
-        these sensors gets one track.
+    tables : of each stream, with its frames without detections. A stream has one topic, or those
+        whose centres are in the same coordinate frame: an object seen by several of these sensors
+        gets one track.
 
     Returns
     -------
@@ -50,7 +47,7 @@ def track_recording(
     -----
     Time and memory grow linearly with the number of detections, memory by some 100 bytes each.
     """
-    streams = [_track_stream(table, settings) for table in gather(frames, together)]
+    streams = [_track_stream(table, settings) for table in tables]
     tracks = [(stream, track) for stream in streams for track in stream.tracks]
     tracks.sort(key=lambda item: item[0].born_ns(item[1]))  # stable: then stream, then birth
     return (_build_track(k, *item, settings) for k, item in enumerate(tracks, 1))

@@ -1,44 +1,10 @@
-"""Input and output records of the tracker."""
+"""The output record of the tracker."""
 
 from dataclasses import replace
 
-from shapecat.arrays import F4, F8, I4, Bool, Record, array
+from shapecat.arrays import F4, F8, I4, Record, array
 
-__all__ = ["FrameDetections", "Track"]
-
-
-class FrameDetections(Record):
-    """The detections of one frame as input of the tracker; a frame may have none.
-
-    Attributes
-    ----------
-    topic : the stream.
-    frame : number of the frame in its stream.
-    stamp_ns : time of the measurement.
-    detections : (n,) numbers of the detections, by which tracks name them.
-    centers : (n, 3) centres of the boxes, metres, in the fixed frame; in the sensor frame if the
-        recording has no fixed frame. All frames of a stream use the same coordinate frame.
-    sizes : (n, 3) lengths of the boxes, metres; the third one is along the up direction.
-    posteriors : (n, c) posteriors of the single views; each sums to 1.
-    partial : (n,) whether the image border or an occluder cuts the object.
-    novelties : (n,) novelties of the single views.
-    orientations : (n, 4) unit quaternions (x, y, z, w) of the boxes, in the frame of the centres;
-        None if unknown.
-    described : (n,) number of the frame whose description each detection repeats, its own number
-        if it was described itself; None if all were.
-    """
-
-    topic: str
-    frame: int
-    stamp_ns: int
-    detections: I4 = array("n", "i4")
-    centers: F8 = array("n 3", "f8")
-    sizes: F4 = array("n 3", "f4")
-    posteriors: F4 = array("n c", "f4")
-    partial: Bool = array("n", "?")
-    novelties: F4 = array("n", "f4")
-    orientations: F4 | None = array("n 4", "f4", default=None)
-    described: I4 | None = array("n", "i4", default=None)
+__all__ = ["Track"]
 
 
 class Track(Record):
@@ -54,8 +20,8 @@ class Track(Record):
     hits : number of rows with a detection.
     frames : (k,) numbers of the frames in their streams, in temporal order.
     stamps_ns : (k,) times of the frames.
-    detections : (k,) number of the detection in `FrameDetections`, -1 where the track coasts.
-    centers : (k, 3) metres, in the coordinate frame of `FrameDetections.centers`.
+    detections : (k,) number of the detection in `DetectionTable`, -1 where the track coasts.
+    centers : (k, 3) metres, in the coordinate frame of `DetectionTable.centers`.
     causal : (k, c) fused posterior of the views up to each row, over the c categories.
     posterior : (c,) fused posterior of all views.
     confidence : largest entry of `posterior`.
