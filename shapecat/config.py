@@ -53,7 +53,7 @@ class DetectionSettings:
 
 @dataclass(frozen=True)
 class SurfaceSettings:
-    """Growing Neural Gas (thesis ch. 5)."""
+    """Growing Neural Gas (thesis ch. 5). Every model is trained with the defaults."""
 
     method: Literal["fritzke", "thesis"] = "fritzke"
     """Insertion of neurons: `fritzke` at a fixed interval of signals (thesis, Algorithm 3),

@@ -354,5 +354,6 @@ def test_frames_that_cannot_be_fused_are_reported(job: Job, tmp_path: Path) -> N
     source = write(tmp_path / "still.mcap", items)
     process(replace(job, source=source))
 
-    (warning,) = read_run(job.folder)["warnings"]
+    warning, of_surface = read_run(job.folder)["warnings"]
     assert "the pose of the sensor is unknown (frames: 4)" in warning
+    assert of_surface.startswith("changed surface.neurons")

@@ -1,8 +1,14 @@
-"""Find what may cost a run its tracks: missing planes, wrong poses, clocks that differ."""
+"""Find what may cost a run tracks or categories.
 
-from collections.abc import Iterator
+These are missing planes, wrong poses, clocks that differ, surfaces other than those of training.
+"""
+
+from collections.abc import Iterator, Mapping
+from dataclasses import asdict
 from pathlib import Path
+from typing import Any
 
+from shapecat.config import SurfaceSettings
 from shapecat.recordings import Recording
 from shapecat.runs.perceive.clocks import explain_clocks
 from shapecat.runs.perceive.misplacement import explain_misplacement
@@ -14,15 +20,30 @@ __all__ = ["explain_doubts"]
 
 
 def explain_doubts(recording: Recording, folder: Path, run: RunInfo) -> Iterator[str]:
-    """Yield a warning for each thing that may cost the run tracks.
+    """Yield a warning for each thing that may cost the run tracks or categories.
 
     Parameters
     ----------
     folder : with the tables of the perceived frames.
     """
+    yield from _explain_surfaces(run["settings"]["surface"])
     yield from explain_missing_planes(recording, folder, run)
     fixed_frame = run["fixed_frame"]
     if fixed_frame is not None:
         yield from explain_jumps(folder, fixed_frame)
         yield from explain_misplacement(folder, fixed_frame)
         yield from explain_clocks(folder)
+
+
+def _explain_surfaces(settings: Mapping[str, Any]) -> Iterator[str]:
+    """Yield a warning if surfaces are made with other settings than those of every training."""
+    changed = [
+        f"surface.{name}"
+        for name, value in asdict(SurfaceSettings()).items()
+        if settings[name] != value
+    ]
+    if changed:
+        yield (
+            f"changed {', '.join(changed)}: every model is trained with the defaults, so "
+            "categories may be wrong, and more objects unknown"
+        )
