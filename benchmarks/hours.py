@@ -7,7 +7,6 @@ Eight objects stand on a table in front of a moving camera. Each is missed in so
 removed for a while every few minutes; false detections appear for a few frames.
 """
 
-import os
 import tempfile
 import time
 from concurrent.futures import ProcessPoolExecutor
@@ -121,7 +120,6 @@ def measure(frames: int) -> tuple[float, float, int]:
     """Track a synthetic run in a process of its own; return as `_track`."""
     with tempfile.TemporaryDirectory() as name:
         make_tables(Path(name), frames)
-        os.environ.setdefault("ARROW_DEFAULT_MEMORY_POOL", "system")  # as the command does
         with ProcessPoolExecutor(1, mp_context=get_context("spawn")) as pool:
             return pool.submit(_track, Path(name)).result()
 

@@ -2,7 +2,6 @@
 
 import errno
 import logging
-import os
 import sys
 from typing import Any
 
@@ -69,8 +68,6 @@ def main() -> None:
     shapecat process demo.mcap --out results  find, categorize and track objects
     shapecat view results/demo                review them in Rerun
     """
-    # Unlike Arrow's default, the system's allocator returns freed memory during long recordings.
-    os.environ.setdefault("ARROW_DEFAULT_MEMORY_POOL", "system")
     logging.basicConfig(level=logging.ERROR, stream=sys.stderr, format="%(levelname)s %(message)s")
 
 

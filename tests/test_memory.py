@@ -1,7 +1,12 @@
 """Test that memory does not grow with the length of a recording."""
 
 import gc
+import os
+import subprocess
+import sys
 from pathlib import Path
+
+import pytest
 
 from shapecat.pipeline import process
 from shapecat.runs.jobs import Job
@@ -31,3 +36,22 @@ def test_memory_does_not_grow_with_number_of_frames(tmp_path: Path) -> None:
 
     assert resident[257] - resident[97] < 8 << 20
     assert alive[257] < alive[97] + 400  # a segment that is not written yet has 200
+
+
+@pytest.mark.parametrize("chosen", [None, "mimalloc"])
+def test_arrow_uses_the_allocator_of_the_system_unless_the_user_chose_one(
+    chosen: str | None,
+) -> None:
+    """A user's choice was respected by the command, and then replaced."""
+    name = "ARROW_DEFAULT_MEMORY_POOL"
+    variables = {key: value for key, value in os.environ.items() if key != name}
+    variables |= {} if chosen is None else {name: chosen}
+    code = (
+        "from shapecat.runs.tables import reading; import pyarrow; "
+        "print(pyarrow.default_memory_pool().backend_name)"
+    )
+    done = subprocess.run(
+        [sys.executable, "-c", code], check=True, capture_output=True, text=True, env=variables
+    )
+
+    assert done.stdout.strip() == (chosen or "system")

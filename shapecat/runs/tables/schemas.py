@@ -25,9 +25,6 @@ __all__ = [
     "TRACKS",
 ]
 
-# Arrow's own allocator holds 50 MB more while a long recording is read, and takes longer.
-pa.set_memory_pool(pa.system_memory_pool())
-
 SCHEMA_VERSION = "1"
 
 _VEC3 = pa.list_(pa.float32(), 3)
