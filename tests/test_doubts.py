@@ -1,12 +1,32 @@
-"""Tests of the warning about surfaces made with other settings than those of training."""
+"""Tests of the warnings about what may cost a run tracks or categories."""
 
 import json
 from collections.abc import Callable
 from pathlib import Path
+from typing import Any
 
+import pytest
 from click.testing import Result
 
+from shapecat.config import Settings
+from shapecat.runs.perceive import doubts
+from tests.run_info import run_info
 from tests.scenes import record
+
+
+@pytest.mark.parametrize("fixed_frame", ["map", None])
+def test_every_doubt_is_looked_for(
+    monkeypatch: pytest.MonkeyPatch, tmp_path: Path, fixed_frame: str | None
+) -> None:
+    """Without a fixed frame, there are no poses to doubt, and sensors are tracked apart."""
+    of_poses = ["explain_jumps", "explain_misplacement", "explain_clocks"]
+    for name in ("explain_missing_planes", *of_poses):
+        monkeypatch.setattr(doubts, name, lambda *_, name=name: iter([name]))
+    run = run_info(fixed_frame=fixed_frame, settings=Settings().as_dict())
+    recording: Any = None
+    found = list(doubts.explain_doubts(recording, tmp_path, run))
+
+    assert found == ["explain_missing_planes", *(of_poses if fixed_frame else [])]
 
 
 def test_changed_surfaces_are_reported_once(
