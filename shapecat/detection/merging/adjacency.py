@@ -112,7 +112,7 @@ def _count(
         if p == 0:
             continue
         ahead = inv_depth[i, j] - inv_depth[y, x]
-        statistics[p].upper_silhouette += fall > steep and ahead > jump
+        statistics[p].lower_edge_free += fall > steep and ahead > jump
         if q == 0:
             if ahead < -jump:
                 statistics[p].hidden += 1

@@ -29,7 +29,7 @@ SEGMENT_FEATURES = np.dtype(
         ("plane_contact", "f4"),  # fractions of the boundary
         ("hidden", "f4"),
         ("shelf_edge", "f4"),
-        ("upper_silhouette", "f4"),
+        ("lower_edge_free", "f4"),
         ("touching", "f4"),
         ("in_front", "f4"),
         ("behind", "f4"),
@@ -106,7 +106,7 @@ def write_segment_features(segments: Segments, p: int, out: Row) -> None:
     out.plane_contact = share(row.plane_contact, boundary)
     out.hidden = share(row.hidden, boundary)
     out.shelf_edge = share(row.shelf_edge, boundary)
-    out.upper_silhouette = share(row.upper_silhouette, boundary)
+    out.lower_edge_free = share(row.lower_edge_free, boundary)
     out.touching = share(touching, boundary)
     out.in_front = share(in_front, boundary)
     out.behind = share(behind, boundary)

@@ -57,7 +57,7 @@ SEGMENT = np.dtype(
         ("plane_contact", "f4"),  # boundary with its plane
         ("hidden", "f4"),  # boundary behind a surface of no segment
         ("shelf_edge", "f4"),  # boundary with another plane
-        ("upper_silhouette", "f4"),  # lower boundary in front of a farther surface
+        ("lower_edge_free", "f4"),  # lower boundary in front of a farther surface
     ],
     align=True,
 )
