@@ -25,7 +25,8 @@ from shapecat.detection.planes.height_map import (
 )
 from shapecat.detection.planes.horizontal import find_horizontal_planes
 from shapecat.detection.planes.oriented_points import level_samples, orient_points
-from shapecat.detection.planes.ransac import draw_trials, horizontal_plane
+from shapecat.detection.planes.plane_fit import horizontal_plane
+from shapecat.detection.planes.ransac import draw_trials
 from shapecat.detection.planes.supporting import supporting_planes
 from tests.level_planes import INTRINSICS, RAY_HEIGHTS, UP, I, J, level
 

@@ -15,13 +15,8 @@ from shapecat.detection.merging.segments import PAIR, SEGMENT, add_statistics
 from shapecat.detection.planes import find_supporting_planes
 from shapecat.detection.planes.extent import DIRECTIONS, SupportingPlane
 from shapecat.detection.planes.height_map import HeightMap, measure_heights, pack_planes
-from shapecat.detection.planes.ransac import (
-    draw_trials,
-    horizontal_plane,
-    plane_normal,
-    ransac_plane,
-    sample_grid,
-)
+from shapecat.detection.planes.plane_fit import horizontal_plane, plane_normal
+from shapecat.detection.planes.ransac import draw_trials, ransac_plane, sample_grid
 from shapecat.detection.segmentation.connectivity import SurfaceGraph, connect_surfaces
 from shapecat.detection.segmentation.settings import SEGMENTATION
 from shapecat.detection.segmentation.watershed import watershed

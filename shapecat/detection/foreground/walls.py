@@ -7,13 +7,8 @@ import numpy as np
 from shapecat.arrays import F4, F8, I4, U1
 from shapecat.detection.depth_grid import BORDER_SHARE, DepthGrid, PinholeIntrinsics
 from shapecat.detection.foreground.settings import WALLS
-from shapecat.detection.planes.ransac import (
-    DepthSamples,
-    plane_normal,
-    ransac_plane,
-    sample_grid,
-    select_outliers,
-)
+from shapecat.detection.planes.plane_fit import DepthSamples, plane_normal
+from shapecat.detection.planes.ransac import ransac_plane, sample_grid, select_outliers
 from shapecat.detection.planes.settings import PLANES
 from shapecat.geometry import cross
 from shapecat.jit import kernel, unset

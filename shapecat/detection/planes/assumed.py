@@ -9,7 +9,7 @@ import numpy as np
 from shapecat.arrays import F8, I4, U1, Bool
 from shapecat.detection.depth_grid import DepthGrid
 from shapecat.detection.planes.extent import COS, SIN, SupportingPlane, level_coordinates
-from shapecat.detection.planes.ransac import horizontal_plane
+from shapecat.detection.planes.plane_fit import horizontal_plane
 from shapecat.detection.planes.settings import ASSUMED, PLANES, UP
 
 __all__ = ["assume_plane", "find_unexplained"]

@@ -7,7 +7,7 @@ import numpy as np
 
 from shapecat.arrays import F8, I4, Bool
 from shapecat.detection.depth_grid import DepthGrid
-from shapecat.detection.planes.ransac import DepthSamples, plane_normal
+from shapecat.detection.planes.plane_fit import DepthSamples, plane_normal
 from shapecat.detection.planes.settings import PLANES
 from shapecat.geometry import gravity_rotation, level_axes
 from shapecat.jit import kernel

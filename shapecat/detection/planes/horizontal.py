@@ -20,15 +20,14 @@ from shapecat.detection.planes.extent import (
     measure_plane,
 )
 from shapecat.detection.planes.oriented_points import OrientedPoints, level_samples
-from shapecat.detection.planes.ransac import (
+from shapecat.detection.planes.plane_fit import (
     DepthSamples,
-    cosine,
-    count_inliers,
+    dot,
     horizontal_plane,
     plane_normal,
-    ransac_plane,
     refine,
 )
+from shapecat.detection.planes.ransac import count_inliers, ransac_plane
 from shapecat.detection.planes.settings import PLANES
 from shapecat.jit import kernel
 
@@ -163,7 +162,7 @@ def _fit(
         count = refine(samples, 1.5 * PLANES.tolerance, plane)
         if count < MIN_SAMPLES:
             return plane, False
-        if cosine(plane_normal(plane, intrinsics), up) < PLANES.steady_cos:
+        if dot(plane_normal(plane, intrinsics), up) < PLANES.steady_cos:
             plane[0], plane[1], plane[2] = level
             break
     close = count_inliers(samples, plane, PLANES.tolerance / 2)

@@ -6,7 +6,7 @@ import numpy as np
 
 from shapecat.arrays import F4, F8
 from shapecat.detection.depth_grid import DepthGrid, PinholeIntrinsics
-from shapecat.detection.planes.ransac import DepthSamples
+from shapecat.detection.planes.plane_fit import DepthSamples
 from shapecat.detection.planes.settings import PLANES
 from shapecat.jit import kernel
 

@@ -20,7 +20,7 @@ from shapecat.detection.planes.extent import (
     outline_corners,
 )
 from shapecat.detection.planes.oriented_points import OrientedPoints
-from shapecat.detection.planes.ransac import DepthSamples, horizontal_plane
+from shapecat.detection.planes.plane_fit import DepthSamples, horizontal_plane
 from shapecat.detection.planes.settings import PLANES, STRIPS
 from shapecat.geometry import gravity_rotation
 from shapecat.jit import kernel, unset

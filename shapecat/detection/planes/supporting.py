@@ -21,7 +21,7 @@ from shapecat.detection.planes.extent import (
     level_coordinates,
 )
 from shapecat.detection.planes.height_map import min_height_at
-from shapecat.detection.planes.ransac import DepthSamples
+from shapecat.detection.planes.plane_fit import DepthSamples
 from shapecat.detection.planes.settings import PLANES
 from shapecat.geometry import NEAREST_M, level_axes
 from shapecat.jit import kernel, unset

@@ -7,7 +7,7 @@ import numpy as np
 from shapecat.arrays import F4, F8
 from shapecat.detection.depth_grid import PinholeIntrinsics
 from shapecat.detection.planes.oriented_points import STRIDE, OrientedPoints, level_samples
-from shapecat.detection.planes.ransac import cosine, horizontal_plane, plane_normal, refine
+from shapecat.detection.planes.plane_fit import dot, horizontal_plane, plane_normal, refine
 from shapecat.detection.planes.settings import PLANES, UP
 from shapecat.geometry import cross
 from shapecat.jit import kernel
@@ -169,9 +169,9 @@ def _hypotheses(directions: F8, corner_cos: float) -> F8:
         for d in range(3):
             result[k, d] = directions[k, d]
         for m in range(k):
-            if abs(cosine(directions[k], directions[m])) < corner_cos:
+            if abs(dot(directions[k], directions[m])) < corner_cos:
                 corner = cross(directions[k], directions[m])
-                norm = math.sqrt(cosine(corner, corner))
+                norm = math.sqrt(dot(corner, corner))
                 for d in range(3):
                     result[n, d], result[n + 1, d] = corner[d] / norm, -corner[d] / norm
                 n += 2
@@ -256,4 +256,4 @@ def _refined(
     for multiple in (4, 3, 2, 1, 1):
         refine(samples, multiple * PLANES.tolerance, plane)
     normal = plane_normal(plane, intrinsics)
-    return normal if cosine(normal, direction) > UP.facing_cos else direction.copy()
+    return normal if dot(normal, direction) > UP.facing_cos else direction.copy()
