@@ -276,4 +276,3 @@ def test_remaining_objects_are_numbered_in_segment_order() -> None:
 
     assert number_objects(parent, rejected, labels, spans).tolist() == [0, 1, 5]
     assert labels.tolist() == [[0, 1, 1], [0, 0, 2]]
-    assert parent.tolist() == [0, 1, 1, 0, 0, 5]

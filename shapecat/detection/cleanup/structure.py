@@ -120,7 +120,7 @@ def number_objects(parent: I4, rejected: Bool, labels: I4, spans: I4) -> I4:
 
     Parameters
     ----------
-    parent : (n + 1,) from `Segments`; set to 0 for rejected segments.
+    parent : (n + 1,) from `Segments`.
     rejected : (n + 1,) from `find_background`.
     labels : (rows, columns) the segments, replaced by the objects 1, 2, ..., 0 elsewhere.
     spans : (rows, 2) as in `SurfaceGraph`.
@@ -137,8 +137,7 @@ def number_objects(parent: I4, rejected: Bool, labels: I4, spans: I4) -> I4:
             n += 1
             representatives[n], numbers[p] = p, n
     for p in range(1, parent.size):
-        q = parent[p]
-        numbers[p], parent[p] = numbers[q], 0 if rejected[q] else q
+        numbers[p] = numbers[parent[p]]
     for i in range(labels.shape[0]):
         for j in range(spans[i, 0], spans[i, 1]):
             labels[i, j] = numbers[labels[i, j]]
