@@ -17,6 +17,7 @@ from benchmarks.measure import markdown
 from benchmarks.open3d_clusters import cluster_above_plane
 from benchmarks.overlap import Finder, labelled_sets, objects_in, score
 from benchmarks.scenes import Array, detected
+from shapecat.detection.depth_grid import DepthGrid
 from shapecat.detection.segmentation.settings import SEGMENTATION
 from shapecat.detection.segmentation.watershed import NO_EDGE
 from shapecat.types import Frame
@@ -26,8 +27,13 @@ def _nothing(*_: object) -> None:
     """Do nothing."""
 
 
+def _no_cell(grid: DepthGrid, *_: object) -> Array:
+    """Return that no cell (rows, columns) is on an object."""
+    return np.zeros(grid.inverse_depth.shape, bool)
+
+
 STEPS: dict[str, tuple[str, Any]] = {
-    "low profile": ("pipeline.find_low_profile", _nothing),
+    "low profile": ("pipeline.find_low_profile", _no_cell),
     "concavity": ("segmentation.watershed.SEGMENTATION", SEGMENTATION._replace(edge_deg=NO_EDGE)),
     "width split": ("pipeline.split_at_width_changes", lambda *given: given[-1]),
     "learned merging": ("pipeline.learned.merge_learned", _nothing),

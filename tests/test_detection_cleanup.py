@@ -84,7 +84,7 @@ def test_height_and_noise_of_plane_around_segment_are_measured() -> None:
     grid = DepthGrid(np.full((11, 11), 0.5, np.float32), INTRINSICS, 1)
     walls, spans = np.zeros((11, 11), np.uint8), np.tile(np.array([0, 11], np.int32), (11, 1))
     planes = np.zeros((1, OUTLINE + DIRECTIONS))
-    low_profile = np.zeros((11, 11), np.int16)
+    low_profile = np.zeros((11, 11), np.bool_)
     heights = HeightMap(plane_id, height)
     seen = Surroundings(planes, heights, low_profile, walls, labels, spans)
     _measure(grid, seen, Limits(-1, -1, -1, -1, 0.25), segments, 0.7, features)

@@ -21,7 +21,7 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import ArrayLike
 
-from shapecat.arrays import F4, F8, I4
+from shapecat.arrays import F4, F8, I4, Bool
 from shapecat.config import DetectionSettings
 from shapecat.detection.cleanup import structure
 from shapecat.detection.cleanup.holes import fill_contact_boundary, fill_holes
@@ -170,8 +170,7 @@ def _model_planes(
     if result is None:
         return None
     up, supports, planes, heights = result
-    low_profile = np.zeros(grid.inverse_depth.shape, np.int16)
-    find_low_profile(grid, heights, planes, low_profile, settings.max_size_m)
+    low_profile: Bool = find_low_profile(grid, heights, planes, settings.max_size_m)
     walls = remove_walls(grid, heights.plane_id, up, settings.max_size_m, trials)
     extend_overhang(grid, heights, planes, walls, settings.max_height_m)
     return PlaneModel(up, supports, planes, heights, low_profile, walls)
@@ -247,8 +246,8 @@ def _clean_up(
     fill_contact_boundary(grid, model.heights, labels)
     filled = np.zeros(labels.shape, np.uint8)
     fill_holes(grid, labels, representatives.size - 1, filled)
-    if model.low_profile.max() > 0:  # it may lie at the level of its plane
-        filled |= (model.low_profile > 0) & (labels > 0)
+    if model.low_profile.any():  # it may lie at the level of its plane
+        filled |= model.low_profile & (labels > 0)
     plane_ids = segments.plane_id[representatives].astype(np.int64) - 1
     plane_ids[0] = 0
     measured = measure_objects(grid, labels, segments, representatives, features, model.up)

@@ -2,7 +2,7 @@
 
 from typing import NamedTuple
 
-from shapecat.arrays import F8, I4, U1
+from shapecat.arrays import F8, I4, U1, Bool
 from shapecat.detection.merging.segments import Segments
 from shapecat.detection.output.measurements import ObjectMeasurements
 from shapecat.detection.planes.extent import SupportingPlane
@@ -21,7 +21,7 @@ class PlaneModel(NamedTuple):
     supports : the planes, lowest first.
     planes : the same, from `pack_planes`.
     heights : the plane below each sample, and the height above it.
-    low_profile : (rows, columns) int16, low-profile objects 1, 2, ..., 0 elsewhere.
+    low_profile : (rows, columns) where low-profile objects are.
     walls : (rows, columns) uint8, from `remove_walls`; not 0 on walls.
     """
 
@@ -29,7 +29,7 @@ class PlaneModel(NamedTuple):
     supports: list[SupportingPlane]
     planes: F8
     heights: HeightMap
-    low_profile: I4
+    low_profile: Bool
     walls: U1
 
 

@@ -10,7 +10,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from shapecat.arrays import F8, I4, U1
+from shapecat.arrays import F8, I4, U1, Bool
 from shapecat.detection.cleanup.settings import CLEANUP
 from shapecat.detection.connected_components import SIDES
 from shapecat.detection.depth_grid import DepthGrid, back_project, find_borders, row_and_column
@@ -92,7 +92,7 @@ class Surroundings(NamedTuple):
 
     planes: F8
     heights: HeightMap
-    low_profile: I4
+    low_profile: Bool
     walls: U1
     labels: I4
     spans: I4
@@ -192,7 +192,7 @@ def _count_by_segment(
                 row.range_limit += 1
             if walls[i, j] == ON_WALL:
                 row.on_wall += 1
-            if low[i, j] > 0:
+            if low[i, j]:
                 row.low_profile += 1
             for di, dj in SIDES:
                 y, x = i + CLEANUP.around_cells * di, j + CLEANUP.around_cells * dj

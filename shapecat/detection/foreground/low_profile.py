@@ -9,7 +9,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from shapecat.arrays import F4, F8, I4
+from shapecat.arrays import F4, F8, I4, Bool
 from shapecat.detection.connected_components import SIDES
 from shapecat.detection.depth_grid import DepthGrid
 from shapecat.detection.foreground.convex_hull import fill_hull
@@ -48,9 +48,7 @@ class Scratch(NamedTuple):
 
 
 @kernel
-def find_low_profile(
-    grid: DepthGrid, heights: HeightMap, planes: F8, low_profile: I4, largest_m: float
-) -> None:
+def find_low_profile(grid: DepthGrid, heights: HeightMap, planes: F8, largest_m: float) -> Bool:
     """Find the low-profile objects on each plane, and assign depth error to the plane.
 
     Parameters
@@ -58,14 +56,17 @@ def find_low_profile(
     heights : ``plane_id`` is changed in place: k + 1 on the objects found on plane k, -(k + 1) on
         cells that only depth error raises.
     planes : from `pack_planes`.
-    low_profile : (rows, columns) zeros; set to 1, 2, ... on low-profile objects.
     largest_m : maximum width of a low-profile object, metres.
+
+    Returns
+    -------
+    (rows, columns) where the low-profile objects are.
     """
     inv_depth, jump, (plane_id, height) = grid.inverse_depth, grid.discontinuity, heights
     shape, size = inv_depth.shape, inv_depth.size
     widest = largest_m * grid.intrinsics.fx
     residuals, high_passes = unset(shape, np.float32), unset(shape, np.float32)
-    drops = unset(size, np.float32)
+    drops, object_ids = unset(size, np.float32), np.zeros(shape, np.int16)
     scratch = Scratch(
         np.zeros(shape, np.int32),
         np.zeros(shape, np.int32),
@@ -79,7 +80,7 @@ def find_low_profile(
         if start == end:
             continue
         plane[2] += start * plane[1]  # rows count from ``start`` from here on
-        values, plane_ids, marks = inv_depth[start:end], plane_id[start:end], low_profile[start:end]
+        values, plane_ids, marks = inv_depth[start:end], plane_id[start:end], object_ids[start:end]
         residual, high_pass = residuals[start:end], high_passes[start:end]
         above = HeightMap(plane_ids, height[start:end])
         if measure_residual(values, above, plane, number, residual) < LOW.min_cells:
@@ -93,6 +94,8 @@ def find_low_profile(
             values, high_pass, plane_ids, number, limits, marks, objects, parts, scratch
         )
         parts = _drop_error(values, residual, plane_ids, number, limits, marks, parts, scratch)
+    low_profile: Bool = object_ids > 0
+    return low_profile
 
 
 @kernel(inline=True)
@@ -125,7 +128,7 @@ def _mark_objects(
     plane_id: I4,
     number: int,
     limits: Limits,
-    low_profile: I4,
+    object_ids: I4,
     objects: int,
     parts: int,
     scratch: Scratch,
@@ -133,9 +136,10 @@ def _mark_objects(
     """Mark the parts above each level that have the outline of an object.
 
     The objects are numbered from ``objects`` + 1, the tested parts from ``parts`` + 1; the last
-    numbers are returned. ``high_pass`` (rows, columns) is from `filter_high_pass`.
+    numbers are returned. ``object_ids`` (rows, columns) holds the number of the object at each
+    cell, 0 elsewhere; ``high_pass`` (rows, columns) is from `filter_high_pass`.
     """
-    flat, marks, plane_ids = high_pass.reshape(-1), low_profile.reshape(-1), plane_id.reshape(-1)
+    flat, marks, plane_ids = high_pass.reshape(-1), object_ids.reshape(-1), plane_id.reshape(-1)
     flooded, part, seeds, stack = scratch
     visited, part_of = flooded.reshape(-1), part.reshape(-1)
     n = _find_seeds(high_pass, limits.level * LOW.levels[-1], seeds)
@@ -237,7 +241,7 @@ def _drop_error(
     plane_id: I4,
     number: int,
     limits: Limits,
-    low_profile: I4,
+    object_ids: I4,
     parts: int,
     scratch: Scratch,
 ) -> int:
@@ -256,7 +260,7 @@ def _drop_error(
         if not any_low:
             continue
         for j in range(columns):
-            low = (plane_id[i, j] == number) & (residual[i, j] != 0) & (low_profile[i, j] == 0)
+            low = (plane_id[i, j] == number) & (residual[i, j] != 0) & (object_ids[i, j] == 0)
             if low and _is_flat(residual, i, j):
                 above[i, j] = 1
                 seeds[n] = i * columns + j
