@@ -4,7 +4,7 @@ import numpy as np
 
 from shapecat.arrays import F4, F8
 from shapecat.description.linear import principal_axes, solve
-from shapecat.description.profile import vertical_axis
+from shapecat.description.profile import VerticalAxis
 from shapecat.description.surface import Surface
 from shapecat.jit import kernel
 
@@ -97,13 +97,20 @@ def _sphere(x: F4, y: F4, z: F4, weight: F4) -> tuple[float, float, float]:
 
 @kernel
 def context(
-    surface: Surface, normals: F4, curvatures: F4, low: float, high: float, out: F4
+    surface: Surface,
+    normals: F4,
+    curvatures: F4,
+    upright: VerticalAxis,
+    low: float,
+    high: float,
+    out: F4,
 ) -> tuple[float, float, float]:
     """Write the features named by `CONTEXT_NAMES`, and return three widths of the object.
 
     Parameters
     ----------
     normals, curvatures : (3, k) and (2, k), from `fit_surfaces`.
+    upright : from `vertical_axis`.
     low, high : heights of the lowest and highest point, in units of the surface.
     out : the block ``context``, written in place.
 
@@ -120,7 +127,7 @@ def context(
     for i in range(x.size):
         level[i] = (z[i] - low) / (high - low) if high > low else 0.5
     _facing(level, weight, normals, out[15:20])
-    _axis(x, y, level, high - low, weight, normals, out[20:29])
+    _axis(x, y, upright, level, high - low, weight, normals, out[20:29])
     residual, size, middle = _sphere(x, y, z, weight)
     out[29] = min(residual, 1.0)
     out[30] = 1.0 / (1.0 + size)
@@ -213,9 +220,18 @@ def _facing(level: F8, weight: F4, normals: F4, out: F4) -> None:
 
 
 @kernel(inline=True)
-def _axis(x: F4, y: F4, level: F8, height: float, weight: F4, normals: F4, out: F4) -> None:
-    """Compare the surface with a surface of revolution about the axis from `vertical_axis`."""
-    cx, cy, residual = vertical_axis(x, y, normals, weight)
+def _axis(
+    x: F4,
+    y: F4,
+    upright: VerticalAxis,
+    level: F8,
+    height: float,
+    weight: F4,
+    normals: F4,
+    out: F4,
+) -> None:
+    """Compare the surface with a surface of revolution about an upright axis."""
+    cx, cy, residual = upright
     radius = radius2 = middle = 0.0
     parts = np.zeros((2, 2))  # lower and upper half: weight, weighted radius
     for i in range(x.size):

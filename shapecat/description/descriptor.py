@@ -96,12 +96,14 @@ def _describe(points: F4, neurons: F4, edges: U2, eye: F4, out: F4) -> None:
         cloud, surface.starts, x, y, z, surface.euclidean, radius, surface.eye
     )
     low, high = _height_range(cloud[2])
-    wide, across, along = context(surface, normals, curvatures, low, high, out[_CONTEXT:_CURVED])
+    upright = vertical_axis(x, y, normals, weight)
+    wide, across, along = context(
+        surface, normals, curvatures, upright, low, high, out[_CONTEXT:_CURVED]
+    )
     distributions(surface, normals, curvatures, out)
-    profile(surface, normals, curvatures, low, high, out[_PROFILE:_REVOLUTION])
-    cx, cy, _ = vertical_axis(x, y, normals, weight)
-    axis, point, _ = rotation_axis(x, y, z, weight, normals)
-    revolved, foot = out[_REVOLUTION:_SOLIDS], np.array((cx, cy, 0.0))
+    profile(surface, normals, curvatures, upright, low, high, out[_PROFILE:_REVOLUTION])
+    axis, point = rotation_axis(x, y, z, weight, normals)
+    revolved, foot = out[_REVOLUTION:_SOLIDS], np.array((upright.x, upright.y, 0.0))
     revolution(surface, normals, axis, point, foot, revolved)
     solids(
         cloud, surface.nearest, x, y, normals, surface.eye, low, high, revolved,

@@ -1,20 +1,34 @@
 """The upright axis of an object, and its radial profile."""
 
+from typing import NamedTuple
+
 import numpy as np
 
 from shapecat.arrays import F4
 from shapecat.description.surface import Surface
 from shapecat.jit import kernel
 
-__all__ = ["PROFILE_NAMES", "PROFILE_SLICES", "profile", "vertical_axis"]
+__all__ = ["PROFILE_NAMES", "PROFILE_SLICES", "VerticalAxis", "profile", "vertical_axis"]
 
 PROFILE_SLICES = 8
 _PROFILE = ("share", "radius", "spread", "inward", "up", "curvature")
 PROFILE_NAMES = tuple(f"{i}_{name}" for i in range(PROFILE_SLICES) for name in _PROFILE)
 
 
+class VerticalAxis(NamedTuple):
+    """A vertical line at x and y.
+
+    ``residual`` is the root mean square distance from it of the horizontal lines in
+    `vertical_axis`.
+    """
+
+    x: float
+    y: float
+    residual: float
+
+
 @kernel
-def vertical_axis(x: F4, y: F4, normals: F4, weight: F4) -> tuple[float, float, float]:
+def vertical_axis(x: F4, y: F4, normals: F4, weight: F4) -> VerticalAxis:
     """Find the vertical axis that the normals of a surface point to or away from.
 
     It is the vertical line nearest to the horizontal lines that pass through the neurons in the
@@ -27,10 +41,6 @@ def vertical_axis(x: F4, y: F4, normals: F4, weight: F4) -> tuple[float, float, 
     x, y : (n,) positions of the neurons, in any unit of length.
     normals : (3, n) unit vectors.
     weight : (n,) each neuron's fraction of the points.
-
-    Returns
-    -------
-    x and y of the line, and the root mean square distance of the horizontal lines from it.
     """
     axx = axy = ayy = bx = by = total = 0.0
     for i in range(x.size):
@@ -52,12 +62,18 @@ def vertical_axis(x: F4, y: F4, normals: F4, weight: F4) -> tuple[float, float, 
     for i in range(x.size):
         off = -normals[1, i] * (x[i] - cx) + normals[0, i] * (y[i] - cy)
         residual += weight[i] * off * off
-    return cx, cy, np.sqrt(residual / max(total, 1e-6))
+    return VerticalAxis(cx, cy, np.sqrt(residual / max(total, 1e-6)))
 
 
 @kernel
 def profile(
-    surface: Surface, normals: F4, curvatures: F4, low: float, high: float, out: F4
+    surface: Surface,
+    normals: F4,
+    curvatures: F4,
+    upright: VerticalAxis,
+    low: float,
+    high: float,
+    out: F4,
 ) -> None:
     """Write the radial profile about the vertical axis, named by `PROFILE_NAMES`.
 
@@ -68,18 +84,18 @@ def profile(
     Parameters
     ----------
     normals, curvatures : (3, n) and (2, n), from `fit_surfaces`.
+    upright : from `vertical_axis`.
     low, high : heights of the lowest and highest point, in units of the surface.
     out : the block ``profile``, written in place.
     """
     x, y, z = surface.neurons[0], surface.neurons[1], surface.neurons[2]
     weight = surface.weight
-    cx, cy, _ = vertical_axis(x, y, normals, weight)
     widest = 1e-6
     for i in range(x.size):
         level = (z[i] - low) / (high - low) if high > low else 0.5
         place = min(max(level * PROFILE_SLICES - 0.5, 0.0), PROFILE_SLICES - 1.0)
         first = min(int(place), PROFILE_SLICES - 2)
-        rx, ry = x[i] - cx, y[i] - cy
+        rx, ry = x[i] - upright.x, y[i] - upright.y
         r = np.sqrt(rx * rx + ry * ry)
         inward = rx * normals[0, i] + ry * normals[1, i] < 0
         curvature = curvatures[0, i] + curvatures[1, i]

@@ -10,7 +10,7 @@ __all__ = ["rotation_axis"]
 
 
 @kernel
-def rotation_axis(x: F4, y: F4, z: F4, weight: F4, normals: F4) -> tuple[F8, F8, F8]:
+def rotation_axis(x: F4, y: F4, z: F4, weight: F4, normals: F4) -> tuple[F8, F8]:
     """Find the line that comes closest to meeting all normals of a surface.
 
     Source: Pottmann and Randrup 1998, restricted to rotations. A line with direction a and moment
@@ -25,8 +25,7 @@ def rotation_axis(x: F4, y: F4, z: F4, weight: F4, normals: F4) -> tuple[F8, F8,
 
     Returns
     -------
-    The unit direction (3,), a point (3,) on the line, and the root mean squares (3,) for the three
-    principal directions of a, ascending: all are small for a sphere, one for a cylinder.
+    The unit direction (3,), and a point (3,) on the line.
     """
     N, B, C = np.zeros((3, 3)), np.zeros((3, 3)), np.zeros((3, 3))
     for i in range(x.size):
@@ -51,18 +50,17 @@ def rotation_axis(x: F4, y: F4, z: F4, weight: F4, normals: F4) -> tuple[F8, F8,
         for j in range(3):
             for k in range(3):
                 C[i, j] += B[k, i] * moment[k, j]
-    values, vectors = principal_axes(C)
-    axis, foot, deviations = np.zeros(3), np.zeros(3), np.zeros(3)
+    _, vectors = principal_axes(C)
+    axis, foot = np.zeros(3), np.zeros(3)
     for i in range(3):
         axis[i] = vectors[i, 0]
         for j in range(3):
             foot[i] += moment[i, j] * vectors[j, 0]
-        deviations[i] = np.sqrt(max(values[i], 0.0))
     point = np.zeros(3)
     for i in range(3):
         j, k = (i + 1) % 3, (i + 2) % 3
         point[i] = axis[j] * foot[k] - axis[k] * foot[j]
-    return axis, point, deviations
+    return axis, point
 
 
 @kernel(inline=True)
