@@ -21,9 +21,11 @@ from shapecat.types import NeuralGas
 __all__ = ["describe"]
 
 _MAX_POINTS = 1200
-_RADIUS = 2.2 * 1.15
+_GRID_SPACING = 1.15
+"""Spacing of a square grid of the same density, relative to the mean gap."""
+_RADIUS = 2.2 * _GRID_SPACING
 """Radius of the neighbourhoods in which curvature is fitted, in mean gaps between neurons."""
-_REACH = 3 * 1.15
+_REACH = 3 * _GRID_SPACING
 """Points farther than this from every neuron are ignored, in mean gaps between neurons."""
 _FAR = 1e6
 

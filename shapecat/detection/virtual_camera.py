@@ -7,6 +7,7 @@ import numpy as np
 
 from shapecat.arrays import F4, F8, I4, Bool
 from shapecat.detection.depth_grid import CELL_M, DepthGrid, PinholeIntrinsics, discontinuity_at
+from shapecat.detection.planes.settings import UP
 from shapecat.geometry import NEAREST_M, gravity_rotation
 from shapecat.jit import kernel
 from shapecat.types import Pose
@@ -116,7 +117,7 @@ def _dominant_plane(sample: F8, hint: F8 | None, rng: np.random.Generator) -> F8
     normal = normal[length > 1e-9] / length[length > 1e-9, None]
     a = a[length > 1e-9]
     if hint is not None:
-        level = abs(normal @ hint) > 0.966
+        level = abs(normal @ hint) > UP.hint_cos
         normal, a = normal[level], a[level]
     if len(normal) == 0:
         return None

@@ -5,7 +5,7 @@ import numpy as np
 from shapecat.arrays import F4, F8, U2
 from shapecat.config import SurfaceSettings
 from shapecat.jit import kernel
-from shapecat.surface.graph import edge_list, finish_graph
+from shapecat.surface.graph import GRID_SPACING, edge_list, finish_graph
 from shapecat.surface.growth import Cloud, Rates, grow_fritzke, grow_thesis
 from shapecat.surface.neurons import FAR, Gas, connect, empty_gas
 from shapecat.surface.voxels import read_only
@@ -107,7 +107,7 @@ def _by_thesis(points: F4, seed: int, neurons: int, share: float) -> tuple[F4, U
     _link_two_points(cloud, gas, state)
     spacing = _spacing(cloud)
     each = cloud.x.size / target
-    square = each * (1.15 * spacing) ** 2
+    square = each * (GRID_SPACING * spacing) ** 2
     count = grow_thesis(
         cloud, state, gas, 2 * target, _EPOCHS,
         _ERROR_LIMIT * each * square / 6, _DISTANCE_LIMIT * spacing,

@@ -8,9 +8,9 @@ from shapecat.surface.growth import Cloud
 from shapecat.surface.neurons import FAR, Gas, index_mask, is_edge
 from shapecat.surface.simd import LANES, three_nearest
 
-__all__ = ["edge_list", "finish_graph"]
+__all__ = ["GRID_SPACING", "edge_list", "finish_graph"]
 
-_GRID_SPACING = 1.15
+GRID_SPACING = 1.15
 """Spacing of a square grid of the same density, relative to the mean nearest distance."""
 _LONGEST = 3.0
 """Longest edge between neurons that are not the two nearest of a point, in spacings."""
@@ -62,7 +62,7 @@ def finish_graph(cloud: Cloud, gas: Gas, count: int, share: float) -> Bool:
     # 2.
     _move_to_means(cloud, gas, n, nearest)
     # 3.
-    limit = (_LONGEST * _GRID_SPACING * _mean_spacing(gas, n)) ** 2
+    limit = (_LONGEST * GRID_SPACING * _mean_spacing(gas, n)) ** 2
     for k in range(cloud.x.size):
         a, b, c = np.int64(nearest[k, 0]), np.int64(nearest[k, 1]), np.int64(nearest[k, 2])
         adjacent[a, b] = adjacent[b, a] = True

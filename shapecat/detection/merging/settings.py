@@ -1,5 +1,6 @@
 """Tuned constants of this stage, with their units and the reason for each."""
 
+import math
 from typing import NamedTuple
 
 __all__ = ["MERGING", "MergingSettings"]
@@ -43,7 +44,7 @@ class MergingSettings(NamedTuple):
     """Largest distance of a sample from the local plane of another: two steps of a Kinect."""
     coplanar_slope: float = 0.05
     """Increase of that limit per metre between the samples: local planes are 3 degrees off."""
-    coplanar_cos: float = 0.966
+    coplanar_cos: float = math.cos(math.radians(15))
     """Minimum cosine between the normals of the samples, for 15 degrees."""
     partner_share: float = 0.45
     """Minimum fraction of the samples of either segment that continue the other; on round objects,

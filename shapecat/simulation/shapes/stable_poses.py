@@ -11,6 +11,9 @@ from shapecat.types import Pose
 
 __all__ = ["StablePose", "choose_stable_pose", "stable_poses"]
 
+_UPRIGHT = 0.966
+"""Minimum cosine between the axis of an upright mesh and up, for 15 degrees."""
+
 
 class StablePose(Record):
     """A stable pose of a mesh on a horizontal surface.
@@ -50,7 +53,7 @@ def stable_poses(mesh: Mesh) -> tuple[StablePose, ...]:
         z = points @ rotation[2]
         place = np.array([*-(rotation[:2] @ middle), -z.min()])
         tilt = rotation[2, 2]
-        name = "upright" if tilt > 0.966 else "upside_down" if tilt < -0.966 else "lying"
+        name = "upright" if tilt > _UPRIGHT else "upside_down" if tilt < -_UPRIGHT else "lying"
         poses.append(StablePose(Pose(rotation, np.round(place, 9)), name))
     return tuple(poses)
 
