@@ -14,7 +14,7 @@ from shapecat.detection.foreground.walls import CLEARED, ON_WALL, remove_walls
 from shapecat.detection.planes.extent import (
     DIRECTIONS,
     SupportingPlane,
-    measure_plane,
+    measure_candidate,
     outline_corners,
 )
 from shapecat.detection.planes.height_map import (
@@ -37,10 +37,8 @@ def grid_of(inv_depth: F4) -> DepthGrid:
 
 def plane_of(grid: DepthGrid, below_m: float) -> SupportingPlane:
     samples, _ = level_samples(orient_points(grid), UP)
-    plane: SupportingPlane = measure_plane(
-        grid, samples, horizontal_plane(INTRINSICS, UP, -below_m)
-    )
-    return plane
+    plane: F8 = horizontal_plane(INTRINSICS, UP, -below_m)
+    return measure_candidate(grid, samples, plane).plane
 
 
 def heights_of(grid: DepthGrid, plane: SupportingPlane) -> tuple[HeightMap, F8]:

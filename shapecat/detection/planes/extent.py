@@ -7,7 +7,7 @@ import numpy as np
 
 from shapecat.arrays import F8, I4, Bool
 from shapecat.detection.depth_grid import DepthGrid
-from shapecat.detection.planes.plane_fit import DepthSamples, plane_normal
+from shapecat.detection.planes.plane_fit import DepthSamples, plane_normal, select_inliers
 from shapecat.detection.planes.settings import PLANES
 from shapecat.geometry import gravity_rotation, level_axes
 from shapecat.jit import kernel
@@ -20,7 +20,7 @@ __all__ = [
     "SupportingPlane",
     "area_of",
     "level_coordinates",
-    "measure_plane",
+    "measure_candidate",
     "outline_corners",
 ]
 
@@ -55,55 +55,56 @@ class SupportingPlane(NamedTuple):
 
 
 class PlaneCandidate(NamedTuple):
-    """A plane that may support objects, the samples to measure it, and its covered area, m²."""
+    """A plane that may support objects, its inliers, and its covered area, m²."""
 
     plane: SupportingPlane
-    samples: DepthSamples
+    inliers: DepthSamples
     covered_m2: float = 0.0
 
 
+def measure_candidate(grid: DepthGrid, samples: DepthSamples, plane: F8) -> PlaneCandidate:
+    """Measure a plane (a, b, c) on its inliers among samples."""
+    inliers: DepthSamples = select_inliers(samples, plane, PLANES.tolerance)
+    return PlaneCandidate(_measure(grid, inliers, plane), inliers)
+
+
 @kernel
-def measure_plane(grid: DepthGrid, samples: DepthSamples, plane: F8) -> SupportingPlane:
-    """Measure height, extent and area of a plane (a, b, c) from its inliers."""
+def _measure(grid: DepthGrid, inliers: DepthSamples, plane: F8) -> SupportingPlane:
+    """Measure height, extent and area of a plane (a, b, c)."""
     normal = plane_normal(plane, grid.intrinsics)
     x, y = plane[0] * grid.intrinsics.fx, plane[1] * grid.intrinsics.fy
     z = plane[0] * grid.intrinsics.cx + plane[1] * grid.intrinsics.cy + plane[2]
     offset = -1 / math.sqrt(x * x + y * y + z * z)
-    area = area_of(samples, plane, -offset) / (grid.intrinsics.fx * grid.intrinsics.fy)
-    ends = _ends(samples, plane, grid.inverse_depth.shape[0], grid.inverse_depth.shape[1])
+    area = area_of(inliers, plane, -offset) / (grid.intrinsics.fx * grid.intrinsics.fy)
+    ends = _ends(inliers, grid.inverse_depth.shape[0], grid.inverse_depth.shape[1])
     extent = _extent_of(grid, plane, normal, ends)
     return SupportingPlane(plane[0], plane[1], plane[2], normal, offset, extent, area)
 
 
 @kernel(fast=True, inner=True)
-def area_of(samples: DepthSamples, plane: F8, distance: float) -> float:
+def area_of(inliers: DepthSamples, plane: F8, distance: float) -> float:
     """Return the visible area of a plane, relative to the area of a cell at 1 m.
 
     ``plane`` (3,) is a, b, c of its inverse depth; ``distance`` is its distance from the sensor,
     metres.
     """
-    j, i, inv_depth = samples.j, samples.i, samples.inverse_depth
     total = 0.0
-    for k in range(inv_depth.size):
-        level = plane[0] * j[k] + plane[1] * i[k] + plane[2]
-        inlier = (level > 0) & (abs(inv_depth[k] - level) < PLANES.tolerance)
+    for k in range(inliers.inverse_depth.size):
+        level = plane[0] * inliers.j[k] + plane[1] * inliers.i[k] + plane[2]
         facing = level * distance  # the cosine between the normal and the ray
-        area = 1 / (level * level * (facing if facing > 0.05 else 0.05))
-        total += area if inlier else 0.0
-    return float(samples.share * total)
+        total += 1 / (level * level * (facing if facing > 0.05 else 0.05))
+    return float(inliers.share * total)
 
 
 @kernel(inline=True)
-def _ends(samples: DepthSamples, plane: F8, rows: int, columns: int) -> I4:
+def _ends(inliers: DepthSamples, rows: int, columns: int) -> I4:
     """Return first and last inlier column of each row, (2, rows); the last is -1 if none."""
     ends = np.zeros((2, rows), np.int32)
     for i in range(rows):
         ends[0, i], ends[1, i] = columns, -1
-    for k in range(samples.inverse_depth.size):
-        level = plane[0] * samples.j[k] + plane[1] * samples.i[k] + plane[2]
-        if level > 0 and abs(samples.inverse_depth[k] - level) < PLANES.tolerance:
-            i, j = int(samples.i[k]), int(samples.j[k])
-            ends[0, i], ends[1, i] = min(ends[0, i], j), max(ends[1, i], j)
+    for k in range(inliers.inverse_depth.size):
+        i, j = int(inliers.i[k]), int(inliers.j[k])
+        ends[0, i], ends[1, i] = min(ends[0, i], j), max(ends[1, i], j)
     return ends
 
 

@@ -15,9 +15,8 @@ from shapecat.detection.depth_grid import DepthGrid, PinholeIntrinsics
 from shapecat.detection.planes.extent import (
     DIRECTIONS,
     PlaneCandidate,
-    SupportingPlane,
     area_of,
-    measure_plane,
+    measure_candidate,
 )
 from shapecat.detection.planes.oriented_points import OrientedPoints, level_samples
 from shapecat.detection.planes.plane_fit import (
@@ -26,6 +25,7 @@ from shapecat.detection.planes.plane_fit import (
     horizontal_plane,
     plane_normal,
     refine,
+    select_inliers,
 )
 from shapecat.detection.planes.ransac import count_inliers, ransac_plane
 from shapecat.detection.planes.settings import PLANES
@@ -47,32 +47,32 @@ def find_horizontal_planes(
 
     ``up`` is a unit vector (3,), sensor frame; ``trials`` are from `draw_trials`.
     """
-    candidates = _fit_candidates(grid, points, up, trials)
+    samples, candidates = _fit_candidates(grid, points, up, trials)
     common = _common_up(candidates) if candidates else up
     if common @ up < PLANES.turned_cos:
-        candidates = _fit_candidates(grid, points, common, trials)
+        samples, candidates = _fit_candidates(grid, points, common, trials)
         common = _common_up(candidates) if candidates else common
     if len(candidates) > 1:
         parallel = [
-            _refit_parallel(grid.intrinsics, samples, plane, common)
-            for plane, samples, _ in candidates
+            _refit_parallel(grid.intrinsics, candidate.inliers, common) for candidate in candidates
         ]
-        candidates = _measure_candidates(grid, candidates[0].samples, parallel)
+        candidates = _measure_candidates(grid, samples, parallel)
     return sorted(candidates, key=lambda candidate: candidate.plane.offset)
 
 
 def _fit_candidates(
     grid: DepthGrid, points: OrientedPoints, up: F8, trials: F8
-) -> list[PlaneCandidate]:
+) -> tuple[DepthSamples, list[PlaneCandidate]]:
+    """Return the level samples, and the planes fitted to them."""
     samples, heights = level_samples(points, up)
     planes = fit_horizontal_planes(samples, heights, grid.intrinsics, up, trials)
-    return _measure_candidates(grid, samples, planes)
+    return samples, _measure_candidates(grid, samples, planes)
 
 
 def _measure_candidates(
     grid: DepthGrid, samples: DepthSamples, planes: Iterable[F8]
 ) -> list[PlaneCandidate]:
-    candidates = (PlaneCandidate(measure_plane(grid, samples, plane), samples) for plane in planes)
+    candidates = (measure_candidate(grid, samples, plane) for plane in planes)
     return [candidate for candidate in candidates if candidate.plane.area_m2 >= PLANES.min_area_m2]
 
 
@@ -87,19 +87,16 @@ def _common_up(candidates: list[PlaneCandidate]) -> F8:
 
 
 @kernel(fast=True)
-def _refit_parallel(
-    intrinsics: PinholeIntrinsics, samples: DepthSamples, plane: SupportingPlane, up: F8
-) -> F8:
+def _refit_parallel(intrinsics: PinholeIntrinsics, inliers: DepthSamples, up: F8) -> F8:
     """Fit a plane with the normal ``up`` to the inliers of another plane, by least squares."""
     # The inverse depth of the plane up @ p == offset is along / offset.
     squares = products = 0.0
-    for k in range(samples.inverse_depth.size):
-        j, i, v = samples.j[k], samples.i[k], samples.inverse_depth[k]
-        inlier = abs(v - (plane.a * j + plane.b * i + plane.c)) < PLANES.tolerance
-        x, y = (j - intrinsics.cx) / intrinsics.fx, (i - intrinsics.cy) / intrinsics.fy
-        along = x * up[0] + y * up[1] + up[2] if inlier else 0.0
+    for k in range(inliers.inverse_depth.size):
+        x = (inliers.j[k] - intrinsics.cx) / intrinsics.fx
+        y = (inliers.i[k] - intrinsics.cy) / intrinsics.fy
+        along = x * up[0] + y * up[1] + up[2]
         squares += along * along
-        products += along * v
+        products += along * inliers.inverse_depth[k]
     parallel: F8 = horizontal_plane(intrinsics, up, squares / products)
     return parallel
 
@@ -172,5 +169,6 @@ def _fit(
         )
         if votes > close:
             plane[0], plane[1], plane[2] = voted
-    area = area_of(samples, plane, abs(offset)) / (intrinsics.fx * intrinsics.fy)
+    inliers = select_inliers(samples, plane, PLANES.tolerance)
+    area = area_of(inliers, plane, abs(offset)) / (intrinsics.fx * intrinsics.fy)
     return plane, bool(area >= PLANES.min_area_m2)

@@ -1,4 +1,4 @@
-"""Planes in inverse depth: depth samples, normals, level planes, and least squares."""
+"""Planes in inverse depth: depth samples, inliers, normals, level planes, and least squares."""
 
 import math
 from typing import NamedTuple
@@ -9,7 +9,7 @@ from shapecat.arrays import F4, F8
 from shapecat.detection.depth_grid import PinholeIntrinsics
 from shapecat.jit import kernel
 
-__all__ = ["DepthSamples", "dot", "horizontal_plane", "plane_normal", "refine"]
+__all__ = ["DepthSamples", "dot", "horizontal_plane", "plane_normal", "refine", "select_inliers"]
 
 
 class DepthSamples(NamedTuple):
@@ -26,6 +26,23 @@ class DepthSamples(NamedTuple):
     i: F4
     inverse_depth: F4
     share: int
+
+
+@kernel
+def select_inliers(samples: DepthSamples, plane: F8, tolerance: float) -> DepthSamples:
+    """Return the samples whose inverse depth differs by less than ``tolerance``, 1/m, from a plane.
+
+    Its inverse depth at column j and row i is ``a * j + b * i + c``, 1/m; where this is not above
+    0, the plane is not visible.
+    """
+    inliers = np.zeros((3, samples.inverse_depth.size), np.float32)
+    n = 0
+    for k in range(samples.inverse_depth.size):
+        j, i, v = samples.j[k], samples.i[k], samples.inverse_depth[k]
+        level = plane[0] * j + plane[1] * i + plane[2]
+        inliers[0, n], inliers[1, n], inliers[2, n] = j, i, v
+        n += (level > 0) & (abs(v - level) < tolerance)
+    return DepthSamples(inliers[0][:n], inliers[1][:n], inliers[2][:n], samples.share)
 
 
 @kernel(inner=True)

@@ -16,7 +16,7 @@ from shapecat.detection.planes.extent import (
     SIN,
     PlaneCandidate,
     SupportingPlane,
-    measure_plane,
+    measure_candidate,
     outline_corners,
 )
 from shapecat.detection.planes.oriented_points import OrientedPoints
@@ -78,7 +78,7 @@ def add_strip_planes(grid: DepthGrid, candidates: list[PlaneCandidate]) -> list[
         if not _may_be_strips(grid, candidates, height, above):
             continue
         added = _plane_at(grid, strips, up, height)
-        if added.plane.area_m2 == 0 or _is_at_range_end(grid.inverse_depth, added.samples):
+        if added.plane.area_m2 == 0 or _is_at_range_end(grid.inverse_depth, added.inliers):
             continue
         duplicates = [k for k in planes if abs(k.plane.offset - added.plane.offset) < STRIPS.same_m]
         if above > STRIPS.covers:
@@ -111,11 +111,10 @@ def _widened(candidate: PlaneCandidate, table: PlaneCandidate) -> PlaneCandidate
 
 def _plane_at(grid: DepthGrid, strips: F4, up: F8, height: float) -> PlaneCandidate:
     """Measure the level plane through the strips at a height."""
-    inliers = np.ascontiguousarray(strips[:, abs(strips[3] - height) < 1.5 * STRIPS.bin_m])
-    offset = float(np.median(inliers[3])) if inliers.size else height
-    samples = DepthSamples(inliers[0], inliers[1], inliers[2], APART)
-    plane = measure_plane(grid, samples, horizontal_plane(grid.intrinsics, up, offset))
-    return PlaneCandidate(plane, samples)
+    near = np.ascontiguousarray(strips[:, abs(strips[3] - height) < 1.5 * STRIPS.bin_m])
+    offset = float(np.median(near[3])) if near.size else height
+    samples = DepthSamples(near[0], near[1], near[2], APART)
+    return measure_candidate(grid, samples, horizontal_plane(grid.intrinsics, up, offset))
 
 
 def _covered(

@@ -70,7 +70,7 @@ def supporting_planes(
     tallest_m : height of the tallest object, metres.
     """
     supports: list[SupportingPlane] = []
-    for plane, samples, covered_m2 in candidates:
+    for plane, inliers, covered_m2 in candidates:
         area_m2 = plane.area_m2 + covered_m2
         drops = [plane.offset - lower.offset for lower in supports if _overlaps(lower, plane)]
         drop = drops[-1] if drops else math.inf
@@ -78,24 +78,24 @@ def supporting_planes(
         if drop < PLANES.min_drop_m:
             continue
         if supports and not high and area_m2 >= PLANES.board_m2:
-            area_m2 = _largest_part(grid, samples, plane) + covered_m2
+            area_m2 = _largest_part(grid, inliers, plane) + covered_m2
         if supports and not high and area_m2 < PLANES.furniture_m2:
-            if _is_enclosed(grid, samples, plane):
+            if _is_enclosed(grid, inliers, plane):
                 supports.append(_extend_to_walls(grid, plane))
                 continue
             if area_m2 < PLANES.board_m2:
                 continue
-        if drop > tallest_m or not _is_top(grid, samples, plane, drop, area_m2):
+        if drop > tallest_m or not _is_top(grid, inliers, plane, drop, area_m2):
             supports.append(plane)
     return supports
 
 
 def _is_top(
-    grid: DepthGrid, samples: DepthSamples, plane: SupportingPlane, drop: float, area_m2: float
+    grid: DepthGrid, inliers: DepthSamples, plane: SupportingPlane, drop: float, area_m2: float
 ) -> bool:
     """Return whether a plane is the top of an object or of several, by rules 5 to 8."""
     furniture = area_m2 >= PLANES.furniture_m2
-    on_wall, beyond = _count_below_edge(grid, samples, plane, drop)
+    on_wall, beyond = _count_below_edge(grid, inliers, plane, drop)
     if on_wall + beyond >= MIN_BELOW:
         walled = on_wall > PLANES.wall_share * (on_wall + beyond)
         return walled and not (furniture and _count_above(grid, plane)[0] >= MIN_ABOVE)
@@ -157,7 +157,7 @@ def _count_above(grid: DepthGrid, plane: SupportingPlane) -> tuple[int, int]:
 
 
 @kernel
-def _largest_part(grid: DepthGrid, samples: DepthSamples, plane: SupportingPlane) -> float:
+def _largest_part(grid: DepthGrid, inliers: DepthSamples, plane: SupportingPlane) -> float:
     """Return the area of the largest connected part of a plane, m2.
 
     Objects on a plane hide parts of it, so nearer surface and missing depth connect parts. Farther
@@ -166,13 +166,11 @@ def _largest_part(grid: DepthGrid, samples: DepthSamples, plane: SupportingPlane
     inv_depth = grid.inverse_depth
     rows, columns = inv_depth.shape
     part, stack = np.zeros(inv_depth.size, np.int32), unset(inv_depth.size, np.int32)
-    areas = np.zeros(samples.inverse_depth.size + 1)
+    areas = np.zeros(inliers.inverse_depth.size + 1)
     parts = 0
-    for k in range(samples.inverse_depth.size):
-        i, j = int(samples.i[k]), int(samples.j[k])
+    for k in range(inliers.inverse_depth.size):
+        i, j = int(inliers.i[k]), int(inliers.j[k])
         level = plane.a * j + plane.b * i + plane.c
-        if level <= 0 or abs(samples.inverse_depth[k] - level) >= PLANES.tolerance:
-            continue
         start = i * columns + j
         if part[start] == 0:
             parts += 1
@@ -190,23 +188,21 @@ def _largest_part(grid: DepthGrid, samples: DepthSamples, plane: SupportingPlane
                         stack[tail], part[v * columns + u] = v * columns + u, parts
                         tail += 1
         facing = max(-level * plane.offset, 0.05)
-        areas[part[start]] += samples.share / (level * level * facing)
+        areas[part[start]] += inliers.share / (level * level * facing)
     return float(areas.max() / (grid.intrinsics.fx * grid.intrinsics.fy))
 
 
 @kernel
-def _is_enclosed(grid: DepthGrid, samples: DepthSamples, plane: SupportingPlane) -> bool:
+def _is_enclosed(grid: DepthGrid, inliers: DepthSamples, plane: SupportingPlane) -> bool:
     """Return whether the surface rises around a plane, as the walls do around the floor of a bin.
 
     Around the top of an object the surface drops.
     """
     inv_depth = grid.inverse_depth
     rises = drops = 0
-    for k in range(samples.inverse_depth.size):
-        i, j = int(samples.i[k]), int(samples.j[k])
+    for k in range(inliers.inverse_depth.size):
+        i, j = int(inliers.i[k]), int(inliers.j[k])
         level = plane.a * j + plane.b * i + plane.c
-        if level <= 0 or abs(samples.inverse_depth[k] - level) >= PLANES.tolerance:
-            continue
         radius = max(2, int(PLANES.around_m * grid.intrinsics.fx * level))
         for di, dj in ((-radius, 0), (radius, 0), (0, -radius), (0, radius)):
             v, u = i + di, j + dj
@@ -219,15 +215,13 @@ def _is_enclosed(grid: DepthGrid, samples: DepthSamples, plane: SupportingPlane)
 
 @kernel
 def _count_below_edge(
-    grid: DepthGrid, samples: DepthSamples, plane: SupportingPlane, drop: float
+    grid: DepthGrid, inliers: DepthSamples, plane: SupportingPlane, drop: float
 ) -> tuple[int, int]:
     """Count the samples below the edge of a plane that are on a wall, and those farther away."""
     on_wall = beyond = 0
-    for k in range(samples.inverse_depth.size):
-        i, j = samples.i[k], samples.j[k]
+    for k in range(inliers.inverse_depth.size):
+        i, j = inliers.i[k], inliers.j[k]
         level = plane.a * j + plane.b * i + plane.c
-        if level <= 0 or abs(samples.inverse_depth[k] - level) >= PLANES.tolerance:
-            continue
         x, y, z = _front_edge(grid, plane, i, j, 1 / level)
         if z == 0:
             continue
