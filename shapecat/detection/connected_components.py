@@ -1,4 +1,4 @@
-"""Connected components of cells, for all steps of detection.
+"""Connected components of cells.
 
 Two passes with a table of equivalent labels (Rosenfeld and Pfaltz 1966).
 """

@@ -5,13 +5,8 @@ import math
 import numpy as np
 
 from shapecat.arrays import F4
-from shapecat.detection.depth_grid import (
-    DepthGrid,
-    PinholeIntrinsics,
-    back_project,
-    project,
-    row_and_column,
-)
+from shapecat.detection.connected_components import DOWN, RIGHT, connected_components
+from shapecat.detection.depth_grid import DepthGrid, PinholeIntrinsics, back_project, project
 from shapecat.detection.planes.extent import (
     COS,
     DIRECTIONS,
@@ -28,9 +23,10 @@ from shapecat.jit import kernel, unset
 
 __all__ = ["supporting_planes"]
 
-BESIDE, DOWN = 5, 20
-"""Maximum number of steps from a sample towards the camera to the edge of its plane, and down from
-that edge."""
+STEPS_TO_EDGE = 5
+"""Maximum number of steps from a sample, towards the camera, to the edge of its plane."""
+STEPS_DOWN = 20
+"""Maximum number of steps down from that edge."""
 EDGE_CELLS = 2
 """Number of cells in which an edge is blurred."""
 MIN_BELOW = 20
@@ -165,30 +161,21 @@ def _largest_part(grid: DepthGrid, inliers: DepthSamples, plane: SupportingPlane
     """
     inv_depth = grid.inverse_depth
     rows, columns = inv_depth.shape
-    part, stack = np.zeros(inv_depth.size, np.int32), unset(inv_depth.size, np.int32)
-    areas = np.zeros(inliers.inverse_depth.size + 1)
-    parts = 0
+    connects = np.zeros(inv_depth.shape, np.bool_)
+    for i in range(rows):
+        for j in range(columns):
+            level, value = plane.a * j + plane.b * i + plane.c, inv_depth[i, j]
+            farthest = level - PLANES.tolerance
+            connects[i, j] = (level > 0) & ((value <= 0) | (value > farthest))
+    links, part = np.full(inv_depth.shape, RIGHT | DOWN, np.uint8), unset(inv_depth.shape, np.int32)
+    spans = np.zeros((rows, 2), np.int32)
+    spans[:, 1] = columns
+    areas = np.zeros(connected_components(connects, links, spans, part).size)
     for k in range(inliers.inverse_depth.size):
         i, j = int(inliers.i[k]), int(inliers.j[k])
         level = plane.a * j + plane.b * i + plane.c
-        start = i * columns + j
-        if part[start] == 0:
-            parts += 1
-            stack[0], part[start], head, tail = start, parts, 0, 1
-            while head < tail:
-                y, x = row_and_column(stack[head], columns)
-                head += 1
-                for dy, dx in ((0, 1), (0, -1), (1, 0), (-1, 0)):
-                    v, u = y + dy, x + dx
-                    if v < 0 or u < 0 or v >= rows or u >= columns or part[v * columns + u] > 0:
-                        continue
-                    at = plane.a * u + plane.b * v + plane.c
-                    value = inv_depth[v, u]
-                    if at > 0 and (value <= 0 or value > at - PLANES.tolerance):
-                        stack[tail], part[v * columns + u] = v * columns + u, parts
-                        tail += 1
         facing = max(-level * plane.offset, 0.05)
-        areas[part[start]] += inliers.share / (level * level * facing)
+        areas[part[i, j]] += inliers.share / (level * level * facing)
     return float(areas.max() / (grid.intrinsics.fx * grid.intrinsics.fy))
 
 
@@ -226,7 +213,7 @@ def _count_below_edge(
         if z == 0:
             continue
         first = max(4, _blurred_steps(grid.intrinsics.fx, plane, x, y, z))  # an edge is rounded
-        for step in range(first, min(DOWN, int(drop / PLANES.step_m))):
+        for step in range(first, min(STEPS_DOWN, int(drop / PLANES.step_m))):
             s = PLANES.step_m * step
             dx, dy, dz = x - s * plane.up[0], y - s * plane.up[1], z - s * plane.up[2]
             inv_depth = _inverse_depth_at(grid.inverse_depth, grid.intrinsics, dx, dy, dz)
@@ -264,7 +251,7 @@ def _front_edge(
     length = math.sqrt(tx * tx + ty * ty + tz * tz)
     step = PLANES.step_m / max(length, PLANES.step_m)
     edge = x, y, z
-    for _ in range(BESIDE):
+    for _ in range(STEPS_TO_EDGE):
         x, y, z = x + step * tx, y + step * ty, z + step * tz
         inv_depth = _inverse_depth_at(grid.inverse_depth, k, x, y, z)
         ahead = inv_depth - 1 / z
