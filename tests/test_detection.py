@@ -14,9 +14,10 @@ from scipy.spatial.transform import Rotation
 from benchmarks.ablation import STEPS, without
 from shapecat.arrays import I4
 from shapecat.config import DetectionSettings
-from shapecat.detection import Hierarchy, Node, detect, format_tree
+from shapecat.detection import detect
 from shapecat.detection.depth_grid import row_and_column
 from shapecat.detection.virtual_camera import _count_occupied
+from shapecat.outputs.scene_graph import Hierarchy, Node, format_tree
 from shapecat.types import Box, Camera, Candidate, Frame, Plane, Scene
 
 Array = NDArray[Any]

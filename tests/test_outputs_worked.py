@@ -23,7 +23,6 @@ from scipy.spatial.transform import Rotation
 
 from shapecat.cameras.colour import ColourImage, ColourView, LensCamera
 from shapecat.colour.masks import Mask
-from shapecat.detection.scene_graph import Node, format_tree
 from shapecat.errors import OutputError, RecordingError
 from shapecat.geometry import IDENTITY
 from shapecat.outputs.annotation.annotated_mcap import _annotations, _encoding
@@ -62,6 +61,7 @@ from shapecat.outputs.review.colour import true_colours
 from shapecat.outputs.review.images import layer_of
 from shapecat.outputs.review.paths import Paths
 from shapecat.outputs.review.scenes import choose_scenes, with_clouds
+from shapecat.outputs.scene_graph import Node, format_tree
 from shapecat.outputs.scene_tree import _apply_labels, _candidate, _described, _topic
 from shapecat.recordings.messages import Topic
 from shapecat.runs.labelled_frames import _join

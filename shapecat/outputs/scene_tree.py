@@ -7,9 +7,9 @@ from typing import Any
 
 import pyarrow as pa
 
-from shapecat.detection.scene_graph import Node, format_tree
 from shapecat.errors import OutputError
 from shapecat.outputs.level_clouds import upward
+from shapecat.outputs.scene_graph import Node, format_tree
 from shapecat.runs.finished import read_finished
 from shapecat.runs.tables.reading import keys_of, read_row_groups
 from shapecat.types import Box, Candidate, LabelledFrame, LabelledObject, Plane, Scene
