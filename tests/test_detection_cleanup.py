@@ -23,7 +23,7 @@ from shapecat.detection.cleanup.structure import (
 )
 from shapecat.detection.depth_grid import DepthGrid, PinholeIntrinsics, downsample
 from shapecat.detection.merging.segments import _blank, roots_of
-from shapecat.detection.pipeline import Task, merge_segments, oversegment
+from shapecat.detection.pipeline import Task, merge_segments, model_planes, oversegment
 from shapecat.detection.planes.extent import DIRECTIONS
 from shapecat.detection.planes.height_map import OUTLINE, HeightMap
 from shapecat.trees import BoostedTrees, Trees
@@ -46,9 +46,9 @@ def features_of(shapes: list[Shape], tilt_deg: float) -> tuple[Array, Array]:
     assert frame.camera is not None
     grid = downsample(frame.depth, frame.camera, range_m=settings.max_range_m)
     assert grid is not None
-    found = oversegment(grid, Task(settings, np.random.default_rng(0)))
-    assert found is not None
-    model, oversegmentation = found
+    model = model_planes(grid, None, Task(settings, np.random.default_rng(0)))
+    assert model is not None
+    oversegmentation = oversegment(grid, model)
     merge_segments(grid, model, oversegmentation)
     features = measure_object_features(grid, model, oversegmentation, settings.max_range_m)
     segments = oversegmentation.segments

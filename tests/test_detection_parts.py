@@ -14,15 +14,14 @@ from shapecat.detection.cleanup.object_features import OBJECT_FEATURES
 from shapecat.detection.depth_grid import downsample
 from shapecat.detection.merging import learned
 from shapecat.detection.merging.pair_features import (
-    FEATURES,
     PAIR_FEATURES,
     ViewGeometry,
     find_adjacent,
     pair_features,
 )
-from shapecat.detection.pipeline import Task, oversegment
+from shapecat.detection.pipeline import Task, model_planes, oversegment
 from shapecat.models.growing import Growth, grow
-from shapecat.models.parts import Series, collect
+from shapecat.models.parts import FEATURES, Series, collect
 from shapecat.simulation import KINECT, make_scene, render_frame
 from shapecat.trees import BoostedTrees, logit_of, read_trees, write_trees
 from tests.test_detection import overlaps
@@ -72,10 +71,10 @@ def test_pair_features_do_not_depend_on_the_order_of_the_pair() -> None:
     assert frame.camera is not None
     grid = downsample(frame.depth, frame.camera, range_m=2.0)
     assert grid is not None
-    found = oversegment(grid, Task(DetectionSettings(), rng))
-    assert found is not None
-    ground, (_, _, segments) = found
-    view_geometry = ViewGeometry(grid.intrinsics.fx, ground.up)
+    model = model_planes(grid, None, Task(DetectionSettings(), rng))
+    assert model is not None
+    segments = oversegment(grid, model).segments
+    view_geometry = ViewGeometry(grid.intrinsics.fx, model.up)
     there, back = np.zeros((2, 1), PAIR_FEATURES)
     seen = 0
     for p in range(1, segments.parent.size):

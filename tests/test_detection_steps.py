@@ -10,7 +10,7 @@ from shapecat.detection.cleanup.holes import fill_holes
 from shapecat.detection.connected_components import DOWN, RIGHT, spans_of
 from shapecat.detection.depth_grid import DepthGrid, downsample
 from shapecat.detection.foreground.convex_hull import fill_hull
-from shapecat.detection.merging.pair_features import FEATURES, PAIR_FEATURES
+from shapecat.detection.merging.pair_features import PAIR_FEATURES
 from shapecat.detection.merging.segments import PAIR, SEGMENT, add_statistics
 from shapecat.detection.planes import find_supporting_planes
 from shapecat.detection.planes.extent import DIRECTIONS, SupportingPlane
@@ -176,7 +176,7 @@ def test_statistics_of_two_segments_add_up() -> None:
 
 def test_feature_records_are_contiguous_floats() -> None:
     """The trees read a record as one row of float32."""
-    assert PAIR_FEATURES.itemsize == 4 * FEATURES == 4 * 70
+    assert PAIR_FEATURES.itemsize == 4 * 70
     assert SEGMENT.itemsize == 4 * len(SEGMENT.names or ())
     assert PAIR.itemsize == 4 * len(PAIR.names or ())
 

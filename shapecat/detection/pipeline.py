@@ -54,7 +54,7 @@ from shapecat.detection.virtual_camera import VirtualImage, top_view, virtual_im
 from shapecat.geometry import IDENTITY, inverse, unit_direction
 from shapecat.types import Camera, Frame, Scene
 
-__all__ = ["Task", "detect", "merge_segments", "oversegment"]
+__all__ = ["Task", "detect", "merge_segments", "model_planes", "oversegment"]
 
 DEFAULT_UP = (0.0, -1.0, 0.0)
 """Up in the optical frame of an upright camera, used if nothing else is known."""
@@ -147,24 +147,21 @@ def _segment(
 
     ``hint`` is the up direction (3,), if it is known; ``upright`` as in `find_supporting_planes`.
     """
-    model = _model_planes(grid, hint, task, upright=upright)
+    model = model_planes(grid, hint, task, upright=upright)
     if model is None:
         return None
-    oversegmentation = _oversegment(grid, model)
+    oversegmentation = oversegment(grid, model)
     merge_segments(grid, model, oversegmentation)
     return _clean_up(grid, model, oversegmentation, task.settings)
 
 
-def oversegment(grid: DepthGrid, task: Task) -> tuple[PlaneModel, OverSegmentation] | None:
-    """Find planes and the segments of objects; None if there is no supporting plane."""
-    model = _model_planes(grid, None, task)
-    return None if model is None else (model, _oversegment(grid, model))
-
-
-def _model_planes(
+def model_planes(
     grid: DepthGrid, hint: F8 | None, task: Task, *, upright: bool = True
 ) -> PlaneModel | None:
-    """Find the planes and what is above them, steps 2 and 3; None without a supporting plane."""
+    """Find the planes and what is above them, steps 2 and 3; None without a supporting plane.
+
+    The parameters are as in `_segment`.
+    """
     trials, settings = draw_trials(task.rng), task.settings
     result = _find_planes(grid, hint, trials, settings, upright=upright)
     if result is None:
@@ -212,7 +209,7 @@ def _find_assumed_plane(
     return assume_plane(grid, unexplained, up, settings.max_height_m)
 
 
-def _oversegment(grid: DepthGrid, model: PlaneModel) -> OverSegmentation:
+def oversegment(grid: DepthGrid, model: PlaneModel) -> OverSegmentation:
     """Split the samples above the planes wherever two objects may meet."""
     heights, up = model.heights, model.up
     graph = connect_surfaces(grid, heights)

@@ -20,14 +20,13 @@ from shapecat.detection.depth_grid import DepthGrid, downsample
 from shapecat.detection.merging import learned
 from shapecat.detection.merging.across_occlusion import merge_across_occluder
 from shapecat.detection.merging.pair_features import (
-    FEATURES,
     PAIR_FEATURES,
     ViewGeometry,
     find_adjacent,
     pair_features,
 )
 from shapecat.detection.merging.segments import Segments, merge
-from shapecat.detection.pipeline import Task, oversegment
+from shapecat.detection.pipeline import Task, model_planes, oversegment
 from shapecat.models.growing import Growth, collect_chunks, grow, growing_options
 from shapecat.models.viewpoints import random_viewpoint
 from shapecat.simulation import KINECT, REALSENSE, make_scene, render_frame
@@ -36,8 +35,10 @@ from shapecat.simulation.scenes.kinds import SceneKind
 from shapecat.trees import write_trees
 from shapecat.types import CATEGORIES, Camera
 
-__all__ = ["collect", "count_labels", "main"]
+__all__ = ["FEATURES", "collect", "count_labels", "main"]
 
+FEATURES = PAIR_FEATURES.itemsize // np.dtype("f4").itemsize
+"""The number of features of a pair."""
 _PURE = 0.6
 """A segment belongs to an object that owns more than this fraction of its cells."""
 _NOISY = replace(IDEAL, noise=0.0015, step=0.0029)
@@ -136,13 +137,13 @@ def _pairs(
     grid = downsample(depth, camera, range_m=settings.max_range_m)
     if grid is None:
         return
-    oversegmented = oversegment(grid, Task(settings, rng))
-    if oversegmented is None:
+    model = model_planes(grid, None, Task(settings, rng))
+    if model is None:
         return
-    ground, (graph, labels, segments) = oversegmented
+    graph, labels, segments = oversegment(grid, model)
     merge_across_occluder(segments, grid, graph.normal, labels)
     counts = count_labels(pixel_labels, labels, grid)
-    view_geometry, yielded = ViewGeometry(grid.intrinsics.fx, ground.up), set()
+    view_geometry, yielded = ViewGeometry(grid.intrinsics.fx, model.up), set()
     while True:
         rows, object_of = _segment_objects(segments, counts, object_labels)
         todo = []

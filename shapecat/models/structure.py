@@ -28,7 +28,7 @@ from shapecat.detection.cleanup.structure import (
 )
 from shapecat.detection.depth_grid import downsample
 from shapecat.detection.merging.segments import Records, roots_of
-from shapecat.detection.pipeline import Task, merge_segments, oversegment
+from shapecat.detection.pipeline import Task, merge_segments, model_planes, oversegment
 from shapecat.models.growing import Growth, collect_chunks, grow, growing_options
 from shapecat.models.parts import count_labels
 from shapecat.models.viewpoints import move_to_floor, random_viewpoint
@@ -266,10 +266,10 @@ def label_objects(frame: Frame, pixel_labels: U1, object_labels: I4) -> Iterator
         return
     grid = downsample(frame.depth, frame.camera, range_m=settings.max_range_m)
     task = Task(settings, np.random.default_rng(0))
-    oversegmented = None if grid is None else oversegment(grid, task)
-    if grid is None or oversegmented is None:
+    model = None if grid is None else model_planes(grid, None, task)
+    if grid is None or model is None:
         return
-    model, oversegmentation = oversegmented
+    oversegmentation = oversegment(grid, model)
     merge_segments(grid, model, oversegmentation)
     features = measure_object_features(grid, model, oversegmentation, settings.max_range_m)
     _, labels, segments = oversegmentation

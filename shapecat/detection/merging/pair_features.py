@@ -27,7 +27,6 @@ from shapecat.geometry import NEAREST_M
 from shapecat.jit import kernel
 
 __all__ = [
-    "FEATURES",
     "PAIR_FEATURES",
     "ViewGeometry",
     "find_adjacent",
@@ -94,8 +93,6 @@ PAIR_FEATURES = np.dtype(
 )
 """The features of two segments, the smaller one first; all are float32, lengths in metres or
 ratios. The trees index them in this order."""
-FEATURES = PAIR_FEATURES.itemsize // np.dtype("f4").itemsize
-"""The number of features of a pair."""
 
 
 class ViewGeometry(NamedTuple):
