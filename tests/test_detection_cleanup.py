@@ -26,6 +26,7 @@ from shapecat.detection.merging.segments import _blank, roots_of
 from shapecat.detection.pipeline import Task, merge_segments, model_planes, oversegment
 from shapecat.detection.planes.extent import DIRECTIONS
 from shapecat.detection.planes.height_map import OUTLINE, HeightMap
+from shapecat.geometry import DISCONTINUITY
 from shapecat.trees import BoostedTrees, Trees
 from tests.test_detection import Array, Shape, box, frame_of, render, table
 
@@ -81,7 +82,7 @@ def test_height_and_noise_of_plane_around_segment_are_measured() -> None:
     segments, features = _blank(2), np.zeros(2, OBJECT_FEATURES)
     segments.statistics["count"], segments.statistics["depth_sum"] = 1, 2.0
     segments.plane_id[:] = 1
-    grid = DepthGrid(np.full((11, 11), 0.5, np.float32), INTRINSICS, 1)
+    grid = DepthGrid(np.full((11, 11), 0.5, np.float32), INTRINSICS, 1, DISCONTINUITY)
     walls, spans = np.zeros((11, 11), np.uint8), np.tile(np.array([0, 11], np.int32), (11, 1))
     planes = np.zeros((1, OUTLINE + DIRECTIONS))
     low_profile = np.zeros((11, 11), np.bool_)
@@ -115,7 +116,7 @@ def test_segment_wider_than_objects_is_rejected() -> None:
     segments = _blank(2)
     features = _features(400)
     features["segment"]["width_m"] = 0.2
-    grid = DepthGrid(np.zeros((40, 40), np.float32), INTRINSICS, 1)
+    grid = DepthGrid(np.zeros((40, 40), np.float32), INTRINSICS, 1, DISCONTINUITY)
     for widest, expected in ((0.1, True), (0.3, False)):
         settings = DetectionSettings(max_size_m=widest)
         assert find_background(segments, features, grid, settings, ALWAYS)[1] == expected
@@ -125,7 +126,7 @@ def test_segment_wider_than_objects_is_rejected() -> None:
 def test_large_segment_cut_by_border_is_rejected_as_arm(cells: int, border: float) -> None:
     features = _features(cells)
     features["surroundings"]["image_border"] = border
-    grid = DepthGrid(np.zeros((40, 40), np.float32), INTRINSICS, 1)
+    grid = DepthGrid(np.zeros((40, 40), np.float32), INTRINSICS, 1, DISCONTINUITY)
     found = find_background(_blank(2), features, grid, DetectionSettings(), ALWAYS)[1]
     assert found == (cells > 100 and border > 0.4)
 
@@ -133,7 +134,7 @@ def test_large_segment_cut_by_border_is_rejected_as_arm(cells: int, border: floa
 @pytest.mark.parametrize(("cells", "rejected"), [(29, True), (31, False)])
 def test_tiny_segment_is_rejected_before_holes_are_filled(cells: int, rejected: bool) -> None:
     """Otherwise it would split a hole in an object."""
-    grid = DepthGrid(np.zeros((40, 40), np.float32), INTRINSICS, 1)
+    grid = DepthGrid(np.zeros((40, 40), np.float32), INTRINSICS, 1, DISCONTINUITY)
     found = find_background(_blank(2), _features(cells), grid, DetectionSettings(), ALWAYS)
     assert found[1] == rejected  # the smallest object covers 60 cells here
 
@@ -146,7 +147,7 @@ def test_context_decides_only_uncertain_segments(
     alone: float, in_context: float, rejected: bool
 ) -> None:
     features = _features(400)
-    grid = DepthGrid(np.zeros((200, 200), np.float32), INTRINSICS, 1)
+    grid = DepthGrid(np.zeros((200, 200), np.float32), INTRINSICS, 1, DISCONTINUITY)
     trees = RejectionTrees(
         *(_LEAF._replace(value=np.array([v], np.float32)) for v in (alone, in_context))
     )
@@ -160,7 +161,9 @@ def test_context_decides_only_uncertain_segments(
 )
 def test_large_objects_need_less_evidence(cells: int, logit: float, *, rejected: bool) -> None:
     """Users notice the loss of a large object first."""
-    grid = DepthGrid(np.zeros((200, 200), np.float32), INTRINSICS, 1)  # 2 % are 800 cells
+    grid = DepthGrid(
+        np.zeros((200, 200), np.float32), INTRINSICS, 1, DISCONTINUITY
+    )  # 2 % are 800 cells
     leaf = _LEAF._replace(value=np.array([logit], np.float32))
     trees = RejectionTrees(leaf, leaf)
     found = find_background(_blank(2), _features(cells), grid, DetectionSettings(), trees)
@@ -200,7 +203,7 @@ def test_image_border_is_where_samples_begin() -> None:
     """A sensor may leave a strip empty; a wider gap is not a border."""
     inv_depth = np.zeros((100, 200), np.float32)
     inv_depth[3:60, 0:195] = 1
-    grid = DepthGrid(inv_depth, INTRINSICS, 1)
+    grid = DepthGrid(inv_depth, INTRINSICS, 1, DISCONTINUITY)
     assert _border_lines(grid) == (3, -1, 0, 194)
     assert _border_lines(grid._replace(inverse_depth=np.zeros_like(inv_depth))) == (-1, -1, -1, -1)
 
@@ -212,7 +215,9 @@ def test_contact_boundary_joins_adjacent_object() -> None:
     labels[:4], plane_id[:4] = 3, 1
     height = np.zeros((8, 8), np.float32)
     height[4:6, :5] = 0.005  # more than .6 of 6.5 mm
-    fill_contact_boundary(DepthGrid(inv_depth, INTRINSICS, 1), HeightMap(plane_id, height), labels)
+    fill_contact_boundary(
+        DepthGrid(inv_depth, INTRINSICS, 1, DISCONTINUITY), HeightMap(plane_id, height), labels
+    )
     assert (labels[4, :5] == 3).all()
     assert (labels[4, 5:] == 0).all()
     assert (labels[5:] == 0).all()
@@ -226,7 +231,7 @@ def test_hole_is_filled_with_enclosing_object() -> None:
     labels[15:25, 15:25] = 0
     labels[20:35, 18:21], inv_depth[20:35, 18:21] = 2, 1.4
     hole = labels[15:25, 15:25] == 0
-    fill_holes(DepthGrid(inv_depth, INTRINSICS, 1), labels, 2, filled)
+    fill_holes(DepthGrid(inv_depth, INTRINSICS, 1, DISCONTINUITY), labels, 2, filled)
     assert (labels[15:25, 15:25][hole] == 1).all()
     assert filled.sum() == hole.sum()
 
@@ -238,7 +243,7 @@ def test_gap_between_two_boxes_is_no_hole() -> None:
     labels[10:30, 5:35] = 1
     labels[20:30] *= 2
     labels[17:23, 15:25] = 0
-    fill_holes(DepthGrid(inv_depth, INTRINSICS, 1), labels, 2, filled)
+    fill_holes(DepthGrid(inv_depth, INTRINSICS, 1, DISCONTINUITY), labels, 2, filled)
     assert not filled.any()
 
 
@@ -252,7 +257,7 @@ def test_mouth_of_cup_seen_from_above_is_filled(width: int, torn: int, filled: b
     labels[hole, hole], inv_depth[hole, hole] = 0, 0
     floor = slice(hole.start + torn, hole.stop - torn)
     inv_depth[floor, floor] = 1.1
-    fill_holes(DepthGrid(inv_depth, INTRINSICS, 1), labels, 1, cells)
+    fill_holes(DepthGrid(inv_depth, INTRINSICS, 1, DISCONTINUITY), labels, 1, cells)
     assert (labels[floor, floor] == filled).all()
     assert cells.sum() == filled * (width - 2 * torn) ** 2
 
@@ -263,7 +268,7 @@ def test_background_of_large_image_is_no_hole() -> None:
     labels, filled = np.zeros((632, 632), np.int16), np.zeros((632, 632), np.uint8)
     labels[[0, 3]] = labels[:, [0, -1]] = 1
     labels[3, 100:601:100], labels[-1, 100:601:100] = 0, 1
-    fill_holes(DepthGrid(inv_depth, INTRINSICS, 1), labels, 1, filled)
+    fill_holes(DepthGrid(inv_depth, INTRINSICS, 1, DISCONTINUITY), labels, 1, filled)
     assert not filled.any()
 
 

@@ -28,11 +28,12 @@ from shapecat.detection.planes.oriented_points import level_samples, orient_poin
 from shapecat.detection.planes.plane_fit import horizontal_plane
 from shapecat.detection.planes.ransac import draw_trials
 from shapecat.detection.planes.supporting import supporting_planes
+from shapecat.geometry import DISCONTINUITY
 from tests.level_planes import INTRINSICS, RAY_HEIGHTS, UP, I, J, level
 
 
 def grid_of(inv_depth: F4) -> DepthGrid:
-    return DepthGrid(np.ascontiguousarray(inv_depth, np.float32), INTRINSICS, 2)
+    return DepthGrid(np.ascontiguousarray(inv_depth, np.float32), INTRINSICS, 2, DISCONTINUITY)
 
 
 def plane_of(grid: DepthGrid, below_m: float) -> SupportingPlane:
@@ -127,7 +128,7 @@ def test_large_upright_face_is_a_wall_unlike_small_one() -> None:
 
     small = np.zeros((240, 320), np.int8)
     small[100:150, 140:190] = 1
-    only = DepthGrid(np.where(small > 0, grid.inverse_depth, 0), INTRINSICS, 2)
+    only = DepthGrid(np.where(small > 0, grid.inverse_depth, 0), INTRINSICS, 2, DISCONTINUITY)
     walls = remove_walls(only, small, up, 0.5, trials)
     assert not (walls == CLEARED).any()
     assert small.sum() == 2500

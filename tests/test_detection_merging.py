@@ -20,6 +20,7 @@ from shapecat.detection.merging.segment_features import (
 from shapecat.detection.merging.segments import Segments, measure_segments, merge
 from shapecat.detection.planes.height_map import HeightMap
 from shapecat.detection.segmentation.connectivity import SurfaceGraph, connect_surfaces
+from shapecat.geometry import DISCONTINUITY
 from tests.test_detection import Array
 
 INTRINSICS = PinholeIntrinsics(250.0, 250.0, 99.5, 74.5)
@@ -32,7 +33,7 @@ def measured(depth: Array, labels: Array) -> tuple[Segments, SurfaceGraph, Depth
     """Measure the labels of a depth image (150, 200), metres, 0 where there is nothing."""
     with np.errstate(divide="ignore"):
         inv_depth = np.where(depth > 0, 1 / depth, 0).astype(np.float32)
-    grid = DepthGrid(inv_depth, INTRINSICS, 1)
+    grid = DepthGrid(inv_depth, INTRINSICS, 1, DISCONTINUITY)
     plane_id = (labels > 0).astype(np.int8)
     y = (np.arange(150)[:, None] - INTRINSICS.cy) / INTRINSICS.fy * depth
     heights = HeightMap(plane_id, np.where(labels > 0, 0.25 - y, 0).astype(np.float32))

@@ -18,6 +18,7 @@ from shapecat.detection.planes.ransac import draw_trials
 from shapecat.detection.planes.settings import UP as UP_SETTINGS
 from shapecat.detection.planes.strips import add_strip_planes
 from shapecat.detection.planes.up_direction import estimate_up
+from shapecat.geometry import DISCONTINUITY
 from shapecat.learning import load_model
 from shapecat.simulation.camera.render import geometry, render
 from shapecat.simulation.scenes.paths import looking_at
@@ -161,7 +162,9 @@ def test_assumed_plane_lies_just_below_unexplained_samples() -> None:
     far = np.where(j > 150, 1.4, 0.0)
     height = blob + far
     inv_depth = np.where((height > 0) & (down > 0.2), down / np.maximum(height, 0.1), 0)
-    grid = DepthGrid(inv_depth.astype(np.float32), PinholeIntrinsics(150.0, 150.0, 70.0, 62.0), 4)
+    grid = DepthGrid(
+        inv_depth.astype(np.float32), PinholeIntrinsics(150.0, 150.0, 70.0, 62.0), 4, DISCONTINUITY
+    )
 
     plane = assume_plane(grid, inv_depth > 0, up, tallest_m=0.3)
 
@@ -190,7 +193,9 @@ def test_given_up_is_kept_without_visible_plane() -> None:
 
 def test_no_plane_is_assumed_for_few_samples_or_above_camera() -> None:
     """A `detection.max_height_m` of nearly 0 must not fail."""
-    grid = DepthGrid(np.ones((60, 80), np.float32), PinholeIntrinsics(75.0, 75.0, 39.5, 29.5), 8)
+    grid = DepthGrid(
+        np.ones((60, 80), np.float32), PinholeIntrinsics(75.0, 75.0, 39.5, 29.5), 8, DISCONTINUITY
+    )
     few = np.zeros((60, 80), np.int8)
     few[6:] = -1  # a tenth of the cells is above no plane
     up = np.array([0.0, 0.0, -1.0])

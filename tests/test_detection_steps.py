@@ -20,6 +20,7 @@ from shapecat.detection.planes.ransac import draw_trials, ransac_plane, sample_g
 from shapecat.detection.segmentation.connectivity import SurfaceGraph, connect_surfaces
 from shapecat.detection.segmentation.settings import SEGMENTATION
 from shapecat.detection.segmentation.watershed import watershed
+from shapecat.geometry import DISCONTINUITY
 from shapecat.types import Camera
 from tests.level_planes import INTRINSICS, UP, level
 
@@ -53,11 +54,11 @@ def test_samples_beyond_the_edge_of_a_plane_have_no_height() -> None:
     inv_depth[100:140, 80:120] = level(0.62)[100:140, 80:120]  # a box of 8 cm
     inv_depth[100:140, 280:300] = level(0.62)[100:140, 280:300]  # and one beyond the edge
     trials = draw_trials(np.random.default_rng(0))
-    grid = DepthGrid(board, INTRINSICS, 2)
+    grid = DepthGrid(board, INTRINSICS, 2, DISCONTINUITY)
     found, _ = find_supporting_planes(grid, UP, trials, tallest_m=0.5, upright=True)
     planes = pack_planes(found)
     assert len(found) == 1
-    heights = measure_heights(DepthGrid(inv_depth, INTRINSICS, 2), planes, 0.6)
+    heights = measure_heights(DepthGrid(inv_depth, INTRINSICS, 2, DISCONTINUITY), planes, 0.6)
     assert (heights.plane_id[105:135, 85:115] == 1).all()
     np.testing.assert_allclose(heights.height[105:135, 85:115], 0.08, atol=1e-4)
     assert (heights.plane_id[100:140, 285:] == 0).all()
@@ -70,7 +71,9 @@ def test_far_sample_below_a_plane_by_noise_is_on_it() -> None:
     plane = SupportingPlane(*_level_plane(40.0), UP, -40.0, extent, 1.0)
     inv_depth = np.zeros((240, 320), np.float32)
     inv_depth[60, 100] = level(40.0)[60, 100] / (1 + 15 / 40)  # 15 m below the plane
-    heights = measure_heights(DepthGrid(inv_depth, INTRINSICS, 2), pack_planes([plane]), 0.6)
+    heights = measure_heights(
+        DepthGrid(inv_depth, INTRINSICS, 2, DISCONTINUITY), pack_planes([plane]), 0.6
+    )
     assert heights.plane_id[60, 100] == -1
     np.testing.assert_allclose(heights.height[60, 100], -15, atol=0.01)
 
@@ -92,7 +95,7 @@ def test_watershed_splits_faces_at_a_concave_edge(rise: float, segments: int) ->
     inv_depth[90:150, 120:200] = (1 / z)[:, None].astype(np.float32)
     plane_id = (inv_depth > 0).astype(np.int8)
     heights = HeightMap(plane_id, np.where(plane_id, 0.1, 0).astype(np.float32))
-    graph = connect_surfaces(DepthGrid(inv_depth, INTRINSICS, 2), heights)
+    graph = connect_surfaces(DepthGrid(inv_depth, INTRINSICS, 2, DISCONTINUITY), heights)
 
     labels, n = watershed(heights, graph)
 
@@ -155,7 +158,7 @@ def test_enclosed_holes_are_filled_and_open_ones_are_not() -> None:
     labels[18:22, 18:22] = 0
     labels[14:16, 10:20] = 0  # open to the left
     filled = np.zeros((40, 40), np.uint8)
-    fill_holes(DepthGrid(inv_depth, INTRINSICS, 2), labels, 1, filled)
+    fill_holes(DepthGrid(inv_depth, INTRINSICS, 2, DISCONTINUITY), labels, 1, filled)
     assert (labels[18:22, 18:22] == 1).all()
     assert (filled[18:22, 18:22] == 1).all()
     assert (labels[14:16, 10:20] == 0).all()

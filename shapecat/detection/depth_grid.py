@@ -67,7 +67,7 @@ class DepthGrid(NamedTuple):
     inverse_depth: F4
     intrinsics: PinholeIntrinsics
     factor: int
-    discontinuity: float = DISCONTINUITY
+    discontinuity: float
 
 
 def downsample(depth: F4, camera: Camera, *, range_m: float) -> DepthGrid | None:

@@ -20,7 +20,7 @@ from shapecat.detection.merging.segment_features import (
     share,
     write_segment_features,
 )
-from shapecat.detection.merging.segments import Records, Row, Segments, depth_of
+from shapecat.detection.merging.segments import Records, Row, Segments, mean_depth
 from shapecat.detection.planes.height_map import HeightMap, distance_outside, min_height_at
 from shapecat.detection.records import OverSegmentation, PlaneModel
 from shapecat.geometry import DISCONTINUITY
@@ -143,7 +143,7 @@ def _measure(
         if segments.parent[p] != p:
             continue
         segment, around, view = segments.statistics[p], out[p].surroundings, out[p].visibility
-        depth = depth_of(segments, p)
+        depth = mean_depth(segment)
         cell, min_height = depth / grid.intrinsics.fx, min_height_at(depth)
         write_segment_features(segments, p, out[p].segment)
         around.image_border = share(around.image_border, 4 * math.sqrt(segment.count))

@@ -20,7 +20,14 @@ from shapecat.detection.merging.segment_features import (
     width_of,
     write_segment_features,
 )
-from shapecat.detection.merging.segments import SEGMENT, Records, Row, Segments, add_statistics
+from shapecat.detection.merging.segments import (
+    SEGMENT,
+    Records,
+    Row,
+    Segments,
+    add_statistics,
+    mean_depth,
+)
 from shapecat.detection.merging.settings import MERGING
 from shapecat.detection.planes.extent import DIRECTIONS
 from shapecat.geometry import NEAREST_M
@@ -180,7 +187,7 @@ def write_pair_features(
     if area_p > area_q or (area_p == area_q and p > q):
         p, q = q, p
     a, b = segments.statistics[p], segments.statistics[q]
-    cell = a.depth_sum / a.count / view_geometry.focal
+    cell = mean_depth(a) / view_geometry.focal
     _write_adjacency(segments, p, q, cell, out.adjacency)
     out.first, out.second = features[p], features[q]
     relation = out.relation

@@ -4,7 +4,7 @@ import math
 
 import numpy as np
 
-from shapecat.detection.merging.segments import BAND_M, BANDS, Row, Segments
+from shapecat.detection.merging.segments import BAND_M, BANDS, Row, Segments, mean_depth
 from shapecat.detection.merging.settings import MERGING
 from shapecat.jit import kernel
 
@@ -52,7 +52,7 @@ def width_of(row: Row) -> float:
 @kernel(inner=True)
 def depth_difference(a: Row, b: Row) -> float:
     """Return the mean depth of segment ``a`` minus that of segment ``b``, metres."""
-    return float(a.depth_sum / a.count - b.depth_sum / b.count)
+    return float(mean_depth(a) - mean_depth(b))
 
 
 @kernel(inner=True)

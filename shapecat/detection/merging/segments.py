@@ -25,8 +25,8 @@ __all__ = [
     "Row",
     "Segments",
     "add_statistics",
-    "depth_of",
     "lateral_axis",
+    "mean_depth",
     "measure_segments",
     "merge",
     "roots_of",
@@ -275,7 +275,6 @@ def add_statistics(statistics: Records, p: int, q: int) -> None:
 
 
 @kernel(inner=True)
-def depth_of(segments: Segments, p: int) -> float:
-    """Return the mean depth of a segment, metres; 1 if it has no cells."""
-    count = segments.statistics[p].count
-    return float(segments.statistics[p].depth_sum / count) if count > 0 else 1.0
+def mean_depth(row: Row) -> Any:
+    """Return the mean depth of a segment, metres; ``row`` is a `SEGMENT`."""
+    return row.depth_sum / row.count

@@ -17,7 +17,14 @@ __all__ = ["ObjectMeasurements", "measure_objects"]
 
 
 class Boxes(NamedTuple):
-    """The boxes of the objects 1..n, in 3D and in the image; fields as in `ObjectMeasurements`."""
+    """The boxes of the objects 1..n, in 3D and in the image, one row each.
+
+    Attributes
+    ----------
+    center, size : (n, 3) metres, of the upright box, view frame.
+    orientation : (n, 4) quaternion x, y, z, w of the box, view frame.
+    low, high : (n, 2) the first and last row and column of the cells of each.
+    """
 
     center: F8
     size: F8
@@ -36,9 +43,7 @@ class ObjectMeasurements(NamedTuple):
 
     Attributes
     ----------
-    center, size : (n, 3) metres, of the upright box, view frame.
-    orientation : (n, 4) quaternion x, y, z, w of the box, view frame.
-    low, high : (n, 2) the first and last row and column of the cells of each.
+    boxes : their boxes.
     supported_by : (n,) the label of the object that each stands on; 0 for its plane.
     support_m : (n,) the height of that support above the plane.
     occluded : (n,) whether a nearer surface hides part of it.
@@ -46,11 +51,7 @@ class ObjectMeasurements(NamedTuple):
     min_cells : (n,) float32, number of cells of the smallest object at its depth.
     """
 
-    center: F8
-    size: F8
-    orientation: F8
-    low: I4
-    high: I4
+    boxes: Boxes
     supported_by: I4
     support_m: F8
     occluded: Bool
@@ -85,7 +86,7 @@ def measure_objects(
     segment, visibility = objects["segment"], objects["visibility"]
     cells_at_limit = np.rint(objects["surroundings"]["range_limit"] * visibility["cells"])
     return ObjectMeasurements(
-        *boxes,
+        boxes,
         supported_by,
         support_m,
         segment["hidden"] + segment["behind"] > OUTPUT.occluded_share,

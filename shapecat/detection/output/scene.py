@@ -117,7 +117,7 @@ def _boxes(
     segmentation: Segmentation, indices: Sequence[U4], points: F4 | None, sensor_from_view: Pose
 ) -> list[Box]:
     """Return the boxes of all lists: measured on cells, or on points for hidden objects."""
-    measured = segmentation.measured
+    measured = segmentation.measured.boxes
     sizes = [measured.center, measured.size, measured.orientation]
     if sensor_from_view is IDENTITY:  # rows of a frozen array are frozen
         sizes = [freeze(rows, "n k", "f4") for rows in sizes]
@@ -130,17 +130,17 @@ def _boxes(
 
 def _at_image_border(grid: DepthGrid, segmentation: Segmentation, _: Pose) -> Bool:
     """Return whether each object reaches the border of the image, or a blank strip along it."""
-    measured, band = segmentation.measured, max(1, round(2 / grid.factor))
+    boxes, band = segmentation.measured.boxes, max(1, round(2 / grid.factor))
     shape = grid.inverse_depth.shape
-    truncated = np.zeros(len(measured.low), bool)
+    truncated = np.zeros(len(boxes.low), bool)
     for side, (blank, extent) in enumerate(find_borders(grid.inverse_depth, band).tolist()):
         axis = side // 2
         # The top of a tall object with nothing behind it is not a border.
         first = band + (blank if extent > OUTPUT.straight_share * shape[1 - axis] else 0)
         if side % 2 == 0:
-            truncated |= measured.low[:, axis] < first
+            truncated |= boxes.low[:, axis] < first
         else:
-            truncated |= measured.high[:, axis] > shape[axis] - 1 - first
+            truncated |= boxes.high[:, axis] > shape[axis] - 1 - first
     return truncated
 
 
