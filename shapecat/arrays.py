@@ -7,7 +7,20 @@ from typing import Any, ClassVar, TypeAlias, dataclass_transform
 import numpy as np
 from numpy.typing import ArrayLike, DTypeLike, NDArray
 
-__all__ = ["F4", "F8", "I4", "U1", "U2", "U4", "Bool", "Record", "array", "freeze"]
+__all__ = [
+    "F4",
+    "F8",
+    "I4",
+    "U1",
+    "U2",
+    "U4",
+    "Bool",
+    "Record",
+    "Records",
+    "Row",
+    "array",
+    "freeze",
+]
 
 F4: TypeAlias = NDArray[np.floating[Any]]
 F8: TypeAlias = NDArray[np.floating[Any]]
@@ -16,6 +29,10 @@ U1: TypeAlias = NDArray[np.integer[Any]]
 U2: TypeAlias = NDArray[np.integer[Any]]
 U4: TypeAlias = NDArray[np.integer[Any]]
 Bool: TypeAlias = NDArray[np.bool_]
+Records: TypeAlias = NDArray[np.void]
+"""An array of a structured type, whose elements kernels read and write by the names of fields."""
+Row: TypeAlias = Any
+"""One of its elements."""
 # mypy tells floats, integers and Booleans apart; `freeze` enforces the size when a record is made.
 
 

@@ -24,8 +24,7 @@ from shapecat.detection.cleanup.structure import (
 from shapecat.detection.depth_grid import DepthGrid, PinholeIntrinsics, downsample
 from shapecat.detection.merging.segments import _blank, roots_of
 from shapecat.detection.pipeline import Task, merge_segments, model_planes, oversegment
-from shapecat.detection.planes.extent import DIRECTIONS
-from shapecat.detection.planes.height_map import OUTLINE, HeightMap
+from shapecat.detection.planes.height_map import PLANE, HeightMap
 from shapecat.geometry import DISCONTINUITY
 from shapecat.trees import BoostedTrees, Trees
 from tests.test_detection import Array, Shape, box, frame_of, render, table
@@ -84,7 +83,7 @@ def test_height_and_noise_of_plane_around_segment_are_measured() -> None:
     segments.plane_id[:] = 1
     grid = DepthGrid(np.full((11, 11), 0.5, np.float32), INTRINSICS, 1, DISCONTINUITY)
     walls, spans = np.zeros((11, 11), np.uint8), np.tile(np.array([0, 11], np.int32), (11, 1))
-    planes = np.zeros((1, OUTLINE + DIRECTIONS))
+    planes = np.zeros(1, PLANE)
     low_profile = np.zeros((11, 11), np.bool_)
     heights = HeightMap(plane_id, height)
     seen = Surroundings(planes, heights, low_profile, walls, labels, spans)

@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from shapecat.arrays import F4, F8
+from shapecat.arrays import F4, F8, Records
 from shapecat.detection.depth_grid import DepthGrid
 from shapecat.detection.foreground.depth_error import filter_high_pass, measure_noise
 from shapecat.detection.foreground.low_profile import find_low_profile
@@ -42,7 +42,7 @@ def plane_of(grid: DepthGrid, below_m: float) -> SupportingPlane:
     return measure_candidate(grid, samples, plane).plane
 
 
-def heights_of(grid: DepthGrid, plane: SupportingPlane) -> tuple[HeightMap, F8]:
+def heights_of(grid: DepthGrid, plane: SupportingPlane) -> tuple[HeightMap, Records]:
     planes = pack_planes([plane])
     return measure_heights(grid, planes, 0.5), planes
 
@@ -80,7 +80,7 @@ def test_rectangular_plane_has_true_outline_and_area() -> None:
     across, along = x, forward[1] * y + forward[2] * depth
     board = (abs(across) < 0.2) & (abs(along - 0.7) < 0.15)
     plane = plane_of(grid_of(np.where(board, level(0.7), 0)), 0.7)
-    corners = outline_corners(plane)
+    corners = outline_corners(plane.up, plane.offset, plane.extent)
     assert 0.75 * 0.12 < plane.area_m2 <= 0.12  # no normals near edges
     np.testing.assert_allclose(corners @ UP, -0.7, atol=1e-9)
     np.testing.assert_allclose(abs(corners[:, 0]).max(), 0.2, atol=0.02)
@@ -89,7 +89,7 @@ def test_rectangular_plane_has_true_outline_and_area() -> None:
 
 def test_points_within_margin_of_outline_are_inside() -> None:
     plane = SupportingPlane(0, 0, 0, np.array([0.0, 0, -1]), -1.0, np.full(DIRECTIONS, 0.5), 1.0)
-    row = pack_planes([plane])[0]
+    row = pack_planes([plane]).view(np.recarray)[0]
     assert distance_outside(row, 0.45, 0.0, 1.0) <= 0.0
     assert distance_outside(row, 0.6, 0.0, 1.0) > 0.0
     assert distance_outside(row, 0.6, 0.0, 1.0) <= 0.15

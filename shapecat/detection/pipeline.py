@@ -21,7 +21,7 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import ArrayLike
 
-from shapecat.arrays import F4, F8, I4, Bool
+from shapecat.arrays import F4, F8, I4, Bool, Records
 from shapecat.config import DetectionSettings
 from shapecat.detection.cleanup import structure
 from shapecat.detection.cleanup.holes import fill_contact_boundary, fill_holes
@@ -166,17 +166,17 @@ def model_planes(
     result = _find_planes(grid, hint, trials, settings, upright=upright)
     if result is None:
         return None
-    up, supports, planes, heights = result
+    up, planes, heights = result
     low_profile: Bool = find_low_profile(grid, heights, planes, settings.max_size_m)
     walls = remove_walls(grid, heights.plane_id, up, settings.max_size_m, trials)
     extend_overhang(grid, heights, planes, walls, settings.max_height_m)
-    return PlaneModel(up, supports, planes, heights, low_profile, walls)
+    return PlaneModel(up, planes, heights, low_profile, walls)
 
 
 def _find_planes(
     grid: DepthGrid, hint: F8 | None, trials: F8, settings: DetectionSettings, *, upright: bool
-) -> tuple[F8, list[SupportingPlane], F8, HeightMap] | None:
-    """Return up, the supporting planes, the same packed, and the height map; None without one."""
+) -> tuple[F8, Records, HeightMap] | None:
+    """Return up, the supporting planes, and the height map; None without a plane."""
     tallest_m = settings.max_height_m
     supports, up = find_supporting_planes(grid, hint, trials, tallest_m=tallest_m, upright=upright)
     if not supports and not upright:  # another view of the cloud may show a plane
@@ -192,7 +192,7 @@ def _find_planes(
         supports = sorted([*supports, assumed], key=lambda support: support.offset)
         planes = pack_planes(supports)
         heights = measure_heights(grid, planes, tallest_m)
-    return (up, supports, planes, heights) if supports else None
+    return (up, planes, heights) if supports else None
 
 
 def _find_assumed_plane(

@@ -2,10 +2,9 @@
 
 from typing import NamedTuple
 
-from shapecat.arrays import F8, I4, U1, Bool
+from shapecat.arrays import F8, I4, U1, Bool, Records
 from shapecat.detection.merging.segments import Segments
 from shapecat.detection.output.measurements import ObjectMeasurements
-from shapecat.detection.planes.extent import SupportingPlane
 from shapecat.detection.planes.height_map import HeightMap
 from shapecat.detection.segmentation.connectivity import SurfaceGraph
 
@@ -18,16 +17,14 @@ class PlaneModel(NamedTuple):
     Attributes
     ----------
     up : (3,) unit vector, sensor frame.
-    supports : the planes, lowest first.
-    planes : the same, from `pack_planes`.
+    planes : (planes,) records of `PLANE`, lowest first.
     heights : the plane below each sample, and the height above it.
     low_profile : (rows, columns) where low-profile objects are.
     walls : (rows, columns) uint8, from `remove_walls`; not 0 on walls.
     """
 
     up: F8
-    supports: list[SupportingPlane]
-    planes: F8
+    planes: Records
     heights: HeightMap
     low_profile: Bool
     walls: U1
@@ -56,7 +53,7 @@ class Segmentation(NamedTuple):
     model : the planes, the samples above them, and the walls.
     labels : (rows, columns) int16, objects 1..count, 0 elsewhere.
     filled : (rows, columns) uint8, 1 where a labelled cell may be at the level of the plane.
-    plane_ids : (count + 1,) index in ``model.supports`` of the plane below each object; 0 for
+    plane_ids : (count + 1,) index in ``model.planes`` of the plane below each object; 0 for
         label 0.
     measured : the boxes, supports and flags of the objects.
     """

@@ -14,7 +14,7 @@ from typing import Literal, NamedTuple
 import click
 import numpy as np
 
-from shapecat.arrays import F4, I4, U1, Bool
+from shapecat.arrays import F4, I4, U1, Bool, Records
 from shapecat.config import DetectionSettings
 from shapecat.detection.cleanup import structure
 from shapecat.detection.cleanup.context import CONTEXT_FEATURES, add_context, measure_borders
@@ -27,7 +27,7 @@ from shapecat.detection.cleanup.structure import (
     logits_of,
 )
 from shapecat.detection.depth_grid import downsample
-from shapecat.detection.merging.segments import Records, roots_of
+from shapecat.detection.merging.segments import roots_of
 from shapecat.detection.pipeline import Task, merge_segments, model_planes, oversegment
 from shapecat.models.growing import Growth, collect_chunks, grow, growing_options
 from shapecat.models.parts import count_labels

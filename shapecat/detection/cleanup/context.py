@@ -8,10 +8,10 @@ Source: auto-context (Tu 2008).
 
 import numpy as np
 
-from shapecat.arrays import F4, I4
+from shapecat.arrays import F4, I4, Records
 from shapecat.detection.cleanup.object_features import OBJECT_FEATURES
 from shapecat.detection.cleanup.settings import CLEANUP
-from shapecat.detection.merging.segments import Records, Segments
+from shapecat.detection.merging.segments import Segments
 
 __all__ = ["CONTEXT_FEATURES", "add_context", "measure_borders"]
 

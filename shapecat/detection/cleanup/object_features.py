@@ -10,7 +10,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from shapecat.arrays import F8, I4, U1, Bool
+from shapecat.arrays import F8, I4, U1, Bool, Records, Row
 from shapecat.detection.cleanup.settings import CLEANUP
 from shapecat.detection.connected_components import SIDES
 from shapecat.detection.depth_grid import DepthGrid, back_project, find_borders, row_and_column
@@ -20,7 +20,7 @@ from shapecat.detection.merging.segment_features import (
     share,
     write_segment_features,
 )
-from shapecat.detection.merging.segments import Records, Row, Segments, mean_depth
+from shapecat.detection.merging.segments import Segments, mean_depth
 from shapecat.detection.planes.height_map import HeightMap, distance_outside, min_height_at
 from shapecat.detection.records import OverSegmentation, PlaneModel
 from shapecat.geometry import DISCONTINUITY
@@ -90,7 +90,7 @@ def measure_object_features(
 class Surroundings(NamedTuple):
     """Fields of `PlaneModel` and `OverSegmentation` that the kernels read."""
 
-    planes: F8
+    planes: Records
     heights: HeightMap
     low_profile: Bool
     walls: U1
@@ -205,19 +205,16 @@ def _count_by_segment(
                     row.depth_edge += 1
                 if plane_id[y, x] != 0 or abs(inv_depth[y, x] - w) >= jump:
                     continue
-                k = plane_id[i, j] - 1
-                if inv_depth[y, x] > max(planes[k, 0] * x + planes[k, 1] * y + planes[k, 2], 0):
+                plane = planes[plane_id[i, j] - 1]
+                if inv_depth[y, x] > max(plane.a * x + plane.b * y + plane.c, 0):
                     row.into_wall += walls[y, x] == CLEARED
                     row.beyond += walls[y, x] != CLEARED
     return near_plane
 
 
 @kernel(inline=True)
-def _measure_outside(grid: DepthGrid, plane: F8, samples: I4, out: Row) -> None:
-    """Write the distance of samples outside the outline of a plane; negative inside.
-
-    ``plane`` is a row of `pack_planes`.
-    """
+def _measure_outside(grid: DepthGrid, plane: Row, samples: I4, out: Row) -> None:
+    """Write the distance of samples outside the outline of a `PLANE`; negative inside."""
     total, n = 0.0, 0
     for s in samples:
         if s < 0:

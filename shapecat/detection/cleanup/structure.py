@@ -12,13 +12,13 @@ from typing import NamedTuple
 
 import numpy as np
 
-from shapecat.arrays import F4, I4, Bool
+from shapecat.arrays import F4, I4, Bool, Records
 from shapecat.config import DetectionSettings
 from shapecat.detection.cleanup.context import CONTEXT_FEATURES, add_context, measure_borders
 from shapecat.detection.cleanup.object_features import OBJECT_FEATURES
 from shapecat.detection.cleanup.settings import CLEANUP
 from shapecat.detection.depth_grid import DepthGrid, smallest_object_at
-from shapecat.detection.merging.segments import Records, Segments, roots_of
+from shapecat.detection.merging.segments import Segments, roots_of
 from shapecat.jit import kernel
 from shapecat.trees import BoostedTrees, logit_of, read_trees
 

@@ -29,7 +29,7 @@ def measure_residual(inv_depth: F4, heights: HeightMap, plane: F8, number: int, 
     Parameters
     ----------
     inv_depth : (rows, columns) 1/m.
-    plane : (3,) or more, beginning with a, b, c of its inverse depth.
+    plane : (3,) a, b, c of its inverse depth.
     number : number of the plane, from 1, as in `HeightMap.plane_id`.
     out : (rows, columns) 1/m, written in place.
     """

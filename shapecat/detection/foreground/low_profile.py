@@ -9,7 +9,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from shapecat.arrays import F4, F8, I4, Bool
+from shapecat.arrays import F4, I4, Bool, Records
 from shapecat.detection.connected_components import SIDES
 from shapecat.detection.depth_grid import DepthGrid
 from shapecat.detection.foreground.convex_hull import fill_hull
@@ -48,7 +48,9 @@ class Scratch(NamedTuple):
 
 
 @kernel
-def find_low_profile(grid: DepthGrid, heights: HeightMap, planes: F8, largest_m: float) -> Bool:
+def find_low_profile(
+    grid: DepthGrid, heights: HeightMap, planes: Records, largest_m: float
+) -> Bool:
     """Find the low-profile objects on each plane, and assign depth error to the plane.
 
     Parameters
@@ -75,11 +77,11 @@ def find_low_profile(grid: DepthGrid, heights: HeightMap, planes: F8, largest_m:
     )
     objects = parts = 0
     for k in range(len(planes)):
-        number, plane = k + 1, planes[k].copy()
+        number, a, b = k + 1, planes[k].a, planes[k].b
         start, end = _rows_of(plane_id, number)
         if start == end:
             continue
-        plane[2] += start * plane[1]  # rows count from ``start`` from here on
+        plane = np.array([a, b, planes[k].c + start * b])  # rows count from ``start`` from here on
         values, plane_ids, marks = inv_depth[start:end], plane_id[start:end], object_ids[start:end]
         residual, high_pass = residuals[start:end], high_passes[start:end]
         above = HeightMap(plane_ids, height[start:end])
@@ -88,7 +90,7 @@ def find_low_profile(grid: DepthGrid, heights: HeightMap, planes: F8, largest_m:
         clear_contact(values, above, number, 2 * jump, residual, scratch.seeds, drops)
         filter_high_pass(residual, high_pass)
         clear = max(LOW.step, LOW.noise_factor * measure_noise(high_pass, plane_ids, number))
-        step = max(clear, LOW.slope_share * math.hypot(plane[0], plane[1]))
+        step = max(clear, LOW.slope_share * math.hypot(a, b))
         limits = Limits(step, np.float32(min(clear, LOW.fine)), widest, jump)
         objects, parts = _mark_objects(
             values, high_pass, plane_ids, number, limits, marks, objects, parts, scratch

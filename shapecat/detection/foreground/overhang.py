@@ -8,12 +8,17 @@ from typing import NamedTuple
 
 import numpy as np
 
-from shapecat.arrays import F8, I4, U1
+from shapecat.arrays import I4, U1, Records, Row
 from shapecat.detection.connected_components import SIDES
 from shapecat.detection.depth_grid import DepthGrid, back_project, row_and_column
 from shapecat.detection.foreground.settings import OVERHANG
 from shapecat.detection.foreground.walls import CLEARED
-from shapecat.detection.planes.height_map import HeightMap, distance_outside, min_height_at
+from shapecat.detection.planes.height_map import (
+    HeightMap,
+    distance_outside,
+    height_above,
+    min_height_at,
+)
 from shapecat.jit import kernel, unset
 
 __all__ = ["extend_overhang"]
@@ -26,7 +31,7 @@ class Overhang(NamedTuple):
     ----------
     grid, heights, walls : as in `extend_overhang`.
     number : number of the plane, from 1, as in `HeightMap.plane_id`.
-    plane : its row of `pack_planes`.
+    plane : its record of `PLANE`.
     highest_m : maximum height of an object above it, metres.
     visited : (rows, columns) int8, ``number`` in the cells already visited for this plane.
     """
@@ -35,14 +40,14 @@ class Overhang(NamedTuple):
     heights: HeightMap
     walls: U1
     number: int
-    plane: F8
+    plane: Row
     highest_m: float
     visited: I4
 
 
 @kernel
 def extend_overhang(
-    grid: DepthGrid, heights: HeightMap, planes: F8, walls: U1, highest_m: float
+    grid: DepthGrid, heights: HeightMap, planes: Records, walls: U1, highest_m: float
 ) -> None:
     """Assign to each plane, in place, the parts of its objects that lie outside its outline.
 
@@ -147,7 +152,7 @@ def _height_beside(over: Overhang, i: int, j: int) -> float:
     if inv_depth <= 0 or over.walls[i, j] == CLEARED:
         return 0.0
     z = 1 / float(inv_depth)
-    height = (inv_depth - (plane[0] * j + plane[1] * i + plane[2])) * z * plane[3]
+    height = height_above(plane, i, j, z)
     if not (min_height_at(z) < height < over.highest_m):
         return 0.0
     x, y = back_project(k, i, j, z)

@@ -12,7 +12,7 @@ from importlib.resources import files
 
 import numpy as np
 
-from shapecat.arrays import F8
+from shapecat.arrays import F8, Records
 from shapecat.detection.merging.pair_features import (
     PAIR_FEATURES,
     ViewGeometry,
@@ -20,7 +20,7 @@ from shapecat.detection.merging.pair_features import (
     write_pair_features,
 )
 from shapecat.detection.merging.segment_features import SEGMENT_FEATURES, write_segment_features
-from shapecat.detection.merging.segments import Records, Segments, merge
+from shapecat.detection.merging.segments import Segments, merge
 from shapecat.detection.merging.settings import MERGING
 from shapecat.jit import kernel
 from shapecat.trees import BoostedTrees, logit_of, read_trees

@@ -9,7 +9,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from shapecat.arrays import F8, Bool
+from shapecat.arrays import F8, Bool, Records, Row
 from shapecat.detection.merging.image_hull import hull_area
 from shapecat.detection.merging.segment_features import (
     SEGMENT_FEATURES,
@@ -22,8 +22,6 @@ from shapecat.detection.merging.segment_features import (
 )
 from shapecat.detection.merging.segments import (
     SEGMENT,
-    Records,
-    Row,
     Segments,
     add_statistics,
     mean_depth,

@@ -4,7 +4,8 @@ import math
 
 import numpy as np
 
-from shapecat.detection.merging.segments import BAND_M, BANDS, Row, Segments, mean_depth
+from shapecat.arrays import Row
+from shapecat.detection.merging.segments import BAND_M, BANDS, Segments, mean_depth
 from shapecat.detection.merging.settings import MERGING
 from shapecat.jit import kernel
 

@@ -1,12 +1,11 @@
 """Segments: the statistics of each segment and of each pair (`adjacency` adds the latter)."""
 
 import math
-from typing import Any, NamedTuple, TypeAlias
+from typing import Any, NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 
-from shapecat.arrays import F4, F8, I4
+from shapecat.arrays import F4, F8, I4, Records, Row
 from shapecat.detection.depth_grid import DepthGrid
 from shapecat.detection.merging.image_hull import extend_hull
 from shapecat.detection.merging.settings import MERGING
@@ -21,8 +20,6 @@ __all__ = [
     "PAIR",
     "SAMPLES",
     "SEGMENT",
-    "Records",
-    "Row",
     "Segments",
     "add_statistics",
     "lateral_axis",
@@ -76,10 +73,6 @@ PAIR = np.dtype(
     align=True,
 )
 """The statistics of an ordered pair of segments: counts along their common border."""
-Records: TypeAlias = NDArray[np.void]
-"""An array of `SEGMENT` or `PAIR` records."""
-Row: TypeAlias = Any
-"""One such record."""
 SAMPLES = 48
 """Maximum number of samples of a segment, evenly spaced, used where all its cells would take too
 long."""

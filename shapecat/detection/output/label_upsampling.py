@@ -4,12 +4,17 @@ from typing import NamedTuple
 
 import numpy as np
 
-from shapecat.arrays import F4, F8, I4, U1, U4
+from shapecat.arrays import F4, F8, I4, U1, U4, Records
 from shapecat.detection.cleanup.settings import CLEANUP
 from shapecat.detection.connected_components import span_of
 from shapecat.detection.depth_grid import DepthGrid, row_and_column
 from shapecat.detection.output.pixel_runs import append_run, pixels_by_label, split_by_label
-from shapecat.detection.planes.height_map import HEIGHT_NOISE, MIN_HEIGHT_M, min_height_at
+from shapecat.detection.planes.height_map import (
+    HEIGHT_NOISE,
+    MIN_HEIGHT_M,
+    height_above,
+    min_height_at,
+)
 from shapecat.detection.records import Segmentation
 from shapecat.geometry import NEAREST_M
 from shapecat.jit import kernel, unset
@@ -34,7 +39,7 @@ class GridLabels(NamedTuple):
     inverse_depth: F4
     labels: I4
     filled: U1
-    planes: F8
+    planes: Records
     plane_ids: I4
     discontinuity: float
 
@@ -184,7 +189,7 @@ def _code_cells(grid_labels: GridLabels) -> tuple[I4, I4]:
 
 
 @kernel(inline=True)
-def _find_high(planes: F8, inv_depth: F4, jump: float, i: int, span: I4, high: U1) -> None:
+def _find_high(planes: Records, inv_depth: F4, jump: float, i: int, span: I4, high: U1) -> None:
     """Write whether all pixels that fit a cell are above each plane, for a span of row i.
 
     A pixel fits within ``jump``, 1/m.
@@ -193,16 +198,17 @@ def _find_high(planes: F8, inv_depth: F4, jump: float, i: int, span: I4, high: U
     base = np.float32(CLEANUP.fringe * HEIGHT_NOISE)
     slope = np.float32(CLEANUP.fringe * MIN_HEIGHT_M)
     for k in range(len(planes)):
-        a, above = np.float32(planes[k, 0]), np.float32(planes[k, 3])
+        plane = planes[k]
+        a, below = np.float32(plane.a), np.float32(-plane.offset)
         # The farthest pixel of a cell is 1.5 cells away.
-        margin = 1.5 * (abs(planes[k, 0]) + abs(planes[k, 1]))
-        level = np.float32(planes[k, 1] * i + planes[k, 2] + margin)
+        margin = 1.5 * (abs(plane.a) + abs(plane.b))
+        level = np.float32(plane.b * i + plane.c + margin)
         for j in range(np.uint64(span[0]), np.uint64(span[1])):
             min_w = inv_depth[i, j] - jump if inv_depth[i, j] - jump > floor else floor
             ground = level + a * np.float32(np.int32(j))
             ground = ground if ground > zero else zero
             # Heights at the depth 1 / min_w, times the square of min_w.
-            high[k, j] = (min_w - ground) * min_w * above > slope * min_w * min_w + base
+            high[k, j] = (min_w - ground) * min_w * below > slope * min_w * min_w + base
 
 
 @kernel(inline=True)
@@ -284,9 +290,8 @@ def assign_labels(grid_labels: GridLabels, cells: I4, positions: F8, n: int, mar
         label = labels[i, j]
         if label <= 0:
             continue
-        k = plane_ids[label]
-        h = (1 - (planes[k, 0] * u + planes[k, 1] * v + planes[k, 2]) * z) * planes[k, 3]
-        if filled[i, j] or h > CLEANUP.fringe * min_height_at(z):
+        height = height_above(planes[plane_ids[label]], v, u, z)
+        if filled[i, j] or height > CLEANUP.fringe * min_height_at(z):
             marks[m] = label
 
 

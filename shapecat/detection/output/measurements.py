@@ -4,10 +4,10 @@ from typing import NamedTuple
 
 import numpy as np
 
-from shapecat.arrays import F4, F8, I4, Bool
+from shapecat.arrays import F4, F8, I4, Bool, Records
 from shapecat.detection.connected_components import spans_of
 from shapecat.detection.depth_grid import DepthGrid, smallest_object_at
-from shapecat.detection.merging.segments import Records, Segments
+from shapecat.detection.merging.segments import Segments
 from shapecat.detection.merging.settings import MERGING
 from shapecat.detection.output.settings import OUTPUT
 from shapecat.geometry import gravity_rotation, level_box

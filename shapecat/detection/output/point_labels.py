@@ -2,7 +2,7 @@
 
 import numpy as np
 
-from shapecat.arrays import F4, F8, I4, U1, U4, Bool
+from shapecat.arrays import F4, I4, U1, U4, Bool, Row
 from shapecat.detection.depth_grid import PinholeIntrinsics
 from shapecat.detection.output.label_upsampling import (
     GridLabels,
@@ -13,7 +13,7 @@ from shapecat.detection.output.label_upsampling import (
 from shapecat.detection.output.occluded_points import label_occluded_points
 from shapecat.detection.output.pixel_runs import pixels_by_label, split_by_label
 from shapecat.detection.output.settings import OUTPUT
-from shapecat.detection.planes.height_map import distance_outside, min_height_at
+from shapecat.detection.planes.height_map import distance_outside, height_above, min_height_at
 from shapecat.detection.records import Segmentation
 from shapecat.detection.virtual_camera import VirtualImage
 from shapecat.jit import kernel
@@ -48,17 +48,15 @@ def label_points(
 
 @kernel
 def _above(
-    points: F4, cell: I4, intrinsics: PinholeIntrinsics, plane: F8, highest_m: float
+    points: F4, cell: I4, intrinsics: PinholeIntrinsics, plane: Row, highest_m: float
 ) -> Bool:
     """Return which points (n, 3) are above a plane and inside its outline, (n,)."""
     result = np.zeros(len(points), np.bool_)
     for k in range(len(points)):
         if cell[k] >= 0:
             x, y, z = points[k, 0], points[k, 1], points[k, 2]
-            level = plane[0] * (intrinsics.fx * x / z + intrinsics.cx) + plane[1] * (
-                intrinsics.fy * y / z + intrinsics.cy
-            )
-            h = (1 / z - level - plane[2]) * z * plane[3]
+            i, j = intrinsics.fy * y / z + intrinsics.cy, intrinsics.fx * x / z + intrinsics.cx
+            h = height_above(plane, i, j, z)
             result[k] = (
                 h > min_height_at(z) and h < highest_m and distance_outside(plane, x, y, z) <= 0
             )

@@ -5,13 +5,13 @@ from itertools import count
 
 import numpy as np
 
-from shapecat.arrays import F4, I4, U4, Bool, freeze
+from shapecat.arrays import F4, I4, U4, Bool, Records, Row, freeze
 from shapecat.config import DetectionSettings
 from shapecat.detection.cleanup.settings import CLEANUP
 from shapecat.detection.depth_grid import DepthGrid, find_borders
 from shapecat.detection.output.measurements import ObjectMeasurements
 from shapecat.detection.output.settings import OUTPUT
-from shapecat.detection.planes.extent import SupportingPlane, outline_corners
+from shapecat.detection.planes.extent import outline_corners
 from shapecat.detection.records import Segmentation
 from shapecat.geometry import (
     IDENTITY,
@@ -46,7 +46,8 @@ def build_scene(
         for an image.
     """
     measured, visible_count = segmentation.measured, segmentation.plane_ids.size - 1
-    numbers = _number_visible(segmentation.model.supports)
+    model = segmentation.model
+    numbers = _number_visible(model.planes)
     plane_id = [numbers[k] for k in segmentation.plane_ids[1:].tolist()]
     supported_by, occluded = measured.supported_by.tolist(), measured.occluded.tolist()
     at_border = _at_image_border if points is None else _at_view_border
@@ -79,15 +80,15 @@ def build_scene(
                 occluded=k < visible_count and occluded[k],
             )
         )
-    visible_planes = [s for s in segmentation.model.supports if s.area_m2 > 0]
-    planes = tuple(_plane(s, visible_planes[0].offset, sensor_from_view) for s in visible_planes)
-    return Scene(sensor_from_view.rotation @ segmentation.model.up, planes, tuple(candidates))
+    visible = model.planes[model.planes["area_m2"] > 0]
+    planes = tuple(_plane(plane, visible[0]["offset"], sensor_from_view) for plane in visible)
+    return Scene(sensor_from_view.rotation @ model.up, planes, tuple(candidates))
 
 
-def _number_visible(supports: Sequence[SupportingPlane]) -> list[int | None]:
+def _number_visible(planes: Records) -> list[int | None]:
     """Return the index of each plane among the visible planes; None for an assumed plane."""
     numbers = count()
-    return [next(numbers) if support.area_m2 > 0 else None for support in supports]
+    return [next(numbers) if area_m2 > 0 else None for area_m2 in planes["area_m2"]]
 
 
 def _select_objects(
@@ -186,10 +187,11 @@ def _transform_box(sensor_from_view: Pose, box: Box) -> Box:
     return Box(center, box.size, quaternion_from_rotation(rotation))
 
 
-def _plane(support: SupportingPlane, lowest: float, sensor_from_view: Pose) -> Plane:
-    normal, offset, outline = support.up, support.offset, outline_corners(support)
+def _plane(plane: Row, lowest: float, sensor_from_view: Pose) -> Plane:
+    normal, offset = plane["up"], float(plane["offset"])
+    outline = outline_corners(normal, offset, plane["extent"])
     if sensor_from_view is not IDENTITY:
         normal = sensor_from_view.rotation @ normal
         offset += float(normal @ sensor_from_view.translation)
         outline = transform(sensor_from_view, outline)
-    return Plane(normal, offset, outline, support.area_m2, support.offset - lowest)
+    return Plane(normal, offset, outline, float(plane["area_m2"]), float(plane["offset"] - lowest))

@@ -150,11 +150,14 @@ def level_coordinates(grid: DepthGrid, mask: Bool, up: F8) -> F8:
     return np.asarray(gravity_rotation(up) @ points)
 
 
-def outline_corners(plane: SupportingPlane) -> F8:
-    """Return the corners (DIRECTIONS, 3) of the convex outline in order, metres, sensor frame."""
+def outline_corners(up: F8, offset: float, extent: F8) -> F8:
+    """Return the corners (DIRECTIONS, 3) of the convex outline in order, metres, sensor frame.
+
+    The parameters are as in `SupportingPlane`.
+    """
     # Neighbouring sides x cos + y sin = extent meet at a corner.
-    along = (np.roll(plane.extent, -1) - plane.extent * COS[1]) / SIN[1]
-    level = np.full((DIRECTIONS, 3), plane.offset)
-    level[:, 0] = plane.extent * COS - along * SIN
-    level[:, 1] = plane.extent * SIN + along * COS
-    return np.asarray(level @ gravity_rotation(plane.up))
+    along = (np.roll(extent, -1) - extent * COS[1]) / SIN[1]
+    level = np.full((DIRECTIONS, 3), offset)
+    level[:, 0] = extent * COS - along * SIN
+    level[:, 1] = extent * SIN + along * COS
+    return np.asarray(level @ gravity_rotation(up))

@@ -4,7 +4,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from shapecat.arrays import F4, F8, I4
+from shapecat.arrays import F4, I4, Records, Row
 from shapecat.detection.depth_grid import DepthGrid
 from shapecat.detection.planes.extent import COS, DIRECTIONS, SIN, SupportingPlane
 from shapecat.geometry import gravity_rotation
@@ -13,9 +13,10 @@ from shapecat.jit import kernel
 __all__ = [
     "HEIGHT_NOISE",
     "MIN_HEIGHT_M",
-    "OUTLINE",
+    "PLANE",
     "HeightMap",
     "distance_outside",
+    "height_above",
     "measure_heights",
     "min_height_at",
     "pack_planes",
@@ -28,10 +29,22 @@ BEYOND_M = 0.1
 """Surface level with a plane, and this near to its outline, is not an object on a lower plane."""
 OUT = -1e6
 """Placeholder for the height of cells that do not belong to a plane: below all noise."""
-OUTLINE = 10
-"""Index at which the outline begins in a row of `pack_planes`."""
 FINE = 65536
 """Steps per 1/m to which inverse depth is rounded."""
+PLANE = np.dtype(
+    [
+        ("a", "f8"),  # a, b, c of inverse depth, as in `SupportingPlane`
+        ("b", "f8"),
+        ("c", "f8"),
+        ("offset", "f8"),
+        ("up", "f8", 3),
+        ("axes", "f8", (2, 3)),  # horizontal axes of its level frame
+        ("extent", "f8", DIRECTIONS),
+        ("area_m2", "f8"),
+    ],
+    align=True,
+)
+"""A supporting plane for kernels: the fields of `SupportingPlane`, and two axes."""
 
 
 class HeightMap(NamedTuple):
@@ -48,22 +61,18 @@ class HeightMap(NamedTuple):
     height: F4
 
 
-def pack_planes(supports: list[SupportingPlane]) -> F8:
-    """Return planes as rows of numbers, for kernels: (planes, `OUTLINE` + `DIRECTIONS`).
-
-    A row is a, b, c of inverse depth, the depth below the sensor, two level axes (3 + 3), and the
-    extent in each direction; lengths in metres, sensor frame.
-    """
-    rows = np.zeros((len(supports), OUTLINE + DIRECTIONS))
-    for row, support in zip(rows, supports, strict=True):
-        row[:4] = support.a, support.b, support.c, -support.offset
-        row[4:OUTLINE] = gravity_rotation(support.up)[:2].ravel()
-        row[OUTLINE:] = support.extent
-    return rows
+def pack_planes(supports: list[SupportingPlane]) -> Records:
+    """Return planes as records of `PLANE`, (planes,)."""
+    planes = np.zeros(len(supports), PLANE)
+    for plane, support in zip(planes, supports, strict=True):
+        for name in SupportingPlane._fields:
+            plane[name] = getattr(support, name)
+        plane["axes"] = gravity_rotation(support.up)[:2]
+    return planes
 
 
 @kernel
-def measure_heights(grid: DepthGrid, planes: F8, highest_m: float) -> HeightMap:
+def measure_heights(grid: DepthGrid, planes: Records, highest_m: float) -> HeightMap:
     """Assign each sample to the highest plane below it.
 
     ``planes`` are from `pack_planes`, lowest first; ``highest_m`` is the maximum height above the
@@ -77,16 +86,17 @@ def measure_heights(grid: DepthGrid, planes: F8, highest_m: float) -> HeightMap:
 
 
 @kernel(inline=True)
-def _assign(grid: DepthGrid, plane: F8, number: int, highest: float, heights: HeightMap) -> None:
+def _assign(grid: DepthGrid, plane: Row, number: int, highest: float, heights: HeightMap) -> None:
     """Assign the free cells inside the outline of a plane to it; the loops over a row vectorise.
 
-    ``plane`` is a row of `pack_planes`, and ``highest`` the maximum height above it, metres.
-    Compiled without ``fast``: with it, the inlined copy would round heights differently in the
-    process that compiles and in later ones.
+    ``plane`` is a `PLANE`, and ``highest`` the maximum height above it, metres. Compiled without
+    ``fast``: with it, the inlined copy would round heights differently in the process that compiles
+    and in later ones.
     """
     inv_depth, intrinsics, (plane_id, height) = grid.inverse_depth, grid.intrinsics, heights
     rows, columns = inv_depth.shape
-    a, scale, zero, one = np.float32(plane[0]), np.float32(plane[3]), np.float32(0), np.float32(1)
+    a, below = np.float32(plane.a), np.float32(-plane.offset)
+    zero, one = np.float32(0), np.float32(1)
     min_height, noise, outside = np.float32(MIN_HEIGHT_M), np.float32(HEIGHT_NOISE), np.float32(OUT)
     beyond, high = np.float32(BEYOND_M), np.float32(highest)
     above, surface = np.int8(number), np.int8(-number)
@@ -95,19 +105,19 @@ def _assign(grid: DepthGrid, plane: F8, number: int, highest: float, heights: He
     # Level coordinates times inverse depth are linear in the image: per column, per row, constant.
     sides = np.zeros((DIRECTIONS // 2, 3))
     for d in range(2):
-        p, q = plane[4 + 3 * d] / intrinsics.fx, plane[5 + 3 * d] / intrinsics.fy
+        p, q = plane.axes[d, 0] / intrinsics.fx, plane.axes[d, 1] / intrinsics.fy
         for k in range(DIRECTIONS // 2):
             part = SIN[k] if d else COS[k]
             sides[k, 0] += part * p
             sides[k, 1] += part * q
-            sides[k, 2] += part * (plane[6 + 3 * d] - p * intrinsics.cx - q * intrinsics.cy)
+            sides[k, 2] += part * (plane.axes[d, 2] - p * intrinsics.cx - q * intrinsics.cy)
     for i in range(rows):
-        base = np.float32(plane[1] * i + plane[2])
+        base = np.float32(plane.b * i + plane.c)
         any_valid = False
         for j in range(np.uint64(columns)):
             v = inv_depth[i, j]
             z = one / v if v > zero else zero
-            h = (v - (a * x[j] + base)) * z * scale
+            h = (v - (a * x[j] + base)) * z * below
             gate = min_height + noise * z * z
             valid = (v > zero) & (h > -gate) & (h < high) & (plane_id[i, j] == 0)
             line[j] = h if valid else outside
@@ -118,8 +128,8 @@ def _assign(grid: DepthGrid, plane: F8, number: int, highest: float, heights: He
         left, right, min_inv_depth, max_inv_depth = _bounds(line, inv_depth, i)
         for k in range(DIRECTIONS // 2):
             step, first = np.float32(sides[k, 0]), np.float32(sides[k, 1] * i + sides[k, 2])
-            extent = np.float32(plane[OUTLINE + k])
-            opposite = np.float32(plane[OUTLINE + k + DIRECTIONS // 2])
+            extent = np.float32(plane.extent[k])
+            opposite = np.float32(plane.extent[k + DIRECTIONS // 2])
             # Few rows reach beyond a side; bounds rule out most of the others.
             ends = step * left + first, step * right + first
             limits = (
@@ -171,14 +181,20 @@ def min_height_at(depth_m: float) -> float:
 
 
 @kernel(inner=True)
-def distance_outside(plane: F8, x: float, y: float, z: float) -> float:
-    """Return how far a point is outside the outline of a plane, metres; negative inside.
+def height_above(plane: Row, i: float, j: float, z: float) -> float:
+    """Return the height above a `PLANE` of a point at the depth z, seen at row i and column j."""
+    return float((1 - (plane.a * j + plane.b * i + plane.c) * z) * -plane.offset)
 
-    ``plane`` is a row of `pack_planes`; x, y, z are metres, sensor frame.
+
+@kernel(inner=True)
+def distance_outside(plane: Row, x: float, y: float, z: float) -> float:
+    """Return how far a point is outside the outline of a `PLANE`, metres; negative inside.
+
+    x, y, z are metres, sensor frame.
     """
-    p = plane[4] * x + plane[5] * y + plane[6] * z
-    q = plane[7] * x + plane[8] * y + plane[9] * z
+    p = plane.axes[0, 0] * x + plane.axes[0, 1] * y + plane.axes[0, 2] * z
+    q = plane.axes[1, 0] * x + plane.axes[1, 1] * y + plane.axes[1, 2] * z
     outside = -np.inf
     for k in range(DIRECTIONS):
-        outside = max(outside, COS[k] * p + SIN[k] * q - plane[OUTLINE + k])
+        outside = max(outside, COS[k] * p + SIN[k] * q - plane.extent[k])
     return outside

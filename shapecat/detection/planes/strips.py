@@ -122,7 +122,7 @@ def _covered(
 ) -> PlaneCandidate:
     """Set the covered area of a plane: 0 if most of its outline is visible."""
     plane = candidate.plane
-    corners = outline_corners(plane)
+    corners = outline_corners(plane.up, plane.offset, plane.extent)
     area_vector = np.cross(corners, np.roll(corners, -1, axis=0)).sum(axis=0)
     outline_m2 = abs(float(area_vector @ plane.up)) / 2
     borne_m2 = _area_over(strips, intrinsics, plane)
