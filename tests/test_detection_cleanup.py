@@ -9,7 +9,6 @@ from shapecat.detection.cleanup.holes import fill_contact_boundary, fill_holes
 from shapecat.detection.cleanup.object_features import (
     OBJECT_FEATURES,
     Limits,
-    Surroundings,
     _border_lines,
     _measure,
     measure_object_features,
@@ -25,6 +24,8 @@ from shapecat.detection.depth_grid import DepthGrid, PinholeIntrinsics, downsamp
 from shapecat.detection.merging.segments import _blank, roots_of
 from shapecat.detection.pipeline import Task, merge_segments, model_planes, oversegment
 from shapecat.detection.planes.height_map import PLANE, HeightMap
+from shapecat.detection.records import OverSegmentation, PlaneModel
+from shapecat.detection.segmentation.connectivity import SurfaceGraph
 from shapecat.geometry import DISCONTINUITY
 from shapecat.trees import BoostedTrees, Trees
 from tests.test_detection import Array, Shape, box, frame_of, render, table
@@ -86,8 +87,11 @@ def test_height_and_noise_of_plane_around_segment_are_measured() -> None:
     planes = np.zeros(1, PLANE)
     low_profile = np.zeros((11, 11), np.bool_)
     heights = HeightMap(plane_id, height)
-    seen = Surroundings(planes, heights, low_profile, walls, labels, spans)
-    _measure(grid, seen, Limits(-1, -1, -1, -1, 0.25), segments, 0.7, features)
+    model = PlaneModel(np.array([0.0, 0.0, 0.7]), planes, heights, low_profile, walls)
+    local_plane, none = np.zeros((11, 3, 11), np.float32), np.zeros((11, 11), np.uint8)
+    graph = SurfaceGraph(local_plane, local_plane, none, none, spans)
+    parts = OverSegmentation(graph, labels, segments)
+    _measure(grid, model, parts, Limits(-1, -1, -1, -1, 0.25), features)
     rows = features["surroundings"]
     least = 0.004 + 0.0025 * 2.0**2
     assert rows["plane_height"][1] == pytest.approx(0.001 / least)

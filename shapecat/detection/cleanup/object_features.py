@@ -10,7 +10,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from shapecat.arrays import F8, I4, U1, Bool, Records, Row
+from shapecat.arrays import F8, I4, Records, Row
 from shapecat.detection.cleanup.settings import CLEANUP
 from shapecat.detection.connected_components import SIDES
 from shapecat.detection.depth_grid import DepthGrid, back_project, find_borders, row_and_column
@@ -20,8 +20,8 @@ from shapecat.detection.merging.segment_features import (
     share,
     write_segment_features,
 )
-from shapecat.detection.merging.segments import Segments, mean_depth
-from shapecat.detection.planes.height_map import HeightMap, distance_outside, min_height_at
+from shapecat.detection.merging.segments import mean_depth
+from shapecat.detection.planes.height_map import distance_outside, min_height_at
 from shapecat.detection.records import OverSegmentation, PlaneModel
 from shapecat.geometry import DISCONTINUITY
 from shapecat.jit import kernel
@@ -77,25 +77,10 @@ def measure_object_features(
 
     ``range_m`` is the range limit, metres.
     """
-    graph, labels, segments = oversegmentation
-    features = np.zeros(segments.parent.size, OBJECT_FEATURES)
-    seen = Surroundings(
-        model.planes, model.heights, model.low_profile, model.walls, labels, graph.spans
-    )
+    features = np.zeros(oversegmentation.segments.parent.size, OBJECT_FEATURES)
     limits = Limits(*_border_lines(grid), 1 / range_m + DISCONTINUITY / 2)
-    _measure(grid, seen, limits, segments, model.up[2], features)
+    _measure(grid, model, oversegmentation, limits, features)
     return features
-
-
-class Surroundings(NamedTuple):
-    """Fields of `PlaneModel` and `OverSegmentation` that the kernels read."""
-
-    planes: Records
-    heights: HeightMap
-    low_profile: Bool
-    walls: U1
-    labels: I4
-    spans: I4
 
 
 class Limits(NamedTuple):
@@ -131,14 +116,14 @@ def _border_lines(grid: DepthGrid) -> tuple[int, int, int, int]:
 @kernel
 def _measure(
     grid: DepthGrid,
-    seen: Surroundings,
+    model: PlaneModel,
+    oversegmentation: OverSegmentation,
     limits: Limits,
-    segments: Segments,
-    down: float,
     out: Records,
 ) -> None:
     """Write the features of merged segments."""
-    near_plane = _count_by_segment(grid, seen, limits, segments.parent, out)
+    segments, down = oversegmentation.segments, model.up[2]
+    near_plane = _count_by_segment(grid, model, oversegmentation, limits, out)
     for p in range(1, segments.parent.size):
         if segments.parent[p] != p:
             continue
@@ -158,7 +143,7 @@ def _measure(
             variance = max(around.plane_noise / near_plane[p] - mean * mean, 0.0)
             around.plane_height = mean / min_height
             around.plane_noise = math.sqrt(variance) / min_height
-        plane = seen.planes[segments.plane_id[p] - 1]
+        plane = model.planes[segments.plane_id[p] - 1]
         _measure_outside(grid, plane, segments.samples[p], around)
         view.cells, view.depth_m, view.cell_m, view.down = segment.count, depth, cell, down
         view.top_by_noise = segment.top / min_height
@@ -168,15 +153,21 @@ def _measure(
 
 @kernel(inline=True)
 def _count_by_segment(
-    grid: DepthGrid, seen: Surroundings, limits: Limits, owner: I4, out: Records
+    grid: DepthGrid,
+    model: PlaneModel,
+    oversegmentation: OverSegmentation,
+    limits: Limits,
+    out: Records,
 ) -> F8:
     """Count the cells of each segment at borders and on walls, and where its surface continues.
 
-    ``owner`` (n + 1,) is the segment that each label has been merged into. Also sums the heights of
-    the samples of planes near each segment, and their squares; returns their number, (n + 1,).
+    Also sums the heights of the samples of planes near each segment, and their squares; returns
+    their number, (n + 1,).
     """
     inv_depth, jump = grid.inverse_depth, grid.discontinuity
-    planes, (plane_id, height), low, walls, labels, spans = seen
+    _, planes, (plane_id, height), low, walls = model
+    (_, _, _, _, spans), labels, segments = oversegmentation
+    owner = segments.parent
     (lines, columns), near_plane = labels.shape, np.zeros(len(out))
     top, bottom, left, right, last = limits
     for i in range(lines):

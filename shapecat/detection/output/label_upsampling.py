@@ -1,7 +1,5 @@
 """Label upsampling: the labels of cells transferred to pixels at full resolution."""
 
-from typing import NamedTuple
-
 import numpy as np
 
 from shapecat.arrays import F4, F8, I4, U1, U4, Records
@@ -20,10 +18,8 @@ from shapecat.geometry import NEAREST_M
 from shapecat.jit import kernel, unset
 
 __all__ = [
-    "GridLabels",
     "assign_labels",
     "dilate_row",
-    "grid_labels_of",
     "label_pixels",
 ]
 
@@ -31,17 +27,6 @@ UNSURE, BARE = -1, -2
 """Codes in place of a label: a closer test is needed; an unlabelled cell next to a labelled one."""
 BLOCK = 16
 """Pixels that are tested together: most are like the previous ones."""
-
-
-class GridLabels(NamedTuple):
-    """The fields of `DepthGrid` and `Segmentation` that kernels read; ``plane_ids`` (labels,)."""
-
-    inverse_depth: F4
-    labels: I4
-    filled: U1
-    planes: Records
-    plane_ids: I4
-    discontinuity: float
 
 
 def label_pixels(
@@ -57,22 +42,7 @@ def label_pixels(
     depth : (height, width) metres, 0 where depth is missing.
     range_m : depths farther away have no label, metres.
     """
-    grid_labels = grid_labels_of(grid, segmentation)
-    return split_by_label(
-        *_list_pixels(depth, grid_labels, grid.factor, range_m, segmentation.plane_ids.size)
-    )
-
-
-def grid_labels_of(grid: DepthGrid, segmentation: Segmentation) -> GridLabels:
-    """Collect the fields that the kernels here read."""
-    return GridLabels(
-        grid.inverse_depth,
-        segmentation.labels,
-        segmentation.filled,
-        segmentation.model.planes,
-        segmentation.plane_ids,
-        grid.discontinuity,
-    )
+    return split_by_label(*_list_pixels(depth, grid, segmentation, range_m))
 
 
 @kernel(inner=True)
@@ -91,23 +61,24 @@ def dilate_row(labels: I4, i: int, scratch: I4, dilated: I4) -> None:
 
 @kernel
 def _list_pixels(
-    depth: F4, grid_labels: GridLabels, factor: int, range_m: float, labels: int
+    depth: F4, grid: DepthGrid, segmentation: Segmentation, range_m: float
 ) -> tuple[U4, I4]:
-    """Return the pixels of the labels below ``labels``, as `pixels_by_label` does."""
-    rows, columns = grid_labels.inverse_depth.shape
+    """Return the pixels of each label, as `pixels_by_label` does."""
+    inv_depth, factor = grid.inverse_depth, grid.factor
+    rows, columns = inv_depth.shape
     height, width = depth.shape
     # The cells of a row at full resolution, and the marks of its pixels.
     wide_code, wide_w = np.zeros(width, np.int16), np.zeros(width, np.float32)
     line, marks = np.zeros(width, np.int16), np.zeros(width, np.int16)
     cells, positions = np.zeros((2, width), np.int64), np.zeros((3, width))
     runs, n = np.zeros((4 * width, 3), np.int32), 0
-    code, spans = _code_cells(grid_labels)
+    code, spans = _code_cells(grid, segmentation)
     max_depth, shift, scale = np.float32(range_m), (factor - 1) * 0.5, 1.0 / factor
-    jump = np.float32(grid_labels.discontinuity)
+    jump = np.float32(grid.discontinuity)
     for i in range(rows):
         if spans[i, 0] == spans[i, 1]:
             continue
-        _widen(code, grid_labels.inverse_depth, i, factor, spans[i], wide_code, wide_w)
+        _widen(code, inv_depth, i, factor, spans[i], wide_code, wide_w)
         x0, x1 = spans[i, 0] * factor, spans[i, 1] * factor if spans[i, 1] < columns else width
         for y in range(i * factor, (i + 1) * factor if i + 1 < rows else height):
             if n + width > len(runs):
@@ -119,7 +90,7 @@ def _list_pixels(
                 cells[0, m], cells[1, m] = i, min(row_and_column(x, factor)[0], columns - 1)
                 positions[0, m], positions[1, m] = (x - shift) * scale, (y - shift) * scale
                 positions[2, m] = depth[y, x]
-            assign_labels(grid_labels, cells, positions, unsure, marks)
+            assign_labels(grid, segmentation, cells, positions, unsure, marks)
             unsure, label, x, start, first = 0, 0, x0, x0, y * width
             while x < x1:
                 mark = line[x]
@@ -131,7 +102,7 @@ def _list_pixels(
                     label, start = mark, x
                 x = _end_of(line, x + 1, x1, label)
             n = append_run(label, first + start, first + x1, runs, n)
-    pixels: tuple[U4, I4] = pixels_by_label(runs[:n], labels)
+    pixels: tuple[U4, I4] = pixels_by_label(runs[:n], segmentation.plane_ids.size)
     return pixels
 
 
@@ -165,13 +136,14 @@ def _end_of(line: I4, x: int, end: int, mark: int) -> int:
 
 
 @kernel(inline=True)
-def _code_cells(grid_labels: GridLabels) -> tuple[I4, I4]:
+def _code_cells(grid: DepthGrid, segmentation: Segmentation) -> tuple[I4, I4]:
     """Return a code for the pixels that fit each cell, (rows, columns), and the spans of the codes.
 
     The code is the label of the cell if all these pixels have it, `UNSURE` if they may have it,
     `BARE` if the cell has none but a neighbour does, and 0 away from all labels.
     """
-    inv_depth, labels, filled, planes, plane_ids, jump = grid_labels
+    inv_depth, jump, planes = grid.inverse_depth, grid.discontinuity, segmentation.model.planes
+    labels, filled, plane_ids = segmentation.labels, segmentation.filled, segmentation.plane_ids
     code, spans = unset(labels.shape, np.int16), np.zeros((len(labels), 2), np.int32)
     scratch = np.zeros(labels.shape[1] + 2, np.int16)
     high = np.zeros((len(planes), labels.shape[1]), np.uint8)
@@ -258,7 +230,9 @@ def _mark(
 
 
 @kernel(inner=True)
-def assign_labels(grid_labels: GridLabels, cells: I4, positions: F8, n: int, marks: I4) -> None:
+def assign_labels(
+    grid: DepthGrid, segmentation: Segmentation, cells: I4, positions: F8, n: int, marks: I4
+) -> None:
     """Write the labels of the first ``n`` of m depths to ``marks``.
 
     Parameters
@@ -267,10 +241,10 @@ def assign_labels(grid_labels: GridLabels, cells: I4, positions: F8, n: int, mar
     positions : (3, m) column and row of each depth in units of cells, and the depth, metres.
     marks : (m,) the labels are written here, 0 where there is none.
     """
-    inv_depth, labels, filled = grid_labels.inverse_depth, grid_labels.labels, grid_labels.filled
-    planes, plane_ids = grid_labels.planes, grid_labels.plane_ids
+    inv_depth, labels, filled = grid.inverse_depth, segmentation.labels, segmentation.filled
+    planes, plane_ids = segmentation.model.planes, segmentation.plane_ids
     rows, columns = inv_depth.shape
-    jump = np.float32(grid_labels.discontinuity)
+    jump = np.float32(grid.discontinuity)
     for m in range(n):
         i, j = cells[0, m], cells[1, m]
         u, v, z = positions[0, m], positions[1, m], np.float32(positions[2, m])

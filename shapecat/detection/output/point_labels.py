@@ -3,12 +3,10 @@
 import numpy as np
 
 from shapecat.arrays import F4, I4, U1, U4, Bool, Row
-from shapecat.detection.depth_grid import PinholeIntrinsics
+from shapecat.detection.depth_grid import DepthGrid, PinholeIntrinsics
 from shapecat.detection.output.label_upsampling import (
-    GridLabels,
     assign_labels,
     dilate_row,
-    grid_labels_of,
 )
 from shapecat.detection.output.occluded_points import label_occluded_points
 from shapecat.detection.output.pixel_runs import pixels_by_label, split_by_label
@@ -31,7 +29,7 @@ def label_points(
     """
     points, grid, labels = view.points, view.grid, segmentation.plane_ids.size
     marks = np.zeros(len(points), np.int16)
-    _mark_points(points, view.cell, grid.intrinsics, grid_labels_of(grid, segmentation), marks)
+    _mark_points(points, view.cell, grid, segmentation, marks)
     if fused:
         above = marks > 0
         for plane in segmentation.model.planes:
@@ -75,14 +73,14 @@ def _dilate(labels: I4) -> U1:
 
 @kernel
 def _mark_points(
-    points: F4, cell: I4, intrinsics: PinholeIntrinsics, grid_labels: GridLabels, marks: I4
+    points: F4, cell: I4, grid: DepthGrid, segmentation: Segmentation, marks: I4
 ) -> None:
     """Write the labels of points (n, 3) in the view frame to ``marks`` (n,).
 
     ``cell`` (n,) is the flat cell of each point; -1 out of view.
     """
-    columns = grid_labels.inverse_depth.shape[1]
-    dilated = _dilate(grid_labels.labels).reshape(-1)
+    intrinsics, columns = grid.intrinsics, grid.inverse_depth.shape[1]
+    dilated = _dilate(segmentation.labels).reshape(-1)
     count = points.shape[0]
     cells, positions = np.zeros((2, count), np.int64), np.zeros((3, count))
     indices, labels = np.zeros(count, np.int64), np.zeros(count, np.int16)
@@ -97,6 +95,6 @@ def _mark_points(
         positions[1, n] = intrinsics.fy * y / z + intrinsics.cy
         positions[2, n] = z
         n += 1
-    assign_labels(grid_labels, cells, positions, n, labels)
+    assign_labels(grid, segmentation, cells, positions, n, labels)
     for m in range(n):
         marks[indices[m]] = labels[m]
