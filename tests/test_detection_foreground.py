@@ -113,7 +113,7 @@ def test_board_is_a_supporting_plane_unlike_box_top(closed: bool, kept: int) -> 
     rng = np.random.default_rng(0)
     found = find_horizontal_planes(grid, orient_points(grid), UP, draw_trials(rng))
     assert len(found) == 2
-    assert len(supporting_planes(grid, found, tallest_m=0.5)) == kept
+    assert len(supporting_planes(grid, found, max_height_m=0.5)) == kept
 
 
 def test_large_upright_face_is_a_wall_unlike_small_one() -> None:

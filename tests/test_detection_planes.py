@@ -66,7 +66,7 @@ def heights(meshes: list[Mesh]) -> tuple[list[float], list[float]]:
 def supports(meshes: list[Mesh], distance_m: float = 1.0) -> list[float]:
     """Return the heights of the supporting planes."""
     grid, trials = grid_of(meshes, distance_m), draw_trials(np.random.default_rng(0))
-    planes, up = find_supporting_planes(grid, None, trials, tallest_m=0.6, upright=True)
+    planes, up = find_supporting_planes(grid, None, trials, max_height_m=0.6, upright=True)
     assert up @ UP > np.cos(np.radians(2))
     return [plane.offset + distance_m * np.sqrt(0.5) for plane in planes]
 
@@ -166,7 +166,7 @@ def test_assumed_plane_lies_just_below_unexplained_samples() -> None:
         inv_depth.astype(np.float32), PinholeIntrinsics(150.0, 150.0, 70.0, 62.0), 4, DISCONTINUITY
     )
 
-    plane = assume_plane(grid, inv_depth > 0, up, tallest_m=0.3)
+    plane = assume_plane(grid, inv_depth > 0, up, max_height_m=0.3)
 
     assert plane is not None
     assert plane.area_m2 == 0
@@ -203,12 +203,12 @@ def test_no_plane_is_assumed_for_few_samples_or_above_camera() -> None:
     rest = find_unexplained(grid, ~few)
     assert rest is not None
     np.testing.assert_array_equal(rest, few == -1)
-    assert assume_plane(grid, rest, -up, tallest_m=0.5) is None
-    assert assume_plane(grid, rest, up, tallest_m=0.5) is not None
+    assert assume_plane(grid, rest, -up, max_height_m=0.5) is None
+    assert assume_plane(grid, rest, up, max_height_m=0.5) is not None
     one = np.arange(few.size).reshape(few.shape) == 3001
-    assert assume_plane(grid, one, up, tallest_m=0.5) is not None
+    assert assume_plane(grid, one, up, max_height_m=0.5) is not None
     for low in (0.0, 0.001, 0.008):  # less than a bin of the histogram
-        assert assume_plane(grid, rest, up, tallest_m=low) is not None
+        assert assume_plane(grid, rest, up, max_height_m=low) is not None
     far = grid._replace(inverse_depth=np.where(few < 0, np.float32(0.4), grid.inverse_depth))
     assert find_unexplained(far, ~few) is None  # background, 2.5 m away
 

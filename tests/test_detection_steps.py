@@ -55,7 +55,7 @@ def test_samples_beyond_the_edge_of_a_plane_have_no_height() -> None:
     inv_depth[100:140, 280:300] = level(0.62)[100:140, 280:300]  # and one beyond the edge
     trials = draw_trials(np.random.default_rng(0))
     grid = DepthGrid(board, INTRINSICS, 2, DISCONTINUITY)
-    found, _ = find_supporting_planes(grid, UP, trials, tallest_m=0.5, upright=True)
+    found, _ = find_supporting_planes(grid, UP, trials, max_height_m=0.5, upright=True)
     planes = pack_planes(found)
     assert len(found) == 1
     heights = measure_heights(DepthGrid(inv_depth, INTRINSICS, 2, DISCONTINUITY), planes, 0.6)

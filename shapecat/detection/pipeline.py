@@ -127,8 +127,12 @@ def _detect_in_cloud(points: F4, hint: F8 | None, task: Task) -> Scene | None:
         segmentation = None if view is None else _segment_view(view, hint, task)
     if view is None or segmentation is None:
         return None
-    fused, highest_m = view.crowded > OUTPUT.crowded, task.settings.max_height_m
-    indices = label_points(view, segmentation, fused=fused, highest_m=highest_m)
+    indices = label_points(
+        view,
+        segmentation,
+        fused=view.crowded > OUTPUT.crowded,
+        max_height_m=task.settings.max_height_m,
+    )
     pose = inverse(view.view_from_sensor)
     return build_scene(
         view.grid, segmentation, indices, pose, settings=task.settings, points=view.points
@@ -177,8 +181,10 @@ def _find_planes(
     grid: DepthGrid, hint: F8 | None, trials: F8, settings: DetectionSettings, *, upright: bool
 ) -> tuple[F8, Records, HeightMap] | None:
     """Return up, the supporting planes, and the height map; None without a plane."""
-    tallest_m = settings.max_height_m
-    supports, up = find_supporting_planes(grid, hint, trials, tallest_m=tallest_m, upright=upright)
+    max_height_m = settings.max_height_m
+    supports, up = find_supporting_planes(
+        grid, hint, trials, max_height_m=max_height_m, upright=upright
+    )
     if not supports and not upright:  # another view of the cloud may show a plane
         return None
     if not supports and hint is not None:
@@ -186,12 +192,12 @@ def _find_planes(
     elif not up.any():
         up = np.array(DEFAULT_UP)
     planes = pack_planes(supports)
-    heights = measure_heights(grid, planes, tallest_m)
+    heights = measure_heights(grid, planes, max_height_m)
     assumed = _find_assumed_plane(grid, heights, up, trials, settings)
     if assumed is not None:
         supports = sorted([*supports, assumed], key=lambda support: support.offset)
         planes = pack_planes(supports)
-        heights = measure_heights(grid, planes, tallest_m)
+        heights = measure_heights(grid, planes, max_height_m)
     return (up, planes, heights) if supports else None
 
 

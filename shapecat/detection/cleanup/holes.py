@@ -12,7 +12,7 @@ from shapecat.detection.connected_components import (
     spans_of,
 )
 from shapecat.detection.depth_grid import DepthGrid
-from shapecat.detection.planes.height_map import HEIGHT_NOISE, MIN_HEIGHT_M, HeightMap
+from shapecat.detection.planes.height_map import FRINGE, HEIGHT_NOISE, MIN_HEIGHT_M, HeightMap
 from shapecat.jit import kernel, unset
 
 __all__ = ["fill_contact_boundary", "fill_holes"]
@@ -31,8 +31,8 @@ def fill_contact_boundary(grid: DepthGrid, heights: HeightMap, labels: I4) -> No
     inv_depth, (plane_id, height) = grid.inverse_depth, heights
     rows, columns = labels.shape
     original, low = labels.copy(), np.zeros(columns, np.bool_)
-    min_height = np.float32(CLEANUP.fringe * MIN_HEIGHT_M)
-    noise = np.float32(CLEANUP.fringe * HEIGHT_NOISE)
+    min_height = np.float32(FRINGE * MIN_HEIGHT_M)
+    noise = np.float32(FRINGE * HEIGHT_NOISE)
     for i in range(rows):
         any_low = False
         for j in range(np.uint64(columns)):  # few rows have any, and this vectorises

@@ -33,18 +33,12 @@ class CleanupSettings(NamedTuple):
     """Maximum fraction of the image that sensors leave blank at a border."""
     around_cells: int = 4
     """Distance from an object, in cells, at which the roughness of its plane is measured."""
-    cut_off_m: float = 0.02
-    """A segment that comes this near to the maximum height continues above it, metres."""
     large_share: float = 0.02
     """Minimum fraction of the image covered by a large object, an arm, furniture or the bent end of
     a table."""
     cut_share: float = 0.4
     """Minimum fraction of the perimeter of such structure, assumed to be square, at the image
     border."""
-    fringe: float = 0.6
-    """Minimum height at which a sample next to an object belongs to it, relative to the
-    minimum elsewhere, which excludes noise: away from objects, samples this low belong to the plane
-    as often as to an object."""
     enclosed_share: float = 0.6
     """Minimum fraction of the boundary of a hole with the label around it: a ring seen from the
     side has this much, the gap between two objects half."""

@@ -19,6 +19,7 @@ from shapecat.detection.cleanup.object_features import OBJECT_FEATURES
 from shapecat.detection.cleanup.settings import CLEANUP
 from shapecat.detection.depth_grid import DepthGrid, smallest_object_at
 from shapecat.detection.merging.segments import Segments, roots_of
+from shapecat.detection.planes.height_map import CUT_OFF_M
 from shapecat.jit import kernel
 from shapecat.trees import BoostedTrees, logit_of, read_trees
 
@@ -81,7 +82,7 @@ def find_background(
     background = logits < min_logits
     background |= cells < CLEANUP.tiny_share * smallest_object_at(grid, depths)
     background |= segment["width_m"] > settings.max_size_m
-    background |= segment["top_m"] > settings.max_height_m - CLEANUP.cut_off_m
+    background |= segment["top_m"] > settings.max_height_m - CUT_OFF_M
     # Large and mostly outside the image: furniture, which the trees were not shown.
     background |= large & (merged["surroundings"]["image_border"] > CLEANUP.cut_share)
     rejected = np.zeros(len(features), np.bool_)

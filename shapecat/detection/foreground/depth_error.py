@@ -12,12 +12,16 @@ from shapecat.detection.foreground.settings import LOW
 from shapecat.detection.planes.height_map import HeightMap
 from shapecat.jit import kernel
 
-__all__ = ["EVERY", "clear_contact", "filter_high_pass", "measure_noise", "measure_residual"]
+__all__ = ["NOISE_STRIDE", "clear_contact", "filter_high_pass", "measure_noise", "measure_residual"]
 
 STEPS = 2**20
 """Steps per 1/m of the integer sums: for a window full of samples 1/m off, they fit in 32 bits."""
-BIN, BINS, EVERY = 2e-5, 500, 3
-"""Histogram of rises: width of a bin, 1/m, number of bins, and step between the cells used."""
+BIN = 2e-5
+"""Width of a bin in the histogram of rises, 1/m."""
+BINS = 500
+"""Number of these bins."""
+NOISE_STRIDE = 3
+"""Step between the rows and columns of the cells whose rises are counted."""
 
 
 @kernel
@@ -209,8 +213,8 @@ def measure_noise(high_pass: F4, plane_id: I4, number: int) -> float:
     rows, columns = high_pass.shape
     histogram = np.zeros(BINS, np.int64)
     n = 0
-    for i in range(0, rows - LOW.rise_cells, EVERY):
-        for j in range(0, columns - LOW.rise_cells, EVERY):
+    for i in range(0, rows - LOW.rise_cells, NOISE_STRIDE):
+        for j in range(0, columns - LOW.rise_cells, NOISE_STRIDE):
             value = high_pass[i, j]
             if plane_id[i, j] != -number or value == 0:
                 continue

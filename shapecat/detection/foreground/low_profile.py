@@ -14,7 +14,7 @@ from shapecat.detection.connected_components import SIDES
 from shapecat.detection.depth_grid import DepthGrid
 from shapecat.detection.foreground.convex_hull import fill_hull
 from shapecat.detection.foreground.depth_error import (
-    EVERY,
+    NOISE_STRIDE,
     clear_contact,
     filter_high_pass,
     measure_noise,
@@ -27,7 +27,7 @@ from shapecat.jit import kernel, unset
 
 __all__ = ["find_low_profile"]
 
-BLOCK = 16
+CELLS_PER_BLOCK = 16
 """Cells that are tested together: most are below all levels."""
 
 
@@ -49,7 +49,7 @@ class Scratch(NamedTuple):
 
 @kernel
 def find_low_profile(
-    grid: DepthGrid, heights: HeightMap, planes: Records, largest_m: float
+    grid: DepthGrid, heights: HeightMap, planes: Records, max_size_m: float
 ) -> Bool:
     """Find the low-profile objects on each plane, and assign depth error to the plane.
 
@@ -58,7 +58,7 @@ def find_low_profile(
     heights : ``plane_id`` is changed in place: k + 1 on the objects found on plane k, -(k + 1) on
         cells that only depth error raises.
     planes : from `pack_planes`.
-    largest_m : maximum width of a low-profile object, metres.
+    max_size_m : maximum width of a low-profile object, metres.
 
     Returns
     -------
@@ -66,7 +66,7 @@ def find_low_profile(
     """
     inv_depth, jump, (plane_id, height) = grid.inverse_depth, grid.discontinuity, heights
     shape, size = inv_depth.shape, inv_depth.size
-    widest = largest_m * grid.intrinsics.fx
+    widest = max_size_m * grid.intrinsics.fx
     residuals, high_passes = unset(shape, np.float32), unset(shape, np.float32)
     drops, object_ids = unset(size, np.float32), np.zeros(shape, np.int16)
     scratch = Scratch(
@@ -118,7 +118,7 @@ def _rows_of(plane_id: I4, number: int) -> tuple[int, int]:
     if end == 0:
         return 0, 0
     start = max(start - LOW.rise_cells, 0)
-    return start - start % EVERY, min(
+    return start - start % NOISE_STRIDE, min(
         end + LOW.rise_cells, rows
     )  # noise is measured on the same rows
 
@@ -192,11 +192,11 @@ def _find_seeds(high_pass: F4, threshold: float, seeds: I4) -> int:
     flat = high_pass.reshape(-1)
     n = 0
     for i in range(1, rows):
-        for start in range(1, columns, BLOCK):
+        for start in range(1, columns, CELLS_PER_BLOCK):
             # Unsigned indices instead of slices, each of which counts references.
             cell = np.uint64(i * columns + start)
             before, above = cell - np.uint64(1), np.uint64((i - 1) * columns + start)
-            cells = np.uint64(min(BLOCK, columns - start))
+            cells = np.uint64(min(CELLS_PER_BLOCK, columns - start))
             any_above = False
             for k in range(cells):
                 value = flat[cell + k]

@@ -32,7 +32,7 @@ class Overhang(NamedTuple):
     grid, heights, walls : as in `extend_overhang`.
     number : number of the plane, from 1, as in `HeightMap.plane_id`.
     plane : its record of `PLANE`.
-    highest_m : maximum height of an object above it, metres.
+    max_height_m : maximum height of an object above it, metres.
     visited : (rows, columns) int8, ``number`` in the cells already visited for this plane.
     """
 
@@ -41,13 +41,13 @@ class Overhang(NamedTuple):
     walls: U1
     number: int
     plane: Row
-    highest_m: float
+    max_height_m: float
     visited: I4
 
 
 @kernel
 def extend_overhang(
-    grid: DepthGrid, heights: HeightMap, planes: Records, walls: U1, highest_m: float
+    grid: DepthGrid, heights: HeightMap, planes: Records, walls: U1, max_height_m: float
 ) -> None:
     """Assign to each plane, in place, the parts of its objects that lie outside its outline.
 
@@ -59,13 +59,13 @@ def extend_overhang(
     heights : changed in place.
     planes : from `pack_planes`.
     walls : (rows, columns) from `remove_walls`; cleared cells are not assigned.
-    highest_m : maximum height of an object above its plane, metres.
+    max_height_m : maximum height of an object above its plane, metres.
     """
     shape = grid.inverse_depth.shape
     visited, stack = np.zeros(shape, np.int8), unset(grid.inverse_depth.size, np.int32)
     border = np.zeros(shape[1], np.uint8)
     for number in range(len(planes), 0, -1):
-        over = Overhang(grid, heights, walls, number, planes[number - 1], highest_m, visited)
+        over = Overhang(grid, heights, walls, number, planes[number - 1], max_height_m, visited)
         for i in range(shape[0]):
             if not _find_border(heights.plane_id, number, i, border):
                 continue
@@ -153,7 +153,7 @@ def _height_beside(over: Overhang, i: int, j: int) -> float:
         return 0.0
     z = 1 / float(inv_depth)
     height = height_above(plane, i, j, z)
-    if not (min_height_at(z) < height < over.highest_m):
+    if not (min_height_at(z) < height < over.max_height_m):
         return 0.0
     x, y = back_project(k, i, j, z)
     return height if distance_outside(plane, x, y, z) <= OVERHANG.max_distance_m else 0.0

@@ -26,7 +26,7 @@ STRIPS = 400
 
 
 @kernel
-def remove_walls(grid: DepthGrid, plane_id: I4, up: F8, largest_m: float, trials: F8) -> U1:
+def remove_walls(grid: DepthGrid, plane_id: I4, up: F8, max_size_m: float, trials: F8) -> U1:
     """Remove the cells on walls from the objects, in place.
 
     Vertical planes are tested one after the other, each the one with the most remaining samples.
@@ -35,7 +35,7 @@ def remove_walls(grid: DepthGrid, plane_id: I4, up: F8, largest_m: float, trials
     ----------
     plane_id : (rows, columns) as in `HeightMap`; cleared cells become 0.
     up : (3,) unit vector, sensor frame.
-    largest_m : size of the largest object, metres.
+    max_size_m : size of the largest object, metres.
     trials : from `draw_trials`.
 
     Returns
@@ -51,16 +51,16 @@ def remove_walls(grid: DepthGrid, plane_id: I4, up: F8, largest_m: float, trials
         if count < WALLS.min_samples:
             break
         normal = plane_normal(plane, grid.intrinsics)
-        if _is_wall(grid, samples, plane, normal, up, largest_m):
+        if _is_wall(grid, samples, plane, normal, up, max_size_m):
             axes = np.stack((normal, cross(normal, up), up))
-            _clear(grid, plane_id, plane, axes, largest_m, walls)
+            _clear(grid, plane_id, plane, axes, max_size_m, walls)
         samples = select_outliers(samples, plane, 2 * PLANES.tolerance)
     return walls
 
 
 @kernel(inline=True)
 def _is_wall(
-    grid: DepthGrid, samples: DepthSamples, plane: F8, normal: F8, up: F8, largest_m: float
+    grid: DepthGrid, samples: DepthSamples, plane: F8, normal: F8, up: F8, max_size_m: float
 ) -> bool:
     """Return whether the inliers of a plane are too many for the face of an object."""
     strips = np.zeros((2, STRIPS))
@@ -71,9 +71,9 @@ def _is_wall(
         along += WALLS.strip_m * (strips[1, k] > WALLS.strip_m**2)
     if area <= WALLS.min_area_m2 or area <= WALLS.filled * across * along:
         return False
-    if max(across, along) > largest_m:
+    if max(across, along) > max_size_m:
         return True
-    large = math.hypot(across, along) > WALLS.cut_off * largest_m
+    large = math.hypot(across, along) > WALLS.cut_off * max_size_m
     return bool(large and _is_cut_off(grid.inverse_depth, samples, plane))
 
 
@@ -126,7 +126,9 @@ def _measure(
 
 
 @kernel(inline=True)
-def _clear(grid: DepthGrid, plane_id: I4, plane: F8, axes: F8, largest_m: float, walls: U1) -> None:
+def _clear(
+    grid: DepthGrid, plane_id: I4, plane: F8, axes: F8, max_size_m: float, walls: U1
+) -> None:
     """Clear the large connected parts of a wall; other parts may be objects in front of it.
 
     ``axes`` (3, 3) are its normal, the horizontal direction along it, and up.
@@ -142,7 +144,7 @@ def _clear(grid: DepthGrid, plane_id: I4, plane: F8, axes: F8, largest_m: float,
                 count, area, squares = _flood(grid, plane, axes[0], i, j, state, stack)
                 exact = area >= WALLS.patch_m2 and squares < count * WALLS.exact**2
                 large = area >= WALLS.part_m2 or exact
-                if large and not _is_free_standing(grid, axes, largest_m, state, stack[:count]):
+                if large and not _is_free_standing(grid, axes, max_size_m, state, stack[:count]):
                     total += area
                     for p in stack[:count]:
                         state[p // columns, p % columns] = CLEARED
@@ -154,7 +156,7 @@ def _clear(grid: DepthGrid, plane_id: I4, plane: F8, axes: F8, largest_m: float,
 
 
 @kernel(inline=True)
-def _is_free_standing(grid: DepthGrid, axes: F8, largest_m: float, state: U1, cells: I4) -> bool:
+def _is_free_standing(grid: DepthGrid, axes: F8, max_size_m: float, state: U1, cells: I4) -> bool:
     """Return whether a connected part of a wall is the front of one of several objects in a row.
 
     It is no larger than an object, and ends to the left and right in front of farther surface. A
@@ -180,7 +182,7 @@ def _is_free_standing(grid: DepthGrid, axes: F8, largest_m: float, state: U1, ce
             ends += 1
             farther += 0 < inv_depth[v, u] < w - grid.discontinuity
             nearer += inv_depth[v, u] > w + grid.discontinuity
-    fits = max(high[0] - low[0], high[1] - low[1]) <= largest_m
+    fits = max(high[0] - low[0], high[1] - low[1]) <= max_size_m
     return bool(fits and farther > nearer and farther > WALLS.free_share * ends)
 
 

@@ -6,7 +6,7 @@ import numpy as np
 
 from shapecat.arrays import F4, F8, I4, Bool
 from shapecat.detection.depth_grid import DepthGrid, back_project, project, row_and_column
-from shapecat.detection.merging.segments import SAMPLES, Segments, merge
+from shapecat.detection.merging.segments import MIN_LINKS, SAMPLES, Segments, merge
 from shapecat.detection.merging.settings import MERGING
 from shapecat.jit import kernel
 
@@ -56,7 +56,7 @@ def _find_shared_occluder(segments: Segments) -> Bool:
     for k in range(1, n):
         count = 0
         for p in range(1, n):
-            if parent[p] == p and pairs[k, p].in_front >= MERGING.min_links:
+            if parent[p] == p and pairs[k, p].in_front >= MIN_LINKS:
                 behind[count] = p
                 count += 1
         for a in range(count):

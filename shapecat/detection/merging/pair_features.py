@@ -21,6 +21,7 @@ from shapecat.detection.merging.segment_features import (
     write_segment_features,
 )
 from shapecat.detection.merging.segments import (
+    MIN_LINKS,
     SEGMENT,
     Segments,
     add_statistics,
@@ -125,7 +126,7 @@ def find_adjacent(segments: Segments, p: int, view_geometry: ViewGeometry) -> Bo
         if q != p and parent[q] == q and plane_id[q] == plane_id[p]:
             border = pairs[p, q].contact + pairs[p, q].near + pairs[p, q].in_front
             border += pairs[q, p].in_front
-            adjacent[q] = border >= MERGING.min_links or _face(segments, p, q, view_geometry)
+            adjacent[q] = border >= MIN_LINKS or _face(segments, p, q, view_geometry)
     return adjacent
 
 

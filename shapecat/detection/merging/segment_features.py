@@ -5,8 +5,9 @@ import math
 import numpy as np
 
 from shapecat.arrays import Row
-from shapecat.detection.merging.segments import BAND_M, BANDS, Segments, mean_depth
+from shapecat.detection.merging.segments import Segments, mean_depth
 from shapecat.detection.merging.settings import MERGING
+from shapecat.detection.segmentation.bands import BAND_M, BANDS
 from shapecat.jit import kernel
 
 __all__ = [

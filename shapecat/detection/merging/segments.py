@@ -11,18 +11,17 @@ from shapecat.detection.merging.image_hull import extend_hull
 from shapecat.detection.merging.settings import MERGING
 from shapecat.detection.planes.extent import DIRECTIONS
 from shapecat.detection.planes.height_map import HeightMap
+from shapecat.detection.segmentation.bands import BAND_M, BANDS, lateral_axis
 from shapecat.detection.segmentation.connectivity import SurfaceGraph
-from shapecat.geometry import level_axes
 from shapecat.jit import kernel
 
 __all__ = [
-    "BAND_M",
+    "MIN_LINKS",
     "PAIR",
     "SAMPLES",
     "SEGMENT",
     "Segments",
     "add_statistics",
-    "lateral_axis",
     "mean_depth",
     "measure_segments",
     "merge",
@@ -73,11 +72,11 @@ PAIR = np.dtype(
     align=True,
 )
 """The statistics of an ordered pair of segments: counts along their common border."""
+MIN_LINKS = 3
+"""Minimum of such a count that is not noise."""
 SAMPLES = 48
 """Maximum number of samples of a segment, evenly spaced, used where all its cells would take too
 long."""
-BAND_M, BANDS = 0.005, 128
-"""Height of a band, metres, and number of bands; higher cells count in the last one."""
 
 
 class Segments(NamedTuple):
@@ -134,15 +133,6 @@ def _blank(size: int) -> Segments:
 def roots_of(segments: Segments) -> I4:
     """Return the segments that have not been merged into another, (r,), ascending."""
     return np.flatnonzero(segments.parent == np.arange(segments.parent.size))[1:]
-
-
-@kernel
-def lateral_axis(up: F8) -> F8:
-    """Return the horizontal unit vector (3,) across the view, sensor frame."""
-    across = math.hypot(up[0], up[1])
-    if across < 0.2:  # the camera looks straight down
-        return np.array(level_axes(up[0], up[1], up[2])[0])
-    return np.array([up[1] / across, -up[0] / across, 0.0])
 
 
 @kernel

@@ -9,8 +9,6 @@ __all__ = ["MERGING", "MergingSettings"]
 class MergingSettings(NamedTuple):
     """Constants of the measuring, comparing and merging of segments."""
 
-    min_links: int = 3
-    """Minimum number of links between two segments that are a contact, not noise."""
     up_cos: float = 0.8
     """Minimum cosine to up of a normal that faces up: noise turns normals by up to 35 degrees."""
     edge_on_cos: float = 0.2

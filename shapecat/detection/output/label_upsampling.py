@@ -3,11 +3,11 @@
 import numpy as np
 
 from shapecat.arrays import F4, F8, I4, U1, U4, Records
-from shapecat.detection.cleanup.settings import CLEANUP
 from shapecat.detection.connected_components import span_of
 from shapecat.detection.depth_grid import DepthGrid, row_and_column
 from shapecat.detection.output.pixel_runs import append_run, pixels_by_label, split_by_label
 from shapecat.detection.planes.height_map import (
+    FRINGE,
     HEIGHT_NOISE,
     MIN_HEIGHT_M,
     height_above,
@@ -25,7 +25,7 @@ __all__ = [
 
 UNSURE, BARE = -1, -2
 """Codes in place of a label: a closer test is needed; an unlabelled cell next to a labelled one."""
-BLOCK = 16
+PIXELS_PER_BLOCK = 16
 """Pixels that are tested together: most are like the previous ones."""
 
 
@@ -110,8 +110,8 @@ def _list_pixels(
 def _find_unsure(line: I4, start: int, end: int, cells: I4) -> int:
     """Write the columns of `UNSURE` pixels to ``cells[1]``; return their number."""
     n = 0
-    for x in range(start, end, BLOCK):
-        last, any_unsure = min(x + BLOCK, end), False
+    for x in range(start, end, PIXELS_PER_BLOCK):
+        last, any_unsure = min(x + PIXELS_PER_BLOCK, end), False
         for k in range(np.uint64(x), np.uint64(last)):
             any_unsure |= line[k] == UNSURE  # few blocks have any, and this vectorises
         for k in range(x, last if any_unsure else x):
@@ -123,13 +123,13 @@ def _find_unsure(line: I4, start: int, end: int, cells: I4) -> int:
 @kernel(inline=True)
 def _end_of(line: I4, x: int, end: int, mark: int) -> int:
     """Return the first column from ``x`` to ``end`` with another mark; ``end`` if there is none."""
-    while x + BLOCK <= end:
+    while x + PIXELS_PER_BLOCK <= end:
         all_equal = True
-        for k in range(np.uint64(x), np.uint64(x + BLOCK)):
+        for k in range(np.uint64(x), np.uint64(x + PIXELS_PER_BLOCK)):
             all_equal &= line[k] == mark  # this vectorises
         if not all_equal:
             break
-        x += BLOCK
+        x += PIXELS_PER_BLOCK
     while x < end and line[x] == mark:
         x += 1
     return x
@@ -167,8 +167,8 @@ def _find_high(planes: Records, inv_depth: F4, jump: float, i: int, span: I4, hi
     A pixel fits within ``jump``, 1/m.
     """
     zero, floor = np.float32(0), np.float32(1e-3)
-    base = np.float32(CLEANUP.fringe * HEIGHT_NOISE)
-    slope = np.float32(CLEANUP.fringe * MIN_HEIGHT_M)
+    base = np.float32(FRINGE * HEIGHT_NOISE)
+    slope = np.float32(FRINGE * MIN_HEIGHT_M)
     for k in range(len(planes)):
         plane = planes[k]
         a, below = np.float32(plane.a), np.float32(-plane.offset)
@@ -265,7 +265,7 @@ def assign_labels(
         if label <= 0:
             continue
         height = height_above(planes[plane_ids[label]], v, u, z)
-        if filled[i, j] or height > CLEANUP.fringe * min_height_at(z):
+        if filled[i, j] or height > FRINGE * min_height_at(z):
             marks[m] = label
 
 

@@ -7,8 +7,7 @@ import numpy as np
 from shapecat.arrays import F4, F8, I4, Bool, Records
 from shapecat.detection.connected_components import spans_of
 from shapecat.detection.depth_grid import DepthGrid, smallest_object_at
-from shapecat.detection.merging.segments import Segments
-from shapecat.detection.merging.settings import MERGING
+from shapecat.detection.merging.segments import MIN_LINKS, Segments
 from shapecat.detection.output.settings import OUTPUT
 from shapecat.geometry import gravity_rotation, level_box
 from shapecat.jit import kernel
@@ -90,7 +89,7 @@ def measure_objects(
         supported_by,
         support_m,
         segment["hidden"] + segment["behind"] > OUTPUT.occluded_share,
-        cells_at_limit >= MERGING.min_links,
+        cells_at_limit >= OUTPUT.min_cells_at_limit,
         smallest_object_at(grid, visibility["depth_m"]),
     )
 
@@ -163,10 +162,10 @@ def _supporting_object(
         larger = pairs[representatives[k]].rests_on > pairs[representatives[best]].rests_on
         best = k if larger and below[k] else best
     contact = pairs[representatives[best]].rests_on
-    if contact >= MERGING.min_links and contact > segment.plane_contact:
+    if contact >= MIN_LINKS and contact > segment.plane_contact:
         height = float(pairs[representatives[best]].rests_on_height / contact)
         return (0, 0.0) if segment.bottom < height - OUTPUT.sunk_m else (best, height)
-    if segment.bottom > OUTPUT.lifted_m and segment.plane_contact < MERGING.min_links:
+    if segment.bottom > OUTPUT.lifted_m and segment.plane_contact < MIN_LINKS:
         best = _hidden_support(segments, representatives, p, below)
         return best, float(statistics[representatives[best]].top) if best else 0.0
     return 0, 0.0
@@ -192,7 +191,7 @@ def _hidden_support(segments: Segments, representatives: I4, p: int, below: Bool
         beside = statistics[q].left < middle < statistics[q].right
         if q != p and below[k] and lower and beside and border > best_border:
             best, best_border = k, border
-    return best if best_border >= MERGING.min_links else 0
+    return best if best_border >= MIN_LINKS else 0
 
 
 @kernel(inline=True)

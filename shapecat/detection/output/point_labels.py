@@ -20,12 +20,12 @@ __all__ = ["label_points"]
 
 
 def label_points(
-    view: VirtualImage, segmentation: Segmentation, *, fused: bool, highest_m: float
+    view: VirtualImage, segmentation: Segmentation, *, fused: bool, max_height_m: float
 ) -> list[U4]:
     """Return the points of each label 1, 2, ...: ascending indices (k,) uint32.
 
-    If ``fused``, points behind the visible surface, at most ``highest_m`` above a plane, join the
-    objects they touch. Lists beyond the labels are clusters that touch no visible object.
+    If ``fused``, points behind the visible surface, at most ``max_height_m`` above a plane, join
+    the objects they touch. Lists beyond the labels are clusters that touch no visible object.
     """
     points, grid, labels = view.points, view.grid, segmentation.plane_ids.size
     marks = np.zeros(len(points), np.int16)
@@ -33,7 +33,7 @@ def label_points(
     if fused:
         above = marks > 0
         for plane in segmentation.model.planes:
-            above |= _above(points, view.cell, grid.intrinsics, plane, highest_m)
+            above |= _above(points, view.cell, grid.intrinsics, plane, max_height_m)
         indices = np.flatnonzero(above)
         if indices.size:
             spread = label_occluded_points(points[indices], marks[indices].astype(np.int64), labels)
@@ -46,7 +46,7 @@ def label_points(
 
 @kernel
 def _above(
-    points: F4, cell: I4, intrinsics: PinholeIntrinsics, plane: Row, highest_m: float
+    points: F4, cell: I4, intrinsics: PinholeIntrinsics, plane: Row, max_height_m: float
 ) -> Bool:
     """Return which points (n, 3) are above a plane and inside its outline, (n,)."""
     result = np.zeros(len(points), np.bool_)
@@ -56,7 +56,7 @@ def _above(
             i, j = intrinsics.fy * y / z + intrinsics.cy, intrinsics.fx * x / z + intrinsics.cx
             h = height_above(plane, i, j, z)
             result[k] = (
-                h > min_height_at(z) and h < highest_m and distance_outside(plane, x, y, z) <= 0
+                h > min_height_at(z) and h < max_height_m and distance_outside(plane, x, y, z) <= 0
             )
     return result
 

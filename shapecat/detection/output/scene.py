@@ -7,11 +7,11 @@ import numpy as np
 
 from shapecat.arrays import F4, I4, U4, Bool, Records, Row, freeze
 from shapecat.config import DetectionSettings
-from shapecat.detection.cleanup.settings import CLEANUP
 from shapecat.detection.depth_grid import DepthGrid, find_borders
 from shapecat.detection.output.measurements import ObjectMeasurements
 from shapecat.detection.output.settings import OUTPUT
 from shapecat.detection.planes.extent import outline_corners
+from shapecat.detection.planes.height_map import CUT_OFF_M
 from shapecat.detection.records import Segmentation
 from shapecat.geometry import (
     IDENTITY,
@@ -110,7 +110,7 @@ def _select_objects(
 def _fits(box: Box, settings: DetectionSettings) -> bool:
     """Return whether a box is that of an object, not of a wall or furniture."""
     length, width, height = box.size.tolist()
-    low = height <= settings.max_height_m - CLEANUP.cut_off_m
+    low = height <= settings.max_height_m - CUT_OFF_M
     return bool(low and max(length, width) <= settings.max_size_m)
 
 

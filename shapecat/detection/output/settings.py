@@ -33,6 +33,8 @@ class OutputSettings(NamedTuple):
     """Minimum fraction of a side along which such a border is straight."""
     forward_cos: float = 0.2
     """Approximate minimum cosine to the optical axis of a point in front of a camera."""
+    min_cells_at_limit: int = 3
+    """Minimum number of cells at the range limit of an object that it cuts off: fewer are noise."""
     crowded: float = 0.08
     """Fraction of points behind others above which a cloud counts as fused from several views."""
 

@@ -16,7 +16,7 @@ __all__ = ["find_supporting_planes"]
 
 
 def find_supporting_planes(
-    grid: DepthGrid, hint: F8 | None, trials: F8, *, tallest_m: float, upright: bool
+    grid: DepthGrid, hint: F8 | None, trials: F8, *, max_height_m: float, upright: bool
 ) -> tuple[list[SupportingPlane], F8]:
     """Find the horizontal planes that objects may stand on (thesis 4.3).
 
@@ -28,7 +28,7 @@ def find_supporting_planes(
     ----------
     hint : (3,) unit vector away from gravity, sensor frame; None if unknown.
     trials : from `draw_trials`.
-    tallest_m : height of the tallest object, metres.
+    max_height_m : height of the tallest object, metres.
     upright : whether the grid is from a real camera, which is rarely held on its side.
 
     Returns
@@ -44,6 +44,6 @@ def find_supporting_planes(
         return [], up
     if may_have_strips(grid, points, candidates):
         candidates = add_strip_planes(grid, candidates)
-    supports = supporting_planes(grid, candidates, tallest_m)
+    supports = supporting_planes(grid, candidates, max_height_m)
     largest = max(supports, key=lambda plane: plane.area_m2, default=None)
     return supports, up if largest is None else largest.up

@@ -14,7 +14,7 @@ from shapecat.detection.planes.settings import ASSUMED, PLANES, UP
 
 __all__ = ["assume_plane", "find_unexplained"]
 
-EVERY = 4
+SAMPLE_STRIDE = 4
 """Step between the unexplained samples that place the plane."""
 
 
@@ -30,7 +30,7 @@ def find_unexplained(grid: DepthGrid, explained: I4 | U1) -> Bool | None:
 
 
 def assume_plane(
-    grid: DepthGrid, unexplained: Bool, up: F8, tallest_m: float
+    grid: DepthGrid, unexplained: Bool, up: F8, max_height_m: float
 ) -> SupportingPlane | None:
     """Return the level plane below most unexplained samples; None if it is above the camera.
 
@@ -41,27 +41,27 @@ def assume_plane(
     ----------
     unexplained : (rows, columns) from `find_unexplained`.
     up : (3,) unit normal of the plane, sensor frame.
-    tallest_m : height of the tallest object, metres.
+    max_height_m : height of the tallest object, metres.
     """
     subset = np.zeros(unexplained.shape, np.bool_)
-    subset.flat[np.flatnonzero(unexplained)[::EVERY]] = True
+    subset.flat[np.flatnonzero(unexplained)[::SAMPLE_STRIDE]] = True
     across, along, height = level_coordinates(grid, subset, up)
     z = 1 / grid.inverse_depth[subset].astype(np.float64)
-    offset = _fullest_interval(height, 1 / (1 + (z / UP.half_weight_m) ** 2), tallest_m)
+    offset = _fullest_interval(height, 1 / (1 + (z / UP.half_weight_m) ** 2), max_height_m)
     if offset >= 0:  # its upper side is not visible
         return None
-    inside = (height > offset) & (height < offset + tallest_m)
+    inside = (height > offset) & (height < offset + max_height_m)
     sides = COS[:, None] * across[inside] + SIN[:, None] * along[inside]
     a, b, c = horizontal_plane(grid.intrinsics, up, offset)
     extent = sides.max(axis=1, initial=-np.inf) + PLANES.margin_m
     return SupportingPlane(a, b, c, up, offset, extent, 0.0)
 
 
-def _fullest_interval(height: F8, weight: F8, tallest_m: float) -> float:
-    """Return a height just below the interval of length ``tallest_m`` with the most weight."""
+def _fullest_interval(height: F8, weight: F8, max_height_m: float) -> float:
+    """Return a height just below the interval of length ``max_height_m`` with the most weight."""
     low = float(height.min())
     count = np.bincount(((height - low) / PLANES.bin_m).astype(np.int64), weight)
-    window = max(round(tallest_m / PLANES.bin_m), 1)
+    window = max(round(max_height_m / PLANES.bin_m), 1)
     total = np.cumsum(np.concatenate([[0.0], count, np.zeros(window)]))
     inside = total[window:] - total[:-window]
     start = int(np.argmax(inside))

@@ -11,6 +11,8 @@ from shapecat.geometry import gravity_rotation
 from shapecat.jit import kernel
 
 __all__ = [
+    "CUT_OFF_M",
+    "FRINGE",
     "HEIGHT_NOISE",
     "MIN_HEIGHT_M",
     "PLANE",
@@ -25,6 +27,11 @@ __all__ = [
 MIN_HEIGHT_M = 0.004
 """Minimum height of an object's sample, metres; `HEIGHT_NOISE` times the squared depth is added."""
 HEIGHT_NOISE = 0.0025
+FRINGE = 0.6
+"""Next to an object, samples above this fraction of the minimum height belong to it. Elsewhere,
+half of such samples are noise of the plane."""
+CUT_OFF_M = 0.02
+"""What comes this near to the maximum height of an object continues above it, metres."""
 BEYOND_M = 0.1
 """Surface level with a plane, and this near to its outline, is not an object on a lower plane."""
 OUT = -1e6
@@ -72,33 +79,35 @@ def pack_planes(supports: list[SupportingPlane]) -> Records:
 
 
 @kernel
-def measure_heights(grid: DepthGrid, planes: Records, highest_m: float) -> HeightMap:
+def measure_heights(grid: DepthGrid, planes: Records, max_height_m: float) -> HeightMap:
     """Assign each sample to the highest plane below it.
 
-    ``planes`` are from `pack_planes`, lowest first; ``highest_m`` is the maximum height above the
-    plane, metres.
+    ``planes`` are from `pack_planes`, lowest first; ``max_height_m`` is the maximum height above
+    the plane, metres.
     """
     shape = grid.inverse_depth.shape
     heights = HeightMap(np.zeros(shape, np.int8), np.zeros(shape, np.float32))
     for number in range(len(planes), 0, -1):
-        _assign(grid, planes[number - 1], number, highest_m, heights)
+        _assign(grid, planes[number - 1], number, max_height_m, heights)
     return heights
 
 
 @kernel(inline=True)
-def _assign(grid: DepthGrid, plane: Row, number: int, highest: float, heights: HeightMap) -> None:
+def _assign(
+    grid: DepthGrid, plane: Row, number: int, max_height_m: float, heights: HeightMap
+) -> None:
     """Assign the free cells inside the outline of a plane to it; the loops over a row vectorise.
 
-    ``plane`` is a `PLANE`, and ``highest`` the maximum height above it, metres. Compiled without
-    ``fast``: with it, the inlined copy would round heights differently in the process that compiles
-    and in later ones.
+    ``plane`` is a `PLANE`, and ``max_height_m`` the maximum height above it, metres. Compiled
+    without ``fast``: with it, the inlined copy would round heights differently in the process that
+    compiles and in later ones.
     """
     inv_depth, intrinsics, (plane_id, height) = grid.inverse_depth, grid.intrinsics, heights
     rows, columns = inv_depth.shape
     a, below = np.float32(plane.a), np.float32(-plane.offset)
     zero, one = np.float32(0), np.float32(1)
     min_height, noise, outside = np.float32(MIN_HEIGHT_M), np.float32(HEIGHT_NOISE), np.float32(OUT)
-    beyond, high = np.float32(BEYOND_M), np.float32(highest)
+    beyond, high = np.float32(BEYOND_M), np.float32(max_height_m)
     above, surface = np.int8(number), np.int8(-number)
     x = np.arange(columns).astype(np.float32)
     line, slack = np.zeros(columns, np.float32), np.zeros(columns, np.float32)

@@ -17,9 +17,11 @@ __all__ = [
     "select_outliers",
 ]
 
-TRIALS, BLOCK = 240, 256
-"""Number of planes tried: one with a seventh of the samples is missed with a probability of a half.
-Number of samples after which a plane that can no longer win is dropped."""
+TRIALS = 240
+"""Number of planes tried: one with a seventh of the samples is missed with a probability of a
+half."""
+SAMPLES_PER_BLOCK = 256
+"""Number of samples after which a plane that can no longer win is dropped."""
 MIN_DOUBLE_AREA = 30.0
 """Twice the minimum area of the triangle of three samples, in square cells: noise spoils smaller
 ones."""
@@ -96,10 +98,11 @@ def ransac_plane(
             continue
         # (2) count the inliers
         inliers = 0
-        for start in range(0, n, BLOCK):
+        for start in range(0, n, SAMPLES_PER_BLOCK):
             if inliers + n - start <= best_count:
                 break
-            inliers += _count_part(samples, plane, tolerance, start, min(start + BLOCK, n))
+            end = min(start + SAMPLES_PER_BLOCK, n)
+            inliers += _count_part(samples, plane, tolerance, start, end)
         if inliers > best_count:
             best_count = inliers
             best[0], best[1], best[2] = plane[0], plane[1], plane[2]

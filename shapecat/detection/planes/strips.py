@@ -27,9 +27,9 @@ from shapecat.jit import kernel, unset
 
 __all__ = ["add_strip_planes", "may_have_strips"]
 
-APART = 2
+COLUMN_STRIDE = 2
 """Step between the columns of the samples used."""
-SPARSE = 4
+AREA_STRIDE = 4
 """Step between the samples that measure the area above a plane."""
 ARM = 2
 """Distance, in cells, to the neighbours that show whether a sample is on level surface."""
@@ -113,7 +113,7 @@ def _plane_at(grid: DepthGrid, strips: F4, up: F8, height: float) -> PlaneCandid
     """Measure the level plane through the strips at a height."""
     near = np.ascontiguousarray(strips[:, abs(strips[3] - height) < 1.5 * STRIPS.bin_m])
     offset = float(np.median(near[3])) if near.size else height
-    samples = DepthSamples(near[0], near[1], near[2], APART)
+    samples = DepthSamples(near[0], near[1], near[2], COLUMN_STRIDE)
     return measure_candidate(grid, samples, horizontal_plane(grid.intrinsics, up, offset))
 
 
@@ -133,7 +133,7 @@ def _covered(
 
 def _area_over(strips: F4, intrinsics: PinholeIntrinsics, plane: SupportingPlane) -> float:
     """Return the area of level surface just above the outline of a plane, m²."""
-    subset = strips[:, ::SPARSE]
+    subset = strips[:, ::AREA_STRIDE]
     above = subset[3] - plane.offset
     tops = subset[:, (above > STRIPS.same_m) & (above < STRIPS.tallest_m)]
     j, i, inv_depth, _ = tops.astype(np.float64)
@@ -141,7 +141,7 @@ def _area_over(strips: F4, intrinsics: PinholeIntrinsics, plane: SupportingPlane
     level = gravity_rotation(plane.up) @ (np.stack([x, y, np.ones(j.size)]) / inv_depth)
     over = (COS[:, None] * level[0] + SIN[:, None] * level[1] < plane.extent[:, None]).all(axis=0)
     facing = np.maximum(-level[2] * inv_depth, STRIPS.min_rise)
-    share = SPARSE * APART / (intrinsics.fx * intrinsics.fy)
+    share = AREA_STRIDE * COLUMN_STRIDE / (intrinsics.fx * intrinsics.fy)
     return float((share / (facing * inv_depth**2))[over].sum())
 
 
@@ -192,17 +192,17 @@ def _level_strips(inv_depth: F4, intrinsics: PinholeIntrinsics, up: F8) -> tuple
     across, down = np.float32(up[0] / intrinsics.fx), np.float32(up[1] / intrinsics.fy)
     ahead = up[2] - intrinsics.cx * across - intrinsics.cy * down
     level, area = np.zeros(columns, np.bool_), np.zeros(BINS)
-    strips = unset((4, inv_depth.size // APART + rows), np.float32)
+    strips = unset((4, inv_depth.size // COLUMN_STRIDE + rows), np.float32)
     n = 0
     for i in range(ARM, rows - ARM):
         start = np.float32(ahead + i * down)
         _find_level(inv_depth, i, (start, across, down), level)
-        for j in range(ARM, columns - ARM, APART):
+        for j in range(ARM, columns - ARM, COLUMN_STRIDE):
             if level[j]:
                 w, rise = inv_depth[i, j], start + across * np.float32(j)
                 strips[0, n], strips[1, n], strips[2, n], strips[3, n] = j, i, w, rise / w
                 facing = max(float(-rise), STRIPS.min_rise) * intrinsics.fx * intrinsics.fy
-                area[BINS - 1 - int(-rise / w / STRIPS.bin_m)] += APART / (facing * w * w)
+                area[BINS - 1 - int(-rise / w / STRIPS.bin_m)] += COLUMN_STRIDE / (facing * w * w)
                 n += 1
     return strips[:, :n].copy(), area
 

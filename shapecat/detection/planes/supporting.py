@@ -31,14 +31,14 @@ EDGE_CELLS = 2
 """Number of cells in which an edge is blurred."""
 MIN_BELOW = 20
 """Minimum number of samples below an edge that allow a decision."""
-SPARSE = 2
+COUNT_STRIDE = 2
 """Step between the rows and columns of the samples that show whether something is on a plane."""
-MIN_ABOVE = 20 // SPARSE**2
+MIN_ABOVE = 20 // COUNT_STRIDE**2
 """Minimum number of these on something on a plane; a small object has more."""
 
 
 def supporting_planes(
-    grid: DepthGrid, candidates: list[PlaneCandidate], tallest_m: float
+    grid: DepthGrid, candidates: list[PlaneCandidate], max_height_m: float
 ) -> list[SupportingPlane]:
     """Return the planes that are not the tops of objects, lowest first.
 
@@ -63,14 +63,14 @@ def supporting_planes(
     Parameters
     ----------
     candidates : planes, lowest first; their covered area counts as visible.
-    tallest_m : height of the tallest object, metres.
+    max_height_m : height of the tallest object, metres.
     """
     supports: list[SupportingPlane] = []
     for plane, inliers, covered_m2 in candidates:
         area_m2 = plane.area_m2 + covered_m2
         drops = [plane.offset - lower.offset for lower in supports if _overlaps(lower, plane)]
         drop = drops[-1] if drops else math.inf
-        high = tallest_m < drop < math.inf
+        high = max_height_m < drop < math.inf
         if drop < PLANES.min_drop_m:
             continue
         if supports and not high and area_m2 >= PLANES.board_m2:
@@ -81,7 +81,7 @@ def supporting_planes(
                 continue
             if area_m2 < PLANES.board_m2:
                 continue
-        if drop > tallest_m or not _is_top(grid, inliers, plane, drop, area_m2):
+        if drop > max_height_m or not _is_top(grid, inliers, plane, drop, area_m2):
             supports.append(plane)
     return supports
 
@@ -133,9 +133,9 @@ def _count_above(grid: DepthGrid, plane: SupportingPlane) -> tuple[int, int]:
     inv_depth, up, k = grid.inverse_depth, plane.up, grid.intrinsics
     across, along, _ = level_axes(up[0], up[1], up[2])
     above = inside = 0
-    for i in range(0, inv_depth.shape[0], SPARSE):
+    for i in range(0, inv_depth.shape[0], COUNT_STRIDE):
         y = (i - k.cy) / k.fy
-        for j in range(0, inv_depth.shape[1], SPARSE):
+        for j in range(0, inv_depth.shape[1], COUNT_STRIDE):
             w = inv_depth[i, j]
             if w <= 0:
                 continue

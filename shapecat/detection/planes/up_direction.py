@@ -16,7 +16,7 @@ __all__ = ["estimate_up"]
 
 MAX_DIRECTIONS = 4
 """Maximum number of directions to find: level surface and the walls of a corner make three."""
-BLOCK = 512
+NORMALS_PER_BLOCK = 512
 """Number of normals after which a direction that can no longer win is dropped."""
 GRAZING_COS = 0.1
 """Lower bound of the cosine between a normal and a ray where an area is measured: at more grazing
@@ -119,10 +119,11 @@ def _ransac_direction(normals: F4, trials: F8, best: F8) -> int:
         k = int(trials[t, 0] * n)
         direction[0], direction[1], direction[2] = normals[0, k], normals[1, k], normals[2, k]
         inliers = 0
-        for start in range(0, n, BLOCK):
+        for start in range(0, n, NORMALS_PER_BLOCK):
             if inliers + n - start <= best_count:
                 break
-            inliers += _count_facing(normals, direction, start, min(start + BLOCK, n))
+            end = min(start + NORMALS_PER_BLOCK, n)
+            inliers += _count_facing(normals, direction, start, end)
         if inliers > best_count:
             best_count = inliers
             best[0], best[1], best[2] = direction[0], direction[1], direction[2]

@@ -11,15 +11,15 @@ import numpy as np
 
 from shapecat.arrays import F4, F8, I4, Bool
 from shapecat.detection.depth_grid import DepthGrid
-from shapecat.detection.merging.segments import BAND_M, BANDS, lateral_axis
 from shapecat.detection.planes.height_map import HeightMap
+from shapecat.detection.segmentation.bands import BAND_M, BANDS, lateral_axis
 from shapecat.detection.segmentation.connectivity import SurfaceGraph
 from shapecat.detection.segmentation.settings import SEGMENTATION
 from shapecat.jit import kernel
 
 __all__ = ["split_at_width_changes"]
 
-BESIDE = SEGMENTATION.bands_beside
+BANDS_BESIDE = SEGMENTATION.bands_beside
 
 
 class Outlines(NamedTuple):
@@ -118,16 +118,18 @@ def _find_cuts(grid: DepthGrid, outlines: Outlines, p: int, side: F8, cuts: Bool
         if cells > 0:
             first, last = (band if band_count == 0 else first), band
             band_count, above = band_count + 1, above + cells
-    if band_count < 2 * BESIDE:
+    if band_count < 2 * BANDS_BESIDE:
         return False
     steps, any_cut = np.zeros(BANDS), False
     cuts[:] = False
-    for band in range(first + BESIDE, last - BESIDE + 2):
+    for band in range(first + BANDS_BESIDE, last - BANDS_BESIDE + 2):
         steps[band] = _step_at(grid, outlines, p, band, side)
     below = 0  # cells since the last cut; ``above``: from here on
-    for band in range(BANDS - BESIDE):
-        largest = steps[band] >= SEGMENTATION.both_steps_m and band >= BESIDE
-        for k in range(band - BESIDE if largest else 0, band + BESIDE + 1 if largest else 0):
+    for band in range(BANDS - BANDS_BESIDE):
+        largest = steps[band] >= SEGMENTATION.both_steps_m and band >= BANDS_BESIDE
+        for k in range(
+            band - BANDS_BESIDE if largest else 0, band + BANDS_BESIDE + 1 if largest else 0
+        ):
             largest &= steps[band] >= steps[k]
         if largest and min(below, above) >= SEGMENTATION.part_cells:
             cuts[band] = any_cut = True
@@ -143,9 +145,9 @@ def _step_at(grid: DepthGrid, outlines: Outlines, p: int, band: int, side: F8) -
     total = largest = 0.0
     for k in range(2):
         end, cells = outlines.ends[k, p], outlines.cells[k, p]
-        low, high = band - BESIDE, band + 1
+        low, high = band - BANDS_BESIDE, band + 1
         after = before = np.float32(0)
-        for k4 in range(BESIDE - 1):
+        for k4 in range(BANDS_BESIDE - 1):
             after += end[high + k4]
             before += end[low + k4]
         change = after - before
@@ -154,7 +156,7 @@ def _step_at(grid: DepthGrid, outlines: Outlines, p: int, band: int, side: F8) -
         sign = np.float32(1 if change > 0 else -1)
         # A slope continues from one of the two sides.
         slope = max(sign * _slope_of(end, low), sign * _slope_of(end, high), 0.0)
-        step = -_second(end, high, -sign) - _second(end, low, sign) - BESIDE * slope
+        step = -_second(end, high, -sign) - _second(end, low, sign) - BANDS_BESIDE * slope
         if step < SEGMENTATION.side_step_m / 2:
             continue
         narrow = band + 1 if sign > 0 else band - 3
