@@ -48,7 +48,7 @@ from shapecat.detection.planes.height_map import HeightMap, measure_heights, pac
 from shapecat.detection.planes.ransac import draw_trials
 from shapecat.detection.records import OverSegmentation, PlaneModel, Segmentation
 from shapecat.detection.segmentation.connectivity import connect_surfaces
-from shapecat.detection.segmentation.watershed import watershed
+from shapecat.detection.segmentation.watershed import SeedSplitter, watershed
 from shapecat.detection.segmentation.width_split import split_at_width_changes
 from shapecat.detection.virtual_camera import VirtualImage, top_view, virtual_image
 from shapecat.geometry import IDENTITY, inverse, unit_direction
@@ -215,11 +215,13 @@ def _find_assumed_plane(
     return assume_plane(grid, unexplained, up, settings.max_height_m)
 
 
-def oversegment(grid: DepthGrid, model: PlaneModel) -> OverSegmentation:
+def oversegment(
+    grid: DepthGrid, model: PlaneModel, *, split_seeds: SeedSplitter | None = None
+) -> OverSegmentation:
     """Split the samples above the planes wherever two objects may meet."""
     heights, up = model.heights, model.up
     graph = connect_surfaces(grid, heights)
-    labels, n = watershed(heights, graph)
+    labels, n = watershed(heights, graph, split_seeds=split_seeds)
     n = split_at_width_changes(grid, heights, graph, labels, up, n)
     segments = measure_segments(grid, heights, graph, labels, n, up)
     measure_adjacency(grid, heights, graph, labels, up, segments)

@@ -1,5 +1,7 @@
 """Watershed: segments of surface bounded by depth discontinuities and concave edges."""
 
+from collections.abc import Callable
+
 import numpy as np
 
 from shapecat.arrays import I4, U1, Bool
@@ -9,24 +11,30 @@ from shapecat.detection.segmentation.connectivity import SurfaceGraph
 from shapecat.detection.segmentation.settings import SEGMENTATION
 from shapecat.jit import kernel, unset
 
-__all__ = ["watershed"]
+__all__ = ["SeedSplitter", "watershed"]
 
 NO_EDGE = 255
 """Concave angle that no edge reaches, degrees."""
 BUCKETS = 256 // SEGMENTATION.bucket_deg
+SeedSplitter = Callable[[SurfaceGraph, I4, int], int]
+"""Splits the labels 1..n of seeds (rows, columns) in place; returns the new n."""
 LEFT, UP = 4, 8
 """Bits of links to the other two neighbours, in addition to `RIGHT` and `DOWN`."""
 
 
-def watershed(heights: HeightMap, graph: SurfaceGraph) -> tuple[I4, int]:
+def watershed(
+    heights: HeightMap, graph: SurfaceGraph, *, split_seeds: SeedSplitter | None = None
+) -> tuple[I4, int]:
     """Split the object cells into segments at depth discontinuities and concave edges.
 
     Each connected component of flat cells is a seed. A flood from the seeds, flattest cells first,
-    assigns the cells of concave edges to the segments beside them (Meyer 1991). Returns the labels
-    1..n, 0 elsewhere, (rows, columns) int16, and n.
+    assigns the cells of concave edges to the segments beside them (Meyer 1991). ``split_seeds`` may
+    split the seeds first. Returns the labels 1..n, 0 elsewhere, (rows, columns) int16, and n.
     """
     labels = np.zeros(heights.plane_id.shape, np.int16)
     n = _label_parts(heights.plane_id, graph, SEGMENTATION.edge_deg, labels, 0)
+    if split_seeds is not None:
+        n = split_seeds(graph, labels, n)
     _flood_labels(graph.links, graph.concavity, graph.spans, labels)
     return labels, _label_parts(heights.plane_id, graph, NO_EDGE, labels, n)
 
