@@ -1,6 +1,8 @@
 """Tests of tracking long recordings in batches that fit into memory."""
 
+import shutil
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pyarrow as pa
@@ -8,6 +10,8 @@ import pyarrow.parquet as pq
 import pytest
 
 from benchmarks.hours import make_tables
+from shapecat.arrays import F8
+from shapecat.completion import BoxViews, FusedBox
 from shapecat.config import TrackingSettings
 from shapecat.runs import full_boxes, tracks
 from shapecat.runs.tables.segments import group_frames
@@ -77,3 +81,39 @@ def test_full_box_from_sample_matches_all_views(
 )
 def test_row_groups_grow_with_number_of_frames(frames: int, length: int) -> None:
     assert group_frames(frames) == length
+
+
+@pytest.fixture
+def occluded(folder: Path, tmp_path: Path) -> Path:
+    """Return a copy of the tables in which every third detection is occluded."""
+    shutil.copytree(folder, tmp_path / "run")
+    path = tmp_path / "run" / "detections.parquet"
+    old = pq.ParquetFile(folder / path.name)
+    with old, pq.ParquetWriter(path, old.schema_arrow) as new:
+        for k in range(old.num_row_groups):
+            group = old.read_row_group(k)
+            at = group.schema.get_field_index("occluded")
+            third = pa.array(np.arange(len(group)) % 3 == 0)
+            new.write_table(group.set_column(at, group.schema.field(at), third))
+    return path.parent
+
+
+def test_sampled_views_keep_their_own_weights(
+    occluded: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """With those of other views, an occluder at the start would spoil the box of a whole track."""
+    fuse, weights = full_boxes.fuse_boxes, list[F8]()
+
+    def fuse_and_note(views: BoxViews, of_views: F8, *others: Any) -> FusedBox:
+        weights.append(of_views)
+        return fuse(views, of_views, *others)
+
+    monkeypatch.setattr(full_boxes, "fuse_boxes", fuse_and_note)
+    tracked(occluded)
+    whole, weights = weights, []
+    monkeypatch.setattr(full_boxes, "_MOST_VIEWS", 60)
+    tracked(occluded)
+
+    assert max(np.ptp(each) for each in whole) > 0
+    for few, each in zip(weights, whole, strict=True):
+        np.testing.assert_array_equal(few, each[full_boxes._spread(len(each))])

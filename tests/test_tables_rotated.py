@@ -509,6 +509,36 @@ def test_merged_box_is_upright_in_named_frame(tmp_path: Path) -> None:
         assert merged.size[2] < SIZE[2] + 0.21  # their heights differ by 0.2 at most
 
 
+def test_only_boxes_of_named_frames_are_transformed(tmp_path: Path) -> None:
+    """A robot may publish clouds in its base frame beside images in that of a camera."""
+    robot = Pose(
+        Rotation.from_euler("xyz", [-1.8, 0.3, 0.7]).as_matrix(), np.array([0.2, -0.4, 1.1])
+    )
+    with PerceptionTables(tmp_path, categories=CATEGORIES, model_id="m") as tables:
+        for k in range(FRAMES):
+            up = ROTATIONS[k].inv().apply(UP)
+            scene = Scene(up, (Plane(up, -0.5, OUTLINE, 0.7, 0.0),), ())
+            stamp = EPOCH + k * SECOND // 10
+            pose = Pose(ROTATIONS[k].as_matrix(), POSITIONS[k])
+            for topic, frame_id, offset in (("/cloud", "base", robot), ("/depth", "optical", None)):
+                found = Perception(topic, k, stamp, frame_id, scene, (detection_of(k, 0),), {})
+                tables.write([found], [FrameRow(stamp, pose, up, frame_from_sensor=offset)])
+    track_run(tmp_path, TrackingSettings(), CATEGORIES)
+    tracks = LabelledTracks.read(tmp_path, read_labels(tmp_path / "tracks.csv", CATEGORIES))
+
+    for visible in (True, False):
+        frames = list(read_annotation_frames(tmp_path, tracks, visible=visible))
+        assert len(frames) == 2 * FRAMES
+        for named, plain in zip(frames[::2], frames[1::2], strict=True):
+            (moved,), (box,) = named.objects, plain.objects
+            assert (named.frame_id, plain.frame_id) == ("base", "optical")
+            assert_allclose(
+                moved.center, robot.rotation @ box.center + robot.translation, atol=1e-6
+            )
+            axes = (Rotation.from_quat(each.orientation).as_matrix() for each in (moved, box))
+            assert_allclose(next(axes), robot.rotation @ next(axes), atol=1e-6)
+
+
 def test_parts_of_merged_track_become_one_object(run: Path) -> None:
     """One part may rest on the other: the lower support counts."""
     frame = next(read_labelled_frames(run, read_labels(run / "tracks.csv", CATEGORIES)))
