@@ -11,7 +11,7 @@ import pytest
 
 from benchmarks.hours import make_tables
 from shapecat.arrays import F8
-from shapecat.completion import BoxViews, FusedBox
+from shapecat.completion import BoxViews, FusedBox, fuse_boxes
 from shapecat.config import TrackingSettings
 from shapecat.runs import full_boxes, tracks
 from shapecat.runs.tables.segments import group_frames
@@ -102,11 +102,11 @@ def test_sampled_views_keep_their_own_weights(
     occluded: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """With those of other views, an occluder at the start would spoil the box of a whole track."""
-    fuse, weights = full_boxes.fuse_boxes, list[F8]()
+    weights = list[F8]()
 
     def fuse_and_note(views: BoxViews, of_views: F8, *others: Any) -> FusedBox:
         weights.append(of_views)
-        return fuse(views, of_views, *others)
+        return fuse_boxes(views, of_views, *others)
 
     monkeypatch.setattr(full_boxes, "fuse_boxes", fuse_and_note)
     tracked(occluded)
