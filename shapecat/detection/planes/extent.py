@@ -28,7 +28,7 @@ DIRECTIONS = 16
 """Sides of the convex outline of a plane."""
 ANGLES = np.arange(DIRECTIONS) * (2 * np.pi / DIRECTIONS)
 COS, SIN = np.cos(ANGLES), np.sin(ANGLES)
-NEIGHBOUR = 3
+APART = 3
 """Distance, in cells, from an inlier to the neighbours that may extend the plane."""
 
 
@@ -122,13 +122,7 @@ def _extent_of(grid: DepthGrid, plane: F8, normal: F8, ends: I4) -> F8:
     for i in range(rows):
         for side in range(2 if ends[1, i] >= 0 else 0):
             j = ends[side, i]
-            for di, dj in (
-                (0, 0),
-                (0, -NEIGHBOUR),
-                (0, NEIGHBOUR),
-                (-NEIGHBOUR, 0),
-                (NEIGHBOUR, 0),
-            ):
+            for di, dj in ((0, 0), (0, -APART), (0, APART), (-APART, 0), (APART, 0)):
                 v, u = i + di, j + dj
                 if v < 0 or u < 0 or v >= rows or u >= columns:
                     continue
