@@ -194,17 +194,34 @@ def test_wall_is_no_table_for_rotated_camera(kind: SceneKind, seed: int, quarter
     rng = np.random.default_rng(seed)
     world = make_scene(kind, rng, frames=1)
     frame, _ = render_frame(world, 0, rng=rng, sensor=KINECT)
+    rotated, up = turned(frame, inverse(world.path[0]).rotation[:, 2], quarters)
+    scene = detect(rotated, settings=DetectionSettings(), rng=np.random.default_rng(0))
+
+    assert scene.planes[0].normal @ up > 0.99
+
+
+@pytest.mark.parametrize("quarters", [0, 1, 2, 3])
+def test_board_at_grazing_angle_is_found_by_rotated_camera(quarters: int) -> None:
+    """One of four boards is just below the camera, which may be mounted in any way."""
+    rng = np.random.default_rng(3019)
+    world = make_scene("shelf", rng, frames=1)
+    frame, _ = render_frame(world, 0, rng=rng, sensor=KINECT)
+    rotated, up = turned(frame, inverse(world.path[0]).rotation[:, 2], quarters)
+    scene = detect(rotated, up=up, settings=DetectionSettings(), rng=np.random.default_rng(0))
+
+    assert len(scene.planes) == 4
+    assert scene.planes[-1].offset > -0.15
+
+
+def turned(frame: Frame, up: NDArray[Any], quarters: int) -> tuple[Frame, NDArray[Any]]:
+    """Return the frame of a camera turned about its optical axis, and the up direction there."""
     assert frame.depth is not None
     assert frame.camera is not None
     depth, camera = np.rot90(frame.depth, quarters), frame.camera
-    up = inverse(world.path[0]).rotation[:, 2]
     for _ in range(quarters):
         camera = Camera(
             camera.height, camera.width, camera.fy, camera.fx,
             camera.cy, camera.width - 1 - camera.cx,
         )  # fmt: skip
         up = np.array([up[1], -up[0], up[2]])
-    rotated = Frame("turned", 0, 0, 0, "c", depth=np.ascontiguousarray(depth), camera=camera)
-    scene = detect(rotated, settings=DetectionSettings(), rng=np.random.default_rng(0))
-
-    assert scene.planes[0].normal @ up > 0.99
+    return Frame("turned", 0, 0, 0, "c", depth=np.ascontiguousarray(depth), camera=camera), up

@@ -5,6 +5,7 @@ it, and a board just below the camera that fills a few rows of the image. But th
 samples agree to millimetres, so if up is known, only the height has to be found.
 """
 
+import math
 from collections.abc import Iterator
 
 import numpy as np
@@ -57,7 +58,8 @@ def _may_be_strips(
     """
     large = [plane.offset for plane, *_ in candidates if plane.area_m2 > PLANES.likely_m2]
     up = candidates[0].plane.up
-    if height > up[1] / (grid.intrinsics.fy * STRIPS.grazing):
+    slope = math.hypot(up[0] / grid.intrinsics.fx, up[1] / grid.intrinsics.fy)
+    if -height < slope / STRIPS.grazing:
         return all(abs(offset - height) > STRIPS.same_m for offset in large)
     below = any(-STRIPS.same_m < height - offset < PLANES.max_object_m for offset in large)
     return above > STRIPS.covers and not below
