@@ -203,12 +203,13 @@ def test_context_weights_neighbours_by_border_length() -> None:
 
 
 def test_image_border_is_where_samples_begin() -> None:
-    """A sensor may leave a strip empty; a wider gap is not a border."""
+    """A sensor may leave a straight strip of 12 % empty; a wider gap is not a border."""
     inv_depth = np.zeros((100, 200), np.float32)
-    inv_depth[3:60, 0:195] = 1
+    inv_depth[11:60, 0:178] = 1
     grid = DepthGrid(inv_depth, INTRINSICS, 1, DISCONTINUITY)
-    assert _border_lines(grid) == (3, -1, 0, 194)
-    assert _border_lines(grid._replace(inverse_depth=np.zeros_like(inv_depth))) == (-1, -1, -1, -1)
+    assert _border_lines(grid) == (11, 99, 0, 177)
+    inv_depth[11:20, 50:] = 0  # the top of an object
+    assert _border_lines(grid) == (0, 99, 0, 177)
 
 
 def test_contact_boundary_joins_adjacent_object() -> None:

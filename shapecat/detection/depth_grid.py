@@ -17,6 +17,7 @@ from shapecat.types import Camera
 
 __all__ = [
     "BORDER_SHARE",
+    "STRAIGHT_SHARE",
     "DepthGrid",
     "PinholeIntrinsics",
     "back_project",
@@ -36,6 +37,9 @@ MIN_CELLS, ENOUGH_CELLS = 20.0, 60.0
 """Fewer cells may be noise; this many are an object, however small it is."""
 BORDER_SHARE = 0.12
 """Maximum fraction of the image in a blank border; a registered Kinect leaves a tenth."""
+STRAIGHT_SHARE = 0.3
+"""Minimum fraction of a side along which a border is straight. The top of a tall object with
+nothing behind it is no border."""
 LARGEST_FACTOR = 16
 STEP_M = 0.004
 """Smallest step between two surfaces, metres. Near the camera, a slanted surface changes from cell
@@ -151,19 +155,20 @@ def smallest_object_at(grid: DepthGrid, depth_m: F4) -> F4:
 
 @kernel
 def find_borders(inv_depth: F4, band: int) -> I4:
-    """Measure the blank border on each side of the image, and the samples next to it.
+    """Measure the blank border on each side of the image.
+
+    A border is straight, and no wider than `BORDER_SHARE` of the image.
 
     Parameters
     ----------
     inv_depth : (rows, columns) 1/m.
-    band : number of lines, from the first with a sample, in which the extent is measured.
+    band : number of lines, from the first with a sample, that show whether it is straight.
 
     Returns
     -------
-    (4, 2) for top, bottom, left and right: the number of blank lines, and the extent of the samples
-    along the side, in cells; -1 for both if more than `BORDER_SHARE` of the lines are blank.
+    (4,) number of blank lines at the top, bottom, left and right; 0 without a blank border.
     """
-    borders = np.full((4, 2), -1, np.int64)
+    borders = np.zeros(4, np.int64)
     for side in range(4):
         axis, back = side // 2, side % 2 > 0
         lines, length = inv_depth.shape[axis], inv_depth.shape[1 - axis]
@@ -176,8 +181,8 @@ def find_borders(inv_depth: F4, band: int) -> I4:
                 if (inv_depth[line, n] if axis == 0 else inv_depth[n, line]) > 0:
                     first = k if high < 0 else first
                     low, high = min(low, n), max(high, n)
-        if high >= 0:
-            borders[side, 0], borders[side, 1] = first, high - low
+        if high - low > STRAIGHT_SHARE * length:
+            borders[side] = first
     return borders
 
 

@@ -88,8 +88,7 @@ class Limits(NamedTuple):
 
     Attributes
     ----------
-    top, bottom, left, right : first and last row and column with samples; -1 if not at the border
-        of the image.
+    top, bottom, left, right : first and last row and column inside the blank borders of the image.
     inverse_depth : a cell with less is at the range limit, 1/m.
     """
 
@@ -101,16 +100,10 @@ class Limits(NamedTuple):
 
 
 def _border_lines(grid: DepthGrid) -> tuple[int, int, int, int]:
-    """Return first and last row, first and last column with samples; -1 if not at the border."""
+    """Return first and last row, first and last column inside the blank borders of the image."""
     rows, columns = grid.inverse_depth.shape
-    top, bottom, left, right = find_borders(grid.inverse_depth, 1)[:, 0].tolist()
-    tall, wide = CLEANUP.border_share * rows, CLEANUP.border_share * columns
-    return (
-        top if top <= tall else -1,
-        rows - 1 - bottom if 0 <= bottom <= tall else -1,
-        left if left <= wide else -1,
-        columns - 1 - right if 0 <= right <= wide else -1,
-    )
+    top, bottom, left, right = find_borders(grid.inverse_depth, 1).tolist()
+    return top, rows - 1 - bottom, left, columns - 1 - right
 
 
 @kernel

@@ -29,8 +29,6 @@ class CleanupSettings(NamedTuple):
     tiny_share: float = 0.5
     """Segments with a smaller fraction of the cells of the smallest object are rejected here.
     Dropped only at the end, they would prevent the filling of the holes around them."""
-    border_share: float = 0.08
-    """Maximum fraction of the image that sensors leave blank at a border."""
     around_cells: int = 4
     """Distance from an object, in cells, at which the roughness of its plane is measured."""
     large_share: float = 0.02

@@ -7,7 +7,7 @@ import numpy as np
 
 from shapecat.arrays import F4, I4, U4, Bool, Records, Row, freeze
 from shapecat.config import DetectionSettings
-from shapecat.detection.depth_grid import DepthGrid, find_borders
+from shapecat.detection.depth_grid import STRAIGHT_SHARE, DepthGrid, find_borders
 from shapecat.detection.output.measurements import ObjectMeasurements
 from shapecat.detection.output.settings import OUTPUT
 from shapecat.detection.planes.extent import outline_corners
@@ -134,10 +134,8 @@ def _at_image_border(grid: DepthGrid, segmentation: Segmentation, _: Pose) -> Bo
     boxes, band = segmentation.measured.boxes, max(1, round(2 / grid.factor))
     shape = grid.inverse_depth.shape
     truncated = np.zeros(len(boxes.low), bool)
-    for side, (blank, extent) in enumerate(find_borders(grid.inverse_depth, band).tolist()):
-        axis = side // 2
-        # The top of a tall object with nothing behind it is not a border.
-        first = band + (blank if extent > OUTPUT.straight_share * shape[1 - axis] else 0)
+    for side, blank in enumerate(find_borders(grid.inverse_depth, band).tolist()):
+        axis, first = side // 2, band + blank
         if side % 2 == 0:
             truncated |= boxes.low[:, axis] < first
         else:
@@ -169,7 +167,7 @@ def _at_view_border(grid: DepthGrid, segmentation: Segmentation, sensor_from_vie
     for axis in range(2):
         for along in (slopes[:, axis], -slopes[:, axis]):
             at_border = along > along.max() - OUTPUT.border_cells / intrinsics.fx
-            if np.ptp(slopes[at_border, 1 - axis]) > OUTPUT.straight_share * spans[1 - axis]:
+            if np.ptp(slopes[at_border, 1 - axis]) > STRAIGHT_SHARE * spans[1 - axis]:
                 result[segmentation.labels[i[at_border], j[at_border]]] = True
     return result[1:]
 

@@ -29,8 +29,6 @@ class OutputSettings(NamedTuple):
     """Largest label of a cluster of occluded points; this bounds the time."""
     border_cells: float = 2.5
     """Width of the border of a cloud, in cells."""
-    straight_share: float = 0.3
-    """Minimum fraction of a side along which such a border is straight."""
     forward_cos: float = 0.2
     """Approximate minimum cosine to the optical axis of a point in front of a camera."""
     min_cells_at_limit: int = 3
