@@ -46,16 +46,18 @@ def supporting_planes(
     plane under its middle. The first rule that applies decides:
 
     1. Drop a plane less than 6 cm high.
-    2. Keep the lowest plane, one with no other below it, or one higher than the tallest object.
+    2. Keep the lowest plane, or one higher than the tallest object.
     3. Keep a plane around which the surface rises, as around the floor of a bin, unless it is
        larger than 0.25 m2.
     4. Drop a plane of less than 0.03 m2.
-    5. Drop a plane with a wall below its front edge, as below the top of a box; but keep one of at
-       least 0.25 m2 with something on it. Bare, it is the tops of boxes with narrow gaps.
-    6. Keep any other plane of at least 0.25 m2.
-    7. If little is visible below its front edge, drop a plane of less than 0.1 m2, or one right
+    5. Keep a plane with no other below it.
+    6. Drop a plane with a wall below its front edge, as below the top of a box; but keep one of at
+       least 0.25 m2 with something on it. With nothing on it, such a plane consists of the tops of
+       boxes with narrow gaps between them.
+    7. Keep any other plane of at least 0.25 m2.
+    8. If little is visible below its front edge, drop a plane of less than 0.1 m2, or one right
        below the camera with nothing on it, such as the top of a carton.
-    8. Keep all others.
+    9. Keep all others.
 
     Above another plane, the largest connected part of a plane counts: the tops of equal boxes are
     many small parts.
@@ -89,7 +91,7 @@ def supporting_planes(
 def _is_top(
     grid: DepthGrid, inliers: DepthSamples, plane: SupportingPlane, drop: float, area_m2: float
 ) -> bool:
-    """Return whether a plane is the top of an object or of several, by rules 5 to 8."""
+    """Return whether a plane is the top of an object or of several, by rules 6 to 9."""
     furniture = area_m2 >= PLANES.furniture_m2
     on_wall, beyond = _count_below_edge(grid, inliers, plane, drop)
     if on_wall + beyond >= MIN_BELOW:
