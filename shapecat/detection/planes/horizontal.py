@@ -33,7 +33,8 @@ from shapecat.jit import kernel
 
 __all__ = ["find_horizontal_planes"]
 
-MAX_PLANES = 10
+MAX_PEAKS = 10
+"""Maximum number of peaks of the height histogram at which a plane is fitted."""
 MIN_SAMPLES = 44
 """Minimum number of points on a plane; noise alone gives a tenth of that."""
 _PEAK_BINS = 5
@@ -115,7 +116,7 @@ def fit_horizontal_planes(
     planes: list[F8] = []
     rest = np.stack([samples.j, samples.i, samples.inverse_depth, heights])
     # (3) one plane candidate for each peak in height
-    for _ in range(MAX_PLANES):
+    for _ in range(MAX_PEAKS):
         if rest.shape[1] < MIN_SAMPLES:
             break
         off_peak = abs(rest[3] - _histogram_peak(rest[3])) > _PEAK_BINS / 2 * PLANES.bin_m
