@@ -36,7 +36,8 @@ class DetectionSettings:
     """Number of consecutive depth images that are fused before detection, including the current one
     (thesis 4.2); 1 turns fusion off."""
     max_height_m: float = 0.6
-    """Points higher than this above a plane do not belong to an object on it."""
+    """Points higher than this above a plane do not belong to an object on it. Objects must be 2 cm
+    lower: what comes nearer may continue above."""
     max_size_m: float = 0.6
     """Segments larger than this are treated as walls or furniture."""
     min_points: int = 60
@@ -46,7 +47,7 @@ class DetectionSettings:
         """Reject numbers that are out of range."""
         _check_range("detection.max_range_m", self.max_range_m, 0.01, 1000.0)
         _check_range("detection.fuse_frames", self.fuse_frames, 1, 30)
-        _check_least("detection.max_height_m", self.max_height_m, 0.001)
+        _check_least("detection.max_height_m", self.max_height_m, 0.025)
         _check_least("detection.max_size_m", self.max_size_m, 0.001)
         _check_least("detection.min_points", self.min_points, 1)
 

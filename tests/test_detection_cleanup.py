@@ -125,6 +125,16 @@ def test_segment_wider_than_objects_is_rejected() -> None:
         assert find_background(segments, features, grid, settings, ALWAYS)[1] == expected
 
 
+def test_segment_near_maximum_height_is_rejected() -> None:
+    """The reference says that objects must be 2 cm lower."""
+    features = _features(400)
+    features["segment"]["top_m"] = 0.1
+    grid = DepthGrid(np.zeros((40, 40), np.float32), INTRINSICS, 1, DISCONTINUITY)
+    for highest, expected in ((0.119, True), (0.121, False)):
+        settings = DetectionSettings(max_height_m=highest)
+        assert find_background(_blank(2), features, grid, settings, ALWAYS)[1] == expected
+
+
 @pytest.mark.parametrize(("cells", "border"), [(400, 0.5), (31, 0.5), (400, 0.3)])
 def test_large_segment_cut_by_border_is_rejected_as_arm(cells: int, border: float) -> None:
     features = _features(cells)

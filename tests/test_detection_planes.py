@@ -192,7 +192,7 @@ def test_given_up_is_kept_without_visible_plane() -> None:
 
 
 def test_no_plane_is_assumed_for_few_samples_or_above_camera() -> None:
-    """A `detection.max_height_m` of nearly 0 must not fail."""
+    """A maximum height of nearly 0 must not fail."""
     grid = DepthGrid(
         np.ones((60, 80), np.float32), PinholeIntrinsics(75.0, 75.0, 39.5, 29.5), 8, DISCONTINUITY
     )
