@@ -152,6 +152,17 @@ def test_upside_down_camera_is_accepted_for_bare_table() -> None:
     assert up @ [0, -UP[1], UP[2]] > np.cos(np.radians(2))
 
 
+def test_up_of_camera_on_high_ceiling_is_found() -> None:
+    """Surface more than 3.2 m below the camera did not count, and a small wall beside it won."""
+    floor, wall = block(0, 0, -0.03, (6.0, 4.0, 0.03)), block(2, 0, 0, (0.1, 4.0, 2.0))
+    grid = grid_of([floor, wall], distance_m=7.0)
+    trials = draw_trials(np.random.default_rng(0))
+    up = estimate_up(
+        orient_points(grid), grid.intrinsics, np.zeros(3), trials, UP_SETTINGS.roll_penalty
+    )
+    assert up @ UP > np.cos(np.radians(0.5))
+
+
 def test_assumed_plane_lies_just_below_unexplained_samples() -> None:
     """They are 0.9 to 0.7 m below a tilted camera; far ones do not count."""
     up = np.array([0.36, -0.48, -0.8])

@@ -35,7 +35,8 @@ AREA_STRIDE = 4
 ARM = 2
 """Distance, in cells, to the neighbours that show whether a sample is on level surface."""
 BINS = 600
-"""Number of bins of `StripSettings.bin_m`: no table is more than 3 m below the camera."""
+"""Number of bins of `StripSettings.bin_m`. Farther below the camera than these 3 m, noise blurs the
+height of a strip."""
 
 
 def may_have_strips(

@@ -21,8 +21,6 @@ NORMALS_PER_BLOCK = 512
 GRAZING_COS = 0.1
 """Lower bound of the cosine between a normal and a ray where an area is measured: at more grazing
 angles, noise decides."""
-BINS = 80
-"""Number of bins of `UpSettings.level_bin_m`: the floor is no more than 3 m below the camera."""
 
 
 @kernel
@@ -52,12 +50,15 @@ def estimate_up(
     directions = _directions(normals, min_count, trials)
     if len(directions) == 0:
         return np.zeros(3)
-    hypotheses = _hypotheses(directions, 0.0 if has_hint else UP.corner_cos)
+    hypotheses, bins = (
+        _hypotheses(directions, 0.0 if has_hint else UP.corner_cos),
+        _bins_of(surface),
+    )
     best, best_score = 0, -1.0
     for k in range(len(hypotheses)):
-        score = _score(surface, hypotheses[k], 0.0 if has_hint else roll_penalty)
+        score = _score(surface, hypotheses[k], bins, 0.0 if has_hint else roll_penalty)
         best, best_score = (k, score) if score > best_score else (best, best_score)
-    up: F8 = _refined(points, surface, intrinsics, hypotheses[best])
+    up: F8 = _refined(points, surface, intrinsics, hypotheses[best], bins)
     return up
 
 
@@ -80,6 +81,16 @@ def _every_second(points: OrientedPoints, intrinsics: PinholeIntrinsics) -> F4:
         surface[7, n] = cell * z**3 / max(distance, GRAZING_COS * z, 1e-9)
         n += normals[2, k] != 0
     return surface[:, :n].copy()
+
+
+@kernel(inline=True)
+def _bins_of(surface: F4) -> int:
+    """Return the number of bins of `UpSettings.level_bin_m` that hold all points."""
+    farthest2 = 0.0
+    for k in range(surface.shape[1]):
+        x, y, z = surface[3, k], surface[4, k], surface[5, k]
+        farthest2 = max(farthest2, x * x + y * y + z * z)
+    return int(math.sqrt(farthest2) / UP.level_bin_m) + 1
 
 
 @kernel(inline=True)
@@ -180,9 +191,9 @@ def _hypotheses(directions: F8, corner_cos: float) -> F8:
 
 
 @kernel(inline=True)
-def _score(surface: F4, direction: F8, roll_penalty: float) -> float:
+def _score(surface: F4, direction: F8, bins: int, roll_penalty: float) -> float:
     """Return the score of a direction: the weight of large levels, adjusted as in `estimate_up`."""
-    count, areas, facing, total = _count_levels(surface, direction)
+    count, areas, facing, total = _count_levels(surface, direction, bins)
     level, squares, area = _large_levels(count, areas, UP.min_share * total)
     if level == 0:
         return 0.0
@@ -223,35 +234,35 @@ def _large_levels(count: F8, areas: F8, min_weight: float) -> tuple[float, float
 
 
 @kernel(inner=True)
-def _count_levels(surface: F4, direction: F8) -> tuple[F8, F8, float, float]:
+def _count_levels(surface: F4, direction: F8, bins: int) -> tuple[F8, F8, float, float]:
     """Sum the weights of the points that face a direction, by their height below the sensor.
 
-    Returns the weight and the area, m2, in each bin, (BINS,) each, the sum of the weights over the
+    Returns the weight and the area, m2, in each bin, (bins,) each, the sum of the weights over the
     bins, and the weight of all points.
     """
     x, y, z = np.float32(direction[0]), np.float32(direction[1]), np.float32(direction[2])
     nx, ny, nz, weights = surface[0], surface[1], surface[2], surface[6]
     px, py, pz = surface[3], surface[4], surface[5]
-    bins, scale = np.zeros(nx.size, np.int32), np.float32(-1 / UP.level_bin_m)
-    min_cos, other_bin = np.float32(UP.facing_cos), np.int32(BINS)
+    bin_of, scale = np.zeros(nx.size, np.int32), np.float32(-1 / UP.level_bin_m)
+    min_cos, other_bin = np.float32(UP.facing_cos), np.int32(bins)
     for k in range(nx.size):  # this vectorises
         below = scale * (px[k] * x + py[k] * y + pz[k] * z)
         faces = nx[k] * x + ny[k] * y + nz[k] * z > min_cos
-        bins[k] = np.int32(below) if faces & (below >= 0) & (below < BINS) else other_bin
-    count, areas = np.zeros(BINS + 1), np.zeros(BINS + 1)  # the last bin is for the other points
+        bin_of[k] = np.int32(below) if faces & (below >= 0) & (below < other_bin) else other_bin
+    count, areas = np.zeros(bins + 1), np.zeros(bins + 1)  # the last bin is for the other points
     for k in range(nx.size):
-        count[bins[k]] += weights[k]
-        areas[bins[k]] += surface[7, k]
-    facing = np.sum(count[:BINS])
-    return count[:BINS], areas[:BINS], facing, facing + count[BINS]
+        count[bin_of[k]] += weights[k]
+        areas[bin_of[k]] += surface[7, k]
+    facing = np.sum(count[:bins])
+    return count[:bins], areas[:bins], facing, facing + count[bins]
 
 
 @kernel(inline=True)
 def _refined(
-    points: OrientedPoints, surface: F4, intrinsics: PinholeIntrinsics, direction: F8
+    points: OrientedPoints, surface: F4, intrinsics: PinholeIntrinsics, direction: F8, bins: int
 ) -> F8:
     """Return the refined normal (3,) of the largest plane that faces ``direction``."""
-    count, _, _, _ = _count_levels(surface, direction)
+    count, _, _, _ = _count_levels(surface, direction, bins)
     plane = horizontal_plane(intrinsics, direction, -(np.argmax(count) + 0.5) * UP.level_bin_m)
     samples, _ = level_samples(points, direction)
     for multiple in (4, 3, 2, 1, 1):
