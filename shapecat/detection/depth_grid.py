@@ -33,8 +33,10 @@ CELL_M = 0.0035
 """Target size of a cell, metres: small against the smallest object, larger than the noise."""
 SMALL_M2 = 9e-4
 """Visible area of the smallest object, m²."""
-MIN_CELLS, ENOUGH_CELLS = 20.0, 60.0
-"""Fewer cells may be noise; this many are an object, however small it is."""
+MIN_CELLS = 20.0
+"""Fewer cells may be noise."""
+ENOUGH_CELLS = 60.0
+"""This many cells are an object, however small it is."""
 BORDER_SHARE = 0.12
 """Maximum fraction of the image in a blank border; a registered Kinect leaves a tenth."""
 STRAIGHT_SHARE = 0.3

@@ -207,7 +207,7 @@ def _find_assumed_plane(
     """Assume a plane below samples that neither planes nor walls explain; None if they are few."""
     unexplained = find_unexplained(grid, heights.plane_id)
     if unexplained is not None:
-        plane_id = heights.plane_id.copy()  # low-profile objects are found before the final walls
+        plane_id = heights.plane_id.copy()  # walls are removed only after the low-profile search
         walls = remove_walls(grid, plane_id, up, settings.max_size_m, trials)
         unexplained = find_unexplained(grid, plane_id.view(np.uint8) | walls)
     if unexplained is None:

@@ -119,9 +119,9 @@ def _count_sides(
 ) -> None:
     """Count the sides of holes by label, (n, labels, 3), and in ``total`` (n,), and their cells.
 
-    A side next to cells without depth counts for the label beyond them, and these cells add to
-    ``area`` (n,). If a hole is not enclosed, its total is so large that no label has a sufficient
-    fraction.
+    Cells without depth beside a hole count as part of its ``area`` (n,), and the label behind them
+    as its neighbour. The total of a hole that is not enclosed is made so large that no label has a
+    sufficient fraction of it.
     """
     inv_depth, jump = grid.inverse_depth, grid.discontinuity
     for i in range(len(spans)):

@@ -21,8 +21,8 @@ class LowProfileSettings(NamedTuple):
     """Minimum rise as a fraction of the plane's change per cell: at a grazing angle, slightly
     displaced samples seem to rise."""
     grown: float = 0.95
-    """A part replaces the objects found within it if its rise per side exceeds this fraction of the
-    largest of theirs: an object together with depth error rises less."""
+    """A part replaces the objects within it if its mean rise is more than this fraction of their
+    largest one. A part that consists of an object and depth error has a smaller one."""
     side: float = 0.004
     """Minimum rise over two cells on the side of an object, 1/m."""
     slope: float = 0.0016
@@ -59,7 +59,8 @@ class OutlineSettings(NamedTuple):
     plane.
     """
     chance: float = 16
-    """Extra mean rise of an outline, times its number of sides: error seldom rises all around."""
+    """Short outlines need more evidence: the required mean rise is multiplied by
+    1 + ``chance`` / sides."""
     inward: int = 2
     """Distance from the outline, in cells, at which its inside is measured."""
     min_sides: int = 30

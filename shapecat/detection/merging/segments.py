@@ -58,8 +58,12 @@ SEGMENT = np.dtype(
     align=True,
 )
 """The statistics of a segment."""
-_MINIMA, _MAXIMA, _FIELDS = 2, 4, SEGMENT.itemsize // 4
-"""The indices at which its minima and its maxima end, and the number of its fields."""
+_MINIMA = 2
+"""The index at which its minima end."""
+_MAXIMA = 4
+"""The index at which its maxima end."""
+_FIELDS = SEGMENT.itemsize // 4
+"""The number of its fields."""
 PAIR = np.dtype(
     [
         ("contact", "f4"),  # linked neighbours

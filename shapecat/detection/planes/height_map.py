@@ -25,8 +25,9 @@ __all__ = [
 ]
 
 MIN_HEIGHT_M = 0.004
-"""Minimum height of an object's sample, metres; `HEIGHT_NOISE` times the squared depth is added."""
+"""Minimum height of an object's sample at a depth of 0, metres."""
 HEIGHT_NOISE = 0.0025
+"""Increase of that height, metres, at a depth of 1 m; it grows with the squared depth."""
 FRINGE = 0.6
 """Next to an object, samples above this fraction of the minimum height belong to it. Elsewhere,
 half of such samples are noise of the plane."""

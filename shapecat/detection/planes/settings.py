@@ -31,7 +31,8 @@ class UpSettings(NamedTuple):
     frontal_penalty: float = 0.6
     """Fraction of the score that a direction along the optical axis loses: it is that of a wall."""
     roll_penalty: float = 4.0
-    """Penalty on directions that imply a camera on its side or upside down: a fifth remains."""
+    """The score of a direction that implies a camera on its side or upside down is divided by 1
+    plus this."""
     frontal_sin2: float = 0.03
     """Squared sine of the angle to the optical axis below which a direction implies no roll."""
     half_weight_m: float = 1.5

@@ -149,11 +149,17 @@ def _area_over(strips: F4, intrinsics: PinholeIntrinsics, plane: SupportingPlane
 
 
 def _peaks(amount: F8, threshold: float) -> Iterator[tuple[float, float]]:
-    """Find the heights of level surface with next to nothing below it.
+    """Find the peaks of level surface that have next to no surface below them.
 
-    ``amount`` (BINS,) is level surface by height, the lowest first; a peak and the two bins beside
-    it hold more than ``threshold``. Yields the heights above the sensor, metres, ascending; and the
-    amount just above each, relative to that of the peak: the tops of objects that cover it.
+    Parameters
+    ----------
+    amount : (BINS,) level surface by height, the lowest first.
+    threshold : minimum amount of a peak together with the two bins beside it.
+
+    Yields
+    ------
+    Height of a peak above the sensor, metres, ascending; and the amount just above it, relative to
+    that of the peak. There are the tops of the objects that cover a plane.
     """
     total = amount[:-2] + amount[1:-1] + amount[2:]
     peaks = (total > threshold) & (amount[1:-1] >= amount[:-2]) & (amount[1:-1] >= amount[2:])

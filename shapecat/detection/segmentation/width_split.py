@@ -27,8 +27,9 @@ class Outlines(NamedTuple):
 
     Attributes
     ----------
-    ends : (2, n + 1, BANDS) float32 metres: the smallest position along `lateral_axis`, and minus
-        the largest, so that both grow where a segment narrows; infinite in a band without cells.
+    ends : (2, n + 1, BANDS) float32 metres, the ends of the range along `lateral_axis`: the
+        smallest position, and the largest times -1. Both grow where a segment narrows. They are
+        infinite in a band without cells.
     cells : (2, n + 1, BANDS) int32 flat indices of the cells at these ends.
     counts : (n + 1, BANDS) int32 the number of cells.
     """
