@@ -17,12 +17,14 @@ FISHEYE_MODELS = ("equidistant", "fisheye", "kannala_brandt")
 LENS_MODELS = ("plumb_bob", "rational_polynomial", *FISHEYE_MODELS)
 """The supported lens models of OpenCV's calibration."""
 
-_ROUNDS, _ENOUGH_PX = 30, 1e-4
-"""Maximum number of iterations, needed near the edge of lenses of 120 degrees, and the error that
-ends them."""
-_WRONG_PX, _LEAST_SHARE = 0.1, 0.3
-"""Pixels with a larger error see no ray: they are outside the round image of a wide lens. If fewer
-pixels than this fraction see one, the coefficients are not those of a lens."""
+_ROUNDS = 30
+"""Maximum number of iterations; it is needed near the edge of lenses of 120 degrees."""
+_ENOUGH_PX = 1e-4
+"""Error at which the iterations end."""
+_WRONG_PX = 0.1
+"""Pixels with a larger error see no ray: they are outside the round image of a wide lens."""
+_LEAST_SHARE = 0.3
+"""If fewer pixels than this fraction see a ray, the coefficients are not those of a lens."""
 
 
 def distort(rays: F8, model: str, coefficients: Sequence[float]) -> F8:

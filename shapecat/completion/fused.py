@@ -13,11 +13,16 @@ __all__ = ["BoxViews", "FusedBox", "FusedBoxes", "fuse_boxes"]
 
 _STILL_M = 0.05
 """While the centre moves less than this, the object stands still."""
-_TURNED_DEG, _ROUND, _STEADY = 20.0, 0.2, 0.7
-"""Smallest turn of an object that counts; elongation below which no side is the longer one; length
-of the mean of unit vectors that agree."""
-_NEIGHBOURS, _TRIED = 2, 16
-"""Views before and after a view that must show the same yaw; yaws that are tried."""
+_TURNED_DEG = 20.0
+"""Smallest turn of an object that counts, degrees."""
+_ROUND = 0.2
+"""Elongation below which no side is the longer one."""
+_STEADY = 0.7
+"""Minimum length of the mean of unit vectors that agree."""
+_NEIGHBOURS = 2
+"""Number of views before a view, and after it, that must show the same yaw."""
+_TRIED = 16
+"""Maximum number of views whose yaw is tried."""
 _NARROWEST = 0.5
 """Minimum width of the overlaid outline, as a fraction of the narrowest view."""
 _UNSEEN = 0.05

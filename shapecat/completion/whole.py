@@ -26,17 +26,20 @@ ENOUGH_POINTS = 256
 
 _TOP = 0.98
 """Fraction of the points below the top; the others count as noise."""
-_NOISY_M, _FLAT = 0.004, 1 / 3
-"""Largest height by which noise lifts points of a flat top, metres; fraction of the points that
-make a face flat."""
+_NOISY_M = 0.004
+"""Largest height by which noise lifts points of a flat top, metres."""
+_FLAT = 1 / 3
+"""Fraction of the points that make a face flat."""
 _HANDLE = 0.06
 """Minimum length by which a handle sticks out of a cup's oval, as a fraction of the radius."""
 _EDGEWISE = -0.2
 """Cosine of the angle to the sensor above which an outline is visible: just past edge-on."""
 _THINNEST_M = 0.005
 """Minimum length of a box: a face that the sensor sees straight on shows no thickness."""
-_NOISE_M, _GUESS = 0.006, 0.35
-"""Standard deviation of a visible length; that of the guessed part, as a fraction of it."""
+_NOISE_M = 0.006
+"""Standard deviation of a visible length, metres."""
+_GUESS = 0.35
+"""Standard deviation of the guessed part of a length, as a fraction of this part."""
 _ANGULAR, _HANDLED = "box", "cup"
 _CIRCULAR = 1e3
 

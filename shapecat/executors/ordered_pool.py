@@ -23,10 +23,12 @@ _Result = TypeVar("_Result")
 
 _ITEMS_BEFORE_START = 1
 """Items processed here before other processes are started: a short run needs none."""
-_SENT_AHEAD, _MOST_PER_PROCESS = 1, 3
-"""Items sent to a busy process in advance; and all that a process is given: the one it works on,
-one sent in advance, and one that waits here. A thread sends the waiting one as soon as the process
-finishes another, even while this process works."""
+_SENT_AHEAD = 1
+"""Items sent to a busy process in advance."""
+_MOST_PER_PROCESS = 3
+"""All items that a process is given: the one it works on, one sent in advance, and one that waits
+here. A thread sends the waiting one as soon as the process finishes another, even while this
+process works."""
 _MOST_PENDING = 8
 """At most this many items are in progress, or wait for the result of an earlier one."""
 _SWITCH_S = 5e-4

@@ -19,8 +19,10 @@ __all__ = ["add_categories"]
 _RIDGE = 1e-2
 """Strength of the L2 regularisation, per view."""
 _FOLDS = 4
-_STEPS, _FEW_STEPS = 150, 40
-"""Iterations of the minimiser: from zero, and from the solution for all folds."""
+_STEPS = 150
+"""Iterations of the minimiser from zero."""
+_FEW_STEPS = 40
+"""Iterations of the minimiser from the solution for all folds."""
 _LOST = 0.006
 """Fraction of the correctly categorized known views that new categories may take over."""
 _LARGEST_SHIFT = 2.0

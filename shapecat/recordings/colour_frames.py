@@ -30,20 +30,26 @@ __all__ = ["KnownImages", "frames_with_colour"]
 
 _HELD_FRAMES = 8
 """At most this many frames wait for a later colour image."""
-_KEPT_IMAGES, _BUFFERED_BYTES = 64, 96 << 20
-"""Limits on the colour images kept for later frames, which may be logged up to a second after an
-image of 60 Hz; two are always kept."""
+_KEPT_IMAGES = 64
+"""Maximum number of colour images kept for later frames. A frame may be logged a second after its
+image, and cameras give up to 60 images per second."""
+_BUFFERED_BYTES = 96 << 20
+"""Maximum size of these images together; two are kept in any case."""
 _STAMP_BYTES = 12
 """The first bytes of a ROS message hold its stamp, which a comparison of calibrations ignores."""
 _PATIENCE_NS = 500_000_000
 """A frame waits no longer than this for a colour image, in log time."""
 _USUAL_PERIOD_NS = 100_000_000
 """Image period assumed if neither stamps nor count and duration give one."""
-_NEAR, _EQUAL = 0.01, 1e-6
-"""Intrinsics that differ by less than these fractions of the image width are similar, or equal."""
-_STRAIGHT_PX, _STEPS = 2.0, 9
+_NEAR = 0.01
+"""Intrinsics that differ by less than this fraction of the image width are similar."""
+_EQUAL = 1e-6
+"""Intrinsics that differ by less than this fraction of the image width are equal."""
+_STRAIGHT_PX = 2.0
 """A lens that moves no pixel of a grid farther than this leaves an image registered. Depth images
 with less distortion are likewise treated as those of a pinhole camera."""
+_STEPS = 9
+"""Rows and columns of that grid."""
 
 KnownImages: TypeAlias = Callable[[str, int], int | None] | None
 """Returns the log time (ns) of a frame's colour image, given the frame's topic and number; None if

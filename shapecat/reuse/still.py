@@ -9,8 +9,10 @@ from shapecat.types import Frame, Pose
 
 __all__ = ["shows_the_same"]
 
-_MOVED_M, _TURNED_DEG = 0.003, 0.15
-"""Poses that differ by no more count as equal: the difference is noise."""
+_MOVED_M = 0.003
+"""Largest distance between two poses that count as equal, metres: it is noise."""
+_TURNED_DEG = 0.15
+"""Largest angle between two such poses, degrees."""
 _STRIDE = 2
 """Step between the pixels that are compared."""
 _SQUARE = 3

@@ -25,16 +25,22 @@ __all__ = ["KeyView", "ObjectView", "Repeat", "find_repeats", "reused", "view_ob
 
 _PLACE_M = 0.015
 """Largest shift of the visible centre of an object at rest, between similar views, metres."""
-_TURN_DEG, _FARTHER = 6.0, 0.05
-"""Largest differences of similar views: in direction, degrees, and in distance, as a fraction."""
-_SIZE_M, _HEIGHT_M, _UP_DEG = 0.02, 0.01, 2.0
-"""Largest changes due to noise, of the box size and the height above the support, metres, and of
-up, degrees."""
+_TURN_DEG = 6.0
+"""Largest angle between the directions of similar views, degrees."""
+_FARTHER = 0.05
+"""Largest difference between the distances of similar views, as a fraction."""
+_SIZE_M = 0.02
+"""Largest change of the box size due to noise, metres."""
+_HEIGHT_M = 0.01
+"""Largest change of the height above the support due to noise, metres."""
+_UP_DEG = 2.0
+"""Largest change of up due to noise, degrees."""
 _AREA = 0.25
 """Largest change of the number of pixels due to noise, at the same distance, as a fraction."""
-_AGREE, _BIAS = 0.95, 0.002
-"""Minimum fraction of the points of either view that must agree with the other view; largest mean
-difference of their inverse depths, 1/m: 2 mm at 1 m."""
+_AGREE = 0.95
+"""Minimum fraction of the points of either view that must agree with the other view."""
+_BIAS = 0.002
+"""Largest mean difference of their inverse depths, 1/m: 2 mm at 1 m."""
 _TRIES = 3
 """Number of earlier views to compare point by point, the newest first: masks may flicker."""
 

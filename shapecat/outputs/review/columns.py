@@ -16,8 +16,10 @@ __all__ = ["At", "Columns", "Drawing", "curve"]
 At = tuple[int, int]
 """Stamp in nanoseconds, and frame number."""
 
-_ROWS, _NUMBERS = 256, 1 << 17
-"""An entity is written when it holds this many rows, or this many numbers in them."""
+_ROWS = 256
+"""An entity is written when it holds this many rows."""
+_NUMBERS = 1 << 17
+"""It is written earlier if its rows hold this many numbers."""
 
 
 class Drawing(NamedTuple):

@@ -11,8 +11,10 @@ from shapecat.outputs.review.shapes import PATHS
 
 __all__ = ["Paths"]
 
-_STEP_M, _POINTS = 0.015, 500
-"""Distance at which a position is added to a path, and number of positions kept."""
+_STEP_M = 0.015
+"""Distance from the last position of a path at which another is added, metres."""
+_POINTS = 500
+"""Maximum number of positions of a path; the oldest are dropped."""
 
 
 @dataclass

@@ -14,8 +14,10 @@ from shapecat.types import Frame, LabelledFrame
 
 __all__ = ["ReviewFrame", "choose_scenes", "with_clouds"]
 
-_SOON_NS, _LATE_NS = 90_000_000, 240_000_000
-"""Shortest time between two drawn scenes, and longest time between scenes that differ."""
+_SOON_NS = 90_000_000
+"""Shortest time between two drawn scenes."""
+_LATE_NS = 240_000_000
+"""Longest time between two drawn scenes, unless one only repeats the other."""
 _STILL_M = 0.015
 """After a motion of this size, the scene is drawn as soon as allowed."""
 

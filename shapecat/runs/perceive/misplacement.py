@@ -18,13 +18,18 @@ from shapecat.runs.tables.reading import (
 
 __all__ = ["explain_misplacement"]
 
-_APART_S, _GAP_S = 0.3, 2.0
-"""Time between the frames that are compared: a slow camera must have moved, but sees the same."""
+_APART_S = 0.3
+"""Minimum time between two frames that are compared: even a slow camera must have moved."""
+_GAP_S = 2.0
+"""Maximum time between them: the camera must see the same objects."""
 _MOVED_M = 0.03
 """The camera has moved if objects have moved farther than this relative to it."""
 _WORSE = 1.5
 """Poses are worse than none if objects move this many times as far as relative to the camera."""
-_MIN_MOTIONS, _WORSE_SHARE = 5, 0.7
+_MIN_MOTIONS = 5
+"""Minimum number of comparisons on which a warning is based."""
+_WORSE_SHARE = 0.7
+"""Minimum fraction of them in which poses are worse than none."""
 
 
 class _Centers(NamedTuple):

@@ -11,9 +11,10 @@ from shapecat.runs.tables.reading import first_stamp, numbers, numbers_or_nan, r
 
 __all__ = ["explain_jumps"]
 
-_JUMP_M, _JUMP_M_S = 0.1, 2.0
-"""Smallest distance and speed of a jump: the tracker follows objects over shorter distances, and
-cameras of robots indoors are slower."""
+_JUMP_M = 0.1
+"""Minimum distance of a jump: the tracker follows objects over shorter ones."""
+_JUMP_M_S = 2.0
+"""Minimum speed of a jump: cameras of robots indoors are slower."""
 _SUDDEN = 5
 """A jump is this many times as fast as the motion before and after it."""
 

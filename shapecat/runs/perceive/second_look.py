@@ -28,17 +28,22 @@ _OFF_DEG = 10.0
 """A frame is revised if its up direction differs by more from the recording's."""
 _AGREES_DEG = 5.0
 """A frame is not revised if the given up direction differs by less from the recording's."""
-_STILL_DEG, _STILL_SHARE = 3.0, 0.6
-"""The camera is at rest if more than this fraction of the nearby frames agree to this angle."""
+_STILL_SHARE = 0.6
+"""The camera is at rest if more than this fraction of the nearby frames agree."""
+_STILL_DEG = 3.0
+"""Largest angle between the up directions of frames that agree."""
 _FIXED_SHARE = 0.5
 """Up is known in the fixed frame if more than this fraction of the frames agree to `_OFF_DEG`."""
-_AROUND, _AROUND_NS = 30, 3_000_000_000
-"""Nearby frames: at most this many before and after, and at most this far in time."""
+_AROUND = 30
+"""Maximum number of nearby frames before a frame, and after it."""
+_AROUND_NS = 3_000_000_000
+"""Maximum time between a frame and a nearby one."""
 _FEWEST = 4
 """With fewer frames to compare, nothing is decided."""
-_STILL_M, _OFF_M = 0.03, 0.08
-"""Largest variation of the height of a support below a camera at rest, and smallest height
-difference to another support."""
+_STILL_M = 0.03
+"""Largest change of the height of a support below a camera at rest, metres."""
+_OFF_M = 0.08
+"""Smallest difference between the heights of two supports, metres."""
 
 
 class Revision(NamedTuple):

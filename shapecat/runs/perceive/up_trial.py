@@ -28,8 +28,10 @@ _CONFIRMS_DEG = 15.0
 _MISNAMED_DEG = 5.0
 """A plane confirms other axes within this angle: the transforms of simulators are exact, but those
 of visual SLAM, whose map has z forward, fit other axes up to the pitch of its camera."""
-_DOUBTS, _LOOKS = 3, 10
-"""Frames with a plane that must contradict the up direction, and frames that are checked."""
+_DOUBTS = 3
+"""Number of frames with a plane that must contradict the up direction."""
+_LOOKS = 10
+"""Maximum number of frames that are checked."""
 _MOST_HELD = 64
 """Frames that are held back at most: a topic may have few frames, or none for a long time."""
 
