@@ -259,6 +259,15 @@ def test_discontinuity_drops_earlier_frames(change: Any) -> None:
     assert kept([(f, IDENTITY) for f in (*two, replace(third, **change))]) == [0, 1, 0]
 
 
+@pytest.mark.parametrize(("apart_ms", "most"), [(200, 5), (500, 5), (501, 0)])
+def test_only_a_gap_before_the_newest_image_restarts_fusion(apart_ms: int, most: int) -> None:
+    """A slow camera would be fused from fewer images than the user asked for."""
+    apart_ns = apart_ms * SECOND // 1000
+    slow = [(frame(render_depth(HOME), k * apart_ns), IDENTITY) for k in range(9)]
+
+    assert kept(slow, 6) == [min(k, most) for k in range(9)]
+
+
 def test_topics_are_separate_and_lost_pose_drops_frames() -> None:
     depth = render_depth(HOME)
     ticks = [frame(depth, k * TICK) for k in range(4)]

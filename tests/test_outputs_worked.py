@@ -1058,6 +1058,43 @@ def test_export_of_recording_that_lost_frames_is_refused(monkeypatch: pytest.Mon
         next(paired)
 
 
+def test_frames_of_sensors_with_equal_numbers_are_not_confused(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    """The cloud and colours of one sensor would be shown or exported with objects of the other."""
+    sensors = ("/left", "/right")
+    asked: dict[str, Any] = {}
+
+    def read_frames(*_: Any, **options: Any) -> Any:
+        asked.update(options)
+        return iter([(SimpleNamespace(topic=t, index=k), None) for k in range(4) for t in sensors])
+
+    monkeypatch.setattr("shapecat.outputs.colouring.read_frames", read_frames)
+    images = {("/right", 0): 50, ("/left", 2): 70, ("/right", 2): 80}
+    labelled = [
+        replace(
+            labelled_frame(number, topic=topic),
+            masks=ImageMasks(f"{topic}/color", 5, log_time, "cam", 6, 4, {}, {}),
+        )
+        for (topic, number), log_time in images.items()
+    ]
+    colours = {topic: f"{topic}/color" for topic in sensors}
+    run: Any = {"options": {"topics": [*sensors]}, "color": colours}
+    recording: Any = SimpleNamespace(path="a.bag")
+    paired = with_colour(labelled, recording, run)
+
+    found = [next(paired)]
+    keys = [(topic, number) for number in range(4) for topic in sensors]
+    image_of = {key: asked["same_images"](*key) for key in keys}
+    needed = [(t, at) for t in colours.values() for at in images.values() if asked["needed"](t, at)]
+    found += paired
+
+    assert {key: at for key, at in image_of.items() if at is not None} == images
+    assert needed == [("/left/color", 70), ("/right/color", 50), ("/right/color", 80)]
+    assert [(label.topic, label.index) for label, *_ in found] == [*images]
+    assert [(frame.topic, frame.index) for _, frame, _ in found] == [*images]
+
+
 def test_frame_of_two_topics_needs_a_topic(tmp_path: Path) -> None:
     """Otherwise the scene of one of the cameras would be shown, whichever came first."""
     keys = [("/a", 3), ("/b", 3), ("/b", 4)]

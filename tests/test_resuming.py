@@ -238,7 +238,7 @@ def test_labels_given_after_an_interruption_are_transferred(
     assert bool(summary.corrections) == bool(kept)
 
 
-def interrupt(*_: Any) -> None:
+def interrupt(*_: Any, **__: Any) -> None:
     raise KeyboardInterrupt
 
 
@@ -261,6 +261,34 @@ def test_labels_given_while_outputs_are_written_are_transferred(
     pipeline.process(job)
 
     assert written == [set(), {"vase"}]
+    assert labels(job.folder) == {"vase"}
+
+
+@pytest.mark.usefixtures("perceiving_fails")
+def test_outputs_of_a_killed_annotation_are_written_as_it_was_asked_to(
+    job: Job, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """They would keep their old labels and boxes, and the run would look for a lost recording."""
+    moved, written = tmp_path / "moved.mcap", []
+    shutil.copyfile(job.source, moved)
+    give_label(job.folder, "vase")
+    with monkeypatch.context() as patch, pytest.raises(KeyboardInterrupt):
+        patch.setattr("shapecat.outputs.review.writing.write_review", interrupt)
+        pipeline.annotate_again(job.folder, None, boxes="visible", recording=moved)
+    for output in ("annotation.annotated_mcap.write_annotated", "review.writing.write_review"):
+
+        def note(*_: Any, run: Any, output: str = output, **__: Any) -> None:
+            written.append((output, run["boxes"], run["input"]["path"]))
+
+        monkeypatch.setattr(f"shapecat.outputs.{output}", note)
+
+    pipeline.process(replace(job, overwrite=False))
+
+    asked = ("visible", str(moved.resolve()))
+    assert written == [
+        ("review.writing.write_review", *asked),
+        ("annotation.annotated_mcap.write_annotated", *asked),
+    ]
     assert labels(job.folder) == {"vase"}
 
 

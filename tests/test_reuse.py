@@ -358,6 +358,29 @@ def test_nothing_is_reused_across_topics_or_up_directions() -> None:
     assert {d.reused_from for d in perceptions[4].detections} == {None}
 
 
+def test_interleaved_sensors_each_reuse_their_own_frames() -> None:
+    """Nothing would be reused on a robot with several cameras: it would take far longer."""
+    left = replace(blank(), topic="/left")
+    assert left.depth is not None
+    right = replace(left, topic="/right", depth=left.depth[:, ::-1])
+    views = [
+        PerceptionInput(replace(frame, index=start + k, stamp_ns=100 * k + start), None)
+        for k in range(3)
+        for start, frame in ((3, left), (8, right))
+    ]
+    guesser: Any = Guesser()
+    perceptions = Perceiver(guesser, Settings(), None)(views)
+
+    assert [p.reused_from for p in perceptions] == [None, None, 3, 8, 3, 8]
+    assert [(p.topic, p.index) for p in perceptions] == [
+        (v.frame.topic, v.frame.index) for v in views
+    ]
+    for now, first in zip(perceptions[2:], perceptions[:2] * 2, strict=True):
+        assert len(now.detections) == len(first.detections) >= 3
+        for again, described in zip(now.detections, first.detections, strict=True):
+            assert np.array_equal(again.posterior, described.posterior)
+
+
 def test_change_of_smallest_object_size_is_noticed() -> None:
     """60 points are an object, which must not vanish in a repeated scene."""
     frame = blank()

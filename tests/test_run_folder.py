@@ -185,6 +185,26 @@ def test_user_files_move_to_new_results(tmp_path: Path) -> None:
     assert (folder / "tracks.csv").read_text() == "new"
 
 
+def test_nothing_of_a_replaced_run_is_moved_to_the_new_one(tmp_path: Path) -> None:
+    """Its report would show old tracks and labels as if they belonged to the new run."""
+    folder = make_run(tmp_path / "lab")
+    for name in (
+        *("frames.parquet", "detections.parquet", "planes.parquet", "masks.parquet"),
+        *("tracks.parquet", "tracks.csv", "tracks.original.csv", "tracks.previous.csv"),
+        *("report.html", "annotated.mcap", "review.rrd"),
+    ):
+        (folder / name).write_text("old")
+        partial_path(folder / name).write_text("half")
+    for name in ("segments", "revisions"):
+        (folder / name / "000000").mkdir(parents=True)
+
+    with staged(folder) as hidden:
+        write_run(hidden, run_info(id=new_id()))
+
+    assert [p.name for p in folder.iterdir()] == ["run.json"]
+    assert [p.name for p in tmp_path.iterdir()] == ["lab"]
+
+
 def test_kill_between_renames_loses_neither_folder(tmp_path: Path) -> None:
     """The old folder is restored; the new one stays until its run resumes."""
     folder = make_run(tmp_path / "lab", tracks_csv="old")

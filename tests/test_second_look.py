@@ -2,6 +2,7 @@
 
 import csv
 from collections.abc import Iterator
+from dataclasses import replace
 from functools import cache
 from pathlib import Path
 from types import SimpleNamespace
@@ -466,20 +467,56 @@ def test_frame_with_same_given_up_is_not_revised() -> None:
     np.testing.assert_allclose(before, given[12], atol=1e-6)
 
 
-def test_revised_frame_is_fused_with_the_frames_before_it(monkeypatch: pytest.MonkeyPatch) -> None:
-    """With other revised frames only, it would be noisier than the frames beside it."""
+@pytest.fixture
+def read(monkeypatch: pytest.MonkeyPatch) -> list[Any]:
+    """Give the second look frames of two cameras in turn, each with its own image and pose."""
     camera, depth = Camera(8, 6, 7.0, 7.0, 3.5, 2.5), np.ones((6, 8), np.float32)
-    stamps = [EPOCH + k * PERIOD for k in range(6)]
-    read = [Frame(TOPIC, k, at, at, "optical", depth, camera) for k, at in enumerate(stamps)]
-    given: Any = [(frame, None, (None, None, IDENTITY)) for frame in read]
+    given: list[Any] = []
+    for k in range(6):
+        for topic in (TOPIC, "/other"):
+            n, at = len(given), EPOCH + k * PERIOD
+            pose, sensor = (Pose(np.eye(3), np.array([n, 0, z])) for z in (0.0, 1.0))
+            frame = Frame(topic, k, at, at + 9 + n, "optical", depth, camera)
+            given.append(
+                (replace(frame, frame_from_sensor=sensor), f"image {n}", (None, None, pose))
+            )
     monkeypatch.setattr(perceiving, "_oriented", lambda *_: iter(given))
     monkeypatch.setattr(perceiving, "_upright", lambda *_: None)
+    return given
+
+
+def look_again(revisions: dict[Any, Revision]) -> list[Any]:
+    """Return the rows and inputs of the chosen frames, three images fused into each."""
     settings = Settings(detection=DetectionSettings(fuse_frames=3))
     work: Any = SimpleNamespace(run={"fixed_frame": None}, job=SimpleNamespace(settings=settings))
+    return [*perceiving._views_again(work, revisions)]
+
+
+@pytest.mark.usefixtures("read")
+def test_revised_frame_is_fused_with_the_frames_before_it() -> None:
+    """With other revised frames only, it would be noisier than the frames beside it."""
     up = np.array([0, -1, 0], np.float32)
-    chosen = {(TOPIC, k): Revision(up, None) for k in (1, 4)}
+    inputs = [one for _, one in look_again({(TOPIC, k): Revision(up, None) for k in (1, 4)})]
 
-    inputs = [one for _, one in perceiving._views_again(work, chosen)]
+    assert [(one.frame.topic, one.frame.index) for one in inputs] == [(TOPIC, 1), (TOPIC, 4)]
+    earlier = [[(each.frame.topic, each.frame.index) for each in one.earlier] for one in inputs]
+    assert earlier == [[(TOPIC, 0)], [(TOPIC, 3), (TOPIC, 2)]]
 
-    assert [one.frame.index for one in inputs] == [1, 4]
-    assert [[each.frame.index for each in one.earlier] for one in inputs] == [[0], [3, 2]]
+
+def test_revised_frame_keeps_its_pose_time_and_image(read: list[Any]) -> None:
+    """Its objects would leave their tracks, or lose their masks on the colour image."""
+    ups = np.eye(3, dtype=np.float32)
+    chosen = {("/other", 2): Revision(ups[0], ups[1]), (TOPIC, 5): Revision(ups[2], None)}
+
+    found = look_again(chosen)
+
+    assert len(found) == len(chosen)
+    for (row, one), n, revision in zip(found, (5, 10), chosen.values(), strict=True):
+        frame, image, (*_, pose) = read[n]
+        assert one.frame is frame
+        assert one.colour == image
+        assert one.up is revision.up
+        assert one.pose is row.fixed_from_sensor is pose
+        assert (row.again, row.log_time_ns) == (True, frame.log_time_ns)
+        assert row.up_given is revision.up_given
+        assert row.frame_from_sensor is frame.frame_from_sensor

@@ -159,6 +159,22 @@ def test_segments_are_written_when_full_or_old(
     assert stored == [0] * (_SEGMENT_FRAMES - 1) + [1] * 3 + [2] * 4  # the next one begins
 
 
+@pytest.mark.parametrize("written", [999, 99_999])
+def test_long_run_stays_in_the_order_of_the_recording(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, written: int
+) -> None:
+    """A thousand segments take half an hour: exports and tracking would then fail."""
+    monkeypatch.setattr("shapecat.runs.perceive.perceived._SEGMENT_FRAMES", 1)
+    with PerceptionTables(tmp_path, categories=CATEGORIES, model_id="m1") as tables:
+        for index in range(4):
+            tables.write([perception(index, 1)], [FrameRow(2000 + index, None)])
+            if index == 0:
+                tables._segments *= written  # as if it had written so many
+
+    for name in ("frames", "detections"):
+        assert pq.read_table(tmp_path / f"{name}.parquet")["frame"].to_pylist() == [0, 1, 2, 3]
+
+
 def test_second_look_without_result_does_not_replace_frame(
     tmp_path: Path,
 ) -> None:

@@ -111,7 +111,7 @@ JUDGED_BY: dict[str, Sequence[str]] = {
     "shapecat.runs.perceive.doubts": ("test_doubts", "test_missing_planes", "test_pose_jumps"),
     "shapecat.runs.perceive.misplacement": ("test_misplacement",),
     "shapecat.runs.perceive.missing_planes": ("test_missing_planes",),
-    "shapecat.runs.perceive.phases": ("test_pipeline", "test_crash"),
+    "shapecat.runs.perceive.phases": ("test_pipeline", "test_crash", "test_second_look"),
     "shapecat.runs.perceive.pose_jumps": ("test_pose_jumps",),
     "shapecat.runs.perceive.resuming": ("test_resuming", "test_batch_planning"),
     "shapecat.runs.perceive.second_look": ("test_second_look",),
