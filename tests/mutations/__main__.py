@@ -27,8 +27,11 @@ from tests.mutations.flips import flips_of
 LIBRARIES = ("numba", "scipy.spatial.transform", "pyarrow.parquet", "rosbags.typesys",
              "mcap.reader", "mcap_ros2.decoder", "click.testing", "scipy.optimize")  # fmt: skip
 """Loaded once, before processes are forked."""
-PACKAGES = ("batch", "cameras", "cli", "colour", "completion", "evaluation", "executors",
-            "learning", "outputs", "recordings", "reuse", "runs", "system", "tracking")  # fmt: skip
+PACKAGES = ("batch", "cameras", "cli", "colour", "completion", "depth_fusion", "evaluation",
+            "executors", "learning", "outputs", "recordings", "reuse", "runs", "system",
+            "tracking")  # fmt: skip
+FILES = ("perception", "pipeline")
+"""Modules beside the packages."""
 JUDGED_BY: dict[str, Sequence[str]] = {
     "shapecat.batch": ("test_batch_planning",),
     "shapecat.batch.ledger": ("test_batch_planning", "test_batch"),
@@ -51,6 +54,7 @@ JUDGED_BY: dict[str, Sequence[str]] = {
     "shapecat.cli.report": ("test_report", "test_report_serve"),
     "shapecat.colour": ("test_colour", "test_colour_outputs", "test_exports_images"),
     "shapecat.completion": ("test_completion", "test_tables_rotated"),
+    "shapecat.depth_fusion": ("test_depth_fusion",),
     "shapecat.evaluation": ("test_evaluation", "test_evaluation_dataset"),
     "shapecat.evaluation.comparison": ("test_compare",),
     "shapecat.evaluation.comparison.identities": ("test_identities", "test_compare"),
@@ -74,6 +78,9 @@ JUDGED_BY: dict[str, Sequence[str]] = {
     "shapecat.outputs.scene_graph": ("test_detection", "test_outputs_worked"),
     "shapecat.outputs.scene_tree": ("test_outputs_worked", "test_exports"),
     "shapecat.outputs.wording": ("test_outputs_worked",),
+    "shapecat.perception": ("test_reuse", "test_depth_fusion", "test_gravity", "test_pipeline"),
+    "shapecat.pipeline": ("test_pipeline", "test_crash", "test_resuming", "test_colour_outputs",
+                          "test_command_line"),
     "shapecat.recordings": ("test_recordings_worked", "test_recordings_frames", "test_cameras",
                             "test_recordings", "test_recordings_colour", "test_recordings_streams",
                             "test_recordings_damaged", "test_changes"),
@@ -136,10 +143,13 @@ SLOW = (
     "shapecat.batch.sources",
     "shapecat.batch.storage",
     "shapecat.cli",
+    "shapecat.depth_fusion",
     "shapecat.evaluation",
     "shapecat.executors",
     "shapecat.outputs.report",
     "shapecat.outputs.review",
+    "shapecat.perception",
+    "shapecat.pipeline",
     "shapecat.runs.perceive.phases",
     "shapecat.runs.perceive.resuming",
     "shapecat.runs.perceive.second_look",
@@ -155,7 +165,7 @@ def modules(only: str) -> dict[str, Path]:
         ".".join(("shapecat", package, *file.relative_to(folder).with_suffix("").parts)): file
         for package, folder in folders.items()
         for file in folder.rglob("*.py")
-    }
+    } | {f"shapecat.{name}": ROOT / "shapecat" / f"{name}.py" for name in FILES}
     return {
         name: file
         for name, file in named.items()
