@@ -27,6 +27,7 @@ from shapecat.detection.merging.pair_features import (
 )
 from shapecat.detection.merging.segments import Segments, merge
 from shapecat.detection.pipeline import Task, model_planes, oversegment
+from shapecat.detection.segmentation.watershed import SeedSplitter
 from shapecat.models.growing import Growth, collect_chunks, grow, growing_options
 from shapecat.models.necks import split_necks
 from shapecat.models.viewpoints import random_viewpoint
@@ -34,7 +35,7 @@ from shapecat.simulation import KINECT, REALSENSE, make_scene, render_frame
 from shapecat.simulation.camera.presets import IDEAL, PRESETS
 from shapecat.simulation.scenes.kinds import SceneKind
 from shapecat.trees import write_trees
-from shapecat.types import CATEGORIES, Camera
+from shapecat.types import CATEGORIES
 
 __all__ = ["FEATURES", "collect", "count_labels", "main"]
 
@@ -46,33 +47,50 @@ _NOISY = replace(IDEAL, noise=0.0015, step=0.0029)
 _BLENDED = replace(IDEAL, noise=0.0015, blend_px=3)
 _CHUNK = 10
 _GROWTH = Growth(300, 256, 0.1)
+_SETTINGS = DetectionSettings()
 
 
 class Series(NamedTuple):
-    """Scenes of one kind: the first seed, their number, and the categories of their objects."""
+    """Scenes of one kind.
+
+    Attributes
+    ----------
+    first, scenes : the first seed and the number of scenes.
+    categories : of the objects.
+    split : whether the seeds of the watershed are split at necks.
+    """
 
     kind: SceneKind
     first: int
     scenes: int
     categories: tuple[str, ...] = CATEGORIES
+    split: bool = False
 
 
 _SERIES = (
-    Series("clutter", 2000, 600),
-    Series("clutter", 50_000, 75, ("box",)),
-    Series("clutter", 70_000, 25, ("box", "can", "plate")),
-    Series("shelf", 2000, 175),
-    Series("turntable", 2000, 20),
-    Series("tabletop", 99_000, 50),
-    Series("rows", 60_000, 200),
-    Series("pile", 80_000, 250),
-    Series("bin", 90_000, 87),
-    Series("shelf_bin", 94_000, 75),
-    Series("room", 98_500, 62),
+    Series("clutter", 2000, 2400),
+    Series("clutter", 50_000, 300, ("box",)),
+    Series("clutter", 70_000, 100, ("box", "can", "plate")),
+    Series("shelf", 2000, 700),
+    Series("turntable", 2000, 80),
+    Series("tabletop", 99_000, 200),
+    Series("pile", 80_000, 1000),
+    Series("bin", 90_000, 350),
+    Series("shelf_bin", 94_000, 300),
+    Series("clutter", 2000, 600, split=True),
+    Series("clutter", 50_000, 75, ("box",), split=True),
+    Series("clutter", 70_000, 25, ("box", "can", "plate"), split=True),
+    Series("shelf", 2000, 175, split=True),
+    Series("turntable", 2000, 20, split=True),
+    Series("tabletop", 99_000, 50, split=True),
+    Series("rows", 60_000, 200, split=True),
+    Series("pile", 80_000, 250, split=True),
+    Series("bin", 90_000, 87, split=True),
+    Series("shelf_bin", 94_000, 75, split=True),
+    Series("room", 98_500, 62, split=True),
 )
 """Seeds below 2000 are for development, seeds from 100000 on for evaluation only. In piles and
-bins, objects lean, lie across each other and touch walls; in rows, like objects nearly touch. Four
-times as many scenes gave no better trees."""
+bins, objects lean, lie across each other and touch walls; in rows, like objects nearly touch."""
 _VIEWS = 4
 """Views of each scene: from its path and from anywhere in turn, with one sensor after the other."""
 _OTHERS = (
@@ -120,30 +138,32 @@ def _collect(series: Series) -> Pairs:
             view = random_viewpoint(world, sensor, rng) if k % 2 else 0
             frame, pixel_labels = render_frame(world, view, rng=rng, sensor=sensor)
             if frame.depth is not None and frame.camera is not None:
-                pairs += _pairs(frame.depth, frame.camera, pixel_labels, object_labels, rng)
+                grid = downsample(frame.depth, frame.camera, range_m=_SETTINGS.max_range_m)
+                if grid is not None:
+                    split_seeds = split_necks if series.split else None
+                    pairs += _pairs(grid, split_seeds, pixel_labels, object_labels, rng)
     features = np.array([features for features, _ in pairs], np.float32).reshape(-1, FEATURES)
     return Pairs(features, np.array([same for _, same in pairs], bool))
 
 
 def _pairs(
-    depth: F4, camera: Camera, pixel_labels: U1, object_labels: I4, rng: np.random.Generator
+    grid: DepthGrid,
+    split_seeds: SeedSplitter | None,
+    pixel_labels: U1,
+    object_labels: I4,
+    rng: np.random.Generator,
 ) -> Iterator[tuple[F4, bool]]:
     """Yield the features of pairs of segments, single or merged, and whether they are one object.
 
     Parameters
     ----------
-    depth : (h, w) metres, 0 where depth is missing.
     pixel_labels : (h, w) pixel labels of the scene.
     object_labels : (k,) labels of objects.
     """
-    settings = DetectionSettings()
-    grid = downsample(depth, camera, range_m=settings.max_range_m)
-    if grid is None:
-        return
-    model = model_planes(grid, None, Task(settings, rng))
+    model = model_planes(grid, None, Task(_SETTINGS, rng))
     if model is None:
         return
-    graph, labels, segments = oversegment(grid, model, split_seeds=split_necks)
+    graph, labels, segments = oversegment(grid, model, split_seeds=split_seeds)
     merge_across_occluder(segments, grid, graph.normal, labels)
     counts = count_labels(pixel_labels, labels, grid)
     view_geometry, yielded = ViewGeometry(grid.intrinsics.fx, model.up), set()
