@@ -478,11 +478,11 @@ def test_confidence_and_guess_use_all_views(run: Path) -> None:
         assert row["category"] in {row["guess"], "unknown"}
 
 
+ROBOT = Pose(Rotation.from_euler("xyz", [-1.8, 0.3, 0.7]).as_matrix(), np.array([0.2, -0.4, 1.1]))
+
+
 def test_merged_box_is_upright_in_named_frame(tmp_path: Path) -> None:
     """A cloud in the frame of the robot is drawn there; up is known in the sensor frame."""
-    robot = Pose(
-        Rotation.from_euler("xyz", [-1.8, 0.3, 0.7]).as_matrix(), np.array([0.2, -0.4, 1.1])
-    )
     with PerceptionTables(tmp_path, categories=CATEGORIES, model_id="m") as tables:
         for k in range(FRAMES):
             up = ROTATIONS[k].inv().apply(UP)
@@ -491,7 +491,7 @@ def test_merged_box_is_upright_in_named_frame(tmp_path: Path) -> None:
             stamp = EPOCH + k * SECOND // 10
             perception = Perception("/depth", k, stamp, "base", scene, found, {})
             pose = Pose(ROTATIONS[k].as_matrix(), POSITIONS[k])
-            tables.write([perception], [FrameRow(stamp, pose, up, frame_from_sensor=robot)])
+            tables.write([perception], [FrameRow(stamp, pose, up, frame_from_sensor=ROBOT)])
     track_run(tmp_path, TrackingSettings(), CATEGORIES)
     labels = read_labels(tmp_path / "tracks.csv", CATEGORIES)
     labels[3] = labels[1]
@@ -500,10 +500,10 @@ def test_merged_box_is_upright_in_named_frame(tmp_path: Path) -> None:
     for frame in read_annotation_frames(tmp_path, tracks, visible=True):
         (merged,) = (box for box in frame.objects if box.track == 1)
         axes = Rotation.from_quat(merged.orientation).as_matrix()
-        up = robot.rotation @ ROTATIONS[frame.index].inv().apply(UP)
+        up = ROBOT.rotation @ ROTATIONS[frame.index].inv().apply(UP)
         assert_allclose(axes[:, 2], up, atol=1e-5)
         centers = ROTATIONS[frame.index].inv().apply(CENTERS - POSITIONS[frame.index])
-        apart = centers @ robot.rotation.T + robot.translation - merged.center
+        apart = centers @ ROBOT.rotation.T + ROBOT.translation - merged.center
         inside = (np.abs(apart @ axes) < np.array(merged.size) / 2).all(axis=1)
         assert inside.sum() >= 2
         assert merged.size[2] < SIZE[2] + 0.21  # their heights differ by 0.2 at most
@@ -511,16 +511,13 @@ def test_merged_box_is_upright_in_named_frame(tmp_path: Path) -> None:
 
 def test_only_boxes_of_named_frames_are_transformed(tmp_path: Path) -> None:
     """A robot may publish clouds in its base frame beside images in that of a camera."""
-    robot = Pose(
-        Rotation.from_euler("xyz", [-1.8, 0.3, 0.7]).as_matrix(), np.array([0.2, -0.4, 1.1])
-    )
     with PerceptionTables(tmp_path, categories=CATEGORIES, model_id="m") as tables:
         for k in range(FRAMES):
             up = ROTATIONS[k].inv().apply(UP)
             scene = Scene(up, (Plane(up, -0.5, OUTLINE, 0.7, 0.0),), ())
             stamp = EPOCH + k * SECOND // 10
             pose = Pose(ROTATIONS[k].as_matrix(), POSITIONS[k])
-            for topic, frame_id, offset in (("/cloud", "base", robot), ("/depth", "optical", None)):
+            for topic, frame_id, offset in (("/cloud", "base", ROBOT), ("/depth", "optical", None)):
                 found = Perception(topic, k, stamp, frame_id, scene, (detection_of(k, 0),), {})
                 tables.write([found], [FrameRow(stamp, pose, up, frame_from_sensor=offset)])
     track_run(tmp_path, TrackingSettings(), CATEGORIES)
@@ -533,10 +530,10 @@ def test_only_boxes_of_named_frames_are_transformed(tmp_path: Path) -> None:
             (moved,), (box,) = named.objects, plain.objects
             assert (named.frame_id, plain.frame_id) == ("base", "optical")
             assert_allclose(
-                moved.center, robot.rotation @ box.center + robot.translation, atol=1e-6
+                moved.center, ROBOT.rotation @ box.center + ROBOT.translation, atol=1e-6
             )
             axes = (Rotation.from_quat(each.orientation).as_matrix() for each in (moved, box))
-            assert_allclose(next(axes), robot.rotation @ next(axes), atol=1e-6)
+            assert_allclose(next(axes), ROBOT.rotation @ next(axes), atol=1e-6)
 
 
 def test_parts_of_merged_track_become_one_object(run: Path) -> None:
