@@ -469,6 +469,14 @@ def test_tracks_of_runs_with_equal_names_have_different_ids(tmp_path: Path) -> N
     assert [a["track_id"] for a in data["annotations"]] == [1, 2, 3, 4]
 
 
+@pytest.mark.parametrize("side", [1, -1])
+def test_top_of_image_is_forward_for_camera_that_looks_straight_down_or_up(side: int) -> None:
+    """Otherwise all boxes of a camera above a bin would be turned by half a turn."""
+    rotation = rectified_from_sensor(np.array([0.01, -0.02, -side]), optical=True)
+
+    assert_allclose(rotation, [[side, 0, 0], [0, 0, side], [0, -1, 0]], atol=0.03)
+
+
 def test_yolo_omits_uncertain_labels(tmp_path: Path) -> None:
     """The format has no flag for uncertain labels, so they would be trained on."""
     categories = ("cup", "can", "bowl")
