@@ -13,24 +13,9 @@ __all__ = ["FrameDetections", "gather", "track_frames"]
 
 
 class FrameDetections(Record):
-    """The detections of one frame, which may have none; columns are as in `DetectionTable`.
+    """The detections (n,) of one frame, which may have none; columns are as in `DetectionTable`.
 
-    Attributes
-    ----------
-    topic : the stream.
-    frame : number of the frame in its stream.
-    stamp_ns : time of the measurement.
-    detections : (n,) numbers of the detections, by which tracks name them.
-    centers : (n, 3) centres of the boxes, metres, in the fixed frame; in the sensor frame if the
-        recording has no fixed frame. All frames of a stream use the same coordinate frame.
-    sizes : (n, 3) lengths of the boxes, metres; the third one is along the up direction.
-    posteriors : (n, c) posteriors of the single views; each sums to 1.
-    partial : (n,) whether the image border or an occluder cuts the object.
-    novelties : (n,) novelties of the single views.
-    orientations : (n, 4) unit quaternions (x, y, z, w) of the boxes, in the frame of the centres;
-        None if unknown.
-    described : (n,) number of the frame whose description each detection repeats, its own number
-        if it was described itself; None if all were.
+    ``detections`` are its ``numbers``. Without ``described``, all were described themselves.
     """
 
     topic: str

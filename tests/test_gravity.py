@@ -24,7 +24,7 @@ from shapecat.recordings.transforms.gravity import Orientation, Upright
 from shapecat.recordings.transforms.window import TransformWindow
 from shapecat.runs.folder import read_run
 from shapecat.runs.jobs import Job
-from shapecat.runs.perceive import up_trial
+from shapecat.runs.perceive import up_check
 from shapecat.runs.perceive.up_report import report_up
 from shapecat.runs.tables.schemas import DETECTIONS, FRAMES, PLANES
 from shapecat.simulation.messages import MessageFactory
@@ -166,11 +166,11 @@ def test_given_up_is_dropped_only_if_no_plane_confirms_it(
     angles = [None if off is None else np.radians(off) for off in off_deg]
     found = [None if a is None else np.array([0, -np.cos(a), -np.sin(a)]) for a in angles]
     planes = iter(found)
-    monkeypatch.setattr(up_trial, "find_up", lambda *_: next(planes))
+    monkeypatch.setattr(up_check, "find_up", lambda *_: next(planes))
     frames = [frame(EPOCH + k) for k in range(len(off_deg))]
 
     oriented = ((item, None, given) for item in frames)
-    returned = list(up_trial.UpTrial(upright, Settings()).before(oriented))
+    returned = list(up_check.UpCheck(upright, Settings()).before(oriented))
 
     assert [item for item, *_ in returned] == frames
     assert upright.dropped == ({"/d": "tf"} if dropped else {})
@@ -181,7 +181,7 @@ def test_topic_that_ends_early_does_not_hold_frames_back(
     monkeypatch: pytest.MonkeyPatch, up: Any, most: int
 ) -> None:
     """All other frames of a long recording would be kept in memory, and nothing be saved."""
-    monkeypatch.setattr(up_trial, "find_up", lambda *_: None)
+    monkeypatch.setattr(up_check, "find_up", lambda *_: None)
     upright = Upright(TransformWindow(TransformBuffer()), None, None, ("tf", "imu"))
     frames = [frame(EPOCH + k) for k in range(300)]
     frames[1] = replace(frames[1], topic="/short")
@@ -193,7 +193,7 @@ def test_topic_that_ends_early_does_not_hold_frames_back(
             assert len(held) <= most
             yield item, None, Orientation("tf" if up is not None else "", up, None)
 
-    for item, *_ in up_trial.UpTrial(upright, Settings()).before(read()):
+    for item, *_ in up_check.UpCheck(upright, Settings()).before(read()):
         held.remove(item.stamp_ns)
     assert not held
 
@@ -202,11 +202,11 @@ def test_up_that_is_given_later_is_tested(monkeypatch: pytest.MonkeyPatch) -> No
     """Transforms often begin after the first frames, which must not decide for the others."""
     upright = Upright(TransformWindow(TransformBuffer()), None, None, ("tf", "imu"))
     given, plane = np.array([0.0, -1.0, 0.0]), np.array([0.0, 0.0, -1.0])
-    monkeypatch.setattr(up_trial, "find_up", lambda *_: plane)
+    monkeypatch.setattr(up_check, "find_up", lambda *_: plane)
     ups = [Orientation("", None, None)] * 4 + [Orientation("tf", given, None)] * 4
     oriented = ((frame(EPOCH + k), None, up) for k, up in enumerate(ups))
 
-    returned = list(up_trial.UpTrial(upright, Settings()).before(oriented))
+    returned = list(up_check.UpCheck(upright, Settings()).before(oriented))
 
     assert [item.stamp_ns - EPOCH for item, *_ in returned] == list(range(8))
     assert upright.dropped == {"/d": "tf"}
@@ -245,11 +245,11 @@ def test_map_with_z_forward_does_not_correct_transforms(
     pitch = np.radians(pitch_deg)
     upright = Upright(TransformWindow(TransformBuffer()), None, None, ("tf", "imu"))
     planes = np.array([0.0, -np.cos(pitch), -np.sin(pitch)])
-    monkeypatch.setattr(up_trial, "find_up", lambda *_: planes)
+    monkeypatch.setattr(up_check, "find_up", lambda *_: planes)
     given = Orientation("transforms, z of map", np.array([0.0, 0.0, 1.0]), None)
     oriented = ((frame(EPOCH + k), None, given) for k in range(4))
 
-    list(up_trial.UpTrial(upright, Settings()).before(oriented))
+    list(up_check.UpCheck(upright, Settings()).before(oriented))
 
     assert bool(upright.misnamed) is corrected
     assert bool(upright.dropped) is not corrected

@@ -19,7 +19,7 @@ from shapecat.recordings.transforms.gravity import Orientation
 from shapecat.runs.folder import read_run
 from shapecat.runs.jobs import Job
 from shapecat.runs.perceive import phases as perceiving
-from shapecat.runs.perceive import up_trial
+from shapecat.runs.perceive import up_check
 from shapecat.runs.perceive.second_look import (
     Revision,
     _around,
@@ -381,7 +381,7 @@ def test_given_up_is_tested_for_each_camera(
     """Only the camera with wrong mounting is doubted, after three of its frames."""
     level, tilted = leaning([0.0, 40.0])
     planes = {"/good": level, "/bad": tilted, "/blind": None}
-    monkeypatch.setattr(up_trial, "find_up", lambda frame, _: planes[frame.topic])
+    monkeypatch.setattr(up_check, "find_up", lambda frame, _: planes[frame.topic])
     doubted: list[tuple[str, str, int]] = []
     upright: Any = SimpleNamespace(
         contradict=lambda topic, source, angles: doubted.append((topic, source, len(angles))),
@@ -390,7 +390,7 @@ def test_given_up_is_tested_for_each_camera(
     frames = [
         Frame(name, k, k, k, "camera", points=np.zeros((1, 3))) for k, name in enumerate(names)
     ]
-    trial = up_trial.UpTrial(upright, Settings())
+    trial = up_check.UpCheck(upright, Settings())
 
     given = {name: Orientation(f"tf of {name}", level, None) for name in planes}
     returned = list(trial.before((frame, None, given[frame.topic]) for frame in frames))

@@ -16,10 +16,12 @@ PROFILE_NAMES = tuple(f"{i}_{name}" for i in range(PROFILE_SLICES) for name in _
 
 
 class VerticalAxis(NamedTuple):
-    """A vertical line at x and y.
+    """A vertical line, in the units of the surface.
 
-    ``residual`` is the root mean square distance from it of the horizontal lines in
-    `vertical_axis`.
+    Attributes
+    ----------
+    x, y : its position.
+    residual : root mean square distance from it of the horizontal lines in `vertical_axis`.
     """
 
     x: float

@@ -3,14 +3,11 @@
 from collections import Counter, deque
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import suppress
-from functools import cached_property, lru_cache
+from functools import cached_property
 from statistics import median
 from typing import Any, NamedTuple, TypeAlias
 
-import numpy as np
-
 from shapecat.cameras.colour import ColourView, LensCamera
-from shapecat.cameras.lenses import distort
 from shapecat.errors import RecordingError
 from shapecat.geometry import IDENTITY, compose
 from shapecat.recordings.colour_streams import ColourStream
@@ -20,6 +17,7 @@ from shapecat.recordings.lens import distortion_problem
 from shapecat.recordings.messages import MALFORMED, Message, MessageError, Needed, reason_of
 from shapecat.recordings.pinhole import camera_of_info, distortion_of, is_rectified
 from shapecat.recordings.recording import Recording
+from shapecat.recordings.registration import are_equal, are_similar, is_straight
 from shapecat.recordings.sensors import is_of_realsense_recorder, same_frame
 from shapecat.recordings.stamps import Clock, stamp_ns
 from shapecat.recordings.streams import Stream, first_message
@@ -41,16 +39,6 @@ _PATIENCE_NS = 500_000_000
 """A frame waits no longer than this for a colour image, in log time."""
 _USUAL_PERIOD_NS = 100_000_000
 """Image period assumed if neither stamps nor count and duration give one."""
-_NEAR = 0.01
-"""Intrinsics that differ by less than this fraction of the image width are similar."""
-_EQUAL = 1e-6
-"""Intrinsics that differ by less than this fraction of the image width are equal."""
-_STRAIGHT_PX = 2.0
-"""A lens that moves no pixel of a grid farther than this leaves an image registered. Depth images
-with less distortion are likewise treated as those of a pinhole camera."""
-_STEPS = 9
-"""Rows and columns of that grid."""
-
 KnownImages: TypeAlias = Callable[[str, int], int | None] | None
 """Returns the log time (ns) of a frame's colour image, given the frame's topic and number; None if
 the frame has no image."""
@@ -268,8 +256,8 @@ class _Partner:
             raise MessageError(msg)
         named = not is_of_realsense_recorder(self.stream.topic)
         one_frame = named and same_frame(image.frame_id, frame.frame_id)
-        straight = lens is None or _bend_px(lens, frame.camera) < _STRAIGHT_PX
-        alike = lens is None or (straight and _alike(lens, frame.camera, _NEAR))
+        straight = lens is None or is_straight(lens, frame.camera)
+        alike = lens is None or (straight and are_similar(lens, frame.camera))
         if same_shape and one_frame and alike:
             return ColourView(image, lens or _lens(frame.camera))
         if lens is None:
@@ -282,7 +270,7 @@ class _Partner:
             offset = frame.frame_from_sensor
             return ColourView(image, lens, pose if offset is None else compose(pose, offset))
         # Two cameras are never calibrated to the same numbers.
-        if same_shape and _alike(lens, frame.camera, _EQUAL):
+        if same_shape and are_equal(lens, frame.camera):
             return ColourView(image, lens, None if straight else IDENTITY)
         names = (name or "a frame without a name" for name in (frame.frame_id, image.frame_id))
         msg = f"no transform between {' and '.join(names)}"
@@ -310,27 +298,3 @@ def _lens_of(info: Any, topic: str) -> LensCamera:
     if problem := distortion_problem(model, coefficients):
         raise MessageError(problem)
     return LensCamera(camera, model, coefficients)
-
-
-def _alike(lens: LensCamera, camera: Camera | None, share: float) -> bool:
-    """Return whether two cameras' intrinsics differ by less than `share` of the image width."""
-    if camera is None:
-        return False
-    intrinsics, camera_intrinsics = ((c.fx, c.fy, c.cx, c.cy) for c in (lens.pinhole, camera))
-    return bool(np.abs(np.subtract(intrinsics, camera_intrinsics)).max() < share * camera.width)
-
-
-@lru_cache(maxsize=8)
-def _bend_px(lens: LensCamera, camera: Camera | None) -> float:
-    """Return the largest distance (px) from a pixel of `camera` to where `lens` sees its ray."""
-    if camera is None or not lens.model:
-        return 0.0
-    pinhole = lens.pinhole
-    steps = np.linspace(0, 1, _STEPS)
-    pixels = np.stack(np.meshgrid(steps * (camera.width - 1), steps * (camera.height - 1)), -1)
-    rays = (pixels - (camera.cx, camera.cy)) / (camera.fx, camera.fy)
-    distorted = distort(rays, lens.model, lens.coefficients) * (pinhole.fx, pinhole.fy) + (
-        pinhole.cx,
-        pinhole.cy,
-    )
-    return float(np.abs(distorted - pixels).max())

@@ -124,7 +124,7 @@ JUDGED_BY: dict[str, Sequence[str]] = {
     "shapecat.runs.perceive.second_look": ("test_second_look",),
     "shapecat.runs.perceive.selection": ("test_recordings_frames", "test_pipeline"),
     "shapecat.runs.perceive.up_report": ("test_gravity",),
-    "shapecat.runs.perceive.up_trial": ("test_gravity", "test_second_look"),
+    "shapecat.runs.perceive.up_check": ("test_gravity", "test_second_look"),
     "shapecat.runs.tables.masks": ("test_colour_outputs", "test_exports_images"),
     "shapecat.runs.tables.placed_frames": ("test_changes", "test_tables_rotated"),
     "shapecat.runs.tables.segments": ("test_tables", "test_tables_rotated"),

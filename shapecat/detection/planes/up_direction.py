@@ -50,10 +50,8 @@ def estimate_up(
     directions = _directions(normals, min_count, trials)
     if len(directions) == 0:
         return np.zeros(3)
-    hypotheses, bins = (
-        _hypotheses(directions, 0.0 if has_hint else UP.corner_cos),
-        _bins_of(surface),
-    )
+    hypotheses = _hypotheses(directions, 0.0 if has_hint else UP.corner_cos)
+    bins = _bins_of(surface)
     best, best_score = 0, -1.0
     for k in range(len(hypotheses)):
         score = _score(surface, hypotheses[k], bins, 0.0 if has_hint else roll_penalty)
@@ -85,7 +83,7 @@ def _every_second(points: OrientedPoints, intrinsics: PinholeIntrinsics) -> F4:
 
 @kernel(inline=True)
 def _bins_of(surface: F4) -> int:
-    """Return the number of bins of `UpSettings.level_bin_m` that hold all points."""
+    """Return the number of bins of `UpSettings.level_bin_m` that hold all points, (8, n)."""
     farthest2 = 0.0
     for k in range(surface.shape[1]):
         x, y, z = surface[3, k], surface[4, k], surface[5, k]

@@ -22,8 +22,8 @@ from shapecat.runs.jobs import Job
 from shapecat.runs.perceive.perceived import FrameRow, PerceptionTables
 from shapecat.runs.perceive.second_look import Revision, frames_to_revise
 from shapecat.runs.perceive.selection import count_frames, read_frames
+from shapecat.runs.perceive.up_check import Oriented, UpCheck
 from shapecat.runs.perceive.up_report import report_up
-from shapecat.runs.perceive.up_trial import Oriented, UpTrial
 from shapecat.runs.run_info import RunInfo
 from shapecat.runs.tables.reading import Key, count_rows, read_row_groups
 from shapecat.runs.tables.segments import read_segments
@@ -188,7 +188,7 @@ def _upright(work: Work, fixed_frame: str | None) -> Upright:
 def _oriented(work: Work, upright: Upright, skipped: Counter[str]) -> Iterator[Oriented]:
     """Yield the frames of a run with their orientations, once the up directions are decided."""
     source = ((frame, colour, upright.orient(frame)) for frame, colour in _readings(work, skipped))
-    for frame, colour, orientation in UpTrial(upright, work.job.settings).before(source):
+    for frame, colour, orientation in UpCheck(upright, work.job.settings).before(source):
         yield frame, colour, upright.corrected(frame.topic, orientation)
 
 

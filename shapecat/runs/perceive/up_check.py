@@ -21,7 +21,7 @@ from shapecat.recordings.transforms.gravity import (
 )
 from shapecat.types import Frame
 
-__all__ = ["Oriented", "UpTrial"]
+__all__ = ["Oriented", "UpCheck"]
 
 _CONFIRMS_DEG = 15.0
 """A plane confirms an up direction within this angle, as in `detect`."""
@@ -39,7 +39,7 @@ Oriented = tuple[Frame, ColourView | None, Orientation]
 """A frame, its colour image, if it has one, and the up direction and pose of the sensor."""
 
 
-class UpTrial:
+class UpCheck:
     """Compares the given up direction with the planes in the first frames of each topic."""
 
     def __init__(self, upright: Upright, settings: Settings) -> None:

@@ -1,0 +1,64 @@
+"""Whether a colour image is registered to the depth image: compare the cameras of both."""
+
+from functools import lru_cache
+
+import numpy as np
+
+from shapecat.cameras.colour import LensCamera
+from shapecat.cameras.lenses import distort
+from shapecat.types import Camera
+
+__all__ = ["are_equal", "are_similar", "is_straight"]
+
+_NEAR = 0.01
+"""Intrinsics that differ by less than this fraction of the image width are similar."""
+_EQUAL = 1e-6
+"""Intrinsics that differ by less than this fraction of the image width are equal."""
+_STRAIGHT_PX = 2.0
+"""A lens that moves no pixel of a grid farther than this leaves an image registered. Depth images
+with less distortion are likewise treated as those of a pinhole camera."""
+_STEPS = 9
+"""Rows and columns of that grid."""
+
+
+def are_similar(lens: LensCamera, camera: Camera | None) -> bool:
+    """Return whether the intrinsics of two cameras are similar; False without a camera."""
+    return _are_within(lens, camera, _NEAR)
+
+
+def are_equal(lens: LensCamera, camera: Camera | None) -> bool:
+    """Return whether the intrinsics of two cameras are equal; False without a camera."""
+    return _are_within(lens, camera, _EQUAL)
+
+
+def is_straight(lens: LensCamera, camera: Camera | None) -> bool:
+    """Return whether a lens sees the rays of a pinhole camera near the camera's pixels.
+
+    A lens without distortion does, and so does any if there is no camera.
+    """
+    return _bend_px(lens, camera) < _STRAIGHT_PX
+
+
+def _are_within(lens: LensCamera, camera: Camera | None, fraction: float) -> bool:
+    """Return whether the intrinsics differ by less than a fraction of the image width."""
+    if camera is None:
+        return False
+    intrinsics, camera_intrinsics = ((c.fx, c.fy, c.cx, c.cy) for c in (lens.pinhole, camera))
+    largest = np.abs(np.subtract(intrinsics, camera_intrinsics)).max()
+    return bool(largest < fraction * camera.width)
+
+
+@lru_cache(maxsize=8)
+def _bend_px(lens: LensCamera, camera: Camera | None) -> float:
+    """Return the largest distance (px) from a pixel of `camera` to where `lens` sees its ray."""
+    if camera is None or not lens.model:
+        return 0.0
+    pinhole = lens.pinhole
+    steps = np.linspace(0, 1, _STEPS)
+    pixels = np.stack(np.meshgrid(steps * (camera.width - 1), steps * (camera.height - 1)), -1)
+    rays = (pixels - (camera.cx, camera.cy)) / (camera.fx, camera.fy)
+    distorted = distort(rays, lens.model, lens.coefficients) * (pinhole.fx, pinhole.fy) + (
+        pinhole.cx,
+        pinhole.cy,
+    )
+    return float(np.abs(distorted - pixels).max())
