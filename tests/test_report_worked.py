@@ -440,6 +440,17 @@ def test_whole_views_are_preferred_to_larger_cut_ones(run: Path, flag: str) -> N
     assert all(k % 2 for k in views)
 
 
+def test_the_largest_masks_of_a_track_are_not_shown() -> None:
+    """They often include a piece of the table; a cut view is not shown if a complete one exists."""
+    sizes = [500, 530, 2000, 510, 520, 540]
+    views = [choosing._View(("/d", k), size, complete=True) for k, size in enumerate(4 * sizes)]
+    cut = [choosing._View(("/d", k), 9000.0 + k, complete=False) for k in range(30, 40)]
+    complete_last = [*cut, choosing._View(("/d", 44), 60.0, complete=True)]
+
+    assert [view.key[1] for view in choosing._good_of_parts(views)] == [5, 11, 17, 23]
+    assert [view.key[1] for view in choosing._good_of_parts(complete_last)] == [31, 34, 37, 44]
+
+
 @pytest.mark.parametrize(
     ("box", "cut"),
     [

@@ -19,7 +19,10 @@ from shapecat.types import ImageMasks
 __all__ = ["Choice", "choose_frames"]
 
 _CANDIDATES = 4
-"""Views of a track that are read again: the best of each quarter of them."""
+"""Views of a track that are read again: a good one of each quarter of them."""
+_RANK = 0.8
+"""Rank of the chosen view among those of a quarter, 1 for the largest. The largest masks often
+include a neighbour or a piece of the table."""
 _STRIP = 12
 _PARTIAL = 0.2
 """Weight of a view that is cut off by the image border or partly occluded."""
@@ -49,6 +52,7 @@ class Choice:
 class _View(NamedTuple):
     key: Key
     worth: float
+    complete: bool
 
 
 def choose_frames(folder: Path, timelines: Mapping[int, Timeline]) -> Choice:
@@ -56,7 +60,7 @@ def choose_frames(folder: Path, timelines: Mapping[int, Timeline]) -> Choice:
     owner = {key: track for track, line in timelines.items() for key in line.keys if key[2] >= 0}
     candidates: dict[Key, set[int]] = {}
     for track, views in _views(folder, owner).items():
-        for view in _best_of_parts(views):
+        for view in _good_of_parts(views):
             candidates.setdefault(view.key, set()).add(track)
     tracks_of: dict[Key, set[int]] = {}
     for (topic, frame, _), track in owner.items():
@@ -79,7 +83,7 @@ def _views(folder: Path, owner: Mapping[Detected, int]) -> dict[int, list[_View]
                 continue
             area, cut = masks.get(key, (_COLOURLESS * points, False))
             complete = not (border or occluded or cut)
-            view = _View((topic, frame), area * (1.0 if complete else _PARTIAL))
+            view = _View((topic, frame), area * (1.0 if complete else _PARTIAL), complete)
             views.setdefault(owner[key], []).append(view)
     return views
 
@@ -95,10 +99,18 @@ def _areas(masks: Iterator[tuple[Key, ImageMasks]]) -> dict[Detected, tuple[floa
     return areas
 
 
-def _best_of_parts(views: Sequence[_View]) -> list[_View]:
-    """Return the best view, the first of equal ones, in each of `_CANDIDATES` parts of a track."""
+def _good_of_parts(views: Sequence[_View]) -> list[_View]:
+    """Return a good view in each of `_CANDIDATES` parts of a track, a complete one if there is one.
+
+    Of equal views, it is the first.
+    """
     ends = np.linspace(0, len(views), min(_CANDIDATES, len(views)) + 1).astype(int)
-    return [max(views[a:b], key=lambda view: view.worth) for a, b in pairwise(ends)]
+    chosen = []
+    for a, b in pairwise(ends):
+        eligible = [view for view in views[a:b] if view.complete] or views[a:b]
+        worth = np.quantile([view.worth for view in eligible], _RANK, method="higher")
+        chosen.append(next(view for view in eligible if view.worth == worth))
+    return chosen
 
 
 def _strip(
