@@ -25,6 +25,7 @@ from shapecat.outputs.exports.crops import Origin, write_crops
 from shapecat.outputs.exports.dataset_frames import DatasetImage, DatasetObject
 from shapecat.outputs.exports.kitti import rectified_from_sensor, write_kitti
 from shapecat.outputs.exports.labelcloud import _described, write_labelcloud
+from shapecat.outputs.exports.points import write_point_labels
 from shapecat.types import Box, Camera, Frame, LabelledFrame, LabelledObject, NeuralGas, Pose
 
 CAMERA = Camera(160, 120, 143.0, 139.0, 77.4, 61.9)
@@ -500,6 +501,18 @@ def test_labels_of_images_with_dots_in_their_names_stay_apart(tmp_path: Path) ->
 
     labels = sorted((tmp_path / "labels" / "train").iterdir())
     assert [path.name for path in labels] == [f"{Path(name).stem}.txt" for name in names]
+
+
+def test_yaml_files_hold_names_as_they_are_written(tmp_path: Path) -> None:
+    """YAML reads an escaped pair of surrogates, as JSON writes a rare character, as two."""
+    run: Any = SimpleNamespace(folder=tmp_path, labels={}, categories=("can", "𠮷 cup"))
+    write_yolo(tmp_path, [], run.categories)
+    cloud = Frame("/depth", 0, 5, 6, "optical", points=np.ones((2, 3), np.float32))
+    empty = replace(labelled(cut=False, hidden=False), objects=())
+    write_point_labels(tmp_path, [(empty, cloud, None)], run)
+
+    assert '  1: "𠮷 cup"\n' in (tmp_path / "data.yaml").read_text("utf-8")
+    assert '  3: "𠮷 cup"\n' in (tmp_path / "semantic-kitti.yaml").read_text("utf-8")
 
 
 def test_tiny_negative_yaw_is_not_written_as_360_degrees() -> None:

@@ -106,7 +106,7 @@ def write_yolo(out: Path, images: Images, categories: Sequence[str]) -> int:
         label = (out / "labels" / split / image.name).with_suffix(".txt")
         label.write_text("".join(lines), "utf-8")
         count += len(lines)
-    names = [f"  {k}: {json.dumps(name)}" for k, name in enumerate(categories)]
+    names = [f"  {k}: {json.dumps(name, ensure_ascii=False)}" for k, name in enumerate(categories)]
     val = "val" if "val" in splits else "train"
     # Without "path", the paths are relative to data.yaml, wherever training is started.
     about = ["train: images/train", f"val: images/{val}", "names:", *names]

@@ -123,7 +123,7 @@ def _yaml(classes: dict[str, int]) -> str:
     names = {0: "none", **{k: name for name, k in classes.items()}}
     colours = {k: colour_of(name)[::-1] if k else (0, 0, 0) for k, name in names.items()}
     lines = ["name: shapecat", "labels:"]
-    lines += [f"  {k}: {json.dumps(name)}" for k, name in names.items()]
+    lines += [f"  {k}: {json.dumps(name, ensure_ascii=False)}" for k, name in names.items()]
     lines += ["color_map:", *(f"  {k}: {list(colour)}" for k, colour in colours.items())]
     lines += ["learning_map:", *(f"  {k}: {k}" for k in names)]
     lines += ["learning_map_inv:", *(f"  {k}: {k}" for k in names)]
