@@ -5,16 +5,29 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
-import pyarrow as pa
+import numpy as np
 
 from shapecat.errors import OutputError
 from shapecat.outputs.level_clouds import upward
 from shapecat.outputs.scene_graph import Node, format_tree
 from shapecat.runs.finished import read_finished
-from shapecat.runs.tables.reading import keys_of, read_row_groups
+from shapecat.runs.tables.reading import keys_of, opened, read_row_groups, read_rows
 from shapecat.types import Box, Candidate, LabelledFrame, LabelledObject, Plane, Scene
 
 __all__ = ["describe_scene"]
+
+_CANDIDATE = (
+    "indices",
+    "center",
+    "size",
+    "orientation",
+    "plane",
+    "on_detection",
+    "height_m",
+    "touches_border",
+    "occluded",
+)
+"""Columns of a detection that a candidate needs."""
 
 
 def describe_scene(folder: Path, frame: int, *, topic: str | None = None) -> str:
@@ -34,7 +47,7 @@ def describe_scene(folder: Path, frame: int, *, topic: str | None = None) -> str
     finished = read_finished(folder)
     topic = _topic(folder, frame, topic)
     labelled = next(f for f in finished.frames() if (f.topic, f.index) == (topic, frame))
-    rows = _rows(folder, "tracks", topic, frame, ["topic", "frame", "detection", "track"])
+    rows = _rows(folder, "tracks", topic, frame, ["detection", "track"])
     deleted = {row["detection"] for row in rows if row["track"] not in finished.labels}
     scene = _read_scene(folder, labelled)
     scene, objects = _apply_labels(scene, labelled.objects, deleted)
@@ -49,7 +62,7 @@ def _read_scene(folder: Path, labelled: LabelledFrame) -> Scene:
     OutputError : an object stands on a plane or an object that the frame lacks, or on itself.
     """
     topic, frame, planes = labelled.topic, labelled.index, labelled.planes
-    rows = _rows(folder, "detections", topic, frame)
+    rows = _rows(folder, "detections", topic, frame, _CANDIDATE)
     if not _are_supported([row["on_detection"] for row in rows]) or any(
         row["plane"] not in (None, *range(len(planes))) for row in rows
     ):
@@ -85,14 +98,15 @@ def _candidate(row: dict[str, Any], planes: Sequence[Plane]) -> Candidate:
 
 
 def _rows(
-    folder: Path, table: str, topic: str, frame: int, columns: Sequence[str] | None = None
+    folder: Path, table: str, topic: str, frame: int, columns: Sequence[str]
 ) -> list[dict[str, Any]]:
-    rows = []
-    for group in read_row_groups(folder / f"{table}.parquet", columns):
-        keys = enumerate(keys_of(group))
-        chosen = pa.array([k for k, key in keys if key == (topic, frame)], pa.int64())
-        rows += group.take(chosen).to_pylist()
-    return rows
+    """Return the rows of a frame; of the other frames only the keys are read."""
+    path = folder / f"{table}.parquet"
+    groups = read_row_groups(path, ["topic", "frame"])
+    keys = enumerate(key for group in groups for key in keys_of(group))
+    wanted = np.array([k for k, key in keys if key == (topic, frame)], np.int64)
+    with opened(path, columns=columns) as file:
+        return [row for _, rows in read_rows(file, columns, wanted) for row in rows.to_pylist()]
 
 
 def _topic(folder: Path, frame: int, topic: str | None) -> str:
