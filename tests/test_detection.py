@@ -17,7 +17,7 @@ from shapecat.config import DetectionSettings
 from shapecat.detection import detect
 from shapecat.detection.depth_grid import row_and_column
 from shapecat.detection.virtual_camera import _count_occupied
-from shapecat.outputs.scene_graph import Hierarchy, Node, format_tree
+from shapecat.outputs.scene_graph import Node, format_tree
 from shapecat.types import Box, Camera, Candidate, Frame, Plane, Scene
 
 Array = NDArray[Any]
@@ -596,6 +596,10 @@ def test_any_cloud_gives_a_scene(n: int, seed: int, odd: float, spread: float) -
     assert np.isfinite(scene.up).all()
 
 
+def _named(node: Node) -> str:
+    return f"{node.kind} {node.index}"
+
+
 def test_hierarchy_puts_stacked_object_below_its_support() -> None:
     """An object on another one is no child of the plane (thesis 4.5)."""
     shapes = [
@@ -612,21 +616,16 @@ def test_hierarchy_puts_stacked_object_below_its_support() -> None:
         for k, c in enumerate(scene.candidates)
     }
     assert len(scene.candidates) == len(name) == 4
-    hierarchy = Hierarchy(scene)
-    on_plane = hierarchy.children(Node("plane", 0))
-    assert {node.index for node in on_plane} == {name[1], name[3], name[4]}
-    assert hierarchy.children(Node("object", name[1])) == (Node("object", name[2]),)
-    assert hierarchy.roots == (Node("plane", 0),)
-    assert len(set(hierarchy.nodes)) == 5
-    tree = format_tree(scene, str).splitlines()
-    assert [line.count("  ") for line in tree].count(2) == 1
+    lower, upper = f"  object {name[1]}", f"    object {name[2]}"
+    tree = format_tree(scene, _named).splitlines()
+    assert tree[0] == "plane 0"
+    assert {*tree[1:]} == {lower, upper, f"  object {name[3]}", f"  object {name[4]}"}
+    assert tree.index(upper) == tree.index(lower) + 1
 
 
 def test_hierarchy_of_bare_table_has_only_its_plane() -> None:
     depth, _ = render([table()])
-    hierarchy = Hierarchy(found(frame_of(depth)))
-    assert hierarchy.roots == hierarchy.nodes == (Node("plane", 0),)
-    assert hierarchy.children(Node("plane", 0)) == ()
+    assert format_tree(found(frame_of(depth)), _named) == "plane 0"
 
 
 @pytest.mark.parametrize("turn", [1, -1])
@@ -664,7 +663,7 @@ def test_hierarchy_puts_each_board_on_the_one_below(turn: int) -> None:
         candidate((0.2, 0.1, -0.62), (0.2, 0.25, 0.16), 0),  # below a board
     )
 
-    tree = format_tree(Scene(axes[2], planes, candidates), lambda node: f"{node.kind} {node.index}")
+    tree = format_tree(Scene(axes[2], planes, candidates), _named)
 
     assert tree.splitlines() == [
         "plane 0",
@@ -678,6 +677,29 @@ def test_hierarchy_puts_each_board_on_the_one_below(turn: int) -> None:
         "    plane 1",
         "      object 3",
         "  object 4",
+    ]
+
+
+def test_object_on_plane_and_on_object_is_below_both() -> None:
+    """A lid that leans on a pot also stands on the table; a mug on the lid is printed once."""
+    box = Box(np.zeros(3), np.ones(3), np.array([0, 0, 0, 1]))
+    below = ((0, None, 0.0), (0, 0, 0.0), (0, 1, 0.2), (None, None, 0.0))
+    candidates = [
+        Candidate(np.arange(60), box, plane, on, support, touches_border=False, occluded=False)
+        for plane, on, support in below
+    ]
+    up = np.array([0.0, 0.0, 1.0])
+    top = Plane(up, 0.0, np.zeros((3, 3)), 1.0, 0.7)
+
+    tree = format_tree(Scene(up, (top,), tuple(candidates)), _named)
+
+    assert tree.splitlines() == [
+        "plane 0",
+        "  object 0",
+        "    object 1",
+        "      object 2",
+        "  = object 1",
+        "object 3",
     ]
 
 
