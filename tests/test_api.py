@@ -210,7 +210,6 @@ def test_perceiving_points_finds_same_objects_as_depth_image(image: Any) -> None
     for one, other in zip(from_points.objects, from_depth.objects, strict=True):
         np.testing.assert_allclose(one.box.center, other.box.center, atol=0.005)
         assert np.isfinite(from_points.points_of(one)).all()
-    assert from_points.labelled.up is not None
     assert from_points.labelled.up @ [0, -0.622, -0.783] == pytest.approx(1, abs=0.001)
 
 

@@ -437,7 +437,9 @@ def test_unorganised_clouds_get_semantic_kitti_labels(tmp_path: Path) -> None:
         causal=np.ones(1),
     )
     frame = Frame("/scan", 0, 5, 5, "laser", points=points)
-    labelled = LabelledFrame("/scan", 0, 5, 5, "laser", None, (), (item,), (), {})
+    labelled = LabelledFrame(
+        "/scan", 0, 5, 5, "laser", None, (), (item,), (), {}, np.array([0, 0, 1])
+    )
     run: Any = {"model": {"categories": ["cup", "can"]}}
     finished = FinishedRun(tmp_path, run, {513: TrackLabel(513, "can", 1.0)})
 

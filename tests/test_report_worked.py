@@ -44,6 +44,7 @@ from shapecat.types import (
 )
 
 NAMES = ("cup", "can", "box")
+UP = np.array([0, -1, 0])
 
 
 def test_card_shows_views_times_and_sorted_posterior() -> None:
@@ -526,7 +527,7 @@ def test_card_without_recording_shows_view_with_most_points() -> None:
     for k, points in enumerate((5, 9, 7)):
         item = LabelledObject(5, "cup", 0.9, box, np.arange(points), gas, np.ones(1), np.ones(1))
         other = replace(item, track=6, indices=np.arange(99))  # not wanted from this frame
-        frame = LabelledFrame("/d", k, k, k, "camera", None, (), (other, item), (), {})
+        frame = LabelledFrame("/d", k, k, k, "camera", None, (), (other, item), (), {}, UP)
         taken.add(frame, None, None)
 
     assert {track: best.item.indices.size for track, best in taken.best.items()} == {5: 9}
@@ -573,7 +574,7 @@ def test_strip_boxes_scale_with_their_images() -> None:
     gas = NeuralGas(np.zeros((0, 3)), np.zeros((0, 2), int))
     box = Box(np.array([0, 0, 1]), np.full(3, 0.1), np.array([0, 0, 0, 1]))
     item = LabelledObject(5, "cup", 0.9, box, np.arange(3), gas, np.ones(1), np.ones(1))
-    labelled = LabelledFrame("/d", 0, 0, 0, "camera", None, (), (item,), (), {})
+    labelled = LabelledFrame("/d", 0, 0, 0, "camera", None, (), (item,), (), {}, UP)
     photo = np.zeros((900, 1200, 3), np.uint8)
     view = FramePicture((Mask(300, 90, np.ones((180, 240), bool)),), np.zeros(1), frame, photo)
     picture = _strip_frame(labelled, view, 0.0)

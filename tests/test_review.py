@@ -41,7 +41,8 @@ GAS = NeuralGas(
     np.array([[0, 1], [0, 2], [1, 2], [1, 3]]),
 )
 OUTLINE = np.array([[-1, 0.4, 0.5], [1, 0.4, 0.5], [1, 0.4, 2], [-1, 0.4, 2]])
-FLOOR = Plane(np.array([0, -1, 0]), -0.4, OUTLINE, 3.0, 0.0)
+UP = np.array([0, -1, 0])
+FLOOR = Plane(UP, -0.4, OUTLINE, 3.0, 0.0)
 RERUN = Path(sys.executable).with_name("rerun")
 
 
@@ -70,14 +71,9 @@ def scene(
     pose: Pose | None = None,
     ended: tuple[int, ...] = (),
 ) -> tuple[LabelledFrame, Frame]:
-    frame = image(k)
+    about = (TOPIC, k, stamp(k), stamp(k), "optical", pose)
     seconds = {"detect": 0.01 * k}
-    return (
-        LabelledFrame(
-            TOPIC, k, stamp(k), stamp(k), "optical", pose, (FLOOR,), tuple(objects), ended, seconds
-        ),
-        frame,
-    )
+    return LabelledFrame(*about, (FLOOR,), tuple(objects), ended, seconds, UP), image(k)
 
 
 def write(path: Path, scenes: Iterable[tuple[LabelledFrame, Frame]], **options: Any) -> Path:
@@ -717,7 +713,10 @@ def test_eye_steps_back_to_show_all_objects_if_near() -> None:
 
 @pytest.mark.parametrize("kind", ["planes", "image", "cloud", "nothing"])
 def test_view_of_a_frame_without_objects_shows_what_there_is(kind: str) -> None:
-    """A run without objects is opened to see why; its view must not be empty or upside down."""
+    """A run without objects is opened to see why; its view must not be empty or upside down.
+
+    Where no plane is found, detection takes the up direction of a camera even for a lidar.
+    """
     labelled, frame = scene(0)
     if kind != "planes":
         labelled = dataclasses.replace(labelled, planes=())
@@ -733,3 +732,10 @@ def test_view_of_a_frame_without_objects_shows_what_there_is(kind: str) -> None:
     assert np.array_equal(eye.up, [0, -1, 0] if kind in {"planes", "image"} else [0, 0, 1])
     assert (eye.position - eye.target) @ eye.up > 0.3
     assert kind != "image" or 0.9 < eye.target[2] < 1.1
+
+
+def test_view_has_measured_up_direction_even_without_planes() -> None:
+    """A camera that looks down would else show a slope."""
+    labelled, frame = scene(0)
+    labelled = dataclasses.replace(labelled, planes=(), up=np.array([0.1, -0.7, -0.7]))
+    assert choose_eye(labelled, frame, fixed=False).up == pytest.approx([0.1, -0.7, -0.7])

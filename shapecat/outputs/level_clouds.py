@@ -8,7 +8,7 @@ from shapecat.arrays import F4, U4
 from shapecat.geometry import level_from_sensor, quaternion_from_rotation, transform
 from shapecat.types import Frame, LabelledFrame, LabelledObject, Pose
 
-__all__ = ["finite_points", "support_offset", "upright_cloud", "upward", "write_pcd"]
+__all__ = ["finite_points", "support_offset", "upright_cloud", "write_pcd"]
 
 
 def write_pcd(path: Path, points: F4, *, viewpoint: Pose) -> None:
@@ -42,19 +42,6 @@ def support_offset(item: LabelledObject, up: F4) -> float:
     return middle - (item.height_m if np.isfinite(item.height_m) else half)
 
 
-def upward(labelled: LabelledFrame) -> F4:
-    """Return the up direction of a frame in the sensor frame, a unit vector (3,).
-
-    Raises
-    ------
-    ValueError : the up direction is unknown.
-    """
-    if labelled.up is None:
-        msg = f"frame {labelled.index} of {labelled.topic} has no up direction"
-        raise ValueError(msg)
-    return labelled.up
-
-
 def upright_cloud(
     labelled: LabelledFrame, frame: Frame, item: LabelledObject
 ) -> tuple[F4, Pose] | None:
@@ -65,6 +52,5 @@ def upright_cloud(
     points = finite_points(frame, item.indices)
     if not len(points):
         return None
-    up = upward(labelled)
-    level = level_from_sensor(up, support_offset(item, up), points)
+    level = level_from_sensor(labelled.up, support_offset(item, labelled.up), points)
     return transform(level, points).astype(np.float32), level

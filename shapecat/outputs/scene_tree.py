@@ -8,7 +8,6 @@ from typing import Any
 import numpy as np
 
 from shapecat.errors import OutputError
-from shapecat.outputs.level_clouds import upward
 from shapecat.outputs.scene_graph import Node, format_tree
 from shapecat.runs.finished import read_finished
 from shapecat.runs.tables.reading import keys_of, opened, read_row_groups, read_rows
@@ -70,7 +69,7 @@ def _read_scene(folder: Path, labelled: LabelledFrame) -> Scene:
         msg = f"{folder}: {damage}; process the recording again"
         raise OutputError(msg)
     objects = [_candidate(row, planes) for row in rows]
-    return Scene(upward(labelled), planes, tuple(objects))
+    return Scene(labelled.up, planes, tuple(objects))
 
 
 def _are_supported(below: Sequence[int | None]) -> bool:

@@ -52,7 +52,7 @@ class LabelledFrame(Record):
     fixed_from_sensor : None where the recording has no fixed frame.
     ended : tracks whose last frame was the previous one of the topic.
     seconds : time spent in each stage.
-    up : (3,) unit vector, sensor frame; None if unknown.
+    up : (3,) unit vector, sensor frame.
     reused_from : index of the earlier frame from which the scene is copied; None if it is new.
     masks : None without a colour image.
     """
@@ -67,7 +67,7 @@ class LabelledFrame(Record):
     objects: tuple[LabelledObject, ...]
     ended: tuple[int, ...]
     seconds: dict[str, float]
-    up: F4 | None = array("3", "f4", default=None)
+    up: F4 = array("3", "f4")
     reused_from: int | None = None
     masks: ImageMasks | None = None
 

@@ -21,7 +21,7 @@ from shapecat.cameras.colour import LensCamera
 from shapecat.colour.projection import project, rectified
 from shapecat.geometry import IDENTITY, rotation_from_quaternion
 from shapecat.outputs.colouring import Coloured, ExportedFrame
-from shapecat.outputs.level_clouds import finite_points, upward
+from shapecat.outputs.level_clouds import finite_points
 from shapecat.recordings import MessageError
 from shapecat.recordings.decoding.colour_image import pixels_of
 from shapecat.runs.finished import FinishedRun
@@ -50,8 +50,8 @@ def write_kitti(out: Path, frames: Iterable[ExportedFrame], _finished: FinishedR
         for number, (labelled, frame, coloured) in enumerate(frames):
             view = _write_image(out, number, frame, coloured)
             index.writerow((f"{number:06d}", labelled.topic, labelled.index, labelled.stamp_ns))
-            up = upward(labelled)
-            turn = rectified_from_sensor(up, optical=frame.organized or bool(up[1] < -0.7))
+            optical = frame.organized or bool(labelled.up[1] < -0.7)
+            turn = rectified_from_sensor(labelled.up, optical=optical)
             lines = [_label(item, frame, turn, view) for item in labelled.objects]
             (out / "label_2" / f"{number:06d}.txt").write_text("".join(lines), "utf-8")
             (out / "calib" / f"{number:06d}.txt").write_text(_calibration(view, turn), "utf-8")

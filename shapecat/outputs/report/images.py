@@ -132,9 +132,9 @@ def _organized(labelled: LabelledFrame, frame: Frame) -> tuple[Frame, list[U4]] 
     return organized_frame, [cell[cell >= 0].astype(np.uint32) for cell in cells]
 
 
-def _upright(points: F4, up: F4 | None) -> F8:
+def _upright(points: F4, up: F4) -> F8:
     """Return the rotation (3, 3) from the sensor to a level optical frame that faces a cloud."""
-    level = gravity_rotation((0.0, -1.0, 0.0) if up is None else up)
+    level = gravity_rotation(up)
     x, y, _ = np.nan_to_num(np.nanmean(points @ level.T, axis=0)) if len(points) else (1.0, 0, 0)
     norm = np.hypot(x, y)
     x, y = (x / norm, y / norm) if norm > 1e-6 else (1.0, 0.0)

@@ -30,9 +30,6 @@ from shapecat.types import Frame, LabelledFrame, LabelledObject, NeuralGas
 
 __all__ = ["Pictures", "StripFrame", "TrackPictures", "take_pictures"]
 
-_UPRIGHT = np.array([0.0, -1.0, 0.0], np.float32)
-"""Up direction of a camera that is held upright, used if the up direction is unknown."""
-
 
 class TrackPictures(NamedTuple):
     """The best view of a track: crop, drawings of the surface, and size of the full box in metres.
@@ -164,10 +161,9 @@ def _strip_frame(labelled: LabelledFrame, image: FramePicture, seconds: float) -
 def _snapshot(labelled: LabelledFrame, frame: Frame | None, item: LabelledObject) -> Snapshot:
     """Return the points and mesh of an object in the level frame, its support at z = 0."""
     points = _points(frame, item)
-    up = _UPRIGHT if labelled.up is None else labelled.up
     neurons, middle = item.gas.neurons, np.asarray([item.box.center])
     body = next(points for points in (points, neurons, middle) if len(points))
-    level = level_from_sensor(up, support_offset(item, up), body)
+    level = level_from_sensor(labelled.up, support_offset(item, labelled.up), body)
     gas = NeuralGas(transform(level, neurons), item.gas.edges)
     return Snapshot(transform(level, points), gas, level.translation)
 

@@ -56,7 +56,7 @@ def choose_eye(labelled: LabelledFrame, frame: Frame, *, fixed: bool) -> Eye:
     """
     pose = labelled.fixed_from_sensor if fixed else None
     pose = pose or IDENTITY
-    up = _up(labelled, frame, pose, fixed=fixed)
+    up = np.array([0.0, 0.0, 1.0]) if fixed else _up(labelled, frame)
     target, radius = _subject(labelled, frame, pose)
     back = pose.translation - target
     back = back - (back @ up) * up
@@ -81,12 +81,11 @@ def stepped_back(eye: Eye, low: F8, high: F8) -> Eye:
     return Eye(middle + away / np.linalg.norm(away) * distance, middle, eye.up)
 
 
-def _up(labelled: LabelledFrame, frame: Frame, pose: Pose, *, fixed: bool) -> F8:
-    if fixed:
-        return np.array([0.0, 0.0, 1.0])
-    if labelled.planes:
-        return np.asarray(pose.rotation @ labelled.planes[0].normal)
-    return np.array([0.0, -1.0, 0.0] if frame.organized else [0.0, 0.0, 1.0])
+def _up(labelled: LabelledFrame, frame: Frame) -> F8:
+    """Return the up direction (3,) of a frame, or a likely one if no plane confirms it."""
+    if labelled.planes or frame.organized:
+        return np.asarray(labelled.up, np.float64)
+    return np.array([0.0, 0.0, 1.0])  # of a lidar, not of a camera as detection assumes
 
 
 def _subject(labelled: LabelledFrame, frame: Frame, pose: Pose) -> tuple[F8, float]:
