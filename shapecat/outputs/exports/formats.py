@@ -291,7 +291,7 @@ def _require_own(target: Path, about: Mapping[str, Any]) -> None:
         previous = f"{target}: holds the {format} export of another recording"
         msg = f"{previous}; choose another --out{hint}"
         raise OutputError(msg)
-    if earlier.get("topics", about.get("topics")) != about.get("topics"):
+    if earlier.get("topics") != about.get("topics"):
         msg = f"{target}: holds the {format} export of other topics; choose another --out"
         raise OutputError(msg)
     if not _covers(about.get("range_s"), earlier.get("range_s")):
@@ -308,10 +308,10 @@ def _require_own(target: Path, about: Mapping[str, Any]) -> None:
 def _covers(new: Any, old: Any) -> bool:
     """Return whether the time range ``new`` includes ``old``.
 
-    A range that is None is unknown, and fits; a limit that is None is that of the recording.
+    Data sets have no range: theirs is None. A limit that is None is that of the recording.
     """
     if new is None or old is None:
-        return True
+        return new is old
     (start, end), (old_start, old_end) = (
         (first or 0, math.inf if last is None else last) for first, last in (new, old)
     )
