@@ -20,8 +20,7 @@ from shapecat.errors import OutputError, RecordingError
 from shapecat.evaluation.dataset import read_dataset
 from shapecat.geometry import rotation_from_quaternion
 from shapecat.outputs.exports.crops import Origin
-from shapecat.outputs.exports.dataset_frames import Selection
-from shapecat.outputs.exports.formats import common_categories, export_dataset, export_run
+from shapecat.outputs.exports.formats import common_categories, export_run
 from shapecat.outputs.exports.kitti import rectified_from_sensor
 from shapecat.outputs.exports.points import write_point_labels
 from shapecat.runs.finished import FinishedRun, open_source, read_finished
@@ -568,13 +567,3 @@ def test_crops_of_ranges_within_a_second_are_told_apart() -> None:
 
     assert Origin.read(f"lab.{second}.track-3") == second
     assert not first.shares_frames(second)
-
-
-def test_unknown_format_is_refused_before_anything_is_read(tmp_path: Path) -> None:
-    """*yolo* is a format of data sets only, *kitti* one of single runs."""
-    out = tmp_path / "out"
-    with pytest.raises(ValueError, match=r"no export format 'yolo'; known: .*kitti"):
-        export_run(tmp_path, "yolo", out)
-    with pytest.raises(ValueError, match=r"no data set format 'kitti'; known: .*yolo"):
-        export_dataset([tmp_path], "kitti", out, Selection())
-    assert list(tmp_path.iterdir()) == []

@@ -90,13 +90,10 @@ def split_runs(runs: Sequence[FinishedRun], val: float) -> list[str]:
     The random draw depends on the content of the recordings, so that adding runs changes little. A
     single recording goes to the training split.
 
-    Raises
-    ------
-    ValueError : ``val`` is not in [0, 1).
+    Parameters
+    ----------
+    val : fraction of the recordings for the validation split, from 0 to below 1.
     """
-    if not 0 <= val < 1:
-        msg = f"val must be at least 0 and less than 1, got {val}"
-        raise ValueError(msg)
     digests = {run.info["input"]["digest"] or run.name for run in runs}
     order = sorted(digests, key=lambda digest: xxhash.xxh3_64_hexdigest(digest.encode()))
     chosen = set(order[: min(round(val * len(order)), len(order) - 1)])

@@ -97,14 +97,10 @@ def export_run(
 
     Raises
     ------
-    ValueError : the format is unknown.
     OutputError : the folder is not a finished run, the content of the recording has changed, or
         ``out`` is not writable, is a run, or holds something else.
     RecordingError : the recording is missing or unreadable.
     """
-    if format not in FORMATS:
-        msg = f"no export format {format!r}; known: {', '.join(FORMATS)}"
-        raise ValueError(msg)
     if (out / "run.json").exists():
         msg = f"{out}: is a run; choose another --out"
         raise OutputError(msg)
@@ -144,20 +140,16 @@ def export_dataset(
 
     Parameters
     ----------
-    format : ``coco`` or ``yolo``.
+    format : a key of `DATASETS`.
     recording : path of the recording of a single run; by default where it was processed.
     observe : called with the phase, the number of frames done, and the total.
 
     Raises
     ------
-    ValueError : the format is unknown.
     OutputError : a folder is not a finished run, a run has no images, no image can be exported, the
         content of a recording has changed, or ``out`` is not writable or holds something else.
     RecordingError : a recording is missing or unreadable.
     """
-    if format not in DATASETS:
-        msg = f"no data set format {format!r}; known: {', '.join(DATASETS)}"
-        raise ValueError(msg)
     runs = [read_finished(folder) for folder in folders]
     categories = _common(runs)
     total = sum(int(run.info["counts"]["frames"]) for run in runs)
