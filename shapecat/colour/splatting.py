@@ -1,7 +1,6 @@
 """A depth image as a colour camera sees it: its pixels splatted, the nearest on top."""
 
 from collections.abc import Sequence
-from typing import NamedTuple
 
 import numpy as np
 
@@ -11,7 +10,7 @@ from shapecat.colour.projection import Lens, kernel_lens, project_in_place
 from shapecat.jit import kernel
 from shapecat.types import Camera, Pose
 
-__all__ = ["SplattedLabels", "splat_depth"]
+__all__ = ["splat_depth"]
 
 _FOOTPRINT_PX = 0.05
 """Margin on each side of a splatted depth pixel, in colour pixels, to leave no gaps."""
@@ -23,27 +22,9 @@ _BESIDE_PX = 30
 """Margin around the objects in the colour image, in depth pixels."""
 
 
-class SplattedLabels(NamedTuple):
-    """The labels in the part of the colour image where the objects are.
-
-    Attributes
-    ----------
-    left, top : column and row, in the image, of the first pixel of the part.
-    labels : (h, w) int32 the object, from 1; 0 for another surface, -1 where nothing is known.
-        Label 0 occurs only within ``boxes``.
-    boxes : (n + 1, 4) bounding box of each label's pixels, including hidden ones:
-        left, top, right + 1, bottom + 1, in pixels of the part; zeros for a label without pixels.
-    """
-
-    left: int
-    top: int
-    labels: I4
-    boxes: I4
-
-
 def splat_depth(
     depth: F4, camera: Camera, objects: Sequence[U4], lens: LensCamera, colour_from_depth: Pose
-) -> SplattedLabels:
+) -> tuple[int, int, I4, I4]:
     """Label the pixels of a colour camera with the objects of a depth image.
 
     Each depth pixel of an object covers a square of its own size on the colour image, slightly
@@ -58,6 +39,14 @@ def splat_depth(
     lens : the colour camera.
     colour_from_depth : pose of the depth sensor in the optical frame of the colour camera.
 
+    Returns
+    -------
+    left, top : column and row, in the image, of the first pixel of the part with the objects.
+    labels : (h, w) int32 the object, from 1; 0 for another surface, -1 where nothing is known.
+        Label 0 occurs only within ``boxes``.
+    boxes : (n + 1, 4) bounding box of each label's pixels, including hidden ones:
+        left, top, right + 1, bottom + 1, in pixels of the part; zeros for a label without pixels.
+
     Notes
     -----
     Time grows with the pixels of the objects, the pixels that they cover, and a sixteenth of the
@@ -70,7 +59,7 @@ def splat_depth(
     rays, size = _rays(camera, colour_from_depth), (target.width, target.height)
     boxes = np.zeros((len(objects) + 1, 4), np.int64)
     left, top, splat = _splat(depth, pixels, labels, rays, kernel_lens(lens), scale, size, boxes)
-    return SplattedLabels(left, top, splat, boxes)
+    return left, top, splat, boxes
 
 
 def _rays(camera: Camera, colour_from_depth: Pose) -> tuple[F4, F4, F4]:
@@ -97,7 +86,7 @@ def _splat(
     size: tuple[int, int],
     boxes: I4,
 ) -> tuple[int, int, I4]:
-    """Return left, top and labels of the `SplattedLabels`, and write their boxes to ``boxes``.
+    """Return left, top and labels as `splat_depth` does, and write their boxes to ``boxes``.
 
     ``pixels`` and ``labels`` (n,) are flat depth pixels and their objects; ``scale`` is the colour
     pixels per depth pixel at equal distance; ``size`` is width and height of the colour image.

@@ -1,6 +1,6 @@
 """The box of a whole object, estimated from its visible sides."""
 
-from shapecat.completion.fused import BoxViews, FusedBox, FusedBoxes, fuse_boxes
+from shapecat.completion.fused import BoxViews, FusedBox, fuse_boxes
 from shapecat.completion.outline import DIRECTIONS
 from shapecat.completion.whole import ENOUGH_POINTS, complete
 
@@ -9,7 +9,6 @@ __all__ = [
     "ENOUGH_POINTS",
     "BoxViews",
     "FusedBox",
-    "FusedBoxes",
     "complete",
     "fuse_boxes",
 ]

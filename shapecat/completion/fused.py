@@ -9,7 +9,7 @@ from shapecat.arrays import F8, Bool
 from shapecat.completion.outline import COSINES, DIRECTIONS, SINES
 from shapecat.completion.whole import faced, footprint
 
-__all__ = ["BoxViews", "FusedBox", "FusedBoxes", "fuse_boxes"]
+__all__ = ["BoxViews", "FusedBox", "fuse_boxes"]
 
 _STILL_M = 0.05
 """While the centre moves less than this, the object stands still."""
@@ -54,15 +54,6 @@ class BoxViews(NamedTuple):
     sensors: F8
 
 
-class FusedBoxes(NamedTuple):
-    """The box of one object in k views, of the same size in all; fields as in `BoxViews`."""
-
-    centers: F8
-    axes: F8
-    sizes: F8
-    stds: F8
-
-
 class FusedBox(NamedTuple):
     """The box of an object, fused from the views in which it stands in one place.
 
@@ -80,20 +71,19 @@ class FusedBox(NamedTuple):
     std: F8
     round: bool
 
-    def in_views(self, centers: F8, axes: F8, sizes: F8) -> FusedBoxes:
-        """Return the box in views (k,) of the object, given their boxes as in `BoxViews`.
+    def in_views(self, centers: F8, axes: F8, sizes: F8) -> tuple[F8, F8]:
+        """Return centre (k, 3) and axes (k, 3, 3) in views of the object, given their boxes.
 
-        A view that shows the object elsewhere, or turned, keeps its own centre and yaw.
+        A view that shows the object elsewhere, or turned, keeps its own centre and yaw. All are as
+        in `BoxViews`.
         """
         still = _near(centers, self.place)
         if not self.round:
             elongation = float(_elongation(self.size[None])[0])
             still &= ~_turned_from(self.axes, elongation, axes, sizes)
-        return FusedBoxes(
+        return (
             np.where(still[:, None], self.center, centers),
             np.where(still[:, None, None], self.axes, _alike(axes, sizes, self.size)),
-            np.tile(self.size, (len(centers), 1)),
-            np.tile(self.std, (len(centers), 1)),
         )
 
 

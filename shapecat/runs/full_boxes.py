@@ -127,11 +127,12 @@ class FullBoxes:
         for first in range(0, len(sighting.rows), _BLOCK):
             block = slice(first, first + _BLOCK)
             boxes, poses = sighting.boxes[block], self.frames.poses_of(sighting.rows[block])
-            in_view = fused.in_views(*_placed(boxes, poses), boxes[:, 3:6])
+            centers, axes = fused.in_views(*_placed(boxes, poses), boxes[:, 3:6])
             turns, places = poses[:, :, :3], poses[:, :, 3]
-            back = np.einsum("kji,kj->ki", turns, in_view.centers - places)
-            quaternions = Rotation.from_matrix(np.swapaxes(turns, 1, 2) @ in_view.axes).as_quat()
-            result[sighting.at[block]] = np.hstack([back, in_view.sizes, quaternions, in_view.stds])
+            back = np.einsum("kji,kj->ki", turns, centers - places)
+            quaternions = Rotation.from_matrix(np.swapaxes(turns, 1, 2) @ axes).as_quat()
+            size, std = (np.broadcast_to(values, back.shape) for values in (fused.size, fused.std))
+            result[sighting.at[block]] = np.hstack([back, size, quaternions, std])
 
     def _read(self, rows: Sequence[I4], values: _Selection) -> list[F4]:
         """Return the values (n, k) of the rows (n,) of the table that each track has."""
