@@ -110,8 +110,7 @@ def take_screenshot(path: Path, png: Path) -> None:
             _wait_for(viewer, port, log)
             client = ViewerClient(f"rerun+http://{_HERE}:{port}/proxy")
             _show(client, path)
-            client.save_screenshot(str(png.absolute()))
-            _wait_until(png.exists)
+            client.save_screenshot(str(png.absolute()))  # returns once it is saved
         except (RuntimeError, OSError) as error:
             ended = _has_ended(viewer)
             msg = _why(log) if ended else f"{path}: the viewer cannot draw it: {error}"
