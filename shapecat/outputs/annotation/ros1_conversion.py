@@ -24,9 +24,9 @@ from shapecat.outputs.annotation.content import AnnotationChannel
 from shapecat.recordings.decoding.decoders import LIBRARY_ERRORS, typestore_of
 from shapecat.recordings.messages import Channel
 
-__all__ = ["RAW_TYPE", "ConvertedChannel", "convert_channel", "raw_channel", "wrap_raw"]
+__all__ = ["convert_channel", "raw_channel", "wrap_raw"]
 
-RAW_TYPE = "shapecat_msgs/msg/RawMessage"
+_RAW_TYPE = "shapecat_msgs/msg/RawMessage"
 _RENAMED = {"tf/msg/tfMessage": "tf2_msgs/msg/TFMessage"}
 _FOREVER = QosTime(2147483647, 4294967295)
 _LATCHED = Qos(
@@ -48,10 +48,10 @@ _FIELD = re.compile("[a-z](_?[a-z0-9])*")
 _KEPT = 64
 """Number of definitions for which types are kept: thousands of topics may share one."""
 
-ConvertedChannel = tuple[AnnotationChannel, Callable[[bytes | memoryview], memoryview]]
+_ConvertedChannel = tuple[AnnotationChannel, Callable[[bytes | memoryview], memoryview]]
 
 
-def convert_channel(channel: Channel) -> ConvertedChannel | None:
+def convert_channel(channel: Channel) -> _ConvertedChannel | None:
     """Convert a ROS 1 channel to ROS 2.
 
     Types keep the definition in the bag, with names that ROS 2 allows (``O_T_EE`` becomes
@@ -108,7 +108,7 @@ def _renamed(constants: Any, fields: Any) -> Any:
 def raw_channel(topic: str) -> AnnotationChannel:
     """Return the channel for messages that are kept as recorded; see `wrap_raw`."""
     text = files("shapecat.schemas").joinpath("RawMessage.msg").read_bytes()
-    return AnnotationChannel(topic, "cdr", RAW_TYPE, "ros2msg", text)
+    return AnnotationChannel(topic, "cdr", _RAW_TYPE, "ros2msg", text)
 
 
 def wrap_raw(channel: Channel, data: bytes | memoryview) -> memoryview:
@@ -117,17 +117,17 @@ def wrap_raw(channel: Channel, data: bytes | memoryview) -> memoryview:
     Most ROS tools cannot play or open a file with two encodings.
     """
     store = _raw_store()
-    message = store.types[RAW_TYPE](
+    message = store.types[_RAW_TYPE](
         type=channel.type,
         encoding=channel.encoding,
         definition=channel.schema.decode("utf-8", "replace"),
         data=np.frombuffer(data, np.uint8),
     )
-    return store.serialize_cdr(message, RAW_TYPE)
+    return store.serialize_cdr(message, _RAW_TYPE)
 
 
 @cache
 def _raw_store() -> Typestore:
     store = get_typestore(Stores.EMPTY)
-    store.register(get_types_from_msg(raw_channel("").schema.decode(), RAW_TYPE))
+    store.register(get_types_from_msg(raw_channel("").schema.decode(), _RAW_TYPE))
     return store

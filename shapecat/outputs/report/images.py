@@ -20,9 +20,9 @@ from shapecat.recordings.decoding.colour_image import pixels_of
 from shapecat.recordings.messages import MessageError
 from shapecat.types import Camera, Frame, LabelledFrame
 
-__all__ = ["CROP_PX", "Crop", "FramePicture", "crop_of", "encode", "prepare_picture", "worth_of"]
+__all__ = ["Crop", "FramePicture", "crop_of", "encode", "prepare_picture", "worth_of"]
 
-CROP_PX = 256
+_CROP_PX = 256
 """Longest side of the picture of an object."""
 
 _FRAME_PX = 960
@@ -235,7 +235,7 @@ def _window(image: FramePicture, mask: Mask) -> Window:
 
 def _cut(frame_image: FramePicture, window: Window) -> Image.Image:
     image = Image.fromarray(frame_image.pixels(window))
-    scale = CROP_PX / max(image.size)
+    scale = _CROP_PX / max(image.size)
     size = (max(1, round(image.width * scale)), max(1, round(image.height * scale)))
     return image.resize(size, Image.Resampling.BICUBIC if scale > 1 else Image.Resampling.BOX)
 

@@ -11,7 +11,7 @@ from shapecat.outputs.png import png
 from shapecat.surface.triangles import triangles_of
 from shapecat.types import NeuralGas
 
-__all__ = ["MOST_POINTS", "SIDE", "Snapshot", "SurfaceDrawing", "draw", "graph_points"]
+__all__ = ["MOST_POINTS", "SIDE", "Snapshot", "SurfaceDrawing", "draw"]
 
 SIDE = 160
 """Width and height of a picture in pixels."""
@@ -49,7 +49,7 @@ def draw(shot: Snapshot, colour: tuple[int, int, int]) -> tuple[SurfaceDrawing, 
     All three drawings have the same scale, from the sphere around the points and neurons.
     """
     points = np.asarray(shot.points[:: 1 + len(shot.points) // MOST_POINTS], np.float64)
-    points = points if len(points) else np.asarray(graph_points(shot.gas), np.float64)
+    points = points if len(points) else np.asarray(_graph_points(shot.gas), np.float64)
     everything = np.concatenate([points, shot.gas.neurons])
     if not len(everything):
         everything = points = np.zeros((1, 3))
@@ -83,7 +83,7 @@ def draw(shot: Snapshot, colour: tuple[int, int, int]) -> tuple[SurfaceDrawing, 
     return tuple(pictures)
 
 
-def graph_points(gas: NeuralGas) -> F4:
+def _graph_points(gas: NeuralGas) -> F4:
     """Return points (n, 3), metres, on the triangles and edges of a mesh, to replace its cloud."""
     corners = gas.neurons[triangles_of(gas.edges, len(gas.neurons))]
     weights = np.array([[a, b, 8 - a - b] for a in range(9) for b in range(9 - a)]) / 8

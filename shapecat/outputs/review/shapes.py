@@ -31,7 +31,6 @@ __all__ = [
     "SCENE",
     "SKETCH",
     "DrawnScene",
-    "Way",
     "label",
     "markdown",
     "pinhole",
@@ -48,7 +47,7 @@ _DASHES = (np.arange(5)[:, None] + [0.0, 0.5])[..., None] / 4.5
 """Start and end (5, 2, 1) of the dashes of an edge, as fractions of its length, from 0 to 1."""
 
 _Columns = Iterable[rr.ComponentColumn]
-Way = tuple[str, F8]
+_Way = tuple[str, F8]
 """The category of a track and its path (n, 3), metres."""
 
 
@@ -225,7 +224,7 @@ SKETCH: Mapping[str, Drawing] = {
 """The `Drawing` of each entity below the sensor, made from the objects' `Sketch` in every frame."""
 
 
-def _paths(snapshots: Sequence[Sequence[Way]]) -> _Columns:
+def _paths(snapshots: Sequence[Sequence[_Way]]) -> _Columns:
     strips = [way for snapshot in snapshots for way in snapshot]
     yield from rr.LineStrips3D.columns(
         strips=[places for _, places in strips],
