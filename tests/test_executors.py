@@ -21,7 +21,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from shapecat.errors import ConfigError
+from shapecat.errors import ConfigError, ShapecatError
 from shapecat.executors import (
     LocalExecutor,
     ProgressReceiver,
@@ -421,6 +421,31 @@ def test_dask_without_a_worker_is_known_to_wait() -> None:
         cluster.scale(1)
         assert executor.submit(abs, -3).result(timeout=60) == 3
         assert not executor.lacks_workers()
+
+
+@pytest.mark.parametrize("status", ["closing", "closed"])
+def test_lost_dask_scheduler_is_a_known_error(status: str) -> None:
+    """Dask closes the client of a scheduler that does not come back within half a minute.
+
+    A call submitted to a closed client was a traceback, and to one that was closing never ended.
+    """
+
+    class ClosedClientError(Exception):
+        """Stands for the error of `distributed.client`."""
+
+    def cancel(*, wait: bool) -> None:
+        raise ClosedClientError(wait)
+
+    executor = SimpleNamespace(submit=lambda *_: Future(), shutdown=cancel)
+    client: Any = SimpleNamespace(
+        get_executor=lambda **_: executor, status=status, close=lambda **_: None
+    )
+
+    with (
+        pytest.raises(ShapecatError, match=r"scheduler is gone.*run the same command"),
+        _DaskExecutor(client, None) as dask,
+    ):
+        dask.submit(abs, -3)
 
 
 def test_processes_keep_order_and_hold_few_items() -> None:

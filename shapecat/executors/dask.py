@@ -5,7 +5,7 @@ from concurrent.futures import Future
 from contextlib import suppress
 from typing import Any
 
-from shapecat.errors import ConfigError
+from shapecat.errors import ConfigError, ShapecatError
 from shapecat.executors.cores import single_threaded
 from shapecat.executors.interface import WorkerExecutor
 
@@ -24,6 +24,10 @@ class _DaskExecutor(WorkerExecutor):
         self._executor = client.get_executor(pure=False)
 
     def submit(self, fn: Any, /, *args: Any, **kwargs: Any) -> Future[Any]:
+        """Submit a call; raise `ShapecatError` if the scheduler was lost and did not come back."""
+        if self._is_cut_off():
+            msg = "the Dask scheduler is gone: start it again, and run the same command again"
+            raise ShapecatError(msg)
         future: Future[Any] = self._executor.submit(fn, *args, **kwargs)
         return future
 
@@ -37,8 +41,13 @@ class _DaskExecutor(WorkerExecutor):
 
     def terminate(self) -> None:
         """Cancel waiting tasks, and end the workers started here."""
-        self._executor.shutdown(wait=False)
+        if not self._is_cut_off():
+            self._executor.shutdown(wait=False)
         self._close(1)
+
+    def _is_cut_off(self) -> bool:
+        """Return whether the client gave up: it refuses calls, or accepts them and forgets them."""
+        return self._client.status in {"closing", "closed"}
 
     def _close(self, timeout_s: float) -> None:
         for each in (self._client, self._cluster):
