@@ -303,6 +303,20 @@ def test_frames_with_equal_stamps_are_told_apart(tmp_path: Path) -> None:
     assert labels_of(target) == {1: "mug", 2: "tin"}
 
 
+@pytest.mark.parametrize("kept", [slice(0), slice(0, None, 2)])
+def test_detections_of_another_run_are_refused(tmp_path: Path, kept: slice) -> None:
+    """A frame that is missing was a KeyError, and a detection an IndexError."""
+    objects = {1: static((0, 0, 1)), 2: static((1, 0, 1))}
+    source = make_run(tmp_path / "a", objects, labels={1: "bowl"})
+    target = make_run(tmp_path / "b", objects)
+    path = target / "detections.parquet"
+    rows = pq.read_table(path).to_pylist()[kept]
+    write_table(path, {name: [row[name] for row in rows] for name in DETECTIONS.names}, DETECTIONS)
+
+    with pytest.raises(OutputError, match="tables do not fit together"):
+        match_labels(source, target)
+
+
 def test_run_without_objects_misses_each_label(tmp_path: Path) -> None:
     """An error about fixed frames, which one recording does not need, would hide the reason."""
     labels = {1: "mug", 2: "merge with 1"}

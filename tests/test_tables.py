@@ -33,7 +33,7 @@ from shapecat.runs.run_info import (
     RunInfo,
     parse_run,
 )
-from shapecat.runs.tables.masks import read_masks
+from shapecat.runs.tables.masks import mask_columns, read_masks, read_nearest_masks
 from shapecat.runs.tables.reading import (
     opened,
     read_row_groups,
@@ -41,7 +41,7 @@ from shapecat.runs.tables.reading import (
     read_together,
     with_fixed_lists,
 )
-from shapecat.runs.tables.schemas import ADDED, DETECTIONS, FRAMES, PLANES, TABLES, TRACKS
+from shapecat.runs.tables.schemas import ADDED, DETECTIONS, FRAMES, MASKS, PLANES, TABLES, TRACKS
 from shapecat.runs.tables.segments import SEGMENTS, list_segments
 from shapecat.runs.tables.writing import arrow_table, lists, open_writer, write_table
 from shapecat.types import (
@@ -309,7 +309,7 @@ def test_edited_detections_are_refused(tmp_path: Path, change: Callable[[Any], A
     pq.write_table(pa.Table.from_pylist(change(pq.read_table(path).to_pylist()), DETECTIONS), path)
     labels = {5: TrackLabel(5, "cup", 0.7), 6: TrackLabel(6, "cup", 0.7)}
 
-    with pytest.raises(OutputError, match="tracks do not fit its detections"):
+    with pytest.raises(OutputError, match="tables do not fit together"):
         list(read_annotation_frames(tmp_path, LabelledTracks.read(tmp_path, labels)))
 
 
@@ -321,8 +321,22 @@ def test_track_of_missing_detection_is_refused(tmp_path: Path) -> None:
     labels = {5: TrackLabel(5, "cup", 0.7)}
     boxes = read_annotation_frames(tmp_path, LabelledTracks.read(tmp_path, labels))
     for frames in (boxes, read_labelled_frames(tmp_path, labels)):
-        with pytest.raises(OutputError, match="tracks do not fit its detections"):
+        with pytest.raises(OutputError, match="tables do not fit together"):
             list(frames)
+
+
+def test_masks_of_missing_frame_are_refused(tmp_path: Path) -> None:
+    """It was a RuntimeError, and an export wrote all later frames without masks."""
+    write_run_tables(tmp_path, [1, 1])
+    write_tracks(tmp_path, [(5, 0, 0)])
+    masks = ImageMasks("/rgb", 1000, 2000, "c", 40, 30, {0: (3, 4, 7, 9)}, {0: np.array([7])})
+    perceived = [replace(perception(index, 1), masks=masks) for index in (0, 5, 1)]
+    write_table(tmp_path / "masks.parquet", mask_columns(perceived), MASKS)
+
+    labels = {5: TrackLabel(5, "cup", 0.7)}
+    for found in (read_nearest_masks(tmp_path), read_labelled_frames(tmp_path, labels)):
+        with pytest.raises(OutputError, match="tables do not fit together"):
+            list(found)
 
 
 def test_rewritten_table_with_other_row_groups_is_refused(tmp_path: Path) -> None:

@@ -10,10 +10,10 @@ import pyarrow as pa
 
 from shapecat.arrays import F4
 from shapecat.geometry import box_around
-from shapecat.runs.labelled_tracks import LabelledTracks, misfit
+from shapecat.runs.labelled_tracks import LabelledTracks
 from shapecat.runs.labels.meaning import TrackLabel
 from shapecat.runs.tables.masks import read_masks
-from shapecat.runs.tables.reading import Key, numbers, read_together
+from shapecat.runs.tables.reading import Key, misfit, numbers, read_together
 from shapecat.system.memory import release_memory
 from shapecat.types import (
     Box,
@@ -54,7 +54,7 @@ def read_labelled_frames(folder: Path, labels: Mapping[int, TrackLabel]) -> Iter
 
     Raises
     ------
-    OutputError : a table is unreadable, or tracks and detections do not fit together.
+    OutputError : a table is unreadable, or the tables do not fit together.
     """
     tracks = LabelledTracks.read(folder, labels, causal=True)
     release_memory()  # of the table of tracks
@@ -71,6 +71,8 @@ def read_labelled_frames(folder: Path, labels: Mapping[int, TrackLabel]) -> Iter
             planes_of_frame = supports.get(key, [])
             frame = _labelled_frame(row, detected_rows, planes_of_frame, tracks, ended(key))
             yield replace(frame, masks=masks.of(key))
+    if masks.remain:
+        raise misfit(folder)
 
 
 class _MasksByFrame:
@@ -86,6 +88,11 @@ class _MasksByFrame:
             return None
         row, self._next = self._next[1], next(self._rows, None)
         return row
+
+    @property
+    def remain(self) -> bool:
+        """Whether there are masks of frames that were not requested in the order of the table."""
+        return self._next is not None
 
 
 def rows_by_frame(table: pa.Table) -> dict[tuple[str, int], list[dict[str, Any]]]:

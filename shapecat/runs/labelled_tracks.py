@@ -11,7 +11,6 @@ import pyarrow as pa
 import pyarrow.parquet as pq
 
 from shapecat.arrays import F4, F8, I4
-from shapecat.errors import OutputError
 from shapecat.geometry import (
     box_around,
     quaternion_from_rotation,
@@ -23,6 +22,7 @@ from shapecat.runs.tables.reading import (
     Key,
     frame_rows,
     full_boxes_of,
+    misfit,
     numbers,
     opened,
     read_rows,
@@ -33,7 +33,7 @@ from shapecat.runs.tables.reading import (
 from shapecat.runs.tables.schemas import BOX_WIDTH, FULL_BOX
 from shapecat.types import AnnotationBox, AnnotationFrame, Box, Pose
 
-__all__ = ["LabelledTracks", "misfit", "read_annotation_frames"]
+__all__ = ["LabelledTracks", "read_annotation_frames"]
 
 _AT_ONCE = 8  # row groups of boxes in memory
 _NO_ROWS = slice(0, 0)
@@ -133,7 +133,7 @@ def read_annotation_frames(
 
     Raises
     ------
-    OutputError : a table is unreadable, or tracks and detections do not fit together.
+    OutputError : a table is unreadable, or the tables do not fit together.
     """
     ended = tracks.endings()
     plain_columns = ("topic", "frame", "stamp_ns", "log_time_ns", "frame_id")
@@ -150,12 +150,6 @@ def read_annotation_frames(
             poses = (frames[name].to_pylist() for name in pose_columns)
             boxes = map(_in_named_frame, boxes, *poses)
         yield from map(AnnotationFrame, *plain, boxes, map(ended, keys))
-
-
-def misfit(folder: Path) -> OutputError:
-    """Return the error that a track of a run has a detection that is not in its table."""
-    msg = f"{folder}: its tracks do not fit its detections; process the recording again"
-    return OutputError(msg)
 
 
 def _boxes(

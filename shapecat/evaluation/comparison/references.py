@@ -23,8 +23,14 @@ from shapecat.geometry import box_around
 from shapecat.runs.finished import FinishedRun, read_finished
 from shapecat.runs.folder import read_run
 from shapecat.runs.labelled_frames import rows_by_frame
-from shapecat.runs.labelled_tracks import LabelledTracks, misfit
-from shapecat.runs.tables.reading import Key, read_row_groups, read_stamps, read_together
+from shapecat.runs.labelled_tracks import LabelledTracks
+from shapecat.runs.tables.reading import (
+    Key,
+    misfit,
+    read_row_groups,
+    read_stamps,
+    read_together,
+)
 from shapecat.types import Box
 
 __all__ = [

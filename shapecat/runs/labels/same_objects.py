@@ -260,7 +260,7 @@ def _standing(folder: Path) -> tuple[list[_Standing], list[int]]:
         centers = tracks.centers[tracks.tracks == track]
         middle = np.median(centers, axis=0)
         spread = float(np.median(np.linalg.norm(centers - middle, axis=1)))
-        width, extent = extents.get(track, (np.nan, np.nan))
+        width, extent = extents[track]
         if spread > max(_STILL_M, _REACH / 2 * width):
             moved.append(track)
         else:

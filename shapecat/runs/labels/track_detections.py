@@ -10,7 +10,7 @@ import numpy as np
 import pyarrow as pa
 
 from shapecat.arrays import F4, F8, I4
-from shapecat.runs.tables.reading import frame_rows, numbers, opened, read_row_groups
+from shapecat.runs.tables.reading import frame_rows, misfit, numbers, opened, read_row_groups
 
 __all__ = ["TrackDetections", "extents_of", "read_track_detections"]
 
@@ -71,7 +71,12 @@ def _moments(table: pa.Table) -> Iterator[_Moment]:
 
 
 def extents_of(folder: Path, tracks: TrackDetections) -> dict[int, tuple[float, float]]:
-    """Return the width and largest extent of each track, metres: medians of some views."""
+    """Return the width and largest extent of each track, metres: medians of some views.
+
+    Raises
+    ------
+    OutputError : the table of detections is unreadable, or lacks some of these.
+    """
     rows_of: dict[tuple[str, int], list[int]] = {}
     for track in np.unique(tracks.tracks):
         rows = np.flatnonzero(tracks.tracks == track)
@@ -81,8 +86,12 @@ def extents_of(folder: Path, tracks: TrackDetections) -> dict[int, tuple[float, 
     for group in read_row_groups(folder / "detections.parquet", ["topic", "frame", "size"]):
         size = numbers(group["size"]).reshape(-1, 3)
         for key, span in frame_rows(group).items():
-            for row in rows_of.get(key, ()):
-                extent = size[span][tracks.detections[row]]
-                sizes.setdefault(int(tracks.tracks[row]), []).append(extent)
+            for row in rows_of.pop(key, ()):
+                at = span.start + int(tracks.detections[row])
+                if at >= span.stop:
+                    raise misfit(folder)
+                sizes.setdefault(int(tracks.tracks[row]), []).append(size[at])
+    if rows_of:
+        raise misfit(folder)
     middles = {track: np.median(np.stack(extent), axis=0) for track, extent in sizes.items()}
     return {t: (float(max(m[:2])), float(max(m))) for t, m in middles.items()}

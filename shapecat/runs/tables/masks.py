@@ -9,7 +9,7 @@ import numpy as np
 import pyarrow as pa
 
 from shapecat.arrays import U4
-from shapecat.runs.tables.reading import Key, numbers, read_row_groups, read_stamps
+from shapecat.runs.tables.reading import Key, misfit, numbers, read_row_groups, read_stamps
 from shapecat.runs.tables.schemas import MASKS
 from shapecat.types import ImageMasks, Perception
 
@@ -64,12 +64,18 @@ def read_nearest_masks(folder: Path) -> Iterator[tuple[Key, ImageMasks]]:
 
     Several frames have the same image if images are rarer, or if several depth sensors share a
     colour camera; the frames of one of these may come later. Run lengths are left out.
+
+    Raises
+    ------
+    OutputError : a table is unreadable, or a frame with masks is not in the frames table.
     """
     last = _sensors_of(folder)  # the image of the last frame of each sensor
     held: dict[str, dict[_Times, tuple[int, Key, ImageMasks]]] = {}
     stamps = read_stamps(folder)
     for key, masks in read_masks(folder, boxes_only=True):
-        stamp = next(stamp for candidate, stamp in stamps if candidate == key)
+        stamp = next((stamp for candidate, stamp in stamps if candidate == key), None)
+        if stamp is None:
+            raise misfit(folder)
         apart, times = abs(stamp - masks.stamp_ns), _times_ns(masks)
         images = held.setdefault(masks.topic, {})
         if times not in images or apart < images[times][0]:

@@ -24,6 +24,7 @@ __all__ = [
     "frame_rows",
     "full_boxes_of",
     "keys_of",
+    "misfit",
     "numbers",
     "numbers_or_nan",
     "opened",
@@ -154,6 +155,12 @@ def read_together(
         names = ", ".join(columns)
         msg = f"{folder}: {names} have different row groups; process the recording again"
         raise OutputError(msg) from error
+
+
+def misfit(folder: Path) -> OutputError:
+    """Return the error that rows of a run's tables refer to rows that are not there."""
+    msg = f"{folder}: its tables do not fit together; process the recording again"
+    return OutputError(msg)
 
 
 def keys_of(table: pa.Table) -> list[Key]:
