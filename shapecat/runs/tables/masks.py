@@ -15,9 +15,8 @@ from shapecat.types import ImageMasks, Perception
 
 __all__ = ["mask_columns", "read_masks", "read_nearest_masks"]
 
-_Times = tuple[int, int]
-_HELD = 64
-"""Most images of a topic that are held back for the frames of a sensor that come later."""
+_HELD = 256
+"""Images that are held back for the frames of a sensor that come later."""
 
 
 def mask_columns(perceptions: Iterable[Perception]) -> dict[str, Any]:
@@ -69,39 +68,20 @@ def read_nearest_masks(folder: Path) -> Iterator[tuple[Key, ImageMasks]]:
     ------
     OutputError : a table is unreadable, or a frame with masks is not in the frames table.
     """
-    last = _sensors_of(folder)  # the image of the last frame of each sensor
-    held: dict[str, dict[_Times, tuple[int, Key, ImageMasks]]] = {}
+    held: dict[tuple[str, int, int], tuple[int, Key, ImageMasks]] = {}
     stamps = read_stamps(folder)
     for key, masks in read_masks(folder, boxes_only=True):
         stamp = next((stamp for candidate, stamp in stamps if candidate == key), None)
         if stamp is None:
             raise misfit(folder)
-        apart, times = abs(stamp - masks.stamp_ns), _times_ns(masks)
-        images = held.setdefault(masks.topic, {})
-        if times not in images or apart < images[times][0]:
-            images[times] = apart, key, masks
-        last.setdefault(masks.topic, {})[key[0]] = times
-        latest = set(last[masks.topic].values())
-        while len(images) > _HELD or (None not in latest and next(iter(images)) not in latest):
-            yield images.pop(next(iter(images)))[1:]
-    for images in held.values():
-        for _, key, masks in images.values():
-            yield key, masks
-
-
-def _sensors_of(folder: Path) -> dict[str, dict[str, _Times | None]]:
-    """Return, for each topic of images, the depth topics with masks in them, each with None."""
-    path, sensors = folder / "masks.parquet", dict[str, dict[str, _Times | None]]()
-    for group in read_row_groups(path, ["topic", "color_topic"]) if path.exists() else ():
-        pairs = zip(*(group[name].to_pylist() for name in ("topic", "color_topic")), strict=True)
-        for topic, images in pairs:
-            sensors.setdefault(images, {})[topic] = None
-    return sensors
-
-
-def _times_ns(masks: ImageMasks) -> _Times:
-    """Return stamp and log time of an image; stamps alone repeat after a clock was set back."""
-    return masks.stamp_ns, masks.log_time_ns
+        apart = abs(stamp - masks.stamp_ns)
+        # Stamps alone repeat after a clock was set back.
+        image = masks.topic, masks.stamp_ns, masks.log_time_ns
+        if image not in held or apart < held[image][0]:
+            held[image] = apart, key, masks
+        if len(held) > _HELD:
+            yield held.pop(next(iter(held)))[1:]
+    yield from (nearest[1:] for nearest in held.values())
 
 
 def _run_lengths(column: pa.ChunkedArray) -> Iterator[U4]:
