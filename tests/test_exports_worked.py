@@ -389,20 +389,6 @@ def test_crops_of_a_renamed_run_replace_the_earlier_ones(tmp_path: Path) -> None
     assert [path.name[:7] for path in tmp_path.glob("*/*")] == ["lab 2.a"]
 
 
-def test_crops_of_an_earlier_version_are_replaced(tmp_path: Path) -> None:
-    """Their names have fewer digits; each object was there twice, with two labels if corrected."""
-    write_crops(tmp_path, crops_frames("/depth"), crops_run("/depth"))
-    (first,) = tmp_path.glob("*/*")
-    name, digest, track = first.name.split(".")
-    first.rename(first.with_name(f"{name}.{digest[:8]}.{track}"))
-    other = first.with_name(f"{name}.{digest[:7]}x.{track}")
-    other.mkdir()
-
-    write_crops(tmp_path, crops_frames("/depth"), crops_run("/depth"))
-
-    assert {path.name for path in tmp_path.glob("*/*")} == {first.name, other.name}
-
-
 @pytest.mark.parametrize(
     ("ranges", "kept"),
     [

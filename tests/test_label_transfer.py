@@ -125,6 +125,7 @@ def make_run(
     found = {**empty, **found, "size": sizes[: len(rows)]}
     write_table(folder / "detections.parquet", found, DETECTIONS)
     write_table(folder / "frames.parquet", {f.name: [] for f in FRAMES}, FRAMES)
+    write_csv(folder / "tracks.original.csv", objects, work, {})
     write_csv(folder / "tracks.csv", objects, work, labels or {})
     return folder
 
@@ -714,28 +715,14 @@ def test_labels_without_match_survive_later_runs(tmp_path: Path) -> None:
     assert kept == {"teapot", "vase"}
 
 
-def make_earlier(folder: Path) -> None:
-    """Turn a run into one of a version without colour, full boxes and positions in double."""
-    run = json.loads((folder / "run.json").read_text())
-    del run["options"]["color"]
-    (folder / "run.json").write_text(json.dumps(run))
-    for name in ("tracks", "detections"):
-        table = pq.read_table(folder / f"{name}.parquet")
-        table = table.drop_columns([c for c in table.column_names if "_full" in c])
-        place = table.schema.get_field_index("center_fixed")
-        single = table["center_fixed"].cast(pa.list_(pa.float32(), 3))
-        table = table.set_column(place, "center_fixed", single)
-        pq.write_table(table, folder / f"{name}.parquet")
-
-
 @pytest.mark.parametrize("fixed_frame", ["map", None])
-def test_labels_of_an_earlier_version_are_transferred(
-    tmp_path: Path, fixed_frame: str | None
-) -> None:
+def test_labels_of_another_version_are_transferred(tmp_path: Path, fixed_frame: str | None) -> None:
     """Its folder could not be replaced, and its labels reached no other run."""
     objects = {4: static(CUP), 5: static(BOWL)}
     old = make_run(tmp_path / "lab", objects, labels={4: "mug"}, fixed_frame=fixed_frame)
-    make_earlier(old)
+    description = json.loads((old / "run.json").read_text())
+    del description["options"]["color"]
+    (old / "run.json").write_text(json.dumps(description))
     objects = {1: static(BOWL), 2: static(CUP)}
     with pytest.raises(OutputError, match=r"options\.color is .* another version .* --overwrite"):
         read_run(old)
@@ -898,6 +885,20 @@ def test_by_place_transfers_labels_of_another_run(
     assert "teapot" in annotated_classes(two)
     # Without it, corrected labels could not be transferred once more.
     assert [item["label"] for item in read_run(two)["corrections"]["transferred"]] == ["teapot"]
+
+
+@pytest.mark.parametrize("confidence", ["nan", "inf", "-0.1", "1.01", "495"])
+def test_table_alone_with_confidence_outside_0_to_1_is_refused(
+    tmp_path: Path, confidence: str
+) -> None:
+    """A spreadsheet that turned 0.495 into 495 has changed the positions as well."""
+    table = tmp_path / "table.csv"
+    write_csv(table, {4: static(CUP)}, "wfar", {4: "mug"})
+    table.write_text(table.read_text().replace(",0.9,", f",{confidence},"))
+    target = second(tmp_path / "target", {2: static(CUP)})
+
+    with pytest.raises(OutputError, match=f"a confidence from 0 to 1, got .*'{confidence}'"):
+        transfer_labels(table, target)
 
 
 @pytest.mark.parametrize(("found", "place"), [("x,y,z", "u,v,w"), ("0.34,", ",")])

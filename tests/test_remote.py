@@ -599,7 +599,7 @@ def test_unusable_run_at_url_is_named(shapecat: Run, served: Path, content: byte
     assert only_error(done).startswith("Error: memory://unusable/a/run.json: not a description of")
 
 
-def test_run_of_an_earlier_version_at_url_can_be_overwritten(tmp_path: Path) -> None:
+def test_run_of_another_version_at_url_can_be_overwritten(tmp_path: Path) -> None:
     """Its labels could not be transferred, as it was refused even with --overwrite."""
     url = "memory://earlier/run"
     run = run_info()

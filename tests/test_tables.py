@@ -1,6 +1,5 @@
 import json
 import math
-import shutil
 from collections.abc import Callable
 from dataclasses import replace
 from importlib.resources import files
@@ -21,7 +20,6 @@ from shapecat.runs import labelled_tracks
 from shapecat.runs.folder import read_run
 from shapecat.runs.labelled_frames import read_labelled_frames
 from shapecat.runs.labelled_tracks import LabelledTracks, read_annotation_frames
-from shapecat.runs.labels.corrections import read_labels
 from shapecat.runs.labels.meaning import TrackLabel
 from shapecat.runs.perceive.perceived import _SEGMENT_FRAMES, FrameRow, PerceptionTables
 from shapecat.runs.run_info import (
@@ -31,7 +29,6 @@ from shapecat.runs.run_info import (
     Options,
     OriginInfo,
     RunInfo,
-    parse_run,
 )
 from shapecat.runs.tables.masks import mask_columns, read_masks, read_nearest_masks
 from shapecat.runs.tables.reading import (
@@ -41,7 +38,7 @@ from shapecat.runs.tables.reading import (
     read_together,
     with_fixed_lists,
 )
-from shapecat.runs.tables.schemas import ADDED, DETECTIONS, FRAMES, MASKS, PLANES, TABLES, TRACKS
+from shapecat.runs.tables.schemas import DETECTIONS, FRAMES, MASKS, PLANES, TABLES, TRACKS
 from shapecat.runs.tables.segments import SEGMENTS, list_segments
 from shapecat.runs.tables.writing import arrow_table, lists, open_writer, write_table
 from shapecat.types import (
@@ -55,7 +52,6 @@ from shapecat.types import (
     Pose,
     Scene,
 )
-from tests.run_info import run_info
 from tests.track_tables import write_tracks
 
 CATEGORIES = ("cup", "can")
@@ -424,31 +420,6 @@ def test_chosen_rows_are_read_from_all_row_groups(tmp_path: Path, at_once: int) 
         np.testing.assert_array_equal(found, rows)
 
 
-def test_run_of_an_earlier_version_is_annotated(guessed_run: Path, tmp_path: Path) -> None:
-    """Columns that were added since must not cost the corrections of a finished run."""
-    run = shutil.copytree(guessed_run, tmp_path / "run")
-    tracks = LabelledTracks.read(run, read_labels(run / "tracks.csv"))
-    now = list(read_annotation_frames(run, tracks))
-    table = pq.read_table(run / "frames.parquet")
-    assert set(table.column_names) >= ADDED
-    pq.write_table(table.drop_columns(sorted(ADDED)), run / "frames.parquet")
-    assert list(read_annotation_frames(run, tracks)) == now
-
-
-def test_positions_of_an_earlier_version_are_read(tmp_path: Path) -> None:
-    """It wrote them in single precision, and its runs and their corrections were refused."""
-    field = DETECTIONS.field("center_fixed")
-    single = pa.list_(pa.float32(), 3)
-    places = pa.array([[0.5, -1.25, 2.0], None], single)
-    columns = {f.name: pa.nulls(2, f.type) for f in DETECTIONS} | {field.name: places}
-    pq.write_table(pa.table(columns), tmp_path / "detections.parquet")
-
-    (table,) = read_row_groups(tmp_path / "detections.parquet", [field.name])
-
-    assert table.schema.field(field.name).type == field.type
-    assert table[field.name].to_pylist() == [[0.5, -1.25, 2.0], None]
-
-
 @pytest.mark.parametrize("table", TABLES)
 def test_table_with_other_columns_is_rejected(tmp_path: Path, table: str) -> None:
     """One of another version, or rewritten by a data frame library, gave a traceback later."""
@@ -456,8 +427,7 @@ def test_table_with_other_columns_is_rejected(tmp_path: Path, table: str) -> Non
     empty = TABLES[table].empty_table()
     for k, field in enumerate(TABLES[table]):
         other = empty.set_column(k, field.name, pa.array([], pa.float64()))
-        lacking = [] if field.name in ADDED else [empty.drop_columns([field.name])]
-        for damaged in (*lacking, other):
+        for damaged in (empty.drop_columns([field.name]), other):
             pq.write_table(damaged, path)
             with pytest.raises(OutputError, match=rf"column {field.name}\b.*process the recording"):
                 next(read_row_groups(path))
@@ -501,19 +471,11 @@ def test_schema_requires_what_the_reader_requires(entry: str, kind: Any) -> None
     assert part["properties"].keys() == get_type_hints(kind).keys()
 
 
-def test_run_of_earlier_version_has_no_colour_topics() -> None:
-    """Its run.json has no entry for them, which outputs read."""
-    content = {name: value for name, value in run_info().items() if name != "color"}
-
-    assert parse_run(json.dumps(content).encode(), "lab")["color"] == {}
-    of_topic = json.dumps(run_info(color={"/depth": "/rgb"})).encode()
-    assert parse_run(of_topic, "lab")["color"] == {"/depth": "/rgb"}
-
-
 @pytest.mark.parametrize(
     ("change", "wrong"),
     [
         (lambda info: info.pop("counts"), ": counts"),
+        (lambda info: info.pop("color"), ": color"),
         (lambda info: info["counts"].pop("skipped"), ": counts.skipped"),
         (lambda info: info["counts"].update(frames="4"), ": counts.frames"),
         (lambda info: info["seconds"].update(perceive=True), ": seconds.perceive"),

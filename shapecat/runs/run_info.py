@@ -104,7 +104,6 @@ class RunInfo(RunIdentity):
     """The contents of run.json; ``seconds`` has the duration of each finished phase.
 
     ``damaged`` is there if reading the frames met damage in an MCAP file: see `Recording.damaged`.
-    ``color`` may be missing only in a file of an earlier version: `parse_run` adds it.
     """
 
     settings: dict[str, Any]
@@ -113,8 +112,8 @@ class RunInfo(RunIdentity):
     counts: Counts
     seconds: dict[str, float]
     warnings: list[str]
+    color: dict[str, str]
     damaged: NotRequired[bool]
-    color: NotRequired[dict[str, str]]
     boxes: NotRequired[str]
     origin: NotRequired[OriginInfo]
     corrections: NotRequired[dict[str, Any]]
@@ -160,8 +159,7 @@ def parse_run(content: bytes, folder: str) -> RunInfo:
     ------
     OutputError : it is damaged, or has missing or wrong entries.
     """
-    run: dict[str, Any] = {**parse_identity(content, folder)}
-    run.setdefault("color", {})  # runs of earlier versions lack it
+    run: Any = parse_identity(content, folder)
     if (wrong := wrong_entry(run)) is not None:
         msg = (
             f"{folder}/run.json: not a description of a run: {wrong} is missing or wrong; if "

@@ -21,16 +21,14 @@ from shapecat.runs.finished import FinishedRun
 
 __all__ = ["Origin", "write_crops"]
 
-_INSTANCE = re.compile(
-    r".*\.([0-9a-f]{8}(?:[0-9a-f]{4})?)(?:\.([\d.]+)-([\d.]+|inf))?\.track-\d+", re.DOTALL
-)
+_INSTANCE = re.compile(r".*\.([0-9a-f]{12})(?:\.([\d.]+)-([\d.]+|inf))?\.track-\d+", re.DOTALL)
 
 
 class Origin(NamedTuple):
     """Where the views of a run come from; the name of the run does not matter.
 
-    ``source`` is a digest of the recording and the topics, of which earlier versions wrote fewer
-    digits; ``start_s`` and ``end_s`` bound the time range, seconds.
+    ``source`` is a digest of the recording and the topics; ``start_s`` and ``end_s`` bound the time
+    range, seconds.
     """
 
     source: str
@@ -56,8 +54,7 @@ class Origin(NamedTuple):
     def shares_frames(self, other: "Origin") -> bool:
         """Return whether both may show the same frames."""
         begin, end = max(self.start_s, other.start_s), min(self.end_s, other.end_s)
-        digits = min(len(self.source), len(other.source))
-        return self.source[:digits] == other.source[:digits] and begin < end
+        return self.source == other.source and begin < end
 
     def __str__(self) -> str:
         is_whole = (self.start_s, self.end_s) == (0, math.inf)

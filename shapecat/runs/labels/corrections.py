@@ -76,8 +76,6 @@ def read_original_table(path: Path) -> tuple[TrackTable, list[str]]:
     """
     table = read_track_table(path)
     require_same_run(path, table, path.parent)
-    if not path.with_name(ORIGINAL).exists():  # of a run by an earlier version
-        return table, [*table.problems, *table.wrong_numbers]
     original = read_track_table(path.with_name(ORIGINAL))
     edited = {row.track: row for row in table.rows}
     missing = [f"#{row.track}" for row in original.rows if row.track not in edited]

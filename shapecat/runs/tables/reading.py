@@ -15,7 +15,7 @@ import pyarrow.parquet as pq
 
 from shapecat.arrays import F4, I4
 from shapecat.errors import OutputError
-from shapecat.runs.tables.schemas import ADDED, FIXED_LISTS, FULL_BOX, TABLES
+from shapecat.runs.tables.schemas import FIXED_LISTS, FULL_BOX, TABLES
 
 __all__ = [
     "Key",
@@ -105,7 +105,7 @@ def read_row_groups(
         for first in range(0, count, at_once):
             groups = range(first, min(first + at_once, count))
             table = file.read_row_groups(groups, columns=columns, use_threads=False)
-            yield _validated(_with_added(table, TABLES[path.stem], columns))
+            yield _validated(table)
 
 
 def read_rows(
@@ -233,8 +233,7 @@ def opened(
 
     Raises
     ------
-    OutputError : the table is missing or unreadable, or lacks one of the columns that is not in
-        `ADDED`.
+    OutputError : the table is missing or unreadable, or lacks one of the columns.
     """
     try:
         with _open_parquet(path, read_dictionary) as file:
@@ -269,15 +268,6 @@ def _validated(table: pa.Table) -> pa.Table:
     return table
 
 
-def _with_added(table: pa.Table, schema: pa.Schema, columns: Sequence[str] | None) -> pa.Table:
-    """Add the chosen columns that a table of an earlier version lacks."""
-    for name in ADDED.intersection(schema.names if columns is None else columns):
-        if name not in table.column_names:
-            nulls = pa.nulls(len(table), schema.field(name).type)
-            table = table.append_column(schema.field(name), nulls)
-    return table
-
-
 def with_fixed_lists(table: pa.Table) -> pa.Table:
     """Return rows of a table as read, with the lists of fixed size of its schema.
 
@@ -303,20 +293,15 @@ def _wrong_column(schema: pa.Schema, expected: pa.Schema, columns: Sequence[str]
     """Describe the first column that another version, or another program, wrote otherwise."""
     for field in (field for field in expected if columns is None or field.name in columns):
         if field.name not in schema.names:
-            if field.name in ADDED:
-                continue
             return f"no column {field.name}"
         kind = schema.field(field.name).type
-        if (kind.value_type if pa.types.is_dictionary(kind) else kind) not in _file_types(
-            field.type
-        ):
+        kind = kind.value_type if pa.types.is_dictionary(kind) else kind
+        if kind not in _file_types(field.type):
             return f"column {field.name} holds {kind}, not {field.type}"
     return ""
 
 
 def _file_types(kind: pa.DataType) -> tuple[pa.DataType, ...]:
-    """Return the types that a column may have in a file: earlier versions wrote other lists."""
-    if not pa.types.is_fixed_size_list(kind):
-        return (kind,)
-    single = pa.list_(pa.float32(), kind.list_size)  # positions in the fixed frame
-    return (kind, pa.list_(kind.value_type), single)
+    """Return the types that a column may have in a file: lists with nulls have no fixed size."""
+    is_fixed = pa.types.is_fixed_size_list(kind)
+    return (kind, pa.list_(kind.value_type)) if is_fixed else (kind,)

@@ -2,13 +2,12 @@
 
 A run folder holds ``frames``, ``detections``, ``planes`` and, with colour images, ``masks``
 (written by perceive), and ``tracks`` (written by track). Adding a column is allowed within a schema
-version (see `ADDED`); changing the meaning of one is not.
+version; changing the meaning of one is not.
 """
 
 import pyarrow as pa
 
 __all__ = [
-    "ADDED",
     "BOX_WIDTH",
     "DETECTIONS",
     "FIXED_LISTS",
@@ -78,9 +77,6 @@ the result is from a second look, with the up direction of the whole recording. 
 the earlier frame whose scene this one repeats, null if none. ``fixed_*`` is ``fixed_from_sensor``
 (rotation row by row), null if unknown; ``frame_*`` is ``frame_from_sensor``, null if ``frame_id``
 is the frame of the sensor. ``seconds`` has one entry per entry of ``stages``."""
-
-ADDED = frozenset({"frame_translation", "frame_rotation"})
-"""Columns that tables of earlier versions lack; they are read as null."""
 
 DETECTIONS = pa.schema(
     [
