@@ -1,6 +1,7 @@
 """Tests of colour streams: choice, decoding, pairing in time, and registration to the depth."""
 
 import io
+import json
 from collections import Counter
 from collections.abc import Sequence
 from pathlib import Path
@@ -27,6 +28,7 @@ from shapecat.recordings.transforms import extrinsics
 from shapecat.recordings.transforms.extrinsics import Extrinsics
 from shapecat.types import Camera, Frame
 from tests.colour_messages import gradient, jpeg, packed, png, raw
+from tests.mcap_files import McapChannels, mcap_writer
 from tests.messages import (
     EPOCH,
     IMAGE,
@@ -622,6 +624,25 @@ def test_unreadable_colour_messages_are_skipped_and_reported(tmp_path: Path) -> 
         "(1×): image encoding 'nv21' is not colour"[:40],
         "(2×): no colour image near the time of the frame"[:40],
     ]
+
+
+def test_json_image_without_data_is_reported(tmp_path: Path) -> None:
+    """It ended the run in a traceback, as only ROS definitions guarantee the fields."""
+    path, stamps = tmp_path / "a.mcap", [EPOCH, EPOCH + 33 * MS]
+    stamp = {"sec": EPOCH // SECOND, "nanosec": 0}
+    content = {"header": {"stamp": stamp, "frame_id": "camera"}, "encoding": "rgb8"}
+    with mcap_writer(path) as writer:
+        channels = McapChannels(writer, STORE)
+        schema = writer.register_schema(IMAGE, "jsonschema", b"{}")
+        colour = writer.register_channel("/cam/color/image_raw", "json", schema)
+        writer.add_message(colour, EPOCH, json.dumps(content).encode(), EPOCH)
+        for topic, time, message in depth_items(*stamps):
+            kind = message.__msgtype__
+            channels.write(topic, kind, time, bytes(STORE.serialize_cdr(message, kind)))
+    pairs, warnings = read(path)
+
+    assert [view for _, view in pairs] == [None, None]
+    assert any("(1×): message does not match its type" in w for w in warnings)
 
 
 def test_image_in_unknown_encoding_is_message_error() -> None:

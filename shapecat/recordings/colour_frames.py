@@ -132,6 +132,7 @@ class _BufferedImage(NamedTuple):
     stamp_ns: int
     log_time_ns: int
     decoded: Any
+    bytes: int
     setbacks: int
 
 
@@ -160,6 +161,7 @@ class _Partner:
             return
         try:
             image = self._recording.decode(message)
+            size = len(image.data)
             stamp = self._clock.check(stamp_ns(image.header), message.log_time_ns)
         except (RecordingError, *MALFORMED) as error:
             self._left_out[reason_of(error, self.stream.topic)] += 1
@@ -168,7 +170,7 @@ class _Partner:
             self._steps.append(stamp - self._newest)
         self._setbacks += stamp < (self._newest or 0)
         self._newest = stamp
-        self._images.append(_BufferedImage(stamp, message.log_time_ns, image, self._setbacks))
+        self._images.append(_BufferedImage(stamp, message.log_time_ns, image, size, self._setbacks))
         while len(self._images) > _KEPT_IMAGES or self._too_much():
             self._images.popleft()
 
@@ -230,7 +232,7 @@ class _Partner:
             self._recording.warn(f"{self.stream.topic}: frames without colour ({count}×): {reason}")
 
     def _too_much(self) -> bool:
-        stored_bytes = sum(len(image.decoded.data) for image in self._images)
+        stored_bytes = sum(image.bytes for image in self._images)
         return stored_bytes > _BUFFERED_BYTES and len(self._images) > 2
 
     def _period(self) -> int:
