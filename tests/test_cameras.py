@@ -51,6 +51,20 @@ def test_rectified_image_uses_p_and_raw_image_uses_k() -> None:
     assert distorted
 
 
+@pytest.mark.parametrize("coefficients", [(), (0.0, 0.0, 0.0, 0.0)])
+@pytest.mark.parametrize("model", ["plumb_bob", "equidistant"])
+def test_image_without_distortion_coefficients_is_rectified(
+    model: str, coefficients: tuple[float, ...]
+) -> None:
+    """ROS's image_geometry reads it so; as that of a fisheye lens the scene would be bent."""
+    given = calibration(distortion_model=model, d=np.array(coefficients))
+
+    assert camera_of_info(given, rectified=False) == (
+        Camera(*SIZE, 531.7, 527.1, 322.3, 243.9),
+        False,
+    )
+
+
 @pytest.mark.parametrize(
     ("topic", "rectified"),
     [

@@ -184,6 +184,8 @@ def camera_of_info(info: Any, *, rectified: bool) -> tuple[Camera, bool]:
         msg = f"camera info that fits no camera (fx {fx:g}, fy {fy:g}, cx {cx:g}, cy {cy:g})"
         raise MessageError(msg)
     camera = Camera(width // bin_x, height // bin_y, *(float(value) for value in values))
+    # Coefficients that are all zero mean a rectified image, as in image_geometry of ROS, even with
+    # a fisheye model: drivers that rectify its images set only the coefficients to zero.
     return camera, bool(not (rectified or use_p) and np.any(d != 0))
 
 
