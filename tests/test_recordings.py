@@ -648,6 +648,7 @@ def test_database_without_definitions_uses_humble(tmp_path: Path) -> None:
         ("none.mcap", None, "does not exist"),
         ("empty.bag", b"", "is empty"),
         ("text.mcap", b"hello world", "begins with 'hello wo'"),
+        ("folder.mcap", b"folder of robots", "begins with 'folder o'"),
         ("a.mcap.zstd", zstandard.compress(b"\x89MCAP0"), "a compressed file: unpack it first"),
         ("a.bag.gz", gzip.compress(b"#ROSBAG", mtime=0), "a compressed file: unpack it first"),
         ("bag.bag", b"#ROSBAG V1.2\n", "not a readable ROS 1 bag"),

@@ -23,7 +23,8 @@ def open_recording(path: Path) -> Recording:
     path = Path(path)
     with explained(f"{path}: cannot be read", RecordingError):
         try:
-            return _READERS[_sniff(path)](path)
+            reader = _ros2 if path.is_dir() else _READERS[_sniff(path)]
+            return reader(path)
         except RecordingError as error:
             msg = f"{path}: {error}"
             raise RecordingError(msg) from error
@@ -41,9 +42,8 @@ _READERS: dict[str, Callable[[Path], Recording]] = {
     "\x89MCAP": McapRecording,
     "#ROSBAG": BagRecording,
     "SQLite format 3": _ros2,
-    "folder": _ros2,
 }
-"""Readers by the first bytes of a file; ``folder`` for folders."""
+"""Readers by the first bytes of a file."""
 
 _PACKED = ("(\xb5/\xfd", "\x1f\x8b", "BZh", "\xfd7zXZ", "\x04\x22\x4d\x18", "PK\x03\x04")
 """First bytes of files compressed with zstd, gzip, bzip2, xz and lz4, and of zip archives."""
@@ -51,8 +51,6 @@ _EXPECTED = "expected an .mcap, .bag or .db3 file, or a ROS 2 bag folder"
 
 
 def _sniff(path: Path) -> str:
-    if path.is_dir():
-        return "folder"
     if not path.exists():
         msg = f"does not exist; {_EXPECTED}"
         raise RecordingError(msg)
