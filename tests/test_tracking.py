@@ -11,18 +11,12 @@ from numpy.typing import ArrayLike
 
 from shapecat.arrays import F8
 from shapecat.config import TrackingSettings
-from shapecat.tracking import (
-    Fragments,
-    Tracker,
-    causal,
-    fuse,
-    merge_fragments,
-    scene_cuts,
-)
 from shapecat.tracking.association import assign, size_key
 from shapecat.tracking.common_motion import find_common_motion
-from shapecat.tracking.fusion import fuse_novelty, view_weights
+from shapecat.tracking.fusion import causal, fuse, fuse_novelty, view_weights
 from shapecat.tracking.recording import _without_gaps
+from shapecat.tracking.stitching import Fragments, merge_fragments, scene_cuts
+from shapecat.tracking.tracker import Tracker
 from tests.frame_detections import FrameDetections, gather, track_frames
 
 SETTINGS = TrackingSettings()

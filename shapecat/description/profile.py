@@ -8,11 +8,11 @@ from shapecat.arrays import F4
 from shapecat.description.surface import Surface
 from shapecat.jit import kernel
 
-__all__ = ["PROFILE_NAMES", "PROFILE_SLICES", "VerticalAxis", "profile", "vertical_axis"]
+__all__ = ["PROFILE_NAMES", "VerticalAxis", "profile", "vertical_axis"]
 
-PROFILE_SLICES = 8
+_PROFILE_SLICES = 8
 _PROFILE = ("share", "radius", "spread", "inward", "up", "curvature")
-PROFILE_NAMES = tuple(f"{i}_{name}" for i in range(PROFILE_SLICES) for name in _PROFILE)
+PROFILE_NAMES = tuple(f"{i}_{name}" for i in range(_PROFILE_SLICES) for name in _PROFILE)
 
 
 class VerticalAxis(NamedTuple):
@@ -95,8 +95,8 @@ def profile(
     widest = 1e-6
     for i in range(x.size):
         level = (z[i] - low) / (high - low) if high > low else 0.5
-        place = min(max(level * PROFILE_SLICES - 0.5, 0.0), PROFILE_SLICES - 1.0)
-        first = min(int(place), PROFILE_SLICES - 2)
+        place = min(max(level * _PROFILE_SLICES - 0.5, 0.0), _PROFILE_SLICES - 1.0)
+        first = min(int(place), _PROFILE_SLICES - 2)
         rx, ry = x[i] - upright.x, y[i] - upright.y
         r = np.sqrt(rx * rx + ry * ry)
         inward = rx * normals[0, i] + ry * normals[1, i] < 0
@@ -110,13 +110,13 @@ def profile(
             out[at + 3] += share * (1.0 - abs(normals[2, i])) * inward
             out[at + 4] += share * normals[2, i]
             out[at + 5] += share * curvature / (1 + abs(curvature))
-    for k in range(PROFILE_SLICES):
+    for k in range(_PROFILE_SLICES):
         at = k * 6
         share = out[at]
         for m in range(1, 6):
             out[at + m] = out[at + m] / share if share > 1e-4 else 0.0
         out[at + 2] = np.sqrt(max(out[at + 2] - out[at + 1] ** 2, 0.0))
         widest = max(widest, out[at + 1])
-    for k in range(PROFILE_SLICES):
+    for k in range(_PROFILE_SLICES):
         out[k * 6 + 1] /= widest
         out[k * 6 + 2] /= widest

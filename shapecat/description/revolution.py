@@ -7,9 +7,9 @@ from shapecat.description.linear import solve
 from shapecat.description.surface import Surface
 from shapecat.jit import kernel
 
-__all__ = ["REVOLUTION_NAMES", "REVOLUTION_SLICES", "fit_axis", "revolution"]
+__all__ = ["REVOLUTION_NAMES", "fit_axis", "revolution"]
 
-REVOLUTION_SLICES = 8
+_REVOLUTION_SLICES = 8
 _SLICE = ("share", "radius", "residual", "inward")
 REVOLUTION_NAMES = (
     "upright_residual",
@@ -19,7 +19,7 @@ REVOLUTION_NAMES = (
     "axis_vertical",
     "axis_moved",
     "axis_to_eye",
-    *(f"{i}_{name}" for i in range(REVOLUTION_SLICES) for name in _SLICE),
+    *(f"{i}_{name}" for i in range(_REVOLUTION_SLICES) for name in _SLICE),
 )
 _ROUNDS = 4
 _OUTLIER = 3.0
@@ -47,7 +47,7 @@ def revolution(surface: Surface, normals: F4, axis: F8, point: F8, foot: F8, out
     """
     cloud, owner, neurons = surface.points, surface.nearest, surface.neurons
     weight, eye = surface.weight, surface.eye
-    slices = np.zeros((REVOLUTION_SLICES, 4))
+    slices = np.zeros((_REVOLUTION_SLICES, 4))
     upright, before = np.zeros(3), np.zeros(3)
     upright[2] = 1.0
     for j in range(3):
@@ -64,14 +64,14 @@ def revolution(surface: Surface, normals: F4, axis: F8, point: F8, foot: F8, out
     out[5] = abs(axis[0] * before[0] + axis[1] * before[1] + axis[2] * before[2])
     lean = 0.0
     widest = 1e-6
-    for k in range(REVOLUTION_SLICES):
-        lean += slices[k, 0] * (k - 0.5 * (REVOLUTION_SLICES - 1)) * (slices[k, 1] - radius)
+    for k in range(_REVOLUTION_SLICES):
+        lean += slices[k, 0] * (k - 0.5 * (_REVOLUTION_SLICES - 1)) * (slices[k, 1] - radius)
         widest = max(widest, slices[k, 1])
     distance = np.sqrt(eye[0] * eye[0] + eye[1] * eye[1] + eye[2] * eye[2])
     facing = (axis[0] * eye[0] + axis[1] * eye[1] + axis[2] * eye[2]) / max(distance, 1e-6)
     out[6] = -facing if lean > 0 else facing
-    for k in range(REVOLUTION_SLICES):
-        slice_id = REVOLUTION_SLICES - 1 - k if lean > 0 else k
+    for k in range(_REVOLUTION_SLICES):
+        slice_id = _REVOLUTION_SLICES - 1 - k if lean > 0 else k
         at = 7 + 4 * k
         out[at], out[at + 1] = slices[slice_id, 0], slices[slice_id, 1] / widest
         out[at + 2], out[at + 3] = min(slices[slice_id, 2] / widest, 2.0), slices[slice_id, 3]
@@ -142,7 +142,7 @@ def _place(
 @kernel
 def _slice(along: float, extent: F8) -> int:
     share = (along - extent[0]) / max(extent[1] - extent[0], 1e-6)
-    return min(int(share * REVOLUTION_SLICES), REVOLUTION_SLICES - 1)
+    return min(int(share * _REVOLUTION_SLICES), _REVOLUTION_SLICES - 1)
 
 
 @kernel(inline=True)
@@ -155,14 +155,14 @@ def _improve(
     rows, extent = _place(neurons, owner, normals, axis, point, first, second)
     for i in range(owner.size):
         rows[4, i] *= weight[i]
-    means = np.zeros((REVOLUTION_SLICES, 6))  # weight, radius, derivatives
+    means = np.zeros((_REVOLUTION_SLICES, 6))  # weight, radius, derivatives
     row = np.zeros(6)
     for i in range(rows.shape[1]):
         _derivatives(rows, i, row)
         k = _slice(rows[0, i], extent)
         for j in range(6):
             means[k, j] += rows[4, i] * row[j]
-    for k in range(REVOLUTION_SLICES):
+    for k in range(_REVOLUTION_SLICES):
         for j in range(1, 6):
             means[k, j] /= max(means[k, 0], 1e-9)
     A, b = np.zeros((free, free)), np.zeros(free)
@@ -230,19 +230,19 @@ def _measure(
     rows, extent = _place(cloud, owner, normals, axis, point, first, second)
     count = rows.shape[1]
     slices[:] = 0.0
-    weights = np.zeros(REVOLUTION_SLICES)
+    weights = np.zeros(_REVOLUTION_SLICES)
     for i in range(count):
         k = _slice(rows[0, i], extent)
         weights[k] += rows[4, i]
         slices[k, 0] += 1.0
         slices[k, 1] += rows[4, i] * rows[1, i]
     total = radius = 0.0
-    for k in range(REVOLUTION_SLICES):
+    for k in range(_REVOLUTION_SLICES):
         total += weights[k]
         radius += slices[k, 1]
     radius /= max(total, 1e-9)
     enough = 1e-3 * count
-    for k in range(REVOLUTION_SLICES):
+    for k in range(_REVOLUTION_SLICES):
         slices[k, 1] = slices[k, 1] / weights[k] if weights[k] > enough else 0.0
     cost = 0.0
     for i in range(count):
@@ -256,7 +256,7 @@ def _measure(
         for j in range(3):
             outward += normals[j, o] * (rows[2, i] * first[j] + rows[3, i] * second[j])
         slices[k, 3] += outward < _INWARD
-    for k in range(REVOLUTION_SLICES):
+    for k in range(_REVOLUTION_SLICES):
         slices[k, 2] = np.sqrt(slices[k, 2])
         slices[k, 3] /= max(slices[k, 0], 1.0)
         slices[k, 0] /= count

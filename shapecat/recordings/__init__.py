@@ -5,12 +5,7 @@ from shapecat.recordings.frames import FrameRange, frames
 from shapecat.recordings.messages import Channel, Message, MessageError, Topic
 from shapecat.recordings.recording import Recording
 from shapecat.recordings.streams import Stream, choose_streams, depth_streams
-from shapecat.recordings.transforms.buffer import (
-    TransformBuffer,
-    TransformError,
-    fixed_frame,
-    read_transforms,
-)
+from shapecat.recordings.transforms.buffer import TransformBuffer, fixed_frame, read_transforms
 
 __all__ = [
     "Channel",
@@ -21,7 +16,6 @@ __all__ = [
     "Stream",
     "Topic",
     "TransformBuffer",
-    "TransformError",
     "choose_streams",
     "depth_streams",
     "fixed_frame",

@@ -12,7 +12,6 @@ from shapecat.recordings.messages import MessageError
 from shapecat.types import Camera
 
 __all__ = [
-    "LARGEST_ERROR_PX",
     "PinholeFit",
     "camera_of_info",
     "distortion_of",
@@ -23,9 +22,8 @@ __all__ = [
     "still_fits",
 ]
 
-LARGEST_ERROR_PX = 0.6
+_LARGEST_ERROR_PX = 0.6
 """A camera fits an organized cloud if 95 % of its points are reprojected within this distance."""
-
 _OFF_CENTER = 0.12
 """Fraction of the width or height. Depth cameras stay below 0.05; intrinsics for 640 x 480 pixels
 with images of 848 x 480 have 0.123."""
@@ -61,7 +59,7 @@ def fit_pinhole(points: F4) -> PinholeFit | None:
     Returns
     -------
     The fit; None if there are few points, or they cover a narrow part of the image, or no camera
-    reprojects 95 % of them to within `LARGEST_ERROR_PX`.
+    reprojects 95 % of them to within 0.6 pixels.
     """
     height, width = points.shape[:2]
     sample = _sample(points)
@@ -81,7 +79,7 @@ def fit_pinhole(points: F4) -> PinholeFit | None:
         fy, cy = _line(y[keep], v[keep])
     camera = Camera(width, height, fx, fy, cx, cy)
     largest, rms = _errors(camera, sample)
-    return PinholeFit(camera, rms) if fx > 0 and fy > 0 and largest < LARGEST_ERROR_PX else None
+    return PinholeFit(camera, rms) if fx > 0 and fy > 0 and largest < _LARGEST_ERROR_PX else None
 
 
 def still_fits(fit: PinholeFit, points: F4) -> bool:
@@ -93,7 +91,7 @@ def still_fits(fit: PinholeFit, points: F4) -> bool:
     if sample is None:
         return True  # too few points to contradict it
     largest, rms = _errors(camera, sample)
-    return largest < LARGEST_ERROR_PX and rms < 2 * fit.error_px + 0.02
+    return largest < _LARGEST_ERROR_PX and rms < 2 * fit.error_px + 0.02
 
 
 def _errors(camera: Camera, sample: tuple[F8, F8, F8, F8]) -> tuple[float, float]:

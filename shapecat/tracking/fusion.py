@@ -8,11 +8,11 @@ from numpy.typing import ArrayLike
 
 from shapecat.arrays import F4, F8, Bool
 
-__all__ = ["PARTIAL_WEIGHT", "Method", "causal", "fuse", "fuse_novelty", "view_weights"]
+__all__ = ["Method", "causal", "fuse", "fuse_novelty", "view_weights"]
 
 Method = Literal["mean", "product", "vote"]
 
-PARTIAL_WEIGHT = 0.25
+_PARTIAL_WEIGHT = 0.25
 """Weight of a view that is cut by the image border or an occluder, relative to a whole view."""
 
 _LENIENCE = 0.08
@@ -27,7 +27,7 @@ _BLOCK = 2**16
 
 def view_weights(partial: Bool) -> F8:
     """Return the weights (k,) of views; ``partial`` (k,) marks partial views."""
-    return np.where(np.asarray(partial, np.bool_), PARTIAL_WEIGHT, 1.0)
+    return np.where(np.asarray(partial, np.bool_), _PARTIAL_WEIGHT, 1.0)
 
 
 def fuse(posteriors: ArrayLike, method: Method = "product", weights: ArrayLike | None = None) -> F8:
