@@ -249,19 +249,20 @@ def test_successive_images_with_equal_stamps_are_all_annotated(
     assert found == [(("/d", 0), 60), (("/d", 2), 160)]
 
 
-@pytest.mark.parametrize("late", [0, 1, 200])
 @pytest.mark.parametrize("every", [1, 3])
+@pytest.mark.parametrize("late", [0, 1, 100])
 def test_image_of_two_sensors_is_annotated_once_if_one_is_late(
     late: int, every: int, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """Its boxes would flicker: those of one sensor, then of the other, in messages out of order.
 
-    The late sensor is nearer in time, may be slower, and ends early.
+    The late sensor is nearer in time and ends early. The other one may skip images.
     """
     frames: list[tuple[str, int, int]] = []  # topic, number, stamp
     for k in range(600):
-        frames.append(("/early", k, 10 * k + 2))
-        if late <= k < 400 and (k - late) % every == 0:
+        if k % every == 0:
+            frames.append(("/early", k, 10 * k + 2))
+        if late <= k < 400:
             frames.append(("/late", k - late, 10 * (k - late) + 1))
     masks = [
         ((topic, k), ImageMasks("/rgb", 10 * k, 10 * k + 5, "c", 40, 30, {}, {}))
@@ -271,14 +272,15 @@ def test_image_of_two_sensors_is_annotated_once_if_one_is_late(
     patch_masks(monkeypatch, masks, [stamp for *_, stamp in frames])
     monkeypatch.setattr("shapecat.runs.tables.masks.read_masks", lambda _folder, **_: unread)
     found, waiting = [], []
-    for (topic, k), image in read_nearest_masks(Path()):
+    for (topic, _), image in read_nearest_masks(Path()):
         found.append((topic, image.stamp_ns // 10))
         number_read = len(masks) - unread.__length_hint__()
-        waiting.append(max(number for (_, number), _ in masks[:number_read]) - k)
+        waiting.append(len({one.stamp_ns for _, one in masks[:number_read]}) - len(found))
 
-    nearer = range(0, 400 - late, every)
-    assert found == [("/late" if k in nearer else "/early", k) for k in range(600)]
-    assert max(waiting) == 256  # memory does not grow with the length
+    nearer = range(400 - late)
+    kept = [k for k in range(600) if k in nearer or k % every == 0]
+    assert found == [("/late" if k in nearer else "/early", k) for k in kept]
+    assert max(waiting) <= 256  # memory does not grow with the length
 
 
 def test_simultaneous_images_of_two_cameras_are_annotated(

@@ -61,14 +61,15 @@ def read_masks(folder: Path, *, boxes_only: bool = False) -> Iterator[tuple[Key,
 def read_nearest_masks(folder: Path) -> Iterator[tuple[Key, ImageMasks]]:
     """Yield each image once, with the boxes of the masks of the frame nearest to it in time.
 
-    Several frames have the same image if images are rarer, or if several depth sensors share a
-    colour camera; the frames of one of these may come later. Run lengths are left out.
+    Images are in the order in which they were recorded. Several frames have the same image if
+    images are rarer, or if several depth sensors share a colour camera; the frames of one of these
+    may come later. Run lengths are left out.
 
     Raises
     ------
     OutputError : a table is unreadable, or a frame with masks is not in the frames table.
     """
-    held: dict[tuple[str, int, int], tuple[int, Key, ImageMasks]] = {}
+    held: dict[tuple[int, int, str], tuple[int, Key, ImageMasks]] = {}
     stamps = read_stamps(folder)
     for key, masks in read_masks(folder, boxes_only=True):
         stamp = next((stamp for candidate, stamp in stamps if candidate == key), None)
@@ -76,12 +77,12 @@ def read_nearest_masks(folder: Path) -> Iterator[tuple[Key, ImageMasks]]:
             raise misfit(folder)
         apart = abs(stamp - masks.stamp_ns)
         # Stamps alone repeat after a clock was set back.
-        image = masks.topic, masks.stamp_ns, masks.log_time_ns
+        image = masks.log_time_ns, masks.stamp_ns, masks.topic
         if image not in held or apart < held[image][0]:
             held[image] = apart, key, masks
         if len(held) > _HELD:
-            yield held.pop(next(iter(held)))[1:]
-    yield from (nearest[1:] for nearest in held.values())
+            yield held.pop(min(held))[1:]
+    yield from (held[image][1:] for image in sorted(held))
 
 
 def _run_lengths(column: pa.ChunkedArray) -> Iterator[U4]:
