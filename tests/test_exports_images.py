@@ -240,7 +240,19 @@ def test_depth_images_are_millimetres_with_their_own_masks(run: Path, tmp_path: 
     pixels = np.asarray(Image.open(tmp_path / "out/images/train" / first["file_name"]))
     stored = np.frombuffer(bytes(messages[0][1].data), "<u2").reshape(480, 640)
     np.testing.assert_array_equal(pixels, stored)
-    assert all(row["segmentation"]["size"] == [480, 640] for row in data["annotations"])
+    names = {c["id"]: c["name"] for c in data["categories"]}
+    frames = {image["id"]: image["frame"] for image in data["images"]}
+    left = {f.index: {o.track: o for o in f.objects} for f in read_finished(run).frames()}
+    for row in data["annotations"]:
+        item = left[frames[row["image_id"]]].pop(row["attributes"]["track"])
+        mask, own = decoded(row["segmentation"]), np.zeros((480, 640), bool)
+        own.flat[item.indices] = True
+        assert (mask & own).sum() / (mask | own).sum() > 0.9  # holes are filled
+        v, u = np.nonzero(mask)
+        assert row["bbox"] == [u.min(), v.min(), np.ptp(u) + 1, np.ptp(v) + 1]
+        assert row["area"] == mask.sum()
+        assert names[row["category_id"]] == item.category
+    assert {o.category for objects in left.values() for o in objects.values()} <= {"unknown"}
 
 
 def test_all_runs_without_colour_are_named_before_export(
