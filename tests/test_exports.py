@@ -468,12 +468,26 @@ def test_export_never_replaces_its_run(run: Path) -> None:
 
 
 def test_export_replaces_only_export_of_same_format(run: Path, tmp_path: Path) -> None:
-    for _ in range(2):
-        export_run(run, "point-labels", tmp_path, every=6)
-    assert len(list((tmp_path / "table" / "semantic").iterdir())) == 2
+    """Its marker states the source, so that no export of another one is replaced."""
+    folder = shutil.copytree(run, tmp_path / "table")
+    info = read_run(folder)
+    info["options"] |= {"start_s": 0.0, "end_s": 99.5}
+    write_run(folder, info)
+    objects = {export_run(folder, "point-labels", tmp_path / "out", every=6) for _ in range(2)}
+    out = tmp_path / "out" / "table"
 
+    assert len(list((out / "semantic").iterdir())) == 2
+    assert json.loads((out / "export.json").read_text()) == {
+        "format": "point-labels",
+        "run": info["id"],
+        "input": info["input"],
+        "topics": ["/camera/depth/image_raw"],
+        "range_s": [0.0, 99.5],
+        "objects": objects.pop(),
+        "made": sorted(path.name for path in out.iterdir() if path.name != "export.json"),
+    }
     with pytest.raises(OutputError, match="holds point-labels"):
-        export_run(run, "kitti", tmp_path)
+        export_run(folder, "kitti", tmp_path / "out")
 
 
 def test_missing_or_changed_recording_is_refused(run: Path, tmp_path: Path) -> None:
