@@ -3,6 +3,7 @@
 import json
 from collections.abc import Iterable
 from dataclasses import replace
+from importlib import import_module
 from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
@@ -66,7 +67,9 @@ def plain(message: Any) -> Any:
 def read_back(channel: AnnotationChannel, data: bytes) -> Any:
     """Return a message, decoded by its channel's own schema."""
     if channel.encoding == "json":
-        return plain(json.loads(data))
+        message = json.loads(data)
+        import_module("jsonschema").validate(message, json.loads(channel.schema))
+        return plain(message)
     if channel.encoding == "protobuf":
         return plain(message_decoder(channel.schema, channel.schema_name)(data))
     ros1 = channel.encoding == "ros1"
@@ -282,8 +285,10 @@ def test_object_visible_to_another_sensor_is_not_deleted(tmp_path: Path) -> None
     assert [[d.id for d in scene.deletions] for scene in scenes] == [[], [], [], ["track-7"]]
 
 
-IMAGE_BOX = ImageBox(7, "bowl", 0.625, (31, 44, 120, 66))
-IMAGE = ImageFrame("/color", STAMP, STAMP + 3, "colour", (IMAGE_BOX,))
+IMAGE_BOXES = (
+    ImageBox(7, "bowl", 0.625, (31, 44, 120, 66)), ImageBox(9, "cup", 0.25, (5, 8, 13, 210))
+)  # fmt: skip
+IMAGE = ImageFrame("/color", STAMP, STAMP + 3, "colour", IMAGE_BOXES)
 
 
 def image_messages(encoding: str) -> dict[str, Any]:
@@ -294,25 +299,33 @@ def image_messages(encoding: str) -> dict[str, Any]:
 
 @pytest.mark.parametrize("encoding", ["cdr", "ros1", "json", "protobuf"])
 def test_image_annotations_are_equal_in_every_encoding(encoding: str) -> None:
-    """The box is 120 wide and 66 high at (31, 44), in the colour of its category."""
-    message, colour = image_messages(encoding)["/shapecat/image_annotations"], colour_of("bowl")
-    (line,), (text,) = message.points, message.texts
-    corners = [(p.x, p.y) for p in line.points]
+    """Boxes in the colour of their category, readable on any image; type 2 is a closed line."""
+    message = image_messages(encoding)["/shapecat/image_annotations"]
+    expected = [
+        ("bowl", "#7 bowl 0.63", 11.0, [(31, 44), (151, 44), (151, 110), (31, 110)]),
+        ("cup", "#9 cup 0.25", 18.0, [(5, 8), (18, 8), (18, 218), (5, 218)]),
+    ]
 
-    assert (line.timestamp, text.timestamp) == (STAMP, STAMP)
-    assert sorted(corners) == [(31, 44), (31, 110), (151, 44), (151, 110)]
-    assert corners[0] in {(corners[1][0], corners[3][1]), (corners[3][0], corners[1][1])}
-    assert_allclose(numbers(line.outline_color, "rgb"), np.array(colour) / 255, atol=1e-6)
-    assert_allclose(numbers(line.fill_color, "rgb"), np.array(colour) / 255, atol=1e-6)
-    assert_allclose(numbers(text.background_color, "rgb"), np.array(colour) / 255, atol=1e-6)
-    assert (text.position.x, text.position.y) == corners[0]
-    assert "bowl" in text.text
+    assert len(message.circles) == 0
+    for line, text, (category, words, font_size, corners) in zip(
+        message.points, message.texts, expected, strict=True
+    ):
+        colour = np.array(colour_of(category)) / 255
+        assert (line.timestamp, text.timestamp) == (STAMP, STAMP)
+        assert [(p.x, p.y) for p in line.points] == corners
+        assert (text.position.x, text.position.y) == corners[0]
+        assert (int(line.type), line.thickness, len(line.outline_colors)) == (2, 2.0, 0)
+        assert (text.text, text.font_size) == (words, font_size)
+        assert_allclose(numbers(line.outline_color, "rgba"), [*colour, 1.0], atol=1e-6)
+        assert_allclose(numbers(line.fill_color, "rgba"), [*colour, 0.15], atol=1e-6)
+        assert_allclose(numbers(text.background_color, "rgba"), [*colour, 0.7], atol=1e-6)
+        assert_allclose(numbers(text.text_color, "rgba"), [1.0, 1.0, 1.0, 1.0], atol=1e-6)
 
 
 def test_each_of_several_cameras_has_its_annotations(tmp_path: Path) -> None:
     """Viewers draw all messages of a channel on an image: also the boxes of other cameras."""
     images = [
-        ImageFrame(topic, STAMP, STAMP + k, "colour", (IMAGE_BOX,) * boxes)
+        ImageFrame(topic, STAMP, STAMP + k, "colour", IMAGE_BOXES[:1] * boxes)
         for k, (topic, boxes) in enumerate([("/l/rgb", 1), ("r/rgb", 2), ("/l/rgb", 3)])
     ]
     target, topics = tmp_path / "out.mcap", ["/l/rgb", "r/rgb"]
@@ -335,13 +348,13 @@ def test_each_of_several_cameras_has_its_annotations(tmp_path: Path) -> None:
 @pytest.mark.parametrize("encoding", ["cdr", "ros1"])
 def test_image_detections_have_right_values(encoding: str) -> None:
     message = image_messages(encoding)["/shapecat/detections_2d"]
-    (item,) = message.detections
+    expected = [("7", "bowl", 0.625, (91, 77, 120, 66)), ("9", "cup", 0.25, (11.5, 113, 13, 210))]
 
-    assert (message.header.stamp, message.header.frame_id) == (STAMP, "colour")
-    middle = item.bbox.center.position
-    assert (middle.x, middle.y, item.bbox.size_x, item.bbox.size_y) == (91, 77, 120, 66)
-    assert (item.results[0].hypothesis.class_id, item.results[0].hypothesis.score) == (
-        "bowl",
-        0.625,
-    )
-    assert item.id == "7"
+    for header in (message.header, *(item.header for item in message.detections)):
+        assert (header.stamp, header.frame_id) == (STAMP, "colour")
+    for item, (number, category, score, box) in zip(message.detections, expected, strict=True):
+        (result,), bbox = item.results, item.bbox
+        middle = bbox.center.position
+        assert (middle.x, middle.y, bbox.size_x, bbox.size_y) == box
+        assert (result.hypothesis.class_id, result.hypothesis.score) == (category, score)
+        assert (item.id, bbox.center.theta) == (number, 0.0)

@@ -5,7 +5,6 @@ import shutil
 from collections.abc import Callable, Sequence
 from copy import deepcopy
 from dataclasses import replace
-from importlib import import_module
 from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
@@ -24,9 +23,6 @@ from shapecat.config import Settings
 from shapecat.errors import NoStreamError
 from shapecat.outputs.annotation import image_annotations
 from shapecat.outputs.annotation.image_annotations import (
-    ImageBox,
-    ImageFrame,
-    image_encoders_for,
     read_image_frames,
 )
 from shapecat.outputs.colouring import Coloured, with_colour
@@ -35,7 +31,6 @@ from shapecat.outputs.review.writing import write_review
 from shapecat.perception import Perceiver
 from shapecat.pipeline import annotate_again, process
 from shapecat.recordings import FrameRange, open_recording
-from shapecat.recordings.decoding.protobuf import message_decoder
 from shapecat.runs.finished import open_source, read_finished
 from shapecat.runs.jobs import Job
 from shapecat.runs.labels.corrections import read_labels
@@ -305,40 +300,6 @@ def test_run_json_names_colour_topic(run: Path) -> None:
     assert about["color"] == {"/camera/depth/image_raw": IMAGES}
     assert about["counts"]["color"] == FRAMES
     assert pq.read_table(run / "masks.parquet").num_rows == FRAMES
-
-
-DRAWING = ImageFrame(
-    "/c",
-    1_700_000_000_123_456_789,
-    5,
-    "optical",
-    (ImageBox(6, "cup", 0.97, (11, 22, 33, 44)), ImageBox(7, "unknown", 0.5, (0, 0, 5, 3))),
-)
-
-
-def test_annotations_in_json_and_protobuf_are_equal() -> None:
-    """Read back with the embedded schema, as Foxglove does."""
-    ((as_json, encode),) = image_encoders_for("json", ["/c"])["/c"]
-    plain = json.loads(encode(DRAWING))
-    validate: Any = import_module("jsonschema").validate
-    validate(plain, json.loads(as_json.schema))
-    ((packed, pack),) = image_encoders_for("protobuf", ["/c"])["/c"]
-    decode = message_decoder(packed.schema, packed.schema_name)
-    message = decode(pack(DRAWING))
-
-    assert as_json.schema_name == packed.schema_name == "foxglove.ImageAnnotations"
-    assert len(plain["points"]) == len(plain["texts"]) == 2
-    first = plain["points"][0]
-    assert [(p["x"], p["y"]) for p in first["points"]] == [(11, 22), (44, 22), (44, 66), (11, 66)]
-    assert [(p.x, p.y) for p in message.points[0].points] == [
-        (11, 22),
-        (44, 22),
-        (44, 66),
-        (11, 66),
-    ]
-    assert message.points[0].type == first["type"] == 2
-    assert first["timestamp"] == {"sec": 1_700_000_000, "nsec": 123_456_789}
-    assert message.texts[0].text == plain["texts"][0]["text"] == "#6 cup 0.97"
 
 
 def test_run_lengths_match_coco_and_decode_to_mask() -> None:
