@@ -2,6 +2,7 @@
 
 import csv
 import math
+from collections.abc import Iterable
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -59,6 +60,16 @@ PARTIAL = [False, True, False, False, True, False]
 NOVELTIES = np.array([[0.9 if cut else 0.4, 0.3, 1.2] for cut in PARTIAL])
 """By frame and object; a cut view has a higher novelty."""
 SIZE = np.array([0.06, 0.11, 0.19])
+FULL_CENTERS = CENTERS + np.array([0.01, 0.02, 0.03])
+FULL_AXES = Rotation.from_euler("z", 0.9)
+FULL_SIZE = np.array([0.07, 0.13, 0.22])
+FULL_STD = np.array([0.004, 0.006, 0.009])
+AROUND = np.arange(DIRECTIONS) * (2 * np.pi / DIRECTIONS)
+EXTENTS = np.stack([np.cos(AROUND), np.sin(AROUND)], axis=1)
+FULL_OUTLINE = abs(EXTENTS) @ (0.035, 0.065) + EXTENTS @ (0.011, 0.004)
+"""A rectangle of 0.07 m by 0.13 m with its middle at (0.011, 0.004) in the box."""
+FUSED_CENTERS = FULL_CENTERS + FULL_AXES.apply([0.011, 0.004, 0.0])
+"""Of the boxes around these outlines."""
 NEURONS = np.array([[0.1, 0.2, 0.3], [0.4, 0.5, 0.6], [0.7, 0.8, 0.9]])
 OUTLINE = np.array([[0.1, 0.2, 1.3], [1.4, 0.5, 1.6], [1.7, 1.8, 1.9], [0.2, 1.1, 1.2]])
 
@@ -69,50 +80,69 @@ def detection_of(frame: int, item: int) -> Detection:
     center = inverse.apply(CENTERS[item] - POSITIONS[frame])
     orientation = (inverse * AXES).as_quat()
     candidate = Candidate(
-        indices=np.arange(10 * item, 10 * item + 5),
+        indices=np.arange(10 * item, 10 * item + 5 + item),
         box=Box(center, SIZE, orientation),
-        plane=0,
-        on_candidate=None,
-        support_m=0.0,
+        plane=item % 2,
+        on_candidate=item - 1 if item else None,
+        support_m=0.04 * item,
         touches_border=item == 0 and PARTIAL[frame],
         occluded=False,
     )
     gas = NeuralGas(NEURONS + item, np.array([[0, 2], [1, 2]]))
-    around = np.arange(DIRECTIONS) * (2 * np.pi / DIRECTIONS)
-    length, width, _ = SIZE + 0.01
-    oval = (length + width) / 4 + (length - width) / 4 * np.cos(2 * around)
-    full = FullBox(center, SIZE + 0.01, orientation, np.full(3, 0.005), oval)
+    full_center = inverse.apply(FULL_CENTERS[item] - POSITIONS[frame])
+    turn = (inverse * FULL_AXES).as_quat()
+    full = FullBox(full_center, FULL_SIZE, turn, FULL_STD, FULL_OUTLINE)
     posterior, novelty = POSTERIORS[frame % 2, item], float(NOVELTIES[frame, item])
-    return Detection(candidate, gas, np.arange(4.0), posterior, novelty, 0.001, full)
+    seconds = 0.001 * (1 + frame + 10 * item)
+    return Detection(candidate, gas, np.arange(4.0), posterior, novelty, seconds, full)
+
+
+def stamp(frame: int) -> int:
+    return EPOCH + frame * SECOND // 10
+
+
+def frame_of(
+    k: int,
+    objects: Iterable[Detection],
+    *,
+    topic: str = "/depth",
+    index: int | None = None,
+    stamp_ns: int | None = None,
+    posed: bool = True,
+    origin: Any = 0.0,
+    frame_id: str = "cam",
+    offset: Pose | None = None,
+) -> tuple[Perception, FrameRow]:
+    """Return a frame from the k-th place of the sensor, by default its k-th frame."""
+    up = ROTATIONS[k].inv().apply(UP)
+    planes = (Plane(up, -0.5, OUTLINE, 0.7, 0.0), Plane(up, -0.2, OUTLINE + 1, 0.4, 0.3))
+    index, stamp_ns = k if index is None else index, stamp(k) if stamp_ns is None else stamp_ns
+    pose = Pose(ROTATIONS[k].as_matrix(), POSITIONS[k] + origin) if posed else None
+    found, seconds = tuple(objects), {"detect": 0.01 + 0.001 * k, "surface": 0.05}
+    perception = Perception(topic, index, stamp_ns, frame_id, Scene(up, planes, ()), found, seconds)
+    return perception, FrameRow(stamp_ns + 5, pose, up, frame_from_sensor=offset)
+
+
+def all_of(k: int) -> list[Detection]:
+    return [detection_of(k, item) for item in range(3)]
+
+
+def write_frames(
+    folder: Path, frames: Iterable[tuple[Perception, FrameRow]], *, work: str = ""
+) -> Path:
+    """Write the tables of some frames, and track their detections."""
+    with PerceptionTables(folder, categories=CATEGORIES, model_id="m") as tables:
+        for perception, row in frames:
+            tables.write([perception], [row])
+    track_run(folder, TrackingSettings(), CATEGORIES, work=work)
+    return folder
 
 
 @pytest.fixture(scope="module")
 def run(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """Write the tables of three objects seen by a moving, rotated sensor."""
-    return write_run(tmp_path_factory.mktemp("turned"), np.zeros(3))
-
-
-def write_run(folder: Path, origin: Any, *, vague: int | None = None) -> Path:
-    """Write the tables, with all objects and the sensor moved by ``origin``, metres.
-
-    The whole size of the object ``vague`` is unknown.
-    """
-    with PerceptionTables(folder, categories=CATEGORIES, model_id="m") as tables:
-        for k in range(FRAMES):
-            up = ROTATIONS[k].inv().apply(UP)
-            planes = (Plane(up, -0.5, OUTLINE, 0.7, 0.0), Plane(up, -0.2, OUTLINE + 1, 0.4, 0.3))
-            scene = Scene(up, planes, ())
-            objects = [detection_of(k, item) for item in range(3)]
-            found = tuple(
-                replace(one, full=None) if item == vague else one
-                for item, one in enumerate(objects)
-            )
-            stamp = EPOCH + k * SECOND // 10
-            perception = Perception("/depth", k, stamp, "cam", scene, found, {"detect": 0.01})
-            pose = Pose(ROTATIONS[k].as_matrix(), POSITIONS[k] + origin)
-            tables.write([perception], [FrameRow(stamp + 5, pose, up)])
-    track_run(folder, TrackingSettings(), CATEGORIES, work="w0123")
-    return folder
+    folder = tmp_path_factory.mktemp("turned")
+    return write_frames(folder, (frame_of(k, all_of(k)) for k in range(FRAMES)), work="w0123")
 
 
 def lines(folder: Path) -> list[dict[str, str]]:
@@ -127,10 +157,9 @@ def test_sensor_pose_is_written_row_major(run: Path) -> None:
         assert_allclose(np.reshape(row["fixed_rotation"], (3, 3)), ROTATIONS[k].as_matrix())
         assert_allclose(row["fixed_translation"], POSITIONS[k])
         assert_allclose(row["up_given"], ROTATIONS[k].inv().apply(UP), atol=1e-6)
-        assert (row["stamp_ns"], row["log_time_ns"]) == (
-            EPOCH + k * SECOND // 10,
-            EPOCH + k * SECOND // 10 + 5,
-        )
+        assert (row["stamp_ns"], row["log_time_ns"]) == (stamp(k), stamp(k) + 5)
+        assert row["stages"] == ["detect", "surface"]
+        assert_allclose(row["seconds"], [0.01 + 0.001 * k, 0.05], rtol=1e-6)
 
 
 def test_centres_are_in_sensor_and_fixed_frame(run: Path) -> None:
@@ -139,8 +168,10 @@ def test_centres_are_in_sensor_and_fixed_frame(run: Path) -> None:
         own = ROTATIONS[k].inv().apply(CENTERS[item] - POSITIONS[k])
         assert_allclose(row["center"], own, atol=1e-5)
         assert_allclose(row["center_fixed"], CENTERS[item], atol=1e-5)
-        assert_allclose(row["height_m"], ROTATIONS[k].inv().apply(UP) @ own + 0.5, atol=1e-5)
-        assert row["touches_border"] == (item == 0 and PARTIAL[k])
+        support = (-0.5, -0.2)[item % 2] + 0.04 * item
+        assert_allclose(row["height_m"], ROTATIONS[k].inv().apply(UP) @ own - support, atol=1e-5)
+        flags = (row["touches_border"], row["occluded"])
+        assert flags == (item == 0 and PARTIAL[k], False)
         best = "can" if k % 2 else "cup"
         assert row["category"] == (best, best, "unknown")[item]
 
@@ -151,7 +182,7 @@ def test_plane_columns_have_right_values(run: Path) -> None:
     assert len(found) == 2 * FRAMES
     for row in found:
         k, number = row["frame"], row["plane"]
-        assert (row["topic"], row["stamp_ns"]) == ("/depth", EPOCH + k * SECOND // 10)
+        assert (row["topic"], row["stamp_ns"]) == ("/depth", stamp(k))
         assert_allclose(row["normal"], ROTATIONS[k].inv().apply(UP), atol=1e-6)
         assert_allclose(row["offset"], (-0.5, -0.2)[number], rtol=1e-6)
         assert_allclose(row["height_m"], (0.0, 0.3)[number], atol=1e-7)
@@ -166,11 +197,21 @@ def test_detection_columns_have_right_values(run: Path) -> None:
         assert_allclose(np.reshape(row["neurons"], (-1, 3)), NEURONS + item, rtol=1e-6)
         assert row["edges"] == [0, 2, 1, 2]
         assert row["descriptor"] == [0, 1, 2, 3]
-        assert row["indices"] == list(range(10 * item, 10 * item + 5))
-        assert (row["points"], row["frame_id"], row["plane"]) == (5, "cam", 0)
+        assert row["indices"] == list(range(10 * item, 10 * item + 5 + item))
+        assert (row["points"], row["frame_id"], row["plane"]) == (5 + item, "cam", item % 2)
+        assert (row["on_detection"], row["reused_from"]) == (item - 1 if item else None, None)
         assert_allclose(row["size"], SIZE, rtol=1e-6)
-        assert_allclose(row["size_full"], SIZE + 0.01, rtol=1e-6)
-        assert_allclose(row["size_full_std"], [0.005] * 3, rtol=1e-6)
+        k, inverse = row["frame"], ROTATIONS[row["frame"]].inv()
+        center = inverse.apply(FULL_CENTERS[item] - POSITIONS[k])
+        assert_allclose(row["center_full"], center, atol=1e-6)
+        assert_allclose(row["size_full"], FULL_SIZE, rtol=1e-6)
+        turn = Rotation.from_quat(row["orientation_full"])
+        assert_allclose(turn.as_matrix(), (inverse * FULL_AXES).as_matrix(), atol=1e-6)
+        turn = Rotation.from_quat(row["orientation"])
+        assert_allclose(turn.as_matrix(), (inverse * AXES).as_matrix(), atol=1e-6)
+        assert_allclose(row["size_full_std"], FULL_STD, rtol=1e-6)
+        assert_allclose(row["outline_full"], FULL_OUTLINE, rtol=1e-6)
+        assert row["seconds"] == pytest.approx(0.001 * (1 + k + 10 * item))
         assert_allclose(row["novelty"], NOVELTIES[row["frame"], item], rtol=1e-6)
         best = int(np.argmax(POSTERIORS[row["frame"] % 2, item]))
         assert row["confidence"] == pytest.approx(POSTERIORS[row["frame"] % 2, item, best])
@@ -196,23 +237,22 @@ def test_tracker_reads_interleaved_topics_as_their_streams(tmp_path: Path) -> No
     """A detection in the frame of another topic, or row group, would be elsewhere."""
     count = 2 * GROUP_FRAMES + 5
     wanted: dict[str, list[tuple[int, int, list[float]]]] = {"": [], "/own": []}
-    with PerceptionTables(tmp_path, categories=CATEGORIES, model_id="m") as tables:
-        row = 0
-        for k in range(count):
-            topic, at = ("/own", "/a", "/b")[k % 3], k % FRAMES
-            found = [detection_of(at, item) for item in range(3)][: k % 4]
-            has_pose = topic != "/own" and k != 7
-            pose = Pose(ROTATIONS[at].as_matrix(), POSITIONS[at]) if has_pose else None
-            for item, one in enumerate(found):
-                if topic == "/own":
-                    center = one.candidate.box.center.tolist()
-                    wanted["/own"].append((EPOCH + k, row + item, center))
-                elif pose is not None:
-                    wanted[""].append((EPOCH + k, row + item, CENTERS[item].tolist()))
-            row += len(found)
-            scene = Scene(UP, (Plane(UP, -0.5, OUTLINE, 0.7, 0.0),), ())
-            perception = Perception(topic, k // 3, EPOCH + k, "cam", scene, tuple(found), {})
-            tables.write([perception], [FrameRow(EPOCH + k, pose)])
+    written, row = [], 0
+    for k in range(count):
+        topic, at = ("/own", "/a", "/b")[k % 3], k % FRAMES
+        found = all_of(at)[: k % 4]
+        posed = topic != "/own" and k != 7
+        for item, one in enumerate(found):
+            if topic == "/own":
+                center = one.candidate.box.center.tolist()
+                wanted["/own"].append((EPOCH + k, row + item, center))
+            elif posed:
+                wanted[""].append((EPOCH + k, row + item, CENTERS[item].tolist()))
+        row += len(found)
+        written.append(
+            frame_of(at, found, topic=topic, index=k // 3, stamp_ns=EPOCH + k, posed=posed)
+        )
+    write_frames(tmp_path, written)
     placed = streams_with_poses(tmp_path)
     own, shared = _read_streams(tmp_path, len(CATEGORIES), placed)
 
@@ -230,13 +270,8 @@ def test_tracker_reads_interleaved_topics_as_their_streams(tmp_path: Path) -> No
 
 def test_tracker_reads_which_views_are_reused(tmp_path: Path) -> None:
     """A view reused in a static scene would count as many views."""
-    origins = [None, 0, 0, None]
-    scene = Scene(UP, (Plane(UP, -0.5, OUTLINE, 0.7, 0.0),), ())
-    with PerceptionTables(tmp_path, categories=CATEGORIES, model_id="m") as tables:
-        for k, origin in enumerate(origins):
-            found = (replace(detection_of(k, 1), reused_from=origin),)
-            perception = Perception("/depth", k, k, "cam", scene, found, {})
-            tables.write([perception], [FrameRow(k, None)])
+    seen = [replace(detection_of(k, 1), reused_from=(None, 0, 0, None)[k]) for k in range(4)]
+    write_frames(tmp_path, (frame_of(k, [one], posed=False) for k, one in enumerate(seen)))
 
     (table,) = _read_streams(tmp_path, len(CATEGORIES), set())
 
@@ -246,18 +281,12 @@ def test_tracker_reads_which_views_are_reused(tmp_path: Path) -> None:
 @pytest.mark.parametrize("flag", ["touches_border", "occluded"])
 def test_view_with_either_flag_counts_as_partial(tmp_path: Path, flag: str) -> None:
     """A view of a half-hidden object would weigh as much as four of its kind."""
-    with PerceptionTables(tmp_path, categories=CATEGORIES, model_id="m") as tables:
-        for k in range(FRAMES):
-            one = detection_of(k, 1)
-            flags: dict[str, Any] = {"touches_border": False, "occluded": False, flag: k == 5}
-            one = replace(one, candidate=replace(one.candidate, **flags))
-            up = ROTATIONS[k].inv().apply(UP)
-            scene = Scene(up, (Plane(up, -0.5, OUTLINE, 0.7, 0.0),), ())
-            stamp = EPOCH + k * SECOND // 10
-            perception = Perception("/depth", k, stamp, "cam", scene, (one,), {})
-            pose = Pose(ROTATIONS[k].as_matrix(), POSITIONS[k])
-            tables.write([perception], [FrameRow(stamp, pose, up)])
-    track_run(tmp_path, TrackingSettings(), CATEGORIES)
+    frames = []
+    for k in range(FRAMES):
+        one = detection_of(k, 1)
+        flags: dict[str, Any] = {flag: k == 5}
+        frames.append(frame_of(k, [replace(one, candidate=replace(one.candidate, **flags))]))
+    write_frames(tmp_path, frames)
 
     views = POSTERIORS[np.arange(FRAMES) % 2, 1]
     fused = np.exp(np.average(np.log(views), axis=0, weights=[1, 1, 1, 1, 1, 0.25]))
@@ -265,25 +294,29 @@ def test_view_with_either_flag_counts_as_partial(tmp_path: Path, flag: str) -> N
 
 
 def test_track_boxes_match_object_poses(run: Path) -> None:
+    """The fused box is around the outlines; of their variance, all six views share one half."""
     tracks = rows(run, "tracks")
+    # The standard deviation of a visible length is 6 mm, that of the height is given.
+    std = np.array([0.006, 0.006, FULL_STD[2]]) * math.sqrt(1 / 2 + 1 / 12)
 
     assert len(tracks) == 3 * FRAMES
     for row in tracks:
         k, item = row["frame"], row["detection"]
         inverse = ROTATIONS[k].inv()
         assert_allclose(row["center_fixed"], CENTERS[item], atol=1e-5)
-        assert_allclose(row["center_full"], inverse.apply(CENTERS[item] - POSITIONS[k]), atol=0.02)
-        rotation = Rotation.from_quat(row["orientation_full"])
-        difference = (rotation.inv() * inverse * AXES).magnitude()
-        quarter = np.pi / 2  # which gives the same box
-        assert min(difference % quarter, quarter - difference % quarter) < np.radians(10)
-        assert_allclose(np.sort(row["size_full"]), SIZE + 0.01, atol=0.03)
+        center = inverse.apply(FUSED_CENTERS[item] - POSITIONS[k])
+        assert_allclose(row["center_full"], center, atol=1e-5)
+        turn = Rotation.from_quat(row["orientation_full"])
+        assert_allclose(turn.as_matrix(), (inverse * FULL_AXES).as_matrix(), atol=1e-5)
+        assert_allclose(row["size_full"], FULL_SIZE, atol=1e-5)
+        assert_allclose(row["size_full_std"], std, atol=1e-6)
 
 
 def test_positions_far_from_origin_are_exact(tmp_path: Path) -> None:
     """Fixed frames of outdoor robots have coordinates of millions of metres (UTM)."""
     origin = np.array([500_000.25, 5_400_000.125, 310.5])
-    folder = write_run(tmp_path, origin)
+    frames = (frame_of(k, all_of(k), origin=origin) for k in range(FRAMES))
+    folder = write_frames(tmp_path, frames)
 
     for table in ("detections", "tracks"):
         found = rows(folder, table)
@@ -297,25 +330,20 @@ def test_positions_far_from_origin_are_exact(tmp_path: Path) -> None:
 
 def test_equal_frame_numbers_of_two_sensors_are_not_confused(tmp_path: Path) -> None:
     """Each box is shown in the frame of the sensor that saw it."""
-    with PerceptionTables(tmp_path, categories=CATEGORIES, model_id="m") as tables:
-        for k in range(FRAMES):
-            up = ROTATIONS[k].inv().apply(UP)
-            scene = Scene(up, (Plane(up, -0.5, OUTLINE, 0.7, 0.0),), ())
-            found = tuple(detection_of(k, item) for item in range(3))
-            stamp, topic = EPOCH + k * SECOND // 10, "/right" if k % 2 else "/left"
-            perception = Perception(topic, k // 2, stamp, topic, scene, found, {})
-            pose = Pose(ROTATIONS[k].as_matrix(), POSITIONS[k])
-            tables.write([perception], [FrameRow(stamp, pose, up)])
-    track_run(tmp_path, TrackingSettings(), CATEGORIES)
+    topics = ["/right" if k % 2 else "/left" for k in range(FRAMES)]
+    write_frames(
+        tmp_path,
+        (frame_of(k, all_of(k), topic=topic, index=k // 2) for k, topic in enumerate(topics)),
+    )
 
     tracks = rows(tmp_path, "tracks")
     assert len(tracks) == 3 * FRAMES
     for row in tracks:
         k, item = 2 * row["frame"] + (row["topic"] == "/right"), row["detection"]
-        assert row["stamp_ns"] == EPOCH + k * SECOND // 10
+        assert row["stamp_ns"] == stamp(k)
         assert_allclose(row["center_fixed"], CENTERS[item], atol=1e-5)
-        own = ROTATIONS[k].inv().apply(CENTERS[item] - POSITIONS[k])
-        assert_allclose(row["center_full"], own, atol=0.02)
+        own = ROTATIONS[k].inv().apply(FUSED_CENTERS[item] - POSITIONS[k])
+        assert_allclose(row["center_full"], own, atol=1e-5)
 
 
 @pytest.mark.parametrize("flag", ["touches_border", "occluded"])
@@ -323,27 +351,22 @@ def test_cut_views_have_less_weight_for_full_box(tmp_path: Path, flag: str) -> N
     """Four cut views weigh as much as one of the two whole views."""
     cut = (True, False, True, True, False, True)
     heights = [0.11 if one else 0.21 for one in cut]
-    with PerceptionTables(tmp_path, categories=CATEGORIES, model_id="m") as tables:
-        for k in range(FRAMES):
-            up = ROTATIONS[k].inv().apply(UP)
-            found = [detection_of(k, item) for item in range(3)]
-            first, whole = found[1].candidate, found[1].full
-            flags: dict[str, Any] = {flag: cut[k]}
-            assert whole is not None
-            found[1] = replace(
-                found[1],
-                candidate=replace(first, **flags),
-                full=replace(whole, size=np.array([*whole.size[:2], heights[k]])),
-            )
-            scene = Scene(up, (Plane(up, -0.5, OUTLINE, 0.7, 0.0),), ())
-            stamp = EPOCH + k * SECOND // 10
-            perception = Perception("/depth", k, stamp, "cam", scene, tuple(found), {})
-            pose = Pose(ROTATIONS[k].as_matrix(), POSITIONS[k])
-            tables.write([perception], [FrameRow(stamp, pose, up)])
-    track_run(tmp_path, TrackingSettings(), CATEGORIES)
+    frames = []
+    for k in range(FRAMES):
+        found = all_of(k)
+        first, whole = found[1].candidate, found[1].full
+        flags: dict[str, Any] = {flag: cut[k]}
+        assert whole is not None
+        found[1] = replace(
+            found[1],
+            candidate=replace(first, **flags),
+            full=replace(whole, size=np.array([*whole.size[:2], heights[k]])),
+        )
+        frames.append(frame_of(k, found))
+    write_frames(tmp_path, frames)
 
     for row in rows(tmp_path, "tracks"):
-        height = 0.21 if row["detection"] == 1 else SIZE[2] + 0.01
+        height = 0.21 if row["detection"] == 1 else FULL_SIZE[2]
         assert row["size_full"][2] == pytest.approx(height, abs=1e-5)
 
 
@@ -351,17 +374,13 @@ def test_cut_views_have_less_weight_for_full_box(tmp_path: Path, flag: str) -> N
 def test_pose_missing_in_half_of_frames_is_not_used(tmp_path: Path, posed: int) -> None:
     """Detections without a pose would be lost; a few of them are."""
     own = np.array([0.31, -0.12, 0.94])
-    with PerceptionTables(tmp_path, categories=CATEGORIES, model_id="m") as tables:
-        for k in range(FRAMES):
-            one = detection_of(0, 1)
-            box = replace(one.candidate.box, center=own)
-            one = replace(one, candidate=replace(one.candidate, box=box))
-            pose = Pose(ROTATIONS[0].as_matrix(), POSITIONS[0]) if k < posed else None
-            scene = Scene(UP, (Plane(UP, -0.5, OUTLINE, 0.7, 0.0),), ())
-            stamp = EPOCH + k * SECOND // 10
-            perception = Perception("/depth", k, stamp, "cam", scene, (one,), {})
-            tables.write([perception], [FrameRow(stamp, pose, UP)])
-    track_run(tmp_path, TrackingSettings(), CATEGORIES)
+    one = detection_of(0, 1)
+    box = replace(one.candidate.box, center=own)
+    one = replace(one, candidate=replace(one.candidate, box=box))
+    frames = (
+        frame_of(0, [one], index=k, stamp_ns=stamp(k), posed=k < posed) for k in range(FRAMES)
+    )
+    write_frames(tmp_path, frames)
 
     place, count = (ROTATIONS[0].apply(own) + POSITIONS[0], 4) if posed == 4 else (own, FRAMES)
     tracks = [row for row in rows(tmp_path, "tracks") if row["detection"] is not None]
@@ -426,7 +445,7 @@ def test_labelled_frames_and_annotations_have_same_boxes(run: Path, *, merged: b
 
     assert [frame.index for frame in shown] == [frame.index for frame in labelled]
     for one, other in zip(shown, labelled, strict=True):
-        assert one.stamp_ns == other.stamp_ns == EPOCH + one.index * SECOND // 10
+        assert one.stamp_ns == other.stamp_ns == stamp(one.index)
         assert other.fixed_from_sensor is not None
         assert_allclose(other.fixed_from_sensor.rotation, ROTATIONS[one.index].as_matrix())
         assert len(one.objects) == 3 - merged
@@ -440,24 +459,27 @@ def test_labelled_frames_and_annotations_have_same_boxes(run: Path, *, merged: b
 
 def test_annotation_of_unknown_whole_is_the_visible_part(tmp_path: Path) -> None:
     """One such object must not cost the others of the frame their whole boxes."""
-    folder = write_run(tmp_path, np.zeros(3), vague=1)
+    frames = []
+    for k in range(FRAMES):
+        first, vague, last = all_of(k)
+        frames.append(frame_of(k, [first, replace(vague, full=None), last]))
+    folder = write_frames(tmp_path, frames)
     labels = read_labels(folder / "tracks.csv", CATEGORIES)
 
     for frame in read_annotation_frames(folder, LabelledTracks.read(folder, labels)):
-        sizes = sorted(one.size[0] for one in frame.objects)
-        assert sizes == pytest.approx([SIZE[0], SIZE[0] + 0.01, SIZE[0] + 0.01], abs=1e-6)
+        sizes = sorted(one.size for one in frame.objects)
+        assert_allclose(sizes, [SIZE, FULL_SIZE, FULL_SIZE], atol=1e-6)
 
 
 def test_times_count_from_earliest_stamp_not_first_message(tmp_path: Path) -> None:
     """Beside a camera whose frames arrive late, a track would begin before the recording."""
-    with PerceptionTables(tmp_path, categories=CATEGORIES, model_id="m") as tables:
-        for k in range(FRAMES):
-            for topic, delay in (("/soon", SECOND // 20), ("/late", 0)):
-                scene = Scene(UP, (Plane(UP, -0.5, OUTLINE, 0.7, 0.0),), ())
-                stamp = EPOCH + k * SECOND // 10 + delay
-                perception = Perception(topic, k, stamp, "cam", scene, (detection_of(0, 1),), {})
-                tables.write([perception], [FrameRow(stamp, None, UP)])
-    track_run(tmp_path, TrackingSettings(), CATEGORIES)
+    one, delays = [detection_of(0, 1)], {"/soon": SECOND // 20, "/late": 0}
+    frames = (
+        frame_of(k, one, topic=topic, stamp_ns=stamp(k) + delay, posed=False)
+        for k in range(FRAMES)
+        for topic, delay in delays.items()
+    )
+    write_frames(tmp_path, frames)
 
     table, timelines = lines(tmp_path), read_timelines(tmp_path)
     begins = {row["topic"]: (row["first_s"], row["last_s"]) for row in table}
@@ -483,16 +505,10 @@ ROBOT = Pose(Rotation.from_euler("xyz", [-1.8, 0.3, 0.7]).as_matrix(), np.array(
 
 def test_merged_box_is_upright_in_named_frame(tmp_path: Path) -> None:
     """A cloud in the frame of the robot is drawn there; up is known in the sensor frame."""
-    with PerceptionTables(tmp_path, categories=CATEGORIES, model_id="m") as tables:
-        for k in range(FRAMES):
-            up = ROTATIONS[k].inv().apply(UP)
-            scene = Scene(up, (Plane(up, -0.5, OUTLINE, 0.7, 0.0),), ())
-            found = tuple(detection_of(k, item) for item in range(3))
-            stamp = EPOCH + k * SECOND // 10
-            perception = Perception("/depth", k, stamp, "base", scene, found, {})
-            pose = Pose(ROTATIONS[k].as_matrix(), POSITIONS[k])
-            tables.write([perception], [FrameRow(stamp, pose, up, frame_from_sensor=ROBOT)])
-    track_run(tmp_path, TrackingSettings(), CATEGORIES)
+    write_frames(
+        tmp_path,
+        (frame_of(k, all_of(k), frame_id="base", offset=ROBOT) for k in range(FRAMES)),
+    )
     labels = read_labels(tmp_path / "tracks.csv", CATEGORIES)
     labels[3] = labels[1]
 
@@ -511,16 +527,13 @@ def test_merged_box_is_upright_in_named_frame(tmp_path: Path) -> None:
 
 def test_only_boxes_of_named_frames_are_transformed(tmp_path: Path) -> None:
     """A robot may publish clouds in its base frame beside images in that of a camera."""
-    with PerceptionTables(tmp_path, categories=CATEGORIES, model_id="m") as tables:
-        for k in range(FRAMES):
-            up = ROTATIONS[k].inv().apply(UP)
-            scene = Scene(up, (Plane(up, -0.5, OUTLINE, 0.7, 0.0),), ())
-            stamp = EPOCH + k * SECOND // 10
-            pose = Pose(ROTATIONS[k].as_matrix(), POSITIONS[k])
-            for topic, frame_id, offset in (("/cloud", "base", ROBOT), ("/depth", "optical", None)):
-                found = Perception(topic, k, stamp, frame_id, scene, (detection_of(k, 0),), {})
-                tables.write([found], [FrameRow(stamp, pose, up, frame_from_sensor=offset)])
-    track_run(tmp_path, TrackingSettings(), CATEGORIES)
+    sensors = (("/cloud", "base", ROBOT), ("/depth", "optical", None))
+    written = (
+        frame_of(k, [detection_of(k, 0)], topic=topic, frame_id=frame_id, offset=offset)
+        for k in range(FRAMES)
+        for topic, frame_id, offset in sensors
+    )
+    write_frames(tmp_path, written)
     tracks = LabelledTracks.read(tmp_path, read_labels(tmp_path / "tracks.csv", CATEGORIES))
 
     for visible in (True, False):
