@@ -1,5 +1,6 @@
 """Tests of the Python interface: imports, shapes of arrays, and the examples of its page."""
 
+import io
 import json
 import re
 import runpy
@@ -19,6 +20,7 @@ import pyarrow.compute as pc
 import pyarrow.parquet as pq
 import pytest
 from click.testing import Result
+from PIL import Image
 
 import shapecat
 from shapecat import api
@@ -30,10 +32,11 @@ from shapecat.types import Camera
 from tests import messages
 from tests.conftest import Guesser
 from tests.loading import loaded_by
-from tests.mcap_files import mcap_writer
+from tests.mcap_files import mcap_writer, read_ros
 from tests.messages import EPOCH
 from tests.scenes import record
 from tests.test_docs_run import run_here
+from tests.test_tables_rotated import all_of, frame_of
 
 PAGE = Path(__file__).parents[1] / "docs" / "python.md"
 
@@ -59,6 +62,9 @@ def test_posterior_times_start_at_first_frame(guessed_run: Path, tmp_path: Path)
     """Tracks start at different times; times since their own start could not be compared."""
     run = shapecat.open_run(guessed_run)
     rows = run.tracks.arrow()
+    made = np.random.default_rng(0).random((len(rows), len(run.categories)), np.float32)
+    at = rows.column_names.index("posterior")
+    rows = rows.set_column(at, "posterior", pa.array(list(made)))
     pq.write_table(rows.filter(pc.greater_equal(rows["frame"], 3)), tmp_path / "late.parquet")
     run.tracks = Table(tmp_path / "late.parquet")
     stamps = run.frame_table.numpy("stamp_ns")
@@ -66,7 +72,7 @@ def test_posterior_times_start_at_first_frame(guessed_run: Path, tmp_path: Path)
     seconds, posteriors = run.posterior(1)
 
     np.testing.assert_allclose(seconds, (stamps[3:] - stamps[0]) * 1e-9)
-    assert posteriors.shape == (len(stamps) - 3, len(run.categories))
+    np.testing.assert_array_equal(posteriors, made[rows["track"].to_numpy() == 1][3:])
 
 
 def test_every_example_on_the_page_runs(page_folder: Path) -> None:
@@ -124,12 +130,13 @@ def test_frame_with_colour_can_be_sent_to_another_process(page_folder: Path) -> 
     """A pool of processes refused frames with colour: their images are views of other memory."""
     run = shapecat.open_run(page_folder / "results" / "demo")
     frame = next(run.frames(recording=page_folder / "demo.mcap"))
+    (_, message), *_ = read_ros(page_folder / "demo.mcap", "/camera/color/image_raw/compressed")
 
     sent = deepcopy(frame)  # as if it was pickled
 
-    assert frame.color is not None
-    assert sent.color is not None
-    assert np.array_equal(sent.color, frame.color)
+    image = np.asarray(Image.open(io.BytesIO(bytes(message.data))))
+    np.testing.assert_array_equal(frame.color, image)
+    np.testing.assert_array_equal(sent.color, image)
     assert np.array_equal(sent.labels, frame.labels)
 
 
@@ -175,6 +182,47 @@ def test_perceive_finds_same_objects_as_processing_recording(image: Any, tmp_pat
                 result.labels.ravel()[item.indices], [item.track] * item.indices.size
             )
         assert (result.labels > 0).sum() == sum(o.indices.size for o in result.objects)
+
+
+def test_perceived_frame_has_all_that_was_found(monkeypatch: pytest.MonkeyPatch) -> None:
+    """A flag in place of another, or a missing plane, would change what a robot does."""
+    perception, _ = frame_of(2, all_of(2))
+    first, second, third = perception.detections
+    cut = replace(second, candidate=replace(second.candidate, touches_border=True))
+    hidden = replace(third, candidate=replace(third.candidate, occluded=True, plane=None))
+    perception = replace(perception, detections=(first, cut, hidden))
+    monkeypatch.setattr("shapecat.outputs.in_memory.perceive", lambda *_, **__: perception)
+
+    labelled = shapecat.perceive(np.zeros((48, 64)), (61, 62, 33, 25)).labelled
+
+    assert labelled.planes == perception.scene.planes
+    assert labelled.up is perception.scene.up
+    assert labelled.seconds == perception.seconds
+    assert labelled.fixed_from_sensor is None
+    for number, (item, found) in enumerate(
+        zip(labelled.objects, perception.detections, strict=True)
+    ):
+        candidate, posterior = found.candidate, found.posterior
+        assert vars(item) | {"height_m": None} == {
+            "track": number + 1,
+            "category": ("cup", "cup", "unknown")[number],
+            "confidence": float(max(posterior)),
+            "box": candidate.box,
+            "indices": candidate.indices,
+            "gas": found.gas,
+            "posterior": posterior,
+            "causal": posterior,
+            "height_m": None,
+            "touches_border": number == 1,
+            "occluded": number == 2,
+            "detections": (number,),
+            "full": found.full,
+        }
+    heights = [item.height_m for item in labelled.objects]
+    wanted = [float(labelled.up @ item.box.center) for item in labelled.objects[:2]]
+    np.testing.assert_allclose(
+        heights, [wanted[0] + 0.5, wanted[1] + 0.2 - 0.04, np.nan], atol=1e-5
+    )
 
 
 def test_masked_values_are_missing(image: Any) -> None:
