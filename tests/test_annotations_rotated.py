@@ -20,10 +20,9 @@ from shapecat.outputs.annotation.channels import encoder_for, text_position
 from shapecat.outputs.annotation.content import Annotation, AnnotationChannel
 from shapecat.outputs.annotation.image_annotations import ImageBox, ImageFrame, image_encoders_for
 from shapecat.outputs.colours import colour_of
-from shapecat.outputs.review.shapes import _above
 from shapecat.recordings import open_recording
 from shapecat.recordings.decoding.protobuf import message_decoder
-from shapecat.types import AnnotationBox, AnnotationFrame, Box
+from shapecat.types import AnnotationBox, AnnotationFrame
 from tests.mcap_files import read_ros, summary_of
 from tests.test_annotated_mcap import EPOCH, write_mcap
 
@@ -100,12 +99,6 @@ def check_box(pose: Any, size: Any) -> None:
 def test_label_is_above_top_of_box() -> None:
     """With a transposed rotation it would be beside a tilted box."""
     assert_allclose(text_position(BOX), ABOVE, atol=1e-12)
-
-
-def test_review_label_is_above_top_of_box() -> None:
-    box = Box(np.array(CENTER), np.array(SIZE), ROTATION.as_quat())
-
-    assert_allclose(_above(box), CENTER + ROTATION.apply([0, 0, SIZE[2] / 2 + 0.02]), atol=1e-6)
 
 
 @pytest.mark.parametrize("encoding", ["cdr", "ros1", "json", "protobuf"])

@@ -74,7 +74,7 @@ JUDGED_BY: dict[str, Sequence[str]] = {
     "shapecat.outputs.in_memory": ("test_api",),
     "shapecat.outputs.opened_run": ("test_api",),
     "shapecat.outputs.report": ("test_report_worked", "test_report", "test_report_serve"),
-    "shapecat.outputs.review": ("test_review", "test_outputs_worked"),
+    "shapecat.outputs.review": ("test_review_worked", "test_review", "test_outputs_worked"),
     "shapecat.outputs.scene_graph": ("test_detection", "test_outputs_worked"),
     "shapecat.outputs.scene_tree": ("test_outputs_worked", "test_exports"),
     "shapecat.outputs.wording": ("test_outputs_worked",),
