@@ -99,6 +99,11 @@ def test_kitti_calibration_projects_points_to_pixels(tmp_path: Path) -> None:
         name: np.array(list(map(float, text.split()))).reshape(3, -1)
         for name, text in (line.split(": ") for line in lines)
     }
+    for name in ("P0", "P1", "P3"):
+        assert np.array_equal(matrices[name], matrices["P2"])
+    assert np.array_equal(matrices["Tr_imu_to_velo"], np.eye(3, 4))
+    to_sensor = LEVEL_FROM_SENSOR.inv().as_matrix()
+    assert_allclose(matrices["Tr_rect_to_sensor"], np.c_[to_sensor, np.zeros(3)], atol=1e-6)
     points = np.fromfile(tmp_path / "velodyne" / "000000.bin", "<f4").reshape(-1, 4)
     velo = np.column_stack([points[:, :3], np.ones(len(points))])
     rectified = matrices["R0_rect"] @ matrices["Tr_velo_to_cam"] @ velo.T

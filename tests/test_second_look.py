@@ -181,6 +181,7 @@ def test_recording_with_tenth_of_frames_disturbed_loses_no_track(
     assert revised(plain) == []
     assert revised(out) == ([] if moving else [*DISTURBED])  # transforms define up anyway
     assert "revised" not in read_run(plain)["counts"]
+    assert read_run(out)["counts"].get("revised", 0) == len(revised(out))
     assert_same_tracks(plain, out)
     # Most objects without any support in sight pass for background, even with the right up.
     assert share_found(out, plain) > 0.4

@@ -67,6 +67,36 @@ def test_category_is_ambiguous_if_little_of_object_is_visible(
     assert [judged(shown)["ambiguous"] for shown in (0.8, 0.79)] == [False, True]
 
 
+def test_truth_states_how_objects_stand() -> None:
+    """Categories, and results for lying or tilted objects, are judged by it."""
+    names = (
+        "label",
+        "category",
+        "kind",
+        "lying",
+        "upside_down",
+        "tilted",
+        "on_support",
+        "on_track",
+    )
+    stand: list[tuple[Any, ...]] = [
+        (20, "cup", "mug", True, False, False, "table", None),
+        (21, "unknown", "arm", False, True, False, "shelf", None),
+        (22, "box", "book", False, False, True, None, 1),
+    ]
+    world = make_scene("tabletop", np.random.default_rng(11), frames=1)
+    items = [
+        replace(item, **dict(zip(names[1:], row[1:], strict=True)))
+        for item, row in zip(world.objects, stand, strict=False)
+    ]
+    nothing = np.zeros((480, 640), np.uint8)
+    found = frame_truth(replace(world, objects=tuple(items)), 0, nothing, KINECT.camera)
+
+    assert [tuple(entry[name] for name in names) for entry in found["hidden"]] == stand
+    assert [entry["parts"] for entry in found["hidden"]] == [[20], [21], [22]]
+    assert found["objects"] == []
+
+
 @pytest.fixture(scope="module", params=WORLDS, ids=str)
 def world(request: pytest.FixtureRequest) -> World:
     kind, seed = request.param
