@@ -14,29 +14,29 @@ from shapecat.runs.folder import read_run
 from tests.conftest import Guesser
 from tests.mcap_files import read_ros
 
-Sizes = dict[tuple[int, str], list[float]]
+Boxes = dict[tuple[int, str], list[float]]
 
 
-def annotated(folder: Path) -> Sizes:
-    """Return the sizes in annotated.mcap by stamp and track."""
+def annotated(folder: Path) -> Boxes:
+    """Return the sizes and centres in annotated.mcap by stamp and track."""
     found = {}
     for _, message in read_ros(folder / "annotated.mcap", "/shapecat/detections"):
         stamp = message.header.stamp
         for item in message.detections:
-            size = item.bbox.size
+            size, center = item.bbox.size, item.bbox.center.position
             key = (stamp.sec * 10**9 + stamp.nanosec, item.id)
-            found[key] = [size.x, size.y, size.z]
+            found[key] = [size.x, size.y, size.z, center.x, center.y, center.z]
     return found
 
 
-def tables(folder: Path, *, full: bool) -> Sizes:
-    """Return the sizes in the tables: full sizes of tracks, or visible sizes of detections."""
+def tables(folder: Path, *, full: bool) -> Boxes:
+    """Return the sizes and centres in the tables: full of tracks, or visible of detections."""
     visible = {
-        (row["frame"], row["detection"]): row["size"]
+        (row["frame"], row["detection"]): row["size"] + row["center"]
         for row in pq.read_table(folder / "detections.parquet").to_pylist()
     }
     return {
-        (row["stamp_ns"], str(row["track"])): row["size_full"]
+        (row["stamp_ns"], str(row["track"])): row["size_full"] + row["center_full"]
         if full
         else visible[row["frame"], row["detection"]]
         for row in pq.read_table(folder / "tracks.parquet").to_pylist()
@@ -104,7 +104,7 @@ def test_exports_have_requested_boxes(
     full, visible = (tables(guessed_run, full=full) for full in (True, False))
     first = min(stamp for stamp, _ in full)
     sizes, others = (
-        sorted(size for (stamp, _), size in known.items() if stamp == first)
+        sorted(box[:3] for (stamp, _), box in known.items() if stamp == first)
         for known in ((visible, full) if options else (full, visible))
     )
     assert np.allclose(found, sizes, atol=1e-6)

@@ -22,14 +22,11 @@ from shapecat.geometry import rotation_from_quaternion
 from shapecat.outputs.exports.crops import Origin
 from shapecat.outputs.exports.formats import common_categories, export_run
 from shapecat.outputs.exports.kitti import rectified_from_sensor
-from shapecat.outputs.exports.points import write_point_labels
-from shapecat.runs.finished import FinishedRun, open_source, read_finished
+from shapecat.runs.finished import open_source, read_finished
 from shapecat.runs.folder import read_run, write_run
 from shapecat.runs.labels.corrections import adopt_labels
-from shapecat.runs.labels.meaning import TrackLabel
 from shapecat.runs.labels.track_table import read_track_table
 from shapecat.runs.perceive.selection import read_frames
-from shapecat.types import Box, Frame, LabelledFrame, LabelledObject, NeuralGas
 from tests.track_tables import rows
 
 Run = Callable[..., Result]
@@ -258,27 +255,6 @@ def test_kitti_boxes_match_tables_within_1_mm(run: Path, tmp_path: Path, which: 
     assert {"wine_glass", "unknown"} <= kinds
 
 
-def test_kitti_points_project_to_their_pixels(run: Path, tmp_path: Path) -> None:
-    """Only the calibration connects boxes, points and image."""
-    export_run(run, "kitti", tmp_path, every=6)
-    out = tmp_path / "table"
-    for number in ("000000", "000001"):
-        calibration = read_calibration(out / "calib" / f"{number}.txt")
-        points = np.fromfile(out / "velodyne" / f"{number}.bin", "<f4").reshape(-1, 4)[:, :3]
-        rectified = points @ calibration["Tr_velo_to_cam"][:, :3].T @ calibration["R0_rect"].T
-        pixels = rectified @ calibration["P2"][:, :3].T
-        pixels = pixels[:, :2] / pixels[:, 2:]
-        assert_allclose(pixels, np.round(pixels), atol=0.02)
-        assert pixels.min() > -0.5
-        assert points[:, 0].min() > 0  # in front of the sensor
-        for _, (left, top, right, bottom), corners in read_kitti(out / "label_2" / f"{number}.txt"):
-            low, high = corners.min(axis=0) - 1e-3, corners.max(axis=0) + 1e-3
-            box = ((rectified > low) & (rectified < high)).all(axis=1)
-            inside = pixels[box]
-            visible = (inside > [left - 1, top - 1]) & (inside < [right + 1, bottom + 1])
-            assert visible.all(axis=1).mean() > 0.5
-
-
 def intrinsics(run: Path) -> np.ndarray:
     finished = read_finished(run)
     with open_source(finished.info) as recording:
@@ -421,40 +397,6 @@ def test_frames_without_pose_are_left_out(run: Path, tmp_path: Path, format: str
     with (tmp_path / "out" / "lost" / "frames.csv").open() as file:
         frames = [int(row["frame"]) for row in csv.DictReader(file)]
     assert frames == list(range(1, len(table)))
-
-
-def test_unorganised_clouds_get_semantic_kitti_labels(tmp_path: Path) -> None:
-    points = np.array([[1, 0, 0], [np.nan] * 3, [2, 0, 0], [3, 0, 0]], np.float32)
-    item = LabelledObject(
-        track=513,
-        category="can",
-        confidence=1.0,
-        box=Box(np.zeros(3), np.ones(3), np.array([0, 0, 0, 1])),
-        indices=np.array([1, 2]),
-        gas=NeuralGas(np.zeros((0, 3)), np.zeros((0, 2), int)),
-        posterior=np.ones(1),
-        causal=np.ones(1),
-    )
-    frame = Frame("/scan", 0, 5, 5, "laser", points=points)
-    labelled = LabelledFrame(
-        "/scan", 0, 5, 5, "laser", None, (), (item,), (), {}, np.array([0, 0, 1])
-    )
-    run: Any = {"model": {"categories": ["cup", "can"]}}
-    finished = FinishedRun(tmp_path, run, {513: TrackLabel(513, "can", 1.0)})
-
-    assert write_point_labels(tmp_path, [(labelled, frame, None)], finished) == 1
-
-    cloud = np.fromfile(tmp_path / "velodyne" / "000000.bin", "<f4").reshape(-1, 4)
-    label = np.fromfile(tmp_path / "labels" / "000000.label", "<u4")
-    legend = json.loads((tmp_path / "labels.json").read_text())
-    assert cloud[:, 0].tolist() == [1, 2, 3]
-    assert (label >> 16).tolist() == [0, 513, 0]
-    assert [legend["classes"][str(k)] for k in (label & 0xFFFF)] == ["none", "can", "none"]
-    assert '3: "can"' in (tmp_path / "semantic-kitti.yaml").read_text()
-
-    many = FinishedRun(tmp_path, finished.info, {70000: TrackLabel(70000, "can", 1.0)})
-    with pytest.raises(OutputError, match="65535"):
-        write_point_labels(tmp_path, [], many)
 
 
 def test_export_never_replaces_its_run(run: Path) -> None:

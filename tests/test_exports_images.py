@@ -19,11 +19,11 @@ from shapecat.colour.image_masks import mask_of
 from shapecat.colour.masks import Mask
 from shapecat.colour.outline import joined, outlines
 from shapecat.errors import OutputError
-from shapecat.outputs.exports.dataset_frames import Selection, split_runs
+from shapecat.outputs.exports.dataset_frames import Selection
 from shapecat.outputs.exports.formats import export_dataset, export_run
 from shapecat.recordings import MessageError
 from shapecat.recordings.decoding.colour_image import pixels_of
-from shapecat.runs.finished import FinishedRun, read_finished
+from shapecat.runs.finished import read_finished
 from shapecat.runs.tables.masks import read_masks
 from tests.mcap_files import read_ros
 from tests.test_colour_outputs import IMAGES
@@ -357,19 +357,6 @@ def test_runs_with_equal_names_keep_their_images(coloured_run: Path, tmp_path: P
     assert all(list((tmp_path / "out").rglob(Path(name).name)) for name in names)
     info = json.loads((tmp_path / "out" / "export.json").read_text())
     assert list(info["runs"]) == ["lab 1", "lab 1-2"]
-
-
-def test_recording_is_never_in_both_splits() -> None:
-    def finished(name: str, digest: str) -> FinishedRun:
-        run: Any = {"input": {"digest": digest}}
-        return FinishedRun(Path(name), run, {})
-
-    runs = [finished(f"r{k}", f"d{k // 2}") for k in range(20)]
-    splits = split_runs(runs, 0.3)
-    assert all(splits[k] == splits[k + 1] for k in range(0, 20, 2))
-    assert splits.count("val") == 6
-    assert split_runs(runs[::-1], 0.3) == splits[::-1]
-    assert split_runs(runs[:1], 0.9) == ["train"]
 
 
 def test_frames_are_selected_by_interval_and_by_track(run: Path, tmp_path: Path) -> None:

@@ -629,7 +629,9 @@ def runs(count: int, same: int = 0) -> Any:
 )
 def test_share_of_recordings_is_used_for_validation(count: int, val: float, expected: int) -> None:
     """At least one is left for training; runs of one recording are never split."""
-    assert split_runs(runs(count), val).count("val") == expected
+    splits = split_runs(runs(count), val)
+    assert splits.count("val") == expected
+    assert split_runs(runs(count)[::-1], val) == splits[::-1]
     assert len(set(split_runs(runs(10, same=6), 0.4)[:7])) == 1
     assert split_runs(runs(5, same=9), 0.9) == ["train"] * 5  # of one recording
 
@@ -843,6 +845,13 @@ def test_point_labels_have_class_and_instance_of_each_point(tmp_path: Path) -> N
     assert list(first.values()) == ["000000", "/depth", "4", "5", "3", "2", "143.0", "139.0",
                                     "1.25", "0.75"]  # fmt: skip
     assert list(second.values()) == ["000001", "/scan", "9", "7", *[""] * 6]
+
+
+def test_tracks_beyond_16_bits_are_refused(tmp_path: Path) -> None:
+    """Their numbers would run into the classes of other points."""
+    run: Any = SimpleNamespace(folder=tmp_path, labels={65536: TrackLabel(65536, "cup", 1.0)})
+    with pytest.raises(OutputError, match="65535"):
+        write_point_labels(tmp_path, [], run)
 
 
 def test_point_label_legends_have_right_colours(tmp_path: Path) -> None:
