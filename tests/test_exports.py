@@ -27,6 +27,7 @@ from shapecat.runs.folder import read_run, write_run
 from shapecat.runs.labels.corrections import adopt_labels
 from shapecat.runs.labels.track_table import read_track_table
 from shapecat.runs.perceive.selection import read_frames
+from tests.kitti_files import read_calibration, read_labels
 from tests.track_tables import rows
 
 Run = Callable[..., Result]
@@ -206,52 +207,28 @@ def test_exporting_again_removes_views_with_earlier_labels(run: Path, tmp_path: 
     assert (own / "view.pcd").exists()
 
 
-def read_kitti(path: Path) -> list[tuple[str, np.ndarray, np.ndarray]]:
-    """Return type, 2D box and corners (8, 3) in the rectified camera of each line of label_2."""
-    found = []
-    for line in path.read_text().splitlines():
-        kind, *words = line.split(" ")
-        assert len(words) == 14
-        values = list(map(float, words))
-        h, w, l, x, y, z, ry = values[7:]
-        xs = np.array([l, l, -l, -l, l, l, -l, -l]) / 2
-        ys = np.array([0, 0, 0, 0, -h, -h, -h, -h])
-        zs = np.array([w, -w, -w, w, w, -w, -w, w]) / 2
-        c, s = np.cos(ry), np.sin(ry)
-        R = np.array([[c, 0, s], [0, 1, 0], [-s, 0, c]])
-        found.append((kind, np.array(values[3:7]), (R @ [xs, ys, zs]).T + np.array([x, y, z])))
-        assert -np.pi <= values[2] <= np.pi
-    return found
-
-
-def read_calibration(path: Path) -> dict[str, np.ndarray]:
-    lines = (line.split(":") for line in path.read_text().splitlines() if line)
-    matrices = {name: np.array(list(map(float, text.split()))) for name, text in lines}
-    return {name: values.reshape(3, -1) for name, values in matrices.items()}
-
-
 @pytest.mark.parametrize("which", ["", "_full"])
 def test_kitti_boxes_match_tables_within_1_mm(run: Path, tmp_path: Path, which: str) -> None:
     """Detectors are trained on whole objects; visible boxes are optional."""
     export_run(run, "kitti", tmp_path, visible_boxes=not which)
     out = tmp_path / "table"
     camera = intrinsics(run)
-    worst = 0.0
+    worst, kinds = 0.0, set()
     with (out / "frames.csv").open() as file:
         index = list(csv.DictReader(file))
     table_boxes = boxes(run, which)
     for entry in index:
-        calibration = read_calibration(out / "calib" / f"{entry['number']}.txt")
-        sensor_from_rectified = np.linalg.inv(camera) @ calibration["P2"][:, :3]
+        projection = read_calibration(out, entry["number"])["P2"]
+        sensor_from_rectified = np.linalg.inv(camera) @ projection[:, :3]
         assert_allclose(sensor_from_rectified @ sensor_from_rectified.T, np.eye(3), atol=1e-6)
-        labels = read_kitti(out / "label_2" / f"{entry['number']}.txt")
+        labels = read_labels(out, entry["number"])
         expected = table_boxes[int(entry["frame"])]
         assert len(labels) == len(expected)
-        for (_, _, corners), (_, wanted) in zip(labels, expected, strict=True):
-            worst = max(worst, farthest(corners @ sensor_from_rectified.T, wanted))
+        for label, (_, wanted) in zip(labels, expected, strict=True):
+            worst = max(worst, farthest(label.corners @ sensor_from_rectified.T, wanted))
+            kinds.add(label.kind)
     assert len(index) == 8
     assert worst < 0.001
-    kinds = {label[0] for path in (out / "label_2").iterdir() for label in read_kitti(path)}
     assert {"wine_glass", "unknown"} <= kinds
 
 

@@ -25,6 +25,7 @@ from shapecat.recordings import MessageError
 from shapecat.recordings.decoding.colour_image import pixels_of
 from shapecat.runs.finished import read_finished
 from shapecat.runs.tables.masks import read_masks
+from tests.kitti_files import read_calibration, read_labels
 from tests.mcap_files import read_ros
 from tests.test_colour_outputs import IMAGES
 from tests.test_exports import relabel
@@ -477,19 +478,10 @@ def test_kitti_boxes_project_onto_colour_image(run: Path, tmp_path: Path) -> Non
     for k, number in enumerate(numbers):
         picture = np.asarray(Image.open(folder / "image_2" / f"{number}.png"))
         assert picture.shape == (720, 960, 3)
-        lines = (folder / "calib" / f"{number}.txt").read_text().splitlines()
-        rows = dict(line.split(": ") for line in lines if line)
-        p2 = np.array(list(map(float, rows["P2"].split()))).reshape(3, 4)
-        for line in (folder / "label_2" / f"{number}.txt").read_text().splitlines():
-            values = list(map(float, line.split()[1:]))
-            left, top, right, bottom = values[3:7]
-            h, w, length, x, y, z, yaw = values[7:14]
-            half = np.array([length, 0, w]) / 2
-            corners = np.array([[i, j, m] for i in (-1, 1) for j in (0, -1) for m in (-1, 1)])
-            local = corners * (half + np.array([0, h, 0]))
-            c, s = np.cos(yaw), np.sin(yaw)
-            placed = local @ np.array([[c, 0, s], [0, 1, 0], [-s, 0, c]]).T + (x, y, z)
-            projected = np.column_stack([placed, np.ones(8)]) @ p2.T
+        projection = read_calibration(folder, number)["P2"]
+        for label in read_labels(folder, number):
+            left, top, right, bottom = label.box
+            projected = np.column_stack([label.corners, np.ones(8)]) @ projection.T
             u, v = (projected[:, :2] / projected[:, 2:]).T
             if right < 955 and bottom < 715 and left > 5 and top > 5:
                 assert u.min() - 6 <= left <= right <= u.max() + 6

@@ -27,6 +27,13 @@ from shapecat.outputs.exports.kitti import rectified_from_sensor, write_kitti
 from shapecat.outputs.exports.labelcloud import _described, write_labelcloud
 from shapecat.outputs.exports.points import write_point_labels
 from shapecat.types import Box, Camera, Frame, LabelledFrame, LabelledObject, NeuralGas, Pose
+from tests.kitti_files import (
+    KittiLabel,
+    projected_points,
+    read_calibration,
+    read_labels,
+    read_points,
+)
 
 CAMERA = Camera(160, 120, 143.0, 139.0, 77.4, 61.9)
 PITCH, ROLL = np.radians(34.0), np.radians(6.0)
@@ -65,56 +72,43 @@ def frame() -> Frame:
     return Frame("/depth", 0, 5, 6, "optical", depth, CAMERA)
 
 
-def kitti(folder: Path, *, cut: bool, hidden: bool) -> list[str]:
+def kitti(folder: Path, *, cut: bool, hidden: bool) -> KittiLabel:
     views: Any = [(labelled(cut=cut, hidden=hidden), frame(), None)]
     unused: Any = SimpleNamespace()
     assert write_kitti(folder, views, unused) == 1
-    return (folder / "label_2" / "000000.txt").read_text().split()
+    (label,) = read_labels(folder)
+    return label
 
 
 def test_kitti_line_matches_hand_calculation(tmp_path: Path) -> None:
     """The position is the bottom of the box; alpha is the yaw minus the bearing."""
-    kind, truncated, occluded, *words = kitti(tmp_path, cut=True, hidden=False)
-    alpha, *box = map(float, words[:5])
-    height, width, length, x, y, z, yaw = map(float, words[5:])
+    label = kitti(tmp_path, cut=True, hidden=False)
 
-    assert kind == "bowl"
-    assert (float(truncated), occluded) == (1.0, "0")
-    assert_allclose([height, width, length], [0.23, 0.14, 0.31], atol=1e-5)
-    assert_allclose([x, y, z], [-0.37, 0.52 + 0.115, 1.64], atol=1e-5)
-    assert yaw == pytest.approx(0.7, abs=1e-5)
-    assert alpha == pytest.approx(0.7 + np.arctan(0.37 / 1.64), abs=1e-5)
-    assert box == [40, 70, 63, 92]
+    assert (label.kind, label.truncated, label.occluded) == ("bowl", 1.0, 0)
+    assert_allclose(label.size, [0.23, 0.14, 0.31], atol=1e-5)
+    assert_allclose(label.place, [-0.37, 0.52 + 0.115, 1.64], atol=1e-5)
+    assert label.yaw == pytest.approx(0.7, abs=1e-5)
+    assert label.alpha == pytest.approx(0.7 + np.arctan(0.37 / 1.64), abs=1e-5)
+    assert label.box == [40, 70, 63, 92]
 
 
 def test_kitti_distinguishes_truncated_from_occluded(tmp_path: Path) -> None:
     """Truncated is cut by the image border; occluded is hidden by another object."""
-    assert kitti(tmp_path, cut=False, hidden=True)[1:3] == ["0.0", "1"]
+    assert kitti(tmp_path, cut=False, hidden=True)[1:3] == (0.0, 1)
 
 
 def test_kitti_calibration_projects_points_to_pixels(tmp_path: Path) -> None:
     kitti(tmp_path, cut=False, hidden=False)
-    lines = (tmp_path / "calib" / "000000.txt").read_text().splitlines()
-    matrices = {
-        name: np.array(list(map(float, text.split()))).reshape(3, -1)
-        for name, text in (line.split(": ") for line in lines)
-    }
+    matrices, points = read_calibration(tmp_path), read_points(tmp_path)
     for name in ("P0", "P1", "P3"):
         assert np.array_equal(matrices[name], matrices["P2"])
     assert np.array_equal(matrices["Tr_imu_to_velo"], np.eye(3, 4))
     to_sensor = LEVEL_FROM_SENSOR.inv().as_matrix()
     assert_allclose(matrices["Tr_rect_to_sensor"], np.c_[to_sensor, np.zeros(3)], atol=1e-6)
-    points = np.fromfile(tmp_path / "velodyne" / "000000.bin", "<f4").reshape(-1, 4)
-    velo = np.column_stack([points[:, :3], np.ones(len(points))])
-    rectified = matrices["R0_rect"] @ matrices["Tr_velo_to_cam"] @ velo.T
-    pixels = matrices["P2"] @ np.vstack([rectified, np.ones(len(points))])
-
     v, u = np.mgrid[:120, :160]
-    assert_allclose(pixels[0] / pixels[2], u.ravel(), atol=2e-3)
-    assert_allclose(pixels[1] / pixels[2], v.ravel(), atol=2e-3)
-    own = frame().xyz()
-    level = LEVEL_FROM_SENSOR.apply(own)  # x right, y down, z forward
-    assert_allclose(velo[:, :3], level[:, [2, 0, 1]] * [1, -1, -1], atol=1e-5)
+    assert_allclose(projected_points(tmp_path), np.c_[u.ravel(), v.ravel()], atol=2e-3)
+    level = LEVEL_FROM_SENSOR.apply(frame().xyz())  # x right, y down, z forward
+    assert_allclose(points[:, :3], level[:, [2, 0, 1]] * [1, -1, -1], atol=1e-5)
     assert (points[:, 3] == 0).all()
 
 
@@ -133,14 +127,10 @@ def test_kitti_calibration_projects_points_into_colour_camera(tmp_path: Path) ->
 
     x, y, z = (frame().xyz() @ pose.rotation.T + pose.translation).T
     u, v = 171.0 * x / z + 103.2, 166.0 * y / z + 71.5
-    projection, mount, points = read_kitti(tmp_path)
-    points[:, 3] = 1
-    pixels = projection @ np.vstack([mount @ points.T, np.ones(len(points))])
-    assert_allclose(pixels[:2] / pixels[2], [u, v], atol=2e-3)
+    assert_allclose(projected_points(tmp_path), np.c_[u, v], atol=2e-3)
     of_object = [row * CAMERA.width + column for column, row in PIXELS]
-    box = [float(word) for word in (tmp_path / "label_2" / "000000.txt").read_text().split()[4:8]]
     low, high = ([f(at[of_object]) for at in (u, v)] for f in (np.min, np.max))
-    assert box == np.rint([*low, *high]).tolist()
+    assert read_labels(tmp_path)[0].box == np.rint([*low, *high]).tolist()
     assert (tmp_path / "image_2" / "000000.png").exists()
 
     # The rotation between the cameras must not rotate the boxes that are read back.
@@ -152,17 +142,6 @@ def test_kitti_calibration_projects_points_into_colour_camera(tmp_path: Path) ->
     assert_allclose(back.center, item.box.center, atol=2e-5)
     error = Rotation.from_quat(back.orientation).inv() * Rotation.from_quat(item.box.orientation)
     assert error.magnitude() < 1e-4
-
-
-def read_kitti(folder: Path) -> tuple[Any, Any, Any]:
-    """Return ``P2`` (3, 4), ``Tr_velo_to_cam`` (3, 4) and the points (n, 4) of the first frame."""
-    text = (folder / "calib" / "000000.txt").read_text()
-    projection, mount = (
-        np.array(list(map(float, re.findall(rf"{name}: (.*)", text)[0].split()))).reshape(3, 4)
-        for name in ("P2", "Tr_velo_to_cam")
-    )
-    points = np.fromfile(folder / "velodyne" / "000000.bin", "<f4").reshape(-1, 4)
-    return projection, mount, points
 
 
 def test_kitti_image_is_that_of_its_pinhole_camera(tmp_path: Path) -> None:
@@ -188,9 +167,7 @@ def test_kitti_image_is_that_of_its_pinhole_camera(tmp_path: Path) -> None:
     unused: Any = SimpleNamespace()
     write_kitti(tmp_path, views, unused)
 
-    projection, mount, points = read_kitti(tmp_path)
-    at = projection @ [*(mount @ [*points[row * CAMERA.width + column, :3], 1]), 1]
-    expected = at[:2] / at[2]
+    expected = projected_points(tmp_path)[row * CAMERA.width + column]
     drawn = np.asarray(Image.open(tmp_path / "image_2" / "000000.png").convert("L"), float)
     found = [float(np.average(axis, weights=drawn)) for axis in np.mgrid[:150, :200][::-1]]
     assert_allclose(found, expected, atol=1.0)
@@ -207,11 +184,8 @@ def test_kitti_image_on_depth_pixels_has_the_depth_camera(tmp_path: Path) -> Non
     unused: Any = SimpleNamespace()
     write_kitti(tmp_path, views, unused)
 
-    projection, mount, points = read_kitti(tmp_path)
-    points[:, 3] = 1
-    at = projection @ np.vstack([mount @ points.T, np.ones(len(points))])
     v, u = np.mgrid[:120, :160]
-    assert_allclose(at[:2] / at[2], [u.ravel(), v.ravel()], atol=2e-3)
+    assert_allclose(projected_points(tmp_path), np.c_[u.ravel(), v.ravel()], atol=2e-3)
     assert np.array_equal(np.asarray(Image.open(tmp_path / "image_2" / "000000.png")), pixels)
 
 
@@ -237,9 +211,8 @@ def test_kitti_2d_box_is_clipped_to_colour_image(
     views: Any = [(labelled(cut=False, hidden=False), frame(), coloured)]
     unused: Any = SimpleNamespace()
     write_kitti(tmp_path, views, unused)
-    words = (tmp_path / "label_2" / "000000.txt").read_text().split()
 
-    assert list(map(float, words[4:8])) == box
+    assert read_labels(tmp_path)[0].box == box
 
 
 def labelcloud(folder: Path) -> None:
@@ -305,11 +278,9 @@ def test_kitti_2d_box_of_cloud_is_minus_one(tmp_path: Path) -> None:
     views: Any = [(labelled(cut=False, hidden=False), cloud, None)]
     unused: Any = SimpleNamespace()
     write_kitti(tmp_path, views, unused)
-    words = (tmp_path / "label_2" / "000000.txt").read_text().split()
 
-    assert list(map(float, words[4:8])) == [-1, -1, -1, -1]
-    rows = np.fromfile(tmp_path / "velodyne" / "000000.bin", "<f4").reshape(-1, 4)
-    assert len(rows) == len(points)
+    assert read_labels(tmp_path)[0].box == [-1, -1, -1, -1]
+    assert len(read_points(tmp_path)) == len(points)
 
 
 def test_kitti_keeps_cloud_of_level_lidar(tmp_path: Path) -> None:
@@ -320,7 +291,7 @@ def test_kitti_keeps_cloud_of_level_lidar(tmp_path: Path) -> None:
     unused: Any = SimpleNamespace()
     write_kitti(tmp_path, views, unused)
 
-    rows = np.fromfile(tmp_path / "velodyne" / "000000.bin", "<f4").reshape(-1, 4)
+    rows = read_points(tmp_path)
     assert_allclose(rows[:, :3], points, atol=1e-6)
 
 
@@ -333,7 +304,7 @@ def test_kitti_turns_loose_points_of_camera_like_its_image(tmp_path: Path) -> No
         (tmp_path / name).mkdir()
         views: Any = [(labelled(cut=False, hidden=False), seen, None)]
         write_kitti(tmp_path / name, views, unused)
-        found.append(np.fromfile(tmp_path / name / "velodyne" / "000000.bin", "<f4"))
+        found.append(read_points(tmp_path / name))
 
     assert_allclose(found[1], found[0])
     assert found[0].reshape(-1, 4)[:, 0].min() > 0.7  # x is forward
@@ -628,14 +599,14 @@ def test_kitti_2d_box_is_that_of_the_image_that_is_written(
         unused: Any = SimpleNamespace()
         folder.mkdir()
         write_kitti(folder, views, unused)
-    words, alone = ((one / "label_2" / "000000.txt").read_text().split() for one in folders)
+    (label,), (alone,) = map(read_labels, folders)
 
     if without == "view":  # the colour camera does not see it
-        assert list(map(float, words[4:8])) == [-1, -1, -1, -1]
-        assert float(alone[6]) > 0
+        assert label.box == [-1, -1, -1, -1]
+        assert alone.box[2] > 0
         return
-    assert words == alone
-    assert read_kitti(folders[0])[0].tolist() == read_kitti(folders[1])[0].tolist()
+    assert label == alone
+    assert np.array_equal(*(read_calibration(one)["P2"] for one in folders))
     assert not (folders[0] / "image_2").exists()
     assert ("image_2/000000.png is missing" in caplog.text) is (without == "data")
 
