@@ -291,8 +291,7 @@ def test_kitti_keeps_cloud_of_level_lidar(tmp_path: Path) -> None:
     unused: Any = SimpleNamespace()
     write_kitti(tmp_path, views, unused)
 
-    rows = read_points(tmp_path)
-    assert_allclose(rows[:, :3], points, atol=1e-6)
+    assert_allclose(read_points(tmp_path)[:, :3], points, atol=1e-6)
 
 
 def test_kitti_turns_loose_points_of_camera_like_its_image(tmp_path: Path) -> None:
@@ -307,7 +306,7 @@ def test_kitti_turns_loose_points_of_camera_like_its_image(tmp_path: Path) -> No
         found.append(read_points(tmp_path / name))
 
     assert_allclose(found[1], found[0])
-    assert found[0].reshape(-1, 4)[:, 0].min() > 0.7  # x is forward
+    assert found[0][:, 0].min() > 0.7  # x is forward
 
 
 @pytest.mark.parametrize(("up", "forward"), [((0, 0, 1), (1, 0, 0)), ((0.3, 0, 0.95), (1, 0, 0))])

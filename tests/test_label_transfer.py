@@ -27,6 +27,7 @@ from shapecat.runs.tables.writing import write_table
 from tests.mcap_files import read_ros
 from tests.run_info import run_info
 from tests.scenes import record
+from tests.track_tables import lines
 
 Run = Callable[..., Result]
 Path3 = Sequence[Sequence[float] | None]
@@ -788,13 +789,8 @@ def processed(shapecat: Run, tmp_path_factory: pytest.TempPathFactory) -> tuple[
     return recording, folder / "out" / "lab"
 
 
-def rows_of(run: Path) -> list[dict[str, str]]:
-    with (run / "tracks.csv").open(encoding="utf-8") as file:
-        return list(csv.DictReader(file))
-
-
 def label_first(run: Path, label: str) -> dict[str, str]:
-    rows = rows_of(run)
+    rows = lines(run)
     rows[0]["label"] = label
     with (run / "tracks.csv").open("w", newline="", encoding="utf-8") as file:
         writer = csv.DictWriter(file, rows[0].keys())
@@ -823,7 +819,7 @@ def test_overwriting_keeps_corrections_unless_discarded(
 
     assert done.exit_code == 0
     assert "lab.mcap: transferred 1 of 1 corrected labels" in done.stderr
-    (row,) = [row for row in rows_of(run) if row["label"]]
+    (row,) = [row for row in lines(run) if row["label"]]
     assert row["label"] == "teapot"
     assert np.allclose(place_of(row), place_of(before), atol=0.02)
     assert read_run(run)["corrections"]["transferred"][0]["label"] == "teapot"

@@ -19,6 +19,7 @@ from shapecat.simulation.scenes.paths import Filming, arc_orbit
 from shapecat.simulation.shapes.distractors import make_distractor
 from shapecat.simulation.shapes.stable_poses import StablePose
 from shapecat.types import CATEGORIES, Pose
+from tests.track_tables import lines
 
 Run = Callable[..., Result]
 NEW = "wine glass"
@@ -70,11 +71,6 @@ def correct_objects(recording: Path, folder: Path) -> set[int]:
     return known - {label for track, (label, name) in objects.items() if predicted[track] != name}
 
 
-def read_table(path: Path) -> list[dict[str, str]]:
-    with path.open(newline="") as file:
-        return list(csv.DictReader(file))
-
-
 def write_table(path: Path, rows: list[dict[str, str]]) -> None:
     with path.open("w", newline="") as file:
         writer = csv.DictWriter(file, rows[0])
@@ -83,7 +79,7 @@ def write_table(path: Path, rows: list[dict[str, str]]) -> None:
 
 
 def categories(folder: Path) -> dict[int, str]:
-    return {int(row["track"]): row["category"] for row in read_table(folder / "tracks.csv")}
+    return {int(row["track"]): row["category"] for row in lines(folder)}
 
 
 def command(shapecat: Run, *words: object) -> str:
@@ -113,7 +109,7 @@ def test_new_category_is_learned_from_corrections(shapecat: Run, tmp_path: Path)
     assert len(glasses) >= 4
     assert len(correct) >= len(correct_before) >= 5
 
-    rows = read_table(first / "tracks.csv")
+    rows = lines(first)
     for row in rows:  # as if the model had confused two of them
         if int(row["track"]) in correct[:2]:
             row["category"] = next(n for n in CATEGORIES if n != truth[int(row["track"])])

@@ -29,6 +29,7 @@ from shapecat.outputs.report.writing import Reports, RunReport, read_report
 from shapecat.runs.labels.corrections import adopt_labels, read_labels
 from shapecat.runs.labels.track_table import read_track_table
 from tests.browser import Browser
+from tests.track_tables import lines
 
 Run = Callable[..., Result]
 
@@ -42,8 +43,7 @@ SAVED = (
 @pytest.fixture
 def long_run(run: Path) -> Path:
     """Return a run with `TRACKS` tracks, copies of those found; its recording is missing."""
-    with (run / "tracks.csv").open(newline="") as file:
-        rows = list(csv.DictReader(file))
+    rows = lines(run)
     tracks = pq.read_table(run / "tracks.parquet")
     many, tables = [], []
     for number in range(1, TRACKS + 1):

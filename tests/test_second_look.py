@@ -1,6 +1,5 @@
 """Tests of perceiving disturbed frames again with the up direction of the whole recording."""
 
-import csv
 from collections.abc import Iterator
 from dataclasses import replace
 from functools import cache
@@ -35,7 +34,7 @@ from shapecat.types import Camera, Frame, Pose
 from tests.messages import EPOCH, write
 from tests.scenes import OPTICAL, PERIOD, STEP
 from tests.test_crash import assert_same_tables
-from tests.track_tables import rows
+from tests.track_tables import lines, rows
 
 MAKE = MessageFactory(2)
 TOPIC = "/depth/image_raw"
@@ -132,17 +131,12 @@ def share_found(out: Path, plain: Path) -> float:
 
 def assert_same_tracks(one: Path, other: Path, fixed: Pose = IDENTITY) -> None:
     """Check that each object is one track in both runs, with equal category and position."""
-    tracks = tracks_of(one), tracks_of(other)
+    tracks = lines(one), lines(other)
     assert len(tracks[0]) == len(tracks[1]) >= 5
     for a in tracks[0]:
         (b,) = [t for t in tracks[1] if np.linalg.norm(place(t) - fixed.rotation @ place(a)) < 0.03]
         assert a["category"] == b["category"]
         assert abs(int(a["frames"]) - int(b["frames"])) <= len(DISTURBED)
-
-
-def tracks_of(out: Path) -> list[dict[str, str]]:
-    with (out / "tracks.csv").open(newline="") as file:
-        return list(csv.DictReader(file))
 
 
 def place(track: dict[str, str]) -> Any:
@@ -211,12 +205,12 @@ def test_consecutive_disturbed_frames_end_no_track(
 
     assert revised(out) == [*BRIEF]
     assert_same_tracks(plain, out)
-    lengths = [int(track["frames"]) for track in tracks_of(out)]
+    lengths = [int(track["frames"]) for track in lines(out)]
     short, *whole = sorted(lengths)
     assert short == len(BRIEF)
     assert min(whole) >= COUNT - len(BRIEF)  # without its table, a small cup passes for noise
-    assert max(int(track["frames"]) for track in tracks_of(once)) <= BRIEF[0]
-    assert len(tracks_of(once)) > len(lengths)
+    assert max(int(track["frames"]) for track in lines(once)) <= BRIEF[0]
+    assert len(lines(once)) > len(lengths)
 
 
 def test_up_of_tilted_fixed_frame_is_dropped(walk: Path, tmp_path: Path) -> None:

@@ -1,6 +1,5 @@
 """Tests of the tables of a moving, rotated sensor; all numbers differ, so swaps are noticed."""
 
-import csv
 import math
 from collections.abc import Iterable
 from dataclasses import replace
@@ -34,7 +33,7 @@ from shapecat.types import (
     Pose,
     Scene,
 )
-from tests.track_tables import rows
+from tests.track_tables import lines, rows
 
 CATEGORIES = ("cup", "can", "bowl")
 SECOND = 10**9
@@ -143,11 +142,6 @@ def run(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """Write the tables of three objects seen by a moving, rotated sensor."""
     folder = tmp_path_factory.mktemp("turned")
     return write_frames(folder, (frame_of(k, all_of(k)) for k in range(FRAMES)), work="w0123")
-
-
-def lines(folder: Path) -> list[dict[str, str]]:
-    with (folder / "tracks.csv").open(newline="") as file:
-        return list(csv.DictReader(file))
 
 
 def test_sensor_pose_is_written_row_major(run: Path) -> None:

@@ -12,8 +12,7 @@ from shapecat.pipeline import annotate_again
 from shapecat.runs.finished import open_source
 from shapecat.runs.folder import read_run
 from shapecat.runs.perceive.selection import read_frames
-from tests.test_tables_rotated import lines
-from tests.track_tables import rows
+from tests.track_tables import lines, rows
 
 
 def test_neurons_lie_on_points_of_their_object(guessed_run: Path) -> None:

@@ -1,5 +1,6 @@
 """Builder of track tables for synthetic runs, and readers of tables."""
 
+import csv
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
@@ -10,7 +11,7 @@ import pyarrow.parquet as pq
 from shapecat.runs.tables.schemas import TRACKS
 from shapecat.runs.tables.writing import write_table
 
-__all__ = ["rows", "untimed_table", "write_tracks"]
+__all__ = ["lines", "rows", "untimed_table", "write_tracks"]
 
 
 def write_tracks(
@@ -38,6 +39,12 @@ def rows(folder: Path, table: str, *columns: str) -> list[dict[str, Any]]:
     """Return the rows of a table of a run, with all columns unless some are named."""
     found = pq.read_table(folder / f"{table}.parquet", columns=list(columns) or None)
     return list(found.to_pylist())
+
+
+def lines(folder: Path) -> list[dict[str, str]]:
+    """Return the lines of tracks.csv of a run."""
+    with (folder / "tracks.csv").open(newline="", encoding="utf-8") as file:
+        return list(csv.DictReader(file))
 
 
 def untimed_table(folder: Path, name: str) -> pa.Table:
