@@ -2,14 +2,16 @@
 
 from collections.abc import Collection, Iterable, Iterator
 from dataclasses import replace
+from typing import Any
 
 import numpy as np
+from numpy.typing import ArrayLike
 
 from shapecat.arrays import F4, F8, I4, Bool, Record, array
 from shapecat.config import TrackingSettings
 from shapecat.tracking import DetectionTable, TableBuilder, Track, track_recording
 
-__all__ = ["FrameDetections", "gather", "track_frames"]
+__all__ = ["FrameDetections", "frame", "gather", "track_frames"]
 
 
 class FrameDetections(Record):
@@ -29,6 +31,28 @@ class FrameDetections(Record):
     novelties: F4 = array("n", "f4")
     orientations: F4 | None = array("n 4", "f4", default=None)
     described: I4 | None = array("n", "i4", default=None)
+
+
+def frame(
+    k: int,
+    centers: Any,
+    *,
+    size: ArrayLike = (0.13, 0.09, 0.07),
+    posterior: ArrayLike = (0.9, 0.1),
+    **changes: Any,
+) -> FrameDetections:
+    """Return a frame, ten per second by default, of equal objects at given positions."""
+    places = np.reshape(np.asarray(centers, float), (-1, 3))
+    n = len(places)
+    found = FrameDetections(
+        *("/depth", k, k * 10**8, np.arange(n), places),
+        np.broadcast_to(size, (n, 3)),
+        np.broadcast_to(posterior, (n, 2)),
+        np.zeros(n, bool),
+        np.full(n, 0.5),
+        np.broadcast_to((0, 0, 0, 1), (n, 4)),
+    )
+    return replace(found, **changes)
 
 
 def gather(

@@ -17,37 +17,11 @@ from shapecat.tracking.fusion import causal, fuse, fuse_novelty, view_weights
 from shapecat.tracking.recording import _without_gaps
 from shapecat.tracking.stitching import Fragments, merge_fragments, scene_cuts
 from shapecat.tracking.tracker import Tracker
-from tests.frame_detections import FrameDetections, gather, track_frames
+from tests.frame_detections import FrameDetections, frame, gather, track_frames
 
 SETTINGS = TrackingSettings()
 SECOND = 1_000_000_000
 CUP, BOX = np.array([0.9, 0.1]), np.array([0.1, 0.9])
-
-
-def frame(
-    k: int,
-    centers: Any,
-    *,
-    stamp_ns: int | None = None,
-    size: ArrayLike = (0.1, 0.1, 0.1),
-    posterior: F8 = CUP,
-    topic: str = "/depth",
-) -> FrameDetections:
-    """Return a frame (ten per second by default) of equal objects at given positions."""
-    points = np.reshape(np.asarray(centers, float), (-1, 3))
-    n = len(points)
-    return FrameDetections(
-        topic,
-        k,
-        k * SECOND // 10 if stamp_ns is None else stamp_ns,
-        np.arange(n),
-        points,
-        np.broadcast_to(size, (n, 3)),
-        np.broadcast_to(posterior, (n, 2)),
-        np.zeros(n, bool),
-        np.full(n, 0.5),
-        np.broadcast_to((0, 0, 0, 1), (n, 4)),
-    )
 
 
 def step(tracker: Tracker, k: int, centers: ArrayLike, **options: Any) -> list[int]:
@@ -788,7 +762,7 @@ def test_partial_view_changes_its_track_less() -> None:
     whole, cut = after(partial=False), after(partial=True)
     assert 0 < cut.position[0, 0] < 0.8 * whole.position[0, 0]
     for name in ("size", "posterior"):
-        before = size_key(np.full((1, 3), 0.1)) if name == "size" else CUP[None]
+        before = size_key(frame(0, [0, 0, 0]).sizes) if name == "size" else CUP[None]
         moved = [np.abs(getattr(tracks, name) - before).max() for tracks in (whole, cut)]
         assert moved[1] == pytest.approx(0.25 * moved[0], rel=1e-5)
 

@@ -21,26 +21,11 @@ from shapecat.tracking.pieces import _joint, _largest, _time_overlap
 from shapecat.tracking.recording import _describe, _line, _needed
 from shapecat.tracking.stitching import Fragments, _contradiction, _distances
 from shapecat.tracking.tracker import Tracker
-from tests.frame_detections import FrameDetections, gather, track_frames
+from tests.frame_detections import frame, gather, track_frames
 
 SETTINGS = TrackingSettings()
 SECOND = 1_000_000_000
 TURNED = Rotation.from_euler("zyx", [0.7, -0.4, 0.3]).as_matrix()
-
-
-def frame(k: int, centers: Any, **changes: Any) -> FrameDetections:
-    """Return detections 0.1 s after those before."""
-    places = np.reshape(np.asarray(centers, float), (-1, 3))
-    n = len(places)
-    found = FrameDetections(
-        *("/depth", k, k * SECOND // 10, np.arange(n), places),
-        np.broadcast_to((0.13, 0.09, 0.07), (n, 3)),
-        np.broadcast_to((0.8, 0.2), (n, 2)),
-        np.zeros(n, bool),
-        np.full(n, 0.5),
-        np.broadcast_to((0, 0, 0, 1), (n, 4)),
-    )
-    return replace(found, **changes)
 
 
 def two_tracks(**changes: Any) -> tracker._Active:
