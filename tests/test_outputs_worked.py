@@ -682,9 +682,13 @@ def test_data_set_of_several_recordings_is_not_replaced_by_one_of_them(
             export_dataset([alone], "coco", out, Selection())
     export_dataset([c, b, a], "coco", out, Selection())
 
-    about = json.loads((out / "export.json").read_text())
-    assert about["recordings"] == ["d-a", "d-b", "d-c"]
-    assert about["runs"] == {"a": "id-a", "b": "id-b", "c": "id-c"}
+    assert json.loads((out / "export.json").read_text()) == {
+        "format": "coco",
+        "runs": {"a": "id-a", "b": "id-b", "c": "id-c"},
+        "recordings": ["d-a", "d-b", "d-c"],
+        "objects": 3,
+        "made": [],
+    }
 
 
 def test_export_of_other_topics_is_not_replaced(tmp_path: Path) -> None:
