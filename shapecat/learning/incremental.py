@@ -81,8 +81,6 @@ def add_categories(
     known = _known_views(categorizer)
     categories = (*categorizer.categories, *added)
     codes = np.array([categories.index(name) for name in names])
-    for name in added:  # as in earlier versions, so that a seed still gives the same model
-        rng.permutation(np.count_nonzero(names == name))
     z = np.concatenate([known, categorizer.bank.standardise(descriptors)])
     # During the fit, the new logits come last, after the one for unknown shapes.
     count, old_count = len(added), len(categorizer.categories)

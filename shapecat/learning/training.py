@@ -98,7 +98,7 @@ def fit_categorizer(
     codes[codes < 0] = len(categories)  # the column of the learner of unknown shapes
     used = [blocks[name] for name in settings.blocks or blocks]
     bank = fit_standardisation(train.descriptors, used, len(categories))
-    number = np.random.RandomState(seed).randint(2**31)  # the draw of the default model
+    rng = np.random.default_rng(seed)
     dictionary = grow_dictionary(
         bank.standardise(train.descriptors),
         codes,
@@ -106,9 +106,9 @@ def fit_categorizer(
         leaves=settings.leaves,
         rate=settings.rate,
         jobs=settings.jobs,
-        rng=np.random.default_rng(number),
+        rng=rng,
     )
-    chosen = choose_evenly(codes, settings.known_views, np.random.default_rng(seed))
+    chosen = choose_evenly(codes, settings.known_views, rng)
     categorizer = Categorizer(
         categories=tuple(categories),
         descriptor_names=tuple(descriptor_names),
