@@ -54,7 +54,6 @@ def fit(settings: LearningSettings = SMALL, seed: int = 0) -> Categorizer:
         blobs(60, 1, (*CATEGORIES, UNKNOWN)),
         blobs(40, 2),
         descriptor_names=NAMES,
-        blocks=BLOCKS,
         categories=CATEGORIES,
         settings=settings,
         seed=seed,
@@ -199,7 +198,7 @@ def test_unknown_shapes_are_more_novel_than_known_ones(categorizer: Categorizer)
 def test_uncertain_views_are_novel_without_unknown_examples() -> None:
     """A data set without `unknown` gives a model that cannot predict it."""
     model = fit_categorizer(
-        blobs(60, 1), blobs(40, 2), descriptor_names=NAMES, blocks=BLOCKS, categories=CATEGORIES,
+        blobs(60, 1), blobs(40, 2), descriptor_names=NAMES, categories=CATEGORIES,
         settings=SMALL,
     )  # fmt: skip
     prediction = model.predict(blobs(100, 6).descriptors)
@@ -258,7 +257,7 @@ def test_constant_features_become_zero() -> None:
     x = data.descriptors.copy()
     x[:, 2] = 7.0
     blocks = tuple(BLOCKS.values())
-    z = fit_standardisation(x, blocks, len(CATEGORIES)).standardise(x)
+    z = fit_standardisation(x, len(CATEGORIES)).standardise(x)
 
     assert np.all(np.isfinite(z))
     assert np.all(z[:, 2] == 0)
@@ -298,15 +297,6 @@ def test_temperature_needs_views_of_half_of_the_categories(
     assert model.threshold != categorizer.threshold
 
 
-def test_unused_blocks_have_no_influence() -> None:
-    model = fit(replace(SMALL, blocks=("second",)))
-    x = blobs(20, 5).descriptors
-    other = x.copy()
-    other[:, :3] += 100
-
-    assert np.array_equal(model.predict(x).posteriors, model.predict(other).posteriors)
-
-
 @pytest.mark.usefixtures("few_trees")
 def test_baselines_learn() -> None:
     train, test = blobs(60, 1), blobs(40, 2)
@@ -331,7 +321,6 @@ def test_category_without_views_raises() -> None:
             blobs(20, 1, ("cup", "can")),
             blobs(5, 2),
             descriptor_names=NAMES,
-            blocks=BLOCKS,
             categories=CATEGORIES,
             settings=SMALL,
         )

@@ -8,7 +8,7 @@ import numpy as np
 
 from shapecat.arrays import Bool
 from shapecat.config import Settings
-from shapecat.description import BLOCKS, DESCRIPTOR_NAMES
+from shapecat.description import DESCRIPTOR_NAMES
 from shapecat.errors import ModelError, RecordingError
 from shapecat.evaluation.dataset import read_dataset
 from shapecat.evaluation.names import require_category_names
@@ -138,7 +138,7 @@ def fit_views(
     ------
     ValueError : there are fewer than two categories.
     """
-    # scikit-learn is only needed here.
+    # Only training needs these parts of SciPy.
     from shapecat.learning.training import (  # noqa: PLC0415
         Examples,
         LearningSettings,
@@ -149,7 +149,6 @@ def fit_views(
         Examples(train.descriptors, train.labels, train.instances),
         Examples(held_out.descriptors, held_out.labels, held_out.instances),
         descriptor_names=DESCRIPTOR_NAMES,
-        blocks=BLOCKS,
         categories=order_categories(train.labels),
         settings=LearningSettings(**choices),
         seed=seed,

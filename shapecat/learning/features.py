@@ -1,6 +1,5 @@
 """Features of a descriptor: its standardised values."""
 
-from collections.abc import Sequence
 from functools import partial
 
 import numpy as np
@@ -19,7 +18,7 @@ class Standardisation(Record):
 
     Attributes
     ----------
-    columns : (d,) indices of the used components of the descriptor, block after block.
+    columns : (d,) indices of the used components of the descriptor.
     mean, inverse_scale : (d,) standardisation; a constant component has inverse scale 0.
     starts, kernels, spans, bandwidth, level, spread : parts of model files for Parzen densities,
         which no model has (docs/decisions/0008-boosted-dictionary.md): zeros, one more than
@@ -58,13 +57,9 @@ class Standardisation(Record):
         return z.clip(-_CLIP, _CLIP, out=z)
 
 
-def fit_standardisation(x: F4, blocks: Sequence[slice], categories: int) -> Standardisation:
-    """Fit the standardisation of descriptors ``x`` (n, d) for a number of categories.
-
-    ``blocks`` are ranges of the descriptor; components outside all blocks are not used.
-    """
-    columns = np.concatenate([np.arange(block.start, block.stop) for block in blocks])
-    x = x[:, columns]
+def fit_standardisation(x: F4, categories: int) -> Standardisation:
+    """Fit the standardisation of descriptors ``x`` (n, d) for a number of categories."""
+    columns = np.arange(x.shape[1])
     mean = x.mean(axis=0, dtype=np.float64)
     scale = x.std(axis=0, dtype=np.float64)
     used = scale > 1e-7 * np.maximum(1.0, np.abs(mean))

@@ -1,6 +1,6 @@
 """Training: from descriptors and labels to a fitted `Categorizer`."""
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from dataclasses import asdict, dataclass, replace
 from typing import Any, NamedTuple
 
@@ -27,8 +27,6 @@ __all__ = [
 class LearningSettings:
     """Settings of the training."""
 
-    blocks: tuple[str, ...] = ()
-    """Blocks of the descriptor to use; all if empty."""
     rounds: int = 500
     """Boosting rounds; each grows one tree per category."""
     leaves: int = 16
@@ -68,7 +66,6 @@ def fit_categorizer(
     held_out: Examples,
     *,
     descriptor_names: Sequence[str],
-    blocks: Mapping[str, slice],
     categories: Sequence[str],
     settings: LearningSettings,
     seed: int = 0,
@@ -80,7 +77,6 @@ def fit_categorizer(
     train : training views.
     held_out : views of other instances, which fit the temperature and the novelty threshold.
     descriptor_names : names of the components of the descriptor.
-    blocks : range of each block in the descriptor, by name.
     categories : the categories in the order of the posterior.
 
     Raises
@@ -96,8 +92,7 @@ def fit_categorizer(
         raise ValueError(msg)
     codes = encode(train.labels, categories)
     codes[codes < 0] = len(categories)  # the column of the learner of unknown shapes
-    used = [blocks[name] for name in settings.blocks or blocks]
-    bank = fit_standardisation(train.descriptors, used, len(categories))
+    bank = fit_standardisation(train.descriptors, len(categories))
     rng = np.random.default_rng(seed)
     dictionary = grow_dictionary(
         bank.standardise(train.descriptors),
@@ -128,8 +123,7 @@ def fit_categorizer(
 
 def _notes_of(settings: LearningSettings) -> dict[str, Any]:
     """Return the settings that affect the model: all except the number of jobs."""
-    notes = {name: value for name, value in asdict(settings).items() if name != "jobs"}
-    return notes | {"kernels": 0}  # of Parzen densities, which are gone; the model's id covers it
+    return {name: value for name, value in asdict(settings).items() if name != "jobs"}
 
 
 def calibrate(categorizer: Categorizer, held_out: Examples, *, rejected: float) -> Categorizer:

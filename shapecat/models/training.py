@@ -9,7 +9,6 @@ from typing import Any
 
 import click
 
-from shapecat.description import BLOCKS
 from shapecat.evaluation.training import fit_views
 from shapecat.learning import Categorizer, save_model
 from shapecat.learning.training import Examples, fit_threshold
@@ -56,7 +55,7 @@ def main(
 
 def _fit(train: SimulatedViews, held_out: SimulatedViews, seed: int, jobs: int) -> Categorizer:
     """Train a model; fit its temperature on all held-out views, its threshold on partial ones."""
-    choices = {"blocks": tuple(BLOCKS), "jobs": jobs, "rejected": _REJECTED, **_TREES}
+    choices = {"jobs": jobs, "rejected": _REJECTED, **_TREES}
     model = fit_views(train.views, held_out.views, seed=seed, **choices)
     views = held_out.where(partial_views(held_out)).views
     pieces = Examples(views.descriptors, views.labels, views.instances)
