@@ -15,7 +15,7 @@ from shapecat.arrays import F4
 from shapecat.evaluation.baseline_classifiers import Densities, make_baselines
 from shapecat.evaluation.shape_functions import shape_functions
 from shapecat.learning import Categorizer
-from shapecat.learning.boosted import Dictionary, grow_dictionary
+from shapecat.learning.boosted import BoostedEnsemble, grow_ensemble
 from shapecat.learning.boosting import Tree, grow_tree
 from shapecat.learning.calibration import fit_temperature, softmax
 from shapecat.learning.features import fit_standardisation
@@ -65,13 +65,13 @@ def categorizer() -> Categorizer:
     return fit()
 
 
-def grow(x: F4, labels: np.ndarray, **options: Any) -> Dictionary:
+def grow(x: F4, labels: np.ndarray, **options: Any) -> BoostedEnsemble:
     chosen = {"leaves": 4, "rate": 0.1, "jobs": None, **options}
-    return grow_dictionary(x, labels, rng=np.random.default_rng(0), **chosen)
+    return grow_ensemble(x, labels, rng=np.random.default_rng(0), **chosen)
 
 
-def logits_of(dictionary: Dictionary, x: F4) -> Any:
-    return dictionary.votes[dictionary.forest.apply(x)].sum(axis=1) + dictionary.bias
+def logits_of(ensemble: BoostedEnsemble, x: F4) -> Any:
+    return ensemble.leaf_values[ensemble.forest.apply(x)].sum(axis=1) + ensemble.bias
 
 
 def test_trees_are_evaluated_to_the_leaf() -> None:
@@ -98,8 +98,8 @@ def test_prediction_matches_fitted_chain() -> None:
     Its trees are checked by `test_trees_are_evaluated_to_the_leaf`.
     """
     test, model = blobs(50, 9), fit()
-    words = model.forest.apply(model.bank.standardise(test.descriptors))
-    logits = model.votes.astype(float)[words].sum(axis=1) + model.bias
+    leaf_ids = model.forest.apply(model.bank.standardise(test.descriptors))
+    logits = model.votes.astype(float)[leaf_ids].sum(axis=1) + model.bias
 
     prediction = model.predict(test.descriptors)
 
@@ -136,7 +136,7 @@ def test_first_tree_makes_the_best_split(monkeypatch: pytest.MonkeyPatch) -> Non
     step = [-0.1 * gradient[part].sum() / (hessian[part].sum() + 2) for part in (left, ~left)]
 
     assert (int(model.forest.feature[0]), float(model.forest.threshold[0])) == (feature, cut)
-    np.testing.assert_allclose(model.votes[:2, 0], step, rtol=2e-3)
+    np.testing.assert_allclose(model.leaf_values[:2, 0], step, rtol=2e-3)
 
 
 def test_growing_trees_can_be_interrupted(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -474,8 +474,8 @@ def test_shift_of_new_categories_uses_correct_held_out_views(
     assert shift == pytest.approx(float(np.quantile(margins[1::2], 0.006)))
 
 
-@pytest.mark.parametrize("ridge", [1e-1, 1e-2])
-def test_classifier_of_new_category_matches_scikit_learn(ridge: float) -> None:
+@pytest.mark.parametrize("l2", [1e-1, 1e-2])
+def test_classifier_of_new_category_matches_scikit_learn(l2: float) -> None:
     """The logit of the old category is zero. Too few iterations would not converge."""
     rng, count = np.random.default_rng(4), 300
     truth = (np.arange(count) % 5 == 0).astype(np.int64)
@@ -483,9 +483,9 @@ def test_classifier_of_new_category_matches_scikit_learn(ridge: float) -> None:
     leaves = (rng.random((count, 10)) < 0.3).astype(np.float64)
     start = np.zeros((features.shape[1] + leaves.shape[1] + 1, 1))
     inputs = _Inputs(features, sparse.csr_array(leaves))
-    learned = _fit_new(inputs, np.zeros((count, 1)), truth, start, ridge, _STEPS)
+    learned = _fit_new(inputs, np.zeros((count, 1)), truth, start, l2, _STEPS)
 
-    exact = LogisticRegression(C=1 / ridge, tol=1e-10, max_iter=10_000).fit(
+    exact = LogisticRegression(C=1 / l2, tol=1e-10, max_iter=10_000).fit(
         np.hstack([features, leaves]), truth, sample_weight=0.5 / np.bincount(truth)[truth]
     )
     weights = [*exact.coef_[0], *exact.intercept_]

@@ -87,7 +87,7 @@ def learn_on_folder(
 ) -> dict[str, Any]:
     """Add the new categories of a data set to a model and write the result.
 
-    The dictionary and the classifiers of the old categories do not change.
+    The trees and the classifiers of the old categories do not change.
 
     Parameters
     ----------

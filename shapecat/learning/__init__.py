@@ -1,7 +1,7 @@
 """Learning shape categories (thesis ch. 7).
 
-`features` standardises a descriptor. `forest` maps these features to words, the leaves of a
-dictionary of trees. `categorizer` turns the words into a calibrated posterior and a novelty. These
+`features` standardises a descriptor. `forest` finds the leaf of each tree that these features
+reach. `categorizer` turns the values of the leaves into a calibrated posterior and a novelty. These
 modules predict; `boosted` and `training` train.
 """
 

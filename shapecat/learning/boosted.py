@@ -1,4 +1,4 @@
-"""Boosted trees as a dictionary of words, with a classifier per category (thesis 7.3, 7.4)."""
+"""The ensemble of boosted trees that computes the logits of all categories (thesis 7.3, 7.4)."""
 
 from collections.abc import Sequence
 from concurrent.futures import ThreadPoolExecutor
@@ -11,7 +11,7 @@ from shapecat.learning.boosting import Bins, Tree, TreeSettings, grow_tree, join
 from shapecat.learning.forest import FlatForest
 from shapecat.system import stopping
 
-__all__ = ["Dictionary", "grow_dictionary"]
+__all__ = ["BoostedEnsemble", "grow_ensemble"]
 
 _L2 = 2.0
 _MIN_HESSIAN = 1.0
@@ -21,21 +21,23 @@ _FEWEST_COLUMNS = 10
 _FEWEST_ROWS = 100
 
 
-class Dictionary(NamedTuple):
-    """Boosted trees whose leaves are words, and the classifiers on the words.
+class BoostedEnsemble(NamedTuple):
+    """Boosted trees, and the values of their leaves.
+
+    In the thesis, the ensemble is the *dictionary*, and its leaves are the *words*.
 
     Attributes
     ----------
-    votes : (words, k) the value that each word adds to each logit, rounded to half precision.
+    leaf_values : (l, k) the value that each leaf adds to each logit, rounded to half precision.
     bias : (k,) constants of the logits.
     """
 
     forest: FlatForest
-    votes: F4
+    leaf_values: F4
     bias: F8
 
 
-def grow_dictionary(
+def grow_ensemble(
     features: F4,
     labels: I4,
     *,
@@ -44,18 +46,18 @@ def grow_dictionary(
     rate: float,
     jobs: int,
     rng: np.random.Generator,
-) -> Dictionary:
-    """Grow gradient-boosted trees; a logit is the sum of the values of a view's words.
+) -> BoostedEnsemble:
+    """Grow gradient-boosted trees; a logit is the sum of the values of a view's leaves.
 
     Each round grows one tree per category against the rest, on the residual of its posterior. The
-    dictionary and the classifiers on its words are thus learned together.
+    trees and the classifiers, which sum their leaf values, are thus learned together.
 
     Parameters
     ----------
     features : (n, f).
     labels : (n,) column of each view's logit, from 0.
     rounds : trees per category.
-    leaves : maximum number of words (leaves) per tree.
+    leaves : maximum number of leaves per tree.
     rate : learning rate.
     jobs : number of trees grown at the same time; it does not affect the result.
 
@@ -70,7 +72,7 @@ def grow_dictionary(
     scores = np.repeat(bias[:, None], labels.size, axis=1).astype(np.float32)
     settings = TreeSettings(leaves, rate, _L2, _MIN_HESSIAN)
     trees = _boost(make_bins(features), labels, scores, rounds, settings, jobs, rng)
-    return Dictionary(*_join(trees, bias.size), bias)
+    return BoostedEnsemble(*_join(trees, bias.size), bias)
 
 
 def _boost(
@@ -117,12 +119,12 @@ def _draw(bins: Bins, rng: np.random.Generator) -> tuple[I4, I4]:
 
 
 def _join(trees: Sequence[Tree], categories: int) -> tuple[FlatForest, F4]:
-    """Return the trees as one forest, and the values (words, categories) of its leaves."""
+    """Return the trees as one forest, and the values (l, categories) of its l leaves."""
     (roots, feature, threshold, left), value = joined(trees)
     leaf = left == 0
     forest = FlatForest(roots, feature, np.where(leaf, 0, threshold), left)
     sizes = np.diff(roots, append=left.size)
     owner = np.repeat(np.arange(len(trees)) % categories, sizes)[leaf]
-    votes = np.zeros((forest.words, categories), np.float16)
-    votes[np.arange(forest.words), owner] = value[leaf]
-    return forest, votes.astype(np.float32)
+    leaf_values = np.zeros((forest.leaf_count, categories), np.float16)
+    leaf_values[np.arange(forest.leaf_count), owner] = value[leaf]
+    return forest, leaf_values.astype(np.float32)

@@ -39,15 +39,15 @@ class Prediction(NamedTuple):
 
 
 class Categorizer(Record):
-    """The fitted model: features, dictionary, a classifier per category on its words, novelty.
+    """The fitted model: features, boosted trees, a classifier per category, novelty.
 
     Attributes
     ----------
     categories : names of the columns of the posterior.
     descriptor_names : names of the descriptor's components, in order.
     bank : standardises a descriptor, which gives the features.
-    forest : the dictionary; each leaf is a word.
-    votes : (w, k) the value that each word adds to each logit. k is c, the number of categories,
+    forest : the boosted trees.
+    votes : (l, k) the value that each leaf adds to each logit. k is c, the number of categories,
         or c + 1 if the model was trained with unknown shapes, whose logit comes last.
     linear : (k, f) weights of the features in the logits; nonzero only for added categories.
     bias : (k,) constants of the logits.
@@ -67,7 +67,7 @@ class Categorizer(Record):
     descriptor_names: tuple[str, ...]
     bank: Standardisation
     forest: FlatForest
-    votes: F4 = array("w k", "f2")
+    votes: F4 = array("l k", "f2")
     linear: F4 = array("k f", "f4")
     bias: F8 = array("k", "f8")
     temperature: float
@@ -86,7 +86,7 @@ class Categorizer(Record):
             "category names": len(set(self.categories)) == len(self.categories)
             and 0 < len(self.categories) <= MOST_CATEGORIES
             and all(name and name.isprintable() and name != UNKNOWN for name in self.categories),
-            "words": self.forest.words == len(self.votes),
+            "leaves": self.forest.leaf_count == len(self.votes),
             "features": self.linear.shape[1]
             == self.bank.mean.size
             > self.forest.feature.max(initial=0),
@@ -183,7 +183,7 @@ def parts_of(record: Record, prefix: str = "") -> dict[str, Any]:
 def _predict(
     features: F4,
     forest: Any,
-    votes: F4,
+    leaf_values: F4,
     linear: F4,
     use_linear: bool,  # noqa: FBT001  compiled kernels take their arguments by position
     bias: F8,
@@ -193,19 +193,19 @@ def _predict(
     novelty: F4,
 ) -> None:
     """Write posteriors (n, c) and novelty (n,) of standardised descriptors (n, f)."""
-    trees, word = forest
+    trees, leaf_id = forest
     categories = posteriors.shape[1]
-    words = np.zeros(trees.roots.size, np.int64)
+    reached = np.zeros(trees.roots.size, np.int64)
     logits = np.zeros(bias.size)
     for i in range(features.shape[0]):
-        # (1) Dictionary: the leaf of each tree.
-        apply(features[i], trees, word, words)
+        # (1) The leaf of each tree.
+        apply(features[i], trees, leaf_id, reached)
         # (2) Logits of the categories.
         for c in range(bias.size):
             logits[c] = bias[c]
-        for w in words:
+        for leaf in reached:
             for c in range(bias.size):
-                logits[c] += votes[w, c]
+                logits[c] += leaf_values[leaf, c]
         if use_linear:
             for c in range(bias.size):
                 for j in range(linear.shape[1]):

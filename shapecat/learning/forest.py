@@ -1,4 +1,4 @@
-"""A forest as flat arrays; each leaf is a word of the dictionary (thesis 7.3)."""
+"""A forest as flat arrays, and the leaves that a view reaches in it (thesis 7.3)."""
 
 from functools import cached_property
 
@@ -14,8 +14,8 @@ __all__ = ["FlatForest", "apply"]
 class FlatForest(Record):
     """Decision trees in four arrays, evaluated without scikit-learn.
 
-    Both children of a node are adjacent and come after it. A word is the number of a leaf, counted
-    in the order of the nodes.
+    Both children of a node are adjacent and come after it. The id of a leaf is its number
+    among the leaves, in the order of the nodes.
 
     Attributes
     ----------
@@ -49,23 +49,23 @@ class FlatForest(Record):
             raise ValueError(msg)
 
     @cached_property
-    def word(self) -> I4:
-        """The word of each leaf, (n,); meaningless for inner nodes."""
+    def leaf_id(self) -> I4:
+        """The id of each leaf, (n,); meaningless for inner nodes."""
         return (np.cumsum(self.left == 0) - 1).astype(np.int32)
 
     @property
-    def words(self) -> int:
+    def leaf_count(self) -> int:
         """Number of leaves."""
         return int(np.count_nonzero(self.left == 0))
 
     @cached_property
     def parameters(self) -> tuple[Trees, I4]:
-        """The trees and words for `apply`; small types keep a large forest in the cache."""
+        """The trees and leaf ids for `apply`; small types keep a large forest in the cache."""
         left = self.left.astype(np.int32)
-        return Trees(self.roots, self.feature, self.threshold, left), self.word
+        return Trees(self.roots, self.feature, self.threshold, left), self.leaf_id
 
     def apply(self, features: F4) -> I4:
-        """Return the words (n, t), one for each tree, of features (n, f).
+        """Return the leaf ids (n, t), one for each tree, of features (n, f).
 
         Raises
         ------
@@ -82,13 +82,13 @@ class FlatForest(Record):
 
 
 @kernel
-def apply(x: F4, trees: Trees, word: I4, result: I4) -> None:
-    """Write the word (number of the leaf) that one view reaches in each tree into ``result`` (t,).
+def apply(x: F4, trees: Trees, leaf_id: I4, result: I4) -> None:
+    """Write the id of the leaf that one view reaches in each tree into ``result`` (t,).
 
-    ``x`` (f,) are its features; ``word`` (n,) is from `FlatForest.word`.
+    ``x`` (f,) are its features; ``leaf_id`` (n,) is from `FlatForest.leaf_id`.
     """
     leaves, (roots, feature, threshold, left) = np.zeros(LANES, np.int32), trees
     for first in range(0, result.size, LANES):
         count = find_leaves(x, roots, feature, threshold, left, first, leaves)
         for lane in range(count):
-            result[first + lane] = word[leaves[lane]]
+            result[first + lane] = leaf_id[leaves[lane]]

@@ -1,4 +1,4 @@
-"""Adding categories to a fixed dictionary without relearning the old ones (thesis 7.5.3)."""
+"""Adding categories to fixed trees without relearning the old ones (thesis 7.5.3)."""
 
 from collections.abc import Sequence
 from dataclasses import replace
@@ -16,7 +16,7 @@ from shapecat.learning.known_views import KNOWN_VIEWS, choose_evenly
 
 __all__ = ["add_categories"]
 
-_RIDGE = 1e-2
+_L2 = 1e-2
 """Strength of the L2 regularisation, per view."""
 _FOLDS = 4
 _STEPS = 150
@@ -29,13 +29,19 @@ _LARGEST_SHIFT = 2.0
 
 
 class _Inputs(NamedTuple):
-    """Inputs of the new classifiers: ``features`` (n, f) and sparse ``words`` (n, w) of n views."""
+    """Inputs of the new classifiers, of n views.
+
+    Attributes
+    ----------
+    features : (n, f).
+    leaf_indicators : sparse (n, l): 1 at the leaves that a view reaches, 0 elsewhere.
+    """
 
     features: F8
-    words: sparse.csr_array
+    leaf_indicators: sparse.csr_array
 
     def where(self, chosen: Bool) -> "_Inputs":
-        return _Inputs(self.features[chosen], self.words[chosen])
+        return _Inputs(self.features[chosen], self.leaf_indicators[chosen])
 
 
 def add_categories(
@@ -47,9 +53,9 @@ def add_categories(
 ) -> Categorizer:
     """Add new categories to a model from a few views of each.
 
-    Each new category gets its own linear classifier on the words and the descriptor. The
-    dictionary, the classifiers and the temperature of the old categories do not change. The known
-    views stored in the model are the negative examples.
+    Each new category gets its own linear classifier on the leaves and the descriptor. The trees,
+    the classifiers and the temperature of the old categories do not change. The known views stored
+    in the model are the negative examples.
 
     Parameters
     ----------
@@ -86,22 +92,22 @@ def add_categories(
     count, old_count = len(added), len(categorizer.categories)
     order = _order(old_count, count, unknown=categorizer.knows_unknown)
     truth = np.concatenate([categorizer.known_category.astype(np.int64), order[codes]])
-    words = categorizer.forest.apply(z)
-    inputs = _Inputs(z.astype(np.float64), _bag_of_words(words, categorizer.forest.words))
+    indicators = _leaf_indicators(categorizer.forest.apply(z), categorizer.forest.leaf_count)
+    inputs = _Inputs(z.astype(np.float64), indicators)
     old = _old_logits(categorizer, inputs)
     cold = old / categorizer.temperature
-    learned = _fit_new(inputs, cold, truth, np.zeros((_width(inputs), count)), _RIDGE, _STEPS)
-    learned[-1] += _shift(inputs, cold, truth, learned, _RIDGE, rng)
+    learned = _fit_new(inputs, cold, truth, np.zeros((_width(inputs), count)), _L2, _STEPS)
+    learned[-1] += _shift(inputs, cold, truth, learned, _L2, rng)
     learned *= categorizer.temperature
     linear = np.concatenate([categorizer.linear, learned[: z.shape[1]].T])
-    votes = np.concatenate([categorizer.votes, learned[z.shape[1] : -1]], axis=1)
+    leaf_values = np.concatenate([categorizer.votes, learned[z.shape[1] : -1]], axis=1)
     columns = np.argsort(order)[truth]
     stored = choose_evenly(columns, KNOWN_VIEWS, rng)
     return replace(
         categorizer,
         categories=categories,
         bank=replace(categorizer.bank, starts=np.zeros(len(categories) + 1, np.int32)),
-        votes=votes[:, order],
+        votes=leaf_values[:, order],
         linear=linear[order],
         bias=np.concatenate([categorizer.bias, learned[-1]])[order],
         known_descriptors=z[stored],
@@ -123,32 +129,32 @@ def _known_views(categorizer: Categorizer) -> F4:
     return categorizer.known_descriptors.astype(np.float32)
 
 
-def _bag_of_words(words: I4, vocabulary: int) -> sparse.csr_array:
-    """Return sparse rows (n, vocabulary), one per view: 1 at its words (n, t), 0 elsewhere."""
-    views, trees = words.shape
+def _leaf_indicators(leaf_ids: I4, leaf_count: int) -> sparse.csr_array:
+    """Return sparse rows (n, leaf_count), one per view: 1 at its leaf ids (n, t), 0 elsewhere."""
+    views, trees = leaf_ids.shape
     starts = np.arange(views + 1, dtype=np.int32) * trees
-    columns = words.reshape(-1).astype(np.int32)
-    return sparse.csr_array((np.ones(words.size), columns, starts), shape=(views, vocabulary))
+    columns = leaf_ids.reshape(-1).astype(np.int32)
+    return sparse.csr_array((np.ones(leaf_ids.size), columns, starts), shape=(views, leaf_count))
 
 
 def _old_logits(categorizer: Categorizer, inputs: _Inputs) -> F8:
-    votes = inputs.words @ categorizer.votes.astype(np.float64)
+    of_leaves = inputs.leaf_indicators @ categorizer.votes.astype(np.float64)
     linear = inputs.features @ categorizer.linear.T
-    return np.asarray(votes + linear + categorizer.bias)
+    return np.asarray(of_leaves + linear + categorizer.bias)
 
 
 def _width(inputs: _Inputs) -> int:
-    """Return the number of weights per new category: features, words, constant."""
-    return int(inputs.features.shape[1] + inputs.words.shape[1] + 1)
+    """Return the number of weights per new category: features, leaves, constant."""
+    return int(inputs.features.shape[1] + inputs.leaf_indicators.shape[1] + 1)
 
 
 def _logits(inputs: _Inputs, weights: F8) -> F8:
     width = inputs.features.shape[1]
     linear_part = np.einsum("nf,cf->nc", inputs.features, np.ascontiguousarray(weights[:width].T))
-    return np.asarray(linear_part + inputs.words @ weights[width:-1] + weights[-1])
+    return np.asarray(linear_part + inputs.leaf_indicators @ weights[width:-1] + weights[-1])
 
 
-def _fit_new(inputs: _Inputs, old: F8, truth: I4, start: F8, ridge: float, steps: int) -> F8:
+def _fit_new(inputs: _Inputs, old: F8, truth: I4, start: F8, l2: float, steps: int) -> F8:
     """Return the weights (`_width`, new categories) of the new logits.
 
     ``old`` (n, k) are the old logits, divided by the temperature; ``truth`` (n,) true columns.
@@ -169,11 +175,12 @@ def _fit_new(inputs: _Inputs, old: F8, truth: I4, start: F8, ridge: float, steps
         total = np.logaddexp.reduce(np.concatenate([offset, new], axis=1), axis=1)
         chosen = np.where(truth < first, own_old, (new * target).sum(axis=1))
         residual = share[:, None] * (np.exp(new - total[:, None]) - target)
-        own_slope = np.einsum("nf,nc->cf", inputs.features, residual).T
-        slope = np.concatenate([own_slope, inputs.words.T @ residual, residual.sum(axis=0)[None]])
-        slope[:-1] += ridge * weights[:-1]
-        value = float(share @ (total - chosen)) + 0.5 * ridge * float((weights[:-1] ** 2).sum())
-        return value, slope.reshape(-1)
+        of_features = np.einsum("nf,nc->cf", inputs.features, residual).T
+        of_leaves = inputs.leaf_indicators.T @ residual
+        gradient = np.concatenate([of_features, of_leaves, residual.sum(axis=0)[None]])
+        gradient[:-1] += l2 * weights[:-1]
+        value = float(share @ (total - chosen)) + 0.5 * l2 * float((weights[:-1] ** 2).sum())
+        return value, gradient.reshape(-1)
 
     # For such short sums, threads spend most of the time waiting for each other.
     with threadpool_limits(1):
@@ -184,7 +191,7 @@ def _fit_new(inputs: _Inputs, old: F8, truth: I4, start: F8, ridge: float, steps
 
 
 def _shift(
-    inputs: _Inputs, old: F8, truth: I4, learned: F8, ridge: float, rng: np.random.Generator
+    inputs: _Inputs, old: F8, truth: I4, learned: F8, l2: float, rng: np.random.Generator
 ) -> float:
     """Return the largest constant for the new logits that takes few views from old categories.
 
@@ -194,7 +201,7 @@ def _shift(
     new = np.zeros((len(truth), learned.shape[1]))
     for k in range(_FOLDS):
         test = fold == k
-        fitted = _fit_new(inputs.where(~test), old[~test], truth[~test], learned, ridge, _FEW_STEPS)
+        fitted = _fit_new(inputs.where(~test), old[~test], truth[~test], learned, l2, _FEW_STEPS)
         new[test] = _logits(inputs.where(test), fitted)
     right = old.argmax(axis=1) == truth
     margin = (old.max(axis=1) - new.max(axis=1))[right]

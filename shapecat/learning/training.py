@@ -7,7 +7,7 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from shapecat.arrays import F4, I4
-from shapecat.learning.boosted import grow_dictionary
+from shapecat.learning.boosted import grow_ensemble
 from shapecat.learning.calibration import can_calibrate, fit_temperature
 from shapecat.learning.categorizer import Categorizer
 from shapecat.learning.features import fit_standardisation
@@ -30,7 +30,7 @@ class LearningSettings:
     rounds: int = 500
     """Boosting rounds; each grows one tree per category."""
     leaves: int = 16
-    """Maximum number of leaves (words) of a tree."""
+    """Maximum number of leaves of a tree."""
     rate: float = 0.06
     """Learning rate of the boosting."""
     known_views: int = KNOWN_VIEWS
@@ -94,7 +94,7 @@ def fit_categorizer(
     codes[codes < 0] = len(categories)  # the column of the learner of unknown shapes
     bank = fit_standardisation(train.descriptors, len(categories))
     rng = np.random.default_rng(seed)
-    dictionary = grow_dictionary(
+    ensemble = grow_ensemble(
         bank.standardise(train.descriptors),
         codes,
         rounds=settings.rounds,
@@ -108,10 +108,10 @@ def fit_categorizer(
         categories=tuple(categories),
         descriptor_names=tuple(descriptor_names),
         bank=bank,
-        forest=dictionary.forest,
-        votes=dictionary.votes,
-        linear=np.zeros((dictionary.bias.size, bank.mean.size)),
-        bias=dictionary.bias,
+        forest=ensemble.forest,
+        votes=ensemble.leaf_values,
+        linear=np.zeros((ensemble.bias.size, bank.mean.size)),
+        bias=ensemble.bias,
         temperature=1.0,
         threshold=0.0,
         known_descriptors=bank.standardise(train.descriptors[chosen]),
