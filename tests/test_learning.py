@@ -98,8 +98,8 @@ def test_prediction_matches_fitted_chain() -> None:
     Its trees are checked by `test_trees_are_evaluated_to_the_leaf`.
     """
     test, model = blobs(50, 9), fit()
-    leaf_ids = model.forest.apply(model.bank.standardise(test.descriptors))
-    logits = model.votes.astype(float)[leaf_ids].sum(axis=1) + model.bias
+    leaf_ids = model.forest.apply(model.standardisation.standardise(test.descriptors))
+    logits = model.leaf_values.astype(float)[leaf_ids].sum(axis=1) + model.bias
 
     prediction = model.predict(test.descriptors)
 
@@ -257,7 +257,7 @@ def test_constant_features_become_zero() -> None:
     x = data.descriptors.copy()
     x[:, 2] = 7.0
     blocks = tuple(BLOCKS.values())
-    z = fit_standardisation(x, len(CATEGORIES)).standardise(x)
+    z = fit_standardisation(x).standardise(x)
 
     assert np.all(np.isfinite(z))
     assert np.all(z[:, 2] == 0)
@@ -337,7 +337,9 @@ def test_new_category_is_learned_on_fixed_trees(categorizer: Categorizer) -> Non
     correct = prediction.posteriors.argmax(axis=1) == encode(test.labels, extended.categories)
 
     assert extended.categories == (*CATEGORIES, "cone")
-    assert np.array_equal(extended.votes[:, [0, 1, 2, 4]], categorizer.votes)  # unknown stays last
+    assert np.array_equal(
+        extended.leaf_values[:, [0, 1, 2, 4]], categorizer.leaf_values
+    )  # unknown stays last
     assert np.array_equal(extended.bias[[0, 1, 2, 4]], categorizer.bias)
     assert np.array_equal(extended.forest.threshold, categorizer.forest.threshold)
     assert correct[test.labels == "cone"].mean() > 0.9
@@ -375,7 +377,7 @@ def test_learning_stores_a_limited_number_of_views(
 
     assert np.bincount(categorizer.known_category).tolist() == [50] * 4  # the last are unknown
     assert np.bincount(model.known_category).tolist() == [20] * 6
-    z = categorizer.bank.standardise(new.descriptors).astype(np.float16)
+    z = categorizer.standardisation.standardise(new.descriptors).astype(np.float16)
     before = categorizer.known_descriptors[categorizer.known_category == 3]
     for code, views in ((3, z[new.labels == "cone"]), (4, z[new.labels == "spoon"]), (5, before)):
         stored = model.known_descriptors[model.known_category == code]

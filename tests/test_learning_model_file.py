@@ -26,19 +26,17 @@ def tiny() -> Categorizer:
         np.array([0.5, 0, 0, -1, 0, 0]),
         np.array([1, 0, 0, 4, 0, 0]),
     )
-    bank = Standardisation(
+    standardisation = Standardisation(
         columns=np.arange(3),
         mean=np.zeros(3),
         inverse_scale=np.ones(3),
-        starts=np.zeros(3, np.int32),
-        kernels=np.zeros((0, 3)),
     )
     return Categorizer(
         categories=("cup", "can"),
         descriptor_names=("a", "b", "c"),
-        bank=bank,
+        standardisation=standardisation,
         forest=forest,
-        votes=np.array([[1, 0], [0, 1], [0.5, 0], [0, 0.5]]),
+        leaf_values=np.array([[1, 0], [0, 1], [0.5, 0], [0, 0.5]]),
         linear=np.zeros((2, 3)),
         bias=np.array([0.0, 0.1]),
         temperature=0.7,
@@ -159,11 +157,12 @@ def put(name: str, value: object, dtype: str) -> Callable[[dict[str, bytes]], No
 
 
 def break_header(members: dict[str, bytes]) -> None:
-    members["votes.npy"] = members["votes.npy"].replace(b"}", b" ", 1)
+    members["leaf_values.npy"] = members["leaf_values.npy"].replace(b"}", b" ", 1)
 
 
 _HOSTILE = {
-    "newer": (edit_header(version=3), "version 3"),
+    "older": (edit_header(version=2), "version 2, this shapecat reads version 3"),
+    "newer": (edit_header(version=4), "version 4"),
     "other format": (edit_header(format="x"), "does not say"),
     "header is a list": (lambda m: m.update({"header.json": b"[]"}), "does not say"),
     "header is deep": (lambda m: m.update({"header.json": b"[" * 10**6}), "not a usable"),
@@ -176,23 +175,23 @@ _HOSTILE = {
     "a name of two lines": (edit_header(categories=["cup", "a\nb"]), "category names"),
     "a name that is no Unicode": (edit_header(categories=["cup", "\ud800"]), "category names"),
     "unknown as a category": (edit_header(categories=["cup", "unknown"]), "category names"),
-    "a category missing": (edit_header(categories=["cup"]), "categories"),
+    "a category too many": (edit_header(categories=["cup", "can", "box"]), "categories"),
+    "two categories missing": (edit_header(categories=[]), "categories, category names"),
     "a name is no text": (edit_header(categories=["cup", 3]), "wrong type"),
-    "an array missing": (lambda m: m.pop("votes.npy"), "no votes"),
+    "an array missing": (lambda m: m.pop("leaf_values.npy"), "no leaf_values"),
     "an array without header": (break_header, "header of an array is damaged"),
-    "of another type": (put("votes", np.zeros((4, 2)), "f8"), "wrong type"),
-    "of objects": (put("votes", np.zeros((4, 2)), "c8"), "differs from its header"),
+    "of another type": (put("leaf_values", np.zeros((4, 2)), "f8"), "wrong type"),
+    "of objects": (put("leaf_values", np.zeros((4, 2)), "c8"), "differs from its header"),
     "a loop": (put("forest.left", [1, 0, 0, 3, 0, 0], "u4"), "damaged"),
     "a child behind the end": (put("forest.left", [1, 0, 0, 4, 0, 5], "u4"), "damaged"),
     "a root behind the end": (put("forest.roots", [0, 99], "u4"), "damaged"),
     "no trees": (put("forest.roots", [], "u4"), "damaged"),
     "a feature too many": (put("forest.feature", [9, 0, 0, 2, 0, 0], "u2"), "features"),
-    "a component too many": (put("bank.columns", [0, 1, 9], "u2"), "descriptor"),
-    "densities": (put("bank.kernels", [[0, 0, 0], [0, 1, 0]], "f2"), "Parzen densities"),
-    "a mean of NaN": (put("bank.mean", [0, np.nan, 0], "f4"), "not finite"),
+    "a component too many": (put("standardisation.columns", [0, 1, 9], "u2"), "descriptor"),
+    "a mean of NaN": (put("standardisation.mean", [0, np.nan, 0], "f4"), "not finite"),
     "no threshold": (edit_header(threshold=float("inf")), "numbers"),
     "two learners too many": (put("bias", [0.0, 0.1, 0.2, 0.3], "f8"), "not a usable"),
-    "infinite votes": (put("votes", np.full((4, 2), np.inf), "f2"), "numbers"),
+    "infinite leaf values": (put("leaf_values", np.full((4, 2), np.inf), "f2"), "numbers"),
     "known views of NaN": (put("known_descriptors", np.full((2, 3), np.nan), "f2"), "numbers"),
     "an unknown category": (put("known_category", [0, 7], "u1"), "known views"),
 }
@@ -214,7 +213,9 @@ def test_claimed_array_size_is_not_allocated(saved: Path) -> None:
     real = npy(np.zeros((4, 2)), "f2")
     rewrite(
         saved,
-        lambda m: m.update({"votes.npy": real.replace(b"(4, 2), }    ", b"(400000000, 2), }")}),
+        lambda m: m.update(
+            {"leaf_values.npy": real.replace(b"(4, 2), }    ", b"(400000000, 2), }")}
+        ),
     )
     tracemalloc.start()
     try:
@@ -233,7 +234,7 @@ def test_zip_bomb_is_not_unpacked(saved: Path, monkeypatch: pytest.MonkeyPatch) 
     monkeypatch.setattr(model_file, "_LARGEST_PART", 8 << 20)
     content = bytes(9 << 20)
     with zipfile.ZipFile(saved, "w", zipfile.ZIP_DEFLATED, compresslevel=1) as archive:
-        archive.writestr("votes.npy", content)
+        archive.writestr("leaf_values.npy", content)
 
     with pytest.raises(ModelError, match="unpacks to more than"):
         load_model(saved)
@@ -258,7 +259,7 @@ def test_damaged_file_raises_or_still_predicts(saved: Path) -> None:
 def test_pickles_are_never_loaded(saved: Path) -> None:
     stream = io.BytesIO()
     np.save(stream, np.array([{}], object), allow_pickle=True)
-    rewrite(saved, lambda m: m.update({"votes.npy": stream.getvalue()}))
+    rewrite(saved, lambda m: m.update({"leaf_values.npy": stream.getvalue()}))
 
     with pytest.raises(ModelError, match="differs from its header"):
         load_model(saved)

@@ -45,10 +45,10 @@ class Categorizer(Record):
     ----------
     categories : names of the columns of the posterior.
     descriptor_names : names of the descriptor's components, in order.
-    bank : standardises a descriptor, which gives the features.
+    standardisation : standardises a descriptor, which gives the features.
     forest : the boosted trees.
-    votes : (l, k) the value that each leaf adds to each logit. k is c, the number of categories,
-        or c + 1 if the model was trained with unknown shapes, whose logit comes last.
+    leaf_values : (l, k) the value that each leaf adds to each logit. k is c, the number of
+        categories, or c + 1 if the model was trained with unknown shapes, whose logit comes last.
     linear : (k, f) weights of the features in the logits; nonzero only for added categories.
     bias : (k,) constants of the logits.
     temperature : posteriors are ``softmax(logits / temperature)``.
@@ -65,9 +65,9 @@ class Categorizer(Record):
 
     categories: tuple[str, ...]
     descriptor_names: tuple[str, ...]
-    bank: Standardisation
+    standardisation: Standardisation
     forest: FlatForest
-    votes: F4 = array("l k", "f2")
+    leaf_values: F4 = array("l k", "f2")
     linear: F4 = array("k f", "f4")
     bias: F8 = array("k", "f8")
     temperature: float
@@ -80,21 +80,20 @@ class Categorizer(Record):
         """Check that the parts fit together."""
         super().__post_init__()
         sizes = {
-            "descriptor": len(self.descriptor_names) > self.bank.columns.max(initial=0),
-            "categories": self.bias.size - len(self.categories) in {0, 1}
-            and self.bank.starts.size == len(self.categories) + 1,
+            "descriptor": len(self.descriptor_names) > self.standardisation.columns.max(initial=0),
+            "categories": self.bias.size - len(self.categories) in {0, 1},
             "category names": len(set(self.categories)) == len(self.categories)
             and 0 < len(self.categories) <= MOST_CATEGORIES
             and all(name and name.isprintable() and name != UNKNOWN for name in self.categories),
-            "leaves": self.forest.leaf_count == len(self.votes),
+            "leaves": self.forest.leaf_count == len(self.leaf_values),
             "features": self.linear.shape[1]
-            == self.bank.mean.size
+            == self.standardisation.mean.size
             > self.forest.feature.max(initial=0),
-            "known views": self.known_descriptors.shape[1] == self.bank.mean.size
+            "known views": self.known_descriptors.shape[1] == self.standardisation.mean.size
             and bool(np.all(self.known_category < self.bias.size)),
             "numbers": all(
                 bool(np.all(np.abs(values.astype(np.float64)) <= _LARGEST))
-                for values in (self.votes, self.linear, self.bias, self.known_descriptors)
+                for values in (self.leaf_values, self.linear, self.bias, self.known_descriptors)
             )
             and 1e-3 <= self.temperature <= 1e3
             and abs(self.threshold) <= _LARGEST,
@@ -153,14 +152,14 @@ class Categorizer(Record):
             raise ValueError(msg)
         posteriors = np.zeros((len(x), len(self.categories)), np.float32)
         novelty = np.zeros(len(x), np.float32)
-        _predict(self.bank.standardise(x), *self._parameters, posteriors, novelty)
+        _predict(self.standardisation.standardise(x), *self._parameters, posteriors, novelty)
         return Prediction(posteriors, novelty)
 
     @cached_property
     def _parameters(self) -> tuple[Any, ...]:
         return (
             self.forest.parameters,
-            np.ascontiguousarray(self.votes, np.float32),
+            np.ascontiguousarray(self.leaf_values, np.float32),
             self.linear,
             bool(np.any(self.linear)),
             self.bias,

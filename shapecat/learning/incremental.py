@@ -87,7 +87,7 @@ def add_categories(
     known = _known_views(categorizer)
     categories = (*categorizer.categories, *added)
     codes = np.array([categories.index(name) for name in names])
-    z = np.concatenate([known, categorizer.bank.standardise(descriptors)])
+    z = np.concatenate([known, categorizer.standardisation.standardise(descriptors)])
     # During the fit, the new logits come last, after the one for unknown shapes.
     count, old_count = len(added), len(categorizer.categories)
     order = _order(old_count, count, unknown=categorizer.knows_unknown)
@@ -100,14 +100,13 @@ def add_categories(
     learned[-1] += _shift(inputs, cold, truth, learned, _L2, rng)
     learned *= categorizer.temperature
     linear = np.concatenate([categorizer.linear, learned[: z.shape[1]].T])
-    leaf_values = np.concatenate([categorizer.votes, learned[z.shape[1] : -1]], axis=1)
+    leaf_values = np.concatenate([categorizer.leaf_values, learned[z.shape[1] : -1]], axis=1)
     columns = np.argsort(order)[truth]
     stored = choose_evenly(columns, KNOWN_VIEWS, rng)
     return replace(
         categorizer,
         categories=categories,
-        bank=replace(categorizer.bank, starts=np.zeros(len(categories) + 1, np.int32)),
-        votes=leaf_values[:, order],
+        leaf_values=leaf_values[:, order],
         linear=linear[order],
         bias=np.concatenate([categorizer.bias, learned[-1]])[order],
         known_descriptors=z[stored],
@@ -138,7 +137,7 @@ def _leaf_indicators(leaf_ids: I4, leaf_count: int) -> sparse.csr_array:
 
 
 def _old_logits(categorizer: Categorizer, inputs: _Inputs) -> F8:
-    of_leaves = inputs.leaf_indicators @ categorizer.votes.astype(np.float64)
+    of_leaves = inputs.leaf_indicators @ categorizer.leaf_values.astype(np.float64)
     linear = inputs.features @ categorizer.linear.T
     return np.asarray(of_leaves + linear + categorizer.bias)
 

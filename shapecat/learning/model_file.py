@@ -26,7 +26,7 @@ _Record = TypeVar("_Record", bound=Record)
 __all__ = ["load_model", "require_model_path", "save_model"]
 
 _FORMAT = "shapecat-model"
-_VERSION = 2
+_VERSION = 3
 _LARGEST_FILE = 64 << 20
 _LARGEST_PART = 128 << 20
 _HEADER = "header.json"

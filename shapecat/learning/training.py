@@ -92,10 +92,10 @@ def fit_categorizer(
         raise ValueError(msg)
     codes = encode(train.labels, categories)
     codes[codes < 0] = len(categories)  # the column of the learner of unknown shapes
-    bank = fit_standardisation(train.descriptors, len(categories))
+    standardisation = fit_standardisation(train.descriptors)
     rng = np.random.default_rng(seed)
     ensemble = grow_ensemble(
-        bank.standardise(train.descriptors),
+        standardisation.standardise(train.descriptors),
         codes,
         rounds=settings.rounds,
         leaves=settings.leaves,
@@ -107,14 +107,14 @@ def fit_categorizer(
     categorizer = Categorizer(
         categories=tuple(categories),
         descriptor_names=tuple(descriptor_names),
-        bank=bank,
+        standardisation=standardisation,
         forest=ensemble.forest,
-        votes=ensemble.leaf_values,
-        linear=np.zeros((ensemble.bias.size, bank.mean.size)),
+        leaf_values=ensemble.leaf_values,
+        linear=np.zeros((ensemble.bias.size, standardisation.mean.size)),
         bias=ensemble.bias,
         temperature=1.0,
         threshold=0.0,
-        known_descriptors=bank.standardise(train.descriptors[chosen]),
+        known_descriptors=standardisation.standardise(train.descriptors[chosen]),
         known_category=codes[chosen],
         notes={"seed": seed, "learning": _notes_of(settings)},
     )
