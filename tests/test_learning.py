@@ -308,11 +308,11 @@ def test_baselines_learn() -> None:
 
 def test_known_views_are_chosen_evenly() -> None:
     """A category with many views must not push the others out of the model."""
-    codes = np.repeat([0, 1, -1], [1000, 10, 500])
+    codes = np.repeat([0, 1, 2], [1000, 10, 500])
 
     chosen = choose_evenly(codes, 40, np.random.default_rng(0))
 
-    assert np.bincount(codes[chosen]).tolist() == [30, 10]
+    assert np.bincount(codes[chosen]).tolist() == [15, 10, 15]
 
 
 def test_category_without_views_raises() -> None:

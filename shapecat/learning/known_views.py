@@ -15,10 +15,9 @@ def choose_evenly(codes: I4, count: int, rng: np.random.Generator) -> I4:
 
     Parameters
     ----------
-    codes : (n,) category of each view; views with a negative code are left out.
+    codes : (n,) category of each view.
     """
     order = rng.permutation(len(codes))
-    order = order[codes[order] >= 0]
     rank = np.zeros(len(order), np.int64)
     for code in np.unique(codes[order]):
         of_code = codes[order] == code
