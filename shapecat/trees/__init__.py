@@ -1,4 +1,4 @@
-"""Decision trees for kernels: the trees of the dictionary, and boosted trees."""
+"""Decision trees for kernels, and boosted trees whose leaf values add up to one logit."""
 
 from shapecat.trees.boosted import BoostedTrees, logit_of, read_trees, write_trees
 from shapecat.trees.walking import LANES, Trees, find_leaves
