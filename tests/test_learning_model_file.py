@@ -26,11 +26,7 @@ def tiny() -> Categorizer:
         np.array([0.5, 0, 0, -1, 0, 0]),
         np.array([1, 0, 0, 4, 0, 0]),
     )
-    standardisation = Standardisation(
-        columns=np.arange(3),
-        mean=np.zeros(3),
-        inverse_scale=np.ones(3),
-    )
+    standardisation = Standardisation(mean=np.zeros(3), inverse_scale=np.ones(3))
     return Categorizer(
         categories=("cup", "can"),
         descriptor_names=("a", "b", "c"),
@@ -187,7 +183,8 @@ _HOSTILE = {
     "a root behind the end": (put("forest.roots", [0, 99], "u4"), "damaged"),
     "no trees": (put("forest.roots", [], "u4"), "damaged"),
     "a feature too many": (put("forest.feature", [9, 0, 0, 2, 0, 0], "u2"), "features"),
-    "a component too many": (put("standardisation.columns", [0, 1, 9], "u2"), "descriptor"),
+    "a component too many": (edit_header(descriptor_names=["a", "b", "c", "d"]), "descriptor"),
+    "a component missing": (edit_header(descriptor_names=["a", "b"]), "descriptor"),
     "a mean of NaN": (put("standardisation.mean", [0, np.nan, 0], "f4"), "not finite"),
     "no threshold": (edit_header(threshold=float("inf")), "numbers"),
     "two learners too many": (put("bias", [0.0, 0.1, 0.2, 0.3], "f8"), "not a usable"),

@@ -80,7 +80,7 @@ class Categorizer(Record):
         """Check that the parts fit together."""
         super().__post_init__()
         sizes = {
-            "descriptor": len(self.descriptor_names) > self.standardisation.columns.max(initial=0),
+            "descriptor": len(self.descriptor_names) == self.standardisation.mean.size,
             "categories": self.bias.size - len(self.categories) in {0, 1},
             "category names": len(set(self.categories)) == len(self.categories)
             and 0 < len(self.categories) <= MOST_CATEGORIES

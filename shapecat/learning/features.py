@@ -2,7 +2,7 @@
 
 import numpy as np
 
-from shapecat.arrays import F4, U2, Record, array
+from shapecat.arrays import F4, Record, array
 
 __all__ = ["Standardisation", "fit_standardisation"]
 
@@ -15,7 +15,6 @@ class Standardisation(Record):
 
     Attributes
     ----------
-    columns : (d,) indices of the used components of the descriptor.
     mean, inverse_scale : (d,) standardisation; a constant component has inverse scale 0.
 
     Raises
@@ -23,7 +22,6 @@ class Standardisation(Record):
     ValueError : a number is not finite.
     """
 
-    columns: U2 = array("d", "u2")
     mean: F4 = array("d", "f4")
     inverse_scale: F4 = array("d", "f4")
 
@@ -35,9 +33,8 @@ class Standardisation(Record):
             raise ValueError(msg)
 
     def standardise(self, descriptors: F4) -> F4:
-        """Return the used components of whole descriptors, standardised and clipped, (n, d)."""
-        z = np.asarray(descriptors, np.float32).take(self.columns, axis=1)
-        z -= self.mean
+        """Return descriptors (n, d), standardised and clipped."""
+        z = np.asarray(descriptors, np.float32) - self.mean
         z *= self.inverse_scale
         return z.clip(-_CLIP, _CLIP, out=z)
 
@@ -48,4 +45,4 @@ def fit_standardisation(x: F4) -> Standardisation:
     scale = x.std(axis=0, dtype=np.float64)
     used = scale > 1e-7 * np.maximum(1.0, np.abs(mean))
     inverse = np.where(used, 1.0 / np.where(used, scale, 1.0), 0.0)
-    return Standardisation(np.arange(x.shape[1]), mean, inverse)
+    return Standardisation(mean, inverse)
