@@ -15,7 +15,10 @@ from shapecat.evaluation.names import require_category_names
 from shapecat.evaluation.report import evaluate
 from shapecat.evaluation.views import DescribedViews, describe_views
 from shapecat.learning import Categorizer, load_model, save_model
+from shapecat.learning.calibration import can_calibrate
 from shapecat.learning.categorizer import MOST_CATEGORIES
+from shapecat.learning.incremental import add_categories
+from shapecat.learning.training import Examples, LearningSettings, fit_categorizer
 from shapecat.runs.labels.meaning import order_categories
 from shapecat.system.progress import Observer, ignore
 from shapecat.types import UNKNOWN
@@ -53,9 +56,6 @@ def train_on_folder(
     ModelError : there are too many categories.
     OutputError : the model cannot be written.
     """
-    # Only training needs these parts of SciPy.
-    from shapecat.learning.calibration import can_calibrate  # noqa: PLC0415
-
     views, lost = _describe_folder(root, seed, observe)
     categories = order_categories(views.labels)
     if len(categories) < 2:
@@ -105,9 +105,6 @@ def learn_on_folder(
     ModelError : the model is unusable, or there is no new category, or there are too many.
     OutputError : the result cannot be written.
     """
-    # Only learning needs these parts of SciPy.
-    from shapecat.learning.incremental import add_categories  # noqa: PLC0415
-
     categorizer = load_model(model)
     categorizer.require_descriptor(DESCRIPTOR_NAMES)
     views, lost = _describe_folder(root, seed, observe, categorizer.categories)
@@ -138,13 +135,6 @@ def fit_views(
     ------
     ValueError : there are fewer than two categories.
     """
-    # Only training needs these parts of SciPy.
-    from shapecat.learning.training import (  # noqa: PLC0415
-        Examples,
-        LearningSettings,
-        fit_categorizer,
-    )
-
     return fit_categorizer(
         Examples(train.descriptors, train.labels, train.instances),
         Examples(held_out.descriptors, held_out.labels, held_out.instances),
