@@ -68,7 +68,7 @@ from shapecat.evaluation.comparison.references import (
     read_complete,
     run_labellings,
 )
-from shapecat.evaluation.comparison.references_coco import CocoLabels, filled_polygon
+from shapecat.evaluation.comparison.references_coco import CocoLabels, _Annotation, filled_polygon
 from shapecat.evaluation.comparison.references_kitti import KittiLabels
 from shapecat.runs.tables.reading import read_stamps
 from shapecat.runs.tables.schemas import DETECTIONS, FRAMES, TRACKS
@@ -162,6 +162,21 @@ def write_truth(folder: Path) -> Path:
     ]
     (folder / "lab.truth.json").write_text(json.dumps(truth))
     return folder / "lab.truth.json"
+
+
+def coco_text(**changes: dict[str, str]) -> str:
+    """Return COCO labels with two annotations; give values of the image, or the last, as JSON."""
+    plain = {"id": "1", "image_id": "1", "category_id": "1", "segmentation": "[[0, 0, 5, 0, 5, 5]]"}
+    image = {"id": "1", "stamp_ns": "0", "height": "10", "width": "10"} | changes.get("image", {})
+    last = plain | changes.get("annotation", {})
+    image_text, plain_text, last_text = (
+        "{" + ", ".join(f'"{name}": {value}' for name, value in item.items()) + "}"
+        for item in (image, plain, last)
+    )
+    return (
+        f'{{"categories": [{{"id": 1, "name": "cup"}}], "images": [{image_text}], '
+        f'"annotations": [{plain_text}, {last_text}]}}'
+    )
 
 
 def test_coco_crowd_has_undecidable_category() -> None:
@@ -624,6 +639,9 @@ def test_truth_skips_label_images_of_missing_frames(tmp_path: Path) -> None:
         ({"parts": None}, "lacks 'parts'"),
         ({"ambiguous": None}, "lacks 'ambiguous'"),
         ({"box": {"center": [0, 0, 1], "size": [1, 1]}}, "is damaged"),
+        ({"box": {"center": [0, 0, 1], "size": None, "orientation": [0, 0, 0, 1]}}, "is damaged"),
+        ({"box": {"center": [0, 0, 1], "size": [10**400, 1, 1]}}, "is damaged"),
+        ({"track": [11]}, "is damaged"),
     ],
 )
 def test_truth_without_a_field_is_refused_in_one_line(
@@ -638,6 +656,30 @@ def test_truth_without_a_field_is_refused_in_one_line(
 
     with pytest.raises(RecordingError, match=f"lab.truth.json: the frame .*{message}"):
         open_reference(path).at(("/d", 1), START + STEP)
+
+
+@pytest.mark.parametrize(
+    "text",
+    [
+        "[" * 200_000,
+        '{"a":' * 100_000,
+        '[{"stamp_ns": 1e999, "objects": []}]',
+        '[{"stamp_ns": 0, "frame": 1e999, "objects": []}]',
+        coco_text(image={"height": "1e999"}),
+        coco_text(image={"stamp_ns": "1e999"}),
+        coco_text(image={"id": "[1]"}),
+        coco_text(annotation={"track_id": "1e999"}),
+        coco_text(annotation={"track_id": '"first"'}),
+        coco_text(annotation={"attributes": "null"}),
+    ],
+)
+def test_absurd_values_in_references_are_refused_in_one_line(tmp_path: Path, text: str) -> None:
+    """JSON allows any nesting and any number, and Python has errors of its own for them."""
+    path = write_truth(tmp_path)
+    path.write_text(text)
+
+    with pytest.raises(RecordingError, match=r"lab\.truth\.json: "):
+        open_reference(path).at(("/d", 0), 0)
 
 
 @pytest.mark.parametrize("place", [60, 500])
@@ -1093,9 +1135,10 @@ def test_compressed_run_lengths_are_decoded() -> None:
 def test_run_lengths_that_do_not_fill_the_image_are_refused(tmp_path: Path, counts: Any) -> None:
     """Files of labels come from anywhere: a wrong sum would give a mask elsewhere, or a crash."""
     segmentation = {"size": [40, 50], "counts": counts}
+    annotation = _Annotation({"id": 5, "segmentation": segmentation}, "cup", None)
     reference: Any = SimpleNamespace(path=tmp_path)
     with pytest.raises(RecordingError, match="annotation 5 has no readable mask"):
-        CocoLabels._item(reference, {"id": 5, "name": "cup", "segmentation": segmentation}, 40, 50)
+        CocoLabels._item(reference, annotation, 40, 50)
 
 
 def test_filled_polygon_has_its_area() -> None:
@@ -1454,8 +1497,12 @@ def test_labels_of_other_frames_are_described_by_their_range(tmp_path: Path) -> 
     [
         ("label_2/first.txt", "", "not a folder of KITTI labels (invalid literal for int()"),
         ("frames.csv", "number,topic\n000007,/d\n", "not a folder of KITTI labels ('stamp_ns')"),
+        ("frames.csv", "number,topic,stamp_ns\n000007,/d\n", "not a folder of KITTI labels ("),
+        ("frames.csv", f"number,stamp_ns\n{'7' * 200_000},5\n", "not a folder of KITTI labels ("),
         ("label_2/000007.txt", "cup 0 0 0\n", "000007.txt: not a KITTI label file (not enough"),
+        ("label_2/000007.txt", f"cup{' 1' * 13} inf\n", "000007.txt: not a KITTI label file ("),
         ("calib/000007.txt", "Tr_rect_to_sensor: 1 0 0\n", "000007.txt: not a KITTI label file ("),
+        ("calib/000007.txt", f"Tr_rect_to_sensor:{' nan' * 12}\n", "000007.txt: not a KITTI lab"),
     ],
 )
 def test_damaged_kitti_labels_are_refused_with_the_file(
@@ -1464,7 +1511,7 @@ def test_damaged_kitti_labels_are_refused_with_the_file(
     """They are often edited by hand or by scripts."""
     for folder in ("label_2", "calib"):
         (tmp_path / folder).mkdir()
-    (tmp_path / "label_2" / "000007.txt").write_text("")
+    (tmp_path / "label_2" / "000007.txt").write_text("cup 0 0 0 0 0 0 0 0.2 0.3 0.1 0 0.1 1 0\n")
     (tmp_path / file).write_text(content)
 
     with pytest.raises(RecordingError) as error:

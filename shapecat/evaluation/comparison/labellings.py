@@ -7,21 +7,29 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Generic, TypeVar
 
+import numpy as np
+from numpy.typing import ArrayLike
+
 from shapecat.arrays import F4, U4, Bool
 from shapecat.errors import RecordingError
+from shapecat.recordings.messages import MALFORMED
 from shapecat.runs.tables.reading import Key
 from shapecat.types import Box
 
 __all__ = [
+    "UNREADABLE",
     "LabelledItem",
     "Labelling",
     "Place",
     "Reference",
     "find_frame",
+    "finite_box",
     "index_frames",
     "numbering_notes",
 ]
 
+UNREADABLE = (*MALFORMED, OSError, RecursionError)
+"""Errors of reading a text file, and of using values in it that are absurd or of other types."""
 _Frame = TypeVar("_Frame")
 Place = tuple[str | None, int, int | None]
 """Topic, None for any; timestamp (ns) or frame number; and the frame number in addition to a
@@ -50,6 +58,20 @@ class LabelledItem:
     confidence: float = 1.0
     view_category: str = ""
     posterior: F4 | None = None
+
+
+def finite_box(center: ArrayLike, size: ArrayLike, orientation: ArrayLike) -> Box:
+    """Return the `Box` that a file describes.
+
+    Raises
+    ------
+    ValueError : a shape is wrong, or a value is not finite.
+    """
+    values = [np.asarray(value, np.float32) for value in (center, size, orientation)]
+    if not all(np.isfinite(value).all() for value in values):
+        msg = "a box has values that are not finite"
+        raise ValueError(msg)
+    return Box(*values)
 
 
 @dataclass(frozen=True)

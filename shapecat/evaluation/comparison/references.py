@@ -12,9 +12,11 @@ import numpy as np
 from shapecat.arrays import U1
 from shapecat.errors import OutputError, RecordingError
 from shapecat.evaluation.comparison.labellings import (
+    UNREADABLE,
     LabelledItem,
     Labelling,
     Reference,
+    finite_box,
 )
 from shapecat.evaluation.comparison.references_coco import CocoLabels
 from shapecat.evaluation.comparison.references_kitti import KittiLabels
@@ -78,7 +80,7 @@ def open_reference(
         if isinstance(content, list):
             return SimulatedTruth(path, content)
         return CocoLabels(path, content, run, digest)
-    except (OSError, ValueError, KeyError, TypeError, AttributeError) as error:
+    except UNREADABLE as error:
         reason = f"it lacks {error}" if isinstance(error, KeyError) else error
         msg = f"{path}: neither ground truth of `shapecat simulate` nor COCO labels ({reason})"
         raise RecordingError(msg) from error
@@ -108,7 +110,7 @@ class SimulatedTruth(Reference[dict[str, Any]]):
         """
         try:
             return _true_labelling(entry, self._labels.read(int(entry["frame"])))
-        except (KeyError, TypeError, ValueError, AttributeError) as error:
+        except UNREADABLE as error:
             reason = f"lacks {error}" if isinstance(error, KeyError) else f"is damaged ({error})"
             msg = f"{self.path}: the frame with stamp {entry['stamp_ns']} {reason}"
             raise RecordingError(msg) from error
@@ -119,10 +121,10 @@ def _true_labelling(entry: Mapping[str, Any], image: U1) -> Labelling:
     flat = image.reshape(-1)
     items = (
         LabelledItem(
-            track=item.get("track"),
+            track=None if item.get("track") is None else int(item["track"]),
             category=str(item["category"]),
             pixels=np.flatnonzero(np.isin(flat, item["parts"])),
-            box=Box(**item["box"]) if "box" in item else None,
+            box=finite_box(**item["box"]) if "box" in item else None,
             decidable=not item["ambiguous"],
         )
         for item in entry["objects"]

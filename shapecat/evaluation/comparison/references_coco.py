@@ -12,6 +12,7 @@ from shapecat.arrays import I4, Bool
 from shapecat.colour.rle import parse_rle_text, rle_mask
 from shapecat.errors import RecordingError
 from shapecat.evaluation.comparison.labellings import (
+    UNREADABLE,
     LabelledItem,
     Labelling,
     Place,
@@ -26,12 +27,21 @@ _A_STAMP = 10**17
 of which the longest, with milliseconds, have 17 digits."""
 
 
+class _Annotation(NamedTuple):
+    """An annotation of a COCO file, with its category, and its track if it has one."""
+
+    content: Mapping[str, Any]
+    category: str
+    track: int | None
+
+
 class _Image(NamedTuple):
-    """An image of a COCO file, with its size in pixels."""
+    """An image of a COCO file, with its size in pixels and its annotations."""
 
     id: Any
     height: int
     width: int
+    annotations: Sequence[_Annotation]
 
 
 class CocoLabels(Reference[_Image]):
@@ -50,17 +60,20 @@ class CocoLabels(Reference[_Image]):
         self, path: Path, content: Mapping[str, Any], run: str = "", digest: str = ""
     ) -> None:
         names = {item["id"]: str(item["name"]) for item in content["categories"]}
-        self._labels = defaultdict(list)
+        annotations = defaultdict(list)
         for item in content["annotations"]:
-            self._labels[item["image_id"]].append({**item, "name": names[item["category_id"]]})
+            annotation = _Annotation(item, names[item["category_id"]], _track_of(item))
+            annotations[item["image_id"]].append(annotation)
         images = _images_of(run, path, content["images"])
         same = [image for image in images if image.get("digest") == digest]
         images = same or images
-        sized = (_Image(image["id"], int(image["height"]), int(image["width"])) for image in images)
-        super().__init__(path, zip(map(_place_of, images), sized, strict=True))
+        entries = (
+            _Image(i["id"], int(i["height"]), int(i["width"]), annotations[i["id"]]) for i in images
+        )
+        super().__init__(path, zip(map(_place_of, images), entries, strict=True))
         self.numbered = any(map(_is_numbered, images))
-        items = [item for some in self._labels.values() for item in some]
-        self.tracked = bool(items) and all(_track_of(item) is not None for item in items)
+        tracks = [annotation.track for some in annotations.values() for annotation in some]
+        self.tracked = bool(tracks) and None not in tracks
 
     def labelling(self, entry: _Image) -> Labelling:
         """Return the objects of an image.
@@ -69,24 +82,25 @@ class CocoLabels(Reference[_Image]):
         ------
         RecordingError : the image size or a mask is invalid.
         """
-        name, height, width = entry
+        name, height, width, annotations = entry
         if not 0 < height * width <= _MOST_PIXELS:
             msg = f"{self.path}: image {name} is {width}×{height}"
             raise RecordingError(msg)
-        items = (self._item(item, height, width) for item in self._labels[name])
+        items = (self._item(annotation, height, width) for annotation in annotations)
         return Labelling(tuple(items), None, (height, width))
 
-    def _item(self, item: Mapping[str, Any], height: int, width: int) -> LabelledItem:
+    def _item(self, annotation: _Annotation, height: int, width: int) -> LabelledItem:
+        content, category, track = annotation
         try:
-            mask = _mask(item["segmentation"], height, width)
-        except (KeyError, ValueError, TypeError, IndexError, OverflowError) as error:
-            msg = f"{self.path}: annotation {item.get('id')} has no readable mask ({error!r})"
+            mask = _mask(content["segmentation"], height, width)
+        except UNREADABLE as error:
+            msg = f"{self.path}: annotation {content.get('id')} has no readable mask ({error!r})"
             raise RecordingError(msg) from error
         return LabelledItem(
-            track=_track_of(item),
-            category=item["name"],
+            track=track,
+            category=category,
             pixels=np.flatnonzero(mask),
-            decidable=not item.get("iscrowd"),
+            decidable=not content.get("iscrowd"),
         )
 
 

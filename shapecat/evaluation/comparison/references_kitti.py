@@ -1,6 +1,7 @@
 """KITTI 3D labels: label_2 and calib, as `shapecat export --format kitti` writes them."""
 
 import csv
+import math
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 
@@ -9,10 +10,12 @@ import numpy as np
 from shapecat.arrays import F8
 from shapecat.errors import RecordingError
 from shapecat.evaluation.comparison.labellings import (
+    UNREADABLE,
     LabelledItem,
     Labelling,
     Place,
     Reference,
+    finite_box,
 )
 from shapecat.geometry import quaternion_from_rotation
 from shapecat.outputs.exports.kitti import kitti_type
@@ -43,7 +46,7 @@ class KittiLabels(Reference[str]):
             names = _listed(folder / "frames.csv")
             self.numbered = not names
             names = names or [((None, int(name), None), name) for name in numbers]
-        except (OSError, ValueError, KeyError) as error:
+        except (csv.Error, *UNREADABLE) as error:
             msg = f"{folder}: not a folder of KITTI labels ({error})"
             raise RecordingError(msg) from error
         super().__init__(folder, names)
@@ -60,7 +63,7 @@ class KittiLabels(Reference[str]):
             turn = _sensor_from_rectified(self.path / "calib" / f"{entry}.txt")
             lines = path.read_text("utf-8").splitlines()
             items = [self._item(line.split(), turn) for line in lines if line.strip()]
-        except (OSError, ValueError, IndexError, np.linalg.LinAlgError) as error:
+        except UNREADABLE as error:
             msg = f"{path}: not a KITTI label file ({error})"
             raise RecordingError(msg) from error
         return Labelling(tuple(item for item in items if item.category != "DontCare"))
@@ -99,9 +102,9 @@ def _sensor_from_rectified(path: Path) -> F8:
 def _box(words: list[str], turn: F8) -> Box:
     """Return the box of a line: type truncated occluded alpha bbox h w l x y z rotation_y."""
     height, width, length, x, y, z, yaw = map(float, words[8:15])
-    c, s = np.cos(yaw), np.sin(yaw)
+    c, s = math.cos(yaw), math.sin(yaw)
     axes = np.array([[c, s, 0.0], [0.0, 0.0, -1.0], [-s, c, 0.0]])  # columns: along, across, up
-    return Box(
+    return finite_box(
         turn @ np.array([x, y - height / 2, z]),
         np.array([length, width, height]),
         quaternion_from_rotation(turn @ axes),
