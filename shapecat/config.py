@@ -159,15 +159,21 @@ def load_settings(path: Path | None = None, overrides: Sequence[str] = ()) -> Se
     ConfigError : the file cannot be read, a setting does not exist (the message suggests the
         nearest name), or a value has the wrong type or is out of range.
     """
-    tree: Mapping[str, Any] = {}
-    if path is not None:
-        try:
-            with explained(f"{path}: cannot be read", ConfigError):
-                tree = tomllib.loads(path.read_text("utf-8-sig"))
-        except ValueError as error:
-            msg = f"{path}: not a readable TOML file: {error}"
-            raise ConfigError(msg) from error
-    return with_overrides(with_settings(Settings(), tree), overrides)
+    try:
+        tree = {} if path is None else _read_toml(path)
+        return with_overrides(with_settings(Settings(), tree), overrides)
+    except RecursionError as error:
+        msg = "the settings are nested too deeply"
+        raise ConfigError(msg) from error
+
+
+def _read_toml(path: Path) -> Mapping[str, Any]:
+    try:
+        with explained(f"{path}: cannot be read", ConfigError):
+            return tomllib.loads(path.read_text("utf-8-sig"))
+    except ValueError as error:
+        msg = f"{path}: not a readable TOML file: {error}"
+        raise ConfigError(msg) from error
 
 
 def with_settings(settings: Settings, tree: Mapping[str, Any]) -> Settings:

@@ -1159,8 +1159,9 @@ def test_recording_at_url_keeps_the_folder_of_its_run() -> None:
         manifest.record([Entry("lab", sources[1].url, "complete")])
 
     assert existing_names(sources, out, {"lab"}) == {1: "lab"}
-    (Location(out) / "monday_lab" / "run.json").write(b"[")  # a run that cannot be read
-    assert existing_names(sources, out, {"lab", "monday_lab"}) == {1: "lab"}
+    for content in (b"[", b"[" * 100_000):  # a run that cannot be read
+        (Location(out) / "monday_lab" / "run.json").write(content)
+        assert existing_names(sources, out, {"lab", "monday_lab"}) == {1: "lab"}
 
 
 def test_numbered_folder_name_may_already_be_taken() -> None:

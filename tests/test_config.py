@@ -27,6 +27,25 @@ def test_command_line_overrides_file_and_file_overrides_defaults(tmp_path: Path)
     assert settings.surface == Settings().surface
 
 
+@pytest.mark.parametrize(
+    ("text", "overrides"),
+    [
+        ("seed = " + "[" * 50_000, []),
+        (f"seed{'.a' * 20_000} = 1", []),
+        ("", ["seed=" + "[" * 100_000]),
+        ("", [f"seed{'.a' * 30_000}=1"]),
+    ],
+)
+def test_deeply_nested_settings_are_refused(
+    tmp_path: Path, text: str, overrides: list[str]
+) -> None:
+    """TOML and JSON allow any nesting, and Python has an error of its own for it."""
+    (tmp_path / "s.toml").write_text(text)
+
+    with pytest.raises(ConfigError, match="settings are nested too deeply"):
+        load_settings(tmp_path / "s.toml", overrides)
+
+
 def test_numbers_of_numpy_are_settings() -> None:
     """A number computed from an image was refused: float64 "must be a number"."""
     given = {

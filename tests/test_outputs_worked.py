@@ -794,6 +794,9 @@ def test_only_unchanged_export_of_same_format_is_replaced(tmp_path: Path) -> Non
     with pytest.raises(OutputError, match="holds something else"):
         _require_own(out, KITTI)
     mark = out / "export.json"
+    mark.write_text("[" * 100_000)
+    with pytest.raises(OutputError, match="holds something else"):
+        _require_own(out, KITTI)
     mark.write_text(json.dumps({"format": "kitti", "made": ["notes.txt"], "objects": 3}))
     _require_own(out, KITTI)
     assert _made_by_export(out) == ["notes.txt", "export.json"]

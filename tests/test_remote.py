@@ -654,6 +654,16 @@ def test_only_one_process_claims_a_folder(url: str, monkeypatch: pytest.MonkeyPa
     assert files(url.removesuffix("/run")) == set()
 
 
+@pytest.mark.parametrize("content", [b"5", b"[" * 100_000])
+def test_damaged_claim_is_taken_over(monkeypatch: pytest.MonkeyPatch, content: bytes) -> None:
+    """Nobody renews it."""
+    monkeypatch.setattr(claims, "_STALE_S", 0.02)
+    monkeypatch.setattr(claims, "_POLL_S", 0.01)
+    (Location("memory://damaged-claims") / ".run.claim").write(content)
+
+    assert claims.Claim("memory://damaged-claims/run", "one").inherited
+
+
 def test_claim_of_dead_process_is_taken_over(made: Path, bucket: Path) -> None:
     """A worker presumed dead may wake up: its results must not mix with the new ones."""
     url = "s3://lab/late/run"

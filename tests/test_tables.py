@@ -482,6 +482,7 @@ def test_schema_requires_what_the_reader_requires(entry: str, kind: Any) -> None
         (lambda info: info["input"].pop("digest"), ": input.digest"),
         (lambda info: info["model"].update(categories=None), ": model.categories"),
         (lambda info: info["options"].update(start_s=math.nan), ": options.start_s"),
+        (lambda info: info["options"].update(start_s=10**400), ": options.start_s"),
         (lambda info: info["options"].update(topics=["/depth", 3]), ": options.topics"),
         (lambda info: info.update(options=[]), ": options"),
         (lambda info: info.update(boxes=3), ": boxes"),

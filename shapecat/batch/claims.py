@@ -163,7 +163,7 @@ def claimed(url: str, batch: str) -> Iterator[Claim]:
 
 
 def _parse(content: bytes) -> dict[str, Any]:
-    with suppress(ValueError):
+    with suppress(ValueError, RecursionError):
         fields = json.loads(content)
         return fields if isinstance(fields, dict) else {}
     return {}

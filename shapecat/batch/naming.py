@@ -89,7 +89,7 @@ def _recording_of(out: str, name: str, entry: Entry | None) -> str:
         return recording
     if Path(recording).is_absolute():  # other paths depend on the current folder
         return os.path.realpath(recording)
-    with suppress(ShapecatError, ValueError, LookupError, TypeError):
+    with suppress(ShapecatError, ValueError, LookupError, TypeError, RecursionError):
         if not is_url(out):
             return read_identity(Path(out, name))["input"]["path"]
         content = (Location(out) / name / "run.json").read() or b"{}"

@@ -1,7 +1,7 @@
 """The contents of run.json, which describes a run; `schemas/run.json` documents each entry."""
 
 import json
-import math
+import sys
 from contextlib import suppress
 from functools import cache
 from types import UnionType
@@ -132,7 +132,7 @@ def wrong_entry(content: Any, kind: Any = RunInfo, name: str = "") -> str | None
     if origin is UnionType:
         fits = any(wrong_entry(content, part) is None for part in parts)
     elif kind is float:
-        fits = type(content) in {int, float} and math.isfinite(content)
+        fits = type(content) in {int, float} and abs(content) <= sys.float_info.max
     else:
         fits = kind is Any or type(content) is (dict if is_typeddict(kind) else origin or kind)
     if not fits:

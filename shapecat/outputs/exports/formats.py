@@ -239,7 +239,7 @@ def _mark(folder: Path, about: Mapping[str, Any]) -> None:
 
 def _read_mark(folder: Path) -> dict[str, Any]:
     """Return the marker of an export; empty if it has none."""
-    with suppress(OSError, ValueError):
+    with suppress(OSError, ValueError, RecursionError):
         about = json.loads((folder / _MARK).read_text("utf-8"))
         if isinstance(about, dict) and isinstance(about.get("made"), list):
             return about
