@@ -28,7 +28,7 @@ def seen(label: str, instance: str, cup: float, novelty: float) -> SimulatedView
     view = View(points, np.array([0.5, 0.0, 0.5]), label, instance)
     descriptor = np.array([cup, novelty], np.float32)
     return SimulatedView(
-        descriptor, label, instance, 200, 0.7, 0.0, "upright", "truth", 1.0, 1.0, "kinect", view,
+        descriptor, label, instance, 200, 0.7, "upright", "truth", 1.0, 1.0, "kinect", view,
     )  # fmt: skip
 
 

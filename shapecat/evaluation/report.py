@@ -3,7 +3,6 @@
 import io
 import itertools
 import math
-import time
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 from functools import partial
@@ -73,8 +72,6 @@ class Report:
     recall : recall of each category.
     confusion : (c, c) number of views of each true category (row) by predicted category (column),
         in the order of ``categories``.
-    seconds_per_object : median time from points to descriptor, which leaves out the loading of
-        kernels for the first view, and the mean time to predict.
     novelty : ``n`` unknown shapes, ``rejected``, the fraction of them with a novelty above 1, and
         ``auroc``; None without unknown shapes.
     rejected_known : fraction of the known shapes with a novelty above 1.
@@ -93,7 +90,6 @@ class Report:
     ece: float | None
     recall: dict[str, float | None]
     confusion: tuple[tuple[int, ...], ...]
-    seconds_per_object: float | None
     novelty: dict[str, float | None] | None = None
     rejected_known: float | None = None
     skipped: int = 0
@@ -140,10 +136,7 @@ def evaluate(views: DescribedViews, categorizer: Categorizer) -> Report:
     ModelError : the model does not know a label.
     """
     require_categories(np.unique(views.labels).tolist(), categorizer)
-    categorizer.predict(views.descriptors[:1])  # loads the kernel
-    begun = time.perf_counter()
     prediction = categorizer.predict(views.descriptors)
-    predicting = (time.perf_counter() - begun) / max(len(views.labels), 1)
     categories = categorizer.categories
     known = views.labels != UNKNOWN
     truth = np.array([categories.index(label) for label in views.labels[known]], np.int64)
@@ -163,7 +156,6 @@ def evaluate(views: DescribedViews, categorizer: Categorizer) -> Report:
         ece=_defined(metrics.expected_calibration_error(truth, posteriors)),
         recall=dict(zip(categories, map(_defined, metrics.recall(table)), strict=True)),
         confusion=tuple(tuple(row) for row in table.tolist()),
-        seconds_per_object=_defined(_median(views.seconds) + predicting),
         novelty=novelty,
         rejected_known=_defined(_mean(prediction.novelty[known] > 1)),
         skipped=views.skipped,
@@ -216,10 +208,6 @@ def _as_dicts(rows: Ranges) -> list[dict[str, Any]]:
     return [{"range": name, "n": n, "accuracy": value} for name, n, value in rows]
 
 
-def _median(values: np.ndarray) -> float:
-    return float(np.median(values)) if len(values) else math.nan
-
-
 def _mean(values: np.ndarray) -> float:
     return float(np.mean(values)) if len(values) else math.nan
 
@@ -264,8 +252,6 @@ def _figures(report: Report) -> Rows:
     if report.novelty is not None:
         figures["unknown shapes rejected"] = report.novelty["rejected"]
         figures["novelty AUROC"] = report.novelty["auroc"]
-    seconds = report.seconds_per_object
-    figures["ms per object"] = None if seconds is None else seconds * 1e3
     return [(name, figure_text(value, "-")) for name, value in figures.items()]
 
 

@@ -1,7 +1,6 @@
 """From labelled views to descriptors, as in a run but without detection."""
 
 import math
-import time
 from collections.abc import Iterable
 from typing import NamedTuple
 
@@ -29,7 +28,6 @@ class DescribedViews(NamedTuple):
     labels, instances : (n,) names of categories and of instances.
     points : (n,) number of voxels.
     distances : (n,) distance from the sensor, metres.
-    seconds : (n,) time from points to descriptor.
     skipped : number of views with too few points for a surface, which are left out.
     elevations : (n,) elevation of the sensor as seen from the object, degrees; may be empty.
     functions : (n, f) shape distributions from `shapecat.evaluation.shape_functions`; may
@@ -41,7 +39,6 @@ class DescribedViews(NamedTuple):
     instances: np.ndarray
     points: np.ndarray
     distances: np.ndarray
-    seconds: np.ndarray
     skipped: int = 0
     elevations: np.ndarray = _NOT_ASKED
     functions: F4 = _NOT_ASKED
@@ -57,24 +54,21 @@ class DescribedViews(NamedTuple):
 
 
 class DescribedView(NamedTuple):
-    """The descriptor (d,) of a view, its number of voxels, and the computing time in seconds."""
+    """The descriptor (d,) of a view, and its number of voxels."""
 
     descriptor: F4
     points: int
-    seconds: float
 
 
 def describe_view(
     view: View, *, settings: Settings, rng: np.random.Generator
 ) -> DescribedView | None:
     """Describe a view; return None if it has too few points for a surface."""
-    begun = time.perf_counter()
     cloud = thin(view.points, settings=settings.surface)
     gas = reconstruct(cloud, settings=settings.surface, rng=rng)
     if gas is None:
         return None
-    descriptor = describe(cloud, gas, view.eye)
-    return DescribedView(descriptor, len(cloud), time.perf_counter() - begun)
+    return DescribedView(describe(cloud, gas, view.eye), len(cloud))
 
 
 def describe_views(
@@ -118,7 +112,6 @@ def describe_views(
         instances=np.array([item[2] for item in described_views], str),
         points=np.array([item[0].points for item in described_views], np.int64),
         distances=np.array([item[3] for item in described_views]),
-        seconds=np.array([item[0].seconds for item in described_views]),
         skipped=count - len(described_views),
         elevations=np.array([item[4] for item in described_views]),
         functions=np.array(functions, np.float32) if with_functions else _NOT_ASKED,

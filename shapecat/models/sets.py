@@ -87,7 +87,6 @@ def collect(views: Iterable[SimulatedView]) -> SimulatedViews:
         instances=columns["instance"],
         points=columns["points"],
         distances=columns["distance"],
-        seconds=columns["seconds"],
     )
     conditions = {name: columns[name] for name in SimulatedViews._fields[1:]}
     return SimulatedViews(described, **conditions)

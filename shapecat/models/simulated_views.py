@@ -65,7 +65,6 @@ class SimulatedView(NamedTuple):
     instance : name of the object.
     points : number of voxels.
     distance : mean distance from the sensor, metres.
-    seconds : time to compute the descriptor from the points.
     resting_pose : ``upright``, ``lying``, ``upside_down``, ``leaning`` or ``tilted``.
     source : how the view was segmented: ``truth``, ``detected`` or ``fragment``; or ``background``,
         a thin detection that shows no object, whose label is ``unknown``.
@@ -80,7 +79,6 @@ class SimulatedView(NamedTuple):
     instance: str
     points: int
     distance: float
-    seconds: float
     resting_pose: str
     source: str
     visible: float
@@ -282,7 +280,6 @@ def _described(view: View, source: str, conditions: _Conditions) -> SimulatedVie
         instance=view.instance,
         points=described.points,
         distance=distance,
-        seconds=described.seconds,
         source=source,
         view=view,
         **conditions._asdict(),
