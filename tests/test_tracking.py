@@ -570,32 +570,6 @@ def test_object_entering_view_in_fragments_is_one_track() -> None:
     assert [track.hits for track in tracks] == [42]
 
 
-@pytest.mark.parametrize("partial", [True, False])
-def test_object_passing_behind_post_is_one_track(partial: bool) -> None:
-    """For some frames both of its sides are visible, but never its whole width."""
-    left, right = (0.0, 0.0, 0.0), (0.15, 0.0, 0.0)
-    sides = [[left]] * 20 + [[left, right]] * 4 + [[right]] * 20
-    frames = [
-        replace(
-            frame(k, places, size=(0.04, 0.18, 0.02)),
-            partial=np.full(len(places), partial),
-        )
-        for k, places in enumerate(sides)
-    ]
-    tracks = tuple(track_frames(frames, SETTINGS))
-    assert [track.hits for track in tracks] == ([44] if partial else [24, 24])
-
-
-@pytest.mark.parametrize("in_one", [True, False])
-def test_whole_view_joins_two_sides_of_object(in_one: bool) -> None:
-    """Without it, they could be two objects."""
-    left, right = (0.0, 0.05), (0.1, 0.15)
-    split, whole = [left, right], [(0.0, 0.15)]
-    change = [split, whole if in_one else split, split, split, split, split]
-    tracks = tuple(track_frames(boxed([[left]] * 18 + change + [[right]] * 14), SETTINGS))
-    assert [track.hits for track in tracks] == ([38] if in_one else [24, 20])
-
-
 def test_object_reappearing_after_gap_may_be_another() -> None:
     """A track survives 0.8 s unseen; all of its views decide whether it came back."""
     before = [frame(k, [0, 0, 0], posterior=CUP) for k in range(20)]

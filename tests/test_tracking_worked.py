@@ -17,7 +17,7 @@ from shapecat.tracking.common_motion import CommonMotion, _fit, _in_space, _leve
 from shapecat.tracking.detection_table import DetectionTable
 from shapecat.tracking.false_tracks import _in_box
 from shapecat.tracking.pieces import _fit as fit_pieces
-from shapecat.tracking.pieces import _joint, _largest, _time_overlap
+from shapecat.tracking.pieces import _joint, _largest
 from shapecat.tracking.recording import _describe, _line, _needed
 from shapecat.tracking.stitching import Fragments, _contradiction, _distances
 from shapecat.tracking.tracker import Tracker
@@ -347,23 +347,6 @@ def test_larger_of_two_pieces_is_kept() -> None:
     ]
 
     assert _largest(next(gather(frames)), np.array([4, 0, 3, 1, 2])).tolist() == [1, 2, 4]
-
-
-def test_change_of_tracks_is_their_overlap() -> None:
-    """Rows 0 to 9 and 8 to 19 share two frames of ten; one within the other is no change."""
-    rows = [range(10), range(8, 20), range(3, 6)]
-    members: list[list[int]] = [[], [], []]
-    frames, at = [], 0
-    for k in range(20):
-        present = [m for m, own in enumerate(rows) if k in own]
-        frames.append(frame(k, [[0.1 * m, 0, 0] for m in present]))
-        for m in present:
-            members[m].append(at)
-            at += 1
-    duos = np.array([[0, 1], [0, 2]])
-    share = _time_overlap(next(gather(frames)), [np.array(m) for m in members], duos)
-
-    assert share.tolist() == [0.2, np.inf]
 
 
 def test_point_in_box_is_tested_along_axes_of_box() -> None:

@@ -2,7 +2,6 @@
 
 from collections import Counter
 from collections.abc import Sequence
-from functools import cache, partial
 
 import numpy as np
 from scipy.spatial import cKDTree
@@ -17,8 +16,6 @@ _NEAR_M = 0.35  # largest distance between the centres of pieces
 _SLACK, _SLACK_M = 1.1, 0.01  # factor and length by which the pieces may exceed the whole object
 _LACKING = 0.95  # some length of both pieces is less than this fraction of their joint box's
 _MOSTLY = 0.5  # fraction of the common frames in which two tracks must be pieces
-_PASSING = 0.25  # largest overlap in time of two tracks while an object passes an occluder
-_CHANGING = 0.5  # the same, if one detection sometimes covers both sides of the occluder
 
 
 def join_pieces(table: DetectionTable, tracks: Sequence[I4]) -> list[I4]:
@@ -27,12 +24,6 @@ def join_pieces(table: DetectionTable, tracks: Sequence[I4]) -> list[I4]:
     The size of the whole object is known from frames in which it was not split. The box around two
     pieces is no larger than that; the box around two objects side by side is. Of two pieces in the
     same frame, the larger one stays in the track.
-
-    An object that moves behind a narrow occluder appears on one side before it has disappeared on
-    the other, so that one track ends soon after the other one began. In both tracks only a part of
-    the object was visible, so the shorter side of the whole object may be as long as its longer
-    side. If one detection sometimes covered both sides of the occluder, the size of this detection
-    counts.
 
     Parameters
     ----------
@@ -57,53 +48,14 @@ def join_pieces(table: DetectionTable, tracks: Sequence[I4]) -> list[I4]:
 def _count_fits(table: DetectionTable, tracks: Sequence[I4]) -> Counter[tuple[int, int]]:
     """Return the number of frames in which two tracks are pieces of one object, for each pair."""
     owner, counts = table.track_of_each(tracks), Counter[tuple[int, int]]()
-    sizes = _WholeSizes(table, tracks)
+    wholes = np.array([_wholes(table, track) for track in tracks])
     for block in table.blocks():
         pairs = _neighbours(table, owner, block)
         track_pairs, which = np.unique(np.sort(owner[pairs], axis=1), axis=0, return_inverse=True)
-        fits = _fit(table, pairs, sizes.of(pairs, owner, track_pairs, which.ravel()))
+        fits = _fit(table, pairs, wholes[owner[pairs], table.topics[table.rows[pairs]]])
         fitting = np.bincount(which.ravel()[fits], minlength=len(track_pairs))
         counts.update(dict(zip(map(tuple, track_pairs.tolist()), fitting.tolist(), strict=True)))
     return counts
-
-
-class _WholeSizes:
-    """Sizes of the whole object that two pieces may belong to."""
-
-    def __init__(self, table: DetectionTable, tracks: Sequence[I4]) -> None:
-        self._table, self._tracks = table, tracks
-        self._wholes = np.array([_wholes(table, track) for track in tracks])
-        # A cached method would make a reference cycle, which could keep gigabytes alive.
-        self._in_one = cache(partial(_seen_in_one, table, tracks))
-
-    def of(self, pairs: I4, owner: I4, track_pairs: I4, which: I4) -> F8:
-        """Return the lengths (p, 2, 3) of the whole object from either track, metres.
-
-        ``pairs`` (p, 2) are pairs of detections, ``track_pairs`` (q, 2) the pairs of tracks, and
-        ``which`` (p,) the position of each pair's tracks in ``track_pairs``.
-        """
-        table = self._table
-        sizes = self._wholes[owner[pairs], table.topics[table.rows[pairs]]]
-        share = _time_overlap(table, self._tracks, track_pairs)
-        passing = (share <= _PASSING)[which] & table.partial[pairs].all(axis=1)
-        sizes[passing, :, 1] = sizes[passing, :, 0]
-        for k in _where(share <= _CHANGING):
-            group = which == k
-            sizes[group] = np.maximum(sizes[group], self._in_one(*track_pairs[k].tolist()))
-        return np.asarray(sizes)
-
-
-def _seen_in_one(table: DetectionTable, tracks: Sequence[I4], a: int, b: int) -> F8:
-    """Return the largest lengths (3,) in frames where only one of two tracks is seen, metres.
-
-    Only frames while both tracks last count; 0 if there are none.
-    """
-    detections = np.concatenate([tracks[a], tracks[b]])
-    start = max(table.rows[tracks[k][0]] for k in (a, b))
-    stop = min(table.rows[tracks[k][-1]] for k in (a, b))
-    rows, at, counts = np.unique(table.rows[detections], return_index=True, return_counts=True)
-    alone = detections[at[(counts == 1) & (rows > start) & (rows < stop)]]
-    return np.asarray(sorted_sides(table.sizes[alone]).max(axis=0, initial=0))
 
 
 def _where(mask: Bool) -> list[int]:
@@ -133,18 +85,6 @@ def _neighbours(table: DetectionTable, owner: I4, block: slice) -> I4:
     near = cKDTree(positions).query_pairs(_NEAR_M, output_type="ndarray")
     pairs = tracked[near]
     return np.asarray(pairs[np.lexsort(pairs.T)])
-
-
-def _time_overlap(table: DetectionTable, tracks: Sequence[I4], track_pairs: I4) -> F8:
-    """Return the overlap in time (q,) of pairs of tracks (q, 2), relative to the shorter track.
-
-    It is inf if one track lies within the other.
-    """
-    first = np.array([table.rows[track[0]] for track in tracks])[track_pairs]
-    last = np.array([table.rows[track[-1]] for track in tracks])[track_pairs]
-    share = (last.min(axis=1) - first.max(axis=1) + 1) / (last - first + 1).min(axis=1)
-    within = np.argmin(first, axis=1) != np.argmin(last, axis=1)
-    return np.where(within, np.inf, share)
 
 
 def _fit(table: DetectionTable, pairs: I4, wholes: F8) -> Bool:
