@@ -530,8 +530,12 @@ def test_manifest_survives_damaged_lines(tmp_path: Path, one_by_one: Path) -> No
     path = tmp_path / "manifest.jsonl"
     shutil.copy(one_by_one / "manifest.jsonl", path)
     before = Manifest(path).entries
+    complete = {"folder": "log", "recording": "a.mcap", "state": "complete"}
     with path.open("ab") as file:
-        file.write(b'{"folder": 3}\n[]\n\xff\n{"folder": "log", "recor')
+        file.write(b'{"folder": 3}\n[]\n\xff\n')
+        for wrong in ({"recording": 3}, {"seconds": "1"}, {"tracks": [1]}, {"tries": 0.5}):
+            file.write(json.dumps({**complete, **wrong}).encode() + b"\n")
+        file.write(b'{"folder": "log", "recor')
 
     manifest = Manifest(path)
     assert manifest.entries == before

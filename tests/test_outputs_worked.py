@@ -726,6 +726,15 @@ def test_export_of_other_time_range_is_not_replaced(
         _require_own(tmp_path, after)
 
 
+@pytest.mark.parametrize("wrong", [{"range_s": 3}, {"range_s": ["a", 2]}, {"recordings": 3}])
+def test_marks_of_others_are_not_taken_for_exports(tmp_path: Path, wrong: Any) -> None:
+    """A file of the same name, made by another program, ended in a traceback."""
+    (tmp_path / "export.json").write_text(json.dumps({**KITTI, "made": [], "objects": 3, **wrong}))
+
+    with pytest.raises(OutputError, match="holds something else"):
+        _require_own(tmp_path, KITTI)
+
+
 def test_file_moved_into_export_is_not_deleted_with_it(tmp_path: Path) -> None:
     """It keeps its time, which may be before that of the export."""
     out, mine = tmp_path / "out", tmp_path / "mine.png"

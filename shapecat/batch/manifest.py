@@ -16,6 +16,7 @@ from dataclasses import dataclass, fields, replace
 from datetime import UTC, datetime
 from pathlib import Path
 from threading import Event, Lock, Thread
+from types import UnionType
 from typing import Any, Literal, Self, get_args
 from uuid import uuid4
 
@@ -80,6 +81,13 @@ class Entry:
 
 
 _NAMES = tuple(field.name for field in fields(Entry))
+_TYPES: dict[str, type | UnionType] = {
+    **dict.fromkeys(_NAMES, str),
+    **dict.fromkeys(("tries", "frames", "exit_code"), int),
+    "seconds": int | float,
+    "tracks": dict,
+}
+"""Types of the values in a line."""
 
 
 class Manifest:
@@ -256,9 +264,11 @@ def _parse(line: bytes) -> Entry | None:
     try:
         values = json.loads(line)
         entry = Entry(**{name: _interned(name, value) for name, value in values.items()})
+        is_valid = entry.state in get_args(State) and all(
+            isinstance(value, _TYPES[name]) for name, value in values.items()
+        )
     except (ValueError, TypeError, AttributeError, RecursionError):
         return None
-    is_valid = isinstance(values["folder"], str) and entry.state in get_args(State)
     return entry if is_valid else None
 
 

@@ -239,9 +239,10 @@ def _mark(folder: Path, about: Mapping[str, Any]) -> None:
 
 def _read_mark(folder: Path) -> dict[str, Any]:
     """Return the marker of an export; empty if it has none."""
-    with suppress(OSError, ValueError, RecursionError):
+    with suppress(OSError, ValueError, TypeError, RecursionError):
         about = json.loads((folder / _MARK).read_text("utf-8"))
         if isinstance(about, dict) and isinstance(about.get("made"), list):
+            _recordings_of(about), _covers((0, None), about.get("range_s"))  # fail on wrong types
             return about
     return {}
 
