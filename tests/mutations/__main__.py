@@ -63,6 +63,8 @@ JUDGED_BY: dict[str, Sequence[str]] = {
     "shapecat.learning": ("test_learning", "test_learning_model_file"),
     "shapecat.outputs": ("test_outputs_worked", "test_annotations_rotated",
                          "test_annotated_mcap", "test_exports_worked"),
+    "shapecat.outputs.annotation.annotated_mcap": ("test_outputs_worked", "test_annotated_mcap",
+                                                   "test_annotations_rotated", "test_pipeline"),
     "shapecat.outputs.annotation.image_annotations": ("test_outputs_worked", "test_colour_outputs",
                                                       "test_annotations_rotated"),
     "shapecat.outputs.colouring": ("test_colour_outputs", "test_exports_images",
