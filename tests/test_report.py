@@ -316,10 +316,21 @@ def view(blur: float = 0, left: int = 60, top: int = 50, hidden: float = 0, side
 
 
 @pytest.mark.parametrize(
-    "worse", [{"blur": 3}, {"left": 0}, {"top": 0}, {"hidden": 0.3}, {"side": 30}]
+    "worse",
+    [
+        {"blur": 3},
+        *({"left": 0}, {"top": 0}, {"left": 160}, {"top": 100}),
+        {"hidden": 0.3},
+        {"side": 30},
+    ],
 )
 def test_blurred_cut_occluded_or_small_views_score_lower(worse: dict[str, Any]) -> None:
     assert worth_of(view(**worse), 0) < 0.9 * worth_of(view(), 0)
+
+
+@pytest.mark.parametrize(("left", "top"), [(140, 5), (5, 95)])
+def test_views_near_image_border_score_no_lower(left: int, top: int) -> None:
+    assert worth_of(view(left=left, top=top), 0) > 0.97 * worth_of(view(), 0)
 
 
 def test_invisible_object_scores_zero() -> None:
@@ -327,21 +338,36 @@ def test_invisible_object_scores_zero() -> None:
     assert worth_of(replace(view(), masks=(empty,)), 0) == 0
 
 
-@pytest.mark.parametrize(("left", "top"), [(60, 50), (0, 0), (160, 100)])
-def test_crop_shows_object_and_outline(left: int, top: int) -> None:
-    """The object may be at the border of the image."""
-    photo = np.zeros((180, 240, 3), np.uint8)
-    photo[top : top + 80, left : left + 80] = (250, 40, 40)
-    crop = crop_of(replace(view(left=left, top=top), colour=photo), 0)
+@pytest.mark.parametrize(
+    ("left", "top", "wide", "high", "shape", "size"),
+    [
+        (60, 50, 80, 80, (180, 240), (256, 256)),
+        (0, 0, 80, 80, (180, 240), (256, 256)),
+        (160, 100, 80, 80, (180, 240), (256, 256)),
+        (40, 90, 150, 30, (180, 240), (256, 205)),  # its square would be 225 pixels high
+        (90, 40, 30, 150, (240, 180), (205, 256)),
+        (10, 5, 220, 170, (180, 240), (256, 192)),  # the whole image
+        (3, 170, 5, 8, (180, 240), (256, 256)),  # at least 24 pixels
+    ],
+)
+def test_crop_shows_object_and_outline(
+    left: int, top: int, wide: int, high: int, shape: tuple[int, int], size: tuple[int, int]
+) -> None:
+    """The object may be at the border of the image, or nearly as large as the image."""
+    photo = np.zeros((*shape, 3), np.uint8)
+    photo[top : top + high, left : left + wide] = (250, 40, 40)
+    mask = Mask(left, top, np.ones((high, wide), bool))
+    crop = crop_of(replace(view(), masks=(mask,), colour=photo), 0)
     image = decode(crop.image)
     red = image[..., 0] > 128
     corners = np.array(re.findall(r"(\d+) (\d+)", crop.outline), int)
     rows, columns = np.nonzero(red)
 
-    assert (crop.width, crop.height) == image.shape[1::-1] == (256, 256)
+    assert (crop.width, crop.height) == image.shape[1::-1] == size
     assert abs(corners.min(axis=0) - [columns.min(), rows.min()]).max() <= 3
     assert abs(corners.max(axis=0) - [columns.max(), rows.max()]).max() <= 3
-    assert 0.3 < red.mean() < 0.6
+    scale = 256 / min(max(1.5 * max(wide, high), 24), max(shape))
+    assert abs(np.ptp([columns, rows], axis=1) - np.array([wide, high]) * scale).max() <= 3
 
 
 def labelled(*indices: np.ndarray, up: Sequence[int] = (0, -1, 0)) -> LabelledFrame:
