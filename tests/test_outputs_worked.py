@@ -58,6 +58,7 @@ from shapecat.outputs.png import png
 from shapecat.outputs.report.cards import _guess
 from shapecat.outputs.report.pictures import _require_unchanged
 from shapecat.outputs.review.colour import true_colours
+from shapecat.outputs.review.columns import At
 from shapecat.outputs.review.images import layer_of
 from shapecat.outputs.review.paths import Paths
 from shapecat.outputs.review.scenes import choose_scenes, with_clouds
@@ -420,7 +421,13 @@ def test_scene_is_redrawn_if_object_moves_or_time_goes_back() -> None:
 def test_long_path_keeps_newest_positions() -> None:
     """The newest 500 positions are kept; steps of at most 15 mm are ignored."""
     drawn: list[Any] = []
-    columns: Any = SimpleNamespace(add=lambda _entity, _at, ways, _draw, **_: drawn.append(ways))
+    sizes: list[int] = []
+
+    def add(_entity: str, _at: At, ways: Any, _drawing: Any, *, size: int) -> None:
+        drawn.append(ways)
+        sizes.append(size)
+
+    columns: Any = SimpleNamespace(add=add)
     paths = Paths(columns)
     for k in range(507):
         paths.add("/p", (k, k), {4: ("cup", np.array([0.02 * k, 0.3, 1.1]))}, ())
@@ -431,6 +438,7 @@ def test_long_path_keeps_newest_positions() -> None:
     assert_allclose(places[:, 0], 0.02 * np.arange(7, 507))
     paths.add("/p", (508, 508), {}, (4,))
     assert drawn[-1] == []
+    assert (sizes[0], *sizes[-2:]) == (2 * 3, 500 * 3, 0)  # or hundreds of copies are held back
 
 
 def test_path_of_ended_track_leaves_all_sensors() -> None:

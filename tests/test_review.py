@@ -8,6 +8,7 @@ import sys
 import time
 from collections.abc import Iterable, Iterator, Sequence
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
@@ -16,6 +17,7 @@ import rerun as rr
 from scipy.spatial.transform import Rotation
 
 from shapecat.cameras.colour import ColourImage, ColourView
+from shapecat.colour.masks import Mask
 from shapecat.errors import OutputError
 from shapecat.outputs.colouring import Coloured
 from shapecat.outputs.colours import colour_of
@@ -23,12 +25,12 @@ from shapecat.outputs.review import layout as review_layout
 from shapecat.outputs.review import viewer as review_viewer
 from shapecat.outputs.review import writing as review
 from shapecat.outputs.review.clouds import paint
-from shapecat.outputs.review.columns import Columns, Drawing, curve
+from shapecat.outputs.review.columns import At, Columns, Drawing, curve
 from shapecat.outputs.review.file import ReviewFile
 from shapecat.outputs.review.images import Images
 from shapecat.outputs.review.layout import Eye, TrackView, _track_tabs, choose_eye, stepped_back
 from shapecat.outputs.review.scenes import ReviewFrame, choose_scenes
-from shapecat.outputs.review.shapes import markdown, short_label
+from shapecat.outputs.review.shapes import SCENE, markdown, short_label
 from shapecat.runs.labels.meaning import TrackLabel
 from shapecat.types import Box, Camera, Frame, LabelledFrame, LabelledObject, NeuralGas, Plane, Pose
 from tests.processes import alive
@@ -433,6 +435,43 @@ def test_few_rows_or_numbers_are_held_back(rows: int, size: int) -> None:
     for k in range(2 * rows):
         columns.add("plot", (k, k), [0.5], Drawing(draw), size=size)
         assert sum(sent) == (k + 1) // rows * rows
+
+
+def test_large_images_and_masks_are_not_held_back() -> None:
+    """Counted as single rows, 256 of them would be in memory."""
+    sent: list[str] = []
+    stream: Any = SimpleNamespace(
+        log=lambda *_, **__: None, send_columns=lambda entity, *_: sent.append(entity)
+    )
+    images = Images(Columns(stream))
+    photo = ColourImage("/colour", 0, 0, "camera", "png", 1600, 1500, 0, bytes(270_000))
+    noise = np.random.default_rng(3).random((1500, 1600)) < 0.5  # its PNG file has 300 kB
+    coloured = Coloured(ColourView(photo), (Mask(0, 0, noise),))
+    for k in range(5):
+        images.add(scene(k, [labelled_object(4)])[0], coloured)
+
+    name = rr.new_entity_path(["images", TOPIC])
+    assert sent == [name, f"{name}/masks"] * 2  # when two hold 512 kB
+
+
+def test_rows_of_a_scene_count_as_what_they_hold(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Counted as single rows, 256 scenes with all their points would be in memory."""
+    sizes, add = {}, Columns.add
+
+    def added(columns: Columns, entity: str, at: At, row: Any, *rest: Any, size: int = 1) -> None:
+        sizes[entity] = size
+        add(columns, entity, at, row, *rest, size=size)
+
+    monkeypatch.setattr(Columns, "add", added)
+    settings = {"outputs": {"cloud_points": 0}}
+    seen = scene(0, [labelled_object(1), labelled_object(2)])
+    write(tmp_path / "review.rrd", [seen], run={"settings": settings})
+
+    entity = rr.new_entity_path(["world", TOPIC])
+    points, listed = 48 * 60, 2 * 8  # four columns of the depth image are empty
+    assert {sizes[f"{entity}/{name}"] for name in SCENE} == {points + listed}
 
 
 def test_label_has_only_low_confidences() -> None:
