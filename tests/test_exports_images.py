@@ -217,9 +217,13 @@ def test_parts_of_object_are_joined_into_one_polygon() -> None:
 
 
 def test_outlines_are_sorted_by_area_and_links_add_none() -> None:
-    """The first part frames the crop of an object; COCO tools compute areas of polygons."""
+    """The first part frames the crop of an object; COCO tools compute areas of polygons.
+
+    A hole is no part: linked to its object, it would take these pixels from it.
+    """
     pixels = np.zeros((20, 40), bool)
     pixels[1:3, 30:34], pixels[4:19, 2:14], pixels[9:15, 20:27] = True, True, True
+    pixels[6:16, 4:11] = pixels[16, 9:12] = pixels[11:13, 23] = False
     parts = outlines(Mask(100, 70, pixels))
 
     def area(ring: Any) -> float:
