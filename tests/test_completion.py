@@ -11,6 +11,8 @@ from numpy.testing import assert_allclose
 from scipy.spatial.transform import Rotation
 
 from shapecat.completion import DIRECTIONS, BoxViews, complete, fuse_boxes
+from shapecat.completion.outline import COSINES, SINES
+from shapecat.completion.whole import faced, footprint
 from shapecat.evaluation.comparison.overlap import box_iou
 from shapecat.geometry import (
     gravity_rotation,
@@ -137,7 +139,38 @@ def test_full_box_reaches_down_to_hidden_support() -> None:
     )
 
     assert hidden.size[2] == pytest.approx(0.2, rel=0.02)
+    assert hidden.size_std[2] == pytest.approx(np.hypot(0.006, 0.35 * 0.12), rel=0.08)
     assert hidden.size_std[2] > 3 * box.size_std[2]
+
+
+@pytest.mark.parametrize(
+    ("boxy", "depth", "deviation"),
+    [
+        (1.0, 0.0576, 0.0),
+        (0.9, 0.0576, 0.3),  # of a choice between both depths: √(0.9 · 0.1) of their difference
+        (0.25, 0.096, np.hypot(0.35, 0.433)),  # and 0.35 of the guessed part
+        (0.0, 0.096, 0.35),
+    ],
+)
+def test_hidden_side_is_uncertain_if_object_may_be_box_or_round(
+    boxy: float, depth: float, deviation: float
+) -> None:
+    """Users would trust a guessed length.
+
+    Of an oval of 104 by 96 mm, a sensor before its wide side sees a depth of 57.6 mm.
+    """
+    angle = np.linspace(0, 2 * np.pi, 3000)
+    around = np.stack([0.052 * np.cos(angle), 0.048 * np.sin(angle)], axis=1)
+    turn = about_z(17 * 2 * np.pi / DIRECTIONS)[:2, :2]
+    visible = around[np.sin(angle) < 0.2] @ turn.T
+    outline = (visible @ np.stack([COSINES, SINES])).max(axis=0)
+    facing = faced(turn @ [0, -1]).astype(np.float64)
+    posterior = boxy * one_hot("box") + (1 - boxy) * one_hot("bottle")
+    plan = footprint(outline, facing, posterior, CATEGORIES)
+
+    assert plan.side == 17
+    assert_allclose(plan.size, [0.104, depth], atol=0.0015)
+    assert_allclose(plan.std, [0.006, np.hypot(0.006, deviation * (0.096 - 0.0576))], rtol=0.08)
 
 
 def test_lying_bottle_is_not_as_wide_as_long() -> None:
