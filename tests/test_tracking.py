@@ -654,6 +654,22 @@ def test_late_messages_of_one_sensor_do_not_put_it_behind_the_other() -> None:
     assert np.diff(track.stamps_ns).min() >= -3 * SECOND // 10
 
 
+@pytest.mark.parametrize("wrong", [20, 1, 198])
+@pytest.mark.parametrize("sensor", ["/a", "/b"])
+@pytest.mark.parametrize("ahead_s", [3, -5])
+def test_single_odd_stamp_does_not_put_a_sensor_behind_the_other(
+    wrong: int, sensor: str, ahead_s: int
+) -> None:
+    """Taken for a clock that was set back, it would divide the tracks of both sensors."""
+    frames = [
+        frame(k, [0, 0, 0], stamp_ns=k * SECOND // 10 + after_ns + odd_s * SECOND, topic=topic)
+        for topic, after_ns in (("/a", 0), ("/b", SECOND // 30))
+        for k in range(200)
+        for odd_s in [ahead_s * (k == wrong and topic == sensor)]
+    ]
+    assert [track.hits for track in track_frames(frames, SETTINGS, together={"/a", "/b"})] == [400]
+
+
 @pytest.mark.parametrize("single", [False, True])
 def test_two_sensors_share_tracks_despite_clock_jump(single: bool) -> None:
     """Even after a single wrong stamp, neither sensor may lag behind."""
