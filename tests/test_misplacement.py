@@ -1,5 +1,6 @@
 """Tests of the warning about poses of the sensor that are worse than none."""
 
+from collections.abc import Container
 from pathlib import Path
 from typing import Any
 
@@ -19,15 +20,22 @@ TURN = np.array([[0.0, 0.8, 0.6], [-1.0, 0.0, 0.0], [0.0, -0.6, 0.8]])
 
 
 def write_run(
-    folder: Path, speed_m_s: float, axes: F8, carried_m_s: float = 0, *, cells: int = 1
+    folder: Path,
+    speed_m_s: float,
+    axes: F8,
+    carried_m_s: float = 0,
+    *,
+    cells: int = 1,
+    empty: Container[int] = range(2, 130, 7),
 ) -> None:
     """Write the frames of a camera that drives along x, whose frame has other ``axes`` (3, 3).
 
-    Some frames are without objects. In each of ``cells`` equal rooms there is such a camera.
+    The frames ``empty`` are without objects. In each of ``cells`` equal rooms there is such a
+    camera.
     """
     rows: dict[str, list[Any]] = {"topic": [], "center": [], "center_fixed": [], "frame": []}
-    frames = range(40)
-    for k in (k for k in frames if k % 7 != 2):
+    frames = range(130)
+    for k in (k for k in frames if k not in empty):
         place = np.array([0.1 * k * speed_m_s, -0.2, 1.3])
         own = (OBJECTS + np.array([0.1 * k * carried_m_s, 0, 0]) - place) @ TURN
         for cell in range(cells):
@@ -68,6 +76,25 @@ def test_poses_that_are_worse_than_none_are_reported(
 
     warnings = list(explain_misplacement(tmp_path, "map"))
     assert [w.split(":")[0] for w in warnings] == ["/depth"] * warns
+
+
+@pytest.mark.parametrize(
+    ("seen", "warns"),
+    [
+        ({*range(6), *range(35, 60)}, True),  # once before the gap, eight times after it
+        ({*range(6), *range(46, 60)}, True),
+        ({*range(6), *range(48, 60)}, False),  # too seldom
+        (range(0, 130, 19), True),  # 1.9 s apart
+        (range(0, 130, 20), False),  # 2 s apart
+    ],
+)
+def test_frames_two_seconds_apart_are_not_compared(
+    tmp_path: Path, seen: Container[int], *, warns: bool
+) -> None:
+    """The camera may see other objects by then, but comparisons must go on after such a gap."""
+    write_run(tmp_path, 0.2, OPENGL, empty=[k for k in range(130) if k not in seen])
+
+    assert len(list(explain_misplacement(tmp_path, "map"))) == warns
 
 
 @pytest.mark.parametrize(("axes", "topics"), [(np.eye(3), []), (OPENGL, ["/depth", "/depth1"])])
