@@ -196,7 +196,19 @@ def test_single_colour_camera_is_not_used_for_two_sensors(
     assert {colour.topic for colour in wanted.values()} == {"/one/image"}
 
 
-def test_colour_camera_of_another_sensor_is_not_used(tmp_path: Path) -> None:
+@pytest.mark.parametrize(
+    ("topic", "users"),
+    [
+        ("/robot/left/color/image", ["left"]),
+        ("/robot/right/color/image", ["right"]),
+        ("/robot/rgb/image", ["left", "right"]),  # as near to one as to the other
+        ("/robot/image", ["left", "right"]),
+        ("/lab/left/image", []),
+    ],
+)
+def test_colour_camera_of_another_sensor_is_not_used(
+    tmp_path: Path, topic: str, users: list[str]
+) -> None:
     """Each object would have two masks on its images, one from each depth camera."""
     items = []
     for side in ("left", "right"):
@@ -204,13 +216,13 @@ def test_colour_camera_of_another_sensor_is_not_used(tmp_path: Path) -> None:
             (f"/robot/{side}/depth/camera_info", EPOCH, info(EPOCH)),
             (f"/robot/{side}/depth/image", EPOCH, image(EPOCH, wavy_depth(), frame_id=side)),
         ]
-    items += colour("/robot/left/color/image")
+    items += colour(topic)
     with open_recording(record(tmp_path / "a.mcap", in_order(items))) as recording:
         streams = choose_streams(recording, [f"/robot/{s}/depth/image" for s in ("left", "right")])
         pairs = pair_colours(recording, streams, None)
 
     assert {depth: colour.topic for depth, colour in pairs.items()} == {
-        "/robot/left/depth/image": "/robot/left/color/image"
+        f"/robot/{side}/depth/image": topic for side in users
     }
 
 
