@@ -654,7 +654,7 @@ def test_late_messages_of_one_sensor_do_not_put_it_behind_the_other() -> None:
     assert np.diff(track.stamps_ns).min() >= -3 * SECOND // 10
 
 
-@pytest.mark.parametrize("wrong", [20, 1, 198])
+@pytest.mark.parametrize("wrong", [20, 0, 1, 198, 199])
 @pytest.mark.parametrize("sensor", ["/a", "/b"])
 @pytest.mark.parametrize("ahead_s", [3, -5])
 def test_single_odd_stamp_does_not_put_a_sensor_behind_the_other(

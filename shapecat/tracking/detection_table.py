@@ -233,6 +233,8 @@ def _times_set_back(stamps_ns: I4) -> I4:
 
     To ignore these, the two frames before are compared with this one and the next.
     """
-    stamps = np.pad(stamps_ns, 2, mode="edge")
+    # No second stamp confirms a jump after the first or before the last: neither counts.
+    ends = ((stamps_ns.min(), stamps_ns.max()),)
+    stamps = np.pad(stamps_ns, 2, constant_values=ends)
     before = np.minimum(stamps[:-4], stamps[1:-3])
     return np.asarray((np.maximum(stamps[2:-2], stamps[3:-1]) < before - _SET_BACK_NS).cumsum())
