@@ -242,7 +242,8 @@ def _read_mark(folder: Path) -> dict[str, Any]:
     with suppress(OSError, ValueError, TypeError, RecursionError):
         about = json.loads((folder / _MARK).read_text("utf-8"))
         if isinstance(about, dict) and isinstance(about.get("made"), list):
-            _recordings_of(about), _covers((0, None), about.get("range_s"))  # fail on wrong types
+            _covers((0, None), about.get("range_s"))  # fails on wrong types
+            _recordings_of(about)  # likewise
             return about
     return {}
 
