@@ -10,7 +10,7 @@ from types import SimpleNamespace
 import pytest
 import zstandard
 from mcap.opcode import Opcode
-from mcap.writer import CompressionType
+from mcap.writer import CompressionType, IndexType
 from rosbags.rosbag2 import CompressionMode, StoragePlugin
 
 from shapecat.errors import RecordingError
@@ -46,6 +46,25 @@ def replace(path: Path, old: bytes, new: bytes, nth: int = 0) -> None:
 
 
 # ---- MCAP
+
+
+@pytest.mark.parametrize(("opcode", "warned"), [(0x40, True), (0x90, False)])
+def test_records_of_unknown_kind_are_skipped(tmp_path: Path, opcode: int, warned: bool) -> None:
+    """Opcodes from 0x80 on are for private use; a later format might define the others."""
+    path = tmp_path / "a.mcap"
+    with mcap_writer(path, "", use_chunking=False, index_types=IndexType.NONE) as writer:
+        channel = writer.register_channel("/a", "raw", 0)
+        for time in (3, 5):
+            writer.add_message(channel, time, b"x", time)
+    data = path.read_bytes()
+    at = data.index(struct.pack("<BQ", Opcode.MESSAGE, 23))
+    path.write_bytes(data[:at] + struct.pack("<BQ", opcode, 4) + b"\x07\x08\x09\x0a" + data[at:])
+
+    times, warnings = read(path)
+    assert times == [3, 5]
+    assert [w for w in warnings if "unknown kind" in w] == (
+        ["skipped records of unknown kind 64"] if warned else []
+    )
 
 
 @pytest.mark.parametrize("damaged", ["", "std/String", "/topic"])

@@ -821,6 +821,19 @@ def test_confirmed_track_ends_by_elapsed_time_alone(hits: int, alive: int) -> No
     assert len(tracker._active.ids) == alive
 
 
+@pytest.mark.parametrize("start_ns", [0, 1_700_200_000_000_000_000])
+def test_detection_of_two_frames_makes_no_track(start_ns: int) -> None:
+    """Whatever the clock, three frames must confirm noise, but all frames of a short recording."""
+    seen = [[[0.0, 0, 0], [0.5, 0, 0]] if k in {7, 8} else [[0.0, 0, 0]] for k in range(20)]
+    frames = [
+        frame(k, places, stamp_ns=start_ns + k * SECOND // 10) for k, places in enumerate(seen)
+    ]
+    settings = replace(SETTINGS, min_hits=3)
+
+    assert [track.hits for track in track_frames(frames, settings)] == [20]
+    assert [track.hits for track in track_frames(frames[7:9], settings)] == [2, 2]
+
+
 def test_cup_shown_briefly_beside_tall_bottle_keeps_its_track() -> None:
     """Only what is near the middle of a narrow object may count as a piece of it."""
     bottle, cup = (0.07, 0.08, 0.31), (0.08, 0.09, 0.1)

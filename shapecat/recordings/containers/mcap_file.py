@@ -195,7 +195,7 @@ class McapRecording(ChunkedRecording):
                 self.warn(
                     f"skipped messages of channel {message.channel_id}, which is not described"
                 )
-        elif opcode not in _DEFINING and opcode not in _KNOWN:
+        elif opcode not in _KNOWN:
             self.warn(f"skipped records of unknown kind {opcode}")
         elif self.indexed:
             return
