@@ -448,8 +448,13 @@ def test_the_largest_masks_of_a_track_are_not_shown() -> None:
     cut = [choosing._View(("/d", k), 9000.0 + k, complete=False) for k in range(30, 40)]
     complete_last = [*cut, choosing._View(("/d", 44), 60.0, complete=True)]
 
-    assert [view.key[1] for view in choosing._good_of_parts(views)] == [5, 11, 17, 23]
-    assert [view.key[1] for view in choosing._good_of_parts(complete_last)] == [31, 34, 37, 44]
+    assert [view.key[1] for view in choosing._representative_views(views)] == [5, 11, 17, 23]
+    assert [view.key[1] for view in choosing._representative_views(complete_last)] == [
+        31,
+        34,
+        37,
+        44,
+    ]
 
 
 @pytest.mark.parametrize(

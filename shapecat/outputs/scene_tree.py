@@ -15,7 +15,7 @@ from shapecat.types import Box, Candidate, LabelledFrame, LabelledObject, Plane,
 
 __all__ = ["describe_scene"]
 
-_CANDIDATE = (
+_CANDIDATE_COLUMNS = (
     "indices",
     "center",
     "size",
@@ -61,7 +61,7 @@ def _read_scene(folder: Path, labelled: LabelledFrame) -> Scene:
     OutputError : an object stands on a plane or an object that the frame lacks, or on itself.
     """
     topic, frame, planes = labelled.topic, labelled.index, labelled.planes
-    rows = _rows(folder, "detections", topic, frame, _CANDIDATE)
+    rows = _rows(folder, "detections", topic, frame, _CANDIDATE_COLUMNS)
     if not _are_supported([row["on_detection"] for row in rows]) or any(
         row["plane"] not in (None, *range(len(planes))) for row in rows
     ):

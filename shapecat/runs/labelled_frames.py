@@ -71,7 +71,7 @@ def read_labelled_frames(folder: Path, labels: Mapping[int, TrackLabel]) -> Iter
             planes_of_frame = supports.get(key, [])
             frame = _labelled_frame(row, detected_rows, planes_of_frame, tracks, ended(key))
             yield replace(frame, masks=masks.of(key))
-    if masks.remain:
+    if masks.has_more:
         raise misfit(folder)
 
 
@@ -90,7 +90,7 @@ class _MasksByFrame:
         return row
 
     @property
-    def remain(self) -> bool:
+    def has_more(self) -> bool:
         """Whether there are masks of frames that were not requested in the order of the table."""
         return self._next is not None
 

@@ -19,7 +19,7 @@ from shapecat.types import ImageMasks
 __all__ = ["Choice", "choose_frames"]
 
 _CANDIDATES = 4
-"""Views of a track that are read again: a good one of each quarter of them."""
+"""Views of a track that are read again: a typical large one of each quarter of them."""
 _RANK = 0.8
 """Rank of the chosen view among those of a quarter, 1 for the largest. The largest masks often
 include a neighbour or a piece of the table."""
@@ -60,7 +60,7 @@ def choose_frames(folder: Path, timelines: Mapping[int, Timeline]) -> Choice:
     owner = {key: track for track, line in timelines.items() for key in line.keys if key[2] >= 0}
     candidates: dict[Key, set[int]] = {}
     for track, views in _views(folder, owner).items():
-        for view in _good_of_parts(views):
+        for view in _representative_views(views):
             candidates.setdefault(view.key, set()).add(track)
     tracks_of: dict[Key, set[int]] = {}
     for (topic, frame, _), track in owner.items():
@@ -99,8 +99,8 @@ def _areas(masks: Iterator[tuple[Key, ImageMasks]]) -> dict[Detected, tuple[floa
     return areas
 
 
-def _good_of_parts(views: Sequence[_View]) -> list[_View]:
-    """Return a good view in each of `_CANDIDATES` parts of a track, a complete one if there is one.
+def _representative_views(views: Sequence[_View]) -> list[_View]:
+    """Return a typical large view of each of `_CANDIDATES` parts of a track, if possible complete.
 
     Of equal views, it is the first.
     """
