@@ -91,17 +91,9 @@ class WallSettings(NamedTuple):
     """Minimum area of a connected part that is cleared: smaller ones may be objects."""
     cleared_m2: float = 0.1
     """Minimum area of all cleared parts together."""
-    patch_m2: float = 0.008
-    """Minimum area of a part that is cleared because it lies exactly in the wall."""
-    exact: float = 0.0045
-    """Largest standard deviation of such a part from the wall, 1/m: that of a wall's samples."""
     free_share: float = 0.25
     """Minimum fraction of the left and right ends of a part in front of farther surface, for the
     front of an object; it has half if one flank is visible too."""
-    cut_off: float = 0.75
-    """Minimum diagonal of a wall that is cut off by two sides of the image, relative to the largest
-    object.
-    """
     filled: float = 0.3
     """Minimum fraction of its extent that a wall fills: the front edges of a shelf are also in one
     plane."""

@@ -4,8 +4,8 @@ import math
 
 import numpy as np
 
-from shapecat.arrays import F4, F8, I4, U1
-from shapecat.detection.depth_grid import BORDER_SHARE, DepthGrid, PinholeIntrinsics
+from shapecat.arrays import F8, I4, U1
+from shapecat.detection.depth_grid import DepthGrid, PinholeIntrinsics
 from shapecat.detection.foreground.settings import WALLS
 from shapecat.detection.planes.plane_fit import DepthSamples, plane_normal
 from shapecat.detection.planes.ransac import ransac_plane, sample_grid, select_outliers
@@ -51,7 +51,7 @@ def remove_walls(grid: DepthGrid, plane_id: I4, up: F8, max_size_m: float, trial
         if count < WALLS.min_samples:
             break
         normal = plane_normal(plane, grid.intrinsics)
-        if _is_wall(grid, samples, plane, normal, up, max_size_m):
+        if _is_wall(grid.intrinsics, samples, plane, normal, up, max_size_m):
             axes = np.stack((normal, cross(normal, up), up))
             _clear(grid, plane_id, plane, axes, max_size_m, walls)
         samples = select_outliers(samples, plane, 2 * PLANES.tolerance)
@@ -60,47 +60,23 @@ def remove_walls(grid: DepthGrid, plane_id: I4, up: F8, max_size_m: float, trial
 
 @kernel(inline=True)
 def _is_wall(
-    grid: DepthGrid, samples: DepthSamples, plane: F8, normal: F8, up: F8, max_size_m: float
+    intrinsics: PinholeIntrinsics,
+    samples: DepthSamples,
+    plane: F8,
+    normal: F8,
+    up: F8,
+    max_size_m: float,
 ) -> bool:
     """Return whether the inliers of a plane are too many for the face of an object."""
     strips = np.zeros((2, STRIPS))
-    area = _measure(grid.intrinsics, samples, plane, normal, up, strips)
+    area = _measure(intrinsics, samples, plane, normal, up, strips)
     across = along = 0.0
     for k in range(STRIPS):  # a strip counts if the wall in it is longer than the strip is wide
         across += WALLS.strip_m * (strips[0, k] > WALLS.strip_m**2)
         along += WALLS.strip_m * (strips[1, k] > WALLS.strip_m**2)
     if area <= WALLS.min_area_m2 or area <= WALLS.filled * across * along:
         return False
-    if max(across, along) > max_size_m:
-        return True
-    large = math.hypot(across, along) > WALLS.cut_off * max_size_m
-    return bool(large and _is_cut_off(grid.inverse_depth, samples, plane))
-
-
-@kernel(inline=True)
-def _is_cut_off(inv_depth: F4, samples: DepthSamples, plane: F8) -> bool:
-    """Return whether the inliers of a plane reach two sides of the image or of its sampled part."""
-    plane_bounds = _bounds(samples, plane, PLANES.tolerance)
-    sample_bounds = _bounds(sample_grid(inv_depth, inv_depth), plane, np.inf)
-    sides, margin = 0, 1.5 * math.sqrt(samples.share)
-    for d in range(2):
-        last = inv_depth.shape[1 - d]
-        sides += plane_bounds[d] < min(sample_bounds[d] + margin, BORDER_SHARE * last)
-        sides += plane_bounds[2 + d] > max(sample_bounds[2 + d] - margin, (1 - BORDER_SHARE) * last)
-    return sides >= 2
-
-
-@kernel(inner=True)
-def _bounds(samples: DepthSamples, plane: F8, tolerance: float) -> F8:
-    """Return the first column, first row, last column and last row of a plane's inliers."""
-    bounds = np.array([np.inf, np.inf, -np.inf, -np.inf])
-    for k in range(samples.inverse_depth.size):
-        j, i = float(samples.j[k]), float(samples.i[k])
-        level = plane[0] * j + plane[1] * i + plane[2]
-        if abs(samples.inverse_depth[k] - level) < tolerance:
-            bounds[0], bounds[1] = min(bounds[0], j), min(bounds[1], i)
-            bounds[2], bounds[3] = max(bounds[2], j), max(bounds[3], i)
-    return bounds
+    return bool(max(across, along) > max_size_m)
 
 
 @kernel(inline=True)
@@ -141,9 +117,8 @@ def _clear(
     for i in range(rows):
         for j in range(columns):
             if state[i, j] == UNMEASURED:
-                count, area, squares = _flood(grid, plane, axes[0], i, j, state, stack)
-                exact = area >= WALLS.patch_m2 and squares < count * WALLS.exact**2
-                large = area >= WALLS.part_m2 or exact
+                count, area = _flood(grid, axes[0], i, j, state, stack)
+                large = area >= WALLS.part_m2
                 if large and not _is_free_standing(grid, axes, max_size_m, state, stack[:count]):
                     total += area
                     for p in stack[:count]:
@@ -187,32 +162,28 @@ def _is_free_standing(grid: DepthGrid, axes: F8, max_size_m: float, state: U1, c
 
 
 @kernel(inline=True)
-def _flood(
-    grid: DepthGrid, plane: F8, normal: F8, i: int, j: int, state: U1, stack: I4
-) -> tuple[int, float, float]:
+def _flood(grid: DepthGrid, normal: F8, i: int, j: int, state: U1, stack: I4) -> tuple[int, float]:
     """Collect the connected part of a wall at cell (i, j).
 
-    Returns the number of cells, their area, m², and the sum of their squared distances from the
-    plane, 1/m².
+    Returns the number of cells and their area, m².
     """
     inv_depth, k = grid.inverse_depth, grid.intrinsics
     rows, columns = inv_depth.shape
     stack[0], state[i, j] = i * columns + j, ON_WALL
-    head, tail, area, squares = 0, 1, 0.0, 0.0
+    head, tail, area = 0, 1, 0.0
     while head < tail:
         i, j = stack[head] // columns, stack[head] % columns
         head += 1
         x, y, w = (j - k.cx) / k.fx, (i - k.cy) / k.fy, inv_depth[i, j]
         facing = max(-(x * normal[0] + y * normal[1] + normal[2]), 0.1)
         area += 1 / (w * w * k.fx * k.fy * facing)
-        squares += (w - (plane[0] * j + plane[1] * i + plane[2])) ** 2
         for di, dj in ((1, 0), (-1, 0), (0, 1), (0, -1)):  # a different order rounds differently
             v, u = i + di, j + dj
             if v < 0 or u < 0 or v >= rows or u >= columns or state[v, u] != UNMEASURED:
                 continue
             stack[tail], state[v, u] = v * columns + u, ON_WALL
             tail += 1
-    return tail, area, squares
+    return tail, area
 
 
 @kernel(inline=True)
