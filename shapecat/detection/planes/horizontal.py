@@ -48,26 +48,14 @@ def find_horizontal_planes(
 
     ``up`` is a unit vector (3,), sensor frame; ``trials`` are from `draw_trials`.
     """
-    samples, candidates = _fit_candidates(grid, points, up, trials)
-    common = _common_up(candidates) if candidates else up
-    if common @ up < PLANES.turned_cos:
-        samples, candidates = _fit_candidates(grid, points, common, trials)
-        common = _common_up(candidates) if candidates else common
-    if len(candidates) > 1:
-        parallel = [
-            _refit_parallel(grid.intrinsics, candidate.inliers, common) for candidate in candidates
-        ]
-        candidates = _measure_candidates(grid, samples, parallel)
-    return sorted(candidates, key=lambda candidate: candidate.plane.offset)
-
-
-def _fit_candidates(
-    grid: DepthGrid, points: OrientedPoints, up: F8, trials: F8
-) -> tuple[DepthSamples, list[PlaneCandidate]]:
-    """Return the level samples, and the planes fitted to them."""
     samples, heights = level_samples(points, up)
     planes = fit_horizontal_planes(samples, heights, grid.intrinsics, up, trials)
-    return samples, _measure_candidates(grid, samples, planes)
+    candidates = _measure_candidates(grid, samples, planes)
+    if len(candidates) > 1:
+        common = _common_up(candidates)
+        planes = [_refit_parallel(grid.intrinsics, c.inliers, common) for c in candidates]
+        candidates = _measure_candidates(grid, samples, planes)
+    return sorted(candidates, key=lambda candidate: candidate.plane.offset)
 
 
 def _measure_candidates(

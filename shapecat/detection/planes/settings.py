@@ -57,8 +57,6 @@ class PlaneSettings(NamedTuple):
     close_share: float = 0.75
     """Minimum fraction of the inliers within half the tolerance. A plane tilted between two others,
     such as a table and the plates on it, has fewer."""
-    turned_cos: float = math.cos(math.radians(1))
-    """If up turns by more, planes are refitted: heights blur by a centimetre at half a metre."""
     furniture_m2: float = 0.25
     """Larger planes are furniture, whatever is below their edge."""
     likely_m2: float = 0.1
