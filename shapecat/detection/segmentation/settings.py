@@ -48,8 +48,6 @@ class SegmentationSettings(NamedTuple):
     sharp; the others show the outline before and after it."""
     part_cells: int = 60
     """Minimum number of cells on either side of a split: fewer are a knob or a handle."""
-    shadow_cells: int = 6
-    """Width of a Kinect's shadow beside an occluder, in cells."""
 
 
 SEGMENTATION = SegmentationSettings()

@@ -4,7 +4,6 @@ Where a wider or narrower object begins, both sides of the outline step in or ou
 fronts are one surface. The ends of a cup's handle look the same; merging joins its parts again.
 """
 
-import math
 from typing import NamedTuple
 
 import numpy as np
@@ -30,12 +29,10 @@ class Outlines(NamedTuple):
     ends : (2, n + 1, BANDS) float32 metres, the ends of the range along `lateral_axis`: the
         smallest position, and the largest times -1. Both grow where a segment narrows. They are
         infinite in a band without cells.
-    cells : (2, n + 1, BANDS) int32 flat indices of the cells at these ends.
     counts : (n + 1, BANDS) int32 the number of cells.
     """
 
     ends: F4
-    cells: I4
     counts: I4
 
 
@@ -58,7 +55,7 @@ def split_at_width_changes(
     cuts, last_label = np.zeros(BANDS, np.bool_), n
     for p in range(1, n + 1):
         top_label = p  # the label above the cuts so far
-        for band in range(BANDS if _find_cuts(grid, outlines, p, side, cuts) else 0):
+        for band in range(BANDS if _find_cuts(outlines, p, cuts) else 0):
             if cuts[band]:
                 last_label += 1
                 _relabel_above(
@@ -85,7 +82,7 @@ def _relabel_above(
 @kernel(inline=True)
 def _outlines_of(grid: DepthGrid, height: F4, spans: I4, labels: I4, n: int, side: F8) -> Outlines:
     """Collect the outlines of the labels 1..n."""
-    inv_depth, intrinsics, columns = grid.inverse_depth, grid.intrinsics, labels.shape[1]
+    inv_depth, intrinsics = grid.inverse_depth, grid.intrinsics
     one, per_band = np.float32(1), np.float32(1 / BAND_M)
     # Lateral position over depth is linear in column and row.
     a, b = np.float32(side[0] / intrinsics.fx), np.float32(side[1] / intrinsics.fy)
@@ -94,7 +91,7 @@ def _outlines_of(grid: DepthGrid, height: F4, spans: I4, labels: I4, n: int, sid
     )
     ends = np.zeros((2, n + 1, BANDS), np.float32)
     ends[:] = np.inf
-    cells, count = np.zeros((2, n + 1, BANDS), np.int32), np.zeros((n + 1, BANDS), np.int32)
+    count = np.zeros((n + 1, BANDS), np.int32)
     for i in range(labels.shape[0]):
         for j in range(spans[i, 0], spans[i, 1]):
             p = labels[i, j]
@@ -103,15 +100,13 @@ def _outlines_of(grid: DepthGrid, height: F4, spans: I4, labels: I4, n: int, sid
             u = (np.float32(j) * a + np.float32(i) * b + c) * (one / inv_depth[i, j])
             band = min(max(int(height[i, j] * per_band), 0), BANDS - 1)
             count[p, band] += 1
-            if u < ends[0, p, band]:
-                ends[0, p, band], cells[0, p, band] = u, i * columns + j
-            if -u < ends[1, p, band]:
-                ends[1, p, band], cells[1, p, band] = -u, i * columns + j
-    return Outlines(ends, cells, count)
+            ends[0, p, band] = min(ends[0, p, band], u)
+            ends[1, p, band] = min(ends[1, p, band], -u)
+    return Outlines(ends, count)
 
 
 @kernel(inline=True)
-def _find_cuts(grid: DepthGrid, outlines: Outlines, p: int, side: F8, cuts: Bool) -> bool:
+def _find_cuts(outlines: Outlines, p: int, cuts: Bool) -> bool:
     """Mark the bands (BANDS,) below which label ``p`` is cut; return whether there are any."""
     first, last, band_count, above = 0, 0, 0, 0
     for band in range(BANDS):
@@ -124,7 +119,7 @@ def _find_cuts(grid: DepthGrid, outlines: Outlines, p: int, side: F8, cuts: Bool
     steps, any_cut = np.zeros(BANDS), False
     cuts[:] = False
     for band in range(first + BANDS_BESIDE, last - BANDS_BESIDE + 2):
-        steps[band] = _step_at(grid, outlines, p, band, side)
+        steps[band] = _step_at(outlines, p, band)
     below = 0  # cells since the last cut; ``above``: from here on
     for band in range(BANDS - BANDS_BESIDE):
         largest = steps[band] >= SEGMENTATION.both_steps_m and band >= BANDS_BESIDE
@@ -141,11 +136,11 @@ def _find_cuts(grid: DepthGrid, outlines: Outlines, p: int, side: F8, cuts: Bool
 
 
 @kernel(inline=True)
-def _step_at(grid: DepthGrid, outlines: Outlines, p: int, band: int, side: F8) -> float:
+def _step_at(outlines: Outlines, p: int, band: int) -> float:
     """Return the sum of the steps of both sides below a band, metres; 0 if both are small."""
     total = largest = 0.0
     for k in range(2):
-        end, cells = outlines.ends[k, p], outlines.cells[k, p]
+        end = outlines.ends[k, p]
         low, high = band - BANDS_BESIDE, band + 1
         after = before = np.float32(0)
         for k4 in range(BANDS_BESIDE - 1):
@@ -158,13 +153,7 @@ def _step_at(grid: DepthGrid, outlines: Outlines, p: int, band: int, side: F8) -
         # A slope continues from one of the two sides.
         slope = max(sign * _slope_of(end, low), sign * _slope_of(end, high), 0.0)
         step = -_second(end, high, -sign) - _second(end, low, sign) - BANDS_BESIDE * slope
-        if step < SEGMENTATION.side_step_m / 2:
-            continue
-        narrow = band + 1 if sign > 0 else band - 3
-        outward = -1.0 if k == 0 else 1.0
-        if _is_free(grid, cells[narrow], outward, side) and _is_free(
-            grid, cells[narrow + 1], outward, side
-        ):
+        if step >= SEGMENTATION.side_step_m / 2:
             total, largest = total + step, max(largest, step)
     return total if largest >= SEGMENTATION.side_step_m else 0.0
 
@@ -180,20 +169,3 @@ def _second(end: F4, k: int, sign: float) -> float:
 def _slope_of(end: F4, k: int) -> float:
     """Return the mean difference of consecutive values, over four values."""
     return float((end[k + 3] + end[k + 2] - end[k + 1] - end[k]) / 4)
-
-
-@kernel(inner=True)
-def _is_free(grid: DepthGrid, cell: int, sign: float, side: F8) -> bool:
-    """Return whether no nearer surface is beside a cell, to the left (-1) or right (1)."""
-    inv_depth = grid.inverse_depth
-    rows, columns = inv_depth.shape
-    i, j = cell // columns, cell % columns
-    across = max(math.hypot(side[0], side[1]), 1e-6)
-    for step in range(1, SEGMENTATION.shadow_cells + 1):
-        y = i + round(sign * step * side[1] / across)
-        x = j + round(sign * step * side[0] / across)
-        if y < 0 or x < 0 or y >= rows or x >= columns:
-            return False
-        if inv_depth[y, x] - inv_depth[i, j] > grid.discontinuity:
-            return False
-    return True
