@@ -38,7 +38,6 @@ STEPS: dict[str, tuple[str, Any]] = {
     "width split": ("pipeline.split_at_width_changes", lambda *given: given[-1]),
     "learned merging": ("pipeline.learned.merge_learned", _nothing),
     "across occlusion": ("pipeline.merge_across_occluder", _nothing),
-    "contact boundary": ("pipeline.fill_contact_boundary", _nothing),
     "hole filling": ("pipeline.fill_holes", _nothing),
 }
 """Steps beyond the thesis, with what replaces each when it is left out."""

@@ -5,7 +5,7 @@ import pytest
 
 from shapecat.config import DetectionSettings
 from shapecat.detection.cleanup.context import add_context, measure_borders
-from shapecat.detection.cleanup.holes import fill_contact_boundary, fill_holes
+from shapecat.detection.cleanup.holes import fill_holes
 from shapecat.detection.cleanup.object_features import (
     OBJECT_FEATURES,
     Limits,
@@ -220,21 +220,6 @@ def test_image_border_is_where_samples_begin() -> None:
     assert _border_lines(grid) == (11, 99, 0, 177)
     inv_depth[11:20, 50:] = 0  # the top of an object
     assert _border_lines(grid) == (0, 99, 0, 177)
-
-
-def test_contact_boundary_joins_adjacent_object() -> None:
-    """Only cells that rise a little join it, and only one cell far."""
-    inv_depth = np.full((8, 8), 1.0, np.float32)
-    labels, plane_id = np.zeros((8, 8), np.int16), np.full((8, 8), -1, np.int8)
-    labels[:4], plane_id[:4] = 3, 1
-    height = np.zeros((8, 8), np.float32)
-    height[4:6, :5] = 0.005  # more than .6 of 6.5 mm
-    fill_contact_boundary(
-        DepthGrid(inv_depth, INTRINSICS, 1, DISCONTINUITY), HeightMap(plane_id, height), labels
-    )
-    assert (labels[4, :5] == 3).all()
-    assert (labels[4, 5:] == 0).all()
-    assert (labels[5:] == 0).all()
 
 
 def test_hole_is_filled_with_enclosing_object() -> None:

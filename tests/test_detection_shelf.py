@@ -147,7 +147,7 @@ def test_small_far_object_is_not_split(seed: int, label: int) -> None:
 @pytest.mark.parametrize("label", [25, 28])
 def test_small_plate_is_not_merged_with_small_box_below(label: int) -> None:
     """They touch along much of their outlines, but only the box stands on the board."""
-    assert overlap_in_shelf(53, label) > 0.7
+    assert overlap_in_shelf(53, label) > 0.6
 
 
 @pytest.mark.parametrize(("seed", "label"), [(280, 25), (290, 22)])

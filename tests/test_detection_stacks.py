@@ -243,7 +243,7 @@ def test_ball_on_can_with_hidden_base_is_separated() -> None:
     check([*shapes, box((0, -0.1, 0), (0.2, 0.03, 0.05))], [1, 2, 3], tilt_deg=20)
 
 
-MERGING = ("learned merging", "across occlusion", "contact boundary", "hole filling")
+MERGING = ("learned merging", "across occlusion", "hole filling")
 """The steps that merge segments of an object."""
 
 

@@ -24,7 +24,7 @@ from numpy.typing import ArrayLike
 from shapecat.arrays import F4, F8, I4, Bool, Records
 from shapecat.config import DetectionSettings
 from shapecat.detection.cleanup import structure
-from shapecat.detection.cleanup.holes import fill_contact_boundary, fill_holes
+from shapecat.detection.cleanup.holes import fill_holes
 from shapecat.detection.cleanup.object_features import measure_object_features
 from shapecat.detection.cleanup.structure import find_background, number_objects
 from shapecat.detection.depth_grid import DepthGrid, downsample
@@ -242,13 +242,12 @@ def _clean_up(
     oversegmentation: OverSegmentation,
     settings: DetectionSettings,
 ) -> Segmentation:
-    """Reject structure, fill contact boundaries and holes, and measure the objects."""
+    """Reject structure, fill holes, and measure the objects."""
     graph, labels, segments = oversegmentation
     features = measure_object_features(grid, model, oversegmentation, settings.max_range_m)
     rejected = find_background(segments, features, grid, settings, structure.load_trees())
     representatives: I4 = number_objects(segments.parent, rejected, labels, graph.spans)
     # From here on, the labels are those of objects.
-    fill_contact_boundary(grid, model.heights, labels)
     filled = np.zeros(labels.shape, np.uint8)
     fill_holes(grid, labels, representatives.size - 1, filled)
     if model.low_profile.any():  # it may lie at the level of its plane

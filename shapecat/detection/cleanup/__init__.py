@@ -1,1 +1,1 @@
-"""Clean-up: structure rejection, and filling of holes and contact boundaries."""
+"""Clean-up: structure rejection and hole filling."""

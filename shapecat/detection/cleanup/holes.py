@@ -1,4 +1,4 @@
-"""Hole filling: object cells at the level of their plane, as in contact boundaries and floors."""
+"""Hole filling: object cells at the level of their plane, such as the floors of bowls."""
 
 import numpy as np
 
@@ -12,44 +12,13 @@ from shapecat.detection.connected_components import (
     spans_of,
 )
 from shapecat.detection.depth_grid import DepthGrid
-from shapecat.detection.planes.height_map import FRINGE, HEIGHT_NOISE, MIN_HEIGHT_M, HeightMap
 from shapecat.jit import kernel, unset
 
-__all__ = ["fill_contact_boundary", "fill_holes"]
+__all__ = ["fill_holes"]
 
 BOUNDARY, IN_FRONT, CONTINUOUS = range(3)
 """Indices of the counts of a hole's sides with a label: all, those where the label is in front of
 the hole, and those where the surface continues."""
-
-
-@kernel
-def fill_contact_boundary(grid: DepthGrid, heights: HeightMap, labels: I4) -> None:
-    """Give the label of an object to adjacent cells that are slightly above its plane, in place.
-
-    ``labels`` (rows, columns) int16 are the objects, 0 elsewhere.
-    """
-    inv_depth, (plane_id, height) = grid.inverse_depth, heights
-    rows, columns = labels.shape
-    original, low = labels.copy(), np.zeros(columns, np.bool_)
-    min_height = np.float32(FRINGE * MIN_HEIGHT_M)
-    noise = np.float32(FRINGE * HEIGHT_NOISE)
-    for i in range(rows):
-        any_low = False
-        for j in range(np.uint64(columns)):  # few rows have any, and this vectorises
-            v = inv_depth[i, j]
-            low[j] = height[i, j] * v * v > min_height * v * v + noise
-            low[j] &= (plane_id[i, j] < 0) & (original[i, j] == 0)
-            any_low |= low[j]
-        for j in range(columns if any_low else 0):
-            if not low[j]:
-                continue
-            for di, dj in SIDES:
-                y, x = i + di, j + dj
-                if y < 0 or x < 0 or y >= rows or x >= columns or original[y, x] <= 0:
-                    continue
-                same_surface = abs(inv_depth[y, x] - inv_depth[i, j]) < grid.discontinuity
-                if same_surface and abs(plane_id[y, x]) == -plane_id[i, j]:
-                    labels[i, j] = original[y, x]
 
 
 @kernel
@@ -120,8 +89,7 @@ def _count_sides(
     """Count the sides of holes by label, (n, labels, 3), and in ``total`` (n,), and their cells.
 
     Cells without depth beside a hole count as part of its ``area`` (n,), and the label behind them
-    as its neighbour. The total of a hole that is not enclosed is made so large that no label has a
-    sufficient fraction of it.
+    as its neighbour. Sides that are open count in the total only.
     """
     inv_depth, jump = grid.inverse_depth, grid.discontinuity
     for i in range(len(spans)):
@@ -141,10 +109,7 @@ def _count_sides(
                     sides[p, label, BOUNDARY] += 1
                     sides[p, label, IN_FRONT] += neighbour_w > w + jump
                     sides[p, label, CONTINUOUS] += abs(neighbour_w - w) < jump
-                if label > 0 or missing:
-                    total[p] += 1
-                elif not inside[y, x]:
-                    total[p] += labels.size
+                total[p] += label > 0 or missing or not inside[y, x]
 
 
 @kernel(inline=True)
