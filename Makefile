@@ -26,8 +26,10 @@ setup: .venv/ready ## make the virtual environment .venv from the lock file
 	@$(PYTHON) -c 'import ensurepip' 2>/dev/null || $(call apt,python3-venv)
 	$(PYTHON) -m venv .venv
 	@echo "installing the locked packages, about two minutes and 2.5 GB"
-	$(BIN)/pip install --quiet --disable-pip-version-check --no-deps --require-hashes -r requirements.lock
+	$(BIN)/pip install --quiet --disable-pip-version-check --no-deps --no-compile --require-hashes \
+	    -r requirements.lock
 	$(BIN)/pip install --quiet --disable-pip-version-check --no-deps --editable .
+	@$(BIN)/python -m compileall -qq -j 0 .venv/lib || true # pip would compile on a single core
 	@$(BIN)/python -c 'import open3d' >/dev/null 2>&1 || $(call apt,$(OPEN3D_LIBRARIES)) \
 	    || echo "(only training on triangle meshes needs them)" >&2
 	@touch $@
