@@ -187,6 +187,23 @@ def check(shapes: list[Shape], objects: list[int], least: float = 0.85, **view: 
     return scene
 
 
+def test_boxes_reach_down_to_the_plane_where_objects_touch_it() -> None:
+    """The lowest millimetres cannot be told from the plane; a hidden base is not guessed."""
+    scene = check(
+        [table(), box((-0.2, 0, 0), (0.16, 0.14, 0.08)), can(-0.2, 0, 0.08, 0.03, 0.09),
+         box((0.15, -0.06, 0), (0.2, 0.05, 0.07)), box((0.15, 0.02, 0), (0.12, 0.04, 0.17))],
+        [1, 2, 3, 4],
+    )  # fmt: skip
+    bottoms = [
+        float(scene.up @ c.box.center - c.box.size[2] / 2 - scene.planes[0].offset)
+        for c in scene.candidates
+    ]
+    lower, front, hidden, upper = sorted(bottoms)
+    assert (lower, front) == pytest.approx((0, 0), abs=1e-6)
+    assert 0.02 < hidden < 0.07
+    assert upper == pytest.approx(0.08, abs=0.01)
+
+
 def test_separate_objects_on_plane_are_detected() -> None:
     """The plain case, with height, up direction, size and flags."""
     scene = check(

@@ -254,5 +254,6 @@ def _clean_up(
         filled |= model.low_profile & (labels > 0)
     plane_ids = segments.plane_id[representatives].astype(np.int64) - 1
     plane_ids[0] = 0
-    measured = measure_objects(grid, labels, segments, representatives, features, model.up)
+    offsets = model.planes["offset"][plane_ids[1:]]
+    measured = measure_objects(grid, labels, segments, representatives, features, model.up, offsets)
     return Segmentation(model, labels, filled, plane_ids, measured)

@@ -65,10 +65,12 @@ def measure_objects(
     representatives: I4,
     features: Records,
     up: F8,
+    plane_offsets: F8,
 ) -> ObjectMeasurements:
     """Measure the objects.
 
-    The box is a `shapecat.geometry.upright_box` around the outermost cells.
+    The box is a `shapecat.geometry.upright_box` around the outermost cells. Where an object touches
+    its plane, the box reaches down to it.
 
     Parameters
     ----------
@@ -76,11 +78,14 @@ def measure_objects(
     representatives : (n + 1,) from `number_objects`.
     features : (n + 1,) of the segments, from `measure_object_features`.
     up : (3,) unit vector, view frame.
+    plane_offsets : (n,) ``up @ p`` for the points p of the plane below each object, metres.
     """
     roots = representatives[1:]
     boxes = _blank_boxes(roots.size)
     _measure_boxes(grid, labels, gravity_rotation(up), boxes)
     supported_by, support_m = _find_supports(segments, representatives, boxes, up)
+    touches = segments.statistics["plane_contact"][roots] >= MIN_LINKS
+    _extend_to_planes(boxes, touches & (supported_by == 0), up, plane_offsets)
     objects = features[roots]
     segment, visibility = objects["segment"], objects["visibility"]
     cells_at_limit = np.rint(objects["surroundings"]["range_limit"] * visibility["cells"])
@@ -92,6 +97,17 @@ def measure_objects(
         cells_at_limit >= OUTPUT.min_cells_at_limit,
         smallest_object_at(grid, visibility["depth_m"]),
     )
+
+
+def _extend_to_planes(boxes: Boxes, standing: Bool, up: F8, plane_offsets: F8) -> None:
+    """Extend boxes down to the planes, in place: the lowest millimetres count as the plane.
+
+    ``standing`` (n,) are the objects that touch their plane.
+    """
+    gaps = boxes.center @ up - boxes.size[:, 2] / 2 - plane_offsets
+    gaps[~standing | (gaps < 0) | (gaps > OUTPUT.lifted_m)] = 0
+    boxes.size[:, 2] += gaps
+    boxes.center[:] -= np.outer(gaps / 2, up)
 
 
 @kernel
