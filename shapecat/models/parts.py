@@ -156,6 +156,7 @@ def _pairs(
     if model is None:
         return
     graph, labels, segments = oversegment(grid, model, split_seeds=split_seeds)
+    # Pairs that this rule merges are not left to the trees.
     merge_across_occluder(segments, grid, graph.normal, labels)
     counts = count_labels(pixel_labels, labels, grid)
     view_geometry, yielded = ViewGeometry(grid.intrinsics.fx, model.up), set()

@@ -83,7 +83,7 @@ def find_background(
     background |= cells < CLEANUP.tiny_share * smallest_object_at(grid, depths)
     background |= segment["width_m"] > settings.max_size_m
     background |= segment["top_m"] > settings.max_height_m - CUT_OFF_M
-    # Large and mostly outside the image: furniture, which the trees were not shown.
+    # Large and cut off by the image border: an arm or furniture; the trees keep some.
     background |= large & (merged["surroundings"]["image_border"] > CLEANUP.cut_share)
     rejected = np.zeros(len(features), np.bool_)
     rejected[roots] = background

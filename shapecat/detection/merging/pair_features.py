@@ -98,7 +98,8 @@ PAIR_FEATURES = np.dtype(
     align=True,
 )
 """The features of two segments, the smaller one first; all are float32, lengths in metres or
-ratios. The trees index them in this order."""
+ratios. The trees index them in this order. One record serves pair after pair, so that each field is
+written for every pair."""
 
 
 class ViewGeometry(NamedTuple):

@@ -1,4 +1,4 @@
-"""Supporting planes: up direction, RANSAC, parallel planes, planes with objects, heights."""
+"""Supporting planes: up direction, parallel planes, planes with objects, heights."""
 
 import numpy as np
 

@@ -49,7 +49,7 @@ def find_horizontal_planes(
     ``up`` is a unit vector (3,), sensor frame; ``trials`` are from `draw_trials`.
     """
     samples, heights = level_samples(points, up)
-    planes = fit_horizontal_planes(samples, heights, grid.intrinsics, up, trials)
+    planes = fit_peaks(samples, heights, grid.intrinsics, up, trials)
     candidates = _measure_candidates(grid, samples, planes)
     if len(candidates) > 1:
         common = _common_up(candidates)
@@ -90,10 +90,10 @@ def _refit_parallel(intrinsics: PinholeIntrinsics, inliers: DepthSamples, up: F8
     return parallel
 
 
-def fit_horizontal_planes(
+def fit_peaks(
     samples: DepthSamples, heights: F4, intrinsics: PinholeIntrinsics, up: F8, trials: F8
 ) -> list[F8]:
-    """Return the horizontal planes, as coefficients a, b, c (3,), most samples first.
+    """Fit a plane to each peak of the heights; return coefficients a, b, c (3,) of those found.
 
     Parameters
     ----------
@@ -103,7 +103,6 @@ def fit_horizontal_planes(
     """
     planes: list[F8] = []
     rest = np.stack([samples.j, samples.i, samples.inverse_depth, heights])
-    # (3) one plane candidate for each peak in height
     for _ in range(MAX_PEAKS):
         if rest.shape[1] < MIN_SAMPLES:
             break
@@ -113,7 +112,6 @@ def fit_horizontal_planes(
         size = at_peak.size
         if size < MIN_SAMPLES:
             break
-        # (4) refine the plane, and drop the samples on it
         offset = float(np.partition(at_peak, size // 2)[size // 2])
         if offset > -PLANES.margin_m:
             continue
