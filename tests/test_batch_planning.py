@@ -21,7 +21,7 @@ from shapecat.batch.finding_urls import _combined_key
 from shapecat.batch.ledger import Ledger, Outcome
 from shapecat.batch.manifest import Entry, Manifest, RemoteManifest, State
 from shapecat.batch.naming import existing_names, name_folders
-from shapecat.batch.plans import parse_shard, part_of, plan_batch
+from shapecat.batch.plans import _input_key, parse_shard, part_of, plan_batch
 from shapecat.batch.runs import _reporter, process_here, process_on
 from shapecat.batch.sources import Source
 from shapecat.batch.storage import Location, content_key
@@ -506,6 +506,19 @@ def test_batch_notices_replaced_recording_with_same_times(source: Path, tmp_path
     assert key() != before
 
 
+def test_key_of_bag_covers_all_its_files(tmp_path: Path) -> None:
+    """A bag whose last part was copied again, or arrived later, had complete results."""
+    bag = tmp_path / "bag"
+    bag.mkdir()
+    keys = []
+    for name, content in (("bag_0", b"one"), ("bag_1", b"three"), ("bag_1", b"seventy")):
+        (bag / f"{name}.mcap").write_bytes(content)
+        keys.append(_input_key(bag))
+
+    assert [size for _, size in keys] == [3, 8, 10]
+    assert len({key for key, _ in keys}) == 3
+
+
 @pytest.mark.parametrize(
     ("noted", "there", "status"),
     [
@@ -640,6 +653,7 @@ def test_interrupted_overwriting_continues(
     assert overwritten(source.parent, out, most=1) == {"lab": "new", "other": "new"}
 
     assert overwritten(source.parent, out, most=1, discard_labels=True)["lab"] == "new"
+    assert overwritten(source.parent, out, most=1, discard_labels=True)["lab"] == "complete"
     assert overwritten(source.parent, out, most=1, frame_range=second)["lab"] == "new"
     for _ in range(2):  # interrupted again, before the next is complete
         assert overwritten(source.parent, out, most=1, frame_range=second)["lab"] == "complete"
@@ -843,28 +857,58 @@ def test_run_stores_absolute_path(source: Path, monkeypatch: pytest.MonkeyPatch)
 
 
 @pytest.mark.parametrize(
-    "option",
+    ("option", "model_id", "other"),
     [
-        {"topics": ("/front",)},
-        {"frame_range": FrameRange(start_s=1.5)},
-        {"frame_range": FrameRange(end_s=2.5)},
-        {"frame_range": FrameRange(every=3)},
-        *({"model": Path("mine.npz")}, {"settings": Settings(seed=3)}),
+        ({"topics": ("/front",)}, "m1", True),
+        ({"up": "imu"}, "m1", True),
+        ({"fixed_frame": "odom"}, "m1", True),
+        ({"color": ""}, "m1", True),
+        ({"frame_range": FrameRange(start_s=1.5)}, "m1", True),
+        ({"frame_range": FrameRange(end_s=2.5)}, "m1", True),
+        ({"frame_range": FrameRange(every=3)}, "m1", True),
+        ({"settings": Settings(seed=3)}, "m1", True),
+        ({"settings": with_overrides(Settings(), ["detection.max_range_m=1.5"])}, "m1", True),
+        ({}, "m2", True),  # trained again, and saved under the same name
+        ({"model": Path("copy.npz")}, "m1", False),
+        ({"model": Path("copy.npz")}, "m2", True),
+    ],
+)
+@pytest.mark.parametrize(
+    ("named", "model", "place"),
+    [
+        ("lab.mcap", None, "memory://work"),
+        ("lab.mcap", Path("mine.npz"), "memory://work"),
+        ("lab.mcap", Path("mine.npz"), "out"),
+        (".", None, "out"),
     ],
 )
 def test_other_frames_model_or_settings_are_other_work(
-    source: Path, monkeypatch: pytest.MonkeyPatch, option: dict[str, Any]
+    source: Path,
+    monkeypatch: pytest.MonkeyPatch,
+    option: dict[str, Any],
+    model_id: str,
+    *,
+    other: bool,
+    named: str,
+    model: Path | None,
+    place: str,
 ) -> None:
-    """Results at a URL are told apart by this key alone: other ones would be kept."""
-    model = SimpleNamespace(model_id="mine")
-    monkeypatch.setattr("shapecat.batch.plans.load_model", lambda path: model if path else MODEL)
-    out = f"memory://work-{next(iter(option))}"
-    keys = set()
-    for job in (Job(Path(), Path()), Job(Path(), Path(), **option)):
-        with plan_batch(job, [str(source)], out) as batch:
-            keys |= {task.work for task in batch.tasks}
+    """Results at a URL, and those of an interrupted --overwrite, are told apart by this key alone.
 
-    assert len(keys) == 2
+    Other results would be kept; the same model under another name makes the same.
+    """
+    monkeypatch.chdir(source.parent)
+    (source.parent / "other.mcap").write_bytes(b"another")
+    first = Job(Path(), Path(), model=model)
+    keys = set()
+    for job, content in ((first, "m1"), (replace(first, **option), model_id)):
+        loaded = SimpleNamespace(model_id=content)
+        monkeypatch.setattr("shapecat.batch.plans.load_model", lambda _path, found=loaded: found)
+        with plan_batch(job, [named], place) as batch:
+            keys |= {task.work for task in batch.tasks}
+            assert {task.job.model_id for task in batch.tasks} == {content}
+
+    assert len(keys) == 1 + other
 
 
 INFO: Mapping[str, Any] = {"size": 7, "ETag": "e1", "mtime": 1.5}
