@@ -87,6 +87,17 @@ def test_unreadable_file_is_not_skipped(source: Path, monkeypatch: pytest.Monkey
     assert found.skipped == 1
 
 
+def test_recordings_are_known_by_their_first_bytes(tmp_path: Path) -> None:
+    """A user who gives a recording any name would miss it among the others."""
+    starts = {"a": b"\x89MCAP0\r\n", "b": b"#ROSBAG V2.0\n", "c": b"SQLite format 3\0"}
+    for name, content in {**starts, "d": b"SQLite", "e": b"MCAP", "f.mcap": b""}.items():
+        (tmp_path / name).write_bytes(content)
+    found = find_recordings(sorted(map(str, tmp_path.iterdir())))
+
+    assert [kept.stem for kept in found.sources] == ["a", "b", "c", "f"]
+    assert found.skipped == 2
+
+
 def test_unreadable_folder_does_not_end_search(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
 ) -> None:
@@ -333,6 +344,34 @@ def test_bag_is_the_same_recording_through_links_and_within(
         assert (source.stem, source.parent, Path(source.path).resolve()) == ("walk", "data", bag)
 
 
+@pytest.mark.parametrize("way", ["link", "folder", "link to folder", "here"])
+def test_recording_is_named_by_its_link(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, way: str
+) -> None:
+    """git-annex and DVC store a file under its digest, and put a link with its name in place."""
+    store, links = tmp_path / "store", tmp_path / "links"
+    for folder in (store, links):
+        folder.mkdir()
+    for stem, digest in (("monday", "3f9c0a"), ("night.bag", "b77e1d")):
+        (store / f"{digest}.bag").write_bytes(b"#ROSBAG V2.0\n" + digest.encode())
+        (links / f"{stem}.bag").symlink_to(Path("..", "store", f"{digest}.bag"))
+    (tmp_path / "again").symlink_to(links)
+    monkeypatch.chdir(links)
+    named = {
+        "link": [str(links / "monday.bag"), str(links / "night.bag.bag")],
+        "folder": [str(links)],
+        "link to folder": [str(tmp_path / "again")],
+        "here": ["."],
+    }[way]
+
+    found = find_recordings(named).sources
+
+    assert [source.stem for source in found] == ["monday", "night.bag"]
+    assert [Path(source.path).stem for source in found] == ["monday", "night.bag"]
+    assert [Path(source.path).resolve().stem for source in found] == ["3f9c0a", "b77e1d"]
+    assert find_recordings(named[:1]).sources[0] == found[0]
+
+
 def test_looping_links_are_followed_once(tmp_path: Path) -> None:
     """Two links to their own folder made the search endless, one gave paths of 40 links."""
     (tmp_path / "z").mkdir()
@@ -359,11 +398,12 @@ def test_recording_found_under_several_names_is_processed_once(tmp_path: Path) -
     (other / "linked.mcap").symlink_to(data / "b.mcap")
     named = [data, data / "a.mcap", data / ".." / "data" / "a.mcap", other]
 
-    found = [Path(source.path) for source in find_recordings(list(map(str, named))).sources]
+    found = find_recordings(list(map(str, named))).sources
 
-    assert sorted(path.resolve() for path in found) == [
+    assert sorted(Path(source.path) for source in found) == [
         data / "a.mcap", data / "b.mcap", other / "a.mcap"
     ]  # fmt: skip
+    assert sorted(source.stem for source in found) == ["a", "a", "b"]
 
 
 def partial(folder: Path, run: RunInfo) -> None:
@@ -1166,7 +1206,7 @@ def test_recording_of_a_batch_keeps_its_name_alone(tmp_path: Path) -> None:
     assert existing_names(sources, str(out), {name}) == {}
 
 
-@pytest.mark.parametrize("known_from", ["all", "1-of-2", "relative path", "run.json"])
+@pytest.mark.parametrize("known_from", ["all", "1-of-2", "link", "relative path", "run.json"])
 def test_run_at_url_keeps_folder_when_recording_of_same_name_is_added(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, known_from: str
 ) -> None:
@@ -1177,11 +1217,13 @@ def test_run_at_url_keeps_folder_when_recording_of_same_name_is_added(
         (tmp_path / day / "lab.mcap").write_bytes(day.encode())
     out, path = f"memory://added-{known_from[:3]}", str(tmp_path / "monday" / "lab.mcap")
     noted = known_from in {"all", "1-of-2"}
+    (tmp_path / "linked").symlink_to(tmp_path)
     run = {} if noted else run_info(input={"path": path})
     (Location(out) / "lab" / "run.json").write(json.dumps(run).encode())
     monkeypatch.chdir(tmp_path / "tuesday")  # where the relative path leads to the other one
     if known_from != "run.json":
-        recording = "lab.mcap" if known_from == "relative path" else path
+        through_link = str(tmp_path / "linked" / "monday" / "lab.mcap")
+        recording = {"relative path": "lab.mcap", "link": through_link}.get(known_from, path)
         with RemoteManifest(out, known_from if noted else "") as manifest:
             manifest.record([Entry("lab", recording, "complete")])
     days = [str(tmp_path / day / "lab.mcap") for day in ("tuesday", "monday")]
