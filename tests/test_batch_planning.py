@@ -14,6 +14,7 @@ from typing import Any, get_args
 
 import fsspec
 import pytest
+from xxhash import xxh3_128_hexdigest
 
 from shapecat.batch import claims
 from shapecat.batch.finding import find_recordings
@@ -275,6 +276,24 @@ def test_only_files_of_a_bag_count_as_its_content(tmp_path: Path) -> None:
     (bag / "bag_1.db3.zstd").write_bytes(b"longer than before")
     assert not unchanged(known["files"], bag)
     assert not same_content(known, bag, lambda: content_digest(bag))
+
+
+def test_digest_covers_the_whole_recording(tmp_path: Path) -> None:
+    """Labels would be drawn on another recording that begins in the same way."""
+    path = tmp_path / "lab.mcap"
+    for content in (b"short", b"short\0", bytes(range(256)) * 10_000 + b"end"):
+        path.write_bytes(content)
+        assert content_digest(path) == f"xxh3-128:{xxh3_128_hexdigest(content)}"
+
+    digests = set[str]()
+    for parts in ({"a_0": b"12", "a_1": b"3"}, {"a_0": b"1", "a_1": b"23"},
+                  {"b_0": b"12", "b_1": b"3"}, {"a_0": b"3", "a_1": b"12"}):  # fmt: skip
+        bag = tmp_path / f"bag {len(digests)}"
+        bag.mkdir()
+        for name, content in parts.items():
+            (bag / f"{name}.mcap").write_bytes(content)
+        digests.add(content_digest(bag))
+    assert len(digests) == 4
 
 
 @pytest.mark.parametrize("whole", [True, False])
