@@ -245,10 +245,14 @@ def test_workers_end_when_their_parent_is_killed(tmp_path: Path) -> None:
 
 
 def test_progress_arrives_and_missing_receivers_are_ignored(tmp_path: Path) -> None:
+    """A name has up to 255 bytes, here six in JSON each: a cut message would be dropped."""
     received: SimpleQueue[Any] = SimpleQueue()
+    longest = [os.fsdecode(b"\xff" * 255), "perceive", 10**12, 10**13]
+    messages = [["kitchen", 3], longest, ["厨房" * 42, "track", 0, None], ["hall", 4]]
     with ProgressReceiver(received.put) as receiver:
-        send_progress(receiver.address, ["kitchen", 3])
-        assert received.get(timeout=5) == ["kitchen", 3]
+        for message in messages:
+            send_progress(receiver.address, message)
+        assert [received.get(timeout=5) for _ in messages] == messages
     send_progress(receiver.address, "nobody listens")
     send_progress(str(tmp_path / "no such place"), "nor here")
 
