@@ -233,23 +233,106 @@ def test_nearer_view_with_flipped_yaw_is_alike_up_to_noise(pixels: int, *, alike
     assert _similar(sights[1], sights[0]) == alike
 
 
-@pytest.mark.parametrize(("before", "now"), [(40, 46), (46, 40), (40, 40)])
-def test_object_with_a_part_more_or_less_is_described_again(before: int, now: int) -> None:
-    """A handle that comes into view, or leaves it, is another shape in a box as large as before."""
-    sights = []
-    for k, width in enumerate((before, now)):
-        mask = np.zeros((480, 640), np.bool_)
-        mask[200:240, 300 : 300 + width] = True
-        depth = np.where(mask, 1.0, 1.3).astype(np.float32)
-        box = Box(np.array([0, 0, 1.0]), np.array([0.1, 0.07, 0.05]), np.array([0, 0, 0, 1.0]))
-        found = Candidate(np.flatnonzero(mask), box, 0, None, 0.0, False, False)
-        frame = replace(blank(k), depth=depth)
-        sights.append(view_object(frame, IDENTITY, found, np.array([0, -1.0, 0]), 0.03))
-    assert _similar(sights[1].summary, sights[0].summary)
-    described: Any = None
-    (repeat,) = find_repeats(sights[1:], [KeyView(sights[0], described)])
+PLACE, EYE = np.array([0.7, -0.4, 0.5]), np.array([0.1, 0.3, 1.3])
+"""An object and the sensor, in the fixed frame."""
+LOOK = Rotation.from_euler("xyz", [-130, 12, 35], degrees=True)
 
-    assert (repeat is not None) == (before == now)
+
+def summary_of(
+    *,
+    eye: Any = EYE,
+    look: Rotation = LOOK,
+    moved: Any = (0, 0, 0),
+    up: Any = (0, 0, 1),
+    sides: Any = (0.2, 0.12, 0.3),
+    height_m: float = 0.15,
+    pixels: int = 1000,
+    posed: bool = True,
+    **flags: bool,
+) -> Any:
+    """Return the summary of an object; ``moved`` and ``up`` are vectors in the fixed frame."""
+    box = Box(look.inv().apply(PLACE + moved - eye), np.array(sides), np.array([0, 0, 0, 1.0]))
+    flags = {"touches_border": False, "occluded": False, **flags}
+    found = Candidate(np.arange(pixels), box, 0, None, 0.0, **flags)
+    pose = Pose(look.as_matrix(), eye) if posed else None
+    return view_object(rendered(), pose, found, look.inv().apply(up), height_m).summary
+
+
+def circled(*turn_deg: float) -> dict[str, Any]:
+    """Return the sensor turned about the object, which stays where it is in the image."""
+    turn = Rotation.from_rotvec(turn_deg, degrees=True)
+    return {"eye": PLACE + turn.apply(EYE - PLACE), "look": turn * LOOK}
+
+
+@pytest.mark.parametrize(
+    ("changes", "alike"),
+    [
+        *(({"look": Rotation.from_rotvec(pan, degrees=True) * LOOK}, True)
+          for pan in ([25, 0, 0], [0, -25, 0], [0, 0, 25])),
+        *((circled(*turn), True) for turn in ((5, 0, 0), (0, -5, 0), (0, 0, 5))),
+        *((circled(*turn), False) for turn in ((15, 0, 0), (0, -15, 0), (0, 0, 15))),
+        *(({"eye": EYE + share * (PLACE - EYE), "pixels": pixels}, alike)
+          for share, pixels, alike in ((0.04, 1085, True), (-0.04, 925, True),
+                                       (0.06, 1132, False), (-0.06, 890, False))),
+        *(({"moved": sign * 0.01 * m * axis}, m < 1.5)
+          for m, sign in ((1.4, 1), (1.6, 1), (1.6, -1)) for axis in np.eye(3)),
+        *(({"up": (np.sin(a), 0, np.cos(a))}, abs(a) < 0.03) for a in (0.025, 0.045, -0.045)),
+        *(({"up": (0, np.sin(a), np.cos(a))}, abs(a) < 0.03) for a in (0.025, 0.045, -0.045)),
+        *(({"sides": np.add((0.2, 0.12, 0.3), change * axis)}, abs(change) < 0.02)
+          for change in (0.018, 0.022, -0.022) for axis in np.eye(3)),
+        *(({"height_m": 0.15 + change}, abs(change) < 0.01) for change in (0.009, 0.011, -0.011)),
+        *(({"pixels": pixels}, 750 <= pixels <= 1250) for pixels in (1240, 1260, 760, 740)),
+        ({"touches_border": True}, False),
+        ({"occluded": True}, False),
+    ],
+)  # fmt: skip
+def test_views_are_alike_up_to_noise_in_the_fixed_frame(
+    changes: dict[str, Any], *, alike: bool
+) -> None:
+    """A sensor that pans sees the same side; one that circles an object sees another one."""
+    assert _similar(summary_of(**changes), summary_of()) == alike
+
+
+def test_views_of_another_kind_are_not_alike() -> None:
+    """Nor is one cut by the image border like a hidden one, or one without a pose like others."""
+    start: dict[str, Any] = {"eye": np.zeros(3), "look": Rotation.identity()}
+    assert not _similar(summary_of(touches_border=True), summary_of(occluded=True))
+    assert _similar(summary_of(**start, posed=False), summary_of(**start, posed=False))
+    assert not _similar(summary_of(**start, posed=False), summary_of(**start))
+
+
+@pytest.mark.parametrize(
+    ("before", "now", "repeated"),
+    [
+        ((40,), 46, None),
+        ((46,), 40, None),
+        ((40, 40), 40, 1),  # the newest, which may differ least
+        ((40, 40, 46), 40, 1),
+        ((40, 46, 46), 40, 0),  # a mask may flicker
+        ((40, 46, 46, 46), 40, None),  # each comparison takes time
+    ],
+)
+def test_object_with_a_part_more_or_less_is_described_again(
+    before: tuple[int, ...], now: int, repeated: int | None
+) -> None:
+    """A handle that comes into view, or leaves it, is another shape in a box as large as before."""
+    *earlier, view = (view_of_width(k, width) for k, width in enumerate((*before, now)))
+    assert all(_similar(each.summary, view.summary) for each in earlier)
+    described: Any = None
+    (repeat,) = find_repeats([view], [KeyView(each, described) for each in earlier])
+
+    assert (repeat.key.view.frame.index if repeat else None) == repeated
+
+
+def view_of_width(index: int, width: int) -> Any:
+    """Return the view of an object of this width, pixels, in a frame of its own."""
+    mask = np.zeros((480, 640), np.bool_)
+    mask[200:240, 300 : 300 + width] = True
+    depth = np.where(mask, 1.0, 1.3).astype(np.float32)
+    box = Box(np.array([0, 0, 1.0]), np.array([0.1, 0.07, 0.05]), np.array([0, 0, 0, 1.0]))
+    found = Candidate(np.flatnonzero(mask), box, 0, None, 0.0, False, False)
+    frame = replace(blank(index), depth=depth)
+    return view_object(frame, IDENTITY, found, np.array([0, -1.0, 0]), 0.03)
 
 
 ASIDE = 4 / KINECT.camera.fx
