@@ -302,14 +302,17 @@ def test_kill_between_revised_tables_is_repaired(
 
 
 def tables(
-    up: Any, *, given: Any = None, rotation: Any = None, offsets: Any = None
+    up: Any, *, given: Any = None, rotation: Any = None, offsets: Any = None, every: int = 1
 ) -> list[tuple[pa.Table, pa.Table]]:
-    """Return tables of one topic with a plane per frame, none where the offset is NaN."""
+    """Return tables of one topic with a plane per frame, none where the offset is NaN.
+
+    ``every`` is the step between the numbers of the frames.
+    """
     n = len(up)
     offsets = np.full(n, -0.9) if offsets is None else offsets
     columns = {
         "topic": ["/d"] * n,
-        "frame": list(range(n)),
+        "frame": [every * k for k in range(n)],
         "stamp_ns": [EPOCH + k * PERIOD for k in range(n)],
         "up": [list(map(float, vector)) for vector in up],
         "up_given": [None] * n if given is None else [list(map(float, v)) for v in given],
@@ -317,11 +320,24 @@ def tables(
     }
     frames = pa.table({k: pa.array(v, FRAMES.field(k).type) for k, v in columns.items()})
     level = np.flatnonzero(np.isfinite(offsets))
-    data = {"topic": ["/d"] * len(level), "frame": level, "offset": offsets[level]}
+    data = {"topic": ["/d"] * len(level), "frame": every * level, "offset": offsets[level]}
     planes = pa.table({k: pa.array(v, PLANES.field(k).type) for k, v in data.items()})
     return [
         (frames[:9], planes.filter(pa.array(level < 9))),
         (frames[9:], planes.filter(pa.array(level >= 9))),
+    ]
+
+
+def in_turn(one: Any, other: Any) -> list[tuple[pa.Table, pa.Table]]:
+    """Return tables with the frames of two cameras in turn, as they were recorded."""
+    return [
+        tuple(
+            pa.concat_tables([a, b.set_column(0, "topic", pa.array(["/e"] * len(b)))]).take(
+                pa.array(np.arange(2 * len(a)).reshape(2, -1).T.ravel())
+            )
+            for a, b in zip(*parts, strict=True)
+        )
+        for parts in zip(one, other, strict=True)
     ]
 
 
@@ -335,9 +351,9 @@ def test_still_camera_takes_up_from_nearby_frames() -> None:
     up, offsets = leaning(np.full(20, 35.0)), np.full(20, -0.9)
     up[6], up[13], offsets[13], offsets[17] = leaning([80.0])[0], (0, -1, 0), np.nan, -0.5
 
-    chosen = frames_to_revise(tables(up, offsets=offsets))
+    chosen = frames_to_revise(tables(up, offsets=offsets, every=3))
 
-    assert list(chosen) == [("/d", 6), ("/d", 13), ("/d", 17)]
+    assert list(chosen) == [("/d", 18), ("/d", 39), ("/d", 51)]
     for revision in chosen.values():
         np.testing.assert_allclose(revision.up, leaning([35.0])[0], atol=1e-6)
         assert revision.up_given is None
@@ -359,15 +375,34 @@ def test_frames_are_compared_within_each_camera() -> None:
     """Two cameras that lean differently would revise each other's frames."""
     one, other = (leaning(np.full(20, degrees)) for degrees in (35.0, 10.0))
     one[6], other[3] = leaning([80.0])[0], leaning([60.0])[0]
-    both = [
-        tuple(
-            pa.concat_tables([a, b.set_column(0, "topic", pa.array(["/e"] * len(b)))])
-            for a, b in zip(*parts, strict=True)
-        )
-        for parts in zip(tables(one), tables(other), strict=True)
-    ]
+    shelf = np.where(np.arange(20) == 12, -0.9, -0.4)
+    both = in_turn(tables(one), tables(other, offsets=shelf, every=5))
 
-    assert list(frames_to_revise(both)) == [("/d", 6), ("/e", 3)]
+    assert list(frames_to_revise(both)) == [("/d", 6), ("/e", 15), ("/e", 60)]
+
+
+def test_rows_of_each_camera_are_read_apart() -> None:
+    """A robot with two cameras writes their frames in turn, with numbers of their own."""
+    rng, n = np.random.default_rng(5), 20
+    columns: list[Any] = [
+        {
+            "up": rng.normal(size=(n, 3)),
+            "given": rng.normal(size=(n, 3)),
+            "rotation": rng.normal(size=(n, 3, 3)),
+            "offsets": rng.normal(size=n),
+        }
+        for _ in range(2)
+    ]
+    one, other = tables(**columns[0], every=3), tables(**columns[1], every=7)
+    streams = _streams(in_turn(one, other))
+
+    for topic, every, expected in zip(("/d", "/e"), (3, 7), columns, strict=True):
+        found = streams[topic]
+        assert found.frames.tolist() == [every * k for k in range(n)]
+        assert found.stamps_ns.tolist() == [EPOCH + k * PERIOD for k in range(n)]
+        for name in ("up", "given", "rotation"):
+            np.testing.assert_allclose(getattr(found, name), expected[name], rtol=1e-6)
+        np.testing.assert_allclose(np.concatenate(found.offsets), expected["offsets"], rtol=1e-6)
 
 
 def test_given_up_is_tested_for_each_camera(
@@ -421,10 +456,11 @@ def test_poses_relate_up_directions_of_moving_camera() -> None:
     up[4], offsets[8] = (1, 0, 0), np.nan
     offsets[14] = -0.5  # a shelf, which a moving camera may well see
 
-    chosen = frames_to_revise(tables(up, rotation=rotation, offsets=offsets))
+    chosen = frames_to_revise(tables(up, rotation=rotation, offsets=offsets, every=2))
 
-    assert [frame for _, frame in chosen] == [4, 8]
-    np.testing.assert_allclose(chosen["/d", 4].up, truth[4], atol=1e-5)
+    assert [frame for _, frame in chosen] == [8, 16]
+    np.testing.assert_allclose(chosen["/d", 8].up, truth[4], atol=1e-5)
+    np.testing.assert_allclose(chosen["/d", 16].up, truth[8], atol=1e-5)
 
 
 def test_frames_without_planes_do_not_decide_up_in_fixed_frame() -> None:
@@ -454,10 +490,11 @@ def test_frame_with_same_given_up_is_not_revised() -> None:
     offsets[[5, 12]] = np.nan
     given[12] = leaning([65.0])[0]
 
-    chosen = frames_to_revise(tables(leaning(np.full(20, 35.0)), given=given, offsets=offsets))
+    up = leaning(np.full(20, 35.0))
+    chosen = frames_to_revise(tables(up, given=given, offsets=offsets, every=2))
 
-    assert [frame for _, frame in chosen] == [12]
-    before = chosen["/d", 12].up_given
+    assert [frame for _, frame in chosen] == [24]
+    before = chosen["/d", 24].up_given
     assert before is not None
     np.testing.assert_allclose(before, given[12], atol=1e-6)
 
@@ -471,7 +508,7 @@ def read(monkeypatch: pytest.MonkeyPatch) -> list[Any]:
         for topic in (TOPIC, "/other"):
             n, at = len(given), EPOCH + k * PERIOD
             pose, sensor = (Pose(np.eye(3), np.array([n, 0, z])) for z in (0.0, 1.0))
-            frame = Frame(topic, k, at, at + 9 + n, "optical", depth, camera)
+            frame = Frame(topic, 3 * k + 2, at, at + 9 + n, "optical", depth, camera)
             given.append(
                 (replace(frame, frame_from_sensor=sensor), f"image {n}", (None, None, pose))
             )
@@ -491,17 +528,17 @@ def look_again(revisions: dict[Any, Revision]) -> list[Any]:
 def test_revised_frame_is_fused_with_the_frames_before_it() -> None:
     """With other revised frames only, it would be noisier than the frames beside it."""
     up = np.array([0, -1, 0], np.float32)
-    inputs = [one for _, one in look_again({(TOPIC, k): Revision(up, None) for k in (1, 4)})]
+    inputs = [one for _, one in look_again({(TOPIC, k): Revision(up, None) for k in (5, 14)})]
 
-    assert [(one.frame.topic, one.frame.index) for one in inputs] == [(TOPIC, 1), (TOPIC, 4)]
+    assert [(one.frame.topic, one.frame.index) for one in inputs] == [(TOPIC, 5), (TOPIC, 14)]
     earlier = [[(each.frame.topic, each.frame.index) for each in one.earlier] for one in inputs]
-    assert earlier == [[(TOPIC, 0)], [(TOPIC, 3), (TOPIC, 2)]]
+    assert earlier == [[(TOPIC, 2)], [(TOPIC, 11), (TOPIC, 8)]]
 
 
 def test_revised_frame_keeps_its_pose_time_and_image(read: list[Any]) -> None:
     """Its objects would leave their tracks, or lose their masks on the colour image."""
     ups = np.eye(3, dtype=np.float32)
-    chosen = {("/other", 2): Revision(ups[0], ups[1]), (TOPIC, 5): Revision(ups[2], None)}
+    chosen = {("/other", 8): Revision(ups[0], ups[1]), (TOPIC, 17): Revision(ups[2], None)}
 
     found = look_again(chosen)
 

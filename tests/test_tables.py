@@ -32,6 +32,7 @@ from shapecat.runs.run_info import (
 )
 from shapecat.runs.tables.masks import mask_columns, read_masks, read_nearest_masks
 from shapecat.runs.tables.reading import (
+    keys_of,
     opened,
     read_row_groups,
     read_rows,
@@ -77,11 +78,11 @@ def detection(k: int, *, points: int = 4) -> Detection:
     return Detection(candidate, gas, np.arange(5.0) + k, posterior, 0.5 + k, 0.001)
 
 
-def perception(index: int, count: int) -> Perception:
+def perception(index: int, count: int, topic: str = "/depth") -> Perception:
     scene = Scene(np.array([0, -1, 0]), (plane(0), plane(0.3)), ())
     found = tuple(detection(k) for k in range(count))
     seconds = {"detect": 0.01, "describe": 0.002}
-    return Perception("/depth", index, 1000 + index, "cam", scene, found, seconds)
+    return Perception(topic, index, 1000 + index, "cam", scene, found, seconds)
 
 
 def write_run_tables(folder: Path, counts: list[int], pose: Pose | None = None) -> None:
@@ -187,6 +188,34 @@ def test_second_look_without_result_does_not_replace_frame(
     assert read["frames"]["revised"].to_pylist() == [False, True, False, False]
     assert read["detections"]["frame"].to_pylist() == [0, 0, 1, 1, 1, 3, 3]
     assert read["planes"]["frame"].to_pylist() == [0, 0, 1, 1, 2, 2, 3, 3]
+
+
+@pytest.mark.parametrize("segment_frames", [1, 9])
+def test_second_look_replaces_frame_of_its_own_sensor(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, segment_frames: int
+) -> None:
+    """Sensors share frame numbers, and these have gaps with --every or after skipped frames."""
+    monkeypatch.setattr("shapecat.runs.perceive.perceived._SEGMENT_FRAMES", segment_frames)
+    counts = {("/a", 2): 2, ("/b", 2): 1, ("/a", 5): 1, ("/b", 5): 0, ("/a", 8): 2, ("/b", 8): 1}
+    again = {("/b", 2): 3, ("/a", 8): 1, ("/b", 8): 2}
+    for found in (counts, again):
+        is_second = found is again
+        with PerceptionTables(
+            tmp_path, categories=CATEGORIES, model_id="m1", again=is_second
+        ) as tables:
+            for (topic, index), count in found.items():
+                row = FrameRow(2000 + index, None, again=is_second)
+                tables.write([perception(index, count, topic)], [row])
+
+    frames, detections, planes = (
+        pq.read_table(tmp_path / f"{name}.parquet") for name in ("frames", "detections", "planes")
+    )
+    assert dict(zip(keys_of(frames), frames["revised"].to_pylist(), strict=True)) == {
+        key: key in again for key in counts
+    }
+    expected = [key for key, count in (counts | again).items() for _ in range(count)]
+    assert keys_of(detections) == expected
+    assert keys_of(planes) == [key for key in counts for _ in range(2)]
 
 
 def test_second_look_replaces_masks(tmp_path: Path) -> None:
