@@ -478,21 +478,22 @@ def test_frames_without_pose_are_reported_with_what_they_cost(
 
 def test_frame_with_objects_does_not_count_as_without_plane(tmp_path: Path) -> None:
     """An assumed plane is in no table; the run would contradict its own warning."""
-    for name, schema, frames in (
-        ("frames", FRAMES, (0, 1, 2, 3, 4)),
-        ("planes", PLANES, (0, 3)),
-        ("detections", DETECTIONS, (1,)),
+    for name, schema, frames, of_other in (
+        ("frames", FRAMES, (0, 1, 2, 3, 4), (0, 1, 3)),
+        ("planes", PLANES, (0, 3), (1,)),
+        ("detections", DETECTIONS, (1,), (3,)),
     ):
-        rows = [dict.fromkeys(schema.names) | {"topic": "/d", "frame": k} for k in frames]
+        keys = [("/d", k) for k in frames] + [("/e", k) for k in of_other]
+        rows = [dict.fromkeys(schema.names) | {"topic": t, "frame": k} for t, k in keys]
         for row in rows if name == "frames" else ():
-            given = None if row["frame"] == 3 else [0.0, -1.0, 0.0]
+            given = None if (row["topic"], row["frame"]) == ("/d", 3) else [0.0, -1.0, 0.0]
             row |= {"up": [0.0, -np.cos(0.1), np.sin(0.1)], "up_given": given}
         pq.write_table(pa.Table.from_pylist(rows, schema), tmp_path / f"{name}.parquet")
     upright = Upright(TransformWindow(TransformBuffer()), None, None, ("tf",))
     upright.given = {"transforms, z of map": 3, "planes": 1}
 
     report = report_up(upright, tmp_path)
-    assert (report["planes_differ_deg"], report["frames_without_plane"]) == (5.7, 2)
+    assert (report["planes_differ_deg"], report["frames_without_plane"]) == (5.7, 3)
 
 
 @pytest.mark.parametrize(

@@ -3,7 +3,7 @@
 import csv
 import json
 from collections import Counter
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Collection, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -84,10 +84,12 @@ def make_run(
     first_size: tuple[float, float, float] | None = None,
     labels: Mapping[int, str] | None = None,
     alike: int = 1,
+    right: Collection[int] = (),
 ) -> Path:
     """Write the tables of a run whose tracks are at the given positions.
 
-    ``alike`` is the number of successive frames with the same stamp.
+    ``alike`` is the number of successive frames with the same stamp. Another camera, with the same
+    stamps and frame numbers, sees the tracks in ``right``.
     """
     folder.mkdir(parents=True)
     work = work or f"w{folder.name}"
@@ -102,14 +104,15 @@ def make_run(
         if place is not None
     ]
     stamps = [1_000 + 33 * (frame // alike) for _, frame, _ in rows]
-    counts: dict[int, int] = {}
+    counts: dict[tuple[str, int], int] = {}
+    topics = ["/right" if track in right else "/depth" for track, _, _ in rows]
     detections = []
-    for _, frame, _ in rows:
-        detections.append(counts.get(frame, 0))
-        counts[frame] = detections[-1] + 1
+    for key in zip(topics, (frame for _, frame, _ in rows), strict=True):
+        detections.append(counts.get(key, 0))
+        counts[key] = detections[-1] + 1
     columns: dict[str, Any] = {
         "track": [track for track, _, _ in rows],
-        "topic": ["/depth"] * len(rows),
+        "topic": topics,
         "frame": [frame for _, frame, _ in rows],
         "stamp_ns": stamps,
         "detection": pa.array(detections, pa.int32()),
@@ -118,7 +121,7 @@ def make_run(
     }
     full = {name: [None] * len(rows) for name in TRACKS.names if "_full" in name}
     write_table(folder / "tracks.parquet", full | columns, TRACKS)
-    order = sorted(range(len(rows)), key=lambda k: (rows[k][1], detections[k]))
+    order = sorted(range(len(rows)), key=lambda k: (rows[k][1], topics[k], detections[k]))
     found = {name: [columns[name][k] for k in order] for name in ("topic", "frame", "stamp_ns")}
     empty = {field.name: [None] * len(rows) for field in DETECTIONS}
     sides = size if isinstance(size, tuple) else (size, size, 1.3 * size)
@@ -303,6 +306,18 @@ def test_frames_with_equal_stamps_are_told_apart(tmp_path: Path) -> None:
     transfer_labels(source, target)
 
     assert labels_of(target) == {1: "mug", 2: "tin"}
+
+
+def test_tracks_of_two_cameras_are_told_apart(tmp_path: Path) -> None:
+    """They may start at the same moment: half of the objects would be in no frame."""
+    objects = {1: static(CUP), 2: static(CAN), 3: static(shifted(CUP, x=0.4))}
+    labels = {1: "mug", 2: "tin", 3: "bowl"}
+    source = make_run(tmp_path / "source", objects, labels=labels, right={2})
+    target = make_run(tmp_path / "target", objects, right={2})
+
+    transfer_labels(source, target)
+
+    assert labels_of(target) == labels
 
 
 @pytest.mark.parametrize("kept", [slice(0), slice(0, None, 2)])

@@ -612,7 +612,7 @@ def write_run(folder: Path) -> None:
             perception = Perception("/d", index, index, "cam", scene, found, {})
             tables.write([perception], [FrameRow(0, None)])
     rows = [(1, 0, 0), (1, 1, 0), (1, 2, 0), (2, 0, 1), (3, 1, 1), (3, 2, 1)]
-    write_tracks(folder, rows, topic="/d", begin_ns=0)
+    write_tracks(folder, rows, topics=["/d"] * len(rows), begin_ns=0)
 
 
 def test_merged_tracks_continue_as_one_track(tmp_path: Path) -> None:

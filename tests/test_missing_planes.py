@@ -18,7 +18,7 @@ from shapecat.runs.perceive.missing_planes import explain_missing_planes
 from shapecat.runs.perceive.perceived import FrameRow, PerceptionTables
 from shapecat.runs.tables.segments import GROUP_FRAMES
 from shapecat.simulation.messages import MessageFactory
-from shapecat.types import Frame, Perception, Scene
+from shapecat.types import Frame, Perception, Plane, Scene
 from tests.messages import CAMERA, EPOCH, SECOND, write
 from tests.scenes import record
 from tests.test_detection import ball, frame_of, render
@@ -95,18 +95,25 @@ def test_warning_distinguishes_missing_depth_wrong_up_and_noise(tmp_path: Path) 
 def test_only_first_frames_without_plane_are_read_again(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """Reading hours of depth images would take as long as perceiving them."""
-    scene, asked = Scene(np.array([0, -1, 0], np.float32), (), ()), list[int]()
+    """Reading hours of depth images would take as long as perceiving them.
+
+    Another camera sees a plane in its first frames, which have the same numbers.
+    """
+    up, asked = np.array([0, -1, 0], np.float32), list[tuple[str, int]]()
+    plane = Plane(up, -0.5, np.eye(3, dtype=np.float32), 0.5, 0.0)
+    keys = [(topic, k) for k in range(3 * GROUP_FRAMES) for topic in ("/other", "/depth")[k > 2 :]]
     with PerceptionTables(tmp_path, categories=("can",), model_id="m") as tables:
-        for k in range(3 * GROUP_FRAMES):
-            perception = Perception("/depth", k, EPOCH + k, "camera", scene, (), {})
+        for topic, k in keys:
+            scene = Scene(up, (plane,) if topic == "/other" else (), ())
+            perception = Perception(topic, k, EPOCH + k, "camera", scene, (), {})
             tables.write([perception], [FrameRow(EPOCH + k, None)])
 
     def read(*_: Any, **__: Any) -> Iterator[tuple[Frame, None]]:
-        for k in range(3 * GROUP_FRAMES):
-            asked.append(k)
-            depth = np.full((CAMERA.height, CAMERA.width), 3.5 if k < 3 else 1, np.float32)
-            yield Frame("/depth", k, EPOCH + k, EPOCH + k, "camera", depth, CAMERA), None
+        for topic, k in keys:
+            asked.append((topic, k))
+            depth_m = 3.5 if topic == "/depth" and k < 3 else 1
+            depth = np.full((CAMERA.height, CAMERA.width), depth_m, np.float32)
+            yield Frame(topic, k, EPOCH + k, EPOCH + k, "camera", depth, CAMERA), None
 
     monkeypatch.setattr("shapecat.runs.perceive.missing_planes.read_frames", read)
     settings = {"detection": {"max_range_m": 2.0}}
@@ -114,8 +121,8 @@ def test_only_first_frames_without_plane_are_read_again(
     recording: Any = None
     (warning,) = explain_missing_planes(recording, tmp_path, run)
 
-    assert asked == [0, 1, 2]
-    assert "no supporting plane in 96 of 96 frames: 100% of their depth is beyond" in warning
+    assert asked == keys[:6]
+    assert "no supporting plane in 96 of 99 frames: 100% of their depth is beyond" in warning
 
 
 def test_no_warning_if_objects_stand_on_assumed_plane(tmp_path: Path) -> None:

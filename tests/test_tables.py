@@ -279,6 +279,34 @@ def test_labelled_frames_join_tracks_and_labels(tmp_path: Path) -> None:
     assert_allclose(frames[0].fixed_from_sensor.translation, [1, 2, 3])
 
 
+def test_objects_of_two_sensors_are_kept_apart(tmp_path: Path) -> None:
+    """They share frame numbers: a sensor would get the tracks or masks of the other."""
+    counts = {("/a", 2): 2, ("/b", 2): 3, ("/a", 5): 1, ("/b", 5): 2}
+    masked = {("/b", 2): {1: (3, 4, 7, 9)}, ("/a", 5): {0: (1, 2, 5, 6)}}
+    with PerceptionTables(tmp_path, categories=CATEGORIES, model_id="m1", colour=True) as tables:
+        for key, count in counts.items():
+            found = perception(key[1], count, key[0])
+            if boxes := masked.get(key):
+                runs = dict.fromkeys(boxes, np.array([7]))
+                masks = ImageMasks("/rgb", 1000, 2000, "c", 40, 30, boxes, runs)
+                found = replace(found, masks=masks)
+            tables.write([found], [FrameRow(2000, None)])
+    rows = [(5, 2, 0), (5, 5, 0), (6, 2, 1), (7, 2, 0), (7, 5, 1), (8, 2, 2), (8, 5, 0)]
+    write_tracks(tmp_path, rows, topics=["/a"] * 3 + ["/b"] * 4)
+    labels = {track: TrackLabel(track, "cup", 1.0) for track in (5, 6, 7, 8)}
+
+    frames = list(read_labelled_frames(tmp_path, labels))
+
+    assert [
+        (f.topic, f.index, {o.track: round(10 * float(o.box.center[0])) for o in f.objects})
+        for f in frames
+    ] == [
+        ("/a", 2, {5: 0, 6: 1}), ("/b", 2, {7: 0, 8: 2}),
+        ("/a", 5, {5: 0}), ("/b", 5, {8: 0, 7: 1}),
+    ]  # fmt: skip
+    assert {(f.topic, f.index): f.masks.boxes for f in frames if f.masks} == masked
+
+
 def test_ended_tracks_are_reported_in_next_frame_of_sensor() -> None:
     """A viewer would not look for the end of a track in a frame of another sensor."""
     no_rows, last_in = (

@@ -18,13 +18,16 @@ def write_tracks(
     folder: Path,
     rows: Sequence[tuple[int, int, int | None]],
     *,
-    topic: str = "/depth",
+    topics: Sequence[str] = (),
     begin_ns: int = 1000,
 ) -> None:
-    """Write tracks.parquet of rows (track, frame, detection); frames are a nanosecond apart."""
+    """Write tracks.parquet of rows (track, frame, detection); frames are a nanosecond apart.
+
+    ``topics`` are those of the rows; by default all are of one.
+    """
     columns = {
         "track": [track for track, _, _ in rows],
-        "topic": [topic] * len(rows),
+        "topic": list(topics) or ["/depth"] * len(rows),
         "frame": [frame for _, frame, _ in rows],
         "stamp_ns": [begin_ns + frame for _, frame, _ in rows],
         "detection": [detection for _, _, detection in rows],
