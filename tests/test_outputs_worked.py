@@ -64,6 +64,7 @@ from shapecat.outputs.review.paths import Paths
 from shapecat.outputs.review.scenes import choose_scenes, with_clouds
 from shapecat.outputs.scene_graph import Node, format_tree
 from shapecat.outputs.scene_tree import _apply_labels, _candidate, _described, _topic
+from shapecat.outputs.wording import different_names, safe_name
 from shapecat.recordings.messages import Topic
 from shapecat.runs.labelled_frames import _join
 from shapecat.runs.labelled_tracks import LabelledTracks
@@ -1198,3 +1199,10 @@ def test_clouds_have_no_image_in_a_data_set(kind: str) -> None:
     assert [one is not None and one[2] for one in found] == [
         (4, 6) if kind == "image" else False
     ] * 2
+
+
+def test_long_names_are_cut_between_letters_and_stay_different() -> None:
+    """File systems allow 255 bytes, and a Chinese letter takes three of them."""
+    assert safe_name("厨" * 90) == "厨" * 40
+    assert safe_name("a" + "厨" * 90) == "a" + "厨" * 39
+    assert different_names(["厨" * 90, "厨" * 91, "b"]) == ["厨" * 40, "厨" * 40 + "-2", "b"]
