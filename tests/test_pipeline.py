@@ -4,6 +4,7 @@ import json
 import shutil
 from collections import Counter
 from collections.abc import Callable
+from copy import deepcopy
 from dataclasses import replace
 from pathlib import Path
 from types import SimpleNamespace
@@ -16,6 +17,8 @@ from mcap.reader import make_reader
 from numpy.testing import assert_allclose
 
 from shapecat.config import Settings, with_overrides
+from shapecat.errors import ModelError
+from shapecat.perception import Perceiver
 from shapecat.pipeline import annotate, annotate_again, process
 from shapecat.runs.folder import read_run
 from shapecat.runs.jobs import Job
@@ -434,6 +437,24 @@ def test_real_clouds_give_same_objects_as_depth_images(
     assert set(have) <= set(depth_image_centres)
     for stamp, found in have.items():
         assert_allclose(found, depth_image_centres[stamp], atol=2e-3)
+
+
+def test_process_that_perceives_frames_has_model_and_settings_of_the_run(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    """It reads the model file again, which may have been replaced since the run began."""
+    models: dict[Path | None, Any] = {
+        Path(f"{name}.npz"): SimpleNamespace(model_id=name) for name in ("one", "two")
+    }
+    monkeypatch.setattr("shapecat.perception.load_model", models.__getitem__)
+    for name, seed in (("one", 3), ("two", 3), ("two", 4)):
+        path = Path(f"{name}.npz")
+        sent = Perceiver(models[path], Settings(seed=seed), path)
+        assert deepcopy(sent) == sent  # restored in the same way as in another process
+
+    replaced: Any = SimpleNamespace(model_id="before")
+    with pytest.raises(ModelError, match=r"two\.npz: has changed since the run began"):
+        deepcopy(Perceiver(replaced, Settings(), Path("two.npz")))
 
 
 def test_output_added_later_leaves_others_to_be_annotated(

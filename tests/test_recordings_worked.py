@@ -2,6 +2,7 @@
 
 import struct
 from collections import Counter
+from dataclasses import replace
 from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
@@ -227,17 +228,22 @@ def test_colour_camera_of_another_sensor_is_not_used(
 
 
 def test_new_colour_calibration_changes_lens(tmp_path: Path) -> None:
-    """Each image uses the last calibration before it; a repeated one changes nothing."""
-    items = [*depth_items(EPOCH, EPOCH + 100 * MS, EPOCH + 200 * MS)]
+    """Each image uses the last calibration before it; a repeated one changes nothing.
+
+    If only the bottom of the image is cut off, only its height differs.
+    """
+    cut = replace(OTHER, height=OTHER.height - 8)
+    items = depth_items(*(EPOCH + 100 * k * MS for k in range(4)))
     items.append(("/tf_static", EPOCH, static("camera", "color", (0.05, 0, 0), (0, 0, 0, 1))))
-    for k, camera in enumerate((WIDE, WIDE, OTHER)):
+    for k, camera in enumerate((WIDE, WIDE, OTHER, cut)):
         stamp = EPOCH + 100 * k * MS
+        pixels = gradient(camera.height, camera.width)
         items.append(("/cam/color/camera_info", stamp, info(stamp, camera)))
-        items.append(("/cam/color/image_raw", stamp, raw(stamp, gradient(60, 80), "rgb8", "color")))
+        items.append(("/cam/color/image_raw", stamp, raw(stamp, pixels, "rgb8", "color")))
     pairs, _ = read(record(tmp_path / "a.mcap", in_order(items)))
 
     lenses = [view and view.lens and view.lens.pinhole for _, view in pairs]
-    assert lenses == [WIDE, WIDE, OTHER]
+    assert lenses == [WIDE, WIDE, OTHER, cut]
 
 
 def test_new_colour_distortion_alone_changes_lens(tmp_path: Path) -> None:

@@ -531,6 +531,20 @@ def test_tables_record_reuse_within_each_block(
             assert row[name] == first[name]
 
 
+def test_frame_has_same_result_whatever_its_number() -> None:
+    """A recording cut at its beginning has the same frames, with other numbers."""
+    guesser: Any = Guesser()
+    perceiver = Perceiver(guesser, Settings(), None)
+    neurons = []
+    for index, stamp_ns in ((0, 500), (7, 500), (0, 501)):
+        frame = replace(blank(index), stamp_ns=stamp_ns)
+        (perception,) = perceiver([PerceptionInput(frame, None)])
+        neurons.append(np.concatenate([d.gas.neurons for d in perception.detections]))
+
+    assert np.array_equal(neurons[0], neurons[1])
+    assert not np.array_equal(neurons[0], neurons[2])
+
+
 def test_blocks_of_one_frame_reuse_nothing() -> None:
     guesser: Any = Guesser()
     perceiver = Perceiver(guesser, Settings(), None)
