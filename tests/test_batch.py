@@ -247,8 +247,13 @@ def test_metadata_of_a_data_set_makes_no_bag(tmp_path: Path) -> None:
     for take in takes:
         take.touch()
     (tmp_path / "metadata.yaml").write_text("robot: stretch\nlicense: CC0\n")
+    bag = tmp_path / "bag"
+    bag.mkdir()
+    (bag / "x.mcap").touch()
+    (bag / "metadata.yaml").write_text(f"# {'note' * 99}\nrosbag2_bagfile_information:\n")
 
-    assert {Path(source.path) for source in find_recordings([str(tmp_path)]).sources} == takes
+    found = {Path(source.path) for source in find_recordings([str(tmp_path)]).sources}
+    assert found == {*takes, bag}
 
 
 def test_folders_are_searched_and_bags_stay_whole(tmp_path: Path) -> None:

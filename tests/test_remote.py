@@ -254,10 +254,11 @@ def test_storage_is_searched_like_a_folder(place: str) -> None:
 def test_metadata_of_a_data_set_in_storage_makes_no_bag() -> None:
     """As in a folder of this machine: its takes were mixed in one run."""
     names = {"set/walk.mcap", "set/run.mcap", "set/bag"}
-    for name in ("set/walk.mcap", "set/run.mcap", "set/bag/bag_0.mcap"):
+    for name in ("set/walk.mcap", "set/run.mcap", "set/bag/x.mcap"):
         (Location("memory://takes") / name).write(name.encode())
     (Location("memory://takes/set") / "metadata.yaml").write(b"license: MIT\n")
-    (Location("memory://takes/set/bag") / "metadata.yaml").write(b"rosbag2_bagfile_information:\n")
+    noted = b"# " + 99 * b"note" + b"\nrosbag2_bagfile_information:\n"
+    (Location("memory://takes/set/bag") / "metadata.yaml").write(noted)
 
     found = find_recordings(["memory://takes/"]).sources
 
