@@ -56,19 +56,26 @@ from shapecat.outputs.level_clouds import support_offset, upright_cloud
 from shapecat.outputs.opened_run import RunFrame
 from shapecat.outputs.png import png
 from shapecat.outputs.report.cards import _guess
-from shapecat.outputs.report.pictures import _require_unchanged
+from shapecat.outputs.report.pictures import _frames, _require_unchanged
 from shapecat.outputs.review.colour import true_colours
 from shapecat.outputs.review.columns import At
 from shapecat.outputs.review.images import layer_of
 from shapecat.outputs.review.paths import Paths
 from shapecat.outputs.review.scenes import choose_scenes, with_clouds
 from shapecat.outputs.scene_graph import Node, format_tree
-from shapecat.outputs.scene_tree import _apply_labels, _candidate, _described, _topic
+from shapecat.outputs.scene_tree import (
+    _apply_labels,
+    _candidate,
+    _described,
+    _topic,
+    describe_scene,
+)
 from shapecat.outputs.wording import different_names, safe_name
 from shapecat.recordings.messages import Topic
-from shapecat.runs.labelled_frames import _join
+from shapecat.runs.labelled_frames import _join, read_labelled_frames
 from shapecat.runs.labelled_tracks import LabelledTracks
 from shapecat.runs.labels.meaning import TrackLabel, _slips
+from shapecat.runs.perceive.perceived import FrameRow, PerceptionTables
 from shapecat.runs.tables.masks import read_nearest_masks
 from shapecat.runs.tables.reading import Key
 from shapecat.runs.tables.schemas import FRAMES
@@ -88,6 +95,8 @@ from shapecat.types import (
     Scene,
 )
 from tests.test_exports_worked import UP
+from tests.test_tables import perception
+from tests.track_tables import write_tracks
 
 MS = 1_000_000
 NO_GAS = NeuralGas(np.zeros((0, 3)), np.zeros((0, 2), int))
@@ -548,7 +557,10 @@ def test_view_vector_has_direction_distance_size_and_shape() -> None:
 
 
 def test_images_without_certain_objects_are_omitted(monkeypatch: pytest.MonkeyPatch) -> None:
-    """A detector would learn that an image with only uncertain objects is empty."""
+    """A detector would learn that an image with only uncertain objects is empty.
+
+    Nor are those of another sensor, whose frames of the same numbers are not chosen.
+    """
     images = [
         None,
         *(
@@ -557,7 +569,8 @@ def test_images_without_certain_objects_are_omitted(monkeypatch: pytest.MonkeyPa
         ),
     ]
     place = "shapecat.outputs.exports.dataset_frames"
-    labelled = [labelled_frame(k) for k in range(len(images))]
+    sensors = ("/other", "/depth")
+    labelled = [labelled_frame(k, topic=topic) for k in range(len(images)) for topic in sensors]
     stubs: dict[str, Any] = {
         "read_track_table": lambda _path: SimpleNamespace(labels={}),
         "_chosen": lambda *_: {("/depth", k) for k in range(len(images))},
@@ -573,7 +586,7 @@ def test_images_without_certain_objects_are_omitted(monkeypatch: pytest.MonkeyPa
     )
 
     left_out = Counter[str]()
-    stems = {"/depth": "lab"}
+    stems = dict.fromkeys(sensors, "lab")
     found = images_of(finished, Selection(), stems=stems, left_out=left_out)
 
     assert list(found) == [images[1], images[4]]
@@ -1125,6 +1138,30 @@ def test_frames_of_sensors_with_equal_numbers_are_not_confused(
     assert needed == [("/left/color", 70), ("/right/color", 50), ("/right/color", 80)]
     assert [(label.topic, label.index) for label, *_ in found] == [*images]
     assert [(frame.topic, frame.index) for _, frame, _ in found] == [*images]
+
+
+def test_tree_and_pictures_of_a_frame_are_of_its_own_sensor(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Two sensors share frame numbers: one would be shown with the tracks of the other."""
+    with PerceptionTables(tmp_path, categories=("cup", "can"), model_id="m1") as tables:
+        for topic, count in (("/a", 2), ("/b", 1)):
+            tables.write([perception(3, count, topic)], [FrameRow(5, None)])
+    write_tracks(tmp_path, [(5, 3, 0), (6, 3, 1), (7, 3, 0)], topics=["/a", "/a", "/b"])
+    labels = {track: TrackLabel(track, "cup", 0.9) for track in (5, 6, 7)}
+    finished: Any = SimpleNamespace(
+        folder=tmp_path, labels=labels, frames=lambda: read_labelled_frames(tmp_path, labels)
+    )
+    monkeypatch.setattr("shapecat.outputs.scene_tree.read_finished", lambda _: finished)
+    rows: Any = [SimpleNamespace(track=k, category="cup", confidence=0.9) for k in labels]
+
+    for topic, shown in (("/b", {7}), ("/a", {5, 6})):
+        text = describe_scene(tmp_path, 3, topic=topic)
+        assert {track for track in labels if f"#{track}:" in text} == shown
+        assert len(text.splitlines()) == 2 + len(shown)  # below two planes
+        choice: Any = SimpleNamespace(frames=[(topic, 3)])
+        (frame,) = _frames(finished, rows, choice)
+        assert {item.track for item in frame.objects} == shown
 
 
 def test_frame_of_two_topics_needs_a_topic(tmp_path: Path) -> None:
