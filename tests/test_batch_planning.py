@@ -395,6 +395,20 @@ def test_recording_is_named_by_its_link(
     assert find_recordings(named[:1]).sources[0] == found[0]
 
 
+def test_recordings_of_equal_names_are_told_apart_by_folders_of_their_links(tmp_path: Path) -> None:
+    """The folder of the files they point to says nothing."""
+    for day, digest in (("monday", "3f9c0a"), ("tuesday", "b77e1d")):
+        store, folder = tmp_path / "store" / digest[:2], tmp_path / day
+        store.mkdir(parents=True)
+        folder.mkdir()
+        (store / f"{digest}.mcap").write_bytes(b"\x89MCAP" + digest.encode())
+        (folder / "lab.mcap").symlink_to(store / f"{digest}.mcap")
+
+    found = find_recordings([str(tmp_path / "monday"), str(tmp_path / "tuesday")]).sources
+
+    assert [source.parent for source in found] == ["monday", "tuesday"]
+
+
 def test_looping_links_are_followed_once(tmp_path: Path) -> None:
     """Two links to their own folder made the search endless, one gave paths of 40 links."""
     (tmp_path / "z").mkdir()

@@ -64,7 +64,9 @@ def find_recordings(sources: Sequence[str]) -> SearchResult:
 
 
 def _of_path(path: Path, real: Path) -> Source:
-    return Source(str(path), "", real.name if path.is_dir() else path.stem, real.parent.name)
+    if path.is_dir():  # "." has no name
+        return Source(str(path), "", real.name, real.parent.name)
+    return Source(str(path), "", path.stem, path.absolute().parent.name)
 
 
 def _search_paths(sources: Sequence[Path]) -> tuple[dict[Path, Path], int]:
