@@ -40,7 +40,7 @@ from shapecat.runs.jobs import (
     summarize,
 )
 from shapecat.runs.labels.corrections import adopt_labels, read_labels
-from shapecat.runs.labels.replaced import forget_old_labels, keep_labels
+from shapecat.runs.labels.replaced import forget_old_labels, keep_labels, require_labels
 from shapecat.runs.labels.transfer import Transfer, transfer_labels
 from shapecat.runs.perceive.doubts import explain_doubts
 from shapecat.runs.perceive.phases import Work, perceive_all, revise
@@ -92,8 +92,9 @@ def process(job: Job, observe: Observer = ignore, *, cores: int = 1) -> Summary:
         recover(job.folder)
         if made_by_run(job.folder) is not None and not job.overwrite:
             return _add_outputs(job, recording, run, content, observe)
+        require_labels(job)
         with staged(job.folder, worth_keeping=has_work) as folder:
-            run = resume(folder, run, job.source, content.result)
+            run = resume(folder, run, job.source, content.result, overwrite=job.overwrite)
             if "perceive" not in run["seconds"]:
                 run = take_over_frames(job.folder, folder, run, job.source, content.result)
             run["color"] = {topic: colour.topic for topic, colour in colours.items()}

@@ -2,6 +2,7 @@
 
 import json
 import os
+import re
 import threading
 import time
 from collections.abc import Callable, Mapping
@@ -448,6 +449,12 @@ def partial(folder: Path, run: RunInfo) -> None:
     write_run(folder, run)
 
 
+def resumed_in(
+    folder: Path, wanted: RunInfo, source: Path, digest: str = "", *, overwrite: bool = False
+) -> RunInfo:
+    return resume(folder, wanted, source, lambda: digest, overwrite=overwrite)
+
+
 def test_partial_results_count_as_work(source: Path, tmp_path: Path) -> None:
     """A full disk after an hour must not cost that hour."""
     run = planned(source)
@@ -466,7 +473,7 @@ def test_partial_run_of_same_work_resumes(source: Path, tmp_path: Path) -> None:
     folder, run = tmp_path / "half", planned(source)
     partial(folder, run)
 
-    assert resume(folder, planned(source), source, lambda: "")["id"] == run["id"]
+    assert resumed_in(folder, planned(source), source)["id"] == run["id"]
     assert (folder / "segments" / "000000").exists()
 
 
@@ -475,7 +482,7 @@ def test_partial_run_resumes_with_other_outputs(source: Path, tmp_path: Path) ->
     folder, run = tmp_path / "half", planned(source, rrd=False)
     partial(folder, run)
 
-    resumed = resume(folder, planned(source), source, lambda: "")
+    resumed = resumed_in(folder, planned(source), source)
 
     assert (resumed["id"], resumed["options"]["rrd"]) == (run["id"], True)
 
@@ -486,29 +493,50 @@ def test_partial_run_resumes_with_copy_of_its_recording(source: Path, tmp_path: 
     partial(folder, run)
     os.utime(source, (1, 1))
 
-    resumed = resume(folder, planned(source), source, lambda: run["input"]["digest"])
+    resumed = resumed_in(folder, planned(source), source, run["input"]["digest"])
 
     assert resumed["id"] == run["id"]
     require_unchanged(folder, resumed, source)
     assert has_work(folder)
 
 
-@pytest.mark.parametrize("what", ["model", "settings", "shapecat", "numpy", "content"])
-def test_partial_run_of_other_work_is_discarded(source: Path, tmp_path: Path, what: str) -> None:
-    """Otherwise half of the tables would come from another model or version."""
+@pytest.mark.parametrize(
+    ("what", "asks"),
+    [
+        ("model", "model: m2 there, m1 wanted"),
+        ("settings", "seed: 99 there, 0 wanted"),
+        ("other", "input: /data/lab.mcap there"),
+        ("shapecat", ""),
+        ("numpy", ""),
+        ("content", ""),
+    ],
+)
+def test_partial_run_of_other_work_is_discarded(
+    source: Path, tmp_path: Path, what: str, asks: str
+) -> None:
+    """Otherwise half of the tables would come from another model or version.
+
+    Hours of work are not lost because of another --end; they are if nothing can continue them.
+    """
     folder, run = tmp_path / "half", planned(source)
     if what == "model":
         run["model"] = {**run["model"], "id": "m2"}
     elif what == "settings":
         run["settings"] = {**run["settings"], "seed": 99}
-    elif what == "content":
+    elif what in ("content", "other"):
         run["input"] = {**run["input"], "files": [["lab.mcap", 5, 1, 1]]}
+        run["input"]["path"] = "/data/lab.mcap" if what == "other" else run["input"]["path"]
     else:
         run["versions"] = {**run["versions"], what: "0.0.1"}
     partial(folder, run)
     wanted = planned(source)
 
-    assert resume(folder, wanted, source, lambda: "xxh3-128:other")["id"] == wanted["id"]
+    if asks:
+        with pytest.raises(OutputError, match=re.escape(f"({asks}); repeat that command")):
+            resumed_in(folder, wanted, source, "xxh3-128:other")
+        assert has_work(folder)
+    found = resumed_in(folder, wanted, source, "xxh3-128:other", overwrite=bool(asks))
+    assert found["id"] == wanted["id"]
     assert not (folder / "segments").exists()
     assert read_run(folder)["id"] == wanted["id"]
 
@@ -529,7 +557,7 @@ def test_truncated_partial_run_is_discarded(source: Path, tmp_path: Path, name: 
     (folder / name).parent.mkdir(parents=True, exist_ok=True)
     (folder / name).write_bytes(b"")
 
-    assert resume(folder, wanted, source, lambda: "")["id"] == wanted["id"]
+    assert resumed_in(folder, wanted, source)["id"] == wanted["id"]
     assert not (folder / name).exists()
 
 

@@ -238,6 +238,15 @@ def test_labels_given_after_an_interruption_are_transferred(
     assert bool(summary.corrections) == bool(kept)
 
 
+@pytest.mark.usefixtures("perceiving_fails")
+def test_unreadable_labels_are_reported_before_frames_are_perceived(job: Job) -> None:
+    """Hours later, the same command would only fail again."""
+    (job.folder / "tracks.csv").write_text("")
+
+    with pytest.raises(OutputError, match="no column"):
+        pipeline.process(replace(job, settings=changed("detection.min_points=70")))
+
+
 def interrupt(*_: Any, **__: Any) -> None:
     raise KeyboardInterrupt
 

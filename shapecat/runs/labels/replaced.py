@@ -13,7 +13,17 @@ from shapecat.runs.labels.transfer import lost_labels, transfer_labels
 from shapecat.runs.run_info import RunInfo
 from shapecat.system.files import replacing
 
-__all__ = ["forget_old_labels", "keep_labels"]
+__all__ = ["forget_old_labels", "keep_labels", "require_labels"]
+
+
+def require_labels(job: Job) -> None:
+    """Check that the labels of the results to be replaced are readable, before hours of work.
+
+    Raises
+    ------
+    OutputError : their table is unreadable.
+    """
+    _labelled_table(job)
 
 
 def keep_labels(folder: Path, run: RunInfo, job: Job) -> None:

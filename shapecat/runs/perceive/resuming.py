@@ -21,7 +21,9 @@ _LATER = ("tracking.", "outputs.")
 """Groups of settings that perceiving does not use."""
 
 
-def resume(folder: Path, planned: RunInfo, source: Path, digest: Callable[[], str]) -> RunInfo:
+def resume(
+    folder: Path, planned: RunInfo, source: Path, digest: Callable[[], str], *, overwrite: bool
+) -> RunInfo:
     """Return the run.json of the interrupted run in a folder if ``planned`` can continue it.
 
     That is possible if settings, options, model, versions and recording are the same, and its
@@ -32,20 +34,30 @@ def resume(folder: Path, planned: RunInfo, source: Path, digest: Callable[[], st
     ----------
     digest : returns the digest of the recording; called only if names, sizes or times of its files
         differ.
+    overwrite : whether finished work of another input, model or settings is discarded.
 
     Raises
     ------
-    OutputError : the folder cannot be written.
+    OutputError : the folder cannot be written, or has finished work that is not to be discarded.
     """
+    differing: dict[str, str] = {}
     with suppress(OutputError):
         run = _with_outputs(read_run(folder), planned)
-        if not differences(run, planned) and _same_recording_and_versions(
-            run, planned, source, digest
-        ):
+        differing = differences(run, planned)
+        if not differing and _same_recording_and_versions(run, planned, source, digest):
             _require_complete(folder)
             if "perceive" in run["seconds"]:
                 run["counts"]["resumed"] = run["counts"]["frames"]
             return {**run, "input": planned["input"]}
+        if run["input"]["path"] != planned["input"]["path"]:
+            differing["input"] = f"{run['input']['path']} there"
+    if differing and has_work(folder) and not overwrite:
+        listed = "; ".join(f"{name}: {text}" for name, text in differing.items())
+        msg = (
+            f"{folder}: has finished work of an interrupted run of another input, model or "
+            f"settings ({listed}); repeat that command, choose another --out, or --overwrite it"
+        )
+        raise OutputError(msg)
     clear(folder)
     write_run(folder, planned)
     return planned
