@@ -5,14 +5,18 @@ from typing import Any
 
 import click
 
-from .options import ANY_PATH, boxes_option, recording_option
+from .options import ANY_PATH, boxes_option
 from .render import changed_labels, missed_words, progress_bars
 
 
 @click.command()
 @click.argument("run", type=ANY_PATH)
 @click.option(
-    "--labels", type=ANY_PATH, metavar="LABELS", help="Corrected table; by default RUN/tracks.csv."
+    "--labels",
+    type=ANY_PATH,
+    metavar="LABELS",
+    help="Corrected table; its labels are copied into RUN/tracks.csv. By default, the labels in "
+    "RUN/tracks.csv are applied.",
 )
 @click.option(
     "--by-place",
@@ -21,14 +25,17 @@ from .render import changed_labels, missed_words, progress_bars
     "the same places.",
 )
 @boxes_option("In annotated.mcap, {}; if not given, boxes are not changed.")
-@recording_option
+@click.option(
+    "--recording", type=ANY_PATH, help="New path of a moved recording; stored in run.json."
+)
 def annotate(
     *, run: Path, labels: Path | None, by_place: bool, boxes: str | None, recording: Path | None
 ) -> None:
-    """Write corrected labels into annotated.mcap and review.rrd.
+    """Apply corrected labels to the files of a run.
 
     Fill in the column `label` of RUN/tracks.csv in a spreadsheet, or correct tracks in the page
-    that `shapecat report` makes.
+    that `shapecat report` makes. The labels are written to tracks.csv, annotated.mcap and
+    review.rrd.
 
     \b
     shapecat annotate results/lab --labels corrected.csv

@@ -46,7 +46,8 @@ if TYPE_CHECKING:
     show_default=True,
     metavar="auto|tf|imu|X,Y,Z",
     help="Up direction: from transforms (tf), an accelerometer (imu), or a vector in the sensor "
-    "frame. auto uses transforms, else an accelerometer, else the planes that the camera sees.",
+    "frame. auto uses transforms, else an accelerometer, else the planes that the camera sees; it "
+    "ignores a direction that the planes contradict.",
 )
 @click.option(
     "--fixed-frame",

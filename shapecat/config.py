@@ -99,7 +99,7 @@ class TrackingSettings:
     """Assignment of detections to tracks: `hungarian` minimises the total cost (distance and
     change of size and category), `greedy` takes the pair with the lowest cost first."""
     gate_m: float = 0.12
-    """Largest distance between a track and the centroid of its next detection; smaller for
+    """Largest distance between a track and the box centre of its next detection; smaller for
     small objects."""
     min_hits: int = 3
     """Number of detections that confirm a track; fewer are enough if there are fewer frames within

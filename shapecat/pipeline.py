@@ -1,8 +1,8 @@
-"""Process a recording in three phases: perceive, track, annotate.
+"""Process a recording in four phases: perceive, revise, track, annotate.
 
 The phases are connected only by the tables of the run folder, so each can be repeated alone.
-Perceiving is expensive and treats frames one by one; tracking is cheap and needs no points;
-annotating needs only the tables and the recording.
+Perceiving and revising are expensive and treat frames one by one; tracking is cheap and needs no
+points; annotating, which writes the outputs, needs only the tables and the recording.
 """
 
 import logging
@@ -57,7 +57,7 @@ _log = logging.getLogger(__name__)
 
 
 def process(job: Job, observe: Observer = ignore, *, cores: int = 1) -> Summary:
-    """Process one recording into its run folder: perceive, track, annotate.
+    """Process one recording into its run folder: perceive, revise, track, annotate.
 
     A complete folder made from the same input, settings and model is kept, and gets the outputs
     that it lacks. A new folder gets its final name only when it is complete; an interrupted run

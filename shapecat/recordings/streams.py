@@ -37,6 +37,7 @@ _PEEK = 5
 _WARNINGS = 3
 """Warnings about a recording that an error repeats."""
 _UNREADABLE = "no readable messages"
+_NO_INFO_REMEDY = "record the camera_info topic, or use a PointCloud2"
 _OTHER_WORDS = (
     *("amplitude", "confidence", "disparity", "intensity", "mask", "snr", "statemap", "texture"),
     "thermal",
@@ -116,7 +117,8 @@ def _select(
         if stream is None:
             raise NoStreamError(_why_unusable(recording, streams, name))
         if not stream.usable:
-            msg = f"{recording.path}: no sensor_msgs/CameraInfo for the depth images on {name}"
+            problem = f"no sensor_msgs/CameraInfo for the depth images on {name}"
+            msg = f"{recording.path}: {problem}; {_NO_INFO_REMEDY}"
             raise NoStreamError(msg)
         chosen.append(stream)
     return tuple(chosen)
@@ -139,7 +141,7 @@ def _why_unusable(recording: Recording, streams: tuple[Stream, ...], name: str) 
 def _why_none(recording: Recording, streams: tuple[Stream, ...]) -> str:
     if streams:
         names = listed([stream.topic for stream in streams])
-        problem = f"depth images without a sensor_msgs/CameraInfo: {names}"
+        problem = f"depth images without a sensor_msgs/CameraInfo: {names}; {_NO_INFO_REMEDY}"
         return f"{recording.path}: {problem}{_warnings(recording)}"
     details = ((topic, _encoding_or_error(recording, topic)) for topic in recording.topics)
     lines = [f"{t.name} ({', '.join(filter(None, (t.type or t.encoding, d)))})" for t, d in details]

@@ -226,7 +226,9 @@ class Upright:
         if not self.sources:
             self.warnings.append(f"--up {off}: is it right? --up auto estimates up from the planes")
         elif len(self.sources) == 1:
-            self.warnings.append(f"up ({source}) {off}: is --up {self.sources[0]} right?")
+            self.warnings.append(
+                f"up ({source}) {off}; --up auto ignores a direction that the planes contradict"
+            )
         else:
             self.dropped[topic] = source
             name = "imu" if source.startswith("imu") else "tf"

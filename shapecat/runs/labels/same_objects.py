@@ -224,14 +224,18 @@ def _require_one_frame(source: Path | None, target: Path) -> None:
     names = [_fixed_frame(folder) for folder in (source, target) if folder is not None]
     if len(set(names)) > 1:
         frame_names = " and ".join(names)
-        msg = f"{target}: the fixed frames differ ({frame_names}); process with --fixed-frame"
+        hint = "process both with the same --fixed-frame"
+        msg = f"{target}: the fixed frames differ ({frame_names}); {hint}"
         raise OutputError(msg)
 
 
 def _fixed_frame(folder: Path) -> str:
     name = read_identity(folder)["fixed_frame"]
     if name is None:
-        msg = f"{folder}: has no fixed frame, which is needed to find objects by place"
+        msg = (
+            f"{folder}: has no fixed frame, which is needed to find objects by place; record "
+            "transforms, or label tracks.csv by hand"
+        )
         raise OutputError(msg)
     return name
 

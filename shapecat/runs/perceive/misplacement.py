@@ -55,8 +55,8 @@ def explain_misplacement(folder: Path, fixed_frame: str) -> Iterator[str]:
             )
             yield (
                 f"{topic}: the transforms look wrong: while the camera moves, objects move farther "
-                f"in {fixed_frame} than relative to the camera, and may get no tracks; to ignore "
-                f"the transforms, pass --fixed-frame {frame_ids[topic][0]}"
+                f"in {fixed_frame} than relative to the camera, and may get no tracks; to track in "
+                f"the sensor frame, pass --fixed-frame {frame_ids[topic][0]}"
             )
 
 

@@ -40,7 +40,10 @@ def report_up(upright: Upright, folder: Path) -> dict[str, Any]:
         typical = round(float(np.median(angles)), 1) if angles else None
         report |= {"planes_differ_deg": typical, "frames_without_plane": bare}
         if typical is not None and typical > _DISAGREE_DEG:
-            upright.warnings.append(f"up and the detected planes differ by {typical} degrees")
+            upright.warnings.append(
+                f"up and the detected planes differ by {typical} degrees; try another --up "
+                "(tf, imu, or X,Y,Z)"
+            )
     return report
 
 
