@@ -31,6 +31,7 @@ def evaluate(
 
     Print accuracy, confusion matrix, calibration error and novelty detection, and the accuracy
     after fusing 3, 10 and 30 views of an instance. DATASET is laid out as for `shapecat train`.
+    The model must know every category of DATASET. Cross-validation needs two objects of each.
 
     \b
     --baselines compares these classifiers with shapecat's own:
@@ -44,7 +45,7 @@ def evaluate(
 
     \b
     shapecat evaluate crops --model mine.npz --report crops.html
-    shapecat evaluate crops --baselines crops
+    shapecat evaluate crops --model mine.npz --baselines crops
     """
     from shapecat.evaluation import evaluate_folder, format_report
     from shapecat.evaluation.page import write_page

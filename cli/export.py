@@ -15,6 +15,10 @@ from .render import for_any_reader, progress_bars
 _DATASETS = ("coco", "yolo")
 _WITH_BOXES = ("kitti", "labelcloud")
 _FORMATS = (*_DATASETS, "crops", *_WITH_BOXES, "point-labels")
+_NO_VAL = (
+    "all frames of a recording go to the same split; export more recordings, or raise --val if "
+    "there are several"
+)
 
 
 @click.command()
@@ -147,7 +151,7 @@ def _export_dataset(
         exported = export_dataset(runs, kind, out, selection, recording=recording, observe=bars)
     click.echo(f"{plural(len(runs), 'run')}: {plural(exported.objects, 'labelled view')} in {out}")
     train, val = (exported.images.get(split, 0) for split in ("train", "val"))
-    hint = "" if val or not selection.val else ": all frames of a recording go to the same split"
+    hint = "" if val or not selection.val else f": {_NO_VAL}"
     click.echo(f"{plural(train, 'image')} in train, {val:,} in val{hint}")
     if kind == "yolo" and exported.uncertain:
         click.echo(

@@ -97,7 +97,7 @@ if TYPE_CHECKING:
     "--overwrite",
     is_flag=True,
     help="Replace earlier results. Corrected labels are transferred to the objects at the same "
-    "places. If only settings of tracking or outputs differ, perceived frames are kept.",
+    "places. If only `tracking` or `outputs` settings differ, detection is not repeated.",
 )
 @click.option("--discard-labels", is_flag=True, help="With --overwrite: drop corrected labels.")
 @click.option(

@@ -39,9 +39,7 @@ _SUFFIXES: "dict[FormatName, str]" = {"mcap": ".mcap", "ros1": ".bag", "ros2": "
     type=click.Choice(["mcap", "ros1", "ros2"]),
     help="Format of the recording; by default that of OUT's suffix.",
 )
-@choice_option(
-    "--sensor", _SENSORS, f"Depth camera to simulate: {', '.join(_SENSORS)}.", metavar="SENSOR"
-)
+@choice_option("--sensor", _SENSORS, "Depth camera, listed above.", metavar="SENSOR")
 @click.option(
     "--frames",
     type=click.IntRange(1),
@@ -85,6 +83,18 @@ def simulate(
     walking     a camera that moves along a counter and back
     crossing    two moving objects that occlude each other and others
     rearranged  objects that are added, removed, carried and pushed
+
+    \b
+    kinect        Kinect v1, Xtion or Carmine, registered to the colour camera
+    realsense     Intel D435 with its spatial filter
+    kinect-v2     Kinect v2
+    azure-kinect  Azure Kinect, narrow field of view
+    d415          Intel D415 without filters
+    d435          Intel D435 without filters
+    d455          Intel D455 without filters
+    sr300         Intel SR300 or F200
+    l515          Intel L515 (lidar)
+    phone         lidar of a phone
 
     \b
     shapecat simulate demo.mcap --scene clutter --frames 60 --seed 3

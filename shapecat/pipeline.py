@@ -184,7 +184,7 @@ def _add_outputs(
             run["seconds"].pop(output, None)
     differing = differences(run, planned)
     if not same_content(run["input"], job.source, content.result):
-        differing["input"] = f"{run['input']['path']} there"
+        differing["input"] = f"{run['input']['path']} in the old run"
     if differing:
         listed = "; ".join(f"{name}: {text}" for name, text in differing.items())
         msg = (

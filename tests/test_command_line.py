@@ -465,8 +465,12 @@ def test_refusal_names_differing_options(shapecat: Run, recording: Path, runs: P
     result = shapecat("process", recording, "--out", runs / "a", *options)
 
     assert result.exit_code == 1
-    differing = "detection.min_points: 60 there, 7 wanted; every: 1 there, 2 wanted; "
-    assert f"({differing}color: default there, none wanted)" in result.stderr
+    differing = [
+        "detection.min_points: 60 in the old run, 7 requested",
+        "every: 1 in the old run, 2 requested",
+        "color: default in the old run, none requested",
+    ]
+    assert f"({'; '.join(differing)})" in result.stderr
 
 
 def listening_addresses(pid: int) -> set[str]:

@@ -443,7 +443,8 @@ CALLS = {
         Exported(7, 0, {"train": 1}),
         (
             "2 runs: 7 labelled views in o\n"
-            "1 image in train, 0 in val: all frames of a recording go to the same split\n"
+            "1 image in train, 0 in val: all frames of a recording go to the same split; export "
+            "more recordings, or raise --val if there are several\n"
         ),
     ),
     "export a --format kitti --out o --every 3 --boxes visible --recording r.bag": (

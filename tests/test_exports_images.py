@@ -154,8 +154,8 @@ def test_export_warns_about_missing_validation_and_labels(
     options = ("--format", kind, "--out", tmp_path / "out")
     done = shapecat("export", run, *options, "--corrected-only")
 
-    why = "all frames of a recording go to the same split"
-    line = f"{len(data['images'])} images in train, 0 in val: {why}"
+    why = "all frames of a recording go to the same split; export more recordings, or "
+    line = f"{len(data['images'])} images in train, 0 in val: {why}raise --val if there are several"
     assert done.stdout.splitlines()[1:] == [line]
     warning = f"Warning: a model will learn {crowds} visible objects without a reliable label as"
     assert (warning in done.stderr) == (kind == "yolo")

@@ -473,7 +473,7 @@ def test_frames_without_pose_are_reported_with_what_they_cost(
 
     report_up(upright, tmp_path)
 
-    assert upright.warnings[1:] == [f"/d: its pose in map is {loss}"]
+    assert upright.warnings[1:] == [f"/d: the pose of its sensor in map is {loss}"]
 
 
 def test_frame_with_objects_does_not_count_as_without_plane(tmp_path: Path) -> None:

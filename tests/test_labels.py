@@ -193,11 +193,15 @@ def test_merge_into_deleted_track_is_refused(run: Path) -> None:
 
 def test_tracks_of_different_topics_are_not_merged(run: Path) -> None:
     """One number on two topics would make one annotation delete the other."""
-    text = labelled(t4="merge with 1").replace("merge with 1,/depth", "merge with 1,/other")
-    write_table(run, text)
+    for topic, problem in (
+        ("/other", "track #1 belongs to another topic, /other"),
+        ("", "the table names no topic for track #1"),
+    ):
+        text = labelled(t4="merge with 1").replace("cup,0.500,,/depth", f"cup,0.500,,{topic}")
+        write_table(run, text)
 
-    with pytest.raises(OutputError, match="another topic"):
-        read_labels(run / "tracks.csv")
+        with pytest.raises(OutputError, match=problem):
+            read_labels(run / "tracks.csv")
 
 
 def test_tracks_with_common_sensor_are_merged(run: Path) -> None:

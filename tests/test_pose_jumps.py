@@ -57,7 +57,9 @@ def test_correction_of_the_map_is_reported(tmp_path: Path) -> None:
     write_frames(tmp_path, places, yaws, np.arange(90), 30)
     (warning,) = explain_jumps(tmp_path, "map")
 
-    assert warning.startswith("/head: its pose in map jumps 2 times, first at 1.3 s, by up to 0.2")
+    assert warning.startswith(
+        "/head: the pose of its sensor in map jumps 2 times, first at 1.3 s, by up to 0.2"
+    )
     assert "--fixed-frame" in warning
 
 
@@ -113,4 +115,6 @@ def test_run_of_a_corrected_map_has_the_warning(tmp_path: Path) -> None:
     process(Job(tmp_path / "a.mcap", tmp_path / "out"))
 
     warning = next(text for text in read_run(tmp_path / "out")["warnings"] if "jumps" in text)
-    assert warning.startswith("/camera/depth/image_raw: its pose in map jumps once, at 0.2 s")
+    assert warning.startswith(
+        "/camera/depth/image_raw: the pose of its sensor in map jumps once, at 0.2 s"
+    )

@@ -170,7 +170,8 @@ def differences(run: RunInfo, planned: Mapping[str, Any]) -> dict[str, str]:
     """
     entries, planned_entries = (_entries(each) for each in (run, planned))
     return {
-        name: f"{_words(entries.get(name))} there, {_words(planned_entries.get(name))} wanted"
+        name: f"{_words(entries.get(name))} in the old run, "
+        f"{_words(planned_entries.get(name))} requested"
         for name in dict.fromkeys((*entries, *planned_entries))
         if entries.get(name) != planned_entries.get(name)
     }

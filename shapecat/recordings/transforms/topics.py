@@ -58,7 +58,10 @@ def _of_other_robots(
         rivals = [owner[f] for f in frames if f in owner and spaces[owner[f]] != spaces[topic]]
         nearer = [other for other in rivals if spaces[other] in around]
         if nearer and spaces[topic] not in around:
-            recording.warn(f"transforms on {topic} are ignored: those on {nearer[0]} are nearer")
+            recording.warn(
+                f"transforms on {topic} are ignored: {nearer[0]}, in the namespace of the depth "
+                "topic, has frames of the same name"
+            )
             left.add(topic)
             continue
         if rivals:

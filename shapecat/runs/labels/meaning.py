@@ -127,7 +127,9 @@ def resolve_labels(
         try:
             target = by_track[_follow(row.track, verdicts)]
             if not (one_frame or _share_a_topic(target, row)):
-                msg = f"track {target.track} belongs to another topic, {target.topic or 'none'}"
+                msg = f"track #{target.track} belongs to another topic, {target.topic}"
+                if not target.topic:
+                    msg = f"the table names no topic for track #{target.track}"
                 raise ValueError(msg)  # noqa: TRY301  collected with those of the calls
         except ValueError as error:
             misread[row.track] = f"{row.label!r}: {error}"

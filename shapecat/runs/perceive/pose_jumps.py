@@ -36,9 +36,9 @@ def explain_jumps(folder: Path, fixed_frame: str) -> Iterator[str]:
             seconds = (stamps_ns[jumps[0] + 1] - first_stamp(folder)) * 1e-9
             times = f"{len(jumps)} times, first" if len(jumps) > 1 else "once,"
             yield (
-                f"{topic}: its pose in {fixed_frame} jumps {times} at {seconds:.1f} s, by up to "
-                f"{steps.max():.2f} m, and objects may get new tracks; if odometry has a frame of "
-                "its own, give its name to --fixed-frame"
+                f"{topic}: the pose of its sensor in {fixed_frame} jumps {times} at {seconds:.1f} "
+                f"s, by up to {steps.max():.2f} m, and objects may get new tracks; if odometry has "
+                "a frame of its own, pass it, for example --fixed-frame odom"
             )
 
 

@@ -57,7 +57,7 @@ def _missing_poses(folder: Path, fixed_frame: str | None) -> Iterator[str]:
             loss = ": its tracks are in the frame of the sensor"
         if with_pose < count:
             frames = f"{count - with_pose} of {count} frames"
-            yield f"{topic}: its pose in {fixed_frame} is unknown in {frames}{loss}"
+            yield f"{topic}: the pose of its sensor in {fixed_frame} is unknown in {frames}{loss}"
 
 
 def _angles_to_planes(folder: Path) -> tuple[list[float], int]:
