@@ -38,7 +38,8 @@ def evaluate(
     forest        random forest on shapecat's descriptor
     linear        logistic regression on shapecat's descriptor
     pnn           probabilistic neural network on shapecat's descriptor
-    forest words  the thesis: linear classifiers on the leaves of a forest
+    forest leaves (thesis)
+                  linear classifiers on the leaves of a forest
     forest on D2  random forest on the distribution of point distances
     forest on D2, D3, A3 (ESF-like)
                   random forest on distributions of distances, areas and angles

@@ -20,7 +20,8 @@ PHASES = {
     "review": "writing review.rrd",
     "report": "drawing reports",
     "export": "exporting",
-    "train": "learning",
+    "train": "training",
+    "baselines": "comparing classifiers",
     "evaluate": "evaluating",
     "compare": "comparing",
 }
@@ -120,7 +121,7 @@ def note_skipped(learned: Mapping[str, Any]) -> None:
 
 def missed_words(missed: Mapping[str, Any]) -> str:
     """Describe a label that was not transferred, with the reason."""
-    what = f"track {missed['old_track']}, {missed['label']}: " if missed["old_track"] else ""
+    what = f"track #{missed['old_track']}, {missed['label']}: " if missed["old_track"] else ""
     return f"  {what}{missed['reason']}"
 
 

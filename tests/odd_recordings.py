@@ -474,7 +474,7 @@ CASES: dict[str, Case] = {
     "foreign channels": Case(foreign),
     "absurd numbers": Case(
         absurd_numbers,
-        reported="calibration: /camera/depth/camera_info: message does not match its type",
+        reported="CameraInfo: /camera/depth/camera_info: message does not match its type",
     ),
     "clock from power-on": Case(lambda p: clocks(p, "uptime"), reported="does not count from 1970"),
     "clock missing": Case(lambda p: clocks(p, "zero"), reported="stamp is 0"),

@@ -495,7 +495,7 @@ def test_table_columns_become_arrays(page_folder: Path) -> None:
     assert run.frame_table.numpy("fixed_rotation").shape == (4, 9)
     with pytest.raises(OutputError, match=r"no column centre; known: .*center"):
         run.detections.numpy("centre")
-    with pytest.raises(OutputError, match=r"no track 999 among \d+ tracks"):
+    with pytest.raises(OutputError, match=r"no track #999 among \d+ tracks"):
         run.posterior(999)
 
 

@@ -98,7 +98,7 @@ def test_killed_batch_resumes_when_started_twice_at_once(bucket: Path, tmp_path:
     for text in errors:
         reported = [line for line in text.splitlines() if line.startswith("Error")]
         # If the machine stalls for long, one command may take over from the other.
-        known = ("another run is writing there", "another run has taken over")
+        known = ("another process is writing to this folder", "another process has taken over")
         assert all(any(words in line for words in known) for line in reported), text
     assert last.returncode == 0, last.stderr
     assert sorted(made(bucket)) == [f"run_{k:04}" for k in range(8)]

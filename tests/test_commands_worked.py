@@ -611,7 +611,7 @@ def test_annotate_reports_written_files_and_untransferred_labels(
         "t.csv: this table is not in a run folder, so shapecat assumes the same fixed frame and "
         "unmoved objects; give the run folder to check both"
     )
-    assert reason == "  track 17, tea pot: no object there"
+    assert reason == "  track #17, tea pot: no object there"
 
 
 def test_process_reports_where_untransferred_labels_are(
@@ -627,9 +627,9 @@ def test_process_reports_where_untransferred_labels_are(
     message = "lab: transferred 5 of 6 corrected labels; the others are in"
     assert capsys.readouterr().err.splitlines() == [
         f"{message} out/lab/tracks.previous.csv",
-        "  track 17, tea pot: no object there",
+        "  track #17, tea pot: no object there",
         f"{message} s3://b/lab/tracks.previous.csv",
-        "  track 17, tea pot: no object there",
+        "  track #17, tea pot: no object there",
         "lab: transferred 5 of 5 corrected labels",
     ]
 

@@ -515,7 +515,10 @@ def test_page_shows_all_content_in_its_place() -> None:
     assert legend == [
         (str(COLOURS["both"]), "both"),
         (str(COLOURS["missed"]), "missed: only in the reference"),
-        (str(COLOURS["surplus"]), "surplus: only in the run, or on another object"),
+        (
+            str(COLOURS["surplus"]),
+            "surplus (false positive): only in the run, or on another object",
+        ),
         (str(COLOURS["category"]), "wrong category"),
     ]
     # Text of a fixed size would hide a small picture.

@@ -247,7 +247,7 @@ def test_two_runs_cannot_write_same_folder(recording: Path, tmp_path: Path) -> N
 
     def start_second_run(phase: str, done: int, _total: int | None) -> None:
         if (phase, done) == ("perceive", 1):
-            with pytest.raises(OutputError, match="another run is writing"):
+            with pytest.raises(OutputError, match="another process is writing to this folder"):
                 process(job)
 
     process(job, start_second_run)

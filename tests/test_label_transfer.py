@@ -346,7 +346,7 @@ def test_run_without_objects_misses_each_label(tmp_path: Path) -> None:
     assert not transfer.transferred
     assert {(item.old_track, item.label): item.reason for item in transfer.missed} == {
         (1, "mug"): "nothing was found there",
-        (2, "merge with 1"): "track 1, which it is merged with: nothing was found there",
+        (2, "merge with 1"): "track #1, which it is merged with: nothing was found there",
     }
     listed = read_run(target)["corrections"]
     assert (listed["by"], listed["transferred"]) == ("frames in common", [])
@@ -401,7 +401,7 @@ def test_missing_objects_are_reported(tmp_path: Path) -> None:
     assert labels_of(target) == {1: "", 2: "mug"}
     assert {item.old_track: item.reason for item in transfer.missed} == {
         2: "nothing was found there",
-        3: "track 2, which it is merged with: nothing was found there",
+        3: "track #2, which it is merged with: nothing was found there",
     }
 
 
@@ -457,7 +457,7 @@ def test_existing_label_in_target_is_kept(tmp_path: Path) -> None:
 
     (missed,) = transfer_labels(source, target).missed
 
-    assert missed.reason == "track 5 already has the label teapot"
+    assert missed.reason == "track #5 already has the label teapot"
     assert labels_of(target) == {5: "teapot"}
 
 
@@ -480,7 +480,7 @@ def test_second_transfer_keeps_corrected_label(tmp_path: Path) -> None:
 
     (missed,) = transfer_labels(source, target).missed
 
-    assert missed.reason == "track 5 already has the label teapot"
+    assert missed.reason == "track #5 already has the label teapot"
     assert labels_of(target) == {5: "teapot"}
 
 
@@ -493,7 +493,7 @@ def test_conflicting_label_does_not_block_the_others(tmp_path: Path) -> None:
 
     (missed,) = transfer_labels(source, target).missed
 
-    assert (missed.old_track, "track 5 is deleted" in missed.reason) == (1, True)
+    assert (missed.old_track, "track #5 is deleted" in missed.reason) == (1, True)
     assert labels_of(target) == {5: "", 6: "merge with 5", 7: "mug"}
 
 
@@ -923,7 +923,7 @@ def test_table_alone_without_positions_is_refused(tmp_path: Path, found: str, pl
     target = second(tmp_path / "target", {1: static(CAN), 2: static(CUP)})
 
     line, track = (2, 4) if place == "u,v,w" else (3, 5)
-    with pytest.raises(OutputError, match=f"line {line}: no position x, y, z of track {track}"):
+    with pytest.raises(OutputError, match=f"line {line}: no position x, y, z of track #{track}"):
         transfer_labels(table, target)
     assert labels_of(target) == {1: "", 2: ""}
 
@@ -955,6 +955,6 @@ def test_object_between_two_old_ones_is_that_of_neither(tmp_path: Path) -> None:
 
         assert labels_of(target) == {7: ""}
         assert {one.old_track: one.reason for one in transfer.missed} == {
-            1: "track 7 could also be track 2",
-            2: "track 7 could also be track 1",
+            1: "track #7 could also be track #2",
+            2: "track #7 could also be track #1",
         }

@@ -107,8 +107,8 @@ def test_category_names_are_normalised(run: Path, label: str, meant: str) -> Non
         ("merge 2", "is not a category"),
         ("new delete", "is not a category"),
         ("new merge with 1", "is not a category"),
-        ("merge with 77", "there is no track 77"),
-        ("merge with 4", "forms a loop: 4 -> 4"),
+        ("merge with 77", "there is no track #77"),
+        ("merge with 4", "forms a loop: #4 -> #4"),
         ("7", "is not a category"),
         ("../../etc", "is not a category"),
         ("a/b", "a category is a letter followed by letters, digits, spaces and - _ . + & ' ( )"),
@@ -137,7 +137,7 @@ def test_message_about_a_wrong_table_is_short(run: Path) -> None:
 
     _, first, *rest = str(caught.value).splitlines()
     assert first.startswith(f"  line 2: '{'9' * 80}…' is not a category")
-    assert rest[0] == "  line 6: there is no track 1000"
+    assert rest[0] == "  line 6: there is no track #1000"
     assert (len(rest), rest[-1]) == (20, "  and 981 more problems")
 
 
@@ -171,7 +171,7 @@ def test_chains_of_merges_end_in_one_track(run: Path) -> None:
 
     for wrong, message in [
         ({"t4": "merge with 2", "t2": "merge with 4"}, "forms a loop"),
-        ({"t4": "merge with 2", "t2": "delete"}, "track 2 is deleted"),
+        ({"t4": "merge with 2", "t2": "delete"}, "track #2 is deleted"),
     ]:
         (run / "tracks.csv").write_text(labelled(**wrong))
         with pytest.raises(OutputError, match=message):
@@ -187,7 +187,7 @@ def test_merge_into_deleted_track_is_refused(run: Path) -> None:
 
     label_of = {row.track: row.label for row in kept}
     assert (label_of[first], label_of[second]) == ("", "delete")
-    assert f"track {second} is deleted" in refused.pop(first)
+    assert f"track #{second} is deleted" in refused.pop(first)
     assert refused == {}
 
 
@@ -307,7 +307,7 @@ def test_edited_category_is_refused(run: Path, edited: str) -> None:
     wrong = ORIGINAL.replace("2,0.000,can,", f"2,0.000,{edited},")
     for path in (run / "tracks.csv", run.parent / "mine.csv"):
         path.write_text(wrong)
-        with pytest.raises(OutputError, match="line 3: the category of track 2 is 'can', not"):
+        with pytest.raises(OutputError, match="line 3: the category of track #2 is 'can', not"):
             adopt_labels(path, run)
     with pytest.raises(OutputError, match="write corrections into the column label"):
         read_labels(run / "tracks.csv")

@@ -572,7 +572,7 @@ def test_unreadable_calibration_is_searched_once(
         found = list(frames(recording, streams, skipped=skipped))
 
     assert not found
-    assert skipped == {"depth image without camera info": 30}
+    assert skipped == {"depth image without CameraInfo": 30}
     assert decoded["/depth/camera_info"] < 30 + 10
 
 
@@ -585,7 +585,7 @@ def test_mismatched_calibration_is_counted_with_its_topic(tmp_path: Path) -> Non
 
     _, skipped, _ = read(write(tmp_path / "a.mcap", items))
 
-    assert skipped == {"with depth of 32 x 24 but camera info for 64 x 48 on /depth/camera_info": 1}
+    assert skipped == {"with depth of 32 x 24 but CameraInfo for 64 x 48 on /depth/camera_info": 1}
 
 
 @pytest.mark.parametrize(

@@ -350,7 +350,7 @@ def test_colour_image_of_other_size_than_calibration_is_unused(tmp_path: Path) -
     ((_, view),), warnings = read(record(tmp_path / "a.mcap", in_order(items)))
 
     assert view is None
-    assert any("image of 80 x 61 pixels with camera info for 80 x 60" in w for w in warnings)
+    assert any("image of 80 x 61 pixels with CameraInfo for 80 x 60" in w for w in warnings)
 
 
 @pytest.mark.parametrize(("gap_ms", "found"), [(49, True), (51, False)])
@@ -742,9 +742,9 @@ def test_description_has_times_sizes_and_uses_of_topics(tmp_path: Path) -> None:
 
     uses = {topic["name"]: (topic["use"], topic["count"]) for topic in description.pop("topics")}
     assert uses == {
-        "/cam/color/camera_info": ("camera", 1),
+        "/cam/color/camera_info": ("CameraInfo", 1),
         "/cam/color/image_raw": ("colour of /cam/depth/image_raw", 1),
-        "/cam/depth/camera_info": ("camera", 2),
+        "/cam/depth/camera_info": ("CameraInfo", 2),
         "/cam/depth/image_raw": ("depth stream", 2),
         "/tf_static": ("", 1),
     }

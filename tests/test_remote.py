@@ -648,7 +648,7 @@ def test_foreign_folder_is_not_touched(made: Path) -> None:
 @pytest.mark.usefixtures("bucket")
 def test_only_one_process_claims_a_folder(url: str, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(claims, "_STALE_S", 60.0)  # on a busy machine, a beat may come late
-    with claimed(url, "one"), pytest.raises(OutputError, match="another run is writing there"):
+    with claimed(url, "one"), pytest.raises(OutputError, match="another process is writing"):
         claims.Claim(url, "two")
     with claimed(url, "two") as claim:
         assert not claim.inherited

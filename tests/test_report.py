@@ -247,7 +247,7 @@ def test_damaged_run_does_not_prevent_pages_of_others(shapecat: Run, run: Path) 
 
     assert result.exit_code == 1
     assert result.stdout.splitlines() == [str(run / "report.html"), str(index)]
-    assert "there is no track 999" in result.stderr
+    assert "there is no track #999" in result.stderr
     assert [f"Error: {folder}/" in result.stderr for folder in (bad, broken)] == [True, True]
     assert re.findall(r'class="run" href="([^"]+)"', index.read_text("utf-8")) == [
         "table/report.html"

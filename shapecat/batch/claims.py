@@ -97,7 +97,10 @@ class Claim:
                 return False
             if now != content:
                 owner = f"process {other.get('process')} on {other.get('host')}"
-                msg = f"{self._url}: another run is writing there: {owner}; wait for it, or stop it"
+                msg = (
+                    f"{self._url}: another process is writing to this folder ({owner}); wait for "
+                    "it, or stop it"
+                )
                 raise OutputError(msg)
         return True
 
@@ -115,7 +118,10 @@ class Claim:
         OutputError : another process has taken it over, because this one was silent too long.
         """
         if not self._is_held():
-            msg = f"{self._url}: another run has taken over, since this one did not renew its claim"
+            msg = (
+                f"{self._url}: another process has taken over this folder, since this one did not "
+                "renew its claim"
+            )
             raise OutputError(msg)
 
     def renew(self) -> bool:

@@ -28,9 +28,9 @@ def make_baselines(blocks: Sequence[slice]) -> dict[str, Callable[[], Any]]:
     """Return functions that make unfitted baselines, by name; all classify whole descriptors.
 
     ``forest`` is a random forest; ``linear`` is logistic regression on the standardised descriptor;
-    ``pnn`` multiplies the Parzen densities of the blocks; ``forest words`` is the method of the
-    thesis: linear one-versus-rest classifiers on the leaves of a forest that is trained on the
-    descriptor and its densities.
+    ``pnn`` multiplies the Parzen densities of the blocks; ``forest leaves (thesis)`` are
+    linear one-versus-rest classifiers on the leaves of a forest that is trained on the descriptor
+    and its densities.
 
     ``blocks`` is the range of each block in the descriptor.
     """
@@ -40,7 +40,7 @@ def make_baselines(blocks: Sequence[slice]) -> dict[str, Callable[[], Any]]:
             StandardScaler(), LogisticRegression(C=0.1, class_weight="balanced", max_iter=2000)
         ),
         "pnn": lambda: _DensityProduct(blocks),
-        "forest words": lambda: _ForestWords(blocks),
+        "forest leaves (thesis)": lambda: _ForestWords(blocks),
     }
 
 

@@ -12,17 +12,15 @@ __all__ = ["FlatForest", "apply"]
 
 
 class FlatForest(Record):
-    """Decision trees in four arrays, evaluated without scikit-learn.
+    """Trees whose n nodes are stored one after the other, children after their parents.
 
-    Both children of a node are adjacent and come after it. The id of a leaf is its number
-    among the leaves, in the order of the nodes.
+    The id of a leaf is its number among the leaves, in the order of the nodes.
 
     Attributes
     ----------
-    roots : (t,) index of each tree's root.
-    feature : (n,) index of the feature that a node compares; 0 for leaves.
-    threshold : (n,) a view goes to the left child if its feature is <= threshold.
-    left : (n,) index of the left child, 0 for leaves; the right child is ``left + 1``.
+    roots : (t,) index of the root of each tree.
+    feature, threshold : (n,) a sample goes left if this feature is <= this threshold.
+    left : (n,) index of the left child, 0 in leaves; the right child is ``left + 1``.
 
     Raises
     ------

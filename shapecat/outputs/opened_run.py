@@ -220,7 +220,9 @@ class Run:
         tracks = self.tracks.numpy("track")
         rows = np.flatnonzero(tracks == track)
         if not len(rows):
-            msg = f"{self.folder}: no track {track} among {plural(len(np.unique(tracks)), 'track')}"
+            msg = (
+                f"{self.folder}: no track #{track} among {plural(len(np.unique(tracks)), 'track')}"
+            )
             raise OutputError(msg)
         seconds = (self.tracks.numpy("stamp_ns")[rows] - first_stamp(self.folder)) * 1e-9
         return seconds, self.tracks.numpy("posterior")[rows]

@@ -183,7 +183,7 @@ class _Partner:
             self._lens = _lens_of(self._recording.decode(message), self.stream.topic)
             self._calibration = content
         except (RecordingError, *MALFORMED) as error:
-            self._left_out[f"calibration: {reason_of(error, self.stream.topic)}"] += 1
+            self._left_out[f"CameraInfo: {reason_of(error, self.stream.topic)}"] += 1
 
     def notice(self, frame: Frame) -> None:
         """Take note of a new frame: if the clock was set back, earlier images are not its own."""
@@ -254,7 +254,7 @@ class _Partner:
         lens = self._first_lens if self._lens is None else self._lens
         if lens is not None and (lens.pinhole.height, lens.pinhole.width) != shape:
             size = f"{lens.pinhole.width} x {lens.pinhole.height}"
-            msg = f"image of {shape[1]} x {shape[0]} pixels with camera info for {size}"
+            msg = f"image of {shape[1]} x {shape[0]} pixels with CameraInfo for {size}"
             raise MessageError(msg)
         named = not is_of_realsense_recorder(self.stream.topic)
         one_frame = named and same_frame(image.frame_id, frame.frame_id)

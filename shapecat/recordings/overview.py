@@ -51,7 +51,7 @@ def describe_recording(path: Path) -> dict[str, Any]:
 
 def _uses(recording: Recording, streams: Mapping[str, Stream]) -> dict[str, str]:
     """Return the use of each topic, in words; unused topics are absent."""
-    uses = {stream.info_topic: "camera" for stream in streams.values() if stream.info_topic}
+    uses = {stream.info_topic: "CameraInfo" for stream in streams.values() if stream.info_topic}
     colours = pair_colours(recording, list(streams.values()))
     for topic, stream in streams.items():
         uses[topic] = f"{stream.kind} stream{'' if stream.usable else ' without CameraInfo'}"
@@ -64,5 +64,5 @@ def _uses(recording: Recording, streams: Mapping[str, Stream]) -> dict[str, str]
         use = uses.get(colour.topic, "")
         uses[colour.topic] = f"{use}, {topic}" if use else f"colour of {topic}"
         if colour.info_topic:
-            uses.setdefault(colour.info_topic, "camera")
+            uses.setdefault(colour.info_topic, "CameraInfo")
     return uses

@@ -176,10 +176,10 @@ def camera_of_info(info: Any, *, rectified: bool) -> tuple[Camera, bool]:
         cx, cy = cx - int(roi.x_offset), cy - int(roi.y_offset)
     values = (fx / bin_x, fy / bin_y, cx / bin_x, cy / bin_y)
     if not (np.isfinite(values).all() and fx > _UNIT and fy > _UNIT):
-        msg = f"camera info without a calibration (focal length {min(fx, fy):g})"
+        msg = f"CameraInfo without intrinsics (focal length {min(fx, fy):g})"
         raise MessageError(msg)
     if np.abs(values).max() > _LARGEST_PX:
-        msg = f"camera info that fits no camera (fx {fx:g}, fy {fy:g}, cx {cx:g}, cy {cy:g})"
+        msg = f"CameraInfo with implausible intrinsics (fx {fx:g}, fy {fy:g}, cx {cx:g}, cy {cy:g})"
         raise MessageError(msg)
     camera = Camera(width // bin_x, height // bin_y, *(float(value) for value in values))
     # Coefficients that are all zero mean a rectified image, as in image_geometry of ROS, even with

@@ -144,7 +144,7 @@ class DepthSource(Source):
             stamp = stamp_ns(info.header)
         except (RecordingError, *MALFORMED) as error:
             reason = reason_of(error, message.topic)
-            self.recording.warn(f"skipped a calibration: {message.topic}: {reason}")
+            self.recording.warn(f"skipped a CameraInfo: {message.topic}: {reason}")
             return
         if self._waiting is None:
             self._info, self._info_stamp = info, stamp
@@ -192,7 +192,7 @@ class DepthSource(Source):
         if self._info is None:
             self._info = self._first_info
         if self._info is None:
-            msg = "depth image without camera info"
+            msg = "depth image without CameraInfo"
             raise MessageError(msg)
         camera, distorted = camera_of_info(self._info, rectified=self.rectified)
         compressed = ros_counterpart(self.stream.type) == COMPRESSED
@@ -203,7 +203,7 @@ class DepthSource(Source):
             shape = f"{depth.shape[1]} x {depth.shape[0]}"
             size = f"{camera.width} x {camera.height}"
             # After a count, which may be 1.
-            msg = f"with depth of {shape} but camera info for {size} on {self.info_topic}"
+            msg = f"with depth of {shape} but CameraInfo for {size} on {self.info_topic}"
             raise MessageError(msg)
         if off_center(camera) and not self._info.roi.width:
             self.recording.warn(

@@ -272,7 +272,7 @@ def _depth_stream(topic: Topic, first: Any, recording: Recording) -> Stream:
         info_frame = _frame_of(recording, info)
         if info_frame and info_frame.strip("/") != frame_id.strip("/"):
             doubt = (
-                f"{topic.name}: the frame of its images is {frame_id}, but the only calibration, "
+                f"{topic.name}: the frame of its images is {frame_id}, but the only CameraInfo, on "
                 f"{info}, is for {info_frame}: are these the intrinsics of another camera?"
             )
     return Stream(topic.name, topic.type, "depth", info, topic.count, frame_id, doubt)

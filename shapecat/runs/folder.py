@@ -96,13 +96,13 @@ def staged(
     """Provide a hidden folder; rename it to ``folder`` when the block succeeds.
 
     An earlier ``folder`` is moved away first and removed afterwards. After a signal or a kill, the
-    hidden folder is kept, so that the next run can resume; after an error, only if
+    hidden folder is kept, so that the same command can resume; after an error, only if
     ``worth_keeping`` returns True for it.
 
     Raises
     ------
-    OutputError : the folder cannot be written, was not made by shapecat, or another run is writing
-        to it.
+    OutputError : the folder cannot be written, was not made by shapecat, or another process is
+        writing to it.
     """
     hidden = partial_path(folder)
     with explained(f"{folder}: cannot be written", OutputError):  # its name may be too long
@@ -115,7 +115,7 @@ def staged(
             yield hidden
             _replace(folder, hidden, marker)
     except BusyError as error:
-        msg = f"{folder}: another run is writing there"
+        msg = f"{folder}: another process is writing to this folder"
         raise OutputError(msg) from error
     except Exception as error:
         resumable = worth_keeping(hidden)

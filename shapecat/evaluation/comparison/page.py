@@ -174,7 +174,7 @@ def format_page(found: Comparison) -> str:
                 (
                     "both",
                     "missed: only in the reference",
-                    "surplus: only in the run, or on another object",
+                    "surplus (false positive): only in the run, or on another object",
                     "wrong category",
                 ),
                 COLOURS.values(),

@@ -104,11 +104,11 @@ def _contradictions(table: TrackTable, original: TrackTable) -> list[str]:
     problems = []
     for row in table.rows:
         if row.track not in stored:
-            problems.append(f"line {row.line}: there is no track {row.track}")
+            problems.append(f"line {row.line}: there is no track #{row.track}")
         elif row.category.lower() != stored[row.track].lower():
             problems.append(
-                f"line {row.line}: the category of track {row.track} is {stored[row.track]!r}, not "
-                f"{row.category!r}; write corrections into the column label"
+                f"line {row.line}: the category of track #{row.track} is {stored[row.track]!r}, "
+                f"not {row.category!r}; write corrections into the column label"
             )
     return problems
 

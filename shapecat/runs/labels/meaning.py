@@ -155,14 +155,14 @@ def _follow(track: int, verdicts: Mapping[int, _Verdict]) -> int:
     chain = [track]
     while isinstance(target := verdicts[chain[-1]], int):
         if target not in verdicts:
-            msg = f"there is no track {target}"
+            msg = f"there is no track #{target}"
             raise ValueError(msg)
         if target in chain:
-            msg = f"forms a loop: {' -> '.join(map(str, [*chain, target]))}"
+            msg = f"forms a loop: {' -> '.join(f'#{k}' for k in [*chain, target])}"
             raise ValueError(msg)
         chain.append(target)
         if verdicts[target] is None:
-            msg = f"track {target} is deleted"
+            msg = f"track #{target} is deleted"
             raise ValueError(msg)
     return chain[-1]
 

@@ -103,7 +103,7 @@ def _by_majority(
         rivals = [k for k in others if shares[k] >= _RIVAL]
         if shares[best] < _MAJORITY or rivals:
             for old in (old for k in (best, *rivals) for old in objects[k]):
-                reasons[old] = f"track {new} matches it only part of the time"
+                reasons[old] = f"track #{new} matches it only part of the time"
             continue
         for old in objects[best]:
             mean = apart[old, new] / votes[old, new]
@@ -196,13 +196,13 @@ def _nearest_there(
     (distance, first), *others = reached
     nearest = new[first]
     if others and others[0][0] - distance < _CLEAR_M:
-        return None, f"tracks {nearest.track} and {new[others[0][1]].track} are both there"
+        return None, f"tracks #{nearest.track} and #{new[others[0][1]].track} are both there"
     rivals = [other.track for other in old if _apart(other, nearest) < distance + _CLEAR_M]
     if rivals:
-        return None, f"track {nearest.track} could also be track {rivals[0]}"
+        return None, f"track #{nearest.track} could also be track #{rivals[0]}"
     ratio = max(item.extent_m, nearest.extent_m) / min(item.extent_m, nearest.extent_m)
     if ratio > _SIZE_RATIO:
-        return None, f"track {nearest.track} is there, but has a different size"
+        return None, f"track #{nearest.track} is there, but has a different size"
     return Match(nearest.track, round(distance, 4)), ""
 
 
@@ -250,7 +250,7 @@ def _place_of(row: TrackRow) -> F8:
     try:
         place = [parse_number(row.cells[name]) for name in "xyz"]
     except (KeyError, ValueError) as error:
-        msg = f"line {row.line}: no position x, y, z of track {row.track}"
+        msg = f"line {row.line}: no position x, y, z of track #{row.track}"
         raise OutputError(msg) from error
     return np.array(place)
 

@@ -110,7 +110,7 @@ def read_track_table(path: Path) -> TrackTable:
                     "CSV UTF-8"
                 )
             if rows.setdefault(row.track, row) is not row:
-                problems.append(f"line {row.line}: track {row.track} is listed twice")
+                problems.append(f"line {row.line}: track #{row.track} is listed twice")
     except csv.Error as error:
         problems.append(f"line {lines.line_num}: {error}")
     if not columns:

@@ -115,7 +115,7 @@ def _labelled_otherwise(transfer: Transfer, target: Path, run: RunInfo) -> dict[
     }
     current = read_track_table(target / "tracks.csv").labels
     return {
-        item.track: f"track {item.track} already has the label {current[item.track]}"
+        item.track: f"track #{item.track} already has the label {current[item.track]}"
         for item in transfer.transferred
         if current[item.track] not in ("", item.label)
         and (item.track, current[item.track]) not in earlier
@@ -258,4 +258,4 @@ def _translate(
 def _why(track: int, whole: int, matches: Matches) -> str:
     """Return the reason why the whole that a track belongs to has no match."""
     reason = matches.reasons.get(whole, "nothing was found there")
-    return reason if track == whole else f"track {whole}, which it is merged with: {reason}"
+    return reason if track == whole else f"track #{whole}, which it is merged with: {reason}"
