@@ -30,14 +30,15 @@ class DetectionSettings:
     """Planes and object candidates (thesis ch. 4). Lengths in metres."""
 
     max_range_m: float = 3.0
-    """Points at a larger depth than this, along the optical axis, are ignored (thesis 4.2). The
-    axis of an unorganized cloud points from the origin of its frame to its middle."""
+    """Points at a larger depth than this, along the optical axis, are ignored (thesis 4.2). For an
+    unorganized cloud, the optical axis is the line from the origin of its frame to the centre of
+    the cloud."""
     fuse_frames: int = 1
     """Number of consecutive depth images that are fused before detection, including the current one
     (thesis 4.2); 1 turns fusion off."""
     max_height_m: float = 0.6
-    """Points higher than this above a plane do not belong to an object on it. Objects must be 2 cm
-    lower: what comes nearer may continue above."""
+    """Points higher than this above a plane do not belong to an object on it. An object must end at
+    least 2 cm below this limit; a taller one may continue above it and is dropped."""
     max_size_m: float = 0.6
     """Segments larger than this are treated as walls or furniture."""
     min_points: int = 60
@@ -69,8 +70,8 @@ class SurfaceSettings:
     """Edge of the voxels in which the points of an object are averaged before the neural gas learns
     them."""
     smooth_radius_m: float = 0.0
-    """Radius of moving least squares smoothing, applied to the averages of the voxels, for example
-    0.015 (thesis 4.2), at least 1.5 times `surface.voxel_m`; 0 turns it off."""
+    """Radius of moving least squares smoothing, applied to the voxel centroids, for example 0.015
+    (thesis 4.2), at least 1.5 times `surface.voxel_m`; 0 turns it off."""
 
     def __post_init__(self) -> None:
         """Reject numbers and lengths that are out of range."""

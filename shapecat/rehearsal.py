@@ -51,7 +51,7 @@ _TABLE_M = 0.4
 
 
 def find_ball() -> int:
-    """Detect a synthetic ball, a plate and a block; return the number of repeated objects."""
+    """Detect a synthetic ball, plate and block; return the number of objects that repeat."""
     v, u = np.mgrid[:480, :640]
     rays = np.stack([(u - 320) / 525, (v - 240) / 525, np.ones(u.shape)], axis=-1)
     up = np.array([0, -np.sqrt(0.5), -np.sqrt(0.5)])

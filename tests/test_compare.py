@@ -1060,7 +1060,7 @@ def test_track_of_missing_detection_is_refused(run: Path) -> None:
     path = run / "detections.parquet"
     pq.write_table(pq.read_table(path).slice(1), path)
 
-    with pytest.raises(OutputError, match="tables do not fit together"):
+    with pytest.raises(OutputError, match="tables are inconsistent"):
         list(run_labellings(read_complete(run)))
 
 

@@ -330,7 +330,7 @@ def test_detections_of_another_run_are_refused(tmp_path: Path, kept: slice) -> N
     rows = pq.read_table(path).to_pylist()[kept]
     write_table(path, {name: [row[name] for row in rows] for name in DETECTIONS.names}, DETECTIONS)
 
-    with pytest.raises(OutputError, match="tables do not fit together"):
+    with pytest.raises(OutputError, match="tables are inconsistent"):
         match_labels(source, target)
 
 

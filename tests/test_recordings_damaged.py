@@ -273,7 +273,7 @@ def test_messages_that_cannot_be_assigned_are_reported(tmp_path: Path) -> None:
     times, warnings = read(path)
 
     assert times == [3, 8]
-    assert "skipped messages of channel 9, which is not described" in warnings
+    assert "skipped messages of channel 9, which has no Channel record" in warnings
     assert f"skipped a record at byte {short}: message record of 10 bytes" in warnings
 
 
@@ -429,7 +429,7 @@ def test_bag_messages_of_an_unknown_connection_are_reported(tmp_path: Path) -> N
     times, warnings = read(path)
 
     assert len(times) == 11
-    assert "skipped messages of connection 7, which is not described" in warnings
+    assert "skipped messages of connection 7, which has no connection record" in warnings
 
 
 def test_message_lost_in_a_bag_chunk_is_reported(tmp_path: Path) -> None:

@@ -362,7 +362,7 @@ def test_edited_detections_are_refused(tmp_path: Path, change: Callable[[Any], A
     pq.write_table(pa.Table.from_pylist(change(pq.read_table(path).to_pylist()), DETECTIONS), path)
     labels = {5: TrackLabel(5, "cup", 0.7), 6: TrackLabel(6, "cup", 0.7)}
 
-    with pytest.raises(OutputError, match="tables do not fit together"):
+    with pytest.raises(OutputError, match="tables are inconsistent"):
         list(read_annotation_frames(tmp_path, LabelledTracks.read(tmp_path, labels)))
 
 
@@ -374,7 +374,7 @@ def test_track_of_missing_detection_is_refused(tmp_path: Path) -> None:
     labels = {5: TrackLabel(5, "cup", 0.7)}
     boxes = read_annotation_frames(tmp_path, LabelledTracks.read(tmp_path, labels))
     for frames in (boxes, read_labelled_frames(tmp_path, labels)):
-        with pytest.raises(OutputError, match="tables do not fit together"):
+        with pytest.raises(OutputError, match="tables are inconsistent"):
             list(frames)
 
 
@@ -388,7 +388,7 @@ def test_masks_of_missing_frame_are_refused(tmp_path: Path) -> None:
 
     labels = {5: TrackLabel(5, "cup", 0.7)}
     for found in (read_nearest_masks(tmp_path), read_labelled_frames(tmp_path, labels)):
-        with pytest.raises(OutputError, match="tables do not fit together"):
+        with pytest.raises(OutputError, match="tables are inconsistent"):
             list(found)
 
 

@@ -67,5 +67,5 @@ def is_lost(error: BaseException) -> bool:
 
 
 def is_dropped(error: BaseException) -> bool:
-    """Return whether the scheduler is lost, so that the task may not have started."""
+    """Return whether an error means that the scheduler is lost; the task may not have started."""
     return type(error).__name__ in _DROPPED

@@ -76,7 +76,10 @@ class Worker:
         self._stop_pipe.close()
 
     def send(self, task: Task) -> None:
-        """Send a call, which waits while another one runs; the receiving thread sets its future."""
+        """Queue a call in the process.
+
+        The listener thread sets the task's future when the result arrives.
+        """
         parts = _pickled(task.call)
         self._sent.put(task)
         with suppress(OSError):  # the listener gets the same error

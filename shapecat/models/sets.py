@@ -62,7 +62,7 @@ class SimulatedViews(NamedTuple):
 
 
 def options_of(name: str) -> ArrangementOptions:
-    """Return the parameters of the arrangements of a set in `SETS`."""
+    """Return the scene parameters of the training, calibration or test set, as in `SETS`."""
     kinds = [kind for k, kind in enumerate(DISTRACTORS) if (k % 3 == 0) == (name == "test")]
     if name == "training":
         kinds += _TIMES * list(PROCEDURAL)

@@ -165,7 +165,7 @@ def main(*, seed: int, jobs: int, out: Path) -> None:
 def collect(scenes: tuple[Series, ...], jobs: int) -> list[Samples]:
     """Return the merged segments of all scenes; the number of jobs does not affect the result.
 
-    Samples of the same scene are in the same part.
+    Each item holds whole scenes, so that folds never split a scene.
     """
     return collect_chunks(_collect, scenes, _CHUNK, jobs)
 

@@ -20,7 +20,7 @@ _FAR_NS = 2**62
 
 @dataclass(frozen=True)
 class FrameRange:
-    """Which frames of a recording are wanted.
+    """Time range and step of the frames to read from a recording.
 
     Attributes
     ----------

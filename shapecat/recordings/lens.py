@@ -35,7 +35,7 @@ def lens_content(
         warn(f"{problem} is ignored")
         return {"depth": depth, "camera": camera}
     if lens.blind > 0:
-        warn(f"{lens.blind:.0%} of its pixels, which the lens model leaves out, are ignored")
+        warn(f"{lens.blind:.0%} of its pixels have no ray in the lens model and are ignored")
     if lens.fit is not None:
         return {"depth": depth, "camera": lens.fit.camera}
     warn("not rectified: converted to points along the undistorted rays")

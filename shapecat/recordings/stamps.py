@@ -27,7 +27,7 @@ def stamp_ns(header: Any) -> int:
     """
     stamp = int(header.stamp.sec) * 10**9 + int(header.stamp.nanosec)
     if not 0 <= stamp < 2**63:
-        msg = f"header.stamp of {stamp:.3g} ns"
+        msg = f"invalid header.stamp: {stamp:.3g} ns"
         raise MessageError(msg)
     return stamp
 
@@ -82,8 +82,8 @@ class Clock:
 
 _TEXTS = {
     "zero": "header.stamp is 0 ({}×): it is estimated from the log time",
-    "epoch": "header.stamp does not count from 1970 ({}×): transforms may not match",
-    "same": "header.stamp is that of the message before ({}×): poses and tracks may be wrong",
+    "epoch": "header.stamp is not Unix time ({}×): transforms may not match",
+    "same": "header.stamp repeats the previous one ({}×): poses and tracks may be wrong",
     "back": "header.stamp goes backwards ({}×)",
     "jump": "header.stamp jumps relative to the log time ({}×)",
 }

@@ -31,7 +31,7 @@ class _Forgiving(io.TextIOWrapper):
 def require_stdout() -> None:
     """Make stdout the null device if it was closed before the start, as a daemon's may be.
 
-    Otherwise the next file that is opened would get its number, here and in worker processes.
+    Otherwise the next opened file would get file descriptor 1, here and in worker processes.
     Characters that a terminal cannot show, such as those of another script, are escaped.
     """
     if sys.stdout is None:
@@ -45,8 +45,8 @@ def require_stdout() -> None:
 def forgive_stderr() -> None:
     """Make stderr drop messages if its disk is full or its terminal or reader is gone.
 
-    If it was closed before the start, it becomes the null device: otherwise the next file that is
-    opened would get its number, and messages of libraries.
+    If it was closed before the start, it becomes the null device: otherwise the next opened file
+    would get file descriptor 2, and libraries would write their messages into it.
     """
     if sys.stderr is None:
         os.dup2(os.open(os.devnull, os.O_WRONLY), 2)

@@ -84,7 +84,7 @@ def measure_object_features(
 
 
 class Limits(NamedTuple):
-    """Where the view ends.
+    """Limits of the view: the borders of the image and the range.
 
     Attributes
     ----------

@@ -55,8 +55,8 @@ def find_low_profile(
 
     Parameters
     ----------
-    heights : ``plane_id`` is changed in place: k + 1 on the objects found on plane k, -(k + 1) on
-        cells that only depth error raises.
+    heights : ``plane_id`` is changed in place: k + 1 for objects on plane k; -(k + 1) for samples
+        of plane k that only depth error lifts off it.
     planes : from `pack_planes`.
     max_size_m : maximum width of a low-profile object, metres.
 

@@ -32,16 +32,16 @@ PITCH = RUN + 2 * WINDOW
 
 @kernel
 def fit_local_planes(grid: DepthGrid, plane_id: I4, spans: I4, local_plane: F4, normal: F4) -> None:
-    """Write the local planes and normals of the object cells, as in `SurfaceGraph`.
+    """Fit a plane to the neighbourhood of each object sample; write its coefficients and normal.
 
-    Each plane is fitted to up to 25 cells in a checkerboard pattern: those above the same
-    supporting plane have weight 1, the others 0.
+    The neighbourhood is up to 25 samples in a checkerboard pattern: those above the same supporting
+    plane have weight 1, the others 0.
 
     Parameters
     ----------
     plane_id : (rows, columns) as in `HeightMap`.
     spans : (rows, 2) first column of the object cells of each row, and one past the last.
-    local_plane, normal : (rows, 3, columns), written in place.
+    local_plane, normal : (rows, 3, columns), written in place; as in `SurfaceGraph`.
     """
     values = np.zeros(SIDE * PITCH, np.float32)
     fits = np.zeros(6 * PITCH, np.float32)

@@ -108,7 +108,7 @@ class Reference(ABC, Generic[_Frame]):
     kind: str
     """Kind of the reference, in words."""
     unit = "frames"
-    """What timestamps or numbers count."""
+    """Plural noun for the timestamps or numbers that identify frames, for messages."""
     tracked: bool = False
     """Whether objects have identities over time."""
     numbered: bool = False

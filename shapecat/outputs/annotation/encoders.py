@@ -66,7 +66,7 @@ def encoders_of(encoding: str, kinds: Iterable[MessageKind[_T]]) -> Encoders[_T]
 
 
 class _Encoding(NamedTuple):
-    """How messages are made, encoded and described.
+    """Types, encoder and schemas of the messages in an encoding.
 
     ``encode`` takes a message and the name of its type; ``schema`` returns name, encoding and
     content of the schema of a type.

@@ -68,8 +68,8 @@ def read_image_frames(folder: Path, tracks: LabelledTracks) -> Iterator[ImageFra
 def image_encoders_for(encoding: str, topics: Iterable[str]) -> dict[str, Encoders[ImageFrame]]:
     """Return the channels that annotate the images of each topic, each with its encoder.
 
-    Channels of several topics are named after these, since viewers draw all messages of a channel
-    on an image. An unknown encoding is replaced by JSON.
+    If there are several topics, each channel name ends in its topic, since viewers draw all
+    messages of a channel on an image. An unsupported message encoding becomes JSON.
     """
     names, found = list(topics), {}
     for name in names:

@@ -25,7 +25,7 @@ _INSTANCE = re.compile(r".*\.([0-9a-f]{12})(?:\.([\d.]+)-([\d.]+|inf))?\.track-\
 
 
 class Origin(NamedTuple):
-    """Where the views of a run come from; the name of the run does not matter.
+    """Source and time range of the views of a run; the name of the run does not matter.
 
     ``source`` is a digest of the recording and the topics; ``start_s`` and ``end_s`` bound the time
     range, seconds.

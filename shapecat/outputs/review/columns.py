@@ -23,7 +23,7 @@ _NUMBERS = 1 << 17
 
 
 class Drawing(NamedTuple):
-    """How an entity is drawn: the function from its rows to columns, and its static style."""
+    """Drawing function (from rows to columns) and static style of an entity."""
 
     columns: Callable[[Sequence[Any]], Iterable[rr.ComponentColumn]]
     style: rr.AsComponents | None = None

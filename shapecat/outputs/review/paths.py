@@ -51,7 +51,8 @@ class Paths:
     ) -> None:
         """Add the category and position of each track in a frame; remove tracks that have ended.
 
-        Another entity may have a part of their path, from another sensor.
+        A track seen by two sensors has a path in each one's entity; if it has ended, all are
+        removed.
         """
         gone, entity_paths = set(ended), self._paths.setdefault(entity, {})
         changed = set()

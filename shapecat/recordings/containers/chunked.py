@@ -28,7 +28,7 @@ class RawMessage(NamedTuple):
 
 
 class Chunk(NamedTuple):
-    """What the index says about a chunk.
+    """Position, times and channels of a chunk, from the index.
 
     Attributes
     ----------

@@ -193,7 +193,7 @@ class McapRecording(ChunkedRecording):
                 yield message
             else:
                 self.warn(
-                    f"skipped messages of channel {message.channel_id}, which is not described"
+                    f"skipped messages of channel {message.channel_id}, which has no Channel record"
                 )
         elif opcode not in _KNOWN:
             self.warn(f"skipped records of unknown kind {opcode}")

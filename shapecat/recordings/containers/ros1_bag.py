@@ -161,7 +161,9 @@ class BagRecording(ChunkedRecording):
             if number in self._channels:
                 yield RawMessage(number, 0, time, time, data)
             else:
-                self.warn(f"skipped messages of connection {number}, which is not described")
+                self.warn(
+                    f"skipped messages of connection {number}, which has no connection record"
+                )
         elif kind == bytes([CONNECTION]) and not self.indexed:
             self._connect(fields, data)
 

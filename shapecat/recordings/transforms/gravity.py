@@ -25,12 +25,12 @@ _SOURCES = {"auto": ("tf", "imu"), "tf": ("tf",), "imu": ("imu",)}
 
 
 class Misnaming(NamedTuple):
-    """A way in which data name a frame that is not their own.
+    """A way in which the axes of data differ from those of the frame in their ``frame_id``.
 
     Attributes
     ----------
-    text : what is wrong, for the user, after the topic.
-    named_from_data : (3, 3) rotation from the frame of the data to the frame that they name.
+    text : the difference in words, for the user, after the topic.
+    named_from_data : (3, 3) rotation from the frame of the data to the frame in ``frame_id``.
     """
 
     text: str
@@ -39,19 +39,21 @@ class Misnaming(NamedTuple):
 
 MISNAMINGS = (
     Misnaming(
-        "its data are in an optical frame (z forward), although the frame they name has x forward",
+        "its data are in an optical frame (z forward), but their frame_id names a frame with x "
+        "forward",
         LINK_FROM_OPTICAL.rotation,
     ),
     Misnaming(
-        "its points have x forward, although the frame they name is an optical one (z forward)",
+        "its points have x forward, but their frame_id names an optical frame (z forward)",
         LINK_FROM_OPTICAL.rotation.T,
     ),
     Misnaming(
-        "its data and the frame they name differ like the ROS and OpenGL conventions (z backward)",
+        "its data have OpenGL axes (z backward), but their frame_id names a frame with ROS axes, "
+        "or the reverse",
         np.diag([1.0, -1.0, -1.0]),
     ),
 )
-"""Ways in which simulators name a frame that is not that of the data, the usual one first."""
+"""Misnamings by simulators, the usual one first."""
 
 
 class Orientation(NamedTuple):

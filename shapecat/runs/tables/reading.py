@@ -159,7 +159,8 @@ def read_together(
 
 def misfit(folder: Path) -> OutputError:
     """Return the error that rows of a run's tables refer to rows that are not there."""
-    msg = f"{folder}: its tables do not fit together; process the recording again"
+    problem = "its tables are inconsistent, as if from different runs"
+    msg = f"{folder}: {problem}; process the recording again"
     return OutputError(msg)
 
 
