@@ -44,7 +44,7 @@ from shapecat.runs.labels.replaced import forget_old_labels, keep_labels, requir
 from shapecat.runs.labels.transfer import Transfer, transfer_labels
 from shapecat.runs.perceive.doubts import explain_doubts
 from shapecat.runs.perceive.phases import Work, perceive_all, revise
-from shapecat.runs.perceive.resuming import has_work, resume, take_over_frames
+from shapecat.runs.perceive.resuming import has_work, require_resumable, resume, take_over_frames
 from shapecat.runs.run_info import RunInfo
 from shapecat.runs.tables.segments import discard_segments
 from shapecat.system.files import holding, require_utf8
@@ -92,9 +92,10 @@ def process(job: Job, observe: Observer = ignore, *, cores: int = 1) -> Summary:
         recover(job.folder)
         if made_by_run(job.folder) is not None and not job.overwrite:
             return _add_outputs(job, recording, run, content, observe)
+        require_resumable(job, run, content.result)
         require_labels(job)
         with staged(job.folder, worth_keeping=has_work) as folder:
-            run = resume(folder, run, job.source, content.result, overwrite=job.overwrite)
+            run = resume(folder, run, job.source, content.result)
             if "perceive" not in run["seconds"]:
                 run = take_over_frames(job.folder, folder, run, job.source, content.result)
             run["color"] = {topic: colour.topic for topic, colour in colours.items()}

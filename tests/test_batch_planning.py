@@ -7,6 +7,7 @@ import threading
 import time
 from collections.abc import Callable, Mapping
 from concurrent.futures import CancelledError, Executor, Future
+from contextlib import nullcontext
 from dataclasses import replace
 from itertools import islice
 from pathlib import Path
@@ -49,7 +50,7 @@ from shapecat.runs.jobs import (
     require_unchanged,
     summarize,
 )
-from shapecat.runs.perceive.resuming import has_work, resume
+from shapecat.runs.perceive.resuming import has_work, require_resumable, resume
 from shapecat.runs.run_info import RunInfo
 from shapecat.system.files import partial_path
 from tests.run_info import run_info
@@ -449,12 +450,6 @@ def partial(folder: Path, run: RunInfo) -> None:
     write_run(folder, run)
 
 
-def resumed_in(
-    folder: Path, wanted: RunInfo, source: Path, digest: str = "", *, overwrite: bool = False
-) -> RunInfo:
-    return resume(folder, wanted, source, lambda: digest, overwrite=overwrite)
-
-
 def test_partial_results_count_as_work(source: Path, tmp_path: Path) -> None:
     """A full disk after an hour must not cost that hour."""
     run = planned(source)
@@ -473,7 +468,7 @@ def test_partial_run_of_same_work_resumes(source: Path, tmp_path: Path) -> None:
     folder, run = tmp_path / "half", planned(source)
     partial(folder, run)
 
-    assert resumed_in(folder, planned(source), source)["id"] == run["id"]
+    assert resume(folder, planned(source), source, lambda: "")["id"] == run["id"]
     assert (folder / "segments" / "000000").exists()
 
 
@@ -482,7 +477,7 @@ def test_partial_run_resumes_with_other_outputs(source: Path, tmp_path: Path) ->
     folder, run = tmp_path / "half", planned(source, rrd=False)
     partial(folder, run)
 
-    resumed = resumed_in(folder, planned(source), source)
+    resumed = resume(folder, planned(source), source, lambda: "")
 
     assert (resumed["id"], resumed["options"]["rrd"]) == (run["id"], True)
 
@@ -493,7 +488,7 @@ def test_partial_run_resumes_with_copy_of_its_recording(source: Path, tmp_path: 
     partial(folder, run)
     os.utime(source, (1, 1))
 
-    resumed = resumed_in(folder, planned(source), source, run["input"]["digest"])
+    resumed = resume(folder, planned(source), source, lambda: run["input"]["digest"])
 
     assert resumed["id"] == run["id"]
     require_unchanged(folder, resumed, source)
@@ -503,9 +498,9 @@ def test_partial_run_resumes_with_copy_of_its_recording(source: Path, tmp_path: 
 @pytest.mark.parametrize(
     ("what", "asks"),
     [
-        ("model", "model: m2 there, m1 wanted"),
-        ("settings", "seed: 99 there, 0 wanted"),
-        ("other", "input: /data/lab.mcap there"),
+        ("model", "model: m2 in the old run, m1 requested"),
+        ("settings", "seed: 99 in the old run, 0 requested"),
+        ("other", "input: /data/lab.mcap in the old run"),
         ("shapecat", ""),
         ("numpy", ""),
         ("content", ""),
@@ -518,7 +513,8 @@ def test_partial_run_of_other_work_is_discarded(
 
     Hours of work are not lost because of another --end; they are if nothing can continue them.
     """
-    folder, run = tmp_path / "half", planned(source)
+    job = Job(source, tmp_path / "lab")
+    folder, run = partial_path(job.folder), planned(source)
     if what == "model":
         run["model"] = {**run["model"], "id": "m2"}
     elif what == "settings":
@@ -531,12 +527,12 @@ def test_partial_run_of_other_work_is_discarded(
     partial(folder, run)
     wanted = planned(source)
 
-    if asks:
-        with pytest.raises(OutputError, match=re.escape(f"({asks}); repeat that command")):
-            resumed_in(folder, wanted, source, "xxh3-128:other")
-        assert has_work(folder)
-    found = resumed_in(folder, wanted, source, "xxh3-128:other", overwrite=bool(asks))
-    assert found["id"] == wanted["id"]
+    refused = f"({asks}); repeat its command"
+    with pytest.raises(OutputError, match=re.escape(refused)) if asks else nullcontext():
+        require_resumable(job, wanted, lambda: "xxh3-128:other")
+    require_resumable(replace(job, overwrite=True), wanted, lambda: "")
+
+    assert resume(folder, wanted, source, lambda: "xxh3-128:other")["id"] == wanted["id"]
     assert not (folder / "segments").exists()
     assert read_run(folder)["id"] == wanted["id"]
 
@@ -557,7 +553,7 @@ def test_truncated_partial_run_is_discarded(source: Path, tmp_path: Path, name: 
     (folder / name).parent.mkdir(parents=True, exist_ok=True)
     (folder / name).write_bytes(b"")
 
-    assert resumed_in(folder, wanted, source)["id"] == wanted["id"]
+    assert resume(folder, wanted, source, lambda: "")["id"] == wanted["id"]
     assert not (folder / name).exists()
 
 

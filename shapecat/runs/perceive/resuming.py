@@ -9,21 +9,53 @@ from pathlib import Path
 from shapecat.errors import OutputError
 from shapecat.runs.folder import OUTPUT_OPTIONS, clear, read_run, write_run
 from shapecat.runs.identity import same_content, unchanged
-from shapecat.runs.jobs import differences
+from shapecat.runs.jobs import Job, differences
 from shapecat.runs.run_info import RunInfo
 from shapecat.runs.tables.reading import count_rows
 from shapecat.runs.tables.schemas import PERCEIVED, TABLES
 from shapecat.runs.tables.segments import SEGMENTS, list_segments, require_complete
+from shapecat.system.files import partial_path
 
-__all__ = ["has_work", "resume", "take_over_frames"]
+__all__ = ["has_work", "require_resumable", "resume", "take_over_frames"]
 
 _LATER = ("tracking.", "outputs.")
 """Groups of settings that perceiving does not use."""
 
 
-def resume(
-    folder: Path, planned: RunInfo, source: Path, digest: Callable[[], str], *, overwrite: bool
-) -> RunInfo:
+def require_resumable(job: Job, planned: RunInfo, digest: Callable[[], str]) -> None:
+    """Check that a job would not discard the work of an interrupted run of something else.
+
+    The work of other versions, or on a recording that has changed, is not worth keeping.
+
+    Parameters
+    ----------
+    planned, digest : as in `resume`.
+
+    Raises
+    ------
+    OutputError : the folder has finished work of another input, model or settings.
+    """
+    folder = partial_path(job.folder)
+    if job.overwrite or not has_work(folder):
+        return
+    try:
+        run = _with_outputs(read_run(folder), planned)
+    except OutputError:  # nothing can continue it
+        return
+    differing, place = differences(run, planned), run["input"]["path"]
+    if place != planned["input"]["path"] and not same_content(run["input"], job.source, digest):
+        differing["input"] = f"{place} in the old run"
+    if not differing:
+        return
+    listed = "; ".join(f"{name}: {text}" for name, text in differing.items())
+    msg = (
+        f"{folder}: has finished work of an interrupted run of another input, model or settings "
+        f"({listed}); repeat its command to continue it, choose another --out, or --overwrite it"
+    )
+    raise OutputError(msg)
+
+
+def resume(folder: Path, planned: RunInfo, source: Path, digest: Callable[[], str]) -> RunInfo:
     """Return the run.json of the interrupted run in a folder if ``planned`` can continue it.
 
     That is possible if settings, options, model, versions and recording are the same, and its
@@ -34,30 +66,20 @@ def resume(
     ----------
     digest : returns the digest of the recording; called only if names, sizes or times of its files
         differ.
-    overwrite : whether finished work of another input, model or settings is discarded.
 
     Raises
     ------
-    OutputError : the folder cannot be written, or has finished work that is not to be discarded.
+    OutputError : the folder cannot be written.
     """
-    differing: dict[str, str] = {}
     with suppress(OutputError):
         run = _with_outputs(read_run(folder), planned)
-        differing = differences(run, planned)
-        if not differing and _same_recording_and_versions(run, planned, source, digest):
+        if not differences(run, planned) and _same_recording_and_versions(
+            run, planned, source, digest
+        ):
             _require_complete(folder)
             if "perceive" in run["seconds"]:
                 run["counts"]["resumed"] = run["counts"]["frames"]
             return {**run, "input": planned["input"]}
-        if run["input"]["path"] != planned["input"]["path"]:
-            differing["input"] = f"{run['input']['path']} there"
-    if differing and has_work(folder) and not overwrite:
-        listed = "; ".join(f"{name}: {text}" for name, text in differing.items())
-        msg = (
-            f"{folder}: has finished work of an interrupted run of another input, model or "
-            f"settings ({listed}); repeat that command, choose another --out, or --overwrite it"
-        )
-        raise OutputError(msg)
     clear(folder)
     write_run(folder, planned)
     return planned
