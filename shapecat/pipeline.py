@@ -90,10 +90,11 @@ def process(job: Job, observe: Observer = ignore, *, cores: int = 1) -> Summary:
             "%s: %s, model %s", job.name, " ".join(run["options"]["topics"]), job.model or "default"
         )
         recover(job.folder)
-        if made_by_run(job.folder) is not None and not job.overwrite:
-            return _add_outputs(job, recording, run, content, observe)
+        if made_by_run(job.folder) is not None:
+            if not job.overwrite:
+                return _add_outputs(job, recording, run, content, observe)
+            require_labels(job)
         require_resumable(job, run, content.result)
-        require_labels(job)
         with staged(job.folder, worth_keeping=has_work) as folder:
             run = resume(folder, run, job.source, content.result)
             if "perceive" not in run["seconds"]:

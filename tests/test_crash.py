@@ -142,9 +142,11 @@ def test_run_survives_fifty_kills(recording: Path, undisturbed: Path, tmp_path: 
         killed, whole = killed + kills, whole if kills else 0.8 * whole  # less load than before
 
 
-def test_work_under_other_settings_is_discarded(
+def test_work_under_other_settings_is_discarded_only_if_asked(
     recording: Path, undisturbed: Path, tmp_path: Path
 ) -> None:
+    """A typo in an option must not cost the night's work."""
+
     def stop(_phase: str, done: int, _total: int | None) -> None:
         if done == 40:
             raise KeyboardInterrupt
@@ -153,7 +155,13 @@ def test_work_under_other_settings_is_discarded(
         process(Job(recording, tmp_path / "table", settings=Settings(seed=5), rrd=False), stop)
     assert (tmp_path / ".table.partial" / "segments" / "000000").exists()
 
-    process(Job(recording, tmp_path / "table", rrd=False))
+    with pytest.raises(
+        OutputError, match=r"finished work .* \(seed: 5 in the old run, 0 requested\)"
+    ):
+        process(Job(recording, tmp_path / "table", rrd=False))
+    assert (tmp_path / ".table.partial" / "segments" / "000000").exists()
+
+    process(Job(recording, tmp_path / "table", rrd=False, overwrite=True))
 
     assert "resumed" not in read_run(tmp_path / "table")["counts"]
     assert contents(tmp_path) == contents(undisturbed)
