@@ -27,6 +27,7 @@ __all__ = [
 DELETE = "delete"
 
 _MERGE = re.compile(r"merged? +(?:with|into) +#?(\d{1,9})(?:[.,]0*)?", re.IGNORECASE)
+_INCOMPLETE_MERGE = re.compile(r"merge\D*(\d{1,9})", re.IGNORECASE)
 _COMMAND = re.compile(r"(merged?( |$)|del(ete)?$|remove$)", re.IGNORECASE)
 _NEW = re.compile(r"new +(.+)", re.IGNORECASE)
 _RESERVED = ("none", "dontcare", "na", "nan", "null")
@@ -185,6 +186,9 @@ def _understand(label: str, names: dict[str, str]) -> _Verdict:
     new = _NEW.fullmatch(label)
     name = new[1] if new else label
     if not is_category_name(name):
+        if intended := _INCOMPLETE_MERGE.fullmatch(label):
+            msg = f"{label!r}: did you mean {merging_with(int(intended[1]))}?"
+            raise ValueError(msg)
         hint = "" if _NAME.fullmatch(_without_marks(name)) else f"; a category is {NAME_RULE}"
         shown = label if len(label) <= _SHOWN else f"{label[:_SHOWN]}…"
         msg = f"{shown!r} is not a category, `{DELETE}` or `merge with N`{hint}"
