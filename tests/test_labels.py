@@ -4,6 +4,7 @@ import json
 import shutil
 import unicodedata
 from collections.abc import Callable, Sequence
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -21,7 +22,7 @@ from shapecat.runs.labelled_tracks import _last_in
 from shapecat.runs.labels import meaning
 from shapecat.runs.labels.corrections import _valid_labels, adopt_labels, read_labels, relabel
 from shapecat.runs.labels.meaning import TrackLabel
-from shapecat.runs.labels.track_table import TrackRow, read_track_table
+from shapecat.runs.labels.track_table import TrackRow, read_track_table, write_track_table
 from shapecat.runs.perceive.perceived import FrameRow, PerceptionTables
 from shapecat.runs.tracks import _CSV, _write_csv
 from shapecat.types import Box, Candidate, Detection, NeuralGas, Perception, Plane, Scene
@@ -780,3 +781,59 @@ def test_new_category_of_many_tracks_is_compared_with_no_name(
     assert {label.category for label in labels.values()} == {"pan"}
     assert not misread
     assert not compared
+
+
+def refusals(shapecat: Callable[..., Result], folder: Path, out: Path) -> dict[str, str]:
+    """Return the message of each command that needs the labels of a run, which must stay as is."""
+    before = {path: path.read_bytes() for path in folder.iterdir()}
+    messages = {}
+    for name, *options in (("annotate",), ("report",), ("export", "--format", "crops")):
+        out_options = ("--out", out) if options else ()
+        result = shapecat(name, folder, *options, *out_options)
+        assert result.exit_code == 1
+        messages[name] = result.stderr
+    assert {path: path.read_bytes() for path in folder.iterdir()} == before
+    assert not out.exists()
+    return messages
+
+
+@pytest.mark.parametrize("content", [None, b""])
+def test_missing_table_of_a_run_can_be_restored(
+    guessed_run: Path, tmp_path: Path, shapecat: Callable[..., Result], content: bytes | None
+) -> None:
+    """The run's own table is beside it, but no message named it."""
+    folder = tmp_path / "table"
+    shutil.copytree(guessed_run, folder)
+    (folder / "tracks.csv").unlink()
+    if content is not None:
+        (folder / "tracks.csv").write_bytes(content)
+
+    path = folder / "tracks.csv"
+    message = f"Error: {path}: missing or empty; restore it from tracks.original.csv\n"
+    assert set(refusals(shapecat, folder, tmp_path / "crops").values()) == {message}
+    shutil.copy(folder / "tracks.original.csv", path)
+    assert shapecat("report", folder).exit_code == 0
+
+    path.unlink()
+    (folder / "tracks.original.csv").unlink()
+    for message in refusals(shapecat, folder, tmp_path / "crops").values():
+        assert "restore" not in message
+
+
+def test_message_about_a_label_names_what_was_not_done(
+    guessed_run: Path, tmp_path: Path, shapecat: Callable[..., Result]
+) -> None:
+    """`report` and `export` said that nothing was written, although they never write labels."""
+    folder = tmp_path / "table"
+    shutil.copytree(guessed_run, folder)
+    path = folder / "tracks.csv"
+    table = read_track_table(path)
+    first = replace(table.rows[0], cells={**table.rows[0].cells, "label": "merge 7"})
+    write_track_table(path, replace(table, rows=(first, *table.rows[1:])))
+
+    problem = "\n  line 2: 'merge 7': did you mean merge with 7?\n"
+    assert refusals(shapecat, folder, tmp_path / "crops") == {
+        "annotate": f"Error: {path}: nothing was written:{problem}",
+        "report": f"Error: {path}: the table cannot be used:{problem}",
+        "export": f"Error: {path}: the table cannot be used:{problem}",
+    }

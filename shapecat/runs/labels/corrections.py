@@ -5,7 +5,7 @@ from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
 
-from shapecat.errors import OutputError, listed
+from shapecat.errors import OutputError, explained, listed
 from shapecat.runs.folder import read_run, require_work
 from shapecat.runs.labels.meaning import (
     DELETE,
@@ -61,7 +61,7 @@ def read_labels(path: Path, categories: Iterable[str] = ()) -> dict[int, TrackLa
     """
     table, problems = read_original_table(path)
     labels, misread = resolve_labels(table.rows, categories, one_frame=_one_frame(path.parent))
-    _refuse(path, [*problems, *_lines(table.rows, misread)])
+    _refuse(path, [*problems, *_lines(table.rows, misread)], "the table cannot be used")
     return labels
 
 
@@ -74,6 +74,7 @@ def read_original_table(path: Path) -> tuple[TrackTable, list[str]]:
     ------
     OutputError : the table is unreadable, or belongs to another run.
     """
+    _require_content(path)
     table = read_track_table(path)
     require_same_run(path, table, path.parent)
     original = read_track_table(path.with_name(ORIGINAL))
@@ -96,6 +97,20 @@ def read_original_table(path: Path) -> tuple[TrackTable, list[str]]:
     )
     restored = _relabelled(TrackTable(columns, rows, ()), table.rows)
     return restored, problems
+
+
+def _require_content(path: Path) -> None:
+    """Check that the table of a run is there, if the run's own table is.
+
+    Raises
+    ------
+    OutputError : it is missing or empty.
+    """
+    with explained(f"{path}: cannot be read", OutputError):
+        is_lost = not (path.exists() and path.stat().st_size)
+        if is_lost and path.with_name(ORIGINAL).exists():
+            msg = f"{path}: missing or empty; restore it from {ORIGINAL}"
+            raise OutputError(msg)
 
 
 def _contradictions(table: TrackTable, original: TrackTable) -> list[str]:
@@ -255,12 +270,12 @@ def _relabelled(base: TrackTable, rows: Iterable[TrackRow]) -> TrackTable:
     return replace(base, rows=tuple(changed))
 
 
-def _refuse(path: Path, problems: Sequence[str]) -> None:
+def _refuse(path: Path, problems: Sequence[str], effect: str = "nothing was written") -> None:
     if problems:
         lines = sorted(problems, key=_line_of)
         if len(lines) > _MOST_PROBLEMS:
             lines[_MOST_PROBLEMS:] = [f"and {len(lines) - _MOST_PROBLEMS} more problems"]
-        msg = "\n  ".join((f"{path}: nothing was written:", *lines))
+        msg = "\n  ".join((f"{path}: {effect}:", *lines))
         raise OutputError(msg)
 
 
