@@ -369,6 +369,34 @@ def test_bag_is_the_same_recording_through_links_and_within(
         assert (source.stem, source.parent, Path(source.path).resolve()) == ("walk", "data", bag)
 
 
+@pytest.mark.parametrize(
+    ("pattern", "found"),
+    [
+        ("in/*.mcap", ["in/a.mcap", "in/b[1].mcap"]),
+        ("in/b[1].mcap", ["in/b[1].mcap"]),  # a name, although the pattern means b1.mcap
+        ("in/[ab].mcap", ["in/a.mcap"]),
+        ("in/?.mcap", ["in/a.mcap"]),
+        ("in/*", ["in/a.mcap", "in/b[1].mcap", "in/bag"]),
+        ("in/ba*", ["in/bag"]),
+        ("**/*_?.mcap", ["in/bag/bag_0.mcap", "in/bag/bag_1.mcap"]),
+        ("**", ["in/a.mcap", "in/b[1].mcap", "in/bag"]),
+        ("in/*.bag", ["in/*.bag"]),
+    ],
+)
+def test_pattern_that_no_shell_expanded_is_expanded(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, pattern: str, found: list[str]
+) -> None:
+    """A script that starts the command, or quotes, gave *does not exist*; at URLs it worked."""
+    names = ("a.mcap", "b[1].mcap", ".c.mcap", "n.txt", "bag/bag_0.mcap", "bag/bag_1.mcap")
+    for name in (*names, "done/old.mcap", "done/run.json"):
+        path = tmp_path / "in" / name
+        path.parent.mkdir(parents=True, exist_ok=True)
+        path.write_bytes(b"\x89MCAP" if name.endswith(".mcap") else b"")
+    monkeypatch.chdir(tmp_path)
+
+    assert [source.path for source in find_recordings([pattern]).sources] == found
+
+
 @pytest.mark.parametrize("way", ["link", "folder", "link to folder", "here"])
 def test_recording_is_named_by_its_link(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, way: str

@@ -5,6 +5,7 @@ import os
 from collections.abc import Iterator, Sequence
 from contextlib import suppress
 from dataclasses import dataclass
+from glob import glob
 from itertools import pairwise
 from pathlib import Path
 
@@ -44,9 +45,11 @@ class SearchResult:
 def find_recordings(sources: Sequence[str]) -> SearchResult:
     """Return the recordings among files, folders and URLs.
 
-    Folders are searched recursively, except hidden files and folders and run folders; a ROS 2 bag
-    counts as one recording. A single file is always kept. Among several, files with neither the
-    suffix nor the first bytes of a recording are skipped and counted, so that ``folder/*`` works.
+    Patterns are expanded, since a program that calls the command without a shell leaves them, but
+    not if a file has this name. Folders are searched recursively, except hidden files and folders
+    and run folders; a ROS 2 bag counts as one recording. A single file is always kept. Among
+    several, files with neither the suffix nor the first bytes of a recording are skipped and
+    counted, so that ``folder/*`` works.
 
     Raises
     ------
@@ -54,13 +57,24 @@ def find_recordings(sources: Sequence[str]) -> SearchResult:
     """
     search = search_url if len(sources) == 1 else search_url_beside_others
     remote = {found.url: found for source in sources if is_url(source) for found in search(source)}
-    local, skipped = _search_paths([Path(source) for source in sources if not is_url(source)])
+    paths = [path for source in sources if not is_url(source) for path in _expanded(source)]
+    local, skipped = _search_paths(paths)
     found = [_of_path(path, real) for real, path in local.items()] + list(remote.values())
     if not found:
         named = " ".join(sources[:3])
         msg = f"{named}: no recording found; expected .mcap, .bag or .db3 files, or a ROS 2 bag"
         raise RecordingError(msg)
     return SearchResult(found, skipped)
+
+
+def _expanded(source: str) -> list[Path]:
+    """Return the path itself, or the paths that match a pattern; not those in folders that do."""
+    if os.path.lexists(source):
+        return [Path(source)]
+    names = glob(source, recursive=True)  # noqa: PTH207  Path.glob finds hidden files, too
+    matches = [Path(name) for name in sorted(names)]
+    folders = {path for path in matches if path.is_dir()}
+    return [path for path in matches if folders.isdisjoint(path.parents)] or [Path(source)]
 
 
 def _of_path(path: Path, real: Path) -> Source:
