@@ -10,6 +10,7 @@ from typing import TYPE_CHECKING, Any, Self
 
 import click
 
+from shapecat.errors import listed
 from shapecat.outputs.counts import plural, size_words
 
 from .render import PHASES, rich_progress
@@ -39,13 +40,16 @@ _SHARES = {
 """Roughly where in the work on a recording each phase begins and ends."""
 
 
-def describe_plan(tasks: Sequence["Task"], skipped: int, workers: int, cores: int) -> str:
+def describe_plan(
+    tasks: Sequence["Task"], skipped: int, workers: int, cores: int, repeated: Sequence[str] = ()
+) -> str:
     """Return a one-line summary of the plan.
 
     Parameters
     ----------
     skipped : number of files that are not recordings.
     workers, cores : recordings processed at once, and frames of each processed at once.
+    repeated : names two paths of each recording that was given twice.
     """
     counts = Counter(task.status for task in tasks)
     words = _STATUS_WORDS.items()
@@ -54,6 +58,8 @@ def describe_plan(tasks: Sequence["Task"], skipped: int, workers: int, cores: in
         parts += [size_words(remaining), plural(workers * cores, "process")]
     if skipped:
         parts.append(f"skipped {plural(skipped, 'file')} of other formats")
+    if repeated:
+        parts.append(listed(repeated))
     return f"{plural(len(tasks), 'recording')}: {'; '.join(parts)}"
 
 

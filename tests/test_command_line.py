@@ -47,6 +47,24 @@ def runs(shapecat: Run, recording: Path, tmp_path_factory: pytest.TempPathFactor
     return out
 
 
+def test_recording_given_twice_is_named(shapecat: Run, recording: Path, tmp_path: Path) -> None:
+    """With one run for two names, the results of the other name seemed to be lost."""
+    link, folder, out = tmp_path / "b.mcap", tmp_path / "in", tmp_path / "out"
+    folder.mkdir()
+    file = folder / "a.mcap"
+    shutil.copy(recording, file)
+    link.symlink_to(file)
+    words = ("--out", out, "--no-rrd", "--no-mcap")
+    done = shapecat("process", link, folder, file, *words)
+
+    assert done.exit_code == 0, done.stderr
+    assert [path.name for path in out.iterdir()] == ["b"]
+    assert done.stderr.splitlines()[0].endswith(f"; {file} is {link}")
+    again = shapecat("process", folder, file, *words)  # under one name
+    assert again.exit_code == 0, again.stderr
+    assert " is " not in again.stderr
+
+
 def test_info_lists_all_recordings_in_folder(shapecat: Run, tmp_path: Path) -> None:
     """A bag beside an MCAP file is not part of a ROS 2 recording, and must not be skipped."""
     record(tmp_path / "one.mcap", 2)

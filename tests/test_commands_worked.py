@@ -256,7 +256,8 @@ def test_plan_describes_remaining_work() -> None:
     )
     small = PROGRESS.describe_plan([task("a", size=31_000)], 0, 1, 1)
     assert small == "1 recording: 1 new; 31.0 kB; 1 process"  # not 0.0 MB
-    assert PROGRESS.describe_plan(tasks[:1], 0, 2, 3) == "1 recording: 1 already complete"
+    text = PROGRESS.describe_plan(tasks[:1], 0, 2, 3, ["b is a", "c is a"])
+    assert text == "1 recording: 1 already complete; b is a, c is a"
 
 
 def test_cores_are_shared_by_remaining_recordings(monkeypatch: pytest.MonkeyPatch) -> None:

@@ -36,10 +36,14 @@ _MAGIC = (b"\x89MCAP", b"#ROSBAG", b"SQLite format 3")
 
 @dataclass(frozen=True)
 class SearchResult:
-    """The recordings without duplicates, and the number of files skipped."""
+    """The recordings without duplicates, and the number of files skipped.
+
+    ``repeated`` names each path that leads to the same recording as an earlier one.
+    """
 
     sources: list[Source]
     skipped: int
+    repeated: list[str]
 
 
 def find_recordings(sources: Sequence[str]) -> SearchResult:
@@ -58,13 +62,13 @@ def find_recordings(sources: Sequence[str]) -> SearchResult:
     search = search_url if len(sources) == 1 else search_url_beside_others
     remote = {found.url: found for source in sources if is_url(source) for found in search(source)}
     paths = [path for source in sources if not is_url(source) for path in _expanded(source)]
-    local, skipped = _search_paths(paths)
+    local, skipped, repeated = _search_paths(paths)
     found = [_of_path(path, real) for real, path in local.items()] + list(remote.values())
     if not found:
         named = " ".join(sources[:3])
         msg = f"{named}: no recording found; expected .mcap, .bag or .db3 files, or a ROS 2 bag"
         raise RecordingError(msg)
-    return SearchResult(found, skipped)
+    return SearchResult(found, skipped, repeated)
 
 
 def _expanded(source: str) -> list[Path]:
@@ -83,22 +87,24 @@ def _of_path(path: Path, real: Path) -> Source:
     return Source(str(path), "", path.stem, path.absolute().parent.name)
 
 
-def _search_paths(sources: Sequence[Path]) -> tuple[dict[Path, Path], int]:
-    """Return the recordings, by resolved path, and the number of files skipped."""
+def _search_paths(sources: Sequence[Path]) -> tuple[dict[Path, Path], int, list[str]]:
+    """Return the recordings, by resolved path, the number of files skipped, and repeated paths."""
     folders = {source for source in sources if source.is_dir() and not _is_bag(source)}
     if len(sources) == 1 and not folders:
-        return {_real_path(sources[0]): sources[0]}, 0
+        return {_real_path(sources[0]): sources[0]}, 0, []
     found: dict[Path, Path] = {}
+    others: dict[Path, Path] = {}  # other paths of recordings, with their resolved paths
     skipped: set[Path] = set()
     for source in sources:
         for path in _search(source, set()) if source in folders else [source]:
             if path.is_file() and not _may_be_recording(path):
                 skipped.add(_real_path(path))
-            else:
-                found.setdefault(_real_path(path), path)
+            elif found.setdefault(real := _real_path(path), path) != path:
+                others[path] = real
     bags = {real for real, path in found.items() if path.is_dir()}
     kept = {real: path for real, path in found.items() if real.parent not in bags}
-    return kept, sum(real.parent not in bags for real in skipped)
+    repeated = [f"{path} is {kept[real]}" for path, real in others.items() if real in kept]
+    return kept, sum(real.parent not in bags for real in skipped), repeated
 
 
 def _is_bag(folder: Path) -> bool:
