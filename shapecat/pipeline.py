@@ -36,6 +36,7 @@ from shapecat.runs.jobs import (
     differences,
     identify,
     require_model,
+    require_other_folder,
     require_unchanged,
     summarize,
 )
@@ -77,6 +78,7 @@ def process(job: Job, observe: Observer = ignore, *, cores: int = 1) -> Summary:
     begun = time.perf_counter()
     require_utf8(job.source, RecordingError)
     require_utf8(job.folder)
+    require_other_folder(job)
     with open_recording(job.source) as recording, ContentDigest(job.source) as content:
         categorizer = load_model(job.model)
         categorizer.require_descriptor(DESCRIPTOR_NAMES)

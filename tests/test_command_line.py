@@ -65,6 +65,23 @@ def test_recording_given_twice_is_named(shapecat: Run, recording: Path, tmp_path
     assert " is " not in again.stderr
 
 
+def test_results_do_not_replace_the_recording(shapecat: Run, tmp_path: Path) -> None:
+    """A ROS 2 bag in --out has the name of its run folder: it seemed to be in the way."""
+    bag, out = record(tmp_path / "in" / "day", 2, container="ros2"), tmp_path / "in"
+    before = {path: path.read_bytes() for path in bag.iterdir()}
+
+    for source, *options in ((out,), (bag, "--overwrite")):
+        refused = shapecat("process", source, "--out", out, *options)
+        assert refused.exit_code == 1
+        assert refused.stderr == (
+            f"Error: {bag}: the results would replace the recording itself; choose another --out\n"
+        )
+    assert {path: path.read_bytes() for path in bag.iterdir()} == before
+    assert list(out.iterdir()) == [bag]
+    missing = shapecat("process", out / "night", "--out", out)
+    assert "night: does not exist" in missing.stderr
+
+
 def test_info_lists_all_recordings_in_folder(shapecat: Run, tmp_path: Path) -> None:
     """A bag beside an MCAP file is not part of a ROS 2 recording, and must not be skipped."""
     record(tmp_path / "one.mcap", 2)

@@ -2,6 +2,7 @@
 
 import platform
 from collections.abc import Iterable, Mapping
+from contextlib import suppress
 from dataclasses import dataclass, field
 from importlib.metadata import version
 from pathlib import Path
@@ -9,7 +10,7 @@ from typing import Any
 
 from shapecat import __version__
 from shapecat.config import Settings
-from shapecat.errors import ModelError, RecordingError
+from shapecat.errors import ModelError, OutputError, RecordingError
 from shapecat.learning import Categorizer
 from shapecat.recordings.files import input_size
 from shapecat.recordings.frames import ALL_FRAMES, FrameRange
@@ -31,6 +32,7 @@ __all__ = [
     "differences",
     "identify",
     "require_model",
+    "require_other_folder",
     "require_unchanged",
     "summarize",
 ]
@@ -207,6 +209,22 @@ def identify(run: RunInfo, content: ContentDigest) -> None:
     """
     run["input"]["digest"] = run["input"]["digest"] or content.result()
     run["work"] = work_id(run)
+
+
+def require_other_folder(job: Job) -> None:
+    """Check that the results do not go where the recording is.
+
+    Raises
+    ------
+    OutputError : the run folder is the recording itself, such as a ROS 2 bag in ``--out``.
+    """
+    with suppress(OSError):  # one of them is missing, or reported when it is opened
+        if job.folder.samefile(job.source):
+            msg = (
+                f"{job.folder}: the results would replace the recording itself; choose another "
+                "--out"
+            )
+            raise OutputError(msg)
 
 
 def require_model(job: Job, categorizer: Categorizer) -> None:
