@@ -22,7 +22,7 @@ from shapecat.batch import claims
 from shapecat.batch.finding import find_recordings
 from shapecat.batch.finding_urls import _combined_key
 from shapecat.batch.ledger import Ledger, Outcome
-from shapecat.batch.manifest import Entry, Manifest, RemoteManifest, State
+from shapecat.batch.manifest import Entry, Manifest, RemoteManifest, State, open_manifest
 from shapecat.batch.naming import existing_names, name_folders
 from shapecat.batch.plans import _input_key, parse_shard, part_of, plan_batch
 from shapecat.batch.runs import _reporter, process_here, process_on
@@ -861,6 +861,46 @@ def test_partial_line_of_crash_does_not_lose_next_entry(tmp_path: Path) -> None:
     entry = Manifest(path).entries["b"]
     assert (entry.state, entry.tries, entry.exit_code, entry.message) == ("failed", 2, 3, "bad")
     assert list(Manifest(path).entries) == ["b"]
+
+
+OURS = b'{"folder": "a", "recording": "a.mcap", "state": "comp'
+"""A line that a crash cut off."""
+
+
+@pytest.mark.parametrize("place", ["folder", "url"])
+@pytest.mark.parametrize(
+    ("content", "is_ours"),
+    [
+        (b'{"hello": 1}\n', False),
+        (b"hello", False),
+        (b'\n{"audio": "a.wav"}\n{"audio', False),
+        (OURS, True),
+        (OURS[:5], True),
+        (b"\0" * 40 + OURS + b'\n{"hello": 1}\n', True),
+        (b"\0" * 40, True),
+        (b'{"folder": "a", "state": "planned", "later": 1}\n', True),  # of another version
+        (b"", True),
+        (b"\n", True),
+    ],
+)
+def test_manifest_of_another_program_is_refused(
+    tmp_path: Path, place: str, content: bytes, *, is_ours: bool
+) -> None:
+    """Lines were appended to it without a word, and at a URL it was replaced."""
+    out = str(tmp_path) if place == "folder" else f"memory://manifests-{content[:60].hex()}"
+    file = Path(out, "manifest.jsonl") if place == "folder" else Location(out) / "manifest.jsonl"
+    file.write_bytes(content) if isinstance(file, Path) else file.write(content)
+    name = file if isinstance(file, Path) else file.url
+
+    if is_ours:
+        with open_manifest(out) as manifest:
+            manifest.record([Entry("b", "b.mcap", "complete")])
+        assert list(open_manifest(out).entries) == ["b"]
+        return
+    message = f"{name}: shapecat did not make this; choose another --out, or move it away"
+    with pytest.raises(OutputError, match=f"^{re.escape(message)}$"):
+        open_manifest(out)
+    assert (file.read_bytes() if isinstance(file, Path) else file.read()) == content
 
 
 def test_last_line_of_a_recording_counts(tmp_path: Path) -> None:

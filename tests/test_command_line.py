@@ -82,6 +82,23 @@ def test_results_do_not_replace_the_recording(shapecat: Run, tmp_path: Path) -> 
     assert "night: does not exist" in missing.stderr
 
 
+def test_batch_beside_a_foreign_manifest_is_refused(shapecat: Run, tmp_path: Path) -> None:
+    """The lines of the batch were appended to it without a word."""
+    out = tmp_path / "out"
+    for file in (tmp_path / "in" / "a.mcap", tmp_path / "in" / "b.mcap", out / "manifest.jsonl"):
+        file.parent.mkdir(exist_ok=True)
+        file.write_text('{"hello": 1}\n')
+    refused = shapecat("process", tmp_path / "in", "--out", out)
+
+    assert refused.exit_code == 1
+    assert refused.stderr == (
+        f"Error: {out / 'manifest.jsonl'}: shapecat did not make this; choose another --out, or "
+        "move it away\n"
+    )
+    assert [path.name for path in out.iterdir()] == ["manifest.jsonl"]
+    assert (out / "manifest.jsonl").read_text() == '{"hello": 1}\n'
+
+
 def test_info_lists_all_recordings_in_folder(shapecat: Run, tmp_path: Path) -> None:
     """A bag beside an MCAP file is not part of a ROS 2 recording, and must not be skipped."""
     record(tmp_path / "one.mcap", 2)

@@ -37,6 +37,8 @@ MANIFEST = "manifest.jsonl"
 
 _log = logging.getLogger(__name__)
 
+_BEGIN = b'{"folder": "'
+"""The first bytes of each line."""
 _PART_FOLDER = ".manifest"
 _PART_BYTES = 2**20
 _MOST_WAITING_BYTES = 8 * 2**20
@@ -95,7 +97,7 @@ class Manifest:
 
     def __init__(self, path: Path) -> None:
         """Read the file, if it exists and is readable."""
-        self.path = path
+        self.path, self.name = path, str(path)
         self.entries: dict[str, Entry] = {}
         with suppress(OSError), path.open("rb") as file:  # reported when it is written to
             self._merge(file)
@@ -105,6 +107,12 @@ class Manifest:
 
     def __exit__(self, *error: object) -> None:
         """Finish writing."""
+
+    def begin(self) -> bytes:
+        """Return the first megabyte of the file; nothing if it is missing or unreadable."""
+        with suppress(OSError), self.path.open("rb") as file:
+            return file.read(_PART_BYTES)
+        return b""
 
     def _merge(self, lines: Iterable[bytes]) -> None:
         for entry in filter(None, map(_parse, lines)):
@@ -151,6 +159,7 @@ class RemoteManifest(Manifest):
         self.entries = {}
         place = Location(url, OutputError)
         self._summary = place / (f"manifest-{shard}.jsonl" if shard else MANIFEST)
+        self.name = self._summary.url
         self._parts = place / _PART_FOLDER / (shard or "all")
         self._writer = f"{datetime.now(UTC):%Y%m%dT%H%M%S}-{uuid4().hex[:8]}"
         self._part_number = self._sent_bytes = 0
@@ -183,6 +192,10 @@ class RemoteManifest(Manifest):
             if not name.startswith(self._writer) and self._part_keys.get(name) != key:
                 self._part_keys[name] = key
                 self._merge(((self._parts / name).read() or b"").splitlines())
+
+    def begin(self) -> bytes:
+        """Return the file that the summary at the end would replace; nothing if it is missing."""
+        return self._summary.read() or b""
 
     def _merge(self, lines: Iterable[bytes]) -> None:
         """Keep the later of two entries, since several writers may work at the same time."""
@@ -233,11 +246,16 @@ def open_manifest(out: str, *, shard: str | None = None) -> Manifest:
 
     Raises
     ------
-    OutputError : the storage at the URL cannot be read.
+    OutputError : shapecat did not make the file, or the storage at the URL cannot be read.
     """
-    if is_url(out):
-        return RemoteManifest(out, shard.replace("/", "-of-") if shard else "")
-    return Manifest(Path(out) / MANIFEST)
+    part = shard.replace("/", "-of-") if shard else ""
+    manifest = RemoteManifest(out, part) if is_url(out) else Manifest(Path(out) / MANIFEST)
+    lines = () if manifest.entries else manifest.begin().splitlines()
+    begins = [line.strip(b"\0 ")[: len(_BEGIN)] for line in lines]  # zeros follow a power cut
+    if any(begins) and not any(map(_BEGIN.startswith, filter(None, begins))):
+        msg = f"{manifest.name}: shapecat did not make this; choose another --out, or move it away"
+        raise OutputError(msg)
+    return manifest
 
 
 def entries_at(url: str) -> dict[str, Entry]:
