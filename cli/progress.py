@@ -1,6 +1,7 @@
 """Progress of ``process`` on stderr: bars, plain lines, or JSON lines."""
 
 import json
+import math
 import sys
 import time
 from collections import Counter
@@ -12,6 +13,7 @@ import click
 
 from shapecat.errors import listed
 from shapecat.outputs.counts import plural, size_words
+from shapecat.system.progress import COMPILE, WAIT_FOR_KERNELS, kernel_words
 
 from .render import PHASES, rich_progress
 
@@ -23,7 +25,6 @@ _LINE_S = 5.0
 _EVENT_S = 0.5
 _MOST_WARNINGS = 3
 """At most this many warnings about a recording are printed."""
-_COMPILING = "compiling kernels, once per installation: about a minute"
 _STATUS_WORDS: "dict[Status, str]" = {
     "complete": "already complete",
     "resume": "to resume",
@@ -79,7 +80,8 @@ class Progress:
         self.done_bytes = 0  # of recordings that have ended
         self.running: dict[str, tuple[str, int, int | None]] = {}
         self.complete = self.failed = 0
-        self._announced = False  # that kernels are compiled
+        self._announced = False  # that this command compiles kernels
+        self._counted = -math.inf  # time of the last line with the number of kernels
         self._first: tuple[float, float] | None = None  # time and bytes of the first progress
 
     def __enter__(self) -> Self:
@@ -94,16 +96,27 @@ class Progress:
     def progress(self, folder: str, phase: str, done: int, total: int | None) -> None:
         """Receive the progress of the recording with this run folder; total is None if unknown."""
         with self.lock:
-            if phase == "compile":
-                if not self._announced:
-                    self._announced = True
-                    self.note(_COMPILING)
+            if phase in {COMPILE, WAIT_FOR_KERNELS}:
+                self._compiling(phase, done)
                 return
             if folder in self.tasks:
                 self.running[folder] = (phase, done, total)
                 if self._first is None:
                     self._first = time.monotonic(), self._bytes_done()
                 self.show(folder)
+
+    def _compiling(self, phase: str, done: int) -> None:
+        """Note that kernels are compiled, once, and their number; all workers report it.
+
+        Most of them wait for one that compiles.
+        """
+        counts = phase == COMPILE and done > 0
+        now = time.monotonic()
+        if (self._announced and not counts) or (done and now - self._counted < _LINE_S):
+            return
+        self._announced |= phase == COMPILE
+        self._counted = now if done else self._counted
+        self.note(kernel_words(phase, done))
 
     def ended(self, outcome: "Outcome") -> None:
         """Receive the outcome of a recording."""

@@ -110,9 +110,7 @@ def process(job: Job, observe: Observer = ignore, *, cores: int = 1) -> Summary:
 def _run_phases(work: Work, content: ContentDigest, begun: float) -> None:
     """Run the phases that are not done; ``begun`` is when the work began, on `perf_counter`."""
     folder, run, job, observe = work.folder, work.run, work.job, work.observe
-    compiling_s = compile_all(
-        lambda: observe("compile", 0, None), cores=work.cores, colour=bool(work.colours)
-    )
+    compiling_s = compile_all(observe, cores=work.cores, colour=bool(work.colours))
     content.start()
     # A kill after the last phase leaves a total.
     earlier_s = run["seconds"].pop("total", None) or sum(run["seconds"].values())

@@ -10,7 +10,6 @@ import gc
 import hashlib
 import os
 import sys
-import threading
 import time
 from collections.abc import Callable, Sequence
 from concurrent.futures import wait
@@ -39,6 +38,13 @@ from shapecat.surface import reconstruct, thin
 from shapecat.surface.triangles import triangles_of
 from shapecat.system import stopping
 from shapecat.system.files import lock
+from shapecat.system.progress import (
+    COMPILE,
+    WAIT_FOR_KERNELS,
+    Observer,
+    ignore,
+    kernel_words,
+)
 from shapecat.system.scripts import runs_again
 from shapecat.types import Camera, Candidate, Detection, Frame, NeuralGas, Pose, Scene
 
@@ -138,16 +144,15 @@ def rehearse() -> None:
         rehearsal()
 
 
-def compile_all(
-    begin: Callable[[], None] = lambda: None, *, cores: int = 2, colour: bool = False
-) -> float:
+def compile_all(observe: Observer = ignore, *, cores: int = 2, colour: bool = False) -> float:
     """Compile the kernels in other processes unless that is done; return the seconds it took.
 
     Only one process at a time compiles; others wait for it.
 
     Parameters
     ----------
-    begin : called before compilation begins.
+    observe : called before compilation begins, and then every ten seconds with the number of
+        kernels compiled so far, also while another process compiles them.
     cores : largest number of processes.
     colour : whether colour images need masks.
 
@@ -164,16 +169,19 @@ def compile_all(
         msg = 'a script that processes recordings needs `if __name__ == "__main__":`'
         raise RuntimeError(msg)
     begun = time.perf_counter()
+    report = _reporter(observe)
     notes.parent.mkdir(parents=True, exist_ok=True)  # another version may have removed it
     while (held := lock(notes.parent)) is None:
         stopping.check()
+        report(WAIT_FOR_KERNELS)
         time.sleep(_POLL_S)
     try:
         if not notes.exists():
-            begin()
+            observe(COMPILE, 0, None)
             # The rest is compiled when it is called; another version may remove the folder.
             with suppress(WorkerLostError, FileNotFoundError):
-                _rehearse(cores, (*_REHEARSALS, find_mask) if colour else _REHEARSALS)
+                called = (*_REHEARSALS, find_mask) if colour else _REHEARSALS
+                _rehearse(cores, called, report)
                 notes.touch()
                 if colour and (of_depth := _notes(colour=False)) is not None:
                     of_depth.touch()
@@ -193,7 +201,22 @@ def _notes(*, colour: bool) -> Path | None:
     return folders[0] / f"complete-{hashlib.sha256(' '.join(made_of).encode()).hexdigest()[:16]}"
 
 
-def _rehearse(cores: int, rehearsals: Sequence[Callable[[], object]]) -> None:
+def _reporter(observe: Observer) -> Callable[[str], None]:
+    """Return a function that reports the number of kernels, but only every ten seconds."""
+    last = time.monotonic()
+
+    def report(phase: str) -> None:
+        nonlocal last
+        if time.monotonic() - last >= _TELL_S:
+            last = time.monotonic()
+            observe(phase, _count(), None)
+
+    return report
+
+
+def _rehearse(
+    cores: int, rehearsals: Sequence[Callable[[], object]], report: Callable[[str], None]
+) -> None:
     if current_process().daemon or runs_again():  # may not start processes
         for rehearsal in rehearsals:
             rehearsal()
@@ -203,6 +226,7 @@ def _rehearse(cores: int, rehearsals: Sequence[Callable[[], object]]) -> None:
         waiting = {executor.submit(_uncollected, rehearsal) for rehearsal in rehearsals}
         while waiting:
             stopping.check()
+            report(COMPILE)
             done, waiting = wait(waiting, timeout=_POLL_S)
             for future in done:
                 future.result()
@@ -219,7 +243,9 @@ def _uncollected(rehearsal: Callable[[], object]) -> None:
 def _count() -> int:
     """Return the number of kernels that are compiled and stored."""
     folders = (code_folder(Path(__file__).with_name(stage)) for stage in (*_STAGES, "colour"))
-    return sum(len([*folder.rglob("*.nbi")]) for folder in folders if folder is not None)
+    found = (os.walk(folder) for folder in folders if folder is not None)  # also if it disappears
+    names = (name for walk in found for _, _, files in walk for name in files)
+    return sum(name.endswith(".nbi") for name in names)
 
 
 def main(words: Sequence[str] | None = None) -> None:
@@ -236,24 +262,12 @@ def main(words: Sequence[str] | None = None) -> None:
     """
     about = "Compile the kernels of perception ahead of time, unless that is already done."
     argparse.ArgumentParser("python -m shapecat.rehearsal", description=about).parse_args(words)
-    ended = threading.Event()
-
-    def tell() -> None:
-        say("compiling the kernels, once per installation: about a minute")
-        while not ended.wait(_TELL_S):
-            say(f"{_count()} kernels compiled")
 
     def say(line: str) -> None:
         sys.stdout.write(f"{line}\n")
         sys.stdout.flush()
 
-    teller = threading.Thread(target=tell, daemon=True)
-    try:
-        seconds = compile_all(teller.start, colour=True)
-    finally:
-        ended.set()
-        if teller.is_alive():
-            teller.join()
+    seconds = compile_all(lambda phase, done, _total: say(kernel_words(phase, done)), colour=True)
     if seconds:
         say(f"all {_count()} kernels compiled in {seconds:.0f} s")
 

@@ -579,8 +579,32 @@ def test_compile_notice_appears_once(capsys: pytest.CaptureFixture[str], kind: s
     with open_progress(kind, []) as progress:
         for name in ("a", "b", "c"):
             progress.progress(name, "compile", 0, None)
+        progress.progress("a", "compile", 120, None)
+        for name in ("b", "c"):
+            progress.progress(name, "wait for kernels", 121, None)  # for the worker of a
 
-    assert capsys.readouterr().err.count("compiling kernels") == 1
+    assert capsys.readouterr().err.rstrip().splitlines() == [
+        "compiling kernels, once per installation: about a minute",
+        "120 kernels compiled",
+    ]
+
+
+def test_workers_that_wait_for_another_command_say_so_once(
+    capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """One line for all of them, every ten seconds."""
+    module = import_module("shapecat.cli.progress")
+    now = 50.0
+    monkeypatch.setattr("shapecat.cli.progress.time.monotonic", lambda: now)
+    with module.open_progress("plain", []) as progress:
+        for now, name in ((60.0, "a"), (61.0, "b"), (70.0, "a"), (71.0, "b")):
+            progress.progress(name, "wait for kernels", round(now), None)
+
+    waiting = "waiting for another process that compiles kernels"
+    assert capsys.readouterr().err.splitlines() == [
+        f"{waiting}: 60 compiled",
+        f"{waiting}: 70 compiled",
+    ]
 
 
 FIXTURE = str(Path(__file__).parents[1] / "fixtures" / "tabletop.mcap")

@@ -1,10 +1,12 @@
 """Tests of compiling ahead of time: all kernels, only once, without leftover processes."""
 
 import multiprocessing
+import os
 import shutil
 import subprocess
 import sys
-import threading
+import time
+from collections.abc import Callable
 from pathlib import Path
 from types import ModuleType
 from typing import Any
@@ -15,6 +17,7 @@ from shapecat import geometry, rehearsal
 from shapecat.detection.planes import horizontal, strips, supporting
 from shapecat.rehearsal import compile_all, find_ball, find_mask, recognize_ball
 from shapecat.reuse import agreement
+from shapecat.system.files import lock
 
 KERNELS = [
     (geometry, "_mean"),
@@ -64,11 +67,11 @@ def trace(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
 
 def test_kernels_are_compiled_only_once(trace: Path) -> None:
     """A run announces the compilation and waits for it; the next run must not."""
-    announced: list[str] = []
+    announced: list[tuple[str, int, int | None]] = []
 
-    assert compile_all(lambda: announced.append("begin")) > 0
-    assert compile_all(lambda: announced.append("begin")) == 0
-    assert announced == ["begin"]
+    assert compile_all(lambda *report: announced.append(report)) > 0
+    assert compile_all(lambda *report: announced.append(report)) == 0
+    assert announced == [("compile", 0, None)]
     assert trace.read_text() == "x"
 
 
@@ -80,7 +83,9 @@ def test_kernels_for_colour_are_compiled_when_needed(
     monkeypatch.setattr(
         rehearsal, "_notes", lambda *, colour: tmp_path / ("colour" if colour else "depth")
     )
-    monkeypatch.setattr(rehearsal, "_rehearse", lambda _, called: calls.append(len(called)))
+    monkeypatch.setattr(
+        rehearsal, "_rehearse", lambda _, called, _report: calls.append(len(called))
+    )
 
     for colour, expected in ((False, [2]), (True, [2, 3]), (False, [2, 3]), (True, [2, 3])):
         compile_all(colour=colour)
@@ -122,23 +127,57 @@ def test_compiling_reports_its_progress(
     trace: Path, monkeypatch: pytest.MonkeyPatch, capfd: pytest.CaptureFixture[str]
 ) -> None:
     """Minutes of silence look like a hang; compiled kernels need no announcement."""
-    counted = threading.Event()
 
-    def count() -> int:
-        counted.set()
-        return 7
+    def compile_slowly(_cores: int, _called: object, report: Callable[[str], None]) -> None:
+        for _ in range(2):
+            time.sleep(0.002)
+            report("compile")
 
     monkeypatch.setattr(rehearsal, "_TELL_S", 0.001)
-    monkeypatch.setattr(rehearsal, "_count", count)
-    monkeypatch.setattr(rehearsal, "_rehearse", lambda *_: counted.wait())
+    monkeypatch.setattr(rehearsal, "_count", lambda: 7)
+    monkeypatch.setattr(rehearsal, "_rehearse", compile_slowly)
 
     rehearsal.main([])
-    first, second, *_, last = capfd.readouterr().out.splitlines()
-    assert first.startswith("compiling")
-    assert second == "7 kernels compiled"
+    first, *counts, last = capfd.readouterr().out.splitlines()
+    assert first == "compiling kernels, once per installation: about a minute"
+    assert counts == ["7 kernels compiled"] * 2
     assert last.startswith("all 7 kernels")
     rehearsal.main([])
     assert not capfd.readouterr().out
+    assert not trace.exists()
+
+
+def test_kernels_are_counted_every_ten_seconds(monkeypatch: pytest.MonkeyPatch) -> None:
+    """A line for each tenth of a second would bury all others."""
+    now, reports = 100.0, list[tuple[str, int, int | None]]()
+    monkeypatch.setattr("shapecat.rehearsal.time.monotonic", lambda: now)
+    monkeypatch.setattr(rehearsal, "_count", lambda: int(now))
+    report = rehearsal._reporter(lambda *each: reports.append(each))
+    for now in (100.1, 109.9, 110.0, 110.1, 119.9, 120.1):  # noqa: B007  read by the functions
+        report("compile")
+
+    assert reports == [("compile", 110, None), ("compile", 120, None)]
+
+
+def test_waiting_for_another_process_is_reported(
+    trace: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """A second command was silent until the first had compiled, for minutes on a busy machine."""
+    reports: list[tuple[str, int, int | None]] = []
+    monkeypatch.setattr(rehearsal, "_TELL_S", 0.001)
+    monkeypatch.setattr(rehearsal, "_POLL_S", 0.002)
+    monkeypatch.setattr(rehearsal, "_count", lambda: 7)
+    held = lock(trace.parent)
+    assert held is not None
+
+    def observe(*report: object) -> None:
+        reports.append(report)  # type: ignore[arg-type]
+        if len(reports) == 2:
+            (trace.parent / "complete").touch()
+            os.close(held)
+
+    assert compile_all(observe) > 0
+    assert reports == [("wait for kernels", 7, None)] * 2
     assert not trace.exists()
 
 
@@ -157,7 +196,9 @@ def test_help_and_wrong_usage_do_not_compile(
 
 def test_compiling_processes_end() -> None:
     before = set(multiprocessing.active_children())
-    rehearsal._rehearse(1, (multiprocessing.active_children,) * 2)
+    reports: list[str] = []
+    rehearsal._rehearse(1, (multiprocessing.active_children,) * 2, reports.append)
+    assert set(reports) == {"compile"}
     left = set(multiprocessing.active_children()) - before
     for process in left:
         process.join(timeout=10)

@@ -5,12 +5,15 @@ from typing import TypeVar
 
 from shapecat.system import stopping
 
-__all__ = ["Observer", "ignore", "observed"]
+__all__ = ["COMPILE", "WAIT_FOR_KERNELS", "Observer", "ignore", "kernel_words", "observed"]
 
 _Item = TypeVar("_Item")
 
 Observer = Callable[[str, int, int | None], None]
 """Called with the phase, the number of items done, and the total (None if unknown)."""
+
+COMPILE, WAIT_FOR_KERNELS = "compile", "wait for kernels"
+"""The phases in which this process or another one compiles kernels; the items are kernels."""
 
 
 def ignore(_phase: str, _done: int, _total: int | None) -> None:
@@ -33,3 +36,18 @@ def observed(
         stopping.check()
         yield item
         observe(phase, done, total)
+
+
+def kernel_words(phase: str, done: int) -> str:
+    """Describe a report of one of the phases that compile kernels; the first one has none done.
+
+    Examples
+    --------
+    >>> kernel_words(COMPILE, 120)
+    '120 kernels compiled'
+    """
+    if phase == WAIT_FOR_KERNELS:
+        return f"waiting for another process that compiles kernels: {done} compiled"
+    if not done:
+        return "compiling kernels, once per installation: about a minute"
+    return f"{done} kernels compiled"
