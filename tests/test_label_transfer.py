@@ -898,7 +898,7 @@ def test_by_place_transfers_labels_of_another_run(
     assert [item["label"] for item in read_run(two)["corrections"]["transferred"]] == ["teapot"]
 
 
-@pytest.mark.parametrize("confidence", ["nan", "inf", "-0.1", "1.01", "495"])
+@pytest.mark.parametrize("confidence", ["", "nan", "inf", "-0.1", "1.01", "495"])
 def test_table_alone_with_confidence_outside_0_to_1_is_refused(
     tmp_path: Path, confidence: str
 ) -> None:

@@ -332,6 +332,24 @@ def test_only_labels_and_additional_columns_can_be_edited(run: Path) -> None:
     assert "2,0.000,can,0.500,box,/depth,dusty" in (run / "tracks.csv").read_text()
 
 
+def test_table_needs_no_confidence(run: Path) -> None:
+    """Only the label is read; a short table was refused, and so was one with a column removed."""
+    corrected = run.parent / "mine.csv"
+    corrected.write_text("track,category,label\n4,unknown,bowl\n")
+    adopt_labels(corrected, run)
+    assert (run / "tracks.csv").read_text() == labelled(t4="bowl")
+
+    cut = (run / "tracks.csv").read_text().replace(",confidence,", ",").replace(",0.500,", ",")
+    (run / "tracks.csv").write_text(cut)
+    assert read_labels(run / "tracks.csv")[2] == TrackLabel(2, "can", 0.5)
+    adopt_labels(run / "tracks.csv", run)
+    assert (run / "tracks.csv").read_text() == labelled(t4="bowl")
+
+    corrected.write_text("track,label\n4,cup\n")  # perhaps of another run
+    with pytest.raises(OutputError, match="no column category; expected a table like"):
+        adopt_labels(corrected, run)
+
+
 def test_notes_in_columns_without_a_name_are_kept(run: Path) -> None:
     """Only the last of several such columns was written again."""
     names = f"{HEADER.strip()},,,label"

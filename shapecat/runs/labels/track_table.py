@@ -30,7 +30,8 @@ ORIGINAL = "tracks.original.csv"
 """The table as the run wrote it, beside tracks.csv, which a person may edit."""
 LABEL_SEEN = "label_seen"
 """The column of the table of a report page that holds the labels which the table may replace."""
-_COLUMNS = ("track", "category", "confidence", "label")
+_COLUMNS = ("track", "category", "label")
+"""The columns that a table needs; ``category`` shows whether its tracks are those of the run."""
 _LARGEST_TABLE = 64 << 20
 
 
