@@ -144,7 +144,8 @@ def process(
     mcap, rrd : whether to write annotated.mcap and review.rrd.
     cores : number of processes that perceive frames. If there are several, a script must have
         ``if __name__ == "__main__":``.
-    observe : called with the phase, the number of frames done, and the total (None if unknown).
+    observe : called with the phase, the number of frames done, and the total (None if unknown);
+        while kernels are compiled, with their number.
     settings : for example ``seed=3`` or ``detection={"max_range_m": 1.5}``; see docs/reference.md.
 
     Raises

@@ -67,7 +67,8 @@ def process(job: Job, observe: Observer = ignore, *, cores: int = 1) -> Summary:
 
     Parameters
     ----------
-    observe : called with the phase, the number of frames done, and the total (None if unknown).
+    observe : called with the phase, the number of frames done, and the total (None if unknown);
+        while kernels are compiled, with their number.
     cores : number of processes that perceive frames; the tables do not depend on it.
 
     Raises
