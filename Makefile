@@ -29,7 +29,8 @@ setup: .venv/ready ## make the virtual environment .venv from the lock file
 	$(BIN)/pip install --quiet --disable-pip-version-check --no-deps --no-compile --require-hashes \
 	    -r requirements.lock
 	$(BIN)/pip install --quiet --disable-pip-version-check --no-deps --editable .
-	@$(BIN)/python -m compileall -qq -j 0 .venv/lib || true # pip would compile on a single core
+	@# pip would compile on a single core, and also what a run never loads
+	@$(BIN)/python -m compileall -qq -j 0 -x '/(tests?|ray|plotly|dash)/' .venv/lib || true
 	@$(BIN)/python -c 'import open3d' >/dev/null 2>&1 || $(call apt,$(OPEN3D_LIBRARIES)) \
 	    || echo "(only training on triangle meshes needs them)" >&2
 	@touch $@
