@@ -31,7 +31,7 @@ def test_command_line_overrides_file_and_file_overrides_defaults(tmp_path: Path)
     ("text", "overrides"),
     [
         ("seed = " + "[" * 50_000, []),
-        (f"seed{'.a' * 20_000} = 1", []),
+        (f"seed{'.a' * 4_000} = 1", []),
         ("", ["seed=" + "[" * 100_000]),
         ("", [f"seed{'.a' * 30_000}=1"]),
     ],
