@@ -71,6 +71,7 @@ def simulate(
     NAME.color_labels.npz holds the object that each colour pixel shows.
 
     \b
+    Scenes:
     tabletop    separate objects on a table
     shelf       objects on three boards of a shelf
     clutter     objects close together and stacked on a table
@@ -85,6 +86,7 @@ def simulate(
     rearranged  objects that are added, removed, carried and pushed
 
     \b
+    Sensors:
     kinect        Kinect v1, Xtion or Carmine, registered to the colour camera
     realsense     Intel D435 with its spatial filter
     kinect-v2     Kinect v2
