@@ -40,7 +40,7 @@ def make_baselines(blocks: Sequence[slice]) -> dict[str, Callable[[], Any]]:
             StandardScaler(), LogisticRegression(C=0.1, class_weight="balanced", max_iter=2000)
         ),
         "pnn": lambda: _DensityProduct(blocks),
-        "forest leaves (thesis)": lambda: _ForestWords(blocks),
+        "forest leaves (thesis)": lambda: _ForestLeaves(blocks),
     }
 
 
@@ -150,7 +150,7 @@ class _DensityProduct:
         return softmax(self._densities.log_densities(x) @ self._densities.deviation)
 
 
-class _ForestWords:
+class _ForestLeaves:
     """Linear classifiers on the words of a view: the leaves it reaches in a forest (thesis 7.3)."""
 
     def __init__(self, blocks: Sequence[slice]) -> None:

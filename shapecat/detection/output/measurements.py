@@ -102,7 +102,8 @@ def measure_objects(
 def _extend_to_planes(boxes: Boxes, standing: Bool, up: F8, plane_offsets: F8) -> None:
     """Extend boxes down to the planes, in place: the lowest millimetres count as the plane.
 
-    ``standing`` (n,) are the objects that touch their plane.
+    ``standing`` (n,) are the objects that touch their plane; ``up`` (3,) and ``plane_offsets``
+    (n,), metres, are as in `measure_objects`.
     """
     gaps = boxes.center @ up - boxes.size[:, 2] / 2 - plane_offsets
     gaps[~standing | (gaps < 0) | (gaps > OUTPUT.lifted_m)] = 0
