@@ -510,6 +510,20 @@ def test_partial_run_resumes_with_other_outputs(source: Path, tmp_path: Path) ->
     assert (resumed["id"], resumed["options"]["rrd"]) == (run["id"], True)
 
 
+def test_partial_run_resumes_with_other_tracking(source: Path, tmp_path: Path) -> None:
+    """Frames of hours would be discarded, or the command be refused, because of a gate."""
+    job = Job(source, tmp_path / "lab", with_overrides(Settings(), ["tracking.gate_m=0.3"]))
+    folder = partial_path(job.folder)
+    partial(folder, planned(source))
+    wanted = planned(source) | {"settings": job.settings.as_dict()}
+
+    require_resumable(job, wanted, lambda: "")
+    resume(folder, wanted, source, lambda: "")
+
+    assert has_work(folder)
+    assert read_run(folder)["settings"]["tracking"]["gate_m"] == 0.3
+
+
 def test_partial_run_resumes_with_copy_of_its_recording(source: Path, tmp_path: Path) -> None:
     """With the old file's times, the recording would seem changed and the work be discarded."""
     folder, run = tmp_path / "half", planned(source)

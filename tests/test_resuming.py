@@ -201,6 +201,32 @@ def test_seconds_of_killed_run_count_once(
     assert before < read_run(job.folder)["seconds"]["total"] < before + 90
 
 
+def test_interrupted_run_keeps_its_frames_if_tracking_changes(
+    job: Job, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """They were perceived with the same settings; tracks, labels and outputs are made anew."""
+    half = replace(job, folder=tmp_path / "half", overwrite=False, rrd=False)
+    with monkeypatch.context() as patch, pytest.raises(KeyboardInterrupt):
+        patch.setattr(pipeline, "annotate", interrupt)
+        pipeline.process(half)
+    before = read_run(partial_path(half.folder))
+    assert {"track", "labels"} <= before["seconds"].keys()
+    other = replace(half, settings=changed("tracking.gate_m=0.001", "outputs.boxes=visible"))
+    with monkeypatch.context() as patch:
+        patch.setattr(pipeline, "perceive_all", None)
+        pipeline.process(other)
+
+    pipeline.process(replace(other, folder=tmp_path / "new"))
+    run, new = read_run(half.folder), read_run(tmp_path / "new")
+    for name in TABLES:
+        assert untimed_table(half.folder, name).equals(untimed_table(tmp_path / "new", name)), name
+    assert run["counts"] == new["counts"] | {"resumed": 4}
+    assert (run["settings"], run["work"]) == (new["settings"], new["work"])
+    assert run["seconds"]["perceive"] == before["seconds"]["perceive"]
+    assert run["seconds"]["track"] != before["seconds"]["track"]
+    assert run["id"] != before["id"]
+
+
 def give_label(folder: Path, label: str) -> None:
     """Give the first track a label, or none."""
     rows = [row for row in read_track_table(folder / "tracks.csv").rows if row.track == 1]

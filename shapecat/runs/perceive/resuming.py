@@ -23,9 +23,9 @@ _LATER = ("tracking.", "outputs.")
 
 
 def require_resumable(job: Job, planned: RunInfo, digest: Callable[[], str]) -> None:
-    """Check that a job would not discard the work of an interrupted run of something else.
+    """Check that a job would not discard the frames of an interrupted run of something else.
 
-    The work of other versions, or on a recording that has changed, is not worth keeping.
+    Those of other versions, or of a recording that has changed, are not worth keeping.
 
     Parameters
     ----------
@@ -42,7 +42,7 @@ def require_resumable(job: Job, planned: RunInfo, digest: Callable[[], str]) -> 
         run = _with_outputs(read_run(folder), planned)
     except OutputError:  # nothing can continue it
         return
-    differing, place = differences(run, planned), run["input"]["path"]
+    differing, place = _perceived_otherwise(run, planned), run["input"]["path"]
     if place != planned["input"]["path"] and not same_content(run["input"], job.source, digest):
         differing["input"] = f"{place} in the old run"
     if not differing:
@@ -59,8 +59,8 @@ def resume(folder: Path, planned: RunInfo, source: Path, digest: Callable[[], st
     """Return the run.json of the interrupted run in a folder if ``planned`` can continue it.
 
     That is possible if settings, options, model, versions and recording are the same, and its
-    files are whole. Otherwise clear the folder, write ``planned`` as its run.json and return
-    ``planned``.
+    files are whole. If settings of tracking or of outputs differ, the frames are kept. Otherwise
+    clear the folder, write ``planned`` as its run.json and return ``planned``.
 
     Parameters
     ----------
@@ -73,11 +73,14 @@ def resume(folder: Path, planned: RunInfo, source: Path, digest: Callable[[], st
     """
     with suppress(OutputError):
         run = _with_outputs(read_run(folder), planned)
-        if not differences(run, planned) and _same_recording_and_versions(
+        if not _perceived_otherwise(run, planned) and _same_recording_and_versions(
             run, planned, source, digest
         ):
             _require_complete(folder)
-            if "perceive" in run["seconds"]:
+            if differences(run, planned):
+                run = _with_frames(planned, run)
+                write_run(folder, run)
+            elif "perceive" in run["seconds"]:
                 run["counts"]["resumed"] = run["counts"]["frames"]
             return {**run, "input": planned["input"]}
     clear(folder)
@@ -108,8 +111,7 @@ def take_over_frames(
     """
     try:
         run = _with_outputs(read_run(finished), planned)
-        changed = differences(run, planned)
-        later = bool(changed) and all(each.startswith(_LATER) for each in changed)
+        later = bool(differences(run, planned)) and not _perceived_otherwise(run, planned)
         alike = later and _same_recording_and_versions(run, planned, source, digest)
         if not (alike and _is_complete(finished, run)):
             return planned
@@ -117,13 +119,7 @@ def take_over_frames(
         return planned
     for table in PERCEIVED:
         _link(finished / f"{table}.parquet", folder)
-    new = planned.copy()
-    new["counts"] = {**run["counts"], "resumed": run["counts"]["frames"]}
-    new["counts"].pop("tracks", None)
-    new["seconds"] = {phase: run["seconds"][phase] for phase in ("perceive", "revise")}
-    new["fixed_frame"], new["up"], new["warnings"] = run["fixed_frame"], run["up"], run["warnings"]
-    if run.get("damaged"):
-        new["damaged"] = True
+    new = _with_frames(planned, run)
     write_run(folder, new)
     return new
 
@@ -133,6 +129,26 @@ def has_work(folder: Path) -> bool:
     with suppress(OutputError):
         return bool(list_segments(folder / SEGMENTS)) or "perceive" in read_run(folder)["seconds"]
     return False
+
+
+def _perceived_otherwise(run: RunInfo, planned: RunInfo) -> dict[str, str]:
+    """Return the `differences` of two runs that affect the perceived frames."""
+    found = differences(run, planned).items()
+    return {name: text for name, text in found if not name.startswith(_LATER)}
+
+
+def _with_frames(planned: RunInfo, run: RunInfo) -> RunInfo:
+    """Return ``planned`` with the results of perceiving from another run."""
+    new, counts, seconds = planned.copy(), run["counts"].copy(), run["seconds"]
+    counts.pop("tracks", None)
+    if "perceive" in seconds:
+        counts["resumed"] = counts["frames"]
+    new["counts"] = counts
+    new["seconds"] = {name: seconds[name] for name in ("perceive", "revise") if name in seconds}
+    new["fixed_frame"], new["up"], new["warnings"] = run["fixed_frame"], run["up"], run["warnings"]
+    if run.get("damaged"):
+        new["damaged"] = True
+    return new
 
 
 def _require_complete(folder: Path) -> None:
