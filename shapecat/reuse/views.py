@@ -10,7 +10,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from shapecat.arrays import F4, F8, Bool
+from shapecat.arrays import F4, F8, Bool, Records, Row
 from shapecat.geometry import (
     IDENTITY,
     compose,
@@ -43,6 +43,18 @@ _BIAS = 0.002
 """Largest mean difference of their inverse depths, 1/m: 2 mm at 1 m."""
 _TRIES = 3
 """Number of earlier views to compare point by point, the newest first: masks may flicker."""
+_SUMMARY = np.dtype(
+    [
+        ("center_m", "f8", 3),  # of the box, in the fixed frame; the sensor frame without one
+        ("ray_m", "f8", 3),  # from the sensor to the centre, in the same frame
+        ("up", "f8", 3),  # in the same frame
+        ("size_m", "f8", 3),  # longer side, shorter side and height of the box
+        ("height_m", "f8"),  # of the centre above the support
+        ("pixels", "f8"),
+        ("kind", "i8"),  # flags that must be equal
+    ]
+)
+"""What is compared before the points."""
 
 
 class ObjectView(NamedTuple):
@@ -51,21 +63,13 @@ class ObjectView(NamedTuple):
     Attributes
     ----------
     pose : ``fixed_from_sensor``; None where there is no fixed frame.
-    summary : (15,) numbers that are compared before the points: box centre (3), vector from the
-        sensor to it (3) and up (3), in the fixed frame if there is one, else in the sensor frame;
-        longer side, shorter side and height of the box; height above the support; number of
-        pixels; flags as an integer. Lengths are in metres.
+    summary : a row of `_SUMMARY`.
     """
 
     frame: Frame
     pose: Pose | None
     candidate: Candidate
-    summary: F8
-
-
-_PLACE, _RAY, _UP, _SIZE = slice(3), slice(3, 6), slice(6, 9), slice(9, 12)
-_HEIGHT, _PIXELS, _KIND = 12, 13, 14
-"""Indices into `ObjectView.summary`."""
+    summary: Row
 
 
 def view_object(
@@ -85,8 +89,8 @@ def view_object(
     size = (max(length, width), min(length, width), height)  # the yaw of a box may flip
     kind = candidate.touches_border + 2 * candidate.occluded + 4 * (pose is None)
     pixels = len(candidate.indices)
-    summary = np.array([*(ray + shift), *ray, *(turn @ up), *size, height_m, pixels, kind])
-    return ObjectView(frame, pose, candidate, summary)
+    summary = (ray + shift, ray, turn @ up, size, height_m, pixels, kind)
+    return ObjectView(frame, pose, candidate, np.array(summary, _SUMMARY)[()])
 
 
 class KeyView(NamedTuple):
@@ -129,8 +133,8 @@ def find_repeats(views: Sequence[ObjectView], keys: Sequence[KeyView]) -> list[R
     """
     if not keys or not views:
         return [None] * len(views)
-    summaries = np.array([view.summary for view in views])
-    key_summaries = np.array([key.view.summary for key in keys])
+    summaries = np.array([view.summary for view in views], _SUMMARY)
+    key_summaries = np.array([key.view.summary for key in keys], _SUMMARY)
     alike, moves = _similar(summaries[:, None], key_summaries[None]), dict[int, Move]()
     repeats: list[Repeat | None] = []
     for view, row in zip(views, alike, strict=True):
@@ -181,21 +185,22 @@ def _moved_box(move: Move, box: FullBox | None) -> FullBox | None:
     return replace(box, center=transform(move.pose, box.center), orientation=turned)
 
 
-def _similar(views: F8, keys: F8) -> Bool:
-    """Return which pairs of `ObjectView.summary` (..., 15) are alike: (...) bool."""
-    distance, key_distance = (np.linalg.norm(each[..., _RAY], axis=-1) for each in (views, keys))
-    area = views[..., _PIXELS] * distance**2 / (keys[..., _PIXELS] * key_distance**2)
-    turned = (views[..., _RAY] * keys[..., _RAY]).sum(axis=-1) / (distance * key_distance)
-    tilted = (views[..., _UP] * keys[..., _UP]).sum(axis=-1)
+def _similar(views: Records, keys: Records) -> Bool:
+    """Return which pairs of `ObjectView.summary` are alike, of the common shape of both."""
+    ray, key_ray = views["ray_m"], keys["ray_m"]
+    distance, key_distance = np.linalg.norm(ray, axis=-1), np.linalg.norm(key_ray, axis=-1)
+    area = views["pixels"] * distance**2 / (keys["pixels"] * key_distance**2)
+    turned = (ray * key_ray).sum(axis=-1) / (distance * key_distance)
+    tilted = (views["up"] * keys["up"]).sum(axis=-1)
     return np.asarray(
-        (views[..., _KIND] == keys[..., _KIND])
-        & (((views - keys)[..., _PLACE] ** 2).sum(axis=-1) <= _PLACE_M**2)
+        (views["kind"] == keys["kind"])
+        & (np.linalg.norm(views["center_m"] - keys["center_m"], axis=-1) <= _PLACE_M)
         & (turned >= np.cos(np.radians(_TURN_DEG)))
         & (tilted >= np.cos(np.radians(_UP_DEG)))
         & (np.abs(distance / key_distance - 1) <= _FARTHER)
         & (np.abs(area - 1) <= _AREA)
-        & (np.abs(views - keys)[..., _SIZE].max(axis=-1) <= _SIZE_M)
-        & (np.abs(views - keys)[..., _HEIGHT] <= _HEIGHT_M)
+        & (np.abs(views["size_m"] - keys["size_m"]).max(axis=-1) <= _SIZE_M)
+        & (np.abs(views["height_m"] - keys["height_m"]) <= _HEIGHT_M)
     )
 
 
