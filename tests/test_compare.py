@@ -1362,7 +1362,9 @@ def test_errors_are_one_line_with_reason_and_exit_code(
     shapecat: Run, run: Path, truth: Path, tmp_path: Path
 ) -> None:
     half = shutil.copytree(run, tmp_path / "half")
-    (half / "tracks.csv").unlink()
+    (half / "tracks.parquet").unlink()
+    lost = shutil.copytree(run, tmp_path / "lost")
+    (lost / "tracks.csv").rename(lost / "tracks.original.csv")
     later = write_run(tmp_path / "later", digest="two", shift_ns=STEP // 2)
     (tmp_path / "odd.json").write_text('{"images": []}')
     coco = {"categories": [], "annotations": [], "images": [{"id": 1, "stamp_ns": START}]}
@@ -1374,6 +1376,7 @@ def test_errors_are_one_line_with_reason_and_exit_code(
     for words, code, text in (
         ((tmp_path, truth), 1, "no run.json there"),
         ((half, truth), 1, "not complete"),
+        ((lost, truth), 1, "tracks.csv: missing or empty; restore it from tracks.original.csv"),
         ((later, truth), 3, "no frame in common"),
         ((run, later), 1, "another recording"),
         ((run, tmp_path / "none.json"), 3, "nothing to compare with"),

@@ -107,6 +107,8 @@ def test_category_names_are_normalised(run: Path, label: str, meant: str) -> Non
         ("merge with", "is not a category, `delete` or `merge with N`"),
         ("merge 2", "line 2: 'merge 2': did you mean merge with 2?"),
         ("Merge to #12", "did you mean merge with 12?"),
+        ("merge-7", "did you mean merge with 7?"),
+        ("merged7", "did you mean merge with 7?"),
         ("merge with 2 or 3", "is not a category"),
         ("new delete", "is not a category"),
         ("new merge with 1", "is not a category"),

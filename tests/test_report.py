@@ -722,7 +722,14 @@ LABELS = (
     *("delete", "Delete", "delte", "del", "remove", "removed"),
     *("merge", "merger", "merge 3", "merged x", "mergers", "merge with", "merge with 999"),
     *("new delete", "new del", "new Remove", "new merge with {b}", "new merger", "new removal"),
-    *("Merged into #{b}", "merge with {b}.0", "merge with 0{b}", "merge with {b}x"),
+    *(
+        "Merged into #{b}",
+        "merge with {b}.0",
+        "merge with 0{b}",
+        "merge with {b}x",
+        "merge-7",
+        "merged7",
+    ),
     *("merge with {a}", "merge with {b}", "merge with {c}", "merge with {d}", "merge with {e}"),
 )
 """Labels for track a: b has a new name, c is deleted, d merges with a, e has another topic."""

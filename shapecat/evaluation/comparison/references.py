@@ -231,7 +231,7 @@ def read_complete(folder: Path) -> FinishedRun:
     OutputError : the folder is not a run, or the run is not complete.
     """
     read_run(folder)  # says if there is no run
-    if not ((folder / "tracks.parquet").is_file() and (folder / "tracks.csv").is_file()):
+    if not (folder / "tracks.parquet").is_file():
         msg = f"{folder}: the run is not complete; run the same command again to resume"
         raise OutputError(msg)
     return read_finished(folder)

@@ -28,7 +28,7 @@ function misread(label, names) {
   const lower = label.toLowerCase();
   if (!label || lower === "delete" || names.has(lower) || MERGE.test(label)) return "";
   const name = label.replace(NEW, "$1").toLowerCase();
-  if (/^(merged?( |$)|(del(ete)?|remove|none|dontcare|na|nan|null)$)/.test(name)) {
+  if (/^(merged?( |\W*\d|$)|(del(ete)?|remove|none|dontcare|na|nan|null)$)/.test(name)) {
     return "Write a category, delete, or merge with #3.";
   }
   if (!NAME.test(name.replace(/\p{M}/gu, ""))) {

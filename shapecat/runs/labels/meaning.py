@@ -28,7 +28,7 @@ DELETE = "delete"
 
 _MERGE = re.compile(r"merged? +(?:with|into) +#?(\d{1,9})(?:[.,]0*)?", re.IGNORECASE)
 _INCOMPLETE_MERGE = re.compile(r"merge\D*(\d{1,9})", re.IGNORECASE)
-_COMMAND = re.compile(r"(merged?( |$)|del(ete)?$|remove$)", re.IGNORECASE)
+_COMMAND = re.compile(r"(merged?( |\W*\d|$)|del(ete)?$|remove$)", re.IGNORECASE)
 _NEW = re.compile(r"new +(.+)", re.IGNORECASE)
 _RESERVED = ("none", "dontcare", "na", "nan", "null")
 """Names that mean "no object" in exported formats, or "no value" to readers of tables."""
