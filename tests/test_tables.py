@@ -438,6 +438,27 @@ def test_older_readers_open_tables_with_nulls(tmp_path: Path, name: str) -> None
         assert (table.schema, table.schema.metadata) == (schema, schema.metadata)
 
 
+@pytest.mark.parametrize("name", TABLES)
+def test_changed_byte_in_any_column_is_found(tmp_path: Path, name: str) -> None:
+    """A disk error would move a box or change a label without a word, or end in a traceback."""
+    path = tmp_path / f"{name}.parquet"
+    schema = TABLES[name].with_metadata({"model": "m"})
+    write_table(path, {field.name: [None] for field in schema}, schema)
+    content = path.read_bytes()
+    group = pq.read_metadata(path).row_group(0)
+
+    for column in map(group.column, range(group.num_columns)):
+        last = column.data_page_offset + column.total_compressed_size - 1
+        if column.has_dictionary_page:
+            last = column.dictionary_page_offset + column.total_compressed_size - 1
+        damaged = bytearray(content)
+        damaged[last] ^= 1
+        path.write_bytes(damaged)
+        for read in (lambda: list(read_row_groups(path)), Table(path).arrow):
+            with pytest.raises(OutputError, match="could not verify page integrity"):
+                read()
+
+
 def test_list_of_wrong_size_is_refused(tmp_path: Path) -> None:
     write_run_tables(tmp_path, [2], Pose(np.eye(3), np.zeros(3)))
     path = tmp_path / "frames.parquet"

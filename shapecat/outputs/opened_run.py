@@ -61,7 +61,10 @@ class Table:
         if missing := [name for name in names if name not in available]:
             msg = f"{self.path}: no column {missing[0]}; known: {', '.join(available)}"
             raise OutputError(msg)
-        with self._reading(), pq.ParquetFile(self.path) as file:
+        with (
+            self._reading(),
+            pq.ParquetFile(self.path, page_checksum_verification=True) as file,
+        ):
             return with_fixed_lists(file.read(columns=names))
 
     @contextmanager

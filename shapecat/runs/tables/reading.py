@@ -284,7 +284,9 @@ def with_fixed_lists(table: pa.Table) -> pa.Table:
 
 def _open_parquet(path: Path, read_dictionary: Sequence[str]) -> pq.ParquetFile:
     try:
-        return pq.ParquetFile(path, read_dictionary=list(read_dictionary))
+        return pq.ParquetFile(
+            path, read_dictionary=list(read_dictionary), page_checksum_verification=True
+        )
     except KeyError as error:
         msg = f"no column {', '.join(read_dictionary)}"
         raise pa.ArrowInvalid(msg) from error

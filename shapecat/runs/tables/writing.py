@@ -32,6 +32,7 @@ def open_writer(path: Path, schema: pa.Schema) -> pq.ParquetWriter:
         path,
         pa.schema(fields, schema.metadata),
         compression="zstd",
+        write_page_checksum=True,
         use_dictionary=texts,
         column_encoding=deltas or None,
         # The statistics of all columns of a long recording take ten megabytes to read.
