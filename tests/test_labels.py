@@ -96,6 +96,14 @@ def test_category_names_are_normalised(run: Path, label: str, meant: str) -> Non
     assert read_labels(run / "tracks.csv", ["cactus"])[4] == TrackLabel(4, meant, 1.0)
 
 
+def test_damaged_table_of_shapecat_is_refused(run: Path) -> None:
+    """Confidences come from it: NaN ended in a traceback."""
+    (run / "tracks.original.csv").write_text(ORIGINAL.replace("0.500", "nan", 1))
+
+    with pytest.raises(OutputError, match=r"tracks.original.csv, line \d: expected a track number"):
+        read_labels(run / "tracks.csv")
+
+
 @pytest.mark.parametrize(
     ("label", "message"),
     [

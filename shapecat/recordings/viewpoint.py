@@ -44,7 +44,7 @@ def find_viewpoint(points: F4, previous: PinholeFit | None) -> tuple[PinholeFit,
     keep = np.ones(len(places), bool)
     for _ in range(_ROUNDS):
         matrix, unclear = _projection_matrix(places[keep], pixels[keep])
-        with np.errstate(divide="ignore", invalid="ignore"):
+        with np.errstate(divide="ignore", invalid="ignore", over="ignore"):
             projected = places @ matrix.T
             error = np.linalg.norm(projected[:, :2] / projected[:, 2:] - pixels, axis=1)
         error[np.isnan(error)] = np.inf

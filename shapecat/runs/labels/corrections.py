@@ -81,6 +81,7 @@ def read_original_table(path: Path) -> tuple[TrackTable, list[str]]:
     edited = {row.track: row for row in table.rows}
     missing = [f"#{row.track}" for row in original.rows if row.track not in edited]
     problems = [*table.problems, *_contradictions(table, original)]
+    problems += [f"{ORIGINAL}, {text}" for text in (*original.problems, *original.wrong_numbers)]
     if missing:
         problems.append(
             f"missing tracks: {listed(missing)}; restore the lines from "
