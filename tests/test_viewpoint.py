@@ -20,6 +20,7 @@ from shapecat.pipeline import process
 from shapecat.recordings import choose_streams, frames, open_recording
 from shapecat.recordings.colour_frames import frames_with_colour
 from shapecat.recordings.colour_streams import pair_colours
+from shapecat.recordings.decoding.pointcloud2 import unorganized
 from shapecat.recordings.pinhole import fit_pinhole
 from shapecat.recordings.viewpoint import find_viewpoint
 from shapecat.runs.folder import read_run
@@ -72,6 +73,20 @@ def test_camera_of_transformed_cloud_is_found(invalid: float) -> None:
     np.testing.assert_allclose(pose.translation, [0.3, -1.2, 0.8], atol=1e-4)
     rotation = rotation_from_quaternion((0.3, -0.6, 0.4, 0.5))
     np.testing.assert_allclose(pose.rotation, rotation, atol=1e-4)
+
+
+def test_clouds_with_damaged_numbers_are_read_without_warnings() -> None:
+    """NumPy would print its own between the messages of shapecat."""
+    points = posed(organized_points(wavy_depth()))
+    points.view(np.uint32)[::7, ::5] = 0x7F800001  # a signaling NaN
+    points[3::7, ::5] = 3e38
+
+    flat = unorganized(points)["points"]
+
+    find_viewpoint(points, None)
+    valid = np.isfinite(points).all(axis=2).reshape(-1)
+    assert np.isnan(flat[~valid]).all()
+    np.testing.assert_array_equal(flat[valid], points.reshape(-1, 3)[valid])
 
 
 def test_missing_points_at_the_origin_of_another_frame_have_no_depth(tmp_path: Path) -> None:

@@ -122,8 +122,7 @@ def sample_pixels(points: F4, valid: Callable[[F4], Bool]) -> tuple[F8, F8, F8] 
     while np.gcd(stride, width) > 1:
         stride += 2
     flat = points.reshape(-1, 3)[::stride]
-    with np.errstate(invalid="ignore"):  # damage may make signaling NaNs
-        index = np.flatnonzero(np.isfinite(flat).all(1) & valid(flat))
+    index = np.flatnonzero(np.isfinite(flat).all(1) & valid(flat))
     if index.size < _FEWEST:
         return None
     index = index[:: max(1, index.size // _SAMPLES)]

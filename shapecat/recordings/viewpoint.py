@@ -33,7 +33,7 @@ def find_viewpoint(points: F4, previous: PinholeFit | None) -> tuple[PinholeFit,
     The camera, ``frame_from_camera``, and the points (h, w, 3) in the frame of the camera; None if
     no camera fits, or if the points do not determine one, like those of a single plane.
     """
-    sample = sample_pixels(points, lambda flat: np.asarray(flat.any(axis=1)))
+    sample = sample_pixels(points, lambda flat: np.asarray((flat != 0).any(axis=1)))
     if sample is None:
         return None
     width = points.shape[1]

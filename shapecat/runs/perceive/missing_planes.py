@@ -86,5 +86,6 @@ def _distances(frame: Frame) -> F4:
         depths: F4 = frame.depth[frame.depth > 0]
         return depths
     points = frame.xyz()
-    distances: F4 = np.linalg.norm(points[np.isfinite(points).all(axis=1)], axis=1)
+    with np.errstate(over="ignore"):
+        distances: F4 = np.linalg.norm(points[np.isfinite(points).all(axis=1)], axis=1)
     return distances
