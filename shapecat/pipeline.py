@@ -34,7 +34,9 @@ from shapecat.runs.jobs import (
     add_warnings,
     describe_run,
     differences,
+    follow,
     identify,
+    other_work,
     require_model,
     require_other_folder,
     require_unchanged,
@@ -189,15 +191,14 @@ def _add_outputs(
     if not same_content(run["input"], job.source, content.result):
         differing["input"] = f"{run['input']['path']} in the old run"
     if differing:
-        listed = "; ".join(f"{name}: {text}" for name, text in differing.items())
-        msg = (
-            f"{job.folder}: has results of another input, model or settings "
-            f"({listed}); choose another --out, or --overwrite it"
-        )
+        other = other_work(differing)
+        msg = f"{job.folder}: has results of {other}; choose another --out, or --overwrite it"
         raise OutputError(msg)
     if not job.target:
         with writing_outputs(job.folder):
             sweep(job.folder)
+            if follow(run, planned["input"]):
+                write_run(job.folder, run)
             annotate(job.folder, recording, run, observe)
     return summarize(run, processed=False)
 

@@ -628,6 +628,11 @@ def test_batch_checks_results_of_other_model_settings_or_content(
     assert status_of(Job(Path(), Path(), settings=Settings(seed=3), rrd=False), source, out) != (
         "complete"
     )
+    run = read_run(out / "lab")
+    for path, status in (("/gone/lab.mcap", "check"), (str(source), "complete")):
+        run["input"]["path"] = path  # the check stores where the recording is now
+        write_run(out / "lab", run)
+        assert status_of(job, source, out) == status
     source.write_bytes(b"recordinG")
     assert status_of(job, source, out) == "check"
 

@@ -14,6 +14,7 @@ from shapecat.config import Settings, with_overrides
 from shapecat.errors import OutputError
 from shapecat.recordings import FrameRange
 from shapecat.runs.folder import previous_path, read_run, write_run
+from shapecat.runs.identity import file_stats
 from shapecat.runs.jobs import Job
 from shapecat.runs.labels.track_table import read_track_table
 from shapecat.runs.tables.segments import list_segments
@@ -160,6 +161,26 @@ def test_removed_output_is_written_again(job: Job) -> None:
 
     assert mcap.read_bytes().endswith(b"\x89MCAP0\r\n")
     assert tracks.stat().st_mtime_ns == known
+
+
+@pytest.mark.usefixtures("perceiving_fails")
+@pytest.mark.parametrize("gone", [True, False])
+def test_finished_run_follows_its_recording(job: Job, tmp_path: Path, *, gone: bool) -> None:
+    """Reports and exports would not find it, although the command had called it complete."""
+    first, moved = tmp_path / "first.mcap", tmp_path / "moved.mcap"
+    shutil.copyfile(job.source, moved)
+    if not gone:
+        shutil.copyfile(job.source, first)
+    run = read_run(job.folder)
+    run["input"] |= {"path": str(first), "files": file_stats(job.source)}
+    write_run(job.folder, run)
+
+    summary = pipeline.process(replace(job, source=moved, overwrite=False, rrd=False, mcap=False))
+
+    assert not summary.processed
+    stored = read_run(job.folder)["input"]
+    assert stored["path"] == str(moved if gone else first)
+    assert stored["files"] == file_stats(moved if gone else job.source)
 
 
 @pytest.mark.usefixtures("perceiving_fails")

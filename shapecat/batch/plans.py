@@ -280,7 +280,8 @@ def _is_wanted_run(task: Task, model_id: str) -> bool:
         [topic.strip("/") for topic in topics] for topics in (run["options"]["topics"], job.topics)
     )
     return (
-        all(name in run["seconds"] and (job.folder / name).exists() for name in outputs)
+        (job.origin or Path(run["input"]["path"]).exists())  # or it was moved
+        and all(name in run["seconds"] and (job.folder / name).exists() for name in outputs)
         and not differing
         and requested in ([], chosen)
     )

@@ -22,7 +22,7 @@ from shapecat.runs.identity import (
     unchanged,
     work_id,
 )
-from shapecat.runs.run_info import Options, OriginInfo, RunInfo
+from shapecat.runs.run_info import InputInfo, Options, OriginInfo, RunInfo
 
 __all__ = [
     "Job",
@@ -30,7 +30,9 @@ __all__ = [
     "add_warnings",
     "describe_run",
     "differences",
+    "follow",
     "identify",
+    "other_work",
     "require_model",
     "require_other_folder",
     "require_unchanged",
@@ -179,6 +181,12 @@ def differences(run: RunInfo, planned: Mapping[str, Any]) -> dict[str, str]:
     }
 
 
+def other_work(differing: Mapping[str, str]) -> str:
+    """Return, for a message, in what a run differs; from `differences`, and the input."""
+    listed = "; ".join(f"{name}: {text}" for name, text in differing.items())
+    return f"another input, model or settings ({listed})"
+
+
 def _entries(run: Mapping[str, Any]) -> dict[str, Any]:
     """Return the settings, options and model of a run, each by its name."""
     tree: dict[str, Any] = {**run["settings"], **run["options"], "model": run["model"]["id"]}
@@ -209,6 +217,14 @@ def identify(run: RunInfo, content: ContentDigest) -> None:
     """
     run["input"]["digest"] = run["input"]["digest"] or content.result()
     run["work"] = work_id(run)
+
+
+def follow(run: RunInfo, found: InputInfo) -> bool:
+    """Store where the same recording was ``found`` if it is gone from its path; return whether."""
+    moved = not Path(run["input"]["path"]).exists() and run["input"]["path"] != found["path"]
+    if moved:
+        run["input"] |= {"path": found["path"], "files": found["files"]}
+    return moved
 
 
 def require_other_folder(job: Job) -> None:

@@ -9,7 +9,7 @@ from pathlib import Path
 from shapecat.errors import OutputError
 from shapecat.runs.folder import OUTPUT_OPTIONS, clear, read_run, write_run
 from shapecat.runs.identity import same_content, unchanged
-from shapecat.runs.jobs import Job, differences
+from shapecat.runs.jobs import Job, differences, other_work
 from shapecat.runs.run_info import RunInfo
 from shapecat.runs.tables.reading import count_rows
 from shapecat.runs.tables.schemas import PERCEIVED, TABLES
@@ -47,10 +47,9 @@ def require_resumable(job: Job, planned: RunInfo, digest: Callable[[], str]) -> 
         differing["input"] = f"{place} in the old run"
     if not differing:
         return
-    listed = "; ".join(f"{name}: {text}" for name, text in differing.items())
     msg = (
-        f"{folder}: has finished work of an interrupted run of another input, model or settings "
-        f"({listed}); repeat its command to continue it, choose another --out, or --overwrite it"
+        f"{folder}: has finished work of an interrupted run of {other_work(differing)}; repeat its "
+        "command to continue it, choose another --out, or --overwrite it"
     )
     raise OutputError(msg)
 
