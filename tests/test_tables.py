@@ -474,6 +474,17 @@ def test_no_lists_give_empty_column() -> None:
     assert lists([], DETECTIONS.field("indices").type.value_type).to_pylist() == []
 
 
+def test_damaged_name_of_a_column_is_reported(tmp_path: Path) -> None:
+    """Only pages have checksums; Arrow cannot decode the name."""
+    write_run_tables(tmp_path, [2])
+    path = tmp_path / "frames.parquet"
+    path.write_bytes(path.read_bytes().replace(b"stamp_ns", b"sta\xffp_ns"))
+
+    for read in (lambda: list(read_row_groups(path)), Table(path).arrow):
+        with pytest.raises(OutputError, match=r"frames.parquet: not a readable table"):
+            read()
+
+
 def test_foreign_file_is_rejected_as_table(tmp_path: Path) -> None:
     (tmp_path / "frames.parquet").write_bytes(b"hello")
     with pytest.raises(OutputError, match="process the recording again"):

@@ -182,7 +182,12 @@ def test_each_transform_takes_little_memory() -> None:
 
 @pytest.mark.parametrize(
     "bad",
-    [((np.nan, 0, 0), (0, 0, 0, 1)), ((0, 0, 0), (0, 0, 0, 0)), ((0, 0, 0), (np.inf, 0, 0, 1))],
+    [
+        ((np.nan, 0, 0), (0, 0, 0, 1)),
+        ((0, -1e30, 0), (0, 0, 0, 1)),
+        ((0, 0, 0), (0, 0, 0, 0)),
+        ((0, 0, 0), (np.inf, 0, 0, 1)),
+    ],
 )
 def test_invalid_transform_is_refused(bad: Any) -> None:
     buffer = TransformBuffer()

@@ -71,7 +71,7 @@ class Table:
     def _reading(self) -> Iterator[None]:
         try:
             yield
-        except (OSError, pa.ArrowException) as error:
+        except (OSError, pa.ArrowException, UnicodeDecodeError) as error:
             msg = f"{self.path}: not a readable table of a run ({error})"
             raise OutputError(msg) from error
 

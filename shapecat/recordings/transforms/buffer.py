@@ -37,6 +37,8 @@ __all__ = [
 
 _TOLERANCE_NS = 100_000_000
 """Time before its first and after its last sample in which a transform is taken as constant."""
+_FARTHEST_M = 1e9
+"""A larger translation is damage: nothing on Earth is so far from its centre."""
 _DEEPEST = 200
 _FIXED = ("map", "odom", "world")
 
@@ -92,14 +94,15 @@ class TransformBuffer:
         Returns
         -------
         Whether it was added; False if the transform is invalid: a frame has no name or is its own
-        parent, a number is not finite, or the quaternion is zero.
+        parent, a number is not finite, the translation is larger than `_FARTHEST_M`, or the
+        quaternion is zero.
         """
         parent, child = parent.strip().lstrip("/"), child.strip().lstrip("/")
         # Numpy would take most of the time of reading: joints publish a thousand times a second.
         x, y, z = map(float, parent_from_child[0])
         quaternion = tuple(map(float, parent_from_child[1]))
         norm = math.hypot(*quaternion)
-        fine = all(map(math.isfinite, (x, y, z, norm))) and norm > 1e-6
+        fine = math.hypot(x, y, z) < _FARTHEST_M and 1e-6 < norm < math.inf
         if not (fine and parent and child and parent != child):
             return False
         parent = sys.intern(parent)  # one for all samples

@@ -242,7 +242,7 @@ def opened(
                 msg = f"{path}: {wrong}; process the recording again"
                 raise OutputError(msg)
             yield file
-    except (OSError, pa.ArrowException) as error:
+    except (OSError, pa.ArrowException, UnicodeDecodeError) as error:
         msg = f"{path}: not a readable table of a run folder ({error}); process the recording again"
         raise OutputError(msg) from error
 
