@@ -79,7 +79,7 @@ def simulate(
     bin         objects dropped into a bin
     shelf_bin   objects in a compartment of a shelf, seen from the front
     room        a table among robot arms, people and furniture
-    rows        like objects in rows, grids and stacks
+    rows        similar objects in rows, grids and stacks
     turntable   a turntable in front of a fixed camera
     walking     a camera that moves along a counter and back
     crossing    two moving objects that occlude each other and others

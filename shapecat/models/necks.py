@@ -1,7 +1,7 @@
 """Segments for training, split where a narrow neck joins two wider parts.
 
-The trees that merge segments learn from more and smaller segments than detection has: most of all,
-from pairs of like objects that touch.
+The trees that merge segments learn from more and smaller segments than detection has, above all
+from pairs of similar objects that touch.
 """
 
 import numpy as np
@@ -74,7 +74,7 @@ def split_necks(graph: SurfaceGraph, labels: I4, n: int) -> int:
 
 @kernel
 def _distances(links: U1, spans: I4, labels: I4) -> tuple[I4, int]:
-    """Return the distance of each labelled cell to the border of its label, and their number.
+    """Return the distance of each labelled cell to the border of its label, and the cell count.
 
     The distances (rows, columns) are uninitialised elsewhere.
     """
@@ -115,7 +115,7 @@ def _distances(links: U1, spans: I4, labels: I4) -> tuple[I4, int]:
 
 @kernel
 def _inner_first(depth: I4, labels: I4, spans: I4, columns: int, count: int) -> I4:
-    """Return the labelled cells (count,) by falling distance from the border."""
+    """Return the labelled cells (count,) by decreasing distance from the border."""
     deepest = 0
     for i in range(len(spans)):
         for p in range(i * columns + spans[i, 0], i * columns + spans[i, 1]):

@@ -1,4 +1,4 @@
-"""Scenes of like objects in rows, grids and stacks, as in shops, warehouses and kitchens."""
+"""Scenes of similar objects in rows, grids and stacks, as in shops, warehouses and kitchens."""
 
 from collections.abc import Sequence
 from typing import NamedTuple
@@ -40,7 +40,7 @@ _TOP_M = 0.03
 class _Place(NamedTuple):
     """An object of a group, and the group's place below it.
 
-    ``corner`` (3,) is the least corner of its bounding box in the group, metres.
+    ``corner`` (3,) is the minimum corner of its bounding box in the group, metres.
     """
 
     piece: Piece
@@ -50,7 +50,7 @@ class _Place(NamedTuple):
 
 
 def rows(rng: Generator, categories: Sequence[str], filming: Filming) -> World:
-    """Return groups of like objects on a table, on a shelf, or in a bin.
+    """Return groups of similar objects on a table, on a shelf, or in a bin.
 
     Parameters
     ----------
@@ -123,7 +123,7 @@ class _Groups:
                 return
 
     def middle(self) -> F8:
-        """Return the mean position (2,) of the groups; that of the support if there are none."""
+        """Return the mean position (2,) of the groups; the origin if there are none."""
         middles = [outline.mean(axis=0) for _, outline in self._outlines]
         return np.mean(middles, axis=0) if middles else np.zeros(2)
 
