@@ -60,9 +60,9 @@ def evaluate(
     with progress_bars() as bars:
         report = evaluate_folder(dataset, model, baselines=baselines, observe=bars)
     if page is not None:
-        name = dataset.resolve().name  # of `.` too
+        name = dataset.resolve().name  # resolved, so that `.` has a name
         write_page(page, report, title=f"{name}: {plural(report.n, 'view')}")
-        click.echo(page, err=True)  # stdout has the figures
+        click.echo(page, err=True)  # stdout is for the metrics
     if as_json:
         print_json(report.as_dict())
     else:

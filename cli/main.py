@@ -46,7 +46,7 @@ class _Commands(click.Group):
     def main(self, *args: Any, **extra: Any) -> Any:
         try:
             return super().main(*args, **extra)
-        except OSError as error:  # of the output: others name a file, or are ShapecatErrors
+        except OSError as error:  # writing stdout failed: other errors name a file
             if error.errno != errno.ENOSPC or error.filename is not None:
                 raise
             click.echo(f"Error: cannot write the output: {error.strerror}", err=True)

@@ -26,7 +26,7 @@ class _NonEmptyPath(click.Path):
 
 
 class _LocalPath(_NonEmptyPath):
-    """A path on this machine: as one, a URL would lose a slash and name a local folder."""
+    """A path on this machine; refuses URLs, which would lose a slash and name a local folder."""
 
     def convert(self, value: Any, param: click.Parameter | None, ctx: click.Context | None) -> Any:
         from shapecat.batch.storage import is_url
@@ -112,7 +112,7 @@ def choice_option(
 
 
 def boxes_option(where: str) -> Any:
-    """Return the option ``--boxes``; ``where`` states the outputs concerned and the default."""
+    """Return the option ``--boxes``; ``where`` names the affected outputs and the default."""
     about = "boxes enclose whole objects (full) or their visible parts"
     return click.option("--boxes", type=click.Choice(["full", "visible"]), help=where.format(about))
 

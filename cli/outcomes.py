@@ -25,7 +25,8 @@ _THREADS = 16
 class Tally:
     """Counts of the outcomes of a batch, and the complete recordings to print.
 
-    It keeps the first 100, or all if ``keep_all``, and those that got labels of replaced results.
+    It keeps the first 100, or all if ``keep_all``, and every run that received labels from replaced
+    results.
     """
 
     def __init__(self, *, keep_all: bool) -> None:
@@ -69,8 +70,8 @@ def print_closing(tasks: Sequence["Task"], tally: Tally) -> None:
 def summaries_as_dicts(complete: Sequence[tuple["Job", "Summary"]]) -> list[dict[str, Any]]:
     """Return the summaries of complete recordings as plain values.
 
-    Those of recordings that were complete before are read from their run folders: the manifest has
-    neither their warnings nor all counts.
+    If a recording was complete before, its summary is read from its run folder, because the
+    manifest lacks warnings and some counts.
     """
     from shapecat.batch.plans import run_of
     from shapecat.errors import OutputError

@@ -209,7 +209,7 @@ def _frame_range(start_s: float | None, end_s: float | None, every: int) -> "Fra
 
     try:
         return FrameRange(start_s, end_s, every)
-    except ConfigError:  # the options alone are valid
+    except ConfigError:  # each option alone is valid
         msg = f"--end {end_s:g} is not after --start {start_s or 0:g}"
         raise click.UsageError(msg) from None
 

@@ -106,9 +106,9 @@ class Progress:
                 self.show(folder)
 
     def _compiling(self, phase: str, done: int) -> None:
-        """Note that kernels are compiled, once, and their number; all workers report it.
+        """Note once that kernels are being compiled, and then how many, at intervals.
 
-        Most of them wait for one that compiles.
+        All workers report; most of them wait for one that compiles.
         """
         counts = phase == COMPILE and done > 0
         now = time.monotonic()
@@ -135,7 +135,7 @@ class Progress:
     def remaining_s(self) -> float | None:
         """Return the estimated seconds left, from the bytes done so far; None before the first.
 
-        Loading and compiling, before the first frame, do not count.
+        The time for loading and compiling, before the first frame, is excluded.
         """
         begun, before = self._first or (self.begun, 0.0)
         now, done = time.monotonic(), self._bytes_done()
@@ -252,7 +252,7 @@ class JsonProgress(Progress):
 
 
 def _event(event: str, **values: Any) -> None:
-    """Write an event with those of its values that are not None."""
+    """Write an event without the values that are None."""
     present = {name: value for name, value in values.items() if value is not None}
     click.echo(json.dumps({"event": event, **present}), err=True)
 

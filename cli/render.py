@@ -70,7 +70,7 @@ def progress_bars() -> Iterator[Bars]:
 
 
 def print_json(value: Any) -> None:
-    """Print one JSON value; stdout would escape in its own way what is not in its encoding."""
+    """Print one JSON value; non-ASCII characters are escaped unless stdout is UTF-8."""
     as_it_is = sys.stdout.encoding.lower() == "utf-8"
     click.echo(json.dumps(value, indent=1, ensure_ascii=not as_it_is))
 
@@ -78,7 +78,7 @@ def print_json(value: Any) -> None:
 def print_table(columns: Sequence[str], rows: Sequence[Sequence[Any]]) -> None:
     """Print a table with right-aligned columns of numbers; names are printed as they are.
 
-    Only on a terminal, it is folded to the width.
+    It is folded to the width of a terminal, but not elsewhere.
     """
     from rich.console import Console
     from rich.table import Table
@@ -98,7 +98,7 @@ def print_table(columns: Sequence[str], rows: Sequence[Sequence[Any]]) -> None:
 
 @contextmanager
 def for_any_reader() -> Iterator[None]:
-    """Print on stdout in the block; a reader that ends early, such as `head`, causes no error."""
+    """Let the block print to stdout; a reader that stops early, such as `head`, causes no error."""
     try:
         yield
         sys.stdout.flush()
@@ -107,7 +107,7 @@ def for_any_reader() -> Iterator[None]:
 
 
 def discard_stdout() -> None:
-    """Discard what is still in the buffer of stdout, which cannot be written."""
+    """Discard the buffered output that stdout could not write."""
     os.dup2(os.open(os.devnull, os.O_WRONLY), 1)
 
 

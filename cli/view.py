@@ -39,7 +39,7 @@ def view(*, run: Path, web: bool, screenshot: Path | None) -> None:
         raise click.UsageError(msg)
     review = run if run.is_file() else run / "review.rrd"
     if not review.is_file():
-        read_run(run)  # if there is no run, says that
+        read_run(run)  # raises if there is no run
     if screenshot is not None:
         require_writable(screenshot)
         take_screenshot(review, screenshot)

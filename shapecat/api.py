@@ -151,7 +151,7 @@ def process(
     Raises
     ------
     ConfigError : an option or setting does not exist or has an invalid value, or several processes
-        are wanted and the script lacks the ``__main__`` line.
+        are requested and the script lacks the ``__main__`` line.
     RecordingError : the recording cannot be read, or is a folder of several.
     NoStreamError, ModelError, OutputError : as for the command, which prints them.
     """
@@ -205,8 +205,8 @@ def perceive(
 
     Returns
     -------
-    A frame like those of a run. In place of a track, each object has its number in the frame, from
-    1; its posterior and confidence are those of this view.
+    A frame like the frames of a run. The track of each object is its number in the frame, from 1;
+    posterior and confidence come from this view alone.
 
     Raises
     ------

@@ -55,7 +55,7 @@ class OutputError(ShapecatError):
 
 @contextmanager
 def explained(what: str, kind: type[ShapecatError]) -> Iterator[None]:
-    """Raise an `OSError` of the block as an error of a kind: ``what`` failed, and the reason."""
+    """Raise an `OSError` of the block as ``kind``, with the message ``what`` and the reason."""
     try:
         yield
     except OSError as error:

@@ -149,7 +149,7 @@ def _require_begun(job: Job, recording: Recording) -> None:
 
 
 def _revise_and_warn(work: Work) -> None:
-    """Perceive again the frames that disagree with the rest; warn of what will cost tracks."""
+    """Perceive again the frames that disagree with the rest; warn of problems that cost tracks."""
     revise(work)
     work.run["warnings"] += explain_doubts(work.recording, work.folder, work.run)
 
@@ -171,7 +171,7 @@ def _run_once(phase: str, folder: Path, run: RunInfo, work: Callable[[], object]
 def _add_outputs(
     job: Job, recording: Recording, planned: RunInfo, content: ContentDigest, observe: Observer
 ) -> Summary:
-    """Return the summary of a complete folder, after writing the wanted outputs that it lacks.
+    """Write the requested outputs that a complete folder lacks, and return its summary.
 
     Raises
     ------

@@ -57,7 +57,7 @@ _TABLE_M = 0.4
 
 
 def find_ball() -> int:
-    """Detect a synthetic ball, plate and block; return the number of objects that repeat."""
+    """Detect a synthetic ball, plate and block; return how many match their own views."""
     v, u = np.mgrid[:480, :640]
     rays = np.stack([(u - 320) / 525, (v - 240) / 525, np.ones(u.shape)], axis=-1)
     up = np.array([0, -np.sqrt(0.5), -np.sqrt(0.5)])
@@ -118,7 +118,7 @@ def recognize_ball() -> str:
 
 
 def find_mask() -> int:
-    """Find a square on images of its own and of another camera; return the number of pixels."""
+    """Find the mask of a square on a registered image and on another; return the sum of pixels."""
     frame = _frame_of(np.full((480, 640), 0.7))
     v, u = np.mgrid[200:240, 300:340]
     square = (v * 640 + u).ravel().astype(np.uint32)
@@ -253,8 +253,7 @@ def main(words: Sequence[str] | None = None) -> None:
 
     Parameters
     ----------
-    words : arguments of the command line, by default those of this process. There are none but
-        ``--help``.
+    words : command-line arguments, by default of this process; only ``--help`` is allowed.
 
     Raises
     ------

@@ -45,7 +45,7 @@ def partial_path(path: Path) -> Path:
 
     Raises
     ------
-    OutputError : the path has no name, like that of the current folder or of the root.
+    OutputError : the path has no name, as for the current folder or the root.
     """
     if not path.name:
         msg = f"{path}: name a file or folder in it"
@@ -91,11 +91,11 @@ def require_writable(path: Path) -> None:
 
 
 def require_utf8(path: Path, kind: type[ShapecatError] = OutputError) -> None:
-    """Check that Arrow and Rerun can open a path, which they need as UTF-8.
+    """Check that a path is valid UTF-8, as Arrow and Rerun require.
 
     Raises
     ------
-    ShapecatError : it is not valid UTF-8; of the given kind.
+    ShapecatError : it is not; the error is of the given kind.
     """
     absolute = path.absolute()
     try:
@@ -190,12 +190,12 @@ def holding(path: Path, *, wait: bool = True) -> Iterator[None]:
 
 @contextmanager
 def scratch_folder() -> Iterator[Path]:
-    """Provide a temporary folder for the block; remove those of killed processes.
+    """Provide a temporary folder for the block; also remove the folders of killed processes.
 
-    Only those of this machine are removed, since NFS does not tell other machines of locks on
-    folders, and only where there are locks: others may be in use.
+    Only folders of this machine are removed, since NFS does not show locks of folders to other
+    machines, and only where locks work: others may be in use.
     """
-    prefix = f"{_SCRATCH}{socket.gethostname()}+"  # in no host name, unlike "-"
+    prefix = f"{_SCRATCH}{socket.gethostname()}+"  # "+" never occurs in a host name, unlike "-"
     for earlier in Path(gettempdir()).glob(f"{glob.escape(prefix)}*"):
         with suppress(OSError):
             if time.time() - earlier.stat().st_mtime > _UNLOCKED_S:

@@ -39,7 +39,7 @@ def observed(
 
 
 def kernel_words(phase: str, done: int) -> str:
-    """Describe a report of one of the phases that compile kernels; the first one has none done.
+    """Describe a progress report of a phase that compiles kernels; the first has 0 done.
 
     Examples
     --------

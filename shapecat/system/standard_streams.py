@@ -32,7 +32,7 @@ def require_stdout() -> None:
     """Make stdout the null device if it was closed before the start, as a daemon's may be.
 
     Otherwise the next opened file would get file descriptor 1, here and in worker processes.
-    Characters that a terminal cannot show, such as those of another script, are escaped.
+    Characters that the encoding of the terminal lacks are escaped.
     """
     if sys.stdout is None:
         os.dup2(os.open(os.devnull, os.O_WRONLY), 1)

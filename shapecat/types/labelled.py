@@ -22,7 +22,7 @@ class LabelledObject(Record):
     causal : (c,) fused from the track's views up to this frame.
     height_m : height of the box centre above the surface it stands on; NaN if that is unknown.
     touches_border, occluded : as in `Candidate`.
-    detections : numbers of its detections in the frame; several where tracks were merged.
+    detections : numbers of its detections in the frame; several if tracks were merged.
     full : the box of the whole object, estimated from the track's views; None if unknown.
     """
 
@@ -75,7 +75,7 @@ class LabelledFrame(Record):
 class AnnotationBox(NamedTuple):
     """The annotation of one object, as plain numbers.
 
-    ``center`` (metres), ``size`` (metres) and ``orientation`` (x, y, z, w) are those of a `Box`.
+    ``center`` (metres), ``size`` (metres) and ``orientation`` (x, y, z, w) are as in `Box`.
     """
 
     track: int
