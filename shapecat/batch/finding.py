@@ -49,11 +49,11 @@ class SearchResult:
 def find_recordings(sources: Sequence[str]) -> SearchResult:
     """Return the recordings among files, folders and URLs.
 
-    Patterns are expanded, since a program that calls the command without a shell leaves them, but
-    not if a file has this name. Folders are searched recursively, except hidden files and folders
-    and run folders; a ROS 2 bag counts as one recording. A single file is always kept. Among
-    several, files with neither the suffix nor the first bytes of a recording are skipped and
-    counted, so that ``folder/*`` works.
+    Patterns are expanded, for programs that call the command without a shell, unless a file has
+    this name. Folders are searched recursively, except hidden files and folders and run folders; a
+    ROS 2 bag counts as one recording. A single file is always kept. Among several, files with
+    neither the suffix nor the first bytes of a recording are skipped and counted, so that
+    ``folder/*`` works.
 
     Raises
     ------
@@ -72,7 +72,7 @@ def find_recordings(sources: Sequence[str]) -> SearchResult:
 
 
 def _expanded(source: str) -> list[Path]:
-    """Return the path itself, or the paths that match a pattern; not those in folders that do."""
+    """Return the path itself, or the paths that match a pattern, without those in such folders."""
     if os.path.lexists(source):
         return [Path(source)]
     names = glob(source, recursive=True)  # noqa: PTH207  Path.glob finds hidden files, too

@@ -68,7 +68,7 @@ def _search_matches(pattern: Location) -> Iterator[Source]:
 
 
 def search_url_beside_others(url: str) -> list[Source]:
-    """Search a URL; a missing one is a recording, which fails as a missing file does."""
+    """Search a URL; a missing one counts as a recording, which fails later, like a missing file."""
     found = search_url(url)
     if found or next(Location(url).walk(deep=False), None) is None:
         return found or [_of_url(url)]
@@ -77,7 +77,7 @@ def search_url_beside_others(url: str) -> list[Source]:
 
 
 def _is_remote_folder(location: Location) -> bool:
-    """Return whether a URL is that of a folder; one with the suffix of a recording is not asked."""
+    """Return whether a URL is a folder, without a request if it has the suffix of a recording."""
     if has_recording_suffix(location.url.partition("?")[0]):
         return False
     with suppress(RecordingError):  # reported when it is downloaded
@@ -140,7 +140,7 @@ def _search_remote_folder(location: Location) -> Iterator[Source]:
 
 
 def _bags_among(folders: Iterable[str]) -> list[str]:
-    """Return the folders, by URL, whose metadata.yaml is that of a bag."""
+    """Return the folders, by URL, that hold the metadata.yaml of a bag."""
 
     def is_bag(folder: str) -> bool:
         return BAG_KEY in ((Location(folder) / "metadata.yaml").read() or b"")[:METADATA_BYTES]

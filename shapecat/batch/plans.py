@@ -131,7 +131,7 @@ def part_of(named: Sequence[_NamedSource], index: int, count: int) -> list[_Name
 class Batch:
     """The tasks of a batch, the manifest, and the number of files that are not recordings.
 
-    ``manifest`` is None for a single recording; ``repeated`` is that of the `SearchResult`.
+    ``manifest`` is None for a single recording; ``repeated`` is as in `SearchResult`.
     """
 
     tasks: list[Task]
@@ -233,9 +233,9 @@ class _Planner:
 
 
 def _command(job: Job, work: str, entries: Iterable[Entry | None]) -> str:
-    """Return the id of a command that overwrites: of an interrupted one, or a new one.
+    """Return the id of the interrupted command that overwrites, or a new id.
 
-    ``entries`` are those of its recordings.
+    ``entries`` are the manifest entries of its recordings.
     """
     kind = "discard-labels" if job.discard_labels else "overwrite"
     unfinished = [
@@ -257,7 +257,7 @@ def _names_in(folder: Path) -> set[str]:
 
 
 def _is_wanted_run(task: Task, model_id: str) -> bool:
-    """Return whether a run that the manifest lists as complete is the one wanted, with its outputs.
+    """Return whether a run listed as complete is the requested one, and has its outputs.
 
     A command for this recording alone, or with other shards, may have replaced it, and an
     interrupted `annotate` leaves outputs missing.

@@ -31,8 +31,8 @@ _PREVIOUS = tuple(name for name in RUN_FILES if name not in {*OUTPUTS, "report.h
 def process_remote(job: Job, observe: Observer, *, cores: int, batch: str) -> Summary:
     """Download the recording of a job, process it, and upload the results.
 
-    ``batch`` identifies the command that sent the job. With the keys of the job, the same work is
-    not done twice.
+    ``batch`` identifies the command that sent the job. The keys of the job keep the same work from
+    being done twice.
 
     Raises
     ------

@@ -36,7 +36,7 @@ class _DaskExecutor(WorkerExecutor):
         self._close(_CLOSE_S)
 
     def lacks_workers(self) -> bool:
-        """Return whether the scheduler has no worker yet, like that of an adaptive cluster."""
+        """Return whether the scheduler has no worker yet, as in an adaptive cluster."""
         return not self._client.nthreads()
 
     def terminate(self) -> None:
