@@ -59,8 +59,8 @@ class ColourView(Record):
     Attributes
     ----------
     lens : the colour camera; None if it is unknown.
-    colour_from_depth : pose of the depth sensor in the optical frame of the colour camera; None
-        for a registered image, whose pixels (row by row) are those of the frame.
+    colour_from_depth : pose of the depth sensor in the optical frame of the colour camera; None for
+        a registered image, whose pixels (row by row) coincide with the frame's.
     """
 
     image: ColourImage

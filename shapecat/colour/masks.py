@@ -71,8 +71,8 @@ def dense_masks(
     frame : a depth image.
     objects : for each object, (k,) uint32 flat indices of its pixels in the frame.
     lens : the colour camera; not needed for a registered image.
-    colour_from_depth : pose of the depth sensor in the optical frame of the colour camera; None
-        for a registered image, whose pixels are those of the depth image.
+    colour_from_depth : pose of the depth sensor in the optical frame of the colour camera; None for
+        a registered image, whose pixels coincide with the depth image's.
 
     Returns
     -------

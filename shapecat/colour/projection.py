@@ -92,9 +92,9 @@ def rectified(pixels: U1, lens: LensCamera) -> U1:
 
 @lru_cache(maxsize=2)  # a recording has one lens
 def _sources(lens: LensCamera) -> F8:
-    """Return row and column (2, h, w) where the lens shows each ray of the pinhole camera.
+    """Return the row and column (2, h, w) at which the lens shows each ray of its pinhole camera.
 
-    They are -1 where it shows none, and may be outside the image.
+    They may be outside the image, and are -1 for rays that the lens does not see.
     """
     camera = lens.pinhole
     v, u = np.mgrid[: camera.height, : camera.width]

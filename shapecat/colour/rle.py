@@ -43,7 +43,7 @@ def rle_mask(counts: U4 | Sequence[int], height: int, width: int) -> Mask:
            [1, 0]])
     """
     runs, size = np.asarray(counts), height * width
-    # The sum of runs that are longer than the image may overflow, and be that of the image.
+    # The sum of runs that are longer than the image may overflow to the size of the image.
     if runs.min(initial=0) < 0 or runs.max(initial=0) > size or runs.sum() != size:
         total = sum(map(int, counts))
         msg = f"run lengths of {total} pixels, or negative ones, for an image of {width} x {height}"

@@ -112,7 +112,7 @@ def _splat(
 
 @kernel(inner=True)
 def _list_beside(depth: F4, pixels: U4) -> U4:
-    """Return the sparse pixels outside objects, which may hide an object or lie beside one."""
+    """Return the background pixels with depth in every `_SPARSE`-th row and column."""
     rows, columns = (depth.shape[0] - 1) // _SPARSE + 1, (depth.shape[1] - 1) // _SPARSE + 1
     outside = np.ones((rows, columns), np.bool_)
     v, width = 0, depth.shape[1]

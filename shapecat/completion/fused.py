@@ -61,7 +61,7 @@ class FusedBox(NamedTuple):
     ----------
     place : (3,) metres, the box centre of the most central view.
     center, axes, size, std : (3,), (3, 3), (3,), (3,) the fused box, as in `BoxViews`.
-    round : whether the footprint is about a circle, whose yaw is chance.
+    round : whether the footprint is nearly a circle, so that its yaw means nothing.
     """
 
     place: F8
@@ -72,10 +72,10 @@ class FusedBox(NamedTuple):
     round: bool
 
     def in_views(self, centers: F8, axes: F8, sizes: F8) -> tuple[F8, F8]:
-        """Return centre (k, 3) and axes (k, 3, 3) in views of the object, given their boxes.
+        """Return centre (k, 3) and axes (k, 3, 3) of the box in each view of the object.
 
-        A view that shows the object elsewhere, or turned, keeps its own centre and yaw. All are as
-        in `BoxViews`.
+        A view that shows the object elsewhere, or turned, keeps its own centre and yaw. The boxes
+        of the views are as in `BoxViews`.
         """
         still = _near(centers, self.place)
         if not self.round:
@@ -124,7 +124,7 @@ def fuse_boxes(views: BoxViews, weights: F8, posterior: F8, categories: Sequence
 def _resting(centers: F8, weights: F8) -> int:
     """Return the most central view of those that show the object where it stands longest.
 
-    Between two places, a carried object is not on its support, from which boxes are estimated.
+    While an object is carried, it is not on its support, which the estimate of boxes needs.
     """
     distances = np.linalg.norm(centers - _median(centers, weights), axis=1)
     first = int(distances.argmin())
@@ -164,7 +164,7 @@ def _not_turned(axes: F8, sizes: F8, weights: F8) -> Bool:
 def _turned_from(base: F8, elongation: float, axes: F8, sizes: F8) -> Bool:
     """Return in which views (k,) an object has turned from a box with the axes ``base``.
 
-    Neighbouring views must agree, as a single one may err. ``elongation`` is that of the box.
+    Neighbouring views must agree, as a single one may err. ``elongation`` is from `_elongation`.
     """
     angle, longer, count = _yaws(base, axes), _elongation(sizes), np.ones(len(axes))
     weights = _SQUARE + abs(longer)

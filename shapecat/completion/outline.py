@@ -3,7 +3,8 @@
 The support function of a convex outline in the direction t is the largest ``x . t`` over its points
 x: the extent of the outline in that direction. For a circle it is ``center . t + radius``. An oval
 adds ``p cos 2a + q sin 2a``, to first order, where a is the angle of t. Both formulas are linear in
-their unknowns. The support function of a union of two outlines is the larger of theirs.
+their unknowns. The support function of a union of outlines is the maximum of their support
+functions.
 """
 
 import numpy as np

@@ -1,8 +1,8 @@
 """Consecutive depth images become one with less noise and fewer holes (thesis 4.2).
 
-Each pixel of the current image is projected into the earlier ones. So the pixels stay those of the
-current camera, a surface that an earlier image does not see is never mixed in, and depths of
-anything that has moved since disagree and are left out.
+Each pixel of the current image is projected into the earlier ones. The result therefore keeps the
+pixels of the current camera and never averages two surfaces. Depths of anything that has moved
+since disagree, and are not used.
 """
 
 from collections.abc import Sequence
@@ -101,7 +101,7 @@ def _homography(camera: Camera, earlier_from_sensor: Pose) -> tuple[F4, F4]:
 
 @kernel
 def _expected_depth(depth: F4, range_m: float) -> F4:
-    """Return the depth to expect at each pixel: its own, or for a hole, minus a neighbour's.
+    """Return the expected depth of each pixel: its own; in a hole, a neighbour's, negated.
 
     It is 0 beyond the range and without a neighbour.
     """

@@ -137,7 +137,7 @@ def fit_surfaces(
 def _normal(
     u: F4, v: F4, w: F4, n_points: int, ex: float, ey: float, ez: float
 ) -> tuple[float, float, float]:
-    """Return the direction of smallest variance; if there is none, that of (ex, ey, ez)."""
+    """Return the direction of smallest variance; if that is undefined, (ex, ey, ez) normalised."""
     su = sv = sw = suu = suv = suw = svv = svw = sww = np.float32(0)
     for k in range(n_points):
         a, b, c = u[k], v[k], w[k]

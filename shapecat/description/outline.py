@@ -1,7 +1,7 @@
 """The outline: the width of an object in the image, slice by slice.
 
-Depth cameras err along the line of sight, hardly across it. In a view from afar, widths are the
-most reliable features.
+Depth cameras err mainly along the line of sight. In distant views, widths are therefore the most
+reliable features.
 """
 
 import numpy as np

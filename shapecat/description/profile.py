@@ -36,7 +36,7 @@ def vertical_axis(x: F4, y: F4, normals: F4, weight: F4) -> VerticalAxis:
     It is the vertical line nearest to the horizontal lines that pass through the neurons in the
     horizontal direction of their normals.
 
-    A weak pull to the origin makes the result unique where all normals are parallel or vertical.
+    A weak prior at the origin makes the result unique even if all normals are parallel or vertical.
 
     Parameters
     ----------

@@ -38,7 +38,7 @@ def rotation_axis(x: F4, y: F4, z: F4, weight: F4, normals: F4) -> tuple[F8, F8]
                 B[j, k] += weight[i] * n[j] * m[k]
                 C[j, k] += weight[i] * m[j] * m[k]
     for j in range(3):
-        N[j, j] += 1e-2  # where the normals leave it open, the axis passes near the origin
+        N[j, j] += 1e-2  # if the normals do not determine it, the axis passes near the origin
     _invert(N)
     # b = -N^-1 B a leaves a . (C - B^T N^-1 B) a to minimise.
     moment = np.zeros((3, 3))

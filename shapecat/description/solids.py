@@ -76,10 +76,10 @@ def _log_ratio(a: float, b: float) -> float:
 
 @kernel(inline=True)
 def _box_frame(cloud: F4, x: F4, y: F4, normals: F4, eye: F4) -> tuple[F4, F4]:
-    """Return the horizontal coordinates (n,) of the points in the upright box of best fit.
+    """Return the points' coordinates (n,) along both horizontal axes of the best upright box.
 
-    Both axes point towards the sensor. The fit minimises the distance of the vertical surface from
-    the two visible walls (Zhang et al. 2017, "L-shape fitting", the closeness criterion).
+    Both axes point towards the sensor. The fit minimises the distance from vertical surface to the
+    nearer of the two visible walls (Zhang et al. 2017, "L-shape fitting", the closeness criterion).
     """
     u, v = np.zeros(x.size, np.float32), np.zeros(x.size, np.float32)
     start = np.arctan2(eye[1], eye[0])  # so that the result turns with the scene

@@ -8,7 +8,7 @@ __all__ = ["Surface"]
 
 
 class Surface(NamedTuple):
-    """The points and neurons of an object, with what follows from them.
+    """The points and neurons of an object, and quantities derived from them.
 
     Positions are relative to ``center``, and lengths in units of ``unit``, unless in metres.
 

@@ -60,7 +60,7 @@ class Categorizer(Record):
 
     Raises
     ------
-    ValueError : the parts do not fit together.
+    ValueError : the parts are inconsistent.
     """
 
     categories: tuple[str, ...]
@@ -77,7 +77,7 @@ class Categorizer(Record):
     notes: Mapping[str, Any]
 
     def __post_init__(self) -> None:
-        """Check that the parts fit together."""
+        """Check that the parts are consistent."""
         super().__post_init__()
         sizes = {
             "descriptor": len(self.descriptor_names) == self.standardisation.mean.size,

@@ -91,7 +91,7 @@ def fit_categorizer(
         msg = f"a classifier needs at least 2 categories, got {len(categories)}"
         raise ValueError(msg)
     codes = encode(train.labels, categories)
-    codes[codes < 0] = len(categories)  # the column of the learner of unknown shapes
+    codes[codes < 0] = len(categories)  # the column of unknown shapes
     standardisation = fit_standardisation(train.descriptors)
     rng = np.random.default_rng(seed)
     ensemble = grow_ensemble(

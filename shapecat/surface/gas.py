@@ -99,9 +99,8 @@ def _by_thesis(points: F4, seed: int, neurons: int, share: float) -> tuple[F4, U
     """Grow a gas on points (m, 3) by Algorithm 4 of the thesis."""
     cloud, frame = _normalise(points)
     target = _target_size(cloud, neurons)
-    # differs: a bound on the neurons, for memory; and thresholds relative to the object. A neuron
-    # with an equal part of the surface, a square of side h, has a mean squared distance of
-    # h**2 / 6.
+    # differs: a bound on the neurons, for memory; and thresholds relative to the object. If a
+    # neuron's share of the surface is a square of side h, its mean squared distance is h**2 / 6.
     gas = empty_gas(2 * target)
     state = np.uint64(seed)
     _link_two_points(cloud, gas, state)

@@ -90,7 +90,7 @@ def connect(gas: Gas, i: int, j: int) -> None:
 
 @kernel(inner=True)
 def refresh(degree: I4, wins: I4, edge_birth: I4, i: int, j: int) -> None:
-    """Link neurons i and j, or reset the age of their edge; the arrays are those of a `Gas`."""
+    """Link neurons i and j, or reset the age of their edge; the arrays are from a `Gas`."""
     if edge_birth[i * degree.size + j] == ABSENT:
         degree[i] += 1
         degree[j] += 1
@@ -101,7 +101,7 @@ def refresh(degree: I4, wins: I4, edge_birth: I4, i: int, j: int) -> None:
 
 @kernel(inner=True)
 def disconnect(degree: I4, edge_birth: I4, i: int, j: int) -> None:
-    """Remove the edge between neurons i and j; the arrays are those of a `Gas`."""
+    """Remove the edge between neurons i and j; the arrays are from a `Gas`."""
     edge_birth[i * degree.size + j] = ABSENT
     edge_birth[j * degree.size + i] = ABSENT
     degree[i] -= 1
