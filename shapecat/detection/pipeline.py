@@ -247,7 +247,7 @@ def _clean_up(
     features = measure_object_features(grid, model, oversegmentation, settings.max_range_m)
     rejected = find_background(segments, features, grid, settings, structure.load_trees())
     representatives: I4 = number_objects(segments.parent, rejected, labels, graph.spans)
-    # From here on, the labels are those of objects.
+    # From here on, labels number the objects.
     filled = np.zeros(labels.shape, np.uint8)
     fill_holes(grid, labels, representatives.size - 1, filled)
     if model.low_profile.any():  # it may lie at the level of its plane

@@ -1,7 +1,7 @@
-"""Context: the verdicts on the neighbours of a segment.
+"""Context: the classifications of a segment's neighbours.
 
 A finger of a gripper looks like an object, but it is connected to an arm. So trees that classify
-each segment by itself are followed by others, which also see the verdicts on its neighbours.
+each segment alone are followed by others, which also see the classifications of its neighbours.
 
 Source: auto-context (Tu 2008).
 """
@@ -30,7 +30,7 @@ CONTEXT_FEATURES = np.dtype(
 def measure_borders(segments: Segments, roots: I4) -> F4:
     """Return the lengths of the borders between the merged segments ``roots`` (r,).
 
-    The lengths (4, r, r), in cells, are those of four kinds of border: the two are connected, the
+    There are four kinds of border, with lengths (4, r, r) in cells: the two are connected, the
     second is behind the first, the second is in front of it, and they are near but not connected.
     """
     index = np.ix_(roots, roots)

@@ -86,10 +86,10 @@ def _count_sides(
     total: I4,
     area: I4,
 ) -> None:
-    """Count the sides of holes by label, (n, labels, 3), and in ``total`` (n,), and their cells.
+    """Count the sides of holes, by label (n, labels, 3) and in ``total`` (n,), and their cells.
 
-    Cells without depth beside a hole count as part of its ``area`` (n,), and the label behind them
-    as its neighbour. Sides that are open count in the total only.
+    Cells without depth beside a hole are part of its ``area`` (n,), and the label behind them is
+    its neighbour. Open sides count only in the total.
     """
     inv_depth, jump = grid.inverse_depth, grid.discontinuity
     for i in range(len(spans)):
@@ -132,7 +132,7 @@ def _owner_of(sides: I4, total: int, area: int, label_area: I4) -> int:
         best = k if sides[k, BOUNDARY] > sides[best, BOUNDARY] else best
     if sides[best, BOUNDARY] <= CLEANUP.enclosed_share * total:
         return 0
-    # Of a cup seen from above, the inner wall is hidden, but its mouth is large.
+    # In a cup seen from above, the inner wall is hidden, but the mouth is large.
     if (
         sides[best, CONTINUOUS] <= CLEANUP.continuous_share * total
         and area <= CLEANUP.mouth_share * label_area[best]

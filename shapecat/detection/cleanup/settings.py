@@ -6,7 +6,7 @@ __all__ = ["CLEANUP", "CleanupSettings"]
 
 
 class CleanupSettings(NamedTuple):
-    """Constants of the rejection of structure and the completion of labels."""
+    """Constants for rejecting structure and completing labels."""
 
     min_logit: float = 0.0
     """Minimum logit of an object, which is then more likely than structure. Of the segments between
@@ -20,12 +20,12 @@ class CleanupSettings(NamedTuple):
     objects that a range of 3 m adds to one of 2 m, and 2 of the 57 true ones."""
     certain_logit: float = 4.0
     """Absolute partial logit beyond which evaluation stops: of 1,742 segments, the remaining trees
-    would change no verdict."""
+    would reclassify none."""
     uncertain_logit: float = 3.0
-    """Absolute logit below which a segment is classified again in its context. If all of 98,747
-    segments were, the numbers of lost objects and of false ones would change by 0.3 %."""
+    """Absolute logit below which a segment is classified again in its context. Doing so for all of
+    98,747 segments would change the numbers of lost and of false objects by 0.3 %."""
     sure_logit: float = 4.0
-    """Logit at which a verdict on a neighbour counts as nearly certain: three quarters of one."""
+    """Logit at which a neighbour counts three quarters of one that is certain."""
     tiny_share: float = 0.5
     """Segments with a smaller fraction of the cells of the smallest object are rejected here.
     Dropped only at the end, they would prevent the filling of the holes around them."""

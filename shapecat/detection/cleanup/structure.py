@@ -1,9 +1,9 @@
 """Structure rejection: boosted trees separate objects from background structure and noise.
 
-Background structure is walls of bins, sides and edges of shelves, furniture, bent ends of tables
-and blobs of noise. No single feature separates it from objects; many weak ones together do. The
-trees are trained on simulated scenes (`shapecat.models.structure`), including rooms with arms and
-people. They classify each segment alone, and then in the context of the others (`context`).
+Background means walls of bins, sides and edges of shelves, furniture, bent ends of tables and blobs
+of noise. No single feature separates it from objects; many weak ones together do. The trees are
+trained on simulated scenes (`shapecat.models.structure`), including rooms with arms and people.
+They classify each segment alone, and then in the context of the others (`context`).
 """
 
 from functools import cache

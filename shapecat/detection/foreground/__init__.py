@@ -1,1 +1,1 @@
-"""Foreground segmentation where the height above the plane does not suffice."""
+"""Foreground segmentation where height above the plane is not enough."""

@@ -50,7 +50,7 @@ def fill_hull(residual: F4, part: I4, stack: I4, count: int) -> int:
 
 @kernel(inner=True)
 def _straighten(side: F8, first: int, last: int) -> None:
-    """Replace one side of an outline, a column for each row, with that of its convex hull."""
+    """Replace one side of an outline, a column for each row, with that side of its convex hull."""
     corners = np.zeros(side.size, np.int32)
     n = 0
     for i in range(first, last + 1):

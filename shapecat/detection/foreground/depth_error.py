@@ -1,7 +1,7 @@
 """Removal of low-frequency depth error: slow waves that sensors measure on a flat surface.
 
-The waves are higher than a plate is thick. When they are removed, steps and noise remain, and the
-noise is measured.
+The waves are higher than a plate is thick. Without them, only steps and noise remain, and the noise
+is measured.
 """
 
 import numpy as np
@@ -207,8 +207,8 @@ def _add_windows(sums: I4, counts: I4, total: I4, count: I4) -> None:
 def measure_noise(high_pass: F4, plane_id: I4, number: int) -> float:
     """Return the median rise, 1/m, between cells of a plane that are `LOW.rise_cells` cells apart.
 
-    ``high_pass`` (rows, columns), 1/m, is from `filter_high_pass`; ``number``, from 1, is that of
-    the plane in ``plane_id`` (rows, columns), which is as in `HeightMap`.
+    ``high_pass`` (rows, columns), 1/m, is from `filter_high_pass`; ``number``, from 1, is the
+    plane's number in ``plane_id`` (rows, columns), as in `HeightMap`.
     """
     rows, columns = high_pass.shape
     histogram = np.zeros(BINS, np.int64)

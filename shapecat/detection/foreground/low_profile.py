@@ -247,7 +247,7 @@ def _drop_error(
     parts: int,
     scratch: Scratch,
 ) -> int:
-    """Assign flat parts of low object cells to the plane if their outline is that of depth error.
+    """Assign flat parts of low object cells to the plane if their outline shows depth error.
 
     The parts are numbered from ``parts`` + 1; the last number is returned.
     """

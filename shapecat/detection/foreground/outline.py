@@ -37,7 +37,7 @@ class Outline(NamedTuple):
     sides : all sides.
     table : sides that face the plane.
     bounded : ``table`` sides, sides next to higher cells, and sides in front of a farther surface.
-    hidden : sides next to a nearer surface or a cell without depth.
+    hidden : sides next to a nearer surface, or to a cell without depth.
     rise : sum of the rises of the ``table`` sides, each divided by the minimum mean rise.
     steep : steep sides among the ``table`` sides.
     """
@@ -67,7 +67,7 @@ def width_of_part(inv_depth: F4, stack: I4, count: int) -> float:
 
 @kernel(inline=True)
 def is_object(outline: Outline, count: int) -> bool:
-    """Return whether an outline around ``count`` cells is that of an object."""
+    """Return whether an outline around ``count`` cells belongs to an object."""
     table, sides = outline.table, outline.sides
     if table < OUTLINES.bounded_share * sides and sides * sides > OUTLINES.ragged * count:
         return False

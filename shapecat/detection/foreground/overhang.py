@@ -1,7 +1,7 @@
 """Overhang: the parts of objects that extend beyond the outline of their plane.
 
-The outline is that of the visible samples: it ends before a hidden far edge of the table, and at
-the front edge, which objects may overhang.
+The outline encloses only visible samples: it ends before a hidden far edge of the table, and at the
+front edge, which objects may overhang.
 """
 
 from typing import NamedTuple

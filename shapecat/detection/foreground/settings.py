@@ -22,7 +22,7 @@ class LowProfileSettings(NamedTuple):
     displaced samples seem to rise."""
     grown: float = 0.95
     """A part replaces the objects within it if its mean rise is more than this fraction of their
-    largest one. A part that consists of an object and depth error has a smaller one."""
+    largest mean rise. A part that combines an object with depth error rises less."""
     side: float = 0.004
     """Minimum rise over two cells on the side of an object, 1/m."""
     slope: float = 0.0016
@@ -77,7 +77,7 @@ class OutlineSettings(NamedTuple):
 
 
 class WallSettings(NamedTuple):
-    """Constants of the search for walls."""
+    """Constants for finding walls."""
 
     max_planes: int = 5
     """Maximum number of planes that are tested, which bounds the time."""
@@ -102,7 +102,7 @@ class WallSettings(NamedTuple):
 
 
 class OverhangSettings(NamedTuple):
-    """Constants of the overhang: objects that extend beyond the outline of their plane."""
+    """Constants for objects that extend beyond the outline of their plane."""
 
     max_distance_m: float = 0.15
     """Largest distance of an object's cell from the outline, metres."""

@@ -29,7 +29,8 @@ STRIPS = 400
 def remove_walls(grid: DepthGrid, plane_id: I4, up: F8, max_size_m: float, trials: F8) -> U1:
     """Remove the cells on walls from the objects, in place.
 
-    Vertical planes are tested one after the other, each the one with the most remaining samples.
+    Vertical planes are tested one after the other, always the plane with the most remaining
+    samples.
 
     Parameters
     ----------

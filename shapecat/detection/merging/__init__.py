@@ -1,1 +1,1 @@
-"""Merging: the segments of one object are joined again."""
+"""Merging: join the segments of each object."""

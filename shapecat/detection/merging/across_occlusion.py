@@ -122,7 +122,7 @@ def _find_partners(a: F8, b: F8) -> tuple[float, F8]:
 
 @kernel(inline=True)
 def _is_hidden(segments: Segments, p: int, q: int, grid: DepthGrid, labels: I4, lines: F8) -> bool:
-    """Return whether lines (n, 2, 3) between two segments are hidden, not in free space."""
+    """Return whether lines (n, 2, 3) between two segments run behind an occluder."""
     inv_depth, intrinsics = grid.inverse_depth, grid.intrinsics
     free = hidden = measured = 0
     for k in range(len(lines)):

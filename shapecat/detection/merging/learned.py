@@ -54,7 +54,7 @@ def merge_learned(segments: Segments, view_geometry: ViewGeometry, ensemble: Boo
         if logits[p, q] < MERGING.merge_logit:
             return
         merge(segments, p, q)
-        write_segment_features(segments, p, features[p])  # those of other segments do not change
+        write_segment_features(segments, p, features[p])  # only these have changed
         for k in range(n):
             logits[q, k] = logits[k, q] = -np.inf
         _rate(segments, features, p, 1, view_geometry, ensemble, pair, logits)
@@ -71,7 +71,7 @@ def _rate(
     pair: Records,
     logits: F8,
 ) -> None:
-    """Write the logits of ``p`` with segments ``first`` and above; the lower number is the row.
+    """Write the logits of ``p`` paired with segments from ``first`` on; the smaller is the row.
 
     ``pair`` (1,) is work space for the features of a pair, which the trees read as numbers.
     """

@@ -119,7 +119,7 @@ class ViewGeometry(NamedTuple):
 def find_adjacent(segments: Segments, p: int, view_geometry: ViewGeometry) -> Bool:
     """Return which segments may be one object with segment ``p``: (n + 1,) bool.
 
-    They are above the same plane as ``p``, and touch it, hide it, are hidden by it, or face it.
+    They are above the same plane as ``p``, and touch, occlude or face it, or are occluded by it.
     """
     pairs, parent, plane_id = segments.pairs, segments.parent, segments.plane_id
     adjacent = np.zeros(parent.size, np.bool_)

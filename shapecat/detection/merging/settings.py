@@ -7,7 +7,7 @@ __all__ = ["MERGING", "MergingSettings"]
 
 
 class MergingSettings(NamedTuple):
-    """Constants of the measuring, comparing and merging of segments."""
+    """Constants for measuring, comparing and merging segments."""
 
     up_cos: float = 0.8
     """Minimum cosine to up of a normal that faces up: noise turns normals by up to 35 degrees."""
@@ -35,7 +35,7 @@ class MergingSettings(NamedTuple):
     contact, metres."""
     merge_logit: float = 0.3
     """Minimum logit of a pair that is merged, for a probability of 0.57: a wrong merge loses two
-    objects, a missing merge seldom one."""
+    objects, a missing merge rarely one."""
     stop_logit: float = -3.0
     """Partial logit below which evaluation stops: with -2.5, none of 500 scenes would differ."""
     coplanar_m: float = 0.006

@@ -34,13 +34,13 @@ def label_pixels(
 ) -> list[U4]:
     """Return the pixels of each label 1, 2, ...: ascending flat indices (k,) uint32.
 
-    A pixel takes the label of its cell if their depths agree, else that of the neighbouring cell
-    whose depth agrees best. It keeps the label only if it is above the plane or in a filled cell.
+    A pixel takes the label of its cell if their depths agree, else the label of the neighbour whose
+    depth agrees best. It keeps the label only if it is above the plane or in a filled cell.
 
     Parameters
     ----------
     depth : (height, width) metres, 0 where depth is missing.
-    range_m : depths farther away have no label, metres.
+    range_m : pixels farther away get no label, metres.
     """
     return split_by_label(*_list_pixels(depth, grid, segmentation, range_m))
 
@@ -214,8 +214,8 @@ def _mark(
 ) -> None:
     """Write the labels of a run of pixels, `UNSURE` where a closer test is needed.
 
-    ``run`` is the row, the first column, and one past the last; ``inv_depth`` and ``code`` are
-    those of the cells, by column of the pixels; a pixel fits a cell within ``jump``, 1/m. This
+    ``run`` is the row, the first column, and one past the last; ``inv_depth`` and ``code`` hold the
+    values of the cells for each pixel column; a pixel fits a cell within ``jump``, 1/m. This
     vectorises.
     """
     min_depth, zero = np.float32(NEAREST_M), np.int16(0)

@@ -100,7 +100,7 @@ def measure_objects(
 
 
 def _extend_to_planes(boxes: Boxes, standing: Bool, up: F8, plane_offsets: F8) -> None:
-    """Extend boxes down to the planes, in place: the lowest millimetres count as the plane.
+    """Extend boxes down to the planes, in place: their lowest millimetres are labelled as plane.
 
     ``standing`` (n,) are the objects that touch their plane; ``up`` (3,) and ``plane_offsets``
     (n,), metres, are as in `measure_objects`.
@@ -134,8 +134,8 @@ def _find_supports(segments: Segments, representatives: I4, boxes: Boxes, up: F8
 def _objects_below(boxes: Boxes, up: F8, k: int) -> Bool:
     """Return which labels, (n + 1,), have the middle of object ``k`` above them, seen from above.
 
-    What hides behind the visible part of an object may be a bit of it. An object whose middle is
-    farther behind stands behind it, even if its visible part begins at the top of the other.
+    An object may extend a little behind its visible part. An object whose middle is farther behind
+    stands behind it, even if its visible part begins at the top of the other.
     """
     count = boxes.center.shape[0]
     below = np.zeros(count + 1, np.bool_)
@@ -213,7 +213,7 @@ def _hidden_support(segments: Segments, representatives: I4, p: int, below: Bool
 
 @kernel(inline=True)
 def _break_cycles(supported_by: I4, support_m: F8) -> None:
-    """Put objects on their plane if they would otherwise stand, through others, on themselves."""
+    """Put objects on their plane if they would otherwise support themselves through others."""
     for k in range(supported_by.size):
         support = supported_by[k]
         for _ in range(supported_by.size):

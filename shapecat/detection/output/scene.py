@@ -108,7 +108,7 @@ def _select_objects(
 
 
 def _fits(box: Box, settings: DetectionSettings) -> bool:
-    """Return whether a box is that of an object, not of a wall or furniture."""
+    """Return whether a box has the size of an object, not of a wall or furniture."""
     length, width, height = box.size.tolist()
     low = height <= settings.max_height_m - CUT_OFF_M
     return bool(low and max(length, width) <= settings.max_size_m)

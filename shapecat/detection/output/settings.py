@@ -6,7 +6,7 @@ __all__ = ["OUTPUT", "OutputSettings"]
 
 
 class OutputSettings(NamedTuple):
-    """Constants of the measuring and labelling of objects."""
+    """Constants for measuring and labelling objects."""
 
     occluded_share: float = 0.12
     """Minimum fraction of the boundary of an occluded object that is behind a nearer surface."""

@@ -2,7 +2,7 @@
 
 They are parallel: all get one normal, which the larger ones determine best. A board that is partly
 visible or seen at a grazing angle constrains its tilt poorly, and half a degree is a centimetre of
-height at a distance of one metre. Planes that are then not level, such as the top of a tilted
+height at a distance of one metre. Planes that do not fit this normal, such as the top of a tilted
 object, are dropped.
 """
 

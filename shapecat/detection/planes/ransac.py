@@ -74,7 +74,7 @@ def ransac_plane(
     cosines: tuple[float, float],
     tolerance: float,
 ) -> tuple[F8, int]:
-    """Return the plane (a, b, c) of inverse depth with the most inliers, and their number, or 0.
+    """Return the plane (a, b, c) of inverse depth with the most inliers, and how many; 0 if none.
 
     Parameters
     ----------

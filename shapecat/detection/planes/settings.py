@@ -7,7 +7,7 @@ __all__ = ["ASSUMED", "PLANES", "STRIPS", "UP"]
 
 
 class UpSettings(NamedTuple):
-    """Constants of the estimation of the up direction."""
+    """Constants for estimating the up direction."""
 
     facing_cos: float = math.cos(math.radians(20))
     """Minimum cosine between a direction and the normal of surface that faces it, for 20 degrees:
@@ -29,18 +29,18 @@ class UpSettings(NamedTuple):
     purity_exponent: float = 2.0
     """Exponent of the fraction of the surface facing the direction that lies in large levels."""
     frontal_penalty: float = 0.6
-    """Fraction of the score that a direction along the optical axis loses: it is that of a wall."""
+    """Fraction of the score that a direction along the optical axis loses: it belongs to a wall."""
     roll_penalty: float = 4.0
     """The score of a direction that implies a camera on its side or upside down is divided by 1
     plus this."""
     frontal_sin2: float = 0.03
     """Squared sine of the angle to the optical axis below which a direction implies no roll."""
     half_weight_m: float = 1.5
-    """Depth at which surface has half the weight: near surface decides."""
+    """Depth at which surface has half the weight, so that near surface dominates."""
 
 
 class PlaneSettings(NamedTuple):
-    """Constants of the search for planes, and of their distinction from the tops of objects."""
+    """Constants for finding planes and distinguishing them from the tops of objects."""
 
     tolerance: float = 0.01
     """Distance of an inlier from a plane in inverse depth, 1/m: three steps of a Kinect."""
@@ -85,7 +85,7 @@ class PlaneSettings(NamedTuple):
 
 
 class StripSettings(NamedTuple):
-    """Constants of the search for planes of which only narrow strips are visible."""
+    """Constants for finding planes of which only narrow strips are visible."""
 
     bin_m: float = 0.005
     """Height of a bin, metres: the noise of strips at 1 m."""
@@ -97,7 +97,7 @@ class StripSettings(NamedTuple):
     min_rise: float = 0.05
     """Smallest downward slope that is used to compute the area a cell covers."""
     below: int = 10
-    """Number of bins below a plane that hold next to no surface."""
+    """Number of bins below a plane that hold almost no surface."""
     above: int = 30
     """Number of bins above a covered plane that hold the tops of the objects on it."""
     covers: float = 1.0

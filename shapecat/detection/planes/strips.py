@@ -149,7 +149,7 @@ def _area_over(strips: F4, intrinsics: PinholeIntrinsics, plane: SupportingPlane
 
 
 def _peaks(amount: F8, threshold: float) -> Iterator[tuple[float, float]]:
-    """Find the peaks of level surface that have next to no surface below them.
+    """Find the peaks of level surface that have almost no surface below them.
 
     Parameters
     ----------
@@ -158,8 +158,8 @@ def _peaks(amount: F8, threshold: float) -> Iterator[tuple[float, float]]:
 
     Yields
     ------
-    Height of a peak above the sensor, metres, ascending; and the amount just above it, relative to
-    that of the peak. There are the tops of the objects that cover a plane.
+    Height of a peak above the sensor, metres, ascending; and the amount just above it, where the
+    tops of covering objects are, relative to the peak.
     """
     total = amount[:-2] + amount[1:-1] + amount[2:]
     peaks = (total > threshold) & (amount[1:-1] >= amount[:-2]) & (amount[1:-1] >= amount[2:])

@@ -97,7 +97,7 @@ def _is_top(
     if on_wall + beyond >= MIN_BELOW:
         walled = on_wall > PLANES.wall_share * (on_wall + beyond)
         return walled and not (furniture and _count_above(grid, plane)[0] >= MIN_ABOVE)
-    below_camera = plane.extent.min() > 0  # from there, the sides below its edge are hidden
+    below_camera = plane.extent.min() > 0  # which cannot see the sides below its edge
     if furniture or area_m2 < PLANES.likely_m2 or not below_camera:
         return area_m2 < PLANES.likely_m2
     above, inside = _count_above(grid, plane)

@@ -1,1 +1,1 @@
-"""Over-segmentation: surfaces are split at depth discontinuities and concave edges."""
+"""Over-segmentation: split surfaces at depth discontinuities and concave edges."""

@@ -1,8 +1,8 @@
 """Normals: least-squares planes around the object cells, many cells at a time.
 
 Numba vectorises over 16 cells only if it knows that arrays do not overlap, which requires few
-arrays at constant distances. So the windows of a run of cells are first copied to a buffer of
-fixed width, and the sums of each cell stay in registers.
+arrays at constant distances. The windows of a run of cells are therefore first copied to a buffer
+of fixed width, and the sums of each cell stay in registers.
 """
 
 from typing import Any

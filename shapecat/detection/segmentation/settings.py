@@ -6,7 +6,7 @@ __all__ = ["SEGMENTATION", "SegmentationSettings"]
 
 
 class SegmentationSettings(NamedTuple):
-    """Constants of the fitting, linking and splitting of surfaces."""
+    """Constants for fitting, linking and splitting surfaces."""
 
     gate: float = 0.008
     """Largest difference in inverse depth between a sample of a local plane and its centre, 1/m:
