@@ -39,7 +39,7 @@ class FinishedRun:
 
     @property
     def categories(self) -> tuple[str, ...]:
-        """The common categories; then those of the model, and those that a person added."""
+        """The common categories, then the model's, then the ones that a person added."""
         of_model = dict.fromkeys((*self.common, *self.info["model"]["categories"]))
         added = {label.category for label in self.labels.values()} - {*of_model, "unknown"}
         return (*of_model, *sorted(added))

@@ -170,7 +170,7 @@ def _replace(folder: Path, hidden: Path, marker: Marker) -> None:
 
 
 def previous_path(folder: Path) -> Path:
-    """Return the hidden path of a folder while a new one replaces it."""
+    """Return the hidden path that a folder has while a new one replaces it."""
     return folder.with_name(f".{folder.name}.old")
 
 

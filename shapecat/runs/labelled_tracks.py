@@ -49,7 +49,7 @@ class LabelledTracks:
     frames : the rows of the arrays below, for each frame.
     detections, tracks : (rows,) numbers of the detections in their frames, and of their tracks.
     labels : the label of each track.
-    last_in : for each frame, the tracks whose last frame it is; frames without any are missing.
+    last_in : the tracks that end in each frame; frames in which none ends are missing.
     causal : (rows, categories) causal posteriors; empty unless requested.
     full : (rows, 10) centre, size (metres) and orientation of the full boxes in the sensor frame;
         NaN if unknown.

@@ -65,8 +65,8 @@ class ModelInfo(TypedDict):
 class Counts(TypedDict):
     """Numbers of frames, detections and tracks.
 
-    ``skipped`` is by reason, ``tracks`` by category; ``resumed`` and ``revised`` count frames;
-    ``color`` counts frames with a colour image.
+    ``skipped`` counts frames by reason, ``tracks`` counts tracks by category; ``resumed`` and
+    ``revised`` count frames; ``color`` counts frames with a colour image.
     """
 
     frames: int

@@ -140,8 +140,8 @@ def _parts(tracks: list[Track]) -> Iterator[tuple[list[Track], slice]]:
 def _read_streams(folder: Path, categories: int, placed: set[str]) -> Iterator[DetectionTable]:
     """Yield the detections of each stream, numbered by their rows in the table.
 
-    The topics ``placed`` are one stream, in the fixed frame; every other topic is one of its own,
-    in the sensor frame.
+    The topics ``placed`` form one stream, in the fixed frame; every other topic is a stream of its
+    own, in the sensor frame.
     """
     streams: dict[str, TableBuilder] = {}
     count = 0

@@ -33,7 +33,8 @@ _OF_DETECTIONS: dict[str, tuple[str, tuple[Any, ...]]] = {
 class DetectionTable:
     """All detections of a stream, in the order of the frames.
 
-    A detection takes only about 100 bytes, because those of many hours are kept at once.
+    A detection takes only about 100 bytes, because the detections of many hours are in memory at
+    once.
 
     Attributes
     ----------
@@ -159,14 +160,14 @@ class DetectionTable:
         return np.isin(self.topics[rows], self.topics[self.rows[track]])
 
     def on_topics_of(self, track: I4, which: I4) -> I4:
-        """Return those of the detections ``which`` whose topics also have detections of a track."""
+        """Return the detections among ``which`` whose topics also have detections of a track."""
         return which if len(self.names) == 1 else which[self.sees(track, self.rows[which])]
 
 
 class TableBuilder:
     """Joins the frames of a stream, as they are read, to its `DetectionTable`.
 
-    Columns are bytes that grow, since arrays in parts would be in memory twice when joined.
+    Columns are growing byte buffers, since joining arrays would need twice the memory.
     """
 
     def __init__(self, categories: int) -> None:
@@ -179,9 +180,9 @@ class TableBuilder:
 
         Parameters
         ----------
-        topics : of each frame.
-        columns : ``frames``, ``stamps_ns`` and ``counts`` (f,), number, time and number of
-            detections of each frame; and all columns of its detections in `DetectionTable`.
+        topics : the topic of each frame.
+        columns : ``frames``, ``stamps_ns`` and ``counts`` (f,): number, time and number of
+            detections of each frame; and the columns of the detections, as in `DetectionTable`.
         """
         names = self._names
         columns["topics"] = [names.setdefault(topic, len(names)) for topic in topics]
@@ -191,7 +192,7 @@ class TableBuilder:
             self._bytes[name] += np.asarray(columns[name], kind).tobytes()
 
     def table(self) -> DetectionTable:
-        """Return the table of the stream, sorted by time; the builder is of no use afterwards."""
+        """Return the table of the stream, sorted by time; the builder cannot be used afterwards."""
         of_frames = {name: self._column(name, kind) for name, kind in _OF_FRAMES.items()}
         counts = of_frames.pop("counts")
         which: Any = slice(None)
@@ -210,7 +211,7 @@ class TableBuilder:
         )
 
     def _column(self, name: str, kind: str, shape: tuple[Any, ...] = ()) -> Any:
-        """Return a column as an array over its bytes, which are given away."""
+        """Return a column as an array that takes over its bytes."""
         widths = (self._categories if width == "c" else width for width in shape)
         return np.frombuffer(self._bytes.pop(name), kind).reshape(-1, *widths)
 
@@ -218,7 +219,7 @@ class TableBuilder:
 def _by_time(topics: I4, stamps_ns: I4) -> Any:
     """Return the order of frames by time that keeps each topic's order of recording.
 
-    What any topic recorded before its clock was set back comes first.
+    Frames that any topic recorded before its clock was set back come first.
     """
     streams = [np.flatnonzero(topics == topic) for topic in range(topics.max() + 1)]
     stamps, time = np.unique(stamps_ns, return_inverse=True)

@@ -16,7 +16,7 @@ def without_pieces(table: DetectionTable, tracks: Sequence[I4], max_gap_s: float
     """Remove tracks that are often a part of another object.
 
     If an object is split in some frames, the track of a piece lies, in the other frames, in the box
-    of the whole object. An object that only stands near another one, or is hidden by it, has its
+    of the whole object. An object that only stands near another one, or is occluded by it, has its
     centre outside that box. ``tracks`` are the indices (k,) of the detections of each track,
     ascending; gaps in a track that are longer than ``max_gap_s`` are not checked.
     """

@@ -103,7 +103,7 @@ def _fit(table: DetectionTable, pairs: I4, wholes: F8) -> Bool:
 
 
 def _joint(table: DetectionTable, pairs: I4) -> F8:
-    """Return the lengths (p, 3) of the box around each pair, along the first box's axes, metres."""
+    """Return the `sorted_sides` (p, 3) of a box around each pair, along the first box's axes."""
     i, j = pairs.T
     axes_i, axes_j = table.axes(i), table.axes(j)
     offset = np.einsum("pji,pj->pi", axes_i, table.centers[j] - table.centers[i])

@@ -32,9 +32,9 @@ def track_recording(
 
     Parameters
     ----------
-    tables : of each stream, with its frames without detections. A stream has one topic, or those
-        whose centres are in the same coordinate frame: an object seen by several of these sensors
-        gets one track.
+    tables : the detections of each stream; frames without any are included. A stream is one topic,
+        or several whose centres are in the same coordinate frame: an object seen by several of
+        these sensors gets one track.
 
     Returns
     -------
@@ -55,7 +55,7 @@ def track_recording(
 
 @dataclass(frozen=True)
 class _Followed:
-    """A tracked stream: its detections, without any common motion, and those of each track."""
+    """A tracked stream: its detections without any common motion, and each track's detections."""
 
     table: DetectionTable
     tracks: list[I4]

@@ -130,7 +130,7 @@ def _successors(fragments: Fragments, limit: F8, settings: TrackingSettings) -> 
     first = fragments.first_ns[order]
     window = int(min(settings.max_missed_s * 1e9, 2**62))
     for i, end in enumerate(fragments.last_ns):
-        # One by one, as all together would be lists of millions of numbers after some hours.
+        # One by one: after some hours, lists of all of them would have millions of numbers.
         near = tree.query_ball_point(fragments.end[i], limit[i], return_sorted=True)
         for_place = np.array(near, np.int64)
         low, high = np.searchsorted(first, [end, end + window], side="right")
@@ -206,8 +206,9 @@ def _continues(
     """Return whether frames i and j may show the same scene: at least half of the objects match.
 
     A partial view may be smaller than its object. With ``slow``, positions and posteriors must
-    agree better; those of partial views less so. Instead, most objects, and at least two, may have
-    moved together, on a belt or as seen by a moving sensor: unrelated images rarely look like that.
+    agree more closely, but less so in partial views. Alternatively, most objects, and at least two,
+    have moved together, on a belt or as seen by a moving sensor: unrelated images rarely look like
+    that.
     """
     a, b = table.of_frame(i), table.of_frame(j)
     offsets = table.centers[b][None] - table.centers[a][:, None]
@@ -244,5 +245,5 @@ def _moved_together(offsets: F8, alike: Bool) -> int:
 
 
 def _pairs(matches: Bool) -> int:
-    """Return the smaller one of the numbers of rows and of columns with a match."""
+    """Return the number of rows with a match, or of columns with one if that is smaller."""
     return min(int(matches.any(axis=1).sum()), int(matches.any(axis=0).sum()))

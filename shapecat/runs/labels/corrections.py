@@ -68,7 +68,7 @@ def read_labels(path: Path, categories: Iterable[str] = ()) -> dict[int, TrackLa
 def read_original_table(path: Path) -> tuple[TrackTable, list[str]]:
     """Read the labels and added columns in the tracks.csv of a run, and the problems of its lines.
 
-    Other cells and the order are those of tracks.original.csv; missing tracks are a problem.
+    Other cells and the order come from tracks.original.csv; missing tracks are a problem.
 
     Raises
     ------
@@ -92,7 +92,7 @@ def read_original_table(path: Path) -> tuple[TrackTable, list[str]]:
         for row in original.rows
         if row.track in edited
     )
-    # Only in the table that a page writes does it tell which labels are new.
+    # `LABEL_SEEN` means something only in a table that a page wrote, not in the run's own.
     columns = tuple(
         n for n in dict.fromkeys((*original.columns, *table.columns)) if n != LABEL_SEEN
     )

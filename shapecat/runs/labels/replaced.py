@@ -29,8 +29,8 @@ def require_labels(job: Job) -> None:
 def keep_labels(folder: Path, run: RunInfo, job: Job) -> None:
     """Transfer the corrected labels of the replaced results to the new ones.
 
-    The table with the original labels is kept as tracks.previous.csv. If labels were not
-    transferred, a copy is kept beside the replaced results, and so beside all later ones.
+    The replaced table is kept as tracks.previous.csv. If some labels could not be transferred, a
+    copy is also put among the replaced results, from where it passes to all later ones.
 
     Raises
     ------
@@ -53,7 +53,7 @@ def keep_labels(folder: Path, run: RunInfo, job: Job) -> None:
 
 
 def forget_old_labels(folder: Path, run: RunInfo, job: Job) -> None:
-    """Undo `keep_labels` if the replaced results have got other labels since.
+    """Undo `keep_labels` if the replaced results have been given other labels since.
 
     Labels and outputs then count as missing in ``run``.
 

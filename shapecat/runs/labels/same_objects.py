@@ -42,7 +42,7 @@ Group = Callable[[int], int]
 
 
 class Match(NamedTuple):
-    """A track of the target, and the distance of its centre from the source track's, metres."""
+    """A track of the target, and the distance of its centre from the source track, metres."""
 
     track: int
     distance_m: float
@@ -177,7 +177,7 @@ def match_in_place(
         match, reason = _nearest_there(item, other_objects, new)
         if match is None:
             reasons[item.track] = reason
-        else:  # no other object has this match: each would be a rival of the other
+        else:  # no other object has this match, since the two would be ambiguous
             matches_of[item.track] = [match]
     return Matches(matches_of, reasons)
 

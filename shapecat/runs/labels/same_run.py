@@ -1,4 +1,4 @@
-"""Check that a table of tracks belongs to a run: another run's labels are for other objects."""
+"""Check that a table of tracks belongs to a run: other runs number their objects differently."""
 
 from contextlib import suppress
 from pathlib import Path

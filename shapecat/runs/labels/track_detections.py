@@ -1,4 +1,4 @@
-"""The detections of the tracks of a run, to compare them with those of another run."""
+"""The detections of a run's tracks, for comparison with another run."""
 
 from collections.abc import Iterator
 from itertools import compress, groupby

@@ -66,7 +66,7 @@ class TrackTable:
 
     @property
     def wrong_numbers(self) -> tuple[str, ...]:
-        """The problems of lines with a wrong confidence: a spreadsheet may turn 0.495 into 495."""
+        """Problems of lines with a wrong confidence: a spreadsheet may turn 0.495 into 495."""
         wrong = (row for row in self.rows if math.isnan(row.confidence))
         return tuple(_wrong_numbers(row.line, row.cells) for row in wrong)
 

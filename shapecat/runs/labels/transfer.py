@@ -179,8 +179,8 @@ def match_labels(source: Path, target: Path) -> Transfer:
 def _require_complete(path: Path, table: TrackTable, *, alone: bool) -> None:
     """Check that a table has only valid lines, all from one run.
 
-    Without the other tables of its run, if ``alone``, its positions are used. A wrong confidence
-    shows that a spreadsheet changed numbers, and so these, too.
+    If the table is ``alone``, without the other tables of its run, its positions are used. A wrong
+    confidence then is an error, since a spreadsheet may have changed the positions, too.
 
     Raises
     ------

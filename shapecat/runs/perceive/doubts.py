@@ -1,6 +1,6 @@
-"""Find what may cost a run tracks or categories.
+"""Find problems that may cost a run tracks or categories.
 
-These are missing planes, wrong poses, clocks that differ, surfaces other than those of training.
+These are missing planes, wrong poses, clocks that differ, and surface settings unlike in training.
 """
 
 from collections.abc import Iterator, Mapping
@@ -20,7 +20,7 @@ __all__ = ["explain_doubts"]
 
 
 def explain_doubts(recording: Recording, folder: Path, run: RunInfo) -> Iterator[str]:
-    """Yield a warning for each thing that may cost the run tracks or categories.
+    """Yield a warning for each problem that may cost the run tracks or categories.
 
     Parameters
     ----------
@@ -36,7 +36,7 @@ def explain_doubts(recording: Recording, folder: Path, run: RunInfo) -> Iterator
 
 
 def _explain_surfaces(settings: Mapping[str, Any]) -> Iterator[str]:
-    """Yield a warning if surfaces are made with other settings than those of every training."""
+    """Yield a warning if surface settings differ from the defaults, which all training uses."""
     changed = [
         f"surface.{name}"
         for name, value in asdict(SurfaceSettings()).items()

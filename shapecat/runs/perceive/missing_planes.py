@@ -45,7 +45,7 @@ def explain_missing_planes(recording: Recording, folder: Path, run: RunInfo) -> 
 def _reason(distances: Sequence[F4], range_m: float, source: str) -> str:
     """Return the likely reason why frames have no plane, given their distances (n,), metres.
 
-    ``source`` is that of the up direction.
+    ``source`` is the source of the up direction.
     """
     if not distances:
         return "they have no valid depth"

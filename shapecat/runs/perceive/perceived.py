@@ -74,7 +74,7 @@ class PerceptionTables:
         colour: bool = False,
         again: bool = False,
     ) -> None:
-        """Find the segments in ``folder``, those of the second look if ``again``.
+        """Find the segments in ``folder``; if ``again``, the segments of the second look.
 
         Without ``colour``, no table of masks is written.
         """

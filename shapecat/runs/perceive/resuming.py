@@ -23,9 +23,9 @@ _LATER = ("tracking.", "outputs.")
 
 
 def require_resumable(job: Job, planned: RunInfo, digest: Callable[[], str]) -> None:
-    """Check that a job would not discard the frames of an interrupted run of something else.
+    """Check that a job would not discard an interrupted run of other input, model or settings.
 
-    Those of other versions, or of a recording that has changed, are not worth keeping.
+    Frames of other versions, or of a recording that has changed, are not worth keeping.
 
     Parameters
     ----------
@@ -93,7 +93,7 @@ def take_over_frames(
     """Take over the perceived frames of a finished run that differs only in later phases.
 
     That is possible if settings of tracking or of outputs differ, but nothing else. If nothing
-    differs, the user wants all computed again. The tables are linked or copied.
+    differs, the user wants everything computed again. The tables are linked or copied.
 
     Parameters
     ----------

@@ -89,7 +89,7 @@ def frames_to_revise(tables: Iterable[tuple[pa.Table, pa.Table]]) -> dict[Key, R
 
     Returns
     -------
-    The frames whose up direction is now known better, in their order.
+    The frames for which a better up direction is now known, in their order.
 
     Notes
     -----

@@ -18,7 +18,8 @@ _DISAGREE_DEG = 10
 def report_up(upright: Upright, folder: Path) -> dict[str, Any]:
     """Return the source of the up direction and its agreement with the planes, for run.json.
 
-    Failed look-ups, what they cost, and large differences are added to the warnings of ``upright``.
+    Failed look-ups, their consequences, and large differences are added to the warnings of
+    ``upright``.
 
     Parameters
     ----------

@@ -61,7 +61,7 @@ def count_rows(folder: Path, table: str) -> int:
 def first_stamp(folder: Path) -> int:
     """Return the earliest stamp of the frames of a run, ns; 0 without frames.
 
-    It need not be that of the first row: frames are in the order in which they were recorded.
+    It may be in a later row than the first: frames are in the order in which they were recorded.
     """
     groups = read_row_groups(folder / "frames.parquet", ["stamp_ns"])
     return min((int(numbers(group["stamp_ns"]).min()) for group in groups if len(group)), default=0)
