@@ -37,11 +37,11 @@ def with_colour(
 ) -> Iterator[ExportedFrame]:
     """Pair labelled frames with their frames and colour images from the recording.
 
-    From an indexed file, only the wanted frames are read.
+    From an indexed file, only the requested frames are read.
 
     Parameters
     ----------
-    labelled : the wanted frames, in the order of the recording.
+    labelled : the requested frames, in the order of the recording.
 
     Yields
     ------
@@ -71,7 +71,7 @@ def with_colour(
 
 
 class _Awaited:
-    """The wanted frames; a few are known in advance, so that others need not be read."""
+    """The requested frames; a few are known in advance, so that others need not be read."""
 
     def __init__(self, frames: Iterable[LabelledFrame], run: RunInfo) -> None:
         self._topics, self._colours = set(run["options"]["topics"]), {*run["color"].values()}

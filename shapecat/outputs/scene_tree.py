@@ -32,7 +32,7 @@ _CANDIDATE_COLUMNS = (
 def describe_scene(folder: Path, frame: int, *, topic: str | None = None) -> str:
     """Return the tree of planes and objects in a frame, indented, one per line.
 
-    Objects are those of the other outputs: merged tracks are one object, deleted ones are left out.
+    As in the other outputs, merged tracks are one object, and deleted ones are left out.
 
     Parameters
     ----------
@@ -137,8 +137,8 @@ def _apply_labels(
 ) -> tuple[Scene, dict[int, LabelledObject]]:
     """Join the parts of merged objects, and leave deleted candidates out.
 
-    What stood on a deleted object stands on the surface below it. A merged object stands where its
-    lowest part stands.
+    An object that stood on a deleted one stands on the surface below that. A merged object stands
+    where its lowest part stands.
 
     Parameters
     ----------

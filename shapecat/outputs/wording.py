@@ -17,8 +17,8 @@ _LONGEST_BYTES = 120
 def caption(track: int, category: str, confidence: float) -> str:
     """Return the text beside an object: track, category and confidence.
 
-    An unknown object has no confidence in the text: its number is that of the most probable
-    category, and would read as the certainty that the object is unknown.
+    The text of an unknown object omits the confidence: it belongs to the most probable category,
+    and would read as the certainty that the object is unknown.
 
     Examples
     --------

@@ -169,7 +169,7 @@ def _annotations(frames: Iterable[AnnotationFrame]) -> Iterator[Annotation]:
 def _with_periods(frames: Iterable[AnnotationFrame]) -> Iterator[tuple[AnnotationFrame, int]]:
     """Yield each frame with the time to the next one of its topic, ns.
 
-    The last one has the time since the one before.
+    The last frame gets the time since the one before.
     """
     source = iter(frames)
     following = deque(islice(source, _AHEAD))
@@ -187,13 +187,13 @@ def _with_periods(frames: Iterable[AnnotationFrame]) -> Iterator[tuple[Annotatio
 
 
 def _period(frame: AnnotationFrame, following: AnnotationFrame) -> int:
-    """Return the time between two frames, ns: by stamp, or by the log time of viewers if longer."""
+    """Return the longer of the times between two frames, ns, by stamp and by viewers' log time."""
     by_stamp = following.stamp_ns - frame.stamp_ns
     return max(1, by_stamp, following.log_time_ns - frame.log_time_ns)
 
 
 def _encoding(recording: Recording, first: Annotation | None) -> str:
-    """Return the encoding for annotations: that of the annotated topic, else the most common."""
+    """Return the encoding for annotations: the annotated topic's, else the most common one."""
     if recording.kind == "ros1":
         return "cdr"
     topics = [topic for topic in recording.topics if topic.encoding in ENCODINGS]

@@ -54,8 +54,8 @@ _ConvertedChannel = tuple[AnnotationChannel, Callable[[bytes | memoryview], memo
 def convert_channel(channel: Channel) -> _ConvertedChannel | None:
     """Convert a ROS 1 channel to ROS 2.
 
-    Types keep the definition in the bag, with names that ROS 2 allows (``O_T_EE`` becomes
-    ``o_t_ee``), which are those of its own types (``K`` of CameraInfo is ``k``). Only the sequence
+    Types keep the definition in the bag, but their fields get names that ROS 2 allows (``O_T_EE``
+    becomes ``o_t_ee``), as in its own types (``K`` of CameraInfo is ``k``). Only the sequence
     number of headers is lost, since ROS 2 has none.
 
     Returns

@@ -65,7 +65,7 @@ def write_crops(out: Path, frames: Iterable[ExportedFrame], finished: FinishedRu
     """Add the views of a run to a data set; return their number.
 
     Earlier views of the same topics of the recording are replaced, whatever the name of their run,
-    so that none keeps an outdated label or is there twice; those of another time range stay.
+    so that none keeps an outdated label or is there twice; views of another time range stay.
     Deleted tracks are left out; ``unknown`` is a category like any other.
 
     Raises

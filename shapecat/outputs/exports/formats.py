@@ -87,7 +87,7 @@ def export_run(
     format : a key of `FORMATS`.
     every : export every n-th frame of a stream.
     visible_boxes : whether boxes enclose only the visible part of objects, not the whole.
-    categories : those of all runs that are exported together, so that their numbers agree.
+    categories : the categories of all runs that are exported together, so that their numbers agree.
     recording : path of the recording; by default where it was processed.
     observe : called with the phase, the number of frames done, and the total.
 
@@ -302,7 +302,8 @@ def _require_own(target: Path, about: Mapping[str, Any]) -> None:
 def _covers(new: Any, old: Any) -> bool:
     """Return whether the time range ``new`` includes ``old``.
 
-    Data sets have no range: theirs is None. A limit that is None is that of the recording.
+    Data sets have no range, which is None. A limit that is None is the start or end of the
+    recording.
     """
     if new is None or old is None:
         return new is old

@@ -102,7 +102,7 @@ def _areas(masks: Iterator[tuple[Key, ImageMasks]]) -> dict[Detected, tuple[floa
 def _representative_views(views: Sequence[_View]) -> list[_View]:
     """Return a typical large view of each of `_CANDIDATES` parts of a track, if possible complete.
 
-    Of equal views, it is the first.
+    Among equal views, the first is taken.
     """
     ends = np.linspace(0, len(views), min(_CANDIDATES, len(views)) + 1).astype(int)
     chosen = []

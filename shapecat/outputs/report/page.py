@@ -70,9 +70,9 @@ def run_page(
     frames : the frames of the strip.
     stages : (frames,) seconds of each stage.
     length_s : time from the first to the last frame, seconds.
-    notes : warnings in addition to those of the run.
+    notes : warnings in addition to the run's.
     index : link to the index of several runs; None if there is none.
-    served : whether corrections are sent to a server, instead of to a table to download.
+    served : whether corrections are sent to a server; if not, the page offers a table to download.
     """
     run = finished.info
     counts = Counter(card.row.category for card in cards)

@@ -35,9 +35,9 @@ _FACES = 6
 class RunReport:
     """The content of a run's page, except the labels, which are read when the page is made.
 
-    ``work`` is that of run.json, ``stages`` has the seconds (frames,) of each stage, ``length_s``
-    is the time from the first to the last frame, seconds, and ``index`` is the link to the index of
-    several runs, None if there is none.
+    ``work`` is the id in run.json, ``stages`` holds the seconds (frames,) of each stage,
+    ``length_s`` is the time from the first to the last frame, seconds, and ``index`` is the link to
+    the index of several runs, None if there is none.
     """
 
     folder: Path
@@ -53,7 +53,8 @@ class RunReport:
 
         Parameters
         ----------
-        served : whether corrections are sent to a server, instead of to a table to download.
+        served : whether corrections are sent to a server; if not, the page offers a table to
+            download.
 
         Raises
         ------
@@ -107,7 +108,7 @@ class RunReport:
 
 @dataclass(frozen=True)
 class Reports:
-    """The reports of runs; ``indexed`` is whether there is an index in their common folder.
+    """The reports of runs; ``indexed`` says whether there is an index in their common folder.
 
     ``failed`` holds the reason for each run that has no report.
     """
@@ -223,7 +224,7 @@ def _above(runs: Sequence[Path]) -> Path:
 
 
 def _place(run: Path) -> Path:
-    """Return the absolute path of a run folder; if it is a link, that of the link."""
+    """Return the absolute path of a run folder, without resolving it if it is a link."""
     absolute = Path(os.path.abspath(run))  # noqa: PTH100  `resolve` would follow the link
     return absolute.parent.resolve() / absolute.name
 

@@ -103,8 +103,8 @@ def _radius(frame: Frame, points: F4, step: int) -> float:
 def _thin(wanted: Bool, limit: int) -> tuple[int, I4]:
     """Return a step, and the flat indices of about ``limit`` of the wanted pixels or points.
 
-    The step is that of a grid of pixels in an image (h, w), and every k-th of the points in a cloud
-    (n,). A limit of 0 means all.
+    In an image (h, w), pixels on a grid with this step are chosen; of the wanted points of a cloud
+    (n,), every ``step``-th. A limit of 0 means all.
     """
     share = np.count_nonzero(wanted) / limit if limit else 1.0
     if wanted.ndim == 1:

@@ -65,7 +65,7 @@ class Images:
         self.entities: dict[str, str] = {}
 
     def add(self, labelled: LabelledFrame, coloured: Coloured) -> None:
-        """Add the image of a frame; nothing if the colours are those of an unorganized cloud.
+        """Add the image of a frame, unless its colours are from an unorganized cloud.
 
         Raises
         ------

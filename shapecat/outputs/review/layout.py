@@ -40,7 +40,7 @@ class TrackView:
 
 
 class _Layout(rrb.Blueprint):  # type: ignore[misc]  # Rerun is untyped
-    """A blueprint that keeps the stream in which Rerun writes it down, to be closed afterwards."""
+    """A blueprint that keeps the stream to which Rerun writes it, to be closed afterwards."""
 
     stream: rr.RecordingStream | None = None
 
@@ -62,7 +62,7 @@ def choose_eye(labelled: LabelledFrame, frame: Frame, *, fixed: bool) -> Eye:
     back = back - (back @ up) * up
     norm = np.linalg.norm(back)
     back = back / norm if norm > 1e-3 else np.zeros(3)
-    side = np.cross(up, back)  # from one side, so that the sensor does not block the view
+    side = np.cross(up, back)  # from one side, so that the drawn sensor does not block the view
     distance = max(0.6, 2.2 * radius)
     return Eye(target + distance * (0.7 * back + 0.3 * side + 0.6 * up), target, up)
 

@@ -32,7 +32,7 @@ _DISPLAYS = ("DISPLAY", "WAYLAND_DISPLAY", "WAYLAND_SOCKET")
 
 
 def open_viewer(path: Path) -> None:
-    """Open a review in a window, and return once the window has stayed open.
+    """Open a review in a window, and return once it is clear that the window stays open.
 
     Raises
     ------
