@@ -61,7 +61,8 @@ def frames_with_colour(
     colours : the colour stream of each depth topic that has one.
     frame_range, skipped : as for `frames`.
     needed : as for `frames`; also called for colour images.
-    same_images : the images of the frames when all were read; by default those nearest in time.
+    same_images : returns the log time of a frame's image, ns, or None, given the frame's topic and
+        number; by default, the images nearest in time are chosen.
 
     Yields
     ------
@@ -203,7 +204,7 @@ class _Partner:
         return self._newest is not None and self._newest >= frame.stamp_ns
 
     def _candidates(self, frame: Frame) -> list[_BufferedImage]:
-        """Return the images that may be that of a frame."""
+        """Return the images that may belong to a frame."""
         if self._same_images is not None:
             logged = self._same_images(frame.topic, frame.index)
             return [one for one in self._images if one.log_time_ns == logged]

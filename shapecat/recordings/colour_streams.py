@@ -93,7 +93,7 @@ def pair_colours(
 
     Raises
     ------
-    NoStreamError : the wanted topic does not exist or holds no colour images.
+    NoStreamError : the requested topic does not exist or holds no colour images.
     """
     if requested == "":
         return {}
@@ -176,7 +176,7 @@ def _nearest_sensors(
 def _belongs(
     one: ColourStream, stream: Stream, nearest: Mapping[str, Sequence[_NearSensor]]
 ) -> bool:
-    """Return whether images are those of a depth stream's sensor, see `pair_colours`."""
+    """Return whether images belong to a depth stream's sensor, see `pair_colours`."""
     if same_frame(one.frame_id, stream.frame_id):
         return True
     shared = _shared(one, stream)

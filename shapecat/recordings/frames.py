@@ -38,7 +38,7 @@ class FrameRange:
     every: int = 1
 
     def __post_init__(self) -> None:
-        """Check the numbers; those of NumPy become plain ones, which can be written as JSON."""
+        """Check the numbers; NumPy's become plain ones, which can be written as JSON."""
         if self.every < 1 or self.every % 1:
             msg = f"every must be an integer of at least 1, got {self.every!r}"
             raise ConfigError(msg)

@@ -119,7 +119,7 @@ def detached(data: bytes | memoryview) -> bytes | memoryview:
 
 
 def sum_topics(topics: Iterable[Topic]) -> tuple[Topic, ...]:
-    """Return topics sorted, with equal ones as one that has the messages of all."""
+    """Return topics sorted; equal ones become one, and their messages are added up."""
     counts: Counter[tuple[str, str, str]] = Counter()
     for topic in topics:
         counts[topic.name, topic.type, topic.encoding] += topic.count

@@ -23,7 +23,8 @@ class Stream:
 
     ``info_topic`` is the topic of a depth image's calibration, None if there is none; ``count`` is
     the number of messages; ``frame_id`` is from the first message; ``doubt`` says why its frames
-    may be wrong, for example with the calibration of another camera; it is empty if nothing is.
+    may be wrong, for example with the calibration of another camera; it is empty if there is no
+    doubt.
     """
 
     topic: str
@@ -64,7 +65,7 @@ def by_sensor(streams: Sequence[Stream]) -> list[list[Stream]]:
     Streams belong to the same sensor if they share the sensor's namespace (``/camera/depth/points``
     and ``/camera/aligned_depth_to_color/image_raw``), unless what follows names different cameras
     (``/spot/depth/left/image`` and ``/spot/depth/right/image``), or if they share a frame, unless
-    one driver seems to run in both of their namespaces, like that of two robots of one kind.
+    the same driver seems to run in both namespaces, as on two robots of one kind.
     """
     places = {stream.topic: _place(stream.topic) for stream in streams}
     twins = {
@@ -100,16 +101,16 @@ def _place(topic: str) -> _Place:
 def _share_namespace(a: _Place, b: _Place) -> bool:
     if a.space != b.space or a.camera != b.camera:
         return False
-    # Without a namespace, the topics of a depth camera are beside those of any other sensor.
+    # Without a namespace, a topic may belong to any sensor.
     return a.space != () or all("depth" in "/".join(one.rest[:-1]) for one in (a, b))
 
 
 def _are_twins(a: Stream, b: Stream, first: _Place, second: _Place) -> bool:
     """Return whether the same topic of a driver is in two namespaces, each with its calibration.
 
-    Namespaces that begin equally (``/kinect2/hd``, ``/kinect2/qhd``) belong to one driver, and one
-    within another, such as that of throttled topics, holds a copy. Clouds have no calibration, so
-    the last two parts of their topics are compared.
+    Namespaces with the same first part (``/kinect2/hd``, ``/kinect2/qhd``) belong to one driver,
+    and a namespace put before another, as for throttled topics, holds a copy. Clouds have no
+    calibration, so the last two parts of their topics are compared.
     """
     short, long = sorted((first.space, second.space), key=len)
     copied = first.space[:1] == second.space[:1] or long[len(long) - len(short) :] == short

@@ -70,7 +70,7 @@ def depth_streams(recording: Recording, requested: Sequence[str] = ()) -> tuple[
 
 
 def choose_streams(recording: Recording, requested: Sequence[str] = ()) -> tuple[Stream, ...]:
-    """Choose the streams to process: the wanted ones, or the best one of the only sensor.
+    """Choose the streams to process: the requested ones, or the best one of the only sensor.
 
     `by_sensor` says which streams belong to the same sensor. Within a sensor the preference is, in
     this order: no doubt about content or calibration; depth images, since a cloud holds the same
@@ -84,8 +84,8 @@ def choose_streams(recording: Recording, requested: Sequence[str] = ()) -> tuple
 
     Raises
     ------
-    NoStreamError : no stream can be processed, a wanted one is missing or lacks a calibration, or
-        nothing is wanted and there are several sensors.
+    NoStreamError : no stream can be processed, a requested one is missing or lacks a calibration,
+        or none is requested and there are several sensors.
     """
     streams = depth_streams(recording, requested)
     chosen = _select(recording, streams, requested) if requested else (_best(recording, streams),)
@@ -125,7 +125,7 @@ def _select(
 
 
 def _why_unusable(recording: Recording, streams: tuple[Stream, ...], name: str) -> str:
-    """Return the error for a wanted topic that is missing or holds no depth."""
+    """Return the error for a requested topic that is missing or holds no depth."""
     usable = listed([stream.topic for stream in streams]) or "none"
     topics = [t for t in recording.topics if t.name.strip("/") == name.strip("/")]
     details = [detail for topic in topics if (detail := _encoding_or_error(recording, topic))]
@@ -201,7 +201,7 @@ def _is_infrared(topic: str) -> bool:
 
 
 def _is_radial(topic: str) -> bool:
-    """Return whether images are named after distances, but not those to the image plane."""
+    """Return whether images are named after distances, but not to the image plane."""
     name = _own_name(topic)
     return "distance" in name and "plane" not in name
 
@@ -217,7 +217,7 @@ def first_message(recording: Recording, topic: str) -> Any:
 
 
 def first_messages(recording: Recording, topic: str, kind: str | None = None) -> Iterator[Any]:
-    """Yield those of a topic's first few messages that can be decoded.
+    """Yield the messages, among a topic's first few, that can be decoded.
 
     With ``kind``, messages of other types are left out.
     """

@@ -45,7 +45,7 @@ class Chunk(NamedTuple):
     entry: Any
 
     def overlaps(self, channel_ids: set[int], selection: Selection) -> bool:
-        """Return whether the chunk may hold messages of these channels in the time selected."""
+        """Return whether the chunk may hold messages of these channels in the selected time."""
         return (
             (selection.start_ns is None or self.end >= selection.start_ns)
             and (selection.stop_ns is None or self.start < selection.stop_ns)

@@ -87,7 +87,7 @@ class DatabaseRecording(Recording):
             folder = self._cleanup.enter_context(scratch_folder())
             copy = folder / "a.db3"
             room = shutil.disk_usage(folder).free // 2
-            if self.path.stat().st_size + 2 * log.stat().st_size > room:  # it is added to the copy
+            if self.path.stat().st_size + 2 * log.stat().st_size > room:  # which is merged in
                 msg = "not enough space in the temporary folder to copy it"
                 raise OSError(msg)  # noqa: TRY301  handled like a full disk
             shutil.copyfile(self.path, copy)

@@ -241,12 +241,12 @@ def cloud_colours(message: Any) -> U1:
 def colour_image(
     kind: str, topic: str, stamp_ns: int, log_time_ns: int, decoded: Any
 ) -> ColourImage:
-    """Return the colour image in a decoded message, whose pixels are decoded only in a cloud.
+    """Return the colour image in a decoded message; only those of a cloud are decoded to pixels.
 
     Parameters
     ----------
     kind : ``raw``, ``compressed`` or ``cloud``.
-    stamp_ns, log_time_ns : those of the message, nanoseconds.
+    stamp_ns, log_time_ns : of the message, nanoseconds.
 
     Raises
     ------

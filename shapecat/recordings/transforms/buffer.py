@@ -98,7 +98,7 @@ class TransformBuffer:
         quaternion is zero.
         """
         parent, child = parent.strip().lstrip("/"), child.strip().lstrip("/")
-        # Numpy would take most of the time of reading: joints publish a thousand times a second.
+        # With Numpy, this would take most of the reading time: joints publish at 1 kHz.
         x, y, z = map(float, parent_from_child[0])
         quaternion = tuple(map(float, parent_from_child[1]))
         norm = math.hypot(*quaternion)
@@ -238,7 +238,7 @@ def fixed_frame(buffer: TransformBuffer, frame_id: str, at_ns: int | None = None
     connected = [name for name in buffer.frames if _is_below(buffer, name, root)]
     names = [n for usual in _FIXED for n in connected if n.rsplit("/", 1)[-1] == usual]
     names += [root] if root != sensor else []
-    if "/" in sensor:  # for r2/camera, the frames of another robot, as r1/odom, come last
+    if "/" in sensor:  # for r2/camera, another robot's frames, such as r1/odom, come last
         names.sort(key=lambda name: not sensor.startswith(name[: name.rfind("/") + 1]))
     placed = [n for n in names if at_ns is None or _can_transform(buffer, n, sensor, at_ns)]
     return next(iter(placed or names), None)

@@ -55,8 +55,8 @@ class Extrinsics:
         Parameters
         ----------
         depth_frame, colour_frame : frame ids of the messages.
-        log_time_ns, stamp_ns : those of the depth image, nanoseconds. Images come in the order of
-            the recording.
+        log_time_ns, stamp_ns : of the depth image, nanoseconds. Images come in the order of the
+            recording.
         """
         if is_of_realsense_recorder(self._depth.topic):
             return self._realsense

@@ -75,7 +75,7 @@ class Orientation(NamedTuple):
 class Upright:
     """The up direction, and the pose of the sensor in the fixed frame, for each frame.
 
-    Frames are looked up in the order of the recording, since little is kept of what came before.
+    Frames are looked up in the order of the recording, since only a little of the past is kept.
 
     Attributes
     ----------
@@ -122,11 +122,11 @@ class Upright:
             ``X,Y,Z`` in the sensor frame.
         fixed_frame : name of the frame in which the scene is at rest, with or without a leading
             slash; None to choose one.
-        streams : those whose frames will be looked up.
+        streams : the streams whose frames will be looked up.
 
         Raises
         ------
-        ConfigError : ``up`` is malformed, or the recording lacks the wanted source or frame.
+        ConfigError : ``up`` is malformed, or the recording lacks the requested source or frame.
         """
         sources = _SOURCES.get(up, ())
         vector = None if sources else _parse_vector(up)
@@ -185,7 +185,7 @@ class Upright:
         return min((name for name in candidates if name is not None), key=_rank, default=own_frame)
 
     def corrected(self, topic: str, orientation: Orientation) -> Orientation:
-        """Return the orientation of the data on a topic, given that of the frame they name."""
+        """Return the orientation of the data on a topic, given the one of the frame they name."""
         source, up, pose = orientation
         turn = self.misnamed.get(topic)
         if turn is None:
@@ -200,7 +200,7 @@ class Upright:
         self.warnings.append(f"{topic}: {misnaming.text}; its transforms are corrected")
 
     def accept(self, topic: str, orientation: Orientation) -> F4 | None:
-        """Count where an up direction comes from, and return it; None if the topic's is dropped."""
+        """Count an up direction by its source, and return it; None if the topic's is dropped."""
         up = None if topic in self.dropped else orientation.up
         source = "planes" if up is None else orientation.source
         self.given[source] = self.given.get(source, 0) + 1
@@ -222,7 +222,7 @@ class Upright:
         Parameters
         ----------
         source : source of the up direction, as in `Orientation`.
-        angles_deg : angles between the up direction and that of the planes, one per frame.
+        angles_deg : angles between the up direction and the normal of the planes, one per frame.
         """
         off = f"differs by {np.median(angles_deg):.0f} degrees from the planes of {topic}"
         if not self.sources:
@@ -275,7 +275,7 @@ class Upright:
 
 
 def _level_frames(frames: Sequence[str], sensor: str) -> list[str]:
-    """Return the level frames, best first: those of the sensor's robot before those of others."""
+    """Return the level frames, best first: the sensor's own robot comes before others."""
 
     def order(name: str) -> tuple[int, bool, bool]:
         robot = name.rpartition("/")[0]
@@ -285,7 +285,7 @@ def _level_frames(frames: Sequence[str], sensor: str) -> list[str]:
 
 
 def turned(up: F4, named_from_data: F8) -> F4:
-    """Return a direction (3,) of the frame that data name in the frame of the data."""
+    """Convert a direction (3,) from the frame that data name to the frame of the data."""
     return np.asarray(up @ named_from_data, np.float32)
 
 

@@ -24,8 +24,8 @@ class TransformTopics(NamedTuple):
 def transform_topics(recording: Recording, sensor_topics: Sequence[str] = ()) -> TransformTopics:
     """Return the topics of a recording that hold transforms.
 
-    If frames of the same name are on ``/r1/tf`` and ``/r2/tf``, the namespace around the topics in
-    ``sensor_topics`` counts, and the topic of the other robot is left out. ``/tf`` always counts.
+    If frames of the same name are on ``/r1/tf`` and ``/r2/tf``, the topic in the namespace of
+    ``sensor_topics`` is used, and the other robot's is left out. ``/tf`` is always used.
     """
     topics = {t.name for t in recording.topics if ros_counterpart(t.type) in TF_TYPES}
     spaces = {topic: topic.strip("/").rpartition("/")[0] for topic in sorted(topics)}
@@ -52,7 +52,7 @@ def _of_other_robots(
         for name in sensor_topics
     }
     left: set[str] = set()
-    owner: dict[str, str] = {}  # a topic by frame
+    owner: dict[str, str] = {}  # the topic of each frame
     for topic in sorted(spaces, key=lambda topic: spaces[topic] not in around):
         frames = _frames(recording, topic)
         rivals = [owner[f] for f in frames if f in owner and spaces[owner[f]] != spaces[topic]]
