@@ -77,7 +77,7 @@ def _folds(views: DescribedViews) -> Iterator[tuple[DescribedViews, DescribedVie
 
     fewest = min(_instances(views).values())
     folds = StratifiedGroupKFold(min(_FOLDS, fewest), shuffle=True, random_state=0)
-    with warnings.catch_warnings():  # of unknown shapes, there may be fewer than folds
+    with warnings.catch_warnings():  # there may be fewer unknown shapes than folds
         warnings.simplefilter("ignore", UserWarning)
         splits = list(folds.split(views.descriptors, views.labels, views.instances))
     for train, test in splits:

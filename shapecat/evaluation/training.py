@@ -45,9 +45,9 @@ def train_on_folder(
 
     Returns
     -------
-    Plain values: ``views``, ``skipped``, ``lost``, categories of which all views were skipped,
-    ``categories``, ``model`` (its id), ``calibrated``, whether enough instances were held out to
-    fit the temperature, and ``held_out``, the report on them.
+    Plain values: ``views``, ``skipped``, ``lost`` (categories of which all views were skipped),
+    ``categories``, ``model`` (its id), ``calibrated`` (whether enough instances were held out to
+    fit the temperature), and ``held_out`` (the report on them).
 
     Raises
     ------
@@ -95,7 +95,7 @@ def learn_on_folder(
 
     Returns
     -------
-    Plain values like those of `train_on_folder`, with ``added``, the new categories, but without
+    Plain values as for `train_on_folder`, with ``added`` (the new categories), but without
     calibration.
 
     Raises

@@ -53,7 +53,7 @@ def remove_base(view: View, rng: np.random.Generator) -> View:
 
 
 def image_plane_points(view: View) -> F8:
-    """Return the points (n, 2) of a view projected across its line of sight, metres."""
+    """Return the points of a view, (n, 2) metres, on a plane across the line of sight."""
     centre = view.points.mean(axis=0, dtype=np.float64)
     sight = view.eye - centre
     sight /= np.linalg.norm(sight)

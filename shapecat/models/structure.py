@@ -63,8 +63,8 @@ class Series(NamedTuple):
     view : the camera is on the ``path`` of the scene, or ``anywhere``: near or far, low or straight
         above; for ``floor`` the table is removed.
     changed : turns a bin into a tote, or a shelf into a rack.
-    arms : of the robot with the camera, or of a person, ``reaching`` for the objects or ``resting``
-        at the image border.
+    arms : arms of the robot with the camera, or of a person: ``reaching`` for the objects, or
+        ``resting`` at the image border.
     coarse : whether images have a fraction of the sensor's resolution.
     """
 
@@ -141,7 +141,7 @@ class Samples(NamedTuple):
     ----------
     features : (n,) `OBJECT_FEATURES`.
     objects : (n,) whether each is an object.
-    weights : for each frame, those of its segments, from `measure_borders`.
+    weights : for each frame, the borders of its segments, from `measure_borders`.
     """
 
     features: Records
@@ -240,7 +240,7 @@ def _with_arms(
 ) -> World:
     """Add the arms of the robot whose camera takes the frame, or of a person beside it.
 
-    ``arms`` is as in `Series`, ``intrinsics`` are those of the camera at ``view``.
+    ``arms`` is as in `Series`; ``intrinsics`` belong to the camera at ``view``.
     """
     if arms == "none":
         return world

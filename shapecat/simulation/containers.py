@@ -63,7 +63,7 @@ class _Mcap:
 class _Bag:
     """A recording written by rosbags; leaving the ``with`` block completes it.
 
-    ``options`` are those of a connection; they depend on whether its topic is latched.
+    ``options`` returns the options of a connection, given whether its topic is latched.
     """
 
     def __init__(

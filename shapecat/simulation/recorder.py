@@ -56,7 +56,7 @@ def simulate(
     Topics: /camera/depth/image_raw (16UC1, mm) or /camera/depth/points, /camera/depth/camera_info,
     /tf (map, base_link, camera_link) and /tf_static. Beside the recording, ``NAME.truth.json``
     lists the objects of each frame with their poses, and ``NAME.labels.npz`` holds the object of
-    each depth pixel. All of them replace those of an earlier recording of this name. The same
+    each depth pixel. They replace the files of an earlier recording of this name. The same
     arguments give the same messages on every machine.
 
     Parameters
@@ -159,7 +159,7 @@ def write_frame(
     clouds: bool = False,
     color: bool = False,
 ) -> None:
-    """Write a depth image and its transforms; those of the first frame hold the static ones, too.
+    """Write a depth image and its transforms; with the first frame, also the static transforms.
 
     ``clouds`` and ``color`` are as for `simulate`; the colour image is not written.
     """

@@ -1,4 +1,4 @@
-"""The labels of two runs, or of a run and other labels, compared."""
+"""Comparison of a run's labels with another run or with other labels."""
 
 from shapecat.evaluation.comparison.comparing import Comparison, compare
 

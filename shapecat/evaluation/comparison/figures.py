@@ -1,4 +1,4 @@
-"""What a comparison counts over its frames, and the metrics from these counts."""
+"""Counts of a comparison over its frames, and the metrics from these counts."""
 
 from collections import Counter
 from collections.abc import Sequence

@@ -178,7 +178,7 @@ def _count_matches(
 
     Parameters
     ----------
-    pairs : for each frame, index of the true identity times ``found_count``, plus that of the
+    pairs : for each frame, index of the true identity times ``found_count``, plus index of the
         found one.
     similar : for each frame, the similarity of each pair.
 

@@ -82,8 +82,8 @@ class Labelling:
     ----------
     known : (n,) which pixels of the frame have a label; None if all have.
     shape : height and width of the image; None if unknown.
-    ignored : (n,) which pixels show objects that need not be found, nor are false if they are;
-        None if there are none.
+    ignored : (n,) which pixels show objects that count neither as missed nor as false; None if
+        there are none.
     """
 
     items: tuple[LabelledItem, ...]
@@ -145,7 +145,7 @@ class Reference(ABC, Generic[_Frame]):
 
 
 def numbering_notes(other: Reference[Any], start_s: float | None) -> list[str]:
-    """Return a note if run and reference may begin to number frames at different ones.
+    """Return a note if run and reference may number their frames from different ones.
 
     ``start_s`` is where the run began in its recording, None for the beginning.
     """

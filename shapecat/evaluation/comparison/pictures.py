@@ -66,8 +66,8 @@ def draw_frame(
     ----------
     frame : the depth frame; None for a plain background.
     pairs : index of the true object for each matched found object.
-    rows : differences of the frame: those of the found objects, then those of the missed ones, both
-        in their order.
+    rows : differences of the frame: first of the found objects, then of the missed ones, both in
+        their order.
 
     Returns
     -------
@@ -98,8 +98,8 @@ def _states(
 ) -> U1:
     """Return the colour number of each pixel, (n,), from 1; 0 without an object.
 
-    Where a found object lies on a true one that it is not matched with, its pixels are surplus, so
-    that split objects show.
+    If a found object lies on a true one that it is not matched with, its pixels count as surplus,
+    so that split objects are visible.
     """
     state = np.zeros(size, np.int64)
     for number, labelling in ((2, true), (3, found)):

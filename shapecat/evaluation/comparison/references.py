@@ -54,9 +54,9 @@ def open_reference(
     ----------
     path : a run folder; a KITTI folder, which has a folder ``label_2``; a JSON file of `shapecat
         simulate` or COCO; or a simulated recording with its ground truth beside it.
-    categories : those of the run to compare; they show which ``_`` in a KITTI type are spaces.
-    run, digest : name of the run to compare, and digest of its recording; they show which images of
-        several recordings are used.
+    categories : categories of the run to compare; they tell which ``_`` in a KITTI type are spaces.
+    run, digest : name of the run to compare, and digest of its recording; they select the images if
+        the reference has several recordings.
 
     Raises
     ------
@@ -117,7 +117,7 @@ class SimulatedTruth(Reference[dict[str, Any]]):
 
 
 def _true_labelling(entry: Mapping[str, Any], image: U1) -> Labelling:
-    """Return the objects of an entry of the ground truth with its label image (h, w)."""
+    """Return the objects of a ground-truth entry, given its label image (h, w)."""
     flat = image.reshape(-1)
     items = (
         LabelledItem(
@@ -142,7 +142,7 @@ class _LabelImages:
         self._path = path
         self._next = 0
         try:
-            # Closed together with this object, as frames are read until then.
+            # Closed with this object, which reads frames until then.
             self._file = zipfile.ZipFile(path).open("labels.npy")  # noqa: SIM115
             self._shape = _image_shape(self._file)
         except DAMAGED as error:
@@ -230,7 +230,7 @@ def read_complete(folder: Path) -> FinishedRun:
     ------
     OutputError : the folder is not a run, or the run is not complete.
     """
-    read_run(folder)  # says if there is no run
+    read_run(folder)  # raises if there is no run
     if not (folder / "tracks.parquet").is_file():
         msg = f"{folder}: the run is not complete; run the same command again to resume"
         raise OutputError(msg)
@@ -240,9 +240,9 @@ def read_complete(folder: Path) -> FinishedRun:
 def run_labellings(finished: FinishedRun) -> Iterator[tuple[Key, Mapping[str, Any], Labelling]]:
     """Yield the frames of a run in order: topic and number, the frame's table row, its objects.
 
-    Detections without a track keep the category of the single view; detections of deleted tracks
-    are left out, those of merged tracks in one frame are joined. Boxes are full boxes where these
-    are known, else visible ones.
+    Detections without a track keep the category of the single view, detections of deleted tracks
+    are left out, and detections of merged tracks in one frame are joined. Boxes are full boxes if
+    these are known, else visible ones.
     """
     folder = finished.folder
     deleted = _deleted(folder, finished.labels)
@@ -285,7 +285,7 @@ def _item(
     full: Sequence[Box | None],
     up: Sequence[float],
 ) -> LabelledItem:
-    """Return the object of some detections; the largest gives the category of the single view."""
+    """Join detections to one object; the largest gives the category of the single view."""
     track, category, confidence = label
     boxes = [
         whole or Box(row["center"], row["size"], row["orientation"])

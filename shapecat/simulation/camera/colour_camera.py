@@ -73,7 +73,7 @@ def _paint(
 ) -> U1:
     """Return the shaded colours (h, w, 3) uint8; the texture moves with each object.
 
-    ``pose`` is that of the ``camera`` in the world; the other parameters are as for `_colour_in`.
+    ``pose`` is ``world_from_camera``; the other parameters are as for `_colour_in`.
     """
     supports = len(world.supports)
     poses = [pose] * supports  # from the camera to the frame of each texture

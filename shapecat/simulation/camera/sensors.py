@@ -74,7 +74,7 @@ def interpolated(first: Sensor, second: Sensor, share: float) -> Sensor:
     """Interpolate the error models of two sensors.
 
     ``share`` is 0 for the first model and 1 for the second. Intrinsics, device, shadows and borders
-    are those of the first sensor.
+    come from the first sensor.
     """
     mixed = {
         field.name: _mixed(getattr(first, field.name), getattr(second, field.name), share)

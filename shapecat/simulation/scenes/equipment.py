@@ -55,7 +55,7 @@ def make_own_arms(rng: Generator, camera: Pose, height: float) -> list[Mesh]:
     """
     ahead = camera.rotation[:, 2]
     distance = (camera.translation[2] - height) / max(-float(ahead[2]), 0.3)
-    below = 1 if rng.random() < 0.75 else -1  # else it looks back at its own body
+    below = 1 if rng.random() < 0.75 else -1  # otherwise the camera sees the robot's own body
     links: list[Mesh] = []
     for side in rng.permutation([-1, 1])[: int(rng.integers(1, 3))]:
         thick = rng.uniform(0.035, 0.09)
@@ -268,5 +268,5 @@ def _above(place: F8, height: float) -> F8:
 
 def _put(mesh: Mesh, place: ArrayLike, degrees: float) -> Mesh:
     """Turn a mesh about z and move it."""
-    # At once, the coordinates would be rounded only once, and recordings differ.
+    # In one step, coordinates would be rounded only once, which would change recordings.
     return placed(placed(mesh, about="z", degrees=degrees), place)

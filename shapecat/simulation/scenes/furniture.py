@@ -92,7 +92,7 @@ def make_shelf(
 
 
 def make_rack(rng: Generator, supports: Sequence[Support]) -> list[Support]:
-    """Return shelf ``supports`` with posts instead of the sides.
+    """Return the ``supports`` of a shelf with posts instead of the sides.
 
     The back is kept with probability 1/3.
     """
@@ -123,7 +123,7 @@ def make_bin(rng: Generator) -> tuple[Support, list[Support]]:
 
 
 def make_tote(rng: Generator, supports: Sequence[Support]) -> list[Support]:
-    """Return bin ``supports`` with sides that lean outwards and, with probability 1/2, a rim."""
+    """Return the ``supports`` of a bin with sides that lean outwards and, half the time, a rim."""
     bottom = next(support for support in supports if support.name == "bin")
     sides = [support for support in supports if support.name in _SIDES]
     points = np.concatenate([side.mesh.vertices for side in sides])

@@ -71,7 +71,7 @@ def place_piece(
     support : what it stands on, unless that is another object.
     on_track : the object that it stands on, if any.
     """
-    # No pose of a box is its upright one.
+    # Every pose of a box counts as upright.
     resting_pose = "upright" if piece.category == "box" else piece.stable_pose.name
     return PlacedObject(
         track,

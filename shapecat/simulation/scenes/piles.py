@@ -124,7 +124,7 @@ def _drops_within(rng: Generator, items: Sequence[Item], half: F8) -> list[Drop]
 
 
 def _dropped_rotation(rng: Generator) -> F8:
-    """Draw a rotation (3, 3): nearly upright with probability `_UPRIGHT`, else any."""
+    """Draw a rotation (3, 3): nearly upright with probability `_UPRIGHT`, else uniformly random."""
     if rng.random() >= _UPRIGHT:
         return random_rotation(rng)
     tilt, half_yaw = rng.normal(0, np.radians(_TILT_DEG) / 2, 2), rng.uniform(0, np.pi)
@@ -143,7 +143,7 @@ def settled(
     """Drop items onto supports; return the objects that come to rest on the support ``below``.
 
     They are numbered from 0 in the order of ``items``. Objects that rise ``highest_m`` metres or
-    more above the surface of ``below`` are left out too, and so is what rests on objects left out.
+    more above the surface of ``below`` are left out too, and so is everything that rests on them.
     """
     settled_poses = settle([support.mesh for support in supports], drops)
     stays = [

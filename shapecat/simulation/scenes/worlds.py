@@ -135,7 +135,7 @@ class World(Record):
         return shift is None or bool(np.isfinite(shift[frame]).all())
 
     def geometry(self, frame: int) -> Geometry:
-        """Return the triangles of a frame, world frame: those of the supports come first."""
+        """Return the triangles in a frame, world coordinates; the supports come first."""
         moves = self.motions or self.turns is not None
         return self._gather(frame) if moves else self._still
 
@@ -145,7 +145,7 @@ class World(Record):
 
     @cached_property
     def _labels(self) -> U1:
-        """(n + 1,) labels of the supports, then of the objects; the last is that of no mesh."""
+        """(n + 1,) labels of the supports, then of the objects; the last means no mesh."""
         labels = [s.label for s in self.supports] + [t.label for t in self.objects]
         return np.array([*labels, 0], np.uint8)
 

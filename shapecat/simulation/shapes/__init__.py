@@ -1,1 +1,1 @@
-"""Meshes of objects: the seven categories, and what belongs to none."""
+"""Meshes of objects: the seven categories, and objects that belong to none."""

@@ -101,7 +101,7 @@ def _thickened(points: F8) -> F8:
 
 
 def _corners(points: F8, directions: F8) -> F8:
-    """Return the points (k, 3) farthest along one of the directions: a hull with few corners."""
+    """Return the points (k, 3) farthest along any of the directions: a hull with few corners."""
     return np.asarray(points[np.unique((points @ directions.T).argmax(axis=0))])
 
 

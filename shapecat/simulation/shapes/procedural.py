@@ -67,7 +67,7 @@ def _slab(rng: Generator) -> Mesh:
 
 
 def _lump(rng: Generator) -> Mesh:
-    """Return a lump with waves of several lengths: a stone, bread, clothes or a bag."""
+    """Return a lump with bumps of several wavelengths: a stone, bread, clothes or a bag."""
     ball = ellipsoid(log_uniform(rng, 0.025, 0.08) * rng.uniform(0.35, 1.4, 3))
     points = np.asarray(ball.vertices, np.float64)
     unit = points / (np.linalg.norm(points, axis=1, keepdims=True) + 1e-12)
