@@ -87,7 +87,7 @@ if TYPE_CHECKING:
     "shows bars on a terminal, else plain lines.",
 )
 @click.option(
-    "--color", metavar="TOPIC", help="Topic of colour images; by default those of the depth camera."
+    "--color", metavar="TOPIC", help="Topic of colour images; by default chosen for each camera."
 )
 @click.option("--no-color", is_flag=True, help="Do not use colour images.")
 @boxes_option("In annotated.mcap, {}; full by default.")

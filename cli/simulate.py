@@ -37,7 +37,7 @@ _SUFFIXES: "dict[FormatName, str]" = {"mcap": ".mcap", "ros1": ".bag", "ros2": "
     "--format",
     "container",
     type=click.Choice(["mcap", "ros1", "ros2"]),
-    help="Format of the recording; by default that of OUT's suffix.",
+    help="Format of the recording; by default from the suffix of OUT.",
 )
 @choice_option("--sensor", _SENSORS, "Depth camera, listed above.", metavar="SENSOR")
 @click.option(
