@@ -61,7 +61,7 @@ def annotate(
 
 
 def _labels_of(run: Path) -> dict[int, str]:
-    """Return the label of each track of a run; none if it has no readable table."""
+    """Return the label of each track of a run; empty if it has no readable table."""
     from shapecat.errors import OutputError
     from shapecat.runs.labels.track_table import read_track_table
 

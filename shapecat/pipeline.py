@@ -115,11 +115,11 @@ def _run_phases(work: Work, content: ContentDigest, begun: float) -> None:
     folder, run, job, observe = work.folder, work.run, work.job, work.observe
     compiling_s = compile_all(observe, cores=work.cores, colour=bool(work.colours))
     content.start()
-    # A kill after the last phase leaves a total.
+    # There is a total if the run was killed after the last phase.
     earlier_s = run["seconds"].pop("total", None) or sum(run["seconds"].values())
     _run_once("perceive", folder, run, lambda: perceive_all(work))
     _run_once("revise", folder, run, lambda: _revise_and_warn(work))
-    require_unchanged(folder, run, job.source)  # or frames of two recordings could be resumed
+    require_unchanged(folder, run, job.source)  # or a resumed run could mix two recordings
     identify(run, content)
     write_run(folder, run)
     discard_segments(folder)
@@ -314,7 +314,7 @@ def annotate_again(
         run |= {"boxes": boxes} if boxes else {}
         for output in OUTPUTS:
             run["seconds"].pop(output, None)
-        write_run(folder, run)  # after a kill, the next run writes what is missing
+        write_run(folder, run)  # so that, after a kill, the next run writes the missing outputs
         annotate(folder, source, run, observe)
         write_run(folder, run)
     return transfer

@@ -109,7 +109,7 @@ class Manifest:
         """Finish writing."""
 
     def begin(self) -> bytes:
-        """Return the first megabyte of the file; nothing if it is missing or unreadable."""
+        """Return the first megabyte of the file; empty if it is missing or unreadable."""
         with suppress(OSError), self.path.open("rb") as file:
             return file.read(_PART_BYTES)
         return b""
@@ -194,7 +194,7 @@ class RemoteManifest(Manifest):
                 self._merge(((self._parts / name).read() or b"").splitlines())
 
     def begin(self) -> bytes:
-        """Return the file that the summary at the end would replace; nothing if it is missing."""
+        """Return the file that the summary at the end would replace; empty if it is missing."""
         return self._summary.read() or b""
 
     def _merge(self, lines: Iterable[bytes]) -> None:
@@ -251,7 +251,7 @@ def open_manifest(out: str, *, shard: str | None = None) -> Manifest:
     part = shard.replace("/", "-of-") if shard else ""
     manifest = RemoteManifest(out, part) if is_url(out) else Manifest(Path(out) / MANIFEST)
     lines = () if manifest.entries else manifest.begin().splitlines()
-    begins = [line.strip(b"\0 ")[: len(_BEGIN)] for line in lines]  # zeros follow a power cut
+    begins = [line.strip(b"\0 ")[: len(_BEGIN)] for line in lines]  # a power cut may leave zeros
     if any(begins) and not any(map(_BEGIN.startswith, filter(None, begins))):
         msg = f"{manifest.name}: shapecat did not make this; choose another --out, or move it away"
         raise OutputError(msg)

@@ -250,7 +250,7 @@ def _command(job: Job, work: str, entries: Iterable[Entry | None]) -> str:
 
 
 def _names_in(folder: Path) -> set[str]:
-    """Return the names in a folder; none if it is missing or unreadable."""
+    """Return the names in a folder; empty if it is missing or unreadable."""
     with suppress(OSError):
         return {path.name for path in folder.iterdir()}
     return set()

@@ -101,7 +101,7 @@ def _download(url: str, folder: Path) -> Path:
     Location(url).download(target)
     if target.suffix.lower() == ".db3" and target.is_file() and "?" not in url:
         log, info = Location(f"{url}-wal"), None  # of a recorder that was killed
-        with suppress(RecordingError):  # where listing is forbidden, so is asking for a missing one
+        with suppress(RecordingError):  # a missing file is an error if listing is forbidden
             info = log.info()
         if info is not None:
             log.download(target.with_name(f"{target.name}-wal"))

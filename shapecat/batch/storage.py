@@ -228,7 +228,7 @@ class Location:
         return {PurePosixPath(url).name for url, _ in self.walk(deep=False)}
 
     def walk(self, *, deep: bool = True) -> Iterator[tuple[str, Mapping[str, Any]]]:
-        """Yield URL and info of the files in a folder; none if it does not exist.
+        """Yield URL and info of the files in a folder, which need not exist.
 
         Parameters
         ----------

@@ -32,7 +32,7 @@ class _DaskExecutor(WorkerExecutor):
         return future
 
     def shutdown(self, wait: bool = True, *, cancel_futures: bool = False) -> None:  # noqa: FBT001, FBT002  as in the base class
-        self._executor.shutdown(wait=wait and not cancel_futures)  # without waiting it cancels
+        self._executor.shutdown(wait=wait and not cancel_futures)  # cancels if it does not wait
         self._close(_CLOSE_S)
 
     def lacks_workers(self) -> bool:
@@ -70,7 +70,7 @@ def open_dask(workers: int, address: str | None) -> WorkerExecutor:
     except ImportError as error:
         msg = "--executor dask needs Dask: in a clone of shapecat, pip install '.[cluster]'"
         raise ConfigError(msg) from error
-    logging.getLogger("distributed").setLevel(logging.WARNING)  # its steps would hide our progress
+    logging.getLogger("distributed").setLevel(logging.WARNING)  # its log would bury our progress
     if address is None:
         with single_threaded():
             cluster = LocalCluster(
@@ -78,7 +78,7 @@ def open_dask(workers: int, address: str | None) -> WorkerExecutor:
                 threads_per_worker=1,
                 processes=True,
                 host="127.0.0.1",
-                dashboard_address="127.0.0.1:0",  # None is port 8787, which may be taken
+                dashboard_address="127.0.0.1:0",  # None means port 8787, which may be taken
                 memory_limit=0,
             )
         return _DaskExecutor(Client(cluster), cluster)

@@ -51,7 +51,7 @@ class LocalExecutor(WorkerExecutor):
             dispatcher = threading.Thread(target=self._dispatch, args=(k,), daemon=True)
             try:
                 dispatcher.start()
-            except RuntimeError:  # the limit of processes is reached: those that started share
+            except RuntimeError:  # the limit of processes is reached; make do with fewer
                 break
             self._dispatchers.append(dispatcher)
         atexit.register(self.terminate)

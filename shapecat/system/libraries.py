@@ -35,7 +35,7 @@ def _is_caller(module: str) -> bool:
 
 
 def block_unused() -> None:
-    """Keep this process from importing what no command uses; only for shapecat's own processes.
+    """Keep this process from importing unused libraries; only for shapecat's own processes.
 
     With its first array, Arrow loads pandas where it is installed, in order to recognise data
     frames: 0.4 s in each process. With its first kernel, numba loads SciPy's linear algebra, which

@@ -8,7 +8,7 @@ __all__ = ["forgive_stderr", "require_stdout"]
 
 
 class _Forgiving(io.TextIOWrapper):
-    """A stream that drops what cannot be written.
+    """A stream that drops text that it cannot write.
 
     Its methods use no global name: Python flushes stderr after it has cleared the modules.
     """
@@ -21,7 +21,7 @@ class _Forgiving(io.TextIOWrapper):
             return len(text)
 
     def flush(self) -> None:
-        """Write what is in the buffer, as far as possible."""
+        """Write as much of the buffer as possible."""
         try:  # noqa: SIM105  `suppress` would be a global name
             super().flush()
         except OSError:

@@ -50,7 +50,7 @@ class LabelledFrame(Record):
     Attributes
     ----------
     fixed_from_sensor : None where the recording has no fixed frame.
-    ended : tracks whose last frame was the previous one of the topic.
+    ended : tracks that ended in the previous frame of the topic.
     seconds : time spent in each stage.
     up : (3,) unit vector, sensor frame.
     reused_from : index of the earlier frame from which the scene is copied; None if it is new.
