@@ -73,7 +73,7 @@ def undistorted_rays(camera: Camera, model: str, coefficients: Sequence[float]) 
     distorted = np.stack([(u - camera.cx) / camera.fx, (v - camera.cy) / camera.fy], axis=-1)
     targets = distorted.reshape(-1, 2)
     rays, error, active = targets.copy(), np.full(len(targets), np.inf), np.arange(len(targets))
-    with np.errstate(all="ignore"):  # beyond the image of the lens it diverges: rejected below
+    with np.errstate(all="ignore"):  # diverges outside the image of the lens: rejected below
         for _ in range(_ROUNDS):
             bent = distort(rays[active], model, coefficients)
             off = targets[active] - bent
@@ -82,7 +82,7 @@ def undistorted_rays(camera: Camera, model: str, coefficients: Sequence[float]) 
             rays[active] += off * np.where(stretch > 0, stretch, 1)[:, None]
             error[active] = np.abs(off * (camera.fx, camera.fy)).max(axis=1)
             active = active[error[active] > _ENOUGH_PX]
-    converged = error < _WRONG_PX  # never so for NaN
+    converged = error < _WRONG_PX  # False for NaN
     rays[~converged] = np.nan
     return rays.reshape(distorted.shape) if converged.mean() >= _LEAST_SHARE else None
 

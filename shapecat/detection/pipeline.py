@@ -162,7 +162,7 @@ def _segment(
 def model_planes(
     grid: DepthGrid, hint: F8 | None, task: Task, *, upright: bool = True
 ) -> PlaneModel | None:
-    """Find the planes and what is above them, steps 2 and 3; None without a supporting plane.
+    """Find the planes and the samples above them (steps 2 and 3); None without supporting plane.
 
     The parameters are as in `_segment`.
     """

@@ -90,7 +90,7 @@ def top_view(
     -------
     The image; None if there are fewer than `MIN_POINTS` points or no plane.
     """
-    in_range: Bool = np.asarray((np.abs(points) <= range_m).all(axis=1))  # never so for NaN
+    in_range: Bool = np.asarray((np.abs(points) <= range_m).all(axis=1))  # False for NaN
     in_range[in_range] = np.linalg.norm(points[in_range], axis=1) <= range_m
     valid = points[in_range]
     if len(valid) < MIN_POINTS:
@@ -140,7 +140,7 @@ def _sum_of_directions(points: F4, origin: F8, range_m: float) -> tuple[F8, int]
     for k in range(points.shape[0]):
         x, y, z = points[k, 0] - origin[0], points[k, 1] - origin[1], points[k, 2] - origin[2]
         distance = math.sqrt(x * x + y * y + z * z)
-        if (distance >= NEAREST_M) & (distance <= 2 * range_m):  # never so for NaN
+        if (distance >= NEAREST_M) & (distance <= 2 * range_m):  # False for NaN
             scale = 1 / distance
             ax += x * scale
             ay += y * scale

@@ -27,7 +27,7 @@ _GROWTH = 0.6
 _EPOCHS = 8
 """Maximum number of epochs of the thesis's rule, which rarely reaches its distance limit sooner."""
 _ERROR_LIMIT = 3.0
-"""t_gamma, relative to the error per epoch of a neuron with an equal part of the surface."""
+"""t_gamma, relative to the error per epoch of a neuron with an equal share of the surface."""
 _DISTANCE_LIMIT = 0.7
 """t_alpha, relative to the spacing of the points: smaller distances are noise."""
 

@@ -75,7 +75,7 @@ class DetectionTable:
         return replace(self, sizes=np.zeros((0, 3), np.float32), orientations=None)
 
     def axes(self, which: I4 | slice) -> F8:
-        """Return the axes (k, 3, 3) of the boxes of ``which``, as columns; none if unknown."""
+        """Return the axes (k, 3, 3) of the boxes of ``which``, as columns; empty if unknown."""
         quaternions = None if self.orientations is None else self.orientations[which]
         if quaternions is None or len(quaternions) == 0:
             return np.zeros((0, 3, 3))

@@ -39,9 +39,9 @@ def fuse(posteriors: ArrayLike, method: Method = "product", weights: ArrayLike |
     Parameters
     ----------
     posteriors : (k, c) rows that sum to 1.
-    method : ``product``, tempered by the number of views, that is the normalised geometric mean;
-        ``mean``; or ``vote``, the fraction of the views that each category wins (on ties, the
-        first).
+    method : ``product``, tempered by the number of views, which is the normalised geometric mean;
+        ``mean``; or ``vote``, the fraction of the views that each category wins
+        (on ties, the first).
     weights : (k,) weights of the views, the first one positive; equal by default.
 
     Returns

@@ -230,7 +230,7 @@ def _count_below_edge(
 
 @kernel(inline=True)
 def _blurred_steps(fx: float, plane: SupportingPlane, x: float, y: float, z: float) -> int:
-    """Return the number of steps below an edge that cannot be told from what is beyond it.
+    """Return the number of steps below an edge that cannot be told from the surface beyond it.
 
     ``x``, ``y``, ``z`` are a point of the edge, metres, sensor frame; ``fx`` is in cells. Seen
     from above, the side below an edge covers few cells, and the edge is blurred.
