@@ -66,7 +66,7 @@ def frame_of(reading: ArrayLike, intrinsics: ArrayLike | None = None) -> Frame:
 
 
 def _camera(intrinsics: ArrayLike, height: int, width: int) -> Camera:
-    """Return the camera of an image; its centre is at most twice the image's size away from it."""
+    """Return the camera of an image; refuse intrinsics that are malformed or implausible."""
     with suppress(TypeError, ValueError):  # not numbers, or rows of different lengths
         values = np.asarray(intrinsics, np.float64)
         if values.shape == (3, 3) and (values[_FIXED] == np.eye(3)[_FIXED]).all():

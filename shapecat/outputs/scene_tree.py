@@ -159,7 +159,7 @@ def _apply_labels(
         return float(scene.up @ box.center - box.size[2] / 2)
 
     def changed(n: int) -> Candidate:
-        """Return a kept candidate with the box of its object, on what lies below all parts."""
+        """Return a kept candidate with the box of its object, on the support of its lowest part."""
         base = scene.candidates[min(parts[n], key=bottom)]
         while (below := base.on_candidate) is not None and index.get(below, index[n]) == index[n]:
             base = scene.candidates[below]

@@ -70,8 +70,8 @@ class Channel(NamedTuple):
     """A topic, with the type of its messages and the definition of that type.
 
     ``type`` is normalized to ``package/msg/Name`` for ROS types; ``schema_name`` is as recorded.
-    ``encoding`` of messages is cdr, ros1, json or protobuf. ``metadata`` holds what recorders add,
-    such as ``offered_qos_profiles``.
+    ``encoding`` of messages is cdr, ros1, json or protobuf. ``metadata`` holds entries that
+    recorders add, such as ``offered_qos_profiles``.
     """
 
     topic: str

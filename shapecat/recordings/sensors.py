@@ -63,9 +63,10 @@ def by_sensor(streams: Sequence[Stream]) -> list[list[Stream]]:
     """Group streams by sensor.
 
     Streams belong to the same sensor if they share the sensor's namespace (``/camera/depth/points``
-    and ``/camera/aligned_depth_to_color/image_raw``), unless what follows names different cameras
-    (``/spot/depth/left/image`` and ``/spot/depth/right/image``), or if they share a frame, unless
-    the same driver seems to run in both namespaces, as on two robots of one kind.
+    and ``/camera/aligned_depth_to_color/image_raw``), unless the rest of their names tells
+    different cameras apart (``/spot/depth/left/image`` and ``/spot/depth/right/image``), or if they
+    share a frame, unless the same driver seems to run in both namespaces, as on two robots of one
+    kind.
     """
     places = {stream.topic: _place(stream.topic) for stream in streams}
     twins = {

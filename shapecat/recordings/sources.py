@@ -91,7 +91,7 @@ class PointsSource(Source):
         self.pose: Pose | None = None
 
     def read(self, message: Message, index: int) -> Iterator[Frame]:
-        """Yield the frame of a cloud, or none if it is unreadable."""
+        """Yield the frame of a cloud, unless it is unreadable."""
         with self.counting():
             cloud = self.recording.decode(message)
             points = _placed(cloud_points(cloud), getattr(cloud, "pose", None))

@@ -47,8 +47,8 @@ def new_id() -> str:
 def work_id(run: RunInfo) -> str:
     """Return the id of the work that run.json describes, once the digest of the input is known.
 
-    It is a hash of content, settings, options, model and version, except what affects only masks
-    and outputs. The first letter keeps spreadsheets from reading a number.
+    It is a hash of content, settings, options, model and version, without those that affect only
+    masks and outputs. The first letter keeps spreadsheets from reading a number.
     """
     settings = {name: value for name, value in run["settings"].items() if name != "outputs"}
     options = {name: value for name, value in run["options"].items() if name not in _OUTPUTS}

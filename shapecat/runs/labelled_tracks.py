@@ -106,7 +106,7 @@ class LabelledTracks:
     def endings(self) -> Callable[[Key], tuple[int, ...]]:
         """Return a function to call with each frame in turn.
 
-        It returns the tracks whose last frame was the one before, of the same topic.
+        It returns the tracks that ended in the previous frame of the same topic.
         """
         latest: dict[str, Key] = {}
 

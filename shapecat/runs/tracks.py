@@ -128,7 +128,7 @@ def _batches(tracks: Iterable[Track]) -> Iterator[list[Track]]:
 
 
 def _parts(tracks: list[Track]) -> Iterator[tuple[list[Track], slice]]:
-    """Yield the tracks to write at a time, and their rows in the batch."""
+    """Yield the tracks to write at once, and their rows: a long track is written in parts."""
     if len(tracks) != 1:
         yield tracks, slice(None)
         return

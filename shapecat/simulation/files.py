@@ -30,7 +30,7 @@ def written_paths(out: Path, format: str, *, color: bool = False) -> list[Path]:
 
 @contextmanager
 def completed(paths: Sequence[Path], *, obsolete: Sequence[Path]) -> Iterator[list[Path]]:
-    """Provide hidden paths; if the block succeeds, move what it wrote there to ``paths``.
+    """Provide hidden paths; if the block succeeds, move the files written there to ``paths``.
 
     The first path is the recording. ``obsolete`` files of an earlier one are then deleted.
 
@@ -56,7 +56,7 @@ def completed(paths: Sequence[Path], *, obsolete: Sequence[Path]) -> Iterator[li
 
 
 def _require_replaceable(path: Path) -> list[Path]:
-    """Return the files of a folder that a recording may replace; none if it is not a folder.
+    """Return the files of a folder that a recording may replace; empty if it is not a folder.
 
     Raises
     ------

@@ -71,7 +71,7 @@ class Matched(NamedTuple):
     pairs : index of the true object for each matched found object.
     similarity : (found, true) IoU of the masks, or of the 3D boxes if matched by boxes.
     f : (found, true) overlap F of the masks; None if matched by boxes.
-    overlap : counts of the masks' pixels; nothing if matched by boxes.
+    overlap : counts of the masks' pixels; all 0 if matched by boxes.
     """
 
     pairs: dict[int, int]

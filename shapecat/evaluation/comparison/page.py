@@ -193,7 +193,7 @@ _HEAD = ("frame", "difference", "true", "found", "track", "confidence", "overlap
 
 
 def _confidence(row: Difference) -> str:
-    """Return the confidence as captions have it: none for an unknown object."""
+    """Return the confidence as in captions, which omit it for an unknown object."""
     if row.confidence is None or row.category == UNKNOWN:
         return ""
     return confidence_text(row.confidence)

@@ -74,7 +74,7 @@ class KittiLabels(Reference[str]):
 
 
 def _listed(path: Path) -> list[tuple[Place, str]]:
-    """Return the frame and the name of each label file; none without ``frames.csv``.
+    """Return the frame and the name of each label file; empty without ``frames.csv``.
 
     Labels of a single topic match any topic, since the recording may use another name.
     """

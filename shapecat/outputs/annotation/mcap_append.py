@@ -78,7 +78,7 @@ def copy_bytes(source: Path, target: Path, length: int) -> None:
         if total == 0:
             while block := file.read(min(1 << 20, length - total)):
                 total += copy.write(block)
-        if total < length:  # what is missing would be zeros
+        if total < length:  # the rest would be zeros
             raise OSError(errno.EIO, "the recording became shorter while it was copied")
 
 

@@ -1,1 +1,1 @@
-"""The review: a Rerun recording of what was detected, and its viewer."""
+"""The review: a Rerun recording of the detections, and its viewer."""

@@ -129,7 +129,7 @@ class _Review:
     """Writes a review frame by frame, and keeps the data for its layout and paths."""
 
     def __init__(self, stream: rr.RecordingStream, run: RunInfo) -> None:
-        """Write what does not change over time."""
+        """Write the data that do not change over time."""
         self._stream, self._columns = stream, Columns(stream)
         self._log = stream.log
         self._limit = run["settings"]["outputs"]["cloud_points"]

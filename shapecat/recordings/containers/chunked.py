@@ -153,7 +153,7 @@ class ChunkedRecording(Recording):
             unneeded = selection.needed and not selection.needed(channel.topic, raw.log_time)
             data = b"" if unneeded else decompressed(self, channel, raw.data)
             if data is None and selection.needed:
-                data = b""  # it counts, as it does where it is not needed
+                data = b""  # it keeps its place, as unneeded messages do
             if data is not None:
                 times = raw.log_time, raw.publish_time
                 yield Message(channel, *times, raw.sequence, detached(data))

@@ -94,7 +94,7 @@ class McapRecording(ChunkedRecording):
                 c,
             )
             for c in summary.chunks
-            if c.message_end_time or c.message_index_offsets  # else it has no messages
+            if c.message_end_time or c.message_index_offsets  # others have no messages
         ]
         usable = summary.checked or self._agrees()
         if not usable:
@@ -173,7 +173,7 @@ class McapRecording(ChunkedRecording):
                 yield from self._take(opcode, content)
         except ChunkError as error:
             self.damaged = True
-            if record.offset not in self._reported:  # a part of it may fail for another reason
+            if record.offset not in self._reported:  # warn once per chunk
                 part = "" if record.whole else "the rest of "
                 self.warn(f"skipped {part}the chunk at byte {record.offset - 9}: {error}")
             self._reported.add(record.offset)

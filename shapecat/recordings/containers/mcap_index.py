@@ -24,7 +24,7 @@ class IndexedMessage(NamedTuple):
 
 
 def read_message_index(file: BinaryIO, chunk: records.ChunkIndex) -> list[IndexedMessage]:
-    """Return the index entries of a chunk; none if one is damaged or a channel is missing.
+    """Return the index entries of a chunk; empty if one is damaged or a channel is missing.
 
     The entries have no checksum: they must lie within the time and the size of the chunk.
     """

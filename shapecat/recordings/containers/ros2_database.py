@@ -126,7 +126,7 @@ class DatabaseRecording(Recording):
                 continue
             plain = None if data is None else decompressed(self, channel, bytes(data))
             if plain is None and selection.needed:
-                plain = b""  # it counts
+                plain = b""  # it keeps its place
             if plain is not None:
                 yield Message(channel, time, time, 0, plain)
 

@@ -1,4 +1,4 @@
-"""Compressed depth images: 16-bit PNG, or what compressed_depth_image_transport writes."""
+"""Compressed depth images: 16-bit PNG, or the format of compressed_depth_image_transport."""
 
 import io
 import struct

@@ -99,7 +99,7 @@ def transfer_labels(source: Path, target: Path) -> Transfer:
     transfer = match_labels(source, target)
     transfer = _without(transfer, _labelled_otherwise(transfer, target, run))
     refused = relabel(target, _labels(transfer))
-    if refused:  # as a typo, perhaps, since the model there does not know the category
+    if refused:  # perhaps as a typo, since that run's model does not know the category
         transfer = _with_new_categories(transfer, refused)
         refused = relabel(target, _labels(transfer))
     transfer = _without(transfer, refused)

@@ -1,1 +1,1 @@
-"""The phases that perceive the frames of a recording, and what they report."""
+"""The phases that perceive the frames of a recording, and their reports."""

@@ -38,7 +38,7 @@ def mask_columns(perceptions: Iterable[Perception]) -> dict[str, Any]:
 
 
 def read_masks(folder: Path, *, boxes_only: bool = False) -> Iterator[tuple[Key, ImageMasks]]:
-    """Yield frames and their masks in the order of the frames table; nothing without colour.
+    """Yield frames with a colour image and their masks, in the order of the frames table.
 
     ``boxes_only`` leaves out the run lengths, which make up most of the table.
     """

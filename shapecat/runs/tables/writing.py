@@ -66,7 +66,7 @@ def rows_as_lists(values: F4) -> pa.Array:
 class _Writer(pq.ParquetWriter):  # type: ignore[misc]  # pyarrow has no types
     """Writes row groups with the lists of fixed size that may be null as plain lists.
 
-    Arrow before version 26, and what uses it, cannot read nulls among lists of fixed size.
+    Arrow before version 26, and programs that use it, cannot read nulls among lists of fixed size.
     """
 
     def write_table(self, table: pa.Table) -> None:

@@ -68,7 +68,7 @@ def place_piece(
     Parameters
     ----------
     pose : ``world_from_mesh``, in its stable pose.
-    support : what it stands on, unless that is another object.
+    support : the support that it stands on, unless it stands on another object.
     on_track : the object that it stands on, if any.
     """
     # Every pose of a box counts as upright.

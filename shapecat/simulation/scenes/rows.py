@@ -147,7 +147,7 @@ class _Groups:
 
 
 def _draw_group(category: str, rng: Generator, gap: float, room: F8) -> list[_Place]:
-    """Draw the objects of a group, layer by layer; none if one is larger than ``room``.
+    """Draw the objects of a group, layer by layer; empty if one is larger than ``room``.
 
     ``gap`` between objects and ``room`` (3,) are in metres.
     """
