@@ -43,7 +43,7 @@ def _count(row: F4, start: int, bins: int, place: float, weight: float) -> None:
 
 @kernel(inner=True)
 def _find_bins(lengths: F4, i: int, scale: float, one: float, bins: I4, shares: F4) -> None:
-    """Write, for each length in row i, the first of its two bins, and the fraction of the second.
+    """Write, for each length in row i, the first of its two bins, and the share of the second.
 
     Shares add up to ``one``; ``scale`` is bins per unit of length.
     """

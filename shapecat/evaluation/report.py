@@ -72,8 +72,8 @@ class Report:
     recall : recall of each category.
     confusion : (c, c) number of views of each true category (row) by predicted category (column),
         in the order of ``categories``.
-    novelty : ``n`` unknown shapes, ``rejected``, the fraction of them with a novelty above 1, and
-        ``auroc``; None without unknown shapes.
+    novelty : ``n`` (number of unknown shapes), ``rejected`` (fraction of them with a novelty above
+        1) and ``auroc``; None without unknown shapes.
     rejected_known : fraction of the known shapes with a novelty above 1.
     skipped : number of views with too few points for a surface.
     by_distance, by_points, by_elevation : (range, views, accuracy) over the distance in metres, the

@@ -54,7 +54,7 @@ class LookAhead:
         self._read_from(recording.start_ns)
 
     def read_all(self) -> None:
-        """Hand over all messages that are left, and forget none from now on."""
+        """Hand over all remaining messages; from now on, forget none."""
         self.whole = True
         self._read_until(None)
 

@@ -30,8 +30,8 @@ CONTEXT_FEATURES = np.dtype(
 def measure_borders(segments: Segments, roots: I4) -> F4:
     """Return the lengths of the borders between the merged segments ``roots`` (r,).
 
-    There are four kinds of border, with lengths (4, r, r) in cells: the two are connected, the
-    second is behind the first, the second is in front of it, and they are near but not connected.
+    The result (4, r, r), in cells, is for four kinds of border: the two are connected, the second
+    is behind the first, the second is in front, and they are near but not connected.
     """
     index = np.ix_(roots, roots)
     contact, in_front, near = (segments.pairs[n][index] for n in ("contact", "in_front", "near"))

@@ -119,7 +119,7 @@ def measure_segments(
 
 
 def _blank(size: int) -> Segments:
-    """Return segments without cells."""
+    """Return statistics of segments that have no cells yet."""
     segments = Segments(
         np.zeros((size, size), PAIR),
         np.zeros(size, SEGMENT),

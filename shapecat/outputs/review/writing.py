@@ -87,7 +87,7 @@ def write_review(
     frames : all frames in the order of the recording, with points if their scene is drawn.
     name : name of the recording in the viewer.
     run : the content of run.json.
-    labels : the final label of each track; a review with others is another recording.
+    labels : the final label of each track; other labels give another recording id.
 
     Raises
     ------

@@ -290,7 +290,7 @@ def turned(up: F4, named_from_data: F8) -> F4:
 
 
 def has_z_up(frame_id: str) -> bool:
-    """Return whether z is up in a frame by convention, and the frame thus not one of a camera."""
+    """Return whether a frame has z up by convention, and so does not belong to a camera."""
     return _rank(frame_id) < len(_LEVEL_FRAMES)
 
 
