@@ -185,7 +185,7 @@ class Upright:
         return min((name for name in candidates if name is not None), key=_rank, default=own_frame)
 
     def corrected(self, topic: str, orientation: Orientation) -> Orientation:
-        """Return the orientation of the data on a topic, given the one of the frame they name."""
+        """Return the orientation of the data on a topic, given their named frame's orientation."""
         source, up, pose = orientation
         turn = self.misnamed.get(topic)
         if turn is None:
