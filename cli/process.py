@@ -223,8 +223,8 @@ def _process(
 
     tasks, manifest = batch.tasks, batch.manifest
     workers, cores = share_cores(jobs, sum(task.status != "complete" for task in tasks))
-    if len(tasks) > 1 or batch.repeated:
-        display.plan(describe_plan(tasks, batch.skipped, workers, cores, batch.repeated))
+    if len(tasks) > 1 or batch.skipped or batch.notes:
+        display.plan(describe_plan(tasks, batch.skipped, workers, cores, batch.notes))
     if not tasks:
         display.plan("no recordings in this shard")
     if name == "local" and scheduler is None and workers <= 1:

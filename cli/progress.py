@@ -42,7 +42,7 @@ _SHARES = {
 
 
 def describe_plan(
-    tasks: Sequence["Task"], skipped: int, workers: int, cores: int, repeated: Sequence[str] = ()
+    tasks: Sequence["Task"], skipped: int, workers: int, cores: int, notes: Sequence[str] = ()
 ) -> str:
     """Return a one-line summary of the plan.
 
@@ -50,7 +50,7 @@ def describe_plan(
     ----------
     skipped : number of files that are not recordings.
     workers, cores : recordings processed at once, and frames of each processed at once.
-    repeated : names two paths of each recording that was given twice.
+    notes : as in `SearchResult`.
     """
     counts = Counter(task.status for task in tasks)
     words = _STATUS_WORDS.items()
@@ -59,8 +59,8 @@ def describe_plan(
         parts += [size_words(remaining), plural(workers * cores, "process")]
     if skipped:
         parts.append(f"skipped {plural(skipped, 'file')} of other formats")
-    if repeated:
-        parts.append(listed(repeated))
+    if notes:
+        parts.append(listed(notes))
     return f"{plural(len(tasks), 'recording')}: {'; '.join(parts)}"
 
 

@@ -65,6 +65,24 @@ def test_recording_given_twice_is_named(shapecat: Run, recording: Path, tmp_path
     assert " is " not in again.stderr
 
 
+def test_inputs_without_a_recording_are_named(
+    shapecat: Run, recording: Path, tmp_path: Path
+) -> None:
+    """A disk that was not mounted seemed to be processed."""
+    mount, notes = tmp_path / "mount", tmp_path / "notes.txt"
+    mount.mkdir()
+    notes.write_text("none")
+    words = (recording, "--out", tmp_path / "out", "--no-rrd", "--no-mcap", "--every", 2)
+
+    done = [shapecat("process", *given, *words) for given in ((mount, notes), ())]
+
+    assert [each.exit_code for each in done] == [0, 0]
+    first = done[0].stderr.splitlines()[0]
+    assert first.startswith("1 recording: ")
+    assert first.endswith(f"; skipped 1 file of other formats; no recording in {mount}")
+    assert "no recording" not in done[1].stderr
+
+
 def test_results_do_not_replace_the_recording(shapecat: Run, tmp_path: Path) -> None:
     """A ROS 2 bag in --out has the name of its run folder: it seemed to be in the way."""
     bag, out = record(tmp_path / "in" / "day", 2, container="ros2"), tmp_path / "in"

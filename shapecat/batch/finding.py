@@ -38,12 +38,13 @@ _MAGIC = (b"\x89MCAP", b"#ROSBAG", b"SQLite format 3")
 class SearchResult:
     """The recordings without duplicates, and the number of files skipped.
 
-    ``repeated`` names each path that leads to the same recording as an earlier one.
+    ``notes`` name each path that leads to the same recording as an earlier one, and each folder
+    without a recording, such as a disk that is not mounted.
     """
 
     sources: list[Source]
     skipped: int
-    repeated: list[str]
+    notes: list[str]
 
 
 def find_recordings(sources: Sequence[str]) -> SearchResult:
@@ -62,13 +63,13 @@ def find_recordings(sources: Sequence[str]) -> SearchResult:
     search = search_url if len(sources) == 1 else search_url_beside_others
     remote = {found.url: found for source in sources if is_url(source) for found in search(source)}
     paths = [path for source in sources if not is_url(source) for path in _expanded(source)]
-    local, skipped, repeated = _search_paths(paths)
+    local, skipped, notes = _search_paths(paths)
     found = [_of_path(path, real) for real, path in local.items()] + list(remote.values())
     if not found:
         named = " ".join(sources[:3])
         msg = f"{named}: no recording found; expected .mcap, .bag or .db3 files, or a ROS 2 bag"
         raise RecordingError(msg)
-    return SearchResult(found, skipped, repeated)
+    return SearchResult(found, skipped, notes)
 
 
 def _expanded(source: str) -> list[Path]:
@@ -88,23 +89,27 @@ def _of_path(path: Path, real: Path) -> Source:
 
 
 def _search_paths(sources: Sequence[Path]) -> tuple[dict[Path, Path], int, list[str]]:
-    """Return the recordings, by resolved path, the number of files skipped, and repeated paths."""
+    """Return the recordings, by resolved path, the number of files skipped, and notes."""
     folders = {source for source in sources if source.is_dir() and not _is_bag(source)}
     if len(sources) == 1 and not folders:
         return {_real_path(sources[0]): sources[0]}, 0, []
     found: dict[Path, Path] = {}
     others: dict[Path, Path] = {}  # other paths of recordings, with their resolved paths
     skipped: set[Path] = set()
+    empty = []
     for source in sources:
-        for path in _search(source, set()) if source in folders else [source]:
-            if path.is_file() and not _may_be_recording(path):
-                skipped.add(_real_path(path))
-            elif found.setdefault(real := _real_path(path), path) != path:
+        paths = list(_search(source, set())) if source in folders else [source]
+        recordings = [path for path in paths if not path.is_file() or _may_be_recording(path)]
+        skipped.update(_real_path(path) for path in set(paths).difference(recordings))
+        for path in recordings:
+            if found.setdefault(real := _real_path(path), path) != path:
                 others[path] = real
+        if source in folders and not recordings:
+            empty.append(f"no recording in {source}")
     bags = {real for real, path in found.items() if path.is_dir()}
     kept = {real: path for real, path in found.items() if real.parent not in bags}
     repeated = [f"{path} is {kept[real]}" for path, real in others.items() if real in kept]
-    return kept, sum(real.parent not in bags for real in skipped), repeated
+    return kept, sum(real.parent not in bags for real in skipped), [*repeated, *empty]
 
 
 def _is_bag(folder: Path) -> bool:

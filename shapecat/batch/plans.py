@@ -131,13 +131,13 @@ def part_of(named: Sequence[_NamedSource], index: int, count: int) -> list[_Name
 class Batch:
     """The tasks of a batch, the manifest, and the number of files that are not recordings.
 
-    ``manifest`` is None for a single recording; ``repeated`` is as in `SearchResult`.
+    ``manifest`` is None for a single recording; ``notes`` are as in `SearchResult`.
     """
 
     tasks: list[Task]
     manifest: Manifest | None
     skipped: int
-    repeated: Sequence[str] = ()
+    notes: Sequence[str] = ()
 
 
 @contextmanager
@@ -171,7 +171,7 @@ def plan_batch(
     with open_manifest(out, shard=shard) if len(named) > 1 else nullcontext() as manifest:
         planner = _Planner(job, out, listing, manifest)
         chosen = part_of(named, *part) if part is not None else named
-        yield Batch(planner.tasks(chosen), manifest, found.skipped, found.repeated)
+        yield Batch(planner.tasks(chosen), manifest, found.skipped, found.notes)
 
 
 class _Planner:
