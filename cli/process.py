@@ -96,8 +96,9 @@ if TYPE_CHECKING:
 @click.option(
     "--overwrite",
     is_flag=True,
-    help="Replace earlier results. Corrected labels are transferred to the objects at the same "
-    "places. If only `tracking` or `outputs` settings differ, detection is not repeated.",
+    help="Replace earlier results. Corrected labels of the same recording are transferred to the "
+    "objects at the same places. If only `tracking` or `outputs` settings differ, detection is not "
+    "repeated.",
 )
 @click.option("--discard-labels", is_flag=True, help="With --overwrite: drop corrected labels.")
 @click.option(

@@ -731,6 +731,22 @@ def test_labels_without_match_survive_later_runs(tmp_path: Path) -> None:
     assert kept == {"teapot", "vase"}
 
 
+def test_labels_of_another_recording_wait_until_they_are_asked_for(tmp_path: Path) -> None:
+    """A recording of another day may have the same name: a bowl at the place of a deleted cup."""
+    old = make_run(tmp_path / "lab", {4: static(CUP)}, labels={4: "delete"})
+    new = second(tmp_path / "new", {1: static(CUP)})
+    run = read_run(new)
+
+    keep_labels(new, run, Job(tmp_path / "lab.mcap", old))
+
+    assert labels_of(new) == {1: ""}
+    (missed,) = run["corrections"]["not_transferred"]
+    assert "annotate --by-place --labels tracks.previous.csv" in missed["reason"]
+    assert [labels_in(table) for table in old.glob("tracks.previous-*.csv")] == [{"delete"}]
+    assert not transfer_labels(new / "tracks.previous.csv", new).missed
+    assert labels_of(new) == {1: "delete"}
+
+
 @pytest.mark.parametrize("fixed_frame", ["map", None])
 def test_labels_of_another_version_are_transferred(tmp_path: Path, fixed_frame: str | None) -> None:
     """Its folder could not be replaced, and its labels reached no other run."""

@@ -5,7 +5,7 @@ from pathlib import Path
 import xxhash
 
 from shapecat.errors import OutputError
-from shapecat.runs.folder import OUTPUTS, write_run
+from shapecat.runs.folder import OUTPUTS, read_identity, write_run
 from shapecat.runs.jobs import Job
 from shapecat.runs.labels.corrections import LOST, PREVIOUS, has_labels
 from shapecat.runs.labels.track_table import ORIGINAL
@@ -14,6 +14,8 @@ from shapecat.runs.run_info import RunInfo
 from shapecat.system.files import replacing
 
 __all__ = ["forget_old_labels", "keep_labels", "require_labels"]
+
+_OTHER = f"the recording is another one; `annotate --by-place --labels {PREVIOUS}` transfers labels"
 
 
 def require_labels(job: Job) -> None:
@@ -29,6 +31,9 @@ def require_labels(job: Job) -> None:
 def keep_labels(folder: Path, run: RunInfo, job: Job) -> None:
     """Transfer the corrected labels of the replaced results to the new ones.
 
+    Only labels of the same recording are transferred: in another one, other objects may be at the
+    same places.
+
     The replaced table is kept as tracks.previous.csv. If some labels could not be transferred, a
     copy is also put among the replaced results, from where it passes to all later ones.
 
@@ -42,7 +47,8 @@ def keep_labels(folder: Path, run: RunInfo, job: Job) -> None:
     with replacing(folder / PREVIOUS) as path:
         path.write_bytes(table)
     try:
-        transfer = transfer_labels(job.folder, folder)
+        other = read_identity(job.folder)["input"]["digest"] != run["input"]["digest"]
+        transfer = lost_labels(job.folder, _OTHER) if other else transfer_labels(job.folder, folder)
     except OutputError as error:
         transfer = lost_labels(job.folder, str(error))
     if transfer.missed:
