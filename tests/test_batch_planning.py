@@ -1298,26 +1298,35 @@ def test_new_recording_does_not_get_existing_folder() -> None:
     assert folders == ["a_x_1", "a_x", "b_x"]
 
 
+@pytest.mark.parametrize("state", ["complete", "killed", "failed"])
 @pytest.mark.parametrize(
     ("way", "name"), [("whole", "lab"), ("relative", "lab_2"), ("link", "monday_lab_3")]
 )
 def test_run_keeps_folder_when_recording_of_same_name_is_added(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, way: str, name: str
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, way: str, name: str, state: str
 ) -> None:
     """Otherwise it is processed again without its labels, and counted twice in each export.
 
-    run.json has the absolute path without links, however the user names the recording.
+    run.json has the absolute path without links, however the user names the recording. Work of a
+    killed run would be orphaned, and a recording that fails be a new failure with each command.
     """
     for day in ("monday", "tuesday"):
         (tmp_path / day).mkdir()
         (tmp_path / day / "lab.mcap").write_bytes(day.encode())
     out = str(tmp_path / "out")
     path = str((tmp_path / "monday" / "lab.mcap").resolve())
-    (tmp_path / "out" / name).mkdir(parents=True)
-    write_run(tmp_path / "out" / name, run_info(input={"path": path}))
+    folder = tmp_path / "out" / name
+    folder = partial_path(folder) if state == "killed" else folder
     (tmp_path / "linked").symlink_to(tmp_path)
     monkeypatch.chdir(tmp_path)
     place = {"whole": tmp_path, "relative": Path(), "link": tmp_path / "linked"}[way]
+    if state == "failed":
+        (tmp_path / "out").mkdir()
+        with open_manifest(out) as manifest:
+            manifest.record([Entry(name, str(place / "monday" / "lab.mcap"), "failed")])
+    else:
+        folder.mkdir(parents=True)
+        write_run(folder, run_info(input={"path": path}))
     days = [str(place / day / "lab.mcap") for day in ("tuesday", "monday")]
 
     with plan_batch(Job(Path(), Path()), days, out) as batch:
@@ -1336,7 +1345,7 @@ def test_copy_of_run_keeps_its_name(tmp_path: Path) -> None:
     sources = find_recordings([str(tmp_path / day) for day in ("monday", "tuesday")]).sources
 
     assert existing_names(
-        sources, str(tmp_path / "out"), {"a copy of monday_lab", "monday_lab"}
+        sources, str(tmp_path / "out"), {"a copy of monday_lab", "monday_lab"}, {}
     ) == {0: "monday_lab"}
 
 
@@ -1350,10 +1359,10 @@ def test_recording_of_a_batch_keeps_its_name_alone(tmp_path: Path) -> None:
     write_run(out / name, run_info(input={"path": str(path)}))
     sources = find_recordings([str(path)]).sources
 
-    assert existing_names(sources, str(out), {name}) == {0: name}
-    assert existing_names(sources, str(out), {name, "lab"}) == {}
+    assert existing_names(sources, str(out), {name}, {}) == {0: name}
+    assert existing_names(sources, str(out), {name, "lab"}, {}) == {}
     write_run(out / name, run_info(input={"path": "/another/monday/lab.mcap"}))
-    assert existing_names(sources, str(out), {name}) == {}
+    assert existing_names(sources, str(out), {name}, {}) == {}
 
 
 @pytest.mark.parametrize("known_from", ["all", "1-of-2", "link", "relative path", "run.json"])
@@ -1394,10 +1403,10 @@ def test_recording_at_url_keeps_the_folder_of_its_run() -> None:
     with RemoteManifest(out) as manifest:
         manifest.record([Entry("lab", sources[1].url, "complete")])
 
-    assert existing_names(sources, out, {"lab"}) == {1: "lab"}
+    assert existing_names(sources, out, {"lab"}, {}) == {1: "lab"}
     for content in (b"[", b"[" * 100_000):  # a run that cannot be read
         (Location(out) / "monday_lab" / "run.json").write(content)
-        assert existing_names(sources, out, {"lab", "monday_lab"}) == {1: "lab"}
+        assert existing_names(sources, out, {"lab", "monday_lab"}, {}) == {1: "lab"}
 
 
 def test_numbered_folder_name_may_already_be_taken() -> None:

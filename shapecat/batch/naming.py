@@ -15,10 +15,13 @@ from shapecat.batch.sources import Source
 from shapecat.batch.storage import Location, is_url
 from shapecat.errors import ShapecatError
 from shapecat.runs.folder import read_identity
+from shapecat.system.files import partial_path
 
 __all__ = ["existing_names", "name_folders"]
 
 _NUMBER = re.compile(r"_\d+$")
+_PARTIAL = re.compile(re.escape(partial_path(Path("*")).name).replace(r"\*", "(.+)"))
+"""The names of interrupted runs."""
 
 
 def name_folders(
@@ -54,15 +57,19 @@ def name_folders(
     return folders
 
 
-def existing_names(sources: Sequence[Source], out: str, listing: set[str]) -> dict[int, str]:
+def existing_names(
+    sources: Sequence[Source], out: str, listing: set[str], noted: Mapping[str, Entry]
+) -> dict[int, str]:
     """Return the names of the run folders that recordings, by index, already have in ``out``.
 
-    A recording that comes to a batch later, or is processed alone, must not rename a run.
-    Recordings whose name is in ``out`` and shared by no other recording are left out.
+    A recording that comes to a batch later, or is processed alone, must not rename a run, nor an
+    interrupted or failed one. Recordings whose name is in ``out`` and shared by no other recording
+    are left out.
 
     Parameters
     ----------
     listing : the names in ``out``.
+    noted : entries of the manifest in a folder; at a URL, those of all shards are read.
     """
     counts = Counter(source.stem for source in sources)
     ambiguous = {
@@ -72,17 +79,29 @@ def existing_names(sources: Sequence[Source], out: str, listing: set[str]) -> di
     }
     some = [sources[k] for k in ambiguous.values()]
     possible = {name for s in some for name in (s.stem, f"{s.parent}_{s.stem}")}
-    folders = sorted(n for n in listing if n in possible or _NUMBER.sub("", n) in possible)
-    entries = entries_at(out) if folders and is_url(out) else {}
+    partial = {match[1] for match in map(_PARTIAL.fullmatch, listing) if match}
+    names = {*listing, *partial, *noted}
+    folders = sorted(n for n in names if n in possible or _NUMBER.sub("", n) in possible)
+    entries = entries_at(out) if folders and is_url(out) else noted
+    recording_of = _recording_at_url if is_url(out) else _recording_in
     existing: dict[int, str] = {}
     for folder in folders:
-        k = ambiguous.get(_recording_of(out, folder, entries.get(folder)))
+        k = ambiguous.get(recording_of(out, folder, entries.get(folder)))
         if k is not None:
             existing.setdefault(k, folder)
     return existing
 
 
-def _recording_of(out: str, name: str, entry: Entry | None) -> str:
+def _recording_in(out: str, name: str, entry: Entry | None) -> str:
+    """Return the path or URL of the recording of a run, also of one only begun, else empty."""
+    for folder in (Path(out, name), partial_path(Path(out, name))):
+        with suppress(ShapecatError):
+            return read_identity(folder)["input"]["path"]
+    recording = entry.recording if entry is not None else ""
+    return recording if is_url(recording) or not recording else os.path.realpath(recording)
+
+
+def _recording_at_url(out: str, name: str, entry: Entry | None) -> str:
     """Return the path or URL of the recording of a run; empty if there is no readable run."""
     recording = entry.recording if entry is not None else ""
     if is_url(recording):
@@ -90,8 +109,6 @@ def _recording_of(out: str, name: str, entry: Entry | None) -> str:
     if Path(recording).is_absolute():  # other paths depend on the current folder
         return os.path.realpath(recording)
     with suppress(ShapecatError, ValueError, LookupError, TypeError, RecursionError):
-        if not is_url(out):
-            return read_identity(Path(out, name))["input"]["path"]
         content = (Location(out) / name / "run.json").read() or b"{}"
         return str(json.loads(content)["input"]["path"])
     return ""

@@ -166,9 +166,10 @@ def plan_batch(
     found = find_recordings(sources)
     listing = Location(out, OutputError).names() if is_url(out) else _names_in(Path(out))
     stems, parents = [s.stem for s in found.sources], [s.parent for s in found.sources]
-    names = name_folders(stems, parents, existing_names(found.sources, out, listing))
-    named = list(zip(names, found.sources, strict=True))
-    with open_manifest(out, shard=shard) if len(named) > 1 else nullcontext() as manifest:
+    with open_manifest(out, shard=shard) if len(stems) > 1 else nullcontext() as manifest:
+        noted = manifest.entries if manifest is not None else {}
+        names = name_folders(stems, parents, existing_names(found.sources, out, listing, noted))
+        named = list(zip(names, found.sources, strict=True))
         planner = _Planner(job, out, listing, manifest)
         chosen = part_of(named, *part) if part is not None else named
         yield Batch(planner.tasks(chosen), manifest, found.skipped, found.notes)
