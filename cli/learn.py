@@ -14,9 +14,12 @@ from .render import note_skipped, print_json, progress_bars
 @click.argument("model", type=ANY_PATH)
 @click.argument("dataset", type=ANY_PATH)
 @click.option("--out", type=ANY_PATH, required=True, help="Model file to write.")
+@click.option("--overwrite", is_flag=True, help="Replace an existing model.")
 @seed_option
 @json_option
-def learn(*, model: Path, dataset: Path, out: Path, seed: int, as_json: bool) -> None:
+def learn(
+    *, model: Path, dataset: Path, out: Path, overwrite: bool, seed: int, as_json: bool
+) -> None:
     """Add the new categories of a data set to a model.
 
     MODEL is a model file, or `default` for the model that comes with shapecat. Its existing
@@ -31,7 +34,7 @@ def learn(*, model: Path, dataset: Path, out: Path, seed: int, as_json: bool) ->
     from shapecat.learning import require_model_path
 
     source = None if str(model) == "default" else model
-    require_model_path(out)
+    require_model_path(out, overwrite=overwrite)
     with progress_bars() as bars:
         result = learn_on_folder(source, dataset, out, seed=seed, observe=bars)
     note_skipped(result)

@@ -13,9 +13,10 @@ from .render import note_skipped, print_json, progress_bars
 @click.command()
 @click.argument("dataset", type=ANY_PATH)
 @click.option("--out", type=ANY_PATH, required=True, help="Model file to write.")
+@click.option("--overwrite", is_flag=True, help="Replace an existing model.")
 @seed_option
 @json_option
-def train(*, dataset: Path, out: Path, seed: int, as_json: bool) -> None:
+def train(*, dataset: Path, out: Path, overwrite: bool, seed: int, as_json: bool) -> None:
     """Train a model on labelled views of objects.
 
     DATASET holds one file per view, <category>/<instance>/<view>.pcd (or .ply, .npz): the points of
@@ -30,7 +31,7 @@ def train(*, dataset: Path, out: Path, seed: int, as_json: bool) -> None:
     from shapecat.evaluation.training import train_on_folder
     from shapecat.learning import require_model_path
 
-    require_model_path(out)
+    require_model_path(out, overwrite=overwrite)
     with progress_bars() as bars:
         result = train_on_folder(dataset, out, seed=seed, observe=bars)
     note_skipped(result)

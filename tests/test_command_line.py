@@ -24,6 +24,7 @@ from click.testing import Result
 
 from shapecat.api import open_recording
 from shapecat.errors import RecordingError
+from shapecat.learning import load_model, save_model
 from shapecat.runs.folder import read_run
 from shapecat.system.standard_streams import forgive_stderr, require_stdout
 from tests.processes import descendants, wait_for
@@ -225,6 +226,25 @@ def test_unwritable_output_is_refused_before_reading_data(
     assert result.exit_code in {1, 2}
     assert "cannot be written" in result.stderr
     assert result.stderr.count("\n") == 1
+
+
+@pytest.mark.parametrize("command", [("learn", "default"), ("train",)])
+def test_existing_model_is_kept_unless_overwritten(
+    shapecat: Run, tmp_path: Path, command: tuple[str, ...]
+) -> None:
+    """A model of hours of labelling was replaced without a word. The data set does not exist."""
+    model = tmp_path / "mine.npz"
+    save_model(model, load_model())
+    content = model.read_bytes()
+    words = (*command, tmp_path / "none", "--out", model)
+
+    for option, said in (((), "exists already; choose another --out, or --overwrite it"),
+                         (("--overwrite",), "none")):  # fmt: skip
+        result = shapecat(*words, *option)
+        assert result.exit_code in {1, 3}
+        assert said in result.stderr
+        assert ("exists already" in result.stderr) == (not option)
+    assert model.read_bytes() == content
 
 
 def test_missing_parent_folders_are_created(tmp_path: Path) -> None:

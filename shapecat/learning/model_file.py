@@ -63,23 +63,32 @@ def save_model(path: Path, categorizer: Categorizer) -> None:
         hidden.write_bytes(buffer.getvalue())
 
 
-def require_model_path(path: Path) -> None:
+def require_model_path(path: Path, *, overwrite: bool = True) -> None:
     """Check that a model can be written to a path, and replaces nothing but a model.
 
     Raises
     ------
-    OutputError : it cannot be written, or the file exists and is not a model.
+    OutputError : it cannot be written, or the file exists and is not a model, or no model may be
+        replaced.
     """
     require_writable(path)
     with explained(f"{path}: cannot be read", OutputError):
         if not path.exists() or not path.stat().st_size:
             return
-        if zipfile.is_zipfile(path):
-            with suppress(zipfile.BadZipFile), zipfile.ZipFile(path) as archive:
-                if _HEADER in archive.namelist():
-                    return
+        is_model = _is_model(path)
+    if is_model and overwrite:
+        return
     msg = f"{path}: exists and is not a model; choose another --out, or move it away"
+    if is_model:
+        msg = f"{path}: exists already; choose another --out, or --overwrite it"
     raise OutputError(msg)
+
+
+def _is_model(path: Path) -> bool:
+    if zipfile.is_zipfile(path):
+        with suppress(zipfile.BadZipFile), zipfile.ZipFile(path) as archive:
+            return _HEADER in archive.namelist()
+    return False
 
 
 def _write_member(archive: zipfile.ZipFile, name: str, content: bytes) -> None:
