@@ -48,8 +48,8 @@ class DetectionSettings:
         """Reject numbers that are out of range."""
         _check_range("detection.max_range_m", self.max_range_m, 0.01, 1000.0)
         _check_range("detection.fuse_frames", self.fuse_frames, 1, 30)
-        _check_least("detection.max_height_m", self.max_height_m, 0.025)
-        _check_least("detection.max_size_m", self.max_size_m, 0.001)
+        _check_range("detection.max_height_m", self.max_height_m, 0.025, 10.0)  # not millimetres
+        _check_range("detection.max_size_m", self.max_size_m, 0.001, 10.0)
         _check_least("detection.min_points", self.min_points, 1)
 
 
@@ -114,7 +114,7 @@ class TrackingSettings:
 
     def __post_init__(self) -> None:
         """Reject numbers that are out of range."""
-        _check_least("tracking.gate_m", self.gate_m, 0.001)
+        _check_range("tracking.gate_m", self.gate_m, 0.001, 10.0)
         _check_least("tracking.min_hits", self.min_hits, 1)
 
 
