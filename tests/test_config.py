@@ -86,8 +86,8 @@ def test_numbers_of_numpy_are_settings() -> None:
         ("surface.voxel_m=0", "surface.voxel_m must be from 0.0001 to 0.02, got 0.0"),
         ("surface.voxel_m=0.5", "to 0.02, got 0.5"),  # all objects would be unknown
         ("surface.neurons=3", "from 20 to 512, got 3"),  # the same
-        ("detection.max_height_m=0.02", "from 0.025 to 10.0, got 0.02"),
-        ("tracking.gate_m=120", "from 0.001 to 10.0, got 120"),  # no object would be found
+        ("detection.max_height_m=0.02", "from 0.025 to 10.0, got 0.02"),  # no object would be found
+        ("tracking.gate_m=120", "from 0.001 to 10.0, got 120"),  # millimetres
         ("surface.signals=6", "must be at least 100, got 6"),  # the same
         ("surface.smooth_radius_m=1.0", "to 0.1, got 1.0"),
         ("surface.smooth_radius_m=1e-9", "if not 0, must be from 0.0001"),
