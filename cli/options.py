@@ -72,7 +72,10 @@ set_option = click.option(
     help="Change a setting, for example detection.max_range_m=1.5. Repeatable.",
 )
 model_option = click.option(
-    "--model", type=ANY_PATH, help="Model file; by default the model that comes with shapecat."
+    "--model",
+    type=ANY_PATH,
+    callback=lambda _ctx, _param, path: None if path == Path("default") else path,
+    help="Model file; by default `default`, the model that comes with shapecat.",
 )
 
 

@@ -10,6 +10,7 @@ from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
 
+import click
 import pytest
 from click.testing import Result
 
@@ -457,6 +458,31 @@ CALLS = {
     ),
 }  # fmt: skip
 """By command line: the called function, its arguments, its result, and the printed text."""
+
+
+@pytest.mark.parametrize(
+    ("line", "target"),
+    [
+        ("evaluate data", "shapecat.evaluation.evaluate_folder"),
+        ("process a.mcap --out o", "shapecat.batch.plans.plan_batch"),
+    ],
+)
+@pytest.mark.parametrize(("option", "model"), [("default", None), ("m.npz", Path("m.npz"))])
+def test_default_names_the_model_of_shapecat(
+    shapecat: Run, monkeypatch: pytest.MonkeyPatch, line: str, target: str, option: str, model: Any
+) -> None:
+    """`learn default` works; the same word after --model was taken for a missing file."""
+    calls: list[Any] = []
+
+    def stub(*arguments: Any, **_: Any) -> Any:
+        calls.append(arguments)
+        raise click.Abort
+
+    monkeypatch.setattr(target, stub)
+    shapecat(*line.split(), "--model", option)
+
+    (arguments,) = calls
+    assert (arguments[0].model if "process" in line else arguments[1]) == model
 
 
 @pytest.mark.parametrize("line", CALLS)
