@@ -28,7 +28,7 @@ from shapecat.rehearsal import compile_all
 from shapecat.runs.jobs import Job
 from shapecat.system.progress import Observer, ignore
 from shapecat.system.scripts import runs_again
-from shapecat.types import Frame
+from shapecat.types import Camera, Frame
 
 __all__ = [
     "OpenRecording",
@@ -182,7 +182,7 @@ def process(
 
 def perceive(
     reading: ArrayLike,
-    intrinsics: ArrayLike | None = None,
+    intrinsics: ArrayLike | Camera | None = None,
     *,
     up: Sequence[float] | None = None,
     model: str | Path | None = None,
@@ -199,14 +199,16 @@ def perceive(
     reading : a depth image (h, w) along the optical axis, floats in metres or integers in
         millimetres; or points (n, 3) or (h, w, 3) in the sensor frame, metres. Zero, negative and
         non-finite depth, non-finite points, and values that NumPy masks are missing.
-    intrinsics : fx, fy, cx, cy of the depth image, pixels, or its camera matrix (3, 3).
+    intrinsics : fx, fy, cx, cy of the depth image, pixels, or its camera matrix (3, 3), or the
+        `Camera` of a frame.
     up : (3,) up direction in the sensor frame; None to estimate it from planes.
     model, config, settings : as for `process`.
 
     Returns
     -------
     A frame like the frames of a run. The track of each object is its number in the frame, from 1;
-    posterior and confidence come from this view alone.
+    posterior and confidence come from this view alone. If ``labelled.planes`` is empty,
+    ``labelled.up`` is not an estimate, but ``up`` or, without it, the default (0, -1, 0).
 
     Raises
     ------

@@ -301,6 +301,10 @@ class OnGpu:
         (IMAGE, {"intrinsics": (5, 5, 3, 20)}, "fx, fy, cx, cy in pixels of an image 6 x 4"),
         (IMAGE, {"intrinsics": (0, 5, 3, 2)}, "fx, fy, cx, cy in pixels of an image 6 x 4"),
         (IMAGE, {"intrinsics": (5, np.nan, 3, 2)}, "fx, fy, cx, cy in pixels of an image 6 x 4"),
+        # Divided by the size of the image, and the camera of another image:
+        (np.ones((48, 64)), {"intrinsics": (0.8, 1.1, 0.5, 0.5)}, "in pixels of an image 64 x 48"),
+        (np.ones((48, 64)), {"intrinsics": (60, 1.1, 32, 24)}, "in pixels of an image 64 x 48"),
+        (IMAGE, {"intrinsics": Camera(4, 6, 5, 5, 2, 3)}, r"of an image 6 x 4.* got Camera\("),
         *(
             (IMAGE, {"intrinsics": wrong}, r"image 6 x 4, or its camera matrix \(3, 3\), got")
             for wrong in (
@@ -336,12 +340,13 @@ def test_perceive_rejects_invalid_input(
         shapecat.perceive(reading, **options)
 
 
-def test_camera_matrix_equals_four_numbers() -> None:
+def test_camera_matrix_and_camera_equal_four_numbers() -> None:
     matrix = np.array([[61.0, 0, 33], [0, 62, 25], [0, 0, 1]])
-    for given in (matrix, matrix.tolist(), matrix[[0, 1, 0, 1], [0, 1, 2, 2]]):
+    same = Camera(64, 48, 61, 62, 33, 25)
+    for given in (matrix, matrix.tolist(), matrix[[0, 1, 0, 1], [0, 1, 2, 2]], same):
         camera = shapecat.perceive(np.zeros((48, 64)), given).reading.camera
 
-        assert camera == Camera(64, 48, 61, 62, 33, 25)
+        assert camera == same
 
 
 def test_crop_of_image_is_perceived() -> None:
@@ -478,8 +483,9 @@ def test_model_of_another_version_is_refused(tmp_path: Path) -> None:
 def test_empty_depth_image_has_no_objects(reading: Any) -> None:
     result = shapecat.perceive(reading, (60, 60, 32, 24))
 
-    assert result.objects == ()
+    assert (result.objects, result.labelled.planes) == ((), ())
     assert (result.labels == -1).all()
+    assert result.labelled.up.tolist() == [0, -1, 0]  # the default, says `perceive`
 
 
 def test_table_columns_become_arrays(page_folder: Path) -> None:

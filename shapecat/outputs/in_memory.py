@@ -22,9 +22,11 @@ _FARTHEST_M = 100.0
 """Values whose median depth, or coordinate, is larger are not in metres."""
 _FIXED = ([0, 1, 2, 2, 2], [1, 0, 0, 1, 2])
 """The elements of a camera matrix that are the same for all cameras, without skew."""
+_SHORTEST = 0.05
+"""A focal length that is at most this fraction of the image's side is not in pixels."""
 
 
-def frame_of(reading: ArrayLike, intrinsics: ArrayLike | None = None) -> Frame:
+def frame_of(reading: ArrayLike, intrinsics: ArrayLike | Camera | None = None) -> Frame:
     """Return a depth image or points as a frame, with stamp 0.
 
     Parameters
@@ -65,15 +67,18 @@ def frame_of(reading: ArrayLike, intrinsics: ArrayLike | None = None) -> Frame:
     return frame(depth=depth, camera=_camera(intrinsics, *depth.shape))
 
 
-def _camera(intrinsics: ArrayLike, height: int, width: int) -> Camera:
+def _camera(intrinsics: ArrayLike | Camera, height: int, width: int) -> Camera:
     """Return the camera of an image; refuse intrinsics that are malformed or implausible."""
+    if isinstance(intrinsics, Camera) and (intrinsics.width, intrinsics.height) == (width, height):
+        return intrinsics
     with suppress(TypeError, ValueError):  # not numbers, or rows of different lengths
         values = np.asarray(intrinsics, np.float64)
         if values.shape == (3, 3) and (values[_FIXED] == np.eye(3)[_FIXED]).all():
             values = values[[0, 1, 0, 1], [0, 1, 2, 2]]
         if values.shape == (4,) and np.isfinite(values).all():
             fx, fy, cx, cy = values.tolist()
-            if min(fx, fy) > 0 and abs(cx) <= 3 * width and abs(cy) <= 3 * height:
+            in_pixels = fx > _SHORTEST * width and fy > _SHORTEST * height
+            if in_pixels and abs(cx) <= 3 * width and abs(cy) <= 3 * height:
                 return Camera(width, height, fx, fy, cx, cy)
     msg = (
         f"expected fx, fy, cx, cy in pixels of an image {width} x {height}, or its camera matrix "
