@@ -7,7 +7,7 @@ import click
 from shapecat.outputs.counts import plural
 
 from .options import ANY_PATH, json_option, model_option
-from .render import print_json, progress_bars
+from .render import note_off_support, print_json, progress_bars
 
 
 @click.command()
@@ -59,6 +59,7 @@ def evaluate(
         require_writable(page)
     with progress_bars() as bars:
         report = evaluate_folder(dataset, model, baselines=baselines, observe=bars)
+    note_off_support(report.off_support)
     if page is not None:
         name = dataset.resolve().name  # resolved, so that `.` has a name
         write_page(page, report, title=f"{name}: {plural(report.n, 'view')}")

@@ -111,8 +111,19 @@ def discard_stdout() -> None:
     os.dup2(os.open(os.devnull, os.O_WRONLY), 1)
 
 
+def note_off_support(categories: Sequence[str]) -> None:
+    """Print to stderr the categories of a data set whose views are probably in another frame."""
+    if categories:
+        text = "most views do not stand at z = 0: z must point up, with the support at z = 0"
+        click.echo(f"Warning: {', '.join(categories)}: {text}", err=True)
+
+
 def note_skipped(learned: Mapping[str, Any]) -> None:
-    """Print to stderr how many views `train` or `learn` skipped, and the categories without any."""
+    """Print to stderr the defects of the views from which `train` or `learn` has learned.
+
+    These are the number of skipped views, the categories without any, and wrong frames.
+    """
+    note_off_support(learned["off_support"])
     if learned["skipped"]:
         none = f"; no views remain of {', '.join(learned['lost'])}" if learned["lost"] else ""
         views = plural(learned["skipped"], "view")

@@ -420,14 +420,15 @@ CALLS = {
         "shapecat.evaluation.training.learn_on_folder",
         [None, Path("data"), Path("m.npz")],
         {"seed": 5},
-        {"added": ["jar", "mug"], "views": 1075, "skipped": 0},
+        {"added": ["jar", "mug"], "views": 1075, "skipped": 0, "off_support": []},
         "m.npz: learned jar, mug from a data set of 1,075 views\n",
     ),
     "train data --out m.npz --seed 5": (
         "shapecat.evaluation.training.train_on_folder",
         [Path("data"), Path("m.npz")],
         {"seed": 5},
-        {"categories": ["cup", "can"], "views": 1, "skipped": 0, "calibrated": True},
+        {"categories": ["cup", "can"], "views": 1, "skipped": 0, "calibrated": True,
+         "off_support": []},
         "m.npz: 1 view of cup, can\n",
     ),
     "export a b --format coco --out o --every 3 --per-track 7 --min-confidence 0.6 "
@@ -526,7 +527,10 @@ def test_train_names_the_defects_of_its_model(
     shapecat: Run, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, answer: Any, said: str
 ) -> None:
     """Users would trust the confidences, and look for the missing categories in vain."""
-    good = {"categories": ["cup", "can"], "views": 2, "calibrated": True, "skipped": 0, "lost": []}
+    good = {
+        "categories": ["cup", "can"], "views": 2, "calibrated": True, "skipped": 0, "lost": [],
+        "off_support": [],
+    }  # fmt: skip
     target = "shapecat.evaluation.training.train_on_folder"
     monkeypatch.setattr(target, lambda *_, **__: good | answer)
     done = shapecat("train", "data", "--out", tmp_path / "m.npz")

@@ -310,6 +310,37 @@ def test_categories_without_usable_views_are_named(trained: Path, tmp_path: Path
     assert (done["lost"], done["skipped"], done["categories"]) == (["pen"], 3, ["box", "ball"])
 
 
+def test_views_in_another_frame_are_noticed(
+    shapecat: Callable[..., Result], trained: Path, tmp_path: Path
+) -> None:
+    """A category learned from clouds in the frame of the camera recognizes nothing."""
+    dataset = write_dataset(tmp_path / "data", ("ball", "plate", "unknown"), instances=2)
+    plates, model = list((dataset / "plate").glob("*/*.npz")), tmp_path / "m.npz"
+    shift(dataset / "ball" / "ball_0" / "1.npz", -0.06)
+    shift(plates[0], 0.06)  # most are right
+    for view in plates[1:]:
+        shift(view, 0.045)
+    upright = shapecat("learn", trained, dataset, "--out", tmp_path / "right.npz")
+    for view in plates[1:]:
+        shift(view, -0.1)
+
+    answers = [
+        shapecat("learn", trained, dataset, "--out", model),
+        shapecat("train", dataset, "--out", tmp_path / "trained.npz"),
+        shapecat("evaluate", dataset, "--model", model),
+    ]
+
+    said = "Warning: plate: most views do not stand at z = 0: z must point up, with the support at"
+    assert [(each.exit_code, each.stderr.count(said)) for each in answers] == [(0, 1)] * 3
+    assert (upright.exit_code, upright.stderr) == (0, "")
+
+
+def shift(view: Path, by_m: float) -> None:
+    """Move the points and the viewpoint of a view along z."""
+    content = np.load(view)
+    np.savez(view, **{name: content[name] + [0, 0, by_m] for name in ("points", "viewpoint")})
+
+
 def test_evaluation_on_untrained_category_raises(trained: Path, tmp_path: Path) -> None:
     """Counted as wrong, it would distort the metrics without notice."""
     dataset = write_dataset(tmp_path / "data", ("plate",), instances=1)

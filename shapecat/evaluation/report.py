@@ -76,6 +76,7 @@ class Report:
         1) and ``auroc``; None without unknown shapes.
     rejected_known : fraction of the known shapes with a novelty above 1.
     skipped : number of views with too few points for a surface.
+    off_support : categories of which most views do not stand at z = 0.
     by_distance, by_points, by_elevation : (range, views, accuracy) over the distance in metres, the
         number of voxels, and the elevation of the sensor in degrees.
     fused : accuracy after fusing several views; empty if no object has three views.
@@ -93,6 +94,7 @@ class Report:
     novelty: dict[str, float | None] | None = None
     rejected_known: float | None = None
     skipped: int = 0
+    off_support: tuple[str, ...] = ()
     calibration: tuple[metrics.Bin, ...] = ()
     by_distance: Ranges = ()
     by_points: Ranges = ()
@@ -159,6 +161,7 @@ def evaluate(views: DescribedViews, categorizer: Categorizer) -> Report:
         novelty=novelty,
         rejected_known=_defined(_mean(prediction.novelty[known] > 1)),
         skipped=views.skipped,
+        off_support=views.off_support,
         calibration=metrics.calibration_curve(truth, posteriors),
         by_distance=_accuracy_over(views.distances[known], truth == predicted, _DISTANCES_M, " m"),
         by_points=_accuracy_over(views.points[known], truth == predicted, _POINTS, ""),

@@ -46,8 +46,9 @@ def train_on_folder(
     Returns
     -------
     Plain values: ``views``, ``skipped``, ``lost`` (categories of which all views were skipped),
-    ``categories``, ``model`` (its id), ``calibrated`` (whether enough instances were held out to
-    fit the temperature), and ``held_out`` (the report on them).
+    ``off_support`` (categories of which most views do not stand at z = 0), ``categories``,
+    ``model`` (its id), ``calibrated`` (whether enough instances were held out to fit the
+    temperature), and ``held_out`` (the report on them).
 
     Raises
     ------
@@ -184,6 +185,7 @@ def _summary(views: DescribedViews, lost: list[str], model: Categorizer) -> dict
         "views": len(views.labels),
         "skipped": views.skipped,
         "lost": lost,
+        "off_support": list(views.off_support),
         "categories": list(model.categories),
         "model": model.model_id,
     }

@@ -17,6 +17,8 @@ from shapecat.system.progress import Observer, ignore
 __all__ = ["DescribedViews", "describe_view", "describe_views"]
 
 _NOT_ASKED = np.zeros(0)
+_NEAR_SUPPORT_M = 0.05
+"""Largest distance of an object's lowest point from its support; below it may be occluded."""
 
 
 class DescribedViews(NamedTuple):
@@ -32,6 +34,8 @@ class DescribedViews(NamedTuple):
     elevations : (n,) elevation of the sensor as seen from the object, degrees; may be empty.
     functions : (n, f) shape distributions from `shapecat.evaluation.shape_functions`; may
         be empty.
+    off_support : categories of which most views, also skipped ones, have their lowest point farther
+        than `_NEAR_SUPPORT_M` from z = 0, so that they are probably in another frame.
     """
 
     descriptors: F4
@@ -42,13 +46,14 @@ class DescribedViews(NamedTuple):
     skipped: int = 0
     elevations: np.ndarray = _NOT_ASKED
     functions: F4 = _NOT_ASKED
+    off_support: tuple[str, ...] = ()
 
     def where(self, chosen: np.ndarray) -> "DescribedViews":
         """Return the views that a mask (n,) or indices select."""
         columns = {
             name: value[chosen]
             for name, value in self._asdict().items()
-            if name != "skipped" and len(value) == len(self.labels)
+            if name not in {"skipped", "off_support"} and len(value) == len(self.labels)
         }
         return self._replace(**columns)
 
@@ -90,8 +95,11 @@ def describe_views(
     """
     described_views: list[tuple[DescribedView, str, str, float, float]] = []
     functions: list[F4] = []
+    near_support: dict[str, list[bool]] = {}
     count = 0
     for count, view in enumerate(views, start=1):
+        lowest = abs(float(view.points[:, 2].min()))
+        near_support.setdefault(view.category, []).append(lowest <= _NEAR_SUPPORT_M)
         described = describe_view(
             view, settings=settings, rng=np.random.default_rng((settings.seed, count))
         )
@@ -115,4 +123,5 @@ def describe_views(
         skipped=count - len(described_views),
         elevations=np.array([item[4] for item in described_views]),
         functions=np.array(functions, np.float32) if with_functions else _NOT_ASKED,
+        off_support=tuple(name for name, near in near_support.items() if 2 * sum(near) < len(near)),
     )
