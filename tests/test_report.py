@@ -75,6 +75,7 @@ def test_every_track_has_card_with_pictures(reported_run: Path) -> None:
     assert text.count("<polyline") >= len(table.rows)
     assert [row["track"] for row in data_of(text)["rows"]] == [str(r.track) for r in table.rows]
     assert "drawn from their meshes" not in text
+    assert text.count(", shaded depth</span>") == text.count('class="caption"') == 8
 
 
 def test_page_loads_no_external_files(reported_run: Path) -> None:

@@ -123,13 +123,16 @@ def test_card_has_right_values() -> None:
 def test_strip_boxes_have_right_positions(topics: tuple[str, str]) -> None:
     """Left and width are fractions of the width, top and height of the height.
 
-    Topics are named if there are several. Captions of frames less than 0.1 s apart differ.
+    Topics are named if there are several. Captions of frames less than 0.1 s apart differ, and say
+    what the colours mean.
     """
     boxes = {17: (50, 30, 20, 15), 99: (1, 2, 3, 4)}
     few = StripFrame("data:few", 200, 100, 0.52, topics[0], boxes)
     many = StripFrame("data:many", 100, 80, 3.48, topics[1], {k: (k, 4, 8, 6) for k in range(5)})
+    many = many._replace(shaded=True)
     strip = _strip([few, many], [worked_card()])
     names = ["0.52 s /d", "3.48 s /e"] if topics[0] != topics[1] else ["0.52 s", "3.48 s"]
+    names[1] += ", shaded depth"
 
     assert text_of(strip) == ["#17", "can", names[0], names[1]]  # 99 has no card
     assert re.findall(r'data-track="(\d+)" style="(.*?)"', strip) == [

@@ -197,6 +197,7 @@ def frame_html(frame: StripFrame, categories: Mapping[int, str], *, several: boo
     several : whether the run has several topics, so that the caption names the topic.
     """
     name = f"{frame.seconds:.2f} s" + (f" {frame.topic}" if several else "")
+    name += ", shaded depth" if frame.shaded else ""
     boxes = "".join(
         _box(frame, track, box, categories[track])
         for track, box in frame.boxes.items()

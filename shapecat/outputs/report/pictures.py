@@ -45,7 +45,8 @@ class TrackPictures(NamedTuple):
 class StripFrame(NamedTuple):
     """A frame as a data URI, its size, and its time in seconds since the first frame.
 
-    ``boxes`` are left, top, width and height of each track, in pixels of the picture.
+    ``boxes`` are left, top, width and height of each track, in pixels of the picture. ``shaded``
+    says whether it is a shaded depth image, not a colour image.
     """
 
     image: str
@@ -54,6 +55,7 @@ class StripFrame(NamedTuple):
     seconds: float
     topic: str
     boxes: Mapping[int, tuple[float, float, float, float]]
+    shaded: bool = False
 
 
 @dataclass(frozen=True)
@@ -155,7 +157,8 @@ def _strip_frame(labelled: LabelledFrame, image: FramePicture, seconds: float) -
         for item, mask in zip(labelled.objects, image.masks, strict=True)
         if mask.pixels.size
     }
-    return StripFrame(uri, width, height, seconds, labelled.topic, boxes)
+    shaded = image.colour is None
+    return StripFrame(uri, width, height, seconds, labelled.topic, boxes, shaded)
 
 
 def _snapshot(labelled: LabelledFrame, frame: Frame | None, item: LabelledObject) -> Snapshot:
