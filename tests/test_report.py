@@ -262,6 +262,27 @@ def test_damaged_run_does_not_prevent_pages_of_others(shapecat: Run, run: Path) 
     assert not index.exists()
 
 
+@pytest.mark.usefixtures("without_pictures")
+def test_index_names_recordings_that_failed(shapecat: Run, run: Path) -> None:
+    """A page of the runs alone looks as if the batch had been complete."""
+    states = [
+        ("table", "failed"),  # done since, by a command for it alone
+        ("b", "planned"), ("b", "failed"), ("c", "failed"), ("c", "complete"),
+        ("<a>", "failed"), ("d", "running"),
+    ]  # fmt: skip
+    lines = [json.dumps({"folder": name, "state": state}) for name, state in states]
+    manifest = run.parent / "manifest.jsonl"
+    manifest.write_text("\n".join(['[{"', "7", *lines, '{"folder": "e", "sta']))
+    done = [shapecat("report", run.parent)]
+    index = (run.parent / "index.html").read_text("utf-8")
+    manifest.unlink()
+    done += [shapecat("report", run.parent)]
+
+    assert [each.exit_code for each in done] == [0, 0]
+    assert "<li>⚠ 2 recordings failed: &lt;a&gt;, b (manifest.jsonl)</li>" in index
+    assert "failed" not in (run.parent / "index.html").read_text("utf-8")
+
+
 def decode(image: str) -> np.ndarray:
     opened = Image.open(io.BytesIO(base64.b64decode(image.partition(",")[2])))
     return np.asarray(opened.convert("RGBA")).astype(int)
@@ -471,6 +492,7 @@ def test_frames_and_crops_are_in_colour(coloured_run: Path, tmp_path: Path) -> N
     colours = [decode(item.crop.image)[..., :3] for item in pictures.tracks.values() if item.crop]
 
     assert len(pictures.frames) == 4
+    assert not any(frame.shaded for frame in pictures.frames)
     assert image.shape[:2] == (frame.height, frame.width)
     difference = np.abs(recorded(run, frame.seconds) - image[..., :3])
     assert np.quantile(difference, 0.999) <= 30  # loss of WebP; the next frame differs by 77

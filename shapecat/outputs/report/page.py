@@ -109,8 +109,8 @@ def run_page(
     )
 
 
-def index_page(title: str, runs: Sequence[Listed]) -> str:
-    """Return the page that lists several runs."""
+def index_page(title: str, runs: Sequence[Listed], notes: Sequence[str] = ()) -> str:
+    """Return the page that lists several runs, with warnings above them."""
     total = sum((item.categories for item in runs), Counter[str]())
     tiles = {
         "recordings": len(runs),
@@ -124,6 +124,7 @@ def index_page(title: str, runs: Sequence[Listed]) -> str:
         title=escape(title),
         subtitle=escape(count_words(total, "no tracks")),
         tiles=_tiles(tiles),
+        warnings=_warnings(notes),
         runs="".join(map(_listed, runs)),
     )
 

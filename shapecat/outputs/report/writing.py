@@ -1,5 +1,6 @@
 """Write ``report.html`` of each run, and ``index.html`` of several."""
 
+import json
 import os
 from collections import Counter
 from collections.abc import Callable, Mapping, Sequence
@@ -11,6 +12,8 @@ from urllib.parse import quote, unquote
 
 from shapecat.arrays import F8
 from shapecat.errors import OutputError, explained
+from shapecat.errors import listed as named
+from shapecat.outputs.counts import plural
 from shapecat.outputs.report.cards import Card, is_unsure
 from shapecat.outputs.report.choosing import choose_frames
 from shapecat.outputs.report.page import Listed, index_page, run_page
@@ -26,6 +29,8 @@ from shapecat.system.progress import Observer, ignore
 __all__ = ["INDEX", "PAGE", "Reports", "RunReport", "read_report", "read_reports"]
 
 PAGE, INDEX = "report.html", "index.html"
+_MANIFEST = "manifest.jsonl"
+"""The file in which a batch records the state of each recording."""
 _MARK = b'<p class="kicker">shapecat report</p>'
 """A part of index.html in each version."""
 _FACES = 6
@@ -141,7 +146,9 @@ class Reports:
         count = Counter(card.name for card in cards)
         names = (str(Path(unquote(c.link)).parent) if count[c.name] > 1 else c.name for c in cards)
         listed = [replace(card, name=name) for card, name in zip(cards, names, strict=True)]
-        return index_page(self.above.resolve().name, listed)
+        failed = _failed_recordings(self.above / _MANIFEST) - {r.folder.name for r in self.runs}
+        note = f"{plural(len(failed), 'recording')} failed: {named(sorted(failed))} ({_MANIFEST})"
+        return index_page(self.above.resolve().name, listed, [note] if failed else [])
 
     def write(self) -> list[Path]:
         """Write all pages, the index last, and return their paths.
@@ -209,6 +216,17 @@ def read_report(folder: Path, *, index: str | None = None) -> RunReport:
     pictures = take_pictures(finished, rows, choose_frames(folder, timelines))
     work, stages = finished.info["work"], read_stage_seconds(folder)
     return RunReport(folder, work, timelines, pictures, stages, read_length(folder), index)
+
+
+def _failed_recordings(manifest: Path) -> set[str]:
+    """Return the run folders that failed in a batch; none without a readable manifest."""
+    states: dict[str, str] = {}
+    with suppress(OSError), manifest.open("rb") as lines:
+        for line in lines:
+            with suppress(ValueError, TypeError, KeyError, RecursionError):  # truncated by a crash
+                entry = json.loads(line)
+                states[str(entry["folder"])] = entry["state"]
+    return {folder for folder, state in states.items() if state == "failed"}
 
 
 def _require_ours(index: Path) -> None:
