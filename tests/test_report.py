@@ -1,8 +1,10 @@
 """Tests of the report: the content of the page, and its behaviour in a browser if there is one."""
 
 import base64
+import errno
 import io
 import json
+import os
 import re
 import shutil
 from collections import Counter
@@ -281,6 +283,30 @@ def test_index_names_recordings_that_failed(shapecat: Run, run: Path) -> None:
     assert [each.exit_code for each in done] == [0, 0]
     assert "<li>⚠ 2 recordings failed: &lt;a&gt;, b (manifest.jsonl)</li>" in index
     assert "failed" not in (run.parent / "index.html").read_text("utf-8")
+
+
+@pytest.mark.usefixtures("without_pictures")
+@pytest.mark.parametrize(
+    ("code", "said"),
+    [
+        (errno.EACCES, "Permission denied; copy the folder to a place where you may write\n"),
+        (errno.EROFS, "Read-only file system; copy the folder to a place where you may write\n"),
+        (errno.ENOSPC, "No space left on device\n"),
+    ],
+)
+def test_report_in_read_only_folder_names_a_remedy(
+    shapecat: Run, run: Path, monkeypatch: pytest.MonkeyPatch, code: int, said: str
+) -> None:
+    """Runs on a shared disk belong to others, and the page has its place in the run."""
+
+    def refuse(*_: Any) -> None:
+        raise OSError(code, os.strerror(code))
+
+    monkeypatch.setattr(Path, "write_text", refuse)
+    done = shapecat("report", run)
+
+    assert done.exit_code == 1
+    assert done.stderr == f"Error: {run / 'report.html'}: cannot be written: {said}"
 
 
 def decode(image: str) -> np.ndarray:

@@ -1,5 +1,6 @@
 """Write ``report.html`` of each run, and ``index.html`` of several."""
 
+import errno
 import json
 import os
 from collections import Counter
@@ -34,6 +35,7 @@ _MANIFEST = "manifest.jsonl"
 _MARK = b'<p class="kicker">shapecat report</p>'
 """A part of index.html in each version."""
 _FACES = 6
+_REFUSED = (errno.EACCES, errno.EPERM, errno.EROFS)
 
 
 @dataclass(frozen=True)
@@ -170,7 +172,9 @@ class Reports:
                 with replacing(page) as path:
                     path.write_text(text, "utf-8")
             except OutputError as error:
-                failures.append(error)
+                refused = isinstance(error.__cause__, OSError) and error.__cause__.errno in _REFUSED
+                hint = "; copy the folder to a place where you may write" if refused else ""
+                failures.append(OutputError(f"{error}{hint}"))
         if failures:
             raise failures[0]
         return list(pages)
