@@ -92,6 +92,25 @@ def test_warning_distinguishes_missing_depth_wrong_up_and_noise(tmp_path: Path) 
     )
 
 
+def test_warning_says_that_a_single_object_lacks_its_table(tmp_path: Path) -> None:
+    """Its advice led from a missing --up to a wrong one, and back."""
+    images = np.zeros((2, CAMERA.height, CAMERA.width), np.float32)
+    images[:, 10:40, 20:50] = np.random.default_rng(1).uniform(0.8, 1.1, (2, 30, 30))
+    cut_out = walls(tmp_path / "object.mcap", images)
+    images[1, 20, 60] = 1.0
+    wider = walls(tmp_path / "wider.mcap", images)
+
+    said = [warnings_of(cut_out, tmp_path / up, up=up)[-1] for up in ("auto", "0,-1,0")]
+
+    reason = (
+        "; all points are within 0.6 m: if they are a single object, cut out of its scene, "
+        "shapecat also needs the points of the table below it"
+    )
+    assert [text.endswith(reason) for text in said] == [True, True]
+    assert said[0].startswith("no supporting plane in 2 of 2 frames: try --up X,Y,Z")
+    assert warnings_of(wider, tmp_path)[-1].endswith("with --set detection.max_range_m=M")
+
+
 def test_only_first_frames_without_plane_are_read_again(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:

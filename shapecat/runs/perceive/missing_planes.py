@@ -19,6 +19,13 @@ __all__ = ["explain_missing_planes"]
 _NO_ROOM_M = 10.0
 """A median depth that no indoor camera measures: the unit is wrong, not the range."""
 
+_OBJECT_M = 0.6
+"""All points of a frame within this length may be a single object."""
+_CUT_OUT = (
+    f"; all points are within {_OBJECT_M:g} m: if they are a single object, cut out of its scene, "
+    "shapecat also needs the points of the table below it"
+)
+
 _FRAMES = 3
 """Number of frames without a plane whose depths are examined."""
 
@@ -37,8 +44,11 @@ def explain_missing_planes(recording: Recording, folder: Path, run: RunInfo) -> 
         return
     pairs = read_frames(recording, run["options"], skipped=Counter())
     chosen = (frame for frame, _ in pairs if (frame.topic, frame.index) in first)
-    distances = [_distances(frame) for frame in islice(chosen, len(first))]
-    reason = _reason([each for each in distances if each.size], range_m, run["up"]["source"])
+    seen = [(_distances(frame), _extent_m(frame)) for frame in islice(chosen, len(first))]
+    distances = [each for each, _ in seen if each.size]
+    reason = _reason(distances, range_m, run["up"]["source"])
+    if distances and max(extent_m for _, extent_m in seen) <= _OBJECT_M:
+        reason += _CUT_OUT
     yield f"no supporting plane in {bare} of {frames} frames: {reason}"
 
 
@@ -89,3 +99,11 @@ def _distances(frame: Frame) -> F4:
     with np.errstate(over="ignore"):
         distances: F4 = np.linalg.norm(points[np.isfinite(points).all(axis=1)], axis=1)
     return distances
+
+
+def _extent_m(frame: Frame) -> float:
+    """Return the longest side of the box around all points, along the axes of the sensor."""
+    points = frame.xyz()
+    valid = points[np.isfinite(points).all(axis=1)]
+    with np.errstate(over="ignore"):
+        return float(np.ptp(valid, axis=0).max()) if len(valid) else 0.0
