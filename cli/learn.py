@@ -23,8 +23,8 @@ def learn(
     """Add the new categories of a data set to a model.
 
     MODEL is a model file, or `default` for the model that comes with shapecat. Its existing
-    categories do not change. DATASET is laid out as for `shapecat train`; `shapecat export --format
-    crops` writes such a data set.
+    categories do not change. DATASET is laid out as for `shapecat train`, with z up and the support
+    at z = 0; `shapecat export --format crops` writes such a data set.
 
     \b
     shapecat learn default crops --out mine.npz

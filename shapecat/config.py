@@ -255,7 +255,8 @@ def _replace(group: Any, tree: Mapping[str, Any], prefix: str) -> Any:
     for key, value in tree.items():
         name = f"{prefix}{key}"
         if key not in hints:
-            near = difflib.get_close_matches(key, hints, 1)
+            near = [f"{part}.{key}" for part in hints if hasattr(getattr(group, part), key)]
+            near = near or difflib.get_close_matches(key, hints, 1)
             hint = f"; did you mean {prefix}{near[0]}?" if near else f"; known: {', '.join(hints)}"
             msg = f"unknown setting {name}{hint}"
             raise ConfigError(msg)

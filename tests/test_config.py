@@ -82,6 +82,7 @@ def test_numbers_of_numpy_are_settings() -> None:
         ("outputs.markers=False", "must be true or false, got 'False'"),
         ("tracking.fusion=median", "must be one of mean"),
         ("tracking=1", "group of settings"),
+        ("max_range_m=4", "unknown setting max_range_m; did you mean detection.max_range_m?"),
         ("surface.neurons=513", "surface.neurons must be from 20 to 512, got 513"),
         ("surface.voxel_m=0", "surface.voxel_m must be from 0.0001 to 0.02, got 0.0"),
         ("surface.voxel_m=0.5", "to 0.02, got 0.5"),  # all objects would be unknown
