@@ -187,13 +187,13 @@ class _Partner:
             self._left_out[f"CameraInfo: {reason_of(error, self.stream.topic)}"] += 1
 
     def notice(self, frame: Frame) -> None:
-        """Take note of a new frame: if the clock was set back, earlier images are not its own."""
+        """Note a new frame; if the clock was set back, the images so far are not for it."""
         if frame.stamp_ns < self._latest:
             self._setbacks, self._newest = self._setbacks + 1, None
         self._latest = frame.stamp_ns
 
     def reaches(self, frame: Frame) -> bool:
-        """Return whether the newest image is not older than a frame: later ones are not nearer.
+        """Return whether an image as new as a frame was read, so that no later one is nearer.
 
         If the image of the frame is known, return whether it was read.
         """

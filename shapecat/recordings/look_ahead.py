@@ -17,7 +17,7 @@ its stamp, and publish transforms more often than this."""
 
 
 def is_read_at_once(recording: Recording) -> bool:
-    """Return whether all messages are read at first: the recording is short, or has no index."""
+    """Return whether all messages are read at the start: the recording is short or unindexed."""
     return recording.end_ns - recording.start_ns <= 2 * AROUND_NS or not recording.indexed
 
 

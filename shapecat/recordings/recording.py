@@ -75,8 +75,8 @@ class Recording(ABC):
         topics : names to read; all by default.
         start_ns, stop_ns : messages with ``start_ns <= log time < stop_ns`` are read.
         needed : returns whether the data of a message is needed. Messages that are not needed may
-            come without data; destroyed ones always do. Both are yielded, so that frame numbers do
-            not depend on what is needed.
+            come without data; those that damage has destroyed always do. Both are yielded, so that
+            frame numbers do not depend on what is needed.
 
         Yields
         ------

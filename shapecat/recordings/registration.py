@@ -32,9 +32,9 @@ def are_equal(lens: LensCamera, camera: Camera | None) -> bool:
 
 
 def is_straight(lens: LensCamera, camera: Camera | None) -> bool:
-    """Return whether a lens sees the rays of a pinhole camera near the camera's pixels.
+    """Return whether a lens moves no pixel of a pinhole camera by `_STRAIGHT_PX` or more.
 
-    A lens without distortion does, and so does any if there is no camera.
+    A lens without distortion counts as straight, and so does any lens if there is no camera.
     """
     return _bend_px(lens, camera) < _STRAIGHT_PX
 

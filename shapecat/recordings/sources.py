@@ -39,7 +39,7 @@ class Source:
     """A stream and its state between frames; ``skipped`` counts unreadable messages by reason."""
 
     def __init__(self, recording: Recording, stream: Stream, skipped: Counter[str]) -> None:
-        """Start before the first message."""
+        """Start before the first message; ``skipped`` is updated in place."""
         self.recording = recording
         self.stream = stream
         self.skipped = skipped

@@ -47,7 +47,7 @@ def delay_ns(recording: Recording, topic: str) -> int:
 
 
 class Clock:
-    """Replaces missing stamps on one topic, and counts odd ones."""
+    """Replaces missing stamps on one topic, and counts suspicious ones."""
 
     def __init__(self, recording: Recording, topic: str) -> None:
         """Start before the first stamp of a topic."""
@@ -74,7 +74,7 @@ class Clock:
         return delay_ns(self.recording, self.topic)
 
     def report(self) -> None:
-        """Add warnings about odd stamps to the recording."""
+        """Add warnings about suspicious stamps to the recording."""
         for name, count in self.counts.items():
             if count:
                 self.recording.warn(f"{self.topic}: {_TEXTS[name].format(count)}")

@@ -201,7 +201,7 @@ def _is_infrared(topic: str) -> bool:
 
 
 def _is_radial(topic: str) -> bool:
-    """Return whether images are named after distances, but not to the image plane."""
+    """Return whether a topic is named after distances that are not to the image plane."""
     name = _own_name(topic)
     return "distance" in name and "plane" not in name
 

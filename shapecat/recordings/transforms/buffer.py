@@ -128,7 +128,7 @@ class TransformBuffer:
         return self._ancestors(self._require_frame(frame_id))[-1]
 
     def find_loop(self) -> str:
-        """Return the error of a loop in the latest transforms; empty if there is none."""
+        """Return the error message for a loop in the latest transforms; empty if there is none."""
         for name in self.frames:
             try:
                 self._ancestors(name)

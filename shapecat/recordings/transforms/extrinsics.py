@@ -96,7 +96,10 @@ class Extrinsics:
         return compose(colour, inverse(depth))
 
     def _driver_topics(self) -> list[str]:
-        """Return the topics around the depth topic, nearest first, or the only one there is."""
+        """Return the driver's topics whose namespaces hold the depth topic, the longest first.
+
+        Without any, return the only such topic of the recording, if there is just one.
+        """
         names = {t.name for t in self._recording.topics if f"/{t.name}".endswith(_DRIVER)}
         around = [n for n in names if self._depth.topic.startswith(n.removesuffix(_DRIVER[1:]))]
         return sorted(around, key=len, reverse=True) or (list(names) if len(names) == 1 else [])

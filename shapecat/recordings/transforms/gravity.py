@@ -200,7 +200,7 @@ class Upright:
         self.warnings.append(f"{topic}: {misnaming.text}; its transforms are corrected")
 
     def accept(self, topic: str, orientation: Orientation) -> F4 | None:
-        """Count an up direction by its source, and return it; None if the topic's is dropped."""
+        """Count an up direction by its source, and return it; None if it is unknown or dropped."""
         up = None if topic in self.dropped else orientation.up
         source = "planes" if up is None else orientation.source
         self.given[source] = self.given.get(source, 0) + 1
@@ -295,7 +295,7 @@ def has_z_up(frame_id: str) -> bool:
 
 
 def _rank(name: str) -> int:
-    """Return the rank of a frame among the level ones, without its robot's name; else the last."""
+    """Return the index in `_LEVEL_FRAMES` of a name without its robot; others come last."""
     plain = name.rpartition("/")[2]
     return _LEVEL_FRAMES.index(plain) if plain in _LEVEL_FRAMES else len(_LEVEL_FRAMES)
 

@@ -47,7 +47,10 @@ class TransformTrack:
         return TransformSample(self._parents[k], (x, y, z), tuple(quaternion))
 
     def gaps_ns(self, stamp: int) -> tuple[int, int]:
-        """Return how long a time is after the last sample and before the first; negative within."""
+        """Return the ns from the last sample to a time, and from the time to the first sample.
+
+        A positive number means that the time is outside; latched samples never end.
+        """
         if not self.stamps:
             return _NEVER_NS, _NEVER_NS
         return 0 if self.latched else stamp - self.stamps[-1], self.stamps[0] - stamp
@@ -63,7 +66,7 @@ class TransformTrack:
             self._set(slice(at, at), stamp, sample)
 
     def forget(self, stamp: int) -> None:
-        """Remove the samples before the last one that is not later than a time."""
+        """Keep the last sample at or before a time (ns), and later ones; remove the others."""
         first = bisect_right(self.stamps, stamp) - 1
         if first > 0:
             del self.stamps[:first], self._parents[:first], self._numbers[: 7 * first]

@@ -37,7 +37,7 @@ def transform_topics(recording: Recording, sensor_topics: Sequence[str] = ()) ->
 
 
 def is_latched(kind: str) -> bool:
-    """Return whether transforms in messages of a type are valid until the next: Foxglove's are."""
+    """Return whether transforms of a message type hold until the next one, as Foxglove's do."""
     return ros_counterpart(kind) in TF_TYPES and kind not in TF_TYPES
 
 

@@ -21,7 +21,7 @@ _NEAR_NS = 1_000_000_000
 
 
 class TransformWindow:
-    """The transforms that are known when a frame looks one up.
+    """The transforms around the current frame, or all of a short recording.
 
     Attributes
     ----------
