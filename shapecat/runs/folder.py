@@ -97,7 +97,7 @@ def staged(
 
     An earlier ``folder`` is moved away first and removed afterwards. After a signal or a kill, the
     hidden folder is kept, so that the same command can resume; after an error, only if
-    ``worth_keeping`` returns True for it.
+    ``worth_keeping`` returns True for it. ``marker`` recognises folders that shapecat made.
 
     Raises
     ------
@@ -130,7 +130,7 @@ def staged(
 
 
 def require_ours(folder: Path, marker: Marker = made_by_run) -> None:
-    """Check that a folder is missing, empty or made by shapecat.
+    """Check that a folder is missing, empty or made by shapecat, which ``marker`` recognises.
 
     Raises
     ------
@@ -189,7 +189,10 @@ def _retire(folder: Path, marker: Marker) -> None:
 
 
 def recover(folder: Path, marker: Marker = made_by_run) -> None:
-    """Restore a folder that a killed run had moved away, or finish removing it.
+    """Complete the replacement of a folder that a killed run had begun, or undo it.
+
+    The earlier folder is restored if there is no new one, else removed. ``marker`` recognises
+    folders that shapecat made; see `Marker`.
 
     Raises
     ------

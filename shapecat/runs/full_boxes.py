@@ -135,7 +135,7 @@ class FullBoxes:
             result[sighting.at[block]] = np.hstack([back, size, quaternions, std])
 
     def _read(self, rows: Sequence[I4], values: _Selection) -> list[F4]:
-        """Return the values (n, k) of the rows (n,) of the table that each track has."""
+        """Return, for each track, the values (n, k) in its ``rows`` (n,) of the table."""
         together = np.concatenate([_NO_ROWS, *rows])
         result = np.zeros((len(together), values.width), np.float32)
         with opened(self.table) as file:

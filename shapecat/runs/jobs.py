@@ -100,7 +100,7 @@ class Job:
         return {"input": self.input_key, "work": self.work_key}
 
     def made(self, run: RunInfo) -> bool:
-        """Return whether a run at a URL has the same keys, and they are known."""
+        """Return whether a run at a URL has the keys of this job; False if these are unknown."""
         return bool(self.input_key and self.work_key) and run.get("origin") == self.keys
 
     def selection(self) -> Options:
@@ -162,7 +162,7 @@ def describe_run(job: Job, categorizer: Categorizer) -> RunInfo:
 
 
 def differences(run: RunInfo, planned: Mapping[str, Any]) -> dict[str, str]:
-    """Return both values of each setting and option, and of the model, in which two runs differ.
+    """Return the settings, options and model in which two runs differ, with both values.
 
     Parameters
     ----------
@@ -182,7 +182,7 @@ def differences(run: RunInfo, planned: Mapping[str, Any]) -> dict[str, str]:
 
 
 def other_work(differing: Mapping[str, str]) -> str:
-    """Return, for a message, in what a run differs; from `differences`, and the input."""
+    """Return, for a message, how a run differs: its `differences`, and any in the input."""
     listed = "; ".join(f"{name}: {text}" for name, text in differing.items())
     return f"another input, model or settings ({listed})"
 
@@ -220,7 +220,7 @@ def identify(run: RunInfo, content: ContentDigest) -> None:
 
 
 def follow(run: RunInfo, found: InputInfo) -> bool:
-    """Store where the same recording was ``found`` if it is gone from its path; return whether."""
+    """If a run's recording is gone from its path, store where it was ``found``, return True."""
     moved = not Path(run["input"]["path"]).exists() and run["input"]["path"] != found["path"]
     if moved:
         run["input"] |= {"path": found["path"], "files": found["files"]}

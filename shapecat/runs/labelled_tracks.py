@@ -42,15 +42,16 @@ _NONE = np.zeros((0, 0), np.float32)
 
 @dataclass(frozen=True)
 class LabelledTracks:
-    """The detections of each frame of a run that have a track, with its final label.
+    """The detections of a run that have a track, frame by frame, and the labels of the tracks.
 
     Attributes
     ----------
-    frames : the rows of the arrays below, for each frame.
-    detections, tracks : (rows,) numbers of the detections in their frames, and of their tracks.
-    labels : the label of each track.
+    frames : for each frame, its rows of the arrays below.
+    detections : (rows,) number of each detection in its frame.
+    tracks : (rows,) number of its track.
+    labels : the final label of each track.
     last_in : the tracks that end in each frame; frames in which none ends are missing.
-    causal : (rows, categories) causal posteriors; empty unless requested.
+    causal : (rows, categories) posterior of each track up to the frame; empty unless requested.
     full : (rows, 10) centre, size (metres) and orientation of the full boxes in the sensor frame;
         NaN if unknown.
     """
@@ -91,7 +92,7 @@ class LabelledTracks:
             )
 
     def objects(self, key: Key) -> dict[TrackLabel, dict[int, int]]:
-        """Return the objects of a frame by label: the row of each of their detections, by number.
+        """Return, for each label in a frame, the rows of its detections by their numbers.
 
         An object has several detections where a person merged their tracks. Objects are in the
         order of their first detections.

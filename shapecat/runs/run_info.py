@@ -103,7 +103,7 @@ class RunIdentity(TypedDict):
 class RunInfo(RunIdentity):
     """The contents of run.json; ``seconds`` has the duration of each finished phase.
 
-    ``damaged`` is there if reading the frames met damage in an MCAP file: see `Recording.damaged`.
+    ``damaged`` is present if damage was found while reading the frames: see `Recording.damaged`.
     """
 
     settings: dict[str, Any]

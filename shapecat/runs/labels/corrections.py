@@ -175,11 +175,12 @@ def relabel(folder: Path, labels: Mapping[int, str]) -> dict[int, str]:
 
     Returns
     -------
-    The reason for each track whose label was rejected: it is invalid, or contradicts other labels.
+    For each track whose label was rejected, why: it is invalid, or contradicts other labels.
 
     Raises
     ------
-    OutputError : the run's table is unreadable, invalid or another run's, or cannot be written.
+    OutputError : the run's table is unreadable or invalid, belongs to another run, or cannot be
+        written.
     """
     current = folder / "tracks.csv"
     base, problems = read_original_table(current)

@@ -22,12 +22,12 @@ _Moment = tuple[str, int, int]
 
 
 class TrackDetections(NamedTuple):
-    """All detections of the tracks of a run, sorted by moment.
+    """All detections of the tracks of a run, sorted by topic and time.
 
     Attributes
     ----------
     tracks, numbers, detections : (n,) track, frame and detection numbers.
-    frames : the moment of each detection.
+    frames : the `_Moment` of each detection.
     centers : (n, 3) metres, fixed frame.
     keys : the rows of each moment.
     """

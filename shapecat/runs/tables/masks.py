@@ -61,9 +61,9 @@ def read_masks(folder: Path, *, boxes_only: bool = False) -> Iterator[tuple[Key,
 def read_nearest_masks(folder: Path) -> Iterator[tuple[Key, ImageMasks]]:
     """Yield each image once, with the boxes of the masks of the frame nearest to it in time.
 
-    Images are in the order in which they were recorded. Several frames have the same image if
-    images are rarer, or if several depth sensors share a colour camera; the frames of one of these
-    may come later. Run lengths are left out.
+    Images are in the order in which they were recorded. Several frames share an image if there are
+    fewer images than frames, or if several depth sensors share a colour camera; the frames of one
+    sensor may come later than those of another. Run lengths are left out.
 
     Raises
     ------

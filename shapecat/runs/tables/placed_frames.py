@@ -50,11 +50,11 @@ class DetectedFrames:
         return cls(np.concatenate(first), np.concatenate(poses))
 
     def poses_of(self, rows: I4) -> F8:
-        """Return the pose (n, 3, 4) of the sensor for each of some rows (n,) of detections."""
+        """Return the ``poses`` (n, 3, 4) for the detections in table rows ``rows`` (n,)."""
         return np.asarray(self.poses[self._find(rows)])
 
     def numbers_of(self, rows: I4) -> I4:
-        """Return the number in its frame of each of some rows (n,) of detections."""
+        """Return the numbers (n,), in their frames, of the detections in table rows (n,)."""
         return np.asarray(rows - self.first[self._find(rows)])
 
     def _find(self, rows: I4) -> I4:

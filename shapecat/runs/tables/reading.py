@@ -76,11 +76,12 @@ def read_stamps(folder: Path) -> Iterator[tuple[Key, int]]:
 def read_by_topic(
     folder: Path, columns: Sequence[str], values: Callable[[pa.Table], Any]
 ) -> dict[str, Any]:
-    """Return values of the frames of each topic, in their order.
+    """Compute values from the frames table; return one array per topic, in its order of frames.
 
     Parameters
     ----------
-    values : returns an array with a row for each row of these columns of the frames table.
+    columns : the columns to read, in addition to the topic.
+    values : called with some rows of these columns; returns an array with one row for each.
     """
     parts: dict[str, list[Any]] = {}
     for group in read_row_groups(folder / "frames.parquet", ["topic", *columns]):
@@ -270,7 +271,7 @@ def _validated(table: pa.Table) -> pa.Table:
 
 
 def with_fixed_lists(table: pa.Table) -> pa.Table:
-    """Return rows of a table as read, with the lists of fixed size of its schema.
+    """Return a table with each column in `FIXED_LISTS` cast to lists of fixed size.
 
     Raises
     ------

@@ -93,7 +93,7 @@ def _revised(frames: pa.Table) -> Iterator[Key]:
 
 
 def _picked(name: str, keys: Sequence[Key], sources: Sequence[_Tables]) -> pa.Table:
-    """Return the rows of the table ``name`` for each of ``keys``, from the source beside it."""
+    """Return rows of the table ``name``: those of each key, from the source at its index."""
     rows = {id(tables): frame_rows(tables[name]) for tables in sources}
     chosen = [
         (tables[name], rows[id(tables)].get(key, slice(0, 0)))

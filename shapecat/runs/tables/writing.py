@@ -64,7 +64,7 @@ def rows_as_lists(values: F4) -> pa.Array:
 
 
 class _Writer(pq.ParquetWriter):  # type: ignore[misc]  # pyarrow has no types
-    """Writes row groups with the lists of fixed size that may be null as plain lists.
+    """Writes row groups; lists of fixed size that may be null are written as plain lists.
 
     Arrow before version 26, and programs that use it, cannot read nulls among lists of fixed size.
     """
