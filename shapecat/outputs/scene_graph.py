@@ -58,7 +58,7 @@ def format_tree(scene: Scene, describe: Callable[[Node], str]) -> str:
 
 
 def _below_object(candidate: Candidate) -> Sequence[Node | None]:
-    """Return the object and the plane on which an object stands directly; a None for neither."""
+    """Return the object and the plane on which an object stands directly; [None] if neither."""
     below: list[Node | None] = []
     if candidate.on_candidate is not None:
         below.append(Node("object", candidate.on_candidate))

@@ -101,7 +101,7 @@ def split_runs(runs: Sequence[FinishedRun], val: float) -> list[str]:
 
 
 def image_stems(runs: Sequence[FinishedRun]) -> list[dict[str, str]]:
-    """Return the prefix of image names of each topic, for each run; no two are equal."""
+    """Return, for each run, a prefix of image names for each topic; no two are equal."""
     names = different_names([run.name for run in runs])
     topics = [run.info["options"]["topics"] for run in runs]
     stems = [

@@ -21,9 +21,9 @@ class Timeline(Record):
     seconds : (k,) time of each row since the first frame of the run, ascending.
     seen : (k,) whether the track was detected.
     causal : (k, c) posterior fused from the views so far.
-    keys : the detection of each row.
-    fused : (c,) posterior fused from all views. After a clock was set back, the last row of
-        ``causal`` differs from it.
+    keys : topic, frame and detection of each row, as in `Detected`.
+    fused : (c,) posterior fused from all views: the last row of ``causal``, unless a clock was set
+        back.
     """
 
     seconds: F8 = array("k", "f8")

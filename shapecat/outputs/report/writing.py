@@ -209,6 +209,7 @@ def read_report(folder: Path, *, index: str | None = None) -> RunReport:
     """Read the content of the report of one run.
 
     Pictures come from the recording. If it cannot be read, surfaces are drawn from their meshes.
+    ``index`` is the link from the page to the index of several runs; None if there is none.
 
     Raises
     ------

@@ -62,7 +62,7 @@ class ReviewFile:
             raise self._error
 
     def close(self) -> None:
-        """Write the rest and disconnect the stream."""
+        """Write the remaining output and disconnect the stream."""
         self._stream.disconnect()
         self._thread.join()
 

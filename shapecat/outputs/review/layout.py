@@ -156,7 +156,10 @@ def lay_out(
 
 
 def send_layout(stream: rr.RecordingStream, layout: _Layout) -> None:
-    """Write a layout; then close its own stream, which would keep two threads forever."""
+    """Write a layout to ``stream``, and close the layout's own stream.
+
+    Left open, the layout's stream would keep two threads forever.
+    """
     stream.send_blueprint(layout)
     if layout.stream is not None:
         layout.stream.disconnect()

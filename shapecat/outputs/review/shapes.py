@@ -135,7 +135,7 @@ def _dashes(scenes: Sequence[DrawnScene]) -> _Columns:
 
 
 def _graphs(scenes: Sequence[DrawnScene]) -> _Columns:
-    """Return the edges of the graphs."""
+    """Return the edges of the objects' neural gases."""
     objects = [o for m in scenes for o in m.labelled.objects]
     lines = [o.gas.neurons[o.gas.edges] for o in objects]
     pairs = np.concatenate(lines) if lines else np.zeros((0, 2, 3), np.float32)
@@ -154,7 +154,7 @@ def _segments(pairs: F4) -> pa.Array:
 
 
 def _surfaces(scenes: Sequence[DrawnScene]) -> _Columns:
-    """Return the triangles of the graphs, one translucent mesh per frame."""
+    """Return the triangles of the objects' neural gases, one translucent mesh per frame."""
     meshes = [
         [(o, faces) for o in m.labelled.objects if len(faces := _triangles(o))] for m in scenes
     ]

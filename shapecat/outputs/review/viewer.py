@@ -187,7 +187,10 @@ def _wait_for(viewer: subprocess.Popen[bytes], port: int, log: IO[bytes]) -> Non
 
 
 def _has_ended(viewer: subprocess.Popen[bytes]) -> bool:
-    """Return whether the viewer has ended, or ends soon: its connection closes before that."""
+    """Return whether the viewer ends within `_SETTLE_S`.
+
+    Its connection closes shortly before it ends.
+    """
     with suppress(subprocess.TimeoutExpired):
         viewer.wait(_SETTLE_S)
     return viewer.poll() is not None
