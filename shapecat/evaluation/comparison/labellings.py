@@ -136,7 +136,7 @@ class Reference(ABC, Generic[_Frame]):
 
     @abstractmethod
     def labelling(self, entry: _Frame) -> Labelling:
-        """Return the objects of a frame; raise as `at`."""
+        """Return the objects of a frame; errors are as for `at`."""
 
     def describe_frames(self) -> str:
         """Describe the range of frames in a few words."""
@@ -145,7 +145,7 @@ class Reference(ABC, Generic[_Frame]):
 
 
 def numbering_notes(other: Reference[Any], start_s: float | None) -> list[str]:
-    """Return a note if run and reference may number their frames from different ones.
+    """Return a note if frame 0 of the run may not be frame 0 of the reference.
 
     ``start_s`` is where the run began in its recording, None for the beginning.
     """
@@ -166,8 +166,8 @@ def index_frames(path: Path, frames: Iterable[tuple[Place, _Frame]]) -> dict[Pla
     Parameters
     ----------
     path : of the reference, for the message.
-    frames : entries with their topic, None for any topic; their timestamp (ns) or frame number;
-        and the frame number in addition to a timestamp, None if unknown.
+    frames : pairs of a place and an entry. A place is the topic (None for any), the timestamp (ns)
+        or else the frame number, and the frame number beside a timestamp (None if unknown).
 
     Raises
     ------
