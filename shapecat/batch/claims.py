@@ -146,7 +146,7 @@ def claimed(url: str, batch: str) -> Iterator[Claim]:
 
     Parameters
     ----------
-    batch : as for `Claim`.
+    batch : identifies the command; a claim of the same batch is taken over without waiting.
 
     Raises
     ------

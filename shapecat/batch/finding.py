@@ -73,7 +73,7 @@ def find_recordings(sources: Sequence[str]) -> SearchResult:
 
 
 def _expanded(source: str) -> list[Path]:
-    """Return the path itself, or the paths that match a pattern, without those in such folders."""
+    """Return the path itself, or the matches of a pattern, without those in matching folders."""
     if os.path.lexists(source):
         return [Path(source)]
     names = glob(source, recursive=True)  # noqa: PTH207  Path.glob finds hidden files, too

@@ -113,7 +113,7 @@ class Location:
 
     @property
     def root(self) -> str:
-        """The URL, spelt as at the start of the URLs of `walk`."""
+        """The URL in the spelling with which the URLs from `walk` begin."""
         return self._url_of({"name": self._path})
 
     def _retry(self, participle: str, call: Callable[[], _T]) -> _T:
