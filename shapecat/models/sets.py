@@ -102,7 +102,7 @@ def clear_views(views: SimulatedViews) -> Bool:
 
 
 def partial_views(views: SimulatedViews) -> Bool:
-    """Return the mask (n,) of views that show a part of an object, more than it, or background."""
+    """Return the mask (n,) of views that are occluded, cut, badly segmented, or background."""
     parts = np.isin(views.source, ("fragment", "background"))
     return np.asarray(
         parts | (views.visible < MOSTLY_VISIBLE) | (views.overlap < WELL_SEGMENTED_IOU)

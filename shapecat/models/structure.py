@@ -60,8 +60,8 @@ class Series(NamedTuple):
     first, scenes : the first seed and the number of scenes.
     sensors : used in turn.
     scale : factor of all sizes and distances.
-    view : the camera is on the ``path`` of the scene, or ``anywhere``: near or far, low or straight
-        above; for ``floor`` the table is removed.
+    view : where the camera is: on the ``path`` of the scene, or ``anywhere`` around it (near or
+        far, low or straight above); ``floor`` is anywhere, with the table removed.
     changed : turns a bin into a tote, or a shelf into a rack.
     arms : arms of the robot with the camera, or of a person: ``reaching`` for the objects, or
         ``resting`` at the image border.

@@ -25,7 +25,9 @@ def random_viewpoint(
     *,
     distance_m: tuple[float, float] = _DISTANCE_M,
 ) -> Pose | int:
-    """Return a random ``world_from_camera`` facing the objects; the path's if there are none.
+    """Return a random ``world_from_camera`` that faces the objects.
+
+    If there are no objects, return 0, the first frame of the path.
 
     Parameters
     ----------

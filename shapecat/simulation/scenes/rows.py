@@ -38,9 +38,10 @@ _TOP_M = 0.03
 
 
 class _Place(NamedTuple):
-    """An object of a group, and the group's place below it.
+    """An object of a group.
 
-    ``corner`` (3,) is the minimum corner of its bounding box in the group, metres.
+    ``corner`` (3,) is the minimum corner of its bounding box in the group, metres; ``below`` is the
+    index of the object that it stands on, None on the support.
     """
 
     piece: Piece
