@@ -104,7 +104,7 @@ def open_recording(path: str | Path) -> OpenRecording:
     Raises
     ------
     ConfigError : the path is a URL.
-    RecordingError : the path is not a readable recording, or a folder of several.
+    RecordingError : the path is not a readable recording, or is a folder of several recordings.
     """
     return OpenRecording(_open_recording(_one_recording(_path(path))))
 
@@ -145,7 +145,7 @@ def process(
     cores : number of processes that perceive frames. If there are several, a script must have
         ``if __name__ == "__main__":``.
     observe : called with the phase, the number of frames done, and the total (None if unknown);
-        while kernels are compiled, with their number.
+        while kernels are compiled, with the number compiled so far.
     settings : for example ``seed=3`` or ``detection={"max_range_m": 1.5}``; see docs/reference.md.
 
     Raises

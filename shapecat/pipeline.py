@@ -70,7 +70,7 @@ def process(job: Job, observe: Observer = ignore, *, cores: int = 1) -> Summary:
     Parameters
     ----------
     observe : called with the phase, the number of frames done, and the total (None if unknown);
-        while kernels are compiled, with their number.
+        while kernels are compiled, with the number compiled so far.
     cores : number of processes that perceive frames; the tables do not depend on it.
 
     Raises
