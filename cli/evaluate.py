@@ -31,7 +31,8 @@ def evaluate(
 
     Print accuracy, confusion matrix, calibration error and novelty detection, and the accuracy
     after fusing 3, 10 and 30 views of an instance. DATASET is laid out as for `shapecat train`.
-    The model must know every category of DATASET. Cross-validation needs two objects of each.
+    The model must know every category of DATASET. Cross-validation needs two objects of each
+    category.
 
     \b
     --baselines compares these classifiers with shapecat's own:

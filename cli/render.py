@@ -78,7 +78,7 @@ def print_json(value: Any) -> None:
 def print_table(columns: Sequence[str], rows: Sequence[Sequence[Any]]) -> None:
     """Print a table with right-aligned columns of numbers; names are printed as they are.
 
-    It is folded to the width of a terminal, but not elsewhere.
+    On a terminal, lines are folded to its width.
     """
     from rich.console import Console
     from rich.table import Table
