@@ -32,7 +32,8 @@ class _LocalPath(_NonEmptyPath):
         from shapecat.batch.storage import is_url
 
         if isinstance(value, str) and is_url(value):
-            self.fail(f"{value} is a URL; only RECORDING and --out of `process` may be", param, ctx)
+            text = f"{value} is a URL; only RECORDING and --out of `process` may be URLs"
+            self.fail(text, param, ctx)
         return super().convert(value, param, ctx)
 
 

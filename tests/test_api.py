@@ -297,16 +297,20 @@ class OnGpu:
     ("reading", "options", "problem"),
     [
         (IMAGE, {}, r"points \(n, 3\), or a depth image with intrinsics"),
-        (IMAGE, {"intrinsics": (5, 5, 3)}, "fx, fy, cx, cy in pixels of an image 6 x 4"),
-        (IMAGE, {"intrinsics": (5, 5, 3, 20)}, "fx, fy, cx, cy in pixels of an image 6 x 4"),
-        (IMAGE, {"intrinsics": (0, 5, 3, 2)}, "fx, fy, cx, cy in pixels of an image 6 x 4"),
-        (IMAGE, {"intrinsics": (5, np.nan, 3, 2)}, "fx, fy, cx, cy in pixels of an image 6 x 4"),
+        (IMAGE, {"intrinsics": (5, 5, 3)}, "fx, fy, cx, cy in pixels of an image of 6 x 4"),
+        (IMAGE, {"intrinsics": (5, 5, 3, 20)}, "fx, fy, cx, cy in pixels of an image of 6 x 4"),
+        (IMAGE, {"intrinsics": (0, 5, 3, 2)}, "fx, fy, cx, cy in pixels of an image of 6 x 4"),
+        (IMAGE, {"intrinsics": (5, np.nan, 3, 2)}, "fx, fy, cx, cy in pixels of an image of 6 x 4"),
         # Divided by the size of the image, and the camera of another image:
-        (np.ones((48, 64)), {"intrinsics": (0.8, 1.1, 0.5, 0.5)}, "in pixels of an image 64 x 48"),
-        (np.ones((48, 64)), {"intrinsics": (60, 1.1, 32, 24)}, "in pixels of an image 64 x 48"),
-        (IMAGE, {"intrinsics": Camera(4, 6, 5, 5, 2, 3)}, r"of an image 6 x 4.* got Camera\("),
+        (
+            np.ones((48, 64)),
+            {"intrinsics": (0.8, 1.1, 0.5, 0.5)},
+            "in pixels of an image of 64 x 48",
+        ),
+        (np.ones((48, 64)), {"intrinsics": (60, 1.1, 32, 24)}, "in pixels of an image of 64 x 48"),
+        (IMAGE, {"intrinsics": Camera(4, 6, 5, 5, 2, 3)}, r"of an image of 6 x 4.* got Camera\("),
         *(
-            (IMAGE, {"intrinsics": wrong}, r"image 6 x 4, or its camera matrix \(3, 3\), got")
+            (IMAGE, {"intrinsics": wrong}, r"image of 6 x 4, or its camera matrix \(3, 3\), got")
             for wrong in (
                 np.eye(3)[:2],
                 [[5, 0, 3], [0, 5], [0, 0, 1]],

@@ -79,7 +79,8 @@ def test_messages_of_closed_recording_are_refused(
             next(messages)
 
     assert recording.closed
-    with pytest.raises(RecordingError, match=f"^{path}: is closed; read its frames before$"):
+    closed = f"^{path}: is closed; read its frames before you close it$"
+    with pytest.raises(RecordingError, match=closed):
         next(messages)
     with pytest.raises(RecordingError, match="is closed"):
         list(recording.messages())

@@ -58,8 +58,8 @@ class RecentFrames:
             f"{topic}: clouds are not fused, only depth images (frames: {n})"
             for topic, n in self._loose.items()
         ] + [
-            f"{topic}: the pose of the sensor is unknown (frames: {n}): "
-            "these are fused as if it had not moved, where their depths agree"
+            f"{topic}: the pose of the sensor is unknown (frames: {n}): where their depths agree, "
+            "these frames are fused as if it had not moved"
             for topic, n in self._unplaced.items()
             if n
         ]

@@ -81,8 +81,8 @@ def _camera(intrinsics: ArrayLike | Camera, height: int, width: int) -> Camera:
             if in_pixels and abs(cx) <= 3 * width and abs(cy) <= 3 * height:
                 return Camera(width, height, fx, fy, cx, cy)
     msg = (
-        f"expected fx, fy, cx, cy in pixels of an image {width} x {height}, or its camera matrix "
-        f"(3, 3), got {' '.join(repr(intrinsics).split())}"
+        f"expected fx, fy, cx, cy in pixels of an image of {width} x {height}, or its camera "
+        f"matrix (3, 3), got {' '.join(repr(intrinsics).split())}"
     )
     raise ConfigError(msg)
 

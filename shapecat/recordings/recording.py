@@ -96,7 +96,7 @@ class Recording(ABC):
 
     def _require_open(self) -> None:
         if self.closed:
-            msg = f"{self.path}: is closed; read its frames before"
+            msg = f"{self.path}: is closed; read its frames before you close it"
             raise RecordingError(msg)
 
     @abstractmethod

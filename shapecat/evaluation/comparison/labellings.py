@@ -152,8 +152,9 @@ def numbering_notes(other: Reference[Any], start_s: float | None) -> list[str]:
     if not (other.numbered and start_s):
         return []
     note = (
-        f"Frames are matched by number, which the run counts from --start {start_s:g}: labels "
-        "numbered from the start of the recording belong to other frames, and need timestamps."
+        f"Frames are matched by number, which the run counts from --start {start_s:g}. If the "
+        "labels count from the start of the recording, they are matched with the wrong frames: use "
+        "labels with timestamps."
     )
     return [note]
 
