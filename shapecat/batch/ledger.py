@@ -69,7 +69,7 @@ class Ledger:
             return Outcome(job, message=str(error), code=error.exit_code)
 
     def begin(self, task: Task) -> None:
-        """Follow the attempts at a recording from now on."""
+        """Begin to count the attempts at a recording; call this before `record_running`."""
         with self._lock:
             self._in_progress.setdefault(task.name, replace(task.entry(), tries=1))
 

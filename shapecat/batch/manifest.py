@@ -109,7 +109,7 @@ class Manifest:
         """Finish writing."""
 
     def begin(self) -> bytes:
-        """Return the first megabyte of the file; empty if it is missing or unreadable."""
+        """Return the first megabyte of the file; empty if there is no readable file."""
         with suppress(OSError), self.path.open("rb") as file:
             return file.read(_PART_BYTES)
         return b""

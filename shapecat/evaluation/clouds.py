@@ -34,7 +34,8 @@ _PLY_TYPES = {
 class CloudFile(NamedTuple):
     """The content of a point cloud file.
 
-    ``points`` (n, 3) as stored, including NaN; ``viewpoint`` (3,), None if the file has none.
+    ``points`` (n, 3) are as stored, including NaN; ``viewpoint`` (3,) is the position of the
+    sensor, None if the file has none.
     """
 
     points: F8

@@ -52,7 +52,7 @@ class Origin(NamedTuple):
         return None
 
     def shares_frames(self, other: "Origin") -> bool:
-        """Return whether both may show the same frames."""
+        """Return whether views of both origins may be from the same frames."""
         begin, end = max(self.start_s, other.start_s), min(self.end_s, other.end_s)
         return self.source == other.source and begin < end
 

@@ -52,6 +52,7 @@ class Columns:
 
         Parameters
         ----------
+        at : stamp (ns) and number of the frame.
         drawing : the same for all rows of this entity.
         size : number of values that the row keeps in memory.
         """

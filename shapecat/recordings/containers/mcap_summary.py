@@ -108,7 +108,7 @@ def _collect(file: BinaryIO, start: int, end: int) -> Summary:
 
 
 def _find_data_end(file: BinaryIO, summary: Summary, summary_start: int) -> int:
-    """Return the offset of the data end record; walk there from the last indexed record."""
+    """Return the offset of the data end record, found from the last indexed record onwards."""
     ends = [c.chunk_start_offset + c.chunk_length for c in summary.chunks]
     ends += [item.offset + item.length for item in (*summary.attachments, *summary.metadata)]
     for record in walk(file, max(ends, default=len(MAGIC)), summary_start):
